@@ -1,0 +1,330 @@
+"""Any surface made into a shape with an inside: what wrapping starts from.
+
+Nothing here trusts the mesh's winding or connectivity. The surface is sampled, air is let in from
+outside, and everywhere the air stays a distance `reach` away; growing the air back by `reach` gives
+the closed shape. Gaps narrower than twice the reach are bridged, walls and parts inside vanish.
+"""
+
+import dataclasses
+import os
+
+import numpy as np
+
+from .field import Field
+from .quality import normals
+
+Mesh = tuple[np.ndarray, np.ndarray]
+
+MOST_SIZE = 2.0  # [m]; a larger bounding box is taken for millimetres
+LEAST_SIZE = 2e-3  # [m]; a smaller one for kilometres or a slip of the scale
+_LEAST_THICKNESS = 1e-2  # of the diagonal; thinner is flat
+_MOST_CAP = 0.15  # of the area; a larger hole makes the surface open
+SHELL = 0.3  # of the grid's spacing; the inside starts below this, so that sheets have none
+
+
+def load(mesh, scale: float = 1.0) -> tuple[str, np.ndarray, np.ndarray]:
+  """Returns a name for messages, vertices (n, 3) [m] and triangles (m, 3), checked.
+
+  Args:
+    mesh: a file that trimesh reads (OBJ, STL, PLY, glTF), a trimesh, or (vertices, triangles)
+    scale: metres per unit of the mesh
+  """
+  if not (np.isfinite(scale) and scale > 0):
+    raise ValueError(f"scale is {scale}, expected a number above 0 (0.001 for millimetres)")
+  if isinstance(mesh, str | os.PathLike):
+    name = os.fspath(mesh)
+    vertices, triangles = _read(name)
+  else:
+    name = "mesh"
+    vertices, triangles = mesh if isinstance(mesh, tuple) else (mesh.vertices, mesh.faces)
+  vertices = np.array(vertices, dtype=float).reshape(-1, 3) * scale
+  triangles = np.array(triangles, dtype=np.int64).reshape(-1, 3)
+  _check(name, vertices, triangles)
+  return name, *_tidy(vertices, triangles)
+
+
+def _read(name: str) -> Mesh:
+  import trimesh
+
+  if not os.path.exists(name):
+    raise FileNotFoundError(f"{name}: no such file")
+  try:
+    loaded = trimesh.load(name, force="mesh", process=False)
+    return np.asarray(loaded.vertices), np.asarray(loaded.faces)  # pyright: ignore
+  except Exception as error:
+    kinds = "obj, stl, ply, gltf, glb"
+    raise ValueError(f"{name}: not a surface mesh that can be read ({kinds}): {error}") from error
+
+
+def _check(name: str, vertices: np.ndarray, triangles: np.ndarray) -> None:
+  """Raises a ValueError for what no repair can help."""
+  if not len(triangles):
+    raise ValueError(f"{name}: has no triangles, expected a surface")
+  if triangles.min() < 0 or triangles.max() >= len(vertices):
+    raise ValueError(f"{name}: a triangle uses a vertex outside 0..{len(vertices) - 1}")
+  used = np.unique(triangles)
+  bad = used[~np.isfinite(vertices[used]).all(axis=1)]
+  if len(bad):
+    raise ValueError(f"{name}: vertex {bad[0]} is {vertices[bad[0]]}, expected finite numbers")
+  size = float(np.linalg.norm(np.ptp(vertices[used], axis=0)))
+  if size > MOST_SIZE:
+    raise ValueError(
+      f"{name}: the bounding box is {size:.4g} m across, expected at most {MOST_SIZE} m; "
+      "this looks like millimetres: pass scale=0.001"
+    )
+  if size < LEAST_SIZE:
+    raise ValueError(
+      f"{name}: the bounding box is {size:.4g} m across, expected at least {LEAST_SIZE} m; "
+      "pass the metres per unit of the mesh as scale"
+    )
+  centered = vertices[used] - vertices[used].mean(axis=0)
+  axes = np.linalg.svd(centered.T @ centered)[0]
+  thickness = float(np.ptp(centered @ axes, axis=0).min())
+  if thickness < _LEAST_THICKNESS * size:
+    raise ValueError(
+      f"{name}: flat, {thickness:.3g} m thick and {size:.3g} m across, expected a surface around "
+      f"an inside at least {_LEAST_THICKNESS:.0%} as thick as it is large"
+    )
+
+
+def _tidy(vertices: np.ndarray, triangles: np.ndarray) -> Mesh:
+  """Returns the mesh with equal vertices merged, without degenerate or repeated triangles."""
+  used, number = np.unique(triangles, return_inverse=True)
+  vertices, triangles = vertices[used], number.reshape(-1, 3)
+  low, size = vertices.min(axis=0), np.ptp(vertices, axis=0).max()
+  cell = np.round((vertices - low) / size * 2**20).astype(np.int64)
+  key = (cell[:, 0] << 42) + (cell[:, 1] << 21) + cell[:, 2]
+  _, first, merged = np.unique(key, return_index=True, return_inverse=True)
+  triangles = merged.ravel()[triangles]
+  apart = (triangles != np.roll(triangles, 1, axis=1)).all(axis=1)
+  triangles = triangles[apart]
+  _, once = np.unique(np.sort(triangles, axis=1), axis=0, return_index=True)
+  triangles = triangles[np.sort(once)]
+  used, number = np.unique(triangles, return_inverse=True)
+  return vertices[first][used], number.reshape(-1, 3)
+
+
+def cap(vertices: np.ndarray, triangles: np.ndarray) -> Mesh:
+  """Returns the mesh with a fan over every hole that is small beside the surface."""
+  from scipy.sparse import coo_array
+  from scipy.sparse.csgraph import connected_components
+
+  n = len(vertices)
+  edge = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]))
+  key, count = np.unique(edge[:, 0] * n + edge[:, 1], return_counts=True)
+  rim = np.stack(np.divmod(key[count == 1], n), axis=1)
+  if not len(rim):
+    return vertices, triangles
+  graph = coo_array((np.ones(len(rim)), rim.T), shape=(n, n))
+  _, label = connected_components(graph, directed=False)
+  _, hole = np.unique(label[rim[:, 0]], return_inverse=True)
+  share = np.bincount(hole)[:, None]
+  middle = np.stack([np.bincount(hole, x) for x in vertices[rim].mean(axis=1).T], axis=1) / share
+  fan = np.column_stack([rim, n + hole])
+  vertices = np.concatenate([vertices, middle])
+  area = np.bincount(hole, np.linalg.norm(normals(vertices, fan), axis=1))
+  whole = np.linalg.norm(normals(vertices, triangles), axis=1).sum()
+  return vertices, np.concatenate([triangles, fan[(area < _MOST_CAP * whole)[hole]]])
+
+
+class Target:
+  """A surface to measure distances to.
+
+  Attributes:
+    vertices: its vertices                       (n, 3)
+    triangles: its triangles                     (m, 3)
+    points: samples about `spacing` apart        (k, 3)
+    triangle: the triangle each sample lies on   (k,)
+  """
+
+  def __init__(self, vertices: np.ndarray, triangles: np.ndarray, spacing: float):
+    from scipy.spatial import KDTree
+
+    self.vertices, self.triangles = vertices, triangles
+    inner, triangle = _thin_out(*_sample(vertices, triangles, spacing), spacing / 2)
+    owner = np.zeros(len(vertices), dtype=np.int64)
+    owner[triangles.ravel()] = np.repeat(np.arange(len(triangles)), 3)
+    used = np.unique(triangles)
+    corner, corner_triangle = _thin_out(vertices[used], owner[used], spacing)
+    self.points = np.concatenate([corner, inner])
+    self.triangle = np.concatenate([corner_triangle, triangle])
+    self._tree = KDTree(self.points)
+
+  def distance(self, points: np.ndarray) -> np.ndarray:
+    """Returns the distance to the nearest sample [m], (n,)."""
+    return self._tree.query(points)[0]
+
+  def closest(self, points: np.ndarray) -> np.ndarray:
+    """Returns the closest points of the surface, (n, 3)."""
+    near = self._tree.query(points, k=min(8, len(self.points)))[1].reshape(len(points), -1)
+    triangle = self.triangle[near]
+    share, squared = _closest_on_triangle(points, self.vertices, self.triangles, triangle)
+    row, best = np.arange(len(points)), squared.argmin(axis=1)
+    corner = self.vertices[self.triangles[triangle[row, best]]]
+    return np.einsum("nk,nkd->nd", share[row, best], corner)
+
+
+def _sample(
+  vertices: np.ndarray, triangles: np.ndarray, spacing: float
+) -> tuple[np.ndarray, np.ndarray]:
+  """Returns points inside the triangles, in rows along their longest edges, and whose they are."""
+  corner = vertices[triangles]
+  length = np.linalg.norm(np.roll(corner, -1, axis=1) - corner, axis=2)
+  turn = (length.argmax(axis=1)[:, None] + np.arange(3)) % 3
+  a, b, c = np.take_along_axis(corner, turn[:, :, None], axis=1).transpose(1, 0, 2)
+  longest = length.max(axis=1)
+  height = np.linalg.norm(np.cross(b - a, c - a), axis=1) / np.maximum(longest, 1e-300)
+  across = np.maximum(np.ceil(height / spacing), 1).astype(np.int64)
+  triangle, row = _ranges(across)
+  up = (row + 0.5) / across[triangle]
+  along = np.maximum(np.ceil((1 - up) * longest[triangle] / spacing), 1).astype(np.int64)
+  line, column = _ranges(along)
+  triangle, s = triangle[line], up[line][:, None]
+  u = ((column + 0.5) / along[line])[:, None]
+  a, b, c = a[triangle], b[triangle], c[triangle]
+  return (1 - s) * (a + u * (b - a)) + s * c, triangle
+
+
+def _ranges(count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+  """Returns i repeated count[i] times for every i, and the numbers 0..count[i]-1 beside it."""
+  owner = np.repeat(np.arange(len(count)), count)
+  return owner, np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)
+
+
+def _thin_out(
+  points: np.ndarray, label: np.ndarray, spacing: float
+) -> tuple[np.ndarray, np.ndarray]:
+  """Returns one point, with its label, of every cell of a grid."""
+  cell = np.floor((points - points.min(axis=0)) / spacing).astype(np.int64)
+  key = (cell[:, 0] << 42) + (cell[:, 1] << 21) + cell[:, 2]
+  _, first = np.unique(key, return_index=True)
+  first = np.sort(first)
+  return points[first], label[first]
+
+
+def _closest_on_triangle(
+  points: np.ndarray, vertices: np.ndarray, triangles: np.ndarray, which: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+  """Returns the closest points of triangles, as shares of the corners, and squared distances.
+
+  Args:
+    points: points to measure from          (n, 3)
+    vertices: vertices of the surface       (v, 3)
+    triangles: triangles of the surface     (m, 3)
+    which: triangles to measure to          (n, k)
+  """
+  a = vertices[triangles[:, 0]]
+  ab, ac = vertices[triangles[:, 1]] - a, vertices[triangles[:, 2]] - a
+  bb, cc, bc = (np.einsum("md,md->m", x, y)[which] for x, y in ((ab, ab), (ac, ac), (ab, ac)))
+  bb, cc = np.maximum(bb, 1e-300), np.maximum(cc, 1e-300)
+  ap = points[:, None] - a[which]
+  pb, pc = (np.einsum("nkd,nkd->nk", x[which], ap) for x in (ab, ac))
+  det = bb * cc - bc**2
+  flat = det < 1e-14 * bb * cc
+  det = np.where(flat, 1.0, det)
+  u, v = (cc * pb - bc * pc) / det, (bb * pc - bc * pb) / det
+  inside = ~flat & (u >= 0) & (v >= 0) & (u + v <= 1)
+  # Otherwise the closest point is on an edge.
+  t = np.clip((pc - pb + bb - bc) / np.maximum(bb + cc - 2 * bc, 1e-300), 0, 1)
+  zero = np.zeros_like(t)
+  edges = [(np.clip(pb / bb, 0, 1), zero), (zero, np.clip(pc / cc, 0, 1)), (1 - t, t)]
+
+  def squared(u, v):
+    return u * u * bb + v * v * cc + 2 * (u * v * bc - u * pb - v * pc)
+
+  best = np.where(inside, squared(u, v), np.inf)
+  u, v = np.where(inside, u, 0.0), np.where(inside, v, 0.0)
+  for eu, ev in edges:
+    other = squared(eu, ev)
+    better = ~inside & (other < best)
+    best = np.where(better, other, best)
+    u, v = np.where(better, eu, u), np.where(better, ev, v)
+  return np.stack([1 - u - v, u, v], axis=2), best + np.einsum("nkd,nkd->nk", ap, ap)
+
+
+@dataclasses.dataclass(frozen=True)
+class Solid:
+  """The closed shape found in a surface.
+
+  Attributes:
+    field: the shape
+    reach: half the width of the widest gap bridged [m]
+    covered: share of the samples that lie on or in the shape
+    pieces: number of separate pieces found, of which the largest is kept
+    exposed: samples of the target that the shape's surface should pass through  (k, 3)
+  """
+
+  field: Field
+  reach: float
+  covered: float
+  pieces: int
+  exposed: np.ndarray
+
+  @property
+  def shell(self) -> float:
+    """How far under the surface the inside starts [m]."""
+    return SHELL * self.field.spacing
+
+
+def solidify(target: Target, spacing: float, reach: float) -> Solid | None:
+  """Returns the shape that air kept `reach` away from the surface leaves; None if it has no inside.
+
+  Args:
+    target: the surface
+    spacing: of the grid [m]
+    reach: distance kept from the surface [m], over half the spacing
+  """
+  from scipy.spatial import KDTree
+
+  origin = target.points.min(axis=0) - reach - 3 * spacing
+  count = np.ceil((target.points.max(axis=0) + reach + 3 * spacing - origin) / spacing) + 1
+  place = np.round((target.points - origin) / spacing).astype(int)
+  empty = np.ones(count.astype(int), dtype=bool)
+  empty[tuple(place.T)] = False
+  distance = _edt(empty) * spacing
+  near = np.argwhere(np.abs(distance - reach) < 2 * spacing)
+  distance[tuple(near.T)] = target.distance(origin + near * spacing)
+  label, _ = _pieces(distance > reach)
+  air = label == label[0, 0, 0]
+  rim = Field(np.where(air | (distance <= reach), distance, 0.0) - reach, origin, spacing)
+  tree = KDTree(rim.surface()[0])
+  value = np.where(air, reach + spacing * _edt(air), reach - spacing * _edt(~air))
+  near = np.argwhere(np.abs(value) < reach + 4 * spacing)
+  away = tree.query(origin + near * spacing)[0]
+  value[tuple(near.T)] = reach + np.where(air[tuple(near.T)], away, -away)
+
+  inside = value < -SHELL * spacing
+  label, pieces = _pieces(inside)
+  if not pieces:
+    return None
+  kept = np.bincount(label.ravel())[1:].argmax() + 1
+  away, nearest = _edt(~inside), _nearest(inside)
+  covered = away[tuple(place.T)] <= 2.5
+  own = label[tuple(nearest[(slice(None), *place.T)])] == kept
+  value[inside & (label != kept)] = spacing
+  field = Field(value, origin, spacing)
+  exposed = covered & own & (field.at(target.points) > -0.5 * reach - spacing)
+  points, _ = _thin_out(target.points[exposed], np.flatnonzero(exposed), spacing / 2)
+  return Solid(field, reach, float(covered.mean()), int(pieces), points)
+
+
+def _pieces(mask: np.ndarray) -> tuple[np.ndarray, int]:
+  """Returns which connected piece of true cells every cell belongs to, and their count."""
+  from scipy.ndimage import label
+
+  numbered, count = label(mask)  # pyright: ignore
+  return numbered, count
+
+
+def _nearest(mask: np.ndarray) -> np.ndarray:
+  """Returns the index of the true cell nearest to every cell, (3, nx, ny, nz)."""
+  from scipy.ndimage import distance_transform_edt
+
+  return np.asarray(distance_transform_edt(~mask, return_distances=False, return_indices=True))
+
+
+def _edt(mask: np.ndarray) -> np.ndarray:
+  """Returns the distance of every true cell to the nearest false one, in cells."""
+  from scipy.ndimage import distance_transform_edt
+
+  return np.asarray(distance_transform_edt(mask))

@@ -1,0 +1,49 @@
+"""Palpate: soft-tissue simulation for MuJoCo.
+
+`import palpate` registers the engine plugin `palpate.organ`; a `<flexcomp>` that declares it in
+MJCF is then a deformable organ in `mujoco.mj_step` and everything that is built on it.
+"""
+
+from __future__ import annotations
+
+import os as _os
+import sys as _sys
+from importlib.util import find_spec as _find_spec
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+  from .organ import Organ
+
+__all__ = ["Organ", "__version__", "register"]
+__version__ = "0.1.0"
+
+
+def register() -> int:
+  """Registers the plugin with MuJoCo, once a process; returns its slot.
+
+  `import palpate` does it, except in the `palpate` command, whose help needs neither MuJoCo nor
+  Warp. From here on Warp speaks of warnings and errors only; `warp.config.log_level` changes it.
+  """
+  from . import engine, organ, quiet
+
+  if "Organ" not in globals():
+    globals()["Organ"] = organ.Organ
+    quiet.lower_log_level()
+  return engine.register()
+
+
+def _is_command() -> bool:
+  """Returns whether this interpreter was started as `palpate` or `python -m palpate`."""
+  program = _os.path.basename(_sys.argv[0]) if _sys.argv else ""
+  if program == "-m":  # the package is being imported to be run
+    words = _sys.orig_argv
+    return words[words.index("-m") + 1] == "palpate" if "-m" in words[:-1] else False
+  return _os.path.splitext(program)[0] in ("palpate", "palpate-script")
+
+
+if not _is_command():
+  register()
+  if _find_spec("gymnasium"):
+    from palpate.tasks import registry as _registry
+
+    _registry.register()

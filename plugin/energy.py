@@ -1,0 +1,103 @@
+"""Elastic energy of a surface in float64: the definition that the kernels' forces are gradients of.
+
+Plain numpy on (nvert, 3) arrays, for reports and as the reference of the tests; nothing here runs
+inside a step.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from . import config as configuration
+from . import mesh as topology
+from .config import Config
+from .mesh import Mesh
+
+
+def membrane(mesh: Mesh, config: Config, u: np.ndarray) -> float:
+  """Returns the St. Venant-Kirchhoff plane stress energy [J].
+
+  Sum over triangles of A t (lambda'/2 (tr E)^2 + mu E : E), E the Green strain.
+
+  Args:
+    mesh: the surface at rest
+    config: material
+    u: displacement from rest [m], (nvert, 3)
+  """
+  a, b, c = mesh.elem.T
+  r1, r2 = mesh.rest[b] - mesh.rest[a], mesh.rest[c] - mesh.rest[a]
+  p1, p2 = u[b] - u[a], u[c] - u[a]
+
+  def dot(x, y):
+    return (x * y).sum(axis=1)
+
+  metric = np.stack([dot(r1, r1), dot(r1, r2), dot(r1, r2), dot(r2, r2)], 1).reshape(-1, 2, 2)
+  e11 = dot(r1, p1) + 0.5 * dot(p1, p1)
+  e22 = dot(r2, p2) + 0.5 * dot(p2, p2)
+  e12 = 0.5 * (dot(r1, p2) + dot(r2, p1) + dot(p1, p2))
+  strain = np.linalg.inv(metric) @ np.stack([e11, e12, e12, e22], 1).reshape(-1, 2, 2)
+  trace = np.trace(strain, axis1=1, axis2=2)
+  square = np.einsum("tij,tji->t", strain, strain)
+  area = 0.5 * np.sqrt(np.linalg.det(metric))
+  lam, mu = configuration.lame(config, mesh.nelem)
+  return float((area * config.thickness * (0.5 * lam * trace**2 + mu * square)).sum())
+
+
+def springs(mesh: Mesh, config: Config, u: np.ndarray) -> float:
+  """Returns the energy of the edge springs k/2 (l - r)^2 [J], thesis eq. 5.1."""
+  i, j = _edges(mesh)
+  rest = np.linalg.norm(mesh.rest[j] - mesh.rest[i], axis=1)
+  x = mesh.rest + u
+  length = np.linalg.norm(x[j] - x[i], axis=1)
+  return float(0.5 * config.stiffness * ((length - rest) ** 2).sum())
+
+
+def _edges(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+  half = np.arange(len(mesh.twin))
+  once = (mesh.twin < 0) | (half < mesh.twin)
+  return mesh.elem.ravel()[once], mesh.elem[:, [1, 2, 0]].ravel()[once]
+
+
+def hinge_angles(mesh: Mesh, hinge: topology.Hinges, u: np.ndarray) -> np.ndarray:
+  """Returns 2 sin(theta / 2) of each hinge, (nhinge,)."""
+  x = mesh.rest + u
+  normal = topology.area_vectors(x, mesh.elem)
+  normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+  left, right = normal[hinge.elem[:, 0]], normal[hinge.elem[:, 1]]
+  edge = x[hinge.vert[:, 1]] - x[hinge.vert[:, 0]]
+  sine = (np.cross(left, right) * edge).sum(1) / np.linalg.norm(edge, axis=1)
+  half_sine = np.sqrt(np.maximum(0.5 - 0.5 * (left * right).sum(1), 0.0))
+  return 2 * np.copysign(half_sine, sine)
+
+
+def bending(mesh: Mesh, config: Config, u: np.ndarray) -> float:
+  """Returns the plate energy of the hinges 1/2 d^T G d [J], d the angles less those at rest."""
+  if config.bend == 0:
+    return 0.0
+  hinge = topology.hinges(mesh, configuration.rigidity(config, mesh.nelem), config.poisson)
+  change = hinge_angles(mesh, hinge, u) - hinge_angles(mesh, hinge, np.zeros_like(u))
+  each = np.where(hinge.of_elem >= 0, change[hinge.of_elem], 0.0)
+  return float(0.5 * np.einsum("ti,tij,tj->", each, hinge.gain, each))
+
+
+def foundation(mesh: Mesh, config: Config, u: np.ndarray) -> float:
+  """Returns the energy of the Winkler foundation, 1/2 foundation area |u|^2 [J]."""
+  area = topology.vertex_areas(mesh.rest, mesh.elem)
+  return float(0.5 * config.foundation * (area[:, None] * u * u).sum())
+
+
+def enclosed(mesh: Mesh, config: Config, u: np.ndarray) -> float:
+  """Returns bulk/2 (V - V0)^2 / V0 - pressure (V - V0) [J]."""
+  if config.bulk == 0 and config.pressure == 0:
+    return 0.0
+  centre = mesh.rest.mean(axis=0)
+  rest = topology.volume(mesh.rest - centre, mesh.elem)
+  change = topology.volume(mesh.rest + u - centre, mesh.elem) - rest
+  return float(0.5 * config.bulk * change**2 / rest - config.pressure * change)
+
+
+def total(mesh: Mesh, config: Config, u: np.ndarray) -> float:
+  """Returns the energy of all terms that are on [J]."""
+  stretch = springs if config.elements == "spring" else membrane
+  terms = (stretch, bending, foundation, enclosed)
+  return sum(term(mesh, config, u) for term in terms)

@@ -1,0 +1,146 @@
+"""Effective inertia: the mass that a contact meets at a node, given to MuJoCo as joint armature."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+
+import mujoco
+import numpy as np
+import warp as wp
+
+from . import mesh as topology
+from . import mjstruct, solver, types
+from .declare import Organ, meeting_geoms
+from .mesh import Mesh
+from .surface import from_slices, to_slices
+from .types import State, Surface
+
+# Loads whose response gives the effective inertia; between them it follows the nodal area.
+_SAMPLES = 24
+_KNOWN = 64
+_time_step: dict[bytes, float] = {}  # digest of an armature of ours -> the time step it is for
+
+
+def set_armature(m, organ: Organ):
+  """Gives the organ's dofs the effective inertia as armature, unless the MJCF gave them one.
+
+  Ours are recognised by their digest, so that they can follow the time step.
+  """
+  armature = mjstruct.view(m.dof_armature, m.nv)
+  dofs = organ.dofs
+  present = armature[dofs]
+  if organ.config.integrator == "explicit":
+    return  # explicit steps are those of the masses
+  h = float(m.opt.timestep)
+  if present.any() and _time_step.get(_digest(present), h) == h:
+    return
+  mass = mjstruct.view(m.body_mass, m.nbody)[organ.body]
+  inertia = of_nodes(m, organ, mass, h, organ.flex)
+  added = np.repeat((inertia - mass)[organ.free], 3)
+  armature[dofs] = added
+  if len(_time_step) >= _KNOWN:
+    _time_step.pop(next(iter(_time_step)))
+  _time_step[_digest(added)] = h
+  # mj_setConst gives the same: M0 has the armature, the inverse weights, which scale the contacts'
+  # softness, are those of the masses alone for such dofs.
+  mjstruct.view(m.dof_M0, m.nv)[dofs] = np.repeat(inertia[organ.free], 3)
+
+
+def of_nodes(m, organ: Organ, mass: np.ndarray, h: float, flex: int) -> np.ndarray:
+  """Returns the effective inertia of every node for the tools that meet `flex` [kg], (nvert,)."""
+  radius = _tool_radius(m, organ, flex)
+  state = types.make_state(organ.surface)
+  padding = np.where(organ.surface.vert.numpy() >= 0, 0.0, 1.0).reshape(1, -1, 8)
+  state.mass.assign(padding)
+  return effective_inertia(organ.surface, state, organ.mesh, mass, organ.free, h, radius)
+
+
+def _digest(values: np.ndarray) -> bytes:
+  return hashlib.sha256(np.ascontiguousarray(values).tobytes()).digest()
+
+
+def _tool_radius(m, organ: Organ, flex: int) -> float:
+  """Returns the radius of the largest contact patch to expect [m]: that of the thickest tool.
+
+  Planes and height fields touch all there is; a patch of a quarter of the organ stands for them.
+  """
+  colliding = meeting_geoms(m, flex)
+  limit = 0.25 * float(np.ptp(organ.mesh.rest, axis=0).max())
+  kind = mjstruct.view(m.geom_type, m.ngeom, np.int32)
+  size = mjstruct.view(m.geom_size, (m.ngeom, 3))
+  geom = mujoco.mjtGeom
+  radius = 0.0
+  for g in colliding:
+    if kind[g] in (geom.mjGEOM_SPHERE, geom.mjGEOM_CAPSULE, geom.mjGEOM_CYLINDER):
+      own = size[g, 0]
+    elif kind[g] in (geom.mjGEOM_BOX, geom.mjGEOM_ELLIPSOID, geom.mjGEOM_MESH):
+      own = np.sort(size[g])[1]
+    else:
+      own = limit
+    radius = max(radius, float(own))
+  return min(radius, limit)
+
+
+def effective_inertia(
+  s: Surface, d: State, mesh: Mesh, mass: np.ndarray, free: np.ndarray, h: float, radius: float
+) -> np.ndarray:
+  """Returns the inertia that a contact meets at each node at rest [kg], (nvert,).
+
+  That of node i is 1 / sum_j n^T (A^-1)_ij n over the nodes j within a contact patch. The row sum
+  keeps the spectral radius of Mhat (A^-1 on the contact nodes) at or under 1; the iteration on the
+  contact force is stable up to 2. Evenly spread nodes are solved for; others follow the nearest of
+  them in proportion to their area.
+
+  Args:
+    s: the organ
+    d: a state of one world, overwritten
+    mesh: its mesh
+    mass: nodal masses [kg], (nvert,)
+    free: nodes that move, (nvert,) bool
+    h: time step [s]
+    radius: radius of the contact patch [m]; 0 for the node alone
+  """
+  # A per cent is enough: the iteration it serves has a margin of two.
+  s = dataclasses.replace(s, tolerance=1e-2, newton=1)
+  normal = topology.vertex_normals(mesh.rest, mesh.elem)
+  area = topology.vertex_areas(mesh.rest, mesh.elem)
+  sample = _spread(mesh.rest, np.flatnonzero(free), _SAMPLES)
+  vert = np.asarray(s.vert.numpy(), np.int64)
+  real = np.flatnonzero(vert >= 0)
+
+  def put(array: wp.array, values: np.ndarray):
+    full = np.zeros((s.nnode, *values.shape[1:]))
+    full[real] = values[vert[real]]
+    array.assign(to_slices(full.astype(np.float32))[None])
+
+  for array in (d.pos, d.vel, d.dvel_warm):
+    array.zero_()
+  put(d.mass, mass)
+  floor = 0.0
+  d.step.assign(np.array([[h, h * h + h * s.damping, floor, 0]], np.float32))
+  response = np.zeros(len(sample))
+  for k, i in enumerate(sample):
+    patch = free & (((mesh.rest - mesh.rest[i]) ** 2).sum(axis=1) <= radius**2)
+    patch[i] = True
+    put(d.force_ext, np.where(patch[:, None], normal[i] / h, 0.0))
+    solver.step(s, d)
+    dvel = from_slices(np.asarray(d.dvel.numpy()[0]))[int(s.node.numpy()[i])]
+    response[k] = dvel @ normal[i]
+  # Per area, so that finer parts of the surface get less.
+  specific = 1 / np.maximum(response, 1e-300) / area[sample]
+  distance2 = ((mesh.rest[:, None] - mesh.rest[sample]) ** 2).sum(axis=2)
+  nearest = np.argsort(distance2, axis=1)[:, :3]
+  weight = 1 / (np.take_along_axis(distance2, nearest, axis=1) + 1e-12 * distance2.max() + 1e-300)
+  weight /= weight.sum(axis=1, keepdims=True)
+  return np.maximum(area * (weight * specific[nearest]).sum(axis=1), mass)
+
+
+def _spread(rest: np.ndarray, candidates: np.ndarray, count: int) -> np.ndarray:
+  """Returns up to `count` of the candidates, each farthest from those before (Gonzalez 1985)."""
+  chosen = [int(candidates[0])]
+  distance2 = ((rest[candidates] - rest[chosen[0]]) ** 2).sum(axis=1)
+  while len(chosen) < min(count, len(candidates)):
+    chosen.append(int(candidates[np.argmax(distance2)]))
+    distance2 = np.minimum(distance2, ((rest[candidates] - rest[chosen[-1]]) ** 2).sum(axis=1))
+  return np.array(chosen)

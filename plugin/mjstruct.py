@@ -1,0 +1,124 @@
+"""ctypes views of mjModel and mjData that follow the installed MuJoCo.
+
+MuJoCo's own introspection data gives the declarations, so that no layout is written down here.
+`check` compares the result with the addresses the bindings report, once, before anything is run.
+"""
+
+from __future__ import annotations
+
+import ctypes as C
+import functools
+import importlib.metadata
+import math
+import pathlib
+from typing import Any, cast
+
+import mujoco
+import numpy as np
+from mujoco.introspect import ast_nodes, structs
+
+_SCALAR = {
+  "mjtNum": C.c_double,
+  "double": C.c_double,
+  "float": C.c_float,
+  "int": C.c_int,
+  "char": C.c_char,
+  "mjtByte": C.c_ubyte,
+  "mjtBool": C.c_bool,
+  "mjtSize": C.c_int64,
+  "uint64_t": C.c_uint64,
+  "uintptr_t": C.c_size_t,
+  "size_t": C.c_size_t,
+  "unsigned int": C.c_uint,
+  "unsigned char": C.c_ubyte,
+}
+
+
+def _ctype(declared) -> type:
+  if isinstance(declared, ast_nodes.PointerType):
+    return C.c_void_p
+  if isinstance(declared, ast_nodes.ArrayType):
+    out: Any = _ctype(declared.inner_type)
+    for extent in reversed(declared.extents):
+      out = out * extent
+    return out
+  if not hasattr(declared, "name"):  # anonymous struct
+    fields = [(f.name, _ctype(f.type)) for f in declared.fields]
+    return type("anonymous", (C.Structure,), {"_fields_": fields})
+  name = declared.name.removeprefix("struct ")
+  if name in _SCALAR:
+    return _SCALAR[name]
+  return C.c_int if name.startswith("mjt") else _struct(name)
+
+
+@functools.cache
+def _struct(name: str) -> type[C.Structure]:
+  known = structs.STRUCTS
+  declared = known.get(name) or known.get(name + "_") or known[name.rstrip("_")]
+  fields = [(f.name, _ctype(f.type)) for f in declared.fields]
+  return type(declared.name, (C.Structure,), {"_fields_": fields})
+
+
+Model = _struct("mjModel")
+Data = _struct("mjData")
+
+
+@functools.cache
+def library() -> C.CDLL:
+  """Returns MuJoCo's shared library, the same that the Python bindings use."""
+  folder = pathlib.Path(mujoco.__file__).parent
+  names = ("libmujoco.so*", "libmujoco*.dylib", "mujoco.dll")
+  found = sorted(path for name in names for path in folder.glob(name))
+  if not found:
+    raise ImportError(f"palpate: no MuJoCo library (libmujoco) in {folder}")
+  lib = C.CDLL(str(found[0]))
+  lib.mj_getPluginConfig.restype = C.c_char_p
+  lib.mj_getPluginConfig.argtypes = [C.c_void_p, C.c_int, C.c_char_p]
+  lib.mj_fwdPosition.argtypes = [C.c_void_p, C.c_void_p]
+  lib.mju_warning.argtypes = [C.c_char_p, C.c_char_p]
+  lib.mjp_registerPlugin.argtypes = [C.c_void_p]
+  lib.mjp_defaultPlugin.argtypes = [C.c_void_p]
+  return lib
+
+
+def view(address: int | None, shape, dtype: type = np.float64) -> np.ndarray:
+  """Returns the array of `shape` that starts at `address`, without a copy."""
+  sizes: tuple[int, ...] = tuple(int(n) for n in np.atleast_1d(shape))
+  if not address or 0 in sizes:
+    return np.zeros(sizes, dtype)
+  size = math.prod(sizes) * np.dtype(dtype).itemsize
+  buffer: Any = (C.c_char * size).from_address(address)
+  return np.frombuffer(buffer, dtype).reshape(sizes)
+
+
+def config(model: int, instance: int, key: str) -> str:
+  """Returns a plugin instance's configuration value, empty where it is not set."""
+  value = library().mj_getPluginConfig(model, instance, key.encode())
+  return value.decode() if value else ""
+
+
+def name_of(m: C.Structure, addresses: int | None, index: int) -> str:
+  """Returns the name that starts at `m.names[addresses[index]]`."""
+  start = int(view(addresses, index + 1, np.int32)[index])
+  return C.string_at(m.names + start).decode()  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def check():
+  """Raises ImportError where the layouts disagree with the bindings' own arrays."""
+  m = mujoco.MjModel.from_xml_string(
+    "<mujoco><worldbody><body><freejoint/><geom size='1'/></body></worldbody></mujoco>"
+  )
+  d = mujoco.MjData(m)
+  for owner, struct in ((m, Model), (d, Data)):
+    raw = struct.from_address(owner._address)
+    for field, ctype in cast(list[tuple[str, type]], struct._fields_):
+      array = getattr(owner, field, None)
+      # Empty and unallocated arena arrays have placeholder addresses in the bindings.
+      if ctype is not C.c_void_p or not isinstance(array, np.ndarray) or array.size == 0:
+        continue
+      if getattr(raw, field) and array.__array_interface__["data"][0] != getattr(raw, field):
+        version = importlib.metadata.version("mujoco")
+        raise ImportError(
+          f"palpate: {struct.__name__}.{field} of mujoco {version} is not where its introspection "
+          "data says; install a version that palpate was run with (3.17)"
+        )

@@ -1,0 +1,242 @@
+"""`Organ`: the user's handle on one organ of a model."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from . import energy, engine, workspace
+from . import mesh as topology
+from .config import Config
+
+
+class Organ:
+  """Positions, forces and measures of an organ, in world coordinates and SI units.
+
+  Reading is cheap and changes nothing; every property is computed when it is asked for.
+
+  Args:
+    model: the compiled model
+    data: its data
+    name: name of the flexcomp
+
+  Raises:
+    ValueError: the model has no organ of that name; the message lists those it has.
+  """
+
+  def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, name: str):
+    organs = {}
+    for flex in range(model.nflex):
+      instance = _instance(model, flex)
+      if instance is not None:
+        organs[mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_FLEX, flex) or ""] = instance
+    if name not in organs:
+      have = ", ".join(repr(key) for key in organs) or "none"
+      raise ValueError(f"no organ {name!r} in the model, it has {have}")
+    self.model = model
+    self.data = data
+    self.name = name
+    self._instance = organs[name]
+    self._space = engine.find(data._address, self._instance)
+    self._organ = self._space.organ
+    organ = self._organ
+    moving = np.flatnonzero(organ.free)
+    self._moving = moving
+    self._qpos = organ.qposs.reshape(-1, 3)
+    self._dofs = organ.dofs.reshape(-1, 3)
+    start = int(model.plugin_stateadr[self._instance])
+    self._plugin_state = slice(start, start + int(model.plugin_statenum[self._instance]))
+
+  @property
+  def config(self) -> Config:
+    """The configuration in force."""
+    return self._space.config
+
+  def configure(self, **keys):
+    """Changes configuration keys for this mjData while running, for example `tolerance=1e-5`.
+
+    `integrator`, `iterations`, `tolerance`, `newton`, `damping`, `foundation`, `bulk` and
+    `pressure` may change. The dofs' armature stays that of the compiled configuration.
+
+    Raises:
+      ValueError: a key may not change, or its value is not allowed.
+    """
+    texts = {key: str(value) for key, value in keys.items()}
+    workspace.configure(self._space, self._instance, texts)
+
+  @property
+  def integrator(self) -> str:
+    """Time stepping scheme: `implicit`, `neumann` or `explicit`; may be set while running."""
+    return self._space.config.integrator
+
+  @integrator.setter
+  def integrator(self, name: str):
+    self.configure(integrator=name)
+
+  @property
+  def nvert(self) -> int:
+    """Number of vertices."""
+    return self._organ.mesh.nvert
+
+  @property
+  def elem(self) -> np.ndarray:
+    """Triangles, counter-clockwise from outside, (nelem, 3)."""
+    return self._organ.mesh.elem
+
+  @property
+  def free(self) -> np.ndarray:
+    """Whether a vertex moves, (nvert,) bool; the others are pinned."""
+    return self._organ.free
+
+  @property
+  def xpos0(self) -> np.ndarray:
+    """Rest positions [m], (nvert, 3)."""
+    return self._organ.origin + self._organ.mesh.rest @ self._organ.frame.T
+
+  @property
+  def displacement(self) -> np.ndarray:
+    """Displacement from rest [m], in the frame of the parent body, (nvert, 3)."""
+    if self._organ.windows:
+      return self._own_state(0).copy()
+    u = np.zeros((self.nvert, 3))
+    u[self._moving] = self.data.qpos[self._qpos] - self.model.qpos0[self._qpos]
+    return u
+
+  @property
+  def xpos(self) -> np.ndarray:
+    """Positions [m], (nvert, 3)."""
+    return self.xpos0 + self.displacement @ self._organ.frame.T
+
+  @property
+  def xvel(self) -> np.ndarray:
+    """Velocities [m/s], (nvert, 3)."""
+    if self._organ.windows:
+      return self._own_state(1) @ self._organ.frame.T
+    return self._to_world(self.data.qvel)
+
+  @property
+  def contact_force(self) -> np.ndarray:
+    """Constraint force on each vertex in the last step [N], (nvert, 3): contacts and equalities."""
+    if self._organ.windows:
+      out = np.zeros((self.nvert, 3))
+      node = self._space.views["placed"].numpy()
+      used = node >= 0
+      start = 9 * self.nvert
+      force = self.data.plugin_state[self._plugin_state][start : start + 3 * len(node)]
+      out[node[used]] = force.reshape(-1, 3)[used] @ self._organ.frame.T
+      return out
+    return self._to_world(self.data.qfrc_constraint)
+
+  @property
+  def window_overflow(self) -> tuple[int, int]:
+    """Touched nodes and triangles that the windows had no room for in the last step."""
+    return int(self._space.flags[2]), int(self._space.flags[3])
+
+  @property
+  def force(self) -> np.ndarray:
+    """Sum of `contact_force` [N], (3,)."""
+    return self.contact_force.sum(axis=0)
+
+  @property
+  def energy(self) -> float:
+    """Elastic energy [J]: membrane or springs, bending, foundation, volume and pressure."""
+    return energy.total(self._organ.mesh, self._space.config, self.displacement)
+
+  @property
+  def volume(self) -> float:
+    """Enclosed volume [m^3]; NaN for an open surface."""
+    if not self._organ.mesh.closed:
+      return float("nan")
+    return topology.volume(self._organ.mesh.rest + self.displacement, self.elem)
+
+  @property
+  def iterations(self) -> int:
+    """PCG iterations of the last step."""
+    return int(self._space.status[0])
+
+  @property
+  def residual(self) -> float:
+    """Relative residual of the last step's solve [-]."""
+    return float(self._space.status[1])
+
+  @property
+  def error(self) -> str | None:
+    """What went wrong while running since the last reset, or None."""
+    return self._space.error
+
+  @property
+  def device(self) -> str:
+    """Device the organ is solved on."""
+    return self._organ.surface.device.alias
+
+  def set_state(self, xpos: np.ndarray | None = None, xvel: np.ndarray | None = None):
+    """Places the organ; pinned vertices stay, and forces of the past are forgotten.
+
+    Args:
+      xpos: positions [m], (nvert, 3); None leaves them
+      xvel: velocities [m/s], (nvert, 3); None leaves them
+
+    Raises:
+      ValueError: an array has the wrong shape or holds a number that is not finite.
+    """
+    frame = self._organ.frame
+    xpos = None if xpos is None else self._checked("xpos", xpos)
+    xvel = None if xvel is None else self._checked("xvel", xvel)
+    if self._organ.windows:
+      self._set_own_state(xpos, xvel)
+      return
+    if xpos is not None:
+      u = (xpos - self.xpos0) @ frame
+      self.data.qpos[self._qpos] = self.model.qpos0[self._qpos] + u[self._moving]
+    if xvel is not None:
+      self.data.qvel[self._dofs] = (xvel @ frame)[self._moving]
+    self.data.plugin_state[self._plugin_state] = 0
+    self._space.error = None
+
+  def _set_own_state(self, xpos: np.ndarray | None, xvel: np.ndarray | None):
+    u, v = self.displacement, self._own_state(1).copy()
+    if xpos is not None:
+      u[self._moving] = ((xpos - self.xpos0) @ self._organ.frame)[self._moving]
+    if xvel is not None:
+      v[self._moving] = (xvel @ self._organ.frame)[self._moving]
+    state = self.data.plugin_state[self._plugin_state]
+    state[:] = 0
+    self._own_state(0)[:], self._own_state(1)[:] = u, v
+    self._space.error = None
+    workspace.place(self._space)
+
+  def reset(self):
+    """Puts the organ at rest; the rest of the model stays as it is."""
+    self.set_state(self.xpos0, np.zeros((self.nvert, 3)))
+
+  def _checked(self, what: str, values: np.ndarray) -> np.ndarray:
+    array = np.asarray(values, dtype=np.float64)
+    if array.shape != (self.nvert, 3):
+      raise ValueError(
+        f"organ {self.name!r}: {what} has shape {array.shape}, expected ({self.nvert}, 3)"
+      )
+    if not np.isfinite(array).all():
+      raise ValueError(f"organ {self.name!r}: {what} holds numbers that are not finite")
+    return array
+
+  def _own_state(self, k: int) -> np.ndarray:
+    """Returns the displacement (0) or velocity (1) in the plugin state of a windowed organ."""
+    size = 3 * self.nvert
+    return self.data.plugin_state[self._plugin_state][k * size : (k + 1) * size].reshape(-1, 3)
+
+  def _to_world(self, generalized: np.ndarray) -> np.ndarray:
+    out = np.zeros((self.nvert, 3))
+    out[self._moving] = generalized[self._dofs] @ self._organ.frame.T
+    return out
+
+
+def _instance(model: mujoco.MjModel, flex: int) -> int | None:
+  """Returns the palpate plugin instance of a flex, or None."""
+  start, num = model.flex_vertadr[flex], model.flex_vertnum[flex]
+  bodies = np.unique(model.flex_vertbodyid[start : start + num])
+  if not model.flex_rigid[flex]:  # a windowed organ is rigid
+    bodies = bodies[model.body_jntnum[bodies] > 0]  # parents of pinned vertices are marked too
+  owner = model.body_plugin[bodies]
+  slot = engine.register()
+  mine = [int(i) for i in np.unique(owner[owner >= 0]) if model.plugin[i] == slot]
+  return mine[0] if mine else None

@@ -1,0 +1,147 @@
+"""One source for both devices: native element code over slices of eight nodes.
+
+Nodes are stored in slices of `LANES`: an array of vectors is (nworld, nslice, 3, 8), so that one
+slice is a SIMD register on the CPU and eight neighbouring threads on CUDA, and the three components
+of a node lie within two cache lines. In native code `V` is a vector of eight floats on the CPU and
+one float on CUDA; `LD`, `ST` and `GATHER` hide the difference. Irregular lists (the neighbours of a
+node) are sliced ELLPACK: row `k` of slice `s` holds the k-th entry of its eight nodes
+(Kreutzer et al. 2014, SELL-C-sigma, doi:10.1137/130930352).
+"""
+
+LANES = 8
+
+_PRELUDE = """
+#ifndef PALPATE_SIMD
+#define PALPATE_SIMD
+#if defined(__CUDA_ARCH__) || defined(__CUDACC_RTC__)
+  #define SIMD_TYPES typedef float V; typedef float VU;
+  #define LD(p, r) ((p)[8 * (r) + lane])
+  #define ST(p, r, v) ((p)[8 * (r) + lane] = (v))
+  #define GATHER(p, o, c) ((p)[(o)[lane] + 8 * (c)])
+  #define SQRT(a) sqrtf(a)
+  #define MAX(a, b) fmaxf(a, b)
+  #define MIN(a, b) fminf(a, b)
+  #define SPLAT(a) (a)
+  #define HSUM(a) (a)
+  #define SELECT(c, a, b) ((c) ? (a) : (b))
+  #define FOR_SLICES(s) for (int s = tid >> 3; s < nslice; s += nthread >> 3)
+#else
+  #define SIMD_TYPES \\
+    typedef float V __attribute__((ext_vector_type(8))); \\
+    typedef float VU __attribute__((ext_vector_type(8), aligned(4)));
+  #define LD(p, r) ((V) * (const VU*)((p) + 8 * (r)))
+  #define ST(p, r, v) (*(VU*)((p) + 8 * (r)) = (VU)(v))
+  #define AT(p, o, c, l) (p)[(o)[l] + 8 * (c)]
+  #define GATHER(p, o, c) (V){AT(p, o, c, 0), AT(p, o, c, 1), AT(p, o, c, 2), AT(p, o, c, 3), \\
+    AT(p, o, c, 4), AT(p, o, c, 5), AT(p, o, c, 6), AT(p, o, c, 7)}
+  #define SQRT(a) __builtin_elementwise_sqrt(a)
+  #define MAX(a, b) __builtin_elementwise_max(a, b)
+  #define MIN(a, b) __builtin_elementwise_min(a, b)
+  #define SPLAT(a) ((V)(a))
+  #define HSUM(a) (((a)[0] + (a)[4]) + ((a)[1] + (a)[5]) + (((a)[2] + (a)[6]) + ((a)[3] + (a)[7])))
+  #define SELECT(c, a, b) ((c) ? (a) : (b))
+  #define FOR_SLICES(s) for (int s = 0; s < nslice; ++s)
+#endif
+#endif
+"""
+
+# Sums over all nodes of a world, the same value in every thread, and barriers. On CUDA a world is a
+# group of `nthread` threads in whole blocks that are all resident; blocks meet at a counter that is
+# zero before the launch. The order of summation is fixed, so that runs repeat to the bit.
+_GROUP = """
+#if defined(__CUDA_ARCH__) || defined(__CUDACC_RTC__)
+  __shared__ float red[33];
+  const int lane = tid & 7, thread = threadIdx.x, nwarp = blockDim.x >> 5;
+  const int nblock = nthread / blockDim.x, block_ = tid / blockDim.x;
+  volatile float* partial = partial_.data + 2 * MAXBLOCK * (size_t)world;
+  int* counter = counter_.data + world;
+  int phase = 0;
+  auto group_sum = [&](float v) -> float {
+    for (int o = 16; o > 0; o >>= 1) v += __shfl_xor_sync(0xffffffffu, v, o);
+    if ((thread & 31) == 0) red[thread >> 5] = v;
+    __syncthreads();
+    if (thread == 0) {
+      float t = 0.0f;
+      for (int w = 0; w < nwarp; ++w) t += red[w];
+      red[32] = t;
+      if (nblock > 1) {
+        partial[(phase & 1) * MAXBLOCK + block_] = t;
+        __threadfence();
+        atomicAdd(counter, 1);
+        while (*(volatile int*)counter < nblock * (phase + 1)) {}
+        __threadfence();
+      }
+    }
+    __syncthreads();
+    if (nblock > 1 && thread < 32) {
+      float t = 0.0f;
+      for (int b = thread; b < nblock; b += 32) t += partial[(phase & 1) * MAXBLOCK + b];
+      for (int o = 16; o > 0; o >>= 1) t += __shfl_xor_sync(0xffffffffu, t, o);
+      if (thread == 0) red[32] = t;
+    }
+    __syncthreads();
+    const float total_ = red[32];
+    __syncthreads();
+    ++phase;
+    return total_;
+  };
+  #define GROUP_SYNC() group_sum(0.0f)
+#else
+  const int lane = 0, thread = 0;
+  auto group_sum = [&](V v) -> float { return HSUM(v); };
+  #define GROUP_SYNC()
+#endif
+"""
+MAX_BLOCKS = 256
+BLOCK = 512
+
+
+def group(body: str) -> str:
+  """Returns native code in which all threads of a world work on `body` together.
+
+  Arguments: `world`, `tid`, `nthread`, `nslice`, `partial_` (nworld, 2, MAX_BLOCKS) and `counter_`
+  (nworld,) zeroed before the launch. On the CPU there is one thread.
+  """
+  return function(_GROUP.replace("MAXBLOCK", str(MAX_BLOCKS)) + body)
+
+
+def function(body: str) -> str:
+  """Returns native code that starts with the SIMD types; contraction to FMA is allowed."""
+  return f"""{_PRELUDE}
+{{
+#if !defined(__CUDA_ARCH__) && !defined(__CUDACC_RTC__)
+#pragma clang fp contract(fast) reassociate(on)
+#endif
+SIMD_TYPES
+{body}
+}}"""
+
+
+def slices(body: str) -> str:
+  """Returns native code that runs `body` for each slice `s`; arguments: `tid`, `nslice`.
+
+  On the CPU one thread does all slices; on CUDA thread `tid` does lane `tid % 8` of its slice.
+  """
+  return function(f"""
+#if defined(__CUDA_ARCH__) || defined(__CUDACC_RTC__)
+  const int s = tid >> 3, lane = tid & 7;
+  if (s >= nslice) return;
+  {{ {body} }}
+#else
+  for (int s = 0; s < nslice; ++s) {{ {body} }}
+#endif
+""")
+
+
+def group_size(device, nslice: int, nworld: int) -> int:
+  """Returns the threads of a world for code made by `group`, to launch in blocks of `BLOCK`."""
+  if not device.is_cuda:
+    return 1
+  # Blocks of one world wait for each other, so all of them must be resident: one a multiprocessor.
+  most = max(1, min(device.sm_count // nworld, MAX_BLOCKS))
+  return BLOCK * max(1, min(most, -(-nslice * LANES // BLOCK)))
+
+
+def threads(device, nslice: int) -> int:
+  """Returns the launch dimension for `nslice` slices: one thread on the CPU, one a lane on CUDA."""
+  return nslice * LANES if device.is_cuda else 1

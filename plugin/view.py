@@ -1,0 +1,37 @@
+"""`palpate view`: MuJoCo's viewer on a scene, the instruments' handles draggable."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+
+from . import register
+from .console import CommandError
+
+
+def add_arguments(parser: argparse.ArgumentParser):
+  """Declares the options."""
+  from . import scenes
+
+  parser.epilog = (
+    "Double-click the yellow ball at an instrument's tip, then hold Ctrl and drag with the right "
+    "button: the tip follows. Space pauses, Backspace starts anew, [ and ] change the camera."
+  )
+  scenes.add_arguments(parser)
+
+
+def main(args: argparse.Namespace) -> int:
+  """Runs the job and returns its exit code."""
+  if sys.platform.startswith("linux") and not (
+    os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+  ):
+    raise CommandError("no display to open a window on; `palpate render` makes pictures", code=1)
+  register()
+  from . import scenes
+
+  model, data = scenes.load(args, handle=True)
+  import mujoco.viewer
+
+  mujoco.viewer.launch(model, data)
+  return 0

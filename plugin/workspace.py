@@ -1,0 +1,234 @@
+"""Everything one organ needs in one mjData: state, views of MuJoCo's arrays, recorded graphs."""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+import weakref
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from . import config as configuration
+from . import (
+  coupling,
+  declare,
+  elastic,
+  inertia,
+  mjstruct,
+  schemes,
+  solver,
+  types,
+  window,
+  window_kernels,
+)
+from .config import Config
+from .declare import Organ
+from .types import State, Surface
+
+_lock = threading.RLock()
+
+
+@dataclasses.dataclass
+class Workspace:
+  """One organ in one mjData.
+
+  Attributes:
+    organ: constants
+    config: configuration in force, which may differ from the compiled one
+    surface: constants on the device with the numbers of `config`
+    state: solver state on the organ's device
+    host: the arrays of `state` that MuJoCo's side reads and writes, on the CPU
+    ext: external and lagged contact force in float64 [N]  (3 nnode,)
+    model: address of the mjModel the views are of
+    data: address of the mjData
+    before, solve, after: recorded graphs of a step's forces
+    advance: recorded graph of the plugin state's step
+    place: recorded graph that puts the windows where the plugin state says, or None
+    flags: what the windows report: slots the model lacks, -, nodes touched beyond the window's
+      size, triangles beyond it  (4,)
+    status: iterations, relative residual, norm, failure  (4,)
+    error: what went wrong since the last reset, or None
+    warning: last index and count of each of MuJoCo's warnings (nwarning, 2)
+    nbad: MuJoCo's warnings of bad states that were looked at since the last reset
+    time_step: time step that the armature is for [s]
+    views: what the graphs point at, kept alive
+  """
+
+  organ: Organ
+  config: Config
+  surface: Surface
+  state: State
+  host: dict[str, wp.array]
+  ext: wp.array
+  data: int
+  model: int = 0
+  before: Any = None
+  solve: Any = None
+  after: Any = None
+  advance: Any = None
+  place: Any = None
+  flags: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(4, np.int32))
+  status: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(4, np.float32))
+  error: str | None = None
+  warning: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 2), np.int32))
+  nbad: int = 0
+  time_step: float = 0.0
+  views: dict = dataclasses.field(default_factory=dict)
+
+  def run(self):
+    """Computes the step's forces and adds them to qfrc_passive."""
+    wp.capture_launch(self.before)
+    if self.place is not None and (not self._owns_model() or self.flags[0]):
+      # The model's windows are not those of this state, which was set from outside or shares the
+      # model with another: contacts must be found again with the windows in place.
+      wp.capture_launch(self.place)
+      mjstruct.library().mj_fwdPosition(self.model, self.data)
+      wp.capture_launch(self.before)
+    wp.capture_launch(self.solve)
+    if self.surface.device.is_cuda:
+      wp.synchronize_device(self.surface.device)
+    wp.capture_launch(self.after)
+
+
+  def _owns_model(self) -> bool:
+    """Returns whether the model's windows were last placed here, and makes it so.
+
+    Raises:
+      RuntimeError: two threads step the same model.
+    """
+    before = _owner.get(self.model)
+    mine = weakref.ref(self)
+    _owner[self.model] = (mine, threading.get_ident())
+    if before is None or before[0]() is self:
+      return before is not None
+    if before[0]() is not None and before[1] != threading.get_ident():
+      raise RuntimeError(
+        "two threads step one mjModel, which holds the windows; give each thread its own model "
+        "(copy.copy(model))"
+      )
+    return False
+
+
+# By address of the mjModel: whose windows it holds, and the thread that placed them.
+_owner: dict[int, tuple[Any, int]] = {}
+
+
+def place(w: Workspace):
+  """Puts the windows where the plugin state says."""
+  wp.capture_launch(w.place)
+  _owner[w.model] = (weakref.ref(w), threading.get_ident())
+
+
+def state_size(model: int, instance: int) -> int:
+  """Returns the length of the plugin state.
+
+  Contact force and last dv of each moving vertex, or what `window` says.
+  """
+  m = mjstruct.Model.from_address(model)
+  if mjstruct.config(model, instance, "window"):
+    # Asked before MuJoCo has filled in the flexes: 9 nvert + 4 nslot is at most this.
+    return 9 * m.nflexvert
+  return 6 * len(declare.moving_bodies(m, instance))
+
+
+def make(model: int, data: int, instance: int) -> Workspace:
+  """Returns the workspace of an organ in a fresh mjData; gives the model an armature if needed."""
+  organ = declare.read(model, instance)
+  m = mjstruct.Model.from_address(model)
+  with _lock:
+    s = organ.surface
+    state = types.make_state(s)
+    host = {}
+    crossing = ("step", "pos", "vel", "mass", "force_ext", "dvel_warm", "dvel", "status")
+    for field in crossing:
+      array = getattr(state, field)
+      if s.device.is_cuda:
+        array = wp.zeros(array.shape, dtype=float, device="cpu", pinned=True)
+      host[field] = array
+    size = organ.windows.nslot if organ.windows else s.nnode
+    ext = wp.zeros(3 * size, dtype=wp.float64, device="cpu")
+    w = Workspace(organ, organ.config, s, state, host, ext, data)
+    w.status = host["status"].numpy()[0]
+    offset, count = mjstruct.Data.warning.offset, len(mjstruct.Data.from_address(data).warning)
+    w.warning = mjstruct.view(data + offset, (count, 2), np.int32)
+    if organ.windows is None:
+      inertia.set_armature(m, organ)
+    # Padding nodes have a mass so that nothing divides by zero.
+    mass = np.where(s.vert.numpy() >= 0, 0.0, 1.0).reshape(1, -1, 8)
+    host["mass"].assign(mass)
+    bind(w, model, instance)
+    if w.place is not None:
+      window.settle(w, model)
+    return w
+
+
+def bind(w: Workspace, model: int, instance: int):
+  """Points the graphs at the arrays of `model` and of the workspace's mjData and records them."""
+  m = mjstruct.Model.from_address(model)
+  device, cpu = w.surface.device, wp.get_device("cpu")
+  side = window if w.organ.windows else coupling
+  with _lock:
+    load(device)
+    launches = side.launches(w, model, instance)
+    solve = _on_device if device.is_cuda else _on_cpu
+    w.before = _record(cpu, launches.gather)
+    w.solve = _record(device, lambda: solve(w))
+    w.after = _record(cpu, launches.scatter)
+    w.advance = _record(cpu, launches.advance)
+    w.place = _record(cpu, launches.place) if launches.place else None
+  w.model = model
+  w.time_step = float(m.opt.timestep)
+
+
+def _on_cpu(w: Workspace):
+  schemes.step(w.surface, w.state, w.config.integrator)
+
+
+def _on_device(w: Workspace):
+  for field in ("step", "pos", "vel", "mass", "force_ext", "dvel_warm"):
+    wp.copy(getattr(w.state, field), w.host[field])
+  schemes.step(w.surface, w.state, w.config.integrator)
+  wp.copy(w.host["dvel"], w.state.dvel)
+  wp.copy(w.host["status"], w.state.status)
+
+
+def _record(device, work) -> Any:
+  with wp.ScopedDevice(device), wp.ScopedCapture(device=device) as capture:
+    work()
+  return capture.graph
+
+
+def load(device):
+  """Loads the modules of a step on a device, compiling them where the cache has none."""
+  for module in (elastic, solver, schemes, coupling, window_kernels):
+    wp.load_module(module.__name__, device=device)
+    wp.load_module(module.__name__, device="cpu")
+
+
+def configure(w: Workspace, instance: int, texts: dict[str, str]):
+  """Changes configuration keys while running and records the step anew.
+
+  Raises:
+    ValueError: a key may not change, or its value is not allowed.
+  """
+  w.config = configuration.change(w.organ.name, w.config, texts, w.organ.mesh.closed)
+  numbers = ("iterations", "tolerance", "newton", "damping", "foundation", "bulk", "pressure")
+  w.surface = dataclasses.replace(w.surface, **{k: getattr(w.config, k) for k in numbers})
+  # Terms that were off have no arrays yet.
+  fresh = types.make_state(w.surface)
+  if fresh.areavec.shape != w.state.areavec.shape:
+    w.state.areavec = fresh.areavec
+  bind(w, w.model, instance)
+
+
+def refresh(w: Workspace):
+  """Renews the armature after the time step was changed; see `inertia`."""
+  m = mjstruct.Model.from_address(w.model)
+  with _lock:
+    if w.organ.windows is None:
+      inertia.set_armature(m, w.organ)
+    else:
+      window.set_inertia(w, m)
+    w.time_step = float(m.opt.timestep)

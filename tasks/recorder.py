@@ -1,0 +1,237 @@
+"""Records an exercise step by step; see `recording` for what comes out."""
+
+import json
+import math
+import os
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from .recording import (
+  COLUMNS,
+  Event,
+  Recording,
+  Settings,
+  check_array,
+  check_constant,
+  check_event,
+  check_watch,
+)
+from .score import Metrics
+
+__all__ = ["Event", "Recorder", "Recording", "Settings"]
+
+_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*")
+
+
+class _Buffer:
+  """An array that grows by doubling."""
+
+  def __init__(self, shape: tuple[int, ...], dtype: np.dtype, past: int):
+    self.shape = shape
+    self.values = np.empty((max(256, 2 * past), *shape), dtype)
+    if past:
+      self.skip(0, past)
+
+  def put(self, index: int, value: np.ndarray | float) -> None:
+    self._reach(index)
+    self.values[index] = value
+
+  def skip(self, start: int, end: int) -> None:
+    """Marks the samples start to end as missing; floating point only."""
+    self._reach(end - 1)
+    self.values[start:end] = np.nan
+
+  def view(self, count: int) -> np.ndarray:
+    view = self.values[:count]
+    view.flags.writeable = False
+    return view
+
+  def _reach(self, index: int) -> None:
+    if index >= len(self.values):
+      grown = np.empty((max(2 * len(self.values), index + 1), *self.shape), self.values.dtype)
+      grown[: len(self.values)] = self.values
+      self.values = grown
+
+
+class Recorder:
+  """Takes one sample a control step from any environment or plain MuJoCo loop.
+
+  In short: `recorder = Recorder(settings=Settings(force_limit=1.5), watch=["drop"])`; after every
+  control step `recorder.append(data.time, data.site("tip").xpos, force=force)`; in the end
+  `recorder.metrics()` and `recorder.save("exercise.npz")`.
+  """
+
+  def __init__(
+    self,
+    instruments: Sequence[str] = ("instrument",),
+    settings: Settings | None = None,
+    watch: Sequence[str] = (),
+    info: Mapping[str, Any] | None = None,
+  ):
+    """Starts an empty recording.
+
+    Args:
+      instruments: names, the main one first
+      settings: limits and thresholds
+      watch: kinds of event (`metrics.EVENTS`) that the caller looks for; without an event, a kind
+        that is watched counts 0 and one that is not is unknown
+      info: the caller's own data (task, seed, performer), anything that JSON holds
+    """
+    if isinstance(instruments, str) or not instruments:
+      raise ValueError(f"instruments is {instruments!r}, expected a list of names")
+    self.instruments = tuple(str(name) for name in instruments)
+    self.settings = settings or Settings()
+    self.watch = check_watch(watch)
+    try:
+      self.info = json.loads(json.dumps(dict(info or {}), allow_nan=False))
+    except (TypeError, ValueError) as error:
+      raise ValueError(f"info cannot be written as JSON: {error}") from error
+    self._count = 0
+    self._last = -math.inf
+    self._time = _Buffer((), np.dtype(float), 0)
+    self._columns: dict[str, _Buffer] = {}
+    self._arrays: dict[str, _Buffer] = {}
+    self._constants: dict[str, np.ndarray] = {}
+    self._events: list[Event] = []
+
+  def __len__(self) -> int:
+    return self._count
+
+  def append(
+    self,
+    time: float,
+    tip_pos: ArrayLike,
+    *,
+    quat: ArrayLike | None = None,
+    axis: ArrayLike | None = None,
+    force: ArrayLike | None = None,
+    area: ArrayLike | None = None,
+    grip: ArrayLike | None = None,
+    held: ArrayLike | None = None,
+    visible: ArrayLike | None = None,
+    arrays: Mapping[str, ArrayLike] | None = None,
+  ) -> None:
+    """Adds one sample; with several instruments each argument has a row (or a number) for each.
+
+    A value that is left out is missing (NaN) in this sample; NaN stands for it too. A call that
+    raises leaves the recording as it was.
+
+    Args:
+      time: above the last one [s]
+      tip_pos: tip position in the world [m]  (3,) or (ninstrument, 3)
+      quat: tip orientation, w x y z  (4,)
+      axis: direction of the shaft in the world, if not `settings.local_axis` turned by quat  (3,)
+      force: contact force on the instrument [N]  (3,), or its magnitude  ()
+      area: area of the organ's touched triangles [m^2]  ()
+      grip: above 0.5 where the jaw is told to close  ()
+      held: above 0.5 where the jaw holds tissue  ()
+      visible: 1 where the camera's view holds the tip, else 0  ()
+      arrays: the caller's own, of any shape and number type, the same in every sample; arrays that
+        are not floating point may not miss a sample
+    """
+    time = float(time)
+    if not (math.isfinite(time) and time > self._last):
+      raise ValueError(f"sample {self._count}: time is {time}, expected above {self._last}")
+    given = {"tip_pos": tip_pos, "quat": quat, "axis": axis, "force": force}
+    given |= {"area": area, "grip": grip, "held": held, "visible": visible}
+    columns = {k: self._entry(k, v) for k, v in given.items() if v is not None}
+    own = {name: self._own(name, value) for name, value in (arrays or {}).items()}
+    k = self._count
+    for name, buffer in self._arrays.items():
+      if name not in own and buffer.values.dtype.kind != "f":
+        raise ValueError(f"sample {k}: array {name!r} is {buffer.values.dtype} and is missing")
+    for table, entries in ((self._columns, columns), (self._arrays, own)):
+      for name, buffer in table.items():
+        if name not in entries:
+          buffer.skip(k, k + 1)
+      for name, value in entries.items():
+        if name not in table:
+          table[name] = _Buffer(value.shape, value.dtype, k)
+        table[name].put(k, value)
+    self._time.put(k, time)
+    self._count, self._last = k + 1, time
+
+  def _entry(self, name: str, value: ArrayLike) -> np.ndarray:
+    count = len(self.instruments)
+    array = np.asarray(value, np.float64)
+    shapes = [COLUMNS[name]] + ([()] if name == "force" else [])
+    if name in self._columns:
+      shapes = [self._columns[name].shape[1:]]
+    for shape in shapes:
+      if array.shape == (count, *shape) or (count == 1 and array.shape == shape):
+        return array.reshape(count, *shape)
+    wanted = " or ".join(str((count, *shape) if count > 1 else shape) for shape in shapes)
+    raise ValueError(f"sample {self._count}: {name} has shape {array.shape}, expected {wanted}")
+
+  def _own(self, name: str, value: ArrayLike) -> np.ndarray:
+    array = np.asarray(value)
+    if not _NAME.fullmatch(name):
+      raise ValueError(f"array name {name!r}, expected letters, digits, _ . -")
+    check_array(f"array {name!r}", array)
+    buffer = self._arrays.get(name)
+    if buffer is None:
+      if self._count and array.dtype.kind != "f":
+        raise ValueError(f"array {name!r} is {array.dtype} and misses the samples so far")
+      return array
+    # Only what the buffer holds without loss: a float64 in a float32 buffer would not replay.
+    if array.shape != buffer.shape or not np.can_cast(array.dtype, buffer.values.dtype):
+      raise ValueError(
+        f"sample {self._count}: array {name!r} is {array.dtype} {array.shape}, "
+        f"expected {buffer.values.dtype} {buffer.shape}"
+      )
+    return array
+
+  def attach(self, name: str, value: ArrayLike) -> None:
+    """Keeps an array of the whole exercise.
+
+    Three names have a meaning: `curve`, the polyline to trace [m] (ncorner, 3); `vertices` [m]
+    (nvert, 3) and `triangles` (ntri, 3), the surface that the report draws.
+    """
+    array = np.array(value)
+    if not _NAME.fullmatch(name):
+      raise ValueError(f"constant name {name!r}, expected letters, digits, _ . -")
+    check_constant(name, array)
+    array.flags.writeable = False
+    self._constants[name] = array
+
+  def event(
+    self,
+    kind: str,
+    time: float,
+    value: float | None = None,
+    instrument: int = 0,
+    label: str = "",
+  ) -> None:
+    """Reports an event, see `Event`."""
+    number = None if value is None else float(value)
+    event = Event(str(kind), float(time), number, int(instrument), str(label))
+    check_event(event, len(self.instruments))
+    self._events.append(event)
+
+  def recording(self) -> Recording:
+    """Returns what was recorded so far; read-only views, cheap."""
+    n = self._count
+    return Recording(
+      time=self._time.view(n),
+      columns={name: buffer.view(n) for name, buffer in self._columns.items()},
+      arrays={name: buffer.view(n) for name, buffer in self._arrays.items()},
+      constants=dict(self._constants),
+      events=tuple(self._events),
+      instruments=self.instruments,
+      settings=self.settings,
+      watch=self.watch,
+      info=self.info,
+    )
+
+  def metrics(self, instrument: int | None = None) -> Metrics:
+    """Returns the metrics so far, see `Recording.metrics`."""
+    return self.recording().metrics(instrument)
+
+  def save(self, path: str | os.PathLike[str]) -> Path:
+    """Writes what was recorded so far, see `Recording.save`."""
+    return self.recording().save(path)

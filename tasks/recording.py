@@ -1,0 +1,423 @@
+"""A recorded exercise: its file and its metrics.
+
+A recording is enough to compute every metric again to the bit, and, with the caller's own arrays
+(states, actions), to replay the exercise. On disk it is an `.npz` of plain arrays; the rest is JSON
+in its entry `meta`. Nothing in it is executed when it is read.
+"""
+
+import dataclasses
+import json
+import math
+import os
+import zipfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from . import metrics as m
+from .metrics import ERRORS, EVENTS, Unknown
+from .score import METRICS, Metrics
+
+FORMAT = "palpate-recording"
+VERSION = 1
+# Width of one instrument's entry; force has 3 components or is a magnitude.
+COLUMNS: dict[str, tuple[int, ...]] = {
+  "tip_pos": (3,),
+  "quat": (4,),
+  "axis": (3,),
+  "force": (3,),
+  "area": (),
+  "grip": (),
+  "held": (),
+  "visible": (),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+  """What the metrics need to know besides the samples; None where it is unknown.
+
+  Attributes:
+    force_limit: F_max, the force that breaches and excess impulse are counted above [N]
+    reference_length: length of the path that the task asks for, all instruments together [m]
+    movement_speed: tip speed above which an instrument moves [m/s]
+    movement_debounce: shortest movement, and shortest pause between two [s]
+    idle_speed: tip speed below which an instrument rests [m/s]
+    contact_force: force above which there is contact [N]
+    local_axis: direction of the shaft in the tip's own frame, used where no axis is recorded  (3,)
+  """
+
+  force_limit: float | None = None
+  reference_length: float | None = None
+  movement_speed: float = 0.05
+  movement_debounce: float = 0.2
+  idle_speed: float = 0.005
+  contact_force: float = 0.0
+  local_axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
+
+  def __post_init__(self):
+    axis = tuple(float(x) for x in self.local_axis)
+    if len(axis) != 3 or not all(map(math.isfinite, axis)) or not any(axis):
+      raise ValueError(f"local_axis is {self.local_axis!r}, expected three numbers, not all zero")
+    object.__setattr__(self, "local_axis", axis)
+    for field in dataclasses.fields(self)[:-1]:
+      value = getattr(self, field.name)
+      if value is None and field.default is None:
+        continue
+      if isinstance(value, bool) or not isinstance(value, int | float | np.number):
+        raise ValueError(f"{field.name} is {value!r}, expected a number")
+      if not (math.isfinite(value) and value >= 0):
+        raise ValueError(f"{field.name} is {value!r}, expected a finite number >= 0")
+      object.__setattr__(self, field.name, float(value))
+
+
+@dataclasses.dataclass(frozen=True)
+class Event:
+  """Something that happened once.
+
+  Attributes:
+    kind: one of `metrics.EVENTS`
+    time: when [s]
+    value: for `target`, the distance to the target [m]; None where there is none
+    instrument: index of the instrument
+    label: text for people
+  """
+
+  kind: str
+  time: float
+  value: float | None = None
+  instrument: int = 0
+  label: str = ""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Recording:
+  """One exercise, complete.
+
+  Attributes:
+    time: sample times [s]  (nstep,)
+    columns: what was recorded of the instruments, see `Recorder.append`  (nstep, ninstrument, ...)
+    arrays: the caller's arrays, one entry a sample: states, actions  (nstep, ...)
+    constants: arrays of the whole exercise: curve, vertices, triangles, initial state
+    events: in the order they were reported
+    instruments: their names
+    settings: limits and thresholds
+    watch: kinds of event that the caller looks for
+    info: the caller's own data (task, seed, performer); JSON
+  """
+
+  time: np.ndarray
+  columns: dict[str, np.ndarray]
+  arrays: dict[str, np.ndarray]
+  constants: dict[str, np.ndarray]
+  events: tuple[Event, ...]
+  instruments: tuple[str, ...]
+  settings: Settings
+  watch: tuple[str, ...]
+  info: dict[str, Any]
+
+  def column(self, name: str, instrument: int = 0) -> np.ndarray | None:
+    """Returns one instrument's column, or None where it was not recorded."""
+    if name not in self.columns:
+      return None
+    values = np.ascontiguousarray(self.columns[name][:, instrument])
+    return None if np.isnan(values).all() and len(values) else values
+
+  def force(self, instrument: int = 0) -> np.ndarray | None:
+    """Returns the force magnitude [N]  (nstep,), NaN where it is missing; None if all is."""
+    force = self.column("force", instrument)
+    if force is None or force.ndim == 1:
+      return force if force is None else np.abs(force)
+    return np.linalg.norm(force, axis=1)
+
+  def metrics(self, instrument: int | None = None) -> Metrics:
+    """Returns the metrics of all instruments together, or of one.
+
+    Several instruments: lengths, counts and impulses add up, peaks take the largest, smoothness and
+    mean forces the mean over the instruments where they are known. Tracing errors are those of the
+    first instrument, over the samples in contact (from the first to the last one for Frechet), over
+    all samples where no force was recorded.
+    """
+    count = len(self.instruments)
+    if instrument is not None and not 0 <= instrument < count:
+      raise ValueError(f"instrument is {instrument}, expected 0 to {count - 1}")
+    if len(self.time) == 0:
+      return Metrics(**dict.fromkeys(METRICS, Unknown("the recording is empty")))
+    which = list(range(count)) if instrument is None else [instrument]
+    each = [self._instrument_metrics(i) for i in which]
+    values = {
+      name: _combine(METRICS[name].combine, [row[name] for row in each]) for name in each[0]
+    }
+    return Metrics(**values, **self._shared_metrics(which, values["path_length"]))
+
+  def _instrument_metrics(self, i: int) -> dict[str, float]:
+    time, set_ = self.time, self.settings
+    pos, quat, force = self.column("tip_pos", i), self.column("quat", i), self.column("force", i)
+    axis, area, visible = self.column("axis", i), self.column("area", i), self.column("visible", i)
+    grip, held = self.column("grip", i), self.column("held", i)
+    if axis is None and quat is not None:
+      axis = _rotate(quat, set_.local_axis)
+    limit = math.nan if set_.force_limit is None else set_.force_limit
+    touch = set_.contact_force
+
+    def smooth(function: Callable[[np.ndarray, float], float]) -> float:
+      return m.metric(lambda: function(*m.uniform_speed(time, self._position(i))))()
+
+    row = {
+      "path_length": _of(m.path_length, tip_pos=pos),
+      "sparc": smooth(m.sparc),
+      "log_dimensionless_jerk": smooth(m.log_dimensionless_jerk),
+      "angular_path": _of(m.angular_path, quat=quat),
+      "depth_path": _of(m.depth_path, tip_pos=pos, axis=axis),
+      "response_orientation": _of(m.response_orientation, quat=quat, local_axis=set_.local_axis),
+      "number_of_movements": m.metric(
+        lambda: m.number_of_movements(
+          time, self._speed(i), set_.movement_speed, set_.movement_debounce
+        )
+      )(),
+      "peak_force": _of(m.peak_force, force=force, contact=touch),
+      "mean_force": _of(m.mean_force, time=time, force=force, contact=touch),
+      "rms_force": _of(m.rms_force, time=time, force=force, contact=touch),
+      "force_time_product": _of(m.force_time_product, time=time, force=force, contact=touch),
+      "force_breaches": _of(m.force_breaches, force=force, limit=limit, contact=touch),
+      "excess_impulse": _of(m.excess_impulse, time=time, force=force, limit=limit, contact=touch),
+      "peak_pressure": _of(m.peak_pressure, force=force, area=area, contact=touch),
+      "grasp_slips": _of(m.grasp_slips, grip=grip, held=held),
+      "out_of_view": _of(m.out_of_view, time=time, visible=visible),
+    }
+    if (grip is None or held is None) and self._watches("slip"):
+      row["grasp_slips"] = m.count_events(self._kinds([i]), ["slip"])
+    # An instrument that never moved did not turn economically: nothing is known of its turning.
+    if math.isnan(row["path_length"]) and row["angular_path"] == 0:
+      row["angular_path"] = row["response_orientation"] = Unknown("no motion")
+    return row
+
+  def _shared_metrics(self, which: Sequence[int], path_length: float) -> dict[str, float]:
+    time, set_ = self.time, self.settings
+    reference = math.nan if set_.reference_length is None else set_.reference_length
+    kinds = self._kinds(which)
+    reached = [
+      math.nan if e.value is None else e.value
+      for e in self.events
+      if e.kind == "target" and e.instrument in which
+    ]
+    row = {
+      "time": m.time_to_completion(time),
+      "path_inefficiency": m.path_inefficiency(path_length, reference),
+      "target_error": m.target_error(reached),
+      "errors": Unknown("no kind of error was watched for"),
+      "bimanual_dexterity": Unknown("a single instrument"),
+    }
+    if self._watches(*ERRORS):
+      row["errors"] = m.count_events(kinds, ERRORS)
+    if len(which) > 1:
+      row["bimanual_dexterity"] = m.metric(
+        lambda: m.bimanual_dexterity(self._speed(which[0]), self._speed(which[1]))
+      )()
+
+    def resting(function: Callable[..., float]) -> float:
+      return function(time, [self._speed(i) for i in which], set_.idle_speed)
+
+    row["idle_time"] = m.metric(lambda: resting(m.idle_time))()
+    row["idle_share"] = m.metric(lambda: resting(m.idle_share))()
+    row["trace_rms"] = m.metric(lambda: m.trace_rms(*self._trace(which[0], whole=False)))()
+    row["trace_frechet"] = m.metric(lambda: m.trace_frechet(*self._trace(which[0], whole=True)))()
+    return row
+
+  def _position(self, i: int) -> np.ndarray:
+    pos = self.column("tip_pos", i)
+    if pos is None:
+      raise m.UnknownError("tip_pos not recorded")
+    return pos
+
+  def _speed(self, i: int) -> np.ndarray:
+    return m.speed(self.time, self._position(i))
+
+  def _trace(self, i: int, whole: bool) -> tuple[np.ndarray, np.ndarray]:
+    if "curve" not in self.constants:
+      raise m.UnknownError("no curve to trace")
+    pos, force = self._position(i), self.column("force", i)
+    if force is not None:
+      touch = (m.magnitude(force) > self.settings.contact_force).nonzero()[0]
+      if len(touch) == 0:
+        raise m.UnknownError("no contact")
+      pos = pos[touch[0] : touch[-1] + 1] if whole else pos[touch]
+    return pos, self.constants["curve"]
+
+  def _watches(self, *kinds: str) -> bool:
+    return any(k in self.watch or any(e.kind == k for e in self.events) for k in kinds)
+
+  def _kinds(self, which: Sequence[int]) -> list[str]:
+    return [e.kind for e in self.events if e.instrument in which]
+
+  def save(self, path: str | os.PathLike[str]) -> Path:
+    """Writes the recording; an interrupted write leaves the old file as it was.
+
+    Args:
+      path: the file, by custom with the suffix .npz; its folder must exist
+    """
+    path = Path(path)
+    meta = {
+      "format": FORMAT,
+      "version": VERSION,
+      "instruments": list(self.instruments),
+      "settings": dataclasses.asdict(self.settings),
+      "watch": list(self.watch),
+      "events": [dataclasses.asdict(e) for e in self.events],
+      "info": self.info,
+    }
+    entries = {"meta": np.array(json.dumps(meta, allow_nan=False)), "time": self.time}
+    for kind, table in _TABLES.items():
+      entries |= {f"{kind}.{name}": value for name, value in getattr(self, table).items()}
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+      with part.open("wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **entries)
+        file.flush()
+        os.fsync(file.fileno())
+      os.replace(part, path)
+    finally:
+      part.unlink(missing_ok=True)
+    return path
+
+  @classmethod
+  def load(cls, path: str | os.PathLike[str]) -> "Recording":
+    """Reads a recording; ValueError names the file and what is wrong with it."""
+    path = Path(path)
+    with path.open("rb") as file:
+      if file.read(2) != b"PK":
+        raise ValueError(f"{path}: not a {FORMAT}: not a zip archive")
+      file.seek(0)
+      # Whatever broken bytes make zipfile, zlib, numpy or json raise is the file's fault.
+      try:
+        return cls._read(file)
+      except Exception as error:
+        text = str(error) or type(error).__name__
+        raise ValueError(f"{path}: not a readable {FORMAT}: {text}") from error
+
+  @classmethod
+  def _read(cls, file: Any) -> "Recording":
+    with zipfile.ZipFile(file) as archive:
+      if broken := archive.testzip():
+        raise ValueError(f"{broken} fails its checksum")
+    file.seek(0)
+    tables: dict[str, dict[str, np.ndarray]] = {table: {} for table in _TABLES.values()}
+    with np.load(file, allow_pickle=False) as archive:
+      for required in ("meta", "time"):
+        if required not in archive.files:
+          raise ValueError(f"no entry {required!r}")
+      if archive["meta"].dtype.kind != "U" or archive["meta"].shape != ():
+        raise ValueError("entry 'meta' is no text")
+      meta = _check_meta(json.loads(str(archive["meta"][()])))
+      time = m.check_time(check_array("time", archive["time"]), least=0)
+      for name in set(archive.files) - {"meta", "time"}:
+        kind, _, rest = name.partition(".")
+        if kind not in _TABLES or not rest:
+          raise ValueError(f"unknown entry {name!r}")
+        value = check_array(name, archive[name])
+        if kind != "constant" and value.shape[:1] != time.shape:
+          raise ValueError(f"{name} has shape {value.shape}, expected {len(time)} samples")
+        if kind == "column":
+          _check_column(rest, value, len(meta["instruments"]))
+        if kind == "constant":
+          check_constant(rest, value)
+        tables[_TABLES[kind]][rest] = value
+    return cls(time=time, **tables, **meta)
+
+
+_TABLES = {"column": "columns", "array": "arrays", "constant": "constants"}
+
+
+def _of(function: Callable[..., float], **inputs: Any) -> float:
+  """Returns the metric, or `Unknown` naming the inputs that are None."""
+  if absent := [name for name, value in inputs.items() if value is None]:
+    return Unknown(f"{' and '.join(absent)} not recorded")
+  return function(*inputs.values())
+
+
+def _combine(how: str, values: Sequence[float]) -> float:
+  """Returns one value of several instruments; bad data of one makes all unknown, absence not."""
+  for value in values:
+    if isinstance(value, Unknown) and value.fault:
+      return value
+  known = [v for v in values if not math.isnan(v)]
+  if not known:
+    return values[0]
+  return max(known) if how == "max" else sum(known) / (len(known) if how == "mean" else 1)
+
+
+def _rotate(quat: np.ndarray, axis: ArrayLike) -> np.ndarray:
+  """Returns a vector of the tip's frame in the world  (nstep, 3)."""
+  w, v = quat[:, :1], quat[:, 1:]
+  twice = 2 * np.cross(v, np.asarray(axis, np.float64))
+  return np.asarray(axis, np.float64) + w * twice + np.cross(v, twice)
+
+
+def check_array(name: str, value: np.ndarray) -> np.ndarray:
+  """Returns the array; ValueError unless it holds numbers."""
+  if value.dtype.kind not in "fiub":
+    raise ValueError(f"{name} has dtype {value.dtype}, expected numbers or booleans")
+  return value
+
+
+def check_constant(name: str, value: np.ndarray) -> None:
+  """Raises ValueError unless the constant holds numbers, those with a meaning in rows of three."""
+  check_array(f"constant {name!r}", value)
+  if name in ("curve", "vertices", "triangles") and (value.ndim != 2 or value.shape[1] != 3):
+    raise ValueError(f"constant {name!r} has shape {value.shape}, expected (n, 3)")
+
+
+def _check_column(name: str, value: np.ndarray, count: int) -> None:
+  if name not in COLUMNS:
+    raise ValueError(f"unknown column {name!r}, expected one of {', '.join(COLUMNS)}")
+  allowed = [(count, *COLUMNS[name])] + ([(count,)] if name == "force" else [])
+  if value.dtype != np.float64 or value.shape[1:] not in allowed:
+    raise ValueError(f"column {name} is {value.dtype} {value.shape}, expected float64 {allowed}")
+
+
+def _check_meta(meta: Any) -> dict[str, Any]:
+  if not isinstance(meta, dict) or meta.get("format") != FORMAT:
+    raise ValueError(f"format is {meta.get('format') if isinstance(meta, dict) else meta!r}")
+  if meta.get("version") != VERSION:
+    raise ValueError(f"version is {meta.get('version')!r}, this program reads {VERSION}")
+  names = meta["instruments"]
+  if not (isinstance(names, list) and names and all(isinstance(n, str) for n in names)):
+    raise ValueError(f"instruments is {names!r}, expected a list of names")
+  events = tuple(Event(**event) for event in meta["events"])
+  for event in events:
+    check_event(event, len(names))
+  if not isinstance(meta["info"], dict):
+    raise ValueError(f"info is {meta['info']!r}, expected an object")
+  return {
+    "instruments": tuple(names),
+    "settings": Settings(**meta["settings"]),
+    "watch": check_watch(meta["watch"]),
+    "events": events,
+    "info": meta["info"],
+  }
+
+
+def check_watch(watch: Sequence[str]) -> tuple[str, ...]:
+  """Returns the kinds; ValueError unless all are `metrics.EVENTS`."""
+  for kind in watch:
+    if kind not in EVENTS:
+      raise ValueError(f"no event {kind!r} to watch, expected one of {', '.join(EVENTS)}")
+  return tuple(watch)
+
+
+def check_event(event: Event, count: int) -> None:
+  """Raises ValueError unless the event is one that `count` instruments can have."""
+  if event.kind not in EVENTS:
+    raise ValueError(f"no event {event.kind!r}, expected one of {', '.join(EVENTS)}")
+  if type(event.instrument) is not int or not 0 <= event.instrument < count:
+    raise ValueError(f"event {event.kind!r}: instrument is {event.instrument!r} of {count}")
+  if not isinstance(event.label, str):
+    raise ValueError(f"event {event.kind!r}: label is {event.label!r}, expected text")
+  for name, value in (("time", event.time), ("value", event.value)):
+    if not (value is None and name == "value") and not (
+      isinstance(value, int | float) and math.isfinite(value)
+    ):
+      raise ValueError(f"event {event.kind!r}: {name} is {value!r}, expected a finite number")

@@ -1,0 +1,159 @@
+"""Retract: grasp the gallbladder and pull it aside until what it hides is seen, and hold it there.
+
+Own observations: `target` (3,), from the tip to the site to grasp [m]; `hidden` (3,), from the
+tip to the hidden disc [m]; `visible` (1,), share of the disc that the laparoscope sees [-];
+`held` (1,), share of the holding time done [-]; `grasped` (1,), whether the jaws hold the organ.
+
+Progress: 0.15 * max(0, 1 - distance / distance at the start) until it is grasped; then 0.3 + 0.5
+* visible / wanted + 0.2 * held. Only the organ hides: instruments are not looked at. Success:
+the wanted share is seen for the holding time, the organ being held. Failure: a force above the
+damage limit, jaws included, or the time limit.
+"""
+
+import dataclasses
+
+import numpy as np
+from dm_control.utils import containers
+
+from . import base
+from .base import Physics, Task
+from .grasp import FUNDUS, REACH
+from .scenes import Scene
+
+SUITE = containers.TaggedTasks()
+_BEHIND = 0.02  # from the organ's middle to the disc [m]
+_SAMPLES = 12  # points of the disc
+
+
+@SUITE.add("benchmarking", "easy")
+def easy(time_limit=20, random=None, environment_kwargs=None, **kwargs):
+  """Returns the task to uncover half of a disc of 3 mm for 0.5 s."""
+  kwargs = {"radius": 0.003, "wanted": 0.5, "hold": 0.5, **kwargs}
+  task = Retract(dataclasses.replace(FUNDUS, nodes=250), random, name="retract/easy", **kwargs)
+  return base.make(task, time_limit, environment_kwargs)
+
+
+@SUITE.add("benchmarking")
+def standard(time_limit=30, random=None, environment_kwargs=None, **kwargs):
+  """Returns the task to uncover 80 % of a disc of 4 mm for 1 s."""
+  kwargs = {"radius": 0.004, "wanted": 0.8, "hold": 1.0, "jitter": 0.003, **kwargs}
+  task = Retract(dataclasses.replace(FUNDUS, nodes=250), random, name="retract/standard", **kwargs)
+  return base.make(task, time_limit, environment_kwargs)
+
+
+@SUITE.add("benchmarking", "hard")
+def hard(time_limit=40, random=None, environment_kwargs=None, **kwargs):
+  """Returns the task to uncover a disc of 4 mm for 2 s with less force, on varying organs."""
+  kwargs = {"radius": 0.004, "wanted": 1.0, "hold": 2.0, "jitter": 0.005, **kwargs}
+  kwargs = {"variants": (None, 1, 2), "force_limit": 3.4, "damage": 6.0, **kwargs}
+  task = Retract(dataclasses.replace(FUNDUS, nodes=500), random, name="retract/hard", **kwargs)
+  return base.make(task, time_limit, environment_kwargs)
+
+
+class Retract(Task):
+  """Pull tissue aside and hold it."""
+
+  watch = ("miss", "unintended_contact", "drop")
+
+  def __init__(
+    self,
+    scene: Scene,
+    random=None,
+    *,
+    name: str,
+    radius: float,
+    wanted: float,
+    hold: float,
+    **kwargs,
+  ):
+    """Makes the task.
+
+    Args:
+      scene: what it plays in
+      random: see Task
+      name: domain and task
+      radius: of the hidden disc [m]
+      wanted: share of the disc that must be seen [-]
+      hold: for how long [s]
+      **kwargs: see Task; the force limit counts the jaws too
+    """
+    self.name, self.targets = name, 2
+    self.radius, self.wanted, self.hold = radius, wanted, hold
+    kwargs = {"spread": 0.012, "force_limit": 4.0, "damage": 8.0, **kwargs}
+    super().__init__(dataclasses.replace(scene, targets=2), random, **kwargs)
+
+  def begin(self, physics: Physics) -> None:
+    """Draws the site to grasp and hides the disc behind the organ's edge, far from the trocar."""
+    place, center = self.place_of_work(physics)
+    self.site = int(self.random.choice(place))
+    self.held, self.visible = 0.0, 0.0
+    self.grasped, self._closing = False, False
+    self.disc = self._hide(physics, center)
+    self.distance0 = self.distance(physics)
+    physics.mark(0, self.disc[0])
+    physics.mark(1, physics.point(self.site))
+    physics.model.site_size[physics._targets[0]] = self.radius
+    physics.model.site_rgba[physics._targets[0], :3] = 0.95, 0.8, 0.15
+
+  def _hide(self, physics: Physics, center: np.ndarray) -> np.ndarray:
+    _, mat, _ = physics.camera()
+    right, up, back = mat.T
+    behind = physics.organ.xpos.mean(axis=0)
+    # In the plane behind the organ, on the line through the site that is grasped.
+    height = float((center - behind) @ up) + self.random.uniform(-0.012, 0.0)
+    aside = np.arange(-0.06, 0.06, 0.001)
+    line = behind - _BEHIND * back + height * up + aside[:, None] * right
+    covered = physics.hidden(line)
+    if not covered.any():
+      raise ValueError(f"{self.name}: the organ hides nothing from the laparoscope")
+    edge = aside[covered].min()
+    self.right = right
+    middle = behind - _BEHIND * back + height * up + (edge + 1.8 * self.radius) * right
+    turn = np.linspace(0, 2 * np.pi, _SAMPLES, endpoint=False)[:-1]
+    ring = np.cos(turn)[:, None] * right + np.sin(turn)[:, None] * up
+    return np.concatenate([middle[None], middle + 0.9 * self.radius * ring])
+
+  def distance(self, physics: Physics) -> float:
+    """Returns how far the tip is from the site to grasp [m]."""
+    return float(np.linalg.norm(physics.point(self.site) - physics.tip_pos()))
+
+  def advance(self, physics: Physics) -> float:
+    """Follows the grasp and what is seen."""
+    physics.mark(1, physics.point(self.site))
+    closing = physics.closing()
+    holds = physics.holds()
+    if self.grasped and not holds:
+      self.event(physics, "drop", label="slipped" if closing else "let go")
+    if closing and not self._closing and self.distance(physics) >= 2 * REACH:
+      self.event(physics, "miss", self.distance(physics), "closed off the site")
+    grasped = holds and closing and (self.grasped or self.distance(physics) < REACH)
+    if grasped and not self.grasped:
+      self.event(physics, "target", self.distance(physics), "grasp")
+    self.grasped, self._closing = grasped, closing
+    self.visible = 1 - float(physics.hidden(self.disc).mean())
+    seen = self.visible >= self.wanted - 1e-9
+    self.held = self.held + base.CONTROL_TIMESTEP if seen and grasped else 0.0
+    if self.held >= self.hold - 1e-9:
+      self.outcome = "success"
+      return 1.0
+    if not grasped:
+      return 0.15 * base.closeness(self.distance(physics), self.distance0)
+    return 0.3 + 0.5 * min(self.visible / self.wanted, 1.0) + 0.2 * self.held / self.hold
+
+  def observe(self, physics: Physics) -> dict[str, np.ndarray]:
+    """Returns target, hidden, visible, held and grasped."""
+    return {
+      "target": physics.point(self.site) - physics.tip_pos(),
+      "hidden": self.disc[0] - physics.tip_pos(),
+      "visible": np.array([self.visible]),
+      "held": np.array([min(self.held / self.hold, 1.0)]),
+      "grasped": np.array([float(self.grasped)]),
+    }
+
+  def recorded(self, physics: Physics) -> dict[str, float]:
+    """Returns whether the jaws are told to close and whether they hold."""
+    return {"grip": float(physics.closing()), "held": float(self.grasped)}
+
+  def reference_length(self) -> float:
+    """Returns the way to the site and aside by four radii of the disc [m]."""
+    return self.distance0 + 4 * self.radius

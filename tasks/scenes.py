@@ -1,0 +1,190 @@
+# mujoco ships its bindings without type stubs:
+# pyright: reportAttributeAccessIssue=false
+"""Scenes of the exercises: one organ, one instrument on a trocar, a laparoscope, target markers.
+
+World: z is up, away from the table, and the patient lies on the back: the organ's frame (x to the
+patient's right, y anterior, z superior) is turned so that anterior is up and superior is -y.
+
+Every scene has the organ `organ`, the instrument under the prefix `probe/` or `grasper/`, the
+camera `laparoscope` and the sites `target0`, `target1`, ... that the task puts where it wants
+them.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Mapping
+
+import mujoco
+import numpy as np
+from palpate.models import shapes, trocar
+
+ORGAN = "organ"
+CAMERA = "laparoscope"
+_TURN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # organ's frame to world
+
+
+@dataclasses.dataclass(frozen=True)
+class Material:
+  """Tissue of an organ; the plugin's configuration keys.
+
+  Attributes:
+    mass: of the organ [kg]
+    young: Young's modulus of the surface [Pa]
+    thickness: of the surface [m]
+    foundation: stands for what lies under the surface [Pa/m]
+    bulk: volume preservation [Pa]
+    damping: Rayleigh coefficient on the stiffness [s]
+    pinned: whether the organ's attachments (`shapes.patches`) are fixed
+  """
+
+  mass: float
+  young: float
+  thickness: float
+  foundation: float
+  bulk: float = 0.0
+  damping: float = 0.005
+  pinned: bool = True
+
+
+# Young's moduli: 2 G (1 + nu) with G from PMC6925591 for the liver; the wall of gallbladder and
+# stomach is thinner and tougher. Foundations give 0.3 to 1 N at 5 mm under the 2.5 mm tip.
+MATERIALS: Mapping[str, Material] = {
+  "liver": Material(0.4, 5.4e3, 0.003, 4e5),
+  "kidney": Material(0.15, 1.0e4, 0.006, 1e5),
+  "stomach": Material(0.2, 2.0e4, 0.003, 2e5),
+  "gallbladder": Material(0.05, 1.5e4, 0.002, 1.5e4, bulk=1e4),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene:
+  """What a scene is made of; equal scenes compile to equal models.
+
+  Attributes:
+    organ: one of `MATERIALS`
+    instrument: `probe` or `grasper`
+    nodes: number of the organ's nodes
+    variant: seed of the organ's shape, None for the mean shape
+    center: the organ's landmark that ports and camera look at
+    port: from there to the trocar [m]  (3,)
+    camera: from there to the camera [m]  (3,)
+    targets: number of target sites
+    inclusion: hidden stiff place: position in the world [m] (3), radius [m], factor on Young's
+      modulus and factor on the force; None for healthy tissue
+  """
+
+  organ: str = "liver"
+  instrument: str = "probe"
+  nodes: int = 1000
+  variant: int | None = None
+  center: str = "right_lobe"
+  port: tuple[float, float, float] = (0.03, 0.05, 0.125)
+  camera: tuple[float, float, float] = (-0.05, 0.15, 0.12)
+  targets: int = 1
+  inclusion: tuple[float, ...] | None = None
+
+
+@functools.lru_cache(maxsize=32)
+def surface(organ: str, nodes: int, variant: int | None) -> tuple[np.ndarray, np.ndarray]:
+  """Returns vertices in the world [m] (nvert, 3) and triangles (nelem, 3)."""
+  vertices, triangles = getattr(shapes, organ)(nodes, variant)
+  vertices = vertices @ _TURN.T
+  vertices.flags.writeable = triangles.flags.writeable = False
+  return vertices, triangles
+
+
+@functools.lru_cache(maxsize=32)
+def _pins(organ: str, nodes: int, variant: int | None) -> tuple[int, ...]:
+  vertices, _ = surface(organ, nodes, variant)
+  patches = shapes.patches(organ, vertices @ _TURN, variant)
+  return tuple(int(i) for i in np.unique(np.concatenate(list(patches.values()))))
+
+
+@functools.lru_cache(maxsize=32)
+def _landmarks(organ: str, variant: int | None) -> dict[str, np.ndarray]:
+  return {k: _TURN @ v for k, v in shapes.landmarks(organ, variant).items()}
+
+
+def landmark(scene: Scene, name: str) -> np.ndarray:
+  """Returns the place of one of the organ's landmarks in the world [m]  (3,)."""
+  marks = _landmarks(scene.organ, scene.variant)
+  if name not in marks:
+    raise ValueError(f"organ {scene.organ!r} has no landmark {name!r}, it has {', '.join(marks)}")
+  return marks[name]
+
+
+def build(scene: Scene) -> mujoco.MjSpec:
+  """Returns the scene, ready to be changed and compiled."""
+  if scene.organ not in MATERIALS:
+    raise ValueError(f"organ is {scene.organ!r}, expected one of {', '.join(MATERIALS)}")
+  material = MATERIALS[scene.organ]
+  vertices, triangles = surface(scene.organ, scene.nodes, scene.variant)
+  pins = _pins(scene.organ, scene.nodes, scene.variant) if material.pinned else ()
+  young = np.array([material.young])
+  if scene.inclusion is not None:
+    *place, radius, factor = scene.inclusion
+    young = shapes.inclusion_young(
+      vertices, triangles, np.array(place), radius, material.young, factor * material.young
+    )
+  center = landmark(scene, scene.center)
+  spec = mujoco.MjSpec.from_string(_xml(material, vertices, triangles, pins, young, center, scene))
+  port = center + scene.port
+  trocar.attach(
+    spec, scene.instrument, f"{scene.instrument}/", pos=port, quat=trocar.aim(port, center)
+  )
+  return spec
+
+
+def _xml(material, vertices, triangles, pins, young, center, scene: Scene) -> str:
+  def numbers(values) -> str:
+    return " ".join(f"{float(x):.7g}" for x in np.ravel(values))
+
+  camera = center + scene.camera
+  back = -np.asarray(scene.camera) / np.linalg.norm(scene.camera)
+  right = np.cross(back, [0.0, 0.0, 1.0])
+  right /= np.linalg.norm(right)
+  pin = f'<pin id="{" ".join(map(str, pins))}"/>' if pins else ""
+  sites = "".join(
+    f'<site name="target{i}" size="0.003" rgba="0.15 0.75 0.35 0.9"/>' for i in range(scene.targets)
+  )
+  color = "0.72 0.36 0.31 1" if scene.organ != "gallbladder" else "0.48 0.62 0.34 1"
+  config = {
+    "young": numbers(young),
+    "thickness": material.thickness,
+    "foundation": material.foundation,
+    "bulk": material.bulk,
+    "damping": material.damping,
+    "device": "cpu",
+  }
+  keys = "".join(f'<config key="{key}" value="{value}"/>' for key, value in config.items())
+  # solmix: the organ's solref counts, not the instrument's: light nodes want stiff contacts.
+  return f"""
+<mujoco model="exercise">
+  <compiler autolimits="true"/>
+  <option timestep="0.001" integrator="implicitfast" cone="elliptic" impratio="3"/>
+  <extension><plugin plugin="palpate.organ"/></extension>
+  <visual>
+    <global offwidth="1280" offheight="960"/>
+    <headlight ambient="0.3 0.3 0.3" diffuse="0.6 0.6 0.6"/>
+    <map znear="0.005" zfar="5"/>
+  </visual>
+  <statistic center="{numbers(center)}" extent="0.2"/>
+  <asset>
+    <texture type="skybox" builtin="gradient" rgb1="0.25 0.12 0.12" rgb2="0.05 0.02 0.02"
+      width="64" height="64"/>
+  </asset>
+  <worldbody>
+    <light pos="{numbers(camera + np.array([0, 0, 0.05]))}" dir="{numbers(back)}"
+      castshadow="false"/>
+    <camera name="{CAMERA}" pos="{numbers(camera)}" fovy="50"
+      xyaxes="{numbers(right)} {numbers(np.cross(right, back))}"/>
+    {sites}
+    <flexcomp name="{ORGAN}" type="direct" dim="2" mass="{material.mass}" radius="0.001"
+      point="{numbers(vertices)}" element="{" ".join(map(str, triangles.ravel()))}" rgba="{color}">
+      <plugin plugin="palpate.organ">{keys}</plugin>
+      <contact condim="3" selfcollide="none" solref="0.002 1" solimp="0.95 0.99 0.001"
+        solmix="1e4"/>
+      {pin}
+    </flexcomp>
+  </worldbody>
+</mujoco>"""

@@ -1,0 +1,129 @@
+"""Touch: touch numbered points on the liver in order with the probe.
+
+Own observations: `target` (3,), from the tip to the point to touch [m]; `normal` (3,), of the
+surface there [-].
+
+Progress: (points touched + 0.9 * max(0, 1 - distance / distance at the start)) / points. A point is
+touched when the probe presses it with more than 0.03 N within the tolerance; pressing elsewhere is
+a miss. Success: all points. Failure: a force above the damage limit, or the time limit.
+"""
+
+import dataclasses
+
+import numpy as np
+from dm_control.utils import containers
+
+from . import base
+from .base import Physics, Task
+from .scenes import Scene
+
+SUITE = containers.TaggedTasks()
+CONTACT = 0.03  # force that counts as a touch [N]
+
+
+@SUITE.add("benchmarking", "easy")
+def easy(time_limit=10, random=None, environment_kwargs=None, **kwargs):
+  """Returns the task to touch one point within 5 mm."""
+  task = Touch(1, 0.005, Scene(nodes=250), random, name="touch/easy", **kwargs)
+  return base.make(task, time_limit, environment_kwargs)
+
+
+@SUITE.add("benchmarking")
+def standard(time_limit=30, random=None, environment_kwargs=None, **kwargs):
+  """Returns the task to touch four points within 3 mm."""
+  kwargs = {"jitter": 0.005, **kwargs}
+  task = Touch(4, 0.003, Scene(nodes=500), random, name="touch/standard", **kwargs)
+  return base.make(task, time_limit, environment_kwargs)
+
+
+@SUITE.add("benchmarking", "hard")
+def hard(time_limit=40, random=None, environment_kwargs=None, **kwargs):
+  """Returns the task to touch six points within 2 mm and under 0.5 N, on livers that vary."""
+  kwargs = {"jitter": 0.01, "variants": (None, 1, 2), "force_limit": 0.5, "damage": 2.0, **kwargs}
+  task = Touch(6, 0.002, Scene(nodes=1000), random, name="touch/hard", **kwargs)
+  return base.make(task, time_limit, environment_kwargs)
+
+
+class Touch(Task):
+  """Touch points in order."""
+
+  def __init__(self, points: int, tolerance: float, scene: Scene, random=None, *, name, **kwargs):
+    """Makes the task.
+
+    Args:
+      points: how many to touch
+      tolerance: largest distance from tip to point [m]
+      scene: what it plays in
+      random: see Task
+      name: domain and task
+      **kwargs: see Task
+    """
+    self.name, self.targets, self.tolerance = name, points, tolerance
+    kwargs = {"spread": 0.035, **kwargs}
+    super().__init__(dataclasses.replace(scene, targets=points), random, **kwargs)
+
+  def begin(self, physics: Physics) -> None:
+    """Draws the points, apart from each other."""
+    place, _ = self.place_of_work(physics)
+    self.goals = draw_apart(self.random, physics, place, self.targets, 0.012)
+    self.done, self.pressing = 0, False
+    self._aim(physics)
+    self._path = float(np.linalg.norm(np.diff(self._stations(physics), axis=0), axis=1).sum())
+
+  def _stations(self, physics: Physics) -> np.ndarray:
+    return np.array([physics.tip_pos(), *(physics.point(t) for t in self.goals)])
+
+  def _aim(self, physics: Physics) -> None:
+    for i, goal in enumerate(self.goals):
+      physics.mark(i, physics.point(goal), shown=i >= self.done)
+    if self.done < self.targets:
+      self.distance0 = self.distance(physics)
+
+  def goal(self) -> int:
+    """Returns the triangle to touch next; the last one when all are done."""
+    return self.goals[min(self.done, self.targets - 1)]
+
+  def distance(self, physics: Physics) -> float:
+    """Returns how far the tip is from the point to touch [m]."""
+    return float(np.linalg.norm(physics.point(self.goal()) - physics.tip_pos()))
+
+  def advance(self, physics: Physics) -> float:
+    """Counts touches and misses."""
+    pressing = physics.peak_force > CONTACT
+    distance = self.distance(physics)
+    if pressing and distance <= self.tolerance:
+      self.event(physics, "target", distance, str(self.done + 1))
+      self.done += 1
+      self._aim(physics)
+    elif pressing and not self.pressing:
+      self.event(physics, "miss", distance)
+    self.pressing = pressing
+    if self.done == self.targets:
+      self.outcome = "success"
+      return 1.0
+    return (self.done + 0.9 * base.closeness(self.distance(physics), self.distance0)) / self.targets
+
+  def observe(self, physics: Physics) -> dict[str, np.ndarray]:
+    """Returns target and normal."""
+    goal = self.goal()
+    return {
+      "target": physics.point(goal) - physics.tip_pos(),
+      "normal": physics.normals()[goal],
+    }
+
+  def reference_length(self) -> float:
+    """Returns the length of the straight lines from point to point [m]."""
+    return self._path
+
+
+def draw_apart(
+  random: np.random.RandomState, physics: Physics, place: np.ndarray, count: int, gap: float
+) -> list[int]:
+  """Returns triangles at least `gap` [m] apart, or as far as the place allows."""
+  middle = physics.organ.xpos[physics.organ.elem].mean(axis=1)
+  chosen = [int(random.choice(place))]
+  while len(chosen) < count:
+    distance = np.linalg.norm(middle[place][:, None] - middle[chosen], axis=2).min(axis=1)
+    far = place[distance >= min(gap, 0.8 * distance.max())]
+    chosen.append(int(random.choice(far)))
+  return chosen

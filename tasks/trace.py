@@ -1,0 +1,192 @@
+"""Trace: follow a curve drawn on the stomach with the probe, in light contact.
+
+Own observations: `target` (3,), from the tip to the next point of the curve [m]; `ahead` (3, 3),
+from the tip to points 5, 10 and 15 mm further along the curve [m].
+
+Progress: 0.1 * max(0, 1 - distance to the curve's start / distance at the start) until the first
+point is touched, then 0.1 + 0.9 * share of the curve done. The curve is done up to a point when the
+tip presses with 0.02 N or more within the tolerance of it, in order. Success: all of it. Failure: a
+force above the damage limit, or the time limit.
+"""
+
+import dataclasses
+
+import numpy as np
+from dm_control.utils import containers
+from scipy.spatial import cKDTree
+
+from . import base
+from .base import Physics, Task
+from .scenes import Scene
+
+SUITE = containers.TaggedTasks()
+STOMACH = Scene(organ="stomach", center="body", port=(0.03, 0.045, 0.12), camera=(-0.05, 0.1, 0.14))
+CONTACT = 0.02  # [N]
+_STEP = 0.0015  # between points of the curve [m]
+_ATTEMPTS = 40
+_FACING = 0.7  # least cosine between the surface's normal and the way to the trocar
+_MARKS = 30  # spheres that draw the curve
+
+
+@SUITE.add("benchmarking", "easy")
+def easy(time_limit=20, random=None, environment_kwargs=None, **kwargs):
+  """Returns the task to trace an arc of about 40 mm within 5 mm."""
+  kwargs = {"size": 0.02, "turns": 0.0, "tolerance": 0.005, **kwargs}
+  task = Trace(dataclasses.replace(STOMACH, nodes=250), random, name="trace/easy", **kwargs)
+  return base.make(task, time_limit, environment_kwargs)
+
+
+@SUITE.add("benchmarking")
+def standard(time_limit=30, random=None, environment_kwargs=None, **kwargs):
+  """Returns the task to trace an S of about 60 mm within 3.5 mm."""
+  kwargs = {"size": 0.025, "turns": 1.0, "tolerance": 0.0035, "jitter": 0.005, **kwargs}
+  task = Trace(dataclasses.replace(STOMACH, nodes=500), random, name="trace/standard", **kwargs)
+  return base.make(task, time_limit, environment_kwargs)
+
+
+@SUITE.add("benchmarking", "hard")
+def hard(time_limit=40, random=None, environment_kwargs=None, **kwargs):
+  """Returns the task to trace a double S of about 80 mm within 3 mm, on stomachs that vary."""
+  kwargs = {"size": 0.026, "turns": 2.0, "tolerance": 0.003, "jitter": 0.005, **kwargs}
+  kwargs = {"variants": (None, 1, 2), "force_limit": 0.5, "damage": 2.0, **kwargs}
+  task = Trace(dataclasses.replace(STOMACH, nodes=1000), random, name="trace/hard", **kwargs)
+  return base.make(task, time_limit, environment_kwargs)
+
+
+class Trace(Task):
+  """Follow a curve in light contact."""
+
+  watch = ("miss", "unintended_contact", "drop")
+
+  def __init__(
+    self,
+    scene: Scene,
+    random=None,
+    *,
+    name: str,
+    size: float,
+    turns: float,
+    tolerance: float,
+    **kwargs,
+  ):
+    """Makes the task.
+
+    Args:
+      scene: what it plays in
+      random: see Task
+      name: domain and task
+      size: half the width of the curve [m]
+      turns: how often it waves; 0 is an arc
+      tolerance: largest distance of the tip from the curve [m]
+      **kwargs: see Task
+    """
+    self.name, self.targets = name, _MARKS
+    self.size, self.turns, self.tolerance = size, turns, tolerance
+    kwargs = {"spread": 0.03, **kwargs}
+    super().__init__(dataclasses.replace(scene, targets=_MARKS), random, **kwargs)
+
+  def begin(self, physics: Physics) -> None:
+    """Draws the curve: a wave in the plane across the shaft, dropped on the surface."""
+    place, center = self.place_of_work(physics)
+    for attempt in range(_ATTEMPTS):  # where the organ is narrow a curve may fall off its edge
+      if attempt:
+        center = physics.point(self.random.choice(place))
+      drawn = self._draw(physics, center, self.size * 0.98**attempt)
+      if drawn is not None:
+        self.curve, self.triangles, self.weights = drawn
+        break
+    else:
+      raise ValueError(f"{self.name}: no room for the curve under the shaft")
+    gaps = np.linalg.norm(np.diff(self.curve, axis=0), axis=1)
+    self.length = float(gaps.sum())
+    self.done, self._touching = 0, False
+    self.distance0 = self.distance(physics)
+    for i, k in enumerate(np.linspace(0, len(self.curve) - 1, _MARKS).round().astype(int)):
+      physics.mark(i, self.curve[k])
+      physics.model.site_size[physics._targets[i]] = 0.0015
+
+  def _draw(self, physics: Physics, center: np.ndarray, size: float):
+    """Returns points, triangles and weights in them; None where the curve leaves the place."""
+    port = physics.trocar()
+    across = port.mat[:, :2]
+    angle = self.random.uniform(0, 2 * np.pi)
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    t = np.linspace(-1, 1, 160)
+    bend = self.random.uniform(0.25, 0.4) * self.random.choice([-1, 1])
+    if self.turns:
+      wave = bend * np.sin(self.turns * np.pi * t)
+    else:
+      wave = bend * (1 - t**2)
+    flat = size * np.stack([t, wave], axis=1) @ turn.T
+    start = center + flat @ across.T
+    # Drop along the shaft: the triangle hit from outside that is nearest to the trocar.
+    points, triangles, weights = [], [], []
+    organ, x = physics.organ, physics.organ.xpos
+    a, b, c = np.moveaxis(x[organ.elem], 1, 0)
+    e1, e2, ray = b - a, c - a, -port.mat[:, 2]
+    p = np.cross(ray, e2)
+    with np.errstate(divide="ignore", invalid="ignore"):
+      scale = 1 / np.einsum("ij,ij->i", e1, p)
+      for origin in start - 0.1 * ray:
+        s = origin - a
+        q = np.cross(s, e1)
+        u, v = np.einsum("ij,ij->i", s, p) * scale, (q @ ray) * scale
+        far = np.einsum("ij,ij->i", e2, q) * scale
+        hit = np.flatnonzero((u >= 0) & (v >= 0) & (u + v <= 1) & (far > 0))
+        if len(hit):
+          k = int(hit[np.argmin(far[hit])])
+          points.append(origin + far[k] * ray)
+          triangles.append(k)
+          weights.append((1 - u[k] - v[k], u[k], v[k]))
+    gaps = np.linalg.norm(np.diff(points, axis=0), axis=1) if len(points) == len(start) else [1.0]
+    if np.max(gaps) > _STEP or (physics.normals()[triangles] @ -ray).min() < _FACING:
+      return None
+    along = np.concatenate([[0], np.linalg.norm(np.diff(points, axis=0), axis=1).cumsum()])
+    keep = np.unique(np.searchsorted(along, np.arange(0, along[-1], _STEP)))
+    return np.array(points)[keep], np.array(triangles)[keep], np.array(weights)[keep]
+
+  def now(self, physics: Physics) -> np.ndarray:
+    """Returns where the curve is on the deformed organ [m]  (npoint, 3)."""
+    corner = physics.organ.xpos[physics.organ.elem[self.triangles]]
+    return np.einsum("ij,ijk->ik", self.weights, corner)
+
+  def distance(self, physics: Physics) -> float:
+    """Returns how far the tip is from the next point of the curve [m]."""
+    k = min(self.done, len(self.curve) - 1)
+    return float(np.linalg.norm(self.now(physics)[k] - physics.tip_pos()))
+
+  def advance(self, physics: Physics) -> float:
+    """Follows the tip along the curve."""
+    touching = physics.peak_force > CONTACT
+    curve, tip = self.now(physics), physics.tip_pos()
+    if touching:
+      while self.done < len(curve) and np.linalg.norm(curve[self.done] - tip) <= self.tolerance:
+        self.done += 1
+    elif self._touching and 0 < self.done < len(curve):
+      self.event(physics, "drop", label="contact lost")
+    if touching and not self._touching:
+      off = float(cKDTree(curve).query(tip)[0])
+      if off > self.tolerance:
+        self.event(physics, "miss", off)
+    self._touching = touching
+    if self.done == len(curve):
+      self.outcome = "success"
+      return 1.0
+    if not self.done:
+      return 0.1 * base.closeness(self.distance(physics), self.distance0)
+    return 0.1 + 0.9 * self.done / len(curve)
+
+  def observe(self, physics: Physics) -> dict[str, np.ndarray]:
+    """Returns target and ahead."""
+    curve = self.now(physics) - physics.tip_pos()
+    last = len(curve) - 1
+    further = [min(self.done + round(d / _STEP), last) for d in (0.005, 0.01, 0.015)]
+    return {"target": curve[min(self.done, last)], "ahead": curve[further]}
+
+  def constants(self, physics: Physics) -> dict[str, np.ndarray]:
+    """Returns the curve to trace [m]."""
+    return {"curve": self.curve}
+
+  def reference_length(self) -> float:
+    """Returns the length of the curve and of the way to it [m]."""
+    return self.length + self.distance0

@@ -1,0 +1,261 @@
+"""Short forms of the benches: what a user would notice if it were wrong."""
+
+import json
+import math
+import pathlib
+
+import mujoco
+import numpy as np
+import palpate
+import pytest
+from palpate import cli, energy
+from palpate.bench import error, exact, runner, scene, skipping, stability, thesis
+from palpate.config import Config
+
+BENCHES = {b.name: b for b in (error.BENCH, stability.BENCH, thesis.BENCH, skipping.BENCH)}
+ELEMENTS = {"membrane": {}, "spring": {"elements": "spring", "stiffness": 50.0}}
+
+
+def rows_of(name: str, out: pathlib.Path) -> list[dict]:
+  return runner.read(out / f"{name}.csv")
+
+
+def command(*words) -> int:
+  return cli.main(["bench", *map(str, words)])
+
+
+@pytest.fixture(scope="module")
+def error_rows(tmp_path_factory):
+  out = tmp_path_factory.mktemp("error")
+  assert command("error", "--short", "--jobs", 1, "--out", out) == 0
+  return out, rows_of("error", out)
+
+
+def only(rows, **what):
+  return [r for r in rows if all(r[k] == v for k, v in what.items())]
+
+
+# The float64 reference.
+
+
+@pytest.mark.parametrize("elements", ELEMENTS)
+def test_float64_force_is_minus_the_gradient_of_the_energy(elements):
+  mesh = scene.shape("sphere", 162)
+  config = Config(young=(3e4,), poisson=0.3, bend=0, foundation=2e5, **ELEMENTS[elements])
+  own = exact.Elastic(mesh, config)
+  random = np.random.RandomState(0)
+  u, along = 1e-3 * random.standard_normal((2, mesh.nvert, 3))
+  assert own.energy(u) == pytest.approx(energy.total(mesh, config, u), rel=1e-12)
+  step = 1e-4
+  slope = (own.energy(u + step * along) - own.energy(u - step * along)) / (2 * step)
+  assert -(own.force(u) * along).sum() == pytest.approx(slope, rel=1e-6)
+  k = own.stiffness(u)
+  v = random.standard_normal((mesh.nvert, 3))
+  damped = -config.damping * (k @ v.ravel()).reshape(-1, 3)
+  np.testing.assert_allclose(own.force(u, v) - own.force(u), damped, atol=1e-9 * abs(damped).max())
+
+
+@pytest.mark.parametrize("newton", [1, 3])
+@pytest.mark.parametrize("elements", ELEMENTS)
+def test_a_step_of_the_organ_is_the_float64_step(elements, newton):
+  mesh = scene.shape("sphere", 162)
+  tissue = scene.Tissue(**ELEMENTS[elements])
+  keys = {"newton": newton, "tolerance": 1e-6, "iterations": 200}
+  model = scene.build(mesh, tissue, "implicit", 1e-3, **keys)
+  data = mujoco.MjData(model)
+  nodes = scene.node_dofs(model, mesh.nvert)
+  random = np.random.RandomState(1)
+  u, v = 1e-3 * random.standard_normal((mesh.nvert, 3)), random.standard_normal((mesh.nvert, 3)) / 9
+  data.qpos[nodes], data.qvel[nodes] = u, v
+  mujoco.mj_step(model, data)
+  config = Config(young=(3e4,), poisson=0.3, bend=0, foundation=2e5, **ELEMENTS[elements])
+  mass = np.full(mesh.nvert, tissue.mass / mesh.nvert)
+  step = exact.Step(exact.Elastic(mesh, config), mass, np.ones(mesh.nvert, bool))
+  expected = step(1e-3, u, v, np.zeros_like(u), newton)
+  gap = np.linalg.norm(data.qvel[nodes] - v - expected)
+  assert gap < 1e-5 * np.linalg.norm(expected)  # the tolerance, and float32
+
+
+def test_native_flex_gets_the_same_static_force():
+  # The documented constants mean the same on both sides: a press at rest, small time step.
+  found = []
+  for scheme in ("implicit", scene.NATIVE):
+    case = {"scene": "press", "nodes": 162, "elements": "membrane"}
+    model = error._build(case, scheme, 2.5e-4)
+    film = error._Film(case, model)
+    film.move(0.15)
+    found.append(film.force[-1][2])
+  assert found[0] > 0.1
+  assert found[1] == pytest.approx(found[0], rel=0.02)  # MuJoCo's contacts give with h
+
+
+# Error.
+
+
+def test_error_bench_fills_its_files(error_rows):
+  out, rows = error_rows
+  about = json.loads((out / "error.json").read_text())
+  assert about["done"] == about["cases"] == 10
+  assert {"palpate", "mujoco", "warp", "cpu", "seed", "python"} <= set(about)
+  assert about["palpate"] == palpate.__version__
+  assert {r["status"] for r in rows} == {"ok"}
+  for name in ("error_press.png", "error_vibrate.png"):
+    assert (out / name).read_bytes().startswith(b"\x89PNG")
+  page = (out / "error.md").read_text()
+  assert "palpate bench error --short" in page and "wins" in page
+
+
+@pytest.mark.parametrize("run", ["implicit", "implicit, 3 Newton", "native"])
+def test_force_error_falls_with_the_time_step(error_rows, run):
+  rows = sorted(only(error_rows[1], run=run, scene="press"), key=lambda r: r["h"])
+  errors = [r["force_rms"] for r in rows]
+  assert len(errors) == 3 and errors == sorted(errors)
+
+
+@pytest.mark.parametrize("scheme", ["implicit", "implicit, 3 Newton"])
+def test_implicit_scheme_is_of_first_order(error_rows, scheme):
+  rows = only(error_rows[1], run=scheme, scene="press")
+  assert error.order(rows, "force_rms", most=2.1e-3) >= 0.9
+  assert error.order(rows, "position_rms", most=2.1e-3) >= 0.9
+
+
+def test_implicit_scheme_solves_its_step_to_the_tolerance(error_rows):
+  for row in only(error_rows[1], run="implicit"):
+    assert row["algebraic"] < 1e-3  # tolerance 1e-4 in another norm
+  (row,) = only(error_rows[1], run="implicit, 3 Newton", scene="press", h=1e-3)
+  assert row["nonlinear"] < 1e-3
+
+
+def test_implicit_force_is_closer_than_native_at_the_same_time_step(error_rows):
+  for h in (5e-4, 1e-3, 2e-3):
+    ours, native = (
+      only(error_rows[1], run=run, scene="press", h=h)[0] for run in ("implicit", "native")
+    )
+    assert ours["force_rms"] < native["force_rms"]
+    assert ours["force_rms"] < 0.015
+
+
+# Stability.
+
+
+def test_stability_bench_judges_every_case_and_resumes(tmp_path, capsys, monkeypatch):
+  whole = stability.stages(short=True)
+  few = [[c for c in whole[0] if c["scheme"] == "implicit" and c["nodes"] == 162][-3:]]
+  bench = stability.BENCH
+  small = type(bench)(**{**vars(bench), "stages": lambda short: few})
+  assert not runner.execute(small, tmp_path, short=True, seconds=0)
+  assert rows_of("stability", tmp_path) == []
+  assert runner.execute(small, tmp_path, short=True, resume=True)
+  rows = rows_of("stability", tmp_path)
+  assert {r["case"] for r in rows} == {c["case"] for c in few[0]}
+  assert {r["verdict"] for r in rows} <= set(stability.VERDICTS)
+  # A row cut short by a kill is run again; the others are not.
+  path = tmp_path / "stability.csv"
+  kept = path.read_text().splitlines(keepends=True)
+  path.write_text("".join(kept[:-1]) + kept[-1][:20])
+  assert runner.execute(small, tmp_path, short=True, resume=True)
+  assert path.read_text().splitlines(keepends=True)[:-1] == kept[:-1]
+  assert len(rows_of("stability", tmp_path)) == len(rows)
+  for written in runner.report(small, tmp_path):
+    assert written.stat().st_size > 0
+
+
+def test_stability_bench_covers_what_it_says():
+  cases = stability.stages(short=False)[0]
+  ours = [c for c in cases if c["scheme"] == "implicit"]
+  assert len(ours) >= 1000
+  assert len({c["case"] for c in cases}) == len(cases)
+  assert {c["nodes"] for c in ours} == {162, 642, 2562, 10242}
+  assert {c["shape"] for c in ours} >= set(scene.SHAPES) and len(scene.SHAPES) == 3
+  assert {c["start"] for c in ours} == {"rest", *stability.STARTS}
+  for key, low, high in (("h", 6e-4, 1.9e-2), ("young", 1.5e2, 8e6), ("speed", 0.03, 1.9)):
+    assert min(c[key] for c in ours) < low and max(c[key] for c in ours) > high
+  mass = [c["mass"] for c in ours]
+  assert max(mass) / min(mass) > 0.9e4
+  assert stability.stages(short=False) == stability.stages(short=False)
+
+
+@pytest.mark.parametrize(("h", "young"), [(5e-4, 1e3), (1e-3, 1e5), (5e-3, 1e4), (5e-3, 1e6)])
+def test_a_press_in_the_usual_range_comes_back_to_rest(tmp_path, h, young):
+  case = stability.USUAL | {"set": "map", "scheme": "implicit", "h": h, "young": young}
+  (row,) = stability.run(case | {"nodes": 162, "case": "x"}, tmp_path)
+  assert row["verdict"] in ("rest", "moving")
+  assert row["growth"] <= 1.0
+  assert row["force_N"] > 0
+
+
+def test_an_explicit_step_that_blows_up_is_called_so(tmp_path):
+  case = stability.USUAL | {"set": "map", "scheme": "explicit", "h": 1e-2, "young": 1e6}
+  (row,) = stability.run(case | {"nodes": 162, "case": "x"}, tmp_path)
+  assert row["verdict"] in stability.FAILURES
+
+
+# Thesis and skipping.
+
+
+def test_thesis_bench_measures_every_scheme(tmp_path):
+  out = tmp_path
+  bench = type(thesis.BENCH)(
+    **{**vars(thesis.BENCH), "stages": lambda short: [thesis.stages(True)[0][:5]]}
+  )
+  assert runner.execute(bench, out, short=True)
+  runner.report(bench, out)
+  rates = [r for r in rows_of("thesis", out) if r["kind"] == "rate" and r["device"] == "cpu"]
+  assert {r["scheme"] for r in rates} == {"implicit", "neumann", "explicit"}
+  assert all(r["rate_hz"] > 0 and 0 < r["integration_ms"] < 1e3 for r in rates)
+  traces = [r for r in rows_of("thesis", out) if r["kind"] == "trace"]
+  for scheme in ("implicit", "explicit"):
+    force = [r["force_N"] for r in traces if r["scheme"] == scheme and r["device"] == "cpu"]
+    assert max(force) > 0.1 and force[-1] == 0
+  assert "560 / " in (out / "thesis.md").read_text()
+
+
+def test_skipping_bench_gives_a_row_to_every_feature(tmp_path):
+  assert command("skipping", "--short", "--out", tmp_path) == 0
+  rows = rows_of("skipping", tmp_path)
+  left_out = {r["feature"].split(" ")[0] for r in rows}
+  assert {"nothing", "bending", "volume", "foundation", "contact", "readback"} <= left_out
+  assert all(math.isfinite(r["with_ms"]) and r["with_ms"] > 0 for r in rows)
+
+
+# The runner.
+
+
+def test_a_case_that_fails_or_dies_is_noted_and_the_rest_goes_on(tmp_path):
+  bench = type(error.BENCH)(
+    **{**vars(error.BENCH), "stages": lambda short: [[
+      {"case": "bad", "kind": "run", "scene": "press", "nodes": 162, "elements": "membrane",
+       "h": 1e-3, "short": 1},  # has no reference
+      {"case": "good", "kind": "reference", "scene": "vibrate", "nodes": 162,
+       "elements": "membrane", "level": 8},
+    ]]}
+  )  # fmt: skip
+  assert runner.execute(bench, tmp_path)
+  status = {r["case"]: r["status"] for r in rows_of("error", tmp_path)}
+  assert status["bad"].startswith("error: ValueError: no reference")
+  assert status["good"] == "ok"
+
+
+def test_starting_over_keeps_the_old_rows_aside(tmp_path):
+  bench = type(error.BENCH)(**{**vars(error.BENCH), "stages": lambda short: []})
+  (tmp_path / "error.csv").write_text("case,status\nold,ok\n")
+  runner.execute(bench, tmp_path)
+  assert (tmp_path / "error.csv.old").read_text() == "case,status\nold,ok\n"
+  assert rows_of("error", tmp_path) == []
+
+
+@pytest.mark.parametrize("name", BENCHES)
+def test_every_bench_is_a_command_with_help(name, capsys):
+  with pytest.raises(SystemExit) as end:
+    command(name, "--help")
+  assert end.value.code == 0
+  text = capsys.readouterr().out
+  for option in ("--short", "--resume", "--jobs", "--minutes", "--out"):
+    assert option in text
+
+
+def test_wrong_options_are_refused_in_one_line(tmp_path, capsys):
+  assert command("error", "--jobs", 0, "--out", tmp_path) == 2
+  assert "jobs is 0" in capsys.readouterr().err
+  assert command("error", "--draw", "--out", tmp_path) == 1
+  assert "expected the rows of an earlier run" in capsys.readouterr().err

@@ -1,0 +1,199 @@
+"""The organs' files and the loader."""
+
+import pathlib
+
+import mujoco
+import numpy as np
+import palpate
+import pytest
+from dm_control import mujoco as dm_mujoco
+from palpate import models
+from palpate.models import build, catalog, scene, shapes
+
+NAMES = models.NAMES
+
+
+@pytest.fixture(autouse=True)
+def _log_nothing(tmp_path, monkeypatch):
+  """MuJoCo writes its warnings to a file in the working folder: there must be none."""
+  monkeypatch.chdir(tmp_path)
+  yield
+  assert not (tmp_path / "MUJOCO_LOG.TXT").exists(), (tmp_path / "MUJOCO_LOG.TXT").read_text()
+
+
+def _attached(name: str, *prefixes: str) -> mujoco.MjSpec:
+  spec = mujoco.MjSpec()
+  for i, prefix in enumerate(prefixes):
+    child = mujoco.MjSpec.from_file(str(models.path(name, scene=False)))
+    frame = spec.worldbody.add_frame(pos=[0.5 * i, 0, 0], quat=[0.8, 0, 0.6 * i, 0.6 * (1 - i)])
+    spec.attach(child, prefix=prefix, frame=frame)
+  return spec
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_organ_and_scene_files_load(name):
+  for path in (models.path(name, scene=False), models.path(name)):
+    model = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data)
+    assert not sum(int(w.number) for w in data.warning)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_files_are_what_the_source_makes(name):
+  files = build.files(name)
+  assert len(files) == 3
+  for path, text in files.items():
+    assert path.read_bytes() == text.encode(), f"{path.name}: run python -m palpate.models.build"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_folder_is_complete(name):
+  folder = models.path(name).parent
+  picture = folder / f"{name}.png"
+  assert picture.stat().st_size < 200_000
+  readme = (folder / "README.md").read_text()
+  for word in (picture.name, "Young", "Apache-2.0", f"{catalog.entry(name).young:g}"):
+    assert word in readme
+
+
+@pytest.mark.parametrize("nodes", models.RESOLUTIONS[:3])
+def test_resolution(nodes):
+  model = models.load("kidney", nodes, instruments=()).compile()
+  organ = palpate.Organ(model, mujoco.MjData(model), "kidney/kidney")
+  assert abs(organ.nvert - nodes) <= 0.1 * nodes
+  assert np.isfinite(organ.volume)
+  entry = catalog.entry("kidney")
+  volume = entry.density * organ.volume
+  mass = model.body_mass[np.unique(model.flex_vertbodyid)].sum()
+  np.testing.assert_allclose(mass, volume, rtol=0.1)  # pinned nodes carry none
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", catalog.NAMES)
+def test_finest_resolution(name):
+  model = models.load(name, 16000, instruments=()).compile()
+  assert abs(model.nflexvert - 16000) <= 1600
+
+
+@pytest.mark.parametrize("side", [16, 32])
+def test_grid(side):
+  spec = models.organ("gallbladder", grid=side)
+  model = spec.compile()
+  assert model.nflexvert == side * side + 2
+  assert palpate.Organ(model, mujoco.MjData(model), "gallbladder").volume > 0
+
+
+def test_seed_is_a_variant_and_repeats():
+  first, again, other = (scene.Body(catalog.entry("kidney"), 250, 0, s) for s in (3, 3, 4))
+  np.testing.assert_array_equal(first.vertices, again.vertices)
+  assert abs(first.volume / other.volume - 1) > 1e-3
+  assert models.load("kidney", 250, seed=3).compile().nflexvert == len(first.vertices)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_patches_are_pinned_and_sites_on_the_surface(name):
+  model = mujoco.MjModel.from_xml_path(str(models.path(name, scene=False)))
+  data = mujoco.MjData(model)
+  mujoco.mj_forward(model, data)
+  organ = palpate.Organ(model, data, name)
+  entry = catalog.entry(name)
+  pins = np.concatenate(list(shapes.patches(entry.shape, organ.xpos0).values()))
+  np.testing.assert_array_equal(np.flatnonzero(~organ.free), np.unique(pins))
+  spacing = np.sqrt(np.linalg.norm(np.ptp(organ.xpos0, axis=0)) ** 2 / organ.nvert)
+  for mark in shapes.landmarks(entry.shape):
+    site = data.site(f"{name}_{mark}").xpos
+    assert np.linalg.norm(organ.xpos0 - site, axis=1).min() < spacing
+
+
+def test_inclusion_is_stiff_under_its_landmark():
+  model = mujoco.MjModel.from_xml_path(str(models.path("liver_inclusion", scene=False)))
+  data = mujoco.MjData(model)
+  organ = palpate.Organ(model, data, "liver_inclusion")
+  young = np.array(organ.config.young)
+  entry = catalog.entry("liver_inclusion")
+  assert len(young) == len(organ.elem)
+  middle = organ.xpos0[organ.elem].mean(axis=1)
+  mujoco.mj_forward(model, data)
+  site = data.site(f"liver_inclusion_{entry.inclusion.landmark}").xpos
+  distance = np.linalg.norm(middle - site, axis=1)
+  assert young[np.argmin(distance)] > 0.7 * entry.inclusion.young
+  np.testing.assert_allclose(young[distance > 0.1], entry.young)
+
+
+@pytest.mark.parametrize("name", ["liver", "liver_inclusion", "gallbladder"])
+def test_attaches_twice(name):
+  model = _attached(name, "a/", "b/").compile()
+  data = mujoco.MjData(model)
+  a, b = (palpate.Organ(model, data, f"{prefix}/{name}") for prefix in "ab")
+  assert model.nplugin == 2
+  assert a.config == b.config
+  force = np.zeros(3)
+  body = model.flex_vertbodyid[np.flatnonzero(a.free)[0]]
+  data.xfrc_applied[body, 2] = 0.1
+  model.opt.gravity = force
+  for _ in range(20):
+    mujoco.mj_step(model, data)
+  assert np.abs(a.displacement).max() > 1e-5
+  assert np.abs(b.displacement).max() < 1e-8  # rest edges are rounded to float32
+
+
+def test_mjcf_attach_and_include_twice(tmp_path):
+  organ = models.path("kidney", scene=False)
+  text = f"""<mujoco><asset><model name="k" file="{organ}"/></asset><worldbody>
+    <frame pos="0 0 0.3" euler="30 0 50"><attach model="k" prefix="one/"/></frame>
+    <attach model="k" prefix="two/"/></worldbody></mujoco>"""
+  model = mujoco.MjModel.from_xml_string(text)
+  for prefix in ("one", "two"):
+    palpate.Organ(model, mujoco.MjData(model), f"{prefix}/kidney")
+  file = tmp_path / "scene.xml"
+  file.write_text(f'<mujoco><include file="{organ}"/></mujoco>')
+  for asset in (organ.parent / "assets").iterdir():
+    (tmp_path / "assets").mkdir(exist_ok=True)
+    (tmp_path / "assets" / asset.name).write_bytes(asset.read_bytes())
+  assert mujoco.MjModel.from_xml_path(str(file)).nflex == 1
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_dm_control(name):
+  physics = dm_mujoco.Physics.from_xml_path(str(models.path(name)))
+  physics.reset(keyframe_id=physics.model.name2id("press", "key"))
+  physics.step(nstep=100)
+  assert np.isfinite(physics.data.qpos).all()
+  assert physics.named.data.site_xpos["probe/tip"].shape == (3,)
+
+
+def test_liver_rests_under_gravity():
+  """Weight sags the organ that stands alone; then it is still: < 0.1 mm from 1.5 to 2 s."""
+  model = mujoco.MjModel.from_xml_path(str(models.path("liver", scene=False)))
+  model.opt.timestep = 0.002
+  data = mujoco.MjData(model)
+  organ = palpate.Organ(model, data, "liver")
+  assert model.opt.gravity[2] < -9
+  for _ in range(750):
+    mujoco.mj_step(model, data)
+  before = organ.displacement
+  for _ in range(250):
+    mujoco.mj_step(model, data)
+  assert np.abs(organ.displacement - before).max() < 1e-4
+  assert 1e-4 < np.abs(before).max() < 5e-3
+
+
+def test_bad_input():
+  with pytest.raises(ValueError, match="'spleen', expected one of liver, liver_inclusion, stom"):
+    models.load("spleen")
+  with pytest.raises(ValueError, match="'spleen', expected one of"):
+    models.path("spleen")
+  with pytest.raises(ValueError, match="'liver': nodes is 300, expected one of 250, 1000, 4000"):
+    models.load("liver", 300)
+  with pytest.raises(ValueError, match="'liver': grid is 20, expected one of 16, 32, 64, 128, 256"):
+    models.organ("liver", grid=20)
+  with pytest.raises(ValueError, match="'scalpel', expected one of probe, grasper, scissors, hook"):
+    models.load("liver", instruments=("scalpel",))
+  with pytest.raises(ValueError, match="3 names, expected at most two"):
+    models.load("liver", instruments=("probe",) * 3)
+  with pytest.raises(ValueError, match="expected a tuple such as"):
+    models.load("liver", instruments="probe")
+  with pytest.raises(ValueError, match="seed is -1, expected"):
+    models.load("liver", seed=-1)
+  assert all(isinstance(models.path(name), pathlib.Path) for name in NAMES)

@@ -1,0 +1,171 @@
+import numpy as np
+import pytest
+from palpate.models import volume as volumes
+from palpate.models.quality import normals, quality
+from palpate.models.quality import volume as enclosed
+
+nibabel = pytest.importorskip("nibabel")
+nrrd = pytest.importorskip("nrrd")
+
+CENTER = np.array([0.012, -0.034, 0.051])  # [m]
+RADII = np.array([0.030, 0.022, 0.026])  # [m]
+
+
+def rotation(degrees=35.0):
+  """Returns a rotation about a skew axis."""
+  axis = np.array([1.0, 2.0, -1.0]) / np.sqrt(6)
+  a, cross = np.radians(degrees), np.cross(np.eye(3), axis)
+  return np.eye(3) + np.sin(a) * cross + (1 - np.cos(a)) * cross @ cross
+
+
+def grid(spacing, turn, shape=(64, 60, 56)):
+  """Returns an affine map from indices to metres with the ellipsoid's middle inside."""
+  affine = np.eye(4)
+  affine[:3, :3] = turn @ np.diag(spacing)
+  affine[:3, 3] = CENTER - affine[:3, :3] @ (np.array(shape) / 2.1)
+  return affine
+
+
+def ellipsoid(affine, shape=(64, 60, 56), radii=RADII, label=1):
+  """Returns the label map of an ellipsoid that stands upright in the world."""
+  index = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1)
+  world = index @ affine[:3, :3].T + affine[:3, 3]
+  inside = (((world - CENTER) / radii) ** 2).sum(axis=-1) < 1
+  return np.where(inside, label, 0).astype(np.int16)
+
+
+GRIDS = {
+  "even": grid([1.2e-3] * 3, np.eye(3)),
+  "thick slices": grid([0.9e-3, 0.9e-3, 2.5e-3], np.eye(3), (84, 84, 30)),
+  "oblique": grid([1.2e-3, 1.0e-3, 1.6e-3], rotation()),
+  "mirrored": grid([1.2e-3, 1.2e-3, 1.4e-3], np.diag([-1.0, 1.0, 1.0])),
+}
+SHAPES = {"thick slices": (84, 84, 30)}
+
+
+def moments(vertices, triangles):
+  """Returns the centroid of the solid inside a surface."""
+  corner = vertices[triangles] - CENTER
+  share = (corner[:, 0] * np.cross(corner[:, 1], corner[:, 2])).sum(axis=1) / 6
+  return CENTER + share @ corner.sum(axis=1) / 4 / share.sum()
+
+
+@pytest.mark.parametrize("name", GRIDS)
+def test_surface_is_the_ellipsoid(name):
+  affine, shape = GRIDS[name], SHAPES.get(name, (64, 60, 56))
+  vertices, triangles = volumes.surface(ellipsoid(affine, shape), affine)
+  q = quality(vertices, triangles)
+  assert q.closed, q  # positive volume: outward, mirrored or not
+  # Smoothing over s = 0.6 voxel edges moves the surface in by s^2 / r, 1 % of the volume at 2.5 mm.
+  expected = 4 / 3 * np.pi * RADII.prod()
+  assert enclosed(vertices, triangles) == pytest.approx(expected, rel=0.03)
+  np.testing.assert_allclose(moments(vertices, triangles), CENTER, atol=2e-4)
+  np.testing.assert_allclose(np.ptp(vertices, axis=0), 2 * RADII, atol=1.5e-3)
+
+
+def save_nifti(path, labels, affine, unit="mm"):
+  scale = {"mm": 1e3, "meter": 1.0, "micron": 1e6}[unit]
+  image = nibabel.Nifti1Image(labels, np.diag([scale, scale, scale, 1]) @ affine)
+  image.header.set_xyzt_units(unit)
+  nibabel.save(image, path)
+
+
+def save_nrrd(path, labels, affine, space="right-anterior-superior", sign=(1, 1, 1)):
+  affine = np.diag([*(1e3 * np.array(sign)), 1.0]) @ affine
+  header = {
+    "space": space,
+    "space directions": affine[:3, :3].T,
+    "space origin": affine[:3, 3],
+    "kinds": ["domain"] * 3,
+  }
+  nrrd.write(str(path), labels, header)
+
+
+@pytest.mark.parametrize("unit", ["mm", "meter", "micron"])
+@pytest.mark.parametrize("ending", ["nii", "nii.gz"])
+def test_nifti_keeps_place_and_units(ending, unit, tmp_path):
+  path, affine = tmp_path / f"scan.{ending}", GRIDS["oblique"]
+  labels = ellipsoid(affine)
+  save_nifti(path, labels, affine, unit)
+  found, found_affine = volumes.read(path)
+  np.testing.assert_array_equal(found, labels)
+  np.testing.assert_allclose(found_affine, affine, rtol=1e-5, atol=1e-8)  # stored as float32
+
+
+@pytest.mark.parametrize(
+  ("space", "sign"),
+  [
+    ("right-anterior-superior", (1, 1, 1)),
+    ("left-posterior-superior", (-1, -1, 1)),
+    ("LPS", (-1, -1, 1)),
+    ("left-anterior-superior", (-1, 1, 1)),
+  ],
+)
+def test_nrrd_keeps_place(space, sign, tmp_path):
+  path, affine = tmp_path / "scan.nrrd", GRIDS["oblique"]
+  labels = ellipsoid(affine)
+  save_nrrd(path, labels, affine, space, sign)
+  found, found_affine = volumes.read(path)
+  np.testing.assert_array_equal(found, labels)
+  np.testing.assert_allclose(found_affine, affine, rtol=1e-9, atol=1e-12)
+
+
+def test_wrap_volume_makes_an_organ(tmp_path):
+  path, affine = tmp_path / "scan.nii.gz", GRIDS["oblique"]
+  labels = ellipsoid(affine, label=3)
+  labels[:5, :5, :5] = 7  # another organ in a corner
+  save_nifti(path, labels, affine)
+  vertices, triangles, report = volumes.wrap_volume(path, 500, label=3)
+  q = quality(vertices, triangles)
+  assert q.closed and q.nodes == 500 and q.min_angle > 20
+  assert report.foldovers == 0
+  # 500 nodes cut 1 % off, smoothing as above.
+  assert q.volume == pytest.approx(4 / 3 * np.pi * RADII.prod(), rel=0.04)
+  np.testing.assert_allclose(moments(vertices, triangles), CENTER, atol=3e-4)
+  up = normals(vertices, triangles)
+  out = vertices[triangles].mean(axis=1) - CENTER
+  assert (np.einsum("md,md->m", up, out) > 0).all()
+
+
+def test_label_at_the_border_is_closed():
+  labels = np.ones((20, 24, 16), dtype=np.int16)
+  vertices, triangles = volumes.surface(labels, np.diag([2e-3, 2e-3, 2e-3, 1]))
+  q = quality(vertices, triangles)
+  assert q.closed
+  assert q.volume == pytest.approx(20 * 24 * 16 * 8e-9, rel=0.05)  # edges are rounded
+
+
+def test_labels_are_listed(tmp_path):
+  path, affine = tmp_path / "scan.nii", GRIDS["even"]
+  labels = ellipsoid(affine, label=2)
+  labels[0, 0, 0] = 5
+  save_nifti(path, labels, affine)
+  with pytest.raises(ValueError, match=r"scan.nii: label is 4, .*in the volume: 2, 5"):
+    volumes.wrap_volume(path, label=4)
+  with pytest.raises(ValueError, match=r"label is not given, .*in the volume: 2, 5"):
+    volumes.wrap_volume(path)
+  with pytest.raises(ValueError, match="label 5 is too small, 1 voxels"):
+    volumes.wrap_volume(path, label=5)
+  with pytest.raises(ValueError, match="in the volume: none"):
+    volumes.surface(labels * 0, affine)
+
+
+def test_files_that_are_no_label_maps(tmp_path):
+  affine = np.eye(4)
+  with pytest.raises(ValueError, match=r"scan.dcm: .*\.nii, \.nii\.gz, \.nrrd"):
+    volumes.read(tmp_path / "scan.dcm")
+  with pytest.raises(FileNotFoundError, match="none"):
+    volumes.read(tmp_path / "none.nii")
+  for ending in ("nii", "nrrd"):
+    path = tmp_path / f"broken.{ending}"
+    path.write_bytes(b"nothing of use")
+    with pytest.raises(ValueError, match=rf"broken.{ending}: cannot be read"):
+      volumes.read(path)
+  path = tmp_path / "grey.nii"
+  nibabel.save(nibabel.Nifti1Image(np.full((4, 4, 4), 0.5, np.float32), affine), path)
+  with pytest.raises(ValueError, match=r"has the value 0.5, expected a label map"):
+    volumes.read(path)
+  path = tmp_path / "many.nii"
+  nibabel.save(nibabel.Nifti1Image(np.ones((4, 4, 4, 3), np.int16), affine), path)
+  with pytest.raises(ValueError, match="has 4 dimensions, expected a label map with 3"):
+    volumes.read(path)

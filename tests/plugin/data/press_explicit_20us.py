@@ -1,0 +1,97 @@
+"""Reference of the press: springs and foundation stepped explicitly, 20 us, in float64.
+
+A sphere of edge springs on a Winkler foundation is pressed 12 mm by a ball on a position actuator
+in 100 ms and held. Semi-implicit Euler through MuJoCo's passive callback: no plugin, no kernel.
+
+  python press_explicit_20us.py    writes press_explicit_20us.csv: time [s], force [N]
+"""
+
+import pathlib
+
+import mujoco
+import numpy as np
+import trimesh
+
+RADIUS = 0.05  # of the sphere [m]
+MASS = 0.1  # of all nodes [kg]
+STIFFNESS = 200.0  # of each spring [N/m]
+FOUNDATION = 4e4  # [Pa/m]
+DAMPING = 0.002  # Rayleigh coefficient [s]
+DEPTH = 0.012  # of the actuator [m]
+HOLD = 0.1  # when the depth is reached [s]
+DURATION = 0.25  # [s]
+STEP = 2e-5  # [s]
+EVERY = 1e-3  # between two rows [s]
+
+# Three slots: the plugin's declaration, its keys and the time step.
+MJCF = """
+<mujoco><option timestep="{h}" integrator="Euler" solver="Newton" tolerance="1e-10" gravity="0 0 0"/>
+<size memory="200M"/>{extension}
+<worldbody>
+  <flexcomp name="organ" type="direct" dim="2" mass="0.1" radius="0.0005" point="{point}" element="{element}">
+    {plugin}<contact selfcollide="none" condim="1" solref="0.004 1"/><edge damping="1e-9"/>
+  </flexcomp>
+  <body pos="0 0 0.0565"><joint name="z" type="slide" axis="0 0 1"/>
+    <geom size="0.006" mass="0.05" condim="1" solref="0.004 1"/></body>
+</worldbody>
+<actuator><position joint="z" kp="500" kv="10"/></actuator></mujoco>"""  # noqa: E501
+
+
+def surface() -> trimesh.Trimesh:
+  """Returns the sphere."""
+  return trimesh.creation.icosphere(subdivisions=3, radius=RADIUS)
+
+
+def mjcf(h: float, extension: str = "", plugin: str = "") -> str:
+  """Returns the scene."""
+  mesh = surface()
+  point = " ".join(f"{x:.17g}" for x in mesh.vertices.ravel())
+  element = " ".join(map(str, mesh.faces.ravel()))
+  return MJCF.format(h=h, point=point, element=element, extension=extension, plugin=plugin)
+
+
+def press(model: mujoco.MjModel, duration: float = DURATION) -> np.ndarray:
+  """Returns time and contact force on the ball of each millisecond, (nrow, 2)."""
+  data = mujoco.MjData(model)
+  h = model.opt.timestep
+  every, rows = max(1, round(EVERY / h)), []
+  for step in range(round(duration / h)):
+    data.ctrl[0] = -DEPTH * min(1, data.time / HOLD)
+    mujoco.mj_step(model, data)
+    if (step + 1) % every == 0:
+      rows.append((data.time, data.qfrc_constraint[model.nv - 1]))
+  return np.array(rows)
+
+
+def reference(duration: float = DURATION) -> np.ndarray:
+  """Returns the explicit solution; see `press`."""
+  mesh = surface()
+  rest = np.array(mesh.vertices)
+  (i, j), length0 = mesh.edges_unique.T, mesh.edges_unique_length
+  area = np.bincount(mesh.faces.ravel(), np.repeat(mesh.area_faces / 3, 3))[:, None]
+  model = mujoco.MjModel.from_xml_string(mjcf(STEP))
+  start = np.array([model.body(f"organ_{p}").dofadr[0] for p in range(len(rest))])
+  dofs = start[:, None] + np.arange(3)
+
+  def passive(_, data):
+    u, v = data.qpos[dofs], data.qvel[dofs]
+    edge = rest[j] + u[j] - rest[i] - u[i]
+    length = np.linalg.norm(edge, axis=1)
+    along = edge / length[:, None]
+    rate = ((v[j] - v[i]) * along).sum(axis=1)
+    pull = (STIFFNESS * (length - length0 + DAMPING * rate))[:, None] * along
+    force = -FOUNDATION * area * (u + DAMPING * v)
+    for c in range(3):
+      force[:, c] += np.bincount(i, pull[:, c], len(rest)) - np.bincount(j, pull[:, c], len(rest))
+    data.qfrc_passive[dofs] += force
+
+  mujoco.set_mjcb_passive(passive)
+  try:
+    return press(model, duration)
+  finally:
+    mujoco.set_mjcb_passive(None)
+
+
+if __name__ == "__main__":
+  path = pathlib.Path(__file__).with_suffix(".csv")
+  np.savetxt(path, reference(), fmt="%.7g", delimiter=",", header="time [s],force [N]", comments="")

@@ -1,0 +1,137 @@
+"""Recording, replay to the bit, evaluation, and the commands on top."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+from palpate import cli, tasks
+from palpate.tasks import episode, evaluate, experts
+from palpate.tasks.recording import Recording
+
+
+def record(name="touch/easy", seed=0, style="expert", **kwargs):
+  env = tasks.load(*name.split("/"), task_kwargs={"random": 5})
+  return episode.run(env, experts.make(env, style, seed), seed, {"task_kwargs": {}}, **kwargs)
+
+
+@pytest.mark.parametrize("name", ["touch/easy", "grasp/easy", "trace/easy"])
+def test_replay_gives_everything_again_to_the_bit(name, tmp_path):
+  first = record(name, states=name == "touch/easy")
+  again, _ = episode.replay(Recording.load(first.save(tmp_path / "a.npz")))
+  assert episode.differences(first, again) == []
+  assert again.info["outcome"] == first.info["outcome"] == "success"
+  assert again.metrics() == first.metrics()
+
+
+def test_a_changed_action_is_noticed():
+  first = record()
+  actions = first.arrays["action"].copy()
+  actions[3, 0] += 1e-3
+  first.arrays["action"] = actions
+  again, _ = episode.replay(first)
+  assert "constant state_last" in episode.differences(first, again)
+
+
+def test_what_was_recorded_before_an_error_is_kept(tmp_path):
+  env = tasks.load("touch", "easy")
+  good = iter([np.zeros(4)] * 3)
+  with pytest.raises(
+    episode.EpisodeError, match=r"touch/easy: step 3: ValueError: .*roll is nan"
+  ) as e:
+    episode.run(env, lambda _: next(good, np.array([0, 0, np.nan, 0])), 0)
+  assert len(e.value.recording.time) == 3
+  assert Recording.load(e.value.recording.save(tmp_path / "a.npz")).info["outcome"] == "error"
+
+  def broken(_):
+    raise RuntimeError("no idea")
+
+  with pytest.raises(episode.EpisodeError, match="step 0: RuntimeError: no idea"):
+    episode.run(env, broken, 0)
+
+
+def test_metrics_of_an_expert_are_known():
+  metrics = record("trace/easy").metrics()
+  for name in (
+    "path_length",
+    "peak_force",
+    "trace_rms",
+    "trace_frechet",
+    "peak_pressure",
+    "errors",
+  ):
+    assert np.isfinite(getattr(metrics, name)), (name, metrics.reasons())
+  assert metrics.trace_rms < 0.005
+  assert np.isfinite(record("grasp/easy").metrics().grasp_slips)
+
+
+def test_policies_are_found_by_name(tmp_path, monkeypatch):
+  (tmp_path / "mine.py").write_text(
+    "import numpy as np\nclass P:\n  def __init__(self, env, seed): self.env = env\n"
+    "  def __call__(self, timestep): return np.zeros(4)\n"
+    "def still(observation): return np.zeros(4)\nnumber = 3\n"
+  )
+  monkeypatch.chdir(tmp_path)
+  monkeypatch.setattr(sys, "path", sys.path.copy())
+  env = tasks.load("touch", "easy")
+  timestep = env.reset()
+  for spec in ("mine:P", "mine:still"):
+    assert episode.performer(spec, env, 0)(timestep).shape == (4,)
+  for spec, text in (
+    ("mine", "expected module:object"),
+    ("mine:nothing", "mine has no 'nothing'"),
+    ("mine:number", "is a int, expected something to call"),
+    ("nowhere:x", "ModuleNotFoundError"),
+  ):
+    with pytest.raises(ValueError, match=text):
+      episode.find(spec)
+
+
+def test_evaluate_prints_success_and_spread(capsys, tmp_path):
+  out = tmp_path / "reference.json"
+  assert cli.main(["evaluate", "touch/easy", "--episodes", "2", "--reference", str(out)]) == 0
+  text = capsys.readouterr().out
+  assert "success  2/2" in text and "Path length [mm]" in text
+  data = json.loads(out.read_text())
+  assert data["task"] == "touch/easy" and data["n"] == 2 and data["seed"] == 0
+  assert cli.main(["evaluate", "touch/eazy"]) == 2
+  assert "expected one of touch/easy" in capsys.readouterr().err
+  assert cli.main(["evaluate", "touch/easy", "--policy", "nobody"]) == 2
+
+
+def test_processes_give_the_same_as_one():
+  one = list(evaluate.evaluate("touch/easy", "expert", range(2)))
+  two = list(evaluate.evaluate("touch/easy", "expert", range(2), processes=2))
+  assert one == two
+
+
+def test_exercise_writes_recording_metrics_and_report(tmp_path, capsys):
+  folder = str(tmp_path / "out")
+  assert cli.main(["exercise", "touch/easy", "-o", folder]) == 0
+  assert "success after" in capsys.readouterr().out
+  assert (tmp_path / "out" / "report.html").stat().st_size > 1000
+  again = ["exercise", "--replay", f"{folder}/recording.npz", "-o", str(tmp_path / "b")]
+  assert cli.main([*again, "--no-report"]) == 0
+  assert "the same to the bit" in capsys.readouterr().out
+  assert cli.main(["report", f"{folder}/recording.npz", "-o", str(tmp_path / "c")]) == 0
+  (tmp_path / "foreign.npz").write_bytes(b"PK nonsense")
+  assert cli.main(["exercise", "--replay", str(tmp_path / "foreign.npz")]) == 2
+  assert "not a readable palpate-recording" in capsys.readouterr().err
+  assert cli.main(["exercise", "touch/easy", "--performer", "nobody"]) == 2
+  assert cli.main(["exercise", "nothing"]) == 2
+
+
+def test_film(tmp_path):
+  pytest.importorskip("imageio")
+  out = tmp_path / "a.gif"
+  words = ["exercise", "touch/easy", "-o", str(tmp_path), "--no-report", "--film", str(out)]
+  assert cli.main(words) == 0
+  assert out.read_bytes()[:3] == b"GIF"
+
+
+def test_references_are_those_of_the_tasks():
+  for pair in tasks.ALL_TASKS:
+    name = "/".join(pair)
+    reference = episode.reference(name)
+    if reference is not None:
+      assert reference["task"] == name and reference["n"] >= 5

@@ -1,0 +1,79 @@
+"""The exercises in Gymnasium."""
+
+import subprocess
+import sys
+import warnings
+
+import numpy as np
+import pytest
+
+gymnasium = pytest.importorskip("gymnasium")
+
+from gymnasium.utils.env_checker import check_env  # noqa: E402
+from palpate.tasks import registry  # noqa: E402
+
+IDS = [registry.gym_id(domain, task) for domain, tasks in registry.TASKS.items() for task in tasks]
+
+
+def test_import_palpate_registers_and_stays_light():
+  code = (
+    "import sys, palpate, gymnasium;"
+    "assert 'palpate/Touch-v0' in gymnasium.registry;"
+    "assert 'dm_control' not in sys.modules and 'palpate.tasks.base' not in sys.modules"
+  )
+  subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
+
+
+def test_ids():
+  assert len(set(IDS)) == 19
+  assert {"palpate/Touch-v0", "palpate/TouchEasy-v0", "palpate/ProbePalpateHard-v0"} < set(IDS)
+
+
+@pytest.mark.parametrize("domain", ["Touch", "Probe", "ProbePalpate", "Grasp", "Trace", "Retract"])
+def test_env_checker(domain):
+  with warnings.catch_warnings():
+    warnings.filterwarnings("ignore", ".*infinity.*")
+    warnings.filterwarnings("ignore", ".*observation space m.*imum value.*")
+    env = gymnasium.make(f"palpate/{domain}Easy-v0")
+    check_env(env.unwrapped, skip_render_check=True)
+    env.close()
+
+
+def test_a_seed_repeats_and_another_does_not():
+  env = gymnasium.make("palpate/TouchEasy-v0", disable_env_checker=True)
+  first, second, third = (env.reset(seed=s)[0]["tip_pos"] for s in (1, 1, 2))
+  np.testing.assert_array_equal(first, second)
+  assert not np.array_equal(first, third)
+
+
+def test_rendering():
+  env = gymnasium.make("palpate/TouchEasy-v0", render_mode="rgb_array", width=64, height=48)
+  env.reset(seed=0)
+  picture = env.render()
+  assert picture.shape == (48, 64, 3) and picture.dtype == np.uint8 and np.ptp(picture) > 20
+  with pytest.raises(ValueError, match="render_mode is 'ascii'"):
+    env.unwrapped.__class__(render_mode="ascii")
+  env.close()
+
+
+def test_human_says_that_there_is_no_display(monkeypatch):
+  if not sys.platform.startswith("linux"):
+    pytest.skip("displays are asked for on Linux")
+  monkeypatch.delenv("DISPLAY", raising=False)
+  monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+  env = gymnasium.make("palpate/TouchEasy-v0", render_mode="human")
+  with pytest.raises(RuntimeError, match="no display"):
+    env.reset()
+
+
+def test_vectors_and_the_end_of_an_episode():
+  envs = gymnasium.make_vec(
+    "palpate/TouchEasy-v0", num_envs=2, vectorization_mode="sync", time_limit=0.06, record=True
+  )
+  observation, _ = envs.reset(seed=0)
+  assert observation["target"].shape == (2, 3)
+  for _ in range(3):
+    _, reward, terminated, truncated, info = envs.step(np.zeros((2, 4)))
+  assert truncated.all() and not terminated.any() and reward.shape == (2,)
+  assert "time" in info["metrics"]
+  envs.close()

@@ -1,0 +1,503 @@
+"""The recorder, its file and the metrics computed from either."""
+
+import dataclasses
+import io
+import json
+import math
+import os
+import zipfile
+
+import numpy as np
+import pytest
+from palpate.tasks import metrics as functions
+from palpate.tasks import recorder as recorder_module
+from palpate.tasks.metrics import Unknown
+from palpate.tasks.recorder import Event, Recorder, Recording, Settings
+from palpate.tasks.score import METRICS
+
+SETTINGS = Settings(force_limit=1.5, reference_length=0.1, idle_speed=0.06)
+
+
+def _exercise(steps=300, instruments=("left", "right"), seed=0):
+  """Everything that can be recorded, with two instruments that move and touch."""
+  rng = np.random.RandomState(seed)
+  recorder = Recorder(instruments, SETTINGS, watch=["drop"], info={"task": "touch", "seed": seed})
+  recorder.attach("curve", [[0, 0, 0], [0.05, 0, 0], [0.1, 0.02, 0]])
+  recorder.attach("initial_state", rng.rand(7))
+  pos = np.cumsum(rng.randn(steps, len(instruments), 3) * 1e-3, 0)
+  for k in range(steps):
+    half = 0.3 * np.sin(k / 40)
+    quat = np.array([np.cos(half), 0, np.sin(half), 0])
+    force = np.maximum(0, rng.randn(len(instruments), 3))
+    recorder.append(
+      k * 0.02,
+      pos[k],
+      quat=[quat] * len(instruments),
+      force=force,
+      area=np.full(len(instruments), 2e-5),
+      grip=np.full(len(instruments), k % 100 < 60),
+      held=np.full(len(instruments), 10 < k % 100 < 40),
+      visible=rng.rand(len(instruments)) > 0.1,
+      arrays={"qpos": rng.rand(9), "action": rng.rand(5).astype(np.float32), "step": k},
+    )
+  recorder.event("target", 1.0, 0.002, label="first")
+  recorder.event("target", 2.0, 0.004, instrument=len(instruments) - 1)
+  recorder.event("drop", 2.5)
+  return recorder
+
+
+def _plain(pos, **columns):
+  recorder = Recorder(settings=SETTINGS)
+  for k, point in enumerate(pos):
+    recorder.append(k * 0.02, point, **{n: v[k] for n, v in columns.items()})
+  return recorder
+
+
+LINE = np.stack([np.linspace(0, 0.12, 61), np.zeros(61), np.zeros(61)], 1)
+
+
+def _same_bits(a, b):
+  assert a.dtype == b.dtype and a.shape == b.shape
+  assert a.tobytes() == b.tobytes()
+
+
+# The file.
+
+
+def test_round_trip_is_exact(tmp_path):
+  made = _exercise()
+  path = made.save(tmp_path / "exercise.npz")
+  before, after = made.recording(), Recording.load(path)
+  _same_bits(after.time, before.time)
+  for table in ("columns", "arrays", "constants"):
+    old, new = getattr(before, table), getattr(after, table)
+    assert old.keys() == new.keys() and old
+    for name in old:
+      _same_bits(new[name], old[name])
+  for field in ("events", "instruments", "settings", "watch", "info"):
+    assert getattr(after, field) == getattr(before, field)
+  assert after.arrays["action"].dtype == np.float32
+  assert after.metrics() == made.metrics()
+  assert after.metrics(1) == made.metrics(1) != made.metrics(0)
+  known = set(METRICS) - set(after.metrics().reasons())
+  assert known == set(METRICS)  # the comparison compared something everywhere
+  again = after.save(tmp_path / "again.npz")
+  assert Recording.load(again).metrics() == made.metrics()
+
+
+def test_the_file_needs_no_pickle(tmp_path):
+  path = _exercise(5).save(tmp_path / "exercise.npz")
+  with np.load(path, allow_pickle=False) as archive:
+    meta = json.loads(str(archive["meta"][()]))
+    assert all(archive[name].dtype.kind in "fiubU" for name in archive.files)
+  assert (meta["format"], meta["version"]) == ("palpate-recording", 1)
+
+
+def test_empty_and_single_sample(tmp_path):
+  empty = Recording.load(Recorder().save(tmp_path / "empty.npz"))
+  assert len(empty.time) == 0
+  assert set(empty.metrics().reasons().values()) == {"the recording is empty"}
+  one = Recorder(settings=SETTINGS)
+  one.append(0.0, [0, 0, 0], force=2.0)
+  loaded = Recording.load(one.save(tmp_path / "one.npz"))
+  assert loaded.metrics() == one.metrics()
+  assert loaded.metrics().peak_force == 2.0 and loaded.metrics().force_breaches == 1
+  assert "too few samples" in loaded.metrics().reasons()["time"]
+
+
+def test_saving_replaces_whole_files_only(tmp_path, monkeypatch):
+  path = tmp_path / "exercise.npz"
+  made = _exercise(20)
+  made.save(path)
+  old = path.read_bytes()
+
+  def broken(file, **entries):
+    file.write(b"half")
+    raise OSError("no space left on device")
+
+  monkeypatch.setattr(np, "savez_compressed", broken)
+  with pytest.raises(OSError, match="no space"):
+    _exercise(30).save(path)
+  assert path.read_bytes() == old
+  assert os.listdir(tmp_path) == ["exercise.npz"]
+  monkeypatch.undo()
+  _exercise(30).save(path)
+  assert len(Recording.load(path).time) == 30
+  with pytest.raises(FileNotFoundError):
+    made.save(tmp_path / "nowhere" / "exercise.npz")
+  with pytest.raises(FileNotFoundError):
+    Recording.load(tmp_path / "nothing.npz")
+
+
+@pytest.mark.parametrize("content", [b"", b"P", b"PK", b"PK\x03\x04rubbish", b"hello world"])
+def test_foreign_bytes_are_refused(tmp_path, content):
+  path = tmp_path / "foreign.npz"
+  path.write_bytes(content)
+  with pytest.raises(ValueError, match=r"foreign\.npz: not a"):
+    Recording.load(path)
+
+
+def test_truncated_files_are_refused(tmp_path):
+  data = _exercise(40).save(tmp_path / "whole.npz").read_bytes()
+  path = tmp_path / "cut.npz"
+  for size in np.linspace(0, len(data) - 1, 40).astype(int):
+    path.write_bytes(data[:size])
+    with pytest.raises(ValueError, match=r"cut\.npz"):
+      Recording.load(path)
+
+
+def test_flipped_bytes_are_refused_or_harmless(tmp_path):
+  made = _exercise(40)
+  data = made.save(tmp_path / "whole.npz").read_bytes()
+  path = tmp_path / "flipped.npz"
+  rng = np.random.RandomState(0)
+  refused = 0
+  for at in rng.randint(0, len(data), 150):
+    broken = bytearray(data)
+    broken[at] ^= 1 << rng.randint(8)
+    path.write_bytes(broken)
+    try:
+      loaded = Recording.load(path)
+    except ValueError as error:
+      assert "flipped.npz" in str(error)
+      refused += 1
+    else:  # a date or another field that nothing depends on
+      assert loaded.metrics() == made.metrics()
+      for name, value in made.recording().arrays.items():
+        _same_bits(loaded.arrays[name], value)
+  assert refused > 100
+
+
+def _rewrite(source, target, change):
+  """Copies a recording with its entries changed by `change(entries, meta)`."""
+  with np.load(source, allow_pickle=False) as archive:
+    entries = {name: archive[name] for name in archive.files}
+  meta = json.loads(str(entries["meta"][()]))
+  change(entries, meta)
+  if "meta" in entries:
+    entries["meta"] = np.array(json.dumps(meta))
+  np.savez(target, allow_pickle=True, **entries)
+
+
+def _set(table, key, value):
+  return lambda entries, meta: (entries if table == "entries" else meta).update({key: value})
+
+
+EVENT = {"kind": "drop", "time": 1.0, "value": None, "instrument": 0, "label": ""}
+
+
+@pytest.mark.parametrize(
+  ("change", "match"),
+  [
+    (lambda e, m: e.pop("meta"), "no entry 'meta'"),
+    (lambda e, m: e.pop("time"), "no entry 'time'"),
+    (_set("meta", "format", "other"), "format is 'other'"),
+    (_set("meta", "version", 99), "version is 99, this program reads 1"),
+    (_set("meta", "instruments", []), "instruments is"),
+    (lambda e, m: m.update(instruments=["one"], events=[]), "column .* is float64"),
+    (_set("meta", "info", 3), "info is 3"),
+    (_set("meta", "watch", ["explosion"]), "no event 'explosion'"),
+    (_set("meta", "settings", {"force_limit": -1}), "force_limit is -1"),
+    (_set("meta", "settings", {"gravity": 1}), "gravity"),
+    (_set("meta", "events", [EVENT | {"kind": "party"}]), "no event 'party'"),
+    (_set("meta", "events", [EVENT | {"instrument": 2}]), "instrument is 2 of 2"),
+    (_set("meta", "events", [EVENT | {"time": None}]), "time is None"),
+    (_set("meta", "events", [EVENT | {"label": 3}]), "label is 3"),
+    (_set("entries", "time", np.zeros(20)), "time does not increase at sample 1"),
+    (_set("entries", "time", np.arange(19) * 1.0), "expected 19 samples"),
+    (_set("entries", "column.tip_pos", np.zeros((20, 2, 4))), "column tip_pos is"),
+    (_set("entries", "column.tip_pos", np.zeros((20, 2, 3), "f4")), "column tip_pos is float32"),
+    (_set("entries", "column.charm", np.zeros((20, 2))), "unknown column 'charm'"),
+    (_set("entries", "array.qpos", np.array([{}] * 20)), "allow_pickle"),
+    (_set("entries", "array.qpos", np.array(["x"] * 20)), "dtype <U1"),
+    (_set("entries", "array.qpos", np.zeros(())), "expected 20 samples"),
+    (_set("entries", "constant.curve", np.zeros(3)), "'curve' has shape"),
+    (_set("entries", "stranger", np.zeros(20)), "unknown entry 'stranger'"),
+  ],
+)
+def test_foreign_content_is_named(tmp_path, change, match):
+  source = _exercise(20).save(tmp_path / "good.npz")
+  _rewrite(source, tmp_path / "same.npz", lambda entries, meta: None)
+  Recording.load(tmp_path / "same.npz")  # the copying itself does no harm
+  _rewrite(source, tmp_path / "bad.npz", change)
+  with pytest.raises(ValueError, match=match) as error:
+    Recording.load(tmp_path / "bad.npz")
+  assert "bad.npz" in str(error.value)
+
+
+def test_a_pickle_in_the_archive_is_not_run(tmp_path):
+  class Trap:
+    def __reduce__(self):
+      return os.mkdir, (str(tmp_path / "sprung"),)
+
+  buffer = io.BytesIO()
+  np.lib.format.write_array(buffer, np.array(Trap(), object), allow_pickle=True)
+  path = tmp_path / "trap.npz"
+  with zipfile.ZipFile(path, "w") as archive:
+    archive.writestr("meta.npy", buffer.getvalue())
+    archive.writestr("time.npy", buffer.getvalue())
+  with pytest.raises(ValueError, match="trap"):
+    Recording.load(path)
+  assert not (tmp_path / "sprung").exists()
+
+
+# Recording.
+
+
+def test_growth_keeps_every_sample():
+  recorder = Recorder()
+  rows = np.random.RandomState(1).rand(1000, 3)
+  views = []
+  for k, row in enumerate(rows):
+    recorder.append(k * 0.1, row, arrays={"q": row[:2]})
+    if k in (10, 255, 256, 700):
+      views.append(recorder.recording())
+  full = recorder.recording()
+  np.testing.assert_array_equal(full.columns["tip_pos"][:, 0], rows)
+  np.testing.assert_array_equal(full.arrays["q"], rows[:, :2])
+  for view in views:  # earlier views still hold what they held
+    np.testing.assert_array_equal(view.columns["tip_pos"][:, 0], rows[: len(view.time)])
+  with pytest.raises(ValueError, match="read-only"):
+    full.time[0] = 1
+  assert len(recorder) == 1000
+
+
+def test_what_is_given_is_copied():
+  recorder = Recorder()
+  pos, state, curve = np.zeros(3), np.zeros(2), np.zeros((2, 3))
+  recorder.attach("curve", curve)
+  recorder.append(0.0, pos, arrays={"state": state})
+  pos += 1
+  state += 1
+  curve += 1
+  made = recorder.recording()
+  for values in (made.columns["tip_pos"], made.arrays["state"], made.constants["curve"]):
+    assert not values.any()
+
+
+def test_missing_samples_are_nan_and_make_the_metric_unknown():
+  recorder = Recorder(settings=SETTINGS)
+  recorder.append(0.0, [0, 0, 0])
+  recorder.append(0.1, [1, 0, 0], force=[0, 0, 2], arrays={"late": [1.0]})
+  recorder.append(0.2, [2, 0, 0], force=[0, 0, 1])
+  made = recorder.recording()
+  assert np.isnan(made.column("force")).tolist() == [[True] * 3, [False] * 3, [False] * 3]
+  assert np.isnan(made.arrays["late"])[:, 0].tolist() == [True, False, True]
+  assert made.metrics().reasons()["peak_force"] == "force is not finite at sample 0"
+  assert made.metrics().path_length == 2
+  assert made.column("quat") is None and made.force().tolist()[1:] == [2, 1]
+
+
+@pytest.mark.parametrize(
+  ("kwargs", "match"),
+  [
+    ({"time": 0.1}, r"sample 2: time is 0.1, expected above 0.1"),
+    ({"time": math.nan}, "time is nan"),
+    ({"tip_pos": [0, 0]}, r"tip_pos has shape \(2,\), expected \(3,\)"),
+    ({"quat": [0, 0, 1]}, r"quat has shape \(3,\), expected \(4,\)"),
+    ({"force": [0, 0, 1]}, r"force has shape \(3,\), expected \(\)"),  # began as a magnitude
+    ({"visible": [1, 1]}, "visible has shape"),
+    ({"arrays": {"q": [1.0, 2.0, 3.0], "n": 1}}, r"'q' is float64 \(3,\), expected float64 \(2,\)"),
+    ({"arrays": {"q": [1.0, 2.0]}}, "'n' is int64 and is missing"),
+    ({"arrays": {"q": [1.0, 2.0], "n": 1.5}}, "'n' is float64"),
+    ({"arrays": {"q": [1.0, 2.0], "n": 1, "a/b": 1.0}}, "array name 'a/b'"),
+    ({"arrays": {"q": [1.0, 2.0], "n": 1, "s": "text"}}, "dtype <U4"),
+    ({"arrays": {"q": [1.0, 2.0], "n": 1, "late": 3}}, "'late' is int64 and misses"),
+    ({"arrays": {"q": [None, {}], "n": 1}}, "dtype object"),
+  ],
+)
+def test_a_refused_sample_leaves_the_recording_as_it_was(tmp_path, kwargs, match):
+  recorder = Recorder()
+  for k in range(2):
+    recorder.append(k * 0.1, [k, 0, 0], force=1.0, arrays={"q": [1.0, 2.0], "n": k})
+  before = recorder.recording()
+  good = {"time": 0.2, "tip_pos": [2, 0, 0], "force": 2.0, "arrays": {"q": [3.0, 4.0], "n": 2}}
+  with pytest.raises(ValueError, match=match):
+    recorder.append(**(good | kwargs))
+  after = recorder.recording()
+  assert len(after.time) == 2
+  for table in ("columns", "arrays"):
+    assert getattr(after, table).keys() == getattr(before, table).keys()
+  recorder.append(**good)
+  assert recorder.metrics().path_length == 2
+  assert Recording.load(recorder.save(tmp_path / "a.npz")).arrays["n"].tolist() == [0, 1, 2]
+
+
+def test_two_instruments_need_two_rows():
+  recorder = Recorder(("left", "right"))
+  with pytest.raises(ValueError, match=r"tip_pos has shape \(3,\), expected \(2, 3\)"):
+    recorder.append(0.0, [0, 0, 0])
+  recorder.append(0.0, np.zeros((2, 3)), force=[1.0, 2.0])
+  assert recorder.metrics().peak_force == 2 and recorder.metrics(0).peak_force == 1
+  with pytest.raises(ValueError, match="instrument is 2, expected 0 to 1"):
+    recorder.metrics(2)
+
+
+@pytest.mark.parametrize(
+  ("make", "match"),
+  [
+    (lambda: Recorder([]), "instruments is"),
+    (lambda: Recorder("left"), "instruments is"),
+    (lambda: Recorder(watch=["fun"]), "no event 'fun' to watch, expected one of target"),
+    (lambda: Recorder(info={"x": math.nan}), "info cannot be written as JSON"),
+    (lambda: Recorder(info={"x": object()}), "info cannot be written as JSON"),
+    (lambda: Recorder().event("fun", 0.0), "no event 'fun', expected one of target"),
+    (lambda: Recorder().event("drop", math.nan), "time is nan"),
+    (lambda: Recorder().event("target", 0.0, math.inf), "value is inf"),
+    (lambda: Recorder().event("drop", 0.0, instrument=1), "instrument is 1 of 1"),
+    (lambda: Recorder().attach("curve", [0, 1, 2]), "'curve' has shape"),
+    (lambda: Recorder().attach("../x", [0.0]), "constant name"),
+    (lambda: Recorder().attach("x", ["a"]), "dtype <U1"),
+    (lambda: Settings(force_limit=math.nan), "force_limit is nan"),
+    (lambda: Settings(idle_speed=None), "idle_speed is None"),
+    (lambda: Settings(contact_force="1"), "contact_force is '1'"),
+    (lambda: Settings(local_axis=(0, 0, 0)), "local_axis"),
+  ],
+)
+def test_mistakes_are_named(make, match):
+  with pytest.raises(ValueError, match=match):
+    make()
+
+
+def test_docstrings_list_the_fields_in_order():
+  for cls in (Recording, Settings, Event):
+    lines = [line.strip() for line in cls.__doc__.split("Attributes:")[1].splitlines()]
+    fields = [f.name for f in dataclasses.fields(cls)]
+    listed = [line.split(":")[0] for line in lines if line.split(":")[0] in fields]
+    assert listed == fields
+  assert recorder_module.Recording is Recording
+
+
+# Metrics.
+
+
+def test_metrics_of_a_straight_line():
+  made = _plain(LINE).metrics()
+  assert made.time == pytest.approx(1.2)
+  assert made.path_length == pytest.approx(0.12)
+  assert made.path_inefficiency == pytest.approx(20)
+  assert made.number_of_movements == 1  # 100 mm/s
+  assert made.idle_time == 0 and made.idle_share == 0
+  reasons = made.reasons()
+  assert reasons["peak_force"] == "force not recorded"
+  assert reasons["angular_path"] == "quat not recorded"
+  assert reasons["depth_path"] == "axis not recorded"
+  assert reasons["errors"] == "no kind of error was watched for"
+  assert reasons["grasp_slips"] == "grip and held not recorded"
+  assert reasons["target_error"] == "no target was touched"
+  assert reasons["trace_rms"] == reasons["trace_frechet"] == "no curve to trace"
+  assert reasons["bimanual_dexterity"] == "a single instrument"
+
+
+def test_metrics_agree_with_the_functions():
+  made = _exercise(instruments=("only",))
+  data, got = made.recording(), made.metrics()
+  time, pos = data.time, data.column("tip_pos")
+  force, limit = data.column("force"), SETTINGS.force_limit
+  assert got.path_length == functions.path_length(pos)
+  assert got.sparc == functions.sparc(*functions.uniform_speed(time, pos))
+  assert got.rms_force == functions.rms_force(time, force)
+  assert got.excess_impulse == functions.excess_impulse(time, force, limit)
+  assert got.peak_pressure == functions.peak_pressure(force, data.column("area"))
+  assert got.target_error == pytest.approx(0.003)
+  assert got.errors == 1
+  assert got.grasp_slips == 3  # held ends at 40, the jaw opens at 60, three times
+  # quat turns about y: the shaft, its z, is (sin a, 0, cos a) with a = 0.6 sin(k / 40).
+  angle = 0.6 * np.sin(np.arange(300) / 40)
+  axis = np.stack([np.sin(angle), 0 * angle, np.cos(angle)], 1)
+  assert got.depth_path == pytest.approx(functions.depth_path(pos, axis), rel=1e-12)
+  assert got.angular_path == pytest.approx(np.abs(np.diff(angle)).sum(), rel=1e-9)
+  assert got.response_orientation == pytest.approx(0, abs=1e-12)
+
+
+def test_the_recorded_axis_goes_before_the_derived_one():
+  quat = np.tile([1.0, 0, 0, 0], (61, 1))
+  assert _plain(LINE, quat=quat).metrics().depth_path == 0
+  axis = np.tile([1.0, 0, 0], (61, 1))
+  assert _plain(LINE, quat=quat, axis=axis).metrics().depth_path == pytest.approx(0.12)
+
+
+def test_a_still_instrument_is_unknown_not_perfect():
+  quat = np.tile([1.0, 0, 0, 0], (61, 1))
+  still = _plain(0 * LINE, quat=quat, force=np.zeros(61)).metrics()
+  reasons = still.reasons()
+  for name in ("path_length", "path_inefficiency", "sparc", "log_dimensionless_jerk"):
+    assert reasons[name] == "no motion"
+  for name in ("angular_path", "response_orientation", "depth_path", "number_of_movements"):
+    assert reasons[name] == "no motion"
+  for name in ("peak_force", "mean_force", "force_time_product", "force_breaches"):
+    assert reasons[name] == "no contact"
+  assert still.idle_share == 100
+  assert _plain(LINE, quat=quat).metrics().angular_path == 0  # moved without turning: known
+
+
+def test_instruments_combine():
+  made = _exercise()
+  both, left, right = made.metrics(), made.metrics(0), made.metrics(1)
+  assert both.path_length == left.path_length + right.path_length
+  assert both.peak_force == max(left.peak_force, right.peak_force)
+  assert both.sparc == (left.sparc + right.sparc) / 2
+  assert both.time == left.time
+  assert both.idle_time < min(left.idle_time, right.idle_time)
+  assert -1 <= both.bimanual_dexterity <= 1 and math.isnan(left.bimanual_dexterity)
+  assert (left.errors, right.errors, both.errors) == (1, 0, 1)
+  assert left.target_error == 0.002 and right.target_error == 0.004
+
+
+def test_an_idle_second_instrument_does_not_hide_the_first():
+  recorder = Recorder(("left", "right"), SETTINGS)
+  for k, point in enumerate(LINE):
+    recorder.append(k * 0.02, [point, [0, 0, 0]], force=[1.0, math.nan])
+  assert recorder.metrics().path_length == pytest.approx(0.12)
+  assert recorder.metrics().peak_force == 1  # the right one has no sensor
+  assert recorder.metrics(1).reasons()["peak_force"] == "force not recorded"
+  assert recorder.metrics().reasons()["bimanual_dexterity"].startswith("an instrument's speed")
+
+
+def test_bad_data_of_one_instrument_is_not_hidden():
+  recorder = Recorder(("left", "right"), SETTINGS)
+  for k, point in enumerate(LINE):
+    recorder.append(k * 0.02, [point, point if k != 30 else [math.nan] * 3])
+  made = recorder.metrics()
+  for name in ("path_length", "path_inefficiency", "sparc", "number_of_movements", "idle_time"):
+    assert made.reasons()[name] == "tip_pos is not finite at sample 30", name
+  assert recorder.metrics(0).path_length == pytest.approx(0.12)
+
+
+def test_tracing_counts_the_contact_only():
+  recorder = Recorder(settings=SETTINGS)
+  recorder.attach("curve", [[0.02, 0, 0], [0.1, 0, 0]])
+  for k, point in enumerate(LINE):
+    touching = 0.02 <= point[0] <= 0.1
+    height = 0.001 if touching else 0.5
+    recorder.append(k * 0.02, [point[0], 0, height], force=float(touching))
+  assert recorder.metrics().trace_rms == pytest.approx(0.001)
+  # The tip is sampled every 2 mm: the point half-way is 1 mm along and 1 mm across from either.
+  assert recorder.metrics().trace_frechet == pytest.approx(math.hypot(1e-3, 1e-3), rel=1e-3)
+  lifted = Recorder(settings=SETTINGS)  # in the middle, for 10 mm, by 8 mm
+  lifted.attach("curve", [[0.02, 0, 0], [0.1, 0, 0]])
+  for k in range(81):
+    off = 35 < k < 45
+    lifted.append(k * 0.02, [0.02 + k * 1e-3, 0, 0.008 if off else 0], force=0.0 if off else 1.0)
+  assert lifted.metrics().trace_rms == pytest.approx(0, abs=1e-12)
+  assert lifted.metrics().trace_frechet == pytest.approx(0.008, rel=1e-2)
+  never = _plain(LINE, force=np.zeros(61))
+  never.attach("curve", LINE[:2])
+  assert never.metrics().reasons()["trace_rms"] == "no contact"
+  unmeasured = _plain(LINE)
+  unmeasured.attach("curve", LINE[[0, -1]])
+  assert unmeasured.metrics().trace_rms == pytest.approx(0, abs=1e-12)
+
+
+def test_watched_events_without_an_event_are_a_known_zero():
+  def counts(watch, *events):
+    recorder = Recorder(watch=watch)
+    for k in range(3):
+      recorder.append(k * 0.1, [k, 0, 0])
+    for kind in events:
+      recorder.event(kind, 0.1)
+    return recorder.metrics().errors, recorder.metrics().grasp_slips
+
+  assert counts(["miss", "slip"]) == (0, 0)
+  assert counts([], "drop", "slip", "slip", "miss", "target") == (2, 2)
+  assert all(isinstance(v, Unknown) for v in counts(["target"]))

@@ -1,0 +1,206 @@
+"""The exercises, after dm_control's suite_test: specs, seeds, observations, rewards, reset."""
+
+import mujoco
+import numpy as np
+import pytest
+from dm_control.rl import control
+from palpate import models, tasks
+from palpate.tasks import registry, suite
+
+IDS = ["/".join(pair) for pair in tasks.ALL_TASKS]
+_cache = {}
+
+
+def load(name, **kwargs):
+  return tasks.load(*suite.split(name), task_kwargs={"random": 0, **kwargs})
+
+
+@pytest.fixture(params=IDS)
+def env(request):
+  """One environment a task, made once: the organ's mesh takes a second."""
+  if request.param not in _cache:
+    _cache[request.param] = load(request.param)
+  seed(_cache[request.param], 0)
+  return _cache[request.param]
+
+
+def seed(env, value):
+  env.task.random = np.random.RandomState(value)
+
+
+def actions(env, count, value=1):
+  spec = env.action_spec()
+  draw = np.random.RandomState(value).uniform
+  found = [draw(spec.minimum, spec.maximum) for _ in range(count)]
+  if "report" in env.task.components:  # a report ends the episode
+    for action in found:
+      action[4] = -1.0
+  return found
+
+
+def roll(env, steps):
+  out = [env.reset()]
+  for action in actions(env, steps):
+    out.append(env.step(action))
+  return out
+
+
+def test_tasks_and_tags():
+  assert len(tasks.ALL_TASKS) == 19
+  assert set(tasks.BENCHMARKING) == set(tasks.ALL_TASKS)
+  assert set(tasks.EASY) | set(tasks.HARD) < set(tasks.ALL_TASKS)
+  assert suite.TASKS_BY_DOMAIN == registry.TASKS
+
+
+def test_unknown_names_list_the_choices():
+  with pytest.raises(ValueError, match="domain is 'tuch', expected one of touch, probe, grasp"):
+    tasks.load("tuch", "easy")
+  with pytest.raises(ValueError, match="touch: task is 'eazy', expected one of easy, standard"):
+    tasks.load("touch", "eazy")
+  with pytest.raises(ValueError, match="task is 'touch/eazy', expected one of touch/easy"):
+    suite.split("touch/eazy")
+  with pytest.raises(ValueError, match="reward is 'dence', expected one of dense, sparse"):
+    load("touch/easy", reward="dence")
+
+
+def test_specs_and_observations(env):
+  spec = env.action_spec()
+  assert spec.shape == (len(env.task.components),)
+  assert (spec.minimum == -1).all() and (spec.maximum == 1).all()
+  assert spec.name.split("\t") == list(env.task.components)
+  assert env.control_timestep() == pytest.approx(0.02)
+  assert env.physics.timestep() == 0.001
+  specs = env.observation_spec()
+  for timestep in roll(env, 3):
+    assert list(timestep.observation) == list(specs)
+    for name, value in timestep.observation.items():
+      specs[name].validate(value)
+      assert value.dtype == np.float64 and np.isfinite(value).all(), name
+  module = __import__(f"palpate.tasks.{type(env.task).__module__.split('.')[-1]}", fromlist="x")
+  base = __import__("palpate.tasks.base", fromlist="x")
+  for name in specs:  # every observation is in a table
+    assert f"`{name}`" in (module.__doc__ + base.__doc__), name
+
+
+def test_a_seed_decides_everything(env):
+  first = roll(env, 6)
+  state = env.physics.integration_state()
+  seed(env, 0)
+  second = roll(env, 6)
+  np.testing.assert_array_equal(state, env.physics.integration_state())
+  for a, b in zip(first, second, strict=True):
+    assert a.reward == b.reward
+    for name in a.observation:
+      np.testing.assert_array_equal(a.observation[name], b.observation[name], err_msg=name)
+  seed(env, 1)
+  other = env.reset()
+  assert not np.array_equal(other.observation["tip_pos"], first[0].observation["tip_pos"])
+
+
+def test_rewards_are_finite_and_bounded_and_the_episode_can_start_anew(env):
+  for _ in range(2):
+    steps = roll(env, 8)
+    total = 0.0
+    for timestep in steps[1:]:
+      if timestep.first():  # an episode ended before
+        break
+      assert np.isfinite(timestep.reward) and 0 <= timestep.reward <= 1
+      total += timestep.reward
+    assert total <= 1 + 1e-9
+  # From whatever state the physics is in:
+  env.physics.data.qvel[:] = np.random.RandomState(0).normal(size=env.physics.model.nv) * 0.1
+  seed(env, 0)
+  a = env.reset()
+  seed(env, 0)
+  b = env.reset()
+  for name in a.observation:
+    np.testing.assert_array_equal(a.observation[name], b.observation[name], err_msg=name)
+
+
+def test_going_on_from_a_state_gives_the_same_to_the_bit():
+  env = load("touch/easy")
+  roll(env, 5)
+  state = env.physics.integration_state()
+  ends = []
+  for _ in range(2):
+    env.physics.place(state)
+    for action in actions(env, 5, 2):
+      env.task.before_step(action, env.physics)
+      env.physics.step(20)
+    ends.append(env.physics.integration_state())
+  np.testing.assert_array_equal(*ends)
+
+
+def test_sparse_reward_pays_success_alone():
+  env = load("touch/easy", reward="sparse")
+  assert all(t.reward == 0 for t in roll(env, 5)[1:])
+
+
+def test_pixels():
+  env = load("touch/easy", pixels=(24, 32))
+  pixels = env.reset().observation["pixels"]
+  assert pixels.shape == (24, 32, 3) and pixels.dtype == np.uint8 and np.ptp(pixels) > 20
+
+
+@pytest.mark.parametrize("value, text", [(np.nan, "nan"), (1.5, "1.5"), (-np.inf, "-inf")])
+def test_actions_that_are_not_allowed(value, text):
+  env = load("touch/easy")
+  env.reset()
+  with pytest.raises(ValueError, match=f"touch/easy: action yaw is {text}, expected a number in"):
+    env.step(np.array([0, value, 0, 0]))
+  with pytest.raises(ValueError, match=r"action has shape \(3,\), expected \(4,\): pitch, yaw"):
+    env.step(np.zeros(3))
+
+
+def test_a_scene_of_ones_own_must_have_what_the_task_needs():
+  from palpate.tasks import scenes
+
+  spec = scenes.build(scenes.Scene(nodes=250, targets=1))
+  env = load("touch/easy", model=spec)
+  assert env.reset().observation["target"].shape == (3,)
+  spec.delete(spec.site("target0"))
+  with pytest.raises(ValueError, match="no site 'target0'"):
+    load("touch/easy", model=spec)
+  catalogue = models.load("liver", nodes=250, instruments=("probe",))
+  catalogue.worldbody.add_site(name="target0")
+  env = load("touch/easy", model=catalogue, organ="liver/liver")
+  assert env.reset().observation["nodes_near"].shape == (8, 3)
+  with pytest.raises(ValueError, match="no flex 'organ'"):
+    load("touch/easy", model=catalogue)
+  with pytest.raises(ValueError, match="palpate_easy: model is given, expected none"):
+    load("probe/palpate_easy", model=spec)
+  bare = mujoco.MjSpec()
+  with pytest.raises(ValueError, match="no body 'probe/trocar'"):
+    load("touch/easy", model=bare)
+
+
+def test_too_much_force_is_a_failure():
+  env = load("touch/easy", damage=0.2)
+  env.reset()
+  task, physics = env.task, env.physics
+  timestep = None
+  for _ in range(400):
+    offset = physics.point(task.goal()) - physics.tip_pos()
+    deeper = physics.trocar().mat[:, 2] @ offset < 0 or physics.peak_force > 0
+    timestep = env.step(np.array([0, 0, 0, 1.0 if deeper else 0.0]))
+    task.done = min(task.done, 0)  # presses on
+    if timestep.last():
+      break
+    task.outcome = None
+  assert timestep.last() and env.task.outcome in ("damage", "success")
+
+
+def test_a_wrong_report_is_a_miss():
+  env = load("probe/palpate_easy")
+  env.reset()
+  timestep = env.step(np.array([0, 0, 0, 0, 1.0]))
+  assert timestep.last() and timestep.discount == 0 and env.task.outcome == "missed"
+
+
+def test_time_limit_ends_with_the_discount_of_going_on():
+  env = load("touch/easy", time_limit=0.1)
+  env.reset()
+  for _ in range(5):
+    timestep = env.step(np.zeros(4))
+  assert timestep.last() and timestep.discount == 1 and env.task.outcome is None
+  assert isinstance(env, control.Environment)

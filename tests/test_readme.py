@@ -1,0 +1,141 @@
+"""What the README and the wheel promise."""
+
+import os
+import pathlib
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+import zipfile
+
+import pytest
+from palpate import cli
+from palpate.config import KEYS, Config
+
+ROOT = pathlib.Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def blocks(language):
+  return re.findall(rf"^```{language}\n(.*?)^```", README, re.M | re.S)
+
+
+def test_the_first_two_commands_set_up_everything():
+  run, test = (block.strip() for block in blocks("sh")[:2])
+  extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+  for command in (run, test):
+    assert command.startswith("python3 -m venv .venv && .venv/bin/pip install -e '.[")
+    assert re.search(r"\[(\w+)\]", command)[1] in extras
+  assert run.endswith("&& .venv/bin/palpate run press")
+  assert test.endswith("&& .venv/bin/python -m pytest")
+
+
+def test_the_ci_runs_the_test_command_of_the_readme():
+  ci = (ROOT / ".ci" / "run").read_text()
+  find = re.search(r"test_command=\"\$\((.*)\)\"", ci)[1]
+  found = subprocess.run(["bash", "-c", find], cwd=ROOT, capture_output=True, text=True).stdout
+  assert found.strip() == blocks("sh")[1].strip()
+  assert '\nbash -c "$test_command"\n' in ci
+  assert os.access(ROOT / ".ci" / "run", os.X_OK)
+  assert "run: .ci/run" in (ROOT / ".github" / "workflows" / "ci.yml").read_text()
+
+
+def test_the_examples_run_and_the_organ_carries_the_ball(tmp_path):
+  (tmp_path / "organ.xml").write_text(blocks("xml")[0])
+  shutil.copytree(ROOT / "models" / "press", tmp_path / "models" / "press")
+  done = subprocess.run(
+    [sys.executable, "-c", blocks("python")[0]],
+    cwd=tmp_path,
+    capture_output=True,
+    text=True,
+    timeout=300,
+  )
+  assert (done.returncode, done.stderr) == (0, "")
+  said = [float(x) for x in re.search(r"contact force \[N\] \[(.*)\]", done.stdout)[1].split()]
+  assert said[2] == pytest.approx(-0.02 * 9.81, abs=2e-4)  # nearly at rest after 2 s
+  assert not (tmp_path / "MUJOCO_LOG.TXT").exists()
+
+
+def test_every_configuration_key_is_explained_with_its_default():
+  told = {}
+  for names, default in re.findall(r"^\| (`[^|]+`) \|.*\| ([^|]+) \|$", README, re.M):
+    keys, values = re.findall(r"`(\w+)`", names), default.split(", ")
+    told |= dict(zip(keys, values, strict=len(keys) == len(values)))
+  config = Config()
+  for key in KEYS:
+    value = getattr(config, key)
+    value = value[0] if key == "young" else value
+    if told[key] == "-":
+      assert not value, key
+    elif isinstance(value, str):
+      assert told[key] == value
+    else:
+      assert float(told[key]) == value, key
+
+
+def test_the_commands_it_names_exist():
+  names = {" ".join(words) for words in cli.COMMANDS}
+  for line in re.findall(r"^\| (`palpate .+?`) \|", README, re.M):
+    for words in re.findall(r"`palpate ([\w ]+)`", line):
+      assert words in names
+
+
+def test_its_links_lead_somewhere_and_the_picture_is_small():
+  for target in re.findall(r"\]\((?!https?:)([^)#]+)\)", README):
+    assert (ROOT / target).is_file(), target
+  assert (ROOT / "models" / "press" / "press.png").stat().st_size < 300e3
+
+
+def test_the_wheel_holds_everything_and_runs_without_the_sources(tmp_path):
+  pytest.importorskip("setuptools", "77")
+  tree = tmp_path / "tree"
+  skip = shutil.ignore_patterns(".*", "build", "dist", "out", "tests", "*.egg-info", "__pycache__")
+  shutil.copytree(ROOT, tree, ignore=skip)
+  build = [
+    "wheel",
+    "--no-deps",
+    "--no-build-isolation",
+    "--no-index",
+    "-w",
+    str(tmp_path),
+    str(tree),
+  ]
+  done = subprocess.run(
+    [sys.executable, "-m", "pip", *build], capture_output=True, text=True, timeout=300
+  )
+  assert done.returncode == 0, done.stderr
+  (wheel,) = tmp_path.glob("palpate-*.whl")
+  with zipfile.ZipFile(wheel) as archive:
+    held = set(archive.namelist())
+    archive.extractall(tmp_path / "site")
+
+  expected = set()
+  for folder, package in (("plugin", ""), ("models", "models/"), ("tasks", "tasks/")):
+    for file in (tree / folder).rglob("*"):
+      if file.is_file():
+        expected.add(f"palpate/{package}{file.relative_to(tree / folder).as_posix()}")
+  assert expected - held == set()
+  assert {name for name in held if "test" in name.lower()} == set()
+  assert "palpate/models/instruments/parts/common.xml" in held
+
+  outside = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
+  done = subprocess.run(
+    [sys.executable, "-m", "palpate", "run", "press", "--depth", "0.002", "--hold", "0.02"],
+    cwd=tmp_path,
+    env=outside | {"PYTHONPATH": str(tmp_path / "site")},
+    capture_output=True,
+    text=True,
+    timeout=300,
+  )
+  assert (done.returncode, done.stderr) == (0, "")
+  assert "contact force, static" in done.stdout
+  where = subprocess.run(
+    [sys.executable, "-c", "import palpate; print(palpate.__file__)"],
+    cwd=tmp_path,
+    env=outside | {"PYTHONPATH": str(tmp_path / "site")},
+    capture_output=True,
+    text=True,
+    timeout=60,
+  )
+  assert where.stdout.startswith(str(tmp_path))
