@@ -154,13 +154,13 @@ def set_inertia(w, m):
 
 
 def settle(w, model: int):
-  """Makes the compiled model's windows those of the default slots."""
+  """Readies the compiled model and the state for the default slots."""
   m = mjstruct.Model.from_address(model)
   organ = w.organ
   set_inertia(w, m)
+  w.views["plugin_state"].fill_(0.0)  # MuJoCo has not cleared it yet
   # A rigid flex's vertices are only looked at by `draw`: spare MuJoCo their rotation.
   mjstruct.view(m.flex_centered, m.nflex, np.bool_)[organ.flex] = True
-  wp.capture_launch(w.place)
 
 
 def draw(w, model: int, data: int):

@@ -7,7 +7,7 @@ import warp as wp
 _SLOT = """
   auto node_of = [&](int k) -> int {
     const int n = (int)slots[k];
-    return n == 0 ? home.data[k] : n - 1 < 0 ? -1 : n - 1;
+    return n == 0 ? home.data[k] : n < 0 || n > nvert ? -1 : n - 1;
   };
 """
 

@@ -161,6 +161,7 @@ def make(model: int, data: int, instance: int) -> Workspace:
     bind(w, model, instance)
     if w.place is not None:
       window.settle(w, model)
+      place(w)
     return w
 
 

@@ -1,6 +1,9 @@
 """Window coupling: the same motion as nodal coupling, and what may go wrong."""
 
 import copy
+import os
+import subprocess
+import sys
 
 import mujoco
 import numpy as np
@@ -139,6 +142,19 @@ def test_copied_data_continues_alike():
   other = copy.copy(d)
   ahead = drive(m, d, 50)
   np.testing.assert_array_equal(drive(m, other, 50), ahead)
+
+
+def test_memory_need_not_be_clear_before():
+  code = """if True:
+    import importlib.util, sys
+    spec = importlib.util.spec_from_file_location("test_window", sys.argv[1])
+    tests = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(tests)
+    tests.test_copied_data_continues_alike()
+    tests.test_two_data_of_one_model_take_turns()"""
+  # glibc fills what it hands out with this byte's complement: slots of about 2e5.
+  env = {**os.environ, "MALLOC_PERTURB_": str(0xFF ^ 0x41)}
+  subprocess.run([sys.executable, "-c", code, __file__], env=env, check=True)
 
 
 def test_threads_need_a_model_each():
