@@ -35,6 +35,8 @@ class Config:
     follow: bodies whose geoms the windows follow, a comma between windows; all that collide
     mass: mass of the organ [kg], only with `window`
     pin: vertices that do not move, only with `window`
+    resident: whether the motion stays on the device between steps, only with `window`; the plugin
+      state is then brought up to date by `Organ.sync` alone
     device: `cpu`, `cuda:N`, or `auto` (CUDA where there is a device and enough nodes, else CPU)
   """
 
@@ -56,6 +58,7 @@ class Config:
   follow: tuple[tuple[str, ...], ...] = ()
   mass: float = 0.0
   pin: tuple[int, ...] = ()
+  resident: bool = False
   device: str = "auto"
 
 
@@ -145,6 +148,12 @@ def _pin(organ: str, text: str) -> tuple[int, ...]:
   return tuple(int(word) for word in words)
 
 
+def _flag(organ: str, key: str, text: str) -> bool:
+  if text not in ("true", "false"):
+    raise ValueError(f"organ {organ!r}: {key} is {text!r}, expected 'true' or 'false'")
+  return text == "true"
+
+
 def _device(organ: str, text: str) -> str:
   kind, _, index = text.partition(":")
   if text in ("auto", "cpu", "cuda") or (kind == "cuda" and index.isdigit()):
@@ -209,6 +218,8 @@ def _values(organ: str, texts: dict[str, str], nelem: int) -> dict:
       values[key] = _pin(organ, text)
     elif key == "device":
       values[key] = _device(organ, text)
+    elif key == "resident":
+      values[key] = _flag(organ, key, text)
     elif text not in _CHOICES[key]:
       allowed = " or ".join(repr(choice) for choice in _CHOICES[key])
       raise ValueError(f"organ {organ!r}: {key} is {text!r}, expected {allowed}")
@@ -225,7 +236,7 @@ def _check_combination(organ: str, config: Config, given: dict, closed: bool):
     raise ValueError(
       f"organ {organ!r}: stiffness is {config.stiffness:g}, allowed only with elements='spring'"
     )
-  for key in ("follow", "mass", "pin"):
+  for key in ("follow", "mass", "pin", "resident"):
     if key in given and not config.window:
       raise ValueError(f"organ {organ!r}: {key} is set, allowed only with window")
   if config.window and "mass" not in given and not config.mass:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -259,19 +260,25 @@ def _remember(
 
 @dataclasses.dataclass
 class Launches:
-  """What a coupling launches on the CPU around the solve.
+  """What a coupling launches around the solve.
 
   Attributes:
-    gather: reads MuJoCo's arrays into the solver's state
-    scatter: adds the passive force
-    advance: steps the plugin state
-    place: makes the model fit the plugin state, or None where there is nothing to do
+    gather: reads MuJoCo's arrays, on the CPU
+    scatter: adds the passive force, on the CPU
+    advance: steps the plugin state, on the CPU
+    place: makes the model fit the plugin state, on the CPU, or None where there is nothing to do
+    enter: fills the solver's state, on `side`
+    look: looks at the solution, on `side`
+    side: the device of these two
   """
 
   gather: Callable[[], None]
   scatter: Callable[[], None]
   advance: Callable[[], None]
   place: Callable[[], None] | None = None
+  enter: Callable[[], None] = lambda: None
+  look: Callable[[], None] = lambda: None
+  side: Any = "cpu"
 
 
 def wrap(address: int, size: int, dtype: type = wp.float64) -> wp.array:

@@ -128,7 +128,7 @@ def read(model: int, instance: int) -> Organ:
   name = _flex_name(m, flex)
   _check_flex(m, flex, name)
   start = mjstruct.view(m.flex_vertadr, m.nflex, np.int32)[flex]
-  nvert = mjstruct.view(m.flex_vertnum, m.nflex, np.int32)[flex]
+  nvert = _vertices(m, flex)
   body = mjstruct.view(m.flex_vertbodyid, m.nflexvert, np.int32)[start : start + nvert].copy()
   local = mjstruct.view(m.flex_vert, (m.nflexvert, 3))[start : start + nvert]
   free = np.isin(body, moving_bodies(m, instance))
@@ -212,7 +212,7 @@ def _read_windowed(model: int, m, instance: int) -> Organ:
     if value:
       raise ValueError(f"organ {name!r}: {key} is {value}, expected 0: its windows collide for it")
   frame, origin = _static_frame(m, name, int(bodies[0]))
-  nvert = int(mjstruct.view(m.flex_vertnum, m.nflex, np.int32)[flex])
+  nvert = _vertices(m, flex)
   rest = mjstruct.view(m.flex_vert, (m.nflexvert, 3))[start[flex] : start[flex] + nvert].copy()
   elem = _elements(m, flex)
   mesh = topology.build(name, rest, elem)
@@ -266,7 +266,7 @@ def _windows(model, m, instance, name, config, mesh, mass, place) -> Windows:
     f = names.index(window)
     _check_flex(m, f, window)
     start = int(mjstruct.view(m.flex_vertadr, m.nflex, np.int32)[f])
-    count = int(mjstruct.view(m.flex_vertnum, m.nflex, np.int32)[f])
+    count = _vertices(m, f)
     own = mjstruct.view(m.flex_vertbodyid, m.nflexvert, np.int32)[start : start + count].copy()
     jointed = mjstruct.view(m.body_jntnum, m.nbody, np.int32)[own] > 0
     if not jointed.all():
@@ -461,9 +461,19 @@ def _static_frame(m, name: str, parent: int) -> tuple[np.ndarray, np.ndarray]:
   return rotation, position
 
 
+def _vertices(m, flex: int) -> int:
+  """Returns the number of a flex's vertices; MuJoCo's own is 0 while an organ is hidden."""
+  return _extent(m.flex_vertadr, m.nflex, m.nflexvert, flex)
+
+
+def _extent(addresses: int | None, nflex: int, total: int, flex: int) -> int:
+  adr = mjstruct.view(addresses, nflex, np.int32)
+  return int((adr[flex + 1] if flex + 1 < nflex else total) - adr[flex])
+
+
 def _elements(m, flex: int) -> np.ndarray:
   adr = int(mjstruct.view(m.flex_elemdataadr, m.nflex, np.int32)[flex])
-  num = int(mjstruct.view(m.flex_elemnum, m.nflex, np.int32)[flex])
+  num = _extent(m.flex_elemadr, m.nflex, m.nflexelem, flex)
   data = mjstruct.view(m.flex_elem, m.nflexelemdata, np.int32)
   return data[adr : adr + 3 * num].reshape(num, 3).copy()
 

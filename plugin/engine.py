@@ -17,7 +17,6 @@ from typing import Any
 
 import mujoco
 import numpy as np
-import warp as wp
 
 from . import mjstruct, window, workspace
 from .config import KEYS
@@ -145,7 +144,7 @@ def _fail(w: Workspace, text: str):
 def _advance(model: int, data: int, instance: int):
   w = _workspaces[data, instance]
   try:
-    wp.capture_launch(w.advance)  # pyright: ignore[reportArgumentType]
+    w.step()
     if mjstruct.Model.from_address(model).opt.timestep != w.time_step:
       workspace.refresh(w)
   except Exception as error:

@@ -160,6 +160,11 @@ class Organ:
     return float(self._space.status[1])
 
   @property
+  def asleep(self) -> bool:
+    """Whether the organ is at rest with no tool near, so that its step is skipped (windows)."""
+    return self._space.asleep
+
+  @property
   def error(self) -> str | None:
     """What went wrong while running since the last reset, or None."""
     return self._space.error
@@ -205,6 +210,13 @@ class Organ:
     self._space.error = None
     workspace.place(self._space)
 
+  def sync(self):
+    """Brings a motion that stays on a device (`resident`) into mjData.plugin_state.
+
+    Needed before mj_getState and mj_copyData, and only there; a state saved without it is refused.
+    """
+    workspace.sync(self._space)
+
   def reset(self):
     """Puts the organ at rest; the rest of the model stays as it is."""
     self.set_state(self.xpos0, np.zeros((self.nvert, 3)))
@@ -221,6 +233,7 @@ class Organ:
 
   def _own_state(self, k: int) -> np.ndarray:
     """Returns the displacement (0) or velocity (1) in the plugin state of a windowed organ."""
+    workspace.sync(self._space)
     size = 3 * self.nvert
     return self.data.plugin_state[self._plugin_state][k * size : (k + 1) * size].reshape(-1, 3)
 
@@ -232,8 +245,8 @@ class Organ:
 
 def _instance(model: mujoco.MjModel, flex: int) -> int | None:
   """Returns the palpate plugin instance of a flex, or None."""
-  start, num = model.flex_vertadr[flex], model.flex_vertnum[flex]
-  bodies = np.unique(model.flex_vertbodyid[start : start + num])
+  start, stop = np.append(model.flex_vertadr, model.nflexvert)[flex : flex + 2]
+  bodies = np.unique(model.flex_vertbodyid[start:stop])
   if not model.flex_rigid[flex]:  # a windowed organ is rigid
     bodies = bodies[model.body_jntnum[bodies] > 0]  # parents of pinned vertices are marked too
   owner = model.body_plugin[bodies]

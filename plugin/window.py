@@ -1,13 +1,16 @@
 """What MuJoCo sees of an organ through windows: small flexes that slide over it, under the tools.
 
-Only nodes near a tool need degrees of freedom of MuJoCo: the organ's state lives in `plugin_state`,
-and each window's vertex bodies ("slots") stand on the nodes nearest to the tool, with their
-position, velocity and effective inertia. The window's triangles are the organ's triangles between
-them. Forces follow the formula of `coupling`; a node outside the window moves by dv exactly as it
-would with dofs of its own and no contact.
+Only nodes near a tool need degrees of freedom of MuJoCo: the organ's motion lives in
+`plugin_state`, and each window's vertex bodies ("slots") stand on the nodes nearest to the tool,
+with their position, velocity and effective inertia. The window's triangles are the organ's
+triangles between them. Forces follow the formula of `coupling`; a node outside the window moves by
+dv exactly as it would with dofs of its own and no contact.
 
 plugin_state: displacement (3 nvert), velocity (3 nvert), last dv (3 nvert), contact force (3 W),
-slots (W; node + 1, 0 for the slot's default node, -1 for a slot that is not used).
+slots (W; node + 1, 0 for the slot's default node, -1 for a slot that is not used), `TAIL` numbers.
+
+The nodes' kernels (`window_nodes`) run on the CPU over that memory, or, for a `resident` organ, on
+its device over a copy that `Resident` keeps; the slots' kernels (`window_slots`) on the CPU.
 """
 
 from __future__ import annotations
@@ -16,68 +19,184 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from . import inertia, mjstruct, solver
-from . import window_kernels as kernels
+from . import inertia, mjstruct, solver, window_nodes, window_slots
 from .coupling import Launches, mass_addresses, option_views, wrap
+from .resident import Resident
+from .window_nodes import Nodes
+from .window_slots import Slots
 
 # Nodes within this many mean edges of a tool may be in its window.
 _REACH = 4.0
+# An organ whose nodes move by less than this share of its size a second is at rest.
+_SLOW = 1e-5
+# Candidates of a window that a device reports, times the window's slots.
+_ROOM = 16
+
+
+def state_size(nvert: int, nslot: int) -> int:
+  """Returns the length of the plugin state."""
+  return 9 * nvert + 4 * nslot + window_slots.TAIL
 
 
 def launches(w, model: int, instance: int) -> Launches:
   """Returns the launches of window coupling for a workspace."""
-  m, d = mjstruct.Model.from_address(model), mjstruct.Data.from_address(w.data)
-  organ, s, host, win = w.organ, w.surface, w.host, w.organ.windows
-  nvert, nslot, nwindow = organ.mesh.nvert, win.nslot, len(win.flex)
-  start = int(mjstruct.view(m.plugin_stateadr, m.nplugin, np.int32)[instance])
-
-  def ints(values) -> wp.array:
-    return wp.array(np.asarray(values, np.int32).ravel(), dtype=int, device="cpu")
-
-  def doubles(values) -> wp.array:
-    return wp.array(np.asarray(values, np.float64).ravel(), dtype=wp.float64, device="cpu")
-
-  node = s.node.numpy()
-  dofs = (win.dofadr[:, None] + np.arange(3)).ravel()
-  incidence = np.argsort(organ.mesh.elem.ravel(), kind="stable") // 3
-  near_adr = np.concatenate([[0], np.cumsum(np.bincount(organ.mesh.elem.ravel(), minlength=nvert))])
-  edge = organ.mesh.rest[organ.mesh.elem[:, [1, 2, 0]]] - organ.mesh.rest[organ.mesh.elem]
-  spacing = float(np.linalg.norm(edge, axis=2).mean())
-  radius = float(mjstruct.view(m.flex_radius, m.nflex)[win.flex].max())
+  organ, s = w.organ, w.surface
+  win = organ.windows
+  nslot, nvert = win.nslot, organ.mesh.nvert
+  side = s.device if w.config.resident else wp.get_device("cpu")
   if not w.views:
-    w.views = {
-      "placed": ints(np.full(nslot, -2)),
-      "taken": ints(np.full(nvert, -1)),
-      "chosen": ints(np.zeros(nvert)),
-      "candidate": ints(np.zeros(nvert)),
-      "distance": doubles(np.zeros(nvert)),
-      "flags": ints(np.zeros(4)),
-      "inertia": doubles(np.zeros(nvert)),
-    }
+    w.views = _scratch(w, side)
     w.flags = w.views["flags"].numpy()
   v = w.views
-  v |= option_views(model) | {
-    "node": ints((node // 8) * 24 + node % 8),
-    "node_mass": doubles(win.mass),
-    "rest": doubles(organ.mesh.rest),
-    "elem": ints(organ.mesh.elem),
-    "near_adr": ints(near_adr),
-    "near": ints(incidence),
-    "home": ints(win.home),
-    "qhome": doubles(win.qhome),
-    "dofadr": ints(win.dofadr),
-    "massadr": ints(mass_addresses(m, dofs)),
-    "qposadr": ints(win.qposadr),
-    "bodyid": ints(win.body),
-    "window_adr": ints(win.adr),
-    "elem_adr": ints(win.elem_adr),
-    "elem_num": ints(win.elem_num),
-    "geom_adr": ints(win.geom_adr),
-    "geom": ints(win.geom if win.geom.size else [0]),
-    "frame": doubles(organ.frame),
-    "origin": doubles(organ.origin),
-    "reach": doubles([_REACH * spacing + radius]),
-    "touch": doubles([spacing + radius]),
+  m, d = mjstruct.Model.from_address(model), mjstruct.Data.from_address(w.data)
+  start = int(mjstruct.view(m.plugin_stateadr, m.nplugin, np.int32)[instance])
+  v["plugin_state"] = wrap(d.plugin_state + 8 * start, state_size(nvert, nslot))
+  w.counts = mjstruct.view(m.flex_vertnum, m.nflex, np.int32)[organ.flex :]
+  slots = _slots(w, model)
+  nodes = _nodes(w, side)
+  away = nodes.inbox is not v["inbox"]  # the nodes are on another device
+
+  def over_slots(kernel):
+    wp.launch(kernel, dim=1, inputs=[slots], device="cpu")
+
+  def over_nodes(kernel, count: int = nvert):
+    window_nodes.launch(kernel, nodes, count, side)
+
+  def receive():
+    if away:
+      wp.copy(nodes.inbox, v["inbox"])
+
+  def end_step():
+    over_nodes(window_nodes.commit)
+    over_nodes(window_nodes.move_slots, nslot)
+
+  def enter():
+    receive()
+    if w.resident:
+      end_step()
+    over_nodes(window_nodes.enter)
+    over_nodes(window_nodes.push_slots, nslot)
+
+  def look():
+    over_nodes(window_nodes.search)
+    over_nodes(window_nodes.report, nslot)
+    if away:
+      wp.copy(v["outbox"], nodes.outbox)
+      wp.copy(w.host["status"], w.state.status)
+
+  def look_again():
+    receive()
+    look()
+
+  def end_step_now():
+    receive()
+    end_step()
+
+  def advance():
+    over_slots(window_slots.leave)
+    if not w.resident:
+      end_step()
+    over_slots(window_slots.choose)
+
+  if w.config.resident:
+    w.resident = Resident(w, nodes, start, end_step_now, look_again)
+  return Launches(
+    gather=lambda: over_slots(window_slots.gather),
+    scatter=lambda: over_slots(window_slots.scatter),
+    advance=advance,
+    place=lambda: over_slots(window_slots.place),
+    enter=enter,
+    look=look,
+    side=side,
+  )
+
+
+def _ints(values) -> wp.array:
+  return wp.array(np.asarray(values, np.int32).ravel(), dtype=int, device="cpu")
+
+
+def _doubles(values) -> wp.array:
+  return wp.array(np.asarray(values, np.float64).ravel(), dtype=wp.float64, device="cpu")
+
+
+def _scratch(w, side: wp.Device) -> dict[str, wp.array]:
+  """Returns the arrays of a workspace that outlive a new recording."""
+  win = w.organ.windows
+  nvert, nslot, nwindow = w.organ.mesh.nvert, win.nslot, len(win.flex)
+  most = nvert
+  if side.is_cuda:
+    most = min(nvert, _ROOM * int(np.diff(win.adr).max()))
+  boxes = {
+    "inbox": window_nodes.inbox_size(nslot, nwindow),
+    "outbox": window_nodes.outbox_size(nslot, nwindow, most),
+  }
+  return {
+    "placed": _ints(np.full(nslot, -2)),
+    "taken": _ints(np.full(nvert, -1)),
+    "chosen": _ints(np.zeros(nvert)),
+    "candidate": _ints(np.zeros(nvert)),
+    "distance": _doubles(np.zeros(nvert)),
+    "inertia": _doubles(np.zeros(nvert)),
+    "flags": _ints(np.zeros(6)),
+    **{
+      name: wp.zeros(size, dtype=wp.float64, device="cpu", pinned=side.is_cuda)
+      for name, size in boxes.items()
+    },
+  }
+
+
+def _most(w) -> int:
+  """Returns the candidates of a window that the outbox has room for."""
+  win = w.organ.windows
+  head = window_nodes.outbox_size(win.nslot, len(win.flex), 0)
+  return (len(w.views["outbox"]) - head) // (len(win.flex) * window_nodes.RECORD)
+
+
+def _slots(w, model: int) -> Slots:
+  """Returns the kernels' view of the slots."""
+  m, d = mjstruct.Model.from_address(model), mjstruct.Data.from_address(w.data)
+  organ, win, mesh = w.organ, w.organ.windows, w.organ.mesh
+  dofs = (win.dofadr[:, None] + np.arange(3)).ravel()
+  incidence = np.argsort(mesh.elem.ravel(), kind="stable") // 3
+  count = np.bincount(mesh.elem.ravel(), minlength=mesh.nvert)
+  edge = mesh.rest[mesh.elem[:, [1, 2, 0]]] - mesh.rest[mesh.elem]
+  spacing = float(np.linalg.norm(edge, axis=2).mean())
+  radius = float(mjstruct.view(m.flex_radius, m.nflex)[win.flex].max())
+  numbers = {
+    "nvert": mesh.nvert,
+    "nslot": win.nslot,
+    "nwindow": len(win.flex),
+    "most": _most(w),
+    "no_gravity": int(mujoco.mjtDisableBit.mjDSBL_GRAVITY),
+    "resident": int(w.config.resident),
+    "damping": w.surface.damping,
+    "rest_share": solver.REST,
+    "reach": _REACH * spacing + radius,
+    "touch": spacing + radius,
+    "slow": _SLOW * float(np.linalg.norm(np.ptp(mesh.rest, axis=0))),
+    "weight": float(win.mass.sum()),
+  }
+  arrays = option_views(model) | {
+    "node_mass": _doubles(win.mass),
+    "rest": _doubles(mesh.rest),
+    "elem": _ints(mesh.elem),
+    "near_adr": _ints(np.concatenate([[0], np.cumsum(count)])),
+    "near": _ints(incidence),
+    "home": _ints(win.home),
+    "qhome": _doubles(win.qhome),
+    "dofadr": _ints(win.dofadr),
+    "massadr": _ints(mass_addresses(m, dofs)),
+    "qposadr": _ints(win.qposadr),
+    "bodyid": _ints(win.body),
+    "window_adr": _ints(win.adr),
+    "elem_adr": _ints(win.elem_adr),
+    "elem_num": _ints(win.elem_num),
+    "geom_adr": _ints(win.geom_adr),
+    "geom": _ints(win.geom if win.geom.size else [0]),
+    "frame": _doubles(organ.frame),
+    "origin": _doubles(organ.origin),
+    "ext": w.ext,
+    "status": w.host["status"],
     "geom_type": wrap(m.geom_type, m.ngeom, wp.int32),
     "geom_size": wrap(m.geom_size, 3 * m.ngeom),
     "geom_aabb": wrap(m.geom_aabb, 6 * m.ngeom),
@@ -97,49 +216,83 @@ def launches(w, model: int, instance: int) -> Launches:
     "qfrc_passive": wrap(d.qfrc_passive, m.nv),
     "qfrc_constraint": wrap(d.qfrc_constraint, m.nv),
     "xfrc_applied": wrap(d.xfrc_applied, 6 * m.nbody),
-    "plugin_state": wrap(d.plugin_state + 8 * start, 9 * nvert + 4 * nslot),
   }
+  return _struct(Slots, numbers | arrays | w.views)
+
+
+def _nodes(w, side: wp.Device) -> Nodes:
+  """Returns the kernels' view of the nodes: plugin state on the CPU, own arrays elsewhere."""
+  organ, s, v = w.organ, w.surface, w.views
+  nvert, nslot, nwindow = organ.mesh.nvert, organ.windows.nslot, len(organ.windows.flex)
+  node = s.node.numpy()
+  address, size = v["plugin_state"].ptr, 3 * nvert
+  if w.config.resident:
+    motion = [wp.zeros(size, dtype=wp.float64, device=side) for _ in range(3)]
+  else:
+    motion = [wrap(address + 8 * k * size, size) for k in range(3)]
+  solving = w.state if w.config.resident else None
+  crossing = ("step", "pos", "vel", "force_ext", "dvel_warm", "dvel", "status")
   mass = np.ones(s.nnode)
-  mass[node] = win.mass
-  host["mass"].assign(mass.reshape(1, -1, 8).astype(np.float32))
+  mass[node] = organ.windows.mass
+  w.host["mass"].assign(mass.reshape(1, -1, 8).astype(np.float32))
+  wp.copy(w.state.mass, w.host["mass"])
+  numbers = {"nvert": nvert, "nslot": nslot, "nwindow": nwindow, "most": _most(w)}
+  lowest = np.full(7, window_nodes.LOWEST)
+  arrays = {
+    "node": _ints((node // 8) * 24 + node % 8).to(side),
+    "mass": _doubles(organ.windows.mass).to(side),
+    "rest": _doubles(organ.mesh.rest).to(side),
+    "disp": motion[0],
+    "velocity": motion[1],
+    "last": motion[2],
+    "inbox": v["inbox"] if not side.is_cuda else wp.clone(v["inbox"], device=side),
+    "outbox": v["outbox"] if not side.is_cuda else wp.clone(v["outbox"], device=side),
+    "count": _ints(np.zeros(nwindow)).to(side),
+    "extent": _ints(lowest).to(side),
+    **{k: getattr(solving, k) if solving else w.host[k] for k in crossing},
+  }
+  return _struct(Nodes, numbers | arrays)
 
-  def pick(*names: str) -> list[wp.array]:
-    return [v[name] for name in names]
 
-  def run(kernel, numbers, inputs, outputs):
-    wp.launch(kernel, dim=1, inputs=[*numbers, *inputs], outputs=outputs, device="cpu")
+def _struct(kind, values: dict):
+  """Returns a Warp struct with its fields from `values`."""
+  out = kind()
+  for name in kind.vars:
+    setattr(out, name, values[name])
+  return out
 
-  def gather():
-    numbers = [nvert, nslot, int(mujoco.mjtDisableBit.mjDSBL_GRAVITY), s.damping, solver.REST]
-    inputs = pick("node", "node_mass", "home", "placed", "dofadr", "bodyid", "frame", "timestep")
-    inputs += pick("gravity", "disableflags", "body_mass", "qfrc_applied", "qfrc_passive")
-    inputs += pick("xfrc_applied", "plugin_state")
-    outputs = [host[k] for k in ("step", "pos", "vel", "force_ext", "dvel_warm")]
-    run(kernels.gather, numbers, inputs, [*outputs, w.ext, v["flags"]])
 
-  def scatter():
-    inputs = pick("node", "placed", "dofadr", "massadr", "timestep", "M")
-    inputs += [w.ext, host["dvel"], host["status"]]
-    run(kernels.scatter, [nslot], inputs, [v["qfrc_passive"]])
+def settle(w, model: int):
+  """Readies the compiled model and the state for the default slots."""
+  m = mjstruct.Model.from_address(model)
+  set_inertia(w, m)
+  w.views["plugin_state"].fill_(0.0)  # MuJoCo has not cleared it yet
 
-  def place(force: bool):
-    inputs = pick("rest", "node_mass", "inertia", "elem", "near_adr", "near", "home", "qhome")
-    inputs += pick("dofadr", "qposadr", "bodyid", "window_adr", "elem_adr", "elem_num")
-    inputs += pick("body_mass", "plugin_state")
-    outputs = pick("placed", "taken", "flex_elem", "dof_armature", "dof_M0", "dof_invweight0")
-    outputs += pick("body_invweight0", "qpos", "qvel", "flags")
-    run(kernels.place, [nvert, nslot, nwindow, int(force)], inputs, outputs)
 
-  def advance():
-    inputs = pick("node", "rest", "home", "qhome", "placed", "dofadr", "qposadr", "window_adr")
-    inputs += pick("geom_adr", "geom", "frame", "origin", "reach", "touch", "timestep")
-    inputs += pick("geom_type", "geom_size", "geom_aabb", "geom_rbound", "geom_xpos", "geom_xmat")
-    inputs += [*pick("qpos", "qvel", "qfrc_constraint"), host["dvel"], host["status"]]
-    outputs = pick("plugin_state", "taken", "chosen", "candidate", "distance", "flags")
-    run(kernels.advance, [nvert, nslot, nwindow], inputs, outputs)
-    place(force=False)
+def show(w, m, shown: bool):
+  """Lets MuJoCo see the organ's own flex, or hides it, so that a step spends nothing on it.
 
-  return Launches(gather, scatter, advance, lambda: place(force=True))
+  It touches nothing and is drawn from what `draw` writes, but MuJoCo updates its vertices, boxes
+  and bounding volumes in every step, which can take longer than the organ's step. A scene has room
+  for the flex whether it was made with the one or the other: 2 (shells + elements).
+  """
+  flex, mesh = w.organ.flex, w.organ.mesh
+  shells = int((mesh.twin < 0).sum())
+  counts = (mesh.nvert, mesh.nelem, shells) if shown else (0, 0, shells + mesh.nelem)
+  names = ("flex_vertnum", "flex_elemnum", "flex_shellnum", "flex_bvhnum", "flex_bvhadr")
+  for name, count in zip(names, (*counts, 0, -1), strict=True):
+    mjstruct.view(getattr(m, name), m.nflex, np.int32)[flex] = count
+
+
+def hide(w):
+  """Hides the organ's flex from MuJoCo until it is drawn again."""
+  if w.counts[0]:
+    show(w, mjstruct.Model.from_address(w.model), shown=False)
+
+
+def wake(w):
+  """Ends the organ's sleep: something has changed."""
+  w.views["plugin_state"].numpy()[-window_slots.TAIL + 1] = 0.0
 
 
 def set_inertia(w, m):
@@ -153,22 +306,15 @@ def set_inertia(w, m):
   w.views["inertia"].assign(nodal)
 
 
-def settle(w, model: int):
-  """Readies the compiled model and the state for the default slots."""
-  m = mjstruct.Model.from_address(model)
-  organ = w.organ
-  set_inertia(w, m)
-  w.views["plugin_state"].fill_(0.0)  # MuJoCo has not cleared it yet
-  # A rigid flex's vertices are only looked at by `draw`: spare MuJoCo their rotation.
-  mjstruct.view(m.flex_centered, m.nflex, np.bool_)[organ.flex] = True
-
-
 def draw(w, model: int, data: int):
   """Writes the deformed surface where renderers read it."""
   m, d = mjstruct.Model.from_address(model), mjstruct.Data.from_address(data)
   organ = w.organ
   start = int(mjstruct.view(m.flex_vertadr, m.nflex, np.int32)[organ.flex])
   n = organ.mesh.nvert
+  show(w, m, shown=True)
+  if w.resident:
+    w.resident.fetch()
   out = mjstruct.view(d.flexvert_xpos, (m.nflexvert, 3))[start : start + n]
   u = w.views["plugin_state"].numpy()[: 3 * n].reshape(n, 3)
   out[:] = organ.origin + (organ.mesh.rest + u) @ organ.frame.T

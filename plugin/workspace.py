@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import threading
 import weakref
 from typing import Any
@@ -21,10 +22,12 @@ from . import (
   solver,
   types,
   window,
-  window_kernels,
+  window_nodes,
+  window_slots,
 )
 from .config import Config
 from .declare import Organ
+from .resident import Resident
 from .types import State, Surface
 
 _lock = threading.RLock()
@@ -43,11 +46,13 @@ class Workspace:
     ext: external and lagged contact force in float64 [N]  (3 nnode,)
     model: address of the mjModel the views are of
     data: address of the mjData
-    before, solve, after: recorded graphs of a step's forces
+    before, after: recorded graphs of a step's forces around the solve
+    solve: recorded graphs of the solve and what it needs, each on one device
     advance: recorded graph of the plugin state's step
     place: recorded graph that puts the windows where the plugin state says, or None
-    flags: what the windows report: slots the model lacks, -, nodes touched beyond the window's
-      size, triangles beyond it  (4,)
+    resident: keeper of a motion that stays on the device, or None
+    flags: what the windows report, see `window_slots`  (6,)
+    counts: the number of vertices that MuJoCo sees of a windowed organ comes first
     status: iterations, relative residual, norm, failure  (4,)
     error: what went wrong since the last reset, or None
     warning: last index and count of each of MuJoCo's warnings (nwarning, 2)
@@ -65,11 +70,13 @@ class Workspace:
   data: int
   model: int = 0
   before: Any = None
-  solve: Any = None
+  solve: list = dataclasses.field(default_factory=list)
   after: Any = None
   advance: Any = None
   place: Any = None
-  flags: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(4, np.int32))
+  resident: Resident | None = None
+  flags: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(6, np.int32))
+  counts: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(1, np.int32))
   status: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(4, np.float32))
   error: str | None = None
   warning: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 2), np.int32))
@@ -86,11 +93,29 @@ class Workspace:
       wp.capture_launch(self.place)
       mjstruct.library().mj_fwdPosition(self.model, self.data)
       wp.capture_launch(self.before)
-    wp.capture_launch(self.solve)
-    if self.surface.device.is_cuda:
-      wp.synchronize_device(self.surface.device)
+    if not self.asleep:
+      if self.resident:
+        self.resident.send()
+      for device, graph in self.solve:
+        wp.capture_launch(graph)
+        if device.is_cuda:
+          wp.synchronize_device(device)
+      if self.resident:
+        self.resident.look()
     wp.capture_launch(self.after)
 
+  def step(self):
+    """Steps the plugin state after MuJoCo has moved."""
+    wp.capture_launch(self.advance)
+    if self.place is not None:
+      window.hide(self)
+    if self.resident and not self.asleep:
+      self.resident.step()
+
+  @property
+  def asleep(self) -> bool:
+    """Whether the organ is at rest and its solve was skipped."""
+    return bool(self.flags[window_slots.ASLEEP])
 
   def _owns_model(self) -> bool:
     """Returns whether the model's windows were last placed here, and makes it so.
@@ -128,7 +153,7 @@ def state_size(model: int, instance: int) -> int:
   """
   m = mjstruct.Model.from_address(model)
   if mjstruct.config(model, instance, "window"):
-    # Asked before MuJoCo has filled in the flexes: 9 nvert + 4 nslot is at most this.
+    # Asked before MuJoCo has filled in the flexes: what `window` needs is at most this.
     return 9 * m.nflexvert
   return 6 * len(declare.moving_bodies(m, instance))
 
@@ -141,8 +166,7 @@ def make(model: int, data: int, instance: int) -> Workspace:
     s = organ.surface
     state = types.make_state(s)
     host = {}
-    crossing = ("step", "pos", "vel", "mass", "force_ext", "dvel_warm", "dvel", "status")
-    for field in crossing:
+    for field in (*_IN, *_OUT):
       array = getattr(state, field)
       if s.device.is_cuda:
         array = wp.zeros(array.shape, dtype=float, device="cpu", pinned=True)
@@ -172,10 +196,21 @@ def bind(w: Workspace, model: int, instance: int):
   side = window if w.organ.windows else coupling
   with _lock:
     load(device)
+    if w.resident:
+      w.resident.fetch()
     launches = side.launches(w, model, instance)
-    solve = _on_device if device.is_cuda else _on_cpu
+    near = wp.get_device(launches.side)
+    crossing = device != near
+
+    def solve():
+      if crossing:
+        _cross(w, _IN, to_device=True)
+      schemes.step(w.surface, w.state, w.config.integrator)
+      if crossing:
+        _cross(w, _OUT, to_device=False)
+
     w.before = _record(cpu, launches.gather)
-    w.solve = _record(device, lambda: solve(w))
+    w.solve = _record_all((near, launches.enter), (device, solve), (near, launches.look))
     w.after = _record(cpu, launches.scatter)
     w.advance = _record(cpu, launches.advance)
     w.place = _record(cpu, launches.place) if launches.place else None
@@ -183,16 +218,24 @@ def bind(w: Workspace, model: int, instance: int):
   w.time_step = float(m.opt.timestep)
 
 
-def _on_cpu(w: Workspace):
-  schemes.step(w.surface, w.state, w.config.integrator)
+# What a solve on another device than MuJoCo's side reads and writes.
+_IN = ("step", "pos", "vel", "mass", "force_ext", "dvel_warm")
+_OUT = ("dvel", "status")
 
 
-def _on_device(w: Workspace):
-  for field in ("step", "pos", "vel", "mass", "force_ext", "dvel_warm"):
-    wp.copy(getattr(w.state, field), w.host[field])
-  schemes.step(w.surface, w.state, w.config.integrator)
-  wp.copy(w.host["dvel"], w.state.dvel)
-  wp.copy(w.host["status"], w.state.status)
+def _cross(w: Workspace, fields: tuple[str, ...], to_device: bool):
+  for field in fields:
+    pair = (getattr(w.state, field), w.host[field])
+    wp.copy(*(pair if to_device else pair[::-1]))
+
+
+def _record_all(*parts) -> list:
+  """Records (device, work) pairs, those in a row on one device as one graph."""
+  graphs = []
+  for device, group in itertools.groupby(parts, key=lambda part: part[0]):
+    work = [part[1] for part in group]
+    graphs.append((device, _record(device, lambda work=work: [each() for each in work])))
+  return graphs
 
 
 def _record(device, work) -> Any:
@@ -203,7 +246,7 @@ def _record(device, work) -> Any:
 
 def load(device):
   """Loads the modules of a step on a device, compiling them where the cache has none."""
-  for module in (elastic, solver, schemes, coupling, window_kernels):
+  for module in (elastic, solver, schemes, coupling, window_nodes, window_slots):
     wp.load_module(module.__name__, device=device)
     wp.load_module(module.__name__, device="cpu")
 
@@ -222,6 +265,14 @@ def configure(w: Workspace, instance: int, texts: dict[str, str]):
   if fresh.areavec.shape != w.state.areavec.shape:
     w.state.areavec = fresh.areavec
   bind(w, w.model, instance)
+  if w.place is not None:
+    window.wake(w)
+
+
+def sync(w: Workspace):
+  """Brings a motion that is on a device into the plugin state."""
+  if w.resident:
+    w.resident.fetch()
 
 
 def refresh(w: Workspace):

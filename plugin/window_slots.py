@@ -1,0 +1,477 @@
+"""Kernels of window coupling over the windows' slots, on the CPU beside MuJoCo.
+
+A slot is a vertex body of a window; see `window`. The last numbers of the plugin state (`TAIL`):
+stamp of a motion kept on a device, time without motion [s], gravity [m/s^2] of the step in which
+the organ fell asleep, and the organ's bounds.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from .window_nodes import GEOM, HEAD, MAX_GEOMS, RECORD, SUMMARY
+
+TAIL = 11
+STALE, ASLEEP, MISSED_NODES, MISSED_ELEMENTS, PENDING, NEAR = range(6)  # flags
+# Time without motion, force and tool after which an organ sleeps [s].
+QUIET = 0.2
+
+
+@wp.struct
+class Slots:
+  """What MuJoCo and a windowed organ share; see `declare.Windows` for the organ's own arrays.
+
+  Attributes:
+    nvert, nslot, nwindow, most: counts, see `Nodes`
+    no_gravity: bit of mjDSBL_GRAVITY
+    resident: 1 if the motion stays on a device and the plugin state may be old
+    damping: Rayleigh coefficient [s]
+    rest_share: see `solver.REST`
+    reach: distance from a geom within which nodes may be in a window [m]
+    touch: distance at which a node outside its window counts as missed [m]
+    slow: speed below which the organ counts as at rest [m/s]
+    weight: mass of the organ [kg]
+    placed: node of each slot in the model, -1 for none     (nslot,)
+    taken: slot of each node, -1 for none                   (nvert,)
+    chosen, candidate, distance: scratch                    (nvert,)
+    inertia: effective inertia of each node [kg]            (nvert,)
+    ext: external and lagged contact force [N]              (3 nslot,)
+    flags: STALE (the model lacks slots), ASLEEP, MISSED_NODES, MISSED_ELEMENTS, PENDING (mode of
+      the next commit), NEAR (a tool is near)               (6,)
+  """
+
+  nvert: int
+  nslot: int
+  nwindow: int
+  most: int
+  no_gravity: int
+  resident: int
+  damping: wp.float64
+  rest_share: wp.float64
+  reach: wp.float64
+  touch: wp.float64
+  slow: wp.float64
+  weight: wp.float64
+  # Organ:
+  node_mass: wp.array[wp.float64]
+  rest: wp.array[wp.float64]
+  inertia: wp.array[wp.float64]
+  elem: wp.array[int]
+  near_adr: wp.array[int]
+  near: wp.array[int]
+  home: wp.array[int]
+  qhome: wp.array[wp.float64]
+  dofadr: wp.array[int]
+  massadr: wp.array[int]
+  qposadr: wp.array[int]
+  bodyid: wp.array[int]
+  window_adr: wp.array[int]
+  elem_adr: wp.array[int]
+  elem_num: wp.array[int]
+  geom_adr: wp.array[int]
+  geom: wp.array[int]
+  frame: wp.array[wp.float64]
+  origin: wp.array[wp.float64]
+  # Scratch:
+  placed: wp.array[int]
+  taken: wp.array[int]
+  chosen: wp.array[int]
+  candidate: wp.array[int]
+  distance: wp.array[wp.float64]
+  ext: wp.array[wp.float64]
+  flags: wp.array[int]
+  inbox: wp.array[wp.float64]
+  outbox: wp.array[wp.float64]
+  status: wp.array2d[float]
+  # Model:
+  timestep: wp.array[wp.float64]
+  gravity: wp.array[wp.float64]
+  disableflags: wp.array[int]
+  geom_type: wp.array[int]
+  geom_size: wp.array[wp.float64]
+  geom_aabb: wp.array[wp.float64]
+  geom_rbound: wp.array[wp.float64]
+  body_mass: wp.array[wp.float64]
+  flex_elem: wp.array[int]
+  dof_armature: wp.array[wp.float64]
+  dof_M0: wp.array[wp.float64]
+  dof_invweight0: wp.array[wp.float64]
+  body_invweight0: wp.array[wp.float64]
+  # Data:
+  geom_xpos: wp.array[wp.float64]
+  geom_xmat: wp.array[wp.float64]
+  qpos: wp.array[wp.float64]
+  qvel: wp.array[wp.float64]
+  M: wp.array[wp.float64]
+  qfrc_applied: wp.array[wp.float64]
+  qfrc_passive: wp.array[wp.float64]
+  qfrc_constraint: wp.array[wp.float64]
+  xfrc_applied: wp.array[wp.float64]
+  plugin_state: wp.array[wp.float64]
+
+
+_STATE = f"""
+  double* U = s.plugin_state.data;
+  double* W = U + 3 * s.nvert;
+  double* fc = U + 9 * s.nvert;
+  double* slots = fc + 3 * s.nslot;
+  double* tail = slots + s.nslot;
+  double* in = s.inbox.data;
+  double* moved = in + {HEAD};
+  double* pushed = moved + 7 * s.nslot;
+  double* tools = pushed + 4 * s.nslot;
+  const double* out = s.outbox.data;
+  double* quiet = tail + 1;
+  double* bounds = tail + 5;
+  auto node_of = [&](int k) -> int {{
+    const double n = slots[k];
+    return n == 0.0 ? s.home.data[k] : n >= 1.0 && n <= s.nvert ? (int)n - 1 : -1;
+  }};
+  auto stand = [&](int k, int i, const double* u, const double* v) {{
+    const int adr = s.dofadr.data[k], qadr = s.qposadr.data[k], body = s.bodyid.data[k];
+    const double own = s.body_mass.data[body];
+    const double total = s.inertia.data[i] > own ? s.inertia.data[i] : own;
+    for (int c = 0; c < 3; ++c) {{
+      s.qpos.data[qadr + c] = s.qhome.data[3 * k + c] + s.rest.data[3 * i + c] + u[c];
+      s.qvel.data[adr + c] = v[c];
+      s.dof_armature.data[adr + c] = total - own;
+      s.dof_M0.data[adr + c] = total;
+      s.dof_invweight0.data[adr + c] = 1.0 / s.node_mass.data[i];
+    }}
+    s.body_invweight0.data[2 * body] = 1.0 / s.node_mass.data[i];
+  }};
+"""
+
+# The windows' triangles: those of the organ whose corners are in one window.
+_TRIANGLES = f"""
+  auto triangles = [&]() {{
+    s.flags.data[{MISSED_ELEMENTS}] = 0;
+    for (int w = 0; w < s.nwindow; ++w) {{
+      const int first = s.window_adr.data[w], last = s.window_adr.data[w + 1];
+      int* list = s.flex_elem.data + s.elem_adr.data[w];
+      const int most = s.elem_num.data[w];
+      int count = 0;
+      for (int k = first; k < last; ++k) {{
+        const int i = s.placed.data[k];
+        if (i < 0) continue;
+        for (int q = s.near_adr.data[i]; q < s.near_adr.data[i + 1]; ++q) {{
+          const int* e = s.elem.data + 3 * s.near.data[q];
+          if (e[0] != i) continue;
+          const int b = s.taken.data[e[1]], c = s.taken.data[e[2]];
+          if (b < first || b >= last || c < first || c >= last) continue;
+          if (count == most) {{ s.flags.data[{MISSED_ELEMENTS}] += 1; continue; }}
+          list[3 * count] = k - first;
+          list[3 * count + 1] = b - first;
+          list[3 * count + 2] = c - first;
+          ++count;
+        }}
+      }}
+      for (int q = count; q < most && count > 0; ++q)
+        for (int c = 0; c < 3; ++c) list[3 * q + c] = list[c];
+    }}
+  }};
+"""
+
+
+@wp.func_native(
+  _STATE
+  + f"""
+  const double h = s.timestep.data[0];
+  in[0] = h;
+  in[1] = h * h + h * s.damping;
+  const double still = s.rest_share * 9.81 * h;
+  in[2] = s.weight * still * still;
+  in[3] = s.flags.data[{PENDING}];
+  const bool falls = !(s.disableflags.data[0] & s.no_gravity);
+  bool changed = false;
+  for (int c = 0; c < 3; ++c) {{
+    double g = 0.0;
+    for (int k = 0; k < 3 && falls; ++k) g += s.frame.data[3 * k + c] * s.gravity.data[k];
+    in[4 + c] = g;
+    changed = changed || g != tail[2 + c];
+  }}
+  in[7] = s.reach;
+  int stale = 0;
+  bool pushes = false;
+  for (int k = 0; k < s.nslot; ++k) {{
+    const int i = node_of(k), adr = s.dofadr.data[k], body = s.bodyid.data[k];
+    if (i != s.placed.data[k]) stale = 1;
+    const double* x = s.xfrc_applied.data + 6 * body;
+    double* push = pushed + 4 * k;
+    push[0] = i;
+    for (int c = 0; c < 3; ++c) {{
+      // What acts on the slot besides its own weight acts on the node.
+      const double f = s.qfrc_applied.data[adr + c] + s.qfrc_passive.data[adr + c]
+        + s.frame.data[c] * x[0] + s.frame.data[3 + c] * x[1] + s.frame.data[6 + c] * x[2];
+      push[1 + c] = i < 0 ? f : f + fc[3 * k + c];
+      s.ext.data[3 * k + c] = push[1 + c] + s.body_mass.data[body] * in[4 + c];
+      pushes = pushes || push[1 + c] != 0.0;
+    }}
+  }}
+  s.flags.data[{STALE}] = stale;
+  // The geoms in the organ's frame, and whether one is near the organ's bounds.
+  bool near = bounds[3] <= bounds[0];
+  const double margin = 0.5 * s.reach;
+  for (int w = 0; w < s.nwindow; ++w) {{
+    double* list = tools + w * {1 + MAX_GEOMS * GEOM};
+    int count = 0;
+    for (int q = s.geom_adr.data[w]; q < s.geom_adr.data[w + 1] && count < {MAX_GEOMS}; ++q) {{
+      const int g = s.geom.data[q];
+      double* G = list + 1 + {GEOM} * count++;
+      const double* R = s.geom_xmat.data + 9 * g;
+      for (int c = 0; c < 3; ++c) {{
+        G[c] = 0.0;
+        for (int k = 0; k < 3; ++k)
+          G[c] += s.frame.data[3 * k + c] * (s.geom_xpos.data[3 * g + k] - s.origin.data[k]);
+        for (int a = 0; a < 3; ++a) {{
+          double e = 0.0;
+          for (int k = 0; k < 3; ++k) e += s.frame.data[3 * k + c] * R[3 * k + a];
+          G[3 + 3 * a + c] = e;
+        }}
+        G[13 + c] = s.geom_size.data[3 * g + c];
+      }}
+      G[12] = s.geom_type.data[g];
+      for (int c = 0; c < 6; ++c) G[16 + c] = s.geom_aabb.data[6 * g + c];
+      const double r = s.geom_rbound.data[g] + s.reach;
+      G[22] = r * r;
+      // Boxes apart along an axis of one of them are apart.
+      bool apart = false;
+      double middle[3];
+      for (int c = 0; c < 3; ++c)
+        middle[c] = G[c] + G[3 + c] * G[16] + G[6 + c] * G[17] + G[9 + c] * G[18];
+      for (int c = 0; c < 3; ++c) {{
+        double half = margin;
+        for (int a = 0; a < 3; ++a) half += G[19 + a] * (G[3 + 3 * a + c] < 0.0 ? -G[3 + 3 * a + c]
+          : G[3 + 3 * a + c]);
+        apart = apart || middle[c] + half < bounds[c] || middle[c] - half > bounds[3 + c];
+        double at = 0.0, reach = margin + G[19 + c];
+        for (int k = 0; k < 3; ++k) {{
+          const double e = G[3 + 3 * c + k];
+          at += e * (middle[k] - 0.5 * (bounds[k] + bounds[3 + k]));
+          reach += 0.5 * (bounds[3 + k] - bounds[k]) * (e < 0.0 ? -e : e);
+        }}
+        apart = apart || at > reach || at < -reach;
+      }}
+      near = near || !apart;
+    }}
+    list[0] = count;
+  }}
+  s.flags.data[{NEAR}] = near;
+  s.flags.data[{ASLEEP}] = quiet[0] >= {QUIET} && !near && !pushes && !changed;
+"""
+)
+def _gather(s: Slots): ...
+
+
+@wp.func_native(
+  _STATE
+  + f"""
+  const bool asleep = s.flags.data[{ASLEEP}];
+  const double ok = !asleep && out[3] == 0.0 ? 1.0 : 0.0;
+  if (asleep) s.status.data[0] = s.status.data[1] = 0.0f;
+  else s.flags.data[{PENDING}] = 0;
+  for (int k = 0; k < s.nslot; ++k) {{
+    const int adr = s.dofadr.data[k];
+    for (int c = 0; c < 3; ++c) {{
+      const double inertia = s.M.data[s.massadr.data[3 * k + c]];
+      const double dv = ok != 0.0 ? out[{SUMMARY} + 3 * k + c] : 0.0;
+      const double f = inertia * dv / in[0] - s.ext.data[3 * k + c];
+      if (f == f) s.qfrc_passive.data[adr + c] += f;
+    }}
+  }}
+"""
+)
+def _scatter(s: Slots): ...
+
+
+@wp.func_native(
+  _STATE
+  + f"""
+  in[3] = 0.0;
+  if (s.flags.data[{ASLEEP}]) {{
+    // Contacts of a window that was left behind wake the organ.
+    for (int k = 0; k < s.nslot; ++k)
+      for (int c = 0; c < 3 && s.placed.data[k] >= 0; ++c)
+        fc[3 * k + c] = s.qfrc_constraint.data[s.dofadr.data[k] + c];
+    return;
+  }}
+  for (int c = 0; c < 6; ++c) bounds[c] = out[5 + c];
+  bool calm = !s.flags.data[{NEAR}] && quiet[0] < {QUIET} && out[4] < s.slow * s.slow;
+  for (int k = 0; k < s.nslot; ++k) {{
+    const int i = s.placed.data[k], adr = s.dofadr.data[k], qadr = s.qposadr.data[k];
+    double* move = moved + 7 * k;
+    move[0] = i;
+    for (int c = 0; c < 3; ++c) {{
+      fc[3 * k + c] = i < 0 ? 0.0 : s.qfrc_constraint.data[adr + c];
+      calm = calm && fc[3 * k + c] == 0.0 && pushed[4 * k + 1 + c] == 0.0;
+      if (i < 0) continue;
+      move[1 + c] = s.qpos.data[qadr + c] - s.qhome.data[3 * k + c] - s.rest.data[3 * i + c];
+      move[4 + c] = s.qvel.data[adr + c];
+    }}
+  }}
+  quiet[0] = calm ? quiet[0] + in[0] : 0.0;
+  int mode = 1;
+  if (quiet[0] >= {QUIET}) {{
+    mode = 2;
+    for (int c = 0; c < 3; ++c) tail[2 + c] = in[4 + c];
+    for (int k = 0; k < s.nslot; ++k)
+      for (int c = 0; c < 3; ++c) moved[7 * k + 4 + c] = 0.0;
+  }}
+  in[3] = mode;
+  in[8] = in[0];
+  s.flags.data[{PENDING}] = s.resident ? mode : 0;
+"""
+)
+def _leave(s: Slots): ...
+
+
+# Picks each window's nodes by the distance to its geoms.
+@wp.func_native(
+  _STATE
+  + _TRIANGLES
+  + f"""
+  if (s.flags.data[{ASLEEP}]) return;
+  s.flags.data[{MISSED_NODES}] = 0;
+  bool renewed = false;
+  for (int k = 0; k < s.nslot; ++k) {{
+    if (s.placed.data[k] >= 0) stand(k, s.placed.data[k], moved + 7 * k + 1, moved + 7 * k + 4);
+    else for (int c = 0; c < 3; ++c) s.qvel.data[s.dofadr.data[k] + c] = 0.0;
+  }}
+  for (int w = 0; w < s.nwindow; ++w) {{
+    const int first = s.window_adr.data[w], many = s.window_adr.data[w + 1] - first;
+    const double* record = out + {SUMMARY} + 3 * s.nslot + s.nwindow
+      + (size_t)w * s.most * {RECORD};
+    const int found = (int)out[{SUMMARY} + 3 * s.nslot + w];
+    int count = 0;
+    for (int q = 0; q < found && q < s.most; ++q) {{
+      const int i = (int)record[{RECORD} * q], k = s.taken.data[i];
+      if (k >= 0 && (k < first || k >= first + many)) continue;
+      s.candidate.data[count] = q;
+      s.distance.data[count++] = record[{RECORD} * q + 1];
+    }}
+    if (count < 3) continue;
+    // The `many` nearest, by quickselect; vertex numbers decide between equals.
+    double* far = s.distance.data;
+    int* which = s.candidate.data;
+    auto before = [&](double d, int p, double e, int q) -> bool {{
+      return d < e || (d == e && record[{RECORD} * p] < record[{RECORD} * q]);
+    }};
+    if (count > many) {{
+      int a = 0, b = count - 1;
+      while (a < b) {{
+        const double pivot = far[(a + b) / 2];
+        const int middle = which[(a + b) / 2];
+        int i = a, j = b;
+        while (i <= j) {{
+          while (before(far[i], which[i], pivot, middle)) ++i;
+          while (before(pivot, middle, far[j], which[j])) --j;
+          if (i <= j) {{
+            const double t = far[i]; far[i] = far[j]; far[j] = t;
+            const int n = which[i]; which[i] = which[j]; which[j] = n;
+            ++i; --j;
+          }}
+        }}
+        if (many - 1 <= j) b = j;
+        else if (many - 1 >= i) a = i;
+        else break;
+      }}
+      for (int q = many; q < count; ++q) s.flags.data[{MISSED_NODES}] += far[q] < s.touch;
+      count = many;
+    }}
+    // Nodes that stay keep their slot; the others fill the free ones in the order of the mesh.
+    for (int k = first; k < first + many; ++k)
+      if (s.placed.data[k] >= 0) s.taken.data[s.placed.data[k]] = -1;
+    for (int q = 0; q < count; ++q) s.chosen.data[(int)record[{RECORD} * which[q]]] = 1;
+    for (int k = first; k < first + many; ++k) {{
+      const int i = s.placed.data[k];
+      if (i >= 0 && s.chosen.data[i]) {{
+        s.taken.data[i] = k;
+        s.chosen.data[i] = 0;
+        slots[k] = i + 1.0;
+        continue;
+      }}
+      renewed = renewed || i >= 0;
+      slots[k] = -1.0;
+      s.placed.data[k] = -1;
+      for (int c = 0; c < 3; ++c) {{
+        fc[3 * k + c] = 0.0;
+        s.qvel.data[s.dofadr.data[k] + c] = 0.0;
+      }}
+    }}
+    int fresh = 0;
+    for (int q = 0; q < count; ++q) {{
+      const int r = which[q];
+      if (!s.chosen.data[(int)record[{RECORD} * r]]) continue;
+      s.chosen.data[(int)record[{RECORD} * r]] = 0;
+      int p = fresh++;
+      for (; p > 0 && record[{RECORD} * which[p - 1]] > record[{RECORD} * r]; --p)
+        which[p] = which[p - 1];
+      which[p] = r;
+    }}
+    int k = first;
+    for (int q = 0; q < fresh; ++q) {{
+      const double* r = record + {RECORD} * which[q];
+      while (slots[k] >= 0.0) ++k;
+      const int i = (int)r[0];
+      slots[k] = i + 1.0;
+      s.placed.data[k] = i;
+      s.taken.data[i] = k;
+      stand(k, i, s.resident ? r + 2 : U + 3 * i, s.resident ? r + 5 : W + 3 * i);
+      renewed = true;
+    }}
+  }}
+  if (renewed) triangles();
+"""
+)
+def _choose(s: Slots): ...
+
+
+@wp.func_native(
+  _STATE
+  + _TRIANGLES
+  + """
+  for (int i = 0; i < s.nvert; ++i) s.taken.data[i] = -1;
+  for (int k = 0; k < s.nslot; ++k) {
+    const int i = node_of(k);
+    s.placed.data[k] = i;
+    if (i < 0) {
+      for (int c = 0; c < 3; ++c) s.qvel.data[s.dofadr.data[k] + c] = 0.0;
+      continue;
+    }
+    s.taken.data[i] = k;
+    stand(k, i, U + 3 * i, W + 3 * i);
+  }
+  triangles();
+"""
+)
+def _place(s: Slots): ...
+
+
+@wp.kernel(enable_backward=False)
+def gather(slots: Slots):
+  """Reads what acts on the slots and where the tools are; flags slots that the model lacks."""
+  _gather(slots)
+
+
+@wp.kernel(enable_backward=False)
+def scatter(slots: Slots):
+  """Adds the passive force that carries v + dv to the windows' dofs."""
+  _scatter(slots)
+
+
+@wp.kernel(enable_backward=False)
+def leave(slots: Slots):
+  """Takes the motion of the slots' nodes and their contact force, and says if all is at rest."""
+  _leave(slots)
+
+
+@wp.kernel(enable_backward=False)
+def choose(slots: Slots):
+  """Gives each window the nodes nearest to its geoms."""
+  _choose(slots)
+
+
+@wp.kernel(enable_backward=False)
+def place(slots: Slots):
+  """Puts the windows' bodies on the nodes of their slots and rewrites their triangles."""
+  _place(slots)

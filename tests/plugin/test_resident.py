@@ -1,0 +1,199 @@
+"""Sleep of windowed organs, and motions that stay on the device."""
+
+import copy
+
+import mujoco
+import numpy as np
+import palpate
+import pytest
+import warp as wp
+from windowed import drive, scene
+
+STATE = mujoco.mjtState.mjSTATE_INTEGRATION
+
+
+def make(device="cpu", resident=False, **more):
+  keys = {"device": device, "resident": str(resident).lower(), **more}
+  m = mujoco.MjModel.from_xml_string(scene(keys=keys))
+  d = mujoco.MjData(m)
+  return m, d, palpate.Organ(m, d, "organ")
+
+
+def get_state(m, d) -> np.ndarray:
+  state = np.empty(mujoco.mj_stateSize(m, STATE))
+  mujoco.mj_getState(m, d, state, STATE)
+  return state
+
+
+def test_resident_motion_is_the_same(device):
+  m, d, organ = make(device)
+  expected = drive(m, d, 170)
+  m, d, resident = make(device, resident=True)
+  np.testing.assert_allclose(drive(m, d, 170), expected, atol=1e-6 * np.abs(expected).max())
+  np.testing.assert_allclose(resident.xpos, organ.xpos, atol=1e-8)
+  np.testing.assert_allclose(resident.xvel, organ.xvel, atol=1e-6)
+  assert organ.error is None and resident.error is None
+
+
+def test_looking_at_a_resident_motion_changes_nothing(device):
+  m, d, organ = make(device, resident=True)
+  expected = drive(m, d, 120)
+  m, d, organ = make(device, resident=True)
+  forces = []
+  for _ in range(12):
+    forces.append(drive(m, d, 10))
+    assert np.abs(organ.displacement).max() < 0.01
+  np.testing.assert_array_equal(np.concatenate(forces), expected)
+
+
+def test_synced_resident_state_restores_to_the_bit(device):
+  m, d, organ = make(device, resident=True)
+  drive(m, d, 100)
+  organ.sync()
+  state = get_state(m, d)
+  expected = drive(m, d, 50)
+  mujoco.mj_resetData(m, d)
+  drive(m, d, 20)
+  mujoco.mj_setState(m, d, state, STATE)
+  np.testing.assert_array_equal(drive(m, d, 50), expected)
+  organ.sync()
+  m2 = copy.copy(m)
+  d2 = mujoco.MjData(m2)
+  mujoco.mj_copyData(d2, m2, d)
+  np.testing.assert_array_equal(drive(m2, d2, 30), drive(m, d, 30))
+
+
+def test_state_saved_without_sync_is_refused(device):
+  m, d, organ = make(device, resident=True)
+  drive(m, d, 50)
+  state = get_state(m, d)
+  drive(m, d, 5)
+  mujoco.mj_setState(m, d, state, STATE)
+  mujoco.mj_step(m, d)
+  assert "sync()" in organ.error
+  mujoco.mj_resetData(m, d)
+  drive(m, d, 5)
+  assert organ.error is None
+
+
+def test_resident_reset_and_set_state(device):
+  m, d, organ = make(device, resident=True)
+  expected = drive(m, d, 100)
+  mujoco.mj_resetData(m, d)
+  assert np.abs(organ.displacement).max() == 0.0
+  np.testing.assert_array_equal(drive(m, d, 100), expected)
+  organ.set_state(xpos=organ.xpos0 + 0.001)
+  np.testing.assert_allclose(organ.xpos, organ.xpos0 + 0.001, atol=1e-12)
+  d.ctrl[0] = 0.05
+  mujoco.mj_step(m, d)
+  assert 1e-4 < np.abs(organ.displacement).max() < 2e-3
+  before = organ.displacement
+  organ.configure(tolerance="1e-5")
+  np.testing.assert_array_equal(organ.displacement, before)
+  drive(m, d, 20)
+  assert organ.error is None
+
+
+@pytest.mark.skipif(not wp.is_cuda_available(), reason="needs a CUDA device")
+def test_search_with_little_room_keeps_the_nearest(monkeypatch):
+  m, d, _ = make("cuda:0", resident=True)
+  expected = drive(m, d, 120)
+  monkeypatch.setattr("palpate.window._ROOM", 1)
+  m, d, _ = make("cuda:0", resident=True)
+  np.testing.assert_allclose(drive(m, d, 120), expected, atol=5e-3 * np.abs(expected).max())
+
+
+def settle(m, d, organ, seconds=8.0):
+  """Steps with the tool away until the organ sleeps."""
+  d.ctrl[0] = 0.05
+  for _ in range(round(seconds / m.opt.timestep)):
+    mujoco.mj_step(m, d)
+    if organ.asleep:
+      return
+  raise AssertionError("the organ does not fall asleep")
+
+
+@pytest.fixture(params=[False, True])
+def at_rest(request):
+  m, d, organ = make(resident=request.param)
+  m.opt.gravity[2] = -9.81
+  drive(m, d, 120)
+  settle(m, d, organ)
+  return m, d, organ
+
+
+def test_organ_at_rest_sleeps_and_stays_where_it_is(at_rest):
+  m, d, organ = at_rest
+  before, quiet = organ.displacement, organ.iterations
+  mujoco.mj_step(m, d, nstep=100)
+  assert organ.asleep and quiet == 0
+  np.testing.assert_array_equal(organ.displacement, before)
+  assert np.abs(organ.xvel).max() == 0.0
+
+
+def test_sleep_changes_nothing_measurable(monkeypatch):
+  def run():
+    m, d, organ = make()
+    m.opt.gravity[2] = -9.81
+    first = drive(m, d, 120)
+    d.ctrl[0] = 0.05
+    slept = 0
+    for _ in range(3500):
+      mujoco.mj_step(m, d)
+      slept += organ.asleep
+    at_rest = organ.displacement
+    d.time = 0.0
+    return slept, np.concatenate([first, drive(m, d, 170)]), at_rest
+
+  slept, force, at_rest = run()
+  assert slept > 500
+  monkeypatch.setattr("palpate.window._SLOW", 0.0)
+  never, expected, awake = run()
+  assert never == 0
+  assert np.abs(at_rest - awake).max() < 1e-7
+  assert np.abs(force - expected).max() < 1e-3 * np.abs(expected).max()
+
+
+@pytest.mark.parametrize("what", ["tool", "force", "gravity", "parameter", "state"])
+def test_sleeping_organ_wakes(at_rest, what):
+  m, d, organ = at_rest
+  before = organ.displacement
+  if what == "tool":
+    d.ctrl[0] = -0.008
+    mujoco.mj_step(m, d, nstep=300)
+    assert np.abs(organ.contact_force).max() > 0.005
+  elif what == "force":
+    slot = int(np.flatnonzero(organ._space.views["placed"].numpy() >= 0)[0])
+    d.xfrc_applied[organ._organ.windows.body[slot], 2] = 0.01
+  elif what == "gravity":
+    m.opt.gravity[:] = 9.81, 0, 0
+  elif what == "parameter":
+    organ.configure(foundation="5e3")
+  elif what == "state":
+    organ.set_state(xpos=organ.xpos + np.array([0, 0, 0.001]))
+  mujoco.mj_step(m, d, nstep=20)
+  assert not organ.asleep
+  assert np.abs(organ.displacement - before).max() > 1e-6
+
+
+def test_sleep_is_part_of_the_state():
+  m, d, organ = make()
+  drive(m, d, 120)
+  settle(m, d, organ)
+  state = get_state(m, d)
+  d.time = 0.0
+  expected = drive(m, d, 100)
+  mujoco.mj_resetData(m, d)
+  drive(m, d, 30)
+  mujoco.mj_setState(m, d, state, STATE)
+  mujoco.mj_forward(m, d)
+  assert organ.asleep
+  d.time = 0.0
+  np.testing.assert_array_equal(drive(m, d, 100), expected)
+
+
+def test_resident_needs_a_window():
+  with pytest.raises(ValueError, match="resident is set, allowed only with window"):
+    mujoco.MjModel.from_xml_string(scene(False, keys={"resident": "true"}))
+  with pytest.raises(ValueError, match="resident is 'yes', expected 'true' or 'false'"):
+    mujoco.MjModel.from_xml_string(scene(keys={"resident": "yes"}))
