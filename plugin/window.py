@@ -282,6 +282,10 @@ def show(w, m, shown: bool):
   names = ("flex_vertnum", "flex_elemnum", "flex_shellnum", "flex_bvhnum", "flex_bvhadr")
   for name, count in zip(names, (*counts, 0, -1), strict=True):
     mjstruct.view(getattr(m, name), m.nflex, np.int32)[flex] = count
+  # The broad phase passes over vertices of the world; the first one still tells whose they are.
+  start = int(mjstruct.view(m.flex_vertadr, m.nflex, np.int32)[flex])
+  body = mjstruct.view(m.flex_vertbodyid, m.nflexvert, np.int32)[start : start + mesh.nvert]
+  body[1:] = body[0] if shown else 0
 
 
 def hide(w):
