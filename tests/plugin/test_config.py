@@ -38,6 +38,7 @@ REFUSED = [
   ("elements", "tetrahedron", "'membrane' or 'spring'"),
   ("mass", "0", "> 0"),
   ("pin", "1 -2", "vertex numbers"),
+  ("resident", "yes", "'true' or 'false'"),
 ]
 
 
