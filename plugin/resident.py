@@ -36,7 +36,7 @@ class Resident:
     self.device = w.surface.device
     self.live = -1
     self._end_step, self._look_again = end_step, look_again
-    self._staging = wp.empty(
+    self._staging = wp.zeros(
       3 * 3 * nodes.nvert, dtype=wp.float64, device="cpu", pinned=self.device.is_cuda
     )
 

@@ -6,8 +6,11 @@ comes back is another, the outbox (the slots' dv, what is near the tools, how fa
 
 from __future__ import annotations
 
+from typing import Any
+
 import warp as wp
 
+struct: Any = wp.struct  # type checkers take what wp.struct makes for a value
 MAX_GEOMS = 16  # of a window
 HEAD = 10  # h, its square with damping, floor, mode, gravity (3), reach, h of the step to commit, -
 GEOM = 24  # centre, axes, type, size, bounding box, squared reach of the bounding sphere
@@ -17,7 +20,7 @@ LOWEST = -(2**31)
 STILL, COMMIT, HALT = 0, 1, 2  # mode: nothing to commit, the last step, it and standing still
 
 
-@wp.struct
+@struct
 class Nodes:
   """A windowed organ's nodes; doubles in the order of the vertices, in the organ's frame.
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from .window_nodes import GEOM, HEAD, MAX_GEOMS, RECORD, SUMMARY
+from .window_nodes import GEOM, HEAD, MAX_GEOMS, RECORD, SUMMARY, struct
 
 TAIL = 11
 STALE, ASLEEP, MISSED_NODES, MISSED_ELEMENTS, PENDING, NEAR = range(6)  # flags
@@ -17,7 +17,7 @@ STALE, ASLEEP, MISSED_NODES, MISSED_ELEMENTS, PENDING, NEAR = range(6)  # flags
 QUIET = 0.2
 
 
-@wp.struct
+@struct
 class Slots:
   """What MuJoCo and a windowed organ share; see `declare.Windows` for the organ's own arrays.
 

@@ -225,8 +225,11 @@ _OUT = ("dvel", "status")
 
 def _cross(w: Workspace, fields: tuple[str, ...], to_device: bool):
   for field in fields:
-    pair = (getattr(w.state, field), w.host[field])
-    wp.copy(*(pair if to_device else pair[::-1]))
+    there, here = getattr(w.state, field), w.host[field]
+    if to_device:
+      wp.copy(there, here)
+    else:
+      wp.copy(here, there)
 
 
 def _record_all(*parts) -> list:
