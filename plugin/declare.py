@@ -440,7 +440,9 @@ def _check_surface(m, flex: int, name: str):
 def _check_flex(m, flex: int, name: str):
   _check_surface(m, flex, name)
   if mjstruct.view(m.flex_rigid, m.nflex, np.bool_)[flex]:
-    raise ValueError(f"organ {name!r}: flexcomp is rigid, expected rigid='false'")
+    raise ValueError(
+      f"organ {name!r}: flexcomp is rigid (or all its vertices are pinned), expected rigid='false'"
+    )
   if mjstruct.view(m.flex_interp, m.nflex, np.int32)[flex]:
     raise ValueError(f"organ {name!r}: flexcomp dof is interpolated, expected dof='full'")
   stiffness = mjstruct.view(m.flex_edgestiffness, m.nflex)[flex]
