@@ -67,12 +67,21 @@ def find(data: int, instance: int) -> Workspace:
   return _workspaces[data, instance]
 
 
+def _windowed(model: mujoco.MjModel, data: mujoco.MjData) -> list[Workspace]:
+  found = [_workspaces.get((data._address, i)) for i in range(model.nplugin)]
+  return [w for w in found if w is not None and w.place is not None]
+
+
+def sync(model: mujoco.MjModel, data: mujoco.MjData):
+  """Brings the motion of all organs into the plugin state, before it is read or saved."""
+  for w in _windowed(model, data):
+    workspace.sync(w)
+
+
 def place_windows(model: mujoco.MjModel, data: mujoco.MjData):
   """Puts the windows where a plugin state that was set says; stepping does it by itself."""
-  for instance in range(model.nplugin):
-    w = _workspaces.get((data._address, instance))
-    if w is not None and w.place is not None:
-      workspace.place(w)
+  for w in _windowed(model, data):
+    workspace.place(w)
 
 
 def warn(text: str):

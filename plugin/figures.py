@@ -73,6 +73,7 @@ def plot_if_able(samples: Sequence[Sample], path: pathlib.Path, title: str):
 
 def snapshot(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
   """Returns what a picture of the scene needs."""
+  engine.sync(model, data)
   state = np.empty(mujoco.mj_stateSize(model, _SHOWN))
   mujoco.mj_getState(model, data, state, _SHOWN)
   return state.astype(np.float32)
