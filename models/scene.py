@@ -12,11 +12,13 @@ from collections.abc import Sequence
 
 import mujoco
 import numpy as np
+from palpate import author
 
 from . import catalog, quality, shapes, trocar
 from .catalog import DEFAULT, GRIDS, RESOLUTIONS, Entry, Port
 
 INSTRUMENTS = trocar.NAMES
+COUPLINGS = ("nodal", "window")
 _ROOT = pathlib.Path(__file__).parent
 
 
@@ -100,6 +102,7 @@ def load(
   instruments: Sequence[str] = ("probe", "grasper"),
   handle: bool = False,
   grid: int | None = None,
+  coupling: str = "nodal",
 ) -> mujoco.MjSpec:
   """Returns a scene: the organ, instruments, light, laparoscope, targets and keyframes.
 
@@ -110,25 +113,44 @@ def load(
     instruments: of `INSTRUMENTS`, at most two: the right hand's first
     handle: whether mocap handles pull the instruments in place of position actuators
     grid: a regular sheet of grid x grid nodes in place of `nodes`, one of `GRIDS`
+    coupling: `nodal`, or `window` where MuJoCo knows the nodes near the instruments alone
   """
   shape = _body(name, nodes, seed, grid)
   _check_instruments(instruments)
   spec = mujoco.MjSpec.from_string(scene_xml(shape, name, instruments, handle, False, False))
-  spec.attach(_organ(shape, name), prefix=f"{name}/", frame=spec.frame(name))
-  for key, (qpos, ctrl, mocap) in keyframes(shape, instruments, handle).items():
+  spec.attach(_organ(shape, name, coupling), prefix=f"{name}/", frame=spec.frame(name))
+  free = None
+  if coupling == "window":
+    window = author.add_windows(spec, f"{name}/{name}")[0]
+    free = 3 * len(spec.flex(window).vertbody)
+    spec.memory = _megabytes(free // 3) << 20
+  for key, (qpos, ctrl, mocap) in keyframes(shape, instruments, handle, free).items():
     spec.add_key(name=key, qpos=qpos, ctrl=ctrl, mpos=mocap)
   return spec
 
 
 def organ(
-  name: str, nodes: int = DEFAULT, seed: int | None = None, grid: int | None = None
+  name: str,
+  nodes: int = DEFAULT,
+  seed: int | None = None,
+  grid: int | None = None,
+  coupling: str = "nodal",
 ) -> mujoco.MjSpec:
-  """Returns the organ alone, to attach to a scene of your own; arguments as for `load`."""
-  return _organ(_body(name, nodes, seed, grid), name)
+  """Returns the organ alone, to attach to a scene of your own; arguments as for `load`.
+
+  With `coupling="window"` its window is sized for one 5 mm instrument;
+  `palpate.add_windows(spec, name)` of the scene's own nodal organ sizes it for the tools there.
+  """
+  spec = _organ(_body(name, nodes, seed, grid), name, coupling)
+  if coupling == "window":
+    author.add_windows(spec, name)
+  return spec
 
 
-def _organ(shape: Body, name: str) -> mujoco.MjSpec:
-  return mujoco.MjSpec.from_string(organ_xml(shape, name, file=None))
+def _organ(shape: Body, name: str, coupling: str) -> mujoco.MjSpec:
+  if coupling not in COUPLINGS:
+    raise ValueError(f"organ {name!r}: coupling is {coupling!r}, expected nodal or window")
+  return mujoco.MjSpec.from_string(organ_xml(shape, name, None, coupling == "window"))
 
 
 def targets(name: str) -> tuple[str, ...]:
@@ -172,8 +194,15 @@ def obj(shape: Body) -> str:
   return "\n".join(lines) + "\n"
 
 
-def organ_xml(shape: Body, name: str, file: str | None) -> str:
-  """Returns the organ alone as MJCF; the mesh is in `file` under assets/, or in the text."""
+def organ_xml(shape: Body, name: str, file: str | None, rigid: bool = False) -> str:
+  """Returns the organ alone as MJCF.
+
+  Args:
+    shape: its mesh
+    name: its name
+    file: the mesh under assets/; None has it in the text
+    rigid: whether it is declared to be given windows, in place of dofs for the nodes
+  """
   entry = shape.entry
   if file is None:
     points, elements = numbers(shape.vertices), " ".join(map(str, shape.triangles.ravel()))
@@ -184,6 +213,28 @@ def organ_xml(shape: Body, name: str, file: str | None) -> str:
     f'        <pin id="{" ".join(map(str, index))}"/>  <!-- {patch} -->\n'
     for patch, index in shape.patches.items()
   )
+  config = {
+    "young": " ".join(f"{v:g}" for v in shape.young()),
+    "poisson": f"{entry.poisson:g}",
+    "thickness": f"{entry.thickness:g}",
+    "foundation": f"{entry.foundation:g}",
+    "bulk": f"{entry.bulk:g}",
+    "damping": f"{entry.damping:g}",
+  }
+  if rigid:
+    config |= {"mass": f"{shape.mass:.4g}", "pin": " ".join(map(str, shape.pins))}
+  keys = "".join(f'          <config key="{k}" value="{v}"/>\n' for k, v in config.items())
+  contact = (
+    '        <contact condim="3" friction="0.3" solref="0.004 1" solimp="0.95 0.99 0.001" '
+    'solmix="1000"\n          selfcollide="none"/>\n'
+  )
+  declared, owned, how = '<plugin plugin="palpate.organ"/>', "", f'mass="{shape.mass:.4g}"'
+  plugin = f'        <plugin plugin="palpate.organ">\n{keys}        </plugin>\n'
+  plugin += '        <edge damping="1e-9"/>\n'
+  if rigid:
+    declared = f'<plugin plugin="palpate.organ"><instance name="{name}">{keys}</instance></plugin>'
+    owned, how = f'      <plugin plugin="palpate.organ" instance="{name}"/>\n', 'rigid="true"'
+    plugin, pins = "", ""
   sites = "".join(
     f'      <site name="{name}_{mark}" class="{name}_target" pos="{numbers(pos)}"/>\n'
     for mark, pos in shape.landmarks.items()
@@ -191,7 +242,7 @@ def organ_xml(shape: Body, name: str, file: str | None) -> str:
   return f"""<mujoco model="{name}">
   <!-- {entry.title}. x to the patient's right, y anterior, z superior. -->
   <extension>
-    <plugin plugin="palpate.organ"/>
+    {declared}
   </extension>
 
   <default>
@@ -207,20 +258,9 @@ def organ_xml(shape: Body, name: str, file: str | None) -> str:
 
   <worldbody>
     <body name="{name}">
-      <flexcomp name="{name}" {mesh} dim="2" mass="{shape.mass:.4g}" radius="0.001"
+{owned}      <flexcomp name="{name}" {mesh} dim="2" {how} radius="0.001"
         material="{name}" flatskin="false">
-        <plugin plugin="palpate.organ">
-          <config key="young" value="{" ".join(f"{v:g}" for v in shape.young())}"/>
-          <config key="poisson" value="{entry.poisson:g}"/>
-          <config key="thickness" value="{entry.thickness:g}"/>
-          <config key="foundation" value="{entry.foundation:g}"/>
-          <config key="bulk" value="{entry.bulk:g}"/>
-          <config key="damping" value="{entry.damping:g}"/>
-        </plugin>
-        <edge damping="1e-9"/>
-        <contact condim="3" friction="0.3" solref="0.004 1" solimp="0.95 0.99 0.001" solmix="1000"
-          selfcollide="none"/>
-{pins}      </flexcomp>
+{plugin}{contact}{pins}      </flexcomp>
 {sites}    </body>
   </worldbody>
 </mujoco>
@@ -347,16 +387,17 @@ def _place(shape: Body, port: Port) -> tuple[np.ndarray, np.ndarray]:
 
 
 def keyframes(
-  shape: Body, instruments: Sequence[str], handle: bool
+  shape: Body, instruments: Sequence[str], handle: bool, free: int | None = None
 ) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:
   """Returns qpos, ctrl and mocap positions of every keyframe by name.
 
   `home` has every joint at zero; `touch` the tips 5 mm off the places they point at, grasper and
   scissors 8 mm and open; `press` is `touch` with controls that take the first instrument 10 mm
   deep. The dofs of the instruments come first, so that their addresses do not depend on the
-  organ's resolution.
+  organ's resolution; `free` are those of the organ, unless its nodes are.
   """
-  free = 3 * (len(shape.vertices) - len(shape.pins))
+  if free is None:
+    free = 3 * (len(shape.vertices) - len(shape.pins))
   keys = {}
   for key in ("home", "touch", "press"):
     qpos, ctrl, mocap = [], [], []

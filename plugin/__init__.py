@@ -12,9 +12,10 @@ from importlib.util import find_spec as _find_spec
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+  from .author import add_windows
   from .organ import Organ
 
-__all__ = ["Organ", "__version__", "register"]
+__all__ = ["Organ", "__version__", "add_windows", "register"]
 __version__ = "0.1.0"
 
 
@@ -24,10 +25,11 @@ def register() -> int:
   `import palpate` does it, except in the `palpate` command, whose help needs neither MuJoCo nor
   Warp. From here on Warp speaks of warnings and errors only; `warp.config.log_level` changes it.
   """
-  from . import engine, organ, quiet
+  from . import author, engine, organ, quiet
 
   if "Organ" not in globals():
     globals()["Organ"] = organ.Organ
+    globals()["add_windows"] = author.add_windows
     quiet.lower_log_level()
   return engine.register()
 

@@ -16,10 +16,10 @@ from . import mesh as topology
 from .config import Config
 from .mesh import Mesh
 from .types import Surface
+from .window_nodes import MAX_GEOMS, MAX_WINDOWS
 
 _lock = threading.RLock()
 _CACHED = 16
-_MAX_GEOMS = 16  # of a window: native code has room for so many
 _made: dict[bytes, Organ] = {}
 
 
@@ -193,11 +193,7 @@ def _keys(model: int, instance: int) -> dict[str, str]:
 
 def _read_windowed(model: int, m, instance: int) -> Organ:
   """Returns an organ that MuJoCo knows as a rigid flex, with windows."""
-  bodies = np.flatnonzero(mjstruct.view(m.body_plugin, m.nbody, np.int32) == instance)
-  start = mjstruct.view(m.flex_vertadr, m.nflex, np.int32)
-  vertbody = mjstruct.view(m.flex_vertbodyid, m.nflexvert, np.int32)
-  rigid = mjstruct.view(m.flex_rigid, m.nflex, np.bool_)
-  mine = [f for f in range(m.nflex) if rigid[f] and vertbody[start[f]] in bodies]
+  bodies, mine = _rigid_flexes(m, instance)
   who = mjstruct.name_of(m, m.name_bodyadr, int(bodies[0]))
   if len(mine) != 1:
     raise ValueError(
@@ -205,6 +201,7 @@ def _read_windowed(model: int, m, instance: int) -> Organ:
       "expected one <flexcomp rigid='true'> in the body that has the plugin"
     )
   flex = mine[0]
+  start = mjstruct.view(m.flex_vertadr, m.nflex, np.int32)
   name = _flex_name(m, flex)
   _check_surface(m, flex, name)
   for key in ("contype", "conaffinity"):
@@ -246,36 +243,71 @@ def _read_windowed(model: int, m, instance: int) -> Organ:
   )
 
 
+def _rigid_flexes(m, instance: int) -> tuple[np.ndarray, list[int]]:
+  """Returns the bodies of a plugin instance and the rigid flexes in them."""
+  bodies = np.flatnonzero(mjstruct.view(m.body_plugin, m.nbody, np.int32) == instance)
+  start = mjstruct.view(m.flex_vertadr, m.nflex, np.int32)
+  vertbody = mjstruct.view(m.flex_vertbodyid, m.nflexvert, np.int32)
+  rigid = mjstruct.view(m.flex_rigid, m.nflex, np.bool_)
+  return bodies, [f for f in range(m.nflex) if rigid[f] and vertbody[start[f]] in bodies]
+
+
+def _resolve(name: str, organ: str, names: list[str]) -> str | None:
+  """Returns the name that an organ's configuration means, or None.
+
+  `<attach prefix="...">` renames flexes and bodies and leaves configurations alone: the longest
+  prefix that the organ has too counts.
+  """
+  prefixes = [other[: len(other) - len(name)] for other in names if other.endswith(name)]
+  prefixes = [prefix for prefix in prefixes if organ.startswith(prefix)]
+  return max(prefixes, key=len) + name if prefixes else None
+
+
+def _claims(model, m, instance: int, names: list[str]) -> dict[str, str]:
+  """Returns the windows of the other organs, and whose they are."""
+  claimed: dict[str, str] = {}
+  plugin = mjstruct.view(m.plugin, m.nplugin, np.int32)
+  for other in range(m.nplugin):
+    if other != instance and plugin[other] == plugin[instance]:
+      for flex in _rigid_flexes(m, other)[1]:
+        for window in mjstruct.config(model, other, "window").split():
+          organ = _flex_name(m, flex)
+          claimed[_resolve(window, organ, names) or window] = f"organ {organ!r}"
+  return claimed
+
+
 def _windows(model, m, instance, name, config, mesh, mass, place) -> Windows:
   names = [_flex_name(m, f) for f in range(m.nflex)]
-  claimed: dict[str, str] = {}
-  for other in range(m.nplugin):
-    if other != instance and mjstruct.view(m.plugin, m.nplugin, np.int32)[other] == (
-      mjstruct.view(m.plugin, m.nplugin, np.int32)[instance]
-    ):
-      claimed |= dict.fromkeys(mjstruct.config(model, other, "window").split(), "another organ")
+  claimed = _claims(model, m, instance, names)
+  if len(config.window) > MAX_WINDOWS:
+    raise ValueError(
+      f"organ {name!r}: window has {len(config.window)} names, expected at most {MAX_WINDOWS}"
+    )
   body, dofadr, qposadr, offsets, sizes = [], [], [], [], []
   flex, elem_adr, elem_num = [], [], []
   for window in config.window:
     what = f"organ {name!r}: window {window!r}"
-    if window not in names:
+    found = _resolve(window, name, names)
+    if found is None:
       raise ValueError(f"{what} does not exist, expected a flexcomp; the model has {names}")
-    if window in claimed:
-      raise ValueError(f"{what} is claimed by {claimed[window]} too, expected one organ a window")
-    claimed[window] = "this organ"
-    f = names.index(window)
-    _check_flex(m, f, window)
+    if found in claimed:
+      raise ValueError(f"{what} is claimed by {claimed[found]} too, expected one organ a window")
+    claimed[found] = "this organ"
+    f = names.index(found)
     start = int(mjstruct.view(m.flex_vertadr, m.nflex, np.int32)[f])
     count = _vertices(m, f)
     own = mjstruct.view(m.flex_vertbodyid, m.nflexvert, np.int32)[start : start + count].copy()
     jointed = mjstruct.view(m.body_jntnum, m.nbody, np.int32)[own] > 0
-    if not jointed.all():
-      raise ValueError(f"{what} has vertices without joints, expected no pins and rigid='false'")
-    parent = _parent(m, window, own, jointed)
-    frame, origin = _static_frame(m, window, parent)
+    try:
+      _check_flex(m, f, window)
+      if not jointed.all():
+        raise ValueError(f"organ {window!r}: vertices without joints, expected no pins")
+      frame, origin = _static_frame(m, window, _parent(m, window, own, jointed))
+      dofs, qposs = _addresses(m, window, own, jointed)
+    except ValueError as error:
+      raise ValueError(f"{what}: {str(error).partition(': ')[2]}") from None
     if np.abs(frame - place[0]).max() > 1e-9:
       raise ValueError(f"{what} is rotated against the organ, expected the same orientation")
-    dofs, qposs = _addresses(m, window, own, jointed)
     offsets.append(np.tile(place[0].T @ (place[1] - origin), (count, 1)))
     body.append(own)
     dofadr.append(dofs)
@@ -324,22 +356,25 @@ def _followed(m, name: str, config: Config, flex: list[int]) -> tuple[np.ndarray
         )
       wanted = []
       for body in config.follow[k]:
-        if body not in names:
+        found = _resolve(body, name, names)
+        if found is None:
           raise ValueError(f"organ {name!r}: follow names body {body!r}, which does not exist")
-        wanted.append(names.index(body))
+        wanted.append(names.index(found))
       mine = [g for g in meets if bodyid[g] in wanted]
     else:
       mine = [g for g in meets if weld[bodyid[g]] != 0]
     groups.append(mine)
   if not config.follow and len(flex) > 1:
-    bodies = sorted({int(bodyid[g]) for group in groups for g in group})
-    turn = {b: k % len(flex) for k, b in enumerate(bodies)}
-    groups = [[g for g in group if turn[int(bodyid[g])] == k] for k, group in enumerate(groups)]
+    # A tree of bodies is one tool: a triangle between two windows would touch neither jaw.
+    root = mjstruct.view(m.body_treeid, m.nbody, np.int32)[bodyid]
+    trees = sorted({root[g] for group in groups for g in group})
+    turn = {tree: k % len(flex) for k, tree in enumerate(trees)}
+    groups = [[g for g in group if turn[root[g]] == k] for k, group in enumerate(groups)]
   for k, group in enumerate(groups):
-    if len(group) > _MAX_GEOMS:
+    if len(group) > MAX_GEOMS:
       raise ValueError(
         f"organ {name!r}: window {config.window[k]!r} follows {len(group)} geoms, expected at most "
-        f"{_MAX_GEOMS}; name bodies in follow"
+        f"{MAX_GEOMS}; name bodies in follow"
       )
   adr = np.concatenate([[0], np.cumsum([len(group) for group in groups])])
   return adr, np.array([g for group in groups for g in group], np.int64)
@@ -405,7 +440,9 @@ def _check_surface(m, flex: int, name: str):
 def _check_flex(m, flex: int, name: str):
   _check_surface(m, flex, name)
   if mjstruct.view(m.flex_rigid, m.nflex, np.bool_)[flex]:
-    raise ValueError(f"organ {name!r}: flexcomp is rigid, expected rigid='false'")
+    raise ValueError(
+      f"organ {name!r}: flexcomp is rigid (or all its vertices are pinned), expected rigid='false'"
+    )
   if mjstruct.view(m.flex_interp, m.nflex, np.int32)[flex]:
     raise ValueError(f"organ {name!r}: flexcomp dof is interpolated, expected dof='full'")
   stiffness = mjstruct.view(m.flex_edgestiffness, m.nflex)[flex]

@@ -20,6 +20,7 @@ import numpy as np
 
 from . import mjstruct, window, workspace
 from .config import KEYS
+from .window_slots import MISSED_ELEMENTS, MISSED_NODES
 from .workspace import Workspace
 
 NAME = "palpate.organ"
@@ -64,6 +65,23 @@ _next_handle = itertools.count(1)
 def find(data: int, instance: int) -> Workspace:
   """Returns the workspace of plugin instance `instance` in the mjData at address `data`."""
   return _workspaces[data, instance]
+
+
+def _windowed(model: mujoco.MjModel, data: mujoco.MjData) -> list[Workspace]:
+  found = [_workspaces.get((data._address, i)) for i in range(model.nplugin)]
+  return [w for w in found if w is not None and w.place is not None]
+
+
+def sync(model: mujoco.MjModel, data: mujoco.MjData):
+  """Brings the motion of all organs into the plugin state, before it is read or saved."""
+  for w in _windowed(model, data):
+    workspace.sync(w)
+
+
+def place_windows(model: mujoco.MjModel, data: mujoco.MjData):
+  """Puts the windows where a plugin state that was set says; stepping does it by itself."""
+  for w in _windowed(model, data):
+    workspace.place(w)
 
 
 def warn(text: str):
@@ -145,10 +163,22 @@ def _advance(model: int, data: int, instance: int):
   w = _workspaces[data, instance]
   try:
     w.step()
+    if w.overflow is None and (w.flags[MISSED_NODES] or w.flags[MISSED_ELEMENTS]):
+      _overflow(w)
     if mjstruct.Model.from_address(model).opt.timestep != w.time_step:
       workspace.refresh(w)
   except Exception as error:
     _fail(w, f"{type(error).__name__}: {error}")
+
+
+def _overflow(w: Workspace):
+  """Says, once, that a window is too small."""
+  nodes, triangles = int(w.flags[MISSED_NODES]), int(w.flags[MISSED_ELEMENTS])
+  what = f"{triangles} triangles between their nodes; give them more elements"
+  if nodes:
+    what = f"{nodes} nodes that tools touch and keep the deepest; give them more vertices"
+  w.overflow = f"organ {w.organ.name!r}: its windows have no room for {what}"
+  warn(w.overflow)
 
 
 def _visualize(model: int, data: int, option: int, scene: int, instance: int):

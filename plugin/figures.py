@@ -10,10 +10,13 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
+from . import engine
 from .console import CommandError, Interrupt, Progress
 from .probe import Sample
 
 _FORCE, _MOTION, _INK = "#c1442e", "#2f6f9f", "#333333"
+# What a frame needs: an organ with windows has its shape in the plugin state.
+_SHOWN = mujoco.mjtState.mjSTATE_QPOS | mujoco.mjtState.mjSTATE_PLUGIN
 
 
 def need(extra: str, *modules: str):
@@ -68,8 +71,16 @@ def plot_if_able(samples: Sequence[Sample], path: pathlib.Path, title: str):
     print(f"palpate: no plot: {error}", file=sys.stderr)
 
 
+def snapshot(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+  """Returns what a picture of the scene needs."""
+  engine.sync(model, data)
+  state = np.empty(mujoco.mj_stateSize(model, _SHOWN))
+  mujoco.mj_getState(model, data, state, _SHOWN)
+  return state.astype(np.float32)
+
+
 def picture(model: mujoco.MjModel, data: mujoco.MjData, state: np.ndarray, path: pathlib.Path):
-  """Renders generalized positions to a PNG file, without a screen."""
+  """Renders a snapshot to a PNG file, without a screen."""
   import imageio.v2 as imageio
 
   with _renderer(model, 960, 720) as renderer:
@@ -86,12 +97,12 @@ def film(
   interrupt: Interrupt,
   progress: Progress,
 ):
-  """Renders generalized positions to an MP4 or GIF, without a screen.
+  """Renders snapshots to an MP4 or GIF, without a screen.
 
   Args:
     model: compiled model
     data: of that model; its positions are changed
-    states: qpos of every frame
+    states: snapshot of every frame
     path: file to write, .mp4 or .gif
     rate: frames per second
     interrupt: ends the film early
@@ -129,7 +140,8 @@ def _renderer(model: mujoco.MjModel, width: int, height: int) -> mujoco.Renderer
 
 
 def _frame(model, data, state: np.ndarray, renderer: mujoco.Renderer) -> np.ndarray:
-  data.qpos[:] = state
+  mujoco.mj_setState(model, data, state.astype(np.float64), _SHOWN)
+  engine.place_windows(model, data)
   mujoco.mj_fwdPosition(model, data)
   renderer.update_scene(data, 0 if model.ncam else -1)
   return renderer.render()

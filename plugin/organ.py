@@ -133,6 +133,11 @@ class Organ:
     return int(self._space.flags[2]), int(self._space.flags[3])
 
   @property
+  def window_warning(self) -> str | None:
+    """What the windows were too small for, the first time that they were, or None."""
+    return self._space.overflow
+
+  @property
   def force(self) -> np.ndarray:
     """Sum of `contact_force` [N], (3,)."""
     return self.contact_force.sum(axis=0)

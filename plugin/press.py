@@ -36,6 +36,11 @@ def add_arguments(parser: argparse.ArgumentParser):
   add("--h", metavar="S", type=float, help="time step (the scene's)")
   add("--nodes", metavar="N", type=int, help="make the shipped organ anew with so many nodes")
   add("--seed", metavar="N", type=int, help="make the shipped organ anew with other lobes")
+  add(
+    "--coupling",
+    choices=("nodal", "window"),
+    help="window: MuJoCo knows the nodes near the probe alone (the scene's)",
+  )
   add("--device", metavar="DEVICE", help="cpu, cuda:0 or auto (the scene's)")
   add(
     "--set",
@@ -92,9 +97,9 @@ def main(args: argparse.Namespace) -> int:
         samples.append(sample)
         writer.writerow(f"{v:.7g}" if isinstance(v, float) else v for v in _fields(sample))
         if film and len(samples) % every == 1 % every:
-          states.append(data.qpos.astype(np.float32))
+          states.append(figures.snapshot(model, data))
         if picture and sample.phase == "hold":
-          deepest = data.qpos.copy()
+          deepest = figures.snapshot(model, data)
         progress.show(
           f"{sample.phase:<8} {sample.time_s:6.3f} s  depth {1e3 * sample.depth_m:5.2f} mm  "
           f"force {sample.force:6.3f} N"
@@ -202,7 +207,7 @@ def _load(args: argparse.Namespace):
 def _compile(path: pathlib.Path, args: argparse.Namespace):
   import mujoco
 
-  from . import config, engine
+  from . import author, config, engine
   from .organ import Organ
 
   changes = {}
@@ -213,6 +218,8 @@ def _compile(path: pathlib.Path, args: argparse.Namespace):
     changes[key] = value
   try:
     spec = mujoco.MjSpec.from_file(str(path))
+    if args.coupling:
+      _couple(spec, args.coupling, author)
     ours = {b.plugin.name for b in spec.bodies if b.plugin.plugin_name == engine.NAME}
     for plugin in spec.plugins:
       if plugin.name in ours:
@@ -236,6 +243,15 @@ def _compile(path: pathlib.Path, args: argparse.Namespace):
     return model, data, Organ(model, data, args.organ or names[0])
   except ValueError as error:
     raise CommandError(f"scene {path.name}: {error}") from None
+
+
+def _couple(spec, coupling: str, author):
+  """Gives every nodal organ a window, where that is asked for."""
+  for organ, windowed in author.organs(spec).items():
+    if coupling == "window" and not windowed:
+      author.add_windows(spec, organ)
+    elif coupling == "nodal" and windowed:
+      raise CommandError(f"coupling is 'nodal', organ {organ!r} is declared with windows")
 
 
 def _plain(message: str) -> str:

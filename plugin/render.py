@@ -146,14 +146,14 @@ def _shots(args, model, data, renderer, seconds: float, film: bool) -> Iterator[
       mujoco.mj_forward(model, data)
     renderer.update_scene(data, camera, option)
     if args.edges:
-      _draw_edges(model, data, renderer.scene)
+      _draw_edges(model, data, renderer.scene, option)
     if args.forces:
       _draw_forces(model, data, renderer.scene)
     yield renderer.render()
 
 
-def _draw_edges(model, data, scene):
-  """Adds the edges of every flex surface to the scene, as lines just above its skin."""
+def _draw_edges(model, data, scene, option):
+  """Adds the edges of every flex surface that is drawn, as lines just above its skin."""
   import mujoco
 
   from .mesh import vertex_normals
@@ -161,7 +161,7 @@ def _draw_edges(model, data, scene):
   for flex in range(model.nflex):
     first, count = model.flex_vertadr[flex], model.flex_vertnum[flex]
     adr, nelem = model.flex_elemdataadr[flex], model.flex_elemnum[flex]
-    if model.flex_dim[flex] != 2:
+    if model.flex_dim[flex] != 2 or not option.flexgroup[model.flex_group[flex]]:
       continue
     pos = data.flexvert_xpos[first : first + count]
     elem = model.flex_elem[adr : adr + 3 * nelem].reshape(nelem, 3)

@@ -20,6 +20,11 @@ def add_arguments(parser: argparse.ArgumentParser):
     metavar="NAMES",
     help="of a named model, separated by commas (probe,grasper)",
   )
+  parser.add_argument(
+    "--coupling",
+    choices=("nodal", "window"),
+    help="of a named model; window: MuJoCo knows the nodes near the instruments alone (nodal)",
+  )
   parser.add_argument("--keyframe", metavar="NAME", help="state to start from (the first keyframe)")
 
 
@@ -27,11 +32,14 @@ def load(args: argparse.Namespace, handle: bool) -> tuple[mujoco.MjModel, mujoco
   """Returns model and data at the keyframe; `handle` gives named models handles to drag."""
   from palpate import models
 
-  given = [option for option in ("nodes", "seed", "instruments") if getattr(args, option)]
+  given = [
+    option for option in ("nodes", "seed", "instruments", "coupling") if getattr(args, option)
+  ]
   path = pathlib.Path(args.scene)
   try:
     if args.scene in models.NAMES:
       options = {"nodes": args.nodes or models.RESOLUTIONS[1], "seed": args.seed, "handle": handle}
+      options["coupling"] = args.coupling or "nodal"
       if args.instruments is not None:
         options["instruments"] = [name for name in args.instruments.split(",") if name]
       model = models.load(args.scene, **options).compile()

@@ -33,5 +33,11 @@ def main(args: argparse.Namespace) -> int:
   model, data = scenes.load(args, handle=True)
   import mujoco.viewer
 
-  mujoco.viewer.launch(model, data)
+  loaded = [(model, data, args.scene)]
+
+  def load():
+    return loaded.pop() if loaded else (*scenes.load(args, handle=True), args.scene)
+
+  # The viewer points its camera at a scene only if it is loaded under a name.
+  mujoco.viewer.launch(loader=load)
   return 0

@@ -136,6 +136,9 @@ def _scratch(w, side: wp.Device) -> dict[str, wp.array]:
     "chosen": _ints(np.zeros(nvert)),
     "candidate": _ints(np.zeros(nvert)),
     "distance": _doubles(np.zeros(nvert)),
+    "claim": _ints(np.full(nvert, -1)),
+    "left": _ints(np.full(nslot, -1)),
+    "lagged": _doubles(np.zeros(3 * nslot)),
     "inertia": _doubles(np.zeros(nvert)),
     "flags": _ints(np.zeros(6)),
     **{
@@ -160,7 +163,12 @@ def _slots(w, model: int) -> Slots:
   incidence = np.argsort(mesh.elem.ravel(), kind="stable") // 3
   count = np.bincount(mesh.elem.ravel(), minlength=mesh.nvert)
   edge = mesh.rest[mesh.elem[:, [1, 2, 0]]] - mesh.rest[mesh.elem]
-  spacing = float(np.linalg.norm(edge, axis=2).mean())
+  length = np.linalg.norm(edge, axis=2)
+  spacing = float(length.mean())
+  # A tool that touches a triangle is no farther from its corners than their longest edges.
+  longest = np.zeros(mesh.nvert)
+  for corner in (mesh.elem, mesh.elem[:, [1, 2, 0]]):
+    np.maximum.at(longest, corner.ravel(), length.ravel())
   radius = float(mjstruct.view(m.flex_radius, m.nflex)[win.flex].max())
   numbers = {
     "nvert": mesh.nvert,
@@ -171,14 +179,14 @@ def _slots(w, model: int) -> Slots:
     "resident": int(w.config.resident),
     "damping": w.surface.damping,
     "rest_share": solver.REST,
-    "reach": _REACH * spacing + radius,
-    "touch": spacing + radius,
+    "reach": max(_REACH * spacing, float(longest.max())) + radius,
     "slow": _SLOW * float(np.linalg.norm(np.ptp(mesh.rest, axis=0))),
     "weight": float(win.mass.sum()),
   }
   arrays = option_views(model) | {
     "node_mass": _doubles(win.mass),
     "rest": _doubles(mesh.rest),
+    "touch": _doubles(longest + radius),
     "elem": _ints(mesh.elem),
     "near_adr": _ints(np.concatenate([[0], np.cumsum(count)])),
     "near": _ints(incidence),

@@ -11,7 +11,8 @@ from typing import Any
 import warp as wp
 
 struct: Any = wp.struct  # type checkers take what wp.struct makes for a value
-MAX_GEOMS = 16  # of a window
+MAX_WINDOWS = 64  # of an organ
+MAX_GEOMS = 32  # of a window
 HEAD = 10  # h, its square with damping, floor, mode, gravity (3), reach, h of the step to commit, -
 GEOM = 24  # centre, axes, type, size, bounding box, squared reach of the bounding sphere
 SUMMARY = 11  # status (4), squared speed, bounds: lowest and highest corner

@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import warp as wp
 
-from .window_nodes import GEOM, HEAD, MAX_GEOMS, RECORD, SUMMARY, struct
+from .window_nodes import GEOM, HEAD, MAX_GEOMS, MAX_WINDOWS, RECORD, SUMMARY, struct
 
 TAIL = 11
 STALE, ASLEEP, MISSED_NODES, MISSED_ELEMENTS, PENDING, NEAR = range(6)  # flags
+# Height at which a window without triangles waits [m].
+AWAY = 1e3
 # Time without motion, force and tool after which an organ sleeps [s].
 QUIET = 0.2
 
@@ -28,13 +30,16 @@ class Slots:
     damping: Rayleigh coefficient [s]
     rest_share: see `solver.REST`
     reach: distance from a geom within which nodes may be in a window [m]
-    touch: distance at which a node outside its window counts as missed [m]
     slow: speed below which the organ counts as at rest [m/s]
     weight: mass of the organ [kg]
     placed: node of each slot in the model, -1 for none     (nslot,)
     taken: slot of each node, -1 for none                   (nvert,)
     chosen, candidate, distance: scratch                    (nvert,)
     inertia: effective inertia of each node [kg]            (nvert,)
+    touch: distance from a geom within which a node's triangles may touch it [m]  (nvert,)
+    claim: scratch; -1 between steps                        (nvert,)
+    left: node that a slot has given up in this step, -1    (nslot,)
+    lagged: contact forces before the slots are given anew [N]  (3 nslot,)
     ext: external and lagged contact force [N]              (3 nslot,)
     flags: STALE (the model lacks slots), ASLEEP, MISSED_NODES, MISSED_ELEMENTS, PENDING (mode of
       the next commit), NEAR (a tool is near)               (6,)
@@ -49,13 +54,13 @@ class Slots:
   damping: wp.float64
   rest_share: wp.float64
   reach: wp.float64
-  touch: wp.float64
   slow: wp.float64
   weight: wp.float64
   # Organ:
   node_mass: wp.array[wp.float64]
   rest: wp.array[wp.float64]
   inertia: wp.array[wp.float64]
+  touch: wp.array[wp.float64]
   elem: wp.array[int]
   near_adr: wp.array[int]
   near: wp.array[int]
@@ -78,6 +83,9 @@ class Slots:
   chosen: wp.array[int]
   candidate: wp.array[int]
   distance: wp.array[wp.float64]
+  claim: wp.array[int]
+  left: wp.array[int]
+  lagged: wp.array[wp.float64]
   ext: wp.array[wp.float64]
   flags: wp.array[int]
   inbox: wp.array[wp.float64]
@@ -166,7 +174,19 @@ _TRIANGLES = f"""
           ++count;
         }}
       }}
-      for (int q = count; q < most && count > 0; ++q)
+      if (count == 0) {{
+        // Nothing to touch: all triangles are one point, out of everybody's way.
+        int k = first;
+        while (k + 1 < last && s.placed.data[k] >= 0) ++k;
+        for (int c = 0; c < 3; ++c) {{
+          list[c] = k - first;
+          if (s.placed.data[k] >= 0) continue;
+          s.qpos.data[s.qposadr.data[k] + c] = s.qhome.data[3 * k + c]
+            + {AWAY} * s.frame.data[6 + c];
+        }}
+        count = 1;
+      }}
+      for (int q = count; q < most; ++q)
         for (int c = 0; c < 3; ++c) list[3 * q + c] = list[c];
     }}
   }};
@@ -325,7 +345,8 @@ def _scatter(s: Slots): ...
 def _leave(s: Slots): ...
 
 
-# Picks each window's nodes by the distance to its geoms.
+# Picks each window's nodes by the distance to its geoms. Windows whose tools touch the same nodes
+# pick as one, the first of them first: a triangle between two windows would touch nothing.
 @wp.func_native(
   _STATE
   + _TRIANGLES
@@ -334,27 +355,50 @@ def _leave(s: Slots): ...
   s.flags.data[{MISSED_NODES}] = 0;
   bool renewed = false;
   for (int k = 0; k < s.nslot; ++k) {{
+    s.left.data[k] = -1;
+    for (int c = 0; c < 3; ++c) s.lagged.data[3 * k + c] = fc[3 * k + c];
     if (s.placed.data[k] >= 0) stand(k, s.placed.data[k], moved + 7 * k + 1, moved + 7 * k + 4);
     else for (int c = 0; c < 3; ++c) s.qvel.data[s.dofadr.data[k] + c] = 0.0;
   }}
+  const double* number = out + {SUMMARY} + 3 * s.nslot;
+  const double* record = number + s.nwindow;
+  auto node_at = [&](int q) -> int {{ return (int)record[(size_t){RECORD} * q]; }};
+  auto far_at = [&](int q) -> double {{ return record[(size_t){RECORD} * q + 1]; }};
+  auto found = [&](int w) -> int {{ return number[w] < s.most ? (int)number[w] : s.most; }};
+  auto give_up = [&](int k) {{
+    s.left.data[k] = s.placed.data[k];
+    slots[k] = -1.0;
+    s.placed.data[k] = -1;
+    for (int c = 0; c < 3; ++c) fc[3 * k + c] = s.qvel.data[s.dofadr.data[k] + c] = 0.0;
+    renewed = true;
+  }};
+  int group[{MAX_WINDOWS}];
+  for (int w = 0; w < s.nwindow; ++w) {{
+    group[w] = w;
+    for (int q = w * s.most; q < w * s.most + found(w); ++q) {{
+      const int i = node_at(q), other = s.claim.data[i];
+      if (other < 0 || far_at(q) < far_at(other)) s.claim.data[i] = q;
+      if (other < 0 || far_at(q) >= s.touch.data[i] || far_at(other) >= s.touch.data[i]) continue;
+      const int a = group[other / s.most], b = group[w], joint = a < b ? a : b;
+      for (int v = 0; v <= w; ++v) if (group[v] == a || group[v] == b) group[v] = joint;
+    }}
+  }}
   for (int w = 0; w < s.nwindow; ++w) {{
     const int first = s.window_adr.data[w], many = s.window_adr.data[w + 1] - first;
-    const double* record = out + {SUMMARY} + 3 * s.nslot + s.nwindow
-      + (size_t)w * s.most * {RECORD};
-    const int found = (int)out[{SUMMARY} + 3 * s.nslot + w];
     int count = 0;
-    for (int q = 0; q < found && q < s.most; ++q) {{
-      const int i = (int)record[{RECORD} * q], k = s.taken.data[i];
-      if (k >= 0 && (k < first || k >= first + many)) continue;
-      s.candidate.data[count] = q;
-      s.distance.data[count++] = record[{RECORD} * q + 1];
+    for (int v = 0; v < s.nwindow; ++v) {{
+      for (int q = v * s.most; group[v] == group[w] && q < v * s.most + found(v); ++q) {{
+        if (s.claim.data[node_at(q)] != q) continue;
+        s.candidate.data[count] = q;
+        s.distance.data[count++] = far_at(q);
+      }}
     }}
     if (count < 3) continue;
     // The `many` nearest, by quickselect; vertex numbers decide between equals.
     double* far = s.distance.data;
     int* which = s.candidate.data;
     auto before = [&](double d, int p, double e, int q) -> bool {{
-      return d < e || (d == e && record[{RECORD} * p] < record[{RECORD} * q]);
+      return d < e || (d == e && node_at(p) < node_at(q));
     }};
     if (count > many) {{
       int a = 0, b = count - 1;
@@ -375,50 +419,61 @@ def _leave(s: Slots): ...
         else if (many - 1 >= i) a = i;
         else break;
       }}
-      for (int q = many; q < count; ++q) s.flags.data[{MISSED_NODES}] += far[q] < s.touch;
+      for (int q = many; q < count; ++q)
+        s.flags.data[{MISSED_NODES}] += far[q] < s.touch.data[node_at(which[q])];
       count = many;
     }}
     // Nodes that stay keep their slot; the others fill the free ones in the order of the mesh.
-    for (int k = first; k < first + many; ++k)
-      if (s.placed.data[k] >= 0) s.taken.data[s.placed.data[k]] = -1;
-    for (int q = 0; q < count; ++q) s.chosen.data[(int)record[{RECORD} * which[q]]] = 1;
+    for (int q = 0; q < count; ++q) {{
+      s.chosen.data[node_at(which[q])] = 1;
+      s.claim.data[node_at(which[q])] = -1;
+    }}
     for (int k = first; k < first + many; ++k) {{
       const int i = s.placed.data[k];
       if (i >= 0 && s.chosen.data[i]) {{
-        s.taken.data[i] = k;
         s.chosen.data[i] = 0;
         slots[k] = i + 1.0;
-        continue;
-      }}
-      renewed = renewed || i >= 0;
-      slots[k] = -1.0;
-      s.placed.data[k] = -1;
-      for (int c = 0; c < 3; ++c) {{
-        fc[3 * k + c] = 0.0;
-        s.qvel.data[s.dofadr.data[k] + c] = 0.0;
+      }} else if (i >= 0) {{
+        give_up(k);
+      }} else {{
+        slots[k] = -1.0;
       }}
     }}
     int fresh = 0;
     for (int q = 0; q < count; ++q) {{
       const int r = which[q];
-      if (!s.chosen.data[(int)record[{RECORD} * r]]) continue;
-      s.chosen.data[(int)record[{RECORD} * r]] = 0;
+      if (!s.chosen.data[node_at(r)]) continue;
+      s.chosen.data[node_at(r)] = 0;
       int p = fresh++;
-      for (; p > 0 && record[{RECORD} * which[p - 1]] > record[{RECORD} * r]; --p)
-        which[p] = which[p - 1];
+      for (; p > 0 && node_at(which[p - 1]) > node_at(r); --p) which[p] = which[p - 1];
       which[p] = r;
     }}
     int k = first;
     for (int q = 0; q < fresh; ++q) {{
-      const double* r = record + {RECORD} * which[q];
+      const double* r = record + (size_t){RECORD} * which[q];
       while (slots[k] >= 0.0) ++k;
-      const int i = (int)r[0];
+      const int i = (int)r[0], other = s.taken.data[i];
+      const double* at = s.resident ? r + 2 : U + 3 * i;
+      const double* speed = s.resident ? r + 5 : W + 3 * i;
+      if (other >= 0) {{
+        // Another window had it: its motion and contact force come along.
+        if (s.placed.data[other] == i) give_up(other);
+        at = moved + 7 * other + 1;
+        speed = at + 3;
+        for (int c = 0; c < 3; ++c) fc[3 * k + c] = s.lagged.data[3 * other + c];
+      }}
       slots[k] = i + 1.0;
       s.placed.data[k] = i;
       s.taken.data[i] = k;
-      stand(k, i, s.resident ? r + 2 : U + 3 * i, s.resident ? r + 5 : W + 3 * i);
+      stand(k, i, at, speed);
       renewed = true;
     }}
+  }}
+  for (int q, w = 0; w < s.nwindow; ++w)
+    for (q = w * s.most; q < w * s.most + found(w); ++q) s.claim.data[node_at(q)] = -1;
+  for (int k = 0; k < s.nslot; ++k) {{
+    const int i = s.left.data[k];
+    if (i >= 0 && s.taken.data[i] == k && s.placed.data[k] != i) s.taken.data[i] = -1;
   }}
   if (renewed) triangles();
 """

@@ -55,6 +55,7 @@ class Workspace:
     counts: the number of vertices that MuJoCo sees of a windowed organ comes first
     status: iterations, relative residual, norm, failure  (4,)
     error: what went wrong since the last reset, or None
+    overflow: what the windows had no room for, the first time, or None
     warning: last index and count of each of MuJoCo's warnings (nwarning, 2)
     nbad: MuJoCo's warnings of bad states that were looked at since the last reset
     time_step: time step that the armature is for [s]
@@ -79,6 +80,7 @@ class Workspace:
   counts: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(1, np.int32))
   status: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(4, np.float32))
   error: str | None = None
+  overflow: str | None = None
   warning: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 2), np.int32))
   nbad: int = 0
   time_step: float = 0.0

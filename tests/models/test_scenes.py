@@ -169,15 +169,24 @@ def test_scenes_attach_with_prefixes():
 
 def test_the_page_on_authoring_runs(tmp_path, monkeypatch):
   """Its MJCF has at most 30 lines; its Python runs as it stands."""
-  blocks = dict(re.findall(r"```(xml|python)\n(.*?)```", AUTHORING.read_text(), re.S))
-  assert blocks["xml"].count("\n") <= 30
-  text = blocks["xml"].replace("MODELS", str(models.path("liver").parents[1]))
+  blocks = re.findall(r"```(xml|python)\n(.*?)```", AUTHORING.read_text(), re.S)
+  xml, press, *windows = (text for _, text in blocks)
+  assert xml.count("\n") <= 30
+  text = xml.replace("MODELS", str(models.path("liver").parents[1]))
   (tmp_path / "my_scene.xml").write_text(text)
   model = mujoco.MjModel.from_xml_path(str(tmp_path / "my_scene.xml"))
   assert model.nflex == 1
   assert _names(model, "camera")
   assert model.nu == 9
   scope: dict = {}
-  exec(blocks["python"], scope)
+  exec(press, scope)
   assert np.isfinite(scope["data"].qpos).all()
   assert np.linalg.norm(scope["organ"].force) > 0.01
+  for block in windows:
+    exec(block, scope)
+  assert scope["model"].nv < 900  # 4000 nodes
+  windowed = mujoco.MjModel.from_xml_path("my_windowed_scene.xml")
+  assert windowed.nv < model.nv / 3
+  data = mujoco.MjData(windowed)
+  mujoco.mj_step(windowed, data)
+  assert palpate.Organ(windowed, data, "organ/liver").error is None

@@ -111,8 +111,9 @@ def test_view_gives_the_viewer_handles(monkeypatch):
   viewer = pytest.importorskip("mujoco.viewer")
   seen = []
   monkeypatch.setenv("DISPLAY", ":0")
-  monkeypatch.setattr(viewer, "launch", lambda model, data: seen.append((model, data)))
+  monkeypatch.setattr(viewer, "launch", lambda loader: seen.extend([loader(), loader()]))
   assert cli.main(["view", "kidney", "--nodes", "250", "--keyframe", "touch"]) == 0
-  model, data = seen[0]
-  assert model.nmocap == 2
+  model, data, name = seen[0]
+  assert model.nmocap == 2 and name == "kidney"
+  assert seen[1][0] is not model  # the viewer's button to load anew
   np.testing.assert_allclose(data.site("probe/tip").xpos, data.mocap_pos[0], atol=1e-6)

@@ -112,19 +112,6 @@ def test_memory_need_not_be_clear_before():
   subprocess.run([sys.executable, "-c", code, __file__], env=env, check=True)
 
 
-def test_threads_need_a_model_each():
-  import threading
-
-  m = mujoco.MjModel.from_xml_string(scene())
-  d, other = mujoco.MjData(m), mujoco.MjData(m)
-  mujoco.mj_step(m, d)
-  thread = threading.Thread(target=mujoco.mj_step, args=(m, other))
-  thread.start()
-  thread.join()
-  error = palpate.Organ(m, other, "organ").error
-  assert error is not None and "'organ'" in error and "thread" in error
-
-
 def test_rotated_frame_gives_the_same_force():
   plain = mujoco.MjModel.from_xml_string(scene())
   turned = mujoco.MjModel.from_xml_string(scene(frame='pos=".1 .2 .3" euler="40 20 70"'))
@@ -179,9 +166,6 @@ def test_set_state_and_reset():
 @pytest.mark.parametrize(
   ("keys", "words"),
   [
-    ({"window": "nothing"}, ["'organ'", "'nothing'", "does not exist"]),
-    ({"window": "window window"}, ["claimed"]),
-    ({"window": "organ"}, ["rigid"]),
     ({"mass": None}, ["mass"]),
     ({"mass": "-1"}, ["mass", "-1"]),
     ({"pin": "0 9999"}, ["pin", "9999"]),
@@ -195,15 +179,3 @@ def test_bad_windows_are_named(keys, words):
     mujoco.MjModel.from_xml_string(scene(keys=keys))
   for word in words:
     assert word in str(error.value)
-
-
-def test_window_on_a_nodal_organ_is_refused():
-  with pytest.raises(ValueError, match="rigid"):
-    mujoco.MjModel.from_xml_string(scene(False, keys={"window": "organ", "mass": 0.1}))
-
-
-def test_small_window_counts_what_it_leaves_out():
-  m = mujoco.MjModel.from_xml_string(scene(count="3 2 1"))
-  d = mujoco.MjData(m)
-  drive(m, d, 90)
-  assert sum(palpate.Organ(m, d, "organ").window_overflow) > 0

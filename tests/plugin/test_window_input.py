@@ -1,0 +1,188 @@
+"""Windows and what people do with them: an error that says what is wrong, or correct motion."""
+
+import re
+import threading
+
+import mujoco
+import numpy as np
+import palpate
+import pytest
+from windowed import drive, scene
+
+
+def refused(text: str, *words: str):
+  with pytest.raises(ValueError) as error:
+    mujoco.MjModel.from_xml_string(text)
+  for word in words:
+    assert word in str(error.value)
+
+
+def load(text: str):
+  m = mujoco.MjModel.from_xml_string(text)
+  d = mujoco.MjData(m)
+  return m, d, palpate.Organ(m, d, "organ")
+
+
+def edited(old: str, new: str, **options) -> str:
+  text = scene(**options)
+  assert old in text
+  return text.replace(old, new)
+
+
+def second_organ(window: str) -> str:
+  """Returns a scene of two organs, the other with its own window or the first one's."""
+  text = scene()
+  body = re.search(r'<body name="organ">.*?</body>', text, re.S).group(0)
+  flex = re.search(r'<flexcomp name="window".*?</flexcomp>', text, re.S).group(0)
+  other = body.replace('name="organ"', 'name="other"').replace(
+    'value="window"', f'value="{window}"'
+  )
+  other = other.replace('<body name="other"', '<body name="other" pos=".3 0 0"')
+  return text.replace(body, body + other + flex.replace('name="window"', 'name="window2"'))
+
+
+def test_a_name_that_does_not_exist():
+  refused(scene(keys={"window": "nothing"}), "'organ'", "'nothing'", "does not exist", "'window'")
+
+
+def test_a_name_that_is_no_flexcomp():
+  refused(scene(keys={"window": "tool"}), "'organ'", "'tool'", "expected a flexcomp")
+
+
+def test_the_organ_as_its_own_window():
+  refused(scene(keys={"window": "organ"}), "organ 'organ': window 'organ'", "rigid")
+
+
+def test_a_window_without_free_vertices():
+  pinned = '<pin gridrange="0 0 8 5"/><contact '
+  text = scene()
+  at = text.index('name="window"')
+  text = text[:at] + text[at:].replace("<contact ", pinned, 1)
+  refused(text, "organ 'organ': window 'window'", "pinned")
+
+
+def test_a_rigid_window():
+  refused(
+    edited('<flexcomp name="window"', '<flexcomp name="window" rigid="true"'), "'window'", "rigid"
+  )
+
+
+def test_a_window_with_some_pins():
+  text = scene()
+  at = text.index('name="window"')
+  text = text[:at] + text[at:].replace("<contact ", '<pin id="0"/><contact ', 1)
+  refused(text, "organ 'organ': window 'window'", "pins")
+
+
+def test_a_volumetric_window():
+  text = edited('count="9 6 1" spacing=".01 .01 .01" dim="2"', 'count="3 3 3" dim="3"')
+  refused(text, "organ 'organ': window 'window'", "dim")
+
+
+def test_a_window_claimed_twice():
+  refused(scene(keys={"window": "window window"}), "'window'", "claimed by this organ")
+
+
+def test_a_window_of_two_organs():
+  refused(second_organ("window"), "'window'", "claimed by organ")
+  m, d, organ = load(second_organ("window2"))
+  drive(m, d, 20)
+  assert organ.error is None and palpate.Organ(m, d, "other").error is None
+
+
+def test_a_window_on_a_nodal_organ():
+  refused(scene(False, keys={"window": "organ", "mass": 0.1}), "rigid flexcomp", "expected one")
+
+
+def test_too_many_geoms():
+  geoms = '<geom size=".001" mass="1e-4"/>' * 40
+  refused(edited('<geom name="tip"', geoms + '<geom name="tip"'), "'window'", "41 geoms", "follow")
+
+
+def test_too_few_elements_are_counted_and_warned_of():
+  # Two rows: many vertices for their triangles.
+  m, d, organ = load(scene(count="27 2 1"))
+  drive(m, d, 60)
+  assert organ.window_overflow[1] > 0
+  assert "elements" in organ.window_warning and "'organ'" in organ.window_warning
+
+
+def test_two_data_in_two_threads():
+  m, d, _ = load(scene())
+  other = mujoco.MjData(m)
+  mujoco.mj_step(m, d)
+  thread = threading.Thread(target=mujoco.mj_step, args=(m, other))
+  thread.start()
+  thread.join()
+  error = palpate.Organ(m, other, "organ").error
+  assert error and "copy.copy(model)" in error
+
+
+@pytest.mark.parametrize("target", [(0.0, 0.5), (0.3, -0.2), (-0.1, -0.0567)])
+def test_a_teleporting_tool(target):
+  """The tool jumps away, far into the organ, or out at the other side, and back."""
+  m, d, organ = load(scene())
+  d.ctrl[0] = -0.006
+  for _ in range(100):
+    mujoco.mj_step(m, d)
+  d.qpos[-2:] = d.ctrl[:] = target[1], target[0]
+  for _ in range(150):
+    mujoco.mj_step(m, d)
+  assert organ.error is None and np.isfinite(organ.displacement).all()
+  assert d.warning.number[mujoco.mjtWarning.mjWARN_BADQACC] == 0
+  assert np.abs(organ.displacement).max() < 0.02
+  d.qpos[-2:], d.qvel[-2:] = 0, 0
+  d.ctrl[:] = -0.006, 0
+  for _ in range(600):
+    mujoco.mj_step(m, d)
+  still = load(scene())
+  still[1].ctrl[0] = -0.006
+  for _ in range(850):
+    mujoco.mj_step(*still[:2])
+  assert organ.force[2] == pytest.approx(still[2].force[2], rel=0.02)
+  np.testing.assert_allclose(organ.xpos, still[2].xpos, atol=2e-4)
+
+
+def test_a_jump_into_the_middle_lets_the_tool_out_without_an_explosion():
+  m, d, organ = load(scene())
+  d.qpos[-2] = d.ctrl[0] = -0.05
+  for _ in range(200):
+    mujoco.mj_step(m, d)
+  assert organ.error is None and np.abs(organ.displacement).max() < 0.05
+  assert d.warning.number[mujoco.mjtWarning.mjWARN_BADQACC] == 0
+
+
+def scaled(factor: float) -> str:
+  """Returns the scene with all lengths times `factor`: so are displacements, and forces by f^2."""
+  text = scene(keys={
+    "thickness": 0.002 * factor, "foundation": 1e4 / factor, "mass": 0.1 * factor
+  })  # fmt: skip
+
+  def lengths(match):
+    values = " ".join(f"{factor * float(x):.9g}" for x in match.group(2).split())
+    return f'{match.group(1)}="{values}"'
+
+  text = re.sub(r'(point|radius|spacing|pos|size)="([-\d. e]+)"', lengths, text)
+  # A stiffness E t is then times f, so with masses times f the motion in time is the same.
+  # The impedance of contacts depends on a length, unless it is constant.
+  text = text.replace('solref="', 'solimp=".95 .95 .001" solref="').replace(
+    '<geom name="tip"',
+    f'<inertial pos="0 0 0" mass="{0.05 * factor}" diaginertia="1e-5 1e-5 1e-5"/>'
+    '<geom name="tip" solimp=".95 .95 .001"',
+  )
+  text = text.replace('mass="0.01"', f'mass="{0.01 * factor}"')
+  return text.replace('kp="500" kv="10"', f'kp="{500 * factor}" kv="{10 * factor}"')
+
+
+@pytest.mark.parametrize("factor", [1e-3, 1e3])
+def test_scaled_by_a_thousand(factor):
+  results = []
+  for f in (1.0, factor):
+    m, d, organ = load(scaled(f))
+    for _ in range(250):
+      d.ctrl[0] = -0.006 * f * min(1, d.time / 0.1)
+      mujoco.mj_step(m, d)
+    assert organ.error is None
+    results.append((organ.force[2] / f**2, organ.displacement[:, 2].min() / f))
+  assert results[0][0] < -0.02
+  assert results[1] == pytest.approx(results[0], rel=0.01)
