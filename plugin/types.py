@@ -148,9 +148,9 @@ class State:
     r: PCG residual                                 (nworld, nslice, 3, 8)
     p: PCG direction                                (nworld, nslice, 3, 8)
     q: A times direction                            (nworld, nslice, 3, 8)
-    pn: direction along the normals                 (nworld, nslice, 8)
-    partial: sums of the blocks of a world          (nworld, 2, MAX_BLOCKS)
-    counter: blocks that have met                   (nworld,) int
+    z: preconditioned residual                      (nworld, nslice, 3, 8)
+    zn: that along the normals                      (nworld, nslice, 8)
+    partial: what the blocks of a world exchange    (nworld, 8, MAX_BLOCKS)
     status: PCG iterations, relative residual, norm of the right-hand side, 1 if not finite
                                                     (nworld, 4)
   """
@@ -181,9 +181,9 @@ class State:
   r: wp.array
   p: wp.array
   q: wp.array
-  pn: wp.array
+  z: wp.array
+  zn: wp.array
   partial: wp.array
-  counter: wp.array
   status: wp.array
 
 
@@ -206,14 +206,12 @@ def make_state(surface: Surface, nworld: int = 1) -> State:
     "hinge_half": bend,
     "hinge_moment": bend,
     "total": (2,),
-    "pn": scalar if s.has_bending else (0, 8),
-    "partial": (2, MAX_BLOCKS),
-    "counter": (),
+    "zn": scalar if s.has_bending else (0, 8),
+    "partial": (8, MAX_BLOCKS),
     "status": (4,),
   }
   arrays = {}
   for field in dataclasses.fields(State)[1:]:
     shape = (nworld, *shapes.get(field.name, vector))
-    kind = int if field.name == "counter" else float
-    arrays[field.name] = wp.zeros(shape, dtype=kind, device=s.device)
+    arrays[field.name] = wp.zeros(shape, dtype=float, device=s.device)
   return State(nworld=nworld, **arrays)
