@@ -118,7 +118,7 @@ def _direct_world(
 ): ...
 
 
-@wp.kernel(enable_backward=False, launch_bounds=simd.BLOCK)
+@wp.kernel(enable_backward=False, launch_bounds=simd.BOUNDS)
 def _direct(
   nthread: int,
   nslice: int,

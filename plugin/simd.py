@@ -124,7 +124,8 @@ _GROUP = """
 """
 MAX_BLOCKS = 512
 BLOCK = 512  # threads of a block, at most
-PER_SM = 1  # blocks of a group on one multiprocessor, at most
+PER_SM = 2  # blocks of a group on one multiprocessor, at most: kernels have it in their bounds
+BOUNDS = (BLOCK, PER_SM)
 
 
 def group(body: str) -> str:

@@ -1,9 +1,10 @@
 """The implicit step: preconditioned conjugate gradients on A dv = b, Newton iterations around it.
 
 A has sliced 3x3 blocks, the bending matrix along the node normals and the rank-one volume term; the
-preconditioner is the inverse of the diagonal blocks. PCG stops when sqrt(r^T D^-1 r), D the
-diagonal blocks, is `tolerance` times that of b. It starts at the last step's solution, scaled to
-the least error in the energy norm.
+preconditioner is the inverse of the diagonal blocks, or for an organ that has them a cycle on
+coarser meshes (`multilevel`). With either PCG stops when sqrt(r^T D^-1 r), D the diagonal blocks,
+is `tolerance` times that of b. It starts at the last step's solution, scaled to the least error in
+the energy norm.
 """
 
 from __future__ import annotations
@@ -297,7 +298,7 @@ def _solve_world(
 ): ...
 
 
-@wp.kernel(enable_backward=False, launch_bounds=simd.BLOCK)
+@wp.kernel(enable_backward=False, launch_bounds=simd.BOUNDS)
 def _solve(
   nthread: int,
   nslice: int,
@@ -446,6 +447,9 @@ def _newton_update(
 
 def solve(s: Surface, d: State, first: bool):
   """Solves A x = rhs to the organ's tolerance; writes `x` and `status`."""
+  if s.levels is not None:
+    multilevel().solve(s, d, first)
+    return
   nthread = simd.group_size(s.device, s.nslice, d.nworld)
   d.partial.zero_()
   wp.launch(
@@ -485,6 +489,13 @@ def solve(s: Surface, d: State, first: bool):
   )
 
 
+def multilevel():
+  """Returns that module, which takes seconds to compile and which most organs do without."""
+  from . import multilevel
+
+  return multilevel
+
+
 def step(s: Surface, d: State):
   """Computes `dvel`, the change of velocity in one implicit step; capturable in a graph.
 
@@ -497,6 +508,8 @@ def step(s: Surface, d: State):
   for it in range(s.newton):
     first = it == 0
     elastic.assemble(s, d, Stage.FIRST if first else Stage.LATER)
+    if s.levels is not None:
+      multilevel().assemble(s, d)
     solve(s, d, first)
     wp.launch(
       _newton_update,
