@@ -144,6 +144,7 @@ def read(model: int, instance: int) -> Organ:
   order = np.cumsum(free) - 1
   mass = mjstruct.view(m.body_mass, m.nbody)[body]
   return _cached(
+    float(m.opt.timestep),
     name=name,
     flex=flex,
     mesh=mesh,
@@ -160,9 +161,9 @@ def read(model: int, instance: int) -> Organ:
   )
 
 
-def _cached(name: str, mesh: Mesh, config: Config, free: np.ndarray, **fields) -> Organ:
+def _cached(h: float, name: str, mesh: Mesh, config: Config, free: np.ndarray, **fields) -> Organ:
   """Returns the organ with its constants on the device, the same object for the same content."""
-  digest = hashlib.sha256(repr((name, fields["flex"], config)).encode())
+  digest = hashlib.sha256(repr((h, name, fields["flex"], config)).encode())
   for part in (mesh.rest, mesh.elem, free, *fields.values()):
     if isinstance(part, np.ndarray):
       digest.update(np.ascontiguousarray(part).tobytes())
@@ -173,7 +174,9 @@ def _cached(name: str, mesh: Mesh, config: Config, free: np.ndarray, **fields) -
   with _lock:
     if key not in _made:
       try:
-        constants = surface.make(mesh, config, ~free, config.device)
+        scale = (h * h + h * config.damping) / max(float(fields["mass"][free].mean()), 1e-300)
+        implicit = config.integrator == "implicit"
+        constants = surface.make(mesh, config, ~free, config.device, scale if implicit else 0.0)
       except ValueError as error:
         raise ValueError(f"organ {name!r}: {error}") from None
       with wp.ScopedDevice(constants.device):
@@ -226,6 +229,7 @@ def _read_windowed(model: int, m, instance: int) -> Organ:
   windows = _windows(model, m, instance, name, config, mesh, mass, (frame, origin))
   absent = np.full(nvert, -1)
   return _cached(
+    float(m.opt.timestep),
     name=name,
     flex=flex,
     mesh=mesh,

@@ -695,6 +695,11 @@ def assemble(s: Surface, d: State, stage: Stage):
   """
   if s.has_bending:
     _bending(s, d, stage)
+  rows(s, d, stage)
+
+
+def rows(s: Surface, d: State, stage: Stage):
+  """Writes what `assemble` does, from the hinges' moments that are there: the last pass of it."""
   wp.launch(
     _assembly,
     dim=(d.nworld, simd.threads(s.device, s.nslice)),

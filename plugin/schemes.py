@@ -114,12 +114,11 @@ def _direct_world(
   x_: wp.array4d[float],
   q_: wp.array4d[float],
   partial_: wp.array3d[float],
-  counter_: wp.array[int],
   status: wp.array2d[float],
 ): ...
 
 
-@wp.kernel(enable_backward=False, launch_bounds=simd.BLOCK)
+@wp.kernel(enable_backward=False, launch_bounds=simd.BOUNDS)
 def _direct(
   nthread: int,
   nslice: int,
@@ -147,7 +146,6 @@ def _direct(
   x_out: wp.array4d[float],
   q_out: wp.array4d[float],
   partial_out: wp.array3d[float],
-  counter_out: wp.array[int],
   status_out: wp.array2d[float],
 ):
   world, tid = wp.tid()
@@ -177,7 +175,6 @@ def _direct(
     x_out,
     q_out,
     partial_out,
-    counter_out,
     status_out,
   )
 
@@ -198,7 +195,7 @@ def step(s: Surface, d: State, integrator: str):
   wp.copy(d.vel_trial, d.vel)
   elastic.assemble(s, d, Stage.NEUMANN if neumann else Stage.EXPLICIT)
   nthread = simd.group_size(s.device, s.nslice, d.nworld)
-  d.counter.zero_()
+  d.partial.zero_()
   wp.launch(
     _direct,
     dim=(d.nworld, nthread),
@@ -224,7 +221,7 @@ def step(s: Surface, d: State, integrator: str):
       d.rhs,
       d.areavec,
     ],
-    outputs=[d.total, d.x, d.q, d.partial, d.counter, d.status],
+    outputs=[d.total, d.x, d.q, d.partial, d.status],
     device=s.device,
   )
   wp.copy(d.dvel, d.x)

@@ -24,7 +24,7 @@ _PRELUDE = """
   #define SPLAT(a) (a)
   #define HSUM(a) (a)
   #define SELECT(c, a, b) ((c) ? (a) : (b))
-  #define FOR_SLICES(s) for (int s = tid >> 3; s < nslice; s += nthread >> 3)
+  #define FOR_RANGE(s, from, to) for (int s = (from) + (tid >> 3); s < (to); s += nthread >> 3)
 #else
   #define SIMD_TYPES \\
     typedef float V __attribute__((ext_vector_type(8))); \\
@@ -40,67 +40,99 @@ _PRELUDE = """
   #define SPLAT(a) ((V)(a))
   #define HSUM(a) (((a)[0] + (a)[4]) + ((a)[1] + (a)[5]) + (((a)[2] + (a)[6]) + ((a)[3] + (a)[7])))
   #define SELECT(c, a, b) ((c) ? (a) : (b))
-  #define FOR_SLICES(s) for (int s = 0; s < nslice; ++s)
+  #define FOR_RANGE(s, from, to) for (int s = from; s < (to); ++s)
 #endif
+#define FOR_SLICES(s) FOR_RANGE(s, 0, nslice)
 #endif
 """
 
 # Sums over all nodes of a world, the same value in every thread, and barriers. On CUDA a world is a
-# group of `nthread` threads in whole blocks that are all resident; blocks meet at a counter that is
-# zero before the launch. The order of summation is fixed, so that runs repeat to the bit.
+# group of `nthread` threads in whole blocks that are all resident. Each block publishes its sums
+# with the number of the meeting in one 64-bit word, and all blocks read the words of all: no
+# counter, and one trip through memory. The words are zero before the launch and alternate between
+# two sets: who meets again has read the set before. The order of summation is fixed, so that runs
+# repeat to the bit.
 _GROUP = """
 #if defined(__CUDA_ARCH__) || defined(__CUDACC_RTC__)
-  __shared__ float red[33];
+  __shared__ float red[2][4][32];
   const int lane = tid & 7, thread = threadIdx.x, nwarp = blockDim.x >> 5;
   const int nblock = nthread / blockDim.x, block_ = tid / blockDim.x;
-  volatile float* partial = partial_.data + 2 * MAXBLOCK * (size_t)world;
-  int* counter = counter_.data + world;
-  int phase = 0;
-  auto group_sum = [&](float v) -> float {
+  volatile unsigned long long* word =
+    (volatile unsigned long long*)partial_.data + 4 * MAXBLOCK * (size_t)world;
+  unsigned phase = 0;
+  auto warp_sum = [](float v) -> float {
     for (int o = 16; o > 0; o >>= 1) v += __shfl_xor_sync(0xffffffffu, v, o);
-    if ((thread & 31) == 0) red[thread >> 5] = v;
-    __syncthreads();
-    if (thread == 0) {
-      float t = 0.0f;
-      for (int w = 0; w < nwarp; ++w) t += red[w];
-      red[32] = t;
-      if (nblock > 1) {
-        partial[(phase & 1) * MAXBLOCK + block_] = t;
-        __threadfence();
-        atomicAdd(counter, 1);
-        while (*(volatile int*)counter < nblock * (phase + 1)) {}
-        __threadfence();
-      }
-    }
-    __syncthreads();
-    if (nblock > 1 && thread < 32) {
-      float t = 0.0f;
-      for (int b = thread; b < nblock; b += 32) t += partial[(phase & 1) * MAXBLOCK + b];
-      for (int o = 16; o > 0; o >>= 1) t += __shfl_xor_sync(0xffffffffu, t, o);
-      if (thread == 0) red[32] = t;
-    }
-    __syncthreads();
-    const float total_ = red[32];
-    __syncthreads();
-    ++phase;
-    return total_;
+    return v;
   };
+  // Sums u, and v where `two`, over the group; memory written before is seen after.
+  auto meet = [&](float& u, float& v, bool two) {
+    float* mine = red[phase & 1][0];
+    const int warp = thread >> 5, at = thread & 31;
+    u = warp_sum(u);
+    if (two) v = warp_sum(v);
+    if (at == 0) { mine[32 * 0 + warp] = u; mine[32 * 1 + warp] = v; }
+    __syncthreads();
+    int nsum = nwarp, from = 0;
+    if (nblock > 1) {
+      volatile unsigned long long* set = word + 2 * MAXBLOCK * (phase & 1);
+      ++phase;
+      if (warp == 0) {
+        u = warp_sum(at < nwarp ? mine[32 * 0 + at] : 0.0f);
+        v = warp_sum(two && at < nwarp ? mine[32 * 1 + at] : 0.0f);
+        if (at < 2) {
+          __threadfence();
+          const unsigned bits = __float_as_uint(at == 0 ? u : v);
+          set[2 * block_ + at] = (unsigned long long)phase << 32 | bits;
+        }
+      }
+      u = v = 0.0f;
+      for (int b = thread; b < nblock; b += blockDim.x) {
+        unsigned long long w;
+        do w = set[2 * b]; while ((unsigned)(w >> 32) != phase);
+        u += __uint_as_float((unsigned)w);
+        if (two) {
+          do w = set[2 * b + 1]; while ((unsigned)(w >> 32) != phase);
+          v += __uint_as_float((unsigned)w);
+        }
+      }
+      if (warp * 32 < nblock) __threadfence();
+      u = warp_sum(u);
+      if (two) v = warp_sum(v);
+      if (at == 0) { mine[32 * 2 + warp] = u; mine[32 * 3 + warp] = v; }
+      __syncthreads();
+      nsum = nwarp < (nblock + 31) / 32 ? nwarp : (nblock + 31) / 32;
+      from = 64;
+    } else {
+      ++phase;
+    }
+    u = v = 0.0f;
+    for (int w = 0; w < nsum; ++w) { u += mine[from + w]; v += mine[from + 32 + w]; }
+  };
+  auto group_sum = [&](float u) -> float {
+    float v = 0.0f;
+    meet(u, v, false);
+    return u;
+  };
+  #define GROUP_SUMS(u, v, a, b) float a = u, b = v; meet(a, b, true);
   #define GROUP_SYNC() group_sum(0.0f)
 #else
   const int lane = 0, thread = 0;
   auto group_sum = [&](V v) -> float { return HSUM(v); };
+  #define GROUP_SUMS(u, v, a, b) float a = HSUM(u), b = HSUM(v);
   #define GROUP_SYNC()
 #endif
 """
-MAX_BLOCKS = 256
-BLOCK = 512
+MAX_BLOCKS = 512
+BLOCK = 512  # threads of a block, at most
+PER_SM = 2  # blocks of a group on one multiprocessor, at most: kernels have it in their bounds
+BOUNDS = (BLOCK, PER_SM)
 
 
 def group(body: str) -> str:
   """Returns native code in which all threads of a world work on `body` together.
 
-  Arguments: `world`, `tid`, `nthread`, `nslice`, `partial_` (nworld, 2, MAX_BLOCKS) and `counter_`
-  (nworld,) zeroed before the launch. On the CPU there is one thread.
+  Arguments: `world`, `tid`, `nthread`, `nslice` and `partial_` (nworld, 8, MAX_BLOCKS), which is
+  zero before the launch. On the CPU there is one thread.
   """
   return function(_GROUP.replace("MAXBLOCK", str(MAX_BLOCKS)) + body)
 
@@ -137,8 +169,8 @@ def group_size(device, nslice: int, nworld: int) -> int:
   """Returns the threads of a world for code made by `group`, to launch in blocks of `BLOCK`."""
   if not device.is_cuda:
     return 1
-  # Blocks of one world wait for each other, so all of them must be resident: one a multiprocessor.
-  most = max(1, min(device.sm_count // nworld, MAX_BLOCKS))
+  # Blocks of one world wait for each other, so all of them must be resident.
+  most = max(1, min(PER_SM * device.sm_count // nworld, MAX_BLOCKS))
   return BLOCK * max(1, min(most, -(-nslice * LANES // BLOCK)))
 
 

@@ -1,9 +1,10 @@
 """The implicit step: preconditioned conjugate gradients on A dv = b, Newton iterations around it.
 
 A has sliced 3x3 blocks, the bending matrix along the node normals and the rank-one volume term; the
-preconditioner is the inverse of the diagonal blocks. PCG stops when the residual in the
-preconditioned norm, sqrt(r^T D^-1 r), is `tolerance` times that of b. It starts at the last step's
-solution, scaled to the least error in the energy norm.
+preconditioner is the inverse of the diagonal blocks, or for an organ that has them a cycle on
+coarser meshes (`multilevel`). With either PCG stops when sqrt(r^T D^-1 r), D the diagonal blocks,
+is `tolerance` times that of b. It starts at the last step's solution, scaled to the least error in
+the energy norm.
 """
 
 from __future__ import annotations
@@ -17,15 +18,16 @@ from .types import State, Surface
 # A right-hand side below this share of the weight's impulse is at rest: residuals count against it.
 REST = 1e-3
 
-# Product of A with the vector P of slice s, in ax, ay, az; x, y, z is P there.
-_PRODUCT = """
+# Product of A with the vector P of slice s, in ax, ay, az; x, y, z is P there. PN is P along the
+# normals and `along` its sum with the area vectors.
+PRODUCT = """
 #define PRODUCT(P, PN, along) \\
   const V x = LD(P + 24 * s, 0), y = LD(P + 24 * s, 1), z = LD(P + 24 * s, 2); \\
   const V md = LD(M, s); \\
   V ax = md * x, ay = md * y, az = md * z; \\
   { \\
-    const int row0 = slot_adr.data[s], width = slot_adr.data[s + 1] - row0; \\
-    const int* node = fan_node.data + 8 * (row0 + 2 * s + 1); \\
+    const int row0 = slot[s], width = slot[s + 1] - row0; \\
+    const int* node = fan + 8 * (row0 + 2 * s + 1); \\
     const float* k = K + 72 * (size_t)row0; \\
     for (int i = 0; i < width; ++i, node += 8, k += 72) { \\
       const V dx = GATHER(P, node, 0) - x, dy = GATHER(P, node, 1) - y, \\
@@ -36,9 +38,9 @@ _PRODUCT = """
     } \\
   } \\
   if (bending) { \\
-    const int* node = bend_node.data + 8 * bend_adr.data[s]; \\
-    const float* k = bend_gain.data + 8 * bend_adr.data[s]; \\
-    const int width = bend_adr.data[s + 1] - bend_adr.data[s]; \\
+    const int row0 = bend_row[s], width = bend_row[s + 1] - row0; \\
+    const int* node = bend_at + 8 * row0; \\
+    const float* k = Q + 8 * row0; \\
     V sum = SPLAT(0.0f); \\
     for (int i = 0; i < width; ++i, node += 8, k += 8) sum += LD(k, 0) * GATHER(PN, node, 0); \\
     sum *= g; \\
@@ -56,9 +58,15 @@ _PRODUCT = """
     zy = xy * x + yy * y + yz * z; \\
     zz = xz * x + yz * y + LD(I, 5) * z; \\
   }
+#define LOAD(x, y, z, P) \\
+  V x = LD((P) + 24 * s, 0), y = LD((P) + 24 * s, 1), z = LD((P) + 24 * s, 2);
+#define STORE(P, x, y, z) ST((P) + 24 * s, 0, x); ST((P) + 24 * s, 1, y); ST((P) + 24 * s, 2, z);
+#define WITH(P, x, y, z) \\
+  (x * LD((P) + 24 * s, 0) + y * LD((P) + 24 * s, 1) + z * LD((P) + 24 * s, 2))
 """
 
-_WORLD = """
+# What PRODUCT and PRECONDITION read, in world `world`.
+WORLD = """
   const size_t base = (size_t)world * nslice;
   const float h = step.data[4 * world], g = step.data[4 * world + 1];
   const float* K = block.data + 72 * (size_t)world * nslot;
@@ -66,6 +74,11 @@ _WORLD = """
   const float* I_ = inverse.data + 48 * base;
   const float* O = areavec.data + 24 * base;
   const float* N = normal.data + 24 * base;
+  const int* slot = slot_adr.data;
+  const int* fan = fan_node.data;
+  const int* bend_row = bend_adr.data;
+  const int* bend_at = bend_node.data;
+  const float* Q = bend_gain.data;
 """
 
 # Impulse of volume and pressure along the area vectors, (push - pull) O: push is the force's, pull
@@ -82,18 +95,29 @@ VOLUME = """
         rate += LD(W + 24 * s, c) * o;
       }
     }
-    const float V1 = group_sum(vol) / 18.0f;
-    if (tid == 0) total.data[2 * world] = V1;
-    push = h * (pressure - bulk * (V1 - volume0) / volume0) / 6.0f;
-    pull = gv * bulk / volume0 / 36.0f * group_sum(rate);
+    GROUP_SUMS(vol, rate, volume, flux)
+    volume /= 18.0f;
+    if (tid == 0) total.data[2 * world] = volume;
+    push = h * (pressure - bulk * (volume - volume0) / volume0) / 6.0f;
+    pull = gv * bulk / volume0 / 36.0f * flux;
   }
 """
 
-# The whole solve of one world in one call: launches would cost more than the iterations.
-_SOLVE = (
-  _PRODUCT
-  + simd.group(
-    _WORLD
+def body(setup: str, precondition: str, scale: str) -> str:
+  """Returns the native code of the whole solve of one world: launches cost more than iterations.
+
+  The iteration is conjugate gradients with q = A p carried as A z + beta q, as z is what neighbours
+  exchange then: two meetings an iteration (Chronopoulos and Gear 1989,
+  doi:10.1016/0377-0427(89)90045-9), and no cancellation, since p^T q is summed, not derived.
+
+  Args:
+    setup: declarations before the first iteration
+    precondition: writes Z, the preconditioned R, and makes it seen by all; sets rz = r^T z and
+      `along`, the sum of z with the area vectors, from V rr (r^T D^-1 r) and V zo
+    scale: scales zx, zy, zz, which are D^-1 R, before they become Z
+  """
+  return PRODUCT + simd.group(
+    WORLD
     + """
   const float* U = pos.data + 24 * base;
   const float* W = vel.data + 24 * base;
@@ -102,123 +126,134 @@ _SOLVE = (
   float* X = x_.data + 24 * base;
   float* R = r_.data + 24 * base;
   float* P = p_.data + 24 * base;
-  float* Q = q_.data + 24 * base;
-  float* PN = pn_.data + 8 * base;
+  float* AP = q_.data + 24 * base;
+  float* Z = z_.data + 24 * base;
+  float* ZN = zn_.data + 8 * base;
   const float gv = first ? g : g - h * h;
 """
     + VOLUME
+    + setup
     + """
   // Right-hand side, its norm, and the start.
-  V bb = zero;
-  V along = zero;
+  V bb = zero, zo = zero;
   FOR_SLICES(s) {
-    V bx = LD(R0 + 24 * s, 0), by = LD(R0 + 24 * s, 1), bz = LD(R0 + 24 * s, 2);
+    LOAD(bx, by, bz, R0)
     if (push != 0.0f || pull != 0.0f) {
       bx += (push - pull) * LD(O + 24 * s, 0);
       by += (push - pull) * LD(O + 24 * s, 1);
       bz += (push - pull) * LD(O + 24 * s, 2);
     }
-    ST(R + 24 * s, 0, bx); ST(R + 24 * s, 1, by); ST(R + 24 * s, 2, bz);
+    STORE(R, bx, by, bz)
     V zx, zy, zz;
     PRECONDITION(zx, zy, zz, bx, by, bz)
     bb += bx * zx + by * zy + bz * zz;
-    const V x = LD(D0 + 24 * s, 0), y = LD(D0 + 24 * s, 1), z = LD(D0 + 24 * s, 2);
-    if (bending) ST(PN, s, x * LD(N + 24 * s, 0) + y * LD(N + 24 * s, 1) + z * LD(N + 24 * s, 2));
-    if (bulk != 0.0f)
-      along += x * LD(O + 24 * s, 0) + y * LD(O + 24 * s, 1) + z * LD(O + 24 * s, 2);
+    LOAD(x, y, z, D0)
+    if (bending) ST(ZN, s, WITH(N, x, y, z));
+    if (bulk != 0.0f) zo += WITH(O, x, y, z);
   }
-  const float norm = group_sum(bb);
+  GROUP_SUMS(bb, zo, norm, along)
   const float floor_ = step.data[4 * world + 2];
   const float target = tolerance * tolerance * (norm > floor_ ? norm : floor_);
-  int it = 0;
-  float rz = norm, start = 0.0f;
+  float start = 0.0f;
   if (first && norm > target) {
     V db = zero, dq = zero;
-    const float sum = bulk != 0.0f ? group_sum(along) : 0.0f;
     FOR_SLICES(s) {
-      PRODUCT(D0, PN, sum)
-      ST(Q + 24 * s, 0, ax); ST(Q + 24 * s, 1, ay); ST(Q + 24 * s, 2, az);
+      PRODUCT(D0, ZN, along)
+      STORE(AP, ax, ay, az)
       dq += x * ax + y * ay + z * az;
-      db += x * LD(R + 24 * s, 0) + y * LD(R + 24 * s, 1) + z * LD(R + 24 * s, 2);
+      db += WITH(R, x, y, z);
     }
-    const float curvature = group_sum(dq), gain = group_sum(db);
+    GROUP_SUMS(dq, db, curvature, gain)
     if (curvature > 0.0f) start = gain / curvature;
   }
-  along = zero;
   V rr = zero;
+  zo = zero;
   FOR_SLICES(s) {
     V x = zero, y = zero, z = zero;
-    V rx = LD(R + 24 * s, 0), ry = LD(R + 24 * s, 1), rz_ = LD(R + 24 * s, 2);
+    LOAD(rx, ry, rz_, R)
     if (start != 0.0f) {
       x = start * LD(D0 + 24 * s, 0); y = start * LD(D0 + 24 * s, 1);
       z = start * LD(D0 + 24 * s, 2);
-      rx -= start * LD(Q + 24 * s, 0); ry -= start * LD(Q + 24 * s, 1);
-      rz_ -= start * LD(Q + 24 * s, 2);
-      ST(R + 24 * s, 0, rx); ST(R + 24 * s, 1, ry); ST(R + 24 * s, 2, rz_);
+      rx -= start * LD(AP + 24 * s, 0); ry -= start * LD(AP + 24 * s, 1);
+      rz_ -= start * LD(AP + 24 * s, 2);
+      STORE(R, rx, ry, rz_)
     }
-    ST(X + 24 * s, 0, x); ST(X + 24 * s, 1, y); ST(X + 24 * s, 2, z);
-    V px, py, pz;
-    PRECONDITION(px, py, pz, rx, ry, rz_)
-    rr += rx * px + ry * py + rz_ * pz;
-    ST(P + 24 * s, 0, px); ST(P + 24 * s, 1, py); ST(P + 24 * s, 2, pz);
-    if (bending)
-      ST(PN, s, px * LD(N + 24 * s, 0) + py * LD(N + 24 * s, 1) + pz * LD(N + 24 * s, 2));
-    if (bulk != 0.0f)
-      along += px * LD(O + 24 * s, 0) + py * LD(O + 24 * s, 1) + pz * LD(O + 24 * s, 2);
+    STORE(X, x, y, z)
+    V zx, zy, zz;
+    PRECONDITION(zx, zy, zz, rx, ry, rz_)
+    rr += rx * zx + ry * zy + rz_ * zz;
+"""
+    + scale
+    + """
+    STORE(Z, zx, zy, zz)
+    if (bending) ST(ZN, s, WITH(N, zx, zy, zz));
+    if (bulk != 0.0f) zo += WITH(O, zx, zy, zz);
   }
-  rz = group_sum(rr);
-  while (rz > target && it < iterations) {
+  int it = 0;
+  float rz = 0.0f, before = 0.0f, residual = 0.0f;
+  while (true) {
+"""
+    + precondition
+    + """
+    const float beta = before != 0.0f ? rz / before : 0.0f;
     V pq = zero;
-    const float sum = bulk != 0.0f ? group_sum(along) : 0.0f;
     FOR_SLICES(s) {
-      PRODUCT(P, PN, sum)
-      ST(Q + 24 * s, 0, ax); ST(Q + 24 * s, 1, ay); ST(Q + 24 * s, 2, az);
-      pq += x * ax + y * ay + z * az;
+      PRODUCT(Z, ZN, along)
+      V px = x, py = y, pz = z;
+      if (beta != 0.0f) {
+        ax += beta * LD(AP + 24 * s, 0); ay += beta * LD(AP + 24 * s, 1);
+        az += beta * LD(AP + 24 * s, 2);
+        px += beta * LD(P + 24 * s, 0); py += beta * LD(P + 24 * s, 1);
+        pz += beta * LD(P + 24 * s, 2);
+      }
+      STORE(AP, ax, ay, az)
+      STORE(P, px, py, pz)
+      pq += px * ax + py * ay + pz * az;
     }
     const float alpha = rz / group_sum(pq);
-    rr = zero;
+    before = rz;
+    rr = zo = zero;
     FOR_SLICES(s) {
       float* X1 = X + 24 * s;
-      float* R1 = R + 24 * s;
-      float* Q1 = Q + 24 * s;
       const float* P1 = P + 24 * s;
       for (int c = 0; c < 3; ++c) ST(X1, c, LD(X1, c) + alpha * LD(P1, c));
-      const V rx = LD(R1, 0) - alpha * LD(Q1, 0), ry = LD(R1, 1) - alpha * LD(Q1, 1);
-      const V rz_ = LD(R1, 2) - alpha * LD(Q1, 2);
-      ST(R1, 0, rx); ST(R1, 1, ry); ST(R1, 2, rz_);
+      LOAD(rx, ry, rz_, R)
+      rx -= alpha * LD(AP + 24 * s, 0); ry -= alpha * LD(AP + 24 * s, 1);
+      rz_ -= alpha * LD(AP + 24 * s, 2);
+      STORE(R, rx, ry, rz_)
       V zx, zy, zz;
       PRECONDITION(zx, zy, zz, rx, ry, rz_)
-      ST(Q1, 0, zx); ST(Q1, 1, zy); ST(Q1, 2, zz);
       rr += rx * zx + ry * zy + rz_ * zz;
+"""
+    + scale
+    + """
+      STORE(Z, zx, zy, zz)
+      if (bending) ST(ZN, s, WITH(N, zx, zy, zz));
+      if (bulk != 0.0f) zo += WITH(O, zx, zy, zz);
     }
-    const float fresh = group_sum(rr), beta = fresh / rz;
-    rz = fresh;
     ++it;
-    if (!(rz > target) || it >= iterations) break;
-    along = zero;
-    FOR_SLICES(s) {
-      const float* Q1 = Q + 24 * s;
-      float* P1 = P + 24 * s;
-      const V px = LD(Q1, 0) + beta * LD(P1, 0), py = LD(Q1, 1) + beta * LD(P1, 1);
-      const V pz = LD(Q1, 2) + beta * LD(P1, 2);
-      ST(P1, 0, px); ST(P1, 1, py); ST(P1, 2, pz);
-      if (bending)
-        ST(PN, s, px * LD(N + 24 * s, 0) + py * LD(N + 24 * s, 1) + pz * LD(N + 24 * s, 2));
-      if (bulk != 0.0f)
-        along += px * LD(O + 24 * s, 0) + py * LD(O + 24 * s, 1) + pz * LD(O + 24 * s, 2);
-    }
-    if (bulk == 0.0f) GROUP_SYNC();
   }
   if (tid != 0) return;
   float* out = status.data + 4 * world;
   const float whole = (first ? 0.0f : out[0]) + (float)it;
   out[0] = whole;
   if (first) out[2] = norm;
-  out[1] = out[2] > 0.0f ? sqrtf((rz > 0.0f ? rz : 0.0f) / out[2]) : 0.0f;
-  out[3] = (norm < 1e30f && rz < 1e30f && norm >= 0.0f) ? 0.0f : 1.0f;
+  out[1] = out[2] > 0.0f ? sqrtf((residual > 0.0f ? residual : 0.0f) / out[2]) : 0.0f;
+  out[3] = (norm < 1e30f && residual < 1e30f && norm >= 0.0f) ? 0.0f : 1.0f;
 """
   )
-)
+
+
+# With block Jacobi the residual's norm is all there is to sum.
+_JACOBI = """
+    {
+      GROUP_SUMS(rr, zo, fresh, flux)
+      rz = residual = fresh;
+      along = flux;
+    }
+    if (!(residual > target) || it >= iterations) break;
+"""
+_SOLVE = body("", _JACOBI, "")
 
 
 @wp.func_native(_SOLVE)
@@ -256,14 +291,14 @@ def _solve_world(
   r_: wp.array4d[float],
   p_: wp.array4d[float],
   q_: wp.array4d[float],
-  pn_: wp.array3d[float],
+  z_: wp.array4d[float],
+  zn_: wp.array3d[float],
   partial_: wp.array3d[float],
-  counter_: wp.array[int],
   status: wp.array2d[float],
 ): ...
 
 
-@wp.kernel(enable_backward=False, launch_bounds=simd.BLOCK)
+@wp.kernel(enable_backward=False, launch_bounds=simd.BOUNDS)
 def _solve(
   nthread: int,
   nslice: int,
@@ -299,9 +334,9 @@ def _solve(
   r_out: wp.array4d[float],
   p_out: wp.array4d[float],
   q_out: wp.array4d[float],
-  pn_out: wp.array3d[float],
+  z_out: wp.array4d[float],
+  zn_out: wp.array3d[float],
   partial_out: wp.array3d[float],
-  counter_out: wp.array[int],
   status_out: wp.array2d[float],
 ):
   world, tid = wp.tid()
@@ -339,9 +374,9 @@ def _solve(
     r_out,
     p_out,
     q_out,
-    pn_out,
+    z_out,
+    zn_out,
     partial_out,
-    counter_out,
     status_out,
   )
 
@@ -412,8 +447,11 @@ def _newton_update(
 
 def solve(s: Surface, d: State, first: bool):
   """Solves A x = rhs to the organ's tolerance; writes `x` and `status`."""
+  if s.levels is not None:
+    multilevel().solve(s, d, first)
+    return
   nthread = simd.group_size(s.device, s.nslice, d.nworld)
-  d.counter.zero_()
+  d.partial.zero_()
   wp.launch(
     _solve,
     dim=(d.nworld, nthread),
@@ -446,9 +484,16 @@ def solve(s: Surface, d: State, first: bool):
       d.areavec,
       d.normal,
     ],
-    outputs=[d.total, d.x, d.r, d.p, d.q, d.pn, d.partial, d.counter, d.status],
+    outputs=[d.total, d.x, d.r, d.p, d.q, d.z, d.zn, d.partial, d.status],
     device=s.device,
   )
+
+
+def multilevel():
+  """Returns that module, which takes seconds to compile and which most organs do without."""
+  from . import multilevel
+
+  return multilevel
 
 
 def step(s: Surface, d: State):
@@ -463,6 +508,8 @@ def step(s: Surface, d: State):
   for it in range(s.newton):
     first = it == 0
     elastic.assemble(s, d, Stage.FIRST if first else Stage.LATER)
+    if s.levels is not None:
+      multilevel().assemble(s, d)
     solve(s, d, first)
     wp.launch(
       _newton_update,

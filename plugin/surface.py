@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import warp as wp
 from scipy import sparse
 
 from . import config as configuration
+from . import hierarchy, levels
 from . import mesh as topology
 from .config import Config
 from .mesh import Mesh
 from .simd import LANES
-from .types import Surface
+from .types import Levels, Surface
 
 # With fewer nodes the CPU solves a step before a GPU has met its barriers (benchmarks/solver.py).
 _CUDA_FROM = 2000
+_COARSEST = 64  # nodes of the coarsest mesh of the multilevel preconditioner
 
 
 def _pad(array: np.ndarray, fill=0, least=0) -> np.ndarray:
@@ -41,7 +45,9 @@ def _offset(index: np.ndarray) -> np.ndarray:
   return (index // LANES) * 3 * LANES + index % LANES
 
 
-def make(mesh: Mesh, config: Config, pinned: np.ndarray, device: str) -> Surface:
+def make(
+  mesh: Mesh, config: Config, pinned: np.ndarray, device: str, scale: float = 0.0
+) -> Surface:
   """Returns the constants of an organ.
 
   Args:
@@ -49,32 +55,66 @@ def make(mesh: Mesh, config: Config, pinned: np.ndarray, device: str) -> Surface
     config: its configuration
     pinned: vertices that do not move, (nvert,) bool
     device: Warp device, or `auto`
+    scale: (h^2 + h damping) over the mean mass of a node [s^2/kg], by which coarser meshes are made
+      for the multilevel preconditioner if it pays; infinity makes them anyway
   """
   target = resolve_device(device, mesh.nvert)
+  finest = arrays(mesh, config, pinned)
+  made = _surface(mesh, config, finest, target)
+  if scale * levels.condition(finest) < levels.threshold(target):
+    return made
+  coarse = hierarchy.build(mesh, _COARSEST)
+  if not coarse:
+    return made
+  young = levels.young(np.broadcast_to(config.young, mesh.nelem), mesh, coarse)
+  masks = [pinned, *(pinned[level.vert] for level in coarse)]
+  parts = [finest] + [
+    arrays(level.mesh, dataclasses.replace(config, young=e), mask)
+    for level, e, mask in zip(coarse, young, masks[1:], strict=True)
+  ]
+  put = _put(levels.transfer(coarse, parts, masks) | {"rate": levels.rates(parts)}, target)
+  made.levels = Levels(
+    nlevel=len(coarse),
+    nodes=int((~pinned).sum()),
+    threshold=levels.threshold(target),
+    surface=_surface(mesh, config, levels.join(parts[1:]), target),
+    **put,
+  )
+  return made
+
+
+def arrays(mesh: Mesh, config: Config, pinned: np.ndarray) -> dict:
+  """Returns the arrays of `Surface` by name."""
   vert = topology.node_order(mesh)
-  nnode, nslice = len(vert), len(vert) // LANES
   node = np.empty(mesh.nvert, np.int64)
   node[vert[vert >= 0]] = np.flatnonzero(vert >= 0)
-  arrays = {
+  return {
     **_fans(mesh, config, vert, node),
-    **_bending(mesh, config, node, nslice),
+    **_bending(mesh, config, node, len(vert) // LANES),
     "vert": vert.astype(np.int32),
     "node": node.astype(np.int32),
     "area": _node_values(topology.vertex_areas(mesh.rest, mesh.elem), vert),
     "free": _node_values(np.where(pinned, 0.0, 1.0), vert),
   }
-  nslot = int(arrays["slot_adr"][-1])
+
+
+def _put(values: dict, device) -> dict:
+  """Returns arrays on the device, of int or float."""
   put = {}
-  for name, array in arrays.items():
+  for name, array in values.items():
     kind = wp.int32 if array.dtype.kind == "i" else wp.float32
-    put[name] = wp.array(np.ascontiguousarray(array), dtype=kind, device=target)
+    put[name] = wp.array(np.ascontiguousarray(array), dtype=kind, device=device)
+  return put
+
+
+def _surface(mesh: Mesh, config: Config, values: dict, target) -> Surface:
   return Surface(
-    nvert=mesh.nvert,
-    nnode=nnode,
-    nslice=nslice,
-    nelemslice=len(arrays["elem_node"]),
-    nhingeslice=len(arrays["hinge_node"]),
-    nslot=nslot,
+    nvert=len(values["node"]),
+    nnode=len(values["vert"]),
+    nslice=len(values["area"]),
+    nelemslice=len(values["elem_node"]),
+    nhingeslice=len(values["hinge_node"]),
+    nslot=int(values["slot_adr"][-1]),
     spring=config.stiffness if config.elements == "spring" else 0.0,
     foundation=config.foundation,
     bulk=config.bulk,
@@ -85,7 +125,7 @@ def make(mesh: Mesh, config: Config, pinned: np.ndarray, device: str) -> Surface
     tolerance=config.tolerance,
     newton=config.newton,
     device=target,
-    **put,
+    **_put(values, target),
   )
 
 

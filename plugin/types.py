@@ -10,6 +10,49 @@ from .simd import MAX_BLOCKS
 
 
 @dataclasses.dataclass
+class Levels:
+  """Coarser meshes of an organ for the multilevel preconditioner; see `multilevel`.
+
+  The nodes of all of them follow one another in `surface`, each level in whole slices. Offsets are
+  those of a node's x component in floats, on the finest mesh or among all coarse nodes.
+
+  Attributes:
+    nlevel: number of coarse meshes
+    nodes: moving nodes of the finest mesh
+    threshold: condition number from which the preconditioner is used [-]
+    surface: the coarse meshes
+    slice_adr: first slice of each level              (nlevel + 1,)
+    source: offset of each coarse node on the finest  (coarse slices, 8)
+    share: nodes of the finest that one stands for    (coarse slices, 8)
+    rate: of each level, the finest first: stiffness of a node times g / mass where g / mass is one
+      [N/m], upper and lower end of the smoother's interval, its degree, the finest mesh's nodes for
+      one of its own                                  (nlevel + 1, 5)
+    down_adr: first row of each slice in `down_node`  (coarse slices + 1,)
+    down_node: offset on the next finer mesh          (rows, 8)
+    down_weight: what it gives to the coarse node [-] (rows, 8)
+    up_adr: first row of each slice in `up_node`, the finest mesh's slices first
+                                                      (nslice + coarse slices + 1,)
+    up_node: offset on the next coarser mesh          (rows, 8)
+    up_weight: share of the coarse node [-]           (rows, 8)
+  """
+
+  nlevel: int
+  nodes: int
+  threshold: float
+  surface: Surface
+  slice_adr: wp.array
+  source: wp.array
+  share: wp.array
+  rate: wp.array
+  down_adr: wp.array
+  down_node: wp.array
+  down_weight: wp.array
+  up_adr: wp.array
+  up_node: wp.array
+  up_weight: wp.array
+
+
+@dataclasses.dataclass
 class Surface:
   """Constants of one organ on one device; see `simd` for the layout of slices.
 
@@ -61,6 +104,7 @@ class Surface:
     tolerance: relative residual to stop at [-]
     newton: Newton iterations a step
     device: Warp device
+    levels: coarser meshes for the multilevel preconditioner, or None
   """
 
   nvert: int
@@ -105,6 +149,7 @@ class Surface:
   tolerance: float
   newton: int
   device: wp.Device
+  levels: Levels | None = None
 
   @property
   def has_bending(self) -> bool:
@@ -148,11 +193,15 @@ class State:
     r: PCG residual                                 (nworld, nslice, 3, 8)
     p: PCG direction                                (nworld, nslice, 3, 8)
     q: A times direction                            (nworld, nslice, 3, 8)
-    pn: direction along the normals                 (nworld, nslice, 8)
-    partial: sums of the blocks of a world          (nworld, 2, MAX_BLOCKS)
-    counter: blocks that have met                   (nworld,) int
+    z: preconditioned residual                      (nworld, nslice, 3, 8)
+    zn: that along the normals                      (nworld, nslice, 8)
+    e: as z, between smoothing steps                (nworld, nslice, 3, 8)
+    en: that along the normals                      (nworld, nslice, 8)
+    t: smoother's direction and residual            (nworld, nslice, 3, 8)
+    partial: what the blocks of a world exchange    (nworld, 8, MAX_BLOCKS)
     status: PCG iterations, relative residual, norm of the right-hand side, 1 if not finite
                                                     (nworld, 4)
+    coarse: that of the coarser meshes, or None; shares `step`
   """
 
   nworld: int
@@ -181,16 +230,21 @@ class State:
   r: wp.array
   p: wp.array
   q: wp.array
-  pn: wp.array
+  z: wp.array
+  zn: wp.array
+  e: wp.array
+  en: wp.array
+  t: wp.array
   partial: wp.array
-  counter: wp.array
   status: wp.array
+  coarse: State | None = None
 
 
-def make_state(surface: Surface, nworld: int = 1) -> State:
+def make_state(surface: Surface, nworld: int = 1, is_coarse: bool = False) -> State:
   """Returns a zeroed state; everything a step needs is allocated here."""
   s = surface
   vector, scalar = (s.nslice, 3, 8), (s.nslice, 8)
+  cycles = is_coarse or s.levels is not None
   bend, elem = (s.nhingeslice, 8), (s.nelemslice if s.has_bending else 0, 3, 8)
   shapes: dict[str, tuple[int, ...]] = {
     "step": (4,),
@@ -206,14 +260,19 @@ def make_state(surface: Surface, nworld: int = 1) -> State:
     "hinge_half": bend,
     "hinge_moment": bend,
     "total": (2,),
-    "pn": scalar if s.has_bending else (0, 8),
-    "partial": (2, MAX_BLOCKS),
-    "counter": (),
+    "zn": scalar if s.has_bending else (0, 8),
+    "e": vector if cycles else (0, 3, 8),
+    "en": scalar if cycles and s.has_bending else (0, 8),
+    "t": vector if cycles else (0, 3, 8),
+    "partial": (8, MAX_BLOCKS),
     "status": (4,),
   }
   arrays = {}
-  for field in dataclasses.fields(State)[1:]:
+  for field in dataclasses.fields(State)[1:-1]:
     shape = (nworld, *shapes.get(field.name, vector))
-    kind = int if field.name == "counter" else float
-    arrays[field.name] = wp.zeros(shape, dtype=kind, device=s.device)
-  return State(nworld=nworld, **arrays)
+    arrays[field.name] = wp.zeros(shape, dtype=float, device=s.device)
+  state = State(nworld=nworld, **arrays)
+  if s.levels is not None:
+    state.coarse = make_state(s.levels.surface, nworld, is_coarse=True)
+    state.coarse.step = state.step
+  return state

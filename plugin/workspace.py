@@ -198,6 +198,8 @@ def bind(w: Workspace, model: int, instance: int):
   side = window if w.organ.windows else coupling
   with _lock:
     load(device)
+    if w.surface.levels is not None:
+      wp.load_module(solver.multilevel().__name__, device=device)
     if w.resident:
       w.resident.fetch()
     launches = side.launches(w, model, instance)
