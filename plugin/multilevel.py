@@ -314,7 +314,7 @@ def _solve_world(
 ): ...
 
 
-@wp.kernel(enable_backward=False, launch_bounds=simd.BOUNDS)
+@wp.kernel(enable_backward=False, launch_bounds=(simd.BLOCK, 2))
 def _solve(
   nthread: int,
   nslice: int,
@@ -535,12 +535,12 @@ def solve(s: Surface, d: State, first: bool):
   """Solves A x = rhs as `solver.solve` does, with the matrices that `assemble` wrote."""
   levels: Levels = s.levels
   c, e = levels.surface, d.coarse
-  nthread = simd.group_size(s.device, s.nslice, d.nworld)
+  nthread = simd.group_size(s.device, s.nslice, d.nworld, per_sm=2)
   d.partial.zero_()
   wp.launch(
     _solve,
     dim=(d.nworld, nthread),
-    block_dim=simd.BLOCK,
+    block_dim=simd.block(s.device, s.nslice),
     inputs=[
       nthread,
       s.nslice,

@@ -118,7 +118,7 @@ def _direct_world(
 ): ...
 
 
-@wp.kernel(enable_backward=False, launch_bounds=simd.BOUNDS)
+@wp.kernel(enable_backward=False, launch_bounds=simd.BLOCK)
 def _direct(
   nthread: int,
   nslice: int,
@@ -199,7 +199,7 @@ def step(s: Surface, d: State, integrator: str):
   wp.launch(
     _direct,
     dim=(d.nworld, nthread),
-    block_dim=simd.BLOCK,
+    block_dim=simd.block(s.device, s.nslice),
     inputs=[
       nthread,
       s.nslice,

@@ -298,7 +298,7 @@ def _solve_world(
 ): ...
 
 
-@wp.kernel(enable_backward=False, launch_bounds=simd.BOUNDS)
+@wp.kernel(enable_backward=False, launch_bounds=simd.BLOCK)
 def _solve(
   nthread: int,
   nslice: int,
@@ -455,7 +455,7 @@ def solve(s: Surface, d: State, first: bool):
   wp.launch(
     _solve,
     dim=(d.nworld, nthread),
-    block_dim=simd.BLOCK,
+    block_dim=simd.block(s.device, s.nslice),
     inputs=[
       nthread,
       s.nslice,
