@@ -72,21 +72,24 @@ def add_windows(
   taken = [name for name in names if spec.flex(name) is not None]
   if taken:
     raise ValueError(f"organ {organ!r}: the spec has a flex {taken[0]!r} already")
-  keys = _take_keys(spec)
-  meets = (flex.contype, flex.conaffinity)
-  surface = bodies[flex.vertbody[0]]
-  if len(set(flex.vertbody)) > 1 or "mass" not in config:
-    surface, meets = _make_rigid(spec, flex, bodies, plugin, config)
-  elif not any(meets):
-    meets = (1, 1)  # MuJoCo's own
-  rest = np.reshape(flex.vert, (-1, 3))
-  elem = np.reshape(flex.elem, (-1, 3))
-  edge = float(np.linalg.norm(rest[elem[:, [1, 2, 0]]] - rest[elem], axis=2).mean())
+  if nodes is not None and not 5 <= nodes:
+    raise ValueError(f"organ {organ!r}: nodes is {nodes}, expected at least 5")
+  nodal = len(set(flex.vertbody)) > 1 or "mass" not in config
+  meets = (flex.contype, flex.conaffinity) if nodal or flex.contype or flex.conaffinity else (1, 1)
   colliding = [g for g in spec.geoms if (g.contype & meets[1]) | (g.conaffinity & meets[0])]
   followed = [[g for g in colliding if not group.isdisjoint(_ancestors(g))] for group in groups]
   for group, mine in zip(groups, followed, strict=True):
     if not mine:
       raise ValueError(f"organ {organ!r}: nothing of {sorted(group)} collides with it")
+    if not all(g.parent.name for g in mine):
+      raise ValueError(f"organ {organ!r}: a body of {sorted(group)} has no name, expected one")
+  own = _own_bodies(flex, bodies) if nodal else []
+  # From here on the spec changes.
+  keys = _take_keys(spec)
+  surface = _make_rigid(spec, flex, own, plugin, config) if nodal else bodies[flex.vertbody[0]]
+  rest = np.reshape(flex.vert, (-1, 3))
+  elem = np.reshape(flex.elem, (-1, 3))
+  edge = float(np.linalg.norm(rest[elem[:, [1, 2, 0]]] - rest[elem], axis=2).mean())
   every = list(itertools.chain(*followed)) if groups else [g for g in colliding if _moves(g)]
   # Each window has room for all tools, for when they meet.
   size = min(nodes or _slots(every, edge, flex.radius), len(rest))
@@ -165,18 +168,23 @@ def _groups(organ: str, bodies: dict, tools) -> list[set[str]]:
   return groups
 
 
-def _make_rigid(spec, flex, bodies: dict, plugin, config: dict[str, str]):
-  """Makes a nodal organ's flex rigid; returns the body it is in and how it collides."""
-  vertbody = list(flex.vertbody)
-  free = np.array([bodies[name].first_joint() is not None for name in vertbody])
-  if not free.any() or len(set(np.array(vertbody)[free])) < free.sum():
+def _own_bodies(flex, bodies: dict) -> list:
+  """Returns the bodies of a nodal organ's moving vertices."""
+  own = [bodies[name] for name in flex.vertbody if bodies[name].first_joint() is not None]
+  if not own or len({body.name for body in own}) < len(own):
     raise ValueError(f"organ {flex.name!r} has no vertices of its own, expected a <flexcomp>")
   if flex.selfcollide != mujoco.mjtFlexSelf.mjFLEXSELF_NONE:
     raise ValueError(
       f"organ {flex.name!r} collides with itself, which needs nodal coupling; expected "
       "<contact selfcollide='none'/>"
     )
-  own = [bodies[name] for name, moves in zip(vertbody, free, strict=True) if moves]
+  return own
+
+
+def _make_rigid(spec, flex, own: list, plugin, config: dict[str, str]):
+  """Makes a nodal organ's flex rigid; returns the body it is in."""
+  vertbody = list(flex.vertbody)
+  free = np.isin(vertbody, [body.name for body in own])
   parent = own[0].parent
   rest = np.zeros((len(vertbody), 3))
   rest += np.reshape(flex.vert, (-1, 3)) if len(flex.vert) else 0.0  # none: all on their bodies
@@ -187,7 +195,8 @@ def _make_rigid(spec, flex, bodies: dict, plugin, config: dict[str, str]):
   surface = parent
   if parent.plugin.name != plugin.name:  # MuJoCo marks the parent where vertices are pinned to it
     surface = parent.add_body(name=f"{flex.name}_surface")
-    surface.set_frame(own[0].frame) if own[0].frame is not None else None
+    if own[0].frame is not None:
+      surface.set_frame(own[0].frame)
     surface.plugin.name, surface.plugin.plugin_name = plugin.name, engine.NAME
     surface.plugin.active = True
   # One by one the vertices' bodies take MuJoCo quadratic time to delete.
@@ -197,7 +206,7 @@ def _make_rigid(spec, flex, bodies: dict, plugin, config: dict[str, str]):
   spec.delete(doomed)
   flex.vert, flex.vertbody = rest.ravel(), [surface.name] * len(rest)
   flex.edgedamping = 0.0
-  return surface, (flex.contype, flex.conaffinity)
+  return surface
 
 
 def _slots(geoms: list, edge: float, radius: float) -> int:

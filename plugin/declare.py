@@ -39,7 +39,7 @@ class Organ:
     qposadr: first qpos, -1 if pinned       (nvert,)
     stateadr: first own number in the plugin state, -1 if pinned (nvert,)
     nfree: three times the number of moving vertices
-    frame: rotation from the parent body to the world (3, 3)
+    frame: rotation from the slides' axes to the world (3, 3)
     origin: position of the parent body [m] (3,)
     mass: mass of each vertex [kg]          (nvert,)
     digest: identifies geometry, configuration and masses
@@ -136,7 +136,10 @@ def read(model: int, instance: int) -> Organ:
     raise ValueError(f"organ {name!r}: all vertices are pinned, expected some that move")
   parent = _parent(m, name, body, free)
   frame, origin = _static_frame(m, name, parent)
-  rest = np.where(free[:, None], mjstruct.view(m.body_pos, (m.nbody, 3))[body], 0.0) + local
+  turn = _turn(m, name, body[free])
+  frame = frame @ turn
+  rest = np.where(free[:, None], mjstruct.view(m.body_pos, (m.nbody, 3))[body] @ turn, 0.0)
+  rest += np.where(free[:, None], local, local @ turn)
   elem = _elements(m, flex)
   mesh = topology.build(name, rest, elem)
   config = configuration.parse(name, _keys(model, instance), len(elem), mesh.closed)
@@ -287,7 +290,7 @@ def _windows(model, m, instance, name, config, mesh, mass, place) -> Windows:
     raise ValueError(
       f"organ {name!r}: window has {len(config.window)} names, expected at most {MAX_WINDOWS}"
     )
-  body, dofadr, qposadr, offsets, sizes = [], [], [], [], []
+  body, dofadr, qposadr, offsets, turns, sizes = [], [], [], [], [], []
   flex, elem_adr, elem_num = [], [], []
   for window in config.window:
     what = f"organ {name!r}: window {window!r}"
@@ -307,11 +310,14 @@ def _windows(model, m, instance, name, config, mesh, mass, place) -> Windows:
       if not jointed.all():
         raise ValueError(f"organ {window!r}: vertices without joints, expected no pins")
       frame, origin = _static_frame(m, window, _parent(m, window, own, jointed))
+      turn = _turn(m, window, own)
+      frame = frame @ turn
       dofs, qposs = _addresses(m, window, own, jointed)
     except ValueError as error:
       raise ValueError(f"{what}: {str(error).partition(': ')[2]}") from None
     if np.abs(frame - place[0]).max() > 1e-9:
       raise ValueError(f"{what} is rotated against the organ, expected the same orientation")
+    turns.append(np.tile(turn, (count, 1, 1)))
     offsets.append(np.tile(place[0].T @ (place[1] - origin), (count, 1)))
     body.append(own)
     dofadr.append(dofs)
@@ -323,10 +329,11 @@ def _windows(model, m, instance, name, config, mesh, mass, place) -> Windows:
   # At rest the windows stand on patches of their own: their bodies move there, so that qpos0 fits.
   home = _home_slots(mesh.elem, mesh.nvert, sizes)
   used = home >= 0
-  body, offset = np.concatenate(body), np.concatenate(offsets)
+  body, offset, turn = (np.concatenate(parts) for parts in (body, offsets, turns))
   body_pos = mjstruct.view(m.body_pos, (m.nbody, 3))
-  body_pos[body[used]] = offset[used] + mesh.rest[home[used]]
-  qhome = offset - body_pos[body]
+  stand = offset[used] + mesh.rest[home[used]]
+  body_pos[body[used]] = np.einsum("kij,kj->ki", turn[used], stand)
+  qhome = offset - np.einsum("kji,kj->ki", turn, body_pos[body])
   geom_adr, geom = _followed(m, name, config, flex)
   return Windows(
     flex=np.array(flex),
@@ -476,6 +483,19 @@ def _parent(m, name: str, body: np.ndarray, free: np.ndarray) -> int:
       "pinned to the parent body"
     )
   return int(parents[0])
+
+
+def _turn(m, name: str, body: np.ndarray) -> np.ndarray:
+  """Returns the rotation of the vertices' bodies, and of their slides, against the parent body.
+
+  A flexcomp has none, but `attach` turns the bodies of a world that it puts in a frame.
+  """
+  quats = mjstruct.view(m.body_quat, (m.nbody, 4))[body]
+  if np.abs(quats - quats[0]).max() > 1e-9:
+    raise ValueError(f"organ {name!r}: its vertices' bodies are rotated, expected all alike")
+  turn = np.zeros(9)
+  mujoco.mju_quat2Mat(turn, quats[0].copy())
+  return turn.reshape(3, 3)
 
 
 def _static_frame(m, name: str, parent: int) -> tuple[np.ndarray, np.ndarray]:

@@ -196,6 +196,57 @@ def test_catalogue_with_windows_presses_as_without():
     models.load("kidney", nodes=250, coupling="none")
 
 
+@pytest.mark.parametrize("coupling", ["nodal", "window", "by hand"])
+def test_organ_of_a_world_that_is_attached_in_a_turned_frame(coupling):
+  text = scene(pinned=False)
+  start, stop = text.index("<flexcomp"), text.index("</flexcomp>") + len("</flexcomp>")
+  child = mujoco.MjSpec.from_string(
+    '<mujoco><extension><plugin plugin="palpate.organ"/></extension>'
+    f"<worldbody>{text[start:stop]}</worldbody></mujoco>"
+  )
+  world = mujoco.MjSpec()
+  frame = world.worldbody.add_frame(pos=[0.1, 0, 0], quat=[0.5, 0.5, 0.5, 0.5])  # x to y to z
+  world.attach(child, prefix="a/", frame=frame)
+  if coupling == "window":
+    palpate.add_windows(world, "a/organ")
+  elif coupling == "by hand":
+    config = dict(child.plugins[0].config) | {"window": "window", "mass": "0.02"}
+    keys = "".join(f'<config key="{k}" value="{v}"/>' for k, v in config.items())
+    shape = text[text.index("point=") : text.index(">", start)]
+    world = mujoco.MjSpec()
+    world.attach(
+      mujoco.MjSpec.from_string(f"""<mujoco><extension><plugin plugin="palpate.organ">
+      <instance name="x">{keys}</instance></plugin></extension><worldbody><body name="organ">
+      <plugin plugin="palpate.organ" instance="x"/><flexcomp name="organ" type="direct" dim="2"
+      rigid="true" radius="0.0005" {shape}><contact contype="0" conaffinity="0"
+      selfcollide="none"/></flexcomp></body><flexcomp name="window" type="grid" count="9 6 1"
+      spacing=".01 .01 .01" dim="2" mass=".001" radius="0.0005"><edge damping="1e-9"/>
+      <contact selfcollide="none"/></flexcomp></worldbody></mujoco>"""),
+      prefix="a/",
+      frame=world.worldbody.add_frame(pos=[0.1, 0, 0], quat=[0.5, 0.5, 0.5, 0.5]),
+    )
+  m = world.compile()
+  d = mujoco.MjData(m)
+  m.opt.gravity = 0
+  organ = palpate.Organ(m, d, "a/organ")
+  size = np.ptp(organ.xpos0, axis=0)
+  np.testing.assert_allclose(size, [0.06, 0.02, 0.04], rtol=0.02)  # z is now along x
+  organ.set_state(organ.xpos0 + np.array([0, 0.001, 0]))
+  if coupling == "nodal":
+    mujoco.mj_forward(m, d)
+    np.testing.assert_allclose(d.flexvert_xpos, organ.xpos, atol=1e-12)
+  mujoco.mj_step(m, d)
+  assert organ.error is None
+  if coupling != "nodal":
+    slots = organ._space.views["placed"].numpy()
+    bodies = organ._organ.windows.body[slots >= 0]
+    mujoco.mj_kinematics(m, d)
+    np.testing.assert_allclose(d.xpos[bodies], organ.xpos[slots[slots >= 0]], atol=1e-9)
+  # The foundation takes it back, along y alone.
+  speed = organ.xvel.mean(axis=0)
+  assert speed[1] < 0 and np.abs(speed[[0, 2]]).max() < 1e-3 * abs(speed[1])
+
+
 def test_organs_of_a_spec():
   made = spec()
   assert author.organs(made) == {"organ": False}
@@ -220,6 +271,15 @@ def test_bad_requests_are_named(options, organ, tools, words):
     palpate.add_windows(made, organ, tools)
   for word in words:
     assert word in str(error.value)
+
+
+def test_a_refusal_changes_nothing():
+  made = spec()
+  before = made.to_xml()
+  for tools, nodes in ((["organ_1"], None), (None, 2)):
+    with pytest.raises(ValueError):
+      palpate.add_windows(made, "organ", tools, nodes)
+  assert made.to_xml() == before
 
 
 def test_a_second_time_is_refused():
