@@ -22,7 +22,7 @@ _LENGTH = 20.0
 _TOOL = (0.0025, 0.02)
 # Of a slot's body; it does not turn, and is lighter than any node.
 _INERTIA, _SHARE = 1e-8, 0.01
-_KEY_FIELDS = {"qpos": 1, "qvel": 2}  # columns of `_layout`
+_KEY_FIELDS = {"qpos": 0, "qvel": 1}  # columns of `_layout`
 _WINDOW_GROUP = 4  # drawn by nobody who does not ask for it
 
 
@@ -273,11 +273,11 @@ def _warn_of_others(organ: str, colliding: list, groups: list[set[str]]):
       )
 
 
-def _layout(spec) -> list[tuple[tuple[str, int], int, int]]:
+def _layout(spec) -> list[tuple[tuple[str, int], tuple[int, int]]]:
   """Returns body and index, positions and velocities of each joint, in the order of qpos."""
   sizes = {mujoco.mjtJoint.mjJNT_FREE: (7, 6), mujoco.mjtJoint.mjJNT_BALL: (4, 3)}
   return [
-    ((body.name, k), *sizes.get(joint.type, (1, 1)))
+    ((body.name, k), sizes.get(joint.type, (1, 1)))
     for body in spec.bodies
     for k, joint in enumerate(body.joints)
   ]
@@ -294,7 +294,7 @@ def _take_keys(spec) -> list[tuple]:
   for key in spec.keys:
     for field, column in _KEY_FIELDS.items():
       values = np.array(getattr(key, field), dtype=float)
-      cuts = np.cumsum([joint[column] for joint in joints])
+      cuts = np.cumsum([sizes[column] for _, sizes in joints])
       if values.size and values.size != cuts[-1]:
         raise ValueError(
           f"keyframe {key.name!r} has {values.size} numbers of {field}, expected {cuts[-1]}"
@@ -311,6 +311,7 @@ def _fit_keys(spec, keys: list[tuple]):
   """Gives the keyframes the numbers of the joints that there are now, zero for the new ones."""
   joints = _layout(spec)
   for key, field, had in keys:
-    column = _KEY_FIELDS[field]
-    new = [had.get(joint[0], np.zeros(joint[column])) for joint in joints]
+    sizes = [both[_KEY_FIELDS[field]] for _, both in joints]
+    names = [joint[0] for joint in joints]
+    new = [had.get(name, np.zeros(size)) for name, size in zip(names, sizes, strict=True)]
     setattr(key, field, np.concatenate(new))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+from typing import Any
 
 from . import register
 from .console import CommandError
@@ -35,7 +36,7 @@ def main(args: argparse.Namespace) -> int:
 
   loaded = [(model, data, args.scene)]
 
-  def load():
+  def load() -> Any:  # the viewer also takes a name, which its type leaves out
     return loaded.pop() if loaded else (*scenes.load(args, handle=True), args.scene)
 
   # The viewer points its camera at a scene only if it is loaded under a name.
