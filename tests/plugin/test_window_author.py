@@ -293,22 +293,3 @@ def test_a_table_that_nobody_follows_is_pointed_out():
   table = '<geom name="table" type="plane" size="1 1 .1" pos="0 0 -.1"/>'
   with pytest.warns(UserWarning, match="'table'"):
     palpate.add_windows(spec(extra=table), "organ")
-
-
-def test_saved_scene_needs_the_import_alone(tmp_path):
-  import subprocess
-  import sys
-
-  made = spec()
-  palpate.add_windows(made, "organ")
-  made.compile()
-  path = tmp_path / "scene.xml"
-  path.write_text(made.to_xml())
-  code = (
-    "import mujoco, palpate, sys; m = mujoco.MjModel.from_xml_path(sys.argv[1]);"
-    "d = mujoco.MjData(m); mujoco.mj_step(m, d, nstep=3); print(m.nv)"
-  )
-  run = subprocess.run(
-    [sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=True
-  )
-  assert int(run.stdout) < 3 * 138
