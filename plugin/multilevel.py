@@ -20,6 +20,8 @@ from .types import Levels, State, Surface
 
 # Below this condition number a mesh is solved by a few steps of the smoother.
 _EASY = 8.0
+# Above this one float32 residuals are noise to the slowest modes, which only cycles would act on.
+_WORST = 2e5
 
 _SETUP = """
   // What one level's passes read and write.
@@ -58,7 +60,7 @@ _SETUP = """
     return per_mass * rate.data[5 * l] / rate.data[5 * l + 4];
   };
   int depth = 0;
-  if (condition(0) >= threshold) {
+  if (condition(0) >= threshold && condition(0) <= WORST) {
     depth = 1;
     while (depth < nlevel && condition(depth) > EASY) ++depth;
   }
@@ -234,7 +236,7 @@ _CYCLE = """
     }
 """
 _SOLVE = solver.body(
-  _SETUP.replace("EASY", f"{_EASY}f"),
+  _SETUP.replace("EASY", f"{_EASY}f").replace("WORST", f"{_WORST}f"),
   _CYCLE,
   "zx *= damp; zy *= damp; zz *= damp;",
 )
