@@ -66,7 +66,7 @@ _EDGE = """
   REST(rb, rest, 3)
   CROSS(rn, ra, rb)
   const V scale = 1.0f / SQRT(MAX(DOT(n, n), 0.01f * DOT(rn, rn) + 1e-30f));
-  float* out = normal.data + 24 * ((size_t)world * nslice + s);
+  float* out = normal.data + 32 * ((size_t)world * nslice + s);
   ST(out, 0, nx * scale);
   ST(out, 1, ny * scale);
   ST(out, 2, nz * scale);
@@ -111,7 +111,7 @@ def _elem_normal(
   const float gv = AHEAD(stage, h, step.data[4 * world + 1]);
   const float* U = pos.data + 24 * (size_t)world * nnodeslice;
   const float* W = vel.data + 24 * (size_t)world * nnodeslice;
-  const float* N = elem_normal.data + 24 * (size_t)world * nelemslice;
+  const float* N = elem_normal.data + 32 * (size_t)world * nelemslice;
   const int* node = hinge_node.data + 32 * s;
   const int* elem = hinge_elem.data + 16 * s;
   const float* rest = hinge_rest.data + 72 * s;
@@ -149,8 +149,12 @@ def _elem_normal(
   const V rate = -DOT(l, c) / SQRT(MAX(DOT(a, a), DOT(na, na) * rest2 + 1e-30f))
     - DOT(r, d) / SQRT(MAX(DOT(b, b), DOT(nb, nb) * rest2 + 1e-30f));
   const size_t out = (size_t)world * nslice + s;
-  ST(angle.data, out, h * (psi - LD(angle0.data, s)) + gv * half * rate);
+  const V change = psi - LD(angle0.data, s);
+  ST(angle.data, out, h * change + gv * half * rate);
   ST(half_out.data, out, half);
+  // What the bending matrix may leave out here, see _elem_corner_slices.
+  const V fold = 4.0f - 4.0f * half * half + 2.0f * change * change;
+  ST(rough.data, out, LD(hinge_gain.data, 5 * s) * fold);
 """)
 )
 def _hinge_angle_slices(
@@ -163,6 +167,7 @@ def _hinge_angle_slices(
   hinge_node: wp.array3d[int],
   hinge_rest: wp.array3d[float],
   hinge_elem: wp.array3d[int],
+  hinge_gain: wp.array3d[float],
   angle0: wp.array2d[float],
   step: wp.array2d[float],
   pos: wp.array4d[float],
@@ -170,6 +175,7 @@ def _hinge_angle_slices(
   elem_normal: wp.array4d[float],
   angle: wp.array3d[float],
   half_out: wp.array3d[float],
+  rough: wp.array3d[float],
 ): ...
 
 
@@ -183,6 +189,7 @@ def _hinge_angle(
   hinge_node: wp.array3d[int],
   hinge_rest: wp.array3d[float],
   hinge_elem: wp.array3d[int],
+  hinge_gain: wp.array3d[float],
   hinge_angle0: wp.array2d[float],
   # State in:
   step_in: wp.array2d[float],
@@ -192,6 +199,7 @@ def _hinge_angle(
   # State out:
   hinge_angle_out: wp.array3d[float],
   hinge_half_out: wp.array3d[float],
+  hinge_rough_out: wp.array3d[float],
 ):
   world, tid = wp.tid()
   _hinge_angle_slices(
@@ -204,6 +212,7 @@ def _hinge_angle(
     hinge_node,
     hinge_rest,
     hinge_elem,
+    hinge_gain,
     hinge_angle0,
     step_in,
     pos_in,
@@ -211,6 +220,7 @@ def _hinge_angle(
     elem_normal_in,
     hinge_angle_out,
     hinge_half_out,
+    hinge_rough_out,
   )
 
 
@@ -256,11 +266,19 @@ def _hinge_moment(
 
 
 # A triangle's part of minus moment times grad theta lies along its normal: one number a corner.
+#
+# The bending matrix n Q n^T takes normals of nodes for those of triangles, and rest heights. The
+# step is stable while the matrix is at least half the true Hessian; on thick shells, folded,
+# crushed or curved like their thickness, it fell short by factors of 10 to 100. What it leaves out
+# grows with a hinge's angle squared, and with moment times change of angle in the Hessian's second
+# derivatives; over the heights squared that is a stiffness, which the triangle's edges get. It
+# acts on dv alone, so no rest state depends on it, and a product with the matrix costs the same.
 @wp.func_native(
   _EDGE
   + simd.slices("""
   const float* U = pos.data + 24 * (size_t)world * nnodeslice;
   const float* T = moment.data + 8 * (size_t)world * nhingeslice;
+  const float* R = rough.data + 8 * (size_t)world * nhingeslice;
   const int* node = elem_node.data + 24 * s;
   const int* hinge = elem_hinge.data + 24 * s;
   const float* rest = elem_rest.data + 48 * s;
@@ -289,6 +307,9 @@ def _hinge_moment(
   ST(out, 0, s0);
   ST(out, 1, s1);
   ST(out, 2, s2);
+  const V cover = scale * scale
+    * (GATHER(R, hinge, 0) * cc + GATHER(R, hinge + 8, 0) * bb + GATHER(R, hinge + 16, 0) * aa);
+  ST(normal.data + 32 * ((size_t)world * nslice + s), 3, cover);
 """)
 )
 def _elem_corner_slices(
@@ -302,6 +323,8 @@ def _elem_corner_slices(
   elem_hinge: wp.array3d[int],
   pos: wp.array4d[float],
   moment: wp.array3d[float],
+  rough: wp.array3d[float],
+  normal: wp.array4d[float],
   corner: wp.array4d[float],
 ): ...
 
@@ -318,7 +341,9 @@ def _elem_corner(
   # State in:
   pos_in: wp.array4d[float],
   hinge_moment_in: wp.array3d[float],
+  hinge_rough_in: wp.array3d[float],
   # State out:
+  elem_normal_out: wp.array4d[float],
   elem_corner_out: wp.array4d[float],
 ):
   world, tid = wp.tid()
@@ -333,6 +358,8 @@ def _elem_corner(
     elem_hinge,
     pos_in,
     hinge_moment_in,
+    hinge_rough_in,
+    elem_normal_out,
     elem_corner_out,
   )
 
@@ -350,7 +377,7 @@ def _elem_corner(
   const size_t base = (size_t)world * nslice;
   const float* U = pos.data + 24 * base;
   const float* W = vel.data + 24 * base;
-  const float* N = elem_normal.data + 24 * (size_t)world * nelemslice;
+  const float* N = elem_normal.data + 32 * (size_t)world * nelemslice;
   const float* C = elem_corner.data + 24 * (size_t)world * nelemslice;
   const int row0 = slot_adr.data[s], width = slot_adr.data[s + 1] - row0;
   const int* node = fan_node.data + 8 * (row0 + 2 * s);
@@ -369,7 +396,7 @@ def _elem_corner(
   V squeeze = SPLAT(1.0f);
   V dxx = zero, dxy = zero, dxz = zero, dyy = zero, dyz = zero, dzz = zero;
   V k0 = zero, k1 = zero, k2 = zero, k3 = zero, k4 = zero;
-  V k5 = zero, k6 = zero, k7 = zero, k8 = zero;
+  V k5 = zero, k6 = zero, k7 = zero, k8 = zero, cover = zero;
   // Entry k of the fan as displacement difference d and edge e.
   V px = GATHER(U, node, 0) - ux, py = GATHER(U, node, 1) - uy, pz = GATHER(U, node, 2) - uz;
   V rx = LD(rest, 0), ry = LD(rest, 1), rz = LD(rest, 2);
@@ -381,7 +408,8 @@ def _elem_corner(
     const V ax = rx + px, ay = ry + py, az = rz + pz;
     const V bx = tx + qx, by = ty + qy, bz = tz + qz;
     const V G11 = LD(metric, 5 * k), G12 = LD(metric, 5 * k + 1), G22 = LD(metric, 5 * k + 2);
-    V n0, n1, n2, n3, n4, n5, n6, n7, n8;
+    V n0, n1, n2, n3, n4, n5, n6, n7, n8, over = zero;
+    if (bending && matrix) over = SELECT(G11 > zero, GATHER(N, corner + 8 * k, 3), zero);
     if (spring == 0.0f) {
       const V mu = LD(metric, 5 * k + 3), lam = LD(metric, 5 * k + 4);
       const V E11 = DOT(r, p) + 0.5f * DOT(p, p);
@@ -446,6 +474,8 @@ def _elem_corner(
       jz += k6 * wx + k7 * wy + k8 * wz;
       if (matrix) {
         float* out = K + 72 * (k - 1);
+        cover += over;  // after the product with the velocity above, which is exact
+        k0 += cover; k4 += cover; k8 += cover;
         ST(out, 0, -g * k0); ST(out, 1, -g * k1); ST(out, 2, -g * k2);
         ST(out, 3, -g * k3); ST(out, 4, -g * k4); ST(out, 5, -g * k5);
         ST(out, 6, -g * k6); ST(out, 7, -g * k7); ST(out, 8, -g * k8);
@@ -462,6 +492,7 @@ def _elem_corner(
       }
     }
     k0 = n0; k1 = n1; k2 = n2; k3 = n3; k4 = n4; k5 = n5; k6 = n6; k7 = n7; k8 = n8;
+    cover = SELECT(degree_ > SPLAT((float)k), over, zero);
     px = qx; py = qy; pz = qz;
     rx = tx; ry = ty; rz = tz;
   }
@@ -647,13 +678,14 @@ def _hinge_angles(s: Surface, d: State, stage: Stage):
       s.hinge_node,
       s.hinge_rest,
       s.hinge_elem,
+      s.hinge_gain,
       s.hinge_angle0,
       d.step,
       d.pos_trial,
       d.vel_trial,
       d.elem_normal,
     ],
-    outputs=[d.hinge_angle, d.hinge_half],
+    outputs=[d.hinge_angle, d.hinge_half, d.hinge_rough],
     device=s.device,
   )
 
@@ -679,8 +711,9 @@ def _bending(s: Surface, d: State, stage: Stage):
       s.elem_hinge,
       d.pos_trial,
       d.hinge_moment,
+      d.hinge_rough,
     ],
-    outputs=[d.elem_corner],
+    outputs=[d.elem_normal, d.elem_corner],
     device=s.device,
   )
 

@@ -19,6 +19,8 @@ from .types import State, Surface
 # Loads whose response gives the effective inertia; between them it follows the nodal area.
 _SAMPLES = 24
 _KNOWN = 64
+# A pressed shell stiffens and few nodes of a patch touch: between 1 and the limit of 2.
+_MARGIN = 1.5
 _time_step: dict[bytes, float] = {}  # digest of an armature of ours -> the time step it is for
 
 
@@ -89,8 +91,9 @@ def effective_inertia(
 
   That of node i is 1 / sum_j n^T (A^-1)_ij n over the nodes j within a contact patch. The row sum
   keeps the spectral radius of Mhat (A^-1 on the contact nodes) at or under 1; the iteration on the
-  contact force is stable up to 2. Evenly spread nodes are solved for; others follow the nearest of
-  them in proportion to their area.
+  contact force is stable up to 2. What it adds to the mass is taken `_MARGIN` times: too little
+  lets a contact move its nodes alone, and stiff shells crumple under the tool. Evenly spread nodes
+  are solved for; others follow the nearest of them in proportion to their area.
 
   Args:
     s: the organ
@@ -133,7 +136,8 @@ def effective_inertia(
   nearest = np.argsort(distance2, axis=1)[:, :3]
   weight = 1 / (np.take_along_axis(distance2, nearest, axis=1) + 1e-12 * distance2.max() + 1e-300)
   weight /= weight.sum(axis=1, keepdims=True)
-  return np.maximum(area * (weight * specific[nearest]).sum(axis=1), mass)
+  found = np.maximum(area * (weight * specific[nearest]).sum(axis=1), mass)
+  return mass + _MARGIN * (found - mass)
 
 
 def _spread(rest: np.ndarray, candidates: np.ndarray, count: int) -> np.ndarray:

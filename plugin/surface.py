@@ -40,9 +40,9 @@ def from_slices(array: np.ndarray) -> np.ndarray:
   return moved.reshape(-1, *moved.shape[2:])
 
 
-def _offset(index: np.ndarray) -> np.ndarray:
-  """Returns where the x component of vector `index` starts, in floats."""
-  return (index // LANES) * 3 * LANES + index % LANES
+def _offset(index: np.ndarray, size: int = 3) -> np.ndarray:
+  """Returns where the first of the `size` components of `index` starts, in floats."""
+  return (index // LANES) * size * LANES + index % LANES
 
 
 def make(
@@ -211,7 +211,7 @@ def _fans(mesh: Mesh, config: Config, vert: np.ndarray, node: np.ndarray) -> dic
     "fan_rest": rows(toward, 2).astype(np.float32),
     "fan_metric": rows(metric, 1).astype(np.float32),
     "fan_spring": rows(spring, 0).astype(np.float32),
-    "fan_corner": rows(_offset(corner // 3), 1).astype(np.int32),
+    "fan_corner": rows(_offset(corner // 3, 4), 1).astype(np.int32),
     # Corner forces are (nelemslice, 3, 8): component c of vector t.
     "fan_side": rows(_offset(corner // 3) + corner % 3 * LANES, 1).astype(np.int32),
     "degree": to_slices(degree.astype(np.float32)),
@@ -259,7 +259,7 @@ def _bending(mesh: Mesh, config: Config, node: np.ndarray, nslice: int) -> dict:
     "elem_hinge": to_slices(_pad(opposite, nhinge)).astype(np.int32),
     "hinge_node": to_slices(_pad(_offset(node[hinge.vert]), least=1)).astype(np.int32),
     "hinge_rest": to_slices(_pad(hinge_rest, least=1)).astype(np.float32),
-    "hinge_elem": to_slices(_pad(_offset(hinge.elem), least=1)).astype(np.int32),
+    "hinge_elem": to_slices(_pad(_offset(hinge.elem, 4), least=1)).astype(np.int32),
     "hinge_near": to_slices(_pad(near, least=1)).astype(np.int32),
     "hinge_gain": to_slices(_pad(gain, least=1)).astype(np.float32),
   }

@@ -183,11 +183,13 @@ class State:
     rhs: right-hand side [N s]                      (nworld, nslice, 3, 8)
     areavec: area vector of a node, 6 dV/dx [m^2]   (nworld, nslice, 3, 8)
     normal: unit normal of a node                   (nworld, nslice, 3, 8)
-    elem_normal: unit normal of a triangle          (nworld, nelemslice, 3, 8)
+    elem_normal: unit normal of a triangle, and the stiffness that its edges add to the matrix
+      [N/m]                                         (nworld, nelemslice, 4, 8)
     elem_corner: force on each corner along it [N s](nworld, nelemslice, 3, 8)
     hinge_angle: strain impulse angle of a hinge    (nworld, nhingeslice, 8)
     hinge_half: cos(theta / 2)                      (nworld, nhingeslice, 8)
     hinge_moment: moment impulse [N m s]            (nworld, nhingeslice, 8)
+    hinge_rough: what the bending matrix may leave out [N m](nworld, nhingeslice, 8)
     total: volume difference [m^3] and areavec . vel(nworld, 2)
     x: PCG solution [m/s]                           (nworld, nslice, 3, 8)
     r: PCG residual                                 (nworld, nslice, 3, 8)
@@ -225,6 +227,7 @@ class State:
   hinge_angle: wp.array
   hinge_half: wp.array
   hinge_moment: wp.array
+  hinge_rough: wp.array
   total: wp.array
   x: wp.array
   r: wp.array
@@ -254,11 +257,12 @@ def make_state(surface: Surface, nworld: int = 1, is_coarse: bool = False) -> St
     "inverse": (s.nslice, 6, 8),
     "areavec": vector if s.has_volume or s.has_bending else (0, 3, 8),
     "normal": vector if s.has_bending else (0, 3, 8),
-    "elem_normal": elem,
+    "elem_normal": (elem[0], 4, 8),
     "elem_corner": elem,
     "hinge_angle": bend,
     "hinge_half": bend,
     "hinge_moment": bend,
+    "hinge_rough": bend,
     "total": (2,),
     "zn": scalar if s.has_bending else (0, 8),
     "e": vector if cycles else (0, 3, 8),
