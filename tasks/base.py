@@ -62,6 +62,7 @@ from .scenes import CAMERA, ORGAN, Scene
 CONTROL_TIMESTEP = 0.02  # [s]
 RATES = (1.0, 1.0, 3.0, 0.12)  # pitch, yaw, roll [rad/s], insertion [m/s]
 AXES = ("pitch", "yaw", "roll", "insertion")
+JAWS = "grasper/"  # prefix of the instrument that has them
 REWARDS = ("dense", "sparse")
 NEAR, COARSE = 8, 32  # nodes in the observations
 HELD_FORCE = 0.05  # force on both jaws above which they hold tissue [N]
@@ -278,9 +279,10 @@ class Physics(mujoco.Physics):
     body = self.model.ptr.body(f"{self.prefix}trocar")
     self._home = body.pos.copy(), body.quat.copy()
 
-  def mark(self, index: int, pos: np.ndarray, shown: bool = True) -> None:
-    """Puts target site `index` at `pos` [m], for the pictures."""
+  def mark(self, index: int, pos: np.ndarray, shown: bool = True, now: bool = False) -> None:
+    """Puts target site `index` at `pos` [m], for the pictures; yellow where it is its turn now."""
     site = self._targets[index]
+    self.model.site_rgba[site, :3] = scenes.NOW if now else scenes.LATER
     self.model.site_pos[site] = pos
     self.data.site_xpos[site] = pos
     self.model.site_rgba[site, 3] = 0.9 if shown else 0.0
@@ -288,11 +290,12 @@ class Physics(mujoco.Physics):
 
 def check_scene(model: mj.MjModel, prefix: str, targets: int, organ: str) -> None:
   """Raises ValueError naming what a scene lacks for an exercise; arguments as `Physics.use`."""
+  jaw, touch = (("jaw",), ("jaw", "touch_left", "touch_right")) if prefix == JAWS else ((), ())
   for kind, names in (
     ("body", [f"{prefix}trocar"]),
     ("site", [f"{prefix}tip", *(f"target{i}" for i in range(targets))]),
-    ("actuator", [prefix + axis for axis in AXES]),
-    ("sensor", [f"{prefix}{name}" for name in ("tip_pos", "tip_force", "shaft_force")]),
+    ("actuator", [prefix + name for name in (*AXES, *jaw)]),
+    ("sensor", [prefix + name for name in ("tip_pos", "tip_force", "shaft_force", *touch)]),
     ("camera", [CAMERA]),
     ("flex", [organ]),
   ):
@@ -379,7 +382,7 @@ class Task(control.Task):
   @property
   def jaws(self) -> bool:
     """Whether the instrument has jaws."""
-    return self.scene.instrument == "grasper"
+    return self.prefix == JAWS
 
   @property
   def components(self) -> tuple[str, ...]:
@@ -503,7 +506,8 @@ class Task(control.Task):
       self.random.uniform(-limit, limit, 3), 8.7 * self.random.uniform(-limit, limit, 3)
     )
     self.outcome, self.best, self.events = None, 0.0, []
-    self.peak, self._area, self._shaft, self._over = 0.0, 0.0, False, False
+    self.peak, self._area, self._shaft = 0.0, 0.0, False
+    physics.peak_force = 0.0  # the last episode's would be in the first observation
     self._place_instrument(physics)
     self.begin(physics)
     self.start = physics.tip_pos()

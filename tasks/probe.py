@@ -141,7 +141,7 @@ class Press(Task):
 
   def _aim(self, physics: Physics) -> None:
     for i, point in enumerate(self.points):
-      physics.mark(i, point, shown=i >= self.done)
+      physics.mark(i, point, shown=i >= self.done, now=i == self.done)
     self.held = 0.0
     self.distance0 = self.distance(physics)
 

@@ -90,10 +90,9 @@ class Retract(Task):
     self.grasped, self._closing = False, False
     self.disc = self._hide(physics, center)
     self.distance0 = self.distance(physics)
-    physics.mark(0, self.disc[0])
+    physics.mark(0, self.disc[0], now=True)
     physics.mark(1, physics.point(self.site))
     physics.model.site_size[physics._targets[0]] = self.radius
-    physics.model.site_rgba[physics._targets[0], :3] = 0.95, 0.8, 0.15
 
   def _hide(self, physics: Physics, center: np.ndarray) -> np.ndarray:
     _, mat, _ = physics.camera()

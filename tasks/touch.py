@@ -75,7 +75,7 @@ class Touch(Task):
 
   def _aim(self, physics: Physics) -> None:
     for i, goal in enumerate(self.goals):
-      physics.mark(i, physics.point(goal), shown=i >= self.done)
+      physics.mark(i, physics.point(goal), shown=i >= self.done, now=i == self.done)
     if self.done < self.targets:
       self.distance0 = self.distance(physics)
 

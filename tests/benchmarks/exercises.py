@@ -1,25 +1,34 @@
-"""Measures the exercises: steps a second with the cost of the metrics, and expert against novices.
+"""Measures the exercises: experts' success, expert against novices, and steps a second.
 
-    python tests/benchmarks/exercises.py speed -o tests/benchmarks/results/exercises_cpu.csv
+    python tests/benchmarks/exercises.py experts -o tests/benchmarks/results/experts.csv
     python tests/benchmarks/exercises.py skill -o tests/benchmarks/results/skill.md
+    python tests/benchmarks/exercises.py speed -o tests/benchmarks/results/exercises_cpu.csv
 
-`speed` runs each exercise with its expert. `skill` measures every metric over the same seeds for
-the expert and for each novice; the effect size is Cohen's d, positive where the novice is worse.
+`experts` runs every exercise over the seeds 0 to 49 and counts successes; with `--references
+palpate/tasks/references` the expert references are made of the same episodes. `skill` measures
+every metric over the same seeds for the expert and for each novice; the effect size is Cohen's d,
+positive where the novice is worse. Both keep each episode's recording in `--runs` and do not run
+again what is there: stop and go on at will, and remove that folder when the code has changed.
+`speed` runs each exercise with its expert.
 """
 
 import argparse
 import csv
+import json
 import math
+import multiprocessing
 import pathlib
 import time
+from collections.abc import Iterator
 
 import mujoco
 import numpy as np
 import palpate
 from palpate import tasks
-from palpate.tasks import evaluate, experts
+from palpate.tasks import episode, experts, suite
 from palpate.tasks.recorder import Recorder
-from palpate.tasks.score import METRICS, Metrics
+from palpate.tasks.recording import Recording
+from palpate.tasks.score import METRICS, Metrics, make_reference
 
 SKILL_TASKS = ("touch/standard", "probe/easy", "grasp/easy", "trace/easy", "retract/easy")
 # What each novice does differently, and the metrics that must show it.
@@ -35,6 +44,85 @@ EXCUSED = {
   ("trace/easy", "overshoot"): "the tip is led along the curve",
 }
 LARGE = 0.8  # Cohen's d
+
+
+def performances(
+  name: str, style: str, episodes: int, folder: pathlib.Path, processes: int
+) -> Iterator[Recording]:
+  """Yields the recordings of the seeds 0, 1, ..., run unless they are in the folder."""
+  jobs = [(name, style, seed, folder) for seed in range(episodes)]
+  if processes == 1:
+    yield from map(_perform, jobs)
+    return
+  with multiprocessing.get_context("spawn").Pool(processes) as pool:
+    yield from pool.imap(_perform, jobs)
+
+
+_environments = {}  # the last one of this process
+
+
+def _perform(job: tuple[str, str, int, pathlib.Path]) -> Recording:
+  name, style, seed, folder = job
+  path = folder / name.replace("/", "_") / f"{style}_{seed}.npz"
+  if path.exists():
+    return Recording.load(path)
+  if name not in _environments:
+    _environments.clear()
+    _environments[name] = suite.load(*suite.split(name), task_kwargs={"random": 0})
+  env = _environments[name]
+  info = {"task_kwargs": {}, "performer": style}
+  try:
+    recording = episode.run(env, experts.make(env, style, seed), seed, info)
+  except episode.EpisodeError as error:
+    recording = error.recording
+  path.parent.mkdir(parents=True, exist_ok=True)
+  recording.save(path)
+  return recording
+
+
+def success(args: argparse.Namespace):
+  """Writes how many of its episodes each expert solves, and the references if asked to."""
+  rows = []
+  for pair in tasks.ALL_TASKS:
+    name = "/".join(pair)
+    count, good, failed, ends, peaks = args.episodes or 50, [], [], [], []
+    runs = performances(name, "expert", count, args.runs, args.processes)
+    for seed, recording in enumerate(runs):
+      metrics = recording.metrics()
+      ends.append(float(recording.time[-1]))
+      peaks.append(metrics.peak_force)
+      if recording.info["outcome"] == "success":
+        good.append(metrics)
+      else:
+        failed.append(f"{seed} {recording.info['outcome']}")
+    row = {
+      "task": name,
+      "episodes": count,
+      "success": len(good),
+      "percent": round(100 * len(good) / count, 1),
+      "time_s_mean": round(float(np.mean(ends)), 2),
+      "time_s_max": round(max(ends), 2),
+      "peak_force_N_mean": round(float(np.nanmean(peaks)), 3),
+      "failed_seeds": "; ".join(failed),
+      "palpate": palpate.__version__,
+      "mujoco": mujoco.__version__,
+    }
+    print(row, flush=True)
+    rows.append(row)
+    if args.references:
+      data = make_reference(good, name, 0)
+      data |= {"palpate": palpate.__version__, "mujoco": mujoco.__version__, "episodes": count}
+      path = args.references / f"{name.replace('/', '_')}.json"
+      path.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+  write_csv(args.out, rows)
+
+
+def write_csv(path: pathlib.Path, rows: list[dict]):
+  """Writes a table."""
+  with path.open("w", newline="") as file:
+    writer = csv.DictWriter(file, rows[0], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
 
 
 def speed(path: pathlib.Path, seconds: float):
@@ -73,14 +161,12 @@ def speed(path: pathlib.Path, seconds: float):
     }
     print(row, flush=True)
     rows.append(row)
-  with path.open("w", newline="") as file:
-    writer = csv.DictWriter(file, rows[0], lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
+  write_csv(path, rows)
 
 
-def skill(path: pathlib.Path, episodes: int, processes: int):
+def skill(args: argparse.Namespace):
   """Writes the table of expert against novices."""
+  episodes = args.episodes or 10
   lines = [
     "# Metrics: expert against novices",
     "",
@@ -96,19 +182,13 @@ def skill(path: pathlib.Path, episodes: int, processes: int):
     labels = ", ".join(METRICS[name].label for name in names)
     lines += ["", f"- `{style}` {text}: {labels}"]
   for name in SKILL_TASKS:
-    results = {
-      style: list(evaluate.evaluate(name, style, range(episodes), processes))
-      for style in experts.STYLES
-    }
-    wins = {
-      style: f"{sum(r.outcome == 'success' for r in rows)}/{episodes}"
-      for style, rows in results.items()
-    }
+    values, wins = {}, {}
+    for style in experts.STYLES:
+      runs = list(performances(name, style, episodes, args.runs, args.processes))
+      values[style] = [run.metrics() for run in runs]
+      wins[style] = f"{sum(run.info['outcome'] == 'success' for run in runs)}/{episodes}"
     lines += ["", f"## {name}", "", "Success: " + ", ".join(f"{k} {v}" for k, v in wins.items())]
     lines += ["", f"| metric | expert | {' | '.join(STATED)} |", "|---|---|" + "---|" * len(STATED)]
-    values = {
-      style: [Metrics.from_json(r.metrics) for r in rows] for style, rows in results.items()
-    }
     for metric, spec in METRICS.items():
       base = _known(values["expert"], metric)
       if not base:
@@ -125,7 +205,7 @@ def skill(path: pathlib.Path, episodes: int, processes: int):
         cells.append(text)
       lines.append(f"| {spec.label} | {shown} | {' | '.join(cells)} |")
     print(name, wins, flush=True)
-  path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+  args.out.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def _known(results: list[Metrics], metric: str) -> list[float]:
@@ -146,16 +226,19 @@ def _cohen(expert: list[float], novice: list[float], better: str) -> float | Non
 
 def main():
   parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-  parser.add_argument("what", choices=["speed", "skill"])
-  parser.add_argument("-o", "--out", type=pathlib.Path, required=True)
-  parser.add_argument("--seconds", type=float, default=4.0, help="of stepping a task")
-  parser.add_argument("--episodes", type=int, default=8)
-  parser.add_argument("--processes", type=int, default=1)
+  add = parser.add_argument
+  add("what", choices=["experts", "skill", "speed"])
+  add("-o", "--out", type=pathlib.Path, required=True)
+  add("--episodes", type=int, help="of each performer (experts 50, skill 10)")
+  add("--processes", type=int, default=1)
+  add("--runs", type=pathlib.Path, default="out/episodes", help="recordings, kept (%(default)s)")
+  add("--references", type=pathlib.Path, help="experts: folder to write references to")
+  add("--seconds", type=float, default=4.0, help="speed: of stepping a task (%(default)s)")
   args = parser.parse_args()
   if args.what == "speed":
     speed(args.out, args.seconds)
   else:
-    skill(args.out, args.episodes, args.processes)
+    {"experts": success, "skill": skill}[args.what](args)
 
 
 if __name__ == "__main__":
