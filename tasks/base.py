@@ -27,12 +27,14 @@ Observations, all float64 in SI units and world axes; every domain adds its own:
 | `gripper` | 4 | grasper only: opening [rad], its target [rad], force on the left, right jaw [N] |
 | `nodes_near` | (8, 3) | the organ's nodes nearest to the tip, from the tip [m], nearest first |
 | `surface` | (32, 3) | displacement from rest of 32 nodes spread over the organ [m] |
-| `progress` | 1 | best progress so far, see below [-] |
+| `progress` | 1 | progress, see below [-] |
 | `pixels` | (height, width, 3) | the laparoscope's picture, uint8; with `pixels=` only |
 
-Reward: a task measures its progress phi in [0, 1]. `dense` (the default) pays the gain of the
-best progress so far, max(phi - best, 0), nothing for a gain made above the force limit; over an
-episode it adds up to 1 at most. `sparse` pays 1 on the step of success and 0 elsewhere.
+Reward: a task measures its progress phi in [-1, 1], 0 at the start and 1 on success. `dense` (the
+default) pays its change, phi now - phi a step ago, so that what is lost costs what it had paid, but
+nothing for a gain made above the force limit; over an episode it adds up to 1 at most. This is the
+shaping of Ng, Harada and Russell 1999. `sparse` pays 1 on the step of success and 0 elsewhere.
+The domains' formulas of phi use closeness = max(1 - distance / distance at the start, -1).
 
 An episode ends with `task.outcome`: `success`, `damage` (a force above the damage limit, the
 discount is 0 as for success), `missed` (a wrong report), or None when the time limit ended it.
@@ -320,6 +322,7 @@ class Task(control.Task):
     name: domain and task, for instance "touch/easy"
     random: everything random comes from here
     outcome: how the episode ended, see the module's head; None while it runs
+    progress: see the module's head [-]
     best: best progress so far [-]
     events: since the last `take_events`
   """
@@ -374,7 +377,7 @@ class Task(control.Task):
     self._models: dict[int | None, tuple[mj.MjModel, np.ndarray]] = {}
     self.visualize_reward = False
     self.outcome: str | None = None
-    self.best = 0.0
+    self.progress, self.best = 0.0, 0.0
     self.events: list[Event] = []
 
   # Scene.
@@ -505,7 +508,8 @@ class Task(control.Task):
     physics.move_port(
       self.random.uniform(-limit, limit, 3), 8.7 * self.random.uniform(-limit, limit, 3)
     )
-    self.outcome, self.best, self.events = None, 0.0, []
+    self.outcome, self.events = None, []
+    self.progress, self.gain, self.best = 0.0, 0.0, 0.0
     self.peak, self._area, self._shaft = 0.0, 0.0, False
     physics.peak_force = 0.0  # the last episode's would be in the first observation
     self._place_instrument(physics)
@@ -562,9 +566,9 @@ class Task(control.Task):
   def after_step(self, physics: Physics) -> None:
     """Measures the progress and looks for errors and damage."""
     self.peak = max(self.peak, physics.peak_force)
-    phi = self.advance(physics)
-    self.gain = max(phi - self.best, 0.0)
-    self.best = max(self.best, phi)
+    before, self.progress = self.progress, self.advance(physics)
+    self.gain = self.progress - before
+    self.best = max(self.best, self.progress)
     shaft = physics.shaft_force() > 0.05
     if shaft and not self._shaft:
       self.event(physics, "unintended_contact", label="shaft")
@@ -573,7 +577,6 @@ class Task(control.Task):
       self.outcome = "damage"
       self.event(physics, "note", label=f"damage: {physics.peak_force:.2f} N")
     elif self.outcome == "success":
-      self.best = 1.0
       self.event(physics, "note", label="success")
 
   def get_observation(self, physics: Physics) -> collections.OrderedDict:
@@ -590,7 +593,7 @@ class Task(control.Task):
       out["gripper"] = physics.gripper()
     out["nodes_near"] = physics.nodes_near()
     out["surface"] = physics.surface()
-    out["progress"] = np.array([self.best])
+    out["progress"] = np.array([self.progress])
     out.update(self.observe(physics))
     if self.pixels is not None:
       height, width = self.pixels
@@ -601,9 +604,8 @@ class Task(control.Task):
     """Returns the reward of the last step, see the module's head."""
     if self.reward == "sparse":
       return float(self.outcome == "success")
-    if self.outcome == "damage" or physics.peak_force > self.force_limit:
-      return 0.0
-    return float(min(self.gain, 1.0))
+    over = physics.peak_force > min(self.force_limit, self.damage)
+    return float(min(self.gain, 0.0) if over else self.gain)
 
   def get_termination(self, physics: Physics) -> float | None:
     """Returns the final discount 0 once there is an outcome."""
@@ -646,8 +648,8 @@ class Task(control.Task):
 
 
 def closeness(distance: float, start: float) -> float:
-  """Returns 1 at the goal, falling to 0 at the distance it started from [-]."""
-  return max(0.0, 1.0 - distance / max(start, 1e-3))
+  """Returns 1 at the goal, 0 at the distance it started from, -1 at twice that and beyond [-]."""
+  return max(-1.0, 1.0 - distance / max(start, 1e-3))
 
 
 def make(task: Task, time_limit: float, environment_kwargs: Mapping | None) -> control.Environment:

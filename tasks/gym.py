@@ -114,7 +114,7 @@ class Exercise(gymnasium.Env):
     return {
       "success": outcome == "success",
       "outcome": outcome,
-      "progress": float(self._task.best),
+      "progress": float(self._task.progress),
       "peak_force": float(self._physics.peak_force),
     }
 

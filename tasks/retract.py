@@ -4,7 +4,7 @@ Own observations: `target` (3,), from the tip to the site to grasp [m]; `hidden`
 tip to the hidden disc [m]; `visible` (1,), share of the disc that the laparoscope sees [-];
 `held` (1,), share of the holding time done [-]; `grasped` (1,), whether the jaws hold the organ.
 
-Progress: 0.15 * max(0, 1 - distance / distance at the start) until it is grasped; then 0.3 + 0.5
+Progress: 0.15 * closeness until it is grasped; then 0.3 + 0.5
 * visible / wanted + 0.2 * held. Only the organ hides: instruments are not looked at. Success:
 the wanted share is seen for the holding time, the organ being held. Failure: a force above the
 damage limit, jaws included, or the time limit.

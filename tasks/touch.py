@@ -3,9 +3,10 @@
 Own observations: `target` (3,), from the tip to the point to touch [m]; `normal` (3,), of the
 surface there [-].
 
-Progress: (points touched + 0.9 * max(0, 1 - distance / distance at the start)) / points. A point is
-touched when the probe presses it with more than 0.03 N within the tolerance; pressing elsewhere is
-a miss. Success: all points. Failure: a force above the damage limit, or the time limit.
+Progress: (points touched + 0.9 * closeness) / points, closeness counting from the point before. A
+point is touched when the probe presses it with more than 0.03 N within the tolerance; pressing
+elsewhere is a miss. Success: all points. Failure: a force above the damage limit, or the time
+limit.
 """
 
 import dataclasses

@@ -3,10 +3,10 @@
 Own observations: `target` (3,), from the tip to the next point of the curve [m]; `ahead` (3, 3),
 from the tip to points 5, 10 and 15 mm further along the curve [m].
 
-Progress: 0.1 * max(0, 1 - distance to the curve's start / distance at the start) until the first
-point is touched, then 0.1 + 0.9 * share of the curve done. The curve is done up to a point when the
-tip presses with 0.02 N or more within the tolerance of it, in order. Success: all of it. Failure: a
-force above the damage limit, or the time limit.
+Progress: 0.1 * closeness to the curve's start until the first point is touched, then 0.1 + 0.9 *
+share of the curve done. The curve is done up to a point when the tip presses with 0.02 N or more
+within the tolerance of it, in order. Success: all of it. Failure: a force above the damage limit,
+or the time limit.
 """
 
 import dataclasses

@@ -104,7 +104,7 @@ def test_rewards_are_finite_and_bounded_and_the_episode_can_start_anew(env):
     for timestep in steps[1:]:
       if timestep.first():  # an episode ended before
         break
-      assert np.isfinite(timestep.reward) and 0 <= timestep.reward <= 1
+      assert np.isfinite(timestep.reward) and -1 <= timestep.reward <= 1
       total += timestep.reward
     assert total <= 1 + 1e-9
   # From whatever state the physics is in:
@@ -129,6 +129,29 @@ def test_going_on_from_a_state_gives_the_same_to_the_bit():
       env.physics.step(20)
     ends.append(env.physics.integration_state())
   np.testing.assert_array_equal(*ends)
+
+
+def test_dense_reward_is_the_change_of_progress_and_takes_back_what_is_lost():
+  env = load("touch/easy")
+  first = env.reset()
+  assert first.observation["progress"] == 0 and first.observation["peak_force"] == 0
+  total, least = 0.0, 0.0
+  for k in range(40):  # towards the organ, then away from it
+    timestep = env.step(np.array([0, 0, 0, 0.5 if k < 10 else -1.0]))
+    total += timestep.reward
+    least = min(least, timestep.reward)
+    np.testing.assert_allclose(total, timestep.observation["progress"][0], atol=1e-12)
+  assert least < -0.01 and total < 0
+  assert env.reset().observation["progress"] == 0
+
+
+def test_above_the_force_limit_progress_pays_nothing_but_may_cost():
+  env = load("touch/easy", force_limit=1e-9)
+  env.reset()
+  task, physics = env.task, env.physics
+  for gain, force, reward in ((0.2, 1.0, 0.0), (-0.2, 1.0, -0.2), (0.2, 0.0, 0.2)):
+    task.gain, physics.peak_force = gain, force
+    assert task.get_reward(physics) == reward
 
 
 def test_sparse_reward_pays_success_alone():
