@@ -73,7 +73,7 @@ def run(
     "mujoco": mujoco.__version__,
     **json.loads(json.dumps(dict(info or {}))),
   }
-  recorder.attach("vertices", physics.organ.xpos)
+  recorder.attach("vertices", physics.nodes())
   recorder.attach("triangles", physics.organ.elem)
   recorder.attach("state_first", physics.integration_state())
   for name, value in task.constants(physics).items():

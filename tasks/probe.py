@@ -186,7 +186,7 @@ class Press(Task):
     """Returns target, normal, level and held."""
     return {
       "target": self.points[self.now] - physics.tip_pos(),
-      "normal": physics.normals()[self.goals[self.now]],
+      "normal": physics.normal(self.goals[self.now]),
       "level": np.array([self.level(physics) - sum(self.band) / 2]),
       "held": np.array([self.held / self.hold]),
     }

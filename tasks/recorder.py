@@ -159,9 +159,14 @@ class Recorder:
   def _entry(self, name: str, value: ArrayLike) -> np.ndarray:
     count = len(self.instruments)
     array = np.asarray(value, np.float64)
+    buffer = self._columns.get(name)
+    if buffer is not None and (
+      array.shape == buffer.shape or (count == 1 and array.shape == buffer.shape[1:])
+    ):
+      return array  # fits as it is
     shapes = [COLUMNS[name]] + ([()] if name == "force" else [])
-    if name in self._columns:
-      shapes = [self._columns[name].shape[1:]]
+    if buffer is not None:
+      shapes = [buffer.shape[1:]]
     for shape in shapes:
       if array.shape == (count, *shape) or (count == 1 and array.shape == shape):
         return array.reshape(count, *shape)

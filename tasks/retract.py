@@ -97,7 +97,7 @@ class Retract(Task):
   def _hide(self, physics: Physics, center: np.ndarray) -> np.ndarray:
     _, mat, _ = physics.camera()
     right, up, back = mat.T
-    behind = physics.organ.xpos.mean(axis=0)
+    behind = physics.nodes().mean(axis=0)
     # In the plane behind the organ, on the line through the site that is grasped.
     height = float((center - behind) @ up) + self.random.uniform(-0.012, 0.0)
     aside = np.arange(-0.06, 0.06, 0.001)

@@ -109,7 +109,7 @@ class Touch(Task):
     goal = self.goal()
     return {
       "target": physics.point(goal) - physics.tip_pos(),
-      "normal": physics.normals()[goal],
+      "normal": physics.normal(goal),
     }
 
   def reference_length(self) -> float:
@@ -121,7 +121,7 @@ def draw_apart(
   random: np.random.RandomState, physics: Physics, place: np.ndarray, count: int, gap: float
 ) -> list[int]:
   """Returns triangles at least `gap` [m] apart, or as far as the place allows."""
-  middle = physics.organ.xpos[physics.organ.elem].mean(axis=1)
+  middle = physics.nodes()[physics.organ.elem].mean(axis=1)
   chosen = [int(random.choice(place))]
   while len(chosen) < count:
     distance = np.linalg.norm(middle[place][:, None] - middle[chosen], axis=2).min(axis=1)

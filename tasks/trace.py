@@ -121,7 +121,7 @@ class Trace(Task):
     start = center + flat @ across.T
     # Drop along the shaft: the triangle hit from outside that is nearest to the trocar.
     points, triangles, weights = [], [], []
-    organ, x = physics.organ, physics.organ.xpos
+    organ, x = physics.organ, physics.nodes()
     a, b, c = np.moveaxis(x[organ.elem], 1, 0)
     e1, e2, ray = b - a, c - a, -port.mat[:, 2]
     p = np.cross(ray, e2)
@@ -147,7 +147,7 @@ class Trace(Task):
 
   def now(self, physics: Physics) -> np.ndarray:
     """Returns where the curve is on the deformed organ [m]  (npoint, 3)."""
-    corner = physics.organ.xpos[physics.organ.elem[self.triangles]]
+    corner = physics.nodes()[physics.organ.elem[self.triangles]]
     return np.einsum("ij,ijk->ik", self.weights, corner)
 
   def distance(self, physics: Physics) -> float:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from dm_control.rl import control
 from palpate import models, tasks
-from palpate.tasks import registry, suite
+from palpate.tasks import metrics, registry, suite
 
 IDS = ["/".join(pair) for pair in tasks.ALL_TASKS]
 _cache = {}
@@ -152,6 +152,47 @@ def test_above_the_force_limit_progress_pays_nothing_but_may_cost():
   for gain, force, reward in ((0.2, 1.0, 0.0), (-0.2, 1.0, -0.2), (0.2, 0.0, 0.2)):
     task.gain, physics.peak_force = gain, force
     assert task.get_reward(physics) == reward
+
+
+def test_quick_forms_agree_with_the_plain_ones():
+  env = load("grasp/easy")
+  physics = env.physics
+  env.reset()
+  camera = physics.model.ptr.camera("laparoscope").id
+  seen = set()
+  for turn in np.linspace(-0.8, 0.8, 9):  # of the camera about its own vertical
+    pos, mat, fovy = physics.camera()
+    rotation = np.array(
+      [[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]]
+    )
+    kept = physics.data.ptr.cam_xmat[camera].copy()
+    physics.data.ptr.cam_xmat[camera] = (mat @ rotation).ravel()
+    wanted = metrics.in_view(physics.tip_pos(), pos, mat @ rotation, fovy)
+    assert physics.tip_visible() == bool(wanted)
+    seen.add(bool(wanted))
+    physics.data.ptr.cam_xmat[camera] = kept
+  assert seen == {True, False}
+  normals = physics.normals()
+  np.testing.assert_allclose(physics.normal(7), normals[7], rtol=1e-14)
+  nodes, elem = physics.organ.xpos, physics.organ.elem
+  np.testing.assert_array_equal(physics.nodes(), nodes)
+  a, b, c = nodes[elem[7]]
+  np.testing.assert_allclose(
+    np.cross(b - a, c - a) / np.linalg.norm(np.cross(b - a, c - a)), normals[7], rtol=1e-12
+  )
+  spec = env.action_spec()
+  down = np.array([0, 0, 0, 0.6, 1.0])
+  for _ in range(60):
+    env.step(np.clip(down, spec.minimum, spec.maximum))
+    elements = physics.data.ptr.contact.elem
+    touched = np.unique(elements[elements >= 0])
+    if len(touched):
+      break
+  np.testing.assert_array_equal(physics.nodes(), physics.organ.xpos)  # not those before the step
+  a, b, c = np.moveaxis(physics.organ.xpos[elem[touched]], 1, 0)
+  area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
+  assert area > 0
+  np.testing.assert_allclose(physics.contact_area(), area, rtol=1e-9)
 
 
 def test_sparse_reward_pays_success_alone():
