@@ -94,6 +94,14 @@ def test_evaluate_prints_success_and_spread(capsys, tmp_path):
   assert "success  2/2" in text and "Path length [mm]" in text
   data = json.loads(out.read_text())
   assert data["task"] == "touch/easy" and data["n"] == 2 and data["seed"] == 0
+  kept = tmp_path / "kept"
+  words = ["evaluate", "touch/easy", "--policy", "math:nan", "--episodes", "1"]
+  assert cli.main([*words, "--recordings", str(kept)]) == 2
+  assert "math:nan' is a float, expected something to call" in capsys.readouterr().err
+  words = ["evaluate", "touch/easy", "--policy", "math:sqrt", "--episodes", "1"]
+  assert cli.main([*words, "--recordings", str(kept)]) == 1
+  assert "1 episodes failed, the first: TypeError" in capsys.readouterr().err
+  assert Recording.load(kept / "0.npz").info["outcome"] == "error"
   assert cli.main(["evaluate", "touch/eazy"]) == 2
   assert "expected one of touch/easy" in capsys.readouterr().err
   assert cli.main(["evaluate", "touch/easy", "--policy", "nobody"]) == 2
@@ -118,6 +126,12 @@ def test_exercise_writes_recording_metrics_and_report(tmp_path, capsys):
   assert cli.main(["exercise", "--replay", str(tmp_path / "foreign.npz")]) == 2
   assert "not a readable palpate-recording" in capsys.readouterr().err
   assert cli.main(["exercise", "touch/easy", "--performer", "nobody"]) == 2
+  assert "keyboard or module:object" in capsys.readouterr().err
+  assert cli.main(["exercise", "touch/easy", "--performer", "math:none"]) == 2
+  assert "math has no 'none'" in capsys.readouterr().err
+  assert cli.main(["exercise", "touch/easy", "--performer", "math:sqrt", "-o", folder]) == 1
+  said = capsys.readouterr()
+  assert "error after 0.00 s" in said.out and "step 0: TypeError" in said.err
   assert cli.main(["exercise", "nothing"]) == 2
 
 
