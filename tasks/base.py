@@ -247,10 +247,13 @@ class Physics(mujoco.Physics):
     if not self.data.ptr.ncon:
       return 0.0
     elem = {k for k in self.data.ptr.contact.elem.ravel().tolist() if k >= 0}
-    corner = self.nodes()[self.organ.elem[sorted(elem)]]
-    edge = corner[:, 1:] - corner[:, :1]
-    g = edge @ edge.transpose(0, 2, 1)
-    return 0.5 * float(np.sqrt(np.maximum(g[:, 0, 0] * g[:, 1, 1] - g[:, 0, 1] ** 2, 0)).sum())
+    area = 0.0
+    # One triangle or two under a probe, thirty in the jaws: plain numbers are quicker than arrays.
+    for (ax, ay, az), b, c in self.nodes()[self.organ.elem[sorted(elem)]].tolist():
+      ux, uy, uz = b[0] - ax, b[1] - ay, b[2] - az
+      vx, vy, vz = c[0] - ax, c[1] - ay, c[2] - az
+      area += math.hypot(uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx) / 2
+    return area
 
   def tip_visible(self) -> bool:
     """Whether the laparoscope's picture holds the tip."""

@@ -5,7 +5,7 @@
     python tests/benchmarks/exercises.py speed -o tests/benchmarks/results/exercises_cpu.csv
 
 `experts` runs every exercise over the seeds 0 to 49 and counts successes; with `--references
-palpate/tasks/references` the expert references are made of the same episodes. `skill` measures
+tasks/references` the expert references are made of the same episodes. `skill` measures
 every metric over the same seeds for the expert and for each novice; the effect size is Cohen's d,
 positive where the novice is worse. Both keep each episode's recording in `--runs` and do not run
 again what is there: stop and go on at will, and remove that folder when the code has changed.
