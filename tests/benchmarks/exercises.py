@@ -5,11 +5,11 @@
     python tests/benchmarks/exercises.py speed -o tests/benchmarks/results/exercises_cpu.csv
 
 `experts` runs every exercise over the seeds 0 to 49 and counts successes; with `--references
-tasks/references` the expert references are made of the same episodes. `skill` measures
-every metric over the same seeds for the expert and for each novice; the effect size is Cohen's d,
-positive where the novice is worse. Both keep each episode's recording in `--runs` and do not run
-again what is there: stop and go on at will, and remove that folder when the code has changed.
-`speed` runs each exercise with its expert.
+tasks/references` the expert references are made of the same episodes. `skill` measures every metric
+over the same seeds for the expert and for each novice; the effect size is Cohen's d, positive where
+the novice is worse. Both keep each episode's recording in `--runs` and do not run again what is
+there: stop and go on at will, and remove that folder when the code has changed. `speed` runs each
+exercise with its expert and counts CPU time.
 """
 
 import argparse
@@ -33,11 +33,14 @@ from palpate.tasks.score import METRICS, Metrics, make_reference
 SKILL_TASKS = ("touch/standard", "probe/easy", "grasp/easy", "trace/easy", "retract/easy")
 # What each novice does differently, and the metrics that must show it.
 STATED = {
-  "tremor": ("trembles", ("log_dimensionless_jerk",)),
+  "tremor": ("trembles", ("sparc", "log_dimensionless_jerk")),
   "overshoot": ("goes too far and comes back", ("path_length", "path_inefficiency")),
-  "delay": ("waits and is slow", ("time", "idle_time")),
-  "force": ("starts with twice the force", ("peak_force",)),
-  "detour": ("goes round about", ("path_length", "path_inefficiency")),
+  "delay": ("waits and is slow", ("time", "idle_time", "idle_share")),
+  "force": (
+    "starts with twice the force",
+    ("peak_force", "mean_force", "rms_force", "force_time_product", "peak_pressure"),
+  ),
+  "detour": ("goes round about", ("path_length", "path_inefficiency", "angular_path")),
 }
 # Where the novice's way does not come into play: why.
 EXCUSED = {
@@ -83,8 +86,7 @@ def _perform(job: tuple[str, str, int, pathlib.Path]) -> Recording:
 def success(args: argparse.Namespace):
   """Writes how many of its episodes each expert solves, and the references if asked to."""
   rows = []
-  for pair in tasks.ALL_TASKS:
-    name = "/".join(pair)
+  for name in args.tasks:
     count, good, failed, ends, peaks = args.episodes or 50, [], [], [], []
     runs = performances(name, "expert", count, args.runs, args.processes)
     for seed, recording in enumerate(runs):
@@ -166,7 +168,7 @@ def speed(path: pathlib.Path, seconds: float):
 def skill(args: argparse.Namespace):
   """Writes the table of expert against novices."""
   episodes = args.episodes or 10
-  lines = [
+  head = [
     "# Metrics: expert against novices",
     "",
     f"{episodes} episodes of each (seeds 0 to {episodes - 1}), palpate {palpate.__version__}, "
@@ -179,7 +181,8 @@ def skill(args: argparse.Namespace):
   ]
   for style, (text, names) in STATED.items():
     labels = ", ".join(METRICS[name].label for name in names)
-    lines += ["", f"- `{style}` {text}: {labels}"]
+    head += ["", f"- `{style}` {text}: {labels}"]
+  lines, told = [], {}
   for name in SKILL_TASKS:
     values, wins = {}, {}
     for style in experts.STYLES:
@@ -197,14 +200,39 @@ def skill(args: argparse.Namespace):
       for style in STATED:
         d = _cohen(base, _known(values[style], metric), spec.better)
         text = "" if d is None else f"{d:.1f}"
+        why = EXCUSED.get((name, style))
         if metric in STATED[style][1]:
           good = d is not None and d >= LARGE
-          why = EXCUSED.get((name, style))
           text = f"**{text}**" if good else f"{text} ({why})" if why else f"**no** {text}"
+        if not why:
+          told.setdefault((metric, style), {})[name] = -math.inf if d is None else d
         cells.append(text)
       lines.append(f"| {spec.label} | {shown} | {' | '.join(cells)} |")
     print(name, wins, flush=True)
+  lines = [*head, "", "## Metric by metric", "", *_verdicts(told), *lines]
   args.out.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _verdicts(told: dict[tuple[str, str], dict[str, float]]) -> list[str]:
+  """Returns a table of what each metric tells apart: d by task for every (metric, novice)."""
+  lines = ["| metric | must show | does in | does not in | also shows |", "|---|---|---|---|---|"]
+  for metric, spec in METRICS.items():
+    stated = [style for style in STATED if metric in STATED[style][1]]
+    found = {style: told.get((metric, style), {}) for style in STATED}
+    good, bad = [], []
+    for style in stated:
+      for task, d in found[style].items():
+        (good if d >= LARGE else bad).append(f"{task} ({style})" if len(stated) > 1 else task)
+    also = [
+      f"{style} in {count} of {len(found[style])}"
+      for style in STATED
+      if style not in stated and (count := sum(d >= LARGE for d in found[style].values()))
+    ]
+    if not any(found.values()):
+      bad = ["not known in these tasks"]
+    cells = [", ".join(stated) or "none of them", ", ".join(good), ", ".join(bad), ", ".join(also)]
+    lines.append(f"| {spec.label} | {' | '.join(cells)} |")
+  return lines
 
 
 def _known(results: list[Metrics], metric: str) -> list[float]:
@@ -228,6 +256,8 @@ def main():
   add = parser.add_argument
   add("what", choices=["experts", "skill", "speed"])
   add("-o", "--out", type=pathlib.Path, required=True)
+  names = ["/".join(pair) for pair in tasks.ALL_TASKS]
+  add("--tasks", nargs="+", metavar="TASK", choices=names, default=names, help="experts: some only")
   add("--episodes", type=int, help="of each performer (experts 50, skill 10)")
   add("--processes", type=int, default=1)
   add("--runs", type=pathlib.Path, default="out/episodes", help="recordings, kept (%(default)s)")
