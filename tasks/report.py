@@ -161,7 +161,8 @@ def path_figure(recording: Recording) -> "Figure | None":
     getattr(ax, f"set_{axis}label")(f"{axis} [mm]", labelpad=6)
     getattr(ax, f"{axis}axis").set_pane_color((0.97, 0.97, 0.98, 1.0))
   ax.locator_params(nbins=5)
-  ax.set_box_aspect(half, zoom=1.0)
+  # A tall box would leave the figure.
+  ax.set_box_aspect(half, zoom=min(1.0, 0.72 * float(np.linalg.norm(half) / half[2])))
   ax.view_init(elev=28, azim=-55)
   figure.legend(loc="outside right upper", fontsize=9, frameon=False)
   return figure
