@@ -90,9 +90,8 @@ class Retract(Task):
     self.grasped, self._closing = False, False
     self.disc = self._hide(physics, center)
     self.distance0 = self.distance(physics)
-    physics.mark(0, self.disc[0], now=True)
+    physics.mark(0, self.disc[0], now=True, size=self.radius)
     physics.mark(1, physics.point(self.site))
-    physics.model.site_size[physics._targets[0]] = self.radius
 
   def _hide(self, physics: Physics, center: np.ndarray) -> np.ndarray:
     _, mat, _ = physics.camera()

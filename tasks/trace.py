@@ -102,8 +102,7 @@ class Trace(Task):
     self.done, self._touching = 0, False
     self.distance0 = self.distance(physics)
     for i, k in enumerate(np.linspace(0, len(self.curve) - 1, _MARKS).round().astype(int)):
-      physics.mark(i, self.curve[k])
-      physics.model.site_size[physics._targets[i]] = 0.0015
+      physics.mark(i, self.curve[k], size=0.0015)
 
   def _draw(self, physics: Physics, center: np.ndarray, size: float):
     """Returns points, triangles and weights in them; None where the curve leaves the place."""

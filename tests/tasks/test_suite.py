@@ -233,6 +233,10 @@ def test_a_scene_of_ones_own_must_have_what_the_task_needs():
     load("touch/easy", model=catalogue)
   with pytest.raises(ValueError, match="palpate_easy: model is given, expected none"):
     load("probe/palpate_easy", model=spec)
+  gripper = scenes.build(scenes.Scene("gallbladder", "grasper", nodes=250, center="fundus"))
+  gripper.delete(next(a for a in gripper.actuators if a.name == "grasper/jaw"))
+  with pytest.raises(ValueError, match="no actuator 'grasper/jaw'"):
+    load("grasp/easy", model=gripper)
   bare = mujoco.MjSpec()
   with pytest.raises(ValueError, match="no body 'probe/trocar'"):
     load("touch/easy", model=bare)
