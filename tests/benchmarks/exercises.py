@@ -238,6 +238,8 @@ def _verdicts(told: dict[tuple[str, str], dict[str, float]]) -> list[str]:
     ]
     if not any(found.values()):
       bad = ["not known in these tasks"]
+    elif good and not bad:
+      good = ["all"]
     cells = [", ".join(words) for words in (stated or ["no novice is made to"], good, bad, also)]
     lines.append(f"| {spec.label} | {' | '.join(cells)} |")
   return lines
