@@ -147,5 +147,6 @@ def test_references_are_those_of_the_tasks():
   for pair in tasks.ALL_TASKS:
     name = "/".join(pair)
     reference = episode.reference(name)
-    if reference is not None:
-      assert reference["task"] == name and reference["n"] >= 5
+    assert reference is not None, name
+    assert reference["task"] == name and reference["n"] >= 5
+    assert {"seed", "palpate", "mujoco"} < set(reference)
