@@ -27,12 +27,14 @@ Observations, all float64 in SI units and world axes; every domain adds its own:
 | `gripper` | 4 | grasper only: opening [rad], its target [rad], force on the left, right jaw [N] |
 | `nodes_near` | (8, 3) | the organ's nodes nearest to the tip, from the tip [m], nearest first |
 | `surface` | (32, 3) | displacement from rest of 32 nodes spread over the organ [m] |
-| `progress` | 1 | best progress so far, see below [-] |
+| `progress` | 1 | progress, see below [-] |
 | `pixels` | (height, width, 3) | the laparoscope's picture, uint8; with `pixels=` only |
 
-Reward: a task measures its progress phi in [0, 1]. `dense` (the default) pays the gain of the
-best progress so far, max(phi - best, 0), nothing for a gain made above the force limit; over an
-episode it adds up to 1 at most. `sparse` pays 1 on the step of success and 0 elsewhere.
+Reward: a task measures its progress phi in [-1, 1], 0 at the start and 1 on success. `dense` (the
+default) pays its change, phi now - phi a step ago, so that what is lost costs what it had paid, but
+nothing for a gain made above the force limit; over an episode it adds up to 1 at most. This is the
+shaping of Ng, Harada and Russell 1999. `sparse` pays 1 on the step of success and 0 elsewhere.
+The domains' formulas of phi use closeness = max(1 - distance / distance at the start, -1).
 
 An episode ends with `task.outcome`: `success`, `damage` (a force above the damage limit, the
 discount is 0 as for success), `missed` (a wrong report), or None when the time limit ended it.
@@ -47,267 +49,25 @@ from typing import Any
 
 import mujoco as mj
 import numpy as np
-from dm_control import mujoco
 from dm_control.mujoco import wrapper
 from dm_control.rl import control
 from dm_env import specs
-from palpate import Organ
 from palpate.models import trocar
 from scipy.spatial import cKDTree
 
-from . import metrics, scenes
+from . import scenes
+from .physics import AXES, JAWS, STATE, Physics, check_scene
 from .recording import Event, Settings
 from .scenes import CAMERA, ORGAN, Scene
 
 CONTROL_TIMESTEP = 0.02  # [s]
 RATES = (1.0, 1.0, 3.0, 0.12)  # pitch, yaw, roll [rad/s], insertion [m/s]
-AXES = ("pitch", "yaw", "roll", "insertion")
 REWARDS = ("dense", "sparse")
-NEAR, COARSE = 8, 32  # nodes in the observations
-HELD_FORCE = 0.05  # force on both jaws above which they hold tissue [N]
 
-_STATE = mj.mjtState.mjSTATE_INTEGRATION
 _SETTLE = 0.3  # [s]
 _FACING = 0.75  # least cosine between a target's normal and the way to the trocar
 _PIN_GAP = 0.012  # targets keep this far from pinned nodes [m]
-_CLOSING = 0.005  # [rad]
 _SLACK = 1e-6  # what rounding may add to an action
-
-
-class Physics(mujoco.Physics):
-  """Physics of an exercise: one organ, one instrument on a trocar."""
-
-  organ: Organ
-  prefix = ""
-
-  def use(self, model: mj.MjModel, prefix: str, targets: int, organ: str = ORGAN) -> None:
-    """Takes a compiled scene; ValueError names what it lacks.
-
-    Args:
-      model: with the organ, the instrument and the sites `target0`, ...
-      prefix: of the instrument, for instance "probe/"
-      targets: number of target sites needed
-      organ: name of the organ
-    """
-    self.prefix = prefix
-    check_scene(model, prefix, targets, organ)
-    if model is not self.model.ptr:
-      self._reload_from_data(wrapper.MjData(wrapper.MjModel(model)))
-    self.organ = Organ(model, self.data.ptr, organ)
-    self.peak_force = 0.0
-    self._sensors = {}
-    for i in range(model.nsensor):
-      name = model.sensor(i).name
-      if name.startswith(prefix):
-        adr = int(model.sensor_adr[i])
-        self._sensors[name[len(prefix) :]] = slice(adr, adr + int(model.sensor_dim[i]))
-    self._joint = [model.joint(prefix + axis) for axis in AXES]
-    self._qpos = np.array([int(j.qposadr[0]) for j in self._joint])
-    self._dof = np.array([int(j.dofadr[0]) for j in self._joint])
-    self.drives = np.array([model.actuator(prefix + axis).id for axis in AXES])
-    self.drive_range = model.actuator_ctrlrange[self.drives].copy()
-    self.jaw = model.actuator(prefix + "jaw").id if self.has_jaw else -1
-    self._targets = [model.site(f"target{i}").id for i in range(targets)]
-    model.site_sameframe[self._targets] = 0  # else a site at its body's origin stays there
-    self._coarse = _spread(self.organ.xpos0, COARSE)
-    self._trocar = trocar.trocar(model, prefix)
-
-  @property
-  def has_jaw(self) -> bool:
-    """Whether the instrument has jaws."""
-    return "jaw" in self._sensors
-
-  def step(self, nstep: int = 1) -> None:
-    """Advances the physics and keeps the largest contact force of all the steps."""
-    with self.check_invalid_state():
-      model, data = self.model.ptr, self.data.ptr
-      force, peak = data.sensordata[self._sensors["tip_force"]], 0.0
-      sides = [self._sensors[f"touch_{side}"].start for side in ("left", "right") if self.has_jaw]
-      grip = np.zeros(len(sides))
-      for _ in range(nstep):
-        mj.mj_step2(model, data)
-        peak = max(peak, float(force @ force))
-        if sides:
-          grip += data.sensordata[sides]
-        mj.mj_step1(model, data)
-      # Pinched folds make single steps of large jaw force: the jaws' is a mean over the step.
-      self.peak_force = max(peak**0.5, float(grip.max(initial=0.0)) / nstep)
-
-  def place(self, state: np.ndarray) -> None:
-    """Puts the physics in an integration state, from which it goes on as it did before."""
-    mj.mj_setState(self.model.ptr, self.data.ptr, state, _STATE)
-    mj.mj_forward(self.model.ptr, self.data.ptr)
-    # mj_forward replaces the warm start.
-    mj.mj_setState(self.model.ptr, self.data.ptr, state, _STATE)
-
-  def integration_state(self) -> np.ndarray:
-    """Returns everything that the next step depends on (mjSTATE_INTEGRATION)."""
-    state = np.empty(mj.mj_stateSize(self.model.ptr, _STATE))
-    mj.mj_getState(self.model.ptr, self.data.ptr, state, _STATE)
-    return state
-
-  def sensor(self, name: str) -> np.ndarray:
-    """Returns a copy of one of the instrument's sensors."""
-    return self.data.sensordata[self._sensors[name]].copy()
-
-  def tip_pos(self) -> np.ndarray:
-    """Returns the tip's position [m]  (3,)."""
-    return self.sensor("tip_pos")
-
-  def tip_vel(self) -> np.ndarray:
-    """Returns the tip's velocity [m/s]  (3,)."""
-    return self.sensor("tip_vel")
-
-  def tip_quat(self) -> np.ndarray:
-    """Returns the tip's orientation, w x y z  (4,)."""
-    return self.sensor("tip_quat")
-
-  def joints(self) -> np.ndarray:
-    """Returns pitch, yaw, roll [rad] and insertion [m]  (4,)."""
-    return self.data.qpos[self._qpos]
-
-  def joint_vel(self) -> np.ndarray:
-    """Returns the velocities of `joints`  (4,)."""
-    return self.data.qvel[self._dof]
-
-  def drive_targets(self) -> np.ndarray:
-    """Returns the targets of the position drives, as `joints`  (4,)."""
-    return self.data.ctrl[self.drives]
-
-  def contact_force(self) -> np.ndarray:
-    """Returns the contact force on the instrument below the shaft [N]  (3,)."""
-    return -self.sensor("tip_force")
-
-  def shaft_force(self) -> float:
-    """Returns the magnitude of the contact force on the shaft [N]."""
-    return float(np.linalg.norm(self.sensor("shaft_force")))
-
-  def gripper(self) -> np.ndarray:
-    """Returns opening and its target [rad], force on the left and right jaw [N]  (4,)."""
-    touch = self.sensor("touch_left"), self.sensor("touch_right")
-    return np.concatenate([self.sensor("jaw"), self.data.ctrl[[self.jaw]], *touch])
-
-  def closing(self) -> bool:
-    """Whether the jaws are told to close: the drive's target is below the opening."""
-    opening, target = self.gripper()[:2]
-    return bool(target < opening - _CLOSING)
-
-  def holds(self) -> bool:
-    """Whether both jaws press on something."""
-    return bool(self.gripper()[2:].min() > HELD_FORCE)
-
-  def nodes_near(self) -> np.ndarray:
-    """Returns the organ's nodes nearest to the tip, from the tip [m]  (NEAR, 3)."""
-    offset = self.organ.xpos - self.tip_pos()
-    distance2 = np.einsum("ij,ij->i", offset, offset)
-    near = np.argpartition(distance2, NEAR)[:NEAR]
-    return offset[near[np.argsort(distance2[near], kind="stable")]]
-
-  def surface(self) -> np.ndarray:
-    """Returns the displacement of nodes spread over the organ [m]  (COARSE, 3)."""
-    return (self.organ.xpos - self.organ.xpos0)[self._coarse]
-
-  def point(self, triangle: int) -> np.ndarray:
-    """Returns where the middle of one of the organ's triangles is [m]  (3,)."""
-    return self.organ.xpos[self.organ.elem[triangle]].mean(axis=0)
-
-  def normals(self) -> np.ndarray:
-    """Returns the outward unit normals of the organ's triangles  (nelem, 3)."""
-    a, b, c = np.moveaxis(self.organ.xpos[self.organ.elem], 1, 0)
-    normal = np.cross(b - a, c - a)
-    return normal / np.linalg.norm(normal, axis=1, keepdims=True)
-
-  def contact_area(self) -> float:
-    """Returns the area of the organ's triangles in contact with the instrument [m^2]."""
-    contact = self.data.ptr.contact
-    elem = np.unique(contact.elem[contact.elem >= 0]) if len(contact) else np.zeros(0, int)
-    if not len(elem):
-      return 0.0
-    a, b, c = np.moveaxis(self.organ.xpos[self.organ.elem[elem]], 1, 0)
-    return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
-
-  def tip_visible(self) -> bool:
-    """Whether the laparoscope's picture holds the tip."""
-    pos, mat, fovy = self.camera()
-    return bool(metrics.in_view(self.tip_pos()[None], pos[None], mat[None], fovy)[0])
-
-  def camera(self) -> tuple[np.ndarray, np.ndarray, float]:
-    """Returns the laparoscope's position [m], axes and vertical field of view [deg]."""
-    k = self.model.ptr.camera(CAMERA).id
-    return (
-      self.data.cam_xpos[k].copy(),
-      self.data.cam_xmat[k].reshape(3, 3).copy(),
-      float(self.model.cam_fovy[k]),
-    )
-
-  def hidden(self, points: np.ndarray) -> np.ndarray:
-    """Returns which points the organ hides from the laparoscope  (n,) bool.
-
-    Rays against triangles after Moeller and Trumbore 1997.
-    """
-    eye = self.camera()[0]
-    a, b, c = np.moveaxis(self.organ.xpos[self.organ.elem], 1, 0)
-    e1, e2, s = b - a, c - a, eye - a
-    q = np.cross(s, e1)
-    far = np.einsum("ij,ij->i", e2, q)
-    out = np.zeros(len(points), bool)
-    for k, ray in enumerate(points - eye):
-      p = np.cross(ray, e2)
-      with np.errstate(divide="ignore", invalid="ignore"):
-        scale = 1 / np.einsum("ij,ij->i", e1, p)
-        u, v, t = np.einsum("ij,ij->i", s, p) * scale, (q @ ray) * scale, far * scale
-      out[k] = ((u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0) & (t < 0.999)).any()
-    return out
-
-  def trocar(self) -> trocar.Trocar:
-    """Returns the instrument's trocar."""
-    return self._trocar
-
-  def move_port(self, shift: np.ndarray, turn: np.ndarray) -> None:
-    """Moves the trocar and turns it about itself; `shift` [m] and `turn` [rad] are small  (3,)."""
-    model, body = self.model.ptr, self.model.ptr.body(f"{self.prefix}trocar")
-    quat, rotation = np.zeros(4), np.zeros(4)
-    angle = float(np.linalg.norm(turn))
-    mj.mju_axisAngle2Quat(rotation, turn / max(angle, 1e-12), angle)
-    mj.mju_mulQuat(quat, rotation, self._home[1])
-    body.pos[:], body.quat[:] = self._home[0] + shift, quat
-    self._trocar = trocar.trocar(model, self.prefix)
-
-  def keep_port(self) -> None:
-    """Takes the trocar's pose as the one that `move_port` starts from."""
-    body = self.model.ptr.body(f"{self.prefix}trocar")
-    self._home = body.pos.copy(), body.quat.copy()
-
-  def mark(self, index: int, pos: np.ndarray, shown: bool = True) -> None:
-    """Puts target site `index` at `pos` [m], for the pictures."""
-    site = self._targets[index]
-    self.model.site_pos[site] = pos
-    self.data.site_xpos[site] = pos
-    self.model.site_rgba[site, 3] = 0.9 if shown else 0.0
-
-
-def check_scene(model: mj.MjModel, prefix: str, targets: int, organ: str) -> None:
-  """Raises ValueError naming what a scene lacks for an exercise; arguments as `Physics.use`."""
-  for kind, names in (
-    ("body", [f"{prefix}trocar"]),
-    ("site", [f"{prefix}tip", *(f"target{i}" for i in range(targets))]),
-    ("actuator", [prefix + axis for axis in AXES]),
-    ("sensor", [f"{prefix}{name}" for name in ("tip_pos", "tip_force", "shaft_force")]),
-    ("camera", [CAMERA]),
-    ("flex", [organ]),
-  ):
-    for name in names:
-      if mj.mj_name2id(model, getattr(mj.mjtObj, f"mjOBJ_{kind.upper()}"), name) < 0:
-        raise ValueError(f"the scene has no {kind} {name!r}, which the exercise needs")
-
-
-def _spread(points: np.ndarray, count: int) -> np.ndarray:
-  """Returns indices of points far from each other, each farthest from those before."""
-  chosen, distance2 = [0], np.full(len(points), np.inf)
-  while len(chosen) < min(count, len(points)):
-    distance2 = np.minimum(distance2, ((points - points[chosen[-1]]) ** 2).sum(axis=1))
-    chosen.append(int(np.argmax(distance2)))
-  return np.array(chosen)
 
 
 class Task(control.Task):
@@ -317,6 +77,7 @@ class Task(control.Task):
     name: domain and task, for instance "touch/easy"
     random: everything random comes from here
     outcome: how the episode ended, see the module's head; None while it runs
+    progress: see the module's head [-]
     best: best progress so far [-]
     events: since the last `take_events`
   """
@@ -371,7 +132,7 @@ class Task(control.Task):
     self._models: dict[int | None, tuple[mj.MjModel, np.ndarray]] = {}
     self.visualize_reward = False
     self.outcome: str | None = None
-    self.best = 0.0
+    self.progress, self.best = 0.0, 0.0
     self.events: list[Event] = []
 
   # Scene.
@@ -379,7 +140,7 @@ class Task(control.Task):
   @property
   def jaws(self) -> bool:
     """Whether the instrument has jaws."""
-    return self.scene.instrument == "grasper"
+    return self.prefix == JAWS
 
   @property
   def components(self) -> tuple[str, ...]:
@@ -425,8 +186,8 @@ class Task(control.Task):
     data.qvel[:] = 0
     data.qacc_warmstart[:] = 0
     data.time = 0
-    state = np.empty(mj.mj_stateSize(model, _STATE))
-    mj.mj_getState(model, data, state, _STATE)
+    state = np.empty(mj.mj_stateSize(model, STATE))
+    mj.mj_getState(model, data, state, STATE)
     return model, state
 
   def place_of_work(self, physics: Physics) -> tuple[np.ndarray, np.ndarray]:
@@ -436,7 +197,7 @@ class Task(control.Task):
     from pinned nodes.
     """
     organ, port = physics.organ, physics.trocar()
-    x = organ.xpos
+    x = physics.nodes()
     middle = x[organ.elem].mean(axis=1)
     shaft = -port.mat[:, 2]
     offset = middle - port.pos
@@ -496,14 +257,17 @@ class Task(control.Task):
         physics.move_port(np.zeros(3), np.zeros(3))
       physics.use(model, self.prefix, self.targets, self.organ)
       physics.keep_port()
-    mj.mj_setState(model, physics.data.ptr, state, _STATE)
+    mj.mj_setState(model, physics.data.ptr, state, STATE)
     mj.mj_kinematics(model, physics.data.ptr)
+    physics.moved()
     limit = self.jitter
     physics.move_port(
       self.random.uniform(-limit, limit, 3), 8.7 * self.random.uniform(-limit, limit, 3)
     )
-    self.outcome, self.best, self.events = None, 0.0, []
-    self.peak, self._area, self._shaft, self._over = 0.0, 0.0, False, False
+    self.outcome, self.events = None, []
+    self.progress, self.gain, self.best = 0.0, 0.0, 0.0
+    self.peak, self._area, self._shaft = 0.0, 0.0, False
+    physics.peak_force = 0.0  # the last episode's would be in the first observation
     self._place_instrument(physics)
     self.begin(physics)
     self.start = physics.tip_pos()
@@ -516,11 +280,7 @@ class Task(control.Task):
     tip = center + self.random.uniform(0.03, 0.045) * away + aside
     joints = trocar.inverse(port, tip)
     pose = np.array([joints[0], joints[1], self.random.uniform(-0.5, 0.5), joints[2]])
-    physics.data.qpos[physics._qpos] = pose
-    physics.data.ctrl[physics.drives] = pose
-    if physics.jaw >= 0:
-      physics.data.ctrl[physics.jaw] = 0.0
-    mj.mj_forward(physics.model.ptr, physics.data.ptr)
+    physics.set_joints(pose)
 
   def action_spec(self, physics: Physics) -> specs.BoundedArray:
     """Returns the bounds of the action; the components are at the module's head."""
@@ -558,9 +318,9 @@ class Task(control.Task):
   def after_step(self, physics: Physics) -> None:
     """Measures the progress and looks for errors and damage."""
     self.peak = max(self.peak, physics.peak_force)
-    phi = self.advance(physics)
-    self.gain = max(phi - self.best, 0.0)
-    self.best = max(self.best, phi)
+    before, self.progress = self.progress, self.advance(physics)
+    self.gain = self.progress - before
+    self.best = max(self.best, self.progress)
     shaft = physics.shaft_force() > 0.05
     if shaft and not self._shaft:
       self.event(physics, "unintended_contact", label="shaft")
@@ -569,7 +329,6 @@ class Task(control.Task):
       self.outcome = "damage"
       self.event(physics, "note", label=f"damage: {physics.peak_force:.2f} N")
     elif self.outcome == "success":
-      self.best = 1.0
       self.event(physics, "note", label="success")
 
   def get_observation(self, physics: Physics) -> collections.OrderedDict:
@@ -586,7 +345,7 @@ class Task(control.Task):
       out["gripper"] = physics.gripper()
     out["nodes_near"] = physics.nodes_near()
     out["surface"] = physics.surface()
-    out["progress"] = np.array([self.best])
+    out["progress"] = np.array([self.progress])
     out.update(self.observe(physics))
     if self.pixels is not None:
       height, width = self.pixels
@@ -597,9 +356,8 @@ class Task(control.Task):
     """Returns the reward of the last step, see the module's head."""
     if self.reward == "sparse":
       return float(self.outcome == "success")
-    if self.outcome == "damage" or physics.peak_force > self.force_limit:
-      return 0.0
-    return float(min(self.gain, 1.0))
+    over = physics.peak_force > min(self.force_limit, self.damage)
+    return float(min(self.gain, 0.0) if over else self.gain)
 
   def get_termination(self, physics: Physics) -> float | None:
     """Returns the final discount 0 once there is an outcome."""
@@ -628,10 +386,10 @@ class Task(control.Task):
   def sample(self, physics: Physics) -> dict[str, Any]:
     """Returns a sample for `Recorder.append`; `force` is the largest of the control step [N]."""
     force = physics.peak_force
-    area = physics.contact_area()
+    area = physics.contact_area() if force > 0 else 0.0
     self._area = area if area > 0 else self._area
     return {
-      "time": physics.time(),
+      "time": physics.data.ptr.time,
       "tip_pos": physics.tip_pos(),
       "quat": physics.tip_quat(),
       "force": force,
@@ -642,8 +400,8 @@ class Task(control.Task):
 
 
 def closeness(distance: float, start: float) -> float:
-  """Returns 1 at the goal, falling to 0 at the distance it started from [-]."""
-  return max(0.0, 1.0 - distance / max(start, 1e-3))
+  """Returns 1 at the goal, 0 at the distance it started from, -1 at twice that and beyond [-]."""
+  return max(-1.0, 1.0 - distance / max(start, 1e-3))
 
 
 def make(task: Task, time_limit: float, environment_kwargs: Mapping | None) -> control.Environment:

@@ -2,6 +2,7 @@
 
 A recording of an exercise holds the task's name and options, the seed, every action and reward, the
 organ's surface, and the states at the start and the end. Seed and actions give all the rest again.
+Sample 0 is the start; action and reward of sample k are those of the step that led to it, NaN in 0.
 """
 
 import dataclasses
@@ -72,11 +73,13 @@ def run(
     "mujoco": mujoco.__version__,
     **json.loads(json.dumps(dict(info or {}))),
   }
-  recorder.attach("vertices", physics.organ.xpos)
+  recorder.attach("vertices", physics.nodes())
   recorder.attach("triangles", physics.organ.elem)
   recorder.attach("state_first", physics.integration_state())
   for name, value in task.constants(physics).items():
     recorder.attach(name, value)
+  first = {"state": physics.integration_state()} if states else None
+  recorder.append(**task.sample(physics), arrays=first)
   total = 0.0
 
   def finish() -> Recording:
@@ -91,7 +94,7 @@ def run(
     except Exception as error:
       task.outcome = task.outcome or "error"
       recorder.info["error"] = f"{type(error).__name__}: {error}"
-      text = f"{task.name}: step {len(recorder)}: {recorder.info['error']}"
+      text = f"{task.name}: step {len(recorder) - 1}: {recorder.info['error']}"
       raise EpisodeError(text, finish()) from error
     total += timestep.reward
     arrays = {"action": action, "reward": np.float64(timestep.reward)}
@@ -109,7 +112,7 @@ def run(
 def environment(recording: Recording) -> control.Environment:
   """Returns the environment that a recording was made in."""
   info = recording.info
-  if "action" not in recording.arrays and len(recording.time):
+  if "action" not in recording.arrays and len(recording.time) > 1:
     raise ValueError("the recording holds no actions: it is not one of an exercise")
   for key in ("task", "seed", "task_kwargs"):
     if key not in info:
@@ -122,7 +125,7 @@ def replay(
 ) -> tuple[Recording, control.Environment]:
   """Returns a recording's episode run anew from its seed and actions, and its environment."""
   env = environment(recording)
-  actions = iter(recording.arrays.get("action", np.zeros((0, 0))))
+  actions = iter(recording.arrays.get("action", np.zeros((0, 0)))[1:])
 
   class _Over(Exception):
     pass

@@ -45,6 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser):
   add("--processes", metavar="N", type=int, default=1, help="at a time (%(default)s)")
   add("--json", metavar="FILE", help="write every episode's metrics")
   add("--reference", metavar="FILE", help="write an expert reference of these episodes")
+  add("--recordings", metavar="FOLDER", help="keep every episode's recording, whole or not")
 
 
 def main(args: argparse.Namespace) -> int:
@@ -62,7 +63,7 @@ def main(args: argparse.Namespace) -> int:
     raise CommandError(str(error)) from None
   seeds = range(args.seed, args.seed + args.episodes)
   progress, results = Progress(), []
-  for result in evaluate(name, args.policy, seeds, args.processes):
+  for result in evaluate(name, args.policy, seeds, args.processes, args.recordings):
     results.append(result)
     progress.show(f"{len(results)} of {args.episodes}")
   progress.clear()
@@ -91,9 +92,19 @@ def _check_policy(spec: str):
     raise ValueError(f"policy is {spec!r}, expected module:object or one of {names}")
 
 
-def evaluate(name: str, policy: str, seeds: range, processes: int = 1) -> Iterator[Result]:
-  """Yields the result of each seed, in order; the processes are spawned, not forked."""
-  jobs = [(name, policy, seed) for seed in seeds]
+def evaluate(
+  name: str, policy: str, seeds: range, processes: int = 1, recordings: str | None = None
+) -> Iterator[Result]:
+  """Yields the result of each seed, in order; the processes are spawned, not forked.
+
+  Args:
+    name: of the task, such as "touch/easy"
+    policy: see `episode.performer`
+    seeds: of the episodes
+    processes: at a time
+    recordings: folder to keep the recordings in, SEED.npz
+  """
+  jobs = [(name, policy, seed, recordings) for seed in seeds]
   if processes == 1:
     yield from map(_one, jobs)
     return
@@ -106,18 +117,22 @@ def evaluate(name: str, policy: str, seeds: range, processes: int = 1) -> Iterat
 _environments: dict[str, Any] = {}  # of this process
 
 
-def _one(job: tuple[str, str, int]) -> Result:
-  name, policy, seed = job
+def _one(job: tuple[str, str, int, str | None]) -> Result:
+  name, policy, seed, folder = job
   palpate.register()
   from . import episode, suite
 
   if name not in _environments:
     _environments[name] = suite.load(*suite.split(name), task_kwargs={"random": 0})
   env = _environments[name]
+  options = {"task_kwargs": {}, "performer": policy}
   try:
-    recording = episode.run(env, episode.performer(policy, env, seed), seed)
+    recording = episode.run(env, episode.performer(policy, env, seed), seed, options)
   except episode.EpisodeError as error:
     recording = error.recording
+  if folder is not None:
+    pathlib.Path(folder).mkdir(parents=True, exist_ok=True)
+    recording.save(pathlib.Path(folder) / f"{seed}.npz")
   info = recording.info
   return Result(
     seed=seed,

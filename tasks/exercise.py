@@ -38,7 +38,10 @@ def add_arguments(parser: argparse.ArgumentParser):
   add = parser.add_argument
   add("task", metavar="TASK", nargs="?", help="such as touch/easy; a domain alone is its standard")
   add("--list", action="store_true", help="list the exercises and performers")
-  add("--performer", metavar="NAME", default="expert", help="expert, tremor, ..., keyboard")
+  add(
+    "--performer", metavar="NAME", default="expert",
+    help="expert, tremor, ..., keyboard, or a policy as module:object",
+  )  # fmt: skip
   add("--seed", metavar="N", type=int, default=0, help="of the episode (%(default)s)")
   add("--replay", metavar="FILE", help="repeat a recording and check that it comes out the same")
   add("-o", "--out", metavar="FOLDER", help="where recording and report go (out/TASK)")
@@ -58,7 +61,7 @@ def main(args: argparse.Namespace) -> int:
   if args.list:
     for domain, task in suite.ALL_TASKS:
       print(f"{f'{domain}/{task}':24} {suite.summary(domain, task)}")
-    print(f"performers: {', '.join(experts.STYLES)}, keyboard")
+    print(f"performers: {', '.join(experts.STYLES)}, keyboard, module:object")
     return 0
   old = None
   try:
@@ -68,9 +71,13 @@ def main(args: argparse.Namespace) -> int:
       name, seed, options = old.info["task"], old.info["seed"], old.info["task_kwargs"]
     else:
       name, seed, options = "/".join(suite.split(args.task)), args.seed, {}
-      if args.performer not in (*experts.STYLES, "keyboard"):
+      if ":" in args.performer:
+        episode.find(args.performer)
+      elif args.performer not in (*experts.STYLES, "keyboard"):
         names = ", ".join(experts.STYLES)
-        raise ValueError(f"performer is {args.performer!r}, expected {names} or keyboard")
+        raise ValueError(
+          f"performer is {args.performer!r}, expected {names}, keyboard or module:object"
+        )
       env = suite.load(*suite.split(name), task_kwargs=options)
   except (ValueError, OSError) as error:
     raise CommandError(str(error)) from None
@@ -93,7 +100,7 @@ def main(args: argparse.Namespace) -> int:
       elif args.performer == "keyboard":
         recording = _keyboard(env, seed, info, watch)
       else:
-        act = experts.make(env, args.performer, seed)
+        act = episode.performer(args.performer, env, seed)
         recording = episode.run(env, act, seed, info, args.states, watch)
     except episode.EpisodeError as error:
       recording, failure, code = error.recording, error, 1

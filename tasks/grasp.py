@@ -4,7 +4,7 @@ Own observations: `target` (3,), from the tip to the site to grasp [m]; `height`
 site above its place at rest, towards the trocar, minus the height to lift to [m]; `held` (1,),
 share of the holding time done [-]; `grasped` (1,), whether both jaws press on something.
 
-Progress: 0.2 * max(0, 1 - distance / distance at the start) until it is grasped; then 0.3 + 0.4
+Progress: 0.2 * closeness until it is grasped; then 0.3 + 0.4
 * min(height / lift, 1) + 0.2 * held; 0.9 once held long enough, 1 on release. Grasped means that
 both jaws press within 12 mm of the site. Success: released below half of the height after
 holding. Slipping from closed jaws and letting go above half of the height start the holding

@@ -86,6 +86,7 @@ class Exercise(gymnasium.Env):
       self._recorder = Recorder(["instrument"], self._task.settings(), self._task.watch)
       for name, value in self._task.constants(self._physics).items():
         self._recorder.attach(name, value)
+      self._recorder.append(**self._task.sample(self._physics))
     if self.render_mode == "human":
       self._show()
     return dict(timestep.observation), self._info()
@@ -113,7 +114,7 @@ class Exercise(gymnasium.Env):
     return {
       "success": outcome == "success",
       "outcome": outcome,
-      "progress": float(self._task.best),
+      "progress": float(self._task.progress),
       "peak_force": float(self._physics.peak_force),
     }
 

@@ -399,14 +399,15 @@ def in_view(
   """Returns whether points lie inside a MuJoCo camera's view; tissue in front is not looked at.
 
   Args:
-    tip_pos: points in the world [m]  (nstep, 3)
+    tip_pos: points in the world [m]  (nstep, 3), or one (3,)
     cam_pos: `cam_xpos` [m]  (3,) or (nstep, 3)
     cam_mat: `cam_xmat`; the camera looks along its -z  (3, 3) or (nstep, 3, 3)
     fovy: vertical field of view, as in MuJoCo [deg]
     aspect: width over height of the picture [-]
   """
   offset = np.asarray(tip_pos, np.float64) - np.asarray(cam_pos, np.float64)
-  local = np.einsum("...ij,...i->...j", np.asarray(cam_mat, np.float64), offset)
+  mat = np.asarray(cam_mat, np.float64)
+  local = offset @ mat if mat.ndim == 2 else np.einsum("nij,ni->nj", mat, offset)
   half = -local[..., 2] * math.tan(math.radians(fovy) / 2)
   inside = (np.abs(local[..., 1]) <= half) & (np.abs(local[..., 0]) <= half * aspect)
   return inside & (local[..., 2] < 0)
@@ -609,13 +610,15 @@ def trace_frechet(tip_pos: ArrayLike, curve: ArrayLike) -> float:
   n, m = distance.shape
   flat = distance.ravel()
   # Anti-diagonals i + j = k do not depend on themselves; entry i + 1 belongs to row i.
-  last, before = np.full(n + 1, np.inf), np.full(n + 1, np.inf)
+  before, last, new = np.full((3, n + 1), np.inf)
   before[0] = -np.inf  # the way into (0, 0)
   for k in range(n + m - 1):
     low, high = max(0, k - m + 1), min(k, n - 1) + 1
     cost = flat[k + low * (m - 1) : k + (high - 1) * (m - 1) + 1 : m - 1]
-    way = np.minimum(np.minimum(last[low + 1 : high + 1], last[low:high]), before[low:high])
-    new = np.full(n + 1, np.inf)
-    np.maximum(cost, way, out=new[low + 1 : high + 1])
-    before, last = last, new
+    here = new[low + 1 : high + 1]
+    np.minimum(last[low + 1 : high + 1], last[low:high], out=here)
+    np.minimum(here, before[low:high], out=here)
+    np.maximum(here, cost, out=here)
+    before[: low + 2] = np.inf  # becomes `new`, whose rows start one later at most
+    before, last, new = last, new, before
   return float(last[n])

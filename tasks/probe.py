@@ -3,14 +3,13 @@
 Pressing (`easy`, `standard`, `hard`, `depth`). Own observations: `target` (3,), from the tip to the
 site [m]; `normal` (3,), of the surface there [-]; `level` (1,), the pressed force [N] (or
 depth [m]) minus the middle of the band; `held` (1,), share of the holding time done [-].
-Progress: (sites done + 0.4 * max(0, 1 - distance / distance at the start) + 0.5 * held) / sites.
-Pressing counts within the tolerance of the site; leaving the band starts the holding again.
+Progress: (sites done + 0.4 * closeness + 0.5 * held) / sites, closeness counting from the site
+before. Pressing counts within the tolerance of the site; leaving the band starts the holding again.
 
 Palpation (`palpate_easy`, `palpate_standard`, `palpate_hard`): a stiff inclusion lies under the
 kidney's front, within 22 mm of its middle. It can be felt, not seen: reporting it (action
 `report` above 0.5) ends the episode, with success when the tip is within the tolerance of it. No
-own observations. Progress: 0.5 * max(0, 1 - distance / distance at the start) while the probe
-presses, 1 on success.
+own observations. Progress: 0.5 * max(closeness, 0) while the probe presses, 1 on success.
 """
 
 import dataclasses
@@ -141,7 +140,7 @@ class Press(Task):
 
   def _aim(self, physics: Physics) -> None:
     for i, point in enumerate(self.points):
-      physics.mark(i, point, shown=i >= self.done)
+      physics.mark(i, point, shown=i >= self.done, now=i == self.done)
     self.held = 0.0
     self.distance0 = self.distance(physics)
 
@@ -187,7 +186,7 @@ class Press(Task):
     """Returns target, normal, level and held."""
     return {
       "target": self.points[self.now] - physics.tip_pos(),
-      "normal": physics.normals()[self.goals[self.now]],
+      "normal": physics.normal(self.goals[self.now]),
       "level": np.array([self.level(physics) - sum(self.band) / 2]),
       "held": np.array([self.held / self.hold]),
     }
@@ -281,4 +280,4 @@ class Palpate(Task):
       return 1.0 if found else 0.0
     if np.linalg.norm(physics.contact_force()) < 0.05:
       return 0.0
-    return 0.5 * base.closeness(self.distance(physics), self.distance0)
+    return 0.5 * max(base.closeness(self.distance(physics), self.distance0), 0.0)

@@ -38,7 +38,8 @@ class _Buffer:
       self.skip(0, past)
 
   def put(self, index: int, value: np.ndarray | float) -> None:
-    self._reach(index)
+    if index >= len(self.values):
+      self._reach(index)
     self.values[index] = value
 
   def skip(self, start: int, end: int) -> None:
@@ -140,18 +141,20 @@ class Recorder:
     given = {"tip_pos": tip_pos, "quat": quat, "axis": axis, "force": force}
     given |= {"area": area, "grip": grip, "held": held, "visible": visible}
     columns = {k: self._entry(k, v) for k, v in given.items() if v is not None}
-    own = {name: self._own(name, value) for name, value in (arrays or {}).items()}
+    own = {name: self._own(name, value) for name, value in arrays.items()} if arrays else {}
     k = self._count
     for name, buffer in self._arrays.items():
       if name not in own and buffer.values.dtype.kind != "f":
         raise ValueError(f"sample {k}: array {name!r} is {buffer.values.dtype} and is missing")
     for table, entries in ((self._columns, columns), (self._arrays, own)):
-      for name, buffer in table.items():
-        if name not in entries:
-          buffer.skip(k, k + 1)
+      if table.keys() != entries.keys():
+        for name, buffer in table.items():
+          if name not in entries:
+            buffer.skip(k, k + 1)
+        for name, value in entries.items():
+          if name not in table:
+            table[name] = _Buffer(value.shape, value.dtype, k)
       for name, value in entries.items():
-        if name not in table:
-          table[name] = _Buffer(value.shape, value.dtype, k)
         table[name].put(k, value)
     self._time.put(k, time)
     self._count, self._last = k + 1, time
@@ -159,9 +162,14 @@ class Recorder:
   def _entry(self, name: str, value: ArrayLike) -> np.ndarray:
     count = len(self.instruments)
     array = np.asarray(value, np.float64)
+    buffer = self._columns.get(name)
+    if buffer is not None and (
+      array.shape == buffer.shape or (count == 1 and array.shape == buffer.shape[1:])
+    ):
+      return array  # fits as it is
     shapes = [COLUMNS[name]] + ([()] if name == "force" else [])
-    if name in self._columns:
-      shapes = [self._columns[name].shape[1:]]
+    if buffer is not None:
+      shapes = [buffer.shape[1:]]
     for shape in shapes:
       if array.shape == (count, *shape) or (count == 1 and array.shape == shape):
         return array.reshape(count, *shape)

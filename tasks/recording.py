@@ -81,7 +81,7 @@ class Event:
   Attributes:
     kind: one of `metrics.EVENTS`
     time: when [s]
-    value: for `target`, the distance to the target [m]; None where there is none
+    value: for `target` and `miss`, the distance to the target [m]; None where there is none
     instrument: index of the instrument
     label: text for people
   """

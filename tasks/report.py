@@ -161,7 +161,8 @@ def path_figure(recording: Recording) -> "Figure | None":
     getattr(ax, f"set_{axis}label")(f"{axis} [mm]", labelpad=6)
     getattr(ax, f"{axis}axis").set_pane_color((0.97, 0.97, 0.98, 1.0))
   ax.locator_params(nbins=5)
-  ax.set_box_aspect(half, zoom=1.0)
+  # A tall box would leave the figure.
+  ax.set_box_aspect(half, zoom=min(1.0, 0.72 * float(np.linalg.norm(half) / half[2])))
   ax.view_init(elev=28, azim=-55)
   figure.legend(loc="outside right upper", fontsize=9, frameon=False)
   return figure
@@ -193,13 +194,17 @@ def force_figure(recording: Recording) -> "Figure | None":
     ax.axhline(limit, color=_BAD, linestyle="--", linewidth=1.2, label=f"limit {limit:g} N")
     top = max(top, limit)
   top = 1.25 * top if top > 0 else 1.0
+  marks: dict[float, list[str]] = {}  # events of one moment share a line
   for event in recording.events:
-    at = event.time - recording.time[0]
+    marks.setdefault(event.time - recording.time[0], []).append(event.label or event.kind)
+  for at, words in marks.items():
     ax.axvline(at, color=_FAINT, linewidth=0.8, linestyle=":")
-    if len(recording.events) <= 12:
+    if len(marks) <= 12:
+      late = at > 0.96 * time[-1]  # its words would leave the plot
       ax.annotate(
-        _label(event.label or event.kind), (at, top), xytext=(3, -3), textcoords="offset points",
-        fontsize=8, color="#5d6472", rotation=90, va="top",
+        ", ".join(_label(word) for word in words), (at, top), xytext=(-3 if late else 3, -3),
+        textcoords="offset points", fontsize=8, color="#5d6472", rotation=90, va="top",
+        ha="right" if late else "left",
       )  # fmt: skip
   ax.set_ylim(0, top)
   ax.set_xlim(0, max(time[-1], 1e-9))
@@ -468,8 +473,8 @@ def _event_table(recording: Recording) -> str:
   for event in recording.events[:_MOST_EVENTS]:
     distance = ""
     if event.value is not None:
-      target = event.kind == "target"
-      distance = f"{_number(1e3 * event.value)} mm" if target else f"{event.value:g}"
+      length = event.kind in ("target", "miss")
+      distance = f"{_number(1e3 * event.value)} mm" if length else f"{event.value:g}"
     cells = [_number(event.time - start), event.kind, distance]
     cells += [recording.instruments[event.instrument], event.label]
     rows.append(_row(map(_text, cells), [0]))

@@ -4,7 +4,7 @@ Own observations: `target` (3,), from the tip to the site to grasp [m]; `hidden`
 tip to the hidden disc [m]; `visible` (1,), share of the disc that the laparoscope sees [-];
 `held` (1,), share of the holding time done [-]; `grasped` (1,), whether the jaws hold the organ.
 
-Progress: 0.15 * max(0, 1 - distance / distance at the start) until it is grasped; then 0.3 + 0.5
+Progress: 0.15 * closeness until it is grasped; then 0.3 + 0.5
 * visible / wanted + 0.2 * held. Only the organ hides: instruments are not looked at. Success:
 the wanted share is seen for the holding time, the organ being held. Failure: a force above the
 damage limit, jaws included, or the time limit.
@@ -90,15 +90,13 @@ class Retract(Task):
     self.grasped, self._closing = False, False
     self.disc = self._hide(physics, center)
     self.distance0 = self.distance(physics)
-    physics.mark(0, self.disc[0])
+    physics.mark(0, self.disc[0], now=True, size=self.radius)
     physics.mark(1, physics.point(self.site))
-    physics.model.site_size[physics._targets[0]] = self.radius
-    physics.model.site_rgba[physics._targets[0], :3] = 0.95, 0.8, 0.15
 
   def _hide(self, physics: Physics, center: np.ndarray) -> np.ndarray:
     _, mat, _ = physics.camera()
     right, up, back = mat.T
-    behind = physics.organ.xpos.mean(axis=0)
+    behind = physics.nodes().mean(axis=0)
     # In the plane behind the organ, on the line through the site that is grasped.
     height = float((center - behind) @ up) + self.random.uniform(-0.012, 0.0)
     aside = np.arange(-0.06, 0.06, 0.001)

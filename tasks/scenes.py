@@ -18,6 +18,7 @@ import mujoco
 import numpy as np
 from palpate.models import shapes, trocar
 
+NOW, LATER = (1.0, 0.8, 0.1), (0.2, 0.75, 0.95)  # colours of targets
 ORGAN = "organ"
 CAMERA = "laparoscope"
 _TURN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # organ's frame to world
@@ -145,7 +146,7 @@ def _xml(material, vertices, triangles, pins, young, center, scene: Scene) -> st
   right /= np.linalg.norm(right)
   pin = f'<pin id="{" ".join(map(str, pins))}"/>' if pins else ""
   sites = "".join(
-    f'<site name="target{i}" size="0.003" rgba="0.15 0.75 0.35 0.9"/>' for i in range(scene.targets)
+    f'<site name="target{i}" size="0.003" rgba="0.2 0.75 0.95 0.9"/>' for i in range(scene.targets)
   )
   color = "0.72 0.36 0.31 1" if scene.organ != "gallbladder" else "0.48 0.62 0.34 1"
   config = {

@@ -3,9 +3,10 @@
 Own observations: `target` (3,), from the tip to the point to touch [m]; `normal` (3,), of the
 surface there [-].
 
-Progress: (points touched + 0.9 * max(0, 1 - distance / distance at the start)) / points. A point is
-touched when the probe presses it with more than 0.03 N within the tolerance; pressing elsewhere is
-a miss. Success: all points. Failure: a force above the damage limit, or the time limit.
+Progress: (points touched + 0.9 * closeness) / points, closeness counting from the point before. A
+point is touched when the probe presses it with more than 0.03 N within the tolerance; pressing
+elsewhere is a miss. Success: all points. Failure: a force above the damage limit, or the time
+limit.
 """
 
 import dataclasses
@@ -75,7 +76,7 @@ class Touch(Task):
 
   def _aim(self, physics: Physics) -> None:
     for i, goal in enumerate(self.goals):
-      physics.mark(i, physics.point(goal), shown=i >= self.done)
+      physics.mark(i, physics.point(goal), shown=i >= self.done, now=i == self.done)
     if self.done < self.targets:
       self.distance0 = self.distance(physics)
 
@@ -108,7 +109,7 @@ class Touch(Task):
     goal = self.goal()
     return {
       "target": physics.point(goal) - physics.tip_pos(),
-      "normal": physics.normals()[goal],
+      "normal": physics.normal(goal),
     }
 
   def reference_length(self) -> float:
@@ -120,7 +121,7 @@ def draw_apart(
   random: np.random.RandomState, physics: Physics, place: np.ndarray, count: int, gap: float
 ) -> list[int]:
   """Returns triangles at least `gap` [m] apart, or as far as the place allows."""
-  middle = physics.organ.xpos[physics.organ.elem].mean(axis=1)
+  middle = physics.nodes()[physics.organ.elem].mean(axis=1)
   chosen = [int(random.choice(place))]
   while len(chosen) < count:
     distance = np.linalg.norm(middle[place][:, None] - middle[chosen], axis=2).min(axis=1)

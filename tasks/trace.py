@@ -3,10 +3,10 @@
 Own observations: `target` (3,), from the tip to the next point of the curve [m]; `ahead` (3, 3),
 from the tip to points 5, 10 and 15 mm further along the curve [m].
 
-Progress: 0.1 * max(0, 1 - distance to the curve's start / distance at the start) until the first
-point is touched, then 0.1 + 0.9 * share of the curve done. The curve is done up to a point when the
-tip presses with 0.02 N or more within the tolerance of it, in order. Success: all of it. Failure: a
-force above the damage limit, or the time limit.
+Progress: 0.1 * closeness to the curve's start until the first point is touched, then 0.1 + 0.9 *
+share of the curve done. The curve is done up to a point when the tip presses with 0.02 N or more
+within the tolerance of it, in order. Success: all of it. Failure: a force above the damage limit,
+or the time limit.
 """
 
 import dataclasses
@@ -102,8 +102,7 @@ class Trace(Task):
     self.done, self._touching = 0, False
     self.distance0 = self.distance(physics)
     for i, k in enumerate(np.linspace(0, len(self.curve) - 1, _MARKS).round().astype(int)):
-      physics.mark(i, self.curve[k])
-      physics.model.site_size[physics._targets[i]] = 0.0015
+      physics.mark(i, self.curve[k], size=0.0015)
 
   def _draw(self, physics: Physics, center: np.ndarray, size: float):
     """Returns points, triangles and weights in them; None where the curve leaves the place."""
@@ -121,7 +120,7 @@ class Trace(Task):
     start = center + flat @ across.T
     # Drop along the shaft: the triangle hit from outside that is nearest to the trocar.
     points, triangles, weights = [], [], []
-    organ, x = physics.organ, physics.organ.xpos
+    organ, x = physics.organ, physics.nodes()
     a, b, c = np.moveaxis(x[organ.elem], 1, 0)
     e1, e2, ray = b - a, c - a, -port.mat[:, 2]
     p = np.cross(ray, e2)
@@ -147,7 +146,7 @@ class Trace(Task):
 
   def now(self, physics: Physics) -> np.ndarray:
     """Returns where the curve is on the deformed organ [m]  (npoint, 3)."""
-    corner = physics.organ.xpos[physics.organ.elem[self.triangles]]
+    corner = physics.nodes()[physics.organ.elem[self.triangles]]
     return np.einsum("ij,ijk->ik", self.weights, corner)
 
   def distance(self, physics: Physics) -> float:

@@ -27,7 +27,7 @@ def test_replay_gives_everything_again_to_the_bit(name, tmp_path):
 def test_a_changed_action_is_noticed():
   first = record()
   actions = first.arrays["action"].copy()
-  actions[3, 0] += 1e-3
+  actions[4, 0] += 1e-3
   first.arrays["action"] = actions
   again, _ = episode.replay(first)
   assert "constant state_last" in episode.differences(first, again)
@@ -40,7 +40,7 @@ def test_what_was_recorded_before_an_error_is_kept(tmp_path):
     episode.EpisodeError, match=r"touch/easy: step 3: ValueError: .*roll is nan"
   ) as e:
     episode.run(env, lambda _: next(good, np.array([0, 0, np.nan, 0])), 0)
-  assert len(e.value.recording.time) == 3
+  assert len(e.value.recording.time) == 1 + 3
   assert Recording.load(e.value.recording.save(tmp_path / "a.npz")).info["outcome"] == "error"
 
   def broken(_):
@@ -94,6 +94,14 @@ def test_evaluate_prints_success_and_spread(capsys, tmp_path):
   assert "success  2/2" in text and "Path length [mm]" in text
   data = json.loads(out.read_text())
   assert data["task"] == "touch/easy" and data["n"] == 2 and data["seed"] == 0
+  kept = tmp_path / "kept"
+  words = ["evaluate", "touch/easy", "--policy", "math:nan", "--episodes", "1"]
+  assert cli.main([*words, "--recordings", str(kept)]) == 2
+  assert "math:nan' is a float, expected something to call" in capsys.readouterr().err
+  words = ["evaluate", "touch/easy", "--policy", "math:sqrt", "--episodes", "1"]
+  assert cli.main([*words, "--recordings", str(kept)]) == 1
+  assert "1 episodes failed, the first: TypeError" in capsys.readouterr().err
+  assert Recording.load(kept / "0.npz").info["outcome"] == "error"
   assert cli.main(["evaluate", "touch/eazy"]) == 2
   assert "expected one of touch/easy" in capsys.readouterr().err
   assert cli.main(["evaluate", "touch/easy", "--policy", "nobody"]) == 2
@@ -118,6 +126,12 @@ def test_exercise_writes_recording_metrics_and_report(tmp_path, capsys):
   assert cli.main(["exercise", "--replay", str(tmp_path / "foreign.npz")]) == 2
   assert "not a readable palpate-recording" in capsys.readouterr().err
   assert cli.main(["exercise", "touch/easy", "--performer", "nobody"]) == 2
+  assert "keyboard or module:object" in capsys.readouterr().err
+  assert cli.main(["exercise", "touch/easy", "--performer", "math:none"]) == 2
+  assert "math has no 'none'" in capsys.readouterr().err
+  assert cli.main(["exercise", "touch/easy", "--performer", "math:sqrt", "-o", folder]) == 1
+  said = capsys.readouterr()
+  assert "error after 0.00 s" in said.out and "step 0: TypeError" in said.err
   assert cli.main(["exercise", "nothing"]) == 2
 
 
@@ -133,5 +147,6 @@ def test_references_are_those_of_the_tasks():
   for pair in tasks.ALL_TASKS:
     name = "/".join(pair)
     reference = episode.reference(name)
-    if reference is not None:
-      assert reference["task"] == name and reference["n"] >= 5
+    assert reference is not None, name
+    assert reference["task"] == name and reference["n"] >= 5
+    assert {"seed", "palpate", "mujoco"} < set(reference)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from dm_control.rl import control
 from palpate import models, tasks
-from palpate.tasks import registry, suite
+from palpate.tasks import metrics, registry, suite
 
 IDS = ["/".join(pair) for pair in tasks.ALL_TASKS]
 _cache = {}
@@ -104,7 +104,7 @@ def test_rewards_are_finite_and_bounded_and_the_episode_can_start_anew(env):
     for timestep in steps[1:]:
       if timestep.first():  # an episode ended before
         break
-      assert np.isfinite(timestep.reward) and 0 <= timestep.reward <= 1
+      assert np.isfinite(timestep.reward) and -1 <= timestep.reward <= 1
       total += timestep.reward
     assert total <= 1 + 1e-9
   # From whatever state the physics is in:
@@ -129,6 +129,70 @@ def test_going_on_from_a_state_gives_the_same_to_the_bit():
       env.physics.step(20)
     ends.append(env.physics.integration_state())
   np.testing.assert_array_equal(*ends)
+
+
+def test_dense_reward_is_the_change_of_progress_and_takes_back_what_is_lost():
+  env = load("touch/easy")
+  first = env.reset()
+  assert first.observation["progress"] == 0 and first.observation["peak_force"] == 0
+  total, least = 0.0, 0.0
+  for k in range(40):  # towards the organ, then away from it
+    timestep = env.step(np.array([0, 0, 0, 0.5 if k < 10 else -1.0]))
+    total += timestep.reward
+    least = min(least, timestep.reward)
+    np.testing.assert_allclose(total, timestep.observation["progress"][0], atol=1e-12)
+  assert least < -0.01 and total < 0
+  assert env.reset().observation["progress"] == 0
+
+
+def test_above_the_force_limit_progress_pays_nothing_but_may_cost():
+  env = load("touch/easy", force_limit=1e-9)
+  env.reset()
+  task, physics = env.task, env.physics
+  for gain, force, reward in ((0.2, 1.0, 0.0), (-0.2, 1.0, -0.2), (0.2, 0.0, 0.2)):
+    task.gain, physics.peak_force = gain, force
+    assert task.get_reward(physics) == reward
+
+
+def test_quick_forms_agree_with_the_plain_ones():
+  env = load("grasp/easy")
+  physics = env.physics
+  env.reset()
+  camera = physics.model.ptr.camera("laparoscope").id
+  seen = set()
+  for turn in np.linspace(-0.8, 0.8, 9):  # of the camera about its own vertical
+    pos, mat, fovy = physics.camera()
+    rotation = np.array(
+      [[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]]
+    )
+    kept = physics.data.ptr.cam_xmat[camera].copy()
+    physics.data.ptr.cam_xmat[camera] = (mat @ rotation).ravel()
+    wanted = metrics.in_view(physics.tip_pos(), pos, mat @ rotation, fovy)
+    assert physics.tip_visible() == bool(wanted)
+    seen.add(bool(wanted))
+    physics.data.ptr.cam_xmat[camera] = kept
+  assert seen == {True, False}
+  normals = physics.normals()
+  np.testing.assert_allclose(physics.normal(7), normals[7], rtol=1e-14)
+  nodes, elem = physics.organ.xpos, physics.organ.elem
+  np.testing.assert_array_equal(physics.nodes(), nodes)
+  a, b, c = nodes[elem[7]]
+  np.testing.assert_allclose(
+    np.cross(b - a, c - a) / np.linalg.norm(np.cross(b - a, c - a)), normals[7], rtol=1e-12
+  )
+  spec = env.action_spec()
+  down = np.array([0, 0, 0, 0.6, 1.0])
+  for _ in range(60):
+    env.step(np.clip(down, spec.minimum, spec.maximum))
+    elements = physics.data.ptr.contact.elem
+    touched = np.unique(elements[elements >= 0])
+    if len(touched):
+      break
+  np.testing.assert_array_equal(physics.nodes(), physics.organ.xpos)  # not those before the step
+  a, b, c = np.moveaxis(physics.organ.xpos[elem[touched]], 1, 0)
+  area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
+  assert area > 0
+  np.testing.assert_allclose(physics.contact_area(), area, rtol=1e-9)
 
 
 def test_sparse_reward_pays_success_alone():
@@ -169,6 +233,10 @@ def test_a_scene_of_ones_own_must_have_what_the_task_needs():
     load("touch/easy", model=catalogue)
   with pytest.raises(ValueError, match="palpate_easy: model is given, expected none"):
     load("probe/palpate_easy", model=spec)
+  gripper = scenes.build(scenes.Scene("gallbladder", "grasper", nodes=250, center="fundus"))
+  gripper.delete(next(a for a in gripper.actuators if a.name == "grasper/jaw"))
+  with pytest.raises(ValueError, match="no actuator 'grasper/jaw'"):
+    load("grasp/easy", model=gripper)
   bare = mujoco.MjSpec()
   with pytest.raises(ValueError, match="no body 'probe/trocar'"):
     load("touch/easy", model=bare)

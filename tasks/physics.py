@@ -1,0 +1,320 @@
+# mujoco ships its bindings without type stubs:
+# pyright: reportAttributeAccessIssue=false
+"""The physics of an exercise: one organ, one instrument on a trocar, and what one asks of them."""
+
+import math
+
+import mujoco as mj
+import numpy as np
+from dm_control import mujoco
+from dm_control.mujoco import wrapper
+from palpate import Organ
+from palpate.models import trocar
+
+from . import scenes
+from .scenes import CAMERA, ORGAN
+
+AXES = ("pitch", "yaw", "roll", "insertion")
+JAWS = "grasper/"  # prefix of the instrument that has them
+NEAR, COARSE = 8, 32  # nodes in the observations
+HELD_FORCE = 0.05  # force on both jaws above which they hold tissue [N]
+
+STATE = mj.mjtState.mjSTATE_INTEGRATION
+_CLOSING = 0.005  # [rad]
+
+
+class Physics(mujoco.Physics):
+  """Physics of an exercise: one organ, one instrument on a trocar."""
+
+  organ: Organ
+  prefix = ""
+
+  def use(self, model: mj.MjModel, prefix: str, targets: int, organ: str = ORGAN) -> None:
+    """Takes a compiled scene; ValueError names what it lacks.
+
+    Args:
+      model: with the organ, the instrument and the sites `target0`, ...
+      prefix: of the instrument, for instance "probe/"
+      targets: number of target sites needed
+      organ: name of the organ
+    """
+    self.prefix = prefix
+    check_scene(model, prefix, targets, organ)
+    if model is not self.model.ptr:
+      self._reload_from_data(wrapper.MjData(wrapper.MjModel(model)))
+    self.organ = Organ(model, self.data.ptr, organ)
+    self.peak_force = 0.0
+    self._nodes: np.ndarray | None = None
+    self._camera = model.camera(CAMERA).id
+    self._sensors = {}
+    for i in range(model.nsensor):
+      name = model.sensor(i).name
+      if name.startswith(prefix):
+        adr = int(model.sensor_adr[i])
+        self._sensors[name[len(prefix) :]] = slice(adr, adr + int(model.sensor_dim[i]))
+    self._joint = [model.joint(prefix + axis) for axis in AXES]
+    self._qpos = np.array([int(j.qposadr[0]) for j in self._joint])
+    self._dof = np.array([int(j.dofadr[0]) for j in self._joint])
+    self.drives = np.array([model.actuator(prefix + axis).id for axis in AXES])
+    self.drive_range = model.actuator_ctrlrange[self.drives].copy()
+    self.jaw = model.actuator(prefix + "jaw").id if self.has_jaw else -1
+    self._targets = [model.site(f"target{i}").id for i in range(targets)]
+    model.site_sameframe[self._targets] = 0  # else a site at its body's origin stays there
+    self._coarse = _spread(self.organ.xpos0, COARSE)
+    self._coarse0 = self.organ.xpos0[self._coarse]
+    self._trocar = trocar.trocar(model, prefix)
+
+  @property
+  def has_jaw(self) -> bool:
+    """Whether the instrument has jaws."""
+    return "jaw" in self._sensors
+
+  def step(self, nstep: int = 1) -> None:
+    """Advances the physics and keeps the largest contact force of all the steps."""
+    with self.check_invalid_state():
+      model, data = self.model.ptr, self.data.ptr
+      force, peak = data.sensordata[self._sensors["tip_force"]], 0.0
+      sides = [self._sensors[f"touch_{side}"].start for side in ("left", "right") if self.has_jaw]
+      grip = np.zeros(len(sides))
+      for _ in range(nstep):
+        mj.mj_step2(model, data)
+        peak = max(peak, float(force @ force))
+        if sides:
+          grip += data.sensordata[sides]
+        mj.mj_step1(model, data)
+      # Pinched folds make single steps of large jaw force: the jaws' is a mean over the step.
+      self.peak_force = max(peak**0.5, float(grip.max(initial=0.0)) / nstep)
+      self.moved()
+
+  def forward(self) -> None:
+    """Recomputes what depends on the state."""
+    super().forward()
+    self.moved()
+
+  def moved(self) -> None:
+    """Forgets `nodes`: to be called when the state was changed from outside."""
+    self._nodes = None
+
+  def place(self, state: np.ndarray) -> None:
+    """Puts the physics in an integration state, from which it goes on as it did before."""
+    mj.mj_setState(self.model.ptr, self.data.ptr, state, STATE)
+    mj.mj_forward(self.model.ptr, self.data.ptr)
+    # mj_forward replaces the warm start.
+    mj.mj_setState(self.model.ptr, self.data.ptr, state, STATE)
+    self.moved()
+
+  def integration_state(self) -> np.ndarray:
+    """Returns everything that the next step depends on (mjSTATE_INTEGRATION)."""
+    state = np.empty(mj.mj_stateSize(self.model.ptr, STATE))
+    mj.mj_getState(self.model.ptr, self.data.ptr, state, STATE)
+    return state
+
+  def sensor(self, name: str) -> np.ndarray:
+    """Returns a copy of one of the instrument's sensors."""
+    return self.data.ptr.sensordata[self._sensors[name]].copy()
+
+  def tip_pos(self) -> np.ndarray:
+    """Returns the tip's position [m]  (3,)."""
+    return self.sensor("tip_pos")
+
+  def tip_vel(self) -> np.ndarray:
+    """Returns the tip's velocity [m/s]  (3,)."""
+    return self.sensor("tip_vel")
+
+  def tip_quat(self) -> np.ndarray:
+    """Returns the tip's orientation, w x y z  (4,)."""
+    return self.sensor("tip_quat")
+
+  def joints(self) -> np.ndarray:
+    """Returns pitch, yaw, roll [rad] and insertion [m]  (4,)."""
+    return self.data.qpos[self._qpos]
+
+  def set_joints(self, pose: np.ndarray) -> None:
+    """Puts the instrument and its drives at a pose, as `joints`, with closed jaws."""
+    self.data.qpos[self._qpos] = pose
+    self.data.ctrl[self.drives] = pose
+    if self.jaw >= 0:
+      self.data.ctrl[self.jaw] = 0.0
+    mj.mj_forward(self.model.ptr, self.data.ptr)
+
+  def joint_vel(self) -> np.ndarray:
+    """Returns the velocities of `joints`  (4,)."""
+    return self.data.qvel[self._dof]
+
+  def drive_targets(self) -> np.ndarray:
+    """Returns the targets of the position drives, as `joints`  (4,)."""
+    return self.data.ctrl[self.drives]
+
+  def contact_force(self) -> np.ndarray:
+    """Returns the contact force on the instrument below the shaft [N]  (3,)."""
+    return -self.sensor("tip_force")
+
+  def shaft_force(self) -> float:
+    """Returns the magnitude of the contact force on the shaft [N]."""
+    return float(np.linalg.norm(self.sensor("shaft_force")))
+
+  def gripper(self) -> np.ndarray:
+    """Returns opening and its target [rad], force on the left and right jaw [N]  (4,)."""
+    touch = self.sensor("touch_left"), self.sensor("touch_right")
+    return np.concatenate([self.sensor("jaw"), self.data.ctrl[[self.jaw]], *touch])
+
+  def closing(self) -> bool:
+    """Whether the jaws are told to close: the drive's target is below the opening."""
+    opening, target = self.gripper()[:2]
+    return bool(target < opening - _CLOSING)
+
+  def holds(self) -> bool:
+    """Whether both jaws press on something."""
+    return bool(self.gripper()[2:].min() > HELD_FORCE)
+
+  def nodes(self) -> np.ndarray:
+    """Returns the positions of the organ's nodes [m]  (nvert, 3); computed once a control step."""
+    if self._nodes is None:
+      self._nodes = self.organ.xpos
+      self._nodes.flags.writeable = False
+    return self._nodes
+
+  def nodes_near(self) -> np.ndarray:
+    """Returns the organ's nodes nearest to the tip, from the tip [m]  (NEAR, 3)."""
+    offset = self.nodes() - self.tip_pos()
+    distance2 = np.einsum("ij,ij->i", offset, offset)
+    near = np.argpartition(distance2, NEAR)[:NEAR]
+    return offset[near[np.argsort(distance2[near], kind="stable")]]
+
+  def surface(self) -> np.ndarray:
+    """Returns the displacement of nodes spread over the organ [m]  (COARSE, 3)."""
+    return self.nodes()[self._coarse] - self._coarse0
+
+  def point(self, triangle: int) -> np.ndarray:
+    """Returns where the middle of one of the organ's triangles is [m]  (3,)."""
+    return self.nodes()[self.organ.elem[triangle]].mean(axis=0)
+
+  def normals(self) -> np.ndarray:
+    """Returns the outward unit normals of the organ's triangles  (nelem, 3)."""
+    normal = _twice_area(self.nodes(), self.organ.elem)
+    return normal / np.linalg.norm(normal, axis=1, keepdims=True)
+
+  def normal(self, triangle: int) -> np.ndarray:
+    """Returns the outward unit normal of one of the organ's triangles  (3,)."""
+    normal = _twice_area(self.nodes(), self.organ.elem[triangle][None])[0]
+    return normal / np.linalg.norm(normal)
+
+  def contact_area(self) -> float:
+    """Returns the area of the organ's triangles in contact with the instrument [m^2]."""
+    if not self.data.ptr.ncon:
+      return 0.0
+    elem = {k for k in self.data.ptr.contact.elem.ravel().tolist() if k >= 0}
+    area = 0.0
+    # One triangle or two under a probe, thirty in the jaws: plain numbers are quicker than arrays.
+    for (ax, ay, az), b, c in self.nodes()[self.organ.elem[sorted(elem)]].tolist():
+      ux, uy, uz = b[0] - ax, b[1] - ay, b[2] - az
+      vx, vy, vz = c[0] - ax, c[1] - ay, c[2] - az
+      area += math.hypot(uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx) / 2
+    return area
+
+  def tip_visible(self) -> bool:
+    """Whether the laparoscope's picture holds the tip."""
+    # As metrics.in_view; in plain numbers it takes a tenth of the time, and it runs every step.
+    k, data = self._camera, self.data.ptr
+    x, y, z = (data.sensordata[self._sensors["tip_pos"]] - data.cam_xpos[k]).tolist()
+    m = data.cam_xmat[k].tolist()
+    depth = -(m[2] * x + m[5] * y + m[8] * z)
+    half = depth * math.tan(math.radians(float(self.model.ptr.cam_fovy[k])) / 2)
+    across, up = m[0] * x + m[3] * y + m[6] * z, m[1] * x + m[4] * y + m[7] * z
+    return depth > 0 and abs(up) <= half and abs(across) <= half * 4 / 3
+
+  def camera(self) -> tuple[np.ndarray, np.ndarray, float]:
+    """Returns the laparoscope's position [m], axes and vertical field of view [deg]."""
+    k, data = self._camera, self.data.ptr
+    return (
+      data.cam_xpos[k].copy(),
+      data.cam_xmat[k].reshape(3, 3).copy(),
+      float(self.model.ptr.cam_fovy[k]),
+    )
+
+  def hidden(self, points: np.ndarray) -> np.ndarray:
+    """Returns which points the organ hides from the laparoscope  (n,) bool.
+
+    Rays against triangles after Moeller and Trumbore 1997.
+    """
+    eye = self.camera()[0]
+    a, b, c = np.moveaxis(self.nodes()[self.organ.elem], 1, 0)
+    e1, e2, s = b - a, c - a, eye - a
+    q = np.cross(s, e1)
+    far = np.einsum("ij,ij->i", e2, q)
+    out = np.zeros(len(points), bool)
+    for k, ray in enumerate(points - eye):
+      p = np.cross(ray, e2)
+      with np.errstate(divide="ignore", invalid="ignore"):
+        scale = 1 / np.einsum("ij,ij->i", e1, p)
+        u, v, t = np.einsum("ij,ij->i", s, p) * scale, (q @ ray) * scale, far * scale
+      out[k] = ((u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0) & (t < 0.999)).any()
+    return out
+
+  def trocar(self) -> trocar.Trocar:
+    """Returns the instrument's trocar."""
+    return self._trocar
+
+  def move_port(self, shift: np.ndarray, turn: np.ndarray) -> None:
+    """Moves the trocar and turns it about itself; `shift` [m] and `turn` [rad] are small  (3,)."""
+    model, body = self.model.ptr, self.model.ptr.body(f"{self.prefix}trocar")
+    quat, rotation = np.zeros(4), np.zeros(4)
+    angle = float(np.linalg.norm(turn))
+    mj.mju_axisAngle2Quat(rotation, turn / max(angle, 1e-12), angle)
+    mj.mju_mulQuat(quat, rotation, self._home[1])
+    body.pos[:], body.quat[:] = self._home[0] + shift, quat
+    self._trocar = trocar.trocar(model, self.prefix)
+
+  def keep_port(self) -> None:
+    """Takes the trocar's pose as the one that `move_port` starts from."""
+    body = self.model.ptr.body(f"{self.prefix}trocar")
+    self._home = body.pos.copy(), body.quat.copy()
+
+  def mark(
+    self,
+    index: int,
+    pos: np.ndarray,
+    shown: bool = True,
+    now: bool = False,
+    size: float | None = None,
+  ) -> None:
+    """Puts target site `index` at `pos` [m], for the pictures; yellow where it is its turn now."""
+    site = self._targets[index]
+    if size is not None:
+      self.model.site_size[site] = size
+    self.model.site_rgba[site, :3] = scenes.NOW if now else scenes.LATER
+    self.model.site_pos[site] = pos
+    self.data.site_xpos[site] = pos
+    self.model.site_rgba[site, 3] = 0.9 if shown else 0.0
+
+
+def check_scene(model: mj.MjModel, prefix: str, targets: int, organ: str) -> None:
+  """Raises ValueError naming what a scene lacks for an exercise; arguments as `Physics.use`."""
+  jaw, touch = (("jaw",), ("jaw", "touch_left", "touch_right")) if prefix == JAWS else ((), ())
+  for kind, names in (
+    ("body", [f"{prefix}trocar"]),
+    ("site", [f"{prefix}tip", *(f"target{i}" for i in range(targets))]),
+    ("actuator", [prefix + name for name in (*AXES, *jaw)]),
+    ("sensor", [prefix + name for name in ("tip_pos", "tip_force", "shaft_force", *touch)]),
+    ("camera", [CAMERA]),
+    ("flex", [organ]),
+  ):
+    for name in names:
+      if mj.mj_name2id(model, getattr(mj.mjtObj, f"mjOBJ_{kind.upper()}"), name) < 0:
+        raise ValueError(f"the scene has no {kind} {name!r}, which the exercise needs")
+
+
+def _twice_area(pos: np.ndarray, elem: np.ndarray) -> np.ndarray:
+  """Returns the normals of triangles, as long as twice their areas [m^2]  (nelem, 3)."""
+  a, b, c = pos[elem[:, 0]], pos[elem[:, 1]], pos[elem[:, 2]]
+  (x1, y1, z1), (x2, y2, z2) = (b - a).T, (c - a).T
+  return np.stack([y1 * z2 - z1 * y2, z1 * x2 - x1 * z2, x1 * y2 - y1 * x2], axis=1)
+
+
+def _spread(points: np.ndarray, count: int) -> np.ndarray:
+  """Returns indices of points far from each other, each farthest from those before."""
+  chosen, distance2 = [0], np.full(len(points), np.inf)
+  while len(chosen) < min(count, len(points)):
+    distance2 = np.minimum(distance2, ((points - points[chosen[-1]]) ** 2).sum(axis=1))
+    chosen.append(int(np.argmax(distance2)))
+  return np.array(chosen)

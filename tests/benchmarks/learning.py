@@ -1,0 +1,153 @@
+"""Learns `touch/easy` with Soft Actor-Critic of Stable-Baselines3, on one thread of the CPU.
+
+    pip install -e '.[learn]'
+    python tests/benchmarks/learning.py -o tests/benchmarks/results
+
+writes learning.csv, mean return and success of evaluations on the way beside those of random
+actions, and the curve learning.png. The exercise is as it comes, with its dense reward and its time
+limit of 10 s. What the agent adds are ordinary wrappers: it sees the state observations of
+`OBSERVATIONS`, normalised, and decides every 0.08 s. Training and evaluation draw their episodes
+from different seeds; the evaluations' are the same each time.
+"""
+
+import argparse
+import csv
+import pathlib
+import time
+
+import gymnasium
+import numpy as np
+import palpate  # registers the environments
+import torch
+from gymnasium.wrappers import FilterObservation, FlattenObservation
+from stable_baselines3 import SAC
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+ID = "palpate/TouchEasy-v0"
+OBSERVATIONS = (
+  "joints", "joint_vel", "drive", "tip_vel", "contact_force", "peak_force", "progress", "target",
+  "normal",
+)  # fmt: skip
+REPEAT = 4  # control steps a decision
+GAMMA = 0.98  # a horizon of 4 s
+SEEDS = 10_000  # the evaluations' episodes start here; training draws its own from --seed
+
+
+class Repeat(gymnasium.Wrapper):
+  """Repeats each action and adds up the rewards."""
+
+  def step(self, action):
+    """Takes REPEAT control steps, fewer at the end of an episode."""
+    total = 0.0
+    for _ in range(REPEAT):
+      observation, reward, terminated, truncated, info = self.env.step(action)
+      total += float(reward)
+      if terminated or truncated:
+        break
+    return observation, total, terminated, truncated, info
+
+
+def make() -> gymnasium.Env:
+  """Returns the exercise as the agent sees it."""
+  env = gymnasium.make(ID, disable_env_checker=True)
+  return FlattenObservation(FilterObservation(Repeat(env), OBSERVATIONS))
+
+
+def evaluate(act, env: gymnasium.Env, episodes: int) -> dict:
+  """Returns return, success, damage and duration of episodes; `act` maps observation to action."""
+  returns, times, outcomes = [], [], []
+  for seed in range(SEEDS, SEEDS + episodes):
+    observation, info = env.reset(seed=seed)
+    total, over = 0.0, False
+    while not over:
+      observation, reward, terminated, truncated, info = env.step(act(observation))
+      total, over = total + float(reward), terminated or truncated
+    returns.append(total)
+    times.append(env.unwrapped.environment.physics.time())
+    outcomes.append(info["outcome"])
+  return {
+    "episodes": episodes,
+    "return_mean": round(float(np.mean(returns)), 3),
+    "return_sd": round(float(np.std(returns, ddof=1)), 3),
+    "success_percent": round(100 * outcomes.count("success") / episodes, 1),
+    "damage_percent": round(100 * outcomes.count("damage") / episodes, 1),
+    "time_s_mean": round(float(np.mean(times)), 2),
+  }
+
+
+def train(args: argparse.Namespace):
+  """Yields a row for the random policy and for the agent each time it is evaluated."""
+  torch.set_num_threads(1)
+  watched, training = make(), 0.0
+  space = watched.action_space
+  space.seed(args.seed)
+
+  def row(policy: str, decisions: int, result: dict) -> dict:
+    versions = {"palpate": palpate.__version__, "seed": args.seed}
+    head = {"policy": policy, "decisions": decisions, "simulated_s": decisions * REPEAT * 0.02}
+    return head | {"training_s": round(training, 1)} | result | versions
+
+  yield row("random", 0, evaluate(lambda _: space.sample(), watched, args.episodes))
+  # Rewards add up to 1 over an episode: normalised, SAC's entropy does not drown them.
+  env = VecNormalize(DummyVecEnv([make]), gamma=GAMMA)
+  agent = SAC(
+    "MlpPolicy", env, seed=args.seed, device="cpu", gamma=GAMMA, learning_rate=1e-3,
+    learning_starts=1_000, ent_coef="auto_0.1", policy_kwargs={"net_arch": [128, 128]},
+  )  # fmt: skip
+
+  def act(observation: np.ndarray) -> np.ndarray:
+    return agent.predict(env.normalize_obs(observation), deterministic=True)[0]
+
+  yield row("SAC", 0, evaluate(act, watched, args.episodes))
+  done = 0
+  while done < args.decisions:
+    more = min(args.every, args.decisions - done)
+    before = time.perf_counter()
+    agent.learn(more, reset_num_timesteps=done == 0)
+    training += time.perf_counter() - before
+    done += more
+    yield row("SAC", done, evaluate(act, watched, args.episodes if done >= args.decisions else 20))
+
+
+def draw(path: pathlib.Path, rows: list[dict]):
+  """Draws return and success over training."""
+  from matplotlib.figure import Figure
+
+  figure = Figure((6.4, 3.0), layout="constrained")
+  for k, (key, label) in enumerate((("return_mean", "return"), ("success_percent", "success [%]"))):
+    ax = figure.add_subplot(1, 2, k + 1)
+    agent = [r for r in rows if r["policy"] == "SAC"]
+    ax.plot([r["simulated_s"] / 60 for r in agent], [r[key] for r in agent], "o-", label="SAC")
+    ax.axhline(rows[0][key], color="#8a8f98", linestyle="--", label="random actions")
+    ax.set_xlabel("practice, simulated [min]")
+    ax.set_ylabel(label)
+    ax.spines[["top", "right"]].set_visible(False)
+    ax.grid(color="#e4e7ec")
+  figure.axes[0].legend(loc="lower right", frameon=False)
+  figure.savefig(path, dpi=100)
+
+
+def main():
+  """Trains, and writes table and curve after every evaluation."""
+  parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+  add = parser.add_argument
+  add("-o", "--out", type=pathlib.Path, required=True, help="folder of learning.csv and .png")
+  add("--decisions", type=int, default=15_000, help="of training (%(default)s)")
+  add("--every", type=int, default=2_500, help="decisions between evaluations (%(default)s)")
+  add("--episodes", type=int, default=50, help="of the first and last evaluation (%(default)s)")
+  add("--seed", type=int, default=0, help="of the agent and its episodes (%(default)s)")
+  args = parser.parse_args()
+  args.out.mkdir(parents=True, exist_ok=True)
+  rows = []
+  for row in train(args):
+    print(row, flush=True)
+    rows.append(row)
+    with (args.out / "learning.csv").open("w", newline="") as file:
+      writer = csv.DictWriter(file, rows[0], lineterminator="\n")
+      writer.writeheader()
+      writer.writerows(rows)
+  draw(args.out / "learning.png", rows)
+
+
+if __name__ == "__main__":
+  main()
