@@ -128,11 +128,10 @@ def _centre_world(
   warm: wp.array4d[float],
   step: wp.array2d[float],
   partial_: wp.array3d[float],
-  counter_: wp.array[int],
 ): ...
 
 
-@wp.kernel(enable_backward=False, launch_bounds=simd.BLOCK)
+@wp.kernel(enable_backward=False, launch_bounds=simd.BOUNDS)
 def _centre(
   nthread: int,
   nslice: int,
@@ -142,12 +141,9 @@ def _centre(
   # State out:
   step_out: wp.array2d[float],
   partial_out: wp.array3d[float],
-  counter_out: wp.array[int],
 ):
   world, tid = wp.tid()
-  _centre_world(
-    world, tid, nthread, nslice, undo, dvel_warm_in, step_out, partial_out, counter_out
-  )
+  _centre_world(world, tid, nthread, nslice, undo, dvel_warm_in, step_out, partial_out)
 
 
 @wp.func_native(_DIRECT)
@@ -297,13 +293,13 @@ def _midpoint(s: Surface, d: State):
   nthread = simd.group_size(s.device, s.nslice, d.nworld)
 
   def centre(undo: int):
-    d.counter.zero_()
+    d.partial.zero_()
     wp.launch(
       _centre,
       dim=(d.nworld, nthread),
       block_dim=simd.BLOCK,
       inputs=[nthread, s.nslice, undo, d.dvel_warm],
-      outputs=[d.step, d.partial, d.counter],
+      outputs=[d.step, d.partial],
       device=s.device,
     )
 
@@ -311,6 +307,8 @@ def _midpoint(s: Surface, d: State):
   wp.copy(d.vel_trial, d.vel)
   centre(undo=0)
   elastic.assemble(s, d, Stage.FIRST)
+  if s.levels is not None:
+    solver.multilevel().assemble(s, d)
   solver.solve(s, d, first=True)
   centre(undo=1)
   wp.copy(d.dvel, d.x)
