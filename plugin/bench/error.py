@@ -45,7 +45,6 @@ RUNS = (
   ("neumann", "neumann", {}),
   ("explicit", "explicit", {}),
   ("native", NATIVE, {}),
-  ("native, tolerance 1e-10", NATIVE, {"mj_tolerance": 1e-10}),
   ("native, Newton", NATIVE, {"solver": "Newton"}),
 )
 DRAWN = ("implicit", "implicit, window", "midpoint", "midpoint, window", "neumann", "explicit",
@@ -101,9 +100,8 @@ def _bulge(rest: np.ndarray) -> np.ndarray:
 
 SCRIPTS = {
   "press": Script(0.16, motion=_along((0.0, 0.1, (0, 0, -0.012)))),
-  "slide": Script(
-    0.2, motion=_along((0.0, 0.08, (0, 0, -0.008)), (0.08, 0.12, (0.012, 0, 0))), friction=0.3
-  ),
+  # Without friction: with it the probe sticks on a facet and jumps off it, and when is chance.
+  "slide": Script(0.2, motion=_along((0.0, 0.08, (0, 0, -0.008)), (0.08, 0.12, (0.012, 0, 0)))),
   "pull": Script(0.2, motion=_along((0.0, 0.08, (0, 0, 0.01))), joined=True, released=0.1),
   "vibrate": Script(0.08, probe=False, begin=_bulge),
 }
@@ -181,7 +179,7 @@ class _Film:
     self.probe = scene.probe_dofs(model) if self.script.probe else None
     self.force: list[np.ndarray] = []
     self.places: list[np.ndarray] = []
-    self.walls: list[float] = []
+    self.times: list[float] = []
     self.n = 0
     if self.script.begin:
       self.state.put(self.script.begin(self.mesh.rest))
@@ -198,9 +196,9 @@ class _Film:
           self.data.eq_active[:] = 0
       if before:
         before()
-      start = time.perf_counter()
+      start = runner.clock()
       mujoco.mj_step(self.model, self.data)
-      self.walls.append(time.perf_counter() - start)
+      self.times.append(runner.clock() - start)
       self.n += 1
       if after:
         after()
@@ -383,7 +381,7 @@ def run(case: Case, out: pathlib.Path) -> list[Row]:
     row |= {k: case[k] for k in ("scene", "nodes", "elements")}
     row["newton"] = settings.get("newton", 1) if scheme == "implicit" else ""
     row["tolerance"] = settings.get("tolerance", settings.get("mj_tolerance", ""))
-    row["step_ms"] = 1e3 * float(np.median(film.walls[1:]))
+    row["step_ms"] = 1e3 * float(np.median(film.times[1:]))
     row["total_s"] = row["step_ms"] * 1e-3 * script.duration / h
     row["finite"] = int(name not in dead)
     row |= _errors(film, truth, h, FORCE_AT.get(scheme, "start")) if name not in dead else {}
@@ -407,11 +405,11 @@ def _applies(case: Case, scheme: str, settings: dict) -> bool:
   newton = settings.get("solver") == "Newton"
   if scheme == NATIVE and case["elements"] == "spring":
     return False  # MuJoCo's flex has no such element that its implicit step knows
-  if settings.get("window") and (script.joined or not script.probe):
-    return False  # no contact for it
-  if large and (newton or "mj_tolerance" in settings):
-    return False  # seconds a step
-  return not newton or case["h"] >= 1e-3
+  if settings.get("window") and (large or script.joined or not script.probe):
+    return False  # no contact for it; large: its spare triangles count contacts twice
+  if newton:  # a tenth of a second a step, a second with more nodes
+    return not large and case["h"] >= 1e-3 and case["scene"] == "press"
+  return True
 
 
 def _errors(film: _Film, truth: dict, h: float, at: str) -> Row:
@@ -424,8 +422,11 @@ def _errors(film: _Film, truth: dict, h: float, at: str) -> Row:
     end = truth["force"][every - 1 :: every]
     wanted = {"start": np.concatenate([0 * end[:1], end[:-1]]), "end": end}
     force = np.array(film.force)
+    # Where it lets go the force drops from one step to the next: which of them is chance.
+    begins = h * np.arange(len(force))
+    smooth = np.abs(begins + 0.5 * h - film.script.released) > 1.6 * h
     for time_level, values in wanted.items():
-      gap = np.linalg.norm(force - values, axis=1)
+      gap = np.linalg.norm(force - values, axis=1)[smooth]
       row[f"force_rms_{time_level}"] = float(np.sqrt(np.mean(gap**2)) / truth["force_peak"])
     row["force_rms"] = row[f"force_rms_{at}"]
     highest = np.linalg.norm(force, axis=1).max()
@@ -547,7 +548,7 @@ def summarize(rows: list[Row], about: dict) -> str:
     "and of its start for the others, which is the better one for each (both are in the CSV). The "
     "reference is explicit, in float64, at "
     f"{1e6 * TAU:g} us and multiples, extrapolated. Run time is the median step times the steps of "
-    "the scene.",
+    "the scene, in CPU time of the one thread, so that other load does not count.",
     "",
   ]
   found = groups(rows)

@@ -215,6 +215,11 @@ def read(path: pathlib.Path) -> list[Row]:
   ]
 
 
+def clock() -> float:
+  """Returns the CPU time of this thread [s]: of work on one thread, whatever else is running."""
+  return time.thread_time()
+
+
 def machine() -> dict:
   """Returns the versions and the machine, for the results."""
   import mujoco
