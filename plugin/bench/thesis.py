@@ -277,9 +277,9 @@ def summarize(rows: list[Row], about: dict) -> str:
   lines += [
     "Thesis (3.0 GHz Pentium 4, GeForce 7600 GS, 2008) / today. Its implicit scheme is our "
     "`neumann`; our `implicit` solves to a residual of 1e-4. n x n is n^2 + 2 nodes here. A haptic "
-    "cycle is a whole mj_step with all nodes as degrees of freedom, on the CPU in CPU time of its one "
-    "thread, as if nothing else ran; at 256 x 256 only the step of "
-    "the organ itself was run.",
+    "cycle is a whole mj_step with all nodes as degrees of freedom; at 256 x 256 only the step of "
+    "the organ itself was run. Times on the CPU are CPU time of the one thread: other load does "
+    "not count.",
     "",
   ]
   sides = sorted({key[2] for key in rates})
