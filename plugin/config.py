@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 ELEMENTS = ("membrane", "spring")
-INTEGRATORS = ("implicit", "neumann", "explicit")
+INTEGRATORS = ("implicit", "midpoint", "neumann", "explicit")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -22,8 +22,9 @@ from .types import State, Surface
 class Stage(enum.IntEnum):
   """What the right-hand side is for, which decides the weight of K v in it.
 
-  FIRST and LATER are Newton iterations: the first looks a step ahead, h^2 + h damping; later ones
-  are residuals at the trial state, h damping. EXPLICIT has h damping, and NEUMANN brings its own.
+  FIRST and LATER are Newton iterations. The first stands at x + share h v, share in `step`, and
+  has the rest of the step ahead in it: h^2 (1 - share) + h damping; later ones are residuals at the
+  trial state, h damping. EXPLICIT has h damping, and NEUMANN brings its own.
   """
 
   FIRST = 0
@@ -34,7 +35,8 @@ class Stage(enum.IntEnum):
 # Rest vector plus difference of displacements: float32 keeps the digits of small strains.
 _EDGE = """
 // Weight of K v on the right-hand side: see Stage.
-#define AHEAD(stage, h, g) ((stage) == 0 ? (g) : (stage) == 3 ? 0.0f : (g) - (h) * (h))
+#define AHEAD(stage, step) ((stage) == 3 ? 0.0f \\
+  : (step)[1] - ((stage) == 0 ? (step)[3] : 1.0f) * (step)[0] * (step)[0])
 #define EDGE(name, rest, row, node, origin) \\
   V name##x = LD(rest, row) + GATHER(U, node, 0) - origin##x; \\
   V name##y = LD(rest, row + 1) + GATHER(U, node, 1) - origin##y; \\
@@ -108,7 +110,7 @@ def _elem_normal(
   _EDGE
   + simd.slices("""
   const float h = step.data[4 * world];
-  const float gv = AHEAD(stage, h, step.data[4 * world + 1]);
+  const float gv = AHEAD(stage, step.data + 4 * world);
   const float* U = pos.data + 24 * (size_t)world * nnodeslice;
   const float* W = vel.data + 24 * (size_t)world * nnodeslice;
   const float* N = elem_normal.data + 32 * (size_t)world * nelemslice;
@@ -372,7 +374,7 @@ def _elem_corner(
   _EDGE
   + simd.slices("""
   const float h = step.data[4 * world], g = step.data[4 * world + 1];
-  const float gv = AHEAD(stage, h, g);
+  const float gv = AHEAD(stage, step.data + 4 * world);
   const bool matrix = stage < 2;
   const size_t base = (size_t)world * nslice;
   const float* U = pos.data + 24 * base;

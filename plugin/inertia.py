@@ -55,7 +55,10 @@ def of_nodes(m, organ: Organ, mass: np.ndarray, h: float, flex: int) -> np.ndarr
   state = types.make_state(organ.surface)
   padding = np.where(organ.surface.vert.numpy() >= 0, 0.0, 1.0).reshape(1, -1, 8)
   state.mass.assign(padding)
-  return effective_inertia(organ.surface, state, organ.mesh, mass, organ.free, h, radius)
+  gain = h * h + h * organ.surface.damping
+  if organ.config.integrator == "midpoint":
+    gain *= 0.5
+  return effective_inertia(organ.surface, state, organ.mesh, mass, organ.free, h, radius, gain)
 
 
 def _digest(values: np.ndarray) -> bytes:
@@ -85,7 +88,14 @@ def _tool_radius(m, organ: Organ, flex: int) -> float:
 
 
 def effective_inertia(
-  s: Surface, d: State, mesh: Mesh, mass: np.ndarray, free: np.ndarray, h: float, radius: float
+  s: Surface,
+  d: State,
+  mesh: Mesh,
+  mass: np.ndarray,
+  free: np.ndarray,
+  h: float,
+  radius: float,
+  gain: float | None = None,
 ) -> np.ndarray:
   """Returns the inertia that a contact meets at each node at rest [kg], (nvert,).
 
@@ -103,6 +113,7 @@ def effective_inertia(
     free: nodes that move, (nvert,) bool
     h: time step [s]
     radius: radius of the contact patch [m]; 0 for the node alone
+    gain: factor of K in A [s^2]; None for h^2 + h damping
   """
   # A per cent is enough: the iteration it serves has a margin of two.
   s = dataclasses.replace(s, tolerance=1e-2, newton=1)
@@ -121,7 +132,8 @@ def effective_inertia(
     array.zero_()
   put(d.mass, mass)
   floor = 0.0
-  d.step.assign(np.array([[h, h * h + h * s.damping, floor, 0]], np.float32))
+  gain = h * h + h * s.damping if gain is None else gain
+  d.step.assign(np.array([[h, gain, floor, 0]], np.float32))
   response = np.zeros(len(sample))
   for k, i in enumerate(sample):
     patch = free & (((mesh.rest - mesh.rest[i]) ** 2).sum(axis=1) <= radius**2)

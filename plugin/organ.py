@@ -66,7 +66,7 @@ class Organ:
 
   @property
   def integrator(self) -> str:
-    """Time stepping scheme: `implicit`, `neumann` or `explicit`; may be set while running."""
+    """Time stepping scheme: `implicit`, `midpoint`, `neumann` or `explicit`; may be set."""
     return self._space.config.integrator
 
   @integrator.setter

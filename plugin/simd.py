@@ -3,7 +3,8 @@
 Nodes are stored in slices of `LANES`: an array of vectors is (nworld, nslice, 3, 8), so that one
 slice is a SIMD register on the CPU and eight neighbouring threads on CUDA, and the three components
 of a node lie within two cache lines. In native code `V` is a vector of eight floats on the CPU and
-one float on CUDA; `LD`, `ST` and `GATHER` hide the difference. Irregular lists (the neighbours of a
+one float on CUDA; `LD`, `ST` and `GATHER` hide the difference, and `PUT_MOST` keeps the largest of
+numbers >= 0. Irregular lists (the neighbours of a
 node) are sliced ELLPACK: row `k` of slice `s` holds the k-th entry of its eight nodes
 (Kreutzer et al. 2014, SELL-C-sigma, doi:10.1137/130930352).
 """
@@ -23,6 +24,8 @@ _PRELUDE = """
   #define MIN(a, b) fminf(a, b)
   #define SPLAT(a) (a)
   #define HSUM(a) (a)
+  #define PUT_MOST(p, v) \\
+    if (__float_as_int(v) > *(volatile int*)(p)) atomicMax((int*)(p), __float_as_int(v));
   #define SELECT(c, a, b) ((c) ? (a) : (b))
   #define FOR_RANGE(s, from, to) for (int s = (from) + (tid >> 3); s < (to); s += nthread >> 3)
 #else
@@ -39,6 +42,8 @@ _PRELUDE = """
   #define MIN(a, b) __builtin_elementwise_min(a, b)
   #define SPLAT(a) ((V)(a))
   #define HSUM(a) (((a)[0] + (a)[4]) + ((a)[1] + (a)[5]) + (((a)[2] + (a)[6]) + ((a)[3] + (a)[7])))
+  #define PUT_MOST(p, v) \\
+    { const float most_ = __builtin_reduce_max(v); if (most_ > *(p)) *(p) = most_; }
   #define SELECT(c, a, b) ((c) ? (a) : (b))
   #define FOR_RANGE(s, from, to) for (int s = from; s < (to); ++s)
 #endif

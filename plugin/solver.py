@@ -18,6 +18,10 @@ from .types import State, Surface
 # A right-hand side below this share of the weight's impulse is at rest: residuals count against it.
 REST = 1e-3
 
+# The first Newton iteration stands where the present velocity leads, but no edge changes by more
+# than this share of its length on the way: forces far off would be those of another shape.
+AHEAD = 0.1
+
 # Product of A with the vector P of slice s, in ax, ay, az; x, y, z is P there. PN is P along the
 # normals and `along` its sum with the area vectors.
 PRODUCT = """
@@ -129,7 +133,7 @@ def body(setup: str, precondition: str, scale: str) -> str:
   float* AP = q_.data + 24 * base;
   float* Z = z_.data + 24 * base;
   float* ZN = zn_.data + 8 * base;
-  const float gv = first ? g : g - h * h;
+  const float gv = g - (first ? step.data[4 * world + 3] : 1.0f) * h * h;
 """
     + VOLUME
     + setup
@@ -381,6 +385,98 @@ def _solve(
   )
 
 
+# Where the first Newton iteration stands: how fast edges change, then how much of h v that allows.
+@wp.func_native(
+  simd.slices("""
+  const float* W = vel.data + 24 * (size_t)world * nslice;
+  const int row0 = slot_adr.data[s] + 2 * s + 1, width = slot_adr.data[s + 1] - slot_adr.data[s];
+  const int* node = fan_node.data + 8 * row0;
+  const float* rest = fan_rest.data + 24 * row0;
+  const V x = LD(W + 24 * s, 0), y = LD(W + 24 * s, 1), z = LD(W + 24 * s, 2);
+  V most = SPLAT(0.0f);
+  for (int i = 0; i < width; ++i, node += 8, rest += 24) {
+    const V dx = GATHER(W, node, 0) - x, dy = GATHER(W, node, 1) - y, dz = GATHER(W, node, 2) - z;
+    const V rx = LD(rest, 0), ry = LD(rest, 1), rz = LD(rest, 2);
+    const V length2 = MAX(rx * rx + ry * ry + rz * rz, SPLAT(1e-30f));
+    most = MAX(most, (dx * dx + dy * dy + dz * dz) / length2);
+  }
+  PUT_MOST(change.data + world, most)
+""")
+)
+def _edge_change_slices(
+  world: int,
+  tid: int,
+  nslice: int,
+  slot_adr: wp.array[int],
+  fan_node: wp.array2d[int],
+  fan_rest: wp.array3d[float],
+  vel: wp.array4d[float],
+  change: wp.array[float],
+): ...
+
+
+@wp.kernel(enable_backward=False)
+def _edge_change(
+  nslice: int,
+  # Surface:
+  slot_adr: wp.array[int],
+  fan_node: wp.array2d[int],
+  fan_rest: wp.array3d[float],
+  # State in:
+  vel_in: wp.array4d[float],
+  # State out:
+  change_out: wp.array[float],
+):
+  world, tid = wp.tid()
+  _edge_change_slices(world, tid, nslice, slot_adr, fan_node, fan_rest, vel_in, change_out)
+
+
+@wp.func_native(
+  simd.slices("""
+  const float h = step.data[4 * world], most = h * sqrtf(change.data[world]);
+  const float share = most > ahead ? ahead / most : 1.0f;
+  const size_t at = 24 * ((size_t)world * nslice + s);
+  for (int c = 0; c < 3; ++c) {
+    const V v = LD(vel.data + at, c);
+    ST(vel_trial.data + at, c, v);
+    ST(pos_trial.data + at, c, LD(pos.data + at, c) + share * h * v);
+  }
+  if (tid == 0) step.data[4 * world + 3] = share;
+""")
+)
+def _predict_slices(
+  world: int,
+  tid: int,
+  nslice: int,
+  ahead: float,
+  change: wp.array[float],
+  pos: wp.array4d[float],
+  vel: wp.array4d[float],
+  step: wp.array2d[float],
+  pos_trial: wp.array4d[float],
+  vel_trial: wp.array4d[float],
+): ...
+
+
+@wp.kernel(enable_backward=False)
+def _predict(
+  nslice: int,
+  ahead: float,
+  # State in:
+  change_in: wp.array[float],
+  pos_in: wp.array4d[float],
+  vel_in: wp.array4d[float],
+  # State out:
+  step_out: wp.array2d[float],
+  pos_trial_out: wp.array4d[float],
+  vel_trial_out: wp.array4d[float],
+):
+  world, tid = wp.tid()
+  _predict_slices(
+    world, tid, nslice, ahead, change_in, pos_in, vel_in, step_out, pos_trial_out, vel_trial_out
+  )
+
+
 @wp.func_native(
   simd.slices("""
   const size_t at = 24 * ((size_t)world * nslice + s);
@@ -496,6 +592,26 @@ def multilevel():
   return multilevel
 
 
+def _look_ahead(s: Surface, d: State):
+  """Writes where the first iteration stands: `pos_trial`, `vel_trial` and the share in `step`."""
+  d.change.zero_()
+  size = (d.nworld, simd.threads(s.device, s.nslice))
+  wp.launch(
+    _edge_change,
+    dim=size,
+    inputs=[s.nslice, s.slot_adr, s.fan_node, s.fan_rest, d.vel],
+    outputs=[d.change],
+    device=s.device,
+  )
+  wp.launch(
+    _predict,
+    dim=size,
+    inputs=[s.nslice, AHEAD, d.change, d.pos, d.vel],
+    outputs=[d.step, d.pos_trial, d.vel_trial],
+    device=s.device,
+  )
+
+
 def step(s: Surface, d: State):
   """Computes `dvel`, the change of velocity in one implicit step; capturable in a graph.
 
@@ -503,8 +619,7 @@ def step(s: Surface, d: State):
     s: the organ
     d: its state: `step`, `pos`, `vel`, `mass`, `force_ext` and `dvel_warm` are read
   """
-  wp.copy(d.pos_trial, d.pos)
-  wp.copy(d.vel_trial, d.vel)
+  _look_ahead(s, d)
   for it in range(s.newton):
     first = it == 0
     elastic.assemble(s, d, Stage.FIRST if first else Stage.LATER)

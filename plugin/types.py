@@ -168,13 +168,15 @@ class State:
 
   Attributes:
     nworld: number of worlds
-    step: time step h, h^2 + h damping, gravity-scaled floor of the residual  (nworld, 4)
+    step: time step h, h^2 + h damping, gravity-scaled floor of the residual, share of h v at which
+      the first Newton iteration stands           (nworld, 4)
     pos: displacement from rest [m]                 (nworld, nslice, 3, 8)
     vel: velocity [m/s]                             (nworld, nslice, 3, 8)
     mass: mass [kg]                                 (nworld, nslice, 8)
     force_ext: external and lagged contact force [N](nworld, nslice, 3, 8)
     dvel: change of velocity in this step [m/s]     (nworld, nslice, 3, 8)
     dvel_warm: that of the step before, where PCG starts (nworld, nslice, 3, 8)
+    change: largest (rate of an edge's ends over its length)^2 [1/s^2]  (nworld,)
     pos_trial: displacement of the present Newton iteration [m]
     vel_trial: velocity of the present Newton iteration [m/s]
     block: off-diagonal 3x3 blocks of A [kg]        (nworld, nslot, 9, 8)
@@ -214,6 +216,7 @@ class State:
   force_ext: wp.array
   dvel: wp.array
   dvel_warm: wp.array
+  change: wp.array
   pos_trial: wp.array
   vel_trial: wp.array
   block: wp.array
@@ -263,6 +266,7 @@ def make_state(surface: Surface, nworld: int = 1, is_coarse: bool = False) -> St
     "hinge_half": bend,
     "hinge_moment": bend,
     "hinge_rough": bend,
+    "change": (),
     "total": (2,),
     "zn": scalar if s.has_bending else (0, 8),
     "e": vector if cycles else (0, 3, 8),

@@ -14,6 +14,7 @@ from scipy.sparse import linalg
 
 from .. import config as configuration
 from .. import mesh as topology
+from .. import solver
 from ..config import Config
 from ..mesh import Mesh
 
@@ -103,6 +104,11 @@ class Elastic:
     size = 3 * self.mesh.nvert
     k = sparse.coo_matrix((nodal.ravel(), (self._row, self._col)), (size, size)).tocsc()
     return k + sparse.diags(np.repeat(self.foundation, 3)).tocsc()
+
+  def edges(self) -> np.ndarray:
+    """Returns the ends of every edge, (nedge, 2)."""
+    elem = self.mesh.elem
+    return np.unique(np.sort(np.stack([elem, elem[:, [1, 2, 0]]], -1).reshape(-1, 2), 1), axis=0)
 
   def energy(self, u: np.ndarray) -> float:
     """Returns the elastic energy [J]."""
@@ -196,7 +202,7 @@ class Elastic:
 
 
 class Step:
-  """One implicit step of an organ in float64, solved exactly.
+  """One step of an organ in float64, solved exactly: `implicit`, or `midpoint` but for the first.
 
   Args:
     elastic: forces
@@ -206,11 +212,18 @@ class Step:
 
   def __init__(self, elastic: Elastic, mass: np.ndarray, free: np.ndarray):
     self.elastic = elastic
+    self.edge = elastic.edges()
     self.mass = np.repeat(mass, 3)
     self.keep = np.repeat(free, 3)
 
   def __call__(
-    self, h: float, u: np.ndarray, v: np.ndarray, force: np.ndarray, newton: int = 1
+    self,
+    h: float,
+    u: np.ndarray,
+    v: np.ndarray,
+    force: np.ndarray,
+    newton: int = 1,
+    scheme: str = "implicit",
   ) -> np.ndarray:
     """Returns the change of velocity, (nvert, 3); see `palpate.elastic` for the equations.
 
@@ -219,18 +232,22 @@ class Step:
       u: displacement [m], (nvert, 3)
       v: velocity [m/s], (nvert, 3)
       force: external and contact force [N], (nvert, 3)
-      newton: Newton iterations
+      newton: Newton iterations, of `implicit`
+      scheme: `implicit` or `midpoint`
     """
     e, beta = self.elastic, self.elastic.config.damping
     gain = h * h + h * beta
+    share = self._share(h * v)
+    if scheme == "midpoint":
+      newton, share, gain = 1, 0.0, 0.5 * gain
     dv = np.zeros_like(u)
     for it in range(newton):
-      x, w = (u, v) if it == 0 else (u + h * (v + dv), v + dv)
+      w = v + dv
+      x = u + h * (share * v if it == 0 else w)
       k = e.stiffness(x)
-      if it == 0:
-        rhs = h * (e.force(x) + force).ravel() - gain * (k @ v.ravel())
-      else:
-        rhs = h * (e.force(x) + force).ravel() - h * beta * (k @ w.ravel()) - self.mass * dv.ravel()
+      rhs = h * (e.force(x) + force).ravel() - h * beta * (k @ w.ravel()) - self.mass * dv.ravel()
+      if it == 0 and scheme == "implicit":
+        rhs -= (1 - share) * h * h * (k @ v.ravel())
       a = (sparse.diags(self.mass) + gain * k).tocsc()[self.keep][:, self.keep]
       change = np.zeros(u.size)
       change[self.keep] = np.asarray(linalg.spsolve(a, rhs[self.keep]))
@@ -238,3 +255,10 @@ class Step:
       if it and np.abs(change).max() < 1e-12 * np.abs(dv).max():
         break
     return dv
+
+  def _share(self, move: np.ndarray) -> float:
+    """Returns how much of a move the first iteration makes; see `palpate.solver`."""
+    i, j = self.edge.T
+    length = np.linalg.norm(self.elastic.mesh.rest[j] - self.elastic.mesh.rest[i], axis=1)
+    change = (np.linalg.norm(move[j] - move[i], axis=1) / length).max()
+    return min(1.0, solver.AHEAD / max(change, 1e-300))

@@ -11,7 +11,9 @@ INK = "#333333"
 # One colour and marker a scheme, the same in every figure.
 STYLES = {
   "implicit": ("#08519c", "o", "-"),
-  "implicit, 3 Newton": ("#4292c6", "s", "-"),
+  "implicit, window": ("#6baed6", "o", "--"),
+  "midpoint": ("#000000", "s", "-"),
+  "midpoint, window": ("#969696", "s", "--"),
   "neumann": ("#9467bd", "^", "--"),
   "explicit": ("#2ca02c", "v", "--"),
   "native": ("#c1442e", "D", "-"),

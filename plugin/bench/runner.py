@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import csv
 import dataclasses
+import difflib
 import importlib
 import io
 import json
@@ -63,6 +64,8 @@ def add_arguments(parser: argparse.ArgumentParser, bench: Bench):
   add("--minutes", metavar="M", type=float, default=math.inf,
       help="stop after so long; --resume goes on from there")  # fmt: skip
   add("--draw", action="store_true", help="only draw figures and summary from the rows there are")
+  add("--only", metavar="CASE", action="append", default=[],
+      help="run this case of the CSV again and print its rows; may be repeated")  # fmt: skip
 
 
 def main(bench: Bench, args: argparse.Namespace) -> int:
@@ -76,6 +79,8 @@ def main(bench: Bench, args: argparse.Namespace) -> int:
     raise CommandError(f"cannot write to {str(out)!r}: {error.strerror}") from None
   path = out / f"{bench.name}.csv"
   complete = True
+  if args.only:
+    return _again(bench, out, args.short, args.only)
   if not args.draw:
     complete = execute(bench, out, args.short, args.resume, args.jobs, 60 * args.minutes)
   if not path.exists():
@@ -83,6 +88,25 @@ def main(bench: Bench, args: argparse.Namespace) -> int:
   for written in report(bench, out):
     print(written)
   return 0 if complete else 130
+
+
+def _again(bench: Bench, out: pathlib.Path, short: bool, names: list[str]) -> int:
+  """Runs single cases and prints their rows, which go into no file."""
+  cases = {case["case"]: case for stage in bench.stages(short) for case in stage}
+  for name in names:
+    if name not in cases:
+      near = difflib.get_close_matches(name, cases, 3, 0) or ["none"]
+      raise CommandError(f"no case {name!r} in this bench, the nearest are {', '.join(near)}")
+  register_quietly()
+  for name in names:
+    try:
+      rows = bench.run(cases[name], out.resolve())
+    except Exception as error:
+      raise CommandError(f"{name}: {type(error).__name__}: {error}", code=1) from None
+    for row in rows:
+      print(f"case {name}")
+      print("\n".join(f"  {key} {value}" for key, value in _plain(row).items()))
+  return 0
 
 
 def execute(
@@ -189,6 +213,11 @@ def read(path: pathlib.Path) -> list[Row]:
     for row in reader
     if None not in row and None not in row.values()
   ]
+
+
+def clock() -> float:
+  """Returns the CPU time of this thread [s]: of work on one thread, whatever else is running."""
+  return time.thread_time()
 
 
 def machine() -> dict:

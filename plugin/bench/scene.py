@@ -14,6 +14,7 @@ from ..organ import Organ
 
 RADIUS = 0.05  # of the shapes, about [m]
 PROBE = 0.006  # radius of the probe [m]
+FLEX = 0.0005  # radius of the flexes [m]
 SHAPES = ("sphere", "liver", "lobed")
 NATIVE = "native"
 
@@ -116,6 +117,9 @@ def build(
   contact: str = CONTACT,
   solver: str = "CG",
   mj_tolerance: float = 1e-8,
+  window: bool = False,
+  lumped: bool = False,
+  heavy: bool = False,
   **keys,
 ) -> mujoco.MjModel:
   """Returns a scene: the organ and, if `probe` says where, a ball on three slides.
@@ -123,8 +127,7 @@ def build(
   Args:
     mesh: the organ
     tissue: its constants
-    scheme: `implicit`, `neumann`, `explicit`; `native` for MuJoCo's flex; `passive` for a flex
-      without any forces
+    scheme: one of the plugin's; `native` for MuJoCo's flex; `passive` for a flex without any forces
     h: time step [s]
     probe: centre of the ball [m]; None for no ball
     joined: nodes that hang on the ball by connect equalities, which then touches nothing
@@ -132,6 +135,10 @@ def build(
     contact: MuJoCo's attributes of the contacts
     solver: MuJoCo's constraint solver
     mj_tolerance: of that solver
+    window: window coupling instead of nodal
+    heavy: a probe of 10,000 times the organ's mass, which contacts do not move between the places
+      that it is given, instead of half of it
+    lumped: masses in proportion to the nodes' area, as a window has them, instead of even ones
     **keys: further configuration keys of the plugin
   """
   inside = '<edge damping="1e-9"/>'
@@ -149,9 +156,11 @@ def build(
     settings = {"device": "cpu"} | tissue.keys() | keys
     if scheme != "implicit":
       settings["integrator"] = scheme
-    inside += '<plugin plugin="palpate.organ">'
-    inside += "".join(f'<config key="{k}" value="{v}"/>' for k, v in settings.items())
-    inside += "</plugin>"
+    if window:
+      settings |= {"window": "window", "mass": tissue.mass}
+    plugin = "".join(f'<config key="{k}" value="{v}"/>' for k, v in settings.items())
+    plugin = f'<plugin plugin="palpate.organ">{plugin}</plugin>'
+    inside += "" if window else plugin
   condim = f'condim="{3 if friction else 1}" friction="{friction or 1}"'
   ball = equality = ""
   if probe is not None:
@@ -161,31 +170,92 @@ def build(
       for name, axis in (("x", "1 0 0"), ("y", "0 1 0"), ("z", "0 0 1"))
     )
     ball = (
-      f'<body name="probe" pos="{join(probe)}">{slides}'
-      f'<geom size="{PROBE}" mass="{0.5 * tissue.mass}" {condim} {touches} {contact}/></body>'
+      f'<body name="probe" pos="{join(probe)}">{slides}<geom size="{PROBE}" '
+      f'mass="{(1e4 if heavy else 0.5) * tissue.mass}" {condim} {touches} {contact}/></body>'
     )
     if joined is not None:
       connects = (
         f'<connect body1="organ_{i}" body2="probe" anchor="0 0 0" {contact}/>' for i in joined
       )
       equality = f"<equality>{''.join(connects)}</equality>"
+  shape = (
+    f'type="direct" dim="2" radius="{FLEX}" point="{join(mesh.rest)}" '
+    f'element="{" ".join(map(str, mesh.elem.ravel()))}"'
+  )
+  contacts = f'<contact selfcollide="none" {condim} {contact}/>'
+  organ = f'<flexcomp name="organ" mass="{tissue.mass}" {shape}>{inside}{contacts}</flexcomp>'
   memory = max(200, 3 * mesh.nvert**2 // 10**6)  # MuJoCo's collision wants n^2 bytes and more [MB]
+  if window:
+    side = window_side(mesh)
+    memory = 200
+    organ = (
+      f'<body name="organ">{plugin}<flexcomp name="organ" rigid="true" {shape}>'
+      '<contact contype="0" conaffinity="0" selfcollide="none"/></flexcomp></body>'
+      f'<flexcomp name="window" type="grid" count="{side} {side} 1" spacing=".01 .01 .01" dim="2" '
+      f'mass="0.01" radius="{FLEX}">{inside}{contacts}</flexcomp>'
+    )
   xml = (
     f'<mujoco><option timestep="{h}" integrator="{integrator}" solver="{solver}" '
     f'tolerance="{mj_tolerance}" gravity="0 0 0"/><size memory="{memory}M"/>'
     '<extension><plugin plugin="palpate.organ"/></extension><worldbody>'
-    f'<flexcomp name="organ" type="direct" dim="2" mass="{tissue.mass}" radius="0.0005" '
-    f'point="{join(mesh.rest)}" element="{" ".join(map(str, mesh.elem.ravel()))}">{inside}'
-    f'<contact selfcollide="none" {condim} {contact}/></flexcomp>{ball}</worldbody>'
-    f"{equality}</mujoco>"
+    f"{organ}{ball}</worldbody>{equality}</mujoco>"
   )
   model = mujoco.MjModel.from_xml_string(xml)
+  if lumped and not window:
+    area = topology.vertex_areas(mesh.rest, mesh.elem)
+    bodies = model.dof_bodyid[node_dofs(model, mesh.nvert)[:, 0]]
+    model.body_mass[bodies] = tissue.mass * area / area.sum()
+    mujoco.mj_setConst(model, mujoco.MjData(model))
   if scheme == NATIVE and tissue.foundation:
     dofs = node_dofs(model, mesh.nvert)
     gain = tissue.foundation * topology.vertex_areas(mesh.rest, mesh.elem)
     model.jnt_stiffness[model.dof_jntid[dofs]] = gain[:, None]
     model.dof_damping[dofs] = tissue.damping * gain[:, None]
   return model
+
+
+def window_side(mesh: Mesh) -> int:
+  """Returns the side of a square window with room for what the probe may touch."""
+  edge = np.linalg.norm(mesh.rest[mesh.elem[:, 1]] - mesh.rest[mesh.elem[:, 0]], axis=1).mean()
+  area = topology.vertex_areas(mesh.rest, mesh.elem).mean()
+  reach = 1.5 * PROBE + 3 * edge
+  return int(np.ceil(np.sqrt(min(1.3 * np.pi * reach**2 / area, mesh.nvert)))) + 1
+
+
+class Nodes:
+  """Displacements and velocities of an organ's or a flex's nodes, whatever their coupling.
+
+  Args:
+    model: a scene of `build`
+    data: its data
+    mesh: its mesh
+    organ: the organ's handle; None for MuJoCo's own flex
+  """
+
+  def __init__(
+    self, model: mujoco.MjModel, data: mujoco.MjData, mesh: Mesh, organ: Organ | None = None
+  ):
+    self.data = data
+    self.organ = organ if organ is not None and organ.config.window else None
+    self.dofs = None if self.organ else node_dofs(model, mesh.nvert)
+    self.rest = mesh.rest
+
+  def state(self) -> tuple[np.ndarray, np.ndarray]:
+    """Returns displacement [m] and velocity [m/s], (nvert, 3) each."""
+    if self.organ:
+      return self.organ.displacement, self.organ.xvel
+    return self.data.qpos[self.dofs], self.data.qvel[self.dofs]
+
+  def contact_force(self) -> np.ndarray:
+    """Returns the force of constraints on each node in the last step [N], (nvert, 3)."""
+    return self.organ.contact_force if self.organ else self.data.qfrc_constraint[self.dofs]
+
+  def put(self, u: np.ndarray):
+    """Sets the displacement [m], (nvert, 3)."""
+    if self.organ:
+      self.organ.set_state(self.organ.xpos0 + u)
+    else:
+      self.data.qpos[self.dofs] = u
 
 
 def node_dofs(model: mujoco.MjModel, nvert: int) -> np.ndarray:

@@ -102,28 +102,42 @@ def test_error_bench_fills_its_files(error_rows):
   for name in ("error_press.png", "error_vibrate.png"):
     assert (out / name).read_bytes().startswith(b"\x89PNG")
   page = (out / "error.md").read_text()
-  assert "palpate bench error --short" in page and "wins" in page
+  assert "palpate bench error --short" in page and "A peer is faster" in page
 
 
-@pytest.mark.parametrize("run", ["implicit", "implicit, 3 Newton", "native"])
+@pytest.mark.parametrize("run", ["implicit", "implicit, window", "midpoint", "native"])
 def test_force_error_falls_with_the_time_step(error_rows, run):
   rows = sorted(only(error_rows[1], run=run, scene="press"), key=lambda r: r["h"])
   errors = [r["force_rms"] for r in rows]
   assert len(errors) == 3 and errors == sorted(errors)
 
 
-@pytest.mark.parametrize("scheme", ["implicit", "implicit, 3 Newton"])
+@pytest.mark.parametrize("scheme", ["implicit", "implicit, window"])
 def test_implicit_scheme_is_of_first_order(error_rows, scheme):
   rows = only(error_rows[1], run=scheme, scene="press")
-  assert error.order(rows, "force_rms", most=2.1e-3) >= 0.9
-  assert error.order(rows, "position_rms", most=2.1e-3) >= 0.9
+  assert error.order(rows, "force_rms", most=2.1e-3) >= 0.95
+  assert error.order(rows, "position_rms", most=2.1e-3) >= 0.95
 
 
-def test_implicit_scheme_solves_its_step_to_the_tolerance(error_rows):
-  for row in only(error_rows[1], run="implicit"):
-    assert row["algebraic"] < 1e-3  # tolerance 1e-4 in another norm
-  (row,) = only(error_rows[1], run="implicit, 3 Newton", scene="press", h=1e-3)
-  assert row["nonlinear"] < 1e-3
+def test_midpoint_is_of_second_order_in_vibration(error_rows):
+  rows = only(error_rows[1], run="midpoint", scene="vibrate")
+  assert error.order(rows, "position_rms") >= 1.8
+
+
+def test_windows_have_the_error_of_nodal_coupling(error_rows):
+  for scheme in ("implicit", "midpoint"):
+    for row in only(error_rows[1], run=f"{scheme}, window"):
+      (nodal,) = only(error_rows[1], run=scheme, scene=row["scene"], h=row["h"])
+      assert row["force_rms"] == pytest.approx(nodal["force_rms"], rel=0.05)
+
+
+def test_steps_are_solved_to_the_tolerance(error_rows):
+  for scheme in ("implicit", "midpoint"):
+    for row in only(error_rows[1], run=scheme):
+      assert row["algebraic"] < 1e-3  # tolerance 1e-4 in another norm
+  # One iteration, and yet near the converged step.
+  (row,) = only(error_rows[1], run="implicit", scene="press", h=1e-3)
+  assert row["nonlinear"] < 0.01
 
 
 def test_implicit_force_is_closer_than_native_at_the_same_time_step(error_rows):
@@ -141,6 +155,7 @@ def test_implicit_force_is_closer_than_native_at_the_same_time_step(error_rows):
 def test_stability_bench_judges_every_case_and_resumes(tmp_path, capsys, monkeypatch):
   whole = stability.stages(short=True)
   few = [[c for c in whole[0] if c["scheme"] == "implicit" and c["nodes"] == 162][-3:]]
+  assert {c["coupling"] for c in few[0]} == {"nodal", "window"}
   bench = stability.BENCH
   small = type(bench)(**{**vars(bench), "stages": lambda short: few})
   assert not runner.execute(small, tmp_path, short=True, seconds=0)
@@ -163,7 +178,9 @@ def test_stability_bench_judges_every_case_and_resumes(tmp_path, capsys, monkeyp
 def test_stability_bench_covers_what_it_says():
   cases = stability.stages(short=False)[0]
   ours = [c for c in cases if c["scheme"] == "implicit"]
-  assert len(ours) >= 1000
+  assert sum(c["coupling"] == "nodal" for c in ours) >= 1000
+  assert sum(c["coupling"] == "window" for c in ours) >= 500
+  assert {c["side"] for c in cases} == set(stability.SIDES)
   assert len({c["case"] for c in cases}) == len(cases)
   assert {c["nodes"] for c in ours} == {162, 642, 2562, 10242}
   assert {c["shape"] for c in ours} >= set(scene.SHAPES) and len(scene.SHAPES) == 3
@@ -175,19 +192,55 @@ def test_stability_bench_covers_what_it_says():
   assert stability.stages(short=False) == stability.stages(short=False)
 
 
+def test_stability_bench_loses_little_when_time_runs_out():
+  # The maps and the wild starts come first, then draws in blocks, each over the whole hypercube.
+  cases = stability.stages(short=False)[0]
+  cube = [c for c in cases if c["set"] == "hypercube"]
+  assert all(c["set"] != "hypercube" for c in cases[: len(cases) - len(cube)])
+  first = cube[: len(cube) // 10]
+  assert {c["nodes"] for c in first} == {162, 642, 2562, 10242}
+  assert {c["side"] for c in first} >= {"implicit", "implicit, window", "MuJoCo flex"}
+
+
+def _judged(tmp_path, side, **what):
+  scheme, coupling = stability.SIDES[side]
+  case = {"set": "map", "scheme": scheme, "coupling": coupling, "side": side, "case": "x"}
+  (row,) = stability.run(stability.USUAL | case | {"nodes": 162} | what, tmp_path)
+  return row
+
+
+@pytest.mark.parametrize("side", ["implicit", "implicit, window"])
 @pytest.mark.parametrize(("h", "young"), [(5e-4, 1e3), (1e-3, 1e5), (5e-3, 1e4), (5e-3, 1e6)])
-def test_a_press_in_the_usual_range_comes_back_to_rest(tmp_path, h, young):
-  case = stability.USUAL | {"set": "map", "scheme": "implicit", "h": h, "young": young}
-  (row,) = stability.run(case | {"nodes": 162, "case": "x"}, tmp_path)
+def test_a_press_in_the_usual_range_comes_back_to_rest(tmp_path, side, h, young):
+  row = _judged(tmp_path, side, h=h, young=young)
   assert row["verdict"] in ("rest", "moving")
-  assert row["growth"] <= 1.0
+  assert row["growth"] <= 1.0 and row["excess"] < 0.05
   assert row["force_N"] > 0
 
 
+def test_energy_that_contacts_give_is_not_called_growth(tmp_path):
+  # A fast probe loads the organ within a few steps: its energy is the contacts' work.
+  row = _judged(tmp_path, "implicit", h=1e-3, young=1e5, speed=1.0)
+  assert row["excess"] < 0.05 and row["verdict"] not in stability.FAILURES
+
+
 def test_an_explicit_step_that_blows_up_is_called_so(tmp_path):
-  case = stability.USUAL | {"set": "map", "scheme": "explicit", "h": 1e-2, "young": 1e6}
-  (row,) = stability.run(case | {"nodes": 162, "case": "x"}, tmp_path)
-  assert row["verdict"] in stability.FAILURES
+  assert _judged(tmp_path, "explicit", h=1e-2, young=1e6)["verdict"] in stability.FAILURES
+
+
+def test_one_case_of_the_stability_bench_is_run_again_by_name(tmp_path, capsys):
+  (case,) = [
+    c["case"]
+    for c in stability.stages(short=True)[0]
+    if c["set"] == "map" and c["side"] == "implicit" and c["h"] == 1e-3 and c["young"] == 1e3
+  ]
+  for _ in range(2):
+    assert command("stability", "--short", "--only", case, "--out", tmp_path) == 0
+  found = [line for line in capsys.readouterr().out.splitlines() if "wall_s" not in line]
+  assert found[: len(found) // 2] == found[len(found) // 2 :]
+  assert f"case {case}" in found and any(line.startswith("  verdict ") for line in found)
+  assert command("stability", "--short", "--only", "map-nothing", "--out", tmp_path) == 2
+  assert "the nearest are map-" in capsys.readouterr().err
 
 
 # Thesis and skipping.
@@ -215,6 +268,7 @@ def test_skipping_bench_gives_a_row_to_every_feature(tmp_path):
   rows = rows_of("skipping", tmp_path)
   left_out = {r["feature"].split(" ")[0] for r in rows}
   assert {"nothing", "bending", "volume", "foundation", "contact", "readback"} <= left_out
+  assert "dofs" in left_out  # windows
   assert all(math.isfinite(r["with_ms"]) and r["with_ms"] > 0 for r in rows)
 
 
@@ -227,7 +281,7 @@ def test_a_case_that_fails_or_dies_is_noted_and_the_rest_goes_on(tmp_path):
       {"case": "bad", "kind": "run", "scene": "press", "nodes": 162, "elements": "membrane",
        "h": 1e-3, "short": 1},  # has no reference
       {"case": "good", "kind": "reference", "scene": "vibrate", "nodes": 162,
-       "elements": "membrane", "level": 8},
+       "elements": "membrane", "level": 4},
     ]]}
   )  # fmt: skip
   assert runner.execute(bench, tmp_path)
@@ -250,7 +304,7 @@ def test_every_bench_is_a_command_with_help(name, capsys):
     command(name, "--help")
   assert end.value.code == 0
   text = capsys.readouterr().out
-  for option in ("--short", "--resume", "--jobs", "--minutes", "--out"):
+  for option in ("--short", "--resume", "--jobs", "--minutes", "--only", "--out"):
     assert option in text
 
 

@@ -54,8 +54,8 @@ def reference():
 
 @pytest.mark.parametrize(
   ("h", "newton", "allowed"),
-  # Share of the peak; lagging contact force and the one Newton iteration leave this.
-  [(5e-4, 1, 0.01), (1e-3, 1, 0.01), (2e-3, 1, 0.02), (1e-3, 3, 0.01)],
+  # Share of the peak; half of the square is the first touch, where the ball bounces on one node.
+  [(5e-4, 1, 0.005), (1e-3, 1, 0.006), (2e-3, 1, 0.013), (1e-3, 3, 0.006)],
 )
 def test_the_press_of_the_explicit_reference_is_reproduced(reference, device, h, newton, allowed):
   script = runpy.run_path(str(REFERENCE.with_suffix(".py")))

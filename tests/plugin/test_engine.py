@@ -517,7 +517,7 @@ def _refused(scenes, xml, *words):
     ("poisson", "0.5", ("poisson is '0.5'", "[0, 0.5)")),
     ("stiffness", "3", ("stiffness is 3", "elements='spring'")),
     ("elements", "spring", ("stiffness is missing",)),
-    ("integrator", "RK4", ("integrator is 'RK4'", "'implicit' or 'neumann' or 'explicit'")),
+    ("integrator", "RK4", ("integrator is 'RK4'", "'implicit' or 'midpoint' or 'neumann'")),
     ("device", "cuda:77", ("device is 'cuda:77'", "'cpu'")),
     ("device", "gpu", ("device is 'gpu'", "'cpu'")),
   ],

@@ -78,8 +78,11 @@ def reference(duration: float = DURATION) -> np.ndarray:
     edge = rest[j] + u[j] - rest[i] - u[i]
     length = np.linalg.norm(edge, axis=1)
     along = edge / length[:, None]
-    rate = ((v[j] - v[i]) * along).sum(axis=1)
-    pull = (STIFFNESS * (length - length0 + DAMPING * rate))[:, None] * along
+    # Damping on the stiffness matrix, along the spring and, where it is stretched, across it.
+    rate = v[j] - v[i]
+    stretch = np.maximum(1 - length0 / length, 0)[:, None]
+    rate = (1 - stretch) * (rate * along).sum(axis=1)[:, None] * along + stretch * rate
+    pull = STIFFNESS * ((length - length0)[:, None] * along + DAMPING * rate)
     force = -FOUNDATION * area * (u + DAMPING * v)
     for c in range(3):
       force[:, c] += np.bincount(i, pull[:, c], len(rest)) - np.bincount(j, pull[:, c], len(rest))
