@@ -131,7 +131,7 @@ def _centre_world(
 ): ...
 
 
-@wp.kernel(enable_backward=False, launch_bounds=simd.BOUNDS)
+@wp.kernel(enable_backward=False, launch_bounds=simd.BLOCK)
 def _centre(
   nthread: int,
   nslice: int,
@@ -297,7 +297,7 @@ def _midpoint(s: Surface, d: State):
     wp.launch(
       _centre,
       dim=(d.nworld, nthread),
-      block_dim=simd.BLOCK,
+      block_dim=simd.block(s.device, s.nslice),
       inputs=[nthread, s.nslice, undo, d.dvel_warm],
       outputs=[d.step, d.partial],
       device=s.device,
