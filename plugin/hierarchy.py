@@ -49,7 +49,7 @@ def build(mesh: Mesh, least: int) -> list[Coarse]:
   vert = np.arange(mesh.nvert)
   while mesh.nvert > least:
     start = mesh.nvert
-    weight = sparse.eye_array(start, format="csr")
+    weight = sparse.csr_array(sparse.eye_array(start))
     for _ in range(_ROUNDS):
       if mesh.nvert <= max(_RATIO * start, least):
         break
@@ -225,11 +225,10 @@ def _new_edges(mesh: Mesh, vert: np.ndarray, onto: np.ndarray) -> np.ndarray:
 
 def _prune(weight: sparse.csr_array) -> sparse.csr_array:
   """Returns `weight` with the largest entries of each row, scaled to the same sum."""
-  coo = weight.tocoo()
-  order = np.lexsort((-coo.data, coo.row))
-  row, col, value = coo.row[order], coo.col[order], coo.data[order]
-  count = np.bincount(row, minlength=weight.shape[0])
-  keep = np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count) < _ENTRIES
-  out = sparse.csr_array((value[keep], (row[keep], col[keep])), shape=weight.shape)
-  scale = weight.sum(axis=1) / np.maximum(out.sum(axis=1), 1e-300)
-  return sparse.csr_array(sparse.diags_array(scale) @ out)
+  begin, data = np.asarray(weight.indptr), np.asarray(weight.data)
+  row = np.repeat(np.arange(len(begin) - 1), np.diff(begin))
+  order = np.lexsort((np.negative(data), row))
+  keep = order[np.arange(len(row)) - begin[row] < _ENTRIES]
+  row, col, value = row[keep], np.asarray(weight.indices)[keep], data[keep]
+  value = value / np.bincount(row, value, len(begin) - 1)[row]
+  return sparse.csr_array((value, (row, col)), shape=weight.shape)

@@ -8,8 +8,8 @@ from .hierarchy import Coarse
 from .simd import LANES
 
 # Condition number from which cycles take less time than the iterations of block Jacobi that they
-# save (tests/benchmarks/solver.py); on CUDA a cycle's many meetings weigh more.
-_THRESHOLD = {"cpu": 50.0, "cuda": 200.0}
+# save, with the warm start of a running simulation (tests/benchmarks/solver.py has a cold one).
+THRESHOLD = 200.0
 # Interval of the smoother, as greatest eigenvalue of D^-1 A and its ratio to the lower end, by
 # degree. A membrane's is 2.3 on good meshes, at most 3 (three corners an element), and bending
 # raises it to 3.4; the smoother stays a contraction up to the sum of both ends.
@@ -94,11 +94,6 @@ def rates(parts: list[dict]) -> np.ndarray:
   return out
 
 
-def threshold(device) -> float:
-  """Returns the condition number from which the preconditioner is used on a device."""
-  return _THRESHOLD["cuda" if device.is_cuda else "cpu"]
-
-
 def transfer(coarse: list[Coarse], parts: list[dict], pinned: list[np.ndarray]) -> dict:
   """Returns the arrays of `Levels` that carry residuals down and corrections up.
 
@@ -126,7 +121,8 @@ def transfer(coarse: list[Coarse], parts: list[dict], pinned: list[np.ndarray]) 
     begin = LANES * (first[k - 1] if k else 0)
     down.append(_ellpack(own, _offset(fine + begin), value, nslice[k + 1]))
     up.append(_ellpack(fine, _offset(own + LANES * first[k]), value, nslice[k]))
-  up.append(_ellpack(*np.zeros((3, 0), np.int64), nslice[-1]))
+  none = np.zeros(0, np.int64)
+  up.append(_ellpack(none, none, none, nslice[-1]))
   out = {"source": source, "share": share, "slice_adr": first.astype(np.int32)}
   for name, lists in (("down", down), ("up", up)):
     size = np.concatenate([width for width, _, _ in lists])

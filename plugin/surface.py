@@ -18,7 +18,7 @@ from .types import Levels, Surface
 
 # With fewer nodes the CPU solves a step before a GPU has met its barriers (benchmarks/solver.py).
 _CUDA_FROM = 2000
-_COARSEST = 64  # nodes of the coarsest mesh of the multilevel preconditioner
+COARSEST = 64  # nodes of the coarsest mesh of the multilevel preconditioner
 
 
 def _pad(array: np.ndarray, fill=0, least=0) -> np.ndarray:
@@ -61,9 +61,9 @@ def make(
   target = resolve_device(device, mesh.nvert)
   finest = arrays(mesh, config, pinned)
   made = _surface(mesh, config, finest, target)
-  if scale * levels.condition(finest) < levels.threshold(target):
+  if scale * levels.condition(finest) < levels.THRESHOLD:
     return made
-  coarse = hierarchy.build(mesh, _COARSEST)
+  coarse = hierarchy.build(mesh, COARSEST)
   if not coarse:
     return made
   young = levels.young(np.broadcast_to(config.young, mesh.nelem), mesh, coarse)
@@ -76,7 +76,7 @@ def make(
   made.levels = Levels(
     nlevel=len(coarse),
     nodes=int((~pinned).sum()),
-    threshold=levels.threshold(target),
+    threshold=levels.THRESHOLD,
     surface=_surface(mesh, config, levels.join(parts[1:]), target),
     **put,
   )

@@ -1,13 +1,15 @@
 """Times the implicit step alone, device by device, and checks CUDA against the CPU first.
 
-    python tests/benchmarks/solver.py --device cuda:0 --nodes 16384 65536 -o results
+    python tests/benchmarks/solver.py --device cuda:0 --nodes 678 16386 65538 262146 -o results
 
 Each size is an octahedral sphere of radius 5 cm pressed over a 6 mm patch (E = 30 kPa, t = 2 mm,
-0.1 kg, h = 1 ms) and solved from a cold start; the median of graph replays is reported.
+0.1 kg, h = 1 ms) and solved from a cold start with each preconditioner; the median of graph replays
+is reported. `condition` is what the choice between them goes by, `auto` what it is.
 """
 
 import argparse
 import csv
+import itertools
 import pathlib
 import sys
 import time
@@ -15,7 +17,7 @@ import time
 import numpy as np
 import palpate
 import warp as wp
-from palpate import config, elastic, mesh, solver, surface, types
+from palpate import config, elastic, levels, mesh, solver, surface, types
 from palpate.models import grid
 
 H = 1e-3
@@ -27,7 +29,9 @@ VARIANTS = {
   "closed": {"bulk": 1e4, "pressure": 50.0, "foundation": 1e4},
   "newton": {"newton": 3},
   "spring": {"elements": "spring", "stiffness": 200.0, "bend": 0.0},
+  "stiff": {"young": (3e6,)},
 }
+PRECONDITIONERS = {"jacobi": np.inf, "multilevel": 0.0}  # condition number to use cycles from
 
 
 def sphere(nodes: int) -> mesh.Mesh:
@@ -36,11 +40,13 @@ def sphere(nodes: int) -> mesh.Mesh:
   return mesh.build("sphere", np.asarray(made[0]) * RADIUS, np.asarray(made[1]))
 
 
-def make(shape: mesh.Mesh, device: str, **keys) -> tuple[types.Surface, types.State]:
-  """Returns the constants and a fresh state of an organ of that shape."""
-  cfg = config.Config(young=(3e4,), poisson=0.3, device=device, **keys)
-  pinned = shape.rest[:, 2] < -0.9 * RADIUS
-  s = surface.make(shape, cfg, pinned, device)
+def make(
+  shape: mesh.Mesh, device: str, scale: float = np.inf, **keys
+) -> tuple[types.Surface, types.State]:
+  """Returns the constants and a fresh state of an organ of that shape, with coarse meshes."""
+  cfg = config.Config(**({"young": (3e4,), "poisson": 0.3, "device": device} | keys))
+  pinned = shape.rest[:, 2] < shape.rest[:, 2].min() + 0.05 * np.ptp(shape.rest[:, 2])
+  s = surface.make(shape, cfg, pinned, device, scale)
   d = types.make_state(s)
   with wp.ScopedDevice(s.device):
     elastic.calibrate(s, d)
@@ -86,47 +92,80 @@ def agreement(device: str) -> float:
   v = 0.05 * rng.standard_normal(shape.rest.shape)
   worst = 0.0
   for name, keys in VARIANTS.items():
-    results = []
-    for where in ("cpu", device, device):
-      s, d = make(shape, where, tolerance=1e-6, iterations=500, **keys)
-      put(s, d.pos, u)
-      put(s, d.vel, v)
-      put(s, d.force_ext, load(shape))
-      solver.step(s, d)
-      results.append((get(s, d.dvel), d.status.numpy()[0]))
-    free = np.linalg.norm(results[0][0])
-    difference = np.linalg.norm(results[0][0] - results[1][0]) / free
-    repeats = np.array_equal(results[1][0], results[2][0])
-    worst = max(worst, difference if repeats else np.inf)
-    print(
-      f"{name:10s} difference {difference:.2e}, repeats to the bit: {repeats}, "
-      f"iterations {results[0][1][0]:.0f} / {results[1][1][0]:.0f}"
-    )
+    for kind, threshold in PRECONDITIONERS.items():
+      results = []
+      for where in ("cpu", device, device):
+        s, d = make(shape, where, tolerance=1e-6, iterations=1000, **keys)
+        s.levels.threshold = threshold
+        put(s, d.pos, u)
+        put(s, d.vel, v)
+        put(s, d.force_ext, load(shape))
+        solver.step(s, d)
+        results.append((get(s, d.dvel), d.status.numpy()[0].copy()))
+      free = np.linalg.norm(results[0][0])
+      difference = np.linalg.norm(results[0][0] - results[1][0]) / free
+      repeats = np.array_equal(results[1][0], results[2][0])
+      worst = max(worst, difference if repeats else np.inf)
+      print(
+        f"{name:10s} {kind:10s} difference {difference:.2e}, repeats to the bit: {repeats}, "
+        f"iterations {results[0][1][0]:.0f} / {results[1][1][0]:.0f}",
+        flush=True,
+      )
   return worst
 
 
-def measure(device: str, nodes: int, tolerance: float, bend: float, repeat: int) -> dict:
-  """Returns the figures of one size."""
+def measure(device: str, nodes: int, tolerance: list[float], bend: float, args) -> list[dict]:
+  """Returns the figures of one size, a row for each tolerance and preconditioner."""
   shape = sphere(nodes)
   start = time.perf_counter()
-  s, d = make(shape, device, tolerance=tolerance, iterations=1000, bend=bend)
+  s, d = make(shape, device, iterations=1000, bend=bend)
   wp.synchronize_device(s.device)
   made = time.perf_counter() - start
+  coarse = s.levels
+  condition = float(d.step.numpy()[0, 1] / (MASS / s.nvert) * coarse.rate.numpy()[0, 0])
+  auto = "multilevel" if condition >= levels.THRESHOLD else "jacobi"
+  coarse.threshold = PRECONDITIONERS["multilevel"]
+  press(shape, s, d, 20)
+  rows = []
+  for limit in tolerance:
+    for kind in args.preconditioner:
+      s.tolerance = limit
+      s.levels = coarse if kind == "multilevel" else None
+      row = {"device": device, "nodes": s.nvert, "bend": bend, "tolerance": limit}
+      row |= {"preconditioner": kind}
+      row |= timed(s, d, args.repeat)
+      row |= {"condition": condition, "auto": auto, "make_s": made, "bytes_a_node": size(s, d)}
+      rows.append(row)
+      print({k: f"{v:.4g}" if isinstance(v, float) else v for k, v in row.items()}, flush=True)
+  return rows
+
+
+def press(shape: mesh.Mesh, s: types.Surface, d: types.State, steps: int):
+  """Moves the organ some steps under `load`."""
   put(s, d.force_ext, load(shape))
   graph = record(s, lambda: solver.step(s, d))
   u, v = np.zeros_like(shape.rest), np.zeros_like(shape.rest)
-  for _ in range(20):  # a pressed state
+  for _ in range(steps):
     wp.capture_launch(graph)
     v += get(s, d.dvel)
     u += H * v
     put(s, d.pos, u)
     put(s, d.vel, v)
+
+
+def timed(s: types.Surface, d: types.State, repeat: int) -> dict:
+  """Returns medians of a step, its assembly and its solve in ms, iterations and residual."""
+
+  def assemble():
+    elastic.assemble(s, d, elastic.Stage.FIRST)
+    if s.levels is not None:
+      solver.multilevel().assemble(s, d)
+
   parts = {
-    "step": graph,
-    "assemble": record(s, lambda: elastic.assemble(s, d, elastic.Stage.FIRST)),
+    "step": record(s, lambda: solver.step(s, d)),
+    "assemble": record(s, assemble),
     "solve": record(s, lambda: solver.solve(s, d, first=True)),
   }
-  row = {"device": device, "nodes": len(shape.rest), "bend": bend, "tolerance": tolerance}
   times = {name: [] for name in parts}
   for _ in range(repeat):
     for name, part in parts.items():
@@ -135,13 +174,21 @@ def measure(device: str, nodes: int, tolerance: float, bend: float, repeat: int)
       wp.capture_launch(part)
       wp.synchronize_device(s.device)
       times[name].append(time.perf_counter() - start)
-  row |= {f"{name}_ms": 1e3 * float(np.median(values)) for name, values in times.items()}
   status = d.status.numpy()[0]
-  row |= {"iterations": int(status[0]), "residual": float(status[1]), "make_s": made}
-  size = sum(
-    a.size * 4 for x in (s, d) for a in vars(x).values() if isinstance(a, wp.array)
-  )
-  return row | {"bytes_a_node": round(size / len(shape.rest))}
+  out = {f"{name}_ms": 1e3 * float(np.median(values)) for name, values in times.items()}
+  return out | {"iterations": int(status[0]), "residual": float(status[1])}
+
+
+def size(s: types.Surface, d: types.State) -> int:
+  """Returns the bytes a node of all arrays, those of the coarse meshes where they are in use."""
+  parts = [s, d]
+  if s.levels is not None:
+    parts += [s.levels, s.levels.surface, d.coarse]
+  arrays = {id(a): a for x in parts for a in vars(x).values() if isinstance(a, wp.array)}
+  if s.levels is None:
+    for unused in (d.e, d.en, d.t):
+      arrays.pop(id(unused))
+  return round(sum(a.size * 4 for a in arrays.values()) / s.nvert)
 
 
 def main():
@@ -151,17 +198,18 @@ def main():
   parser.add_argument("--nodes", type=int, nargs="+", default=[642, 2562, 10242])
   parser.add_argument("--tolerance", type=float, nargs="+", default=[1e-4])
   parser.add_argument("--repeat", type=int, default=50)
+  parser.add_argument("--bend", type=float, nargs="+", default=[0.0, 1.0])
+  parser.add_argument(
+    "--preconditioner", nargs="+", choices=PRECONDITIONERS, default=list(PRECONDITIONERS)
+  )
   parser.add_argument("-o", "--output", type=pathlib.Path)
   args = parser.parse_args()
   print(f"palpate {palpate.__version__}, warp {wp.__version__}, {wp.get_device(args.device).name}")
   if args.device != "cpu" and agreement(args.device) > 1e-4:
     sys.exit(f"{args.device} disagrees with the CPU")
   rows = []
-  for nodes in args.nodes:
-    for bend in (0.0, 1.0):
-      for tolerance in args.tolerance:
-        rows.append(measure(args.device, nodes, tolerance, bend, args.repeat))
-        print({k: f"{v:.4g}" if isinstance(v, float) else v for k, v in rows[-1].items()})
+  for nodes, bend in itertools.product(args.nodes, args.bend):
+    rows += measure(args.device, nodes, args.tolerance, bend, args)
   if args.output:
     args.output.mkdir(parents=True, exist_ok=True)
     path = args.output / f"solver_{args.device.split(':')[0]}.csv"
