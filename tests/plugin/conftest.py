@@ -150,11 +150,13 @@ class Scenes:
 
   @staticmethod
   def settle(model, data, organ, steps=200, still=1e-5):
-    """Steps until a step moves no vertex by more than `still` of the greatest displacement."""
+    """Steps until two steps move no vertex by more than `still` of the greatest displacement."""
+    quiet = 0
     for _ in range(steps):
       mujoco.mj_step(model, data)
       moved = np.abs(data.qvel).max() * model.opt.timestep
-      if moved <= still * np.abs(organ.displacement).max():
+      quiet = quiet + 1 if moved <= still * np.abs(organ.displacement).max() else 0
+      if quiet == 2:
         return
     raise AssertionError(f"still moving by {moved} m a step after {steps} steps")
 
