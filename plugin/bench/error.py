@@ -291,6 +291,7 @@ class _Check:
     self.film, self.scheme, self.newton, self.twin = film, scheme, newton, twin
     mesh = film.mesh
     model, nodes = film.model, film.state.dofs
+    assert nodes is not None  # all nodes have dofs here
     mass = model.body_mass[model.dof_bodyid[nodes[:, 0]]]
     elastic = exact.Elastic(mesh, _config(case["elements"]))
     self.solve = exact.Step(elastic, mass, np.ones(mesh.nvert, bool))

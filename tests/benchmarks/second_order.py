@@ -20,6 +20,8 @@ from palpate.bench import error, exact, plots, runner, scene
 from scipy import sparse
 from scipy.sparse import linalg
 
+ABOUT = str(__doc__)
+
 NODES = 162
 SOLVES = {"implicit": 1, "midpoint": 1, "BDF2": 1, "TR-BDF2": 2}
 COLOURS = {"implicit": "#08519c", "midpoint": "#000000", "BDF2": "#c1442e", "TR-BDF2": "#2ca02c"}
@@ -75,7 +77,7 @@ class Scheme:
     if self.name == "implicit" or (self.name == "BDF2" and self.past is None):
       v1 = v + self.solve(x + h * v, v, lambda F: h * (F + f), h * h, h)
       return v1, v1
-    if self.name == "BDF2":
+    if self.name == "BDF2" and self.past is not None:
       c = 2 / 3 * h
       back = (v - self.past[1]) / 3
       guess = (4 * x - self.past[0]) / 3 + c * v
@@ -175,7 +177,7 @@ def report(rows: list[dict], out: pathlib.Path):
   figure, axes = plots.grid(1, 2, width=8.6, height=3.8)
   about = runner.machine() | {"cases": len(rows), "done": len(rows)}
   lines = ["# Schemes of second order, in float64", "", runner.caption(about), ""]
-  lines += ["    python tests/benchmarks/second_order.py -o FOLDER", "", __doc__.split("\n\n")[2]]
+  lines += ["    python tests/benchmarks/second_order.py -o FOLDER", "", ABOUT.split("\n\n")[2]]
   lines += ["", "Errors in % of the reference's peak: contact force, taken for that of the better "
             "end of its step, or positions. TR-BDF2 has two solves a step.", ""]  # fmt: skip
   table = []
@@ -201,7 +203,7 @@ def report(rows: list[dict], out: pathlib.Path):
 
 def main():
   """Runs all and writes the files."""
-  parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+  parser = argparse.ArgumentParser(description=ABOUT.splitlines()[0])
   parser.add_argument("-o", "--out", type=pathlib.Path, default=pathlib.Path("out", "bench"))
   parser.add_argument("--draw", action="store_true", help="only draw the rows there are")
   args = parser.parse_args()
