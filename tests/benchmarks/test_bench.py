@@ -249,12 +249,12 @@ def test_one_case_of_the_stability_bench_is_run_again_by_name(tmp_path, capsys):
 def test_thesis_bench_measures_every_scheme(tmp_path):
   out = tmp_path
   bench = type(thesis.BENCH)(
-    **{**vars(thesis.BENCH), "stages": lambda short: [thesis.stages(True)[0][:5]]}
+    **{**vars(thesis.BENCH), "stages": lambda short: [thesis.stages(True)[0][:6]]}
   )
   assert runner.execute(bench, out, short=True)
   runner.report(bench, out)
   rates = [r for r in rows_of("thesis", out) if r["kind"] == "rate" and r["device"] == "cpu"]
-  assert {r["scheme"] for r in rates} == {"implicit", "neumann", "explicit"}
+  assert {r["scheme"] for r in rates} == {"implicit", "neumann", "explicit", thesis.WINDOW}
   assert all(r["rate_hz"] > 0 and 0 < r["integration_ms"] < 1e3 for r in rates)
   traces = [r for r in rows_of("thesis", out) if r["kind"] == "trace"]
   for scheme in ("implicit", "explicit"):
