@@ -47,7 +47,7 @@ def add_windows(
     organ: name of the flexcomp
     tools: what each window follows: a body with all that hangs on it, or several; None for one
       window that follows all that moves and collides
-    nodes: slots of each window; None sizes it from the tools' geoms and the organ's edges
+    nodes: most nodes in each window; None sizes it from the tools' geoms and the organ's edges
 
   Returns:
     Names of the windows.
@@ -92,7 +92,7 @@ def add_windows(
   edge = float(np.linalg.norm(rest[elem[:, [1, 2, 0]]] - rest[elem], axis=2).mean())
   every = list(itertools.chain(*followed)) if groups else [g for g in colliding if _moves(g)]
   # Each window has room for all tools, for when they meet.
-  size = min(nodes or _slots(every, edge, flex.radius), len(rest))
+  size = 1 + min(nodes or _slots(every, edge, flex.radius), len(rest))  # one slot stays free
   for name in names:
     _add_window(spec, flex, surface, name, size, meets, edge, config)
   _warn_of_others(organ, colliding, groups)

@@ -327,7 +327,9 @@ def _windows(model, m, instance, name, config, mesh, mass, place) -> Windows:
     elem_adr.append(int(mjstruct.view(m.flex_elemdataadr, m.nflex, np.int32)[f]))
     elem_num.append(int(mjstruct.view(m.flex_elemnum, m.nflex, np.int32)[f]))
   # At rest the windows stand on patches of their own: their bodies move there, so that qpos0 fits.
-  home = _home_slots(mesh.elem, mesh.nvert, sizes)
+  # The last slot stays free; a patch of n nodes has up to 2 n - 4 triangles: see `window_slots`.
+  room = [min(n - 1, t // 2 + 2) for n, t in zip(sizes, elem_num, strict=True)]
+  home = _home_slots(mesh.elem, mesh.nvert, sizes, room)
   used = home >= 0
   body, offset, turn = (np.concatenate(parts) for parts in (body, offsets, turns))
   body_pos = mjstruct.view(m.body_pos, (m.nbody, 3))
@@ -559,7 +561,7 @@ def _addresses(m, name: str, body: np.ndarray, free: np.ndarray):
   return dofadr, qposadr
 
 
-def _home_slots(elem: np.ndarray, nvert: int, sizes: list[int]) -> np.ndarray:
+def _home_slots(elem: np.ndarray, nvert: int, sizes: list[int], room: list[int]) -> np.ndarray:
   """Returns the default node of each slot: disjoint patches grown over the surface, (W,)."""
   neighbours: list[set[int]] = [set() for _ in range(nvert)]
   for a, b, c in elem:
@@ -568,11 +570,11 @@ def _home_slots(elem: np.ndarray, nvert: int, sizes: list[int]) -> np.ndarray:
     neighbours[c] |= {a, b}
   used: set[int] = set()
   out = []
-  for size in sizes:
+  for size, most in zip(sizes, room, strict=True):
     seed = next(i for i in range(nvert) if i not in used)
     patch, queue = [], [seed]
     used.add(seed)
-    while queue and len(patch) < size:
+    while queue and len(patch) < most:
       i = queue.pop(0)
       patch.append(i)
       for j in sorted(neighbours[i] - used):

@@ -135,6 +135,9 @@ _STATE = f"""
     const double n = slots[k];
     return n == 0.0 ? s.home.data[k] : n >= 1.0 && n <= s.nvert ? (int)n - 1 : -1;
   }};
+  auto parked = [&](int k, int c) -> double {{
+    return s.qhome.data[3 * k + c] + {AWAY} * s.frame.data[6 + c];
+  }};
   auto stand = [&](int k, int i, const double* u, const double* v) {{
     const int adr = s.dofadr.data[k], qadr = s.qposadr.data[k], body = s.bodyid.data[k];
     const double own = s.body_mass.data[body];
@@ -174,20 +177,11 @@ _TRIANGLES = f"""
           ++count;
         }}
       }}
-      if (count == 0) {{
-        // Nothing to touch: all triangles are one point, out of everybody's way.
-        int k = first;
-        while (k + 1 < last && s.placed.data[k] >= 0) ++k;
-        for (int c = 0; c < 3; ++c) {{
-          list[c] = k - first;
-          if (s.placed.data[k] >= 0) continue;
-          s.qpos.data[s.qposadr.data[k] + c] = s.qhome.data[3 * k + c]
-            + {AWAY} * s.frame.data[6 + c];
-        }}
-        count = 1;
-      }}
-      for (int q = count; q < most; ++q)
-        for (int c = 0; c < 3; ++c) list[3 * q + c] = list[c];
+      // Triangles to spare are points of the last slot, out of everybody's way: repeating one of the
+      // others would multiply its contacts.
+      const int spare = last - 1;
+      for (int c = 0; c < 3; ++c) s.qpos.data[s.qposadr.data[spare] + c] = parked(spare, c);
+      for (int q = 3 * count; q < 3 * most; ++q) list[q] = spare - first;
     }}
   }};
 """
@@ -226,6 +220,13 @@ _TRIANGLES = f"""
       push[1 + c] = i < 0 ? f : f + fc[3 * k + c];
       s.ext.data[3 * k + c] = push[1 + c] + s.body_mass.data[body] * in[4 + c];
       pushes = pushes || push[1 + c] != 0.0;
+    }}
+  }}
+  for (int w = 0; w < s.nwindow; ++w) {{
+    const int spare = s.window_adr.data[w + 1] - 1;
+    for (int c = 0; c < 3; ++c) {{
+      const double away = s.qpos.data[s.qposadr.data[spare] + c] - parked(spare, c);
+      if (away > 1.0 || away < -1.0) stale = 1;
     }}
   }}
   s.flags.data[{STALE}] = stale;
@@ -384,7 +385,10 @@ def _leave(s: Slots): ...
     }}
   }}
   for (int w = 0; w < s.nwindow; ++w) {{
-    const int first = s.window_adr.data[w], many = s.window_adr.data[w + 1] - first;
+    // The last slot stays free, see `triangles`. A patch of n nodes has up to 2 n - 4 triangles.
+    const int first = s.window_adr.data[w], room = s.elem_num.data[w] / 2 + 2;
+    int many = s.window_adr.data[w + 1] - first - 1;
+    if (many > room) many = room;
     int count = 0;
     for (int v = 0; v < s.nwindow; ++v) {{
       for (int q = v * s.most; group[v] == group[w] && q < v * s.most + found(v); ++q) {{

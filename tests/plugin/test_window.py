@@ -179,3 +179,21 @@ def test_bad_windows_are_named(keys, words):
     mujoco.MjModel.from_xml_string(scene(keys=keys))
   for word in words:
     assert word in str(error.value)
+
+
+@pytest.mark.parametrize("count", ["9 6 1", "18 12 1"])  # little room, and much to spare
+def test_window_touches_what_nodal_dofs_touch(count):
+  found = []
+  for text in (scene(False, condim=1), scene(condim=1, count=count)):
+    m = mujoco.MjModel.from_xml_string(text)
+    d = mujoco.MjData(m)
+    d.qpos[-2:] = 0.002, -0.012
+    d.ctrl[1] = -0.012
+    contacts = 0
+    for _ in range(300):
+      d.ctrl[0] = -min(0.008, 0.1 * d.time)
+      mujoco.mj_step(m, d)
+      contacts = max(contacts, d.ncon)
+    found.append((contacts, d.qfrc_constraint[-2]))
+  assert found[1][0] == found[0][0]
+  assert found[1][1] == pytest.approx(found[0][1], rel=0.01)  # masses are spread otherwise
