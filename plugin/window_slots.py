@@ -177,8 +177,8 @@ _TRIANGLES = f"""
           ++count;
         }}
       }}
-      // Triangles to spare are points of the last slot, out of everybody's way: repeating one of the
-      // others would multiply its contacts.
+      // Triangles to spare are points of the last slot, out of everybody's way: repeating one of
+      // the others would multiply its contacts.
       const int spare = last - 1;
       for (int c = 0; c < 3; ++c) s.qpos.data[s.qposadr.data[spare] + c] = parked(spare, c);
       for (int q = 3 * count; q < 3 * most; ++q) list[q] = spare - first;
