@@ -8,7 +8,7 @@ from .hierarchy import Coarse
 from .simd import LANES
 
 # Condition number from which cycles take less time than the iterations of block Jacobi that they
-# save: at 203 they take 2.3 times as long on an H200, at 810 half as long (benchmarks/solver.py), and
+# save: at 203 they take 2.3 times as long on an H200, at 810 0.56 times (benchmarks/solver.py), and
 # at 504 0.87 times as long on the CPU, in warm contact.
 THRESHOLD = 300.0
 # Interval of the smoother, as greatest eigenvalue of D^-1 A and its ratio to the lower end, by
