@@ -8,6 +8,7 @@ import numpy as np
 from . import energy, engine, workspace
 from . import mesh as topology
 from .config import Config
+from .window_slots import MISSED_ELEMENTS, MISSED_NODES
 
 
 class Organ:
@@ -130,7 +131,7 @@ class Organ:
   @property
   def window_overflow(self) -> tuple[int, int]:
     """Touched nodes and triangles that the windows had no room for in the last step."""
-    return int(self._space.flags[2]), int(self._space.flags[3])
+    return int(self._space.flags[MISSED_NODES]), int(self._space.flags[MISSED_ELEMENTS])
 
   @property
   def window_warning(self) -> str | None:

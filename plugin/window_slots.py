@@ -13,7 +13,7 @@ from .window_nodes import GEOM, HEAD, MAX_GEOMS, MAX_WINDOWS, RECORD, SUMMARY, s
 
 TAIL = 11
 STALE, ASLEEP, MISSED_NODES, MISSED_ELEMENTS, PENDING, NEAR = range(6)  # flags
-# Height at which a window without triangles waits [m].
+# Height at which the spare slot of a window waits [m].
 AWAY = 1e3
 # Time without motion, force and tool after which an organ sleeps [s].
 QUIET = 0.2

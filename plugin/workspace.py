@@ -89,7 +89,7 @@ class Workspace:
   def run(self):
     """Computes the step's forces and adds them to qfrc_passive."""
     wp.capture_launch(self.before)
-    if self.place is not None and (not self._owns_model() or self.flags[0]):
+    if self.place is not None and (not self._owns_model() or self.flags[window_slots.STALE]):
       # The model's windows are not those of this state, which was set from outside or shares the
       # model with another: contacts must be found again with the windows in place.
       wp.capture_launch(self.place)
