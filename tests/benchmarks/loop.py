@@ -12,6 +12,7 @@ asleep.
 
 import argparse
 import csv
+import itertools
 import json
 import pathlib
 import time
@@ -26,7 +27,9 @@ from palpate.models import grid
 RADIUS, TIP, H = 0.05, 0.0025, 1e-3
 
 
-def model(nodes: int, device: str, tolerance: float, bend: float, slots: int) -> mujoco.MjModel:
+def model(
+  nodes: int, device: str, tolerance: float, bend: float, slots: int, condim: int
+) -> mujoco.MjModel:
   """Returns a sphere of about `nodes` nodes with a window under a probe."""
   point, elem = grid.octasphere(max(2, round(np.sqrt((nodes - 2) / 4))))
   # In random order: MuJoCo's compiler hashes edges, and neighbours with near numbers collide.
@@ -58,20 +61,22 @@ def model(nodes: int, device: str, tolerance: float, bend: float, slots: int) ->
       <contact contype="0" conaffinity="0" selfcollide="none"/></flexcomp></body>
   <flexcomp name="window" type="grid" count="{side} {side} 1" spacing=".01 .01 .01" dim="2"
     mass="{slots * 0.1 / len(point)}" radius="0.0002"><edge damping="1e-9"/>
-    <contact selfcollide="none" condim="3" solref="0.004 1"
+    <contact selfcollide="none" condim="{condim}" solref="0.004 1"
       solimp="0.99 0.999 0.001"/></flexcomp>
   <body pos="0 0 {RADIUS + TIP + 0.0002}"><joint name="z" type="slide" axis="0 0 1"/>
-    <joint name="x" type="slide" axis="1 0 0"/><geom size="{TIP}" mass="0.05"/></body>
+    <joint name="x" type="slide" axis="1 0 0"/><geom size="{TIP}" mass="0.05" condim="1"/></body>
 </worldbody>
 <actuator><position joint="z" kp="500" kv="10"/><position joint="x" kp="500" kv="10"/></actuator>
 </mujoco>""")
   return spec.compile()
 
 
-def measure(nodes: int, device: str, tolerance: float, bend: float, slots: int, steps: int) -> dict:
+def measure(
+  nodes: int, device: str, tolerance: float, bend: float, slots: int, condim: int, steps: int
+) -> dict:
   """Returns medians over the last half of `steps` steps, in ms."""
   start = time.perf_counter()
-  m = model(nodes, device, tolerance, bend, slots)
+  m = model(nodes, device, tolerance, bend, slots, condim)
   d = mujoco.MjData(m)
   made = time.perf_counter() - start
   organ = palpate.Organ(m, d, "organ")
@@ -95,6 +100,7 @@ def measure(nodes: int, device: str, tolerance: float, bend: float, slots: int, 
     "bend": bend,
     "tolerance": tolerance,
     "slots": w.organ.windows.nslot,
+    "condim": condim,
     "contacts": int(np.median(contacts[steps // 2 :])),
     "iterations": float(np.mean(iterations[steps // 2 :])),
     "force_N": float(d.qfrc_constraint[m.nv - 2]),
@@ -165,12 +171,13 @@ def main():
   parser.add_argument("--tolerance", type=float, default=1e-3)
   parser.add_argument("--bend", type=float, default=0.0)
   parser.add_argument("--slots", type=int, default=100)
+  parser.add_argument("--condim", type=int, nargs="+", default=[3], help="1 is without friction")
   parser.add_argument("--steps", type=int, default=400)
   parser.add_argument("-o", "--output", type=pathlib.Path)
   args = parser.parse_args()
   rows = []
-  for nodes in args.nodes:
-    row = measure(nodes, args.device, args.tolerance, args.bend, args.slots, args.steps)
+  for nodes, condim in itertools.product(args.nodes, args.condim):
+    row = measure(nodes, args.device, args.tolerance, args.bend, args.slots, condim, args.steps)
     rows.append(row)
     print(json.dumps({k: round(v, 5) if isinstance(v, float) else v for k, v in row.items()}))
   if args.output:
