@@ -8,6 +8,11 @@ with Mhat the diagonal inertia of the dofs (mass + armature), f_ext what MuJoCo 
 itself in this step and f_c their constraint force of the last step, both of which are also on the
 right-hand side of the implicit step. MuJoCo's own step then gives
 v + dv + h (f_c_new - f_c) / Mhat: at rest the contact force is exact whatever h is.
+
+Where tissue is stiff for the time step (`inertia.is_stiff`) the last term is put right after
+MuJoCo's step: it becomes A^-1 h (f_c_new - f_c), the organ's own response, so that the organ has
+taken an implicit step under the forces that act in it, and gains no more energy than they give.
+Mhat then is a guess of what a tool meets, and follows the organ's answers (`HEAVIER`).
 """
 
 from __future__ import annotations
@@ -22,6 +27,15 @@ import warp as wp
 
 from . import mjstruct, solver
 from .simd import LANES
+
+# Of contact forces, the change that says something about the inertia which they meet: its share of
+# them, and the share of it that does not cancel; the most that it may make of the inertia, and in
+# a step.
+_CHANGE, _COHERENT, _HEAVIEST, _FASTER = 0.005, 0.7, 8.0, 2.0
+
+# What a coupling reports, in `Workspace.flags`; see there.
+NFLAG = 8
+STALE, ASLEEP, MISSED_NODES, MISSED_ELEMENTS, PENDING, NEAR, CHANGED, ANSWERED = range(NFLAG)
 
 
 @wp.func_native("""
@@ -156,16 +170,43 @@ def _gather(
   )
 
 
-@wp.func_native("""
+# How many times their inertia at rest the nodes in contact have: a secant through the
+# last change of the contact forces, as in the coupling of fluids and structures (Kuettler and Wall
+# 2008, doi:10.1007/s00466-008-0255-5). `acted` is the sum of impulse times the organ's answer,
+# `meant` that of impulse times what the dofs' inertia makes of it, `sum` that of the changes,
+# `gross` and `whole` those of their sizes and of the forces' sizes. Impulses that cancel say
+# nothing about what a tool meets.
+HEAVIER = f"""
+  auto touched = [](const double* f) {{ return f[0] != 0.0 || f[1] != 0.0 || f[2] != 0.0; }};
+  auto heavier = [&](double now, double acted, double meant, const double* sum, double gross,
+                     double whole) -> double {{
+    if (whole == 0.0) return 1.0;
+    const double net = sqrt(sum[0] * sum[0] + sum[1] * sum[1] + sum[2] * sum[2]);
+    if (!(acted > 0.0) || gross < {_CHANGE} * whole || net < {_COHERENT} * gross) return now;
+    const double seen = now * meant / acted;
+    const double most = {_FASTER} * now < {_HEAVIEST} ? {_FASTER} * now : {_HEAVIEST};
+    return seen < 1.0 ? 1.0 : seen > most ? most : seen;
+  }};
+"""
+
+
+@wp.func_native(HEAVIER + """
   // A solve that failed holds the organ still for this step instead of spreading the damage.
   const double ok = status.data[3] == 0.0f ? 1.0 : 0.0;
   const double per_h = ok / timestep.data[0];
+  const double heavy = plugin_state.data[2 * nfree];
   for (int i = 0; i < nnode; ++i) {
     const int at = (i >> 3) * 24 + (i & 7), adr = dofadr.data[i];
     if (adr < 0) continue;
     const double m = body_mass.data[bodyid.data[i]];
+    const double gain = heavy > 1.0 && touched(&plugin_state.data[stateadr.data[i]]) ? heavy : 1.0;
     for (int c = 0; c < 3; ++c) {
-      const double inertia = m + dof_armature.data[adr + c];
+      const double inertia = gain * (m + dof_armature.data[adr + c]);
+      if (gain > 1.0) {
+        const int diagonal = massadr.data[3 * i + c];
+        M.data[diagonal] = qLD.data[diagonal] = inertia;
+        qLDiagInv.data[adr + c] = 1.0 / inertia;
+      }
       const double dv = (double)dvel.data[at + 8 * c];
       const double f = (ok != 0.0 ? inertia * dv * per_h : 0.0) - ext.data[3 * i + c];
       if (f == f) qfrc_passive.data[adr + c] += f;
@@ -174,23 +215,33 @@ def _gather(
 """)
 def _scatter_native(
   nnode: int,
+  nfree: int,
   dofadr: wp.array[int],
   bodyid: wp.array[int],
+  massadr: wp.array[int],
+  stateadr: wp.array[int],
   timestep: wp.array[wp.float64],
   body_mass: wp.array[wp.float64],
   dof_armature: wp.array[wp.float64],
   ext: wp.array[wp.float64],
   dvel: wp.array4d[float],
   status: wp.array2d[float],
+  plugin_state: wp.array[wp.float64],
   qfrc_passive: wp.array[wp.float64],
+  M: wp.array[wp.float64],
+  qLD: wp.array[wp.float64],
+  qLDiagInv: wp.array[wp.float64],
 ): ...
 
 
 @wp.kernel(enable_backward=False)
 def _scatter(
   nnode: int,
+  nfree: int,
   dofadr: wp.array[int],
   bodyid: wp.array[int],
+  massadr: wp.array[int],
+  stateadr: wp.array[int],
   # Model:
   timestep: wp.array[wp.float64],
   body_mass: wp.array[wp.float64],
@@ -199,42 +250,133 @@ def _scatter(
   ext_in: wp.array[wp.float64],
   dvel_in: wp.array4d[float],
   status_in: wp.array2d[float],
+  # Data in:
+  plugin_state_in: wp.array[wp.float64],
   # Data out:
   qfrc_passive_out: wp.array[wp.float64],
+  M_out: wp.array[wp.float64],
+  qLD_out: wp.array[wp.float64],
+  qLDiagInv_out: wp.array[wp.float64],
 ):
   _scatter_native(
     nnode,
+    nfree,
     dofadr,
     bodyid,
+    massadr,
+    stateadr,
     timestep,
     body_mass,
     dof_armature,
     ext_in,
     dvel_in,
     status_in,
+    plugin_state_in,
     qfrc_passive_out,
+    M_out,
+    qLD_out,
+    qLDiagInv_out,
   )
 
 
-@wp.func_native("""
-  for (int i = 0; i < nnode; ++i) {
+@wp.func_native(f"""
+  const double h = timestep.data[0];
+  bool changed = false;
+  for (int i = 0; i < nnode; ++i) {{
+    const int at = (i >> 3) * 24 + (i & 7), adr = dofadr.data[i], own = stateadr.data[i];
+    for (int c = 0; c < 3; ++c) {{
+      double df = 0.0;
+      if (adr >= 0) df = qfrc_constraint.data[adr + c] - plugin_state.data[own + c];
+      rhs.data[at + 8 * c] = (float)(h * df);
+      changed = changed || df != 0.0;
+    }}
+  }}
+  flags.data[{CHANGED}] = changed;
+""")
+def _impulses_native(
+  nnode: int,
+  dofadr: wp.array[int],
+  stateadr: wp.array[int],
+  timestep: wp.array[wp.float64],
+  qfrc_constraint: wp.array[wp.float64],
+  plugin_state: wp.array[wp.float64],
+  rhs: wp.array4d[float],
+  flags: wp.array[int],
+): ...
+
+
+@wp.kernel(enable_backward=False)
+def _impulses(
+  nnode: int,
+  dofadr: wp.array[int],
+  stateadr: wp.array[int],
+  # Model:
+  timestep: wp.array[wp.float64],
+  # Data in:
+  qfrc_constraint_in: wp.array[wp.float64],
+  plugin_state_in: wp.array[wp.float64],
+  # State out:
+  rhs_out: wp.array4d[float],
+  flags_out: wp.array[int],
+):
+  _impulses_native(
+    nnode, dofadr, stateadr, timestep, qfrc_constraint_in, plugin_state_in, rhs_out, flags_out
+  )
+
+
+@wp.func_native(HEAVIER + f"""
+  // Not by what MuJoCo made of them: its solver may have stopped where the forces that it reports
+  // are not quite those that moved the dofs.
+  const double h = timestep.data[0];
+  const bool ok = status.data[3] == 0.0f, answered = ok && flags.data[{ANSWERED}];
+  const double heavy = plugin_state.data[2 * nfree] > 1.0 ? plugin_state.data[2 * nfree] : 1.0;
+  double acted = 0.0, meant = 0.0, gross = 0.0, whole = 0.0, sum[3] = {{0.0, 0.0, 0.0}};
+  for (int i = 0; i < nnode; ++i) {{
     const int at = (i >> 3) * 24 + (i & 7), adr = dofadr.data[i], own = stateadr.data[i];
     if (adr < 0) continue;
-    for (int c = 0; c < 3; ++c) {
-      const float dv = dvel.data[at + 8 * c];
-      plugin_state.data[own + c] = qfrc_constraint.data[adr + c];
-      plugin_state.data[own + nfree + c] = status.data[3] == 0.0f ? (double)dv : 0.0;
-    }
-  }
+    const double gain = touched(&plugin_state.data[own]) ? heavy : 1.0;
+    const double inertia = gain * (body_mass.data[bodyid.data[i]] + dof_armature.data[adr]);
+    double df2 = 0.0, f2 = 0.0;
+    for (int c = 0; c < 3; ++c) {{
+      double dv = ok ? (double)dvel.data[at + 8 * c] : 0.0;
+      const double f = qfrc_constraint.data[adr + c], df = f - plugin_state.data[own + c];
+      f2 += f * f;
+      df2 += df * df;
+      sum[c] += df;
+      if (answered) {{
+        acted += h * df * (double)x.data[at + 8 * c];
+        dv += (double)x.data[at + 8 * c];
+        const double v = (double)vel.data[at + 8 * c] + dv;
+        qpos.data[qposadr.data[i] + c] += h * (v - qvel.data[adr + c]);
+        qvel.data[adr + c] = v;
+      }}
+      plugin_state.data[own + c] = f;
+      plugin_state.data[own + nfree + c] = dv;
+    }}
+    meant += h * h * df2 / inertia;
+    gross += sqrt(df2);
+    whole += sqrt(f2);
+  }}
+  if (answered) plugin_state.data[2 * nfree] = heavier(heavy, acted, meant, sum, gross, whole);
 """)
 def _remember_native(
   nnode: int,
   nfree: int,
   dofadr: wp.array[int],
+  qposadr: wp.array[int],
+  bodyid: wp.array[int],
   stateadr: wp.array[int],
+  timestep: wp.array[wp.float64],
+  body_mass: wp.array[wp.float64],
+  dof_armature: wp.array[wp.float64],
   qfrc_constraint: wp.array[wp.float64],
+  vel: wp.array4d[float],
   dvel: wp.array4d[float],
+  x: wp.array4d[float],
   status: wp.array2d[float],
+  flags: wp.array[int],
+  qpos: wp.array[wp.float64],
+  qvel: wp.array[wp.float64],
   plugin_state: wp.array[wp.float64],
 ): ...
 
@@ -244,17 +386,45 @@ def _remember(
   nnode: int,
   nfree: int,
   dofadr: wp.array[int],
+  qposadr: wp.array[int],
+  bodyid: wp.array[int],
   stateadr: wp.array[int],
+  # Model:
+  timestep: wp.array[wp.float64],
+  body_mass: wp.array[wp.float64],
+  dof_armature: wp.array[wp.float64],
   # Data in:
   qfrc_constraint_in: wp.array[wp.float64],
   # State in:
+  vel_in: wp.array4d[float],
   dvel_in: wp.array4d[float],
+  x_in: wp.array4d[float],
   status_in: wp.array2d[float],
+  flags_in: wp.array[int],
   # Data out:
+  qpos_out: wp.array[wp.float64],
+  qvel_out: wp.array[wp.float64],
   plugin_state_out: wp.array[wp.float64],
 ):
   _remember_native(
-    nnode, nfree, dofadr, stateadr, qfrc_constraint_in, dvel_in, status_in, plugin_state_out
+    nnode,
+    nfree,
+    dofadr,
+    qposadr,
+    bodyid,
+    stateadr,
+    timestep,
+    body_mass,
+    dof_armature,
+    qfrc_constraint_in,
+    vel_in,
+    dvel_in,
+    x_in,
+    status_in,
+    flags_in,
+    qpos_out,
+    qvel_out,
+    plugin_state_out,
   )
 
 
@@ -265,19 +435,27 @@ class Launches:
   Attributes:
     gather: reads MuJoCo's arrays, on the CPU
     scatter: adds the passive force, on the CPU
+    leave: takes the contact forces that MuJoCo found and what they changed by, on the CPU
+    push: fills the solver's right-hand side with these impulses, on `side`
+    answer: ends the step with the response to them, on `side`
+    end: ends the step without one, on the CPU, or None where there is nothing to do
     advance: steps the plugin state, on the CPU
     place: makes the model fit the plugin state, on the CPU, or None where there is nothing to do
     enter: fills the solver's state, on `side`
     look: looks at the solution, on `side`
-    side: the device of these two
+    side: the device of these
   """
 
   gather: Callable[[], None]
   scatter: Callable[[], None]
+  leave: Callable[[], None]
   advance: Callable[[], None]
+  end: Callable[[], None] | None = None
   place: Callable[[], None] | None = None
   enter: Callable[[], None] = lambda: None
   look: Callable[[], None] = lambda: None
+  push: Callable[[], None] = lambda: None
+  answer: Callable[[], None] = lambda: None
   side: Any = "cpu"
 
 
@@ -314,6 +492,7 @@ def launches(w, model: int, instance: int) -> Launches:
     "qposadr": node_addresses(organ.qposadr, vert),
     "bodyid": node_addresses(organ.body, vert),
     "stateadr": node_addresses(organ.stateadr, vert),
+    "massadr": _mass_addresses(m, organ, vert),
     "frame": wp.array(organ.frame.ravel(), dtype=wp.float64, device="cpu"),
     "qpos0": wrap(m.qpos0, m.nq),
     "body_mass": wrap(m.body_mass, m.nbody),
@@ -324,7 +503,11 @@ def launches(w, model: int, instance: int) -> Launches:
     "qfrc_passive": wrap(d.qfrc_passive, m.nv),
     "qfrc_constraint": wrap(d.qfrc_constraint, m.nv),
     "xfrc_applied": wrap(d.xfrc_applied, 6 * m.nbody),
-    "plugin_state": wrap(d.plugin_state + 8 * start, 2 * organ.nfree),
+    "M": wrap(d.M, m.nC),
+    "qLD": wrap(d.qLD, m.nC),
+    "qLDiagInv": wrap(d.qLDiagInv, m.nv),
+    "plugin_state": wrap(d.plugin_state + 8 * start, 2 * organ.nfree + 1),
+    "flags": wp.array(w.flags, dtype=int, device="cpu", copy=False),
   }
 
   def gather():
@@ -355,12 +538,27 @@ def launches(w, model: int, instance: int) -> Launches:
       dim=1,
       inputs=[
         s.nnode,
-        *(v[k] for k in ("dofadr", "bodyid", "timestep", "body_mass", "dof_armature")),
+        organ.nfree,
+        *(v[k] for k in ("dofadr", "bodyid", "massadr", "stateadr", "timestep", "body_mass")),
+        v["dof_armature"],
         w.ext,
         host["dvel"],
         host["status"],
+        v["plugin_state"],
       ],
-      outputs=[v["qfrc_passive"]],
+      outputs=[v[k] for k in ("qfrc_passive", "M", "qLD", "qLDiagInv")],
+      device="cpu",
+    )
+
+  def leave():
+    wp.launch(
+      _impulses,
+      dim=1,
+      inputs=[
+        s.nnode,
+        *(v[k] for k in ("dofadr", "stateadr", "timestep", "qfrc_constraint", "plugin_state")),
+      ],
+      outputs=[host["rhs"], v["flags"]],
       device="cpu",
     )
 
@@ -371,17 +569,23 @@ def launches(w, model: int, instance: int) -> Launches:
       inputs=[
         s.nnode,
         organ.nfree,
-        v["dofadr"],
-        v["stateadr"],
-        v["qfrc_constraint"],
-        host["dvel"],
-        host["status"],
+        *(v[k] for k in ("dofadr", "qposadr", "bodyid", "stateadr", "timestep", "body_mass")),
+        *(v[k] for k in ("dof_armature", "qfrc_constraint")),
+        *(host[k] for k in ("vel", "dvel", "x", "status")),
+        v["flags"],
       ],
-      outputs=[v["plugin_state"]],
+      outputs=[v["qpos"], v["qvel"], v["plugin_state"]],
       device="cpu",
     )
 
-  return Launches(gather, scatter, advance)
+  return Launches(gather, scatter, leave, advance)
+
+
+def _mass_addresses(m, organ, vert: np.ndarray) -> wp.array:
+  first = node_addresses(organ.dofadr, vert).numpy()
+  dofs = np.maximum(first, 0)[:, None] + np.arange(3)
+  found = np.where(first[:, None] >= 0, mass_addresses(m, dofs), -1)
+  return wp.array(found.astype(np.int32).ravel(), dtype=int, device="cpu")
 
 
 def node_addresses(values: np.ndarray, vert: np.ndarray) -> wp.array:

@@ -24,13 +24,15 @@ class Stage(enum.IntEnum):
 
   FIRST and LATER are Newton iterations. The first stands at x + share h v, share in `step`, and
   has the rest of the step ahead in it: h^2 (1 - share) + h damping; later ones are residuals at the
-  trial state, h damping. EXPLICIT has h damping, and NEUMANN brings its own.
+  trial state, h damping. EXPLICIT has h damping, and NEUMANN brings its own. RESPONSE is the answer
+  to impulses alone, with the matrix of the last solve.
   """
 
   FIRST = 0
   LATER = 1
   EXPLICIT = 2
   NEUMANN = 3
+  RESPONSE = 4
 
 # Rest vector plus difference of displacements: float32 keeps the digits of small strains.
 _EDGE = """

@@ -20,7 +20,7 @@ import numpy as np
 
 from . import mjstruct, window, workspace
 from .config import KEYS
-from .window_slots import MISSED_ELEMENTS, MISSED_NODES
+from .coupling import MISSED_ELEMENTS, MISSED_NODES
 from .workspace import Workspace
 
 NAME = "palpate.organ"

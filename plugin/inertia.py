@@ -11,6 +11,7 @@ import warp as wp
 
 from . import mesh as topology
 from . import mjstruct, solver, types
+from .config import Config
 from .declare import Organ, meeting_geoms
 from .mesh import Mesh
 from .surface import from_slices, to_slices
@@ -18,9 +19,14 @@ from .types import State, Surface
 
 # Loads whose response gives the effective inertia; between them it follows the nodal area.
 _SAMPLES = 24
+# Nodes that say whether tissue is stiff, and times its own mass that one moves then: of presses
+# with less, none gained energy from contacts that MuJoCo answers with the dofs' inertia.
+_FEW = 8
+_STIFF = 1.8
 _KNOWN = 64
 # A pressed shell stiffens and few nodes of a patch touch: between 1 and the limit of 2.
 _MARGIN = 1.5
+_stiff: dict[bytes, bool] = {}  # digest of what it depends on -> whether that tissue is stiff
 _time_step: dict[bytes, float] = {}  # digest of an armature of ours -> the time step it is for
 
 
@@ -37,7 +43,7 @@ def set_armature(m, organ: Organ):
   h = float(m.opt.timestep)
   if present.any() and _time_step.get(_digest(present), h) == h:
     return
-  mass = mjstruct.view(m.body_mass, m.nbody)[organ.body]
+  mass = _masses(m, organ)
   inertia = of_nodes(m, organ, mass, h, organ.flex)
   added = np.repeat((inertia - mass)[organ.free], 3)
   armature[dofs] = added
@@ -49,16 +55,54 @@ def set_armature(m, organ: Organ):
   mjstruct.view(m.dof_M0, m.nv)[dofs] = np.repeat(inertia[organ.free], 3)
 
 
+def is_stiff(m, organ: Organ, config: Config) -> bool:
+  """Returns whether a push on one node moves others with it within a step of the model's length.
+
+  That is where a node by itself has an effective inertia of over `_STIFF` masses.
+  """
+  h = float(m.opt.timestep)
+  mass = _masses(m, organ)
+  damping = config.damping
+  numbers = np.array([h, damping, config.foundation, config.bulk])
+  key = _digest(np.concatenate([numbers, mass, organ.mesh.rest.ravel(), organ.free]))
+  key = _digest(np.frombuffer(key + repr(organ.config).encode(), np.uint8))
+  if key not in _stiff:
+    if len(_stiff) >= _KNOWN:
+      _stiff.pop(next(iter(_stiff)))
+    s = dataclasses.replace(
+      organ.surface, damping=damping, foundation=config.foundation, bulk=config.bulk
+    )
+    gain = _gain(config, h)
+    sample = _spread(organ.mesh.rest, np.flatnonzero(organ.free), _FEW)
+    alone = _responses(s, _state(s), organ.mesh, mass, organ.free, h, 0.0, gain, sample)
+    ratio = 1 / np.maximum(alone, 1e-300) / mass[sample]
+    _stiff[key] = bool(ratio.max() > _STIFF)
+  return _stiff[key]
+
+
 def of_nodes(m, organ: Organ, mass: np.ndarray, h: float, flex: int) -> np.ndarray:
   """Returns the effective inertia of every node for the tools that meet `flex` [kg], (nvert,)."""
   radius = _tool_radius(m, organ, flex)
-  state = types.make_state(organ.surface)
-  padding = np.where(organ.surface.vert.numpy() >= 0, 0.0, 1.0).reshape(1, -1, 8)
-  state.mass.assign(padding)
-  gain = h * h + h * organ.surface.damping
-  if organ.config.integrator == "midpoint":
-    gain *= 0.5
-  return effective_inertia(organ.surface, state, organ.mesh, mass, organ.free, h, radius, gain)
+  s = organ.surface
+  gain = _gain(organ.config, h)
+  return effective_inertia(s, _state(s), organ.mesh, mass, organ.free, h, radius, gain)
+
+
+def _masses(m, organ: Organ) -> np.ndarray:
+  if organ.windows:
+    return organ.windows.mass
+  return mjstruct.view(m.body_mass, m.nbody)[organ.body]
+
+
+def _gain(config: Config, h: float) -> float:
+  gain = h * h + h * config.damping
+  return 0.5 * gain if config.integrator == "midpoint" else gain
+
+
+def _state(s: Surface) -> State:
+  state = types.make_state(s)
+  state.mass.assign(np.where(s.vert.numpy() >= 0, 0.0, 1.0).reshape(1, -1, 8))
+  return state
 
 
 def _digest(values: np.ndarray) -> bytes:
@@ -115,11 +159,35 @@ def effective_inertia(
     radius: radius of the contact patch [m]; 0 for the node alone
     gain: factor of K in A [s^2]; None for h^2 + h damping
   """
+  area = topology.vertex_areas(mesh.rest, mesh.elem)
+  sample = _spread(mesh.rest, np.flatnonzero(free), _SAMPLES)
+  gain = h * h + h * s.damping if gain is None else gain
+  response = _responses(s, d, mesh, mass, free, h, radius, gain, sample)
+  # Per area, so that finer parts of the surface get less.
+  specific = 1 / np.maximum(response, 1e-300) / area[sample]
+  distance2 = ((mesh.rest[:, None] - mesh.rest[sample]) ** 2).sum(axis=2)
+  nearest = np.argsort(distance2, axis=1)[:, :3]
+  weight = 1 / (np.take_along_axis(distance2, nearest, axis=1) + 1e-12 * distance2.max() + 1e-300)
+  weight /= weight.sum(axis=1, keepdims=True)
+  found = np.maximum(area * (weight * specific[nearest]).sum(axis=1), mass)
+  return mass + _MARGIN * (found - mass)
+
+
+def _responses(
+  s: Surface,
+  d: State,
+  mesh: Mesh,
+  mass: np.ndarray,
+  free: np.ndarray,
+  h: float,
+  radius: float,
+  gain: float,
+  sample: np.ndarray,
+) -> np.ndarray:
+  """Returns how fast each sample moves where it and the nodes around it get a unit impulse."""
   # A per cent is enough: the iteration it serves has a margin of two.
   s = dataclasses.replace(s, tolerance=1e-2, newton=1)
   normal = topology.vertex_normals(mesh.rest, mesh.elem)
-  area = topology.vertex_areas(mesh.rest, mesh.elem)
-  sample = _spread(mesh.rest, np.flatnonzero(free), _SAMPLES)
   vert = np.asarray(s.vert.numpy(), np.int64)
   real = np.flatnonzero(vert >= 0)
 
@@ -132,7 +200,6 @@ def effective_inertia(
     array.zero_()
   put(d.mass, mass)
   floor = 0.0
-  gain = h * h + h * s.damping if gain is None else gain
   d.step.assign(np.array([[h, gain, floor, 0]], np.float32))
   response = np.zeros(len(sample))
   for k, i in enumerate(sample):
@@ -142,14 +209,7 @@ def effective_inertia(
     solver.step(s, d)
     dvel = from_slices(np.asarray(d.dvel.numpy()[0]))[int(s.node.numpy()[i])]
     response[k] = dvel @ normal[i]
-  # Per area, so that finer parts of the surface get less.
-  specific = 1 / np.maximum(response, 1e-300) / area[sample]
-  distance2 = ((mesh.rest[:, None] - mesh.rest[sample]) ** 2).sum(axis=2)
-  nearest = np.argsort(distance2, axis=1)[:, :3]
-  weight = 1 / (np.take_along_axis(distance2, nearest, axis=1) + 1e-12 * distance2.max() + 1e-300)
-  weight /= weight.sum(axis=1, keepdims=True)
-  found = np.maximum(area * (weight * specific[nearest]).sum(axis=1), mass)
-  return mass + _MARGIN * (found - mass)
+  return response
 
 
 def _spread(rest: np.ndarray, candidates: np.ndarray, count: int) -> np.ndarray:

@@ -249,7 +249,7 @@ def _solve_world(
   nthread: int,
   nslice: int,
   nslot: int,
-  first: int,
+  stage: int,
   bending: int,
   bulk: float,
   pressure: float,
@@ -321,7 +321,7 @@ def _solve(
   nthread: int,
   nslice: int,
   nslot: int,
-  first: int,
+  stage: int,
   bending: int,
   bulk: float,
   pressure: float,
@@ -397,7 +397,7 @@ def _solve(
     nthread,
     nslice,
     nslot,
-    first,
+    stage,
     bending,
     bulk,
     pressure,
@@ -533,7 +533,7 @@ def assemble(s: Surface, d: State):
   elastic.rows(c, d.coarse, Stage.FIRST)
 
 
-def solve(s: Surface, d: State, first: bool):
+def solve(s: Surface, d: State, stage: Stage):
   """Solves A x = rhs as `solver.solve` does, with the matrices that `assemble` wrote."""
   levels: Levels = s.levels
   c, e = levels.surface, d.coarse
@@ -547,7 +547,7 @@ def solve(s: Surface, d: State, first: bool):
       nthread,
       s.nslice,
       s.nslot,
-      int(first),
+      int(stage),
       int(s.has_bending),
       s.bulk,
       s.pressure,

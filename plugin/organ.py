@@ -8,7 +8,7 @@ import numpy as np
 from . import energy, engine, workspace
 from . import mesh as topology
 from .config import Config
-from .window_slots import MISSED_ELEMENTS, MISSED_NODES
+from .coupling import MISSED_ELEMENTS, MISSED_NODES
 
 
 class Organ:

@@ -13,7 +13,7 @@ import time
 import warp as wp
 
 from . import window_slots
-from .window_slots import PENDING
+from .coupling import PENDING
 
 _stamps = itertools.count(time.time_ns() >> 10)  # never the same number twice
 
@@ -72,7 +72,7 @@ class Resident:
     """Repeats the search within a shorter reach while it finds more than there is room for."""
     w, n = self.w, self.nodes
     inbox, outbox = w.views["inbox"].numpy(), w.views["outbox"].numpy()
-    first = window_slots.SUMMARY + 3 * n.nslot
+    first = window_slots.SUMMARY + 12 * n.nslot
     found = outbox[first : first + n.nwindow]
     while found.max() > n.most:
       inbox[7] *= 0.75

@@ -25,6 +25,9 @@ from . import elastic, simd, solver
 from .elastic import Stage
 from .types import State, Surface
 
+# Schemes with a response of their own to contact forces; see `coupling`.
+RESPONDING = ("implicit", "midpoint")
+
 _DIRECT = simd.group(
   """
   const size_t base = (size_t)world * nslice;
@@ -35,6 +38,7 @@ _DIRECT = simd.group(
   const float* M = mass.data + 8 * base;
   float* X = x_.data + 24 * base;
   float* Z = q_.data + 24 * base;
+  const bool response = false;
 """
   + solver.VOLUME
   + """
@@ -289,26 +293,41 @@ def step(s: Surface, d: State, integrator: str):
   wp.copy(d.dvel, d.x)
 
 
-def _midpoint(s: Surface, d: State):
+def respond(s: Surface, d: State, integrator: str):
+  """Writes to `x` how the impulses in `rhs` [N s] change the velocity in the step just computed.
+
+  Args:
+    s: the organ
+    d: its state as `step` left it
+    integrator: `implicit` or `midpoint`
+  """
+  if integrator == "midpoint":
+    _centre_step(s, d, undo=0)
+  solver.solve(s, d, Stage.RESPONSE)
+  if integrator == "midpoint":
+    _centre_step(s, d, undo=1)
+
+
+def _centre_step(s: Surface, d: State, undo: int):
   nthread = simd.group_size(s.device, s.nslice, d.nworld)
+  d.partial.zero_()
+  wp.launch(
+    _centre,
+    dim=(d.nworld, nthread),
+    block_dim=simd.block(s.device, s.nslice),
+    inputs=[nthread, s.nslice, undo, d.dvel_warm],
+    outputs=[d.step, d.partial],
+    device=s.device,
+  )
 
-  def centre(undo: int):
-    d.partial.zero_()
-    wp.launch(
-      _centre,
-      dim=(d.nworld, nthread),
-      block_dim=simd.block(s.device, s.nslice),
-      inputs=[nthread, s.nslice, undo, d.dvel_warm],
-      outputs=[d.step, d.partial],
-      device=s.device,
-    )
 
+def _midpoint(s: Surface, d: State):
   wp.copy(d.pos_trial, d.pos)
   wp.copy(d.vel_trial, d.vel)
-  centre(undo=0)
+  _centre_step(s, d, undo=0)
   elastic.assemble(s, d, Stage.FIRST)
   if s.levels is not None:
     solver.multilevel().assemble(s, d)
-  solver.solve(s, d, first=True)
-  centre(undo=1)
+  solver.solve(s, d, Stage.FIRST)
+  _centre_step(s, d, undo=1)
   wp.copy(d.dvel, d.x)

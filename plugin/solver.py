@@ -18,6 +18,10 @@ from .types import State, Surface
 # A right-hand side below this share of the weight's impulse is at rest: residuals count against it.
 REST = 1e-3
 
+# Relative residual at which the response to a change of the contact forces is good enough: it is
+# part of the step, whose tolerance holds too where that is looser.
+RESPONSE = 0.03
+
 # The first Newton iteration stands where the present velocity leads, but no edge changes by more
 # than this share of its length on the way: forces far off would be those of another shape.
 AHEAD = 0.1
@@ -90,7 +94,7 @@ WORLD = """
 VOLUME = """
   const V zero = SPLAT(0.0f);
   float push = 0.0f, pull = 0.0f;
-  if (bulk != 0.0f || pressure != 0.0f) {
+  if (!response && (bulk != 0.0f || pressure != 0.0f)) {
     V vol = zero, rate = zero;
     FOR_SLICES(s) {
       for (int c = 0; c < 3; ++c) {
@@ -107,6 +111,13 @@ VOLUME = """
   }
 """
 
+_STAGES = f"""
+#define FIRST_ {int(Stage.FIRST)}
+#define RESPONSE_ {int(Stage.RESPONSE)}
+#define ENOUGH_ {RESPONSE}f
+"""
+
+
 def body(setup: str, precondition: str, scale: str) -> str:
   """Returns the native code of the whole solve of one world: launches cost more than iterations.
 
@@ -120,7 +131,7 @@ def body(setup: str, precondition: str, scale: str) -> str:
       `along`, the sum of z with the area vectors, from V rr (r^T D^-1 r) and V zo
     scale: scales zx, zy, zz, which are D^-1 R, before they become Z
   """
-  return PRODUCT + simd.group(
+  return _STAGES + PRODUCT + simd.group(
     WORLD
     + """
   const float* U = pos.data + 24 * base;
@@ -133,6 +144,7 @@ def body(setup: str, precondition: str, scale: str) -> str:
   float* AP = q_.data + 24 * base;
   float* Z = z_.data + 24 * base;
   float* ZN = zn_.data + 8 * base;
+  const bool first = stage == FIRST_, response = stage == RESPONSE_;
   const float gv = g - (first ? step.data[4 * world + 3] : 1.0f) * h * h;
 """
     + VOLUME
@@ -157,7 +169,9 @@ def body(setup: str, precondition: str, scale: str) -> str:
   }
   GROUP_SUMS(bb, zo, norm, along)
   const float floor_ = step.data[4 * world + 2];
-  const float target = tolerance * tolerance * (norm > floor_ ? norm : floor_);
+  const float whole = response ? status.data[4 * world + 2] : norm;
+  float target = tolerance * tolerance * (whole > floor_ ? whole : floor_);
+  if (response && target < ENOUGH_ * ENOUGH_ * norm) target = ENOUGH_ * ENOUGH_ * norm;
   float start = 0.0f;
   if (first && norm > target) {
     V db = zero, dq = zero;
@@ -239,10 +253,10 @@ def body(setup: str, precondition: str, scale: str) -> str:
   }
   if (tid != 0) return;
   float* out = status.data + 4 * world;
-  const float whole = (first ? 0.0f : out[0]) + (float)it;
-  out[0] = whole;
+  out[0] = (first ? 0.0f : out[0]) + (float)it;
   if (first) out[2] = norm;
-  out[1] = out[2] > 0.0f ? sqrtf((residual > 0.0f ? residual : 0.0f) / out[2]) : 0.0f;
+  if (!response)
+    out[1] = out[2] > 0.0f ? sqrtf((residual > 0.0f ? residual : 0.0f) / out[2]) : 0.0f;
   out[3] = (norm < 1e30f && residual < 1e30f && norm >= 0.0f) ? 0.0f : 1.0f;
 """
   )
@@ -267,7 +281,7 @@ def _solve_world(
   nthread: int,
   nslice: int,
   nslot: int,
-  first: int,
+  stage: int,
   bending: int,
   bulk: float,
   pressure: float,
@@ -307,7 +321,7 @@ def _solve(
   nthread: int,
   nslice: int,
   nslot: int,
-  first: int,
+  stage: int,
   bending: int,
   bulk: float,
   pressure: float,
@@ -350,7 +364,7 @@ def _solve(
     nthread,
     nslice,
     nslot,
-    first,
+    stage,
     bending,
     bulk,
     pressure,
@@ -541,10 +555,16 @@ def _newton_update(
   )
 
 
-def solve(s: Surface, d: State, first: bool):
-  """Solves A x = rhs to the organ's tolerance; writes `x` and `status`."""
+def solve(s: Surface, d: State, stage: Stage):
+  """Solves A x = rhs to the organ's tolerance; writes `x` and `status`.
+
+  Args:
+    s: the organ
+    d: its state, with A as `elastic.assemble` wrote it
+    stage: FIRST, LATER or RESPONSE
+  """
   if s.levels is not None:
-    multilevel().solve(s, d, first)
+    multilevel().solve(s, d, stage)
     return
   nthread = simd.group_size(s.device, s.nslice, d.nworld)
   d.partial.zero_()
@@ -556,7 +576,7 @@ def solve(s: Surface, d: State, first: bool):
       nthread,
       s.nslice,
       s.nslot,
-      int(first),
+      int(stage),
       int(s.has_bending),
       s.bulk,
       s.pressure,
@@ -621,16 +641,16 @@ def step(s: Surface, d: State):
   """
   _look_ahead(s, d)
   for it in range(s.newton):
-    first = it == 0
-    elastic.assemble(s, d, Stage.FIRST if first else Stage.LATER)
+    stage = Stage.FIRST if it == 0 else Stage.LATER
+    elastic.assemble(s, d, stage)
     if s.levels is not None:
       multilevel().assemble(s, d)
-    solve(s, d, first)
+    solve(s, d, stage)
     wp.launch(
       _newton_update,
       dim=(d.nworld, simd.threads(s.device, s.nslice)),
       block_dim=simd.BLOCK,
-      inputs=[s.nslice, int(first), int(it + 1 < s.newton), d.step, d.pos, d.vel, d.x],
+      inputs=[s.nslice, int(it == 0), int(it + 1 < s.newton), d.step, d.pos, d.vel, d.x],
       outputs=[d.dvel, d.pos_trial, d.vel_trial],
       device=s.device,
     )

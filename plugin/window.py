@@ -46,7 +46,6 @@ def launches(w, model: int, instance: int) -> Launches:
   side = s.device if w.config.resident else wp.get_device("cpu")
   if not w.views:
     w.views = _scratch(w, side)
-    w.flags = w.views["flags"].numpy()
   v = w.views
   m, d = mjstruct.Model.from_address(model), mjstruct.Data.from_address(w.data)
   start = int(mjstruct.view(m.plugin_stateadr, m.nplugin, np.int32)[instance])
@@ -66,6 +65,11 @@ def launches(w, model: int, instance: int) -> Launches:
     if away:
       wp.copy(nodes.inbox, v["inbox"])
 
+  def send():
+    if away:
+      wp.copy(v["outbox"], nodes.outbox)
+      wp.copy(w.host["status"], w.state.status)
+
   def end_step():
     over_nodes(window_nodes.commit)
     over_nodes(window_nodes.move_slots, nslot)
@@ -80,9 +84,7 @@ def launches(w, model: int, instance: int) -> Launches:
   def look():
     over_nodes(window_nodes.search)
     over_nodes(window_nodes.report, nslot)
-    if away:
-      wp.copy(v["outbox"], nodes.outbox)
-      wp.copy(w.host["status"], w.state.status)
+    send()
 
   def look_again():
     receive()
@@ -92,18 +94,25 @@ def launches(w, model: int, instance: int) -> Launches:
     receive()
     end_step()
 
-  def advance():
-    over_slots(window_slots.leave)
-    if not w.resident:
-      end_step()
-    over_slots(window_slots.choose)
+  def push():
+    receive()
+    nodes.rhs.zero_()
+    over_nodes(window_nodes.push_impulses, nslot)
+
+  def answer():
+    over_nodes(window_nodes.commit)
+    look()
 
   if w.config.resident:
     w.resident = Resident(w, nodes, start, end_step_now, look_again)
   return Launches(
     gather=lambda: over_slots(window_slots.gather),
     scatter=lambda: over_slots(window_slots.scatter),
-    advance=advance,
+    leave=lambda: over_slots(window_slots.leave),
+    push=push,
+    answer=answer,
+    end=None if w.resident else end_step,
+    advance=lambda: over_slots(window_slots.choose),
     place=lambda: over_slots(window_slots.place),
     enter=enter,
     look=look,
@@ -140,7 +149,7 @@ def _scratch(w, side: wp.Device) -> dict[str, wp.array]:
     "left": _ints(np.full(nslot, -1)),
     "lagged": _doubles(np.zeros(3 * nslot)),
     "inertia": _doubles(np.zeros(nvert)),
-    "flags": _ints(np.zeros(6)),
+    "flags": wp.array(w.flags, dtype=int, device="cpu", copy=False),
     **{
       name: wp.zeros(size, dtype=wp.float64, device="cpu", pinned=side.is_cuda)
       for name, size in boxes.items()
@@ -220,6 +229,8 @@ def _slots(w, model: int) -> Slots:
     "qpos": wrap(d.qpos, m.nq),
     "qvel": wrap(d.qvel, m.nv),
     "M": wrap(d.M, m.nC),
+    "qLD": wrap(d.qLD, m.nC),
+    "qLDiagInv": wrap(d.qLDiagInv, m.nv),
     "qfrc_applied": wrap(d.qfrc_applied, m.nv),
     "qfrc_passive": wrap(d.qfrc_passive, m.nv),
     "qfrc_constraint": wrap(d.qfrc_constraint, m.nv),
@@ -239,7 +250,7 @@ def _nodes(w, side: wp.Device) -> Nodes:
   else:
     motion = [wrap(address + 8 * k * size, size) for k in range(3)]
   solving = w.state if w.config.resident else None
-  crossing = ("step", "pos", "vel", "force_ext", "dvel_warm", "dvel", "status")
+  crossing = ("step", "pos", "vel", "force_ext", "dvel_warm", "dvel", "rhs", "x", "status")
   mass = np.ones(s.nnode)
   mass[node] = organ.windows.mass
   w.host["mass"].assign(mass.reshape(1, -1, 8).astype(np.float32))
@@ -273,6 +284,10 @@ def _struct(kind, values: dict):
 def settle(w, model: int):
   """Readies the compiled model and the state for the default slots."""
   m = mjstruct.Model.from_address(model)
+  # A slot must be no heavier than the lightest node that it may stand on.
+  win = w.organ.windows
+  mass = mjstruct.view(m.body_mass, m.nbody)
+  mass[win.body] = np.minimum(mass[win.body], win.mass.min())
   set_inertia(w, m)
   w.views["plugin_state"].fill_(0.0)  # MuJoCo has not cleared it yet
 

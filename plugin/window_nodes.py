@@ -13,7 +13,7 @@ import warp as wp
 struct: Any = wp.struct  # type checkers take what wp.struct makes for a value
 MAX_WINDOWS = 64  # of an organ
 MAX_GEOMS = 32  # of a window
-HEAD = 10  # h, its square with damping, floor, mode, gravity (3), reach, h of the step to commit, -
+HEAD = 10  # h, its square with damping, floor, mode, gravity (3), reach, h to commit, 1: answered
 GEOM = 24  # centre, axes, type, size, bounding box, squared reach of the bounding sphere
 SUMMARY = 11  # status (4), squared speed, bounds: lowest and highest corner
 RECORD = 8  # vertex, distance, displacement, velocity
@@ -33,11 +33,13 @@ class Nodes:
     rest: rest position [m]                              (3 nvert,)
     disp, velocity, last: displacement [m], velocity and last change of it [m/s]  (3 nvert,) each
     inbox: HEAD numbers, node, displacement and velocity of each slot after the last step, node and
-      force of each slot now, and the geoms of each window: their number and GEOM numbers each
-    outbox: SUMMARY numbers, dv of each slot, number of candidates of each window, RECORDs
+      force of each slot now (after MuJoCo's step the impulse to answer), and the geoms of each
+      window: their number and GEOM numbers each
+    outbox: SUMMARY numbers, dv of each slot, its displacement, velocity and answer where there was
+      one, number of candidates of each window, RECORDs
     count: candidates of each window; 0 between steps    (nwindow,)
     extent: squared speed and bounds as ordered ints; the lowest one between steps  (7,)
-    step, pos, vel, force_ext, dvel_warm, dvel, status: see `State`, for one world
+    step, pos, vel, force_ext, dvel_warm, dvel, rhs, x, status: see `State`, for one world
   """
 
   nvert: int
@@ -60,6 +62,8 @@ class Nodes:
   force_ext: wp.array4d[float]
   dvel_warm: wp.array4d[float]
   dvel: wp.array4d[float]
+  rhs: wp.array4d[float]
+  x: wp.array4d[float]
   status: wp.array2d[float]
 
 
@@ -70,7 +74,7 @@ def inbox_size(nslot: int, nwindow: int) -> int:
 
 def outbox_size(nslot: int, nwindow: int, most: int) -> int:
   """Returns the length of the outbox."""
-  return SUMMARY + 3 * nslot + nwindow * (1 + most * RECORD)
+  return SUMMARY + 12 * nslot + nwindow * (1 + most * RECORD)
 
 
 _BOXES = f"""
@@ -84,6 +88,9 @@ _BOXES = f"""
   const double* pushed = moved + 7 * n.nslot;
   const double* tools = pushed + 4 * n.nslot;
   double* out = n.outbox.data;
+  double* motion = out + {SUMMARY} + 3 * n.nslot;
+  double* number = motion + 9 * n.nslot;
+  const bool answered = in[9] != 0.0;
 """
 
 
@@ -96,9 +103,11 @@ _BOXES = f"""
   const double keep = mode == 1 ? 1.0 : 0.0;
   for (int i = tid; i < n.nvert; i += nthread) {
     const float* dv_ = n.dvel.data + n.node.data[i];
+    const float* answer = n.x.data + n.node.data[i];
     for (int c = 0; c < 3; ++c) {
       const int j = 3 * i + c;
-      const double dv = ok * (double)dv_[8 * c], v = n.velocity.data[j] + dv;
+      const double whole = (double)dv_[8 * c] + (answered ? (double)answer[8 * c] : 0.0);
+      const double dv = ok * whole, v = n.velocity.data[j] + dv;
       n.disp.data[j] += h * v;
       n.velocity.data[j] = keep * v;
       n.last.data[j] = keep * dv;
@@ -112,7 +121,7 @@ def _commit(tid: int, nthread: int, n: Nodes): ...
 @wp.func_native(
   _BOXES
   + """
-  if ((int)in[3] == 0) return;
+  if ((int)in[3] == 0 || answered) return;
   for (int k = tid; k < n.nslot; k += nthread) {
     const int i = (int)moved[7 * k];
     for (int c = 0; c < 3 && i >= 0; ++c) {
@@ -183,6 +192,20 @@ def _enter(tid: int, nthread: int, n: Nodes): ...
 def _push_slots(tid: int, nthread: int, n: Nodes): ...
 
 
+@wp.func_native(
+  _BOXES
+  + """
+  for (int k = tid; k < n.nslot; k += nthread) {
+    const int i = (int)pushed[4 * k];
+    if (i < 0) continue;
+    float* impulse = n.rhs.data + n.node.data[i];
+    for (int c = 0; c < 3; ++c) impulse[8 * c] = (float)pushed[4 * k + 1 + c];
+  }
+"""
+)
+def _push_impulses(tid: int, nthread: int, n: Nodes): ...
+
+
 # Distance of the point d from a geom's centre to the geom; G: centre, axes, type, size, box.
 _DISTANCE = """
   double l[3];
@@ -223,12 +246,14 @@ _DISTANCE = """
 @wp.func_native(
   _BOXES
   + f"""
-  const double h = in[0], reach = in[7], ok = n.status.data[3] == 0.0f ? 1.0 : 0.0;
+  // Before the step has ended: where it will, without what contacts change.
+  const double reach = in[7], ok = n.status.data[3] == 0.0f && !answered ? 1.0 : 0.0;
+  const double h = answered ? 0.0 : in[0];
   const double* bounds = out + 5;
   for (int w = 0; w < n.nwindow; ++w) {{
     const double* list = tools + w * {1 + MAX_GEOMS * GEOM};
     const int ngeom = (int)list[0];
-    double* record = out + {SUMMARY} + 3 * n.nslot + n.nwindow + (size_t)w * n.most * {RECORD};
+    double* record = number + n.nwindow + (size_t)w * n.most * {RECORD};
     int count = 0;
 #if !ON_CUDA
     bool any = false;
@@ -290,11 +315,16 @@ def _search(tid: int, nthread: int, n: Nodes): ...
     const int i = (int)pushed[4 * k];
     for (int c = 0; c < 3; ++c)
       out[{SUMMARY} + 3 * k + c] = i < 0 ? 0.0 : (double)n.dvel.data[n.node.data[i] + 8 * c];
+    for (int c = 0; c < 3 && i >= 0 && answered; ++c) {{
+      motion[9 * k + c] = n.disp.data[3 * i + c];
+      motion[9 * k + 3 + c] = n.velocity.data[3 * i + c];
+      motion[9 * k + 6 + c] = (double)n.x.data[n.node.data[i] + 8 * c];
+    }}
   }}
   if (tid > 0) return;
   for (int k = 0; k < 4; ++k) out[k] = (double)n.status.data[k];
   for (int w = 0; w < n.nwindow; ++w) {{
-    out[{SUMMARY} + 3 * n.nslot + w] = n.count.data[w];
+    number[w] = n.count.data[w];
     n.count.data[w] = 0;
   }}
 #if ON_CUDA
@@ -334,6 +364,12 @@ def enter(nthread: int, nodes: Nodes):
 def push_slots(nthread: int, nodes: Nodes):
   """Adds the forces on the slots to the solver's input."""
   _push_slots(wp.tid(), nthread, nodes)
+
+
+@wp.kernel(enable_backward=False)
+def push_impulses(nthread: int, nodes: Nodes):
+  """Writes the impulses on the slots to the solver's right-hand side, which is zero."""
+  _push_impulses(wp.tid(), nthread, nodes)
 
 
 @wp.kernel(enable_backward=False)

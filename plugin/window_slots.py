@@ -2,17 +2,27 @@
 
 A slot is a vertex body of a window; see `window`. The last numbers of the plugin state (`TAIL`):
 stamp of a motion kept on a device, time without motion [s], gravity [m/s^2] of the step in which
-the organ fell asleep, and the organ's bounds.
+the organ fell asleep, the organ's bounds, and how many times its inertia at rest a tool meets.
 """
 
 from __future__ import annotations
 
 import warp as wp
 
+from .coupling import (
+  ANSWERED,
+  ASLEEP,
+  CHANGED,
+  HEAVIER,
+  MISSED_ELEMENTS,
+  MISSED_NODES,
+  NEAR,
+  PENDING,
+  STALE,
+)
 from .window_nodes import GEOM, HEAD, MAX_GEOMS, MAX_WINDOWS, RECORD, SUMMARY, struct
 
-TAIL = 11
-STALE, ASLEEP, MISSED_NODES, MISSED_ELEMENTS, PENDING, NEAR = range(6)  # flags
+TAIL = 12
 # Height at which the spare slot of a window waits [m].
 AWAY = 1e3
 # Time without motion, force and tool after which an organ sleeps [s].
@@ -41,8 +51,7 @@ class Slots:
     left: node that a slot has given up in this step, -1    (nslot,)
     lagged: contact forces before the slots are given anew [N]  (3 nslot,)
     ext: external and lagged contact force [N]              (3 nslot,)
-    flags: STALE (the model lacks slots), ASLEEP, MISSED_NODES, MISSED_ELEMENTS, PENDING (mode of
-      the next commit), NEAR (a tool is near)               (6,)
+    flags: see `Workspace`                                  (8,)
   """
 
   nvert: int
@@ -111,6 +120,8 @@ class Slots:
   qpos: wp.array[wp.float64]
   qvel: wp.array[wp.float64]
   M: wp.array[wp.float64]
+  qLD: wp.array[wp.float64]
+  qLDiagInv: wp.array[wp.float64]
   qfrc_applied: wp.array[wp.float64]
   qfrc_passive: wp.array[wp.float64]
   qfrc_constraint: wp.array[wp.float64]
@@ -129,8 +140,11 @@ _STATE = f"""
   double* pushed = moved + 7 * s.nslot;
   double* tools = pushed + 4 * s.nslot;
   const double* out = s.outbox.data;
+  const double* motion = out + {SUMMARY} + 3 * s.nslot;
+  const double* number = motion + 9 * s.nslot;
   double* quiet = tail + 1;
   double* bounds = tail + 5;
+  double* times = tail + 11;
   auto node_of = [&](int k) -> int {{
     const double n = slots[k];
     return n == 0.0 ? s.home.data[k] : n >= 1.0 && n <= s.nvert ? (int)n - 1 : -1;
@@ -286,6 +300,7 @@ def _gather(s: Slots): ...
 
 @wp.func_native(
   _STATE
+  + HEAVIER
   + f"""
   const bool asleep = s.flags.data[{ASLEEP}];
   const double ok = !asleep && out[3] == 0.0 ? 1.0 : 0.0;
@@ -293,8 +308,14 @@ def _gather(s: Slots): ...
   else s.flags.data[{PENDING}] = 0;
   for (int k = 0; k < s.nslot; ++k) {{
     const int adr = s.dofadr.data[k];
+    const double gain = times[0] > 1.0 && touched(fc + 3 * k) ? times[0] : 1.0;
     for (int c = 0; c < 3; ++c) {{
-      const double inertia = s.M.data[s.massadr.data[3 * k + c]];
+      const int diagonal = s.massadr.data[3 * k + c];
+      const double inertia = gain * (s.body_mass.data[s.bodyid.data[k]] + s.dof_armature.data[adr]);
+      if (gain > 1.0) {{
+        s.M.data[diagonal] = s.qLD.data[diagonal] = inertia;
+        s.qLDiagInv.data[adr + c] = 1.0 / inertia;
+      }}
       const double dv = ok != 0.0 ? out[{SUMMARY} + 3 * k + c] : 0.0;
       const double f = inertia * dv / in[0] - s.ext.data[3 * k + c];
       if (f == f) s.qfrc_passive.data[adr + c] += f;
@@ -308,7 +329,8 @@ def _scatter(s: Slots): ...
 @wp.func_native(
   _STATE
   + f"""
-  in[3] = 0.0;
+  in[3] = in[9] = 0.0;
+  s.flags.data[{CHANGED}] = 0;
   if (s.flags.data[{ASLEEP}]) {{
     // Contacts of a window that was left behind wake the organ.
     for (int k = 0; k < s.nslot; ++k)
@@ -317,19 +339,25 @@ def _scatter(s: Slots): ...
     return;
   }}
   for (int c = 0; c < 6; ++c) bounds[c] = out[5 + c];
+  bool touched = false;
   bool calm = !s.flags.data[{NEAR}] && quiet[0] < {QUIET} && out[4] < s.slow * s.slow;
   for (int k = 0; k < s.nslot; ++k) {{
     const int i = s.placed.data[k], adr = s.dofadr.data[k], qadr = s.qposadr.data[k];
     double* move = moved + 7 * k;
     move[0] = i;
     for (int c = 0; c < 3; ++c) {{
-      fc[3 * k + c] = i < 0 ? 0.0 : s.qfrc_constraint.data[adr + c];
-      calm = calm && fc[3 * k + c] == 0.0 && pushed[4 * k + 1 + c] == 0.0;
+      const double before = fc[3 * k + c], f = i < 0 ? 0.0 : s.qfrc_constraint.data[adr + c];
+      touched = touched || f != 0.0;
+      calm = calm && f == 0.0 && pushed[4 * k + 1 + c] == 0.0;
+      fc[3 * k + c] = f;
+      pushed[4 * k + 1 + c] = in[0] * (f - before);
+      if (f != before) s.flags.data[{CHANGED}] = 1;
       if (i < 0) continue;
       move[1 + c] = s.qpos.data[qadr + c] - s.qhome.data[3 * k + c] - s.rest.data[3 * i + c];
       move[4 + c] = s.qvel.data[adr + c];
     }}
   }}
+  if (!touched) times[0] = 1.0;
   quiet[0] = calm ? quiet[0] + in[0] : 0.0;
   int mode = 1;
   if (quiet[0] >= {QUIET}) {{
@@ -351,17 +379,36 @@ def _leave(s: Slots): ...
 @wp.func_native(
   _STATE
   + _TRIANGLES
+  + HEAVIER
   + f"""
   if (s.flags.data[{ASLEEP}]) return;
   s.flags.data[{MISSED_NODES}] = 0;
   bool renewed = false;
+  const bool answered = s.flags.data[{ANSWERED}];
+  auto moved_to = [&](int k) {{ return answered ? motion + 9 * k : moved + 7 * k + 1; }};
+  if (answered) {{
+    double acted = 0.0, meant = 0.0, gross = 0.0, whole = 0.0, sum[3] = {{0.0, 0.0, 0.0}};
+    for (int k = 0; k < s.nslot; ++k) {{
+      double p2 = 0.0, f2 = 0.0;
+      for (int c = 0; c < 3 && s.placed.data[k] >= 0; ++c) {{
+        const double p = pushed[4 * k + 1 + c], f = fc[3 * k + c];
+        acted += p * motion[9 * k + 6 + c];
+        sum[c] += p;
+        p2 += p * p;
+        f2 += f * f;
+      }}
+      meant += p2 / s.M.data[s.massadr.data[3 * k]];
+      gross += sqrt(p2);
+      whole += in[0] * sqrt(f2);
+    }}
+    times[0] = heavier(times[0] > 1.0 ? times[0] : 1.0, acted, meant, sum, gross, whole);
+  }}
   for (int k = 0; k < s.nslot; ++k) {{
     s.left.data[k] = -1;
     for (int c = 0; c < 3; ++c) s.lagged.data[3 * k + c] = fc[3 * k + c];
-    if (s.placed.data[k] >= 0) stand(k, s.placed.data[k], moved + 7 * k + 1, moved + 7 * k + 4);
+    if (s.placed.data[k] >= 0) stand(k, s.placed.data[k], moved_to(k), moved_to(k) + 3);
     else for (int c = 0; c < 3; ++c) s.qvel.data[s.dofadr.data[k] + c] = 0.0;
   }}
-  const double* number = out + {SUMMARY} + 3 * s.nslot;
   const double* record = number + s.nwindow;
   auto node_at = [&](int q) -> int {{ return (int)record[(size_t){RECORD} * q]; }};
   auto far_at = [&](int q) -> double {{ return record[(size_t){RECORD} * q + 1]; }};
@@ -462,7 +509,7 @@ def _leave(s: Slots): ...
       if (other >= 0) {{
         // Another window had it: its motion and contact force come along.
         if (s.placed.data[other] == i) give_up(other);
-        at = moved + 7 * other + 1;
+        at = moved_to(other);
         speed = at + 3;
         for (int c = 0; c < 3; ++c) fc[3 * k + c] = s.lagged.data[3 * other + c];
       }}

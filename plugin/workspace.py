@@ -26,6 +26,7 @@ from . import (
   window_slots,
 )
 from .config import Config
+from .coupling import ANSWERED, ASLEEP, CHANGED, NFLAG, PENDING, STALE
 from .declare import Organ
 from .resident import Resident
 from .types import State, Surface
@@ -48,10 +49,17 @@ class Workspace:
     data: address of the mjData
     before, after: recorded graphs of a step's forces around the solve
     solve: recorded graphs of the solve and what it needs, each on one device
+    leave: recorded graph that takes the contact forces after MuJoCo's step
+    respond: recorded graphs of the organ's response to their change; none where the scheme has none
+    end: recorded graph that ends a step without that, or None
     advance: recorded graph of the plugin state's step
     place: recorded graph that puts the windows where the plugin state says, or None
     resident: keeper of a motion that stays on the device, or None
-    flags: what the windows report, see `window_slots`  (6,)
+    stiff: whether the response is needed, see `inertia.is_stiff`
+    computed: whether forces were computed for the step that ends
+    flags: what the coupling reports: STALE (the model lacks slots), ASLEEP, MISSED_NODES,
+      MISSED_ELEMENTS, PENDING (mode of the next commit), NEAR (a tool is near), CHANGED (contact
+      forces did) and ANSWERED (the organ responded)  (NFLAG,)
     counts: the number of vertices that MuJoCo sees of a windowed organ comes first
     status: iterations, relative residual, norm, failure  (4,)
     error: what went wrong since the last reset, or None
@@ -73,10 +81,15 @@ class Workspace:
   before: Any = None
   solve: list = dataclasses.field(default_factory=list)
   after: Any = None
+  leave: Any = None
+  respond: list = dataclasses.field(default_factory=list)
+  end: Any = None
   advance: Any = None
   place: Any = None
   resident: Resident | None = None
-  flags: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(6, np.int32))
+  stiff: bool = False
+  computed: bool = False
+  flags: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(NFLAG, np.int32))
   counts: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(1, np.int32))
   status: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(4, np.float32))
   error: str | None = None
@@ -89,7 +102,7 @@ class Workspace:
   def run(self):
     """Computes the step's forces and adds them to qfrc_passive."""
     wp.capture_launch(self.before)
-    if self.place is not None and (not self._owns_model() or self.flags[window_slots.STALE]):
+    if self.place is not None and (not self._owns_model() or self.flags[STALE]):
       # The model's windows are not those of this state, which was set from outside or shares the
       # model with another: contacts must be found again with the windows in place.
       wp.capture_launch(self.place)
@@ -98,26 +111,45 @@ class Workspace:
     if not self.asleep:
       if self.resident:
         self.resident.send()
-      for device, graph in self.solve:
-        wp.capture_launch(graph)
-        if device.is_cuda:
-          wp.synchronize_device(device)
+      _launch_all(self.solve)
       if self.resident:
         self.resident.look()
     wp.capture_launch(self.after)
+    self.computed = True
 
   def step(self):
     """Steps the plugin state after MuJoCo has moved."""
-    wp.capture_launch(self.advance)
+    computed, self.computed = self.computed, False
+    responds = bool(self.respond) and self.stiff and computed
+    if responds or self.place is not None:
+      wp.capture_launch(self.leave)
     if self.place is not None:
       window.hide(self)
-    if self.resident and not self.asleep:
+    if self.asleep:
+      return
+    responds = responds and bool(self.flags[CHANGED])
+    self.flags[ANSWERED] = responds
+    if responds:
+      self._answer()
+    elif self.end is not None:
+      wp.capture_launch(self.end)
+    wp.capture_launch(self.advance)
+    if self.resident:
       self.resident.step()
+
+  def _answer(self):
+    """Ends the step with the organ's own response to the change of the contact forces."""
+    if self.place is not None:
+      self.views["inbox"].numpy()[window_nodes.HEAD - 1] = 1.0
+    _launch_all(self.respond)
+    if self.resident:
+      self.flags[PENDING] = 0
+      self.resident.look()
 
   @property
   def asleep(self) -> bool:
     """Whether the organ is at rest and its solve was skipped."""
-    return bool(self.flags[window_slots.ASLEEP])
+    return bool(self.flags[ASLEEP])
 
   def _owns_model(self) -> bool:
     """Returns whether the model's windows were last placed here, and makes it so.
@@ -136,6 +168,13 @@ class Workspace:
         "(copy.copy(model))"
       )
     return False
+
+
+def _launch_all(graphs: list):
+  for device, graph in graphs:
+    wp.capture_launch(graph)
+    if device.is_cuda:
+      wp.synchronize_device(device)
 
 
 # By address of the mjModel: whose windows it holds, and the thread that placed them.
@@ -157,7 +196,7 @@ def state_size(model: int, instance: int) -> int:
   if mjstruct.config(model, instance, "window"):
     # Asked before MuJoCo has filled in the flexes: what `window` needs is at most this.
     return 9 * m.nflexvert
-  return 6 * len(declare.moving_bodies(m, instance))
+  return 6 * len(declare.moving_bodies(m, instance)) + 1
 
 
 def make(model: int, data: int, instance: int) -> Workspace:
@@ -168,7 +207,7 @@ def make(model: int, data: int, instance: int) -> Workspace:
     s = organ.surface
     state = types.make_state(s)
     host = {}
-    for field in (*_IN, *_OUT):
+    for field in (*_IN, *_OUT, "rhs", "x"):
       array = getattr(state, field)
       if s.device.is_cuda:
         array = wp.zeros(array.shape, dtype=float, device="cpu", pinned=True)
@@ -185,6 +224,7 @@ def make(model: int, data: int, instance: int) -> Workspace:
     mass = np.where(s.vert.numpy() >= 0, 0.0, 1.0).reshape(1, -1, 8)
     host["mass"].assign(mass)
     bind(w, model, instance)
+    w.stiff = inertia.is_stiff(m, organ, w.config)
     if w.place is not None:
       window.settle(w, model)
       place(w)
@@ -213,9 +253,21 @@ def bind(w: Workspace, model: int, instance: int):
       if crossing:
         _cross(w, _OUT, to_device=False)
 
+    def respond():
+      if crossing:
+        _cross(w, ("rhs",), to_device=True)
+      schemes.respond(w.surface, w.state, w.config.integrator)
+      if crossing:
+        _cross(w, ("x", "status"), to_device=False)
+
     w.before = _record(cpu, launches.gather)
     w.solve = _record_all((near, launches.enter), (device, solve), (near, launches.look))
     w.after = _record(cpu, launches.scatter)
+    w.leave = _record(cpu, launches.leave)
+    w.respond = []
+    if w.config.integrator in schemes.RESPONDING:
+      w.respond = _record_all((near, launches.push), (device, respond), (near, launches.answer))
+    w.end = _record(cpu, launches.end) if launches.end else None
     w.advance = _record(cpu, launches.advance)
     w.place = _record(cpu, launches.place) if launches.place else None
   w.model = model
@@ -272,6 +324,7 @@ def configure(w: Workspace, instance: int, texts: dict[str, str]):
   if fresh.areavec.shape != w.state.areavec.shape:
     w.state.areavec = fresh.areavec
   bind(w, w.model, instance)
+  w.stiff = inertia.is_stiff(mjstruct.Model.from_address(w.model), w.organ, w.config)
   if w.place is not None:
     window.wake(w)
 
@@ -290,4 +343,5 @@ def refresh(w: Workspace):
       inertia.set_armature(m, w.organ)
     else:
       window.set_inertia(w, m)
+    w.stiff = inertia.is_stiff(m, w.organ, w.config)
     w.time_step = float(m.opt.timestep)

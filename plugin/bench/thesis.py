@@ -196,7 +196,7 @@ def _parts(s: Surface, d: State, scheme: str, repeat: int = 30) -> Row:
   works = {"integration_ms": lambda: schemes.step(s, d, scheme)}
   if scheme == "implicit":
     works["assemble_ms"] = lambda: elastic.assemble(s, d, Stage.FIRST)
-    works["solve_ms"] = lambda: solver.solve(s, d, True)
+    works["solve_ms"] = lambda: solver.solve(s, d, Stage.FIRST)
   if s.device.is_cuda:
     works |= {"to_ms": to_device, "from_ms": from_device}
   row: Row = {}

@@ -41,7 +41,7 @@ def count(s: types.Surface, d: types.State) -> dict:
   for kind, tolerance in itertools.product(PRECONDITIONERS, TOLERANCES):
     s.levels = coarse if kind == "multilevel" else None
     s.tolerance = tolerance
-    solver.solve(s, d, first=True)
+    solver.solve(s, d, elastic.Stage.FIRST)
     iterations, residual = d.status.numpy()[0, :2]
     out[f"{kind}_{tolerance:g}"] = int(iterations) if residual <= tolerance else MOST + 1
   s.levels = coarse

@@ -164,7 +164,7 @@ def timed(s: types.Surface, d: types.State, repeat: int) -> dict:
   parts = {
     "step": record(s, lambda: solver.step(s, d)),
     "assemble": record(s, assemble),
-    "solve": record(s, lambda: solver.solve(s, d, first=True)),
+    "solve": record(s, lambda: solver.solve(s, d, elastic.Stage.FIRST)),
   }
   times = {name: [] for name in parts}
   for _ in range(repeat):
