@@ -228,6 +228,24 @@ def test_an_explicit_step_that_blows_up_is_called_so(tmp_path):
   assert _judged(tmp_path, "explicit", h=1e-2, young=1e6)["verdict"] in stability.FAILURES
 
 
+@pytest.mark.parametrize(
+  "name",
+  [
+    "map-implicit-0.005-1e+06",
+    "hypercube-implicit-0.004155-89990-47",
+    "hypercube-implicit-0.0009322-3.832e+06-130",  # 1.5 m/s
+    "hypercube-implicit-0.001454-1.154e+06-366",  # pushed through by 0.1 m/s
+    "hypercube-implicit-0.0005733-39910-213",  # plate thicker than its triangles are wide
+    "hypercube-implicit-window-0.0007135-154.1-170",  # 1 g of tissue
+    "hypercube-implicit-window-0.001793-570.6-214",
+  ],
+)
+def test_what_once_failed_is_stable(tmp_path, name):
+  (case,) = [c for c in stability.stages(short=False)[0] if c["case"] == name]
+  (row,) = stability.run(case, tmp_path)
+  assert row["verdict"] not in stability.FAILURES
+
+
 def test_one_case_of_the_stability_bench_is_run_again_by_name(tmp_path, capsys):
   (case,) = [
     c["case"]
