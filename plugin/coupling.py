@@ -9,7 +9,7 @@ itself in this step and f_c their constraint force of the last step, both of whi
 right-hand side of the implicit step. MuJoCo's own step then gives
 v + dv + h (f_c_new - f_c) / Mhat: at rest the contact force is exact whatever h is.
 
-Where tissue is stiff for the time step (`inertia.is_stiff`) the last term is put right after
+Where tissue is stiff for the time step (`inertia.stiffness`) the last term is put right after
 MuJoCo's step: it becomes A^-1 h (f_c_new - f_c), the organ's own response, so that the organ has
 taken an implicit step under the forces that act in it, and gains no more energy than they give.
 Mhat then is a guess of what a tool meets, and follows the organ's answers (`HEAVIER`).
@@ -29,9 +29,8 @@ from . import mjstruct, solver
 from .simd import LANES
 
 # Of contact forces, the change that says something about the inertia which they meet: its share of
-# them, and the share of it that does not cancel; the most that it may make of the inertia, and in
-# a step.
-_CHANGE, _COHERENT, _HEAVIEST, _FASTER = 0.005, 0.7, 8.0, 2.0
+# them, and the share of it that does not cancel; and the most that it may make more in a step.
+_CHANGE, _COHERENT, _FASTER = 0.005, 0.7, 2.0
 
 # What a coupling reports, in `Workspace.flags`; see there.
 NFLAG = 8
@@ -175,16 +174,16 @@ def _gather(
 # 2008, doi:10.1007/s00466-008-0255-5). `acted` is the sum of impulse times the organ's answer,
 # `meant` that of impulse times what the dofs' inertia makes of it, `sum` that of the changes,
 # `gross` and `whole` those of their sizes and of the forces' sizes. Impulses that cancel say
-# nothing about what a tool meets.
+# nothing about what a tool meets, and it meets no more than one node alone has, `heaviest` times.
 HEAVIER = f"""
   auto touched = [](const double* f) {{ return f[0] != 0.0 || f[1] != 0.0 || f[2] != 0.0; }};
   auto heavier = [&](double now, double acted, double meant, const double* sum, double gross,
-                     double whole) -> double {{
+                     double whole, double heaviest) -> double {{
     if (whole == 0.0) return 1.0;
     const double net = sqrt(sum[0] * sum[0] + sum[1] * sum[1] + sum[2] * sum[2]);
     if (!(acted > 0.0) || gross < {_CHANGE} * whole || net < {_COHERENT} * gross) return now;
     const double seen = now * meant / acted;
-    const double most = {_FASTER} * now < {_HEAVIEST} ? {_FASTER} * now : {_HEAVIEST};
+    const double most = {_FASTER} * now < heaviest ? {_FASTER} * now : heaviest;
     return seen < 1.0 ? 1.0 : seen > most ? most : seen;
   }};
 """
@@ -357,7 +356,8 @@ def _impulses(
     gross += sqrt(df2);
     whole += sqrt(f2);
   }}
-  if (answered) plugin_state.data[2 * nfree] = heavier(heavy, acted, meant, sum, gross, whole);
+  if (answered) plugin_state.data[2 * nfree] = heavier(heavy, acted, meant, sum, gross, whole,
+                                                     heaviest.data[0]);
 """)
 def _remember_native(
   nnode: int,
@@ -366,6 +366,7 @@ def _remember_native(
   qposadr: wp.array[int],
   bodyid: wp.array[int],
   stateadr: wp.array[int],
+  heaviest: wp.array[wp.float64],
   timestep: wp.array[wp.float64],
   body_mass: wp.array[wp.float64],
   dof_armature: wp.array[wp.float64],
@@ -389,6 +390,7 @@ def _remember(
   qposadr: wp.array[int],
   bodyid: wp.array[int],
   stateadr: wp.array[int],
+  heaviest: wp.array[wp.float64],
   # Model:
   timestep: wp.array[wp.float64],
   body_mass: wp.array[wp.float64],
@@ -413,6 +415,7 @@ def _remember(
     qposadr,
     bodyid,
     stateadr,
+    heaviest,
     timestep,
     body_mass,
     dof_armature,
@@ -508,6 +511,7 @@ def launches(w, model: int, instance: int) -> Launches:
     "qLDiagInv": wrap(d.qLDiagInv, m.nv),
     "plugin_state": wrap(d.plugin_state + 8 * start, 2 * organ.nfree + 1),
     "flags": wp.array(w.flags, dtype=int, device="cpu", copy=False),
+    "heaviest": wp.array(w.heaviest, dtype=wp.float64, device="cpu", copy=False),
   }
 
   def gather():
@@ -569,8 +573,8 @@ def launches(w, model: int, instance: int) -> Launches:
       inputs=[
         s.nnode,
         organ.nfree,
-        *(v[k] for k in ("dofadr", "qposadr", "bodyid", "stateadr", "timestep", "body_mass")),
-        *(v[k] for k in ("dof_armature", "qfrc_constraint")),
+        *(v[k] for k in ("dofadr", "qposadr", "bodyid", "stateadr", "heaviest", "timestep")),
+        *(v[k] for k in ("body_mass", "dof_armature", "qfrc_constraint")),
         *(host[k] for k in ("vel", "dvel", "x", "status")),
         v["flags"],
       ],

@@ -22,11 +22,13 @@ _SAMPLES = 24
 # Nodes that say whether tissue is stiff, and times its own mass that one moves then: of presses
 # with less, none gained energy from contacts that MuJoCo answers with the dofs' inertia.
 _FEW = 8
-_STIFF = 1.8
+_STIFF = 2.0
+# Times its inertia by itself that a pressed node may have, which is stretched too.
+_PRESSED = 2.0
 _KNOWN = 64
 # A pressed shell stiffens and few nodes of a patch touch: between 1 and the limit of 2.
 _MARGIN = 1.5
-_stiff: dict[bytes, bool] = {}  # digest of what it depends on -> whether that tissue is stiff
+_alone: dict[bytes, np.ndarray] = {}  # digest of what it depends on -> `alone`
 _time_step: dict[bytes, float] = {}  # digest of an armature of ours -> the time step it is for
 
 
@@ -55,29 +57,43 @@ def set_armature(m, organ: Organ):
   mjstruct.view(m.dof_M0, m.nv)[dofs] = np.repeat(inertia[organ.free], 3)
 
 
-def is_stiff(m, organ: Organ, config: Config) -> bool:
-  """Returns whether a push on one node moves others with it within a step of the model's length.
+def stiffness(m, organ: Organ, config: Config, nodal: np.ndarray) -> tuple[bool, float]:
+  """Returns whether tissue is stiff for the model's time step, and how much one node alone is more.
 
-  That is where a node by itself has an effective inertia of over `_STIFF` masses.
+  It is where a push on one node moves others with it within a step: where one in four has an
+  effective inertia of over `_STIFF` masses by itself.
+
+  Args:
+    m: the mjModel
+    organ: the organ
+    config: its configuration in force
+    nodal: effective inertia of every node [kg], (nvert,)
+
+  Returns:
+    whether it is; most times its inertia in `nodal` that a pressed node may have [-]
   """
-  h = float(m.opt.timestep)
-  mass = _masses(m, organ)
-  damping = config.damping
-  numbers = np.array([h, damping, config.foundation, config.bulk])
+  sample = _spread(organ.mesh.rest, np.flatnonzero(organ.free), _FEW)
+  alone = _by_itself(m, organ, config, sample)
+  stiff = np.quantile(alone / _masses(m, organ)[sample], 0.75) > _STIFF
+  return bool(stiff), _PRESSED * max(1.0, float(np.median(alone / nodal[sample])))
+
+
+def _by_itself(m, organ: Organ, config: Config, sample: np.ndarray) -> np.ndarray:
+  """Returns the effective inertia of the nodes `sample` [kg], each pushed alone."""
+  h, mass = float(m.opt.timestep), _masses(m, organ)
+  numbers = [h, config.damping, config.foundation, config.bulk]
   key = _digest(np.concatenate([numbers, mass, organ.mesh.rest.ravel(), organ.free]))
   key = _digest(np.frombuffer(key + repr(organ.config).encode(), np.uint8))
-  if key not in _stiff:
-    if len(_stiff) >= _KNOWN:
-      _stiff.pop(next(iter(_stiff)))
+  if key not in _alone:
+    if len(_alone) >= _KNOWN:
+      _alone.pop(next(iter(_alone)))
     s = dataclasses.replace(
-      organ.surface, damping=damping, foundation=config.foundation, bulk=config.bulk
+      organ.surface, damping=config.damping, foundation=config.foundation, bulk=config.bulk
     )
     gain = _gain(config, h)
-    sample = _spread(organ.mesh.rest, np.flatnonzero(organ.free), _FEW)
-    alone = _responses(s, _state(s), organ.mesh, mass, organ.free, h, 0.0, gain, sample)
-    ratio = 1 / np.maximum(alone, 1e-300) / mass[sample]
-    _stiff[key] = bool(ratio.max() > _STIFF)
-  return _stiff[key]
+    response = _responses(s, _state(s), organ.mesh, mass, organ.free, h, 0.0, gain, sample)
+    _alone[key] = 1 / np.maximum(response, 1e-300)
+  return _alone[key]
 
 
 def of_nodes(m, organ: Organ, mass: np.ndarray, h: float, flex: int) -> np.ndarray:
@@ -86,6 +102,13 @@ def of_nodes(m, organ: Organ, mass: np.ndarray, h: float, flex: int) -> np.ndarr
   s = organ.surface
   gain = _gain(organ.config, h)
   return effective_inertia(s, _state(s), organ.mesh, mass, organ.free, h, radius, gain)
+
+
+def of_dofs(m, organ: Organ) -> np.ndarray:
+  """Returns the inertia that the dofs of every node have in the model [kg], (nvert,)."""
+  inertia = _masses(m, organ).copy()
+  inertia[organ.free] += mjstruct.view(m.dof_armature, m.nv)[organ.dofs].reshape(-1, 3)[:, 0]
+  return inertia
 
 
 def _masses(m, organ: Organ) -> np.ndarray:

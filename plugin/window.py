@@ -150,6 +150,7 @@ def _scratch(w, side: wp.Device) -> dict[str, wp.array]:
     "lagged": _doubles(np.zeros(3 * nslot)),
     "inertia": _doubles(np.zeros(nvert)),
     "flags": wp.array(w.flags, dtype=int, device="cpu", copy=False),
+    "heaviest": wp.array(w.heaviest, dtype=wp.float64, device="cpu", copy=False),
     **{
       name: wp.zeros(size, dtype=wp.float64, device="cpu", pinned=side.is_cuda)
       for name, size in boxes.items()

@@ -51,7 +51,7 @@ class Slots:
     left: node that a slot has given up in this step, -1    (nslot,)
     lagged: contact forces before the slots are given anew [N]  (3 nslot,)
     ext: external and lagged contact force [N]              (3 nslot,)
-    flags: see `Workspace`                                  (8,)
+    flags, heaviest: see `Workspace`                        (8,), (1,)
   """
 
   nvert: int
@@ -97,6 +97,7 @@ class Slots:
   lagged: wp.array[wp.float64]
   ext: wp.array[wp.float64]
   flags: wp.array[int]
+  heaviest: wp.array[wp.float64]
   inbox: wp.array[wp.float64]
   outbox: wp.array[wp.float64]
   status: wp.array2d[float]
@@ -210,6 +211,7 @@ _TRIANGLES = f"""
   const double still = s.rest_share * 9.81 * h;
   in[2] = s.weight * still * still;
   in[3] = s.flags.data[{PENDING}];
+  in[9] = 0.0;
   const bool falls = !(s.disableflags.data[0] & s.no_gravity);
   bool changed = false;
   for (int c = 0; c < 3; ++c) {{
@@ -401,7 +403,8 @@ def _leave(s: Slots): ...
       gross += sqrt(p2);
       whole += in[0] * sqrt(f2);
     }}
-    times[0] = heavier(times[0] > 1.0 ? times[0] : 1.0, acted, meant, sum, gross, whole);
+    times[0] = heavier(times[0] > 1.0 ? times[0] : 1.0, acted, meant, sum, gross, whole,
+      s.heaviest.data[0]);
   }}
   for (int k = 0; k < s.nslot; ++k) {{
     s.left.data[k] = -1;

@@ -55,7 +55,8 @@ class Workspace:
     advance: recorded graph of the plugin state's step
     place: recorded graph that puts the windows where the plugin state says, or None
     resident: keeper of a motion that stays on the device, or None
-    stiff: whether the response is needed, see `inertia.is_stiff`
+    stiff: whether the response is needed, see `inertia.stiffness`
+    heaviest: most times its inertia that a node in contact may have, see there  (1,)
     computed: whether forces were computed for the step that ends
     flags: what the coupling reports: STALE (the model lacks slots), ASLEEP, MISSED_NODES,
       MISSED_ELEMENTS, PENDING (mode of the next commit), NEAR (a tool is near), CHANGED (contact
@@ -88,6 +89,7 @@ class Workspace:
   place: Any = None
   resident: Resident | None = None
   stiff: bool = False
+  heaviest: np.ndarray = dataclasses.field(default_factory=lambda: np.ones(1))
   computed: bool = False
   flags: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(NFLAG, np.int32))
   counts: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(1, np.int32))
@@ -224,11 +226,20 @@ def make(model: int, data: int, instance: int) -> Workspace:
     mass = np.where(s.vert.numpy() >= 0, 0.0, 1.0).reshape(1, -1, 8)
     host["mass"].assign(mass)
     bind(w, model, instance)
-    w.stiff = inertia.is_stiff(m, organ, w.config)
     if w.place is not None:
       window.settle(w, model)
       place(w)
+    _feel(w, m)
     return w
+
+
+def _feel(w: Workspace, m):
+  """Notes whether the organ is stiff for the present time step."""
+  if w.organ.windows:
+    nodal = w.views["inertia"].numpy()
+  else:
+    nodal = inertia.of_dofs(m, w.organ)
+  w.stiff, w.heaviest[0] = inertia.stiffness(m, w.organ, w.config, nodal)
 
 
 def bind(w: Workspace, model: int, instance: int):
@@ -324,7 +335,7 @@ def configure(w: Workspace, instance: int, texts: dict[str, str]):
   if fresh.areavec.shape != w.state.areavec.shape:
     w.state.areavec = fresh.areavec
   bind(w, w.model, instance)
-  w.stiff = inertia.is_stiff(mjstruct.Model.from_address(w.model), w.organ, w.config)
+  _feel(w, mjstruct.Model.from_address(w.model))
   if w.place is not None:
     window.wake(w)
 
@@ -343,5 +354,5 @@ def refresh(w: Workspace):
       inertia.set_armature(m, w.organ)
     else:
       window.set_inertia(w, m)
-    w.stiff = inertia.is_stiff(m, w.organ, w.config)
+    _feel(w, m)
     w.time_step = float(m.opt.timestep)
