@@ -99,7 +99,7 @@ def test_tissue_is_stiff_for_a_time_step(device):
   assert not soft[2]._space.stiff
   assert load("window", device)[2]._space.stiff
   m, d, organ = soft
-  m.opt.timestep = 8e-3
+  m.opt.timestep = 2e-2
   mujoco.mj_step(m, d, 2)
   assert organ._space.stiff
   m.opt.timestep = 1e-3
