@@ -27,7 +27,11 @@ NAME = "palpate.organ"
 
 _P = C.c_void_p
 # MuJoCo's warnings of a state it then resets: of positions, velocities and accelerations.
-_BAD = slice(int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mjWARN_BADQACC) + 1)
+_BAD = (
+  int(mujoco.mjtWarning.mjWARN_BADQPOS),
+  int(mujoco.mjtWarning.mjWARN_BADQVEL),
+  int(mujoco.mjtWarning.mjWARN_BADQACC),
+)
 
 
 class _Plugin(C.Structure):
@@ -132,7 +136,7 @@ def _compute(model: int, data: int, instance: int, capability: int):
   try:
     if w.model != model:
       workspace.bind(w, model, instance)
-    if w.warning[_BAD, 1].sum() > w.nbad:
+    if _count_bad(w) > w.nbad:
       _find_bad_state(w)
     w.run()
   except Exception as error:
@@ -141,14 +145,18 @@ def _compute(model: int, data: int, instance: int, capability: int):
     _fail(w, "the implicit step has no finite solution: the motion diverged")
 
 
+def _count_bad(w: Workspace) -> int:
+  warned = w.warning  # last index and count of each
+  return warned[2 * _BAD[0] + 1] + warned[2 * _BAD[1] + 1] + warned[2 * _BAD[2] + 1]
+
+
 def _find_bad_state(w: Workspace):
   """Makes an error of what MuJoCo warned of, and has reset since, if it is in this organ's dofs."""
-  w.nbad = int(w.warning[_BAD, 1].sum())
+  w.nbad = _count_bad(w)
   organ = w.organ
   names = ("position (qpos", "velocity (qvel", "acceleration (qacc")
-  for (index, count), name, own in zip(
-    w.warning[_BAD], names, (organ.qposs, organ.dofs, organ.dofs), strict=True
-  ):
+  for kind, name, own in zip(_BAD, names, (organ.qposs, organ.dofs, organ.dofs), strict=True):
+    index, count = w.warning[2 * kind : 2 * kind + 2]
     if count and index in own:
       _fail(w, f"{name} {index}) is not finite or huge; the motion diverged")
 
@@ -165,7 +173,7 @@ def _advance(model: int, data: int, instance: int):
     w.step()
     if w.overflow is None and (w.flags[MISSED_NODES] or w.flags[MISSED_ELEMENTS]):
       _overflow(w)
-    if mjstruct.Model.from_address(model).opt.timestep != w.time_step:
+    if w.model_step[0] != w.time_step:
       workspace.refresh(w)
   except Exception as error:
     _fail(w, f"{type(error).__name__}: {error}")

@@ -50,7 +50,7 @@ def launches(w, model: int, instance: int) -> Launches:
   m, d = mjstruct.Model.from_address(model), mjstruct.Data.from_address(w.data)
   start = int(mjstruct.view(m.plugin_stateadr, m.nplugin, np.int32)[instance])
   v["plugin_state"] = wrap(d.plugin_state + 8 * start, state_size(nvert, nslot))
-  w.counts = mjstruct.view(m.flex_vertnum, m.nflex, np.int32)[organ.flex :]
+  w.counts = memoryview(mjstruct.view(m.flex_vertnum, m.nflex, np.int32)[organ.flex :])
   slots = _slots(w, model)
   nodes = _nodes(w, side)
   away = nodes.inbox is not v["inbox"]  # the nodes are on another device

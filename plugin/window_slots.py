@@ -294,7 +294,15 @@ _TRIANGLES = f"""
     list[0] = count;
   }}
   s.flags.data[{NEAR}] = near;
-  s.flags.data[{ASLEEP}] = quiet[0] >= {QUIET} && !near && !pushes && !changed;
+  const bool asleep = quiet[0] >= {QUIET} && !near && !pushes && !changed;
+  s.flags.data[{ASLEEP}] = asleep;
+  if (!asleep || stale) return;
+  // The slots stay where they are; nothing else is done in such a step.
+  s.status.data[0] = s.status.data[1] = 0.0f;
+  for (int k = 0; k < s.nslot; ++k)
+    for (int c = 0; c < 3; ++c)
+      if (s.ext.data[3 * k + c] == s.ext.data[3 * k + c])
+        s.qfrc_passive.data[s.dofadr.data[k] + c] -= s.ext.data[3 * k + c];
 """
 )
 def _gather(s: Slots): ...
@@ -304,10 +312,8 @@ def _gather(s: Slots): ...
   _STATE
   + HEAVIER
   + f"""
-  const bool asleep = s.flags.data[{ASLEEP}];
-  const double ok = !asleep && out[3] == 0.0 ? 1.0 : 0.0;
-  if (asleep) s.status.data[0] = s.status.data[1] = 0.0f;
-  else s.flags.data[{PENDING}] = 0;
+  const double ok = out[3] == 0.0 ? 1.0 : 0.0;
+  s.flags.data[{PENDING}] = 0;
   for (int k = 0; k < s.nslot; ++k) {{
     const int adr = s.dofadr.data[k];
     const double gain = times[0] > 1.0 && touched(fc + 3 * k) ? times[0] : 1.0;
@@ -558,7 +564,10 @@ def _place(s: Slots): ...
 
 @wp.kernel(enable_backward=False)
 def gather(slots: Slots):
-  """Reads what acts on the slots and where the tools are; flags slots that the model lacks."""
+  """Reads what acts on the slots and where the tools are; flags slots that the model lacks.
+
+  Asleep it does what `scatter` does otherwise.
+  """
   _gather(slots)
 
 

@@ -65,8 +65,10 @@ class Workspace:
     status: iterations, relative residual, norm, failure  (4,)
     error: what went wrong since the last reset, or None
     overflow: what the windows had no room for, the first time, or None
-    warning: last index and count of each of MuJoCo's warnings (nwarning, 2)
+    warning: last index and count of each of MuJoCo's warnings, one after the other
+    nefc: the number of MuJoCo's constraints comes first
     nbad: MuJoCo's warnings of bad states that were looked at since the last reset
+    model_step: the model's time step comes first [s]
     time_step: time step that the armature is for [s]
     views: what the graphs point at, kept alive
   """
@@ -92,36 +94,53 @@ class Workspace:
   heaviest: np.ndarray = dataclasses.field(default_factory=lambda: np.ones(1))
   computed: bool = False
   flags: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(NFLAG, np.int32))
-  counts: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(1, np.int32))
+  counts: memoryview = dataclasses.field(default_factory=lambda: memoryview(np.zeros(1, np.int32)))
   status: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(4, np.float32))
   error: str | None = None
   overflow: str | None = None
-  warning: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 2), np.int32))
+  # Views that every step looks at: an item of a memoryview costs a tenth of one of an array.
+  warning: memoryview = dataclasses.field(default_factory=lambda: memoryview(b""))
+  nefc: memoryview = dataclasses.field(default_factory=lambda: memoryview(b"\0"))
   nbad: int = 0
+  model_step: memoryview = dataclasses.field(default_factory=lambda: memoryview(b"\0"))
   time_step: float = 0.0
   views: dict = dataclasses.field(default_factory=dict)
 
+  def __post_init__(self):
+    self._me = weakref.ref(self)
+
   def run(self):
     """Computes the step's forces and adds them to qfrc_passive."""
+    # The model's windows may not be those of this state, which was set from outside or shares the
+    # model with another: contacts must be found again with the windows in place.
+    if self.place is not None and not self._owns_model():
+      self._find_contacts_again()
     wp.capture_launch(self.before)
-    if self.place is not None and (not self._owns_model() or self.flags[STALE]):
-      # The model's windows are not those of this state, which was set from outside or shares the
-      # model with another: contacts must be found again with the windows in place.
-      wp.capture_launch(self.place)
-      mjstruct.library().mj_fwdPosition(self.model, self.data)
+    if self.place is not None and self.flags[STALE]:
+      self._find_contacts_again()
       wp.capture_launch(self.before)
-    if not self.asleep:
-      if self.resident:
-        self.resident.send()
-      _launch_all(self.solve)
-      if self.resident:
-        self.resident.look()
+    if self.asleep:
+      self.computed = True
+      return  # what `after` does was done with `before`
+    if self.resident:
+      self.resident.send()
+    _launch_all(self.solve)
+    if self.resident:
+      self.resident.look()
     wp.capture_launch(self.after)
     self.computed = True
+
+  def _find_contacts_again(self):
+    wp.capture_launch(self.place)
+    mjstruct.library().mj_fwdPosition(self.model, self.data)
 
   def step(self):
     """Steps the plugin state after MuJoCo has moved."""
     computed, self.computed = self.computed, False
+    if self.asleep and not self.nefc[0]:
+      if self.counts[0]:
+        window.hide(self)
+      return
     responds = bool(self.respond) and self.stiff and computed
     if responds or self.place is not None:
       wp.capture_launch(self.leave)
@@ -159,10 +178,11 @@ class Workspace:
     Raises:
       RuntimeError: two threads step the same model.
     """
-    before = _owner.get(self.model)
-    mine = weakref.ref(self)
-    _owner[self.model] = (mine, threading.get_ident())
-    if before is None or before[0]() is self:
+    before, thread = _owner.get(self.model), threading.get_ident()
+    if before is not None and before == (self._me, thread):
+      return True
+    _owner[self.model] = (self._me, thread)
+    if before is None or before[0] is self._me:
       return before is not None
     if before[0]() is not None and before[1] != threading.get_ident():
       raise RuntimeError(
@@ -186,7 +206,7 @@ _owner: dict[int, tuple[Any, int]] = {}
 def place(w: Workspace):
   """Puts the windows where the plugin state says."""
   wp.capture_launch(w.place)
-  _owner[w.model] = (weakref.ref(w), threading.get_ident())
+  _owner[w.model] = (w._me, threading.get_ident())
 
 
 def state_size(model: int, instance: int) -> int:
@@ -218,8 +238,9 @@ def make(model: int, data: int, instance: int) -> Workspace:
     ext = wp.zeros(3 * size, dtype=wp.float64, device="cpu")
     w = Workspace(organ, organ.config, s, state, host, ext, data)
     w.status = host["status"].numpy()[0]
-    offset, count = mjstruct.Data.warning.offset, len(mjstruct.Data.from_address(data).warning)
-    w.warning = mjstruct.view(data + offset, (count, 2), np.int32)
+    d, count = mjstruct.Data, len(mjstruct.Data.from_address(data).warning)
+    w.warning = memoryview(mjstruct.view(data + d.warning.offset, 2 * count, np.int32))
+    w.nefc = memoryview(mjstruct.view(data + d.nefc.offset, 1, np.int32))
     if organ.windows is None:
       inertia.set_armature(m, organ)
     # Padding nodes have a mass so that nothing divides by zero.
@@ -282,6 +303,7 @@ def bind(w: Workspace, model: int, instance: int):
     w.advance = _record(cpu, launches.advance)
     w.place = _record(cpu, launches.place) if launches.place else None
   w.model = model
+  w.model_step = memoryview(coupling.option_views(model)["timestep"].numpy())
   w.time_step = float(m.opt.timestep)
 
 
