@@ -7,7 +7,8 @@ triangles between them. Forces follow the formula of `coupling`; a node outside 
 dv exactly as it would with dofs of its own and no contact.
 
 plugin_state: displacement (3 nvert), velocity (3 nvert), last dv (3 nvert), contact force (3 W),
-slots (W; node + 1, 0 for the slot's default node, -1 for a slot that is not used), `TAIL` numbers.
+slots (W; node + 1, 0 for the slot's default node, -1 for a slot that is not used), poses of the
+windows' geoms when the organ fell asleep (12 each), `TAIL` numbers.
 
 The nodes' kernels (`window_nodes`) run on the CPU over that memory, or, for a `resident` organ, on
 its device over a copy that `Resident` keeps; the slots' kernels (`window_slots`) on the CPU.
@@ -33,9 +34,9 @@ _SLOW = 1e-5
 _ROOM = 16
 
 
-def state_size(nvert: int, nslot: int) -> int:
-  """Returns the length of the plugin state."""
-  return 9 * nvert + 4 * nslot + window_slots.TAIL
+def state_size(nvert: int, nslot: int, ngeom: int) -> int:
+  """Returns the length of the plugin state; ngeom is summed over the windows."""
+  return 9 * nvert + 4 * nslot + window_slots.POSE * ngeom + window_slots.TAIL
 
 
 def launches(w, model: int, instance: int) -> Launches:
@@ -49,7 +50,7 @@ def launches(w, model: int, instance: int) -> Launches:
   v = w.views
   m, d = mjstruct.Model.from_address(model), mjstruct.Data.from_address(w.data)
   start = int(mjstruct.view(m.plugin_stateadr, m.nplugin, np.int32)[instance])
-  v["plugin_state"] = wrap(d.plugin_state + 8 * start, state_size(nvert, nslot))
+  v["plugin_state"] = wrap(d.plugin_state + 8 * start, state_size(nvert, nslot, win.geom.size))
   w.counts = memoryview(mjstruct.view(m.flex_vertnum, m.nflex, np.int32)[organ.flex :])
   slots = _slots(w, model)
   nodes = _nodes(w, side)
@@ -180,6 +181,8 @@ def _slots(w, model: int) -> Slots:
   for corner in (mesh.elem, mesh.elem[:, [1, 2, 0]]):
     np.maximum.at(longest, corner.ravel(), length.ravel())
   radius = float(mjstruct.view(m.flex_radius, m.nflex)[win.flex].max())
+  margin = float(mjstruct.view(m.flex_margin, m.nflex)[win.flex].max())
+  margin += float(mjstruct.view(m.geom_margin, m.ngeom)[win.geom].max(initial=0.0))
   numbers = {
     "nvert": mesh.nvert,
     "nslot": win.nslot,
@@ -191,6 +194,8 @@ def _slots(w, model: int) -> Slots:
     "rest_share": solver.REST,
     "reach": max(_REACH * spacing, float(longest.max())) + radius,
     "slow": _SLOW * float(np.linalg.norm(np.ptp(mesh.rest, axis=0))),
+    "longest": float(longest.max()),
+    "skin": radius + margin,
     "weight": float(win.mass.sum()),
   }
   arrays = option_views(model) | {

@@ -207,7 +207,7 @@ def _push_impulses(tid: int, nthread: int, n: Nodes): ...
 
 
 # Distance of the point d from a geom's centre to the geom; G: centre, axes, type, size, box.
-_DISTANCE = """
+DISTANCE = """
   double l[3];
   for (int c = 0; c < 3; ++c) l[c] = G[3 + c] * dx + G[6 + c] * dy + G[9 + c] * dz;
   const double* s = G + 13;
@@ -284,7 +284,7 @@ _DISTANCE = """
         const double* G = list + 1 + {GEOM} * q;
         const double dx = x[0] - G[0], dy = x[1] - G[1], dz = x[2] - G[2];
         if (dx * dx + dy * dy + dz * dz > G[22]) continue;
-        {_DISTANCE}
+        {DISTANCE}
         best = dist < best ? dist : best;
       }}
       if (best > reach) continue;

@@ -2,7 +2,8 @@
 
 A slot is a vertex body of a window; see `window`. The last numbers of the plugin state (`TAIL`):
 stamp of a motion kept on a device, time without motion [s], gravity [m/s^2] of the step in which
-the organ fell asleep, the organ's bounds, and how many times its inertia at rest a tool meets.
+the organ fell asleep, the organ's bounds, how many times its inertia at rest a tool meets, and how
+far a tool may go from where it was when the organ fell asleep [m].
 """
 
 from __future__ import annotations
@@ -20,13 +21,26 @@ from .coupling import (
   PENDING,
   STALE,
 )
-from .window_nodes import GEOM, HEAD, MAX_GEOMS, MAX_WINDOWS, RECORD, SUMMARY, struct
+from .window_nodes import (
+  DISTANCE,
+  GEOM,
+  HEAD,
+  MAX_GEOMS,
+  MAX_WINDOWS,
+  RECORD,
+  SUMMARY,
+  struct,
+)
 
-TAIL = 12
+TAIL = 13
+POSE = 12  # of a geom: centre and axes in the organ's frame
 # Height at which the spare slot of a window waits [m].
 AWAY = 1e3
-# Time without motion, force and tool after which an organ sleeps [s].
+# Time without motion and force after which an organ sleeps [s].
 QUIET = 0.2
+# A triangle that may be the nearest to a tool is sampled at this many points along an edge. No
+# point of a triangle is farther from a corner than its longest edge over the root of 3.
+_FINE, _CORNER = 16, 0.578
 
 
 @struct
@@ -41,6 +55,8 @@ class Slots:
     rest_share: see `solver.REST`
     reach: distance from a geom within which nodes may be in a window [m]
     slow: speed below which the organ counts as at rest [m/s]
+    longest: longest edge [m]
+    skin: distance between surface and geom at which MuJoCo finds a contact, at most [m]
     weight: mass of the organ [kg]
     placed: node of each slot in the model, -1 for none     (nslot,)
     taken: slot of each node, -1 for none                   (nvert,)
@@ -64,6 +80,8 @@ class Slots:
   rest_share: wp.float64
   reach: wp.float64
   slow: wp.float64
+  longest: wp.float64
+  skin: wp.float64
   weight: wp.float64
   # Organ:
   node_mass: wp.array[wp.float64]
@@ -135,7 +153,8 @@ _STATE = f"""
   double* W = U + 3 * s.nvert;
   double* fc = U + 9 * s.nvert;
   double* slots = fc + 3 * s.nslot;
-  double* tail = slots + s.nslot;
+  double* poses = slots + s.nslot;
+  double* tail = poses + {POSE} * s.geom_adr.data[s.nwindow];
   double* in = s.inbox.data;
   double* moved = in + {HEAD};
   double* pushed = moved + 7 * s.nslot;
@@ -146,6 +165,7 @@ _STATE = f"""
   double* quiet = tail + 1;
   double* bounds = tail + 5;
   double* times = tail + 11;
+  double* leeway = tail + 12;
   auto node_of = [&](int k) -> int {{
     const double n = slots[k];
     return n == 0.0 ? s.home.data[k] : n >= 1.0 && n <= s.nvert ? (int)n - 1 : -1;
@@ -246,8 +266,9 @@ _TRIANGLES = f"""
     }}
   }}
   s.flags.data[{STALE}] = stale;
-  // The geoms in the organ's frame, and whether one is near the organ's bounds.
-  bool near = bounds[3] <= bounds[0];
+  // The geoms in the organ's frame, whether one is near the organ's bounds, and whether one that is
+  // has moved too far since the organ fell asleep.
+  bool near = bounds[3] <= bounds[0], stirs = near;
   const double margin = 0.5 * s.reach;
   for (int w = 0; w < s.nwindow; ++w) {{
     double* list = tools + w * {1 + MAX_GEOMS * GEOM};
@@ -289,12 +310,24 @@ _TRIANGLES = f"""
         }}
         apart = apart || at > reach || at < -reach;
       }}
-      near = near || !apart;
+      if (apart) continue;
+      near = true;
+      double gone = 0.0, turned = 0.0, centre = 0.0, half = 0.0;
+      for (int c = 0; c < {POSE}; ++c) {{
+        const double e = G[c] - poses[{POSE} * q + c];
+        (c < 3 ? gone : turned) += e * e;
+      }}
+      for (int c = 0; c < 3; ++c) {{
+        centre += G[16 + c] * G[16 + c];
+        half += G[19 + c] * G[19 + c];
+      }}
+      gone = sqrt(gone) + sqrt(turned) * (sqrt(centre) + sqrt(half));
+      stirs = stirs || !(gone < leeway[0]);
     }}
     list[0] = count;
   }}
   s.flags.data[{NEAR}] = near;
-  const bool asleep = quiet[0] >= {QUIET} && !near && !pushes && !changed;
+  const bool asleep = quiet[0] >= {QUIET} && !stirs && !pushes && !changed;
   s.flags.data[{ASLEEP}] = asleep;
   if (!asleep || stale) return;
   // The slots stay where they are; nothing else is done in such a step.
@@ -334,8 +367,75 @@ def _gather(s: Slots): ...
 def _scatter(s: Slots): ...
 
 
+# How far the tools are from the surface at least, of what the last search found: triangles with a
+# corner that it did not are beyond its reach. Distance to convex geoms has slope 1.
+_CLEARANCE = f"""
+  auto geom_at = [&](int w, int q) -> const double* {{
+    return tools + w * {1 + MAX_GEOMS * GEOM} + 1 + {GEOM} * q;
+  }};
+  auto away = [&](int w, const double* p) -> double {{
+    double best = 1e300;
+    for (int q = 0; q < (int)tools[w * {1 + MAX_GEOMS * GEOM}]; ++q) {{
+      const double* G = geom_at(w, q);
+      const double dx = p[0] - G[0], dy = p[1] - G[1], dz = p[2] - G[2];
+      {DISTANCE}
+      best = dist < best ? dist : best;
+    }}
+    return best;
+  }};
+  auto nearest = [&](int w, const double* const* corner, double enough) -> double {{
+    double x[3][3], lowest = 1e300, longest = 0.0;
+    for (int k = 0; k < 3; ++k) {{
+      const int i = (int)corner[k][0];
+      for (int c = 0; c < 3; ++c) x[k][c] = s.rest.data[3 * i + c] + corner[k][2 + c];
+      lowest = corner[k][1] < lowest ? corner[k][1] : lowest;
+    }}
+    for (int k = 0; k < 3; ++k) {{
+      const double* to = x[(k + 1) % 3];
+      double edge = 0.0;
+      for (int c = 0; c < 3; ++c) edge += (x[k][c] - to[c]) * (x[k][c] - to[c]);
+      longest = edge > longest * longest ? sqrt(edge) : longest;
+    }}
+    if (lowest - {_CORNER} * longest >= enough) return enough;
+    for (int a = 0; a <= {_FINE}; ++a) {{
+      for (int b = 0; a + b <= {_FINE}; ++b) {{
+        double p[3];
+        for (int c = 0; c < 3; ++c)
+          p[c] = x[0][c] + (a * (x[1][c] - x[0][c]) + b * (x[2][c] - x[0][c])) / {_FINE};
+        const double at = away(w, p);
+        lowest = at < lowest ? at : lowest;
+      }}
+    }}
+    return lowest - {_CORNER} * longest / {_FINE};
+  }};
+  auto clearance = [&]() -> double {{
+    double least = in[7] - s.longest;
+    for (int w = 0; w < s.nwindow; ++w) {{
+      const double* record = number + s.nwindow + (size_t){RECORD} * w * s.most;
+      const int count = number[w] < s.most ? (int)number[w] : s.most;
+      for (int q = 0; q < count; ++q) s.claim.data[(int)record[{RECORD} * q]] = q;
+      for (int q = 0; q < count; ++q) {{
+        const int i = (int)record[{RECORD} * q];
+        for (int t = s.near_adr.data[i]; t < s.near_adr.data[i + 1]; ++t) {{
+          const int* e = s.elem.data + 3 * s.near.data[t];
+          const int b = s.claim.data[e[1]], c = s.claim.data[e[2]];
+          if (e[0] != i || b < 0 || c < 0) continue;
+          const double* corner[3] = {{record + {RECORD} * q, record + {RECORD} * b,
+            record + {RECORD} * c}};
+          const double at = nearest(w, corner, least);
+          least = at < least ? at : least;
+        }}
+      }}
+      for (int q = 0; q < count; ++q) s.claim.data[(int)record[{RECORD} * q]] = -1;
+    }}
+    return least - s.skin;
+  }};
+"""
+
+
 @wp.func_native(
   _STATE
+  + _CLEARANCE
   + f"""
   in[3] = in[9] = 0.0;
   s.flags.data[{CHANGED}] = 0;
@@ -348,7 +448,7 @@ def _scatter(s: Slots): ...
   }}
   for (int c = 0; c < 6; ++c) bounds[c] = out[5 + c];
   bool touched = false;
-  bool calm = !s.flags.data[{NEAR}] && quiet[0] < {QUIET} && out[4] < s.slow * s.slow;
+  bool calm = quiet[0] < {QUIET} && out[4] < s.slow * s.slow;
   for (int k = 0; k < s.nslot; ++k) {{
     const int i = s.placed.data[k], adr = s.dofadr.data[k], qadr = s.qposadr.data[k];
     double* move = moved + 7 * k;
@@ -368,8 +468,17 @@ def _scatter(s: Slots): ...
   if (!touched) times[0] = 1.0;
   quiet[0] = calm ? quiet[0] + in[0] : 0.0;
   int mode = 1;
+  leeway[0] = 0.0;
+  if (quiet[0] >= {QUIET} && s.flags.data[{NEAR}]) {{
+    leeway[0] = 0.5 * clearance();
+    if (!(leeway[0] > 0.0)) quiet[0] = 0.0;
+  }}
   if (quiet[0] >= {QUIET}) {{
     mode = 2;
+    for (int w = 0; w < s.nwindow; ++w)
+      for (int q = s.geom_adr.data[w]; q < s.geom_adr.data[w + 1]; ++q)
+        for (int c = 0; c < {POSE}; ++c)
+          poses[{POSE} * q + c] = geom_at(w, q - s.geom_adr.data[w])[c];
     for (int c = 0; c < 3; ++c) tail[2 + c] = in[4 + c];
     for (int k = 0; k < s.nslot; ++k)
       for (int c = 0; c < 3; ++c) moved[7 * k + 4 + c] = 0.0;

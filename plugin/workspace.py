@@ -215,9 +215,10 @@ def state_size(model: int, instance: int) -> int:
   Contact force and last dv of each moving vertex, or what `window` says.
   """
   m = mjstruct.Model.from_address(model)
-  if mjstruct.config(model, instance, "window"):
+  names = mjstruct.config(model, instance, "window").split()
+  if names:
     # Asked before MuJoCo has filled in the flexes: what `window` needs is at most this.
-    return 9 * m.nflexvert
+    return window.state_size(m.nflexvert, 0, m.ngeom * len(names))
   return 6 * len(declare.moving_bodies(m, instance)) + 1
 
 

@@ -5,6 +5,7 @@ import copy
 import mujoco
 import numpy as np
 import palpate
+import palpate.models
 import pytest
 import warp as wp
 from windowed import drive, scene
@@ -190,6 +191,127 @@ def test_sleep_is_part_of_the_state():
   assert organ.asleep
   d.time = 0.0
   np.testing.assert_array_equal(drive(m, d, 100), expected)
+
+
+SWING = (
+  ('<joint name="x" type="slide" axis="1 0 0"/>', '<joint name="x" axis="0 1 0" armature="1e-4"/>'),
+  ('<geom name="tip" size="0.006"', '<geom name="tip" type="capsule" size="0.004 0.02"'),
+)
+
+
+def hovering(resident=False, swing=False):
+  """Returns a sphere under a still tool at 3 mm, or under a capsule that can swing into it."""
+  text = scene(keys={"resident": str(resident).lower()})
+  for old, new in SWING if swing else ():
+    text = text.replace(old, new)
+  m = mujoco.MjModel.from_xml_string(text)
+  d = mujoco.MjData(m)
+  if swing:
+    d.qpos[-1] = d.ctrl[1] = np.pi / 2
+  d.qpos[-2] = d.ctrl[0] = 0.003
+  organ = palpate.Organ(m, d, "organ")
+  return m, d, organ
+
+
+def approach(m, d, organ, steps, joint, to):
+  """Moves one joint of the tool evenly; returns its forces, and whether the organ slept."""
+  start, forces, slept = d.ctrl[joint], [], []
+  for i in range(steps):
+    d.ctrl[joint] = start + (to - start) * (i + 1) / steps
+    mujoco.mj_step(m, d)
+    forces.append(d.qfrc_constraint[-2:].copy())
+    slept.append(organ.asleep)
+  return np.array(forces), np.array(slept)
+
+
+def test_liver_sleeps_with_its_probe_in_the_home_pose():
+  m = palpate.models.load("liver", coupling="window", instruments=("probe",)).compile()
+  d = mujoco.MjData(m)
+  organ = palpate.Organ(m, d, "liver/liver")
+  mujoco.mj_resetDataKeyframe(m, d, 0)
+  mujoco.mj_step(m, d, nstep=250)
+  assert organ.asleep and organ.nvert == 1000
+  mujoco.mj_resetDataKeyframe(m, d, mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_KEY, "press"))
+  mujoco.mj_step(m, d, nstep=500)
+  assert not organ.asleep and np.linalg.norm(organ.force) > 0.1
+
+
+@pytest.mark.parametrize("resident", [False, True])
+@pytest.mark.parametrize("swing", [False, True])
+@pytest.mark.parametrize("steps", [60, 2000])
+def test_still_tool_nearby_lets_it_sleep_and_wakes_it_before_it_touches(
+  monkeypatch, resident, swing, steps
+):
+  def press(slow):
+    monkeypatch.setattr("palpate.window._SLOW", slow)
+    m, d, organ = hovering(resident, swing)
+    mujoco.mj_step(m, d, nstep=250)
+    slept = organ.asleep
+    end = 0.4 if swing else -0.008
+    return slept, *approach(m, d, organ, steps, int(swing), end)
+
+  slept, force, asleep = press(1e-5 * 0.17)
+  never, expected, awake = press(0.0)
+  assert slept and not never and not awake.any()
+  touches = np.flatnonzero(np.abs(expected).max(axis=1) > 0)
+  assert asleep[0] and not asleep[touches[0] - 1 :].any()
+  assert np.abs(expected).max() > (1e-3 if swing else 0.01)
+  np.testing.assert_allclose(force, expected, atol=1e-6 * np.abs(expected).max())
+
+
+def test_tool_that_trembles_lets_it_sleep_and_one_that_goes_wakes_it():
+  m, d, organ = hovering()
+  mujoco.mj_step(m, d, nstep=250)
+  for i in range(100):
+    d.ctrl[0] = 0.003 + 2e-4 * np.sin(0.3 * i)
+    mujoco.mj_step(m, d)
+    assert organ.asleep
+  d.ctrl[0] = 0.006
+  mujoco.mj_step(m, d, nstep=50)
+  assert not organ.asleep
+  mujoco.mj_step(m, d, nstep=250)
+  assert organ.asleep
+
+
+@pytest.mark.parametrize("height", [0.001, 0.006])
+@pytest.mark.parametrize("swing", [False, True])
+def test_tool_may_go_half_of_its_distance_from_the_surface(swing, height):
+  m, d, organ = hovering(swing=swing)
+  d.qpos[-2] = d.ctrl[0] = height
+  mujoco.mj_step(m, d, nstep=250)
+  assert organ.asleep
+  leeway = organ._space.views["plugin_state"].numpy()[-1]
+  n = 60
+  a, b = np.array([(i / n, j / n) for i in range(n + 1) for j in range(n + 1 - i)]).T[:, :, None]
+  x, y, z = organ.xpos[organ.elem].transpose(1, 0, 2)[:, :, None]
+  surface = x + a * (y - x) + b * (z - x)
+  tip = m.geom("tip").id
+  to = surface.reshape(-1, 3) - d.geom_xpos[tip]
+  axis = d.geom_xmat[tip].reshape(3, 3)[:, 2]
+  along = np.clip(to @ axis, -0.02, 0.02) if swing else np.zeros(len(to))
+  away = np.linalg.norm(to - along[:, None] * axis, axis=1) - m.geom_size[tip, 0]
+  gap = away.min() - 0.0005  # the radius of the flex
+  # Less than half, by at most half of what the sampling of an edge of 17 mm may miss.
+  assert gap / 2 - 0.0004 < leeway < gap / 2
+
+
+@pytest.mark.parametrize("resident", [False, True])
+def test_sleep_near_a_tool_is_part_of_the_state(resident):
+  m, d, organ = hovering(resident)
+  mujoco.mj_step(m, d, nstep=250)
+  approach(m, d, organ, 20, 0, 0.0028)
+  assert organ.asleep
+  organ.sync()
+  state = get_state(m, d)
+  expected, slept = approach(m, d, organ, 100, 0, -0.008)
+  assert slept[0] and not slept[-1] and np.abs(expected[-1]).max() > 0.01
+  mujoco.mj_resetData(m, d)
+  drive(m, d, 30)
+  mujoco.mj_setState(m, d, state, STATE)
+  d.ctrl[:] = 0.0028, 0.0
+  force, again = approach(m, d, organ, 100, 0, -0.008)
+  np.testing.assert_array_equal(again, slept)
+  np.testing.assert_array_equal(force, expected)
 
 
 def test_resident_needs_a_window():

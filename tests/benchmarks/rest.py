@@ -1,0 +1,92 @@
+"""Times mj_step of a scene with a sleeping windowed organ against the scene without the organ.
+
+    python tests/benchmarks/rest.py --nodes 1000 4000 -o tests/benchmarks/results
+
+The liver with a probe in its home pose, or withdrawn; CPU time of blocks of steps, all variants in
+turn. `mujoco_us` is the same model with the plugin left out: what MuJoCo spends on the
+window's dofs. `awake_us` is the organ kept from sleeping.
+"""
+
+import argparse
+import csv
+import json
+import pathlib
+import time
+
+import mujoco
+import numpy as np
+import palpate
+from palpate import mjstruct, models
+from palpate.models import scene
+
+ROUNDS, STEPS = 200, 20
+TOOLS = ("probe",)
+
+
+def block(model, data, steps: int) -> float:
+  """Returns the CPU time of a step in us, which neighbours on the machine change least."""
+  start = time.process_time()
+  mujoco.mj_step(model, data, nstep=steps)
+  return 1e6 * (time.process_time() - start) / steps
+
+
+def measure(nodes: int, insertion: float) -> dict:
+  """Returns medians of a step's time and their ratios to the scene without the organ."""
+  windowed = models.load("liver", nodes=nodes, coupling="window", instruments=TOOLS).compile()
+  shape = scene.body("liver", nodes)
+  bare = mujoco.MjModel.from_xml_string(scene.scene_xml(shape, "liver", TOOLS, False, False, False))
+  variants, organs = {}, {}
+  for name, m in (("bare", bare), ("asleep", windowed), ("awake", windowed.__copy__())):
+    d = mujoco.MjData(m)
+    d.ctrl[2] = insertion
+    if name != "bare":
+      organs[name] = palpate.Organ(m, d, "liver/liver")
+    variants[name] = m, d
+    mujoco.mj_step(m, d, nstep=3000)
+  if not organs["asleep"].asleep:
+    raise RuntimeError("the organ does not fall asleep")
+  m, d = variants["asleep"]
+  raw = mjstruct.Model.from_address(m._address)
+  times = {name: [] for name in (*variants, "mujoco")}
+  for _ in range(ROUNDS):
+    for name in ("bare", "asleep"):
+      times[name].append(block(*variants[name], STEPS))
+    organs["awake"].configure(tolerance=1e-3)  # a change of a key ends its sleep
+    times["awake"].append(block(*variants["awake"], STEPS))
+    raw.nplugin = 0
+    times["mujoco"].append(block(m, d, STEPS))
+    raw.nplugin = 1
+  median = {name: float(np.median(each)) for name, each in times.items()}
+  return {
+    "nodes": nodes,
+    "insertion_m": insertion,
+    "nv": m.nv,
+    "contacts": d.ncon,
+    **{f"{name}_us": value for name, value in median.items()},
+    "asleep_ratio": median["asleep"] / median["bare"],
+    "mujoco_ratio": median["mujoco"] / median["bare"],
+    "awake_ratio": median["awake"] / median["bare"],
+  }
+
+
+def main():
+  """Runs the benchmark."""
+  parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+  parser.add_argument("--nodes", type=int, nargs="+", default=[1000])
+  parser.add_argument("-o", "--output", type=pathlib.Path)
+  args = parser.parse_args()
+  rows = []
+  for nodes in args.nodes:
+    for insertion in (0.0, -0.08):
+      rows.append(measure(nodes, insertion))
+      print(json.dumps({k: round(v, 3) for k, v in rows[-1].items()}))
+  if args.output:
+    args.output.mkdir(parents=True, exist_ok=True)
+    with open(args.output / "rest_cpu.csv", "w", newline="") as file:
+      writer = csv.DictWriter(file, rows[0])
+      writer.writeheader()
+      writer.writerows(rows)
+
+
+if __name__ == "__main__":
+  main()
