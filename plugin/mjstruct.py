@@ -75,6 +75,7 @@ def library() -> C.CDLL:
   lib.mj_getPluginConfig.restype = C.c_char_p
   lib.mj_getPluginConfig.argtypes = [C.c_void_p, C.c_int, C.c_char_p]
   lib.mj_fwdPosition.argtypes = [C.c_void_p, C.c_void_p]
+  lib.mj_comVel.argtypes = [C.c_void_p, C.c_void_p]
   lib.mju_warning.argtypes = [C.c_char_p, C.c_char_p]
   lib.mjp_registerPlugin.argtypes = [C.c_void_p]
   lib.mjp_defaultPlugin.argtypes = [C.c_void_p]

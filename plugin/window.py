@@ -51,6 +51,8 @@ def launches(w, model: int, instance: int) -> Launches:
   m, d = mjstruct.Model.from_address(model), mjstruct.Data.from_address(w.data)
   start = int(mjstruct.view(m.plugin_stateadr, m.nplugin, np.int32)[instance])
   v["plugin_state"] = wrap(d.plugin_state + 8 * start, state_size(nvert, nslot, win.geom.size))
+  first = mjstruct.view(m.body_treeid, m.nbody, np.int32)[win.body[0]]
+  w.policy = memoryview(mjstruct.view(m.tree_sleep_policy, m.ntree, np.int32)[first:])
   w.counts = memoryview(mjstruct.view(m.flex_vertnum, m.nflex, np.int32)[organ.flex :])
   slots = _slots(w, model)
   nodes = _nodes(w, side)
@@ -230,6 +232,7 @@ def _slots(w, model: int) -> Slots:
     "dof_M0": wrap(m.dof_M0, m.nv),
     "dof_invweight0": wrap(m.dof_invweight0, m.nv),
     "body_invweight0": wrap(m.body_invweight0, 2 * m.nbody),
+    "body_awake": wrap(d.body_awake, m.nbody, wp.int32),
     "geom_xpos": wrap(d.geom_xpos, 3 * m.ngeom),
     "geom_xmat": wrap(d.geom_xmat, 9 * m.ngeom),
     "qpos": wrap(d.qpos, m.nq),
@@ -321,6 +324,26 @@ def hide(w):
   """Hides the organ's flex from MuJoCo until it is drawn again."""
   if w.counts[0]:
     show(w, mjstruct.Model.from_address(w.model), shown=False)
+
+
+def let_sleep(w, allowed: bool):
+  """Lets MuJoCo put the windows' bodies to sleep, or wakes them in the middle of a step.
+
+  It does so itself where `<flag sleep="enable"/>` is set: it then spends next to nothing on dofs
+  that have nothing to do while the organ sleeps.
+  """
+  m, d = mjstruct.Model.from_address(w.model), mjstruct.Data.from_address(w.data)
+  tree = mjstruct.view(m.body_treeid, m.nbody, np.int32)[w.organ.windows.body]
+  policy = mujoco.mjtSleepPolicy
+  may = policy.mjSLEEP_AUTO_ALLOWED if allowed else policy.mjSLEEP_AUTO_NEVER
+  mjstruct.view(m.tree_sleep_policy, m.ntree, np.int32)[tree] = int(may)
+  if allowed or (mjstruct.view(d.tree_asleep, m.ntree, np.int32)[tree] < 0).all():
+    return
+  lib = mjstruct.library()
+  lib.mj_fwdPosition(w.model, w.data)  # trees that may not sleep wake
+  lib.mj_comVel(w.model, w.data)
+  mjstruct.view(d.qfrc_passive, m.nv)[w.organ.dofs] = 0.0
+  wp.capture_launch(w.before)
 
 
 def wake(w):

@@ -134,6 +134,7 @@ class Slots:
   dof_invweight0: wp.array[wp.float64]
   body_invweight0: wp.array[wp.float64]
   # Data:
+  body_awake: wp.array[int]
   geom_xpos: wp.array[wp.float64]
   geom_xmat: wp.array[wp.float64]
   qpos: wp.array[wp.float64]
@@ -245,13 +246,14 @@ _TRIANGLES = f"""
   bool pushes = false;
   for (int k = 0; k < s.nslot; ++k) {{
     const int i = node_of(k), adr = s.dofadr.data[k], body = s.bodyid.data[k];
+    const bool still = s.body_awake.data[body] == 0;  // MuJoCo skips it: its forces are old
     if (i != s.placed.data[k]) stale = 1;
     const double* x = s.xfrc_applied.data + 6 * body;
     double* push = pushed + 4 * k;
     push[0] = i;
     for (int c = 0; c < 3; ++c) {{
       // What acts on the slot besides its own weight acts on the node.
-      const double f = s.qfrc_applied.data[adr + c] + s.qfrc_passive.data[adr + c]
+      const double f = s.qfrc_applied.data[adr + c] + (still ? 0.0 : s.qfrc_passive.data[adr + c])
         + s.frame.data[c] * x[0] + s.frame.data[3 + c] * x[1] + s.frame.data[6 + c] * x[2];
       push[1 + c] = i < 0 ? f : f + fc[3 * k + c];
       s.ext.data[3 * k + c] = push[1 + c] + s.body_mass.data[body] * in[4 + c];
@@ -334,7 +336,7 @@ _TRIANGLES = f"""
   s.status.data[0] = s.status.data[1] = 0.0f;
   for (int k = 0; k < s.nslot; ++k)
     for (int c = 0; c < 3; ++c)
-      if (s.ext.data[3 * k + c] == s.ext.data[3 * k + c])
+      if (s.ext.data[3 * k + c] == s.ext.data[3 * k + c] && s.body_awake.data[s.bodyid.data[k]])
         s.qfrc_passive.data[s.dofadr.data[k] + c] -= s.ext.data[3 * k + c];
 """
 )

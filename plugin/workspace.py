@@ -8,6 +8,7 @@ import threading
 import weakref
 from typing import Any
 
+import mujoco
 import numpy as np
 import warp as wp
 
@@ -31,6 +32,7 @@ from .declare import Organ
 from .resident import Resident
 from .types import State, Surface
 
+_ALLOWED = int(mujoco.mjtSleepPolicy.mjSLEEP_AUTO_ALLOWED)
 _lock = threading.RLock()
 
 
@@ -61,6 +63,7 @@ class Workspace:
     flags: what the coupling reports: STALE (the model lacks slots), ASLEEP, MISSED_NODES,
       MISSED_ELEMENTS, PENDING (mode of the next commit), NEAR (a tool is near), CHANGED (contact
       forces did) and ANSWERED (the organ responded)  (NFLAG,)
+    policy: MuJoCo's sleep policy of the windows' bodies comes first
     counts: the number of vertices that MuJoCo sees of a windowed organ comes first
     status: iterations, relative residual, norm, failure  (4,)
     error: what went wrong since the last reset, or None
@@ -94,6 +97,7 @@ class Workspace:
   heaviest: np.ndarray = dataclasses.field(default_factory=lambda: np.ones(1))
   computed: bool = False
   flags: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(NFLAG, np.int32))
+  policy: memoryview = dataclasses.field(default_factory=lambda: memoryview(np.zeros(1, np.int32)))
   counts: memoryview = dataclasses.field(default_factory=lambda: memoryview(np.zeros(1, np.int32)))
   status: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(4, np.float32))
   error: str | None = None
@@ -119,6 +123,8 @@ class Workspace:
     if self.place is not None and self.flags[STALE]:
       self._find_contacts_again()
       wp.capture_launch(self.before)
+    if self.place is not None and not self.asleep and self.policy[0] == _ALLOWED:
+      window.let_sleep(self, False)
     if self.asleep:
       self.computed = True
       return  # what `after` does was done with `before`
@@ -140,6 +146,8 @@ class Workspace:
     if self.asleep and not self.nefc[0]:
       if self.counts[0]:
         window.hide(self)
+      if self.policy[0] != _ALLOWED:
+        window.let_sleep(self, True)
       return
     responds = bool(self.respond) and self.stiff and computed
     if responds or self.place is not None:

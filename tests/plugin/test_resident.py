@@ -199,9 +199,10 @@ SWING = (
 )
 
 
-def hovering(resident=False, swing=False):
+def hovering(resident=False, swing=False, flag=""):
   """Returns a sphere under a still tool at 3 mm, or under a capsule that can swing into it."""
   text = scene(keys={"resident": str(resident).lower()})
+  text = text.replace('gravity="0 0 0"/>', f'gravity="0 0 0">{flag}</option>')
   for old, new in SWING if swing else ():
     text = text.replace(old, new)
   m = mujoco.MjModel.from_xml_string(text)
@@ -312,6 +313,58 @@ def test_sleep_near_a_tool_is_part_of_the_state(resident):
   force, again = approach(m, d, organ, 100, 0, -0.008)
   np.testing.assert_array_equal(again, slept)
   np.testing.assert_array_equal(force, expected)
+
+
+MUJOCO_SLEEPS = '<flag sleep="enable"/>'
+
+
+@pytest.mark.parametrize("resident", [False, True])
+@pytest.mark.parametrize("gravity", [0.0, -9.81])
+def test_mujoco_skips_the_slots_of_a_sleeping_organ(resident, gravity):
+  def press(flag):
+    m, d, organ = hovering(resident, flag=flag)
+    m.opt.gravity[2] = gravity
+    d.ctrl[0] = 0.006
+    mujoco.mj_step(m, d, nstep=4000 if gravity else 400)
+    assert organ.asleep and m.nv == 164
+    return d.nv_awake, *approach(m, d, organ, 80, 0, -0.008), organ.displacement
+
+  everything, expected, slept, there = press("")
+  tool, force, again, here = press(MUJOCO_SLEEPS)
+  assert (everything, tool) == (164, 2)
+  assert slept[0] and not slept[-1] and np.abs(expected).max() > 0.01
+  np.testing.assert_array_equal(again, slept)
+  np.testing.assert_array_equal(force, expected)
+  np.testing.assert_array_equal(here, there)
+
+
+def test_states_of_an_organ_whose_slots_mujoco_skips():
+  m, d, organ = hovering(flag=MUJOCO_SLEEPS)
+  awake = get_state(m, d)
+  mujoco.mj_step(m, d, nstep=250)
+  state = get_state(m, d)
+  assert organ.asleep and d.nv_awake == 2
+  other = mujoco.MjData(m)  # on the same model, and awake
+  mujoco.mj_setState(m, other, awake, STATE)
+  other.ctrl[0] = -0.008
+  mujoco.mj_step(m, other, nstep=50)
+  assert other.nv_awake == m.nv and np.abs(palpate.Organ(m, other, "organ").force).max() > 0.001
+  expected, slept = approach(m, d, organ, 100, 0, -0.008)
+  assert slept[0] and not slept[-1] and d.nv_awake == m.nv
+  mujoco.mj_setState(m, d, state, STATE)
+  d.ctrl[:] = 0.003, 0.0
+  np.testing.assert_array_equal(approach(m, d, organ, 100, 0, -0.008)[0], expected)
+
+
+def test_force_on_a_slot_that_mujoco_skips_wakes_the_organ():
+  m, d, organ = hovering(flag=MUJOCO_SLEEPS)
+  mujoco.mj_step(m, d, nstep=250)
+  slot = int(np.flatnonzero(organ._space.views["placed"].numpy() >= 0)[0])
+  d.xfrc_applied[organ._organ.windows.body[slot], 2] = 0.01
+  mujoco.mj_step(m, d)
+  assert not organ.asleep and d.nv_awake == m.nv
+  mujoco.mj_step(m, d, nstep=19)
+  assert np.abs(organ.displacement).max() > 1e-6
 
 
 def test_resident_needs_a_window():
