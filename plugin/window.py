@@ -340,8 +340,13 @@ def let_sleep(w, allowed: bool):
   if allowed or (mjstruct.view(d.tree_asleep, m.ntree, np.int32)[tree] < 0).all():
     return
   lib = mjstruct.library()
+  # Inertias stay: another organ may have made its own greater in this step.
+  inertias = [(d.M, m.nC), (d.qLD, m.nC), (d.qLDiagInv, m.nv)]
+  kept = [mjstruct.view(*each).copy() for each in inertias]
   lib.mj_fwdPosition(w.model, w.data)  # trees that may not sleep wake
   lib.mj_comVel(w.model, w.data)
+  for each, values in zip(inertias, kept, strict=True):
+    mjstruct.view(*each)[:] = values
   mjstruct.view(d.qfrc_passive, m.nv)[w.organ.dofs] = 0.0
   wp.capture_launch(w.before)
 

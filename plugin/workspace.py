@@ -143,7 +143,9 @@ class Workspace:
   def step(self):
     """Steps the plugin state after MuJoCo has moved."""
     computed, self.computed = self.computed, False
-    if self.asleep and not self.nefc[0]:
+    if self.asleep:
+      if self.nefc[0]:  # contacts of a window that was left behind wake the organ
+        wp.capture_launch(self.leave)
       if self.counts[0]:
         window.hide(self)
       if self.policy[0] != _ALLOWED:
@@ -154,8 +156,6 @@ class Workspace:
       wp.capture_launch(self.leave)
     if self.place is not None:
       window.hide(self)
-    if self.asleep:
-      return
     responds = responds and bool(self.flags[CHANGED])
     self.flags[ANSWERED] = responds
     if responds:

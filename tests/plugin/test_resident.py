@@ -225,16 +225,22 @@ def approach(m, d, organ, steps, joint, to):
   return np.array(forces), np.array(slept)
 
 
-def test_liver_sleeps_with_its_probe_in_the_home_pose():
-  m = palpate.models.load("liver", coupling="window", instruments=("probe",)).compile()
-  d = mujoco.MjData(m)
-  organ = palpate.Organ(m, d, "liver/liver")
-  mujoco.mj_resetDataKeyframe(m, d, 0)
-  mujoco.mj_step(m, d, nstep=250)
-  assert organ.asleep and organ.nvert == 1000
-  mujoco.mj_resetDataKeyframe(m, d, mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_KEY, "press"))
-  mujoco.mj_step(m, d, nstep=500)
-  assert not organ.asleep and np.linalg.norm(organ.force) > 0.1
+def test_liver_sleeps_with_its_tools_in_the_home_pose():
+  presses = []
+  for flag in (0, int(mujoco.mjtEnableBit.mjENBL_SLEEP)):  # MuJoCo's own sleep off and on
+    m = palpate.models.load("liver", coupling="window").compile()
+    m.opt.enableflags |= flag
+    d = mujoco.MjData(m)
+    organ = palpate.Organ(m, d, "liver/liver")
+    mujoco.mj_resetDataKeyframe(m, d, 0)
+    mujoco.mj_step(m, d, nstep=250)
+    assert organ.asleep and organ.nvert == 1000
+    assert d.nv_awake == (10 if flag else m.nv)
+    d.ctrl[2] = 0.035
+    mujoco.mj_step(m, d, nstep=250)
+    assert not organ.asleep and np.linalg.norm(organ.force) > 0.1
+    presses.append(organ.contact_force)
+  np.testing.assert_array_equal(*presses)
 
 
 @pytest.mark.parametrize("resident", [False, True])
