@@ -52,8 +52,8 @@ def launches(w, model: int, instance: int) -> Launches:
   start = int(mjstruct.view(m.plugin_stateadr, m.nplugin, np.int32)[instance])
   v["plugin_state"] = wrap(d.plugin_state + 8 * start, state_size(nvert, nslot, win.geom.size))
   first = mjstruct.view(m.body_treeid, m.nbody, np.int32)[win.body[0]]
-  w.policy = memoryview(mjstruct.view(m.tree_sleep_policy, m.ntree, np.int32)[first:])
-  w.counts = memoryview(mjstruct.view(m.flex_vertnum, m.nflex, np.int32)[organ.flex :])
+  w.policy = mjstruct.view(m.tree_sleep_policy, m.ntree, np.int32)[first:].data
+  w.counts = mjstruct.view(m.flex_vertnum, m.nflex, np.int32)[organ.flex :].data
   slots = _slots(w, model)
   nodes = _nodes(w, side)
   away = nodes.inbox is not v["inbox"]  # the nodes are on another device

@@ -97,8 +97,8 @@ class Workspace:
   heaviest: np.ndarray = dataclasses.field(default_factory=lambda: np.ones(1))
   computed: bool = False
   flags: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(NFLAG, np.int32))
-  policy: memoryview = dataclasses.field(default_factory=lambda: memoryview(np.zeros(1, np.int32)))
-  counts: memoryview = dataclasses.field(default_factory=lambda: memoryview(np.zeros(1, np.int32)))
+  policy: memoryview = dataclasses.field(default_factory=lambda: np.zeros(1, np.int32).data)
+  counts: memoryview = dataclasses.field(default_factory=lambda: np.zeros(1, np.int32).data)
   status: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(4, np.float32))
   error: str | None = None
   overflow: str | None = None
@@ -248,8 +248,8 @@ def make(model: int, data: int, instance: int) -> Workspace:
     w = Workspace(organ, organ.config, s, state, host, ext, data)
     w.status = host["status"].numpy()[0]
     d, count = mjstruct.Data, len(mjstruct.Data.from_address(data).warning)
-    w.warning = memoryview(mjstruct.view(data + d.warning.offset, 2 * count, np.int32))
-    w.nefc = memoryview(mjstruct.view(data + d.nefc.offset, 1, np.int32))
+    w.warning = mjstruct.view(data + d.warning.offset, 2 * count, np.int32).data
+    w.nefc = mjstruct.view(data + d.nefc.offset, 1, np.int32).data
     if organ.windows is None:
       inertia.set_armature(m, organ)
     # Padding nodes have a mass so that nothing divides by zero.
@@ -312,7 +312,7 @@ def bind(w: Workspace, model: int, instance: int):
     w.advance = _record(cpu, launches.advance)
     w.place = _record(cpu, launches.place) if launches.place else None
   w.model = model
-  w.model_step = memoryview(coupling.option_views(model)["timestep"].numpy())
+  w.model_step = coupling.option_views(model)["timestep"].numpy().data
   w.time_step = float(m.opt.timestep)
 
 
