@@ -4,9 +4,10 @@ Nodes are stored in slices of `LANES`: an array of vectors is (nworld, nslice, 3
 slice is a SIMD register on the CPU and eight neighbouring threads on CUDA, and the three components
 of a node lie within two cache lines. In native code `V` is a vector of eight floats on the CPU and
 one float on CUDA; `LD`, `ST` and `GATHER` hide the difference, and `PUT_MOST` keeps the largest of
-numbers >= 0. Irregular lists (the neighbours of a
-node) are sliced ELLPACK: row `k` of slice `s` holds the k-th entry of its eight nodes
-(Kreutzer et al. 2014, SELL-C-sigma, doi:10.1137/130930352).
+numbers >= 0. Irregular lists (the neighbours of a node) are sliced ELLPACK: row `k` of slice `s`
+holds the k-th entry of its eight nodes (Kreutzer et al. 2014, SELL-C-sigma,
+doi:10.1137/130930352). On the CPU gathering is most of an iteration, so what is gathered often is
+kept in quads as well, see `GATHER_QUADS`; on CUDA that macro reads the vectors.
 """
 
 LANES = 8
@@ -19,6 +20,9 @@ _PRELUDE = """
   #define LD(p, r) ((p)[8 * (r) + lane])
   #define ST(p, r, v) ((p)[8 * (r) + lane] = (v))
   #define GATHER(p, o, c) ((p)[(o)[lane] + 8 * (c)])
+  #define GATHER_QUADS(x, y, z, p, quads, o) \\
+    const V x = GATHER(p, o, 0), y = GATHER(p, o, 1), z = GATHER(p, o, 2);
+  #define PUT_QUADS(q, x, y, z)
   #define SQRT(a) sqrtf(a)
   #define MAX(a, b) fmaxf(a, b)
   #define MIN(a, b) fminf(a, b)
@@ -31,12 +35,41 @@ _PRELUDE = """
 #else
   #define SIMD_TYPES \\
     typedef float V __attribute__((ext_vector_type(8))); \\
-    typedef float VU __attribute__((ext_vector_type(8), aligned(4)));
+    typedef float VU __attribute__((ext_vector_type(8), aligned(4))); \\
+    typedef float QUAD __attribute__((ext_vector_type(4)));
   #define LD(p, r) ((V) * (const VU*)((p) + 8 * (r)))
   #define ST(p, r, v) (*(VU*)((p) + 8 * (r)) = (VU)(v))
   #define AT(p, o, c, l) (p)[(o)[l] + 8 * (c)]
   #define GATHER(p, o, c) (V){AT(p, o, c, 0), AT(p, o, c, 1), AT(p, o, c, 2), AT(p, o, c, 3), \\
     AT(p, o, c, 4), AT(p, o, c, 5), AT(p, o, c, 6), AT(p, o, c, 7)}
+  // Quads: x, y, z and 0 of a node side by side, at four times its offset in vectors of slices.
+  // Eight of them are read in eight loads and seven shuffles, where GATHER takes 24 and 21.
+  #define PICK __builtin_shufflevector
+  #define LOWS(a, b) PICK(a, b, 0, 8, 1, 9, 4, 12, 5, 13)
+  #define HIGHS(a, b) PICK(a, b, 2, 10, 3, 11, 6, 14, 7, 15)
+  #define FRONTS(a, b) PICK(a, b, 0, 1, 8, 9, 4, 5, 12, 13)
+  #define BACKS(a, b) PICK(a, b, 2, 3, 10, 11, 6, 7, 14, 15)
+  #define QUAD_AT(q, o, l) (*(const QUAD*)((q) + 4 * (long long)(o)[l]))
+  #define TWO_QUADS(q, o, l) \\
+    PICK(QUAD_AT(q, o, l), QUAD_AT(q, o, (l) + 4), 0, 1, 2, 3, 4, 5, 6, 7)
+  #define GATHER_QUADS(x, y, z, p, quads, o) \\
+    V x, y, z; \\
+    { \\
+      const V a_ = TWO_QUADS(quads, o, 0), b_ = TWO_QUADS(quads, o, 1); \\
+      const V c_ = TWO_QUADS(quads, o, 2), d_ = TWO_QUADS(quads, o, 3); \\
+      const V e_ = LOWS(a_, b_), f_ = LOWS(c_, d_); \\
+      x = FRONTS(e_, f_); y = BACKS(e_, f_); z = FRONTS(HIGHS(a_, b_), HIGHS(c_, d_)); \\
+    }
+  #define PUT_QUADS(q, x, y, z) \\
+    { \\
+      const V w_ = {}; \\
+      const V a_ = LOWS(x, y), b_ = HIGHS(x, y), c_ = LOWS(z, w_), d_ = HIGHS(z, w_); \\
+      const V e_ = FRONTS(a_, c_), f_ = BACKS(a_, c_), g_ = FRONTS(b_, d_), h_ = BACKS(b_, d_); \\
+      ST(q, 0, PICK(e_, f_, 0, 1, 2, 3, 8, 9, 10, 11)); \\
+      ST(q, 1, PICK(g_, h_, 0, 1, 2, 3, 8, 9, 10, 11)); \\
+      ST(q, 2, PICK(e_, f_, 4, 5, 6, 7, 12, 13, 14, 15)); \\
+      ST(q, 3, PICK(g_, h_, 4, 5, 6, 7, 12, 13, 14, 15)); \\
+    }
   #define SQRT(a) __builtin_elementwise_sqrt(a)
   #define MAX(a, b) __builtin_elementwise_max(a, b)
   #define MIN(a, b) __builtin_elementwise_min(a, b)

@@ -30,7 +30,7 @@ AHEAD = 0.1
 # normals and `along` its sum with the area vectors.
 PRODUCT = """
 #define PRODUCT(P, PN, along) \\
-  const V x = LD(P + 24 * s, 0), y = LD(P + 24 * s, 1), z = LD(P + 24 * s, 2); \\
+  LOAD(x, y, z, P) \\
   const V md = LD(M, s); \\
   V ax = md * x, ay = md * y, az = md * z; \\
   { \\
@@ -38,8 +38,8 @@ PRODUCT = """
     const int* node = fan + 8 * (row0 + 2 * s + 1); \\
     const float* k = K + 72 * (size_t)row0; \\
     for (int i = 0; i < width; ++i, node += 8, k += 72) { \\
-      const V dx = GATHER(P, node, 0) - x, dy = GATHER(P, node, 1) - y, \\
-        dz = GATHER(P, node, 2) - z; \\
+      NEAR(jx, jy, jz, P, node) \\
+      const V dx = jx - x, dy = jy - y, dz = jz - z; \\
       ax += LD(k, 0) * dx + LD(k, 1) * dy + LD(k, 2) * dz; \\
       ay += LD(k, 3) * dx + LD(k, 4) * dy + LD(k, 5) * dz; \\
       az += LD(k, 6) * dx + LD(k, 7) * dy + LD(k, 8) * dz; \\
@@ -111,6 +111,17 @@ VOLUME = """
   }
 """
 
+# How PRODUCT reads neighbours, and what it needs for that of a vector whose slice s is x, y, z.
+_VECTORS = """
+#define NEAR(x, y, z, P, node) \\
+  const V x = GATHER(P, node, 0), y = GATHER(P, node, 1), z = GATHER(P, node, 2);
+#define SHOW(x, y, z)
+"""
+_QUADS = """
+#define NEAR(x, y, z, P, node) GATHER_QUADS(x, y, z, P, quad_.data + 96 * base, node)
+#define SHOW(x, y, z) PUT_QUADS(quad_.data + 96 * (base + s), x, y, z)
+"""
+
 _STAGES = f"""
 #define FIRST_ {int(Stage.FIRST)}
 #define RESPONSE_ {int(Stage.RESPONSE)}
@@ -118,7 +129,7 @@ _STAGES = f"""
 """
 
 
-def body(setup: str, precondition: str, scale: str) -> str:
+def body(setup: str, precondition: str, scale: str, quads: bool = False) -> str:
   """Returns the native code of the whole solve of one world: launches cost more than iterations.
 
   The iteration is conjugate gradients with q = A p carried as A z + beta q, as z is what neighbours
@@ -130,8 +141,9 @@ def body(setup: str, precondition: str, scale: str) -> str:
     precondition: writes Z, the preconditioned R, and makes it seen by all; sets rz = r^T z and
       `along`, the sum of z with the area vectors, from V rr (r^T D^-1 r) and V zo
     scale: scales zx, zy, zz, which are D^-1 R, before they become Z
+    quads: on the CPU, neighbours read Z in `quad_`, see `simd`
   """
-  return _STAGES + PRODUCT + simd.group(
+  return _STAGES + (_QUADS if quads else _VECTORS) + PRODUCT + simd.group(
     WORLD
     + """
   const float* U = pos.data + 24 * base;
@@ -164,6 +176,7 @@ def body(setup: str, precondition: str, scale: str) -> str:
     PRECONDITION(zx, zy, zz, bx, by, bz)
     bb += bx * zx + by * zy + bz * zz;
     LOAD(x, y, z, D0)
+    SHOW(x, y, z)
     if (bending) ST(ZN, s, WITH(N, x, y, z));
     if (bulk != 0.0f) zo += WITH(O, x, y, z);
   }
@@ -204,6 +217,7 @@ def body(setup: str, precondition: str, scale: str) -> str:
     + scale
     + """
     STORE(Z, zx, zy, zz)
+    SHOW(zx, zy, zz)
     if (bending) ST(ZN, s, WITH(N, zx, zy, zz));
     if (bulk != 0.0f) zo += WITH(O, zx, zy, zz);
   }
@@ -246,6 +260,7 @@ def body(setup: str, precondition: str, scale: str) -> str:
     + scale
     + """
       STORE(Z, zx, zy, zz)
+      SHOW(zx, zy, zz)
       if (bending) ST(ZN, s, WITH(N, zx, zy, zz));
       if (bulk != 0.0f) zo += WITH(O, zx, zy, zz);
     }
@@ -271,7 +286,7 @@ _JACOBI = """
     }
     if (!(residual > target) || it >= iterations) break;
 """
-_SOLVE = body("", _JACOBI, "")
+_SOLVE = body("", _JACOBI, "", quads=True)
 
 
 @wp.func_native(_SOLVE)
@@ -311,6 +326,7 @@ def _solve_world(
   q_: wp.array4d[float],
   z_: wp.array4d[float],
   zn_: wp.array3d[float],
+  quad_: wp.array4d[float],
   partial_: wp.array3d[float],
   status: wp.array2d[float],
 ): ...
@@ -354,6 +370,7 @@ def _solve(
   q_out: wp.array4d[float],
   z_out: wp.array4d[float],
   zn_out: wp.array3d[float],
+  quad_out: wp.array4d[float],
   partial_out: wp.array3d[float],
   status_out: wp.array2d[float],
 ):
@@ -394,6 +411,7 @@ def _solve(
     q_out,
     z_out,
     zn_out,
+    quad_out,
     partial_out,
     status_out,
   )
@@ -600,7 +618,7 @@ def solve(s: Surface, d: State, stage: Stage):
       d.areavec,
       d.normal,
     ],
-    outputs=[d.total, d.x, d.r, d.p, d.q, d.z, d.zn, d.partial, d.status],
+    outputs=[d.total, d.x, d.r, d.p, d.q, d.z, d.zn, d.quad, d.partial, d.status],
     device=s.device,
   )
 

@@ -199,6 +199,7 @@ class State:
     q: A times direction                            (nworld, nslice, 3, 8)
     z: preconditioned residual                      (nworld, nslice, 3, 8)
     zn: that along the normals                      (nworld, nslice, 8)
+    quad: z of a node side by side, see simd.py; the CPU's without levels (nworld, nslice, 12, 8)
     e: as z, between smoothing steps                (nworld, nslice, 3, 8)
     en: that along the normals                      (nworld, nslice, 8)
     t: smoother's direction and residual            (nworld, nslice, 3, 8)
@@ -238,6 +239,7 @@ class State:
   q: wp.array
   z: wp.array
   zn: wp.array
+  quad: wp.array
   e: wp.array
   en: wp.array
   t: wp.array
@@ -269,6 +271,7 @@ def make_state(surface: Surface, nworld: int = 1, is_coarse: bool = False) -> St
     "change": (),
     "total": (2,),
     "zn": scalar if s.has_bending else (0, 8),
+    "quad": (s.nslice if not (cycles or s.device.is_cuda) else 0, 12, 8),
     "e": vector if cycles else (0, 3, 8),
     "en": scalar if cycles and s.has_bending else (0, 8),
     "t": vector if cycles else (0, 3, 8),
