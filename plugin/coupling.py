@@ -63,7 +63,8 @@ STALE, ASLEEP, MISSED_NODES, MISSED_ELEMENTS, PENDING, NEAR, CHANGED, ANSWERED =
       force_ext.data[at + 8 * c] = (float)lagged;
       pos.data[at + 8 * c] = (float)(qpos.data[qadr + c] - qpos0.data[qadr + c]);
       vel.data[at + 8 * c] = (float)qvel.data[adr + c];
-      dvel_warm.data[at + 8 * c] = (float)plugin_state.data[own + nfree + c];
+      const double* last = plugin_state.data + own + nfree + c;
+      dvel_warm.data[at + 8 * c] = (float)(2.0 * last[0] - last[nfree]);
     }
   }
   // Residual floor: with D ~ mass, sqrt(r^T D^-1 r) of this share of the weight's impulse.
@@ -193,7 +194,7 @@ HEAVIER = f"""
   // A solve that failed holds the organ still for this step instead of spreading the damage.
   const double ok = status.data[3] == 0.0f ? 1.0 : 0.0;
   const double per_h = ok / timestep.data[0];
-  const double heavy = plugin_state.data[2 * nfree];
+  const double heavy = plugin_state.data[3 * nfree];
   for (int i = 0; i < nnode; ++i) {
     const int at = (i >> 3) * 24 + (i & 7), adr = dofadr.data[i];
     if (adr < 0) continue;
@@ -328,7 +329,7 @@ def _impulses(
   // are not quite those that moved the dofs.
   const double h = timestep.data[0];
   const bool ok = status.data[3] == 0.0f, answered = ok && flags.data[{ANSWERED}];
-  const double heavy = plugin_state.data[2 * nfree] > 1.0 ? plugin_state.data[2 * nfree] : 1.0;
+  const double heavy = plugin_state.data[3 * nfree] > 1.0 ? plugin_state.data[3 * nfree] : 1.0;
   double acted = 0.0, meant = 0.0, gross = 0.0, whole = 0.0, sum[3] = {{0.0, 0.0, 0.0}};
   for (int i = 0; i < nnode; ++i) {{
     const int at = (i >> 3) * 24 + (i & 7), adr = dofadr.data[i], own = stateadr.data[i];
@@ -350,13 +351,15 @@ def _impulses(
         qvel.data[adr + c] = v;
       }}
       plugin_state.data[own + c] = f;
-      plugin_state.data[own + nfree + c] = dv;
+      double* last = plugin_state.data + own + nfree + c;
+      last[nfree] = last[0];
+      last[0] = dv;
     }}
     meant += h * h * df2 / inertia;
     gross += sqrt(df2);
     whole += sqrt(f2);
   }}
-  if (answered) plugin_state.data[2 * nfree] = heavier(heavy, acted, meant, sum, gross, whole,
+  if (answered) plugin_state.data[3 * nfree] = heavier(heavy, acted, meant, sum, gross, whole,
                                                      heaviest.data[0]);
 """)
 def _remember_native(
@@ -509,7 +512,7 @@ def launches(w, model: int, instance: int) -> Launches:
     "M": wrap(d.M, m.nC),
     "qLD": wrap(d.qLD, m.nC),
     "qLDiagInv": wrap(d.qLDiagInv, m.nv),
-    "plugin_state": wrap(d.plugin_state + 8 * start, 2 * organ.nfree + 1),
+    "plugin_state": wrap(d.plugin_state + 8 * start, 3 * organ.nfree + 1),
     "flags": wp.array(w.flags, dtype=int, device="cpu", copy=False),
     "heaviest": wp.array(w.heaviest, dtype=wp.float64, device="cpu", copy=False),
   }

@@ -122,7 +122,7 @@ class Organ:
       out = np.zeros((self.nvert, 3))
       node = self._space.views["placed"].numpy()
       used = node >= 0
-      start = 9 * self.nvert
+      start = 12 * self.nvert
       force = self.data.plugin_state[self._plugin_state][start : start + 3 * len(node)]
       out[node[used]] = force.reshape(-1, 3)[used] @ self._organ.frame.T
       return out

@@ -36,8 +36,9 @@ class Resident:
     self.device = w.surface.device
     self.live = -1
     self._end_step, self._look_again = end_step, look_again
+    self._motion = (nodes.disp, nodes.velocity, nodes.last, nodes.before)
     self._staging = wp.zeros(
-      3 * 3 * nodes.nvert, dtype=wp.float64, device="cpu", pinned=self.device.is_cuda
+      4 * 3 * nodes.nvert, dtype=wp.float64, device="cpu", pinned=self.device.is_cuda
     )
 
   def send(self):
@@ -55,8 +56,8 @@ class Resident:
         "call palpate.Organ.sync() before saving or copying it"
       )
     size = 3 * self.nodes.nvert
-    self._staging.numpy()[:] = self.state[: 3 * size]
-    for k, array in enumerate((self.nodes.disp, self.nodes.velocity, self.nodes.last)):
+    self._staging.numpy()[:] = self.state[: 4 * size]
+    for k, array in enumerate(self._motion):
       wp.copy(array, self._staging, src_offset=k * size, count=size)
     wp.synchronize_device(self.device)
     self.w.flags[PENDING] = self.w.views["inbox"].numpy()[3] = 0  # it ends no step
@@ -88,9 +89,9 @@ class Resident:
     inbox[3] = flags[PENDING]
     self._end_step()
     size = 3 * self.nodes.nvert
-    for k, array in enumerate((self.nodes.disp, self.nodes.velocity, self.nodes.last)):
+    for k, array in enumerate(self._motion):
       wp.copy(self._staging, array, dest_offset=k * size, count=size)
     wp.synchronize_device(self.device)
-    self.state[: 3 * size] = self._staging.numpy()
+    self.state[: 4 * size] = self._staging.numpy()
     inbox[3] = flags[PENDING] = 0
     self.tail[0] = self.live

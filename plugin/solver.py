@@ -3,8 +3,9 @@
 A has sliced 3x3 blocks, the bending matrix along the node normals and the rank-one volume term; the
 preconditioner is the inverse of the diagonal blocks, or for an organ that has them a cycle on
 coarser meshes (`multilevel`). With either PCG stops when sqrt(r^T D^-1 r), D the diagonal blocks,
-is `tolerance` times that of b. It starts at the last step's solution, scaled to the least error in
-the energy norm.
+is `tolerance` times that of b. It starts where a line through the last two steps' solutions leads,
+scaled to the least error in the energy norm: from 2562 nodes on that takes 4 to 6 iterations less
+than the last solution alone in smooth motion, which takes 4 to 6 less than zero.
 """
 
 from __future__ import annotations

@@ -175,7 +175,7 @@ class State:
     mass: mass [kg]                                 (nworld, nslice, 8)
     force_ext: external and lagged contact force [N](nworld, nslice, 3, 8)
     dvel: change of velocity in this step [m/s]     (nworld, nslice, 3, 8)
-    dvel_warm: that of the step before, where PCG starts (nworld, nslice, 3, 8)
+    dvel_warm: what those of the last steps lead to, where PCG starts (nworld, nslice, 3, 8)
     change: largest (rate of an edge's ends over its length)^2 [1/s^2]  (nworld,)
     pos_trial: displacement of the present Newton iteration [m]
     vel_trial: velocity of the present Newton iteration [m/s]

@@ -6,7 +6,7 @@ with their position, velocity and effective inertia. The window's triangles are 
 triangles between them. Forces follow the formula of `coupling`; a node outside the window moves by
 dv exactly as it would with dofs of its own and no contact.
 
-plugin_state: displacement (3 nvert), velocity (3 nvert), last dv (3 nvert), contact force (3 W),
+plugin_state: displacement, velocity, last dv and the dv before (3 nvert each), contact force (3 W),
 slots (W; node + 1, 0 for the slot's default node, -1 for a slot that is not used), poses of the
 windows' geoms when the organ fell asleep (12 each), `TAIL` numbers.
 
@@ -36,7 +36,7 @@ _ROOM = 16
 
 def state_size(nvert: int, nslot: int, ngeom: int) -> int:
   """Returns the length of the plugin state; ngeom is summed over the windows."""
-  return 9 * nvert + 4 * nslot + window_slots.POSE * ngeom + window_slots.TAIL
+  return 12 * nvert + 4 * nslot + window_slots.POSE * ngeom + window_slots.TAIL
 
 
 def launches(w, model: int, instance: int) -> Launches:
@@ -255,9 +255,9 @@ def _nodes(w, side: wp.Device) -> Nodes:
   node = s.node.numpy()
   address, size = v["plugin_state"].ptr, 3 * nvert
   if w.config.resident:
-    motion = [wp.zeros(size, dtype=wp.float64, device=side) for _ in range(3)]
+    motion = [wp.zeros(size, dtype=wp.float64, device=side) for _ in range(4)]
   else:
-    motion = [wrap(address + 8 * k * size, size) for k in range(3)]
+    motion = [wrap(address + 8 * k * size, size) for k in range(4)]
   solving = w.state if w.config.resident else None
   crossing = ("step", "pos", "vel", "force_ext", "dvel_warm", "dvel", "rhs", "x", "status")
   mass = np.ones(s.nnode)
@@ -273,6 +273,7 @@ def _nodes(w, side: wp.Device) -> Nodes:
     "disp": motion[0],
     "velocity": motion[1],
     "last": motion[2],
+    "before": motion[3],
     "inbox": v["inbox"] if not side.is_cuda else wp.clone(v["inbox"], device=side),
     "outbox": v["outbox"] if not side.is_cuda else wp.clone(v["outbox"], device=side),
     "count": _ints(np.zeros(nwindow)).to(side),

@@ -31,7 +31,8 @@ class Nodes:
     node: where a vertex starts in vectors of slices     (nvert,)
     mass: mass [kg]                                      (nvert,)
     rest: rest position [m]                              (3 nvert,)
-    disp, velocity, last: displacement [m], velocity and last change of it [m/s]  (3 nvert,) each
+    disp, velocity: displacement [m], velocity [m/s]     (3 nvert,) each
+    last, before: last change of the velocity, the one before it [m/s]  (3 nvert,) each
     inbox: HEAD numbers, node, displacement and velocity of each slot after the last step, node and
       force of each slot now (after MuJoCo's step the impulse to answer), and the geoms of each
       window: their number and GEOM numbers each
@@ -52,6 +53,7 @@ class Nodes:
   disp: wp.array[wp.float64]
   velocity: wp.array[wp.float64]
   last: wp.array[wp.float64]
+  before: wp.array[wp.float64]
   inbox: wp.array[wp.float64]
   outbox: wp.array[wp.float64]
   count: wp.array[int]
@@ -110,6 +112,7 @@ _BOXES = f"""
       const double dv = ok * whole, v = n.velocity.data[j] + dv;
       n.disp.data[j] += h * v;
       n.velocity.data[j] = keep * v;
+      n.before.data[j] = keep * n.last.data[j];
       n.last.data[j] = keep * dv;
     }
   }
@@ -149,7 +152,7 @@ def _move_slots(tid: int, nthread: int, n: Nodes): ...
       const float x = (float)n.rest.data[j] + u;
       n.pos.data[at + 8 * c] = u;
       n.vel.data[at + 8 * c] = v;
-      n.dvel_warm.data[at + 8 * c] = (float)n.last.data[j];
+      n.dvel_warm.data[at + 8 * c] = (float)(2.0 * n.last.data[j] - n.before.data[j]);
       n.force_ext.data[at + 8 * c] = (float)(m * in[4 + c]);
       speed += v * v;
       low[c] = x < low[c] ? x : low[c];
@@ -344,7 +347,7 @@ def _report(tid: int, nthread: int, n: Nodes): ...
 
 @wp.kernel(enable_backward=False)
 def commit(nthread: int, nodes: Nodes):
-  """Ends the last step: disp, velocity, last."""
+  """Ends the last step: disp, velocity, last, before."""
   _commit(wp.tid(), nthread, nodes)
 
 

@@ -152,7 +152,7 @@ class Slots:
 _STATE = f"""
   double* U = s.plugin_state.data;
   double* W = U + 3 * s.nvert;
-  double* fc = U + 9 * s.nvert;
+  double* fc = U + 12 * s.nvert;
   double* slots = fc + 3 * s.nslot;
   double* poses = slots + s.nslot;
   double* tail = poses + {POSE} * s.geom_adr.data[s.nwindow];

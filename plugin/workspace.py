@@ -220,14 +220,14 @@ def place(w: Workspace):
 def state_size(model: int, instance: int) -> int:
   """Returns the length of the plugin state.
 
-  Contact force and last dv of each moving vertex, or what `window` says.
+  Contact force, last dv and the one before of each moving vertex, or what `window` says.
   """
   m = mjstruct.Model.from_address(model)
   names = mjstruct.config(model, instance, "window").split()
   if names:
     # Asked before MuJoCo has filled in the flexes: what `window` needs is at most this.
     return window.state_size(m.nflexvert, 0, m.ngeom * len(names))
-  return 6 * len(declare.moving_bodies(m, instance)) + 1
+  return 9 * len(declare.moving_bodies(m, instance)) + 1
 
 
 def make(model: int, data: int, instance: int) -> Workspace:
