@@ -28,7 +28,7 @@ _PRESSED = 2.0
 _KNOWN = 64
 # A pressed shell stiffens and few nodes of a patch touch: between 1 and the limit of 2.
 _MARGIN = 1.5
-_alone: dict[bytes, np.ndarray] = {}  # digest of what it depends on -> `alone`
+_alone: dict[bytes, np.ndarray] = {}  # what it depends on -> `_by_itself`
 _time_step: dict[bytes, float] = {}  # digest of an armature of ours -> the time step it is for
 
 
@@ -83,7 +83,7 @@ def _by_itself(m, organ: Organ, config: Config, sample: np.ndarray) -> np.ndarra
   h, mass = float(m.opt.timestep), _masses(m, organ)
   numbers = [h, config.damping, config.foundation, config.bulk]
   key = _digest(np.concatenate([numbers, mass, organ.mesh.rest.ravel(), organ.free]))
-  key = _digest(np.frombuffer(key + repr(organ.config).encode(), np.uint8))
+  key += repr(organ.config).encode()
   if key not in _alone:
     if len(_alone) >= _KNOWN:
       _alone.pop(next(iter(_alone)))
