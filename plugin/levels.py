@@ -8,8 +8,7 @@ from .hierarchy import Coarse
 from .simd import LANES
 
 # Condition number from which cycles take less time than the iterations of block Jacobi that they
-# save: at 203 they take 2.3 times as long on an H200, at 810 0.56 times (benchmarks/solver.py), and
-# at 504 0.87 times as long on the CPU, in warm contact.
+# save, where there is bending (benchmarks/solver.py, benchmarks/preconditioner.py).
 THRESHOLD = 300.0
 # Interval of the smoother, as greatest eigenvalue of D^-1 A and its ratio to the lower end, by
 # degree. A membrane's is 2.3 on good meshes, at most 3 (three corners an element), and bending
@@ -77,10 +76,19 @@ def stiffness(part: dict) -> tuple[float, float]:
   return float(total.sum() / 3 / real), float(part["bend_diag"].sum() / real)
 
 
-def condition(part: dict) -> float:
-  """Returns the condition number of A where g / mass is one, M^-1 A at rest: see `rates`."""
+def pay(part: dict, scale: float) -> bool:
+  """Returns whether cycles take less time than block Jacobi at the time step of `scale`.
+
+  Not on a membrane: contact moves it where it is touched, and block Jacobi takes at most ten times
+  the cycles, warm half of that, from 678 to 262,146 nodes and from 3 kPa to 3 MPa
+  (benchmarks/preconditioner.py), while a cycle takes as long as eight iterations and more.
+
+  Args:
+    part: arrays of the mesh, see `surface.arrays`
+    scale: (h^2 + h damping) over the mean mass of a node [s^2/kg]
+  """
   membrane, bend = stiffness(part)
-  return membrane + bend
+  return bend > _BENDING * membrane and scale * (membrane + bend) >= THRESHOLD
 
 
 def rates(parts: list[dict]) -> np.ndarray:

@@ -61,7 +61,7 @@ def make(
   target = resolve_device(device, mesh.nvert)
   finest = arrays(mesh, config, pinned)
   made = _surface(mesh, config, finest, target)
-  if scale * levels.condition(finest) < levels.THRESHOLD:
+  if not np.isinf(scale) and not levels.pay(finest, scale):
     return made
   coarse = hierarchy.build(mesh, COARSEST)
   if not coarse:
