@@ -165,21 +165,46 @@ def _rings(organ, elem, twin, nvert):
   return np.stack(ring, axis=1), np.stack(ring_elem, axis=1), degree
 
 
-def node_order(mesh: Mesh) -> np.ndarray:
+def node_order(mesh: Mesh, patch: int = 0) -> np.ndarray:
   """Returns vertices in the order of the solver, padded with -1 to whole slices.
 
-  Reverse Cuthill-McKee keeps neighbours close in memory; sorting by degree within a window keeps
-  the slices full.
+  Reverse Cuthill-McKee keeps neighbours close in memory, patches keep most of them in one block of
+  threads; sorting by degree within a window keeps the slices full.
+
+  Args:
+    mesh: the surface
+    patch: nodes of a block of threads that works on a patch of the surface, 0 for no patches
   """
+  order = _patches(mesh.rest, patch) if patch else _band(mesh)
+  window = np.arange(mesh.nvert) // (8 * LANES)
+  order = order[np.lexsort((np.arange(mesh.nvert), -mesh.degree[order], window))]
+  return np.concatenate([order, np.full(-mesh.nvert % LANES, -1)])
+
+
+def _patches(point: np.ndarray, size: int) -> np.ndarray:
+  """Returns points in runs of `size` close to each other: halved across their longest extent."""
+  out, todo = [], [(np.arange(len(point)), size)]
+  while todo:
+    part, unit = todo.pop()
+    if len(part) <= unit:
+      unit = 8 * LANES
+    if len(part) <= unit:
+      out.append(part)
+      continue
+    half = unit * max(1, len(part) // unit // 2)
+    axis = np.argmax(np.ptp(point[part], axis=0))
+    part = part[np.argsort(point[part, axis], kind="stable")]
+    todo += [(part[half:], unit), (part[:half], unit)]
+  return np.concatenate(out)
+
+
+def _band(mesh: Mesh) -> np.ndarray:
   start, end = mesh.elem.ravel(), mesh.elem[:, [1, 2, 0]].ravel()
   graph = sparse.coo_matrix(
     (np.ones(2 * len(start)), (np.concatenate([start, end]), np.concatenate([end, start]))),
     shape=(mesh.nvert, mesh.nvert),
   ).tocsr()
-  order = csgraph.reverse_cuthill_mckee(graph, symmetric_mode=True).astype(np.int64)
-  window = np.arange(mesh.nvert) // (8 * LANES)
-  order = order[np.lexsort((np.arange(mesh.nvert), -mesh.degree[order], window))]
-  return np.concatenate([order, np.full(-mesh.nvert % LANES, -1)])
+  return csgraph.reverse_cuthill_mckee(graph, symmetric_mode=True).astype(np.int64)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -292,9 +317,7 @@ def hinges(mesh: Mesh, rigidity: np.ndarray, poisson: float) -> Hinges:
   inverse = np.where(degenerate, 20 / np.maximum(largest, 1e-300), inverse)
   gain = np.einsum("tik,tk,tjk->tij", vector, inverse, vector)
   gain = np.where(both, gain, 0) * (area * rigidity)[:, None, None]
-  return Hinges(
-    vert, np.stack([half // 3, other // 3], axis=1), of_half.reshape(-1, 3), gain, rows
-  )
+  return Hinges(vert, np.stack([half // 3, other // 3], axis=1), of_half.reshape(-1, 3), gain, rows)
 
 
 def bending_matrix(mesh: Mesh, hinge: Hinges) -> sparse.csr_matrix:

@@ -93,8 +93,7 @@ _SETUP = """
     FOR_RANGE(s, first_slice(l), last_slice(l)) {
       V rx, ry, rz_, qx, qy, qz;
       {
-        const float bulk = 0.0f;
-        PRODUCT(from, fromn, 0.0f)
+        PRODUCT(from, fromn)
         LOAD(bx, by, bz, b)
         rx = bx - ax; ry = by - ay; rz_ = bz - az;
         PRECONDITION(qx, qy, qz, rx, ry, rz_)
@@ -160,9 +159,8 @@ _CYCLE = """
           const float* from = z_of(l, false);
           const float* fromn = zn_of(l, false);
           float* t = m.t;
-          const float bulk = 0.0f;
           FOR_RANGE(s, first_slice(l), last_slice(l)) {
-            PRODUCT(from, fromn, 0.0f)
+            PRODUCT(from, fromn)
             LOAD(bx, by, bz, b)
             STORE(t, bx - ax, by - ay, bz - az)
           }
@@ -538,7 +536,6 @@ def solve(s: Surface, d: State, stage: Stage):
   levels: Levels = s.levels
   c, e = levels.surface, d.coarse
   nthread = simd.group_size(s.device, s.nslice, d.nworld, per_sm=2)
-  d.partial.zero_()
   wp.launch(
     _solve,
     dim=(d.nworld, nthread),

@@ -261,7 +261,6 @@ def step(s: Surface, d: State, integrator: str):
   wp.copy(d.vel_trial, d.vel)
   elastic.assemble(s, d, Stage.NEUMANN if neumann else Stage.EXPLICIT)
   nthread = simd.group_size(s.device, s.nslice, d.nworld)
-  d.partial.zero_()
   wp.launch(
     _direct,
     dim=(d.nworld, nthread),
@@ -310,7 +309,6 @@ def respond(s: Surface, d: State, integrator: str):
 
 def _centre_step(s: Surface, d: State, undo: int):
   nthread = simd.group_size(s.device, s.nslice, d.nworld)
-  d.partial.zero_()
   wp.launch(
     _centre,
     dim=(d.nworld, nthread),

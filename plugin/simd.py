@@ -7,7 +7,7 @@ one float on CUDA; `LD`, `ST` and `GATHER` hide the difference, and `PUT_MOST` k
 numbers >= 0. Irregular lists (the neighbours of a node) are sliced ELLPACK: row `k` of slice `s`
 holds the k-th entry of its eight nodes (Kreutzer et al. 2014, SELL-C-sigma,
 doi:10.1137/130930352). On the CPU gathering is most of an iteration, so what is gathered often is
-kept in quads as well, see `GATHER_QUADS`; on CUDA that macro reads the vectors.
+kept in quads as well, see `GATHER_QUADS`; `group` says how the threads of a world work together.
 """
 
 LANES = 8
@@ -20,9 +20,6 @@ _PRELUDE = """
   #define LD(p, r) ((p)[8 * (r) + lane])
   #define ST(p, r, v) ((p)[8 * (r) + lane] = (v))
   #define GATHER(p, o, c) ((p)[(o)[lane] + 8 * (c)])
-  #define GATHER_QUADS(x, y, z, p, quads, o) \\
-    const V x = GATHER(p, o, 0), y = GATHER(p, o, 1), z = GATHER(p, o, 2);
-  #define PUT_QUADS(q, x, y, z)
   #define SQRT(a) sqrtf(a)
   #define MAX(a, b) fmaxf(a, b)
   #define MIN(a, b) fminf(a, b)
@@ -32,6 +29,13 @@ _PRELUDE = """
     if (__float_as_int(v) > *(volatile int*)(p)) atomicMax((int*)(p), __float_as_int(v));
   #define SELECT(c, a, b) ((c) ? (a) : (b))
   #define FOR_RANGE(s, from, to) for (int s = (from) + (tid >> 3); s < (to); s += nthread >> 3)
+  #define FOR_OWN(k, s) _Pragma("unroll OWN_SIZE") \\
+    for (int k = 0, s = OWN ? first_ + (thread >> 3) : tid >> 3; \\
+         OWN ? k < OWN : s < nslice; ++k, s += (OWN ? blockDim.x : nthread) >> 3) \\
+      if (!OWN || s < last_)
+  #define OWN_VECTOR(name, p) float* name = p; float name##_[OWN_SIZE][3];
+  #define GET(name, c) (OWN ? name##_[OWN ? k : 0][c] : LD(name + 24 * s, c))
+  #define PUT(name, c, v) if (OWN) name##_[OWN ? k : 0][c] = v; else ST(name + 24 * s, c, v);
 #else
   #define SIMD_TYPES \\
     typedef float V __attribute__((ext_vector_type(8))); \\
@@ -79,98 +83,182 @@ _PRELUDE = """
     { const float most_ = __builtin_reduce_max(v); if (most_ > *(p)) *(p) = most_; }
   #define SELECT(c, a, b) ((c) ? (a) : (b))
   #define FOR_RANGE(s, from, to) for (int s = from; s < (to); ++s)
+  #define FOR_OWN(k, s) for (int s = 0; s < nslice; ++s)
+  #define OWN_VECTOR(name, p) float* name = p;
+  #define GET(name, c) LD(name + 24 * s, c)
+  #define PUT(name, c, v) ST(name + 24 * s, c, v);
 #endif
 #define FOR_SLICES(s) FOR_RANGE(s, 0, nslice)
 #endif
 """
 
 # Sums over all nodes of a world, the same value in every thread, and barriers. On CUDA a world is a
-# group of `nthread` threads in whole blocks that are all resident. Each block publishes its sums
-# with the number of the meeting in one 64-bit word, and all blocks read the words of all: no
-# counter, and one trip through memory. The words are zero before the launch and alternate between
-# two sets: who meets again has read the set before. The order of summation is fixed, so that runs
-# repeat to the bit.
+# group of `nthread` threads in whole blocks that are all resident. What they tell each other goes
+# through memory in words of 128 bits, three numbers and the number of the turn, which are written
+# and read whole: whoever waits for a word needs neither counter nor fence. Turns go on from launch
+# to launch; the last one is kept behind the words. In a meeting each block publishes its sums and
+# reads those of all, in two sets that alternate: who meets again has read the set before. The order
+# of summation is fixed, so that runs repeat to the bit. Other memory written before a meeting is
+# seen after it where `SEEN`.
 _GROUP = """
 #if defined(__CUDA_ARCH__) || defined(__CUDACC_RTC__)
-  __shared__ float red[2][4][32];
+  __shared__ float red[2][6][32];
   const int lane = tid & 7, thread = threadIdx.x, nwarp = blockDim.x >> 5;
   const int nblock = nthread / blockDim.x, block_ = tid / blockDim.x;
-  volatile unsigned long long* word =
-    (volatile unsigned long long*)partial_.data + 4 * MAXBLOCK * (size_t)world;
-  unsigned phase = 0;
+  float* words_ = partial_.data + WORDS * (size_t)world;
+  volatile unsigned* kept_ = (volatile unsigned*)(words_ + 8 * MAXBLOCK);
+  unsigned turn_ = *kept_, flip_ = 0;
+  __syncthreads();
+  struct Keep_ {
+    volatile unsigned* at;
+    const unsigned& turn;
+    const bool mine;
+    __device__ ~Keep_() { if (mine) *at = turn; }
+  } keep_{kept_, turn_, tid == 0};
+  typedef unsigned long long Two_;
+  auto pack = [](Two_& w, float a, unsigned b) { w = (Two_)b << 32 | __float_as_uint(a); };
+  auto lower = [](Two_ w) -> float { return __uint_as_float((unsigned)w); };
+  auto upper = [](Two_ w) -> float { return __uint_as_float((unsigned)(w >> 32)); };
+  auto put_word = [&](float* p, float a, float b, float c, unsigned turn) {
+    Two_ low, high;
+    pack(low, a, __float_as_uint(b));
+    pack(high, c, turn);
+    asm volatile("{.reg .b128 w; mov.b128 w, {%1, %2}; st.relaxed.gpu.global.b128 [%0], w;}"
+      :: "l"(p), "l"(low), "l"(high) : "memory");
+  };
+  auto get_word_if = [](bool wanted, const float* p, Two_& low, Two_& high) {
+    asm volatile("{.reg .b128 w; .reg .pred q; setp.ne.b32 q, %3, 0; mov.b128 w, {%0, %1};"
+      " @q ld.relaxed.gpu.global.b128 w, [%2]; mov.b128 {%0, %1}, w;}"
+      : "+l"(low), "+l"(high) : "l"(p), "r"((int)wanted) : "memory");
+  };
+  auto put_half_word = [&](float* p, float a, unsigned turn) {
+    Two_ w;
+    pack(w, a, turn);
+    asm volatile("st.relaxed.gpu.global.b64 [%0], %1;" :: "l"(p), "l"(w) : "memory");
+  };
+  auto get_half_word_if = [](bool wanted, const float* p, Two_& w) {
+    asm volatile("{.reg .pred q; setp.ne.b32 q, %2, 0; @q ld.relaxed.gpu.global.b64 %0, [%1];}"
+      : "+l"(w) : "l"(p), "r"((int)wanted) : "memory");
+  };
   auto warp_sum = [](float v) -> float {
     for (int o = 16; o > 0; o >>= 1) v += __shfl_xor_sync(0xffffffffu, v, o);
     return v;
   };
-  // Sums u, and v where `two`, over the group; memory written before is seen after.
-  auto meet = [&](float& u, float& v, bool two) {
-    float* mine = red[phase & 1][0];
+  // Sums one to three numbers over the group.
+  auto meet = [&](auto& v, bool seen) {
+    constexpr int N = sizeof(v) / sizeof(float);
     const int warp = thread >> 5, at = thread & 31;
-    u = warp_sum(u);
-    if (two) v = warp_sum(v);
-    if (at == 0) { mine[32 * 0 + warp] = u; mine[32 * 1 + warp] = v; }
+    auto* mine = red[flip_];
+    float* set = words_ + 4 * MAXBLOCK * flip_;
+    flip_ ^= 1;
+    ++turn_;
+    for (int c = 0; c < N; ++c) v[c] = warp_sum(v[c]);
+    if (at == 0) for (int c = 0; c < N; ++c) mine[c][warp] = v[c];
     __syncthreads();
     int nsum = nwarp, from = 0;
     if (nblock > 1) {
-      volatile unsigned long long* set = word + 2 * MAXBLOCK * (phase & 1);
-      ++phase;
       if (warp == 0) {
-        u = warp_sum(at < nwarp ? mine[32 * 0 + at] : 0.0f);
-        v = warp_sum(two && at < nwarp ? mine[32 * 1 + at] : 0.0f);
-        if (at < 2) {
-          __threadfence();
-          const unsigned bits = __float_as_uint(at == 0 ? u : v);
-          set[2 * block_ + at] = (unsigned long long)phase << 32 | bits;
+        float sum[3] = {0.0f, 0.0f, 0.0f};
+        for (int c = 0; c < N; ++c) sum[c] = warp_sum(at < nwarp ? mine[c][at] : 0.0f);
+        if (at == 0) {
+          if (seen) __threadfence();
+          put_word(set + 4 * block_, sum[0], sum[1], sum[2], turn_);
         }
       }
-      u = v = 0.0f;
+      for (int c = 0; c < N; ++c) v[c] = 0.0f;
       for (int b = thread; b < nblock; b += blockDim.x) {
-        unsigned long long w;
-        do w = set[2 * b]; while ((unsigned)(w >> 32) != phase);
-        u += __uint_as_float((unsigned)w);
-        if (two) {
-          do w = set[2 * b + 1]; while ((unsigned)(w >> 32) != phase);
-          v += __uint_as_float((unsigned)w);
-        }
+        Two_ low, high;
+        do get_word_if(true, set + 4 * b, low, high); while ((unsigned)(high >> 32) != turn_);
+        const float w[3] = {lower(low), upper(low), lower(high)};
+        for (int c = 0; c < N; ++c) v[c] += w[c];
       }
-      if (warp * 32 < nblock) __threadfence();
-      u = warp_sum(u);
-      if (two) v = warp_sum(v);
-      if (at == 0) { mine[32 * 2 + warp] = u; mine[32 * 3 + warp] = v; }
+      if (warp * 32 < nblock) {
+        if (seen) __threadfence();
+        for (int c = 0; c < N; ++c) v[c] = warp_sum(v[c]);
+        if (at == 0) for (int c = 0; c < N; ++c) mine[3 + c][warp] = v[c];
+      }
       __syncthreads();
       nsum = nwarp < (nblock + 31) / 32 ? nwarp : (nblock + 31) / 32;
-      from = 64;
-    } else {
-      ++phase;
+      from = 3;
     }
-    u = v = 0.0f;
-    for (int w = 0; w < nsum; ++w) { u += mine[from + w]; v += mine[from + 32 + w]; }
+    for (int c = 0; c < N; ++c) {
+      v[c] = 0.0f;
+      for (int w = 0; w < nsum; ++w) v[c] += mine[from + c][w];
+    }
   };
   auto group_sum = [&](float u) -> float {
-    float v = 0.0f;
-    meet(u, v, false);
-    return u;
+    float v[1] = {u};
+    meet(v, SEEN);
+    return v[0];
   };
-  #define GROUP_SUMS(u, v, a, b) float a = u, b = v; meet(a, b, true);
+  #define GROUP_SUMS(u, v, a, b) float a, b; \\
+    { float sums_[2] = {u, v}; meet(sums_, SEEN); a = sums_[0]; b = sums_[1]; }
+  #define GROUP_SUMS3(u, v, w, a, b, c) float a, b, c; \\
+    { float sums_[3] = {u, v, w}; meet(sums_, SEEN); a = sums_[0]; b = sums_[1]; c = sums_[2]; }
   #define GROUP_SYNC() group_sum(0.0f)
 #else
   const int lane = 0, thread = 0;
   auto group_sum = [&](V v) -> float { return HSUM(v); };
   #define GROUP_SUMS(u, v, a, b) float a = HSUM(u), b = HSUM(v);
+  #define GROUP_SUMS3(u, v, w, a, b, c) float a = HSUM(u), b = HSUM(v), c = HSUM(w);
   #define GROUP_SYNC()
 #endif
 """
 MAX_BLOCKS = 512
+WORDS = 2 * MAX_BLOCKS + 1  # of 128 bits that a world's threads exchange
 BLOCK = 512  # threads of a block, at most
 
 
-def group(body: str) -> str:
+def group(body: str, seen: bool = True) -> str:
   """Returns native code in which all threads of a world work on `body` together.
 
-  Arguments: `world`, `tid`, `nthread`, `nslice` and `partial_` (nworld, 8, MAX_BLOCKS), which is
-  zero before the launch. On the CPU there is one thread.
+  Arguments: `world`, `tid`, `nthread`, `nslice` and `partial_` (nworld, WORDS, 4), which is zero
+  before the first launch. On the CPU there is one thread.
+
+  Args:
+    body: the code
+    seen: whether what a thread writes to memory before a meeting is seen after it by the others
   """
-  return function(_GROUP.replace("MAXBLOCK", str(MAX_BLOCKS)) + body)
+  words = _GROUP.replace("MAXBLOCK", str(MAX_BLOCKS)).replace("WORDS", str(4 * WORDS))
+  return function(words.replace("SEEN", str(seen).lower()) + body)
+
+
+def owned(body: str, wanted: bool = True) -> str:
+  """Returns code of a group in which each thread may keep up to four of its nodes in registers.
+
+  `body` is compiled for one, four and any number of nodes a thread, `OWN`, 0 for any. In it an
+  `OWN_VECTOR` is a vector that no other thread reads, and `GET` and `PUT` are for the node of
+  `FOR_OWN(k, s)`. A block then has the slices from `first_` to `last_`, and four numbers of each of
+  their nodes have room in `near_`.
+
+  Args:
+    body: the code
+    wanted: whether to keep them there; otherwise `OWN` is 0
+  """
+  sizes = """
+  if (own_ == 1) { run_((char(*)[2])nullptr); return; }
+  if (own_ <= 4) { run_((char(*)[5])nullptr); return; }
+"""
+  return f"""
+#if defined(__CUDA_ARCH__) || defined(__CUDACC_RTC__)
+  const int chunk_ = (nslice + nblock - 1) / nblock, first_ = block_ * chunk_;
+  const int last_ = first_ + chunk_ < nslice ? first_ + chunk_ : nslice;
+  const int own_ = (8 * chunk_ + blockDim.x - 1) / blockDim.x;
+  __shared__ float near_[4][{4 * BLOCK if wanted else 1}];
+  auto run_ = [&](auto size_) {{
+    constexpr int OWN = sizeof(*size_) - 1, OWN_SIZE = OWN > 0 ? OWN : 1;
+#else
+  constexpr int OWN = 0;
+  {{
+#endif
+{body}
+  }}
+#if defined(__CUDA_ARCH__) || defined(__CUDACC_RTC__)
+  ;
+{sizes if wanted else ""}
+  run_((char(*)[1])nullptr);
+#endif
+"""
 
 
 def function(body: str) -> str:
@@ -225,6 +313,13 @@ def group_size(device, nslice: int, nworld: int, per_sm: int = 1) -> int:
   most = max(1, min(per_sm * device.sm_count // nworld, MAX_BLOCKS))
   size = block(device, nslice)
   return size * max(1, min(most, -(-nslice * LANES // size)))
+
+
+def patch(device, nslice: int) -> int:
+  """Returns the nodes that a block has of one world of `nslice` slices, 0 on the CPU."""
+  if not device.is_cuda:
+    return 0
+  return LANES * -(-nslice // (group_size(device, nslice, 1) // block(device, nslice)))
 
 
 def threads(device, nslice: int) -> int:

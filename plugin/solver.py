@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from . import elastic, simd
+from . import elastic, product, simd
 from .elastic import Stage
 from .types import State, Surface
 
@@ -26,69 +26,6 @@ RESPONSE = 0.03
 # The first Newton iteration stands where the present velocity leads, but no edge changes by more
 # than this share of its length on the way: forces far off would be those of another shape.
 AHEAD = 0.1
-
-# Product of A with the vector P of slice s, in ax, ay, az; x, y, z is P there. PN is P along the
-# normals and `along` its sum with the area vectors.
-PRODUCT = """
-#define PRODUCT(P, PN, along) \\
-  LOAD(x, y, z, P) \\
-  const V md = LD(M, s); \\
-  V ax = md * x, ay = md * y, az = md * z; \\
-  { \\
-    const int row0 = slot[s], width = slot[s + 1] - row0; \\
-    const int* node = fan + 8 * (row0 + 2 * s + 1); \\
-    const float* k = K + 72 * (size_t)row0; \\
-    for (int i = 0; i < width; ++i, node += 8, k += 72) { \\
-      NEAR(jx, jy, jz, P, node) \\
-      const V dx = jx - x, dy = jy - y, dz = jz - z; \\
-      ax += LD(k, 0) * dx + LD(k, 1) * dy + LD(k, 2) * dz; \\
-      ay += LD(k, 3) * dx + LD(k, 4) * dy + LD(k, 5) * dz; \\
-      az += LD(k, 6) * dx + LD(k, 7) * dy + LD(k, 8) * dz; \\
-    } \\
-  } \\
-  if (bending) { \\
-    const int row0 = bend_row[s], width = bend_row[s + 1] - row0; \\
-    const int* node = bend_at + 8 * row0; \\
-    const float* k = Q + 8 * row0; \\
-    V sum = SPLAT(0.0f); \\
-    for (int i = 0; i < width; ++i, node += 8, k += 8) sum += LD(k, 0) * GATHER(PN, node, 0); \\
-    sum *= g; \\
-    ax += sum * LD(N + 24 * s, 0); ay += sum * LD(N + 24 * s, 1); az += sum * LD(N + 24 * s, 2); \\
-  } \\
-  if (bulk != 0.0f) { \\
-    const float c = g * bulk / volume0 / 36.0f * (along); \\
-    ax += c * LD(O + 24 * s, 0); ay += c * LD(O + 24 * s, 1); az += c * LD(O + 24 * s, 2); \\
-  }
-#define PRECONDITION(zx, zy, zz, x, y, z) \\
-  { \\
-    const float* I = I_ + 48 * s; \\
-    const V xx = LD(I, 0), xy = LD(I, 1), xz = LD(I, 2), yy = LD(I, 3), yz = LD(I, 4); \\
-    zx = xx * x + xy * y + xz * z; \\
-    zy = xy * x + yy * y + yz * z; \\
-    zz = xz * x + yz * y + LD(I, 5) * z; \\
-  }
-#define LOAD(x, y, z, P) \\
-  V x = LD((P) + 24 * s, 0), y = LD((P) + 24 * s, 1), z = LD((P) + 24 * s, 2);
-#define STORE(P, x, y, z) ST((P) + 24 * s, 0, x); ST((P) + 24 * s, 1, y); ST((P) + 24 * s, 2, z);
-#define WITH(P, x, y, z) \\
-  (x * LD((P) + 24 * s, 0) + y * LD((P) + 24 * s, 1) + z * LD((P) + 24 * s, 2))
-"""
-
-# What PRODUCT and PRECONDITION read, in world `world`.
-WORLD = """
-  const size_t base = (size_t)world * nslice;
-  const float h = step.data[4 * world], g = step.data[4 * world + 1];
-  const float* K = block.data + 72 * (size_t)world * nslot;
-  const float* M = diag.data + 8 * base;
-  const float* I_ = inverse.data + 48 * base;
-  const float* O = areavec.data + 24 * base;
-  const float* N = normal.data + 24 * base;
-  const int* slot = slot_adr.data;
-  const int* fan = fan_node.data;
-  const int* bend_row = bend_adr.data;
-  const int* bend_at = bend_node.data;
-  const float* Q = bend_gain.data;
-"""
 
 # Impulse of volume and pressure along the area vectors, (push - pull) O: push is the force's, pull
 # that of K v with weight gv.
@@ -112,17 +49,6 @@ VOLUME = """
   }
 """
 
-# How PRODUCT reads neighbours, and what it needs for that of a vector whose slice s is x, y, z.
-_VECTORS = """
-#define NEAR(x, y, z, P, node) \\
-  const V x = GATHER(P, node, 0), y = GATHER(P, node, 1), z = GATHER(P, node, 2);
-#define SHOW(x, y, z)
-"""
-_QUADS = """
-#define NEAR(x, y, z, P, node) GATHER_QUADS(x, y, z, P, quad_.data + 96 * base, node)
-#define SHOW(x, y, z) PUT_QUADS(quad_.data + 96 * (base + s), x, y, z)
-"""
-
 _STAGES = f"""
 #define FIRST_ {int(Stage.FIRST)}
 #define RESPONSE_ {int(Stage.RESPONSE)}
@@ -130,55 +56,69 @@ _STAGES = f"""
 """
 
 
-def body(setup: str, precondition: str, scale: str, quads: bool = False) -> str:
+def body(
+  setup: str, precondition: str, scale: str, curvature: str = "", quads: bool = False
+) -> str:
   """Returns the native code of the whole solve of one world: launches cost more than iterations.
 
-  The iteration is conjugate gradients with q = A p carried as A z + beta q, as z is what neighbours
-  exchange then: two meetings an iteration (Chronopoulos and Gear 1989,
-  doi:10.1016/0377-0427(89)90045-9), and no cancellation, since p^T q is summed, not derived.
+  The iteration is conjugate gradients with all sums of an iteration in one (Chronopoulos and Gear
+  1989, doi:10.1016/0377-0427(89)90045-9): q = A p is carried as A z + beta q, and p^T q as
+  z^T A z - beta^2 p^T q, which loses no more than a digit as the second is seldom twice the first.
 
   Args:
     setup: declarations before the first iteration
     precondition: writes Z, the preconditioned R, and makes it seen by all; sets rz = r^T z and
       `along`, the sum of z with the area vectors, from V rr (r^T D^-1 r) and V zo
     scale: scales zx, zy, zz, which are D^-1 R, before they become Z
-    quads: on the CPU, neighbours read Z in `quad_`, see `simd`
+    curvature: sums V zw, z^T A z less the volume term, to `curvature`; may do what `precondition`
+      leaves to it
+    quads: neighbours read Z in `quad_`, and on CUDA what no other thread reads stays in registers
+      where there is room for it
   """
-  return _STAGES + (_QUADS if quads else _VECTORS) + PRODUCT + simd.group(
-    WORLD
-    + """
+  return (
+    _STAGES
+    + product.code(quads)
+    + simd.group(
+      simd.owned(
+        product.WORLD
+        + """
   const float* U = pos.data + 24 * base;
   const float* W = vel.data + 24 * base;
   const float* R0 = rhs.data + 24 * base;
   const float* D0 = warm.data + 24 * base;
-  float* X = x_.data + 24 * base;
-  float* R = r_.data + 24 * base;
-  float* P = p_.data + 24 * base;
-  float* AP = q_.data + 24 * base;
+  OWN_VECTOR(X, x_.data + 24 * base)
+  OWN_VECTOR(R, r_.data + 24 * base)
+  OWN_VECTOR(P, p_.data + 24 * base)
+  OWN_VECTOR(AP, q_.data + 24 * base)
+  OWN_VECTOR(AZ, t_.data + 24 * base)
   float* Z = z_.data + 24 * base;
   float* ZN = zn_.data + 8 * base;
+  unsigned shown = 0;
   const bool first = stage == FIRST_, response = stage == RESPONSE_;
   const float gv = g - (first ? step.data[4 * world + 3] : 1.0f) * h * h;
 """
-    + VOLUME
-    + setup
-    + """
+        + VOLUME
+        + setup
+        + """
+  // What the volume term adds to a product is this times `along` along the area vectors.
+  const float gain_ = bulk != 0.0f ? g * bulk / volume0 / 36.0f : 0.0f;
   // Right-hand side, its norm, and the start.
   V bb = zero, zo = zero;
-  FOR_SLICES(s) {
+  NEXT_TURN
+  FOR_OWN(k, s) {
     LOAD(bx, by, bz, R0)
     if (push != 0.0f || pull != 0.0f) {
       bx += (push - pull) * LD(O + 24 * s, 0);
       by += (push - pull) * LD(O + 24 * s, 1);
       bz += (push - pull) * LD(O + 24 * s, 2);
     }
-    STORE(R, bx, by, bz)
+    PUT3(R, bx, by, bz)
     V zx, zy, zz;
     PRECONDITION(zx, zy, zz, bx, by, bz)
     bb += bx * zx + by * zy + bz * zz;
     LOAD(x, y, z, D0)
     SHOW(x, y, z)
-    if (bending) ST(ZN, s, WITH(N, x, y, z));
+    if (bending) { SHOW_NORMAL(WITH(N, x, y, z)) }
     if (bulk != 0.0f) zo += WITH(O, x, y, z);
   }
   GROUP_SUMS(bb, zo, norm, along)
@@ -189,83 +129,104 @@ def body(setup: str, precondition: str, scale: str, quads: bool = False) -> str:
   float start = 0.0f;
   if (first && norm > target) {
     V db = zero, dq = zero;
-    FOR_SLICES(s) {
-      PRODUCT(D0, ZN, along)
-      STORE(AP, ax, ay, az)
+    const float c = gain_ * along;
+    FOR_OWN(k, s) {
+      PRODUCT(D0, ZN)
+      if (c != 0.0f) {
+        ax += c * LD(O + 24 * s, 0); ay += c * LD(O + 24 * s, 1); az += c * LD(O + 24 * s, 2);
+      }
+      PUT3(AP, ax, ay, az)
       dq += x * ax + y * ay + z * az;
-      db += WITH(R, x, y, z);
+      db += x * GET(R, 0) + y * GET(R, 1) + z * GET(R, 2);
     }
     GROUP_SUMS(dq, db, curvature, gain)
     if (curvature > 0.0f) start = gain / curvature;
   }
   V rr = zero;
   zo = zero;
-  FOR_SLICES(s) {
+  NEXT_TURN
+  FOR_OWN(k, s) {
     V x = zero, y = zero, z = zero;
-    LOAD(rx, ry, rz_, R)
+    V rx = GET(R, 0), ry = GET(R, 1), rz_ = GET(R, 2);
     if (start != 0.0f) {
       x = start * LD(D0 + 24 * s, 0); y = start * LD(D0 + 24 * s, 1);
       z = start * LD(D0 + 24 * s, 2);
-      rx -= start * LD(AP + 24 * s, 0); ry -= start * LD(AP + 24 * s, 1);
-      rz_ -= start * LD(AP + 24 * s, 2);
-      STORE(R, rx, ry, rz_)
+      rx -= start * GET(AP, 0); ry -= start * GET(AP, 1); rz_ -= start * GET(AP, 2);
+      PUT3(R, rx, ry, rz_)
     }
-    STORE(X, x, y, z)
+    PUT3(X, x, y, z)
+    PUT3(P, zero, zero, zero)
+    PUT3(AP, zero, zero, zero)
     V zx, zy, zz;
     PRECONDITION(zx, zy, zz, rx, ry, rz_)
     rr += rx * zx + ry * zy + rz_ * zz;
 """
-    + scale
-    + """
-    STORE(Z, zx, zy, zz)
+        + scale
+        + """
+    if (!OWN) { STORE(Z, zx, zy, zz) }
     SHOW(zx, zy, zz)
-    if (bending) ST(ZN, s, WITH(N, zx, zy, zz));
+    if (bending) { SHOW_NORMAL(WITH(N, zx, zy, zz)) }
     if (bulk != 0.0f) zo += WITH(O, zx, zy, zz);
   }
   int it = 0;
-  float rz = 0.0f, before = 0.0f, residual = 0.0f;
+  float rz = 0.0f, before = 0.0f, bent = 0.0f, residual = 0.0f;  // bent: p^T A p
   while (true) {
 """
-    + precondition
-    + """
-    const float beta = before != 0.0f ? rz / before : 0.0f;
-    V pq = zero;
-    FOR_SLICES(s) {
-      PRODUCT(Z, ZN, along)
-      V px = x, py = y, pz = z;
-      if (beta != 0.0f) {
-        ax += beta * LD(AP + 24 * s, 0); ay += beta * LD(AP + 24 * s, 1);
-        az += beta * LD(AP + 24 * s, 2);
-        px += beta * LD(P + 24 * s, 0); py += beta * LD(P + 24 * s, 1);
-        pz += beta * LD(P + 24 * s, 2);
-      }
-      STORE(AP, ax, ay, az)
-      STORE(P, px, py, pz)
-      pq += px * ax + py * ay + pz * az;
+        + precondition
+        + """
+    V zw = zero;
+    SHOWN
+    FOR_OWN(k, s) {
+      PRODUCT(Z, ZN)
+      PUT3(AZ, ax, ay, az)
+      zw += x * ax + y * ay + z * az;
     }
-    const float alpha = rz / group_sum(pq);
+    float curvature;
+"""
+        + (curvature or "curvature = group_sum(zw);")
+        + """
+    const float volume_ = gain_ * along;
+    curvature += volume_ * along;
+    float beta = before != 0.0f ? rz / before : 0.0f;
+    bent = curvature - beta * beta * bent;
+    if (!(bent > 0.0f)) {  // rounding has eaten it
+      beta = 0.0f;
+      bent = curvature;
+    }
+    const float alpha = rz / bent;
     before = rz;
     rr = zo = zero;
-    FOR_SLICES(s) {
-      float* X1 = X + 24 * s;
-      const float* P1 = P + 24 * s;
-      for (int c = 0; c < 3; ++c) ST(X1, c, LD(X1, c) + alpha * LD(P1, c));
-      LOAD(rx, ry, rz_, R)
-      rx -= alpha * LD(AP + 24 * s, 0); ry -= alpha * LD(AP + 24 * s, 1);
-      rz_ -= alpha * LD(AP + 24 * s, 2);
-      STORE(R, rx, ry, rz_)
+    NEXT_TURN
+    FOR_OWN(k, s) {
+      V ax = GET(AZ, 0), ay = GET(AZ, 1), az = GET(AZ, 2);
+      if (volume_ != 0.0f) {
+        ax += volume_ * LD(O + 24 * s, 0); ay += volume_ * LD(O + 24 * s, 1);
+        az += volume_ * LD(O + 24 * s, 2);
+      }
+      SELF(x, y, z, Z)
+      ax += beta * GET(AP, 0); ay += beta * GET(AP, 1); az += beta * GET(AP, 2);
+      x += beta * GET(P, 0); y += beta * GET(P, 1); z += beta * GET(P, 2);
+      PUT3(AP, ax, ay, az)
+      PUT3(P, x, y, z)
+      PUT3(X, GET(X, 0) + alpha * x, GET(X, 1) + alpha * y, GET(X, 2) + alpha * z)
+      const V rx = GET(R, 0) - alpha * ax, ry = GET(R, 1) - alpha * ay;
+      const V rz_ = GET(R, 2) - alpha * az;
+      PUT3(R, rx, ry, rz_)
       V zx, zy, zz;
       PRECONDITION(zx, zy, zz, rx, ry, rz_)
       rr += rx * zx + ry * zy + rz_ * zz;
 """
-    + scale
-    + """
-      STORE(Z, zx, zy, zz)
+        + scale
+        + """
+      if (!OWN) { STORE(Z, zx, zy, zz) }
       SHOW(zx, zy, zz)
-      if (bending) ST(ZN, s, WITH(N, zx, zy, zz));
+      if (bending) { SHOW_NORMAL(WITH(N, zx, zy, zz)) }
       if (bulk != 0.0f) zo += WITH(O, zx, zy, zz);
     }
     ++it;
+  }
+  FOR_OWN(k, s) {
+    for (int c = 0; c < 3; ++c) ST(X + 24 * s, c, GET(X, c));
   }
   if (tid != 0) return;
   float* out = status.data + 4 * world;
@@ -274,20 +235,36 @@ def body(setup: str, precondition: str, scale: str, quads: bool = False) -> str:
   if (!response)
     out[1] = out[2] > 0.0f ? sqrtf((residual > 0.0f ? residual : 0.0f) / out[2]) : 0.0f;
   out[3] = (norm < 1e30f && residual < 1e30f && norm >= 0.0f) ? 0.0f : 1.0f;
-"""
+""",
+        quads,
+      ),
+      not quads,
+    )
   )
 
 
-# With block Jacobi the residual's norm is all there is to sum.
+# With block Jacobi the residual's norm is all there is to sum: at no cost on the CPU, and on CUDA
+# together with the curvature, after one product more than it takes.
 _JACOBI = """
-    {
+    if (!SUMS_COST) {
       GROUP_SUMS(rr, zo, fresh, flux)
       rz = residual = fresh;
       along = flux;
+      if (!(residual > target) || it >= iterations) break;
     }
-    if (!(residual > target) || it >= iterations) break;
 """
-_SOLVE = body("", _JACOBI, "", quads=True)
+_JACOBI_CURVATURE = """
+    if (SUMS_COST) {
+      GROUP_SUMS3(rr, zo, zw, fresh, flux, bend_)
+      rz = residual = fresh;
+      along = flux;
+      curvature = bend_;
+      if (!(residual > target) || it >= iterations) break;
+    } else {
+      curvature = group_sum(zw);
+    }
+"""
+_SOLVE = body("", _JACOBI, "", _JACOBI_CURVATURE, quads=True)
 
 
 @wp.func_native(_SOLVE)
@@ -328,12 +305,13 @@ def _solve_world(
   z_: wp.array4d[float],
   zn_: wp.array3d[float],
   quad_: wp.array4d[float],
+  t_: wp.array4d[float],
   partial_: wp.array3d[float],
   status: wp.array2d[float],
 ): ...
 
 
-@wp.kernel(enable_backward=False, launch_bounds=simd.BLOCK)
+@wp.kernel(enable_backward=False, launch_bounds=(simd.BLOCK, 1))
 def _solve(
   nthread: int,
   nslice: int,
@@ -372,6 +350,7 @@ def _solve(
   z_out: wp.array4d[float],
   zn_out: wp.array3d[float],
   quad_out: wp.array4d[float],
+  t_out: wp.array4d[float],
   partial_out: wp.array3d[float],
   status_out: wp.array2d[float],
 ):
@@ -413,6 +392,7 @@ def _solve(
     z_out,
     zn_out,
     quad_out,
+    t_out,
     partial_out,
     status_out,
   )
@@ -586,7 +566,6 @@ def solve(s: Surface, d: State, stage: Stage):
     multilevel().solve(s, d, stage)
     return
   nthread = simd.group_size(s.device, s.nslice, d.nworld)
-  d.partial.zero_()
   wp.launch(
     _solve,
     dim=(d.nworld, nthread),
@@ -619,7 +598,7 @@ def solve(s: Surface, d: State, stage: Stage):
       d.areavec,
       d.normal,
     ],
-    outputs=[d.total, d.x, d.r, d.p, d.q, d.z, d.zn, d.quad, d.partial, d.status],
+    outputs=[d.total, d.x, d.r, d.p, d.q, d.z, d.zn, d.quad, d.t, d.partial, d.status],
     device=s.device,
   )
 

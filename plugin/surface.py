@@ -9,7 +9,7 @@ import warp as wp
 from scipy import sparse
 
 from . import config as configuration
-from . import hierarchy, levels
+from . import hierarchy, levels, simd
 from . import mesh as topology
 from .config import Config
 from .mesh import Mesh
@@ -59,7 +59,7 @@ def make(
       for the multilevel preconditioner if it pays; infinity makes them anyway
   """
   target = resolve_device(device, mesh.nvert)
-  finest = arrays(mesh, config, pinned)
+  finest = arrays(mesh, config, pinned, simd.patch(target, -(-mesh.nvert // LANES)))
   made = _surface(mesh, config, finest, target)
   if not np.isinf(scale) and not levels.pay(finest, scale):
     return made
@@ -83,9 +83,9 @@ def make(
   return made
 
 
-def arrays(mesh: Mesh, config: Config, pinned: np.ndarray) -> dict:
-  """Returns the arrays of `Surface` by name."""
-  vert = topology.node_order(mesh)
+def arrays(mesh: Mesh, config: Config, pinned: np.ndarray, patch: int = 0) -> dict:
+  """Returns the arrays of `Surface` by name; for `patch` see `mesh.node_order`."""
+  vert = topology.node_order(mesh, patch)
   node = np.empty(mesh.nvert, np.int64)
   node[vert[vert >= 0]] = np.flatnonzero(vert >= 0)
   return {

@@ -6,7 +6,7 @@ import dataclasses
 
 import warp as wp
 
-from .simd import MAX_BLOCKS
+from .simd import WORDS
 
 
 @dataclasses.dataclass
@@ -198,12 +198,12 @@ class State:
     p: PCG direction                                (nworld, nslice, 3, 8)
     q: A times direction                            (nworld, nslice, 3, 8)
     z: preconditioned residual                      (nworld, nslice, 3, 8)
-    zn: that along the normals                      (nworld, nslice, 8)
-    quad: z of a node side by side, see simd.py; the CPU's without levels (nworld, nslice, 12, 8)
+    zn: that along the normals, with turns on CUDA  (nworld, nslice, 16)
+    quad: z of a node side by side, see simd.py           (nworld, nslice, 12, 8)
     e: as z, between smoothing steps                (nworld, nslice, 3, 8)
     en: that along the normals                      (nworld, nslice, 8)
-    t: smoother's direction and residual            (nworld, nslice, 3, 8)
-    partial: what the blocks of a world exchange    (nworld, 8, MAX_BLOCKS)
+    t: A times z; smoother's direction and residual (nworld, nslice, 3, 8)
+    partial: what the blocks of a world exchange    (nworld, WORDS, 4)
     status: PCG iterations, relative residual, norm of the right-hand side, 1 if not finite
                                                     (nworld, 4)
     coarse: that of the coarser meshes, or None; shares `step`
@@ -270,12 +270,11 @@ def make_state(surface: Surface, nworld: int = 1, is_coarse: bool = False) -> St
     "hinge_rough": bend,
     "change": (),
     "total": (2,),
-    "zn": scalar if s.has_bending else (0, 8),
-    "quad": (s.nslice if not (cycles or s.device.is_cuda) else 0, 12, 8),
+    "zn": (s.nslice, 16) if s.has_bending else (0, 16),
+    "quad": (0 if is_coarse else s.nslice, 12, 8),
     "e": vector if cycles else (0, 3, 8),
     "en": scalar if cycles and s.has_bending else (0, 8),
-    "t": vector if cycles else (0, 3, 8),
-    "partial": (8, MAX_BLOCKS),
+    "partial": (WORDS, 4),
     "status": (4,),
   }
   arrays = {}

@@ -85,6 +85,19 @@ def test_node_order_holds_every_vertex_once_in_whole_slices(scenes):
   assert sorted(order[order >= 0]) == list(range(surface.nvert))
 
 
+def test_patches_hold_neighbours_together(scenes):
+  surface = mesh.build("organ", *scenes.sphere(5))
+  order = mesh.node_order(surface, 256)
+  assert sorted(order[order >= 0]) == list(range(surface.nvert))
+  patch = np.empty(surface.nvert, int)
+  patch[order[order >= 0]] = np.flatnonzero(order >= 0) // 256
+  edge = surface.elem[:, [0, 1]]
+  assert np.mean(patch[edge[:, 0]] != patch[edge[:, 1]]) < 0.12
+  # Too few nodes for two patches, and a number that is no multiple of one.
+  for nodes in (surface.nvert, 5 * surface.nvert, 104):
+    assert sorted(mesh.node_order(surface, nodes)[order >= 0]) == list(range(surface.nvert))
+
+
 def _plate(scenes, jitter, nu):
   points, elem = scenes.triangular(0.1, 0.1, 12, 14, jitter)
   surface = mesh.build("organ", points, elem)
