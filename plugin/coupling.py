@@ -33,8 +33,9 @@ from .simd import LANES
 _CHANGE, _COHERENT, _FASTER = 0.005, 0.7, 2.0
 
 # What a coupling reports, in `Workspace.flags`; see there.
-NFLAG = 8
-STALE, ASLEEP, MISSED_NODES, MISSED_ELEMENTS, PENDING, NEAR, CHANGED, ANSWERED = range(NFLAG)
+NFLAG = 9
+STALE, ASLEEP, MISSED_NODES, MISSED_ELEMENTS = range(4)
+PENDING, NEAR, CHANGED, ANSWERED, FORESEEN = range(4, NFLAG)
 
 
 @wp.func_native("""
@@ -448,6 +449,9 @@ class Launches:
     advance: steps the plugin state, on the CPU
     place: makes the model fit the plugin state, on the CPU, or None where there is nothing to do
     enter: fills the solver's state, on `side`
+    foresee: guesses what the next `gather` reads, on the CPU, or None where nobody wants it
+    enter_ahead: fills the solver's state with that, on `side`
+    look_only: looks at a solution that was begun so, on `side`
     look: looks at the solution, on `side`
     side: the device of these
   """
@@ -460,6 +464,9 @@ class Launches:
   place: Callable[[], None] | None = None
   enter: Callable[[], None] = lambda: None
   look: Callable[[], None] = lambda: None
+  foresee: Callable[[], None] | None = None
+  enter_ahead: Callable[[], None] = lambda: None
+  look_only: Callable[[], None] = lambda: None
   push: Callable[[], None] = lambda: None
   answer: Callable[[], None] = lambda: None
   side: Any = "cpu"

@@ -3,17 +3,23 @@
 The first number of the plugin state's tail is a stamp of the motion: 0 where the state was set from
 outside and has to be sent, n where the plugin state holds motion n, -n where motion n is on the
 device alone. A state that was saved with -n can be continued only by the device that still has it.
+
+The device begins a step as soon as the last one has ended, and works while MuJoCo looks for
+contacts and the user's program decides what to do. It takes for granted that what acts on the
+organ besides contacts stays; where that was wrong the solve is done again.
 """
 
 from __future__ import annotations
 
 import itertools
 import time
+from typing import Any
 
 import warp as wp
 
 from . import window_slots
-from .coupling import PENDING
+from .coupling import FORESEEN, PENDING
+from .window_nodes import HALT
 
 _stamps = itertools.count(time.time_ns() >> 10)  # never the same number twice
 
@@ -35,6 +41,12 @@ class Resident:
     self.tail = self.state[-window_slots.TAIL :]
     self.device = w.surface.device
     self.live = -1
+    # Recorded graphs: the guess, on the CPU; the solve with it, on the device; what is left then.
+    self.foresee: Any = None
+    self.begin_graph: Any = None
+    self.rest: list = []
+    self._begun = False
+    w.flags[FORESEEN] = 1
     self._end_step, self._look_again = end_step, look_again
     self._motion = (nodes.disp, nodes.velocity, nodes.last, nodes.before)
     self._staging = wp.zeros(
@@ -50,6 +62,7 @@ class Resident:
     stamp = int(self.tail[0])
     if abs(stamp) == self.live:
       return
+    self._begun = False
     if stamp < 0:
       raise RuntimeError(
         "this state was saved or copied while its motion was on the device (resident='true'); "
@@ -65,9 +78,25 @@ class Resident:
     self.tail[0] = self.live
 
   def step(self):
-    """Notes that a step was taken on the device alone."""
+    """Notes that a step was taken on the device alone, and begins the next one there.
+
+    Not if the last guess was wrong: what acts on the organ changes from step to step then.
+    """
     self.live = next(_stamps)
     self.tail[0] = -self.live
+    w = self.w
+    wp.capture_launch(self.foresee)
+    self._begun = bool(w.flags[FORESEEN]) and w.flags[PENDING] != HALT
+    if self._begun:
+      wp.capture_launch(self.begin_graph)
+      w.flags[PENDING] = w.views["inbox"].numpy()[3] = 0  # this ends the last step
+
+  def left_to_do(self) -> list:
+    """Returns the graphs of the solve, or of what is left of one that was begun with the truth."""
+    if self._begun and self.w.flags[FORESEEN]:
+      return self.rest
+    self._begun = False
+    return self.w.solve
 
   def look(self):
     """Repeats the search within a shorter reach while it finds more than there is room for."""

@@ -97,6 +97,12 @@ def launches(w, model: int, instance: int) -> Launches:
     receive()
     end_step()
 
+  def enter_ahead():
+    wp.copy(nodes.inbox, v["foreseen"])
+    end_step()
+    over_nodes(window_nodes.enter)
+    over_nodes(window_nodes.push_slots, nslot)
+
   def push():
     receive()
     nodes.rhs.zero_()
@@ -119,6 +125,9 @@ def launches(w, model: int, instance: int) -> Launches:
     place=lambda: over_slots(window_slots.place),
     enter=enter,
     look=look,
+    foresee=(lambda: over_slots(window_slots.foresee)) if w.resident else None,
+    enter_ahead=enter_ahead,
+    look_only=look_again,
     side=side,
   )
 
@@ -141,6 +150,7 @@ def _scratch(w, side: wp.Device) -> dict[str, wp.array]:
   boxes = {
     "inbox": window_nodes.inbox_size(nslot, nwindow),
     "outbox": window_nodes.outbox_size(nslot, nwindow, most),
+    "foreseen": window_nodes.inbox_size(nslot, nwindow),
   }
   return {
     "placed": _ints(np.full(nslot, -2)),
@@ -151,6 +161,7 @@ def _scratch(w, side: wp.Device) -> dict[str, wp.array]:
     "claim": _ints(np.full(nvert, -1)),
     "left": _ints(np.full(nslot, -1)),
     "lagged": _doubles(np.zeros(3 * nslot)),
+    "other": _doubles(np.zeros(3 * nslot)),
     "inertia": _doubles(np.zeros(nvert)),
     "flags": wp.array(w.flags, dtype=int, device="cpu", copy=False),
     "heaviest": wp.array(w.heaviest, dtype=wp.float64, device="cpu", copy=False),

@@ -14,6 +14,7 @@ from .coupling import (
   ANSWERED,
   ASLEEP,
   CHANGED,
+  FORESEEN,
   HEAVIER,
   MISSED_ELEMENTS,
   MISSED_NODES,
@@ -67,6 +68,8 @@ class Slots:
     left: node that a slot has given up in this step, -1    (nslot,)
     lagged: contact forces before the slots are given anew [N]  (3 nslot,)
     ext: external and lagged contact force [N]              (3 nslot,)
+    other: what acted on the slots besides contacts [N]     (3 nslot,)
+    foreseen: the inbox that the next step is expected to have, see `foresee`
     flags, heaviest: see `Workspace`                        (8,), (1,)
   """
 
@@ -114,6 +117,8 @@ class Slots:
   left: wp.array[int]
   lagged: wp.array[wp.float64]
   ext: wp.array[wp.float64]
+  other: wp.array[wp.float64]
+  foreseen: wp.array[wp.float64]
   flags: wp.array[int]
   heaviest: wp.array[wp.float64]
   inbox: wp.array[wp.float64]
@@ -255,6 +260,7 @@ _TRIANGLES = f"""
       // What acts on the slot besides its own weight acts on the node.
       const double f = s.qfrc_applied.data[adr + c] + (still ? 0.0 : s.qfrc_passive.data[adr + c])
         + s.frame.data[c] * x[0] + s.frame.data[3 + c] * x[1] + s.frame.data[6 + c] * x[2];
+      s.other.data[3 * k + c] = f;
       push[1 + c] = i < 0 ? f : f + fc[3 * k + c];
       s.ext.data[3 * k + c] = push[1 + c] + s.body_mass.data[body] * in[4 + c];
       pushes = pushes || push[1 + c] != 0.0;
@@ -268,6 +274,11 @@ _TRIANGLES = f"""
     }}
   }}
   s.flags.data[{STALE}] = stale;
+  const double* then = s.foreseen.data;
+  bool same = true;
+  for (int c = 0; c < 7; ++c) same = same && (c == 3 || in[c] == then[c]);
+  for (int k = 0; k < 4 * s.nslot; ++k) same = same && pushed[k] == then[pushed - in + k];
+  s.flags.data[{FORESEEN}] = same;
   // The geoms in the organ's frame, whether one is near the organ's bounds, and whether one that is
   // has moved too far since the organ fell asleep.
   bool near = bounds[3] <= bounds[0], stirs = near;
@@ -673,6 +684,25 @@ def _choose(s: Slots): ...
 def _place(s: Slots): ...
 
 
+@wp.func_native(
+  _STATE
+  + f"""
+  double* then = s.foreseen.data;
+  for (int c = 0; c < {HEAD} + 7 * s.nslot; ++c) then[c] = in[c];
+  then[3] = s.flags.data[{PENDING}];
+  then[9] = 0.0;
+  for (int k = 0; k < s.nslot; ++k) {{
+    double* push = then + {HEAD} + 7 * s.nslot + 4 * k;
+    const int i = node_of(k);
+    push[0] = i;
+    for (int c = 0; c < 3; ++c)
+      push[1 + c] = i < 0 ? s.other.data[3 * k + c] : s.other.data[3 * k + c] + fc[3 * k + c];
+  }}
+"""
+)
+def _foresee(s: Slots): ...
+
+
 @wp.kernel(enable_backward=False)
 def gather(slots: Slots):
   """Reads what acts on the slots and where the tools are; flags slots that the model lacks.
@@ -698,6 +728,12 @@ def leave(slots: Slots):
 def choose(slots: Slots):
   """Gives each window the nodes nearest to its geoms."""
   _choose(slots)
+
+
+@wp.kernel(enable_backward=False)
+def foresee(slots: Slots):
+  """Writes what `gather` will if the step and what acts on the slots besides contacts stay."""
+  _foresee(slots)
 
 
 @wp.kernel(enable_backward=False)

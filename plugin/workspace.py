@@ -62,7 +62,7 @@ class Workspace:
     computed: whether forces were computed for the step that ends
     flags: what the coupling reports: STALE (the model lacks slots), ASLEEP, MISSED_NODES,
       MISSED_ELEMENTS, PENDING (mode of the next commit), NEAR (a tool is near), CHANGED (contact
-      forces did) and ANSWERED (the organ responded)  (NFLAG,)
+      forces did), ANSWERED (the organ responded) and FORESEEN (what acts on it was)  (NFLAG,)
     policy: MuJoCo's sleep policy of the windows' bodies comes first
     counts: the number of vertices that MuJoCo sees of a windowed organ comes first
     status: iterations, relative residual, norm, failure  (4,)
@@ -130,9 +130,10 @@ class Workspace:
       return  # what `after` does was done with `before`
     if self.resident:
       self.resident.send()
-    _launch_all(self.solve)
-    if self.resident:
+      _launch_all(self.resident.left_to_do())
       self.resident.look()
+    else:
+      _launch_all(self.solve)
     wp.capture_launch(self.after)
     self.computed = True
 
@@ -311,6 +312,11 @@ def bind(w: Workspace, model: int, instance: int):
     w.end = _record(cpu, launches.end) if launches.end else None
     w.advance = _record(cpu, launches.advance)
     w.place = _record(cpu, launches.place) if launches.place else None
+    if w.resident:
+      w.resident.foresee = _record(cpu, launches.foresee)
+      ahead = _record_all((near, launches.enter_ahead), (device, solve))
+      w.resident.begin_graph = ahead[0][1]
+      w.resident.rest = _record_all((near, launches.look_only))
   w.model = model
   w.model_step = coupling.option_views(model)["timestep"].numpy().data
   w.time_step = float(m.opt.timestep)

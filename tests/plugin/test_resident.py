@@ -95,6 +95,37 @@ def test_resident_reset_and_set_state(device):
   assert organ.error is None
 
 
+def test_what_changes_between_steps_counts_at_once(device):
+  def run(resident):
+    m, d, organ = make(device, resident=resident)
+    forces = [drive(m, d, 60)]
+    body = m.body("window_12").id
+    for force, gravity, timestep in ((0.02, 0.0, 1.0), (0.0, -3.0, 1.0), (0.0, -3.0, 0.5)):
+      d.xfrc_applied[body, 2] = force
+      m.opt.gravity[2] = gravity
+      m.opt.timestep = 1e-3 * timestep
+      forces.append(drive(m, d, 15))
+    assert organ.error is None
+    return np.concatenate(forces), organ.xpos
+
+  (expected, shape), (forces, found) = run(False), run(True)
+  np.testing.assert_allclose(forces, expected, atol=1e-6 * np.abs(expected).max())
+  np.testing.assert_allclose(found, shape, atol=1e-8)
+
+
+def test_forward_between_steps_changes_nothing(device):
+  m, d, organ = make(device, resident=True)
+  expected = drive(m, d, 100)
+  m, d, organ = make(device, resident=True)
+  forces = []
+  for step in range(10):
+    forces.append(drive(m, d, 10))
+    for _ in range(step % 3):
+      mujoco.mj_forward(m, d)
+  np.testing.assert_array_equal(np.concatenate(forces), expected)
+  assert organ.error is None
+
+
 @pytest.mark.skipif(not wp.is_cuda_available(), reason="needs a CUDA device")
 def test_search_with_little_room_keeps_the_nearest(monkeypatch):
   m, d, _ = make("cuda:0", resident=True)
