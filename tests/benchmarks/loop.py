@@ -3,11 +3,12 @@
     python tests/benchmarks/loop.py --device cuda:0 --nodes 16384 65536 262144 -o results
 
 An octahedral sphere of radius 5 cm (E = 30 kPa, t = 2 mm, 0.1 kg, foundation 1e5 Pa/m, h = 1 ms),
-pinned below, is pressed 1.5 mm deep by a probe of 5 mm and slid over, solved to the tolerance
-given. On CUDA the motion stays on the device (`resident`). Bending is off unless `--bend 1`. The
-last columns are medians of what one step spends: MuJoCo itself, the CPU's side of the coupling,
-and the device's (search, solve and transfer); `rest_ms` is a step with the probe away and the organ
-asleep.
+pinned below, is pressed 1.5 mm deep by a probe of 5 mm, or as thick as `--tip` says, and slid
+over, solved to the tolerance given. On CUDA the motion stays on the device (`resident`). Bending is
+off unless `--bend 1`. The last columns are medians of what one step spends: MuJoCo itself, the
+CPU's side of the coupling, and waiting for the device (search, transfer and what is left of the
+solve, which a resident organ begins before MuJoCo looks for contacts); `rest_ms` is a step with the
+probe away and the organ asleep.
 """
 
 import argparse
@@ -24,13 +25,13 @@ import warp as wp
 from palpate import engine
 from palpate.models import grid
 
-RADIUS, TIP, H = 0.05, 0.0025, 1e-3
+RADIUS, H = 0.05, 1e-3
 
 
 def model(
-  nodes: int, device: str, tolerance: float, bend: float, slots: int, condim: int
+  nodes: int, device: str, tolerance: float, bend: float, slots: int, condim: int, tip: float
 ) -> mujoco.MjModel:
-  """Returns a sphere of about `nodes` nodes with a window under a probe."""
+  """Returns a sphere of about `nodes` nodes with a window under a probe of radius `tip`."""
   point, elem = grid.octasphere(max(2, round(np.sqrt((nodes - 2) / 4))))
   # In random order: MuJoCo's compiler hashes edges, and neighbours with near numbers collide.
   order = np.random.default_rng(0).permutation(len(point))
@@ -63,8 +64,8 @@ def model(
     mass="{slots * 0.1 / len(point)}" radius="0.0002"><edge damping="1e-9"/>
     <contact selfcollide="none" condim="{condim}" solref="0.004 1"
       solimp="0.99 0.999 0.001"/></flexcomp>
-  <body pos="0 0 {RADIUS + TIP + 0.0002}"><joint name="z" type="slide" axis="0 0 1"/>
-    <joint name="x" type="slide" axis="1 0 0"/><geom size="{TIP}" mass="0.05" condim="1"/></body>
+  <body pos="0 0 {RADIUS + tip + 0.0002}"><joint name="z" type="slide" axis="0 0 1"/>
+    <joint name="x" type="slide" axis="1 0 0"/><geom size="{tip}" mass="0.05" condim="1"/></body>
 </worldbody>
 <actuator><position joint="z" kp="500" kv="10"/><position joint="x" kp="500" kv="10"/></actuator>
 </mujoco>""")
@@ -72,11 +73,18 @@ def model(
 
 
 def measure(
-  nodes: int, device: str, tolerance: float, bend: float, slots: int, condim: int, steps: int
+  nodes: int,
+  device: str,
+  tolerance: float,
+  bend: float,
+  slots: int,
+  condim: int,
+  tip: float,
+  steps: int,
 ) -> dict:
   """Returns medians over the last half of `steps` steps, in ms."""
   start = time.perf_counter()
-  m = model(nodes, device, tolerance, bend, slots, condim)
+  m = model(nodes, device, tolerance, bend, slots, condim, tip)
   d = mujoco.MjData(m)
   made = time.perf_counter() - start
   organ = palpate.Organ(m, d, "organ")
@@ -101,6 +109,7 @@ def measure(
     "tolerance": tolerance,
     "slots": w.organ.windows.nslot,
     "condim": condim,
+    "tip_m": tip,
     "contacts": int(np.median(contacts[steps // 2 :])),
     "iterations": float(np.mean(iterations[steps // 2 :])),
     "force_N": float(d.qfrc_constraint[m.nv - 2]),
@@ -132,7 +141,8 @@ def timed(w, spent: dict):
     return call
 
   original = wp.capture_launch
-  device_graphs = {id(graph) for _, graph in w.solve}
+  rest = w.resident.rest if w.resident else []
+  device_graphs = {id(graph) for _, graph in [*w.solve, *w.respond, *rest]}
 
   def capture_launch(graph, *args):
     if id(graph) not in device_graphs:
@@ -172,12 +182,14 @@ def main():
   parser.add_argument("--bend", type=float, default=0.0)
   parser.add_argument("--slots", type=int, default=100)
   parser.add_argument("--condim", type=int, nargs="+", default=[3], help="1 is without friction")
+  parser.add_argument("--tip", type=float, nargs="+", default=[0.0025], help="radius [m]")
   parser.add_argument("--steps", type=int, default=400)
   parser.add_argument("-o", "--output", type=pathlib.Path)
   args = parser.parse_args()
   rows = []
-  for nodes, condim in itertools.product(args.nodes, args.condim):
-    row = measure(nodes, args.device, args.tolerance, args.bend, args.slots, condim, args.steps)
+  for nodes, tip, condim in itertools.product(args.nodes, args.tip, args.condim):
+    scene = (args.tolerance, args.bend, args.slots, condim, tip)
+    row = measure(nodes, args.device, *scene, args.steps)
     rows.append(row)
     print(json.dumps({k: round(v, 5) if isinstance(v, float) else v for k, v in row.items()}))
   if args.output:
