@@ -77,13 +77,19 @@ class Resident:
     self.live = next(_stamps)
     self.tail[0] = self.live
 
-  def step(self):
+  def step(self, computed: bool):
     """Notes that a step was taken on the device alone, and begins the next one there.
 
     Not if the last guess was wrong: what acts on the organ changes from step to step then.
+
+    Args:
+      computed: whether forces were computed in this step, and so the device was waited for
     """
     self.live = next(_stamps)
     self.tail[0] = -self.live
+    self._begun = False
+    if not computed:
+      return
     w = self.w
     wp.capture_launch(self.foresee)
     self._begun = bool(w.flags[FORESEEN]) and w.flags[PENDING] != HALT

@@ -165,7 +165,7 @@ class Workspace:
       wp.capture_launch(self.end)
     wp.capture_launch(self.advance)
     if self.resident:
-      self.resident.step()
+      self.resident.step(computed)
 
   def _answer(self):
     """Ends the step with the organ's own response to the change of the contact forces."""
