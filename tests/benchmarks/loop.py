@@ -1,6 +1,7 @@
 """Times the whole loop, mj_step with a probe in contact with a windowed organ, and where it goes.
 
     python tests/benchmarks/loop.py --device cuda:0 --nodes 16384 65536 262144 -o results
+    python tests/benchmarks/loop.py --table results
 
 An octahedral sphere of radius 5 cm (E = 30 kPa, t = 2 mm, 0.1 kg, foundation 1e5 Pa/m, h = 1 ms),
 pinned below, is pressed 1.5 mm deep by a probe of 5 mm, or as thick as `--tip` says, and slid
@@ -8,7 +9,8 @@ over, solved to the tolerance given. On CUDA the motion stays on the device (`re
 off unless `--bend 1`. The last columns are medians of what one step spends: MuJoCo itself, the
 CPU's side of the coupling, and waiting for the device (search, transfer and what is left of the
 solve, which a resident organ begins before MuJoCo looks for contacts); `rest_ms` is a step with the
-probe away and the organ asleep.
+probe away and the organ asleep. The parts of the device's work are timed by themselves after the
+run, in the state of its last step. `--table` writes what they cost a node to loop.md.
 """
 
 import argparse
@@ -22,7 +24,8 @@ import mujoco
 import numpy as np
 import palpate
 import warp as wp
-from palpate import engine
+from palpate import elastic, engine, solver, window, workspace
+from palpate.elastic import Stage
 from palpate.models import grid
 
 RADIUS, H = 0.05, 1e-3
@@ -122,6 +125,7 @@ def measure(
     "rate_Hz": 1e3 / total,
     "make_s": made,
   }
+  out |= parts(w)
   out["rest_ms"] = rest(m, d, organ)
   assert organ.error is None, organ.error
   return out
@@ -158,6 +162,69 @@ def timed(w, spent: dict):
   w.step = wrap(w.step, "cpu")
 
 
+def parts(w) -> dict:
+  """Returns what each part of a step's work on the organ's device takes, medians in ms."""
+  s, d = w.surface, w.state
+  workspace.sync(w)
+  state = w.views["plugin_state"].numpy()
+  kept = state.copy()
+  solving = replay(
+    s.device,
+    assemble=lambda: assemble(s, d),
+    solve=lambda: solver.solve(s, d, Stage.FIRST),
+    step=lambda: solver.step(s, d),
+  )
+  launches = window.launches(w, w.model, 0)
+  side = wp.get_device(launches.side)
+  boxes = [(wp.clone(w.views[name], device=side), w.views[name]) for name in ("inbox", "outbox")]
+  w.views["inbox"].numpy()[3] = 1.0  # there is a step to end
+  around = replay(
+    side,
+    transfer=lambda: (wp.copy(*boxes[0]), wp.copy(*reversed(boxes[1]))),
+    enter=launches.enter,
+    search=launches.look,
+    end=launches.end or (lambda: None),
+  )
+  state[:] = kept
+  workspace.bind(w, w.model, 0)
+  rest_of_step = solving["step"] - solving["assemble"] - solving["solve"]
+  return {
+    "search_ms": around["search"],
+    "transfer_ms": around["transfer"] if side.is_cuda else 0.0,
+    "assemble_ms": solving["assemble"],
+    "solve_ms": solving["solve"],
+    "integrate_ms": around["enter"] + around["end"] + max(0.0, rest_of_step),
+  }
+
+
+def assemble(s, d):
+  """Writes the matrices of a step."""
+  elastic.assemble(s, d, Stage.FIRST)
+  if s.levels is not None:
+    solver.multilevel().assemble(s, d)
+
+
+def replay(device, **works) -> dict[str, float]:
+  """Returns the median times of recorded graphs of `works`, in turn, in ms."""
+  graphs, times = {}, {name: [] for name in works}
+  for name, work in works.items():
+    with wp.ScopedDevice(device), wp.ScopedCapture(device=device) as capture:
+      work()
+    graphs[name] = capture.graph
+  for name in 20 * list(works):
+    if device.is_cuda:
+      start, end = (wp.Event(device, enable_timing=True) for _ in range(2))
+      wp.record_event(start)
+      wp.capture_launch(graphs[name])
+      wp.record_event(end)
+      times[name].append(wp.get_event_elapsed_time(start, end))
+    else:
+      before = time.perf_counter()
+      wp.capture_launch(graphs[name])
+      times[name].append(1e3 * (time.perf_counter() - before))
+  return {name: float(np.median(each)) for name, each in times.items()}
+
+
 def rest(m, d, organ) -> float:
   """Returns a step's time in ms with the probe away and the organ asleep; NaN if it is awake."""
   d.ctrl[:] = 0.08, 0.0
@@ -173,6 +240,47 @@ def rest(m, d, organ) -> float:
   return 1e3 * float(np.median(times)) if organ.asleep else float("nan")
 
 
+def table(results: pathlib.Path) -> str:
+  """Returns the page of the results, microseconds a step and nanoseconds a node."""
+  lines = [
+    "# What a step costs, and where the time goes",
+    "",
+    "Microseconds; device: its work by itself, which on CUDA goes on beside MuJoCo's. Per node:",
+    "the device's work in ns. From loop_cpu.csv and loop_cuda.csv; `tests/benchmarks/loop.py` says",
+    "how they were measured.",
+    "",
+    f"| device | nodes | condim | contacts | iterations | mj_step | rate | {' | '.join(_COLUMNS)} "
+    "| device per node | asleep |",
+    "|" + "---|" * (9 + len(_COLUMNS)),
+  ]
+  for path in sorted(results.glob("loop_c*.csv")):
+    with open(path, newline="") as file:
+      for row in csv.DictReader(file):
+        cost = [1e3 * float(row[f"{name}_ms"]) for name in _COLUMNS.values()]
+        own = sum(cost[2:]) * 1e3 / float(row["nodes"])
+        cells = [row["device"], row["nodes"], row["condim"], row["contacts"]]
+        cells += [f"{float(row['iterations']):.0f}", _digits(1e3 * float(row["step_ms"]))]
+        cells += [f"{float(row['rate_Hz']):.0f} Hz", *map(_digits, cost), f"{own:.1f} ns"]
+        lines.append(f"| {' | '.join([*cells, _digits(1e3 * float(row['rest_ms']))])} |")
+  return "\n".join(lines) + "\n"
+
+
+# Columns of the table: the whole step's first, then the parts of the device's work.
+_COLUMNS = {
+  "MuJoCo": "mujoco",
+  "coupling": "coupling",
+  "search": "search",
+  "transfer": "transfer",
+  "assemble": "assemble",
+  "solve": "solve",
+  "integrate": "integrate",
+}
+
+
+def _digits(value: float) -> str:
+  return f"{value:.3g}" if value < 1000 else f"{value:.0f}"
+
+
 def main():
   """Runs the benchmark."""
   parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -185,7 +293,11 @@ def main():
   parser.add_argument("--tip", type=float, nargs="+", default=[0.0025], help="radius [m]")
   parser.add_argument("--steps", type=int, default=400)
   parser.add_argument("-o", "--output", type=pathlib.Path)
+  parser.add_argument("--table", type=pathlib.Path, metavar="DIR", help="write DIR/loop.md only")
   args = parser.parse_args()
+  if args.table:
+    (args.table / "loop.md").write_text(table(args.table))
+    return
   rows = []
   for nodes, tip, condim in itertools.product(args.nodes, args.tip, args.condim):
     scene = (args.tolerance, args.bend, args.slots, condim, tip)
