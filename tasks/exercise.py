@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
 import pathlib
 import sys
 from typing import Any
@@ -160,15 +159,9 @@ class _Film:
 
 def _keyboard(env, seed: int, info, watch):
   """Runs an episode with the keyboard in MuJoCo's viewer, in real time."""
-  if sys.platform.startswith("linux") and not (
-    os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-  ):
-    raise CommandError("no display for the keyboard's window; use another performer", code=1)
   import time
 
-  import mujoco.viewer
-
-  from . import episode
+  from . import episode, viewer
 
   names = env.task.components
   pressed: dict[str, tuple[float, float]] = {}  # component -> sign, until
@@ -185,10 +178,12 @@ def _keyboard(env, seed: int, info, watch):
   # The episode starts with the first step; the window needs the model that it will have.
   env.task.random = np.random.RandomState(seed)
   env.reset()
-  physics = env.physics
-  with mujoco.viewer.launch_passive(
-    physics.model.ptr, physics.data.ptr, key_callback=key, show_left_ui=False, show_right_ui=False
-  ) as viewer:
+  try:
+    window = viewer.launch(env.physics, key)
+  except RuntimeError as error:
+    raise CommandError(f"{error}; use another performer", code=1) from None
+  with window:
+    look = window.opt.flags.copy(), window.user_scn.flags.copy()
     due = [time.monotonic()]
 
     def act(_) -> np.ndarray:
@@ -200,9 +195,11 @@ def _keyboard(env, seed: int, info, watch):
       return np.array(action)
 
     def step(env) -> bool:
-      viewer.sync()
+      with window.lock():  # most letters are switches of the viewer too
+        window.opt.flags[:], window.user_scn.flags[:] = look
+      window.sync()
       due[0] += env.control_timestep()
       time.sleep(max(0.0, due[0] - time.monotonic()))
-      return watch(env) or not viewer.is_running()
+      return watch(env) or not window.is_running()
 
     return episode.run(env, act, seed, info, watch=step)

@@ -10,14 +10,12 @@ last step has `metrics` as well: the known skill metrics of the episode [SI] by 
 """
 
 import math
-import os
-import sys
 from typing import Any
 
 import gymnasium
 import numpy as np
 
-from . import suite
+from . import suite, viewer
 from .recorder import Recorder
 from .scenes import CAMERA
 
@@ -126,16 +124,13 @@ class Exercise(gymnasium.Env):
     return self._physics.render(*self._size, camera_id=camera)
 
   def _show(self) -> None:
-    if sys.platform.startswith("linux") and not (
-      os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-    ):
-      raise RuntimeError("no display for render_mode 'human', use 'rgb_array'")
     if self._shown is not self._physics.data.ptr:  # another organ is another model
       self._close_viewer()
-      import mujoco.viewer
-
+      try:
+        self._viewer = viewer.launch(self._physics)
+      except RuntimeError as error:
+        raise RuntimeError(f"render_mode 'human': {error}; use 'rgb_array'") from None
       self._shown = self._physics.data.ptr
-      self._viewer = mujoco.viewer.launch_passive(self._physics.model.ptr, self._shown)
     self._viewer.sync()
 
   def _close_viewer(self) -> None:

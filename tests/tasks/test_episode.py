@@ -1,8 +1,11 @@
 """Recording, replay to the bit, evaluation, and the commands on top."""
 
+import contextlib
 import json
 import sys
+import types
 
+import mujoco
 import numpy as np
 import pytest
 from palpate import cli, tasks
@@ -150,3 +153,62 @@ def test_references_are_those_of_the_tasks():
     assert reference is not None, name
     assert reference["task"] == name and reference["n"] >= 5
     assert {"seed", "palpate", "mujoco"} < set(reference)
+
+
+class Window:
+  """Stands in for MuJoCo's passive viewer: presses a key at every second picture."""
+
+  def __init__(self, model, data, key_callback, **panels):
+    self.key, self.pictures = key_callback, 0
+    self.cam = types.SimpleNamespace(type=None, fixedcamid=-1)
+    self.opt = types.SimpleNamespace(flags=np.zeros(4, np.uint8))
+    self.user_scn = types.SimpleNamespace(flags=np.ones(4, np.uint8))
+    self.model, self.panels = model, panels
+
+  def __enter__(self):
+    return self
+
+  def __exit__(self, *_):
+    pass
+
+  lock = contextlib.nullcontext
+
+  def sync(self):
+    assert not self.opt.flags.any() and self.user_scn.flags.all()
+    self.pictures += 1
+    if self.pictures % 2:
+      self.key(ord("S"))
+      self.user_scn.flags[1], self.opt.flags[2] = False, True  # the viewer's own switches
+
+  def is_running(self):
+    return self.pictures < 25
+
+
+def test_keyboard_moves_the_tool_in_front_of_the_laparoscope(tmp_path, monkeypatch):
+  windows = []
+
+  def launch(*words, **keys):
+    windows.append(Window(*words, **keys))
+    return windows[-1]
+
+  monkeypatch.setattr("mujoco.viewer.launch_passive", launch)
+  monkeypatch.setenv("DISPLAY", ":0")
+  words = ["exercise", "touch/easy", "--performer", "keyboard", "--no-report"]
+  assert cli.main([*words, "--out", str(tmp_path)]) == 0
+  (window,) = windows
+  assert window.cam.type == mujoco.mjtCamera.mjCAMERA_FIXED
+  assert window.cam.fixedcamid == window.model.camera("laparoscope").id
+  assert not any(window.panels.values())
+  recording = Recording.load(tmp_path / "recording.npz")
+  assert recording.info["performer"] == "keyboard" and len(recording.time) > 20
+  moved = recording.arrays["action"]
+  assert moved[2:, :].max() == 1.0  # inserted, by the key that was held
+
+
+def test_keyboard_says_that_there_is_no_display(tmp_path, monkeypatch, capsys):
+  if not sys.platform.startswith("linux"):
+    pytest.skip("displays are asked for on Linux")
+  monkeypatch.delenv("DISPLAY", raising=False)
+  monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+  assert cli.main(["exercise", "touch/easy", "--performer", "keyboard", "--out", str(tmp_path)])
+  assert "no display to open a window on; use another performer" in capsys.readouterr().err
