@@ -8,8 +8,10 @@ from .hierarchy import Coarse
 from .simd import LANES
 
 # Condition number from which cycles take less time than the iterations of block Jacobi that they
-# save, where there is bending (benchmarks/solver.py, benchmarks/preconditioner.py).
-THRESHOLD = 300.0
+# save, where there is bending. In warm contact steps with cycles take 1.4 times as long at 65, 1.0
+# at 75, 0.9 at 110 and 0.8 at 220 on the CPU (2562 to 16,386 nodes, medians of CPU time); a cycle
+# takes as long as 9 iterations there and as 15 on an H200 (benchmarks/solver.py).
+_THRESHOLD = {"cpu": 100.0, "cuda": 300.0}
 # Interval of the smoother, as greatest eigenvalue of D^-1 A and its ratio to the lower end, by
 # degree. A membrane's is 2.3 on good meshes, at most 3 (three corners an element), and bending
 # raises it to 3.4; the smoother stays a contraction up to the sum of both ends.
@@ -76,7 +78,12 @@ def stiffness(part: dict) -> tuple[float, float]:
   return float(total.sum() / 3 / real), float(part["bend_diag"].sum() / real)
 
 
-def pay(part: dict, scale: float) -> bool:
+def threshold(device) -> float:
+  """Returns the condition number from which cycles pay on a Warp device."""
+  return _THRESHOLD["cuda" if device.is_cuda else "cpu"]
+
+
+def pay(part: dict, scale: float, threshold: float) -> bool:
   """Returns whether cycles take less time than block Jacobi at the time step of `scale`.
 
   Not on a membrane: contact moves it where it is touched, and block Jacobi takes at most ten times
@@ -86,9 +93,10 @@ def pay(part: dict, scale: float) -> bool:
   Args:
     part: arrays of the mesh, see `surface.arrays`
     scale: (h^2 + h damping) over the mean mass of a node [s^2/kg]
+    threshold: condition number from which they do
   """
   membrane, bend = stiffness(part)
-  return bend > _BENDING * membrane and scale * (membrane + bend) >= THRESHOLD
+  return bend > _BENDING * membrane and scale * (membrane + bend) >= threshold
 
 
 def rates(parts: list[dict]) -> np.ndarray:

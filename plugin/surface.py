@@ -61,7 +61,8 @@ def make(
   target = resolve_device(device, mesh.nvert)
   finest = arrays(mesh, config, pinned, simd.patch(target, -(-mesh.nvert // LANES)))
   made = _surface(mesh, config, finest, target)
-  if not np.isinf(scale) and not levels.pay(finest, scale):
+  threshold = levels.threshold(target)
+  if not np.isinf(scale) and not levels.pay(finest, scale, threshold):
     return made
   coarse = hierarchy.build(mesh, COARSEST)
   if not coarse:
@@ -76,7 +77,7 @@ def make(
   made.levels = Levels(
     nlevel=len(coarse),
     nodes=int((~pinned).sum()),
-    threshold=levels.THRESHOLD,
+    threshold=threshold,
     surface=_surface(mesh, config, levels.join(parts[1:]), target),
     **put,
   )

@@ -123,7 +123,7 @@ def measure(device: str, nodes: int, tolerance: list[float], bend: float, args) 
   made = time.perf_counter() - start
   coarse = s.levels
   condition = float(d.step.numpy()[0, 1] / (MASS / s.nvert) * coarse.rate.numpy()[0, 0])
-  auto = "multilevel" if bend and condition >= levels.THRESHOLD else "jacobi"
+  auto = "multilevel" if bend and condition >= levels.threshold(s.device) else "jacobi"
   coarse.threshold = PRECONDITIONERS["multilevel"]
   press(shape, s, d, 20)
   rows = []
