@@ -8,6 +8,7 @@ import palpate
 import palpate.models
 import pytest
 import warp as wp
+from palpate import engine
 from windowed import drive, scene
 
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
@@ -111,6 +112,26 @@ def test_what_changes_between_steps_counts_at_once(device):
   (expected, shape), (forces, found) = run(False), run(True)
   np.testing.assert_allclose(forces, expected, atol=1e-6 * np.abs(expected).max())
   np.testing.assert_allclose(found, shape, atol=1e-8)
+
+
+def test_steps_are_begun_ahead_unless_what_acts_changes(device, monkeypatch):
+  m, d, _ = make(device, resident=True)
+  resident = engine.find(d._address, 0).resident
+  original, left = resident.left_to_do, []
+
+  def left_to_do():
+    left.append(original() is resident.rest)
+    return original()
+
+  monkeypatch.setattr(resident, "left_to_do", left_to_do)
+  drive(m, d, 100)
+  assert sum(left) >= 97  # all but the first ones
+  left.clear()
+  body = m.body("window_12").id
+  for step in range(20):  # a force that never is what it was
+    d.xfrc_applied[body, 2] = 1e-3 * step
+    drive(m, d, 1)
+  assert sum(left) <= 1
 
 
 def test_forward_between_steps_changes_nothing(device):
