@@ -7,6 +7,7 @@ model is compiled they become its error message, while it runs a MuJoCo warning 
 from __future__ import annotations
 
 import _thread
+import atexit
 import ctypes as C
 import functools
 import itertools
@@ -238,12 +239,19 @@ def register() -> int:
   if slot < 0:
     raise ImportError(f"palpate: MuJoCo did not accept the plugin {NAME!r} (slot {slot})")
   _keep.append((plugin, attributes))
+  atexit.register(_let_go, slot)
   if (
     threading.current_thread() is threading.main_thread()
     and signal.getsignal(signal.SIGINT) is signal.default_int_handler
   ):
     signal.signal(signal.SIGINT, _on_interrupt)
   return slot
+
+
+def _let_go(slot: int):
+  """Lets mjData that outlives Python's modules be freed without calling back into them."""
+  registered = _Plugin.from_address(mjstruct.library().mjp_getPluginAtSlot(slot))
+  registered.destroy = type(registered.destroy)()
 
 
 _keep: list = []  # MuJoCo keeps pointers into these

@@ -79,6 +79,8 @@ def library() -> C.CDLL:
   lib.mju_warning.argtypes = [C.c_char_p, C.c_char_p]
   lib.mjp_registerPlugin.argtypes = [C.c_void_p]
   lib.mjp_defaultPlugin.argtypes = [C.c_void_p]
+  lib.mjp_getPluginAtSlot.restype = C.c_void_p
+  lib.mjp_getPluginAtSlot.argtypes = [C.c_int]
   return lib
 
 

@@ -722,3 +722,21 @@ def test_ctrl_c_ends_a_loop_of_steps(tmp_path):
   )
   out = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False)
   assert out.stdout.strip().endswith("interrupted None"), out.stdout + out.stderr
+
+
+def test_data_that_outlives_the_modules_is_freed_quietly(scenes):
+  # In a cycle that only the interpreter's last collection finds.
+  code = f"""
+import gc, sys, mujoco, palpate
+gc.disable()
+class Holder: pass
+holder = Holder()
+holder.model = mujoco.MjModel.from_xml_string({scenes.press(subdivisions=1)!r})
+holder.data = mujoco.MjData(holder.model)
+mujoco.mj_step(holder.model, holder.data)
+holder.me = sys.modules["kept by nobody"] = holder
+print("stepped")
+"""
+  done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+  assert (done.returncode, done.stdout.strip()) == (0, "stepped"), done.stderr
+  assert "Exception" not in done.stderr and "Error" not in done.stderr
