@@ -74,13 +74,19 @@ def table(rows: Iterable[tuple[str, str]]) -> str:
   return "\n".join(f"{name:<{left}}  {value:>{right}}" for name, value in rows)
 
 
+def has_display() -> bool:
+  """Returns whether a window can be opened, as far as the environment tells."""
+  if not sys.platform.startswith("linux"):
+    return True
+  return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
 def prepare_gl():
   """Chooses a way to render without a screen, unless MUJOCO_GL is set or there is a screen.
 
   MuJoCo reads the variable once, when it is imported.
   """
-  screen = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-  if "MUJOCO_GL" in os.environ or screen or not sys.platform.startswith("linux"):
+  if "MUJOCO_GL" in os.environ or has_display():
     return
   for backend, library in (("egl", "EGL"), ("osmesa", "OSMesa")):
     if ctypes.util.find_library(library):

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import os
-import sys
 from typing import Any
 
 from . import register
-from .console import CommandError
+from .console import CommandError, has_display
 
 
 def add_arguments(parser: argparse.ArgumentParser):
@@ -24,9 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser):
 
 def main(args: argparse.Namespace) -> int:
   """Runs the job and returns its exit code."""
-  if sys.platform.startswith("linux") and not (
-    os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-  ):
+  if not has_display():
     raise CommandError("no display to open a window on; `palpate render` makes pictures", code=1)
   register()
   from . import scenes

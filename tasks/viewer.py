@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import os
-import sys
 from collections.abc import Callable
 from typing import Any
+
+from palpate.console import has_display
 
 from .scenes import CAMERA
 
@@ -20,9 +20,7 @@ def launch(physics, key: Callable[[int], None] | None = None) -> Any:
   Raises:
     RuntimeError: there is no display.
   """
-  if sys.platform.startswith("linux") and not (
-    os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-  ):
+  if not has_display():
     raise RuntimeError("no display to open a window on")
   import mujoco.viewer  # loads the window system
 
