@@ -77,12 +77,15 @@ def launches(w, model: int, instance: int) -> Launches:
     over_nodes(window_nodes.commit)
     over_nodes(window_nodes.move_slots, nslot)
 
-  def enter():
-    receive()
+  def begin():
     if w.resident:
       end_step()
     over_nodes(window_nodes.enter)
     over_nodes(window_nodes.push_slots, nslot)
+
+  def enter():
+    receive()
+    begin()
 
   def look():
     over_nodes(window_nodes.search)
@@ -99,9 +102,7 @@ def launches(w, model: int, instance: int) -> Launches:
 
   def enter_ahead():
     wp.copy(nodes.inbox, v["foreseen"])
-    end_step()
-    over_nodes(window_nodes.enter)
-    over_nodes(window_nodes.push_slots, nslot)
+    begin()
 
   def push():
     receive()
