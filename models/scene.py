@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 import mujoco
 import numpy as np
-from palpate import author
+from palpate import windows as author
 
 from . import catalog, quality, shapes, trocar
 from .catalog import DEFAULT, GRIDS, RESOLUTIONS, Entry, Port

@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import os as _os
 import sys as _sys
-from importlib.util import find_spec as _find_spec
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-  from .author import add_windows
   from .organ import Organ
+  from .windows import add_windows
 
 __all__ = ["Organ", "__version__", "add_windows", "register"]
 __version__ = "0.1.0"
@@ -25,13 +24,15 @@ def register() -> int:
   `import palpate` does it, except in the `palpate` command, whose help needs neither MuJoCo nor
   Warp. From here on Warp speaks of warnings and errors only; `warp.config.log_level` changes it.
   """
-  from . import author, engine, organ, quiet
+  from . import organ, windows
+  from .engine import plugin
+  from .tissue import quiet
 
   if "Organ" not in globals():
     globals()["Organ"] = organ.Organ
-    globals()["add_windows"] = author.add_windows
+    globals()["add_windows"] = windows.add_windows
     quiet.lower_log_level()
-  return engine.register()
+  return plugin.register()
 
 
 def _is_command() -> bool:
@@ -45,7 +46,3 @@ def _is_command() -> bool:
 
 if not _is_command():
   register()
-  if _find_spec("gymnasium"):
-    from palpate.tasks import registry as _registry
-
-    _registry.register()

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import mujoco
 import numpy as np
+from palpate.engine.coupling import MISSED_ELEMENTS, MISSED_NODES
+from palpate.tissue.config import Config
 
-from . import energy, engine, workspace
-from . import mesh as topology
-from .config import Config
-from .coupling import MISSED_ELEMENTS, MISSED_NODES
+from .engine import plugin as engine
+from .engine import workspace
+from .tissue import energy
+from .tissue import mesh as topology
 
 
 class Organ:

@@ -16,6 +16,6 @@ __all__ = ["ALL_TASKS", "BENCHMARKING", "EASY", "HARD", "TASKS_BY_DOMAIN", "load
 def __getattr__(name: str) -> Any:
   if name not in __all__:
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-  from . import suite  # imports dm_control, which the metrics do not need
+  from . import suite
 
   return getattr(suite, name)

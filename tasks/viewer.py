@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from palpate.console import has_display
+from palpate.app.console import has_display
 
 from .scenes import CAMERA
 

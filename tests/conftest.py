@@ -12,6 +12,8 @@ if sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
     if ctypes.util.find_library(library):
       os.environ.setdefault("MUJOCO_GL", backend)
 
+from scenes import Scenes, needs_cuda
+
 
 def pytest_collection_modifyitems(config, items):
   """Leaves out the long forms unless `-m` speaks of them."""
@@ -20,3 +22,13 @@ def pytest_collection_modifyitems(config, items):
   for item in items:
     if item.get_closest_marker("slow"):
       item.add_marker(pytest.mark.skip(reason="long form: run with -m slow"))
+
+
+@pytest.fixture(scope="session")
+def scenes() -> type[Scenes]:
+  return Scenes
+
+
+@pytest.fixture(params=["cpu", pytest.param("cuda:0", marks=needs_cuda)])
+def device(request) -> str:
+  return request.param

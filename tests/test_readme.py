@@ -10,8 +10,8 @@ import tomllib
 import zipfile
 
 import pytest
-from palpate import cli
-from palpate.config import KEYS, Config
+from palpate.app import cli
+from palpate.tissue.config import KEYS, Config
 
 ROOT = pathlib.Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")

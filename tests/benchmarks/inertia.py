@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 import palpate
 
-PRESS = pathlib.Path(__file__).parents[1] / "plugin" / "data" / "press_explicit_20us.py"
+PRESS = pathlib.Path(__file__).parents[1] / "reference" / "press_explicit_20us.py"
 FACTORS = (1e-3, 0.25, 0.5, 1.0, 2.0, 4.0)
 
 

@@ -16,8 +16,8 @@ import mujoco
 import numpy as np
 import palpate
 from loop import model
-from palpate import engine
-from palpate.surface import from_slices
+from palpate.engine import plugin as engine
+from palpate.tissue.shape import from_slices
 from scipy import sparse
 
 RINGS = (1, 2, 4, 8, 16, 32)

@@ -24,9 +24,11 @@ import mujoco
 import numpy as np
 import palpate
 import warp as wp
-from palpate import elastic, engine, solver, window, workspace
-from palpate.elastic import Stage
+from palpate.engine import plugin as engine
+from palpate.engine import window, workspace
 from palpate.models import grid
+from palpate.tissue import elastic, solver
+from palpate.tissue.elastic import Stage
 
 RADIUS, H = 0.05, 1e-3
 

@@ -15,8 +15,9 @@ import pathlib
 import numpy as np
 import palpate
 import trimesh
-from palpate import elastic, hierarchy, mesh, solver, surface, types
 from palpate import models as _models
+from palpate.tissue import elastic, hierarchy, mesh, solver, types
+from palpate.tissue import shape as surface
 from solver import MASS, PRECONDITIONERS, make, press, sphere
 
 MOST = 1000  # iterations

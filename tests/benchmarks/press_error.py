@@ -2,7 +2,7 @@
 
   python press_error.py    prints RMS errors in % of the peak, of the whole and of its three parts
 
-The press of tests/plugin/test_coupling.py and its explicit reference. `touch` is the first 35 ms,
+The press of tests/engine/test_coupling.py and its explicit reference. `touch` is the first 35 ms,
 in which the ball bounces on one node, `ramp` until it stops at 100 ms, `hold` the rest; their
 squares add up.
 """
@@ -13,10 +13,10 @@ import runpy
 import mujoco
 import numpy as np
 import palpate
-from palpate import solver
-from palpate.bench import plots
+from benchmarks import plots
+from palpate.tissue import solver
 
-REFERENCE = pathlib.Path(__file__).parents[1] / "plugin" / "data" / "press_explicit_20us"
+REFERENCE = pathlib.Path(__file__).parents[1] / "reference" / "press_explicit_20us"
 PARTS = {"touch": (0, 0.035), "ramp": (0.035, 0.1), "hold": (0.1, 1)}  # [s]
 CASES = {
   "as it is": {},

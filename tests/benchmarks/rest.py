@@ -17,7 +17,8 @@ import time
 import mujoco
 import numpy as np
 import palpate
-from palpate import mjstruct, models
+from palpate import models
+from palpate.engine import mjstruct
 from palpate.models import scene
 
 ROUNDS, STEPS = 200, 20

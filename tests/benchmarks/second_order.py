@@ -15,8 +15,11 @@ import pathlib
 
 import mujoco
 import numpy as np
-from palpate import inertia, surface, types
-from palpate.bench import error, exact, plots, runner, scene
+from benchmarks import error, plots, runner, scene
+from palpate.engine import inertia
+from palpate.tissue import shape as surface
+from palpate.tissue import types
+from reference import exact
 from scipy import sparse
 from scipy.sparse import linalg
 

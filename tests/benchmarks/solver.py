@@ -17,8 +17,9 @@ import time
 import numpy as np
 import palpate
 import warp as wp
-from palpate import config, elastic, levels, mesh, solver, surface, types
 from palpate.models import grid
+from palpate.tissue import config, elastic, levels, mesh, solver, types
+from palpate.tissue import shape as surface
 
 H = 1e-3
 MASS = 0.1

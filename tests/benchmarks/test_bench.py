@@ -8,9 +8,10 @@ import mujoco
 import numpy as np
 import palpate
 import pytest
-from palpate import cli, energy
-from palpate.bench import error, exact, runner, scene, skipping, stability, thesis
-from palpate.config import Config
+from benchmarks import error, run, runner, scene, skipping, stability, thesis
+from palpate.tissue import energy
+from palpate.tissue.config import Config
+from reference import exact
 
 BENCHES = {b.name: b for b in (error.BENCH, stability.BENCH, thesis.BENCH, skipping.BENCH)}
 ELEMENTS = {"membrane": {}, "spring": {"elements": "spring", "stiffness": 50.0}}
@@ -21,7 +22,7 @@ def rows_of(name: str, out: pathlib.Path) -> list[dict]:
 
 
 def command(*words) -> int:
-  return cli.main(["bench", *map(str, words)])
+  return run.main([*map(str, words)])
 
 
 @pytest.fixture(scope="module")
@@ -102,7 +103,7 @@ def test_error_bench_fills_its_files(error_rows):
   for name in ("error_press.png", "error_vibrate.png"):
     assert (out / name).read_bytes().startswith(b"\x89PNG")
   page = (out / "error.md").read_text()
-  assert "palpate bench error --short" in page and "A peer is faster" in page
+  assert "run.py error --short" in page and "A peer is faster" in page
 
 
 @pytest.mark.parametrize("run", ["implicit", "implicit, window", "midpoint", "native"])

@@ -8,8 +8,9 @@ import types
 import mujoco
 import numpy as np
 import pytest
-from palpate import cli, tasks
-from palpate.tasks import episode, evaluate, experts
+from palpate import tasks
+from palpate.app import cli, evaluate
+from palpate.tasks import episode, experts
 from palpate.tasks.recording import Recording
 
 

@@ -1,0 +1,1 @@
+"""What a person types: the `palpate` command. Nothing imports it."""

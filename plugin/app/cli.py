@@ -1,0 +1,68 @@
+"""The `palpate` command.
+
+A subcommand is one module with two functions, `add_arguments(parser)` and `main(args) -> int`, and
+one line in `COMMANDS`. The module is imported when it is used, so that help comes at once; it calls
+`palpate.register()` before it loads a model.
+
+Exit codes: 0 done; 1 it did not work; 2 a wrong option or scene; 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import sys
+from collections.abc import Sequence
+
+from palpate import __version__
+
+from .console import CommandError, prepare_gl
+
+# Words of the command -> module of this package, and what the help says.
+COMMANDS = {
+  ("run", "press"): ("press", "press an organ with a probe, hold, release; measure step and force"),
+  ("doctor",): ("doctor", "say what is installed, what works and what is wrong"),
+  ("warmup",): ("warmup", "compile all kernels ahead, for the CPU and every CUDA device"),
+  ("view",): ("view", "open MuJoCo's viewer on a scene, its instruments draggable"),
+  ("render",): ("render", "make a picture or a film of a scene, without a screen"),
+  ("wrap",): ("wrap", "make an organ of a mesh or a segmented volume, in a model folder"),
+  ("exercise",): ("exercise", "run an exercise, record it and write its report"),
+  ("report",): ("report", "write the page about a recording"),
+  ("evaluate",): ("evaluate", "score a policy over many episodes of an exercise"),
+}
+_GROUPS = {"run": "run a job on a scene"}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+  """Runs the command line and returns its exit code."""
+  words = list(sys.argv[1:] if argv is None else argv)
+  try:
+    args = _parser(words).parse_args(words)
+    return args.main(args)
+  except CommandError as error:
+    print(f"palpate: {error}", file=sys.stderr)
+    return error.code
+  except KeyboardInterrupt:
+    print("palpate: interrupted", file=sys.stderr)
+    return 130
+
+
+def _parser(words: list[str]) -> argparse.ArgumentParser:
+  parser = argparse.ArgumentParser("palpate", description="Soft-tissue simulation for MuJoCo.")
+  parser.add_argument("--version", action="version", version=f"palpate {__version__}")
+  commands = parser.add_subparsers(metavar="COMMAND", required=True)
+  groups = {}
+  for name, (module, text) in COMMANDS.items():
+    place = commands
+    if len(name) > 1:
+      if name[0] not in groups:
+        group = commands.add_parser(name[0], help=_GROUPS[name[0]], description=_GROUPS[name[0]])
+        groups[name[0]] = group.add_subparsers(metavar="JOB", required=True)
+      place = groups[name[0]]
+    command = place.add_parser(name[-1], help=text, description=text[0].upper() + text[1:] + ".")
+    if tuple(words[: len(name)]) == name:
+      prepare_gl()
+      chosen = importlib.import_module(f".{module}", __package__)
+      chosen.add_arguments(command)
+      command.set_defaults(main=chosen.main)
+  return parser

@@ -1,0 +1,218 @@
+"""`palpate doctor`: what is installed, what works, and what is wrong, one line each."""
+
+from __future__ import annotations
+
+import argparse
+import importlib.metadata
+import os
+import pathlib
+import platform
+import statistics
+import subprocess
+import sys
+from collections.abc import Callable
+
+from palpate import __version__
+
+from .console import CommandError
+
+_PACKAGES = ("mujoco", "warp-lang", "dm-control", "numpy", "scipy", "trimesh")
+_EXTRAS = {
+  "matplotlib": "plot",
+  "imageio-ffmpeg": "video",
+  "gymnasium": "gym",
+  "scikit-image": "image",
+}
+_TIMEOUT = 60  # [s]
+_DRAW = """
+import mujoco
+model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
+data = mujoco.MjData(model)
+mujoco.mj_forward(model, data)
+with mujoco.Renderer(model, 16, 16) as renderer:
+  renderer.update_scene(data)
+  assert renderer.render().any(), "the picture is black"
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser):
+  """Declares the options: none."""
+
+
+def main(args: argparse.Namespace) -> int:
+  """Prints the findings; returns 1 if something is wrong, else 0."""
+  wrong = 0
+  for name, check in _CHECKS.items():
+    try:
+      state, lines = "ok", check()
+    except Exception as error:
+      what = str(error) if isinstance(error, CommandError) else f"{type(error).__name__}: {error}"
+      state, lines = "WRONG", [" ".join(what.split())]
+      wrong += 1
+    for line in lines:
+      print(f"{state:<5}  {name:<9} {line}", flush=True)
+  print("all is well" if not wrong else f"{wrong} thing{'s' * (wrong > 1)} wrong")
+  return 1 if wrong else 0
+
+
+def _palpate() -> list[str]:
+  where = pathlib.Path(__file__).parent
+  return [f"{__version__}, python {platform.python_version()}, {platform.platform()}, {where}"]
+
+
+def _packages() -> list[str]:
+  lines, bad = [], []
+  wanted = _requirements()
+  for package in _PACKAGES:
+    try:
+      version = importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+      bad.append(f"{package} is not installed, expected {wanted.get(package, 'it')}")
+      continue
+    lines.append(f"{package} {version}")
+    if not _within(version, wanted.get(package, "")):
+      bad.append(f"{package} is {version}, expected {wanted[package]}")
+  if bad:
+    raise CommandError("; ".join(bad))
+  missing = []
+  for package, extra in _EXTRAS.items():
+    try:
+      lines.append(f"{package} {importlib.metadata.version(package)}")
+    except importlib.metadata.PackageNotFoundError:
+      missing.append(f"{package} (extra {extra})")
+  return [", ".join(lines)] + ([f"not installed: {', '.join(missing)}"] if missing else [])
+
+
+def _requirements() -> dict[str, str]:
+  """Returns the version ranges this package asks for, by package."""
+  ranges = {}
+  for line in importlib.metadata.requires("palpate") or []:
+    spec = line.partition(";")[0].replace(" ", "")
+    if ";" in line and "extra" in line:
+      continue
+    at = min((spec.index(c) for c in "<>=!~" if c in spec), default=len(spec))
+    ranges[spec[:at]] = spec[at:]
+  return ranges
+
+
+def _within(version: str, spec: str) -> bool:
+  """Returns whether a release lies in a range of >=, < and == parts."""
+
+  def parts(text: str) -> list[int]:
+    numbers = []
+    for word in text.split("."):
+      if not word.isdigit():
+        break
+      numbers.append(int(word))
+    return (numbers + [0] * 4)[:4]
+
+  mine = parts(version)
+  for part in filter(None, spec.split(",")):
+    if part.startswith(">=") and mine < parts(part[2:]):
+      return False
+    if part.startswith("<") and mine >= parts(part[1:]):
+      return False
+    if part.startswith("==") and mine != parts(part[2:]):
+      return False
+  return True
+
+
+def _devices() -> list[str]:
+  import warp as wp
+  from palpate.tissue import quiet
+
+  quiet.lower_log_level()
+  quiet.init()
+  lines = [f"{d.alias}: {d.name}" for d in wp.get_cuda_devices()] or ["no CUDA device"]
+  return [f"cpu: {os.cpu_count()} cores; {'; '.join(lines)}"]
+
+
+def _cache() -> list[str]:
+  import warp as wp
+
+  folder = pathlib.Path(wp.config.kernel_cache_dir or "")
+  if not os.access(folder, os.W_OK):
+    raise CommandError(f"cannot write to the kernel cache {folder}; set WARP_CACHE_PATH")
+  size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+  return [f"{folder} ({size / 1e6:.1f} MB)"]
+
+
+def _plugin() -> list[str]:
+  from palpate import register
+  from palpate.engine import plugin as engine
+
+  slot = register()
+  return [f"{engine.NAME} is registered with MuJoCo, slot {slot}"]
+
+
+def _dm_control() -> list[str]:
+  _python("import dm_control.mujoco, dm_control.rl.control")
+  return ["dm_control starts"]
+
+
+def _gl() -> list[str]:
+  chosen = os.environ.get("MUJOCO_GL")
+  reasons, works = [], []
+  for backend in ("egl", "osmesa", "glfw"):
+    try:
+      _python(_DRAW, MUJOCO_GL=backend)
+      works.append(backend)
+    except CommandError as error:
+      reasons.append(f"{backend}: {error}")
+  if not works:
+    raise CommandError(f"no way to draw, install libegl1 or libosmesa6 ({'; '.join(reasons)})")
+  if chosen in ("egl", "osmesa", "glfw") and chosen not in works:
+    raise CommandError(f"MUJOCO_GL is {chosen}, which does not work here; {', '.join(works)} does")
+  return [f"works: {', '.join(works)}; MUJOCO_GL is {chosen or 'not set'}"]
+
+
+def _python(code: str, **environment: str):
+  """Runs code in an interpreter of its own; raises CommandError with its last word if it fails."""
+  inherited = {k: v for k, v in os.environ.items() if k != "PYOPENGL_PLATFORM"}  # MuJoCo sets it
+  try:
+    done = subprocess.run(
+      [sys.executable, "-c", code],
+      env=inherited | environment,
+      capture_output=True,
+      text=True,
+      timeout=_TIMEOUT,
+    )
+  except subprocess.TimeoutExpired:
+    raise CommandError(f"no answer in {_TIMEOUT} s", 1) from None
+  if done.returncode:
+    words = done.stderr.strip().splitlines() or [f"ended by signal {-done.returncode}"]
+    raise CommandError(words[-1], 1)
+
+
+def _self_test() -> list[str]:
+  import mujoco
+  from palpate import register
+  from palpate.organ import Organ
+
+  from . import press, probe
+
+  register()
+  model = mujoco.MjModel.from_xml_path(str(press.folder() / "scene.xml"))
+  data = mujoco.MjData(model)
+  organ = Organ(model, data, "organ")
+  tool = probe.find(model, "probe")
+  samples = list(probe.press(model, data, organ, tool, depth=0.005, speed=0.1, hold=0.02))
+  if organ.error:
+    raise CommandError(organ.error)
+  step = statistics.median(s.step_s for s in samples)
+  force = max(s.force for s in samples)
+  if not 0.01 < force < 1 or samples[-1].force:
+    raise CommandError(f"the press of 5 mm gives {force:.3g} N, expected 0.01 to 1 N")
+  return [f"press on {organ.device}: {len(samples)} steps of {1e3 * step:.2f} ms, {force:.3f} N"]
+
+
+_CHECKS: dict[str, Callable[[], list[str]]] = {
+  "palpate": _palpate,
+  "packages": _packages,
+  "devices": _devices,
+  "cache": _cache,
+  "plugin": _plugin,
+  "tasks": _dm_control,
+  "drawing": _gl,
+  "self-test": _self_test,
+}

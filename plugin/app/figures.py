@@ -1,0 +1,147 @@
+"""Pictures of a press: force and displacement over time, and a film of it."""
+
+from __future__ import annotations
+
+import importlib.util
+import pathlib
+import sys
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+from palpate.engine import plugin as engine
+
+from .console import CommandError, Interrupt, Progress
+from .probe import Sample
+
+_FORCE, _MOTION, _INK = "#c1442e", "#2f6f9f", "#333333"
+# What a frame needs: an organ with windows has its shape in the plugin state.
+_SHOWN = mujoco.mjtState.mjSTATE_QPOS | mujoco.mjtState.mjSTATE_PLUGIN
+
+
+def need(extra: str, *modules: str):
+  """Raises CommandError, naming the extra to install, if a module is missing."""
+  missing = [name for name in modules if importlib.util.find_spec(name) is None]
+  if missing:
+    raise CommandError(
+      f"{', '.join(missing)} is not installed: pip install 'palpate[{extra}]'", code=1
+    )
+
+
+def plot(samples: Sequence[Sample], path: pathlib.Path, title: str):
+  """Draws displacement of the node nearest to the probe and contact force against time.
+
+  The two axes of figures 7.6-7.14 in V. Kotamraju's thesis (Simon Fraser University, 2008).
+  """
+  need("plot", "matplotlib")
+  from matplotlib.figure import Figure
+
+  time = np.array([s.time_s for s in samples])
+  figure = Figure(figsize=(7.2, 4.0), dpi=150, layout="constrained")
+  left = figure.subplots()
+  right = left.twinx()
+  for phase in ("press", "hold", "release"):
+    when = [s.time_s for s in samples if s.phase == phase]
+    if when:
+      left.axvline(when[0], color="#bbbbbb", lw=0.8, ls=":")
+      left.annotate(phase, (when[0], 1), (3, -3), xycoords=("data", "axes fraction"),
+                    textcoords="offset points", va="top", fontsize=8, color="#777777")  # fmt: skip
+  moved = 1e3 * np.array([s.node_m for s in samples])
+  (motion,) = left.plot(time, moved, color=_MOTION, lw=1.8, label="displacement, nearest node")
+  (force,) = right.plot(time, [s.force for s in samples], color=_FORCE, lw=1.4, label="force")
+  left.set_xlabel("time [s]")
+  left.set_ylabel("displacement [mm]", color=_MOTION)
+  right.set_ylabel("contact force [N]", color=_FORCE)
+  for axes, values in ((left, moved), (right, [s.force for s in samples])):
+    axes.set_ylim(0, 1.18 * max(float(np.max(values)), 1e-9))
+    axes.spines["top"].set_visible(False)
+  left.set_xlim(time[0], time[-1] + 1e-9)
+  left.set_title(title, fontsize=10, color=_INK, loc="left")
+  left.legend(handles=[motion, force], loc="upper left", bbox_to_anchor=(0, 0.94), frameon=False,
+              fontsize=8)  # fmt: skip
+  figure.savefig(path)
+
+
+def plot_if_able(samples: Sequence[Sample], path: pathlib.Path, title: str):
+  """Draws the plot and says where it is, or says what is missing."""
+  try:
+    plot(samples, path, title)
+    print(f"{path}: force and displacement over time")
+  except CommandError as error:
+    print(f"palpate: no plot: {error}", file=sys.stderr)
+
+
+def snapshot(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+  """Returns what a picture of the scene needs."""
+  engine.sync(model, data)
+  state = np.empty(mujoco.mj_stateSize(model, _SHOWN))
+  mujoco.mj_getState(model, data, state, _SHOWN)
+  return state.astype(np.float32)
+
+
+def picture(model: mujoco.MjModel, data: mujoco.MjData, state: np.ndarray, path: pathlib.Path):
+  """Renders a snapshot to a PNG file, without a screen."""
+  import imageio.v2 as imageio
+
+  with _renderer(model, 960, 720) as renderer:
+    imageio.imwrite(path, _frame(model, data, state, renderer))
+  print(f"{path}: the organ at its deepest")
+
+
+def film(
+  model: mujoco.MjModel,
+  data: mujoco.MjData,
+  states: Sequence[np.ndarray],
+  path: pathlib.Path,
+  rate: int,
+  interrupt: Interrupt,
+  progress: Progress,
+):
+  """Renders snapshots to an MP4 or GIF, without a screen.
+
+  Args:
+    model: compiled model
+    data: of that model; its positions are changed
+    states: snapshot of every frame
+    path: file to write, .mp4 or .gif
+    rate: frames per second
+    interrupt: ends the film early
+    progress: told of each frame
+  """
+  import imageio.v2 as imageio
+
+  how: dict = {"fps": rate, "macro_block_size": 16, "quality": 8}
+  if path.suffix == ".gif":
+    how = {"duration": 1000 / rate, "loop": 0}
+  frames = 0
+  with _renderer(model, 640, 480) as renderer, imageio.get_writer(path, **how) as writer:
+    for state in states:
+      if interrupt.seen:
+        break
+      writer.append_data(_frame(model, data, state, renderer))
+      frames += 1
+      progress.show(f"filming {frames} of {len(states)}")
+  progress.clear()
+  print(f"{path}: {frames} frames")
+
+
+def _renderer(model: mujoco.MjModel, width: int, height: int) -> mujoco.Renderer:
+  """Returns a renderer that needs no screen, at most as large as the scene's offscreen buffer."""
+  width = min(width, model.vis.global_.offwidth) // 16 * 16
+  height = min(height, model.vis.global_.offheight) // 16 * 16
+  try:
+    return mujoco.Renderer(model, height, width)
+  except Exception as error:
+    raise CommandError(
+      f"no way to render without a screen ({type(error).__name__}: {error}); install libegl1 or "
+      "libosmesa6 and set MUJOCO_GL=egl or osmesa; see palpate doctor",
+      code=1,
+    ) from error
+
+
+def _frame(model, data, state: np.ndarray, renderer: mujoco.Renderer) -> np.ndarray:
+  mujoco.mj_setState(model, data, state.astype(np.float64), _SHOWN)
+  engine.place_windows(model, data)
+  mujoco.mj_fwdPosition(model, data)
+  renderer.update_scene(data, 0 if model.ncam else -1)
+  return renderer.render()

@@ -1,0 +1,54 @@
+"""`palpate warmup`: compiles and loads everything ahead, so that no first run has to wait."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import pkgutil
+import time
+
+from palpate import register
+
+from .console import CommandError, Progress, table
+
+
+def add_arguments(parser: argparse.ArgumentParser):
+  """Declares the options."""
+  parser.add_argument("--device", help="this one alone: cpu, cuda:0, ... (all)")
+
+
+def main(args: argparse.Namespace) -> int:
+  """Loads every module with kernels on every device; prints the seconds each took."""
+  register()
+  import warp as wp
+  from palpate.tissue import quiet
+
+  quiet.init()
+  known = [device.alias for device in wp.get_devices()]
+  if args.device and args.device not in known:
+    raise CommandError(f"no device {args.device!r}, expected one of {', '.join(known)}")
+  progress, rows, total = Progress(), [], 0.0
+  for device in [args.device] if args.device else known:
+    for module in modules():
+      progress.show(f"{module.rpartition('.')[2]} on {device}", always=True)
+      start = time.perf_counter()
+      wp.load_module(module, device=device)
+      rows.append((f"{device}  {module}", f"{time.perf_counter() - start:.2f} s"))
+      total += time.perf_counter() - start
+  progress.clear()
+  print(table([*rows, ("all", f"{total:.2f} s")]))
+  return 0
+
+
+def modules() -> list[str]:
+  """Returns the names of this package's modules that hold kernels."""
+  import warp as wp
+  from palpate import engine, tissue
+
+  found = []
+  for room in (engine, tissue):
+    for info in pkgutil.iter_modules(room.__path__):
+      module = importlib.import_module(f"{room.__name__}.{info.name}")
+      if any(isinstance(value, wp.Kernel) for value in vars(module).values()):
+        found.append(module.__name__)
+  return found

@@ -1,0 +1,246 @@
+"""Effective inertia: the mass that a contact meets at a node, given to MuJoCo as joint armature."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+
+import mujoco
+import numpy as np
+import warp as wp
+from palpate.tissue import mesh as topology
+from palpate.tissue import solver, types
+from palpate.tissue.config import Config
+from palpate.tissue.mesh import Mesh
+from palpate.tissue.shape import from_slices, to_slices
+from palpate.tissue.types import State, Surface
+
+from . import mjstruct
+from .declare import Organ, meeting_geoms
+
+# Loads whose response gives the effective inertia; between them it follows the nodal area.
+_SAMPLES = 24
+# Nodes that say whether tissue is stiff, and times its own mass that one moves then: of presses
+# with less, none gained energy from contacts that MuJoCo answers with the dofs' inertia.
+_FEW = 8
+_STIFF = 2.0
+# Times its inertia by itself that a pressed node may have, which is stretched too.
+_PRESSED = 2.0
+_KNOWN = 64
+# A pressed shell stiffens and few nodes of a patch touch: between 1 and the limit of 2.
+_MARGIN = 1.5
+_alone: dict[bytes, np.ndarray] = {}  # what it depends on -> `_by_itself`
+_time_step: dict[bytes, float] = {}  # digest of an armature of ours -> the time step it is for
+
+
+def set_armature(m, organ: Organ):
+  """Gives the organ's dofs the effective inertia as armature, unless the MJCF gave them one.
+
+  Ours are recognised by their digest, so that they can follow the time step.
+  """
+  armature = mjstruct.view(m.dof_armature, m.nv)
+  dofs = organ.dofs
+  present = armature[dofs]
+  if organ.config.integrator == "explicit":
+    return  # explicit steps are those of the masses
+  h = float(m.opt.timestep)
+  if present.any() and _time_step.get(_digest(present), h) == h:
+    return
+  mass = _masses(m, organ)
+  inertia = of_nodes(m, organ, mass, h, organ.flex)
+  added = np.repeat((inertia - mass)[organ.free], 3)
+  armature[dofs] = added
+  if len(_time_step) >= _KNOWN:
+    _time_step.pop(next(iter(_time_step)))
+  _time_step[_digest(added)] = h
+  # mj_setConst gives the same: M0 has the armature, the inverse weights, which scale the contacts'
+  # softness, are those of the masses alone for such dofs.
+  mjstruct.view(m.dof_M0, m.nv)[dofs] = np.repeat(inertia[organ.free], 3)
+
+
+def stiffness(m, organ: Organ, config: Config, nodal: np.ndarray) -> tuple[bool, float]:
+  """Returns whether tissue is stiff for the model's time step, and how much one node alone is more.
+
+  It is where a push on one node moves others with it within a step: where one in four has an
+  effective inertia of over `_STIFF` masses by itself.
+
+  Args:
+    m: the mjModel
+    organ: the organ
+    config: its configuration in force
+    nodal: effective inertia of every node [kg], (nvert,)
+
+  Returns:
+    whether it is; most times its inertia in `nodal` that a pressed node may have [-]
+  """
+  sample = _spread(organ.mesh.rest, np.flatnonzero(organ.free), _FEW)
+  alone = _by_itself(m, organ, config, sample)
+  stiff = np.quantile(alone / _masses(m, organ)[sample], 0.75) > _STIFF
+  return bool(stiff), _PRESSED * max(1.0, float(np.median(alone / nodal[sample])))
+
+
+def _by_itself(m, organ: Organ, config: Config, sample: np.ndarray) -> np.ndarray:
+  """Returns the effective inertia of the nodes `sample` [kg], each pushed alone."""
+  h, mass = float(m.opt.timestep), _masses(m, organ)
+  numbers = [h, config.damping, config.foundation, config.bulk]
+  key = _digest(np.concatenate([numbers, mass, organ.mesh.rest.ravel(), organ.free]))
+  key += repr(organ.config).encode()
+  if key not in _alone:
+    if len(_alone) >= _KNOWN:
+      _alone.pop(next(iter(_alone)))
+    s = dataclasses.replace(
+      organ.surface, damping=config.damping, foundation=config.foundation, bulk=config.bulk
+    )
+    gain = _gain(config, h)
+    response = _responses(s, _state(s), organ.mesh, mass, organ.free, h, 0.0, gain, sample)
+    _alone[key] = 1 / np.maximum(response, 1e-300)
+  return _alone[key]
+
+
+def of_nodes(m, organ: Organ, mass: np.ndarray, h: float, flex: int) -> np.ndarray:
+  """Returns the effective inertia of every node for the tools that meet `flex` [kg], (nvert,)."""
+  radius = _tool_radius(m, organ, flex)
+  s = organ.surface
+  gain = _gain(organ.config, h)
+  return effective_inertia(s, _state(s), organ.mesh, mass, organ.free, h, radius, gain)
+
+
+def of_dofs(m, organ: Organ) -> np.ndarray:
+  """Returns the inertia that the dofs of every node have in the model [kg], (nvert,)."""
+  inertia = _masses(m, organ).copy()
+  inertia[organ.free] += mjstruct.view(m.dof_armature, m.nv)[organ.dofs].reshape(-1, 3)[:, 0]
+  return inertia
+
+
+def _masses(m, organ: Organ) -> np.ndarray:
+  if organ.windows:
+    return organ.windows.mass
+  return mjstruct.view(m.body_mass, m.nbody)[organ.body]
+
+
+def _gain(config: Config, h: float) -> float:
+  gain = h * h + h * config.damping
+  return 0.5 * gain if config.integrator == "midpoint" else gain
+
+
+def _state(s: Surface) -> State:
+  state = types.make_state(s)
+  state.mass.assign(np.where(s.vert.numpy() >= 0, 0.0, 1.0).reshape(1, -1, 8))
+  return state
+
+
+def _digest(values: np.ndarray) -> bytes:
+  return hashlib.sha256(np.ascontiguousarray(values).tobytes()).digest()
+
+
+def _tool_radius(m, organ: Organ, flex: int) -> float:
+  """Returns the radius of the largest contact patch to expect [m]: that of the thickest tool.
+
+  Planes and height fields touch all there is; a patch of a quarter of the organ stands for them.
+  """
+  colliding = meeting_geoms(m, flex)
+  limit = 0.25 * float(np.ptp(organ.mesh.rest, axis=0).max())
+  kind = mjstruct.view(m.geom_type, m.ngeom, np.int32)
+  size = mjstruct.view(m.geom_size, (m.ngeom, 3))
+  geom = mujoco.mjtGeom
+  radius = 0.0
+  for g in colliding:
+    if kind[g] in (geom.mjGEOM_SPHERE, geom.mjGEOM_CAPSULE, geom.mjGEOM_CYLINDER):
+      own = size[g, 0]
+    elif kind[g] in (geom.mjGEOM_BOX, geom.mjGEOM_ELLIPSOID, geom.mjGEOM_MESH):
+      own = np.sort(size[g])[1]
+    else:
+      own = limit
+    radius = max(radius, float(own))
+  return min(radius, limit)
+
+
+def effective_inertia(
+  s: Surface,
+  d: State,
+  mesh: Mesh,
+  mass: np.ndarray,
+  free: np.ndarray,
+  h: float,
+  radius: float,
+  gain: float | None = None,
+) -> np.ndarray:
+  """Returns the inertia that a contact meets at each node at rest [kg], (nvert,).
+
+  That of node i is 1 / sum_j n^T (A^-1)_ij n over the nodes j within a contact patch. The row sum
+  keeps the spectral radius of Mhat (A^-1 on the contact nodes) at or under 1; the iteration on the
+  contact force is stable up to 2. What it adds to the mass is taken `_MARGIN` times: too little
+  lets a contact move its nodes alone, and stiff shells crumple under the tool. Evenly spread nodes
+  are solved for; others follow the nearest of them in proportion to their area.
+
+  Args:
+    s: the organ
+    d: a state of one world, overwritten
+    mesh: its mesh
+    mass: nodal masses [kg], (nvert,)
+    free: nodes that move, (nvert,) bool
+    h: time step [s]
+    radius: radius of the contact patch [m]; 0 for the node alone
+    gain: factor of K in A [s^2]; None for h^2 + h damping
+  """
+  area = topology.vertex_areas(mesh.rest, mesh.elem)
+  sample = _spread(mesh.rest, np.flatnonzero(free), _SAMPLES)
+  gain = h * h + h * s.damping if gain is None else gain
+  response = _responses(s, d, mesh, mass, free, h, radius, gain, sample)
+  # Per area, so that finer parts of the surface get less.
+  specific = 1 / np.maximum(response, 1e-300) / area[sample]
+  distance2 = ((mesh.rest[:, None] - mesh.rest[sample]) ** 2).sum(axis=2)
+  nearest = np.argsort(distance2, axis=1)[:, :3]
+  weight = 1 / (np.take_along_axis(distance2, nearest, axis=1) + 1e-12 * distance2.max() + 1e-300)
+  weight /= weight.sum(axis=1, keepdims=True)
+  found = np.maximum(area * (weight * specific[nearest]).sum(axis=1), mass)
+  return mass + _MARGIN * (found - mass)
+
+
+def _responses(
+  s: Surface,
+  d: State,
+  mesh: Mesh,
+  mass: np.ndarray,
+  free: np.ndarray,
+  h: float,
+  radius: float,
+  gain: float,
+  sample: np.ndarray,
+) -> np.ndarray:
+  """Returns how fast each sample moves where it and the nodes around it get a unit impulse."""
+  # A per cent is enough: the iteration it serves has a margin of two.
+  s = dataclasses.replace(s, tolerance=1e-2, newton=1)
+  normal = topology.vertex_normals(mesh.rest, mesh.elem)
+  vert = np.asarray(s.vert.numpy(), np.int64)
+  real = np.flatnonzero(vert >= 0)
+
+  def put(array: wp.array, values: np.ndarray):
+    full = np.zeros((s.nnode, *values.shape[1:]))
+    full[real] = values[vert[real]]
+    array.assign(to_slices(full.astype(np.float32))[None])
+
+  for array in (d.pos, d.vel, d.dvel_warm):
+    array.zero_()
+  put(d.mass, mass)
+  floor = 0.0
+  d.step.assign(np.array([[h, gain, floor, 0]], np.float32))
+  response = np.zeros(len(sample))
+  for k, i in enumerate(sample):
+    patch = free & (((mesh.rest - mesh.rest[i]) ** 2).sum(axis=1) <= radius**2)
+    patch[i] = True
+    put(d.force_ext, np.where(patch[:, None], normal[i] / h, 0.0))
+    solver.step(s, d)
+    dvel = from_slices(np.asarray(d.dvel.numpy()[0]))[int(s.node.numpy()[i])]
+    response[k] = dvel @ normal[i]
+  return response
+
+
+def _spread(rest: np.ndarray, candidates: np.ndarray, count: int) -> np.ndarray:
+  """Returns up to `count` of the candidates, each farthest from those before (Gonzalez 1985)."""
+  chosen = [int(candidates[0])]
+  distance2 = ((rest[candidates] - rest[chosen[0]]) ** 2).sum(axis=1)
+  while len(chosen) < min(count, len(candidates)):
+    chosen.append(int(candidates[np.argmax(distance2)]))
+    distance2 = np.minimum(distance2, ((rest[candidates] - rest[chosen[-1]]) ** 2).sum(axis=1))
+  return np.array(chosen)

@@ -1,0 +1,1 @@
+"""The physics of soft tissue: meshes, energies, the implicit step. Knows nothing of MuJoCo."""

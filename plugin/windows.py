@@ -1,0 +1,317 @@
+# mujoco ships its bindings without type stubs:
+# pyright: reportAttributeAccessIssue=false
+"""Writing scenes: gives an organ of an `mujoco.MjSpec` windows, so that nobody does it by hand."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import warnings
+from collections.abc import Iterator, Sequence
+
+import mujoco
+import numpy as np
+
+from .engine import plugin as engine
+
+# Slots of a window: from so few up to so many, unless told.
+_LEAST, _MOST = 16, 256
+# Of a long thin geom, only so many radii of its length are taken to touch.
+_LENGTH = 20.0
+# A 5 mm instrument, for a window made before its tools are there: radius, length [m].
+_TOOL = (0.0025, 0.02)
+# Of a slot's body; it does not turn, and is lighter than any node.
+_INERTIA, _SHARE = 1e-8, 0.01
+_KEY_FIELDS = {"qpos": 0, "qvel": 1}  # columns of `_layout`
+_WINDOW_GROUP = 4  # drawn by nobody who does not ask for it
+
+
+def add_windows(
+  spec: mujoco.MjSpec,
+  organ: str,
+  tools: Sequence[str | Sequence[str]] | None = None,
+  nodes: int | None = None,
+) -> tuple[str, ...]:
+  """Gives an organ window coupling: MuJoCo then has dofs only under the tools.
+
+  A nodal organ (a flexcomp with the plugin) becomes a rigid flex; mass, pins, look, contact
+  parameters and configuration are carried over. A rigid organ that is declared with `mass`, and no
+  `window` yet, keeps what it has. The spec can be saved as XML, compiled and attached to another.
+
+  One window for all tools is right for most scenes. Windows of their own, one a tool, keep a tool
+  that touches much from taking the nodes of another; where tools meet, the first window serves
+  both, because a triangle whose corners are in different windows touches nothing.
+
+  Args:
+    spec: changed in place
+    organ: name of the flexcomp
+    tools: what each window follows: a body with all that hangs on it, or several; None for one
+      window that follows all that moves and collides
+    nodes: most nodes in each window; None sizes it from the tools' geoms and the organ's edges
+
+  Returns:
+    Names of the windows.
+
+  Raises:
+    ValueError: there is no such organ or body, or it cannot have windows.
+  """
+  flex = spec.flex(organ)
+  if flex is None:
+    have = ", ".join(repr(f.name) for f in spec.flexes) or "none"
+    raise ValueError(f"no flexcomp {organ!r} in the spec, it has {have}")
+  bodies = {body.name: body for body in spec.bodies}
+  plugin = _plugin(spec, organ, [bodies[name] for name in dict.fromkeys(flex.vertbody)])
+  config = {key: value for key, value in plugin.config.items() if value}
+  if config.get("window"):
+    raise ValueError(f"organ {organ!r} has window {config['window']!r} already, expected none")
+  if flex.dim != 2:
+    raise ValueError(f"organ {organ!r}: flexcomp dim is {flex.dim}, expected dim='2' (a surface)")
+  groups = _groups(organ, bodies, tools)
+  many = len(groups) if groups else 1
+  names = [f"{organ}_window{k if many > 1 else ''}" for k in range(many)]
+  taken = [name for name in names if spec.flex(name) is not None]
+  if taken:
+    raise ValueError(f"organ {organ!r}: the spec has a flex {taken[0]!r} already")
+  if nodes is not None and not 5 <= nodes:
+    raise ValueError(f"organ {organ!r}: nodes is {nodes}, expected at least 5")
+  nodal = len(set(flex.vertbody)) > 1 or "mass" not in config
+  meets = (flex.contype, flex.conaffinity) if nodal or flex.contype or flex.conaffinity else (1, 1)
+  colliding = [g for g in spec.geoms if (g.contype & meets[1]) | (g.conaffinity & meets[0])]
+  followed = [[g for g in colliding if not group.isdisjoint(_ancestors(g))] for group in groups]
+  for group, mine in zip(groups, followed, strict=True):
+    if not mine:
+      raise ValueError(f"organ {organ!r}: nothing of {sorted(group)} collides with it")
+    if not all(g.parent.name for g in mine):
+      raise ValueError(f"organ {organ!r}: a body of {sorted(group)} has no name, expected one")
+  own = _own_bodies(flex, bodies) if nodal else []
+  # From here on the spec changes.
+  keys = _take_keys(spec)
+  surface = _make_rigid(spec, flex, own, plugin, config) if nodal else bodies[flex.vertbody[0]]
+  rest = np.reshape(flex.vert, (-1, 3))
+  elem = np.reshape(flex.elem, (-1, 3))
+  edge = float(np.linalg.norm(rest[elem[:, [1, 2, 0]]] - rest[elem], axis=2).mean())
+  every = list(itertools.chain(*followed)) if groups else [g for g in colliding if _moves(g)]
+  # Each window has room for all tools, for when they meet.
+  size = 1 + min(nodes or _slots(every, edge, flex.radius), len(rest))  # one slot stays free
+  for name in names:
+    _add_window(spec, flex, surface, name, size, meets, edge, config)
+  _warn_of_others(organ, colliding, groups)
+  config["window"] = " ".join(names)
+  if groups:
+    config["follow"] = ", ".join(
+      " ".join(dict.fromkeys(g.parent.name for g in mine)) for mine in followed
+    )
+  plugin.config = config
+  flex.contype = flex.conaffinity = 0
+  _fit_keys(spec, keys)
+  return tuple(names)
+
+
+def organs(spec: mujoco.MjSpec) -> dict[str, bool]:
+  """Returns the organs of a spec and whether each has windows."""
+  bodies = {body.name: body for body in spec.bodies}
+  configs = {plugin.name: plugin.config for plugin in spec.plugins}
+  found = {}
+  for flex in spec.flexes:
+    plugins = [bodies[name].plugin for name in dict.fromkeys(flex.vertbody)]
+    mine = [p for p in plugins if p.active and p.plugin_name == engine.NAME]
+    if mine:
+      config = configs[mine[0].name] if mine[0].name else mine[0].config
+      found[flex.name] = bool(config.get("window"))
+  return found
+
+
+def _plugin(spec, organ: str, bodies: list):
+  """Returns the instance of this plugin that the vertices' bodies have, and its name."""
+  mine = [b for b in bodies if b.plugin.active and b.plugin.plugin_name == engine.NAME]
+  instances = {body.plugin.name for body in mine}
+  if len(instances) != 1:
+    raise ValueError(f"flexcomp {organ!r} has {len(instances)} plugins {engine.NAME}, expected one")
+  name = instances.pop()
+  if name:
+    return next(p for p in spec.plugins if p.name == name)
+  # MuJoCo loses an instance without a name when it is attached to another spec.
+  plugin = spec.add_plugin(name=organ, plugin_name=engine.NAME, active=True)
+  plugin.config = dict(mine[0].plugin.config)
+  mine[0].plugin.name = organ
+  return plugin
+
+
+def _ancestors(geom) -> Iterator[str]:
+  """Yields the names of a geom's body and of those that it hangs on."""
+  body = geom.parent
+  while body is not None:
+    yield body.name
+    body = body.parent
+
+
+def _moves(geom) -> bool:
+  """Returns whether a geom's body or one that it hangs on has joints or is a mocap body."""
+  body = geom.parent
+  while body is not None:
+    if body.first_joint() is not None or body.mocap:
+      return True
+    body = body.parent
+  return False
+
+
+def _groups(organ: str, bodies: dict, tools) -> list[set[str]]:
+  """Returns the bodies that each window follows; none for all that moves."""
+  if tools is None:
+    return []
+  if isinstance(tools, str) or not len(tools):
+    raise ValueError(f"tools is {tools!r}, expected a list of bodies, one entry a window")
+  groups = [{tool} if isinstance(tool, str) else set(tool) for tool in tools]
+  for name in itertools.chain(*groups):
+    if name not in bodies:
+      raise ValueError(f"organ {organ!r}: tools names body {name!r}, which does not exist")
+  return groups
+
+
+def _own_bodies(flex, bodies: dict) -> list:
+  """Returns the bodies of a nodal organ's moving vertices."""
+  own = [bodies[name] for name in flex.vertbody if bodies[name].first_joint() is not None]
+  if not own or len({body.name for body in own}) < len(own):
+    raise ValueError(f"organ {flex.name!r} has no vertices of its own, expected a <flexcomp>")
+  if flex.selfcollide != mujoco.mjtFlexSelf.mjFLEXSELF_NONE:
+    raise ValueError(
+      f"organ {flex.name!r} collides with itself, which needs nodal coupling; expected "
+      "<contact selfcollide='none'/>"
+    )
+  return own
+
+
+def _make_rigid(spec, flex, own: list, plugin, config: dict[str, str]):
+  """Makes a nodal organ's flex rigid; returns the body it is in."""
+  vertbody = list(flex.vertbody)
+  free = np.isin(vertbody, [body.name for body in own])
+  parent = own[0].parent
+  rest = np.zeros((len(vertbody), 3))
+  rest += np.reshape(flex.vert, (-1, 3)) if len(flex.vert) else 0.0  # none: all on their bodies
+  rest[free] += [body.pos for body in own]
+  config["mass"] = f"{len(rest) * np.mean([body.mass for body in own]):.9g}"
+  if not free.all():
+    config["pin"] = " ".join(map(str, np.flatnonzero(~free)))
+  surface = parent
+  if parent.plugin.name != plugin.name:  # MuJoCo marks the parent where vertices are pinned to it
+    surface = parent.add_body(name=f"{flex.name}_surface")
+    if own[0].frame is not None:
+      surface.set_frame(own[0].frame)
+    surface.plugin.name, surface.plugin.plugin_name = plugin.name, engine.NAME
+    surface.plugin.active = True
+  # One by one the vertices' bodies take MuJoCo quadratic time to delete.
+  doomed = parent.add_frame()
+  for body in own:
+    body.set_frame(doomed)
+  spec.delete(doomed)
+  flex.vert, flex.vertbody = rest.ravel(), [surface.name] * len(rest)
+  flex.edgedamping = 0.0
+  return surface
+
+
+def _slots(geoms: list, edge: float, radius: float) -> int:
+  """Returns how many nodes the geoms can touch: half their surface, an edge and more away."""
+  area = 0.0
+  sizes = []
+  for geom in geoms:
+    kind, size = geom.type, np.nan_to_num(np.array(geom.size))
+    fromto = np.array(geom.fromto)
+    half = np.linalg.norm(fromto[3:] - fromto[:3]) / 2 if np.isfinite(fromto).all() else size[1]
+    if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
+      sizes.append((size[0], 0.0))
+    elif kind in (mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_CYLINDER):
+      sizes.append((size[0], 2 * half))
+    elif kind in (mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_ELLIPSOID):
+      _, middle, large = np.sort(size)
+      sizes.append((middle, 2 * (large - middle)))
+    else:
+      return _MOST  # what a mesh or a plane can touch is not known here
+  for r, length in sizes or [_TOOL]:
+    r, length = r + edge + radius, min(length, _LENGTH * r)
+    area += math.pi * r * (2 * r + length)
+  # A node has two equilateral triangles.
+  return int(np.clip(math.ceil(area / (math.sqrt(3) / 2 * edge**2)), _LEAST, _MOST))
+
+
+def _add_window(spec, flex, surface, name: str, size: int, meets, edge: float, config):
+  """Adds a window: a bipyramid, which has as many triangles as so many nodes can have."""
+  size = max(size, 5)
+  angle = 2 * np.pi * np.arange(size - 2) / (size - 2)
+  ring = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+  points = edge * np.concatenate([ring, [[0, 0, 1], [0, 0, -1]]])
+  a, pole = np.arange(size - 2), np.full(size - 2, size - 2)
+  b = (a + 1) % (size - 2)
+  elem = np.concatenate([np.stack([a, b, pole], axis=1), np.stack([b, a, pole + 1], axis=1)])
+  mass = _SHARE * float(config["mass"]) / (len(flex.vert) // 3)
+  names = []
+  # Next to the organ's own body, or in it, so that they turn alike.
+  for k, point in enumerate(points):
+    body = surface.add_body(name=f"{name}_{k}", pos=point, ipos=np.zeros(3), mass=mass)
+    body.inertia, body.explicitinertial = [_INERTIA] * 3, True
+    for axis in np.eye(3):
+      body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
+    names.append(body.name)
+  window = spec.add_flex(
+    name=name, dim=2, vert=np.zeros(3 * size), vertbody=names, elem=elem.ravel(), edgedamping=1e-9
+  )
+  for key in ("condim", "priority", "friction", "solmix", "solref", "solimp", "margin", "gap"):
+    setattr(window, key, getattr(flex, key))
+  window.contype, window.conaffinity = meets
+  window.radius, window.group = flex.radius, _WINDOW_GROUP
+  window.selfcollide = mujoco.mjtFlexSelf.mjFLEXSELF_NONE
+
+
+def _warn_of_others(organ: str, colliding: list, groups: list[set[str]]):
+  """Warns of geoms that the organ would collide with and that no window follows."""
+  followed = set().union(*groups)
+  for geom in colliding:
+    if followed.isdisjoint(_ancestors(geom)) and (groups or not _moves(geom)):
+      warnings.warn(
+        f"organ {organ!r}: no window follows geom {geom.name or geom.type!r} of body "
+        f"{geom.parent.name!r}, which it can touch; name the body in tools, or use nodal coupling",
+        stacklevel=3,
+      )
+
+
+def _layout(spec) -> list[tuple[tuple[str, int], tuple[int, int]]]:
+  """Returns body and index, positions and velocities of each joint, in the order of qpos."""
+  sizes = {mujoco.mjtJoint.mjJNT_FREE: (7, 6), mujoco.mjtJoint.mjJNT_BALL: (4, 3)}
+  return [
+    ((body.name, k), sizes.get(joint.type, (1, 1)))
+    for body in spec.bodies
+    for k, joint in enumerate(body.joints)
+  ]
+
+
+def _take_keys(spec) -> list[tuple]:
+  """Empties the keyframes, which MuJoCo wants to fit at every moment.
+
+  Returns:
+    Keyframe, field, and the numbers of each joint, for what they had.
+  """
+  joints = _layout(spec)
+  found = []
+  for key in spec.keys:
+    for field, column in _KEY_FIELDS.items():
+      values = np.array(getattr(key, field), dtype=float)
+      cuts = np.cumsum([sizes[column] for _, sizes in joints])
+      if values.size and values.size != cuts[-1]:
+        raise ValueError(
+          f"keyframe {key.name!r} has {values.size} numbers of {field}, expected {cuts[-1]}"
+        )
+      if values.size:
+        names = [joint[0] for joint in joints]
+        found.append((key, field, dict(zip(names, np.split(values, cuts[:-1]), strict=True))))
+  for key, field, _ in found:
+    setattr(key, field, [])
+  return found
+
+
+def _fit_keys(spec, keys: list[tuple]):
+  """Gives the keyframes the numbers of the joints that there are now, zero for the new ones."""
+  joints = _layout(spec)
+  for key, field, had in keys:
+    sizes = [both[_KEY_FIELDS[field]] for _, both in joints]
+    names = [joint[0] for joint in joints]
+    new = [had.get(name, np.zeros(size)) for name, size in zip(names, sizes, strict=True)]
+    setattr(key, field, np.concatenate(new))

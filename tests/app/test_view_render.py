@@ -1,0 +1,120 @@
+"""`palpate view` and `palpate render`."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("imageio")
+import imageio.v3 as imageio
+import mujoco
+from palpate import models
+from palpate.app import cli
+
+SIZE = ("--size", "160x120")
+
+
+@pytest.fixture(autouse=True)
+def _here(tmp_path, monkeypatch):
+  monkeypatch.chdir(tmp_path)
+  monkeypatch.delenv("DISPLAY", raising=False)
+  monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _can_render():
+  try:
+    mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 16, 16).close()
+  except Exception as error:
+    pytest.skip(f"no OpenGL here: {error}")
+
+
+def _render(*words: str) -> np.ndarray:
+  assert cli.main(["render", *words, "-o", "out.png", *SIZE]) == 0
+  image = imageio.imread("out.png")
+  assert image.shape == (120, 160, 3)
+  return image.astype(int)
+
+
+def test_picture_shows_a_press():
+  words = ("kidney", "--nodes", "250", "--keyframe")
+  still, pressed = _render(*words, "touch"), _render(*words, "press", "--seconds", "0.3")
+  red = still[..., 0] > 2 * still[..., 2] + 30  # the organ, lit
+  assert 0.05 < red.mean() < 0.7
+  moved = np.abs(still - pressed).max(axis=2) > 12
+  assert (moved & red).mean() > 0.002
+  assert np.ptp(still) > 100
+
+
+@pytest.mark.parametrize("option", ["--edges", "--wireframe", "--forces", "--sites"])
+def test_options_draw_something(option):
+  words = ["kidney", "--nodes", "250", "--keyframe", "press", "--seconds", "0.2"]
+  assert (np.abs(_render(*words) - _render(*words, option)).max(axis=2) > 20).mean() > 2e-4
+
+
+def test_cameras_differ():
+  words = ["kidney", "--nodes", "250", "--camera"]
+  laparoscope, side, free = (_render(*words, name) for name in ("laparoscope", "side", "free"))
+  assert np.abs(laparoscope - side).mean() > 1
+  assert np.abs(free - side).mean() > 1
+
+
+def test_path_of_a_scene():
+  assert np.ptp(_render(str(models.path("gallbladder")))) > 100
+
+
+@pytest.mark.parametrize("suffix", ["gif", "mp4"])
+def test_film(suffix, capsys):
+  if suffix == "mp4":
+    pytest.importorskip("imageio_ffmpeg")
+  words = ["kidney", "--nodes", "250", "--keyframe", "press", "--seconds", "0.1", "--fps", "50"]
+  words += ["-o", f"film.{suffix}"]
+  assert cli.main(["render", *words, *SIZE]) == 0
+  assert "5 frames of 160 x 120" in capsys.readouterr().out
+  assert len(list(imageio.imiter(f"film.{suffix}"))) == 5
+
+
+@pytest.mark.parametrize(
+  ("words", "message"),
+  [
+    (["spleen"], "expected an MJCF file or one of liver,"),
+    (["liver", "--nodes", "7"], "nodes is 7, expected one of 250, 1000"),
+    (["liver", "--instruments", "saw"], "'saw', expected one of probe"),
+    (["liver", "--size", "big"], "size is 'big', expected WxH"),
+    (["kidney", "--nodes", "250", "--camera", "x"], "expected one of laparoscope, overview, side"),
+    (["kidney", "--nodes", "250", "--keyframe", "x"], "the scene has home, touch, press"),
+    (["liver", "--seconds", "-1"], "seconds is -1"),
+    (["liver", "--fps", "0"], "fps is 0"),
+  ],
+)
+def test_bad_input(words, message, capsys):
+  assert cli.main(["render", *words, "-o", "out.png"]) == 2
+  error = capsys.readouterr().err
+  assert message in error
+  assert error.count("\n") == 1
+
+
+def test_bad_files(tmp_path, capsys):
+  assert cli.main(["render", "liver", "-o", "out.jpg"]) == 2
+  assert "expected a name that ends in .png" in capsys.readouterr().err
+  (tmp_path / "broken.xml").write_text("<mujoco><worldbody>")
+  assert cli.main(["render", "broken.xml", "-o", "out.png"]) == 2
+  assert cli.main(["render", "broken.xml", "-o", "out.png", "--nodes", "250"]) == 2
+  assert "goes with a named model" in capsys.readouterr().err
+
+
+def test_view_needs_a_display(capsys):
+  assert cli.main(["view", "liver"]) == 1
+  assert "no display" in capsys.readouterr().err
+  with pytest.raises(SystemExit):
+    cli.main(["view"])
+
+
+def test_view_gives_the_viewer_handles(monkeypatch):
+  viewer = pytest.importorskip("mujoco.viewer")
+  seen = []
+  monkeypatch.setenv("DISPLAY", ":0")
+  monkeypatch.setattr(viewer, "launch", lambda loader: seen.extend([loader(), loader()]))
+  assert cli.main(["view", "kidney", "--nodes", "250", "--keyframe", "touch"]) == 0
+  model, data, name = seen[0]
+  assert model.nmocap == 2 and name == "kidney"
+  assert seen[1][0] is not model  # the viewer's button to load anew
+  np.testing.assert_allclose(data.site("probe/tip").xpos, data.mocap_pos[0], atol=1e-6)

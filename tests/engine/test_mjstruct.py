@@ -1,0 +1,42 @@
+"""The ctypes views of mjModel and mjData."""
+
+import mujoco
+import numpy as np
+import pytest
+from palpate.engine import mjstruct
+
+
+def test_views_are_the_arrays_of_the_bindings(scenes):
+  model, data, _ = scenes.load(scenes.press())
+  m = mjstruct.Model.from_address(model._address)
+  d = mjstruct.Data.from_address(data._address)
+  assert (m.nv, m.nq, m.nflexvert) == (model.nv, model.nq, model.nflexvert)
+  assert m.opt.timestep == model.opt.timestep
+  view = mjstruct.view(d.qpos, m.nq)
+  view[3] = 0.25
+  assert data.qpos[3] == 0.25
+  np.testing.assert_array_equal(mjstruct.view(m.geom_size, (m.ngeom, 3)), model.geom_size)
+  name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_FLEX, 0)
+  assert mjstruct.name_of(m, m.name_flexadr, 0) == name
+
+
+def test_an_empty_or_absent_array_is_empty():
+  assert mjstruct.view(None, 0).shape == (0,)
+  assert mjstruct.view(0, (0, 3)).shape == (0, 3)
+
+
+def test_a_layout_that_disagrees_with_the_bindings_is_an_import_error(monkeypatch):
+  wrong = mujoco.MjModel.from_xml_string("<mujoco/>")._address
+
+  class Shifted(mjstruct.Data):
+    @classmethod
+    def from_address(cls, address):
+      return mjstruct.Model.from_address(wrong)
+
+  monkeypatch.setattr(mjstruct, "Data", Shifted)
+  with pytest.raises((ImportError, AttributeError)):
+    mjstruct.check()
+
+
+def test_the_layouts_of_this_version_agree():
+  mjstruct.check()
