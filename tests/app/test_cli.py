@@ -163,7 +163,7 @@ def test_doctor_says_what_is_wrong():
 
 def test_warmup_prints_seconds_for_every_module(capsys):
   assert cli.main(["warmup", "--device", "cpu"]) == 0
-  rows = dict(re.findall(r"cpu +palpate\.(\w+) +([\d.]+) s", capsys.readouterr().out))
+  rows = dict(re.findall(r"cpu +palpate\.\w+\.(\w+) +([\d.]+) s", capsys.readouterr().out))
   assert {"coupling", "elastic", "solver"} <= set(rows)
 
 
