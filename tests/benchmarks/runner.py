@@ -227,10 +227,10 @@ def machine() -> dict:
   import scipy
   import warp
   from palpate import __version__
-  from palpate.tissue import quiet
+  from palpate.tissue import device
 
-  quiet.lower_log_level()
-  quiet.init()
+  device.lower_log_level()
+  device.init()
   cpu = platform.processor()
   info = pathlib.Path("/proc/cpuinfo")
   if info.exists():
