@@ -8,7 +8,6 @@ import threading
 
 import mujoco
 import numpy as np
-import warp as wp
 from palpate.tissue import config as configuration
 from palpate.tissue import device as devices
 from palpate.tissue import mesh as topology

@@ -66,9 +66,7 @@ def set_armature(m, organ: Organ, body: Body, config: Config):
   mjstruct.view(m.dof_M0, m.nv)[dofs] = np.repeat(inertia[organ.free], 3)
 
 
-def stiffness(
-  m, organ: Organ, body: Body, config: Config, nodal: np.ndarray
-) -> tuple[bool, float]:
+def stiffness(m, organ: Organ, body: Body, config: Config, nodal: np.ndarray) -> tuple[bool, float]:
   """Returns whether tissue is stiff for the model's time step, and how much one node alone is more.
 
   It is where a push on one node moves others with it within a step: where one in four has an

@@ -11,9 +11,9 @@ from typing import Any
 import mujoco
 import numpy as np
 import warp as wp
-from palpate.tissue import config as configuration
 from palpate.tissue import body as bodies
-from palpate.tissue import kernels, shape, step
+from palpate.tissue import config as configuration
+from palpate.tissue import shape, step
 from palpate.tissue.body import Body
 from palpate.tissue.config import Config
 
@@ -356,8 +356,9 @@ def configure(w: Workspace, instance: int, texts: dict[str, str]):
   Raises:
     ValueError: a key may not change, or its value is not allowed.
   """
-  before, w.config = w.config, configuration.change(
-    w.organ.name, w.config, texts, w.organ.mesh.closed
+  before, w.config = (
+    w.config,
+    configuration.change(w.organ.name, w.config, texts, w.organ.mesh.closed),
   )
   if w.resident:
     w.resident.stop()
@@ -366,7 +367,8 @@ def configure(w: Workspace, instance: int, texts: dict[str, str]):
     shape.change(w.body, w.organ.mesh, w.config, ~w.organ.free)
   else:
     shape.renumber(w.body, w.config)
-  bind(w, w.model, instance)
+  if changed.intersection(("integrator", "newton")) or w.body.levels:
+    bind(w, w.model, instance)
   if changed.intersection(configuration.MATERIAL):
     refresh(w)
   else:
