@@ -22,6 +22,7 @@ RADIUS = 0.05  # of the test sphere [m]
 FLEX = 0.0005  # radius of the flexes [m]
 PLAIN = {"solref": "0.004 1", "condim": "1"}  # stiff contacts without friction
 UNTOUCHED = {"contype": 0, "conaffinity": 0}
+EDGES = '<edge damping="1e-9"/>'  # a flex without forces of its own, without a warning
 
 
 def join(values) -> str:
@@ -103,16 +104,24 @@ def contacts(**attributes):
   return f"<contact {text}/>"
 
 
+def flex(
+  points, elem, inside, name="organ", mass=0.1, pin=(), contact=None, radius=FLEX, attributes=""
+):
+  """Returns a flexcomp whose nodes are MuJoCo's, around what is `inside` of it."""
+  pins = f'<pin id="{" ".join(map(str, pin))}"/>' if len(pin) else ""
+  shape = surface_text(points, elem, radius)
+  return (
+    f'<flexcomp name="{name}" mass="{mass}" {shape} {attributes}>{inside}'
+    f"{contacts(**(contact or {}))}{pins}</flexcomp>"
+  )
+
+
 def organ(
   points, elem, name="organ", mass=0.1, pin=(), contact=None, radius=FLEX, attributes="", **config
 ):
   """Returns an organ whose nodes are MuJoCo's; `config` are the plugin's keys."""
-  pins = f'<pin id="{" ".join(map(str, pin))}"/>' if len(pin) else ""
-  return (
-    f'<flexcomp name="{name}" mass="{mass}" {surface_text(points, elem, radius)} {attributes}>'
-    f"{plugin(**config)}{contacts(**(contact or {}))}"
-    f'<edge damping="1e-9"/>{pins}</flexcomp>'
-  )
+  inside = plugin(**config) + EDGES
+  return flex(points, elem, inside, name, mass, pin, contact, radius, attributes)
 
 
 def windowed(
@@ -124,16 +133,27 @@ def windowed(
   slots = f'type="grid" count="{count}" spacing=".01 .01 .01" dim="2" mass="0.01"'
   return (
     f'<body name="{name}">{plugin(**config)}<flexcomp {rigid}>{contacts(**UNTOUCHED)}</flexcomp>'
-    f'</body><flexcomp name="{grid}" {slots} radius="{radius}"><edge damping="1e-9"/>'
+    f'</body><flexcomp name="{grid}" {slots} radius="{radius}">{EDGES}'
     f"{contacts(**(contact or {}))}</flexcomp>"
   )
 
 
-def world(*bodies, h=1e-3, gravity=(0, 0, 0), integrator="Euler", option="", flag="", extra=""):
-  """Returns a whole MJCF document around the bodies."""
+def world(
+  *bodies,
+  h=1e-3,
+  gravity=(0, 0, 0),
+  integrator="Euler",
+  solver="Newton",
+  tolerance=1e-10,
+  memory=100,
+  option="",
+  flag="",
+  extra="",
+):
+  """Returns a whole MJCF document around the bodies; `memory` in MB."""
   return (
     f'<mujoco><option timestep="{h}" gravity="{join(gravity)}" integrator="{integrator}" '
-    f'solver="Newton" tolerance="1e-10" {option}>{flag}</option><size memory="100M"/>'
+    f'solver="{solver}" tolerance="{tolerance}" {option}>{flag}</option><size memory="{memory}M"/>'
     f'<extension><plugin plugin="palpate.organ"/></extension>'
     f"<worldbody>{''.join(bodies)}</worldbody>{extra}</mujoco>"
   )
