@@ -151,7 +151,7 @@ def test_forward_between_steps_changes_nothing(device):
 def test_search_with_little_room_keeps_the_nearest(monkeypatch):
   m, d, _ = make("cuda:0", resident=True)
   expected = drive(m, d, 120)
-  monkeypatch.setattr("palpate.window._ROOM", 1)
+  monkeypatch.setattr("palpate.engine.window._ROOM", 1)
   m, d, _ = make("cuda:0", resident=True)
   np.testing.assert_allclose(drive(m, d, 120), expected, atol=5e-3 * np.abs(expected).max())
 
@@ -200,7 +200,7 @@ def test_sleep_changes_nothing_measurable(monkeypatch):
 
   slept, force, at_rest = run()
   assert slept > 500
-  monkeypatch.setattr("palpate.window._SLOW", 0.0)
+  monkeypatch.setattr("palpate.engine.window._SLOW", 0.0)
   never, expected, awake = run()
   assert never == 0
   assert np.abs(at_rest - awake).max() < 1e-7
@@ -302,7 +302,7 @@ def test_still_tool_nearby_lets_it_sleep_and_wakes_it_before_it_touches(
   monkeypatch, resident, swing, steps
 ):
   def press(slow):
-    monkeypatch.setattr("palpate.window._SLOW", slow)
+    monkeypatch.setattr("palpate.engine.window._SLOW", slow)
     m, d, organ = hovering(resident, swing)
     mujoco.mj_step(m, d, nstep=250)
     slept = organ.asleep

@@ -9,12 +9,13 @@ import mujoco
 import numpy as np
 import palpate
 import pytest
+from palpate.tissue import mesh as topology
 from windowed import drive, scene
 
 
 def nodal_masses(m, organ):
   """Gives a nodal organ the area-lumped masses of a windowed one."""
-  area = palpate.mesh.vertex_areas(organ.xpos0, organ.elem)
+  area = topology.vertex_areas(organ.xpos0, organ.elem)
   bodies = organ._organ.body
   m.body_mass[bodies] = 0.1 * area / area.sum()
   mujoco.mj_setConst(m, mujoco.MjData(m))
@@ -101,7 +102,7 @@ def test_copied_data_continues_alike():
 def test_memory_need_not_be_clear_before():
   code = """if True:
     import importlib.util, pathlib, sys
-    sys.path.insert(0, str(pathlib.Path(sys.argv[1]).parent))
+    sys.path.insert(0, str(pathlib.Path(sys.argv[1]).parents[1]))
     spec = importlib.util.spec_from_file_location("test_window", sys.argv[1])
     tests = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(tests)

@@ -58,7 +58,7 @@ def test_a_windowed_organ_looks_like_a_nodal_one(backend):
     except Exception as error:
       print(error)
       sys.exit(77)
-    sys.path.insert(0, {os.path.dirname(__file__)!r})
+    sys.path.insert(0, {os.path.dirname(os.path.dirname(__file__))!r})
     spec = importlib.util.spec_from_file_location("drawing", {__file__!r})
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)

@@ -1,0 +1,184 @@
+"""What the kernels read and write: one struct a group, one line a field.
+
+A line says meaning, unit, type and shape, and the shape is what `allocate` makes. Sizes are named:
+nworld worlds; nslice slices of nodes, nelemslice of triangles, nhingeslice of hinges (0 without
+bending); nslot rows of stiffness blocks; nlist, nfan, nwedge rows of fans (see `Shape`); others see
+`sizes`. Nodes lie in slices of eight, the last axis; `native/simd.h` says how they are read.
+"""
+
+# Annotations here are objects, not text: no `from __future__ import annotations`.
+import dataclasses
+
+import numpy as np
+import warp as wp
+
+
+@dataclasses.dataclass(frozen=True)
+class Array:
+  """Type and shape of a field."""
+
+  dtype: type
+  dims: tuple
+
+
+def floats(*dims) -> Array:
+  """Returns the type of an array of float32."""
+  return Array(wp.float32, dims)
+
+
+def ints(*dims) -> Array:
+  """Returns the type of an array of int32."""
+  return Array(wp.int32, dims)
+
+
+DIMS: dict[str, dict[str, tuple]] = {}  # struct and field -> its shape
+
+
+def struct(cls):
+  """Returns a Warp struct whose arrays have the shapes of the annotations."""
+  kinds = cls.__annotations__
+  arrays = {name: kind for name, kind in kinds.items() if isinstance(kind, Array)}
+  DIMS[cls.__name__] = {name: kind.dims for name, kind in arrays.items()}
+  cls.__annotations__ = kinds | {
+    name: wp.array(dtype=kind.dtype, ndim=len(kind.dims)) for name, kind in arrays.items()
+  }
+  return wp.struct(cls)
+
+
+# Numbers that may change while running, in the order of `Tissue.number`: configuration keys.
+NUMBERS = (
+  "foundation", "bulk", "pressure", "damping", "tolerance", "iterations", "stiffness"
+)  # fmt: skip
+
+vector = floats("nworld", "nslice", 3, 8)
+scalar = floats("nworld", "nslice", 8)
+
+
+@struct
+class Shape:
+  """Topology and rest shape.
+
+  A fan is the ring of neighbours of a node, `width` entries, the last one repeated in front and the
+  first one behind: entries [k] and [k + 1] are the k-th triangle of the node. Irregular lists are
+  sliced ELLPACK (Kreutzer et al. 2014, doi:10.1137/130930352): row k of a slice holds the k-th
+  entry of its eight nodes. An offset is where a node's x starts in a vector of slices, in floats.
+  """
+
+  nvert: int  # vertices
+  nnode: int  # nodes: vertices padded to whole slices
+  nslice: int  # slices of nodes
+  nelemslice: int  # slices of triangles; 0 without bending
+  nhingeslice: int  # slices of hinges; 0 without bending
+  nslot: int  # rows of stiffness blocks
+  closed: int  # whether the surface encloses a volume
+  volume0: float  # rest volume [m^3]; 0 for an open surface
+  vert: ints("nnode")  # vertex of each node, -1 for padding
+  node: ints("nvert")  # node of each vertex
+  slot_adr: ints("nslice + 1")  # first row of stiffness blocks
+  fan_node: ints("nslot + 2 nslice", 8)  # offset of each fan entry's node
+  fan_rest: floats("nslot + 2 nslice", 3, 8)  # rest vector to each fan entry [m]
+  fan_corner: ints("nslot + nslice", 8)  # offset of each fan triangle's normal
+  fan_side: ints("nslot + nslice", 8)  # offset of its corner force at this node
+  degree: floats("nslice", 8)  # number of neighbours
+  rest: floats("nslice", 3, 8)  # rest position about the centroid [m]
+  area: floats("nslice", 8)  # nodal area [m^2]; 0 for padding
+  free: floats("nslice", 8)  # 1 for nodes that move, 0 pinned or padding
+  elem_node: ints("nelemslice", 3, 8)  # offset of each corner's node
+  elem_rest: floats("nelemslice", 6, 8)  # rest vectors corner 0 -> 1, 0 -> 2 [m]
+  elem_hinge: ints("nelemslice", 3, 8)  # hinge opposite each corner
+  hinge_node: ints("nhingeslice", 4, 8)  # offset of p0, p1, left, right apex
+  hinge_rest: floats("nhingeslice", 9, 8)  # rest vectors p0 -> p1, left, right [m]
+  hinge_elem: ints("nhingeslice", 2, 8)  # offset of left and right triangle
+  hinge_near: ints("nhingeslice", 4, 8)  # the four other hinges of both triangles
+  hinge_angle0: floats("nhingeslice", 8)  # rest angle 2 sin(theta / 2) [-]
+  bend_adr: ints("nslice + 1")  # first row of the bending matrix
+  bend_node: ints("nbend", 8)  # node of each entry
+
+
+@struct
+class Tissue:
+  """Material on a shape; `number` may change while running, without a graph recorded anew."""
+
+  number: floats("nnumber")  # see NUMBERS
+  fan_metric: floats("nslot + nslice", 5, 8)  # rest metric [1/m^2]; mu, lambda' times volume [N m]
+  fan_spring: floats("nslot", 8)  # spring that stands for an edge, for `neumann` [N/m]
+  hinge_gain: floats("nhingeslice", 5, 8)  # stiffness to itself and to `hinge_near` [N m]
+  bend_gain: floats("nbend", 8)  # bending matrix [N/m]
+  bend_diag: floats("nbendslice", 8)  # its diagonal [N/m]
+
+
+@struct
+class State:
+  """Motion of the organs of nworld worlds, and what acts on them."""
+
+  step: floats("nworld", 4)  # h, h^2 + h damping, floor of the residual, share of h v looked ahead
+  disp: vector  # displacement from rest [m]
+  vel: vector  # velocity [m/s]
+  mass: scalar  # mass [kg]
+  force_ext: vector  # external and lagged contact force [N]
+  dvel: vector  # change of velocity in this step [m/s]
+  dvel_warm: vector  # what those of the last steps lead to, where PCG starts [m/s]
+
+
+@struct
+class System:
+  """The linear system of a step and the vectors of its solve."""
+
+  change: floats("nworld")  # largest (rate of an edge's ends over its length)^2 [1/s^2]
+  disp_trial: vector  # displacement of the present Newton iteration [m]
+  vel_trial: vector  # velocity of the present Newton iteration [m/s]
+  block: floats("nworld", "nslot", 9, 8)  # off-diagonal blocks of A [kg]
+  diag: scalar  # inertia and foundation on the diagonal [kg]
+  inverse: floats("nworld", "nslice", 6, 8)  # inverse of the diagonal blocks [1/kg]
+  rhs: vector  # right-hand side [N s]
+  areavec: floats("nworld", "nareaslice", 3, 8)  # area vector of a node, 6 dV/dx [m^2]
+  normal: floats("nworld", "nbendslice", 3, 8)  # unit normal of a node
+  elem_normal: floats("nworld", "nelemslice", 4, 8)  # unit normal; stiffness of its edges [N/m]
+  elem_corner: floats("nworld", "nelemslice", 3, 8)  # force on each corner along it [N s]
+  hinge_angle: floats("nworld", "nhingeslice", 8)  # strain impulse angle of a hinge
+  hinge_half: floats("nworld", "nhingeslice", 8)  # cos(theta / 2)
+  hinge_moment: floats("nworld", "nhingeslice", 8)  # moment impulse [N m s]
+  hinge_rough: floats("nworld", "nhingeslice", 8)  # what the bending matrix may leave out [N m]
+  total: floats("nworld", 2)  # volume difference [m^3], areavec . vel
+  sol: vector  # PCG solution [m/s]
+  r: vector  # PCG residual
+  p: vector  # PCG direction
+  q: vector  # A times direction
+  z: vector  # preconditioned residual
+  zn: floats("nworld", "nbendslice", 16)  # that along the normals, with turns on CUDA
+  quad: floats("nworld", "nquadslice", 12, 8)  # z of a node side by side
+  e: floats("nworld", "ncycleslice", 3, 8)  # as z, between smoothing steps
+  en: floats("nworld", "ncyclebendslice", 8)  # that along the normals
+  t: vector  # A times z; smoother's direction and residual
+  partial: floats("nworld", "nword", 4)  # what the blocks of a world exchange
+  status: floats("nworld", 4)  # PCG iterations, relative residual, norm of rhs, 1 if not finite
+
+
+@struct
+class Fields:
+  """What every kernel of a body takes."""
+
+  shape: Shape
+  tissue: Tissue
+  state: State
+  system: System
+
+
+def allocate(kind, device, sizes: dict[str, int]):
+  """Returns a struct of zeroed arrays; `sizes` has the named sizes of their shapes."""
+  out = kind()
+  for name, dims in DIMS[kind.key].items():
+    shape = tuple(sizes[n] if isinstance(n, str) else n for n in dims)
+    setattr(out, name, wp.zeros(shape, dtype=kind.vars[name].type.dtype, device=device))
+  return out
+
+
+def fill(kind, device, values: dict[str, np.ndarray | float]):
+  """Returns a struct with its fields from `values`, arrays copied to the device."""
+  out = kind()
+  for name, var in kind.vars.items():
+    value = values[name]
+    if isinstance(value, np.ndarray):
+      value = wp.array(np.ascontiguousarray(value), dtype=var.type.dtype, device=device)
+    setattr(out, name, value)
+  return out
