@@ -12,7 +12,7 @@ if sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
     if ctypes.util.find_library(library):
       os.environ.setdefault("MUJOCO_GL", backend)
 
-from scenes import Scenes, needs_cuda
+import scenes as builders
 
 
 def pytest_collection_modifyitems(config, items):
@@ -25,10 +25,10 @@ def pytest_collection_modifyitems(config, items):
 
 
 @pytest.fixture(scope="session")
-def scenes() -> type[Scenes]:
-  return Scenes
+def scenes():
+  return builders
 
 
-@pytest.fixture(params=["cpu", pytest.param("cuda:0", marks=needs_cuda)])
+@pytest.fixture(params=["cpu", pytest.param("cuda:0", marks=builders.needs_cuda)])
 def device(request) -> str:
   return request.param

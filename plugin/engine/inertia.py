@@ -1,4 +1,4 @@
-"""Effective inertia: the mass that a contact meets at a node, given to MuJoCo as joint armature."""
+"""Effective inertia: the mass that a contact meets at a node; MuJoCo gets it as joint armature."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from palpate.tissue.shape import from_slices, to_slices
 from palpate.tissue.types import State, Surface
 
 from . import mjstruct
-from .declare import Organ, meeting_geoms
+from .declare import Declaration, meeting_geoms
 
 # Loads whose response gives the effective inertia; between them it follows the nodal area.
 _SAMPLES = 24
@@ -30,35 +30,9 @@ _KNOWN = 64
 # A pressed shell stiffens and few nodes of a patch touch: between 1 and the limit of 2.
 _MARGIN = 1.5
 _alone: dict[bytes, np.ndarray] = {}  # what it depends on -> `_by_itself`
-_time_step: dict[bytes, float] = {}  # digest of an armature of ours -> the time step it is for
 
 
-def set_armature(m, organ: Organ):
-  """Gives the organ's dofs the effective inertia as armature, unless the MJCF gave them one.
-
-  Ours are recognised by their digest, so that they can follow the time step.
-  """
-  armature = mjstruct.view(m.dof_armature, m.nv)
-  dofs = organ.dofs
-  present = armature[dofs]
-  if organ.config.integrator == "explicit":
-    return  # explicit steps are those of the masses
-  h = float(m.opt.timestep)
-  if present.any() and _time_step.get(_digest(present), h) == h:
-    return
-  mass = _masses(m, organ)
-  inertia = of_nodes(m, organ, mass, h, organ.flex)
-  added = np.repeat((inertia - mass)[organ.free], 3)
-  armature[dofs] = added
-  if len(_time_step) >= _KNOWN:
-    _time_step.pop(next(iter(_time_step)))
-  _time_step[_digest(added)] = h
-  # mj_setConst gives the same: M0 has the armature, the inverse weights, which scale the contacts'
-  # softness, are those of the masses alone for such dofs.
-  mjstruct.view(m.dof_M0, m.nv)[dofs] = np.repeat(inertia[organ.free], 3)
-
-
-def stiffness(m, organ: Organ, config: Config, nodal: np.ndarray) -> tuple[bool, float]:
+def stiffness(m, organ: Declaration, config: Config, nodal: np.ndarray) -> tuple[bool, float]:
   """Returns whether tissue is stiff for the model's time step, and how much one node alone is more.
 
   It is where a push on one node moves others with it within a step: where one in four has an
@@ -75,13 +49,13 @@ def stiffness(m, organ: Organ, config: Config, nodal: np.ndarray) -> tuple[bool,
   """
   sample = _spread(organ.mesh.rest, np.flatnonzero(organ.free), _FEW)
   alone = _by_itself(m, organ, config, sample)
-  stiff = np.quantile(alone / _masses(m, organ)[sample], 0.75) > _STIFF
+  stiff = np.quantile(alone / masses(m, organ)[sample], 0.75) > _STIFF
   return bool(stiff), _PRESSED * max(1.0, float(np.median(alone / nodal[sample])))
 
 
-def _by_itself(m, organ: Organ, config: Config, sample: np.ndarray) -> np.ndarray:
+def _by_itself(m, organ: Declaration, config: Config, sample: np.ndarray) -> np.ndarray:
   """Returns the effective inertia of the nodes `sample` [kg], each pushed alone."""
-  h, mass = float(m.opt.timestep), _masses(m, organ)
+  h, mass = float(m.opt.timestep), masses(m, organ)
   numbers = [h, config.damping, config.foundation, config.bulk]
   key = _digest(np.concatenate([numbers, mass, organ.mesh.rest.ravel(), organ.free]))
   key += repr(organ.config).encode()
@@ -97,7 +71,7 @@ def _by_itself(m, organ: Organ, config: Config, sample: np.ndarray) -> np.ndarra
   return _alone[key]
 
 
-def of_nodes(m, organ: Organ, mass: np.ndarray, h: float, flex: int) -> np.ndarray:
+def of_nodes(m, organ: Declaration, mass: np.ndarray, h: float, flex: int) -> np.ndarray:
   """Returns the effective inertia of every node for the tools that meet `flex` [kg], (nvert,)."""
   radius = _tool_radius(m, organ, flex)
   s = organ.surface
@@ -105,14 +79,15 @@ def of_nodes(m, organ: Organ, mass: np.ndarray, h: float, flex: int) -> np.ndarr
   return effective_inertia(s, _state(s), organ.mesh, mass, organ.free, h, radius, gain)
 
 
-def of_dofs(m, organ: Organ) -> np.ndarray:
+def of_dofs(m, organ: Declaration) -> np.ndarray:
   """Returns the inertia that the dofs of every node have in the model [kg], (nvert,)."""
-  inertia = _masses(m, organ).copy()
+  inertia = masses(m, organ).copy()
   inertia[organ.free] += mjstruct.view(m.dof_armature, m.nv)[organ.dofs].reshape(-1, 3)[:, 0]
   return inertia
 
 
-def _masses(m, organ: Organ) -> np.ndarray:
+def masses(m, organ: Declaration) -> np.ndarray:
+  """Returns the mass of every node that MuJoCo or the windows give it [kg], (nvert,)."""
   if organ.windows:
     return organ.windows.mass
   return mjstruct.view(m.body_mass, m.nbody)[organ.body]
@@ -133,7 +108,7 @@ def _digest(values: np.ndarray) -> bytes:
   return hashlib.sha256(np.ascontiguousarray(values).tobytes()).digest()
 
 
-def _tool_radius(m, organ: Organ, flex: int) -> float:
+def _tool_radius(m, organ: Declaration, flex: int) -> float:
   """Returns the radius of the largest contact patch to expect [m]: that of the thickest tool.
 
   Planes and height fields touch all there is; a patch of a quarter of the organ stands for them.

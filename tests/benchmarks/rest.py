@@ -19,7 +19,8 @@ import numpy as np
 import palpate
 from palpate import models
 from palpate.engine import mjstruct
-from palpate.models import scene
+from palpate.models import markup
+from palpate.models import organs as anatomy
 
 ROUNDS, STEPS = 200, 20
 TOOLS = ("probe",)
@@ -35,8 +36,8 @@ def block(model, data, steps: int) -> float:
 def measure(nodes: int, insertion: float) -> dict:
   """Returns medians of a step's time and their ratios to the scene without the organ."""
   windowed = models.load("liver", nodes=nodes, coupling="window", instruments=TOOLS).compile()
-  shape = scene.body("liver", nodes)
-  bare = mujoco.MjModel.from_xml_string(scene.scene_xml(shape, "liver", TOOLS, False, False, False))
+  build = anatomy.build("liver", nodes)
+  bare = mujoco.MjModel.from_xml_string(markup.scene(build, "liver", TOOLS, root=None))
   variants, organs = {}, {}
   napping = windowed.__copy__()
   napping.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP

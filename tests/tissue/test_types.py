@@ -13,7 +13,7 @@ CLASSES = (
   mesh.Hinges,
   types.Surface,
   types.State,
-  workspace.Organ,
+  workspace.Declaration,
   workspace.Workspace,
 )
 
