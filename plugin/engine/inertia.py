@@ -1,4 +1,4 @@
-"""Effective inertia: the mass that a contact meets at a node, given to MuJoCo as joint armature."""
+"""Effective inertia: the mass that a contact meets at a node; MuJoCo gets it as joint armature."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from palpate.tissue.order import from_slices, to_slices
 from palpate.tissue.step import SCHEMES
 
 from . import mjstruct
-from .declare import Organ, meeting_geoms
+from .declare import Declaration, meeting_geoms
 
 # Loads whose response gives the effective inertia; between them it follows the nodal area.
 _SAMPLES = 24
@@ -32,41 +32,11 @@ _KNOWN = 64
 # A pressed shell stiffens and few nodes of a patch touch: between 1 and the limit of 2.
 _MARGIN = 1.5
 _alone: dict[bytes, np.ndarray] = {}  # what it depends on -> `_by_itself`
-_made_for: dict[bytes, tuple] = {}  # digest of an armature of ours -> time step and material
 
 
-def set_armature(m, organ: Organ, body: Body, config: Config):
-  """Gives the organ's dofs the effective inertia as armature, unless the MJCF gave them one.
-
-  Ours are recognised by their digest, so that they can follow the time step and the tissue.
-
-  Args:
-    m: the mjModel
-    organ: the organ
-    body: its tissue
-    config: its configuration in force
-  """
-  if not SCHEMES[organ.config.integrator].spreads:
-    return  # steps are those of the masses
-  armature = mjstruct.view(m.dof_armature, m.nv)
-  dofs = organ.dofs
-  present = armature[dofs]
-  of = (float(m.opt.timestep), *_material(config))
-  if present.any() and _made_for.get(_digest(present), of) == of:
-    return
-  mass = _masses(m, organ)
-  inertia = of_nodes(m, organ, body, config, mass, organ.flex)
-  added = np.repeat((inertia - mass)[organ.free], 3)
-  armature[dofs] = added
-  if len(_made_for) >= _KNOWN:
-    _made_for.pop(next(iter(_made_for)))
-  _made_for[_digest(added)] = of
-  # mj_setConst gives the same: M0 has the armature, the inverse weights, which scale the contacts'
-  # softness, are those of the masses alone for such dofs.
-  mjstruct.view(m.dof_M0, m.nv)[dofs] = np.repeat(inertia[organ.free], 3)
-
-
-def stiffness(m, organ: Organ, body: Body, config: Config, nodal: np.ndarray) -> tuple[bool, float]:
+def stiffness(
+  m, organ: Declaration, body: Body, config: Config, nodal: np.ndarray
+) -> tuple[bool, float]:
   """Returns whether tissue is stiff for the model's time step, and how much one node alone is more.
 
   It is where a push on one node moves others with it within a step: where one in four has an
@@ -84,16 +54,16 @@ def stiffness(m, organ: Organ, body: Body, config: Config, nodal: np.ndarray) ->
   """
   sample = _spread(organ.mesh.rest, np.flatnonzero(organ.free), _FEW)
   alone = _by_itself(m, organ, body, config, sample)
-  stiff = np.quantile(alone / _masses(m, organ)[sample], 0.75) > _STIFF
+  stiff = np.quantile(alone / masses(m, organ)[sample], 0.75) > _STIFF
   return bool(stiff), _PRESSED * max(1.0, float(np.median(alone / nodal[sample])))
 
 
-def _by_itself(m, organ: Organ, body: Body, config: Config, sample: np.ndarray) -> np.ndarray:
+def _by_itself(m, organ: Declaration, body: Body, config: Config, sample: np.ndarray) -> np.ndarray:
   """Returns the effective inertia of the nodes `sample` [kg], each pushed alone."""
-  h, mass = float(m.opt.timestep), _masses(m, organ)
+  h, mass = float(m.opt.timestep), masses(m, organ)
   numbers = [h, config.damping, config.foundation, config.bulk]
   key = _digest(np.concatenate([numbers, mass, organ.mesh.rest.ravel(), organ.free]))
-  key += repr((organ.config, config.integrator, _material(config))).encode()
+  key += repr((organ.config, config.integrator, material(config))).encode()
   if key not in _alone:
     if len(_alone) >= _KNOWN:
       _alone.pop(next(iter(_alone)))
@@ -106,7 +76,7 @@ def _by_itself(m, organ: Organ, body: Body, config: Config, sample: np.ndarray) 
 
 
 def of_nodes(
-  m, organ: Organ, body: Body, config: Config, mass: np.ndarray, flex: int
+  m, organ: Declaration, body: Body, config: Config, mass: np.ndarray, flex: int
 ) -> np.ndarray:
   """Returns the effective inertia of every node for the tools that meet `flex` [kg], (nvert,).
 
@@ -119,26 +89,28 @@ def of_nodes(
   return effective_inertia(scratch, organ.mesh, mass, organ.free, h, radius, gain)
 
 
-def of_dofs(m, organ: Organ) -> np.ndarray:
+def of_dofs(m, organ: Declaration) -> np.ndarray:
   """Returns the inertia that the dofs of every node have in the model [kg], (nvert,)."""
-  inertia = _masses(m, organ).copy()
+  inertia = masses(m, organ).copy()
   inertia[organ.free] += mjstruct.view(m.dof_armature, m.nv)[organ.dofs].reshape(-1, 3)[:, 0]
   return inertia
 
 
-def _masses(m, organ: Organ) -> np.ndarray:
+def masses(m, organ: Declaration) -> np.ndarray:
+  """Returns the mass of every node that MuJoCo or the windows give it [kg], (nvert,)."""
   if organ.windows:
     return organ.windows.mass
   return mjstruct.view(m.body_mass, m.nbody)[organ.body]
 
 
-def _material(config: Config) -> tuple:
+def material(config: Config) -> tuple:
+  """Returns the constants of the tissue that its stiffness follows from."""
   return tuple(getattr(config, key) for key in MATERIAL)
 
 
-def _compiled(organ: Organ, config: Config) -> Config:
+def _compiled(organ: Declaration, config: Config) -> Config:
   """Returns the compiled configuration with the material of another."""
-  return dataclasses.replace(organ.config, **dict(zip(MATERIAL, _material(config), strict=True)))
+  return dataclasses.replace(organ.config, **dict(zip(MATERIAL, material(config), strict=True)))
 
 
 def _scratch(body: Body, config: Config) -> Body:
@@ -153,7 +125,7 @@ def _digest(values: np.ndarray) -> bytes:
   return hashlib.sha256(np.ascontiguousarray(values).tobytes()).digest()
 
 
-def _tool_radius(m, organ: Organ, flex: int) -> float:
+def _tool_radius(m, organ: Declaration, flex: int) -> float:
   """Returns the radius of the largest contact patch to expect [m]: that of the thickest tool.
 
   Planes and height fields touch all there is; a patch of a quarter of the organ stands for them.

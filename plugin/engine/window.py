@@ -22,7 +22,7 @@ import warp as wp
 from palpate.tissue import step
 from palpate.tissue.types import State, System
 
-from . import inertia, mjstruct, window_nodes, window_slots
+from . import inertia, mjstruct, prepare, window_nodes, window_slots
 from .coupling import Launches, mass_addresses, option_views, wrap
 from .resident import Resident
 from .window_nodes import Nodes
@@ -309,39 +309,15 @@ def _struct(kind, values: dict):
 
 
 def settle(w, model: int):
-  """Readies the compiled model and the state for the default slots."""
-  m = mjstruct.Model.from_address(model)
-  # A slot must be no heavier than the lightest node that it may stand on.
-  win = w.organ.windows
-  mass = mjstruct.view(m.body_mass, m.nbody)
-  mass[win.body] = np.minimum(mass[win.body], win.mass.min())
-  set_inertia(w, m)
+  """Readies the state for the default slots."""
+  set_inertia(w, mjstruct.Model.from_address(model))
   w.views["plugin_state"].fill_(0.0)  # MuJoCo has not cleared it yet
-
-
-def show(w, m, shown: bool):
-  """Lets MuJoCo see the organ's own flex, or hides it, so that a step spends nothing on it.
-
-  It touches nothing and is drawn from what `draw` writes, but MuJoCo updates its vertices, boxes
-  and bounding volumes in every step, which can take longer than the organ's step. A scene has room
-  for the flex whether it was made with the one or the other: 2 (shells + elements).
-  """
-  flex, mesh = w.organ.flex, w.organ.mesh
-  shells = int((mesh.twin < 0).sum())
-  counts = (mesh.nvert, mesh.nelem, shells) if shown else (0, 0, shells + mesh.nelem)
-  names = ("flex_vertnum", "flex_elemnum", "flex_shellnum", "flex_bvhnum", "flex_bvhadr")
-  for name, count in zip(names, (*counts, 0, -1), strict=True):
-    mjstruct.view(getattr(m, name), m.nflex, np.int32)[flex] = count
-  # The broad phase passes over vertices of the world; the first one still tells whose they are.
-  start = int(mjstruct.view(m.flex_vertadr, m.nflex, np.int32)[flex])
-  body = mjstruct.view(m.flex_vertbodyid, m.nflexvert, np.int32)[start : start + mesh.nvert]
-  body[1:] = body[0] if shown else 0
 
 
 def hide(w):
   """Hides the organ's flex from MuJoCo until it is drawn again."""
   if w.counts[0]:
-    show(w, mjstruct.Model.from_address(w.model), shown=False)
+    prepare.show(mjstruct.Model.from_address(w.model), w.organ, shown=False)
 
 
 def let_sleep(w, allowed: bool):
@@ -389,7 +365,7 @@ def draw(w, model: int, data: int):
   organ = w.organ
   start = int(mjstruct.view(m.flex_vertadr, m.nflex, np.int32)[organ.flex])
   n = organ.mesh.nvert
-  show(w, m, shown=True)
+  prepare.show(m, organ, shown=True)
   if w.resident:
     w.resident.fetch()
   out = mjstruct.view(d.flexvert_xpos, (m.nflexvert, 3))[start : start + n]

@@ -17,9 +17,19 @@ from palpate.tissue import shape, step
 from palpate.tissue.body import Body
 from palpate.tissue.config import Config
 
-from . import coupling, declare, inertia, mjstruct, window, window_nodes, window_slots
+from . import (
+  coupling,
+  declare,
+  declare_windows,
+  inertia,
+  mjstruct,
+  prepare,
+  window,
+  window_nodes,
+  window_slots,
+)
 from .coupling import ANSWERED, ASLEEP, CHANGED, NFLAG, PENDING, STALE
-from .declare import Organ
+from .declare import Declaration
 from .resident import Resident
 
 _ALLOWED = int(mujoco.mjtSleepPolicy.mjSLEEP_AUTO_ALLOWED)
@@ -65,7 +75,7 @@ class Workspace:
     views: what the graphs point at, kept alive
   """
 
-  organ: Organ
+  organ: Declaration
   config: Config
   body: Body
   host: dict[str, wp.array]
@@ -221,7 +231,8 @@ def state_size(model: int, instance: int) -> int:
 
 def make(model: int, data: int, instance: int) -> Workspace:
   """Returns the workspace of an organ in a fresh mjData; gives the model an armature if needed."""
-  organ = declare.read(model, instance)
+  windowed = bool(mjstruct.config(model, instance, "window"))
+  organ = (declare_windows if windowed else declare).read(model, instance)
   m = mjstruct.Model.from_address(model)
   with _lock:
     body = bodies.worlds(organ.still)
@@ -239,8 +250,7 @@ def make(model: int, data: int, instance: int) -> Workspace:
     d, count = mjstruct.Data, len(mjstruct.Data.from_address(data).warning)
     w.warning = mjstruct.view(data + d.warning.offset, 2 * count, np.int32).data
     w.nefc = mjstruct.view(data + d.nefc.offset, 1, np.int32).data
-    if organ.windows is None:
-      inertia.set_armature(m, organ, body, organ.config)
+    prepare.fit(m, organ, body)
     # Padding nodes have a mass so that nothing divides by zero.
     mass = np.where(s.vert.numpy() >= 0, 0.0, 1.0).reshape(1, -1, 8)
     host["mass"].assign(mass)
@@ -388,7 +398,7 @@ def refresh(w: Workspace):
   m = mjstruct.Model.from_address(w.model)
   with _lock:
     if w.organ.windows is None:
-      inertia.set_armature(m, w.organ, w.body, w.config)
+      prepare.give_armature(m, w.organ, w.body, w.config)
     else:
       window.set_inertia(w, m)
     _feel(w, m)

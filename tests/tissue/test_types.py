@@ -15,7 +15,7 @@ CLASSES = (
   mesh.Mesh,
   plate.Hinges,
   step.Scheme,
-  workspace.Organ,
+  workspace.Declaration,
   workspace.Workspace,
 )
 STRUCTS = ("Shape", "Tissue", "State", "System", "Transfer")
