@@ -42,18 +42,27 @@ struct V3 { V x, y, z; };
 struct M3 { V xx, xy, xz, yx, yy, yz, zx, zy, zz; };
 struct S3 { V xx, xy, xz, yy, yz, zz; };  // symmetric
 
-// Reading and writing rows; `gather` takes component c from eight places, `at` in floats.
+// Reading and writing rows; `gather` takes component c from eight places, `at` in floats, and
+// `gather_number` numbers of one row a slice from the places of vectors.
 
 #if ON_CUDA
 PALPATE V ld(const float* p, int row, Lane lane) { return p[LANES * row + lane]; }
 PALPATE void st(float* p, int row, V v, Lane lane) { p[LANES * row + lane] = v; }
 PALPATE V gather(const float* p, const int* at, int c, Lane lane) { return p[at[lane] + LANES * c]; }
+PALPATE V gather_number(const float* p, const int* at, Lane lane) {
+  return p[at[lane] / (3 * LANES) * LANES + at[lane] % (3 * LANES)];
+}
 #else
 PALPATE V ld(const float* p, int row, Lane) { return (V) * (const Unaligned*)(p + LANES * row); }
 PALPATE void st(float* p, int row, V v, Lane) { *(Unaligned*)(p + LANES * row) = (Unaligned)v; }
 PALPATE V gather(const float* p, const int* at, int c, Lane) {
   const float* q = p + LANES * c;
   return (V){q[at[0]], q[at[1]], q[at[2]], q[at[3]], q[at[4]], q[at[5]], q[at[6]], q[at[7]]};
+}
+PALPATE V gather_number(const float* p, const int* at, Lane) {
+  V out;
+  for (int l = 0; l < LANES; ++l) out[l] = p[at[l] / (3 * LANES) * LANES + at[l] % (3 * LANES)];
+  return out;
 }
 #endif
 

@@ -164,6 +164,40 @@ class Fields:
   system: System
 
 
+@struct
+class Transfer:
+  """What lies between a mesh and the coarser ones, whose nodes follow one another.
+
+  Each level has whole slices. Offsets are those of a node's x component in floats, on the finest
+  mesh or among all coarse nodes; `ncoarse` is the number of their slices.
+  """
+
+  nlevel: int  # number of coarse meshes
+  nodes: int  # moving nodes of the finest mesh
+  threshold: float  # condition number from which cycles are used [-]
+  slice_adr: ints("nlevel + 1")  # first slice of each level
+  source: ints("ncoarse", 8)  # offset of each coarse node on the finest mesh
+  share: floats("ncoarse", 8)  # nodes of the finest that one stands for
+  # Of each level, the finest first: stiffness of a node times g / mass where g / mass is one [N/m],
+  # ends of the smoother's interval (high, low), its degree, the finest's nodes for one of its own.
+  rate: floats("nlevel + 1", 5)
+  down_adr: ints("ncoarse + 1")  # first row of each slice in `down_node`
+  down_node: ints("ndown", 8)  # offset on the next finer mesh
+  down_weight: floats("ndown", 8)  # what it gives to the coarse node [-]
+  up_adr: ints("nslice + ncoarse + 1")  # first row of each slice in `up_node`, the finest's first
+  up_node: ints("nup", 8)  # offset on the next coarser mesh
+  up_weight: floats("nup", 8)  # share of the coarse node [-]
+
+
+@struct
+class Cycle:
+  """What the kernels of the multilevel preconditioner take."""
+
+  fine: Fields
+  coarse: Fields
+  transfer: Transfer
+
+
 def allocate(kind, device, sizes: dict[str, int]):
   """Returns a struct of zeroed arrays; `sizes` has the named sizes of their shapes."""
   out = kind()
