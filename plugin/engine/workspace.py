@@ -366,10 +366,8 @@ def configure(w: Workspace, instance: int, texts: dict[str, str]):
   Raises:
     ValueError: a key may not change, or its value is not allowed.
   """
-  before, w.config = (
-    w.config,
-    configuration.change(w.organ.name, w.config, texts, w.organ.mesh.closed),
-  )
+  before = w.config
+  w.config = configuration.change(w.organ.name, before, texts, w.organ.mesh.closed)
   if w.resident:
     w.resident.stop()
   changed = {key for key in texts if getattr(before, key) != getattr(w.config, key)}
@@ -377,7 +375,7 @@ def configure(w: Workspace, instance: int, texts: dict[str, str]):
     shape.change(w.body, w.organ.mesh, w.config, ~w.organ.free)
   else:
     shape.renumber(w.body, w.config)
-  if changed.intersection(("integrator", "newton")) or w.body.levels:
+  if changed.intersection(("integrator", "newton")):
     bind(w, w.model, instance)
   if changed.intersection(configuration.MATERIAL):
     refresh(w)

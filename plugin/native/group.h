@@ -113,7 +113,7 @@ class Group {
   // Runs body(s, lane) for the slices of this thread from `from` to `to`.
   template <class Body>
   PALPATE void each(int from, int to, Body body) const {
-    const int lane = tid % LANES;
+    const Lane lane = lane_of(tid);
     for (int s = from + (tid >> 3); s < to; s += nthread >> 3) body(s, lane);
   }
 
@@ -239,7 +239,7 @@ class Slices {
   template <class Body>
   PALPATE void each(Body body) const {
     constexpr int SIZE = Own<OWN>::SIZE;
-    const int lane = tid % LANES;
+    const Lane lane = lane_of(tid);
 #pragma unroll SIZE
     for (int k = 0, s = OWN ? first + (threadIdx.x >> 3) : tid >> 3; OWN ? k < OWN : s < nslice;
          ++k, s += (OWN ? blockDim.x : nthread) >> 3)
@@ -322,7 +322,7 @@ class Quads {
         found[b].get(quad + 4 * at[b], has && !mine);
       }
       for (int b = 0; b < AHEAD; ++b) {
-        if (at[b] < 0) break;
+        if (at[b] < 0) continue;
         while (found[b].turn() != turn) found[b].get(quad + 4 * at[b]);
         body(found[b].value());
       }
@@ -344,7 +344,7 @@ class Quads {
         found[b].get(word + 2 * at[b], has && !mine);
       }
       for (int b = 0; b < AHEAD; ++b) {
-        if (at[b] < 0) break;
+        if (at[b] < 0) continue;
         while (found[b].turn() != turn) found[b].get(word + 2 * at[b]);
         body(found[b].value());
       }
