@@ -10,10 +10,11 @@ import pytest
 import trimesh
 import warp as wp
 from palpate.engine import plugin as engine
-from palpate.tissue import elastic, solver, types
 from palpate.tissue import mesh as topology
-from palpate.tissue import shape as surface
+from palpate.tissue import shape
+from palpate.tissue import step as stepping
 from palpate.tissue.config import Config
+from palpate.tissue.order import from_slices, to_slices
 from scipy.spatial import Delaunay
 
 needs_cuda = pytest.mark.skipif(not wp.is_cuda_available(), reason="needs a CUDA device")
@@ -333,57 +334,50 @@ class Scenes:
 
   @staticmethod
   def kernels(points, elem, nworld=1, device="cpu", pin=(), **config):
-    """Returns (mesh, configuration, surface, state) of an organ outside of MuJoCo."""
+    """Returns (mesh, configuration, body) of an organ outside of MuJoCo."""
     mesh = topology.build("organ", points, elem)
     settings = Config(**({"bend": 0.0} | config))
     pinned = np.zeros(mesh.nvert, bool)
     pinned[list(pin)] = True
-    constants = surface.make(mesh, settings, pinned, device)
-    with wp.ScopedDevice(constants.device):
-      elastic.calibrate(constants, types.make_state(constants))
-      state = types.make_state(constants, nworld)
-    return mesh, settings, constants, state
+    return mesh, settings, shape.make(mesh, settings, pinned, device, nworld=nworld)
 
   @staticmethod
-  def put(s, array, values):
+  def put(body, array, values):
     """Writes values per vertex, (nvert, ...) or (nworld, nvert, ...), into a sliced array."""
-    nworld = array.shape[0]
-    vert = s.vert.numpy()
-    values = np.broadcast_to(values, (nworld, s.nvert, *((3,) if len(array.shape) == 4 else ())))
-    full = np.where(vert >= 0, 0.0, 1.0)  # padding: mass 1, and
-    full = np.broadcast_to(
-      full if len(array.shape) == 3 else 0.0 * full[:, None], (nworld, s.nnode, *values.shape[2:])
-    ).copy()
-    full[:, vert >= 0] = values[:, vert[vert >= 0]]
-    array.assign(np.stack([surface.to_slices(f) for f in full]).astype(np.float32))
+    nworld, rest = array.shape[0], (3,) if len(array.shape) == 4 else ()
+    node, nnode = body.shape.node.numpy(), body.shape.nnode
+    full = np.full((nworld, nnode, *rest), 0.0 if rest else 1.0)  # padding has a mass of 1
+    full[:, node] = np.broadcast_to(values, (nworld, len(node), *rest))
+    array.assign(np.stack([to_slices(each) for each in full]).astype(np.float32))
 
   @staticmethod
-  def get(s, array, world=0):
+  def get(body, array, world=0):
     """Returns a sliced array as float64 values per vertex."""
-    return surface.from_slices(array.numpy()[world])[s.node.numpy()].astype(np.float64)
+    return from_slices(array.numpy()[world])[body.shape.node.numpy()].astype(np.float64)
 
   @staticmethod
-  def step(s, state, h, u, v=0.0, mass=1.0, force=0.0, beta=None):
-    """Returns the change of velocity of one implicit step, (nvert, 3); `beta` replaces damping."""
-    beta = s.damping if beta is None else beta
+  def step(body, h, u, v=0.0, mass=1.0, force=0.0, beta=None, scheme="implicit"):
+    """Returns the change of velocity of one step, (nvert, 3); `beta` replaces the damping."""
+    beta = body.number("damping") if beta is None else beta
+    state = body.state
     row = np.array([[h, h * h + h * beta, 0, 0]], np.float32)
-    state.step.assign(np.repeat(row, state.nworld, axis=0))
+    state.step.assign(np.repeat(row, body.nworld, axis=0))
     for array, values in (
-      (state.pos, u),
+      (state.disp, u),
       (state.vel, v),
       (state.mass, mass),
       (state.force_ext, force),
       (state.dvel_warm, 0.0),
     ):
-      Scenes.put(s, array, np.asarray(values))
-    with wp.ScopedDevice(s.device):
-      solver.step(s, state)
-    return Scenes.get(s, state.dvel)
+      Scenes.put(body, array, np.asarray(values))
+    with wp.ScopedDevice(body.device):
+      stepping.step(body, scheme)
+    return Scenes.get(body, state.dvel)
 
   @staticmethod
-  def force(s, state, u):
+  def force(body, u):
     """Returns the internal force at displacement u [N]: one step of unit mass without K in it."""
-    return Scenes.step(s, state, 1.0, u, beta=-1.0)
+    return Scenes.step(body, 1.0, u, beta=-1.0)
 
 
 kernels, put, get, step, force = (

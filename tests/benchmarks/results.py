@@ -119,10 +119,10 @@ def machine() -> dict:
   import scipy
   import warp
   from palpate import __version__
-  from palpate.tissue import quiet
+  from palpate.tissue import device as devices
 
-  quiet.lower_log_level()
-  quiet.init()
+  devices.lower_log_level()
+  devices.init()
   cpu = platform.processor()
   info = pathlib.Path("/proc/cpuinfo")
   if info.exists():

@@ -126,7 +126,7 @@ def test_effective_inertia_keeps_the_contact_iteration_stable(scenes):
   model, _, organ = scenes.load(scenes.press(h, subdivisions=3, tool=0.012))
   mass = 0.1 / organ.nvert
   inertia = mass + model.dof_armature[scenes.dofs(organ)][:, 0]
-  _, _, s, state = scenes.kernels(points, elem, **config)
+  _, _, body = scenes.kernels(points, elem, **config)
   normal = points / scenes.RADIUS
   order = np.argsort(points[:, 2])[::-1]
   patch = order[np.linalg.norm(points[order] - points[order[0]], axis=1) < 0.012]
@@ -135,7 +135,7 @@ def test_effective_inertia_keeps_the_contact_iteration_stable(scenes):
   for k, i in enumerate(patch):
     force = np.zeros(points.shape)
     force[i] = normal[i] / h
-    dvel = scenes.step(s, state, h, np.zeros(points.shape), mass=mass, force=force)
+    dvel = scenes.step(body, h, np.zeros(points.shape), mass=mass, force=force)
     response[:, k] = (dvel[patch] * normal[patch]).sum(axis=1)
   radius = np.abs(np.linalg.eigvals(inertia[patch][:, None] * response)).max()
   assert radius < 1.2  # stable up to 2; the rule aims at 1, interpolation between samples adds some

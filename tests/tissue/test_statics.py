@@ -56,12 +56,12 @@ def test_patch_with_a_linear_boundary_displacement_is_linear_inside(scenes, devi
   affine = np.array([[1.02, 0.01, 0], [0.015, 1.0, 0], [0, 0, 1]])
   config = {key: value for key, value in STATIC.items() if key != "tolerance"}
   # The rest shape is the undeformed one: hold the boundary where the map puts it.
-  mesh, _, s, state = scenes.kernels(
+  mesh, _, body = scenes.kernels(
     points, elem, device=device, pin=np.flatnonzero(~inside), tolerance=1e-7, **config
   )
   u = np.where(inside[:, None], 0, points @ affine.T - points)
   for _ in range(20):  # long steps without inertia: Newton's method for the equilibrium
-    u = u + LONG * scenes.step(s, state, LONG, u, mass=1e-6)
+    u = u + LONG * scenes.step(body, LONG, u, mass=1e-6)
   np.testing.assert_allclose(u, points @ affine.T - points, atol=1e-5 * np.abs(u).max())
   assert mesh.nvert == len(u)
 
