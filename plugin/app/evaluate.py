@@ -147,7 +147,8 @@ def _one(job: tuple[str, str, int, str | None]) -> Result:
 
 def table(name: str, policy: str, results: list[Result], reference: dict | None) -> str:
   """Returns mean and spread of return, time and every known metric, for people."""
-  from palpate.tasks.score import METRICS, Metrics, score
+  from palpate.tasks.metrics import METRICS, Metrics
+  from palpate.tasks.score import score
 
   wins = sum(r.outcome == "success" for r in results)
   low, high = _wilson(wins, len(results))
@@ -180,7 +181,8 @@ def table(name: str, policy: str, results: list[Result], reference: dict | None)
 def write_reference(path: pathlib.Path, name: str, seed: int, results: list[Result]):
   """Writes the reference of the episodes that succeeded, with seed and versions."""
   import mujoco
-  from palpate.tasks.score import Metrics, make_reference
+  from palpate.tasks.metrics import Metrics
+  from palpate.tasks.score import make_reference
 
   good = [Metrics.from_json(r.metrics) for r in results if r.outcome == "success"]
   if not good:

@@ -26,9 +26,10 @@ import numpy as np
 import palpate
 from palpate import tasks
 from palpate.tasks import episode, experts, suite
+from palpate.tasks.metrics import METRICS, Metrics
 from palpate.tasks.recorder import Recorder
 from palpate.tasks.recording import Recording
-from palpate.tasks.score import METRICS, Metrics, make_reference
+from palpate.tasks.score import make_reference
 
 SKILL_TASKS = ("touch/standard", "probe/easy", "grasp/easy", "trace/easy", "retract/easy")
 # What each novice does differently, and the metrics that must show it.
