@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from .files import replacing
 from .inputs import COLUMNS, measure
 from .metrics import EVENTS, Metrics, check_time
 
@@ -152,15 +153,8 @@ class Recording:
     entries = {"meta": np.array(json.dumps(meta, allow_nan=False)), "time": self.time}
     for kind, table in _TABLES.items():
       entries |= {f"{kind}.{name}": value for name, value in getattr(self, table).items()}
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-      with part.open("wb") as file:
-        np.savez_compressed(file, allow_pickle=False, **entries)
-        file.flush()
-        os.fsync(file.fileno())
-      os.replace(part, path)
-    finally:
-      part.unlink(missing_ok=True)
+    with replacing(path, "wb") as file:
+      np.savez_compressed(file, allow_pickle=False, **entries)
     return path
 
   @classmethod

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from .files import replacing
 from .metrics import METRICS, Metrics, Spec, Unknown, number
 from .plots import force_figure, path_figure, png, spectrum_figure
 from .recording import Recording
@@ -56,12 +57,8 @@ def write_report(
   page = render(recording, reference, title)
   path = Path(folder) / "report.html"
   path.parent.mkdir(parents=True, exist_ok=True)
-  part = path.with_name(f".{path.name}.{os.getpid()}.part")
-  try:
-    part.write_text(page, encoding="utf-8")
-    os.replace(part, path)
-  finally:
-    part.unlink(missing_ok=True)
+  with replacing(path) as file:
+    file.write(page)
   return path
 
 

@@ -23,7 +23,10 @@ reference has with an SD; a recording that lacks a metric of the reference is no
 """
 
 import dataclasses
+import functools
+import json
 import math
+import pathlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -83,6 +86,25 @@ def check_reference(reference: Any) -> None:
       raise ValueError(f"palpate-reference: {name}.mean is {mean!r}, expected a finite number")
     if sd is not None and not (_number(sd) and sd >= 0):
       raise ValueError(f"palpate-reference: {name}.sd is {sd!r}, expected a number >= 0 or null")
+
+
+def reference_path(task: str) -> pathlib.Path:
+  """Returns where the expert reference of a task such as "touch/easy" is kept."""
+  return pathlib.Path(__file__).parent / "references" / f"{task.replace('/', '_')}.json"
+
+
+@functools.cache
+def reference(task: str) -> dict[str, Any] | None:
+  """Returns the expert reference of a task, None where there is none."""
+  path = reference_path(task)
+  return read_reference(path) if path.is_file() else None
+
+
+def read_reference(path: pathlib.Path) -> dict[str, Any]:
+  """Returns the expert reference in a file; ValueError says what is wrong with it."""
+  data = json.loads(path.read_text(encoding="utf-8"))
+  check_reference(data)
+  return data
 
 
 def _number(value: Any) -> bool:

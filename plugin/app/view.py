@@ -6,8 +6,9 @@ import argparse
 from typing import Any
 
 from palpate import register
+from palpate.tasks.display import has_display
 
-from .console import CommandError, has_display
+from .console import CommandError
 
 
 def add_arguments(parser: argparse.ArgumentParser):

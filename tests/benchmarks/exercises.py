@@ -25,7 +25,7 @@ import mujoco
 import numpy as np
 import palpate
 from palpate import tasks
-from palpate.tasks import episode, experts, suite
+from palpate.tasks import episode, performer, suite
 from palpate.tasks.metrics import METRICS, Metrics
 from palpate.tasks.recorder import Recorder
 from palpate.tasks.recording import Recording
@@ -84,7 +84,7 @@ def _perform(job: tuple[str, str, int, pathlib.Path]) -> Recording:
   env = _environments[name]
   info = {"task_kwargs": {}, "performer": style}
   try:
-    recording = episode.run(env, experts.make(env, style, seed), seed, info)
+    recording = episode.run(env, performer.make(env, style, seed), seed, info)
   except episode.EpisodeError as error:
     recording = error.recording
   path.parent.mkdir(parents=True, exist_ok=True)
@@ -141,7 +141,7 @@ def speed(args: argparse.Namespace):
   rows, clock = [], time.process_time
   for name in args.tasks:
     env = tasks.load(*suite.split(name), {"random": 0})
-    act = experts.make(env)
+    act = performer.make(env)
     stepping, recording, steps = 0.0, 0.0, 0
     while stepping < args.seconds:  # whole episodes, as the metrics at the end belong to them
       timestep = env.reset()
@@ -194,7 +194,7 @@ def skill(args: argparse.Namespace):
   lines, told = [], {}
   for name in SKILL_TASKS:
     values, wins = {}, {}
-    for style in experts.STYLES:
+    for style in performer.STYLES:
       runs = list(performances(name, style, episodes, args.runs, args.processes))
       values[style] = [run.metrics() for run in runs]
       wins[style] = f"{sum(run.info['outcome'] == 'success' for run in runs)}/{episodes}"

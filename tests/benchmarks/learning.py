@@ -17,7 +17,7 @@ import time
 
 import gymnasium
 import numpy as np
-import palpate  # registers the environments
+import palpate.tasks  # registers the environments
 import torch
 from gymnasium.wrappers import FilterObservation, FlattenObservation
 from stable_baselines3 import SAC

@@ -122,7 +122,7 @@ def _row(nodes: int, feature: str, with_ms: float, without_ms: float, variant: _
 
 def _picture(variant: _Variant) -> float | None:
   """Returns the time of a picture [ms], or None where nothing can render."""
-  from palpate.app.console import prepare_gl
+  from palpate.tasks.display import prepare_gl
 
   prepare_gl()
   try:

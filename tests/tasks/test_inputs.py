@@ -54,6 +54,13 @@ def test_a_metric_of_what_is_not_recorded_is_named():
     metric("N", "-", "efficiency", "most", "this test")
 
 
+def test_every_metric_names_unit_and_direction():
+  for name, spec in METRICS.items():
+    first = spec.function.__doc__.split("\n")[0]
+    assert f"[{spec.unit}]" in first, name
+    assert f"{spec.better} is better" in first or spec.better == "higher" in first, name
+
+
 def test_metrics_cannot_be_changed_and_name_strangers():
   made = plain(LINE).metrics()
   with pytest.raises(AttributeError, match="cannot set 'time'"):

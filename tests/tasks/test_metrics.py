@@ -443,10 +443,3 @@ def test_inputs_are_left_alone():
   metrics.trace_frechet(pos, pos[:5])
   for a, b in zip((time, force, pos, quat), before, strict=True):
     np.testing.assert_array_equal(a, b)
-
-
-def test_every_metric_names_unit_and_direction():
-  for name, spec in metrics.METRICS.items():
-    first = spec.function.__doc__.split("\n")[0]
-    assert f"[{spec.unit}]" in first, name
-    assert f"{spec.better} is better" in first or spec.better == "higher" in first, name

@@ -5,6 +5,7 @@ import json
 import math
 
 import pytest
+from palpate import tasks
 from palpate.tasks import score as scoring
 from palpate.tasks.metrics import METRICS, Metrics, Unknown
 from palpate.tasks.score import WEIGHTS, make_reference, score, z_score
@@ -204,3 +205,12 @@ def test_bad_references_are_named(path, value, match):
     score(Metrics(time=1.0), reference)
   with pytest.raises(ValueError, match="format is 'list'"):
     scoring.check_reference([])
+
+
+def test_references_are_those_of_the_tasks():
+  for pair in tasks.ALL_TASKS:
+    name = "/".join(pair)
+    reference = scoring.reference(name)
+    assert reference is not None, name
+    assert reference["task"] == name and reference["n"] >= 5
+    assert {"seed", "palpate", "mujoco"} < set(reference)
