@@ -1,5 +1,6 @@
 """The exercises in Gymnasium."""
 
+import ctypes.util
 import subprocess
 import sys
 import warnings
@@ -83,6 +84,21 @@ def test_rendering():
   with pytest.raises(ValueError, match="render_mode is 'ascii'"):
     env.unwrapped.__class__(render_mode="ascii")
   env.close()
+
+
+@pytest.mark.skipif(
+  not (ctypes.util.find_library("EGL") or ctypes.util.find_library("OSMesa")),
+  reason="no way to draw without a screen",
+)
+def test_rendering_without_a_screen_and_without_being_told_how(monkeypatch):
+  for name in ("MUJOCO_GL", "PYOPENGL_PLATFORM", "DISPLAY", "WAYLAND_DISPLAY"):
+    monkeypatch.delenv(name, raising=False)
+  run(
+    "import gymnasium, palpate.tasks",
+    "env = gymnasium.make('palpate/TouchEasy-v0', render_mode='rgb_array', width=64, height=48)",
+    "env.reset(seed=0)",
+    "assert env.render().std() > 10",
+  )
 
 
 def test_human_says_that_there_is_no_display(monkeypatch):
