@@ -13,6 +13,7 @@ longer looks for entry points.
 """
 
 import contextlib
+import importlib
 from typing import TYPE_CHECKING, Any
 
 from . import registry
@@ -26,8 +27,7 @@ __all__ = ["ALL_TASKS", "BENCHMARKING", "EASY", "HARD", "TASKS_BY_DOMAIN", "load
 def __getattr__(name: str) -> Any:
   if name not in __all__:
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-  from . import suite
-
+  suite = importlib.import_module(".suite", __package__)  # which takes a second
   return getattr(suite, name)
 
 

@@ -1,7 +1,6 @@
 """The palpate command: exit codes, one-line errors, doctor, warmup, silence."""
 
 import os
-import pathlib
 import re
 import shutil
 import subprocess
@@ -57,16 +56,6 @@ def test_a_reader_that_has_enough_is_no_error(words):
       stdout=closed, stderr=subprocess.PIPE, text=True, timeout=60,
     )  # fmt: skip
   assert (done.returncode, done.stderr) == (141, "")
-
-
-def test_nothing_below_knows_the_commands():
-  root = pathlib.Path(cli.__file__).parents[1]
-  rooms = [root.parent / "tasks", root.parent / "models", *(root / r for r in ("engine", "tissue"))]
-  files = [file for room in rooms for file in room.rglob("*.py")] + list(root.glob("*.py"))
-  for file in files:
-    if file.name != "__main__.py":
-      text = file.read_text(encoding="utf-8")
-      assert not re.search(r"^\s*(from|import) .*\bapp\b", text, re.MULTILINE), file
 
 
 def test_without_a_command_it_says_what_is_missing():
