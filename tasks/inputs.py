@@ -4,15 +4,12 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from . import metrics as m
 from .metrics import METRICS, Metrics, Spec, Unknown, UnknownError
-
-if TYPE_CHECKING:
-  from .recording import Recording
 
 # What is recorded of each instrument, and the width of an entry; force is a vector or a magnitude.
 COLUMNS: dict[str, tuple[int, ...]] = {
@@ -27,8 +24,8 @@ COLUMNS: dict[str, tuple[int, ...]] = {
 }
 
 
-def measure(recording: "Recording", which: Sequence[int]) -> Metrics:
-  """Returns the metrics of some of a recording's instruments together."""
+def measure(recording: Any, which: Sequence[int]) -> Metrics:
+  """Returns the metrics of some of the instruments of a `recording.Recording` together."""
   if len(recording.time) == 0:
     return Metrics(**dict.fromkeys(METRICS, Unknown("the recording is empty")))
   each = [Inputs(recording, [i]) for i in which]
@@ -52,7 +49,7 @@ class Inputs:
   """
 
   def __init__(
-    self, recording: "Recording", which: Sequence[int], values: Mapping[str, float] | None = None
+    self, recording: Any, which: Sequence[int], values: Mapping[str, float] | None = None
   ):
     """Makes the inputs of some instruments; `values` are metrics that are known already."""
     self._recording, self._which, self._values = recording, which, values or {}

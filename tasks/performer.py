@@ -138,7 +138,8 @@ class Performer:
       self.roll = float(self.physics.drive_targets()[2])
       self.extra = np.zeros(len(self.task.components) - len(AXES))
       self._phase = self.random.uniform(0, 2 * math.pi, (len(_TREMOR_HZ), 3))
-      self._steps = self.task.expert(self)
+      script: Script = self.task.expert(self)
+      self._steps = script
     try:
       return next(self._steps)
     except StopIteration:

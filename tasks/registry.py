@@ -15,8 +15,8 @@ _TASK = re.compile(r"^@SUITE\.add\([^)]*\)\ndef (\w+)\(", re.MULTILINE)
 
 def _find() -> dict[str, tuple[str, ...]]:
   # Read, not imported: dm_control takes a second, which nobody should wait for to see names.
-  found = {}
-  for file in sorted(importlib.resources.files(__package__).iterdir(), key=lambda file: file.name):
+  found, folder = {}, importlib.resources.files("palpate.tasks")
+  for file in sorted(folder.iterdir(), key=lambda file: file.name):
     if file.name.endswith(".py") and (names := _TASK.findall(file.read_text(encoding="utf-8"))):
       found[file.name.removesuffix(".py")] = tuple(names)
   return found

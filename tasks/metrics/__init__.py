@@ -1,4 +1,4 @@
-# ruff: noqa: F401, F403
+# ruff: noqa: F403
 """Skill metrics: pure functions of arrays, in SI units.
 
 A metric that cannot be known (no contact, no motion, nothing recorded) is an `Unknown`: a NaN that
@@ -9,9 +9,9 @@ A function under `@metric(...)` in `force`, `motion` or `outcome` is a metric: `
 recordings compute it, and scores, reports and evaluations show it.
 """
 
-from .definition import METRICS, Spec, Unknown, UnknownError, metric, number
+from .definition import *
 from .force import *
 from .motion import *
 from .outcome import *
 from .samples import *
-from .values import Metrics, check_header, check_names
+from .values import *
