@@ -135,7 +135,7 @@ class Scenes:
   @staticmethod
   def dof(organ):
     """Returns the degrees of freedom of each moving vertex, (nfree, 3)."""
-    return organ._dofs
+    return organ.dofs
 
   @staticmethod
   def run(model, data, steps, record=False, speed=0.1, deepest=0.008):

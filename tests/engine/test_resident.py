@@ -216,8 +216,8 @@ def test_sleeping_organ_wakes(at_rest, what):
     mujoco.mj_step(m, d, nstep=300)
     assert np.abs(organ.contact_force).max() > 0.005
   elif what == "force":
-    slot = int(np.flatnonzero(organ._space.views["placed"].numpy() >= 0)[0])
-    d.xfrc_applied[organ._organ.windows.body[slot], 2] = 0.01
+    slot = int(np.flatnonzero(organ.slots >= 0)[0])
+    d.xfrc_applied[organ.bodies[slot], 2] = 0.01
   elif what == "gravity":
     m.opt.gravity[:] = 9.81, 0, 0
   elif what == "parameter":
@@ -339,7 +339,7 @@ def test_tool_may_go_half_of_its_distance_from_the_surface(swing, height):
   d.qpos[-2] = d.ctrl[0] = height
   mujoco.mj_step(m, d, nstep=250)
   assert organ.asleep
-  leeway = organ._space.views["plugin_state"].numpy()[-1]
+  leeway = engine.find(d._address, 0).plugin_state[-1]
   n = 60
   a, b = np.array([(i / n, j / n) for i in range(n + 1) for j in range(n + 1 - i)]).T[:, :, None]
   x, y, z = organ.xpos[organ.elem].transpose(1, 0, 2)[:, :, None]
@@ -417,8 +417,8 @@ def test_states_of_an_organ_whose_slots_mujoco_skips():
 def test_force_on_a_slot_that_mujoco_skips_wakes_the_organ():
   m, d, organ = hovering(flag=MUJOCO_SLEEPS)
   mujoco.mj_step(m, d, nstep=250)
-  slot = int(np.flatnonzero(organ._space.views["placed"].numpy() >= 0)[0])
-  d.xfrc_applied[organ._organ.windows.body[slot], 2] = 0.01
+  slot = int(np.flatnonzero(organ.slots >= 0)[0])
+  d.xfrc_applied[organ.bodies[slot], 2] = 0.01
   mujoco.mj_step(m, d)
   assert not organ.asleep and d.nv_awake == m.nv
   mujoco.mj_step(m, d, nstep=19)

@@ -21,17 +21,11 @@ def load(coupling, device, h=2e-3, **keys):
   return m, d, palpate.Organ(m, d, "organ")
 
 
-def masses(organ):
-  if organ._organ.windows:
-    return organ._organ.mass
-  return np.full(organ.nvert, 0.1 / organ.nvert)
-
-
 @pytest.mark.parametrize("coupling", COUPLINGS)
 def test_the_step_is_implicit_in_the_contact_forces_that_the_step_finds(coupling, device):
   m, d, organ = load(coupling, device, bend=0)
   step = exact.Step(
-    exact.Elastic(organ._organ.mesh, organ.config), masses(organ), np.ones(organ.nvert, bool)
+    exact.Elastic(organ.mesh, organ.config), organ.mass, np.ones(organ.nvert, bool)
   )
   seen = 0
   u, v, before = np.zeros((3, organ.nvert, 3))
@@ -55,7 +49,7 @@ def excess(m, d, organ, steps):
   """Returns the most energy that the organ has beyond the contacts' work, and that work."""
   work = gross = most = 0.0
   x = organ.xpos
-  mass = masses(organ)[:, None]
+  mass = organ.mass[:, None]
   for _ in range(steps):
     windowed.drive(m, d, 1)
     each = organ.contact_force * (organ.xpos - x)
@@ -101,10 +95,10 @@ def test_tissue_is_stiff_for_a_time_step(device):
   m, d, organ = soft
   m.opt.timestep = 2e-2
   mujoco.mj_step(m, d, 2)
-  assert organ._space.stiff
+  assert organ.stiff
   m.opt.timestep = 1e-3
   mujoco.mj_step(m, d, 2)
-  assert not organ._space.stiff
+  assert not organ.stiff
 
 
 def test_a_light_organ_is_not_heavier_for_its_window(device):

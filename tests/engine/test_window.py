@@ -16,7 +16,7 @@ from windowed import drive, scene
 def nodal_masses(m, organ):
   """Gives a nodal organ the area-lumped masses of a windowed one."""
   area = topology.vertex_areas(organ.xpos0, organ.elem)
-  bodies = organ._organ.body
+  bodies = organ.bodies
   m.body_mass[bodies] = 0.1 * area / area.sum()
   mujoco.mj_setConst(m, mujoco.MjData(m))
 

@@ -12,7 +12,7 @@ LONG = 1.0
 
 
 def _load(organ, data, forces):
-  data.qfrc_applied[organ._dofs] = forces[organ.free]
+  data.qfrc_applied[organ.dofs] = forces[organ.free]
 
 
 def _edge_load(points, at, force):
