@@ -90,57 +90,6 @@ class Organ:
     return self._organ.origin + self._organ.mesh.rest @ self._organ.frame.T
 
   @property
-  def dofs(self) -> np.ndarray:
-    """Degrees of freedom of the vertices that move, or of the windows' slots, (n, 3)."""
-    return self._organ.dofs.reshape(-1, 3)
-
-  @property
-  def qposadr(self) -> np.ndarray:
-    """Where they are in qpos, (n, 3)."""
-    return self._organ.qposs.reshape(-1, 3)
-
-  @property
-  def bodies(self) -> np.ndarray:
-    """Body of each vertex, (nvert,), or of each of the windows' slots, (nslot,)."""
-    return self._organ.windows.body if self._organ.windows else self._organ.body
-
-  @property
-  def slots(self) -> np.ndarray:
-    """Vertex on which each of the windows' slots stands, -1 for none, (nslot,)."""
-    return self._space.slots.copy() if self._organ.windows else np.zeros(0, int)
-
-  @property
-  def mass(self) -> np.ndarray:
-    """Mass of each vertex [kg], (nvert,)."""
-    return self._space.mass(self.model._address)
-
-  @property
-  def inertia(self) -> np.ndarray:
-    """Effective inertia of each vertex, which contacts meet [kg], (nvert,)."""
-    return self._space.inertia(self.model._address)
-
-  @property
-  def stiff(self) -> bool:
-    """Whether the organ answers contacts after MuJoCo's step, because it is stiff for the step."""
-    return self._space.stiff
-
-  @property
-  def frame(self) -> np.ndarray:
-    """Rotation from the organ's frame to the world, (3, 3)."""
-    return self._organ.frame
-
-  @property
-  def mesh(self) -> topology.Mesh:
-    """Rest shape, in the organ's frame, and topology."""
-    return self._organ.mesh
-
-  @property
-  def levels(self) -> int:
-    """Number of coarser levels of the solve."""
-    levels = self._organ.surface.levels
-    return 0 if levels is None else levels.nlevel
-
-  @property
   def displacement(self) -> np.ndarray:
     """Displacement from rest [m], in the frame of the parent body, (nvert, 3)."""
     return self._motion.displacement(self.model, self.data)
@@ -210,7 +159,7 @@ class Organ:
   @property
   def device(self) -> str:
     """Device the organ is solved on."""
-    return self._organ.surface.device.alias
+    return self._organ.still.device.alias
 
   def set_state(self, xpos: np.ndarray | None = None, xvel: np.ndarray | None = None):
     """Places the organ; pinned vertices stay, and forces of the past are forgotten.

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import warp as wp
-from palpate.tissue import elastic, schemes, solver
+from palpate.tissue import step
+from palpate.tissue.body import Body
 
 from . import coupling, declare, graphs, mjstruct, window, window_nodes, window_slots
 
@@ -12,13 +13,12 @@ from . import coupling, declare, graphs, mjstruct, window, window_nodes, window_
 def bind(w, model: int):
   """Points the graphs at the arrays of `model` and of the workspace's mjData and records them."""
   m = mjstruct.Model.from_address(model)
-  device, cpu = w.surface.device, wp.get_device("cpu")
+  device, cpu = w.body.device, wp.get_device("cpu")
+  scheme = step.SCHEMES[w.config.integrator]
   side = window if w.organ.windows else coupling
   with graphs.lock:
     declare.check_frame(m, w.organ)
-    load(device)
-    if w.surface.levels is not None:
-      wp.load_module(solver.multilevel().__name__, device=device)
+    load(w.body)
     if w.resident:
       w.resident.fetch()
     launches = side.launches(w, model, w.instance)
@@ -28,23 +28,23 @@ def bind(w, model: int):
     def solve():
       if crossing:
         _cross(w, _IN, to_device=True)
-      schemes.step(w.surface, w.state, w.config.integrator)
+      scheme.step(w.body)
       if crossing:
         _cross(w, _OUT, to_device=False)
 
     def respond():
       if crossing:
         _cross(w, ("rhs",), to_device=True)
-      schemes.respond(w.surface, w.state, w.config.integrator)
+      scheme.respond(w.body)
       if crossing:
-        _cross(w, ("x", "status"), to_device=False)
+        _cross(w, ("sol", "status"), to_device=False)
 
     w.before = graphs.record(cpu, launches.gather)
     w.solve = graphs.record_all((near, launches.enter), (device, solve), (near, launches.look))
     w.after = graphs.record(cpu, launches.scatter)
     w.leave = graphs.record(cpu, launches.leave)
     w.respond = []
-    if w.config.integrator in schemes.RESPONDING:
+    if scheme.respond:
       w.respond = graphs.record_all(
         (near, launches.push), (device, respond), (near, launches.answer)
       )
@@ -68,22 +68,28 @@ def bind(w, model: int):
 
 
 # What a solve on another device than MuJoCo's side reads and writes.
-_IN = ("step", "pos", "vel", "mass", "force_ext", "dvel_warm")
+_IN = ("step", "disp", "vel", "mass", "force_ext", "dvel_warm")
 _OUT = ("dvel", "status")
 CROSSING = (*_IN, *_OUT)
 
 
+def field_of(body: Body, name: str) -> wp.array:
+  """Returns an array of a body's state or system."""
+  return getattr(body.state if hasattr(body.state, name) else body.system, name)
+
+
 def _cross(w, fields: tuple[str, ...], to_device: bool):
   for field in fields:
-    there, here = getattr(w.state, field), w.host[field]
+    there, here = field_of(w.body, field), w.host[field]
     if to_device:
       wp.copy(there, here)
     else:
       wp.copy(here, there)
 
 
-def load(device):
-  """Loads the modules of a step on a device, compiling them where the cache has none."""
-  for module in (elastic, solver, schemes, coupling, window_nodes, window_slots):
-    wp.load_module(module.__name__, device=device)
-    wp.load_module(module.__name__, device="cpu")
+def load(body: Body):
+  """Loads the modules of a step on a body's device, compiling them where the cache has none."""
+  mine = [module.__name__ for module in (coupling, window_nodes, window_slots)]
+  for module in (*step.modules(body), *mine):
+    wp.load_module(module, device=body.device)
+    wp.load_module(module, device="cpu")

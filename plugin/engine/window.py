@@ -19,7 +19,8 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 import warp as wp
-from palpate.tissue import solver
+from palpate.tissue import step
+from palpate.tissue.types import State, System
 
 from . import inertia, mjstruct, prepare, window_nodes, window_slots
 from .coupling import Launches, mass_addresses, option_views, wrap
@@ -42,7 +43,7 @@ def state_size(nvert: int, nslot: int, ngeom: int) -> int:
 
 def launches(w, model: int, instance: int) -> Launches:
   """Returns the launches of window coupling for a workspace."""
-  organ, s = w.organ, w.surface
+  organ, s = w.organ, w.body
   win = organ.windows
   nslot, nvert = win.nslot, organ.mesh.nvert
   side = s.device if w.config.resident else wp.get_device("cpu")
@@ -72,7 +73,7 @@ def launches(w, model: int, instance: int) -> Launches:
   def send():
     if away:
       wp.copy(v["outbox"], nodes.outbox)
-      wp.copy(w.host["status"], w.state.status)
+      wp.copy(w.host["status"], w.body.system.status)
 
   def end_step():
     over_nodes(window_nodes.commit)
@@ -205,8 +206,8 @@ def _slots(w, model: int) -> Slots:
     "most": _most(w),
     "no_gravity": int(mujoco.mjtDisableBit.mjDSBL_GRAVITY),
     "resident": int(w.config.resident),
-    "damping": w.surface.damping,
-    "rest_share": solver.REST,
+    "number": w.body.numbers,
+    "rest_share": step.REST,
     "reach": max(_REACH * spacing, float(longest.max())) + radius,
     "slow": _SLOW * float(np.linalg.norm(np.ptp(mesh.rest, axis=0))),
     "longest": float(longest.max()),
@@ -263,7 +264,7 @@ def _slots(w, model: int) -> Slots:
 
 def _nodes(w, side: wp.Device) -> Nodes:
   """Returns the kernels' view of the nodes: plugin state on the CPU, own arrays elsewhere."""
-  organ, s, v = w.organ, w.surface, w.views
+  organ, s, v = w.organ, w.body.shape, w.views
   nvert, nslot, nwindow = organ.mesh.nvert, organ.windows.nslot, len(organ.windows.flex)
   node = s.node.numpy()
   address, size = v["plugin_state"].ptr, 3 * nvert
@@ -271,12 +272,15 @@ def _nodes(w, side: wp.Device) -> Nodes:
     motion = [wp.zeros(size, dtype=wp.float64, device=side) for _ in range(4)]
   else:
     motion = [wrap(address + 8 * k * size, size) for k in range(4)]
-  solving = w.state if w.config.resident else None
-  crossing = ("step", "pos", "vel", "force_ext", "dvel_warm", "dvel", "rhs", "x", "status")
+  solving = w.host
+  if w.config.resident:
+    solving = {k: getattr(w.body.state, k) for k in State.vars}
+    solving |= {k: getattr(w.body.system, k) for k in System.vars}
+  crossing = ("step", "disp", "vel", "force_ext", "dvel_warm", "dvel", "rhs", "sol", "status")
   mass = np.ones(s.nnode)
   mass[node] = organ.windows.mass
   w.host["mass"].assign(mass.reshape(1, -1, 8).astype(np.float32))
-  wp.copy(w.state.mass, w.host["mass"])
+  wp.copy(w.body.state.mass, w.host["mass"])
   numbers = {"nvert": nvert, "nslot": nslot, "nwindow": nwindow, "most": _most(w)}
   lowest = np.full(7, window_nodes.LOWEST)
   arrays = {
@@ -291,7 +295,7 @@ def _nodes(w, side: wp.Device) -> Nodes:
     "outbox": v["outbox"] if not side.is_cuda else wp.clone(v["outbox"], device=side),
     "count": _ints(np.zeros(nwindow)).to(side),
     "extent": _ints(lowest).to(side),
-    **{k: getattr(solving, k) if solving else w.host[k] for k in crossing},
+    **{{"disp": "pos", "sol": "x"}.get(k, k): solving[k] for k in crossing},
   }
   return _struct(Nodes, numbers | arrays)
 
@@ -364,11 +368,9 @@ def wake(w):
 def set_inertia(w, m):
   """Stores the effective inertia of every node for the present time step."""
   organ, win = w.organ, w.organ.windows
-  h = float(m.opt.timestep)
-  if w.config.integrator == "explicit":
-    nodal = win.mass
-  else:
-    nodal = inertia.of_nodes(m, organ, win.mass, h, int(win.flex[0]))
+  nodal = win.mass
+  if step.SCHEMES[w.config.integrator].spreads:
+    nodal = inertia.of_nodes(m, organ, w.body, w.config, win.mass, int(win.flex[0]))
   w.views["inertia"].assign(nodal)
 
 

@@ -8,10 +8,11 @@ from typing import Any
 import mujoco
 import numpy as np
 import warp as wp
+from palpate.tissue import body as bodies
 from palpate.tissue import config as configuration
-from palpate.tissue import types
+from palpate.tissue import shape
+from palpate.tissue.body import Body
 from palpate.tissue.config import Config
-from palpate.tissue.types import State, Surface
 
 from . import (
   declare,
@@ -24,7 +25,7 @@ from . import (
   window,
   window_nodes,
 )
-from .bind import CROSSING, bind
+from .bind import CROSSING, bind, field_of
 from .coupling import ANSWERED, ASLEEP, CHANGED, NFLAG, PENDING, STALE
 from .declare import Declaration
 from .resident import Resident
@@ -42,9 +43,8 @@ class Workspace:
   Attributes:
     organ: constants
     config: configuration in force, which may differ from the compiled one
-    surface: constants on the device with the numbers of `config`
-    state: solver state on the organ's device
-    host: the arrays of `state` that MuJoCo's side reads and writes, on the CPU
+    body: shape, tissue and state on the organ's device
+    host: the arrays of its state that MuJoCo's side reads and writes, on the CPU
     ext: external and lagged contact force in float64 [N]  (3 nnode,)
     data: address of the mjData
     instance: the plugin instance
@@ -87,8 +87,7 @@ class Workspace:
 
   organ: Declaration
   config: Config
-  surface: Surface
-  state: State
+  body: Body
   host: dict[str, wp.array]
   ext: wp.array
   data: int
@@ -249,10 +248,6 @@ class Workspace:
     """Node of each slot in the model, -1 for none, (nslot,)."""
     return self.views["placed"].numpy()
 
-  def mass(self, model: int) -> np.ndarray:
-    """Returns the mass of each vertex in a model [kg], (nvert,)."""
-    return inertia.masses(mjstruct.Model.from_address(model), self.organ).copy()
-
   def inertia(self, model: int) -> np.ndarray:
     """Returns the inertia that contacts meet at each vertex [kg], (nvert,)."""
     if self.organ.windows:
@@ -301,19 +296,19 @@ def make(model: int, data: int, instance: int) -> Workspace:
   with graphs.lock:
     organ = (declare_windows if windowed else declare).read(model, instance)
     m = mjstruct.Model.from_address(model)
-    s = organ.surface
-    state = types.make_state(s)
+    body = bodies.worlds(organ.still)
+    s = body.shape
     host = {}
-    for field in (*CROSSING, "rhs", "x"):
-      array = getattr(state, field)
-      if s.device.is_cuda:
+    for field in (*CROSSING, "rhs", "sol"):
+      array = field_of(body, field)
+      if body.device.is_cuda:
         array = wp.zeros(array.shape, dtype=float, device="cpu", pinned=True)
       host[field] = array
     size = organ.windows.nslot if organ.windows else s.nnode
     ext = wp.zeros(3 * size, dtype=wp.float64, device="cpu")
-    w = Workspace(organ, organ.config, s, state, host, ext, data, instance)
+    w = Workspace(organ, organ.config, body, host, ext, data, instance)
     _view(w, mjstruct.Data.from_address(data), m)
-    prepare.fit(m, organ)
+    prepare.fit(m, organ, body)
     # Padding nodes have a mass so that nothing divides by zero.
     mass = np.where(s.vert.numpy() >= 0, 0.0, 1.0).reshape(1, -1, 8)
     host["mass"].assign(mass)
@@ -344,11 +339,11 @@ def _view(w: Workspace, d, m):
 def _feel(w: Workspace, m):
   """Notes whether the organ is stiff for the present time step."""
   nodal = w.inertia(w.model)
-  w.stiff, w.heaviest[0] = inertia.stiffness(m, w.organ, w.config, nodal)
+  w.stiff, w.heaviest[0] = inertia.stiffness(m, w.organ, w.body, w.config, nodal)
 
 
 def configure(w: Workspace, model: int, texts: dict[str, str]):
-  """Changes configuration keys while running and records the step anew.
+  """Changes configuration keys while running.
 
   Raises:
     ValueError: a key may not change, or its value is not allowed.
@@ -364,16 +359,20 @@ def copy(w: Workspace, model: int, other: Workspace):
 
 
 def _change(w: Workspace, model: int, config: Config):
+  before, w.config = w.config, config
+  if w.resident:
+    w.resident.stop()
+  material = any(getattr(before, key) != getattr(config, key) for key in configuration.MATERIAL)
   with graphs.lock:
-    w.config = config
-    numbers = ("iterations", "tolerance", "newton", "damping", "foundation", "bulk", "pressure")
-    w.surface = dataclasses.replace(w.surface, **{k: getattr(config, k) for k in numbers})
-    # Terms that were off have no arrays yet.
-    fresh = types.make_state(w.surface)
-    if fresh.areavec.shape != w.state.areavec.shape:
-      w.state.areavec = fresh.areavec
+    if material:
+      shape.change(w.body, w.organ.mesh, config, ~w.organ.free)
+    else:
+      shape.renumber(w.body, config)
     bind(w, model)
-    _feel(w, mjstruct.Model.from_address(model))
+    if material:
+      refresh(w)
+    else:
+      _feel(w, mjstruct.Model.from_address(model))
   if w.turn is not None:
     window.wake(w)
 
@@ -385,11 +384,11 @@ def sync(w: Workspace):
 
 
 def refresh(w: Workspace):
-  """Renews the armature after the time step was changed; see `inertia`."""
+  """Renews the effective inertia after the time step or the material changed; see `inertia`."""
   m = mjstruct.Model.from_address(w.model)
   with graphs.lock:
     if w.organ.windows is None:
-      prepare.give_armature(m, w.organ)
+      prepare.give_armature(m, w.organ, w.body, w.config)
     else:
       window.set_inertia(w, m)
     _feel(w, m)
