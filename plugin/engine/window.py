@@ -314,6 +314,21 @@ def settle(w, model: int):
   w.views["plugin_state"].fill_(0.0)  # MuJoCo has not cleared it yet
 
 
+def find_astray(w) -> float:
+  """Returns how far a slot is from the node that the plugin state says it is on, at most [m]."""
+  if w.plugin_state[-window_slots.TAIL] < 0:  # that motion is on a device, and the slots have moved
+    return np.inf if w.stood else 0.0
+  win, n, state = w.organ.windows, w.organ.mesh.nvert, w.plugin_state
+  number = state[12 * n + 3 * win.nslot : 12 * n + 4 * win.nslot]
+  node = np.where(number == 0, win.home, np.where((number >= 1) & (number <= n), number - 1, -1))
+  used = np.flatnonzero(node >= 0)
+  node = node[used].astype(int)
+  first = win.qposadr[used, None] + np.arange(3)
+  qpos = mjstruct.view(mjstruct.Data.from_address(w.data).qpos, first.max(initial=-1) + 1)[first]
+  u = state[: 3 * n].reshape(n, 3)[node]
+  return float(np.abs(qpos - win.qhome[used] - w.organ.mesh.rest[node] - u).max(initial=0.0))
+
+
 def hide(w):
   """Hides the organ's flex from MuJoCo until it is drawn again."""
   if w.counts[0]:

@@ -176,7 +176,7 @@ def parts(w) -> dict:
     end=launches.end or (lambda: None),
   )
   state[:] = kept
-  workspace.bind(w, w.model, 0)
+  workspace.bind(w, w.model)
   rest_of_step = solving["step"] - solving["assemble"] - solving["solve"]
   return {
     "search_ms": around["search"],

@@ -10,7 +10,7 @@ import mujoco
 import palpate
 from benchmarks.runner import Bench, Case, Row
 from palpate import tasks
-from palpate.tasks import experts, suite
+from palpate.tasks import performer, suite
 from palpate.tasks.recorder import Recorder
 
 NAMES = ["/".join(pair) for pair in tasks.ALL_TASKS]
@@ -33,7 +33,7 @@ def run(case: Case, out: pathlib.Path) -> list[Row]:
   """Returns the row of an exercise."""
   name, clock = case["task"], time.process_time
   env = tasks.load(*suite.split(name), {"random": 0})
-  act = experts.make(env)
+  act = performer.make(env)
   stepping, recording, steps = 0.0, 0.0, 0
   while stepping < case["seconds"]:  # whole episodes, as the metrics at the end belong to them
     timestep = env.reset()
