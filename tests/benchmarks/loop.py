@@ -27,8 +27,8 @@ from benchmarks import results
 from benchmarks.runner import Bench, Case, Row
 from palpate.engine import window, workspace
 from palpate.models import grid
-from palpate.tissue import elastic, solver
-from palpate.tissue.elastic import Stage
+from palpate.tissue import step as stepping
+from palpate.tissue.types import Stage
 
 RADIUS, H = 0.05, 1e-3
 
@@ -143,8 +143,8 @@ def timed(w, spent: dict):
       return original(graph, *args)
     before = time.perf_counter()
     original(graph, *args)
-    if w.surface.device.is_cuda:
-      wp.synchronize_device(w.surface.device)
+    if w.body.device.is_cuda:
+      wp.synchronize_device(w.body.device)
     spent["device"] += time.perf_counter() - before
 
   wp.capture_launch = capture_launch
@@ -154,15 +154,15 @@ def timed(w, spent: dict):
 
 def parts(w) -> dict:
   """Returns what each part of a step's work on the organ's device takes, medians in ms."""
-  s, d = w.surface, w.state
+  body = w.body
   workspace.sync(w)
   state = w.views["plugin_state"].numpy()
   kept = state.copy()
   solving = replay(
-    s.device,
-    assemble=lambda: assemble(s, d),
-    solve=lambda: solver.solve(s, d, Stage.FIRST),
-    step=lambda: solver.step(s, d),
+    body.device,
+    assemble=lambda: stepping.assemble(body, Stage.FIRST),
+    solve=lambda: stepping.solve(body, Stage.FIRST),
+    step=lambda: stepping.step(body),
   )
   launches = window.launches(w, w.model, 0)
   side = wp.get_device(launches.side)
@@ -185,13 +185,6 @@ def parts(w) -> dict:
     "solve_ms": solving["solve"],
     "integrate_ms": around["enter"] + around["end"] + max(0.0, rest_of_step),
   }
-
-
-def assemble(s, d):
-  """Writes the matrices of a step."""
-  elastic.assemble(s, d, Stage.FIRST)
-  if s.levels is not None:
-    solver.multilevel().assemble(s, d)
 
 
 def replay(device, **works) -> dict[str, float]:
