@@ -8,6 +8,7 @@ bending); nslot rows of stiffness blocks; nlist, nfan, nwedge rows of fans (see 
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 import dataclasses
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -26,6 +27,11 @@ def floats(*dims) -> Array:
   return Array(wp.float32, dims)
 
 
+def doubles(*dims) -> Array:
+  """Returns the type of an array of float64."""
+  return Array(wp.float64, dims)
+
+
 def ints(*dims) -> Array:
   """Returns the type of an array of int32."""
   return Array(wp.int32, dims)
@@ -34,7 +40,7 @@ def ints(*dims) -> Array:
 DIMS: dict[str, dict[str, tuple]] = {}  # struct and field -> its shape
 
 
-def struct(cls):
+def struct(cls) -> Any:
   """Returns a Warp struct whose arrays have the shapes of the annotations."""
   kinds = cls.__annotations__
   arrays = {name: kind for name, kind in kinds.items() if isinstance(kind, Array)}
