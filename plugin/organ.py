@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import mujoco
 import numpy as np
-from palpate.engine.coupling import MISSED_ELEMENTS, MISSED_NODES
+from palpate.engine.layout import FLAG
 from palpate.tissue.config import Config
 
 from .engine import plugin as engine
@@ -124,16 +124,15 @@ class Organ:
       out = np.zeros((self.nvert, 3))
       node = self._space.views["placed"].numpy()
       used = node >= 0
-      start = 12 * self.nvert
-      force = self.data.plugin_state[self._plugin_state][start : start + 3 * len(node)]
-      out[node[used]] = force.reshape(-1, 3)[used] @ self._organ.frame.T
+      force = self._space.boxes["own"].force.numpy()
+      out[node[used]] = force[used] @ self._organ.frame.T
       return out
     return self._to_world(self.data.qfrc_constraint)
 
   @property
   def window_overflow(self) -> tuple[int, int]:
     """Touched nodes and triangles that the windows had no room for in the last step."""
-    return int(self._space.flags[MISSED_NODES]), int(self._space.flags[MISSED_ELEMENTS])
+    return int(self._space.flags[FLAG.missed_nodes]), int(self._space.flags[FLAG.missed_elements])
 
   @property
   def window_warning(self) -> str | None:
@@ -242,8 +241,8 @@ class Organ:
   def _own_state(self, k: int) -> np.ndarray:
     """Returns the displacement (0) or velocity (1) in the plugin state of a windowed organ."""
     workspace.sync(self._space)
-    size = 3 * self.nvert
-    return self.data.plugin_state[self._plugin_state][k * size : (k + 1) * size].reshape(-1, 3)
+    motion = self._space.boxes["own"].motion
+    return (motion.disp, motion.vel)[k].numpy()
 
   def _to_world(self, generalized: np.ndarray) -> np.ndarray:
     out = np.zeros((self.nvert, 3))

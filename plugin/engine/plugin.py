@@ -20,8 +20,8 @@ import mujoco
 import numpy as np
 from palpate.tissue.config import KEYS
 
-from . import mjstruct, window, workspace
-from .coupling import MISSED_ELEMENTS, MISSED_NODES
+from . import mjstruct, windowed, workspace
+from .layout import FLAG
 from .workspace import Workspace
 
 NAME = "palpate.organ"
@@ -172,7 +172,7 @@ def _advance(model: int, data: int, instance: int):
   w = _workspaces[data, instance]
   try:
     w.step()
-    if w.overflow is None and (w.flags[MISSED_NODES] or w.flags[MISSED_ELEMENTS]):
+    if w.overflow is None and (w.flags[FLAG.missed_nodes] or w.flags[FLAG.missed_elements]):
       _overflow(w)
     if w.model_step[0] != w.time_step:
       workspace.refresh(w)
@@ -182,7 +182,7 @@ def _advance(model: int, data: int, instance: int):
 
 def _overflow(w: Workspace):
   """Says, once, that a window is too small."""
-  nodes, triangles = int(w.flags[MISSED_NODES]), int(w.flags[MISSED_ELEMENTS])
+  nodes, triangles = int(w.flags[FLAG.missed_nodes]), int(w.flags[FLAG.missed_elements])
   what = f"{triangles} triangles between their nodes; give them more elements"
   if nodes:
     what = f"{nodes} nodes that tools touch and keep the deepest; give them more vertices"
@@ -194,7 +194,7 @@ def _visualize(model: int, data: int, option: int, scene: int, instance: int):
   w = _workspaces[data, instance]
   try:
     if w.organ.windows:
-      window.draw(w, model, data)
+      windowed.draw(w, model, data)
   except Exception as error:
     _fail(w, f"{type(error).__name__}: {error}")
 

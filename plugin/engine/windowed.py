@@ -1,17 +1,13 @@
-"""What MuJoCo sees of an organ through windows: small flexes that slide over it, under the tools.
+"""Windows: what MuJoCo sees of an organ are small flexes that slide over it, under the tools.
 
 Only nodes near a tool need degrees of freedom of MuJoCo: the organ's motion lives in
 `plugin_state`, and each window's vertex bodies ("slots") stand on the nodes nearest to the tool,
 with their position, velocity and effective inertia. The window's triangles are the organ's
-triangles between them. Forces follow the formula of `coupling`; a node outside the window moves by
-dv exactly as it would with dofs of its own and no contact.
+triangles between them. Forces follow the same formula as on all nodes; a node outside the window
+moves by dv exactly as it would with dofs of its own and no contact.
 
-plugin_state: displacement, velocity, last dv and the dv before (3 nvert each), contact force (3 W),
-slots (W; node + 1, 0 for the slot's default node, -1 for a slot that is not used), poses of the
-windows' geoms when the organ fell asleep (12 each), `TAIL` numbers.
-
-The nodes' kernels (`window_nodes`) run on the CPU over that memory, or, for a `resident` organ, on
-its device over a copy that `Resident` keeps; the slots' kernels (`window_slots`) on the CPU.
+The nodes' kernels (`nodes`) run on the CPU over the plugin state, or, for a `resident` organ, on
+its device over a copy that `Resident` keeps; the slots' kernels (`slots`) on the CPU.
 """
 
 from __future__ import annotations
@@ -19,289 +15,164 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 import warp as wp
-from palpate.tissue import solver
 
-from . import inertia, mjstruct, prepare, window_nodes, window_slots
-from .coupling import Launches, mass_addresses, option_views, wrap
+from . import coupling, inertia, layout, mjstruct, nodes, prepare, slots
+from .layout import TAIL, Inbox, Motion, Outbox, WindowState
 from .resident import Resident
-from .window_nodes import Nodes
-from .window_slots import Slots
 
-# Nodes within this many mean edges of a tool may be in its window.
-_REACH = 4.0
-# An organ whose nodes move by less than this share of its size a second is at rest.
-_SLOW = 1e-5
 # Candidates of a window that a device reports, times the window's slots.
-_ROOM = 16
+ROOM = 16
 
 
 def state_size(nvert: int, nslot: int, ngeom: int) -> int:
   """Returns the length of the plugin state; ngeom is summed over the windows."""
-  return 12 * nvert + 4 * nslot + window_slots.POSE * ngeom + window_slots.TAIL
+  return layout.size(WindowState, {"nvert": nvert, "nslot": nslot, "ngeom": ngeom})
 
 
-def launches(w, model: int, instance: int) -> Launches:
-  """Returns the launches of window coupling for a workspace."""
-  organ, s = w.organ, w.surface
-  win = organ.windows
-  nslot, nvert = win.nslot, organ.mesh.nvert
-  side = s.device if w.config.resident else wp.get_device("cpu")
-  if not w.views:
-    w.views = _scratch(w, side)
-  v = w.views
-  m, d = mjstruct.Model.from_address(model), mjstruct.Data.from_address(w.data)
-  start = int(mjstruct.view(m.plugin_stateadr, m.nplugin, np.int32)[instance])
-  v["plugin_state"] = wrap(d.plugin_state + 8 * start, state_size(nvert, nslot, win.geom.size))
-  first = mjstruct.view(m.body_treeid, m.nbody, np.int32)[win.body[0]]
-  w.policy = mjstruct.view(m.tree_sleep_policy, m.ntree, np.int32)[first:].data
-  w.counts = mjstruct.view(m.flex_vertnum, m.nflex, np.int32)[organ.flex :].data
-  slots = _slots(w, model)
-  nodes = _nodes(w, side)
-  away = nodes.inbox is not v["inbox"]  # the nodes are on another device
+class Phases(coupling.Phases):
+  """Window coupling of a workspace's organ."""
 
-  def over_slots(kernel):
-    wp.launch(kernel, dim=1, inputs=[slots], device="cpu")
+  def __init__(self, w, model: int, instance: int):
+    organ, win = w.organ, w.organ.windows
+    self.side = w.surface.device if w.config.resident else wp.get_device("cpu")
+    self._resident, self._away = w.config.resident, self.side.is_cuda
+    self._status = w.host["status"], w.state.status
+    m = mjstruct.Model.from_address(model)
+    first = mjstruct.view(m.body_treeid, m.nbody, np.int32)[win.body[0]]
+    w.policy = mjstruct.view(m.tree_sleep_policy, m.ntree, np.int32)[first:].data
+    w.counts = mjstruct.view(m.flex_vertnum, m.nflex, np.int32)[organ.flex :].data
+    sizes = self._sizes(organ)
+    size = layout.size(WindowState, sizes)
+    state = coupling.plugin_state(model, w.data, instance, size)
+    if not w.views:
+      w.views = slots.scratch(organ.mesh.nvert, win.nslot) | {
+        name: wp.zeros(layout.size(kind, sizes), dtype=wp.float64, device="cpu", pinned=self._away)
+        for name, kind in (("inbox", Inbox), ("outbox", Outbox), ("foreseen", Inbox))
+      }
+    v = w.views
+    v["plugin_state"] = state
+    w.boxes = {
+      "own": layout.carve(WindowState, state, sizes),
+      "inbox": layout.carve(Inbox, v["inbox"], sizes),
+      "outbox": layout.carve(Outbox, v["outbox"], sizes),
+      "foreseen": layout.carve(Inbox, v["foreseen"], sizes),
+    }
+    self._slots = slots.make(w, model, sizes)
+    # The boxes here and on `side`, which may be the same.
+    self._near, self._foreseen = (v["inbox"], v["outbox"]), v["foreseen"]
+    self._far, motion = self._near, w.boxes["own"].motion
+    if self._away:
+      inbox, outbox = (wp.clone(box, device=self.side) for box in self._near)
+      self._far = inbox, outbox
+    if w.config.resident:
+      self._motion = wp.zeros(layout.size(Motion, sizes), dtype=wp.float64, device=self.side)
+      motion = layout.carve(Motion, self._motion, sizes)
+      w.resident = Resident(w, self._motion, self._end_now, self.look_ahead)
+    self._nodes = nodes.make(w, self.side, motion, self._far, sizes)
 
-  def over_nodes(kernel, count: int = nvert):
-    window_nodes.launch(kernel, nodes, count, side)
+  def _sizes(self, organ) -> dict[str, int]:
+    """Returns what the blocks of `layout` need."""
+    win, nvert = organ.windows, organ.mesh.nvert
+    most = nvert
+    if self.side.is_cuda:
+      most = min(nvert, ROOM * int(np.diff(win.adr).max()))
+    return {
+      "nvert": nvert,
+      "nslot": win.nslot,
+      "nwindow": len(win.flex),
+      "ngeom": win.geom.size,
+      "most": most,
+    }
 
-  def receive():
-    if away:
-      wp.copy(nodes.inbox, v["inbox"])
+  def _over_slots(self, kernel):
+    slots.launch(kernel, self._slots)
 
-  def send():
-    if away:
-      wp.copy(v["outbox"], nodes.outbox)
-      wp.copy(w.host["status"], w.state.status)
+  def _over_nodes(self, kernel):
+    nodes.launch(kernel, self._nodes, self._nodes.nvert, self.side)
 
-  def end_step():
-    over_nodes(window_nodes.commit)
-    over_nodes(window_nodes.move_slots, nslot)
+  def _over_pushed(self, kernel):
+    nodes.launch(kernel, self._nodes, self._nodes.nslot, self.side)
 
-  def begin():
-    if w.resident:
-      end_step()
-    over_nodes(window_nodes.enter)
-    over_nodes(window_nodes.push_slots, nslot)
+  def _receive(self):
+    if self._away:
+      wp.copy(self._far[0], self._near[0])
 
-  def enter():
-    receive()
-    begin()
+  def place(self):
+    """Puts the windows where the plugin state says."""
+    self._over_slots(slots.place)
 
-  def look():
-    over_nodes(window_nodes.search)
-    over_nodes(window_nodes.report, nslot)
-    send()
+  def gather(self):
+    """Tells what acts on the slots and where the tools are."""
+    self._over_slots(slots.gather)
 
-  def look_again():
-    receive()
-    look()
+  def enter(self):
+    """Ends the last step if the motion is on a device; fills the solver's state."""
+    self._receive()
+    self._begin()
 
-  def end_step_now():
-    receive()
-    end_step()
+  def _begin(self):
+    if self._resident:
+      self._end()
+    self._over_nodes(nodes.enter)
+    self._over_pushed(nodes.push_slots)
 
-  def enter_ahead():
-    wp.copy(nodes.inbox, v["foreseen"])
-    begin()
+  def look(self):
+    """Looks for nodes near the tools."""
+    self._over_nodes(nodes.search)
+    self._over_pushed(nodes.report)
+    if self._away:
+      wp.copy(self._near[1], self._far[1])
+      wp.copy(*self._status)
 
-  def push():
-    receive()
-    nodes.rhs.zero_()
-    over_nodes(window_nodes.push_impulses, nslot)
+  def scatter(self):
+    """Adds the passive force on the slots."""
+    self._over_slots(slots.scatter)
 
-  def answer():
-    over_nodes(window_nodes.commit)
-    look()
+  def leave(self):
+    """Takes the slots' motion and contact forces, and says whether the organ falls asleep."""
+    self._over_slots(slots.leave)
 
-  if w.config.resident:
-    w.resident = Resident(w, nodes, start, end_step_now, look_again)
-  return Launches(
-    gather=lambda: over_slots(window_slots.gather),
-    scatter=lambda: over_slots(window_slots.scatter),
-    leave=lambda: over_slots(window_slots.leave),
-    push=push,
-    answer=answer,
-    end=None if w.resident else end_step,
-    advance=lambda: over_slots(window_slots.choose),
-    place=lambda: over_slots(window_slots.place),
-    enter=enter,
-    look=look,
-    foresee=(lambda: over_slots(window_slots.foresee)) if w.resident else None,
-    enter_ahead=enter_ahead,
-    look_only=look_again,
-    side=side,
-  )
+  def push(self):
+    """Fills the right-hand side with the impulses on the slots."""
+    self._receive()
+    self._nodes.solve.rhs.zero_()
+    self._over_pushed(nodes.push_impulses)
 
+  def answer(self):
+    """Ends the step with the response, and looks at where the nodes are then."""
+    self._over_nodes(nodes.commit)
+    self.look()
 
-def _ints(values) -> wp.array:
-  return wp.array(np.asarray(values, np.int32).ravel(), dtype=int, device="cpu")
+  def end(self):
+    """Ends the step, unless the motion is on a device: there the next one does."""
+    if not self._resident:
+      self._end()
 
+  def _end(self):
+    self._over_nodes(nodes.commit)
+    self._over_pushed(nodes.move_slots)
 
-def _doubles(values) -> wp.array:
-  return wp.array(np.asarray(values, np.float64).ravel(), dtype=wp.float64, device="cpu")
+  def _end_now(self):
+    self._receive()
+    self._end()
 
+  def advance(self):
+    """Gives each window the nodes nearest to its tools."""
+    self._over_slots(slots.choose)
 
-def _scratch(w, side: wp.Device) -> dict[str, wp.array]:
-  """Returns the arrays of a workspace that outlive a new recording."""
-  win = w.organ.windows
-  nvert, nslot, nwindow = w.organ.mesh.nvert, win.nslot, len(win.flex)
-  most = nvert
-  if side.is_cuda:
-    most = min(nvert, _ROOM * int(np.diff(win.adr).max()))
-  boxes = {
-    "inbox": window_nodes.inbox_size(nslot, nwindow),
-    "outbox": window_nodes.outbox_size(nslot, nwindow, most),
-    "foreseen": window_nodes.inbox_size(nslot, nwindow),
-  }
-  return {
-    "placed": _ints(np.full(nslot, -2)),
-    "taken": _ints(np.full(nvert, -1)),
-    "chosen": _ints(np.zeros(nvert)),
-    "candidate": _ints(np.zeros(nvert)),
-    "distance": _doubles(np.zeros(nvert)),
-    "claim": _ints(np.full(nvert, -1)),
-    "left": _ints(np.full(nslot, -1)),
-    "lagged": _doubles(np.zeros(3 * nslot)),
-    "other": _doubles(np.zeros(3 * nslot)),
-    "inertia": _doubles(np.zeros(nvert)),
-    "flags": wp.array(w.flags, dtype=int, device="cpu", copy=False),
-    "heaviest": wp.array(w.heaviest, dtype=wp.float64, device="cpu", copy=False),
-    **{
-      name: wp.zeros(size, dtype=wp.float64, device="cpu", pinned=side.is_cuda)
-      for name, size in boxes.items()
-    },
-  }
+  def foresee(self):
+    """Guesses what the next `gather` tells."""
+    self._over_slots(slots.foresee)
 
+  def enter_ahead(self):
+    """Ends the last step and fills the solver's state with the guess."""
+    wp.copy(self._far[0], self._foreseen)
+    self._begin()
 
-def _most(w) -> int:
-  """Returns the candidates of a window that the outbox has room for."""
-  win = w.organ.windows
-  head = window_nodes.outbox_size(win.nslot, len(win.flex), 0)
-  return (len(w.views["outbox"]) - head) // (len(win.flex) * window_nodes.RECORD)
-
-
-def _slots(w, model: int) -> Slots:
-  """Returns the kernels' view of the slots."""
-  m, d = mjstruct.Model.from_address(model), mjstruct.Data.from_address(w.data)
-  organ, win, mesh = w.organ, w.organ.windows, w.organ.mesh
-  dofs = (win.dofadr[:, None] + np.arange(3)).ravel()
-  incidence = np.argsort(mesh.elem.ravel(), kind="stable") // 3
-  count = np.bincount(mesh.elem.ravel(), minlength=mesh.nvert)
-  edge = mesh.rest[mesh.elem[:, [1, 2, 0]]] - mesh.rest[mesh.elem]
-  length = np.linalg.norm(edge, axis=2)
-  spacing = float(length.mean())
-  # A tool that touches a triangle is no farther from its corners than their longest edges.
-  longest = np.zeros(mesh.nvert)
-  for corner in (mesh.elem, mesh.elem[:, [1, 2, 0]]):
-    np.maximum.at(longest, corner.ravel(), length.ravel())
-  radius = float(mjstruct.view(m.flex_radius, m.nflex)[win.flex].max())
-  margin = float(mjstruct.view(m.flex_margin, m.nflex)[win.flex].max())
-  margin += float(mjstruct.view(m.geom_margin, m.ngeom)[win.geom].max(initial=0.0))
-  numbers = {
-    "nvert": mesh.nvert,
-    "nslot": win.nslot,
-    "nwindow": len(win.flex),
-    "most": _most(w),
-    "no_gravity": int(mujoco.mjtDisableBit.mjDSBL_GRAVITY),
-    "resident": int(w.config.resident),
-    "damping": w.surface.damping,
-    "rest_share": solver.REST,
-    "reach": max(_REACH * spacing, float(longest.max())) + radius,
-    "slow": _SLOW * float(np.linalg.norm(np.ptp(mesh.rest, axis=0))),
-    "longest": float(longest.max()),
-    "skin": radius + margin,
-    "weight": float(win.mass.sum()),
-  }
-  arrays = option_views(model) | {
-    "node_mass": _doubles(win.mass),
-    "rest": _doubles(mesh.rest),
-    "touch": _doubles(longest + radius),
-    "elem": _ints(mesh.elem),
-    "near_adr": _ints(np.concatenate([[0], np.cumsum(count)])),
-    "near": _ints(incidence),
-    "home": _ints(win.home),
-    "qhome": _doubles(win.qhome),
-    "dofadr": _ints(win.dofadr),
-    "massadr": _ints(mass_addresses(m, dofs)),
-    "qposadr": _ints(win.qposadr),
-    "bodyid": _ints(win.body),
-    "window_adr": _ints(win.adr),
-    "elem_adr": _ints(win.elem_adr),
-    "elem_num": _ints(win.elem_num),
-    "geom_adr": _ints(win.geom_adr),
-    "geom": _ints(win.geom if win.geom.size else [0]),
-    "frame": _doubles(organ.frame),
-    "origin": _doubles(organ.origin),
-    "ext": w.ext,
-    "status": w.host["status"],
-    "geom_type": wrap(m.geom_type, m.ngeom, wp.int32),
-    "geom_size": wrap(m.geom_size, 3 * m.ngeom),
-    "geom_aabb": wrap(m.geom_aabb, 6 * m.ngeom),
-    "geom_rbound": wrap(m.geom_rbound, m.ngeom),
-    "body_mass": wrap(m.body_mass, m.nbody),
-    "flex_elem": wrap(m.flex_elem, m.nflexelemdata, wp.int32),
-    "dof_armature": wrap(m.dof_armature, m.nv),
-    "dof_M0": wrap(m.dof_M0, m.nv),
-    "dof_invweight0": wrap(m.dof_invweight0, m.nv),
-    "body_invweight0": wrap(m.body_invweight0, 2 * m.nbody),
-    "body_awake": wrap(d.body_awake, m.nbody, wp.int32),
-    "geom_xpos": wrap(d.geom_xpos, 3 * m.ngeom),
-    "geom_xmat": wrap(d.geom_xmat, 9 * m.ngeom),
-    "qpos": wrap(d.qpos, m.nq),
-    "qvel": wrap(d.qvel, m.nv),
-    "M": wrap(d.M, m.nC),
-    "qLD": wrap(d.qLD, m.nC),
-    "qLDiagInv": wrap(d.qLDiagInv, m.nv),
-    "qfrc_applied": wrap(d.qfrc_applied, m.nv),
-    "qfrc_passive": wrap(d.qfrc_passive, m.nv),
-    "qfrc_constraint": wrap(d.qfrc_constraint, m.nv),
-    "xfrc_applied": wrap(d.xfrc_applied, 6 * m.nbody),
-  }
-  return _struct(Slots, numbers | arrays | w.views)
-
-
-def _nodes(w, side: wp.Device) -> Nodes:
-  """Returns the kernels' view of the nodes: plugin state on the CPU, own arrays elsewhere."""
-  organ, s, v = w.organ, w.surface, w.views
-  nvert, nslot, nwindow = organ.mesh.nvert, organ.windows.nslot, len(organ.windows.flex)
-  node = s.node.numpy()
-  address, size = v["plugin_state"].ptr, 3 * nvert
-  if w.config.resident:
-    motion = [wp.zeros(size, dtype=wp.float64, device=side) for _ in range(4)]
-  else:
-    motion = [wrap(address + 8 * k * size, size) for k in range(4)]
-  solving = w.state if w.config.resident else None
-  crossing = ("step", "pos", "vel", "force_ext", "dvel_warm", "dvel", "rhs", "x", "status")
-  mass = np.ones(s.nnode)
-  mass[node] = organ.windows.mass
-  w.host["mass"].assign(mass.reshape(1, -1, 8).astype(np.float32))
-  wp.copy(w.state.mass, w.host["mass"])
-  numbers = {"nvert": nvert, "nslot": nslot, "nwindow": nwindow, "most": _most(w)}
-  lowest = np.full(7, window_nodes.LOWEST)
-  arrays = {
-    "node": _ints((node // 8) * 24 + node % 8).to(side),
-    "mass": _doubles(organ.windows.mass).to(side),
-    "rest": _doubles(organ.mesh.rest).to(side),
-    "disp": motion[0],
-    "velocity": motion[1],
-    "last": motion[2],
-    "before": motion[3],
-    "inbox": v["inbox"] if not side.is_cuda else wp.clone(v["inbox"], device=side),
-    "outbox": v["outbox"] if not side.is_cuda else wp.clone(v["outbox"], device=side),
-    "count": _ints(np.zeros(nwindow)).to(side),
-    "extent": _ints(lowest).to(side),
-    **{k: getattr(solving, k) if solving else w.host[k] for k in crossing},
-  }
-  return _struct(Nodes, numbers | arrays)
-
-
-def _struct(kind, values: dict):
-  """Returns a Warp struct with its fields from `values`."""
-  out = kind()
-  for name in kind.vars:
-    setattr(out, name, values[name])
-  return out
+  def look_ahead(self):
+    """Looks again, with where the tools are now."""
+    self._receive()
+    self.look()
 
 
 def settle(w, model: int):
@@ -343,7 +214,7 @@ def let_sleep(w, allowed: bool):
 
 def wake(w):
   """Ends the organ's sleep: something has changed."""
-  w.views["plugin_state"].numpy()[-window_slots.TAIL + 1] = 0.0
+  w.boxes["own"].tail.numpy()[TAIL.quiet] = 0.0
 
 
 def set_inertia(w, m):
@@ -367,5 +238,5 @@ def draw(w, model: int, data: int):
   if w.resident:
     w.resident.fetch()
   out = mjstruct.view(d.flexvert_xpos, (m.nflexvert, 3))[start : start + n]
-  u = w.views["plugin_state"].numpy()[: 3 * n].reshape(n, 3)
-  out[:] = organ.origin + (organ.mesh.rest + u) @ organ.frame.T
+  disp = w.boxes["own"].motion.disp.numpy()
+  out[:] = organ.origin + (organ.mesh.rest + disp) @ organ.frame.T

@@ -12,23 +12,23 @@ import mujoco
 import numpy as np
 import warp as wp
 from palpate.tissue import config as configuration
-from palpate.tissue import elastic, schemes, solver, types
+from palpate.tissue import elastic, kernels, schemes, solver, types
 from palpate.tissue.config import Config
+from palpate.tissue.structs import NUMBERS
 from palpate.tissue.types import State, Surface
 
 from . import (
-  coupling,
   declare,
   declare_windows,
   inertia,
   mjstruct,
+  nodal,
   prepare,
-  window,
-  window_nodes,
-  window_slots,
+  windowed,
 )
-from .coupling import ANSWERED, ASLEEP, CHANGED, NFLAG, PENDING, STALE
+from .coupling import Phases
 from .declare import Declaration
+from .layout import FLAG, HEAD
 from .resident import Resident
 
 _ALLOWED = int(mujoco.mjtSleepPolicy.mjSLEEP_AUTO_ALLOWED)
@@ -45,23 +45,22 @@ class Workspace:
     surface: constants on the device with the numbers of `config`
     state: solver state on the organ's device
     host: the arrays of `state` that MuJoCo's side reads and writes, on the CPU
-    ext: external and lagged contact force in float64 [N]  (3 nnode,)
+    lagged: external and lagged contact force [N]  (nodes or slots, 3)
+    number: `NUMBERS` in force that the coupling reads
     model: address of the mjModel the views are of
     data: address of the mjData
     before, after: recorded graphs of a step's forces around the solve
     solve: recorded graphs of the solve and what it needs, each on one device
     leave: recorded graph that takes the contact forces after MuJoCo's step
     respond: recorded graphs of the organ's response to their change; none where the scheme has none
-    end: recorded graph that ends a step without that, or None
+    end: recorded graph that ends a step without that
     advance: recorded graph of the plugin state's step
     place: recorded graph that puts the windows where the plugin state says, or None
     resident: keeper of a motion that stays on the device, or None
     stiff: whether the response is needed, see `inertia.stiffness`
     heaviest: most times its inertia that a node in contact may have, see there  (1,)
     computed: whether forces were computed for the step that ends
-    flags: what the coupling reports: STALE (the model lacks slots), ASLEEP, MISSED_NODES,
-      MISSED_ELEMENTS, PENDING (mode of the next commit), NEAR (a tool is near), CHANGED (contact
-      forces did), ANSWERED (the organ responded) and FORESEEN (what acts on it was)  (NFLAG,)
+    flags: what the coupling reports, see `layout.FLAG`
     policy: MuJoCo's sleep policy of the windows' bodies comes first
     counts: the number of vertices that MuJoCo sees of a windowed organ comes first
     status: iterations, relative residual, norm, failure  (4,)
@@ -72,7 +71,9 @@ class Workspace:
     nbad: MuJoCo's warnings of bad states that were looked at since the last reset
     model_step: the model's time step comes first [s]
     time_step: time step that the armature is for [s]
-    views: what the graphs point at, kept alive
+    views: what a coupling keeps when its graphs are recorded anew
+    boxes: blocks of the plugin state and of what crosses in a step, see `layout`; windows
+    phases: what the graphs launch
   """
 
   organ: Declaration
@@ -80,7 +81,8 @@ class Workspace:
   surface: Surface
   state: State
   host: dict[str, wp.array]
-  ext: wp.array
+  lagged: wp.array
+  number: np.ndarray
   data: int
   model: int = 0
   before: Any = None
@@ -95,7 +97,7 @@ class Workspace:
   stiff: bool = False
   heaviest: np.ndarray = dataclasses.field(default_factory=lambda: np.ones(1))
   computed: bool = False
-  flags: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(NFLAG, np.int32))
+  flags: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(len(FLAG), np.int32))
   policy: memoryview = dataclasses.field(default_factory=lambda: np.zeros(1, np.int32).data)
   counts: memoryview = dataclasses.field(default_factory=lambda: np.zeros(1, np.int32).data)
   status: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(4, np.float32))
@@ -108,6 +110,8 @@ class Workspace:
   model_step: memoryview = dataclasses.field(default_factory=lambda: memoryview(b"\0"))
   time_step: float = 0.0
   views: dict = dataclasses.field(default_factory=dict)
+  boxes: dict = dataclasses.field(default_factory=dict)
+  phases: Phases | None = None
 
   def __post_init__(self):
     self._me = weakref.ref(self)
@@ -119,11 +123,11 @@ class Workspace:
     if self.place is not None and not self._owns_model():
       self._find_contacts_again()
     wp.capture_launch(self.before)
-    if self.place is not None and self.flags[STALE]:
+    if self.place is not None and self.flags[FLAG.stale]:
       self._find_contacts_again()
       wp.capture_launch(self.before)
     if self.place is not None and not self.asleep and self.policy[0] == _ALLOWED:
-      window.let_sleep(self, False)
+      windowed.let_sleep(self, False)
     if self.asleep:
       self.computed = True
       return  # what `after` does was done with `before`
@@ -147,20 +151,20 @@ class Workspace:
       if self.nefc[0]:  # contacts of a window that was left behind wake the organ
         wp.capture_launch(self.leave)
       if self.counts[0]:
-        window.hide(self)
+        windowed.hide(self)
       if self.policy[0] != _ALLOWED:
-        window.let_sleep(self, True)
+        windowed.let_sleep(self, True)
       return
     responds = bool(self.respond) and self.stiff and computed
     if responds or self.place is not None:
       wp.capture_launch(self.leave)
     if self.place is not None:
-      window.hide(self)
-    responds = responds and bool(self.flags[CHANGED])
-    self.flags[ANSWERED] = responds
+      windowed.hide(self)
+    responds = responds and bool(self.flags[FLAG.changed])
+    self.flags[FLAG.answered] = responds
     if responds:
       self._answer()
-    elif self.end is not None:
+    else:
       wp.capture_launch(self.end)
     wp.capture_launch(self.advance)
     if self.resident:
@@ -169,16 +173,16 @@ class Workspace:
   def _answer(self):
     """Ends the step with the organ's own response to the change of the contact forces."""
     if self.place is not None:
-      self.views["inbox"].numpy()[window_nodes.HEAD - 1] = 1.0
+      self.boxes["inbox"].head.numpy()[HEAD.answered] = 1.0
     _launch_all(self.respond)
     if self.resident:
-      self.flags[PENDING] = 0
+      self.flags[FLAG.pending] = 0
       self.resident.look()
 
   @property
   def asleep(self) -> bool:
     """Whether the organ is at rest and its solve was skipped."""
-    return bool(self.flags[ASLEEP])
+    return bool(self.flags[FLAG.asleep])
 
   def _owns_model(self) -> bool:
     """Returns whether the model's windows were last placed here, and makes it so.
@@ -226,14 +230,14 @@ def state_size(model: int, instance: int) -> int:
   names = mjstruct.config(model, instance, "window").split()
   if names:
     # Asked before MuJoCo has filled in the flexes: what `window` needs is at most this.
-    return window.state_size(m.nflexvert, 0, m.ngeom * len(names))
-  return 9 * len(declare.moving_bodies(m, instance)) + 1
+    return windowed.state_size(m.nflexvert, 0, m.ngeom * len(names))
+  return nodal.state_size(3 * len(declare.moving_bodies(m, instance)))
 
 
 def make(model: int, data: int, instance: int) -> Workspace:
   """Returns the workspace of an organ in a fresh mjData; gives the model an armature if needed."""
-  windowed = bool(mjstruct.config(model, instance, "window"))
-  organ = (declare_windows if windowed else declare).read(model, instance)
+  has_windows = bool(mjstruct.config(model, instance, "window"))
+  organ = (declare_windows if has_windows else declare).read(model, instance)
   m = mjstruct.Model.from_address(model)
   with _lock:
     s = organ.surface
@@ -245,8 +249,8 @@ def make(model: int, data: int, instance: int) -> Workspace:
         array = wp.zeros(array.shape, dtype=float, device="cpu", pinned=True)
       host[field] = array
     size = organ.windows.nslot if organ.windows else s.nnode
-    ext = wp.zeros(3 * size, dtype=wp.float64, device="cpu")
-    w = Workspace(organ, organ.config, s, state, host, ext, data)
+    lagged = wp.zeros((size, 3), dtype=wp.float64, device="cpu")
+    w = Workspace(organ, organ.config, s, state, host, lagged, _numbers(organ.config), data)
     w.status = host["status"].numpy()[0]
     d, count = mjstruct.Data, len(mjstruct.Data.from_address(data).warning)
     w.warning = mjstruct.view(data + d.warning.offset, 2 * count, np.int32).data
@@ -257,10 +261,15 @@ def make(model: int, data: int, instance: int) -> Workspace:
     host["mass"].assign(mass)
     bind(w, model, instance)
     if w.place is not None:
-      window.settle(w, model)
+      windowed.settle(w, model)
       place(w)
     _feel(w, m)
     return w
+
+
+def _numbers(config: Config) -> np.ndarray:
+  """Returns the numbers of a configuration that may change while running."""
+  return np.array([getattr(config, name) for name in NUMBERS], float)
 
 
 def _feel(w: Workspace, m):
@@ -276,15 +285,15 @@ def bind(w: Workspace, model: int, instance: int):
   """Points the graphs at the arrays of `model` and of the workspace's mjData and records them."""
   m = mjstruct.Model.from_address(model)
   device, cpu = w.surface.device, wp.get_device("cpu")
-  side = window if w.organ.windows else coupling
+  side = windowed if w.organ.windows else nodal
   with _lock:
     load(device)
     if w.surface.levels is not None:
       wp.load_module(solver.multilevel().__name__, device=device)
     if w.resident:
       w.resident.fetch()
-    launches = side.launches(w, model, instance)
-    near = wp.get_device(launches.side)
+    w.phases = does = side.Phases(w, model, instance)
+    near = wp.get_device(does.side)
     crossing = device != near
 
     def solve():
@@ -301,23 +310,24 @@ def bind(w: Workspace, model: int, instance: int):
       if crossing:
         _cross(w, ("x", "status"), to_device=False)
 
-    w.before = _record(cpu, launches.gather)
-    w.solve = _record_all((near, launches.enter), (device, solve), (near, launches.look))
-    w.after = _record(cpu, launches.scatter)
-    w.leave = _record(cpu, launches.leave)
+    w.before = _record(cpu, does.gather)
+    w.solve = _record_all((near, does.enter), (device, solve), (near, does.look))
+    w.after = _record(cpu, does.scatter)
+    w.leave = _record(cpu, does.leave)
     w.respond = []
     if w.config.integrator in schemes.RESPONDING:
-      w.respond = _record_all((near, launches.push), (device, respond), (near, launches.answer))
-    w.end = _record(cpu, launches.end) if launches.end else None
-    w.advance = _record(cpu, launches.advance)
-    w.place = _record(cpu, launches.place) if launches.place else None
+      w.respond = _record_all((near, does.push), (device, respond), (near, does.answer))
+    w.end = _record(cpu, does.end)
+    w.advance = _record(cpu, does.advance)
+    w.place = _record(cpu, does.place) if w.organ.windows else None
     if w.resident:
-      w.resident.foresee = _record(cpu, launches.foresee)
-      ahead = _record_all((near, launches.enter_ahead), (device, solve))
+      w.resident.foresee = _record(cpu, does.foresee)
+      ahead = _record_all((near, does.enter_ahead), (device, solve))
       w.resident.begin_graph = ahead[0][1]
-      w.resident.rest = _record_all((near, launches.look_only))
+      w.resident.rest = _record_all((near, does.look_ahead))
   w.model = model
-  w.model_step = coupling.option_views(model)["timestep"].numpy().data
+  step = model + mjstruct.Model.opt.offset + type(m.opt).timestep.offset
+  w.model_step = mjstruct.view(step, 1).data
   w.time_step = float(m.opt.timestep)
 
 
@@ -352,9 +362,9 @@ def _record(device, work) -> Any:
 
 def load(device):
   """Loads the modules of a step on a device, compiling them where the cache has none."""
-  for module in (elastic, solver, schemes, coupling, window_nodes, window_slots):
-    wp.load_module(module.__name__, device=device)
-    wp.load_module(module.__name__, device="cpu")
+  for module in (*(m.__name__ for m in (elastic, solver, schemes)), *kernels.MODULES):
+    wp.load_module(module, device=device)
+    wp.load_module(module, device="cpu")
 
 
 def configure(w: Workspace, instance: int, texts: dict[str, str]):
@@ -365,6 +375,7 @@ def configure(w: Workspace, instance: int, texts: dict[str, str]):
   """
   w.config = configuration.change(w.organ.name, w.config, texts, w.organ.mesh.closed)
   numbers = ("iterations", "tolerance", "newton", "damping", "foundation", "bulk", "pressure")
+  w.number[:] = _numbers(w.config)
   w.surface = dataclasses.replace(w.surface, **{k: getattr(w.config, k) for k in numbers})
   # Terms that were off have no arrays yet.
   fresh = types.make_state(w.surface)
@@ -373,7 +384,7 @@ def configure(w: Workspace, instance: int, texts: dict[str, str]):
   bind(w, w.model, instance)
   _feel(w, mjstruct.Model.from_address(w.model))
   if w.place is not None:
-    window.wake(w)
+    windowed.wake(w)
 
 
 def sync(w: Workspace):
@@ -389,6 +400,6 @@ def refresh(w: Workspace):
     if w.organ.windows is None:
       prepare.give_armature(m, w.organ)
     else:
-      window.set_inertia(w, m)
+      windowed.set_inertia(w, m)
     _feel(w, m)
     w.time_step = float(m.opt.timestep)

@@ -25,7 +25,8 @@ import numpy as np
 import palpate
 import warp as wp
 from palpate.engine import plugin as engine
-from palpate.engine import window, workspace
+from palpate.engine import windowed, workspace
+from palpate.engine.layout import HEAD, MODE
 from palpate.models import grid
 from palpate.tissue import elastic, solver
 from palpate.tissue.elastic import Stage
@@ -176,16 +177,16 @@ def parts(w) -> dict:
     solve=lambda: solver.solve(s, d, Stage.FIRST),
     step=lambda: solver.step(s, d),
   )
-  launches = window.launches(w, w.model, 0)
-  side = wp.get_device(launches.side)
+  phases = windowed.Phases(w, w.model, 0)
+  side = wp.get_device(phases.side)
   boxes = [(wp.clone(w.views[name], device=side), w.views[name]) for name in ("inbox", "outbox")]
-  w.views["inbox"].numpy()[3] = 1.0  # there is a step to end
+  w.boxes["inbox"].head.numpy()[HEAD.mode] = MODE.commit  # there is a step to end
   around = replay(
     side,
     transfer=lambda: (wp.copy(*boxes[0]), wp.copy(*reversed(boxes[1]))),
-    enter=launches.enter,
-    search=launches.look,
-    end=launches.end or (lambda: None),
+    enter=phases.enter,
+    search=phases.look,
+    end=phases.end,
   )
   state[:] = kept
   workspace.bind(w, w.model, 0)
