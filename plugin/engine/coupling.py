@@ -15,9 +15,10 @@ from typing import Any
 import mujoco
 import numpy as np
 import warp as wp
+from palpate.tissue import types
+from palpate.tissue.body import Body
 from palpate.tissue.kernels import kernel
-from palpate.tissue.simd import LANES
-from palpate.tissue.structs import DIMS, doubles, floats, ints, scalar, struct, vector
+from palpate.tissue.types import DIMS, doubles, floats, ints, scalar, struct, vector
 
 from . import layout, mjstruct
 
@@ -110,7 +111,7 @@ class Mujoco:
 
 @struct
 class Crossing:
-  """What of the solver's arrays a coupling reads and writes, for one world; see `State`."""
+  """What of a body's `State` and `System` a coupling reads and writes, for one world."""
 
   step: floats("nworld", 4)
   disp: vector
@@ -125,11 +126,11 @@ class Crossing:
 
 
 CONSTANTS = {
-  "LANES": LANES,
   "DISABLE_GRAVITY": int(mujoco.mjtDisableBit.mjDSBL_GRAVITY),
   **{f"GEOM_IS_{name}": int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for name in (
     "PLANE", "SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER"
   )},
+  **types.CONSTANTS,
   **layout.CONSTANTS,
 }  # fmt: skip
 
@@ -159,11 +160,19 @@ def mujoco_arrays(model: int, data: int):
   return out
 
 
-def crossing(get):
-  """Returns `Crossing` with the arrays that `get` has for the names of `State`."""
+def on_body(body: Body) -> dict[str, wp.array]:
+  """Returns a body's arrays of `Crossing`."""
+  return {
+    name: getattr(body.state if hasattr(body.state, name) else body.system, name)
+    for name in Crossing.vars
+  }
+
+
+def crossing(arrays: dict[str, wp.array]):
+  """Returns `Crossing` of these arrays."""
   out = Crossing()
   for name in Crossing.vars:
-    setattr(out, name, get({"disp": "pos", "sol": "x"}.get(name, name)))
+    setattr(out, name, arrays[name])
   return out
 
 

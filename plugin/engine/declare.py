@@ -11,14 +11,14 @@ import threading
 
 import mujoco
 import numpy as np
-import warp as wp
 from palpate.tissue import config as configuration
-from palpate.tissue import elastic, quiet, types
+from palpate.tissue import device as devices
 from palpate.tissue import mesh as topology
-from palpate.tissue import shape as surface
+from palpate.tissue import shape
+from palpate.tissue.body import Body
 from palpate.tissue.config import Config
 from palpate.tissue.mesh import Mesh
-from palpate.tissue.types import Surface
+from palpate.tissue.step import SCHEMES
 
 from . import mjstruct
 
@@ -36,7 +36,7 @@ class Declaration:
     flex: index of the flex
     mesh: topology and rest shape, in the frame of the parent body
     config: configuration
-    surface: constants on the device
+    still: shape and tissue on the device, with no world
     free: whether a vertex moves            (nvert,) bool
     body: body of each vertex               (nvert,)
     dofadr: first dof, -1 if pinned         (nvert,)
@@ -54,7 +54,7 @@ class Declaration:
   flex: int
   mesh: Mesh
   config: Config
-  surface: Surface
+  still: Body
   free: np.ndarray
   body: np.ndarray
   dofadr: np.ndarray
@@ -126,7 +126,7 @@ def read(model: int, instance: int) -> Declaration:
   Raises:
     ValueError: the declaration is not one this plugin can run.
   """
-  quiet.init()
+  devices.init()
   m = mjstruct.Model.from_address(model)
   flex = _flex_of(m, instance)
   name = flex_name(m, flex)
@@ -184,16 +184,14 @@ def cached(
     if key not in _made:
       try:
         scale = (h * h + h * config.damping) / max(float(fields["mass"][free].mean()), 1e-300)
-        implicit = config.integrator == "implicit"
-        constants = surface.make(mesh, config, ~free, config.device, scale if implicit else 0.0)
+        scale *= SCHEMES[config.integrator].levels
+        still = shape.make(mesh, config, ~free, config.device, scale, nworld=0)
       except ValueError as error:
         raise ValueError(f"organ {name!r}: {error}") from None
-      with wp.ScopedDevice(constants.device):
-        elastic.calibrate(constants, types.make_state(constants))
       if len(_made) >= _CACHED:
         _made.pop(next(iter(_made)))
       _made[key] = Declaration(
-        name=name, mesh=mesh, config=config, free=free, surface=constants, digest=key, **fields
+        name=name, mesh=mesh, config=config, free=free, still=still, digest=key, **fields
       )
     return _made[key]
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 from palpate.tissue import config as configuration
+from palpate.tissue import device as devices
 from palpate.tissue import mesh as topology
-from palpate.tissue import quiet
 from palpate.tissue.config import Config
 
 from . import declare, mjstruct
@@ -19,7 +19,7 @@ def read(model: int, instance: int) -> Declaration:
   Raises:
     ValueError: the declaration is not one this plugin can run.
   """
-  quiet.init()
+  devices.init()
   m = mjstruct.Model.from_address(model)
   flex, parent = _surface(m, instance)
   name = declare.flex_name(m, flex)

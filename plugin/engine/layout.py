@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping
 
 import warp as wp
-from palpate.tissue.structs import DIMS, NUMBERS, doubles, struct
+from palpate.tissue.types import DIMS, doubles, struct
 
 MAX_WINDOWS = 64  # of an organ
 MAX_GEOMS = 32  # of a window
@@ -152,7 +152,6 @@ TABLES = (FLAG, MODE, HEAD, MOVED, PUSHED, GEOM, SUMMARY, ANSWER, RECORD, POSE, 
 CONSTANTS = {
   "MAX_WINDOWS": MAX_WINDOWS,
   "MAX_GEOMS": MAX_GEOMS,
-  "NUMBER_DAMPING": NUMBERS.index("damping"),
   **{name: value for table in TABLES for name, value in table.constants().items()},
 }
 

@@ -4,8 +4,8 @@
 # pyright: reportInvalidTypeForm=false
 import numpy as np
 import warp as wp
-from palpate.tissue import solver
-from palpate.tissue.structs import doubles, fill, ints, struct
+from palpate.tissue import step
+from palpate.tissue.types import doubles, fill, ints, struct
 
 from . import coupling, layout, mjstruct
 from .coupling import Crossing, Mujoco
@@ -17,7 +17,7 @@ class Nodal:
   """A nodal organ in MuJoCo's arrays and in the solver's; nodes are padded to whole slices."""
 
   nnode: int  # nodes
-  rest_share: float  # see `solver.REST`
+  rest_share: float  # see `step.REST`
   dofadr: ints("nnode")  # first dof of a node, -1 for pinned ones and padding
   qposadr: ints("nnode")  # its first number in qpos
   bodyid: ints("nnode")  # its body
@@ -36,6 +36,7 @@ class Nodal:
 _gather, _scatter, _push, _remember = coupling.kernels(
   "nodal.h", Nodal, "gather_nodes", "scatter_nodes", "push_nodes", "remember_nodes"
 )
+MODULE = _gather.module.name
 
 
 def state_size(nfree: int) -> int:
@@ -49,14 +50,14 @@ class Phases(coupling.Phases):
   side = "cpu"
 
   def __init__(self, w, model: int, instance: int):
-    m, organ, s = mjstruct.Model.from_address(model), w.organ, w.surface
+    m, organ, s = mjstruct.Model.from_address(model), w.organ, w.body.shape
     vert = s.vert.numpy()
     dofadr = _in_node_order(organ.dofadr, vert)
     dofs = np.maximum(dofadr, 0)[:, None] + np.arange(3)
     state = coupling.plugin_state(model, w.data, instance, state_size(organ.nfree))
     values = dict(
       nnode=s.nnode,
-      rest_share=solver.REST,
+      rest_share=step.REST,
       dofadr=dofadr,
       qposadr=_in_node_order(organ.qposadr, vert),
       bodyid=_in_node_order(organ.body, vert),
@@ -64,12 +65,12 @@ class Phases(coupling.Phases):
       massadr=np.where(dofadr[:, None] >= 0, coupling.mass_addresses(m, dofs), -1),
       frame=organ.frame,
       heaviest=wp.array(w.heaviest, dtype=wp.float64, device="cpu", copy=False),
-      number=wp.array(w.number, dtype=wp.float64, device="cpu", copy=False),
+      number=w.body.numbers,
       flags=wp.array(w.flags, dtype=int, device="cpu", copy=False),
       lagged=w.lagged,
       own=layout.carve(NodalState, state, {"nfree": organ.nfree}),
       mj=coupling.mujoco_arrays(model, w.data),
-      solve=coupling.crossing(w.host.__getitem__),
+      solve=coupling.crossing(w.host),
     )
     self._nodal = fill(Nodal, "cpu", values)
 

@@ -4,7 +4,7 @@
 # pyright: reportInvalidTypeForm=false
 import numpy as np
 import warp as wp
-from palpate.tissue.structs import doubles, fill, ints, struct
+from palpate.tissue.types import doubles, fill, ints, struct
 
 from . import coupling, layout
 from .coupling import Crossing
@@ -37,6 +37,7 @@ commit, move_slots, enter, push_slots, push_impulses, search, report = coupling.
   Nodes,
   *("commit", "move_slots", "enter", "push_slots", "push_impulses", "search", "report"),
 )
+MODULE = commit.module.name
 
 
 def make(w, side, motion, boxes: tuple[wp.array, wp.array], sizes: dict[str, int]):
@@ -49,12 +50,12 @@ def make(w, side, motion, boxes: tuple[wp.array, wp.array], sizes: dict[str, int
     boxes: numbers of inbox and outbox there
     sizes: what the blocks of `layout` need
   """
-  organ, s = w.organ, w.surface
+  organ, s = w.organ, w.body.shape
   node = s.node.numpy()
   mass = np.ones(s.nnode)
   mass[node] = organ.windows.mass
   w.host["mass"].assign(mass.reshape(1, -1, 8).astype(np.float32))
-  wp.copy(w.state.mass, w.host["mass"])
+  wp.copy(w.body.state.mass, w.host["mass"])
   values = dict(
     nvert=sizes["nvert"],
     nslot=sizes["nslot"],
@@ -68,9 +69,7 @@ def make(w, side, motion, boxes: tuple[wp.array, wp.array], sizes: dict[str, int
     motion=motion,
     inbox=layout.carve(Inbox, boxes[0], sizes),
     outbox=layout.carve(Outbox, boxes[1], sizes),
-    solve=coupling.crossing(
-      (lambda name: getattr(w.state, name)) if w.config.resident else w.host.__getitem__
-    ),
+    solve=coupling.crossing(coupling.on_body(w.body) if w.config.resident else w.host),
   )
   return fill(Nodes, side, values)
 

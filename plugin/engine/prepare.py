@@ -9,22 +9,25 @@ from __future__ import annotations
 import hashlib
 
 import numpy as np
+from palpate.tissue.body import Body
+from palpate.tissue.config import Config
+from palpate.tissue.step import SCHEMES
 
 from . import inertia, mjstruct
 from .declare import Declaration
 
 _KNOWN = 64
-_time_step: dict[bytes, float] = {}  # digest of an armature of ours -> the time step it is for
+_made_for: dict[bytes, tuple] = {}  # digest of an armature of ours -> time step and material
 
 
-def fit(m, organ: Declaration):
-  """Makes a model fit an organ that it declares."""
+def fit(m, organ: Declaration, body: Body):
+  """Makes a model fit an organ that it declares, with the tissue `body`."""
   # MuJoCo warns of a flex without forces of its own; an <edge damping> silences it and, zero here,
   # costs nothing while running. The plugin's own damping acts instead.
   flexes = organ.windows.flex if organ.windows else [organ.flex]
   mjstruct.view(m.flex_edgedamping, m.nflex)[flexes] = 0.0
   if organ.windows is None:
-    give_armature(m, organ)
+    give_armature(m, organ, body, organ.config)
     return
   win = organ.windows
   mjstruct.view(m.body_pos, (m.nbody, 3))[win.body] = win.stand
@@ -33,26 +36,32 @@ def fit(m, organ: Declaration):
   mass[win.body] = np.minimum(mass[win.body], win.mass.min())
 
 
-def give_armature(m, organ: Declaration):
+def give_armature(m, organ: Declaration, body: Body, config: Config):
   """Gives the organ's dofs the effective inertia as armature, unless the MJCF gave them one.
 
-  Ours are recognised by their digest, so that they can follow the time step.
+  Ours are recognised by their digest, so that they can follow the time step and the tissue.
+
+  Args:
+    m: the mjModel
+    organ: the organ
+    body: its tissue
+    config: its configuration in force
   """
-  if organ.config.integrator == "explicit":
-    return  # explicit steps are those of the masses
+  if not SCHEMES[organ.config.integrator].spreads:
+    return  # steps are those of the masses
   armature = mjstruct.view(m.dof_armature, m.nv)
   dofs = organ.dofs
   present = armature[dofs]
-  h = float(m.opt.timestep)
-  if present.any() and _time_step.get(_digest(present), h) == h:
+  of = (float(m.opt.timestep), *inertia.material(config))
+  if present.any() and _made_for.get(_digest(present), of) == of:
     return
   mass = inertia.masses(m, organ)
-  found = inertia.of_nodes(m, organ, mass, h, organ.flex)
+  found = inertia.of_nodes(m, organ, body, config, mass, organ.flex)
   added = np.repeat((found - mass)[organ.free], 3)
   armature[dofs] = added
-  if len(_time_step) >= _KNOWN:
-    _time_step.pop(next(iter(_time_step)))
-  _time_step[_digest(added)] = h
+  if len(_made_for) >= _KNOWN:
+    _made_for.pop(next(iter(_made_for)))
+  _made_for[_digest(added)] = of
   # mj_setConst gives the same: M0 has the armature, the inverse weights, which scale the contacts'
   # softness, are those of the masses alone for such dofs.
   mjstruct.view(m.dof_M0, m.nv)[dofs] = np.repeat(found[organ.free], 3)

@@ -37,8 +37,9 @@ class Resident:
     own, inbox, outbox = (w.boxes[name] for name in ("own", "inbox", "outbox"))
     self.state = w.views["plugin_state"].numpy()[: motion.size]  # the motion comes first there
     self.tail, self.head = own.tail.numpy(), inbox.head.numpy()
-    self.found, self.most = outbox.found.numpy(), outbox.record.shape[1]
-    self.device = w.surface.device
+    self.found = outbox.found.numpy()
+    _, self.most, _ = outbox.record.shape
+    self.device = w.body.device
     self.live = -1
     # Recorded graphs: the guess, on the CPU; the solve with it, on the device; what is left then.
     self.foresee: Any = None
@@ -106,6 +107,11 @@ class Resident:
       self.head[HEAD.reach] *= 0.75
       self._look_again()
       wp.synchronize_device(self.device)
+
+  def stop(self):
+    """Brings the motion into the plugin state and forgets the step that was begun."""
+    self.fetch()
+    self.live, self.w.flags[FLAG.foreseen] = -1, 1
 
   def fetch(self):
     """Brings the motion into the plugin state."""

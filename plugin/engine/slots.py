@@ -4,8 +4,8 @@
 # pyright: reportInvalidTypeForm=false
 import numpy as np
 import warp as wp
-from palpate.tissue import solver
-from palpate.tissue.structs import doubles, fill, floats, ints, struct
+from palpate.tissue import step
+from palpate.tissue.types import doubles, fill, floats, ints, struct
 
 from . import coupling, mjstruct
 from .coupling import Mujoco
@@ -26,7 +26,7 @@ class Slots:
   nwindow: int  # windows
   most: int  # candidates of a window that the outbox has room for
   resident: int  # 1 if the motion stays on a device and the plugin state may be old
-  rest_share: wp.float64  # see `solver.REST`
+  rest_share: wp.float64  # see `step.REST`
   reach: wp.float64  # distance from a geom within which nodes may be in a window [m]
   slow: wp.float64  # speed below which the organ counts as at rest [m/s]
   longest: wp.float64  # longest edge [m]
@@ -81,6 +81,7 @@ place, gather, scatter, leave, choose, foresee = coupling.kernels(
   Slots,
   *("place", "gather_slots", "scatter_slots", "leave_slots", "choose", "foresee"),
 )
+MODULE = gather.module.name
 
 
 def scratch(nvert: int, nslot: int) -> dict[str, wp.array]:
@@ -116,7 +117,7 @@ def make(w, model: int, sizes: dict[str, int]):
     nwindow=sizes["nwindow"],
     most=sizes["most"],
     resident=int(w.config.resident),
-    rest_share=solver.REST,
+    rest_share=step.REST,
     reach=max(_REACH * float(lengths.mean()), float(longest.max())) + radius,
     slow=SLOW * float(np.linalg.norm(np.ptp(mesh.rest, axis=0))),
     longest=float(longest.max()),
@@ -131,7 +132,7 @@ def make(w, model: int, sizes: dict[str, int]):
     frame=organ.frame,
     origin=organ.origin,
     heaviest=wp.array(w.heaviest, dtype=wp.float64, device="cpu", copy=False),
-    number=wp.array(w.number, dtype=wp.float64, device="cpu", copy=False),
+    number=w.body.numbers,
     flags=wp.array(w.flags, dtype=int, device="cpu", copy=False),
     home=win.home,
     qhome=win.qhome,

@@ -15,6 +15,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 import warp as wp
+from palpate.tissue import step
 
 from . import coupling, inertia, layout, mjstruct, nodes, prepare, slots
 from .layout import TAIL, Inbox, Motion, Outbox, WindowState
@@ -34,9 +35,9 @@ class Phases(coupling.Phases):
 
   def __init__(self, w, model: int, instance: int):
     organ, win = w.organ, w.organ.windows
-    self.side = w.surface.device if w.config.resident else wp.get_device("cpu")
+    self.side = w.body.device if w.config.resident else wp.get_device("cpu")
     self._resident, self._away = w.config.resident, self.side.is_cuda
-    self._status = w.host["status"], w.state.status
+    self._status = w.host["status"], w.body.system.status
     m = mjstruct.Model.from_address(model)
     first = mjstruct.view(m.body_treeid, m.nbody, np.int32)[win.body[0]]
     w.policy = mjstruct.view(m.tree_sleep_policy, m.ntree, np.int32)[first:].data
@@ -220,11 +221,9 @@ def wake(w):
 def set_inertia(w, m):
   """Stores the effective inertia of every node for the present time step."""
   organ, win = w.organ, w.organ.windows
-  h = float(m.opt.timestep)
-  if w.config.integrator == "explicit":
-    nodal = win.mass
-  else:
-    nodal = inertia.of_nodes(m, organ, win.mass, h, int(win.flex[0]))
+  nodal = win.mass
+  if step.SCHEMES[w.config.integrator].spreads:
+    nodal = inertia.of_nodes(m, organ, w.body, w.config, win.mass, int(win.flex[0]))
   w.views["inertia"].assign(nodal)
 
 

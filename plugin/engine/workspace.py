@@ -11,19 +11,22 @@ from typing import Any
 import mujoco
 import numpy as np
 import warp as wp
+from palpate.tissue import body as bodies
 from palpate.tissue import config as configuration
-from palpate.tissue import elastic, kernels, schemes, solver, types
+from palpate.tissue import shape, step
+from palpate.tissue.body import Body
 from palpate.tissue.config import Config
-from palpate.tissue.structs import NUMBERS
-from palpate.tissue.types import State, Surface
 
 from . import (
+  coupling,
   declare,
   declare_windows,
   inertia,
   mjstruct,
   nodal,
+  nodes,
   prepare,
+  slots,
   windowed,
 )
 from .coupling import Phases
@@ -42,11 +45,9 @@ class Workspace:
   Attributes:
     organ: constants
     config: configuration in force, which may differ from the compiled one
-    surface: constants on the device with the numbers of `config`
-    state: solver state on the organ's device
-    host: the arrays of `state` that MuJoCo's side reads and writes, on the CPU
+    body: shape, tissue and state on the organ's device
+    host: the arrays of its state that MuJoCo's side reads and writes, on the CPU
     lagged: external and lagged contact force [N]  (nodes or slots, 3)
-    number: `NUMBERS` in force that the coupling reads
     model: address of the mjModel the views are of
     data: address of the mjData
     before, after: recorded graphs of a step's forces around the solve
@@ -78,11 +79,9 @@ class Workspace:
 
   organ: Declaration
   config: Config
-  surface: Surface
-  state: State
+  body: Body
   host: dict[str, wp.array]
   lagged: wp.array
-  number: np.ndarray
   data: int
   model: int = 0
   before: Any = None
@@ -240,22 +239,21 @@ def make(model: int, data: int, instance: int) -> Workspace:
   organ = (declare_windows if has_windows else declare).read(model, instance)
   m = mjstruct.Model.from_address(model)
   with _lock:
-    s = organ.surface
-    state = types.make_state(s)
+    body = bodies.worlds(organ.still)
+    s = body.shape
     host = {}
-    for field in (*_IN, *_OUT, "rhs", "x"):
-      array = getattr(state, field)
-      if s.device.is_cuda:
+    for field, array in coupling.on_body(body).items():
+      if body.device.is_cuda:
         array = wp.zeros(array.shape, dtype=float, device="cpu", pinned=True)
       host[field] = array
     size = organ.windows.nslot if organ.windows else s.nnode
     lagged = wp.zeros((size, 3), dtype=wp.float64, device="cpu")
-    w = Workspace(organ, organ.config, s, state, host, lagged, _numbers(organ.config), data)
+    w = Workspace(organ, organ.config, body, host, lagged, data)
     w.status = host["status"].numpy()[0]
     d, count = mjstruct.Data, len(mjstruct.Data.from_address(data).warning)
     w.warning = mjstruct.view(data + d.warning.offset, 2 * count, np.int32).data
     w.nefc = mjstruct.view(data + d.nefc.offset, 1, np.int32).data
-    prepare.fit(m, organ)
+    prepare.fit(m, organ, body)
     # Padding nodes have a mass so that nothing divides by zero.
     mass = np.where(s.vert.numpy() >= 0, 0.0, 1.0).reshape(1, -1, 8)
     host["mass"].assign(mass)
@@ -267,29 +265,23 @@ def make(model: int, data: int, instance: int) -> Workspace:
     return w
 
 
-def _numbers(config: Config) -> np.ndarray:
-  """Returns the numbers of a configuration that may change while running."""
-  return np.array([getattr(config, name) for name in NUMBERS], float)
-
-
 def _feel(w: Workspace, m):
   """Notes whether the organ is stiff for the present time step."""
   if w.organ.windows:
     nodal = w.views["inertia"].numpy()
   else:
     nodal = inertia.of_dofs(m, w.organ)
-  w.stiff, w.heaviest[0] = inertia.stiffness(m, w.organ, w.config, nodal)
+  w.stiff, w.heaviest[0] = inertia.stiffness(m, w.organ, w.body, w.config, nodal)
 
 
 def bind(w: Workspace, model: int, instance: int):
   """Points the graphs at the arrays of `model` and of the workspace's mjData and records them."""
   m = mjstruct.Model.from_address(model)
-  device, cpu = w.surface.device, wp.get_device("cpu")
+  device, cpu = w.body.device, wp.get_device("cpu")
+  scheme = step.SCHEMES[w.config.integrator]
   side = windowed if w.organ.windows else nodal
   with _lock:
-    load(device)
-    if w.surface.levels is not None:
-      wp.load_module(solver.multilevel().__name__, device=device)
+    load(w.body)
     if w.resident:
       w.resident.fetch()
     w.phases = does = side.Phases(w, model, instance)
@@ -299,23 +291,23 @@ def bind(w: Workspace, model: int, instance: int):
     def solve():
       if crossing:
         _cross(w, _IN, to_device=True)
-      schemes.step(w.surface, w.state, w.config.integrator)
+      scheme.step(w.body)
       if crossing:
         _cross(w, _OUT, to_device=False)
 
     def respond():
       if crossing:
         _cross(w, ("rhs",), to_device=True)
-      schemes.respond(w.surface, w.state, w.config.integrator)
+      scheme.respond(w.body)
       if crossing:
-        _cross(w, ("x", "status"), to_device=False)
+        _cross(w, ("sol", "status"), to_device=False)
 
     w.before = _record(cpu, does.gather)
     w.solve = _record_all((near, does.enter), (device, solve), (near, does.look))
     w.after = _record(cpu, does.scatter)
     w.leave = _record(cpu, does.leave)
     w.respond = []
-    if w.config.integrator in schemes.RESPONDING:
+    if scheme.respond:
       w.respond = _record_all((near, does.push), (device, respond), (near, does.answer))
     w.end = _record(cpu, does.end)
     w.advance = _record(cpu, does.advance)
@@ -326,19 +318,20 @@ def bind(w: Workspace, model: int, instance: int):
       w.resident.begin_graph = ahead[0][1]
       w.resident.rest = _record_all((near, does.look_ahead))
   w.model = model
-  step = model + mjstruct.Model.opt.offset + type(m.opt).timestep.offset
-  w.model_step = mjstruct.view(step, 1).data
+  address = model + mjstruct.Model.opt.offset + type(m.opt).timestep.offset
+  w.model_step = mjstruct.view(address, 1).data
   w.time_step = float(m.opt.timestep)
 
 
 # What a solve on another device than MuJoCo's side reads and writes.
-_IN = ("step", "pos", "vel", "mass", "force_ext", "dvel_warm")
+_IN = ("step", "disp", "vel", "mass", "force_ext", "dvel_warm")
 _OUT = ("dvel", "status")
 
 
 def _cross(w: Workspace, fields: tuple[str, ...], to_device: bool):
+  theirs = coupling.on_body(w.body)
   for field in fields:
-    there, here = getattr(w.state, field), w.host[field]
+    there, here = theirs[field], w.host[field]
     if to_device:
       wp.copy(there, here)
     else:
@@ -360,29 +353,36 @@ def _record(device, work) -> Any:
   return capture.graph
 
 
-def load(device):
-  """Loads the modules of a step on a device, compiling them where the cache has none."""
-  for module in (*(m.__name__ for m in (elastic, solver, schemes)), *kernels.MODULES):
-    wp.load_module(module, device=device)
+def load(body: Body):
+  """Loads the modules of a step on a body's device, compiling them where the cache has none."""
+  for module in (*step.modules(body), nodes.MODULE):
+    wp.load_module(module, device=body.device)
+  for module in (*step.modules(body), nodes.MODULE, nodal.MODULE, slots.MODULE):
     wp.load_module(module, device="cpu")
 
 
 def configure(w: Workspace, instance: int, texts: dict[str, str]):
-  """Changes configuration keys while running and records the step anew.
+  """Changes configuration keys while running.
 
   Raises:
     ValueError: a key may not change, or its value is not allowed.
   """
-  w.config = configuration.change(w.organ.name, w.config, texts, w.organ.mesh.closed)
-  numbers = ("iterations", "tolerance", "newton", "damping", "foundation", "bulk", "pressure")
-  w.number[:] = _numbers(w.config)
-  w.surface = dataclasses.replace(w.surface, **{k: getattr(w.config, k) for k in numbers})
-  # Terms that were off have no arrays yet.
-  fresh = types.make_state(w.surface)
-  if fresh.areavec.shape != w.state.areavec.shape:
-    w.state.areavec = fresh.areavec
+  before, w.config = (
+    w.config,
+    configuration.change(w.organ.name, w.config, texts, w.organ.mesh.closed),
+  )
+  if w.resident:
+    w.resident.stop()
+  changed = {key for key in texts if getattr(before, key) != getattr(w.config, key)}
+  if changed.intersection(configuration.MATERIAL):
+    shape.change(w.body, w.organ.mesh, w.config, ~w.organ.free)
+  else:
+    shape.renumber(w.body, w.config)
   bind(w, w.model, instance)
-  _feel(w, mjstruct.Model.from_address(w.model))
+  if changed.intersection(configuration.MATERIAL):
+    refresh(w)
+  else:
+    _feel(w, mjstruct.Model.from_address(w.model))
   if w.place is not None:
     windowed.wake(w)
 
@@ -394,11 +394,11 @@ def sync(w: Workspace):
 
 
 def refresh(w: Workspace):
-  """Renews the armature after the time step was changed; see `inertia`."""
+  """Renews the effective inertia after the time step or the material changed; see `inertia`."""
   m = mjstruct.Model.from_address(w.model)
   with _lock:
     if w.organ.windows is None:
-      prepare.give_armature(m, w.organ)
+      prepare.give_armature(m, w.organ, w.body, w.config)
     else:
       windowed.set_inertia(w, m)
     _feel(w, m)

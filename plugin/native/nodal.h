@@ -15,7 +15,7 @@ template <class Fields>
 PALPATE void gather_nodes(const Fields& f, Thread, int) {
   const auto& mj = f.mj;
   const auto& solve = f.solve;
-  const double h = mj.timestep.data[0], damping = (float)f.number.data[NUMBER_DAMPING];
+  const double h = mj.timestep.data[0], damping = (float)f.number.data[DAMPING];
   solve.step.data[0] = (float)h;
   solve.step.data[1] = (float)(h * h + h * damping);
   const double* R = f.frame.data;

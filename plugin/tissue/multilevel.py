@@ -14,9 +14,9 @@ from __future__ import annotations
 
 import warp as wp
 
-from . import elastic, simd, solver
-from .elastic import Stage
-from .types import Levels, State, Surface
+from . import device as simd_threads
+from . import simd, solver
+from .types import Stage
 
 # Below this condition number a mesh is solved by a few steps of the smoother.
 _EASY = 8.0
@@ -314,7 +314,7 @@ def _solve_world(
 ): ...
 
 
-@wp.kernel(enable_backward=False, launch_bounds=(simd.BLOCK, 2))
+@wp.kernel(enable_backward=False, launch_bounds=(512, 2))
 def _solve(
   nthread: int,
   nslice: int,
@@ -517,29 +517,30 @@ def _sample(
   _sample_slices(world, tid, nslice, nnodeslice, source, share, pos_in, mass_in, pos_out, mass_out)
 
 
-def assemble(s: Surface, d: State):
-  """Writes the matrices of the coarser meshes at `pos_trial`."""
-  levels: Levels = s.levels
-  c = levels.surface
+def sample(body):
+  """Samples the shape at the coarser meshes' nodes."""
+  s, d = solver.old(body)
+  c, e = solver.old(body.levels.body)
+  levels = body.levels.transfer
   wp.launch(
     _sample,
-    dim=(d.nworld, simd.threads(s.device, c.nslice)),
+    dim=(d.nworld, simd_threads.threads(s.device, c.nslice)),
     inputs=[c.nslice, s.nslice, levels.source, levels.share, d.pos_trial, d.mass],
-    outputs=[d.coarse.pos_trial, d.coarse.mass],
+    outputs=[e.pos_trial, e.mass],
     device=s.device,
   )
-  elastic.rows(c, d.coarse, Stage.FIRST)
 
 
-def solve(s: Surface, d: State, stage: Stage):
+def solve(body, stage: Stage):
   """Solves A x = rhs as `solver.solve` does, with the matrices that `assemble` wrote."""
-  levels: Levels = s.levels
-  c, e = levels.surface, d.coarse
-  nthread = simd.group_size(s.device, s.nslice, d.nworld, per_sm=2)
+  s, d = solver.old(body)
+  c, e = solver.old(body.levels.body)
+  levels = body.levels.transfer
+  nthread = simd_threads.group_size(s.device, s.nslice, d.nworld, per_sm=2)
   wp.launch(
     _solve,
     dim=(d.nworld, nthread),
-    block_dim=simd.block(s.device, s.nslice),
+    block_dim=simd_threads.block(s.device, s.nslice),
     inputs=[
       nthread,
       s.nslice,

@@ -204,9 +204,7 @@ _GROUP = """
   #define GROUP_SYNC()
 #endif
 """
-MAX_BLOCKS = 512
-WORDS = 2 * MAX_BLOCKS + 1  # of 128 bits that a world's threads exchange
-BLOCK = 512  # threads of a block, at most
+from .device import BLOCK, MAX_BLOCKS, WORDS
 
 
 def group(body: str, seen: bool = True) -> str:
@@ -287,40 +285,3 @@ def slices(body: str) -> str:
   for (int s = 0; s < nslice; ++s) {{ {body} }}
 #endif
 """)
-
-
-def block(device, nslice: int) -> int:
-  """Returns the threads of a block for code made by `group`.
-
-  Small blocks spread few nodes over more multiprocessors.
-  """
-  return BLOCK // 2 if device.is_cuda and nslice * LANES <= BLOCK // 2 * device.sm_count else BLOCK
-
-
-def group_size(device, nslice: int, nworld: int, per_sm: int = 1) -> int:
-  """Returns the threads of a world for code made by `group`, to launch in blocks of `block`.
-
-  Args:
-    device: where they run
-    nslice: slices of nodes
-    nworld: number of worlds
-    per_sm: blocks on one multiprocessor that the kernel's bounds allow
-  """
-  if not device.is_cuda:
-    return 1
-  # Blocks of one world wait for each other, so all of them must be resident.
-  most = max(1, min(per_sm * device.sm_count // nworld, MAX_BLOCKS))
-  size = block(device, nslice)
-  return size * max(1, min(most, -(-nslice * LANES // size)))
-
-
-def patch(device, nslice: int) -> int:
-  """Returns the nodes that a block has of one world of `nslice` slices, 0 on the CPU."""
-  if not device.is_cuda:
-    return 0
-  return LANES * -(-nslice // (group_size(device, nslice, 1) // block(device, nslice)))
-
-
-def threads(device, nslice: int) -> int:
-  """Returns the launch dimension for `nslice` slices: one thread on the CPU, one a lane on CUDA."""
-  return nslice * LANES if device.is_cuda else 1

@@ -12,20 +12,13 @@ from __future__ import annotations
 
 import warp as wp
 
-from . import elastic, product, simd
-from .elastic import Stage
-from .types import State, Surface
-
-# A right-hand side below this share of the weight's impulse is at rest: residuals count against it.
-REST = 1e-3
+from . import device as simd_threads
+from . import product, simd
+from .types import Stage
 
 # Relative residual at which the response to a change of the contact forces is good enough: it is
 # part of the step, whose tolerance holds too where that is looser.
 RESPONSE = 0.03
-
-# The first Newton iteration stands where the present velocity leads, but no edge changes by more
-# than this share of its length on the way: forces far off would be those of another shape.
-AHEAD = 0.1
 
 # Impulse of volume and pressure along the area vectors, (push - pull) O: push is the force's, pull
 # that of K v with weight gv.
@@ -311,7 +304,7 @@ def _solve_world(
 ): ...
 
 
-@wp.kernel(enable_backward=False, launch_bounds=(simd.BLOCK, 1))
+@wp.kernel(enable_backward=False, launch_bounds=(512, 1))
 def _solve(
   nthread: int,
   nslice: int,
@@ -398,178 +391,40 @@ def _solve(
   )
 
 
-# Where the first Newton iteration stands: how fast edges change, then how much of h v that allows.
-@wp.func_native(
-  simd.slices("""
-  const float* W = vel.data + 24 * (size_t)world * nslice;
-  const int row0 = slot_adr.data[s] + 2 * s + 1, width = slot_adr.data[s + 1] - slot_adr.data[s];
-  const int* node = fan_node.data + 8 * row0;
-  const float* rest = fan_rest.data + 24 * row0;
-  const V x = LD(W + 24 * s, 0), y = LD(W + 24 * s, 1), z = LD(W + 24 * s, 2);
-  V most = SPLAT(0.0f);
-  for (int i = 0; i < width; ++i, node += 8, rest += 24) {
-    const V dx = GATHER(W, node, 0) - x, dy = GATHER(W, node, 1) - y, dz = GATHER(W, node, 2) - z;
-    const V rx = LD(rest, 0), ry = LD(rest, 1), rz = LD(rest, 2);
-    const V length2 = MAX(rx * rx + ry * ry + rz * rz, SPLAT(1e-30f));
-    most = MAX(most, (dx * dx + dy * dy + dz * dz) / length2);
-  }
-  PUT_MOST(change.data + world, most)
-""")
-)
-def _edge_change_slices(
-  world: int,
-  tid: int,
-  nslice: int,
-  slot_adr: wp.array[int],
-  fan_node: wp.array2d[int],
-  fan_rest: wp.array3d[float],
-  vel: wp.array4d[float],
-  change: wp.array[float],
-): ...
+class Old:
+  """Fields of the structs and numbers of a body by the names of old."""
+
+  def __init__(self, *parts, **more):
+    self.parts, self.more = parts, more
+
+  def __getattr__(self, name):
+    name = {"pos_trial": "disp_trial", "pos": "disp", "x": "sol"}.get(name, name)
+    if name in self.more:
+      return self.more[name]
+    for part in self.parts:
+      if name in part._cls.vars:
+        return getattr(part, name)
+    raise AttributeError(name)
 
 
-@wp.kernel(enable_backward=False)
-def _edge_change(
-  nslice: int,
-  # Surface:
-  slot_adr: wp.array[int],
-  fan_node: wp.array2d[int],
-  fan_rest: wp.array3d[float],
-  # State in:
-  vel_in: wp.array4d[float],
-  # State out:
-  change_out: wp.array[float],
-):
-  world, tid = wp.tid()
-  _edge_change_slices(world, tid, nslice, slot_adr, fan_node, fan_rest, vel_in, change_out)
+def old(body):
+  numbers = {k: body.number(k) for k in ("foundation", "bulk", "pressure", "tolerance")}
+  s = Old(body.shape, body.tissue, has_bending=body.has_bending, device=body.device,
+          iterations=int(body.number("iterations")), **numbers)
+  return s, Old(body.state, body.system, nworld=body.nworld)
 
 
-@wp.func_native(
-  simd.slices("""
-  const float h = step.data[4 * world], most = h * sqrtf(change.data[world]);
-  const float share = most > ahead ? ahead / most : 1.0f;
-  const size_t at = 24 * ((size_t)world * nslice + s);
-  for (int c = 0; c < 3; ++c) {
-    const V v = LD(vel.data + at, c);
-    ST(vel_trial.data + at, c, v);
-    ST(pos_trial.data + at, c, LD(pos.data + at, c) + share * h * v);
-  }
-  if (tid == 0) step.data[4 * world + 3] = share;
-""")
-)
-def _predict_slices(
-  world: int,
-  tid: int,
-  nslice: int,
-  ahead: float,
-  change: wp.array[float],
-  pos: wp.array4d[float],
-  vel: wp.array4d[float],
-  step: wp.array2d[float],
-  pos_trial: wp.array4d[float],
-  vel_trial: wp.array4d[float],
-): ...
-
-
-@wp.kernel(enable_backward=False)
-def _predict(
-  nslice: int,
-  ahead: float,
-  # State in:
-  change_in: wp.array[float],
-  pos_in: wp.array4d[float],
-  vel_in: wp.array4d[float],
-  # State out:
-  step_out: wp.array2d[float],
-  pos_trial_out: wp.array4d[float],
-  vel_trial_out: wp.array4d[float],
-):
-  world, tid = wp.tid()
-  _predict_slices(
-    world, tid, nslice, ahead, change_in, pos_in, vel_in, step_out, pos_trial_out, vel_trial_out
-  )
-
-
-@wp.func_native(
-  simd.slices("""
-  const size_t at = 24 * ((size_t)world * nslice + s);
-  const float h = step.data[4 * world];
-  for (int c = 0; c < 3; ++c) {
-    V dv = LD(x.data + at, c);
-    if (!first) dv += LD(dvel.data + at, c);
-    ST(dvel.data + at, c, dv);
-    if (more) {
-      const V v = LD(vel.data + at, c) + dv;
-      ST(vel_trial.data + at, c, v);
-      ST(pos_trial.data + at, c, LD(pos.data + at, c) + h * v);
-    }
-  }
-""")
-)
-def _newton_slices(
-  world: int,
-  tid: int,
-  nslice: int,
-  first: int,
-  more: int,
-  step: wp.array2d[float],
-  pos: wp.array4d[float],
-  vel: wp.array4d[float],
-  x: wp.array4d[float],
-  dvel: wp.array4d[float],
-  pos_trial: wp.array4d[float],
-  vel_trial: wp.array4d[float],
-): ...
-
-
-@wp.kernel(enable_backward=False)
-def _newton_update(
-  nslice: int,
-  first: int,
-  more: int,
-  # State in:
-  step_in: wp.array2d[float],
-  pos_in: wp.array4d[float],
-  vel_in: wp.array4d[float],
-  x_in: wp.array4d[float],
-  # State out:
-  dvel_out: wp.array4d[float],
-  pos_trial_out: wp.array4d[float],
-  vel_trial_out: wp.array4d[float],
-):
-  world, tid = wp.tid()
-  _newton_slices(
-    world,
-    tid,
-    nslice,
-    first,
-    more,
-    step_in,
-    pos_in,
-    vel_in,
-    x_in,
-    dvel_out,
-    pos_trial_out,
-    vel_trial_out,
-  )
-
-
-def solve(s: Surface, d: State, stage: Stage):
-  """Solves A x = rhs to the organ's tolerance; writes `x` and `status`.
-
-  Args:
-    s: the organ
-    d: its state, with A as `elastic.assemble` wrote it
-    stage: FIRST, LATER or RESPONSE
-  """
-  if s.levels is not None:
-    multilevel().solve(s, d, stage)
+def solve(body, stage: Stage):
+  """Solves A x = rhs to the organ's tolerance; writes `x` and `status`."""
+  if body.levels is not None:
+    multilevel().solve(body, stage)
     return
-  nthread = simd.group_size(s.device, s.nslice, d.nworld)
+  s, d = old(body)
+  nthread = simd_threads.group_size(s.device, s.nslice, d.nworld)
   wp.launch(
     _solve,
     dim=(d.nworld, nthread),
-    block_dim=simd.block(s.device, s.nslice),
+    block_dim=simd_threads.block(s.device, s.nslice),
     inputs=[
       nthread,
       s.nslice,
@@ -610,45 +465,259 @@ def multilevel():
   return multilevel
 
 
-def _look_ahead(s: Surface, d: State):
-  """Writes where the first iteration stands: `pos_trial`, `vel_trial` and the share in `step`."""
-  d.change.zero_()
-  size = (d.nworld, simd.threads(s.device, s.nslice))
-  wp.launch(
-    _edge_change,
-    dim=size,
-    inputs=[s.nslice, s.slot_adr, s.fan_node, s.fan_rest, d.vel],
-    outputs=[d.change],
-    device=s.device,
-  )
-  wp.launch(
-    _predict,
-    dim=size,
-    inputs=[s.nslice, AHEAD, d.change, d.pos, d.vel],
-    outputs=[d.step, d.pos_trial, d.vel_trial],
-    device=s.device,
-  )
-
-
-def step(s: Surface, d: State):
-  """Computes `dvel`, the change of velocity in one implicit step; capturable in a graph.
-
-  Args:
-    s: the organ
-    d: its state: `step`, `pos`, `vel`, `mass`, `force_ext` and `dvel_warm` are read
+_DIRECT = simd.group(
   """
-  _look_ahead(s, d)
-  for it in range(s.newton):
-    stage = Stage.FIRST if it == 0 else Stage.LATER
-    elastic.assemble(s, d, stage)
-    if s.levels is not None:
-      multilevel().assemble(s, d)
-    solve(s, d, stage)
-    wp.launch(
-      _newton_update,
-      dim=(d.nworld, simd.threads(s.device, s.nslice)),
-      block_dim=simd.BLOCK,
-      inputs=[s.nslice, int(it == 0), int(it + 1 < s.newton), d.step, d.pos, d.vel, d.x],
-      outputs=[d.dvel, d.pos_trial, d.vel_trial],
-      device=s.device,
-    )
+  const size_t base = (size_t)world * nslice;
+  const float h = step.data[4 * world], g = step.data[4 * world + 1], gv = g - h * h;
+  const float* O = areavec.data + 24 * base;
+  const float* U = pos.data + 24 * base;
+  const float* W = vel.data + 24 * base;
+  const float* M = mass.data + 8 * base;
+  float* X = x_.data + 24 * base;
+  float* Z = q_.data + 24 * base;
+  const bool response = false;
+"""
+  + VOLUME
+  + """
+  V bb = zero;
+  FOR_SLICES(s) {
+    const V inverse = LD(free_.data, s) / LD(M, s);
+    V b[3];
+    for (int c = 0; c < 3; ++c) {
+      b[c] = LD(rhs.data + 24 * (base + s), c);
+      if (push != 0.0f || pull != 0.0f) b[c] += (push - pull) * LD(O + 24 * s, c);
+    }
+    V d = SPLAT(1.0f);
+    if (neumann) {
+      const V kf = foundation * LD(area.data, s);
+      const int row0 = slot_adr.data[s], width = slot_adr.data[s + 1] - row0;
+      const int* node = fan_node.data + 8 * (row0 + 2 * s + 1);
+      const float* k = fan_spring.data + 8 * row0;
+      V sum = kf;
+      for (int c = 0; c < 3; ++c) b[c] -= g * kf * LD(W + 24 * s, c);
+      for (int i = 0; i < width; ++i, node += 8, k += 8) {
+        sum += LD(k, 0);
+        for (int c = 0; c < 3; ++c)
+          b[c] += g * LD(k, 0) * (GATHER(W, node, c) - LD(W + 24 * s, c));
+      }
+      d += g * sum * inverse;
+    }
+    for (int c = 0; c < 3; ++c) {
+      const V y = b[c] * inverse / d;
+      bb += b[c] * b[c] * inverse;
+      ST(X + 24 * s, c, y);
+      ST(Z + 24 * s, c, y);
+    }
+  }
+  const float norm = group_sum(bb);
+  if (neumann) {
+    FOR_SLICES(s) {
+      const V inverse = LD(free_.data, s) / LD(M, s);
+      const int row0 = slot_adr.data[s], width = slot_adr.data[s + 1] - row0;
+      const int* node = fan_node.data + 8 * (row0 + 2 * s + 1);
+      const float* k = fan_spring.data + 8 * row0;
+      V sum = foundation * LD(area.data, s);
+      V n[3] = {zero, zero, zero};
+      for (int i = 0; i < width; ++i, node += 8, k += 8) {
+        sum += LD(k, 0);
+        for (int c = 0; c < 3; ++c) n[c] += LD(k, 0) * GATHER(Z, node, c);
+      }
+      // (2 D^-1 - D^-1 W D^-1) y with W = D - N: z + D^-1 N z, z = D^-1 y.
+      const V scale = g * inverse / (1.0f + g * sum * inverse);
+      for (int c = 0; c < 3; ++c) ST(X + 24 * s, c, LD(Z + 24 * s, c) + scale * n[c]);
+    }
+  }
+  if (tid != 0) return;
+  float* out = status.data + 4 * world;
+  out[0] = neumann ? 1.0f : 0.0f;
+  out[1] = 0.0f;
+  out[2] = norm;
+  out[3] = norm < 1e30f && norm >= 0.0f ? 0.0f : 1.0f;
+"""
+)
+
+
+# What a step of `midpoint` is made of, in place of those of `implicit`; `undo` puts them back. The
+# velocity is that of the time of x where the last step changed none.
+@wp.func_native(
+  simd.group("""
+  const V zero = SPLAT(0.0f);
+  const float* D = warm.data + 24 * (size_t)world * nslice;
+  V sum = zero;
+  FOR_SLICES(s)
+    for (int c = 0; c < 3; ++c) sum += LD(D + 24 * s, c) * LD(D + 24 * s, c);
+  const float part = group_sum(sum) > 0.0f ? 1.0f : 0.5f;
+  if (tid != 0) return;
+  float* out = step.data + 4 * world;
+  if (undo) {
+    out[0] /= part;
+    out[1] *= 2.0f / part;
+    return;
+  }
+  // Such that the weight of K v on the right-hand side is h damping; see `elastic.Stage`.
+  out[3] = (1.0f - 0.5f * out[1] / (out[0] * out[0])) / part;
+  out[0] *= part;
+  out[1] *= 0.5f * part;
+""")
+)
+def _centre_world(
+  world: int,
+  tid: int,
+  nthread: int,
+  nslice: int,
+  undo: int,
+  warm: wp.array4d[float],
+  step: wp.array2d[float],
+  partial_: wp.array3d[float],
+): ...
+
+
+@wp.kernel(enable_backward=False, launch_bounds=512)
+def _centre(
+  nthread: int,
+  nslice: int,
+  undo: int,
+  # State in:
+  dvel_warm_in: wp.array4d[float],
+  # State out:
+  step_out: wp.array2d[float],
+  partial_out: wp.array3d[float],
+):
+  world, tid = wp.tid()
+  _centre_world(world, tid, nthread, nslice, undo, dvel_warm_in, step_out, partial_out)
+
+
+@wp.func_native(_DIRECT)
+def _direct_world(
+  world: int,
+  tid: int,
+  nthread: int,
+  nslice: int,
+  neumann: int,
+  foundation: float,
+  bulk: float,
+  pressure: float,
+  volume0: float,
+  slot_adr: wp.array[int],
+  fan_node: wp.array2d[int],
+  fan_spring: wp.array2d[float],
+  area: wp.array2d[float],
+  free_: wp.array2d[float],
+  rest: wp.array3d[float],
+  step: wp.array2d[float],
+  pos: wp.array4d[float],
+  vel: wp.array4d[float],
+  mass: wp.array3d[float],
+  rhs: wp.array4d[float],
+  areavec: wp.array4d[float],
+  total: wp.array2d[float],
+  x_: wp.array4d[float],
+  q_: wp.array4d[float],
+  partial_: wp.array3d[float],
+  status: wp.array2d[float],
+): ...
+
+
+@wp.kernel(enable_backward=False, launch_bounds=512)
+def _direct(
+  nthread: int,
+  nslice: int,
+  neumann: int,
+  foundation: float,
+  bulk: float,
+  pressure: float,
+  volume0: float,
+  # Surface:
+  slot_adr: wp.array[int],
+  fan_node: wp.array2d[int],
+  fan_spring: wp.array2d[float],
+  area: wp.array2d[float],
+  free: wp.array2d[float],
+  rest: wp.array3d[float],
+  # State in:
+  step_in: wp.array2d[float],
+  pos_in: wp.array4d[float],
+  vel_in: wp.array4d[float],
+  mass_in: wp.array3d[float],
+  rhs_in: wp.array4d[float],
+  areavec_in: wp.array4d[float],
+  # State out:
+  total_out: wp.array2d[float],
+  x_out: wp.array4d[float],
+  q_out: wp.array4d[float],
+  partial_out: wp.array3d[float],
+  status_out: wp.array2d[float],
+):
+  world, tid = wp.tid()
+  _direct_world(
+    world,
+    tid,
+    nthread,
+    nslice,
+    neumann,
+    foundation,
+    bulk,
+    pressure,
+    volume0,
+    slot_adr,
+    fan_node,
+    fan_spring,
+    area,
+    free,
+    rest,
+    step_in,
+    pos_in,
+    vel_in,
+    mass_in,
+    rhs_in,
+    areavec_in,
+    total_out,
+    x_out,
+    q_out,
+    partial_out,
+    status_out,
+  )
+
+
+def direct(nthread, body, stage):
+  s, d = old(body)
+  wp.launch(
+    _direct,
+    dim=(d.nworld, nthread),
+    block_dim=simd_threads.block(s.device, s.nslice),
+    inputs=[
+      nthread,
+      s.nslice,
+      int(stage == Stage.NEUMANN),
+      s.foundation,
+      s.bulk,
+      s.pressure,
+      s.volume0,
+      s.slot_adr,
+      s.fan_node,
+      s.fan_spring,
+      s.area,
+      s.free,
+      s.rest,
+      d.step,
+      d.pos,
+      d.vel,
+      d.mass,
+      d.rhs,
+      d.areavec,
+    ],
+    outputs=[d.total, d.x, d.q, d.partial, d.status],
+    device=s.device,
+  )
+
+
+def centre(nthread, body, undo):
+  s, d = old(body)
+  wp.launch(
+    _centre,
+    dim=(d.nworld, nthread),
+    block_dim=simd_threads.block(s.device, s.nslice),
+    inputs=[nthread, s.nslice, undo, d.dvel_warm],
+    outputs=[d.step, d.partial],
+    device=s.device,
+  )

@@ -6,7 +6,7 @@ import mujoco
 import palpate
 import pytest
 from palpate.engine import layout
-from windowed import scene
+from scenes import probed
 
 SIZES = {"nfree": 21, "nvert": 9, "nslot": 5, "nwindow": 2, "ngeom": 3, "most": 7}
 BLOCKS = (layout.NodalState, layout.WindowState, layout.Inbox, layout.Outbox)
@@ -31,7 +31,7 @@ def test_numbers_have_a_name_a_unit_and_a_meaning(table):
 
 @pytest.mark.parametrize("window", [True, False])
 def test_the_plugin_state_has_room_for_its_table(window):
-  m = mujoco.MjModel.from_xml_string(scene(window))
+  m = mujoco.MjModel.from_xml_string(probed(window=window))
   organ = palpate.Organ(m, mujoco.MjData(m), "organ")
   sizes = {"nvert": organ.nvert, "nfree": 3 * organ.nvert, "nslot": 54, "ngeom": 1}
   needed = layout.size(layout.WindowState if window else layout.NodalState, sizes)
