@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import mujoco
 import numpy as np
-from palpate.engine.coupling import MISSED_ELEMENTS, MISSED_NODES
+from palpate.engine.layout import FLAG
 from palpate.tissue.config import Config
 
 from .engine import motion, workspace
@@ -112,7 +112,7 @@ class Organ:
   @property
   def window_overflow(self) -> tuple[int, int]:
     """Touched nodes and triangles that the windows had no room for in the last step."""
-    return int(self._space.flags[MISSED_NODES]), int(self._space.flags[MISSED_ELEMENTS])
+    return int(self._space.flags[FLAG.missed_nodes]), int(self._space.flags[FLAG.missed_elements])
 
   @property
   def window_warning(self) -> str | None:

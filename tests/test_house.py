@@ -46,12 +46,8 @@ NOT_YET = {
   },
   "tests use public names": {
     "tests/app/test_wrap_command.py: _picture",
-    "tests/engine/test_resident.py: _ROOM",
-    "tests/engine/test_resident.py: _SLOW",
   },
   "files": {
-    "plugin/engine/coupling.py",
-    "plugin/engine/window_slots.py",
     "plugin/native/group.h",
     "plugin/tissue/multilevel.py",
     "tests/engine/test_plugin.py",
@@ -59,32 +55,19 @@ NOT_YET = {
   "functions": {
     "models/grid.py",
     "models/markup.py",
-    "plugin/engine/coupling.py",
-    "plugin/engine/window.py",
     "plugin/tissue/multilevel.py",
     "plugin/tissue/solver.py",
     "plugin/windows.py",
   },
   "device switches": {
-    "plugin/engine/window_nodes.py",
     "plugin/tissue/product.py",
     "plugin/tissue/simd.py",
   },
   "native code in headers": {
-    "plugin/engine/coupling.py",
-    "plugin/engine/window_nodes.py",
-    "plugin/engine/window_slots.py",
     "plugin/tissue/multilevel.py",
   },
   "kernels of four arguments": {
-    "plugin/engine/coupling.py",
     "plugin/tissue/multilevel.py",
-  },
-  "offsets in one table": {
-    "plugin/engine/motion.py",
-    "plugin/engine/resident.py",
-    "plugin/engine/window.py",
-    "plugin/engine/workspace.py",
   },
 }
 

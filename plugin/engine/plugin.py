@@ -16,8 +16,8 @@ import mujoco
 import numpy as np
 from palpate.tissue.config import KEYS
 
-from . import guard, mjstruct, turns, window, workspace
-from .coupling import MISSED_ELEMENTS, MISSED_NODES
+from . import guard, mjstruct, turns, windowed, workspace
+from .layout import FLAG
 from .mjstruct import NAME, warn
 from .workspace import Workspace
 
@@ -172,7 +172,7 @@ def _advance(model: int, data: int, instance: int):
   w = _workspaces[data, instance]
   try:
     w.step()
-    if w.overflow is None and (w.flags[MISSED_NODES] or w.flags[MISSED_ELEMENTS]):
+    if w.overflow is None and (w.flags[FLAG.missed_nodes] or w.flags[FLAG.missed_elements]):
       _overflow(w)
     if w.model_step[0] != w.time_step:
       workspace.refresh(w)
@@ -186,7 +186,7 @@ def _visualize(model: int, data: int, option: int, scene: int, instance: int):
   w = _workspaces[data, instance]
   try:
     if w.organ.windows:
-      window.draw(w, model, data)
+      windowed.draw(w, model, data)
   except BaseException as error:
     _fail(w, error)
 
@@ -238,7 +238,7 @@ def _note(w: Workspace, text: str):
 
 def _overflow(w: Workspace):
   """Says, once, that a window is too small."""
-  nodes, triangles = int(w.flags[MISSED_NODES]), int(w.flags[MISSED_ELEMENTS])
+  nodes, triangles = int(w.flags[FLAG.missed_nodes]), int(w.flags[FLAG.missed_elements])
   what = f"{triangles} triangles between their nodes; give them more elements"
   if nodes:
     what = f"{nodes} nodes that tools touch and keep the deepest; give them more vertices"

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import palpate
 import pytest
+from palpate.engine import layout
 from scenes import drive, lump, probed
 
 
@@ -112,7 +113,11 @@ def test_two_steps_back_tell_where_the_solve_starts(window):
     m = mujoco.MjModel.from_xml_string(probed(window=window, keys={"tolerance": 1e-5}))
     d = mujoco.MjData(m)
     organ = palpate.Organ(m, d, "organ")
-    before = slice(9 * organ.nvert, 12 * organ.nvert) if window else slice(-1 - 3 * organ.nvert, -1)
+    if window:
+      where = layout.spans(layout.Motion, {"nvert": organ.nvert})
+    else:
+      where = layout.spans(layout.NodalState, {"nfree": 3 * organ.nvert})
+    before = where["before"]
     forces.append([])
     counts.append([])
     for _ in range(150):
