@@ -366,8 +366,9 @@ def configure(w: Workspace, instance: int, texts: dict[str, str]):
   Raises:
     ValueError: a key may not change, or its value is not allowed.
   """
-  before, w.config = w.config, configuration.change(
-    w.organ.name, w.config, texts, w.organ.mesh.closed
+  before, w.config = (
+    w.config,
+    configuration.change(w.organ.name, w.config, texts, w.organ.mesh.closed),
   )
   if w.resident:
     w.resident.stop()
@@ -376,7 +377,8 @@ def configure(w: Workspace, instance: int, texts: dict[str, str]):
     shape.change(w.body, w.organ.mesh, w.config, ~w.organ.free)
   else:
     shape.renumber(w.body, w.config)
-  bind(w, w.model, instance)
+  if changed.intersection(("integrator", "newton")) or w.body.levels:
+    bind(w, w.model, instance)
   if changed.intersection(configuration.MATERIAL):
     refresh(w)
   else:

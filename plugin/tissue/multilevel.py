@@ -15,7 +15,7 @@ from __future__ import annotations
 import warp as wp
 
 from . import device as simd_threads
-from . import simd, solver
+from . import solver
 from .types import Stage
 
 # Below this condition number a mesh is solved by a few steps of the smoother.
@@ -459,75 +459,6 @@ def _solve(
     cen_out,
     ct_out,
     status_out,
-  )
-
-
-@wp.func_native(
-  simd.slices("""
-  const size_t base = (size_t)world * nnodeslice, at = (size_t)world * nslice + s;
-  const int* node = source.data + 8 * s;
-  for (int c = 0; c < 3; ++c)
-    ST(out.data + 24 * at, c, GATHER(pos.data + 24 * base, node, c));
-  // Mass is what the node's own is worth for all it stands for: offsets are 24 floats a slice.
-  const float* M = mass.data + 8 * base;
-  MASS
-""".replace(
-    "MASS",
-    """
-#if defined(__CUDA_ARCH__) || defined(__CUDACC_RTC__)
-  const int o = node[lane];
-  const V m = M[o / 24 * 8 + o % 24];
-#else
-  V m;
-  for (int l = 0; l < 8; ++l) m[l] = M[node[l] / 24 * 8 + node[l] % 24];
-#endif
-  ST(mass_out.data, at, m * LD(share.data, s));
-""",
-  ))
-)
-def _sample_slices(
-  world: int,
-  tid: int,
-  nslice: int,
-  nnodeslice: int,
-  source: wp.array2d[int],
-  share: wp.array2d[float],
-  pos: wp.array4d[float],
-  mass: wp.array3d[float],
-  out: wp.array4d[float],
-  mass_out: wp.array3d[float],
-): ...
-
-
-@wp.kernel(enable_backward=False)
-def _sample(
-  nslice: int,
-  nnodeslice: int,
-  # Levels:
-  source: wp.array2d[int],
-  share: wp.array2d[float],
-  # State in:
-  pos_in: wp.array4d[float],
-  mass_in: wp.array3d[float],
-  # State out:
-  pos_out: wp.array4d[float],
-  mass_out: wp.array3d[float],
-):
-  world, tid = wp.tid()
-  _sample_slices(world, tid, nslice, nnodeslice, source, share, pos_in, mass_in, pos_out, mass_out)
-
-
-def sample(body):
-  """Samples the shape at the coarser meshes' nodes."""
-  s, d = solver.old(body)
-  c, e = solver.old(body.levels.body)
-  levels = body.levels.transfer
-  wp.launch(
-    _sample,
-    dim=(d.nworld, simd_threads.threads(s.device, c.nslice)),
-    inputs=[c.nslice, s.nslice, levels.source, levels.share, d.pos_trial, d.mass],
-    outputs=[e.pos_trial, e.mass],
-    device=s.device,
   )
 
 
