@@ -22,7 +22,7 @@ import warp as wp
 from palpate.tissue import step
 from palpate.tissue.types import State, System
 
-from . import inertia, mjstruct, prepare, window_nodes, window_slots
+from . import apart, inertia, mjstruct, prepare, window_nodes, window_slots
 from .coupling import Launches, mass_addresses, option_views, wrap
 from .resident import Resident
 from .window_nodes import Nodes
@@ -352,7 +352,7 @@ def let_sleep(w, allowed: bool):
   # Inertias stay: another organ may have made its own greater in this step.
   inertias = [(d.M, m.nC), (d.qLD, m.nC), (d.qLDiagInv, m.nv)]
   kept = [mjstruct.view(*each).copy() for each in inertias]
-  lib.mj_fwdPosition(w.model, w.data)  # trees that may not sleep wake
+  apart.find_contacts(w.model, w.data)  # trees that may not sleep wake
   lib.mj_comVel(w.model, w.data)
   for each, values in zip(inertias, kept, strict=True):
     mjstruct.view(*each)[:] = values

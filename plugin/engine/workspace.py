@@ -15,10 +15,10 @@ from palpate.tissue.body import Body
 from palpate.tissue.config import Config
 
 from . import (
+  apart,
   declare,
   declare_windows,
   graphs,
-  guard,
   inertia,
   mjstruct,
   prepare,
@@ -185,7 +185,7 @@ class Workspace:
 
   def _find_contacts_again(self):
     self.put_windows()
-    guard.run_apart(mjstruct.library().mj_fwdPosition, self.model, self.data)
+    apart.find_contacts(self.model, self.data)
 
   def put_windows(self):
     """Puts the windows where the plugin state says."""
