@@ -30,6 +30,7 @@ def read(model: int, instance: int) -> Declaration:
   elem = declare.elements(m, flex)
   mesh = topology.build(name, rest, elem)
   config = configuration.parse(name, declare.keys(model, instance), len(elem), mesh.closed)
+  declare.check_volume(name, mesh, config)
   free = np.ones(nvert, bool)
   for vertex in config.pin:
     if vertex >= nvert:

@@ -17,7 +17,7 @@ import numpy as np
 import warp as wp
 from palpate.tissue import step
 
-from . import coupling, inertia, layout, mjstruct, nodes, prepare, slots
+from . import apart, coupling, inertia, layout, mjstruct, nodes, prepare, slots
 from .layout import TAIL, Inbox, Motion, Outbox, WindowState
 from .resident import Resident
 
@@ -220,7 +220,7 @@ def let_sleep(w, allowed: bool):
   # Inertias stay: another organ may have made its own greater in this step.
   inertias = [(d.M, m.nC), (d.qLD, m.nC), (d.qLDiagInv, m.nv)]
   kept = [mjstruct.view(*each).copy() for each in inertias]
-  lib.mj_fwdPosition(w.model, w.data)  # trees that may not sleep wake
+  apart.find_contacts(w.model, w.data)  # trees that may not sleep wake
   lib.mj_comVel(w.model, w.data)
   for each, values in zip(inertias, kept, strict=True):
     mjstruct.view(*each)[:] = values

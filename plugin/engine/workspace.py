@@ -15,11 +15,11 @@ from palpate.tissue.body import Body
 from palpate.tissue.config import Config
 
 from . import (
+  apart,
   coupling,
   declare,
   declare_windows,
   graphs,
-  guard,
   inertia,
   mjstruct,
   nodal,
@@ -189,7 +189,7 @@ class Workspace:
 
   def _find_contacts_again(self):
     self.put_windows()
-    guard.run_apart(mjstruct.library().mj_fwdPosition, self.model, self.data)
+    apart.find_contacts(self.model, self.data)
 
   def put_windows(self):
     """Puts the windows where the plugin state says."""
