@@ -1,8 +1,9 @@
 // The multilevel preconditioner of conjugate gradients, for large or stiff organs.
 //
-// One V-cycle on coarser meshes of the organ takes the place of block Jacobi. The matrix of a coarse
-// mesh is the organ's own, made by the same kernels at the present shape sampled at its nodes: no
-// triple products, bending scales as it should, and a deformed shape is as good as the rest shape.
+// One V-cycle on coarser meshes of the organ takes the place of block Jacobi. The matrix of a
+// coarse mesh is the organ's own, made by the same kernels at the present shape sampled at its
+// nodes: no triple products, bending scales as it should, and a deformed shape is as good as the
+// rest shape.
 // Smoothing is Chebyshev iteration on D^-1 A (Adams et al. 2003,
 // doi:10.1016/S0021-9991(03)00194-3) of two or three steps, before and after, which keeps the
 // preconditioner symmetric; the coarsest mesh in use, whose matrix is mostly mass, has more steps.
