@@ -8,7 +8,7 @@ import argparse
 import pathlib
 from collections.abc import Sequence
 
-from . import scene
+from . import markup, mjcf, organs, scene
 from .catalog import NAMES
 
 INSTRUMENTS = ("probe", "grasper")  # of the committed scenes
@@ -16,13 +16,13 @@ INSTRUMENTS = ("probe", "grasper")  # of the committed scenes
 
 def files(name: str) -> dict[pathlib.Path, str]:
   """Returns the content of every file of an organ, by path."""
-  shape = scene.body(name)
+  build = organs.build(name)
   at = scene.path(name, scene=False)
-  mesh = f"{shape.entry.shape}.obj"
+  mesh = f"{build.entry.shape}.obj"
   return {
-    at.parent / "assets" / mesh: scene.obj(shape),
-    at: scene.organ_xml(shape, name, mesh),
-    scene.path(name): scene.scene_xml(shape, name, INSTRUMENTS),
+    at.parent / "assets" / mesh: mjcf.obj(build.vertices, build.triangles),
+    at: markup.catalogued(build, name, mesh),
+    scene.path(name): markup.scene(build, name, INSTRUMENTS),
   }
 
 

@@ -6,6 +6,7 @@ z superior. World of the scenes: the patient lies on the back, x to the right, z
 """
 
 import dataclasses
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -15,13 +16,152 @@ DEFAULT = 1000
 
 
 @dataclasses.dataclass(frozen=True)
+class Tissue:
+  """What an organ's surface is made of, with the source of every number.
+
+  Attributes:
+    title: which organ this is, and which part of it
+    young: Young's modulus of the surface [Pa]
+    poisson: Poisson's ratio [-]
+    thickness: thickness of the surface [m]
+    foundation: Winkler foundation [Pa/m]
+    bulk: volume preservation [Pa]
+    damping: Rayleigh coefficient on the stiffness [s]
+    density: mass over the enclosed volume [kg/m^3]; None where the mass is given
+    mass: of the organ, spread over its nodes [kg]; None for density times volume
+    sources: where each number is from, by its name
+  """
+
+  title: str
+  young: float
+  poisson: float
+  thickness: float
+  foundation: float
+  bulk: float
+  damping: float
+  density: float | None
+  mass: float | None
+  sources: Mapping[str, str]
+
+  def keys(self) -> dict[str, float]:
+    """Returns the plugin's configuration keys."""
+    names = ("young", "poisson", "thickness", "foundation", "bulk", "damping")
+    return {name: getattr(self, name) for name in names}
+
+  def mass_of(self, volume: float) -> float:
+    """Returns the mass [kg] of an organ that encloses a volume [m^3]."""
+    return self.mass if self.density is None else self.density * volume  # pyright: ignore
+
+
+def _tissue(title: str, **numbers: tuple[float, str]) -> Tissue:
+  values = {"density": None, "mass": None} | {name: value for name, (value, _) in numbers.items()}
+  return Tissue(title, sources={name: source for name, (_, source) in numbers.items()}, **values)  # type: ignore
+
+
+_SKIN = "ours: with the foundation, a 5 mm probe 10 mm deep gives what a half space gives it"
+_WALL = "ours: of the wall"
+_AROUND = "ours: stands for what lies around it"
+_NU = (0.45, "nearly incompressible; ours")
+_BULK = (1e4, "ours: keeps the volume")
+_NO_BULK = (0.0, "ours: off, the foundation stands for the inside")
+_UNKNOWN = "ours; not measured in the literature found"
+_REACH = "ours: 0.3 to 1 N at 5 mm under the probe's 2.5 mm tip"
+
+# `<organ>` is the whole organ of the catalogue's scenes, `<organ>_field` what an exercise's
+# instrument feels of it in the field of view. They differ on purpose: experts and references of
+# the exercises were recorded with theirs, so a change of one of those wants them recorded anew.
+TISSUES: dict[str, Tissue] = {
+  "liver": _tissue(
+    "Whole liver: a skin with bending on a foundation stands for the solid organ",
+    young=(5220.0, "2 G (1 + nu) with G = 1.8 kPa: PMC6925591"),
+    poisson=_NU,
+    thickness=(0.008, _SKIN),
+    foundation=(7e4, _SKIN),
+    bulk=_BULK,
+    damping=(0.005, _UNKNOWN),
+    density=(1060.0, "PMC6925591"),
+  ),
+  "stomach": _tissue(
+    "Whole stomach, moderately filled: a wall around a filling",
+    young=(1860.0, "2 G (1 + nu) with G = 0.64 kPa: PMC6925591"),
+    poisson=_NU,
+    thickness=(0.005, _WALL),
+    foundation=(2e4, _AROUND),
+    bulk=_BULK,
+    damping=(0.005, _UNKNOWN),
+    density=(1058.0, "PMC6925591"),
+  ),
+  "gallbladder": _tissue(
+    "Whole gallbladder: a thin stiff wall around bile",
+    young=(246000.0, "2 G (1 + nu) with G = 85 kPa: PMC6925591"),
+    poisson=_NU,
+    thickness=(0.002, _WALL),
+    foundation=(1e4, _AROUND),
+    bulk=_BULK,
+    damping=(0.002, _UNKNOWN),
+    density=(1060.0, "PMC6925591"),
+  ),
+  "kidney": _tissue(
+    "Whole kidney: a skin with bending on a foundation stands for the solid organ",
+    young=(5250.0, "2 G (1 + nu), G = 1.81 kPa, pig cortex: Amador et al., IEEE UFFC 58 (2011)"),
+    poisson=_NU,
+    thickness=(0.006, _SKIN),
+    foundation=(1e5, _SKIN),
+    bulk=_BULK,
+    damping=(0.004, _UNKNOWN),
+    density=(1060.0, "as liver: PMC6925591"),
+  ),
+  "liver_field": _tissue(
+    "Liver in the field of view: the layer of 5 mm that moves under an instrument",
+    young=(5400.0, "3 G (incompressible) with G = 1.8 kPa: PMC6925591"),
+    poisson=_NU,
+    thickness=(0.003, _REACH),
+    foundation=(4e5, _REACH),
+    bulk=_NO_BULK,
+    damping=(0.005, _UNKNOWN),
+    mass=(0.4, "ours: 5 mm under the whole surface of 0.078 m^2, of a liver of 1.7 kg"),
+  ),
+  "kidney_field": _tissue(
+    "Kidney in the field of view: stiffer than excised cortex",
+    young=(1e4, "ours: chosen for palpation; excised cortex has 5250 Pa, see `kidney`"),
+    poisson=_NU,
+    thickness=(0.006, _REACH),
+    foundation=(1e5, _REACH),
+    bulk=_NO_BULK,
+    damping=(0.005, _UNKNOWN),
+    mass=(0.15, "ours: the whole organ of 151 ml, rounded"),
+  ),
+  "stomach_field": _tissue(
+    "Stomach in the field of view: the wall without a filling",
+    young=(2e4, "ours: chosen for tracing; tougher than `stomach`, whose source looks low"),
+    poisson=_NU,
+    thickness=(0.003, _REACH),
+    foundation=(2e5, _REACH),
+    bulk=_NO_BULK,
+    damping=(0.005, _UNKNOWN),
+    mass=(0.2, "ours: 3 mm of wall on 0.069 m^2"),
+  ),
+  "gallbladder_field": _tissue(
+    "Gallbladder in the field of view: soft enough to be lifted and held aside",
+    young=(1.5e4, "ours: chosen for grasping; the wall alone has 246 kPa, see `gallbladder`"),
+    poisson=_NU,
+    thickness=(0.002, _WALL),
+    foundation=(1.5e4, _AROUND),
+    bulk=_BULK,
+    damping=(0.005, _UNKNOWN),
+    mass=(0.05, "ours: the whole organ of 46 ml, rounded"),
+  ),
+}
+
+
+@dataclasses.dataclass(frozen=True)
 class Inclusion:
   """A stiff lump under the surface, felt as a bell of Young's modulus over the nodes above it.
 
   Attributes:
     landmark: place on the surface above it
-    radius: width of the bell [m]
-    young: Young's modulus at its middle [Pa]
+    radius: width of the bell [m]; ours
+    young: Young's modulus at its middle [Pa]; ten times the liver's: ours
   """
 
   landmark: str
@@ -51,13 +191,7 @@ class Entry:
   Attributes:
     shape: name of the shape in `shapes`
     title: what it is, for the head of the files
-    young: Young's modulus of the surface [Pa]
-    poisson: Poisson's ratio [-]
-    thickness: thickness of the surface [m]
-    foundation: Winkler foundation [Pa/m]
-    bulk: volume preservation [Pa]
-    damping: Rayleigh coefficient on the stiffness [s]
-    density: of the whole organ [kg/m^3]; its mass is spread over the nodes
+    tissue: what it is made of
     rgba: colour
     specular, shininess: of the wet surface
     camera: position of the laparoscope in the world [m]
@@ -69,13 +203,7 @@ class Entry:
 
   shape: str
   title: str
-  young: float
-  poisson: float
-  thickness: float
-  foundation: float
-  bulk: float
-  damping: float
-  density: float
+  tissue: Tissue
   rgba: tuple[float, float, float, float]
   camera: tuple[float, float, float]
   target: tuple[float, float, float]
@@ -89,13 +217,7 @@ class Entry:
 _LIVER = Entry(
   shape="liver",
   title="Liver of an adult, 22 x 12 x 15 cm",
-  young=5220.0,
-  poisson=0.45,
-  thickness=0.008,
-  foundation=7e4,
-  bulk=1e4,
-  damping=0.005,
-  density=1060.0,
+  tissue=TISSUES["liver"],
   rgba=(0.52, 0.17, 0.13, 1.0),
   camera=(0.01, 0.16, 0.12),
   target=(0.0, -0.005, 0.012),
@@ -112,13 +234,7 @@ ENTRIES: dict[str, Entry] = {
   "stomach": Entry(
     shape="stomach",
     title="Stomach, moderately filled, 20 x 11 x 21 cm",
-    young=1860.0,
-    poisson=0.45,
-    thickness=0.005,
-    foundation=2e4,
-    bulk=1e4,
-    damping=0.005,
-    density=1058.0,
+    tissue=TISSUES["stomach"],
     rgba=(0.80, 0.50, 0.44, 1.0),
     specular=0.6,
     shininess=0.7,
@@ -129,13 +245,7 @@ ENTRIES: dict[str, Entry] = {
   "gallbladder": Entry(
     shape="gallbladder",
     title="Gallbladder down to its neck, 5 x 8 x 5 cm",
-    young=246000.0,
-    poisson=0.45,
-    thickness=0.002,
-    foundation=1e4,
-    bulk=1e4,
-    damping=0.002,
-    density=1060.0,
+    tissue=TISSUES["gallbladder"],
     rgba=(0.42, 0.52, 0.30, 1.0),
     backdrop=("liver", (-0.020, -0.008, 0.066)),
     specular=0.8,
@@ -150,13 +260,7 @@ ENTRIES: dict[str, Entry] = {
   "kidney": Entry(
     shape="kidney",
     title="Right kidney with its renal pelvis, 8 x 4 x 11 cm",
-    young=5250.0,
-    poisson=0.45,
-    thickness=0.006,
-    foundation=1e5,
-    bulk=1e4,
-    damping=0.004,
-    density=1060.0,
+    tissue=TISSUES["kidney"],
     rgba=(0.50, 0.20, 0.17, 1.0),
     specular=0.6,
     shininess=0.7,

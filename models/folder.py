@@ -6,12 +6,13 @@ import pathlib
 
 import numpy as np
 
-from . import scene
+from . import markup, mjcf, quality
 from .catalog import ENTRIES
+from .markup import numbers
 from .wrap import Report
 
-# The tissue of a new organ until its maker knows better: the liver's.
-_TISSUE = ENTRIES["liver"]
+# What a new organ is until its maker knows better: liver.
+_LIVER = ENTRIES["liver"]
 
 
 def write(
@@ -20,8 +21,8 @@ def write(
   vertices: np.ndarray,
   triangles: np.ndarray,
   report: Report,
-  young: float = _TISSUE.young,
-  foundation: float = _TISSUE.foundation,
+  young: float = _LIVER.tissue.young,
+  foundation: float = _LIVER.tissue.foundation,
 ) -> list[pathlib.Path]:
   """Writes `<name>.xml`, `scene.xml`, `assets/<name>.obj` and `README.md`; returns their paths.
 
@@ -43,11 +44,13 @@ def write(
     if not (np.isfinite(value) and value > 0):
       raise ValueError(f"{key} is {value:g}, expected a number > 0")
   root = pathlib.Path(folder)
-  a, b, c = (vertices[triangles[:, k]] for k in range(3))
-  mass = _TISSUE.density * float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
+  mass = _LIVER.tissue.mass_of(quality.volume(vertices, triangles))
+  config = _LIVER.tissue.keys() | {"young": young, "foundation": foundation}
   files = {
-    root / "assets" / f"{name}.obj": _obj(vertices, triangles),
-    root / f"{name}.xml": _organ(name, mass, young, foundation),
+    root / "assets" / f"{name}.obj": mjcf.obj(vertices, triangles, decimals=8),
+    root / f"{name}.xml": markup.organ(
+      name, name, f"assets/{name}.obj", mass, config, rgba=_LIVER.rgba
+    ),
     root / "scene.xml": _scene(name, vertices),
     root / "README.md": _readme(name, mass, young, foundation, report),
   }
@@ -57,44 +60,6 @@ def write(
   return list(files)
 
 
-def _obj(vertices: np.ndarray, triangles: np.ndarray) -> str:
-  lines = [f"v {x:.7g} {y:.7g} {z:.7g}" for x, y, z in vertices]
-  lines += [f"f {i} {j} {k}" for i, j, k in triangles + 1]
-  return "\n".join(lines) + "\n"
-
-
-def _organ(name: str, mass: float, young: float, foundation: float) -> str:
-  return f"""<mujoco model="{name}">
-  <extension>
-    <plugin plugin="palpate.organ"/>
-  </extension>
-
-  <asset>
-    <material name="{name}" rgba="{scene.numbers(_TISSUE.rgba)}" specular="0.5" shininess="0.6"/>
-  </asset>
-
-  <worldbody>
-    <body name="{name}">
-      <flexcomp name="{name}" type="mesh" file="assets/{name}.obj" dim="2" mass="{mass:.4g}"
-        radius="0.001" material="{name}" flatskin="false">
-        <plugin plugin="palpate.organ">
-          <config key="young" value="{young:g}"/>
-          <config key="poisson" value="{_TISSUE.poisson:g}"/>
-          <config key="thickness" value="{_TISSUE.thickness:g}"/>
-          <config key="foundation" value="{foundation:g}"/>
-          <config key="bulk" value="{_TISSUE.bulk:g}"/>
-          <config key="damping" value="{_TISSUE.damping:g}"/>
-        </plugin>
-        <edge damping="1e-9"/>
-        <contact condim="3" friction="0.3" solref="0.004 1" solimp="0.95 0.99 0.001" solmix="1000"
-          selfcollide="none"/>
-      </flexcomp>
-    </body>
-  </worldbody>
-</mujoco>
-"""
-
-
 def _scene(name: str, vertices: np.ndarray) -> str:
   low, high = vertices.min(axis=0), vertices.max(axis=0)
   middle, size = (low + high) / 2, float(np.linalg.norm(high - low))
@@ -102,12 +67,12 @@ def _scene(name: str, vertices: np.ndarray) -> str:
   away = (eye - middle) / np.linalg.norm(eye - middle)
   right = np.cross([0.0, 0.0, 1.0], away)
   right /= np.linalg.norm(right)
-  axes = scene.numbers(np.concatenate([right, np.cross(away, right)]))
+  axes = numbers(np.concatenate([right, np.cross(away, right)]))
   memory = 64 + 5 * len(vertices) ** 2 // 2_000_000
   return f"""<mujoco model="{name} scene">
   <option timestep="0.001" gravity="0 0 0"/>
   <size memory="{memory}M"/>
-  <statistic center="{scene.numbers(middle)}" extent="{size:.3g}"/>
+  <statistic center="{numbers(middle)}" extent="{size:.3g}"/>
   <visual>
     <headlight ambient="0.35 0.35 0.35" diffuse="0.5 0.5 0.5"/>
     <map znear="0.01"/>
@@ -121,8 +86,8 @@ def _scene(name: str, vertices: np.ndarray) -> str:
   </asset>
 
   <worldbody>
-    <light pos="{scene.numbers(eye + np.array([0, 0, size]))}" dir="{scene.numbers(-away)}"/>
-    <camera name="overview" pos="{scene.numbers(eye)}" xyaxes="{axes}"/>
+    <light pos="{numbers(eye + np.array([0, 0, size]))}" dir="{numbers(-away)}"/>
+    <camera name="overview" pos="{numbers(eye)}" xyaxes="{axes}"/>
     <frame>
       <attach model="{name}" body="{name}" prefix="{name}/"/>
     </frame>
@@ -142,7 +107,8 @@ Made by `palpate wrap`. `{name}.xml` is the organ to attach, `scene.xml` shows i
 ![{name}]({name}.png)
 
 E = {young:g} Pa, foundation {foundation:g} Pa/m, mass {mass:.4g} kg at
-{_TISSUE.density:g} kg/m^3: the liver's values where not given, to be replaced by the tissue's own.
+{_LIVER.tissue.density:g} kg/m^3: the liver's values where not given, to be replaced by the
+tissue's own.
 Nothing is pinned; the foundation holds it.
 
 | | |

@@ -27,7 +27,7 @@ _MIN_NODES = 100  # fewer cannot follow the organs' ducts
 
 
 @dataclasses.dataclass(frozen=True)
-class Organ:
+class Anatomy:
   """An organ's shape and the places on it that have names.
 
   Attributes:
@@ -102,7 +102,7 @@ def carve(blend: float, shape: Implicit, *tools: Implicit) -> Implicit:
   return lambda x: -inverse(x)
 
 
-def mesh(shape: Organ, nodes: int) -> Mesh:
+def mesh(shape: Anatomy, nodes: int) -> Mesh:
   """Returns an even mesh of the organ with the given number of nodes."""
   if nodes < _MIN_NODES:
     raise ValueError(f"nodes is {nodes}, expected {_MIN_NODES} or more")
@@ -118,13 +118,13 @@ def grid(name: str, side: int, seed: Seed = None) -> Mesh:
   """
   if side < 16 or side % 2:
     raise ValueError(f"side is {side}, expected an even number of 16 or more")
-  shape = organ(name, seed)
+  shape = anatomy(name, seed)
   field = _tabulate(shape, side * side)
   vertices, triangles = shrink(*mesh(shape, 2000), side // 2, field.projector())
   return guard(vertices, project(shape.implicit, vertices), triangles), triangles
 
 
-def _tabulate(shape: Organ, nodes: int) -> Field:
+def _tabulate(shape: Anatomy, nodes: int) -> Field:
   """Returns the shape on a grid fine enough for a number of nodes."""
   size = float((shape.bounds[1] - shape.bounds[0]).max())
   coarse = tabulate(shape.implicit, shape.bounds, size / 40).surface()
@@ -136,43 +136,43 @@ def _tabulate(shape: Organ, nodes: int) -> Field:
 
 def liver(nodes: int = 1000, seed: Seed = None) -> Mesh:
   """Returns a liver; seed None is the mean shape, a number a variant of it."""
-  return mesh(organ("liver", seed), nodes)
+  return mesh(anatomy("liver", seed), nodes)
 
 
 def stomach(nodes: int = 1000, seed: Seed = None) -> Mesh:
   """Returns a moderately filled, J-shaped stomach; seed as in liver."""
-  return mesh(organ("stomach", seed), nodes)
+  return mesh(anatomy("stomach", seed), nodes)
 
 
 def gallbladder(nodes: int = 1000, seed: Seed = None) -> Mesh:
   """Returns a gallbladder down to its neck; seed as in liver."""
-  return mesh(organ("gallbladder", seed), nodes)
+  return mesh(anatomy("gallbladder", seed), nodes)
 
 
 def kidney(nodes: int = 1000, seed: Seed = None) -> Mesh:
   """Returns a right kidney with its renal pelvis; seed as in liver."""
-  return mesh(organ("kidney", seed), nodes)
+  return mesh(anatomy("kidney", seed), nodes)
 
 
 def lobed(nodes: int = 1000, seed: Seed = 0) -> Mesh:
   """Returns a test shape: a ball of 5 cm radius with lobes placed by the seed."""
-  return mesh(organ("lobed", seed), nodes)
+  return mesh(anatomy("lobed", seed), nodes)
 
 
-def organ(name: str, seed: Seed = None) -> Organ:
+def anatomy(name: str, seed: Seed = None) -> Anatomy:
   """Returns the shape of an organ and its named places."""
-  if name not in _ORGANS:
-    raise ValueError(f"unknown organ {name!r}, expected one of {', '.join(sorted(_ORGANS))}")
+  if name not in _SHAPES:
+    raise ValueError(f"unknown organ {name!r}, expected one of {', '.join(sorted(_SHAPES))}")
   random = np.random.RandomState(seed) if isinstance(seed, int | np.integer) else seed
   if name == "lobed":
     return _lobed(random if random is not None else np.random.RandomState(0))
-  mean = _ORGANS[name]()
+  mean = _SHAPES[name]()
   return mean if random is None else _vary(mean, random)
 
 
 def landmarks(name: str, seed: Seed = None) -> dict[str, np.ndarray]:
   """Returns the organ's named points on the surface [m], name -> (3,); seed as for the mesh."""
-  shape = organ(name, seed)
+  shape = anatomy(name, seed)
   names, points = list(shape.landmarks), np.array(list(shape.landmarks.values())).reshape(-1, 3)
   return dict(zip(names, project(shape.implicit, points, steps=20), strict=True))
 
@@ -184,7 +184,7 @@ def patches(name: str, vertices: np.ndarray, seed: Seed = None) -> dict[str, np.
   """
   from scipy.spatial import KDTree
 
-  shape, out = organ(name, seed), {}
+  shape, out = anatomy(name, seed), {}
   for patch, (line, radius) in shape.patches.items():
     at = np.linspace(0, len(line) - 1, 40)
     points = np.stack([np.interp(at, np.arange(len(line)), x) for x in line.T], axis=1)
@@ -212,9 +212,9 @@ def inclusion_young(
   return young + (young_inclusion - young) * np.exp(-((distance / radius) ** 2))
 
 
-def _cm(shape: Implicit, low, high, marks: dict, lines: dict) -> Organ:
+def _cm(shape: Implicit, low, high, marks: dict, lines: dict) -> Anatomy:
   """Returns an organ from a shape, a box and places in centimetres."""
-  return Organ(
+  return Anatomy(
     implicit=lambda x: shape(x * 100) / 100,
     bounds=np.array([low, high]) / 100,
     landmarks={name: np.array(point) / 100 for name, point in marks.items()},
@@ -222,7 +222,7 @@ def _cm(shape: Implicit, low, high, marks: dict, lines: dict) -> Organ:
   )
 
 
-def _liver() -> Organ:
+def _liver() -> Anatomy:
   # The dome under the diaphragm, cut from below by what the liver lies on.
   right = ellipsoid([3.2, 0, -0.3], [7.8, 6.2, 8.0])
   left = ellipsoid([-4.0, 1.4, 2.4], [7.2, 4.6, 4.0])
@@ -252,7 +252,7 @@ def _liver() -> Organ:
   return _cm(shape, [-12, -9, -10], [13, 9, 10], marks, lines)
 
 
-def _stomach() -> Organ:
+def _stomach() -> Anatomy:
   axis = [
     [-6.2, -0.9, 6.0], [-6.3, -0.3, 3.0], [-5.7, 0.6, -0.5], [-4.3, 1.6, -4.0],
     [-1.2, 2.2, -6.6], [2.6, 2.0, -6.4], [5.6, 0.8, -4.6], [7.4, -0.4, -3.4],
@@ -278,7 +278,7 @@ def _stomach() -> Organ:
   return _cm(shape, [-12.5, -7, -12], [10.5, 8, 12.5], marks, lines)
 
 
-def _gallbladder() -> Organ:
+def _gallbladder() -> Anatomy:
   axis = [
     [1.3, 2.4, -1.7], [0.7, 0.8, -0.7], [0.1, -1.1, 0.5], [-0.6, -2.5, 1.5], [-1.5, -3.4, 1.7],
   ]  # fmt: skip
@@ -297,7 +297,7 @@ def _gallbladder() -> Organ:
   return _cm(shape, [-3, -5, -4.5], [4, 5, 3.5], marks, lines)
 
 
-def _kidney() -> Organ:
+def _kidney() -> Anatomy:
   straight = union(
     4.0, ellipsoid([0.5, 0, 1.6], [2.7, 1.65, 3.9]), ellipsoid([0.5, 0, -1.6], [2.5, 1.55, 3.9])
   )
@@ -321,7 +321,7 @@ def _kidney() -> Organ:
   return _cm(shape, [-5, -3.5, -7], [5, 3.5, 7], marks, lines)
 
 
-def _lobed(random: np.random.RandomState) -> Organ:
+def _lobed(random: np.random.RandomState) -> Anatomy:
   toward = random.normal(size=(6, 3))
   toward /= np.linalg.norm(toward, axis=1, keepdims=True)
   height = random.uniform(-0.2, 0.4, size=6)
@@ -334,7 +334,7 @@ def _lobed(random: np.random.RandomState) -> Organ:
   return _cm(ball, [-9.5] * 3, [9.5] * 3, {"top": [0, 0, 5]}, {"bottom": ([[0, 0, -5]], 1.5)})
 
 
-def _vary(mean: Organ, random: np.random.RandomState) -> Organ:
+def _vary(mean: Anatomy, random: np.random.RandomState) -> Anatomy:
   """Returns a variant: lengths within 8 %, and slow waves of 2 % of the size."""
   size = float((mean.bounds[1] - mean.bounds[0]).max())
   scale = random.uniform(0.92, 1.08, size=3)
@@ -353,7 +353,7 @@ def _vary(mean: Organ, random: np.random.RandomState) -> Organ:
       x = x - (to_mean(x) - y) * scale
     return x
 
-  return Organ(
+  return Anatomy(
     implicit=lambda x: mean.implicit(to_mean(x)),
     bounds=mean.bounds * 1.15,
     landmarks={name: from_mean(point[None])[0] for name, point in mean.landmarks.items()},
@@ -361,7 +361,7 @@ def _vary(mean: Organ, random: np.random.RandomState) -> Organ:
   )
 
 
-_ORGANS: dict[str, Callable[..., Organ]] = {
+_SHAPES: dict[str, Callable[..., Anatomy]] = {
   "liver": _liver,
   "stomach": _stomach,
   "gallbladder": _gallbladder,

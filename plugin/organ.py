@@ -180,7 +180,7 @@ class Organ:
   @property
   def device(self) -> str:
     """Device the organ is solved on."""
-    return self._organ.surface.device.alias
+    return self._organ.still.device.alias
 
   def set_state(self, xpos: np.ndarray | None = None, xvel: np.ndarray | None = None):
     """Places the organ; pinned vertices stay, and forces of the past are forgotten.

@@ -16,44 +16,27 @@ from collections.abc import Mapping
 
 import mujoco
 import numpy as np
-from palpate.models import shapes, trocar
+from palpate.models import catalog, mjcf, shapes, trocar
+from palpate.models.catalog import Tissue
 
 NOW, LATER = (1.0, 0.8, 0.1), (0.2, 0.75, 0.95)  # colours of targets
 ORGAN = "organ"
 CAMERA = "laparoscope"
+# The organ's solref counts, not the instrument's: light nodes want stiff contacts.
+_CONTACT = {
+  "condim": 3,
+  "selfcollide": "none",
+  "solref": (0.002, 1),
+  "solimp": (0.95, 0.99, 0.001),
+  "solmix": 1e4,
+}
 _TURN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # organ's frame to world
 
 
-@dataclasses.dataclass(frozen=True)
-class Material:
-  """Tissue of an organ; the plugin's configuration keys.
-
-  Attributes:
-    mass: of the organ [kg]
-    young: Young's modulus of the surface [Pa]
-    thickness: of the surface [m]
-    foundation: stands for what lies under the surface [Pa/m]
-    bulk: volume preservation [Pa]
-    damping: Rayleigh coefficient on the stiffness [s]
-    pinned: whether the organ's attachments (`shapes.patches`) are fixed
-  """
-
-  mass: float
-  young: float
-  thickness: float
-  foundation: float
-  bulk: float = 0.0
-  damping: float = 0.005
-  pinned: bool = True
-
-
-# Young's moduli: 2 G (1 + nu) with G from PMC6925591 for the liver; the wall of gallbladder and
-# stomach is thinner and tougher. Foundations give 0.3 to 1 N at 5 mm under the 2.5 mm tip.
-MATERIALS: Mapping[str, Material] = {
-  "liver": Material(0.4, 5.4e3, 0.003, 4e5),
-  "kidney": Material(0.15, 1.0e4, 0.006, 1e5),
-  "stomach": Material(0.2, 2.0e4, 0.003, 2e5),
-  "gallbladder": Material(0.05, 1.5e4, 0.002, 1.5e4, bulk=1e4),
+# What the instrument feels of each organ; `catalog.TISSUES` has the sources.
+TISSUES: Mapping[str, Tissue] = {
+  organ: catalog.TISSUES[f"{organ}_field"]
+  for organ in ("liver", "kidney", "stomach", "gallbladder")
 }
 
 
@@ -62,7 +45,7 @@ class Scene:
   """What a scene is made of; equal scenes compile to equal models.
 
   Attributes:
-    organ: one of `MATERIALS`
+    organ: one of `TISSUES`
     instrument: `probe` or `grasper`
     nodes: number of the organ's nodes
     variant: seed of the organ's shape, None for the mean shape
@@ -116,19 +99,29 @@ def landmark(scene: Scene, name: str) -> np.ndarray:
 
 def build(scene: Scene) -> mujoco.MjSpec:
   """Returns the scene, ready to be changed and compiled."""
-  if scene.organ not in MATERIALS:
-    raise ValueError(f"organ is {scene.organ!r}, expected one of {', '.join(MATERIALS)}")
-  material = MATERIALS[scene.organ]
+  if scene.organ not in TISSUES:
+    raise ValueError(f"organ is {scene.organ!r}, expected one of {', '.join(TISSUES)}")
+  tissue = TISSUES[scene.organ]
   vertices, triangles = surface(scene.organ, scene.nodes, scene.variant)
-  pins = _pins(scene.organ, scene.nodes, scene.variant) if material.pinned else ()
-  young = np.array([material.young])
+  young = np.array([tissue.young])
   if scene.inclusion is not None:
     *place, radius, factor = scene.inclusion
     young = shapes.inclusion_young(
-      vertices, triangles, np.array(place), radius, material.young, factor * material.young
+      vertices, triangles, np.array(place), radius, tissue.young, factor * tissue.young
     )
   center = landmark(scene, scene.center)
-  spec = mujoco.MjSpec.from_string(_xml(material, vertices, triangles, pins, young, center, scene))
+  flex = mjcf.flexcomp(
+    ORGAN,
+    (vertices, triangles),
+    config=tissue.keys() | {"young": young, "device": "cpu"},
+    contact=_CONTACT,
+    pin=_pins(scene.organ, scene.nodes, scene.variant),
+    digits=7,
+    mass=tissue.mass,
+    radius=0.001,
+    rgba=catalog.entry(scene.organ).rgba,
+  )
+  spec = mujoco.MjSpec.from_string(_xml(flex, center, scene))
   port = center + scene.port
   trocar.attach(
     spec, scene.instrument, f"{scene.instrument}/", pos=port, quat=trocar.aim(port, center)
@@ -136,34 +129,22 @@ def build(scene: Scene) -> mujoco.MjSpec:
   return spec
 
 
-def _xml(material, vertices, triangles, pins, young, center, scene: Scene) -> str:
+def _xml(flex: str, center: np.ndarray, scene: Scene) -> str:
   def numbers(values) -> str:
-    return " ".join(f"{float(x):.7g}" for x in np.ravel(values))
+    return mjcf.numbers(values, digits=7)
 
   camera = center + scene.camera
   back = -np.asarray(scene.camera) / np.linalg.norm(scene.camera)
   right = np.cross(back, [0.0, 0.0, 1.0])
   right /= np.linalg.norm(right)
-  pin = f'<pin id="{" ".join(map(str, pins))}"/>' if pins else ""
   sites = "".join(
     f'<site name="target{i}" size="0.003" rgba="0.2 0.75 0.95 0.9"/>' for i in range(scene.targets)
   )
-  color = "0.72 0.36 0.31 1" if scene.organ != "gallbladder" else "0.48 0.62 0.34 1"
-  config = {
-    "young": numbers(young),
-    "thickness": material.thickness,
-    "foundation": material.foundation,
-    "bulk": material.bulk,
-    "damping": material.damping,
-    "device": "cpu",
-  }
-  keys = "".join(f'<config key="{key}" value="{value}"/>' for key, value in config.items())
-  # solmix: the organ's solref counts, not the instrument's: light nodes want stiff contacts.
   return f"""
 <mujoco model="exercise">
   <compiler autolimits="true"/>
   <option timestep="0.001" integrator="implicitfast" cone="elliptic" impratio="3"/>
-  <extension><plugin plugin="palpate.organ"/></extension>
+  {mjcf.extension()}
   <visual>
     <global offwidth="1280" offheight="960"/>
     <headlight ambient="0.3 0.3 0.3" diffuse="0.6 0.6 0.6"/>
@@ -180,12 +161,6 @@ def _xml(material, vertices, triangles, pins, young, center, scene: Scene) -> st
     <camera name="{CAMERA}" pos="{numbers(camera)}" fovy="50"
       xyaxes="{numbers(right)} {numbers(np.cross(right, back))}"/>
     {sites}
-    <flexcomp name="{ORGAN}" type="direct" dim="2" mass="{material.mass}" radius="0.001"
-      point="{numbers(vertices)}" element="{" ".join(map(str, triangles.ravel()))}" rgba="{color}">
-      <plugin plugin="palpate.organ">{keys}</plugin>
-      <contact condim="3" selfcollide="none" solref="0.002 1" solimp="0.95 0.99 0.001"
-        solmix="1e4"/>
-      {pin}
-    </flexcomp>
+    {flex}
   </worldbody>
 </mujoco>"""

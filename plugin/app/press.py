@@ -180,10 +180,9 @@ def organ_mesh(nodes: int = _NODES, seed: int = _SEED) -> tuple[np.ndarray, np.n
 
 def write_organ(path: pathlib.Path | str, nodes: int = _NODES, seed: int = _SEED):
   """Writes the shipped organ as an OBJ file."""
-  vertices, triangles = organ_mesh(nodes, seed)
-  lines = [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in vertices + 0.0]
-  lines += [f"f {a} {b} {c}" for a, b, c in triangles + 1]
-  pathlib.Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
+  from palpate.models import mjcf
+
+  pathlib.Path(path).write_text(mjcf.obj(*organ_mesh(nodes, seed)), encoding="utf-8")
 
 
 def _load(args: argparse.Namespace):

@@ -24,8 +24,8 @@ from typing import Any
 import mujoco
 import numpy as np
 import warp as wp
-from palpate.tissue import solver
-from palpate.tissue.simd import LANES
+from palpate.tissue import step
+from palpate.tissue.order import LANES
 
 from . import mjstruct
 
@@ -41,7 +41,7 @@ PENDING, NEAR, CHANGED, ANSWERED, FORESEEN = range(4, NFLAG)
 
 @wp.func_native("""
   const double h = timestep.data[0];
-  const double damping_ = damping;
+  const double damping_ = (float)number.data[3];
   step.data[0] = (float)h;
   step.data[1] = (float)(h * h + h * damping_);
   const bool falls = !(disableflags.data[0] & disable_gravity);
@@ -77,7 +77,7 @@ def _gather_native(
   nnode: int,
   nfree: int,
   disable_gravity: int,
-  damping: float,
+  number: wp.array[wp.float64],
   rest_share: float,
   dofadr: wp.array[int],
   qposadr: wp.array[int],
@@ -110,7 +110,7 @@ def _gather(
   nnode: int,
   nfree: int,
   disable_gravity: int,
-  damping: float,
+  number: wp.array[wp.float64],
   rest_share: float,
   # Where each node is in MuJoCo:
   dofadr: wp.array[int],
@@ -144,7 +144,7 @@ def _gather(
     nnode,
     nfree,
     disable_gravity,
-    damping,
+    number,
     rest_share,
     dofadr,
     qposadr,
@@ -498,7 +498,7 @@ def mass_addresses(m, dofs: np.ndarray) -> np.ndarray:
 def launches(w, model: int, instance: int) -> Launches:
   """Returns the launches of nodal coupling for a workspace."""
   m, d = mjstruct.Model.from_address(model), mjstruct.Data.from_address(w.data)
-  organ, s, host = w.organ, w.surface, w.host
+  organ, s, host = w.organ, w.body.shape, w.host
   vert = s.vert.numpy()
   start = int(mjstruct.view(m.plugin_stateadr, m.nplugin, np.int32)[instance])
   w.views = v = option_views(model) | {
@@ -533,15 +533,15 @@ def launches(w, model: int, instance: int) -> Launches:
         s.nnode,
         organ.nfree,
         int(mujoco.mjtDisableBit.mjDSBL_GRAVITY),
-        s.damping,
-        solver.REST,
+        w.body.numbers,
+        step.REST,
         *(v[k] for k in ("dofadr", "qposadr", "bodyid", "stateadr", "frame")),
         *(v[k] for k in ("timestep", "gravity", "disableflags", "qpos0", "body_mass")),
         *(v[k] for k in ("qpos", "qvel", "qfrc_applied", "qfrc_passive", "xfrc_applied")),
         v["plugin_state"],
       ],
       outputs=[
-        *(host[k] for k in ("step", "pos", "vel", "mass", "force_ext", "dvel_warm")),
+        *(host[k] for k in ("step", "disp", "vel", "mass", "force_ext", "dvel_warm")),
         w.ext,
       ],
       device="cpu",
@@ -586,7 +586,7 @@ def launches(w, model: int, instance: int) -> Launches:
         organ.nfree,
         *(v[k] for k in ("dofadr", "qposadr", "bodyid", "stateadr", "heaviest", "timestep")),
         *(v[k] for k in ("body_mass", "dof_armature", "qfrc_constraint")),
-        *(host[k] for k in ("vel", "dvel", "x", "status")),
+        *(host[k] for k in ("vel", "dvel", "sol", "status")),
         v["flags"],
       ],
       outputs=[v["qpos"], v["qvel"], v["plugin_state"]],

@@ -39,7 +39,7 @@ class Resident:
     self.w, self.nodes = w, nodes
     self.state = w.views["plugin_state"].numpy()
     self.tail = self.state[-window_slots.TAIL :]
-    self.device = w.surface.device
+    self.device = w.body.device
     self.live = -1
     # Recorded graphs: the guess, on the CPU; the solve with it, on the device; what is left then.
     self.foresee: Any = None
@@ -114,6 +114,11 @@ class Resident:
       inbox[7] *= 0.75
       self._look_again()
       wp.synchronize_device(self.device)
+
+  def stop(self):
+    """Brings the motion into the plugin state and forgets the step that was begun."""
+    self.fetch()
+    self.live, self.w.flags[FORESEEN] = -1, 1
 
   def fetch(self):
     """Brings the motion into the plugin state."""

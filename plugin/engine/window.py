@@ -19,9 +19,10 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 import warp as wp
-from palpate.tissue import solver
+from palpate.tissue import step
+from palpate.tissue.types import State, System
 
-from . import inertia, mjstruct, window_nodes, window_slots
+from . import inertia, mjstruct, prepare, window_nodes, window_slots
 from .coupling import Launches, mass_addresses, option_views, wrap
 from .resident import Resident
 from .window_nodes import Nodes
@@ -42,7 +43,7 @@ def state_size(nvert: int, nslot: int, ngeom: int) -> int:
 
 def launches(w, model: int, instance: int) -> Launches:
   """Returns the launches of window coupling for a workspace."""
-  organ, s = w.organ, w.surface
+  organ, s = w.organ, w.body
   win = organ.windows
   nslot, nvert = win.nslot, organ.mesh.nvert
   side = s.device if w.config.resident else wp.get_device("cpu")
@@ -72,7 +73,7 @@ def launches(w, model: int, instance: int) -> Launches:
   def send():
     if away:
       wp.copy(v["outbox"], nodes.outbox)
-      wp.copy(w.host["status"], w.state.status)
+      wp.copy(w.host["status"], w.body.system.status)
 
   def end_step():
     over_nodes(window_nodes.commit)
@@ -205,8 +206,8 @@ def _slots(w, model: int) -> Slots:
     "most": _most(w),
     "no_gravity": int(mujoco.mjtDisableBit.mjDSBL_GRAVITY),
     "resident": int(w.config.resident),
-    "damping": w.surface.damping,
-    "rest_share": solver.REST,
+    "number": w.body.numbers,
+    "rest_share": step.REST,
     "reach": max(_REACH * spacing, float(longest.max())) + radius,
     "slow": _SLOW * float(np.linalg.norm(np.ptp(mesh.rest, axis=0))),
     "longest": float(longest.max()),
@@ -263,7 +264,7 @@ def _slots(w, model: int) -> Slots:
 
 def _nodes(w, side: wp.Device) -> Nodes:
   """Returns the kernels' view of the nodes: plugin state on the CPU, own arrays elsewhere."""
-  organ, s, v = w.organ, w.surface, w.views
+  organ, s, v = w.organ, w.body.shape, w.views
   nvert, nslot, nwindow = organ.mesh.nvert, organ.windows.nslot, len(organ.windows.flex)
   node = s.node.numpy()
   address, size = v["plugin_state"].ptr, 3 * nvert
@@ -271,12 +272,15 @@ def _nodes(w, side: wp.Device) -> Nodes:
     motion = [wp.zeros(size, dtype=wp.float64, device=side) for _ in range(4)]
   else:
     motion = [wrap(address + 8 * k * size, size) for k in range(4)]
-  solving = w.state if w.config.resident else None
-  crossing = ("step", "pos", "vel", "force_ext", "dvel_warm", "dvel", "rhs", "x", "status")
+  solving = w.host
+  if w.config.resident:
+    solving = {k: getattr(w.body.state, k) for k in State.vars}
+    solving |= {k: getattr(w.body.system, k) for k in System.vars}
+  crossing = ("step", "disp", "vel", "force_ext", "dvel_warm", "dvel", "rhs", "sol", "status")
   mass = np.ones(s.nnode)
   mass[node] = organ.windows.mass
   w.host["mass"].assign(mass.reshape(1, -1, 8).astype(np.float32))
-  wp.copy(w.state.mass, w.host["mass"])
+  wp.copy(w.body.state.mass, w.host["mass"])
   numbers = {"nvert": nvert, "nslot": nslot, "nwindow": nwindow, "most": _most(w)}
   lowest = np.full(7, window_nodes.LOWEST)
   arrays = {
@@ -291,7 +295,7 @@ def _nodes(w, side: wp.Device) -> Nodes:
     "outbox": v["outbox"] if not side.is_cuda else wp.clone(v["outbox"], device=side),
     "count": _ints(np.zeros(nwindow)).to(side),
     "extent": _ints(lowest).to(side),
-    **{k: getattr(solving, k) if solving else w.host[k] for k in crossing},
+    **{{"disp": "pos", "sol": "x"}.get(k, k): solving[k] for k in crossing},
   }
   return _struct(Nodes, numbers | arrays)
 
@@ -305,39 +309,15 @@ def _struct(kind, values: dict):
 
 
 def settle(w, model: int):
-  """Readies the compiled model and the state for the default slots."""
-  m = mjstruct.Model.from_address(model)
-  # A slot must be no heavier than the lightest node that it may stand on.
-  win = w.organ.windows
-  mass = mjstruct.view(m.body_mass, m.nbody)
-  mass[win.body] = np.minimum(mass[win.body], win.mass.min())
-  set_inertia(w, m)
+  """Readies the state for the default slots."""
+  set_inertia(w, mjstruct.Model.from_address(model))
   w.views["plugin_state"].fill_(0.0)  # MuJoCo has not cleared it yet
-
-
-def show(w, m, shown: bool):
-  """Lets MuJoCo see the organ's own flex, or hides it, so that a step spends nothing on it.
-
-  It touches nothing and is drawn from what `draw` writes, but MuJoCo updates its vertices, boxes
-  and bounding volumes in every step, which can take longer than the organ's step. A scene has room
-  for the flex whether it was made with the one or the other: 2 (shells + elements).
-  """
-  flex, mesh = w.organ.flex, w.organ.mesh
-  shells = int((mesh.twin < 0).sum())
-  counts = (mesh.nvert, mesh.nelem, shells) if shown else (0, 0, shells + mesh.nelem)
-  names = ("flex_vertnum", "flex_elemnum", "flex_shellnum", "flex_bvhnum", "flex_bvhadr")
-  for name, count in zip(names, (*counts, 0, -1), strict=True):
-    mjstruct.view(getattr(m, name), m.nflex, np.int32)[flex] = count
-  # The broad phase passes over vertices of the world; the first one still tells whose they are.
-  start = int(mjstruct.view(m.flex_vertadr, m.nflex, np.int32)[flex])
-  body = mjstruct.view(m.flex_vertbodyid, m.nflexvert, np.int32)[start : start + mesh.nvert]
-  body[1:] = body[0] if shown else 0
 
 
 def hide(w):
   """Hides the organ's flex from MuJoCo until it is drawn again."""
   if w.counts[0]:
-    show(w, mjstruct.Model.from_address(w.model), shown=False)
+    prepare.show(mjstruct.Model.from_address(w.model), w.organ, shown=False)
 
 
 def let_sleep(w, allowed: bool):
@@ -373,11 +353,9 @@ def wake(w):
 def set_inertia(w, m):
   """Stores the effective inertia of every node for the present time step."""
   organ, win = w.organ, w.organ.windows
-  h = float(m.opt.timestep)
-  if w.config.integrator == "explicit":
-    nodal = win.mass
-  else:
-    nodal = inertia.of_nodes(m, organ, win.mass, h, int(win.flex[0]))
+  nodal = win.mass
+  if step.SCHEMES[w.config.integrator].spreads:
+    nodal = inertia.of_nodes(m, organ, w.body, w.config, win.mass, int(win.flex[0]))
   w.views["inertia"].assign(nodal)
 
 
@@ -387,7 +365,7 @@ def draw(w, model: int, data: int):
   organ = w.organ
   start = int(mjstruct.view(m.flex_vertadr, m.nflex, np.int32)[organ.flex])
   n = organ.mesh.nvert
-  show(w, m, shown=True)
+  prepare.show(m, organ, shown=True)
   if w.resident:
     w.resident.fetch()
   out = mjstruct.view(d.flexvert_xpos, (m.nflexvert, 3))[start : start + n]

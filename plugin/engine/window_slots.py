@@ -43,8 +43,8 @@ class Slots:
     nvert, nslot, nwindow, most: counts, see `Nodes`
     no_gravity: bit of mjDSBL_GRAVITY
     resident: 1 if the motion stays on a device and the plugin state may be old
-    damping: Rayleigh coefficient [s]
-    rest_share: see `solver.REST`
+    number: see `types.NUMBERS`
+    rest_share: see `step.REST`
     reach: distance from a geom within which nodes may be in a window [m]
     slow: speed below which the organ counts as at rest [m/s]
     longest: longest edge [m]
@@ -70,7 +70,7 @@ class Slots:
   most: int
   no_gravity: int
   resident: int
-  damping: wp.float64
+  number: wp.array[wp.float64]
   rest_share: wp.float64
   reach: wp.float64
   slow: wp.float64
@@ -224,7 +224,7 @@ _TRIANGLES = f"""
   + f"""
   const double h = s.timestep.data[0];
   in[0] = h;
-  in[1] = h * h + h * s.damping;
+  in[1] = h * h + h * s.number.data[3];
   const double still = s.rest_share * 9.81 * h;
   in[2] = s.weight * still * still;
   in[3] = s.flags.data[{PENDING}];

@@ -11,14 +11,25 @@ from typing import Any
 import mujoco
 import numpy as np
 import warp as wp
+from palpate.tissue import body as bodies
 from palpate.tissue import config as configuration
-from palpate.tissue import elastic, schemes, solver, types
+from palpate.tissue import shape, step
+from palpate.tissue.body import Body
 from palpate.tissue.config import Config
-from palpate.tissue.types import State, Surface
 
-from . import coupling, declare, inertia, mjstruct, window, window_nodes, window_slots
+from . import (
+  coupling,
+  declare,
+  declare_windows,
+  inertia,
+  mjstruct,
+  prepare,
+  window,
+  window_nodes,
+  window_slots,
+)
 from .coupling import ANSWERED, ASLEEP, CHANGED, NFLAG, PENDING, STALE
-from .declare import Organ
+from .declare import Declaration
 from .resident import Resident
 
 _ALLOWED = int(mujoco.mjtSleepPolicy.mjSLEEP_AUTO_ALLOWED)
@@ -32,9 +43,8 @@ class Workspace:
   Attributes:
     organ: constants
     config: configuration in force, which may differ from the compiled one
-    surface: constants on the device with the numbers of `config`
-    state: solver state on the organ's device
-    host: the arrays of `state` that MuJoCo's side reads and writes, on the CPU
+    body: shape, tissue and state on the organ's device
+    host: the arrays of its state that MuJoCo's side reads and writes, on the CPU
     ext: external and lagged contact force in float64 [N]  (3 nnode,)
     model: address of the mjModel the views are of
     data: address of the mjData
@@ -65,10 +75,9 @@ class Workspace:
     views: what the graphs point at, kept alive
   """
 
-  organ: Organ
+  organ: Declaration
   config: Config
-  surface: Surface
-  state: State
+  body: Body
   host: dict[str, wp.array]
   ext: wp.array
   data: int
@@ -222,26 +231,26 @@ def state_size(model: int, instance: int) -> int:
 
 def make(model: int, data: int, instance: int) -> Workspace:
   """Returns the workspace of an organ in a fresh mjData; gives the model an armature if needed."""
-  organ = declare.read(model, instance)
+  windowed = bool(mjstruct.config(model, instance, "window"))
+  organ = (declare_windows if windowed else declare).read(model, instance)
   m = mjstruct.Model.from_address(model)
   with _lock:
-    s = organ.surface
-    state = types.make_state(s)
+    body = bodies.worlds(organ.still)
+    s = body.shape
     host = {}
-    for field in (*_IN, *_OUT, "rhs", "x"):
-      array = getattr(state, field)
-      if s.device.is_cuda:
+    for field in (*_IN, *_OUT, "rhs", "sol"):
+      array = _field(body, field)
+      if body.device.is_cuda:
         array = wp.zeros(array.shape, dtype=float, device="cpu", pinned=True)
       host[field] = array
     size = organ.windows.nslot if organ.windows else s.nnode
     ext = wp.zeros(3 * size, dtype=wp.float64, device="cpu")
-    w = Workspace(organ, organ.config, s, state, host, ext, data)
+    w = Workspace(organ, organ.config, body, host, ext, data)
     w.status = host["status"].numpy()[0]
     d, count = mjstruct.Data, len(mjstruct.Data.from_address(data).warning)
     w.warning = mjstruct.view(data + d.warning.offset, 2 * count, np.int32).data
     w.nefc = mjstruct.view(data + d.nefc.offset, 1, np.int32).data
-    if organ.windows is None:
-      inertia.set_armature(m, organ)
+    prepare.fit(m, organ, body)
     # Padding nodes have a mass so that nothing divides by zero.
     mass = np.where(s.vert.numpy() >= 0, 0.0, 1.0).reshape(1, -1, 8)
     host["mass"].assign(mass)
@@ -259,18 +268,17 @@ def _feel(w: Workspace, m):
     nodal = w.views["inertia"].numpy()
   else:
     nodal = inertia.of_dofs(m, w.organ)
-  w.stiff, w.heaviest[0] = inertia.stiffness(m, w.organ, w.config, nodal)
+  w.stiff, w.heaviest[0] = inertia.stiffness(m, w.organ, w.body, w.config, nodal)
 
 
 def bind(w: Workspace, model: int, instance: int):
   """Points the graphs at the arrays of `model` and of the workspace's mjData and records them."""
   m = mjstruct.Model.from_address(model)
-  device, cpu = w.surface.device, wp.get_device("cpu")
+  device, cpu = w.body.device, wp.get_device("cpu")
+  scheme = step.SCHEMES[w.config.integrator]
   side = window if w.organ.windows else coupling
   with _lock:
-    load(device)
-    if w.surface.levels is not None:
-      wp.load_module(solver.multilevel().__name__, device=device)
+    load(w.body)
     if w.resident:
       w.resident.fetch()
     launches = side.launches(w, model, instance)
@@ -280,23 +288,23 @@ def bind(w: Workspace, model: int, instance: int):
     def solve():
       if crossing:
         _cross(w, _IN, to_device=True)
-      schemes.step(w.surface, w.state, w.config.integrator)
+      scheme.step(w.body)
       if crossing:
         _cross(w, _OUT, to_device=False)
 
     def respond():
       if crossing:
         _cross(w, ("rhs",), to_device=True)
-      schemes.respond(w.surface, w.state, w.config.integrator)
+      scheme.respond(w.body)
       if crossing:
-        _cross(w, ("x", "status"), to_device=False)
+        _cross(w, ("sol", "status"), to_device=False)
 
     w.before = _record(cpu, launches.gather)
     w.solve = _record_all((near, launches.enter), (device, solve), (near, launches.look))
     w.after = _record(cpu, launches.scatter)
     w.leave = _record(cpu, launches.leave)
     w.respond = []
-    if w.config.integrator in schemes.RESPONDING:
+    if scheme.respond:
       w.respond = _record_all((near, launches.push), (device, respond), (near, launches.answer))
     w.end = _record(cpu, launches.end) if launches.end else None
     w.advance = _record(cpu, launches.advance)
@@ -312,13 +320,17 @@ def bind(w: Workspace, model: int, instance: int):
 
 
 # What a solve on another device than MuJoCo's side reads and writes.
-_IN = ("step", "pos", "vel", "mass", "force_ext", "dvel_warm")
+_IN = ("step", "disp", "vel", "mass", "force_ext", "dvel_warm")
 _OUT = ("dvel", "status")
+
+
+def _field(body: Body, name: str) -> wp.array:
+  return getattr(body.state if hasattr(body.state, name) else body.system, name)
 
 
 def _cross(w: Workspace, fields: tuple[str, ...], to_device: bool):
   for field in fields:
-    there, here = getattr(w.state, field), w.host[field]
+    there, here = _field(w.body, field), w.host[field]
     if to_device:
       wp.copy(there, here)
     else:
@@ -340,28 +352,35 @@ def _record(device, work) -> Any:
   return capture.graph
 
 
-def load(device):
-  """Loads the modules of a step on a device, compiling them where the cache has none."""
-  for module in (elastic, solver, schemes, coupling, window_nodes, window_slots):
-    wp.load_module(module.__name__, device=device)
-    wp.load_module(module.__name__, device="cpu")
+def load(body: Body):
+  """Loads the modules of a step on a body's device, compiling them where the cache has none."""
+  mine = [module.__name__ for module in (coupling, window_nodes, window_slots)]
+  for module in (*step.modules(body), *mine):
+    wp.load_module(module, device=body.device)
+    wp.load_module(module, device="cpu")
 
 
 def configure(w: Workspace, instance: int, texts: dict[str, str]):
-  """Changes configuration keys while running and records the step anew.
+  """Changes configuration keys while running.
 
   Raises:
     ValueError: a key may not change, or its value is not allowed.
   """
-  w.config = configuration.change(w.organ.name, w.config, texts, w.organ.mesh.closed)
-  numbers = ("iterations", "tolerance", "newton", "damping", "foundation", "bulk", "pressure")
-  w.surface = dataclasses.replace(w.surface, **{k: getattr(w.config, k) for k in numbers})
-  # Terms that were off have no arrays yet.
-  fresh = types.make_state(w.surface)
-  if fresh.areavec.shape != w.state.areavec.shape:
-    w.state.areavec = fresh.areavec
-  bind(w, w.model, instance)
-  _feel(w, mjstruct.Model.from_address(w.model))
+  before = w.config
+  w.config = configuration.change(w.organ.name, before, texts, w.organ.mesh.closed)
+  if w.resident:
+    w.resident.stop()
+  changed = {key for key in texts if getattr(before, key) != getattr(w.config, key)}
+  if changed.intersection(configuration.MATERIAL):
+    shape.change(w.body, w.organ.mesh, w.config, ~w.organ.free)
+  else:
+    shape.renumber(w.body, w.config)
+  if changed.intersection(("integrator", "newton")):
+    bind(w, w.model, instance)
+  if changed.intersection(configuration.MATERIAL):
+    refresh(w)
+  else:
+    _feel(w, mjstruct.Model.from_address(w.model))
   if w.place is not None:
     window.wake(w)
 
@@ -373,11 +392,11 @@ def sync(w: Workspace):
 
 
 def refresh(w: Workspace):
-  """Renews the armature after the time step was changed; see `inertia`."""
+  """Renews the effective inertia after the time step or the material changed; see `inertia`."""
   m = mjstruct.Model.from_address(w.model)
   with _lock:
     if w.organ.windows is None:
-      inertia.set_armature(m, w.organ)
+      prepare.give_armature(m, w.organ, w.body, w.config)
     else:
       window.set_inertia(w, m)
     _feel(w, m)

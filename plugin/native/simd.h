@@ -39,8 +39,26 @@ struct Lane {};
 #endif
 
 struct V3 { V x, y, z; };
-struct M3 { V xx, xy, xz, yx, yy, yz, zx, zy, zz; };
-struct S3 { V xx, xy, xz, yy, yz, zz; };  // symmetric
+
+// A vector or matrix that is carried around a loop has its members last one first: the compiler
+// ranks the parts of a struct so, and the terms of sums over them stay in their written order.
+struct Carried {
+  V z, y, x;
+  PALPATE Carried(V3 a) : z(a.z), y(a.y), x(a.x) {}
+  PALPATE operator V3() const { return {x, y, z}; }
+};
+struct M3 {
+  V zz, zy, zx, yz, yy, yx, xz, xy, xx;
+  M3() = default;
+  PALPATE M3(V xx, V xy, V xz, V yx, V yy, V yz, V zx, V zy, V zz)
+    : zz(zz), zy(zy), zx(zx), yz(yz), yy(yy), yx(yx), xz(xz), xy(xy), xx(xx) {}
+};
+struct S3 {  // symmetric
+  V zz, yz, yy, xz, xy, xx;
+  S3() = default;
+  PALPATE S3(V xx, V xy, V xz, V yy, V yz, V zz)
+    : zz(zz), yz(yz), yy(yy), xz(xz), xy(xy), xx(xx) {}
+};
 
 // Reading and writing rows; `gather` takes component c from eight places, `at` in floats, and
 // `gather_number` numbers of one row a slice from the places of vectors.
@@ -76,6 +94,11 @@ PALPATE void st3(float* p, int row, V3 a, Lane lane) {
   st(p, row + 2, a.z, lane);
 }
 PALPATE void st3(float* p, V3 a, Lane lane) { st3(p, 0, a, lane); }
+PALPATE void st9(float* p, M3 a, Lane lane) {
+  st3(p, 0, {a.xx, a.xy, a.xz}, lane);
+  st3(p, 3, {a.yx, a.yy, a.yz}, lane);
+  st3(p, 6, {a.zx, a.zy, a.zz}, lane);
+}
 PALPATE V3 gather3(const float* p, const int* at, Lane lane) {
   return {gather(p, at, 0, lane), gather(p, at, 1, lane), gather(p, at, 2, lane)};
 }
@@ -136,11 +159,27 @@ PALPATE V vmin(V a, V b) { return __builtin_elementwise_min(a, b); }
 template <class C>
 PALPATE V select(C condition, V a, V b) { return condition ? a : b; }
 
+// Keeps the largest of numbers >= 0 that any thread gives.
+#if ON_CUDA
+PALPATE void put_most(float* p, V v) {
+  if (__float_as_int(v) > *(volatile int*)p) atomicMax((int*)p, __float_as_int(v));
+}
+#else
+PALPATE void put_most(float* p, V v) {
+  const float most = __builtin_reduce_max(v);
+  if (most > *p) *p = most;
+}
+#endif
+
 // Vectors.
 
 PALPATE V3 operator+(V3 a, V3 b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
 PALPATE V3 operator-(V3 a, V3 b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
 PALPATE V3 operator*(V s, V3 a) { return {s * a.x, s * a.y, s * a.z}; }
+PALPATE V3 operator/(V3 a, V d) { return {a.x / d, a.y / d, a.z / d}; }
+#if !ON_CUDA
+PALPATE V3 operator*(float s, V3 a) { return {s * a.x, s * a.y, s * a.z}; }
+#endif
 PALPATE V3& operator+=(V3& a, V3 b) { a.x += b.x; a.y += b.y; a.z += b.z; return a; }
 PALPATE V3& operator-=(V3& a, V3 b) { a.x -= b.x; a.y -= b.y; a.z -= b.z; return a; }
 PALPATE V dot(V3 a, V3 b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
@@ -156,6 +195,40 @@ PALPATE V3 operator*(const M3& m, V3 a) {
 PALPATE V3 operator*(const S3& m, V3 a) {
   return {m.xx * a.x + m.xy * a.y + m.xz * a.z, m.xy * a.x + m.yy * a.y + m.yz * a.z,
           m.xz * a.x + m.yz * a.y + m.zz * a.z};
+}
+
+// Matrices; the sum with a number is that with a multiple of the identity.
+
+PALPATE M3 outer(V3 a, V3 b) {
+  return {a.x * b.x, a.x * b.y, a.x * b.z, a.y * b.x, a.y * b.y, a.y * b.z,
+          a.z * b.x, a.z * b.y, a.z * b.z};
+}
+PALPATE M3 operator+(M3 a, M3 b) {
+  return {a.xx + b.xx, a.xy + b.xy, a.xz + b.xz, a.yx + b.yx, a.yy + b.yy, a.yz + b.yz,
+          a.zx + b.zx, a.zy + b.zy, a.zz + b.zz};
+}
+PALPATE M3 operator+(M3 a, V d) {
+  return {a.xx + d, a.xy, a.xz, a.yx, a.yy + d, a.yz, a.zx, a.zy, a.zz + d};
+}
+PALPATE M3 operator*(V s, M3 a) {
+  return {s * a.xx, s * a.xy, s * a.xz, s * a.yx, s * a.yy, s * a.yz,
+          s * a.zx, s * a.zy, s * a.zz};
+}
+PALPATE S3 operator+(S3 a, S3 b) {
+  return {a.xx + b.xx, a.xy + b.xy, a.xz + b.xz, a.yy + b.yy, a.yz + b.yz, a.zz + b.zz};
+}
+PALPATE S3 operator+(S3 a, V d) { return {a.xx + d, a.xy, a.xz, a.yy + d, a.yz, a.zz + d}; }
+PALPATE S3 operator*(V s, S3 a) {
+  return {s * a.xx, s * a.xy, s * a.xz, s * a.yy, s * a.yz, s * a.zz};
+}
+PALPATE S3 symmetric(M3 a) {
+  return {a.xx, 0.5f * (a.xy + a.yx), 0.5f * (a.xz + a.zx), a.yy, 0.5f * (a.yz + a.zy), a.zz};
+}
+PALPATE M3 full(S3 a) { return {a.xx, a.xy, a.xz, a.xy, a.yy, a.yz, a.xz, a.yz, a.zz}; }
+// s a a^T.
+PALPATE S3 square(V s, V3 a) {
+  return {s * a.x * a.x, s * a.x * a.y, s * a.x * a.z, s * a.y * a.y, s * a.y * a.z,
+          s * a.z * a.z};
 }
 
 // Work.

@@ -1,6 +1,6 @@
 """Times mj_step of a scene with a sleeping windowed organ against the scene without the organ.
 
-    python tests/benchmarks/rest.py --nodes 1000 4000 -o tests/benchmarks/results
+    python tests/benchmarks/run.py rest
 
 The liver with a probe in its home pose, or withdrawn; CPU time of blocks of steps, all variants in
 turn. `mujoco_us` is the same model with the plugin left out: what MuJoCo spends on the
@@ -9,17 +9,17 @@ sleeping.
 """
 
 import argparse
-import csv
-import json
 import pathlib
 import time
 
 import mujoco
 import numpy as np
 import palpate
+from benchmarks.runner import Bench, Case, Row
 from palpate import models
 from palpate.engine import mjstruct
-from palpate.models import scene
+from palpate.models import markup
+from palpate.models import organs as anatomy
 
 ROUNDS, STEPS = 200, 20
 TOOLS = ("probe",)
@@ -35,8 +35,8 @@ def block(model, data, steps: int) -> float:
 def measure(nodes: int, insertion: float) -> dict:
   """Returns medians of a step's time and their ratios to the scene without the organ."""
   windowed = models.load("liver", nodes=nodes, coupling="window", instruments=TOOLS).compile()
-  shape = scene.body("liver", nodes)
-  bare = mujoco.MjModel.from_xml_string(scene.scene_xml(shape, "liver", TOOLS, False, False, False))
+  build = anatomy.build("liver", nodes)
+  bare = mujoco.MjModel.from_xml_string(markup.scene(build, "liver", TOOLS, root=None))
   variants, organs = {}, {}
   napping = windowed.__copy__()
   napping.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP
@@ -72,24 +72,26 @@ def measure(nodes: int, insertion: float) -> dict:
   }
 
 
-def main():
-  """Runs the benchmark."""
-  parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-  parser.add_argument("--nodes", type=int, nargs="+", default=[1000])
-  parser.add_argument("-o", "--output", type=pathlib.Path)
-  args = parser.parse_args()
-  rows = []
-  for nodes in args.nodes:
-    for insertion in (0.0, -0.08):
-      rows.append(measure(nodes, insertion))
-      print(json.dumps({k: round(v, 3) for k, v in rows[-1].items()}))
-  if args.output:
-    args.output.mkdir(parents=True, exist_ok=True)
-    with open(args.output / "rest_cpu.csv", "w", newline="") as file:
-      writer = csv.DictWriter(file, rows[0])
-      writer.writeheader()
-      writer.writerows(rows)
+def stages(args: argparse.Namespace) -> list[list[Case]]:
+  """Returns a case a size and place of the probe."""
+  nodes = args.nodes[:1] if args.short else args.nodes
+  return [
+    [
+      {"case": f"{n}-{insertion:g}", "nodes": n, "insertion": insertion}
+      for n in nodes
+      for insertion in (0.0, -0.08)
+    ]
+  ]
 
 
-if __name__ == "__main__":
-  main()
+def run(case: Case, out: pathlib.Path) -> list[Row]:
+  """Returns the row of a case."""
+  return [measure(case["nodes"], case["insertion"])]
+
+
+def arguments(parser: argparse.ArgumentParser):
+  """Declares the options."""
+  parser.add_argument("--nodes", type=int, nargs="+", default=[1000, 4000])
+
+
+BENCH = Bench("rest", stages, run, arguments=arguments, file="rest_cpu")

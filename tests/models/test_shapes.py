@@ -78,7 +78,7 @@ def test_size_is_anatomical(name):
 
 def test_nodes_lie_on_the_shape():
   vertices, _ = mesh("gallbladder", 1000)
-  shape = shapes.organ("gallbladder")
+  shape = shapes.anatomy("gallbladder")
   moved = np.linalg.norm(project(shape.implicit, vertices, steps=10) - vertices, axis=1)
   assert moved.max() < 1e-5  # [m], three Newton steps on a smooth shape
 
@@ -110,7 +110,7 @@ def test_patches_are_where_their_names_say():
 
 def test_unknown_organ_lists_the_choices():
   with pytest.raises(ValueError, match=r"'spleen'.*gallbladder, kidney, liver, lobed, stomach"):
-    shapes.organ("spleen")
+    shapes.anatomy("spleen")
   with pytest.raises(ValueError, match="nodes is 10, expected 100 or more"):
     shapes.liver(10)
   with pytest.raises(ValueError, match="side is 17, expected an even number"):

@@ -1,0 +1,139 @@
+"""The one writer of flexcomps and of OBJ files, and how both write a number.
+
+Everything returns text. It does not end in a newline, except for a file's.
+"""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+Mesh = tuple[np.ndarray, np.ndarray]  # points (n, 3), triangles (m, 3)
+
+PLUGIN = "palpate.organ"
+# Keeps MuJoCo from warning of a flex without forces of its own; the plugin sets it to 0.
+EDGE = '<edge damping="1e-9"/>'
+# Of an organ under instruments. solmix: its solref counts, not theirs, for its nodes are light.
+CONTACT: Mapping[str, object] = {
+  "condim": 3,
+  "friction": 0.3,
+  "solref": (0.004, 1),
+  "solimp": (0.95, 0.99, 0.001),
+  "solmix": 1000,
+  "selfcollide": "none",
+}
+# Of a rigid organ: its windows have the contacts.
+NO_CONTACT: Mapping[str, object] = {"contype": 0, "conaffinity": 0, "selfcollide": "none"}
+_WIDTH = 96
+
+
+def numbers(values, digits: int = 9) -> str:
+  """Returns numbers as an attribute has them, with so many significant digits; no -0."""
+  return " ".join(f"{v + 0.0:.{digits}g}" for v in np.ravel(values))
+
+
+def tag(name: str, attributes: Mapping, inside: str = "", digits: int = 9) -> str:
+  """Returns an element in lines of some 100 columns, what is inside indented by two spaces.
+
+  Args:
+    name: of the element
+    attributes: text, numbers, flags, or arrays of numbers; None leaves one out
+    inside: its children
+    digits: of the numbers
+  """
+  lines = [f"<{name}"]
+  for key, value in attributes.items():
+    if value is None:
+      continue
+    word = f'{key}="{_text(value, digits)}"'
+    if len(lines[-1]) + len(word) > _WIDTH and lines[-1] != f"<{name}":
+      lines.append(f"  {word}")
+    else:
+      lines[-1] += f" {word}"
+  head = "\n".join(lines)
+  return f"{head}>\n{textwrap.indent(inside, '  ')}\n</{name}>" if inside else f"{head}/>"
+
+
+def _text(value, digits: int) -> str:
+  if isinstance(value, str):
+    return value
+  if isinstance(value, bool | np.bool_):
+    return "true" if value else "false"
+  array = np.asarray(value)
+  if array.dtype.kind in "iu":
+    return " ".join(map(str, array.ravel()))
+  return numbers(array, digits)
+
+
+def plugin(config: Mapping | None = None, instance: str | None = None, digits: int = 9) -> str:
+  """Returns the plugin of a flexcomp or body.
+
+  Args:
+    config: its keys, texts, numbers or arrays of numbers
+    instance: the instance of the extension that it stands for, in place of keys
+    digits: of the numbers
+  """
+  return tag("plugin", {"plugin": PLUGIN, "instance": instance}, _keys(config or {}, digits))
+
+
+def extension(instances: Mapping[str, Mapping] | None = None, digits: int = 9) -> str:
+  """Returns the extension that declares the plugin, with the keys of named instances of it."""
+  made = [tag("instance", {"name": n}, _keys(k, digits)) for n, k in (instances or {}).items()]
+  return tag("extension", {}, tag("plugin", {"plugin": PLUGIN}, "\n".join(made)))
+
+
+def _keys(config: Mapping, digits: int) -> str:
+  return "\n".join(
+    f'<config key="{key}" value="{_text(value, digits)}"/>' for key, value in config.items()
+  )
+
+
+def flexcomp(
+  name: str,
+  mesh: Mesh | str | None = None,
+  *,
+  config: Mapping | None = None,
+  contact: Mapping | None = None,
+  pin: Sequence[int] | np.ndarray | Mapping[str, Sequence[int] | np.ndarray] = (),
+  inside: str = "",
+  digits: int = 9,
+  **attributes,
+) -> str:
+  """Returns a flexcomp of triangles.
+
+  Args:
+    name: of the flex
+    mesh: points [m] and triangles, or the path of a mesh file; None where attributes say what it is
+    config: the plugin's keys, which make a nodal organ of it; None for a flex without the plugin
+      (a window, a rigid organ, whose body has the plugin, or a flex of MuJoCo's own)
+    contact: attributes of <contact>
+    pin: vertices that do not move; with names, which become comments
+    inside: further children
+    digits: of all numbers
+    **attributes: of <flexcomp>: mass [kg], radius [m], rigid, material, rgba, ...
+  """
+  shape: dict = {}
+  if isinstance(mesh, str):
+    shape = {"type": "mesh", "file": mesh}
+  elif mesh is not None:
+    shape = {"type": "direct", "point": mesh[0], "element": np.asarray(mesh[1])}
+  children = [] if config is None else [plugin(config, digits=digits), EDGE]
+  children += [inside] if inside else []
+  if contact is not None:
+    children.append(tag("contact", contact, digits=digits))
+  if not isinstance(pin, Mapping):
+    children += [tag("pin", {"id": np.asarray(pin)})] if len(pin) else []
+  else:
+    children += [tag("pin", {"id": np.asarray(k)}) + f"  <!-- {n} -->" for n, k in pin.items()]
+  return tag(
+    "flexcomp", {"name": name, **shape, "dim": 2} | attributes, "\n".join(children), digits
+  )
+
+
+def obj(vertices: np.ndarray, triangles: np.ndarray, decimals: int = 6) -> str:
+  """Returns a mesh as an OBJ file; micrometres unless more decimals are asked for."""
+  lines = [" ".join(["v", *(f"{x + 0.0:.{decimals}f}" for x in v)]) for v in vertices]
+  lines += [f"f {a} {b} {c}" for a, b, c in np.asarray(triangles) + 1]
+  return "\n".join(lines) + "\n"
