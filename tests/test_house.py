@@ -31,9 +31,6 @@ FLOORS = ("native", "tissue", "engine", "organ", "models", "tasks", "app")
 LARGE = {"file": 450, "function": 60, "native function": 70}
 
 NOT_YET = {
-  "no import of the package in a function": {
-    "palpate.tissue.step -> palpate.tissue.multilevel",
-  },
   "no import of what is always there in a function": {
     "models/field.py",
     "models/grid.py",
@@ -48,26 +45,12 @@ NOT_YET = {
     "tests/app/test_wrap_command.py: _picture",
   },
   "files": {
-    "plugin/native/group.h",
-    "plugin/tissue/multilevel.py",
     "tests/engine/test_plugin.py",
   },
   "functions": {
     "models/grid.py",
     "models/markup.py",
-    "plugin/tissue/multilevel.py",
-    "plugin/tissue/solver.py",
     "plugin/windows.py",
-  },
-  "device switches": {
-    "plugin/tissue/product.py",
-    "plugin/tissue/simd.py",
-  },
-  "native code in headers": {
-    "plugin/tissue/multilevel.py",
-  },
-  "kernels of four arguments": {
-    "plugin/tissue/multilevel.py",
   },
 }
 

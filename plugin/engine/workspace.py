@@ -372,7 +372,7 @@ def _change(w: Workspace, model: int, config: Config):
     else:
       shape.renumber(w.body, config)
     recorded = ("integrator", "newton")
-    if w.body.levels or any(getattr(before, key) != getattr(config, key) for key in recorded):
+    if any(getattr(before, key) != getattr(config, key) for key in recorded):
       bind(w, model)
     if material:
       refresh(w)

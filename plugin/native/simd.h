@@ -63,18 +63,27 @@ struct S3 {  // symmetric
     : zz(zz), yz(yz), yy(yy), xz(xz), xy(xy), xx(xx) {}
 };
 
-// Reading and writing rows; `gather` takes component c from eight places, `at` in floats.
+// Reading and writing rows; `gather` takes component c from eight places, `at` in floats, and
+// `gather_number` numbers of one row a slice from the places of vectors.
 
 #if ON_CUDA
 PALPATE V ld(const float* p, int row, Lane lane) { return p[LANES * row + lane]; }
 PALPATE void st(float* p, int row, V v, Lane lane) { p[LANES * row + lane] = v; }
 PALPATE V gather(const float* p, const int* at, int c, Lane lane) { return p[at[lane] + LANES * c]; }
+PALPATE V gather_number(const float* p, const int* at, Lane lane) {
+  return p[at[lane] / (3 * LANES) * LANES + at[lane] % (3 * LANES)];
+}
 #else
 PALPATE V ld(const float* p, int row, Lane) { return (V) * (const Unaligned*)(p + LANES * row); }
 PALPATE void st(float* p, int row, V v, Lane) { *(Unaligned*)(p + LANES * row) = (Unaligned)v; }
 PALPATE V gather(const float* p, const int* at, int c, Lane) {
   const float* q = p + LANES * c;
   return (V){q[at[0]], q[at[1]], q[at[2]], q[at[3]], q[at[4]], q[at[5]], q[at[6]], q[at[7]]};
+}
+PALPATE V gather_number(const float* p, const int* at, Lane) {
+  V out;
+  for (int l = 0; l < LANES; ++l) out[l] = p[at[l] / (3 * LANES) * LANES + at[l] % (3 * LANES)];
+  return out;
 }
 #endif
 
@@ -96,18 +105,6 @@ PALPATE void st9(float* p, M3 a, Lane lane) {
 PALPATE V3 gather3(const float* p, const int* at, Lane lane) {
   return {gather(p, at, 0, lane), gather(p, at, 1, lane), gather(p, at, 2, lane)};
 }
-// One number a node from where it lies if its x in a vector is `at`.
-#if ON_CUDA
-PALPATE V gather_scalar(const float* p, const int* at, Lane lane) {
-  return p[at[lane] / (3 * LANES) * LANES + at[lane] % (3 * LANES)];
-}
-#else
-PALPATE V gather_scalar(const float* p, const int* at, Lane) {
-  V out;
-  for (int l = 0; l < LANES; ++l) out[l] = p[at[l] / (3 * LANES) * LANES + at[l] % (3 * LANES)];
-  return out;
-}
-#endif
 PALPATE S3 ld6(const float* p, Lane lane) {
   return {ld(p, 0, lane), ld(p, 1, lane), ld(p, 2, lane),
           ld(p, 3, lane), ld(p, 4, lane), ld(p, 5, lane)};
@@ -242,11 +239,21 @@ PALPATE S3 square(V s, V3 a) {
 // One of the `nthread` threads that work on a world; on the CPU there is one.
 struct Thread { int world, tid, nthread; };
 
+#if ON_CUDA
+// Lane of a thread. That it is below eight is hidden from the compiler, which otherwise takes rows
+// for bits of one number and computes the address of each anew.
+PALPATE Lane lane_of(int tid) {
+  int lane = tid & (LANES - 1);
+  asm("" : "+r"(lane));
+  return lane;
+}
+#endif
+
 // Runs body(s, lane) for each slice: one thread does all on the CPU, eight threads one on CUDA.
 template <class Body>
 PALPATE void each_slice(Thread t, int nslice, Body body) {
 #if ON_CUDA
-  if (t.tid / LANES < nslice) body(t.tid / LANES, t.tid % LANES);
+  if (t.tid >> 3 < nslice) body(t.tid >> 3, lane_of(t.tid));
 #else
   for (int s = 0; s < nslice; ++s) INLINED body(s, Lane());
 #endif
