@@ -267,3 +267,26 @@ def test_a_windowed_organ_rests_on_a_plane_as_a_nodal_one_does(place):
     mujoco.mj_step(m, d, nstep=300)
     found.append(handle.xpos)
   np.testing.assert_allclose(found[1], found[0], atol=1e-5)
+
+
+@pytest.mark.parametrize(("young", "offset"), [(3e4, 0.0), (3e6, 0.0), (3e6, 0.0395)])
+@pytest.mark.parametrize("resident", [None, "true"])
+def test_pinned_vertices_stay_and_carry_a_tool(young, offset, resident):
+  points, elem = sphere(3)
+  pin = np.flatnonzero(points[:, 2] > 0.03)
+  ball = f"""<body pos="{offset} 0 {RADIUS + 0.007}"><joint name="z" type="slide" axis="0 0 1"/>
+    <geom size=".006" mass=".03" condim="1" solref=".004 1"/></body>"""
+  keys = {"young": young, "foundation": 1e3, "tolerance": 1e-6}
+  heights = []
+  for made in (
+    organ(points, elem, pin=pin, **keys),
+    windowed(points, elem, count="12 9 1", pin=" ".join(map(str, pin)), resident=resident, **keys),
+  ):
+    m, d, handle = load(world(made, ball, gravity=(0, 0, -9.81)))
+    for _ in range(10):
+      mujoco.mj_step(m, d, nstep=30)
+      np.testing.assert_array_equal(handle.displacement[pin], 0.0)
+      np.testing.assert_array_equal(handle.xvel[pin], 0.0)
+    heights.append(d.qpos[-1])
+    assert d.qfrc_constraint[-1] == pytest.approx(0.03 * 9.81, rel=1e-3)  # it is at rest
+  assert heights[1] == pytest.approx(heights[0], abs=1e-6)
