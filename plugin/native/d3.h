@@ -27,6 +27,9 @@ PALPATE D3& operator+=(D3& a, D3 b) { return a = a + b; }
 PALPATE bool operator==(D3 a, D3 b) { return a.x == b.x && a.y == b.y && a.z == b.z; }
 PALPATE bool operator!=(D3 a, D3 b) { return !(a == b); }
 PALPATE double dot(D3 a, D3 b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+PALPATE D3 vmax(D3 a, D3 b) {
+  return {a.x > b.x ? a.x : b.x, a.y > b.y ? a.y : b.y, a.z > b.z ? a.z : b.z};
+}
 PALPATE D3 vabs(D3 a) { return {fabs(a.x), fabs(a.y), fabs(a.z)}; }
 PALPATE double norm(D3 a) { return sqrt(dot(a, a)); }
 // a + R^T x, with R row by row.
