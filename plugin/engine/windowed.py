@@ -239,7 +239,7 @@ def set_inertia(w, m):
   nodal = win.mass
   if step.SCHEMES[w.config.integrator].spreads:
     nodal = inertia.of_nodes(m, organ, w.body, w.config, win.mass, int(win.flex[0]))
-  w.views["inertia"].assign(nodal)
+  w.views["inertia"].assign(slots.hold(organ, nodal))
 
 
 def draw(w, model: int, data: int):
