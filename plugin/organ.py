@@ -7,7 +7,7 @@ import numpy as np
 from palpate.engine.layout import FLAG
 from palpate.tissue.config import Config
 
-from .engine import motion, workspace
+from .engine import motion, windowed, workspace
 from .engine import plugin as engine
 from .tissue import energy
 from .tissue import mesh as topology
@@ -121,8 +121,8 @@ class Organ:
 
   @property
   def window_warning(self) -> str | None:
-    """What the windows were too small for, the first time that they were, or None."""
-    return self._space.overflow
+    """What the windows were too small for, at the worst moment so far, or None."""
+    return windowed.shortage(self._space)
 
   @property
   def force(self) -> np.ndarray:

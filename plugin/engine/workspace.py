@@ -70,7 +70,7 @@ class Workspace:
     counts: the number of vertices that MuJoCo sees of a windowed organ comes first
     status: iterations, relative residual, norm, failure  (4,)
     error: what went wrong since the last reset, or None
-    overflow: what the windows had no room for, the first time, or None
+    missed: most nodes and triangles that the windows had no room for in a step
     warning: last index and count of each of MuJoCo's warnings, one after the other
     nefc: the number of MuJoCo's constraints comes first
     noticed: whether it was said that windows came without their state
@@ -115,7 +115,7 @@ class Workspace:
   counts: memoryview = dataclasses.field(default_factory=lambda: np.zeros(1, np.int32).data)
   status: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(4, np.float32))
   error: str | None = None
-  overflow: str | None = None
+  missed: tuple[int, int] = (0, 0)
   noticed: bool = False
   # Views that every step looks at: an item of a memoryview costs a tenth of one of an array.
   warning: memoryview = dataclasses.field(default_factory=lambda: memoryview(b""))
