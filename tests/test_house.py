@@ -31,9 +31,6 @@ FLOORS = ("native", "tissue", "engine", "organ", "models", "tasks", "app")
 LARGE = {"file": 450, "function": 60, "native function": 70}
 
 NOT_YET = {
-  "no import of the package in a function": {
-    "palpate.tissue.step -> palpate.tissue.multilevel",
-  },
   "no import of what is always there in a function": {
     "models/field.py",
     "models/grid.py",
@@ -46,47 +43,14 @@ NOT_YET = {
   },
   "tests use public names": {
     "tests/app/test_wrap_command.py: _picture",
-    "tests/engine/test_plugin.py: _handles",
-    "tests/engine/test_plugin.py: _workspaces",
-    "tests/engine/test_resident.py: _ROOM",
-    "tests/engine/test_resident.py: _SLOW",
   },
   "files": {
-    "plugin/engine/coupling.py",
-    "plugin/engine/window_slots.py",
-    "plugin/native/group.h",
-    "plugin/tissue/multilevel.py",
     "tests/engine/test_plugin.py",
   },
   "functions": {
     "models/grid.py",
     "models/markup.py",
-    "plugin/engine/coupling.py",
-    "plugin/engine/window.py",
-    "plugin/tissue/multilevel.py",
-    "plugin/tissue/solver.py",
     "plugin/windows.py",
-  },
-  "device switches": {
-    "plugin/engine/window_nodes.py",
-    "plugin/tissue/product.py",
-    "plugin/tissue/simd.py",
-  },
-  "native code in headers": {
-    "plugin/engine/coupling.py",
-    "plugin/engine/window_nodes.py",
-    "plugin/engine/window_slots.py",
-    "plugin/tissue/multilevel.py",
-  },
-  "kernels of four arguments": {
-    "plugin/engine/coupling.py",
-    "plugin/tissue/multilevel.py",
-  },
-  "offsets in one table": {
-    "plugin/engine/resident.py",
-    "plugin/engine/window.py",
-    "plugin/engine/workspace.py",
-    "plugin/organ.py",
   },
 }
 
