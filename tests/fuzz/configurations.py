@@ -8,7 +8,8 @@ import scenes
 from palpate.tissue import config
 
 KEPT: tuple[int, ...] = ()  # seeds that once failed
-OPEN: dict[int, str] = {82: "a pin of digits that int() does not read names no key"}  # seeds that fail, and why
+# Seeds that fail, and why.
+OPEN: dict[int, str] = {82: "a pin of digits that int() does not read names no key"}
 # Spans of what is sensible, on a logarithmic scale; an organ within them must move without error.
 SENSIBLE = {
   "young": (1e2, 1e6),

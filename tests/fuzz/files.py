@@ -16,7 +16,8 @@ from palpate.tasks.recorder import Recorder
 from palpate.tasks.recording import Recording
 
 KEPT: tuple[int, ...] = ()  # seeds that once failed
-OPEN: dict[int, str] = {}  # seeds that fail, and why
+# Seeds that fail, and why.
+OPEN: dict[int, str] = {}
 
 
 @functools.cache

@@ -7,7 +7,8 @@ import numpy as np
 import scenes
 
 KEPT: tuple[int, ...] = ()  # seeds that once failed
-OPEN: dict[int, str] = {}  # seeds that fail, and why
+# Seeds that fail, and why.
+OPEN: dict[int, str] = {}
 
 
 def _smooth(random):
