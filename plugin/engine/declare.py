@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import threading
 
 import mujoco
 import numpy as np
@@ -20,9 +19,13 @@ from palpate.tissue.config import Config
 from palpate.tissue.mesh import Mesh
 from palpate.tissue.step import SCHEMES
 
-from . import mjstruct
+from . import graphs, mjstruct
 
-_lock = threading.RLock()
+NO_RK4 = (
+  "integrator is RK4, which evaluates forces four times a step; expected Euler, implicit or "
+  "implicitfast"
+)
+_FLAT = 1e-6  # volume that counts as none, as a share of the area to the power of 1.5
 _CACHED = 16
 _made: dict[bytes, Declaration] = {}
 
@@ -147,6 +150,7 @@ def read(model: int, instance: int) -> Declaration:
   elem = elements(m, flex)
   mesh = topology.build(name, rest, elem)
   config = configuration.parse(name, keys(model, instance), len(elem), mesh.closed)
+  check_volume(name, mesh, config)
   dofadr, qposadr = addresses(m, name, body, free)
   order = np.cumsum(free) - 1
   mass = mjstruct.view(m.body_mass, m.nbody)[body]
@@ -180,7 +184,7 @@ def cached(
       for array in vars(part).values():
         digest.update(np.ascontiguousarray(array).tobytes())
   key = digest.digest()
-  with _lock:
+  with graphs.lock:
     if key not in _made:
       try:
         scale = (h * h + h * config.damping) / max(float(fields["mass"][free].mean()), 1e-300)
@@ -255,10 +259,7 @@ def check_surface(m, flex: int, name: str):
   if dim != 2:
     raise ValueError(f"organ {name!r}: flexcomp dim is {dim}, expected dim='2' (a surface)")
   if m.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
-    raise ValueError(
-      f"organ {name!r}: integrator is RK4, which evaluates forces four times a step; "
-      "expected Euler, implicit or implicitfast"
-    )
+    raise ValueError(f"organ {name!r}: {NO_RK4}")
 
 
 def check_flex(m, flex: int, name: str):
@@ -277,6 +278,24 @@ def check_flex(m, flex: int, name: str):
     raise ValueError(
       f"organ {name!r}: flexcomp has MuJoCo elasticity too, expected no <elasticity young='...'> "
       "and no <edge stiffness='...'>; use the plugin's keys"
+    )
+
+
+def check_volume(name: str, mesh: Mesh, config: Config):
+  """Raises ValueError where a closed surface is inside out, or too flat for what acts inside."""
+  if not mesh.closed:
+    return
+  volume = topology.volume(mesh.rest, mesh.elem)
+  area = np.linalg.norm(topology.area_vectors(mesh.rest, mesh.elem), axis=1).sum()
+  if volume < -_FLAT * area**1.5:
+    raise ValueError(
+      f"organ {name!r}: its surface is inside out and encloses {volume:.3g} m^3, expected "
+      "triangles counter-clockwise from outside"
+    )
+  if config.bulk and volume < _FLAT * area**1.5:
+    raise ValueError(
+      f"organ {name!r}: bulk is {config.bulk:g}, expected 0 for a surface that encloses no volume "
+      f"({volume:.3g} m^3)"
     )
 
 
@@ -332,6 +351,35 @@ def static_frame(m, name: str, parent: int) -> tuple[np.ndarray, np.ndarray]:
     rotation, position = own @ rotation, pos[parent] + own @ position
     parent = int(parentid[parent])
   return rotation, position
+
+
+def static_places(m, organ: Declaration) -> list[memoryview]:
+  """Returns position and turn, as bytes, of each body that the organ or a window hangs on."""
+  parentid = mjstruct.view(m.body_parentid, m.nbody, np.int32)
+  start = [int(organ.body[0])] if organ.windows else parentid[organ.body[organ.free]]
+  slots = parentid[organ.windows.body] if organ.windows else []
+  found: set[int] = set()
+  for body in {int(b) for b in (*start, *slots)}:
+    while body > 0:
+      found.add(body)
+      body = int(parentid[body])
+  places = (mjstruct.view(m.body_pos, (m.nbody, 3)), mjstruct.view(m.body_quat, (m.nbody, 4)))
+  return [each[body].view(np.uint8).data for body in sorted(found) for each in places]
+
+
+def check_frame(m, organ: Declaration):
+  """Raises ValueError where the organ's frame is not, or no longer, where it was declared."""
+  parentid = mjstruct.view(m.body_parentid, m.nbody, np.int32)
+  body = int(organ.body[0]) if organ.windows else int(parentid[organ.body[organ.free][0]])
+  frame, origin = static_frame(m, organ.name, body)
+  if not organ.windows:
+    frame = frame @ find_turn(m, organ.name, organ.body[organ.free])
+  if not (np.array_equal(frame, organ.frame) and np.array_equal(origin, organ.origin)):
+    who = mjstruct.name_of(m, m.name_bodyadr, body)
+    raise ValueError(
+      f"its parent body {who!r} was moved after its mjData was made, expected a static frame; make "
+      "a new MjData"
+    )
 
 
 def vertices(m, flex: int) -> int:

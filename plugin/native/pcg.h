@@ -42,14 +42,15 @@ struct Pcg {
   typename Slices::Vector x{f.system.sol.data + at}, r{f.system.r.data + at};
   typename Slices::Vector p{f.system.p.data + at}, ap{f.system.q.data + at};
   typename Slices::Vector az{f.system.t.data + at};
-  float norm = 0.0f, target = 0.0f, along = 0.0f, rz = 0.0f, residual = 0.0f;
+  float norm = 0.0f, target = 0.0f, along = 0.0f, residual = 0.0f;
+  float rz = 0.0f, before = 0.0f;  // r^T z, and that of the last iteration
   int it = 0;
 
   template <class Preconditioner>
   PALPATE void solve(Preconditioner& m) {
     right_hand_side();
     Part part = first_residual(m, start());
-    float before = 0.0f, bent = 0.0f;  // r^T z of the last iteration, p^T A p
+    float bent = 0.0f;  // p^T A p
     while (m.before(*this, part)) {
       const V zw = multiply();
       float curved;
@@ -75,7 +76,7 @@ struct Pcg {
 
   // r = b, its norm and the residual to reach; neighbours are shown where to start.
   PALPATE void right_hand_side() {
-    const float gv = step[1] - (stage == FIRST ? step[3] : 1.0f) * step[0] * step[0];
+    const float h2 = step[0] * step[0], gv = step[1] - (stage == FIRST ? step[3] * h2 : h2);
     const float impulse = stage == RESPONSE ? 0.0f : volume_impulse(
       f, world, group, f.system.disp_trial.data + at, f.system.vel_trial.data + at, gv);
     V bb = splat(0.0f), flux = splat(0.0f);
@@ -104,7 +105,7 @@ struct Pcg {
       V3 ad = product(a, z, d, s, lane);
       if (volume != 0.0f) ad += volume * ld3(areavec + 24 * s, lane);
       ap.put(s, ad, lane, k);
-      dq += dot(d, ad);
+      dq = add_dot(dq, d, ad);
       db += dot(d, r.get(s, lane, k));
     });
     float curved, gained;
@@ -140,7 +141,7 @@ struct Pcg {
     slices.each([&](int s, Lane lane, int k) {
       const V3 own = z.own(s, lane), w = product(a, z, own, s, lane);
       az.put(s, w, lane, k);
-      zw = zw + own.y * w.y + own.x * w.x + own.z * w.z;  // y first: see simd.h
+      zw = zw + own.y * w.y + own.x * w.x + own.z * w.z;  // in the order that is fused best
     });
     return zw;
   }
@@ -164,6 +165,15 @@ struct Pcg {
       renew(m, s, rest, lane, part);
     });
     return part;
+  }
+
+  // z from here on by another preconditioner; sets rz and `along`.
+  template <class Preconditioner>
+  PALPATE void restart(const Preconditioner& m) {
+    Part part = {splat(0.0f), splat(0.0f)};
+    slices.each([&](int s, Lane lane, int k) { renew(m, s, r.get(s, lane, k), lane, part); });
+    group.sum(part.rr, part.along, rz, along);
+    before = 0.0f;
   }
 
   // z where r is new, and its part of the sums.
@@ -194,8 +204,8 @@ struct Pcg {
   }
 };
 
-// The inverse of the diagonal blocks alone. The norm of the residual is then all there is to sum: at
-// no cost on the CPU, and on CUDA together with z^T A z, after one product more than it takes.
+// The inverse of the diagonal blocks alone. The norm of the residual is then all there is to sum:
+// at no cost on the CPU, and on CUDA together with z^T A z, after one product more than it takes.
 struct Jacobi {
   PALPATE V3 scaled(V3 z) const { return z; }
 

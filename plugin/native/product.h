@@ -4,8 +4,8 @@
 
 namespace palpate {
 
-// The matrix of one world, less its volume term: blocks of neighbours, inertia and foundation on the
-// diagonal, and the bending matrix along the normals.
+// The matrix of one world, less its volume term: blocks of neighbours, inertia and foundation on
+// the diagonal, and the bending matrix along the normals.
 struct Matrix {
   const float* block;
   const float* diag;

@@ -85,7 +85,7 @@ struct Springs {
   int width;
   const int* node;
   const float* k;
-  V foundation, sum;
+  V area, sum;
 
   // Adds g times the springs' pull towards x, as seen from `own`.
   PALPATE V3 pulled(V3 b, float g, const float* x, V3 own, Lane lane) const {
@@ -99,10 +99,10 @@ template <class Fields>
 PALPATE Springs springs(const Fields& f, int s, Lane lane) {
   const int row = f.shape.slot_adr.data[s], width = f.shape.slot_adr.data[s + 1] - row;
   const float* k = f.tissue.fan_spring.data + 8 * row;
-  const V foundation = f.tissue.number.data[FOUNDATION] * ld(f.shape.area.data, s, lane);
-  V sum = foundation;
+  const V area = ld(f.shape.area.data, s, lane);
+  V sum = f.tissue.number.data[FOUNDATION] * area;
   for (int i = 0; i < width; ++i) sum += ld(k, i, lane);
-  return {width, f.shape.fan_node.data + 8 * (row + 2 * s + 1), k, foundation, sum};
+  return {width, f.shape.fan_node.data + 8 * (row + 2 * s + 1), k, area, sum};
 }
 
 // One over the mass of a slice's nodes, 0 for those that do not move: they may have no mass.
@@ -120,6 +120,7 @@ PALPATE void direct(const Fields& f, Thread t, int stage) {
   Group<> group(t, f.system.partial.data);
   const float* step = f.state.step.data + 4 * t.world;
   const float g = step[1], gv = g - step[0] * step[0];
+  const float foundation = g * f.tissue.number.data[FOUNDATION];
   const size_t base = 24 * (size_t)t.world * f.shape.nslice;
   const float* vel = f.state.vel.data + base;
   const float* areavec = f.system.areavec.data + base;
@@ -135,7 +136,7 @@ PALPATE void direct(const Fields& f, Thread t, int stage) {
     if (stage == NEUMANN) {
       const Springs k = springs(f, s, lane);
       const V3 v = ld3(vel + 24 * s, lane);
-      b = k.pulled(b - (g * k.foundation) * v, g, vel, v, lane);
+      b = k.pulled(b - (foundation * k.area) * v, g, vel, v, lane);
       d += g * k.sum * inverse;
     }
     norm = add_dot(norm, inverse * b, b);

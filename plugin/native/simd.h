@@ -8,7 +8,8 @@
 //     const V3 v = ld3(vel + 24 * s, lane);
 //     st(energy, s, 0.5f * ld(mass, s, lane) * dot(v, v), lane);
 //   });
-// LANES is eight; `tissue/kernels.py` prints it and the other constants before the headers.
+// LANES is eight; `tissue/kernels.py` prints it and the other constants before the headers. Code in
+// doubles, whose sums are taken in the order in which they stand, begins with AS_WRITTEN.
 #pragma once
 
 #if defined(__CUDACC__) || defined(__CUDACC_RTC__)
@@ -20,9 +21,11 @@
 #if ON_CUDA
 #define PALPATE __device__ __forceinline__
 #define INLINED
+#define AS_WRITTEN
 #else
 #define PALPATE __attribute__((always_inline)) inline
 #define INLINED [[clang::always_inline]]  // before a call of a lambda
+#define AS_WRITTEN _Pragma("clang fp contract(off) reassociate(off)")
 // Sums of eight are not of one order anyway; products are fused with them.
 #pragma clang fp contract(fast) reassociate(on)
 #endif
@@ -60,18 +63,27 @@ struct S3 {  // symmetric
     : zz(zz), yz(yz), yy(yy), xz(xz), xy(xy), xx(xx) {}
 };
 
-// Reading and writing rows; `gather` takes component c from eight places, `at` in floats.
+// Reading and writing rows; `gather` takes component c from eight places, `at` in floats, and
+// `gather_number` numbers of one row a slice from the places of vectors.
 
 #if ON_CUDA
 PALPATE V ld(const float* p, int row, Lane lane) { return p[LANES * row + lane]; }
 PALPATE void st(float* p, int row, V v, Lane lane) { p[LANES * row + lane] = v; }
 PALPATE V gather(const float* p, const int* at, int c, Lane lane) { return p[at[lane] + LANES * c]; }
+PALPATE V gather_number(const float* p, const int* at, Lane lane) {
+  return p[at[lane] / (3 * LANES) * LANES + at[lane] % (3 * LANES)];
+}
 #else
 PALPATE V ld(const float* p, int row, Lane) { return (V) * (const Unaligned*)(p + LANES * row); }
 PALPATE void st(float* p, int row, V v, Lane) { *(Unaligned*)(p + LANES * row) = (Unaligned)v; }
 PALPATE V gather(const float* p, const int* at, int c, Lane) {
   const float* q = p + LANES * c;
   return (V){q[at[0]], q[at[1]], q[at[2]], q[at[3]], q[at[4]], q[at[5]], q[at[6]], q[at[7]]};
+}
+PALPATE V gather_number(const float* p, const int* at, Lane) {
+  V out;
+  for (int l = 0; l < LANES; ++l) out[l] = p[at[l] / (3 * LANES) * LANES + at[l] % (3 * LANES)];
+  return out;
 }
 #endif
 
@@ -93,18 +105,6 @@ PALPATE void st9(float* p, M3 a, Lane lane) {
 PALPATE V3 gather3(const float* p, const int* at, Lane lane) {
   return {gather(p, at, 0, lane), gather(p, at, 1, lane), gather(p, at, 2, lane)};
 }
-// One number a node from where it lies if its x in a vector is `at`.
-#if ON_CUDA
-PALPATE V gather_scalar(const float* p, const int* at, Lane lane) {
-  return p[at[lane] / (3 * LANES) * LANES + at[lane] % (3 * LANES)];
-}
-#else
-PALPATE V gather_scalar(const float* p, const int* at, Lane) {
-  V out;
-  for (int l = 0; l < LANES; ++l) out[l] = p[at[l] / (3 * LANES) * LANES + at[l] % (3 * LANES)];
-  return out;
-}
-#endif
 PALPATE S3 ld6(const float* p, Lane lane) {
   return {ld(p, 0, lane), ld(p, 1, lane), ld(p, 2, lane),
           ld(p, 3, lane), ld(p, 4, lane), ld(p, 5, lane)};
@@ -239,13 +239,60 @@ PALPATE S3 square(V s, V3 a) {
 // One of the `nthread` threads that work on a world; on the CPU there is one.
 struct Thread { int world, tid, nthread; };
 
+#if ON_CUDA
+// Lane of a thread. That it is below eight is hidden from the compiler, which otherwise takes rows
+// for bits of one number and computes the address of each anew.
+PALPATE Lane lane_of(int tid) {
+  int lane = tid & (LANES - 1);
+  asm("" : "+r"(lane));
+  return lane;
+}
+#endif
+
 // Runs body(s, lane) for each slice: one thread does all on the CPU, eight threads one on CUDA.
 template <class Body>
 PALPATE void each_slice(Thread t, int nslice, Body body) {
 #if ON_CUDA
-  if (t.tid / LANES < nslice) body(t.tid / LANES, t.tid % LANES);
+  if (t.tid >> 3 < nslice) body(t.tid >> 3, lane_of(t.tid));
 #else
   for (int s = 0; s < nslice; ++s) INLINED body(s, Lane());
+#endif
+}
+
+// Runs body(i) for n items, whichever of the threads has them.
+template <class Body>
+PALPATE void each_item(Thread t, int n, Body body) {
+  for (int i = t.tid; i < n; i += t.nthread) body(i);
+}
+
+// The greatest number that threads bring, as an int that is ordered alike: it does not depend on
+// who comes first. `NOTHING_PUT` where nobody has come; on CUDA whole warps call `put_most`.
+constexpr int NOTHING_PUT = -2147483647 - 1;
+
+PALPATE int ordered(int bits) { return bits ^ ((bits >> 31) & 0x7fffffff); }
+#if ON_CUDA
+PALPATE void put_most(int* at, float value) {
+  for (int o = 16; o > 0; o >>= 1) {
+    const float other = __shfl_xor_sync(0xffffffffu, value, o);
+    value = other > value ? other : value;
+  }
+  if ((threadIdx.x & 31) == 0) atomicMax(at, ordered(__float_as_int(value)));
+}
+PALPATE float most(int at) { return __int_as_float(ordered(at)); }
+#else
+PALPATE void put_most(int* at, float value) {
+  const int mine = ordered(__builtin_bit_cast(int, value));
+  if (mine > *at) *at = mine;
+}
+PALPATE float most(int at) { return __builtin_bit_cast(float, ordered(at)); }
+#endif
+
+// Returns the place of one more entry of a list whose length is `count`.
+PALPATE int append(int* count) {
+#if ON_CUDA
+  return atomicAdd(count, 1);
+#else
+  return (*count)++;
 #endif
 }
 

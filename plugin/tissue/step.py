@@ -44,8 +44,20 @@ AHEAD = 0.1
 # part of the step, whose tolerance holds too where that is looser.
 ENOUGH = 0.03
 
+# Condition numbers: below this one a mesh is solved by a few steps of the smoother, and above that
+# one float32 residuals are noise to the slowest modes, which only cycles would act on.
+EASY, WORST = 8.0, 2e5
+
 _FIRST, _MORE = 1, 2  # flags of `newton_update`
-_CONSTANTS = CONSTANTS | {"AHEAD": AHEAD, "IS_FIRST": _FIRST, "IS_MORE": _MORE}
+_CYCLES_PER_SM = 2  # blocks on one multiprocessor
+_CONSTANTS = CONSTANTS | {
+  "AHEAD": AHEAD,
+  "ENOUGH": ENOUGH,
+  "EASY": EASY,
+  "WORST": WORST,
+  "IS_FIRST": _FIRST,
+  "IS_MORE": _MORE,
+}
 
 
 def _elastic(name: str) -> wp.Kernel:
@@ -66,8 +78,9 @@ _predict = _scheme("predict")
 _newton_update = _scheme("newton_update")
 _centre_step = _scheme("centre", BLOCK)
 _direct_step = _scheme("direct", BLOCK)
-_sample = kernel("sample", "sample.h", Cycle, CONSTANTS)
-_solve = kernel("solve", "pcg.h", Fields, CONSTANTS | {"ENOUGH": ENOUGH}, (BLOCK, 1))
+_solve = kernel("solve", "pcg.h", Fields, _CONSTANTS, (BLOCK, 1))
+_sample = kernel("sample", "multigrid.h", Cycle, _CONSTANTS)
+_solve_cycles = kernel("solve_cycles", "multigrid.h", Cycle, _CONSTANTS, (BLOCK, _CYCLES_PER_SM))
 
 
 def _over(kernel: wp.Kernel, body: Body, nslice: int, arg: int = 0, fields: Any = None):
@@ -160,9 +173,7 @@ def solve(body: Body, stage: Stage):
   if body.levels is None:
     _together(_solve, body, stage)
   else:
-    from . import multilevel
-
-    multilevel.solve(body, stage)
+    _together(_solve_cycles, body, stage, body.levels.cycle, _CYCLES_PER_SM)
 
 
 # The schemes.

@@ -15,7 +15,7 @@ import time
 
 import gymnasium
 import numpy as np
-import palpate  # registers the environments
+import palpate.tasks  # registers the environments
 import torch
 from benchmarks import plots, results
 from benchmarks.runner import Bench, Case, Row

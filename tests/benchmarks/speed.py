@@ -11,7 +11,7 @@ import palpate
 from benchmarks import plots, results
 from benchmarks.runner import Bench, Case, Row
 from palpate import tasks
-from palpate.tasks import experts, suite
+from palpate.tasks import performer, suite
 from palpate.tasks.recorder import Recorder
 
 NAMES = ["/".join(pair) for pair in tasks.ALL_TASKS]
@@ -34,7 +34,7 @@ def run(case: Case, out: pathlib.Path) -> list[Row]:
   """Returns the row of an exercise."""
   name, clock = case["task"], time.process_time
   env = tasks.load(*suite.split(name), {"random": 0})
-  act = experts.make(env)
+  act = performer.make(env)
   stepping, recording, steps = 0.0, 0.0, 0
   while stepping < case["seconds"]:  # whole episodes, as the metrics at the end belong to them
     timestep = env.reset()

@@ -488,17 +488,17 @@ def test_dm_control_physics_copies_and_resets(scenes):
 
 def test_deleted_data_and_models_leave_no_workspace(scenes):
   gc.collect()
-  before = len(engine._workspaces), len(engine._handles)
+  before = engine.count()
   for _ in range(5):
     model = mujoco.MjModel.from_xml_string(scenes.press(subdivisions=1))
     datas = [mujoco.MjData(model) for _ in range(3)]
     mujoco.mj_step(model, datas[0])
     twin = copy.copy(datas[0])
     mujoco.mj_copyData(twin, model, datas[1])
-    assert len(engine._workspaces) == before[0] + 4
+    assert engine.count() == before + 4
     del model, datas, twin
     gc.collect()
-    assert (len(engine._workspaces), len(engine._handles)) == before
+    assert engine.count() == before
 
 
 # Mistakes.
