@@ -13,12 +13,13 @@ LEAST, MOST = 0.02, 2.0  # [m], of an organ's bounding box; other sizes are slip
 _USUAL, _LARGE = 0.2, 0.6  # [m]; what an organ usually is, and what it hardly is
 
 
-def read(mesh, scale: float | str = 1.0) -> tuple[str, np.ndarray, np.ndarray]:
+def read(mesh, scale: float | str = 1.0, sized: bool = True) -> tuple[str, np.ndarray, np.ndarray]:
   """Returns a name for messages, vertices (n, 3) [m] and triangles (m, 3).
 
   Args:
     mesh: a file that trimesh reads (OBJ, STL, PLY, glTF), a trimesh, or (vertices, triangles)
     scale: metres per unit of the mesh, or the unit, one of UNITS
+    sized: whether its size must be an organ's
 
   Raises:
     ValueError: this is no surface, or its size is not an organ's; the message says what is allowed.
@@ -40,8 +41,17 @@ def read(mesh, scale: float | str = 1.0) -> tuple[str, np.ndarray, np.ndarray]:
   bad = used[~np.isfinite(vertices[used]).all(axis=1)]
   if len(bad):
     raise ValueError(f"{name}: vertex {bad[0]} is {vertices[bad[0]]}, expected finite numbers")
-  _check_size(name, float(np.linalg.norm(np.ptp(vertices[used], axis=0))), factor)
+  if sized:
+    _check_size(name, float(np.linalg.norm(np.ptp(vertices[used], axis=0))), factor)
   return name, vertices * factor, triangles
+
+
+def merge(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+  """Returns a mesh without vertices that are equal or unused; the others keep their order."""
+  _, first, same = np.unique(vertices, axis=0, return_index=True, return_inverse=True)
+  triangles = first[same.ravel()][triangles]
+  used, number = np.unique(triangles, return_inverse=True)
+  return vertices[used], number.reshape(-1, 3)
 
 
 def factor_of(scale: float | str) -> float:
