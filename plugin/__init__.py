@@ -27,13 +27,13 @@ def register() -> int:
   """
   from . import authoring, organ, windows
   from .engine import plugin
-  from .tissue import quiet
+  from .tissue import device
 
   if "Organ" not in globals():
     globals()["Organ"] = organ.Organ
     globals()["add_organ"] = authoring.add_organ
     globals()["add_windows"] = windows.add_windows
-    quiet.lower_log_level()
+    device.lower_log_level()
   return plugin.register()
 
 

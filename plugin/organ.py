@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import mujoco
 import numpy as np
-from palpate.engine.coupling import MISSED_ELEMENTS, MISSED_NODES
+from palpate.engine.layout import FLAG
 from palpate.tissue.config import Config
 
+from .engine import motion, workspace
 from .engine import plugin as engine
-from .engine import workspace
 from .tissue import energy
 from .tissue import mesh as topology
 
@@ -39,16 +39,9 @@ class Organ:
     self.model = model
     self.data = data
     self.name = name
-    self._instance = organs[name]
-    self._space = engine.find(data._address, self._instance)
+    self._space = engine.find(data._address, organs[name])
     self._organ = self._space.organ
-    organ = self._organ
-    moving = np.flatnonzero(organ.free)
-    self._moving = moving
-    self._qpos = organ.qposs.reshape(-1, 3)
-    self._dofs = organ.dofs.reshape(-1, 3)
-    start = int(model.plugin_stateadr[self._instance])
-    self._plugin_state = slice(start, start + int(model.plugin_statenum[self._instance]))
+    self._motion = motion.of(self._space)
 
   @property
   def config(self) -> Config:
@@ -65,7 +58,7 @@ class Organ:
       ValueError: a key may not change, or its value is not allowed.
     """
     texts = {key: str(value) for key, value in keys.items()}
-    workspace.configure(self._space, self._instance, texts)
+    workspace.configure(self._space, self.model._address, texts)
 
   @property
   def integrator(self) -> str:
@@ -99,11 +92,7 @@ class Organ:
   @property
   def displacement(self) -> np.ndarray:
     """Displacement from rest [m], in the frame of the parent body, (nvert, 3)."""
-    if self._organ.windows:
-      return self._own_state(0).copy()
-    u = np.zeros((self.nvert, 3))
-    u[self._moving] = self.data.qpos[self._qpos] - self.model.qpos0[self._qpos]
-    return u
+    return self._motion.displacement(self.model, self.data)
 
   @property
   def xpos(self) -> np.ndarray:
@@ -113,27 +102,17 @@ class Organ:
   @property
   def xvel(self) -> np.ndarray:
     """Velocities [m/s], (nvert, 3)."""
-    if self._organ.windows:
-      return self._own_state(1) @ self._organ.frame.T
-    return self._to_world(self.data.qvel)
+    return self._motion.velocity(self.data) @ self._organ.frame.T
 
   @property
   def contact_force(self) -> np.ndarray:
     """Constraint force on each vertex in the last step [N], (nvert, 3): contacts and equalities."""
-    if self._organ.windows:
-      out = np.zeros((self.nvert, 3))
-      node = self._space.views["placed"].numpy()
-      used = node >= 0
-      start = 12 * self.nvert
-      force = self.data.plugin_state[self._plugin_state][start : start + 3 * len(node)]
-      out[node[used]] = force.reshape(-1, 3)[used] @ self._organ.frame.T
-      return out
-    return self._to_world(self.data.qfrc_constraint)
+    return self._motion.contact_force(self.data) @ self._organ.frame.T
 
   @property
   def window_overflow(self) -> tuple[int, int]:
     """Touched nodes and triangles that the windows had no room for in the last step."""
-    return int(self._space.flags[MISSED_NODES]), int(self._space.flags[MISSED_ELEMENTS])
+    return int(self._space.flags[FLAG.missed_nodes]), int(self._space.flags[FLAG.missed_elements])
 
   @property
   def window_warning(self) -> str | None:
@@ -180,7 +159,7 @@ class Organ:
   @property
   def device(self) -> str:
     """Device the organ is solved on."""
-    return self._organ.surface.device.alias
+    return self._organ.still.device.alias
 
   def set_state(self, xpos: np.ndarray | None = None, xvel: np.ndarray | None = None):
     """Places the organ; pinned vertices stay, and forces of the past are forgotten.
@@ -192,31 +171,13 @@ class Organ:
     Raises:
       ValueError: an array has the wrong shape or holds a number that is not finite.
     """
-    frame = self._organ.frame
     xpos = None if xpos is None else self._checked("xpos", xpos)
     xvel = None if xvel is None else self._checked("xvel", xvel)
-    if self._organ.windows:
-      self._set_own_state(xpos, xvel)
-      return
-    if xpos is not None:
-      u = (xpos - self.xpos0) @ frame
-      self.data.qpos[self._qpos] = self.model.qpos0[self._qpos] + u[self._moving]
-    if xvel is not None:
-      self.data.qvel[self._dofs] = (xvel @ frame)[self._moving]
-    self.data.plugin_state[self._plugin_state] = 0
-    self._space.error = None
-
-  def _set_own_state(self, xpos: np.ndarray | None, xvel: np.ndarray | None):
-    u, v = self.displacement, self._own_state(1).copy()
-    if xpos is not None:
-      u[self._moving] = ((xpos - self.xpos0) @ self._organ.frame)[self._moving]
-    if xvel is not None:
-      v[self._moving] = (xvel @ self._organ.frame)[self._moving]
-    state = self.data.plugin_state[self._plugin_state]
-    state[:] = 0
-    self._own_state(0)[:], self._own_state(1)[:] = u, v
-    self._space.error = None
-    workspace.place(self._space)
+    frame = self._organ.frame
+    u = None if xpos is None else (xpos - self.xpos0) @ frame
+    v = None if xvel is None else xvel @ frame
+    self._space.forget()
+    self._motion.put(self.model, self.data, u, v)
 
   def sync(self):
     """Brings a motion that stays on a device (`resident`) into mjData.plugin_state.
@@ -238,17 +199,6 @@ class Organ:
     if not np.isfinite(array).all():
       raise ValueError(f"organ {self.name!r}: {what} holds numbers that are not finite")
     return array
-
-  def _own_state(self, k: int) -> np.ndarray:
-    """Returns the displacement (0) or velocity (1) in the plugin state of a windowed organ."""
-    workspace.sync(self._space)
-    size = 3 * self.nvert
-    return self.data.plugin_state[self._plugin_state][k * size : (k + 1) * size].reshape(-1, 3)
-
-  def _to_world(self, generalized: np.ndarray) -> np.ndarray:
-    out = np.zeros((self.nvert, 3))
-    out[self._moving] = generalized[self._dofs] @ self._organ.frame.T
-    return out
 
 
 def _instance(model: mujoco.MjModel, flex: int) -> int | None:

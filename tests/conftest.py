@@ -1,18 +1,14 @@
 """What all tests share."""
 
-import ctypes.util
-import os
-import sys
-
 import pytest
+import screen
 
-# Draw without a screen. MuJoCo reads the variable once, when it is imported.
-if sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
-  for backend, library in (("egl", "EGL"), ("osmesa", "OSMesa")):
-    if ctypes.util.find_library(library):
-      os.environ.setdefault("MUJOCO_GL", backend)
+screen.choose()  # before MuJoCo is imported
+import scenes as builders  # noqa: E402
 
-from scenes import Scenes, needs_cuda
+
+def pytest_addoption(parser):
+  parser.addoption("--seed", type=int, help="of the one fuzz case to run")
 
 
 def pytest_collection_modifyitems(config, items):
@@ -25,10 +21,10 @@ def pytest_collection_modifyitems(config, items):
 
 
 @pytest.fixture(scope="session")
-def scenes() -> type[Scenes]:
-  return Scenes
+def scenes():
+  return builders
 
 
-@pytest.fixture(params=["cpu", pytest.param("cuda:0", marks=needs_cuda)])
+@pytest.fixture(params=["cpu", pytest.param("cuda:0", marks=builders.needs_cuda)])
 def device(request) -> str:
   return request.param

@@ -64,7 +64,7 @@ def test_work_of_a_slow_pull_is_the_energy(scenes):
   work = 0.0
   for k in range(2000):
     force, before = 0.1 * k / 2000, organ.displacement[top, 2]
-    data.qfrc_applied[organ._dofs[top, 2]] = force
+    data.qfrc_applied[scenes.dofs(organ)[top, 2]] = force
     mujoco.mj_step(model, data)
     work += force * (organ.displacement[top, 2] - before)
   assert organ.displacement[top, 2] > 2e-3
@@ -142,8 +142,9 @@ def test_energy_does_not_depend_on_the_frame(scenes):
   inside = scenes.organ(points, elem, foundation=1e4, bulk=1e3)
   energy = []
   for frame in ("", 'pos="1 2 3" euler="20 50 -70"'):
-    _, _, organ = scenes.load(scenes.world(f'<body name="frame" {frame}>{inside}</body>'))
-    turn = organ._organ.frame
+    _, data, organ = scenes.load(scenes.world(f'<body name="frame" {frame}>{inside}</body>'))
+    mujoco.mj_kinematics(organ.model, data)
+    turn = data.body("frame").xmat.reshape(3, 3)
     organ.set_state(organ.xpos0 + np.random.RandomState(0).uniform(-0.01, 0.01, (42, 3)) @ turn.T)
     energy.append(organ.energy)
   assert energy[0] > 0

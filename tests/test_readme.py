@@ -1,4 +1,4 @@
-"""What the README and the wheel promise."""
+"""What the README, the pages and the wheel promise."""
 
 import os
 import pathlib
@@ -11,10 +11,22 @@ import zipfile
 
 import pytest
 from palpate.app import cli
-from palpate.tissue.config import KEYS, Config
+from palpate.tissue.config import KEYS, RUNNING, Config
 
 ROOT = pathlib.Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+CONFIGURATION = (ROOT / "docs" / "configuration.md").read_text(encoding="utf-8")
+PAGES = [
+  page
+  for pattern in (
+    "*.md",
+    "docs/*.md",
+    "tasks/*.md",
+    "models/*/*.md",
+    "tests/benchmarks/results/*.md",
+  )
+  for page in sorted(ROOT.glob(pattern))
+]
 
 
 def blocks(language):
@@ -57,11 +69,14 @@ def test_the_examples_run_and_the_organ_carries_the_ball(tmp_path):
   assert not (tmp_path / "MUJOCO_LOG.TXT").exists()
 
 
+def test_a_newcomer_reads_it_in_three_minutes():
+  assert len(README.splitlines()) <= 150
+  assert len(re.findall(r"^\|(?:-+\|)+$", README, re.M)) == 1  # one table
+
+
 def test_every_configuration_key_is_explained_with_its_default():
-  told = {}
-  for names, default in re.findall(r"^\| (`[^|]+`) \|.*\| ([^|]+) \|$", README, re.M):
-    keys, values = re.findall(r"`(\w+)`", names), default.split(", ")
-    told |= dict(zip(keys, values, strict=len(keys) == len(values)))
+  told = dict(re.findall(r"^\| `(\w+)` \|.*\| ([^|]+) \|$", CONFIGURATION, re.M))
+  assert list(told) == list(KEYS)
   config = Config()
   for key in KEYS:
     value = getattr(config, key)
@@ -74,16 +89,25 @@ def test_every_configuration_key_is_explained_with_its_default():
       assert float(told[key]) == value, key
 
 
+def test_the_keys_that_change_while_running_are_told():
+  (told,) = re.findall(r"`Organ.configure` changes (.*?), in one mjData", CONFIGURATION, re.S)
+  assert set(re.findall(r"`(\w+)`", told)) == set(RUNNING)
+
+
 def test_the_commands_it_names_exist():
   names = {" ".join(words) for words in cli.COMMANDS}
-  for line in re.findall(r"^\| (`palpate .+?`) \|", README, re.M):
-    for words in re.findall(r"`palpate ([\w ]+)`", line):
-      assert words in names
+  told = set(re.findall(r"^palpate (\w+(?: press)?)", README, re.M))
+  assert told <= names
+  assert "run press" in told
 
 
-def test_its_links_lead_somewhere_and_the_picture_is_small():
-  for target in re.findall(r"\]\((?!https?:)([^)#]+)\)", README):
-    assert (ROOT / target).is_file(), target
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_links_lead_somewhere(page):
+  for target in re.findall(r"\]\((?!https?:)([^)#]+)", page.read_text(encoding="utf-8")):
+    assert (page.parent / target).is_file(), target
+
+
+def test_the_picture_is_small():
   assert (ROOT / "models" / "press" / "press.png").stat().st_size < 300e3
 
 

@@ -119,10 +119,10 @@ def _within(version: str, spec: str) -> bool:
 
 def _devices() -> list[str]:
   import warp as wp
-  from palpate.tissue import quiet
+  from palpate.tissue import device
 
-  quiet.lower_log_level()
-  quiet.init()
+  device.lower_log_level()
+  device.init()
   lines = [f"{d.alias}: {d.name}" for d in wp.get_cuda_devices()] or ["no CUDA device"]
   return [f"cpu: {os.cpu_count()} cores; {'; '.join(lines)}"]
 

@@ -21,15 +21,16 @@ def main(args: argparse.Namespace) -> int:
   """Loads every module with kernels on every device; prints the seconds each took."""
   register()
   import warp as wp
-  from palpate.tissue import quiet
+  from palpate.tissue import device as devices
+  from palpate.tissue import kernels
 
-  quiet.init()
+  devices.init()
   known = [device.alias for device in wp.get_devices()]
   if args.device and args.device not in known:
     raise CommandError(f"no device {args.device!r}, expected one of {', '.join(known)}")
   progress, rows, total = Progress(), [], 0.0
   for device in [args.device] if args.device else known:
-    for module in modules():
+    for module in [*kernels.MODULES, *modules()]:
       progress.show(f"{module.rpartition('.')[2]} on {device}", always=True)
       start = time.perf_counter()
       wp.load_module(module, device=device)

@@ -1,32 +1,37 @@
-"""Reads the declaration of an organ from a compiled mjModel and checks it."""
+"""Reads the declaration of an organ from a compiled mjModel and checks it; writes nothing.
+
+`declare_windows` reads that of an organ with windows; `prepare` makes the model fit.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import hashlib
-import threading
 
 import mujoco
 import numpy as np
-import warp as wp
 from palpate.tissue import config as configuration
-from palpate.tissue import elastic, quiet, types
+from palpate.tissue import device as devices
 from palpate.tissue import mesh as topology
-from palpate.tissue import shape as surface
+from palpate.tissue import shape
+from palpate.tissue.body import Body
 from palpate.tissue.config import Config
 from palpate.tissue.mesh import Mesh
-from palpate.tissue.types import Surface
+from palpate.tissue.step import SCHEMES
 
-from . import mjstruct
-from .window_nodes import MAX_GEOMS, MAX_WINDOWS
+from . import graphs, mjstruct
 
-_lock = threading.RLock()
+NO_RK4 = (
+  "integrator is RK4, which evaluates forces four times a step; expected Euler, implicit or "
+  "implicitfast"
+)
+_FLAT = 1e-6  # volume that counts as none, as a share of the area to the power of 1.5
 _CACHED = 16
-_made: dict[bytes, Organ] = {}
+_made: dict[bytes, Declaration] = {}
 
 
 @dataclasses.dataclass(frozen=True)
-class Organ:
+class Declaration:
   """What is the same in every mjData of a model.
 
   Attributes:
@@ -34,7 +39,7 @@ class Organ:
     flex: index of the flex
     mesh: topology and rest shape, in the frame of the parent body
     config: configuration
-    surface: constants on the device
+    still: shape and tissue on the device, with no world
     free: whether a vertex moves            (nvert,) bool
     body: body of each vertex               (nvert,)
     dofadr: first dof, -1 if pinned         (nvert,)
@@ -52,7 +57,7 @@ class Organ:
   flex: int
   mesh: Mesh
   config: Config
-  surface: Surface
+  still: Body
   free: np.ndarray
   body: np.ndarray
   dofadr: np.ndarray
@@ -89,6 +94,7 @@ class Windows:
     dofadr: its first dof                                     (nslot,)
     qposadr: its first qpos                                   (nslot,)
     home: node of each slot after a reset, -1 for none        (nslot,)
+    stand: where its body stands at rest, in its parent [m]   (nslot, 3)
     qhome: qpos less rest position and displacement [m]       (nslot, 3)
     elem_adr: where each window's triangles start in flex_elem(nwindow,)
     elem_num: how many it can hold                            (nwindow,)
@@ -103,6 +109,7 @@ class Windows:
   dofadr: np.ndarray
   qposadr: np.ndarray
   home: np.ndarray
+  stand: np.ndarray
   qhome: np.ndarray
   elem_adr: np.ndarray
   elem_num: np.ndarray
@@ -116,39 +123,38 @@ class Windows:
     return len(self.body)
 
 
-def read(model: int, instance: int) -> Organ:
+def read(model: int, instance: int) -> Declaration:
   """Returns the organ that plugin instance `instance` of an mjModel declares.
 
   Raises:
     ValueError: the declaration is not one this plugin can run.
   """
-  quiet.init()
+  devices.init()
   m = mjstruct.Model.from_address(model)
-  if mjstruct.config(model, instance, "window"):
-    return _read_windowed(model, m, instance)
   flex = _flex_of(m, instance)
-  name = _flex_name(m, flex)
-  _check_flex(m, flex, name)
+  name = flex_name(m, flex)
+  check_flex(m, flex, name)
   start = mjstruct.view(m.flex_vertadr, m.nflex, np.int32)[flex]
-  nvert = _vertices(m, flex)
+  nvert = vertices(m, flex)
   body = mjstruct.view(m.flex_vertbodyid, m.nflexvert, np.int32)[start : start + nvert].copy()
   local = mjstruct.view(m.flex_vert, (m.nflexvert, 3))[start : start + nvert]
   free = np.isin(body, moving_bodies(m, instance))
   if not free.any():
     raise ValueError(f"organ {name!r}: all vertices are pinned, expected some that move")
-  parent = _parent(m, name, body, free)
-  frame, origin = _static_frame(m, name, parent)
-  turn = _turn(m, name, body[free])
+  parent = find_parent(m, name, body, free)
+  frame, origin = static_frame(m, name, parent)
+  turn = find_turn(m, name, body[free])
   frame = frame @ turn
   rest = np.where(free[:, None], mjstruct.view(m.body_pos, (m.nbody, 3))[body] @ turn, 0.0)
   rest += np.where(free[:, None], local, local @ turn)
-  elem = _elements(m, flex)
+  elem = elements(m, flex)
   mesh = topology.build(name, rest, elem)
-  config = configuration.parse(name, _keys(model, instance), len(elem), mesh.closed)
-  dofadr, qposadr = _addresses(m, name, body, free)
+  config = configuration.parse(name, keys(model, instance), len(elem), mesh.closed)
+  check_volume(name, mesh, config)
+  dofadr, qposadr = addresses(m, name, body, free)
   order = np.cumsum(free) - 1
   mass = mjstruct.view(m.body_mass, m.nbody)[body]
-  return _cached(
+  return cached(
     float(m.opt.timestep),
     name=name,
     flex=flex,
@@ -166,7 +172,9 @@ def read(model: int, instance: int) -> Organ:
   )
 
 
-def _cached(h: float, name: str, mesh: Mesh, config: Config, free: np.ndarray, **fields) -> Organ:
+def cached(
+  h: float, name: str, mesh: Mesh, config: Config, free: np.ndarray, **fields
+) -> Declaration:
   """Returns the organ with its constants on the device, the same object for the same content."""
   digest = hashlib.sha256(repr((h, name, fields["flex"], config)).encode())
   for part in (mesh.rest, mesh.elem, free, *fields.values()):
@@ -176,223 +184,26 @@ def _cached(h: float, name: str, mesh: Mesh, config: Config, free: np.ndarray, *
       for array in vars(part).values():
         digest.update(np.ascontiguousarray(array).tobytes())
   key = digest.digest()
-  with _lock:
+  with graphs.lock:
     if key not in _made:
       try:
         scale = (h * h + h * config.damping) / max(float(fields["mass"][free].mean()), 1e-300)
-        implicit = config.integrator == "implicit"
-        constants = surface.make(mesh, config, ~free, config.device, scale if implicit else 0.0)
+        scale *= SCHEMES[config.integrator].levels
+        still = shape.make(mesh, config, ~free, config.device, scale, nworld=0)
       except ValueError as error:
         raise ValueError(f"organ {name!r}: {error}") from None
-      with wp.ScopedDevice(constants.device):
-        elastic.calibrate(constants, types.make_state(constants))
       if len(_made) >= _CACHED:
         _made.pop(next(iter(_made)))
-      _made[key] = Organ(
-        name=name, mesh=mesh, config=config, free=free, surface=constants, digest=key, **fields
+      _made[key] = Declaration(
+        name=name, mesh=mesh, config=config, free=free, still=still, digest=key, **fields
       )
     return _made[key]
 
 
-def _keys(model: int, instance: int) -> dict[str, str]:
+def keys(model: int, instance: int) -> dict[str, str]:
+  """Returns the configuration keys that are set."""
   texts = {key: mjstruct.config(model, instance, key) for key in configuration.KEYS}
   return {key: text for key, text in texts.items() if text}
-
-
-def _read_windowed(model: int, m, instance: int) -> Organ:
-  """Returns an organ that MuJoCo knows as a rigid flex, with windows."""
-  bodies, mine = _rigid_flexes(m, instance)
-  who = mjstruct.name_of(m, m.name_bodyadr, int(bodies[0]))
-  if len(mine) != 1:
-    raise ValueError(
-      f"plugin palpate.organ with window on body {who!r}: {len(mine)} rigid flexcomps there, "
-      "expected one <flexcomp rigid='true'> in the body that has the plugin"
-    )
-  flex = mine[0]
-  start = mjstruct.view(m.flex_vertadr, m.nflex, np.int32)
-  name = _flex_name(m, flex)
-  _check_surface(m, flex, name)
-  for key in ("contype", "conaffinity"):
-    value = mjstruct.view(getattr(m, f"flex_{key}"), m.nflex, np.int32)[flex]
-    if value:
-      raise ValueError(f"organ {name!r}: {key} is {value}, expected 0: its windows collide for it")
-  frame, origin = _static_frame(m, name, int(bodies[0]))
-  nvert = _vertices(m, flex)
-  rest = mjstruct.view(m.flex_vert, (m.nflexvert, 3))[start[flex] : start[flex] + nvert].copy()
-  elem = _elements(m, flex)
-  mesh = topology.build(name, rest, elem)
-  config = configuration.parse(name, _keys(model, instance), len(elem), mesh.closed)
-  free = np.ones(nvert, bool)
-  for vertex in config.pin:
-    if vertex >= nvert:
-      raise ValueError(f"organ {name!r}: pin has {vertex}, expected vertices in [0, {nvert})")
-    free[vertex] = False
-  if not free.any():
-    raise ValueError(f"organ {name!r}: all vertices are pinned, expected some that move")
-  area = topology.vertex_areas(rest, elem)
-  mass = config.mass * area / area.sum()
-  windows = _windows(model, m, instance, name, config, mesh, mass, (frame, origin))
-  absent = np.full(nvert, -1)
-  return _cached(
-    float(m.opt.timestep),
-    name=name,
-    flex=flex,
-    mesh=mesh,
-    config=config,
-    free=free,
-    body=np.full(nvert, int(bodies[0])),
-    dofadr=absent,
-    qposadr=absent,
-    stateadr=absent,
-    nfree=0,
-    frame=frame,
-    origin=origin,
-    mass=mass,
-    windows=windows,
-  )
-
-
-def _rigid_flexes(m, instance: int) -> tuple[np.ndarray, list[int]]:
-  """Returns the bodies of a plugin instance and the rigid flexes in them."""
-  bodies = np.flatnonzero(mjstruct.view(m.body_plugin, m.nbody, np.int32) == instance)
-  start = mjstruct.view(m.flex_vertadr, m.nflex, np.int32)
-  vertbody = mjstruct.view(m.flex_vertbodyid, m.nflexvert, np.int32)
-  rigid = mjstruct.view(m.flex_rigid, m.nflex, np.bool_)
-  return bodies, [f for f in range(m.nflex) if rigid[f] and vertbody[start[f]] in bodies]
-
-
-def _resolve(name: str, organ: str, names: list[str]) -> str | None:
-  """Returns the name that an organ's configuration means, or None.
-
-  `<attach prefix="...">` renames flexes and bodies and leaves configurations alone: the longest
-  prefix that the organ has too counts.
-  """
-  prefixes = [other[: len(other) - len(name)] for other in names if other.endswith(name)]
-  prefixes = [prefix for prefix in prefixes if organ.startswith(prefix)]
-  return max(prefixes, key=len) + name if prefixes else None
-
-
-def _claims(model, m, instance: int, names: list[str]) -> dict[str, str]:
-  """Returns the windows of the other organs, and whose they are."""
-  claimed: dict[str, str] = {}
-  plugin = mjstruct.view(m.plugin, m.nplugin, np.int32)
-  for other in range(m.nplugin):
-    if other != instance and plugin[other] == plugin[instance]:
-      for flex in _rigid_flexes(m, other)[1]:
-        for window in mjstruct.config(model, other, "window").split():
-          organ = _flex_name(m, flex)
-          claimed[_resolve(window, organ, names) or window] = f"organ {organ!r}"
-  return claimed
-
-
-def _windows(model, m, instance, name, config, mesh, mass, place) -> Windows:
-  names = [_flex_name(m, f) for f in range(m.nflex)]
-  claimed = _claims(model, m, instance, names)
-  if len(config.window) > MAX_WINDOWS:
-    raise ValueError(
-      f"organ {name!r}: window has {len(config.window)} names, expected at most {MAX_WINDOWS}"
-    )
-  body, dofadr, qposadr, offsets, turns, sizes = [], [], [], [], [], []
-  flex, elem_adr, elem_num = [], [], []
-  for window in config.window:
-    what = f"organ {name!r}: window {window!r}"
-    found = _resolve(window, name, names)
-    if found is None:
-      raise ValueError(f"{what} does not exist, expected a flexcomp; the model has {names}")
-    if found in claimed:
-      raise ValueError(f"{what} is claimed by {claimed[found]} too, expected one organ a window")
-    claimed[found] = "this organ"
-    f = names.index(found)
-    start = int(mjstruct.view(m.flex_vertadr, m.nflex, np.int32)[f])
-    count = _vertices(m, f)
-    own = mjstruct.view(m.flex_vertbodyid, m.nflexvert, np.int32)[start : start + count].copy()
-    jointed = mjstruct.view(m.body_jntnum, m.nbody, np.int32)[own] > 0
-    try:
-      _check_flex(m, f, window)
-      if not jointed.all():
-        raise ValueError(f"organ {window!r}: vertices without joints, expected no pins")
-      frame, origin = _static_frame(m, window, _parent(m, window, own, jointed))
-      turn = _turn(m, window, own)
-      frame = frame @ turn
-      dofs, qposs = _addresses(m, window, own, jointed)
-    except ValueError as error:
-      raise ValueError(f"{what}: {str(error).partition(': ')[2]}") from None
-    if np.abs(frame - place[0]).max() > 1e-9:
-      raise ValueError(f"{what} is rotated against the organ, expected the same orientation")
-    turns.append(np.tile(turn, (count, 1, 1)))
-    offsets.append(np.tile(place[0].T @ (place[1] - origin), (count, 1)))
-    body.append(own)
-    dofadr.append(dofs)
-    qposadr.append(qposs)
-    sizes.append(count)
-    flex.append(f)
-    elem_adr.append(int(mjstruct.view(m.flex_elemdataadr, m.nflex, np.int32)[f]))
-    elem_num.append(int(mjstruct.view(m.flex_elemnum, m.nflex, np.int32)[f]))
-  # At rest the windows stand on patches of their own: their bodies move there, so that qpos0 fits.
-  # The last slot stays free; a patch of n nodes has up to 2 n - 4 triangles: see `window_slots`.
-  room = [min(n - 1, t // 2 + 2) for n, t in zip(sizes, elem_num, strict=True)]
-  home = _home_slots(mesh.elem, mesh.nvert, sizes, room)
-  used = home >= 0
-  body, offset, turn = (np.concatenate(parts) for parts in (body, offsets, turns))
-  body_pos = mjstruct.view(m.body_pos, (m.nbody, 3))
-  stand = offset[used] + mesh.rest[home[used]]
-  body_pos[body[used]] = np.einsum("kij,kj->ki", turn[used], stand)
-  qhome = offset - np.einsum("kji,kj->ki", turn, body_pos[body])
-  geom_adr, geom = _followed(m, name, config, flex)
-  return Windows(
-    flex=np.array(flex),
-    adr=np.concatenate([[0], np.cumsum(sizes)]),
-    body=body,
-    dofadr=np.concatenate(dofadr),
-    qposadr=np.concatenate(qposadr),
-    home=home,
-    qhome=qhome,
-    elem_adr=np.array(elem_adr),
-    elem_num=np.array(elem_num),
-    geom_adr=geom_adr,
-    geom=geom,
-    mass=mass,
-  )
-
-
-def _followed(m, name: str, config: Config, flex: list[int]) -> tuple[np.ndarray, np.ndarray]:
-  """Returns the geoms of each window: those of the bodies named, or all that move and collide."""
-  bodyid = mjstruct.view(m.geom_bodyid, m.ngeom, np.int32)
-  weld = mjstruct.view(m.body_weldid, m.nbody, np.int32)
-  names = [mjstruct.name_of(m, m.name_bodyadr, b) for b in range(m.nbody)]
-  groups: list[list[int]] = []
-  for k, f in enumerate(flex):
-    meets = meeting_geoms(m, f)
-    if config.follow:
-      if len(config.follow) != len(flex):
-        raise ValueError(
-          f"organ {name!r}: follow has {len(config.follow)} groups, expected {len(flex)}, "
-          "one a window"
-        )
-      wanted = []
-      for body in config.follow[k]:
-        found = _resolve(body, name, names)
-        if found is None:
-          raise ValueError(f"organ {name!r}: follow names body {body!r}, which does not exist")
-        wanted.append(names.index(found))
-      mine = [g for g in meets if bodyid[g] in wanted]
-    else:
-      mine = [g for g in meets if weld[bodyid[g]] != 0]
-    groups.append(mine)
-  if not config.follow and len(flex) > 1:
-    # A tree of bodies is one tool: a triangle between two windows would touch neither jaw.
-    root = mjstruct.view(m.body_treeid, m.nbody, np.int32)[bodyid]
-    trees = sorted({root[g] for group in groups for g in group})
-    turn = {tree: k % len(flex) for k, tree in enumerate(trees)}
-    groups = [[g for g in group if turn[root[g]] == k] for k, group in enumerate(groups)]
-  for k, group in enumerate(groups):
-    if len(group) > MAX_GEOMS:
-      raise ValueError(
-        f"organ {name!r}: window {config.window[k]!r} follows {len(group)} geoms, expected at most "
-        f"{MAX_GEOMS}; name bodies in follow"
-      )
-  adr = np.concatenate([[0], np.cumsum([len(group) for group in groups])])
-  return adr, np.array([g for group in groups for g in group], np.int64)
 
 
 def meeting_geoms(m, flex: int) -> np.ndarray:
@@ -432,28 +243,28 @@ def _flex_of(m, instance: int) -> int:
       "inside a <flexcomp dim='2'>"
     )
   if len(found) > 1:
-    names = " and ".join(repr(_flex_name(m, f)) for f in found)
+    names = " and ".join(repr(flex_name(m, f)) for f in found)
     raise ValueError(f"one palpate.organ instance serves {names}, expected one instance each")
   return found[0]
 
 
-def _flex_name(m, flex: int) -> str:
+def flex_name(m, flex: int) -> str:
+  """Returns the name of a flex, or what to call it."""
   return mjstruct.name_of(m, m.name_flexadr, flex) or f"flex {flex}"
 
 
-def _check_surface(m, flex: int, name: str):
+def check_surface(m, flex: int, name: str):
+  """Raises ValueError where a flex cannot be an organ's surface."""
   dim = mjstruct.view(m.flex_dim, m.nflex, np.int32)[flex]
   if dim != 2:
     raise ValueError(f"organ {name!r}: flexcomp dim is {dim}, expected dim='2' (a surface)")
   if m.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
-    raise ValueError(
-      f"organ {name!r}: integrator is RK4, which evaluates forces four times a step; "
-      "expected Euler, implicit or implicitfast"
-    )
+    raise ValueError(f"organ {name!r}: {NO_RK4}")
 
 
-def _check_flex(m, flex: int, name: str):
-  _check_surface(m, flex, name)
+def check_flex(m, flex: int, name: str):
+  """Raises ValueError where a flex cannot give MuJoCo's dofs to an organ."""
+  check_surface(m, flex, name)
   if mjstruct.view(m.flex_rigid, m.nflex, np.bool_)[flex]:
     raise ValueError(
       f"organ {name!r}: flexcomp is rigid (or all its vertices are pinned), expected rigid='false'"
@@ -468,12 +279,28 @@ def _check_flex(m, flex: int, name: str):
       f"organ {name!r}: flexcomp has MuJoCo elasticity too, expected no <elasticity young='...'> "
       "and no <edge stiffness='...'>; use the plugin's keys"
     )
-  # MuJoCo warns of a flex without forces of its own; an <edge damping> silences it and, zero here,
-  # costs nothing while running. The plugin's own damping acts instead.
-  mjstruct.view(m.flex_edgedamping, m.nflex)[flex] = 0.0
 
 
-def _parent(m, name: str, body: np.ndarray, free: np.ndarray) -> int:
+def check_volume(name: str, mesh: Mesh, config: Config):
+  """Raises ValueError where a closed surface is inside out, or too flat for what acts inside."""
+  if not mesh.closed:
+    return
+  volume = topology.volume(mesh.rest, mesh.elem)
+  area = np.linalg.norm(topology.area_vectors(mesh.rest, mesh.elem), axis=1).sum()
+  if volume < -_FLAT * area**1.5:
+    raise ValueError(
+      f"organ {name!r}: its surface is inside out and encloses {volume:.3g} m^3, expected "
+      "triangles counter-clockwise from outside"
+    )
+  if config.bulk and volume < _FLAT * area**1.5:
+    raise ValueError(
+      f"organ {name!r}: bulk is {config.bulk:g}, expected 0 for a surface that encloses no volume "
+      f"({volume:.3g} m^3)"
+    )
+
+
+def find_parent(m, name: str, body: np.ndarray, free: np.ndarray) -> int:
+  """Returns the one body that the vertices' bodies hang on."""
   parents = np.unique(mjstruct.view(m.body_parentid, m.nbody, np.int32)[body[free]])
   if parents.size > 1:
     raise ValueError(
@@ -489,7 +316,7 @@ def _parent(m, name: str, body: np.ndarray, free: np.ndarray) -> int:
   return int(parents[0])
 
 
-def _turn(m, name: str, body: np.ndarray) -> np.ndarray:
+def find_turn(m, name: str, body: np.ndarray) -> np.ndarray:
   """Returns the rotation of the vertices' bodies, and of their slides, against the parent body.
 
   A flexcomp has none, but `attach` turns the bodies of a world that it puts in a frame.
@@ -502,7 +329,7 @@ def _turn(m, name: str, body: np.ndarray) -> np.ndarray:
   return turn.reshape(3, 3)
 
 
-def _static_frame(m, name: str, parent: int) -> tuple[np.ndarray, np.ndarray]:
+def static_frame(m, name: str, parent: int) -> tuple[np.ndarray, np.ndarray]:
   """Returns rotation and position of the organ's parent body, which must not move."""
   rotation, position = np.eye(3), np.zeros(3)
   parentid = mjstruct.view(m.body_parentid, m.nbody, np.int32)
@@ -526,7 +353,36 @@ def _static_frame(m, name: str, parent: int) -> tuple[np.ndarray, np.ndarray]:
   return rotation, position
 
 
-def _vertices(m, flex: int) -> int:
+def static_places(m, organ: Declaration) -> list[memoryview]:
+  """Returns position and turn, as bytes, of each body that the organ or a window hangs on."""
+  parentid = mjstruct.view(m.body_parentid, m.nbody, np.int32)
+  start = [int(organ.body[0])] if organ.windows else parentid[organ.body[organ.free]]
+  slots = parentid[organ.windows.body] if organ.windows else []
+  found: set[int] = set()
+  for body in {int(b) for b in (*start, *slots)}:
+    while body > 0:
+      found.add(body)
+      body = int(parentid[body])
+  places = (mjstruct.view(m.body_pos, (m.nbody, 3)), mjstruct.view(m.body_quat, (m.nbody, 4)))
+  return [each[body].view(np.uint8).data for body in sorted(found) for each in places]
+
+
+def check_frame(m, organ: Declaration):
+  """Raises ValueError where the organ's frame is not, or no longer, where it was declared."""
+  parentid = mjstruct.view(m.body_parentid, m.nbody, np.int32)
+  body = int(organ.body[0]) if organ.windows else int(parentid[organ.body[organ.free][0]])
+  frame, origin = static_frame(m, organ.name, body)
+  if not organ.windows:
+    frame = frame @ find_turn(m, organ.name, organ.body[organ.free])
+  if not (np.array_equal(frame, organ.frame) and np.array_equal(origin, organ.origin)):
+    who = mjstruct.name_of(m, m.name_bodyadr, body)
+    raise ValueError(
+      f"its parent body {who!r} was moved after its mjData was made, expected a static frame; make "
+      "a new MjData"
+    )
+
+
+def vertices(m, flex: int) -> int:
   """Returns the number of a flex's vertices; MuJoCo's own is 0 while an organ is hidden."""
   return _extent(m.flex_vertadr, m.nflex, m.nflexvert, flex)
 
@@ -536,14 +392,15 @@ def _extent(addresses: int | None, nflex: int, total: int, flex: int) -> int:
   return int((adr[flex + 1] if flex + 1 < nflex else total) - adr[flex])
 
 
-def _elements(m, flex: int) -> np.ndarray:
+def elements(m, flex: int) -> np.ndarray:
+  """Returns the triangles of a flex, (nelem, 3)."""
   adr = int(mjstruct.view(m.flex_elemdataadr, m.nflex, np.int32)[flex])
   num = _extent(m.flex_elemadr, m.nflex, m.nflexelem, flex)
   data = mjstruct.view(m.flex_elem, m.nflexelemdata, np.int32)
   return data[adr : adr + 3 * num].reshape(num, 3).copy()
 
 
-def _addresses(m, name: str, body: np.ndarray, free: np.ndarray):
+def addresses(m, name: str, body: np.ndarray, free: np.ndarray):
   """Returns first dof and first qpos of each vertex, -1 where pinned."""
   jntadr = mjstruct.view(m.body_jntadr, m.nbody, np.int32)[body]
   jntnum = mjstruct.view(m.body_jntnum, m.nbody, np.int32)[body]
@@ -561,27 +418,3 @@ def _addresses(m, name: str, body: np.ndarray, free: np.ndarray):
   dofadr[free] = mjstruct.view(m.jnt_dofadr, m.njnt, np.int32)[first]
   qposadr[free] = mjstruct.view(m.jnt_qposadr, m.njnt, np.int32)[first]
   return dofadr, qposadr
-
-
-def _home_slots(elem: np.ndarray, nvert: int, sizes: list[int], room: list[int]) -> np.ndarray:
-  """Returns the default node of each slot: disjoint patches grown over the surface, (W,)."""
-  neighbours: list[set[int]] = [set() for _ in range(nvert)]
-  for a, b, c in elem:
-    neighbours[a] |= {b, c}
-    neighbours[b] |= {a, c}
-    neighbours[c] |= {a, b}
-  used: set[int] = set()
-  out = []
-  for size, most in zip(sizes, room, strict=True):
-    seed = next(i for i in range(nvert) if i not in used)
-    patch, queue = [], [seed]
-    used.add(seed)
-    while queue and len(patch) < most:
-      i = queue.pop(0)
-      patch.append(i)
-      for j in sorted(neighbours[i] - used):
-        used.add(j)
-        queue.append(j)
-    used -= set(queue)
-    out += patch + [-1] * (size - len(patch))
-  return np.array(out)

@@ -1,4 +1,4 @@
-"""Effective inertia: the mass that a contact meets at a node, given to MuJoCo as joint armature."""
+"""Effective inertia: the mass that a contact meets at a node; MuJoCo gets it as joint armature."""
 
 from __future__ import annotations
 
@@ -8,15 +8,17 @@ import hashlib
 import mujoco
 import numpy as np
 import warp as wp
+from palpate.tissue import body as bodies
 from palpate.tissue import mesh as topology
-from palpate.tissue import solver, types
-from palpate.tissue.config import Config
+from palpate.tissue import shape, step
+from palpate.tissue.body import Body
+from palpate.tissue.config import MATERIAL, Config
 from palpate.tissue.mesh import Mesh
-from palpate.tissue.shape import from_slices, to_slices
-from palpate.tissue.types import State, Surface
+from palpate.tissue.order import from_slices, to_slices
+from palpate.tissue.step import SCHEMES
 
 from . import mjstruct
-from .declare import Organ, meeting_geoms
+from .declare import Declaration, meeting_geoms
 
 # Loads whose response gives the effective inertia; between them it follows the nodal area.
 _SAMPLES = 24
@@ -30,35 +32,11 @@ _KNOWN = 64
 # A pressed shell stiffens and few nodes of a patch touch: between 1 and the limit of 2.
 _MARGIN = 1.5
 _alone: dict[bytes, np.ndarray] = {}  # what it depends on -> `_by_itself`
-_time_step: dict[bytes, float] = {}  # digest of an armature of ours -> the time step it is for
 
 
-def set_armature(m, organ: Organ):
-  """Gives the organ's dofs the effective inertia as armature, unless the MJCF gave them one.
-
-  Ours are recognised by their digest, so that they can follow the time step.
-  """
-  armature = mjstruct.view(m.dof_armature, m.nv)
-  dofs = organ.dofs
-  present = armature[dofs]
-  if organ.config.integrator == "explicit":
-    return  # explicit steps are those of the masses
-  h = float(m.opt.timestep)
-  if present.any() and _time_step.get(_digest(present), h) == h:
-    return
-  mass = _masses(m, organ)
-  inertia = of_nodes(m, organ, mass, h, organ.flex)
-  added = np.repeat((inertia - mass)[organ.free], 3)
-  armature[dofs] = added
-  if len(_time_step) >= _KNOWN:
-    _time_step.pop(next(iter(_time_step)))
-  _time_step[_digest(added)] = h
-  # mj_setConst gives the same: M0 has the armature, the inverse weights, which scale the contacts'
-  # softness, are those of the masses alone for such dofs.
-  mjstruct.view(m.dof_M0, m.nv)[dofs] = np.repeat(inertia[organ.free], 3)
-
-
-def stiffness(m, organ: Organ, config: Config, nodal: np.ndarray) -> tuple[bool, float]:
+def stiffness(
+  m, organ: Declaration, body: Body, config: Config, nodal: np.ndarray
+) -> tuple[bool, float]:
   """Returns whether tissue is stiff for the model's time step, and how much one node alone is more.
 
   It is where a push on one node moves others with it within a step: where one in four has an
@@ -67,6 +45,7 @@ def stiffness(m, organ: Organ, config: Config, nodal: np.ndarray) -> tuple[bool,
   Args:
     m: the mjModel
     organ: the organ
+    body: its tissue
     config: its configuration in force
     nodal: effective inertia of every node [kg], (nvert,)
 
@@ -74,66 +53,79 @@ def stiffness(m, organ: Organ, config: Config, nodal: np.ndarray) -> tuple[bool,
     whether it is; most times its inertia in `nodal` that a pressed node may have [-]
   """
   sample = _spread(organ.mesh.rest, np.flatnonzero(organ.free), _FEW)
-  alone = _by_itself(m, organ, config, sample)
-  stiff = np.quantile(alone / _masses(m, organ)[sample], 0.75) > _STIFF
+  alone = _by_itself(m, organ, body, config, sample)
+  stiff = np.quantile(alone / masses(m, organ)[sample], 0.75) > _STIFF
   return bool(stiff), _PRESSED * max(1.0, float(np.median(alone / nodal[sample])))
 
 
-def _by_itself(m, organ: Organ, config: Config, sample: np.ndarray) -> np.ndarray:
+def _by_itself(m, organ: Declaration, body: Body, config: Config, sample: np.ndarray) -> np.ndarray:
   """Returns the effective inertia of the nodes `sample` [kg], each pushed alone."""
-  h, mass = float(m.opt.timestep), _masses(m, organ)
+  h, mass = float(m.opt.timestep), masses(m, organ)
   numbers = [h, config.damping, config.foundation, config.bulk]
   key = _digest(np.concatenate([numbers, mass, organ.mesh.rest.ravel(), organ.free]))
-  key += repr(organ.config).encode()
+  key += repr((organ.config, config.integrator, material(config))).encode()
   if key not in _alone:
     if len(_alone) >= _KNOWN:
       _alone.pop(next(iter(_alone)))
-    s = dataclasses.replace(
-      organ.surface, damping=config.damping, foundation=config.foundation, bulk=config.bulk
-    )
-    gain = _gain(config, h)
-    response = _responses(s, _state(s), organ.mesh, mass, organ.free, h, 0.0, gain, sample)
+    gain = SCHEMES[config.integrator].gain(h, config.damping)
+    terms = {key: getattr(config, key) for key in ("damping", "foundation", "bulk")}
+    scratch = _scratch(body, dataclasses.replace(_compiled(organ, config), **terms))
+    response = _responses(scratch, organ.mesh, mass, organ.free, h, 0.0, gain, sample)
     _alone[key] = 1 / np.maximum(response, 1e-300)
   return _alone[key]
 
 
-def of_nodes(m, organ: Organ, mass: np.ndarray, h: float, flex: int) -> np.ndarray:
-  """Returns the effective inertia of every node for the tools that meet `flex` [kg], (nvert,)."""
+def of_nodes(
+  m, organ: Declaration, body: Body, config: Config, mass: np.ndarray, flex: int
+) -> np.ndarray:
+  """Returns the effective inertia of every node for the tools that meet `flex` [kg], (nvert,).
+
+  It is that of the compiled configuration with the material in force.
+  """
+  h, config = float(m.opt.timestep), _compiled(organ, config)
   radius = _tool_radius(m, organ, flex)
-  s = organ.surface
-  gain = _gain(organ.config, h)
-  return effective_inertia(s, _state(s), organ.mesh, mass, organ.free, h, radius, gain)
+  gain = SCHEMES[config.integrator].gain(h, config.damping)
+  scratch = _scratch(body, config)
+  return effective_inertia(scratch, organ.mesh, mass, organ.free, h, radius, gain)
 
 
-def of_dofs(m, organ: Organ) -> np.ndarray:
+def of_dofs(m, organ: Declaration) -> np.ndarray:
   """Returns the inertia that the dofs of every node have in the model [kg], (nvert,)."""
-  inertia = _masses(m, organ).copy()
+  inertia = masses(m, organ).copy()
   inertia[organ.free] += mjstruct.view(m.dof_armature, m.nv)[organ.dofs].reshape(-1, 3)[:, 0]
   return inertia
 
 
-def _masses(m, organ: Organ) -> np.ndarray:
+def masses(m, organ: Declaration) -> np.ndarray:
+  """Returns the mass of every node that MuJoCo or the windows give it [kg], (nvert,)."""
   if organ.windows:
     return organ.windows.mass
   return mjstruct.view(m.body_mass, m.nbody)[organ.body]
 
 
-def _gain(config: Config, h: float) -> float:
-  gain = h * h + h * config.damping
-  return 0.5 * gain if config.integrator == "midpoint" else gain
+def material(config: Config) -> tuple:
+  """Returns the constants of the tissue that its stiffness follows from."""
+  return tuple(getattr(config, key) for key in MATERIAL)
 
 
-def _state(s: Surface) -> State:
-  state = types.make_state(s)
-  state.mass.assign(np.where(s.vert.numpy() >= 0, 0.0, 1.0).reshape(1, -1, 8))
-  return state
+def _compiled(organ: Declaration, config: Config) -> Config:
+  """Returns the compiled configuration with the material of another."""
+  return dataclasses.replace(organ.config, **dict(zip(MATERIAL, material(config), strict=True)))
+
+
+def _scratch(body: Body, config: Config) -> Body:
+  """Returns a body of one world of that tissue, for solves that a per cent is good enough for."""
+  out = bodies.worlds(body)
+  shape.renumber(out, dataclasses.replace(config, tolerance=1e-2, newton=1))
+  out.state.mass.assign(np.where(out.shape.vert.numpy() >= 0, 0.0, 1.0).reshape(1, -1, 8))
+  return out
 
 
 def _digest(values: np.ndarray) -> bytes:
   return hashlib.sha256(np.ascontiguousarray(values).tobytes()).digest()
 
 
-def _tool_radius(m, organ: Organ, flex: int) -> float:
+def _tool_radius(m, organ: Declaration, flex: int) -> float:
   """Returns the radius of the largest contact patch to expect [m]: that of the thickest tool.
 
   Planes and height fields touch all there is; a patch of a quarter of the organ stands for them.
@@ -156,14 +148,13 @@ def _tool_radius(m, organ: Organ, flex: int) -> float:
 
 
 def effective_inertia(
-  s: Surface,
-  d: State,
+  body: Body,
   mesh: Mesh,
   mass: np.ndarray,
   free: np.ndarray,
   h: float,
   radius: float,
-  gain: float | None = None,
+  gain: float,
 ) -> np.ndarray:
   """Returns the inertia that a contact meets at each node at rest [kg], (nvert,).
 
@@ -174,19 +165,17 @@ def effective_inertia(
   are solved for; others follow the nearest of them in proportion to their area.
 
   Args:
-    s: the organ
-    d: a state of one world, overwritten
+    body: the organ, of one world; its state is overwritten
     mesh: its mesh
     mass: nodal masses [kg], (nvert,)
     free: nodes that move, (nvert,) bool
     h: time step [s]
     radius: radius of the contact patch [m]; 0 for the node alone
-    gain: factor of K in A [s^2]; None for h^2 + h damping
+    gain: factor of K in A [s^2]
   """
   area = topology.vertex_areas(mesh.rest, mesh.elem)
   sample = _spread(mesh.rest, np.flatnonzero(free), _SAMPLES)
-  gain = h * h + h * s.damping if gain is None else gain
-  response = _responses(s, d, mesh, mass, free, h, radius, gain, sample)
+  response = _responses(body, mesh, mass, free, h, radius, gain, sample)
   # Per area, so that finer parts of the surface get less.
   specific = 1 / np.maximum(response, 1e-300) / area[sample]
   distance2 = ((mesh.rest[:, None] - mesh.rest[sample]) ** 2).sum(axis=2)
@@ -198,8 +187,7 @@ def effective_inertia(
 
 
 def _responses(
-  s: Surface,
-  d: State,
+  body: Body,
   mesh: Mesh,
   mass: np.ndarray,
   free: np.ndarray,
@@ -209,30 +197,26 @@ def _responses(
   sample: np.ndarray,
 ) -> np.ndarray:
   """Returns how fast each sample moves where it and the nodes around it get a unit impulse."""
-  # A per cent is enough: the iteration it serves has a margin of two.
-  s = dataclasses.replace(s, tolerance=1e-2, newton=1)
   normal = topology.vertex_normals(mesh.rest, mesh.elem)
-  vert = np.asarray(s.vert.numpy(), np.int64)
-  real = np.flatnonzero(vert >= 0)
+  node, state = body.shape.node.numpy(), body.state
 
   def put(array: wp.array, values: np.ndarray):
-    full = np.zeros((s.nnode, *values.shape[1:]))
-    full[real] = values[vert[real]]
-    array.assign(to_slices(full.astype(np.float32))[None])
+    full = np.zeros((body.shape.nnode, *values.shape[1:]), np.float32)
+    full[node] = values
+    array.assign(to_slices(full)[None])
 
-  for array in (d.pos, d.vel, d.dvel_warm):
+  for array in (state.disp, state.vel, state.dvel_warm):
     array.zero_()
-  put(d.mass, mass)
+  put(state.mass, mass)
   floor = 0.0
-  d.step.assign(np.array([[h, gain, floor, 0]], np.float32))
+  state.step.assign(np.array([[h, gain, floor, 0]], np.float32))
   response = np.zeros(len(sample))
   for k, i in enumerate(sample):
     patch = free & (((mesh.rest - mesh.rest[i]) ** 2).sum(axis=1) <= radius**2)
     patch[i] = True
-    put(d.force_ext, np.where(patch[:, None], normal[i] / h, 0.0))
-    solver.step(s, d)
-    dvel = from_slices(np.asarray(d.dvel.numpy()[0]))[int(s.node.numpy()[i])]
-    response[k] = dvel @ normal[i]
+    put(state.force_ext, np.where(patch[:, None], normal[i] / h, 0.0))
+    step.step(body)
+    response[k] = from_slices(state.dvel.numpy()[0])[node[i]] @ normal[i]
   return response
 
 

@@ -17,6 +17,8 @@ import mujoco
 import numpy as np
 from mujoco.introspect import ast_nodes, structs
 
+NAME = "palpate.organ"  # of the plugin
+_ERROR = int(mujoco.mjtLogLevel.mjLOG_ERROR)
 _SCALAR = {
   "mjtNum": C.c_double,
   "double": C.c_double,
@@ -61,6 +63,8 @@ def _struct(name: str) -> type[C.Structure]:
 
 Model = _struct("mjModel")
 Data = _struct("mjData")
+_Message = _struct("mjLogMessage")
+LogHandler = C.CFUNCTYPE(None, C.c_void_p)
 
 
 @functools.cache
@@ -76,12 +80,22 @@ def library() -> C.CDLL:
   lib.mj_getPluginConfig.argtypes = [C.c_void_p, C.c_int, C.c_char_p]
   lib.mj_fwdPosition.argtypes = [C.c_void_p, C.c_void_p]
   lib.mj_comVel.argtypes = [C.c_void_p, C.c_void_p]
+  lib._mjPRIVATE_getGlobalLogHandler.restype = C.c_void_p
+  lib._mjPRIVATE_setTlsLogHandler.restype = C.c_void_p
+  lib._mjPRIVATE_setTlsLogHandler.argtypes = [LogHandler]
+  lib.mjp_getPlugin.restype = C.c_void_p
+  lib.mjp_getPlugin.argtypes = [C.c_char_p, C.c_void_p]
   lib.mju_warning.argtypes = [C.c_char_p, C.c_char_p]
   lib.mjp_registerPlugin.argtypes = [C.c_void_p]
   lib.mjp_defaultPlugin.argtypes = [C.c_void_p]
   lib.mjp_getPluginAtSlot.restype = C.c_void_p
   lib.mjp_getPluginAtSlot.argtypes = [C.c_int]
   return lib
+
+
+def warn(text: str):
+  """Issues a MuJoCo warning."""
+  library().mju_warning(b"%s", f"{NAME}: {text}".encode())
 
 
 def view(address: int | None, shape, dtype: type = np.float64) -> np.ndarray:
@@ -98,6 +112,34 @@ def config(model: int, instance: int, key: str) -> str:
   """Returns a plugin instance's configuration value, empty where it is not set."""
   value = library().mj_getPluginConfig(model, instance, key.encode())
   return value.decode() if value else ""
+
+
+def error_text(message: int) -> str | None:
+  """Returns the text of a log message at an address if it is of an error, or None."""
+  found: Any = _Message.from_address(message)
+  if found.level != _ERROR:
+    return None
+  text = found.subject.decode(errors="replace")
+  return f"{found.func.decode()}: {text}" if found.func else text
+
+
+class Identity:
+  """Tells an mjModel from others that take its address when it is freed.
+
+  Arrays lie in one buffer and where in it follows from the sizes at the start of the struct: as
+  long as both are the same, views of the arrays are right.
+  """
+
+  def __init__(self, model: int):
+    self.address = model
+    fields: Any = Model
+    self._sizes = view(model, fields.opt.offset, np.uint8).data
+    self._buffer = view(model + fields.buffer.offset, 1, np.uintp).data
+    self._were = self._sizes.tobytes(), self._buffer[0]
+
+  def is_of(self, model: int) -> bool:
+    """Returns whether views made for this model are right for the living one at an address."""
+    return model == self.address and self._were == (self._sizes.tobytes(), self._buffer[0])
 
 
 def name_of(m: C.Structure, addresses: int | None, index: int) -> str:

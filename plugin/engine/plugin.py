@@ -6,25 +6,25 @@ model is compiled they become its error message, while it runs a MuJoCo warning 
 
 from __future__ import annotations
 
-import _thread
 import atexit
 import ctypes as C
 import functools
 import itertools
-import signal
-import threading
-import types
 from typing import Any
 
 import mujoco
 import numpy as np
 from palpate.tissue.config import KEYS
 
-from . import mjstruct, window, workspace
-from .coupling import MISSED_ELEMENTS, MISSED_NODES
+from . import guard, mjstruct, turns, windowed, workspace
+from .layout import FLAG
+from .mjstruct import NAME, warn
 from .workspace import Workspace
 
-NAME = "palpate.organ"
+if "register" in globals():
+  raise ImportError(
+    f"{__name__} cannot be loaded again: MuJoCo calls what it loaded first; start Python anew"
+  )
 
 _P = C.c_void_p
 # MuJoCo's warnings of a state it then resets: of positions, velocities and accelerations.
@@ -48,7 +48,7 @@ class _Plugin(C.Structure):
     ("nsensordata", _P),
     ("init", C.CFUNCTYPE(C.c_int, _P, _P, C.c_int)),
     ("destroy", C.CFUNCTYPE(None, _P, C.c_int)),
-    ("copy", _P),
+    ("copy", C.CFUNCTYPE(None, _P, _P, _P, C.c_int)),
     ("reset", C.CFUNCTYPE(None, _P, _P, _P, C.c_int)),
     ("compute", C.CFUNCTYPE(None, _P, _P, C.c_int, C.c_int)),
     ("advance", C.CFUNCTYPE(None, _P, _P, C.c_int)),
@@ -72,9 +72,16 @@ def find(data: int, instance: int) -> Workspace:
   return _workspaces[data, instance]
 
 
+def count() -> int:
+  """Returns the number of organs in all mjData that there are."""
+  if len(_workspaces) != len(_handles):
+    raise RuntimeError(f"{len(_workspaces)} workspaces, {len(_handles)} handles")
+  return len(_workspaces)
+
+
 def _windowed(model: mujoco.MjModel, data: mujoco.MjData) -> list[Workspace]:
   found = [_workspaces.get((data._address, i)) for i in range(model.nplugin)]
-  return [w for w in found if w is not None and w.place is not None]
+  return [w for w in found if w is not None and w.turn is not None]
 
 
 def sync(model: mujoco.MjModel, data: mujoco.MjData):
@@ -86,22 +93,22 @@ def sync(model: mujoco.MjModel, data: mujoco.MjData):
 def place_windows(model: mujoco.MjModel, data: mujoco.MjData):
   """Puts the windows where a plugin state that was set says; stepping does it by itself."""
   for w in _windowed(model, data):
-    workspace.place(w)
+    workspace.place(w, model._address)
 
 
-def warn(text: str):
-  """Issues a MuJoCo warning."""
-  mjstruct.library().mju_warning(b"%s", f"{NAME}: {text}".encode())
+# Callbacks.
 
 
+@guard.watch
 def _nstate(model: int, instance: int) -> int:
   try:
     return workspace.state_size(model, instance)
-  except Exception as error:
-    warn(repr(error))
+  except BaseException as error:
+    _say(error)
     return 0
 
 
+@guard.watch
 def _init(model: int, data: int, instance: int) -> int:
   try:
     w = workspace.make(model, data, instance)
@@ -110,40 +117,81 @@ def _init(model: int, data: int, instance: int) -> int:
     mjstruct.view(d.plugin_data, d.nplugin, np.uintp)[instance] = handle
     _workspaces[data, instance] = _handles[handle] = w
     return 0
-  except ValueError as error:
-    warn(str(error))
-  except Exception as error:
-    warn(f"{type(error).__name__}: {error}")
+  except BaseException as error:
+    _say(error)
   return -1
 
 
+@guard.watch
 def _destroy(data: int, instance: int):
   w = _workspaces.pop((data, instance), None)
+  if w is not None and w.turn is not None:
+    w.turn.retire()
   for handle in [h for h, other in _handles.items() if other is w]:
     del _handles[handle]
 
 
+@guard.watch
+def _copy(data: int, model: int, source: int, instance: int):
+  w = _workspaces[data, instance]
+  try:
+    workspace.copy(w, model, _workspaces[source, instance])
+  except BaseException as error:
+    _fail(w, error)
+
+
+@guard.watch
 def _reset(model: int, state: int, data: int | None, instance: int):
   m = mjstruct.Model.from_address(model)
   size = int(mjstruct.view(m.plugin_statenum, m.nplugin, np.int32)[instance])
   mjstruct.view(state, size)[:] = 0
   w = _handles.get(data or 0)
   if w is not None:
-    w.error, w.nbad = None, 0
+    w.forget()
+    w.nbad = 0
 
 
+@guard.watch
 def _compute(model: int, data: int, instance: int, capability: int):
+  guard.enter()
   w = _workspaces[data, instance]
   try:
-    if w.model != model:
-      workspace.bind(w, model, instance)
+    if not w.identity.is_of(model):
+      workspace.attach(w, model)
     if _count_bad(w) > w.nbad:
       _find_bad_state(w)
     w.run()
-  except Exception as error:
-    _fail(w, f"{type(error).__name__}: {error}")
-  if w.status[3]:
-    _fail(w, "the implicit step has no finite solution: the motion diverged")
+    if w.status[3]:
+      _note(w, "the implicit step has no finite solution: the motion diverged")
+  except BaseException as error:
+    _fail(w, error)
+
+
+@guard.watch
+def _advance(model: int, data: int, instance: int):
+  w = _workspaces[data, instance]
+  try:
+    w.step()
+    if w.overflow is None and (w.flags[FLAG.missed_nodes] or w.flags[FLAG.missed_elements]):
+      _overflow(w)
+    if w.model_step[0] != w.time_step:
+      workspace.refresh(w)
+    guard.leave()
+  except BaseException as error:
+    _fail(w, error)
+
+
+@guard.watch
+def _visualize(model: int, data: int, option: int, scene: int, instance: int):
+  w = _workspaces[data, instance]
+  try:
+    if w.organ.windows:
+      windowed.draw(w, model, data)
+  except BaseException as error:
+    _fail(w, error)
+
+
+# What went wrong.
 
 
 def _count_bad(w: Workspace) -> int:
@@ -159,30 +207,38 @@ def _find_bad_state(w: Workspace):
   for kind, name, own in zip(_BAD, names, (organ.qposs, organ.dofs, organ.dofs), strict=True):
     index, count = w.warning[2 * kind : 2 * kind + 2]
     if count and index in own:
-      _fail(w, f"{name} {index}) is not finite or huge; the motion diverged")
+      _note(w, f"{name} {index}) is not finite or huge; the motion diverged")
 
 
-def _fail(w: Workspace, text: str):
+def _say(error: BaseException):
+  """Makes the error message of a model that does not compile."""
+  if guard.is_foreign(error):
+    guard.raise_later(error)
+  warn(str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}")
+
+
+def _fail(w: Workspace, error: BaseException):
+  """Makes an error of an exception in a callback."""
+  if guard.is_foreign(error):
+    guard.raise_later(error)
+    return
+  if isinstance(error, turns.Contested):  # what follows is wrong: nobody may miss it
+    _note(w, str(error))
+    guard.raise_in_caller(RuntimeError(w.error))
+  else:
+    _note(w, f"{type(error).__name__}: {error}")
+
+
+def _note(w: Workspace, text: str):
+  """Keeps the first error and says it."""
   if w.error is None:
     w.error = f"organ {w.organ.name!r}: {text}"
     warn(w.error)
 
 
-def _advance(model: int, data: int, instance: int):
-  w = _workspaces[data, instance]
-  try:
-    w.step()
-    if w.overflow is None and (w.flags[MISSED_NODES] or w.flags[MISSED_ELEMENTS]):
-      _overflow(w)
-    if w.model_step[0] != w.time_step:
-      workspace.refresh(w)
-  except Exception as error:
-    _fail(w, f"{type(error).__name__}: {error}")
-
-
 def _overflow(w: Workspace):
   """Says, once, that a window is too small."""
-  nodes, triangles = int(w.flags[MISSED_NODES]), int(w.flags[MISSED_ELEMENTS])
+  nodes, triangles = int(w.flags[FLAG.missed_nodes]), int(w.flags[FLAG.missed_elements])
   what = f"{triangles} triangles between their nodes; give them more elements"
   if nodes:
     what = f"{nodes} nodes that tools touch and keep the deepest; give them more vertices"
@@ -190,31 +246,17 @@ def _overflow(w: Workspace):
   warn(w.overflow)
 
 
-def _visualize(model: int, data: int, option: int, scene: int, instance: int):
-  w = _workspaces[data, instance]
-  try:
-    if w.organ.windows:
-      window.draw(w, model, data)
-  except Exception as error:
-    _fail(w, f"{type(error).__name__}: {error}")
-
-
-def _on_interrupt(number: int, frame: types.FrameType | None):
-  """Raises KeyboardInterrupt, but not inside a callback, where ctypes would drop it."""
-  here = frame
-  while here is not None:
-    if here.f_code in _codes:
-      threading.Timer(0.001, _thread.interrupt_main).start()
-      return
-    here = here.f_back
-  signal.default_int_handler(number, frame)
-
-
 @functools.cache
 def register() -> int:
   """Registers the plugin with MuJoCo, once a process; returns its slot."""
   mjstruct.check()
   lib = mjstruct.library()
+  slot = C.c_int(-1)
+  if lib.mjp_getPlugin(NAME.encode(), C.byref(slot)):
+    raise ImportError(
+      f"{__name__}: another copy of the package has registered {NAME!r} in this process; import it "
+      "under one name"
+    )
   plugin = _Plugin()
   lib.mjp_defaultPlugin(C.byref(plugin))
   keys = [key.encode() for key in KEYS]
@@ -228,24 +270,20 @@ def register() -> int:
     ("nstate", _nstate),
     ("init", _init),
     ("destroy", _destroy),
+    ("copy", _copy),
     ("reset", _reset),
     ("compute", _compute),
     ("advance", _advance),
     ("visualize", _visualize),
   ):
     setattr(plugin, field, fields[field](function))
-    _codes.add(function.__code__)
-  slot = lib.mjp_registerPlugin(C.byref(plugin))
-  if slot < 0:
-    raise ImportError(f"palpate: MuJoCo did not accept the plugin {NAME!r} (slot {slot})")
+  number = lib.mjp_registerPlugin(C.byref(plugin))
+  if number < 0:
+    raise ImportError(f"palpate: MuJoCo did not accept the plugin {NAME!r} (slot {number})")
   _keep.append((plugin, attributes))
-  atexit.register(_let_go, slot)
-  if (
-    threading.current_thread() is threading.main_thread()
-    and signal.getsignal(signal.SIGINT) is signal.default_int_handler
-  ):
-    signal.signal(signal.SIGINT, _on_interrupt)
-  return slot
+  atexit.register(_let_go, number)
+  guard.install()
+  return number
 
 
 def _let_go(slot: int):
@@ -255,4 +293,3 @@ def _let_go(slot: int):
 
 
 _keep: list = []  # MuJoCo keeps pointers into these
-_codes: set[types.CodeType] = set()  # of the callbacks

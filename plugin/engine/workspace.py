@@ -3,26 +3,39 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
-import threading
-import weakref
 from typing import Any
 
 import mujoco
 import numpy as np
 import warp as wp
+from palpate.tissue import body as bodies
 from palpate.tissue import config as configuration
-from palpate.tissue import elastic, schemes, solver, types
+from palpate.tissue import shape
+from palpate.tissue.body import Body
 from palpate.tissue.config import Config
-from palpate.tissue.types import State, Surface
 
-from . import coupling, declare, inertia, mjstruct, window, window_nodes, window_slots
-from .coupling import ANSWERED, ASLEEP, CHANGED, NFLAG, PENDING, STALE
-from .declare import Organ
+from . import (
+  apart,
+  coupling,
+  declare,
+  declare_windows,
+  graphs,
+  inertia,
+  mjstruct,
+  nodal,
+  prepare,
+  windowed,
+)
+from .bind import bind
+from .coupling import Phases
+from .declare import Declaration
+from .layout import FLAG, HEAD
 from .resident import Resident
+from .turns import Turn
 
 _ALLOWED = int(mujoco.mjtSleepPolicy.mjSLEEP_AUTO_ALLOWED)
-_lock = threading.RLock()
+_RK4 = int(mujoco.mjtIntegrator.mjINT_RK4)
+_ASTRAY = 1e-9  # distance of a slot from its node that rounding does not explain [m]
 
 
 @dataclasses.dataclass
@@ -32,26 +45,27 @@ class Workspace:
   Attributes:
     organ: constants
     config: configuration in force, which may differ from the compiled one
-    surface: constants on the device with the numbers of `config`
-    state: solver state on the organ's device
-    host: the arrays of `state` that MuJoCo's side reads and writes, on the CPU
-    ext: external and lagged contact force in float64 [N]  (3 nnode,)
-    model: address of the mjModel the views are of
+    body: shape, tissue and state on the organ's device
+    host: the arrays of its state that MuJoCo's side reads and writes, on the CPU
+    lagged: external and lagged contact force [N]  (nodes or slots, 3)
     data: address of the mjData
+    instance: the plugin instance
+    model: address of the mjModel the views are of
+    identity: tells that model from others
+    chosen: whether the configuration was changed here, not by a copy
+    turn: this mjData's part in the model's windows, or None
     before, after: recorded graphs of a step's forces around the solve
     solve: recorded graphs of the solve and what it needs, each on one device
     leave: recorded graph that takes the contact forces after MuJoCo's step
     respond: recorded graphs of the organ's response to their change; none where the scheme has none
-    end: recorded graph that ends a step without that, or None
+    end: recorded graph that ends a step without that
     advance: recorded graph of the plugin state's step
     place: recorded graph that puts the windows where the plugin state says, or None
     resident: keeper of a motion that stays on the device, or None
     stiff: whether the response is needed, see `inertia.stiffness`
     heaviest: most times its inertia that a node in contact may have, see there  (1,)
     computed: whether forces were computed for the step that ends
-    flags: what the coupling reports: STALE (the model lacks slots), ASLEEP, MISSED_NODES,
-      MISSED_ELEMENTS, PENDING (mode of the next commit), NEAR (a tool is near), CHANGED (contact
-      forces did), ANSWERED (the organ responded) and FORESEEN (what acts on it was)  (NFLAG,)
+    flags: what the coupling reports, see `layout.FLAG`
     policy: MuJoCo's sleep policy of the windows' bodies comes first
     counts: the number of vertices that MuJoCo sees of a windowed organ comes first
     status: iterations, relative residual, norm, failure  (4,)
@@ -59,20 +73,31 @@ class Workspace:
     overflow: what the windows had no room for, the first time, or None
     warning: last index and count of each of MuJoCo's warnings, one after the other
     nefc: the number of MuJoCo's constraints comes first
+    noticed: whether it was said that windows came without their state
     nbad: MuJoCo's warnings of bad states that were looked at since the last reset
     model_step: the model's time step comes first [s]
     time_step: time step that the armature is for [s]
-    views: what the graphs point at, kept alive
+    integrator: MuJoCo's comes first
+    static: places of the bodies that the organ hangs on, and what they were
+    qpos: numbers of qpos that the slots have, as bytes
+    stood: what they were after the last step, or None
+    plugin_state: the organ's own numbers
+    views: what a coupling keeps when its graphs are recorded anew
+    boxes: blocks of the plugin state and of what crosses in a step, see `layout`; windows
+    phases: what the graphs launch
   """
 
-  organ: Organ
+  organ: Declaration
   config: Config
-  surface: Surface
-  state: State
+  body: Body
   host: dict[str, wp.array]
-  ext: wp.array
+  lagged: wp.array
   data: int
+  instance: int
   model: int = 0
+  identity: Any = None
+  chosen: bool = False
+  turn: Turn | None = None
   before: Any = None
   solve: list = dataclasses.field(default_factory=list)
   after: Any = None
@@ -85,72 +110,124 @@ class Workspace:
   stiff: bool = False
   heaviest: np.ndarray = dataclasses.field(default_factory=lambda: np.ones(1))
   computed: bool = False
-  flags: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(NFLAG, np.int32))
+  flags: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(len(FLAG), np.int32))
   policy: memoryview = dataclasses.field(default_factory=lambda: np.zeros(1, np.int32).data)
   counts: memoryview = dataclasses.field(default_factory=lambda: np.zeros(1, np.int32).data)
   status: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(4, np.float32))
   error: str | None = None
   overflow: str | None = None
+  noticed: bool = False
   # Views that every step looks at: an item of a memoryview costs a tenth of one of an array.
   warning: memoryview = dataclasses.field(default_factory=lambda: memoryview(b""))
   nefc: memoryview = dataclasses.field(default_factory=lambda: memoryview(b"\0"))
   nbad: int = 0
   model_step: memoryview = dataclasses.field(default_factory=lambda: memoryview(b"\0"))
   time_step: float = 0.0
+  integrator: memoryview = dataclasses.field(default_factory=lambda: memoryview(b"\0"))
+  static: list = dataclasses.field(default_factory=list)
+  qpos: memoryview = dataclasses.field(default_factory=lambda: memoryview(b""))
+  stood: bytes | None = None
+  plugin_state: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))
   views: dict = dataclasses.field(default_factory=dict)
-
-  def __post_init__(self):
-    self._me = weakref.ref(self)
+  boxes: dict = dataclasses.field(default_factory=dict)
+  phases: Phases | None = None
 
   def run(self):
     """Computes the step's forces and adds them to qfrc_passive."""
-    # The model's windows may not be those of this state, which was set from outside or shares the
-    # model with another: contacts must be found again with the windows in place.
-    if self.place is not None and not self._owns_model():
-      self._find_contacts_again()
+    self._check_model()
+    if self.turn is not None:
+      if self.turn.refused:
+        self.turn.stand_back()
+        return
+      # The model's windows may not be those of this state, which was set from outside or shares the
+      # model with another: contacts must be found again with the windows in place.
+      if not self.turn.begin() or self._is_astray():
+        self._find_contacts_again()
     wp.capture_launch(self.before)
-    if self.place is not None and self.flags[STALE]:
-      self._find_contacts_again()
-      wp.capture_launch(self.before)
-    if self.place is not None and not self.asleep and self.policy[0] == _ALLOWED:
-      window.let_sleep(self, False)
+    if self.turn is not None:
+      if self.flags[FLAG.stale]:
+        self._find_contacts_again()
+        wp.capture_launch(self.before)
+      if not self.asleep and self.policy[0] == _ALLOWED:
+        windowed.let_sleep(self, False)
     if self.asleep:
       self.computed = True
       return  # what `after` does was done with `before`
     if self.resident:
       self.resident.send()
-      _launch_all(self.resident.left_to_do())
+      graphs.launch_all(self.resident.left_to_do())
       self.resident.look()
     else:
-      _launch_all(self.solve)
+      graphs.launch_all(self.solve)
     wp.capture_launch(self.after)
     self.computed = True
 
+  def _check_model(self):
+    """Makes sure that nothing has changed in the model that may not change while running.
+
+    Raises:
+      ValueError: something has.
+    """
+    if self.integrator[0] == _RK4:
+      raise ValueError(declare.NO_RK4)
+    for place, was in self.static:
+      if place.tobytes() != was:
+        declare.check_frame(mjstruct.Model.from_address(self.model), self.organ)
+
+  def _is_astray(self) -> bool:
+    """Returns whether qpos was set without the plugin state: slots are not on their nodes."""
+    if self.qpos.tobytes() == self.stood:
+      return False
+    far = windowed.find_astray(self)
+    if far > _ASTRAY and not self.noticed:
+      self.noticed = True
+      mjstruct.warn(
+        f"organ {self.organ.name!r}: qpos of its windows was set without plugin_state, which has "
+        "its motion and is kept; save and set mjSTATE_FULLPHYSICS"
+      )
+    return far > _ASTRAY
+
   def _find_contacts_again(self):
+    self.put_windows()
+    apart.find_contacts(self.model, self.data)
+
+  def put_windows(self):
+    """Puts the windows where the plugin state says."""
+    if self.resident:
+      self.resident.fetch()
     wp.capture_launch(self.place)
-    mjstruct.library().mj_fwdPosition(self.model, self.data)
+    self.turn.take()
 
   def step(self):
     """Steps the plugin state after MuJoCo has moved."""
+    if self.turn is None:
+      self._step()
+    elif not self.turn.refused:
+      self.turn.check()
+      self._step()
+      self.turn.end()
+      self.stood = self.qpos.tobytes()
+
+  def _step(self):
     computed, self.computed = self.computed, False
     if self.asleep:
       if self.nefc[0]:  # contacts of a window that was left behind wake the organ
         wp.capture_launch(self.leave)
       if self.counts[0]:
-        window.hide(self)
+        windowed.hide(self)
       if self.policy[0] != _ALLOWED:
-        window.let_sleep(self, True)
+        windowed.let_sleep(self, True)
       return
     responds = bool(self.respond) and self.stiff and computed
-    if responds or self.place is not None:
+    if responds or self.turn is not None:
       wp.capture_launch(self.leave)
-    if self.place is not None:
-      window.hide(self)
-    responds = responds and bool(self.flags[CHANGED])
-    self.flags[ANSWERED] = responds
+    if self.turn is not None:
+      windowed.hide(self)
+    responds = responds and bool(self.flags[FLAG.changed])
+    self.flags[FLAG.answered] = responds
     if responds:
       self._answer()
-    elif self.end is not None:
+    else:
       wp.capture_launch(self.end)
     wp.capture_launch(self.advance)
     if self.resident:
@@ -158,212 +235,151 @@ class Workspace:
 
   def _answer(self):
     """Ends the step with the organ's own response to the change of the contact forces."""
-    if self.place is not None:
-      self.views["inbox"].numpy()[window_nodes.HEAD - 1] = 1.0
-    _launch_all(self.respond)
+    if self.turn is not None:
+      self.boxes["inbox"].head.numpy()[HEAD.answered] = 1.0
+    graphs.launch_all(self.respond)
     if self.resident:
-      self.flags[PENDING] = 0
+      self.flags[FLAG.pending] = 0
       self.resident.look()
 
   @property
   def asleep(self) -> bool:
     """Whether the organ is at rest and its solve was skipped."""
-    return bool(self.flags[ASLEEP])
+    return bool(self.flags[FLAG.asleep])
 
-  def _owns_model(self) -> bool:
-    """Returns whether the model's windows were last placed here, and makes it so.
+  @property
+  def slots(self) -> np.ndarray:
+    """Node of each slot in the model, -1 for none, (nslot,)."""
+    return self.views["placed"].numpy()
 
-    Raises:
-      RuntimeError: two threads step the same model.
-    """
-    before, thread = _owner.get(self.model), threading.get_ident()
-    if before is not None and before == (self._me, thread):
-      return True
-    _owner[self.model] = (self._me, thread)
-    if before is None or before[0] is self._me:
-      return before is not None
-    if before[0]() is not None and before[1] != threading.get_ident():
-      raise RuntimeError(
-        "two threads step one mjModel, which holds the windows; give each thread its own model "
-        "(copy.copy(model))"
-      )
-    return False
+  def inertia(self, model: int) -> np.ndarray:
+    """Returns the inertia that contacts meet at each vertex [kg], (nvert,)."""
+    if self.organ.windows:
+      return self.views["inertia"].numpy().copy()
+    return inertia.of_dofs(mjstruct.Model.from_address(model), self.organ)
+
+  def forget(self):
+    """Forgets what went wrong."""
+    self.error = None
+    if self.turn is not None:
+      self.turn.refused = False
 
 
-def _launch_all(graphs: list):
-  for device, graph in graphs:
-    wp.capture_launch(graph)
-    if device.is_cuda:
-      wp.synchronize_device(device)
+def place(w: Workspace, model: int):
+  """Puts the windows of a model where the plugin state says, unless another thread steps it."""
+  attach(w, model)
+  if w.turn.is_free():
+    w.put_windows()
+    w.stood = w.qpos.tobytes()
+  else:
+    w.turn.leave()
 
 
-# By address of the mjModel: whose windows it holds, and the thread that placed them.
-_owner: dict[int, tuple[Any, int]] = {}
-
-
-def place(w: Workspace):
-  """Puts the windows where the plugin state says."""
-  wp.capture_launch(w.place)
-  _owner[w.model] = (w._me, threading.get_ident())
+def attach(w: Workspace, model: int):
+  """Makes a workspace fit a living model, which need not be the one that it last ran with."""
+  if not w.identity.is_of(model):
+    bind(w, model)
 
 
 def state_size(model: int, instance: int) -> int:
   """Returns the length of the plugin state.
 
-  Contact force, last dv and the one before of each moving vertex, or what `window` says.
+  Contact force, last dv and the one before of each moving vertex, or what `windowed` says.
   """
   m = mjstruct.Model.from_address(model)
   names = mjstruct.config(model, instance, "window").split()
   if names:
-    # Asked before MuJoCo has filled in the flexes: what `window` needs is at most this.
-    return window.state_size(m.nflexvert, 0, m.ngeom * len(names))
-  return 9 * len(declare.moving_bodies(m, instance)) + 1
+    # Asked before MuJoCo has filled in the flexes: what `windowed` needs is at most this.
+    return windowed.state_size(m.nflexvert, 0, m.ngeom * len(names))
+  return nodal.state_size(3 * len(declare.moving_bodies(m, instance)))
 
 
 def make(model: int, data: int, instance: int) -> Workspace:
-  """Returns the workspace of an organ in a fresh mjData; gives the model an armature if needed."""
-  organ = declare.read(model, instance)
-  m = mjstruct.Model.from_address(model)
-  with _lock:
-    s = organ.surface
-    state = types.make_state(s)
+  """Returns the workspace of an organ in a fresh mjData; makes the model fit the organ."""
+  has_windows = bool(mjstruct.config(model, instance, "window"))
+  with graphs.lock:
+    organ = (declare_windows if has_windows else declare).read(model, instance)
+    m = mjstruct.Model.from_address(model)
+    body = bodies.worlds(organ.still)
+    s = body.shape
     host = {}
-    for field in (*_IN, *_OUT, "rhs", "x"):
-      array = getattr(state, field)
-      if s.device.is_cuda:
+    for field, array in coupling.on_body(body).items():
+      if body.device.is_cuda:
         array = wp.zeros(array.shape, dtype=float, device="cpu", pinned=True)
       host[field] = array
     size = organ.windows.nslot if organ.windows else s.nnode
-    ext = wp.zeros(3 * size, dtype=wp.float64, device="cpu")
-    w = Workspace(organ, organ.config, s, state, host, ext, data)
-    w.status = host["status"].numpy()[0]
-    d, count = mjstruct.Data, len(mjstruct.Data.from_address(data).warning)
-    w.warning = mjstruct.view(data + d.warning.offset, 2 * count, np.int32).data
-    w.nefc = mjstruct.view(data + d.nefc.offset, 1, np.int32).data
-    if organ.windows is None:
-      inertia.set_armature(m, organ)
+    lagged = wp.zeros((size, 3), dtype=wp.float64, device="cpu")
+    w = Workspace(organ, organ.config, body, host, lagged, data, instance)
+    _view(w, mjstruct.Data.from_address(data), m)
+    prepare.fit(m, organ, body)
     # Padding nodes have a mass so that nothing divides by zero.
     mass = np.where(s.vert.numpy() >= 0, 0.0, 1.0).reshape(1, -1, 8)
     host["mass"].assign(mass)
-    bind(w, model, instance)
-    if w.place is not None:
-      window.settle(w, model)
-      place(w)
+    if organ.windows:
+      w.turn = Turn()
+    bind(w, model)
+    w.plugin_state = w.views["plugin_state"].numpy()
+    if w.turn is not None:
+      windowed.settle(w, model)
+      if w.turn.is_orphan():
+        wp.capture_launch(w.place)
+        w.turn.go_home()
     _feel(w, m)
     return w
 
 
+def _view(w: Workspace, d, m):
+  """Takes views of an mjData that every step looks at."""
+  fields, count = mjstruct.Data, len(d.warning)
+  w.status = w.host["status"].numpy()[0]
+  w.warning = mjstruct.view(w.data + fields.warning.offset, 2 * count, np.int32).data
+  w.nefc = mjstruct.view(w.data + fields.nefc.offset, 1, np.int32).data
+  if w.organ.windows:
+    first, last = int(w.organ.qposs.min()), int(w.organ.qposs.max()) + 1
+    w.qpos = mjstruct.view(d.qpos + 8 * first, 8 * (last - first), np.uint8).data
+
+
 def _feel(w: Workspace, m):
   """Notes whether the organ is stiff for the present time step."""
-  if w.organ.windows:
-    nodal = w.views["inertia"].numpy()
-  else:
-    nodal = inertia.of_dofs(m, w.organ)
-  w.stiff, w.heaviest[0] = inertia.stiffness(m, w.organ, w.config, nodal)
+  nodal = w.inertia(w.model)
+  w.stiff, w.heaviest[0] = inertia.stiffness(m, w.organ, w.body, w.config, nodal)
 
 
-def bind(w: Workspace, model: int, instance: int):
-  """Points the graphs at the arrays of `model` and of the workspace's mjData and records them."""
-  m = mjstruct.Model.from_address(model)
-  device, cpu = w.surface.device, wp.get_device("cpu")
-  side = window if w.organ.windows else coupling
-  with _lock:
-    load(device)
-    if w.surface.levels is not None:
-      wp.load_module(solver.multilevel().__name__, device=device)
-    if w.resident:
-      w.resident.fetch()
-    launches = side.launches(w, model, instance)
-    near = wp.get_device(launches.side)
-    crossing = device != near
-
-    def solve():
-      if crossing:
-        _cross(w, _IN, to_device=True)
-      schemes.step(w.surface, w.state, w.config.integrator)
-      if crossing:
-        _cross(w, _OUT, to_device=False)
-
-    def respond():
-      if crossing:
-        _cross(w, ("rhs",), to_device=True)
-      schemes.respond(w.surface, w.state, w.config.integrator)
-      if crossing:
-        _cross(w, ("x", "status"), to_device=False)
-
-    w.before = _record(cpu, launches.gather)
-    w.solve = _record_all((near, launches.enter), (device, solve), (near, launches.look))
-    w.after = _record(cpu, launches.scatter)
-    w.leave = _record(cpu, launches.leave)
-    w.respond = []
-    if w.config.integrator in schemes.RESPONDING:
-      w.respond = _record_all((near, launches.push), (device, respond), (near, launches.answer))
-    w.end = _record(cpu, launches.end) if launches.end else None
-    w.advance = _record(cpu, launches.advance)
-    w.place = _record(cpu, launches.place) if launches.place else None
-    if w.resident:
-      w.resident.foresee = _record(cpu, launches.foresee)
-      ahead = _record_all((near, launches.enter_ahead), (device, solve))
-      w.resident.begin_graph = ahead[0][1]
-      w.resident.rest = _record_all((near, launches.look_only))
-  w.model = model
-  w.model_step = coupling.option_views(model)["timestep"].numpy().data
-  w.time_step = float(m.opt.timestep)
-
-
-# What a solve on another device than MuJoCo's side reads and writes.
-_IN = ("step", "pos", "vel", "mass", "force_ext", "dvel_warm")
-_OUT = ("dvel", "status")
-
-
-def _cross(w: Workspace, fields: tuple[str, ...], to_device: bool):
-  for field in fields:
-    there, here = getattr(w.state, field), w.host[field]
-    if to_device:
-      wp.copy(there, here)
-    else:
-      wp.copy(here, there)
-
-
-def _record_all(*parts) -> list:
-  """Records (device, work) pairs, those in a row on one device as one graph."""
-  graphs = []
-  for device, group in itertools.groupby(parts, key=lambda part: part[0]):
-    work = [part[1] for part in group]
-    graphs.append((device, _record(device, lambda work=work: [each() for each in work])))
-  return graphs
-
-
-def _record(device, work) -> Any:
-  with wp.ScopedDevice(device), wp.ScopedCapture(device=device) as capture:
-    work()
-  return capture.graph
-
-
-def load(device):
-  """Loads the modules of a step on a device, compiling them where the cache has none."""
-  for module in (elastic, solver, schemes, coupling, window_nodes, window_slots):
-    wp.load_module(module.__name__, device=device)
-    wp.load_module(module.__name__, device="cpu")
-
-
-def configure(w: Workspace, instance: int, texts: dict[str, str]):
-  """Changes configuration keys while running and records the step anew.
+def configure(w: Workspace, model: int, texts: dict[str, str]):
+  """Changes configuration keys while running.
 
   Raises:
     ValueError: a key may not change, or its value is not allowed.
   """
-  w.config = configuration.change(w.organ.name, w.config, texts, w.organ.mesh.closed)
-  numbers = ("iterations", "tolerance", "newton", "damping", "foundation", "bulk", "pressure")
-  w.surface = dataclasses.replace(w.surface, **{k: getattr(w.config, k) for k in numbers})
-  # Terms that were off have no arrays yet.
-  fresh = types.make_state(w.surface)
-  if fresh.areavec.shape != w.state.areavec.shape:
-    w.state.areavec = fresh.areavec
-  bind(w, w.model, instance)
-  _feel(w, mjstruct.Model.from_address(w.model))
-  if w.place is not None:
-    window.wake(w)
+  _change(w, model, configuration.change(w.organ.name, w.config, texts, w.organ.mesh.closed))
+  w.chosen = True
+
+
+def copy(w: Workspace, model: int, other: Workspace):
+  """Gives a copy of an mjData the configuration of the original, unless it was given one itself."""
+  if not w.chosen and w.config != other.config and w.organ.digest == other.organ.digest:
+    _change(w, model, other.config)
+
+
+def _change(w: Workspace, model: int, config: Config):
+  before, w.config = w.config, config
+  if w.resident:
+    w.resident.stop()
+  material = any(getattr(before, key) != getattr(config, key) for key in configuration.MATERIAL)
+  with graphs.lock:
+    if material:
+      shape.change(w.body, w.organ.mesh, config, ~w.organ.free)
+    else:
+      shape.renumber(w.body, config)
+    recorded = ("integrator", "newton")
+    if any(getattr(before, key) != getattr(config, key) for key in recorded):
+      bind(w, model)
+    if material:
+      refresh(w)
+    else:
+      _feel(w, mjstruct.Model.from_address(model))
+  if w.turn is not None:
+    windowed.wake(w)
 
 
 def sync(w: Workspace):
@@ -373,12 +389,12 @@ def sync(w: Workspace):
 
 
 def refresh(w: Workspace):
-  """Renews the armature after the time step was changed; see `inertia`."""
+  """Renews the effective inertia after the time step or the material changed; see `inertia`."""
   m = mjstruct.Model.from_address(w.model)
-  with _lock:
+  with graphs.lock:
     if w.organ.windows is None:
-      inertia.set_armature(m, w.organ)
+      prepare.give_armature(m, w.organ, w.body, w.config)
     else:
-      window.set_inertia(w, m)
+      windowed.set_inertia(w, m)
     _feel(w, m)
     w.time_step = float(m.opt.timestep)

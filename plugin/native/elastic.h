@@ -1,24 +1,402 @@
 // Internal forces of the surface and the matrix of the implicit step.
+//
+// All kernels run over slices and gather: a node reads its fan of triangles, so that runs repeat to
+// the bit. Impulses and the matrix follow from
+//
+//     A dv = h (F(x) + f_ext) - (h^2 + h damping) K v,    A = M + (h^2 + h damping) K
+//
+// (thesis eq. 5.19 with Rayleigh damping). K is the Hessian of the elastic energy with the
+// compressive part of its geometric term left out, which keeps A positive definite.
 #pragma once
 #include "simd.h"
 
 namespace palpate {
 
-// Unit normal of each triangle; below a tenth of its rest area it fades, and the hinge forces with it.
+// Weight of K v on the right-hand side of a stage; `step` is h, h^2 + h damping, ., share ahead.
+PALPATE float weight_of_rate(int stage, const float* step) {
+  if (stage == NEUMANN) return 0.0f;
+  return step[1] - (stage == FIRST ? step[3] : 1.0f) * step[0] * step[0];
+}
+
+// Triangles.
+
+// A triangle's edges from corner 0, present and at rest. Rest vector plus difference of
+// displacements: float32 keeps the digits of small strains.
+struct Triangle {
+  V3 a, b, rest_a, rest_b;
+
+  // One over twice the area, which counts as a tenth of that at rest where it is less.
+  PALPATE V scale() const {
+    const V3 n = cross(a, b), rn = cross(rest_a, rest_b);
+    return 1.0f / vsqrt(vmax(dot(n, n), 0.01f * dot(rn, rn) + 1e-30f));
+  }
+};
+
+PALPATE Triangle triangle(const float* disp, const int* node, const float* rest, Lane lane) {
+  const V3 ra = ld3(rest, 0, lane), rb = ld3(rest, 3, lane), u = gather3(disp, node, lane);
+  return {ra + gather3(disp, node + 8, lane) - u, rb + gather3(disp, node + 16, lane) - u, ra, rb};
+}
+
+// Unit normal of each triangle; below a tenth of its rest area it fades, and the hinge forces too.
 template <class Fields>
 PALPATE void elem_normal(const Fields& f, Thread t, int) {
   const float* disp = f.system.disp_trial.data + 24 * (size_t)t.world * f.shape.nslice;
   each_slice(t, f.shape.nelemslice, [&](int s, Lane lane) {
     const int* node = f.shape.elem_node.data + 24 * s;
-    const float* rest = f.shape.elem_rest.data + 48 * s;
-    const V3 ra = ld3(rest, 0, lane), rb = ld3(rest, 3, lane), rn = cross(ra, rb);
-    const V3 u = gather3(disp, node, lane);
-    const V3 a = ra + gather3(disp, node + 8, lane) - u;
-    const V3 b = rb + gather3(disp, node + 16, lane) - u;
-    const V3 n = cross(a, b);
-    const V3 unit = (1.0f / vsqrt(vmax(dot(n, n), 0.01f * dot(rn, rn) + 1e-30f))) * n;
+    const Triangle e = triangle(disp, node, f.shape.elem_rest.data + 48 * s, lane);
     float* out = f.system.elem_normal.data + 32 * ((size_t)t.world * f.shape.nelemslice + s);
-    st3(out, unit, lane);
+    st3(out, e.scale() * cross(e.a, e.b), lane);
+  });
+}
+
+// Hinges.
+
+// Angle psi = 2 sin(theta / 2) between the normals l and r about an edge e, and cos(theta / 2): no
+// inverse trigonometry, and bounded when folded. Past a right angle the half angle comes from its
+// sine, which is better conditioned there.
+struct Angle { V psi, half; };
+
+PALPATE Angle angle(V3 l, V3 r, V3 e, V length2) {
+  const V cosine = dot(l, r), sine = dot(cross(l, r), e) / vsqrt(length2);
+  const V chalf = vsqrt(vmax(0.5f + 0.5f * cosine, splat(1e-12f)));
+  const V shalf = vsqrt(vmax(0.5f - 0.5f * cosine, splat(1e-12f)));
+  const V zero = splat(0.0f), size = select(sine < zero, -sine, sine);
+  return {select(cosine > zero, sine / chalf, 2.0f * select(sine < zero, -shalf, shalf)),
+          select(cosine > zero, chalf, 0.5f * size / shalf)};
+}
+
+// Strain impulse of each hinge: h (psi - psi0) and what K v has of it, by the gradient of theta
+// with the apexes' heights and feet (Bergou et al. 2006, Grinspun et al. 2003).
+template <class Fields>
+PALPATE void hinge_angle(const Fields& f, Thread t, int stage) {
+  const float* step = f.state.step.data + 4 * t.world;
+  const float h = step[0], gv = weight_of_rate(stage, step);
+  const size_t base = 24 * (size_t)t.world * f.shape.nslice;
+  const float* disp = f.system.disp_trial.data + base;
+  const float* vel = f.system.vel_trial.data + base;
+  const float* normal = f.system.elem_normal.data + 32 * (size_t)t.world * f.shape.nelemslice;
+  each_slice(t, f.shape.nhingeslice, [&](int s, Lane lane) {
+    const int* node = f.shape.hinge_node.data + 32 * s;
+    const int* elem = f.shape.hinge_elem.data + 16 * s;
+    const float* rest = f.shape.hinge_rest.data + 72 * s;
+    const V3 re = ld3(rest, 0, lane), ra = ld3(rest, 3, lane), rb = ld3(rest, 6, lane);
+    const V3 u = gather3(disp, node, lane);
+    const V3 e = re + gather3(disp, node + 8, lane) - u;
+    V3 a = ra + gather3(disp, node + 16, lane) - u;
+    V3 b = rb + gather3(disp, node + 24, lane) - u;
+    const V3 l = gather3(normal, elem, lane), r = gather3(normal, elem + 8, lane);
+    const V length2 = vmax(dot(e, e), splat(1e-30f));
+    const Angle now = angle(l, r, e, length2);
+    // From the apexes' feet on the edge to the apexes, and how these move against their feet.
+    const V foot_l = dot(a, e) / length2, foot_r = dot(b, e) / length2;
+    a -= foot_l * e;
+    b -= foot_r * e;
+    const V3 v = gather3(vel, node, lane), w = gather3(vel, node + 8, lane);
+    V3 c = gather3(vel, node + 16, lane), d = gather3(vel, node + 24, lane);
+    c -= v + foot_l * (w - v);
+    d -= v + foot_r * (w - v);
+    // Heights of the apexes, not below a tenth of those at rest.
+    const V3 na = cross(ra, re), nb = cross(rb, re);
+    const V rest2 = 0.01f / vmax(dot(re, re), splat(1e-30f));
+    const V rate = -dot(l, c) / vsqrt(vmax(dot(a, a), dot(na, na) * rest2 + 1e-30f))
+      - dot(r, d) / vsqrt(vmax(dot(b, b), dot(nb, nb) * rest2 + 1e-30f));
+    const size_t out = (size_t)t.world * f.shape.nhingeslice + s;
+    const V change = now.psi - ld(f.shape.hinge_angle0.data, s, lane);
+    st(f.system.hinge_angle.data + 8 * out, 0, h * change + gv * now.half * rate, lane);
+    st(f.system.hinge_half.data + 8 * out, 0, now.half, lane);
+    // What the bending matrix may leave out here, see elem_corner.
+    const V fold = 4.0f - 4.0f * now.half * now.half + 2.0f * change * change;
+    st(f.system.hinge_rough.data + 8 * out, 0, ld(f.tissue.hinge_gain.data, 5 * s, lane) * fold,
+       lane);
+  });
+}
+
+// Moment impulse of each hinge: a plate's hinges of one triangle act on each other.
+template <class Fields>
+PALPATE void hinge_moment(const Fields& f, Thread t, int) {
+  const size_t base = (size_t)t.world * f.shape.nhingeslice;
+  const float* angle = f.system.hinge_angle.data + 8 * base;
+  each_slice(t, f.shape.nhingeslice, [&](int s, Lane lane) {
+    const int* near = f.shape.hinge_near.data + 32 * s;
+    const float* gain = f.tissue.hinge_gain.data + 40 * s;
+    V sum = ld(gain, 0, lane) * ld(angle, s, lane);
+    for (int k = 0; k < 4; ++k) sum += ld(gain, k + 1, lane) * gather(angle, near + 8 * k, 0, lane);
+    const V half = ld(f.system.hinge_half.data + 8 * base, s, lane);
+    st(f.system.hinge_moment.data + 8 * base, s, sum * half, lane);
+  });
+}
+
+// A triangle's part of minus moment times grad theta lies along its normal: one number a corner.
+//
+// The bending matrix n Q n^T takes normals of nodes for those of triangles, and rest heights. The
+// step is stable while the matrix is at least half the true Hessian; on thick shells, folded,
+// crushed or curved like their thickness, it fell short by factors of 10 to 100. What it leaves out
+// grows with a hinge's angle squared, and with moment times change of angle in the Hessian's second
+// derivatives; over the heights squared that is a stiffness, which the triangle's edges get. It
+// acts on dv alone, so no rest state depends on it, and a product with the matrix costs the same.
+template <class Fields>
+PALPATE void elem_corner(const Fields& f, Thread t, int) {
+  const float* disp = f.system.disp_trial.data + 24 * (size_t)t.world * f.shape.nslice;
+  const float* moment = f.system.hinge_moment.data + 8 * (size_t)t.world * f.shape.nhingeslice;
+  const float* rough = f.system.hinge_rough.data + 8 * (size_t)t.world * f.shape.nhingeslice;
+  each_slice(t, f.shape.nelemslice, [&](int s, Lane lane) {
+    const int* node = f.shape.elem_node.data + 24 * s;
+    const int* hinge = f.shape.elem_hinge.data + 24 * s;
+    const Triangle e = triangle(disp, node, f.shape.elem_rest.data + 48 * s, lane);
+    const V3 a = e.a, b = e.b, c = b - a;
+    const V scale = e.scale();
+    const V aa = dot(a, a), bb = dot(b, b), cc = dot(c, c), ab = dot(a, b);
+    const V ac = dot(a, c), bc = dot(b, c);
+    // Moment over height, and shares of the edge's two ends: 1 / height = |edge| / (2 area).
+    const V m0 = gather(moment, hinge, 0, lane) * scale;
+    const V m1 = gather(moment, hinge + 8, 0, lane) * scale;
+    const V m2 = gather(moment, hinge + 16, 0, lane) * scale;
+    const V l0 = vsqrt(cc), l1 = vsqrt(bb), l2 = vsqrt(aa);
+    const V i0 = m0 / vmax(l0, splat(1e-15f)), i1 = m1 / vmax(l1, splat(1e-15f));
+    const V i2 = m2 / vmax(l2, splat(1e-15f));
+    const size_t at = (size_t)t.world * f.shape.nelemslice + s;
+    // Edge 1 -> 2 seen from 0, edge 2 -> 0 from 1, edge 0 -> 1 from 2.
+    st3(f.system.elem_corner.data + 24 * at,
+        {m0 * l0 - i1 * (bb - ab) - i2 * (aa - ab), m1 * l1 - i0 * bc - i2 * ab,
+         m2 * l2 + i0 * ac - i1 * ab}, lane);
+    const V cover = scale * scale
+      * (gather(rough, hinge, 0, lane) * cc + gather(rough, hinge + 8, 0, lane) * bb
+         + gather(rough, hinge + 16, 0, lane) * aa);
+    st(f.system.elem_normal.data + 32 * at, 3, cover, lane);
+  });
+}
+
+// Membrane: St. Venant-Kirchhoff plane stress in the covariant basis (e1, e2) of a triangle,
+// E_ab = (e_a . e_b - E_a . E_b) / 2, S = C : E,
+// C^abcd = lambda' G^ab G^cd + mu (G^ac G^bd + G^ad G^bc), all times the volume.
+
+struct Metric { V g11, g12, g22; };
+struct Moduli { V c11, c22, c12, c13, c23, c33; };  // between the components 11, 22, 12
+struct Stress { V s11, s12, s22; };
+
+PALPATE Moduli moduli(Metric g, V mu, V lam) {
+  const V g11 = g.g11, g12 = g.g12, g22 = g.g22, m2 = lam + 2.0f * mu;
+  return {m2 * g11 * g11, m2 * g22 * g22, lam * g11 * g22 + 2.0f * mu * g12 * g12,
+          m2 * g11 * g12, m2 * g22 * g12, lam * g12 * g12 + mu * (g11 * g22 + g12 * g12)};
+}
+
+// Stress of a triangle with rest vectors r, t to its corners and displacements p, q of them.
+PALPATE Stress stress(Moduli c, V3 r, V3 p, V3 t, V3 q) {
+  const V e11 = dot(r, p) + 0.5f * dot(p, p);
+  const V e22 = dot(t, q) + 0.5f * dot(q, q);
+  const V e12 = dot(r, q) + dot(p, t) + dot(p, q);  // twice the component
+  const V s11 = c.c11 * e11 + c.c12 * e22 + c.c13 * e12;
+  const V s22 = c.c12 * e11 + c.c22 * e22 + c.c23 * e12;
+  return {s11, c.c13 * e11 + c.c23 * e22 + c.c33 * e12, s22};
+}
+
+// Tensile part of the stress: the negative principal stress is dropped.
+PALPATE Stress tensile(Stress s, Metric g) {
+  const V zero = splat(0.0f);
+  const V det = 1.0f / vmax(g.g11 * g.g22 - g.g12 * g.g12, splat(1e-30f));
+  const V trace = 0.5f * det * (s.s11 * g.g22 - 2.0f * s.s12 * g.g12 + s.s22 * g.g11);
+  const V root = vsqrt(vmax(trace * trace - det * (s.s11 * s.s22 - s.s12 * s.s12), zero));
+  const V high = trace + root, low = trace - root;
+  const V part = select(low >= zero, splat(1.0f),
+                        select(high <= zero, zero, high / vmax(high - low, splat(1e-30f))));
+  const V shift = vmin(low, zero);
+  return {part * (s.s11 - shift * g.g11), part * (s.s12 - shift * g.g12),
+          part * (s.s22 - shift * g.g22)};
+}
+
+// Stiffness between a node and the two other corners of a triangle, at a and b from it, signs
+// turned: K_0b = -(K_1b + K_2b) with K_ab = C^acbd e_c e_d^T + S^ab I.
+PALPATE M3 towards_a(Moduli c, Stress s, V3 a, V3 b) {
+  const V i1 = c.c11 + c.c13, i2 = c.c13 + c.c33, i3 = c.c13 + c.c12, i4 = c.c33 + c.c23;
+  return outer(a, i1 * a + i2 * b) + outer(b, i3 * a + i4 * b) + (s.s11 + s.s12);
+}
+PALPATE M3 towards_b(Moduli c, Stress s, V3 a, V3 b) {
+  const V i2 = c.c13 + c.c33, i4 = c.c33 + c.c23, j3 = c.c12 + c.c23, j4 = c.c23 + c.c22;
+  return outer(a, i2 * a + j3 * b) + outer(b, i4 * a + j4 * b) + (s.s12 + s.s22);
+}
+
+// Spring along an edge with rest vector t and difference of displacements q: its pull
+// k (|l| - r) / |l| along t + q (thesis eq. 5.1), and its stiffness without compression.
+struct Spring { V pull; S3 stiffness; };
+
+PALPATE Spring spring(V k, V3 t, V3 q) {
+  const V3 b = t + q;
+  const V l2 = vmax(dot(b, b), splat(1e-30f)), il = 1.0f / vsqrt(l2);
+  const V r0 = vsqrt(dot(t, t));
+  const V stretch = (2.0f * dot(t, q) + dot(q, q)) / (vsqrt(l2) + r0);
+  const V side = k * vmax(stretch * il, splat(0.0f)), along = (k - side) * il * il;
+  return {k * stretch * il, square(along, b) + side};
+}
+
+// Rows of the matrix.
+
+// The fan of a slice's nodes, see `Shape`; entries [k] and [k + 1] are the k-th triangle.
+struct Fan {
+  int width;
+  V degree;
+  const int* node;
+  const float* rest;
+  const float* metric;
+  const int* corner;
+  const int* side;
+  float* block;
+};
+
+template <class Fields>
+PALPATE Fan fan_of(const Fields& f, int world, int s, Lane lane) {
+  const int row = f.shape.slot_adr.data[s];
+  return {
+    f.shape.slot_adr.data[s + 1] - row,
+    ld(f.shape.degree.data, s, lane),
+    f.shape.fan_node.data + 8 * (row + 2 * s),
+    f.shape.fan_rest.data + 24 * (row + 2 * s),
+    f.tissue.fan_metric.data + 40 * (row + s),
+    f.shape.fan_corner.data + 8 * (row + s),
+    f.shape.fan_side.data + 8 * (row + s),
+    f.system.block.data + 72 * ((size_t)world * f.shape.nslot + row),
+  };
+}
+
+// What a fan adds up to at its node.
+struct Sum {
+  V3 force;  // elastic force [N]
+  V3 rate;   // minus K v [N/s]
+  S3 stiffness;  // [N/m]
+  Carried area;  // area vector [m^2]
+  V squeeze;  // (rest area / area)^2 of the most compressed triangle
+};
+
+// Motion of all nodes and of a slice's own.
+struct Motion { const float* disp; const float* vel; V3 u, v; };
+
+// What is asked of a fan: g = h^2 + h damping; `normal` has the stiffness that covers bending.
+struct Wanted { float g, spring; bool matrix, areas, bending; const float* normal; };
+
+// Adds the triangle of entries a and b, at rest ra and rb, to the area vector.
+PALPATE void area(Sum& sum, Metric g, V3 a, V3 b) {
+  const V has = select(g.g11 > splat(0.0f), splat(1.0f), splat(0.0f));
+  const V3 c = cross(a, b);
+  sum.area = sum.area + has * c;
+  const V d2 = (g.g11 * g.g22 - g.g12 * g.g12) * dot(c, c);
+  sum.squeeze = vmax(sum.squeeze, has / vmax(d2, splat(0.01f)));
+}
+
+// Goes once around the fan and writes the blocks of its edges.
+PALPATE Sum around(const Fan& fan, const Motion& m, const Wanted& want, Lane lane) {
+  const V zero = splat(0.0f);
+  const V3 none = {zero, zero, zero};
+  const M3 empty = {zero, zero, zero, zero, zero, zero, zero, zero, zero};
+  Sum sum = {none, none, {zero, zero, zero, zero, zero, zero}, none, splat(1.0f)};
+  M3 block = empty;  // towards entry k
+  V cover = zero;
+  Carried p = gather3(m.disp, fan.node, lane) - m.u, r = ld3(fan.rest, 0, lane);
+  for (int k = 0; k <= fan.width; ++k) {
+    const V3 q = gather3(m.disp, fan.node + 8 * (k + 1), lane) - m.u;
+    const V3 t = ld3(fan.rest, 3 * k + 3, lane);
+    const V3 a = r + p, b = t + q;
+    const float* metric = fan.metric + 40 * k;
+    const Metric g = {ld(metric, 0, lane), ld(metric, 1, lane), ld(metric, 2, lane)};
+    const auto present = fan.degree > splat((float)k);
+    M3 next;
+    V over = zero;
+    if (want.bending && want.matrix)
+      over = select(g.g11 > zero, gather(want.normal, fan.corner + 8 * k, 3, lane), zero);
+    if (want.spring == 0.0f) {
+      const Moduli c = moduli(g, ld(metric, 3, lane), ld(metric, 4, lane));
+      const Stress s = stress(c, r, p, t, q);
+      if (k > 0) sum.force += (s.s11 + s.s12) * a + (s.s12 + s.s22) * b;
+      const Stress pulled = tensile(s, g);
+      block = block + towards_a(c, pulled, a, b);
+      next = select(present, splat(1.0f), zero) * towards_b(c, pulled, a, b);
+    } else {
+      const Spring edge = spring(select(present, splat(want.spring), zero), t, q);
+      sum.force += edge.pull * b;
+      next = full(edge.stiffness);
+    }
+    if (k > 0) {
+      sum.rate += block * (gather3(m.vel, fan.node + 8 * k, lane) - m.v);
+      if (want.matrix) {
+        cover += over;  // after the product with the velocity above, which is exact
+        block = block + cover;
+        st9(fan.block + 72 * (k - 1), splat(-want.g) * block, lane);
+        sum.stiffness = sum.stiffness + symmetric(block);
+      }
+      if (want.areas) area(sum, g, a, b);
+    }
+    block = next;
+    cover = select(present, over, zero);
+    p = q;
+    r = t;
+  }
+  return sum;
+}
+
+// Inverse of a symmetric matrix, times `scale`.
+PALPATE S3 inverse(S3 d, V scale) {
+  const V xx = d.yy * d.zz - d.yz * d.yz, xy = d.xz * d.yz - d.xy * d.zz;
+  const V xz = d.xy * d.yz - d.xz * d.yy;
+  const V s = scale / vmax(d.xx * xx + d.xy * xy + d.xz * xz, splat(1e-37f));
+  return {xx * s, xy * s, xz * s, (d.xx * d.zz - d.xz * d.xz) * s,
+          (d.xy * d.xz - d.xx * d.yz) * s, (d.xx * d.yy - d.xy * d.xy) * s};
+}
+
+// Impulse of the hinges around a node: the corner forces of its triangles along their normals.
+PALPATE V3 bending(const Fan& fan, const float* normal, const float* corner, V3 b, Lane lane) {
+  for (int k = 1; k <= fan.width; ++k) {
+    // Absent triangles point at the first one: mask them.
+    const V has = select(ld(fan.metric, 5 * k, lane) > splat(0.0f), splat(1.0f), splat(0.0f));
+    const V c = has * gather(corner, fan.side + 8 * k, 0, lane);
+    b += c * gather3(normal, fan.corner + 8 * k, lane);
+  }
+  return b;
+}
+
+// Right-hand side of each node and, for an implicit stage, its row of the matrix: one pass around
+// the fan of each node.
+template <class Fields>
+PALPATE void row(const Fields& f, Thread t, int stage) {
+  const float* step = f.state.step.data + 4 * t.world;
+  const float* number = f.tissue.number.data;
+  const float h = step[0], g = step[1], gv = weight_of_rate(stage, step);
+  const float foundation = number[FOUNDATION];
+  const size_t base = (size_t)t.world * f.shape.nslice;
+  const size_t elem = (size_t)t.world * f.shape.nelemslice;
+  const float* disp = f.system.disp_trial.data + 24 * base;
+  const float* vel = f.system.vel_trial.data + 24 * base;
+  const float* normal = f.system.elem_normal.data + 32 * elem;
+  const float* corner = f.system.elem_corner.data + 24 * elem;
+  const bool bends = f.shape.nhingeslice > 0;
+  const bool areas = bends || number[BULK] != 0.0f || number[PRESSURE] != 0.0f;
+  const Wanted want = {g, number[STIFFNESS], stage == FIRST || stage == LATER, areas, bends, normal};
+  each_slice(t, f.shape.nslice, [&](int s, Lane lane) {
+    const size_t at = base + s;
+    const Fan fan = fan_of(f, t.world, s, lane);
+    const Motion m = {disp, vel, ld3(disp + 24 * s, lane), ld3(vel + 24 * s, lane)};
+    Sum sum = around(fan, m, want, lane);
+    const V mass = ld(f.state.mass.data + 8 * at, 0, lane);
+    const V kf = splat(foundation) * ld(f.shape.area.data, s, lane), diag = mass + g * kf;
+    V3 b = h * (sum.force + ld3(f.state.force_ext.data + 24 * at, lane) - kf * m.u)
+      + gv * (sum.rate - kf * m.v);
+    if (stage == LATER) b -= mass * ld3(f.state.dvel.data + 24 * at, lane);
+    S3 self = splat(g) * sum.stiffness + diag;
+    if (areas) st3(f.system.areavec.data + 24 * at, sum.area, lane);
+    if (bends) {
+      b = bending(fan, normal, corner, b, lane);
+      // Hinges of squeezed triangles are stiffer than at rest; the normal's length makes up for it.
+      const V scale = vsqrt(sum.squeeze / vmax(dot(sum.area, sum.area), splat(1e-30f)));
+      const V3 n = scale * sum.area;
+      st3(f.system.normal.data + 24 * at, n, lane);
+      self = self + square(g * ld(f.tissue.bend_diag.data, s, lane), n);
+    }
+    st3(f.system.rhs.data + 24 * at, b, lane);
+    if (want.matrix) {
+      st(f.system.diag.data + 8 * at, 0, diag, lane);
+      // Zero where a node cannot move, which keeps it out of the solve.
+      const S3 inv = inverse(self, ld(f.shape.free.data, s, lane));
+      float* out = f.system.inverse.data + 48 * at;
+      st3(out, 0, {inv.xx, inv.xy, inv.xz}, lane);
+      st3(out, 3, {inv.yy, inv.yz, inv.zz}, lane);
+    }
   });
 }
 

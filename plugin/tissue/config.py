@@ -7,8 +7,10 @@ import math
 
 import numpy as np
 
+from .step import SCHEMES
+
 ELEMENTS = ("membrane", "spring")
-INTEGRATORS = ("implicit", "midpoint", "neumann", "explicit")
+INTEGRATORS = tuple(SCHEMES)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,6 +90,8 @@ RUNNING = (
   "bulk",
   "pressure",
 )
+# Those among them that make up the material.
+MATERIAL = ("young", "poisson", "thickness", "stiffness")
 KEYS = tuple(field.name for field in dataclasses.fields(Config))
 
 

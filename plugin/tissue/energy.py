@@ -10,6 +10,7 @@ import numpy as np
 
 from . import config as configuration
 from . import mesh as topology
+from . import plate
 from .config import Config
 from .mesh import Mesh
 
@@ -58,7 +59,7 @@ def _edges(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
   return mesh.elem.ravel()[once], mesh.elem[:, [1, 2, 0]].ravel()[once]
 
 
-def hinge_angles(mesh: Mesh, hinge: topology.Hinges, u: np.ndarray) -> np.ndarray:
+def hinge_angles(mesh: Mesh, hinge: plate.Hinges, u: np.ndarray) -> np.ndarray:
   """Returns 2 sin(theta / 2) of each hinge, (nhinge,)."""
   x = mesh.rest + u
   normal = topology.area_vectors(x, mesh.elem)
@@ -74,7 +75,7 @@ def bending(mesh: Mesh, config: Config, u: np.ndarray) -> float:
   """Returns the plate energy of the hinges 1/2 d^T G d [J], d the angles less those at rest."""
   if config.bend == 0:
     return 0.0
-  hinge = topology.hinges(mesh, configuration.rigidity(config, mesh.nelem), config.poisson)
+  hinge = plate.hinges(mesh, configuration.rigidity(config, mesh.nelem), config.poisson)
   change = hinge_angles(mesh, hinge, u) - hinge_angles(mesh, hinge, np.zeros_like(u))
   each = np.where(hinge.of_elem >= 0, change[hinge.of_elem], 0.0)
   return float(0.5 * np.einsum("ti,tij,tj->", each, hinge.gain, each))

@@ -1,288 +1,275 @@
-"""What the kernels read and write: constant `Surface`, changing `State`, both of Warp arrays."""
+"""What the kernels read and write: one struct a group, one line a field.
 
-from __future__ import annotations
+A line says meaning, unit, type and shape, and the shape is what `allocate` makes. Sizes are named:
+nworld worlds; nslice slices of nodes, nelemslice of triangles, nhingeslice of hinges (0 without
+bending); nslot rows of stiffness blocks; others see `body`. Nodes lie in slices of eight, the last
+axis; `native/simd.h` says how they are read.
+"""
 
+# Annotations here are objects, not text: no `from __future__ import annotations`.
 import dataclasses
+import enum
+from typing import Any
 
+import numpy as np
 import warp as wp
 
-from .simd import WORDS
+from .device import BLOCK, MAX_BLOCKS, WORDS
+from .order import LANES
 
 
-@dataclasses.dataclass
-class Levels:
-  """Coarser meshes of an organ for the multilevel preconditioner; see `multilevel`.
+@dataclasses.dataclass(frozen=True)
+class Array:
+  """Type and shape of a field."""
 
-  The nodes of all of them follow one another in `surface`, each level in whole slices. Offsets are
-  those of a node's x component in floats, on the finest mesh or among all coarse nodes.
+  dtype: type
+  dims: tuple
 
-  Attributes:
-    nlevel: number of coarse meshes
-    nodes: moving nodes of the finest mesh
-    threshold: condition number from which the preconditioner is used [-]
-    surface: the coarse meshes
-    slice_adr: first slice of each level              (nlevel + 1,)
-    source: offset of each coarse node on the finest  (coarse slices, 8)
-    share: nodes of the finest that one stands for    (coarse slices, 8)
-    rate: of each level, the finest first: stiffness of a node times g / mass where g / mass is one
-      [N/m], upper and lower end of the smoother's interval, its degree, the finest mesh's nodes for
-      one of its own                                  (nlevel + 1, 5)
-    down_adr: first row of each slice in `down_node`  (coarse slices + 1,)
-    down_node: offset on the next finer mesh          (rows, 8)
-    down_weight: what it gives to the coarse node [-] (rows, 8)
-    up_adr: first row of each slice in `up_node`, the finest mesh's slices first
-                                                      (nslice + coarse slices + 1,)
-    up_node: offset on the next coarser mesh          (rows, 8)
-    up_weight: share of the coarse node [-]           (rows, 8)
+
+def floats(*dims) -> Array:
+  """Returns the type of an array of float32."""
+  return Array(wp.float32, dims)
+
+
+def doubles(*dims) -> Array:
+  """Returns the type of an array of float64."""
+  return Array(wp.float64, dims)
+
+
+def ints(*dims) -> Array:
+  """Returns the type of an array of int32."""
+  return Array(wp.int32, dims)
+
+
+DIMS: dict[str, dict[str, tuple]] = {}  # struct and field -> its shape
+
+
+def struct(cls) -> Any:
+  """Returns a Warp struct whose arrays have the shapes of the annotations."""
+  kinds = cls.__annotations__
+  arrays = {name: kind for name, kind in kinds.items() if isinstance(kind, Array)}
+  DIMS[cls.__name__] = {name: kind.dims for name, kind in arrays.items()}
+  cls.__annotations__ = kinds | {
+    name: wp.array(dtype=kind.dtype, ndim=len(kind.dims)) for name, kind in arrays.items()
+  }
+  return wp.struct(cls)
+
+
+class Stage(enum.IntEnum):
+  """What a right-hand side is for, which decides the weight of K v in it.
+
+  FIRST and LATER are Newton iterations. The first stands at x + share h v, share in `State.step`,
+  and has the rest of the step ahead in it: h^2 (1 - share) + h damping; later ones are residuals at
+  the trial state, h damping. EXPLICIT has h damping, and NEUMANN brings its own. RESPONSE is the
+  answer to impulses alone, with the matrix of the last solve.
   """
 
-  nlevel: int
-  nodes: int
-  threshold: float
-  surface: Surface
-  slice_adr: wp.array
-  source: wp.array
-  share: wp.array
-  rate: wp.array
-  down_adr: wp.array
-  down_node: wp.array
-  down_weight: wp.array
-  up_adr: wp.array
-  up_node: wp.array
-  up_weight: wp.array
+  FIRST = 0
+  LATER = 1
+  EXPLICIT = 2
+  NEUMANN = 3
+  RESPONSE = 4
 
 
-@dataclasses.dataclass
-class Surface:
-  """Constants of one organ on one device; see `simd` for the layout of slices.
+# Numbers that may change while running, in the order of `Tissue.number`: configuration keys.
+NUMBERS = (
+  "foundation", "bulk", "pressure", "damping", "tolerance", "iterations", "stiffness"
+)  # fmt: skip
+
+# What native code knows of these, as constexpr.
+CONSTANTS: dict[str, int | float] = {
+  "LANES": LANES,
+  "BLOCK": BLOCK,
+  "MAX_BLOCKS": MAX_BLOCKS,
+  "WORDS": WORDS,
+  **{stage.name: stage.value for stage in Stage},
+  **{name.upper(): k for k, name in enumerate(NUMBERS)},
+}
+
+vector = floats("nworld", "nslice", 3, 8)
+scalar = floats("nworld", "nslice", 8)
+
+
+@struct
+class Shape:
+  """Topology and rest shape.
 
   A fan is the ring of neighbours of a node, `width` entries, the last one repeated in front and the
-  first one behind: entries [k] and [k + 1] are the k-th triangle of the node.
-
-  Attributes:
-    nvert: number of vertices
-    nnode: number of nodes, vertices padded to whole slices
-    nslice: slices of nodes
-    nelemslice: slices of triangles
-    nhingeslice: slices of hinges; 0 without bending
-    nslot: rows of stiffness blocks
-    vert: vertex of each node, -1 for padding            (nnode,)
-    node: node of each vertex                            (nvert,)
-    slot_adr: first row of stiffness blocks              (nslice + 1,)
-    fan_node: offset of each fan entry's node            (nslot + 2 nslice, 8)
-    fan_rest: rest vector to each fan entry [m]          (nslot + 2 nslice, 3, 8)
-    fan_metric: contravariant rest metric [1/m^2] and mu, lambda' times volume [N m]
-                                                         (nslot + nslice, 5, 8)
-    fan_spring: constant of the spring that stands for an edge, for `neumann` [N/m]
-                                                         (nslot, 8)
-    fan_corner: offset of each fan triangle's normal     (nslot + nslice, 8)
-    fan_side: offset of its corner force at this node    (nslot + nslice, 8)
-    degree: number of neighbours                         (nslice, 8)
-    rest: rest position about the centroid [m]           (nslice, 3, 8)
-    spring: edge spring constant [N/m]; 0 for membrane
-    area: nodal area [m^2]; 0 for padding                (nslice, 8)
-    free: 1 for nodes that move, 0 pinned or padding     (nslice, 8)
-    elem_node: offset of each corner's node              (nelemslice, 3, 8)
-    elem_rest: rest vectors corner 0 -> 1, 0 -> 2 [m]    (nelemslice, 6, 8)
-    elem_hinge: hinge opposite each corner               (nelemslice, 3, 8)
-    hinge_node: offset of p0, p1, left, right apex       (nhingeslice, 4, 8)
-    hinge_rest: rest vectors p0 -> p1, left, right [m]   (nhingeslice, 9, 8)
-    hinge_elem: offset of left and right triangle        (nhingeslice, 2, 8)
-    hinge_near: the four other hinges of both triangles  (nhingeslice, 4, 8)
-    hinge_gain: stiffness to itself and to those [N m]   (nhingeslice, 5, 8)
-    hinge_angle0: rest angle 2 sin(theta / 2) [-]        (nhingeslice, 8)
-    bend_adr: first row of the bending matrix            (nslice + 1,)
-    bend_node: node of each entry                        (rows, 8)
-    bend_gain: bending matrix [N/m]                      (rows, 8)
-    bend_diag: its diagonal [N/m]                        (nslice, 8)
-    foundation: Winkler foundation [Pa/m]
-    bulk: volume stiffness [Pa]
-    pressure: inside minus outside pressure [Pa]
-    volume0: rest volume [m^3]
-    damping: Rayleigh coefficient [s]
-    iterations: most PCG iterations
-    tolerance: relative residual to stop at [-]
-    newton: Newton iterations a step
-    device: Warp device
-    levels: coarser meshes for the multilevel preconditioner, or None
+  first one behind: entries [k] and [k + 1] are the k-th triangle of the node. Irregular lists are
+  sliced ELLPACK (Kreutzer et al. 2014, doi:10.1137/130930352): row k of a slice holds the k-th
+  entry of its eight nodes. An offset is where a node's x starts in a vector of slices, in floats.
   """
 
-  nvert: int
-  nnode: int
-  nslice: int
-  nelemslice: int
-  nhingeslice: int
-  nslot: int
-  vert: wp.array
-  node: wp.array
-  slot_adr: wp.array
-  fan_node: wp.array
-  fan_rest: wp.array
-  fan_metric: wp.array
-  fan_spring: wp.array
-  fan_corner: wp.array
-  fan_side: wp.array
-  degree: wp.array
-  rest: wp.array
-  spring: float
-  area: wp.array
-  free: wp.array
-  elem_node: wp.array
-  elem_rest: wp.array
-  elem_hinge: wp.array
-  hinge_node: wp.array
-  hinge_rest: wp.array
-  hinge_elem: wp.array
-  hinge_near: wp.array
-  hinge_gain: wp.array
-  hinge_angle0: wp.array
-  bend_adr: wp.array
-  bend_node: wp.array
-  bend_gain: wp.array
-  bend_diag: wp.array
-  foundation: float
-  bulk: float
-  pressure: float
-  volume0: float
-  damping: float
-  iterations: int
-  tolerance: float
-  newton: int
-  device: wp.Device
-  levels: Levels | None = None
-
-  @property
-  def has_bending(self) -> bool:
-    """Whether bending kernels run."""
-    return self.nhingeslice > 0
-
-  @property
-  def has_volume(self) -> bool:
-    """Whether the area vectors push (volume or pressure)."""
-    return self.bulk != 0 or self.pressure != 0
+  nvert: int  # vertices
+  nnode: int  # nodes: vertices padded to whole slices
+  nslice: int  # slices of nodes
+  nelemslice: int  # slices of triangles; 0 without bending
+  nhingeslice: int  # slices of hinges; 0 without bending
+  nslot: int  # rows of stiffness blocks
+  closed: int  # whether the surface encloses a volume
+  volume0: float  # rest volume [m^3]; 0 for an open surface
+  vert: ints("nnode")  # vertex of each node, -1 for padding
+  node: ints("nvert")  # node of each vertex
+  slot_adr: ints("nslice + 1")  # first row of stiffness blocks
+  fan_node: ints("nslot + 2 nslice", 8)  # offset of each fan entry's node
+  fan_rest: floats("nslot + 2 nslice", 3, 8)  # rest vector to each fan entry [m]
+  fan_corner: ints("nslot + nslice", 8)  # offset of each fan triangle's normal
+  fan_side: ints("nslot + nslice", 8)  # offset of its corner force at this node
+  degree: floats("nslice", 8)  # number of neighbours
+  rest: floats("nslice", 3, 8)  # rest position about the centroid [m]
+  area: floats("nslice", 8)  # nodal area [m^2]; 0 for padding
+  free: floats("nslice", 8)  # 1 for nodes that move, 0 pinned or padding
+  elem_node: ints("nelemslice", 3, 8)  # offset of each corner's node
+  elem_rest: floats("nelemslice", 6, 8)  # rest vectors corner 0 -> 1, 0 -> 2 [m]
+  elem_hinge: ints("nelemslice", 3, 8)  # hinge opposite each corner
+  hinge_node: ints("nhingeslice", 4, 8)  # offset of p0, p1, left, right apex
+  hinge_rest: floats("nhingeslice", 9, 8)  # rest vectors p0 -> p1, left, right [m]
+  hinge_elem: ints("nhingeslice", 2, 8)  # offset of left and right triangle
+  hinge_near: ints("nhingeslice", 4, 8)  # the four other hinges of both triangles
+  hinge_angle0: floats("nhingeslice", 8)  # rest angle 2 sin(theta / 2) [-]
+  bend_adr: ints("nslice + 1")  # first row of the bending matrix
+  bend_node: ints("nbend", 8)  # node of each entry
 
 
-@dataclasses.dataclass
+@struct
+class Tissue:
+  """Material on a shape; `number` may change while running, without a graph recorded anew."""
+
+  number: floats("nnumber")  # see NUMBERS
+  fan_metric: floats("nslot + nslice", 5, 8)  # rest metric [1/m^2]; mu, lambda' times volume [N m]
+  fan_spring: floats("nslot", 8)  # spring that stands for an edge, for `neumann` [N/m]
+  hinge_gain: floats("nhingeslice", 5, 8)  # stiffness to itself and to `hinge_near` [N m]
+  bend_gain: floats("nbend", 8)  # bending matrix [N/m]
+  bend_diag: floats("nbendslice", 8)  # its diagonal [N/m]
+
+
+@struct
 class State:
-  """State and work arrays of the organs of `nworld` worlds on one device.
+  """Motion of the organs of nworld worlds, and what acts on them."""
 
-  Attributes:
-    nworld: number of worlds
-    step: time step h, h^2 + h damping, gravity-scaled floor of the residual, share of h v at which
-      the first Newton iteration stands           (nworld, 4)
-    pos: displacement from rest [m]                 (nworld, nslice, 3, 8)
-    vel: velocity [m/s]                             (nworld, nslice, 3, 8)
-    mass: mass [kg]                                 (nworld, nslice, 8)
-    force_ext: external and lagged contact force [N](nworld, nslice, 3, 8)
-    dvel: change of velocity in this step [m/s]     (nworld, nslice, 3, 8)
-    dvel_warm: what those of the last steps lead to, where PCG starts (nworld, nslice, 3, 8)
-    change: largest (rate of an edge's ends over its length)^2 [1/s^2]  (nworld,)
-    pos_trial: displacement of the present Newton iteration [m]
-    vel_trial: velocity of the present Newton iteration [m/s]
-    block: off-diagonal 3x3 blocks of A [kg]        (nworld, nslot, 9, 8)
-    diag: inertia and foundation on the diagonal [kg](nworld, nslice, 8)
-    inverse: inverse of the diagonal blocks [1/kg]  (nworld, nslice, 6, 8)
-    rhs: right-hand side [N s]                      (nworld, nslice, 3, 8)
-    areavec: area vector of a node, 6 dV/dx [m^2]   (nworld, nslice, 3, 8)
-    normal: unit normal of a node                   (nworld, nslice, 3, 8)
-    elem_normal: unit normal of a triangle, and the stiffness that its edges add to the matrix
-      [N/m]                                         (nworld, nelemslice, 4, 8)
-    elem_corner: force on each corner along it [N s](nworld, nelemslice, 3, 8)
-    hinge_angle: strain impulse angle of a hinge    (nworld, nhingeslice, 8)
-    hinge_half: cos(theta / 2)                      (nworld, nhingeslice, 8)
-    hinge_moment: moment impulse [N m s]            (nworld, nhingeslice, 8)
-    hinge_rough: what the bending matrix may leave out [N m](nworld, nhingeslice, 8)
-    total: volume difference [m^3] and areavec . vel(nworld, 2)
-    x: PCG solution [m/s]                           (nworld, nslice, 3, 8)
-    r: PCG residual                                 (nworld, nslice, 3, 8)
-    p: PCG direction                                (nworld, nslice, 3, 8)
-    q: A times direction                            (nworld, nslice, 3, 8)
-    z: preconditioned residual                      (nworld, nslice, 3, 8)
-    zn: that along the normals, with turns on CUDA  (nworld, nslice, 16)
-    quad: z of a node side by side, see simd.py           (nworld, nslice, 12, 8)
-    e: as z, between smoothing steps                (nworld, nslice, 3, 8)
-    en: that along the normals                      (nworld, nslice, 8)
-    t: A times z; smoother's direction and residual (nworld, nslice, 3, 8)
-    partial: what the blocks of a world exchange    (nworld, WORDS, 4)
-    status: PCG iterations, relative residual, norm of the right-hand side, 1 if not finite
-                                                    (nworld, 4)
-    coarse: that of the coarser meshes, or None; shares `step`
+  step: floats("nworld", 4)  # h, h^2 + h damping, floor of the residual, share of h v looked ahead
+  disp: vector  # displacement from rest [m]
+  vel: vector  # velocity [m/s]
+  mass: scalar  # mass [kg]
+  force_ext: vector  # external and lagged contact force [N]
+  dvel: vector  # change of velocity in this step [m/s]
+  dvel_warm: vector  # what those of the last steps lead to, where PCG starts [m/s]
+
+
+@struct
+class System:
+  """The linear system of a step and the vectors of its solve."""
+
+  change: floats("nworld")  # largest (rate of an edge's ends over its length)^2 [1/s^2]
+  disp_trial: vector  # displacement of the present Newton iteration [m]
+  vel_trial: vector  # velocity of the present Newton iteration [m/s]
+  block: floats("nworld", "nslot", 9, 8)  # off-diagonal blocks of A [kg]
+  diag: scalar  # inertia and foundation on the diagonal [kg]
+  inverse: floats("nworld", "nslice", 6, 8)  # inverse of the diagonal blocks [1/kg]
+  rhs: vector  # right-hand side [N s]
+  areavec: floats("nworld", "nareaslice", 3, 8)  # area vector of a node, 6 dV/dx [m^2]
+  normal: floats("nworld", "nbendslice", 3, 8)  # unit normal of a node
+  elem_normal: floats("nworld", "nelemslice", 4, 8)  # unit normal; stiffness of its edges [N/m]
+  elem_corner: floats("nworld", "nelemslice", 3, 8)  # force on each corner along it [N s]
+  hinge_angle: floats("nworld", "nhingeslice", 8)  # strain impulse angle of a hinge
+  hinge_half: floats("nworld", "nhingeslice", 8)  # cos(theta / 2)
+  hinge_moment: floats("nworld", "nhingeslice", 8)  # moment impulse [N m s]
+  hinge_rough: floats("nworld", "nhingeslice", 8)  # what the bending matrix may leave out [N m]
+  total: floats("nworld", 2)  # volume difference [m^3], areavec . vel
+  sol: vector  # PCG solution [m/s]
+  r: vector  # PCG residual
+  p: vector  # PCG direction
+  q: vector  # A times direction
+  z: vector  # preconditioned residual
+  zn: floats("nworld", "nbendslice", 16)  # that along the normals, with turns on CUDA
+  quad: floats("nworld", "nquadslice", 12, 8)  # z of a node side by side
+  e: floats("nworld", "ncycleslice", 3, 8)  # as z, between smoothing steps
+  en: floats("nworld", "ncyclebendslice", 8)  # that along the normals
+  t: vector  # A times z; smoother's direction and residual
+  partial: floats("nworld", "nword", 4)  # what the blocks of a world exchange
+  status: floats("nworld", 4)  # PCG iterations, relative residual, norm of rhs, 1 if not finite
+
+
+@struct
+class Fields:
+  """What every kernel of a body takes."""
+
+  shape: Shape
+  tissue: Tissue
+  state: State
+  system: System
+
+
+@struct
+class Transfer:
+  """What lies between a mesh and the coarser ones, whose nodes follow one another.
+
+  Each level has whole slices. Offsets are those of a node's x component in floats, on the finest
+  mesh or among all coarse nodes; `ncoarse` is the number of their slices.
   """
 
-  nworld: int
-  step: wp.array
-  pos: wp.array
-  vel: wp.array
-  mass: wp.array
-  force_ext: wp.array
-  dvel: wp.array
-  dvel_warm: wp.array
-  change: wp.array
-  pos_trial: wp.array
-  vel_trial: wp.array
-  block: wp.array
-  diag: wp.array
-  inverse: wp.array
-  rhs: wp.array
-  areavec: wp.array
-  normal: wp.array
-  elem_normal: wp.array
-  elem_corner: wp.array
-  hinge_angle: wp.array
-  hinge_half: wp.array
-  hinge_moment: wp.array
-  hinge_rough: wp.array
-  total: wp.array
-  x: wp.array
-  r: wp.array
-  p: wp.array
-  q: wp.array
-  z: wp.array
-  zn: wp.array
-  quad: wp.array
-  e: wp.array
-  en: wp.array
-  t: wp.array
-  partial: wp.array
-  status: wp.array
-  coarse: State | None = None
+  nlevel: int  # number of coarse meshes
+  nodes: int  # moving nodes of the finest mesh
+  threshold: float  # condition number from which cycles are used [-]
+  slice_adr: ints("nlevel + 1")  # first slice of each level
+  source: ints("ncoarse", 8)  # offset of each coarse node on the finest mesh
+  share: floats("ncoarse", 8)  # nodes of the finest that one stands for
+  # Of each level, the finest first: stiffness of a node times g / mass where g / mass is one [N/m],
+  # ends of the smoother's interval (high, low), its degree, the finest's nodes for one of its own.
+  rate: floats("nlevel + 1", 5)
+  down_adr: ints("ncoarse + 1")  # first row of each slice in `down_node`
+  down_node: ints("ndown", 8)  # offset on the next finer mesh
+  down_weight: floats("ndown", 8)  # what it gives to the coarse node [-]
+  up_adr: ints("nslice + ncoarse + 1")  # first row of each slice in `up_node`, the finest's first
+  up_node: ints("nup", 8)  # offset on the next coarser mesh
+  up_weight: floats("nup", 8)  # share of the coarse node [-]
 
 
-def make_state(surface: Surface, nworld: int = 1, is_coarse: bool = False) -> State:
-  """Returns a zeroed state; everything a step needs is allocated here."""
-  s = surface
-  vector, scalar = (s.nslice, 3, 8), (s.nslice, 8)
-  cycles = is_coarse or s.levels is not None
-  bend, elem = (s.nhingeslice, 8), (s.nelemslice if s.has_bending else 0, 3, 8)
-  shapes: dict[str, tuple[int, ...]] = {
-    "step": (4,),
-    "mass": scalar,
-    "block": (s.nslot, 9, 8),
-    "diag": scalar,
-    "inverse": (s.nslice, 6, 8),
-    "areavec": vector if s.has_volume or s.has_bending else (0, 3, 8),
-    "normal": vector if s.has_bending else (0, 3, 8),
-    "elem_normal": (elem[0], 4, 8),
-    "elem_corner": elem,
-    "hinge_angle": bend,
-    "hinge_half": bend,
-    "hinge_moment": bend,
-    "hinge_rough": bend,
-    "change": (),
-    "total": (2,),
-    "zn": (s.nslice, 16) if s.has_bending else (0, 16),
-    "quad": (0 if is_coarse else s.nslice, 12, 8),
-    "e": vector if cycles else (0, 3, 8),
-    "en": scalar if cycles and s.has_bending else (0, 8),
-    "partial": (WORDS, 4),
-    "status": (4,),
-  }
-  arrays = {}
-  for field in dataclasses.fields(State)[1:-1]:
-    shape = (nworld, *shapes.get(field.name, vector))
-    arrays[field.name] = wp.zeros(shape, dtype=float, device=s.device)
-  state = State(nworld=nworld, **arrays)
-  if s.levels is not None:
-    state.coarse = make_state(s.levels.surface, nworld, is_coarse=True)
-    state.coarse.step = state.step
-  return state
+@struct
+class Cycle:
+  """What the kernels of the multilevel preconditioner take."""
+
+  fine: Fields
+  coarse: Fields
+  transfer: Transfer
+
+
+def allocate(kind: Any, device, sizes: dict[str, int]):
+  """Returns a struct of zeroed arrays; `sizes` has the named sizes of their shapes."""
+  out = kind()
+  for name, dims in DIMS[kind.key].items():
+    shape = tuple(_extent(dim, sizes) for dim in dims)
+    setattr(out, name, wp.zeros(shape, dtype=kind.vars[name].type.dtype, device=device))
+  return out
+
+
+def fill(kind: Any, device, values: dict[str, Any], sizes: dict[str, int] | None = None):
+  """Returns a struct with its fields from `values`, arrays copied to the device.
+
+  Args:
+    kind: the struct
+    device: where the arrays are put
+    values: numbers and arrays by field; others are left out
+    sizes: named sizes that the arrays must have, or None where it has none
+  """
+  out = kind()
+  for name, var in kind.vars.items():
+    value = values[name]
+    if isinstance(value, np.ndarray):
+      if sizes is not None:
+        expected = tuple(_extent(dim, sizes) for dim in DIMS[kind.key][name])
+        assert value.shape == expected, (kind.key, name, value.shape, expected)
+      value = wp.array(np.ascontiguousarray(value), dtype=var.type.dtype, device=device)
+    setattr(out, name, value)
+  return out
+
+
+def _extent(dim: int | str, sizes: dict[str, int]) -> int:
+  """Returns a size from the text of an annotation, for example `nslot + 2 nslice`."""
+  if isinstance(dim, int):
+    return dim
+  total = 0
+  for term in dim.split(" + "):
+    *factor, name = term.split()
+    total += int(name) if name.isdigit() else int(factor[0] if factor else 1) * sizes[name]
+  return total

@@ -1,24 +1,24 @@
 """Learns `touch/easy` with Soft Actor-Critic of Stable-Baselines3, on one thread of the CPU.
 
-    pip install -e '.[learn]'
-    python tests/benchmarks/learning.py -o tests/benchmarks/results
+Mean return and success of evaluations on the way beside those of random actions, and the curve
+learning.png; needs `pip install -e '.[learn]'`.
 
-writes learning.csv, mean return and success of evaluations on the way beside those of random
-actions, and the curve learning.png. The exercise is as it comes, with its dense reward and its time
-limit of 10 s. What the agent adds are ordinary wrappers: it sees the state observations of
-`OBSERVATIONS`, normalised, and decides every 0.08 s. Training and evaluation draw their episodes
-from different seeds; the evaluations' are the same each time.
+The exercise is as it comes, with its dense reward and its time limit of 10 s. What the agent adds
+are ordinary wrappers: it sees the state observations of `OBSERVATIONS`, normalised, and decides
+every 0.08 s. Training and evaluation draw their episodes from different seeds; the evaluations' are
+the same each time.
 """
 
 import argparse
-import csv
 import pathlib
 import time
 
 import gymnasium
 import numpy as np
-import palpate  # registers the environments
+import palpate.tasks  # registers the environments
 import torch
+from benchmarks import plots, results
+from benchmarks.runner import Bench, Case, Row
 from gymnasium.wrappers import FilterObservation, FlattenObservation
 from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
@@ -109,7 +109,31 @@ def train(args: argparse.Namespace):
     yield row("SAC", done, evaluate(act, watched, args.episodes if done >= args.decisions else 20))
 
 
-def draw(path: pathlib.Path, rows: list[dict]):
+def arguments(parser: argparse.ArgumentParser):
+  """Declares the options."""
+  add = parser.add_argument
+  add("--decisions", type=int, default=15_000, help="of training (%(default)s)")
+  add("--every", type=int, default=2_500, help="decisions between evaluations (%(default)s)")
+  add("--episodes", type=int, default=50, help="of the first and last evaluation (%(default)s)")
+  add("--seed", type=int, default=0, help="of the agent and its episodes (%(default)s)")
+
+
+def stages(args: argparse.Namespace) -> list[list[Case]]:
+  """Returns one case an agent."""
+  keys = {k: getattr(args, k) for k in ("decisions", "every", "episodes", "seed")}
+  return [[{"case": f"seed-{args.seed}"} | keys]]
+
+
+def run(case: Case, out: pathlib.Path) -> list[Row]:
+  """Trains, and returns a row an evaluation."""
+  rows = []
+  for row in train(argparse.Namespace(**case)):
+    print(row["policy"], row["decisions"], row["return_mean"], flush=True)
+    rows.append(row)
+  return rows
+
+
+def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
   """Draws return and success over training."""
   from matplotlib.figure import Figure
 
@@ -124,30 +148,29 @@ def draw(path: pathlib.Path, rows: list[dict]):
     ax.spines[["top", "right"]].set_visible(False)
     ax.grid(color="#e4e7ec")
   figure.axes[0].legend(loc="lower right", frameon=False)
+  path = out / "learning.png"
   figure.savefig(path, dpi=100)
+  return [path, write(rows, about, out)]
 
 
-def main():
-  """Trains, and writes table and curve after every evaluation."""
-  parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-  add = parser.add_argument
-  add("-o", "--out", type=pathlib.Path, required=True, help="folder of learning.csv and .png")
-  add("--decisions", type=int, default=15_000, help="of training (%(default)s)")
-  add("--every", type=int, default=2_500, help="decisions between evaluations (%(default)s)")
-  add("--episodes", type=int, default=50, help="of the first and last evaluation (%(default)s)")
-  add("--seed", type=int, default=0, help="of the agent and its episodes (%(default)s)")
-  args = parser.parse_args()
-  args.out.mkdir(parents=True, exist_ok=True)
-  rows = []
-  for row in train(args):
-    print(row, flush=True)
-    rows.append(row)
-    with (args.out / "learning.csv").open("w", newline="") as file:
-      writer = csv.DictWriter(file, rows[0], lineterminator="\n")
-      writer.writeheader()
-      writer.writerows(rows)
-  draw(args.out / "learning.png", rows)
+def write(rows: list[Row], about: dict, out: pathlib.Path) -> pathlib.Path:
+  """Writes the page and returns its path."""
+  table = [
+    [r["policy"], f"{r['simulated_s']:.0f}", f"{r['training_s']:.0f}", r["episodes"],
+     f"{r['return_mean']:.2f} ± {r['return_sd']:.2f}", f"{r['success_percent']:.0f} %",
+     f"{r['damage_percent']:.0f} %"]
+    for r in rows
+  ]  # fmt: skip
+  head = ["policy", "simulated [s]", "training [s]", "episodes", "return", "success", "damage"]
+  lines = [
+    "Soft Actor-Critic of Stable-Baselines3 with the dense reward, evaluated on targets that it "
+    "has not seen, beside random actions. " + results.link(out / "learning.csv"),
+    "",
+    *plots.table(head, table),
+    "",
+    "![return and success of SAC on touch/easy over 20 minutes of practice](learning.png)",
+  ]
+  return results.page(out / "learning.md", "Learning `touch/easy`", about, lines)
 
 
-if __name__ == "__main__":
-  main()
+BENCH = Bench("learning", stages, run, report=report, arguments=arguments)

@@ -1,22 +1,23 @@
 """Asks what a solve would gain by leaving out the nodes whose residual is under the tolerance.
 
-    python tests/benchmarks/locality.py --nodes 642 2562 10242
-
 The loop's scene (`loop.py`: a probe presses a windowed sphere, slides and stays) is stepped; at
 some steps the linear system is read back and solved in float64 from the warm start, once on all
 nodes and once on the fewest nodes that carry all but half of the tolerance, grown by rings of
 neighbours to whole slices of eight, and enlarged where the residual on all nodes is still above the
 tolerance (the bound on the error: both stop by the same rule on all nodes). The best number of
-rings is taken and only products are counted: what is printed is an upper bound on the gain.
+rings is taken and only products are counted: the gain is an upper bound.
 """
 
 import argparse
+import itertools
+import pathlib
 
 import mujoco
 import numpy as np
 import palpate
-from loop import model
-from palpate.engine import plugin as engine
+import scenes
+from benchmarks import loop, plots, results
+from benchmarks.runner import Bench, Case, Row
 from palpate.tissue.shape import from_slices
 from scipy import sparse
 
@@ -119,35 +120,54 @@ def study(s, d, tolerance: float) -> dict:
   }
 
 
-def main():
-  """Runs the study."""
-  parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-  parser.add_argument("--nodes", type=int, nargs="+", default=[642, 2562, 10242])
-  parser.add_argument("--tolerance", type=float, nargs="+", default=[1e-3, 1e-4])
-  parser.add_argument("--steps", type=int, default=200)
-  args = parser.parse_args()
-  print("palpate", palpate.__version__)
-  print("nodes bend tolerance | warm residual, its carriers, iterations | active, cost, gain")
-  for nodes in args.nodes:
-    for bend in (0.0, 1.0):
-      for tolerance in args.tolerance:
-        m = model(nodes, "cpu", tolerance, bend, 64)
-        d = mujoco.MjData(m)
-        w = engine.find(d._address, 0)
-        rows = []
-        for step in range(args.steps):
-          d.ctrl[0] = -0.0015 * min(1.0, step / (0.3 * args.steps))
-          d.ctrl[1] = 0.002 * max(0.0, min(step / args.steps, 0.7) - 0.4)
-          mujoco.mj_step(m, d)
-          if step % (args.steps // 8) == args.steps // 8 - 1 and w.status[0] > 0:
-            rows.append(list(study(w.surface, w.state, tolerance).values()))
-        warm, carry, whole, active, cost = np.median(rows, axis=0)
-        print(
-          f"{w.surface.nvert:6d} {bend:g} {tolerance:g} | {warm:.1e}, {carry:4.0%}, {whole:4.0f} | "
-          f"{active:4.0%}, {cost:5.1f}, {1 - cost / whole:+4.0%}",
-          flush=True,
-        )
+def arguments(parser: argparse.ArgumentParser):
+  """Declares the options."""
+  add = parser.add_argument
+  add("--nodes", type=int, nargs="+", default=[642, 2562, 10242])
+  add("--tolerance", type=float, nargs="+", default=[1e-3, 1e-4])
+  add("--steps", type=int, default=200)
 
 
-if __name__ == "__main__":
-  main()
+def stages(args: argparse.Namespace) -> list[list[Case]]:
+  """Returns a case a size, bending and tolerance."""
+  nodes = args.nodes[:1] if args.short else args.nodes
+  return [
+    [
+      {"case": f"{n}-{bend:g}-{limit:g}", "nodes": n, "bend": bend, "tolerance": limit}
+      | {"steps": args.steps}
+      for n, bend, limit in itertools.product(nodes, (0.0, 1.0), args.tolerance)
+    ]
+  ]
+
+
+def run(case: Case, out: pathlib.Path) -> list[Row]:
+  """Returns the row of a case, medians over the steps that were looked at."""
+  steps, tolerance = case["steps"], case["tolerance"]
+  m = loop.model(case["nodes"], "cpu", tolerance, case["bend"], 64, 3, 0.0025)
+  d = mujoco.MjData(m)
+  w = scenes.workspace(palpate.Organ(m, d, "organ"))
+  found = []
+  for step in range(steps):
+    d.ctrl[0] = -0.0015 * min(1.0, step / (0.3 * steps))
+    d.ctrl[1] = 0.002 * max(0.0, min(step / steps, 0.7) - 0.4)
+    mujoco.mj_step(m, d)
+    if step % (steps // 8) == steps // 8 - 1 and w.status[0] > 0:
+      found.append(study(w.surface, w.state, tolerance))
+  row = {"nodes": w.surface.nvert, "bend": case["bend"], "tolerance": tolerance}
+  row |= {key: float(np.median([each[key] for each in found])) for key in found[0]}
+  return [row | {"gain": 1 - row["active_cost"] / row["iterations"]}]
+
+
+def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
+  """Writes the page."""
+  table = [
+    [r["nodes"], r["bend"], r["tolerance"], float(r["warm_residual"]), f"{r['carriers']:.0%}",
+     r["iterations"], f"{r['active']:.0%}", float(r["active_cost"]), f"{r['gain']:+.0%}"]
+    for r in rows
+  ]  # fmt: skip
+  head = ["nodes", "bend", "tolerance", "warm residual", "its carriers", "iterations", "active"]
+  lines = [str(__doc__).partition("\n\n")[2], "", *plots.table([*head, "cost", "gain"], table)]
+  return [results.page(out / "locality.md", "What leaving out nodes would gain", about, lines)]
+
+
+BENCH = Bench("locality", stages, run, report=report, arguments=arguments)

@@ -1,7 +1,7 @@
 """Times the whole loop, mj_step with a probe in contact with a windowed organ, and where it goes.
 
-    python tests/benchmarks/loop.py --device cuda:0 --nodes 16384 65536 262144 -o results
-    python tests/benchmarks/loop.py --table results
+    python tests/benchmarks/run.py loop --device cuda:0 --nodes 16384 65536 262144
+    python tests/benchmarks/run.py loop --draw
 
 An octahedral sphere of radius 5 cm (E = 30 kPa, t = 2 mm, 0.1 kg, foundation 1e5 Pa/m, h = 1 ms),
 pinned below, is pressed 1.5 mm deep by a probe of 5 mm, or as thick as `--tip` says, and slid
@@ -10,25 +10,26 @@ off unless `--bend 1`. The last columns are medians of what one step spends: MuJ
 CPU's side of the coupling, and waiting for the device (search, transfer and what is left of the
 solve, which a resident organ begins before MuJoCo looks for contacts); `rest_ms` is a step with the
 probe away and the organ asleep. The parts of the device's work are timed by themselves after the
-run, in the state of its last step. `--table` writes what they cost a node to loop.md.
+run, in the state of its last step. loop.md says what they cost a node.
 """
 
 import argparse
-import csv
 import itertools
-import json
 import pathlib
 import time
 
 import mujoco
 import numpy as np
 import palpate
+import scenes
 import warp as wp
-from palpate.engine import plugin as engine
-from palpate.engine import window, workspace
+from benchmarks import results
+from benchmarks.runner import Bench, Case, Row
+from palpate.engine import windowed, workspace
+from palpate.engine.layout import HEAD, MODE
 from palpate.models import grid
-from palpate.tissue import elastic, solver
-from palpate.tissue.elastic import Stage
+from palpate.tissue import step
+from palpate.tissue.types import Stage
 
 RADIUS, H = 0.05, 1e-3
 
@@ -41,40 +42,28 @@ def model(
   # In random order: MuJoCo's compiler hashes edges, and neighbours with near numbers collide.
   order = np.random.default_rng(0).permutation(len(point))
   point, elem = np.asarray(point)[order] * RADIUS, np.argsort(order)[np.asarray(elem)]
-  pin = np.flatnonzero(point[:, 2] < -0.9 * RADIUS)
   side = round(np.sqrt(slots))
-  keys = {
-    "young": 3e4,
-    "poisson": 0.3,
-    "foundation": 1e5,
-    "bend": bend,
-    "device": device,
-    "tolerance": tolerance,
-    "window": "window",
-    "mass": 0.1,
-    "resident": str(device != "cpu").lower(),
-    "pin": " ".join(map(str, pin)),
-  }
-  config = "".join(f'<config key="{k}" value="{v}"/>' for k, v in keys.items())
-  spec = mujoco.MjSpec.from_string(f"""
-<mujoco><option timestep="{H}" solver="CG" gravity="0 0 0"/><size memory="2G"/>
-<extension><plugin plugin="palpate.organ"/></extension>
-<worldbody>
-  <body name="organ"><plugin plugin="palpate.organ">{config}</plugin>
-    <flexcomp name="organ" rigid="true" type="direct" dim="2" radius="0.0002"
-      point="{" ".join(f"{x:.8g}" for x in point.ravel())}"
-      element="{" ".join(map(str, np.asarray(elem).ravel()))}">
-      <contact contype="0" conaffinity="0" selfcollide="none"/></flexcomp></body>
-  <flexcomp name="window" type="grid" count="{side} {side} 1" spacing=".01 .01 .01" dim="2"
-    mass="{slots * 0.1 / len(point)}" radius="0.0002"><edge damping="1e-9"/>
-    <contact selfcollide="none" condim="{condim}" solref="0.004 1"
-      solimp="0.99 0.999 0.001"/></flexcomp>
-  <body pos="0 0 {RADIUS + tip + 0.0002}"><joint name="z" type="slide" axis="0 0 1"/>
-    <joint name="x" type="slide" axis="1 0 0"/><geom size="{tip}" mass="0.05" condim="1"/></body>
-</worldbody>
-<actuator><position joint="z" kp="500" kv="10"/><position joint="x" kp="500" kv="10"/></actuator>
-</mujoco>""")
-  return spec.compile()
+  organ = scenes.windowed(
+    point,
+    elem,
+    count=f"{side} {side} 1",
+    radius=0.0002,
+    contact={"condim": condim, "solimp": "0.99 0.999 0.001"},
+    young=3e4,
+    poisson=0.3,
+    foundation=1e5,
+    bend=bend,
+    device=device,
+    tolerance=tolerance,
+    resident=str(device != "cpu").lower(),
+    pin=" ".join(map(str, np.flatnonzero(point[:, 2] < -0.9 * RADIUS))),
+  )
+  probe = f"""<body pos="0 0 {RADIUS + tip + 0.0002}"><joint name="z" type="slide" axis="0 0 1"/>
+    <joint name="x" type="slide" axis="1 0 0"/><geom size="{tip}" mass="0.05" condim="1"/></body>"""
+  drive = """<actuator><position joint="z" kp="500" kv="10"/>
+    <position joint="x" kp="500" kv="10"/></actuator>"""
+  xml = scenes.world(organ, probe, h=H, solver="CG", tolerance=1e-8, memory=2048, extra=drive)
+  return mujoco.MjSpec.from_string(xml).compile()
 
 
 def measure(
@@ -93,13 +82,13 @@ def measure(
   d = mujoco.MjData(m)
   made = time.perf_counter() - start
   organ = palpate.Organ(m, d, "organ")
-  w = engine.find(d._address, 0)
+  w = scenes.workspace(organ)
   spent = {"cpu": 0.0, "device": 0.0}
   timed(w, spent)
   rows, iterations, contacts = [], [], []
-  for step in range(steps):
-    d.ctrl[0] = -0.0015 * min(1.0, step / (0.3 * steps))
-    d.ctrl[1] = 0.002 * max(0.0, step / steps - 0.4)
+  for k in range(steps):
+    d.ctrl[0] = -0.0015 * min(1.0, k / (0.3 * steps))
+    d.ctrl[1] = 0.002 * max(0.0, k / steps - 0.4)
     spent["cpu"] = spent["device"] = 0.0
     before = time.perf_counter()
     mujoco.mj_step(m, d)
@@ -155,8 +144,8 @@ def timed(w, spent: dict):
       return original(graph, *args)
     before = time.perf_counter()
     original(graph, *args)
-    if w.surface.device.is_cuda:
-      wp.synchronize_device(w.surface.device)
+    if w.body.device.is_cuda:
+      wp.synchronize_device(w.body.device)
     spent["device"] += time.perf_counter() - before
 
   wp.capture_launch = capture_launch
@@ -166,29 +155,29 @@ def timed(w, spent: dict):
 
 def parts(w) -> dict:
   """Returns what each part of a step's work on the organ's device takes, medians in ms."""
-  s, d = w.surface, w.state
+  body = w.body
   workspace.sync(w)
   state = w.views["plugin_state"].numpy()
   kept = state.copy()
   solving = replay(
-    s.device,
-    assemble=lambda: assemble(s, d),
-    solve=lambda: solver.solve(s, d, Stage.FIRST),
-    step=lambda: solver.step(s, d),
+    body.device,
+    assemble=lambda: step.assemble(body, Stage.FIRST),
+    solve=lambda: step.solve(body, Stage.FIRST),
+    step=lambda: step.SCHEMES["implicit"].step(body),
   )
-  launches = window.launches(w, w.model, 0)
-  side = wp.get_device(launches.side)
+  phases = windowed.Phases(w, w.model, 0)
+  side = wp.get_device(phases.side)
   boxes = [(wp.clone(w.views[name], device=side), w.views[name]) for name in ("inbox", "outbox")]
-  w.views["inbox"].numpy()[3] = 1.0  # there is a step to end
+  w.boxes["inbox"].head.numpy()[HEAD.mode] = MODE.commit  # there is a step to end
   around = replay(
     side,
     transfer=lambda: (wp.copy(*boxes[0]), wp.copy(*reversed(boxes[1]))),
-    enter=launches.enter,
-    search=launches.look,
-    end=launches.end or (lambda: None),
+    enter=phases.enter,
+    search=phases.look,
+    end=phases.end,
   )
   state[:] = kept
-  workspace.bind(w, w.model, 0)
+  workspace.bind(w, w.model)
   rest_of_step = solving["step"] - solving["assemble"] - solving["solve"]
   return {
     "search_ms": around["search"],
@@ -197,13 +186,6 @@ def parts(w) -> dict:
     "solve_ms": solving["solve"],
     "integrate_ms": around["enter"] + around["end"] + max(0.0, rest_of_step),
   }
-
-
-def assemble(s, d):
-  """Writes the matrices of a step."""
-  elastic.assemble(s, d, Stage.FIRST)
-  if s.levels is not None:
-    solver.multilevel().assemble(s, d)
 
 
 def replay(device, **works) -> dict[str, float]:
@@ -242,11 +224,9 @@ def rest(m, d, organ) -> float:
   return 1e3 * float(np.median(times)) if organ.asleep else float("nan")
 
 
-def table(results: pathlib.Path) -> str:
-  """Returns the page of the results, microseconds a step and nanoseconds a node."""
+def table(out: pathlib.Path) -> list[str]:
+  """Returns the lines of the page, microseconds a step and nanoseconds a node."""
   lines = [
-    "# What a step costs, and where the time goes",
-    "",
     "Microseconds; device: its work by itself, which on CUDA goes on beside MuJoCo's. Per node:",
     "the device's work in ns. From loop_cpu.csv and loop_cuda.csv; `tests/benchmarks/loop.py` says",
     "how they were measured.",
@@ -255,16 +235,15 @@ def table(results: pathlib.Path) -> str:
     "| device per node | asleep |",
     "|" + "---|" * (9 + len(_COLUMNS)),
   ]
-  for path in sorted(results.glob("loop_c*.csv")):
-    with open(path, newline="") as file:
-      for row in csv.DictReader(file):
-        cost = [1e3 * float(row[f"{name}_ms"]) for name in _COLUMNS.values()]
-        own = sum(cost[2:]) * 1e3 / float(row["nodes"])
-        cells = [row["device"], row["nodes"], row["condim"], row["contacts"]]
-        cells += [f"{float(row['iterations']):.0f}", _digits(1e3 * float(row["step_ms"]))]
-        cells += [f"{float(row['rate_Hz']):.0f} Hz", *map(_digits, cost), f"{own:.1f} ns"]
-        lines.append(f"| {' | '.join([*cells, _digits(1e3 * float(row['rest_ms']))])} |")
-  return "\n".join(lines) + "\n"
+  for path in sorted(out.glob("loop_c*.csv")):
+    for row in results.read(path):
+      cost = [1e3 * float(row[f"{name}_ms"]) for name in _COLUMNS.values()]
+      own = sum(cost[2:]) * 1e3 / row["nodes"]
+      cells = [row["device"], row["nodes"], row["condim"], row["contacts"]]
+      cells += [f"{row['iterations']:.0f}", _digits(1e3 * row["step_ms"])]
+      cells += [f"{row['rate_Hz']:.0f} Hz", *map(_digits, cost), f"{own:.1f} ns"]
+      lines.append(f"| {' | '.join(map(str, [*cells, _digits(1e3 * float(row['rest_ms']))]))} |")
+  return lines
 
 
 # Columns of the table: the whole step's first, then the parts of the device's work.
@@ -283,37 +262,40 @@ def _digits(value: float) -> str:
   return f"{value:.3g}" if value < 1000 else f"{value:.0f}"
 
 
-def main():
-  """Runs the benchmark."""
-  parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-  parser.add_argument("--device", default="cpu")
-  parser.add_argument("--nodes", type=int, nargs="+", default=[642, 2562, 4096, 10242])
-  parser.add_argument("--tolerance", type=float, default=1e-3)
-  parser.add_argument("--bend", type=float, default=0.0)
-  parser.add_argument("--slots", type=int, default=100)
-  parser.add_argument("--condim", type=int, nargs="+", default=[3], help="1 is without friction")
-  parser.add_argument("--tip", type=float, nargs="+", default=[0.0025], help="radius [m]")
-  parser.add_argument("--steps", type=int, default=400)
-  parser.add_argument("-o", "--output", type=pathlib.Path)
-  parser.add_argument("--table", type=pathlib.Path, metavar="DIR", help="write DIR/loop.md only")
-  args = parser.parse_args()
-  if args.table:
-    (args.table / "loop.md").write_text(table(args.table))
-    return
-  rows = []
-  for nodes, tip, condim in itertools.product(args.nodes, args.tip, args.condim):
-    scene = (args.tolerance, args.bend, args.slots, condim, tip)
-    row = measure(nodes, args.device, *scene, args.steps)
-    rows.append(row)
-    print(json.dumps({k: round(v, 5) if isinstance(v, float) else v for k, v in row.items()}))
-  if args.output:
-    args.output.mkdir(parents=True, exist_ok=True)
-    kind = "cpu" if args.device == "cpu" else "cuda"
-    with open(args.output / f"loop_{kind}.csv", "w", newline="") as file:
-      writer = csv.DictWriter(file, rows[0])
-      writer.writeheader()
-      writer.writerows(rows)
+def arguments(parser: argparse.ArgumentParser):
+  """Declares the options."""
+  add = parser.add_argument
+  add("--device", default="cpu", help="cpu or cuda:0 (%(default)s)")
+  add("--nodes", type=int, nargs="+", default=[642, 2562, 4096, 10242])
+  add("--tolerance", type=float, default=1e-3)
+  add("--bend", type=float, default=0.0)
+  add("--slots", type=int, default=100)
+  add("--condim", type=int, nargs="+", default=[3], help="1 is without friction")
+  add("--tip", type=float, nargs="+", default=[0.0025], help="radius [m]")
+  add("--steps", type=int, default=400)
 
 
-if __name__ == "__main__":
-  main()
+def stages(args: argparse.Namespace) -> list[list[Case]]:
+  """Returns a case a size, tip and kind of contact."""
+  keys = {k: getattr(args, k) for k in ("device", "tolerance", "bend", "slots", "steps")}
+  nodes = args.nodes[:1] if args.short else args.nodes
+  return [
+    [
+      {"case": f"{n}-{tip:g}-{condim}", "nodes": n, "condim": condim, "tip": tip} | keys
+      for n, tip, condim in itertools.product(nodes, args.tip, args.condim)
+    ]
+  ]
+
+
+def run(case: Case, out: pathlib.Path) -> list[Row]:
+  """Returns the row of a case."""
+  return [measure(**{key: value for key, value in case.items() if key != "case"})]
+
+
+def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
+  """Writes the page, of all devices that there are results of."""
+  return [results.page(out / "loop.md", "What a step costs, and where the time goes", about,
+                       table(out))]  # fmt: skip
+
+
+BENCH = Bench("loop", stages, run, report=report, arguments=arguments, file="loop_{device}")

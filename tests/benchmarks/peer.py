@@ -1,6 +1,6 @@
 """Times a whole mj_step in contact against MuJoCo's native flex, interleaved in one run.
 
-    python tests/benchmarks/peer.py -o tests/benchmarks/results
+    python tests/benchmarks/run.py peer
 
 The same icosphere, mass, documented constants, contact and instrument on all sides, one thread
 each: the peer with `integrator="discrete"` and the CG solver, ours with nodal and with window
@@ -16,7 +16,6 @@ with nu' = nu / 2 and E' = 4 E (1 + nu / 2) / (1 + nu) (fixed in 4.0).
 """
 
 import argparse
-import csv
 import itertools
 import pathlib
 import time
@@ -24,58 +23,49 @@ import time
 import mujoco
 import numpy as np
 import palpate
-import trimesh
+import scenes
+from benchmarks import plots, results, scene
+from benchmarks.runner import Bench, Case, Row
+from scenes import RADIUS
 
 YOUNG, POISSON, THICKNESS, MASS, DAMPING = 3e4, 0.3, 0.002, 0.1, 0.002
-RADIUS, H = 0.05, 1e-3
-SCENES = ("stretch", "both")  # the peer's elastic2d, by our bend
+H = 1e-3  # [s]
 SIDES = ("peer", "nodal", "window")
 
 
 def model(
-  subdivisions: int, side: str, peer: str, bend: int, tolerance: float = 1e-4, h: float = H
+  subdivisions: int, side: str, bend: int, tolerance: float = 1e-4, h: float = H
 ) -> mujoco.MjModel:
   """Returns a sphere pinned below and pressed from above, on one of `SIDES`."""
-  mesh = trimesh.creation.icosphere(subdivisions=subdivisions, radius=RADIUS)
-  point = " ".join(f"{x:.9g}" for x in mesh.vertices.ravel())
-  element = " ".join(map(str, mesh.faces.ravel()))
-  pin = " ".join(map(str, np.flatnonzero(mesh.vertices[:, 2] < -0.9 * RADIUS)))
-  shape = f'type="direct" dim="2" radius="0.0005" point="{point}" element="{element}"'
+  shape = points, _ = scenes.sphere(subdivisions)
+  pin = np.flatnonzero(points[:, 2] < -0.9 * RADIUS)
+  contact = {"condim": 3, "solref": "0.02 1"}
   keys = {"young": YOUNG, "poisson": POISSON, "thickness": THICKNESS, "damping": DAMPING}
-  keys |= {"bend": bend, "device": "cpu", "tolerance": tolerance}
-  if side == "window":
-    keys |= {"window": "window", "mass": MASS, "pin": pin}
-  config = "".join(f'<config key="{k}" value="{v}"/>' for k, v in keys.items())
-  plugin = f'<plugin plugin="palpate.organ">{config}</plugin>'
-  option = f'<option timestep="{h}" integrator="Euler" solver="CG" gravity="0 0 0"/>'
-  contact = '<contact selfcollide="none" condim="3"/>'
   if side == "peer":
-    nu = POISSON / 2
-    young = 4 * YOUNG * (1 + POISSON / 2) / (1 + POISSON)
-    inside = (
-      f'<elasticity young="{young}" poisson="{nu}" thickness="{THICKNESS}" damping="{DAMPING}" '
-      f'elastic2d="{peer}"/>'
-    )
-    option = f'<option timestep="{h}" integrator="discrete" solver="CG" gravity="0 0 0"/>'
-    organ = f"""<flexcomp name="organ" mass="{MASS}" {shape}>
-      {inside}{contact}<pin id="{pin}"/></flexcomp>"""
+    inside = scene.native(**keys, bend=bend)
+    organ = scenes.flex(*shape, inside, mass=MASS, pin=pin, contact=contact)
   elif side == "nodal":
-    organ = f"""<flexcomp name="organ" mass="{MASS}" {shape}>
-      <edge damping="1e-9"/>{plugin}{contact}<pin id="{pin}"/></flexcomp>"""
+    keys |= {"bend": bend, "tolerance": tolerance}
+    organ = scenes.organ(*shape, mass=MASS, pin=pin, contact=contact, **keys)
   else:
-    organ = f"""<body name="organ">{plugin}<flexcomp name="organ" rigid="true" {shape}>
-      <contact contype="0" conaffinity="0" selfcollide="none"/></flexcomp></body>
-    <flexcomp name="window" type="grid" count="10 8 1" spacing=".01 .01 .01" dim="2"
-      mass="{80 * MASS / len(mesh.vertices)}" radius="0.0005">
-      <edge damping="1e-9"/>{contact}</flexcomp>"""
-  return mujoco.MjModel.from_xml_string(f"""
-<mujoco>{option}<size memory="2G"/><extension><plugin plugin="palpate.organ"/></extension>
-<worldbody>
-  {organ}
-  <body pos="0 0 {RADIUS + 0.0056}"><joint name="z" type="slide" axis="0 0 1"/>
-    <geom size="0.005" mass="0.05"/></body>
-</worldbody>
-<actuator><position joint="z" kp="500" kv="10"/></actuator></mujoco>""")
+    keys |= {"bend": bend, "tolerance": tolerance, "mass": MASS, "pin": " ".join(map(str, pin))}
+    organ = scenes.windowed(*shape, count="10 8 1", contact=contact, **keys)
+  probe = f"""<body pos="0 0 {RADIUS + 0.0056}"><joint name="z" type="slide" axis="0 0 1"/>
+    <geom size="0.005" mass="0.05"/></body>"""
+  drive = '<actuator><position joint="z" kp="500" kv="10"/></actuator>'
+  integrator = "discrete" if side == "peer" else "Euler"
+  return mujoco.MjModel.from_xml_string(
+    scenes.world(
+      organ,
+      probe,
+      h=h,
+      integrator=integrator,
+      solver="CG",
+      tolerance=1e-8,
+      memory=2048,
+      extra=drive,
+    )
+  )
 
 
 def measure(nodes: int, bend: int, args: argparse.Namespace) -> list[dict]:
@@ -84,7 +74,7 @@ def measure(nodes: int, bend: int, args: argparse.Namespace) -> list[dict]:
   sides, count = {}, args.steps + 20
   for name, tolerance in [("peer", 0.0), *itertools.product(SIDES[1:], args.tolerance)]:
     start = time.perf_counter()
-    m = model(subdivisions, name, SCENES[bend], bend, tolerance or 1e-4)
+    m = model(subdivisions, name, bend, tolerance or 1e-4)
     if name == "peer":
       m.opt.tolerance = args.peer_tolerance
     sides[name, tolerance] = Side(m, time.perf_counter() - start)
@@ -97,7 +87,7 @@ def measure(nodes: int, bend: int, args: argparse.Namespace) -> list[dict]:
           side.step(step)
   exact = {}
   for name in SIDES if args.refine else ():
-    side = Side(model(subdivisions, name, SCENES[bend], bend, 1e-6, H / args.refine))
+    side = Side(model(subdivisions, name, bend, 1e-6, H / args.refine))
     for step in range(count):
       side.step(step, args.refine)
     exact[name] = np.reshape(side.forces, (count, args.refine))[:, [0, -1]]
@@ -159,32 +149,65 @@ class Side:
     return 1e3 * float(np.median(least[20:]))
 
 
-def main():
-  """Runs the benchmark."""
-  parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-  parser.add_argument("--nodes", type=int, nargs="*", default=[642, 2562, 10242])
+def arguments(parser: argparse.ArgumentParser):
+  """Declares the options."""
+  add = parser.add_argument
+  add("--nodes", type=int, nargs="*", default=[642, 2562, 10242])
   # With bending MuJoCo takes minutes to compile the peer of 10,242 nodes.
-  parser.add_argument("--bent-nodes", type=int, nargs="*", default=[642, 2562])
-  parser.add_argument("--tolerance", type=float, nargs="+", default=[1e-4, 1e-3, 1e-2])
-  parser.add_argument("--peer-tolerance", type=float, default=1e-8)
-  parser.add_argument("--steps", type=int, default=100)
-  parser.add_argument("--block", type=int, default=10)
-  parser.add_argument("--repeats", type=int, default=3)
-  parser.add_argument("--refine", type=int, default=16, help="of the reference; 0 for no errors")
-  parser.add_argument("-o", "--output", type=pathlib.Path)
-  args = parser.parse_args()
-  rows = []
-  for nodes, bend in [*((n, 0) for n in args.nodes), *((n, 1) for n in args.bent_nodes)]:
-    for row in measure(nodes, bend, args):
-      rows.append(row)
-      print({k: f"{v:.4g}" if isinstance(v, float) else v for k, v in row.items()}, flush=True)
-  if args.output:
-    args.output.mkdir(parents=True, exist_ok=True)
-    with open(args.output / "peer_cpu.csv", "w", newline="") as file:
-      writer = csv.DictWriter(file, rows[0])
-      writer.writeheader()
-      writer.writerows(rows)
+  add("--bent-nodes", type=int, nargs="*", default=[642, 2562])
+  add("--tolerance", type=float, nargs="+", default=[1e-4, 1e-3, 1e-2])
+  add("--peer-tolerance", type=float, default=1e-8)
+  add("--steps", type=int, default=100)
+  add("--block", type=int, default=10)
+  add("--repeats", type=int, default=3)
+  add("--refine", type=int, default=16, help="of the reference; 0 for no errors (%(default)s)")
 
 
-if __name__ == "__main__":
-  main()
+def stages(args: argparse.Namespace) -> list[list[Case]]:
+  """Returns a case a size and bending."""
+  names = ("tolerance", "peer_tolerance", "steps", "block", "repeats", "refine")
+  keys = {name: getattr(args, name) for name in names}
+  sizes = [*((n, 0) for n in args.nodes), *((n, 1) for n in args.bent_nodes)]
+  return [
+    [
+      {"case": f"{n}-{bend}", "nodes": n, "bend": bend} | keys
+      for n, bend in (sizes[:1] if args.short else sizes)
+    ]
+  ]
+
+
+def run(case: Case, out: pathlib.Path) -> list[Row]:
+  """Returns the rows of a case."""
+  return measure(case["nodes"], case["bend"], argparse.Namespace(**case))
+
+
+def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
+  """Writes the page."""
+
+  def percent(value) -> str:
+    return f"{100 * float(value):.2g} %"
+
+  table = []
+  for row in rows:
+    ours = []
+    for side in SIDES[1:]:
+      ours += [f"{row[f'{side}_ms']:.3g} ms", f"{row[f'{side}_ratio']:.3g}"]
+      ours.append(percent(row[f"{side}_error"]))
+    table.append([row["nodes"], "on" if row["bending"] else "off", f"{row['tolerance']:.0e}".replace("e-0", "e-"),
+                  f"{row['peer_ms']:.3g} ms", percent(row["peer_error"]), *ours,
+                  f"{row['window_iterations']:.0f}"])  # fmt: skip
+  head = ["nodes", "bending", "tolerance", "native flex", "error"]
+  head += ["organ, nodal", "times faster", "error", "organ, window", "times faster", "error"]
+  lines = [
+    "A whole `mj_step` in contact, one thread each, interleaved in one run: the ratios are the "
+    "result. Both sides have the same mesh and the same documented E = 30 kPa, nu, t = 2 mm and "
+    "mass of 0.1 kg, at h = 1 ms. Errors are of the contact force, RMS in % of its peak, against "
+    "the same side at h / 16. `tolerance` is that of the organ; the flex has MuJoCo's default of "
+    "1e-8. " + results.link(out / "peer_cpu.csv"),
+    "",
+    *plots.table([*head, "PCG iterations"], table),
+  ]
+  return [results.page(out / "peer.md", "A step beside MuJoCo's native flex", about, lines)]
+
+
+BENCH = Bench("peer", stages, run, report=report, arguments=arguments, file="peer_cpu")

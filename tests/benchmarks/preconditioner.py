@@ -1,6 +1,6 @@
 """Counts PCG iterations with block Jacobi and with the multilevel preconditioner.
 
-    python tests/benchmarks/preconditioner.py -o tests/benchmarks/results
+    python tests/benchmarks/run.py preconditioner
 
 The organs are the spheres of `solver.py` and the liver and the stomach of the models, refined by
 halving edges (t = 2 mm, 0.1 kg, h = 1 ms), after ten steps under a load at the top, solved from a
@@ -8,17 +8,17 @@ cold start. The counts do not depend on the device but for rounding.
 """
 
 import argparse
-import csv
 import itertools
 import pathlib
 
 import numpy as np
-import palpate
 import trimesh
+from benchmarks import plots, results
+from benchmarks.runner import Bench, Case, Row
+from benchmarks.solver import MASS, PRECONDITIONERS, make, press, sphere
 from palpate import models as _models
 from palpate.tissue import elastic, hierarchy, mesh, solver, types
 from palpate.tissue import shape as surface
-from solver import MASS, PRECONDITIONERS, make, press, sphere
 
 MOST = 1000  # iterations
 TOLERANCES = (1e-3, 1e-4)
@@ -49,51 +49,69 @@ def count(s: types.Surface, d: types.State) -> dict:
   return out
 
 
-def main():
-  """Runs the benchmark."""
-  parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+def arguments(parser: argparse.ArgumentParser):
+  """Declares the options."""
+  add = parser.add_argument
   sizes = [642, 2562, 10242, 40962, 163842, 262144]
-  parser.add_argument("--nodes", type=int, nargs="*", default=sizes, help="of the spheres")
-  parser.add_argument("--young", type=float, nargs="+", default=[3e3, 3e4, 3e6])
-  parser.add_argument("--halvings", type=int, nargs="*", default=[0, 1, 2], help="of the organs")
-  parser.add_argument("--device", default="cpu")
-  parser.add_argument("-o", "--output", type=pathlib.Path)
-  args = parser.parse_args()
-  print("palpate", palpate.__version__, args.device)
-  shapes = [("sphere", n, lambda n=n: sphere(n)) for n in args.nodes]
-  for name, k in itertools.product(("liver", "stomach"), args.halvings):
-    shapes.append((name, k, lambda name=name, k=k: organ(name, k)))
-  build, rows = hierarchy.build, []
-  print("| organ | nodes | levels | E [kPa] | bending | condition | block Jacobi | multilevel |")
-  print("|---|---|---|---|---|---|---|---|")
-  for name, _, make_shape in shapes:
-    shape = make_shape()
-    coarse = build(shape, surface.COARSEST)
-    hierarchy.build = lambda *_, coarse=coarse: coarse  # the same for every stiffness
-    for young, bend in itertools.product(args.young, (0.0, 1.0)):
-      s, d = make(shape, args.device, young=(young,), bend=bend, iterations=MOST, tolerance=1e-3)
+  add("--nodes", type=int, nargs="*", default=sizes, help="of the spheres")
+  add("--young", type=float, nargs="+", default=[3e3, 3e4, 3e6])
+  add("--halvings", type=int, nargs="*", default=[0, 1, 2], help="of the organs")
+  add("--device", default="cpu")
+
+
+def stages(args: argparse.Namespace) -> list[list[Case]]:
+  """Returns a case a mesh."""
+  meshes = [("sphere", n) for n in (args.nodes[:1] if args.short else args.nodes)]
+  if not args.short:
+    meshes += itertools.product(("liver", "stomach"), args.halvings)
+  keys = {"young": args.young, "device": args.device}
+  return [[{"case": f"{name}-{size}", "name": name, "size": size} | keys for name, size in meshes]]
+
+
+def run(case: Case, out: pathlib.Path) -> list[Row]:
+  """Returns a row a stiffness and bending."""
+  name, build, rows = case["name"], hierarchy.build, []
+  shape = sphere(case["size"]) if name == "sphere" else organ(name, case["size"])
+  coarse = build(shape, surface.COARSEST)
+  hierarchy.build = lambda *_: coarse  # the same for every stiffness
+  try:
+    for young, bend in itertools.product(case["young"], (0.0, 1.0)):
+      s, d = make(shape, case["device"], young=(young,), bend=bend, iterations=MOST, tolerance=1e-3)
       s.levels.threshold = 0.0
       press(shape, s, d, 10)
       condition = d.step.numpy()[0, 1] / (MASS / s.nvert) * s.levels.rate.numpy()[0, 0]
       row = {"organ": name, "nodes": s.nvert, "levels": s.levels.nlevel, "young": young}
-      row |= {"bend": bend, "condition": float(condition)} | count(s, d)
-      rows.append(row)
-      told = [
-        " / ".join(f"{n}" if n <= MOST else f"> {MOST}" for n in numbers)
-        for numbers in ([row[f"{kind}_{t:g}"] for t in TOLERANCES] for kind in PRECONDITIONERS)
-      ]
-      print(
-        f"| {name} | {s.nvert} | {s.levels.nlevel} | {young / 1e3:g} | {'yes' if bend else 'no'} | "
-        f"{condition:.0f} | {told[0]} | {told[1]} |",
-        flush=True,
-      )
-  if args.output:
-    args.output.mkdir(parents=True, exist_ok=True)
-    with open(args.output / "preconditioner.csv", "w", newline="") as file:
-      writer = csv.DictWriter(file, rows[0])
-      writer.writeheader()
-      writer.writerows(rows)
+      rows.append(row | {"bend": bend, "condition": float(condition)} | count(s, d))
+  finally:
+    hierarchy.build = build
+  return rows
 
 
-if __name__ == "__main__":
-  main()
+def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
+  """Writes the page."""
+  kinds = sorted({(row["young"], row["bend"]) for row in rows})
+  head = [f"{young / 1e3:g} kPa{', bending' if bend else ''}" for young, bend in kinds]
+  cells: dict[tuple, dict] = {}
+  for row in rows:
+    told = [
+      " / ".join(f"{n}" if n <= MOST else f"> {MOST}" for n in numbers)
+      for numbers in ([row[f"{kind}_{t:g}"] for t in TOLERANCES] for kind in PRECONDITIONERS)
+    ]
+    mesh = cells.setdefault((row["organ"], row["nodes"]), {})
+    mesh[row["young"], row["bend"]] = "; ".join(told)
+  table = [
+    [f"{organ}, {nodes}", *(found.get(kind, "") for kind in kinds)]
+    for (organ, nodes), found in cells.items()
+  ]
+  lines = [
+    f"PCG iterations to {' / '.join(f'{t:g}' for t in TOLERANCES)} with block Jacobi; then with "
+    "the multilevel cycle. A sphere of 5 cm and two organs, t = 2 mm, 0.1 kg, h = 1 ms, ten steps "
+    "into a load of 1 N on 6 mm, from a cold start. " + results.link(out / "preconditioner.csv"),
+    "",
+    *plots.table(["organ, nodes", *head], table),
+  ]
+  title = "Iterations with each preconditioner"
+  return [results.page(out / "preconditioner.md", title, about, lines)]
+
+
+BENCH = Bench("preconditioner", stages, run, report=report, arguments=arguments)

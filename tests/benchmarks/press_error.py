@@ -1,23 +1,27 @@
 """What is left of the press's force error: each cause switched by itself, against the reference.
 
-  python press_error.py    prints RMS errors in % of the peak, of the whole and of its three parts
-
-The press of tests/engine/test_coupling.py and its explicit reference. `touch` is the first 35 ms,
+RMS errors in % of the peak, of the whole and of its three parts, in the press of
+tests/engine/test_coupling.py against its explicit reference. The force is taken for that of the
+step's end, or its start. `touch` is the first 35 ms,
 in which the ball bounces on one node, `ramp` until it stops at 100 ms, `hold` the rest; their
 squares add up.
 """
 
+import argparse
 import pathlib
 import runpy
 
 import mujoco
 import numpy as np
 import palpate
-from benchmarks import plots
+import scenes
+from benchmarks import plots, results
+from benchmarks.runner import Bench, Case, Row
 from palpate.tissue import solver
 
 REFERENCE = pathlib.Path(__file__).parents[1] / "reference" / "press_explicit_20us"
 PARTS = {"touch": (0, 0.035), "ramp": (0.035, 0.1), "hold": (0.1, 1)}  # [s]
+H = (5e-4, 1e-3, 2e-3)  # [s]
 CASES = {
   "as it is": {},
   "3 Newton iterations": {"newton": 3},
@@ -33,12 +37,10 @@ CASES = {
 
 def press(script: dict, h: float, ahead=0.1, extrapolate=0.0, armature=1.0, **keys) -> np.ndarray:
   """Returns time and contact force, a row each step; see CASES for what may be switched."""
-  texts = {"elements": "spring", "stiffness": script["STIFFNESS"], "bend": 0, "device": "cpu"}
+  texts = {"elements": "spring", "stiffness": script["STIFFNESS"], "bend": 0}
   texts |= {"foundation": script["FOUNDATION"], "damping": script["DAMPING"]} | keys
-  config = "".join(f'<config key="{key}" value="{value}"/>' for key, value in texts.items())
-  plugin = '<plugin plugin="palpate.organ">'
   extension = '<extension><plugin plugin="palpate.organ"/></extension>'
-  xml = script["mjcf"](h, extension, f"{plugin}{config}</plugin>")
+  xml = script["mjcf"](h, extension, scenes.plugin(**texts))
   before, solver.AHEAD = solver.AHEAD, ahead
   try:
     model = mujoco.MjModel.from_xml_string(xml)
@@ -64,26 +66,38 @@ def press(script: dict, h: float, ahead=0.1, extrapolate=0.0, armature=1.0, **ke
   return np.array(rows)
 
 
-def main():
-  """Prints the table."""
+def stages(args: argparse.Namespace) -> list[list[Case]]:
+  """Returns a case a time step and cause."""
+  steps = H[1:2] if args.short else H
+  return [[{"case": f"{h:g}, {name}", "h": h, "switched": name} for h in steps for name in CASES]]
+
+
+def run(case: Case, out: pathlib.Path) -> list[Row]:
+  """Returns the row of a case."""
   palpate.register()
   script = runpy.run_path(str(REFERENCE.with_suffix(".py")))
   time, expected = np.loadtxt(REFERENCE.with_suffix(".csv"), delimiter=",", skiprows=1).T
-  table = []
-  for h in (5e-4, 1e-3, 2e-3):
-    for name, switches in CASES.items():
-      found = press(script, h, **switches)
-      row = [f"{1e3 * h:g}", name]
-      for shift in (0.0, h):  # the force is taken for that of the step's end, or its start
-        gap = np.interp(time, found[:, 0] - shift, found[:, 1]) - expected
-        row.append(100 * float(np.sqrt(np.mean(gap**2))) / expected.max())
-        if not shift:
-          parts = [gap[(time >= a) & (time < b)] for a, b in PARTS.values()]
-      row += [100 * float(np.sqrt((p @ p) / time.size)) / expected.max() for p in parts]
-      table.append(row)
+  found = press(script, case["h"], **CASES[case["switched"]])
+
+  def gap(shift: float) -> np.ndarray:
+    return np.interp(time, found[:, 0] - shift, found[:, 1]) - expected
+
+  def percent(part: np.ndarray) -> float:
+    return 100 * float(np.sqrt((part @ part) / time.size)) / expected.max()
+
+  row = {"h": case["h"], "switched": case["switched"]}
+  row |= {"rms_end": percent(gap(0.0)), "rms_start": percent(gap(case["h"]))}
+  parts = {part: gap(0.0)[(time >= a) & (time < b)] for part, (a, b) in PARTS.items()}
+  return [row | {name: percent(part) for name, part in parts.items()}]
+
+
+def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
+  """Writes the page."""
+  keys = ("rms_end", "rms_start", *PARTS)
+  table = [[f"{1e3 * r['h']:g}", r["switched"], *(float(r[k]) for k in keys)] for r in rows]
   head = ["h [ms]", "", "RMS, as of the step's end", "of its start", *PARTS]
-  print("\n".join(plots.table(head, table)))
+  lines = [str(__doc__).partition("\n\n")[2], "", *plots.table(head, table)]
+  return [results.page(out / "press_error.md", "What is left of the press's error", about, lines)]
 
 
-if __name__ == "__main__":
-  main()
+BENCH = Bench("press_error", stages, run, report=report)

@@ -1,6 +1,6 @@
 """Times mj_step of a scene with a sleeping windowed organ against the scene without the organ.
 
-    python tests/benchmarks/rest.py --nodes 1000 4000 -o tests/benchmarks/results
+    python tests/benchmarks/run.py rest
 
 The liver with a probe in its home pose, or withdrawn; CPU time of blocks of steps, all variants in
 turn. `mujoco_us` is the same model with the plugin left out: what MuJoCo spends on the
@@ -9,14 +9,14 @@ sleeping.
 """
 
 import argparse
-import csv
-import json
 import pathlib
 import time
 
 import mujoco
 import numpy as np
 import palpate
+from benchmarks import plots, results
+from benchmarks.runner import Bench, Case, Row
 from palpate import models
 from palpate.engine import mjstruct
 from palpate.models import markup
@@ -73,24 +73,47 @@ def measure(nodes: int, insertion: float) -> dict:
   }
 
 
-def main():
-  """Runs the benchmark."""
-  parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-  parser.add_argument("--nodes", type=int, nargs="+", default=[1000])
-  parser.add_argument("-o", "--output", type=pathlib.Path)
-  args = parser.parse_args()
-  rows = []
-  for nodes in args.nodes:
-    for insertion in (0.0, -0.08):
-      rows.append(measure(nodes, insertion))
-      print(json.dumps({k: round(v, 3) for k, v in rows[-1].items()}))
-  if args.output:
-    args.output.mkdir(parents=True, exist_ok=True)
-    with open(args.output / "rest_cpu.csv", "w", newline="") as file:
-      writer = csv.DictWriter(file, rows[0])
-      writer.writeheader()
-      writer.writerows(rows)
+def stages(args: argparse.Namespace) -> list[list[Case]]:
+  """Returns a case a size and place of the probe."""
+  nodes = args.nodes[:1] if args.short else args.nodes
+  return [
+    [
+      {"case": f"{n}-{insertion:g}", "nodes": n, "insertion": insertion}
+      for n in nodes
+      for insertion in (0.0, -0.08)
+    ]
+  ]
 
 
-if __name__ == "__main__":
-  main()
+def run(case: Case, out: pathlib.Path) -> list[Row]:
+  """Returns the row of a case."""
+  return [measure(case["nodes"], case["insertion"])]
+
+
+def arguments(parser: argparse.ArgumentParser):
+  """Declares the options."""
+  parser.add_argument("--nodes", type=int, nargs="+", default=[1000, 4000])
+
+
+def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
+  """Writes the page."""
+  table = []
+  for row in rows:
+    place = f"withdrawn {-100 * row['insertion_m']:g} cm" if row["insertion_m"] else "home pose"
+    cells = [f"{row['bare_us']:.1f}"]
+    for name in ("awake", "asleep", "mujoco", "napping"):
+      cells.append(f"{row[f'{name}_us']:.0f} ({row[f'{name}_ratio']:.3g})")
+    table.append([f"{row['nodes']} ({row['nv']})", place, *cells])
+  head = ["nodes (dofs)", "probe", "without the organ", "kept awake", "asleep", "of it MuJoCo"]
+  lines = [
+    "The liver with a probe, window coupling. Medians of CPU time of a step in us, and in brackets "
+    'times the scene without the organ. "of it MuJoCo": the same model with the plugin left out. '
+    "\"with the flag\": `<flag sleep='enable'/>`, MuJoCo's own sleep. "
+    + results.link(out / "rest_cpu.csv"),
+    "",
+    *plots.table([*head, "asleep, with the flag"], table),
+  ]
+  return [results.page(out / "rest.md", "What a sleeping organ costs", about, lines)]
+
+
+BENCH = Bench("rest", stages, run, report=report, arguments=arguments, file="rest_cpu")

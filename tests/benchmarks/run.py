@@ -1,12 +1,7 @@
-"""Runs one benchmark: `python tests/benchmarks/run.py NAME --help`.
-
-A bench is a module with a `BENCH` (see `runner`): its cases are data, one function runs a case and
-returns rows, figures and summary are drawn from the rows.
-"""
+"""Runs one benchmark: `python tests/benchmarks/run.py NAME --help`."""
 
 from __future__ import annotations
 
-import argparse
 import importlib
 import pathlib
 import sys
@@ -14,29 +9,43 @@ from collections.abc import Sequence
 
 sys.path.insert(0, str(pathlib.Path(__file__).parents[1]))  # `benchmarks`, `reference`, `scenes`
 
-from palpate.app.console import CommandError
+import screen
+from benchmarks.results import BenchError
 
 BENCHES = {
   "error": "run time against error, beside MuJoCo's own flex",
+  "experts": "how many of its episodes each expert solves; the references",
+  "inertia": "what the effective inertia does to the contact force",
+  "learning": "SAC on touch/easy",
+  "locality": "what leaving out solved nodes would save",
+  "loop": "the whole loop, mj_step with a probe on a windowed organ",
+  "peer": "mj_step in contact against MuJoCo's native flex",
+  "preconditioner": "iterations with block Jacobi and multilevel",
+  "press_error": "what is left of the press's force error",
+  "rest": "a sleeping organ against none",
+  "second_order": "schemes of second order, in float64",
+  "skill": "metrics: expert against novices",
+  "skipping": "what switching each feature off saves",
+  "solver": "the implicit step alone, device by device",
+  "speed": "control steps a second of the exercises",
   "stability": "where each scheme breaks, over a thousand runs",
   "thesis": "the tables and figures of the thesis, measured today",
-  "skipping": "what switching each feature off saves",
 }
 
 
 def main(argv: Sequence[str] | None = None) -> int:
   """Runs the command line and returns its exit code."""
-  parser = argparse.ArgumentParser("run.py", description="Measures speed, accuracy, stability.")
-  benches = parser.add_subparsers(metavar="BENCH", required=True)
-  for name, text in BENCHES.items():
-    module = importlib.import_module(f"benchmarks.{name}")
-    command = benches.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
-    module.add_arguments(command)
-    command.set_defaults(main=module.main)
+  words = list(sys.argv[1:] if argv is None else argv)
+  if not words or words[0] not in BENCHES:
+    known = "\n".join(f"  {name:16}{text}" for name, text in BENCHES.items())
+    print(f"usage: run.py BENCH [options]; run.py BENCH --help says which\n\n{known}")
+    return 0 if words in (["-h"], ["--help"]) else 2
+  screen.choose()
+  from benchmarks import runner
+
   try:
-    args = parser.parse_args(argv)
-    return args.main(args)
-  except CommandError as error:
+    return runner.main(importlib.import_module(f"benchmarks.{words[0]}").BENCH, words[1:])
+  except BenchError as error:
     print(f"run.py: {error}", file=sys.stderr)
     return error.code
   except KeyboardInterrupt:

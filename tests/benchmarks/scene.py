@@ -10,21 +10,20 @@ import numpy as np
 from palpate.organ import Organ
 from palpate.tissue import mesh as topology
 from palpate.tissue.mesh import Mesh
+from scenes import EDGES, RADIUS, UNTOUCHED, flex, join, organ, windowed, world
 
-RADIUS = 0.05  # of the shapes, about [m]
 PROBE = 0.006  # radius of the probe [m]
-FLEX = 0.0005  # radius of the flexes [m]
 SHAPES = ("sphere", "liver", "lobed")
 NATIVE = "native"
 
 # Nearly hard and h-independent contacts: 20 ms is twice the largest time step of the error bench
 # (MuJoCo raises a shorter time constant); an impedance near one keeps the surfaces together.
-CONTACT = 'solref="0.02 1" solimp="0.99 0.999 0.001"'
+CONTACT = {"solref": "0.02 1", "solimp": "0.99 0.999 0.001"}
 
 
 @functools.lru_cache(maxsize=32)
 def shape(name: str, nodes: int) -> Mesh:
-  """Returns a closed surface centred at the origin, its longest half-axis RADIUS.
+  """Returns a closed surface centred at the origin, its longest half-axis RADIUS [m].
 
   Args:
     name: `sphere` (icosphere: 162, 642, 2562, 10242 nodes), `octa` (octahedral sphere), `sliver`
@@ -99,11 +98,6 @@ class Tissue:
     return keys | ({"stiffness": self.stiffness} if self.elements == "spring" else {})
 
 
-def join(values) -> str:
-  """Returns numbers as the text of an MJCF attribute."""
-  return " ".join(f"{v:.9g}" for v in np.ravel(values))
-
-
 def build(
   mesh: Mesh,
   tissue: Tissue,
@@ -113,7 +107,7 @@ def build(
   probe: np.ndarray | None = None,
   joined: np.ndarray | None = None,
   friction: float = 0.0,
-  contact: str = CONTACT,
+  contact: dict | None = None,
   solver: str = "CG",
   mj_tolerance: float = 1e-8,
   window: bool = False,
@@ -131,7 +125,7 @@ def build(
     probe: centre of the ball [m]; None for no ball
     joined: nodes that hang on the ball by connect equalities, which then touches nothing
     friction: of the contact; 0 for contacts without
-    contact: MuJoCo's attributes of the contacts
+    contact: MuJoCo's attributes of the contacts, for CONTACT
     solver: MuJoCo's constraint solver
     mj_tolerance: of that solver
     window: window coupling instead of nodal
@@ -140,67 +134,34 @@ def build(
     lumped: masses in proportion to the nodes' area, as a window has them, instead of even ones
     **keys: further configuration keys of the plugin
   """
-  inside = '<edge damping="1e-9"/>'
-  integrator = "Euler"
-  if scheme == NATIVE:
-    # MuJoCo 3.17 stretches softer than documented: these reach the documented (E, nu); see 4.0.
-    nu, old = tissue.poisson, mujoco.__version__ < "4"
-    young = 4 * tissue.young * (1 + nu / 2) / (1 + nu) if old else tissue.young
-    inside = (
-      f'<elasticity young="{young}" poisson="{nu / 2 if old else nu}" damping="{tissue.damping}" '
-      f'thickness="{tissue.thickness}" elastic2d="{"both" if tissue.bend else "stretch"}"/>'
-    )
-    integrator = "discrete"
-  elif scheme != "passive":
-    settings = {"device": "cpu"} | tissue.keys() | keys
-    if scheme != "implicit":
-      settings["integrator"] = scheme
-    if window:
-      settings |= {"window": "window", "mass": tissue.mass}
-    plugin = "".join(f'<config key="{k}" value="{v}"/>' for k, v in settings.items())
-    plugin = f'<plugin plugin="palpate.organ">{plugin}</plugin>'
-    inside += "" if window else plugin
-  condim = f'condim="{3 if friction else 1}" friction="{friction or 1}"'
-  ball = equality = ""
+  contact = CONTACT if contact is None else contact
+  rubs = {"condim": 3 if friction else 1, "friction": friction or 1}
+  bodies, ties = [_organ(mesh, tissue, scheme, window, contact | rubs, keys)], ""
   if probe is not None:
-    touches = 'contype="0" conaffinity="0"' if joined is not None else ""
-    slides = "".join(
-      f'<joint name="{name}" type="slide" axis="{axis}"/>'
-      for name, axis in (("x", "1 0 0"), ("y", "0 1 0"), ("z", "0 0 1"))
+    mass = (1e4 if heavy else 0.5) * tissue.mass
+    bodies.append(_probe(probe, mass, contact | rubs | (UNTOUCHED if joined is not None else {})))
+  if joined is not None:
+    solver_of = _text(contact)
+    ties = "".join(
+      f'<connect body1="organ_{i}" body2="probe" anchor="0 0 0" {solver_of}/>' for i in joined
     )
-    ball = (
-      f'<body name="probe" pos="{join(probe)}">{slides}<geom size="{PROBE}" '
-      f'mass="{(1e4 if heavy else 0.5) * tissue.mass}" {condim} {touches} {contact}/></body>'
-    )
-    if joined is not None:
-      connects = (
-        f'<connect body1="organ_{i}" body2="probe" anchor="0 0 0" {contact}/>' for i in joined
-      )
-      equality = f"<equality>{''.join(connects)}</equality>"
-  shape = (
-    f'type="direct" dim="2" radius="{FLEX}" point="{join(mesh.rest)}" '
-    f'element="{" ".join(map(str, mesh.elem.ravel()))}"'
-  )
-  contacts = f'<contact selfcollide="none" {condim} {contact}/>'
-  organ = f'<flexcomp name="organ" mass="{tissue.mass}" {shape}>{inside}{contacts}</flexcomp>'
-  memory = max(200, 3 * mesh.nvert**2 // 10**6)  # MuJoCo's collision wants n^2 bytes and more [MB]
-  if window:
-    side = window_side(mesh)
-    memory = 200
-    organ = (
-      f'<body name="organ">{plugin}<flexcomp name="organ" rigid="true" {shape}>'
-      '<contact contype="0" conaffinity="0" selfcollide="none"/></flexcomp></body>'
-      f'<flexcomp name="window" type="grid" count="{side} {side} 1" spacing=".01 .01 .01" dim="2" '
-      f'mass="0.01" radius="{FLEX}">{inside}{contacts}</flexcomp>'
-    )
-  xml = (
-    f'<mujoco><option timestep="{h}" integrator="{integrator}" solver="{solver}" '
-    f'tolerance="{mj_tolerance}" gravity="0 0 0"/><size memory="{memory}M"/>'
-    '<extension><plugin plugin="palpate.organ"/></extension><worldbody>'
-    f"{organ}{ball}</worldbody>{equality}</mujoco>"
-  )
+    ties = f"<equality>{ties}</equality>"
+  # MuJoCo's collision wants n^2 bytes and more [MB]
+  memory = 200 if window else max(200, 3 * mesh.nvert**2 // 10**6)
+  integrator = "discrete" if scheme == NATIVE else "Euler"
+  xml = world(
+    *bodies, h=h, integrator=integrator, solver=solver, tolerance=mj_tolerance, memory=memory,
+    extra=ties,
+  )  # fmt: skip
   model = mujoco.MjModel.from_xml_string(xml)
-  if lumped and not window:
+  if not window:
+    _adjust(model, mesh, tissue, scheme, lumped)
+  return model
+
+
+def _adjust(model: mujoco.MjModel, mesh: Mesh, tissue: Tissue, scheme: str, lumped: bool):
+  """Writes what MJCF has no words for: masses by area, and the foundation of the native flex."""
+  if lumped:
     area = topology.vertex_areas(mesh.rest, mesh.elem)
     bodies = model.dof_bodyid[node_dofs(model, mesh.nvert)[:, 0]]
     model.body_mass[bodies] = tissue.mass * area / area.sum()
@@ -210,7 +171,50 @@ def build(
     gain = tissue.foundation * topology.vertex_areas(mesh.rest, mesh.elem)
     model.jnt_stiffness[model.dof_jntid[dofs]] = gain[:, None]
     model.dof_damping[dofs] = tissue.damping * gain[:, None]
-  return model
+
+
+def _organ(
+  mesh: Mesh, tissue: Tissue, scheme: str, window: bool, contact: dict, keys: dict
+) -> str:
+  """Returns the organ's MJCF, or that of a flex without the plugin."""
+  shape = mesh.rest, mesh.elem
+  if scheme == NATIVE:
+    inside = native(tissue.young, tissue.poisson, tissue.thickness, tissue.damping, tissue.bend)
+    return flex(*shape, inside, mass=tissue.mass, contact=contact)
+  if scheme == "passive":
+    return flex(*shape, EDGES, mass=tissue.mass, contact=contact)
+  keys = tissue.keys() | {"integrator": None if scheme == "implicit" else scheme} | keys
+  if not window:
+    return organ(*shape, mass=tissue.mass, contact=contact, **keys)
+  side = window_side(mesh)
+  return windowed(*shape, count=f"{side} {side} 1", contact=contact, mass=tissue.mass, **keys)
+
+
+def native(young: float, poisson: float, thickness: float, damping: float, bend: float) -> str:
+  """Returns MuJoCo's elasticity of a flex with these constants.
+
+  MuJoCo 3.17 stretches softer than documented: there others reach the documented ones; see 4.0.
+  """
+  if mujoco.__version__ < "4":
+    young, poisson = 4 * young * (1 + poisson / 2) / (1 + poisson), poisson / 2
+  return (
+    f'<elasticity young="{young}" poisson="{poisson}" damping="{damping}" '
+    f'thickness="{thickness}" elastic2d="{"both" if bend else "stretch"}"/>'
+  )
+
+
+def _probe(at: np.ndarray, mass: float, contact: dict) -> str:
+  """Returns a ball on three slides."""
+  slides = "".join(
+    f'<joint name="{name}" type="slide" axis="{axis}"/>'
+    for name, axis in (("x", "1 0 0"), ("y", "0 1 0"), ("z", "0 0 1"))
+  )
+  ball = f'<geom size="{PROBE}" mass="{mass}" {_text(contact)}/>'
+  return f'<body name="probe" pos="{join(at)}">{slides}{ball}</body>'
+
+
+def _text(attributes: dict) -> str:
+  return " ".join(f'{key}="{value}"' for key, value in attributes.items())
 
 
 def window_side(mesh: Mesh) -> int:

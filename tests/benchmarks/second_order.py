@@ -1,21 +1,20 @@
 """Second-order schemes in float64 beside the implicit step, coupled to MuJoCo as the plugin is.
 
-  python second_order.py -o FOLDER    writes second_order.csv, .md and .png
-
 Implicit Euler, the plugin's `midpoint`, BDF2 and TR-BDF2, each linearly implicit with exact solves,
-on the press and the free vibration of `palpate bench error`, 162 nodes. A scheme hands MuJoCo the
+on the press and the free vibration of the bench `error`, 162 nodes. A scheme hands MuJoCo the
 velocity that moves x to where it wants it, (x1 - x) / h, and keeps what it needs of the past. The
 contact force is that of the last step, corrected by the effective inertia, as in
-`palpate.coupling`.
+the plugin's coupling.
 """
 
 import argparse
-import csv
 import pathlib
 
 import mujoco
 import numpy as np
-from benchmarks import error, plots, runner, scene
+from benchmarks import compare, error, films, plots, results, scene
+from benchmarks.films import Film
+from benchmarks.runner import Bench, Case, Row
 from palpate.engine import inertia
 from palpate.tissue import shape as surface
 from palpate.tissue import types
@@ -23,12 +22,15 @@ from reference import exact
 from scipy import sparse
 from scipy.sparse import linalg
 
-ABOUT = str(__doc__)
-
 NODES = 162
+SCENES = ("press", "vibrate")
+_COLUMNS = (
+  *("scene", "scheme", "h", "finite", "solves", "position_rms", "force_rms_start"),
+  *("force_rms_end", "force_rms", "force_peak"),
+)
 SOLVES = {"implicit": 1, "midpoint": 1, "BDF2": 1, "TR-BDF2": 2}
 COLOURS = {"implicit": "#08519c", "midpoint": "#000000", "BDF2": "#c1442e", "TR-BDF2": "#2ca02c"}
-HS = error.H[1:6]  # [s]
+HS = compare.H[1:6]  # [s]
 SPLIT = 2 - np.sqrt(2)  # part of a TR-BDF2 step that is TR: Bank et al. 1985
 
 
@@ -104,7 +106,7 @@ class Scheme:
       self.v = end + self.kick * correction
 
 
-def _inertia(scheme: Scheme, film: error._Film) -> np.ndarray:
+def _inertia(scheme: Scheme, film: Film) -> np.ndarray:
   """Returns what the scheme makes a contact meet at each node [kg], (nvert,)."""
   mesh, config = film.mesh, scheme.elastic.config
   free = np.ones(mesh.nvert, bool)
@@ -116,14 +118,14 @@ def _inertia(scheme: Scheme, film: error._Film) -> np.ndarray:
   return inertia.effective_inertia(s, state, mesh, mass, free, scheme.h, scene.PROBE, gain)
 
 
-def run(name: str, where: str, h: float) -> error._Film:
+def film_of(name: str, where: str, h: float) -> Film:
   """Runs a scheme on a scene of the error bench."""
   case = {"scene": where, "nodes": NODES, "elements": "membrane"}
-  model = error._build(case, "passive", h, solver="Newton", mj_tolerance=1e-10)
-  film = error._Film(case, model)
+  model = films.build(case, "passive", h, solver="Newton", mj_tolerance=1e-10)
+  film = Film(case, model)
   dofs = film.state.dofs
   mass = model.body_mass[model.dof_bodyid[dofs[:, 0]]]
-  scheme = Scheme(name, exact.Elastic(film.mesh, error._config("membrane")), mass, h)
+  scheme = Scheme(name, exact.Elastic(film.mesh, films.config_of("membrane")), mass, h)
   meets = _inertia(scheme, film)
   model.dof_armature[dofs] = (meets - mass)[:, None]
   weights = model.dof_invweight0.copy(), model.body_invweight0.copy()
@@ -149,45 +151,52 @@ def run(name: str, where: str, h: float) -> error._Film:
   return film
 
 
-def measure(out: pathlib.Path) -> list[dict]:
-  """Returns a row for every scheme, scene and time step; references go to `out`."""
-  rows = []
-  for where in ("press", "vibrate"):
-    case = {"scene": where, "nodes": NODES, "elements": "membrane", "kind": "reference"}
-    for level in (2, 1):
-      error._reference(case | {"level": level}, out)
-    truth = error._truth(out, where, NODES, "membrane")
-    for name in SOLVES:
-      for h in HS:
-        film = run(name, where, h)
-        row = {"scene": where, "scheme": name, "h": h, "finite": int(film.good())}
-        row["solves"] = SOLVES[name] * film.n
-        at = error.FORCE_AT.get(name, "start")
-        row |= error._errors(film, truth, h, at) if film.good() else {}
-        rows.append(row)
-        print({k: f"{v:.3g}" if isinstance(v, float) else v for k, v in row.items()}, flush=True)
-  return rows
+def stages(args: argparse.Namespace) -> list[list[Case]]:
+  """Returns the references, then a case a scheme, scene and time step."""
+  places = SCENES[:1] if args.short else SCENES
+  first = [
+    {"case": f"reference-{where}-{level}", "scene": where, "level": level}
+    for where in places
+    for level in (2, 1)
+  ]
+  second = [
+    {"case": f"{where}-{name}-{h:g}", "scene": where, "scheme": name, "h": h}
+    for where in places
+    for name in SOLVES
+    for h in (HS[2:3] if args.short else HS)
+  ]
+  return [first, second]
 
 
-def report(rows: list[dict], out: pathlib.Path):
-  """Writes CSV, picture and page."""
-  columns = list(dict.fromkeys(key for row in rows for key in row))
-  with open(out / "second_order.csv", "w", newline="", encoding="utf-8") as file:
-    writer = csv.DictWriter(file, columns, restval="")
-    writer.writeheader()
-    writer.writerows({k: f"{v:.4g}" if isinstance(v, float) else v for k, v in r.items()}
-                     for r in rows)  # fmt: skip
+def run(case: Case, out: pathlib.Path) -> list[Row]:
+  """Runs a case: a reference, whose file goes to `out`, or a scheme."""
+  where = case["scene"]
+  if "level" in case:
+    what = {"nodes": NODES, "elements": "membrane", "kind": "reference"}
+    compare.reference(case | what, out)
+    return []
+  truth = compare.truth_of(out, where, NODES, "membrane")
+  name, h = case["scheme"], case["h"]
+  film = film_of(name, where, h)
+  row = {"scene": where, "scheme": name, "h": h, "finite": int(film.good())}
+  row["solves"] = SOLVES[name] * film.n
+  at = compare.FORCE_AT.get(name, "start")
+  return [row | (compare.errors(film, truth, h, at) if film.good() else {})]
+
+
+def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
+  """Draws the picture and writes the page."""
+  rows = [row for row in rows if row["scheme"] != ""]
   figure, axes = plots.grid(1, 2, width=8.6, height=3.8)
-  about = runner.machine() | {"cases": len(rows), "done": len(rows)}
-  lines = ["# Schemes of second order, in float64", "", runner.caption(about), ""]
-  lines += ["    python tests/benchmarks/second_order.py -o FOLDER", "", ABOUT.split("\n\n")[2]]
+  lines = [str(__doc__).partition("\n\n")[2]]
   lines += ["", "Errors in % of the reference's peak: contact force, taken for that of the better "
             "end of its step, or positions. TR-BDF2 has two solves a step.", ""]  # fmt: skip
   table = []
-  for ax, where, key in ((axes[0], "press", "force_rms"), (axes[1], "vibrate", "position_rms")):
+  keys = {"press": "force_rms", "vibrate": "position_rms"}
+  for ax, where in zip(axes, dict.fromkeys(row["scene"] for row in rows), strict=False):
+    key = keys[where]
     for name, colour in COLOURS.items():
-      mine = [r for r in rows if r["scene"] == where and r["scheme"] == name]
-      mine = [r for r in mine if r.get(key, "") != ""]
+      mine = [r for r in rows if (r["scene"], r["scheme"]) == (where, name) and r[key] != ""]
       value = [100 * (min(r["force_rms_start"], r["force_rms_end"]) if where == "press" else r[key])
                for r in mine]  # fmt: skip
       ax.plot([r["solves"] for r in mine], value, "o-", ms=4, color=colour, label=name)
@@ -197,24 +206,12 @@ def report(rows: list[dict], out: pathlib.Path):
     ax.set_ylabel(f"{where}: {key.split('_')[0]} error, RMS [% of peak]", fontsize=9)
     plots.plain(ax.xaxis, 2)
     plots.plain(ax.yaxis, 2)
-  axes[1].legend(frameon=False, fontsize=8)
+  axes[0].legend(frameon=False, fontsize=8)
   head = ["scene", "scheme", *(f"{1e3 * h:g} ms" for h in HS), "order, h <= 1 ms"]
   lines += [*plots.table(head, table), ""]
-  plots.save(figure, out / "second_order.png", "Below and left is better")
-  (out / "second_order.md").write_text("\n".join(lines), encoding="utf-8")
+  picture = plots.save(figure, out / "second_order.png", "Below and left is better")
+  page = out / "second_order.md"
+  return [picture, results.page(page, "Schemes of second order, in float64", about, lines)]
 
 
-def main():
-  """Runs all and writes the files."""
-  parser = argparse.ArgumentParser(description=ABOUT.splitlines()[0])
-  parser.add_argument("-o", "--out", type=pathlib.Path, default=pathlib.Path("out", "bench"))
-  parser.add_argument("--draw", action="store_true", help="only draw the rows there are")
-  args = parser.parse_args()
-  args.out.mkdir(parents=True, exist_ok=True)
-  runner.register_quietly()
-  rows = runner.read(args.out / "second_order.csv") if args.draw else measure(args.out)
-  report(rows, args.out)
-
-
-if __name__ == "__main__":
-  main()
+BENCH = Bench("second_order", stages, run, _COLUMNS, report)

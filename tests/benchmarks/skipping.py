@@ -1,4 +1,4 @@
-"""`run.py skipping`: what each feature costs, so what switching it off saves."""
+"""What each feature costs, so what switching it off saves."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import time
 
 import mujoco
 import numpy as np
-from benchmarks import plots, runner, scene
+from benchmarks import plots, results, runner, scene
 from benchmarks.runner import Bench, Case, Row
 
 NODES = (642, 2562, 10242)
@@ -20,9 +20,9 @@ SCALES = {"picture": 60}  # pictures are made so many times a second, not every 
 _COLUMNS = ("nodes", "feature", "with_ms", "without_ms", "saved_ms", "share", "iterations")
 
 
-def stages(short: bool) -> list[list[Case]]:
+def stages(args: argparse.Namespace) -> list[list[Case]]:
   """Returns one case a size: its variants are interleaved."""
-  return [[{"case": f"{n}", "nodes": n} for n in ((162,) if short else NODES)]]
+  return [[{"case": f"{n}", "nodes": n} for n in ((162,) if args.short else NODES)]]
 
 
 class _Variant:
@@ -122,9 +122,6 @@ def _row(nodes: int, feature: str, with_ms: float, without_ms: float, variant: _
 
 def _picture(variant: _Variant) -> float | None:
   """Returns the time of a picture [ms], or None where nothing can render."""
-  from palpate.app.console import prepare_gl
-
-  prepare_gl()
   try:
     with mujoco.Renderer(variant.model, 480, 640) as renderer:
       times = []
@@ -161,11 +158,9 @@ def draw(rows: list[Row], out: pathlib.Path) -> list[pathlib.Path]:
   return [plots.save(figure, out / "skipping.png", "What leaving a feature out saves")]
 
 
-def summarize(rows: list[Row], about: dict) -> str:
-  """Returns the table."""
-  lines = ["# What each feature costs", "", runner.caption(about), ""]
-  lines += [f"    run.py skipping{' --short' if about.get('short') else ''}", ""]
-  lines += [
+def summarize(rows: list[Row]) -> list[str]:
+  """Returns the lines of the page."""
+  lines = [
     "A sphere pressed 8 mm at h = 1 ms with bending, volume and foundation; each row leaves one "
     "thing out, all interleaved, medians of whole steps in CPU time of the one thread. Leaving a "
     "term out also changes the stiffness matrix and so the iterations: a saving can be negative.",
@@ -184,19 +179,13 @@ def summarize(rows: list[Row], about: dict) -> str:
   if any("asleep" in str(r.get("feature")) for r in rows):
     lines += ["Asleep: an organ with a window, at rest, with no tool near; its saving is of the "
               "windowed step.", ""]  # fmt: skip
-  return "\n".join(lines)
+  return lines
 
 
-BENCH = Bench(
-  "skipping", "benchmarks.skipping", _COLUMNS, stages, run, draw, summarize, limit=1800.0
-)
+def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
+  """Draws the figures and writes the page."""
+  page = results.page(out / "skipping.md", "What each feature costs", about, summarize(rows))
+  return [*draw(rows, out), page]
 
 
-def add_arguments(parser: argparse.ArgumentParser):
-  """Declares the options."""
-  runner.add_arguments(parser, BENCH)
-
-
-def main(args: argparse.Namespace) -> int:
-  """Runs the bench."""
-  return runner.main(BENCH, args)
+BENCH = Bench("skipping", stages, run, _COLUMNS, report, jobs=1, limit=1800.0)

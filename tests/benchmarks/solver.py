@@ -1,6 +1,6 @@
 """Times the implicit step alone, device by device, and checks CUDA against the CPU first.
 
-    python tests/benchmarks/solver.py --device cuda:0 --nodes 678 16386 65538 262146 -o results
+    python tests/benchmarks/run.py solver --device cuda:0 --nodes 678 16386 65538 262146
 
 Each size is an octahedral sphere of radius 5 cm pressed over a 6 mm patch (E = 30 kPa, t = 2 mm,
 0.1 kg, h = 1 ms) and solved from a cold start with each preconditioner; the median of graph replays
@@ -8,15 +8,15 @@ is reported. `condition` is what the choice between them goes by, `auto` what it
 """
 
 import argparse
-import csv
 import itertools
 import pathlib
-import sys
 import time
 
 import numpy as np
-import palpate
 import warp as wp
+from benchmarks import plots, results
+from benchmarks.results import BenchError
+from benchmarks.runner import Bench, Case, Row
 from palpate.models import grid
 from palpate.tissue import config, elastic, levels, mesh, solver, types
 from palpate.tissue import shape as surface
@@ -137,7 +137,6 @@ def measure(device: str, nodes: int, tolerance: list[float], bend: float, args) 
       row |= timed(s, d, args.repeat)
       row |= {"condition": condition, "auto": auto, "make_s": made, "bytes_a_node": size(s, d)}
       rows.append(row)
-      print({k: f"{v:.4g}" if isinstance(v, float) else v for k, v in row.items()}, flush=True)
   return rows
 
 
@@ -192,34 +191,62 @@ def size(s: types.Surface, d: types.State) -> int:
   return round(sum(a.size * 4 for a in arrays.values()) / s.nvert)
 
 
-def main():
-  """Runs the benchmark."""
-  parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-  parser.add_argument("--device", default="cpu")
-  parser.add_argument("--nodes", type=int, nargs="+", default=[642, 2562, 10242])
-  parser.add_argument("--tolerance", type=float, nargs="+", default=[1e-4])
-  parser.add_argument("--repeat", type=int, default=50)
-  parser.add_argument("--bend", type=float, nargs="+", default=[0.0, 1.0])
-  parser.add_argument(
-    "--preconditioner", nargs="+", choices=PRECONDITIONERS, default=list(PRECONDITIONERS)
-  )
-  parser.add_argument("-o", "--output", type=pathlib.Path)
-  args = parser.parse_args()
-  print(f"palpate {palpate.__version__}, warp {wp.__version__}, {wp.get_device(args.device).name}")
+def arguments(parser: argparse.ArgumentParser):
+  """Declares the options."""
+  add = parser.add_argument
+  add("--device", default="cpu", help="cpu or cuda:0 (%(default)s)")
+  add("--nodes", type=int, nargs="+", default=[642, 2562, 10242])
+  add("--tolerance", type=float, nargs="+", default=[1e-4])
+  add("--repeat", type=int, default=50)
+  add("--bend", type=float, nargs="+", default=[0.0, 1.0])
+  add("--preconditioner", nargs="+", choices=PRECONDITIONERS, default=list(PRECONDITIONERS))
+
+
+def stages(args: argparse.Namespace) -> list[list[Case]]:
+  """Returns a case a size and bending."""
+  keys = {k: getattr(args, k) for k in ("device", "tolerance", "repeat", "preconditioner")}
+  nodes = args.nodes[:1] if args.short else args.nodes
+  return [
+    [
+      {"case": f"{n}-{bend:g}", "nodes": n, "bend": bend} | keys
+      for n, bend in itertools.product(nodes, args.bend)
+    ]
+  ]
+
+
+def begin(args: argparse.Namespace):
+  """Checks the device against the CPU."""
   if args.device != "cpu" and agreement(args.device) > 1e-4:
-    sys.exit(f"{args.device} disagrees with the CPU")
-  rows = []
-  for nodes, bend in itertools.product(args.nodes, args.bend):
-    rows += measure(args.device, nodes, args.tolerance, bend, args)
-  if args.output:
-    args.output.mkdir(parents=True, exist_ok=True)
-    path = args.output / f"solver_{args.device.split(':')[0]}.csv"
-    with open(path, "w", newline="") as file:
-      writer = csv.DictWriter(file, rows[0])
-      writer.writeheader()
-      writer.writerows(rows)
-    print(path)
+    raise BenchError(f"{args.device} disagrees with the CPU", code=1)
 
 
-if __name__ == "__main__":
-  main()
+def run(case: Case, out: pathlib.Path) -> list[Row]:
+  """Returns the rows of a size."""
+  args = argparse.Namespace(**case)
+  return measure(args.device, args.nodes, args.tolerance, args.bend, args)
+
+
+def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
+  """Writes the page, of the device that there are results of."""
+  path = out / f"solver_{str(rows[0]['device']).partition(':')[0]}.csv"
+  lines = [
+    "A sphere of 5 cm pressed over 6 mm, E = 30 kPa, t = 2 mm, 0.1 kg, h = 1 ms, from a cold "
+    "start; medians of graph replays. A star marks the preconditioner that the plugin takes by "
+    "itself. " + results.link(path),
+    "",
+  ]
+  table = []
+  for row in rows:
+    count = row["iterations"] if row["residual"] <= row["tolerance"] else f"> {row['iterations']}"
+    table.append([row["nodes"], "on" if row["bend"] else "off", f"{row['tolerance']:g}",
+                  row["preconditioner"], "*" if row["auto"] == row["preconditioner"] else "",
+                  *(f"{row[k]:.3g} ms" for k in ("step_ms", "assemble_ms", "solve_ms")),
+                  count, row["bytes_a_node"]])  # fmt: skip
+  head = ["nodes", "bending", "tolerance", "preconditioner", "chosen", "step", "assemble", "solve"]
+  lines += plots.table([*head, "iterations", "bytes a node"], table)
+  name = "solver.md" if path.stem == "solver_cuda" else f"{path.stem}.md"
+  return [results.page(out / name, "The organ's step alone", about, lines)]
+
+
+BENCH = Bench("solver", stages, run, report=report, arguments=arguments, begin=begin,
+              file="solver_{device}")  # fmt: skip

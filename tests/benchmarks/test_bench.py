@@ -1,5 +1,6 @@
 """Short forms of the benches: what a user would notice if it were wrong."""
 
+import dataclasses
 import json
 import math
 import pathlib
@@ -8,21 +9,33 @@ import mujoco
 import numpy as np
 import palpate
 import pytest
-from benchmarks import error, run, runner, scene, skipping, stability, thesis
+from benchmarks import error, films, results, run, runner, scene, stability, thesis
 from palpate.tissue import energy
 from palpate.tissue.config import Config
 from reference import exact
 
-BENCHES = {b.name: b for b in (error.BENCH, stability.BENCH, thesis.BENCH, skipping.BENCH)}
 ELEMENTS = {"membrane": {}, "spring": {"elements": "spring", "stiffness": 50.0}}
 
 
 def rows_of(name: str, out: pathlib.Path) -> list[dict]:
-  return runner.read(out / f"{name}.csv")
+  return results.read(out / f"{name}.csv")
 
 
 def command(*words) -> int:
   return run.main([*map(str, words)])
+
+
+def options(bench, *words):
+  return runner.options(bench, [*map(str, words)])
+
+
+def of_cases(bench, cases):
+  """Returns the bench with these cases alone."""
+  return dataclasses.replace(bench, stages=lambda args: [cases])
+
+
+def stability_cases(*words) -> list[dict]:
+  return stability.stages(options(stability.BENCH, *words))[0]
 
 
 @pytest.fixture(scope="module")
@@ -82,8 +95,8 @@ def test_native_flex_gets_the_same_static_force():
   found = []
   for scheme in ("implicit", scene.NATIVE):
     case = {"scene": "press", "nodes": 162, "elements": "membrane"}
-    model = error._build(case, scheme, 2.5e-4)
-    film = error._Film(case, model)
+    model = films.build(case, scheme, 2.5e-4)
+    film = films.Film(case, model)
     film.move(0.15)
     found.append(film.force[-1][2])
   assert found[0] > 0.1
@@ -154,30 +167,30 @@ def test_implicit_force_is_closer_than_native_at_the_same_time_step(error_rows):
 
 
 def test_stability_bench_judges_every_case_and_resumes(tmp_path, capsys, monkeypatch):
-  whole = stability.stages(short=True)
-  few = [[c for c in whole[0] if c["scheme"] == "implicit" and c["nodes"] == 162][-3:]]
-  assert {c["coupling"] for c in few[0]} == {"nodal", "window"}
-  bench = stability.BENCH
-  small = type(bench)(**{**vars(bench), "stages": lambda short: few})
-  assert not runner.execute(small, tmp_path, short=True, seconds=0)
+  few = stability_cases("--short")
+  few = [c for c in few if c["scheme"] == "implicit" and c["nodes"] == 162][-3:]
+  assert {c["coupling"] for c in few} == {"nodal", "window"}
+  small = of_cases(stability.BENCH, few)
+  words = ("--short", "--out", tmp_path)
+  assert not runner.execute(small, options(small, *words, "--minutes", 0))
   assert rows_of("stability", tmp_path) == []
-  assert runner.execute(small, tmp_path, short=True, resume=True)
+  assert runner.execute(small, options(small, *words, "--resume"))
   rows = rows_of("stability", tmp_path)
-  assert {r["case"] for r in rows} == {c["case"] for c in few[0]}
+  assert {r["case"] for r in rows} == {c["case"] for c in few}
   assert {r["verdict"] for r in rows} <= set(stability.VERDICTS)
   # A row cut short by a kill is run again; the others are not.
   path = tmp_path / "stability.csv"
   kept = path.read_text().splitlines(keepends=True)
   path.write_text("".join(kept[:-1]) + kept[-1][:20])
-  assert runner.execute(small, tmp_path, short=True, resume=True)
+  assert runner.execute(small, options(small, *words, "--resume"))
   assert path.read_text().splitlines(keepends=True)[:-1] == kept[:-1]
   assert len(rows_of("stability", tmp_path)) == len(rows)
-  for written in runner.report(small, tmp_path):
+  for written in runner.report(small, options(small, *words)):
     assert written.stat().st_size > 0
 
 
 def test_stability_bench_covers_what_it_says():
-  cases = stability.stages(short=False)[0]
+  cases = stability_cases()
   ours = [c for c in cases if c["scheme"] == "implicit"]
   assert sum(c["coupling"] == "nodal" for c in ours) >= 1000
   assert sum(c["coupling"] == "window" for c in ours) >= 500
@@ -190,12 +203,12 @@ def test_stability_bench_covers_what_it_says():
     assert min(c[key] for c in ours) < low and max(c[key] for c in ours) > high
   mass = [c["mass"] for c in ours]
   assert max(mass) / min(mass) > 0.9e4
-  assert stability.stages(short=False) == stability.stages(short=False)
+  assert cases == stability_cases()
 
 
 def test_stability_bench_loses_little_when_time_runs_out():
   # The maps and the wild starts come first, then draws in blocks, each over the whole hypercube.
-  cases = stability.stages(short=False)[0]
+  cases = stability_cases()
   cube = [c for c in cases if c["set"] == "hypercube"]
   assert all(c["set"] != "hypercube" for c in cases[: len(cases) - len(cube)])
   first = cube[: len(cube) // 10]
@@ -242,7 +255,7 @@ def test_an_explicit_step_that_blows_up_is_called_so(tmp_path):
   ],
 )
 def test_what_once_failed_is_stable(tmp_path, name):
-  (case,) = [c for c in stability.stages(short=False)[0] if c["case"] == name]
+  (case,) = [c for c in stability_cases() if c["case"] == name]
   (row,) = stability.run(case, tmp_path)
   assert row["verdict"] not in stability.FAILURES
 
@@ -250,7 +263,7 @@ def test_what_once_failed_is_stable(tmp_path, name):
 def test_one_case_of_the_stability_bench_is_run_again_by_name(tmp_path, capsys):
   (case,) = [
     c["case"]
-    for c in stability.stages(short=True)[0]
+    for c in stability_cases("--short")
     if c["set"] == "map" and c["side"] == "implicit" and c["h"] == 1e-3 and c["young"] == 1e3
   ]
   for _ in range(2):
@@ -267,11 +280,10 @@ def test_one_case_of_the_stability_bench_is_run_again_by_name(tmp_path, capsys):
 
 def test_thesis_bench_measures_every_scheme(tmp_path):
   out = tmp_path
-  bench = type(thesis.BENCH)(
-    **{**vars(thesis.BENCH), "stages": lambda short: [thesis.stages(True)[0][:6]]}
-  )
-  assert runner.execute(bench, out, short=True)
-  runner.report(bench, out)
+  args = options(thesis.BENCH, "--short", "--out", out)
+  bench = of_cases(thesis.BENCH, thesis.stages(args)[0][:6])
+  assert runner.execute(bench, args)
+  runner.report(bench, args)
   rates = [r for r in rows_of("thesis", out) if r["kind"] == "rate" and r["device"] == "cpu"]
   assert {r["scheme"] for r in rates} == {"implicit", "neumann", "explicit", thesis.WINDOW}
   assert all(r["rate_hz"] > 0 and 0 < r["integration_ms"] < 1e3 for r in rates)
@@ -289,46 +301,3 @@ def test_skipping_bench_gives_a_row_to_every_feature(tmp_path):
   assert {"nothing", "bending", "volume", "foundation", "contact", "readback"} <= left_out
   assert {"dofs", "all"} <= left_out  # windows, and asleep
   assert all(math.isfinite(r["with_ms"]) and r["with_ms"] > 0 for r in rows)
-
-
-# The runner.
-
-
-def test_a_case_that_fails_or_dies_is_noted_and_the_rest_goes_on(tmp_path):
-  bench = type(error.BENCH)(
-    **{**vars(error.BENCH), "stages": lambda short: [[
-      {"case": "bad", "kind": "run", "scene": "press", "nodes": 162, "elements": "membrane",
-       "h": 1e-3, "short": 1},  # has no reference
-      {"case": "good", "kind": "reference", "scene": "vibrate", "nodes": 162,
-       "elements": "membrane", "level": 4},
-    ]]}
-  )  # fmt: skip
-  assert runner.execute(bench, tmp_path)
-  status = {r["case"]: r["status"] for r in rows_of("error", tmp_path)}
-  assert status["bad"].startswith("error: ValueError: no reference")
-  assert status["good"] == "ok"
-
-
-def test_starting_over_keeps_the_old_rows_aside(tmp_path):
-  bench = type(error.BENCH)(**{**vars(error.BENCH), "stages": lambda short: []})
-  (tmp_path / "error.csv").write_text("case,status\nold,ok\n")
-  runner.execute(bench, tmp_path)
-  assert (tmp_path / "error.csv.old").read_text() == "case,status\nold,ok\n"
-  assert rows_of("error", tmp_path) == []
-
-
-@pytest.mark.parametrize("name", BENCHES)
-def test_every_bench_is_a_command_with_help(name, capsys):
-  with pytest.raises(SystemExit) as end:
-    command(name, "--help")
-  assert end.value.code == 0
-  text = capsys.readouterr().out
-  for option in ("--short", "--resume", "--jobs", "--minutes", "--only", "--out"):
-    assert option in text
-
-
-def test_wrong_options_are_refused_in_one_line(tmp_path, capsys):
-  assert command("error", "--jobs", 0, "--out", tmp_path) == 2
-  assert "jobs is 0" in capsys.readouterr().err
-  assert command("error", "--draw", "--out", tmp_path) == 1
-  assert "expected the rows of an earlier run" in capsys.readouterr().err

@@ -1,56 +1,73 @@
-"""The scripts that time the solver and the loop: that they run, and what they write adds up."""
+"""The benches of one question: that they run, and what they write adds up."""
 
-import csv
-import importlib.util
-import pathlib
-import sys
+import json
 
 import pytest
-
-HERE = pathlib.Path(__file__).parent
-
-
-@pytest.fixture
-def run(monkeypatch, tmp_path):
-  def call(name, *words):
-    spec = importlib.util.spec_from_file_location(f"benchmark_{name}", HERE / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    monkeypatch.setattr(sys, "argv", [name, *map(str, words), "-o", str(tmp_path)])
-    module.main()
-    return tmp_path
-
-  return call
+from benchmarks import results, run
 
 
-def rows(path):
-  with path.open(newline="") as file:
-    return list(csv.DictReader(file))
+def command(*words) -> int:
+  return run.main([*map(str, words)])
 
 
-def test_solver_is_timed_with_both_preconditioners(run):
-  out = run("solver", "--nodes", 200, "--repeat", 2)
-  found = rows(out / "solver_cpu.csv")
+def test_solver_is_timed_with_both_preconditioners(tmp_path):
+  assert command("solver", "--nodes", 200, "--repeat", 2, "-o", tmp_path) == 0
+  found = results.read(tmp_path / "solver_cpu.csv")
+  assert json.loads((tmp_path / "solver_cpu.json").read_text())["options"]["repeat"] == "2"
   assert [(r["preconditioner"], r["bend"]) for r in found] == [
-    ("jacobi", "0.0"),
-    ("multilevel", "0.0"),
-    ("jacobi", "1.0"),
-    ("multilevel", "1.0"),
+    ("jacobi", 0),
+    ("multilevel", 0),
+    ("jacobi", 1),
+    ("multilevel", 1),
   ]
   assert all(float(r["residual"]) <= 1e-4 and int(r["iterations"]) > 0 for r in found)
   assert all(float(r["step_ms"]) > float(r["assemble_ms"]) > 0 for r in found)
 
 
-def test_loop_touches_says_where_time_goes_and_sleeps(run):
-  out = run("loop", "--nodes", 642, "--steps", 100, "--condim", 3, 1)
-  for row in rows(out / "loop_cpu.csv"):
+def test_loop_touches_says_where_time_goes_and_sleeps(tmp_path):
+  assert command("loop", "--nodes", 642, "--steps", 100, "--condim", 3, 1, "-o", tmp_path) == 0
+  for row in results.read(tmp_path / "loop_cpu.csv"):
     assert int(row["contacts"]) > 0 and int(row["missed"]) == 0
     parts = ("mujoco_ms", "coupling_ms", "device_ms")
     assert sum(float(row[name]) for name in parts) == pytest.approx(float(row["step_ms"]))
     assert float(row["assemble_ms"]) > 0 and float(row["solve_ms"]) > 0
     assert float(row["rest_ms"]) > 0  # NaN if the organ does not fall asleep
-  run("loop", "--table", out)
-  lines = (out / "loop.md").read_text().splitlines()
+  lines = (tmp_path / "loop.md").read_text().splitlines()
   table = [line for line in lines if line.startswith("| cpu | 678 |")]
+  (head,) = [line for line in lines if line.startswith("| device |")]
   assert len(table) == 2
-  assert all(line.count("|") == lines[6].count("|") for line in table)
+  assert all(line.count("|") == head.count("|") for line in table)
+
+
+@pytest.mark.parametrize(
+  ("name", "words"),
+  [
+    ("inertia", ()),
+    ("press_error", ()),
+    ("locality", ("--steps", 48)),
+    ("preconditioner", ("--nodes", 162, "--young", 3e4)),
+    pytest.param("second_order", (), marks=pytest.mark.slow),
+  ],
+)
+def test_short_forms_write_rows_and_a_page(tmp_path, name, words):
+  assert command(name, "--short", *words, "-o", tmp_path) == 0
+  rows = results.read(tmp_path / f"{name}.csv")
+  assert rows and all(row["status"] == "ok" for row in rows)
+  page = (tmp_path / f"{name}.md").read_text()
+  assert f"run.py {name} --short" in page and page.count("|") > 20
+
+
+def test_peer_is_beside_ours(tmp_path):
+  words = ("--nodes", 162, "--tolerance", 1e-3, "--refine", 2, "--repeats", 1, "--steps", 30)
+  assert command("peer", "--short", *words, "-o", tmp_path) == 0
+  (row,) = results.read(tmp_path / "peer_cpu.csv")
+  assert row["peer_ms"] > 0 and row["nodal_ms"] > 0 and row["window_ms"] > 0
+  for side in ("nodal", "window"):
+    assert row[f"{side}_force_N"] == pytest.approx(row["peer_force_N"], rel=0.3)
+
+
+@pytest.mark.slow
+def test_a_sleeping_organ_is_timed(tmp_path):
+  assert command("rest", "--short", "-o", tmp_path) == 0
+  rows = results.read(tmp_path / "rest_cpu.csv")
+  assert all(row["asleep_us"] < row["awake_us"] for row in rows)

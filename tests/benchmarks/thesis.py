@@ -1,4 +1,4 @@
-"""`run.py thesis`: tables 7.1-7.4 and figures 7.6-7.14 of the thesis with today's program.
+"""Tables 7.1-7.4 and figures 7.6-7.14 of the thesis with today's program.
 
 V. Kotamraju, "A GPU-based integrated approach to simulation for deformable surface meshes", Simon
 Fraser University, 2008: a 3.0 GHz Pentium 4 and a GeForce 7600 GS. The same work here: springs on a
@@ -15,8 +15,9 @@ from collections.abc import Callable
 
 import mujoco
 import numpy as np
+import scenes
 import warp as wp
-from benchmarks import plots, runner, scene
+from benchmarks import plots, results, runner, scene
 from benchmarks.runner import Bench, Case, Row
 from palpate.tissue import elastic, schemes, solver, types
 from palpate.tissue import shape as surface
@@ -61,9 +62,9 @@ _COLUMNS = (
 )
 
 
-def stages(short: bool) -> list[list[Case]]:
+def stages(args: argparse.Namespace) -> list[list[Case]]:
   """Returns the cases: every scheme at every size; CUDA ones are empty without such a device."""
-  sides = SIDES[:2] if short else SIDES
+  sides = SIDES[:2] if args.short else SIDES
   return [
     [
       {"case": f"{scheme}-{device}-{side}", "scheme": scheme, "device": device, "side": side}
@@ -105,7 +106,7 @@ def run(case: Case, out: pathlib.Path) -> list[Row]:
   row: Row = {"kind": "rate", "compile_s": time.perf_counter() - began, "nodes": mesh.nvert}
   row |= {k: case[k] for k in ("scheme", "device", "side")}
   probe, organ = scene.probe_dofs(model), scene.handle(model, data)
-  nodes = scene.Nodes(model, data, mesh, organ)
+  nodes, space = scene.Nodes(model, data, mesh, organ), scenes.workspace(organ)
   rows, cycles, iterations, contacts = [], [], [], 0
   collision: list[float] = []
   clock = _clock(case["device"])
@@ -129,7 +130,7 @@ def run(case: Case, out: pathlib.Path) -> list[Row]:
     if clock() > limit:
       break
     if cycle == 150:
-      row |= _parts(organ._space.organ.surface, organ._space.state, scheme)
+      row |= _parts(space.organ.surface, space.state, scheme)
   timed = np.array(cycles[10:])
   row["step_ms"] = 1e3 * float(np.median(timed))
   row["slowest_ms"] = 1e3 * float(np.max(timed))
@@ -274,53 +275,23 @@ def draw(rows: list[Row], out: pathlib.Path) -> list[pathlib.Path]:
   return written
 
 
-def summarize(rows: list[Row], about: dict) -> str:
+def summarize(rows: list[Row]) -> list[str]:
   """Returns the page: each table of the thesis with today's figures beside it."""
   rates = {
     (r["scheme"], r["device"], r["side"]): r
     for r in rows
     if r["status"] == "ok" and r["kind"] == "rate"
   }
-  lines = ["# The tables of the thesis, measured today", "", runner.caption(about), ""]
-  lines += [f"    run.py thesis{' --short' if about.get('short') else ''}", ""]
-  lines += [
+  lines = [
+    "",
     "Thesis (3.0 GHz Pentium 4, GeForce 7600 GS, 2008) / today. Its implicit scheme is our "
     "`neumann`; our `implicit` solves to a residual of 1e-4. n x n is n^2 + 2 nodes here. A haptic "
     "cycle is a whole mj_step with all nodes as degrees of freedom, but for `window`, where MuJoCo "
     "has those near the probe alone; at 256 x 256 only the step of the organ itself was run. Times "
     "on the CPU are CPU time of the one thread: other load does not count.",
     "",
+    *_tables(rates),
   ]
-  sides = sorted({key[2] for key in rates})
-  head = ["scheme", "device", *(f"{side} x {side}" for side in sides)]
-
-  def cell(was, now) -> str:
-    return f"{was if was is not None else '-'} / {f'{now:.3g}' if now not in ('', None) else '-'}"
-
-  for title, key, then in (("7.1 Haptic update rate [Hz]", "rate_hz", RATE),
-                           ("7.2 Integration [ms]", "integration_ms", INTEGRATION)):  # fmt: skip
-    table = []
-    for which in SCHEMES:
-      mine = [rates.get((*which, side), {}).get(key) for side in sides]
-      if any(v is not None for v in mine) or which in then:
-        was = then.get(which, {})
-        pairs = zip(sides, mine, strict=True)
-        table.append([*which, *(cell(was.get(side), now) for side, now in pairs)])
-    lines += [f"## {title}", "", *plots.table(head, table), ""]
-  for title, device, parts, then in (
-    ("7.3 Parts of the GPU step [ms]", "cuda:0", ("to_ms", "from_ms", "solve_ms"), GPU),
-    ("7.4 Parts of the CPU step [ms]", "cpu", ("collision_ms", "assemble_ms", "solve_ms"), CPU),
-  ):
-    table = []
-    for part in parts:
-      mine = [rates.get(("implicit", device, side), {}).get(part) for side in sides]
-      if any(v not in (None, "") for v in mine):
-        was = then.get(part, {})
-        pairs = zip(sides, mine, strict=True)
-        table.append([part.removesuffix("_ms"), device,
-                      *(cell(was.get(side), now) for side, now in pairs)])  # fmt: skip
-    if table:
-      lines += [f"## {title}", "", *plots.table(["part", *head[1:]], table), ""]
   if not any(key[1] != "cpu" for key in rates):
     lines += ["No CUDA device on this machine: its rows are missing.", ""]
   slow = [
@@ -338,18 +309,44 @@ def summarize(rows: list[Row], about: dict) -> str:
     )
     if r[key] != "" and k[2] in was.get(k[:2], {}) and sign * (r[key] - was[k[:2]][k[2]]) < 0
   ]
-  lines += [f"Slower than the thesis: {'; '.join(behind) or 'nothing'}.", ""]
-  return "\n".join(lines)
+  return [*lines, f"Slower than the thesis: {'; '.join(behind) or 'nothing'}."]
 
 
-BENCH = Bench("thesis", "benchmarks.thesis", _COLUMNS, stages, run, draw, summarize, limit=500.0)
+def _tables(rates: dict[tuple, Row]) -> list[str]:
+  """Returns the tables 7.1 to 7.4, a cell the thesis's figure and today's."""
+  sides = sorted({key[2] for key in rates})
+  head, lines = [f"{side} x {side}" for side in sides], []
+
+  def cells(which: tuple, key: str, then: dict, always: bool = False) -> list[str] | None:
+    now = [rates.get((*which, side), {}).get(key) for side in sides]
+    if not always and all(v in (None, "") for v in now):
+      return None
+    return [
+      f"{then.get(side, '-')} / {'-' if value in (None, '') else f'{value:.3g}'}"
+      for side, value in zip(sides, now, strict=True)
+    ]
+
+  for title, key, then in (("7.1 Haptic update rate [Hz]", "rate_hz", RATE),
+                           ("7.2 Integration [ms]", "integration_ms", INTEGRATION)):  # fmt: skip
+    made = {w: cells(w, key, then.get(w, {}), always=w in then) for w in SCHEMES}
+    table = [[*which, *line] for which, line in made.items() if line]
+    lines += [f"## {title}", "", *plots.table(["scheme", "device", *head], table), ""]
+  for title, device, parts, then in (
+    ("7.3 Parts of the GPU step [ms]", "cuda:0", ("to_ms", "from_ms", "solve_ms"), GPU),
+    ("7.4 Parts of the CPU step [ms]", "cpu", ("collision_ms", "assemble_ms", "solve_ms"), CPU),
+  ):
+    made = {part: cells(("implicit", device), part, then.get(part, {})) for part in parts}
+    table = [[part.removesuffix("_ms"), device, *line] for part, line in made.items() if line]
+    if table:
+      lines += [f"## {title}", "", *plots.table(["part", "device", *head], table), ""]
+  return lines
 
 
-def add_arguments(parser: argparse.ArgumentParser):
-  """Declares the options."""
-  runner.add_arguments(parser, BENCH)
+def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
+  """Draws the figures and writes the page."""
+  title = "The tables of the thesis, measured today"
+  page = results.page(out / "thesis.md", title, about, summarize(rows))
+  return [*draw(rows, out), page]
 
 
-def main(args: argparse.Namespace) -> int:
-  """Runs the bench."""
-  return runner.main(BENCH, args)
+BENCH = Bench("thesis", stages, run, _COLUMNS, report, jobs=1, limit=500.0)

@@ -111,7 +111,7 @@ def test_stiff_tissue_is_pressed_without_chatter(scenes, device, young):
 def test_effective_inertia_is_isotropic_and_more_than_the_mass(scenes, device):
   model, _, organ = scenes.load(scenes.press(young=3e5, device=device))
   mass = 0.1 / organ.nvert
-  armature = model.dof_armature[organ._dofs]
+  armature = model.dof_armature[scenes.dofs(organ)]
   np.testing.assert_array_equal(armature, armature[:, :1].repeat(3, axis=1))
   assert (armature >= 0).all()
   # Neighbours move along, the whole organ does not.
@@ -125,8 +125,8 @@ def test_effective_inertia_keeps_the_contact_iteration_stable(scenes):
   config = {"young": (30e3,), "foundation": 2e5, "bend": 1.0, "tolerance": 1e-6, "iterations": 500}
   model, _, organ = scenes.load(scenes.press(h, subdivisions=3, tool=0.012))
   mass = 0.1 / organ.nvert
-  inertia = mass + model.dof_armature[organ._dofs][:, 0]
-  _, _, s, state = scenes.kernels(points, elem, **config)
+  inertia = mass + model.dof_armature[scenes.dofs(organ)][:, 0]
+  _, _, body = scenes.kernels(points, elem, **config)
   normal = points / scenes.RADIUS
   order = np.argsort(points[:, 2])[::-1]
   patch = order[np.linalg.norm(points[order] - points[order[0]], axis=1) < 0.012]
@@ -135,7 +135,7 @@ def test_effective_inertia_keeps_the_contact_iteration_stable(scenes):
   for k, i in enumerate(patch):
     force = np.zeros(points.shape)
     force[i] = normal[i] / h
-    dvel = scenes.step(s, state, h, np.zeros(points.shape), mass=mass, force=force)
+    dvel = scenes.step(body, h, np.zeros(points.shape), mass=mass, force=force)
     response[:, k] = (dvel[patch] * normal[patch]).sum(axis=1)
   radius = np.abs(np.linalg.eigvals(inertia[patch][:, None] * response)).max()
   assert radius < 1.2  # stable up to 2; the rule aims at 1, interpolation between samples adds some
@@ -143,13 +143,13 @@ def test_effective_inertia_keeps_the_contact_iteration_stable(scenes):
 
 def test_the_armature_follows_the_time_step(scenes):
   model, data, organ = scenes.load(scenes.press(1e-3))
-  before = model.dof_armature[organ._dofs].copy()
+  before = model.dof_armature[scenes.dofs(organ)].copy()
   model.opt.timestep = 2e-3
   mujoco.mj_step(model, data)
   other, *_ = scenes.load(scenes.press(2e-3))
-  after = model.dof_armature[organ._dofs]
+  after = model.dof_armature[scenes.dofs(organ)]
   assert after.max() > 1.2 * before.max()
-  np.testing.assert_allclose(after, other.dof_armature[organ._dofs], rtol=1e-4)
+  np.testing.assert_allclose(after, other.dof_armature[scenes.dofs(organ)], rtol=1e-4)
 
 
 def test_an_armature_of_the_user_stays(scenes):
@@ -157,4 +157,4 @@ def test_an_armature_of_the_user_stays(scenes):
   xml = scenes.press().replace("<worldbody>", default + "<worldbody>")
   model, data, organ = scenes.load(xml)
   scenes.run(model, data, 3)
-  np.testing.assert_array_equal(model.dof_armature[organ._dofs], 0.003)
+  np.testing.assert_array_equal(model.dof_armature[scenes.dofs(organ)], 0.003)

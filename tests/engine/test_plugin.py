@@ -219,7 +219,7 @@ def test_applied_forces_push_the_nodes(scenes, device):
     if kind:
       data.xfrc_applied[model.body("organ_7").id, :3] = force
     else:
-      data.qfrc_applied[organ._dofs[7]] = force
+      data.qfrc_applied[scenes.dofs(organ)[7]] = force
     scenes.run(model, data, 400)
     moved.append(organ.displacement)
   np.testing.assert_allclose(moved[1], moved[0], rtol=0, atol=1e-9)
@@ -270,8 +270,9 @@ def test_sleep_leaves_the_motion_as_it_is(scenes):
   for flag in ("disable", "enable"):
     points, elem = scenes.sphere(1)
     organ = scenes.organ(points, elem, foundation=2e5, young=3e4)
-    xml = scenes.world(organ, scenes.ball(0.07), gravity=GRAVITY)
-    xml = xml.replace("<option", f'<option><flag sleep="{flag}"/></option><option', 1)
+    xml = scenes.world(
+      organ, scenes.ball(0.07), gravity=GRAVITY, flag=f'<flag sleep="{flag}"/>'
+    )
     model, data, organ = scenes.load(xml)
     motion.append(scenes.run(model, data, 800, record=True))
   np.testing.assert_array_equal(motion[1], motion[0])
@@ -296,7 +297,7 @@ def test_nothing_but_the_organs_dofs_is_written(scenes):
   scenes.run(model, data, 50)
   data.qfrc_passive[:] = 0
   mujoco.mj_passive(model, data)
-  mine = organ._dofs.ravel()
+  mine = scenes.dofs(organ).ravel()
   others = np.setdiff1d(np.arange(model.nv), mine)
   assert np.abs(data.qfrc_passive[mine]).max() > 0
   np.testing.assert_array_equal(data.qfrc_passive[others], 0)
@@ -487,17 +488,17 @@ def test_dm_control_physics_copies_and_resets(scenes):
 
 def test_deleted_data_and_models_leave_no_workspace(scenes):
   gc.collect()
-  before = len(engine._workspaces), len(engine._handles)
+  before = engine.count()
   for _ in range(5):
     model = mujoco.MjModel.from_xml_string(scenes.press(subdivisions=1))
     datas = [mujoco.MjData(model) for _ in range(3)]
     mujoco.mj_step(model, datas[0])
     twin = copy.copy(datas[0])
     mujoco.mj_copyData(twin, model, datas[1])
-    assert len(engine._workspaces) == before[0] + 4
+    assert engine.count() == before + 4
     del model, datas, twin
     gc.collect()
-    assert (len(engine._workspaces), len(engine._handles)) == before
+    assert engine.count() == before
 
 
 # Mistakes.
@@ -578,7 +579,7 @@ def test_a_state_that_is_not_finite_warns_and_recovers_after_reset(scenes, devic
   scenes.run(model, data, 30)
   model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
   target = {"qpos": data.qpos, "qvel": data.qvel, "force": data.qfrc_applied}[what]
-  target[organ._dofs[5, 1] if what != "qpos" else organ._qpos[5, 1]] = np.nan
+  target[scenes.dofs(organ)[5, 1] if what != "qpos" else scenes.qposs(organ)[5, 1]] = np.nan
   with _Warnings() as log:
     mujoco.mj_forward(model, data)
     text = log()
@@ -607,7 +608,7 @@ def test_an_error_stays_visible_when_mujoco_resets_by_itself(scenes, what):
   model, data, organ = scenes.load(scenes.press())
   scenes.run(model, data, 30)
   target = {"qpos": data.qpos, "qvel": data.qvel, "force": data.qfrc_applied}[what]
-  target[organ._dofs[5, 1] if what != "qpos" else organ._qpos[5, 1]] = np.nan
+  target[scenes.dofs(organ)[5, 1] if what != "qpos" else scenes.qposs(organ)[5, 1]] = np.nan
   with _Warnings() as log:
     scenes.run(model, data, 10)
     text = log()
@@ -633,7 +634,7 @@ def test_an_error_is_of_one_data_and_one_organ(scenes):
   b = palpate.Organ(model, data, "b")
   other = mujoco.MjData(model)
   twin = palpate.Organ(model, other, "a")
-  data.qvel[a._dofs[0]] = np.nan
+  data.qvel[scenes.dofs(a)[0]] = np.nan
   with _Warnings():
     mujoco.mj_step(model, data)
   assert (a.error is None, b.error is None, twin.error is None) == (False, True, True)
@@ -647,7 +648,7 @@ def test_an_error_is_of_one_data_and_one_organ(scenes):
 def test_a_diverging_motion_is_reported_once(scenes):
   model, data, organ = _free(scenes)
   model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-  data.qvel[organ._dofs] = 1e25
+  data.qvel[scenes.dofs(organ)] = 1e25
   with _Warnings() as log:
     scenes.run(model, data, 20)
     text = log()

@@ -9,16 +9,15 @@ import palpate.models
 import pytest
 import warp as wp
 from palpate.engine import plugin as engine
-from windowed import drive, scene
+from palpate.engine.layout import TAIL
+from scenes import drive, load, probed, slot_bodies, slots, workspace
 
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 
 
 def make(device="cpu", resident=False, **more):
   keys = {"device": device, "resident": str(resident).lower(), **more}
-  m = mujoco.MjModel.from_xml_string(scene(keys=keys))
-  d = mujoco.MjData(m)
-  return m, d, palpate.Organ(m, d, "organ")
+  return load(probed(keys=keys))
 
 
 def get_state(m, d) -> np.ndarray:
@@ -151,7 +150,7 @@ def test_forward_between_steps_changes_nothing(device):
 def test_search_with_little_room_keeps_the_nearest(monkeypatch):
   m, d, _ = make("cuda:0", resident=True)
   expected = drive(m, d, 120)
-  monkeypatch.setattr("palpate.engine.window._ROOM", 1)
+  monkeypatch.setattr("palpate.engine.windowed.ROOM", 1)
   m, d, _ = make("cuda:0", resident=True)
   np.testing.assert_allclose(drive(m, d, 120), expected, atol=5e-3 * np.abs(expected).max())
 
@@ -200,7 +199,7 @@ def test_sleep_changes_nothing_measurable(monkeypatch):
 
   slept, force, at_rest = run()
   assert slept > 500
-  monkeypatch.setattr("palpate.engine.window._SLOW", 0.0)
+  monkeypatch.setattr("palpate.engine.slots.SLOW", 0.0)
   never, expected, awake = run()
   assert never == 0
   assert np.abs(at_rest - awake).max() < 1e-7
@@ -216,8 +215,7 @@ def test_sleeping_organ_wakes(at_rest, what):
     mujoco.mj_step(m, d, nstep=300)
     assert np.abs(organ.contact_force).max() > 0.005
   elif what == "force":
-    slot = int(np.flatnonzero(organ._space.views["placed"].numpy() >= 0)[0])
-    d.xfrc_applied[organ._organ.windows.body[slot], 2] = 0.01
+    d.xfrc_applied[slot_bodies(organ)[slots(organ) >= 0][0], 2] = 0.01
   elif what == "gravity":
     m.opt.gravity[:] = 9.81, 0, 0
   elif what == "parameter":
@@ -253,16 +251,13 @@ SWING = (
 
 def hovering(resident=False, swing=False, flag=""):
   """Returns a sphere under a still tool at 3 mm, or under a capsule that can swing into it."""
-  text = scene(keys={"resident": str(resident).lower()})
-  text = text.replace('gravity="0 0 0"/>', f'gravity="0 0 0">{flag}</option>')
+  text = probed(keys={"resident": str(resident).lower()}, flag=flag)
   for old, new in SWING if swing else ():
     text = text.replace(old, new)
-  m = mujoco.MjModel.from_xml_string(text)
-  d = mujoco.MjData(m)
+  m, d, organ = load(text)
   if swing:
     d.qpos[-1] = d.ctrl[1] = np.pi / 2
   d.qpos[-2] = d.ctrl[0] = 0.003
-  organ = palpate.Organ(m, d, "organ")
   return m, d, organ
 
 
@@ -302,7 +297,7 @@ def test_still_tool_nearby_lets_it_sleep_and_wakes_it_before_it_touches(
   monkeypatch, resident, swing, steps
 ):
   def press(slow):
-    monkeypatch.setattr("palpate.engine.window._SLOW", slow)
+    monkeypatch.setattr("palpate.engine.slots.SLOW", slow)
     m, d, organ = hovering(resident, swing)
     mujoco.mj_step(m, d, nstep=250)
     slept = organ.asleep
@@ -339,7 +334,7 @@ def test_tool_may_go_half_of_its_distance_from_the_surface(swing, height):
   d.qpos[-2] = d.ctrl[0] = height
   mujoco.mj_step(m, d, nstep=250)
   assert organ.asleep
-  leeway = organ._space.views["plugin_state"].numpy()[-1]
+  leeway = workspace(organ).boxes["own"].tail.numpy()[TAIL.leeway]
   n = 60
   a, b = np.array([(i / n, j / n) for i in range(n + 1) for j in range(n + 1 - i)]).T[:, :, None]
   x, y, z = organ.xpos[organ.elem].transpose(1, 0, 2)[:, :, None]
@@ -417,8 +412,7 @@ def test_states_of_an_organ_whose_slots_mujoco_skips():
 def test_force_on_a_slot_that_mujoco_skips_wakes_the_organ():
   m, d, organ = hovering(flag=MUJOCO_SLEEPS)
   mujoco.mj_step(m, d, nstep=250)
-  slot = int(np.flatnonzero(organ._space.views["placed"].numpy() >= 0)[0])
-  d.xfrc_applied[organ._organ.windows.body[slot], 2] = 0.01
+  d.xfrc_applied[slot_bodies(organ)[slots(organ) >= 0][0], 2] = 0.01
   mujoco.mj_step(m, d)
   assert not organ.asleep and d.nv_awake == m.nv
   mujoco.mj_step(m, d, nstep=19)
@@ -427,6 +421,6 @@ def test_force_on_a_slot_that_mujoco_skips_wakes_the_organ():
 
 def test_resident_needs_a_window():
   with pytest.raises(ValueError, match="resident is set, allowed only with window"):
-    mujoco.MjModel.from_xml_string(scene(False, keys={"resident": "true"}))
+    mujoco.MjModel.from_xml_string(probed(False, keys={"resident": "true"}))
   with pytest.raises(ValueError, match="resident is 'yes', expected 'true' or 'false'"):
-    mujoco.MjModel.from_xml_string(scene(keys={"resident": "yes"}))
+    mujoco.MjModel.from_xml_string(probed(keys={"resident": "yes"}))

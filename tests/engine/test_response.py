@@ -2,9 +2,8 @@
 
 import mujoco
 import numpy as np
-import palpate
 import pytest
-import windowed
+import scenes
 from reference import exact
 
 STIFF = {"young": 3e6, "foundation": 1e6, "iterations": 500, "damping": 5e-4}
@@ -15,28 +14,24 @@ def load(coupling, device, h=2e-3, **keys):
   keys = STIFF | {"device": device} | keys
   if coupling == "resident":
     keys["resident"] = "true"
-  xml = windowed.scene(coupling != "nodal", keys=keys, h=h, condim=1)
-  m = mujoco.MjModel.from_xml_string(xml)
-  d = mujoco.MjData(m)
-  return m, d, palpate.Organ(m, d, "organ")
+  return scenes.load(scenes.probed(coupling != "nodal", keys=keys, h=h, condim=1))
 
 
 def masses(organ):
-  if organ._organ.windows:
-    return organ._organ.mass
+  if organ.config.window:
+    return scenes.workspace(organ).organ.mass
   return np.full(organ.nvert, 0.1 / organ.nvert)
 
 
 @pytest.mark.parametrize("coupling", COUPLINGS)
 def test_the_step_is_implicit_in_the_contact_forces_that_the_step_finds(coupling, device):
   m, d, organ = load(coupling, device, bend=0)
-  step = exact.Step(
-    exact.Elastic(organ._organ.mesh, organ.config), masses(organ), np.ones(organ.nvert, bool)
-  )
+  mesh = scenes.workspace(organ).organ.mesh
+  step = exact.Step(exact.Elastic(mesh, organ.config), masses(organ), np.ones(organ.nvert, bool))
   seen = 0
   u, v, before = np.zeros((3, organ.nvert, 3))
   for _ in range(60):
-    windowed.drive(m, d, 1)
+    scenes.drive(m, d, 1)
     force = organ.contact_force
     change = np.abs(force - before).max()
     if change > 0.02 * max(np.abs(force).max(), 0.1):
@@ -57,7 +52,7 @@ def excess(m, d, organ, steps):
   x = organ.xpos
   mass = masses(organ)[:, None]
   for _ in range(steps):
-    windowed.drive(m, d, 1)
+    scenes.drive(m, d, 1)
     each = organ.contact_force * (organ.xpos - x)
     work, gross, x = work + each.sum(), gross + np.abs(each).sum(), organ.xpos
     most = max(most, organ.energy + 0.5 * (mass * organ.xvel**2).sum() - work)
@@ -96,15 +91,15 @@ def test_the_contact_force_of_stiff_tissue_comes_to_rest(device):
 
 def test_tissue_is_stiff_for_a_time_step(device):
   soft = load("nodal", device, h=1e-3, young=3e4, foundation=1e4)
-  assert not soft[2]._space.stiff
-  assert load("window", device)[2]._space.stiff
+  assert not scenes.workspace(soft[2]).stiff
+  assert scenes.workspace(load("window", device)[2]).stiff
   m, d, organ = soft
   m.opt.timestep = 2e-2
   mujoco.mj_step(m, d, 2)
-  assert organ._space.stiff
+  assert scenes.workspace(organ).stiff
   m.opt.timestep = 1e-3
   mujoco.mj_step(m, d, 2)
-  assert not organ._space.stiff
+  assert not scenes.workspace(organ).stiff
 
 
 def test_a_light_organ_is_not_heavier_for_its_window(device):
@@ -117,15 +112,15 @@ def test_a_light_organ_is_not_heavier_for_its_window(device):
 @pytest.mark.parametrize("coupling", COUPLINGS)
 def test_a_saved_state_goes_on_to_the_bit(coupling, device):
   m, d, organ = load(coupling, device)
-  windowed.drive(m, d, 25)
+  scenes.drive(m, d, 25)
   kind = mujoco.mjtState.mjSTATE_INTEGRATION
   saved = np.zeros(mujoco.mj_stateSize(m, kind))
   organ.sync()
   mujoco.mj_getState(m, d, saved, kind)
-  expected = windowed.drive(m, d, 20), organ.xpos
+  expected = scenes.drive(m, d, 20), organ.xpos
   mujoco.mj_resetData(m, d)
   mujoco.mj_setState(m, d, saved, kind)
-  found = windowed.drive(m, d, 20), organ.xpos
+  found = scenes.drive(m, d, 20), organ.xpos
   assert np.abs(expected[0]).max() > 0.1
   for a, b in zip(found, expected, strict=True):
     np.testing.assert_array_equal(a, b)

@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from palpate.tissue import energy, solver
+from palpate.tissue import energy
+from palpate.tissue import step as stepping
 
 MASS = 0.005  # of the shell [kg]
 
@@ -21,18 +22,18 @@ def test_a_thick_shell_gains_no_energy_and_comes_to_rest(scenes, start, h):
   # normals alone the energy grew 20 to 3000 times.
   points, elem = scenes.sphere(3)
   config = {"young": (1e6,), "thickness": 0.01, "bend": 1.0, "damping": 2e-4, "poisson": 0.3}
-  mesh, settings, s, state = scenes.kernels(points, elem, foundation=2e6, **config)
+  mesh, settings, body = scenes.kernels(points, elem, foundation=2e6, **config)
   mass = MASS / mesh.nvert
-  row = [[h, h * h + h * settings.damping, MASS * (9.81 * solver.REST * h) ** 2, 0]]
-  state.step.assign(np.array(row, np.float32))
-  scenes.put(s, state.mass, np.array(mass))
+  row = [[h, h * h + h * settings.damping, MASS * (9.81 * stepping.REST * h) ** 2, 0]]
+  body.state.step.assign(np.array(row, np.float32))
+  scenes.put(body, body.state.mass, np.array(mass))
   u, v = _start(points, start), np.zeros_like(points)
   energies = [energy.total(mesh, settings, u)]
   for n in range(60):
-    for array, values in ((state.pos, u), (state.vel, v)):
-      scenes.put(s, array, values)
-    solver.step(s, state)
-    v += scenes.get(s, state.dvel)
+    for array, values in ((body.state.disp, u), (body.state.vel, v)):
+      scenes.put(body, array, values)
+    stepping.step(body)
+    v += scenes.get(body, body.state.dvel)
     u += h * v
     if n % 5 == 4:
       energies.append(energy.total(mesh, settings, u) + 0.5 * mass * (v * v).sum())
@@ -45,7 +46,7 @@ def test_the_stabilising_stiffness_acts_on_the_change_of_velocity_only(scenes, h
   # A free thick shell spins on: K v of a rotation is zero, and the added stiffness not in it.
   points, elem = scenes.sphere(2)
   config = {"young": (1e5,), "thickness": 0.01, "bend": 1.0, "damping": 0.01}
-  _, _, s, state = scenes.kernels(points, elem, **config)
+  _, _, body = scenes.kernels(points, elem, **config)
   v = np.cross([0, 0, 0.1], points)  # slow: no stretch to speak of
-  found = scenes.step(s, state, h, np.zeros_like(points), v, 1e-4)
+  found = scenes.step(body, h, np.zeros_like(points), v, 1e-4)
   assert np.abs(found).max() < 1e-3 * np.abs(v).max()

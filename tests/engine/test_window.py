@@ -9,16 +9,8 @@ import mujoco
 import numpy as np
 import palpate
 import pytest
-from palpate.tissue import mesh as topology
-from windowed import drive, scene
-
-
-def nodal_masses(m, organ):
-  """Gives a nodal organ the area-lumped masses of a windowed one."""
-  area = topology.vertex_areas(organ.xpos0, organ.elem)
-  bodies = organ._organ.body
-  m.body_mass[bodies] = 0.1 * area / area.sum()
-  mujoco.mj_setConst(m, mujoco.MjData(m))
+from palpate.engine import layout
+from scenes import drive, lump, probed
 
 
 # With friction the tip sticks on the facets and jumps off them from 0.18 s on, in a 20 us reference
@@ -26,12 +18,12 @@ def nodal_masses(m, organ):
 @pytest.mark.parametrize(("condim", "steps"), [(1, 350), (3, 170), (4, 170), (6, 170)])
 @pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
 def test_window_moves_as_nodal_dofs_do(condim, steps, cone):
-  m = mujoco.MjModel.from_xml_string(scene(False, condim=condim, cone=cone))
+  m = mujoco.MjModel.from_xml_string(probed(False, condim=condim, cone=cone))
   d = mujoco.MjData(m)
   organ = palpate.Organ(m, d, "organ")
-  nodal_masses(m, organ)
+  lump(organ)
   reference = drive(m, d, steps)
-  mw = mujoco.MjModel.from_xml_string(scene(condim=condim, cone=cone))
+  mw = mujoco.MjModel.from_xml_string(probed(condim=condim, cone=cone))
   dw = mujoco.MjData(mw)
   windowed = palpate.Organ(mw, dw, "organ")
   force = drive(mw, dw, steps)
@@ -46,7 +38,7 @@ def test_window_moves_as_nodal_dofs_do(condim, steps, cone):
 def test_static_force_does_not_depend_on_the_step():
   forces = []
   for h in (5e-4, 1e-3, 2e-3):
-    m = mujoco.MjModel.from_xml_string(scene(h=h))
+    m = mujoco.MjModel.from_xml_string(probed(h=h))
     d = mujoco.MjData(m)
     d.ctrl[0] = -0.006
     for _ in range(round(0.8 / h)):
@@ -56,7 +48,7 @@ def test_static_force_does_not_depend_on_the_step():
 
 
 def test_state_restores_to_the_bit():
-  m = mujoco.MjModel.from_xml_string(scene())
+  m = mujoco.MjModel.from_xml_string(probed())
   d = mujoco.MjData(m)
   drive(m, d, 150)
   kind = mujoco.mjtState.mjSTATE_INTEGRATION
@@ -70,7 +62,7 @@ def test_state_restores_to_the_bit():
 
 
 def test_reset_starts_over():
-  m = mujoco.MjModel.from_xml_string(scene())
+  m = mujoco.MjModel.from_xml_string(probed())
   d = mujoco.MjData(m)
   first = drive(m, d, 200)
   mujoco.mj_resetData(m, d)
@@ -78,7 +70,7 @@ def test_reset_starts_over():
 
 
 def test_two_data_of_one_model_take_turns():
-  m = mujoco.MjModel.from_xml_string(scene())
+  m = mujoco.MjModel.from_xml_string(probed())
   d = mujoco.MjData(m)
   alone = drive(m, d, 160)
   first, second = mujoco.MjData(m), mujoco.MjData(m)
@@ -91,7 +83,7 @@ def test_two_data_of_one_model_take_turns():
 
 
 def test_copied_data_continues_alike():
-  m = mujoco.MjModel.from_xml_string(scene())
+  m = mujoco.MjModel.from_xml_string(probed())
   d = mujoco.MjData(m)
   drive(m, d, 150)
   other = copy.copy(d)
@@ -118,10 +110,14 @@ def test_two_steps_back_tell_where_the_solve_starts(window):
   """Without the dv before the last, the solve takes more iterations to the same motion."""
   forces, counts = [], []
   for forget in (False, True):
-    m = mujoco.MjModel.from_xml_string(scene(window=window, keys={"tolerance": 1e-5}))
+    m = mujoco.MjModel.from_xml_string(probed(window=window, keys={"tolerance": 1e-5}))
     d = mujoco.MjData(m)
     organ = palpate.Organ(m, d, "organ")
-    before = slice(9 * organ.nvert, 12 * organ.nvert) if window else slice(-1 - 3 * organ.nvert, -1)
+    if window:
+      where = layout.spans(layout.Motion, {"nvert": organ.nvert})
+    else:
+      where = layout.spans(layout.NodalState, {"nfree": 3 * organ.nvert})
+    before = where["before"]
     forces.append([])
     counts.append([])
     for _ in range(150):
@@ -135,15 +131,15 @@ def test_two_steps_back_tell_where_the_solve_starts(window):
 
 
 def test_rotated_frame_gives_the_same_force():
-  plain = mujoco.MjModel.from_xml_string(scene())
-  turned = mujoco.MjModel.from_xml_string(scene(frame='pos=".1 .2 .3" euler="40 20 70"'))
+  plain = mujoco.MjModel.from_xml_string(probed())
+  turned = mujoco.MjModel.from_xml_string(probed(frame='pos=".1 .2 .3" euler="40 20 70"'))
   forces = [drive(m, mujoco.MjData(m), 150) for m in (plain, turned)]
   # Rounding differs under the rotation, and friction amplifies it.
   np.testing.assert_allclose(forces[1][:110], forces[0][:110], atol=1e-6 * np.abs(forces[0]).max())
 
 
 def test_far_tool_leaves_the_organ_at_rest_and_finds_it_after_a_jump():
-  m = mujoco.MjModel.from_xml_string(scene())
+  m = mujoco.MjModel.from_xml_string(probed())
   d = mujoco.MjData(m)
   organ = palpate.Organ(m, d, "organ")
   d.qpos[-2] = d.ctrl[0] = 0.5
@@ -158,7 +154,7 @@ def test_far_tool_leaves_the_organ_at_rest_and_finds_it_after_a_jump():
 
 
 def test_deformed_surface_reaches_the_renderer():
-  m = mujoco.MjModel.from_xml_string(scene())
+  m = mujoco.MjModel.from_xml_string(probed())
   d = mujoco.MjData(m)
   drive(m, d, 110)
   organ = palpate.Organ(m, d, "organ")
@@ -174,7 +170,7 @@ def test_deformed_surface_reaches_the_renderer():
 
 
 def test_set_state_and_reset():
-  m = mujoco.MjModel.from_xml_string(scene())
+  m = mujoco.MjModel.from_xml_string(probed())
   d = mujoco.MjData(m)
   organ = palpate.Organ(m, d, "organ")
   moved = organ.xpos0 + np.array([0, 0, 0.001])
@@ -198,7 +194,7 @@ def test_set_state_and_reset():
 )
 def test_bad_windows_are_named(keys, words):
   with pytest.raises(ValueError) as error:
-    mujoco.MjModel.from_xml_string(scene(keys=keys))
+    mujoco.MjModel.from_xml_string(probed(keys=keys))
   for word in words:
     assert word in str(error.value)
 
@@ -206,7 +202,7 @@ def test_bad_windows_are_named(keys, words):
 @pytest.mark.parametrize("count", ["9 6 1", "18 12 1"])  # little room, and much to spare
 def test_window_touches_what_nodal_dofs_touch(count):
   found = []
-  for text in (scene(False, condim=1), scene(condim=1, count=count)):
+  for text in (probed(False, condim=1), probed(condim=1, count=count)):
     m = mujoco.MjModel.from_xml_string(text)
     d = mujoco.MjData(m)
     d.qpos[-2:] = 0.002, -0.012

@@ -9,7 +9,7 @@ import numpy as np
 import palpate
 import pytest
 from palpate.app import cli, figures
-from windowed import drive, scene
+from scenes import drive, probed
 
 CAMERA = '<camera name="side" pos="0 -.2 .12" xyaxes="1 0 0 0 .5 .9"/>'
 LIT = "<worldbody><light pos='.1 -.2 .3' dir='-.3 .5 -.8'/>" + CAMERA
@@ -32,13 +32,13 @@ def picture(m, d) -> np.ndarray:
 
 def draw():
   """Prints how a windowed organ's picture differs from a nodal one's, and from that at rest."""
-  m = mujoco.MjModel.from_xml_string(lit(scene()))
+  m = mujoco.MjModel.from_xml_string(lit(probed()))
   d = mujoco.MjData(m)
   mujoco.mj_forward(m, d)
   still = picture(m, d)
   drive(m, d, 110)
   pressed = picture(m, d)
-  n = mujoco.MjModel.from_xml_string(lit(scene(False)))
+  n = mujoco.MjModel.from_xml_string(lit(probed(False)))
   other = mujoco.MjData(n)
   palpate.Organ(n, other, "organ").set_state(palpate.Organ(m, d, "organ").xpos)
   other.qpos[-2:] = d.qpos[-2:]
@@ -78,7 +78,7 @@ def test_a_windowed_organ_looks_like_a_nodal_one(backend):
 
 
 def test_a_snapshot_brings_the_shape_back():
-  m = mujoco.MjModel.from_xml_string(scene())
+  m = mujoco.MjModel.from_xml_string(probed())
   d = mujoco.MjData(m)
   organ = palpate.Organ(m, d, "organ")
   drive(m, d, 110)
@@ -98,7 +98,7 @@ def test_a_snapshot_brings_the_shape_back():
       first = m.flex_vertadr[flex]
       return d.flexvert_xpos[first : first + organ.nvert].copy()
 
-  np.testing.assert_allclose(figures._frame(m, d, kept, Renderer()), shape, atol=1e-7)
+  np.testing.assert_allclose(figures.frame(m, d, kept, Renderer()), shape, atol=1e-7)
 
 
 @pytest.fixture
@@ -115,7 +115,7 @@ def test_picture_of_a_press_with_a_window(tmp_path):
   images = []
   for coupling in ("nodal", "window"):
     words = ["run", "press", "--coupling", coupling, "--hold", "0.01", "--depth", ".008"]
-    words += ["--speed", ".3", "--out", str(tmp_path / coupling), "--h", "0.002", "--picture"]
+    words += ["--speed", ".1", "--out", str(tmp_path / coupling), "--h", "0.002", "--picture"]
     assert cli.main(words) == 0
     images.append(imageio.imread(tmp_path / coupling / "press_deepest.png").astype(int))
   assert np.abs(images[0] - images[1]).mean() < 0.3

@@ -1,13 +1,12 @@
 """Windows and what people do with them: an error that says what is wrong, or correct motion."""
 
 import re
-import threading
 
 import mujoco
 import numpy as np
 import palpate
 import pytest
-from windowed import drive, scene
+from scenes import drive, load, probed, slots
 
 
 def refused(text: str, *words: str):
@@ -17,21 +16,15 @@ def refused(text: str, *words: str):
     assert word in str(error.value)
 
 
-def load(text: str):
-  m = mujoco.MjModel.from_xml_string(text)
-  d = mujoco.MjData(m)
-  return m, d, palpate.Organ(m, d, "organ")
-
-
 def edited(old: str, new: str, **options) -> str:
-  text = scene(**options)
+  text = probed(**options)
   assert old in text
   return text.replace(old, new)
 
 
 def second_organ(window: str) -> str:
   """Returns a scene of two organs, the other with its own window or the first one's."""
-  text = scene()
+  text = probed()
   body = re.search(r'<body name="organ">.*?</body>', text, re.S).group(0)
   flex = re.search(r'<flexcomp name="window".*?</flexcomp>', text, re.S).group(0)
   other = body.replace('name="organ"', 'name="other"').replace(
@@ -42,20 +35,20 @@ def second_organ(window: str) -> str:
 
 
 def test_a_name_that_does_not_exist():
-  refused(scene(keys={"window": "nothing"}), "'organ'", "'nothing'", "does not exist", "'window'")
+  refused(probed(keys={"window": "nothing"}), "'organ'", "'nothing'", "does not exist", "'window'")
 
 
 def test_a_name_that_is_no_flexcomp():
-  refused(scene(keys={"window": "tool"}), "'organ'", "'tool'", "expected a flexcomp")
+  refused(probed(keys={"window": "tool"}), "'organ'", "'tool'", "expected a flexcomp")
 
 
 def test_the_organ_as_its_own_window():
-  refused(scene(keys={"window": "organ"}), "organ 'organ': window 'organ'", "rigid")
+  refused(probed(keys={"window": "organ"}), "organ 'organ': window 'organ'", "rigid")
 
 
 def test_a_window_without_free_vertices():
   pinned = '<pin gridrange="0 0 8 5"/><contact '
-  text = scene()
+  text = probed()
   at = text.index('name="window"')
   text = text[:at] + text[at:].replace("<contact ", pinned, 1)
   refused(text, "organ 'organ': window 'window'", "pinned")
@@ -68,7 +61,7 @@ def test_a_rigid_window():
 
 
 def test_a_window_with_some_pins():
-  text = scene()
+  text = probed()
   at = text.index('name="window"')
   text = text[:at] + text[at:].replace("<contact ", '<pin id="0"/><contact ', 1)
   refused(text, "organ 'organ': window 'window'", "pins")
@@ -80,7 +73,7 @@ def test_a_volumetric_window():
 
 
 def test_a_window_claimed_twice():
-  refused(scene(keys={"window": "window window"}), "'window'", "claimed by this organ")
+  refused(probed(keys={"window": "window window"}), "'window'", "claimed by this organ")
 
 
 def test_a_window_of_two_organs():
@@ -91,7 +84,7 @@ def test_a_window_of_two_organs():
 
 
 def test_a_window_on_a_nodal_organ():
-  refused(scene(False, keys={"window": "organ", "mass": 0.1}), "rigid flexcomp", "expected one")
+  refused(probed(False, keys={"window": "organ", "mass": 0.1}), "rigid flexcomp", "expected one")
 
 
 def test_too_many_geoms():
@@ -101,30 +94,19 @@ def test_too_many_geoms():
 
 def test_few_elements_hold_fewer_nodes():
   # Two rows have 52 triangles for 54 vertices: 28 nodes are sure to have no more.
-  m, d, organ = load(scene(count="27 2 1", condim=1))
+  m, d, organ = load(probed(count="27 2 1", condim=1))
   force = drive(m, d, 100)[-1, 0]
-  assert (organ._space.views["placed"].numpy() >= 0).sum() == 28
+  assert (slots(organ) >= 0).sum() == 28
   assert organ.window_overflow == (0, 0)
   assert organ.window_warning is None
-  m, d, organ = load(scene(False, condim=1))
+  m, d, organ = load(probed(False, condim=1))
   assert force == pytest.approx(drive(m, d, 100)[-1, 0], rel=0.01)
-
-
-def test_two_data_in_two_threads():
-  m, d, _ = load(scene())
-  other = mujoco.MjData(m)
-  mujoco.mj_step(m, d)
-  thread = threading.Thread(target=mujoco.mj_step, args=(m, other))
-  thread.start()
-  thread.join()
-  error = palpate.Organ(m, other, "organ").error
-  assert error and "copy.copy(model)" in error
 
 
 @pytest.mark.parametrize("target", [(0.0, 0.5), (0.3, -0.2), (-0.1, -0.0567)])
 def test_a_teleporting_tool(target):
   """The tool jumps away, far into the organ, or out at the other side, and back."""
-  m, d, organ = load(scene())
+  m, d, organ = load(probed())
   d.ctrl[0] = -0.006
   for _ in range(100):
     mujoco.mj_step(m, d)
@@ -138,7 +120,7 @@ def test_a_teleporting_tool(target):
   d.ctrl[:] = -0.006, 0
   for _ in range(600):
     mujoco.mj_step(m, d)
-  still = load(scene())
+  still = load(probed())
   still[1].ctrl[0] = -0.006
   for _ in range(850):
     mujoco.mj_step(*still[:2])
@@ -147,7 +129,7 @@ def test_a_teleporting_tool(target):
 
 
 def test_a_jump_into_the_middle_lets_the_tool_out_without_an_explosion():
-  m, d, organ = load(scene())
+  m, d, organ = load(probed())
   d.qpos[-2] = d.ctrl[0] = -0.05
   for _ in range(200):
     mujoco.mj_step(m, d)
@@ -157,7 +139,7 @@ def test_a_jump_into_the_middle_lets_the_tool_out_without_an_explosion():
 
 def scaled(factor: float) -> str:
   """Returns the scene with all lengths times `factor`: so are displacements, and forces by f^2."""
-  text = scene(keys={
+  text = probed(keys={
     "thickness": 0.002 * factor, "foundation": 1e4 / factor, "mass": 0.1 * factor
   })  # fmt: skip
 

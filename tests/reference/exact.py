@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from palpate.tissue import config as configuration
 from palpate.tissue import mesh as topology
-from palpate.tissue import solver
+from palpate.tissue import step as stepping
 from palpate.tissue.config import Config
 from palpate.tissue.mesh import Mesh
 from scipy import sparse
@@ -224,7 +224,7 @@ class Step:
     newton: int = 1,
     scheme: str = "implicit",
   ) -> np.ndarray:
-    """Returns the change of velocity, (nvert, 3); see `palpate.tissue.elastic` for the equations.
+    """Returns the change of velocity, (nvert, 3); see `native/elastic.h` for the equations.
 
     Args:
       h: time step [s]
@@ -256,8 +256,8 @@ class Step:
     return dv
 
   def _share(self, move: np.ndarray) -> float:
-    """Returns how much of a move the first iteration makes; see `palpate.tissue.solver`."""
+    """Returns how much of a move the first iteration makes; see `palpate.tissue.step`."""
     i, j = self.edge.T
     length = np.linalg.norm(self.elastic.mesh.rest[j] - self.elastic.mesh.rest[i], axis=1)
     change = (np.linalg.norm(move[j] - move[i], axis=1) / length).max()
-    return min(1.0, solver.AHEAD / max(change, 1e-300))
+    return min(1.0, stepping.AHEAD / max(change, 1e-300))

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import palpate
 import pytest
-from benchmarks import scene, stability
+from benchmarks import judge, scene
 from palpate.tissue import energy
 from palpate.tissue import mesh as topology
 
@@ -50,52 +50,52 @@ def _gradient(mesh, config, u, step=1e-7):
 @pytest.mark.parametrize("size", [0.01, 0.3])
 @pytest.mark.parametrize("name", list(TERMS))
 def test_force_is_minus_the_gradient_of_the_energy(scenes, device, name, size):
-  mesh, config, s, state = _surface(scenes, name, device=device)
+  mesh, config, body = _surface(scenes, name, device=device)
   u = _displacement(mesh, size)
   expected = -_gradient(mesh, config, u)
-  found = scenes.force(s, state, u)
+  found = scenes.force(body, u)
   # float32 kernels; the differences are good to 1e-7.
   np.testing.assert_allclose(found, expected, atol=3e-5 * np.abs(expected).max())
 
 
 def test_bending_force_of_a_sharply_folded_plate(scenes, device):
   points, elem = scenes.triangular(0.1, 0.05, 8, 5)
-  mesh, config, s, state = scenes.kernels(points, elem, device=device, young=(1e-6,), bend=1e12)
+  mesh, config, body = scenes.kernels(points, elem, device=device, young=(1e-6,), bend=1e12)
   angle = np.deg2rad(130)
   x = np.maximum(points[:, 0] - 0.05, 0)
   u = np.zeros_like(points)
   u[:, 0], u[:, 2] = x * (np.cos(angle) - 1), x * np.sin(angle)
   u += _displacement(mesh, 0.005)
   expected = -_gradient(mesh, config, u)
-  found = scenes.force(s, state, u)
+  found = scenes.force(body, u)
   np.testing.assert_allclose(found, expected, atol=1e-4 * np.abs(expected).max())
 
 
 def test_force_with_a_modulus_of_each_element(scenes, device):
   nelem = 80
   young = tuple(YOUNG * np.random.RandomState(1).uniform(0.1, 3, nelem))
-  mesh, config, s, state = _surface(scenes, "membrane", young=young, bend=5.0, device=device)
+  mesh, config, body = _surface(scenes, "membrane", young=young, bend=5.0, device=device)
   assert mesh.nelem == nelem
   u = _displacement(mesh, 0.1)
   expected = -_gradient(mesh, config, u)
-  found = scenes.force(s, state, u)
+  found = scenes.force(body, u)
   np.testing.assert_allclose(found, expected, atol=3e-5 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("elements", [{}, {"elements": "spring", "stiffness": 20.0}])
 def test_force_on_an_open_surface(scenes, device, elements):
   points, elem = scenes.triangular(0.1, 0.05, 6, 4, jitter=0.2)
-  mesh, config, s, state = scenes.kernels(points, elem, device=device, bend=10.0, **elements)
+  mesh, config, body = scenes.kernels(points, elem, device=device, bend=10.0, **elements)
   u = _displacement(mesh, 0.1)
   expected = -_gradient(mesh, config, u)
-  found = scenes.force(s, state, u)
+  found = scenes.force(body, u)
   np.testing.assert_allclose(found, expected, atol=3e-5 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("name", [name for name in TERMS if name not in ("pressure", "all")])
 def test_no_force_at_rest_to_the_bit(scenes, device, name):
-  mesh, _, s, state = _surface(scenes, name, device=device)
-  found = scenes.force(s, state, np.zeros((mesh.nvert, 3)))
+  mesh, _, body = _surface(scenes, name, device=device)
+  found = scenes.force(body, np.zeros((mesh.nvert, 3)))
   # The volume is a float32 sum: 1e-6 of it, against a force of bulk times area.
   atol = 1e-5 * 3e3 * SCALE**2 if name == "volume" else 0
   np.testing.assert_allclose(found, 0, atol=atol)
@@ -103,35 +103,36 @@ def test_no_force_at_rest_to_the_bit(scenes, device, name):
 
 @pytest.mark.parametrize("name", ["membrane", "spring", "bending", "volume"])
 def test_a_rigid_motion_gives_no_force(scenes, device, name):
-  mesh, _, s, state = _surface(scenes, name, device=device)
+  mesh, _, body = _surface(scenes, name, device=device)
   a, b = 0.8, -1.3
   turn = np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]])
   turn = turn @ np.array([[1, 0, 0], [0, np.cos(b), -np.sin(b)], [0, np.sin(b), np.cos(b)]])
   x = mesh.rest - mesh.rest.mean(axis=0)
-  rigid = scenes.force(s, state, x @ turn.T - x + [0.01, 0.02, -0.03])
-  strained = scenes.force(s, state, _displacement(mesh, 0.1))
+  rigid = scenes.force(body, x @ turn.T - x + [0.01, 0.02, -0.03])
+  strained = scenes.force(body, _displacement(mesh, 0.1))
   # float32 keeps 7 digits of the coordinates, and a strain of 1e-7 where one of 0.1 is usual.
   np.testing.assert_allclose(rigid, 0, atol=2e-5 * np.abs(strained).max())
 
 
 @pytest.mark.parametrize("name", FREE)
 def test_internal_forces_have_no_resultant_and_no_torque(scenes, device, name):
-  mesh, _, s, state = _surface(scenes, name, device=device)
+  mesh, _, body = _surface(scenes, name, device=device)
   u = _displacement(mesh, 0.1)
-  found = scenes.force(s, state, u)
+  found = scenes.force(body, u)
   x = mesh.rest - mesh.rest.mean(axis=0) + u
   largest = np.abs(found).sum()
   assert np.abs(found.sum(axis=0)).max() < 1e-6 * largest
   assert np.abs(np.cross(x, found).sum(axis=0)).max() < 1e-6 * largest * SCALE
 
 
-def _dense(s, state):
+def _dense(body):
   """Returns the matrix A that the solver multiplies with, (3 nvert, 3 nvert) [kg]."""
-  n = s.nnode
+  n = body.shape.nnode
   matrix = np.zeros((n, 3, n, 3))
-  slot, fan = s.slot_adr.numpy(), s.fan_node.numpy()
-  block, diag = state.block.numpy()[0].astype(float), state.diag.numpy()[0].astype(float)
-  g = float(state.step.numpy()[0, 1])
+  slot, fan = body.shape.slot_adr.numpy(), body.shape.fan_node.numpy()
+  block = body.system.block.numpy()[0].astype(float)
+  diag = body.system.diag.numpy()[0].astype(float)
+  g = float(body.state.step.numpy()[0, 1])
   for i in range(n):
     slice_, lane = divmod(i, 8)
     matrix[i, :, i, :] += np.eye(3) * diag[slice_, lane]
@@ -142,15 +143,15 @@ def _dense(s, state):
       matrix[i, :, other, :] += k
       matrix[i, :, i, :] -= k
   matrix = matrix.reshape(3 * n, 3 * n)
-  node = np.repeat(3 * s.node.numpy(), 3) + np.tile(np.arange(3), s.nvert)
+  node = np.repeat(3 * body.shape.node.numpy(), 3) + np.tile(np.arange(3), body.shape.nvert)
 
   def per_node(array):
     values = array.numpy()[0].astype(float)
     return np.moveaxis(values, -1, 1).reshape(-1, 3)
 
-  if s.has_bending:
-    adr, col = s.bend_adr.numpy(), s.bend_node.numpy()
-    gain, normal = s.bend_gain.numpy().astype(float), per_node(state.normal)
+  if body.has_bending:
+    adr, col = body.shape.bend_adr.numpy(), body.shape.bend_node.numpy()
+    gain, normal = body.tissue.bend_gain.numpy().astype(float), per_node(body.system.normal)
     plate = np.zeros((n, n))
     for i in range(n):
       slice_, lane = divmod(i, 8)
@@ -158,9 +159,9 @@ def _dense(s, state):
         plate[i, col[row, lane]] += gain[row, lane]
     whole = plate[:, None, :, None] * normal[:, :, None, None] * normal[None, None]
     matrix += g * whole.reshape(3 * n, 3 * n)
-  if s.bulk:
-    area = per_node(state.areavec).ravel()
-    matrix += g * s.bulk / s.volume0 / 36 * np.outer(area, area)
+  if body.number("bulk"):
+    area = per_node(body.system.areavec).ravel()
+    matrix += g * body.number("bulk") / body.shape.volume0 / 36 * np.outer(area, area)
   return matrix[np.ix_(node, node)]
 
 
@@ -173,10 +174,10 @@ def _tensile(mesh, name):
 @pytest.mark.parametrize("name", ["membrane", "spring", "foundation"])
 def test_matrix_is_the_derivative_of_the_force_in_tension(scenes, name):
   # With bend = bulk = 0 A - M is (h^2 + h damping) K; at g = 1 and no mass it is K.
-  mesh, config, s, state = _surface(scenes, name)
+  mesh, config, body = _surface(scenes, name)
   u = _tensile(mesh, name)
-  scenes.step(s, state, 1.0, u, beta=0.0)
-  matrix = _dense(s, state) - np.eye(3 * mesh.nvert)
+  scenes.step(body, 1.0, u, beta=0.0)
+  matrix = _dense(body) - np.eye(3 * mesh.nvert)
   scale = np.abs(matrix).max()
   np.testing.assert_allclose(matrix, matrix.T, atol=1e-5 * scale)
   for seed in range(3):
@@ -192,9 +193,9 @@ def test_matrix_is_the_derivative_of_the_force_in_tension(scenes, name):
 def test_bending_matrix_is_the_derivative_at_rest(scenes):
   # A flat plate: out-of-plane stiffness is bending alone.
   points, elem = scenes.triangular(0.1, 0.05, 6, 4)
-  mesh, config, s, state = scenes.kernels(points, elem, young=(1e-6,), bend=1e12)
-  scenes.step(s, state, 1.0, np.zeros_like(points), beta=0.0)
-  matrix = _dense(s, state) - np.eye(3 * mesh.nvert)
+  mesh, config, body = scenes.kernels(points, elem, young=(1e-6,), bend=1e12)
+  scenes.step(body, 1.0, np.zeros_like(points), beta=0.0)
+  matrix = _dense(body) - np.eye(3 * mesh.nvert)
   v = np.zeros_like(points)
   v[:, 2] = np.random.RandomState(0).uniform(-1, 1, mesh.nvert)
   step = 1e-6
@@ -204,9 +205,9 @@ def test_bending_matrix_is_the_derivative_at_rest(scenes):
 
 
 def test_volume_matrix_is_the_derivative_but_for_its_geometric_part(scenes):
-  mesh, config, s, state = _surface(scenes, "volume")
-  scenes.step(s, state, 1.0, np.zeros((mesh.nvert, 3)), beta=0.0)
-  matrix = _dense(s, state) - np.eye(3 * mesh.nvert)
+  mesh, config, body = _surface(scenes, "volume")
+  scenes.step(body, 1.0, np.zeros((mesh.nvert, 3)), beta=0.0)
+  matrix = _dense(body) - np.eye(3 * mesh.nvert)
   v = np.random.RandomState(0).uniform(-1, 1, (mesh.nvert, 3))
   step = 1e-6  # at V = V0 the geometric part is zero
   zero = np.zeros_like(v)
@@ -219,29 +220,29 @@ def test_volume_matrix_is_the_derivative_but_for_its_geometric_part(scenes):
 @pytest.mark.parametrize("name", list(TERMS))
 @pytest.mark.parametrize("factor", [-0.4, 0.2])
 def test_matrix_is_positive_definite_under_compression_too(scenes, name, factor):
-  mesh, _, s, state = _surface(scenes, name)
+  mesh, _, body = _surface(scenes, name)
   centred = mesh.rest - mesh.rest.mean(axis=0)
   u = factor * centred + _displacement(mesh, 0.1)
   mass = 1e-6
-  scenes.step(s, state, 1.0, u, mass=mass, beta=0.0)
-  matrix = _dense(s, state)
+  scenes.step(body, 1.0, u, mass=mass, beta=0.0)
+  matrix = _dense(body)
   lowest = np.linalg.eigvalsh(0.5 * (matrix + matrix.T)).min()
   assert lowest > 0 or lowest > -2e-7 * np.abs(matrix).max()  # float32
 
 
 def test_stiffness_of_a_pinned_vertex_does_not_move_it(scenes, device):
   points, elem = scenes.triangular(0.1, 0.05, 6, 4)
-  mesh, _, s, state = scenes.kernels(points, elem, device=device, pin=(0, 5), bend=1.0)
-  dvel = scenes.step(s, state, 1e-3, _displacement(mesh, 0.05), force=[0, 0, -1])
+  mesh, _, body = scenes.kernels(points, elem, device=device, pin=(0, 5), bend=1.0)
+  dvel = scenes.step(body, 1e-3, _displacement(mesh, 0.05), force=[0, 0, -1])
   np.testing.assert_array_equal(dvel[[0, 5]], 0)
   assert (np.abs(np.delete(dvel, [0, 5], axis=0)).max(axis=1) > 0).all()
 
 
 def test_area_vectors_are_six_times_the_gradient_of_the_volume(scenes):
-  mesh, _, s, state = _surface(scenes, "volume")
+  mesh, _, body = _surface(scenes, "volume")
   u = _displacement(mesh, 0.1)
-  scenes.step(s, state, 1.0, u)
-  found = scenes.get(s, state.areavec) / 6
+  scenes.step(body, 1.0, u)
+  found = scenes.get(body, body.system.areavec) / 6
   x, step = mesh.rest + u, 1e-6
   for i in np.ndindex(3, 3):
     move = np.zeros_like(x)
@@ -258,7 +259,7 @@ def test_a_crushed_organ_does_not_gain_energy(start):
   model = scene.build(mesh, tissue, "implicit", 1e-3)
   data = mujoco.MjData(model)
   organ = palpate.Organ(model, data, "organ")
-  organ.set_state(mesh.rest + stability.start_state(mesh, start))
+  organ.set_state(mesh.rest + judge.start_state(mesh, start))
   at_first = organ.energy
   for _ in range(60):
     mujoco.mj_step(model, data)

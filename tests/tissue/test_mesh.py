@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from palpate.tissue import config as configuration
-from palpate.tissue import energy, mesh
+from palpate.tissue import energy, mesh, order, plate
 from palpate.tissue.config import Config
 
 TETRAHEDRON = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
@@ -80,29 +80,29 @@ def test_rings_go_around_every_vertex_in_the_winding_order(scenes, kind):
 
 def test_node_order_holds_every_vertex_once_in_whole_slices(scenes):
   surface = mesh.build("organ", *scenes.sphere(2))
-  order = mesh.node_order(surface)
-  assert len(order) % 8 == 0
-  assert sorted(order[order >= 0]) == list(range(surface.nvert))
+  vert = order.node_order(surface)
+  assert len(vert) % 8 == 0
+  assert sorted(vert[vert >= 0]) == list(range(surface.nvert))
 
 
 def test_patches_hold_neighbours_together(scenes):
   surface = mesh.build("organ", *scenes.sphere(5))
-  order = mesh.node_order(surface, 256)
-  assert sorted(order[order >= 0]) == list(range(surface.nvert))
+  vert = order.node_order(surface, 256)
+  assert sorted(vert[vert >= 0]) == list(range(surface.nvert))
   patch = np.empty(surface.nvert, int)
-  patch[order[order >= 0]] = np.flatnonzero(order >= 0) // 256
+  patch[vert[vert >= 0]] = np.flatnonzero(vert >= 0) // 256
   edge = surface.elem[:, [0, 1]]
   assert np.mean(patch[edge[:, 0]] != patch[edge[:, 1]]) < 0.12
   # Too few nodes for two patches, and a number that is no multiple of one.
   for nodes in (surface.nvert, 5 * surface.nvert, 104):
-    assert sorted(mesh.node_order(surface, nodes)[order >= 0]) == list(range(surface.nvert))
+    assert sorted(order.node_order(surface, nodes)[vert >= 0]) == list(range(surface.nvert))
 
 
 def _plate(scenes, jitter, nu):
   points, elem = scenes.triangular(0.1, 0.1, 12, 14, jitter)
   surface = mesh.build("organ", points, elem)
   config = Config(young=(12.0,), thickness=1.0, poisson=nu)
-  return surface, config, mesh.hinges(surface, configuration.rigidity(config, len(elem)), nu)
+  return surface, config, plate.hinges(surface, configuration.rigidity(config, len(elem)), nu)
 
 
 @pytest.mark.parametrize("nu", [0.0, 0.45])
@@ -128,7 +128,7 @@ def test_inner_triangles_have_the_energy_of_a_kirchhoff_plate(scenes, jitter, nu
 
 def test_bending_matrix_is_symmetric_positive_and_blind_to_tilts(scenes):
   surface, _, hinge = _plate(scenes, 0.2, 0.3)
-  matrix = mesh.bending_matrix(surface, hinge).toarray()
+  matrix = plate.bending_matrix(surface, hinge).toarray()
   scale = np.abs(matrix).max()
   np.testing.assert_allclose(matrix, matrix.T, atol=1e-12 * scale)
   tilts = np.stack([np.ones(surface.nvert), surface.rest[:, 0], surface.rest[:, 1]], 1)

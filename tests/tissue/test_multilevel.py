@@ -1,14 +1,14 @@
 """The multilevel preconditioner: the same answer as block Jacobi, iterations that do not grow."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 import warp as wp
 from palpate.models import grid
-from palpate.tissue import elastic, hierarchy, solver, types
+from palpate.tissue import body as bodies
+from palpate.tissue import coarse
 from palpate.tissue import mesh as topology
-from palpate.tissue import shape as surface
+from palpate.tissue import shape as making
+from palpate.tissue import step as stepping
 from palpate.tissue.config import Config
 
 H = 1e-3
@@ -43,31 +43,27 @@ def _tube(n: int, m: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _organ(shape, device="cpu", nworld=1, pin=None, scale=np.inf, **config):
-  """Returns mesh, surface with coarse meshes, state with a load on the highest nodes."""
+  """Returns mesh and body with coarse meshes."""
   mesh = topology.build("organ", *shape)
   config = {"young": (3e6,), "poisson": 0.3, "tolerance": 1e-4, "iterations": 2000} | config
   low = mesh.rest[:, 2] < mesh.rest[:, 2].min() + 0.05 * np.ptp(mesh.rest[:, 2])
   pinned = low if pin is None else np.isin(np.arange(mesh.nvert), pin)
-  s = surface.make(mesh, Config(**config), pinned, device, scale)
-  with wp.ScopedDevice(s.device):
-    elastic.calibrate(s, types.make_state(s))
-    d = types.make_state(s, nworld)
-  return mesh, s, d
+  return mesh, making.make(mesh, Config(**config), pinned, device, scale, nworld)
 
 
-def _step(scenes, mesh, s, d, threshold, **state):
+def _step(scenes, mesh, body, threshold, **state):
   """Returns the change of velocity, iterations and residual with a threshold in force."""
-  s.levels.threshold = threshold
+  body.levels.transfer.threshold = threshold
   top = mesh.rest[np.argmax(mesh.rest[:, 2])]
   near = np.linalg.norm(mesh.rest - top, axis=1) < 0.12 * RADIUS
   state = {"u": 0.0, "force": near[:, None] * [0, 0, -1.0] / near.sum()} | state
-  found = scenes.step(s, d, H, mass=MASS / mesh.nvert, **state)
-  return found, *d.status.numpy()[0, :2]
+  found = scenes.step(body, H, mass=MASS / mesh.nvert, **state)
+  return found, *body.system.status.numpy()[0, :2]
 
 
-def _both(scenes, mesh, s, d, **state):
-  jacobi = _step(scenes, mesh, s, d, np.inf, **state)
-  return jacobi, _step(scenes, mesh, s, d, 0.0, **state)
+def _both(scenes, mesh, body, **state):
+  jacobi = _step(scenes, mesh, body, np.inf, **state)
+  return jacobi, _step(scenes, mesh, body, 0.0, **state)
 
 
 TERMS = {
@@ -81,10 +77,10 @@ TERMS = {
 
 @pytest.mark.parametrize("terms", TERMS.values(), ids=TERMS.keys())
 def test_the_answer_is_that_of_block_jacobi(scenes, device, terms):
-  mesh, s, d = _organ(_sphere(13), device, tolerance=1e-6, **terms)
+  mesh, body = _organ(_sphere(13), device, tolerance=1e-6, **terms)
   u = 1e-4 * np.random.RandomState(0).standard_normal(mesh.rest.shape)
   v = 0.1 * np.random.RandomState(1).standard_normal(mesh.rest.shape)
-  (expected, many, _), (found, few, residual) = _both(scenes, mesh, s, d, u=u, v=v)
+  (expected, many, _), (found, few, residual) = _both(scenes, mesh, body, u=u, v=v)
   assert residual <= 1e-6
   assert few < 0.5 * many
   np.testing.assert_allclose(found, expected, atol=1e-4 * np.abs(expected).max())
@@ -96,8 +92,8 @@ SHAPES = {"sphere": _sphere(25), "blob": _blob(4), "tube": _tube(48, 60)}
 @pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES.keys())
 @pytest.mark.parametrize("bend", [0.0, 1.0], ids=["membrane", "bending"])
 def test_uneven_and_open_meshes_take_few_iterations_too(scenes, device, shape, bend):
-  mesh, s, d = _organ(shape, device, bend=bend)
-  (expected, many, _), (found, few, _) = _both(scenes, mesh, s, d)
+  mesh, body = _organ(shape, device, bend=bend)
+  (expected, many, _), (found, few, _) = _both(scenes, mesh, body)
   assert few <= 40
   assert few < 0.25 * many
   np.testing.assert_allclose(found, expected, atol=5e-3 * np.abs(expected).max())
@@ -108,8 +104,8 @@ def test_iterations_hardly_grow_with_the_nodes(scenes, device, bend):
   # Block Jacobi's grow as the square root of nodes times stiffness.
   count = {}
   for frequency in (13, 25, 50):
-    mesh, s, d = _organ(_sphere(frequency), device, young=(3e5,), bend=bend)
-    count[frequency] = [int(result[1]) for result in _both(scenes, mesh, s, d)]
+    mesh, body = _organ(_sphere(frequency), device, young=(3e5,), bend=bend)
+    count[frequency] = [int(result[1]) for result in _both(scenes, mesh, body)]
   assert count[50][0] > 2 * count[13][0]
   assert count[50][1] <= 12 and count[50][1] <= 3 * count[13][1]
 
@@ -118,15 +114,15 @@ def test_iterations_hardly_grow_with_the_nodes(scenes, device, bend):
 @pytest.mark.parametrize("young", [3e4, 3e6])
 @pytest.mark.parametrize("frequency, bound", [(128, 20), (256, 25)], ids=["65538", "262146"])
 def test_large_organs_take_few_iterations(scenes, device, frequency, bound, young):
-  mesh, s, d = _organ(_sphere(frequency), device, young=(young,), bend=0.0)
-  assert _step(scenes, mesh, s, d, 0.0)[1] <= bound
+  mesh, body = _organ(_sphere(frequency), device, young=(young,), bend=0.0)
+  assert _step(scenes, mesh, body, 0.0)[1] <= bound
 
 
 def test_a_pressed_shape_takes_hardly_more_iterations_than_the_rest_shape(scenes, device):
-  mesh, s, d = _organ(_sphere(25), device, young=(3e5,))
+  mesh, body = _organ(_sphere(25), device, young=(3e5,))
   top = np.exp(-((mesh.rest - [0, 0, RADIUS]) ** 2).sum(axis=1) / (0.3 * RADIUS) ** 2)
   count = [
-    _step(scenes, mesh, s, d, 0.0, u=depth * top[:, None] * [0.3, 0.0, -1.0])[1]
+    _step(scenes, mesh, body, 0.0, u=depth * top[:, None] * [0.3, 0.0, -1.0])[1]
     for depth in (0.0, 0.2 * RADIUS)
   ]
   assert count[1] <= 1.5 * count[0] + 2
@@ -134,59 +130,57 @@ def test_a_pressed_shape_takes_hardly_more_iterations_than_the_rest_shape(scenes
 
 @pytest.mark.parametrize("pin", [[], [0], list(range(0, 2502, 40))], ids=["none", "one", "many"])
 def test_pinned_nodes_stay(scenes, device, pin):
-  mesh, s, d = _organ(_sphere(25), device, pin=pin)
-  (expected, many, _), (found, few, _) = _both(scenes, mesh, s, d)
+  mesh, body = _organ(_sphere(25), device, pin=pin)
+  (expected, many, _), (found, few, _) = _both(scenes, mesh, body)
   assert few < 0.5 * many
   np.testing.assert_array_equal(found[pin], 0)
   np.testing.assert_allclose(found, expected, atol=5e-3 * np.abs(expected).max())
 
 
 def test_worlds_are_independent_and_repeat_to_the_bit(scenes, device):
-  mesh, s, many = _organ(_sphere(13), device, nworld=2, bulk=1e4)
-  one = types.make_state(s)
+  mesh, many = _organ(_sphere(13), device, nworld=2, bulk=1e4)
+  one = bodies.worlds(many)
   u = np.stack([1e-4 * np.random.RandomState(k).standard_normal(mesh.rest.shape) for k in (0, 1)])
-  _step(scenes, mesh, s, many, 0.0, u=u)
-  together = [scenes.get(s, many.dvel, world) for world in range(2)]
+  _step(scenes, mesh, many, 0.0, u=u)
+  together = [scenes.get(many, many.state.dvel, world) for world in range(2)]
   for world in range(2):
     for _ in range(2):
-      np.testing.assert_array_equal(
-        _step(scenes, mesh, s, one, 0.0, u=u[world])[0], together[world]
-      )
+      np.testing.assert_array_equal(_step(scenes, mesh, one, 0.0, u=u[world])[0], together[world])
 
 
 def test_a_graph_replays_the_step(scenes, device):
-  mesh, s, d = _organ(_sphere(13), device)
-  expected, _, _ = _step(scenes, mesh, s, d, 0.0)
-  with wp.ScopedDevice(s.device):
-    with wp.ScopedCapture(device=s.device) as capture:
-      solver.step(s, d)
-    d.dvel.zero_()
+  mesh, body = _organ(_sphere(13), device)
+  expected, _, _ = _step(scenes, mesh, body, 0.0)
+  with wp.ScopedDevice(body.device):
+    with wp.ScopedCapture(device=body.device) as capture:
+      stepping.step(body)
+    body.state.dvel.zero_()
     wp.capture_launch(capture.graph)
-  np.testing.assert_array_equal(scenes.get(s, d.dvel), expected)
+  np.testing.assert_array_equal(scenes.get(body, body.state.dvel), expected)
 
 
 def test_uneven_stiffness_reaches_the_coarse_meshes(scenes, device):
   points, elem = _sphere(25)
   hard = points[elem].mean(axis=1)[:, 0] > 0
-  mesh, s, d = _organ((points, elem), device, young=tuple(np.where(hard, 3e6, 3e4)))
-  (_, many, _), (_, few, _) = _both(scenes, mesh, s, d)
+  mesh, body = _organ((points, elem), device, young=tuple(np.where(hard, 3e6, 3e4)))
+  (_, many, _), (_, few, _) = _both(scenes, mesh, body)
   assert few < 0.25 * many
 
 
 def test_a_matrix_out_of_the_smoothers_range_is_solved_all_the_same(scenes, device):
   # The smoother's interval is far too low here: the cycle is indefinite and gives way.
-  mesh, s, d = _organ(_sphere(13), device)
-  expected, many, _ = _step(scenes, mesh, s, d, np.inf)
-  rate = s.levels.rate.numpy()
+  mesh, body = _organ(_sphere(13), device)
+  expected, many, _ = _step(scenes, mesh, body, np.inf)
+  rate = body.levels.transfer.rate.numpy()
   rate[:, 1:3] *= 0.3
-  s.levels.rate.assign(rate)
-  found, count, residual = _step(scenes, mesh, s, d, 0.0)
+  body.levels.transfer.rate.assign(rate)
+  found, count, residual = _step(scenes, mesh, body, 0.0)
   assert residual <= 1e-4 and count <= many + 5
   np.testing.assert_allclose(found, expected, atol=5e-3 * np.abs(expected).max())
 
 
 def test_soft_and_small_organs_do_without(scenes):
-  # sqrt(condition) iterations are few there, and fewer on a membrane: see `levels.pay`.
+  # sqrt(condition) iterations are few there, and fewer on a membrane: see `coarse.pay`.
   scale = (H * H + H * 0.002) / (MASS / 678)
   thick = {"thickness": 0.004, "scale": scale}
   assert _organ(_sphere(13), young=(3e3,), **thick)[1].levels is None
@@ -195,16 +189,15 @@ def test_soft_and_small_organs_do_without(scenes):
 
 
 def test_a_shorter_step_uses_block_jacobi_by_itself(scenes, device):
-  mesh, s, d = _organ(_sphere(13), device, young=(3e5,))
-  s = dataclasses.replace(s)
-  threshold = s.levels.threshold = 5.0
+  mesh, body = _organ(_sphere(13), device, young=(3e5,))
+  threshold = body.levels.transfer.threshold = 5.0
 
   def iterations(h, threshold):
-    s.levels.threshold = threshold
+    body.levels.transfer.threshold = threshold
     force = np.zeros((mesh.nvert, 3))
     force[0] = 1.0
-    scenes.step(s, d, h, np.zeros((mesh.nvert, 3)), mass=MASS / mesh.nvert, force=force)
-    return d.status.numpy()[0, 0]
+    scenes.step(body, h, np.zeros((mesh.nvert, 3)), mass=MASS / mesh.nvert, force=force)
+    return body.system.status.numpy()[0, 0]
 
   assert iterations(1e-3, threshold) == iterations(1e-3, 0.0) < iterations(1e-3, np.inf)
   assert iterations(1e-5, threshold) == iterations(1e-5, np.inf)
@@ -215,17 +208,17 @@ def test_stiff_organs_run_in_mujoco_with_coarse_meshes(scenes):
   for young in (3e3, 3e6):
     keys = {"young": young, "bulk": 1e4, "thickness": 0.004}
     model, data, organ = scenes.load(scenes.press(subdivisions=3, **keys))
-    found[young] = organ._organ.surface.levels
+    found[young] = scenes.workspace(organ).organ.still.levels
     scenes.run(model, data, 30, deepest=0.001)
     assert organ.error is None and organ.residual <= 1e-4
-  assert found[3e3] is None and found[3e6].nlevel >= 1
+  assert found[3e3] is None and found[3e6].transfer.nlevel >= 1
   assert organ.iterations <= 15
 
 
 @pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES.keys())
 def test_coarse_meshes_are_good_surfaces(shape):
   mesh = topology.build("organ", *shape)
-  levels = hierarchy.build(mesh, 64)
+  levels = coarse.build(mesh, 64)
   assert len(levels) >= 2
   finer = mesh
   for level in levels:
@@ -246,6 +239,6 @@ def test_coarse_meshes_are_good_surfaces(shape):
 
 
 def test_an_organ_without_coarse_meshes_pays_nothing(scenes, device):
-  _, s, d = _organ(_sphere(6), device, scale=0.0)
-  assert s.levels is None and d.coarse is None
-  assert d.e.size == d.en.size == 0
+  _, body = _organ(_sphere(6), device, scale=0.0)
+  assert body.levels is None
+  assert body.system.e.size == body.system.en.size == 0

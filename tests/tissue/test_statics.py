@@ -11,8 +11,8 @@ STATIC = {"iterations": 5000, "tolerance": 1e-5, "thickness": THICKNESS}
 LONG = 1.0
 
 
-def _load(organ, data, forces):
-  data.qfrc_applied[organ._dofs] = forces[organ.free]
+def _load(scenes, organ, data, forces):
+  data.qfrc_applied[scenes.dofs(organ)] = forces[organ.free]
 
 
 def _edge_load(points, at, force):
@@ -38,7 +38,7 @@ def test_a_strip_in_tension_has_its_young_and_poisson(scenes, device, young, nu,
   pull = young * (stretch**2 - 1) / 2 * stretch * width * THICKNESS
   left, right = (np.flatnonzero(np.abs(points[:, 0] - x) < 1e-9) for x in (0, length))
   along = np.array([pull, 0, 0])
-  _load(organ, data, _edge_load(points, right, along) - _edge_load(points, left, along))
+  _load(scenes, organ, data, _edge_load(points, right, along) - _edge_load(points, left, along))
   scenes.settle(model, data, organ)
   extent = np.ptp(organ.xpos, axis=0)
   # Constant strain is exact in linear triangles: what is left is float32 and the solver.
@@ -56,12 +56,12 @@ def test_patch_with_a_linear_boundary_displacement_is_linear_inside(scenes, devi
   affine = np.array([[1.02, 0.01, 0], [0.015, 1.0, 0], [0, 0, 1]])
   config = {key: value for key, value in STATIC.items() if key != "tolerance"}
   # The rest shape is the undeformed one: hold the boundary where the map puts it.
-  mesh, _, s, state = scenes.kernels(
+  mesh, _, body = scenes.kernels(
     points, elem, device=device, pin=np.flatnonzero(~inside), tolerance=1e-7, **config
   )
   u = np.where(inside[:, None], 0, points @ affine.T - points)
   for _ in range(20):  # long steps without inertia: Newton's method for the equilibrium
-    u = u + LONG * scenes.step(s, state, LONG, u, mass=1e-6)
+    u = u + LONG * scenes.step(body, LONG, u, mass=1e-6)
   np.testing.assert_allclose(u, points @ affine.T - points, atol=1e-5 * np.abs(u).max())
   assert mesh.nvert == len(u)
 
@@ -116,7 +116,7 @@ def _bent_strip(scenes, device, kind, nu, length, width, nx, ny):
   force = sag * 3 * young * inertia / span**3
   tip = np.flatnonzero(points[:, 0] > length - 1e-9)
   load = _edge_load(points, tip, np.array([0, 0, -force]))
-  _load(organ, data, load)
+  _load(scenes, organ, data, load)
   scenes.settle(model, data, organ, still=2e-4)  # as still as float32 lets so slender a strip be
   return -(organ.displacement[:, 2] * load[:, 2]).sum() / load[:, 2].sum() / sag
 
@@ -169,7 +169,7 @@ def test_a_square_plate_sags_under_a_uniform_load(scenes, device, clamped):
   pressure = sag * rigidity / (alpha * span**4)
   force = np.zeros(points.shape)
   force[:, 2] = -pressure * topology.vertex_areas(points, elem)
-  _load(organ, data, force)
+  _load(scenes, organ, data, force)
   scenes.settle(model, data, organ, still=1e-4)
   found = -organ.displacement[:, 2].min()
   # Corners of a supported plate would lift; the pinned ones hold them as the theory does.

@@ -1,21 +1,24 @@
-"""Docstrings of the state classes against their fields."""
+"""Documentation of the state: every field says what it is."""
 
 import dataclasses
+import inspect
 import re
 
 import pytest
 from palpate.engine import workspace
-from palpate.tissue import config, mesh, types
+from palpate.tissue import body, config, mesh, plate, step, types
 
 CLASSES = (
+  body.Body,
+  body.Levels,
   config.Config,
   mesh.Mesh,
-  mesh.Hinges,
-  types.Surface,
-  types.State,
-  workspace.Organ,
+  plate.Hinges,
+  step.Scheme,
+  workspace.Declaration,
   workspace.Workspace,
 )
+STRUCTS = ("Shape", "Tissue", "State", "System", "Transfer")
 
 
 @pytest.mark.parametrize("cls", CLASSES, ids=lambda cls: cls.__name__)
@@ -25,3 +28,11 @@ def test_every_field_is_documented_in_order(cls):
   documented = [name.strip() for line in lines for name in line.split(",")]
   fields = [field.name for field in dataclasses.fields(cls)]
   assert sorted(documented) == sorted(fields)
+
+
+@pytest.mark.parametrize("name", STRUCTS)
+def test_every_field_of_a_struct_says_what_it_is_on_its_line(name):
+  text = inspect.getsource(types).split(f"class {name}:")[1].split("\n@struct")[0]
+  for field in getattr(types, name).vars:
+    line = re.search(rf"(?:^  #.*\n)*^  {field}: .*$", text, re.MULTILINE)[0]
+    assert re.search(r"# \w", line) or re.search(r": (vector|scalar)  # ", line), field

@@ -1,0 +1,87 @@
+"""Records the graphs of a step over the arrays of one mjModel and one mjData."""
+
+from __future__ import annotations
+
+import numpy as np
+import warp as wp
+from palpate.tissue import step
+from palpate.tissue.body import Body
+
+from . import coupling, declare, graphs, mjstruct, nodal, nodes, slots, windowed
+
+
+def bind(w, model: int):
+  """Points the graphs at the arrays of `model` and of the workspace's mjData and records them."""
+  m = mjstruct.Model.from_address(model)
+  device, cpu = w.body.device, wp.get_device("cpu")
+  scheme = step.SCHEMES[w.config.integrator]
+  side = windowed if w.organ.windows else nodal
+  with graphs.lock:
+    declare.check_frame(m, w.organ)
+    load(w.body)
+    if w.resident:
+      w.resident.fetch()
+    w.phases = does = side.Phases(w, model, w.instance)
+    near = wp.get_device(does.side)
+    crossing = device != near
+
+    def solve():
+      if crossing:
+        _cross(w, _IN, to_device=True)
+      scheme.step(w.body)
+      if crossing:
+        _cross(w, _OUT, to_device=False)
+
+    def respond():
+      if crossing:
+        _cross(w, ("rhs",), to_device=True)
+      scheme.respond(w.body)
+      if crossing:
+        _cross(w, ("sol", "status"), to_device=False)
+
+    w.before = graphs.record(cpu, does.gather)
+    w.solve = graphs.record_all((near, does.enter), (device, solve), (near, does.look))
+    w.after = graphs.record(cpu, does.scatter)
+    w.leave = graphs.record(cpu, does.leave)
+    w.respond = []
+    if scheme.respond:
+      w.respond = graphs.record_all((near, does.push), (device, respond), (near, does.answer))
+    w.end = graphs.record(cpu, does.end)
+    w.advance = graphs.record(cpu, does.advance)
+    w.place = graphs.record(cpu, does.place) if w.organ.windows else None
+    if w.resident:
+      w.resident.foresee = graphs.record(cpu, does.foresee)
+      ahead = graphs.record_all((near, does.enter_ahead), (device, solve))
+      w.resident.begin_graph = ahead[0][1]
+      w.resident.rest = graphs.record_all((near, does.look_ahead))
+  w.model, w.identity = model, mjstruct.Identity(model)
+  option = model + mjstruct.Model.opt.offset
+  w.model_step = mjstruct.view(option + type(m.opt).timestep.offset, 1).data
+  w.time_step = float(m.opt.timestep)
+  w.integrator = mjstruct.view(option + type(m.opt).integrator.offset, 1, np.int32).data
+  w.static = [(view, view.tobytes()) for view in declare.static_places(m, w.organ)]
+  if w.turn is not None:
+    w.turn.bind(model, w.organ.windows)
+
+
+# What a solve on another device than MuJoCo's side reads and writes.
+_IN = ("step", "disp", "vel", "mass", "force_ext", "dvel_warm")
+_OUT = ("dvel", "status")
+
+
+def _cross(w, fields: tuple[str, ...], to_device: bool):
+  theirs = coupling.on_body(w.body)
+  for field in fields:
+    there, here = theirs[field], w.host[field]
+    if to_device:
+      wp.copy(there, here)
+    else:
+      wp.copy(here, there)
+
+
+def load(body: Body):
+  """Loads the modules of a step on a body's device, compiling them where the cache has none."""
+  for module in (*step.modules(body), nodes.MODULE):
+    wp.load_module(module, device=body.device)
+  for module in (*step.modules(body), nodes.MODULE, nodal.MODULE, slots.MODULE):
+    wp.load_module(module, device="cpu")

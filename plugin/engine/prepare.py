@@ -1,0 +1,90 @@
+"""Everything that is written to a compiled mjModel outside of a step.
+
+MuJoCo calls the plugin while it compiles, so that plain MJCF needs no helper: what is written here
+stays in the model, and in its copies and files.
+"""
+
+from __future__ import annotations
+
+import hashlib
+
+import numpy as np
+from palpate.tissue.body import Body
+from palpate.tissue.config import Config
+from palpate.tissue.step import SCHEMES
+
+from . import inertia, mjstruct
+from .declare import Declaration
+
+_KNOWN = 64
+_made_for: dict[bytes, tuple] = {}  # digest of an armature of ours -> time step and material
+
+
+def fit(m, organ: Declaration, body: Body):
+  """Makes a model fit an organ that it declares, with the tissue `body`."""
+  # MuJoCo warns of a flex without forces of its own; an <edge damping> silences it and, zero here,
+  # costs nothing while running. The plugin's own damping acts instead.
+  flexes = organ.windows.flex if organ.windows else [organ.flex]
+  mjstruct.view(m.flex_edgedamping, m.nflex)[flexes] = 0.0
+  if organ.windows is None:
+    give_armature(m, organ, body, organ.config)
+    return
+  win = organ.windows
+  mjstruct.view(m.body_pos, (m.nbody, 3))[win.body] = win.stand
+  # A slot must be no heavier than the lightest node that it may stand on.
+  mass = mjstruct.view(m.body_mass, m.nbody)
+  mass[win.body] = np.minimum(mass[win.body], win.mass.min())
+
+
+def give_armature(m, organ: Declaration, body: Body, config: Config):
+  """Gives the organ's dofs the effective inertia as armature, unless the MJCF gave them one.
+
+  Ours are recognised by their digest, so that they can follow the time step and the tissue.
+
+  Args:
+    m: the mjModel
+    organ: the organ
+    body: its tissue
+    config: its configuration in force
+  """
+  if not SCHEMES[organ.config.integrator].spreads:
+    return  # steps are those of the masses
+  armature = mjstruct.view(m.dof_armature, m.nv)
+  dofs = organ.dofs
+  present = armature[dofs]
+  of = (float(m.opt.timestep), *inertia.material(config))
+  if present.any() and _made_for.get(_digest(present), of) == of:
+    return
+  mass = inertia.masses(m, organ)
+  found = inertia.of_nodes(m, organ, body, config, mass, organ.flex)
+  added = np.repeat((found - mass)[organ.free], 3)
+  armature[dofs] = added
+  if len(_made_for) >= _KNOWN:
+    _made_for.pop(next(iter(_made_for)))
+  _made_for[_digest(added)] = of
+  # mj_setConst gives the same: M0 has the armature, the inverse weights, which scale the contacts'
+  # softness, are those of the masses alone for such dofs.
+  mjstruct.view(m.dof_M0, m.nv)[dofs] = np.repeat(found[organ.free], 3)
+
+
+def show(m, organ: Declaration, shown: bool):
+  """Lets MuJoCo see a windowed organ's own flex, or hides it, so that a step spends nothing on it.
+
+  It touches nothing and is drawn from what `window.draw` writes, but MuJoCo updates its vertices,
+  boxes and bounding volumes in every step, which can take longer than the organ's step. A scene has
+  room for the flex whether it was made with the one or the other: 2 (shells + elements).
+  """
+  flex, mesh = organ.flex, organ.mesh
+  shells = int((mesh.twin < 0).sum())
+  counts = (mesh.nvert, mesh.nelem, shells) if shown else (0, 0, shells + mesh.nelem)
+  names = ("flex_vertnum", "flex_elemnum", "flex_shellnum", "flex_bvhnum", "flex_bvhadr")
+  for name, count in zip(names, (*counts, 0, -1), strict=True):
+    mjstruct.view(getattr(m, name), m.nflex, np.int32)[flex] = count
+  # The broad phase passes over vertices of the world; the first one still tells whose they are.
+  start = int(mjstruct.view(m.flex_vertadr, m.nflex, np.int32)[flex])
+  body = mjstruct.view(m.flex_vertbodyid, m.nflexvert, np.int32)[start : start + mesh.nvert]
+  body[1:] = body[0] if shown else 0
+
+
+def _digest(values: np.ndarray) -> bytes:
+  return hashlib.sha256(np.ascontiguousarray(values).tobytes()).digest()

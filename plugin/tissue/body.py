@@ -1,0 +1,191 @@
+"""A body: the structs of an organ on one device, allocated once."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from .device import WORDS
+from .types import (
+  NUMBERS,
+  Cycle,
+  Fields,
+  Shape,
+  State,
+  System,
+  Tissue,
+  Transfer,
+  allocate,
+  fill,
+)
+
+
+@dataclasses.dataclass
+class Body:
+  """An organ's arrays on one device, allocated once: what drivers take.
+
+  Attributes:
+    fields: what kernels take
+    sizes: number of each thing that the arrays' shapes name, less nworld
+    device: Warp device
+    nworld: number of worlds; 0 for the constants alone
+    numbers: those of `tissue.number` on the host, float64   (nnumber,)
+    newton: Newton iterations a step
+    levels: coarser meshes for the multilevel preconditioner, or None
+  """
+
+  fields: Any
+  sizes: dict[str, int]
+  device: wp.Device
+  nworld: int
+  numbers: wp.array
+  newton: int
+  levels: Levels | None = None
+
+  @property
+  def shape(self) -> Any:
+    """Topology and rest shape."""
+    return self.fields.shape
+
+  @property
+  def tissue(self) -> Any:
+    """Material."""
+    return self.fields.tissue
+
+  @property
+  def state(self) -> Any:
+    """Motion, and what acts."""
+    return self.fields.state
+
+  @property
+  def system(self) -> Any:
+    """The linear system of a step."""
+    return self.fields.system
+
+  @property
+  def has_bending(self) -> bool:
+    """Whether bending kernels run."""
+    return self.shape.nhingeslice > 0
+
+  def number(self, name: str) -> float:
+    """Returns one of `NUMBERS`."""
+    return float(self.numbers.numpy()[NUMBERS.index(name)])
+
+
+@dataclasses.dataclass
+class Levels:
+  """Coarser meshes of a body.
+
+  Attributes:
+    body: these meshes one after the other; shares `number` and `step`
+    cycle: what the kernels of the preconditioner take
+  """
+
+  body: Body
+  cycle: Any
+
+  @property
+  def transfer(self) -> Any:
+    """What lies between the meshes."""
+    return self.cycle.transfer
+
+
+def constants(
+  values: dict[str, Any], device: wp.Device, newton: int, coarse: dict[str, Any] | None = None
+) -> Body:
+  """Returns a body of no world: what does not move.
+
+  Args:
+    values: fields of `Shape` and `Tissue`, arrays on the host
+    device: where it is put
+    newton: Newton iterations a step
+    coarse: those of all coarser meshes, and the fields of `Transfer`, or None
+  """
+  sizes = _sizes(values)
+  if coarse is None:
+    return _at_rest(values, sizes, device, newton)
+  sizes |= {"ncycleslice": sizes["nslice"], "ncyclebendslice": sizes["nbendslice"]}
+  fewer = _sizes(coarse)
+  fewer |= {"ncycleslice": fewer["nslice"], "ncyclebendslice": fewer["nbendslice"]}
+  fewer["nquadslice"] = 0
+  body = _at_rest(values, sizes, device, newton)
+  below = _at_rest(coarse, fewer, device, newton)
+  body.levels = _levels(body, below, fill(Transfer, device, coarse))
+  return body
+
+
+def _sizes(values: dict[str, Any]) -> dict[str, int]:
+  """Returns the named sizes of a body from the fields of `Shape` and `Tissue`, but nworld."""
+  shape = ("nvert", "nnode", "nslice", "nelemslice", "nhingeslice", "nslot")
+  out = {name: values[name] for name in shape}
+  bends = out["nhingeslice"] > 0
+  return out | {
+    "nbend": len(values["bend_node"]),
+    "nbendslice": out["nslice"] if bends else 0,
+    "nareaslice": out["nslice"] if bends or values["closed"] else 0,
+    "nquadslice": out["nslice"],
+    "ncycleslice": 0,
+    "ncyclebendslice": 0,
+    "nword": WORDS,
+    "nnumber": len(NUMBERS),
+  }
+
+
+def _at_rest(values: dict[str, Any], sizes: dict[str, int], device: wp.Device, newton: int) -> Body:
+  fields = Fields()
+  fields.shape = fill(Shape, device, values, sizes)
+  fields.tissue = fill(Tissue, device, values, sizes)
+  numbers = wp.array(values["number"], dtype=wp.float64, device="cpu")
+  body = Body(fields, sizes, device, 0, numbers, newton)
+  _put_state(body, 0)
+  return body
+
+
+def _levels(body: Body, coarse: Body, transfer: Any) -> Levels:
+  coarse.tissue.number, coarse.numbers = body.tissue.number, body.numbers
+  coarse.state.step = body.state.step
+  cycle = Cycle()
+  cycle.fine, cycle.coarse, cycle.transfer = body.fields, coarse.fields, transfer
+  return Levels(coarse, cycle)
+
+
+def _put_state(body: Body, nworld: int):
+  body.nworld, sizes = nworld, body.sizes | {"nworld": nworld}
+  body.fields.state = allocate(State, body.device, sizes)
+  body.fields.system = allocate(System, body.device, sizes)
+  body.numbers = wp.clone(body.numbers)
+
+
+def worlds(body: Body, nworld: int = 1) -> Body:
+  """Returns a body of the same shape with a tissue of its own and zeroed states.
+
+  Args:
+    body: the body whose shape it has
+    nworld: number of worlds
+  """
+  fields = Fields()
+  fields.shape = body.shape
+  for name in Tissue.vars:
+    setattr(fields.tissue, name, wp.clone(getattr(body.tissue, name)))
+  out = dataclasses.replace(body, fields=fields, levels=None)
+  _put_state(out, nworld)
+  if body.levels is not None:
+    out.levels = _levels(out, worlds(body.levels.body, nworld), body.levels.transfer)
+  return out
+
+
+def renumber(body: Body, values: dict[str, float]):
+  """Sets `NUMBERS`, in the device's memory too: graphs that are recorded go on with them."""
+  numbers = np.array([values[name] for name in NUMBERS])
+  body.numbers.numpy()[:] = numbers
+  body.tissue.number.assign(numbers.astype(np.float32))
+
+
+def retissue(body: Body, values: dict[str, Any]):
+  """Writes the arrays of `Tissue` into those that are there; `values` as for `constants`."""
+  for name in Tissue.vars:
+    if name != "number":
+      getattr(body.tissue, name).assign(values[name])

@@ -1,0 +1,113 @@
+"""Devices: which one an organ is solved on, how many threads, and a quiet start of Warp.
+
+Warp starts without its greeting, without a line for every module, and without a word on CUDA: a
+machine without an NVIDIA driver is an ordinary place to run, but Warp's library says so on standard
+error whatever the log level is. `palpate doctor` lists the devices.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import os
+import sys
+import tempfile
+
+import warp as wp
+
+from .order import LANES
+
+# With fewer nodes the CPU solves a step before a GPU has met its barriers (benchmarks/solver.py).
+_CUDA_FROM = 2000
+BLOCK = 512  # threads of a block, at most
+MAX_BLOCKS = 512  # of one world
+WORDS = 2 * MAX_BLOCKS + 1  # of 128 bits that a world's threads exchange
+_DRIVER = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
+_NO_DRIVER = "Could not find or load the NVIDIA CUDA driver"
+
+
+def lower_log_level():
+  """Lets Warp speak of warnings and errors only, unless a level other than its default was set."""
+  if wp.config.log_level == wp.LOG_INFO:
+    wp.config.log_level = wp.LOG_WARNING
+
+
+@functools.cache
+def init():
+  """Initialises Warp, once a process."""
+  try:
+    ctypes.CDLL(_DRIVER)
+  except OSError:
+    _init_without_driver()
+  else:
+    wp.init()
+
+
+def _init_without_driver():
+  sys.stderr.flush()
+  kept = os.dup(2)
+  with tempfile.TemporaryFile() as heard:
+    os.dup2(heard.fileno(), 2)
+    try:
+      wp.init()
+    finally:
+      sys.stderr.flush()
+      os.dup2(kept, 2)
+      os.close(kept)
+      heard.seek(0)
+      for line in heard.read().decode(errors="replace").splitlines():
+        if _NO_DRIVER not in line:
+          print(line, file=sys.stderr)
+
+
+def resolve(name: str, nvert: int) -> wp.Device:
+  """Returns the Warp device that `name` asks for; `auto` is the faster one for `nvert` nodes.
+
+  Raises:
+    ValueError: there is no such device.
+  """
+  if name == "auto":
+    name = "cuda:0" if wp.is_cuda_available() and nvert >= _CUDA_FROM else "cpu"
+  if name != "cpu":
+    present = [device.alias for device in wp.get_cuda_devices()] if wp.is_cuda_available() else []
+    if name not in present:
+      have = ", ".join(present) or "no CUDA device"
+      raise ValueError(f"device is {name!r}, but this machine has {have}; expected 'cpu' or 'auto'")
+  return wp.get_device(name)
+
+
+def block(device, nslice: int) -> int:
+  """Returns the threads of a block for code made by `group`.
+
+  Small blocks spread few nodes over more multiprocessors.
+  """
+  return BLOCK // 2 if device.is_cuda and nslice * LANES <= BLOCK // 2 * device.sm_count else BLOCK
+
+
+def group_size(device, nslice: int, nworld: int, per_sm: int = 1) -> int:
+  """Returns the threads of a world for code made by `group`, to launch in blocks of `block`.
+
+  Args:
+    device: where they run
+    nslice: slices of nodes
+    nworld: number of worlds
+    per_sm: blocks on one multiprocessor that the kernel's bounds allow
+  """
+  if not device.is_cuda:
+    return 1
+  # Blocks of one world wait for each other, so all of them must be resident.
+  most = max(1, min(per_sm * device.sm_count // nworld, MAX_BLOCKS))
+  size = block(device, nslice)
+  return size * max(1, min(most, -(-nslice * LANES // size)))
+
+
+def patch(device, nslice: int) -> int:
+  """Returns the nodes that a block has of one world of `nslice` slices, 0 on the CPU."""
+  if not device.is_cuda:
+    return 0
+  return LANES * -(-nslice // (group_size(device, nslice, 1) // block(device, nslice)))
+
+
+def threads(device, nslice: int) -> int:
+  """Returns the launch dimension for `nslice` slices: one thread on the CPU, one a lane on CUDA."""
+  return nslice * LANES if device.is_cuda else 1

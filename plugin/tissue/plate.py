@@ -1,0 +1,175 @@
+"""Hinges of a surface and the stiffness that makes them a Kirchhoff plate."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from scipy import sparse
+
+from .mesh import Mesh, area_vectors
+
+
+@dataclasses.dataclass(frozen=True)
+class Hinges:
+  """Interior edges with the plate stiffness of the triangles beside them.
+
+  Attributes:
+    vert: edge p0, p1 (direction of the left triangle), left apex, right apex  (nhinge, 4)
+    elem: left and right triangle                                              (nhinge, 2)
+    of_elem: hinge of each triangle's half-edge, -1 on the boundary            (nelem, 3)
+    gain: stiffness between the hinges of one triangle [N m]                   (nelem, 3, 3)
+    rows: hinge angle per normal displacement at rest [1/m]             sparse (nhinge, nvert)
+  """
+
+  vert: np.ndarray
+  elem: np.ndarray
+  of_elem: np.ndarray
+  gain: np.ndarray
+  rows: sparse.csr_matrix
+
+
+def hinges(mesh: Mesh, rigidity: np.ndarray, poisson: float) -> Hinges:
+  """Returns the hinges of a surface and the stiffness that makes them a Kirchhoff plate.
+
+  The three angles of a triangle's hinges fix a constant curvature (kxx, kyy, kxy) of the patch of
+  the triangle and its three neighbours, unfolded at rest: angles = C curvature. So the plate
+  energy area/2 curvature^T D curvature becomes 1/2 angles^T G angles, G = area (C D^-1 C^T)^-1,
+  exact for every quadratic deflection on every mesh. With fewer hinges (a boundary) the formula
+  gives the curvature of least energy, a free edge. Patches whose six points nearly lie on a conic
+  would be far too stiff; the small eigenvalues of C D^-1 C^T are raised there.
+
+  Args:
+    mesh: the surface
+    rigidity: plate bending rigidity [N m], (nelem,)
+    poisson: Poisson's ratio [-]
+  """
+  elem, twin = mesh.elem, mesh.twin
+  half = np.flatnonzero((twin >= 0) & (np.arange(len(twin)) < twin))
+  other = twin[half]
+  start, end, apex = elem.ravel(), elem[:, [1, 2, 0]].ravel(), elem[:, [2, 0, 1]].ravel()
+  vert = np.stack([start[half], end[half], apex[half], apex[other]], axis=1)
+  of_half = np.full(len(twin), -1, np.int64)
+  of_half[half] = of_half[other] = np.arange(len(half))
+  rows = _rows(mesh, half, other, vert)
+  present = (twin >= 0).reshape(-1, 3)
+  gain, area = _gain(_angles(mesh), present, poisson), _area(mesh)
+  gain = gain * (area * rigidity)[:, None, None]
+  return Hinges(vert, np.stack([half // 3, other // 3], axis=1), of_half.reshape(-1, 3), gain, rows)
+
+
+def _area(mesh: Mesh) -> np.ndarray:
+  return np.linalg.norm(area_vectors(mesh.rest, mesh.elem), axis=1)
+
+
+def _foot(mesh: Mesh, half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+  """Returns where the apexes of half-edges have their feet, as shares of the edges, and heights."""
+  rest, elem = mesh.rest, mesh.elem
+  start, end, apex = elem.ravel(), elem[:, [1, 2, 0]].ravel(), elem[:, [2, 0, 1]].ravel()
+  edge, arm = rest[end[half]] - rest[start[half]], rest[apex[half]] - rest[start[half]]
+  share = (arm * edge).sum(-1) / (edge * edge).sum(-1)
+  return share, np.linalg.norm(arm - share[..., None] * edge, axis=-1)
+
+
+def _rows(mesh: Mesh, half: np.ndarray, other: np.ndarray, vert: np.ndarray) -> sparse.csr_matrix:
+  """Returns `Hinges.rows` of hinges between half-edges `half` and `other` with vertices `vert`."""
+  share_l, height_l = _foot(mesh, half)
+  share_r, height_r = _foot(mesh, other)
+  share_r = 1 - share_r
+  weight = np.stack(
+    [
+      (1 - share_l) / height_l + (1 - share_r) / height_r,
+      share_l / height_l + share_r / height_r,
+      -1 / height_l,
+      -1 / height_r,
+    ],
+    axis=1,
+  )
+  index = np.repeat(np.arange(len(half)), 4)
+  return sparse.csr_matrix((weight.ravel(), (index, vert.ravel())), shape=(len(half), mesh.nvert))
+
+
+def _unfolded(mesh: Mesh) -> np.ndarray:
+  """Returns the corners of each triangle in its own plane, (nelem, 3, 2)."""
+  corner = mesh.rest[mesh.elem]
+  x_axis = corner[:, 1] - corner[:, 0]
+  x_axis /= np.linalg.norm(x_axis, axis=1, keepdims=True)
+  normal = area_vectors(mesh.rest, mesh.elem)
+  area = np.linalg.norm(normal, axis=1)
+  y_axis = np.cross(normal / area[:, None], x_axis)
+  arm = corner - corner[:, :1]
+  return np.stack([(arm * x_axis[:, None]).sum(-1), (arm * y_axis[:, None]).sum(-1)], axis=-1)
+
+
+def _angles(mesh: Mesh) -> np.ndarray:
+  """Returns C: the angles of each triangle's hinges by curvature kxx, kyy, kxy, (nelem, 3, 3)."""
+  flat, twin = _unfolded(mesh), mesh.twin
+
+  def modes(point):
+    x, y = point[..., 0], point[..., 1]
+    return np.stack([x * x / 2, y * y / 2, x * y], axis=-1)
+
+  angle = np.zeros((mesh.nelem, 3, 3))
+  for c in range(3):
+    h = 3 * np.arange(mesh.nelem) + c
+    p0, p1, inner = flat[:, c], flat[:, (c + 1) % 3], flat[:, (c + 2) % 3]
+    share, height = _foot(mesh, h)
+    share_o, height_o = _foot(mesh, np.where(twin[h] >= 0, twin[h], h))
+    share_o = 1 - share_o
+    inward = inner - p0 - share[:, None] * (p1 - p0)
+    inward /= np.linalg.norm(inward, axis=1, keepdims=True)
+    outer = p0 + share_o[:, None] * (p1 - p0) - height_o[:, None] * inward
+
+    def bend(apex_point, s, height, p0=p0, p1=p1):
+      at_foot = (1 - s)[:, None] * modes(p0) + s[:, None] * modes(p1)
+      return (modes(apex_point) - at_foot) / height[:, None]
+
+    angle[:, c] = -bend(inner, share, height) - bend(outer, share_o, height_o)
+  return angle
+
+
+def _gain(angle: np.ndarray, present: np.ndarray, poisson: float) -> np.ndarray:
+  """Returns (C D^-1 C^T)^-1 for a rigidity of 1, from C and which hinges there are (nelem, 3)."""
+  nu = poisson
+  compliance = np.linalg.inv(np.array([[1, nu, 0], [nu, 1, 0], [0, 0, 2 * (1 - nu)]]))
+  both = present[:, :, None] & present[:, None, :]
+  flexibility = np.where(both, angle @ compliance @ angle.transpose(0, 2, 1), 0)
+  value, vector = np.linalg.eigh(flexibility)
+  largest = value[:, -1:]
+  # Absent hinges have eigenvalue 0 and no stiffness.
+  raised = np.where(value > 1e-12 * largest, np.maximum(value, 0.05 * largest), np.inf)
+  absent = (~present).sum(axis=1)[:, None] > np.arange(3)
+  inverse = np.where(absent | (largest <= 0), 0, 1 / np.maximum(raised, 1e-300))
+  degenerate = ~absent & (value <= 1e-12 * largest) & (largest > 0)
+  inverse = np.where(degenerate, 20 / np.maximum(largest, 1e-300), inverse)
+  return np.where(both, np.einsum("tik,tk,tjk->tij", vector, inverse, vector), 0)
+
+
+def bending_matrix(mesh: Mesh, hinge: Hinges) -> sparse.csr_matrix:
+  """Returns the plate stiffness on normal displacements at rest [N/m], (nvert, nvert)."""
+  h = hinge.of_elem
+  row, col = np.repeat(h, 3, axis=1).ravel(), np.tile(h, (1, 3)).ravel()
+  keep = (row >= 0) & (col >= 0)
+  nhinge = len(hinge.vert)
+  gain = sparse.csr_matrix(
+    (hinge.gain.ravel()[keep], (row[keep], col[keep])), shape=(nhinge, nhinge)
+  )
+  return sparse.csr_matrix(hinge.rows.T @ gain @ hinge.rows)
+
+
+def neighbours(hinge: Hinges) -> tuple[np.ndarray, np.ndarray]:
+  """Returns each hinge's four neighbours in its two triangles, and the gains to itself and them."""
+  nhinge = len(hinge.vert)
+  near = np.zeros((nhinge, 4), np.int64)
+  gain = np.zeros((nhinge, 5))
+  own = np.arange(nhinge)
+  for side in range(2):
+    elem = hinge.elem[:, side]
+    c = np.argmax(hinge.of_elem[elem] == own[:, None], axis=1)
+    gain[:, 0] += hinge.gain[elem, c, c]
+    for k in range(2):
+      other = (c + 1 + k) % 3
+      index = hinge.of_elem[elem, other]
+      near[:, 2 * side + k] = np.where(index >= 0, index, own)
+      gain[:, 1 + 2 * side + k] = np.where(index >= 0, hinge.gain[elem, c, other], 0.0)
+  return near, gain

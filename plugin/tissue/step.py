@@ -1,0 +1,279 @@
+"""A step of a body: the linear system, its solve, and the time stepping schemes by name.
+
+`implicit` takes Newton iterations on A dv = b, the first one with the present velocity's way ahead
+in it; see native/elastic.h for the equations and native/pcg.h for the solve.
+
+`midpoint` is of second order in h. MuJoCo moves x by h v after each step, so that its v is that of
+the middle of a step; about the time of x the step is centred, and stable for every h:
+
+    A dv = h (F + f_ext + f_c) - h damping K v,    A = M + (h^2 + h damping) K / 2
+
+(Newmark's family, with beta = 1/2 so that a step's stiffest motions fade with the damping). A step
+after which v is yet that of the time of x, the first one, makes half of it. It damps no more than
+the tissue does; `implicit` adds h / 2 to the damping. See docs/accuracy.md.
+
+`explicit` is the scheme of the Virtual Training Environment, semi-implicit Euler on the same
+forces: dv = M^-1 h (F + f_ext). `neumann` is the thesis scheme (eq. 5.19-5.26): the constant
+Hessian H of springs along the edges, and the inverse of W = I - (h^2 + h damping) H / m replaced by
+its first-order Neumann polynomial about D = diag W,
+
+    dv = (2 D^-1 - D^-1 W D^-1) (h (F + f_ext) + (h^2 + h damping) H v) / m.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import warp as wp
+
+from .body import Body
+from .device import BLOCK, block, group_size, threads
+from .kernels import kernel
+from .types import CONSTANTS, Cycle, Fields, Stage
+
+# A right-hand side below this share of the weight's impulse is at rest: residuals count against it.
+REST = 1e-3
+
+# The first Newton iteration stands where the present velocity leads, but no edge changes by more
+# than this share of its length on the way: forces far off would be those of another shape.
+AHEAD = 0.1
+
+# Relative residual at which the response to a change of the contact forces is good enough: it is
+# part of the step, whose tolerance holds too where that is looser.
+ENOUGH = 0.03
+
+# Condition numbers: below this one a mesh is solved by a few steps of the smoother, and above that
+# one float32 residuals are noise to the slowest modes, which only cycles would act on.
+EASY, WORST = 8.0, 2e5
+
+_FIRST, _MORE = 1, 2  # flags of `newton_update`
+_CYCLES_PER_SM = 2  # blocks on one multiprocessor
+_CONSTANTS = CONSTANTS | {
+  "AHEAD": AHEAD,
+  "ENOUGH": ENOUGH,
+  "EASY": EASY,
+  "WORST": WORST,
+  "IS_FIRST": _FIRST,
+  "IS_MORE": _MORE,
+}
+
+
+def _elastic(name: str) -> wp.Kernel:
+  return kernel(name, "elastic.h", Fields, CONSTANTS)
+
+
+def _scheme(name: str, bounds: int | None = None) -> wp.Kernel:
+  return kernel(name, "schemes.h", Fields, _CONSTANTS, bounds)
+
+
+_elem_normal = _elastic("elem_normal")
+_hinge_angle = _elastic("hinge_angle")
+_hinge_moment = _elastic("hinge_moment")
+_elem_corner = _elastic("elem_corner")
+_row = _elastic("row")
+_edge_change = _scheme("edge_change")
+_predict = _scheme("predict")
+_newton_update = _scheme("newton_update")
+_centre_step = _scheme("centre", BLOCK)
+_direct_step = _scheme("direct", BLOCK)
+_solve = kernel("solve", "pcg.h", Fields, _CONSTANTS, (BLOCK, 1))
+_sample = kernel("sample", "multigrid.h", Cycle, _CONSTANTS)
+_solve_cycles = kernel("solve_cycles", "multigrid.h", Cycle, _CONSTANTS, (BLOCK, _CYCLES_PER_SM))
+
+
+def _over(kernel: wp.Kernel, body: Body, nslice: int, arg: int = 0, fields: Any = None):
+  """Launches a kernel over `nslice` slices of every world; it takes the body's fields or others."""
+  size = threads(body.device, nslice)
+  wp.launch(
+    kernel,
+    dim=(body.nworld, size),
+    inputs=[size, arg, body.fields if fields is None else fields],
+    device=body.device,
+  )
+
+
+def _together(kernel: wp.Kernel, body: Body, arg: int, fields=None, per_sm: int = 1):
+  """Launches a kernel in which the threads of a world work together; see native/group.h.
+
+  Args:
+    kernel: the kernel
+    body: the body
+    arg: its number
+    fields: what it takes, the body's where None
+    per_sm: blocks on one multiprocessor that the kernel's bounds allow
+  """
+  nslice = body.shape.nslice
+  size = group_size(body.device, nslice, body.nworld, per_sm)
+  wp.launch(
+    kernel,
+    dim=(body.nworld, size),
+    inputs=[size, arg, body.fields if fields is None else fields],
+    device=body.device,
+    block_dim=block(body.device, nslice),
+  )
+
+
+def modules(body: Body) -> list[str]:
+  """Returns the Warp modules that a body's step needs."""
+  kernels = [_row, _predict, _solve]
+  if body.levels is not None:
+    kernels.append(_sample)
+  return [kernel.module.name for kernel in kernels]
+
+
+# The linear system.
+
+
+def assemble(body: Body, stage: Stage):
+  """Writes the right-hand side, and for an implicit stage the matrix, at the trial state.
+
+  Args:
+    body: `state.step`, `mass`, `force_ext` and, after the first iteration, `dvel` are read too
+    stage: what the right-hand side is for
+  """
+  shape = body.shape
+  if body.has_bending:
+    _hinge_angles(body, stage)
+    _over(_hinge_moment, body, shape.nhingeslice)
+    _over(_elem_corner, body, shape.nelemslice)
+  _over(_row, body, shape.nslice, stage)
+  if body.levels is not None and stage in (Stage.FIRST, Stage.LATER):
+    coarse = body.levels.body
+    nslice = coarse.shape.nslice
+    _over(_sample, body, nslice, fields=body.levels.cycle)
+    _over(_row, coarse, nslice, Stage.FIRST)
+
+
+def _hinge_angles(body: Body, stage: Stage):
+  _over(_elem_normal, body, body.shape.nelemslice)
+  _over(_hinge_angle, body, body.shape.nhingeslice, stage)
+
+
+def calibrate(body: Body):
+  """Stores the rest angles as the kernels see them, so that a rest shape is at rest to the bit."""
+  if not body.has_bending:
+    return
+  state, system, angle0 = body.state, body.system, body.shape.hinge_angle0
+  for array in (system.disp_trial, system.vel_trial, angle0, state.step):
+    array.zero_()
+  wp.copy(state.step, wp.array([1.0], dtype=float, device=body.device), count=1)
+  _hinge_angles(body, Stage.EXPLICIT)
+  wp.copy(angle0.flatten(), system.hinge_angle[0].flatten())
+
+
+def solve(body: Body, stage: Stage):
+  """Solves A sol = rhs to the body's tolerance; writes `system.sol` and `status`.
+
+  Args:
+    body: the body, with A as `assemble` wrote it
+    stage: FIRST, LATER or RESPONSE
+  """
+  if body.levels is None:
+    _together(_solve, body, stage)
+  else:
+    _together(_solve_cycles, body, stage, body.levels.cycle, _CYCLES_PER_SM)
+
+
+# The schemes.
+
+
+def _implicit(body: Body):
+  body.system.change.zero_()
+  nslice = body.shape.nslice
+  _over(_edge_change, body, nslice)
+  _over(_predict, body, nslice)
+  for it in range(body.newton):
+    stage = Stage.FIRST if it == 0 else Stage.LATER
+    assemble(body, stage)
+    solve(body, stage)
+    flags = _FIRST * (it == 0) + _MORE * (it + 1 < body.newton)
+    _over(_newton_update, body, nslice, flags)
+
+
+def _at_present(body: Body):
+  """Puts the trial state where the body is."""
+  wp.copy(body.system.disp_trial, body.state.disp)
+  wp.copy(body.system.vel_trial, body.state.vel)
+
+
+def _midpoint(body: Body):
+  _at_present(body)
+  _centre(body)
+  assemble(body, Stage.FIRST)
+  solve(body, Stage.FIRST)
+  _centre(body, undo=True)
+  wp.copy(body.state.dvel, body.system.sol)
+
+
+def _centre(body: Body, undo: bool = False):
+  """Makes `state.step` that of the midpoint step, or puts it back."""
+  _together(_centre_step, body, undo)
+
+
+def _explicit(body: Body):
+  _direct(body, Stage.EXPLICIT)
+
+
+def _neumann(body: Body):
+  _direct(body, Stage.NEUMANN)
+
+
+def _direct(body: Body, stage: Stage):
+  _at_present(body)
+  assemble(body, stage)
+  _together(_direct_step, body, stage)
+  wp.copy(body.state.dvel, body.system.sol)
+
+
+def _respond(body: Body):
+  solve(body, Stage.RESPONSE)
+
+
+def _respond_centred(body: Body):
+  _centre(body)
+  solve(body, Stage.RESPONSE)
+  _centre(body, undo=True)
+
+
+@dataclasses.dataclass(frozen=True)
+class Scheme:
+  """A time stepping scheme.
+
+  Attributes:
+    step: computes `state.dvel`, the change of velocity in one step, from `state.step`, `disp`,
+      `vel`, `mass`, `force_ext` and `dvel_warm`; capturable in a graph
+    gain: factor of K in the matrix of a step, from h and damping [s] to [s^2]; 0 where nodes move
+      with their own mass
+    respond: writes to `system.sol` how the impulses in `system.rhs` [N s] change the velocity in
+      the step just computed; None where the scheme has no such answer
+    levels: whether coarser meshes serve its solve
+  """
+
+  step: Callable[[Body], None]
+  gain: Callable[[float, float], float]
+  respond: Callable[[Body], None] | None = None
+  levels: bool = False
+
+  @property
+  def spreads(self) -> bool:
+    """Whether a push on one node moves others within a step."""
+    return self.gain(1.0, 0.0) > 0
+
+
+def _whole(h: float, damping: float) -> float:
+  return h * h + h * damping
+
+
+SCHEMES = {
+  "implicit": Scheme(_implicit, _whole, _respond, levels=True),
+  "midpoint": Scheme(_midpoint, lambda h, b: 0.5 * _whole(h, b), _respond_centred, levels=True),
+  "neumann": Scheme(_neumann, _whole),
+  "explicit": Scheme(_explicit, lambda h, b: 0.0),
+}
+
+
+def step(body: Body, scheme: str = "implicit"):
+  """Computes `state.dvel` by the scheme of that name, see `Scheme.step`."""
+  SCHEMES[scheme].step(body)

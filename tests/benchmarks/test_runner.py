@@ -1,0 +1,110 @@
+"""The runner: cases that fail, runs that go on, options, and that every bench starts."""
+
+import dataclasses
+
+import pytest
+from benchmarks import error, results, run, runner
+
+
+def command(*words) -> int:
+  return run.main([*map(str, words)])
+
+
+def execute(bench, *words) -> bool:
+  return runner.execute(bench, runner.options(bench, [*map(str, words)]))
+
+
+def rows_of(path) -> list[dict]:
+  return results.read(path)
+
+
+def test_a_case_that_fails_is_noted_and_the_rest_goes_on(tmp_path):
+  what = {"nodes": 162, "elements": "membrane"}
+  bad = {"case": "bad", "kind": "run", "scene": "press", "h": 1e-3, "short": 1} | what
+  good = {"case": "good", "kind": "reference", "scene": "vibrate", "level": 4} | what
+  bench = dataclasses.replace(error.BENCH, stages=lambda args: [[bad, good]])  # no reference of bad
+  assert execute(bench, "--out", tmp_path, "--jobs", 2)
+  status = {r["case"]: r["status"] for r in rows_of(tmp_path / "error.csv")}
+  assert status["bad"].startswith("error: ValueError: no reference")
+  assert status["good"] == "ok"
+
+
+def small(case, out):
+  if case["number"] == 2 and not (out / "go").exists():
+    raise RuntimeError("not yet")
+  return [{"number": case["number"], "square": case["number"] ** 2}]
+
+
+SMALL = runner.Bench(
+  "small", lambda args: [[{"case": f"n{k}", "number": k} for k in range(4)]], small
+)
+
+
+def test_in_one_process_a_case_that_fails_ends_the_run_and_it_resumes_there(tmp_path):
+  with pytest.raises(RuntimeError, match="not yet"):
+    execute(SMALL, "--out", tmp_path)
+  assert [r["square"] for r in rows_of(tmp_path / "small.csv")] == [0, 1]
+  (tmp_path / "go").touch()
+  assert execute(SMALL, "--out", tmp_path, "--resume")
+  rows = rows_of(tmp_path / "small.csv")
+  assert [(r["case"], r["status"], r["square"]) for r in rows] == [
+    ("n0", "ok", 0),
+    ("n1", "ok", 1),
+    ("n2", "ok", 4),
+    ("n3", "ok", 9),
+  ]
+  about = results.notes(tmp_path / "small.csv")
+  assert about["done"] == about["cases"] == 4 and "cpu" in about
+
+
+def test_results_of_another_form_are_not_resumed(tmp_path):
+  (tmp_path / "small.csv").write_text("number,square\n1,1\n")
+  assert rows_of(tmp_path / "small.csv") == [{"status": "ok", "number": 1, "square": 1}]
+  with pytest.raises(results.BenchError, match="another form"):
+    execute(SMALL, "--out", tmp_path, "--resume")
+  assert (tmp_path / "small.csv").read_text() == "number,square\n1,1\n"
+
+
+def test_a_page_written_again_keeps_the_remarks(tmp_path):
+  path, about = tmp_path / "small.md", {"palpate": "1", "bench": "small", "short": True}
+  results.page(path, "Small", about, ["table"])
+  assert path.read_text() == (
+    "# Small\n\npalpate 1.\n\n    python tests/benchmarks/run.py small --short\n\ntable\n"
+  )
+  path.write_text(path.read_text() + "\n## Remarks\n\n- by hand\n")
+  results.page(path, "Small", about, ["another table"])
+  assert path.read_text().endswith("another table\n\n## Remarks\n\n- by hand\n")
+
+
+def test_starting_over_keeps_the_old_rows_aside(tmp_path):
+  bench = dataclasses.replace(error.BENCH, stages=lambda args: [])
+  (tmp_path / "error.csv").write_text("case,status\nold,ok\n")
+  execute(bench, "--out", tmp_path)
+  assert (tmp_path / "error.csv.old").read_text() == "case,status\nold,ok\n"
+  assert rows_of(tmp_path / "error.csv") == []
+
+
+@pytest.mark.parametrize("name", run.BENCHES)
+def test_every_bench_is_a_command_with_help(name, capsys):
+  if name == "learning":
+    pytest.importorskip("stable_baselines3")
+  with pytest.raises(SystemExit) as end:
+    command(name, "--help")
+  assert end.value.code == 0
+  text = capsys.readouterr().out
+  for option in ("--short", "--resume", "--jobs", "--minutes", "--only", "--out"):
+    assert option in text
+
+
+def test_the_list_of_benches(capsys):
+  assert command("--help") == 0
+  text = capsys.readouterr().out
+  assert all(f"  {name} " in text for name in run.BENCHES)
+  assert command("nothing") == 2
+
+
+def test_wrong_options_are_refused_in_one_line(tmp_path, capsys):
+  assert command("error", "--jobs", -1, "--out", tmp_path) == 2
+  assert "jobs is -1" in capsys.readouterr().err
+  assert command("error", "--draw", "--out", tmp_path) == 1
+  assert "expected the rows of an earlier run" in capsys.readouterr().err

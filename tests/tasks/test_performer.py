@@ -1,0 +1,111 @@
+"""Experts solve every task; novices differ from them; no observation is constant on the way."""
+
+import sys
+import types
+
+import numpy as np
+import pytest
+from palpate import tasks
+from palpate.tasks import base, episode, performer, suite
+
+EASY = ["/".join(pair) for pair in tasks.EASY]
+OTHERS = ["/".join(pair) for pair in tasks.ALL_TASKS if pair not in tasks.EASY]
+# Constant while an expert works without a fault, and why: nothing.
+LONG = {
+  "probe/palpate_easy",
+  "probe/palpate_standard",
+  "probe/palpate_hard",
+}  # 16 to 30 s of search
+
+
+def wins(name, seeds):
+  env = tasks.load(*suite.split(name), task_kwargs={"random": 0})
+  count = 0
+  for seed in seeds:
+    env.task.random = np.random.RandomState(seed)
+    act = performer.make(env, seed=seed)
+    timestep, seen, total = env.reset(), [], 0.0
+    while not timestep.last():
+      timestep = env.step(act(timestep))
+      seen.append(timestep.observation)
+      total += timestep.reward
+    count += env.task.outcome == "success"
+    assert total <= 1 + 1e-9
+    for key in timestep.observation:
+      values = np.array([observation[key] for observation in seen])
+      assert np.ptp(values, axis=0).max() > 0, f"observation {key} is constant"
+  return count
+
+
+@pytest.mark.parametrize("name", EASY)
+def test_expert_solves_the_easy_tasks(name):
+  assert wins(name, range(1 if name in LONG else 3)) == (1 if name in LONG else 3)
+
+
+@pytest.mark.parametrize("name", [name for name in OTHERS if name not in LONG])
+def test_expert_solves_the_others(name):
+  assert wins(name, range(1)) == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["/".join(pair) for pair in tasks.ALL_TASKS])
+def test_expert_solves_95_percent_of_50_seeds(name):
+  assert wins(name, range(50)) >= 48
+
+
+def test_novices_differ_in_the_stated_way():
+  def measure(name, style):
+    env = tasks.load(*suite.split(name), task_kwargs={"random": 0})
+    return episode.run(env, performer.make(env, style, seed=0), 0).metrics()
+
+  expert = measure("touch/easy", "expert")
+  assert measure("touch/easy", "tremor").log_dimensionless_jerk < expert.log_dimensionless_jerk
+  assert measure("touch/easy", "delay").time > expert.time + 0.5
+  assert measure("touch/easy", "detour").path_length > 1.1 * expert.path_length
+  assert measure("touch/easy", "overshoot").path_length > 1.1 * expert.path_length
+  assert (
+    measure("probe/easy", "force").peak_force > 1.3 * measure("probe/easy", "expert").peak_force
+  )
+
+
+def test_a_task_without_an_expert_says_so():
+  env = tasks.load("touch", "easy")
+  env.task.expert = types.MethodType(base.Task.expert, env.task)
+  act = performer.make(env)
+  with pytest.raises(ValueError, match="touch/easy: no expert is written for it"):
+    act(env.reset())
+
+
+def test_unknown_performer_lists_the_choices():
+  env = tasks.load("touch", "easy")
+  with pytest.raises(ValueError, match="performer is 'exprt', expected one of expert, tremor"):
+    performer.make(env, "exprt")
+
+
+def test_policies_are_found_by_name(tmp_path, monkeypatch):
+  (tmp_path / "mine.py").write_text(
+    "import numpy as np\nclass P:\n  def __init__(self, env, seed): self.env = env\n"
+    "  def __call__(self, timestep): return np.zeros(4)\n"
+    "def still(observation): return np.zeros(4)\nnumber = 3\n"
+    "class Lost:\n  def __init__(self, env, seed): raise OSError('no weights')\n"
+  )
+  monkeypatch.chdir(tmp_path)
+  monkeypatch.setattr(sys, "path", sys.path.copy())
+  env = tasks.load("touch", "easy")
+  timestep = env.reset()
+  for spec in ("mine:P", "mine:still"):
+    assert performer.make(env, spec)(timestep).shape == (4,)
+  for spec, text in (
+    ("mine", "performer is .mine., expected one of expert"),
+    (":mine", "expected module:object"),
+    ("mine:nothing", "mine has no 'nothing'"),
+    ("mine:number", "is a int, expected something to call"),
+    ("nowhere:x", "ModuleNotFoundError"),
+  ):
+    with pytest.raises(ValueError, match=text):
+      performer.find(spec)
+  (tmp_path / "leaves.py").write_text("raise SystemExit('no GPU')")
+  with pytest.raises(ValueError, match="policy 'leaves:x': SystemExit: no GPU"):
+    performer.find("leaves:x")
+  with pytest.raises(ValueError, match="policy 'mine:Lost': OSError: no weights"):
+    performer.make(env, "mine:Lost")
