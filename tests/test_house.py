@@ -43,38 +43,14 @@ NOT_YET = {
   },
   "tests use public names": {
     "tests/app/test_wrap_command.py: _picture",
-    "tests/engine/test_resident.py: _ROOM",
-    "tests/engine/test_resident.py: _SLOW",
   },
   "files": {
-    "plugin/engine/coupling.py",
-    "plugin/engine/window_slots.py",
-    "plugin/native/group.h",
     "tests/engine/test_plugin.py",
   },
   "functions": {
     "models/grid.py",
     "models/markup.py",
-    "plugin/engine/coupling.py",
-    "plugin/engine/window.py",
     "plugin/windows.py",
-  },
-  "device switches": {
-    "plugin/engine/window_nodes.py",
-  },
-  "native code in headers": {
-    "plugin/engine/coupling.py",
-    "plugin/engine/window_nodes.py",
-    "plugin/engine/window_slots.py",
-  },
-  "kernels of four arguments": {
-    "plugin/engine/coupling.py",
-  },
-  "offsets in one table": {
-    "plugin/engine/motion.py",
-    "plugin/engine/resident.py",
-    "plugin/engine/window.py",
-    "plugin/engine/workspace.py",
   },
 }
 

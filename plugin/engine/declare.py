@@ -25,6 +25,7 @@ NO_RK4 = (
   "integrator is RK4, which evaluates forces four times a step; expected Euler, implicit or "
   "implicitfast"
 )
+_FLAT = 1e-6  # volume that counts as none, as a share of the area to the power of 1.5
 _CACHED = 16
 _made: dict[bytes, Declaration] = {}
 
@@ -149,6 +150,7 @@ def read(model: int, instance: int) -> Declaration:
   elem = elements(m, flex)
   mesh = topology.build(name, rest, elem)
   config = configuration.parse(name, keys(model, instance), len(elem), mesh.closed)
+  check_volume(name, mesh, config)
   dofadr, qposadr = addresses(m, name, body, free)
   order = np.cumsum(free) - 1
   mass = mjstruct.view(m.body_mass, m.nbody)[body]
@@ -276,6 +278,24 @@ def check_flex(m, flex: int, name: str):
     raise ValueError(
       f"organ {name!r}: flexcomp has MuJoCo elasticity too, expected no <elasticity young='...'> "
       "and no <edge stiffness='...'>; use the plugin's keys"
+    )
+
+
+def check_volume(name: str, mesh: Mesh, config: Config):
+  """Raises ValueError where a closed surface is inside out, or too flat for what acts inside."""
+  if not mesh.closed:
+    return
+  volume = topology.volume(mesh.rest, mesh.elem)
+  area = np.linalg.norm(topology.area_vectors(mesh.rest, mesh.elem), axis=1).sum()
+  if volume < -_FLAT * area**1.5:
+    raise ValueError(
+      f"organ {name!r}: its surface is inside out and encloses {volume:.3g} m^3, expected "
+      "triangles counter-clockwise from outside"
+    )
+  if config.bulk and volume < _FLAT * area**1.5:
+    raise ValueError(
+      f"organ {name!r}: bulk is {config.bulk:g}, expected 0 for a surface that encloses no volume "
+      f"({volume:.3g} m^3)"
     )
 
 

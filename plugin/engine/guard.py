@@ -1,7 +1,7 @@
-"""What reaches a callback from outside: exceptions of signals, MuJoCo's errors, the process's end.
+"""What reaches a callback from outside: exceptions of signals, the end of the process.
 
-MuJoCo calls the plugin through ctypes, which drops exceptions; and a MuJoCo error inside a callback
-would jump over Python's frames, as a thread does that is ended in one.
+MuJoCo calls the plugin through ctypes, which drops exceptions; and a thread that is ended in a
+callback takes the process with it.
 """
 
 from __future__ import annotations
@@ -15,8 +15,6 @@ import threading
 import time
 import types
 from collections.abc import Callable, Iterator
-
-from . import mjstruct
 
 _codes: set[types.CodeType] = set()  # of the callbacks
 _MARK = "raised late"  # of such an exception
@@ -126,54 +124,6 @@ def _on_unraisable(unraisable, before=sys.unraisablehook):
     raise_later(unraisable.exc_value)
   else:
     before(unraisable)
-
-
-# MuJoCo's errors.
-
-
-def run_apart(function: Callable, *args):
-  """Calls a function of MuJoCo's where its error does not jump over the frames of a callback.
-
-  That is a thread of its own, which after an error is left waiting for ever.
-
-  Raises:
-    RuntimeError: with MuJoCo's error message.
-  """
-  lib = mjstruct.library()
-  done, never, failed = _thread.allocate_lock(), _thread.allocate_lock(), []
-
-  def on_message(message: int):
-    text = mjstruct.error_text(message)
-    if text is None:
-      mjstruct.LogHandler(lib._mjPRIVATE_getGlobalLogHandler())(message)
-      return
-    failed.append(text)
-    done.release()
-    never.acquire()
-    never.acquire()
-
-  handler = mjstruct.LogHandler(on_message)
-
-  def body():
-    lib._mjPRIVATE_setTlsLogHandler(handler)
-    function(*args)
-    done.release()
-
-  done.acquire()
-  _thread.start_new_thread(body, ())
-  while not _acquire(done):
-    pass
-  if failed:
-    raise RuntimeError(failed[0])
-
-
-def _acquire(lock) -> bool:
-  """Waits for a lock; returns False where a signal's handler raised an exception meanwhile."""
-  try:
-    return lock.acquire()
-  except BaseException as error:
-    raise_later(error)
-    return False
 
 
 # The end of the process.

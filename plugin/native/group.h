@@ -1,12 +1,12 @@
 // The threads of a world as a group: sums over its nodes, the same value in every thread, and
 // vectors of which each reads what others wrote.
 //
-// On the CPU a world has one thread. On CUDA it has `nthread` in whole blocks that are all resident.
-// What they tell each other goes through memory in words of 128 bits, three numbers and the number
-// of the turn, which are written and read whole: whoever waits for a word needs neither counter nor
-// fence. Turns go on from launch to launch; the last one is kept behind the words. In a meeting each
-// block publishes its sums and reads those of all, in two sets that alternate: who meets again has
-// read the set before. The order of summation is fixed, so that runs repeat to the bit.
+// On the CPU a world has one thread. On CUDA it has `nthread` in whole blocks, all resident. What
+// they tell each other goes through memory in words of 128 bits, three numbers and the number of
+// the turn, which are written and read whole: whoever waits for a word needs neither counter nor
+// fence. Turns go on from launch to launch; the last one is kept behind the words. In a meeting
+// each block publishes its sums and reads those of all, in two sets that alternate: who meets again
+// has read the set before. The order of summation is fixed, so that runs repeat to the bit.
 //
 // BLOCK is the most threads of a block, MAX_BLOCKS the most blocks of a world, WORDS what a world
 // has of words. Otherwise everything here has the same name and meaning for both devices.
@@ -24,14 +24,54 @@ struct Own {
   static constexpr int COUNT = N, SIZE = N > 0 ? N : 1;
 };
 
+// A vector that no other thread reads, in registers where there is room for it.
+template <int OWN>
+class OwnVector {
+ public:
+  PALPATE OwnVector(float* memory) : memory(memory) {}
+  PALPATE V3 get(int s, Lane lane, int k) const {
+    return OWN ? own[OWN ? k : 0] : ld3(memory + 24 * s, lane);
+  }
+  PALPATE void put(int s, V3 a, Lane lane, int k) {
+    if (OWN) own[OWN ? k : 0] = a; else st3(memory + 24 * s, a, lane);
+  }
+  PALPATE void store(int s, Lane lane, int k) const {
+    if (OWN) st3(memory + 24 * s, own[OWN ? k : 0], lane);
+  }
+
+ private:
+  float* const memory;
+  V3 own[Own<OWN>::SIZE];
+};
+
 #if ON_CUDA
+
+// Memory of a block: two sets of what its warps and shares of blocks sum up to, and x, y, z and the
+// normal component of a vector at its nodes.
+using WarpSums = float[6][32];
+PALPATE WarpSums* warp_sums() {
+  __shared__ WarpSums sums[2];
+  return sums;
+}
+using BlockNodes = float[4 * BLOCK];
+PALPATE BlockNodes* block_nodes() {
+  __shared__ BlockNodes nodes[4];
+  return nodes;
+}
 
 // Three numbers and a turn in 128 bits.
 class Word {
  public:
+  static constexpr int SIZE = 4;  // floats
+
   PALPATE Word() : low(0), high(0) {}
   PALPATE Word(V3 a, unsigned turn)
     : low(pair(a.x, __float_as_uint(a.y))), high(pair(a.z, turn)) {}
+  // That of a node of this block.
+  PALPATE static Word near(int at, unsigned turn) {
+    const BlockNodes* p = block_nodes();
+    return Word({p[0][at], p[1][at], p[2][at]}, turn);
+  }
   PALPATE V3 value() const {
     return {__uint_as_float((unsigned)low), __uint_as_float((unsigned)(low >> 32)),
             __uint_as_float((unsigned)high)};
@@ -57,8 +97,13 @@ class Word {
 // One number and a turn in 64 bits.
 class HalfWord {
  public:
+  static constexpr int SIZE = 2;
+
   PALPATE HalfWord() : bits(0) {}
   PALPATE HalfWord(float a, unsigned turn) : bits(Word::pair(a, turn)) {}
+  PALPATE static HalfWord near(int at, unsigned turn) {
+    return HalfWord(block_nodes()[3][at], turn);
+  }
   PALPATE float value() const { return __uint_as_float((unsigned)bits); }
   PALPATE unsigned turn() const { return (unsigned)(bits >> 32); }
   PALPATE void put(float* p) const {
@@ -72,19 +117,6 @@ class HalfWord {
  private:
   unsigned long long bits;
 };
-
-// Memory of a block: two sets of what its warps and shares of blocks sum up to, and x, y, z and the
-// normal component of a vector at its nodes.
-using WarpSums = float[6][32];
-PALPATE WarpSums* warp_sums() {
-  __shared__ WarpSums sums[2];
-  return sums;
-}
-using BlockNodes = float[4 * BLOCK];
-PALPATE BlockNodes* block_nodes() {
-  __shared__ BlockNodes nodes[4];
-  return nodes;
-}
 
 PALPATE float warp_sum(float v) {
   for (int o = 16; o > 0; o >>= 1) v += __shfl_xor_sync(0xffffffffu, v, o);
@@ -204,24 +236,6 @@ class Group {
   }
 };
 
-// A vector that no other thread reads, in registers where there is room for it.
-template <int OWN>
-class OwnVector {
- public:
-  PALPATE OwnVector(float* memory) : memory(memory) {}
-  PALPATE V3 get(int s, Lane lane, int k) const {
-    return OWN ? own[OWN ? k : 0] : ld3(memory + 24 * s, lane);
-  }
-  PALPATE void put(int s, V3 a, Lane lane, int k) {
-    if (OWN) own[OWN ? k : 0] = a; else st3(memory + 24 * s, a, lane);
-  }
-  PALPATE void store(int s, Lane lane, int k) const { st3(memory + 24 * s, get(s, lane, k), lane); }
-
- private:
-  float* const memory;
-  V3 own[Own<OWN>::SIZE];
-};
-
 // The slices of a thread: OWN of its block's, or with 0 any of all.
 template <int OWN>
 class Slices {
@@ -246,10 +260,9 @@ class Slices {
       if (!OWN || s < last) body(s, lane, k);
   }
 
-  // Where in its block a node is whose x is at `offset` in a vector; below 0 it is another's.
-  PALPATE int place(int offset) const {
-    const int s = offset / (3 * LANES);
-    return OWN && s >= first && s < last ? LANES * (s - first) + offset % (3 * LANES) : -1;
+  // Where a node of slice `s` is in its block's memory; below 0 it is of another block.
+  PALPATE int place(int s, int lane) const {
+    return OWN && s >= first && s < last ? LANES * (s - first) + lane : -1;
   }
 
   const int nslice, first;
@@ -305,50 +318,17 @@ class Quads {
     return found.value();
   }
 
-  // Runs body(value) for the neighbours, one after the other. The words of several are under way at
-  // once, hence no branches before they are used.
+  // Runs body(value) for the neighbours, one after the other.
   template <class Body>
   PALPATE void each_near(const int* node, int width, Lane lane, Body body) const {
-    constexpr int AHEAD = 3;
-    for (int i = 0; i < width; i += AHEAD, node += AHEAD * LANES) {
-      Word found[AHEAD];
-      int at[AHEAD];
-      for (int b = 0; b < AHEAD; ++b) at[b] = i + b < width ? node[LANES * b + lane] : -1;
-      for (int b = 0; b < AHEAD; ++b) {
-        const int from = at[b] / 24;
-        const bool has = at[b] >= 0, mine = OWN && has && from >= slices.first && from < slices.last;
-        const int here = mine ? 8 * (from - slices.first) + at[b] % 24 : 0;
-        found[b] = Word({block_nodes()[0][here], block_nodes()[1][here], block_nodes()[2][here]}, turn);
-        found[b].get(quad + 4 * at[b], has && !mine);
-      }
-      for (int b = 0; b < AHEAD; ++b) {
-        if (at[b] < 0) continue;
-        while (found[b].turn() != turn) found[b].get(quad + 4 * at[b]);
-        body(found[b].value());
-      }
-    }
+    const auto place = [&](int at) { return slices.place(at / 24, at % 24); };
+    each<3, Word>(quad, node, width, lane, place, body);
   }
-
   // The same for normal components and nodes numbered one by one.
   template <class Body>
   PALPATE void each_bent(const int* node, int width, Lane lane, Body body) const {
-    constexpr int AHEAD = 6;
-    for (int i = 0; i < width; i += AHEAD, node += AHEAD * LANES) {
-      HalfWord found[AHEAD];
-      int at[AHEAD];
-      for (int b = 0; b < AHEAD; ++b) at[b] = i + b < width ? node[LANES * b + lane] : -1;
-      for (int b = 0; b < AHEAD; ++b) {
-        const int from = at[b] >> 3;
-        const bool has = at[b] >= 0, mine = OWN && has && from >= slices.first && from < slices.last;
-        found[b] = HalfWord(block_nodes()[3][mine ? at[b] - 8 * slices.first : 0], turn);
-        found[b].get(word + 2 * at[b], has && !mine);
-      }
-      for (int b = 0; b < AHEAD; ++b) {
-        if (at[b] < 0) continue;
-        while (found[b].turn() != turn) found[b].get(word + 2 * at[b]);
-        body(found[b].value());
-      }
-    }
+    const auto place = [&](int at) { return slices.place(at >> 3, at & 7); };
+    each<6, HalfWord>(word, node, width, lane, place, body);
   }
 
  private:
@@ -356,6 +336,29 @@ class Quads {
   float* const quad;
   float* const word;
   unsigned turn;
+
+  // The words of AHEAD neighbours are under way at once, hence no branches before they are used.
+  template <int AHEAD, class Any, class Place, class Body>
+  PALPATE void each(
+    const float* words, const int* node, int width, Lane lane, Place place, Body body
+  ) const {
+    for (int i = 0; i < width; i += AHEAD, node += AHEAD * LANES) {
+      Any found[AHEAD];
+      int at[AHEAD];
+      for (int b = 0; b < AHEAD; ++b) at[b] = i + b < width ? node[LANES * b + lane] : -1;
+      for (int b = 0; b < AHEAD; ++b) {
+        const bool has = at[b] >= 0;
+        const int here = has ? place(at[b]) : -1;
+        found[b] = Any::near(here < 0 ? 0 : here, turn);
+        found[b].get(words + Any::SIZE * at[b], has && here < 0);
+      }
+      for (int b = 0; b < AHEAD; ++b) {
+        if (at[b] < 0) continue;
+        while (found[b].turn() != turn) found[b].get(words + Any::SIZE * at[b]);
+        body(found[b].value());
+      }
+    }
+  }
 };
 
 #else
@@ -379,18 +382,6 @@ class Group {
   PALPATE void sum(V u, V v, float& a, float& b) { a = sum_of(u); b = sum_of(v); }
   PALPATE void sum(V u, V v, V w, float& a, float& b, float& c) { sum(u, v, a, b); c = sum_of(w); }
   PALPATE void sync() {}
-};
-
-template <int OWN>
-class OwnVector {
- public:
-  PALPATE OwnVector(float* memory) : memory(memory) {}
-  PALPATE V3 get(int s, Lane lane, int) const { return ld3(memory + 24 * s, lane); }
-  PALPATE void put(int s, V3 a, Lane lane, int) { st3(memory + 24 * s, a, lane); }
-  PALPATE void store(int, Lane, int) const {}
-
- private:
-  float* const memory;
 };
 
 template <int OWN>

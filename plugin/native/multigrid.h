@@ -1,8 +1,9 @@
 // The multilevel preconditioner of conjugate gradients, for large or stiff organs.
 //
-// One V-cycle on coarser meshes of the organ takes the place of block Jacobi. The matrix of a coarse
-// mesh is the organ's own, made by the same kernels at the present shape sampled at its nodes: no
-// triple products, bending scales as it should, and a deformed shape is as good as the rest shape.
+// One V-cycle on coarser meshes of the organ takes the place of block Jacobi. The matrix of a
+// coarse mesh is the organ's own, made by the same kernels at the present shape sampled at its
+// nodes: no triple products, bending scales as it should, and a deformed shape is as good as the
+// rest shape.
 // Smoothing is Chebyshev iteration on D^-1 A (Adams et al. 2003,
 // doi:10.1016/S0021-9991(03)00194-3) of two or three steps, before and after, which keeps the
 // preconditioner symmetric; the coarsest mesh in use, whose matrix is mostly mass, has more steps.
@@ -16,11 +17,28 @@
 
 namespace palpate {
 
+// What a level's passes read and write: of the finest mesh, or of the coarser ones, whose nodes
+// follow one another.
+struct Level {
+  Matrix a;
+  float *b, *z, *zn, *e, *en, *t;
+};
+
+template <class Fields>
+PALPATE Level level(const Fields& f, int world) {
+  const size_t base = (size_t)world * f.shape.nslice;
+  return {
+    matrix(f, world), f.system.r.data + 24 * base, f.system.z.data + 24 * base,
+    f.system.zn.data + 8 * base, f.system.e.data + 24 * base, f.system.en.data + 8 * base,
+    f.system.t.data + 24 * base
+  };
+}
+
 template <class Cycle, class Pcg>
 class Multigrid {
  public:
-  PALPATE Multigrid(const Cycle& f, Pcg& s)
-    : f(f), s(s), fine(level_of(f.fine)), coarse(level_of(f.coarse)), turned(0), depth(0) {
+  PALPATE Multigrid(const Cycle& f, const Level (&levels)[2], Pcg& s)
+    : f(f), levels(levels), s(s), turned(0), depth(0) {
     V heavy = splat(0.0f);
     s.group.each(0, f.fine.shape.nslice, [&](int i, Lane lane) {
       heavy += ld(s.a.diag, i, lane) * ld(f.fine.shape.free.data, i, lane);
@@ -52,29 +70,14 @@ class Multigrid {
   }
 
  private:
-  // The finest mesh, or the coarser ones, whose nodes follow one another.
-  struct Level {
-    Matrix a;
-    float *b, *z, *zn, *e, *en, *t;
-  };
-
   const Cycle& f;
+  const Level (&levels)[2];  // in memory of their own: they are chosen by number
   Pcg& s;
-  const Level fine, coarse;
   unsigned turned;  // bit l: z and e of level l have changed places
   int depth;        // coarser levels in use: down to the first one that is easy
   float per_mass, damp;
 
-  template <class Fields>
-  PALPATE Level level_of(const Fields& f) const {
-    const size_t base = (size_t)s.world * f.shape.nslice;
-    return {
-      matrix(f, s.world), f.system.r.data + 24 * base, f.system.z.data + 24 * base,
-      f.system.zn.data + 8 * base, f.system.e.data + 24 * base, f.system.en.data + 8 * base,
-      f.system.t.data + 24 * base
-    };
-  }
-  PALPATE const Level& level(int l) const { return l == 0 ? fine : coarse; }
+  PALPATE const Level& level(int l) const { return levels[l > 0]; }
   PALPATE int first_slice(int l) const { return l == 0 ? 0 : f.transfer.slice_adr.data[l - 1]; }
   PALPATE int last_slice(int l) const {
     return l == 0 ? f.fine.shape.nslice : f.transfer.slice_adr.data[l];
@@ -140,7 +143,7 @@ class Multigrid {
   // Where `same`, d is z. Sums b^T e and e with the area vectors where `last`.
   PALPATE void relax(int l, float keep, float add, bool same, bool last) {
     const Level& m = level(l);
-    const Matrix a = m.a;
+    const Matrix& a = m.a;
     const Vectors from = z(l), to = z(l, true);
     const float* b = m.b;
     float* t = m.t;
@@ -165,7 +168,7 @@ class Multigrid {
   // t = b - A z.
   PALPATE void residual(int l) {
     const Level& m = level(l);
-    const Matrix a = m.a;
+    const Matrix& a = m.a;
     const Vectors from = z(l);
     const float* b = m.b;
     float* t = m.t;
@@ -182,13 +185,14 @@ class Multigrid {
     const Vectors to = z(l);
     const int* row = f.transfer.down_adr.data;
     const float step = 2.0f / (high(l) + low(l));
+    const Level& m = level(l);
     s.group.each(first_slice(l), last_slice(l), [&](int i, Lane lane) {
       V3 b = {splat(0.0f), splat(0.0f), splat(0.0f)};
       for (int k = row[i]; k < row[i + 1]; ++k)
         b += ld(f.transfer.down_weight.data, k, lane)
           * gather3(t, f.transfer.down_node.data + 8 * (size_t)k, lane);
-      st3(coarse.b + 24 * i, b, lane);
-      put(to, coarse.a, i, step * precondition(coarse.a, b, i, lane), lane);
+      st3(m.b + 24 * i, b, lane);
+      put(to, m.a, i, step * precondition(m.a, b, i, lane), lane);
     });
     s.group.sync();
   }
@@ -227,7 +231,8 @@ PALPATE void solve_cycles(const Cycle& f, Thread t, int stage) {
   Vectors z{f.fine.system.z.data + 24 * base, f.fine.system.zn.data + 8 * base};
   using Solve = Pcg<Fields, Group<MEMORY>, Slices<0>, Vectors>;
   Solve pcg{f.fine, t.world, stage, group, slices, z};
-  Multigrid<Cycle, Solve> cycles(f, pcg);
+  const Level levels[2] = {level(f.fine, t.world), level(f.coarse, t.world)};
+  Multigrid<Cycle, Solve> cycles(f, levels, pcg);
   pcg.solve(cycles);
 }
 

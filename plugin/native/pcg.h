@@ -141,7 +141,7 @@ struct Pcg {
     slices.each([&](int s, Lane lane, int k) {
       const V3 own = z.own(s, lane), w = product(a, z, own, s, lane);
       az.put(s, w, lane, k);
-      zw = zw + own.y * w.y + own.x * w.x + own.z * w.z;  // y first: see simd.h
+      zw += dot(own, w);
     });
     return zw;
   }
@@ -204,8 +204,8 @@ struct Pcg {
   }
 };
 
-// The inverse of the diagonal blocks alone. The norm of the residual is then all there is to sum: at
-// no cost on the CPU, and on CUDA together with z^T A z, after one product more than it takes.
+// The inverse of the diagonal blocks alone. The norm of the residual is then all there is to sum:
+// at no cost on the CPU, and on CUDA together with z^T A z, after one product more than it takes.
 struct Jacobi {
   PALPATE V3 scaled(V3 z) const { return z; }
 

@@ -8,7 +8,8 @@
 //     const V3 v = ld3(vel + 24 * s, lane);
 //     st(energy, s, 0.5f * ld(mass, s, lane) * dot(v, v), lane);
 //   });
-// LANES is eight; `tissue/kernels.py` prints it and the other constants before the headers.
+// LANES is eight; `tissue/kernels.py` prints it and the other constants before the headers. Code in
+// doubles, whose sums are taken in the order in which they stand, begins with AS_WRITTEN.
 #pragma once
 
 #if defined(__CUDACC__) || defined(__CUDACC_RTC__)
@@ -20,9 +21,11 @@
 #if ON_CUDA
 #define PALPATE __device__ __forceinline__
 #define INLINED
+#define AS_WRITTEN
 #else
 #define PALPATE __attribute__((always_inline)) inline
 #define INLINED [[clang::always_inline]]  // before a call of a lambda
+#define AS_WRITTEN _Pragma("clang fp contract(off) reassociate(off)")
 // Sums of eight are not of one order anyway; products are fused with them.
 #pragma clang fp contract(fast) reassociate(on)
 #endif
@@ -66,7 +69,9 @@ struct S3 {  // symmetric
 #if ON_CUDA
 PALPATE V ld(const float* p, int row, Lane lane) { return p[LANES * row + lane]; }
 PALPATE void st(float* p, int row, V v, Lane lane) { p[LANES * row + lane] = v; }
-PALPATE V gather(const float* p, const int* at, int c, Lane lane) { return p[at[lane] + LANES * c]; }
+PALPATE V gather(const float* p, const int* at, int c, Lane lane) {
+  return p[at[lane] + LANES * c];
+}
 PALPATE V gather_number(const float* p, const int* at, Lane lane) {
   return p[at[lane] / (3 * LANES) * LANES + at[lane] % (3 * LANES)];
 }
@@ -253,6 +258,43 @@ PALPATE void each_slice(Thread t, int nslice, Body body) {
   if (t.tid >> 3 < nslice) body(t.tid >> 3, lane_of(t.tid));
 #else
   for (int s = 0; s < nslice; ++s) INLINED body(s, Lane());
+#endif
+}
+
+// Runs body(i) for n items, whichever of the threads has them.
+template <class Body>
+PALPATE void each_item(Thread t, int n, Body body) {
+  for (int i = t.tid; i < n; i += t.nthread) body(i);
+}
+
+// The greatest number that threads bring, as an int that is ordered alike: it does not depend on
+// who comes first. `NOTHING_PUT` where nobody has come; on CUDA whole warps call `put_most`.
+constexpr int NOTHING_PUT = -2147483647 - 1;
+
+PALPATE int ordered(int bits) { return bits ^ ((bits >> 31) & 0x7fffffff); }
+#if ON_CUDA
+PALPATE void put_most(int* at, float value) {
+  for (int o = 16; o > 0; o >>= 1) {
+    const float other = __shfl_xor_sync(0xffffffffu, value, o);
+    value = other > value ? other : value;
+  }
+  if ((threadIdx.x & 31) == 0) atomicMax(at, ordered(__float_as_int(value)));
+}
+PALPATE float most(int at) { return __int_as_float(ordered(at)); }
+#else
+PALPATE void put_most(int* at, float value) {
+  const int mine = ordered(__builtin_bit_cast(int, value));
+  if (mine > *at) *at = mine;
+}
+PALPATE float most(int at) { return __builtin_bit_cast(float, ordered(at)); }
+#endif
+
+// Returns the place of one more entry of a list whose length is `count`.
+PALPATE int append(int* count) {
+#if ON_CUDA
+  return atomicAdd(count, 1);
+#else
+  return (*count)++;
 #endif
 }
 

@@ -27,8 +27,8 @@ PALPATE float volume_impulse(
   group.sum(vol, rate, volume, flux);
   volume /= 18.0f;
   if (group.is_first()) f.system.total.data[2 * world] = volume;
-  const float volume0 = f.shape.volume0;
-  const float push = f.state.step.data[4 * world] * (pressure - bulk * (volume - volume0) / volume0) / 6.0f;
+  const float volume0 = f.shape.volume0, h = f.state.step.data[4 * world];
+  const float push = h * (pressure - bulk * (volume - volume0) / volume0) / 6.0f;
   const float pull = gv * bulk / volume0 / 36.0f * flux;
   return push - pull;
 }

@@ -57,6 +57,23 @@ def test_cameras_differ():
   assert np.abs(free - side).mean() > 1
 
 
+@pytest.mark.parametrize("name", models.NAMES)
+def test_every_camera_shows_the_organ_in_light(name):
+  model = mujoco.MjModel.from_xml_path(str(models.path(name)))
+  data = mujoco.MjData(model)
+  mujoco.mj_resetDataKeyframe(model, data, 0)
+  mujoco.mj_forward(model, data)
+  with mujoco.Renderer(model, 120, 160) as renderer:
+    for camera in (-1, *range(model.ncam)):
+      renderer.update_scene(data, camera)
+      image = renderer.render().astype(float)
+      renderer.enable_segmentation_rendering()
+      renderer.update_scene(data, camera)
+      organ = renderer.render()[..., 1] == mujoco.mjtObj.mjOBJ_FLEX
+      renderer.disable_segmentation_rendering()
+      assert organ.mean() > 0.03 and image[organ].mean() > 40, camera
+
+
 def test_every_way_to_name_a_scene(tmp_path):
   folder = models.path("gallbladder").parent
   shown = [_render(str(models.path("gallbladder"))), _render(str(folder)), _render("press")]

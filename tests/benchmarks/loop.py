@@ -25,7 +25,8 @@ import scenes
 import warp as wp
 from benchmarks import results
 from benchmarks.runner import Bench, Case, Row
-from palpate.engine import window, workspace
+from palpate.engine import windowed, workspace
+from palpate.engine.layout import HEAD, MODE
 from palpate.models import grid
 from palpate.tissue import step as stepping
 from palpate.tissue.types import Stage
@@ -85,9 +86,9 @@ def measure(
   spent = {"cpu": 0.0, "device": 0.0}
   timed(w, spent)
   rows, iterations, contacts = [], [], []
-  for step in range(steps):
-    d.ctrl[0] = -0.0015 * min(1.0, step / (0.3 * steps))
-    d.ctrl[1] = 0.002 * max(0.0, step / steps - 0.4)
+  for k in range(steps):
+    d.ctrl[0] = -0.0015 * min(1.0, k / (0.3 * steps))
+    d.ctrl[1] = 0.002 * max(0.0, k / steps - 0.4)
     spent["cpu"] = spent["device"] = 0.0
     before = time.perf_counter()
     mujoco.mj_step(m, d)
@@ -164,16 +165,16 @@ def parts(w) -> dict:
     solve=lambda: stepping.solve(body, Stage.FIRST),
     step=lambda: stepping.step(body),
   )
-  launches = window.launches(w, w.model, 0)
-  side = wp.get_device(launches.side)
+  phases = windowed.Phases(w, w.model, 0)
+  side = wp.get_device(phases.side)
   boxes = [(wp.clone(w.views[name], device=side), w.views[name]) for name in ("inbox", "outbox")]
-  w.views["inbox"].numpy()[3] = 1.0  # there is a step to end
+  w.boxes["inbox"].head.numpy()[HEAD.mode] = MODE.commit  # there is a step to end
   around = replay(
     side,
     transfer=lambda: (wp.copy(*boxes[0]), wp.copy(*reversed(boxes[1]))),
-    enter=launches.enter,
-    search=launches.look,
-    end=launches.end or (lambda: None),
+    enter=phases.enter,
+    search=phases.look,
+    end=phases.end,
   )
   state[:] = kept
   workspace.bind(w, w.model)

@@ -92,19 +92,29 @@ def run(case: Case, out: pathlib.Path) -> list[Row]:
 
 def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
   """Writes the page."""
-  table = []
+  kinds = sorted({(row["young"], row["bend"]) for row in rows})
+  head = [f"{young / 1e3:g} kPa{', bending' if bend else ''}" for young, bend in kinds]
+  cells: dict[tuple, dict] = {}
   for row in rows:
     told = [
       " / ".join(f"{n}" if n <= MOST else f"> {MOST}" for n in numbers)
       for numbers in ([row[f"{kind}_{t:g}"] for t in TOLERANCES] for kind in PRECONDITIONERS)
     ]
-    bends = "yes" if row["bend"] else "no"
-    table.append([row["organ"], row["nodes"], row["levels"], f"{row['young'] / 1e3:g}", bends,
-                  f"{row['condition']:.0f}", *told])  # fmt: skip
-  head = ["organ", "nodes", "levels", "E [kPa]", "bending", "condition", "block Jacobi"]
-  about_it = f"Iterations to a residual of {' / '.join(f'{t:g}' for t in TOLERANCES)}."
-  lines = [about_it, "", *plots.table([*head, "multilevel"], table)]
-  return [results.page(out / "preconditioner.md", "Iterations by preconditioner", about, lines)]
+    mesh = cells.setdefault((row["organ"], row["nodes"]), {})
+    mesh[row["young"], row["bend"]] = "; ".join(told)
+  table = [
+    [f"{organ}, {nodes}", *(found.get(kind, "") for kind in kinds)]
+    for (organ, nodes), found in cells.items()
+  ]
+  lines = [
+    f"PCG iterations to {' / '.join(f'{t:g}' for t in TOLERANCES)} with block Jacobi; then with "
+    "the multilevel cycle. A sphere of 5 cm and two organs, t = 2 mm, 0.1 kg, h = 1 ms, ten steps "
+    "into a load of 1 N on 6 mm, from a cold start. " + results.link(out / "preconditioner.csv"),
+    "",
+    *plots.table(["organ, nodes", *head], table),
+  ]
+  title = "Iterations with each preconditioner"
+  return [results.page(out / "preconditioner.md", title, about, lines)]
 
 
 BENCH = Bench("preconditioner", stages, run, report=report, arguments=arguments)

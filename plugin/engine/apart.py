@@ -1,0 +1,74 @@
+"""Calls of MuJoCo from inside a callback.
+
+A MuJoCo error jumps to where its step was called, over Python's frames if there are any between.
+"""
+
+from __future__ import annotations
+
+import _thread
+from collections.abc import Callable
+
+from . import guard, mjstruct
+
+# What says how many of something a constraint solver has.
+_COUNTS = ("ncon", "ne", "nf", "nl", "nefc", "nJ", "nA", "nisland", "nidof")
+
+
+def find_contacts(model: int, data: int):
+  """Does the position stage of a step once more.
+
+  Raises:
+    RuntimeError: with MuJoCo's error message; the step then has no contacts.
+  """
+  d = mjstruct.Data.from_address(data)
+  stack = d.pstack, d.pbase
+  try:
+    run(mjstruct.library().mj_fwdPosition, model, data)
+  except RuntimeError:
+    d.pstack, d.pbase = stack
+    for name in _COUNTS:
+      setattr(d, name, 0)
+    raise
+
+
+def run(function: Callable, *args):
+  """Calls a function of MuJoCo's in a thread of its own, which after an error waits for ever.
+
+  Raises:
+    RuntimeError: with MuJoCo's error message.
+  """
+  lib = mjstruct.library()
+  done, never, failed = _thread.allocate_lock(), _thread.allocate_lock(), []
+
+  def on_message(message: int):
+    text = mjstruct.error_text(message)
+    if text is None:
+      mjstruct.LogHandler(lib._mjPRIVATE_getGlobalLogHandler())(message)
+      return
+    failed.append(text)
+    done.release()
+    never.acquire()
+    never.acquire()
+
+  handler = mjstruct.LogHandler(on_message)
+
+  def body():
+    lib._mjPRIVATE_setTlsLogHandler(handler)
+    function(*args)
+    done.release()
+
+  done.acquire()
+  _thread.start_new_thread(body, ())
+  while not _acquire(done):
+    pass
+  if failed:
+    raise RuntimeError(" ".join(failed[0].split()))
+
+
+def _acquire(lock) -> bool:
+  """Waits for a lock; returns False where a signal's handler raised an exception meanwhile."""
+  try:
+    return lock.acquire()
+  except BaseException as error:
+    guard.raise_later(error)
+    return False
