@@ -17,6 +17,7 @@ import palpate
 import scenes
 from benchmarks import plots, results
 from benchmarks.runner import Bench, Case, Row
+from palpate.engine import layout
 from palpate.tissue import solver
 
 REFERENCE = pathlib.Path(__file__).parents[1] / "reference" / "press_explicit_20us"
@@ -53,7 +54,7 @@ def press(script: dict, h: float, ahead=0.1, extrapolate=0.0, armature=1.0, **ke
     data = mujoco.MjData(model)
   finally:
     solver.AHEAD = before
-  lagged = data.plugin_state[: model.nv - 1]
+  lagged = data.plugin_state[layout.spans(layout.NodalState, {"nfree": model.nv - 1})["force"]]
   old = np.zeros_like(lagged)
   rows = []
   for _ in range(round(script["DURATION"] / h)):
