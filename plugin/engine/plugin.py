@@ -162,7 +162,7 @@ def _compute(model: int, data: int, instance: int, capability: int):
       _find_bad_state(w)
     w.run()
     if w.status[3]:
-      _note(w, "the implicit step has no finite solution: the motion diverged")
+      _note(w, f"the {w.config.integrator} step has no finite solution: the motion diverged")
   except BaseException as error:
     _fail(w, error)
 

@@ -351,7 +351,9 @@ def configure(w: Workspace, model: int, texts: dict[str, str]):
   Raises:
     ValueError: a key may not change, or its value is not allowed.
   """
-  _change(w, model, configuration.change(w.organ.name, w.config, texts, w.organ.mesh.closed))
+  organ, mesh = w.organ, w.organ.mesh
+  arguments = texts, mesh.nelem, mesh.closed, organ.config
+  _change(w, model, configuration.change(organ.name, w.config, *arguments))
   w.chosen = True
 
 
@@ -371,8 +373,7 @@ def _change(w: Workspace, model: int, config: Config):
       shape.change(w.body, w.organ.mesh, config, ~w.organ.free)
     else:
       shape.renumber(w.body, config)
-    recorded = ("integrator", "newton")
-    if any(getattr(before, key) != getattr(config, key) for key in recorded):
+    if any(getattr(before, key) != getattr(config, key) for key in configuration.RECORDED):
       bind(w, model)
     if material:
       refresh(w)
