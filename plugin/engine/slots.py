@@ -15,8 +15,8 @@ from .layout import FLAG, Inbox, Outbox, WindowState
 _REACH = 4.0
 # An organ whose nodes move by less than this share of its size a second is at rest.
 SLOW = 1e-5
-# Mass and inertia of a slot on a pinned node, in masses of the organ: a wall to tools. MuJoCo's solver
-# takes less care of light ones the more it is.
+# Mass and inertia of a slot on a pinned node, in masses of the organ: a wall to tools. The more it
+# is, the less care MuJoCo's solver takes of light ones.
 _HELD = 1e3
 
 

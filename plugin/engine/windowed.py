@@ -242,6 +242,18 @@ def set_inertia(w, m):
   w.views["inertia"].assign(slots.hold(organ, nodal))
 
 
+def shortage(w) -> str | None:
+  """Returns what the windows had no room for at most, and what to do, or None."""
+  nodes, triangles = w.missed
+  if nodes:
+    what = f"{nodes} nodes that tools touch and keep the deepest; give them more vertices"
+  elif triangles:
+    what = f"{triangles} triangles between their nodes; give them more elements"
+  else:
+    return None
+  return f"organ {w.organ.name!r}: its windows have no room for {what}"
+
+
 def draw(w, model: int, data: int):
   """Writes the deformed surface where renderers read it."""
   m, d = mjstruct.Model.from_address(model), mjstruct.Data.from_address(data)

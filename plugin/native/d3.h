@@ -11,8 +11,8 @@ struct D3 { double x, y, z; };
 PALPATE D3 load(const double* p) { return {p[0], p[1], p[2]}; }
 PALPATE void store(double* p, D3 a) { p[0] = a.x; p[1] = a.y; p[2] = a.z; }
 
-// A node's numbers in a vector of slices; they start at `lane_of(node)`.
-PALPATE int lane_of(int node) { return node / LANES * 3 * LANES + node % LANES; }
+// A node's numbers in a vector of slices; they start at `offset_of(node)`.
+PALPATE int offset_of(int node) { return node / LANES * 3 * LANES + node % LANES; }
 PALPATE D3 load_lane(const float* p) { return {p[0], p[LANES], p[2 * LANES]}; }
 PALPATE void store_lane(float* p, D3 a) {
   p[0] = (float)a.x;

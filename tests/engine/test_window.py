@@ -290,3 +290,17 @@ def test_pinned_vertices_stay_and_carry_a_tool(young, offset, resident):
     heights.append(d.qpos[-1])
     assert d.qfrc_constraint[-1] == pytest.approx(0.03 * 9.81, rel=1e-3)  # it is at rest
   assert heights[1] == pytest.approx(heights[0], abs=1e-6)
+
+
+def test_the_warning_of_a_small_window_tells_the_worst_moment():
+  m, d, handle = load(probed(condim=1, count="3 2 1"))
+  d.qpos[-2] = 0.02
+  counts = []
+  for _ in range(200):
+    d.ctrl[0] = 0.02 - 0.2 * d.time
+    mujoco.mj_step(m, d)
+    counts.append(handle.window_overflow[0])
+  first = next(count for count in counts if count)
+  assert max(counts) > first
+  assert f"no room for {max(counts)} nodes" in handle.window_warning
+  assert d.warning.number.sum() == 0
