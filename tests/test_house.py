@@ -32,24 +32,30 @@ LARGE = {"file": 450, "function": 60, "native function": 70}
 
 NOT_YET = {
   "no import of what is always there in a function": {
+    "models/cling.py",
     "models/field.py",
     "models/grid.py",
+    "models/losses.py",
+    "models/necks.py",
+    "models/parts.py",
     "models/quality.py",
     "models/remesh.py",
     "models/repair.py",
     "models/shapes.py",
     "models/volume.py",
-    "models/wrap.py",
+    "plugin/meshes.py",
   },
   "tests use public names": {
     "tests/app/test_wrap_command.py: _picture",
   },
   "files": {
     "tests/engine/test_plugin.py",
+    "tests/models/test_wrap.py",
   },
   "functions": {
     "models/grid.py",
     "models/markup.py",
+    "plugin/authoring.py",
     "plugin/windows.py",
   },
 }
@@ -62,8 +68,8 @@ def floor(module: str) -> int:
   """Returns the floor of a module of the package."""
   words = module.split(".")
   room = words[1] if len(words) > 1 else "organ"  # palpate itself: the handle and register
-  room = {"windows": "organ", "__main__": "app"}.get(room, room)
-  return FLOORS.index(room)
+  room = {"__main__": "app"}.get(room, room)
+  return FLOORS.index(room if room in FLOORS else "organ")  # windows and others beside the handle
 
 
 def inner() -> list[tuple[str, str, bool]]:
@@ -218,7 +224,7 @@ def calls(pattern: str, paths: list[pathlib.Path], *allowed: str) -> set[str]:
 
 def flexcomp_writers() -> set[str]:
   found = writers(r'<flexcomp\s+\w+="', "models/mjcf.py")
-  return found | calls(r"\.add_flex$", package_files(), "plugin/windows.py")
+  return found | calls(r"\.add_flex$", package_files(), "plugin/windows.py", "plugin/authoring.py")
 
 
 def flexcomp_in_tests() -> set[str]:
