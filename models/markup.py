@@ -189,11 +189,14 @@ def scene(
 
 def _visual(build: Build) -> str:
   size = float(np.ptp(build.vertices, axis=0).max())
+  # The free camera starts on the laparoscope's side.
+  x, y, z = np.subtract(build.entry.target, build.entry.camera)
+  azimuth, elevation = np.degrees([np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))])
   return f"""  <statistic center="0 0 0" extent="{size:.3g}"/>
 
   <visual>
-    <global offwidth="1280" offheight="960" azimuth="120" elevation="-25"/>
-    <headlight ambient="0.22 0.2 0.2" diffuse="0.15 0.14 0.14" specular="0 0 0"/>
+    <global offwidth="1280" offheight="960" azimuth="{azimuth:.0f}" elevation="{elevation:.0f}"/>
+    <headlight ambient="0.3 0.28 0.28" diffuse="0.5 0.48 0.46" specular="0.1 0.1 0.1"/>
     <map znear="0.01" zfar="30"/>
     <rgba haze="0.16 0.07 0.06 1"/>
   </visual>
@@ -207,7 +210,7 @@ def _views(build: Build) -> str:
   side = np.array([1.9, 0.15, 0.25]) * size
   forward = np.subtract(entry.target, entry.camera)
   return f"""    <light name="laparoscope" pos="{numbers(entry.camera)}" dir="{numbers(forward)}"
-      cutoff="50" exponent="8" diffuse="0.85 0.82 0.78" specular="0.6 0.6 0.6" castshadow="false"/>
+      cutoff="50" exponent="8" diffuse="0.5 0.48 0.46" specular="0.6 0.6 0.6" castshadow="false"/>
     <light name="fill" directional="true" dir="0.3 -0.2 -1" diffuse="0.18 0.16 0.16"
       specular="0 0 0" castshadow="false"/>
     <camera name="laparoscope" pos="{numbers(entry.camera)}" fovy="60"

@@ -9,21 +9,15 @@ import textwrap
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from palpate.authoring import CONTACT, text
+
+__all__ = ["CONTACT", "extension", "flexcomp", "numbers", "obj", "plugin", "tag"]
 
 Mesh = tuple[np.ndarray, np.ndarray]  # points (n, 3), triangles (m, 3)
 
 PLUGIN = "palpate.organ"
 # Keeps MuJoCo from warning of a flex without forces of its own; the plugin sets it to 0.
 EDGE = '<edge damping="1e-9"/>'
-# Of an organ under instruments. solmix: its solref counts, not theirs, for its nodes are light.
-CONTACT: Mapping[str, object] = {
-  "condim": 3,
-  "friction": 0.3,
-  "solref": (0.004, 1),
-  "solimp": (0.95, 0.99, 0.001),
-  "solmix": 1000,
-  "selfcollide": "none",
-}
 # Of a rigid organ: its windows have the contacts.
 NO_CONTACT: Mapping[str, object] = {"contype": 0, "conaffinity": 0, "selfcollide": "none"}
 _WIDTH = 96
@@ -31,7 +25,7 @@ _WIDTH = 96
 
 def numbers(values, digits: int = 9) -> str:
   """Returns numbers as an attribute has them, with so many significant digits; no -0."""
-  return " ".join(f"{v + 0.0:.{digits}g}" for v in np.ravel(values))
+  return text(np.asarray(values, dtype=float), digits)
 
 
 def tag(name: str, attributes: Mapping, inside: str = "", digits: int = 9) -> str:
@@ -47,24 +41,13 @@ def tag(name: str, attributes: Mapping, inside: str = "", digits: int = 9) -> st
   for key, value in attributes.items():
     if value is None:
       continue
-    word = f'{key}="{_text(value, digits)}"'
+    word = f'{key}="{text(value, digits)}"'
     if len(lines[-1]) + len(word) > _WIDTH and lines[-1] != f"<{name}":
       lines.append(f"  {word}")
     else:
       lines[-1] += f" {word}"
   head = "\n".join(lines)
   return f"{head}>\n{textwrap.indent(inside, '  ')}\n</{name}>" if inside else f"{head}/>"
-
-
-def _text(value, digits: int) -> str:
-  if isinstance(value, str):
-    return value
-  if isinstance(value, bool | np.bool_):
-    return "true" if value else "false"
-  array = np.asarray(value)
-  if array.dtype.kind in "iu":
-    return " ".join(map(str, array.ravel()))
-  return numbers(array, digits)
 
 
 def plugin(config: Mapping | None = None, instance: str | None = None, digits: int = 9) -> str:
@@ -86,7 +69,7 @@ def extension(instances: Mapping[str, Mapping] | None = None, digits: int = 9) -
 
 def _keys(config: Mapping, digits: int) -> str:
   return "\n".join(
-    f'<config key="{key}" value="{_text(value, digits)}"/>' for key, value in config.items()
+    f'<config key="{key}" value="{text(value, digits)}"/>' for key, value in config.items()
   )
 
 

@@ -5,78 +5,34 @@ outside, and everywhere the air stays a distance `reach` away; growing the air b
 the closed shape. Gaps narrower than twice the reach are bridged, walls and parts inside vanish.
 """
 
+from __future__ import annotations
+
 import dataclasses
-import os
 
 import numpy as np
+from palpate import meshes
 
 from .field import Field
 from .quality import normals
+from .raster import Grid
 
 Mesh = tuple[np.ndarray, np.ndarray]
 
-MOST_SIZE = 2.0  # [m]; a larger bounding box is taken for millimetres
-LEAST_SIZE = 2e-3  # [m]; a smaller one for kilometres or a slip of the scale
 _LEAST_THICKNESS = 1e-2  # of the diagonal; thinner is flat
 _MOST_CAP = 0.15  # of the area; a larger hole makes the surface open
 SHELL = 0.3  # of the grid's spacing; the inside starts below this, so that sheets have none
 
 
-def load(mesh, scale: float = 1.0) -> tuple[str, np.ndarray, np.ndarray]:
-  """Returns a name for messages, vertices (n, 3) [m] and triangles (m, 3), checked.
+def load(mesh, scale: float | str = 1.0) -> tuple[str, np.ndarray, np.ndarray]:
+  """Returns a name for messages, vertices (n, 3) [m] and triangles (m, 3), checked and tidied.
 
   Args:
     mesh: a file that trimesh reads (OBJ, STL, PLY, glTF), a trimesh, or (vertices, triangles)
-    scale: metres per unit of the mesh
+    scale: metres per unit of the mesh, or the unit: m, cm, mm or inch
   """
-  if not (np.isfinite(scale) and scale > 0):
-    raise ValueError(f"scale is {scale}, expected a number above 0 (0.001 for millimetres)")
-  if isinstance(mesh, str | os.PathLike):
-    name = os.fspath(mesh)
-    vertices, triangles = _read(name)
-  else:
-    name = "mesh"
-    vertices, triangles = mesh if isinstance(mesh, tuple) else (mesh.vertices, mesh.faces)
-  vertices = np.array(vertices, dtype=float).reshape(-1, 3) * scale
-  triangles = np.array(triangles, dtype=np.int64).reshape(-1, 3)
-  _check(name, vertices, triangles)
-  return name, *_tidy(vertices, triangles)
-
-
-def _read(name: str) -> Mesh:
-  import trimesh
-
-  if not os.path.exists(name):
-    raise FileNotFoundError(f"{name}: no such file")
-  try:
-    loaded = trimesh.load(name, force="mesh", process=False)
-    return np.asarray(loaded.vertices), np.asarray(loaded.faces)  # pyright: ignore
-  except Exception as error:
-    kinds = "obj, stl, ply, gltf, glb"
-    raise ValueError(f"{name}: not a surface mesh that can be read ({kinds}): {error}") from error
-
-
-def _check(name: str, vertices: np.ndarray, triangles: np.ndarray) -> None:
-  """Raises a ValueError for what no repair can help."""
-  if not len(triangles):
-    raise ValueError(f"{name}: has no triangles, expected a surface")
-  if triangles.min() < 0 or triangles.max() >= len(vertices):
-    raise ValueError(f"{name}: a triangle uses a vertex outside 0..{len(vertices) - 1}")
+  name, vertices, triangles = meshes.read(mesh, scale)
   used = np.unique(triangles)
-  bad = used[~np.isfinite(vertices[used]).all(axis=1)]
-  if len(bad):
-    raise ValueError(f"{name}: vertex {bad[0]} is {vertices[bad[0]]}, expected finite numbers")
   size = float(np.linalg.norm(np.ptp(vertices[used], axis=0)))
-  if size > MOST_SIZE:
-    raise ValueError(
-      f"{name}: the bounding box is {size:.4g} m across, expected at most {MOST_SIZE} m; "
-      "this looks like millimetres: pass scale=0.001"
-    )
-  if size < LEAST_SIZE:
-    raise ValueError(
-      f"{name}: the bounding box is {size:.4g} m across, expected at least {LEAST_SIZE} m; "
-      "pass the metres per unit of the mesh as scale"
-    )
   centered = vertices[used] - vertices[used].mean(axis=0)
   axes = np.linalg.svd(centered.T @ centered)[0]
   thickness = float(np.ptp(centered @ axes, axis=0).min())
@@ -85,6 +41,7 @@ def _check(name: str, vertices: np.ndarray, triangles: np.ndarray) -> None:
       f"{name}: flat, {thickness:.3g} m thick and {size:.3g} m across, expected a surface around "
       f"an inside at least {_LEAST_THICKNESS:.0%} as thick as it is large"
     )
+  return name, *_tidy(vertices, triangles)
 
 
 def _tidy(vertices: np.ndarray, triangles: np.ndarray) -> Mesh:
@@ -264,6 +221,24 @@ class Solid:
   def shell(self) -> float:
     """How far under the surface the inside starts [m]."""
     return SHELL * self.field.spacing
+
+  @property
+  def grid(self) -> Grid:
+    """The points of its field."""
+    return Grid(self.field.origin, self.field.spacing, self.field.value.shape)
+
+  def without(self, region: np.ndarray) -> Solid:
+    """Returns the shape less a region, a mask of its grid's points  (nx, ny, nz)."""
+    spacing = self.field.spacing
+    away = _edt(~region) * spacing
+    value = np.maximum(self.field.value, 0.5 * spacing - away)
+    label, _ = _pieces(value < -self.shell)
+    kept = np.bincount(label.ravel())[1:].argmax() + 1
+    value[(label > 0) & (label != kept)] = spacing
+    left = away[self.grid.index(self.exposed)] > 1.5 * spacing
+    return dataclasses.replace(
+      self, field=Field(value, self.field.origin, spacing), exposed=self.exposed[left]
+    )
 
 
 def solidify(target: Target, spacing: float, reach: float) -> Solid | None:

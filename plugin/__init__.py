@@ -11,10 +11,11 @@ import sys as _sys
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+  from .authoring import add_organ
   from .organ import Organ
   from .windows import add_windows
 
-__all__ = ["Organ", "__version__", "add_windows", "register"]
+__all__ = ["Organ", "__version__", "add_organ", "add_windows", "register"]
 __version__ = "0.1.0"
 
 
@@ -24,12 +25,13 @@ def register() -> int:
   `import palpate` does it, except in the `palpate` command, whose help needs neither MuJoCo nor
   Warp. From here on Warp speaks of warnings and errors only; `warp.config.log_level` changes it.
   """
-  from . import organ, windows
+  from . import authoring, organ, windows
   from .engine import plugin
   from .tissue import device
 
   if "Organ" not in globals():
     globals()["Organ"] = organ.Organ
+    globals()["add_organ"] = authoring.add_organ
     globals()["add_windows"] = windows.add_windows
     device.lower_log_level()
   return plugin.register()

@@ -44,7 +44,7 @@ import collections
 import dataclasses
 import os
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import mujoco as mj
@@ -246,6 +246,10 @@ class Task(control.Task):
   def reference_length(self) -> float | None:
     """Returns the length of the path that the exercise asks for [m]."""
     return None
+
+  def expert(self, p: Any) -> Iterator[np.ndarray]:
+    """Yields the actions of an expert, in the words of `performer.Performer`."""
+    raise ValueError(f"{self.name}: no expert is written for it")
 
   # dm_control's side.
 

@@ -6,12 +6,7 @@ Sample 0 is the start; action and reward of sample k are those of the step that 
 """
 
 import dataclasses
-import functools
-import importlib
 import json
-import os
-import pathlib
-import sys
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -20,12 +15,10 @@ import numpy as np
 import palpate
 from dm_control.rl import control
 
-from . import experts, suite
+from . import suite
+from .performer import Act
 from .recorder import Recorder
 from .recording import Recording
-from .score import check_reference
-
-Act = Callable[[Any], Any]
 
 
 class EpisodeError(RuntimeError):
@@ -65,21 +58,7 @@ def run(
   physics: Any = env.physics
   task.random = np.random.RandomState(seed)
   timestep = env.reset()
-  recorder = Recorder([physics.prefix.rstrip("/")], task.settings(), task.watch)
-  recorder.info = {
-    "task": task.name,
-    "seed": seed,
-    "palpate": palpate.__version__,
-    "mujoco": mujoco.__version__,
-    **json.loads(json.dumps(dict(info or {}))),
-  }
-  recorder.attach("vertices", physics.nodes())
-  recorder.attach("triangles", physics.organ.elem)
-  recorder.attach("state_first", physics.integration_state())
-  for name, value in task.constants(physics).items():
-    recorder.attach(name, value)
-  first = {"state": physics.integration_state()} if states else None
-  recorder.append(**task.sample(physics), arrays=first)
+  recorder = _begin(env, seed, info or {}, states)
   total = 0.0
 
   def finish() -> Recording:
@@ -91,7 +70,7 @@ def run(
     try:
       action = np.asarray(act(timestep), np.float64)
       timestep = env.step(action)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
       task.outcome = task.outcome or "error"
       recorder.info["error"] = f"{type(error).__name__}: {error}"
       text = f"{task.name}: step {len(recorder) - 1}: {recorder.info['error']}"
@@ -109,22 +88,58 @@ def run(
   return finish()
 
 
+def _begin(
+  env: control.Environment, seed: int, info: Mapping[str, Any], states: bool
+) -> Recorder:
+  """Returns the recorder of an episode, with the constants and the sample of its start."""
+  task: Any = env.task
+  physics: Any = env.physics
+  recorder = Recorder([physics.prefix.rstrip("/")], task.settings(), task.watch)
+  recorder.info = {
+    "task": task.name,
+    "seed": seed,
+    "palpate": palpate.__version__,
+    "mujoco": mujoco.__version__,
+    **json.loads(json.dumps(dict(info))),
+  }
+  recorder.attach("vertices", physics.nodes())
+  recorder.attach("triangles", physics.organ.elem)
+  recorder.attach("state_first", physics.integration_state())
+  for name, value in task.constants(physics).items():
+    recorder.attach(name, value)
+  first = {"state": physics.integration_state()} if states else None
+  recorder.append(**task.sample(physics), arrays=first)
+  return recorder
+
+
 def environment(recording: Recording) -> control.Environment:
   """Returns the environment that a recording was made in."""
   info = recording.info
   if "action" not in recording.arrays and len(recording.time) > 1:
     raise ValueError("the recording holds no actions: it is not one of an exercise")
-  for key in ("task", "seed", "task_kwargs"):
-    if key not in info:
-      raise ValueError(f"the recording has no {key!r}: it is not one of an exercise")
-  return suite.load(*suite.split(info["task"]), task_kwargs=info["task_kwargs"])
+  for key, kind in (("task", str), ("seed", int), ("task_kwargs", dict)):
+    if not isinstance(info.get(key), kind):
+      found = repr(info[key]) if key in info else "missing"
+      raise ValueError(f"{key!r} is {found}: the recording is not one of an exercise")
+  try:
+    return suite.load(*suite.split(info["task"]), task_kwargs=info["task_kwargs"])
+  except TypeError as error:
+    raise ValueError(f"'task_kwargs' is {info['task_kwargs']}: {error}") from None
 
 
 def replay(
-  recording: Recording, watch: Callable[[Any], Any] | None = None
-) -> tuple[Recording, control.Environment]:
-  """Returns a recording's episode run anew from its seed and actions, and its environment."""
-  env = environment(recording)
+  recording: Recording,
+  watch: Callable[[Any], Any] | None = None,
+  env: control.Environment | None = None,
+) -> Recording:
+  """Returns a recording's episode run anew from its seed and actions.
+
+  Args:
+    recording: of an exercise
+    watch: see `run`
+    env: to run it in, one like the recording's own by default
+  """
+  env = env or environment(recording)
   actions = iter(recording.arrays.get("action", np.zeros((0, 0)))[1:])
 
   class _Over(Exception):
@@ -138,12 +153,14 @@ def replay(
 
   kept = {k: v for k, v in recording.info.items() if k not in ("outcome", "return", "error")}
   try:
-    again = run(env, act, recording.info["seed"], kept, "state" in recording.arrays, watch)
+    return run(env, act, recording.info["seed"], kept, "state" in recording.arrays, watch)
   except EpisodeError as error:
     if not isinstance(error.__cause__, _Over):
       raise
-    again = error.recording  # it had been stopped there
-  return again, env
+    again = error.recording  # the first one was stopped there
+    again.info["outcome"] = recording.info.get("outcome", "stopped")
+    del again.info["error"]
+    return again
 
 
 def differences(first: Recording, second: Recording) -> list[str]:
@@ -160,64 +177,3 @@ def differences(first: Recording, second: Recording) -> list[str]:
   if first.metrics() != second.metrics():
     out.append("metrics")
   return out
-
-
-def task_kwargs(options: Mapping[str, Any], seed: int) -> dict[str, Any]:
-  """Returns the keyword arguments of a task with its seed."""
-  return {"random": seed, **options}
-
-
-# Policies and references.
-
-
-def find(spec: str) -> Any:
-  """Returns the object that "module:object" names; ValueError says what is wrong with it."""
-  module, _, name = spec.partition(":")
-  if not module or not name:
-    raise ValueError(f"policy is {spec!r}, expected module:object")
-  if os.getcwd() not in sys.path:
-    sys.path.insert(0, os.getcwd())
-  try:
-    found: Any = importlib.import_module(module)
-  except Exception as error:
-    raise ValueError(f"policy {spec!r}: {type(error).__name__}: {error}") from error
-  for part in name.split("."):
-    if not hasattr(found, part):
-      raise ValueError(f"policy {spec!r}: {module} has no {name!r}")
-    found = getattr(found, part)
-  if not callable(found):
-    raise ValueError(f"policy {spec!r} is a {type(found).__name__}, expected something to call")
-  return found
-
-
-def performer(spec: str, env: control.Environment, seed: int) -> Act:
-  """Returns who acts in an environment.
-
-  Args:
-    spec: a name of `experts.STYLES`, or "module:object": a class is made with (env, seed) and its
-      object called with each time step; anything else is called with the observation
-    env: the environment
-    seed: of what is random in a scripted performer
-  """
-  if ":" not in spec:
-    return experts.make(env, spec, seed)
-  found = find(spec)
-  if isinstance(found, type):
-    return found(env, seed)
-  return lambda timestep: found(timestep.observation)
-
-
-def reference_path(name: str) -> pathlib.Path:
-  """Returns where the expert reference of a task such as "touch/easy" is kept."""
-  return pathlib.Path(__file__).parent / "references" / f"{name.replace('/', '_')}.json"
-
-
-@functools.cache
-def reference(name: str) -> dict[str, Any] | None:
-  """Returns the expert reference of a task, None where there is none."""
-  path = reference_path(name)
-  if not path.exists():
-    return None
-  data = json.loads(path.read_text(encoding="utf-8"))
-  check_reference(data)
-  return data

@@ -18,6 +18,7 @@ from dm_control.utils import containers
 
 from . import base
 from .base import Physics, Task
+from .performer import Performer, Script
 from .scenes import Scene
 
 SUITE = containers.TaggedTasks()
@@ -143,3 +144,26 @@ class Grasp(Task):
   def reference_length(self) -> float:
     """Returns the way to the site, up and down again [m]."""
     return self.distance0 + 2 * self.lift
+
+  def expert(self, p: Performer) -> Script:
+    """Grasps, lifts, holds, lowers and lets go."""
+    physics = p.physics
+    while self.outcome is None:
+      yield from p.close(self.site)
+      up = physics.trocar().mat[:, 2]
+      speed, contact = 0.012 * p.style.speed, 0.0
+      yield from p.wait(p.style.delay)
+      goal = self.lift + 0.0015 + 0.3 * p.style.overshoot * self.lift
+      while self.grasped and not self.done:  # up, and hold
+        contact += base.CONTROL_TIMESTEP
+        missing = goal - self.height(physics)
+        p.tip = p.tip + float(np.clip(3 * missing, -speed, speed)) * base.CONTROL_TIMESTEP * up
+        p.grip(contact)
+        yield p.step()
+      yield from p.wait(p.style.delay)
+      while self.grasped and self.height(physics) > 0.2 * self.lift:
+        p.tip = p.tip - speed * base.CONTROL_TIMESTEP * up
+        p.grip(contact)
+        yield p.step()
+      yield from p.open()
+      yield from p.move(p.tip + 0.02 * up)

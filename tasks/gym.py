@@ -1,6 +1,6 @@
 """The exercises as Gymnasium environments.
 
-    import gymnasium, palpate
+    import gymnasium, palpate.tasks
     env = gymnasium.make("palpate/Touch-v0", render_mode="rgb_array")
 
 Observations are those of the exercise (see `base`), a `Dict` of float64 boxes; actions and rewards
@@ -15,7 +15,8 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from . import suite, viewer
+from . import suite
+from .display import Window
 from .recorder import Recorder
 from .scenes import CAMERA
 
@@ -60,8 +61,7 @@ class Exercise(gymnasium.Env):
         for name, spec in self.environment.observation_spec().items()
       }
     )
-    self._viewer: Any = None
-    self._shown: Any = None
+    self._window: Window | None = None
     self._recorder: Recorder | None = None
 
   @property
@@ -124,20 +124,18 @@ class Exercise(gymnasium.Env):
     return self._physics.render(*self._size, camera_id=camera)
 
   def _show(self) -> None:
-    if self._shown is not self._physics.data.ptr:  # another organ is another model
-      self._close_viewer()
+    data = self._physics.data.ptr
+    if self._window is not None and self._window.data is not data:  # another organ, another model
+      self.close()
+    if self._window is None:
       try:
-        self._viewer = viewer.launch(self._physics)
+        self._window = Window(self._physics, CAMERA)
       except RuntimeError as error:
         raise RuntimeError(f"render_mode 'human': {error}; use 'rgb_array'") from None
-      self._shown = self._physics.data.ptr
-    self._viewer.sync()
-
-  def _close_viewer(self) -> None:
-    if self._viewer is not None:
-      self._viewer.close()
-    self._viewer = self._shown = None
+    self._window.show()
 
   def close(self) -> None:
     """Closes the window."""
-    self._close_viewer()
+    if self._window is not None:
+      self._window.close()
+    self._window = None

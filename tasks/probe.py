@@ -19,6 +19,7 @@ from dm_control.utils import containers
 
 from . import base, scenes
 from .base import Physics, Task
+from .performer import Performer, Script
 from .scenes import Scene
 from .touch import draw_apart
 
@@ -195,6 +196,23 @@ class Press(Task):
     """Returns the length of the straight lines from site to site [m]."""
     return self._path
 
+  def expert(self, p: Performer) -> Script:
+    """Presses the sites one by one."""
+    while self.done < self.targets:
+      done, now = self.done, self.now
+      point, normal = self.points[now], self.normals[now]
+      yield from p.move(point + 0.008 * normal)
+      middle = sum(self.band) / 2
+
+      def until(done: int = done) -> bool:
+        return self.done > done
+
+      if self.by_depth:
+        yield from p.sink(middle, point, -normal, until)
+      else:
+        yield from p.push(middle, -normal, until, most=6.0)
+      yield from p.move(point + 0.008 * normal)
+
 
 class Palpate(Task):
   """Find the stiff inclusion and report its place."""
@@ -281,3 +299,67 @@ class Palpate(Task):
     if np.linalg.norm(physics.contact_force()) < 0.05:
       return 0.0
     return 0.5 * max(base.closeness(self.distance(physics), self.distance0), 0.0)
+
+  def expert(self, p: Performer) -> Script:
+    """Feels all over the field, then closer around the stiffest place, and reports that."""
+    physics = p.physics
+    place, center = self.field, self.center
+    middle = physics.organ.xpos0[physics.organ.elem].mean(axis=1)[place]
+    normals = physics.normals()[place]
+    spots, stiffness = [], []
+
+    def feel(point: np.ndarray) -> Script:
+      k = int(np.argmin(np.linalg.norm(middle - point, axis=1)))
+      yield from p.move(middle[k] + 0.005 * normals[k])
+      end = physics.time() + 0.9
+      peak = [0.0]
+
+      def done() -> bool:
+        peak[0] = float(np.linalg.norm(physics.contact_force()))
+        return physics.time() > end
+
+      yield from p.sink(0.004, middle[k], -normals[k], done)
+      spots.append(middle[k])
+      stiffness.append(peak[0])
+      yield from p.move(middle[k] + 0.005 * normals[k])
+
+    for point in _lattice(middle, center, 0.0115):
+      yield from feel(point)
+    for _ in range(2):  # look closer around the stiffest place
+      guess = _stiffest(np.array(spots), np.array(stiffness))
+      away = np.linalg.norm(middle - guess, axis=1)
+      far = np.linalg.norm(middle[:, None] - np.array(spots), axis=2).min(axis=1)
+      for _ in range(3):
+        point = middle[np.argmax(np.where(away < 0.012, far, -1.0))]
+        yield from feel(point)
+        far = np.minimum(far, np.linalg.norm(middle - spots[-1], axis=1))
+    guess = _stiffest(np.array(spots), np.array(stiffness))
+    k = int(np.argmin(np.linalg.norm(middle - guess, axis=1)))
+    yield from p.move(middle[k] + 0.003 * normals[k])
+    yield from p.move(middle[k])
+    yield from p.wait(0.1)
+    p.extra[:] = 1.0
+    yield p.step()
+
+
+def _lattice(points: np.ndarray, center: np.ndarray, gap: float) -> list[np.ndarray]:
+  """Returns points at least `gap` apart, from the center outward in a spiral's order."""
+  chosen = [points[np.argmin(np.linalg.norm(points - center, axis=1))]]
+  while True:
+    distance = np.linalg.norm(points[:, None] - np.array(chosen), axis=2).min(axis=1)
+    left = np.flatnonzero(distance >= gap)
+    if not len(left):
+      return chosen
+    near = np.linalg.norm(points[left] - chosen[-1], axis=1)
+    chosen.append(points[left[np.argmin(near)]])
+
+
+def _stiffest(spots: np.ndarray, stiffness: np.ndarray) -> np.ndarray:
+  """Returns where the force at one depth is largest: the mean of its neighbourhood's excess."""
+  # The smooth maximum counts every spot's neighbours within 10 mm.
+  weight = np.exp(-((np.linalg.norm(spots[:, None] - spots, axis=2) / 0.01) ** 2))
+  smooth = weight @ stiffness / weight.sum(axis=1)
+  best = spots[np.argmax(smooth)]
+  near = np.linalg.norm(spots - best, axis=1) < 0.018
+  excess = np.clip(stiffness - np.median(stiffness), 0, None) ** 1.5 * near
+  return (excess[:, None] * spots).sum(axis=0) / max(excess.sum(), 1e-12)

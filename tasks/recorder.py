@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .inputs import COLUMNS
+from .metrics import Metrics
 from .recording import (
-  COLUMNS,
   Event,
   Recording,
   Settings,
@@ -21,7 +22,6 @@ from .recording import (
   check_event,
   check_watch,
 )
-from .score import Metrics
 
 __all__ = ["Event", "Recorder", "Recording", "Settings"]
 

@@ -10,30 +10,18 @@ import json
 import math
 import os
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from . import metrics as m
-from .metrics import ERRORS, EVENTS, Unknown
-from .score import METRICS, Metrics
+from .files import replacing
+from .inputs import COLUMNS, measure
+from .metrics import EVENTS, Metrics, check_time
 
 FORMAT = "palpate-recording"
 VERSION = 1
-# Width of one instrument's entry; force has 3 components or is a magnitude.
-COLUMNS: dict[str, tuple[int, ...]] = {
-  "tip_pos": (3,),
-  "quat": (4,),
-  "axis": (3,),
-  "force": (3,),
-  "area": (),
-  "grip": (),
-  "held": (),
-  "visible": (),
-}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -144,114 +132,7 @@ class Recording:
     count = len(self.instruments)
     if instrument is not None and not 0 <= instrument < count:
       raise ValueError(f"instrument is {instrument}, expected 0 to {count - 1}")
-    if len(self.time) == 0:
-      return Metrics(**dict.fromkeys(METRICS, Unknown("the recording is empty")))
-    which = list(range(count)) if instrument is None else [instrument]
-    each = [self._instrument_metrics(i) for i in which]
-    values = {
-      name: _combine(METRICS[name].combine, [row[name] for row in each]) for name in each[0]
-    }
-    return Metrics(**values, **self._shared_metrics(which, values["path_length"]))
-
-  def _instrument_metrics(self, i: int) -> dict[str, float]:
-    time, set_ = self.time, self.settings
-    pos, quat, force = self.column("tip_pos", i), self.column("quat", i), self.column("force", i)
-    axis, area, visible = self.column("axis", i), self.column("area", i), self.column("visible", i)
-    grip, held = self.column("grip", i), self.column("held", i)
-    if axis is None and quat is not None:
-      axis = _rotate(quat, set_.local_axis)
-    limit = math.nan if set_.force_limit is None else set_.force_limit
-    touch = set_.contact_force
-
-    def smooth(function: Callable[[np.ndarray, float], float]) -> float:
-      return m.metric(lambda: function(*m.uniform_speed(time, self._position(i))))()
-
-    row = {
-      "path_length": _of(m.path_length, tip_pos=pos),
-      "sparc": smooth(m.sparc),
-      "log_dimensionless_jerk": smooth(m.log_dimensionless_jerk),
-      "angular_path": _of(m.angular_path, quat=quat),
-      "depth_path": _of(m.depth_path, tip_pos=pos, axis=axis),
-      "response_orientation": _of(m.response_orientation, quat=quat, local_axis=set_.local_axis),
-      "number_of_movements": m.metric(
-        lambda: m.number_of_movements(
-          time, self._speed(i), set_.movement_speed, set_.movement_debounce
-        )
-      )(),
-      "peak_force": _of(m.peak_force, force=force, contact=touch),
-      "mean_force": _of(m.mean_force, time=time, force=force, contact=touch),
-      "rms_force": _of(m.rms_force, time=time, force=force, contact=touch),
-      "force_time_product": _of(m.force_time_product, time=time, force=force, contact=touch),
-      "force_breaches": _of(m.force_breaches, force=force, limit=limit, contact=touch),
-      "excess_impulse": _of(m.excess_impulse, time=time, force=force, limit=limit, contact=touch),
-      "peak_pressure": _of(m.peak_pressure, force=force, area=area, contact=touch),
-      "grasp_slips": _of(m.grasp_slips, grip=grip, held=held),
-      "out_of_view": _of(m.out_of_view, time=time, visible=visible),
-    }
-    if (grip is None or held is None) and self._watches("slip"):
-      row["grasp_slips"] = m.count_events(self._kinds([i]), ["slip"])
-    # An instrument that never moved did not turn economically: nothing is known of its turning.
-    if math.isnan(row["path_length"]) and row["angular_path"] == 0:
-      row["angular_path"] = row["response_orientation"] = Unknown("no motion")
-    return row
-
-  def _shared_metrics(self, which: Sequence[int], path_length: float) -> dict[str, float]:
-    time, set_ = self.time, self.settings
-    reference = math.nan if set_.reference_length is None else set_.reference_length
-    kinds = self._kinds(which)
-    reached = [
-      math.nan if e.value is None else e.value
-      for e in self.events
-      if e.kind == "target" and e.instrument in which
-    ]
-    row = {
-      "time": m.time_to_completion(time),
-      "path_inefficiency": m.path_inefficiency(path_length, reference),
-      "target_error": m.target_error(reached),
-      "errors": Unknown("no kind of error was watched for"),
-      "bimanual_dexterity": Unknown("a single instrument"),
-    }
-    if self._watches(*ERRORS):
-      row["errors"] = m.count_events(kinds, ERRORS)
-    if len(which) > 1:
-      row["bimanual_dexterity"] = m.metric(
-        lambda: m.bimanual_dexterity(self._speed(which[0]), self._speed(which[1]))
-      )()
-
-    def resting(function: Callable[..., float]) -> float:
-      return function(time, [self._speed(i) for i in which], set_.idle_speed)
-
-    row["idle_time"] = m.metric(lambda: resting(m.idle_time))()
-    row["idle_share"] = m.metric(lambda: resting(m.idle_share))()
-    row["trace_rms"] = m.metric(lambda: m.trace_rms(*self._trace(which[0], whole=False)))()
-    row["trace_frechet"] = m.metric(lambda: m.trace_frechet(*self._trace(which[0], whole=True)))()
-    return row
-
-  def _position(self, i: int) -> np.ndarray:
-    pos = self.column("tip_pos", i)
-    if pos is None:
-      raise m.UnknownError("tip_pos not recorded")
-    return pos
-
-  def _speed(self, i: int) -> np.ndarray:
-    return m.speed(self.time, self._position(i))
-
-  def _trace(self, i: int, whole: bool) -> tuple[np.ndarray, np.ndarray]:
-    if "curve" not in self.constants:
-      raise m.UnknownError("no curve to trace")
-    pos, force = self._position(i), self.column("force", i)
-    if force is not None:
-      touch = (m.magnitude(force) > self.settings.contact_force).nonzero()[0]
-      if len(touch) == 0:
-        raise m.UnknownError("no contact")
-      pos = pos[touch[0] : touch[-1] + 1] if whole else pos[touch]
-    return pos, self.constants["curve"]
-
-  def _watches(self, *kinds: str) -> bool:
-    return any(k in self.watch or any(e.kind == k for e in self.events) for k in kinds)
-
-  def _kinds(self, which: Sequence[int]) -> list[str]:
-    return [e.kind for e in self.events if e.instrument in which]
+    return measure(self, range(count) if instrument is None else [instrument])
 
   def save(self, path: str | os.PathLike[str]) -> Path:
     """Writes the recording; an interrupted write leaves the old file as it was.
@@ -272,21 +153,16 @@ class Recording:
     entries = {"meta": np.array(json.dumps(meta, allow_nan=False)), "time": self.time}
     for kind, table in _TABLES.items():
       entries |= {f"{kind}.{name}": value for name, value in getattr(self, table).items()}
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-      with part.open("wb") as file:
-        np.savez_compressed(file, allow_pickle=False, **entries)
-        file.flush()
-        os.fsync(file.fileno())
-      os.replace(part, path)
-    finally:
-      part.unlink(missing_ok=True)
+    with replacing(path, "wb") as file:
+      np.savez_compressed(file, allow_pickle=False, **entries)
     return path
 
   @classmethod
   def load(cls, path: str | os.PathLike[str]) -> "Recording":
     """Reads a recording; ValueError names the file and what is wrong with it."""
     path = Path(path)
+    if path.exists() and not path.is_file():  # a pipe would be waited for
+      raise ValueError(f"{path}: not a {FORMAT}: not a file")
     with path.open("rb") as file:
       if file.read(2) != b"PK":
         raise ValueError(f"{path}: not a {FORMAT}: not a zip archive")
@@ -312,7 +188,7 @@ class Recording:
       if archive["meta"].dtype.kind != "U" or archive["meta"].shape != ():
         raise ValueError("entry 'meta' is no text")
       meta = _check_meta(json.loads(str(archive["meta"][()])))
-      time = m.check_time(check_array("time", archive["time"]), least=0)
+      time = check_time(check_array("time", archive["time"]), least=0)
       for name in set(archive.files) - {"meta", "time"}:
         kind, _, rest = name.partition(".")
         if kind not in _TABLES or not rest:
@@ -331,31 +207,6 @@ class Recording:
 _TABLES = {"column": "columns", "array": "arrays", "constant": "constants"}
 
 
-def _of(function: Callable[..., float], **inputs: Any) -> float:
-  """Returns the metric, or `Unknown` naming the inputs that are None."""
-  if absent := [name for name, value in inputs.items() if value is None]:
-    return Unknown(f"{' and '.join(absent)} not recorded")
-  return function(*inputs.values())
-
-
-def _combine(how: str, values: Sequence[float]) -> float:
-  """Returns one value of several instruments; bad data of one makes all unknown, absence not."""
-  for value in values:
-    if isinstance(value, Unknown) and value.fault:
-      return value
-  known = [v for v in values if not math.isnan(v)]
-  if not known:
-    return values[0]
-  return max(known) if how == "max" else sum(known) / (len(known) if how == "mean" else 1)
-
-
-def _rotate(quat: np.ndarray, axis: ArrayLike) -> np.ndarray:
-  """Returns a vector of the tip's frame in the world  (nstep, 3)."""
-  w, v = quat[:, :1], quat[:, 1:]
-  twice = 2 * np.cross(v, np.asarray(axis, np.float64))
-  return np.asarray(axis, np.float64) + w * twice + np.cross(v, twice)
-
-
 def check_array(name: str, value: np.ndarray) -> np.ndarray:
   """Returns the array; ValueError unless it holds numbers."""
   if value.dtype.kind not in "fiub":
@@ -364,10 +215,15 @@ def check_array(name: str, value: np.ndarray) -> np.ndarray:
 
 
 def check_constant(name: str, value: np.ndarray) -> None:
-  """Raises ValueError unless the constant holds numbers, those with a meaning in rows of three."""
+  """Raises ValueError unless the constant holds numbers, those with a meaning finite triples."""
   check_array(f"constant {name!r}", value)
-  if name in ("curve", "vertices", "triangles") and (value.ndim != 2 or value.shape[1] != 3):
+  if name not in ("curve", "vertices", "triangles"):
+    return
+  if value.ndim != 2 or value.shape[1] != 3:
     raise ValueError(f"constant {name!r} has shape {value.shape}, expected (n, 3)")
+  bad = ~np.isfinite(value).all(axis=1)
+  if bad.any():
+    raise ValueError(f"constant {name!r} is not finite in row {int(bad.argmax())}")
 
 
 def _check_column(name: str, value: np.ndarray, count: int) -> None:

@@ -1,18 +1,28 @@
-"""The exercises' ids in Gymnasium, registered by `import palpate` where gymnasium is installed.
+"""The names of the exercises, and their ids in Gymnasium.
 
-A domain's standard task is `palpate/Touch-v0`, the others `palpate/TouchEasy-v0`,
-`palpate/ProbePalpateHard-v0` and so on. A change that changes returns gets a new version.
+A domain is a file of this folder, its tasks are the functions under `@SUITE.add` in it: adding one
+there is all. A domain's standard task is `palpate/Touch-v0` in Gymnasium, the others
+`palpate/TouchEasy-v0`, `palpate/ProbePalpateHard-v0` and so on. A change that changes returns gets
+a new version.
 """
 
+import importlib.resources
+import re
+
 VERSION = 0
-_LEVELS = ("easy", "standard", "hard")
-TASKS = {  # as suite.TASKS_BY_DOMAIN, without importing dm_control
-  "touch": _LEVELS,
-  "probe": (*_LEVELS, "depth", "palpate_easy", "palpate_standard", "palpate_hard"),
-  "grasp": _LEVELS,
-  "trace": _LEVELS,
-  "retract": _LEVELS,
-}
+_TASK = re.compile(r"^@SUITE\.add\([^)]*\)\ndef (\w+)\(", re.MULTILINE)
+
+
+def _find() -> dict[str, tuple[str, ...]]:
+  # Read, not imported: dm_control takes a second, which nobody should wait for to see names.
+  found, folder = {}, importlib.resources.files("palpate.tasks")
+  for file in sorted(folder.iterdir(), key=lambda file: file.name):
+    if file.name.endswith(".py") and (names := _TASK.findall(file.read_text(encoding="utf-8"))):
+      found[file.name.removesuffix(".py")] = tuple(names)
+  return found
+
+
+TASKS = _find()  # domain -> its tasks
 
 
 def gym_id(domain: str, task: str) -> str:

@@ -18,6 +18,7 @@ from dm_control.utils import containers
 from . import base
 from .base import Physics, Task
 from .grasp import FUNDUS, REACH
+from .performer import Performer, Script
 from .scenes import Scene
 
 SUITE = containers.TaggedTasks()
@@ -155,3 +156,29 @@ class Retract(Task):
   def reference_length(self) -> float:
     """Returns the way to the site and aside by four radii of the disc [m]."""
     return self.distance0 + 4 * self.radius
+
+  def expert(self, p: Performer) -> Script:
+    """Grasps and pulls aside, a little up, until enough is seen."""
+    physics = p.physics
+    while self.outcome is None:
+      yield from p.close(self.site)
+      up = physics.trocar().mat[:, 2]
+      yield from p.wait(p.style.delay)
+      along = self.right + 0.15 * up
+      along /= np.linalg.norm(along)
+      start, speed, contact = p.tip.copy(), 0.015 * p.style.speed, 0.0
+      far, extra = 0.0, 0.002 * (1 + 4 * p.style.overshoot)
+      enough = None
+      while self.grasped:
+        contact += base.CONTROL_TIMESTEP
+        if self.visible >= self.wanted - 1e-9:
+          enough = far + extra if enough is None else enough
+        elif enough is not None and far >= enough:
+          enough = None  # the organ slid back
+        if far < (0.035 if enough is None else enough):
+          far += speed * base.CONTROL_TIMESTEP
+        p.tip = start + far * along
+        p.grip(contact)
+        yield p.step()
+      yield from p.open()
+      yield from p.move(p.tip + 0.02 * up)

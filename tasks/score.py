@@ -1,4 +1,4 @@
-"""All metrics of a recording as one object, and its score against an expert reference.
+"""The score of a recording's metrics against an expert reference.
 
 A reference is plain data, so that it ships as JSON:
 
@@ -23,12 +23,14 @@ reference has with an SD; a recording that lacks a metric of the reference is no
 """
 
 import dataclasses
+import functools
 import json
 import math
+import pathlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from .metrics import Unknown
+from .metrics import METRICS, Metrics, Unknown, check_header, check_names
 
 WEIGHTS = {
   "safety": 0.67,
@@ -40,151 +42,6 @@ WEIGHTS = {
 Z_LIMIT = 10.0
 PROFICIENT_SD = 2.0
 LEAST_WEIGHT = 0.5
-
-
-@dataclasses.dataclass(frozen=True)
-class Spec:
-  """What a metric is, as data.
-
-  Attributes:
-    label: name for people
-    unit: SI unit of the value
-    group: category of the composite score, a key of `WEIGHTS`
-    combine: how several instruments make one value: `sum`, `max`, `mean`, or `all` (one value)
-    source: where the definition comes from
-    better: `lower` or `higher`
-    shown: unit for people
-    scale: shown value / SI value
-  """
-
-  label: str
-  unit: str
-  group: str
-  combine: str
-  source: str
-  better: str
-  shown: str
-  scale: float
-
-
-_SHOWN = {"m": ("mm", 1e3), "rad": ("deg", 180 / math.pi), "Pa": ("kPa", 1e-3)}
-_EFFICIENCY, _SAFETY, _DEXTERITY = "efficiency", "safety", "dexterity"
-_FORCE = "Horeman et al. 2010; Barrie et al. 2018"
-_SMOOTH = "Balasubramanian et al. 2015"
-
-
-def _row(
-  label: str, unit: str, group: str, combine: str, source: str, better: str = "lower"
-) -> Any:
-  shown, scale = _SHOWN.get(unit, (unit, 1.0))
-  spec = Spec(label, unit, group, combine, source, better, shown, scale)
-  return dataclasses.field(default=Unknown("not recorded"), metadata={"spec": spec})
-
-
-# fmt: off
-@dataclasses.dataclass(frozen=True, eq=False)
-class Metrics:
-  """Every metric of one recording, SI; `Unknown` where it cannot be known.
-
-  `METRICS` says what each field is; the function of the same name in `metrics` defines it.
-  """
-
-  time: float = _row("Time to completion", "s", "time", "all", "Oropesa et al. 2013")
-  path_length: float = _row("Path length", "m", _EFFICIENCY, "sum", "Oropesa et al. 2013")
-  path_inefficiency: float = _row(
-    "Path inefficiency", "%", _EFFICIENCY, "all", "Perk Tutor; 10.1007/s00464-007-9526-z")
-  sparc: float = _row("Smoothness (SPARC)", "-", _DEXTERITY, "mean", _SMOOTH, "higher")
-  log_dimensionless_jerk: float = _row(
-    "Log dimensionless jerk", "-", _DEXTERITY, "mean", _SMOOTH, "higher")
-  angular_path: float = _row("Angular path", "rad", _EFFICIENCY, "sum", "PMC5845064")
-  depth_path: float = _row("Depth path", "m", _EFFICIENCY, "sum", "Perk Tutor")
-  response_orientation: float = _row("Response orientation", "rad", _EFFICIENCY, "sum", "CELTS")
-  number_of_movements: float = _row(
-    "Number of movements", "count", _EFFICIENCY, "sum", "ICSAD; Perk Tutor")
-  idle_time: float = _row("Idle time", "s", _EFFICIENCY, "all", "PMC4412306")
-  idle_share: float = _row("Idle share", "%", _EFFICIENCY, "all", "PMC4412306")
-  peak_force: float = _row("Peak force", "N", _SAFETY, "max", _FORCE)
-  mean_force: float = _row("Mean force in contact", "N", _SAFETY, "mean", _FORCE)
-  rms_force: float = _row("RMS force in contact", "N", _SAFETY, "mean", _FORCE)
-  force_time_product: float = _row(
-    "Force-time product", "N s", _SAFETY, "sum", "Barrie et al. 2018")
-  force_breaches: float = _row("Force limit breaches", "count", _SAFETY, "sum", "Rodrigues")
-  excess_impulse: float = _row("Excess impulse", "N s", _SAFETY, "sum", "Horeman et al. 2010")
-  peak_pressure: float = _row(
-    "Peak contact pressure", "Pa", _SAFETY, "max", "10.1136/bmjsit-2021-000084")
-  errors: float = _row("Errors", "count", _SAFETY, "all", "10.1186/s12893-020-00839-z")
-  grasp_slips: float = _row("Grasp slips", "count", _SAFETY, "sum", "GOALS tissue handling")
-  target_error: float = _row("Target error", "m", "outcome", "all", "Perk Tutor")
-  trace_frechet: float = _row(
-    "Tracing error (Frechet)", "m", "outcome", "all", "Perk Tutor; Eiter and Mannila 1994")
-  trace_rms: float = _row("Tracing error (RMS)", "m", "outcome", "all", "Perk Tutor")
-  bimanual_dexterity: float = _row(
-    "Bimanual dexterity", "-", _DEXTERITY, "all", "Hofstad et al. 2013", "higher")
-  out_of_view: float = _row("Out of view", "%", _SAFETY, "mean", "PMC5845064")
-  # fmt: on
-
-  def values(self) -> dict[str, float]:
-    """Returns metric -> value [SI]."""
-    return {name: getattr(self, name) for name in METRICS}
-
-  def reasons(self) -> dict[str, str]:
-    """Returns metric -> why it is unknown, for those that are."""
-    return {
-      name: value.reason if isinstance(value, Unknown) else f"the value is {value}"
-      for name, value in self.values().items()
-      if not math.isfinite(value)
-    }
-
-  def __eq__(self, other: object) -> bool:
-    """Equal to the bit; unknown equals unknown for the same reason."""
-    return self.to_json() == other.to_json() if isinstance(other, Metrics) else NotImplemented
-
-  def __hash__(self) -> int:
-    return hash(self.to_json())
-
-  def to_json(self, indent: int | None = None) -> str:
-    """Returns the values (null where unknown), the reasons, the units and the directions."""
-    data = {
-      "format": "palpate-metrics",
-      "version": 1,
-      "values": {k: float(v) if math.isfinite(v) else None for k, v in self.values().items()},
-      "unknown": self.reasons(),
-      "unit": {name: spec.unit for name, spec in METRICS.items()},
-      "better": {name: spec.better for name, spec in METRICS.items()},
-    }
-    return json.dumps(data, indent=indent, allow_nan=False)
-
-  @classmethod
-  def from_json(cls, text: str) -> "Metrics":
-    """Returns the metrics that `to_json` wrote; ValueError for anything else."""
-    data = json.loads(text)
-    _check_header(data, "palpate-metrics")
-    values, unknown = data.get("values"), data.get("unknown", {})
-    if not isinstance(values, dict) or not isinstance(unknown, dict):
-      raise ValueError("palpate-metrics: 'values' and 'unknown' must be objects")
-    _check_names(values)
-    return cls(
-      **{
-        name: Unknown(str(unknown.get(name, "not recorded"))) if value is None else float(value)
-        for name, value in values.items()
-      }
-    )
-
-
-METRICS: dict[str, Spec] = {f.name: f.metadata["spec"] for f in dataclasses.fields(Metrics)}
-
-
-def _check_header(data: Any, name: str) -> None:
-  if not isinstance(data, Mapping) or data.get("format") != name:
-    found = data.get("format") if isinstance(data, Mapping) else type(data).__name__
-    raise ValueError(f"not {name}: format is {found!r}")
-  if data.get("version") != 1:
-    raise ValueError(f"{name}: version is {data.get('version')!r}, expected 1")
-
-
-def _check_names(names: Mapping[str, Any]) -> None:
-  if strange := sorted(set(names) - set(METRICS)):
-    raise ValueError(f"no such metric {strange[0]!r}, expected one of {', '.join(METRICS)}")
 
 
 def make_reference(results: Sequence[Metrics], task: str, seed: int) -> dict[str, Any]:
@@ -217,11 +74,11 @@ def make_reference(results: Sequence[Metrics], task: str, seed: int) -> dict[str
 
 def check_reference(reference: Any) -> None:
   """Raises ValueError naming the entry unless this is a reference to score against."""
-  _check_header(reference, "palpate-reference")
+  check_header(reference, "palpate-reference")
   table = reference.get("metrics")
   if not isinstance(table, Mapping):
     raise ValueError("palpate-reference: 'metrics' is missing or not an object")
-  _check_names(table)
+  check_names(table)
   for name, row in table.items():
     row = row if isinstance(row, Mapping) else {}
     mean, sd = row.get("mean"), row.get("sd")
@@ -229,6 +86,27 @@ def check_reference(reference: Any) -> None:
       raise ValueError(f"palpate-reference: {name}.mean is {mean!r}, expected a finite number")
     if sd is not None and not (_number(sd) and sd >= 0):
       raise ValueError(f"palpate-reference: {name}.sd is {sd!r}, expected a number >= 0 or null")
+
+
+def reference_path(task: str) -> pathlib.Path:
+  """Returns where the expert reference of a task such as "touch/easy" is kept."""
+  return pathlib.Path(__file__).parent / "references" / f"{task.replace('/', '_')}.json"
+
+
+@functools.cache
+def reference(task: str) -> dict[str, Any] | None:
+  """Returns the expert reference of a task, None where there is none."""
+  path = reference_path(task)
+  return read_reference(path) if path.is_file() else None
+
+
+def read_reference(path: pathlib.Path) -> dict[str, Any]:
+  """Returns the expert reference in a file; ValueError says what is wrong with it."""
+  if path.exists() and not path.is_file():  # a pipe would be waited for
+    raise ValueError(f"{path}: not a palpate-reference: not a file")
+  data = json.loads(path.read_text(encoding="utf-8"))
+  check_reference(data)
+  return data
 
 
 def _number(value: Any) -> bool:

@@ -1,14 +1,16 @@
 """The exercises by name, loaded as those of dm_control's suite."""
 
+import importlib
 import inspect
 from collections.abc import Mapping
 from typing import Any
 
 from dm_control.rl import control
 
-from . import grasp, probe, retract, touch, trace
+from . import display, registry
 
-DOMAINS = {"touch": touch, "probe": probe, "grasp": grasp, "trace": trace, "retract": retract}
+display.prepare_gl()  # before the domains import dm_control.mujoco
+DOMAINS = {name: importlib.import_module(f".{name}", __package__) for name in registry.TASKS}
 
 
 def _tagged(tag: str | None) -> tuple[tuple[str, str], ...]:

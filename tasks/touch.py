@@ -16,6 +16,7 @@ from dm_control.utils import containers
 
 from . import base
 from .base import Physics, Task
+from .performer import Performer, Script
 from .scenes import Scene
 
 SUITE = containers.TaggedTasks()
@@ -115,6 +116,16 @@ class Touch(Task):
   def reference_length(self) -> float:
     """Returns the length of the straight lines from point to point [m]."""
     return self._path
+
+  def expert(self, p: Performer) -> Script:
+    """Touches the points one by one."""
+    physics = p.physics
+    while self.done < self.targets:
+      done, goal = self.done, self.goal()
+      point, normal = physics.point(goal), physics.normals()[goal]
+      yield from p.move(point + 0.01 * normal)
+      yield from p.push(0.12, -normal, lambda done=done: self.done > done, most=3.0)
+      yield from p.move(physics.tip_pos() + 0.01 * normal)
 
 
 def draw_apart(

@@ -10,6 +10,7 @@ or the time limit.
 """
 
 import dataclasses
+import math
 
 import numpy as np
 from dm_control.utils import containers
@@ -17,6 +18,7 @@ from scipy.spatial import cKDTree
 
 from . import base
 from .base import Physics, Task
+from .performer import Performer, Script
 from .scenes import Scene
 
 SUITE = containers.TaggedTasks()
@@ -189,3 +191,27 @@ class Trace(Task):
   def reference_length(self) -> float:
     """Returns the length of the curve and of the way to it [m]."""
     return self.length + self.distance0
+
+  def expert(self, p: Performer) -> Script:
+    """Goes along the curve in light contact."""
+    physics = p.physics
+    up = physics.trocar().mat[:, 2]
+    yield from p.move(self.curve[0] + 0.01 * up)
+    yield from p.push(0.08, -up, lambda: self.done > 0, most=3.0)
+    # Pulls a point along the curve and keeps the force by its height.
+    at, height, contact = 0.0, float((p.tip - self.curve[0]) @ up), 0.0
+    step = 0.02 * p.style.speed * base.CONTROL_TIMESTEP / _STEP
+    while self.done < len(self.curve):
+      contact += base.CONTROL_TIMESTEP
+      at = min(at + step, self.done + 2.0, len(self.curve) - 1)
+      force = float(np.linalg.norm(physics.contact_force()))
+      error = 0.12 * p.excess(contact) - force
+      height -= float(np.clip(0.08 * error, -0.01, 0.01)) * base.CONTROL_TIMESTEP
+      k = int(at)
+      ahead = self.curve[min(k + 1, len(self.curve) - 1)]
+      rest = self.curve[k] + (at - k) * (ahead - self.curve[k])
+      wander = p.style.detour * 0.006 * math.sin(2.5 * contact)
+      wander += p.style.overshoot * 0.012 * math.sin(5 * contact)
+      p.tip = rest + height * up + wander * physics.trocar().mat[:, 0]
+      yield p.step()
+    yield from p.move(p.tip + 0.01 * up)

@@ -7,6 +7,10 @@ screen.choose()  # before MuJoCo is imported
 import scenes as builders  # noqa: E402
 
 
+def pytest_addoption(parser):
+  parser.addoption("--seed", type=int, help="of the one fuzz case to run")
+
+
 def pytest_collection_modifyitems(config, items):
   """Leaves out the long forms unless `-m` speaks of them."""
   if "slow" in config.getoption("-m"):

@@ -4,19 +4,21 @@ A subcommand is one module with two functions, `add_arguments(parser)` and `main
 one line in `COMMANDS`. The module is imported when it is used, so that help comes at once; it calls
 `palpate.register()` before it loads a model.
 
-Exit codes: 0 done; 1 it did not work; 2 a wrong option or scene; 130 interrupted.
+Exit codes: 0 done; 1 it did not work; 2 a wrong option or scene; 130 interrupted; 141 whoever read
+the output has closed it.
 """
 
 from __future__ import annotations
 
 import argparse
 import importlib
+import os
 import sys
 from collections.abc import Sequence
 
 from palpate import __version__
 
-from .console import CommandError, prepare_gl
+from .console import CommandError
 
 # Words of the command -> module of this package, and what the help says.
 COMMANDS = {
@@ -37,14 +39,20 @@ def main(argv: Sequence[str] | None = None) -> int:
   """Runs the command line and returns its exit code."""
   words = list(sys.argv[1:] if argv is None else argv)
   try:
-    args = _parser(words).parse_args(words)
-    return args.main(args)
+    try:
+      args = _parser(words).parse_args(words)
+      return args.main(args)
+    finally:
+      sys.stdout.flush()
   except CommandError as error:
     print(f"palpate: {error}", file=sys.stderr)
     return error.code
   except KeyboardInterrupt:
     print("palpate: interrupted", file=sys.stderr)
     return 130
+  except BrokenPipeError:
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is still in it
+    return 141
 
 
 def _parser(words: list[str]) -> argparse.ArgumentParser:
@@ -61,7 +69,8 @@ def _parser(words: list[str]) -> argparse.ArgumentParser:
       place = groups[name[0]]
     command = place.add_parser(name[-1], help=text, description=text[0].upper() + text[1:] + ".")
     if tuple(words[: len(name)]) == name:
-      prepare_gl()
+      display = importlib.import_module("palpate.tasks.display")  # help alone is quicker without
+      display.prepare_gl()
       chosen = importlib.import_module(f".{module}", __package__)
       chosen.add_arguments(command)
       command.set_defaults(main=chosen.main)

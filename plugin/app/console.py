@@ -1,13 +1,17 @@
-"""What the subcommands share: one-line errors, Ctrl-C as a flag, a progress line, tables."""
+"""What the subcommands share: one-line errors, Ctrl-C as a flag, files to write, tables."""
 
 from __future__ import annotations
 
-import ctypes.util
+import contextlib
+import csv
+import importlib.util
 import os
+import pathlib
 import signal
 import sys
+import tempfile
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 
 class CommandError(Exception):
@@ -66,29 +70,71 @@ class Progress:
       print("\r\033[K", end="", file=sys.stderr, flush=True)
 
 
+def need(extra: str, *modules: str):
+  """Raises CommandError, naming the extra to install, if a module is missing."""
+  missing = [name for name in modules if importlib.util.find_spec(name) is None]
+  if missing:
+    raise CommandError(
+      f"{', '.join(missing)} is not installed: pip install 'palpate[{extra}]'", code=1
+    )
+
+
+def output(option: str, name: str | os.PathLike[str], suffixes: Sequence[str] = ()) -> pathlib.Path:
+  """Returns the path of a file to write, its folder made: said before the work, not after it.
+
+  Args:
+    option: that names the file, for the error
+    name: of the file
+    suffixes: that it may end in, any where there are none
+
+  Raises:
+    CommandError: it cannot be written.
+  """
+  path = pathlib.Path(name)
+  if suffixes and path.suffix.lower() not in suffixes:
+    *others, last = suffixes
+    allowed = f"{', '.join(others)} or {last}" if others else last
+    raise CommandError(f"{option} is {str(name)!r}, expected a name that ends in {allowed}")
+  with writing(path, f"{option}: "):
+    if path.is_dir():
+      raise IsADirectoryError(None, "it is a folder")
+    if path.exists() and not os.access(path, os.W_OK):
+      raise PermissionError(None, "permission denied")
+    output_folder(option, path.parent)
+  return path
+
+
+def output_folder(option: str, name: str | os.PathLike[str]) -> pathlib.Path:
+  """Returns a folder to write to, made if it is missing; as `output`."""
+  path = pathlib.Path(name)
+  with writing(path, f"{option}: "):
+    path.mkdir(parents=True, exist_ok=True)
+    tempfile.TemporaryFile(dir=path).close()
+  return path
+
+
+@contextlib.contextmanager
+def writing(path: pathlib.Path, before: str = "") -> Iterator[None]:
+  """Turns what the system says about a file into one line that names it."""
+  try:
+    yield
+  except OSError as error:
+    why = error.strerror or str(error)
+    raise CommandError(f"{before}cannot write {str(path)!r}: {why}", code=1) from None
+
+
+@contextlib.contextmanager
+def csv_rows(path: pathlib.Path, header: Iterable[str]) -> Iterator[Callable[[Iterable], None]]:
+  """Gives a function that writes a row of a CSV file; numbers have seven digits."""
+  with writing(path), path.open("w", newline="", encoding="utf-8") as file:
+    writer = csv.writer(file, lineterminator="\n")
+    writer.writerow(header)
+    yield lambda row: writer.writerow(f"{v:.7g}" if isinstance(v, float) else v for v in row)
+
+
 def table(rows: Iterable[tuple[str, str]]) -> str:
   """Returns the rows as two aligned columns."""
   rows = list(rows)
   left = max(len(name) for name, _ in rows)
   right = max(len(value) for _, value in rows)
   return "\n".join(f"{name:<{left}}  {value:>{right}}" for name, value in rows)
-
-
-def has_display() -> bool:
-  """Returns whether a window can be opened, as far as the environment tells."""
-  if not sys.platform.startswith("linux"):
-    return True
-  return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-
-
-def prepare_gl():
-  """Chooses a way to render without a screen, unless MUJOCO_GL is set or there is a screen.
-
-  MuJoCo reads the variable once, when it is imported.
-  """
-  if "MUJOCO_GL" in os.environ or has_display():
-    return
-  for backend, library in (("egl", "EGL"), ("osmesa", "OSMesa")):
-    if ctypes.util.find_library(library):
-      os.environ["MUJOCO_GL"] = backend
-      return

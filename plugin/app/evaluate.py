@@ -7,12 +7,16 @@ import dataclasses
 import json
 import math
 import pathlib
-from collections.abc import Iterator
+import signal
+import sys
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import palpate
 
-from .console import CommandError, Progress
+from .console import CommandError, Interrupt, Progress, output, output_folder, writing
+
+_POLL = 0.2  # of Ctrl-C, while processes work [s]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,7 +28,7 @@ class Result:
     outcome: `success`, `damage`, `missed`, `time limit` or `error`
     total: sum of rewards [-]
     time: simulated [s]
-    metrics: as JSON, see `score.Metrics`
+    metrics: as JSON, see `metrics.Metrics`; empty if the episode did not begin
     error: what went wrong, empty otherwise
   """
 
@@ -32,7 +36,7 @@ class Result:
   outcome: str
   total: float
   time: float
-  metrics: str
+  metrics: str = ""
   error: str = ""
 
 
@@ -55,64 +59,100 @@ def main(args: argparse.Namespace) -> int:
     if getattr(args, name) < 1:
       raise CommandError(f"{name} is {getattr(args, name)}, expected a whole number >= 1")
   palpate.register()
-  from palpate.tasks import episode, suite
+  from palpate.tasks import performer, score, suite
 
   try:
     name = "/".join(suite.split(args.task))
-    _check_policy(args.policy)
+    performer.find(args.policy)
   except ValueError as error:
     raise CommandError(str(error)) from None
+  files = {
+    key: output(key, getattr(args, key)) for key in ("json", "reference") if getattr(args, key)
+  }
+  if args.recordings:
+    output_folder("recordings", args.recordings)
   seeds = range(args.seed, args.seed + args.episodes)
   progress, results = Progress(), []
-  for result in evaluate(name, args.policy, seeds, args.processes, args.recordings):
-    results.append(result)
-    progress.show(f"{len(results)} of {args.episodes}")
+  with Interrupt() as interrupt:
+    for result in evaluate(name, args.policy, seeds, args.processes, args.recordings, interrupt):
+      results.append(result)
+      progress.show(f"{len(results)} of {args.episodes}")
   progress.clear()
-  print(table(name, args.policy, results, episode.reference(name)))
-  if args.json:
-    rows = [
-      dataclasses.asdict(r) | {"metrics": json.loads(r.metrics) if r.metrics else None}
-      for r in results
-    ]
-    pathlib.Path(args.json).write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
-  if args.reference:
-    write_reference(pathlib.Path(args.reference), name, args.seed, results)
+  if results:
+    print(table(name, args.policy, results, score.reference(name)))
+  if "json" in files:
+    _write_json(files["json"], results)
+  if interrupt.seen:
+    print(f"palpate: interrupted after {len(results)} of {args.episodes} episodes", file=sys.stderr)
+    return 130
+  if "reference" in files:
+    write_reference(files["reference"], name, args.seed, results)
   errors = [r for r in results if r.outcome == "error"]
   if errors:
     raise CommandError(f"{len(errors)} episodes failed, the first: {errors[0].error}", code=1)
   return 0
 
 
-def _check_policy(spec: str):
-  from palpate.tasks import episode, experts
+def _write_json(path: pathlib.Path, results: list[Result]):
+  from palpate.tasks.files import replacing
 
-  if ":" in spec:
-    episode.find(spec)
-  elif spec not in experts.STYLES:
-    names = ", ".join(experts.STYLES)
-    raise ValueError(f"policy is {spec!r}, expected module:object or one of {names}")
+  rows = [
+    dataclasses.asdict(r) | {"metrics": json.loads(r.metrics) if r.metrics else None}
+    for r in results
+  ]
+  with writing(path), replacing(path) as file:
+    file.write(json.dumps(rows, indent=1) + "\n")
 
 
 def evaluate(
-  name: str, policy: str, seeds: range, processes: int = 1, recordings: str | None = None
+  name: str,
+  policy: str,
+  seeds: Sequence[int],
+  processes: int = 1,
+  recordings: str | None = None,
+  interrupt: Interrupt | None = None,
 ) -> Iterator[Result]:
   """Yields the result of each seed, in order; the processes are spawned, not forked.
 
   Args:
     name: of the task, such as "touch/easy"
-    policy: see `episode.performer`
+    policy: see `performer.make`
     seeds: of the episodes
     processes: at a time
     recordings: folder to keep the recordings in, SEED.npz
+    interrupt: once seen, the episodes that run are finished and no more are begun
   """
+  interrupt = interrupt or Interrupt()
   jobs = [(name, policy, seed, recordings) for seed in seeds]
   if processes == 1:
-    yield from map(_one, jobs)
+    for job in jobs:
+      if interrupt.seen:
+        return
+      yield _one(job)
     return
+  import concurrent.futures
   import multiprocessing
 
-  with multiprocessing.get_context("spawn").Pool(min(processes, len(jobs))) as pool:
-    yield from pool.imap(_one, jobs)
+  pool = concurrent.futures.ProcessPoolExecutor(
+    min(processes, len(jobs)), multiprocessing.get_context("spawn"), initializer=_ignore_interrupts
+  )
+  with pool:
+    futures = [pool.submit(_one, job) for job in jobs]
+    for seed, future in zip(seeds, futures, strict=True):
+      while not concurrent.futures.wait([future], _POLL).done:
+        if interrupt.seen:
+          pool.shutdown(wait=False, cancel_futures=True)
+      if future.cancelled():
+        return
+      try:
+        yield future.result()
+      except concurrent.futures.process.BrokenProcessPool:
+        yield Result(seed, "error", 0.0, 0.0, error="a process died, and with it what was left")
+
+
+def _ignore_interrupts():
+  """Leaves Ctrl-C to the parent."""
+  signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 _environments: dict[str, Any] = {}  # of this process
@@ -121,21 +161,20 @@ _environments: dict[str, Any] = {}  # of this process
 def _one(job: tuple[str, str, int, str | None]) -> Result:
   name, policy, seed, folder = job
   palpate.register()
-  from palpate.tasks import episode, suite
+  from palpate.tasks import episode, performer, suite
 
   if name not in _environments:
     _environments[name] = suite.load(*suite.split(name), task_kwargs={"random": 0})
   env = _environments[name]
-  options = {"task_kwargs": {}, "performer": policy}
+  info = {"task_kwargs": {}, "performer": policy}
   try:
-    recording = episode.run(env, episode.performer(policy, env, seed), seed, options)
+    recording = episode.run(env, performer.make(env, policy, seed), seed, info)
   except episode.EpisodeError as error:
     recording = error.recording
-  if folder is not None:
-    pathlib.Path(folder).mkdir(parents=True, exist_ok=True)
-    recording.save(pathlib.Path(folder) / f"{seed}.npz")
+  except ValueError as error:  # the policy could not be made
+    return Result(seed, "error", 0.0, 0.0, error=str(error))
   info = recording.info
-  return Result(
+  result = Result(
     seed=seed,
     outcome=info["outcome"],
     total=float(info["return"]),
@@ -143,11 +182,18 @@ def _one(job: tuple[str, str, int, str | None]) -> Result:
     metrics=recording.metrics().to_json(),
     error=info.get("error", ""),
   )
+  try:
+    if folder is not None:
+      recording.save(pathlib.Path(folder) / f"{seed}.npz")
+  except OSError as error:
+    return dataclasses.replace(result, outcome="error", error=f"recording {seed}: {error}")
+  return result
 
 
 def table(name: str, policy: str, results: list[Result], reference: dict | None) -> str:
   """Returns mean and spread of return, time and every known metric, for people."""
-  from palpate.tasks.score import METRICS, Metrics, score
+  from palpate.tasks.metrics import METRICS, Metrics
+  from palpate.tasks.score import score
 
   wins = sum(r.outcome == "success" for r in results)
   low, high = _wilson(wins, len(results))
@@ -165,7 +211,7 @@ def table(name: str, policy: str, results: list[Result], reference: dict | None)
     return f"{label:28} {mean:>10.4g} {sd:>10.3g} {len(values):>5}"
 
   lines.append(row("Return [-]", [r.total for r in results]))
-  metrics = [Metrics.from_json(r.metrics) for r in results]
+  metrics = [Metrics.from_json(r.metrics) for r in results if r.metrics]
   for key, spec in METRICS.items():
     known = [v * spec.scale for m in metrics if math.isfinite(v := getattr(m, key))]
     if known:
@@ -180,15 +226,17 @@ def table(name: str, policy: str, results: list[Result], reference: dict | None)
 def write_reference(path: pathlib.Path, name: str, seed: int, results: list[Result]):
   """Writes the reference of the episodes that succeeded, with seed and versions."""
   import mujoco
-  from palpate.tasks.score import Metrics, make_reference
+  from palpate.tasks.files import replacing
+  from palpate.tasks.metrics import Metrics
+  from palpate.tasks.score import make_reference
 
   good = [Metrics.from_json(r.metrics) for r in results if r.outcome == "success"]
   if not good:
     raise CommandError(f"{name}: no episode succeeded, so there is no reference", code=1)
   data = make_reference(good, name, seed)
   data |= {"palpate": palpate.__version__, "mujoco": mujoco.__version__, "episodes": len(results)}
-  path.parent.mkdir(parents=True, exist_ok=True)
-  path.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+  with writing(path), replacing(path) as file:
+    file.write(json.dumps(data, indent=1) + "\n")
 
 
 def _mean_sd(values: list[float]) -> tuple[float, float]:

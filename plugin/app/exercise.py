@@ -3,30 +3,22 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+import dataclasses
+import functools
 import math
 import pathlib
 import sys
+from collections.abc import Callable, Iterator
 from typing import Any
 
-import numpy as np
 import palpate
 
-from .console import CommandError, Interrupt, Progress
+from . import film
+from .console import CommandError, Interrupt, Progress, output, output_folder, writing
 
-_KEYS = {  # GLFW key -> component, sign
-  265: ("pitch", 1.0),  # up
-  264: ("pitch", -1.0),  # down
-  262: ("yaw", 1.0),  # right
-  263: ("yaw", -1.0),  # left
-  ord("W"): ("insertion", -1.0),
-  ord("S"): ("insertion", 1.0),
-  ord("A"): ("roll", -1.0),
-  ord("D"): ("roll", 1.0),
-  ord("O"): ("jaw", 1.0),
-  ord("C"): ("jaw", -1.0),
-  ord("R"): ("report", 1.0),
-}
-_HOLD = 0.15  # a key acts for this long [s]
+_FPS = 25  # of the film
+_SIZE = (640, 480)  # of the film [pixels]
 
 
 def add_arguments(parser: argparse.ArgumentParser):
@@ -44,7 +36,10 @@ def add_arguments(parser: argparse.ArgumentParser):
   )  # fmt: skip
   add("--seed", metavar="N", type=int, default=0, help="of the episode (%(default)s)")
   add("--replay", metavar="FILE", help="repeat a recording and check that it comes out the same")
-  add("-o", "--out", metavar="FOLDER", help="where recording and report go (out/TASK)")
+  add(
+    "-o", "--out", metavar="FOLDER",
+    help="where recording and report go (out/TASK; out/TASK_replay)",
+  )  # fmt: skip
   add("--film", metavar="FILE", help="write a film too, .mp4 or .gif")
   add("--states", action="store_true", help="keep the state of every step in the recording")
   add("--no-report", action="store_true", help="write the recording alone")
@@ -55,152 +50,156 @@ def main(args: argparse.Namespace) -> int:
   if not args.list and not args.task and not args.replay:
     raise CommandError("no TASK; `palpate exercise --list` lists them")
   palpate.register()
-  from palpate.tasks import episode, experts, suite
-  from palpate.tasks.recording import Recording
+  from palpate.tasks import episode
 
   if args.list:
-    for domain, task in suite.ALL_TASKS:
-      print(f"{f'{domain}/{task}':24} {suite.summary(domain, task)}")
-    print(f"performers: {', '.join(experts.STYLES)}, keyboard, module:object")
-    return 0
-  old = None
-  try:
-    if args.replay:
-      old = Recording.load(args.replay)
-      env = episode.environment(old)
-      name, seed, options = old.info["task"], old.info["seed"], old.info["task_kwargs"]
-    else:
-      name, seed, options = "/".join(suite.split(args.task)), args.seed, {}
-      if ":" in args.performer:
-        episode.find(args.performer)
-      elif args.performer not in (*experts.STYLES, "keyboard"):
-        names = ", ".join(experts.STYLES)
-        raise ValueError(
-          f"performer is {args.performer!r}, expected {names}, keyboard or module:object"
-        )
-      env = suite.load(*suite.split(name), task_kwargs=options)
-  except (ValueError, OSError) as error:
-    raise CommandError(str(error)) from None
-  folder = pathlib.Path(args.out or pathlib.Path("out") / name.replace("/", "_"))
-  info = {"task_kwargs": options, "performer": "replay" if old else args.performer}
-  progress, code, failure = Progress(), 0, None
-  film = _Film(args.film) if args.film else None
-  with Interrupt() as interrupt:
+    return _list()
+  job = _prepare(args)
+  progress, failure = Progress(), None
+  with Interrupt() as interrupt, _camera(job.film) as shoot:
 
     def watch(env) -> bool:
-      task: Any = env.task
-      progress.show(f"{name} {env.physics.time():.1f} s, {100 * task.best:.0f} % done")
-      if film:
-        film.take(env)
+      progress.show(f"{job.name} {env.physics.time():.1f} s, {100 * env.task.best:.0f} % done")
+      shoot(env)
       return interrupt.seen
 
     try:
-      if old is not None:
-        recording, env = episode.replay(old, watch)
-      elif args.performer == "keyboard":
-        recording = _keyboard(env, seed, info, watch)
-      else:
-        act = episode.performer(args.performer, env, seed)
-        recording = episode.run(env, act, seed, info, args.states, watch)
+      recording = job.run(watch)
     except episode.EpisodeError as error:
-      recording, failure, code = error.recording, error, 1
+      recording, failure = error.recording, error
     finally:
       progress.clear()
-      if film:
-        film.close()
-  folder.mkdir(parents=True, exist_ok=True)
-  path = recording.save(folder / "recording.npz")
-  (folder / "metrics.json").write_text(recording.metrics().to_json(1) + "\n", encoding="utf-8")
-  end = recording.time[-1] if len(recording.time) else 0.0
-  print(f"{name}, seed {seed}: {recording.info['outcome']} after {end:.2f} s")
-  print(f"recording  {path}")
-  if not args.no_report and len(recording.time):
-    from palpate.tasks.report import write_report
-
-    try:
-      print(f"report     {write_report(recording, folder, episode.reference(name))}")
-    except ImportError as error:
-      print(f"no report: {error}; install palpate[plot]", file=sys.stderr)
-  if film:
-    print(f"film       {args.film}")
+  _write(job, recording, report=not args.no_report)
+  if interrupt.seen:
+    print("palpate: interrupted; the recording up to there is kept", file=sys.stderr)
+    return 130
   if failure is not None:
     raise CommandError(str(failure), code=1)
-  if old is not None:
-    changed = episode.differences(old, recording)
+  if job.old is not None:
+    changed = episode.differences(job.old, recording)
     if changed:
       raise CommandError(f"the replay differs in {', '.join(changed)}", code=1)
     print("the replay is the same to the bit")
-  return 130 if interrupt.seen else code
+  return 0
 
 
-class _Film:
-  """Writes the laparoscope's picture at 25 frames a second."""
+def _list() -> int:
+  from palpate.tasks import performer, suite
 
-  def __init__(self, path: str):
-    suffix = pathlib.Path(path).suffix.lower()
-    if suffix not in (".mp4", ".gif"):
-      raise CommandError(f"film is {path!r}, expected a name that ends in .mp4 or .gif")
-    try:
-      import imageio.v2 as imageio
-    except ImportError:
-      raise CommandError("a film needs imageio; install palpate[video]", code=1) from None
-    options: Any = {"fps": 25, "macro_block_size": 8} if suffix == ".mp4" else {"duration": 40}
-    self._writer = imageio.get_writer(path, **options)
-    self._next = -math.inf
-
-  def take(self, env) -> None:
-    if env.physics.time() >= self._next - 1e-9:
-      self._next = env.physics.time() + 0.04
-      camera = env.physics.model.ptr.camera("laparoscope").id
-      self._writer.append_data(env.physics.render(480, 640, camera_id=camera))
-
-  def close(self) -> None:
-    self._writer.close()
+  for domain, task in suite.ALL_TASKS:
+    print(f"{f'{domain}/{task}':24} {suite.summary(domain, task)}")
+  print(f"performers: {', '.join(performer.STYLES)}, keyboard, module:object")
+  return 0
 
 
-def _keyboard(env, seed: int, info, watch):
-  """Runs an episode with the keyboard in MuJoCo's viewer, in real time."""
-  import time
+@dataclasses.dataclass(frozen=True)
+class _Job:
+  """What is run, and where its files go.
 
-  from palpate.tasks import episode, viewer
+  Attributes:
+    name: of the task
+    seed: of the episode
+    run: runs it and returns its recording; takes what is called after every step
+    old: the recording that is replayed, None for a new one
+    folder: of the files
+    film: file of the film, None without one
+  """
 
-  names = env.task.components
-  pressed: dict[str, tuple[float, float]] = {}  # component -> sign, until
-  jaw = [0.0]
+  name: str
+  seed: int
+  run: Callable[[Callable[[Any], bool]], Any]
+  old: Any
+  folder: pathlib.Path
+  film: pathlib.Path | None
 
-  def key(code: int) -> None:
-    if code in _KEYS:
-      component, sign = _KEYS[code]
-      if component == "jaw":
-        jaw[0] = float(np.clip(jaw[0] + 0.1 * sign, -1, 1))
-      else:
-        pressed[component] = sign, time.monotonic() + _HOLD
 
-  # The episode starts with the first step; the window needs the model that it will have.
-  env.task.random = np.random.RandomState(seed)
-  env.reset()
+def _prepare(args: argparse.Namespace) -> _Job:
+  """Returns the job, everything that can be wrong with it checked."""
+  old = None
   try:
-    window = viewer.launch(env.physics, key)
-  except RuntimeError as error:
-    raise CommandError(f"{error}; use another performer", code=1) from None
-  with window:
-    look = window.opt.flags.copy(), window.user_scn.flags.copy()
-    due = [time.monotonic()]
+    if args.replay:
+      old, run = _replay(args.replay)
+      name, seed = old.info["task"], old.info["seed"]
+    else:
+      (name, run), seed = _perform(args), args.seed
+  except (ValueError, OSError) as error:
+    raise CommandError(str(error)) from None
+  folder = pathlib.Path(args.out or f"out/{name.replace('/', '_')}{'_replay' if old else ''}")
+  if old and (folder / "recording.npz").resolve() == pathlib.Path(args.replay).resolve():
+    raise CommandError(f"out is {str(folder)!r}, the folder of the recording that is replayed")
+  shot = output("film", args.film, film.FILMS) if args.film else None
+  if shot:
+    film.check(shot.suffix)
+  return _Job(name, seed, run, old, output_folder("out", folder), shot)
 
-    def act(_) -> np.ndarray:
-      now = time.monotonic()
-      action = [
-        jaw[0] if name == "jaw" else pressed[name][0] if pressed.get(name, (0, 0))[1] > now else 0.0
-        for name in names
-      ]
-      return np.array(action)
 
-    def step(env) -> bool:
-      with window.lock():  # most letters are switches of the viewer too
-        window.opt.flags[:], window.user_scn.flags[:] = look
-      window.sync()
-      due[0] += env.control_timestep()
-      time.sleep(max(0.0, due[0] - time.monotonic()))
-      return watch(env) or not window.is_running()
+def _replay(path: str):
+  """Returns a recording, and what runs it again."""
+  from palpate.tasks import episode
+  from palpate.tasks.recording import Recording
 
-    return episode.run(env, act, seed, info, watch=step)
+  old = Recording.load(path)
+  env = episode.environment(old)
+  return old, lambda watch: episode.replay(old, watch, env)
+
+
+def _perform(args: argparse.Namespace):
+  """Returns a task's name, and what runs an episode of it."""
+  from palpate.tasks import episode, performer, suite
+
+  domain, task = suite.split(args.task)
+  info = {"task_kwargs": {}, "performer": args.performer}
+  if args.performer == "keyboard":
+    from . import keyboard
+
+    env = suite.load(domain, task)
+    run = functools.partial(keyboard.run, env, args.seed, info)
+  else:
+    performer.find(args.performer, "keyboard")
+    env = suite.load(domain, task)
+    act = performer.make(env, args.performer, args.seed)
+    run = functools.partial(episode.run, env, act, args.seed, info, args.states)
+  return f"{domain}/{task}", run
+
+
+def _write(job: _Job, recording: Any, report: bool):
+  """Writes recording, metrics and report, and says where they are."""
+  from palpate.tasks.files import replacing
+  from palpate.tasks.report import write_report
+  from palpate.tasks.score import reference
+
+  end = recording.time[-1] if len(recording.time) else 0.0
+  print(f"{job.name}, seed {job.seed}: {recording.info['outcome']} after {end:.2f} s")
+  with writing(job.folder):
+    print(f"recording  {recording.save(job.folder / 'recording.npz')}")
+    with replacing(job.folder / "metrics.json") as file:
+      file.write(recording.metrics().to_json(1) + "\n")
+    if report and len(recording.time):
+      try:
+        print(f"report     {write_report(recording, job.folder, reference(job.name))}")
+      except ImportError as error:
+        print(f"no report: {error}; install palpate[plot]", file=sys.stderr)
+  if job.film:
+    print(f"film       {job.film}")
+
+
+@contextlib.contextmanager
+def _camera(path: pathlib.Path | None) -> Iterator[Callable[[Any], None]]:
+  """Gives a function that takes the laparoscope's picture for the film, if there is to be one."""
+  if path is None:
+    yield lambda env: None
+    return
+  from palpate.tasks.scenes import CAMERA
+
+  due = -math.inf
+  with film.write(path, _FPS) as write:
+
+    def shoot(env) -> None:
+      nonlocal due
+      if env.physics.time() >= due - 1e-9:
+        due = env.physics.time() + 1 / _FPS
+        width, height = _SIZE
+        camera = env.physics.model.ptr.camera(CAMERA).id
+        write(env.physics.render(height, width, camera_id=camera))
+
+    yield shoot

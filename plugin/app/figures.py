@@ -2,30 +2,20 @@
 
 from __future__ import annotations
 
-import importlib.util
 import pathlib
-import sys
 from collections.abc import Sequence
 
 import mujoco
 import numpy as np
 from palpate.engine import plugin as engine
 
-from .console import CommandError, Interrupt, Progress
+from . import film
+from .console import Interrupt, Progress, need
 from .probe import Sample
 
 _FORCE, _MOTION, _INK = "#c1442e", "#2f6f9f", "#333333"
 # What a frame needs: an organ with windows has its shape in the plugin state.
 _SHOWN = mujoco.mjtState.mjSTATE_QPOS | mujoco.mjtState.mjSTATE_PLUGIN
-
-
-def need(extra: str, *modules: str):
-  """Raises CommandError, naming the extra to install, if a module is missing."""
-  missing = [name for name in modules if importlib.util.find_spec(name) is None]
-  if missing:
-    raise CommandError(
-      f"{', '.join(missing)} is not installed: pip install 'palpate[{extra}]'", code=1
-    )
 
 
 def plot(samples: Sequence[Sample], path: pathlib.Path, title: str):
@@ -62,15 +52,6 @@ def plot(samples: Sequence[Sample], path: pathlib.Path, title: str):
   figure.savefig(path)
 
 
-def plot_if_able(samples: Sequence[Sample], path: pathlib.Path, title: str):
-  """Draws the plot and says where it is, or says what is missing."""
-  try:
-    plot(samples, path, title)
-    print(f"{path}: force and displacement over time")
-  except CommandError as error:
-    print(f"palpate: no plot: {error}", file=sys.stderr)
-
-
 def snapshot(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
   """Returns what a picture of the scene needs."""
   engine.sync(model, data)
@@ -80,24 +61,20 @@ def snapshot(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
 
 
 def picture(model: mujoco.MjModel, data: mujoco.MjData, state: np.ndarray, path: pathlib.Path):
-  """Renders a snapshot to a PNG file, without a screen."""
-  import imageio.v2 as imageio
-
-  with _renderer(model, 960, 720) as renderer:
-    imageio.imwrite(path, _frame(model, data, state, renderer))
-  print(f"{path}: the organ at its deepest")
+  """Draws a snapshot into a PNG file, without a screen."""
+  with film.renderer(model, 960, 720) as renderer, film.write(path, 1) as write:
+    write(frame(model, data, state, renderer))
 
 
-def film(
+def shots(
   model: mujoco.MjModel,
   data: mujoco.MjData,
   states: Sequence[np.ndarray],
   path: pathlib.Path,
   rate: int,
   interrupt: Interrupt,
-  progress: Progress,
-):
-  """Renders snapshots to an MP4 or GIF, without a screen.
+) -> int:
+  """Films snapshots, without a screen; returns the number of frames.
 
   Args:
     model: compiled model
@@ -106,40 +83,21 @@ def film(
     path: file to write, .mp4 or .gif
     rate: frames per second
     interrupt: ends the film early
-    progress: told of each frame
   """
-  import imageio.v2 as imageio
-
-  how: dict = {"fps": rate, "macro_block_size": 16, "quality": 8}
-  if path.suffix == ".gif":
-    how = {"duration": 1000 / rate, "loop": 0}
-  frames = 0
-  with _renderer(model, 640, 480) as renderer, imageio.get_writer(path, **how) as writer:
+  progress, frames = Progress(), 0
+  with film.renderer(model, 640, 480) as renderer, film.write(path, rate) as write:
     for state in states:
       if interrupt.seen:
         break
-      writer.append_data(_frame(model, data, state, renderer))
+      write(frame(model, data, state, renderer))
       frames += 1
       progress.show(f"filming {frames} of {len(states)}")
   progress.clear()
-  print(f"{path}: {frames} frames")
+  return frames
 
 
-def _renderer(model: mujoco.MjModel, width: int, height: int) -> mujoco.Renderer:
-  """Returns a renderer that needs no screen, at most as large as the scene's offscreen buffer."""
-  width = min(width, model.vis.global_.offwidth) // 16 * 16
-  height = min(height, model.vis.global_.offheight) // 16 * 16
-  try:
-    return mujoco.Renderer(model, height, width)
-  except Exception as error:
-    raise CommandError(
-      f"no way to render without a screen ({type(error).__name__}: {error}); install libegl1 or "
-      "libosmesa6 and set MUJOCO_GL=egl or osmesa; see palpate doctor",
-      code=1,
-    ) from error
-
-
-def _frame(model, data, state: np.ndarray, renderer: mujoco.Renderer) -> np.ndarray:
+def frame(model, data, state: np.ndarray, renderer: mujoco.Renderer) -> np.ndarray:
+  """Returns the picture of a snapshot."""
   mujoco.mj_setState(model, data, state.astype(np.float64), _SHOWN)
   engine.place_windows(model, data)
   mujoco.mj_fwdPosition(model, data)

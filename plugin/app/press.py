@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import csv
 import dataclasses
 import math
 import pathlib
@@ -16,7 +15,8 @@ from collections.abc import Sequence
 import numpy as np
 from palpate import register
 
-from .console import CommandError, Interrupt, Progress, table
+from . import film
+from .console import CommandError, Interrupt, Progress, csv_rows, need, output, output_folder, table
 
 _NODES, _SEED = 1000, 1  # of the organ that ships
 _SIZE = (0.9, 0.7, 0.48)  # flattens the lobed ball
@@ -69,62 +69,81 @@ def add_arguments(parser: argparse.ArgumentParser):
 def main(args: argparse.Namespace) -> int:
   """Runs the job and returns its exit code."""
   _check(args)
+  out = output_folder("out", args.out)
+  video = _file(args, "video", out / "press.mp4", film.FILMS)
+  picture = _file(args, "picture", out / "press_deepest.png", film.PICTURES)
+  if args.nodes is not None or args.seed is not None:
+    need("image", "skimage")
   register()
   from . import figures, probe
 
-  out = pathlib.Path(args.out)
-  film = _file(args, "video", out / "press.mp4", (".mp4", ".gif"))
-  picture = _file(args, "picture", out / "press_deepest.png", (".png",))
-  if args.nodes is not None or args.seed is not None:
-    figures.need("image", "skimage")
-  progress = Progress()
   with Interrupt() as interrupt, _warnings():
-    progress.show("loading; the first time takes some seconds more", always=True)
+    Progress().show("loading; the first time takes some seconds more", always=True)
     model, data, organ = _load(args)
-    tool = probe.find(model, args.actuator)
-    try:
-      out.mkdir(parents=True, exist_ok=True)
-      file = open(out / "press.csv", "w", newline="", encoding="utf-8")
-    except OSError as error:
-      raise CommandError(f"cannot write to {args.out!r}: {error.strerror}") from None
-    samples, states, deepest, failure = [], [], None, None
-    every = max(round(1 / (_FPS * _SLOWER) / model.opt.timestep), 1)
-    with file:
-      writer = csv.writer(file)
-      writer.writerow(field.name for field in dataclasses.fields(probe.Sample))
-      run = probe.press(model, data, organ, tool, args.depth, args.speed, args.hold)
-      for sample in run:
-        samples.append(sample)
-        writer.writerow(f"{v:.7g}" if isinstance(v, float) else v for v in _fields(sample))
-        if film and len(samples) % every == 1 % every:
-          states.append(figures.snapshot(model, data))
-        if picture and sample.phase == "hold":
-          deepest = figures.snapshot(model, data)
-        progress.show(
-          f"{sample.phase:<8} {sample.time_s:6.3f} s  depth {1e3 * sample.depth_m:5.2f} mm  "
-          f"force {sample.force:6.3f} N"
-        )
-        failure = _failure(data, organ)
-        if failure or interrupt.seen:
-          break
-    progress.clear()
-    print(table(_summary(model, organ, samples)))
-    print(f"\n{out / 'press.csv'}: {len(samples)} steps")
+    run = _Run(model, data, organ, probe.find(model, args.actuator), filmed=bool(video))
+    failure = run.press(args, out / "press.csv", interrupt)
+    print(table(_summary(model, organ, run.samples)))
+    print(f"\n{out / 'press.csv'}: {len(run.samples)} steps")
     if failure:
       print(f"palpate: {failure}; the data up to there is kept", file=sys.stderr)
       return 1
     if interrupt.seen:
       print("palpate: interrupted; the data up to there is kept", file=sys.stderr)
       return 130
-    figures.plot_if_able(samples, out / "press.png", _title(args))
-    if picture and deepest is not None:
-      figures.picture(model, data, deepest, picture)
-    if film:
-      figures.film(model, data, states, film, _FPS, interrupt, progress)
+    try:
+      figures.plot(run.samples, out / "press.png", _title(args))
+      print(f"{out / 'press.png'}: force and displacement over time")
+    except CommandError as error:
+      print(f"palpate: no plot: {error}", file=sys.stderr)
+    if picture and run.deepest is not None:
+      figures.picture(model, data, run.deepest, picture)
+      print(f"{picture}: the organ at its deepest")
+    if video:
+      print(f"{video}: {figures.shots(model, data, run.states, video, _FPS, interrupt)} frames")
     if interrupt.seen:
       print("palpate: interrupted; the film ends early", file=sys.stderr)
       return 130
     return 0
+
+
+class _Run:
+  """A press, and what is kept of it.
+
+  Attributes:
+    samples: of every step
+    states: snapshots for the film
+    deepest: the last snapshot of the hold, None before
+  """
+
+  def __init__(self, model, data, organ, tool, filmed: bool):
+    self._model, self._data, self._organ, self._tool = model, data, organ, tool
+    self._every = max(round(1 / (_FPS * _SLOWER) / model.opt.timestep), 1) if filmed else 0
+    self.samples, self.states, self.deepest = [], [], None
+
+  def press(self, args: argparse.Namespace, path: pathlib.Path, interrupt: Interrupt) -> str | None:
+    """Presses and writes the CSV; returns what went wrong."""
+    from . import figures, probe
+
+    model, data, progress = self._model, self._data, Progress()
+    names = [field.name for field in dataclasses.fields(probe.Sample)]
+    steps = probe.press(model, data, self._organ, self._tool, args.depth, args.speed, args.hold)
+    with csv_rows(path, names) as write:
+      for sample in steps:
+        self.samples.append(sample)
+        write(getattr(sample, name) for name in names)
+        if self._every and len(self.samples) % self._every == 1 % self._every:
+          self.states.append(figures.snapshot(model, data))
+        if args.picture is not None and sample.phase == "hold":
+          self.deepest = figures.snapshot(model, data)
+        progress.show(
+          f"{sample.phase:<8} {sample.time_s:6.3f} s  depth {1e3 * sample.depth_m:5.2f} mm  "
+          f"force {sample.force:6.3f} N"
+        )
+        failure = _failure(data, self._organ, sample)
+        if failure or interrupt.seen:
+          break
+    progress.clear()
+    return failure
 
 
 def _check(args: argparse.Namespace):
@@ -145,18 +164,11 @@ def _check(args: argparse.Namespace):
 
 def _file(args, option: str, default: pathlib.Path, suffixes: tuple) -> pathlib.Path | None:
   """Returns the file an option asks for, `default` if it names none, None without the option."""
-  from . import figures
-
   name = getattr(args, option)
   if name is None:
     return None
-  path = pathlib.Path(name) if name else default
-  if path.suffix not in suffixes:
-    allowed = " or ".join(suffixes)
-    raise CommandError(f"{option} is {name!r}, expected a name that ends in {allowed}")
-  if name and not path.parent.is_dir():
-    raise CommandError(f"{option} is {name!r}, whose folder does not exist")
-  figures.need("video", "imageio", "imageio_ffmpeg")
+  path = output(option, name or default, suffixes)
+  film.check(path.suffix)
   return path
 
 
@@ -280,9 +292,14 @@ def _warnings():
     mujoco.set_mju_user_warning(None)
 
 
-def _failure(data, organ) -> str | None:
+def _failure(data, organ, sample) -> str | None:
   import mujoco
 
+  if sample.pierced:
+    return (
+      f"the probe went through the surface at t = {sample.time_s:.3f} s, "
+      f"{1e3 * sample.depth_m:.1f} mm deep: no force from there on is that of a press"
+    )
   if organ.error:
     return organ.error
   kind = mujoco.mjtWarning
@@ -292,18 +309,15 @@ def _failure(data, organ) -> str | None:
   return None
 
 
-def _fields(sample) -> list:
-  return [getattr(sample, field.name) for field in dataclasses.fields(sample)]
-
-
 def _summary(model, organ, samples: Sequence) -> list[tuple[str, str]]:
   steps = np.array([s.step_s for s in samples]) if samples else np.full(1, np.nan)
   force = np.array([s.force for s in samples])
   held = np.array([s.force for s in samples if s.phase == "hold"])
   static = float(held[-max(len(held) // 5, 1) :].mean()) if held.size else math.nan
   iterations = [s.iterations for s in samples] or [0]
-  # While it moves under load: at rest there is nothing to solve and nothing to be relative to.
-  pressed = [s.residual for s in samples if s.phase == "press"]
+  # A step at rest may keep a large share of next to nothing, within a few iterations.
+  most, tolerance = organ.config.iterations, organ.config.tolerance
+  ended = [s.residual for s in samples if s.iterations >= most and s.residual > tolerance]
   h = model.opt.timestep
   return [
     ("device", organ.device),
@@ -314,12 +328,13 @@ def _summary(model, organ, samples: Sequence) -> list[tuple[str, str]]:
     ("step time, 99th percentile", f"{1e3 * np.percentile(steps, 99):.3f} ms"),
     ("real-time factor", f"{h * len(steps) / steps.sum():.2f}"),
     ("contact force, peak", f"{force.max(initial=0):.4f} N"),
-    ("contact force, static", f"{static:.4f} N" if held.size else "-"),
+    ("contact force, static", f"{static:.4f} N" if held.size and not samples[-1].pierced else "-"),
     ("indentation", f"{1e3 * max([s.depth_m for s in samples], default=0):.2f} mm"),
     ("contacts, most", str(max([s.contacts for s in samples], default=0))),
-    ("PCG iterations, mean", f"{np.mean(iterations):.1f}"),
-    ("PCG iterations, most", str(max(iterations))),
-    ("PCG residual, most, pressing", f"{max(pressed, default=0):.1e}"),
+    ("PCG iterations a step, mean", f"{np.mean(iterations):.1f}"),
+    ("PCG iterations a step, most", str(max(iterations))),
+    (f"steps that hit a solve's limit, {most}", str(len(ended))),
+    *([("largest residual of those", f"{max(ended):.1e}")] if ended else []),
   ]
 
 

@@ -49,8 +49,11 @@ class Sample:
     force_y_N: "
     force_z_N: "
     contacts: contacts of organ and probe
-    iterations: PCG iterations
-    residual: relative residual of the implicit step
+    iterations: PCG iterations of all solves of the step: each Newton iteration, and the response to
+      changed contact forces
+    residual: of the implicit step, relative to its right-hand side, which is next to nothing while
+      the organ rests; the solve then stops by the weight of the organ instead
+    pierced: 1 once the probe's front is on the other side of the surface
     step_s: wall time of mj_step [s]
   """
 
@@ -65,6 +68,7 @@ class Sample:
   contacts: int
   iterations: int
   residual: float
+  pierced: int
   step_s: float
 
   @property
@@ -101,10 +105,13 @@ def find(model: mujoco.MjModel, name: str) -> Probe:
   return Probe(i, joint, int(model.jnt_qposadr[joint]), low, high, frozenset(bodies))
 
 
-def contact_force(model, data, probe: Probe, flexes: np.ndarray) -> tuple[np.ndarray, int]:
+def contact_force(model, data, probe: Probe, organ: Organ) -> tuple[np.ndarray, int]:
   """Returns the force of an organ's contacts on the probe [N] (3,), and their number."""
   contact = data.contact
   total, wrench = np.zeros(3), np.zeros(6)
+  # Contacts are with the organ, or with the windows that stand in for it.
+  names = (organ.name, *organ.config.window)
+  flexes = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_FLEX, name) for name in names]
   touched = np.isin(contact.flex, flexes).any(axis=1)
   mine = np.flatnonzero(touched & (contact.geom >= 0).any(axis=1))
   count = 0
@@ -131,6 +138,88 @@ def node_ahead(data, probe: Probe, organ: Organ) -> int:
   return int(np.where(near, along, np.inf).argmin())
 
 
+def front(model, data, probe: Probe) -> np.ndarray:
+  """Returns the middle of the probe's front, a radius behind its foremost point [m]  (3,)."""
+  axis = data.xaxis[probe.joint]
+  ends = []
+  for geom in np.flatnonzero(model.geom_contype | model.geom_conaffinity):
+    if int(model.geom_bodyid[geom]) in probe.bodies:
+      along = np.abs(axis @ data.geom_xmat[geom].reshape(3, 3))
+      half, radius = model.geom_aabb[geom, 3:], float(model.geom_size[geom, 0])
+      match model.geom_type[geom]:
+        case mujoco.mjtGeom.mjGEOM_SPHERE:
+          reach = 0.0
+        case mujoco.mjtGeom.mjGEOM_CAPSULE:
+          reach = along[2] * (half[2] - radius)
+        case _:  # as if it were a box
+          reach = along @ half - half.min()
+      ends.append(data.geom_xpos[geom] + reach * axis)
+  if not ends:
+    raise CommandError(f"actuator {model.actuator(probe.actuator).name!r} moves no colliding geom")
+  return max(ends, key=lambda end: float(end @ axis))
+
+
+def pierced(organ: Organ, start: np.ndarray, end: np.ndarray) -> bool:
+  """Returns whether the organ's surface crosses the way from start to end [m]  (3,).
+
+  Rays against triangles after Moeller and Trumbore 1997.
+  """
+  a, b, c = np.moveaxis(organ.xpos[organ.elem], 1, 0)
+  e1, e2, s, ray = b - a, c - a, start - a, end - start
+  p, q = np.cross(ray, e2), np.cross(s, e1)
+  with np.errstate(divide="ignore", invalid="ignore"):
+    scale = 1 / np.einsum("ij,ij->i", e1, p)
+    u, v, t = (
+      np.einsum("ij,ij->i", s, p) * scale,
+      q @ ray * scale,
+      np.einsum("ij,ij->i", e2, q) * scale,
+    )
+  return bool(((u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0) & (t < 1)).any())
+
+
+class _Way:
+  """Where the probe is told to be: approach, press, hold, release."""
+
+  def __init__(self, probe: Probe, start: float, depth: float, speed: float, hold: float):
+    self.probe, self.start, self.depth, self.speed, self.hold = probe, start, depth, speed, hold
+    self.command, self.goal = start, probe.high
+    self.phase, self.touch, self.left, self.done = "approach", None, _SETTLE, False
+
+  def advance(self, h: float) -> float:
+    """Returns the actuator's control for the next step of h [s]."""
+    if self.phase == "hold":
+      self.command = self.goal
+    else:
+      step = self.speed * h * (-1 if self.phase == "release" else 1)
+      self.command = float(np.clip(self.command + step, self.start, self.goal))
+    return self.command
+
+  def meet(self, position: float):
+    """Takes the first contact, at a position of the joint [m]."""
+    self.touch, self.goal = position, position + self.depth
+    if self.goal > self.probe.high:
+      raise CommandError(
+        f"depth is {self.depth:g} m, expected at most {self.probe.high - position:.3g} m, "
+        "where the actuator's range ends"
+      )
+    self.phase, self.left = "press", self.hold
+
+  def end_step(self, h: float):
+    """Goes on to the next phase when it is time."""
+    if self.phase == "press":
+      if self.command >= self.goal:
+        self.phase = "hold"
+      return
+    last = self.goal if self.phase == "approach" else self.start
+    if self.phase == "hold" or self.command == last:
+      self.left -= h
+    if self.left <= 0:
+      if self.phase == "hold":
+        self.phase, self.left = "release", _SETTLE
+      else:
+        self.done = True
+
+
 def press(
   model: mujoco.MjModel,
   data: mujoco.MjData,
@@ -154,39 +243,28 @@ def press(
   Raises:
     CommandError: no contact within the actuator's range, or the depth reaches beyond it.
   """
-  # Contacts are with the organ, or with the windows that stand in for it.
-  names = (organ.name, *organ.config.window)
-  flexes = np.array([mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_FLEX, name) for name in names])
   h = model.opt.timestep
   mujoco.mj_forward(model, data)
   node = node_ahead(data, probe, organ)
-  start = command = float(data.ctrl[probe.actuator])
-  phase, touch, goal, left = "approach", None, probe.high, _SETTLE
-  while True:
-    step = speed * h * (-1 if phase == "release" else 1)
-    command = float(np.clip(command + step, start, goal)) if phase != "hold" else goal
-    data.ctrl[probe.actuator] = command
+  first, start = float(data.qpos[probe.qposadr]), front(model, data, probe)
+  way = _Way(probe, float(data.ctrl[probe.actuator]), depth, speed, hold)
+  while not way.done:
+    data.ctrl[probe.actuator] = way.advance(h)
     at, position = data.time, float(data.qpos[probe.qposadr])
     moved = float(np.linalg.norm(organ.displacement[node]))
+    now = start + (position - first) * data.xaxis[probe.joint]
+    through = way.touch is not None and pierced(organ, start, now)
     before = time.perf_counter()
     mujoco.mj_step(model, data)
     spent = time.perf_counter() - before
-    force, contacts = contact_force(model, data, probe, flexes)
-    if touch is None and contacts:
-      touch = position
-      goal = touch + depth
-      if goal > probe.high:
-        raise CommandError(
-          f"depth is {depth:g} m, expected at most {probe.high - touch:.3g} m, "
-          "where the actuator's range ends"
-        )
-      phase, left = "press", hold
-    beyond = 0.0 if touch is None else max(position - touch, 0.0)
+    force, contacts = contact_force(model, data, probe, organ)
+    if way.touch is None and contacts:
+      way.meet(position)
     yield Sample(
       time_s=at,
-      phase=phase,
+      phase=way.phase,
       probe_m=position,
-      depth_m=beyond,
+      depth_m=0.0 if way.touch is None else max(position - way.touch, 0.0),
       node_m=moved,
       force_x_N=float(force[0]),
       force_y_N=float(force[1]),
@@ -194,19 +272,11 @@ def press(
       contacts=contacts,
       iterations=organ.iterations,
       residual=organ.residual,
+      pierced=int(through),
       step_s=spent,
     )
-    if phase == "press" and command >= goal:
-      phase = "hold"
-    elif phase == "hold":
-      left -= h
-      if left <= 0:
-        phase, left = "release", _SETTLE
-    elif (phase == "approach" and command >= goal) or (phase == "release" and command <= start):
-      left -= h
-      if left <= 0:
-        break
-  if touch is None:
+    way.end_step(h)
+  if way.touch is None:
     raise CommandError(
       f"the probe met no organ within its range, {probe.low:g} to {probe.high:g} m", code=1
     )

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import math
-import pathlib
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 from palpate import register
 
-from .console import CommandError, Interrupt, Progress
+from . import film
+from .console import CommandError, Interrupt, Progress, output
 
-_SUFFIXES = (".png", ".mp4", ".gif")
 _MOST_PIXELS = 8192
 _FORCE = 0.1  # length of an arrow that is a newton [m]
 _WIDTH = 0.0015  # of an arrow [m]
@@ -50,18 +47,19 @@ def add_arguments(parser: argparse.ArgumentParser):
 def main(args: argparse.Namespace) -> int:
   """Runs the job and returns its exit code."""
   width, height = _check(args)
+  out = output("out", args.out, (*film.PICTURES, *film.FILMS))
+  film.check(out.suffix)
   register()
   from . import scenes
 
   model, data = scenes.load(args, handle=False)
-  out = pathlib.Path(args.out)
-  film = out.suffix.lower() != ".png"
-  seconds = args.seconds if args.seconds is not None else (2.0 if film else 0.0)
-  with Interrupt() as interrupt, _renderer(model, width, height) as renderer:
-    shots = _shots(args, model, data, renderer, seconds, film)
+  moving = out.suffix.lower() in film.FILMS
+  seconds = args.seconds if args.seconds is not None else (2.0 if moving else 0.0)
+  with Interrupt() as interrupt, film.renderer(model, width, height) as renderer:
+    shots = _shots(args, model, data, renderer, seconds, moving)
     progress = Progress()
     frames = 0
-    with _writer(out, args.fps) as write:
+    with film.write(out, args.fps) as write:
       for image in shots:
         write(image)
         frames += 1
@@ -79,8 +77,6 @@ def _check(args: argparse.Namespace) -> tuple[int, int]:
   if len(words) != 2 or not all(w.isdigit() and 16 <= int(w) <= _MOST_PIXELS for w in words):
     span = f"[16, {_MOST_PIXELS}]"
     raise CommandError(f"size is {args.size!r}, expected WxH such as 1280x960, both in {span}")
-  if pathlib.Path(args.out).suffix.lower() not in _SUFFIXES:
-    raise CommandError(f"out is {args.out!r}, expected a name that ends in .png, .mp4 or .gif")
   for name, most in (("seconds", 600.0), ("slower", 100.0)):
     value = getattr(args, name)
     if value is not None and not (math.isfinite(value) and 0 <= value <= most):
@@ -92,38 +88,20 @@ def _check(args: argparse.Namespace) -> tuple[int, int]:
   return int(words[0]), int(words[1])
 
 
-@contextlib.contextmanager
-def _renderer(model, width: int, height: int) -> Iterator:
-  import mujoco
-
-  model.vis.global_.offwidth = max(model.vis.global_.offwidth, width)
-  model.vis.global_.offheight = max(model.vis.global_.offheight, height)
-  try:
-    renderer = mujoco.Renderer(model, height, width, max_geom=10000 + model.nflexedge)
-  except Exception as error:  # each backend of OpenGL has its own
-    raise CommandError(
-      f"cannot render: {error}; set MUJOCO_GL to egl or osmesa and install libegl1 or libosmesa6",
-      code=1,
-    ) from None
-  try:
-    yield renderer
-  finally:
-    renderer.close()
-
-
 def _camera(model, name: str | None) -> int | str:
+  from . import scenes
+
   names = [model.camera(i).name for i in range(model.ncam)]
   if name == "free":
     return -1
   if name is None:
-    ends = [n for n in names if n.split("/")[-1] == "laparoscope"]
-    return (ends or names or [-1])[0]
+    return scenes.first_camera(model)
   if name not in names:
     raise CommandError(f"camera is {name!r}, expected one of {', '.join([*names, 'free'])}")
   return name
 
 
-def _shots(args, model, data, renderer, seconds: float, film: bool) -> Iterator[np.ndarray]:
+def _shots(args, model, data, renderer, seconds: float, moving: bool) -> Iterator[np.ndarray]:
   """Yields the pictures while the scene runs."""
   import mujoco
 
@@ -133,10 +111,10 @@ def _shots(args, model, data, renderer, seconds: float, film: bool) -> Iterator[
     option.sitegroup[3] = 1
   renderer.scene.flags[mujoco.mjtRndFlag.mjRND_WIREFRAME] = args.wireframe
   steps = round(seconds / model.opt.timestep)
-  nframe = max(round(seconds * args.fps * args.slower), 1) if film else 1
+  nframe = max(round(seconds * args.fps * args.slower), 1) if moving else 1
   done = 0
   for k in range(nframe):
-    until = round(steps * k / nframe) if film else steps
+    until = round(steps * k / nframe) if moving else steps
     while done < until:
       mujoco.mj_step(model, data)
       done += 1
@@ -204,26 +182,3 @@ def _connect(scene, kind, width: float, start, end, rgba):
     mujoco.mjv_connector(geom, kind, width, start, end)
     geom.emission = 0.5
     scene.ngeom += 1
-
-
-@contextlib.contextmanager
-def _writer(out: pathlib.Path, fps: int) -> Iterator:
-  """Gives a function that takes the pictures."""
-  from . import figures
-
-  figures.need("video", "imageio", "imageio_ffmpeg")
-  import imageio.v2 as imageio
-
-  try:
-    out.parent.mkdir(parents=True, exist_ok=True)
-    if out.suffix.lower() == ".png":
-      yield lambda image: imageio.imwrite(out, image)
-      return
-    mp4 = out.suffix.lower() == ".mp4"
-    options: dict[str, Any] = (
-      {"fps": fps, "macro_block_size": 2} if mp4 else {"duration": 1000 / fps, "loop": 0}
-    )
-    with imageio.get_writer(out, **options) as writer:
-      yield writer.append_data
-  except OSError as error:
-    raise CommandError(f"cannot write {str(out)!r}: {error.strerror or error}", code=1) from None

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import json
 import pathlib
 
-from .console import CommandError
+from .console import CommandError, output_folder, writing
 
 
 def add_arguments(parser: argparse.ArgumentParser):
@@ -19,26 +18,22 @@ def add_arguments(parser: argparse.ArgumentParser):
 
 def main(args: argparse.Namespace) -> int:
   """Runs the job and returns its exit code."""
+  from palpate.tasks import score
   from palpate.tasks.recording import Recording
   from palpate.tasks.report import write_report
-  from palpate.tasks.score import check_reference
 
   path = pathlib.Path(args.recording)
   try:
     recording = Recording.load(path)
     if args.reference:
-      reference = json.loads(pathlib.Path(args.reference).read_text(encoding="utf-8"))
-      check_reference(reference)
+      reference = score.read_reference(pathlib.Path(args.reference))
     else:
-      reference = _own(str(recording.info.get("task", "")))
-    print(write_report(recording, args.out or path.parent, reference))
+      reference = score.reference(str(recording.info.get("task", "")))
+    folder = output_folder("out", args.out or path.parent)
+    with writing(folder):
+      print(write_report(recording, folder, reference))
   except (OSError, ValueError) as error:
     raise CommandError(str(error)) from None
   except ImportError as error:
     raise CommandError(f"{error}; install palpate[plot]", code=1) from None
   return 0
-
-
-def _own(name: str):
-  path = pathlib.Path(__file__).parent / "references" / f"{name.replace('/', '_')}.json"
-  return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None

@@ -7,54 +7,93 @@ import pathlib
 
 import mujoco
 
+from . import press
 from .console import CommandError
 
 
 def add_arguments(parser: argparse.ArgumentParser):
   """Declares the options that choose a scene."""
-  parser.add_argument("scene", metavar="SCENE", help="name of a model or path of an MJCF file")
-  parser.add_argument("--nodes", metavar="N", type=int, help="resolution of a named model")
-  parser.add_argument("--seed", metavar="N", type=int, help="variant of a named model's shape")
+  from palpate import models
+
+  parser.add_argument(
+    "scene",
+    metavar="SCENE",
+    help=f"{', '.join(models.NAMES)} or press; an MJCF file; a folder with a scene.xml",
+  )
+  parser.add_argument(
+    "--nodes",
+    metavar="N",
+    type=int,
+    help=f"resolution of a named organ, {' or '.join(map(str, models.RESOLUTIONS))}",
+  )
+  parser.add_argument("--seed", metavar="N", type=int, help="variant of a named organ's shape")
   parser.add_argument(
     "--instruments",
     metavar="NAMES",
-    help="of a named model, separated by commas (probe,grasper)",
+    help=f"of a named organ, separated by commas ({','.join(models.INSTRUMENTS)})",
   )
   parser.add_argument(
     "--coupling",
     choices=("nodal", "window"),
-    help="of a named model; window: MuJoCo knows the nodes near the instruments alone (nodal)",
+    help="of a named organ; window: MuJoCo knows the nodes near the instruments alone (nodal)",
   )
   parser.add_argument("--keyframe", metavar="NAME", help="state to start from (the first keyframe)")
 
 
 def load(args: argparse.Namespace, handle: bool) -> tuple[mujoco.MjModel, mujoco.MjData]:
-  """Returns model and data at the keyframe; `handle` gives named models handles to drag."""
+  """Returns model and data at the keyframe; `handle` gives named organs handles to drag."""
   from palpate import models
 
-  given = [
-    option for option in ("nodes", "seed", "instruments", "coupling") if getattr(args, option)
-  ]
-  path = pathlib.Path(args.scene)
+  options = ("nodes", "seed", "instruments", "coupling")
+  given = [option for option in options if getattr(args, option) is not None]
   try:
     if args.scene in models.NAMES:
-      options = {"nodes": args.nodes or models.RESOLUTIONS[1], "seed": args.seed, "handle": handle}
-      options["coupling"] = args.coupling or "nodal"
+      choices = {"nodes": args.nodes or models.RESOLUTIONS[1], "seed": args.seed, "handle": handle}
+      choices["coupling"] = args.coupling or "nodal"
       if args.instruments is not None:
-        options["instruments"] = [name for name in args.instruments.split(",") if name]
-      model = models.load(args.scene, **options).compile()
+        choices["instruments"] = [name for name in args.instruments.split(",") if name]
+      model = models.load(args.scene, **choices).compile()
     elif given:
-      raise CommandError(f"--{given[0]} goes with a named model: {', '.join(models.NAMES)}")
-    elif not path.is_file():
-      names = ", ".join(models.NAMES)
-      raise CommandError(f"scene is {args.scene!r}, expected an MJCF file or one of {names}")
+      raise CommandError(f"--{given[0]} goes with a named organ: {', '.join(models.NAMES)}")
     else:
-      model = mujoco.MjModel.from_xml_path(str(path.absolute()))
+      model = _compile(file(args.scene))
   except ValueError as error:
     raise CommandError(str(error)) from None
   data = mujoco.MjData(model)
   reset(model, data, args.keyframe)
   return model, data
+
+
+def file(name: str) -> pathlib.Path:
+  """Returns the scene that a name stands for: press, a file, or the scene.xml of a folder."""
+  from palpate import models
+
+  path = pathlib.Path(name)
+  if name == "press" and not path.exists():
+    return press.folder() / "scene.xml"
+  if path.is_dir() and (path / "scene.xml").is_file():
+    return path / "scene.xml"
+  if not path.is_file():
+    names = ", ".join((*models.NAMES, "press"))
+    raise CommandError(
+      f"scene is {name!r}, expected one of {names}, an MJCF file or a folder with a scene.xml"
+    )
+  return path
+
+
+def _compile(path: pathlib.Path) -> mujoco.MjModel:
+  try:
+    return mujoco.MjModel.from_xml_path(str(path.absolute()))
+  except (ValueError, mujoco.FatalError) as error:
+    raise CommandError(f"scene {path}: {error}") from None
+
+
+def first_camera(model: mujoco.MjModel) -> int:
+  """Returns the camera to look through first: the laparoscope, else the first, else -1 (free)."""
+  names = [model.camera(i).name for i in range(model.ncam)]
+  return next(
+    (i for i, n in enumerate(names) if n.split("/")[-1] == "laparoscope"), 0 if names else -1
+  )
 
 
 def reset(model: mujoco.MjModel, data: mujoco.MjData, keyframe: str | None):

@@ -4,24 +4,41 @@ from __future__ import annotations
 
 import argparse
 import pathlib
+import re
+import sys
 
 from palpate import register
 
 from . import figures
-from .console import CommandError
+from .console import CommandError, table
 
 _VOLUMES = (".nii", ".nii.gz", ".nrrd")
+_NODES = 1000
 
 
 def add_arguments(parser: argparse.ArgumentParser):
   """Declares the options."""
+  parser.epilog = (
+    "What of the mesh the organ leaves out or fills is named, with its volume; nothing is written "
+    "then, and the exit code is 1, unless --accept-losses or --pieces takes care of it."
+  )
   add = parser.add_argument
   add("mesh", metavar="MESH", help="OBJ, STL, PLY, glTF, or a label map in NIfTI or NRRD")
-  add("-o", "--out", metavar="FOLDER", required=True, help="the model folder to write")
-  add("--nodes", metavar="N", type=int, default=1000, help="nodes of the organ (%(default)s)")
+  add(
+    "-o", "--out", metavar="FOLDER", required=True, help="the model folder to write, new or empty"
+  )
+  add("--force", action="store_true", help="write into a folder that has files; they are replaced")
+  add("--nodes", metavar="N", type=int, help=f"nodes of the organ ({_NODES})")
   add("--method", choices=("even", "grid", "direct"), default="even", help="(%(default)s)")
-  add("--scale", metavar="X", type=float, default=1.0, help="file units to m: 0.001 for mm")
-  add("--label", metavar="K", type=int, help="label of a volume to take")
+  add("--scale", metavar="X", help="metres per unit of a mesh, or its unit: m, cm, mm, inch (m)")
+  add(
+    "--label",
+    metavar="K",
+    action="append",
+    help="number or name of a label to take from a volume; may be repeated, or all",
+  )
+  add("--pieces", action="store_true", help="make an organ of every separate piece")
+  add("--accept-losses", action="store_true", help="write the organ even if it leaves parts out")
   add("--name", help="of the organ (the file's)")
   add("--young", metavar="PA", type=float, help="Young's modulus (the liver's)")
   add("--foundation", metavar="PA/M", type=float, help="Winkler foundation (the liver's)")
@@ -29,28 +46,110 @@ def add_arguments(parser: argparse.ArgumentParser):
 
 def main(args: argparse.Namespace) -> int:
   """Runs the job and returns its exit code."""
-  from palpate.models import folder, volume
-  from palpate.models import wrap as wrapping
+  from palpate.models import folder, wrap
 
   figures.need("video", "imageio")
   source = pathlib.Path(args.mesh)
   if not source.is_file():
     raise CommandError(f"no file {str(source)!r}")
-  name = args.name or source.name.split(".")[0]
   constants = {k: getattr(args, k) for k in ("young", "foundation") if getattr(args, k) is not None}
+  nodes = args.nodes or (None if args.method == "direct" else _NODES)
+  name = args.name if args.name is not None else _name(source, args.out)
   try:
-    if source.name.lower().endswith(_VOLUMES):
-      made = volume.wrap_volume(source, args.nodes, label=args.label, method=args.method)
-    else:
-      made = wrapping.wrap(source, args.nodes, method=args.method, scale=args.scale)
-    vertices, triangles, report = made
-    paths = folder.write(args.out, name, vertices, triangles, report, **constants)
-  except ValueError as error:
-    raise CommandError(str(error)) from None
-  paths.append(_picture(paths, name))
-  print(report)
+    _check(args, source)
+    wrap.check(nodes, args.method)
+    folder.check(args.out, [name], overwrite=args.force, **constants)
+    organs = _wrap(args, source, name, nodes)
+    lost = _show(organs)
+    if lost and not args.accept_losses:
+      raise CommandError(_advice(lost, args), code=1)
+    paths = folder.write(args.out, organs, overwrite=args.force, **constants)
+  except (ValueError, ImportError) as error:
+    raise CommandError(_words(str(error))) from None
+  except OSError as error:
+    raise CommandError(f"cannot write to {args.out!r}: {error.strerror}") from None
+  paths.append(_picture(paths, next(iter(organs))))
   print("\n".join(str(path) for path in paths))
   return 0
+
+
+def _name(source: pathlib.Path, out: str) -> str:
+  """Returns a name for the organ: the file's, or the folder's if that is the scene's."""
+  from palpate.models import folder
+
+  for text in (source.name.split(".")[0], pathlib.Path(out).absolute().name, "organ"):
+    name = _allowed(text)
+    if name.strip("_") and name.lower() != folder.SCENE:
+      return name
+  return "organ"
+
+
+def _allowed(text: str) -> str:
+  return re.sub(r"[^A-Za-z0-9_-]+", "_", text)
+
+
+def _check(args: argparse.Namespace, source: pathlib.Path):
+  """Refuses options that would do nothing, and a folder that the mesh itself is in danger in."""
+  volume = source.name.lower().endswith(_VOLUMES)
+  if volume and args.scale is not None:
+    raise CommandError("--scale goes with a mesh; a volume has its own units")
+  if not volume and args.label:
+    raise CommandError(f"--label goes with a volume ({', '.join(_VOLUMES)})")
+  if args.force and pathlib.Path(args.out).resolve() in source.resolve().parents:
+    raise CommandError(f"{str(source)!r} is in the folder that --force writes into")
+
+
+def _wrap(args: argparse.Namespace, source: pathlib.Path, name: str, nodes: int | None) -> dict:
+  """Returns what was wrapped, by name."""
+  from palpate.models import volume, wrap
+
+  if not source.name.lower().endswith(_VOLUMES):
+    call = wrap.wrap_pieces if args.pieces else wrap.wrap
+    made = call(source, nodes, method=args.method, scale=args.scale or 1.0)
+    return _named(name, made if args.pieces else [made])
+  labels = volume.read(source)
+  if args.label == ["all"]:
+    chosen = list(labels.segments)
+  else:
+    chosen = [labels.segment(label) for label in args.label or [None]]
+  organs = {}
+  for segment in chosen:
+    made = volume.wrap_label(labels, segment, nodes, method=args.method, pieces=args.pieces)
+    own = name if len(chosen) == 1 else f"{name}_{_allowed(segment.name or str(segment.value))}"
+    organs |= _named(own if own not in organs else f"{own}_{segment.value}", made)
+  return organs
+
+
+def _named(name: str, made: list) -> dict:
+  if len(made) == 1:
+    return {name: made[0]}
+  return {f"{name}_{k + 1}": each for k, each in enumerate(made)}
+
+
+def _show(organs: dict) -> list[str]:
+  """Prints the reports; returns a line for everything that is left out or filled."""
+  lost = []
+  for name, (_, _, report) in organs.items():
+    print(table([("organ", name), *(row for row in report.rows() if row[0] != "loss")]))
+    for loss in report.losses:
+      print(f"{name}: {loss}", file=sys.stderr)
+      lost.append(loss.kind)
+  return lost
+
+
+def _advice(lost: list[str], args: argparse.Namespace) -> str:
+  options = ["--accept-losses writes it as it is"]
+  if "piece" in lost and not args.pieces:
+    options.append("--pieces makes an organ of every separate piece")
+  if {"part", "filled", "rest"} & set(lost) and args.method != "direct":
+    options.append("--nodes with a larger number may follow more")
+  return f"nothing is written, for parts are left out or filled: {'; '.join(options)}"
+
+
+def _words(message: str) -> str:
+  """Returns a message of Python's in the words of the command."""
+  message = re.sub(r"\b(scale|method)='(\w+)'", r"--\1 \2", message)
+  return message.replace("and nothing in it is to be lost", "--force writes into it")
 
 
 def _picture(paths: list[pathlib.Path], name: str) -> pathlib.Path:
@@ -59,11 +158,12 @@ def _picture(paths: list[pathlib.Path], name: str) -> pathlib.Path:
   import mujoco
 
   register()
-  scene = next(path for path in paths if path.name == "scene.xml")
+  scene = paths[0]
   model = mujoco.MjModel.from_xml_path(str(scene))
   data = mujoco.MjData(model)
   mujoco.mj_step(model, data)
   out = scene.parent / f"{name}.png"
+  out.unlink(missing_ok=True)  # a link is replaced, not followed
   with mujoco.Renderer(model, 480, 640) as renderer:
     renderer.update_scene(data, camera="overview")
     imageio.imwrite(out, renderer.render())

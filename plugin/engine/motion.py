@@ -56,37 +56,35 @@ class Windowed:
 
   def displacement(self, model, data) -> np.ndarray:
     """Returns the displacement from rest [m], (nvert, 3)."""
-    return self._own(0).copy()
+    return self._own("disp").copy()
 
   def velocity(self, data) -> np.ndarray:
     """Returns the velocity [m/s], (nvert, 3)."""
-    return self._own(1).copy()
+    return self._own("vel").copy()
 
   def contact_force(self, data) -> np.ndarray:
     """Returns the constraint force of the last step [N], (nvert, 3)."""
     out = np.zeros((self._nvert, 3))
     node = self._w.slots
     used = node >= 0
-    start = 12 * self._nvert
-    out[node[used]] = self._w.plugin_state[start : start + 3 * len(node)].reshape(-1, 3)[used]
+    out[node[used]] = self._w.boxes["own"].force.numpy()[used]
     return out
 
   def put(self, model: mujoco.MjModel, data, u: np.ndarray | None, v: np.ndarray | None):
     """Sets displacement and velocity of the vertices that move and forgets forces of the past."""
     w, free = self._w, self._w.organ.free
-    new = [self._own(0).copy(), self._own(1).copy()]
+    new = [self._own("disp").copy(), self._own("vel").copy()]
     for old, values in zip(new, (u, v), strict=True):
       if values is not None:
         old[free] = values[free]
     w.plugin_state[:] = 0
-    self._own(0)[:], self._own(1)[:] = new
+    self._own("disp")[:], self._own("vel")[:] = new
     workspace.place(w, model._address)
 
-  def _own(self, k: int) -> np.ndarray:
-    """Returns the displacement (0) or velocity (1) in the plugin state."""
+  def _own(self, name: str) -> np.ndarray:
+    """Returns a vector of the motion in the plugin state."""
     workspace.sync(self._w)
-    size = 3 * self._nvert
-    return self._w.plugin_state[k * size : (k + 1) * size].reshape(-1, 3)
+    return getattr(self._w.boxes["own"].motion, name).numpy()
 
 
 def of(w: Workspace) -> Nodal | Windowed:

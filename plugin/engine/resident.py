@@ -17,9 +17,7 @@ from typing import Any
 
 import warp as wp
 
-from . import window_slots
-from .coupling import FORESEEN, PENDING
-from .window_nodes import HALT
+from .layout import FLAG, HEAD, MODE, TAIL
 
 _stamps = itertools.count(time.time_ns() >> 10)  # never the same number twice
 
@@ -29,16 +27,18 @@ class Resident:
 
   Args:
     w: the workspace
-    nodes: the kernels' view of the nodes
-    start: where the organ's numbers start in mjData.plugin_state
+    motion: the motion on the device, the numbers of `layout.Motion`
     end_step: launches the end of the last step on the device
     look_again: launches the search for nodes near the tools once more
   """
 
-  def __init__(self, w, nodes, start: int, end_step, look_again):
-    self.w, self.nodes = w, nodes
-    self.state = w.views["plugin_state"].numpy()
-    self.tail = self.state[-window_slots.TAIL :]
+  def __init__(self, w, motion: wp.array, end_step, look_again):
+    self.w = w
+    own, inbox, outbox = (w.boxes[name] for name in ("own", "inbox", "outbox"))
+    self.state = w.views["plugin_state"].numpy()[: motion.size]  # the motion comes first there
+    self.tail, self.head = own.tail.numpy(), inbox.head.numpy()
+    self.found = outbox.found.numpy()
+    _, self.most, _ = outbox.record.shape
     self.device = w.body.device
     self.live = -1
     # Recorded graphs: the guess, on the CPU; the solve with it, on the device; what is left then.
@@ -46,11 +46,10 @@ class Resident:
     self.begin_graph: Any = None
     self.rest: list = []
     self._begun = False
-    w.flags[FORESEEN] = 1
-    self._end_step, self._look_again = end_step, look_again
-    self._motion = (nodes.disp, nodes.velocity, nodes.last, nodes.before)
+    w.flags[FLAG.foreseen] = 1
+    self._end_step, self._look_again, self._motion = end_step, look_again, motion
     self._staging = wp.zeros(
-      4 * 3 * nodes.nvert, dtype=wp.float64, device="cpu", pinned=self.device.is_cuda
+      motion.size, dtype=wp.float64, device="cpu", pinned=self.device.is_cuda
     )
 
   def send(self):
@@ -59,7 +58,7 @@ class Resident:
     Raises:
       RuntimeError: the plugin state was saved while its motion was on a device.
     """
-    stamp = int(self.tail[0])
+    stamp = int(self.tail[TAIL.stamp])
     if abs(stamp) == self.live:
       return
     self._begun = False
@@ -68,14 +67,12 @@ class Resident:
         "this state was saved or copied while its motion was on the device (resident='true'); "
         "call palpate.Organ.sync() before saving or copying it"
       )
-    size = 3 * self.nodes.nvert
-    self._staging.numpy()[:] = self.state[: 4 * size]
-    for k, array in enumerate(self._motion):
-      wp.copy(array, self._staging, src_offset=k * size, count=size)
+    self._staging.numpy()[:] = self.state
+    wp.copy(self._motion, self._staging)
     wp.synchronize_device(self.device)
-    self.w.flags[PENDING] = self.w.views["inbox"].numpy()[3] = 0  # it ends no step
+    self.w.flags[FLAG.pending] = self.head[HEAD.mode] = MODE.still  # it ends no step
     self.live = next(_stamps)
-    self.tail[0] = self.live
+    self.tail[TAIL.stamp] = self.live
 
   def step(self, computed: bool):
     """Notes that a step was taken on the device alone, and begins the next one there.
@@ -86,52 +83,46 @@ class Resident:
       computed: whether forces were computed in this step, and so the device was waited for
     """
     self.live = next(_stamps)
-    self.tail[0] = -self.live
+    self.tail[TAIL.stamp] = -self.live
     self._begun = False
     if not computed:
       return
     w = self.w
     wp.capture_launch(self.foresee)
-    self._begun = bool(w.flags[FORESEEN]) and w.flags[PENDING] != HALT
+    self._begun = bool(w.flags[FLAG.foreseen]) and w.flags[FLAG.pending] != MODE.halt
     if self._begun:
       wp.capture_launch(self.begin_graph)
-      w.flags[PENDING] = w.views["inbox"].numpy()[3] = 0  # this ends the last step
+      w.flags[FLAG.pending] = self.head[HEAD.mode] = MODE.still  # this ends the last step
 
   def left_to_do(self) -> list:
     """Returns the graphs of the solve, or of what is left of one that was begun with the truth."""
-    if self._begun and self.w.flags[FORESEEN]:
+    if self._begun and self.w.flags[FLAG.foreseen]:
       return self.rest
     self._begun = False
     return self.w.solve
 
   def look(self):
     """Repeats the search within a shorter reach while it finds more than there is room for."""
-    w, n = self.w, self.nodes
-    inbox, outbox = w.views["inbox"].numpy(), w.views["outbox"].numpy()
-    first = window_slots.SUMMARY + 12 * n.nslot
-    found = outbox[first : first + n.nwindow]
-    while found.max() > n.most:
-      inbox[7] *= 0.75
+    while self.found.max() > self.most:
+      self.head[HEAD.reach] *= 0.75
       self._look_again()
       wp.synchronize_device(self.device)
 
   def stop(self):
     """Brings the motion into the plugin state and forgets the step that was begun."""
     self.fetch()
-    self.live, self.w.flags[FORESEEN] = -1, 1
+    self.live, self.w.flags[FLAG.foreseen] = -1, 1
 
   def fetch(self):
     """Brings the motion into the plugin state."""
-    stamp = int(self.tail[0])
+    stamp = int(self.tail[TAIL.stamp])
     if stamp >= 0 or -stamp != self.live:
       return
-    inbox, flags = self.w.views["inbox"].numpy(), self.w.flags
-    inbox[3] = flags[PENDING]
+    flags = self.w.flags
+    self.head[HEAD.mode] = flags[FLAG.pending]
     self._end_step()
-    size = 3 * self.nodes.nvert
-    for k, array in enumerate(self._motion):
-      wp.copy(self._staging, array, dest_offset=k * size, count=size)
+    wp.copy(self._staging, self._motion)
     wp.synchronize_device(self.device)
-    self.state[: 4 * size] = self._staging.numpy()
-    inbox[3] = flags[PENDING] = 0
-    self.tail[0] = self.live
+    self.state[:] = self._staging.numpy()
+    self.head[HEAD.mode] = flags[FLAG.pending] = MODE.still
+    self.tail[TAIL.stamp] = self.live

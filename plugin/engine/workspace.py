@@ -16,18 +16,20 @@ from palpate.tissue.config import Config
 
 from . import (
   apart,
+  coupling,
   declare,
   declare_windows,
   graphs,
   inertia,
   mjstruct,
+  nodal,
   prepare,
-  window,
-  window_nodes,
+  windowed,
 )
-from .bind import CROSSING, bind, field_of
-from .coupling import ANSWERED, ASLEEP, CHANGED, NFLAG, PENDING, STALE
+from .bind import bind
+from .coupling import Phases
 from .declare import Declaration
+from .layout import FLAG, HEAD
 from .resident import Resident
 from .turns import Turn
 
@@ -45,7 +47,7 @@ class Workspace:
     config: configuration in force, which may differ from the compiled one
     body: shape, tissue and state on the organ's device
     host: the arrays of its state that MuJoCo's side reads and writes, on the CPU
-    ext: external and lagged contact force in float64 [N]  (3 nnode,)
+    lagged: external and lagged contact force [N]  (nodes or slots, 3)
     data: address of the mjData
     instance: the plugin instance
     model: address of the mjModel the views are of
@@ -56,21 +58,19 @@ class Workspace:
     solve: recorded graphs of the solve and what it needs, each on one device
     leave: recorded graph that takes the contact forces after MuJoCo's step
     respond: recorded graphs of the organ's response to their change; none where the scheme has none
-    end: recorded graph that ends a step without that, or None
+    end: recorded graph that ends a step without that
     advance: recorded graph of the plugin state's step
     place: recorded graph that puts the windows where the plugin state says, or None
     resident: keeper of a motion that stays on the device, or None
     stiff: whether the response is needed, see `inertia.stiffness`
     heaviest: most times its inertia that a node in contact may have, see there  (1,)
     computed: whether forces were computed for the step that ends
-    flags: what the coupling reports: STALE (the model lacks slots), ASLEEP, MISSED_NODES,
-      MISSED_ELEMENTS, PENDING (mode of the next commit), NEAR (a tool is near), CHANGED (contact
-      forces did), ANSWERED (the organ responded) and FORESEEN (what acts on it was)  (NFLAG,)
+    flags: what the coupling reports, see `layout.FLAG`
     policy: MuJoCo's sleep policy of the windows' bodies comes first
     counts: the number of vertices that MuJoCo sees of a windowed organ comes first
     status: iterations, relative residual, norm, failure  (4,)
     error: what went wrong since the last reset, or None
-    overflow: what the windows had no room for, the first time, or None
+    missed: most nodes and triangles that the windows had no room for in a step
     warning: last index and count of each of MuJoCo's warnings, one after the other
     nefc: the number of MuJoCo's constraints comes first
     noticed: whether it was said that windows came without their state
@@ -82,14 +82,16 @@ class Workspace:
     qpos: numbers of qpos that the slots have, as bytes
     stood: what they were after the last step, or None
     plugin_state: the organ's own numbers
-    views: what the graphs point at, kept alive
+    views: what a coupling keeps when its graphs are recorded anew
+    boxes: blocks of the plugin state and of what crosses in a step, see `layout`; windows
+    phases: what the graphs launch
   """
 
   organ: Declaration
   config: Config
   body: Body
   host: dict[str, wp.array]
-  ext: wp.array
+  lagged: wp.array
   data: int
   instance: int
   model: int = 0
@@ -108,12 +110,12 @@ class Workspace:
   stiff: bool = False
   heaviest: np.ndarray = dataclasses.field(default_factory=lambda: np.ones(1))
   computed: bool = False
-  flags: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(NFLAG, np.int32))
+  flags: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(len(FLAG), np.int32))
   policy: memoryview = dataclasses.field(default_factory=lambda: np.zeros(1, np.int32).data)
   counts: memoryview = dataclasses.field(default_factory=lambda: np.zeros(1, np.int32).data)
   status: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(4, np.float32))
   error: str | None = None
-  overflow: str | None = None
+  missed: tuple[int, int] = (0, 0)
   noticed: bool = False
   # Views that every step looks at: an item of a memoryview costs a tenth of one of an array.
   warning: memoryview = dataclasses.field(default_factory=lambda: memoryview(b""))
@@ -127,6 +129,8 @@ class Workspace:
   stood: bytes | None = None
   plugin_state: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))
   views: dict = dataclasses.field(default_factory=dict)
+  boxes: dict = dataclasses.field(default_factory=dict)
+  phases: Phases | None = None
 
   def run(self):
     """Computes the step's forces and adds them to qfrc_passive."""
@@ -141,11 +145,11 @@ class Workspace:
         self._find_contacts_again()
     wp.capture_launch(self.before)
     if self.turn is not None:
-      if self.flags[STALE]:
+      if self.flags[FLAG.stale]:
         self._find_contacts_again()
         wp.capture_launch(self.before)
       if not self.asleep and self.policy[0] == _ALLOWED:
-        window.let_sleep(self, False)
+        windowed.let_sleep(self, False)
     if self.asleep:
       self.computed = True
       return  # what `after` does was done with `before`
@@ -174,7 +178,7 @@ class Workspace:
     """Returns whether qpos was set without the plugin state: slots are not on their nodes."""
     if self.qpos.tobytes() == self.stood:
       return False
-    far = window.find_astray(self)
+    far = windowed.find_astray(self)
     if far > _ASTRAY and not self.noticed:
       self.noticed = True
       mjstruct.warn(
@@ -210,20 +214,20 @@ class Workspace:
       if self.nefc[0]:  # contacts of a window that was left behind wake the organ
         wp.capture_launch(self.leave)
       if self.counts[0]:
-        window.hide(self)
+        windowed.hide(self)
       if self.policy[0] != _ALLOWED:
-        window.let_sleep(self, True)
+        windowed.let_sleep(self, True)
       return
     responds = bool(self.respond) and self.stiff and computed
     if responds or self.turn is not None:
       wp.capture_launch(self.leave)
     if self.turn is not None:
-      window.hide(self)
-    responds = responds and bool(self.flags[CHANGED])
-    self.flags[ANSWERED] = responds
+      windowed.hide(self)
+    responds = responds and bool(self.flags[FLAG.changed])
+    self.flags[FLAG.answered] = responds
     if responds:
       self._answer()
-    elif self.end is not None:
+    else:
       wp.capture_launch(self.end)
     wp.capture_launch(self.advance)
     if self.resident:
@@ -232,16 +236,16 @@ class Workspace:
   def _answer(self):
     """Ends the step with the organ's own response to the change of the contact forces."""
     if self.turn is not None:
-      self.views["inbox"].numpy()[window_nodes.HEAD - 1] = 1.0
+      self.boxes["inbox"].head.numpy()[HEAD.answered] = 1.0
     graphs.launch_all(self.respond)
     if self.resident:
-      self.flags[PENDING] = 0
+      self.flags[FLAG.pending] = 0
       self.resident.look()
 
   @property
   def asleep(self) -> bool:
     """Whether the organ is at rest and its solve was skipped."""
-    return bool(self.flags[ASLEEP])
+    return bool(self.flags[FLAG.asleep])
 
   @property
   def slots(self) -> np.ndarray:
@@ -280,33 +284,32 @@ def attach(w: Workspace, model: int):
 def state_size(model: int, instance: int) -> int:
   """Returns the length of the plugin state.
 
-  Contact force, last dv and the one before of each moving vertex, or what `window` says.
+  Contact force, last dv and the one before of each moving vertex, or what `windowed` says.
   """
   m = mjstruct.Model.from_address(model)
   names = mjstruct.config(model, instance, "window").split()
   if names:
-    # Asked before MuJoCo has filled in the flexes: what `window` needs is at most this.
-    return window.state_size(m.nflexvert, 0, m.ngeom * len(names))
-  return 9 * len(declare.moving_bodies(m, instance)) + 1
+    # Asked before MuJoCo has filled in the flexes: what `windowed` needs is at most this.
+    return windowed.state_size(m.nflexvert, 0, m.ngeom * len(names))
+  return nodal.state_size(3 * len(declare.moving_bodies(m, instance)))
 
 
 def make(model: int, data: int, instance: int) -> Workspace:
   """Returns the workspace of an organ in a fresh mjData; makes the model fit the organ."""
-  windowed = bool(mjstruct.config(model, instance, "window"))
+  has_windows = bool(mjstruct.config(model, instance, "window"))
   with graphs.lock:
-    organ = (declare_windows if windowed else declare).read(model, instance)
+    organ = (declare_windows if has_windows else declare).read(model, instance)
     m = mjstruct.Model.from_address(model)
     body = bodies.worlds(organ.still)
     s = body.shape
     host = {}
-    for field in (*CROSSING, "rhs", "sol"):
-      array = field_of(body, field)
+    for field, array in coupling.on_body(body).items():
       if body.device.is_cuda:
         array = wp.zeros(array.shape, dtype=float, device="cpu", pinned=True)
       host[field] = array
     size = organ.windows.nslot if organ.windows else s.nnode
-    ext = wp.zeros(3 * size, dtype=wp.float64, device="cpu")
-    w = Workspace(organ, organ.config, body, host, ext, data, instance)
+    lagged = wp.zeros((size, 3), dtype=wp.float64, device="cpu")
+    w = Workspace(organ, organ.config, body, host, lagged, data, instance)
     _view(w, mjstruct.Data.from_address(data), m)
     prepare.fit(m, organ, body)
     # Padding nodes have a mass so that nothing divides by zero.
@@ -317,7 +320,7 @@ def make(model: int, data: int, instance: int) -> Workspace:
     bind(w, model)
     w.plugin_state = w.views["plugin_state"].numpy()
     if w.turn is not None:
-      window.settle(w, model)
+      windowed.settle(w, model)
       if w.turn.is_orphan():
         wp.capture_launch(w.place)
         w.turn.go_home()
@@ -348,7 +351,9 @@ def configure(w: Workspace, model: int, texts: dict[str, str]):
   Raises:
     ValueError: a key may not change, or its value is not allowed.
   """
-  _change(w, model, configuration.change(w.organ.name, w.config, texts, w.organ.mesh.closed))
+  organ, mesh = w.organ, w.organ.mesh
+  arguments = texts, mesh.nelem, mesh.closed, organ.config
+  _change(w, model, configuration.change(organ.name, w.config, *arguments))
   w.chosen = True
 
 
@@ -368,13 +373,14 @@ def _change(w: Workspace, model: int, config: Config):
       shape.change(w.body, w.organ.mesh, config, ~w.organ.free)
     else:
       shape.renumber(w.body, config)
-    bind(w, model)
+    if any(getattr(before, key) != getattr(config, key) for key in configuration.RECORDED):
+      bind(w, model)
     if material:
       refresh(w)
     else:
       _feel(w, mjstruct.Model.from_address(model))
   if w.turn is not None:
-    window.wake(w)
+    windowed.wake(w)
 
 
 def sync(w: Workspace):
@@ -390,6 +396,6 @@ def refresh(w: Workspace):
     if w.organ.windows is None:
       prepare.give_armature(m, w.organ, w.body, w.config)
     else:
-      window.set_inertia(w, m)
+      windowed.set_inertia(w, m)
     _feel(w, m)
     w.time_step = float(m.opt.timestep)

@@ -262,7 +262,7 @@ struct Sum {
   V3 force;  // elastic force [N]
   V3 rate;   // minus K v [N/s]
   S3 stiffness;  // [N/m]
-  V3 area;  // area vector [m^2]
+  Carried area;  // area vector [m^2]
   V squeeze;  // (rest area / area)^2 of the most compressed triangle
 };
 
@@ -276,7 +276,7 @@ struct Wanted { float g, spring; bool matrix, areas, bending; const float* norma
 PALPATE void area(Sum& sum, Metric g, V3 a, V3 b) {
   const V has = select(g.g11 > splat(0.0f), splat(1.0f), splat(0.0f));
   const V3 c = cross(a, b);
-  sum.area += has * c;
+  sum.area = sum.area + has * c;
   const V d2 = (g.g11 * g.g22 - g.g12 * g.g12) * dot(c, c);
   sum.squeeze = vmax(sum.squeeze, has / vmax(d2, splat(0.01f)));
 }
@@ -289,7 +289,7 @@ PALPATE Sum around(const Fan& fan, const Motion& m, const Wanted& want, Lane lan
   Sum sum = {none, none, {zero, zero, zero, zero, zero, zero}, none, splat(1.0f)};
   M3 block = empty;  // towards entry k
   V cover = zero;
-  V3 p = gather3(m.disp, fan.node, lane) - m.u, r = ld3(fan.rest, 0, lane);
+  Carried p = gather3(m.disp, fan.node, lane) - m.u, r = ld3(fan.rest, 0, lane);
   for (int k = 0; k <= fan.width; ++k) {
     const V3 q = gather3(m.disp, fan.node + 8 * (k + 1), lane) - m.u;
     const V3 t = ld3(fan.rest, 3 * k + 3, lane);

@@ -1,6 +1,6 @@
 // The small passes of the time stepping schemes.
 #pragma once
-#include "simd.h"
+#include "volume.h"
 
 namespace palpate {
 
@@ -52,6 +52,115 @@ PALPATE void newton_update(const Fields& f, Thread t, int flags) {
       st3(f.system.disp_trial.data + at, ld3(f.state.disp.data + at, lane) + h * v, lane);
     }
   });
+}
+
+// Makes the step that of `midpoint` in place of `implicit`'s, or puts it back: half its stiffness,
+// and half of the step where the velocity is that of the time of x, as the last step changed none.
+template <class Fields>
+PALPATE void centre(const Fields& f, Thread t, int undo) {
+  Group<SUMS> group(t, f.system.partial.data);
+  const float* warm = f.state.dvel_warm.data + 24 * (size_t)t.world * f.shape.nslice;
+  V sum = splat(0.0f);
+  group.each(0, f.shape.nslice, [&](int s, Lane lane) {
+    const V3 d = ld3(warm + 24 * s, lane);
+    sum = add_dot(sum, d, d);
+  });
+  const float part = group.sum(sum) > 0.0f ? 1.0f : 0.5f;
+  if (!group.is_first()) return;
+  float* step = f.state.step.data + 4 * t.world;
+  if (undo) {
+    step[0] /= part;
+    step[1] *= 2.0f / part;
+    return;
+  }
+  // Such that the weight of K v on the right-hand side is h damping; see `Stage`.
+  step[3] = (1.0f - 0.5f * step[1] / (step[0] * step[0])) / part;
+  step[0] *= part;
+  step[1] *= 0.5f * part;
+}
+
+// The springs that stand for a slice's edges, for `neumann`: W = I + g (sum - N) / m with
+// sum = foundation area + all springs of a node, N those to its neighbours.
+struct Springs {
+  int width;
+  const int* node;
+  const float* k;
+  V area, sum;
+
+  // Adds g times the springs' pull towards x, as seen from `own`.
+  PALPATE V3 pulled(V3 b, float g, const float* x, V3 own, Lane lane) const {
+    for (int i = 0; i < width; ++i)
+      b += (g * ld(k, i, lane)) * (gather3(x, node + 8 * i, lane) - own);
+    return b;
+  }
+};
+
+template <class Fields>
+PALPATE Springs springs(const Fields& f, int s, Lane lane) {
+  const int row = f.shape.slot_adr.data[s], width = f.shape.slot_adr.data[s + 1] - row;
+  const float* k = f.tissue.fan_spring.data + 8 * row;
+  const V area = ld(f.shape.area.data, s, lane);
+  V sum = f.tissue.number.data[FOUNDATION] * area;
+  for (int i = 0; i < width; ++i) sum += ld(k, i, lane);
+  return {width, f.shape.fan_node.data + 8 * (row + 2 * s + 1), k, area, sum};
+}
+
+// One over the mass of a slice's nodes, 0 for those that do not move: they may have no mass.
+template <class Fields>
+PALPATE V lightness(const Fields& f, int world, int s, Lane lane) {
+  const V free = ld(f.shape.free.data, s, lane), zero = splat(0.0f);
+  const V mass = ld(f.state.mass.data + 8 * (size_t)world * f.shape.nslice, s, lane);
+  return select(free > zero, 1.0f / mass, zero);
+}
+
+// The schemes that solve nothing, from the right-hand side: `explicit`, dv = M^-1 b, and `neumann`,
+// dv = (2 D^-1 - D^-1 W D^-1) (b - g H v) / m.
+template <class Fields>
+PALPATE void direct(const Fields& f, Thread t, int stage) {
+  Group<> group(t, f.system.partial.data);
+  const float* step = f.state.step.data + 4 * t.world;
+  const float g = step[1], gv = g - step[0] * step[0];
+  const float foundation = g * f.tissue.number.data[FOUNDATION];
+  const size_t base = 24 * (size_t)t.world * f.shape.nslice;
+  const float* vel = f.state.vel.data + base;
+  const float* areavec = f.system.areavec.data + base;
+  float* sol = f.system.sol.data + base;
+  float* first = f.system.q.data + base;
+  const float impulse = volume_impulse(f, t.world, group, f.state.disp.data + base, vel, gv);
+  V norm = splat(0.0f);
+  group.each(0, f.shape.nslice, [&](int s, Lane lane) {
+    const V inverse = lightness(f, t.world, s, lane);
+    V3 b = ld3(f.system.rhs.data + base + 24 * s, lane);
+    if (impulse != 0.0f) b += impulse * ld3(areavec + 24 * s, lane);
+    V d = splat(1.0f);
+    if (stage == NEUMANN) {
+      const Springs k = springs(f, s, lane);
+      const V3 v = ld3(vel + 24 * s, lane);
+      b = k.pulled(b - (foundation * k.area) * v, g, vel, v, lane);
+      d += g * k.sum * inverse;
+    }
+    norm = add_dot(norm, inverse * b, b);
+    const V3 y = (inverse * b) / d;
+    st3(sol + 24 * s, y, lane);
+    st3(first + 24 * s, y, lane);
+  });
+  const float whole = group.sum(norm);
+  if (stage == NEUMANN)
+    group.each(0, f.shape.nslice, [&](int s, Lane lane) {
+      // With y = D^-1 (...) and W = D - N: y + D^-1 N y.
+      const V inverse = lightness(f, t.world, s, lane);
+      const Springs k = springs(f, s, lane);
+      const V3 none = {splat(0.0f), splat(0.0f), splat(0.0f)};
+      const V3 pull = k.pulled(none, 1.0f, first, none, lane);
+      const V3 more = ((g * inverse) * pull) / (1.0f + g * k.sum * inverse);
+      st3(sol + 24 * s, ld3(first + 24 * s, lane) + more, lane);
+    });
+  if (!group.is_first()) return;
+  float* status = f.system.status.data + 4 * t.world;
+  status[0] = stage == NEUMANN ? 1.0f : 0.0f;
+  status[1] = 0.0f;
+  status[2] = whole;
+  status[3] = whole < 1e30f && whole >= 0.0f ? 0.0f : 1.0f;
 }
 
 }  // namespace palpate

@@ -8,7 +8,8 @@
 //     const V3 v = ld3(vel + 24 * s, lane);
 //     st(energy, s, 0.5f * ld(mass, s, lane) * dot(v, v), lane);
 //   });
-// LANES is eight; `tissue/kernels.py` prints it and the other constants before the headers.
+// LANES is eight; `tissue/kernels.py` prints it and the other constants before the headers. Code in
+// doubles, whose sums are taken in the order in which they stand, begins with AS_WRITTEN.
 #pragma once
 
 #if defined(__CUDACC__) || defined(__CUDACC_RTC__)
@@ -20,9 +21,11 @@
 #if ON_CUDA
 #define PALPATE __device__ __forceinline__
 #define INLINED
+#define AS_WRITTEN
 #else
 #define PALPATE __attribute__((always_inline)) inline
 #define INLINED [[clang::always_inline]]  // before a call of a lambda
+#define AS_WRITTEN _Pragma("clang fp contract(off) reassociate(off)")
 // Sums of eight are not of one order anyway; products are fused with them.
 #pragma clang fp contract(fast) reassociate(on)
 #endif
@@ -38,12 +41,14 @@ typedef float Unaligned __attribute__((ext_vector_type(8), aligned(4)));
 struct Lane {};
 #endif
 
-// Members stand last one first: the compiler ranks the parts of a struct so, and with it the terms
-// of a sum over components are taken in the order in which they are written.
-struct V3 {
+struct V3 { V x, y, z; };
+
+// A vector or matrix that is carried around a loop has its members last one first: the compiler
+// ranks the parts of a struct so, and the terms of sums over them stay in their written order.
+struct Carried {
   V z, y, x;
-  V3() = default;
-  PALPATE V3(V x, V y, V z) : z(z), y(y), x(x) {}
+  PALPATE Carried(V3 a) : z(a.z), y(a.y), x(a.x) {}
+  PALPATE operator V3() const { return {x, y, z}; }
 };
 struct M3 {
   V zz, zy, zx, yz, yy, yx, xz, xy, xx;
@@ -58,18 +63,29 @@ struct S3 {  // symmetric
     : zz(zz), yz(yz), yy(yy), xz(xz), xy(xy), xx(xx) {}
 };
 
-// Reading and writing rows; `gather` takes component c from eight places, `at` in floats.
+// Reading and writing rows; `gather` takes component c from eight places, `at` in floats, and
+// `gather_number` numbers of one row a slice from the places of vectors.
 
 #if ON_CUDA
 PALPATE V ld(const float* p, int row, Lane lane) { return p[LANES * row + lane]; }
 PALPATE void st(float* p, int row, V v, Lane lane) { p[LANES * row + lane] = v; }
-PALPATE V gather(const float* p, const int* at, int c, Lane lane) { return p[at[lane] + LANES * c]; }
+PALPATE V gather(const float* p, const int* at, int c, Lane lane) {
+  return p[at[lane] + LANES * c];
+}
+PALPATE V gather_number(const float* p, const int* at, Lane lane) {
+  return p[at[lane] / (3 * LANES) * LANES + at[lane] % (3 * LANES)];
+}
 #else
 PALPATE V ld(const float* p, int row, Lane) { return (V) * (const Unaligned*)(p + LANES * row); }
 PALPATE void st(float* p, int row, V v, Lane) { *(Unaligned*)(p + LANES * row) = (Unaligned)v; }
 PALPATE V gather(const float* p, const int* at, int c, Lane) {
   const float* q = p + LANES * c;
   return (V){q[at[0]], q[at[1]], q[at[2]], q[at[3]], q[at[4]], q[at[5]], q[at[6]], q[at[7]]};
+}
+PALPATE V gather_number(const float* p, const int* at, Lane) {
+  V out;
+  for (int l = 0; l < LANES; ++l) out[l] = p[at[l] / (3 * LANES) * LANES + at[l] % (3 * LANES)];
+  return out;
 }
 #endif
 
@@ -91,6 +107,47 @@ PALPATE void st9(float* p, M3 a, Lane lane) {
 PALPATE V3 gather3(const float* p, const int* at, Lane lane) {
   return {gather(p, at, 0, lane), gather(p, at, 1, lane), gather(p, at, 2, lane)};
 }
+PALPATE S3 ld6(const float* p, Lane lane) {
+  return {ld(p, 0, lane), ld(p, 1, lane), ld(p, 2, lane),
+          ld(p, 3, lane), ld(p, 4, lane), ld(p, 5, lane)};
+}
+PALPATE M3 ld9(const float* p, Lane lane) {
+  return {ld(p, 0, lane), ld(p, 1, lane), ld(p, 2, lane), ld(p, 3, lane), ld(p, 4, lane),
+          ld(p, 5, lane), ld(p, 6, lane), ld(p, 7, lane), ld(p, 8, lane)};
+}
+
+#if !ON_CUDA
+// Quads: x, y, z and 0 of a node side by side, at four times its offset in vectors of slices. Eight
+// of them are read in eight loads and seven shuffles, where gather3 takes 24 and 21; on the CPU
+// gathering is most of an iteration.
+#define PICK __builtin_shufflevector
+typedef float Quad __attribute__((ext_vector_type(4)));
+PALPATE V two_quads(const float* quads, const int* at, int l) {
+  const Quad a = *(const Quad*)(quads + 4 * (long long)at[l]);
+  const Quad b = *(const Quad*)(quads + 4 * (long long)at[l + 4]);
+  return PICK(a, b, 0, 1, 2, 3, 4, 5, 6, 7);
+}
+PALPATE V lows(V a, V b) { return PICK(a, b, 0, 8, 1, 9, 4, 12, 5, 13); }
+PALPATE V highs(V a, V b) { return PICK(a, b, 2, 10, 3, 11, 6, 14, 7, 15); }
+PALPATE V fronts(V a, V b) { return PICK(a, b, 0, 1, 8, 9, 4, 5, 12, 13); }
+PALPATE V backs(V a, V b) { return PICK(a, b, 2, 3, 10, 11, 6, 7, 14, 15); }
+PALPATE V3 gather_quads(const float* quads, const int* at) {
+  const V a = two_quads(quads, at, 0), b = two_quads(quads, at, 1);
+  const V c = two_quads(quads, at, 2), d = two_quads(quads, at, 3);
+  const V ab = lows(a, b), cd = lows(c, d);
+  return {fronts(ab, cd), backs(ab, cd), fronts(highs(a, b), highs(c, d))};
+}
+PALPATE void put_quads(float* quads, V3 v) {
+  const V w = {};
+  const V xy = lows(v.x, v.y), zw = lows(v.z, w), xy2 = highs(v.x, v.y), zw2 = highs(v.z, w);
+  const V a = fronts(xy, zw), b = backs(xy, zw), c = fronts(xy2, zw2), d = backs(xy2, zw2);
+  st(quads, 0, PICK(a, b, 0, 1, 2, 3, 8, 9, 10, 11), Lane());
+  st(quads, 1, PICK(c, d, 0, 1, 2, 3, 8, 9, 10, 11), Lane());
+  st(quads, 2, PICK(a, b, 4, 5, 6, 7, 12, 13, 14, 15), Lane());
+  st(quads, 3, PICK(c, d, 4, 5, 6, 7, 12, 13, 14, 15), Lane());
+}
+#undef PICK
+#endif
 
 // Numbers.
 
@@ -124,14 +181,25 @@ PALPATE void put_most(float* p, V v) {
 PALPATE V3 operator+(V3 a, V3 b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
 PALPATE V3 operator-(V3 a, V3 b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
 PALPATE V3 operator*(V s, V3 a) { return {s * a.x, s * a.y, s * a.z}; }
+PALPATE V3 operator/(V3 a, V d) { return {a.x / d, a.y / d, a.z / d}; }
 #if !ON_CUDA
 PALPATE V3 operator*(float s, V3 a) { return {s * a.x, s * a.y, s * a.z}; }
 #endif
 PALPATE V3& operator+=(V3& a, V3 b) { a.x += b.x; a.y += b.y; a.z += b.z; return a; }
 PALPATE V3& operator-=(V3& a, V3 b) { a.x -= b.x; a.y -= b.y; a.z -= b.z; return a; }
 PALPATE V dot(V3 a, V3 b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+// sum + a . b, term after term.
+PALPATE V add_dot(V sum, V3 a, V3 b) { return sum + a.x * b.x + a.y * b.y + a.z * b.z; }
 PALPATE V3 cross(V3 a, V3 b) {
   return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
+}
+PALPATE V3 operator*(const M3& m, V3 a) {
+  return {m.xx * a.x + m.xy * a.y + m.xz * a.z, m.yx * a.x + m.yy * a.y + m.yz * a.z,
+          m.zx * a.x + m.zy * a.y + m.zz * a.z};
+}
+PALPATE V3 operator*(const S3& m, V3 a) {
+  return {m.xx * a.x + m.xy * a.y + m.xz * a.z, m.xy * a.x + m.yy * a.y + m.yz * a.z,
+          m.xz * a.x + m.yz * a.y + m.zz * a.z};
 }
 
 // Matrices; the sum with a number is that with a multiple of the identity.
@@ -150,10 +218,6 @@ PALPATE M3 operator+(M3 a, V d) {
 PALPATE M3 operator*(V s, M3 a) {
   return {s * a.xx, s * a.xy, s * a.xz, s * a.yx, s * a.yy, s * a.yz,
           s * a.zx, s * a.zy, s * a.zz};
-}
-PALPATE V3 operator*(M3 a, V3 b) {
-  return {a.xx * b.x + a.xy * b.y + a.xz * b.z, a.yx * b.x + a.yy * b.y + a.yz * b.z,
-          a.zx * b.x + a.zy * b.y + a.zz * b.z};
 }
 PALPATE S3 operator+(S3 a, S3 b) {
   return {a.xx + b.xx, a.xy + b.xy, a.xz + b.xz, a.yy + b.yy, a.yz + b.yz, a.zz + b.zz};
@@ -177,13 +241,60 @@ PALPATE S3 square(V s, V3 a) {
 // One of the `nthread` threads that work on a world; on the CPU there is one.
 struct Thread { int world, tid, nthread; };
 
+#if ON_CUDA
+// Lane of a thread. That it is below eight is hidden from the compiler, which otherwise takes rows
+// for bits of one number and computes the address of each anew.
+PALPATE Lane lane_of(int tid) {
+  int lane = tid & (LANES - 1);
+  asm("" : "+r"(lane));
+  return lane;
+}
+#endif
+
 // Runs body(s, lane) for each slice: one thread does all on the CPU, eight threads one on CUDA.
 template <class Body>
 PALPATE void each_slice(Thread t, int nslice, Body body) {
 #if ON_CUDA
-  if (t.tid / LANES < nslice) body(t.tid / LANES, t.tid % LANES);
+  if (t.tid >> 3 < nslice) body(t.tid >> 3, lane_of(t.tid));
 #else
   for (int s = 0; s < nslice; ++s) INLINED body(s, Lane());
+#endif
+}
+
+// Runs body(i) for n items, whichever of the threads has them.
+template <class Body>
+PALPATE void each_item(Thread t, int n, Body body) {
+  for (int i = t.tid; i < n; i += t.nthread) body(i);
+}
+
+// The greatest number that threads bring, as an int that is ordered alike: it does not depend on
+// who comes first. `NOTHING_PUT` where nobody has come; on CUDA whole warps call `put_most`.
+constexpr int NOTHING_PUT = -2147483647 - 1;
+
+PALPATE int ordered(int bits) { return bits ^ ((bits >> 31) & 0x7fffffff); }
+#if ON_CUDA
+PALPATE void put_most(int* at, float value) {
+  for (int o = 16; o > 0; o >>= 1) {
+    const float other = __shfl_xor_sync(0xffffffffu, value, o);
+    value = other > value ? other : value;
+  }
+  if ((threadIdx.x & 31) == 0) atomicMax(at, ordered(__float_as_int(value)));
+}
+PALPATE float most(int at) { return __int_as_float(ordered(at)); }
+#else
+PALPATE void put_most(int* at, float value) {
+  const int mine = ordered(__builtin_bit_cast(int, value));
+  if (mine > *at) *at = mine;
+}
+PALPATE float most(int at) { return __builtin_bit_cast(float, ordered(at)); }
+#endif
+
+// Returns the place of one more entry of a list whose length is `count`.
+PALPATE int append(int* count) {
+#if ON_CUDA
+  return atomicAdd(count, 1);
+#else
+  return (*count)++;
 #endif
 }
 

@@ -76,8 +76,9 @@ def _module(header: str, constants: tuple) -> str:
 def _constexpr(constants: Mapping[str, int | float]) -> str:
   """Returns C++ that declares numbers under their Python names."""
   lines = [
-    f"constexpr float {name} = {value!r}f;" if isinstance(value, float) else
-    f"constexpr int {name} = {int(value)};"
+    f"constexpr float {name} = {value!r}f;"
+    if isinstance(value, float)
+    else f"constexpr int {name} = {int(value)};"
     for name, value in constants.items()
   ]
   return "\n".join(["namespace palpate {", *lines, "}"])

@@ -44,23 +44,37 @@ def hinges(mesh: Mesh, rigidity: np.ndarray, poisson: float) -> Hinges:
     rigidity: plate bending rigidity [N m], (nelem,)
     poisson: Poisson's ratio [-]
   """
-  rest, elem, twin = mesh.rest, mesh.elem, mesh.twin
+  elem, twin = mesh.elem, mesh.twin
   half = np.flatnonzero((twin >= 0) & (np.arange(len(twin)) < twin))
   other = twin[half]
   start, end, apex = elem.ravel(), elem[:, [1, 2, 0]].ravel(), elem[:, [2, 0, 1]].ravel()
   vert = np.stack([start[half], end[half], apex[half], apex[other]], axis=1)
-  nhinge = len(half)
   of_half = np.full(len(twin), -1, np.int64)
-  of_half[half] = of_half[other] = np.arange(nhinge)
+  of_half[half] = of_half[other] = np.arange(len(half))
+  rows = _rows(mesh, half, other, vert)
+  present = (twin >= 0).reshape(-1, 3)
+  gain, area = _gain(_angles(mesh), present, poisson), _area(mesh)
+  gain = gain * (area * rigidity)[:, None, None]
+  return Hinges(vert, np.stack([half // 3, other // 3], axis=1), of_half.reshape(-1, 3), gain, rows)
 
-  def foot(h):
-    """Returns (share along the edge, height) of the apex of half-edges h, seen from `start`."""
-    edge, arm = rest[end[h]] - rest[start[h]], rest[apex[h]] - rest[start[h]]
-    share = (arm * edge).sum(-1) / (edge * edge).sum(-1)
-    return share, np.linalg.norm(arm - share[..., None] * edge, axis=-1)
 
-  share_l, height_l = foot(half)
-  share_r, height_r = foot(other)
+def _area(mesh: Mesh) -> np.ndarray:
+  return np.linalg.norm(area_vectors(mesh.rest, mesh.elem), axis=1)
+
+
+def _foot(mesh: Mesh, half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+  """Returns where the apexes of half-edges have their feet, as shares of the edges, and heights."""
+  rest, elem = mesh.rest, mesh.elem
+  start, end, apex = elem.ravel(), elem[:, [1, 2, 0]].ravel(), elem[:, [2, 0, 1]].ravel()
+  edge, arm = rest[end[half]] - rest[start[half]], rest[apex[half]] - rest[start[half]]
+  share = (arm * edge).sum(-1) / (edge * edge).sum(-1)
+  return share, np.linalg.norm(arm - share[..., None] * edge, axis=-1)
+
+
+def _rows(mesh: Mesh, half: np.ndarray, other: np.ndarray, vert: np.ndarray) -> sparse.csr_matrix:
+  """Returns `Hinges.rows` of hinges between half-edges `half` and `other` with vertices `vert`."""
+  share_l, height_l = _foot(mesh, half)
+  share_r, height_r = _foot(mesh, other)
   share_r = 1 - share_r
   weight = np.stack(
     [
@@ -71,31 +85,36 @@ def hinges(mesh: Mesh, rigidity: np.ndarray, poisson: float) -> Hinges:
     ],
     axis=1,
   )
-  index = np.repeat(np.arange(nhinge), 4)
-  rows = sparse.csr_matrix((weight.ravel(), (index, vert.ravel())), shape=(nhinge, mesh.nvert))
+  index = np.repeat(np.arange(len(half)), 4)
+  return sparse.csr_matrix((weight.ravel(), (index, vert.ravel())), shape=(len(half), mesh.nvert))
 
-  # Unfolded patch of each triangle, in its own plane.
-  corner = rest[elem]
+
+def _unfolded(mesh: Mesh) -> np.ndarray:
+  """Returns the corners of each triangle in its own plane, (nelem, 3, 2)."""
+  corner = mesh.rest[mesh.elem]
   x_axis = corner[:, 1] - corner[:, 0]
   x_axis /= np.linalg.norm(x_axis, axis=1, keepdims=True)
-  normal = area_vectors(rest, elem)
+  normal = area_vectors(mesh.rest, mesh.elem)
   area = np.linalg.norm(normal, axis=1)
   y_axis = np.cross(normal / area[:, None], x_axis)
   arm = corner - corner[:, :1]
-  flat = np.stack([(arm * x_axis[:, None]).sum(-1), (arm * y_axis[:, None]).sum(-1)], axis=-1)
+  return np.stack([(arm * x_axis[:, None]).sum(-1), (arm * y_axis[:, None]).sum(-1)], axis=-1)
+
+
+def _angles(mesh: Mesh) -> np.ndarray:
+  """Returns C: the angles of each triangle's hinges by curvature kxx, kyy, kxy, (nelem, 3, 3)."""
+  flat, twin = _unfolded(mesh), mesh.twin
 
   def modes(point):
     x, y = point[..., 0], point[..., 1]
     return np.stack([x * x / 2, y * y / 2, x * y], axis=-1)
 
   angle = np.zeros((mesh.nelem, 3, 3))
-  present = np.zeros((mesh.nelem, 3), bool)
   for c in range(3):
     h = 3 * np.arange(mesh.nelem) + c
-    present[:, c] = twin[h] >= 0
     p0, p1, inner = flat[:, c], flat[:, (c + 1) % 3], flat[:, (c + 2) % 3]
-    share, height = foot(h)
-    share_o, height_o = foot(np.where(twin[h] >= 0, twin[h], h))
+    share, height = _foot(mesh, h)
+    share_o, height_o = _foot(mesh, np.where(twin[h] >= 0, twin[h], h))
     share_o = 1 - share_o
     inward = inner - p0 - share[:, None] * (p1 - p0)
     inward /= np.linalg.norm(inward, axis=1, keepdims=True)
@@ -106,6 +125,11 @@ def hinges(mesh: Mesh, rigidity: np.ndarray, poisson: float) -> Hinges:
       return (modes(apex_point) - at_foot) / height[:, None]
 
     angle[:, c] = -bend(inner, share, height) - bend(outer, share_o, height_o)
+  return angle
+
+
+def _gain(angle: np.ndarray, present: np.ndarray, poisson: float) -> np.ndarray:
+  """Returns (C D^-1 C^T)^-1 for a rigidity of 1, from C and which hinges there are (nelem, 3)."""
   nu = poisson
   compliance = np.linalg.inv(np.array([[1, nu, 0], [nu, 1, 0], [0, 0, 2 * (1 - nu)]]))
   both = present[:, :, None] & present[:, None, :]
@@ -118,9 +142,7 @@ def hinges(mesh: Mesh, rigidity: np.ndarray, poisson: float) -> Hinges:
   inverse = np.where(absent | (largest <= 0), 0, 1 / np.maximum(raised, 1e-300))
   degenerate = ~absent & (value <= 1e-12 * largest) & (largest > 0)
   inverse = np.where(degenerate, 20 / np.maximum(largest, 1e-300), inverse)
-  gain = np.einsum("tik,tk,tjk->tij", vector, inverse, vector)
-  gain = np.where(both, gain, 0) * (area * rigidity)[:, None, None]
-  return Hinges(vert, np.stack([half // 3, other // 3], axis=1), of_half.reshape(-1, 3), gain, rows)
+  return np.where(both, np.einsum("tik,tk,tjk->tij", vector, inverse, vector), 0)
 
 
 def bending_matrix(mesh: Mesh, hinge: Hinges) -> sparse.csr_matrix:

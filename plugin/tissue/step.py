@@ -24,14 +24,14 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from typing import Any
 
 import warp as wp
 
-from . import solver
 from .body import Body
-from .device import BLOCK, group_size, threads
+from .device import BLOCK, block, group_size, threads
 from .kernels import kernel
-from .types import CONSTANTS, Fields, Stage
+from .types import CONSTANTS, Cycle, Fields, Stage
 
 # A right-hand side below this share of the weight's impulse is at rest: residuals count against it.
 REST = 1e-3
@@ -40,16 +40,32 @@ REST = 1e-3
 # than this share of its length on the way: forces far off would be those of another shape.
 AHEAD = 0.1
 
+# Relative residual at which the response to a change of the contact forces is good enough: it is
+# part of the step, whose tolerance holds too where that is looser.
+ENOUGH = 0.03
+
+# Condition numbers: below this one a mesh is solved by a few steps of the smoother, and above that
+# one float32 residuals are noise to the slowest modes, which only cycles would act on.
+EASY, WORST = 8.0, 2e5
+
 _FIRST, _MORE = 1, 2  # flags of `newton_update`
-_CONSTANTS = CONSTANTS | {"AHEAD": AHEAD, "IS_FIRST": _FIRST, "IS_MORE": _MORE}
+_CYCLES_PER_SM = 2  # blocks on one multiprocessor
+_CONSTANTS = CONSTANTS | {
+  "AHEAD": AHEAD,
+  "ENOUGH": ENOUGH,
+  "EASY": EASY,
+  "WORST": WORST,
+  "IS_FIRST": _FIRST,
+  "IS_MORE": _MORE,
+}
 
 
 def _elastic(name: str) -> wp.Kernel:
   return kernel(name, "elastic.h", Fields, CONSTANTS)
 
 
-def _scheme(name: str) -> wp.Kernel:
-  return kernel(name, "schemes.h", Fields, _CONSTANTS)
+def _scheme(name: str, bounds: int | None = None) -> wp.Kernel:
+  return kernel(name, "schemes.h", Fields, _CONSTANTS, bounds)
 
 
 _elem_normal = _elastic("elem_normal")
@@ -60,24 +76,51 @@ _row = _elastic("row")
 _edge_change = _scheme("edge_change")
 _predict = _scheme("predict")
 _newton_update = _scheme("newton_update")
+_centre_step = _scheme("centre", BLOCK)
+_direct_step = _scheme("direct", BLOCK)
+_solve = kernel("solve", "pcg.h", Fields, _CONSTANTS, (BLOCK, 1))
+_sample = kernel("sample", "multigrid.h", Cycle, _CONSTANTS)
+_solve_cycles = kernel("solve_cycles", "multigrid.h", Cycle, _CONSTANTS, (BLOCK, _CYCLES_PER_SM))
 
 
-def _over(kernel: wp.Kernel, body: Body, nslice: int, arg: int = 0, block_dim: int = 256):
-  """Launches a kernel over `nslice` slices of every world."""
+def _over(kernel: wp.Kernel, body: Body, nslice: int, arg: int = 0, fields: Any = None):
+  """Launches a kernel over `nslice` slices of every world; it takes the body's fields or others."""
   size = threads(body.device, nslice)
   wp.launch(
     kernel,
     dim=(body.nworld, size),
-    inputs=[size, arg, body.fields],
+    inputs=[size, arg, body.fields if fields is None else fields],
     device=body.device,
-    block_dim=block_dim,
+  )
+
+
+def _together(kernel: wp.Kernel, body: Body, arg: int, fields=None, per_sm: int = 1):
+  """Launches a kernel in which the threads of a world work together; see native/group.h.
+
+  Args:
+    kernel: the kernel
+    body: the body
+    arg: its number
+    fields: what it takes, the body's where None
+    per_sm: blocks on one multiprocessor that the kernel's bounds allow
+  """
+  nslice = body.shape.nslice
+  size = group_size(body.device, nslice, body.nworld, per_sm)
+  wp.launch(
+    kernel,
+    dim=(body.nworld, size),
+    inputs=[size, arg, body.fields if fields is None else fields],
+    device=body.device,
+    block_dim=block(body.device, nslice),
   )
 
 
 def modules(body: Body) -> list[str]:
   """Returns the Warp modules that a body's step needs."""
-  names = [_row.module.name, _predict.module.name, solver.__name__]
-  return names + [solver.multilevel().__name__] * (body.levels is not None)
+  kernels = [_row, _predict, _solve]
+  if body.levels is not None:
+    kernels.append(_sample)
+  return [kernel.module.name for kernel in kernels]
 
 
 # The linear system.
@@ -97,9 +140,10 @@ def assemble(body: Body, stage: Stage):
     _over(_elem_corner, body, shape.nelemslice)
   _over(_row, body, shape.nslice, stage)
   if body.levels is not None and stage in (Stage.FIRST, Stage.LATER):
-    solver.multilevel().sample(body)
     coarse = body.levels.body
-    _over(_row, coarse, coarse.shape.nslice, Stage.FIRST)
+    nslice = coarse.shape.nslice
+    _over(_sample, body, nslice, fields=body.levels.cycle)
+    _over(_row, coarse, nslice, Stage.FIRST)
 
 
 def _hinge_angles(body: Body, stage: Stage):
@@ -126,7 +170,10 @@ def solve(body: Body, stage: Stage):
     body: the body, with A as `assemble` wrote it
     stage: FIRST, LATER or RESPONSE
   """
-  solver.solve(body, stage)
+  if body.levels is None:
+    _together(_solve, body, stage)
+  else:
+    _together(_solve_cycles, body, stage, body.levels.cycle, _CYCLES_PER_SM)
 
 
 # The schemes.
@@ -142,7 +189,7 @@ def _implicit(body: Body):
     assemble(body, stage)
     solve(body, stage)
     flags = _FIRST * (it == 0) + _MORE * (it + 1 < body.newton)
-    _over(_newton_update, body, nslice, flags, BLOCK)
+    _over(_newton_update, body, nslice, flags)
 
 
 def _at_present(body: Body):
@@ -162,7 +209,7 @@ def _midpoint(body: Body):
 
 def _centre(body: Body, undo: bool = False):
   """Makes `state.step` that of the midpoint step, or puts it back."""
-  solver.centre(group_size(body.device, body.shape.nslice, body.nworld), body, int(undo))
+  _together(_centre_step, body, undo)
 
 
 def _explicit(body: Body):
@@ -176,7 +223,7 @@ def _neumann(body: Body):
 def _direct(body: Body, stage: Stage):
   _at_present(body)
   assemble(body, stage)
-  solver.direct(group_size(body.device, body.shape.nslice, body.nworld), body, stage)
+  _together(_direct_step, body, stage)
   wp.copy(body.state.dvel, body.system.sol)
 
 

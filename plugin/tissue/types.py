@@ -31,6 +31,11 @@ def floats(*dims) -> Array:
   return Array(wp.float32, dims)
 
 
+def doubles(*dims) -> Array:
+  """Returns the type of an array of float64."""
+  return Array(wp.float64, dims)
+
+
 def ints(*dims) -> Array:
   """Returns the type of an array of int32."""
   return Array(wp.int32, dims)

@@ -46,6 +46,18 @@ def test_every_command_has_help(capsys):
     assert f"usage: palpate {' '.join(words)}" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("words", [["--help"], ["run", "press", "--help"], ["exercise", "--list"]])
+def test_a_reader_that_has_enough_is_no_error(words):
+  reader, writer = os.pipe()
+  os.close(reader)
+  with os.fdopen(writer, "w") as closed:
+    done = subprocess.run(
+      [sys.executable, "-m", "palpate", *words], env=os.environ | {"PYTHONUNBUFFERED": ""},
+      stdout=closed, stderr=subprocess.PIPE, text=True, timeout=60,
+    )  # fmt: skip
+  assert (done.returncode, done.stderr) == (141, "")
+
+
 def test_without_a_command_it_says_what_is_missing():
   done = palpate()
   assert done.returncode == 2
@@ -84,7 +96,7 @@ def test_loading_and_running_a_scene_says_nothing_and_leaves_no_log(tmp_path):
     ("--organ spleen", "no organ 'spleen' in the model, it has 'organ'"),
     ("--actuator motor", "no actuator 'motor' in the scene, it has 'probe'"),
     ("--video press.avi", "video is 'press.avi', expected a name that ends in .mp4 or .gif"),
-    ("--picture nowhere/a.png", "picture is 'nowhere/a.png', whose folder does not exist"),
+    ("--picture a.jpg", "picture is 'a.jpg', expected a name that ends in .png"),
     ("--scene SCENE --nodes 500", "nodes and seed make the shipped organ anew"),
   ],
 )

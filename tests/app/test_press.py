@@ -21,7 +21,8 @@ SHORT = ["--depth", "0.004", "--speed", "0.2", "--hold", "0.1"]
 ROWS = {
   "device", "nodes", "elements", "h", "step time, median", "step time, 99th percentile",
   "real-time factor", "contact force, peak", "contact force, static", "indentation",
-  "contacts, most", "PCG iterations, mean", "PCG iterations, most", "PCG residual, most, pressing",
+  "contacts, most", "PCG iterations a step, mean", "PCG iterations a step, most",
+  "steps that hit a solve's limit, 200",
 }  # fmt: skip
 draws = pytest.mark.skipif(
   os.environ.get("MUJOCO_GL", "") not in ("egl", "osmesa"), reason="MUJOCO_GL is not egl or osmesa"
@@ -52,7 +53,7 @@ def test_the_table_says_what_the_csv_holds(tmp_path, capsys):
   assert shown["indentation"] == f"{1e3 * data['depth_m'].max():.2f} mm"
   assert shown["step time, median"] == f"{1e3 * np.median(data['step_s']):.3f} ms"
   assert float(shown["contacts, most"]) == data["contacts"].max() > 0
-  assert float(shown["PCG iterations, most"]) == data["iterations"].max() > 0
+  assert float(shown["PCG iterations a step, most"]) == data["iterations"].max() > 0
 
 
 def test_the_probe_goes_to_the_depth_and_back(tmp_path):
@@ -130,6 +131,40 @@ def test_a_probe_that_meets_nothing_ends_with_1(tmp_path, capsys):
   assert code == 1
   assert "the probe met no organ within its range" in capsys.readouterr().err
   assert set(data["phase"]) == {"approach"}
+
+
+def test_a_probe_that_goes_through_ends_with_1_and_tells_no_force(tmp_path, capsys):
+  code, data = run(tmp_path, "--depth", "0.04", "--h", "0.002")
+  said = capsys.readouterr()
+  assert code == 1
+  at = float(re.search(r"went through the surface at t = ([\d.]+) s", said.err)[1])
+  assert table(said.out)["contact force, static"] == "-"
+  assert data["pierced"].sum() == 1 and data["pierced"][-1] == 1
+  assert data["time_s"][-1] == pytest.approx(at, abs=1e-3)
+  assert 0.015 < data["depth_m"][-1] < 0.04
+
+
+@pytest.mark.parametrize("geom", ["sphere", "capsule", "cylinder", "box", "ellipsoid"])
+def test_the_front_of_a_probe_is_a_radius_behind_its_end(geom):
+  end = {"sphere": 0.004, "ellipsoid": 0.006, "cylinder": 0.01, "box": 0.01, "capsule": 0.014}[geom]
+  size = "0.004 0.005 0.006" if geom == "ellipsoid" else "0.004 0.01 0.01"
+  model = mujoco.MjModel.from_xml_string(
+    f"""<mujoco><worldbody><body euler="0 90 0" pos="1 2 3">
+    <joint name="probe" type="slide" axis="0 0 1"/><geom type="{geom}" size="{size}" mass="1"/>
+    </body></worldbody>
+    <actuator><position name="probe" joint="probe" kp="9" ctrlrange="0 1"/></actuator></mujoco>"""
+  )
+  data = mujoco.MjData(model)
+  mujoco.mj_forward(model, data)
+  front = probe.front(model, data, probe.find(model, "probe"))
+  np.testing.assert_allclose(front, [1 + end - 0.004, 2, 3], atol=1e-9)
+
+
+def test_the_table_counts_the_steps_that_hit_the_limit(tmp_path, capsys):
+  run(tmp_path, "--set=iterations=2", "--set=tolerance=1e-6")
+  shown = table(capsys.readouterr().out)
+  assert int(shown["steps that hit a solve's limit, 2"]) > 100
+  assert float(shown["largest residual of those"]) > 1e-6
 
 
 def test_an_error_of_the_organ_ends_with_1_and_keeps_the_data(tmp_path, capsys, monkeypatch):

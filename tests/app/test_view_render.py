@@ -57,6 +57,39 @@ def test_cameras_differ():
   assert np.abs(free - side).mean() > 1
 
 
+@pytest.mark.parametrize("name", models.NAMES)
+def test_every_camera_shows_the_organ_in_light(name):
+  model = mujoco.MjModel.from_xml_path(str(models.path(name)))
+  data = mujoco.MjData(model)
+  mujoco.mj_resetDataKeyframe(model, data, 0)
+  mujoco.mj_forward(model, data)
+  with mujoco.Renderer(model, 120, 160) as renderer:
+    for camera in (-1, *range(model.ncam)):
+      renderer.update_scene(data, camera)
+      image = renderer.render().astype(float)
+      renderer.enable_segmentation_rendering()
+      renderer.update_scene(data, camera)
+      organ = renderer.render()[..., 1] == mujoco.mjtObj.mjOBJ_FLEX
+      renderer.disable_segmentation_rendering()
+      assert organ.mean() > 0.03 and image[organ].mean() > 40, camera
+
+
+def test_every_way_to_name_a_scene(tmp_path):
+  folder = models.path("gallbladder").parent
+  shown = [_render(str(models.path("gallbladder"))), _render(str(folder)), _render("press")]
+  np.testing.assert_array_equal(shown[0], shown[1])
+  assert np.ptp(shown[2]) > 100 and np.abs(shown[2] - shown[0]).mean() > 5
+
+
+def test_help_lists_the_scenes(capsys):
+  for command in ("view", "render"):
+    with pytest.raises(SystemExit):
+      cli.main([command, "--help"])
+    said = " ".join(capsys.readouterr().out.split())
+    assert f"{', '.join(models.NAMES)} or press; an MJCF file; a folder" in said
+    assert "250 or 1000" in said and "probe,grasper" in said
+
+
 def test_path_of_a_scene():
   assert np.ptp(_render(str(models.path("gallbladder")))) > 100
 
@@ -75,7 +108,7 @@ def test_film(suffix, capsys):
 @pytest.mark.parametrize(
   ("words", "message"),
   [
-    (["spleen"], "expected an MJCF file or one of liver,"),
+    (["spleen"], "scene is 'spleen', expected one of liver, liver_inclusion,"),
     (["liver", "--nodes", "7"], "nodes is 7, expected one of 250, 1000"),
     (["liver", "--instruments", "saw"], "'saw', expected one of probe"),
     (["liver", "--size", "big"], "size is 'big', expected WxH"),
@@ -97,8 +130,11 @@ def test_bad_files(tmp_path, capsys):
   assert "expected a name that ends in .png" in capsys.readouterr().err
   (tmp_path / "broken.xml").write_text("<mujoco><worldbody>")
   assert cli.main(["render", "broken.xml", "-o", "out.png"]) == 2
+  assert "scene broken.xml: XML parse error" in capsys.readouterr().err
+  assert cli.main(["render", "press", "-o", "broken.xml/out.png"]) == 1
+  assert "out: cannot write 'broken.xml'" in capsys.readouterr().err
   assert cli.main(["render", "broken.xml", "-o", "out.png", "--nodes", "250"]) == 2
-  assert "goes with a named model" in capsys.readouterr().err
+  assert "goes with a named organ" in capsys.readouterr().err
 
 
 def test_view_needs_a_display(capsys):
@@ -115,6 +151,7 @@ def test_view_gives_the_viewer_handles(monkeypatch):
   monkeypatch.setattr(viewer, "launch", lambda loader: seen.extend([loader(), loader()]))
   assert cli.main(["view", "kidney", "--nodes", "250", "--keyframe", "touch"]) == 0
   model, data, name = seen[0]
+  assert model.camera(model.vis.global_.cameraid).name == "laparoscope"
   assert model.nmocap == 2 and name == "kidney"
   assert seen[1][0] is not model  # the viewer's button to load anew
   np.testing.assert_allclose(data.site("probe/tip").xpos, data.mocap_pos[0], atol=1e-6)

@@ -15,8 +15,9 @@ import time
 
 import gymnasium
 import numpy as np
-import palpate  # registers the environments
+import palpate.tasks  # registers the environments
 import torch
+from benchmarks import plots, results
 from benchmarks.runner import Bench, Case, Row
 from gymnasium.wrappers import FilterObservation, FlattenObservation
 from stable_baselines3 import SAC
@@ -149,7 +150,27 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
   figure.axes[0].legend(loc="lower right", frameon=False)
   path = out / "learning.png"
   figure.savefig(path, dpi=100)
-  return [path]
+  return [path, write(rows, about, out)]
+
+
+def write(rows: list[Row], about: dict, out: pathlib.Path) -> pathlib.Path:
+  """Writes the page and returns its path."""
+  table = [
+    [r["policy"], f"{r['simulated_s']:.0f}", f"{r['training_s']:.0f}", r["episodes"],
+     f"{r['return_mean']:.2f} ± {r['return_sd']:.2f}", f"{r['success_percent']:.0f} %",
+     f"{r['damage_percent']:.0f} %"]
+    for r in rows
+  ]  # fmt: skip
+  head = ["policy", "simulated [s]", "training [s]", "episodes", "return", "success", "damage"]
+  lines = [
+    "Soft Actor-Critic of Stable-Baselines3 with the dense reward, evaluated on targets that it "
+    "has not seen, beside random actions. " + results.link(out / "learning.csv"),
+    "",
+    *plots.table(head, table),
+    "",
+    "![return and success of SAC on touch/easy over 20 minutes of practice](learning.png)",
+  ]
+  return results.page(out / "learning.md", "Learning `touch/easy`", about, lines)
 
 
 BENCH = Bench("learning", stages, run, report=report, arguments=arguments)

@@ -25,10 +25,11 @@ import scenes
 import warp as wp
 from benchmarks import results
 from benchmarks.runner import Bench, Case, Row
-from palpate.engine import window, workspace
+from palpate.engine import windowed, workspace
+from palpate.engine.layout import HEAD, MODE
 from palpate.models import grid
-from palpate.tissue import elastic, solver
-from palpate.tissue.elastic import Stage
+from palpate.tissue import step as stepping
+from palpate.tissue.types import Stage
 
 RADIUS, H = 0.05, 1e-3
 
@@ -85,9 +86,9 @@ def measure(
   spent = {"cpu": 0.0, "device": 0.0}
   timed(w, spent)
   rows, iterations, contacts = [], [], []
-  for step in range(steps):
-    d.ctrl[0] = -0.0015 * min(1.0, step / (0.3 * steps))
-    d.ctrl[1] = 0.002 * max(0.0, step / steps - 0.4)
+  for k in range(steps):
+    d.ctrl[0] = -0.0015 * min(1.0, k / (0.3 * steps))
+    d.ctrl[1] = 0.002 * max(0.0, k / steps - 0.4)
     spent["cpu"] = spent["device"] = 0.0
     before = time.perf_counter()
     mujoco.mj_step(m, d)
@@ -143,8 +144,8 @@ def timed(w, spent: dict):
       return original(graph, *args)
     before = time.perf_counter()
     original(graph, *args)
-    if w.surface.device.is_cuda:
-      wp.synchronize_device(w.surface.device)
+    if w.body.device.is_cuda:
+      wp.synchronize_device(w.body.device)
     spent["device"] += time.perf_counter() - before
 
   wp.capture_launch = capture_launch
@@ -154,26 +155,26 @@ def timed(w, spent: dict):
 
 def parts(w) -> dict:
   """Returns what each part of a step's work on the organ's device takes, medians in ms."""
-  s, d = w.surface, w.state
+  body = w.body
   workspace.sync(w)
   state = w.views["plugin_state"].numpy()
   kept = state.copy()
   solving = replay(
-    s.device,
-    assemble=lambda: assemble(s, d),
-    solve=lambda: solver.solve(s, d, Stage.FIRST),
-    step=lambda: solver.step(s, d),
+    body.device,
+    assemble=lambda: stepping.assemble(body, Stage.FIRST),
+    solve=lambda: stepping.solve(body, Stage.FIRST),
+    step=lambda: stepping.step(body),
   )
-  launches = window.launches(w, w.model, 0)
-  side = wp.get_device(launches.side)
+  phases = windowed.Phases(w, w.model, 0)
+  side = wp.get_device(phases.side)
   boxes = [(wp.clone(w.views[name], device=side), w.views[name]) for name in ("inbox", "outbox")]
-  w.views["inbox"].numpy()[3] = 1.0  # there is a step to end
+  w.boxes["inbox"].head.numpy()[HEAD.mode] = MODE.commit  # there is a step to end
   around = replay(
     side,
     transfer=lambda: (wp.copy(*boxes[0]), wp.copy(*reversed(boxes[1]))),
-    enter=launches.enter,
-    search=launches.look,
-    end=launches.end or (lambda: None),
+    enter=phases.enter,
+    search=phases.look,
+    end=phases.end,
   )
   state[:] = kept
   workspace.bind(w, w.model)
@@ -185,13 +186,6 @@ def parts(w) -> dict:
     "solve_ms": solving["solve"],
     "integrate_ms": around["enter"] + around["end"] + max(0.0, rest_of_step),
   }
-
-
-def assemble(s, d):
-  """Writes the matrices of a step."""
-  elastic.assemble(s, d, Stage.FIRST)
-  if s.levels is not None:
-    solver.multilevel().assemble(s, d)
 
 
 def replay(device, **works) -> dict[str, float]:

@@ -6,7 +6,7 @@ import argparse
 import pathlib
 from collections.abc import Iterator
 
-from palpate.tasks import episode, experts, suite
+from palpate.tasks import episode, performer, suite
 from palpate.tasks.recording import Recording
 
 _environments = {}  # the last one of this process
@@ -35,7 +35,7 @@ def _perform(name: str, style: str, seed: int, folder: pathlib.Path) -> Recordin
   env = _environments[name]
   info = {"task_kwargs": {}, "performer": style}
   try:
-    recording = episode.run(env, experts.make(env, style, seed), seed, info)
+    recording = episode.run(env, performer.make(env, style, seed), seed, info)
   except episode.EpisodeError as error:
     recording = error.recording
   path.parent.mkdir(parents=True, exist_ok=True)

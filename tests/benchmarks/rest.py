@@ -15,6 +15,7 @@ import time
 import mujoco
 import numpy as np
 import palpate
+from benchmarks import plots, results
 from benchmarks.runner import Bench, Case, Row
 from palpate import models
 from palpate.engine import mjstruct
@@ -94,4 +95,25 @@ def arguments(parser: argparse.ArgumentParser):
   parser.add_argument("--nodes", type=int, nargs="+", default=[1000, 4000])
 
 
-BENCH = Bench("rest", stages, run, arguments=arguments, file="rest_cpu")
+def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
+  """Writes the page."""
+  table = []
+  for row in rows:
+    place = f"withdrawn {-100 * row['insertion_m']:g} cm" if row["insertion_m"] else "home pose"
+    cells = [f"{row['bare_us']:.1f}"]
+    for name in ("awake", "asleep", "mujoco", "napping"):
+      cells.append(f"{row[f'{name}_us']:.0f} ({row[f'{name}_ratio']:.3g})")
+    table.append([f"{row['nodes']} ({row['nv']})", place, *cells])
+  head = ["nodes (dofs)", "probe", "without the organ", "kept awake", "asleep", "of it MuJoCo"]
+  lines = [
+    "The liver with a probe, window coupling. Medians of CPU time of a step in us, and in brackets "
+    'times the scene without the organ. "of it MuJoCo": the same model with the plugin left out. '
+    "\"with the flag\": `<flag sleep='enable'/>`, MuJoCo's own sleep. "
+    + results.link(out / "rest_cpu.csv"),
+    "",
+    *plots.table([*head, "asleep, with the flag"], table),
+  ]
+  return [results.page(out / "rest.md", "What a sleeping organ costs", about, lines)]
+
+
+BENCH = Bench("rest", stages, run, report=report, arguments=arguments, file="rest_cpu")

@@ -144,9 +144,9 @@ def machine() -> dict:
 
 
 def notes(path: pathlib.Path) -> dict:
-  """Returns the notes beside a results file, or those of this machine."""
+  """Returns the notes beside a results file."""
   path = path.with_suffix(".json")
-  return json.loads(path.read_text(encoding="utf-8")) if path.exists() else machine()
+  return json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
 
 
 def note(path: pathlib.Path, about: dict):
@@ -155,20 +155,38 @@ def note(path: pathlib.Path, about: dict):
 
 
 def caption(about: dict) -> str:
-  """Returns the line of a page that says what it was measured with."""
-  gpu = f", {about['cuda'][0]}" if about.get("cuda") else ""
-  return (
-    f"palpate {about['palpate']}, mujoco {about['mujoco']}, warp {about['warp']}, Python "
-    f"{about['python']}, {about['cpu']}{gpu}, {about['cores']} cores, {about.get('jobs', 1) or 1} "
-    f"processes, one thread each; seed {about.get('seed', '-')}; "
-    f"{about.get('done', '?')} of {about.get('cases', '?')} cases."
-  )
+  """Returns the line of a page that says what it was measured with, as far as that is known."""
+  words = [f"{name} {about[name]}" for name in ("palpate", "mujoco", "warp") if name in about]
+  words += [f"Python {about['python']}"] if "python" in about else []
+  words += [about[name] for name in ("cpu",) if name in about] + about.get("cuda", [])[:1]
+  words += [f"{about['cores']} cores"] if "cores" in about else []
+  words += [f"{about['jobs'] or 1} processes, one thread each"] if "jobs" in about else []
+  line = ", ".join(words)
+  if "cases" in about:
+    line += f"; seed {about['seed']}; {about['done']} of {about['cases']} cases"
+  return f"{line}." if line else ""
 
 
 def page(path: pathlib.Path, title: str, about: dict, lines: list[str]) -> pathlib.Path:
-  """Writes a page: a title, what it was measured with and how, and the lines; returns its path."""
-  command = f"    python tests/benchmarks/run.py {path.stem}"
+  """Writes a page: a title, what it was measured with and how, and the lines; returns its path.
+
+  What a page that is there has from `## Remarks` on was written by hand and stays.
+  """
+  command = f"    python tests/benchmarks/run.py {about.get('bench', path.stem)}"
   command += " --short" if about.get("short") else ""
-  text = "\n".join([f"# {title}", "", caption(about), "", command, "", *lines])
-  path.write_text(text.rstrip("\n") + "\n", encoding="utf-8")
+  options = {k: v for k, v in about.get("options", {}).items() if k in ("device",) and v != "cpu"}
+  command += "".join(f" --{key} {value}" for key, value in options.items())
+  known = [word for line in (caption(about), command) if line for word in (line, "")]
+  text = "\n".join([f"# {title}", "", *known, *lines]).rstrip("\n") + "\n"
+  before = path.read_text(encoding="utf-8") if path.exists() else ""
+  _, mark, remarks = before.partition(REMARKS)
+  path.write_text(text + mark + remarks, encoding="utf-8")
   return path
+
+
+REMARKS = "\n## Remarks\n"
+
+
+def link(path: pathlib.Path) -> str:
+  """Returns a line that names the file that a page is from."""
+  return f"From [{path.name}]({path.name})."

@@ -202,7 +202,7 @@ def report(bench: Bench, args: argparse.Namespace) -> list[pathlib.Path]:
   path = bench.path(args)
   rows = results.read(path)
   written = bench.report(rows, results.notes(path), path.parent)
-  return [path, path.with_suffix(".json"), *written]
+  return [path, *written]
 
 
 def clock() -> float:

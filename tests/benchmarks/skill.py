@@ -14,8 +14,8 @@ import numpy as np
 from benchmarks import results
 from benchmarks.performances import arguments, performances
 from benchmarks.runner import Bench, Case, Row
-from palpate.tasks import experts
-from palpate.tasks.score import METRICS
+from palpate.tasks import performer
+from palpate.tasks.metrics import METRICS
 
 SKILL_TASKS = ("touch/standard", "probe/easy", "grasp/easy", "trace/easy", "retract/easy")
 # What each novice does differently, and the metrics that must show it.
@@ -52,7 +52,7 @@ def stages(args: argparse.Namespace) -> list[list[Case]]:
     [
       {"case": f"{task}, {style}", "task": task, "style": style} | keys
       for task in (SKILL_TASKS[:1] if args.short else SKILL_TASKS)
-      for style in experts.STYLES
+      for style in performer.STYLES
     ]
   ]
 
@@ -89,7 +89,7 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
 
 def _task(name: str, rows: list[Row], told: dict) -> list[str]:
   """Returns the table of a task and adds what its metrics tell apart to `told`."""
-  by_style = {style: [r for r in rows if r["style"] == style] for style in experts.STYLES}
+  by_style = {style: [r for r in rows if r["style"] == style] for style in performer.STYLES}
   won = {k: sum(r["outcome"] == "success" for r in mine) for k, mine in by_style.items()}
   wins = ", ".join(f"{k} {won[k]}/{len(mine)}" for k, mine in by_style.items())
   lines = ["", f"## {name}", "", f"Success: {wins}"]

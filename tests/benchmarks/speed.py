@@ -8,9 +8,10 @@ import time
 
 import mujoco
 import palpate
+from benchmarks import plots, results
 from benchmarks.runner import Bench, Case, Row
 from palpate import tasks
-from palpate.tasks import experts, suite
+from palpate.tasks import performer, suite
 from palpate.tasks.recorder import Recorder
 
 NAMES = ["/".join(pair) for pair in tasks.ALL_TASKS]
@@ -33,7 +34,7 @@ def run(case: Case, out: pathlib.Path) -> list[Row]:
   """Returns the row of an exercise."""
   name, clock = case["task"], time.process_time
   env = tasks.load(*suite.split(name), {"random": 0})
-  act = experts.make(env)
+  act = performer.make(env)
   stepping, recording, steps = 0.0, 0.0, 0
   while stepping < case["seconds"]:  # whole episodes, as the metrics at the end belong to them
     timestep = env.reset()
@@ -64,4 +65,19 @@ def run(case: Case, out: pathlib.Path) -> list[Row]:
   return [row]
 
 
-BENCH = Bench("speed", stages, run, arguments=arguments, file="exercises_cpu")
+def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
+  """Writes the page."""
+  table = [
+    [r["task"], r["nodes"], f"{r['steps_per_s']:.0f}", f"{r['metrics_percent']:.1f} %"]
+    for r in rows
+  ]
+  lines = [
+    "A control step is 0.02 s of simulated time, with the expert at work; CPU time. The last "
+    "column is what recording and metrics take. " + results.link(out / "exercises_cpu.csv"),
+    "",
+    *plots.table(["exercise", "nodes", "control steps a second", "of it metrics"], table),
+  ]
+  return [results.page(out / "exercises.md", "How fast the exercises run", about, lines)]
+
+
+BENCH = Bench("speed", stages, run, report=report, arguments=arguments, file="exercises_cpu")

@@ -65,6 +65,17 @@ def test_results_of_another_form_are_not_resumed(tmp_path):
   assert (tmp_path / "small.csv").read_text() == "number,square\n1,1\n"
 
 
+def test_a_page_written_again_keeps_the_remarks(tmp_path):
+  path, about = tmp_path / "small.md", {"palpate": "1", "bench": "small", "short": True}
+  results.page(path, "Small", about, ["table"])
+  assert path.read_text() == (
+    "# Small\n\npalpate 1.\n\n    python tests/benchmarks/run.py small --short\n\ntable\n"
+  )
+  path.write_text(path.read_text() + "\n## Remarks\n\n- by hand\n")
+  results.page(path, "Small", about, ["another table"])
+  assert path.read_text().endswith("another table\n\n## Remarks\n\n- by hand\n")
+
+
 def test_starting_over_keeps_the_old_rows_aside(tmp_path):
   bench = dataclasses.replace(error.BENCH, stages=lambda args: [])
   (tmp_path / "error.csv").write_text("case,status\nold,ok\n")

@@ -9,6 +9,7 @@ import palpate.models
 import pytest
 import warp as wp
 from palpate.engine import plugin as engine
+from palpate.engine.layout import TAIL
 from scenes import drive, load, probed, slot_bodies, slots, workspace
 
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
@@ -149,7 +150,7 @@ def test_forward_between_steps_changes_nothing(device):
 def test_search_with_little_room_keeps_the_nearest(monkeypatch):
   m, d, _ = make("cuda:0", resident=True)
   expected = drive(m, d, 120)
-  monkeypatch.setattr("palpate.engine.window._ROOM", 1)
+  monkeypatch.setattr("palpate.engine.windowed.ROOM", 1)
   m, d, _ = make("cuda:0", resident=True)
   np.testing.assert_allclose(drive(m, d, 120), expected, atol=5e-3 * np.abs(expected).max())
 
@@ -198,7 +199,7 @@ def test_sleep_changes_nothing_measurable(monkeypatch):
 
   slept, force, at_rest = run()
   assert slept > 500
-  monkeypatch.setattr("palpate.engine.window._SLOW", 0.0)
+  monkeypatch.setattr("palpate.engine.slots.SLOW", 0.0)
   never, expected, awake = run()
   assert never == 0
   assert np.abs(at_rest - awake).max() < 1e-7
@@ -296,7 +297,7 @@ def test_still_tool_nearby_lets_it_sleep_and_wakes_it_before_it_touches(
   monkeypatch, resident, swing, steps
 ):
   def press(slow):
-    monkeypatch.setattr("palpate.engine.window._SLOW", slow)
+    monkeypatch.setattr("palpate.engine.slots.SLOW", slow)
     m, d, organ = hovering(resident, swing)
     mujoco.mj_step(m, d, nstep=250)
     slept = organ.asleep
@@ -333,7 +334,7 @@ def test_tool_may_go_half_of_its_distance_from_the_surface(swing, height):
   d.qpos[-2] = d.ctrl[0] = height
   mujoco.mj_step(m, d, nstep=250)
   assert organ.asleep
-  leeway = workspace(organ).views["plugin_state"].numpy()[-1]
+  leeway = workspace(organ).boxes["own"].tail.numpy()[TAIL.leeway]
   n = 60
   a, b = np.array([(i / n, j / n) for i in range(n + 1) for j in range(n + 1 - i)]).T[:, :, None]
   x, y, z = organ.xpos[organ.elem].transpose(1, 0, 2)[:, :, None]

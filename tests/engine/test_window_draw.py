@@ -98,7 +98,7 @@ def test_a_snapshot_brings_the_shape_back():
       first = m.flex_vertadr[flex]
       return d.flexvert_xpos[first : first + organ.nvert].copy()
 
-  np.testing.assert_allclose(figures._frame(m, d, kept, Renderer()), shape, atol=1e-7)
+  np.testing.assert_allclose(figures.frame(m, d, kept, Renderer()), shape, atol=1e-7)
 
 
 @pytest.fixture
@@ -115,7 +115,7 @@ def test_picture_of_a_press_with_a_window(tmp_path):
   images = []
   for coupling in ("nodal", "window"):
     words = ["run", "press", "--coupling", coupling, "--hold", "0.01", "--depth", ".008"]
-    words += ["--speed", ".3", "--out", str(tmp_path / coupling), "--h", "0.002", "--picture"]
+    words += ["--speed", ".1", "--out", str(tmp_path / coupling), "--h", "0.002", "--picture"]
     assert cli.main(words) == 0
     images.append(imageio.imread(tmp_path / coupling / "press_deepest.png").astype(int))
   assert np.abs(images[0] - images[1]).mean() < 0.3

@@ -1,5 +1,6 @@
 """The exercises in Gymnasium."""
 
+import ctypes.util
 import subprocess
 import sys
 import warnings
@@ -15,17 +16,46 @@ from palpate.tasks import registry  # noqa: E402
 IDS = [registry.gym_id(domain, task) for domain, tasks in registry.TASKS.items() for task in tasks]
 
 
-def test_import_palpate_registers_and_stays_light():
-  code = (
-    "import sys, palpate, gymnasium;"
-    "assert 'palpate/Touch-v0' in gymnasium.registry;"
-    "assert 'dm_control' not in sys.modules and 'palpate.tasks.base' not in sys.modules"
+LIGHT = "assert not {'dm_control', 'palpate.tasks.base'} & set(sys.modules)"
+
+
+def run(*lines):
+  subprocess.run([sys.executable, "-c", "\n".join(lines)], check=True, timeout=120)
+
+
+def test_importing_the_tasks_registers_them_and_stays_light():
+  registered = "assert 'palpate/Touch-v0' in gymnasium.registry"
+  run("import sys, palpate.tasks, gymnasium", registered, LIGHT)
+  run("import sys, gymnasium, palpate.tasks", registered, LIGHT)
+
+
+def test_gymnasium_finds_them_without_an_import():
+  run(
+    "import gymnasium",
+    "env = gymnasium.make('palpate.tasks:palpate/TouchEasy-v0')",
+    "assert env.spec.id == 'palpate/TouchEasy-v0'",
+    "assert env.reset(seed=0)[0]['target'].shape == (3,)",
   )
-  subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
+
+
+def test_the_package_knows_neither_its_tasks_nor_its_commands():
+  run(
+    "import sys, palpate",
+    "assert not [m for m in sys.modules if m.startswith(('palpate.tasks', 'palpate.app'))]",
+  )
+
+
+def test_without_gymnasium_the_tasks_are_there():
+  run(
+    "import sys",
+    "sys.modules['gymnasium'] = None",
+    "from palpate import tasks",
+    "assert tasks.load('touch', 'easy').reset().first()",
+  )
 
 
 def test_ids():
-  assert len(set(IDS)) == 19
+  assert len(set(IDS)) == len(IDS)
   assert {"palpate/Touch-v0", "palpate/TouchEasy-v0", "palpate/ProbePalpateHard-v0"} < set(IDS)
 
 
@@ -54,6 +84,21 @@ def test_rendering():
   with pytest.raises(ValueError, match="render_mode is 'ascii'"):
     env.unwrapped.__class__(render_mode="ascii")
   env.close()
+
+
+@pytest.mark.skipif(
+  not (ctypes.util.find_library("EGL") or ctypes.util.find_library("OSMesa")),
+  reason="no way to draw without a screen",
+)
+def test_rendering_without_a_screen_and_without_being_told_how(monkeypatch):
+  for name in ("MUJOCO_GL", "PYOPENGL_PLATFORM", "DISPLAY", "WAYLAND_DISPLAY"):
+    monkeypatch.delenv(name, raising=False)
+  run(
+    "import gymnasium, palpate.tasks",
+    "env = gymnasium.make('palpate/TouchEasy-v0', render_mode='rgb_array', width=64, height=48)",
+    "env.reset(seed=0)",
+    "assert env.render().std() > 10",
+  )
 
 
 def test_human_says_that_there_is_no_display(monkeypatch):

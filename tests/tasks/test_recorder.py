@@ -1,4 +1,4 @@
-"""The recorder, its file and the metrics computed from either."""
+"""The recorder and its file."""
 
 import dataclasses
 import io
@@ -9,51 +9,11 @@ import zipfile
 
 import numpy as np
 import pytest
-from palpate.tasks import metrics as functions
 from palpate.tasks import recorder as recorder_module
-from palpate.tasks.metrics import Unknown
+from palpate.tasks.metrics import METRICS
 from palpate.tasks.recorder import Event, Recorder, Recording, Settings
-from palpate.tasks.score import METRICS
-
-SETTINGS = Settings(force_limit=1.5, reference_length=0.1, idle_speed=0.06)
-
-
-def _exercise(steps=300, instruments=("left", "right"), seed=0):
-  """Everything that can be recorded, with two instruments that move and touch."""
-  rng = np.random.RandomState(seed)
-  recorder = Recorder(instruments, SETTINGS, watch=["drop"], info={"task": "touch", "seed": seed})
-  recorder.attach("curve", [[0, 0, 0], [0.05, 0, 0], [0.1, 0.02, 0]])
-  recorder.attach("initial_state", rng.rand(7))
-  pos = np.cumsum(rng.randn(steps, len(instruments), 3) * 1e-3, 0)
-  for k in range(steps):
-    half = 0.3 * np.sin(k / 40)
-    quat = np.array([np.cos(half), 0, np.sin(half), 0])
-    force = np.maximum(0, rng.randn(len(instruments), 3))
-    recorder.append(
-      k * 0.02,
-      pos[k],
-      quat=[quat] * len(instruments),
-      force=force,
-      area=np.full(len(instruments), 2e-5),
-      grip=np.full(len(instruments), k % 100 < 60),
-      held=np.full(len(instruments), 10 < k % 100 < 40),
-      visible=rng.rand(len(instruments)) > 0.1,
-      arrays={"qpos": rng.rand(9), "action": rng.rand(5).astype(np.float32), "step": k},
-    )
-  recorder.event("target", 1.0, 0.002, label="first")
-  recorder.event("target", 2.0, 0.004, instrument=len(instruments) - 1)
-  recorder.event("drop", 2.5)
-  return recorder
-
-
-def _plain(pos, **columns):
-  recorder = Recorder(settings=SETTINGS)
-  for k, point in enumerate(pos):
-    recorder.append(k * 0.02, point, **{n: v[k] for n, v in columns.items()})
-  return recorder
-
-
-LINE = np.stack([np.linspace(0, 0.12, 61), np.zeros(61), np.zeros(61)], 1)
+from palpate.tasks.score import read_reference
+from recordings import SETTINGS, exercise
 
 
 def _same_bits(a, b):
@@ -65,7 +25,7 @@ def _same_bits(a, b):
 
 
 def test_round_trip_is_exact(tmp_path):
-  made = _exercise()
+  made = exercise()
   path = made.save(tmp_path / "exercise.npz")
   before, after = made.recording(), Recording.load(path)
   _same_bits(after.time, before.time)
@@ -86,7 +46,7 @@ def test_round_trip_is_exact(tmp_path):
 
 
 def test_the_file_needs_no_pickle(tmp_path):
-  path = _exercise(5).save(tmp_path / "exercise.npz")
+  path = exercise(5).save(tmp_path / "exercise.npz")
   with np.load(path, allow_pickle=False) as archive:
     meta = json.loads(str(archive["meta"][()]))
     assert all(archive[name].dtype.kind in "fiubU" for name in archive.files)
@@ -107,7 +67,7 @@ def test_empty_and_single_sample(tmp_path):
 
 def test_saving_replaces_whole_files_only(tmp_path, monkeypatch):
   path = tmp_path / "exercise.npz"
-  made = _exercise(20)
+  made = exercise(20)
   made.save(path)
   old = path.read_bytes()
 
@@ -117,11 +77,11 @@ def test_saving_replaces_whole_files_only(tmp_path, monkeypatch):
 
   monkeypatch.setattr(np, "savez_compressed", broken)
   with pytest.raises(OSError, match="no space"):
-    _exercise(30).save(path)
+    exercise(30).save(path)
   assert path.read_bytes() == old
   assert os.listdir(tmp_path) == ["exercise.npz"]
   monkeypatch.undo()
-  _exercise(30).save(path)
+  exercise(30).save(path)
   assert len(Recording.load(path).time) == 30
   with pytest.raises(FileNotFoundError):
     made.save(tmp_path / "nowhere" / "exercise.npz")
@@ -137,8 +97,16 @@ def test_foreign_bytes_are_refused(tmp_path, content):
     Recording.load(path)
 
 
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes here")
+def test_a_pipe_is_refused_and_not_waited_for(tmp_path):
+  os.mkfifo(tmp_path / "pipe.npz")
+  for read in (Recording.load, read_reference):
+    with pytest.raises(ValueError, match=r"pipe.npz: not a .*: not a file"):
+      read(tmp_path / "pipe.npz")
+
+
 def test_truncated_files_are_refused(tmp_path):
-  data = _exercise(40).save(tmp_path / "whole.npz").read_bytes()
+  data = exercise(40).save(tmp_path / "whole.npz").read_bytes()
   path = tmp_path / "cut.npz"
   for size in np.linspace(0, len(data) - 1, 40).astype(int):
     path.write_bytes(data[:size])
@@ -147,7 +115,7 @@ def test_truncated_files_are_refused(tmp_path):
 
 
 def test_flipped_bytes_are_refused_or_harmless(tmp_path):
-  made = _exercise(40)
+  made = exercise(40)
   data = made.save(tmp_path / "whole.npz").read_bytes()
   path = tmp_path / "flipped.npz"
   rng = np.random.RandomState(0)
@@ -212,11 +180,12 @@ EVENT = {"kind": "drop", "time": 1.0, "value": None, "instrument": 0, "label": "
     (_set("entries", "array.qpos", np.array(["x"] * 20)), "dtype <U1"),
     (_set("entries", "array.qpos", np.zeros(())), "expected 20 samples"),
     (_set("entries", "constant.curve", np.zeros(3)), "'curve' has shape"),
+    (_set("entries", "constant.curve", np.full((4, 3), np.nan)), "'curve' is not finite in row 0"),
     (_set("entries", "stranger", np.zeros(20)), "unknown entry 'stranger'"),
   ],
 )
 def test_foreign_content_is_named(tmp_path, change, match):
-  source = _exercise(20).save(tmp_path / "good.npz")
+  source = exercise(20).save(tmp_path / "good.npz")
   _rewrite(source, tmp_path / "same.npz", lambda entries, meta: None)
   Recording.load(tmp_path / "same.npz")  # the copying itself does no harm
   _rewrite(source, tmp_path / "bad.npz", change)
@@ -366,138 +335,3 @@ def test_docstrings_list_the_fields_in_order():
     listed = [line.split(":")[0] for line in lines if line.split(":")[0] in fields]
     assert listed == fields
   assert recorder_module.Recording is Recording
-
-
-# Metrics.
-
-
-def test_metrics_of_a_straight_line():
-  made = _plain(LINE).metrics()
-  assert made.time == pytest.approx(1.2)
-  assert made.path_length == pytest.approx(0.12)
-  assert made.path_inefficiency == pytest.approx(20)
-  assert made.number_of_movements == 1  # 100 mm/s
-  assert made.idle_time == 0 and made.idle_share == 0
-  reasons = made.reasons()
-  assert reasons["peak_force"] == "force not recorded"
-  assert reasons["angular_path"] == "quat not recorded"
-  assert reasons["depth_path"] == "axis not recorded"
-  assert reasons["errors"] == "no kind of error was watched for"
-  assert reasons["grasp_slips"] == "grip and held not recorded"
-  assert reasons["target_error"] == "no target was touched"
-  assert reasons["trace_rms"] == reasons["trace_frechet"] == "no curve to trace"
-  assert reasons["bimanual_dexterity"] == "a single instrument"
-
-
-def test_metrics_agree_with_the_functions():
-  made = _exercise(instruments=("only",))
-  data, got = made.recording(), made.metrics()
-  time, pos = data.time, data.column("tip_pos")
-  force, limit = data.column("force"), SETTINGS.force_limit
-  assert got.path_length == functions.path_length(pos)
-  assert got.sparc == functions.sparc(*functions.uniform_speed(time, pos))
-  assert got.rms_force == functions.rms_force(time, force)
-  assert got.excess_impulse == functions.excess_impulse(time, force, limit)
-  assert got.peak_pressure == functions.peak_pressure(force, data.column("area"))
-  assert got.target_error == pytest.approx(0.003)
-  assert got.errors == 1
-  assert got.grasp_slips == 3  # held ends at 40, the jaw opens at 60, three times
-  # quat turns about y: the shaft, its z, is (sin a, 0, cos a) with a = 0.6 sin(k / 40).
-  angle = 0.6 * np.sin(np.arange(300) / 40)
-  axis = np.stack([np.sin(angle), 0 * angle, np.cos(angle)], 1)
-  assert got.depth_path == pytest.approx(functions.depth_path(pos, axis), rel=1e-12)
-  assert got.angular_path == pytest.approx(np.abs(np.diff(angle)).sum(), rel=1e-9)
-  assert got.response_orientation == pytest.approx(0, abs=1e-12)
-
-
-def test_the_recorded_axis_goes_before_the_derived_one():
-  quat = np.tile([1.0, 0, 0, 0], (61, 1))
-  assert _plain(LINE, quat=quat).metrics().depth_path == 0
-  axis = np.tile([1.0, 0, 0], (61, 1))
-  assert _plain(LINE, quat=quat, axis=axis).metrics().depth_path == pytest.approx(0.12)
-
-
-def test_a_still_instrument_is_unknown_not_perfect():
-  quat = np.tile([1.0, 0, 0, 0], (61, 1))
-  still = _plain(0 * LINE, quat=quat, force=np.zeros(61)).metrics()
-  reasons = still.reasons()
-  for name in ("path_length", "path_inefficiency", "sparc", "log_dimensionless_jerk"):
-    assert reasons[name] == "no motion"
-  for name in ("angular_path", "response_orientation", "depth_path", "number_of_movements"):
-    assert reasons[name] == "no motion"
-  for name in ("peak_force", "mean_force", "force_time_product", "force_breaches"):
-    assert reasons[name] == "no contact"
-  assert still.idle_share == 100
-  assert _plain(LINE, quat=quat).metrics().angular_path == 0  # moved without turning: known
-
-
-def test_instruments_combine():
-  made = _exercise()
-  both, left, right = made.metrics(), made.metrics(0), made.metrics(1)
-  assert both.path_length == left.path_length + right.path_length
-  assert both.peak_force == max(left.peak_force, right.peak_force)
-  assert both.sparc == (left.sparc + right.sparc) / 2
-  assert both.time == left.time
-  assert both.idle_time < min(left.idle_time, right.idle_time)
-  assert -1 <= both.bimanual_dexterity <= 1 and math.isnan(left.bimanual_dexterity)
-  assert (left.errors, right.errors, both.errors) == (1, 0, 1)
-  assert left.target_error == 0.002 and right.target_error == 0.004
-
-
-def test_an_idle_second_instrument_does_not_hide_the_first():
-  recorder = Recorder(("left", "right"), SETTINGS)
-  for k, point in enumerate(LINE):
-    recorder.append(k * 0.02, [point, [0, 0, 0]], force=[1.0, math.nan])
-  assert recorder.metrics().path_length == pytest.approx(0.12)
-  assert recorder.metrics().peak_force == 1  # the right one has no sensor
-  assert recorder.metrics(1).reasons()["peak_force"] == "force not recorded"
-  assert recorder.metrics().reasons()["bimanual_dexterity"].startswith("an instrument's speed")
-
-
-def test_bad_data_of_one_instrument_is_not_hidden():
-  recorder = Recorder(("left", "right"), SETTINGS)
-  for k, point in enumerate(LINE):
-    recorder.append(k * 0.02, [point, point if k != 30 else [math.nan] * 3])
-  made = recorder.metrics()
-  for name in ("path_length", "path_inefficiency", "sparc", "number_of_movements", "idle_time"):
-    assert made.reasons()[name] == "tip_pos is not finite at sample 30", name
-  assert recorder.metrics(0).path_length == pytest.approx(0.12)
-
-
-def test_tracing_counts_the_contact_only():
-  recorder = Recorder(settings=SETTINGS)
-  recorder.attach("curve", [[0.02, 0, 0], [0.1, 0, 0]])
-  for k, point in enumerate(LINE):
-    touching = 0.02 <= point[0] <= 0.1
-    height = 0.001 if touching else 0.5
-    recorder.append(k * 0.02, [point[0], 0, height], force=float(touching))
-  assert recorder.metrics().trace_rms == pytest.approx(0.001)
-  # The tip is sampled every 2 mm: the point half-way is 1 mm along and 1 mm across from either.
-  assert recorder.metrics().trace_frechet == pytest.approx(math.hypot(1e-3, 1e-3), rel=1e-3)
-  lifted = Recorder(settings=SETTINGS)  # in the middle, for 10 mm, by 8 mm
-  lifted.attach("curve", [[0.02, 0, 0], [0.1, 0, 0]])
-  for k in range(81):
-    off = 35 < k < 45
-    lifted.append(k * 0.02, [0.02 + k * 1e-3, 0, 0.008 if off else 0], force=0.0 if off else 1.0)
-  assert lifted.metrics().trace_rms == pytest.approx(0, abs=1e-12)
-  assert lifted.metrics().trace_frechet == pytest.approx(0.008, rel=1e-2)
-  never = _plain(LINE, force=np.zeros(61))
-  never.attach("curve", LINE[:2])
-  assert never.metrics().reasons()["trace_rms"] == "no contact"
-  unmeasured = _plain(LINE)
-  unmeasured.attach("curve", LINE[[0, -1]])
-  assert unmeasured.metrics().trace_rms == pytest.approx(0, abs=1e-12)
-
-
-def test_watched_events_without_an_event_are_a_known_zero():
-  def counts(watch, *events):
-    recorder = Recorder(watch=watch)
-    for k in range(3):
-      recorder.append(k * 0.1, [k, 0, 0])
-    for kind in events:
-      recorder.event(kind, 0.1)
-    return recorder.metrics().errors, recorder.metrics().grasp_slips
-
-  assert counts(["miss", "slip"]) == (0, 0)
-  assert counts([], "drop", "slip", "slip", "miss", "target") == (2, 2)
-  assert all(isinstance(v, Unknown) for v in counts(["target"]))

@@ -11,9 +11,10 @@ import sys
 
 import numpy as np
 import pytest
-from palpate.tasks import report
+from palpate.tasks import plots, report
+from palpate.tasks.metrics import METRICS, Metrics, number
 from palpate.tasks.recorder import Recorder, Settings
-from palpate.tasks.score import METRICS, Metrics, make_reference
+from palpate.tasks.score import make_reference
 
 pytest.importorskip("matplotlib")
 
@@ -199,9 +200,9 @@ def test_user_text_in_plots_is_no_formula(real_png):
   for text in ("$\\frac{1}$", "$_{$", "a" * 80, "_hidden", "", "\\", "$$$", "π ≤ 3"):
     recorder = _recorder((text, "other"))
     recorder.event("note", 1.0, label=text)
-    for draw in (report.force_figure, report.spectrum_figure):
-      assert report.png(draw(recorder.recording())).startswith(b"\x89PNG")
-  names = [t.get_text() for t in report.force_figure(recorder.recording()).axes[0].legend_.texts]
+    for draw in (plots.force_figure, plots.spectrum_figure):
+      assert plots.png(draw(recorder.recording())).startswith(b"\x89PNG")
+  names = [t.get_text() for t in plots.force_figure(recorder.recording()).axes[0].legend_.texts]
   assert names[0] == "π ≤ 3"
 
 
@@ -217,21 +218,21 @@ def test_several_instruments_have_their_columns():
 
 
 def test_force_figure_shows_force_and_limit():
-  axes = report.force_figure(_recorder().recording()).axes[0]
+  axes = plots.force_figure(_recorder().recording()).axes[0]
   line = axes.lines[0]
   assert line.get_ydata().max() == pytest.approx(2.0) and line.get_xdata()[-1] == pytest.approx(2)
   labels = [t.get_text() for t in axes.legend_.texts]
   assert labels == ["contact force", "over the limit", "limit 1.5 N"]
-  below = report.force_figure(_recorder(limit=5.0).recording()).axes[0]
+  below = plots.force_figure(_recorder(limit=5.0).recording()).axes[0]
   assert [t.get_text() for t in below.legend_.texts] == ["contact force", "limit 5 N"]
   assert below.get_ylim()[1] > 5  # a limit that was kept is still in the picture
-  without = report.force_figure(_recorder(limit=None).recording()).axes[0]
+  without = plots.force_figure(_recorder(limit=None).recording()).axes[0]
   assert [t.get_text() for t in without.legend_.texts] == ["contact force"]
 
 
 def test_spectrum_figure_shows_the_cut_offs():
   recording = _recorder().recording()
-  axes = report.spectrum_figure(recording).axes[0]
+  axes = plots.spectrum_figure(recording).axes[0]
   labels = [t.get_text() for t in axes.legend_.texts]
   assert labels[0] == f"SPARC −{abs(round(recording.metrics().sparc, 2)):.3g}"
   assert labels[1:] == ["10 Hz", "amplitude 0.05"]
@@ -245,7 +246,7 @@ def test_path_figure_is_in_millimetres_over_the_surface():
   recorder.attach("vertices", [[0, 0, 0], [0.2, 0, 0], [0, 0.3, 0], [0, 0, 0.05]])
   recorder.attach("triangles", [[0, 1, 2], [0, 1, 3]])
   recorder.attach("curve", [[0, 0, 0], [0.1, 0.1, 0]])
-  axes = report.path_figure(recorder.recording()).axes[0]
+  axes = plots.path_figure(recorder.recording()).axes[0]
   x, _, z = axes.lines[1].get_data_3d()  # after the curve
   assert x.max() == pytest.approx(120) and z.max() == pytest.approx(20)
   assert axes.get_ylim()[1] >= 300 and len(axes.collections) == 1
@@ -254,12 +255,12 @@ def test_path_figure_is_in_millimetres_over_the_surface():
   np.testing.assert_allclose(spans / box, (spans / box)[0])  # equal scales
   recorder.attach("triangles", [[0, 1, 4]])
   with pytest.raises(ValueError, match="indices of the 4 vertices"):
-    report.path_figure(recorder.recording())
+    plots.path_figure(recorder.recording())
 
 
 def test_colour_marks_contact():
   recording = _recorder().recording()
-  axes = report.path_figure(recording).axes[0]
+  axes = plots.path_figure(recording).axes[0]
   labels = [line.get_label() for line in axes.lines]
   x = axes.lines[labels.index("in contact")].get_data_3d()[0]
   np.testing.assert_array_equal(np.isfinite(x), recording.force() > 0)
@@ -310,7 +311,13 @@ def test_many_events_are_cut_and_counted():
     recorder.event("note", 0.01 * k)
   page = _Page(report.render(recorder.recording()))
   assert "and 31 more" in page.text()
-  report.png(report.force_figure(recorder.recording()))
+  few = plots.force_figure(recorder.recording()).axes[0]
+  assert [len(c.get_segments()) for c in few.collections if hasattr(c, "get_segments")] == [80]
+  for k in range(80, 2000):
+    recorder.event("note", 0.001 * k)
+  many = plots.force_figure(recorder.recording()).axes[0]  # each line costs a millisecond
+  assert not [c for c in many.collections if hasattr(c, "get_segments")]
+  plots.png(many.figure)
 
 
 def test_a_bad_reference_writes_nothing(tmp_path):
@@ -322,11 +329,11 @@ def test_a_bad_reference_writes_nothing(tmp_path):
 def test_every_metric_can_be_shown():
   known = Metrics(**{name: 1.25 for name in METRICS})
   for name, spec in METRICS.items():
-    text = report._number(getattr(known, name), spec)
+    text = number(getattr(known, name), spec)
     assert float(text) == pytest.approx(1.25 * spec.scale, rel=5e-3)
-  assert report._number(123456.7) == "123457" and report._number(-0.5) == "−0.5"
-  assert report._number(3.0, METRICS["errors"]) == "3"
-  assert report._number(math.nan) == "–"
+  assert number(123456.7) == "123457" and number(-0.5) == "−0.5"
+  assert number(3.0, METRICS["errors"]) == "3"
+  assert number(math.nan) == "–"
   assert json.loads(known.to_json())["values"]["time"] == 1.25
 
 

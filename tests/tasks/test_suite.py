@@ -1,11 +1,13 @@
 """The exercises, after dm_control's suite_test: specs, seeds, observations, rewards, reset."""
 
+import itertools
+
 import mujoco
 import numpy as np
 import pytest
 from dm_control.rl import control
 from palpate import models, tasks
-from palpate.tasks import metrics, registry, suite
+from palpate.tasks import metrics, registry, scenes, suite
 
 IDS = ["/".join(pair) for pair in tasks.ALL_TASKS]
 _cache = {}
@@ -46,18 +48,17 @@ def roll(env, steps):
 
 
 def test_tasks_and_tags():
-  assert len(tasks.ALL_TASKS) == 19
   assert set(tasks.BENCHMARKING) == set(tasks.ALL_TASKS)
   assert set(tasks.EASY) | set(tasks.HARD) < set(tasks.ALL_TASKS)
-  assert suite.TASKS_BY_DOMAIN == registry.TASKS
+  assert suite.TASKS_BY_DOMAIN == registry.TASKS  # what is read is what is there
 
 
 def test_unknown_names_list_the_choices():
-  with pytest.raises(ValueError, match="domain is 'tuch', expected one of touch, probe, grasp"):
+  with pytest.raises(ValueError, match=r"domain is 'tuch', expected one of .*probe, .*touch"):
     tasks.load("tuch", "easy")
   with pytest.raises(ValueError, match="touch: task is 'eazy', expected one of easy, standard"):
     tasks.load("touch", "eazy")
-  with pytest.raises(ValueError, match="task is 'touch/eazy', expected one of touch/easy"):
+  with pytest.raises(ValueError, match=r"task is 'touch/eazy', expected one of .*touch/easy"):
     suite.split("touch/eazy")
   with pytest.raises(ValueError, match="reward is 'dence', expected one of dense, sparse"):
     load("touch/easy", reward="dence")
@@ -217,8 +218,6 @@ def test_actions_that_are_not_allowed(value, text):
 
 
 def test_a_scene_of_ones_own_must_have_what_the_task_needs():
-  from palpate.tasks import scenes
-
   spec = scenes.build(scenes.Scene(nodes=250, targets=1))
   env = load("touch/easy", model=spec)
   assert env.reset().observation["target"].shape == (3,)
@@ -240,6 +239,18 @@ def test_a_scene_of_ones_own_must_have_what_the_task_needs():
   bare = mujoco.MjSpec()
   with pytest.raises(ValueError, match="no body 'probe/trocar'"):
     load("touch/easy", model=bare)
+
+
+def test_every_organ_has_its_colour():
+  colours = []
+  for organ, center in (
+    ("liver", "right_lobe"), ("kidney", "anterior"), ("stomach", "body"), ("gallbladder", "fundus")
+  ):  # fmt: skip
+    model = scenes.build(scenes.Scene(organ, nodes=250, center=center)).compile()
+    (colour,) = model.flex_rgba
+    colours.append(colour)
+  for a, b in itertools.combinations(colours, 2):
+    assert np.abs(a - b).max() > 0.02
 
 
 def test_too_much_force_is_a_failure():

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import palpate
 import pytest
-from benchmarks import scene, stability
+from benchmarks import judge, scene
 from palpate.tissue import energy
 from palpate.tissue import mesh as topology
 
@@ -259,7 +259,7 @@ def test_a_crushed_organ_does_not_gain_energy(start):
   model = scene.build(mesh, tissue, "implicit", 1e-3)
   data = mujoco.MjData(model)
   organ = palpate.Organ(model, data, "organ")
-  organ.set_state(mesh.rest + stability.start_state(mesh, start))
+  organ.set_state(mesh.rest + judge.start_state(mesh, start))
   at_first = organ.energy
   for _ in range(60):
     mujoco.mj_step(model, data)

@@ -145,9 +145,7 @@ def test_worlds_are_independent_and_repeat_to_the_bit(scenes, device):
   together = [scenes.get(many, many.state.dvel, world) for world in range(2)]
   for world in range(2):
     for _ in range(2):
-      np.testing.assert_array_equal(
-        _step(scenes, mesh, one, 0.0, u=u[world])[0], together[world]
-      )
+      np.testing.assert_array_equal(_step(scenes, mesh, one, 0.0, u=u[world])[0], together[world])
 
 
 def test_a_graph_replays_the_step(scenes, device):

@@ -1,9 +1,12 @@
 """Experts solve every task; novices differ from them; no observation is constant on the way."""
 
+import sys
+import types
+
 import numpy as np
 import pytest
 from palpate import tasks
-from palpate.tasks import episode, experts, suite
+from palpate.tasks import base, episode, performer, suite
 
 EASY = ["/".join(pair) for pair in tasks.EASY]
 OTHERS = ["/".join(pair) for pair in tasks.ALL_TASKS if pair not in tasks.EASY]
@@ -20,7 +23,7 @@ def wins(name, seeds):
   count = 0
   for seed in seeds:
     env.task.random = np.random.RandomState(seed)
-    act = experts.make(env, seed=seed)
+    act = performer.make(env, seed=seed)
     timestep, seen, total = env.reset(), [], 0.0
     while not timestep.last():
       timestep = env.step(act(timestep))
@@ -53,7 +56,7 @@ def test_expert_solves_95_percent_of_50_seeds(name):
 def test_novices_differ_in_the_stated_way():
   def measure(name, style):
     env = tasks.load(*suite.split(name), task_kwargs={"random": 0})
-    return episode.run(env, experts.make(env, style, seed=0), 0).metrics()
+    return episode.run(env, performer.make(env, style, seed=0), 0).metrics()
 
   expert = measure("touch/easy", "expert")
   assert measure("touch/easy", "tremor").log_dimensionless_jerk < expert.log_dimensionless_jerk
@@ -65,7 +68,44 @@ def test_novices_differ_in_the_stated_way():
   )
 
 
+def test_a_task_without_an_expert_says_so():
+  env = tasks.load("touch", "easy")
+  env.task.expert = types.MethodType(base.Task.expert, env.task)
+  act = performer.make(env)
+  with pytest.raises(ValueError, match="touch/easy: no expert is written for it"):
+    act(env.reset())
+
+
 def test_unknown_performer_lists_the_choices():
   env = tasks.load("touch", "easy")
   with pytest.raises(ValueError, match="performer is 'exprt', expected one of expert, tremor"):
-    experts.make(env, "exprt")
+    performer.make(env, "exprt")
+
+
+def test_policies_are_found_by_name(tmp_path, monkeypatch):
+  (tmp_path / "mine.py").write_text(
+    "import numpy as np\nclass P:\n  def __init__(self, env, seed): self.env = env\n"
+    "  def __call__(self, timestep): return np.zeros(4)\n"
+    "def still(observation): return np.zeros(4)\nnumber = 3\n"
+    "class Lost:\n  def __init__(self, env, seed): raise OSError('no weights')\n"
+  )
+  monkeypatch.chdir(tmp_path)
+  monkeypatch.setattr(sys, "path", sys.path.copy())
+  env = tasks.load("touch", "easy")
+  timestep = env.reset()
+  for spec in ("mine:P", "mine:still"):
+    assert performer.make(env, spec)(timestep).shape == (4,)
+  for spec, text in (
+    ("mine", "performer is .mine., expected one of expert"),
+    (":mine", "expected module:object"),
+    ("mine:nothing", "mine has no 'nothing'"),
+    ("mine:number", "is a int, expected something to call"),
+    ("nowhere:x", "ModuleNotFoundError"),
+  ):
+    with pytest.raises(ValueError, match=text):
+      performer.find(spec)
+  (tmp_path / "leaves.py").write_text("raise SystemExit('no GPU')")
+  with pytest.raises(ValueError, match="policy 'leaves:x': SystemExit: no GPU"):
+    performer.find("leaves:x")
+  with pytest.raises(ValueError, match="policy 'mine:Lost': OSError: no weights"):
+    performer.make(env, "mine:Lost")

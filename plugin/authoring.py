@@ -1,0 +1,272 @@
+# mujoco ships its bindings without type stubs:
+# pyright: reportAttributeAccessIssue=false
+"""Writing scenes: adds an organ to an `mujoco.MjSpec`, as a <flexcomp> does to MJCF."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import mujoco
+import numpy as np
+
+from . import meshes, windows
+from .engine import plugin as engine
+from .tissue import config as configuration
+from .tissue import mesh as topology
+
+# Of an organ under instruments. solmix: its solref counts, not theirs, for its nodes are light.
+CONTACT: Mapping[str, object] = {
+  "condim": 3,
+  "friction": 0.3,
+  "solref": (0.004, 1),
+  "solimp": (0.95, 0.99, 0.001),
+  "solmix": 1000,
+  "selfcollide": "none",
+}
+# Keeps MuJoCo from warning of a flex without forces of its own; the plugin sets it to 0.
+EDGE_DAMPING = 1e-9
+COUPLINGS = ("nodal", "window")
+_DENSITY = 1060.0  # [kg/m^3], of most soft tissue
+_BOX = 0.005  # [m]; half the side of the box whose inertia a node's body has, as in a flexcomp
+_SELF = {
+  word: getattr(mujoco.mjtFlexSelf, f"mjFLEXSELF_{word.upper()}")
+  for word in ("none", "narrow", "bvh", "sap", "auto")
+}
+_SHARED = ("condim", "priority", "solmix", "margin", "gap", "contype", "conaffinity")
+_LISTS = {"friction": (1.0, 0.005, 0.0001), "solref": (0.02, 1.0),
+          "solimp": (0.9, 0.95, 0.001, 0.5, 2.0)}  # fmt: skip
+
+
+def add_organ(
+  spec: mujoco.MjSpec,
+  mesh,
+  name: str = "organ",
+  *,
+  parent: mujoco.MjsBody | str | None = None,
+  pos: Sequence[float] = (0.0, 0.0, 0.0),
+  quat: Sequence[float] = (1.0, 0.0, 0.0, 0.0),
+  scale: float | str = 1.0,
+  mass: float | None = None,
+  pin: Sequence[int] = (),
+  radius: float = 0.001,
+  rgba: Sequence[float] | None = None,
+  material: str | None = None,
+  contact: Mapping[str, object] | None = None,
+  coupling: str = "nodal",
+  tools: Sequence[str | Sequence[str]] | None = None,
+  window_nodes: int | None = None,
+  **config,
+) -> mujoco.MjsFlex:
+  """Adds an organ to a spec, in a body of its name; the same as a <flexcomp> with the plugin.
+
+  The mesh is taken as it is: a manifold surface, of triangles that are not too thin, wound one way.
+  `palpate wrap` makes one of any other, `palpate.models.wrap` does in Python.
+
+      spec = mujoco.MjSpec.from_file("scene.xml")
+      palpate.add_organ(spec, "spleen.obj", young=5e3, foundation=1e5, pos=(0, 0, 0.1))
+      model = spec.compile()
+
+  Args:
+    spec: changed in place, unless an error is raised
+    mesh: a file that trimesh reads (OBJ, STL, PLY, glTF), a trimesh, or (vertices, triangles)
+    name: of the flex, its body and the plugin's instance; the nodes' bodies are `<name>_<k>`
+    parent: what the body is in, which must not move; None for the world
+    pos: of the body in its parent [m]
+    quat: orientation of the body in its parent
+    scale: metres per unit of the mesh, or the unit: m, cm, mm or inch
+    mass: [kg]; None for 1060 kg/m^3 of what a closed surface encloses
+    pin: vertices that do not move
+    radius: of the flex [m]
+    rgba: colour
+    material: name of a material of the spec
+    contact: attributes of <contact> that are not to be as in CONTACT, which suits instruments
+    coupling: `nodal`, or `window` for MuJoCo dofs under the tools alone; the tools are in the
+      spec then
+    tools: as for `add_windows`, with `coupling="window"`
+    window_nodes: as `nodes` for `add_windows`, with `coupling="window"`
+    **config: the plugin's configuration keys: young, poisson, thickness, foundation, bulk, ...
+
+  Returns:
+    The flex.
+
+  Raises:
+    ValueError: a key, value, name or the mesh is not allowed; the message says what is.
+  """
+  windowed = _is_windowed(name, coupling, tools, window_nodes)
+  _, vertices, triangles = meshes.read(mesh, scale, sized=not isinstance(mesh, tuple | list))
+  surface = _surface(name, *meshes.merge(vertices, triangles))
+  pins = _pins(name, pin, surface.nvert)
+  mass = _mass(name, mass, surface)
+  texts = {key: text(value, 17) for key, value in config.items()}
+  _check_keys(name, texts, surface, mass if windowed else None)
+  look = _look(name, radius, rgba, material) | _contact(name, CONTACT | dict(contact or {}))
+  parent = _parent(spec, name, parent)
+  _check_names(spec, name, 0 if windowed else surface.nvert)
+  # From here on the spec changes.
+  spec.activate_plugin(engine.NAME)
+  body = parent.add_body(name=name, pos=pos, quat=quat)
+  if windowed:
+    texts |= {"mass": text(mass, 17), "pin": text(pins)}
+  plugin = spec.add_plugin(name=name, plugin_name=engine.NAME, active=True)
+  plugin.config = {key: value for key, value in texts.items() if value}
+  points, bodies = surface.rest, [name] * surface.nvert
+  if windowed:
+    _own(body, name)
+  else:
+    free = np.setdiff1d(np.arange(surface.nvert), pins)
+    for k in free:
+      _add_node(body, name, f"{name}_{k}", surface.rest[k], mass / surface.nvert)
+      bodies[k] = f"{name}_{k}"
+    points = points.copy()
+    points[free] = 0.0
+  flex = spec.add_flex(
+    name=name,
+    dim=2,
+    vert=points.ravel(),
+    vertbody=bodies,
+    elem=surface.elem.ravel(),
+    edgedamping=0.0 if windowed else EDGE_DAMPING,
+    **look,
+  )
+  if windowed:
+    try:
+      windows.add_windows(spec, name, tools, window_nodes)
+    except ValueError:
+      for added in (flex, plugin, body):
+        spec.delete(added)
+      raise
+  return flex
+
+
+def text(value, digits: int = 9) -> str:
+  """Returns a text, flag, number or array of numbers as MJCF has it."""
+  if isinstance(value, str):
+    return value
+  if isinstance(value, bool | np.bool_):
+    return "true" if value else "false"
+  array = np.asarray(value)
+  if array.dtype.kind in "iu":
+    return " ".join(map(str, array.ravel()))
+  return " ".join(f"{v + 0.0:.{digits}g}" for v in array.ravel())
+
+
+def _is_windowed(name: str, coupling: str, tools, nodes: int | None) -> bool:
+  if coupling not in COUPLINGS:
+    raise ValueError(f"organ {name!r}: coupling is {coupling!r}, expected nodal or window")
+  for key, value in (("tools", tools), ("window_nodes", nodes)):
+    if coupling != "window" and value is not None:
+      raise ValueError(f"organ {name!r}: {key} is set, allowed only with coupling='window'")
+  return coupling == "window"
+
+
+def _surface(name: str, vertices: np.ndarray, triangles: np.ndarray) -> topology.Mesh:
+  try:
+    made = topology.build(name, vertices, triangles)
+  except ValueError as error:
+    raise ValueError(f"{error}; `palpate wrap` makes an organ of it") from None
+  if made.closed and topology.volume(made.rest, made.elem) < 0:  # wound inward
+    return topology.build(name, vertices, triangles[:, ::-1].copy())
+  return made
+
+
+def _pins(name: str, pin: Sequence[int], nvert: int) -> np.ndarray:
+  pins = np.unique(np.asarray(pin, dtype=float))
+  bad = pins[(pins != np.floor(pins)) | (pins < 0) | (pins >= nvert)]
+  if bad.size:
+    raise ValueError(f"organ {name!r}: pin has {bad[0]:g}, expected vertices in [0, {nvert})")
+  if len(pins) == nvert:
+    raise ValueError(f"organ {name!r}: all vertices are pinned, expected some that move")
+  return pins.astype(int)
+
+
+def _mass(name: str, mass: float | None, surface: topology.Mesh) -> float:
+  if mass is not None:
+    if not (np.isfinite(mass) and mass > 0):
+      raise ValueError(f"organ {name!r}: mass is {mass}, expected a number > 0")
+    return float(mass)
+  if not surface.closed:
+    raise ValueError(f"organ {name!r}: mass is missing [kg], the surface is not closed")
+  return _DENSITY * topology.volume(surface.rest, surface.elem)
+
+
+def _check_keys(name: str, texts: dict[str, str], surface: topology.Mesh, mass: float | None):
+  """Raises a ValueError for a key or value that the plugin would refuse."""
+  for key in ("window", "follow"):
+    if key in texts:
+      raise ValueError(f"organ {name!r}: {key} is set, expected coupling='window' and tools")
+  given = texts if mass is None else {**texts, "window": name, "mass": text(mass)}
+  configuration.parse(name, given, surface.nelem, surface.closed)
+
+
+def _look(name: str, radius: float, rgba, material: str | None) -> dict:
+  if not (np.isfinite(radius) and radius > 0):
+    raise ValueError(f"organ {name!r}: radius is {radius}, expected a number > 0")
+  look: dict = {"radius": radius}
+  if rgba is not None:
+    look["rgba"] = np.asarray(rgba, dtype=float)
+    if look["rgba"].shape != (4,):
+      raise ValueError(f"organ {name!r}: rgba is {rgba}, expected four numbers")
+  return look if material is None else look | {"material": material}
+
+
+def _contact(name: str, given: dict) -> dict:
+  """Returns a flex's attributes for those of <contact>."""
+  made: dict = {}
+  for key, value in given.items():
+    if key in _SHARED:
+      made[key] = value
+    elif key in _LISTS:
+      values = np.atleast_1d(np.asarray(value, dtype=float))
+      made[key] = np.concatenate([values, _LISTS[key][len(values) :]])
+    elif key == "selfcollide" and value in _SELF:
+      made[key] = _SELF[value]
+    elif key == "selfcollide":
+      choices = ", ".join(_SELF)
+      raise ValueError(f"organ {name!r}: selfcollide is {value!r}, expected one of {choices}")
+    else:
+      choices = ", ".join((*_SHARED, *_LISTS, "selfcollide"))
+      raise ValueError(f"organ {name!r}: contact has {key!r}, expected one of {choices}")
+  return made
+
+
+def _parent(spec, name: str, parent):
+  """Returns the body that an organ is put in."""
+  if parent is None:
+    return spec.worldbody
+  found = spec.body(parent) if isinstance(parent, str) else parent
+  if found is None:
+    have = ", ".join(repr(body.name) for body in spec.bodies)
+    raise ValueError(f"organ {name!r}: no body {parent!r} in the spec, it has {have}")
+  above = found
+  while above is not None:
+    if above.first_joint() is not None or above.mocap:
+      raise ValueError(f"organ {name!r}: body {above.name!r} above it moves, expected a fixed one")
+    above = above.parent
+  return found
+
+
+def _check_names(spec, name: str, nodes: int):
+  if not name:
+    raise ValueError("name is '', expected the organ's")
+  taken = {body.name for body in spec.bodies}
+  wanted = [name, *(f"{name}_{k}" for k in range(nodes))]
+  clash = next((each for each in wanted if each in taken), None)
+  if clash:
+    raise ValueError(f"organ {name!r}: the spec has a body {clash!r} already")
+  for what, names in (("flex", spec.flexes), ("plugin instance", spec.plugins)):
+    if name in {each.name for each in names}:
+      raise ValueError(f"organ {name!r}: the spec has a {what} {name!r} already")
+
+
+def _own(body, name: str):
+  """Makes a body one of the plugin's instance."""
+  body.plugin.name, body.plugin.plugin_name, body.plugin.active = name, engine.NAME, True
+
+
+def _add_node(parent, organ: str, name: str, pos: np.ndarray, mass: float):
+  """Adds the body of a node, with a slide along each axis."""
+  body = parent.add_body(name=name, pos=pos, ipos=np.zeros(3), mass=mass)
+  body.inertia, body.explicitinertial = [2 / 3 * mass * _BOX**2] * 3, True
+  for axis in np.eye(3):
+    body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
+  _own(body, organ)

@@ -1,0 +1,249 @@
+"""Where every number lies that an organ keeps in mjData.plugin_state or exchanges in a step.
+
+Long arrays are structs of blocks, one after the other in the order of their lines; `carve` makes
+views of them. Short ones (`Numbers`) have a name for each number. Native code has the blocks as
+fields and the offsets of the short ones as constants, HEAD_MODE for `HEAD.mode`.
+"""
+
+# Annotations here are objects, not text: no `from __future__ import annotations`.
+# pyright: reportInvalidTypeForm=false
+import math
+from collections.abc import Mapping
+
+import warp as wp
+from palpate.tissue.types import DIMS, doubles, struct
+
+MAX_WINDOWS = 64  # of an organ
+MAX_GEOMS = 32  # of a window
+
+
+class Numbers:
+  """Offsets of the numbers of a short array by name; `len` is how many there are.
+
+  Args:
+    prefix: of their names in native code
+    rows: name, how many numbers, unit, meaning
+  """
+
+  def __init__(self, prefix: str, *rows: tuple[str, int, str, str]):
+    self.rows = rows
+    self._prefix = prefix
+    self._length = 0
+    for name, size, *_ in rows:
+      setattr(self, name, self._length)
+      self._length += size
+
+  def __getattr__(self, name: str) -> int:
+    raise AttributeError(f"{self._prefix} has no number {name!r}")
+
+  def __len__(self) -> int:
+    return self._length
+
+  def constants(self) -> dict[str, int]:
+    """Returns the offsets, and the length, under their names in native code."""
+    names = [name for name, *_ in self.rows]
+    offsets = {f"{self._prefix}_{name.upper()}": getattr(self, name) for name in names}
+    return offsets | {f"{self._prefix}_LENGTH": len(self)}
+
+
+FLAG = Numbers(
+  "FLAG",
+  ("stale", 1, "-", "the model's windows are not those of the state"),
+  ("asleep", 1, "-", "the organ is at rest and its step is skipped"),
+  ("missed_nodes", 1, "-", "nodes that tools touch and windows have no room for"),
+  ("missed_elements", 1, "-", "triangles that windows have no room for"),
+  ("pending", 1, "-", "mode of the next commit, see MODE"),
+  ("near", 1, "-", "a tool is near"),
+  ("changed", 1, "-", "the contact forces are not those of the last step"),
+  ("answered", 1, "-", "the organ responded to that"),
+  ("foreseen", 1, "-", "what acts on the organ is what was guessed"),
+)
+
+# How the last step ends on the nodes' side. These are values, not offsets.
+MODE = Numbers(
+  "MODE",
+  ("still", 1, "-", "there is nothing to commit"),
+  ("commit", 1, "-", "the last step's change of velocity"),
+  ("halt", 1, "-", "that, and standing still"),
+)
+
+# Of the inbox: what is the same for the whole organ.
+HEAD = Numbers(
+  "HEAD",
+  ("step", 1, "s", "time step h of the step that begins"),
+  ("gain", 1, "s^2", "h^2 + h damping"),
+  ("floor", 1, "kg m^2/s^2", "floor of the residual"),
+  ("mode", 1, "-", "how the last step ends, see MODE"),
+  ("gravity", 3, "m/s^2", "in the organ's frame"),
+  ("reach", 1, "m", "distance from a geom within which nodes may be in a window"),
+  ("step_ended", 1, "s", "time step of the step that ends"),
+  ("answered", 1, "-", "1 where it ends with the organ's response"),
+)
+
+# Of the inbox: where contacts left a slot in the last step.
+MOVED = Numbers(
+  "MOVED",
+  ("node", 1, "-", "-1 for none"),
+  ("disp", 3, "m", "displacement from rest"),
+  ("vel", 3, "m/s", "velocity"),
+)
+
+# Of the inbox: what acts on a slot.
+PUSHED = Numbers(
+  "PUSHED",
+  ("node", 1, "-", "-1 for none"),
+  ("force", 3, "N", "besides weight; after MuJoCo's step the impulse to answer [N s]"),
+)
+
+# Of the inbox: a geom that a window follows, in the organ's frame.
+GEOM = Numbers(
+  "GEOM",
+  ("pos", 3, "m", "centre"),
+  ("axis", 9, "-", "its three axes, one after the other"),
+  ("type", 1, "-", "mjtGeom"),
+  ("size", 3, "m", "as mjModel.geom_size"),
+  ("box", 3, "m", "centre of the bounding box, along the axes"),
+  ("half", 3, "m", "half its lengths"),
+  ("bound2", 1, "m^2", "square of the reach plus the radius of the bounding sphere"),
+)
+
+# Of the outbox: what the whole organ did.
+SUMMARY = Numbers(
+  "SUMMARY",
+  ("status", 4, "-", "as `System.status`"),
+  ("speed2", 1, "m^2/s^2", "square of the greatest speed of a node"),
+  ("low", 3, "m", "lowest corner of the organ's bounds, in its frame"),
+  ("high", 3, "m", "highest corner"),
+)
+
+# Of the outbox: the node of a slot after a step that ended with the organ's response.
+ANSWER = Numbers(
+  "ANSWER",
+  ("disp", 3, "m", "displacement from rest"),
+  ("vel", 3, "m/s", "velocity"),
+  ("dvel", 3, "m/s", "what the response changed of it"),
+)
+
+# Of the outbox: a node that is near a window's geoms.
+RECORD = Numbers(
+  "RECORD",
+  ("node", 1, "-", "its number"),
+  ("distance", 1, "m", "to the nearest geom"),
+  ("disp", 3, "m", "displacement from rest"),
+  ("vel", 3, "m/s", "velocity"),
+)
+
+# Of the plugin state of a windowed organ: where a geom was when the organ fell asleep, as in GEOM.
+POSE = Numbers("POSE", ("pos", 3, "m", "centre"), ("axis", 9, "-", "its three axes"))
+
+# The last numbers of the plugin state of a windowed organ.
+TAIL = Numbers(
+  "TAIL",
+  ("stamp", 1, "-", "of a motion that is kept on a device, see `resident`"),
+  ("quiet", 1, "s", "time without motion and force"),
+  ("gravity", 3, "m/s^2", "of the step in which the organ fell asleep"),
+  ("low", 3, "m", "lowest corner of the organ's bounds, in its frame"),
+  ("high", 3, "m", "highest corner"),
+  ("heavier", 1, "-", "how many times its inertia at rest a tool meets; 0 for once"),
+  ("leeway", 1, "m", "how far a tool may go from where it was when the organ fell asleep"),
+)
+
+TABLES = (FLAG, MODE, HEAD, MOVED, PUSHED, GEOM, SUMMARY, ANSWER, RECORD, POSE, TAIL)
+CONSTANTS = {
+  "MAX_WINDOWS": MAX_WINDOWS,
+  "MAX_GEOMS": MAX_GEOMS,
+  **{name: value for table in TABLES for name, value in table.constants().items()},
+}
+
+
+@struct
+class NodalState:
+  """Plugin state of an organ whose nodes are degrees of freedom of MuJoCo."""
+
+  force: doubles("nfree")  # contact force of the last step [N]
+  last: doubles("nfree")  # last change of the velocity [m/s]
+  before: doubles("nfree")  # the one before it [m/s]
+  heavier: doubles(1)  # how many times its inertia at rest a tool meets; 0 for once [-]
+
+
+@struct
+class Motion:
+  """Motion of a windowed organ, in the order of its vertices and in its frame."""
+
+  disp: doubles("nvert", 3)  # displacement from rest [m]
+  vel: doubles("nvert", 3)  # velocity [m/s]
+  last: doubles("nvert", 3)  # last change of the velocity [m/s]
+  before: doubles("nvert", 3)  # the one before it [m/s]
+
+
+@struct
+class WindowState:
+  """Plugin state of a windowed organ."""
+
+  motion: Motion
+  force: doubles("nslot", 3)  # contact force of the last step on each slot [N]
+  slot: doubles("nslot")  # node + 1; 0: the slot's default node, -1: not used
+  pose: doubles("ngeom", len(POSE))  # where the windows' geoms were, see POSE
+  tail: doubles(len(TAIL))  # see TAIL
+
+
+@struct
+class Inbox:
+  """What a windowed organ's nodes are told."""
+
+  head: doubles(len(HEAD))  # see HEAD
+  moved: doubles("nslot", len(MOVED))  # see MOVED
+  pushed: doubles("nslot", len(PUSHED))  # see PUSHED
+  ngeom: doubles("nwindow")  # geoms of each window
+  geom: doubles("nwindow", MAX_GEOMS, len(GEOM))  # see GEOM
+
+
+@struct
+class Outbox:
+  """What they answer."""
+
+  summary: doubles(len(SUMMARY))  # see SUMMARY
+  dvel: doubles("nslot", 3)  # change of each slot's velocity in this step [m/s]
+  answer: doubles("nslot", len(ANSWER))  # see ANSWER
+  found: doubles("nwindow")  # nodes near each window's geoms
+  record: doubles("nwindow", "most", len(RECORD))  # see RECORD, as far as there is room
+
+
+def spans(kind, sizes: Mapping[str, int], start: int = 0) -> dict[str, slice]:
+  """Returns where each block of a struct lies, by name; `sizes` has the named sizes."""
+  out: dict[str, slice] = {}
+  for name, var in kind.vars.items():
+    dims = DIMS[kind.key].get(name)
+    if dims is None:
+      out |= spans(var.type, sizes, start)
+    else:
+      out[name] = slice(start, start + math.prod(_shape(dims, sizes)))
+    start = list(out.values())[-1].stop
+  return out
+
+
+def size(kind, sizes: Mapping[str, int]) -> int:
+  """Returns how many numbers the blocks of a struct have."""
+  return list(spans(kind, sizes).values())[-1].stop
+
+
+def carve(kind, array: wp.array, sizes: Mapping[str, int]):
+  """Returns the struct whose blocks are views of an array, which must outlive it."""
+  return _carve(kind, array, sizes, spans(kind, sizes))
+
+
+def _carve(kind, array, sizes, where):
+  out = kind()
+  for name, var in kind.vars.items():
+    dims = DIMS[kind.key].get(name)
+    if dims is None:
+      view = _carve(var.type, array, sizes, where)
+    else:
+      address, shape = array.ptr + 8 * where[name].start, _shape(dims, sizes)
+      view = wp.array(ptr=address, dtype=wp.float64, shape=shape, device=array.device)
+    setattr(out, name, view)
+  return out
+
+
+def _shape(dims: tuple, sizes: Mapping[str, int]) -> tuple[int, ...]:
+  return tuple(sizes[n] if isinstance(n, str) else n for n in dims)

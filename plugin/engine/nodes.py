@@ -1,0 +1,81 @@
+"""Windows, the nodes' side: the motion of an organ, on the CPU or on a device."""
+
+# Annotations here are objects, not text: no `from __future__ import annotations`.
+# pyright: reportInvalidTypeForm=false
+import numpy as np
+import warp as wp
+from palpate.tissue.types import doubles, fill, ints, struct
+
+from . import coupling, layout
+from .coupling import Crossing
+from .layout import Inbox, Motion, Outbox
+
+_BLOCK = 128  # threads, whole warps
+
+
+@struct
+class Nodes:
+  """A windowed organ's nodes, in the order of its vertices and in its frame."""
+
+  nvert: int  # vertices
+  nslot: int  # slots of all windows
+  nwindow: int  # windows
+  most: int  # candidates of a window that the outbox has room for
+  node: ints("nvert")  # where a vertex starts in vectors of slices
+  mass: doubles("nvert")  # mass [kg]
+  rest: doubles("nvert", 3)  # rest position [m]
+  count: ints("nwindow")  # candidates of each window; 0 between steps
+  extent: ints(7)  # squared speed, bounds, as `put_most` has them; nothing put between steps
+  motion: Motion
+  inbox: Inbox
+  outbox: Outbox
+  solve: Crossing
+
+
+commit, move_slots, enter, push_slots, push_impulses, search, report = coupling.kernels(
+  "nodes.h",
+  Nodes,
+  *("commit", "move_slots", "enter", "push_slots", "push_impulses", "search", "report"),
+)
+MODULE = commit.module.name
+
+
+def make(w, side, motion, boxes: tuple[wp.array, wp.array], sizes: dict[str, int]):
+  """Returns a workspace's nodes on a device.
+
+  Args:
+    w: the workspace
+    side: the device
+    motion: where the motion is there, `Motion`
+    boxes: numbers of inbox and outbox there
+    sizes: what the blocks of `layout` need
+  """
+  organ, s = w.organ, w.body.shape
+  node = s.node.numpy()
+  mass = np.ones(s.nnode)
+  mass[node] = organ.windows.mass
+  w.host["mass"].assign(mass.reshape(1, -1, 8).astype(np.float32))
+  wp.copy(w.body.state.mass, w.host["mass"])
+  values = dict(
+    nvert=sizes["nvert"],
+    nslot=sizes["nslot"],
+    nwindow=sizes["nwindow"],
+    most=sizes["most"],
+    node=(node // 8) * 24 + node % 8,
+    mass=organ.windows.mass,
+    rest=organ.mesh.rest,
+    count=np.zeros(sizes["nwindow"]),
+    extent=np.full(7, -(2**31)),  # nothing put
+    motion=motion,
+    inbox=layout.carve(Inbox, boxes[0], sizes),
+    outbox=layout.carve(Outbox, boxes[1], sizes),
+    solve=coupling.crossing(coupling.on_body(w.body) if w.config.resident else w.host),
+  )
+  return fill(Nodes, side, values)
+
+
+def launch(kernel, nodes, count: int, device):
+  """Launches a kernel over `count` items: one thread each on CUDA, one for all on the CPU."""
+  nthread = -(-count // _BLOCK) * _BLOCK if wp.get_device(device).is_cuda else 1
+  inputs = [nthread, 0, nodes]
+  wp.launch(kernel, dim=(1, nthread), block_dim=_BLOCK, inputs=inputs, device=device)

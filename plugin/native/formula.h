@@ -1,0 +1,79 @@
+// The coupling of an organ to MuJoCo, for one of its nodes (docs/physics.md, coupling).
+//
+// The organ's step gives a node the velocity v + dv. It reaches MuJoCo as the force
+//
+//   qfrc_passive = Mhat dv / h - f_ext - f_c
+//
+// on the node's degrees of freedom, with Mhat their inertia (mass + armature), f_ext what MuJoCo adds
+// to them by itself in this step and f_c their constraint force of the last step. Both are on the
+// right-hand side of the organ's step too, as its lagged force f_ext + f_c. MuJoCo's own step then
+// ends at v + dv + h (f_c_new - f_c) / Mhat: at rest the contact force is exact whatever h is.
+#pragma once
+#include "d3.h"
+
+namespace palpate {
+
+// Of contact forces, the change that says something about the inertia which they meet: its share of
+// them, and the share of it that does not cancel; and the most that it may make more in a step.
+constexpr double CHANGE = 0.005, COHERENT = 0.7, FASTER = 2.0;
+
+PALPATE bool touched(D3 contact) { return contact != D3{0.0, 0.0, 0.0}; }
+
+// What MuJoCo adds to a node's dofs by itself, in the organ's frame: forces along them, and one on
+// their body, `wrench`, in the world's.
+PALPATE D3 external(D3 along, const double* frame, const double* wrench) {
+  return add_turned(along, frame, load(wrench));
+}
+
+// The force that brings v + dv through MuJoCo's step, from Mhat dv / h and what acts besides; none
+// where that is not a number.
+PALPATE D3 passive(D3 rate, D3 lagged) {
+  const D3 f = rate - lagged;
+  return {f.x == f.x ? f.x : 0.0, f.y == f.y ? f.y : 0.0, f.z == f.z ? f.z : 0.0};
+}
+
+// Lets MuJoCo's solver meet the inertia Mhat at the dofs of a node, which start at `adr`; their
+// diagonals in M are at the three addresses.
+template <class Arrays>
+PALPATE void set_inertia(const Arrays& mj, const int* massadr, int adr, D3 Mhat) {
+  const double diagonal[3] = {Mhat.x, Mhat.y, Mhat.z};
+  for (int c = 0; c < 3; ++c) {
+    mj.M.data[massadr[c]] = mj.qLD.data[massadr[c]] = diagonal[c];
+    mj.qLDiagInv.data[adr + c] = 1.0 / diagonal[c];
+  }
+}
+
+// Where the solve for dv starts: the line through the last two.
+PALPATE D3 forecast(D3 last, D3 before) { return 2.0 * last - before; }
+
+// How many times their inertia at rest the nodes in contact have: a secant through the last change
+// of the contact forces, as in the coupling of fluids and structures (Kuettler and Wall 2008,
+// doi:10.1007/s00466-008-0255-5). Impulses that cancel say nothing about what a tool meets, and it
+// meets no more than one node alone has, `heaviest` times.
+struct Secant {
+  double acted = 0.0;  // impulses times the organ's answer
+  double meant = 0.0;  // impulses times what the dofs' inertia makes of them
+  double gross = 0.0;  // sizes of the changes of the forces
+  double whole = 0.0;  // sizes of the forces
+  D3 sum = {0.0, 0.0, 0.0};  // of the changes
+
+  PALPATE void add(D3 impulse, D3 answer, double expected, D3 change, double force) {
+    acted += impulse.x * answer.x;
+    acted += impulse.y * answer.y;
+    acted += impulse.z * answer.z;
+    meant += expected;
+    sum += change;
+    gross += norm(change);
+    whole += force;
+  }
+
+  PALPATE double heavier(double now, double heaviest) const {
+    if (whole == 0.0) return 1.0;
+    if (!(acted > 0.0) || gross < CHANGE * whole || norm(sum) < COHERENT * gross) return now;
+    const double seen = now * meant / acted;
+    const double most = FASTER * now < heaviest ? FASTER * now : heaviest;
+    return seen < 1.0 ? 1.0 : seen > most ? most : seen;
+  }
+};
+
+}  // namespace palpate

@@ -1,0 +1,121 @@
+// Nodal coupling: each moving node of an organ has three degrees of freedom of MuJoCo.
+#pragma once
+#include "formula.h"
+
+namespace palpate {
+
+// The inertia of dof `k`, less than three, of a node whose dofs start at `adr`.
+template <class Fields>
+PALPATE double inertia(const Fields& f, double mass, int adr, int k) {
+  return mass + f.mj.dof_armature.data[adr + k];
+}
+
+// Reads MuJoCo's arrays into the solver's state and keeps what acts on the nodes.
+template <class Fields>
+PALPATE void gather_nodes(const Fields& f, Thread, int) {
+  const auto& mj = f.mj;
+  const auto& solve = f.solve;
+  const double h = mj.timestep.data[0], damping = (float)f.number.data[DAMPING];
+  solve.step.data[0] = (float)h;
+  solve.step.data[1] = (float)(h * h + h * damping);
+  const double* R = f.frame.data;
+  const bool falls = !(mj.disableflags.data[0] & DISABLE_GRAVITY);
+  const D3 zero = {0.0, 0.0, 0.0}, g = falls ? add_turned(zero, R, load(mj.gravity.data)) : zero;
+  double weight = 0.0;
+  for (int i = 0; i < f.nnode; ++i) {
+    const int at = offset_of(i), adr = f.dofadr.data[i];
+    if (adr < 0) continue;
+    const int qadr = f.qposadr.data[i], body = f.bodyid.data[i], own = f.stateadr.data[i];
+    const double m = mj.body_mass.data[body];
+    solve.mass.data[i] = (float)m;
+    weight += m;
+    const D3 along = m * g + load(mj.qfrc_applied.data + adr) + load(mj.qfrc_passive.data + adr);
+    const D3 lagged = external(along, R, mj.xfrc_applied.data + 6 * body) + load(f.own.force.data + own);
+    store(f.lagged.data + 3 * i, lagged);
+    store_lane(solve.force_ext.data + at, lagged);
+    store_lane(solve.disp.data + at, load(mj.qpos.data + qadr) - load(mj.qpos0.data + qadr));
+    store_lane(solve.vel.data + at, load(mj.qvel.data + adr));
+    const D3 next = forecast(load(f.own.last.data + own), load(f.own.before.data + own));
+    store_lane(solve.dvel_warm.data + at, next);
+  }
+  // Residual floor: with D ~ mass, sqrt(r^T D^-1 r) of this share of the weight's impulse.
+  const double rest = f.rest_share * 9.81 * h;
+  solve.step.data[2] = (float)(weight * rest * rest);
+}
+
+// Adds the passive force.
+template <class Fields>
+PALPATE void scatter_nodes(const Fields& f, Thread, int) {
+  const auto& mj = f.mj;
+  // A solve that failed holds the organ still for this step instead of spreading the damage.
+  const bool ok = f.solve.status.data[3] == 0.0f;
+  const double per_h = 1.0 / mj.timestep.data[0], heavy = f.own.heavier.data[0];
+  for (int i = 0; i < f.nnode; ++i) {
+    const int adr = f.dofadr.data[i], own = f.stateadr.data[i];
+    if (adr < 0) continue;
+    const double m = mj.body_mass.data[f.bodyid.data[i]];
+    const double gain = heavy > 1.0 && touched(load(f.own.force.data + own)) ? heavy : 1.0;
+    const D3 Mhat = {gain * inertia(f, m, adr, 0), gain * inertia(f, m, adr, 1),
+                     gain * inertia(f, m, adr, 2)};
+    if (gain > 1.0) set_inertia(mj, f.massadr.data + 3 * i, adr, Mhat);
+    const D3 dv = load_lane(f.solve.dvel.data + offset_of(i));
+    const D3 rate = {Mhat.x * dv.x * per_h, Mhat.y * dv.y * per_h, Mhat.z * dv.z * per_h};
+    double* out = mj.qfrc_passive.data + adr;
+    store(out, load(out) + passive(ok ? rate : D3{0.0, 0.0, 0.0}, load(f.lagged.data + 3 * i)));
+  }
+}
+
+// Writes the impulses by which the contact forces changed to the solver's right-hand side.
+template <class Fields>
+PALPATE void push_nodes(const Fields& f, Thread, int) {
+  const double h = f.mj.timestep.data[0];
+  bool changed = false;
+  for (int i = 0; i < f.nnode; ++i) {
+    const int adr = f.dofadr.data[i];
+    D3 df = {0.0, 0.0, 0.0};
+    if (adr >= 0)
+      df = load(f.mj.qfrc_constraint.data + adr) - load(f.own.force.data + f.stateadr.data[i]);
+    store_lane(f.solve.rhs.data + offset_of(i), h * df);
+    changed = changed || touched(df);
+  }
+  f.flags.data[FLAG_CHANGED] = changed;
+}
+
+// Steps the plugin state, and ends the step with the organ's response where there was one: not by
+// what MuJoCo made of the forces, whose solver may have stopped where those that it reports are not
+// quite those that moved the dofs.
+template <class Fields>
+PALPATE void remember_nodes(const Fields& f, Thread, int) {
+  const auto& mj = f.mj;
+  const double h = mj.timestep.data[0];
+  const bool ok = f.solve.status.data[3] == 0.0f, answered = ok && f.flags.data[FLAG_ANSWERED];
+  const double heavy = f.own.heavier.data[0] > 1.0 ? f.own.heavier.data[0] : 1.0;
+  Secant secant;
+  for (int i = 0; i < f.nnode; ++i) {
+    const int at = offset_of(i), adr = f.dofadr.data[i], own = f.stateadr.data[i];
+    if (adr < 0) continue;
+    double* last = f.own.last.data + own;
+    double* force = f.own.force.data + own;
+    const D3 now = load(mj.qfrc_constraint.data + adr), df = now - load(force);
+    D3 dv = {0.0, 0.0, 0.0};
+    if (ok) dv = load_lane(f.solve.dvel.data + at);
+    if (answered) {
+      const double m = mj.body_mass.data[f.bodyid.data[i]];
+      const double Mhat = (touched(load(force)) ? heavy : 1.0) * inertia(f, m, adr, 0);
+      const D3 answer = load_lane(f.solve.sol.data + at);
+      secant.add(h * df, answer, h * h * dot(df, df) / Mhat, df, norm(now));
+      dv += answer;
+      const D3 v = load_lane(f.solve.vel.data + at) + dv;
+      double* qpos = mj.qpos.data + f.qposadr.data[i];
+      double* qvel = mj.qvel.data + adr;
+      store(qpos, load(qpos) + h * (v - load(qvel)));
+      store(qvel, v);
+    }
+    store(force, now);
+    store(f.own.before.data + own, load(last));
+    store(last, dv);
+  }
+  if (answered) f.own.heavier.data[0] = secant.heavier(heavy, f.heaviest.data[0]);
+}
+
+}  // namespace palpate

@@ -1,0 +1,87 @@
+// Products with the matrix A of the step, and with the inverse of its diagonal blocks.
+#pragma once
+#include "group.h"
+
+namespace palpate {
+
+// The matrix of one world, less its volume term: blocks of neighbours, inertia and foundation on
+// the diagonal, and the bending matrix along the normals.
+struct Matrix {
+  const float* block;
+  const float* diag;
+  const float* inverse;
+  const float* normal;
+  const int* slot;
+  const int* fan;
+  const int* bend_row;
+  const int* bend_node;
+  const float* bend_gain;
+  float bend;  // h^2 + h damping, by which the bending matrix counts
+  bool bends;  // whether there is one
+};
+
+template <class Fields>
+PALPATE Matrix matrix(const Fields& f, int world) {
+  const size_t base = (size_t)world * f.shape.nslice;
+  return {
+    f.system.block.data + 72 * (size_t)world * f.shape.nslot, f.system.diag.data + 8 * base,
+    f.system.inverse.data + 48 * base, f.system.normal.data + 24 * base, f.shape.slot_adr.data,
+    f.shape.fan_node.data, f.shape.bend_adr.data, f.shape.bend_node.data, f.tissue.bend_gain.data,
+    f.state.step.data[4 * world + 1], f.shape.nhingeslice > 0
+  };
+}
+
+// Row s of A z, where z is `own`:
+//   diag own + sum_j block_j (z_j - own) + bend normal sum_j gain_j (normal_j . z_j),
+// the last term with bending only. `z` says how a vector is read: `Vectors` or `Quads`.
+template <class Vector>
+PALPATE V3 product(const Matrix& a, const Vector& z, V3 own, int s, Lane lane) {
+  Carried out = ld(a.diag, s, lane) * own;
+  {
+    const int row = a.slot[s], width = a.slot[s + 1] - row;
+    const float* block = a.block + 72 * (size_t)row;
+    z.each_near(a.fan + 8 * (row + 2 * s + 1), width, lane, [&](V3 near) {
+      out = out + ld9(block, lane) * (near - own);
+      block += 72;
+    });
+  }
+  if (a.bends) {
+    const int row = a.bend_row[s], width = a.bend_row[s + 1] - row;
+    const float* gain = a.bend_gain + 8 * row;
+    V sum = splat(0.0f);
+    int i = 0;
+    z.each_bent(a.bend_node + 8 * row, width, lane, [&](V near) {
+      sum += ld(gain, i++, lane) * near;
+    });
+    out = out + (a.bend * sum) * ld3(a.normal + 24 * s, lane);
+  }
+  return out;
+}
+
+// D^-1 r, D the diagonal blocks.
+PALPATE V3 precondition(const Matrix& a, V3 r, int s, Lane lane) {
+  return ld6(a.inverse + 48 * s, lane) * r;
+}
+
+// A vector in memory and its components along the normals, which neighbours read after a meeting.
+struct Vectors {
+  template <class Team>
+  PALPATE void next(Team&) {}
+  PALPATE void shown() {}
+  PALPATE void show(int s, V3 a, Lane lane) { st3(z + 24 * s, a, lane); }
+  PALPATE void show_normal(int s, V a, Lane lane) { st(zn, s, a, lane); }
+  PALPATE V3 own(int s, Lane lane) const { return ld3(z + 24 * s, lane); }
+  template <class Body>
+  PALPATE void each_near(const int* node, int width, Lane lane, Body body) const {
+    for (int i = 0; i < width; ++i, node += 8) INLINED body(gather3(z, node, lane));
+  }
+  template <class Body>
+  PALPATE void each_bent(const int* node, int width, Lane lane, Body body) const {
+    for (int i = 0; i < width; ++i, node += 8) INLINED body(gather(zn, node, 0, lane));
+  }
+
+  float* z;
+  float* zn;
+};
+
+}  // namespace palpate

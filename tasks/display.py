@@ -1,0 +1,84 @@
+"""The screen: whether there is one, how to draw without, and MuJoCo's window on an exercise."""
+
+from __future__ import annotations
+
+import atexit
+import ctypes.util
+import os
+import sys
+import threading
+from collections.abc import Callable
+from typing import Any
+
+_PATIENCE = 5.0  # for the window's thread to end [s]
+
+
+def has_display() -> bool:
+  """Returns whether a window can be opened, as far as the environment tells."""
+  if not sys.platform.startswith("linux"):
+    return True
+  return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def prepare_gl() -> None:
+  """Chooses a way to draw without a screen, unless MUJOCO_GL is set or there is a screen.
+
+  MuJoCo reads the variable once, when it is imported, and so does dm_control.
+  """
+  if "MUJOCO_GL" in os.environ or has_display():
+    return
+  for backend, library in (("egl", "EGL"), ("osmesa", "OSMesa")):
+    if ctypes.util.find_library(library):
+      os.environ["MUJOCO_GL"] = backend
+      return
+
+
+class Window:
+  """MuJoCo's window on an exercise, without panels; it shows what the laparoscope sees."""
+
+  def __init__(self, physics, camera: str, key: Callable[[int], None] | None = None):
+    """Opens the window.
+
+    Args:
+      physics: what it shows
+      camera: name of the camera that it looks through
+      key: called with the GLFW number of a key that is pressed, in the window's thread
+
+    Raises:
+      RuntimeError: there is no display.
+    """
+    if not has_display():
+      raise RuntimeError("no display to open a window on")
+    import mujoco.viewer  # loads the window system
+
+    model = physics.model.ptr
+    self.data, others = physics.data.ptr, set(threading.enumerate())
+    self._handle: Any = mujoco.viewer.launch_passive(
+      model, self.data, key_callback=key, show_left_ui=False, show_right_ui=False
+    )
+    self._threads = set(threading.enumerate()) - others
+    # Python must not end while the window's thread draws: MuJoCo then takes its library away.
+    atexit.register(self.close)
+    self._handle.cam.type = mujoco.mjtCamera.mjCAMERA_FIXED
+    self._handle.cam.fixedcamid = model.camera(camera).id
+    self._look = self._handle.opt.flags.copy(), self._handle.user_scn.flags.copy()
+
+  def __enter__(self) -> Window:
+    return self
+
+  def __exit__(self, *_) -> None:
+    self.close()
+
+  def show(self) -> bool:
+    """Shows the present state; returns whether the window is still open."""
+    with self._handle.lock():  # most letters are switches of the viewer too
+      self._handle.opt.flags[:], self._handle.user_scn.flags[:] = self._look
+    self._handle.sync()
+    return self._handle.is_running()
+
+  def close(self) -> None:
+    """Closes the window and waits for its thread."""
+    atexit.unregister(self.close)
+    self._handle.close()
+    for thread in self._threads:
+      thread.join(_PATIENCE)

@@ -1,0 +1,211 @@
+"""What the metrics of a recording are computed of."""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from . import metrics as m
+from .metrics import METRICS, Metrics, Spec, Unknown, UnknownError
+
+# What is recorded of each instrument, and the width of an entry; force is a vector or a magnitude.
+COLUMNS: dict[str, tuple[int, ...]] = {
+  "tip_pos": (3,),
+  "quat": (4,),
+  "axis": (3,),
+  "force": (3,),
+  "area": (),
+  "grip": (),
+  "held": (),
+  "visible": (),
+}
+
+
+def measure(recording: Any, which: Sequence[int]) -> Metrics:
+  """Returns the metrics of some of the instruments of a `recording.Recording` together."""
+  if len(recording.time) == 0:
+    return Metrics(**dict.fromkeys(METRICS, Unknown("the recording is empty")))
+  each = [Inputs(recording, [i]) for i in which]
+  values = {
+    name: _combine(spec.combine, [inputs.value(name, spec) for inputs in each])
+    for name, spec in METRICS.items()
+    if spec.combine != "all"
+  }
+  together = Inputs(recording, which, values)
+  for name, spec in METRICS.items():
+    if spec.combine == "all":
+      values[name] = together.value(name, spec)
+  return Metrics(**values)
+
+
+class Inputs:
+  """What the arguments of metrics stand for, by their names.
+
+  `time`, the recording's `COLUMNS` and `Settings`, the properties below and, for metrics of all
+  instruments together, the other metrics. Of several instruments the columns are the first one's.
+  """
+
+  def __init__(
+    self, recording: Any, which: Sequence[int], values: Mapping[str, float] | None = None
+  ):
+    """Makes the inputs of some instruments; `values` are metrics that are known already."""
+    self._recording, self._which, self._values = recording, which, values or {}
+    self._settings = dataclasses.asdict(recording.settings)
+    self.time = recording.time
+
+  def value(self, name: str, spec: Spec) -> float:
+    """Returns the value of a metric."""
+    given, absent = {}, []
+    try:
+      for need in spec.needs:
+        value = self._get(name, need)
+        if value is not None:
+          given[need] = value
+        elif need not in spec.may:
+          absent.append(need)
+    except UnknownError as error:
+      return Unknown(str(error), error.fault)
+    if absent:
+      return Unknown(f"{' and '.join(absent)} not recorded")
+    return spec.function(**given)
+
+  def _get(self, metric: str, name: str) -> Any:
+    if name == "time" or isinstance(getattr(type(self), name, None), property):
+      return getattr(self, name)
+    if name in self._settings:
+      value = self._settings[name]
+      return math.nan if value is None else value
+    if name in self._values:
+      return self._values[name]
+    if name in COLUMNS:
+      return self._recording.column(name, self._which[0])
+    raise TypeError(f"metric {metric!r}: no input {name!r}, see {type(self).__name__}")
+
+  @property
+  def axis(self) -> np.ndarray | None:
+    """Direction of the shaft in the world  (nstep, 3)."""
+    axis, quat = (self._recording.column(name, self._which[0]) for name in ("axis", "quat"))
+    if axis is None and quat is not None:
+      return _rotate(quat, self._settings["local_axis"])
+    return axis
+
+  @property
+  def moved(self) -> bool:
+    """Whether the tip is known to have moved."""
+    pos = self._recording.column("tip_pos", self._which[0])
+    return pos is not None and not math.isnan(m.path_length(pos))
+
+  @property
+  def speed(self) -> np.ndarray:
+    """Speed in each interval [m/s]  (nstep - 1,)."""
+    return self._speed(0)
+
+  @property
+  def speeds(self) -> list[np.ndarray]:
+    """The same of every instrument  (ninstrument, nstep - 1)."""
+    return [self._speed(k) for k in range(len(self._which))]
+
+  @property
+  def first_speed(self) -> np.ndarray:
+    """Speed of the first of two instruments [m/s]  (nstep - 1,)."""
+    return self._one_of_two(0)
+
+  @property
+  def second_speed(self) -> np.ndarray:
+    """Speed of the second [m/s]  (nstep - 1,)."""
+    return self._one_of_two(1)
+
+  def _one_of_two(self, k: int) -> np.ndarray:
+    if len(self._which) < 2:
+      raise UnknownError("a single instrument")
+    return self._speed(k)
+
+  @functools.cached_property
+  def _even(self) -> tuple[np.ndarray, float]:
+    return m.uniform_speed(self.time, self._position(0))
+
+  @property
+  def even_speed(self) -> np.ndarray:
+    """Speed at a constant rate [m/s]  (n,)."""
+    return self._even[0]
+
+  @property
+  def rate(self) -> float:
+    """That rate [1/s]."""
+    return self._even[1]
+
+  @property
+  def kinds(self) -> list[str]:
+    """Kinds of the instruments' events."""
+    return [e.kind for e in self._recording.events if e.instrument in self._which]
+
+  @property
+  def watched(self) -> set[str]:
+    """Kinds of event that were looked for: an event shows that its kind was."""
+    return {*self._recording.watch, *(e.kind for e in self._recording.events)}
+
+  @property
+  def target_distance(self) -> list[float]:
+    """Distances to the targets that were touched [m]."""
+    return [
+      math.nan if e.value is None else e.value
+      for e in self._recording.events
+      if e.kind == "target" and e.instrument in self._which
+    ]
+
+  @property
+  def curve(self) -> np.ndarray:
+    """Corners of the polyline to trace [m]  (ncorner, 3)."""
+    if "curve" not in self._recording.constants:
+      raise UnknownError("no curve to trace")
+    return self._recording.constants["curve"]
+
+  @property
+  def touching_pos(self) -> np.ndarray:
+    """Tip positions in contact, all of them where no force was recorded [m]  (n, 3)."""
+    return self._tracing(lambda touch: touch)
+
+  @property
+  def traced_pos(self) -> np.ndarray:
+    """Tip positions from the first to the last contact [m]  (n, 3)."""
+    return self._tracing(lambda touch: slice(touch[0], touch[-1] + 1))
+
+  def _tracing(self, choose: Callable[[np.ndarray], Any]) -> np.ndarray:
+    _ = self.curve  # without one nothing is traced
+    pos, force = self._position(0), self._recording.column("force", self._which[0])
+    if force is None:
+      return pos
+    touch = (m.magnitude(force) > self._settings["contact_force"]).nonzero()[0]
+    if len(touch) == 0:
+      raise UnknownError("no contact")
+    return pos[choose(touch)]
+
+  def _position(self, k: int) -> np.ndarray:
+    pos = self._recording.column("tip_pos", self._which[k])
+    if pos is None:
+      raise UnknownError("tip_pos not recorded")
+    return pos
+
+  def _speed(self, k: int) -> np.ndarray:
+    return m.speed(self.time, self._position(k))
+
+
+def _combine(how: str, values: Sequence[float]) -> float:
+  """Returns one value of several instruments; bad data of one makes all unknown, absence not."""
+  for value in values:
+    if isinstance(value, Unknown) and value.fault:
+      return value
+  known = [v for v in values if not math.isnan(v)]
+  if not known:
+    return values[0]
+  return max(known) if how == "max" else sum(known) / (len(known) if how == "mean" else 1)
+
+
+def _rotate(quat: np.ndarray, axis: Sequence[float]) -> np.ndarray:
+  """Returns a vector of the tip's frame in the world  (nstep, 3)."""
+  w, v = quat[:, :1], quat[:, 1:]
+  twice = 2 * np.cross(v, np.asarray(axis, np.float64))
+  return np.asarray(axis, np.float64) + w * twice + np.cross(v, twice)

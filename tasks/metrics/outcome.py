@@ -1,0 +1,131 @@
+"""What came of it: errors, grasps, targets and traces."""
+
+import itertools
+import math
+from collections.abc import Collection, Iterable
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.distance import cdist
+
+from .definition import UnknownError, metric
+from .samples import rows, same
+
+EVENTS = ("target", "miss", "drop", "unintended_contact", "slip", "note")
+ERRORS = ("miss", "drop", "unintended_contact")
+
+
+def count_events(kinds: Iterable[str], wanted: Iterable[str]) -> float:
+  """Returns how many events are of the wanted kinds [count]."""
+  wanted = frozenset(wanted)
+  return float(sum(str(kind) in wanted for kind in kinds))
+
+
+@metric("Errors", "count", "safety", "all", "10.1186/s12893-020-00839-z")
+def errors(kinds: Iterable[str], watched: Collection[str]) -> float:
+  """Returns the number of misses, drops and unintended contacts [count], lower is better.
+
+  Args:
+    kinds: of the events that there were
+    watched: kinds that were looked for
+  """
+  if not set(ERRORS) & set(watched):
+    raise UnknownError("no kind of error was watched for")
+  return count_events(kinds, ERRORS)
+
+
+@metric("Grasp slips", "count", "safety", "sum", "GOALS tissue handling")
+def grasp_slips(
+  grip: ArrayLike | None = None,
+  held: ArrayLike | None = None,
+  kinds: Iterable[str] = (),
+  watched: Collection[str] = (),
+) -> float:
+  """Returns how many grasps are lost before release [count], lower is better (GOALS).
+
+  Args:
+    grip: above 0.5 where the jaw is told to close  (nstep,)
+    held: above 0.5 where the jaw holds tissue  (nstep,)
+    kinds: of the events, of which the slips are counted where grip or held is None
+    watched: kinds of events that were looked for
+  """
+  if grip is None or held is None:
+    if "slip" in watched:
+      return count_events(kinds, ["slip"])
+    absent = [name for name, value in (("grip", grip), ("held", held)) if value is None]
+    raise UnknownError(f"{' and '.join(absent)} not recorded")
+  closed = rows("grip", grip) > 0.5
+  held = same("held", rows("held", held), closed) > 0.5
+  if not held.any():
+    raise UnknownError("nothing was grasped")
+  return int(np.count_nonzero(held[:-1] & ~held[1:] & closed[1:]))
+
+
+@metric("Target error", "m", "outcome", "all", "Perk Tutor")
+def target_error(target_distance: ArrayLike) -> float:
+  """Returns the mean distance to the target at touch [m], lower is better (Perk Tutor).
+
+  Args:
+    target_distance: one a touch [m]  (n,)
+  """
+  touched = rows("target_distance", target_distance, least=0)
+  if len(touched) == 0:
+    raise UnknownError("no target was touched")
+  return float(touched.mean())
+
+
+@metric("Tracing error (Frechet)", "m", "outcome", "all", "Perk Tutor; Eiter and Mannila 1994")
+def trace_frechet(traced_pos: ArrayLike, curve: ArrayLike) -> float:
+  """Returns the discrete Frechet distance of the tip's path to a curve [m], lower is better.
+
+  Eiter and Mannila 1994, on the curve with points added every 1/256 of its length. Both run in
+  their order: a curve traced backwards scores badly. Above the continuous distance by at most the
+  largest gap between neighbouring samples.
+
+  Args:
+    traced_pos: tip position from the first to the last contact [m]  (n, 3)
+    curve: corners of the polyline [m]  (ncorner, 3)
+  """
+  pos = rows("tip_pos", traced_pos, 3)
+  curve = rows("curve", curve, 3, least=2)
+  at = np.concatenate([[0.0], np.linalg.norm(np.diff(curve, axis=0), axis=1).cumsum()])
+  fine = np.union1d(at, np.linspace(0, at[-1], 257))
+  if len(fine) < 2:
+    raise UnknownError("the curve has no length")
+  distance = cdist(pos, np.stack([np.interp(fine, at, column) for column in curve.T], axis=1))
+  n, m = distance.shape
+  flat = distance.ravel()
+  # Anti-diagonals i + j = k do not depend on themselves; entry i + 1 belongs to row i.
+  before, last, new = np.full((3, n + 1), np.inf)
+  before[0] = -np.inf  # the way into (0, 0)
+  for k in range(n + m - 1):
+    low, high = max(0, k - m + 1), min(k, n - 1) + 1
+    cost = flat[k + low * (m - 1) : k + (high - 1) * (m - 1) + 1 : m - 1]
+    here = new[low + 1 : high + 1]
+    np.minimum(last[low + 1 : high + 1], last[low:high], out=here)
+    np.minimum(here, before[low:high], out=here)
+    np.maximum(here, cost, out=here)
+    before[: low + 2] = np.inf  # becomes `new`, whose rows start one later at most
+    before, last, new = last, new, before
+  return float(last[n])
+
+
+@metric("Tracing error (RMS)", "m", "outcome", "all", "Perk Tutor")
+def trace_rms(touching_pos: ArrayLike, curve: ArrayLike) -> float:
+  """Returns the root mean square distance of the tip to a polyline [m], lower is better.
+
+  Perk Tutor.
+
+  Args:
+    touching_pos: tip position while in contact [m]  (n, 3)
+    curve: corners of the polyline [m]  (ncorner, 3)
+  """
+  pos = rows("tip_pos", touching_pos, 3)
+  curve = rows("curve", curve, 3, least=2)
+  least = np.full(len(pos), np.inf)
+  for start, end in itertools.pairwise(curve):  # a polyline has few segments
+    along = end - start
+    share = np.clip((pos - start) @ along / max(along @ along, np.finfo(float).tiny), 0, 1)
+    gap = pos - start - share[:, None] * along
+    np.minimum(least, (gap * gap).sum(axis=1), out=least)
+  return math.sqrt(least.mean())

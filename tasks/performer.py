@@ -1,0 +1,251 @@
+"""Scripted performers: an expert for every exercise, and novices that differ in stated ways.
+
+What to do is the task's method `expert`, beside the task; how it is done, the `Style`, is here.
+
+A performer is made for an environment and called with each time step; it returns the action:
+
+    performer = make(env, seed=0)
+    timestep = env.reset()
+    while not timestep.last():
+      timestep = env.step(performer(timestep))
+
+Scripts see the simulation (targets, triangles, forces), not the observations only: they are
+there to show that an exercise can be solved and to be measured against, not to be learned from.
+"""
+
+import dataclasses
+import importlib
+import math
+import os
+import sys
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+from dm_control.rl import control
+from palpate.models import trocar
+
+from .base import AXES, CONTROL_TIMESTEP, RATES
+
+Act = Callable[[Any], Any]
+Script = Iterator[np.ndarray]
+
+
+@dataclasses.dataclass(frozen=True)
+class Style:
+  """How a performer differs from the expert; the default is the expert.
+
+  Attributes:
+    tremor: root mean square of the trembling of the tip in each direction, 4 to 10 Hz [m]
+    overshoot: how far a movement goes beyond its end, as a share of its length [-]
+    delay: pause before each movement [s]
+    force: factor on the forces that are pressed, pulled and gripped with [-]
+    detour: how far a movement bends aside, as a share of its length [-]
+    speed: factor on the speed of movements [-]
+  """
+
+  tremor: float = 0.0
+  overshoot: float = 0.0
+  delay: float = 0.0
+  force: float = 1.0
+  detour: float = 0.0
+  speed: float = 1.0
+
+
+EXPERT = Style()
+NOVICES = {
+  "tremor": Style(tremor=0.0008),
+  "overshoot": Style(overshoot=0.25),
+  "delay": Style(delay=0.6, speed=0.6),
+  "force": Style(force=2.0),
+  "detour": Style(detour=0.5),
+}
+STYLES = {"expert": EXPERT, **NOVICES}
+_WIDE = 1.0  # action of the jaw: wide open
+_GRIP = 2.4  # force that holds the organ [N]
+_TREMOR_HZ = np.array([4.0, 5.3, 7.1, 8.6, 10.0])
+
+
+def make(env: control.Environment, who: str | Style = EXPERT, seed: int = 0) -> Act:
+  """Returns who acts in an environment, to be called with each time step.
+
+  Args:
+    env: of one of the suite's tasks
+    who: a `Style`, a name of `STYLES`, or "module:object": a class is made with (env, seed) and its
+      object called with each time step; anything else is called with the observation
+    seed: of what is random in a scripted performer
+  """
+  if isinstance(who, Style):
+    return Performer(env, who, seed)
+  found = find(who)
+  if isinstance(found, Style):
+    return Performer(env, found, seed)
+  if not isinstance(found, type):
+    return lambda timestep: found(timestep.observation)
+  try:
+    return found(env, seed)
+  except Exception as error:
+    raise ValueError(f"policy {who!r}: {type(error).__name__}: {error}") from error
+
+
+def find(who: str, *others: str) -> Any:
+  """Returns the style or the object that a name stands for; ValueError says what is wrong with it.
+
+  Args:
+    who: see `make`
+    *others: names that the caller takes as well, for the message
+  """
+  if ":" not in who:
+    if who not in STYLES:
+      names = ", ".join((*STYLES, *others))
+      raise ValueError(f"performer is {who!r}, expected one of {names} or module:object")
+    return STYLES[who]
+  module, _, name = who.partition(":")
+  if not module or not name:
+    raise ValueError(f"policy is {who!r}, expected module:object")
+  if os.getcwd() not in sys.path:
+    sys.path.insert(0, os.getcwd())
+  try:
+    found: Any = importlib.import_module(module)
+  except (Exception, SystemExit) as error:
+    raise ValueError(f"policy {who!r}: {type(error).__name__}: {error}") from error
+  for part in name.split("."):
+    if not hasattr(found, part):
+      raise ValueError(f"policy {who!r}: {module} has no {name!r}")
+    found = getattr(found, part)
+  if not callable(found):
+    raise ValueError(f"policy {who!r} is a {type(found).__name__}, expected something to call")
+  return found
+
+
+class Performer:
+  """Follows the script of the environment's task; starts it again with each episode."""
+
+  def __init__(self, env: control.Environment, style: Style = EXPERT, seed: int = 0):
+    """Makes a performer in a style; see `make`."""
+    self.env, self.style = env, style
+    self.physics: Any = env.physics
+    self.task: Any = env.task
+    self.random = np.random.RandomState(seed)
+    self._steps: Script | None = None
+
+  def __call__(self, timestep: Any) -> np.ndarray:
+    """Returns the action for a time step."""
+    if timestep.first() or self._steps is None:
+      self.trocar = self.physics.trocar()
+      joints = self.physics.drive_targets()[[0, 1, 3]]
+      self.tip = trocar.forward(self.trocar, joints)  # where the tip is told to be
+      self.roll = float(self.physics.drive_targets()[2])
+      self.extra = np.zeros(len(self.task.components) - len(AXES))
+      self._phase = self.random.uniform(0, 2 * math.pi, (len(_TREMOR_HZ), 3))
+      script: Script = self.task.expert(self)
+      self._steps = script
+    try:
+      return next(self._steps)
+    except StopIteration:
+      self._steps = self.wait(math.inf)
+      return next(self._steps)
+
+  # Words of the scripts.
+
+  def step(self) -> np.ndarray:
+    """Returns the action that takes the drives towards `tip`, `roll` and `extra`."""
+    tip = self.tip
+    if self.style.tremor:
+      wave = np.sin(2 * math.pi * _TREMOR_HZ[:, None] * self.physics.time() + self._phase)
+      tip = tip + self.style.tremor * math.sqrt(2 / len(_TREMOR_HZ)) * wave.sum(axis=0)
+    pitch, yaw, insertion = trocar.inverse(self.trocar, tip, check=False)
+    goal = np.array([pitch, yaw, self.roll, insertion])
+    move = (goal - self.physics.drive_targets()) / (np.array(RATES) * CONTROL_TIMESTEP)
+    return np.concatenate([np.clip(move, -1, 1), self.extra])
+
+  def wait(self, duration: float) -> Script:
+    """Holds still for a time [s]."""
+    for _ in range(int(min(duration / CONTROL_TIMESTEP, 10**9))):
+      yield self.step()
+
+  def move(self, goal: np.ndarray, speed: float = 0.05) -> Script:
+    """Moves the tip along a minimum-jerk line; `speed` is its mean [m/s] (Flash, Hogan 1985)."""
+    yield from self.wait(self.style.delay)
+    start, goal = self.tip.copy(), np.asarray(goal, float)
+    length = float(np.linalg.norm(goal - start))
+    if length < 1e-6:
+      return
+    points = [goal]
+    if self.style.detour and length > 0.008:
+      aside = np.cross(goal - start, self.random.normal(size=3))
+      aside *= self.style.detour * length / np.linalg.norm(aside)
+      # Bends away from the organ, not into it.
+      outward = self.trocar.pos - start
+      aside *= math.copysign(1, float(aside @ outward))
+      points.insert(0, (start + goal) / 2 + aside)
+    if self.style.overshoot and length > 0.008:
+      over = goal + self.style.overshoot * (goal - start)
+      points.insert(-1, over)
+    for point in points:
+      yield from self._line(point, speed * self.style.speed)
+
+  def _line(self, goal: np.ndarray, speed: float) -> Script:
+    start = self.tip.copy()
+    steps = max(2, round(float(np.linalg.norm(goal - start)) / speed / CONTROL_TIMESTEP))
+    for k in range(1, steps + 1):
+      s = k / steps
+      self.tip = start + (goal - start) * (10 * s**3 - 15 * s**4 + 6 * s**5)
+      yield self.step()
+
+  def push(self, force: float, along: np.ndarray, until: Callable[[], bool], most=5.0) -> Script:
+    """Presses with a force [N] along a direction until a condition or for `most` seconds."""
+    contact = 0.0  # time in contact [s]
+    for _ in range(round(most / CONTROL_TIMESTEP)):
+      if until():
+        return
+      measured = float(np.linalg.norm(self.physics.contact_force()))
+      contact += CONTROL_TIMESTEP if measured > 0.02 else 0.0
+      speed = np.clip(0.06 * (force * self.excess(contact) - measured), -0.02, 0.012)
+      self.tip = self.tip + speed * CONTROL_TIMESTEP * along
+      yield self.step()
+
+  def excess(self, contact: float) -> float:
+    """Returns the factor on force: too much at first, then corrected within a second or two."""
+    return 1 + (self.style.force - 1) * math.exp(-max(contact - 0.4, 0.0))
+
+  def sink(self, depth: float, point: np.ndarray, along: np.ndarray, until: Callable[[], bool]):
+    """Presses to a depth [m] below a point until a condition, for 5 s at most."""
+    contact = 0.0
+    for _ in range(round(5 / CONTROL_TIMESTEP)):
+      if until():
+        return
+      now = float((self.physics.tip_pos() - point) @ along)
+      contact += CONTROL_TIMESTEP if now > 0 else 0.0
+      speed = np.clip(8 * (depth * self.excess(contact) - now), -0.02, 0.015)
+      self.tip = self.tip + speed * CONTROL_TIMESTEP * along
+      yield self.step()
+
+  def close(self, site: int) -> Script:
+    """Grasps a triangle: opens above it, goes down over it, and closes to a gentle force."""
+    physics, up = self.physics, self.physics.trocar().mat[:, 2]
+    self.roll, self.extra[:] = 0.0, _WIDE
+    yield from self.move(physics.point(site) + 0.012 * up)
+    yield from self.wait(0.2)
+    yield from self.move(physics.point(site) - 0.009 * up, speed=0.03)
+    while self.extra[0] > -0.35:
+      self.extra[0] -= 0.06
+      yield self.step()
+    for _ in range(100):
+      force = float(physics.gripper()[2:].max())
+      self.extra[0] -= float(np.clip(0.02 * (_GRIP * self.excess(0.0) - force), -0.01, 0.01))
+      yield self.step()
+      if abs(force - _GRIP * self.excess(0.0)) < 0.25 and physics.holds():
+        return
+
+  def grip(self, contact: float) -> None:
+    """Keeps the force of the jaws, which have held for a time [s]."""
+    force = float(self.physics.gripper()[2:].max())
+    self.extra[0] -= float(np.clip(0.01 * (_GRIP * self.excess(contact) - force), -0.005, 0.005))
+    self.extra[0] = float(np.clip(self.extra[0], -1, -0.3))
+
+  def open(self) -> Script:
+    """Lets go."""
+    while self.extra[0] < 0.1:
+      self.extra[0] += 0.06
+      yield self.step()

@@ -1,0 +1,239 @@
+"""Figures of a recording: the tip's path, the force, the speed's spectrum.
+
+Needs matplotlib (`palpate[plot]`), which is imported when a figure is drawn and not before.
+"""
+
+import io
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from . import metrics as m
+from .recording import Recording
+
+if TYPE_CHECKING:
+  from matplotlib.figure import Figure
+
+_TIP = ("#1b6ca8", "#2a8f6a", "#8155a3", "#b06a1f")
+_MOST_MARKS = 300  # events that the force's figure shows
+_BAD, _CURVE, _ORGAN, _FAINT = "#c8324b", "#222222", "#e3b5a4", "#8a8f98"
+
+
+def path_figure(recording: Recording) -> "Figure | None":
+  """Returns the tip's path in 3D [mm], over the surface if there is one; None without a path."""
+  paths = [recording.column("tip_pos", i) for i in range(len(recording.instruments))]
+  paths = [None if p is None or not np.isfinite(p).all(axis=1).any() else 1e3 * p for p in paths]
+  if all(p is None for p in paths):
+    return None
+  figure = _figure(7.5, 6.2)
+  from matplotlib import rc_context
+
+  with rc_context({"grid.color": "#dfe3e8"}):
+    ax: Any = figure.add_subplot(projection="3d", computed_zorder=False)
+  bounds = [p[np.isfinite(p).all(axis=1)] for p in paths if p is not None]
+  surface = _surface(recording)
+  if surface is not None:
+    x, y, z = 1e3 * surface[0].T
+    # Translucent, under the path: mplot3d cannot hide a line behind a surface.
+    ax.plot_trisurf(x, y, z, triangles=surface[1], color=_ORGAN, alpha=0.55, linewidth=0, zorder=1)
+    bounds.append(1e3 * surface[0])
+  if "curve" in recording.constants:
+    curve = 1e3 * recording.constants["curve"]
+    # Over the path: a well traced curve would be hidden under it.
+    ax.plot(*curve.T, color=_CURVE, linestyle="--", linewidth=1.2, label="curve to trace", zorder=5)
+    bounds.append(curve)
+  last = max(i for i, path in enumerate(paths) if path is not None)
+  starred = False  # the legend names the stars once
+  for i, path in enumerate(paths):
+    if path is not None:
+      starred |= _draw_tip(ax, recording, i, path, last=i == last, starred=starred)
+  _frame(ax, np.concatenate(bounds))
+  figure.legend(loc="outside right upper", fontsize=9, frameon=False)
+  return figure
+
+
+def _draw_tip(
+  ax: Any, recording: Recording, i: int, path: np.ndarray, last: bool, starred: bool
+) -> bool:
+  """Draws one tip's path [mm] (nstep, 3); returns whether it touched a target."""
+  several = len(recording.instruments) > 1
+  name, color = _label(recording.instruments[i]), _TIP[i % len(_TIP)]
+  ax.plot(*path.T, color=color, linewidth=1.3, zorder=3, label=name if several else "tip")
+  touch = _touching(recording, i)
+  if touch.any():
+    held = np.where(touch[:, None], path, np.nan)
+    label = f"{name} in contact" if several else "in contact"
+    ax.plot(*held.T, color=color if several else _BAD, linewidth=2.2, zorder=4, label=label)
+  ends = path[np.isfinite(path).all(axis=1)][[0, -1]]
+  for k, (marker, word) in enumerate((("o", "start"), ("s", "end"))):
+    ax.plot(
+      *ends[k : k + 1].T, marker, color=color, markersize=7, markeredgecolor="white", zorder=6,
+      label=word if last else None,
+    )  # fmt: skip
+  reached = [e.time for e in recording.events if e.kind == "target" and e.instrument == i]
+  if reached:
+    at = np.stack([np.interp(reached, recording.time, c) for c in path.T])
+    ax.plot(
+      *at, "*", color="#f2b705", markeredgecolor="#5c4700", markersize=9, zorder=7,
+      label="" if starred else "target touched",
+    )  # fmt: skip
+  return bool(reached)
+
+
+def _frame(ax: Any, points: np.ndarray) -> None:
+  """Puts equal axes around all points [mm]  (n, 3)."""
+  low, high = points.min(axis=0), points.max(axis=0)
+  # A flat path must not flatten the box: ticks would run into each other.
+  half = np.maximum((high - low) / 2, 0.2 * (high - low).max() + 1e-3)
+  middle = (low + high) / 2
+  for axis, c, h in zip("xyz", middle, half, strict=True):
+    getattr(ax, f"set_{axis}lim")(c - h, c + h)
+    getattr(ax, f"set_{axis}label")(f"{axis} [mm]", labelpad=6)
+    getattr(ax, f"{axis}axis").set_pane_color((0.97, 0.97, 0.98, 1.0))
+  ax.locator_params(nbins=5)
+  # A tall box would leave the figure.
+  ax.set_box_aspect(half, zoom=min(1.0, 0.72 * float(np.linalg.norm(half) / half[2])))
+  ax.view_init(elev=28, azim=-55)
+
+
+def force_figure(recording: Recording) -> "Figure | None":
+  """Returns the contact force over time with its limit; None where no force was recorded."""
+  forces = [recording.force(i) for i in range(len(recording.instruments))]
+  if all(f is None for f in forces) or len(recording.time) == 0:
+    return None
+  figure = _figure(9, 3.4)
+  ax = figure.add_subplot()
+  time = recording.time - recording.time[0]
+  limit = recording.settings.force_limit
+  top = max((np.nanmax(f) for f in forces if f is not None), default=0.0)
+  for i, force in enumerate(forces):
+    if force is None:
+      continue
+    color = _TIP[i % len(_TIP)]
+    name = _label(recording.instruments[i]) if len(forces) > 1 else "contact force"
+    ax.plot(time, force, color=color, linewidth=1.3, label=name)
+    if limit is not None:
+      over = np.nan_to_num(force) > limit
+      ax.fill_between(
+        time, limit, force, where=over.tolist(), interpolate=True, color=_BAD, alpha=0.35,
+        linewidth=0, label="over the limit" if i == 0 and over.any() else None,
+      )  # fmt: skip
+  if limit is not None:
+    ax.axhline(limit, color=_BAD, linestyle="--", linewidth=1.2, label=f"limit {limit:g} N")
+    top = max(top, limit)
+  top = 1.25 * top if top > 0 else 1.0
+  marks: dict[float, list[str]] = {}  # events of one moment share a line
+  for event in recording.events:
+    marks.setdefault(event.time - recording.time[0], []).append(event.label or event.kind)
+  if len(marks) <= _MOST_MARKS:  # more would be a grey wall, drawn for minutes
+    ax.vlines(list(marks), 0, top, color=_FAINT, linewidth=0.8, linestyle=":")
+  if len(marks) <= 12:
+    for at, words in marks.items():
+      late = at > 0.96 * time[-1]  # its words would leave the plot
+      ax.annotate(
+        ", ".join(_label(word) for word in words), (at, top), xytext=(-3 if late else 3, -3),
+        textcoords="offset points", fontsize=8, color="#5d6472", rotation=90, va="top",
+        ha="right" if late else "left",
+      )  # fmt: skip
+  ax.set_ylim(0, top)
+  ax.set_xlim(0, max(time[-1], 1e-9))
+  ax.set_xlabel("time [s]")
+  ax.set_ylabel("force [N]")
+  _tidy(ax)
+  _legend_above(ax)
+  return figure
+
+
+def spectrum_figure(recording: Recording) -> "Figure | None":
+  """Returns the speed spectrum with the cut-offs of SPARC; None where no tip moved."""
+  spectra = []
+  for i in range(len(recording.instruments)):
+    pos = recording.column("tip_pos", i)
+    try:
+      if pos is not None:
+        values, rate = m.uniform_speed(recording.time, pos)
+        spectra.append((i, m.sparc(values, rate), *m.speed_spectrum(values, rate)))
+    except m.UnknownError:
+      continue
+  if not spectra:
+    return None
+  figure = _figure(9, 3.4)
+  ax = figure.add_subplot()
+  for i, value, freq, amplitude, cut in spectra:
+    color = _TIP[i % len(_TIP)]
+    name = f"{_label(recording.instruments[i])}: " if len(recording.instruments) > 1 else ""
+    ax.plot(freq, amplitude, color=color, linewidth=0.9, alpha=0.5)
+    label = f"{name}SPARC {m.number(round(value, 2))}"
+    ax.plot(freq[:cut], amplitude[:cut], color=color, linewidth=2, label=label)
+    ax.plot(freq[cut - 1], amplitude[cut - 1], "o", color=color, markersize=5)
+  ax.axvline(
+    m.SPARC_CUTOFF, color=_CURVE, linestyle="--", linewidth=1, label=f"{m.SPARC_CUTOFF:g} Hz"
+  )
+  ax.axhline(
+    m.SPARC_AMPLITUDE, color=_CURVE, linestyle=":", linewidth=1,
+    label=f"amplitude {m.SPARC_AMPLITUDE:g}",
+  )  # fmt: skip
+  ax.set_xlim(0, min(1.2 * m.SPARC_CUTOFF, max(s[2][-1] for s in spectra)))
+  # Logarithmic: what decides the cut-off is 20 times lower than the peak at 0 Hz.
+  ax.set_yscale("log")
+  ax.set_ylim(5e-3, 1.2)
+  ax.set_yticks([0.01, 0.05, 0.1, 0.5, 1], ["0.01", "0.05", "0.1", "0.5", "1"], minor=False)
+  ax.set_xlabel("frequency [Hz]")
+  ax.set_ylabel("normalised speed amplitude")
+  _tidy(ax)
+  _legend_above(ax)
+  return figure
+
+
+def png(figure: "Figure") -> bytes:
+  """Returns a figure as PNG."""
+  buffer = io.BytesIO()
+  figure.savefig(buffer, format="png", dpi=120, facecolor="white")
+  return buffer.getvalue()
+
+
+def _figure(width: float, height: float) -> "Figure":
+  try:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+  except ImportError as error:
+    raise ImportError("the report draws with matplotlib: pip install 'palpate[plot]'") from error
+  # No pyplot: its global state and the caller's backend stay as they are.
+  figure = Figure((width, height), layout="constrained")
+  FigureCanvasAgg(figure)
+  return figure
+
+
+def _tidy(ax: Any) -> None:
+  ax.spines[["top", "right"]].set_visible(False)
+  ax.grid(color="#e4e7ec", linewidth=0.7)
+  ax.set_axisbelow(True)
+
+
+def _legend_above(ax: Any) -> None:
+  # Above the plot, where it can hide neither a peak nor an event.
+  ax.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=6, fontsize=9, frameon=False)
+
+
+def _label(text: str) -> str:
+  """Returns the caller's text for a plot: short, and never read as a formula."""
+  text = " ".join(text.split())
+  text = text if len(text) <= 24 else text[:23] + "…"
+  # A label with a leading underscore would drop out of the legend.
+  return text.replace("\\", "/").replace("$", r"\$").lstrip("_") or "-"
+
+
+def _surface(recording: Recording) -> tuple[np.ndarray, np.ndarray] | None:
+  vertices, triangles = (recording.constants.get(k) for k in ("vertices", "triangles"))
+  if vertices is None or triangles is None or not len(triangles):
+    return None
+  if triangles.dtype.kind not in "iu" or triangles.min() < 0 or triangles.max() >= len(vertices):
+    raise ValueError(f"triangles must be indices of the {len(vertices)} vertices")
+  return vertices, triangles
+
+
+def _touching(recording: Recording, instrument: int) -> np.ndarray:
+  force = recording.force(instrument)
+  if force is None:
+    return np.zeros(len(recording.time), bool)
+  return np.nan_to_num(force) > recording.settings.contact_force
