@@ -30,35 +30,7 @@ from sources import (
 FLOORS = ("native", "tissue", "engine", "organ", "models", "tasks", "app")
 LARGE = {"file": 450, "function": 60, "native function": 70}
 
-NOT_YET = {
-  "no import of what is always there in a function": {
-    "models/cling.py",
-    "models/field.py",
-    "models/grid.py",
-    "models/losses.py",
-    "models/necks.py",
-    "models/parts.py",
-    "models/quality.py",
-    "models/remesh.py",
-    "models/repair.py",
-    "models/shapes.py",
-    "models/volume.py",
-    "plugin/meshes.py",
-  },
-  "tests use public names": {
-    "tests/app/test_wrap_command.py: _picture",
-  },
-  "files": {
-    "tests/engine/test_plugin.py",
-    "tests/models/test_wrap.py",
-  },
-  "functions": {
-    "models/grid.py",
-    "models/markup.py",
-    "plugin/authoring.py",
-    "plugin/windows.py",
-  },
-}
+NOT_YET: dict[str, set[str]] = {}
 
 
 # Imports.
@@ -68,8 +40,6 @@ def floor(module: str) -> int:
   """Returns the floor of a module of the package."""
   words = module.split(".")
   room = words[1] if len(words) > 1 else "organ"  # palpate itself: the handle and register
-  room = {"__main__": "app"}.get(room, room)
-  return FLOORS.index(room if room in FLOORS else "organ")  # windows and others beside the handle
 
 
 def inner() -> list[tuple[str, str, bool]]:
@@ -107,9 +77,7 @@ def cycles() -> set[str]:
 
 def hidden() -> set[str]:
   """Returns imports of the package inside of functions, below the roof."""
-  return {
-    f"{a} -> {b}" for a, b, inside in inner() if inside and floor(a) < 6 and a != "palpate"
-  }
+  return {f"{a} -> {b}" for a, b, inside in inner() if inside and floor(a) < 6 and a != "palpate"}
 
 
 def hidden_needs() -> set[str]:
@@ -127,9 +95,7 @@ def hidden_needs() -> set[str]:
 
 def mujoco_in_tissue() -> set[str]:
   engines = ("mujoco", "mujoco_warp", "dm_control")
-  return {
-    f"{a} -> {b}" for a, b, _ in imports() if floor(a) < 2 and b.partition(".")[0] in engines
-  }
+  return {f"{a} -> {b}" for a, b, _ in imports() if floor(a) < 2 and b.partition(".")[0] in engines}
 
 
 # Private names.
