@@ -30,7 +30,15 @@ from sources import (
 FLOORS = ("native", "tissue", "engine", "organ", "models", "tasks", "app")
 LARGE = {"file": 450, "function": 60, "native function": 70}
 
-NOT_YET: dict[str, set[str]] = {}
+NOT_YET = {
+  "files": {
+    "tests/engine/test_plugin.py",
+  },
+  "functions": {
+    "models/markup.py",
+    "plugin/windows.py",
+  },
+}
 
 
 # Imports.
@@ -40,6 +48,8 @@ def floor(module: str) -> int:
   """Returns the floor of a module of the package."""
   words = module.split(".")
   room = words[1] if len(words) > 1 else "organ"  # palpate itself: the handle and register
+  names = {"__main__": "app"} | dict.fromkeys(("authoring", "meshes", "windows"), "organ")
+  return FLOORS.index(names.get(room, room))
 
 
 def inner() -> list[tuple[str, str, bool]]:
