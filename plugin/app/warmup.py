@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import importlib
-import pkgutil
 import time
 
 from palpate import register
@@ -30,7 +28,7 @@ def main(args: argparse.Namespace) -> int:
     raise CommandError(f"no device {args.device!r}, expected one of {', '.join(known)}")
   progress, rows, total = Progress(), [], 0.0
   for device in [args.device] if args.device else known:
-    for module in [*kernels.MODULES, *modules()]:
+    for module in kernels.MODULES:
       progress.show(f"{module.rpartition('.')[2]} on {device}", always=True)
       start = time.perf_counter()
       wp.load_module(module, device=device)
@@ -39,17 +37,3 @@ def main(args: argparse.Namespace) -> int:
   progress.clear()
   print(table([*rows, ("all", f"{total:.2f} s")]))
   return 0
-
-
-def modules() -> list[str]:
-  """Returns the names of this package's modules that hold kernels."""
-  import warp as wp
-  from palpate import engine, tissue
-
-  found = []
-  for room in (engine, tissue):
-    for info in pkgutil.iter_modules(room.__path__):
-      module = importlib.import_module(f"{room.__name__}.{info.name}")
-      if any(isinstance(value, wp.Kernel) for value in vars(module).values()):
-        found.append(module.__name__)
-  return found
