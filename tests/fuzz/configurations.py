@@ -43,7 +43,8 @@ def draw(seed: int) -> tuple[bool, bool, dict]:
   window, sensible = bool(random.randint(2)), bool(random.randint(2))
   keys: dict = {}
   for key in random.permutation(config.KEYS)[: random.randint(0, 9)]:
-    if key in ("window", "mass") and (sensible or not window):  # given by the scene
+    given = key in ("window", "mass") or (key == "pin" and not window)  # by the scene
+    if given and (sensible or not window):
       continue
     if sensible and (key == "stiffness" or (key in ("follow", "pin", "resident") and not window)):
       continue
