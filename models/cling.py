@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+from scipy.ndimage import distance_transform_edt
+from scipy.spatial import KDTree
 
 from . import losses, necks, raster
 from .field import Field
@@ -134,8 +136,6 @@ def _trim(solid: Solid, fine: Mesh, nodes: int) -> tuple[Solid, Mesh, Mesh]:
   A vessel thinner than the edges is gone from a mesh of so many nodes; left in the shape, it would
   draw single nodes out into spikes.
   """
-  from scipy.ndimage import distance_transform_edt
-
   rough = remesh(*fine, nodes, solid.field.projector(), iterations=5)
   edge = quality(*rough).spacing
   made = raster.inside((rough[0], necks.cut(*rough)), solid.grid)
@@ -171,8 +171,6 @@ def _clinging(target: Target, solid: Solid) -> Project:
 
 def _stretch(vertices: np.ndarray, triangles: np.ndarray, solid: Solid, flips: bool) -> Mesh:
   """Returns the mesh with its nearest nodes moved out to corners and edges that it cuts off."""
-  from scipy.spatial import KDTree
-
   spacing, points = solid.field.spacing, solid.exposed
   # The chords of a bend of radius s, the edge length, miss it by s / 8: that is no corner.
   fine = max(0.25 * spacing, 0.15 * quality(vertices, triangles).spacing)

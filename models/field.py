@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Callable
 
 import numpy as np
+from scipy.ndimage import map_coordinates, zoom
 
 # Takes points (n, 3) and returns values (n,), negative inside and close to the distance.
 Implicit = Callable[[np.ndarray], np.ndarray]
@@ -25,8 +26,6 @@ class Field:
 
   def at(self, points: np.ndarray) -> np.ndarray:
     """Returns the distance [m] at points (n, 3), linear between values."""
-    from scipy.ndimage import map_coordinates
-
     index = (points - self.origin).T / self.spacing
     return np.asarray(map_coordinates(self.value, index, order=1, mode="nearest"))
 
@@ -41,8 +40,6 @@ class Field:
 
   def projector(self) -> Callable[[np.ndarray], np.ndarray]:
     """Returns a function that moves points near the surface onto it."""
-    from scipy.ndimage import map_coordinates
-
     slope = np.gradient(self.value, self.spacing)
 
     def project(points):
@@ -62,8 +59,6 @@ class Field:
 
 def tabulate(implicit: Implicit, bounds: np.ndarray, spacing: float) -> Field:
   """Returns the shape on a grid over the bounds (2, 3); exact only near the surface."""
-  from scipy.ndimage import zoom
-
   count = np.ceil((bounds[1] - bounds[0]) / (4 * spacing)).astype(int) * 4 + 1
   origin = bounds.mean(axis=0) - (count - 1) * spacing / 2
   coarse_count = (count - 1) // 4 + 1

@@ -8,6 +8,7 @@ tips, which have four. n x n is n^2 + 2 nodes.
 import numpy as np
 from scipy.sparse import coo_array, diags_array
 from scipy.sparse.linalg import splu
+from scipy.spatial import KDTree
 
 from .quality import angles, normals
 from .remesh import Project, guard, vertex_normals
@@ -147,49 +148,60 @@ def _settle(
   n = len(x)
   laplacian = _laplacian(weight, triangles, n)
   solve = splu((laplacian + 1e-3 * diags_array(np.ones(n))).tocsc()).solve
-
-  def energy(x, facing):
-    """Returns the energy and its gradient; infinite if a triangle turned over."""
-    normal = normals(x, triangles)
-    twice = np.linalg.norm(normal, axis=1)
-    if (np.einsum("md,md->m", normal, facing) <= 0.1 * twice).any():
-      return np.inf, x  # a triangle turned over
-    edge = x[triangles[:, [2, 0, 1]]] - x[triangles[:, [1, 2, 0]]]
-    dirichlet = 0.5 * np.einsum("mk,mkd,mkd->m", weight, edge, edge)
-    ratio = (2 * rest / twice) ** 2
-    pull = weight[:, :, None] * edge
-    slope = (1 + ratio)[:, None, None] * (pull[:, [1, 2, 0]] - pull[:, [2, 0, 1]])
-    of_area = 0.5 * np.cross((normal / twice[:, None])[:, None], edge)
-    slope -= (4 * dirichlet * ratio / twice)[:, None, None] * of_area
-    strain = dirichlet * (1 + ratio) / rest
-    slope *= (_STIFFENING * strain ** (_STIFFENING - 1))[:, None, None]
-    flat = slope.reshape(-1, 3).T
-    gradient = np.stack([np.bincount(triangles.ravel(), f, n) for f in flat], axis=1)
-    return (strain**_STIFFENING * rest).sum(), gradient
-
   size = np.sqrt(rest.sum())
   step = np.inf
   for _ in range(steps):
     facing = normals(x, triangles)
     facing /= np.maximum(np.linalg.norm(facing, axis=1, keepdims=True), 1e-300)
     up = vertex_normals(x, triangles)
-    value, gradient = energy(x, facing)
+    value, gradient = _energy(x, facing, triangles, weight, rest)
     direction = -_along(solve(_along(gradient, up)), up)
     reach = np.abs(direction).max()
     step = min(4 * step, 0.1 * size / reach)
     wanted = 1e-4 * np.einsum("nd,nd->", gradient, direction)
     while step * reach > 1e-9 * size:
       moved = onto(x + step * direction)
-      if energy(moved, facing)[0] <= value + step * wanted:
+      reached = _energy(moved, facing, triangles, weight, rest)[0]
+      if reached <= value + step * wanted:
         break
       step /= 2
     else:
       break
-    gained = value - energy(moved, facing)[0]
+    gained = value - reached
     x = moved
     if gained < 1e-5 * value:
       break
   return x
+
+
+def _energy(
+  x: np.ndarray, facing: np.ndarray, triangles: np.ndarray, weight: np.ndarray, rest: np.ndarray
+) -> tuple[float, np.ndarray]:
+  """Returns the energy and its gradient (n, 3); infinite if a triangle turned over.
+
+  Args:
+    x: nodes                                                    (n, 3)
+    facing: unit normals that the triangles must not turn from  (m, 3)
+    triangles: as in _settle
+    weight: as in _settle
+    rest: as in _settle
+  """
+  normal = normals(x, triangles)
+  twice = np.linalg.norm(normal, axis=1)
+  if (np.einsum("md,md->m", normal, facing) <= 0.1 * twice).any():
+    return np.inf, x  # a triangle turned over
+  edge = x[triangles[:, [2, 0, 1]]] - x[triangles[:, [1, 2, 0]]]
+  dirichlet = 0.5 * np.einsum("mk,mkd,mkd->m", weight, edge, edge)
+  ratio = (2 * rest / twice) ** 2
+  pull = weight[:, :, None] * edge
+  slope = (1 + ratio)[:, None, None] * (pull[:, [1, 2, 0]] - pull[:, [2, 0, 1]])
+  of_area = 0.5 * np.cross((normal / twice[:, None])[:, None], edge)
+  slope -= (4 * dirichlet * ratio / twice)[:, None, None] * of_area
+  strain = dirichlet * (1 + ratio) / rest
+  slope *= (_STIFFENING * strain ** (_STIFFENING - 1))[:, None, None]
+  flat = slope.reshape(-1, 3).T
+  gradient = np.stack([np.bincount(triangles.ravel(), f, len(x)) for f in flat], axis=1)
+  return (strain**_STIFFENING * rest).sum(), gradient
 
 
 def _along(x: np.ndarray, up: np.ndarray) -> np.ndarray:
@@ -201,8 +213,6 @@ def _carry(
   points: np.ndarray, sphere: np.ndarray, vertices: np.ndarray, triangles: np.ndarray
 ) -> np.ndarray:
   """Returns where points on the sphere lie on the surface that the sphere is a map of."""
-  from scipy.spatial import KDTree
-
   middle = sphere[triangles].mean(axis=1)
   middle /= np.linalg.norm(middle, axis=1, keepdims=True)
   _, near = KDTree(middle).query(points, k=min(16, len(triangles)))

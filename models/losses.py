@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.ndimage import binary_dilation, distance_transform_edt, label
 
 from . import raster
 from .field import Field
@@ -161,18 +162,12 @@ def regions(only: np.ndarray, away: np.ndarray, reach: float) -> list[np.ndarray
 
 def _edt(mask: np.ndarray) -> np.ndarray:
   """Returns the distance of every true point to the nearest false one, in spacings."""
-  from scipy.ndimage import distance_transform_edt
-
   return np.asarray(distance_transform_edt(mask))
 
 
 def _label(mask: np.ndarray) -> tuple[np.ndarray, int]:
-  from scipy.ndimage import label
-
   return label(mask)  # pyright: ignore
 
 
 def _grow(mask: np.ndarray, within: np.ndarray, times: int) -> np.ndarray:
-  from scipy.ndimage import binary_dilation
-
   return np.asarray(binary_dilation(mask, iterations=times, mask=within))

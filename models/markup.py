@@ -17,6 +17,8 @@ from .organs import Build
 
 ROOT = pathlib.Path(__file__).parent
 RADIUS = 0.001  # of an organ's flex [m]
+_CAVITY = """<texture name="cavity" type="skybox" builtin="gradient" rgb1="0.42 0.19 0.16"
+  rgb2="0.10 0.03 0.03" width="128" height="128"/>"""
 
 
 def numbers(values, digits: int = 6) -> str:
@@ -154,16 +156,10 @@ def scene(
   entry = build.entry
   whole, root = root is not None, root or str(ROOT)
   backdrop, drawn = _backdrop(entry, root)
-  assets = [f'<model name="{name}" file="{name}.xml"/>'] if whole else []
-  suffix = "_handle" if handle else ""
-  assets += [
-    f'<model name="{i}" file="{root}/instruments/{i}{suffix}.xml"/>'
-    for i in sorted(set(instruments))
-  ]
+  organ = f'<model name="{name}" file="{name}.xml"/>' if whole else ""
   attach = f'<attach model="{name}" prefix="{name}/"/>' if whole else ""
-  inside = "\n".join(filter(None, [drawn, attach]))
-  frame = mjcf.tag("frame", {"name": name, "quat": catalog.SUPINE_QUAT}, inside, digits=6)
-  assets = textwrap.indent("\n".join(assets), "    ")
+  frame = {"name": name, "quat": catalog.SUPINE_QUAT}
+  frame = mjcf.tag("frame", frame, _lines(drawn, attach), digits=6)
   keys = _keys(keyframes(build, instruments, handle)) if whole else ""
   return f"""<mujoco model="{name}_scene">
   <!-- {entry.title}, seen through a laparoscope.
@@ -175,16 +171,28 @@ def scene(
   <size memory="{megabytes(len(build.vertices))}M"/>
 {_visual(build)}
   <asset>
-{assets}
-    <texture name="cavity" type="skybox" builtin="gradient" rgb1="0.42 0.19 0.16"
-      rgb2="0.10 0.03 0.03" width="128" height="128"/>
-{textwrap.indent(backdrop, "    ")}  </asset>
+{textwrap.indent(_lines(organ, _models(instruments, handle, root), _CAVITY, backdrop), "    ")}
+  </asset>
 
   <worldbody>
 {_views(build)}{_ports(build, instruments)}{textwrap.indent(frame, "    ")}
   </worldbody>
 {keys}</mujoco>
 """
+
+
+def _lines(*texts: str) -> str:
+  return "\n".join(filter(None, texts))
+
+
+def _models(instruments: Sequence[str], handle: bool, root: str) -> str:
+  suffix = "_handle" if handle else ""
+  return _lines(
+    *(
+      f'<model name="{each}" file="{root}/instruments/{each}{suffix}.xml"/>'
+      for each in sorted(set(instruments))
+    )
+  )
 
 
 def _visual(build: Build) -> str:
@@ -230,7 +238,7 @@ def _backdrop(entry: catalog.Entry, root: str) -> tuple[str, str]:
   skin = {"name": other, "rgba": catalog.entry(other).rgba, "specular": 0.3, "shininess": 0.5}
   geom = {"name": other, "type": "mesh", "mesh": other, "material": other, "pos": pos}
   geom |= {"contype": 0, "conaffinity": 0, "group": 2}
-  return f"{mjcf.tag('mesh', mesh)}\n{mjcf.tag('material', skin)}\n", mjcf.tag("geom", geom)
+  return _lines(mjcf.tag("mesh", mesh), mjcf.tag("material", skin)), mjcf.tag("geom", geom)
 
 
 def _ports(build: Build, instruments: Sequence[str]) -> str:

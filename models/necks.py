@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from .quality import normals, quality
 from .remesh import Edges
@@ -35,8 +37,6 @@ def cut(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 
 def _loops(triangles: np.ndarray, nodes: int) -> np.ndarray:
   """Returns loops of three edges that are no triangle, (k, 3)."""
-  from scipy.sparse import coo_array
-
   edges = Edges(triangles, nodes)
   a, b = edges.vert.T
   both = np.concatenate([a, b]), np.concatenate([b, a])
@@ -49,9 +49,6 @@ def _loops(triangles: np.ndarray, nodes: int) -> np.ndarray:
 
 def _behind(triangles: np.ndarray, neck: np.ndarray, nodes: int) -> np.ndarray:
   """Returns which triangles are on the side of a loop that has fewer of them."""
-  from scipy.sparse import coo_array
-  from scipy.sparse.csgraph import connected_components
-
   edges = Edges(triangles, nodes)
   open_ = ~np.isin(edges.vert, neck).all(axis=1)
   count = len(triangles)

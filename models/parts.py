@@ -9,6 +9,8 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from . import raster
 from .quality import volume
@@ -59,9 +61,6 @@ def split(vertices: np.ndarray, triangles: np.ndarray) -> list[Part]:
 
 def _pieces(nodes: int, triangles: np.ndarray) -> list[np.ndarray]:
   """Returns the triangles of every closed piece, and of all others together."""
-  from scipy.sparse import coo_array
-  from scipy.sparse.csgraph import connected_components
-
   tail, head = triangles.ravel(), np.roll(triangles, -1, axis=1).ravel()
   graph = coo_array((np.ones(len(tail)), (tail, head)), shape=(nodes, nodes))
   label = connected_components(graph, directed=False)[1]

@@ -3,6 +3,8 @@
 import dataclasses
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,10 +73,6 @@ def volume(vertices: np.ndarray, triangles: np.ndarray) -> float:
 
 def quality(vertices: np.ndarray, triangles: np.ndarray) -> Quality:
   """Returns the quality of a triangle surface; vertices (n, 3) [m], triangles (m, 3)."""
-  # scipy loads its graph code slowly: only when it is asked for.
-  from scipy.sparse import coo_array
-  from scipy.sparse.csgraph import connected_components
-
   n, m = len(vertices), len(triangles)
   tail = triangles.ravel()
   head = np.roll(triangles, -1, axis=1).ravel()

@@ -8,6 +8,7 @@ chosen by rank: the result repeats bit for bit.
 from collections.abc import Callable
 
 import numpy as np
+from scipy.sparse import coo_array
 
 from .quality import angles, normals
 
@@ -281,8 +282,6 @@ def _apart(edges: Edges, pick: np.ndarray, cost: np.ndarray, nodes: int) -> np.n
 
 def _common_neighbours(edges: Edges, nodes: int) -> np.ndarray:
   """Returns how many nodes both ends of every edge are joined to, (e,)."""
-  from scipy.sparse import coo_array
-
   a, b = edges.vert.T
   both = np.concatenate([a, b]), np.concatenate([b, a])
   joined = coo_array((np.ones(2 * len(a)), both), shape=(nodes, nodes)).tocsr()

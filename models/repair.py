@@ -11,6 +11,10 @@ import dataclasses
 
 import numpy as np
 from palpate import meshes
+from scipy.ndimage import distance_transform_edt, label
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
 
 from .field import Field
 from .quality import normals
@@ -63,9 +67,6 @@ def _tidy(vertices: np.ndarray, triangles: np.ndarray) -> Mesh:
 
 def cap(vertices: np.ndarray, triangles: np.ndarray) -> Mesh:
   """Returns the mesh with a fan over every hole that is small beside the surface."""
-  from scipy.sparse import coo_array
-  from scipy.sparse.csgraph import connected_components
-
   n = len(vertices)
   edge = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]))
   key, count = np.unique(edge[:, 0] * n + edge[:, 1], return_counts=True)
@@ -95,8 +96,6 @@ class Target:
   """
 
   def __init__(self, vertices: np.ndarray, triangles: np.ndarray, spacing: float):
-    from scipy.spatial import KDTree
-
     self.vertices, self.triangles = vertices, triangles
     inner, triangle = _thin_out(*_sample(vertices, triangles, spacing), spacing / 2)
     owner = np.zeros(len(vertices), dtype=np.int64)
@@ -249,8 +248,6 @@ def solidify(target: Target, spacing: float, reach: float) -> Solid | None:
     spacing: of the grid [m]
     reach: distance kept from the surface [m], over half the spacing
   """
-  from scipy.spatial import KDTree
-
   origin = target.points.min(axis=0) - reach - 3 * spacing
   count = np.ceil((target.points.max(axis=0) + reach + 3 * spacing - origin) / spacing) + 1
   place = np.round((target.points - origin) / spacing).astype(int)
@@ -285,21 +282,15 @@ def solidify(target: Target, spacing: float, reach: float) -> Solid | None:
 
 def _pieces(mask: np.ndarray) -> tuple[np.ndarray, int]:
   """Returns which connected piece of true cells every cell belongs to, and their count."""
-  from scipy.ndimage import label
-
   numbered, count = label(mask)  # pyright: ignore
   return numbered, count
 
 
 def _nearest(mask: np.ndarray) -> np.ndarray:
   """Returns the index of the true cell nearest to every cell, (3, nx, ny, nz)."""
-  from scipy.ndimage import distance_transform_edt
-
   return np.asarray(distance_transform_edt(~mask, return_distances=False, return_indices=True))
 
 
 def _edt(mask: np.ndarray) -> np.ndarray:
   """Returns the distance of every true cell to the nearest false one, in cells."""
-  from scipy.ndimage import distance_transform_edt
-
   return np.asarray(distance_transform_edt(mask))

@@ -14,6 +14,8 @@ import dataclasses
 from collections.abc import Callable
 
 import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.spatial import KDTree
 
 from .field import Field, Implicit, project, tabulate
 from .grid import shrink
@@ -58,9 +60,6 @@ def ellipsoid(center, radii) -> Implicit:
 
 def tube(points, radii) -> Implicit:
   """Returns a tube of varying radius along a smooth curve through the points."""
-  from scipy.interpolate import CubicSpline
-  from scipy.spatial import KDTree
-
   points, radii = np.asarray(points, float), np.asarray(radii, float)
   knots = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
   t = np.linspace(0, knots[-1], 400)
@@ -182,8 +181,6 @@ def patches(name: str, vertices: np.ndarray, seed: Seed = None) -> dict[str, np.
 
   Every patch has three nodes at least. The seed is the one the mesh was made with.
   """
-  from scipy.spatial import KDTree
-
   shape, out = anatomy(name, seed), {}
   for patch, (line, radius) in shape.patches.items():
     at = np.linspace(0, len(line) - 1, 40)

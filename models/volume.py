@@ -11,6 +11,7 @@ import dataclasses
 import os
 
 import numpy as np
+from scipy.ndimage import distance_transform_edt, gaussian_filter
 
 from .field import Field
 from .wrap import Report, wrap, wrap_pieces
@@ -160,8 +161,6 @@ def surface(mask: np.ndarray, affine: np.ndarray) -> tuple[np.ndarray, np.ndarra
     mask: which voxels                                        (i, j, k)
     affine: from indices (voxel centres) to metres            (4, 4)
   """
-  from scipy.ndimage import gaussian_filter
-
   voxel = np.argwhere(mask)
   low, high = voxel.min(axis=0), voxel.max(axis=0)
   mask = np.pad(mask[tuple(slice(a, b + 1) for a, b in zip(low, high, strict=True))], _PAD)
@@ -177,8 +176,6 @@ def surface(mask: np.ndarray, affine: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def _edt(mask: np.ndarray, edge: np.ndarray) -> np.ndarray:
-  from scipy.ndimage import distance_transform_edt
-
   return np.asarray(distance_transform_edt(mask, sampling=edge))
 
 

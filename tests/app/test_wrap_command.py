@@ -23,7 +23,7 @@ def wrap(tmp_path, capsys, monkeypatch):
   from palpate.app import wrap
 
   # Drawing has tests of its own; the folder must not depend on a GL library here.
-  monkeypatch.setattr(wrap, "_picture", lambda paths, name: paths[0])
+  monkeypatch.setattr(wrap, "picture", lambda paths, name: paths[0])
   monkeypatch.chdir(tmp_path)
 
   def run(*words):

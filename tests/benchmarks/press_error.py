@@ -19,6 +19,7 @@ import scenes
 import warp as wp
 from benchmarks import plots, results
 from benchmarks.runner import Bench, Case, Row
+from palpate.engine import layout
 from palpate.tissue import step as stepping
 from palpate.tissue.body import Body
 from palpate.tissue.types import Stage
@@ -67,7 +68,7 @@ def press(script: dict, h: float, ahead=True, extrapolate=0.0, armature=1.0, **k
     data = mujoco.MjData(model)
   finally:
     stepping.SCHEMES["implicit"] = known
-  lagged = data.plugin_state[: model.nv - 1]
+  lagged = data.plugin_state[layout.spans(layout.NodalState, {"nfree": model.nv - 1})["force"]]
   old = np.zeros_like(lagged)
   rows = []
   for _ in range(round(script["DURATION"] / h)):

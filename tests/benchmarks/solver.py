@@ -88,8 +88,8 @@ def agreement(device: str) -> float:
       for where in ("cpu", device, device):
         body = make(shape, where, tolerance=1e-6, iterations=1000, **keys)
         body.levels.transfer.threshold = threshold
-        for name, values in (("disp", u), ("vel", v), ("force_ext", load(shape))):
-          scenes.put(body, getattr(body.state, name), values)
+        for field, values in (("disp", u), ("vel", v), ("force_ext", load(shape))):
+          scenes.put(body, getattr(body.state, field), values)
         stepping.step(body)
         status = body.system.status.numpy()[0].copy()
         results.append((scenes.get(body, body.state.dvel), status))

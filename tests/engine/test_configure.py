@@ -56,7 +56,7 @@ def test_midpoint_has_coarse_meshes(scenes):
 
 
 @pytest.mark.parametrize("window", [False, True], ids=["nodal", "window"])
-@pytest.mark.parametrize("keys", [STIFFER, {"young": 3e6, "thickness": 0.004}], ids=["soft", "stiff"])
+@pytest.mark.parametrize("keys", [STIFFER, {"young": 3e6, "thickness": 0.004}])
 def test_a_changed_material_is_the_compiled_one(scenes, device, window, keys):
   states = []
   for compiled in (keys, {}):
@@ -76,8 +76,8 @@ def test_a_changed_material_is_the_compiled_one(scenes, device, window, keys):
 def test_a_scale_keeps_the_pattern_of_the_compiled_young(scenes):
   points, elem = scenes.sphere(1)
   young = np.linspace(1e4, 3e4, len(elem))
-  organ = scenes.organ(points, elem, young=scenes.join(young), foundation=1e4)
-  model, data, organ = scenes.load(scenes.world(organ))
+  organ = scenes.organ(points, elem, young=young, foundation=1e4)
+  *_, organ = scenes.load(scenes.world(organ))
   for scale in (2.0, 0.5):  # of the compiled one, not of the last
     organ.configure(young_scale=scale)
     np.testing.assert_allclose(organ.config.young, scale * young)
