@@ -7,7 +7,7 @@ import numpy as np
 from palpate.engine.layout import FLAG
 from palpate.tissue.config import Config
 
-from .engine import motion, workspace
+from .engine import motion, windowed, workspace
 from .engine import plugin as engine
 from .tissue import energy
 from .tissue import mesh as topology
@@ -51,13 +51,18 @@ class Organ:
   def configure(self, **keys):
     """Changes configuration keys for this mjData while running, for example `tolerance=1e-5`.
 
-    `integrator`, `iterations`, `tolerance`, `newton`, `damping`, `foundation`, `bulk` and
-    `pressure` may change. The dofs' armature stays that of the compiled configuration.
+    Those may change that docs/configuration.md says so of; `young_scale` stands for `young` as a
+    multiple of the compiled one. The effective inertia follows the material (`young`, `poisson`,
+    `thickness`, `stiffness`) and stays that of the compiled configuration otherwise. Of an organ
+    without windows it is the armature of the model's joints: give organs of different tissue a
+    model each.
 
     Raises:
       ValueError: a key may not change, or its value is not allowed.
     """
-    texts = {key: str(value) for key, value in keys.items()}
+    texts = {}
+    for key, value in keys.items():
+      texts[key] = value if isinstance(value, str) else " ".join(map(str, np.ravel(value)))
     workspace.configure(self._space, self.model._address, texts)
 
   @property
@@ -116,8 +121,8 @@ class Organ:
 
   @property
   def window_warning(self) -> str | None:
-    """What the windows were too small for, the first time that they were, or None."""
-    return self._space.overflow
+    """What the windows were too small for, at the worst moment so far, or None."""
+    return windowed.shortage(self._space)
 
   @property
   def force(self) -> np.ndarray:

@@ -70,7 +70,7 @@ def run(
     try:
       action = np.asarray(act(timestep), np.float64)
       timestep = env.step(action)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
       task.outcome = task.outcome or "error"
       recorder.info["error"] = f"{type(error).__name__}: {error}"
       text = f"{task.name}: step {len(recorder) - 1}: {recorder.info['error']}"

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
   from matplotlib.figure import Figure
 
 _TIP = ("#1b6ca8", "#2a8f6a", "#8155a3", "#b06a1f")
+_MOST_MARKS = 300  # events that the force's figure shows
 _BAD, _CURVE, _ORGAN, _FAINT = "#c8324b", "#222222", "#e3b5a4", "#8a8f98"
 
 
@@ -124,9 +125,10 @@ def force_figure(recording: Recording) -> "Figure | None":
   marks: dict[float, list[str]] = {}  # events of one moment share a line
   for event in recording.events:
     marks.setdefault(event.time - recording.time[0], []).append(event.label or event.kind)
-  for at, words in marks.items():
-    ax.axvline(at, color=_FAINT, linewidth=0.8, linestyle=":")
-    if len(marks) <= 12:
+  if len(marks) <= _MOST_MARKS:  # more would be a grey wall, drawn for minutes
+    ax.vlines(list(marks), 0, top, color=_FAINT, linewidth=0.8, linestyle=":")
+  if len(marks) <= 12:
+    for at, words in marks.items():
       late = at > 0.96 * time[-1]  # its words would leave the plot
       ax.annotate(
         ", ".join(_label(word) for word in words), (at, top), xytext=(-3 if late else 3, -3),

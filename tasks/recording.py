@@ -161,6 +161,8 @@ class Recording:
   def load(cls, path: str | os.PathLike[str]) -> "Recording":
     """Reads a recording; ValueError names the file and what is wrong with it."""
     path = Path(path)
+    if path.exists() and not path.is_file():  # a pipe would be waited for
+      raise ValueError(f"{path}: not a {FORMAT}: not a file")
     with path.open("rb") as file:
       if file.read(2) != b"PK":
         raise ValueError(f"{path}: not a {FORMAT}: not a zip archive")
@@ -213,10 +215,15 @@ def check_array(name: str, value: np.ndarray) -> np.ndarray:
 
 
 def check_constant(name: str, value: np.ndarray) -> None:
-  """Raises ValueError unless the constant holds numbers, those with a meaning in rows of three."""
+  """Raises ValueError unless the constant holds numbers, those with a meaning finite triples."""
   check_array(f"constant {name!r}", value)
-  if name in ("curve", "vertices", "triangles") and (value.ndim != 2 or value.shape[1] != 3):
+  if name not in ("curve", "vertices", "triangles"):
+    return
+  if value.ndim != 2 or value.shape[1] != 3:
     raise ValueError(f"constant {name!r} has shape {value.shape}, expected (n, 3)")
+  bad = ~np.isfinite(value).all(axis=1)
+  if bad.any():
+    raise ValueError(f"constant {name!r} is not finite in row {int(bad.argmax())}")
 
 
 def _check_column(name: str, value: np.ndarray, count: int) -> None:

@@ -102,6 +102,8 @@ def reference(task: str) -> dict[str, Any] | None:
 
 def read_reference(path: pathlib.Path) -> dict[str, Any]:
   """Returns the expert reference in a file; ValueError says what is wrong with it."""
+  if path.exists() and not path.is_file():  # a pipe would be waited for
+    raise ValueError(f"{path}: not a palpate-reference: not a file")
   data = json.loads(path.read_text(encoding="utf-8"))
   check_reference(data)
   return data

@@ -10,6 +10,7 @@ import pytest
 import trimesh
 import warp as wp
 from palpate.engine import plugin as engine
+from palpate.models import mjcf
 from palpate.tissue import mesh as topology
 from palpate.tissue import shape
 from palpate.tissue import step as stepping
@@ -22,13 +23,6 @@ needs_cuda = pytest.mark.skipif(not wp.is_cuda_available(), reason="needs a CUDA
 RADIUS = 0.05  # of the test sphere [m]
 FLEX = 0.0005  # radius of the flexes [m]
 PLAIN = {"solref": "0.004 1", "condim": "1"}  # stiff contacts without friction
-UNTOUCHED = {"contype": 0, "conaffinity": 0}
-EDGES = '<edge damping="1e-9"/>'  # a flex without forces of its own, without a warning
-
-
-def join(values) -> str:
-  """Returns numbers as the text of an MJCF attribute."""
-  return " ".join(f"{v:.17g}" for v in np.ravel(values))
 
 
 # Meshes: points (nvert, 3) and triangles (nelem, 3).
@@ -83,60 +77,69 @@ def triangular(length, width, nx, ny, jitter=0.0, seed=0):
 # MJCF.
 
 
+DIGITS = 17  # of numbers in MJCF: all that a double has
+
+
 def plugin(**config):
   """Returns the plugin's declaration; a key of None is left out, `device` is cpu unless given."""
-  keys = {"device": "cpu"} | config
-  keys = "".join(f'<config key="{k}" value="{v}"/>' for k, v in keys.items() if v is not None)
-  return f'<plugin plugin="palpate.organ">{keys}</plugin>'
+  return mjcf.plugin(_keys(config), digits=DIGITS)
 
 
-def surface_text(points, elem, radius=FLEX):
-  """Returns the attributes of a flexcomp of these triangles."""
-  return (
-    f'type="direct" dim="2" radius="{radius}" point="{join(points)}" '
-    f'element="{" ".join(map(str, np.ravel(elem)))}"'
-  )
+def _keys(config):
+  return {k: v for k, v in ({"device": "cpu"} | config).items() if v is not None}
 
 
-def contacts(**attributes):
+def contacts(contact):
   """Returns how a flex touches: stiff and without friction unless said otherwise."""
-  attributes = {"selfcollide": "none"} | PLAIN | attributes
-  text = " ".join(f'{key}="{value}"' for key, value in attributes.items())
-  return f"<contact {text}/>"
+  return {"selfcollide": "none"} | PLAIN | (contact or {})
 
 
-def flex(
-  points, elem, inside, name="organ", mass=0.1, pin=(), contact=None, radius=FLEX, attributes=""
-):
+def flex(points, elem, inside, name="organ", pin=(), contact=None, **attributes):
   """Returns a flexcomp whose nodes are MuJoCo's, around what is `inside` of it."""
-  pins = f'<pin id="{" ".join(map(str, pin))}"/>' if len(pin) else ""
-  shape = surface_text(points, elem, radius)
-  return (
-    f'<flexcomp name="{name}" mass="{mass}" {shape} {attributes}>{inside}'
-    f"{contacts(**(contact or {}))}{pins}</flexcomp>"
+  attributes = {"mass": 0.1, "radius": FLEX} | attributes
+  return mjcf.flexcomp(
+    name,
+    (points, elem),
+    inside=inside,
+    contact=contacts(contact),
+    pin=pin,
+    digits=DIGITS,
+    **attributes,
   )
 
 
 def organ(
-  points, elem, name="organ", mass=0.1, pin=(), contact=None, radius=FLEX, attributes="", **config
+  points, elem, name="organ", mass=0.1, pin=(), contact=None, radius=FLEX, rgba=None, **config
 ):
   """Returns an organ whose nodes are MuJoCo's; `config` are the plugin's keys."""
-  inside = plugin(**config) + EDGES
-  return flex(points, elem, inside, name, mass, pin, contact, radius, attributes)
+  inside = "\n".join([plugin(**config), mjcf.EDGE])
+  return flex(points, elem, inside, name, pin, contact, mass=mass, radius=radius, rgba=rgba)
 
 
 def windowed(
   points, elem, name="organ", grid="window", count="9 6 1", contact=None, radius=FLEX, **config
 ):
   """Returns an organ in a body of its own and the flexcomp of its window, `count` slots."""
-  config = {"window": grid, "mass": 0.1} | config
-  rigid = f'name="{name}" rigid="true" {surface_text(points, elem, radius)}'
-  slots = f'type="grid" count="{count}" spacing=".01 .01 .01" dim="2" mass="0.01"'
-  return (
-    f'<body name="{name}">{plugin(**config)}<flexcomp {rigid}>{contacts(**UNTOUCHED)}</flexcomp>'
-    f'</body><flexcomp name="{grid}" {slots} radius="{radius}">{EDGES}'
-    f"{contacts(**(contact or {}))}</flexcomp>"
+  keys = plugin(**{"window": grid, "mass": 0.1} | config)
+  surface = mjcf.flexcomp(
+    name,
+    (points, elem),
+    contact=mjcf.NO_CONTACT,
+    digits=DIGITS,
+    rigid=True,
+    radius=radius,
   )
+  window = mjcf.flexcomp(
+    grid,
+    inside=mjcf.EDGE,
+    contact=contacts(contact),
+    type="grid",
+    count=count,
+    spacing=".01 .01 .01",
+    mass=0.01,
+    radius=radius,
+  )
+  return mjcf.tag("body", {"name": name}, f"{keys}\n{surface}") + window
 
 
 def world(
@@ -153,9 +156,9 @@ def world(
 ):
   """Returns a whole MJCF document around the bodies; `memory` in MB."""
   return (
-    f'<mujoco><option timestep="{h}" gravity="{join(gravity)}" integrator="{integrator}" '
+    f'<mujoco><option timestep="{h}" gravity="{mjcf.numbers(gravity)}" integrator="{integrator}" '
     f'solver="{solver}" tolerance="{tolerance}" {option}>{flag}</option><size memory="{memory}M"/>'
-    f'<extension><plugin plugin="palpate.organ"/></extension>'
+    f"{mjcf.extension()}"
     f"<worldbody>{''.join(bodies)}</worldbody>{extra}</mujoco>"
   )
 
@@ -210,8 +213,8 @@ def ridge(frame="", pinned=True, contact=None, extra=""):
   pin = np.flatnonzero(points[:, 2] < -0.02) if pinned else ()
   contact = {"condim": 4, "friction": 1} | (contact or {})
   keys = {"young": 2e4, "bulk": 1e4, "foundation": 1e4, "tolerance": 1e-7}
-  colour = 'rgba=".8 .4 .3 1"'
-  tissue = organ(points, elem, mass=0.02, pin=pin, contact=contact, attributes=colour, **keys)
+  colour = (0.8, 0.4, 0.3, 1)
+  tissue = organ(points, elem, mass=0.02, pin=pin, contact=contact, rgba=colour, **keys)
   jaws = "".join(
     f'<body name="{name}" pos="{0.0165 * side} 0 0">'
     f'<joint name="{name}" type="slide" axis="{-side} 0 0"/><geom name="{name}" type="ellipsoid" '

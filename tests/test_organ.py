@@ -196,7 +196,9 @@ def test_configuration_changes_while_running(scenes, device):
 @pytest.mark.parametrize(
   ("keys", "words"),
   [
-    ({"young": 1e4}, ("young",)),
+    ({"bend": 2}, ("bend",)),
+    ({"young_scale": 0}, ("young_scale is '0', expected a number > 0",)),
+    ({"young": [1e4, 2e4]}, ("young has 2 values",)),
     ({"damping": -1}, ("damping is '-1'", "a number >= 0")),
     ({"integrator": "rk4"}, ("integrator is 'rk4'", "'implicit'")),
     ({"stiff": 1}, ("stiff",)),

@@ -159,11 +159,10 @@ def test_organ_of_a_world_that_is_attached_in_a_turned_frame(coupling):
   tissue = build(points * [0.010, 0.02, 0.03], elem, foundation=1e4, mass=0.02)
   text = scenes.world(tissue)
   if coupling == "by hand":  # MuJoCo attaches a body with a plugin where its instance has a name
-    keys = re.search(r"(<config.*/>)</plugin>", text).group(1)
+    keys = re.search(r"<plugin[^>]*[^/]>(.*?)</plugin>", text, re.S)[1]
     text = text.replace(f">{keys}</plugin>", ' instance="x"/>')
-    text = text.replace(
-      "/></extension>", f'><instance name="x">{keys}</instance></plugin></extension>'
-    )
+    instance = f'<instance name="x">{keys}</instance></plugin></extension>'
+    text = re.sub(r"/>\s*</extension>", f">{instance}", text)
   child = mujoco.MjSpec.from_string(text)
   world = mujoco.MjSpec.from_string(scenes.world())
   frame = world.worldbody.add_frame(pos=[0.1, 0, 0], quat=[0.5, 0.5, 0.5, 0.5])  # x to y to z

@@ -139,10 +139,10 @@ def _cache() -> list[str]:
 
 def _plugin() -> list[str]:
   from palpate import register
-  from palpate.engine import plugin as engine
+  from palpate.engine.mjstruct import NAME
 
   slot = register()
-  return [f"{engine.NAME} is registered with MuJoCo, slot {slot}"]
+  return [f"{NAME} is registered with MuJoCo, slot {slot}"]
 
 
 def _dm_control() -> list[str]:

@@ -218,7 +218,7 @@ def _load(args: argparse.Namespace):
 def _compile(path: pathlib.Path, args: argparse.Namespace):
   import mujoco
   from palpate import windows as author
-  from palpate.engine import plugin as engine
+  from palpate.engine.mjstruct import NAME
   from palpate.organ import Organ
   from palpate.tissue import config
 
@@ -232,7 +232,7 @@ def _compile(path: pathlib.Path, args: argparse.Namespace):
     spec = mujoco.MjSpec.from_file(str(path))
     if args.coupling:
       _couple(spec, args.coupling, author)
-    ours = {b.plugin.name for b in spec.bodies if b.plugin.plugin_name == engine.NAME}
+    ours = {b.plugin.name for b in spec.bodies if b.plugin.plugin_name == NAME}
     for plugin in spec.plugins:
       if plugin.name in ours:
         plugin.config = {**plugin.config, **changes}
@@ -250,7 +250,7 @@ def _compile(path: pathlib.Path, args: argparse.Namespace):
     with contextlib.suppress(ValueError):
       names.append(Organ(model, data, name).name)
   if not names:
-    raise CommandError(f"no organ in {path.name}, expected a flexcomp with plugin {engine.NAME!r}")
+    raise CommandError(f"no organ in {path.name}, expected a flexcomp with plugin {NAME!r}")
   try:
     return model, data, Organ(model, data, args.organ or names[0])
   except ValueError as error:

@@ -22,7 +22,6 @@ def main(args: argparse.Namespace) -> int:
   register()
   import warp as wp
   from palpate.tissue import device as devices
-  from palpate.tissue import kernels
 
   devices.init()
   known = [device.alias for device in wp.get_devices()]
@@ -30,7 +29,7 @@ def main(args: argparse.Namespace) -> int:
     raise CommandError(f"no device {args.device!r}, expected one of {', '.join(known)}")
   progress, rows, total = Progress(), [], 0.0
   for device in [args.device] if args.device else known:
-    for module in [*kernels.MODULES, *modules()]:
+    for module in modules():
       progress.show(f"{module.rpartition('.')[2]} on {device}", always=True)
       start = time.perf_counter()
       wp.load_module(module, device=device)
@@ -42,14 +41,11 @@ def main(args: argparse.Namespace) -> int:
 
 
 def modules() -> list[str]:
-  """Returns the names of this package's modules that hold kernels."""
-  import warp as wp
+  """Returns the names of Warp's modules with this package's kernels."""
   from palpate import engine, tissue
+  from palpate.tissue import kernels
 
-  found = []
   for room in (engine, tissue):
     for info in pkgutil.iter_modules(room.__path__):
-      module = importlib.import_module(f"{room.__name__}.{info.name}")
-      if any(isinstance(value, wp.Kernel) for value in vars(module).values()):
-        found.append(module.__name__)
-  return found
+      importlib.import_module(f"{room.__name__}.{info.name}")
+  return list(kernels.MODULES)  # complete now that all are imported

@@ -18,9 +18,9 @@ from collections.abc import Callable, Iterator
 
 _codes: set[types.CodeType] = set()  # of the callbacks
 _MARK = "raised late"  # of such an exception
-_late: list[BaseException] = []  # to be raised
-_left = threading.Event()  # the last callback of a step, while there are such
-_RETRY = 0.01  # after which that is tried anyway [s]
+_left = threading.Event()  # the last callback of a step, while somebody waits for it
+_waiting = 0
+_RETRY = 0.01  # after which a step may be over without one [s]
 _raise_in_thread = C.pythonapi.PyThreadState_SetAsyncExc
 _raise_in_thread.argtypes = [C.c_ulong, C.py_object]
 
@@ -59,20 +59,14 @@ def _handlers() -> Iterator[types.CodeType]:
       yield code
 
 
-def raise_later(error: BaseException, thread: int | None = None):
-  """Raises an exception in a thread as soon as that is in no callback.
-
-  Args:
-    error: the exception, this very object
-    thread: identifier of the thread; None for this one
-  """
-  _late.append(error)
+def raise_later(error: BaseException):
+  """Raises an exception in this thread as soon as that is in no callback."""
   vars(error)[_MARK] = True
   error.__traceback__ = None
-  ident = threading.get_ident() if thread is None else thread
-  # Python makes the exception from a class, in the thread where it is raised.
-  late = type(type(error).__name__, (type(error),), {"__new__": lambda _: error})
-  _thread.start_new_thread(_raise_when_out, (error, late, ident))
+  if threading.current_thread() is threading.main_thread():
+    _raise_by_signal(error)
+  else:
+    _raise_in(threading.get_ident(), error)
 
 
 def raise_in_caller(error: BaseException):
@@ -80,40 +74,77 @@ def raise_in_caller(error: BaseException):
 
   The threads of `mujoco.rollout`, say, run for the main thread.
   """
-  here = threading.current_thread()
-  foreign = isinstance(here, threading._DummyThread)
-  raise_later(error, threading.main_thread().ident if foreign else here.ident)
+  if isinstance(threading.current_thread(), threading._DummyThread):
+    vars(error)[_MARK] = True
+    _raise_in(threading.main_thread().ident or 0, error)
+  else:
+    raise_later(error)
 
 
-def _raise_when_out(error: BaseException, late: type, thread: int):
-  while True:
-    _left.clear()
-    _left.wait(_RETRY)
-    frame = inner = sys._current_frames().get(thread)
-    while frame is not None and frame.f_code not in _codes:
-      frame = frame.f_back
-    if frame is None:
-      break
-  _late[:] = [each for each in _late if each is not error]
-  if inner is not None:  # the thread has not ended
+def _raise_by_signal(error: BaseException):
+  """Raises an exception in the main thread, from a signal's handler for the time being."""
+  before, seen, raised = signal.getsignal(signal.SIGINT), threading.Event(), []
+
+  def on_signal(number: int, frame: types.FrameType | None):
+    seen.set()
+    if not _is_inside(frame):
+      signal.signal(signal.SIGINT, before or signal.SIG_DFL)
+      raised.append(True)
+      raise error
+
+  def send():
+    # One signal at a time: none may be left for the handler that was there before.
+    while not raised:
+      _wait_for_end()
+      seen.clear()
+      _thread.interrupt_main()
+      seen.wait()
+
+  signal.signal(signal.SIGINT, on_signal)
+  threading.Thread(target=send, daemon=True).start()
+
+
+def _raise_in(thread: int, error: BaseException):
+  """Raises an exception in a thread; what comes out in a callback comes here again."""
+  # Python makes the exception from a class, where it is raised.
+  late = type(type(error).__name__, (type(error),), {"__new__": lambda _: error})
+
+  def send():
+    while _is_inside(sys._current_frames().get(thread)):
+      _wait_for_end()
     _raise_in_thread(thread, late)
+
+  _thread.start_new_thread(send, ())
+
+
+def _is_inside(frame: types.FrameType | None) -> bool:
+  """Returns whether a frame is in a callback."""
+  while frame is not None and frame.f_code not in _codes:
+    frame = frame.f_back
+  return frame is not None
+
+
+def _wait_for_end():
+  """Waits until a step may have ended."""
+  global _waiting
+  _waiting += 1
+  _left.clear()
+  _left.wait(_RETRY)
+  _waiting -= 1
 
 
 def leave():
   """Notes that the last callback of a step ends."""
-  if _late:
+  if _waiting:
     _left.set()
 
 
 def _on_interrupt(number: int, frame: types.FrameType | None):
   """Raises KeyboardInterrupt, but not inside a callback."""
-  here = frame
-  while here is not None:
-    if here.f_code in _codes:
-      raise_later(KeyboardInterrupt())
-      return
-    here = here.f_back
-  signal.default_int_handler(number, frame)
+  if _is_inside(frame):
+    raise_later(KeyboardInterrupt())
+  else:
+    signal.default_int_handler(number, frame)
 
 
 @watch
@@ -157,7 +188,7 @@ def _park():
     late = start - _LAST
     if all(i in _parked for i, t in _called.items() if t > late and i != me):
       return
-    time.sleep(_RETRY)
+    time.sleep(0.001)
 
 
 def install():

@@ -4,6 +4,7 @@
 # pyright: reportInvalidTypeForm=false
 import numpy as np
 import warp as wp
+from palpate.tissue import order
 from palpate.tissue.types import doubles, fill, ints, struct
 
 from . import coupling, layout
@@ -54,14 +55,14 @@ def make(w, side, motion, boxes: tuple[wp.array, wp.array], sizes: dict[str, int
   node = s.node.numpy()
   mass = np.ones(s.nnode)
   mass[node] = organ.windows.mass
-  w.host["mass"].assign(mass.reshape(1, -1, 8).astype(np.float32))
+  w.host["mass"].assign(order.to_slices(mass)[None].astype(np.float32))
   wp.copy(w.body.state.mass, w.host["mass"])
   values = dict(
     nvert=sizes["nvert"],
     nslot=sizes["nslot"],
     nwindow=sizes["nwindow"],
     most=sizes["most"],
-    node=(node // 8) * 24 + node % 8,
+    node=order.offset(node),
     mass=organ.windows.mass,
     rest=organ.mesh.rest,
     count=np.zeros(sizes["nwindow"]),

@@ -162,7 +162,7 @@ def _compute(model: int, data: int, instance: int, capability: int):
       _find_bad_state(w)
     w.run()
     if w.status[3]:
-      _note(w, "the implicit step has no finite solution: the motion diverged")
+      _note(w, f"the {w.config.integrator} step has no finite solution: the motion diverged")
   except BaseException as error:
     _fail(w, error)
 
@@ -172,8 +172,9 @@ def _advance(model: int, data: int, instance: int):
   w = _workspaces[data, instance]
   try:
     w.step()
-    if w.overflow is None and (w.flags[FLAG.missed_nodes] or w.flags[FLAG.missed_elements]):
-      _overflow(w)
+    nodes, triangles = w.flags[FLAG.missed_nodes], w.flags[FLAG.missed_elements]
+    if nodes > w.missed[0] or triangles > w.missed[1]:
+      _miss(w, int(nodes), int(triangles))
     if w.model_step[0] != w.time_step:
       workspace.refresh(w)
     guard.leave()
@@ -236,14 +237,12 @@ def _note(w: Workspace, text: str):
     warn(w.error)
 
 
-def _overflow(w: Workspace):
-  """Says, once, that a window is too small."""
-  nodes, triangles = int(w.flags[FLAG.missed_nodes]), int(w.flags[FLAG.missed_elements])
-  what = f"{triangles} triangles between their nodes; give them more elements"
-  if nodes:
-    what = f"{nodes} nodes that tools touch and keep the deepest; give them more vertices"
-  w.overflow = f"organ {w.organ.name!r}: its windows have no room for {what}"
-  warn(w.overflow)
+def _miss(w: Workspace, nodes: int, triangles: int):
+  """Keeps the most that the windows had no room for, and warns the first time."""
+  first = w.missed == (0, 0)
+  w.missed = max(nodes, w.missed[0]), max(triangles, w.missed[1])
+  if first:
+    warn(windowed.shortage(w))
 
 
 @functools.cache

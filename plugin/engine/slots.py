@@ -15,6 +15,9 @@ from .layout import FLAG, Inbox, Outbox, WindowState
 _REACH = 4.0
 # An organ whose nodes move by less than this share of its size a second is at rest.
 SLOW = 1e-5
+# Mass and inertia of a slot on a pinned node, in masses of the organ: a wall to tools. The more it
+# is, the less care MuJoCo's solver takes of light ones.
+_HELD = 1e3
 
 
 @struct
@@ -33,9 +36,10 @@ class Slots:
   skin: wp.float64  # distance of surface and geom at which MuJoCo finds a contact, at most [m]
   weight: wp.float64  # mass of the organ [kg]
   # The organ:
-  node_mass: doubles("nvert")  # mass of a node [kg]
+  free: ints("nvert")  # whether a node moves; others are pinned
+  node_mass: doubles("nvert")  # mass, of pinned nodes that of a wall [kg]
   rest: doubles("nvert", 3)  # rest position [m]
-  inertia: doubles("nvert")  # effective inertia [kg]
+  inertia: doubles("nvert")  # effective inertia, of pinned nodes that of a wall [kg]
   touch: doubles("nvert")  # distance from a geom within which a node's triangles may touch it [m]
   elem: ints("nelem", 3)  # nodes of a triangle
   near_adr: ints("nvert + 1")  # first of a node's triangles in `near`
@@ -123,7 +127,8 @@ def make(w, model: int, sizes: dict[str, int]):
     longest=float(longest.max()),
     skin=radius + margin,
     weight=float(win.mass.sum()),
-    node_mass=win.mass,
+    free=organ.free,
+    node_mass=hold(organ, win.mass),
     rest=mesh.rest,
     touch=longest + radius,
     elem=mesh.elem,
@@ -150,6 +155,11 @@ def make(w, model: int, sizes: dict[str, int]):
     mj=coupling.mujoco_arrays(model, w.data),
   )  # fmt: skip
   return fill(Slots, "cpu", values)
+
+
+def hold(organ, inertia: np.ndarray) -> np.ndarray:
+  """Returns the inertia of the nodes, with that of a wall for pinned ones [kg], (nvert,)."""
+  return np.where(organ.free, inertia, _HELD * organ.windows.mass.sum())
 
 
 def _edges(mesh) -> tuple[np.ndarray, np.ndarray]:

@@ -239,7 +239,19 @@ def set_inertia(w, m):
   nodal = win.mass
   if step.SCHEMES[w.config.integrator].spreads:
     nodal = inertia.of_nodes(m, organ, w.body, w.config, win.mass, int(win.flex[0]))
-  w.views["inertia"].assign(nodal)
+  w.views["inertia"].assign(slots.hold(organ, nodal))
+
+
+def shortage(w) -> str | None:
+  """Returns what the windows had no room for at most, and what to do, or None."""
+  nodes, triangles = w.missed
+  if nodes:
+    what = f"{nodes} nodes that tools touch and keep the deepest; give them more vertices"
+  elif triangles:
+    what = f"{triangles} triangles between their nodes; give them more elements"
+  else:
+    return None
+  return f"organ {w.organ.name!r}: its windows have no room for {what}"
 
 
 def draw(w, model: int, data: int):

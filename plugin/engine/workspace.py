@@ -70,7 +70,7 @@ class Workspace:
     counts: the number of vertices that MuJoCo sees of a windowed organ comes first
     status: iterations, relative residual, norm, failure  (4,)
     error: what went wrong since the last reset, or None
-    overflow: what the windows had no room for, the first time, or None
+    missed: most nodes and triangles that the windows had no room for in a step
     warning: last index and count of each of MuJoCo's warnings, one after the other
     nefc: the number of MuJoCo's constraints comes first
     noticed: whether it was said that windows came without their state
@@ -115,7 +115,7 @@ class Workspace:
   counts: memoryview = dataclasses.field(default_factory=lambda: np.zeros(1, np.int32).data)
   status: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(4, np.float32))
   error: str | None = None
-  overflow: str | None = None
+  missed: tuple[int, int] = (0, 0)
   noticed: bool = False
   # Views that every step looks at: an item of a memoryview costs a tenth of one of an array.
   warning: memoryview = dataclasses.field(default_factory=lambda: memoryview(b""))
@@ -351,7 +351,9 @@ def configure(w: Workspace, model: int, texts: dict[str, str]):
   Raises:
     ValueError: a key may not change, or its value is not allowed.
   """
-  _change(w, model, configuration.change(w.organ.name, w.config, texts, w.organ.mesh.closed))
+  organ, mesh = w.organ, w.organ.mesh
+  arguments = texts, mesh.nelem, mesh.closed, organ.config
+  _change(w, model, configuration.change(organ.name, w.config, *arguments))
   w.chosen = True
 
 
@@ -371,8 +373,7 @@ def _change(w: Workspace, model: int, config: Config):
       shape.change(w.body, w.organ.mesh, config, ~w.organ.free)
     else:
       shape.renumber(w.body, config)
-    recorded = ("integrator", "newton")
-    if any(getattr(before, key) != getattr(config, key) for key in recorded):
+    if any(getattr(before, key) != getattr(config, key) for key in configuration.RECORDED):
       bind(w, model)
     if material:
       refresh(w)

@@ -11,8 +11,8 @@ struct D3 { double x, y, z; };
 PALPATE D3 load(const double* p) { return {p[0], p[1], p[2]}; }
 PALPATE void store(double* p, D3 a) { p[0] = a.x; p[1] = a.y; p[2] = a.z; }
 
-// A node's numbers in a vector of slices; they start at `lane_of(node)`.
-PALPATE int lane_of(int node) { return node / LANES * 3 * LANES + node % LANES; }
+// A node's numbers in a vector of slices; they start at `offset_of(node)`.
+PALPATE int offset_of(int node) { return node / LANES * 3 * LANES + node % LANES; }
 PALPATE D3 load_lane(const float* p) { return {p[0], p[LANES], p[2 * LANES]}; }
 PALPATE void store_lane(float* p, D3 a) {
   p[0] = (float)a.x;
@@ -27,6 +27,9 @@ PALPATE D3& operator+=(D3& a, D3 b) { return a = a + b; }
 PALPATE bool operator==(D3 a, D3 b) { return a.x == b.x && a.y == b.y && a.z == b.z; }
 PALPATE bool operator!=(D3 a, D3 b) { return !(a == b); }
 PALPATE double dot(D3 a, D3 b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+PALPATE D3 vmax(D3 a, D3 b) {
+  return {a.x > b.x ? a.x : b.x, a.y > b.y ? a.y : b.y, a.z > b.z ? a.z : b.z};
+}
 PALPATE D3 vabs(D3 a) { return {fabs(a.x), fabs(a.y), fabs(a.z)}; }
 PALPATE double norm(D3 a) { return sqrt(dot(a, a)); }
 // a + R^T x, with R row by row.

@@ -32,7 +32,7 @@ PALPATE double to_cylinder(D3 p, const double* size) {
 
 PALPATE double to_box(D3 p, D3 half) {
   const D3 e = vabs(p) - half;
-  const D3 beyond = {e.x > 0.0 ? e.x : 0.0, e.y > 0.0 ? e.y : 0.0, e.z > 0.0 ? e.z : 0.0};
+  const D3 beyond = vmax(e, {0.0, 0.0, 0.0});
   const double far2 = dot(beyond, beyond), most = e.y > e.x ? e.y : e.x;
   return far2 > 0.0 ? sqrt(far2) : e.z > most ? e.z : most;
 }
@@ -40,11 +40,11 @@ PALPATE double to_box(D3 p, D3 half) {
 // Distance to a geom, see GEOM in `engine/layout.py`, of the point d from its centre: negative
 // inside. Meshes and the rest are their bounding boxes.
 PALPATE double distance(const double* geom, D3 d) {
-  const double* a = geom + GEOM_AXIS;
+  const double* axis = geom + GEOM_AXIS;
   const double* size = geom + GEOM_SIZE;
-  const D3 p = {a[0] * d.x + a[3] * d.y + a[6] * d.z, a[1] * d.x + a[4] * d.y + a[7] * d.z,
-                a[2] * d.x + a[5] * d.y + a[8] * d.z};
+  const D3 p = {dot(load(axis), d), dot(load(axis + 3), d), dot(load(axis + 6), d)};
   const int type = (int)geom[GEOM_TYPE];
+  if (type == GEOM_IS_PLANE) return p.z;
   if (type == GEOM_IS_SPHERE) return to_sphere(p, size);
   if (type == GEOM_IS_CAPSULE) return to_capsule(p, size);
   if (type == GEOM_IS_ELLIPSOID) return to_ellipsoid(p, size);
@@ -62,6 +62,18 @@ PALPATE double nearest(const double* geom, int ngeom, D3 x) {
     best = at < best ? at : best;
   }
   return best;
+}
+
+// Whether a geom comes within `reach` of a box: its bounding sphere, or a plane itself.
+PALPATE bool comes_near(const double* geom, D3 low, D3 high, double reach) {
+  const D3 at = load(geom + GEOM_POS);
+  if ((int)geom[GEOM_TYPE] == GEOM_IS_PLANE) {
+    const D3 normal = load(geom + GEOM_AXIS + 6), half = 0.5 * (high - low);
+    return dot(normal, low + half - at) - dot(vabs(normal), half) <= reach;
+  }
+  const D3 margin = {reach, reach, reach}, zero = {0.0, 0.0, 0.0};
+  const D3 away = vmax(vmax(low - margin - at, at - high - margin), zero);
+  return dot(away, away) <= geom[GEOM_BOUND2];
 }
 
 }  // namespace palpate

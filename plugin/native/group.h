@@ -2,11 +2,11 @@
 // vectors of which each reads what others wrote.
 //
 // On the CPU a world has one thread. On CUDA it has `nthread` in whole blocks, all resident. What
-// they tell each other goes through memory in words of 128 bits, three numbers and the number of the
-// turn, which are written and read whole: whoever waits for a word needs neither counter nor fence.
-// Turns go on from launch to launch; the last one is kept behind the words. In a meeting each block
-// publishes its sums and reads those of all, in two sets that alternate: who meets again has read
-// the set before. The order of summation is fixed, so that runs repeat to the bit.
+// they tell each other goes through memory in words of 128 bits, three numbers and the number of
+// the turn, which are written and read whole: whoever waits for a word needs neither counter nor
+// fence. Turns go on from launch to launch; the last one is kept behind the words. In a meeting
+// each block publishes its sums and reads those of all, in two sets that alternate: who meets again
+// has read the set before. The order of summation is fixed, so that runs repeat to the bit.
 //
 // BLOCK is the most threads of a block, MAX_BLOCKS the most blocks of a world, WORDS what a world
 // has of words. Otherwise everything here has the same name and meaning for both devices.

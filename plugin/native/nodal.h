@@ -23,7 +23,7 @@ PALPATE void gather_nodes(const Fields& f, Thread, int) {
   const D3 zero = {0.0, 0.0, 0.0}, g = falls ? add_turned(zero, R, load(mj.gravity.data)) : zero;
   double weight = 0.0;
   for (int i = 0; i < f.nnode; ++i) {
-    const int at = lane_of(i), adr = f.dofadr.data[i];
+    const int at = offset_of(i), adr = f.dofadr.data[i];
     if (adr < 0) continue;
     const int qadr = f.qposadr.data[i], body = f.bodyid.data[i], own = f.stateadr.data[i];
     const double m = mj.body_mass.data[body];
@@ -58,7 +58,7 @@ PALPATE void scatter_nodes(const Fields& f, Thread, int) {
     const D3 Mhat = {gain * inertia(f, m, adr, 0), gain * inertia(f, m, adr, 1),
                      gain * inertia(f, m, adr, 2)};
     if (gain > 1.0) set_inertia(mj, f.massadr.data + 3 * i, adr, Mhat);
-    const D3 dv = load_lane(f.solve.dvel.data + lane_of(i));
+    const D3 dv = load_lane(f.solve.dvel.data + offset_of(i));
     const D3 rate = {Mhat.x * dv.x * per_h, Mhat.y * dv.y * per_h, Mhat.z * dv.z * per_h};
     double* out = mj.qfrc_passive.data + adr;
     store(out, load(out) + passive(ok ? rate : D3{0.0, 0.0, 0.0}, load(f.lagged.data + 3 * i)));
@@ -75,7 +75,7 @@ PALPATE void push_nodes(const Fields& f, Thread, int) {
     D3 df = {0.0, 0.0, 0.0};
     if (adr >= 0)
       df = load(f.mj.qfrc_constraint.data + adr) - load(f.own.force.data + f.stateadr.data[i]);
-    store_lane(f.solve.rhs.data + lane_of(i), h * df);
+    store_lane(f.solve.rhs.data + offset_of(i), h * df);
     changed = changed || touched(df);
   }
   f.flags.data[FLAG_CHANGED] = changed;
@@ -92,7 +92,7 @@ PALPATE void remember_nodes(const Fields& f, Thread, int) {
   const double heavy = f.own.heavier.data[0] > 1.0 ? f.own.heavier.data[0] : 1.0;
   Secant secant;
   for (int i = 0; i < f.nnode; ++i) {
-    const int at = lane_of(i), adr = f.dofadr.data[i], own = f.stateadr.data[i];
+    const int at = offset_of(i), adr = f.dofadr.data[i], own = f.stateadr.data[i];
     if (adr < 0) continue;
     double* last = f.own.last.data + own;
     double* force = f.own.force.data + own;

@@ -121,24 +121,14 @@ PALPATE void push_impulses(const Fields& n, Thread t, int) {
   });
 }
 
-// Whether a geom's bounding sphere comes near the organ's bounds.
+// Whether a window's geom comes near the organ's bounds.
 template <class Fields>
 PALPATE bool any_near(const Fields& n, const double* geom, int ngeom) {
-  const double* low = n.outbox.summary.data + SUMMARY_LOW;
-  const double* high = n.outbox.summary.data + SUMMARY_HIGH;
-  const double reach = head(n, HEAD_REACH);
-  bool any = false;
-  for (int q = 0; q < ngeom; ++q, geom += GEOM_LENGTH) {
-    double away2 = 0.0;
-    for (int c = 0; c < 3; ++c) {
-      const double at = geom[GEOM_POS + c];
-      const double below = low[c] - reach - at, above = at - high[c] - reach;
-      const double e = below > above ? below : above;
-      away2 += e > 0.0 ? e * e : 0.0;
-    }
-    any = any || away2 <= geom[GEOM_BOUND2];
-  }
-  return any;
+  const D3 low = load(n.outbox.summary.data + SUMMARY_LOW);
+  const D3 high = load(n.outbox.summary.data + SUMMARY_HIGH);
+  for (int q = 0; q < ngeom; ++q, geom += GEOM_LENGTH)
+    if (comes_near(geom, low, high, head(n, HEAD_REACH))) return true;
+  return false;
 }
 
 // Lists the nodes that will be near each window's geoms, by their distance to the surface. Before

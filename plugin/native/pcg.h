@@ -141,7 +141,7 @@ struct Pcg {
     slices.each([&](int s, Lane lane, int k) {
       const V3 own = z.own(s, lane), w = product(a, z, own, s, lane);
       az.put(s, w, lane, k);
-      zw = zw + own.y * w.y + own.x * w.x + own.z * w.z;  // in the order that is fused best
+      zw += dot(own, w);
     });
     return zw;
   }

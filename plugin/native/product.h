@@ -36,12 +36,12 @@ PALPATE Matrix matrix(const Fields& f, int world) {
 // the last term with bending only. `z` says how a vector is read: `Vectors` or `Quads`.
 template <class Vector>
 PALPATE V3 product(const Matrix& a, const Vector& z, V3 own, int s, Lane lane) {
-  V3 out = ld(a.diag, s, lane) * own;
+  Carried out = ld(a.diag, s, lane) * own;
   {
     const int row = a.slot[s], width = a.slot[s + 1] - row;
     const float* block = a.block + 72 * (size_t)row;
     z.each_near(a.fan + 8 * (row + 2 * s + 1), width, lane, [&](V3 near) {
-      out += ld9(block, lane) * (near - own);
+      out = out + ld9(block, lane) * (near - own);
       block += 72;
     });
   }
@@ -53,7 +53,7 @@ PALPATE V3 product(const Matrix& a, const Vector& z, V3 own, int s, Lane lane) {
     z.each_bent(a.bend_node + 8 * row, width, lane, [&](V near) {
       sum += ld(gain, i++, lane) * near;
     });
-    out += (a.bend * sum) * ld3(a.normal + 24 * s, lane);
+    out = out + (a.bend * sum) * ld3(a.normal + 24 * s, lane);
   }
   return out;
 }

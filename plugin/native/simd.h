@@ -69,7 +69,9 @@ struct S3 {  // symmetric
 #if ON_CUDA
 PALPATE V ld(const float* p, int row, Lane lane) { return p[LANES * row + lane]; }
 PALPATE void st(float* p, int row, V v, Lane lane) { p[LANES * row + lane] = v; }
-PALPATE V gather(const float* p, const int* at, int c, Lane lane) { return p[at[lane] + LANES * c]; }
+PALPATE V gather(const float* p, const int* at, int c, Lane lane) {
+  return p[at[lane] + LANES * c];
+}
 PALPATE V gather_number(const float* p, const int* at, Lane lane) {
   return p[at[lane] / (3 * LANES) * LANES + at[lane] % (3 * LANES)];
 }

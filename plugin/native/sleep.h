@@ -73,7 +73,8 @@ PALPATE double clearance(const Fields& f) {
 }
 
 // Takes the contact forces and the motion of the slots' nodes from MuJoCo's step, with the impulses
-// by which the forces changed; says whether nothing touched, pushed or moved.
+// by which the forces changed; says whether nothing touched, pushed or moved. Pinned nodes stay and
+// have no contact force, as where they are part of MuJoCo's world.
 template <class Fields>
 PALPATE bool take_contacts(const Fields& f) {
   const double h = head(f)[HEAD_STEP];
@@ -81,7 +82,8 @@ PALPATE bool take_contacts(const Fields& f) {
   bool any = false, pushes = false;
   for (int k = 0; k < f.nslot; ++k) {
     const int i = f.placed.data[k], adr = f.dofadr.data[k];
-    const D3 before = contact_force(f, k), now = i < 0 ? zero : load(f.mj.qfrc_constraint.data + adr);
+    const bool moves = i >= 0 && f.free.data[i];
+    const D3 before = contact_force(f, k), now = moves ? load(f.mj.qfrc_constraint.data + adr) : zero;
     any = any || touched(now);
     pushes = pushes || load(pushed(f, k) + PUSHED_FORCE) != zero;
     store(f.own.force.data + 3 * k, now);
@@ -90,8 +92,8 @@ PALPATE bool take_contacts(const Fields& f) {
     moved(f, k)[MOVED_NODE] = i;
     if (i < 0) continue;
     const D3 off = load(f.mj.qpos.data + f.qposadr.data[k]) - load(f.qhome.data + 3 * k);
-    store(moved(f, k) + MOVED_DISP, off - load(f.rest.data + 3 * i));
-    store(moved(f, k) + MOVED_VEL, load(f.mj.qvel.data + adr));
+    store(moved(f, k) + MOVED_DISP, moves ? off - load(f.rest.data + 3 * i) : zero);
+    store(moved(f, k) + MOVED_VEL, moves ? load(f.mj.qvel.data + adr) : zero);
   }
   if (!any) tail(f)[TAIL_HEAVIER] = 1.0;
   return !any && !pushes && f.outbox.summary.data[SUMMARY_SPEED2] < f.slow * f.slow;

@@ -6,6 +6,9 @@
 
 namespace palpate {
 
+// Square of a distance beyond all others [m^2].
+constexpr double ENDLESS = 1e300;
+
 // Writes the numbers of the step to the inbox and says whether gravity is not that of the organ's
 // last step.
 template <class Fields>
@@ -86,8 +89,8 @@ PALPATE void tell_geom(const Fields& f, int g, double* geom) {
   store(geom + GEOM_SIZE, load(mj.geom_size.data + 3 * g));
   store(geom + GEOM_BOX, load(mj.geom_aabb.data + 6 * g));
   store(geom + GEOM_HALF, load(mj.geom_aabb.data + 6 * g + 3));
-  const double r = mj.geom_rbound.data[g] + f.reach;
-  geom[GEOM_BOUND2] = r * r;
+  const double r = mj.geom_rbound.data[g];  // 0 for planes, which have no end
+  geom[GEOM_BOUND2] = r > 0.0 ? (r + f.reach) * (r + f.reach) : ENDLESS;
 }
 
 // Whether a geom's box and the organ's bounds are apart: boxes apart along an axis of one are.

@@ -1,168 +1,237 @@
-"""The organ's configuration: the `<config>` keys, their meaning and what they may hold."""
+"""The organ's configuration: one row a `<config>` key says what it means and what it may hold."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
 from .step import SCHEMES
 
-ELEMENTS = ("membrane", "spring")
-INTEGRATORS = tuple(SCHEMES)
+# What takes a change while running: a number in the device's memory, the tissue's arrays, the graph
+# of the step anew. Other keys shape arrays or the model, and stay.
+NUMBER, TISSUE, GRAPH, FIXED = "number", "tissue", "graph", ""
+_SHOWN = 40  # letters of a value in a message
+_SCALE = "young_scale"  # a key of `change` alone
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+  """What is known of a key.
+
+  Attributes:
+    meaning: what it is, in Markdown
+    unit: its unit
+    read: returns the value of a text, for a number of elements; raises ValueError
+    allowed: what it may hold
+    change: what takes a change while running, FIXED if none is possible
+  """
+
+  meaning: str
+  unit: str
+  read: Callable[[str, int], Any]
+  allowed: str
+  change: str
+
+
+def _row(default, kind: tuple, meaning: str, unit: str = "-", change: str = FIXED) -> Any:
+  read, allowed = kind
+  row = Row(meaning, unit, read, allowed, change)
+  return dataclasses.field(default=default, metadata={"row": row})
+
+
+# What a key may hold: how it is read, and what a message says of it.
+
+
+def _number(low: float, high: float = math.inf, closed: bool = True) -> tuple:
+  def read(text: str, nelem: int) -> float:
+    value = float(text)
+    inside = (value >= low if closed else value > low) and value < high
+    if not (math.isfinite(value) and inside):
+      raise ValueError
+    return value
+
+  if not math.isfinite(low):
+    return read, "a finite number"
+  if not math.isfinite(high):
+    return read, f"a number {'>=' if closed else '>'} {low:g}"
+  return read, f"a number in {'[' if closed else '('}{low:g}, {high:g})"
+
+
+def _numbers(text: str, nelem: int) -> tuple[float, ...]:
+  values = tuple(float(word) for word in text.split())
+  if not all(math.isfinite(v) and v > 0 for v in values):
+    raise ValueError
+  if len(values) not in (1, nelem):
+    raise ValueError(f"has {len(values)} values, expected 1 or {nelem} (one an element)")
+  return values
+
+
+def _count(low: int, high: int) -> tuple:
+  def read(text: str, nelem: int) -> int:
+    value = int(text)
+    if not low <= value <= high:
+      raise ValueError
+    return value
+
+  return read, f"a whole number in [{low}, {high}]"
+
+
+def _choice(values: dict[str, Any]) -> tuple:
+  def read(text: str, nelem: int):
+    if text not in values:
+      raise ValueError
+    return values[text]
+
+  return read, " or ".join(repr(text) for text in values)
+
+
+def _device(text: str, nelem: int) -> str:
+  kind, _, index = text.partition(":")
+  if text in ("auto", "cpu", "cuda") or (kind == "cuda" and index.isdigit()):
+    return "cuda:0" if text == "cuda" else text
+  raise ValueError
+
+
+def _vertices(text: str, nelem: int) -> tuple[int, ...]:
+  if not all(word.isdigit() for word in text.split()):
+    raise ValueError
+  return tuple(int(word) for word in text.split())
+
+
+def _names(text: str, nelem: int) -> tuple[str, ...]:
+  return tuple(text.split())
+
+
+def _groups(text: str, nelem: int) -> tuple[tuple[str, ...], ...]:
+  return tuple(tuple(group.split()) for group in text.split(","))
+
+
+def _words(*values: str) -> tuple:
+  return _choice({value: value for value in values})
+
+
+_POSITIVE = _number(0.0, closed=False)
+_NOT_NEGATIVE = _number(0.0)
 
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-  """Configuration of one organ, one field a `<config>` key.
+  """Configuration of one organ, one field a `<config>` key; see its row for what it means."""
 
-  Attributes:
-    elements: `membrane` (St. Venant-Kirchhoff, plane stress) or `spring` (edge springs)
-    young: Young's modulus [Pa], one value or one for each element
-    poisson: Poisson's ratio [-], 0 <= nu < 0.5
-    thickness: thickness of the surface [m]
-    stiffness: constant of the edge springs [N/m]; only with `elements="spring"`
-    bend: factor on the plate rigidity E t^3 / (12 (1 - nu^2)) [-]; 0 is off
-    foundation: Winkler foundation, force per area per displacement [Pa/m]; 0 is off
-    bulk: volume preservation, energy bulk/2 (V - V0)^2 / V0 [Pa]; 0 is off
-    pressure: inside minus outside pressure [Pa]
-    damping: Rayleigh coefficient on the stiffness [s]
-    integrator: time stepping scheme
-    iterations: most PCG iterations of a solve
-    tolerance: relative residual at which PCG stops [-]
-    newton: Newton iterations a step
-    window: flexcomps that follow the tools over the organ, which is rigid then; none for an organ
-      whose vertices are MuJoCo's dofs
-    follow: bodies whose geoms the windows follow, a comma between windows; all that collide
-    mass: mass of the organ [kg], only with `window`
-    pin: vertices that do not move, only with `window`
-    resident: whether the motion stays on the device between steps, only with `window`; the plugin
-      state is then brought up to date by `Organ.sync` alone
-    device: `cpu`, `cuda:N`, or `auto` (CUDA where there is a device and enough nodes, else CPU)
-  """
-
-  elements: str = "membrane"
-  young: tuple[float, ...] = (5000.0,)
-  poisson: float = 0.45
-  thickness: float = 0.002
-  stiffness: float = 0.0
-  bend: float = 1.0
-  foundation: float = 0.0
-  bulk: float = 0.0
-  pressure: float = 0.0
-  damping: float = 0.002
-  integrator: str = "implicit"
-  iterations: int = 200
-  tolerance: float = 1e-4
-  newton: int = 1
-  window: tuple[str, ...] = ()
-  follow: tuple[tuple[str, ...], ...] = ()
-  mass: float = 0.0
-  pin: tuple[int, ...] = ()
-  resident: bool = False
-  device: str = "auto"
-
-
-# Keys in MJCF are the fields above. Numbers: (lowest, highest, is the lowest itself allowed).
-_NUMBERS = {
-  "poisson": (0.0, 0.5, True),
-  "thickness": (0.0, math.inf, False),
-  "stiffness": (0.0, math.inf, False),
-  "bend": (0.0, math.inf, True),
-  "foundation": (0.0, math.inf, True),
-  "bulk": (0.0, math.inf, True),
-  "pressure": (-math.inf, math.inf, True),
-  "damping": (0.0, math.inf, True),
-  "tolerance": (0.0, 1.0, False),
-  "mass": (0.0, math.inf, False),
-}
-_COUNTS = {"iterations": (1, 10000), "newton": (1, 100)}
-_CHOICES = {"elements": ELEMENTS, "integrator": INTEGRATORS}
-# Keys that may change while running; the others shape arrays.
-RUNNING = (
-  "integrator",
-  "iterations",
-  "tolerance",
-  "newton",
-  "damping",
-  "foundation",
-  "bulk",
-  "pressure",
-)
-# Those among them that make up the material.
-MATERIAL = ("young", "poisson", "thickness", "stiffness")
-KEYS = tuple(field.name for field in dataclasses.fields(Config))
-
-
-def _span(low: float, high: float, closed: bool) -> str:
-  if not math.isfinite(low):
-    return "a finite number"
-  if not math.isfinite(high):
-    return f"a number {'>=' if closed else '>'} {low:g}"
-  return f"a number in {'[' if closed else '('}{low:g}, {high:g})"
+  elements: str = _row(
+    "membrane",
+    _words("membrane", "spring"),
+    "`membrane` (St. Venant-Kirchhoff triangles, plane stress) or `spring` (edge springs)",
+  )
+  young: tuple[float, ...] = _row(
+    (5000.0,),
+    (_numbers, "a number > 0"),
+    "Young's modulus of membrane and plate; one value, or one for each triangle",
+    "Pa",
+    TISSUE,
+  )
+  poisson: float = _row(0.45, _number(0.0, 0.5), "Poisson's ratio", "-", TISSUE)
+  thickness: float = _row(0.002, _POSITIVE, "thickness of membrane and plate", "m", TISSUE)
+  stiffness: float = _row(
+    0.0, _POSITIVE, 'constant of the edge springs, with `elements="spring"` alone', "N/m", TISSUE
+  )
+  bend: float = _row(
+    1.0,
+    _NOT_NEGATIVE,
+    "factor on the plate's rigidity E t^3 / (12 (1 - nu^2)); 0 switches bending off",
+  )
+  foundation: float = _row(
+    0.0,
+    _NOT_NEGATIVE,
+    "restoring force per area and displacement: stands for the interior and ligaments",
+    "Pa/m",
+    NUMBER,
+  )
+  bulk: float = _row(
+    0.0,
+    _NOT_NEGATIVE,
+    "volume preservation, energy bulk/2 (V - V0)^2 / V0; closed surfaces",
+    "Pa",
+    NUMBER,
+  )
+  pressure: float = _row(
+    0.0, _number(-math.inf), "inside minus outside; closed surfaces", "Pa", NUMBER
+  )
+  damping: float = _row(0.002, _NOT_NEGATIVE, "Rayleigh coefficient on the stiffness", "s", NUMBER)
+  integrator: str = _row(
+    "implicit",
+    _words(*SCHEMES),
+    "`implicit`; `midpoint` for free motion ([accuracy](accuracy.md)); `neumann`, `explicit` to "
+    "compare with",
+    change=GRAPH,
+  )
+  iterations: int = _row(200, _count(1, 10000), "most PCG iterations of a solve", change=NUMBER)
+  tolerance: float = _row(
+    1e-4, _number(0.0, 1.0, False), "relative residual at which PCG stops", change=NUMBER
+  )
+  newton: int = _row(1, _count(1, 100), "Newton iterations a step", change=GRAPH)
+  window: tuple[str, ...] = _row(
+    (),
+    (_names, "names of flexcomps"),
+    "flexcomps that follow the tools over the organ, which is rigid then (`add_windows` sets it); "
+    "none where the vertices are MuJoCo's dofs",
+  )
+  follow: tuple[tuple[str, ...], ...] = _row(
+    (),
+    (_groups, "names of bodies"),
+    "bodies that each window follows, a comma between windows; left out, all that moves and "
+    "collides",
+  )
+  mass: float = _row(0.0, _POSITIVE, "mass of the organ, with `window` alone", "kg")
+  pin: tuple[int, ...] = _row(
+    (), (_vertices, "vertex numbers"), "vertices that do not move, with `window` alone"
+  )
+  resident: bool = _row(
+    False,
+    _choice({"true": True, "false": False}),
+    "with `window` alone: the motion stays on the CUDA device between steps, and the plugin state "
+    "is brought up to date by `Organ.sync` alone ([internals](internals.md#resident))",
+  )
+  device: str = _row(
+    "auto",
+    (_device, "'cpu', 'cuda:0' or 'auto'"),
+    "`cpu`, `cuda:N`, or `auto`: CUDA where there is a device and enough nodes",
+  )
 
 
-def _number(organ: str, key: str, text: str) -> float:
-  low, high, closed = _NUMBERS[key]
-  try:
-    value = float(text)
-  except ValueError:
-    value = math.nan
-  inside = (value >= low if closed else value > low) and value < high
-  if not (math.isfinite(value) and inside):
-    raise ValueError(f"organ {organ!r}: {key} is {text!r}, expected {_span(low, high, closed)}")
-  return value
+ROWS: dict[str, Row] = {each.name: each.metadata["row"] for each in dataclasses.fields(Config)}
+KEYS = tuple(ROWS)
+RUNNING = tuple(key for key, row in ROWS.items() if row.change)
+MATERIAL = tuple(key for key, row in ROWS.items() if row.change == TISSUE)
+RECORDED = tuple(key for key, row in ROWS.items() if row.change == GRAPH)
 
 
-def _count(organ: str, key: str, text: str) -> int:
-  low, high = _COUNTS[key]
-  try:
-    value = int(text)
-  except ValueError:
-    value = low - 1
-  if not low <= value <= high:
-    raise ValueError(
-      f"organ {organ!r}: {key} is {text!r}, expected a whole number in [{low}, {high}]"
-    )
-  return value
+def table() -> str:
+  """Returns the keys as a Markdown table."""
+  lines = ["| key | meaning | unit | allowed | default | while running |"]
+  lines.append("|---|---|---|---|---|---|")
+  for key, row in ROWS.items():
+    cells = [f"`{key}`", row.meaning, row.unit, row.allowed.replace("'", "`"), _default(key)]
+    lines.append(f"| {' | '.join(cells)} | {'may change' if row.change else '-'} |")
+  return "\n".join(lines) + "\n"
 
 
-def _young(organ: str, text: str, nelem: int) -> tuple[float, ...]:
-  words = text.split()
-  try:
-    values = tuple(float(word) for word in words)
-  except ValueError:
-    values = ()
-  if not values or not all(math.isfinite(v) and v > 0 for v in values):
-    shown = text if len(text) <= 40 else text[:40] + "..."
-    raise ValueError(f"organ {organ!r}: young is {shown!r}, expected a number > 0")
-  if len(values) not in (1, nelem):
-    raise ValueError(
-      f"organ {organ!r}: young has {len(values)} values, expected 1 or {nelem} (one an element)"
-    )
-  return values
-
-
-def _pin(organ: str, text: str) -> tuple[int, ...]:
-  words = text.split()
-  if not all(word.isdigit() for word in words):
-    shown = text if len(text) <= 40 else text[:40] + "..."
-    raise ValueError(f"organ {organ!r}: pin is {shown!r}, expected vertex numbers")
-  return tuple(int(word) for word in words)
-
-
-def _flag(organ: str, key: str, text: str) -> bool:
-  if text not in ("true", "false"):
-    raise ValueError(f"organ {organ!r}: {key} is {text!r}, expected 'true' or 'false'")
-  return text == "true"
-
-
-def _device(organ: str, text: str) -> str:
-  kind, _, index = text.partition(":")
-  if text in ("auto", "cpu", "cuda") or (kind == "cuda" and index.isdigit()):
-    return "cuda:0" if text == "cuda" else text
-  raise ValueError(f"organ {organ!r}: device is {text!r}, expected 'cpu', 'cuda:0' or 'auto'")
+def _default(key: str) -> str:
+  """Returns the default as a text, - where there is none."""
+  value = getattr(Config, key)
+  if isinstance(value, tuple):
+    return " ".join(f"{each:g}" for each in value) or "-"
+  if isinstance(value, float):
+    try:
+      ROWS[key].read(str(value), 1)
+    except ValueError:
+      return "-"
+    return f"{value:g}"
+  return str(value).lower()
 
 
 def parse(organ: str, texts: dict[str, str], nelem: int, closed: bool) -> Config:
@@ -183,53 +252,60 @@ def parse(organ: str, texts: dict[str, str], nelem: int, closed: bool) -> Config
   return config
 
 
-def change(organ: str, config: Config, texts: dict[str, str], closed: bool) -> Config:
+def change(
+  organ: str, config: Config, texts: dict[str, str], nelem: int, closed: bool, compiled: Config
+) -> Config:
   """Returns `config` with the keys in `texts` changed, which must be ones that may change.
+
+  Args:
+    organ: name of the flexcomp, for messages
+    config: configuration in force
+    texts: value of each key that changes; `young_scale` stands for `young` as a multiple of the
+      compiled one
+    nelem: number of triangles
+    closed: whether the surface encloses a volume
+    compiled: the configuration that the model was compiled with
 
   Raises:
     ValueError: a key may not change while running or its value is not allowed.
   """
   for key in texts:
-    if key not in RUNNING:
+    if key not in (*RUNNING, _SCALE):
       raise ValueError(
         f"organ {organ!r}: {key!r} cannot change while running, expected one of "
-        f"{', '.join(RUNNING)}"
+        f"{', '.join((*RUNNING, _SCALE))}"
       )
-  changed = dataclasses.replace(config, **_values(organ, texts, nelem=1))
-  _check_combination(organ, changed, {"stiffness": 0} if config.stiffness else {}, closed)
+  texts = dict(texts)
+  scale = texts.pop(_SCALE, None)
+  values = _values(organ, texts, nelem)
+  if scale is not None:
+    factor = _value(organ, _SCALE, scale, *_POSITIVE)
+    values["young"] = tuple(factor * young for young in compiled.young)
+  changed = dataclasses.replace(config, **values)
+  given = values | ({"stiffness": 0} if config.stiffness else {})
+  _check_combination(organ, changed, given, closed)
   return changed
 
 
-def _values(organ: str, texts: dict[str, str], nelem: int) -> dict:
+def _values(organ: str, texts: dict[str, str], nelem: int) -> dict[str, Any]:
   values = {}
   for key, text in texts.items():
-    text = text.strip()
-    if key not in KEYS:
+    if key not in ROWS:
       raise ValueError(f"organ {organ!r}: unknown key {key!r}, expected one of {', '.join(KEYS)}")
-    if not text:
-      continue
-    if key in _NUMBERS:
-      values[key] = _number(organ, key, text)
-    elif key in _COUNTS:
-      values[key] = _count(organ, key, text)
-    elif key == "young":
-      values[key] = _young(organ, text, nelem)
-    elif key == "window":
-      values[key] = tuple(text.split())
-    elif key == "follow":
-      values[key] = tuple(tuple(group.split()) for group in text.split(","))
-    elif key == "pin":
-      values[key] = _pin(organ, text)
-    elif key == "device":
-      values[key] = _device(organ, text)
-    elif key == "resident":
-      values[key] = _flag(organ, key, text)
-    elif text not in _CHOICES[key]:
-      allowed = " or ".join(repr(choice) for choice in _CHOICES[key])
-      raise ValueError(f"organ {organ!r}: {key} is {text!r}, expected {allowed}")
-    else:
-      values[key] = text
+    if text.strip():
+      values[key] = _value(organ, key, text, ROWS[key].read, ROWS[key].allowed, nelem)
   return values
+
+
+def _value(organ: str, key: str, text: str, read: Callable, allowed: str, nelem: int = 1) -> Any:
+  text = text.strip()
+  try:
+    return read(text, nelem)
+  except ValueError as error:
+    if str(error).startswith("has "):
+      raise ValueError(f"organ {organ!r}: {key} {error}") from None
+    shown = text if len(text) <= _SHOWN else text[:_SHOWN] + "..."
+    raise ValueError(f"organ {organ!r}: {key} is {shown!r}, expected {allowed}") from None
 
 
 def _check_combination(organ: str, config: Config, given: dict, closed: bool):

@@ -25,6 +25,8 @@ def membrane(mesh: Mesh, config: Config, u: np.ndarray) -> float:
     config: material
     u: displacement from rest [m], (nvert, 3)
   """
+  if config.elements != "membrane":
+    return 0.0
   a, b, c = mesh.elem.T
   r1, r2 = mesh.rest[b] - mesh.rest[a], mesh.rest[c] - mesh.rest[a]
   p1, p2 = u[b] - u[a], u[c] - u[a]
@@ -46,6 +48,8 @@ def membrane(mesh: Mesh, config: Config, u: np.ndarray) -> float:
 
 def springs(mesh: Mesh, config: Config, u: np.ndarray) -> float:
   """Returns the energy of the edge springs k/2 (l - r)^2 [J], thesis eq. 5.1."""
+  if config.elements != "spring":
+    return 0.0
   i, j = _edges(mesh)
   rest = np.linalg.norm(mesh.rest[j] - mesh.rest[i], axis=1)
   x = mesh.rest + u
@@ -97,8 +101,16 @@ def enclosed(mesh: Mesh, config: Config, u: np.ndarray) -> float:
   return float(0.5 * config.bulk * change**2 / rest - config.pressure * change)
 
 
+# The terms of the energy: (mesh, config, displacement) -> [J], 0 where a term is off.
+TERMS = {
+  "membrane": membrane,
+  "springs": springs,
+  "bending": bending,
+  "foundation": foundation,
+  "enclosed": enclosed,
+}
+
+
 def total(mesh: Mesh, config: Config, u: np.ndarray) -> float:
-  """Returns the energy of all terms that are on [J]."""
-  stretch = springs if config.elements == "spring" else membrane
-  terms = (stretch, bending, foundation, enclosed)
-  return sum(term(mesh, config, u) for term in terms)
+  """Returns the elastic energy [J], the sum of `TERMS`."""
+  return sum(term(mesh, config, u) for term in TERMS.values())

@@ -62,8 +62,8 @@ def change(body: Body, mesh: Mesh, config: Config, pinned: np.ndarray):
   """
   finest = arrays(mesh, config, pinned, devices.patch(body.device, body.shape.nslice))
   bodies.retissue(body, finest)
-  if body.levels is not None:
-    below = _below(mesh, config, pinned, finest, body.device)
+  below = _below(mesh, config, pinned, finest, body.device) if body.levels else None
+  if body.levels and below:
     bodies.retissue(body.levels.body, below)
     body.levels.transfer.rate.assign(below["rate"])
   renumber(body, config)
@@ -275,7 +275,7 @@ def _bending(mesh: Mesh, config: Config, node: np.ndarray, nslice: int) -> dict[
 
 def _no_bending(nslice: int) -> dict[str, np.ndarray]:
   """Returns the arrays of `_bending` for a surface without it."""
-  out = {"bend_adr": np.zeros(nslice + 1, np.int32)}
+  out: dict[str, np.ndarray] = {"bend_adr": np.zeros(nslice + 1, np.int32)}
   for kind in (types.Shape, types.Tissue):
     for name, dims in types.DIMS[kind.key].items():
       if dims[0] in ("nelemslice", "nhingeslice", "nbend", "nbendslice"):

@@ -31,7 +31,7 @@ def test_evaluate_prints_success_and_spread(capsys, tmp_path):
   assert "1 episodes failed, the first: TypeError" in capsys.readouterr().err
   assert Recording.load(kept / "0.npz").info["outcome"] == "error"
   assert cli.main(["evaluate", "touch/eazy"]) == 2
-  assert "expected one of grasp/easy" in capsys.readouterr().err
+  assert "task is 'touch/eazy', expected one of" in capsys.readouterr().err
   assert cli.main(["evaluate", "touch/easy", "--policy", "nobody"]) == 2
 
 

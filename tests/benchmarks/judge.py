@@ -12,7 +12,7 @@ import numpy as np
 from benchmarks import runner, scene
 from benchmarks.runner import Case, Row
 from palpate.tissue import config as configuration
-from palpate.tissue import energy
+from palpate.tissue import energy, plate
 from palpate.tissue import mesh as topology
 from palpate.tissue.config import Config
 from palpate.tissue.mesh import Mesh
@@ -82,15 +82,15 @@ class Energy:
     area = topology.vertex_areas(mesh.rest, mesh.elem)
     share = area / area.sum() if by_area else np.full(mesh.nvert, 1 / mesh.nvert)
     self.mass = mass * share[:, None]
-    self.hinge = topology.hinges(mesh, configuration.rigidity(config, mesh.nelem), config.poisson)
+    self.hinge = plate.hinges(mesh, configuration.rigidity(config, mesh.nelem), config.poisson)
     self.angle0 = energy.hinge_angles(mesh, self.hinge, np.zeros_like(mesh.rest))
 
   def __call__(self, u: np.ndarray, v: np.ndarray) -> tuple[float, float]:
     """Returns elastic and kinetic energy [J]."""
     mesh, config = self.mesh, self.config
     with np.errstate(all="ignore"):
-      whole = energy.membrane(mesh, config, u) + energy.foundation(mesh, config, u)
-      whole += energy.enclosed(mesh, config, u)
+      others = (term for name, term in energy.TERMS.items() if name != "bending")
+      whole = sum(term(mesh, config, u) for term in others)
       change = energy.hinge_angles(mesh, self.hinge, u) - self.angle0
       each = np.where(self.hinge.of_elem >= 0, change[self.hinge.of_elem], 0.0)
       bending = 0.5 * np.einsum("ti,tij,tj->", each, self.hinge.gain, each)

@@ -18,14 +18,16 @@ import palpate
 import scenes
 from benchmarks import loop, plots, results
 from benchmarks.runner import Bench, Case, Row
-from palpate.tissue.shape import from_slices
+from palpate.tissue.body import Body
+from palpate.tissue.order import from_slices
 from scipy import sparse
 
 RINGS = (1, 2, 4, 8, 16, 32)
 
 
-def system(s, d) -> tuple[sparse.csr_array, sparse.csr_array, np.ndarray, np.ndarray]:
+def system(body: Body) -> tuple[sparse.csr_array, sparse.csr_array, np.ndarray, np.ndarray]:
   """Returns A, the inverse of its diagonal blocks, b and the warm start of the last solve."""
+  s, d = body.shape, body.system
   n, slot, fan = s.nnode, s.slot_adr.numpy(), s.fan_node.numpy()
   slices = np.repeat(np.arange(s.nslice), np.diff(slot))
   offset = fan[np.arange(slot[-1]) + 2 * slices + 1]
@@ -40,19 +42,19 @@ def system(s, d) -> tuple[sparse.csr_array, sparse.csr_array, np.ndarray, np.nda
   within = np.stack(np.meshgrid(np.arange(3), np.arange(3), indexing="ij"))
   index = 3 * at[:, :, None, None] + within[:, None]
   a = sparse.coo_array((blocks.ravel(), index.reshape(2, -1)), shape=(3 * n, 3 * n)).tocsr()
-  if s.has_bending:
-    adr, value = s.bend_adr.numpy(), s.bend_gain.numpy().astype(float)
+  if body.has_bending:
+    adr, value = s.bend_adr.numpy(), body.tissue.bend_gain.numpy().astype(float)
     row = 8 * np.repeat(np.arange(s.nslice), np.diff(adr))[:, None] + np.arange(8)
     q = sparse.coo_array((value.ravel(), (row.ravel(), s.bend_node.numpy().ravel())), shape=(n, n))
     normal = from_slices(d.normal.numpy()[0]).astype(float)
     at = np.repeat(np.arange(n), 3)
     lift = sparse.csr_array((normal.ravel(), (np.arange(3 * n), at)), shape=(3 * n, n))
-    a = a + float(d.step.numpy()[0, 1]) * (lift @ q.tocsr() @ lift.T)
+    a = a + float(body.state.step.numpy()[0, 1]) * (lift @ q.tocsr() @ lift.T)
   free = np.repeat(from_slices(s.free.numpy()), 3).astype(float)
   keep = sparse.diags_array(free)
   inverse = from_slices(d.inverse.numpy()[0])[:, [[0, 1, 2], [1, 3, 4], [2, 4, 5]]].astype(float)
   jacobi = sparse.bsr_array((inverse, np.arange(n), np.arange(n + 1)), shape=(3 * n, 3 * n))
-  b, warm = (free * from_slices(x.numpy()[0]).ravel() for x in (d.rhs, d.dvel_warm))
+  b, warm = (free * from_slices(x.numpy()[0]).ravel() for x in (d.rhs, body.state.dvel_warm))
   return (keep @ a @ keep).tocsr(), jacobi.tocsr(), b, warm
 
 
@@ -79,16 +81,16 @@ def carriers(energy: np.ndarray, rest: float) -> np.ndarray:
   return mask
 
 
-def study(s, d, tolerance: float) -> dict:
+def study(body: Body, tolerance: float) -> dict:
   """Returns the figures of one step."""
-  a, jacobi, b, warm = system(s, d)
+  a, jacobi, b, warm = system(body)
   norm = b @ (jacobi @ b)
   target = tolerance**2 * norm
   curved = warm @ (a @ warm)
   warm = warm * ((warm @ b) / curved if curved > 0 else 0.0)
   graph = sparse.coo_array(abs(a))
   edges = (graph.row // 3, graph.col // 3)
-  graph = sparse.csr_array((np.ones(graph.nnz), edges), shape=(s.nnode, s.nnode))
+  graph = sparse.csr_array((np.ones(graph.nnz), edges), shape=(body.shape.nnode, body.shape.nnode))
 
   def energy(x):
     r = b - a @ x
@@ -108,12 +110,12 @@ def study(s, d, tolerance: float) -> dict:
         more = np.minimum(graph @ more, 1.0)
       active = np.maximum(active, np.repeat(more.reshape(-1, 8).max(axis=1), 8))
       x, count = pcg(a, jacobi, b, x, 0.25 * target, np.repeat(active, 3))
-      cost += count * active.sum() / s.nvert + 1
+      cost += count * active.sum() / body.shape.nvert + 1
     if energy(x).sum() <= target and cost < best:
-      best, share = cost, active.sum() / s.nvert
+      best, share = cost, active.sum() / body.shape.nvert
   return {
     "warm_residual": float(np.sqrt(start.sum() / norm)),
-    "carriers": carriers(start, 0.25 * target).sum() / s.nvert,
+    "carriers": carriers(start, 0.25 * target).sum() / body.shape.nvert,
     "iterations": whole,
     "active": share,
     "active_cost": best,
@@ -152,8 +154,8 @@ def run(case: Case, out: pathlib.Path) -> list[Row]:
     d.ctrl[1] = 0.002 * max(0.0, min(step / steps, 0.7) - 0.4)
     mujoco.mj_step(m, d)
     if step % (steps // 8) == steps // 8 - 1 and w.status[0] > 0:
-      found.append(study(w.surface, w.state, tolerance))
-  row = {"nodes": w.surface.nvert, "bend": case["bend"], "tolerance": tolerance}
+      found.append(study(w.body, tolerance))
+  row = {"nodes": w.body.shape.nvert, "bend": case["bend"], "tolerance": tolerance}
   row |= {key: float(np.median([each[key] for each in found])) for key in found[0]}
   return [row | {"gain": 1 - row["active_cost"] / row["iterations"]}]
 

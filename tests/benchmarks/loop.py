@@ -28,7 +28,7 @@ from benchmarks.runner import Bench, Case, Row
 from palpate.engine import windowed, workspace
 from palpate.engine.layout import HEAD, MODE
 from palpate.models import grid
-from palpate.tissue import step
+from palpate.tissue import step as stepping
 from palpate.tissue.types import Stage
 
 RADIUS, H = 0.05, 1e-3
@@ -161,9 +161,9 @@ def parts(w) -> dict:
   kept = state.copy()
   solving = replay(
     body.device,
-    assemble=lambda: step.assemble(body, Stage.FIRST),
-    solve=lambda: step.solve(body, Stage.FIRST),
-    step=lambda: step.SCHEMES["implicit"].step(body),
+    assemble=lambda: stepping.assemble(body, Stage.FIRST),
+    solve=lambda: stepping.solve(body, Stage.FIRST),
+    step=lambda: stepping.step(body),
   )
   phases = windowed.Phases(w, w.model, 0)
   side = wp.get_device(phases.side)

@@ -193,7 +193,8 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
     for side in SIDES[1:]:
       ours += [f"{row[f'{side}_ms']:.3g} ms", f"{row[f'{side}_ratio']:.3g}"]
       ours.append(percent(row[f"{side}_error"]))
-    table.append([row["nodes"], "on" if row["bending"] else "off", f"{row['tolerance']:.0e}".replace("e-0", "e-"),
+    limit = f"{row['tolerance']:.0e}".replace("e-0", "e-")
+    table.append([row["nodes"], "on" if row["bending"] else "off", limit,
                   f"{row['peer_ms']:.3g} ms", percent(row["peer_error"]), *ours,
                   f"{row['window_iterations']:.0f}"])  # fmt: skip
   head = ["nodes", "bending", "tolerance", "native flex", "error"]

@@ -15,10 +15,13 @@ import numpy as np
 import trimesh
 from benchmarks import plots, results
 from benchmarks.runner import Bench, Case, Row
-from benchmarks.solver import MASS, PRECONDITIONERS, make, press, sphere
+from benchmarks.solver import PRECONDITIONERS, condition, limit, make, press, sphere
 from palpate import models as _models
-from palpate.tissue import elastic, hierarchy, mesh, solver, types
-from palpate.tissue import shape as surface
+from palpate.tissue import coarse as coarsening
+from palpate.tissue import mesh
+from palpate.tissue import step as stepping
+from palpate.tissue.body import Body
+from palpate.tissue.types import Stage
 
 MOST = 1000  # iterations
 TOLERANCES = (1e-3, 1e-4)
@@ -34,18 +37,17 @@ def organ(name: str, halvings: int) -> mesh.Mesh:
   return mesh.build(name, vertices, np.asarray(faces))
 
 
-def count(s: types.Surface, d: types.State) -> dict:
+def count(body: Body) -> dict:
   """Returns the iterations of each preconditioner to each tolerance, one more than MOST if not."""
-  coarse, out = s.levels, {}
-  elastic.assemble(s, d, elastic.Stage.FIRST)
-  solver.multilevel().assemble(s, d)
+  levels, out = body.levels, {}
+  stepping.assemble(body, Stage.FIRST)
   for kind, tolerance in itertools.product(PRECONDITIONERS, TOLERANCES):
-    s.levels = coarse if kind == "multilevel" else None
-    s.tolerance = tolerance
-    solver.solve(s, d, elastic.Stage.FIRST)
-    iterations, residual = d.status.numpy()[0, :2]
+    body.levels = levels if kind == "multilevel" else None
+    limit(body, tolerance)
+    stepping.solve(body, Stage.FIRST)
+    iterations, residual = body.system.status.numpy()[0, :2]
     out[f"{kind}_{tolerance:g}"] = int(iterations) if residual <= tolerance else MOST + 1
-  s.levels = coarse
+  body.levels = levels
   return out
 
 
@@ -70,20 +72,21 @@ def stages(args: argparse.Namespace) -> list[list[Case]]:
 
 def run(case: Case, out: pathlib.Path) -> list[Row]:
   """Returns a row a stiffness and bending."""
-  name, build, rows = case["name"], hierarchy.build, []
+  name, build, rows = case["name"], coarsening.build, []
   shape = sphere(case["size"]) if name == "sphere" else organ(name, case["size"])
-  coarse = build(shape, surface.COARSEST)
-  hierarchy.build = lambda *_: coarse  # the same for every stiffness
+  coarse = build(shape)
+  coarsening.build = lambda *_: coarse  # the same for every stiffness
   try:
     for young, bend in itertools.product(case["young"], (0.0, 1.0)):
-      s, d = make(shape, case["device"], young=(young,), bend=bend, iterations=MOST, tolerance=1e-3)
-      s.levels.threshold = 0.0
-      press(shape, s, d, 10)
-      condition = d.step.numpy()[0, 1] / (MASS / s.nvert) * s.levels.rate.numpy()[0, 0]
-      row = {"organ": name, "nodes": s.nvert, "levels": s.levels.nlevel, "young": young}
-      rows.append(row | {"bend": bend, "condition": float(condition)} | count(s, d))
+      keys = {"young": (young,), "bend": bend, "iterations": MOST, "tolerance": 1e-3}
+      body = make(shape, case["device"], **keys)
+      transfer = body.levels.transfer
+      transfer.threshold = 0.0
+      press(shape, body, 10)
+      row = {"organ": name, "nodes": shape.nvert, "levels": transfer.nlevel, "young": young}
+      rows.append(row | {"bend": bend, "condition": condition(body)} | count(body))
   finally:
-    hierarchy.build = build
+    coarsening.build = build
   return rows
 
 

@@ -7,10 +7,11 @@ import functools
 
 import mujoco
 import numpy as np
+from palpate.models import mjcf
 from palpate.organ import Organ
 from palpate.tissue import mesh as topology
 from palpate.tissue.mesh import Mesh
-from scenes import EDGES, RADIUS, UNTOUCHED, flex, join, organ, windowed, world
+from scenes import RADIUS, flex, organ, windowed, world
 
 PROBE = 0.006  # radius of the probe [m]
 SHAPES = ("sphere", "liver", "lobed")
@@ -139,7 +140,8 @@ def build(
   bodies, ties = [_organ(mesh, tissue, scheme, window, contact | rubs, keys)], ""
   if probe is not None:
     mass = (1e4 if heavy else 0.5) * tissue.mass
-    bodies.append(_probe(probe, mass, contact | rubs | (UNTOUCHED if joined is not None else {})))
+    touches = {} if joined is None else {"contype": 0, "conaffinity": 0}
+    bodies.append(_probe(probe, mass, contact | rubs | touches))
   if joined is not None:
     solver_of = _text(contact)
     ties = "".join(
@@ -182,7 +184,7 @@ def _organ(
     inside = native(tissue.young, tissue.poisson, tissue.thickness, tissue.damping, tissue.bend)
     return flex(*shape, inside, mass=tissue.mass, contact=contact)
   if scheme == "passive":
-    return flex(*shape, EDGES, mass=tissue.mass, contact=contact)
+    return flex(*shape, mjcf.EDGE, mass=tissue.mass, contact=contact)
   keys = tissue.keys() | {"integrator": None if scheme == "implicit" else scheme} | keys
   if not window:
     return organ(*shape, mass=tissue.mass, contact=contact, **keys)
@@ -210,7 +212,7 @@ def _probe(at: np.ndarray, mass: float, contact: dict) -> str:
     for name, axis in (("x", "1 0 0"), ("y", "0 1 0"), ("z", "0 0 1"))
   )
   ball = f'<geom size="{PROBE}" mass="{mass}" {_text(contact)}/>'
-  return f'<body name="probe" pos="{join(at)}">{slides}{ball}</body>'
+  return f'<body name="probe" pos="{mjcf.numbers(at)}">{slides}{ball}</body>'
 
 
 def _text(attributes: dict) -> str:

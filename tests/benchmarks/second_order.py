@@ -8,6 +8,7 @@ the plugin's coupling.
 """
 
 import argparse
+import dataclasses
 import pathlib
 
 import mujoco
@@ -16,8 +17,7 @@ from benchmarks import compare, error, films, plots, results, scene
 from benchmarks.films import Film
 from benchmarks.runner import Bench, Case, Row
 from palpate.engine import inertia
-from palpate.tissue import shape as surface
-from palpate.tissue import types
+from palpate.tissue import shape as making
 from reference import exact
 from scipy import sparse
 from scipy.sparse import linalg
@@ -110,12 +110,10 @@ def _inertia(scheme: Scheme, film: Film) -> np.ndarray:
   """Returns what the scheme makes a contact meet at each node [kg], (nvert,)."""
   mesh, config = film.mesh, scheme.elastic.config
   free = np.ones(mesh.nvert, bool)
-  s = surface.make(mesh, config, ~free, "cpu")
-  state = types.make_state(s)
-  state.mass.fill_(1.0)
+  body = making.make(mesh, dataclasses.replace(config, tolerance=1e-2, newton=1), ~free, "cpu")
   mass = scheme.mass[:, 0] * scheme.share
   gain = scheme.gain * scheme.share
-  return inertia.effective_inertia(s, state, mesh, mass, free, scheme.h, scene.PROBE, gain)
+  return inertia.effective_inertia(body, mesh, mass, free, scheme.h, scene.PROBE, gain)
 
 
 def film_of(name: str, where: str, h: float) -> Film:

@@ -13,13 +13,18 @@ import pathlib
 import time
 
 import numpy as np
+import scenes
 import warp as wp
 from benchmarks import plots, results
 from benchmarks.results import BenchError
 from benchmarks.runner import Bench, Case, Row
 from palpate.models import grid
-from palpate.tissue import config, elastic, levels, mesh, solver, types
-from palpate.tissue import shape as surface
+from palpate.tissue import body as bodies
+from palpate.tissue import coarse, config, mesh
+from palpate.tissue import shape as making
+from palpate.tissue import step as stepping
+from palpate.tissue.body import Body
+from palpate.tissue.types import NUMBERS, Stage
 
 H = 1e-3
 MASS = 0.1
@@ -41,35 +46,20 @@ def sphere(nodes: int) -> mesh.Mesh:
   return mesh.build("sphere", np.asarray(made[0]) * RADIUS, np.asarray(made[1]))
 
 
-def make(
-  shape: mesh.Mesh, device: str, scale: float = np.inf, **keys
-) -> tuple[types.Surface, types.State]:
-  """Returns the constants and a fresh state of an organ of that shape, with coarse meshes."""
+def make(shape: mesh.Mesh, device: str, scale: float = np.inf, **keys) -> Body:
+  """Returns the body of an organ of that shape, with coarse meshes."""
   cfg = config.Config(**({"young": (3e4,), "poisson": 0.3, "device": device} | keys))
   pinned = shape.rest[:, 2] < shape.rest[:, 2].min() + 0.05 * np.ptp(shape.rest[:, 2])
-  s = surface.make(shape, cfg, pinned, device, scale)
-  d = types.make_state(s)
-  with wp.ScopedDevice(s.device):
-    elastic.calibrate(s, d)
-  put(s, d.mass, np.full(len(shape.rest), MASS / len(shape.rest)), padding=1.0)
-  d.step.assign(np.array([[H, H * H + H * cfg.damping, 0, 0]], np.float32))
-  return s, d
+  body = making.make(shape, cfg, pinned, device, scale)
+  scenes.put(body, body.state.mass, MASS / shape.nvert)
+  body.state.step.assign(np.array([[H, H * H + H * cfg.damping, 0, 0]], np.float32))
+  return body
 
 
-def put(s: types.Surface, array: wp.array, values: np.ndarray, padding=0.0):
-  """Writes per-vertex values."""
-  vert = s.vert.numpy()
-  full = np.full((s.nnode, *values.shape[1:]), padding)
-  full[vert >= 0] = values[vert[vert >= 0]]
-  array.assign(surface.to_slices(full.astype(np.float32))[None])
-
-
-def get(s: types.Surface, array: wp.array) -> np.ndarray:
-  """Reads per-vertex values."""
-  vert = s.vert.numpy()
-  out = np.zeros((s.nvert, *array.shape[2:-1]))
-  out[vert[vert >= 0]] = surface.from_slices(array.numpy()[0])[vert >= 0]
-  return out
+def limit(body: Body, tolerance: float):
+  """Sets the tolerance."""
+  numbers = dict(zip(NUMBERS, body.numbers.numpy(), strict=True))
+  bodies.renumber(body, numbers | {"tolerance": tolerance})
 
 
 def load(shape: mesh.Mesh) -> np.ndarray:
@@ -78,9 +68,9 @@ def load(shape: mesh.Mesh) -> np.ndarray:
   return patch[:, None] * [0.0, 0.0, -1.0] / patch.sum()
 
 
-def record(s: types.Surface, work) -> wp.Graph:
+def record(body: Body, work) -> wp.Graph:
   """Returns the graph of `work`."""
-  with wp.ScopedDevice(s.device), wp.ScopedCapture(device=s.device) as capture:
+  with wp.ScopedDevice(body.device), wp.ScopedCapture(device=body.device) as capture:
     work()
   return capture.graph
 
@@ -96,13 +86,13 @@ def agreement(device: str) -> float:
     for kind, threshold in PRECONDITIONERS.items():
       results = []
       for where in ("cpu", device, device):
-        s, d = make(shape, where, tolerance=1e-6, iterations=1000, **keys)
-        s.levels.threshold = threshold
-        put(s, d.pos, u)
-        put(s, d.vel, v)
-        put(s, d.force_ext, load(shape))
-        solver.step(s, d)
-        results.append((get(s, d.dvel), d.status.numpy()[0].copy()))
+        body = make(shape, where, tolerance=1e-6, iterations=1000, **keys)
+        body.levels.transfer.threshold = threshold
+        for field, values in (("disp", u), ("vel", v), ("force_ext", load(shape))):
+          scenes.put(body, getattr(body.state, field), values)
+        stepping.step(body)
+        status = body.system.status.numpy()[0].copy()
+        results.append((scenes.get(body, body.state.dvel), status))
       free = np.linalg.norm(results[0][0])
       difference = np.linalg.norm(results[0][0] - results[1][0]) / free
       repeats = np.array_equal(results[1][0], results[2][0])
@@ -119,76 +109,81 @@ def measure(device: str, nodes: int, tolerance: list[float], bend: float, args) 
   """Returns the figures of one size, a row for each tolerance and preconditioner."""
   shape = sphere(nodes)
   start = time.perf_counter()
-  s, d = make(shape, device, iterations=1000, bend=bend)
-  wp.synchronize_device(s.device)
+  body = make(shape, device, iterations=1000, bend=bend)
+  wp.synchronize_device(body.device)
   made = time.perf_counter() - start
-  coarse = s.levels
-  condition = float(d.step.numpy()[0, 1] / (MASS / s.nvert) * coarse.rate.numpy()[0, 0])
-  auto = "multilevel" if bend and condition >= levels.threshold(s.device) else "jacobi"
-  coarse.threshold = PRECONDITIONERS["multilevel"]
-  press(shape, s, d, 20)
+  auto = "multilevel" if bend and condition(body) >= coarse.threshold(body.device) else "jacobi"
+  levels = body.levels
+  levels.transfer.threshold = PRECONDITIONERS["multilevel"]
+  press(shape, body, 20)
   rows = []
-  for limit in tolerance:
+  for least in tolerance:
     for kind in args.preconditioner:
-      s.tolerance = limit
-      s.levels = coarse if kind == "multilevel" else None
-      row = {"device": device, "nodes": s.nvert, "bend": bend, "tolerance": limit}
+      limit(body, least)
+      body.levels = levels if kind == "multilevel" else None
+      row = {"device": device, "nodes": shape.nvert, "bend": bend, "tolerance": least}
       row |= {"preconditioner": kind}
-      row |= timed(s, d, args.repeat)
-      row |= {"condition": condition, "auto": auto, "make_s": made, "bytes_a_node": size(s, d)}
-      rows.append(row)
+      row |= timed(body, args.repeat)
+      body.levels = levels
+      row |= {"condition": condition(body), "auto": auto, "make_s": made}
+      rows.append(row | {"bytes_a_node": size(body, kind == "multilevel")})
   return rows
 
 
-def press(shape: mesh.Mesh, s: types.Surface, d: types.State, steps: int):
+def condition(body: Body) -> float:
+  """Returns the condition number that the choice of a preconditioner goes by."""
+  stiffness = body.levels.transfer.rate.numpy()[0, 0]
+  return float(body.state.step.numpy()[0, 1] / (MASS / body.shape.nvert) * stiffness)
+
+
+def press(shape: mesh.Mesh, body: Body, steps: int):
   """Moves the organ some steps under `load`."""
-  put(s, d.force_ext, load(shape))
-  graph = record(s, lambda: solver.step(s, d))
+  state = body.state
+  scenes.put(body, state.force_ext, load(shape))
+  graph = record(body, lambda: stepping.step(body))
   u, v = np.zeros_like(shape.rest), np.zeros_like(shape.rest)
   for _ in range(steps):
     wp.capture_launch(graph)
-    v += get(s, d.dvel)
+    v += scenes.get(body, state.dvel)
     u += H * v
-    put(s, d.pos, u)
-    put(s, d.vel, v)
+    scenes.put(body, state.disp, u)
+    scenes.put(body, state.vel, v)
 
 
-def timed(s: types.Surface, d: types.State, repeat: int) -> dict:
+def timed(body: Body, repeat: int) -> dict:
   """Returns medians of a step, its assembly and its solve in ms, iterations and residual."""
-
-  def assemble():
-    elastic.assemble(s, d, elastic.Stage.FIRST)
-    if s.levels is not None:
-      solver.multilevel().assemble(s, d)
-
   parts = {
-    "step": record(s, lambda: solver.step(s, d)),
-    "assemble": record(s, assemble),
-    "solve": record(s, lambda: solver.solve(s, d, elastic.Stage.FIRST)),
+    "step": record(body, lambda: stepping.step(body)),
+    "assemble": record(body, lambda: stepping.assemble(body, Stage.FIRST)),
+    "solve": record(body, lambda: stepping.solve(body, Stage.FIRST)),
   }
   times = {name: [] for name in parts}
   for _ in range(repeat):
     for name, part in parts.items():
-      wp.synchronize_device(s.device)
+      wp.synchronize_device(body.device)
       start = time.perf_counter()
       wp.capture_launch(part)
-      wp.synchronize_device(s.device)
+      wp.synchronize_device(body.device)
       times[name].append(time.perf_counter() - start)
-  status = d.status.numpy()[0]
+  status = body.system.status.numpy()[0]
   out = {f"{name}_ms": 1e3 * float(np.median(values)) for name, values in times.items()}
   return out | {"iterations": int(status[0]), "residual": float(status[1])}
 
 
-def size(s: types.Surface, d: types.State) -> int:
+def size(body: Body, cycles: bool) -> int:
   """Returns the bytes a node of all arrays, those of the coarse meshes where they are in use."""
-  parts = [s, d]
-  if s.levels is not None:
-    parts += [s.levels, s.levels.surface, d.coarse]
-  arrays = {id(a): a for x in parts for a in vars(x).values() if isinstance(a, wp.array)}
-  if s.levels is None:
-    for unused in (d.e, d.en, d.t):
-      arrays.pop(id(unused))
-  return round(sum(a.size * 4 for a in arrays.values()) / s.nvert)
+  unused = set() if cycles else {"e", "en", "t"}
+  structs = [body.shape, body.tissue, body.state, body.system]
+  if cycles:
+    below = body.levels.body
+    structs += [body.levels.transfer, below.shape, below.tissue, below.state, below.system]
+  arrays = {}
+  for each in structs:
+    for name in each._cls.vars:
+      value = getattr(each, name)
+      if isinstance(value, wp.array) and name not in unused:
+        arrays[value.ptr] = value.size * 4
+  return round(sum(arrays.values()) / body.shape.nvert)
 
 
 def arguments(parser: argparse.ArgumentParser):

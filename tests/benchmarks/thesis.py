@@ -19,12 +19,12 @@ import scenes
 import warp as wp
 from benchmarks import plots, results, runner, scene
 from benchmarks.runner import Bench, Case, Row
-from palpate.tissue import elastic, schemes, solver, types
-from palpate.tissue import shape as surface
+from palpate.tissue import shape as making
+from palpate.tissue import step as stepping
+from palpate.tissue.body import Body
 from palpate.tissue.config import Config
-from palpate.tissue.elastic import Stage
 from palpate.tissue.mesh import Mesh
-from palpate.tissue.types import State, Surface
+from palpate.tissue.types import Stage
 
 SIDES = (16, 32, 64, 128, 256)
 H = 1e-3  # a haptic cycle [s]
@@ -130,7 +130,7 @@ def run(case: Case, out: pathlib.Path) -> list[Row]:
     if clock() > limit:
       break
     if cycle == 150:
-      row |= _parts(space.organ.surface, space.state, scheme)
+      row |= _parts(space.body, scheme)
   timed = np.array(cycles[10:])
   row["step_ms"] = 1e3 * float(np.median(timed))
   row["slowest_ms"] = 1e3 * float(np.max(timed))
@@ -160,56 +160,50 @@ def _alone(case: Case, mesh: Mesh) -> Row:
   config = Config(
     elements="spring", stiffness=STIFFNESS, foundation=FOUNDATION, bend=0.0, device=case["device"]
   )
-  s = surface.make(mesh, config, np.zeros(mesh.nvert, bool), case["device"])
-  with wp.ScopedDevice(s.device):
-    d = types.make_state(s)
-    d.mass.fill_(NODE_MASS)
-    d.step.assign(np.array([[H, H * H + H * config.damping, 0, 0]], np.float32))
-    vert = s.vert.numpy()
-    patch = np.linalg.norm(mesh.rest - mesh.rest[np.argmax(mesh.rest[:, 2])], axis=1) < scene.PROBE
-    load = np.where(vert >= 0, patch[vert], False)[:, None] * [0.0, 0.0, -1.0] / patch.sum()
-    d.force_ext.assign(surface.to_slices(load.astype(np.float32))[None])
+  body = making.make(mesh, config, np.zeros(mesh.nvert, bool), case["device"])
+  state = body.state
+  scenes.put(body, state.mass, NODE_MASS)
+  state.step.assign(np.array([[H, H * H + H * config.damping, 0, 0]], np.float32))
+  patch = np.linalg.norm(mesh.rest - mesh.rest[np.argmax(mesh.rest[:, 2])], axis=1) < scene.PROBE
+  scenes.put(body, state.force_ext, patch[:, None] * [0.0, 0.0, -1.0] / patch.sum())
   row: Row = {"kind": "rate", "nodes": mesh.nvert, "compile_s": time.perf_counter() - began}
   row |= {k: case[k] for k in ("scheme", "device", "side")}
-  row |= _parts(s, d, case["scheme"])
-  return row | {"iterations": float(d.status.numpy()[0][0])}
+  row |= _parts(body, case["scheme"])
+  return row | {"iterations": float(body.system.status.numpy()[0][0])}
 
 
-def _parts(s: Surface, d: State, scheme: str, repeat: int = 30) -> Row:
+def _parts(body: Body, scheme: str, repeat: int = 30) -> Row:
   """Returns median times of the step's parts, each as a recorded graph [ms]."""
-  down = ("step", "pos", "vel", "mass", "force_ext", "dvel_warm")
-  host = {
-    name: wp.zeros(getattr(d, name).shape, dtype=float, device="cpu", pinned=s.device.is_cuda)
-    for name in (*down, "dvel", "status")
-  }
-  for name, array in host.items():
-    wp.copy(array, getattr(d, name))
-  wp.synchronize_device(s.device)
+  state, device = body.state, body.device
+  down = [getattr(state, k) for k in ("step", "disp", "vel", "mass", "force_ext", "dvel_warm")]
+  up = [state.dvel, body.system.status]
+  host = {each.ptr: wp.clone(each, device="cpu", pinned=device.is_cuda) for each in (*down, *up)}
+  wp.synchronize_device(device)
 
   def to_device():
-    for name in down:
-      wp.copy(getattr(d, name), host[name])
+    for each in down:
+      wp.copy(each, host[each.ptr])
 
   def from_device():
-    wp.copy(host["dvel"], d.dvel)
-    wp.copy(host["status"], d.status)
+    for each in up:
+      wp.copy(host[each.ptr], each)
 
-  works = {"integration_ms": lambda: schemes.step(s, d, scheme)}
+  works = {"integration_ms": lambda: stepping.step(body, scheme)}
   if scheme == "implicit":
-    works["assemble_ms"] = lambda: elastic.assemble(s, d, Stage.FIRST)
-    works["solve_ms"] = lambda: solver.solve(s, d, Stage.FIRST)
-  if s.device.is_cuda:
+    works["assemble_ms"] = lambda: stepping.assemble(body, Stage.FIRST)
+    works["solve_ms"] = lambda: stepping.solve(body, Stage.FIRST)
+  if device.is_cuda:
     works |= {"to_ms": to_device, "from_ms": from_device}
   row: Row = {}
   for name, work in works.items():
-    with wp.ScopedDevice(s.device), wp.ScopedCapture(device=s.device) as capture:
+    with wp.ScopedDevice(device), wp.ScopedCapture(device=device) as capture:
       work()
 
     def once(graph: wp.Graph = capture.graph):  # type: ignore[assignment]
       wp.capture_launch(graph)
-      wp.synchronize_device(s.device)
+      wp.synchronize_device(device)
 
-    row[name] = 1e3 * float(np.median(_times(once, repeat, _clock(s.device.alias))))
+    row[name] = 1e3 * float(np.median(_times(once, repeat, _clock(device.alias))))
   return row
 
 

@@ -57,7 +57,9 @@ def reference():
   # Share of the peak; half of the square is the first touch, where the ball bounces on one node.
   [(5e-4, 1, 0.005), (1e-3, 1, 0.006), (2e-3, 1, 0.013), (1e-3, 3, 0.006)],
 )
-def test_the_press_of_the_explicit_reference_is_reproduced(reference, device, h, newton, allowed):
+def test_the_press_of_the_explicit_reference_is_reproduced(
+  scenes, reference, device, h, newton, allowed
+):
   script = runpy.run_path(str(REFERENCE.with_suffix(".py")))
   time, expected = reference
   keys = {
@@ -69,12 +71,8 @@ def test_the_press_of_the_explicit_reference_is_reproduced(reference, device, h,
     "newton": newton,
     "device": device,
   }
-  config = "".join(f'<config key="{key}" value="{value}"/>' for key, value in keys.items())
-  xml = script["mjcf"](
-    h,
-    '<extension><plugin plugin="palpate.organ"/></extension>',
-    f'<plugin plugin="palpate.organ">{config}</plugin>',
-  )
+  extension = '<extension><plugin plugin="palpate.organ"/></extension>'
+  xml = script["mjcf"](h, extension, scenes.plugin(**keys))
   found = script["press"](mujoco.MjModel.from_xml_string(xml))
   force = np.interp(time, found[:, 0], found[:, 1])
   error = np.sqrt(np.mean((force - expected) ** 2)) / expected.max()

@@ -10,7 +10,7 @@ import numpy as np
 import palpate
 import pytest
 from palpate.engine import layout
-from scenes import drive, lump, probed
+from scenes import RADIUS, drive, load, lump, organ, probed, sphere, windowed, world
 
 
 # With friction the tip sticks on the facets and jumps off them from 0.18 s on, in a 20 us reference
@@ -215,3 +215,92 @@ def test_window_touches_what_nodal_dofs_touch(count):
     found.append((contacts, d.qfrc_constraint[-2]))
   assert found[1][0] == found[0][0]
   assert found[1][1] == pytest.approx(found[0][1], rel=0.01)  # masses are spread otherwise
+
+
+TILTED = {
+  "capsule": 'type="capsule" size=".004 .02" euler="0 60 0"',
+  "cylinder": 'type="cylinder" size=".004 .02" euler="0 60 0"',
+  "ellipsoid": 'type="ellipsoid" size=".004 .006 .02" euler="0 60 0"',
+  "box": 'type="box" size=".004 .006 .02" euler="0 60 0"',
+}
+
+
+@pytest.mark.parametrize("shape", TILTED)
+def test_a_tilted_tool_meets_the_nodes_under_it(shape):
+  points, elem = sphere(3)
+  geom = f'<geom {TILTED[shape]} mass=".05" condim="1"/>'
+  joint = '<joint name="z" type="slide" axis="0 0 1"/>'
+  tool = f'<body name="tool" pos="0 0 {RADIUS + 0.03}">{joint}{geom}</body>'
+  motor = '<actuator><position joint="z" kp="500" kv="10"/></actuator>'
+  keys = {"young": 3e4, "foundation": 1e5, "tolerance": 1e-6}
+  nodal, window = organ(points, elem, **keys), windowed(points, elem, count="7 5 1", **keys)
+  found = []
+  for made in (nodal, window):
+    m, d, handle = load(world(made, tool, extra=motor))
+    if made is nodal:
+      lump(handle)
+    for _ in range(220):
+      d.ctrl[0] = -0.025 * min(1, d.time / 0.15)
+      mujoco.mj_step(m, d)
+    assert handle.window_overflow == (0, 0)
+    found.append((d.qfrc_constraint[-1], handle.displacement))
+  assert found[0][0] > 0.05
+  assert found[1][0] == pytest.approx(found[0][0], rel=1e-3)
+  np.testing.assert_allclose(found[1][1], found[0][1], atol=1e-5)
+
+
+@pytest.mark.parametrize(
+  "place", ['pos="0 0 {z}"', 'pos=".5 .3 {z}"', 'euler="0 10 0" pos="0 0 {z}"']
+)
+def test_a_windowed_organ_rests_on_a_plane_as_a_nodal_one_does(place):
+  points, elem = sphere(2)
+  keys = {"young": 3e4, "bulk": 1e5, "damping": 0.01, "tolerance": 1e-6}
+  soft = {"solref": "0.01 1"}
+  floor = f'<geom type="plane" size="1 1 1" condim="1" {place.format(z=-RADIUS - 0.002)}/>'
+  nodal = organ(points, elem, contact=soft, **keys)
+  window = windowed(points, elem, count="12 12 1", contact=soft, follow="world", **keys)
+  found = []
+  for made in (nodal, window):
+    m, d, handle = load(world(made, floor, gravity=(0, 0, -9.81)))
+    if made is nodal:
+      lump(handle)
+    mujoco.mj_step(m, d, nstep=300)
+    found.append(handle.xpos)
+  np.testing.assert_allclose(found[1], found[0], atol=1e-5)
+
+
+@pytest.mark.parametrize(("young", "offset"), [(3e4, 0.0), (3e6, 0.0), (3e6, 0.0395)])
+@pytest.mark.parametrize("resident", [None, "true"])
+def test_pinned_vertices_stay_and_carry_a_tool(young, offset, resident):
+  points, elem = sphere(3)
+  pin = np.flatnonzero(points[:, 2] > 0.03)
+  ball = f"""<body pos="{offset} 0 {RADIUS + 0.007}"><joint name="z" type="slide" axis="0 0 1"/>
+    <geom size=".006" mass=".03" condim="1" solref=".004 1"/></body>"""
+  keys = {"young": young, "foundation": 1e3, "tolerance": 1e-6}
+  heights = []
+  for made in (
+    organ(points, elem, pin=pin, **keys),
+    windowed(points, elem, count="12 9 1", pin=" ".join(map(str, pin)), resident=resident, **keys),
+  ):
+    m, d, handle = load(world(made, ball, gravity=(0, 0, -9.81)))
+    for _ in range(10):
+      mujoco.mj_step(m, d, nstep=30)
+      np.testing.assert_array_equal(handle.displacement[pin], 0.0)
+      np.testing.assert_array_equal(handle.xvel[pin], 0.0)
+    heights.append(d.qpos[-1])
+    assert d.qfrc_constraint[-1] == pytest.approx(0.03 * 9.81, rel=1e-3)  # it is at rest
+  assert heights[1] == pytest.approx(heights[0], abs=1e-6)
+
+
+def test_the_warning_of_a_small_window_tells_the_worst_moment():
+  m, d, handle = load(probed(condim=1, count="3 2 1"))
+  d.qpos[-2] = 0.02
+  counts = []
+  for _ in range(200):
+    d.ctrl[0] = 0.02 - 0.2 * d.time
+    mujoco.mj_step(m, d)
+    counts.append(handle.window_overflow[0])
+  first = next(count for count in counts if count)
+  assert max(counts) > first
+  assert f"no room for {max(counts)} nodes" in handle.window_warning
+  assert d.warning.number.sum() == 0

@@ -68,7 +68,8 @@ def test_a_window_with_some_pins():
 
 
 def test_a_volumetric_window():
-  text = edited('count="9 6 1" spacing=".01 .01 .01" dim="2"', 'count="3 3 3" dim="3"')
+  flat, thick = ('dim="2" type="grid" count="9 6 1"', 'dim="3" type="grid" count="3 3 3"')
+  text = edited(flat, thick)
   refused(text, "organ 'organ': window 'window'", "dim")
 
 

@@ -1,6 +1,7 @@
 """Recording an episode and replaying it to the bit."""
 
 import dataclasses
+import sys
 
 import numpy as np
 import pytest
@@ -48,6 +49,14 @@ def test_what_was_recorded_before_an_error_is_kept(tmp_path):
 
   with pytest.raises(episode.EpisodeError, match="step 0: RuntimeError: no idea"):
     episode.run(env, broken, 0)
+
+
+def test_a_policy_that_leaves_ends_its_episode():
+  def leave(_):
+    sys.exit("no GPU")
+
+  with pytest.raises(episode.EpisodeError, match="touch/easy: step 0: SystemExit: no GPU"):
+    episode.run(tasks.load("touch", "easy"), leave, 0)
 
 
 def test_metrics_of_an_expert_are_known():

@@ -12,6 +12,7 @@ import pytest
 from palpate.tasks import recorder as recorder_module
 from palpate.tasks.metrics import METRICS
 from palpate.tasks.recorder import Event, Recorder, Recording, Settings
+from palpate.tasks.score import read_reference
 from recordings import SETTINGS, exercise
 
 
@@ -96,6 +97,14 @@ def test_foreign_bytes_are_refused(tmp_path, content):
     Recording.load(path)
 
 
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes here")
+def test_a_pipe_is_refused_and_not_waited_for(tmp_path):
+  os.mkfifo(tmp_path / "pipe.npz")
+  for read in (Recording.load, read_reference):
+    with pytest.raises(ValueError, match=r"pipe.npz: not a .*: not a file"):
+      read(tmp_path / "pipe.npz")
+
+
 def test_truncated_files_are_refused(tmp_path):
   data = exercise(40).save(tmp_path / "whole.npz").read_bytes()
   path = tmp_path / "cut.npz"
@@ -171,6 +180,7 @@ EVENT = {"kind": "drop", "time": 1.0, "value": None, "instrument": 0, "label": "
     (_set("entries", "array.qpos", np.array(["x"] * 20)), "dtype <U1"),
     (_set("entries", "array.qpos", np.zeros(())), "expected 20 samples"),
     (_set("entries", "constant.curve", np.zeros(3)), "'curve' has shape"),
+    (_set("entries", "constant.curve", np.full((4, 3), np.nan)), "'curve' is not finite in row 0"),
     (_set("entries", "stranger", np.zeros(20)), "unknown entry 'stranger'"),
   ],
 )

@@ -311,7 +311,13 @@ def test_many_events_are_cut_and_counted():
     recorder.event("note", 0.01 * k)
   page = _Page(report.render(recorder.recording()))
   assert "and 31 more" in page.text()
-  plots.png(plots.force_figure(recorder.recording()))
+  few = plots.force_figure(recorder.recording()).axes[0]
+  assert [len(c.get_segments()) for c in few.collections if hasattr(c, "get_segments")] == [80]
+  for k in range(80, 2000):
+    recorder.event("note", 0.001 * k)
+  many = plots.force_figure(recorder.recording()).axes[0]  # each line costs a millisecond
+  assert not [c for c in many.collections if hasattr(c, "get_segments")]
+  plots.png(many.figure)
 
 
 def test_a_bad_reference_writes_nothing(tmp_path):

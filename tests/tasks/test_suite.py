@@ -54,11 +54,11 @@ def test_tasks_and_tags():
 
 
 def test_unknown_names_list_the_choices():
-  with pytest.raises(ValueError, match="domain is 'tuch', expected one of grasp, probe, retract"):
+  with pytest.raises(ValueError, match=r"domain is 'tuch', expected one of .*probe, .*touch"):
     tasks.load("tuch", "easy")
   with pytest.raises(ValueError, match="touch: task is 'eazy', expected one of easy, standard"):
     tasks.load("touch", "eazy")
-  with pytest.raises(ValueError, match="task is 'touch/eazy', expected one of grasp/easy"):
+  with pytest.raises(ValueError, match=r"task is 'touch/eazy', expected one of .*touch/easy"):
     suite.split("touch/eazy")
   with pytest.raises(ValueError, match="reward is 'dence', expected one of dense, sparse"):
     load("touch/easy", reward="dence")

@@ -4,7 +4,11 @@ import dataclasses
 
 import numpy as np
 import pytest
+import warp as wp
 from palpate.tissue import energy, plate
+from palpate.tissue import mesh as topology
+from palpate.tissue import shape as making
+from palpate.tissue import step as stepping
 from palpate.tissue.config import rigidity
 
 H = 1e-3
@@ -216,3 +220,26 @@ def test_the_order_of_the_vertices_does_not_matter(scenes, device):
   _, _, body = scenes.kernels(mesh.rest[order], where[mesh.elem], device=device, **config)
   found = scenes.step(body, H, u[order], v[order], MASS, force[order])
   np.testing.assert_allclose(found[where], expected, atol=1e-5 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize(
+  "change", [{"foundation": 1e5}, {"bulk": 0.0}, {"pressure": 50.0}, {"tolerance": 1e-2}]
+)
+def test_a_recorded_step_follows_the_numbers(scenes, device, change):
+  _, settings, body, u, v, force = _pressed(scenes, device=device, iterations=500)
+  changed = dataclasses.replace(settings, **change)
+  expected = scenes.step(making.make(*_made_of(scenes, changed), device), H, u, v, MASS, force)
+  before = scenes.step(body, H, u, v, MASS, force)
+  with wp.ScopedDevice(body.device), wp.ScopedCapture(device=body.device) as capture:
+    stepping.step(body)
+  making.renumber(body, changed)
+  wp.capture_launch(capture.graph)
+  found = scenes.get(body, body.state.dvel)
+  assert np.abs(found - before).max() > 0
+  np.testing.assert_array_equal(found, expected)
+
+
+def _made_of(scenes, settings):
+  points, elem = scenes.sphere(2)
+  mesh = topology.build("organ", points, elem)
+  return mesh, settings, np.zeros(mesh.nvert, bool)

@@ -11,7 +11,7 @@ from palpate.tissue import body, config, mesh, plate, step, types
 CLASSES = (
   body.Body,
   body.Levels,
-  config.Config,
+  config.Row,
   mesh.Mesh,
   plate.Hinges,
   step.Scheme,
