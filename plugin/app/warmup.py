@@ -20,6 +20,7 @@ def main(args: argparse.Namespace) -> int:
   register()
   import warp as wp
   from palpate.tissue import device as devices
+  from palpate.tissue import kernels
 
   devices.init()
   known = [device.alias for device in wp.get_devices()]
