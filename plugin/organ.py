@@ -95,13 +95,18 @@ class Organ:
 
   @property
   def displacement(self) -> np.ndarray:
-    """Displacement from rest [m], in the frame of the parent body, (nvert, 3)."""
+    """Displacement from rest [m], (nvert, 3)."""
+    return self._deformation @ self._organ.frame.T
+
+  @property
+  def _deformation(self) -> np.ndarray:
+    """Displacement from rest in the organ's own frame [m], (nvert, 3)."""
     return self._motion.displacement(self.model, self.data)
 
   @property
   def xpos(self) -> np.ndarray:
     """Positions [m], (nvert, 3)."""
-    return self.xpos0 + self.displacement @ self._organ.frame.T
+    return self.xpos0 + self.displacement
 
   @property
   def xvel(self) -> np.ndarray:
@@ -131,14 +136,14 @@ class Organ:
   @property
   def energy(self) -> float:
     """Elastic energy [J]: membrane or springs, bending, foundation, volume and pressure."""
-    return energy.total(self._organ.mesh, self._space.config, self.displacement)
+    return energy.total(self._organ.mesh, self._space.config, self._deformation)
 
   @property
   def volume(self) -> float:
     """Enclosed volume [m^3]; NaN for an open surface."""
     if not self._organ.mesh.closed:
       return float("nan")
-    return topology.volume(self._organ.mesh.rest + self.displacement, self.elem)
+    return topology.volume(self._organ.mesh.rest + self._deformation, self.elem)
 
   @property
   def iterations(self) -> int:

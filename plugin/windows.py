@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 
 from .engine import plugin as engine
+from .engine.layout import MAX_GEOMS
 
 # Slots of a window: from so few up to so many, unless told.
 _LEAST, _MOST = 16, 256
@@ -62,27 +63,14 @@ def add_windows(
   bodies = {body.name: body for body in spec.bodies}
   plugin = _plugin(spec, organ, [bodies[name] for name in dict.fromkeys(flex.vertbody)])
   config = {key: value for key, value in plugin.config.items() if value}
-  if config.get("window"):
-    raise ValueError(f"organ {organ!r} has window {config['window']!r} already, expected none")
-  if flex.dim != 2:
-    raise ValueError(f"organ {organ!r}: flexcomp dim is {flex.dim}, expected dim='2' (a surface)")
   groups = _groups(organ, bodies, tools)
   many = len(groups) if groups else 1
   names = [f"{organ}_window{k if many > 1 else ''}" for k in range(many)]
-  taken = [name for name in names if spec.flex(name) is not None]
-  if taken:
-    raise ValueError(f"organ {organ!r}: the spec has a flex {taken[0]!r} already")
-  if nodes is not None and not 5 <= nodes:
-    raise ValueError(f"organ {organ!r}: nodes is {nodes}, expected at least 5")
+  _check(spec, flex, config, names, nodes)
   nodal = len(set(flex.vertbody)) > 1 or "mass" not in config
   meets = (flex.contype, flex.conaffinity) if nodal or flex.contype or flex.conaffinity else (1, 1)
   colliding = [g for g in spec.geoms if (g.contype & meets[1]) | (g.conaffinity & meets[0])]
-  followed = [[g for g in colliding if not group.isdisjoint(_ancestors(g))] for group in groups]
-  for group, mine in zip(groups, followed, strict=True):
-    if not mine:
-      raise ValueError(f"organ {organ!r}: nothing of {sorted(group)} collides with it")
-    if not all(g.parent.name for g in mine):
-      raise ValueError(f"organ {organ!r}: a body of {sorted(group)} has no name, expected one")
+  followed = _followed(organ, groups, colliding)
   own = _own_bodies(flex, bodies) if nodal else []
   # From here on the spec changes.
   keys = _take_keys(spec)
@@ -90,7 +78,7 @@ def add_windows(
   rest = np.reshape(flex.vert, (-1, 3))
   elem = np.reshape(flex.elem, (-1, 3))
   edge = float(np.linalg.norm(rest[elem[:, [1, 2, 0]]] - rest[elem], axis=2).mean())
-  every = list(itertools.chain(*followed)) if groups else [g for g in colliding if _moves(g)]
+  every = list(itertools.chain(*followed))
   # Each window has room for all tools, for when they meet.
   size = 1 + min(nodes or _slots(every, edge, flex.radius), len(rest))  # one slot stays free
   for name in names:
@@ -103,8 +91,43 @@ def add_windows(
     )
   plugin.config = config
   flex.contype = flex.conaffinity = 0
-  _fit_keys(spec, keys)
+  _fit_keys(spec, organ, keys)
   return tuple(names)
+
+
+def _check(spec, flex, config: dict[str, str], names: list[str], nodes: int | None):
+  """Raises ValueError where an organ cannot have windows of these names and so many nodes."""
+  organ = flex.name
+  if config.get("window"):
+    raise ValueError(f"organ {organ!r} has window {config['window']!r} already, expected none")
+  if flex.dim != 2:
+    raise ValueError(f"organ {organ!r}: flexcomp dim is {flex.dim}, expected dim='2' (a surface)")
+  taken = [name for name in names if spec.flex(name) is not None]
+  if taken:
+    raise ValueError(f"organ {organ!r}: the spec has a flex {taken[0]!r} already")
+  if nodes is not None and not 5 <= nodes:
+    raise ValueError(f"organ {organ!r}: nodes is {nodes}, expected at least 5")
+
+
+def _followed(organ: str, groups: list[set[str]], colliding: list) -> list[list]:
+  """Returns the geoms that each window follows; one window follows all that moves."""
+  if not groups:
+    followed = [[g for g in colliding if _moves(g)]]
+  else:
+    followed = [[g for g in colliding if not group.isdisjoint(_ancestors(g))] for group in groups]
+  for group, mine in zip(groups, followed, strict=False):
+    if not mine:
+      raise ValueError(f"organ {organ!r}: nothing of {sorted(group)} collides with it")
+    if not all(g.parent.name for g in mine):
+      raise ValueError(f"organ {organ!r}: a body of {sorted(group)} has no name, expected one")
+  for k, mine in enumerate(followed):
+    if len(mine) > MAX_GEOMS:
+      what = f"{sorted(groups[k])} have" if groups else "the bodies that move have"
+      raise ValueError(
+        f"organ {organ!r}: {what} {len(mine)} geoms that collide with it, expected at most "
+        f"{MAX_GEOMS} a window; name bodies in tools, or let some geoms not collide"
+      )
+  return followed
 
 
 def organs(spec: mujoco.MjSpec) -> dict[str, bool]:
@@ -333,9 +356,18 @@ def _take_keys(spec) -> list[tuple]:
   return found
 
 
-def _fit_keys(spec, keys: list[tuple]):
+def _fit_keys(spec, organ: str, keys: list[tuple]):
   """Gives the keyframes the numbers of the joints that there are now, zero for the new ones."""
   joints = _layout(spec)
+  now = {joint[0] for joint in joints}
+  bent = {key.name for key, _, had in keys for name in had.keys() - now if np.any(had[name])}
+  if bent:
+    warnings.warn(
+      f"organ {organ!r}: what keyframes {sorted(bent)} have of its motion is left out, because an "
+      "organ with windows has it in plugin_state, which keyframes have not; set it with "
+      "Organ.set_state",
+      stacklevel=3,
+    )
   for key, field, had in keys:
     sizes = [both[_KEY_FIELDS[field]] for _, both in joints]
     names = [joint[0] for joint in joints]

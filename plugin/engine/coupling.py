@@ -21,6 +21,7 @@ from palpate.tissue.kernels import kernel
 from palpate.tissue.types import DIMS, doubles, floats, ints, scalar, struct, vector
 
 from . import layout, mjstruct
+from .layout import NodalState, WindowState
 
 
 class Phases:
@@ -182,6 +183,14 @@ def mass_addresses(m, dofs: np.ndarray) -> np.ndarray:
   """Returns where the diagonal of each dof lies in mjData.M, the inertia that MuJoCo uses."""
   rowadr = mjstruct.view(m.M_rowadr, m.nv, np.int32)[dofs]
   return rowadr + mjstruct.view(m.M_rownnz, m.nv, np.int32)[dofs] - 1
+
+
+def motion_size(organ) -> int:
+  """Returns how many numbers at the start of the plugin state are motion and forces."""
+  if organ.windows is None:
+    return layout.spans(NodalState, {"nfree": organ.nfree})["before"].stop
+  sizes = {"nvert": organ.mesh.nvert, "nslot": organ.windows.nslot, "ngeom": 0}
+  return layout.spans(WindowState, sizes)["force"].stop
 
 
 def plugin_state(model: int, data: int, instance: int, size: int) -> wp.array:

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 
 import mujoco
@@ -19,7 +20,7 @@ from palpate.tissue.config import Config
 from palpate.tissue.mesh import Mesh
 from palpate.tissue.step import SCHEMES
 
-from . import graphs, mjstruct
+from . import flexes, graphs, mjstruct
 
 NO_RK4 = (
   "integrator is RK4, which evaluates forces four times a step; expected Euler, implicit or "
@@ -69,6 +70,14 @@ class Declaration:
   mass: np.ndarray
   digest: bytes
   windows: Windows | None = None
+
+  @functools.cached_property
+  def signature(self) -> float:
+    """Marks plugin states of this organ: nodes, triangles, pins and slots; over 2^50."""
+    digest = hashlib.sha256(repr((self.windows is None, self.mesh.rest.shape)).encode())
+    for part in (self.mesh.rest, self.mesh.elem, self.free, self.windows and self.windows.home):
+      digest.update(np.ascontiguousarray(part if part is not None else 0).tobytes())
+    return float(2**50 + int.from_bytes(digest.digest()[:6], "big"))
 
   @property
   def dofs(self) -> np.ndarray:
@@ -132,10 +141,10 @@ def read(model: int, instance: int) -> Declaration:
   devices.init()
   m = mjstruct.Model.from_address(model)
   flex = _flex_of(m, instance)
-  name = flex_name(m, flex)
+  name = flexes.name(m, flex)
   check_flex(m, flex, name)
   start = mjstruct.view(m.flex_vertadr, m.nflex, np.int32)[flex]
-  nvert = vertices(m, flex)
+  nvert = flexes.vertices(m, flex)
   body = mjstruct.view(m.flex_vertbodyid, m.nflexvert, np.int32)[start : start + nvert].copy()
   local = mjstruct.view(m.flex_vert, (m.nflexvert, 3))[start : start + nvert]
   free = np.isin(body, moving_bodies(m, instance))
@@ -147,7 +156,7 @@ def read(model: int, instance: int) -> Declaration:
   frame = frame @ turn
   rest = np.where(free[:, None], mjstruct.view(m.body_pos, (m.nbody, 3))[body] @ turn, 0.0)
   rest += np.where(free[:, None], local, local @ turn)
-  elem = elements(m, flex)
+  elem = flexes.elements(m, flex)
   mesh = topology.build(name, rest, elem)
   config = configuration.parse(name, keys(model, instance), len(elem), mesh.closed)
   check_volume(name, mesh, config)
@@ -206,15 +215,6 @@ def keys(model: int, instance: int) -> dict[str, str]:
   return {key: text for key, text in texts.items() if text}
 
 
-def meeting_geoms(m, flex: int) -> np.ndarray:
-  """Returns the geoms that collide with a flex."""
-  contype = mjstruct.view(m.geom_contype, m.ngeom, np.int32)
-  conaffinity = mjstruct.view(m.geom_conaffinity, m.ngeom, np.int32)
-  mine = mjstruct.view(m.flex_contype, m.nflex, np.int32)[flex]
-  meets = mjstruct.view(m.flex_conaffinity, m.nflex, np.int32)[flex]
-  return np.flatnonzero((contype & meets) | (conaffinity & mine))
-
-
 def moving_bodies(m, instance: int) -> np.ndarray:
   """Returns the bodies of an organ's moving vertices.
 
@@ -243,14 +243,9 @@ def _flex_of(m, instance: int) -> int:
       "inside a <flexcomp dim='2'>"
     )
   if len(found) > 1:
-    names = " and ".join(repr(flex_name(m, f)) for f in found)
+    names = " and ".join(repr(flexes.name(m, f)) for f in found)
     raise ValueError(f"one palpate.organ instance serves {names}, expected one instance each")
   return found[0]
-
-
-def flex_name(m, flex: int) -> str:
-  """Returns the name of a flex, or what to call it."""
-  return mjstruct.name_of(m, m.name_flexadr, flex) or f"flex {flex}"
 
 
 def check_surface(m, flex: int, name: str):
@@ -331,26 +326,20 @@ def find_turn(m, name: str, body: np.ndarray) -> np.ndarray:
 
 def static_frame(m, name: str, parent: int) -> tuple[np.ndarray, np.ndarray]:
   """Returns rotation and position of the organ's parent body, which must not move."""
-  rotation, position = np.eye(3), np.zeros(3)
   parentid = mjstruct.view(m.body_parentid, m.nbody, np.int32)
   jntnum = mjstruct.view(m.body_jntnum, m.nbody, np.int32)
   mocap = mjstruct.view(m.body_mocapid, m.nbody, np.int32)
-  quat = mjstruct.view(m.body_quat, (m.nbody, 4))
-  pos = mjstruct.view(m.body_pos, (m.nbody, 3))
-  while parent > 0:
-    if jntnum[parent] or mocap[parent] >= 0:
-      who = mjstruct.name_of(m, m.name_bodyadr, parent)
-      what = "has joints" if jntnum[parent] else "is a mocap body"
+  body = parent
+  while body > 0:
+    if jntnum[body] or mocap[body] >= 0:
+      who = mjstruct.name_of(m, m.name_bodyadr, body)
+      what = "has joints" if jntnum[body] else "is a mocap body"
       raise ValueError(
         f"organ {name!r}: its parent body {who!r} {what}, expected a static frame "
         "(parent bodies without joints)"
       )
-    own = np.zeros(9)
-    mujoco.mju_quat2Mat(own, quat[parent].copy())
-    own = own.reshape(3, 3)
-    rotation, position = own @ rotation, pos[parent] + own @ position
-    parent = int(parentid[parent])
-  return rotation, position
+    body = int(parentid[body])
+  return flexes.body_frame(m, parent)
 
 
 def static_places(m, organ: Declaration) -> list[memoryview]:
@@ -380,24 +369,6 @@ def check_frame(m, organ: Declaration):
       f"its parent body {who!r} was moved after its mjData was made, expected a static frame; make "
       "a new MjData"
     )
-
-
-def vertices(m, flex: int) -> int:
-  """Returns the number of a flex's vertices; MuJoCo's own is 0 while an organ is hidden."""
-  return _extent(m.flex_vertadr, m.nflex, m.nflexvert, flex)
-
-
-def _extent(addresses: int | None, nflex: int, total: int, flex: int) -> int:
-  adr = mjstruct.view(addresses, nflex, np.int32)
-  return int((adr[flex + 1] if flex + 1 < nflex else total) - adr[flex])
-
-
-def elements(m, flex: int) -> np.ndarray:
-  """Returns the triangles of a flex, (nelem, 3)."""
-  adr = int(mjstruct.view(m.flex_elemdataadr, m.nflex, np.int32)[flex])
-  num = _extent(m.flex_elemadr, m.nflex, m.nflexelem, flex)
-  data = mjstruct.view(m.flex_elem, m.nflexelemdata, np.int32)
-  return data[adr : adr + 3 * num].reshape(num, 3).copy()
 
 
 def addresses(m, name: str, body: np.ndarray, free: np.ndarray):

@@ -8,9 +8,11 @@ from palpate.tissue import device as devices
 from palpate.tissue import mesh as topology
 from palpate.tissue.config import Config
 
-from . import declare, mjstruct
+from . import declare, flexes, mjstruct
 from .declare import Declaration, Windows
 from .layout import MAX_GEOMS, MAX_WINDOWS
+
+_NEAR = 0.1  # of its size: closer than that to an organ, a flex is beside it
 
 
 def read(model: int, instance: int) -> Declaration:
@@ -22,12 +24,12 @@ def read(model: int, instance: int) -> Declaration:
   devices.init()
   m = mjstruct.Model.from_address(model)
   flex, parent = _surface(m, instance)
-  name = declare.flex_name(m, flex)
+  name = flexes.name(m, flex)
   frame, origin = declare.static_frame(m, name, parent)
-  nvert = declare.vertices(m, flex)
+  nvert = flexes.vertices(m, flex)
   start = int(mjstruct.view(m.flex_vertadr, m.nflex, np.int32)[flex])
   rest = mjstruct.view(m.flex_vert, (m.nflexvert, 3))[start : start + nvert].copy()
-  elem = declare.elements(m, flex)
+  elem = flexes.elements(m, flex)
   mesh = topology.build(name, rest, elem)
   config = configuration.parse(name, declare.keys(model, instance), len(elem), mesh.closed)
   declare.check_volume(name, mesh, config)
@@ -41,6 +43,7 @@ def read(model: int, instance: int) -> Declaration:
   area = topology.vertex_areas(rest, elem)
   mass = config.mass * area / area.sum()
   windows = _windows(model, m, instance, name, config, mesh, mass, (frame, origin))
+  _check_neighbours(m, model, instance, name, windows, frame, origin, rest)
   absent = np.full(nvert, -1)
   return declare.cached(
     float(m.opt.timestep),
@@ -71,7 +74,7 @@ def _surface(m, instance: int) -> tuple[int, int]:
       "expected one <flexcomp rigid='true'> in the body that has the plugin"
     )
   flex = mine[0]
-  name = declare.flex_name(m, flex)
+  name = flexes.name(m, flex)
   declare.check_surface(m, flex, name)
   for key in ("contype", "conaffinity"):
     value = mjstruct.view(getattr(m, f"flex_{key}"), m.nflex, np.int32)[flex]
@@ -98,19 +101,6 @@ def _resolve(name: str, organ: str, names: list[str]) -> str | None:
   prefixes = [other[: len(other) - len(name)] for other in names if other.endswith(name)]
   prefixes = [prefix for prefix in prefixes if organ.startswith(prefix)]
   return max(prefixes, key=len) + name if prefixes else None
-
-
-def _claims(model, m, instance: int, names: list[str]) -> dict[str, str]:
-  """Returns the windows of the other organs, and whose they are."""
-  claimed: dict[str, str] = {}
-  plugin = mjstruct.view(m.plugin, m.nplugin, np.int32)
-  for other in range(m.nplugin):
-    if other != instance and plugin[other] == plugin[instance]:
-      for flex in _rigid_flexes(m, other)[1]:
-        for window in mjstruct.config(model, other, "window").split():
-          organ = declare.flex_name(m, flex)
-          claimed[_resolve(window, organ, names) or window] = f"organ {organ!r}"
-  return claimed
 
 
 def _windows(model, m, instance, name, config, mesh, mass, place) -> Windows:
@@ -152,8 +142,9 @@ def _windows(model, m, instance, name, config, mesh, mass, place) -> Windows:
 
 def _claimed(model, m, instance: int, name: str, config: Config) -> list[int]:
   """Returns the flexes that an organ names as its windows and nobody else does."""
-  names = [declare.flex_name(m, f) for f in range(m.nflex)]
-  claimed = _claims(model, m, instance, names)
+  names = [flexes.name(m, f) for f in range(m.nflex)]
+  surface = _surfaces(model, m, instance)
+  claimed = {names[window]: f"organ {names[flex]!r}" for window, flex in surface.items()}
   if len(config.window) > MAX_WINDOWS:
     raise ValueError(
       f"organ {name!r}: window has {len(config.window)} names, expected at most {MAX_WINDOWS}"
@@ -174,7 +165,7 @@ def _claimed(model, m, instance: int, name: str, config: Config) -> list[int]:
 def _slots(m, what: str, window: str, flex: int, place) -> tuple[np.ndarray, ...]:
   """Returns body, first dof, first qpos, offset from the organ and turn of each of its slots."""
   start = int(mjstruct.view(m.flex_vertadr, m.nflex, np.int32)[flex])
-  count = declare.vertices(m, flex)
+  count = flexes.vertices(m, flex)
   own = mjstruct.view(m.flex_vertbodyid, m.nflexvert, np.int32)[start : start + count].copy()
   jointed = mjstruct.view(m.body_jntnum, m.nbody, np.int32)[own] > 0
   try:
@@ -200,7 +191,7 @@ def _followed(m, name: str, config: Config, flex: list[int]) -> tuple[np.ndarray
   names = [mjstruct.name_of(m, m.name_bodyadr, b) for b in range(m.nbody)]
   groups: list[list[int]] = []
   for k, f in enumerate(flex):
-    meets = declare.meeting_geoms(m, f)
+    meets = flexes.meeting_geoms(m, f)
     if config.follow:
       if len(config.follow) != len(flex):
         raise ValueError(
@@ -214,6 +205,7 @@ def _followed(m, name: str, config: Config, flex: list[int]) -> tuple[np.ndarray
           raise ValueError(f"organ {name!r}: follow names body {body!r}, which does not exist")
         wanted.append(names.index(found))
       mine = [g for g in meets if bodyid[g] in wanted]
+      _check_follow(name, config.follow[k], {int(bodyid[g]) for g in mine}, wanted)
     else:
       mine = [g for g in meets if weld[bodyid[g]] != 0]
     groups.append(mine)
@@ -233,6 +225,54 @@ def _followed(m, name: str, config: Config, flex: list[int]) -> tuple[np.ndarray
   return adr, np.array([g for group in groups for g in group], np.int64)
 
 
+def _check_follow(organ: str, follow: tuple[str, ...], touching: set[int], wanted: list[int]):
+  """Raises ValueError where a window follows a body with which it cannot collide."""
+  for body, number in zip(follow, wanted, strict=True):
+    if number not in touching:
+      raise ValueError(
+        f"organ {organ!r}: follow names body {body!r}, which has no geoms that collide with its "
+        "window, expected bodies with geoms"
+      )
+
+
+def _check_neighbours(m, model, instance, name, windows: Windows, frame, origin, rest):
+  """Raises ValueError where a flex is beside the organ and collides with its windows.
+
+  Windows follow geoms: they would not be there.
+  """
+  own = np.isin(np.arange(m.nflex), windows.flex)
+  contype = mjstruct.view(m.flex_contype, m.nflex, np.int32)
+  conaffinity = mjstruct.view(m.flex_conaffinity, m.nflex, np.int32)
+  surface = _surfaces(model, m, instance)
+  points = origin + rest @ frame.T
+  room = _NEAR * float(np.linalg.norm(np.ptp(points, axis=0)))
+  low, high = points.min(axis=0) - room, points.max(axis=0) + room
+  for f in np.flatnonzero(~own):
+    meets = (contype[f] & conaffinity[own]) | (conaffinity[f] & contype[own])
+    other = flexes.rest_points(m, surface.get(int(f), int(f)))
+    if meets.any() and (other.max(axis=0) > low).all() and (other.min(axis=0) < high).all():
+      raise ValueError(
+        f"organ {name!r}: its windows follow geoms and would not feel flex "
+        f"{flexes.name(m, surface.get(int(f), int(f)))!r} beside it; use nodal coupling, or "
+        "contype and conaffinity that do not meet"
+      )
+
+
+def _surfaces(model, m, instance: int) -> dict[int, int]:
+  """Returns the flex of the organ that each window of another organ is of."""
+  names = [flexes.name(m, f) for f in range(m.nflex)]
+  plugin = mjstruct.view(m.plugin, m.nplugin, np.int32)
+  found = {}
+  for other in range(m.nplugin):
+    if other != instance and plugin[other] == plugin[instance]:
+      for flex in _rigid_flexes(m, other)[1]:
+        for window in mjstruct.config(model, other, "window").split():
+          resolved = _resolve(window, names[flex], names)
+          if resolved in names:
+            found[names.index(resolved)] = flex
+  return found
+
+
 def _home_slots(elem: np.ndarray, nvert: int, sizes: list[int], room: list[int]) -> np.ndarray:
   """Returns the default node of each slot: disjoint patches grown over the surface, (W,)."""
   neighbours: list[set[int]] = [set() for _ in range(nvert)]
@@ -243,9 +283,10 @@ def _home_slots(elem: np.ndarray, nvert: int, sizes: list[int], room: list[int])
   used: set[int] = set()
   out = []
   for size, most in zip(sizes, room, strict=True):
-    seed = next(i for i in range(nvert) if i not in used)
-    patch, queue = [], [seed]
-    used.add(seed)
+    # None where other windows have all nodes already.
+    queue = [i for i in range(nvert) if i not in used][:1]
+    patch: list[int] = []
+    used.update(queue)
     while queue and len(patch) < most:
       i = queue.pop(0)
       patch.append(i)

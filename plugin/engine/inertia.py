@@ -18,7 +18,8 @@ from palpate.tissue.order import from_slices, to_slices
 from palpate.tissue.step import SCHEMES
 
 from . import mjstruct
-from .declare import Declaration, meeting_geoms
+from .declare import Declaration
+from .flexes import meeting_geoms
 
 # Loads whose response gives the effective inertia; between them it follows the nodal area.
 _SAMPLES = 24

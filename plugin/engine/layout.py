@@ -165,6 +165,7 @@ class NodalState:
   last: doubles("nfree")  # last change of the velocity [m/s]
   before: doubles("nfree")  # the one before it [m/s]
   heavier: doubles(1)  # how many times its inertia at rest a tool meets; 0 for once [-]
+  signature: doubles(1)  # of the organ, see `Declaration`; 0 where it was set by hand [-]
 
 
 @struct
@@ -186,6 +187,7 @@ class WindowState:
   slot: doubles("nslot")  # node + 1; 0: the slot's default node, -1: not used
   pose: doubles("ngeom", len(POSE))  # where the windows' geoms were, see POSE
   tail: doubles(len(TAIL))  # see TAIL
+  signature: doubles(1)  # of the organ, see `Declaration`; 0 where it was set by hand [-]
 
 
 @struct

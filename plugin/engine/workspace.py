@@ -36,6 +36,7 @@ from .turns import Turn
 
 _ALLOWED = int(mujoco.mjtSleepPolicy.mjSLEEP_AUTO_ALLOWED)
 _RK4 = int(mujoco.mjtIntegrator.mjINT_RK4)
+_HUGE = 1e6  # more than any displacement, velocity or force of an organ [m, m/s, N]
 _ASTRAY = 1e-9  # distance of a slot from its node that rounding does not explain [m]
 
 
@@ -74,6 +75,7 @@ class Workspace:
     missed: most nodes and triangles that the windows had no room for in a step
     warning: last index and count of each of MuJoCo's warnings, one after the other
     nefc: the number of MuJoCo's constraints comes first
+    strange: whether the plugin state is not one of this organ
     noticed: whether it was said that windows came without their state
     nbad: MuJoCo's warnings of bad states that were looked at since the last reset
     model_step: the model's time step comes first [s]
@@ -83,6 +85,7 @@ class Workspace:
     qpos: numbers of qpos that the slots have, as bytes
     stood: what they were after the last step, or None
     plugin_state: the organ's own numbers
+    signature: the last of them, see `Declaration`
     views: what a coupling keeps when its graphs are recorded anew
     boxes: blocks of the plugin state and of what crosses in a step, see `layout`; windows
     phases: what the graphs launch
@@ -117,6 +120,7 @@ class Workspace:
   status: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(4, np.float32))
   error: str | None = None
   missed: tuple[int, int] = (0, 0)
+  strange: bool = False
   noticed: bool = False
   # Views that every step looks at: an item of a memoryview costs a tenth of one of an array.
   warning: memoryview = dataclasses.field(default_factory=lambda: memoryview(b""))
@@ -129,6 +133,7 @@ class Workspace:
   qpos: memoryview = dataclasses.field(default_factory=lambda: memoryview(b""))
   stood: bytes | None = None
   plugin_state: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))
+  signature: memoryview = dataclasses.field(default_factory=lambda: memoryview(b"\0"))
   views: dict = dataclasses.field(default_factory=dict)
   boxes: dict = dataclasses.field(default_factory=dict)
   phases: Phases | None = None
@@ -136,6 +141,10 @@ class Workspace:
   def run(self):
     """Computes the step's forces and adds them to qfrc_passive."""
     self._check_model()
+    self.strange = self.signature[0] != self.organ.signature
+    if self.strange:
+      self._check_state()
+      self.strange = False
     if self.turn is not None:
       if self.turn.refused:
         self.turn.stand_back()
@@ -177,6 +186,23 @@ class Workspace:
       if place.tobytes() != was:
         declare.check_frame(mjstruct.Model.from_address(self.model), self.organ)
 
+  def _check_state(self):
+    """Makes sure that a plugin state that was set from outside is one of this organ.
+
+    Raises:
+      ValueError: it is not, or its numbers cannot be.
+    """
+    if self.signature[0] != 0.0:
+      raise ValueError(
+        "plugin_state is not one of this organ, but saved from another model or damaged; reset the "
+        "data, or set a state that was saved from it"
+      )
+    motion = self.plugin_state[: coupling.motion_size(self.organ)]
+    if not (np.abs(motion) < _HUGE).all():
+      raise ValueError(
+        f"plugin_state has a number that is not finite or over {_HUGE:g}, expected what was saved"
+      )
+
   def _is_astray(self) -> bool:
     """Returns whether qpos was set without the plugin state: slots are not on their nodes."""
     if self.qpos.tobytes() == self.stood:
@@ -204,6 +230,10 @@ class Workspace:
 
   def step(self):
     """Steps the plugin state after MuJoCo has moved."""
+    if self.strange:
+      return
+    if self.computed:
+      self.signature[0] = self.organ.signature
     if self.turn is None:
       self._step()
     elif not self.turn.refused:
@@ -325,6 +355,7 @@ def make(model: int, data: int, instance: int) -> Workspace:
       w.turn = Turn()
     bind(w, model)
     w.plugin_state = w.views["plugin_state"].numpy()
+    w.signature = w.plugin_state[-1:].data
     if w.turn is not None:
       windowed.settle(w, model)
       if w.turn.is_orphan():

@@ -1,0 +1,68 @@
+"""What flexes of a compiled mjModel are: names, vertices, triangles, places, and what they meet."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from . import mjstruct
+
+
+def name(m, flex: int) -> str:
+  """Returns the name of a flex, or what to call it."""
+  return mjstruct.name_of(m, m.name_flexadr, flex) or f"flex {flex}"
+
+
+def meeting_geoms(m, flex: int) -> np.ndarray:
+  """Returns the geoms that collide with a flex."""
+  contype = mjstruct.view(m.geom_contype, m.ngeom, np.int32)
+  conaffinity = mjstruct.view(m.geom_conaffinity, m.ngeom, np.int32)
+  mine = mjstruct.view(m.flex_contype, m.nflex, np.int32)[flex]
+  meets = mjstruct.view(m.flex_conaffinity, m.nflex, np.int32)[flex]
+  return np.flatnonzero((contype & meets) | (conaffinity & mine))
+
+
+def rest_points(m, flex: int) -> np.ndarray:
+  """Returns where the vertices of a flex are in the world in qpos0 [m], (n, 3)."""
+  start, count = int(mjstruct.view(m.flex_vertadr, m.nflex, np.int32)[flex]), vertices(m, flex)
+  body = mjstruct.view(m.flex_vertbodyid, m.nflexvert, np.int32)[start : start + count]
+  if mjstruct.view(m.flex_rigid, m.nflex, np.bool_)[flex]:
+    body = np.full(count, body[0])  # the first one tells it while an organ is hidden
+  point = mjstruct.view(m.flex_vert, (m.nflexvert, 3))[start : start + count].copy()
+  for each in np.unique(body):
+    rotation, position = body_frame(m, int(each))
+    point[body == each] = point[body == each] @ rotation.T + position
+  return point
+
+
+def vertices(m, flex: int) -> int:
+  """Returns the number of a flex's vertices; MuJoCo's own is 0 while an organ is hidden."""
+  return _extent(m.flex_vertadr, m.nflex, m.nflexvert, flex)
+
+
+def _extent(addresses: int | None, nflex: int, total: int, flex: int) -> int:
+  adr = mjstruct.view(addresses, nflex, np.int32)
+  return int((adr[flex + 1] if flex + 1 < nflex else total) - adr[flex])
+
+
+def elements(m, flex: int) -> np.ndarray:
+  """Returns the triangles of a flex, (nelem, 3)."""
+  adr = int(mjstruct.view(m.flex_elemdataadr, m.nflex, np.int32)[flex])
+  num = _extent(m.flex_elemadr, m.nflex, m.nflexelem, flex)
+  data = mjstruct.view(m.flex_elem, m.nflexelemdata, np.int32)
+  return data[adr : adr + 3 * num].reshape(num, 3).copy()
+
+
+def body_frame(m, body: int) -> tuple[np.ndarray, np.ndarray]:
+  """Returns rotation and position of a body in qpos0."""
+  rotation, position = np.eye(3), np.zeros(3)
+  parentid = mjstruct.view(m.body_parentid, m.nbody, np.int32)
+  quat = mjstruct.view(m.body_quat, (m.nbody, 4))
+  pos = mjstruct.view(m.body_pos, (m.nbody, 3))
+  while body > 0:
+    own = np.zeros(9)
+    mujoco.mju_quat2Mat(own, quat[body].copy())
+    own = own.reshape(3, 3)
+    rotation, position = own @ rotation, pos[body] + own @ position
+    body = int(parentid[body])
+  return rotation, position
