@@ -7,7 +7,7 @@ import warp as wp
 from palpate.tissue import step
 from palpate.tissue.body import Body
 
-from . import coupling, declare, graphs, mjstruct, nodal, nodes, slots, windowed
+from . import coupling, declare, graphs, mjstruct, nodal, nodes, slots, weights, windowed
 
 
 def bind(w, model: int):
@@ -25,6 +25,12 @@ def bind(w, model: int):
     near = wp.get_device(does.side)
     crossing = device != near
 
+    touched = weights.make(w, model)
+
+    def before():
+      weights.launch(touched)
+      does.gather()
+
     def solve():
       if crossing:
         _cross(w, _IN, to_device=True)
@@ -40,7 +46,7 @@ def bind(w, model: int):
       if crossing:
         _cross(w, ("sol", "status"), to_device=False)
 
-    w.before = graphs.record(cpu, does.gather)
+    w.before = graphs.record(cpu, before)
     w.solve = graphs.record_all((near, does.enter), (device, solve), (near, does.look))
     w.after = graphs.record(cpu, does.scatter)
     w.leave = graphs.record(cpu, does.leave)
@@ -84,5 +90,5 @@ def load(body: Body):
   """Loads the modules of a step on a body's device, compiling them where the cache has none."""
   for module in (*step.modules(body), nodes.MODULE):
     wp.load_module(module, device=body.device)
-  for module in (*step.modules(body), nodes.MODULE, nodal.MODULE, slots.MODULE):
+  for module in (*step.modules(body), nodes.MODULE, nodal.MODULE, slots.MODULE, weights.MODULE):
     wp.load_module(module, device="cpu")

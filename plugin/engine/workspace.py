@@ -24,6 +24,7 @@ from . import (
   mjstruct,
   nodal,
   prepare,
+  weights,
   windowed,
 )
 from .bind import bind
@@ -150,6 +151,8 @@ class Workspace:
         wp.capture_launch(self.before)
       if not self.asleep and self.policy[0] == _ALLOWED:
         windowed.let_sleep(self, False)
+    if self.flags[FLAG.weighed]:
+      weights.project(self.model, self.data)
     if self.asleep:
       self.computed = True
       return  # what `after` does was done with `before`
