@@ -93,14 +93,12 @@ def _solid(
   spacing = max(size / (50 + 1.25 * np.sqrt(nodes)), finest)
   # Marching cubes makes 1.5 nodes for every square of the grid on the surface.
   most = int(0.5 * np.linalg.norm(normals(vertices, triangles), axis=1).sum() / 2 / finest**2)
-  for _ in range(3):
-    if most < nodes:
-      break
+  for _ in range(3 if nodes <= most else 0):
     target = Target(vertices, triangles, spacing / 2)
     solid, fine = _inside(name, target, spacing)
     if len(fine[0]) >= 2.2 * nodes:
       return target, solid, fine
-    most = int(0.4 * len(fine[0]) * (spacing / finest) ** 2)
+    most = int(len(fine[0]) / 2.2)
     spacing = max(spacing / max(1.05 * np.sqrt(2.2 * nodes / len(fine[0])), 1.2), finest)
   raise ValueError(f"{name}: nodes is {nodes}, expected at most {most} for so small a surface")
 

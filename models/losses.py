@@ -11,7 +11,6 @@ from scipy.ndimage import binary_dilation, distance_transform_edt, label
 from . import raster
 from .field import Field
 from .parts import Part
-from .quality import quality
 from .repair import Target
 
 Mesh = tuple[np.ndarray, np.ndarray]
@@ -75,8 +74,7 @@ class Comparison:
   """A body of a mesh, to compare a wrap of it with.
 
   Attributes:
-    mesh: the body's surface
-    target: the same, to measure distances to
+    target: the body's surface
     grid: points all over it
     given: which of them lie in it  (nx, ny, nz)
   """
@@ -90,9 +88,12 @@ class Comparison:
       nodes: of the wraps to compare it with; samples are finer for more
     """
     spacing = float(np.linalg.norm(np.ptp(mesh[0], axis=0))) / (75 + 2 * np.sqrt(nodes))
-    self.mesh, self.target = mesh, Target(*mesh, spacing)
+    self.target = Target(*mesh, spacing)
     self.grid = raster.Grid.around(mesh[0], spacing)
-    if raster.closed(mesh[1]):
+    is_closed = raster.closed(mesh[1])
+    euler = len(np.unique(mesh[1])) - len(mesh[1]) // 2
+    self._handles = is_closed and euler < 2
+    if is_closed:
       self.given = raster.inside(mesh, self.grid)
     else:
       index = np.indices(self.grid.shape).reshape(3, -1).T
@@ -118,7 +119,7 @@ class Comparison:
     parts = regions(less, _edt(~made), _DEEP * cells)
     depth = _edt(made)
     filled = regions(more, depth, _DEEP * cells)
-    if not filled and quality(*self.mesh).genus > 0:  # the wrap has none of its handles
+    if not filled and self._handles:  # the wrap has none
       tries = (regions(more, depth, share * cells) for share in _SHALLOW)
       filled = next((found for found in tries if found), [])
     sheets = self._sheets(missed, parts + filled, 2 * _DEEP * edge)

@@ -55,18 +55,7 @@ def organ(
     sites: named places on the surface [m]
     rigid: whether it is declared to be given windows, in place of dofs for the nodes
   """
-  pin, weight = pin or {}, f"{mass:.4g}"
-  look = {"radius": RADIUS, "material": name, "flatskin": False}
-  if rigid:
-    pins = np.unique(np.concatenate([*pin.values(), []]).astype(int))
-    extension = mjcf.extension({name: {**config, "mass": weight, "pin": pins}}, digits=6)
-    flex = mjcf.plugin(instance=name) + "\n"
-    flex += mjcf.flexcomp(name, mesh, contact=mjcf.CONTACT, digits=6, rigid=True, **look)
-  else:
-    extension = mjcf.extension()
-    flex = mjcf.flexcomp(
-      name, mesh, config=config, contact=mjcf.CONTACT, pin=pin, digits=6, mass=weight, **look
-    )
+  extension, flex = _flex(name, mesh, f"{mass:.4g}", config, pin or {}, rigid)
   marks = [
     f'<site name="{name}_{mark}" class="{name}_target" pos="{numbers(pos)}"/>'
     for mark, pos in (sites or {}).items()
@@ -95,6 +84,27 @@ def organ(
   </worldbody>
 </mujoco>
 """
+
+
+def _flex(
+  name: str,
+  mesh: mjcf.Mesh | str,
+  mass: str,
+  config: Mapping,
+  pin: Mapping[str, np.ndarray],
+  rigid: bool,
+) -> tuple[str, str]:
+  """Returns extension and flexcomp of an organ."""
+  look = {"radius": RADIUS, "material": name, "flatskin": False}
+  if not rigid:
+    flex = mjcf.flexcomp(
+      name, mesh, config=config, contact=mjcf.CONTACT, pin=pin, digits=6, mass=mass, **look
+    )
+    return mjcf.extension(), flex
+  pins = np.unique(np.concatenate([*pin.values(), []]).astype(int))
+  flex = mjcf.flexcomp(name, mesh, contact=mjcf.CONTACT, digits=6, rigid=True, **look)
+  extension = mjcf.extension({name: {**config, "mass": mass, "pin": pins}}, digits=6)
+  return extension, f"{mjcf.plugin(instance=name)}\n{flex}"
 
 
 def catalogued(build: Build, name: str, file: str | None, rigid: bool = False) -> str:

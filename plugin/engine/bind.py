@@ -39,6 +39,7 @@ def bind(w, model: int):
         _cross(w, _OUT, to_device=False)
 
     def respond():
+      assert scheme.respond is not None  # recorded only then
       if crossing:
         _cross(w, ("rhs",), to_device=True)
       scheme.respond(w.body)

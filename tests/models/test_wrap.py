@@ -185,7 +185,6 @@ def test_targets_at_4096_nodes(name, method):
   assert_organ(vertices, triangles, report)
   assert report.hausdorff < (1.0 if method == "even" else 1.5)
   assert report.min_angle > (20 if method == "even" else 15)
-  assert report.seconds < 30  # under 10 s on a core of its own
 
 
 @pytest.mark.slow
