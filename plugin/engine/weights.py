@@ -79,7 +79,7 @@ MODULE = _weigh.module.name
 
 @functools.cache
 def are_wrong() -> bool:
-  """Returns whether MuJoCo's weights are not barycentric, by one contact off a triangle's middle."""
+  """Returns whether MuJoCo's weights are not barycentric, by one contact off the middle."""
   model = mujoco.MjModel.from_xml_string(
     """<mujoco><option jacobian="dense"/><worldbody>
     <flexcomp name="f" type="direct" dim="2" point="0 0 0 1 0 0 0 1 0" element="0 1 2" radius=".01">
