@@ -35,7 +35,6 @@ NOT_YET = {
     "tests/engine/test_plugin.py",
   },
   "functions": {
-    "models/markup.py",
     "plugin/windows.py",
   },
 }

@@ -52,12 +52,13 @@ def test_files_are_what_the_source_makes(name):
 def test_what_is_behind_an_organ_is_drawn_smooth():
   """MuJoCo draws a triangle flat whose normal is far from its nodes'; the notch had shards."""
   model = mujoco.MjModel.from_xml_path(str(models.path("gallbladder")))
-  faces, points = model.mesh("liver").faceadr[0], model.mesh("liver").vertadr[0]
-  face = model.mesh_face[faces : faces + model.mesh("liver").facenum[0]]
-  corner = model.mesh_vert[points + face].astype(float)
+  mesh = model.mesh("liver").id
+  start = model.mesh_faceadr[mesh]
+  face = model.mesh_face[start : start + model.mesh_facenum[mesh]]
+  corner = model.mesh_vert[model.mesh_vertadr[mesh] + face].astype(float)
   normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
   normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-  of_nodes = model.mesh_normal[model.mesh("liver").normaladr[0] + face]
+  of_nodes = model.mesh_normal[model.mesh_normaladr[mesh] + face]
   assert np.einsum("md,mkd->mk", normal, of_nodes).min() > 0.8
 
 
