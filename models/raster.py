@@ -62,7 +62,7 @@ def inside(mesh: Mesh, grid: Grid) -> np.ndarray:
   if closed(mesh[1]):
     return winding(mesh, grid) != 0
   odd = [_count(mesh, grid, axis, np.ones(len(mesh[1]), np.int32)) % 2 for axis in range(3)]
-  return sum(odd) >= 2
+  return np.sum(odd, axis=0) >= 2
 
 
 def winding(mesh: Mesh, grid: Grid) -> np.ndarray:

@@ -77,7 +77,7 @@ def add_organ(
   pins, mass = _pins(name, pin, surface.nvert), _mass(name, mass, surface)
   windowed, options = windows is not False, _windows(name, windows)
   texts = _texts(name, config, surface, mass if windowed else None)
-  look = _look(name, radius, rgba) | _contact(name, CONTACT | dict(contact or {}))
+  look = _look(name, radius, rgba) | _contact(name, {**CONTACT, **(contact or {})})
   where = _parent(spec, name, parent)
   _check_names(spec, name, 0 if windowed else surface.nvert)
   body = where.add_body(name=name, pos=pos, quat=quat)

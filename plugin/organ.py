@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import mujoco
 import numpy as np
+from palpate.engine import motion, windowed, workspace
+from palpate.engine import plugin as engine
 from palpate.engine.layout import FLAG
+from palpate.tissue import energy
+from palpate.tissue import mesh as topology
 from palpate.tissue.config import Config
-
-from .engine import motion, windowed, workspace
-from .engine import plugin as engine
-from .tissue import energy
-from .tissue import mesh as topology
 
 
 class Organ:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import importlib
-import pkgutil
 import time
 
 from palpate import register
@@ -22,6 +20,7 @@ def main(args: argparse.Namespace) -> int:
   register()
   import warp as wp
   from palpate.tissue import device as devices
+  from palpate.tissue import kernels
 
   devices.init()
   known = [device.alias for device in wp.get_devices()]
@@ -29,7 +28,7 @@ def main(args: argparse.Namespace) -> int:
     raise CommandError(f"no device {args.device!r}, expected one of {', '.join(known)}")
   progress, rows, total = Progress(), [], 0.0
   for device in [args.device] if args.device else known:
-    for module in modules():
+    for module in kernels.MODULES:
       progress.show(f"{module.rpartition('.')[2]} on {device}", always=True)
       start = time.perf_counter()
       wp.load_module(module, device=device)
@@ -38,14 +37,3 @@ def main(args: argparse.Namespace) -> int:
   progress.clear()
   print(table([*rows, ("all", f"{total:.2f} s")]))
   return 0
-
-
-def modules() -> list[str]:
-  """Returns the names of Warp's modules with this package's kernels."""
-  from palpate import engine, tissue
-  from palpate.tissue import kernels
-
-  for room in (engine, tissue):
-    for info in pkgutil.iter_modules(room.__path__):
-      importlib.import_module(f"{room.__name__}.{info.name}")
-  return list(kernels.MODULES)  # complete now that all are imported

@@ -104,9 +104,10 @@ def _wrap(args: argparse.Namespace, source: pathlib.Path, name: str, nodes: int 
   from palpate.models import volume, wrap
 
   if not source.name.lower().endswith(_VOLUMES):
-    call = wrap.wrap_pieces if args.pieces else wrap.wrap
-    made = call(source, nodes, method=args.method, scale=args.scale or 1.0)
-    return _named(name, made if args.pieces else [made])
+    options = {"method": args.method, "scale": args.scale or 1.0}
+    if args.pieces:
+      return _named(name, wrap.wrap_pieces(source, nodes, **options))
+    return _named(name, [wrap.wrap(source, nodes, **options)])
   labels = volume.read(source)
   if args.label == ["all"]:
     chosen = list(labels.segments)

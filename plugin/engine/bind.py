@@ -7,7 +7,7 @@ import warp as wp
 from palpate.tissue import step
 from palpate.tissue.body import Body
 
-from . import coupling, declare, graphs, mjstruct, nodal, nodes, slots, windowed
+from . import coupling, declare, graphs, mjstruct, nodal, nodes, slots, weights, windowed
 
 
 def bind(w, model: int):
@@ -25,6 +25,12 @@ def bind(w, model: int):
     near = wp.get_device(does.side)
     crossing = device != near
 
+    touched = weights.make(w, model)
+
+    def before():
+      weights.launch(touched)
+      does.gather()
+
     def solve():
       if crossing:
         _cross(w, _IN, to_device=True)
@@ -33,13 +39,14 @@ def bind(w, model: int):
         _cross(w, _OUT, to_device=False)
 
     def respond():
+      assert scheme.respond is not None  # recorded only then
       if crossing:
         _cross(w, ("rhs",), to_device=True)
       scheme.respond(w.body)
       if crossing:
         _cross(w, ("sol", "status"), to_device=False)
 
-    w.before = graphs.record(cpu, does.gather)
+    w.before = graphs.record(cpu, before)
     w.solve = graphs.record_all((near, does.enter), (device, solve), (near, does.look))
     w.after = graphs.record(cpu, does.scatter)
     w.leave = graphs.record(cpu, does.leave)
@@ -83,5 +90,5 @@ def load(body: Body):
   """Loads the modules of a step on a body's device, compiling them where the cache has none."""
   for module in (*step.modules(body), nodes.MODULE):
     wp.load_module(module, device=body.device)
-  for module in (*step.modules(body), nodes.MODULE, nodal.MODULE, slots.MODULE):
+  for module in (*step.modules(body), nodes.MODULE, nodal.MODULE, slots.MODULE, weights.MODULE):
     wp.load_module(module, device="cpu")

@@ -145,18 +145,20 @@ def wrap(address: int, shape, dtype: type = wp.float64) -> wp.array:
   return wp.array(ptr=address, dtype=dtype, shape=shape, device="cpu")
 
 
-def mujoco_arrays(model: int, data: int):
-  """Returns `Mujoco` for an mjModel and an mjData."""
+def mujoco_arrays(model: int, data: int, kind=Mujoco):
+  """Returns `Mujoco`, or what has MuJoCo's names in another struct, for an mjModel and mjData."""
   m, d = mjstruct.Model.from_address(model), mjstruct.Data.from_address(data)
   option, start = type(m.opt), model + mjstruct.Model.opt.offset
-  out = Mujoco()
-  for name, dims in DIMS["Mujoco"].items():
+  out = kind()
+  for name, dims in DIMS[kind.key].items():
     if hasattr(option, name):
       address = start + getattr(option, name).offset
-    else:
+    elif hasattr(m, name) or hasattr(d, name):
       address = getattr(m if hasattr(m, name) else d, name)
+    else:
+      continue
     shape = [getattr(m, n) if isinstance(n, str) else n for n in dims]
-    setattr(out, name, wrap(address, shape, Mujoco.vars[name].type.dtype))
+    setattr(out, name, wrap(address, shape, kind.vars[name].type.dtype))
   return out
 
 

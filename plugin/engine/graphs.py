@@ -7,6 +7,7 @@ has a place of its own, as in Warp's native half.
 
 from __future__ import annotations
 
+import functools
 import itertools
 import os
 import threading
@@ -63,8 +64,13 @@ def record_all(*parts) -> list:
   graphs = []
   for device, group in itertools.groupby(parts, key=lambda part: part[0]):
     work = [part[1] for part in group]
-    graphs.append((device, record(device, lambda work=work: [each() for each in work])))
+    graphs.append((device, record(device, functools.partial(_each, work))))
   return graphs
+
+
+def _each(work: list[Callable[[], None]]):
+  for one in work:
+    one()
 
 
 def launch_all(graphs: list):

@@ -57,6 +57,7 @@ FLAG = Numbers(
   ("changed", 1, "-", "the contact forces are not those of the last step"),
   ("answered", 1, "-", "the organ responded to that"),
   ("foreseen", 1, "-", "what acts on the organ is what was guessed"),
+  ("weighed", 1, "-", "rows of contacts changed that MuJoCo has made use of"),
 )
 
 # How the last step ends on the nodes' side. These are values, not offsets.

@@ -63,8 +63,10 @@ def _struct(name: str) -> type[C.Structure]:
 
 Model = _struct("mjModel")
 Data = _struct("mjData")
+Contact = _struct("mjContact")
 _Message = _struct("mjLogMessage")
 LogHandler = C.CFUNCTYPE(None, C.c_void_p)
+size = C.sizeof
 
 
 @functools.cache
@@ -80,6 +82,7 @@ def library() -> C.CDLL:
   lib.mj_getPluginConfig.argtypes = [C.c_void_p, C.c_int, C.c_char_p]
   lib.mj_fwdPosition.argtypes = [C.c_void_p, C.c_void_p]
   lib.mj_comVel.argtypes = [C.c_void_p, C.c_void_p]
+  lib.mj_projectConstraint.argtypes = [C.c_void_p, C.c_void_p]
   lib._mjPRIVATE_getGlobalLogHandler.restype = C.c_void_p
   lib._mjPRIVATE_setTlsLogHandler.restype = C.c_void_p
   lib._mjPRIVATE_setTlsLogHandler.argtypes = [LogHandler]

@@ -242,7 +242,7 @@ def _miss(w: Workspace, nodes: int, triangles: int):
   first = w.missed == (0, 0)
   w.missed = max(nodes, w.missed[0]), max(triangles, w.missed[1])
   if first:
-    warn(windowed.shortage(w))
+    warn(windowed.shortage(w) or "")
 
 
 @functools.cache

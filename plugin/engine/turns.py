@@ -13,6 +13,7 @@ import math
 import threading
 import time
 import weakref
+from typing import Any
 
 import numpy as np
 
@@ -39,7 +40,7 @@ class Turn:
     self.mark = HOME
     self.model = 0  # address
     self.refused = False
-    self._found = memoryview(b"")
+    self._found: Any = memoryview(b"")
     self._thread, self._seen = 0, -math.inf
     self._within = self._waiting = False
     _all.add(self)

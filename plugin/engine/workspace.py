@@ -24,6 +24,7 @@ from . import (
   mjstruct,
   nodal,
   prepare,
+  weights,
   windowed,
 )
 from .bind import bind
@@ -150,6 +151,8 @@ class Workspace:
         wp.capture_launch(self.before)
       if not self.asleep and self.policy[0] == _ALLOWED:
         windowed.let_sleep(self, False)
+    if self.flags[FLAG.weighed]:
+      weights.project(self.model, self.data)
     if self.asleep:
       self.computed = True
       return  # what `after` does was done with `before`
@@ -196,7 +199,8 @@ class Workspace:
     if self.resident:
       self.resident.fetch()
     wp.capture_launch(self.place)
-    self.turn.take()
+    if self.turn is not None:
+      self.turn.take()
 
   def step(self):
     """Steps the plugin state after MuJoCo has moved."""
@@ -268,6 +272,8 @@ class Workspace:
 def place(w: Workspace, model: int):
   """Puts the windows of a model where the plugin state says, unless another thread steps it."""
   attach(w, model)
+  if w.turn is None:
+    return
   if w.turn.is_free():
     w.put_windows()
     w.stood = w.qpos.tobytes()

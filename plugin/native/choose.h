@@ -66,8 +66,8 @@ PALPATE void give_up(const Fields& f, int k) {
   store(f.mj.qvel.data + f.dofadr.data[k], {0.0, 0.0, 0.0});
 }
 
-// Gives each node to the window whose tool is nearest. Windows whose tools touch the same nodes pick
-// as one, the first of them first: a triangle between two windows would touch nothing.
+// Gives each node to the window whose tool is nearest. Windows whose tools touch the same nodes
+// pick as one, the first of them first: a triangle between two windows would touch nothing.
 template <class Fields>
 PALPATE void claim_nodes(const Fields& f, int* group) {
   for (int w = 0; w < f.nwindow; ++w) {
@@ -187,8 +187,8 @@ PALPATE void fill_slots(const Fields& f, int first, int fresh) {
   }
 }
 
-// Gives each window the nodes nearest to its geoms. Nodes that stay keep their slot; the others fill
-// the free ones in the order of the mesh.
+// Gives each window the nodes nearest to its geoms. Nodes that stay keep their slot; the others
+// fill the free ones in the order of the mesh.
 template <class Fields>
 PALPATE void choose(const Fields& f, Thread, int) {
   if (f.flags.data[FLAG_ASLEEP]) return;

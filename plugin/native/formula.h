@@ -4,10 +4,10 @@
 //
 //   qfrc_passive = Mhat dv / h - f_ext - f_c
 //
-// on the node's degrees of freedom, with Mhat their inertia (mass + armature), f_ext what MuJoCo adds
-// to them by itself in this step and f_c their constraint force of the last step. Both are on the
-// right-hand side of the organ's step too, as its lagged force f_ext + f_c. MuJoCo's own step then
-// ends at v + dv + h (f_c_new - f_c) / Mhat: at rest the contact force is exact whatever h is.
+// on the node's degrees of freedom, with Mhat their inertia (mass + armature), f_ext what MuJoCo
+// adds to them by itself in this step and f_c their constraint force of the last step. Both are on
+// the right-hand side of the organ's step too, as its lagged force f_ext + f_c. MuJoCo's own step
+// then ends at v + dv + h (f_c_new - f_c) / Mhat: at rest the contact force is exact whatever h is.
 #pragma once
 #include "d3.h"
 

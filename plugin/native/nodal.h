@@ -30,7 +30,8 @@ PALPATE void gather_nodes(const Fields& f, Thread, int) {
     solve.mass.data[i] = (float)m;
     weight += m;
     const D3 along = m * g + load(mj.qfrc_applied.data + adr) + load(mj.qfrc_passive.data + adr);
-    const D3 lagged = external(along, R, mj.xfrc_applied.data + 6 * body) + load(f.own.force.data + own);
+    const D3 f_ext = external(along, R, mj.xfrc_applied.data + 6 * body);
+    const D3 lagged = f_ext + load(f.own.force.data + own);
     store(f.lagged.data + 3 * i, lagged);
     store_lane(solve.force_ext.data + at, lagged);
     store_lane(solve.disp.data + at, load(mj.qpos.data + qadr) - load(mj.qpos0.data + qadr));

@@ -83,7 +83,8 @@ PALPATE bool take_contacts(const Fields& f) {
   for (int k = 0; k < f.nslot; ++k) {
     const int i = f.placed.data[k], adr = f.dofadr.data[k];
     const bool moves = i >= 0 && f.free.data[i];
-    const D3 before = contact_force(f, k), now = moves ? load(f.mj.qfrc_constraint.data + adr) : zero;
+    const D3 before = contact_force(f, k);
+    const D3 now = moves ? load(f.mj.qfrc_constraint.data + adr) : zero;
     any = any || touched(now);
     pushes = pushes || load(pushed(f, k) + PUSHED_FORCE) != zero;
     store(f.own.force.data + 3 * k, now);

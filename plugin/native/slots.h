@@ -96,7 +96,8 @@ PALPATE void tell_geom(const Fields& f, int g, double* geom) {
 // Whether a geom's box and the organ's bounds are apart: boxes apart along an axis of one are.
 template <class Fields>
 PALPATE bool is_apart(const Fields& f, const double* geom) {
-  const D3 axis[3] = {load(geom + GEOM_AXIS), load(geom + GEOM_AXIS + 3), load(geom + GEOM_AXIS + 6)};
+  const double* axes = geom + GEOM_AXIS;
+  const D3 axis[3] = {load(axes), load(axes + 3), load(axes + 6)};
   const D3 low = load(tail(f) + TAIL_LOW), high = load(tail(f) + TAIL_HIGH);
   const D3 centre = 0.5 * (low + high), length = 0.5 * (high - low);
   const double* half = geom + GEOM_HALF;
@@ -150,8 +151,8 @@ PALPATE bool tell_geoms(const Fields& f) {
   return stirs;
 }
 
-// Reads what acts on the slots and where the tools are, and flags slots that the model lacks. Asleep
-// it does what `scatter_slots` does otherwise.
+// Reads what acts on the slots and where the tools are, and flags slots that the model lacks.
+// Asleep it does what `scatter_slots` does otherwise.
 template <class Fields>
 PALPATE void gather_slots(const Fields& f, Thread, int) {
   const bool changed = tell_step(f), pushes = tell_forces(f), stale = is_stale(f);

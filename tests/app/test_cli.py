@@ -176,7 +176,7 @@ def test_doctor_says_what_is_wrong():
 def test_warmup_prints_seconds_for_every_module(capsys):
   assert cli.main(["warmup", "--device", "cpu"]) == 0
   rows = dict(re.findall(r"cpu +palpate\.\w+\.(\w+) +([\d.]+) s", capsys.readouterr().out))
-  assert {"elastic", "pcg", "nodal", "slots"} <= set(rows)
+  assert {"elastic", "schemes", "pcg", "multigrid", "nodal", "slots"} <= set(rows)
 
 
 def test_warmup_names_the_devices_there_are(capsys):

@@ -1,0 +1,117 @@
+"""Contacts with an organ's triangles get the weights of their corners, see `native/weights.h`.
+
+MuJoCo 3.17 weighs the corners of a touched triangle by inverse distance: forces are off and
+flicker where a tool presses. MuJoCo 4.0 has it right, and is left alone.
+"""
+
+# Annotations here are objects, not text: no `from __future__ import annotations`.
+# pyright: reportInvalidTypeForm=false
+import functools
+
+import mujoco
+import numpy as np
+import warp as wp
+from palpate.tissue.kernels import kernel
+from palpate.tissue.types import Array, doubles, ints, struct
+
+from . import apart, coupling, mjstruct
+from .layout import FLAG
+
+_DATA = (
+  *("contact", "ncon", "nefc", "nisland", "efc_type", "efc_J", "efc_J_rownnz", "efc_J_rowadr"),
+  *("efc_J_colind", "efc_diagA", "efc_R", "efc_D", "map_efc2iefc", "iefc_R", "iefc_D"),
+)
+_CONTACT = ("pos", "dim", "geom", "flex", "elem", "vert", "exclude", "efc_address")
+_SPARSE_FROM = 60  # dofs from which MuJoCo's rows are sparse where it may choose
+
+
+@struct
+class Weights:
+  """An organ's flexes and MuJoCo's memory under its own names."""
+
+  nv: int  # dofs of the model
+  memory: Array(wp.uint64, ("nword",))  # the mjData itself
+  mine: ints("nflex")  # whether a flex is the organ's, or a window of it
+  flags: ints(len(FLAG))  # see FLAG
+  # mjOption:
+  jacobian: ints(1)
+  solver: ints(1)
+  noslip_iterations: ints(1)
+  enableflags: ints(1)
+  # mjModel:
+  body_dofadr: ints("nbody")
+  body_dofnum: ints("nbody")
+  body_invweight0: doubles("nbody", 2)
+  geom_bodyid: ints("ngeom")
+  flex_dim: ints("nflex")
+  flex_vertadr: ints("nflex")
+  flex_vertbodyid: ints("nflexvert")
+  flex_elem: ints("nflexelemdata")
+  flex_elemdataadr: ints("nflex")
+  # mjData:
+  flexvert_xpos: doubles("nflexvert", 3)
+
+
+def _offsets(prefix: str, kind, names) -> dict[str, int]:
+  return {f"{prefix}_{name.upper()}": getattr(kind, name).offset for name in names}
+
+
+_weigh = kernel(
+  "weigh",
+  "weights.h",
+  Weights,
+  coupling.CONSTANTS
+  | _offsets("DATA", mjstruct.Data, _DATA)
+  | _offsets("CONTACT", mjstruct.Contact, _CONTACT)
+  | {
+    "CONTACT_LENGTH": mjstruct.size(mjstruct.Contact),
+    "CONTACT_PYRAMIDAL": int(mujoco.mjtConstraint.mjCNSTR_CONTACT_PYRAMIDAL),
+    "CONTACT_ELLIPTIC": int(mujoco.mjtConstraint.mjCNSTR_CONTACT_ELLIPTIC),
+    "JACOBIAN_DENSE": int(mujoco.mjtJacobian.mjJAC_DENSE),
+    "JACOBIAN_AUTO": int(mujoco.mjtJacobian.mjJAC_AUTO),
+    "SPARSE_FROM": _SPARSE_FROM,
+    "SOLVER_PGS": int(mujoco.mjtSolver.mjSOL_PGS),
+    "ENABLE_DIAGEXACT": int(mujoco.mjtEnableBit.mjENBL_DIAGEXACT),
+  },
+)
+MODULE = _weigh.module.name
+
+
+@functools.cache
+def are_wrong() -> bool:
+  """Returns whether MuJoCo's weights are not barycentric, by one contact off a triangle's middle."""
+  model = mujoco.MjModel.from_xml_string(
+    """<mujoco><option jacobian="dense"/><worldbody>
+    <flexcomp name="f" type="direct" dim="2" point="0 0 0 1 0 0 0 1 0" element="0 1 2" radius=".01">
+    <edge damping="1"/><contact selfcollide="none" condim="1"/></flexcomp>
+    <geom size=".1" pos=".15 .25 .1" condim="1"/></worldbody></mujoco>"""
+  )
+  data = mujoco.MjData(model)
+  mujoco.mj_fwdPosition(model, data)
+  found = np.linalg.norm(data.efc_J.reshape(-1, 3, 3)[0], axis=1)
+  at = data.contact.pos[0]
+  return not np.allclose(found, [1 - at[0] - at[1], at[0], at[1]], atol=1e-3)
+
+
+def make(w, model: int):
+  """Returns `Weights` of a workspace's organ."""
+  m, windows = mjstruct.Model.from_address(model), w.organ.windows
+  mine = np.zeros(m.nflex, np.int32)
+  mine[windows.flex if windows else w.organ.flex] = 1
+  out = coupling.mujoco_arrays(model, w.data, Weights)
+  out.nv = m.nv
+  out.memory = coupling.wrap(w.data, mjstruct.size(mjstruct.Data) // 8, wp.uint64)
+  out.mine = w.views["mine"] = wp.array(mine, dtype=int, device="cpu")
+  out.flags = wp.array(w.flags, dtype=int, device="cpu", copy=False)
+  return out
+
+
+def launch(weights):
+  """Gives the contacts their weights, where MuJoCo's are wrong."""
+  if are_wrong():
+    wp.launch(_weigh, dim=(1, 1), inputs=[1, 0, weights], device="cpu")
+
+
+def project(model: int, data: int):
+  """Computes again what MuJoCo's dual solvers and exact diagonals need of the rows."""
+  apart.run(mjstruct.library().mj_projectConstraint, model, data)

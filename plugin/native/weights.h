@@ -1,0 +1,174 @@
+// Contacts with triangles: a contact acts on the corners of a triangle by the barycentric weights of
+// where it is. MuJoCo 3.17 weighs them by inverse distance, as if the contact were at another point.
+// Its rows are made when this runs, their reference accelerations are not.
+#pragma once
+#include "d3.h"
+
+namespace palpate {
+
+// The barycentric weights of the point nearest to p on the edge from a to b; `far2` gets the square
+// of its distance.
+PALPATE double along_edge(D3 p, D3 a, D3 b, double& far2) {
+  const D3 e = b - a, r = p - a;
+  const double e2 = dot(e, e);
+  double t = e2 > 0.0 ? dot(r, e) / e2 : 0.0;
+  t = t < 0.0 ? 0.0 : t > 1.0 ? 1.0 : t;
+  const D3 off = r - t * e;
+  far2 = dot(off, off);
+  return t;
+}
+
+// The barycentric weights of the point of a triangle that is nearest to p. With edges e, g from
+// corner 0 those of p's projection solve [e.e e.g; e.g g.g] (v, w) = (e.r, g.r), r = p - x0 (Ericson
+// 2005, Real-Time Collision Detection, 3.4); one outside has its nearest point on an edge.
+PALPATE D3 barycentric(D3 p, const D3* x) {
+  const D3 e = x[1] - x[0], g = x[2] - x[0], r = p - x[0];
+  const double ee = dot(e, e), eg = dot(e, g), gg = dot(g, g), er = dot(e, r), gr = dot(g, r);
+  const double det = ee * gg - eg * eg;
+  if (det > 0.0) {
+    const double v = (gg * er - eg * gr) / det, w = (ee * gr - eg * er) / det;
+    if (v >= 0.0 && w >= 0.0 && v + w <= 1.0) return {1.0 - v - w, v, w};
+  }
+  double far0, far1, far2;
+  const double t0 = along_edge(p, x[0], x[1], far0), t1 = along_edge(p, x[1], x[2], far1);
+  const double t2 = along_edge(p, x[2], x[0], far2);
+  if (far0 <= far1 && far0 <= far2) return {1.0 - t0, t0, 0.0};
+  return far1 <= far2 ? D3{0.0, 1.0 - t1, t1} : D3{t2, 0.0, 1.0 - t2};
+}
+
+// A field of mjData: those in its arena are elsewhere in each step.
+template <class T, class Fields>
+PALPATE T& datum(const Fields& f, int offset) {
+  return *(T*)((char*)f.memory.data + offset);
+}
+PALPATE double* pos_of(char* contact) { return (double*)(contact + CONTACT_POS); }
+PALPATE int side_of(const char* contact, int field, int side) {
+  return ((const int*)(contact + field))[side];
+}
+
+// The rows of a contact in efc_J: how many, and which.
+struct Rows { int first, count; bool paired; };
+
+// The rows of a contact; none where MuJoCo left it out.
+template <class Fields>
+PALPATE Rows rows_of(const Fields& f, const char* contact) {
+  const int first = side_of(contact, CONTACT_EFC_ADDRESS, 0), dim = side_of(contact, CONTACT_DIM, 0);
+  if (first < 0 || side_of(contact, CONTACT_EXCLUDE, 0)) return {0, 0, false};
+  const int type = datum<int*>(f, DATA_EFC_TYPE)[first];
+  const bool paired = type == CONTACT_PYRAMIDAL;
+  const int count = paired ? 2 * (dim - 1) : type == CONTACT_ELLIPTIC ? dim : 1;
+  if (first + count > datum<int>(f, DATA_NEFC)) return {0, 0, false};
+  return {first, count, paired};
+}
+
+// Where a row has the three columns of a body's dofs, or null.
+template <class Fields>
+PALPATE double* columns(const Fields& f, int row, int body) {
+  const int adr = f.body_dofadr.data[body], nv = f.nv;
+  double* J = datum<double*>(f, DATA_EFC_J);
+  const int jacobian = f.jacobian.data[0];
+  if (f.body_dofnum.data[body] != 3) return nullptr;
+  if (jacobian == JACOBIAN_DENSE || (jacobian == JACOBIAN_AUTO && nv < SPARSE_FROM))
+    return J + (long long)nv * row + adr;
+  const int start = datum<int*>(f, DATA_EFC_J_ROWADR)[row];
+  const int count = datum<int*>(f, DATA_EFC_J_ROWNNZ)[row];
+  const int* colind = datum<int*>(f, DATA_EFC_J_COLIND) + start;
+  for (int k = 0; k + 2 < count; ++k)
+    if (colind[k] == adr) return J + start + k;
+  return nullptr;
+}
+
+// The weight that the rows give to a body: the length of its part of the normal's row, which is the
+// mean of a pair where the cone is a pyramid.
+template <class Fields>
+PALPATE double weight_of(const Fields& f, Rows rows, int body, double otherwise) {
+  const double* a = columns(f, rows.first, body);
+  if (!a) return otherwise;
+  return rows.paired ? 0.5 * norm(load(a) + load(columns(f, rows.first + 1, body))) : norm(load(a));
+}
+
+// The approximate inverse inertia that a side adds to a contact's, by its weights in the rows.
+template <class Fields>
+PALPATE double inverse_inertia(const Fields& f, const char* contact, Rows rows, int side) {
+  const int geom = side_of(contact, CONTACT_GEOM, side), flex = side_of(contact, CONTACT_FLEX, side);
+  if (geom >= 0) return f.body_invweight0.data[2 * f.geom_bodyid.data[geom]];
+  const int* body = f.flex_vertbodyid.data + f.flex_vertadr.data[flex];
+  const int vert = side_of(contact, CONTACT_VERT, side), n = f.flex_dim.data[flex] + 1;
+  if (vert >= 0) return f.body_invweight0.data[2 * body[vert]];
+  const int* e = f.flex_elem.data + f.flex_elemdataadr.data[flex] +
+                 n * side_of(contact, CONTACT_ELEM, side);
+  double sum = 0.0;  // corners that are no dofs of their own are one rigid body, or pinned
+  for (int k = 0; k < n; ++k)
+    sum += weight_of(f, rows, body[e[k]], 1.0 / n) * f.body_invweight0.data[2 * body[e[k]]];
+  return sum;
+}
+
+// Multiplies the inertia that constraints are regularized by: R is a contact's inverse inertia times
+// what does not know of weights (MuJoCo, Computation, Constraint model). Islands have copies.
+template <class Fields>
+PALPATE void scale_impedance(const Fields& f, Rows rows, double gain) {
+  const bool islands = datum<int>(f, DATA_NISLAND) > 0;
+  for (int r = rows.first; r < rows.first + rows.count; ++r) {
+    datum<double*>(f, DATA_EFC_DIAGA)[r] *= gain;
+    datum<double*>(f, DATA_EFC_R)[r] *= gain;
+    datum<double*>(f, DATA_EFC_D)[r] /= gain;
+    if (!islands) continue;
+    const int at = datum<int*>(f, DATA_MAP_EFC2IEFC)[r];
+    datum<double*>(f, DATA_IEFC_R)[at] *= gain;
+    datum<double*>(f, DATA_IEFC_D)[at] /= gain;
+  }
+}
+
+// Gives the corners of the triangle on one side of a contact their weights.
+template <class Fields>
+PALPATE bool weigh_side(const Fields& f, char* contact, Rows rows, int side) {
+  const int flex = side_of(contact, CONTACT_FLEX, side), elem = side_of(contact, CONTACT_ELEM, side);
+  if (flex < 0 || elem < 0 || !f.mine.data[flex]) return false;
+  const int start = f.flex_vertadr.data[flex], other = side_of(contact, CONTACT_VERT, 1 - side);
+  const int* e = f.flex_elem.data + f.flex_elemdataadr.data[flex] + 3 * elem;
+  D3 x[3];
+  for (int k = 0; k < 3; ++k) {
+    if (e[k] == other) return false;  // MuJoCo leaves that corner out
+    x[k] = load(f.flexvert_xpos.data + 3 * (start + e[k]));
+  }
+  const double before = inverse_inertia(f, contact, rows, 1 - side);
+  double from = before, to = before;
+  const D3 w = barycentric(load(pos_of(contact)), x);
+  const double right[3] = {w.x, w.y, w.z};
+  bool changed = false;
+  for (int k = 0; k < 3; ++k) {
+    const int body = f.flex_vertbodyid.data[start + e[k]];
+    const double found = weight_of(f, rows, body, 0.0);
+    if (!(found > 0.0)) continue;
+    const double gain = right[k] / found;
+    from += found * f.body_invweight0.data[2 * body];
+    to += right[k] * f.body_invweight0.data[2 * body];
+    changed = changed || fabs(right[k] - found) > 1e-12;
+    for (int r = rows.first; r < rows.first + rows.count; ++r) {
+      double* a = columns(f, r, body);
+      store(a, gain * load(a));
+    }
+  }
+  if (from > 0.0 && to > 0.0) scale_impedance(f, rows, to / from);
+  return changed;
+}
+
+// Gives the contacts of an organ's triangles their weights, and flags that what MuJoCo has computed
+// of the rows for its dual solvers has to be computed again. Done twice it does nothing.
+template <class Fields>
+PALPATE void weigh(const Fields& f, Thread, int) {
+  bool changed = false;
+  char* contact = datum<char*>(f, DATA_CONTACT);
+  const int ncon = datum<int>(f, DATA_NEFC) > 0 ? datum<int>(f, DATA_NCON) : 0;
+  for (int c = 0; c < ncon; ++c, contact += CONTACT_LENGTH) {
+    const bool soft = side_of(contact, CONTACT_FLEX, 0) >= 0 || side_of(contact, CONTACT_FLEX, 1) >= 0;
+    const Rows rows = soft ? rows_of(f, contact) : Rows{0, 0, false};
+    for (int side = 0; side < 2 && rows.count; ++side)
+      changed = weigh_side(f, contact, rows, side) || changed;
+  }
+  const bool projects = f.solver.data[0] == SOLVER_PGS || f.noslip_iterations.data[0] > 0 ||
+                        (f.enableflags.data[0] & ENABLE_DIAGEXACT);
+  f.flags.data[FLAG_WEIGHED] = changed && projects;
+}
+
+}  // namespace palpate
