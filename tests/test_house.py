@@ -47,7 +47,9 @@ def floor(module: str) -> int:
   """Returns the floor of a module of the package."""
   words = module.split(".")
   room = words[1] if len(words) > 1 else "organ"  # palpate itself: the handle and register
-  names = {"__main__": "app"} | dict.fromkeys(("authoring", "meshes", "windows"), "organ")
+  names = {"__main__": "app"} | dict.fromkeys(
+    ("attributes", "authoring", "meshes", "windows"), "organ"
+  )
   return FLOORS.index(names.get(room, room))
 
 
