@@ -199,13 +199,13 @@ def _make_rigid(spec, flex, own: list, plugin, config: dict[str, str]):
       surface.set_frame(own[0].frame)
     surface.plugin.name, surface.plugin.plugin_name = plugin.name, engine.NAME
     surface.plugin.active = True
+  flex.vert, flex.vertbody = rest.ravel(), [surface.name] * len(rest)  # MuJoCo 4 deletes it too
+  flex.edgedamping = 0.0
   # One by one the vertices' bodies take MuJoCo quadratic time to delete.
   doomed = parent.add_frame()
   for body in own:
     body.set_frame(doomed)
   spec.delete(doomed)
-  flex.vert, flex.vertbody = rest.ravel(), [surface.name] * len(rest)
-  flex.edgedamping = 0.0
   return surface
 
 
