@@ -8,7 +8,7 @@ import argparse
 import pathlib
 from collections.abc import Sequence
 
-from . import markup, mjcf, organs, scene
+from . import markup, mjcf, organs, remesh, scene
 from .catalog import NAMES
 
 INSTRUMENTS = ("probe", "grasper")  # of the committed scenes
@@ -19,11 +19,17 @@ def files(name: str) -> dict[pathlib.Path, str]:
   build = organs.build(name)
   at = scene.path(name, scene=False)
   mesh = f"{build.entry.shape}.obj"
-  return {
-    at.parent / "assets" / mesh: mjcf.obj(build.vertices, build.triangles),
+  assets = at.parent / "assets"
+  made = {
+    assets / mesh: mjcf.obj(build.vertices, build.triangles),
     at: markup.catalogued(build, name, mesh),
     scene.path(name): markup.scene(build, name, INSTRUMENTS),
   }
+  if build.entry.backdrop is not None:  # drawn only, and as a mesh
+    other = organs.build(build.entry.backdrop[0])
+    soft = remesh.soften(other.vertices, other.triangles)
+    made[assets / f"{build.entry.backdrop[0]}.obj"] = mjcf.obj(soft, other.triangles)
+  return made
 
 
 def main(arguments: Sequence[str] | None = None):

@@ -244,7 +244,7 @@ def _backdrop(entry: catalog.Entry, root: str) -> tuple[str, str]:
   if entry.backdrop is None:
     return "", ""
   other, pos = entry.backdrop
-  mesh = {"name": other, "file": f"{root}/{other}/assets/{other}.obj", "smoothnormal": True}
+  mesh = {"name": other, "file": f"{root}/{entry.shape}/assets/{other}.obj", "smoothnormal": True}
   skin = {"name": other, "rgba": catalog.entry(other).rgba, "specular": 0.3, "shininess": 0.5}
   geom = {"name": other, "type": "mesh", "mesh": other, "material": other, "pos": pos}
   geom |= {"contype": 0, "conaffinity": 0, "group": 2}

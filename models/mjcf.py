@@ -9,7 +9,7 @@ import textwrap
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from palpate.authoring import CONTACT, text
+from palpate.attributes import CONTACT, text
 
 __all__ = ["CONTACT", "extension", "flexcomp", "numbers", "obj", "plugin", "tag"]
 

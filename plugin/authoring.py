@@ -11,19 +11,11 @@ import numpy as np
 
 from . import meshes
 from . import windows as author
+from .attributes import CONTACT, text
 from .engine import plugin as engine
 from .tissue import config as configuration
 from .tissue import mesh as topology
 
-# Of an organ under instruments. solmix: its solref counts, not theirs, for its nodes are light.
-CONTACT: Mapping[str, object] = {
-  "condim": 3,
-  "friction": 0.3,
-  "solref": (0.004, 1),
-  "solimp": (0.95, 0.99, 0.001),
-  "solmix": 1000,
-  "selfcollide": "none",
-}
 _DENSITY = 1060.0  # [kg/m^3], of most soft tissue
 _BOX = 0.005  # [m]; half the side of the box whose inertia a node's body has, as in a flexcomp
 _SELF = {
@@ -130,18 +122,6 @@ def _instance(spec, name: str, texts: dict[str, str]):
   plugin = spec.add_plugin(name=name, plugin_name=engine.NAME, active=True)
   plugin.config = {key: value for key, value in texts.items() if value}
   return plugin
-
-
-def text(value, digits: int = 9) -> str:
-  """Returns a text, flag, number or array of numbers as MJCF has it."""
-  if isinstance(value, str):
-    return value
-  if isinstance(value, bool | np.bool_):
-    return "true" if value else "false"
-  array = np.asarray(value)
-  if array.dtype.kind in "iu":
-    return " ".join(map(str, array.ravel()))
-  return " ".join(f"{v + 0.0:.{digits}g}" for v in array.ravel())
 
 
 def _surface(name: str, vertices: np.ndarray, triangles: np.ndarray) -> topology.Mesh:

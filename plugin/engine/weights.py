@@ -79,12 +79,18 @@ MODULE = _weigh.module.name
 
 @functools.cache
 def are_wrong() -> bool:
-  """Returns whether MuJoCo's weights are not barycentric, by one contact off a triangle's middle."""
+  """Returns whether MuJoCo's weights are not barycentric, by one contact with a triangle."""
+  slides = "".join(f'<joint type="slide" axis="{axis}"/>' for axis in ("1 0 0", "0 1 0", "0 0 1"))
+  corners = "".join(
+    f'<body name="{name}" pos="{pos}"><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>'
+    f"{slides}</body>"
+    for name, pos in (("a", "0 0 0"), ("b", "1 0 0"), ("c", "0 1 0"))
+  )
   model = mujoco.MjModel.from_xml_string(
-    """<mujoco><option jacobian="dense"/><worldbody>
-    <flexcomp name="f" type="direct" dim="2" point="0 0 0 1 0 0 0 1 0" element="0 1 2" radius=".01">
-    <edge damping="1"/><contact selfcollide="none" condim="1"/></flexcomp>
-    <geom size=".1" pos=".15 .25 .1" condim="1"/></worldbody></mujoco>"""
+    f"""<mujoco><option jacobian="dense"/><worldbody>{corners}
+    <geom size=".1" pos=".15 .25 .1" condim="1"/></worldbody>
+    <deformable><flex dim="2" body="a b c" element="0 1 2" radius=".01"><edge damping="1"/>
+    <contact selfcollide="none" condim="1"/></flex></deformable></mujoco>"""
   )
   data = mujoco.MjData(model)
   mujoco.mj_fwdPosition(model, data)

@@ -46,10 +46,8 @@ def test_a_held_organ_carries_its_own_weight(scenes, device, h):
 
 @pytest.fixture(scope="session")
 def reference():
-  """Returns times and forces of the explicit press; other versions' contacts are another press."""
-  if mujoco.__version__.startswith("3."):
-    return np.loadtxt(REFERENCE, delimiter=",", skiprows=1).T
-  return runpy.run_path(str(REFERENCE.with_suffix(".py")))["reference"]().T
+  """Returns times and forces of the explicit press."""
+  return np.loadtxt(REFERENCE, delimiter=",", skiprows=1).T
 
 
 @pytest.mark.parametrize(
@@ -82,8 +80,6 @@ def test_the_press_of_the_explicit_reference_is_reproduced(
 
 @pytest.mark.parametrize("duration", [0.03, pytest.param(0.25, marks=pytest.mark.slow)])
 def test_the_stored_reference_is_what_its_script_computes(duration):
-  if not mujoco.__version__.startswith("3."):
-    pytest.skip("the stored reference has the contacts of MuJoCo 3")
   script = runpy.run_path(str(REFERENCE.with_suffix(".py")))
   stored = np.loadtxt(REFERENCE, delimiter=",", skiprows=1)[: round(duration / script["EVERY"])]
   again = script["reference"](duration)

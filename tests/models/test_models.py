@@ -1,6 +1,7 @@
 """The organs' files and the loader."""
 
 import pathlib
+import re
 
 import mujoco
 import numpy as np
@@ -43,9 +44,22 @@ def test_organ_and_scene_files_load(name):
 @pytest.mark.parametrize("name", NAMES)
 def test_files_are_what_the_source_makes(name):
   files = build.files(name)
-  assert len(files) == 3
+  assert len(files) == (4 if catalog.entry(name).backdrop else 3)
   for path, text in files.items():
     assert path.read_bytes() == text.encode(), f"{path.name}: run python -m palpate.models.build"
+
+
+def test_what_is_behind_an_organ_is_drawn_smooth():
+  """MuJoCo draws a triangle flat whose normal is far from its nodes'; the notch had shards."""
+  model = mujoco.MjModel.from_xml_path(str(models.path("gallbladder")))
+  mesh = model.mesh("liver").id
+  start = model.mesh_faceadr[mesh]
+  face = model.mesh_face[start : start + model.mesh_facenum[mesh]]
+  corner = model.mesh_vert[model.mesh_vertadr[mesh] + face].astype(float)
+  normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+  normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+  of_nodes = model.mesh_normal[model.mesh_normaladr[mesh] + face]
+  assert np.einsum("md,mkd->mk", normal, of_nodes).min() > 0.8
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -66,6 +80,20 @@ def test_folder_is_complete(name):
   }
   for word in (picture.name, "Apache-2.0", *numbers.values()):
     assert word in readme
+
+
+README = pathlib.Path(models.path("liver")).parents[1] / "README.md"
+
+
+def test_the_list_of_models_is_whole():
+  text = README.read_text()
+  for name in (*NAMES, "press", "instruments"):
+    assert re.search(rf"^\| \[`{name}`\]", text, re.M), name
+  for name, tissue in catalog.TISSUES.items():
+    numbers = f"{tissue.young:g} Pa | {1e3 * tissue.thickness:g} mm | {tissue.foundation:g} Pa/m"
+    assert f"| `{name}` | {numbers} | {tissue.bulk:g} Pa |" in text
+  for path in README.parent.glob("*.py"):
+    assert path.name == "__init__.py" or f"`{path.name}`" in text, path.name
 
 
 @pytest.mark.parametrize("name", catalog.TISSUES)

@@ -1,0 +1,29 @@
+"""Attributes as MJCF has them, for specs and for texts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+# Of an organ under instruments. solmix: its solref counts, not theirs, for its nodes are light.
+CONTACT: Mapping[str, object] = {
+  "condim": 3,
+  "friction": 0.3,
+  "solref": (0.004, 1),
+  "solimp": (0.95, 0.99, 0.001),
+  "solmix": 1000,
+  "selfcollide": "none",
+}
+
+
+def text(value, digits: int = 9) -> str:
+  """Returns a text, flag, number or array of numbers as MJCF has it."""
+  if isinstance(value, str):
+    return value
+  if isinstance(value, bool | np.bool_):
+    return "true" if value else "false"
+  array = np.asarray(value)
+  if array.dtype.kind in "iu":
+    return " ".join(map(str, array.ravel()))
+  return " ".join(f"{v + 0.0:.{digits}g}" for v in array.ravel())
