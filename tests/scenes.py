@@ -380,3 +380,33 @@ def step(body, h, u, v=0.0, mass=1.0, force=0.0, beta=None, scheme="implicit"):
 def force(body, u):
   """Returns the internal force at displacement u [N]: one step of unit mass without K in it."""
   return step(body, 1.0, u, beta=-1.0)
+
+
+def motion(model):
+  """Returns qpos and qvel of each step of a press with fresh data."""
+  data = mujoco.MjData(model)
+  return run(model, data, 80, record=True)
+
+
+def adrift(**settings):
+  """Returns an organ on a foundation, in motion, with nothing else."""
+  points, elem = sphere(1)
+  config = {"young": 3e4, "foundation": 1e5, "device": "cpu"}
+  own = set(settings) & {"bulk", "device", "newton"}
+  config |= {key: settings.pop(key) for key in own}
+  model, data, made = load(world(organ(points, elem, **config), **settings))
+  random = np.random.RandomState(0)
+  made.set_state(xvel=random.uniform(-0.1, 0.1, (made.nvert, 3)))
+  return model, data, made
+
+
+class Warnings:
+  """Collects MuJoCo's warnings instead of a log file."""
+
+  def __enter__(self):
+    self.lines = []
+    mujoco.set_mju_user_warning(self.lines.append)
+    return lambda: "\n".join(self.lines)
+
+  def __exit__(self, *_):
+    mujoco.set_mju_user_warning(None)

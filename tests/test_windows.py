@@ -235,3 +235,22 @@ def test_a_table_that_nobody_follows_is_pointed_out():
   table = '<geom name="table" type="plane" size="1 1 .1" pos="0 0 -.1"/>'
   with pytest.warns(UserWarning, match="'table'"):
     palpate.add_windows(spec(extra=table), "organ")
+
+
+def test_the_motion_of_a_keyframe_that_windows_leave_out_is_pointed_out():
+  made = spec()
+  m = made.compile()
+  bent = m.qpos0.copy()
+  bent[: -len(("z", "left", "right"))] = 1e-3
+  made.keys[0].qpos = bent
+  with pytest.warns(UserWarning, match=r"keyframes \['shut'\].*plugin_state.*set_state"):
+    palpate.add_windows(made, "organ")
+
+
+def test_a_tool_of_many_geoms_is_named():
+  geoms = '<geom size=".001" mass="1e-4"/>' * 40
+  extra = f'<body name="brush" pos="0 0 .2"><freejoint/>{geoms}</body>'
+  with pytest.raises(ValueError, match=r"'brush'.*40 geoms.*expected at most 32"):
+    palpate.add_windows(spec(extra=extra), "organ", ["brush"])
+  with pytest.raises(ValueError, match=r"42 geoms.*name bodies in tools"):
+    palpate.add_windows(spec(extra=extra), "organ")

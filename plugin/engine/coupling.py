@@ -185,12 +185,13 @@ def mass_addresses(m, dofs: np.ndarray) -> np.ndarray:
   return rowadr + mjstruct.view(m.M_rownnz, m.nv, np.int32)[dofs] - 1
 
 
-def motion_size(organ) -> int:
-  """Returns how many numbers at the start of the plugin state are motion and forces."""
+def spans(organ) -> dict[str, slice]:
+  """Returns where the blocks of an organ's plugin state lie."""
   if organ.windows is None:
-    return layout.spans(NodalState, {"nfree": organ.nfree})["before"].stop
-  sizes = {"nvert": organ.mesh.nvert, "nslot": organ.windows.nslot, "ngeom": 0}
-  return layout.spans(WindowState, sizes)["force"].stop
+    return layout.spans(NodalState, {"nfree": organ.nfree})
+  win = organ.windows
+  sizes = {"nvert": organ.mesh.nvert, "nslot": win.nslot, "ngeom": win.geom.size}
+  return layout.spans(WindowState, sizes)
 
 
 def plugin_state(model: int, data: int, instance: int, size: int) -> wp.array:

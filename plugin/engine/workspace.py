@@ -197,8 +197,10 @@ class Workspace:
         "plugin_state is not one of this organ, but saved from another model or damaged; reset the "
         "data, or set a state that was saved from it"
       )
-    motion = self.plugin_state[: coupling.motion_size(self.organ)]
-    if not (np.abs(motion) < _HUGE).all():
+    # Forces come last of what is bounded.
+    where = coupling.spans(self.organ)
+    last = "force" if self.organ.windows else "before"
+    if not (np.abs(self.plugin_state[: where[last].stop]) < _HUGE).all():
       raise ValueError(
         f"plugin_state has a number that is not finite or over {_HUGE:g}, expected what was saved"
       )
@@ -355,7 +357,7 @@ def make(model: int, data: int, instance: int) -> Workspace:
       w.turn = Turn()
     bind(w, model)
     w.plugin_state = w.views["plugin_state"].numpy()
-    w.signature = w.plugin_state[-1:].data
+    w.signature = w.plugin_state[coupling.spans(organ)["signature"]].data
     if w.turn is not None:
       windowed.settle(w, model)
       if w.turn.is_orphan():
@@ -401,6 +403,7 @@ def copy(w: Workspace, model: int, other: Workspace):
 
 
 def _change(w: Workspace, model: int, config: Config):
+  attach(w, model)
   before, w.config = w.config, config
   if w.resident:
     w.resident.stop()

@@ -62,9 +62,13 @@ def _number(low: float, high: float = math.inf, closed: bool = True) -> tuple:
 
 
 def _numbers(text: str, nelem: int) -> tuple[float, ...]:
-  values = tuple(float(word) for word in text.split())
-  if not all(math.isfinite(v) and v > 0 for v in values):
-    raise ValueError
+  words = text.split()
+  values = tuple(float(word) for word in words)
+  for k, value in enumerate(values):
+    if not (math.isfinite(value) and value > 0):
+      if len(values) > 1:
+        raise ValueError(f"has {words[k]} for element {k}, expected numbers > 0")
+      raise ValueError
   if len(values) not in (1, nelem):
     raise ValueError(f"has {len(values)} values, expected 1 or {nelem} (one an element)")
   return values
@@ -171,7 +175,7 @@ class Config:
   )
   iterations: int = _row(200, _count(1, 10000), "most PCG iterations of a solve", change=NUMBER)
   tolerance: float = _row(
-    1e-4, _number(0.0, 1.0, False), "relative residual at which PCG stops", change=NUMBER
+    1e-4, _number(1e-10, 1.0), "relative residual at which PCG stops", change=NUMBER
   )
   newton: int = _row(1, _count(1, 100), "Newton iterations a step", change=GRAPH)
   window: tuple[str, ...] = _row(

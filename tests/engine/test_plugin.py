@@ -1,48 +1,17 @@
-"""Contracts with MuJoCo: what an organ does in mj_step, wherever and however the model was made."""
-
-import copy
-import gc
-import os
-import pathlib
-import subprocess
-import sys
+"""Contracts with MuJoCo: what an organ does in mj_step, and what its motion is."""
 
 import mujoco
 import numpy as np
 import palpate
 import pytest
 import warp as wp
-from mujoco import rollout
-from palpate.engine import plugin as engine
 from palpate.tissue import mesh as topology
 
 GRAVITY = (0, 0, -9.81)
-SCENE = pathlib.Path(__file__).parents[2] / "models" / "press" / "scene.xml"
-STATE = mujoco.mjtState.mjSTATE_INTEGRATION
-
-
-def _state(model, data):
-  out = np.empty(mujoco.mj_stateSize(model, STATE))
-  mujoco.mj_getState(model, data, out, STATE)
-  return out
 
 
 def _quiet(data):
   return all(warning.number == 0 for warning in data.warning)
-
-
-def _free(scenes, **world):
-  """Returns an organ on a foundation, in motion, with nothing else."""
-  points, elem = scenes.sphere(1)
-  config = {"young": 3e4, "foundation": 1e5, "device": "cpu"}
-  config |= {key: world.pop(key) for key in list(world) if key in ("bulk", "device", "newton")}
-  model, data, organ = scenes.load(scenes.world(scenes.organ(points, elem, **config), **world))
-  random = np.random.RandomState(0)
-  organ.set_state(xvel=random.uniform(-0.1, 0.1, (organ.nvert, 3)))
-  return model, data, organ
-
-
-# Motion.
 
 
 def test_an_unsupported_organ_falls(scenes, device):
@@ -97,7 +66,7 @@ def test_a_mode_decays_and_swings_as_rayleigh_damping_says(scenes, device):
 def test_every_integrator_but_rk4_gives_the_same_free_motion(scenes, device, integrator):
   motion = []
   for name in ("Euler", integrator):
-    model, data, _ = _free(scenes, integrator=name, device=device)
+    model, data, _ = scenes.adrift(integrator=name, device=device)
     motion.append(scenes.run(model, data, 60, record=True))
   np.testing.assert_allclose(motion[1], motion[0], rtol=0, atol=1e-12)
 
@@ -213,7 +182,7 @@ def test_several_organs_do_not_feel_each_other(scenes, device):
 def test_applied_forces_push_the_nodes(scenes, device):
   moved = []
   for kind in range(2):
-    model, data, organ = _free(scenes, device=device)
+    model, data, organ = scenes.adrift(device=device)
     organ.set_state(xvel=np.zeros((organ.nvert, 3)))
     force = np.array([0.01, -0.02, 0.03])
     if kind:
@@ -270,9 +239,7 @@ def test_sleep_leaves_the_motion_as_it_is(scenes):
   for flag in ("disable", "enable"):
     points, elem = scenes.sphere(1)
     organ = scenes.organ(points, elem, foundation=2e5, young=3e4)
-    xml = scenes.world(
-      organ, scenes.ball(0.07), gravity=GRAVITY, flag=f'<flag sleep="{flag}"/>'
-    )
+    xml = scenes.world(organ, scenes.ball(0.07), gravity=GRAVITY, flag=f'<flag sleep="{flag}"/>')
     model, data, organ = scenes.load(xml)
     motion.append(scenes.run(model, data, 800, record=True))
   np.testing.assert_array_equal(motion[1], motion[0])
@@ -280,7 +247,7 @@ def test_sleep_leaves_the_motion_as_it_is(scenes):
 
 def test_springs_and_dampers_both_disabled_switch_the_organ_off(scenes):
   # MuJoCo then skips all passive forces, the plugin's too (documented).
-  model, data, organ = _free(scenes)
+  model, data, organ = scenes.adrift()
   before = organ.xvel
   model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SPRING | mujoco.mjtDisableBit.mjDSBL_DAMPER
   scenes.run(model, data, 10)
@@ -313,432 +280,3 @@ def test_cpu_and_cuda_agree(scenes):
     found[device] = organ.displacement, organ.force
   for a, b in zip(*found.values(), strict=True):
     np.testing.assert_allclose(b, a, atol=1e-4 * np.abs(a).max())
-
-
-# Repetition and state.
-
-
-def test_runs_repeat_to_the_bit(scenes, device):
-  motion = []
-  for _ in range(2):
-    model, data, _ = scenes.load(scenes.press(bulk=1e4, device=device))
-    motion.append(scenes.run(model, data, 120, record=True))
-  np.testing.assert_array_equal(motion[1], motion[0])
-
-
-def test_forward_twice_changes_nothing(scenes, device):
-  plain = scenes.load(scenes.press(device=device))
-  extra = scenes.load(scenes.press(device=device))
-  motion = [scenes.run(plain[0], plain[1], 100, record=True)]
-  out = []
-  for _ in range(100):
-    extra[1].ctrl[0] = -min(0.1 * extra[1].time, 0.008)
-    mujoco.mj_forward(extra[0], extra[1])
-    before = _state(extra[0], extra[1])
-    mujoco.mj_forward(extra[0], extra[1])
-    np.testing.assert_array_equal(_state(extra[0], extra[1]), before)
-    out.append(scenes.run(extra[0], extra[1], 1, record=True)[0])
-  # The constraint solver starts elsewhere after an extra forward: rounding of its tolerance.
-  np.testing.assert_allclose(out, motion[0], rtol=0, atol=1e-6)
-
-
-@pytest.mark.parametrize("restore", ["setState", "copyData", "copy", "resetData", "keyframe"])
-def test_a_restored_state_gives_the_same_motion_to_the_bit(scenes, restore):
-  model, data, organ = scenes.load(scenes.press(bulk=1e4))
-  start = 0 if restore == "resetData" else 80
-  scenes.run(model, data, start)
-  other = mujoco.MjData(model)
-  if restore == "setState":
-    scenes.run(model, other, 13)
-    mujoco.mj_setState(model, other, _state(model, data), STATE)
-  elif restore == "copyData":
-    mujoco.mj_copyData(other, model, data)
-  elif restore == "copy":
-    other = copy.copy(data)
-  elif restore == "resetData":
-    scenes.run(model, other, 60)
-    mujoco.mj_resetData(model, other)
-  else:
-    spec = mujoco.MjSpec.from_string(scenes.press(bulk=1e4))
-    spec.add_key(name="pressed", qpos=data.qpos, qvel=data.qvel, ctrl=data.ctrl, time=data.time)
-    model = spec.compile()
-    # A keyframe has no contact force: two data restored from it are alike, whatever came before.
-    data, other = mujoco.MjData(model), mujoco.MjData(model)
-    scenes.run(model, other, 60)
-    for d in (data, other):
-      mujoco.mj_resetDataKeyframe(model, d, 0)
-    assert data.time == pytest.approx(0.08)
-  expected = scenes.run(model, data, 60, record=True)
-  np.testing.assert_array_equal(scenes.run(model, other, 60, record=True), expected)
-  assert organ.error is None
-
-
-def test_rollout_with_threads_is_the_same_as_without(scenes):
-  model, data, _ = scenes.load(scenes.press())
-  scenes.run(model, data, 60)
-  full = mujoco.mjtState.mjSTATE_FULLPHYSICS
-  start = np.empty(mujoco.mj_stateSize(model, full))
-  mujoco.mj_getState(model, data, start, full)
-  control = np.linspace(-0.01, 0, 6)[:, None, None] * np.ones((6, 40, 1))
-  found = {}
-  for threads in (1, 3):
-    datas = [mujoco.MjData(model) for _ in range(threads)]
-    with rollout.Rollout(nthread=threads) as run:
-      found[threads], _ = run.rollout(model, datas, np.tile(start, (6, 1)), control)
-  assert np.ptp(found[1][:, -1, -1]) > 0 or np.ptp(found[1][:, -1]) > 1e-4
-  np.testing.assert_array_equal(found[3], found[1])
-
-
-# Models.
-
-
-def _motion(scenes, model):
-  data = mujoco.MjData(model)
-  return scenes.run(model, data, 80, record=True)
-
-
-def test_a_copied_model_moves_alike(scenes):
-  model, *_ = scenes.load(scenes.press())
-  expected = _motion(scenes, model)
-  np.testing.assert_array_equal(_motion(scenes, copy.copy(model)), expected)
-  np.testing.assert_array_equal(_motion(scenes, copy.deepcopy(model)), expected)
-
-
-def test_a_data_used_with_another_copy_of_its_model_follows_that_model(scenes):
-  model, data, organ = scenes.load(scenes.world(scenes.organ(*scenes.sphere(1)), gravity=GRAVITY))
-  scenes.run(model, data, 5)
-  other = copy.copy(model)
-  other.opt.gravity[:] = 0
-  before = organ.xvel
-  scenes.run(other, data, 5)
-  np.testing.assert_allclose(organ.xvel, before, atol=1e-5)  # with gravity: 0.05
-
-
-def test_a_binary_model_reloads(scenes, tmp_path):
-  model, *_ = scenes.load(scenes.press())
-  path = str(tmp_path / "press.mjb")
-  mujoco.mj_saveModel(model, path, None)
-  again = mujoco.MjModel.from_binary_path(path)
-  np.testing.assert_array_equal(_motion(scenes, again), _motion(scenes, model))
-
-
-def test_a_specification_compiles_recompiles_and_saves(scenes, tmp_path):
-  spec = mujoco.MjSpec.from_string(scenes.press())
-  model = spec.compile()
-  expected = _motion(scenes, mujoco.MjModel.from_xml_string(scenes.press()))
-  np.testing.assert_array_equal(_motion(scenes, model), expected)
-  np.testing.assert_array_equal(_motion(scenes, spec.compile()), expected)
-  data = mujoco.MjData(model)
-  scenes.run(model, data, 20)
-  model, data = spec.recompile(model, data)
-  assert data.time == pytest.approx(0.02)
-  scenes.run(model, data, 20)
-  assert palpate.Organ(model, data, "organ").error is None
-  path = tmp_path / "press.xml"
-  path.write_text(spec.to_xml())
-  # Saved text has fewer digits.
-  reloaded = _motion(scenes, mujoco.MjModel.from_xml_path(str(path)))
-  np.testing.assert_allclose(reloaded, expected, atol=1e-2 * np.abs(expected).max())
-
-
-def test_an_organ_attached_with_a_prefix(scenes):
-  organ = scenes.organ(*scenes.sphere(1), foundation=1e5)
-  child = mujoco.MjSpec.from_string(scenes.world(organ, gravity=GRAVITY))
-  parent = mujoco.MjSpec.from_string(scenes.world(gravity=GRAVITY))
-  frame = parent.worldbody.add_frame(pos=[0.1, 0.2, 0.3], euler=[0.3, 0, 0])
-  parent.attach(child, prefix="left/", frame=frame)
-  model = parent.compile()
-  data = mujoco.MjData(model)
-  organ = palpate.Organ(model, data, "left/organ")
-  scenes.run(model, data, 300)
-  assert organ.displacement.std(axis=0).max() < 1e-3
-  assert 1e-6 < np.abs(organ.displacement).max() < 0.05
-  np.testing.assert_allclose(organ.xpos.mean(axis=0)[:2], [0.1, 0.2], atol=1e-3)
-
-
-@pytest.mark.skipif(mujoco.__version__ >= "4", reason="dm_control 1.0.50 knows MuJoCo 3")
-def test_dm_control_physics_copies_and_resets(scenes):
-  dm_mujoco = pytest.importorskip("dm_control.mujoco", reason="dm_control is not installed")
-  physics = dm_mujoco.Physics.from_xml_string(scenes.press())
-
-  def motion(of, steps=60):
-    out = []
-    for _ in range(steps):
-      of.set_control([-0.008])
-      of.step()
-      out.append(of.data.qpos.copy())
-    return np.array(out)
-
-  expected = motion(physics)
-  with physics.reset_context():
-    pass
-  np.testing.assert_array_equal(motion(physics), expected)
-  twins = [physics.copy(share_model=share) for share in (True, False)]
-  moved = [motion(twin) for twin in twins]
-  np.testing.assert_array_equal(moved[1], moved[0])
-  # dm_control calls mj_forward on a copy: the contact solver starts elsewhere.
-  np.testing.assert_allclose(moved[0], motion(physics), atol=2e-5)
-  with physics.reset_context():
-    pass
-  start = physics.get_state()
-  first = motion(physics)
-  with physics.reset_context():
-    physics.set_state(start)
-  np.testing.assert_array_equal(motion(physics), first)
-
-
-def test_deleted_data_and_models_leave_no_workspace(scenes):
-  gc.collect()
-  before = engine.count()
-  for _ in range(5):
-    model = mujoco.MjModel.from_xml_string(scenes.press(subdivisions=1))
-    datas = [mujoco.MjData(model) for _ in range(3)]
-    mujoco.mj_step(model, datas[0])
-    twin = copy.copy(datas[0])
-    mujoco.mj_copyData(twin, model, datas[1])
-    assert engine.count() == before + 4
-    del model, datas, twin
-    gc.collect()
-    assert engine.count() == before
-
-
-# Mistakes.
-
-
-def _refused(scenes, xml, *words):
-  with pytest.raises(ValueError) as error:
-    mujoco.MjModel.from_xml_string(xml)
-  for word in words:
-    assert word in str(error.value), str(error.value)
-
-
-@pytest.mark.parametrize(
-  ("key", "value", "words"),
-  [
-    ("young", "soft", ("young is 'soft'", "a number > 0")),
-    ("poisson", "0.5", ("poisson is '0.5'", "[0, 0.5)")),
-    ("stiffness", "3", ("stiffness is 3", "elements='spring'")),
-    ("elements", "spring", ("stiffness is missing",)),
-    ("integrator", "RK4", ("integrator is 'RK4'", "'implicit' or 'midpoint' or 'neumann'")),
-    ("device", "cuda:77", ("device is 'cuda:77'", "'cpu'")),
-    ("device", "gpu", ("device is 'gpu'", "'cpu'")),
-  ],
-)
-def test_a_bad_key_is_a_compile_error(scenes, key, value, words):
-  organ = scenes.organ(*scenes.sphere(1), name="liver", **{key: value})
-  _refused(scenes, scenes.world(organ), "organ 'liver'", *words)
-
-
-@pytest.mark.parametrize("key", ["bulk", "pressure"])
-def test_an_open_surface_has_no_volume(scenes, key):
-  organ = scenes.organ(*scenes.triangular(0.1, 0.05, 4, 3), name="liver", **{key: "10"})
-  _refused(scenes, scenes.world(organ), "organ 'liver'", f"{key} is 10", "closed surface")
-
-
-def test_an_unknown_key_is_a_compile_error(scenes):
-  organ = scenes.organ(*scenes.sphere(1), yuong="5000")
-  _refused(scenes, scenes.world(organ), "yuong")
-
-
-def test_meshes_that_cannot_be_run_are_compile_errors(scenes):
-  points, elem = scenes.sphere(1)
-  flipped = elem.copy()
-  flipped[5] = flipped[5, ::-1]
-  _refused(scenes, scenes.world(scenes.organ(points, flipped)), "organ 'organ'", "opposite")
-  flat = points.copy()
-  flat[elem[3, 2]] = 0.5 * (flat[elem[3, 0]] + flat[elem[3, 1]])
-  _refused(scenes, scenes.world(scenes.organ(flat, elem)), "organ 'organ'", "degenerate")
-
-
-def test_a_vertex_without_triangles_is_left_out_by_mujoco(scenes):
-  points, elem = scenes.sphere(1)
-  *_, organ = scenes.load(scenes.world(scenes.organ(np.vstack([points, [0, 0, 1]]), elem)))
-  assert organ.nvert == len(points)
-
-
-def test_flexes_that_are_no_surface_are_refused(scenes):
-  plugin = '<plugin plugin="palpate.organ"><config key="device" value="cpu"/></plugin>'
-  for dim, count, what in ((1, "4 1 1", "dim is 1"), (3, "3 3 3", "dim is 3")):
-    grid = f'type="grid" dim="{dim}" count="{count}" spacing=".1 .1 .1"'
-    flex = f'<flexcomp name="rope" {grid} mass="1">'
-    _refused(scenes, scenes.world(f"{flex}{plugin}</flexcomp>"), "organ 'rope'", what, "dim='2'")
-  flex = '<flexcomp name="sheet" type="grid" dim="2" count="4 4 1" spacing=".1 .1 .1" mass="1"'
-  elastic = '<elasticity young="1e3" poisson="0.3" thickness="0.01" elastic2d="both"/>'
-  xml = scenes.world(f"{flex}>{plugin}{elastic}</flexcomp>")
-  _refused(scenes, xml, "organ 'sheet'", "MuJoCo elasticity too")
-
-
-def test_a_plugin_on_a_body_without_a_flex_is_refused(scenes):
-  body = '<body name="box"><geom size="0.1"/><plugin plugin="palpate.organ"/></body>'
-  _refused(scenes, scenes.world(body), "'box'", "flexcomp")
-
-
-@pytest.mark.parametrize("what", ["qpos", "qvel", "force"])
-def test_a_state_that_is_not_finite_warns_and_recovers_after_reset(scenes, device, what):
-  model, data, organ = scenes.load(scenes.press(device=device))
-  expected = _motion(scenes, model)
-  scenes.run(model, data, 30)
-  model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-  target = {"qpos": data.qpos, "qvel": data.qvel, "force": data.qfrc_applied}[what]
-  target[scenes.dofs(organ)[5, 1] if what != "qpos" else scenes.qposs(organ)[5, 1]] = np.nan
-  with _Warnings() as log:
-    mujoco.mj_forward(model, data)
-    text = log()
-  assert organ.error is not None and "'organ'" in organ.error and "finite" in organ.error
-  assert "organ 'organ'" in text
-  model.opt.disableflags = 0
-  mujoco.mj_resetData(model, data)
-  assert organ.error is None
-  np.testing.assert_array_equal(scenes.run(model, data, 80, record=True), expected)
-
-
-class _Warnings:
-  """Collects MuJoCo's warnings instead of a log file."""
-
-  def __enter__(self):
-    self.lines = []
-    mujoco.set_mju_user_warning(self.lines.append)
-    return lambda: "\n".join(self.lines)
-
-  def __exit__(self, *_):
-    mujoco.set_mju_user_warning(None)
-
-
-@pytest.mark.parametrize("what", ["qpos", "qvel", "force"])
-def test_an_error_stays_visible_when_mujoco_resets_by_itself(scenes, what):
-  model, data, organ = scenes.load(scenes.press())
-  scenes.run(model, data, 30)
-  target = {"qpos": data.qpos, "qvel": data.qvel, "force": data.qfrc_applied}[what]
-  target[scenes.dofs(organ)[5, 1] if what != "qpos" else scenes.qposs(organ)[5, 1]] = np.nan
-  with _Warnings() as log:
-    scenes.run(model, data, 10)
-    text = log()
-  assert data.time == pytest.approx(0.01)
-  assert "organ 'organ'" in text
-  assert organ.error is not None and "finite" in organ.error
-  organ.reset()
-  assert organ.error is None
-  scenes.run(model, data, 5)
-  assert organ.error is None
-  mujoco.mj_resetData(model, data)
-  np.testing.assert_array_equal(
-    scenes.run(model, data, 40, record=True)[-1], _motion(scenes, model)[39]
-  )
-
-
-def test_an_error_is_of_one_data_and_one_organ(scenes):
-  points, elem = scenes.sphere(1)
-  xml = scenes.world(
-    *(scenes.organ(points + np.array([x, 0, 0]), elem, name=n) for n, x in (("a", 0), ("b", 0.3)))
-  )
-  model, data, a = scenes.load(xml, "a")
-  b = palpate.Organ(model, data, "b")
-  other = mujoco.MjData(model)
-  twin = palpate.Organ(model, other, "a")
-  data.qvel[scenes.dofs(a)[0]] = np.nan
-  with _Warnings():
-    mujoco.mj_step(model, data)
-  assert (a.error is None, b.error is None, twin.error is None) == (False, True, True)
-  mujoco.mj_copyData(other, model, data)
-  mujoco.mj_resetData(model, other)
-  assert a.error is not None and twin.error is None
-  mujoco.mj_resetData(model, data)
-  assert a.error is None
-
-
-def test_a_diverging_motion_is_reported_once(scenes):
-  model, data, organ = _free(scenes)
-  model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-  data.qvel[scenes.dofs(organ)] = 1e25
-  with _Warnings() as log:
-    scenes.run(model, data, 20)
-    text = log()
-  assert organ.error is not None
-  assert text.count("palpate.organ") == 1
-  organ.reset()
-  assert organ.error is None
-  np.testing.assert_array_equal(organ.displacement, 0)
-
-
-# Processes.
-
-_SCRIPT = """
-import sys, mujoco, palpate
-model = mujoco.MjModel.from_xml_path(sys.argv[1])
-data = mujoco.MjData(model)
-for _ in range(20):
-  mujoco.mj_step(model, data)
-organ = palpate.Organ(model, data, "organ")
-print(mujoco.__version__, organ.nvert, organ.error, repr(float(data.qpos[0])))
-"""
-
-
-def _process(scenes, tmp_path, python=sys.executable):
-  path = tmp_path / "scene.xml"
-  path.write_text(scenes.press(subdivisions=1))
-  environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
-  return subprocess.run(
-    [python, "-c", _SCRIPT, str(path)],
-    cwd=tmp_path,
-    env=environment,
-    capture_output=True,
-    text=True,
-    timeout=300,
-    check=True,
-  )
-
-
-def test_a_fresh_process_prints_nothing_and_leaves_no_log(scenes, tmp_path):
-  done = _process(scenes, tmp_path)
-  assert len(done.stdout.splitlines()) == 1, done.stdout
-  # Warp itself speaks of a missing CUDA driver; of MuJoCo and palpate nothing may be left.
-  ours = [line for line in done.stderr.splitlines() if not line.startswith("Warp CUDA warning")]
-  assert ours == []
-  assert [path.name for path in tmp_path.iterdir()] == ["scene.xml"]
-
-
-def test_mujoco_4_gives_the_same_motion(scenes, tmp_path):
-  python = os.environ.get("PALPATE_MUJOCO4_PYTHON", "")
-  if not pathlib.Path(python).is_file():
-    pytest.skip("PALPATE_MUJOCO4_PYTHON names no Python that has mujoco 4 and palpate")
-  version, nvert, error, qpos = _process(scenes, tmp_path, python).stdout.split()
-  assert version.startswith("4.") and (nvert, error) == ("42", "None")
-  ours = _process(scenes, tmp_path).stdout.split()[3]
-  assert float(qpos) == pytest.approx(float(ours), abs=1e-7)
-
-
-def test_ctrl_c_ends_a_loop_of_steps(tmp_path):
-  # The signal nearly always falls into a callback, where ctypes would drop the exception.
-  script = tmp_path / "loop.py"
-  script.write_text(
-    "import os, signal, threading, mujoco, palpate\n"
-    f"m = mujoco.MjModel.from_xml_path({str(SCENE)!r})\n"
-    "d = mujoco.MjData(m)\n"
-    "mujoco.mj_step(m, d)\n"
-    "threading.Timer(0.2, lambda: os.kill(os.getpid(), signal.SIGINT)).start()\n"
-    "try:\n"
-    "  while d.time < 60: mujoco.mj_step(m, d)\n"
-    "  print('lost')\n"
-    "except KeyboardInterrupt:\n"
-    "  print('interrupted', palpate.Organ(m, d, 'organ').error)\n"
-  )
-  out = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False)
-  assert out.stdout.strip().endswith("interrupted None"), out.stdout + out.stderr
-
-
-def test_data_that_outlives_the_modules_is_freed_quietly(scenes):
-  # In a cycle that only the interpreter's last collection finds.
-  code = f"""
-import gc, sys, mujoco, palpate
-gc.disable()
-class Holder: pass
-holder = Holder()
-holder.model = mujoco.MjModel.from_xml_string({scenes.press(subdivisions=1)!r})
-holder.data = mujoco.MjData(holder.model)
-mujoco.mj_step(holder.model, holder.data)
-holder.me = sys.modules["kept by nobody"] = holder
-print("stepped")
-"""
-  done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-  assert (done.returncode, done.stdout.strip()) == (0, "stepped"), done.stderr
-  assert "Exception" not in done.stderr and "Error" not in done.stderr

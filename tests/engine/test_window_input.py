@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import palpate
 import pytest
+import scenes
 from scenes import drive, load, probed, slots
 
 
@@ -91,6 +92,34 @@ def test_a_window_on_a_nodal_organ():
 def test_too_many_geoms():
   geoms = '<geom size=".001" mass="1e-4"/>' * 40
   refused(edited('<geom name="tip"', geoms + '<geom name="tip"'), "'window'", "41 geoms", "follow")
+
+
+def test_a_window_may_have_more_slots_than_the_organ_has_nodes():
+  m, d, organ = load(probed(count="20 20 1", condim=1))
+  force = drive(m, d, 100)[-1, 0]
+  assert organ.error is None
+  m, d, _ = load(probed(condim=1))
+  assert force == pytest.approx(drive(m, d, 100)[-1, 0], rel=1e-3)
+
+
+def test_a_body_without_geoms_is_not_followed():
+  refused(probed(keys={"follow": "frame"}), "'frame'", "no geoms that collide")
+
+
+def two_organs(apart, first=scenes.windowed, second=scenes.windowed, **second_contact):
+  """Returns two spheres beside each other; the windows of the second are called otherwise."""
+  points, elem = scenes.sphere(1)
+  keys = {"grid": "second_window"} if second is scenes.windowed else {}
+  other = second(points + np.array([apart, 0, 0]), elem, "second", contact=second_contact, **keys)
+  return scenes.world(first(points, elem, "first"), other)
+
+
+@pytest.mark.parametrize("second", [scenes.windowed, scenes.organ])
+def test_an_organ_that_windows_would_not_feel_is_refused(second):
+  refused(two_organs(0.1, second=second), "'first'", "'second'", "nodal coupling")
+  load(two_organs(0.3, second=second), "first")
+  load(two_organs(0.1, second=second, contype=0, conaffinity=0), "first")
+  load(two_organs(0.1, scenes.organ, scenes.organ), "first")
 
 
 def test_few_elements_hold_fewer_nodes():
