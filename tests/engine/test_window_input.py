@@ -94,8 +94,10 @@ def test_too_many_geoms():
   refused(edited('<geom name="tip"', geoms + '<geom name="tip"'), "'window'", "41 geoms", "follow")
 
 
-def test_a_window_may_have_more_slots_than_the_organ_has_nodes():
-  m, d, organ = load(probed(count="20 20 1", condim=1))
+def test_windows_may_have_more_slots_than_the_organ_has_nodes():
+  text = probed(count="20 20 1", condim=1, keys={"window": "window second"})
+  flex = re.search(r'<flexcomp name="window".*?</flexcomp>', text, re.S).group(0)
+  m, d, organ = load(text.replace(flex, flex + flex.replace('name="window"', 'name="second"')))
   force = drive(m, d, 100)[-1, 0]
   assert organ.error is None
   m, d, _ = load(probed(condim=1))
