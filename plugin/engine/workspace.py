@@ -133,7 +133,7 @@ class Workspace:
   qpos: memoryview = dataclasses.field(default_factory=lambda: memoryview(b""))
   stood: bytes | None = None
   plugin_state: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))
-  signature: memoryview = dataclasses.field(default_factory=lambda: memoryview(b"\0"))
+  signature: Any = dataclasses.field(default_factory=lambda: memoryview(b"\0"))
   views: dict = dataclasses.field(default_factory=dict)
   boxes: dict = dataclasses.field(default_factory=dict)
   phases: Phases | None = None
