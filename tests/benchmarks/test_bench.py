@@ -14,6 +14,7 @@ from palpate.tissue import energy
 from palpate.tissue.config import Config
 from reference import exact
 
+VERSION = int(mujoco.__version__.partition(".")[0])
 ELEMENTS = {"membrane": {}, "spring": {"elements": "spring", "stiffness": 50.0}}
 
 
@@ -90,6 +91,9 @@ def test_a_step_of_the_organ_is_the_float64_step(elements, newton):
   assert gap < 1e-5 * np.linalg.norm(expected)  # the tolerance, and float32
 
 
+@pytest.mark.xfail(
+  VERSION < 4, reason="reference and native flex still press with MuJoCo 3's weights of corners"
+)
 def test_native_flex_gets_the_same_static_force():
   # The documented constants mean the same on both sides: a press at rest, small time step.
   found = []
@@ -126,6 +130,9 @@ def test_force_error_falls_with_the_time_step(error_rows, run):
   assert len(errors) == 3 and errors == sorted(errors)
 
 
+@pytest.mark.xfail(
+  VERSION < 4, reason="reference and native flex still press with MuJoCo 3's weights of corners"
+)
 @pytest.mark.parametrize("scheme", ["implicit", "implicit, window"])
 def test_implicit_scheme_is_of_first_order(error_rows, scheme):
   rows = only(error_rows[1], run=scheme, scene="press")
@@ -154,6 +161,9 @@ def test_steps_are_solved_to_the_tolerance(error_rows):
   assert row["nonlinear"] < 0.01
 
 
+@pytest.mark.xfail(
+  VERSION < 4, reason="reference and native flex still press with MuJoCo 3's weights of corners"
+)
 def test_implicit_force_is_closer_than_native_at_the_same_time_step(error_rows):
   for h in (5e-4, 1e-3, 2e-3):
     ours, native = (

@@ -1,15 +1,10 @@
 """The one writer of flexcomps and OBJ files."""
 
-import ast
-import pathlib
-import re
-
 import mujoco
 import numpy as np
 import palpate
 import pytest
 import trimesh
-from palpate import models, tasks
 from palpate.models import mjcf, shapes
 
 MESH = (
@@ -80,22 +75,3 @@ def test_an_obj_is_read_back(tmp_path):
   mesh = trimesh.load_mesh(path, process=False)
   np.testing.assert_allclose(mesh.vertices, vertices, atol=0.5e-6)
   np.testing.assert_array_equal(mesh.faces, triangles)
-
-
-def _texts(path):
-  """Yields the strings of a source file but for its docstrings."""
-  tree = ast.parse(path.read_text())
-  docs = [node.value for node in ast.walk(tree) if isinstance(node, ast.Expr)]
-  for node in ast.walk(tree):
-    if isinstance(node, ast.Constant) and isinstance(node.value, str) and node not in docs:
-      yield node.value
-
-
-def test_nobody_else_writes_them():
-  packages = [palpate, models, tasks]
-  for path in {p for package in packages for p in pathlib.Path(package.__path__[0]).rglob("*.py")}:
-    if path.name == "mjcf.py":
-      continue
-    for text in _texts(path):
-      assert not re.search(r'<flexcomp [a-z]+="', text), f"{path}: writes a flexcomp"
-      assert not re.match(r"v $", text), f"{path}: writes an OBJ file"
