@@ -20,6 +20,10 @@ KEPT: tuple[int, ...] = ()  # seeds that once failed
 OPEN: dict[int, str] = {}
 
 
+NODES = 100
+VOXEL = 3.0  # of the label map [mm]
+
+
 @functools.cache
 def _ball(kind: str) -> bytes:
   """Returns a small sphere as a file."""
@@ -38,12 +42,12 @@ def _labels(kind: str) -> bytes:
     if kind == ".nrrd":
       import nrrd
 
-      space = {"space directions": np.eye(3), "space": "left-posterior-superior"}
+      space = {"space directions": VOXEL * np.eye(3), "space": "left-posterior-superior"}
       nrrd.write(str(path), map_, space)
     else:
       import nibabel
 
-      nibabel.save(nibabel.Nifti1Image(map_, np.eye(4)), path)
+      nibabel.save(nibabel.Nifti1Image(map_, np.diag([VOXEL, VOXEL, VOXEL, 1])), path)
     return path.read_bytes()
 
 
@@ -119,22 +123,24 @@ def check(seed: int):
   """Checks the file of a seed."""
   random = np.random.RandomState(seed)
   kind = random.choice([*MESHES, *VOLUMES, "npz", "npz"])
+  sound = _ball(kind) if kind in MESHES else _labels(kind) if kind in VOLUMES else _recording()
+  change = _spoil_arrays if kind == "npz" and random.randint(2) else spoil
+  data = change(random, sound)
   with tempfile.TemporaryDirectory() as folder:
     path = pathlib.Path(folder) / f"ball.{kind.lstrip('.')}"
+    path.write_bytes(data)
     if kind in MESHES:
-      path.write_bytes(spoil(random, _ball(kind)))
-      read = functools.partial(wrap.wrap, path, 60, method=random.choice(["even", "direct"]))
+      method, nodes = [("direct", None), ("even", NODES)][random.randint(2)]
+      read = functools.partial(wrap.wrap, path, nodes, method=method)
     elif kind in VOLUMES:
-      path.write_bytes(spoil(random, _labels(kind)))
-      read = functools.partial(volume.wrap_volume, path, 60)
+      read = functools.partial(volume.wrap_volume, path, NODES)
     else:
-      change = _spoil_arrays if random.randint(2) else spoil
-      path.write_bytes(change(random, _recording()))
       read = functools.partial(_measure, path)
     try:
       with np.errstate(all="ignore"):
         made = read()
     except ValueError as error:
+      assert data != sound, f"a sound file is refused: {error}"
       assert str(error).strip(), "an error without words"
       return
   if kind != "npz":

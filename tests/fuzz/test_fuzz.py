@@ -11,7 +11,7 @@ import sys
 import pytest
 from fuzz import apart
 
-SHORT = {"configurations": 40, "meshes": 40, "files": 40}
+SHORT = {"configurations": 40, "meshes": 40, "files": 20}
 LONG = 10_000
 LIFE = pathlib.Path(__file__).with_name("life.py")
 
