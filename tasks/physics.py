@@ -174,12 +174,12 @@ class Physics(mujoco.Physics):
 
   def closing(self) -> bool:
     """Whether the jaws are told to close: on a fold of tissue at most, and below the opening."""
-    opening, target = self.gripper()[:2]
-    return bool(target < min(opening - _CLOSING, _FOLD[1]))
+    opening, target = float(self.sensor("jaw")[0]), float(self.data.ctrl[self.jaw])
+    return target < min(opening - _CLOSING, _FOLD[1])
 
   def holds(self) -> bool:
     """Whether tissue is between the jaws: it keeps them open, both inner faces press on it."""
-    return bool(self._inner.min() > HELD_FORCE and self.gripper()[0] > _FOLD[0])
+    return bool(self._inner.min() > HELD_FORCE and self.sensor("jaw")[0] > _FOLD[0])
 
   def nodes(self) -> np.ndarray:
     """Returns the positions of the organ's nodes [m]  (nvert, 3); computed once a control step."""

@@ -13,6 +13,7 @@ import screen
 from benchmarks.results import BenchError
 
 BENCHES = {
+  "attack": "what a search finds in the exercises that does not do the work",
   "error": "run time against error, beside MuJoCo's own flex",
   "experts": "how many of its episodes each expert solves; the references",
   "inertia": "what the effective inertia does to the contact force",
