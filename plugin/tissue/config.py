@@ -128,8 +128,9 @@ class Config:
 
   elements: str = _row(
     "membrane",
-    _words("membrane", "spring"),
-    "`membrane` (St. Venant-Kirchhoff triangles, plane stress) or `spring` (edge springs)",
+    _words("membrane", "spring", "solid"),
+    "`membrane` (St. Venant-Kirchhoff triangles, plane stress), `spring` (edge springs) or `solid` "
+    "(neo-Hookean tetrahedra inside, made when the model is compiled; with `window` alone)",
   )
   young: tuple[float, ...] = _row(
     (5000.0,),
@@ -339,6 +340,11 @@ def lame(config: Config, nelem: int) -> tuple[np.ndarray, np.ndarray]:
   young = np.broadcast_to(np.asarray(config.young), (nelem,))
   nu = config.poisson
   return young * nu / (1 - nu * nu), young / (2 * (1 + nu))
+
+
+def lame_solid(young: np.ndarray, poisson: float) -> tuple[np.ndarray, np.ndarray]:
+  """Returns the Lame constants mu = E / (2 (1 + nu)), lambda = E nu / ((1 + nu) (1 - 2 nu)) [Pa]."""
+  return young / (2 * (1 + poisson)), young * poisson / ((1 + poisson) * (1 - 2 * poisson))
 
 
 def rigidity(config: Config, nelem: int) -> np.ndarray:

@@ -1,0 +1,213 @@
+"""Fills a closed surface with tetrahedra that have its triangles as their faces.
+
+Nodes inside are a body-centred cubic lattice, moved where the tetrahedra around them have their
+middle (the centroidal relaxation of optimal Delaunay triangulations, Alliez et al. 2005,
+doi:10.1145/1073204.1073238), and all nodes are joined by Delaunay's criterion. On a surface of even
+triangles that has the surface's triangles among its faces, but for some pairs of which it has the
+other diagonal: these serve as well. Where it has neither, there is an error.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse import csgraph
+from scipy.spatial import Delaunay, KDTree
+
+from .mesh import Mesh
+
+_COARSER = 1.7  # distance of nodes inside to that on the surface
+_CLEAR = 0.8  # least distance of a node inside to the surface's, in mean edges
+_ROUNDS = 8
+_MOVE = 0.7  # share of the way that a node goes in a round
+_FLAT = 1e-3  # quality of a tetrahedron that is none
+_KEPT = 16
+_TIE = 1e-6  # of the size, by which points on one sphere are told apart
+
+# Faces of a tetrahedron, each opposite the corner of its number.
+_FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
+_EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
+
+
+def fill(organ: str, mesh: Mesh) -> Mesh:
+  """Returns the surface with its inside: the same vertices and triangles, more vertices after them.
+
+  Args:
+    organ: name of the organ, for messages
+    mesh: its surface
+
+  Raises:
+    ValueError: the surface encloses nothing, or its triangles are faces of no Delaunay
+      tetrahedra.
+  """
+  if not mesh.closed:
+    raise ValueError(f"organ {organ!r}: elements is 'solid', expected a closed surface")
+  inner, tet, missing = _fill(mesh.rest.tobytes(), mesh.elem.astype(np.int64).tobytes())
+  if missing >= 0:
+    raise ValueError(
+      f"organ {organ!r}: elements is 'solid', and triangle {missing} (vertices "
+      f"{mesh.elem[missing].tolist()}) cannot be the face of a tetrahedron; expected a surface of "
+      "even triangles that does not cut itself: `palpate wrap` makes one"
+    )
+  return joined(mesh, np.frombuffer(inner).reshape(-1, 3), tet)
+
+
+def joined(mesh: Mesh, inner: np.ndarray, tet: np.ndarray) -> Mesh:
+  """Returns a surface with vertices inside and tetrahedra.
+
+  The ring of a vertex then is what edges of tetrahedra lead to, in the order of the vertices.
+
+  Args:
+    mesh: the surface
+    inner: rest positions of the vertices inside [m]                    (n, 3)
+    tet: corners of each tetrahedron, of positive volume, among all     (ntet, 4)
+  """
+  rest = np.concatenate([mesh.rest, inner])
+  edge = tet[:, _EDGES].reshape(-1, 2)
+  both = np.unique(np.concatenate([edge, edge[:, ::-1]]), axis=0)
+  degree = np.bincount(both[:, 0], minlength=len(rest))
+  ring = np.full((len(rest), int(degree.max())), -1)
+  ring[both[:, 0], np.arange(len(both)) - (np.cumsum(degree) - degree)[both[:, 0]]] = both[:, 1]
+  return dataclasses.replace(
+    mesh, rest=rest, ring=ring, ring_elem=np.full_like(ring, -1), degree=degree, tet=tet
+  )
+
+
+def volumes(point: np.ndarray, tet: np.ndarray) -> np.ndarray:
+  """Returns the volume of each tetrahedron [m^3], (ntet,); the winding gives the sign."""
+  corner = point[tet]
+  return np.linalg.det(corner[:, 1:] - corner[:, :1]) / 6
+
+
+def quality(point: np.ndarray, tet: np.ndarray) -> np.ndarray:
+  """Returns 6 sqrt(2) volume / (RMS edge)^3 of each tetrahedron, 1 for a regular one, (ntet,)."""
+  corner = point[tet]
+  edge = corner[:, _EDGES[:, 0]] - corner[:, _EDGES[:, 1]]
+  length2 = (edge**2).sum(axis=(1, 2)) / 6
+  return 6 * np.sqrt(2) * volumes(point, tet) / np.maximum(length2, 1e-300) ** 1.5
+
+
+@functools.lru_cache(maxsize=_KEPT)
+def _fill(rest: bytes, elem: bytes) -> tuple[bytes, np.ndarray, int]:
+  """Returns the vertices inside, the tetrahedra and the first triangle that is not among them."""
+  surface = np.frombuffer(rest).reshape(-1, 3)
+  triangle = np.frombuffer(elem, np.int64).reshape(-1, 3)
+  inner = _lattice(surface, triangle)
+  best, found, faulty = 0.0, None, -1
+  for _ in range(_ROUNDS):
+    point = np.concatenate([surface, inner])
+    tet, faulty = _inside(point, triangle, len(surface))
+    if faulty >= 0:
+      break
+    used = np.zeros(len(point), bool)
+    used[tet] = used[: len(surface)] = True
+    tet, point = (np.cumsum(used) - 1)[tet], point[used]
+    least = float(quality(point, tet).min(initial=1.0))
+    if least > best:
+      best, found = least, (point[len(surface) :].tobytes(), tet)
+    inner = point + _MOVE * (_middles(point, tet) - point)
+    inner = inner[len(surface) :]
+  return (*found, -1) if found else (b"", np.zeros((0, 4), int), faulty)
+
+
+def _lattice(surface: np.ndarray, triangle: np.ndarray) -> np.ndarray:
+  """Returns the points of a lattice that lie inside, (n, 3); some outside of it may be among them."""
+  arms = surface[triangle[:, 1:]] - surface[triangle[:, :1]]
+  normal = np.zeros_like(surface)
+  np.add.at(normal, triangle.ravel(), np.repeat(np.cross(arms[:, 0], arms[:, 1]), 3, axis=0))
+  edge = np.linalg.norm(surface[triangle[:, [1, 2, 0]]] - surface[triangle], axis=2).mean()
+  side = _COARSER * edge * 2 / np.sqrt(3)  # neighbours are half a diagonal apart
+  low, high = surface.min(axis=0), surface.max(axis=0)
+  count = np.ceil((high - low) / side).astype(int) + 1
+  corner = low + side * np.stack(np.meshgrid(*map(np.arange, count), indexing="ij"), -1)
+  point = np.concatenate([corner.reshape(-1, 3), corner.reshape(-1, 3) + side / 2])
+  distance, nearest = KDTree(surface).query(point)
+  beneath = ((point - surface[nearest]) * normal[nearest]).sum(axis=1) < 0
+  return point[beneath & (distance > _CLEAR * edge)]
+
+
+def _middles(point: np.ndarray, tet: np.ndarray) -> np.ndarray:
+  """Returns the middle of the tetrahedra around each point, weighted by volume, (n, 3)."""
+  weight = np.repeat(volumes(point, tet), 4)
+  middle = np.repeat(point[tet].mean(axis=1), 4, axis=0)
+  total = np.bincount(tet.ravel(), weight, len(point))
+  return np.stack(
+    [np.bincount(tet.ravel(), weight * middle[:, k], len(point)) for k in range(3)], axis=1
+  ) / np.maximum(total, 1e-300)[:, None]
+
+
+def _inside(point: np.ndarray, triangle: np.ndarray, nsurface: int) -> tuple[np.ndarray, int]:
+  """Returns the tetrahedra inside of a surface, and the first triangle that is no face, or -1.
+
+  Args:
+    point: all vertices, the surface's first        (n, 3)
+    triangle: the surface                           (nelem, 3)
+    nsurface: number of its vertices
+  """
+  size = float(np.ptp(point, axis=0).max())
+  shaken = point + _TIE * size * np.random.RandomState(0).uniform(-1, 1, point.shape)
+  made = Delaunay(shaken)
+  tet, neighbour = made.simplices.astype(np.int64), made.neighbors
+  face = tet[:, _FACES]
+  has = (face < nsurface).all(axis=2)
+  known = np.where(has, _key(np.minimum(face, nsurface - 1), nsurface), -1)
+  wanted, faulty = _flipped(triangle, np.unique(known), nsurface)
+  if faulty >= 0:
+    return tet, faulty
+  # What no triangle parts lies on one side.
+  through = ~np.isin(known, wanted) & (neighbour >= 0)
+  start = np.broadcast_to(np.arange(len(tet))[:, None], neighbour.shape)
+  ends = (start[through], neighbour[through])
+  graph = sparse.coo_matrix((np.ones(len(ends[0])), ends), shape=(len(tet), len(tet)))
+  count, part = csgraph.connected_components(graph, directed=False)
+  volume = volumes(point, tet)
+  order = np.lexsort((np.abs(volume), part))
+  largest = order[np.searchsorted(part[order], np.arange(count), side="right") - 1]
+  middle = point[tet[largest]].mean(axis=1)
+  within = np.array([_winding(point[triangle], each) > 0.5 for each in middle])[part]
+  tet = np.where((volume < 0)[:, None], tet[:, [0, 2, 1, 3]], tet)[within]
+  return tet[quality(point, tet) > _FLAT], -1
+
+
+def _key(corner: np.ndarray, n: int) -> np.ndarray:
+  """Returns a number for the three vertices of each triangle, of n."""
+  a, b, c = np.moveaxis(np.sort(corner, axis=-1), -1, 0)
+  return (a * n + b) * n + c
+
+
+def _flipped(triangle: np.ndarray, known: np.ndarray, n: int) -> tuple[np.ndarray, int]:
+  """Returns the triangles as keys that are all known, and the first one that cannot be, or -1.
+
+  Where two that share an edge are not, the two across the other diagonal may be.
+  """
+  key = _key(triangle, n)
+  missing = np.flatnonzero(~np.isin(key, known))
+  if not missing.size:
+    return key, -1
+  apexes: dict[tuple[int, int], list[tuple[int, int]]] = {}
+  for t in missing:
+    for k in range(3):
+      a, b, apex = (int(triangle[t, (k + i) % 3]) for i in range(3))
+      apexes.setdefault((min(a, b), max(a, b)), []).append((int(t), apex))
+  left, faces = set(missing.tolist()), set(known.tolist())
+  for (a, b), sides in apexes.items():
+    if len(sides) < 2 or not {sides[0][0], sides[1][0]} <= left:
+      continue
+    (s, p), (t, q) = sides
+    flipped = _key(np.array([[p, q, a], [p, q, b]]), n)
+    if faces >= set(flipped.tolist()):
+      key[[s, t]] = flipped
+      left -= {s, t}
+  return key, min(left, default=-1)
+
+
+def _winding(corner: np.ndarray, at: np.ndarray) -> float:
+  """Returns how often a surface winds around a point (van Oosterom and Strackee 1983)."""
+  a, b, c = np.moveaxis(corner - at, 1, 0)
+  la, lb, lc = (np.linalg.norm(each, axis=1) for each in (a, b, c))
+  above = (a * np.cross(b, c)).sum(axis=1)
+  below = la * lb * lc + (a * b).sum(1) * lc + (b * c).sum(1) * la + (c * a).sum(1) * lb
+  return float(2 * np.arctan2(above, below).sum() / (4 * np.pi))
