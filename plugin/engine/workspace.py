@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 from palpate.tissue import body as bodies
 from palpate.tissue import config as configuration
-from palpate.tissue import shape
+from palpate.tissue import fill, shape
 from palpate.tissue.body import Body
 from palpate.tissue.config import Config
 
@@ -328,7 +328,8 @@ def state_size(model: int, instance: int) -> int:
   names = mjstruct.config(model, instance, "window").split()
   if names:
     # Asked before MuJoCo has filled in the flexes: what `windowed` needs is at most this.
-    return windowed.state_size(m.nflexvert, 0, m.ngeom * len(names))
+    inside = fill.MOST if mjstruct.config(model, instance, "elements").strip() == "solid" else 0
+    return windowed.state_size((1 + inside) * m.nflexvert, 0, m.ngeom * len(names))
   return nodal.state_size(3 * len(declare.moving_bodies(m, instance)))
 
 

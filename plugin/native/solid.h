@@ -21,24 +21,17 @@ PALPATE V inner(const M3& a, const M3& b) {
 PALPATE M3 transposed(const M3& a) {
   return {a.xx, a.yx, a.zx, a.xy, a.yy, a.zy, a.xz, a.yz, a.zz};
 }
-// The part of cof(A + B) that is linear in each.
+// The derivative of the cofactors of A along B: what is linear in each in those of A + B.
 PALPATE M3 mixed(const M3& a, const M3& b) {
-  const V ta = trace(a), tb = trace(b);
-  const M3 ab = {
-    a.xx * b.xx + a.xy * b.yx + a.xz * b.zx, a.xx * b.xy + a.xy * b.yy + a.xz * b.zy,
-    a.xx * b.xz + a.xy * b.yz + a.xz * b.zz, a.yx * b.xx + a.yy * b.yx + a.yz * b.zx,
-    a.yx * b.xy + a.yy * b.yy + a.yz * b.zy, a.yx * b.xz + a.yy * b.yz + a.yz * b.zz,
-    a.zx * b.xx + a.zy * b.yx + a.zz * b.zx, a.zx * b.xy + a.zy * b.yy + a.zz * b.zy,
-    a.zx * b.xz + a.zy * b.yz + a.zz * b.zz};
-  const M3 ba = {
-    b.xx * a.xx + b.xy * a.yx + b.xz * a.zx, b.xx * a.xy + b.xy * a.yy + b.xz * a.zy,
-    b.xx * a.xz + b.xy * a.yz + b.xz * a.zz, b.yx * a.xx + b.yy * a.yx + b.yz * a.zx,
-    b.yx * a.xy + b.yy * a.yy + b.yz * a.zy, b.yx * a.xz + b.yy * a.yz + b.yz * a.zz,
-    b.zx * a.xx + b.zy * a.yx + b.zz * a.zx, b.zx * a.xy + b.zy * a.yy + b.zz * a.zy,
-    b.zx * a.xz + b.zy * a.yz + b.zz * a.zz};
-  // cof A = (A^T)^2 - tr A A^T + (tr^2 A - tr A^2) / 2, as a form in A twice.
-  return transposed(ab + ba) + splat(-1.0f) * (ta * transposed(b) + tb * transposed(a))
-    + (ta * tb - trace(ab));
+  return {a.yy * b.zz + b.yy * a.zz - a.yz * b.zy - b.yz * a.zy,
+          a.yz * b.zx + b.yz * a.zx - a.yx * b.zz - b.yx * a.zz,
+          a.yx * b.zy + b.yx * a.zy - a.yy * b.zx - b.yy * a.zx,
+          a.xz * b.zy + b.xz * a.zy - a.xy * b.zz - b.xy * a.zz,
+          a.xx * b.zz + b.xx * a.zz - a.xz * b.zx - b.xz * a.zx,
+          a.xy * b.zx + b.xy * a.zx - a.xx * b.zy - b.xx * a.zy,
+          a.xy * b.yz + b.xy * a.yz - a.xz * b.yy - b.xz * a.yy,
+          a.xz * b.yx + b.xz * a.yx - a.xx * b.yz - b.xx * a.yz,
+          a.xx * b.yy + b.xx * a.yy - a.xy * b.yx - b.xy * a.yx};
 }
 PALPATE M3 cofactors(const M3& a) {
   return {a.yy * a.zz - a.yz * a.zy, a.yz * a.zx - a.yx * a.zz, a.yx * a.zy - a.yy * a.zx,
@@ -65,7 +58,8 @@ PALPATE Swelling swelling(const M3& h) {
   return {t + trace(cof) + det, splat(-1.0f) * transposed(h) + t + cof};
 }
 
-// Strain impulse of volume of each tetrahedron: h j + what K v has of it.
+// Strain impulse of volume of each tetrahedron: h j + what K v has of it. The gradients of
+// displacement and velocity are kept, where `tet_stress` then writes what it makes of them.
 template <class Fields>
 PALPATE void tet_strain(const Fields& f, Thread t, int stage) {
   const float* step = f.state.step.data + 4 * t.world;
@@ -74,10 +68,13 @@ PALPATE void tet_strain(const Fields& f, Thread t, int stage) {
   each_slice(t, f.shape.ntetslice, [&](int s, Lane lane) {
     const int* node = f.shape.tet_node.data + 32 * s;
     const float* g = f.shape.tet_gradient.data + 72 * s;
-    const Swelling now = swelling(gradient(f.system.disp_trial.data + base, node, g, lane));
+    const M3 H = gradient(f.system.disp_trial.data + base, node, g, lane);
     const M3 rate = gradient(f.system.vel_trial.data + base, node, g, lane);
-    st(f.system.tet_strain.data, t.world * f.shape.ntetslice + s,
-       h * now.j + gv * (trace(rate) + inner(now.c, rate)), lane);
+    const Swelling now = swelling(H);
+    const size_t at = (size_t)t.world * f.shape.ntetslice + s;
+    st9(f.system.tet_arm.data + 128 * at, H, lane);
+    st9(f.system.tet_impulse.data + 128 * at, rate, lane);
+    st(f.system.tet_strain.data, at, h * now.j + gv * (trace(rate) + inner(now.c, rate)), lane);
   });
 }
 
@@ -97,9 +94,10 @@ PALPATE void node_pressure(const Fields& f, Thread t, int) {
 }
 
 // The rotation nearest to F, by Newton's iteration with Higham's scaling (Higham 1986,
-// doi:10.1137/0907079); of a tetrahedron inside out it is a reflection, which serves as well.
+// doi:10.1137/0907079): three of them, of a stretch of two to 1e-3, for the matrix alone. Of a
+// tetrahedron inside out it is a reflection, which serves as well.
 PALPATE M3 turn(M3 x) {
-  for (int k = 0; k < 6; ++k) {
+  for (int k = 0; k < 3; ++k) {
     const M3 cof = cofactors(x);
     const V det = x.xx * cof.xx + x.xy * cof.xy + x.xz * cof.xz;
     const V size2 = inner(x, x), cof2 = inner(cof, cof);
@@ -122,15 +120,16 @@ PALPATE void tet_stress(const Fields& f, Thread t, int stage) {
   const float* step = f.state.step.data + 4 * t.world;
   const float h = step[0], gv = weight_of_rate(stage, step);
   const bool implicit = stage == FIRST || stage == LATER;
-  const size_t base = 24 * (size_t)t.world * f.shape.nslice;
   const float* pressure = f.system.node_pressure.data + 8 * (size_t)t.world * f.shape.nslice;
   each_slice(t, f.shape.ntetslice, [&](int s, Lane lane) {
     const int* node = f.shape.tet_node.data + 32 * s;
     const float* g = f.shape.tet_gradient.data + 72 * s;
     const float* moduli = f.tissue.tet_moduli.data + 32 * s;
     const V volume = ld(moduli, 0, lane), mu = ld(moduli, 1, lane), lam = ld(moduli, 2, lane);
-    const M3 H = gradient(f.system.disp_trial.data + base, node, g, lane);
-    const M3 rate = gradient(f.system.vel_trial.data + base, node, g, lane);
+    const size_t at = (size_t)t.world * f.shape.ntetslice + s;
+    float* arm = f.system.tet_arm.data + 128 * at;
+    float* impulse = f.system.tet_impulse.data + 128 * at;
+    const M3 H = ld9(arm, lane), rate = ld9(impulse, lane);
     const Swelling now = swelling(H);
     const M3 F = H + splat(1.0f), C = now.c + splat(1.0f);
     const V i = 2.0f * trace(H) + inner(H, H), i4 = 4.0f + i;
@@ -145,32 +144,28 @@ PALPATE void tet_stress(const Fields& f, Thread t, int stage) {
     const M3 moving = 0.75f * mu * (rate + splat(-1.0f) * cdot) + (0.25f * mu * i / i4) * rate
       + (mu * idot / (i4 * i4)) * F + lam * jdot * C + lam * now.j * cdot;
     const M3 P = splat(h) * still + splat(gv) * moving + p * C;
-    const size_t at = (size_t)t.world * f.shape.ntetslice + s;
     const V3 g1 = ld3(g, 0, lane), g2 = ld3(g, 3, lane), g3 = ld3(g, 6, lane);
-    float* impulse = f.system.tet_impulse.data + 96 * at;
     const V3 b1 = -volume * (P * g1), b2 = -volume * (P * g2), b3 = -volume * (P * g3);
-    st3(impulse, 0, -1.0f * (b1 + b2 + b3), lane);
-    st3(impulse, 3, b1, lane);
-    st3(impulse, 6, b2, lane);
-    st3(impulse, 9, b3, lane);
+    share(impulse, splat(-1.0f) * (b1 + b2 + b3), lane);
+    share(impulse + 32, b1, lane);
+    share(impulse + 64, b2, lane);
+    share(impulse + 96, b3, lane);
     if (!implicit) return;
     const M3 Q = turn(F);
     const V root = vsqrt(volume);
     const V3 a1 = root * (Q * g1), a2 = root * (Q * g2), a3 = root * (Q * g3);
-    float* arm = f.system.tet_arm.data + 96 * at;
-    st3(arm, 0, -1.0f * (a1 + a2 + a3), lane);
-    st3(arm, 3, a1, lane);
-    st3(arm, 6, a2, lane);
-    st3(arm, 9, a3, lane);
+    share(arm, splat(-1.0f) * (a1 + a2 + a3), lane);
+    share(arm + 32, a1, lane);
+    share(arm + 64, a2, lane);
+    share(arm + 96, a3, lane);
     const M3 stress = still + (p / h) * C;
     const V mean = inner(Q, stress) / 3.0f;
     const V rest = vmax(inner(stress, stress) - 3.0f * mean * mean, splat(0.0f));
     const V faces = vmax(inner(C, C) / 3.0f, splat(1.0f));
     const V shear = 0.75f * mu;  // of small strains
-    float* out = f.system.tet_now.data + 24 * at;
-    st(out, 0, (lam - 0.625f * mu + ld(moduli, 3, lane)) * faces, lane);
-    st(out, 1, shear, lane);
-    st(out, 2, vmax(mean + 0.40825f * vsqrt(rest), splat(0.0f)), lane);
+    share(f.system.tet_now.data + 32 * at,
+          {(lam - 0.625f * mu + ld(moduli, 3, lane)) * faces, shear,
+           vmax(mean + 0.40825f * vsqrt(rest), splat(0.0f))}, lane);
   });
 }
 
@@ -184,9 +179,9 @@ PALPATE void solid_row(const Fields& f, Thread t, int stage) {
   const bool implicit = stage == FIRST || stage == LATER;
   const size_t base = (size_t)t.world * f.shape.nslice;
   const size_t tet = (size_t)t.world * f.shape.ntetslice;
-  const float* impulse = f.system.tet_impulse.data + 96 * tet;
-  const float* arm = f.system.tet_arm.data + 96 * tet;
-  const float* moduli = f.system.tet_now.data + 24 * tet;
+  const float* impulse = f.system.tet_impulse.data + 128 * tet;
+  const float* arm = f.system.tet_arm.data + 128 * tet;
+  const float* moduli = f.system.tet_now.data + 32 * tet;
   each_slice(t, f.shape.nslice, [&](int s, Lane lane) {
     const size_t at = base + s;
     const V mass = ld(f.state.mass.data + 8 * at, 0, lane);
@@ -196,7 +191,7 @@ PALPATE void solid_row(const Fields& f, Thread t, int stage) {
     V3 b = h * (ld3(f.state.force_ext.data + 24 * at, lane) - kf * u) - gv * kf * v;
     if (stage == LATER) b -= mass * ld3(f.state.dvel.data + 24 * at, lane);
     for (int k = f.shape.around_adr.data[s]; k < f.shape.around_adr.data[s + 1]; ++k)
-      b += gather3(impulse, f.shape.around_corner.data + 8 * k, lane);
+      b += gather_shared(impulse, f.shape.around_corner.data + 8 * k, lane);
     st3(f.system.rhs.data + 24 * at, b, lane);
     if (!implicit) return;
     const V zero = splat(0.0f);
@@ -204,9 +199,9 @@ PALPATE void solid_row(const Fields& f, Thread t, int stage) {
     for (int j = f.shape.slot_adr.data[s]; j < f.shape.slot_adr.data[s + 1]; ++j) {
       M3 block = {zero, zero, zero, zero, zero, zero, zero, zero, zero};
       for (int k = f.shape.edge_adr.data[j]; k < f.shape.edge_adr.data[j + 1]; ++k) {
-        const V3 now = gather3(moduli, f.shape.edge_tet.data + 8 * k, lane);
-        const V3 a = gather3(arm, f.shape.edge_from.data + 8 * k, lane);
-        const V3 c = gather3(arm, f.shape.edge_to.data + 8 * k, lane);
+        const V3 now = gather_shared(moduli, f.shape.edge_tet.data + 8 * k, lane);
+        const V3 a = gather_shared(arm, f.shape.edge_from.data + 8 * k, lane);
+        const V3 c = gather_shared(arm, f.shape.edge_to.data + 8 * k, lane);
         block = block + outer(now.x * a, c) + outer(now.y * c, a) + (now.y + now.z) * dot(a, c);
       }
       st9(f.system.block.data + 72 * ((size_t)t.world * f.shape.nslot + j), splat(g) * block, lane);

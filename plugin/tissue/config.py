@@ -254,7 +254,7 @@ def parse(organ: str, texts: dict[str, str], nelem: int, closed: bool) -> Config
   values = _values(organ, texts, nelem)
   config = Config(**values)
   _check_combination(organ, config, values, closed)
-  return config
+  return dataclasses.replace(config, bend=0.0) if config.elements == "solid" else config
 
 
 def change(
@@ -324,12 +324,29 @@ def _check_combination(organ: str, config: Config, given: dict, closed: bool):
   for key in ("follow", "mass", "pin", "resident"):
     if key in given and not config.window:
       raise ValueError(f"organ {organ!r}: {key} is set, allowed only with window")
+  if config.elements == "solid":
+    _check_solid(organ, config, given)
   if config.window and "mass" not in given and not config.mass:
     raise ValueError(f"organ {organ!r}: window is set and mass is missing [kg]")
   for key in ("bulk", "pressure"):
     value = getattr(config, key)
     if value and not closed:
       raise ValueError(f"organ {organ!r}: {key} is {value:g}, allowed only on a closed surface")
+
+
+def _check_solid(organ: str, config: Config, given: dict):
+  if not config.window:
+    raise ValueError(f"organ {organ!r}: elements is 'solid', expected window too (`add_windows`)")
+  for key in ("thickness", "bend", "bulk", "pressure"):
+    if key in given and given[key]:
+      raise ValueError(
+        f"organ {organ!r}: {key} is {given[key]:g}, allowed only where elements is not 'solid': "
+        "poisson says how a solid keeps its volume"
+      )
+  if config.integrator == "neumann":
+    raise ValueError(
+      f"organ {organ!r}: integrator is 'neumann', allowed only where elements is not 'solid'"
+    )
 
 
 def lame(config: Config, nelem: int) -> tuple[np.ndarray, np.ndarray]:

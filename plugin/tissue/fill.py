@@ -14,11 +14,12 @@ import functools
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse import csgraph
+from scipy.sparse import csgraph, linalg
 from scipy.spatial import Delaunay, KDTree
 
 from .mesh import Mesh
 
+MOST = 1  # nodes inside for one on the surface; the plugin state has room for so many
 _COARSER = 1.7  # distance of nodes inside to that on the surface
 _CLEAR = 0.8  # least distance of a node inside to the surface's, in mean edges
 _ROUNDS = 8
@@ -82,12 +83,35 @@ def volumes(point: np.ndarray, tet: np.ndarray) -> np.ndarray:
   return np.linalg.det(corner[:, 1:] - corner[:, :1]) / 6
 
 
+def vertex_volumes(mesh: Mesh) -> np.ndarray:
+  """Returns a quarter of the volume of the tetrahedra around each vertex [m^3], (nvert,)."""
+  share = np.repeat(volumes(mesh.rest, mesh.tet) / 4, 4)
+  return np.bincount(mesh.tet.ravel(), share, mesh.nvert)
+
+
 def quality(point: np.ndarray, tet: np.ndarray) -> np.ndarray:
   """Returns 6 sqrt(2) volume / (RMS edge)^3 of each tetrahedron, 1 for a regular one, (ntet,)."""
   corner = point[tet]
   edge = corner[:, _EDGES[:, 0]] - corner[:, _EDGES[:, 1]]
   length2 = (edge**2).sum(axis=(1, 2)) / 6
   return 6 * np.sqrt(2) * volumes(point, tet) / np.maximum(length2, 1e-300) ** 1.5
+
+
+def inside(mesh: Mesh, values: np.ndarray) -> np.ndarray:
+  """Returns vectors of the surface's vertices, (nouter, 3), with those inside, (nvert, 3).
+
+  A vertex inside has the mean of those around it.
+  """
+  n = mesh.nouter
+  if n == mesh.nvert:
+    return values
+  start, k = np.nonzero(mesh.ring >= 0)
+  ones = np.ones(len(start))
+  share = sparse.csr_array((ones / mesh.degree[start], (start, mesh.ring[start, k])))
+  below = share[n:]
+  matrix = sparse.eye_array(mesh.nvert - n) - below[:, n:]
+  within = linalg.spsolve(sparse.csc_array(matrix), below[:, :n] @ values)
+  return np.concatenate([values, within.reshape(-1, 3)])
 
 
 @functools.lru_cache(maxsize=_KEPT)
@@ -119,14 +143,18 @@ def _lattice(surface: np.ndarray, triangle: np.ndarray) -> np.ndarray:
   normal = np.zeros_like(surface)
   np.add.at(normal, triangle.ravel(), np.repeat(np.cross(arms[:, 0], arms[:, 1]), 3, axis=0))
   edge = np.linalg.norm(surface[triangle[:, [1, 2, 0]]] - surface[triangle], axis=2).mean()
-  side = _COARSER * edge * 2 / np.sqrt(3)  # neighbours are half a diagonal apart
   low, high = surface.min(axis=0), surface.max(axis=0)
-  count = np.ceil((high - low) / side).astype(int) + 1
-  corner = low + side * np.stack(np.meshgrid(*map(np.arange, count), indexing="ij"), -1)
-  point = np.concatenate([corner.reshape(-1, 3), corner.reshape(-1, 3) + side / 2])
-  distance, nearest = KDTree(surface).query(point)
-  beneath = ((point - surface[nearest]) * normal[nearest]).sum(axis=1) < 0
-  return point[beneath & (distance > _CLEAR * edge)]
+  tree, side = KDTree(surface), _COARSER * edge * 2 / np.sqrt(3)  # neighbours: half a diagonal
+  while True:
+    count = np.ceil((high - low) / side).astype(int) + 1
+    corner = low + side * np.stack(np.meshgrid(*map(np.arange, count), indexing="ij"), -1)
+    point = np.concatenate([corner.reshape(-1, 3), corner.reshape(-1, 3) + side / 2])
+    distance, nearest = tree.query(point)
+    beneath = ((point - surface[nearest]) * normal[nearest]).sum(axis=1) < 0
+    point = point[beneath & (distance > _CLEAR * edge)]
+    if len(point) <= MOST * len(surface):
+      return point
+    side *= max(1.05, (len(point) / (MOST * len(surface))) ** (1 / 3))
 
 
 def _middles(point: np.ndarray, tet: np.ndarray) -> np.ndarray:

@@ -84,8 +84,8 @@ def arrays(mesh: Mesh, config: Config, vert: np.ndarray, node: np.ndarray) -> di
 
 
 def _corner(tet: np.ndarray, corner: np.ndarray) -> np.ndarray:
-  """Returns where a corner's vector starts among those of all tetrahedra, in floats."""
-  return (offset(tet, 12) + corner * 3 * LANES).astype(np.int32)
+  """Returns the number of a corner of a tetrahedron; a slice has eight times four."""
+  return (tet // LANES * 4 * LANES + corner * LANES + tet % LANES).astype(np.int32)
 
 
 def _edges(mesh: Mesh, vert: np.ndarray, node: np.ndarray) -> dict[str, np.ndarray]:
@@ -102,7 +102,7 @@ def _edges(mesh: Mesh, vert: np.ndarray, node: np.ndarray) -> dict[str, np.ndarr
   tet, which = pair // len(a), pair % len(a)
   return {
     "edge_adr": addresses(width),
-    "edge_tet": offset(tet).astype(np.int32),
+    "edge_tet": tet.astype(np.int32),
     "edge_from": _corner(tet, a[which]),
     "edge_to": _corner(tet, b[which]),
   }

@@ -135,12 +135,12 @@ class Shape:
   tet_gradient: floats("ntetslice", 9, 8)  # of the shares of corners 1, 2, 3 at rest [1/m]
   around_adr: ints("nslice + 1")  # first row of each slice in the three below, for solids
   around_tet: ints("naround", 8)  # each tetrahedron around a node
-  around_corner: ints("naround", 8)  # offset of its corner there, in vectors of four corners
+  around_corner: ints("naround", 8)  # number of its corner there
   around_share: floats("naround", 8)  # a quarter of its volume [m^3]; 0 for padding
   edge_adr: ints("nedgeslot + 1")  # first row of each row of blocks in the three below
-  edge_tet: ints("nedge", 8)  # offset of the moduli of each tetrahedron around an edge
-  edge_from: ints("nedge", 8)  # offset of its corner at the node
-  edge_to: ints("nedge", 8)  # offset of its corner at the neighbour
+  edge_tet: ints("nedge", 8)  # each tetrahedron around an edge
+  edge_from: ints("nedge", 8)  # number of its corner at the node
+  edge_to: ints("nedge", 8)  # number of its corner at the neighbour
 
 
 @struct
@@ -191,9 +191,9 @@ class System:
   hinge_rough: floats("nworld", "nhingeslice", 8)  # what the bending matrix may leave out [N m]
   tet_strain: floats("nworld", "ntetslice", 8)  # impulse of the change of volume [s]
   node_pressure: floats("nworld", "nsolidslice", 8)  # averaged pressure impulse [Pa s]
-  tet_impulse: floats("nworld", "ntetslice", 12, 8)  # impulse on each corner [N s]
-  tet_arm: floats("nworld", "ntetslice", 12, 8)  # turned gradient of each corner [m^(1/2)]
-  tet_now: floats("nworld", "ntetslice", 3, 8)  # lambda, mu, tension of the matrix [Pa]
+  tet_impulse: floats("nworld", "ntetslice", 16, 8)  # impulse on each corner [N s]
+  tet_arm: floats("nworld", "ntetslice", 16, 8)  # turned gradient of each corner [m^(1/2)]
+  tet_now: floats("nworld", "ntetslice", 4, 8)  # lambda, mu, tension of the matrix [Pa]
   total: floats("nworld", 2)  # volume difference [m^3], areavec . vel
   sol: vector  # PCG solution [m/s]
   r: vector  # PCG residual
