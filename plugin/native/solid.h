@@ -18,20 +18,13 @@ PALPATE V inner(const M3& a, const M3& b) {
   return a.xx * b.xx + a.xy * b.xy + a.xz * b.xz + a.yx * b.yx + a.yy * b.yy + a.yz * b.yz
     + a.zx * b.zx + a.zy * b.zy + a.zz * b.zz;
 }
+PALPATE M3 operator*(const M3& a, const M3& b) {
+  const V3 x = a * V3{b.xx, b.yx, b.zx}, y = a * V3{b.xy, b.yy, b.zy};
+  const V3 z = a * V3{b.xz, b.yz, b.zz};
+  return {x.x, y.x, z.x, x.y, y.y, z.y, x.z, y.z, z.z};
+}
 PALPATE M3 transposed(const M3& a) {
   return {a.xx, a.yx, a.zx, a.xy, a.yy, a.zy, a.xz, a.yz, a.zz};
-}
-// The derivative of the cofactors of A along B: what is linear in each in those of A + B.
-PALPATE M3 mixed(const M3& a, const M3& b) {
-  return {a.yy * b.zz + b.yy * a.zz - a.yz * b.zy - b.yz * a.zy,
-          a.yz * b.zx + b.yz * a.zx - a.yx * b.zz - b.yx * a.zz,
-          a.yx * b.zy + b.yx * a.zy - a.yy * b.zx - b.yy * a.zx,
-          a.xz * b.zy + b.xz * a.zy - a.xy * b.zz - b.xy * a.zz,
-          a.xx * b.zz + b.xx * a.zz - a.xz * b.zx - b.xz * a.zx,
-          a.xy * b.zx + b.xy * a.zx - a.xx * b.zy - b.xx * a.zy,
-          a.xy * b.yz + b.xy * a.yz - a.xz * b.yy - b.xz * a.yy,
-          a.xz * b.yx + b.xz * a.yx - a.xx * b.yz - b.xx * a.yz,
-          a.xx * b.yy + b.xx * a.yy - a.xy * b.yx - b.xy * a.yx};
 }
 PALPATE M3 cofactors(const M3& a) {
   return {a.yy * a.zz - a.yz * a.zy, a.yz * a.zx - a.yx * a.zz, a.yx * a.zy - a.yy * a.zx,
@@ -113,8 +106,9 @@ PALPATE M3 turn(M3 x) {
 // the root of its volume with the moduli lambda, mu and tension.
 //
 // The matrix is that of small strains in the turned frame, which leaves rotations free, with lambda
-// as large as the stretched faces make it. What pulls has a geometric stiffness
-// (P_a + P_b) / (s_a + s_b) between principal directions, of which `tension` is an upper bound.
+// as large as the stretched faces make it. The stress adds a geometric stiffness between principal
+// directions a and b: (P_a + P_b) / (s_a + s_b) of a tension to rotations, of which `tension` is an
+// upper bound, and the pressure times the third stretch to shear, which mu has. K v is without both.
 template <class Fields>
 PALPATE void tet_stress(const Fields& f, Thread t, int stage) {
   const float* step = f.state.step.data + 4 * t.world;
@@ -133,16 +127,15 @@ PALPATE void tet_stress(const Fields& f, Thread t, int stage) {
     const Swelling now = swelling(H);
     const M3 F = H + splat(1.0f), C = now.c + splat(1.0f);
     const V i = 2.0f * trace(H) + inner(H, H), i4 = 4.0f + i;
-    const V idot = 2.0f * (trace(rate) + inner(H, rate)), jdot = trace(rate) + inner(now.c, rate);
-    const M3 cdot = splat(-1.0f) * transposed(rate) + trace(rate) + mixed(H, rate);
     // Mean pressure of the corners.
     V p = splat(0.0f);
     for (int k = 0; k < 4; ++k) p += gather_number(pressure, node + 8 * k, lane);
     p = 0.25f * p;
     const M3 still = 0.75f * mu * (H + splat(-1.0f) * now.c) + (0.25f * mu * i / i4) * F
       + lam * now.j * C;
-    const M3 moving = 0.75f * mu * (rate + splat(-1.0f) * cdot) + (0.25f * mu * i / i4) * rate
-      + (mu * idot / (i4 * i4)) * F + lam * jdot * C + lam * now.j * cdot;
+    const M3 Q = turn(F), strain = transposed(Q) * rate;
+    const M3 moving = Q * (0.75f * mu * (strain + transposed(strain))
+      + (lam - 0.625f * mu) * trace(strain));
     const M3 P = splat(h) * still + splat(gv) * moving + p * C;
     const V3 g1 = ld3(g, 0, lane), g2 = ld3(g, 3, lane), g3 = ld3(g, 6, lane);
     const V3 b1 = -volume * (P * g1), b2 = -volume * (P * g2), b3 = -volume * (P * g3);
@@ -151,7 +144,6 @@ PALPATE void tet_stress(const Fields& f, Thread t, int stage) {
     share(impulse + 64, b2, lane);
     share(impulse + 96, b3, lane);
     if (!implicit) return;
-    const M3 Q = turn(F);
     const V root = vsqrt(volume);
     const V3 a1 = root * (Q * g1), a2 = root * (Q * g2), a3 = root * (Q * g3);
     share(arm, splat(-1.0f) * (a1 + a2 + a3), lane);
@@ -161,8 +153,9 @@ PALPATE void tet_stress(const Fields& f, Thread t, int stage) {
     const M3 stress = still + (p / h) * C;
     const V mean = inner(Q, stress) / 3.0f;
     const V rest = vmax(inner(stress, stress) - 3.0f * mean * mean, splat(0.0f));
-    const V faces = vmax(inner(C, C) / 3.0f, splat(1.0f));
-    const V shear = 0.75f * mu;  // of small strains
+    const V faces = vmax(inner(C, C) - 2.0f, splat(1.0f));
+    const V squeezed = vmax(-lam * now.j - p / h, splat(0.0f)) * vsqrt(inner(F, F) / 3.0f);
+    const V shear = 0.75f * mu + squeezed;
     share(f.system.tet_now.data + 32 * at,
           {(lam - 0.625f * mu + ld(moduli, 3, lane)) * faces, shear,
            vmax(mean + 0.40825f * vsqrt(rest), splat(0.0f))}, lane);
