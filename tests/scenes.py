@@ -11,9 +11,8 @@ import trimesh
 import warp as wp
 from palpate.engine import plugin as engine
 from palpate.models import mjcf
-from palpate.tissue import fill
+from palpate.tissue import fill, shape
 from palpate.tissue import mesh as topology
-from palpate.tissue import shape
 from palpate.tissue import step as stepping
 from palpate.tissue.config import Config
 from palpate.tissue.order import from_slices, to_slices

@@ -338,14 +338,15 @@ def _check_solid(organ: str, config: Config, given: dict):
   if not config.window:
     raise ValueError(f"organ {organ!r}: elements is 'solid', expected window too (`add_windows`)")
   for key in ("thickness", "bend", "bulk", "pressure"):
-    if key in given and given[key]:
+    if given.get(key):
       raise ValueError(
         f"organ {organ!r}: {key} is {given[key]:g}, allowed only where elements is not 'solid': "
         "poisson says how a solid keeps its volume"
       )
-  if config.integrator == "neumann":
+  if not SCHEMES[config.integrator].solids:
     raise ValueError(
-      f"organ {organ!r}: integrator is 'neumann', allowed only where elements is not 'solid'"
+      f"organ {organ!r}: integrator is {config.integrator!r}, allowed only where elements is not "
+      "'solid'"
     )
 
 
@@ -360,7 +361,10 @@ def lame(config: Config, nelem: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def lame_solid(young: np.ndarray, poisson: float) -> tuple[np.ndarray, np.ndarray]:
-  """Returns the Lame constants mu = E / (2 (1 + nu)), lambda = E nu / ((1 + nu) (1 - 2 nu)) [Pa]."""
+  """Returns the Lame constants mu, lambda of a solid [Pa].
+
+  mu = E / (2 (1 + nu)), lambda = E nu / ((1 + nu) (1 - 2 nu)).
+  """
   return young / (2 * (1 + poisson)), young * poisson / ((1 + poisson) * (1 - 2 * poisson))
 
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from . import config as configuration
-from . import mesh as topology
 from . import fill, plate
+from . import mesh as topology
 from . import solid as solids
 from .config import Config
 from .mesh import Mesh

@@ -138,7 +138,7 @@ def _fill(rest: bytes, elem: bytes) -> tuple[bytes, np.ndarray, int]:
 
 
 def _lattice(surface: np.ndarray, triangle: np.ndarray) -> np.ndarray:
-  """Returns the points of a lattice that lie inside, (n, 3); some outside of it may be among them."""
+  """Returns the points of a lattice inside, (n, 3); some that are outside may be among them."""
   arms = surface[triangle[:, 1:]] - surface[triangle[:, :1]]
   normal = np.zeros_like(surface)
   np.add.at(normal, triangle.ravel(), np.repeat(np.cross(arms[:, 0], arms[:, 1]), 3, axis=0))
@@ -162,9 +162,8 @@ def _middles(point: np.ndarray, tet: np.ndarray) -> np.ndarray:
   weight = np.repeat(volumes(point, tet), 4)
   middle = np.repeat(point[tet].mean(axis=1), 4, axis=0)
   total = np.bincount(tet.ravel(), weight, len(point))
-  return np.stack(
-    [np.bincount(tet.ravel(), weight * middle[:, k], len(point)) for k in range(3)], axis=1
-  ) / np.maximum(total, 1e-300)[:, None]
+  sums = [np.bincount(tet.ravel(), weight * middle[:, k], len(point)) for k in range(3)]
+  return np.stack(sums, axis=1) / np.maximum(total, 1e-300)[:, None]
 
 
 def _inside(point: np.ndarray, triangle: np.ndarray, nsurface: int) -> tuple[np.ndarray, int]:

@@ -70,9 +70,10 @@ def arrays(mesh: Mesh, config: Config, vert: np.ndarray, node: np.ndarray) -> di
   stiff = np.bincount(tet.ravel(), share * np.repeat(averaged, 4), mesh.nvert) / total
   gain = np.where(vert >= 0, (stiff / total)[vert], 0.0)
   values = np.stack([volume, mu, lam, averaged], axis=1)
+  gradient = gradients(mesh)[:, 1:].reshape(-1, 9)
   return {
     "tet_node": to_slices(pad(offset(at), least=1)).astype(np.int32),
-    "tet_gradient": to_slices(pad(gradients(mesh)[:, 1:].reshape(-1, 9), least=1)).astype(np.float32),
+    "tet_gradient": to_slices(pad(gradient, least=1)).astype(np.float32),
     "tet_moduli": to_slices(pad(values, least=1)).astype(np.float32),
     "around_adr": addresses(width),
     "around_tet": (entry // 4).astype(np.int32),

@@ -284,7 +284,7 @@ def fill(kind: Any, device, values: dict[str, Any], sizes: dict[str, int] | None
 
 
 def empty(sizes: tuple[str, ...]) -> dict[str, np.ndarray]:
-  """Returns the arrays of `Shape` and `Tissue` whose first axis is one of `sizes`, of no entries."""
+  """Returns the arrays of `Shape` and `Tissue` whose first axis is one of `sizes`, empty."""
   out = {}
   for kind in (Shape, Tissue):
     for name, dims in DIMS[kind.key].items():

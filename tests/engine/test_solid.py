@@ -73,9 +73,9 @@ def test_a_saved_state_goes_on_to_the_bit(scenes):
 
 
 def test_what_a_user_sees_is_the_surface(scenes):
-  model, data, organ = scenes.load(_resting(scenes))
+  organ = scenes.load(_resting(scenes))[2]
   assert organ.nvert == len(organ.xpos) == len(organ.free) == len(organ.contact_force)
-  moved = organ.xpos0 + [0.0, 0.0, 0.001]
+  moved = organ.xpos0 + np.array([0.0, 0.0, 0.001])
   organ.set_state(moved)
   held = ~organ.free
   np.testing.assert_allclose(organ.xpos[~held], moved[~held], atol=1e-12)
