@@ -143,7 +143,8 @@ class Organ:
     """Enclosed volume [m^3]; NaN for an open surface."""
     if not self._organ.mesh.closed:
       return float("nan")
-    return topology.volume(self.xpos - self._organ.origin, self.elem)
+    moved = (self._organ.mesh.rest + self._deformation)[: self.nvert]
+    return topology.volume(moved, self.elem)
 
   @property
   def iterations(self) -> int:

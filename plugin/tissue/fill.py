@@ -139,9 +139,8 @@ def _fill(rest: bytes, elem: bytes) -> tuple[bytes, np.ndarray, int]:
 
 def _lattice(surface: np.ndarray, triangle: np.ndarray) -> np.ndarray:
   """Returns the points of a lattice inside, (n, 3); some that are outside may be among them."""
-  arms = surface[triangle[:, 1:]] - surface[triangle[:, :1]]
   normal = np.zeros_like(surface)
-  np.add.at(normal, triangle.ravel(), np.repeat(np.cross(arms[:, 0], arms[:, 1]), 3, axis=0))
+  np.add.at(normal, triangle.ravel(), np.repeat(_normals(surface, triangle), 3, axis=0))
   edge = np.linalg.norm(surface[triangle[:, [1, 2, 0]]] - surface[triangle], axis=2).mean()
   low, high = surface.min(axis=0), surface.max(axis=0)
   tree, side = KDTree(surface), _COARSER * edge * 2 / np.sqrt(3)  # neighbours: half a diagonal
@@ -155,6 +154,12 @@ def _lattice(surface: np.ndarray, triangle: np.ndarray) -> np.ndarray:
     if len(point) <= MOST * len(surface):
       return point
     side *= max(1.05, (len(point) / (MOST * len(surface))) ** (1 / 3))
+
+
+def _normals(point: np.ndarray, triangle: np.ndarray) -> np.ndarray:
+  """Returns the normals of triangles, as long as twice their areas, (n, 3)."""
+  arms = point[triangle[:, 1:]] - point[triangle[:, :1]]
+  return np.cross(arms[:, 0], arms[:, 1])
 
 
 def _middles(point: np.ndarray, tet: np.ndarray) -> np.ndarray:
@@ -190,11 +195,15 @@ def _inside(point: np.ndarray, triangle: np.ndarray, nsurface: int) -> tuple[np.
   ends = (start[through], neighbour[through])
   graph = sparse.coo_matrix((np.ones(len(ends[0])), ends), shape=(len(tet), len(tet)))
   count, part = csgraph.connected_components(graph, directed=False)
+  # The side of a triangle on which the corner is that its tetrahedron has beside it.
+  which, corner = np.nonzero(np.isin(known, wanted))
+  order = np.argsort(wanted)
+  at = order[np.searchsorted(wanted, known[which, corner], sorter=order)]
+  side = point[tet[which, corner]] - point[triangle[at, 0]]
+  height = (side * _normals(point, triangle)[at]).sum(axis=1)
+  sure = wanted[at] == _key(triangle[at], nsurface)  # others were flipped
+  within = np.bincount(part[which], np.where(sure, np.sign(height), 0), count)[part] < 0
   volume = volumes(point, tet)
-  order = np.lexsort((np.abs(volume), part))
-  largest = order[np.searchsorted(part[order], np.arange(count), side="right") - 1]
-  middle = point[tet[largest]].mean(axis=1)
-  within = np.array([_winding(point[triangle], each) > 0.5 for each in middle])[part]
   tet = np.where((volume < 0)[:, None], tet[:, [0, 2, 1, 3]], tet)[within]
   return tet[quality(point, tet) > _FLAT], -1
 
@@ -229,12 +238,3 @@ def _flipped(triangle: np.ndarray, known: np.ndarray, n: int) -> tuple[np.ndarra
       key[[s, t]] = flipped
       left -= {s, t}
   return key, min(left, default=-1)
-
-
-def _winding(corner: np.ndarray, at: np.ndarray) -> float:
-  """Returns how often a surface winds around a point (van Oosterom and Strackee 1983)."""
-  a, b, c = np.moveaxis(corner - at, 1, 0)
-  la, lb, lc = (np.linalg.norm(each, axis=1) for each in (a, b, c))
-  above = (a * np.cross(b, c)).sum(axis=1)
-  below = la * lb * lc + (a * b).sum(1) * lc + (b * c).sum(1) * la + (c * a).sum(1) * lb
-  return float(2 * np.arctan2(above, below).sum() / (4 * np.pi))

@@ -95,6 +95,7 @@ def _below(
     for level, e, mask in zip(levels, young, masks[1:], strict=True)
   ]
   joined = coarsening.join(parts[1:])
+  joined |= solid.none(len(joined["area"]))
   return joined | counts(joined) | coarsening.transfer(levels, parts, masks, device)
 
 

@@ -96,9 +96,8 @@ def test_equal_tension_everywhere_swells_by_the_bulk_modulus(scenes, device):
 
 
 @pytest.mark.parametrize("start", ["squeezed", "turned inside out", "random"])
-# Nearly incompressible tissue pays for steps that large with some energy.
-@pytest.mark.parametrize(("poisson", "most"), [(0.3, 1.02), (0.45, 1.02), (0.49, 1.2)])
-def test_a_crushed_solid_does_not_gain_energy(scenes, start, poisson, most):
+@pytest.mark.parametrize("poisson", [0.3, 0.45])
+def test_a_crushed_solid_does_not_gain_energy(scenes, start, poisson):
   points, elem = scenes.sphere(2)
   made = {"elements": "solid", "poisson": poisson, "young": (YOUNG,)}
   mesh, config, body = scenes.kernels(points, elem, damping=0.002, **made)
@@ -114,7 +113,7 @@ def test_a_crushed_solid_does_not_gain_energy(scenes, start, poisson, most):
     v = v + scenes.step(body, 1e-3, u, v, mass)
     u = u + 1e-3 * v
     kinetic = 0.5 * (mass[:, None] * v**2).sum()
-    assert energy.total(mesh, config, u) + kinetic < most * at_first
+    assert energy.total(mesh, config, u) + kinetic < 1.02 * at_first
 
 
 def test_a_modulus_of_each_triangle_goes_as_deep_as_it_is_nearest(scenes):
