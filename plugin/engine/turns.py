@@ -59,7 +59,7 @@ class Turn:
 
   def end(self):
     """Leaves another mark after a step."""
-    mine = self.mine
-    self._found[0] = mark = next(_marks)
+    found, mark = self._found, next(_marks)
     # Where other data was stepped in between, both look for their windows again.
-    self.mark = mark if mine else math.nan
+    self.mark = mark if found[0] == self.mark else math.nan
+    found[0] = mark

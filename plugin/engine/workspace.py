@@ -15,7 +15,6 @@ from palpate.tissue.body import Body
 from palpate.tissue.config import Config
 
 from . import (
-  apart,
   coupling,
   declare,
   declare_windows,
@@ -227,7 +226,7 @@ class Workspace:
 
   def _find_contacts_again(self):
     self.put_windows()
-    apart.find_contacts(self.model, self.data)
+    windowed.find_contacts_again(self)
 
   def put_windows(self):
     """Puts the windows where the plugin state says."""
