@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 from palpate.tissue.config import KEYS
 
-from . import guard, mjstruct, windowed, workspace
+from . import guard, mjstruct, weights, windowed, workspace
 from .layout import FLAG
 from .mjstruct import NAME, warn
 from .workspace import Workspace
@@ -248,6 +248,7 @@ def _miss(w: Workspace, nodes: int, triangles: int):
 def register() -> int:
   """Registers the plugin with MuJoCo, once a process; returns its slot."""
   mjstruct.check()
+  weights.are_wrong()  # compiles a model, which must not be done while another is compiled
   lib = mjstruct.library()
   slot = C.c_int(-1)
   if lib.mjp_getPlugin(NAME.encode(), C.byref(slot)):

@@ -264,6 +264,19 @@ print(organ.error, round(d.time, 6))
   assert (status, out.split("\n")) == (0, ["True", "True", "None 0.01"]), errors
 
 
+@pytest.mark.parametrize("kind", ["organ", "windowed"])
+def test_an_organ_that_fails_late_in_the_first_compilation_is_refused_by_name(process, kind):
+  code = f"""
+import scenes
+points, elem = scenes.triangular(0.1, 0.05, 4, 3)
+try: load(scenes.world(scenes.{kind}(1e-9 * points, elem, young=2e4, foundation=1e4)))
+except ValueError as error: print(error)
+"""
+  status, out, errors = process(code)
+  assert status == 0, errors
+  assert "organ 'organ': vertex" in out and "is its scale right" in out
+
+
 # Signals.
 
 
