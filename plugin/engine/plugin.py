@@ -178,6 +178,8 @@ def _advance(model: int, data: int, instance: int):
       _miss(w, int(nodes), int(triangles))
     if w.model_step[0] != w.time_step:
       workspace.refresh(w)
+    if w.watch.due() and not (w.asleep or w.resident):
+      _watch(w)
   except BaseException as error:
     _fail(w, error)
   return guard.leave()
@@ -234,6 +236,17 @@ def _note(w: Workspace, text: str):
   if w.error is None:
     w.error = f"organ {w.organ.name!r}: {text}"
     warn(w.error)
+
+
+def _watch(w: Workspace):
+  """Warns of tools that have come through the surface."""
+  m = mjstruct.Model.from_address(w.model)
+  for geom in w.watch.look(w):
+    name = mjstruct.name_of(m, m.name_geomadr, geom) or geom
+    warn(
+      f"organ {w.organ.name!r}: geom {name!r} has gone through its surface, where contacts do not "
+      "hold it any more; see Organ.pierced"
+    )
 
 
 def _miss(w: Workspace, nodes: int, triangles: int):

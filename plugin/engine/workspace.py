@@ -30,6 +30,7 @@ from .bind import bind
 from .coupling import Phases
 from .declare import Declaration
 from .layout import FLAG, HEAD
+from .pierce import Watch
 from .resident import Resident
 from .turns import Turn
 
@@ -77,6 +78,7 @@ class Workspace:
     strange: whether the plugin state is not one of this organ
     noticed: whether it was said that windows came without their state
     torn: whether a signal's handler has ended a callback of the last step
+    watch: looks whether tools come through the surface
     nbad: MuJoCo's warnings of bad states that were looked at since the last reset
     model_step: the model's time step comes first [s]
     time_step: time step that the armature is for [s]
@@ -123,6 +125,7 @@ class Workspace:
   strange: bool = False
   noticed: bool = False
   torn: bool = False
+  watch: Watch = dataclasses.field(default_factory=Watch)
   # Views that every step looks at: an item of a memoryview costs a tenth of one of an array.
   warning: memoryview = dataclasses.field(default_factory=lambda: memoryview(b""))
   nefc: memoryview = dataclasses.field(default_factory=lambda: memoryview(b"\0"))
@@ -302,7 +305,7 @@ class Workspace:
 
   def forget(self):
     """Forgets what went wrong."""
-    self.error = None
+    self.error, self.watch = None, Watch()
 
 
 def place(w: Workspace, model: int):
