@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import mujoco
 import numpy as np
-from palpate.engine import motion, windowed, workspace
+from palpate.engine import mjstruct, motion, pierce, windowed, workspace
 from palpate.engine import plugin as engine
 from palpate.engine.layout import FLAG
 from palpate.tissue import energy, fill
@@ -127,6 +127,19 @@ class Organ:
   def window_warning(self) -> str | None:
     """What the windows were too small for, at the worst moment so far, or None."""
     return windowed.shortage(self._space)
+
+  @property
+  def pierced(self) -> tuple[str, ...]:
+    """Geoms that move, touch this organ, and are inside of it: they have gone through its surface.
+
+    Of a long geom some point of the axis is inside, of others the centre. A warning names one that
+    comes through while the organ runs; an open surface has no inside.
+    """
+    m = mjstruct.Model.from_address(self.model._address)
+    d = mjstruct.Data.from_address(self.data._address)
+    tools = pierce.tools(m, self._organ)
+    found = pierce.inside(m, d, self._organ, tools, self._deformation)
+    return tuple(self.model.geom(geom).name or f"geom {geom}" for geom in found)
 
   @property
   def force(self) -> np.ndarray:

@@ -146,7 +146,7 @@ def _windows(model, m, instance, name, config, mesh, mass, place) -> Windows:
 def _claimed(model, m, instance: int, name: str, config: Config) -> list[int]:
   """Returns the flexes that an organ names as its windows and nobody else does."""
   names = [flexes.name(m, f) for f in range(m.nflex)]
-  surface = _surfaces(model, m, instance)
+  surface = _surfaces(model, m, instance, without=instance)
   claimed = {names[window]: f"organ {names[flex]!r}" for window, flex in surface.items()}
   if len(config.window) > MAX_WINDOWS:
     raise ValueError(
@@ -246,7 +246,7 @@ def _check_neighbours(m, model, instance, name, windows: Windows, frame, origin,
   own = np.isin(np.arange(m.nflex), windows.flex)
   contype = mjstruct.view(m.flex_contype, m.nflex, np.int32)
   conaffinity = mjstruct.view(m.flex_conaffinity, m.nflex, np.int32)
-  surface = _surfaces(model, m, instance)
+  surface = _surfaces(model, m, instance, without=instance)
   points = origin + rest @ frame.T
   room = _NEAR * float(np.linalg.norm(np.ptp(points, axis=0)))
   low, high = points.min(axis=0) - room, points.max(axis=0) + room
@@ -261,13 +261,27 @@ def _check_neighbours(m, model, instance, name, windows: Windows, frame, origin,
       )
 
 
-def _surfaces(model, m, instance: int) -> dict[int, int]:
-  """Returns the flex of the organ that each window of another organ is of."""
+def touching(model: int, instance: int) -> np.ndarray:
+  """Returns the flexes that meet tools for this plugin's organs, of which one is an instance."""
+  m = mjstruct.Model.from_address(model)
+  owner = mjstruct.view(m.body_plugin, m.nbody, np.int32)
+  plugin = mjstruct.view(m.plugin, m.nplugin, np.int32)
+  ours = np.flatnonzero((owner >= 0) & (plugin[owner] == plugin[instance]))
+  rigid = mjstruct.view(m.flex_rigid, m.nflex, np.bool_)
+  start = mjstruct.view(m.flex_vertadr, m.nflex, np.int32)
+  body = mjstruct.view(m.flex_vertbodyid, m.nflexvert, np.int32)
+  own = [np.isin(body[start[f] : start[f] + flexes.vertices(m, f)], ours) for f in range(m.nflex)]
+  nodal = [f for f in range(m.nflex) if not rigid[f] and own[f].any()]
+  return np.array([*nodal, *_surfaces(model, m, instance)], int)
+
+
+def _surfaces(model, m, instance: int, without: int = -1) -> dict[int, int]:
+  """Returns the flex of the organ that each window is of, of all organs or without one."""
   names = [flexes.name(m, f) for f in range(m.nflex)]
   plugin = mjstruct.view(m.plugin, m.nplugin, np.int32)
   found = {}
   for other in range(m.nplugin):
-    if other != instance and plugin[other] == plugin[instance]:
+    if other != without and plugin[other] == plugin[instance]:
       for flex in _rigid_flexes(m, other)[1]:
         for window in mjstruct.config(model, other, "window").split():
           resolved = _resolve(window, names[flex], names)

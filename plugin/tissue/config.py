@@ -46,9 +46,16 @@ def _row(default, kind: tuple, meaning: str, unit: str = "-", change: str = FIXE
 # What a key may hold: how it is read, and what a message says of it.
 
 
+def _plain(word: str) -> str:
+  """Returns a word of a number; Python alone reads 1_0 and digits of other scripts as one."""
+  if not word.isascii() or "_" in word:
+    raise ValueError
+  return word
+
+
 def _number(low: float, high: float = math.inf, closed: bool = True) -> tuple:
   def read(text: str, nelem: int) -> float:
-    value = float(text)
+    value = float(_plain(text))
     inside = (value >= low if closed else value > low) and value < high
     if not (math.isfinite(value) and inside):
       raise ValueError
@@ -63,7 +70,7 @@ def _number(low: float, high: float = math.inf, closed: bool = True) -> tuple:
 
 def _numbers(text: str, nelem: int) -> tuple[float, ...]:
   words = text.split()
-  values = tuple(float(word) for word in words)
+  values = tuple(float(_plain(word)) for word in words)
   for k, value in enumerate(values):
     if not (math.isfinite(value) and value > 0):
       if len(values) > 1:
@@ -76,7 +83,7 @@ def _numbers(text: str, nelem: int) -> tuple[float, ...]:
 
 def _count(low: int, high: int) -> tuple:
   def read(text: str, nelem: int) -> int:
-    value = int(text)
+    value = int(_plain(text))
     if not low <= value <= high:
       raise ValueError
     return value
@@ -95,13 +102,13 @@ def _choice(values: dict[str, Any]) -> tuple:
 
 def _device(text: str, nelem: int) -> str:
   kind, _, index = text.partition(":")
-  if text in ("auto", "cpu", "cuda") or (kind == "cuda" and index.isdigit()):
+  if text in ("auto", "cpu", "cuda") or (kind == "cuda" and _plain(index).isdigit()):
     return "cuda:0" if text == "cuda" else text
   raise ValueError
 
 
 def _vertices(text: str, nelem: int) -> tuple[int, ...]:
-  if not all(word.isdigit() for word in text.split()):
+  if not all(_plain(word).isdigit() for word in text.split()):
     raise ValueError
   return tuple(int(word) for word in text.split())
 
