@@ -18,6 +18,7 @@ Progress: 0.3 * felt; on the report 1 or 0.
 """
 
 import dataclasses
+import math
 
 import numpy as np
 from dm_control.utils import containers
@@ -357,7 +358,7 @@ class Palpate(Task):
       yield from feel(int(np.argmax(np.where(near, gap, -1.0))))
     k = _stiffest(places, places[spots], np.array(stiffness), 1.2 * self.radius)
     yield from self._hop(p, places[k] + 0.004 * normals[k])
-    yield from p.push(0.12, -normals[k], lambda: bool(np.linalg.norm(physics.contact_force()) > 0.1))
+    yield from p.push(0.12, -normals[k], lambda: math.hypot(*physics.contact_force()) > 0.1)
     p.extra[:] = 1.0
     yield p.step()
 

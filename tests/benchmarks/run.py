@@ -13,12 +13,13 @@ import screen
 from benchmarks.results import BenchError
 
 BENCHES = {
-  "attack": "what a search finds in the exercises that does not do the work",
+  "attacks": "what random attacks break",
   "error": "run time against error, beside MuJoCo's own flex",
   "experts": "how many of its episodes each expert solves; the references",
   "inertia": "what the effective inertia does to the contact force",
   "learning": "SAC on touch/easy",
   "locality": "what leaving out solved nodes would save",
+  "loopholes": "what a search finds in the exercises that does not do the work",
   "loop": "the whole loop, mj_step with a probe on a windowed organ",
   "peer": "mj_step in contact against MuJoCo's native flex",
   "preconditioner": "iterations with block Jacobi and multilevel",
