@@ -201,6 +201,4 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
   return [results.page(out / "loopholes.md", "Loopholes of the exercises", about, lines)]
 
 
-BENCH = Bench(
-  "loopholes", stages, run, report=report, arguments=arguments, jobs=2, limit=3600.0
-)
+BENCH = Bench("loopholes", stages, run, report=report, arguments=arguments, jobs=2, limit=3600.0)
