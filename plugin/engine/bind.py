@@ -25,7 +25,7 @@ def bind(w, model: int):
     near = wp.get_device(does.side)
     crossing = device != near
 
-    touched = weights.make(w, model)
+    touched = _touched(w, model)
 
     def before():
       weights.launch(touched)
@@ -69,6 +69,14 @@ def bind(w, model: int):
   w.static = [(view, view.tobytes()) for view in declare.static_places(m, w.organ)]
   if w.turn is not None:
     w.turn.bind(model, w.organ.windows)
+
+
+def _touched(w, model: int) -> weights.Weights:
+  """Returns what the contacts with the organ's own flex, or with its windows, get weights by."""
+  flexes = w.organ.windows.flex if w.organ.windows else w.organ.flex
+  out = weights.make(model, w.data, flexes, w.flags)
+  w.views["mine"] = out.mine
+  return out
 
 
 # What a solve on another device than MuJoCo's side reads and writes.
