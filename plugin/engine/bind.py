@@ -46,14 +46,20 @@ def bind(w, model: int):
       if crossing:
         _cross(w, ("sol", "status"), to_device=False)
 
+    def end():
+      does.end()
+      does.advance()
+
+    # As few graphs as may be: a launch costs a small organ a hundredth of its step.
+    after = [] if w.resident else [(cpu, does.scatter)]
     w.before = graphs.record(cpu, before)
-    w.solve = graphs.record_all((near, does.enter), (device, solve), (near, does.look))
-    w.after = graphs.record(cpu, does.scatter)
+    w.solve = graphs.record_all((near, does.enter), (device, solve), (near, does.look), *after)
+    w.after = graphs.record(cpu, does.scatter) if w.resident else None
     w.leave = graphs.record(cpu, does.leave)
     w.respond = []
     if scheme.respond:
       w.respond = graphs.record_all((near, does.push), (device, respond), (near, does.answer))
-    w.end = graphs.record(cpu, does.end)
+    w.end = graphs.record(cpu, end)
     w.advance = graphs.record(cpu, does.advance)
     w.place = graphs.record(cpu, does.place) if w.organ.windows else None
     if w.resident:
@@ -61,6 +67,12 @@ def bind(w, model: int):
       ahead = graphs.record_all((near, does.enter_ahead), (device, solve))
       w.resident.begin_graph = ahead[0][1]
       w.resident.rest = graphs.record_all((near, does.look_ahead))
+  _watch(w, model)
+
+
+def _watch(w, model: int):
+  """Notes what of a model a step looks at, and what it was."""
+  m = mjstruct.Model.from_address(model)
   w.model, w.identity = model, mjstruct.Identity(model)
   option = model + mjstruct.Model.opt.offset
   w.model_step = mjstruct.view(option + type(m.opt).timestep.offset, 1).data
