@@ -12,15 +12,17 @@ from palpate import Organ
 from palpate.models import trocar
 
 from . import scenes
+from .jaws import Jaws
 from .scenes import CAMERA, ORGAN
 
 AXES = ("pitch", "yaw", "roll", "insertion")
 JAWS = "grasper/"  # prefix of the instrument that has them
 NEAR, COARSE = 8, 32  # nodes in the observations
-HELD_FORCE = 0.05  # force on both jaws above which they hold tissue [N]
+HELD_FORCE = 0.2  # of the inner face of either jaw on tissue between them, to hold it [N]
 
 STATE = mj.mjtState.mjSTATE_INTEGRATION
-_CLOSING = 0.005  # [rad]
+_CLOSING = 0.005  # the drive's target is that far below the opening [rad]
+_FOLD = (0.02, 0.15)  # least opening over a fold of tissue, largest target that grips one [rad]
 
 
 class Physics(mujoco.Physics):
@@ -58,6 +60,8 @@ class Physics(mujoco.Physics):
     self.drives = np.array([model.actuator(prefix + axis).id for axis in AXES])
     self.drive_range = model.actuator_ctrlrange[self.drives].copy()
     self.jaw = model.actuator(prefix + "jaw").id if self.has_jaw else -1
+    self._jaws = Jaws(model, prefix) if self.has_jaw else None
+    self._inner = np.zeros(2)
     self._targets = [model.site(f"target{i}").id for i in range(targets)]
     model.site_sameframe[self._targets] = 0  # else a site at its body's origin stays there
     self._coarse = _spread(self.organ.xpos0, COARSE)
@@ -76,11 +80,13 @@ class Physics(mujoco.Physics):
       force, peak = data.sensordata[self._sensors["tip_force"]], 0.0
       sides = [self._sensors[f"touch_{side}"].start for side in ("left", "right") if self.has_jaw]
       grip = np.zeros(len(sides))
-      for _ in range(nstep):
+      for k in range(nstep):
         mj.mj_step2(model, data)
         peak = max(peak, float(force @ force))
         if sides:
           grip += data.sensordata[sides]
+        if self._jaws and k == nstep - 1:
+          self._inner = self._jaws.inner_force(model, data)
         mj.mj_step1(model, data)
       # Pinched folds make single steps of large jaw force: the jaws' is a mean over the step.
       self.peak_force = max(peak**0.5, float(grip.max(initial=0.0)) / nstep)
@@ -135,7 +141,15 @@ class Physics(mujoco.Physics):
     self.data.ctrl[self.drives] = pose
     if self.jaw >= 0:
       self.data.ctrl[self.jaw] = 0.0
+    self._inner = np.zeros(2)
     mj.mj_forward(self.model.ptr, self.data.ptr)
+
+  def from_tip(self, point: np.ndarray) -> np.ndarray:
+    """Returns a point in the frame of the tip [m]  (3,)."""
+    local, turn = np.zeros(3), np.zeros(4)
+    mj.mju_negQuat(turn, self.tip_quat())
+    mj.mju_rotVecQuat(local, point - self.tip_pos(), turn)
+    return local
 
   def joint_vel(self) -> np.ndarray:
     """Returns the velocities of `joints`  (4,)."""
@@ -159,13 +173,13 @@ class Physics(mujoco.Physics):
     return np.concatenate([self.sensor("jaw"), self.data.ctrl[[self.jaw]], *touch])
 
   def closing(self) -> bool:
-    """Whether the jaws are told to close: the drive's target is below the opening."""
-    opening, target = self.gripper()[:2]
-    return bool(target < opening - _CLOSING)
+    """Whether the jaws are told to close: on a fold of tissue at most, and below the opening."""
+    opening, target = float(self.sensor("jaw")[0]), float(self.data.ctrl[self.jaw])
+    return target < min(opening - _CLOSING, _FOLD[1])
 
   def holds(self) -> bool:
-    """Whether both jaws press on something."""
-    return bool(self.gripper()[2:].min() > HELD_FORCE)
+    """Whether tissue is between the jaws: it keeps them open, both inner faces press on it."""
+    return bool(self._inner.min() > HELD_FORCE and self.sensor("jaw")[0] > _FOLD[0])
 
   def nodes(self) -> np.ndarray:
     """Returns the positions of the organ's nodes [m]  (nvert, 3); computed once a control step."""
