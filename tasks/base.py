@@ -43,7 +43,6 @@ discount is 0 as for success), `missed` (a wrong report), or None when the time 
 import collections
 import dataclasses
 import os
-import warnings
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -55,16 +54,16 @@ from dm_env import specs
 from palpate.models import trocar
 from scipy.spatial import cKDTree
 
-from . import scenes
-from .physics import AXES, JAWS, STATE, Physics, check_scene
+from . import scenes, stage
+from .physics import AXES, JAWS, Physics, check_scene
 from .recording import Event, Settings
 from .scenes import CAMERA, ORGAN, Scene
+from .stage import STATE, Stage
 
 CONTROL_TIMESTEP = 0.02  # [s]
 RATES = (1.0, 1.0, 3.0, 0.12)  # pitch, yaw, roll [rad/s], insertion [m/s]
 REWARDS = ("dense", "sparse")
 
-_SETTLE = 0.3  # [s]
 _FACING = 0.75  # least cosine between a target's normal and the way to the trocar
 _PIN_GAP = 0.012  # targets keep this far from pinned nodes [m]
 _SLACK = 1e-6  # what rounding may add to an action
@@ -128,12 +127,15 @@ class Task(control.Task):
     self.spread, self.jitter = spread, jitter
     self.variants = (scene.variant,) if variants is None or model is not None else variants
     self.reward, self.pixels = reward, pixels
-    self._own, self.organ = model, organ
-    self._models: dict[int | None, tuple[mj.MjModel, np.ndarray]] = {}
+    self.organ = organ
+    self._models: dict[int | None, Stage] = {}
     self.visualize_reward = False
     self.outcome: str | None = None
     self.progress, self.best = 0.0, 0.0
     self.events: list[Event] = []
+    if model is not None:
+      own: Any = model if isinstance(model, mj.MjSpec) else mj.MjSpec.from_file(os.fspath(model))
+      self._models[self.variants[0]] = self._stage(own.copy())
 
   # Scene.
 
@@ -149,46 +151,23 @@ class Task(control.Task):
 
   def physics(self) -> Physics:
     """Returns the physics of the scene, to make an environment of."""
-    model, _ = self._compiled(self.variants[0])
+    model = self._compiled(self.variants[0]).model
     physics = Physics.from_model(wrapper.MjModel(model))
     physics.use(model, self.prefix, self.targets, self.organ)
-    physics.keep_port()
     return physics
 
-  def _compiled(self, variant: int | None) -> tuple[mj.MjModel, np.ndarray]:
+  def _compiled(self, variant: int | None) -> Stage:
     if variant not in self._models:
-      if isinstance(self._own, mj.MjSpec):
-        own: Any = self._own
-        spec = own.copy()
-      elif self._own is not None:
-        spec = mj.MjSpec.from_file(os.fspath(self._own))
-      else:
-        spec = scenes.build(self._scene(variant))
-      with warnings.catch_warnings():  # the plugin's passive forces are unknown to the compiler
-        warnings.filterwarnings("ignore", ".*has no equality constraints or passive forces")
-        model = spec.compile()
-      check_scene(model, self.prefix, self.targets, self.organ)
-      self._models[variant] = self._settle(model)
+      self._models[variant] = self._stage(scenes.build(self._scene(variant)))
     return self._models[variant]
+
+  def _stage(self, spec: mj.MjSpec) -> Stage:
+    model = stage.compile_spec(spec)
+    check_scene(model, self.prefix, self.targets, self.organ)
+    return stage.build(model, self.prefix, self.organ)
 
   def _scene(self, variant: int | None) -> Scene:
     return dataclasses.replace(self.scene, variant=variant, targets=self.targets)
-
-  def _settle(self, model: mj.MjModel) -> tuple[mj.MjModel, np.ndarray]:
-    """Returns the model and the state in which the organ rests under its weight."""
-    data = mj.MjData(model)
-    names = [f"{self.prefix}insertion"]
-    for name in names:  # out of the way
-      low = model.actuator(name).ctrlrange[0]
-      data.ctrl[model.actuator(name).id] = low
-      data.qpos[model.joint(name).qposadr[0]] = low
-    mj.mj_step(model, data, round(_SETTLE / model.opt.timestep))
-    data.qvel[:] = 0
-    data.qacc_warmstart[:] = 0
-    data.time = 0
-    state = np.empty(mj.mj_stateSize(model, STATE))
-    mj.mj_getState(model, data, state, STATE)
-    return model, state
 
   def place_of_work(self, physics: Physics) -> tuple[np.ndarray, np.ndarray]:
     """Returns the triangles that targets are drawn from, and the middle of that place [m].
@@ -255,14 +234,12 @@ class Task(control.Task):
 
   def initialize_episode(self, physics: Physics) -> None:
     """Draws shape, trocar, pose and targets, and puts the organ at rest."""
-    model, state = self._compiled(self.choose())
-    if physics.model.ptr is not model:
-      if physics.prefix:
-        physics.move_port(np.zeros(3), np.zeros(3))
-      physics.use(model, self.prefix, self.targets, self.organ)
-      physics.keep_port()
-    mj.mj_setState(model, physics.data.ptr, state, STATE)
-    mj.mj_kinematics(model, physics.data.ptr)
+    place = self._compiled(self.choose())
+    if physics.model.ptr is not place.model:
+      physics.use(place.model, self.prefix, self.targets, self.organ)
+    place.restore()
+    mj.mj_setState(place.model, physics.data.ptr, place.state, STATE)
+    mj.mj_kinematics(place.model, physics.data.ptr)
     physics.moved()
     limit = self.jitter
     physics.move_port(

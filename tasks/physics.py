@@ -6,27 +6,26 @@ import math
 
 import mujoco as mj
 import numpy as np
-from dm_control import mujoco
 from dm_control.mujoco import wrapper
 from palpate import Organ
 from palpate.models import trocar
 
 from . import scenes
+from .portable import Portable
 from .scenes import CAMERA, ORGAN
+from .stage import STATE
 
 AXES = ("pitch", "yaw", "roll", "insertion")
 JAWS = "grasper/"  # prefix of the instrument that has them
 NEAR, COARSE = 8, 32  # nodes in the observations
 HELD_FORCE = 0.05  # force on both jaws above which they hold tissue [N]
 
-STATE = mj.mjtState.mjSTATE_INTEGRATION
 _CLOSING = 0.005  # [rad]
 
 
-class Physics(mujoco.Physics):
+class Physics(Portable):
   """Physics of an exercise: one organ, one instrument on a trocar."""
 
-  organ: Organ
   prefix = ""
 
   def use(self, model: mj.MjModel, prefix: str, targets: int, organ: str = ORGAN) -> None:
@@ -38,7 +37,7 @@ class Physics(mujoco.Physics):
       targets: number of target sites needed
       organ: name of the organ
     """
-    self.prefix = prefix
+    self.prefix, self.organ_name = prefix, organ
     check_scene(model, prefix, targets, organ)
     if model is not self.model.ptr:
       self._reload_from_data(wrapper.MjData(wrapper.MjModel(model)))
@@ -52,9 +51,9 @@ class Physics(mujoco.Physics):
       if name.startswith(prefix):
         adr = int(model.sensor_adr[i])
         self._sensors[name[len(prefix) :]] = slice(adr, adr + int(model.sensor_dim[i]))
-    self._joint = [model.joint(prefix + axis) for axis in AXES]
-    self._qpos = np.array([int(j.qposadr[0]) for j in self._joint])
-    self._dof = np.array([int(j.dofadr[0]) for j in self._joint])
+    joints = [model.joint(prefix + axis) for axis in AXES]
+    self._qpos = np.array([int(joint.qposadr[0]) for joint in joints])
+    self._dof = np.array([int(joint.dofadr[0]) for joint in joints])
     self.drives = np.array([model.actuator(prefix + axis).id for axis in AXES])
     self.drive_range = model.actuator_ctrlrange[self.drives].copy()
     self.jaw = model.actuator(prefix + "jaw").id if self.has_jaw else -1
@@ -261,14 +260,9 @@ class Physics(mujoco.Physics):
     quat, rotation = np.zeros(4), np.zeros(4)
     angle = float(np.linalg.norm(turn))
     mj.mju_axisAngle2Quat(rotation, turn / max(angle, 1e-12), angle)
-    mj.mju_mulQuat(quat, rotation, self._home[1])
-    body.pos[:], body.quat[:] = self._home[0] + shift, quat
+    mj.mju_mulQuat(quat, rotation, body.quat)
+    body.pos[:], body.quat[:] = body.pos + shift, quat
     self._trocar = trocar.trocar(model, self.prefix)
-
-  def keep_port(self) -> None:
-    """Takes the trocar's pose as the one that `move_port` starts from."""
-    body = self.model.ptr.body(f"{self.prefix}trocar")
-    self._home = body.pos.copy(), body.quat.copy()
 
   def mark(
     self,
