@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import atexit
+import os
+import sys
 import threading
 from collections.abc import Callable
 from typing import Any
@@ -10,6 +12,52 @@ from typing import Any
 from palpate.screen import has_display
 
 _PATIENCE = 5.0  # for the window's thread to end [s]
+# Modules that draw for MuJoCo, and what returns the present context.
+_CURRENT = {
+  "OpenGL.EGL": "eglGetCurrentContext",
+  "OpenGL.osmesa": "OSMesaGetCurrentContext",
+  "glfw": "get_current_context",
+}
+_drawn = False  # by this process
+_lost = False  # whether a process that had drawn was forked into this one
+
+
+def can_draw() -> bool:
+  """Returns whether drawing does not wait for threads that a fork has left behind."""
+  return not _lost
+
+
+def check_drawing() -> None:
+  """Notes that this process draws.
+
+  Raises:
+    RuntimeError: it cannot.
+  """
+  global _drawn
+  if _lost:
+    raise RuntimeError(
+      "this process was forked from one that had drawn, and OpenGL does not survive that; start "
+      "processes by 'forkserver' or 'spawn', such as vector_kwargs={'context': 'forkserver'} for "
+      "gymnasium.make_vec(..., vectorization_mode='async'), or draw nothing before"
+    )
+  _drawn = True
+
+
+def _look_for_contexts() -> None:
+  """Notes before a fork what others have drawn."""
+  global _drawn
+  for name, current in _CURRENT.items():
+    if name in sys.modules:
+      _drawn = _drawn or bool(getattr(sys.modules[name], current)())
+
+
+def _lose_contexts() -> None:
+  global _lost
+  _lost = _drawn
+
+
+if hasattr(os, "register_at_fork"):
+  os.register_at_fork(before=_look_for_contexts, after_in_child=_lose_contexts)
 
 
 class Window:

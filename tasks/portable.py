@@ -11,6 +11,7 @@ from dm_control import mujoco
 from palpate import Organ
 from palpate.tissue.config import Config
 
+from . import display
 from .scenes import ORGAN
 
 # What belongs to one process or is made anew from the data.
@@ -30,6 +31,17 @@ class Portable(mujoco.Physics):
 
   organ: Organ
   organ_name = ORGAN
+
+  @property
+  def contexts(self) -> Any:
+    """What draws; RuntimeError in a process where drawing would wait for ever."""
+    display.check_drawing()
+    return super().contexts
+
+  def _free_rendering_contexts(self) -> None:
+    if display.can_draw():
+      super()._free_rendering_contexts()
+    self._contexts = None
 
   def copy(self, share_model: bool = False) -> "Portable":
     """Returns a physics that goes on from here as this one does.
