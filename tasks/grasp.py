@@ -117,7 +117,7 @@ class Grasp(Task):
     self.grasped = (grasped or self.grasped) and physics.holds()
     self._closing = closing
     if self.grasped and height >= self.lift:
-      self.held += base.CONTROL_TIMESTEP
+      self.held += self.control_timestep
       self.done = self.done or self.held >= self.hold - 1e-9
     elif not self.done:
       self.held = 0.0
@@ -155,14 +155,14 @@ class Grasp(Task):
       yield from p.wait(p.style.delay)
       goal = self.lift + 0.0015 + 0.3 * p.style.overshoot * self.lift
       while self.grasped and not self.done:  # up, and hold
-        contact += base.CONTROL_TIMESTEP
+        contact += self.control_timestep
         missing = goal - self.height(physics)
-        p.tip = p.tip + float(np.clip(3 * missing, -speed, speed)) * base.CONTROL_TIMESTEP * up
+        p.tip = p.tip + float(np.clip(3 * missing, -speed, speed)) * self.control_timestep * up
         p.grip(contact)
         yield p.step()
       yield from p.wait(p.style.delay)
       while self.grasped and self.height(physics) > 0.2 * self.lift:
-        p.tip = p.tip - speed * base.CONTROL_TIMESTEP * up
+        p.tip = p.tip - speed * self.control_timestep * up
         p.grip(contact)
         yield p.step()
       yield from p.open()

@@ -57,8 +57,8 @@ class Physics(Portable):
     self.drives = np.array([model.actuator(prefix + axis).id for axis in AXES])
     self.drive_range = model.actuator_ctrlrange[self.drives].copy()
     self.jaw = model.actuator(prefix + "jaw").id if self.has_jaw else -1
-    self._targets = [model.site(f"target{i}").id for i in range(targets)]
-    model.site_sameframe[self._targets] = 0  # else a site at its body's origin stays there
+    self.target_sites = [model.site(f"target{i}").id for i in range(targets)]
+    model.site_sameframe[self.target_sites] = 0  # else a site at its body's origin stays there
     self._coarse = _spread(self.organ.xpos0, COARSE)
     self._coarse0 = self.organ.xpos0[self._coarse]
     self._trocar = trocar.trocar(model, prefix)
@@ -273,7 +273,7 @@ class Physics(Portable):
     size: float | None = None,
   ) -> None:
     """Puts target site `index` at `pos` [m], for the pictures; yellow where it is its turn now."""
-    site = self._targets[index]
+    site = self.target_sites[index]
     if size is not None:
       self.model.site_size[site] = size
     self.model.site_rgba[site, :3] = scenes.NOW if now else scenes.LATER

@@ -200,13 +200,13 @@ class Trace(Task):
     yield from p.push(0.08, -up, lambda: self.done > 0, most=3.0)
     # Pulls a point along the curve and keeps the force by its height.
     at, height, contact = 0.0, float((p.tip - self.curve[0]) @ up), 0.0
-    step = 0.02 * p.style.speed * base.CONTROL_TIMESTEP / _STEP
+    step = 0.02 * p.style.speed * self.control_timestep / _STEP
     while self.done < len(self.curve):
-      contact += base.CONTROL_TIMESTEP
+      contact += self.control_timestep
       at = min(at + step, self.done + 2.0, len(self.curve) - 1)
       force = float(np.linalg.norm(physics.contact_force()))
       error = 0.12 * p.excess(contact) - force
-      height -= float(np.clip(0.08 * error, -0.01, 0.01)) * base.CONTROL_TIMESTEP
+      height -= float(np.clip(0.08 * error, -0.01, 0.01)) * self.control_timestep
       k = int(at)
       ahead = self.curve[min(k + 1, len(self.curve) - 1)]
       rest = self.curve[k] + (at - k) * (ahead - self.curve[k])
