@@ -40,9 +40,10 @@ from dm_env import specs
 from palpate.models import trocar
 from scipy.spatial import cKDTree
 
-from . import observation, scenes, stage
+from . import observation, randomisation, scenes, stage
 from .environment import CONTROL_TIMESTEP, Environment
 from .physics import AXES, JAWS, Physics, check_scene
+from .randomisation import Ranges
 from .recording import Event, Settings
 from .scenes import ORGAN, Scene
 from .stage import STATE, Stage
@@ -63,6 +64,7 @@ class Task(control.Task):
     random: everything random comes from here
     control_timestep: between actions [s]
     observed: what is observed
+    drawn: what `randomisation` drew for this episode
     outcome: how the episode ended, see the module's head; None while it runs
     progress: see the module's head [-]
     best: best progress so far [-]
@@ -86,6 +88,7 @@ class Task(control.Task):
     reward: str = "dense",
     observations: Sequence[str] | None = None,
     pixels: Sequence[int] | None = None,
+    randomise: Ranges | None = None,
     model: "str | os.PathLike[str] | mj.MjSpec | None" = None,
     organ: str = ORGAN,
   ):
@@ -103,6 +106,7 @@ class Task(control.Task):
       observations: groups (`sensors`, `state`), pictures (`pixels`, `depth`, `segmentation`,
         `points`) and names of single observations; the two groups by default
       pixels: height and width of pictures; given without a picture's name, `pixels` is observed
+      randomise: ranges of what is drawn anew for each episode, see `randomisation`
       model: a scene of your own, a file or an MjSpec, in place of `scene`: it has the instrument,
         the camera `laparoscope` and the sites `target0`, ... in the world
       organ: name of the organ in it
@@ -120,6 +124,8 @@ class Task(control.Task):
     self.reward = reward
     self.observed = observation.choose(observations, pixels)
     self.control_timestep = CONTROL_TIMESTEP
+    self.ranges = randomisation.check(randomise or {})
+    self.drawn: dict[str, Any] = {}
     self.organ = organ
     self._models: dict[int | None, Stage] = {}
     self.visualize_reward = False
@@ -232,6 +238,7 @@ class Task(control.Task):
       physics.use(place.model, self.prefix, self.targets, self.organ)
     place.restore()
     mj.mj_setState(place.model, physics.data.ptr, place.state, STATE)
+    self.drawn = randomisation.apply(self.ranges, self.random, physics, place)
     mj.mj_kinematics(place.model, physics.data.ptr)
     physics.moved()
     limit = self.jitter

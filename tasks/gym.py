@@ -6,7 +6,7 @@
 Observations are those of the exercise (see `observation`), a `Dict` of boxes. `terminated` is set
 by success and failure, `truncated` by the time limit, which is the task's, or `max_episode_steps`
 of `gymnasium.make` if that is less. `info` has `success`, `outcome` (None while it runs),
-`progress` and `peak_force` [N]; with
+`progress` and `peak_force` [N]; with ranges to `randomise`, what was drawn as `randomised`; with
 `record=True` the last step has `metrics`: the known skill metrics of the episode [SI] by name.
 
 Nothing is drawn before the first reset, so processes that an asynchronous vector forks can draw.
@@ -151,6 +151,8 @@ class Exercise(gymnasium.Env):
       "progress": float(self._task.progress),
       "peak_force": float(self._physics.peak_force),
     }
+    if self._task.ranges:
+      info["randomised"] = {name: np.array(value) for name, value in self._task.drawn.items()}
     return info
 
   def render(self):

@@ -71,12 +71,14 @@ def test_a_step_without_a_reset_is_refused():
 
 def test_pictures_are_in_their_spaces():
   names = ["sensors", "pixels", "depth", "segmentation", "points"]
-  env = make(observations=names, pixels=(8, 12))
+  env = make(observations=names, pixels=(8, 12), randomise={"light": (0.5, 2)})
   check_env(env.unwrapped, skip_render_check=True)
   space = env.observation_space
   assert space["pixels"] == gymnasium.spaces.Box(0, 255, (8, 12, 3), np.uint8)
   assert space["segmentation"] == gymnasium.spaces.Box(0, 3, (8, 12), np.uint8)
   assert space["points"].dtype == np.float32 and "progress" not in space.keys()
+  _, info = env.reset(seed=0)
+  assert 0.5 <= info["randomised"]["light"] <= 2
 
 
 def test_the_frame_rate_is_that_of_the_control_steps():
