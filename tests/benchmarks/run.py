@@ -12,6 +12,7 @@ sys.path.insert(0, str(pathlib.Path(__file__).parents[1]))  # `benchmarks`, `ref
 from benchmarks.results import BenchError
 
 BENCHES = {
+  "attacks": "what random attacks break",
   "error": "run time against error, beside MuJoCo's own flex",
   "experts": "how many of its episodes each expert solves; the references",
   "inertia": "what the effective inertia does to the contact force",
