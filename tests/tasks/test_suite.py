@@ -77,10 +77,6 @@ def test_specs_and_observations(env):
     for name, value in timestep.observation.items():
       specs[name].validate(value)
       assert value.dtype == np.float64 and np.isfinite(value).all(), name
-  module = __import__(f"palpate.tasks.{type(env.task).__module__.split('.')[-1]}", fromlist="x")
-  base = __import__("palpate.tasks.base", fromlist="x")
-  for name in specs:  # every observation is in a table
-    assert f"`{name}`" in (module.__doc__ + base.__doc__), name
 
 
 def test_a_seed_decides_everything(env):
