@@ -7,7 +7,18 @@ import warp as wp
 from palpate.tissue import step
 from palpate.tissue.body import Body
 
-from . import coupling, declare, graphs, mjstruct, nodal, nodes, slots, weights, windowed
+from . import (
+  coupling,
+  declare,
+  declare_windows,
+  graphs,
+  mjstruct,
+  nodal,
+  nodes,
+  slots,
+  weights,
+  windowed,
+)
 
 
 def bind(w, model: int):
@@ -67,6 +78,8 @@ def bind(w, model: int):
       ahead = graphs.record_all((near, does.enter_ahead), (device, solve))
       w.resident.begin_graph = ahead[0][1]
       w.resident.rest = graphs.record_all((near, does.look_ahead))
+    if w.turn is not None:
+      w.turn.bind(model, w.organ.windows)
   _watch(w, model)
 
 
@@ -79,14 +92,14 @@ def _watch(w, model: int):
   w.time_step = float(m.opt.timestep)
   w.integrator = mjstruct.view(option + type(m.opt).integrator.offset, 1, np.int32).data
   w.static = [(view, view.tobytes()) for view in declare.static_places(m, w.organ)]
-  if w.turn is not None:
-    w.turn.bind(model, w.organ.windows)
 
 
 def _touched(w, model: int) -> weights.Weights:
-  """Returns what the contacts with the organ's own flex, or with its windows, get weights by."""
-  flexes = w.organ.windows.flex if w.organ.windows else w.organ.flex
-  out = weights.make(model, w.data, flexes, w.flags)
+  """Returns what contacts with the organs of the model get weights by.
+
+  With all of them, since one that looks for contacts again has those of the others found again.
+  """
+  out = weights.make(model, w.data, declare_windows.touching(model, w.instance), w.flags)
   w.views["mine"] = out.mine
   return out
 
