@@ -52,6 +52,7 @@ import numpy as np
 from dm_control.mujoco import wrapper
 from dm_control.rl import control
 from dm_env import specs
+from palpate import Organ
 from palpate.models import trocar
 from scipy.spatial import cKDTree
 
@@ -64,7 +65,9 @@ CONTROL_TIMESTEP = 0.02  # [s]
 RATES = (1.0, 1.0, 3.0, 0.12)  # pitch, yaw, roll [rad/s], insertion [m/s]
 REWARDS = ("dense", "sparse")
 
-_SETTLE = 0.3  # [s]
+# An organ is at rest when its fastest node is slower than so much [m/s]; it is waited for so long,
+# and looked at so often [s].
+_STILL, _SETTLE, _LOOK = 1e-7, 3.0, 0.1
 _FACING = 0.75  # least cosine between a target's normal and the way to the trocar
 _PIN_GAP = 0.012  # targets keep this far from pinned nodes [m]
 _SLACK = 1e-6  # what rounding may add to an action
@@ -182,7 +185,11 @@ class Task(control.Task):
       low = model.actuator(name).ctrlrange[0]
       data.ctrl[model.actuator(name).id] = low
       data.qpos[model.joint(name).qposadr[0]] = low
-    mj.mj_step(model, data, round(_SETTLE / model.opt.timestep))
+    organ = Organ(model, data, self.organ)
+    for _ in range(round(_SETTLE / _LOOK)):
+      mj.mj_step(model, data, round(_LOOK / model.opt.timestep))
+      if np.linalg.norm(organ.xvel, axis=1).max() < _STILL:
+        break
     data.qvel[:] = 0
     data.qacc_warmstart[:] = 0
     data.time = 0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from palpate.tissue import config as configuration
 from palpate.tissue import device as devices
+from palpate.tissue import fill
 from palpate.tissue import mesh as topology
 from palpate.tissue.config import Config
 
@@ -33,18 +34,20 @@ def read(model: int, instance: int) -> Declaration:
   mesh = topology.build(name, rest, elem)
   config = configuration.parse(name, declare.keys(model, instance), len(elem), mesh.closed)
   declare.check_volume(name, mesh, config)
-  free = np.ones(nvert, bool)
+  if config.elements == "solid":
+    mesh = fill.fill(name, mesh)
+  free = np.ones(mesh.nvert, bool)
   for vertex in config.pin:
     if vertex >= nvert:
       raise ValueError(f"organ {name!r}: pin has {vertex}, expected vertices in [0, {nvert})")
     free[vertex] = False
   if not free.any():
     raise ValueError(f"organ {name!r}: all vertices are pinned, expected some that move")
-  area = topology.vertex_areas(rest, elem)
-  mass = config.mass * area / area.sum()
+  share = fill.vertex_volumes(mesh) if len(mesh.tet) else topology.vertex_areas(rest, elem)
+  mass = config.mass * share / share.sum()
   windows = _windows(model, m, instance, name, config, mesh, mass, (frame, origin))
   _check_neighbours(m, model, instance, name, windows, frame, origin, rest)
-  absent = np.full(nvert, -1)
+  absent = np.full(mesh.nvert, -1)
   return declare.cached(
     float(m.opt.timestep),
     name=name,
@@ -52,7 +55,7 @@ def read(model: int, instance: int) -> Declaration:
     mesh=mesh,
     config=config,
     free=free,
-    body=np.full(nvert, parent),
+    body=np.full(mesh.nvert, parent),
     dofadr=absent,
     qposadr=absent,
     stateadr=absent,
@@ -118,7 +121,7 @@ def _windows(model, m, instance, name, config, mesh, mass, place) -> Windows:
   # At rest the windows stand on patches of their own: their bodies move there, so that qpos0 fits.
   # The last slot stays free; a patch of n nodes has up to 2 n - 4 triangles: see `native/slot.h`.
   room = [min(n - 1, int(t) // 2 + 2) for n, t in zip(sizes, elem_num, strict=True)]
-  home = _home_slots(mesh.elem, mesh.nvert, sizes, room)
+  home = _home_slots(mesh.elem, mesh.nouter, sizes, room)
   used = home >= 0
   stand = mjstruct.view(m.body_pos, (m.nbody, 3))[body]
   stand[used] = np.einsum("kij,kj->ki", turn[used], offset[used] + mesh.rest[home[used]])

@@ -54,7 +54,7 @@ def stiffness(
   Returns:
     whether it is; most times its inertia in `nodal` that a pressed node may have [-]
   """
-  sample = _spread(organ.mesh.rest, np.flatnonzero(organ.free), _FEW)
+  sample = _spread(organ.mesh.rest, _outer(organ.mesh, organ.free), _FEW)
   alone = _by_itself(m, organ, body, config, sample)
   stiff = np.quantile(alone / masses(m, organ)[sample], 0.75) > _STIFF
   return bool(stiff), _PRESSED * max(1.0, float(np.median(alone / nodal[sample])))
@@ -187,7 +187,7 @@ def effective_inertia(
     gain: factor of K in A [s^2]
   """
   area = topology.vertex_areas(mesh.rest, mesh.elem)
-  sample = _spread(mesh.rest, np.flatnonzero(free), _SAMPLES)
+  sample = _spread(mesh.rest, _outer(mesh, free), _SAMPLES)
   response = _responses(body, mesh, mass, free, h, radius, gain, sample)
   # Per area, so that finer parts of the surface get less.
   specific = 1 / response / area[sample]
@@ -240,6 +240,11 @@ def _responses(
         f"precision can solve; the organ is {size:.3g} m long: is its scale right?"
       )
   return response
+
+
+def _outer(mesh: Mesh, free: np.ndarray) -> np.ndarray:
+  """Returns the nodes of the surface that move."""
+  return np.flatnonzero(free[: mesh.nouter])
 
 
 def _spread(rest: np.ndarray, candidates: np.ndarray, count: int) -> np.ndarray:

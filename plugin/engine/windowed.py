@@ -270,10 +270,10 @@ def draw(w, model: int, data: int):
   m, d = mjstruct.Model.from_address(model), mjstruct.Data.from_address(data)
   organ = w.organ
   start = int(mjstruct.view(m.flex_vertadr, m.nflex, np.int32)[organ.flex])
-  n = organ.mesh.nvert
+  n = organ.mesh.nouter
   prepare.show(m, organ, shown=True)
   if w.resident:
     w.resident.fetch()
   out = mjstruct.view(d.flexvert_xpos, (m.nflexvert, 3))[start : start + n]
-  disp = w.boxes["own"].motion.disp.numpy()
-  out[:] = organ.origin + (organ.mesh.rest + disp) @ organ.frame.T
+  disp = w.boxes["own"].motion.disp.numpy()[:n]
+  out[:] = organ.origin + (organ.mesh.rest[:n] + disp) @ organ.frame.T
