@@ -43,7 +43,7 @@ class Physics(mujoco.Physics):
     if model is not self.model.ptr:
       self._reload_from_data(wrapper.MjData(wrapper.MjModel(model)))
     self.organ = Organ(model, self.data.ptr, organ)
-    self.peak_force = 0.0
+    self.peak_force = self.peak_shaft = 0.0
     self._nodes: np.ndarray | None = None
     self._camera = model.camera(CAMERA).id
     self._sensors = {}
@@ -70,20 +70,23 @@ class Physics(mujoco.Physics):
     return "jaw" in self._sensors
 
   def step(self, nstep: int = 1) -> None:
-    """Advances the physics and keeps the largest contact force of all the steps."""
+    """Advances the physics; keeps the largest contact forces on tip and shaft of all the steps."""
     with self.check_invalid_state():
       model, data = self.model.ptr, self.data.ptr
-      force, peak = data.sensordata[self._sensors["tip_force"]], 0.0
+      tip, shaft = (data.sensordata[self._sensors[f"{part}_force"]] for part in ("tip", "shaft"))
+      tip_peak, shaft_peak = 0.0, 0.0
       sides = [self._sensors[f"touch_{side}"].start for side in ("left", "right") if self.has_jaw]
       grip = np.zeros(len(sides))
       for _ in range(nstep):
         mj.mj_step2(model, data)
-        peak = max(peak, float(force @ force))
+        tip_peak = max(tip_peak, float(tip @ tip))
+        shaft_peak = max(shaft_peak, float(shaft @ shaft))
         if sides:
           grip += data.sensordata[sides]
         mj.mj_step1(model, data)
       # Pinched folds make single steps of large jaw force: the jaws' is a mean over the step.
-      self.peak_force = max(peak**0.5, float(grip.max(initial=0.0)) / nstep)
+      self.peak_force = max(tip_peak**0.5, float(grip.max(initial=0.0)) / nstep)
+      self.peak_shaft = shaft_peak**0.5
       self.moved()
 
   def forward(self) -> None:
@@ -149,9 +152,9 @@ class Physics(mujoco.Physics):
     """Returns the contact force on the instrument below the shaft [N]  (3,)."""
     return -self.sensor("tip_force")
 
-  def shaft_force(self) -> float:
-    """Returns the magnitude of the contact force on the shaft [N]."""
-    return float(np.linalg.norm(self.sensor("shaft_force")))
+  def shaft_force(self) -> np.ndarray:
+    """Returns the contact force on the shaft [N]  (3,)."""
+    return -self.sensor("shaft_force")
 
   def gripper(self) -> np.ndarray:
     """Returns opening and its target [rad], force on the left and right jaw [N]  (4,)."""
