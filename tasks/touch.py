@@ -3,7 +3,7 @@
 Own observations: `target` (3,), from the tip to the point to touch [m]; `normal` (3,), of the
 surface there [-]; `held` (1,), share of the time of a touch done [-].
 
-Progress: (points touched + 0.8 * closeness + 0.1 * held) / points, closeness counting from the
+Progress: (points touched + 0.5 * closeness + 0.2 * held) / points, closeness counting from the
 point before. A point is touched by a contact of 0.1 s, of 0.03 N or more, that was within the
 tolerance of it and the force limit from its start: a ram is to be let go of, and so is a miss,
 which is what starts elsewhere. Success: all points. Failure: a force above the damage limit, or the
@@ -109,7 +109,7 @@ class Touch(Task):
       self.outcome = "success"
       return 1.0
     near = base.closeness(self.distance(physics), self.distance0)
-    return (self.done + 0.8 * near + 0.1 * self.held / DWELL) / self.targets
+    return (self.done + 0.5 * near + 0.2 * self.held / DWELL) / self.targets
 
   def observe(self, physics: Physics) -> dict[str, np.ndarray]:
     """Returns target, normal and held."""

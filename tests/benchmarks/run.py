@@ -13,6 +13,7 @@ import screen
 from benchmarks.results import BenchError
 
 BENCHES = {
+  "attack": "policies that look at nothing, searched for return",
   "error": "run time against error, beside MuJoCo's own flex",
   "experts": "how many of its episodes each expert solves; the references",
   "inertia": "what the effective inertia does to the contact force",
