@@ -5,10 +5,10 @@
 
 Observations are those of the exercise (see `base`), a `Dict` of float64 boxes; actions and rewards
 too. `terminated` is set by success and failure, `truncated` by the time limit. `info` has
-`success`, `outcome` (None while it runs), `progress`, `peak_force` and `shaft_force` (the largest of
-the step [N]), and `cost`, at least 0, the sum of `cost_force`, `cost_shaft` and `cost_damage` (see
-`safety`), as constrained reinforcement learning has it; with `record=True` the last step has
-`metrics` as well: the known skill metrics of the episode [SI] by name.
+`success`, `outcome` (None while it runs), `progress`, the largest forces of the step, `peak_force`
+and `shaft_force` [N], and, as constrained reinforcement learning has it, `cost`, at least 0: the
+sum of `cost_force`, `cost_shaft` and `cost_damage`, see `safety`. With `record=True` the last step
+has `metrics` as well: the known skill metrics of the episode [SI] by name.
 """
 
 import math

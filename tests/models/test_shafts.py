@@ -3,20 +3,15 @@
 import mujoco
 import numpy as np
 import pytest
-from palpate.models import trocar
-
-EDGE = """
-<mujoco><worldbody>
-  <flexcomp name="edge" type="direct" dim="2" radius="0.001" mass="0.01" element="0 1 2"
-    point="0.002 -0.04 -0.1  0.002 0.04 -0.1  0.05 0 -0.1">
-    <contact selfcollide="none"/><edge damping="1e-9"/><pin id="0 1 2"/>
-  </flexcomp>
-</worldbody></mujoco>"""
+from palpate.models import mjcf, trocar
 
 
 @pytest.mark.parametrize("name", trocar.NAMES)
-def test_an_edge_far_from_its_nodes_does_not_go_through(name):
-  spec = mujoco.MjSpec.from_string(EDGE)
+def test_an_edge_far_from_its_nodes_does_not_go_through(scenes, name):
+  points = [[0.002, -0.04, -0.1], [0.002, 0.04, -0.1], [0.05, 0, -0.1]]
+  flex = scenes.flex(points, [[0, 1, 2]], mjcf.EDGE, "edge", pin=(0, 1, 2), radius=0.001)
+  world = f"<mujoco><worldbody>{flex}</worldbody></mujoco>"
+  spec = mujoco.MjSpec.from_string(world)
   trocar.attach(spec, name, "tool/")
   model = spec.compile()
   data = mujoco.MjData(model)

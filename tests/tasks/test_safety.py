@@ -1,4 +1,4 @@
-"""What hurts costs: force over the limit, damage, the shaft against the organ; and rams are no touches."""
+"""Force over the limit, damage and the shaft against the organ cost, and rams are no touches."""
 
 import numpy as np
 import pytest
@@ -61,7 +61,7 @@ def sweep(env, speed, steps=400):
   end = on(physics, center)
   end[3] = min(end[3] + 0.06, physics.drive_range[3, 1])
   for away in np.arange(0.5, 1.0, 0.05):  # where the whole shaft is beside the organ
-    physics.set_joints(end + [0, away, 0, 0])
+    physics.set_joints(end + np.array([0, away, 0, 0]))
     if not physics.data.ptr.ncon:
       break
   rewards, costs, forces, through = [], [], [], False
