@@ -79,8 +79,9 @@ class Physics(mujoco.Physics):
       grip = np.zeros(len(sides))
       for _ in range(nstep):
         mj.mj_step2(model, data)
-        tip_peak = max(tip_peak, float(tip @ tip))
-        shaft_peak = max(shaft_peak, float(shaft @ shaft))
+        if data.ncon:
+          tip_peak = max(tip_peak, float(tip @ tip))
+          shaft_peak = max(shaft_peak, float(shaft @ shaft))
         if sides:
           grip += data.sensordata[sides]
         mj.mj_step1(model, data)

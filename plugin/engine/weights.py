@@ -6,6 +6,7 @@ flicker where a tool presses. MuJoCo 4.0 has it right, and is left alone.
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
+
 import functools
 
 import mujoco
@@ -27,11 +28,11 @@ _SPARSE_FROM = 60  # dofs from which MuJoCo's rows are sparse where it may choos
 
 @struct
 class Weights:
-  """An organ's flexes and MuJoCo's memory under its own names."""
+  """The organs' flexes and MuJoCo's memory under its own names."""
 
   nv: int  # dofs of the model
   memory: Array(wp.uint64, ("nword",))  # the mjData itself
-  mine: ints("nflex")  # whether a flex is the organ's, or a window of it
+  mine: ints("nflex")  # whether a flex is an organ's, or a window of one
   flags: ints(len(FLAG))  # see FLAG
   # mjOption:
   jacobian: ints(1)
@@ -99,16 +100,23 @@ def are_wrong() -> bool:
   return not np.allclose(found, [1 - at[0] - at[1], at[0], at[1]], atol=1e-3)
 
 
-def make(w, model: int):
-  """Returns `Weights` of a workspace's organ."""
-  m, windows = mjstruct.Model.from_address(model), w.organ.windows
-  mine = np.zeros(m.nflex, np.int32)
-  mine[windows.flex if windows else w.organ.flex] = 1
-  out = coupling.mujoco_arrays(model, w.data, Weights)
-  out.nv = m.nv
-  out.memory = coupling.wrap(w.data, mjstruct.size(mjstruct.Data) // 8, wp.uint64)
-  out.mine = w.views["mine"] = wp.array(mine, dtype=int, device="cpu")
-  out.flags = wp.array(w.flags, dtype=int, device="cpu", copy=False)
+def make(model: int, data: int, flexes, flags: np.ndarray | None = None) -> Weights:
+  """Returns `Weights` of an mjModel and mjData.
+
+  Args:
+    model: address of the mjModel
+    data: address of the mjData
+    flexes: the flexes whose contacts get their weights
+    flags: where to report, see FLAG
+  """
+  mine = np.zeros(mjstruct.Model.from_address(model).nflex, np.int32)
+  mine[flexes] = 1
+  out = coupling.mujoco_arrays(model, data, Weights)
+  out.nv = mjstruct.Model.from_address(model).nv
+  out.memory = coupling.wrap(data, mjstruct.size(mjstruct.Data) // 8, wp.uint64)
+  out.mine = wp.array(mine, dtype=int, device="cpu")
+  flags = np.zeros(len(FLAG), np.int32) if flags is None else flags
+  out.flags = wp.array(flags, dtype=int, device="cpu", copy=False)
   return out
 
 

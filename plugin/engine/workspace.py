@@ -10,12 +10,11 @@ import numpy as np
 import warp as wp
 from palpate.tissue import body as bodies
 from palpate.tissue import config as configuration
-from palpate.tissue import shape
+from palpate.tissue import fill, shape
 from palpate.tissue.body import Body
 from palpate.tissue.config import Config
 
 from . import (
-  apart,
   coupling,
   declare,
   declare_windows,
@@ -31,6 +30,7 @@ from .bind import bind
 from .coupling import Phases
 from .declare import Declaration
 from .layout import FLAG, HEAD
+from .pierce import Watch
 from .resident import Resident
 from .turns import Turn
 
@@ -56,12 +56,13 @@ class Workspace:
     identity: tells that model from others
     chosen: whether the configuration was changed here, not by a copy
     turn: this mjData's part in the model's windows, or None
-    before, after: recorded graphs of a step's forces around the solve
-    solve: recorded graphs of the solve and what it needs, each on one device
+    before: recorded graph of a step's forces before the solve
+    solve: recorded graphs of the solve and what is around it, each on one device
+    after: recorded graph of the forces after it where the motion is on a device, else part of it
     leave: recorded graph that takes the contact forces after MuJoCo's step
     respond: recorded graphs of the organ's response to their change; none where the scheme has none
-    end: recorded graph that ends a step without that
-    advance: recorded graph of the plugin state's step
+    advance: recorded graph of the plugin state's step after that
+    end: recorded graph that ends a step without such a response, and steps the plugin state
     place: recorded graph that puts the windows where the plugin state says, or None
     resident: keeper of a motion that stays on the device, or None
     stiff: whether the response is needed, see `inertia.stiffness`
@@ -77,6 +78,8 @@ class Workspace:
     nefc: the number of MuJoCo's constraints comes first
     strange: whether the plugin state is not one of this organ
     noticed: whether it was said that windows came without their state
+    torn: whether a signal's handler has ended a callback of the last step
+    watch: looks whether tools come through the surface
     nbad: MuJoCo's warnings of bad states that were looked at since the last reset
     model_step: the model's time step comes first [s]
     time_step: time step that the armature is for [s]
@@ -114,15 +117,17 @@ class Workspace:
   stiff: bool = False
   heaviest: np.ndarray = dataclasses.field(default_factory=lambda: np.ones(1))
   computed: bool = False
-  flags: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(len(FLAG), np.int32))
   policy: memoryview = dataclasses.field(default_factory=lambda: np.zeros(1, np.int32).data)
   counts: memoryview = dataclasses.field(default_factory=lambda: np.zeros(1, np.int32).data)
-  status: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(4, np.float32))
   error: str | None = None
   missed: tuple[int, int] = (0, 0)
   strange: bool = False
   noticed: bool = False
+  torn: bool = False
+  watch: Watch = dataclasses.field(default_factory=Watch)
   # Views that every step looks at: an item of a memoryview costs a tenth of one of an array.
+  flags: memoryview = dataclasses.field(default_factory=lambda: np.zeros(len(FLAG), np.int32).data)
+  status: memoryview = dataclasses.field(default_factory=lambda: np.zeros(4, np.float32).data)
   warning: memoryview = dataclasses.field(default_factory=lambda: memoryview(b""))
   nefc: memoryview = dataclasses.field(default_factory=lambda: memoryview(b"\0"))
   nbad: int = 0
@@ -145,13 +150,17 @@ class Workspace:
     if self.strange:
       self._check_state()
       self.strange = False
+    if self.turn is None:
+      self._run()
+    else:
+      with self.turn.lock:
+        self._run()
+
+  def _run(self):
     if self.turn is not None:
-      if self.turn.refused:
-        self.turn.stand_back()
-        return
       # The model's windows may not be those of this state, which was set from outside or shares the
       # model with another: contacts must be found again with the windows in place.
-      if not self.turn.begin() or self._is_astray():
+      if self._is_astray() or not self.turn.mine:
         self._find_contacts_again()
     wp.capture_launch(self.before)
     if self.turn is not None:
@@ -169,9 +178,9 @@ class Workspace:
       self.resident.send()
       graphs.launch_all(self.resident.left_to_do())
       self.resident.look()
+      wp.capture_launch(self.after)
     else:
       graphs.launch_all(self.solve)
-    wp.capture_launch(self.after)
     self.computed = True
 
   def _check_model(self):
@@ -210,7 +219,8 @@ class Workspace:
     if self.qpos.tobytes() == self.stood:
       return False
     far = windowed.find_astray(self)
-    if far > _ASTRAY and not self.noticed:
+    torn, self.torn = self.torn, False
+    if far > _ASTRAY and not (self.noticed or torn):
       self.noticed = True
       mjstruct.warn(
         f"organ {self.organ.name!r}: qpos of its windows was set without plugin_state, which has "
@@ -220,7 +230,7 @@ class Workspace:
 
   def _find_contacts_again(self):
     self.put_windows()
-    apart.find_contacts(self.model, self.data)
+    windowed.find_contacts_again(self)
 
   def put_windows(self):
     """Puts the windows where the plugin state says."""
@@ -238,11 +248,11 @@ class Workspace:
       self.signature[0] = self.organ.signature
     if self.turn is None:
       self._step()
-    elif not self.turn.refused:
-      self.turn.check()
-      self._step()
-      self.turn.end()
-      self.stood = self.qpos.tobytes()
+    else:
+      with self.turn.lock:
+        self._step()
+        self.turn.end()
+        self.stood = self.qpos.tobytes()
 
   def _step(self):
     computed, self.computed = self.computed, False
@@ -263,9 +273,7 @@ class Workspace:
     self.flags[FLAG.answered] = responds
     if responds:
       self._answer()
-    else:
-      wp.capture_launch(self.end)
-    wp.capture_launch(self.advance)
+    wp.capture_launch(self.advance if responds else self.end)
     if self.resident:
       self.resident.step(computed)
 
@@ -296,21 +304,16 @@ class Workspace:
 
   def forget(self):
     """Forgets what went wrong."""
-    self.error = None
-    if self.turn is not None:
-      self.turn.refused = False
+    self.error, self.watch = None, Watch()
 
 
 def place(w: Workspace, model: int):
-  """Puts the windows of a model where the plugin state says, unless another thread steps it."""
+  """Puts the windows of a model where the plugin state says."""
   attach(w, model)
-  if w.turn is None:
-    return
-  if w.turn.is_free():
-    w.put_windows()
-    w.stood = w.qpos.tobytes()
-  else:
-    w.turn.leave()
+  if w.turn is not None:
+    with w.turn.lock:
+      w.put_windows()
+      w.stood = w.qpos.tobytes()
 
 
 def attach(w: Workspace, model: int):
@@ -328,7 +331,8 @@ def state_size(model: int, instance: int) -> int:
   names = mjstruct.config(model, instance, "window").split()
   if names:
     # Asked before MuJoCo has filled in the flexes: what `windowed` needs is at most this.
-    return windowed.state_size(m.nflexvert, 0, m.ngeom * len(names))
+    inside = fill.MOST if mjstruct.config(model, instance, "elements").strip() == "solid" else 0
+    return windowed.state_size((1 + inside) * m.nflexvert, 0, m.ngeom * len(names))
   return nodal.state_size(3 * len(declare.moving_bodies(m, instance)))
 
 
@@ -360,9 +364,6 @@ def make(model: int, data: int, instance: int) -> Workspace:
     w.signature = w.plugin_state[coupling.spans(organ)["signature"]].data
     if w.turn is not None:
       windowed.settle(w, model)
-      if w.turn.is_orphan():
-        wp.capture_launch(w.place)
-        w.turn.go_home()
     _feel(w, m)
     return w
 
@@ -370,7 +371,7 @@ def make(model: int, data: int, instance: int) -> Workspace:
 def _view(w: Workspace, d, m):
   """Takes views of an mjData that every step looks at."""
   fields, count = mjstruct.Data, len(d.warning)
-  w.status = w.host["status"].numpy()[0]
+  w.status = w.host["status"].numpy()[0].data
   w.warning = mjstruct.view(w.data + fields.warning.offset, 2 * count, np.int32).data
   w.nefc = mjstruct.view(w.data + fields.nefc.offset, 1, np.int32).data
   if w.organ.windows:

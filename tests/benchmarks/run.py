@@ -13,13 +13,14 @@ import screen
 from benchmarks.results import BenchError
 
 BENCHES = {
-  "attack": "policies that look at nothing, searched for return",
+  "attacks": "what random attacks break",
   "error": "run time against error, beside MuJoCo's own flex",
   "experts": "how many of its episodes each expert solves; the references",
   "inertia": "what the effective inertia does to the contact force",
   "learning": "SAC on touch/easy",
   "locality": "what leaving out solved nodes would save",
   "loop": "the whole loop, mj_step with a probe on a windowed organ",
+  "loopholes": "policies that look at nothing, searched for return",
   "peer": "mj_step in contact against MuJoCo's native flex",
   "preconditioner": "iterations with block Jacobi and multilevel",
   "press_error": "what is left of the press's force error",

@@ -1,9 +1,9 @@
-"""Attacks the exercises with policies that look at nothing: actions in time, searched for return.
+"""Loopholes of the exercises: what policies find that look at nothing, searched for return.
 
-An action a component at a few times, lines between them, the same in every episode. `constant` has
-one time, `random` tries as many at random as `cmaes` (CMA-ES; Hansen 2016, arXiv:1604.00772)
-searches with. Each is searched for on a few seeds and judged on fresh ones: what succeeds there
-without looking is chance, or a loophole. Success with cost is one too.
+Their actions are the same in every episode: one a component at a few times, with lines between.
+`constant` has one time, `random` tries as many at random as `cmaes` (CMA-ES; Hansen 2016,
+arXiv:1604.00772) searches with. Each is searched for on a few seeds and judged on fresh ones: what
+succeeds there without looking is chance, or a loophole. Success with cost is one too.
 """
 
 from __future__ import annotations
@@ -124,11 +124,11 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
   lines = [
     "Policies that look at nothing: `constant` actions, `random` ones in time, and the best that "
     "CMA-ES finds, searched for return on a few seeds and judged on fresh ones. "
-    + results.link(out / "attack.csv"),
+    + results.link(out / "loopholes.csv"),
     "",
     *plots.table(head, table),
   ]
-  return [results.page(out / "attack.md", "What the exercises give away", about, lines)]
+  return [results.page(out / "loopholes.md", "What the exercises give away", about, lines)]
 
 
-BENCH = Bench("attack", stages, run, report=report, arguments=arguments, limit=7200.0)
+BENCH = Bench("loopholes", stages, run, report=report, arguments=arguments, limit=7200.0)
