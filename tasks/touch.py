@@ -99,7 +99,7 @@ class Touch(Task):
       self.event(physics, "miss", distance)
     # A contact that was elsewhere, too strong or counted counts no more until the tip lets go.
     self.spoilt = pressing and (self.spoilt or not on or force > self.force_limit)
-    self.held = self.held + base.CONTROL_TIMESTEP if pressing and not self.spoilt else 0.0
+    self.held = self.held + self.control_timestep if pressing and not self.spoilt else 0.0
     self.pressing = pressing
     if self.held >= DWELL - 1e-9:
       self.event(physics, "target", distance, str(self.done + 1))

@@ -6,7 +6,7 @@ from palpate import tasks
 from palpate.models import trocar
 from palpate.tasks import base, performer, safety, suite
 
-FAST = np.array(base.RATES) * base.CONTROL_TIMESTEP  # of the drives in a control step
+FAST = np.array(base.RATES) * 0.02  # of the drives in a control step
 
 
 def load(name, **kwargs):
