@@ -16,14 +16,17 @@ position drives by the action times the rate:
 
 Observations are in groups to choose from, see `observation` and docs/environments.md.
 
-Reward: a task measures its progress phi in [-1, 1], 0 at the start and 1 on success. `dense` (the
-default) pays its change, phi now - phi a step ago, so that what is lost costs what it had paid, but
-nothing for a gain made above the force limit; over an episode it adds up to 1 at most. This is the
-shaping of Ng, Harada and Russell 1999. `sparse` pays 1 on the step of success and 0 elsewhere.
+Reward: a task measures its progress phi in [-1, 1], 0 at the start, 1 on success, -1 on damage.
+`dense` (the default) pays its change, phi now - phi a step ago, so that what is lost costs what it
+had paid; this is the shaping of Ng, Harada and Russell 1999. It takes a tenth of the step's cost
+(`task.cost`, see `safety`: force over the limit, shaft against the organ, damage), until the costs
+of the episode have taken 1. Rewards then add up to the progress less that: at most 1, at least -2.
+`sparse` pays 1 on the step of success and 0 elsewhere.
 The domains' formulas of phi use closeness = max(1 - distance / distance at the start, -1).
 
-An episode ends with `task.outcome`: `success`, `damage` (a force above the damage limit, the
-discount is 0 as for success), `missed` (a wrong report), or None when the time limit ended it.
+An episode ends with `task.outcome`: `success`, `damage` (a force above the damage limit, of tip or
+shaft; the discount is 0 as for success), `missed` (a wrong report), or None when the time limit
+ended it.
 """
 
 import collections
@@ -40,7 +43,7 @@ from dm_env import specs
 from palpate.models import trocar
 from scipy.spatial import cKDTree
 
-from . import observation, randomisation, scenes, stage
+from . import observation, randomisation, safety, scenes, stage
 from .environment import CONTROL_TIMESTEP, Environment
 from .physics import AXES, JAWS, Physics, check_scene
 from .randomisation import Ranges
@@ -51,6 +54,7 @@ from .stage import STATE, Stage
 RATES = (1.0, 1.0, 3.0, 0.12)  # pitch, yaw, roll [rad/s], insertion [m/s]
 REWARDS = ("dense", "sparse")
 
+_PRICE = 0.1  # of a unit of cost, in the dense reward
 _FACING = 0.75  # least cosine between a target's normal and the way to the trocar
 _PIN_GAP = 0.012  # targets keep this far from pinned nodes [m]
 _SLACK = 1e-6  # what rounding may add to an action
@@ -68,6 +72,8 @@ class Task(control.Task):
     outcome: how the episode ended, see the module's head; None while it runs
     progress: see the module's head [-]
     best: best progress so far [-]
+    cost: of the last control step, see `safety`
+    harm: what costs have taken from the dense reward so far, 1 at most [-]
     events: since the last `take_events`
   """
 
@@ -97,7 +103,7 @@ class Task(control.Task):
     Args:
       scene: what it plays in
       random: a RandomState, a seed, or None for a seed of the system's
-      force_limit: breaches are counted above it, and progress pays nothing there [N]
+      force_limit: force above it is counted and costs [N]
       damage: the episode fails above it [N]
       spread: radius of the place on the organ that targets are drawn from [m]
       jitter: how far the trocar moves from episode to episode [m]; it also turns, 0.5 deg per mm
@@ -131,6 +137,7 @@ class Task(control.Task):
     self.visualize_reward = False
     self.outcome: str | None = None
     self.progress, self.best = 0.0, 0.0
+    self.cost, self.harm = safety.Cost(), 0.0
     self.events: list[Event] = []
     if model is not None:
       own: Any = model if isinstance(model, mj.MjSpec) else mj.MjSpec.from_file(os.fspath(model))
@@ -247,8 +254,9 @@ class Task(control.Task):
     )
     self.outcome, self.events = None, []
     self.progress, self.gain, self.best = 0.0, 0.0, 0.0
-    self.peak, self._area, self._shaft = 0.0, 0.0, False
-    physics.peak_force = 0.0  # the last episode's would be in the first observation
+    self.peak, self._area = 0.0, 0.0
+    self.cost, self.harm, self._price = safety.Cost(), 0.0, 0.0
+    physics.peak_force = physics.peak_shaft = 0.0  # else the last episode's are in the first step
     self._place_instrument(physics)
     self.begin(physics)
     self.start = physics.tip_pos()
@@ -300,17 +308,20 @@ class Task(control.Task):
     """Measures the progress and looks for errors and damage."""
     self.peak = max(self.peak, physics.peak_force)
     before, self.progress = self.progress, self.advance(physics)
-    self.gain = self.progress - before
-    self.best = max(self.best, self.progress)
-    shaft = physics.shaft_force() > 0.05
-    if shaft and not self._shaft:
-      self.event(physics, "unintended_contact", label="shaft")
-    self._shaft = shaft
-    if physics.peak_force > self.damage:
-      self.outcome = "damage"
-      self.event(physics, "note", label=f"damage: {physics.peak_force:.2f} N")
+    tip, shaft, lay = physics.peak_force, physics.peak_shaft, self.cost.shaft > 0
+    self.cost = safety.cost(tip, shaft, self.force_limit, self.damage)
+    if self.cost.shaft and not lay:
+      self.event(physics, "unintended_contact", shaft, label="shaft")
+    if self.cost.damage:
+      self.outcome, self.progress = "damage", -1.0
+      what = "damage" if tip > self.damage else "damage by the shaft"
+      self.event(physics, "note", label=f"{what}: {tip if tip > self.damage else shaft:.2f} N")
     elif self.outcome == "success":
       self.event(physics, "note", label="success")
+    self.gain = self.progress - before
+    self.best = max(self.best, self.progress)
+    self._price = min(_PRICE * self.cost.total, 1.0 - self.harm)
+    self.harm += self._price
 
   def get_observation(self, physics: Physics) -> collections.OrderedDict:
     """Returns what was chosen to be observed, see `observation`."""
@@ -324,8 +335,7 @@ class Task(control.Task):
     """Returns the reward of the last step, see the module's head."""
     if self.reward == "sparse":
       return float(self.outcome == "success")
-    over = physics.peak_force > min(self.force_limit, self.damage)
-    return float(min(self.gain, 0.0) if over else self.gain)
+    return float(self.gain - self._price)
 
   def get_termination(self, physics: Physics) -> float | None:
     """Returns the final discount 0 once there is an outcome."""

@@ -44,7 +44,7 @@ class Physics(Portable):
     if model is not self.model.ptr:
       self._reload_from_data(wrapper.MjData(wrapper.MjModel(model)))
     self.organ = Organ(model, self.data.ptr, organ)
-    self.peak_force = 0.0
+    self.peak_force = self.peak_shaft = 0.0
     self._nodes: np.ndarray | None = None
     self._camera = model.camera(CAMERA).id
     self._sensors = {}
@@ -74,16 +74,17 @@ class Physics(Portable):
     return "jaw" in self._sensors
 
   def step(self, nstep: int = 1) -> None:
-    """Advances the physics and keeps the largest contact force of all the steps."""
+    """Advances the physics; keeps the largest contact forces on tip and shaft of all the steps."""
     with self.check_invalid_state():
       model, data = self.model.ptr, self.data.ptr
-      sensor, peak2, left, right = data.sensordata.data, 0.0, 0.0, 0.0
-      x = self._sensors["tip_force"].start
+      sensor, tip2, shaft2, left, right = data.sensordata.data, 0.0, 0.0, 0.0, 0.0
+      x, y = (self._sensors[f"{part}_force"].start for part in ("tip", "shaft"))
       sides = [self._sensors[f"touch_{side}"].start for side in ("left", "right") if self.has_jaw]
       for k in range(nstep):
         mj.mj_step2(model, data)
-        # In plain numbers: this runs every millisecond.
-        peak2 = max(peak2, sensor[x] ** 2 + sensor[x + 1] ** 2 + sensor[x + 2] ** 2)
+        if data.ncon:  # in plain numbers: this runs every millisecond
+          tip2 = max(tip2, sensor[x] ** 2 + sensor[x + 1] ** 2 + sensor[x + 2] ** 2)
+          shaft2 = max(shaft2, sensor[y] ** 2 + sensor[y + 1] ** 2 + sensor[y + 2] ** 2)
         if sides:
           left += sensor[sides[0]]
           right += sensor[sides[1]]
@@ -91,7 +92,8 @@ class Physics(Portable):
           self._inner = self._jaws.inner_force(model, data)
         mj.mj_step1(model, data)
       # Pinched folds make single steps of large jaw force: the jaws' is a mean over the step.
-      self.peak_force = max(peak2**0.5, left / nstep, right / nstep)
+      self.peak_force = max(tip2**0.5, left / nstep, right / nstep)
+      self.peak_shaft = shaft2**0.5
       self.moved()
 
   def forward(self) -> None:
@@ -165,9 +167,9 @@ class Physics(Portable):
     """Returns the contact force on the instrument below the shaft [N]  (3,)."""
     return -self.sensor("tip_force")
 
-  def shaft_force(self) -> float:
-    """Returns the magnitude of the contact force on the shaft [N]."""
-    return float(np.linalg.norm(self.sensor("shaft_force")))
+  def shaft_force(self) -> np.ndarray:
+    """Returns the contact force on the shaft [N]  (3,)."""
+    return -self.sensor("shaft_force")
 
   def gripper(self) -> np.ndarray:
     """Returns opening and its target [rad], force on the left and right jaw [N]  (4,)."""
