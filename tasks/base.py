@@ -136,8 +136,7 @@ class Task(control.Task):
     self._models: dict[int | None, Stage] = {}
     self.visualize_reward = False
     self.outcome: str | None = None
-    self.progress, self.best = 0.0, 0.0
-    self.cost, self.harm = safety.Cost(), 0.0
+    self.progress, self.best, self.cost, self.harm = 0.0, 0.0, safety.Cost(), 0.0
     self.events: list[Event] = []
     if model is not None:
       own: Any = model if isinstance(model, mj.MjSpec) else mj.MjSpec.from_file(os.fspath(model))
