@@ -15,7 +15,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from . import suite
+from . import episode, suite
 from .display import Window
 from .recorder import Recorder
 from .scenes import CAMERA
@@ -81,7 +81,10 @@ class Exercise(gymnasium.Env):
     timestep = self.environment.reset()
     self._recorder = None
     if self._record:
-      self._recorder = Recorder(["instrument"], self._task.settings(), self._task.watch)
+      self._recorder = Recorder(
+        ["instrument"], self._task.settings(), self._task.watch,
+        substeps=episode.substeps(self.environment),
+      )  # fmt: skip
       for name, value in self._task.constants(self._physics).items():
         self._recorder.attach(name, value)
       self._recorder.append(**self._task.sample(self._physics))

@@ -12,6 +12,7 @@ from palpate import Organ
 from palpate.models import trocar
 
 from . import scenes
+from .metrics import surface_strain
 from .scenes import CAMERA, ORGAN
 
 AXES = ("pitch", "yaw", "roll", "insertion")
@@ -43,7 +44,7 @@ class Physics(mujoco.Physics):
     if model is not self.model.ptr:
       self._reload_from_data(wrapper.MjData(wrapper.MjModel(model)))
     self.organ = Organ(model, self.data.ptr, organ)
-    self.peak_force = 0.0
+    self.quiet()
     self._nodes: np.ndarray | None = None
     self._camera = model.camera(CAMERA).id
     self._sensors = {}
@@ -73,18 +74,38 @@ class Physics(mujoco.Physics):
     """Advances the physics and keeps the largest contact force of all the steps."""
     with self.check_invalid_state():
       model, data = self.model.ptr, self.data.ptr
-      force, peak = data.sensordata[self._sensors["tip_force"]], 0.0
-      sides = [self._sensors[f"touch_{side}"].start for side in ("left", "right") if self.has_jaw]
-      grip = np.zeros(len(sides))
-      for _ in range(nstep):
+      self._steps = np.empty((nstep, model.nsensordata))
+      for row in self._steps:
         mj.mj_step2(model, data)
-        peak = max(peak, float(force @ force))
-        if sides:
-          grip += data.sensordata[sides]
+        row[:] = data.sensordata
         mj.mj_step1(model, data)
       # Pinched folds make single steps of large jaw force: the jaws' is a mean over the step.
-      self.peak_force = max(peak**0.5, float(grip.max(initial=0.0)) / nstep)
+      grip = self._jaw_forces().mean(axis=0).max(initial=0.0)
+      self.peak_force = float(max(self.forces()["force"].max(), grip))
       self.moved()
+
+  def forces(self) -> dict[str, np.ndarray]:
+    """Returns the force of the tip, the shaft and the jaws' grip in each step of the last `step`.
+
+    Magnitudes [N]  (nstep,), as `Recorder.append` takes them; a single 0 before the first.
+    """
+    out = {
+      name: np.linalg.norm(self._steps[:, self._sensors[sensor]], axis=1)
+      for name, sensor in (("force", "tip_force"), ("shaft_force", "shaft_force"))
+    }
+    if self.has_jaw:
+      out["grip_force"] = self._jaw_forces().max(axis=1)
+    return out
+
+  def _jaw_forces(self) -> np.ndarray:
+    """Returns the force on the left and right jaw in each step [N]  (nstep, 2), (nstep, 0)."""
+    sides = [self._sensors[f"touch_{side}"].start for side in ("left", "right") if self.has_jaw]
+    return self._steps[:, sides]
+
+  def quiet(self) -> None:
+    """Forgets the forces of the last `step`: they would be in the next episode's start."""
+    self.peak_force = 0.0
+    self._steps = np.zeros((1, self.model.nsensordata))
 
   def forward(self) -> None:
     """Recomputes what depends on the state."""
@@ -173,6 +194,10 @@ class Physics(mujoco.Physics):
       self._nodes = self.organ.xpos
       self._nodes.flags.writeable = False
     return self._nodes
+
+  def strain(self, rest: np.ndarray) -> float:
+    """Returns the largest strain of the organ's surface against its nodes `rest` [-]."""
+    return float(surface_strain(rest, self.nodes(), self.organ.elem).max())
 
   def nodes_near(self) -> np.ndarray:
     """Returns the organ's nodes nearest to the tip, from the tip [m]  (NEAR, 3)."""

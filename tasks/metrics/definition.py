@@ -10,7 +10,8 @@ from typing import ParamSpec
 P = ParamSpec("P")
 
 COMBINE = ("sum", "max", "mean", "all")
-_SHOWN = {"m": ("mm", 1e3), "rad": ("deg", 180 / math.pi), "Pa": ("kPa", 1e-3)}
+_SHOWN = {"m": ("mm", 1e3), "m/s": ("mm/s", 1e3), "rad": ("deg", 180 / math.pi)}
+_SHOWN |= {"Pa": ("kPa", 1e-3)}
 
 
 class Unknown(float):
