@@ -227,10 +227,7 @@ class Inputs:
 
   def _path(self, k: int) -> np.ndarray | None:
     if k not in self._paths:
-      pos, cutoff = self._recording.column("tip_pos", self._which[k]), self._settings["tip_cutoff"]
-      if pos is not None and cutoff is not None:
-        pos = m.low_pass(self.time, m.rows("tip_pos", pos, 3), cutoff)
-      self._paths[k] = pos
+      self._paths[k] = self._recording.tip_path(self._which[k])
     return self._paths[k]
 
   def _position(self, k: int) -> np.ndarray:

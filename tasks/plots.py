@@ -3,8 +3,9 @@
 Needs matplotlib (`palpate[plot]`), which is imported when a figure is drawn and not before.
 """
 
+import contextlib
 import io
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -93,7 +94,7 @@ def _frame(ax: Any, points: np.ndarray) -> None:
     getattr(ax, f"{axis}axis").set_pane_color((0.97, 0.97, 0.98, 1.0))
   ax.locator_params(nbins=5)
   # A tall box would leave the figure.
-  ax.set_box_aspect(half, zoom=min(1.0, 0.72 * float(np.linalg.norm(half) / half[2])))
+  ax.set_box_aspect(half, zoom=min(1.0, 0.66 * float(np.linalg.norm(half) / half[2])))
   ax.view_init(elev=28, azim=-55)
 
 
@@ -165,12 +166,42 @@ def _mark_events(ax: Any, recording: Recording, top: float, end: float) -> None:
       )  # fmt: skip
 
 
+def compared_figure(recordings: Sequence[tuple[str, Recording]]) -> "Figure | None":
+  """Returns force and speed of several recordings over time; None where neither is known."""
+  figure = _figure(9, 5)
+  axes: Any = figure.subplots(2, 1, sharex=True)
+  for k, (name, recording) in enumerate(recordings):
+    style = {"color": _TIP[k % len(_TIP)], "linewidth": 1.2, "alpha": 0.85, "label": _label(name)}
+    if len(recording.time) < 2:
+      continue
+    start = recording.time[0]
+    if (force := recording.force()) is not None:
+      axes[0].plot(recording.signal_time - start, force, **style)
+    with contextlib.suppress(m.UnknownError):  # positions are missing
+      if (pos := recording.tip_path()) is not None:
+        middle = (recording.time[1:] + recording.time[:-1]) / 2 - start
+        axes[1].plot(middle, 1e3 * m.speed(recording.time, pos), **style)
+  if not any(ax.lines for ax in axes):
+    return None
+  limits = {r.settings.force_limit for _, r in recordings} - {None}
+  for limit in sorted(limits):
+    axes[0].axhline(limit, color=_BAD, linestyle="--", linewidth=1, label=f"limit {limit:g} N")
+  for ax, label in zip(axes, ("force [N]", "speed [mm/s]"), strict=True):
+    ax.set_ylabel(label)
+    ax.set_ylim(bottom=0)
+    _tidy(ax)
+  axes[1].set_xlim(left=0)
+  axes[1].set_xlabel("time [s]")
+  _legend_above(axes[0] if axes[0].lines else axes[1])
+  return figure
+
+
 def spectrum_figure(recording: Recording) -> "Figure | None":
   """Returns the speed spectrum with the cut-offs of SPARC; None where no tip moved."""
   spectra = []
   for i in range(len(recording.instruments)):
-    pos = recording.column("tip_pos", i)
     try:
+      pos = recording.tip_path(i)
       if pos is not None:
         values, rate = m.uniform_speed(recording.time, pos)
         spectra.append((i, m.sparc(values, rate), *m.speed_spectrum(values, rate)))

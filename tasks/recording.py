@@ -19,7 +19,7 @@ import numpy as np
 
 from .files import replacing
 from .inputs import COLUMNS, SIGNALS, measure
-from .metrics import EVENTS, Metrics, check_time
+from .metrics import EVENTS, Metrics, check_time, low_pass, rows
 
 FORMAT = "palpate-recording"
 VERSION = 2
@@ -149,6 +149,13 @@ class Recording:
       return None
     values = np.ascontiguousarray(self.columns[name][:, instrument])
     return None if np.isnan(values).all() and len(values) else values
+
+  def tip_path(self, instrument: int = 0) -> np.ndarray | None:
+    """Returns the tip positions as metrics take them: filtered at `Settings.tip_cutoff` [m]."""
+    pos, cutoff = self.column("tip_pos", instrument), self.settings.tip_cutoff
+    if pos is None or cutoff is None:
+      return pos
+    return low_pass(self.time, rows("tip_pos", pos, 3), cutoff)
 
   def force(self, instrument: int = 0) -> np.ndarray | None:
     """Returns the force magnitude at `signal_time` [N], NaN where it is missing; None if all is."""

@@ -56,7 +56,7 @@ class Spec:
     group: category of the composite score, a key of `score.WEIGHTS`
     combine: how several instruments make one value: `sum`, `max`, `mean`, or `all` (one value)
     source: where the definition comes from
-    better: `lower` or `higher`
+    better: `lower`, `higher`, or `neither`: shown, but neither scored nor limited
     shown: unit for people
     scale: shown value / SI value
     function: what computes it

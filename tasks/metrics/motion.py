@@ -33,9 +33,11 @@ def path_length(tip_pos: ArrayLike) -> float:
   return length
 
 
-@metric("Mean speed", "m/s", "efficiency", "mean", _EVA, "higher")
+@metric("Mean speed", "m/s", "efficiency", "mean", _EVA, "neither")
 def mean_speed(time: ArrayLike, tip_pos: ArrayLike) -> float:
-  """Returns path length over time [m/s], higher is better (Oropesa et al. 2013).
+  """Returns path length over time [m/s], neither is better (Oropesa et al. 2013).
+
+  Experts are faster on their way, and slower where it matters.
 
   Args:
     time: sample times [s]  (nstep,)
@@ -45,11 +47,9 @@ def mean_speed(time: ArrayLike, tip_pos: ArrayLike) -> float:
   return _moved(path_length(tip_pos)) / (time[-1] - time[0])
 
 
-@metric("Peak speed", "m/s", "dexterity", "max", "PMC5845064")
+@metric("Peak speed", "m/s", "efficiency", "max", "PMC5845064", "neither")
 def peak_speed(speed: ArrayLike) -> float:
-  """Returns the largest speed [m/s], lower is better (a feature of PMC5845064).
-
-  That slower is better at the peak is this project's choice: a tip that is thrown is not guided.
+  """Returns the largest speed [m/s], neither is better (a feature of PMC5845064).
 
   Args:
     speed: in each interval [m/s]  (nstep - 1,)
@@ -60,12 +60,12 @@ def peak_speed(speed: ArrayLike) -> float:
   return values.max()
 
 
-@metric("Economy of volume", "-", "efficiency", "mean", _EVA, "higher")
+@metric("Economy of volume", "-", "efficiency", "mean", _EVA, "neither")
 def economy_of_volume(tip_pos: ArrayLike) -> float:
-  """Returns the cube root of the volume the tip used over its path [-], higher is better.
+  """Returns the cube root of the volume the tip used over its path [-], neither is better.
 
-  Oropesa et al. 2013. The volume is that of the path's bounding box along the world's axes: 0 for a
-  path in a plane of them.
+  Oropesa et al. 2013. The volume is that of the path's bounding box along the world's axes. Who
+  transfers many pegs does well to be high; the straightest way to one place is 0.
 
   Args:
     tip_pos: tip position [m]  (nstep, 3)

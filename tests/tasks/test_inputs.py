@@ -31,7 +31,7 @@ def test_a_metric_is_registered_by_its_definition():
     assert both.metrics().highest == 2
     assert Recorder().metrics().reasons()["highest"] == "the recording is empty"
     reference = make_reference([made, plain(LINE).metrics()], "touch/easy", 0)
-    assert score(made, reference).z["highest"] == pytest.approx(-math.sqrt(0.5))
+    assert score(made, reference, "success").z["highest"] == pytest.approx(-math.sqrt(0.5))
     result = evaluate.Result(0, "success", 1.0, 1.0, made.to_json())
     assert "Highest point [mm]" in evaluate.table("touch/easy", "expert", [result], None)
   finally:
