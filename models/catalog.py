@@ -43,10 +43,10 @@ class Tissue:
   mass: float | None
   sources: Mapping[str, str]
 
-  def keys(self) -> dict[str, float]:
-    """Returns the plugin's configuration keys."""
-    names = ("young", "poisson", "thickness", "foundation", "bulk", "damping")
-    return {name: getattr(self, name) for name in names}
+  def keys(self, solid: bool = False) -> dict[str, float]:
+    """Returns the plugin's configuration keys, of the surface or of a solid."""
+    skin = () if solid else ("thickness", "foundation", "bulk")
+    return {name: getattr(self, name) for name in ("young", "poisson", *skin, "damping")}
 
   def mass_of(self, volume: float) -> float:
     """Returns the mass [kg] of an organ that encloses a volume [m^3]."""
@@ -199,6 +199,7 @@ class Entry:
     ports: one an instrument, left and right hand
     inclusion: hidden stiff lump, or None
     backdrop: another organ that is only drawn behind this one, and where it is in this one's frame
+    hollow: whether there is no tissue inside
   """
 
   shape: str
@@ -212,6 +213,7 @@ class Entry:
   shininess: float = 0.6
   inclusion: Inclusion | None = None
   backdrop: tuple[str, tuple[float, float, float]] | None = None
+  hollow: bool = False
 
 
 _LIVER = Entry(
@@ -233,6 +235,7 @@ ENTRIES: dict[str, Entry] = {
   ),
   "stomach": Entry(
     shape="stomach",
+    hollow=True,
     title="Stomach, moderately filled, 20 x 11 x 21 cm",
     tissue=TISSUES["stomach"],
     rgba=(0.80, 0.50, 0.44, 1.0),
@@ -244,6 +247,7 @@ ENTRIES: dict[str, Entry] = {
   ),
   "gallbladder": Entry(
     shape="gallbladder",
+    hollow=True,
     title="Gallbladder down to its neck, 5 x 8 x 5 cm",
     tissue=TISSUES["gallbladder"],
     rgba=(0.42, 0.52, 0.30, 1.0),

@@ -107,7 +107,9 @@ def _flex(
   return extension, f"{mjcf.plugin(instance=name)}\n{flex}"
 
 
-def catalogued(build: Build, name: str, file: str | None, rigid: bool = False) -> str:
+def catalogued(
+  build: Build, name: str, file: str | None, rigid: bool = False, solid: bool = False
+) -> str:
   """Returns an organ of the catalogue as MJCF.
 
   Args:
@@ -115,14 +117,18 @@ def catalogued(build: Build, name: str, file: str | None, rigid: bool = False) -
     name: its name
     file: the mesh under assets/; None has it in the text
     rigid: as in `organ`
+    solid: whether it is made of tetrahedra in place of a skin
   """
   entry = build.entry
+  config = entry.tissue.keys(solid) | {"young": build.young()}
+  if solid:
+    config["elements"] = "solid"
   return organ(
     name,
     f"{entry.title}. x to the patient's right, y anterior, z superior.",
     (build.vertices, build.triangles) if file is None else f"assets/{file}",
     build.mass,
-    entry.tissue.keys() | {"young": build.young()},
+    config,
     rgba=entry.rgba,
     specular=entry.specular,
     shininess=entry.shininess,

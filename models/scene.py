@@ -37,6 +37,7 @@ def load(
   handle: bool = False,
   grid: int | None = None,
   coupling: str = "nodal",
+  interior: str = "none",
 ) -> mujoco.MjSpec:
   """Returns a scene: the organ, instruments, light, laparoscope, targets and keyframes.
 
@@ -48,11 +49,13 @@ def load(
     handle: whether mocap handles pull the instruments in place of position actuators
     grid: a regular sheet of grid x grid nodes in place of `nodes`, one of `GRIDS`
     coupling: `nodal`, or `window` where MuJoCo knows the nodes near the instruments alone
+    interior: `solid` for tetrahedra inside, with `coupling="window"`; `none` for the surface alone,
+      on a foundation and with a bulk modulus that stand for what is inside
   """
   build = _build(name, nodes, seed, grid)
   _check_instruments(instruments)
   spec = mujoco.MjSpec.from_string(markup.scene(build, name, instruments, handle, root=None))
-  spec.attach(_organ(build, name, coupling), prefix=f"{name}/", frame=spec.frame(name))
+  spec.attach(_organ(build, name, coupling, interior), prefix=f"{name}/", frame=spec.frame(name))
   free = None
   if coupling == "window":
     window = author.add_windows(spec, f"{name}/{name}")[0]
@@ -69,22 +72,31 @@ def organ(
   seed: int | None = None,
   grid: int | None = None,
   coupling: str = "nodal",
+  interior: str = "none",
 ) -> mujoco.MjSpec:
   """Returns the organ alone, to attach to a scene of your own; arguments as for `load`.
 
   With `coupling="window"` its window is sized for one 5 mm instrument;
   `palpate.add_windows(spec, name)` of the scene's own nodal organ sizes it for the tools there.
   """
-  spec = _organ(_build(name, nodes, seed, grid), name, coupling)
+  spec = _organ(_build(name, nodes, seed, grid), name, coupling, interior)
   if coupling == "window":
     author.add_windows(spec, name)
   return spec
 
 
-def _organ(build: Build, name: str, coupling: str) -> mujoco.MjSpec:
+def _organ(build: Build, name: str, coupling: str, interior: str) -> mujoco.MjSpec:
   if coupling not in COUPLINGS:
     raise ValueError(f"organ {name!r}: coupling is {coupling!r}, expected nodal or window")
-  return mujoco.MjSpec.from_string(markup.catalogued(build, name, None, coupling == "window"))
+  solid = interior == "solid"
+  if not solid and interior != "none":
+    raise ValueError(f"organ {name!r}: interior is {interior!r}, expected none or solid")
+  if solid and build.entry.hollow:
+    raise ValueError(f"organ {name!r}: interior is 'solid', expected none: it is hollow")
+  if solid and coupling != "window":
+    raise ValueError(f"organ {name!r}: interior is 'solid', expected coupling='window' with it")
+  made = markup.catalogued(build, name, None, coupling == "window", solid)
+  return mujoco.MjSpec.from_string(made)
 
 
 def targets(name: str) -> tuple[str, ...]:

@@ -18,7 +18,7 @@ CONTACT: Mapping[str, object] = {
 
 
 def text(value, digits: int = 9) -> str:
-  """Returns a text, flag, number or array of numbers as MJCF has it."""
+  """Returns a text, flag, number or array of numbers as MJCF has it; 17 digits are all."""
   if isinstance(value, str):
     return value
   if isinstance(value, bool | np.bool_):
@@ -26,4 +26,5 @@ def text(value, digits: int = 9) -> str:
   array = np.asarray(value)
   if array.dtype.kind in "iu":
     return " ".join(map(str, array.ravel()))
-  return " ".join(f"{v + 0.0:.{digits}g}" for v in array.ravel())
+  short = "{!r}" if digits >= 17 else f"{{:.{digits}g}}"  # repr: no more than tell it from others
+  return " ".join(short.format(float(v) + 0.0).removesuffix(".0") for v in array.ravel())

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import mujoco
 import numpy as np
-from palpate.engine import motion, windowed, workspace
+from palpate.engine import mjstruct, motion, pierce, windowed, workspace
 from palpate.engine import plugin as engine
 from palpate.engine.layout import FLAG
-from palpate.tissue import energy
+from palpate.tissue import energy, fill
 from palpate.tissue import mesh as topology
 from palpate.tissue.config import Config
 
@@ -75,8 +75,8 @@ class Organ:
 
   @property
   def nvert(self) -> int:
-    """Number of vertices."""
-    return self._organ.mesh.nvert
+    """Number of vertices, those on the surface of a solid."""
+    return self._organ.mesh.nouter
 
   @property
   def elem(self) -> np.ndarray:
@@ -86,21 +86,21 @@ class Organ:
   @property
   def free(self) -> np.ndarray:
     """Whether a vertex moves, (nvert,) bool; the others are pinned."""
-    return self._organ.free
+    return self._organ.free[: self.nvert]
 
   @property
   def xpos0(self) -> np.ndarray:
     """Rest positions [m], (nvert, 3)."""
-    return self._organ.origin + self._organ.mesh.rest @ self._organ.frame.T
+    return self._organ.origin + self._organ.mesh.rest[: self.nvert] @ self._organ.frame.T
 
   @property
   def displacement(self) -> np.ndarray:
     """Displacement from rest [m], (nvert, 3)."""
-    return self._deformation @ self._organ.frame.T
+    return self._deformation[: self.nvert] @ self._organ.frame.T
 
   @property
   def _deformation(self) -> np.ndarray:
-    """Displacement from rest in the organ's own frame [m], (nvert, 3)."""
+    """Displacement from rest in the organ's own frame, with the inside [m], (nvert + ., 3)."""
     return self._motion.displacement(self.model, self.data)
 
   @property
@@ -111,12 +111,12 @@ class Organ:
   @property
   def xvel(self) -> np.ndarray:
     """Velocities [m/s], (nvert, 3)."""
-    return self._motion.velocity(self.data) @ self._organ.frame.T
+    return self._motion.velocity(self.data)[: self.nvert] @ self._organ.frame.T
 
   @property
   def contact_force(self) -> np.ndarray:
     """Constraint force on each vertex in the last step [N], (nvert, 3): contacts and equalities."""
-    return self._motion.contact_force(self.data) @ self._organ.frame.T
+    return self._motion.contact_force(self.data)[: self.nvert] @ self._organ.frame.T
 
   @property
   def window_overflow(self) -> tuple[int, int]:
@@ -129,13 +129,26 @@ class Organ:
     return windowed.shortage(self._space)
 
   @property
+  def pierced(self) -> tuple[str, ...]:
+    """Geoms that move, touch this organ, and are inside of it: they have gone through its surface.
+
+    Of a long geom some point of the axis is inside, of others the centre. A warning names one that
+    comes through while the organ runs; an open surface has no inside.
+    """
+    m = mjstruct.Model.from_address(self.model._address)
+    d = mjstruct.Data.from_address(self.data._address)
+    tools = pierce.tools(m, self._organ)
+    found = pierce.inside(m, d, self._organ, tools, self._deformation)
+    return tuple(self.model.geom(geom).name or f"geom {geom}" for geom in found)
+
+  @property
   def force(self) -> np.ndarray:
     """Sum of `contact_force` [N], (3,)."""
     return self.contact_force.sum(axis=0)
 
   @property
   def energy(self) -> float:
-    """Elastic energy [J]: membrane or springs, bending, foundation, volume and pressure."""
+    """Elastic energy [J]: membrane, springs or solid, bending, foundation, volume, pressure."""
     return energy.total(self._organ.mesh, self._space.config, self._deformation)
 
   @property
@@ -143,7 +156,8 @@ class Organ:
     """Enclosed volume [m^3]; NaN for an open surface."""
     if not self._organ.mesh.closed:
       return float("nan")
-    return topology.volume(self._organ.mesh.rest + self._deformation, self.elem)
+    moved = (self._organ.mesh.rest + self._deformation)[: self.nvert]
+    return topology.volume(moved, self.elem)
 
   @property
   def iterations(self) -> int:
@@ -173,6 +187,8 @@ class Organ:
   def set_state(self, xpos: np.ndarray | None = None, xvel: np.ndarray | None = None):
     """Places the organ; pinned vertices stay, and forces of the past are forgotten.
 
+    The inside of a solid follows its surface smoothly.
+
     Args:
       xpos: positions [m], (nvert, 3); None leaves them
       xvel: velocities [m/s], (nvert, 3); None leaves them
@@ -183,8 +199,8 @@ class Organ:
     xpos = None if xpos is None else self._checked("xpos", xpos)
     xvel = None if xvel is None else self._checked("xvel", xvel)
     frame = self._organ.frame
-    u = None if xpos is None else (xpos - self.xpos0) @ frame
-    v = None if xvel is None else xvel @ frame
+    u = None if xpos is None else fill.inside(self._organ.mesh, (xpos - self.xpos0) @ frame)
+    v = None if xvel is None else fill.inside(self._organ.mesh, xvel @ frame)
     self._space.forget()
     self._motion.put(self.model, self.data, u, v)
 

@@ -56,10 +56,7 @@ def add_windows(
   Raises:
     ValueError: there is no such organ or body, or it cannot have windows.
   """
-  flex = spec.flex(organ)
-  if flex is None:
-    have = ", ".join(repr(f.name) for f in spec.flexes) or "none"
-    raise ValueError(f"no flexcomp {organ!r} in the spec, it has {have}")
+  flex = _flex(spec, organ)
   bodies = {body.name: body for body in spec.bodies}
   plugin = _plugin(spec, organ, [bodies[name] for name in dict.fromkeys(flex.vertbody)])
   config = {key: value for key, value in plugin.config.items() if value}
@@ -75,14 +72,7 @@ def add_windows(
   # From here on the spec changes.
   keys = _take_keys(spec)
   surface = _make_rigid(spec, flex, own, plugin, config) if nodal else bodies[flex.vertbody[0]]
-  rest = np.reshape(flex.vert, (-1, 3))
-  elem = np.reshape(flex.elem, (-1, 3))
-  edge = float(np.linalg.norm(rest[elem[:, [1, 2, 0]]] - rest[elem], axis=2).mean())
-  every = list(itertools.chain(*followed))
-  # Each window has room for all tools, for when they meet.
-  size = 1 + min(nodes or _slots(every, edge, flex.radius), len(rest))  # one slot stays free
-  for name in names:
-    _add_window(spec, flex, surface, name, size, meets, edge, config)
+  _fill(spec, flex, surface, names, followed, nodes, meets, config)
   _warn_of_others(organ, colliding, groups)
   config["window"] = " ".join(names)
   if groups:
@@ -93,6 +83,15 @@ def add_windows(
   flex.contype = flex.conaffinity = 0
   _fit_keys(spec, organ, keys)
   return tuple(names)
+
+
+def _flex(spec, organ: str):
+  """Returns the flex of an organ."""
+  flex = spec.flex(organ)
+  if flex is None:
+    have = ", ".join(repr(f.name) for f in spec.flexes) or "none"
+    raise ValueError(f"no flexcomp {organ!r} in the spec, it has {have}")
+  return flex
 
 
 def _check(spec, flex, config: dict[str, str], names: list[str], nodes: int | None):
@@ -254,6 +253,17 @@ def _slots(geoms: list, edge: float, radius: float) -> int:
     area += math.pi * r * (2 * r + length)
   # A node has two equilateral triangles.
   return int(np.clip(math.ceil(area / (math.sqrt(3) / 2 * edge**2)), _LEAST, _MOST))
+
+
+def _fill(spec, flex, surface, names: list[str], followed: list, nodes: int | None, meets, config):
+  """Adds the windows; each has room for all tools, for when they meet."""
+  rest = np.reshape(flex.vert, (-1, 3))
+  elem = np.reshape(flex.elem, (-1, 3))
+  edge = float(np.linalg.norm(rest[elem[:, [1, 2, 0]]] - rest[elem], axis=2).mean())
+  every = list(itertools.chain(*followed))
+  size = 1 + min(nodes or _slots(every, edge, flex.radius), len(rest))  # one slot stays free
+  for name in names:
+    _add_window(spec, flex, surface, name, size, meets, edge, config)
 
 
 def _add_window(spec, flex, surface, name: str, size: int, meets, edge: float, config):

@@ -123,7 +123,7 @@ TORN = MESH[0], np.where(np.arange(len(MESH[1]))[:, None] == 3, MESH[1][:, ::-1]
     (MESH, {"yung": 3}, ["'organ'", "'yung'", "young"]),
     (MESH, {"young": -3}, ["young is '-3'", "> 0"]),
     (MESH, {"young": [1, 2]}, ["2 values", "1280"]),
-    (MESH, {"poisson": 0.5}, ["poisson", "[0, 0.5)"]),
+    (MESH, {"poisson": 0.6}, ["poisson is '0.6'", "[0, 0.5)"]),
     (MESH, {"device": "abacus"}, ["'abacus'", "cpu"]),
     (MESH, {"resident": True}, ["resident", "only with window"]),
     (MESH, {"window": "w"}, ["windows=True"]),

@@ -4,6 +4,7 @@ import mujoco
 import numpy as np
 import palpate
 import pytest
+from palpate.attributes import CONTACT, text
 from palpate.tissue import mesh as topology
 
 
@@ -212,6 +213,44 @@ def test_a_configuration_that_may_not_change_stays(scenes, keys, words):
   for word in words:
     assert word in str(error.value)
   assert organ.config == before
+
+
+@pytest.mark.parametrize("force", [0.7, 3.0, 10.0])
+@pytest.mark.parametrize("windowed", [False, True], ids=["nodal", "window"])
+def test_an_8_mm_ball_at_a_hands_speed_does_not_go_through(scenes, windowed, force):
+  build = scenes.windowed if windowed else scenes.organ
+  contact = {key: text(value) for key, value in CONTACT.items()}
+  keys = {"young": 5e3, "foundation": 2e5, "bulk": 1e4}
+  made = build(*scenes.sphere(2), mass=0.5, radius=0.001, contact=contact, **keys)
+  tool = f"""<body name="ball" pos="0.0003 0.0002 {scenes.RADIUS + 0.0055}">
+    <joint name="z" type="slide" axis="0 0 1"/><geom size="0.004" mass="0.02"/></body>"""
+  model, data, organ = scenes.load(scenes.world(tool, made))
+  joint = model.joint("z")
+  data.qvel[joint.dofadr[0]] = -0.25
+  for _ in range(400):
+    data.qfrc_applied[joint.dofadr[0]] = -force * min(1, data.time / 0.05)
+    mujoco.mj_step(model, data)
+  assert organ.error is None and organ.pierced == ()
+  assert data.qfrc_constraint[joint.dofadr[0]] > 0.5 * force  # it is held
+
+
+@pytest.mark.parametrize("windowed", [False, True], ids=["nodal", "window"])
+def test_a_tool_that_goes_through_the_surface_is_named_once(scenes, windowed):
+  model, data, organ = scenes.load(scenes.probed(windowed, keys={"foundation": 1e5}))
+  joint = model.joint("z")
+  with scenes.Warnings() as log:
+    scenes.drive(model, data, 110)
+    assert organ.pierced == () and data.qfrc_constraint[joint.dofadr[0]] > 0.1
+    data.qpos[joint.qposadr[0]] = -scenes.RADIUS  # a jump to the middle
+    for _ in range(1000):
+      data.ctrl[0] = -scenes.RADIUS
+      mujoco.mj_step(model, data)
+    text = log()
+  assert organ.pierced == ("tip",)
+  assert text.count("geom 'tip' has gone through its surface") == 1
+  mujoco.mj_resetData(model, data)
+  mujoco.mj_forward(model, data)
+  assert organ.pierced == ()
 
 
 def test_an_unknown_name_lists_the_organs(scenes):

@@ -38,14 +38,15 @@ def run(function: Callable, *args):
     RuntimeError: with MuJoCo's error message.
   """
   lib = mjstruct.library()
-  done, never, failed = _thread.allocate_lock(), _thread.allocate_lock(), []
+  begin, done, never = (_thread.allocate_lock() for _ in range(3))
+  results: list[str | None] = []
 
   def on_message(message: int):
     text = mjstruct.error_text(message)
     if text is None:
       mjstruct.LogHandler(lib._mjPRIVATE_getGlobalLogHandler())(message)
       return
-    failed.append(text)
+    results.append(text)
     done.release()
     never.acquire()
     never.acquire()
@@ -54,21 +55,26 @@ def run(function: Callable, *args):
 
   def body():
     lib._mjPRIVATE_setTlsLogHandler(handler)
+    begin.acquire()
     function(*args)
+    results.append(None)
     done.release()
 
+  begin.acquire()
   done.acquire()
   _thread.start_new_thread(body, ())
-  while not _acquire(done):
-    pass
-  if failed:
-    raise RuntimeError(" ".join(failed[0].split()))
+  _wait(begin, done, results)
+  if results[0] is not None:
+    raise RuntimeError(" ".join(results[0].split()))
 
 
-def _acquire(lock) -> bool:
-  """Waits for a lock; returns False where a signal's handler raised an exception meanwhile."""
-  try:
-    return lock.acquire()
-  except BaseException as error:
-    guard.raise_later(error)
-    return False
+def _wait(begin, done, results: list):
+  """Lets a thread begin and waits for its result, whatever signals' handlers raise meanwhile."""
+  while not results:
+    try:
+      if begin.locked():
+        begin.release()
+      while not results:
+        done.acquire()
+    except BaseException as error:
+      guard.raise_later(error)

@@ -61,14 +61,14 @@ def bind(w, model: int):
       ahead = graphs.record_all((near, does.enter_ahead), (device, solve))
       w.resident.begin_graph = ahead[0][1]
       w.resident.rest = graphs.record_all((near, does.look_ahead))
+    if w.turn is not None:
+      w.turn.bind(model, w.organ.windows)
   w.model, w.identity = model, mjstruct.Identity(model)
   option = model + mjstruct.Model.opt.offset
   w.model_step = mjstruct.view(option + type(m.opt).timestep.offset, 1).data
   w.time_step = float(m.opt.timestep)
   w.integrator = mjstruct.view(option + type(m.opt).integrator.offset, 1, np.int32).data
   w.static = [(view, view.tobytes()) for view in declare.static_places(m, w.organ)]
-  if w.turn is not None:
-    w.turn.bind(model, w.organ.windows)
 
 
 # What a solve on another device than MuJoCo's side reads and writes.

@@ -353,7 +353,11 @@ def static_places(m, organ: Declaration) -> list[memoryview]:
       found.add(body)
       body = int(parentid[body])
   places = (mjstruct.view(m.body_pos, (m.nbody, 3)), mjstruct.view(m.body_quat, (m.nbody, 4)))
-  return [each[body].view(np.uint8).data for body in sorted(found) for each in places]
+  bodies = np.array(sorted(found), int)
+  runs = np.split(bodies, np.flatnonzero(np.diff(bodies) > 1) + 1) if len(bodies) else []
+  return [
+    each[run[0] : run[-1] + 1].view(np.uint8).reshape(-1).data for run in runs for each in places
+  ]
 
 
 def check_frame(m, organ: Declaration):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from palpate.tissue import config as configuration
 from palpate.tissue import device as devices
+from palpate.tissue import fill
 from palpate.tissue import mesh as topology
 from palpate.tissue.config import Config
 
@@ -33,18 +34,20 @@ def read(model: int, instance: int) -> Declaration:
   mesh = topology.build(name, rest, elem)
   config = configuration.parse(name, declare.keys(model, instance), len(elem), mesh.closed)
   declare.check_volume(name, mesh, config)
-  free = np.ones(nvert, bool)
+  if config.elements == "solid":
+    mesh = fill.fill(name, mesh)
+  free = np.ones(mesh.nvert, bool)
   for vertex in config.pin:
     if vertex >= nvert:
       raise ValueError(f"organ {name!r}: pin has {vertex}, expected vertices in [0, {nvert})")
     free[vertex] = False
   if not free.any():
     raise ValueError(f"organ {name!r}: all vertices are pinned, expected some that move")
-  area = topology.vertex_areas(rest, elem)
-  mass = config.mass * area / area.sum()
+  share = fill.vertex_volumes(mesh) if len(mesh.tet) else topology.vertex_areas(rest, elem)
+  mass = config.mass * share / share.sum()
   windows = _windows(model, m, instance, name, config, mesh, mass, (frame, origin))
   _check_neighbours(m, model, instance, name, windows, frame, origin, rest)
-  absent = np.full(nvert, -1)
+  absent = np.full(mesh.nvert, -1)
   return declare.cached(
     float(m.opt.timestep),
     name=name,
@@ -52,7 +55,7 @@ def read(model: int, instance: int) -> Declaration:
     mesh=mesh,
     config=config,
     free=free,
-    body=np.full(nvert, parent),
+    body=np.full(mesh.nvert, parent),
     dofadr=absent,
     qposadr=absent,
     stateadr=absent,
@@ -118,7 +121,7 @@ def _windows(model, m, instance, name, config, mesh, mass, place) -> Windows:
   # At rest the windows stand on patches of their own: their bodies move there, so that qpos0 fits.
   # The last slot stays free; a patch of n nodes has up to 2 n - 4 triangles: see `native/slot.h`.
   room = [min(n - 1, int(t) // 2 + 2) for n, t in zip(sizes, elem_num, strict=True)]
-  home = _home_slots(mesh.elem, mesh.nvert, sizes, room)
+  home = _home_slots(mesh.elem, mesh.nouter, sizes, room)
   used = home >= 0
   stand = mjstruct.view(m.body_pos, (m.nbody, 3))[body]
   stand[used] = np.einsum("kij,kj->ki", turn[used], offset[used] + mesh.rest[home[used]])
@@ -143,7 +146,7 @@ def _windows(model, m, instance, name, config, mesh, mass, place) -> Windows:
 def _claimed(model, m, instance: int, name: str, config: Config) -> list[int]:
   """Returns the flexes that an organ names as its windows and nobody else does."""
   names = [flexes.name(m, f) for f in range(m.nflex)]
-  surface = _surfaces(model, m, instance)
+  surface = _surfaces(model, m, instance, without=instance)
   claimed = {names[window]: f"organ {names[flex]!r}" for window, flex in surface.items()}
   if len(config.window) > MAX_WINDOWS:
     raise ValueError(
@@ -243,7 +246,7 @@ def _check_neighbours(m, model, instance, name, windows: Windows, frame, origin,
   own = np.isin(np.arange(m.nflex), windows.flex)
   contype = mjstruct.view(m.flex_contype, m.nflex, np.int32)
   conaffinity = mjstruct.view(m.flex_conaffinity, m.nflex, np.int32)
-  surface = _surfaces(model, m, instance)
+  surface = _surfaces(model, m, instance, without=instance)
   points = origin + rest @ frame.T
   room = _NEAR * float(np.linalg.norm(np.ptp(points, axis=0)))
   low, high = points.min(axis=0) - room, points.max(axis=0) + room
@@ -258,13 +261,27 @@ def _check_neighbours(m, model, instance, name, windows: Windows, frame, origin,
       )
 
 
-def _surfaces(model, m, instance: int) -> dict[int, int]:
-  """Returns the flex of the organ that each window of another organ is of."""
+def touching(model: int, instance: int) -> np.ndarray:
+  """Returns the flexes that meet tools for this plugin's organs, of which one is an instance."""
+  m = mjstruct.Model.from_address(model)
+  owner = mjstruct.view(m.body_plugin, m.nbody, np.int32)
+  plugin = mjstruct.view(m.plugin, m.nplugin, np.int32)
+  ours = np.flatnonzero((owner >= 0) & (plugin[owner] == plugin[instance]))
+  rigid = mjstruct.view(m.flex_rigid, m.nflex, np.bool_)
+  start = mjstruct.view(m.flex_vertadr, m.nflex, np.int32)
+  body = mjstruct.view(m.flex_vertbodyid, m.nflexvert, np.int32)
+  own = [np.isin(body[start[f] : start[f] + flexes.vertices(m, f)], ours) for f in range(m.nflex)]
+  nodal = [f for f in range(m.nflex) if not rigid[f] and own[f].any()]
+  return np.array([*nodal, *_surfaces(model, m, instance)], int)
+
+
+def _surfaces(model, m, instance: int, without: int = -1) -> dict[int, int]:
+  """Returns the flex of the organ that each window is of, of all organs or without one."""
   names = [flexes.name(m, f) for f in range(m.nflex)]
   plugin = mjstruct.view(m.plugin, m.nplugin, np.int32)
   found = {}
   for other in range(m.nplugin):
-    if other != instance and plugin[other] == plugin[instance]:
+    if other != without and plugin[other] == plugin[instance]:
       for flex in _rigid_flexes(m, other)[1]:
         for window in mjstruct.config(model, other, "window").split():
           resolved = _resolve(window, names[flex], names)

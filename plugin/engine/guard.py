@@ -9,6 +9,7 @@ from __future__ import annotations
 import _thread
 import atexit
 import ctypes as C
+import functools
 import signal
 import sys
 import threading
@@ -17,10 +18,10 @@ import types
 from collections.abc import Callable, Iterator
 
 _codes: set[types.CodeType] = set()  # of the callbacks
-_MARK = "raised late"  # of such an exception
-_left = threading.Event()  # the last callback of a step, while somebody waits for it
-_waiting = 0
-_RETRY = 0.01  # after which a step may be over without one [s]
+_MARK = "raised late"  # of an exception that came in a callback and is kept until after it
+_late: list[BaseException] = []  # of the main thread
+_late_in: dict[int, BaseException] = {}  # of another thread
+_before: list = []  # handler of SIGINT while there are some
 _raise_in_thread = C.pythonapi.PyThreadState_SetAsyncExc
 _raise_in_thread.argtypes = [C.c_ulong, C.py_object]
 
@@ -32,6 +33,56 @@ def watch(callback: Callable) -> Callable:
 
 
 # Exceptions.
+
+
+class _Bell:
+  """Sends the main thread SIGINT when it is gone; no line of Python is run for that."""
+
+  __del__ = staticmethod(_thread.interrupt_main)
+
+
+def leave() -> object:
+  """Returns what a callback has to return: ctypes drops it, and with that what is late is raised.
+
+  Python looks for signals, and exceptions of other threads, between its instructions. From where
+  ctypes drops what a callback returned the next instruction is one of MuJoCo's caller or of another
+  callback, which does the same again.
+  """
+  if not (_late or _late_in):
+    return None
+  ident = threading.get_ident()
+  if ident == threading.main_thread().ident:
+    return _Bell() if _late else None
+  error = _late_in.pop(ident, None)
+  if error is None:
+    return None
+  # Python makes the exception from a class, where it is raised.
+  kind = type(type(error).__name__, (type(error),), {"__new__": lambda _: error})
+  ring = functools.partial(_raise_in_thread, ident, kind)
+  return type("_Bell", (), {"__del__": staticmethod(ring)})()
+
+
+def raise_later(error: BaseException):
+  """Raises an exception in this thread as soon as that is in no callback, see `leave`."""
+  vars(error)[_MARK] = True
+  error.__traceback__ = None
+  if threading.current_thread() is not threading.main_thread():
+    _late_in[threading.get_ident()] = error
+    return
+  _late.append(error)
+  if signal.getsignal(signal.SIGINT) is not _on_bell:
+    _before[:] = [signal.getsignal(signal.SIGINT)]
+    signal.signal(signal.SIGINT, _on_bell)
+
+
+def _on_bell(number: int, frame: types.FrameType | None):
+  """Raises what is late, once the main thread is in no callback."""
+  if _is_inside(frame):
+    return
+  error = _late.pop(0) if _late else KeyboardInterrupt()
+  if not _late:
+    signal.signal(signal.SIGINT, _before[0] or signal.SIG_DFL)
+  raise error
 
 
 def is_foreign(error: BaseException) -> bool:
@@ -59,84 +110,11 @@ def _handlers() -> Iterator[types.CodeType]:
       yield code
 
 
-def raise_later(error: BaseException):
-  """Raises an exception in this thread as soon as that is in no callback."""
-  vars(error)[_MARK] = True
-  error.__traceback__ = None
-  if threading.current_thread() is threading.main_thread():
-    _raise_by_signal(error)
-  else:
-    _raise_in(threading.get_ident(), error)
-
-
-def raise_in_caller(error: BaseException):
-  """Raises an exception where this callback's caller is; else in the main thread.
-
-  The threads of `mujoco.rollout`, say, run for the main thread.
-  """
-  if isinstance(threading.current_thread(), threading._DummyThread):
-    vars(error)[_MARK] = True
-    _raise_in(threading.main_thread().ident or 0, error)
-  else:
-    raise_later(error)
-
-
-def _raise_by_signal(error: BaseException):
-  """Raises an exception in the main thread, from a signal's handler for the time being."""
-  before, seen, raised = signal.getsignal(signal.SIGINT), threading.Event(), []
-
-  def on_signal(number: int, frame: types.FrameType | None):
-    seen.set()
-    if not _is_inside(frame):
-      signal.signal(signal.SIGINT, before or signal.SIG_DFL)
-      raised.append(True)
-      raise error
-
-  def send():
-    # One signal at a time: none may be left for the handler that was there before.
-    while not raised:
-      _wait_for_end()
-      seen.clear()
-      _thread.interrupt_main()
-      seen.wait()
-
-  signal.signal(signal.SIGINT, on_signal)
-  threading.Thread(target=send, daemon=True).start()
-
-
-def _raise_in(thread: int, error: BaseException):
-  """Raises an exception in a thread; what comes out in a callback comes here again."""
-  # Python makes the exception from a class, where it is raised.
-  late = type(type(error).__name__, (type(error),), {"__new__": lambda _: error})
-
-  def send():
-    while _is_inside(sys._current_frames().get(thread)):
-      _wait_for_end()
-    _raise_in_thread(thread, late)
-
-  _thread.start_new_thread(send, ())
-
-
 def _is_inside(frame: types.FrameType | None) -> bool:
   """Returns whether a frame is in a callback."""
   while frame is not None and frame.f_code not in _codes:
     frame = frame.f_back
   return frame is not None
-
-
-def _wait_for_end():
-  """Waits until a step may have ended."""
-  global _waiting
-  _waiting += 1
-  _left.clear()
-  _left.wait(_RETRY)
-  _waiting -= 1
-
-
-def leave():
-  """Notes that the last callback of a step ends."""
-  if _waiting:
-    _left.set()
 
 
 def _on_interrupt(number: int, frame: types.FrameType | None):
@@ -149,12 +127,18 @@ def _on_interrupt(number: int, frame: types.FrameType | None):
 
 @watch
 def _on_unraisable(unraisable, before=sys.unraisablehook):
-  """Takes what was raised in a callback before its first line."""
-  code = getattr(unraisable.object, "__code__", None)
-  if code in _codes and unraisable.exc_value is not None:
-    raise_later(unraisable.exc_value)
-  else:
-    before(unraisable)
+  """Takes what was raised in a callback before its first line, which is run then, or its last."""
+  callback, error = unraisable.object, unraisable.exc_value
+  code = getattr(callback, "__code__", None)
+  if code not in _codes or error is None:
+    return before(unraisable)
+  known = error.__traceback__.tb_frame.f_locals
+  begun = len(known) > code.co_argcount
+  arguments = [] if begun else [known[name] for name in code.co_varnames[: code.co_argcount]]
+  raise_later(error)
+  if begun or "return" in callback.__annotations__:  # which is lost
+    return leave()
+  return callback(*arguments)
 
 
 # The end of the process.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 
@@ -53,7 +54,7 @@ def stiffness(
   Returns:
     whether it is; most times its inertia in `nodal` that a pressed node may have [-]
   """
-  sample = _spread(organ.mesh.rest, np.flatnonzero(organ.free), _FEW)
+  sample = _spread(organ.mesh.rest, _outer(organ.mesh, organ.free), _FEW)
   alone = _by_itself(m, organ, body, config, sample)
   stiff = np.quantile(alone / masses(m, organ)[sample], 0.75) > _STIFF
   return bool(stiff), _PRESSED * max(1.0, float(np.median(alone / nodal[sample])))
@@ -71,8 +72,9 @@ def _by_itself(m, organ: Declaration, body: Body, config: Config, sample: np.nda
     gain = SCHEMES[config.integrator].gain(h, config.damping)
     terms = {key: getattr(config, key) for key in ("damping", "foundation", "bulk")}
     scratch = _scratch(body, dataclasses.replace(_compiled(organ, config), **terms))
-    response = _responses(scratch, organ.mesh, mass, organ.free, h, 0.0, gain, sample)
-    _alone[key] = 1 / np.maximum(response, 1e-300)
+    with _naming(organ):
+      response = _responses(scratch, organ.mesh, mass, organ.free, h, 0.0, gain, sample)
+    _alone[key] = 1 / response
   return _alone[key]
 
 
@@ -87,7 +89,17 @@ def of_nodes(
   radius = _tool_radius(m, organ, flex)
   gain = SCHEMES[config.integrator].gain(h, config.damping)
   scratch = _scratch(body, config)
-  return effective_inertia(scratch, organ.mesh, mass, organ.free, h, radius, gain)
+  with _naming(organ):
+    return effective_inertia(scratch, organ.mesh, mass, organ.free, h, radius, gain)
+
+
+@contextlib.contextmanager
+def _naming(organ: Declaration):
+  """Names the organ in a ValueError."""
+  try:
+    yield
+  except ValueError as error:
+    raise ValueError(f"organ {organ.name!r}: {error}") from None
 
 
 def of_dofs(m, organ: Declaration) -> np.ndarray:
@@ -175,10 +187,10 @@ def effective_inertia(
     gain: factor of K in A [s^2]
   """
   area = topology.vertex_areas(mesh.rest, mesh.elem)
-  sample = _spread(mesh.rest, np.flatnonzero(free), _SAMPLES)
+  sample = _spread(mesh.rest, _outer(mesh, free), _SAMPLES)
   response = _responses(body, mesh, mass, free, h, radius, gain, sample)
   # Per area, so that finer parts of the surface get less.
-  specific = 1 / np.maximum(response, 1e-300) / area[sample]
+  specific = 1 / response / area[sample]
   distance2 = ((mesh.rest[:, None] - mesh.rest[sample]) ** 2).sum(axis=2)
   nearest = np.argsort(distance2, axis=1)[:, :3]
   weight = 1 / (np.take_along_axis(distance2, nearest, axis=1) + 1e-12 * distance2.max() + 1e-300)
@@ -213,12 +225,26 @@ def _responses(
   state.step.assign(np.array([[h, gain, floor, 0]], np.float32))
   response = np.zeros(len(sample))
   for k, i in enumerate(sample):
-    patch = free & (((mesh.rest - mesh.rest[i]) ** 2).sum(axis=1) <= radius**2)
-    patch[i] = True
-    put(state.force_ext, np.where(patch[:, None], normal[i] / h, 0.0))
-    step.step(body)
-    response[k] = from_slices(state.dvel.numpy()[0])[node[i]] @ normal[i]
+    alone = np.arange(mesh.nvert) == i
+    around = free & (((mesh.rest - mesh.rest[i]) ** 2).sum(axis=1) <= radius**2)
+    for patch in (alone | around, alone):
+      put(state.force_ext, np.where(patch[:, None], normal[i] / h, 0.0))
+      step.step(body)
+      response[k] = from_slices(state.dvel.numpy()[0])[node[i]] @ normal[i]
+      if response[k] > 0.0:  # where the surface is folded, a push may lift its middle
+        break
+    else:
+      size = np.linalg.norm(np.ptp(mesh.rest, axis=0))
+      raise ValueError(
+        f"vertex {i} does not give way to a push, expected tissue that single "
+        f"precision can solve; the organ is {size:.3g} m long: is its scale right?"
+      )
   return response
+
+
+def _outer(mesh: Mesh, free: np.ndarray) -> np.ndarray:
+  """Returns the nodes of the surface that move."""
+  return np.flatnonzero(free[: mesh.nouter])
 
 
 def _spread(rest: np.ndarray, candidates: np.ndarray, count: int) -> np.ndarray:

@@ -138,11 +138,12 @@ class Identity:
     fields: Any = Model
     self._sizes = view(model, fields.opt.offset, np.uint8).data
     self._buffer = view(model + fields.buffer.offset, 1, np.uintp).data
-    self._were = self._sizes.tobytes(), self._buffer[0]
+    self._were, self._lay = self._sizes.tobytes(), self._buffer[0]
 
   def is_of(self, model: int) -> bool:
     """Returns whether views made for this model are right for the living one at an address."""
-    return model == self.address and self._were == (self._sizes.tobytes(), self._buffer[0])
+    same = model == self.address and self._buffer[0] == self._lay
+    return same and self._sizes.tobytes() == self._were
 
 
 def name_of(m: C.Structure, addresses: int | None, index: int) -> str:

@@ -19,6 +19,7 @@ class Nodes:
   """A windowed organ's nodes, in the order of its vertices and in its frame."""
 
   nvert: int  # vertices
+  nouter: int  # those on the surface, the first ones
   nslot: int  # slots of all windows
   nwindow: int  # windows
   most: int  # candidates of a window that the outbox has room for
@@ -59,6 +60,7 @@ def make(w, side, motion, boxes: tuple[wp.array, wp.array], sizes: dict[str, int
   wp.copy(w.body.state.mass, w.host["mass"])
   values = dict(
     nvert=sizes["nvert"],
+    nouter=organ.mesh.nouter,
     nslot=sizes["nslot"],
     nwindow=sizes["nwindow"],
     most=sizes["most"],

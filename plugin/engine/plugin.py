@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 from palpate.tissue.config import KEYS
 
-from . import guard, mjstruct, turns, windowed, workspace
+from . import guard, mjstruct, weights, windowed, workspace
 from .layout import FLAG
 from .mjstruct import NAME, warn
 from .workspace import Workspace
@@ -125,8 +125,6 @@ def _init(model: int, data: int, instance: int) -> int:
 @guard.watch
 def _destroy(data: int, instance: int):
   w = _workspaces.pop((data, instance), None)
-  if w is not None and w.turn is not None:
-    w.turn.retire()
   for handle in [h for h, other in _handles.items() if other is w]:
     del _handles[handle]
 
@@ -138,6 +136,7 @@ def _copy(data: int, model: int, source: int, instance: int):
     workspace.copy(w, model, _workspaces[source, instance])
   except BaseException as error:
     _fail(w, error)
+  return guard.leave()
 
 
 @guard.watch
@@ -149,13 +148,14 @@ def _reset(model: int, state: int, data: int | None, instance: int):
   if w is not None:
     w.forget()
     w.nbad = 0
+  return guard.leave()
 
 
 @guard.watch
 def _compute(model: int, data: int, instance: int, capability: int):
-  guard.enter()
   w = _workspaces[data, instance]
   try:
+    guard.enter()
     if not w.identity.is_of(model):
       workspace.attach(w, model)
     if _count_bad(w) > w.nbad:
@@ -165,6 +165,7 @@ def _compute(model: int, data: int, instance: int, capability: int):
       _note(w, f"the {w.config.integrator} step has no finite solution: the motion diverged")
   except BaseException as error:
     _fail(w, error)
+  return guard.leave()
 
 
 @guard.watch
@@ -177,9 +178,11 @@ def _advance(model: int, data: int, instance: int):
       _miss(w, int(nodes), int(triangles))
     if w.model_step[0] != w.time_step:
       workspace.refresh(w)
-    guard.leave()
+    if w.watch.due() and not (w.asleep or w.resident):
+      _watch(w)
   except BaseException as error:
     _fail(w, error)
+  return guard.leave()
 
 
 @guard.watch
@@ -190,6 +193,7 @@ def _visualize(model: int, data: int, option: int, scene: int, instance: int):
       windowed.draw(w, model, data)
   except BaseException as error:
     _fail(w, error)
+  return guard.leave()
 
 
 # What went wrong.
@@ -222,10 +226,7 @@ def _fail(w: Workspace, error: BaseException):
   """Makes an error of an exception in a callback."""
   if guard.is_foreign(error):
     guard.raise_later(error)
-    return
-  if isinstance(error, turns.Contested):  # what follows is wrong: nobody may miss it
-    _note(w, str(error))
-    guard.raise_in_caller(RuntimeError(w.error))
+    w.torn = True
   else:
     _note(w, f"{type(error).__name__}: {error}")
 
@@ -235,6 +236,17 @@ def _note(w: Workspace, text: str):
   if w.error is None:
     w.error = f"organ {w.organ.name!r}: {text}"
     warn(w.error)
+
+
+def _watch(w: Workspace):
+  """Warns of tools that have come through the surface."""
+  m = mjstruct.Model.from_address(w.model)
+  for geom in w.watch.look(w):
+    name = mjstruct.name_of(m, m.name_geomadr, geom) or geom
+    warn(
+      f"organ {w.organ.name!r}: geom {name!r} has gone through its surface, where contacts do not "
+      "hold it any more; see Organ.pierced"
+    )
 
 
 def _miss(w: Workspace, nodes: int, triangles: int):
@@ -249,6 +261,7 @@ def _miss(w: Workspace, nodes: int, triangles: int):
 def register() -> int:
   """Registers the plugin with MuJoCo, once a process; returns its slot."""
   mjstruct.check()
+  weights.are_wrong()  # compiles a model, which must not be done while another is compiled
   lib = mjstruct.library()
   slot = C.c_int(-1)
   if lib.mjp_getPlugin(NAME.encode(), C.byref(slot)):

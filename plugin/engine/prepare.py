@@ -76,13 +76,13 @@ def show(m, organ: Declaration, shown: bool):
   """
   flex, mesh = organ.flex, organ.mesh
   shells = int((mesh.twin < 0).sum())
-  counts = (mesh.nvert, mesh.nelem, shells) if shown else (0, 0, shells + mesh.nelem)
+  counts = (mesh.nouter, mesh.nelem, shells) if shown else (0, 0, shells + mesh.nelem)
   names = ("flex_vertnum", "flex_elemnum", "flex_shellnum", "flex_bvhnum", "flex_bvhadr")
   for name, count in zip(names, (*counts, 0, -1), strict=True):
     mjstruct.view(getattr(m, name), m.nflex, np.int32)[flex] = count
   # The broad phase passes over vertices of the world; the first one still tells whose they are.
   start = int(mjstruct.view(m.flex_vertadr, m.nflex, np.int32)[flex])
-  body = mjstruct.view(m.flex_vertbodyid, m.nflexvert, np.int32)[start : start + mesh.nvert]
+  body = mjstruct.view(m.flex_vertbodyid, m.nflexvert, np.int32)[start : start + mesh.nouter]
   body[1:] = body[0] if shown else 0
 
 

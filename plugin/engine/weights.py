@@ -14,7 +14,7 @@ import warp as wp
 from palpate.tissue.kernels import kernel
 from palpate.tissue.types import Array, doubles, ints, struct
 
-from . import apart, coupling, mjstruct
+from . import apart, coupling, declare_windows, mjstruct
 from .layout import FLAG
 
 _DATA = (
@@ -27,11 +27,11 @@ _SPARSE_FROM = 60  # dofs from which MuJoCo's rows are sparse where it may choos
 
 @struct
 class Weights:
-  """An organ's flexes and MuJoCo's memory under its own names."""
+  """The organs' flexes and MuJoCo's memory under its own names."""
 
   nv: int  # dofs of the model
   memory: Array(wp.uint64, ("nword",))  # the mjData itself
-  mine: ints("nflex")  # whether a flex is the organ's, or a window of it
+  mine: ints("nflex")  # whether a flex is an organ's, or a window of one
   flags: ints(len(FLAG))  # see FLAG
   # mjOption:
   jacobian: ints(1)
@@ -100,10 +100,13 @@ def are_wrong() -> bool:
 
 
 def make(w, model: int):
-  """Returns `Weights` of a workspace's organ."""
-  m, windows = mjstruct.Model.from_address(model), w.organ.windows
+  """Returns `Weights` of the model's organs, beside a workspace's.
+
+  Of all, since one that looks for contacts again in a step has those of the others found again.
+  """
+  m = mjstruct.Model.from_address(model)
   mine = np.zeros(m.nflex, np.int32)
-  mine[windows.flex if windows else w.organ.flex] = 1
+  mine[declare_windows.touching(model, w.instance)] = 1
   out = coupling.mujoco_arrays(model, w.data, Weights)
   out.nv = m.nv
   out.memory = coupling.wrap(w.data, mjstruct.size(mjstruct.Data) // 8, wp.uint64)

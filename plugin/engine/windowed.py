@@ -216,16 +216,27 @@ def let_sleep(w, allowed: bool):
   mjstruct.view(m.tree_sleep_policy, m.ntree, np.int32)[tree] = int(may)
   if allowed or (mjstruct.view(d.tree_asleep, m.ntree, np.int32)[tree] < 0).all():
     return
-  lib = mjstruct.library()
-  # Inertias stay: another organ may have made its own greater in this step.
-  inertias = [(d.M, m.nC), (d.qLD, m.nC), (d.qLDiagInv, m.nv)]
-  kept = [mjstruct.view(*each).copy() for each in inertias]
-  apart.find_contacts(w.model, w.data)  # trees that may not sleep wake
-  lib.mj_comVel(w.model, w.data)
-  for each, values in zip(inertias, kept, strict=True):
-    mjstruct.view(*each)[:] = values
+  find_contacts_again(w)  # trees that may not sleep wake
+  mjstruct.library().mj_comVel(w.model, w.data)
   mjstruct.view(d.qfrc_passive, m.nv)[w.organ.dofs] = 0.0
   wp.capture_launch(w.before)
+
+
+def find_contacts_again(w):
+  """Does the position stage once more.
+
+  Inertias of others stay: an organ may have made its own greater in this step.
+  """
+  m, d = mjstruct.Model.from_address(w.model), mjstruct.Data.from_address(w.data)
+  other = np.ones(m.nv, bool)
+  other[w.organ.dofs] = False
+  row = np.repeat(other, mjstruct.view(m.M_rownnz, m.nv, np.int32))
+  kept = [(mjstruct.view(d.M, m.nC), row), (mjstruct.view(d.qLD, m.nC), row)]
+  kept += [(mjstruct.view(d.qLDiagInv, m.nv), other)]
+  values = [array[which].copy() for array, which in kept]
+  apart.find_contacts(w.model, w.data)
+  for (array, which), were in zip(kept, values, strict=True):
+    array[which] = were
 
 
 def wake(w):
@@ -259,10 +270,10 @@ def draw(w, model: int, data: int):
   m, d = mjstruct.Model.from_address(model), mjstruct.Data.from_address(data)
   organ = w.organ
   start = int(mjstruct.view(m.flex_vertadr, m.nflex, np.int32)[organ.flex])
-  n = organ.mesh.nvert
+  n = organ.mesh.nouter
   prepare.show(m, organ, shown=True)
   if w.resident:
     w.resident.fetch()
   out = mjstruct.view(d.flexvert_xpos, (m.nflexvert, 3))[start : start + n]
-  disp = w.boxes["own"].motion.disp.numpy()
-  out[:] = organ.origin + (organ.mesh.rest + disp) @ organ.frame.T
+  disp = w.boxes["own"].motion.disp.numpy()[:n]
+  out[:] = organ.origin + (organ.mesh.rest[:n] + disp) @ organ.frame.T

@@ -10,12 +10,11 @@ import numpy as np
 import warp as wp
 from palpate.tissue import body as bodies
 from palpate.tissue import config as configuration
-from palpate.tissue import shape
+from palpate.tissue import fill, shape
 from palpate.tissue.body import Body
 from palpate.tissue.config import Config
 
 from . import (
-  apart,
   coupling,
   declare,
   declare_windows,
@@ -31,6 +30,7 @@ from .bind import bind
 from .coupling import Phases
 from .declare import Declaration
 from .layout import FLAG, HEAD
+from .pierce import Watch
 from .resident import Resident
 from .turns import Turn
 
@@ -77,6 +77,8 @@ class Workspace:
     nefc: the number of MuJoCo's constraints comes first
     strange: whether the plugin state is not one of this organ
     noticed: whether it was said that windows came without their state
+    torn: whether a signal's handler has ended a callback of the last step
+    watch: looks whether tools come through the surface
     nbad: MuJoCo's warnings of bad states that were looked at since the last reset
     model_step: the model's time step comes first [s]
     time_step: time step that the armature is for [s]
@@ -122,6 +124,8 @@ class Workspace:
   missed: tuple[int, int] = (0, 0)
   strange: bool = False
   noticed: bool = False
+  torn: bool = False
+  watch: Watch = dataclasses.field(default_factory=Watch)
   # Views that every step looks at: an item of a memoryview costs a tenth of one of an array.
   warning: memoryview = dataclasses.field(default_factory=lambda: memoryview(b""))
   nefc: memoryview = dataclasses.field(default_factory=lambda: memoryview(b"\0"))
@@ -145,13 +149,17 @@ class Workspace:
     if self.strange:
       self._check_state()
       self.strange = False
+    if self.turn is None:
+      self._run()
+    else:
+      with self.turn.lock:
+        self._run()
+
+  def _run(self):
     if self.turn is not None:
-      if self.turn.refused:
-        self.turn.stand_back()
-        return
       # The model's windows may not be those of this state, which was set from outside or shares the
       # model with another: contacts must be found again with the windows in place.
-      if not self.turn.begin() or self._is_astray():
+      if self._is_astray() or not self.turn.mine:
         self._find_contacts_again()
     wp.capture_launch(self.before)
     if self.turn is not None:
@@ -210,7 +218,8 @@ class Workspace:
     if self.qpos.tobytes() == self.stood:
       return False
     far = windowed.find_astray(self)
-    if far > _ASTRAY and not self.noticed:
+    torn, self.torn = self.torn, False
+    if far > _ASTRAY and not (self.noticed or torn):
       self.noticed = True
       mjstruct.warn(
         f"organ {self.organ.name!r}: qpos of its windows was set without plugin_state, which has "
@@ -220,7 +229,7 @@ class Workspace:
 
   def _find_contacts_again(self):
     self.put_windows()
-    apart.find_contacts(self.model, self.data)
+    windowed.find_contacts_again(self)
 
   def put_windows(self):
     """Puts the windows where the plugin state says."""
@@ -238,11 +247,11 @@ class Workspace:
       self.signature[0] = self.organ.signature
     if self.turn is None:
       self._step()
-    elif not self.turn.refused:
-      self.turn.check()
-      self._step()
-      self.turn.end()
-      self.stood = self.qpos.tobytes()
+    else:
+      with self.turn.lock:
+        self._step()
+        self.turn.end()
+        self.stood = self.qpos.tobytes()
 
   def _step(self):
     computed, self.computed = self.computed, False
@@ -296,21 +305,16 @@ class Workspace:
 
   def forget(self):
     """Forgets what went wrong."""
-    self.error = None
-    if self.turn is not None:
-      self.turn.refused = False
+    self.error, self.watch = None, Watch()
 
 
 def place(w: Workspace, model: int):
-  """Puts the windows of a model where the plugin state says, unless another thread steps it."""
+  """Puts the windows of a model where the plugin state says."""
   attach(w, model)
-  if w.turn is None:
-    return
-  if w.turn.is_free():
-    w.put_windows()
-    w.stood = w.qpos.tobytes()
-  else:
-    w.turn.leave()
+  if w.turn is not None:
+    with w.turn.lock:
+      w.put_windows()
+      w.stood = w.qpos.tobytes()
 
 
 def attach(w: Workspace, model: int):
@@ -328,7 +332,8 @@ def state_size(model: int, instance: int) -> int:
   names = mjstruct.config(model, instance, "window").split()
   if names:
     # Asked before MuJoCo has filled in the flexes: what `windowed` needs is at most this.
-    return windowed.state_size(m.nflexvert, 0, m.ngeom * len(names))
+    inside = fill.MOST if mjstruct.config(model, instance, "elements").strip() == "solid" else 0
+    return windowed.state_size((1 + inside) * m.nflexvert, 0, m.ngeom * len(names))
   return nodal.state_size(3 * len(declare.moving_bodies(m, instance)))
 
 
@@ -360,9 +365,6 @@ def make(model: int, data: int, instance: int) -> Workspace:
     w.signature = w.plugin_state[coupling.spans(organ)["signature"]].data
     if w.turn is not None:
       windowed.settle(w, model)
-      if w.turn.is_orphan():
-        wp.capture_launch(w.place)
-        w.turn.go_home()
     _feel(w, m)
     return w
 

@@ -149,6 +149,19 @@ PALPATE void put_quads(float* quads, V3 v) {
 #undef PICK
 #endif
 
+// Vectors that others gather: numbered, each with room for four numbers. Vector i of eight that begin
+// at 8 n starts at 4 i on the CPU, as quads, and at 32 n + i on CUDA, as rows.
+#if ON_CUDA
+PALPATE V3 gather_shared(const float* p, const int* at, Lane lane) {
+  p += 4 * LANES * (at[lane] / LANES) + at[lane] % LANES;
+  return {p[0], p[LANES], p[2 * LANES]};
+}
+PALPATE void share(float* p, V3 a, Lane lane) { st3(p, a, lane); }
+#else
+PALPATE V3 gather_shared(const float* p, const int* at, Lane) { return gather_quads(p, at); }
+PALPATE void share(float* p, V3 a, Lane) { put_quads(p, a); }
+#endif
+
 // Numbers.
 
 PALPATE V splat(float a) { return (V)a; }

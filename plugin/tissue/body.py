@@ -66,6 +66,11 @@ class Body:
     return self.fields.system
 
   @property
+  def is_solid(self) -> bool:
+    """Whether there are tetrahedra in place of a skin."""
+    return self.shape.ntetslice > 0
+
+  @property
   def has_bending(self) -> bool:
     """Whether bending kernels run."""
     return self.shape.nhingeslice > 0
@@ -119,10 +124,14 @@ def constants(
 
 def _sizes(values: dict[str, Any]) -> dict[str, int]:
   """Returns the named sizes of a body from the fields of `Shape` and `Tissue`, but nworld."""
-  shape = ("nvert", "nnode", "nslice", "nelemslice", "nhingeslice", "nslot")
+  shape = ("nvert", "nnode", "nslice", "nelemslice", "nhingeslice", "ntetslice", "nslot")
   out = {name: values[name] for name in shape}
-  bends = out["nhingeslice"] > 0
+  bends, solid = out["nhingeslice"] > 0, out["ntetslice"] > 0
   return out | {
+    "nsolidslice": out["nslice"] if solid else 0,
+    "nedgeslot": out["nslot"] if solid else 0,
+    "naround": len(values["around_tet"]),
+    "nedge": len(values["edge_tet"]),
     "nbend": len(values["bend_node"]),
     "nbendslice": out["nslice"] if bends else 0,
     "nareaslice": out["nslice"] if bends or values["closed"] else 0,

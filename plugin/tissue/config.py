@@ -46,9 +46,16 @@ def _row(default, kind: tuple, meaning: str, unit: str = "-", change: str = FIXE
 # What a key may hold: how it is read, and what a message says of it.
 
 
+def _plain(word: str) -> str:
+  """Returns a word of a number; Python alone reads 1_0 and digits of other scripts as one."""
+  if not word.isascii() or "_" in word:
+    raise ValueError
+  return word
+
+
 def _number(low: float, high: float = math.inf, closed: bool = True) -> tuple:
   def read(text: str, nelem: int) -> float:
-    value = float(text)
+    value = float(_plain(text))
     inside = (value >= low if closed else value > low) and value < high
     if not (math.isfinite(value) and inside):
       raise ValueError
@@ -63,7 +70,7 @@ def _number(low: float, high: float = math.inf, closed: bool = True) -> tuple:
 
 def _numbers(text: str, nelem: int) -> tuple[float, ...]:
   words = text.split()
-  values = tuple(float(word) for word in words)
+  values = tuple(float(_plain(word)) for word in words)
   for k, value in enumerate(values):
     if not (math.isfinite(value) and value > 0):
       if len(values) > 1:
@@ -76,7 +83,7 @@ def _numbers(text: str, nelem: int) -> tuple[float, ...]:
 
 def _count(low: int, high: int) -> tuple:
   def read(text: str, nelem: int) -> int:
-    value = int(text)
+    value = int(_plain(text))
     if not low <= value <= high:
       raise ValueError
     return value
@@ -95,13 +102,13 @@ def _choice(values: dict[str, Any]) -> tuple:
 
 def _device(text: str, nelem: int) -> str:
   kind, _, index = text.partition(":")
-  if text in ("auto", "cpu", "cuda") or (kind == "cuda" and index.isdigit()):
+  if text in ("auto", "cpu", "cuda") or (kind == "cuda" and _plain(index).isdigit()):
     return "cuda:0" if text == "cuda" else text
   raise ValueError
 
 
 def _vertices(text: str, nelem: int) -> tuple[int, ...]:
-  if not all(word.isdigit() for word in text.split()):
+  if not all(_plain(word).isdigit() for word in text.split()):
     raise ValueError
   return tuple(int(word) for word in text.split())
 
@@ -128,8 +135,9 @@ class Config:
 
   elements: str = _row(
     "membrane",
-    _words("membrane", "spring"),
-    "`membrane` (St. Venant-Kirchhoff triangles, plane stress) or `spring` (edge springs)",
+    _words("membrane", "spring", "solid"),
+    "`membrane` (St. Venant-Kirchhoff triangles, plane stress), `spring` (edge springs) or `solid` "
+    "(neo-Hookean tetrahedra inside, made when the model is compiled; with `window` alone)",
   )
   young: tuple[float, ...] = _row(
     (5000.0,),
@@ -253,7 +261,7 @@ def parse(organ: str, texts: dict[str, str], nelem: int, closed: bool) -> Config
   values = _values(organ, texts, nelem)
   config = Config(**values)
   _check_combination(organ, config, values, closed)
-  return config
+  return dataclasses.replace(config, bend=0.0) if config.elements == "solid" else config
 
 
 def change(
@@ -323,12 +331,30 @@ def _check_combination(organ: str, config: Config, given: dict, closed: bool):
   for key in ("follow", "mass", "pin", "resident"):
     if key in given and not config.window:
       raise ValueError(f"organ {organ!r}: {key} is set, allowed only with window")
+  if config.elements == "solid":
+    _check_solid(organ, config, given)
   if config.window and "mass" not in given and not config.mass:
     raise ValueError(f"organ {organ!r}: window is set and mass is missing [kg]")
   for key in ("bulk", "pressure"):
     value = getattr(config, key)
     if value and not closed:
       raise ValueError(f"organ {organ!r}: {key} is {value:g}, allowed only on a closed surface")
+
+
+def _check_solid(organ: str, config: Config, given: dict):
+  if not config.window:
+    raise ValueError(f"organ {organ!r}: elements is 'solid', expected window too (`add_windows`)")
+  for key in ("thickness", "bend", "bulk", "pressure"):
+    if given.get(key):
+      raise ValueError(
+        f"organ {organ!r}: {key} is {given[key]:g}, allowed only where elements is not 'solid': "
+        "poisson says how a solid keeps its volume"
+      )
+  if not SCHEMES[config.integrator].solids:
+    raise ValueError(
+      f"organ {organ!r}: integrator is {config.integrator!r}, allowed only where elements is not "
+      "'solid'"
+    )
 
 
 def lame(config: Config, nelem: int) -> tuple[np.ndarray, np.ndarray]:
@@ -339,6 +365,14 @@ def lame(config: Config, nelem: int) -> tuple[np.ndarray, np.ndarray]:
   young = np.broadcast_to(np.asarray(config.young), (nelem,))
   nu = config.poisson
   return young * nu / (1 - nu * nu), young / (2 * (1 + nu))
+
+
+def lame_solid(young: np.ndarray, poisson: float) -> tuple[np.ndarray, np.ndarray]:
+  """Returns the Lame constants mu, lambda of a solid [Pa].
+
+  mu = E / (2 (1 + nu)), lambda = E nu / ((1 + nu) (1 - 2 nu)).
+  """
+  return young / (2 * (1 + poisson)), young * poisson / ((1 + poisson) * (1 - 2 * poisson))
 
 
 def rigidity(config: Config, nelem: int) -> np.ndarray:

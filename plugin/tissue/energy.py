@@ -9,8 +9,9 @@ from __future__ import annotations
 import numpy as np
 
 from . import config as configuration
+from . import fill, plate
 from . import mesh as topology
-from . import plate
+from . import solid as solids
 from .config import Config
 from .mesh import Mesh
 
@@ -101,10 +102,33 @@ def enclosed(mesh: Mesh, config: Config, u: np.ndarray) -> float:
   return float(0.5 * config.bulk * change**2 / rest - config.pressure * change)
 
 
+def solid(mesh: Mesh, config: Config, u: np.ndarray) -> float:
+  """Returns the energy of the tetrahedra [J], see native/solid.h."""
+  if config.elements != "solid":
+    return 0.0
+  volume = fill.volumes(mesh.rest, mesh.tet)
+  h = np.einsum("tki,tkj->tij", u[mesh.tet], solids.gradients(mesh))
+  i = 2 * np.trace(h, axis1=1, axis2=2) + (h * h).sum(axis=(1, 2))
+  cofactor = np.stack([np.cross(h[:, k - 2], h[:, k - 1]) for k in range(3)], axis=1)
+  swelling = np.trace(h, axis1=1, axis2=2) + np.trace(cofactor, axis1=1, axis2=2)
+  swelling += (h[:, 0] * cofactor[:, 0]).sum(axis=1)
+  mu, lam, averaged = solids.moduli(mesh, config)
+  own = mu / 2 * (i - np.log1p(i / 4)) - 3 / 4 * mu * swelling + lam / 2 * swelling**2
+  share, corner = np.repeat(volume / 4, 4), mesh.tet.ravel()
+
+  def around(value: np.ndarray) -> np.ndarray:
+    return np.bincount(corner, share * np.repeat(value, 4), mesh.nvert)
+
+  total = around(np.ones(len(volume)))
+  mean, stiffness = around(swelling) / total, around(averaged)
+  return float((volume * own).sum() + 0.5 * (stiffness * mean**2).sum())
+
+
 # The terms of the energy: (mesh, config, displacement) -> [J], 0 where a term is off.
 TERMS = {
   "membrane": membrane,
   "springs": springs,
+  "solid": solid,
   "bending": bending,
   "foundation": foundation,
   "enclosed": enclosed,

@@ -19,6 +19,7 @@ class Mesh:
     ring: neighbours of each vertex in counter-clockwise order, -1  (nvert, most)
     ring_elem: half-edge vertex -> ring[k]; -1 where it has no face (nvert, most)
     degree: number of neighbours                                    (nvert,)
+    tet: corners of each tetrahedron, of positive volume, see `fill`(ntet, 4)
   """
 
   rest: np.ndarray
@@ -28,6 +29,12 @@ class Mesh:
   ring: np.ndarray
   ring_elem: np.ndarray
   degree: np.ndarray
+  tet: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 4), np.int64))
+
+  @property
+  def nouter(self) -> int:
+    """Number of vertices on the surface, which come first."""
+    return int(self.elem.max()) + 1
 
   @property
   def nvert(self) -> int:

@@ -101,7 +101,11 @@ def _patches(point: np.ndarray, size: int) -> np.ndarray:
 
 
 def _band(mesh: Mesh) -> np.ndarray:
-  start, end = mesh.elem.ravel(), mesh.elem[:, [1, 2, 0]].ravel()
+  if len(mesh.tet):
+    start, k = np.nonzero(mesh.ring >= 0)
+    end = mesh.ring[start, k]
+  else:
+    start, end = mesh.elem.ravel(), mesh.elem[:, [1, 2, 0]].ravel()
   graph = sparse.coo_matrix(
     (np.ones(2 * len(start)), (np.concatenate([start, end]), np.concatenate([end, start]))),
     shape=(mesh.nvert, mesh.nvert),

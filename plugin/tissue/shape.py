@@ -13,12 +13,12 @@ from . import coarse as coarsening
 from . import config as configuration
 from . import device as devices
 from . import mesh as topology
-from . import plate, step, types
+from . import plate, solid, step
 from .body import Body
 from .config import Config
 from .mesh import Mesh
 from .order import LANES, addresses, ellpack, node_order, offset, pad, to_slices
-from .types import NUMBERS
+from .types import NUMBERS, empty
 
 
 def make(
@@ -43,7 +43,8 @@ def make(
   target = devices.resolve(device, mesh.nvert)
   finest = arrays(mesh, config, pinned, devices.patch(target, -(-mesh.nvert // LANES)))
   below = None
-  if np.isinf(scale) or coarsening.pay(finest, scale, coarsening.threshold(target)):
+  solid = config.elements == "solid"
+  if not solid and (np.isinf(scale) or coarsening.pay(finest, scale, coarsening.threshold(target))):
     below = _below(mesh, config, pinned, finest, target)
   body = bodies.constants(finest, target, config.newton, below)
   with wp.ScopedDevice(target):
@@ -94,6 +95,7 @@ def _below(
     for level, e, mask in zip(levels, young, masks[1:], strict=True)
   ]
   joined = coarsening.join(parts[1:])
+  joined |= solid.none(len(joined["area"]))
   return joined | counts(joined) | coarsening.transfer(levels, parts, masks, device)
 
 
@@ -105,6 +107,7 @@ def arrays(mesh: Mesh, config: Config, pinned: np.ndarray, patch: int = 0) -> di
   out = {
     **_fans(mesh, config, vert, node),
     **_bending(mesh, config, node, len(vert) // LANES),
+    **(solid.arrays(mesh, config, vert, node) if len(mesh.tet) else solid.none(len(vert) // LANES)),
     "vert": vert.astype(np.int32),
     "node": node.astype(np.int32),
     "area": _node_values(topology.vertex_areas(mesh.rest, mesh.elem), vert),
@@ -124,6 +127,7 @@ def counts(values: dict[str, Any]) -> dict[str, int]:
     "nslice": len(values["area"]),
     "nelemslice": len(values["elem_node"]),
     "nhingeslice": len(values["hinge_node"]),
+    "ntetslice": len(values["tet_node"]),
     "nslot": int(values["slot_adr"][-1]),
   }
 
@@ -275,10 +279,5 @@ def _bending(mesh: Mesh, config: Config, node: np.ndarray, nslice: int) -> dict[
 
 def _no_bending(nslice: int) -> dict[str, np.ndarray]:
   """Returns the arrays of `_bending` for a surface without it."""
-  out: dict[str, np.ndarray] = {"bend_adr": np.zeros(nslice + 1, np.int32)}
-  for kind in (types.Shape, types.Tissue):
-    for name, dims in types.DIMS[kind.key].items():
-      if dims[0] in ("nelemslice", "nhingeslice", "nbend", "nbendslice"):
-        dtype = np.int32 if kind.vars[name].type.dtype is wp.int32 else np.float32
-        out[name] = np.zeros((0, *dims[1:]), dtype)
-  return out
+  sizes = ("nelemslice", "nhingeslice", "nbend", "nbendslice")
+  return {"bend_adr": np.zeros(nslice + 1, np.int32)} | empty(sizes)

@@ -64,6 +64,10 @@ def _elastic(name: str) -> wp.Kernel:
   return kernel(name, "elastic.h", Fields, CONSTANTS)
 
 
+def _solid(name: str) -> wp.Kernel:
+  return kernel(name, "solid.h", Fields, CONSTANTS)
+
+
 def _scheme(name: str, bounds: int | None = None) -> wp.Kernel:
   return kernel(name, "schemes.h", Fields, _CONSTANTS, bounds)
 
@@ -73,6 +77,10 @@ _hinge_angle = _elastic("hinge_angle")
 _hinge_moment = _elastic("hinge_moment")
 _elem_corner = _elastic("elem_corner")
 _row = _elastic("row")
+_tet_strain = _solid("tet_strain")
+_node_pressure = _solid("node_pressure")
+_tet_stress = _solid("tet_stress")
+_solid_row = _solid("solid_row")
 _edge_change = _scheme("edge_change")
 _predict = _scheme("predict")
 _newton_update = _scheme("newton_update")
@@ -117,7 +125,7 @@ def _together(kernel: wp.Kernel, body: Body, arg: int, fields=None, per_sm: int 
 
 def modules(body: Body) -> list[str]:
   """Returns the Warp modules that a body's step needs."""
-  kernels = [_row, _predict, _solve]
+  kernels = [_solid_row if body.is_solid else _row, _predict, _solve]
   if body.levels is not None:
     kernels.append(_sample)
   return [kernel.module.name for kernel in kernels]
@@ -134,6 +142,12 @@ def assemble(body: Body, stage: Stage):
     stage: what the right-hand side is for
   """
   shape = body.shape
+  if body.is_solid:
+    _over(_tet_strain, body, shape.ntetslice, stage)
+    _over(_node_pressure, body, shape.nslice)
+    _over(_tet_stress, body, shape.ntetslice, stage)
+    _over(_solid_row, body, shape.nslice, stage)
+    return
   if body.has_bending:
     _hinge_angles(body, stage)
     _over(_hinge_moment, body, shape.nhingeslice)
@@ -249,12 +263,14 @@ class Scheme:
     respond: writes to `system.sol` how the impulses in `system.rhs` [N s] change the velocity in
       the step just computed; None where the scheme has no such answer
     levels: whether coarser meshes serve its solve
+    solids: whether it can step tetrahedra
   """
 
   step: Callable[[Body], None]
   gain: Callable[[float, float], float]
   respond: Callable[[Body], None] | None = None
   levels: bool = False
+  solids: bool = True
 
   @property
   def spreads(self) -> bool:
@@ -269,7 +285,7 @@ def _whole(h: float, damping: float) -> float:
 SCHEMES = {
   "implicit": Scheme(_implicit, _whole, _respond, levels=True),
   "midpoint": Scheme(_midpoint, lambda h, b: 0.5 * _whole(h, b), _respond_centred, levels=True),
-  "neumann": Scheme(_neumann, _whole),
+  "neumann": Scheme(_neumann, _whole, solids=False),
   "explicit": Scheme(_explicit, lambda h, b: 0.0),
 }
 

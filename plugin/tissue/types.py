@@ -2,7 +2,8 @@
 
 A line says meaning, unit, type and shape, and the shape is what `allocate` makes. Sizes are named:
 nworld worlds; nslice slices of nodes, nelemslice of triangles, nhingeslice of hinges (0 without
-bending); nslot rows of stiffness blocks; others see `body`. Nodes lie in slices of eight, the last
+bending), ntetslice of tetrahedra (0 but for solids); nslot rows of stiffness blocks; others see
+`body`. Nodes lie in slices of eight, the last
 axis; `native/simd.h` says how they are read.
 """
 
@@ -105,6 +106,7 @@ class Shape:
   nslice: int  # slices of nodes
   nelemslice: int  # slices of triangles; 0 without bending
   nhingeslice: int  # slices of hinges; 0 without bending
+  ntetslice: int  # slices of tetrahedra; 0 but for solids
   nslot: int  # rows of stiffness blocks
   closed: int  # whether the surface encloses a volume
   volume0: float  # rest volume [m^3]; 0 for an open surface
@@ -129,6 +131,16 @@ class Shape:
   hinge_angle0: floats("nhingeslice", 8)  # rest angle 2 sin(theta / 2) [-]
   bend_adr: ints("nslice + 1")  # first row of the bending matrix
   bend_node: ints("nbend", 8)  # node of each entry
+  tet_node: ints("ntetslice", 4, 8)  # offset of each corner's node
+  tet_gradient: floats("ntetslice", 9, 8)  # of the shares of corners 1, 2, 3 at rest [1/m]
+  around_adr: ints("nslice + 1")  # first row of each slice in the three below, for solids
+  around_tet: ints("naround", 8)  # each tetrahedron around a node
+  around_corner: ints("naround", 8)  # number of its corner there
+  around_share: floats("naround", 8)  # a quarter of its volume [m^3]; 0 for padding
+  edge_adr: ints("nedgeslot + 1")  # first row of each row of blocks in the three below
+  edge_tet: ints("nedge", 8)  # each tetrahedron around an edge
+  edge_from: ints("nedge", 8)  # number of its corner at the node
+  edge_to: ints("nedge", 8)  # number of its corner at the neighbour
 
 
 @struct
@@ -141,6 +153,8 @@ class Tissue:
   hinge_gain: floats("nhingeslice", 5, 8)  # stiffness to itself and to `hinge_near` [N m]
   bend_gain: floats("nbend", 8)  # bending matrix [N/m]
   bend_diag: floats("nbendslice", 8)  # its diagonal [N/m]
+  tet_moduli: floats("ntetslice", 4, 8)  # volume [m^3]; mu, lambda, its averaged part [Pa]
+  pressure_gain: floats("nsolidslice", 8)  # averaged part of lambda over a node's volume [Pa/m^3]
 
 
 @struct
@@ -175,6 +189,11 @@ class System:
   hinge_half: floats("nworld", "nhingeslice", 8)  # cos(theta / 2)
   hinge_moment: floats("nworld", "nhingeslice", 8)  # moment impulse [N m s]
   hinge_rough: floats("nworld", "nhingeslice", 8)  # what the bending matrix may leave out [N m]
+  tet_strain: floats("nworld", "ntetslice", 8)  # impulse of the change of volume [s]
+  node_pressure: floats("nworld", "nsolidslice", 8)  # averaged pressure impulse [Pa s]
+  tet_impulse: floats("nworld", "ntetslice", 16, 8)  # impulse on each corner [N s]
+  tet_arm: floats("nworld", "ntetslice", 16, 8)  # turned gradient of each corner [m^(1/2)]
+  tet_now: floats("nworld", "ntetslice", 4, 8)  # lambda, mu, tension of the matrix [Pa]
   total: floats("nworld", 2)  # volume difference [m^3], areavec . vel
   sol: vector  # PCG solution [m/s]
   r: vector  # PCG residual
@@ -261,6 +280,17 @@ def fill(kind: Any, device, values: dict[str, Any], sizes: dict[str, int] | None
         assert value.shape == expected, (kind.key, name, value.shape, expected)
       value = wp.array(np.ascontiguousarray(value), dtype=var.type.dtype, device=device)
     setattr(out, name, value)
+  return out
+
+
+def empty(sizes: tuple[str, ...]) -> dict[str, np.ndarray]:
+  """Returns the arrays of `Shape` and `Tissue` whose first axis is one of `sizes`, empty."""
+  out = {}
+  for kind in (Shape, Tissue):
+    for name, dims in DIMS[kind.key].items():
+      if dims[0] in sizes:
+        dtype = np.int32 if kind.vars[name].type.dtype is wp.int32 else np.float32
+        out[name] = np.zeros((0, *dims[1:]), dtype)
   return out
 
 

@@ -153,27 +153,37 @@ def test_a_model_compiled_anew_with_another_geom_says_that_it_resets_the_organ(s
 # Several organs with windows.
 
 
-def probes(*names, apart=0.5):
-  """Returns stiff spheres, where inertia follows the contacts, in a row, each under a probe."""
+def probes(*names, nodal=(), datas=1):
+  """Returns the forces of probes on stiff spheres, where inertia follows the contacts, in a row.
+
+  Args:
+    *names: of the spheres
+    nodal: those without windows
+    datas: how many data of the model are stepped in turns
+  """
   bodies, drives = [], []
   for k, name in enumerate(names):
     points, elem = sphere(2)
-    made = windowed_organ(points, elem, name, f"{name}_window", follow=f"{name}_tool", **STIFF)
+    if name in nodal:
+      made = tissue(points, elem, name, **STIFF)
+    else:
+      made = windowed_organ(points, elem, name, f"{name}_window", follow=f"{name}_tool", **STIFF)
     tool = (
       f'<body name="{name}_tool" pos="0.0013 0.0007 0.0567"><joint name="{name}" type="slide" '
       'axis="0 0 1"/><geom size="0.006" mass="0.05" condim="1"/></body>'
     )
-    bodies.append(f'<body name="{name}_frame" pos="{apart * k} 0 0">{made}{tool}</body>')
+    bodies.append(f'<body name="{name}_frame" pos="{0.5 * k} 0 0">{made}{tool}</body>')
     drives.append(f'<position joint="{name}" kp="500" kv="10"/>')
   extra = f"<actuator>{''.join(drives)}</actuator>"
   m = mujoco.MjModel.from_xml_string(world(*bodies, extra=extra))
-  d = mujoco.MjData(m)
+  stepped = [mujoco.MjData(m) for _ in range(datas)]
   force = []
   for _ in range(150):
-    d.ctrl[:] = -0.008 * min(1, d.time / 0.08)
-    mujoco.mj_step(m, d)
-    force.append([d.joint(name).qfrc_constraint[0] for name in names])
-  assert all(palpate.Organ(m, d, name).error is None for name in names)
+    for d in stepped:
+      d.ctrl[:] = -0.008 * min(1, d.time / 0.08)
+      mujoco.mj_step(m, d)
+    force.append([stepped[0].joint(name).qfrc_constraint[0] for name in names])
+  assert all(palpate.Organ(m, d, name).error is None for name in names for d in stepped)
   return np.array(force)
 
 
@@ -183,6 +193,11 @@ def test_windowed_organs_of_one_model_do_not_disturb_each_other():
   assert alone.max() > 0.5
   # Between them is nothing, and MuJoCo's solver ends at a tolerance.
   np.testing.assert_allclose(together, alone.repeat(3, axis=1), atol=0.01 * alone.max())
+
+
+def test_windows_that_take_turns_leave_another_organs_contacts_and_inertia():
+  expected = probes("a", "b", nodal="a")
+  np.testing.assert_allclose(probes("a", "b", nodal="a", datas=2), expected, atol=1e-7)
 
 
 # Errors of MuJoCo.

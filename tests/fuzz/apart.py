@@ -23,15 +23,17 @@ def one(kind: str, seed: int):
     raise AssertionError(f"{kind}, seed {seed}: {error!r}; again: {again}") from error
 
 
-def sweep(kind: str, count: int) -> dict[int, str]:
-  """Returns what fails of the seeds under `count`, by seed, whatever it does to its process.
+def sweep(kind: str, end: int, first: int = 0) -> dict[int, str]:
+  """Returns what fails of the seeds from `first` under `end`, whatever it does to its process.
 
   Ends where there are more than MOST of them.
+
+  Returns:
+    how each fails, by seed
   """
   failed: dict[int, str] = {}
-  first = 0
-  while first < count and len(failed) <= MOST:
-    last = min(first + BLOCK, count)
+  while first < end and len(failed) <= MOST:
+    last = min(first + BLOCK, end)
     words = [sys.executable, __file__, kind, str(first), str(last)]
     done = subprocess.run(words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     seed = first
@@ -44,6 +46,18 @@ def sweep(kind: str, count: int) -> dict[int, str]:
       failed[seed] = f"ended its process with {done.returncode}: {done.stdout[-500:]}"
     first = seed + 1
   return failed
+
+
+def measure(program: str, *words) -> list[int]:
+  """Returns the numbers with which a program of this folder ends.
+
+  Raises:
+    AssertionError: it fails.
+  """
+  command = [sys.executable, str(TESTS / "fuzz" / program), *map(str, words)]
+  done = subprocess.run(command, capture_output=True, text=True)
+  assert done.returncode == 0, f"{program} {words}:\n{done.stderr[-2000:]}"
+  return [int(word) for word in done.stdout.split()[-2:]]
 
 
 def main(kind: str, first: int, last: int):

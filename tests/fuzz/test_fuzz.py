@@ -4,8 +4,6 @@ A seed that failed is run again with `python -m pytest tests/fuzz -k KIND --seed
 """
 
 import importlib
-import pathlib
-import subprocess
 import sys
 
 import pytest
@@ -13,7 +11,6 @@ from fuzz import apart
 
 SHORT = {"configurations": 40, "meshes": 40, "files": 20}
 LONG = 10_000
-LIFE = pathlib.Path(__file__).with_name("life.py")
 
 
 @pytest.mark.parametrize("kind", SHORT)
@@ -44,20 +41,13 @@ def test_many_cases(kind):
   assert not failed, f"{len(failed)} seeds, known are {known}"
 
 
-def live(seed, steps):
-  words = [sys.executable, str(LIFE), str(seed), str(steps)]
-  done = subprocess.run(words, capture_output=True, text=True)
-  assert done.returncode == 0, f"life, seed {seed}, {steps} steps:\n{done.stderr[-2000:]}"
-  return [int(word) for word in done.stdout.split()[-2:]]
-
-
 def test_lives_end_well(request):
-  live(request.config.getoption("--seed") or 0, 300)
+  apart.measure("life.py", request.config.getoption("--seed") or 0, 300)
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
 @pytest.mark.parametrize("seed", range(8))
 def test_long_lives_hold_no_more_memory(seed):
-  half, whole = live(seed, 6000)
+  half, whole = apart.measure("life.py", seed, 6000)
   assert whole - half < 20_000  # kB in 3000 acts

@@ -1,85 +1,45 @@
-"""The hard exercises under random actions of full scale, and organs on many threads, for long."""
+"""Exercises under random actions, steps on many threads, and memory; long with `-m slow`."""
 
-import copy
-import threading
-import time
-
-import mujoco
-import numpy as np
 import pytest
-import scenes
+from fuzz import apart, soak
 from palpate import tasks
 
 LONG = 10_000_000  # steps of all exercises together
 THREADS = (2, 4, 16)
 
 
-def soak(name: str, seed: int, steps: int):
-  """Acts at random for so many steps of the physics; all must stay finite and without warning."""
-  again = f"soak {name}, seed {seed}: python -m pytest tests/fuzz -k soak --seed {seed}"
-  random = np.random.RandomState(seed)
-  env = tasks.load(*name, {"random": random.randint(2**31)})
-  spec = env.action_spec()
-  warned = []
-  mujoco.set_mju_user_warning(lambda text: warned.append(str(text)))
-  try:
-    timestep, done, hold = env.reset(), 0, 0
-    while done < steps:
-      if timestep.last():
-        timestep = env.reset()
-      if hold == 0:  # trembles, or goes one way for up to two seconds
-        action, hold = random.uniform(spec.minimum, spec.maximum), random.choice([1, 5, 100])
-      timestep, hold = env.step(action), hold - 1
-      done += round(env.control_timestep() / env.physics.model.opt.timestep)
-      assert env.physics.organ.error is None, f"{again}: {env.physics.organ.error}"
-      for key, value in timestep.observation.items():
-        assert np.isfinite(value).all(), f"{again}: {key} after {done} steps"
-      assert not warned, f"{again}: {warned[0]} after {done} steps"
-      assert not any(warning.number for warning in env.physics.data.warning), again
-  finally:
-    mujoco.set_mju_user_warning(None)
-
-
 @pytest.mark.parametrize("name", [("grasp", "hard"), ("retract", "hard")], ids="-".join)
 def test_soak_in_short(name, request):
-  soak(name, request.config.getoption("--seed") or 0, 300)
+  soak.act(name, request.config.getoption("--seed") or 0, 300)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", tasks.HARD, ids="-".join)
 def test_soak(name, request):
-  soak(name, request.config.getoption("--seed") or 1, LONG // len(tasks.HARD))
+  soak.act(name, request.config.getoption("--seed") or 1, LONG // len(tasks.HARD))
 
 
-def step_on_threads(count: int, seconds: float):
-  """Steps copies of a model on as many threads; each must do what it does alone."""
-  xml = scenes.probed(keys={"tolerance": 1e-5})
-  model = mujoco.MjModel.from_xml_string(xml)
-  models = [copy.copy(model) for _ in range(count)]
-  datas = [mujoco.MjData(m) for m in models]
-  forces: list[list[np.ndarray]] = [[] for _ in models]
-  until = time.monotonic() + seconds
-
-  def work(k: int):
-    while not forces[k] or time.monotonic() < until:
-      forces[k].append(scenes.drive(models[k], datas[k], 20))
-
-  threads = [threading.Thread(target=work, args=(k,)) for k in range(count)]
-  for thread in threads:
-    thread.start()
-  for thread in threads:
-    thread.join()
-  expected = scenes.drive(model, mujoco.MjData(model), 20 * max(map(len, forces)))
-  for found in map(np.concatenate, forces):
-    np.testing.assert_array_equal(found, expected[: len(found)])
-
-
+@pytest.mark.parametrize("shared", [False, True], ids=["copies", "one model"])
 @pytest.mark.parametrize("count", THREADS[:2])
-def test_threads_in_short(count):
-  step_on_threads(count, 0.5)
+def test_threads_in_short(count, shared):
+  assert soak.step_on_threads(count, 0.5, shared) >= 20 * count
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("shared", [False, True], ids=["copies", "one model"])
 @pytest.mark.parametrize("count", THREADS)
-def test_threads(count):
-  step_on_threads(count, 120)
+def test_threads(count, shared):
+  soak.step_on_threads(count, 120, shared)
+
+
+@pytest.mark.parametrize("coupling", ["nodal", "window"])
+def test_steps_hold_no_more_memory(coupling):
+  first, last = apart.measure("steps.py", coupling, 4000)
+  assert last - first < 2000  # kB
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("coupling", ["nodal", "window"])
+def test_a_million_steps_hold_no_more_memory(coupling):
+  first, last = apart.measure("steps.py", coupling, 1_000_000)
+  assert last - first < 2000  # kB

@@ -2,6 +2,7 @@
 
 import pathlib
 import re
+import sys
 
 import mujoco
 import numpy as np
@@ -143,6 +144,30 @@ def test_finest_resolution(name):
   assert abs(model.nflexvert - 16000) <= 1600
 
 
+@pytest.mark.parametrize("name", ["liver_inclusion", "kidney"])
+def test_a_solid_organ_is_pressed(name):
+  model = models.load(name, 250, coupling="window", interior="solid").compile()
+  data = mujoco.MjData(model)
+  organ = palpate.Organ(model, data, f"{name}/{name}")
+  mujoco.mj_resetDataKeyframe(model, data, model.key("press").id)
+  mujoco.mj_step(model, data, nstep=400)
+  assert organ.config.elements == "solid" and organ.error is None
+  assert 0.1 < np.linalg.norm(organ.force) < 5.0
+  assert 0.005 < np.abs(organ.displacement).max() < 0.012
+
+
+@pytest.mark.parametrize(
+  ("name", "options", "message"),
+  [
+    ("stomach", {"coupling": "window"}, "expected none: it is hollow"),
+    ("kidney", {}, "expected coupling='window' with it"),
+  ],
+)
+def test_what_cannot_be_solid_says_why(name, options, message):
+  with pytest.raises(ValueError, match=message):
+    models.load(name, 250, interior="solid", **options)
+
+
 @pytest.mark.parametrize("side", [16, 32])
 def test_grid(side):
   spec = models.organ("gallbladder", grid=side)
@@ -244,6 +269,12 @@ def test_liver_rests_under_gravity():
     mujoco.mj_step(model, data)
   assert np.abs(organ.displacement - before).max() < 1e-4
   assert 1e-4 < np.abs(before).max() < 5e-3
+
+
+def test_a_missing_extra_is_named(monkeypatch):
+  monkeypatch.setitem(sys.modules, "skimage.measure", None)
+  with pytest.raises(ImportError, match=r"palpate\[image\]"):
+    models.load("kidney", seed=11)
 
 
 def test_bad_input():

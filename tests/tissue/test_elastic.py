@@ -19,6 +19,7 @@ TERMS = {
   "foundation": {"young": (1e-6,), "foundation": 2e4},
   "volume": {"young": (1e-6,), "bulk": 3e3},
   "pressure": {"young": (1e-6,), "pressure": 200.0},
+  "solid": {"elements": "solid", "bend": 0.0},
   "all": {"bend": 30.0, "foundation": 2e4, "bulk": 3e3, "pressure": 200.0},
 }
 FREE = [name for name in TERMS if name not in ("foundation", "all")]

@@ -1,0 +1,212 @@
+// The inside of a solid: linear tetrahedra of the stable neo-Hookean energy (Smith, de Goes and Kim
+// 2018, doi:10.1145/3180491, eq. 14) with the change of volume averaged over nodes (Bonet and
+// Burton 1998). With the gradient of the displacement H, F = I + H, and
+//
+//     i = tr F^T F - 3 = 2 tr H + H : H,    j = det F - 1,    C = dj/dH = cof F = I + c
+//
+// an element's energy is volume (mu / 2 (i - ln(1 + i / 4)) - 3/4 mu j + lambda / 2 j^2), and a
+// node's lambda' / 2 volume j'^2, j' the mean of j around it. All of it is of the order of H, so that
+// float32 keeps the digits of small strains and a solid at rest is at rest to the bit.
+#pragma once
+#include "elastic.h"
+
+namespace palpate {
+
+// Parts of a 3 x 3 matrix.
+PALPATE V trace(const M3& a) { return a.xx + a.yy + a.zz; }
+PALPATE V inner(const M3& a, const M3& b) {
+  return a.xx * b.xx + a.xy * b.xy + a.xz * b.xz + a.yx * b.yx + a.yy * b.yy + a.yz * b.yz
+    + a.zx * b.zx + a.zy * b.zy + a.zz * b.zz;
+}
+PALPATE M3 operator*(const M3& a, const M3& b) {
+  const V3 x = a * V3{b.xx, b.yx, b.zx}, y = a * V3{b.xy, b.yy, b.zy};
+  const V3 z = a * V3{b.xz, b.yz, b.zz};
+  return {x.x, y.x, z.x, x.y, y.y, z.y, x.z, y.z, z.z};
+}
+PALPATE M3 transposed(const M3& a) {
+  return {a.xx, a.yx, a.zx, a.xy, a.yy, a.zy, a.xz, a.yz, a.zz};
+}
+PALPATE M3 cofactors(const M3& a) {
+  return {a.yy * a.zz - a.yz * a.zy, a.yz * a.zx - a.yx * a.zz, a.yx * a.zy - a.yy * a.zx,
+          a.xz * a.zy - a.xy * a.zz, a.xx * a.zz - a.xz * a.zx, a.xy * a.zx - a.xx * a.zy,
+          a.xy * a.yz - a.xz * a.yy, a.xz * a.yx - a.xx * a.yz, a.xx * a.yy - a.xy * a.yx};
+}
+
+// Gradient of a vector field in a tetrahedron, sum_k x_k g_k^T over its corners 1, 2, 3, relative to
+// corner 0.
+PALPATE M3 gradient(const float* field, const int* node, const float* g, Lane lane) {
+  const V3 x0 = gather3(field, node, lane);
+  const M3 a = outer(gather3(field, node + 8, lane) - x0, ld3(g, 0, lane));
+  const M3 b = outer(gather3(field, node + 16, lane) - x0, ld3(g, 3, lane));
+  return a + b + outer(gather3(field, node + 24, lane) - x0, ld3(g, 6, lane));
+}
+
+// Changes of volume: j, and c with cof F = I + c.
+struct Swelling { V j; M3 c; };
+
+PALPATE Swelling swelling(const M3& h) {
+  const V t = trace(h);
+  const M3 cof = cofactors(h);
+  const V det = h.xx * cof.xx + h.xy * cof.xy + h.xz * cof.xz;
+  return {t + trace(cof) + det, splat(-1.0f) * transposed(h) + t + cof};
+}
+
+// Strain impulse of volume of each tetrahedron: h j + what K v has of it. The gradients of
+// displacement and velocity are kept, where `tet_stress` then writes what it makes of them.
+template <class Fields>
+PALPATE void tet_strain(const Fields& f, Thread t, int stage) {
+  const float* step = f.state.step.data + 4 * t.world;
+  const float h = step[0], gv = weight_of_rate(stage, step);
+  const size_t base = 24 * (size_t)t.world * f.shape.nslice;
+  each_slice(t, f.shape.ntetslice, [&](int s, Lane lane) {
+    const int* node = f.shape.tet_node.data + 32 * s;
+    const float* g = f.shape.tet_gradient.data + 72 * s;
+    const M3 H = gradient(f.system.disp_trial.data + base, node, g, lane);
+    const M3 rate = gradient(f.system.vel_trial.data + base, node, g, lane);
+    const Swelling now = swelling(H);
+    const size_t at = (size_t)t.world * f.shape.ntetslice + s;
+    st9(f.system.tet_arm.data + 128 * at, H, lane);
+    st9(f.system.tet_impulse.data + 128 * at, rate, lane);
+    st(f.system.tet_strain.data, at, h * now.j + gv * (trace(rate) + inner(now.c, rate)), lane);
+  });
+}
+
+// Pressure impulse of each node, from the mean of the tetrahedra around it.
+template <class Fields>
+PALPATE void node_pressure(const Fields& f, Thread t, int) {
+  const float* strain = f.system.tet_strain.data + 8 * (size_t)t.world * f.shape.ntetslice;
+  each_slice(t, f.shape.nslice, [&](int s, Lane lane) {
+    const int row = f.shape.around_adr.data[s], width = f.shape.around_adr.data[s + 1] - row;
+    V sum = splat(0.0f);
+    for (int k = row; k < row + width; ++k)
+      sum += ld(f.shape.around_share.data, k, lane)
+        * gather(strain, f.shape.around_tet.data + 8 * k, 0, lane);
+    st(f.system.node_pressure.data, t.world * f.shape.nslice + s,
+       ld(f.tissue.pressure_gain.data, s, lane) * sum, lane);
+  });
+}
+
+// The rotation nearest to F, by Newton's iteration with Higham's scaling (Higham 1986,
+// doi:10.1137/0907079): three of them, of a stretch of two to 1e-3, for the matrix alone. Of a
+// tetrahedron inside out it is a reflection, which serves as well.
+PALPATE M3 turn(M3 x) {
+  for (int k = 0; k < 3; ++k) {
+    const M3 cof = cofactors(x);
+    const V det = x.xx * cof.xx + x.xy * cof.xy + x.xz * cof.xz;
+    const V size2 = inner(x, x), cof2 = inner(cof, cof);
+    const V least = 1e-4f * size2 * vsqrt(size2) + 1e-30f, zero = splat(0.0f);
+    const V d = select(det < zero, vmin(det, -least), vmax(det, least));
+    const V scale = vsqrt(vsqrt(cof2 / (d * d * vmax(size2, splat(1e-30f)))));
+    x = (0.5f * scale) * x + (0.5f / (scale * d)) * cof;
+  }
+  return x;
+}
+
+// What a tetrahedron gives to its corners: impulses, and for the matrix its turned gradients times
+// the root of its volume with the moduli lambda, mu and tension.
+//
+// The matrix is that of small strains in the turned frame, which leaves rotations free, with lambda
+// as large as the stretched faces make it. The stress adds a geometric stiffness between principal
+// directions a and b: (P_a + P_b) / (s_a + s_b) of a tension to rotations, of which `tension` is an
+// upper bound, and the pressure times the third stretch to shear, which mu has. K v is without both.
+template <class Fields>
+PALPATE void tet_stress(const Fields& f, Thread t, int stage) {
+  const float* step = f.state.step.data + 4 * t.world;
+  const float h = step[0], gv = weight_of_rate(stage, step);
+  const bool implicit = stage == FIRST || stage == LATER;
+  const float* pressure = f.system.node_pressure.data + 8 * (size_t)t.world * f.shape.nslice;
+  each_slice(t, f.shape.ntetslice, [&](int s, Lane lane) {
+    const int* node = f.shape.tet_node.data + 32 * s;
+    const float* g = f.shape.tet_gradient.data + 72 * s;
+    const float* moduli = f.tissue.tet_moduli.data + 32 * s;
+    const V volume = ld(moduli, 0, lane), mu = ld(moduli, 1, lane), lam = ld(moduli, 2, lane);
+    const size_t at = (size_t)t.world * f.shape.ntetslice + s;
+    float* arm = f.system.tet_arm.data + 128 * at;
+    float* impulse = f.system.tet_impulse.data + 128 * at;
+    const M3 H = ld9(arm, lane), rate = ld9(impulse, lane);
+    const Swelling now = swelling(H);
+    const M3 F = H + splat(1.0f), C = now.c + splat(1.0f);
+    const V i = 2.0f * trace(H) + inner(H, H), i4 = 4.0f + i;
+    // Mean pressure of the corners.
+    V p = splat(0.0f);
+    for (int k = 0; k < 4; ++k) p += gather_number(pressure, node + 8 * k, lane);
+    p = 0.25f * p;
+    const M3 still = 0.75f * mu * (H + splat(-1.0f) * now.c) + (0.25f * mu * i / i4) * F
+      + lam * now.j * C;
+    const M3 Q = turn(F), strain = transposed(Q) * rate;
+    const M3 moving = Q * (0.75f * mu * (strain + transposed(strain))
+      + (lam - 0.625f * mu) * trace(strain));
+    const M3 P = splat(h) * still + splat(gv) * moving + p * C;
+    const V3 g1 = ld3(g, 0, lane), g2 = ld3(g, 3, lane), g3 = ld3(g, 6, lane);
+    const V3 b1 = -volume * (P * g1), b2 = -volume * (P * g2), b3 = -volume * (P * g3);
+    share(impulse, splat(-1.0f) * (b1 + b2 + b3), lane);
+    share(impulse + 32, b1, lane);
+    share(impulse + 64, b2, lane);
+    share(impulse + 96, b3, lane);
+    if (!implicit) return;
+    const V root = vsqrt(volume);
+    const V3 a1 = root * (Q * g1), a2 = root * (Q * g2), a3 = root * (Q * g3);
+    share(arm, splat(-1.0f) * (a1 + a2 + a3), lane);
+    share(arm + 32, a1, lane);
+    share(arm + 64, a2, lane);
+    share(arm + 96, a3, lane);
+    const M3 stress = still + (p / h) * C;
+    const V mean = inner(Q, stress) / 3.0f;
+    const V rest = vmax(inner(stress, stress) - 3.0f * mean * mean, splat(0.0f));
+    const V faces = vmax(inner(C, C) - 2.0f, splat(1.0f));
+    const V squeezed = vmax(-lam * now.j - p / h, splat(0.0f)) * vsqrt(inner(F, F) / 3.0f);
+    const V shear = 0.75f * mu + squeezed;
+    share(f.system.tet_now.data + 32 * at,
+          {(lam - 0.625f * mu + ld(moduli, 3, lane)) * faces, shear,
+           vmax(mean + 0.40825f * vsqrt(rest), splat(0.0f))}, lane);
+  });
+}
+
+// Right-hand side of each node and, for an implicit stage, its row of the matrix: the tetrahedra
+// around the node, and those around each of its edges.
+template <class Fields>
+PALPATE void solid_row(const Fields& f, Thread t, int stage) {
+  const float* step = f.state.step.data + 4 * t.world;
+  const float h = step[0], g = step[1], gv = weight_of_rate(stage, step);
+  const float foundation = f.tissue.number.data[FOUNDATION];
+  const bool implicit = stage == FIRST || stage == LATER;
+  const size_t base = (size_t)t.world * f.shape.nslice;
+  const size_t tet = (size_t)t.world * f.shape.ntetslice;
+  const float* impulse = f.system.tet_impulse.data + 128 * tet;
+  const float* arm = f.system.tet_arm.data + 128 * tet;
+  const float* moduli = f.system.tet_now.data + 32 * tet;
+  each_slice(t, f.shape.nslice, [&](int s, Lane lane) {
+    const size_t at = base + s;
+    const V mass = ld(f.state.mass.data + 8 * at, 0, lane);
+    const V kf = splat(foundation) * ld(f.shape.area.data, s, lane), diag = mass + g * kf;
+    const V3 u = ld3(f.system.disp_trial.data + 24 * at, lane);
+    const V3 v = ld3(f.system.vel_trial.data + 24 * at, lane);
+    V3 b = h * (ld3(f.state.force_ext.data + 24 * at, lane) - kf * u) - gv * kf * v;
+    if (stage == LATER) b -= mass * ld3(f.state.dvel.data + 24 * at, lane);
+    for (int k = f.shape.around_adr.data[s]; k < f.shape.around_adr.data[s + 1]; ++k)
+      b += gather_shared(impulse, f.shape.around_corner.data + 8 * k, lane);
+    st3(f.system.rhs.data + 24 * at, b, lane);
+    if (!implicit) return;
+    const V zero = splat(0.0f);
+    S3 self = {zero, zero, zero, zero, zero, zero};
+    for (int j = f.shape.slot_adr.data[s]; j < f.shape.slot_adr.data[s + 1]; ++j) {
+      M3 block = {zero, zero, zero, zero, zero, zero, zero, zero, zero};
+      for (int k = f.shape.edge_adr.data[j]; k < f.shape.edge_adr.data[j + 1]; ++k) {
+        const V3 now = gather_shared(moduli, f.shape.edge_tet.data + 8 * k, lane);
+        const V3 a = gather_shared(arm, f.shape.edge_from.data + 8 * k, lane);
+        const V3 c = gather_shared(arm, f.shape.edge_to.data + 8 * k, lane);
+        block = block + outer(now.x * a, c) + outer(now.y * c, a) + (now.y + now.z) * dot(a, c);
+      }
+      st9(f.system.block.data + 72 * ((size_t)t.world * f.shape.nslot + j), splat(g) * block, lane);
+      self = self + symmetric(block);
+    }
+    st(f.system.diag.data + 8 * at, 0, diag, lane);
+    // Zero where a node cannot move, which keeps it out of the solve.
+    const S3 inv = inverse(splat(-g) * self + diag, ld(f.shape.free.data, s, lane));
+    float* out = f.system.inverse.data + 48 * at;
+    st3(out, 0, {inv.xx, inv.xy, inv.xz}, lane);
+    st3(out, 3, {inv.yy, inv.yz, inv.zz}, lane);
+  });
+}
+
+}  // namespace palpate

@@ -1,0 +1,240 @@
+"""Fills a closed surface with tetrahedra that have its triangles as their faces.
+
+Nodes inside are a body-centred cubic lattice, moved where the tetrahedra around them have their
+middle (the centroidal relaxation of optimal Delaunay triangulations, Alliez et al. 2005,
+doi:10.1145/1073204.1073238), and all nodes are joined by Delaunay's criterion. On a surface of even
+triangles that has the surface's triangles among its faces, but for some pairs of which it has the
+other diagonal: these serve as well. Where it has neither, there is an error.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse import csgraph, linalg
+from scipy.spatial import Delaunay, KDTree
+
+from .mesh import Mesh
+
+MOST = 1  # nodes inside for one on the surface; the plugin state has room for so many
+_COARSER = 1.7  # distance of nodes inside to that on the surface
+_CLEAR = 0.8  # least distance of a node inside to the surface's, in mean edges
+_ROUNDS = 8
+_MOVE = 0.7  # share of the way that a node goes in a round
+_FLAT = 1e-3  # quality of a tetrahedron that is none
+_KEPT = 16
+_TIE = 1e-6  # of the size, by which points on one sphere are told apart
+
+# Faces of a tetrahedron, each opposite the corner of its number.
+_FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
+_EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
+
+
+def fill(organ: str, mesh: Mesh) -> Mesh:
+  """Returns the surface with its inside: the same vertices and triangles, more vertices after them.
+
+  Args:
+    organ: name of the organ, for messages
+    mesh: its surface
+
+  Raises:
+    ValueError: the surface encloses nothing, or its triangles are faces of no Delaunay
+      tetrahedra.
+  """
+  if not mesh.closed:
+    raise ValueError(f"organ {organ!r}: elements is 'solid', expected a closed surface")
+  inner, tet, missing = _fill(mesh.rest.tobytes(), mesh.elem.astype(np.int64).tobytes())
+  if missing >= 0:
+    raise ValueError(
+      f"organ {organ!r}: elements is 'solid', and triangle {missing} (vertices "
+      f"{mesh.elem[missing].tolist()}) cannot be the face of a tetrahedron; expected a surface of "
+      "even triangles that does not cut itself: `palpate wrap` makes one"
+    )
+  return joined(mesh, np.frombuffer(inner).reshape(-1, 3), tet)
+
+
+def joined(mesh: Mesh, inner: np.ndarray, tet: np.ndarray) -> Mesh:
+  """Returns a surface with vertices inside and tetrahedra.
+
+  The ring of a vertex then is what edges of tetrahedra lead to, in the order of the vertices.
+
+  Args:
+    mesh: the surface
+    inner: rest positions of the vertices inside [m]                    (n, 3)
+    tet: corners of each tetrahedron, of positive volume, among all     (ntet, 4)
+  """
+  rest = np.concatenate([mesh.rest, inner])
+  edge = tet[:, _EDGES].reshape(-1, 2)
+  both = np.unique(np.concatenate([edge, edge[:, ::-1]]), axis=0)
+  degree = np.bincount(both[:, 0], minlength=len(rest))
+  ring = np.full((len(rest), int(degree.max())), -1)
+  ring[both[:, 0], np.arange(len(both)) - (np.cumsum(degree) - degree)[both[:, 0]]] = both[:, 1]
+  return dataclasses.replace(
+    mesh, rest=rest, ring=ring, ring_elem=np.full_like(ring, -1), degree=degree, tet=tet
+  )
+
+
+def volumes(point: np.ndarray, tet: np.ndarray) -> np.ndarray:
+  """Returns the volume of each tetrahedron [m^3], (ntet,); the winding gives the sign."""
+  corner = point[tet]
+  return np.linalg.det(corner[:, 1:] - corner[:, :1]) / 6
+
+
+def vertex_volumes(mesh: Mesh) -> np.ndarray:
+  """Returns a quarter of the volume of the tetrahedra around each vertex [m^3], (nvert,)."""
+  share = np.repeat(volumes(mesh.rest, mesh.tet) / 4, 4)
+  return np.bincount(mesh.tet.ravel(), share, mesh.nvert)
+
+
+def quality(point: np.ndarray, tet: np.ndarray) -> np.ndarray:
+  """Returns 6 sqrt(2) volume / (RMS edge)^3 of each tetrahedron, 1 for a regular one, (ntet,)."""
+  corner = point[tet]
+  edge = corner[:, _EDGES[:, 0]] - corner[:, _EDGES[:, 1]]
+  length2 = (edge**2).sum(axis=(1, 2)) / 6
+  return 6 * np.sqrt(2) * volumes(point, tet) / np.maximum(length2, 1e-300) ** 1.5
+
+
+def inside(mesh: Mesh, values: np.ndarray) -> np.ndarray:
+  """Returns vectors of the surface's vertices, (nouter, 3), with those inside, (nvert, 3).
+
+  A vertex inside has the mean of those around it.
+  """
+  n = mesh.nouter
+  if n == mesh.nvert:
+    return values
+  start, k = np.nonzero(mesh.ring >= 0)
+  ones = np.ones(len(start))
+  share = sparse.csr_array((ones / mesh.degree[start], (start, mesh.ring[start, k])))
+  below = share[n:]
+  matrix = sparse.eye_array(mesh.nvert - n) - below[:, n:]
+  within = linalg.spsolve(sparse.csc_array(matrix), below[:, :n] @ values)
+  return np.concatenate([values, within.reshape(-1, 3)])
+
+
+@functools.lru_cache(maxsize=_KEPT)
+def _fill(rest: bytes, elem: bytes) -> tuple[bytes, np.ndarray, int]:
+  """Returns the vertices inside, the tetrahedra and the first triangle that is not among them."""
+  surface = np.frombuffer(rest).reshape(-1, 3)
+  triangle = np.frombuffer(elem, np.int64).reshape(-1, 3)
+  inner = _lattice(surface, triangle)
+  best, found, faulty = 0.0, None, -1
+  for _ in range(_ROUNDS):
+    point = np.concatenate([surface, inner])
+    tet, faulty = _inside(point, triangle, len(surface))
+    if faulty >= 0:
+      break
+    used = np.zeros(len(point), bool)
+    used[tet] = used[: len(surface)] = True
+    tet, point = (np.cumsum(used) - 1)[tet], point[used]
+    least = float(quality(point, tet).min(initial=1.0))
+    if least > best:
+      best, found = least, (point[len(surface) :].tobytes(), tet)
+    inner = point + _MOVE * (_middles(point, tet) - point)
+    inner = inner[len(surface) :]
+  return (*found, -1) if found else (b"", np.zeros((0, 4), int), faulty)
+
+
+def _lattice(surface: np.ndarray, triangle: np.ndarray) -> np.ndarray:
+  """Returns the points of a lattice inside, (n, 3); some that are outside may be among them."""
+  normal = np.zeros_like(surface)
+  np.add.at(normal, triangle.ravel(), np.repeat(_normals(surface, triangle), 3, axis=0))
+  edge = np.linalg.norm(surface[triangle[:, [1, 2, 0]]] - surface[triangle], axis=2).mean()
+  low, high = surface.min(axis=0), surface.max(axis=0)
+  tree, side = KDTree(surface), _COARSER * edge * 2 / np.sqrt(3)  # neighbours: half a diagonal
+  while True:
+    count = np.ceil((high - low) / side).astype(int) + 1
+    corner = low + side * np.stack(np.meshgrid(*map(np.arange, count), indexing="ij"), -1)
+    point = np.concatenate([corner.reshape(-1, 3), corner.reshape(-1, 3) + side / 2])
+    distance, nearest = tree.query(point)
+    beneath = ((point - surface[nearest]) * normal[nearest]).sum(axis=1) < 0
+    point = point[beneath & (distance > _CLEAR * edge)]
+    if len(point) <= MOST * len(surface):
+      return point
+    side *= max(1.05, (len(point) / (MOST * len(surface))) ** (1 / 3))
+
+
+def _normals(point: np.ndarray, triangle: np.ndarray) -> np.ndarray:
+  """Returns the normals of triangles, as long as twice their areas, (n, 3)."""
+  arms = point[triangle[:, 1:]] - point[triangle[:, :1]]
+  return np.cross(arms[:, 0], arms[:, 1])
+
+
+def _middles(point: np.ndarray, tet: np.ndarray) -> np.ndarray:
+  """Returns the middle of the tetrahedra around each point, weighted by volume, (n, 3)."""
+  weight = np.repeat(volumes(point, tet), 4)
+  middle = np.repeat(point[tet].mean(axis=1), 4, axis=0)
+  total = np.bincount(tet.ravel(), weight, len(point))
+  sums = [np.bincount(tet.ravel(), weight * middle[:, k], len(point)) for k in range(3)]
+  return np.stack(sums, axis=1) / np.maximum(total, 1e-300)[:, None]
+
+
+def _inside(point: np.ndarray, triangle: np.ndarray, nsurface: int) -> tuple[np.ndarray, int]:
+  """Returns the tetrahedra inside of a surface, and the first triangle that is no face, or -1.
+
+  Args:
+    point: all vertices, the surface's first        (n, 3)
+    triangle: the surface                           (nelem, 3)
+    nsurface: number of its vertices
+  """
+  size = float(np.ptp(point, axis=0).max())
+  shaken = point + _TIE * size * np.random.RandomState(0).uniform(-1, 1, point.shape)
+  made = Delaunay(shaken)
+  tet, neighbour = made.simplices.astype(np.int64), made.neighbors
+  face = tet[:, _FACES]
+  has = (face < nsurface).all(axis=2)
+  known = np.where(has, _key(np.minimum(face, nsurface - 1), nsurface), -1)
+  wanted, faulty = _flipped(triangle, np.unique(known), nsurface)
+  if faulty >= 0:
+    return tet, faulty
+  # What no triangle parts lies on one side.
+  through = ~np.isin(known, wanted) & (neighbour >= 0)
+  start = np.broadcast_to(np.arange(len(tet))[:, None], neighbour.shape)
+  ends = (start[through], neighbour[through])
+  graph = sparse.coo_matrix((np.ones(len(ends[0])), ends), shape=(len(tet), len(tet)))
+  count, part = csgraph.connected_components(graph, directed=False)
+  # The side of a triangle on which the corner is that its tetrahedron has beside it.
+  which, corner = np.nonzero(np.isin(known, wanted))
+  order = np.argsort(wanted)
+  at = order[np.searchsorted(wanted, known[which, corner], sorter=order)]
+  side = point[tet[which, corner]] - point[triangle[at, 0]]
+  height = (side * _normals(point, triangle)[at]).sum(axis=1)
+  sure = wanted[at] == _key(triangle[at], nsurface)  # others were flipped
+  within = np.bincount(part[which], np.where(sure, np.sign(height), 0), count)[part] < 0
+  volume = volumes(point, tet)
+  tet = np.where((volume < 0)[:, None], tet[:, [0, 2, 1, 3]], tet)[within]
+  return tet[quality(point, tet) > _FLAT], -1
+
+
+def _key(corner: np.ndarray, n: int) -> np.ndarray:
+  """Returns a number for the three vertices of each triangle, of n."""
+  a, b, c = np.moveaxis(np.sort(corner, axis=-1), -1, 0)
+  return (a * n + b) * n + c
+
+
+def _flipped(triangle: np.ndarray, known: np.ndarray, n: int) -> tuple[np.ndarray, int]:
+  """Returns the triangles as keys that are all known, and the first one that cannot be, or -1.
+
+  Where two that share an edge are not, the two across the other diagonal may be.
+  """
+  key = _key(triangle, n)
+  missing = np.flatnonzero(~np.isin(key, known))
+  if not missing.size:
+    return key, -1
+  apexes: dict[tuple[int, int], list[tuple[int, int]]] = {}
+  for t in missing:
+    for k in range(3):
+      a, b, apex = (int(triangle[t, (k + i) % 3]) for i in range(3))
+      apexes.setdefault((min(a, b), max(a, b)), []).append((int(t), apex))
+  left, faces = set(missing.tolist()), set(known.tolist())
+  for (a, b), sides in apexes.items():
+    if len(sides) < 2 or not {sides[0][0], sides[1][0]} <= left:
+      continue
+    (s, p), (t, q) = sides
+    flipped = _key(np.array([[p, q, a], [p, q, b]]), n)
+    if faces >= set(flipped.tolist()):
+      key[[s, t]] = flipped
+      left -= {s, t}
+  return key, min(left, default=-1)

@@ -1,0 +1,112 @@
+"""Solids under MuJoCo's tools: what a user sees of an organ that has an inside."""
+
+import mujoco
+import numpy as np
+import palpate
+import pytest
+
+WEIGHT = 0.05 * 9.81
+KEYS = {"elements": "solid", "young": 2e4, "poisson": 0.45, "damping": 0.01, "tolerance": 1e-6}
+
+
+def _resting(scenes, **keys):
+  """Returns a block, held below, with a ball above that falls onto it."""
+  points, elem = scenes.box((0.06, 0.06, 0.03), 0.006)
+  pin = " ".join(map(str, np.flatnonzero(points[:, 2] < -0.0149)))
+  block = scenes.windowed(points, elem, count="12 12 1", **{"pin": pin, "mass": 0.1} | KEYS | keys)
+  return scenes.world(block + scenes.ball(0.0265, radius=0.01), gravity=(0, 0, -9.81))
+
+
+def test_a_resting_ball_is_carried_exactly(scenes, device):
+  # The window hangs in the air, so that gravity acts on the organ and the ball.
+  model, data, organ = scenes.load(_resting(scenes, device=device))
+  scenes.run(model, data, 1500)
+  assert organ.force[2] == pytest.approx(-WEIGHT, rel=2e-3)
+  assert np.abs(organ.xvel).max() < 1e-3 and organ.error is None
+  assert 5e-4 < np.abs(organ.displacement).max() < 5e-3
+
+
+def test_force_of_an_indentation_is_that_of_hertz_on_a_layer(scenes):
+  radius, depth, height, young, nu = 0.02, 0.003, 0.04, 5000.0, 0.45
+  points, elem = scenes.box((0.08, 0.08, height), 0.005)
+  pin = " ".join(map(str, np.flatnonzero(points[:, 2] < -height / 2 + 1e-4)))
+  keys = KEYS | {"young": young, "poisson": nu, "mass": 0.25, "pin": pin, "tolerance": 1e-4}
+  block = scenes.windowed(points, elem, count="20 20 1", radius=0.0003, **keys)
+  top = height / 2 + 0.0003
+  ball = scenes.ball(top + radius + 0.0005, radius=radius)
+  drive = '<actuator><position joint="z" kp="5000" kv="20"/></actuator>'
+  model, data, organ = scenes.load(scenes.world(block + ball, h=2e-3, extra=drive))
+  scenes.run(model, data, 500, deepest=depth + 0.0005)
+  # What the contact gives way is not indentation.
+  given = -min(contact.dist for contact in data.contact[: data.ncon])
+  deep = -data.qpos[model.joint("z").qposadr[0]] - 0.0005 - given
+  hertz = 4 / 3 * young / (1 - nu**2) * np.sqrt(radius) * deep**1.5
+  # A layer that is bonded below is stiffer than a half space (Dimitriadis et al. 2002, eq. 12,
+  # doi:10.1016/S0006-3495(02)75620-8); triangles of the size of the contact add to it.
+  chi = np.sqrt(radius * deep) / height
+  layer = 1 + 1.133 * chi + 1.283 * chi**2 + 0.769 * chi**3
+  assert 1.0 < np.linalg.norm(organ.force) / (hertz * layer) < 1.5
+
+
+def test_a_solid_that_nothing_holds_falls_freely(scenes):
+  points, elem = scenes.sphere(2)
+  organ = scenes.windowed(points, elem, **KEYS | {"mass": 0.5})
+  far = scenes.ball(1.0)
+  model, data, organ = scenes.load(scenes.world(organ + far, gravity=(0, 0, -9.81), h=1e-3))
+  scenes.run(model, data, 100)
+  np.testing.assert_allclose(organ.xvel - [0, 0, -0.981], 0.0, atol=1e-3)
+  assert organ.energy < 1e-9
+
+
+def test_a_saved_state_goes_on_to_the_bit(scenes):
+  model, data, organ = scenes.load(_resting(scenes))
+  scenes.run(model, data, 60)
+  kind = mujoco.mjtState.mjSTATE_FULLPHYSICS
+  state = np.zeros(mujoco.mj_stateSize(model, kind))
+  mujoco.mj_getState(model, data, state, kind)
+  scenes.run(model, data, 40)
+  expected = organ.xpos
+  other = mujoco.MjData(model)
+  mujoco.mj_setState(model, other, state, kind)
+  scenes.run(model, other, 40)
+  np.testing.assert_array_equal(palpate.Organ(model, other, "organ").xpos, expected)
+
+
+def test_what_a_user_sees_is_the_surface(scenes):
+  organ = scenes.load(_resting(scenes))[2]
+  assert organ.nvert == len(organ.xpos) == len(organ.free) == len(organ.contact_force)
+  moved = organ.xpos0 + np.array([0.0, 0.0, 0.001])
+  organ.set_state(moved)
+  held = ~organ.free
+  np.testing.assert_allclose(organ.xpos[~held], moved[~held], atol=1e-12)
+  np.testing.assert_allclose(organ.xpos[held], organ.xpos0[held], atol=1e-12)
+  organ.reset()
+  assert np.abs(organ.displacement).max() == 0 and organ.energy == 0
+
+
+@pytest.mark.parametrize(
+  ("keys", "message"),
+  [
+    ({"thickness": 0.003}, "thickness is 0.003, allowed only where elements is not 'solid'"),
+    ({"bend": 2}, "bend is 2, allowed only"),
+    ({"bulk": 1e4}, "bulk is 10000, allowed only"),
+    ({"pressure": 100}, "pressure is 100, allowed only"),
+    ({"integrator": "neumann"}, "integrator is 'neumann', allowed only"),
+    ({"poisson": 0.5}, r"poisson is '0.5', expected a number in \[0, 0.5\)"),
+  ],
+)
+def test_what_a_solid_has_not_is_refused(scenes, keys, message):
+  with pytest.raises(ValueError, match=message):
+    scenes.load(_resting(scenes, **keys))
+
+
+def test_a_solid_needs_windows(scenes):
+  points, elem = scenes.sphere(1)
+  with pytest.raises(ValueError, match="elements is 'solid', expected window too"):
+    scenes.load(scenes.world(scenes.organ(points, elem, **KEYS)))
+
+
+def test_a_solid_that_is_open_is_refused(scenes):
+  points, elem = scenes.strip(0.1, 0.05, 4, 3)
+  with pytest.raises(ValueError, match="expected a closed surface"):
+    scenes.load(scenes.world(scenes.windowed(points, elem, **KEYS) + scenes.ball(0.1)))
