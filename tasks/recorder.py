@@ -157,6 +157,12 @@ class Recorder:
     given |= {"grip": grip, "held": held, "visible": visible}
     columns = {k: self._entry(k, v) for k, v in given.items() if v is not None}
     own = {name: self._own(name, value) for name, value in arrays.items()} if arrays else {}
+    self._store(time, columns, own)
+
+  def _store(
+    self, time: float, columns: dict[str, np.ndarray], own: dict[str, np.ndarray]
+  ) -> None:
+    """Adds a sample whose entries were checked one by one."""
     k = self._count
     for name, buffer in self._arrays.items():
       if name not in own and buffer.values.dtype.kind != "f":

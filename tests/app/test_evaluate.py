@@ -6,7 +6,7 @@ import signal
 import sys
 
 import pytest
-from palpate.app import cli, console, evaluate, references
+from palpate.app import cli, console, evaluate, panel
 from palpate.tasks import score
 from palpate.tasks.recording import Recording
 
@@ -47,7 +47,7 @@ def test_standing_still_scores_the_floor(tmp_path, capsys):
 
 
 def test_references_are_made_in_parallel_and_resumed(tmp_path, capsys, monkeypatch):
-  words = ["references", "touch/easy", "-o", "made", "--runs", "runs", "--processes", "2"]
+  words = ["panel", "touch/easy", "-o", "made", "--runs", "runs", "--processes", "2"]
   assert cli.main([*words, "--episodes", "2"]) == 0
   assert "touch/easy: 2 of 2 episodes succeeded" in capsys.readouterr().out
   path = tmp_path / "made" / "touch_easy.json"
@@ -58,17 +58,17 @@ def test_references_are_made_in_parallel_and_resumed(tmp_path, capsys, monkeypat
   (runs,) = (tmp_path / "runs").iterdir()
   assert len(list(runs.iterdir())) == 2
   ran = []
-  monkeypatch.setattr(references, "perform", lambda job: ran.append(job) or evaluate.perform(job))
+  monkeypatch.setattr(panel, "perform", lambda job: ran.append(job) or evaluate.perform(job))
   assert cli.main([*words[:-1], "1", "--episodes", "3"]) == 0
   assert [job[2] for job in ran] == [10002]
   assert score.read_reference(path)["n"] == 3
-  monkeypatch.setattr(references, "fingerprint", lambda: "changed")
+  monkeypatch.setattr(panel, "fingerprint", lambda: "changed")
   assert cli.main([*words[:-1], "1", "--episodes", "1"]) == 0
   assert len(ran) == 2  # other sources, other episodes
 
 
 def test_references_need_successes(tmp_path, capsys):
-  words = ["references", "touch/easy", "-o", "made", "--episodes", "1", "--processes", "1"]
+  words = ["panel", "touch/easy", "-o", "made", "--episodes", "1", "--processes", "1"]
   assert cli.main([*words, "--performer", "math:sqrt"]) == 1
   assert "0 of 1 episodes succeeded, too few for a reference; TypeError" in capsys.readouterr().err
   assert cli.main([*words, "--performer", "nobody"]) == 2

@@ -1,4 +1,4 @@
-"""`palpate references`: makes the references that exercises are scored against.
+"""`palpate panel`: makes the references that exercises are scored against.
 
 Every episode is kept in a folder as soon as it ends, and what is there is not run again: stop and
 go on at will. The folder is named after what decides an episode (sources, models, versions), so
@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser):
   add = parser.add_argument
   add("tasks", metavar="TASK", nargs="*", help="such as touch/easy; all without one")
   add("-o", "--out", metavar="FOLDER", required=True, help="where TASK.json goes")
-  add("--runs", metavar="FOLDER", default="out/references", help="of the episodes (%(default)s)")
+  add("--runs", metavar="FOLDER", default="out/panel", help="of the episodes (%(default)s)")
   add("--performer", metavar="NAME", default="skilled", help="as evaluate's policy (%(default)s)")
   add("--episodes", metavar="N", type=int, default=100, help="of each task (%(default)s)")
   add("--seed", metavar="N", type=int, default=_SEED, help="of the first episode (%(default)s)")
