@@ -30,7 +30,7 @@ import numpy as np
 from dm_control.rl import control
 from palpate.models import trocar
 
-from .base import AXES, CONTROL_TIMESTEP, RATES
+from .base import AXES, RATES
 
 Act = Callable[[Any], Any]
 Script = Iterator[np.ndarray]
@@ -153,6 +153,7 @@ class Performer:
   def __init__(self, env: control.Environment, style: Style = EXPERT, seed: int = 0):
     """Makes a performer in a style; see `make`."""
     self.env, self.style = env, style
+    self.dt = env.control_timestep()  # [s]
     self.physics: Any = env.physics
     self.task: Any = env.task
     self.random = np.random.RandomState(seed)
@@ -166,7 +167,7 @@ class Performer:
       self.tip = trocar.forward(self.trocar, joints)  # where the tip is told to be
       self.roll = float(self.physics.drive_targets()[2])
       self.extra = np.zeros(len(self.task.components) - len(AXES))
-      late = round(self.style.reaction / CONTROL_TIMESTEP)
+      late = round(self.style.reaction / self.dt)
       still = self.tip, self.roll, self.extra.copy()
       self._told = collections.deque([still] * late, maxlen=late + 1)
       self._phase = self.random.uniform(0, 2 * math.pi, (len(_TREMOR_HZ), 3))
@@ -189,12 +190,12 @@ class Performer:
       tip = tip + self.style.tremor * math.sqrt(2 / len(_TREMOR_HZ)) * wave.sum(axis=0)
     pitch, yaw, insertion = trocar.inverse(self.trocar, tip, check=False)
     goal = np.array([pitch, yaw, roll, insertion])
-    move = (goal - self.physics.drive_targets()) / (np.array(RATES) * CONTROL_TIMESTEP)
+    move = (goal - self.physics.drive_targets()) / (np.array(RATES) * self.dt)
     return np.concatenate([np.clip(move, -1, 1), extra])
 
   def wait(self, duration: float) -> Script:
     """Holds still for a time [s]."""
-    for _ in range(int(min(duration / CONTROL_TIMESTEP, 10**9))):
+    for _ in range(int(min(duration / self.dt, 10**9))):
       yield self.step()
 
   def move(self, goal: np.ndarray, speed: float = 0.05) -> Script:
@@ -220,7 +221,7 @@ class Performer:
 
   def _line(self, goal: np.ndarray, speed: float) -> Script:
     start = self.tip.copy()
-    steps = max(2, round(float(np.linalg.norm(goal - start)) / speed / CONTROL_TIMESTEP))
+    steps = max(2, round(float(np.linalg.norm(goal - start)) / speed / self.dt))
     for k in range(1, steps + 1):
       s = k / steps
       self.tip = start + (goal - start) * (10 * s**3 - 15 * s**4 + 6 * s**5)
@@ -229,13 +230,13 @@ class Performer:
   def push(self, force: float, along: np.ndarray, until: Callable[[], bool], most=5.0) -> Script:
     """Presses with a force [N] along a direction until a condition or for `most` seconds."""
     contact = 0.0  # time in contact [s]
-    for _ in range(round(most / self.care / CONTROL_TIMESTEP)):
+    for _ in range(round(most / self.care / self.dt)):
       if until():
         return
       measured = float(np.linalg.norm(self.physics.contact_force()))
-      contact += CONTROL_TIMESTEP if measured > 0.02 else 0.0
+      contact += self.dt if measured > 0.02 else 0.0
       speed = np.clip(0.06 * (force * self.excess(contact) - measured), -0.02, 0.012)
-      self.tip = self.tip + self.care * speed * CONTROL_TIMESTEP * along
+      self.tip = self.tip + self.care * speed * self.dt * along
       yield self.step()
 
   @property
@@ -250,13 +251,13 @@ class Performer:
   def sink(self, depth: float, point: np.ndarray, along: np.ndarray, until: Callable[[], bool]):
     """Presses to a depth [m] below a point until a condition, for 5 s at most."""
     contact = 0.0
-    for _ in range(round(5 / self.care / CONTROL_TIMESTEP)):
+    for _ in range(round(5 / self.care / self.dt)):
       if until():
         return
       now = float((self.physics.tip_pos() - point) @ along)
-      contact += CONTROL_TIMESTEP if now > 0 else 0.0
+      contact += self.dt if now > 0 else 0.0
       speed = np.clip(8 * (depth * self.excess(contact) - now), -0.02, 0.015)
-      self.tip = self.tip + self.care * speed * CONTROL_TIMESTEP * along
+      self.tip = self.tip + self.care * speed * self.dt * along
       yield self.step()
 
   def close(self, site: int) -> Script:

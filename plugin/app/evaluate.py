@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import palpate
 
+from . import options
 from .console import CommandError, Interrupt, Progress, output, output_folder, writing
 from .workers import parallel
 
@@ -50,6 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser):
   add("--episodes", metavar="N", type=int, default=10, help="how many (%(default)s)")
   add("--seed", metavar="N", type=int, default=0, help="of the first episode (%(default)s)")
   add("--processes", metavar="N", type=int, default=1, help="at a time (%(default)s)")
+  options.add_argument(parser)
   add("--json", metavar="FILE", help="write every episode's metrics")
   add("--recordings", metavar="FOLDER", help="keep every episode's recording, whole or not")
 
@@ -70,10 +72,15 @@ def main(args: argparse.Namespace) -> int:
   file = output("json", args.json) if args.json else None
   if args.recordings:
     output_folder("recordings", args.recordings)
+  task_kwargs = options.read(args.set)
+  if task_kwargs:  # what is wrong with them is said once
+    options.load(name, task_kwargs)
   seeds = range(args.seed, args.seed + args.episodes)
   progress, results = Progress(), []
   with Interrupt() as interrupt:
-    for result in evaluate(name, args.policy, seeds, args.processes, args.recordings, interrupt):
+    for result in evaluate(
+      name, args.policy, seeds, args.processes, args.recordings, interrupt, task_kwargs
+    ):
       results.append(result)
       progress.show(f"{len(results)} of {args.episodes}")
   progress.clear()
@@ -108,6 +115,7 @@ def evaluate(
   processes: int = 1,
   recordings: str | None = None,
   interrupt: Interrupt | None = None,
+  task_kwargs: Mapping[str, Any] | None = None,
 ) -> Iterator[Result]:
   """Yields the result of each seed, in order; the processes are spawned, not forked.
 
@@ -118,28 +126,30 @@ def evaluate(
     processes: at a time
     recordings: folder to keep the recordings in, SEED.npz
     interrupt: once seen, the episodes that run are finished and no more are begun
+    task_kwargs: options of the task, JSON
   """
-  jobs = [(name, policy, seed, recordings) for seed in seeds]
+  kwargs = json.dumps(dict(task_kwargs or {}))
+  jobs = [(name, policy, seed, recordings, kwargs) for seed in seeds]
   done = parallel(perform, jobs, processes, interrupt or Interrupt())
   for seed, result in zip(seeds, done, strict=False):  # an interrupt leaves some out
     died = Result(seed, "error", 0.0, 0.0, error="a process died, and with it what was left")
     yield result or died
 
 
-_environment: tuple[str, Any] = ("", None)  # the last one of this process: each takes memory
+_environment: tuple[Any, Any] = (None, None)  # the last one of this process: each takes memory
 
 
-def perform(job: tuple[str, str, int, str | None]) -> Result:
-  """Returns the result of one episode: a job is task, policy, seed and folder for its recording."""
+def perform(job: tuple[str, str, int, str | None, str]) -> Result:
+  """Returns the result of an episode; a job is task, policy, seed, recordings' folder, options."""
   global _environment
-  name, policy, seed, folder = job
+  name, policy, seed, folder, kwargs = job
   palpate.register()
-  from palpate.tasks import episode, performer, suite
+  from palpate.tasks import episode, performer
 
-  if _environment[0] != name:
-    _environment = name, suite.load(*suite.split(name), task_kwargs={"random": 0})
+  if _environment[0] != (name, kwargs):
+    _environment = (name, kwargs), options.load(name, json.loads(kwargs))
   env = _environment[1]
-  info = {"task_kwargs": {}, "performer": policy}
+  info = {"task_kwargs": json.loads(kwargs), "performer": policy}
   try:
     recording = episode.run(env, performer.make(env, policy, seed), seed, info)
   except episode.EpisodeError as error:

@@ -98,7 +98,7 @@ def _kept(job: tuple[str, str, int, str]) -> Result:
   path = pathlib.Path(folder) / f"{task} {who} {seed}.json".replace("/", "_").replace(":", "_")
   if path.exists():
     return Result(**json.loads(path.read_text(encoding="utf-8")))
-  result = perform((task, who, seed, None))
+  result = perform((task, who, seed, None, "{}"))
   with replacing(path) as file:
     json.dump(dataclasses.asdict(result), file)
   return result

@@ -7,7 +7,18 @@ import warp as wp
 from palpate.tissue import step
 from palpate.tissue.body import Body
 
-from . import coupling, declare, graphs, mjstruct, nodal, nodes, slots, weights, windowed
+from . import (
+  coupling,
+  declare,
+  declare_windows,
+  graphs,
+  mjstruct,
+  nodal,
+  nodes,
+  slots,
+  weights,
+  windowed,
+)
 
 
 def bind(w, model: int):
@@ -25,7 +36,7 @@ def bind(w, model: int):
     near = wp.get_device(does.side)
     crossing = device != near
 
-    touched = weights.make(w, model)
+    touched = _touched(w, model)
 
     def before():
       weights.launch(touched)
@@ -46,14 +57,20 @@ def bind(w, model: int):
       if crossing:
         _cross(w, ("sol", "status"), to_device=False)
 
+    def end():
+      does.end()
+      does.advance()
+
+    # As few graphs as may be: a launch costs a small organ a hundredth of its step.
+    after = [] if w.resident else [(cpu, does.scatter)]
     w.before = graphs.record(cpu, before)
-    w.solve = graphs.record_all((near, does.enter), (device, solve), (near, does.look))
-    w.after = graphs.record(cpu, does.scatter)
+    w.solve = graphs.record_all((near, does.enter), (device, solve), (near, does.look), *after)
+    w.after = graphs.record(cpu, does.scatter) if w.resident else None
     w.leave = graphs.record(cpu, does.leave)
     w.respond = []
     if scheme.respond:
       w.respond = graphs.record_all((near, does.push), (device, respond), (near, does.answer))
-    w.end = graphs.record(cpu, does.end)
+    w.end = graphs.record(cpu, end)
     w.advance = graphs.record(cpu, does.advance)
     w.place = graphs.record(cpu, does.place) if w.organ.windows else None
     if w.resident:
@@ -63,12 +80,28 @@ def bind(w, model: int):
       w.resident.rest = graphs.record_all((near, does.look_ahead))
     if w.turn is not None:
       w.turn.bind(model, w.organ.windows)
+  _watch(w, model)
+
+
+def _watch(w, model: int):
+  """Notes what of a model a step looks at, and what it was."""
+  m = mjstruct.Model.from_address(model)
   w.model, w.identity = model, mjstruct.Identity(model)
   option = model + mjstruct.Model.opt.offset
   w.model_step = mjstruct.view(option + type(m.opt).timestep.offset, 1).data
   w.time_step = float(m.opt.timestep)
   w.integrator = mjstruct.view(option + type(m.opt).integrator.offset, 1, np.int32).data
   w.static = [(view, view.tobytes()) for view in declare.static_places(m, w.organ)]
+
+
+def _touched(w, model: int) -> weights.Weights:
+  """Returns what contacts with the organs of the model get weights by.
+
+  With all of them, since one that looks for contacts again has those of the others found again.
+  """
+  out = weights.make(model, w.data, declare_windows.touching(model, w.instance), w.flags)
+  w.views["mine"] = out.mine
+  return out
 
 
 # What a solve on another device than MuJoCo's side reads and writes.

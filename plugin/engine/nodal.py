@@ -66,7 +66,7 @@ class Phases(coupling.Phases):
       frame=organ.frame,
       heaviest=wp.array(w.heaviest, dtype=wp.float64, device="cpu", copy=False),
       number=w.body.numbers,
-      flags=wp.array(w.flags, dtype=int, device="cpu", copy=False),
+      flags=wp.array(np.asarray(w.flags), dtype=int, device="cpu", copy=False),
       lagged=w.lagged,
       own=layout.carve(NodalState, state, {"nfree": organ.nfree}),
       mj=coupling.mujoco_arrays(model, w.data),

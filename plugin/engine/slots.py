@@ -138,7 +138,7 @@ def make(w, model: int, sizes: dict[str, int]):
     origin=organ.origin,
     heaviest=wp.array(w.heaviest, dtype=wp.float64, device="cpu", copy=False),
     number=w.body.numbers,
-    flags=wp.array(w.flags, dtype=int, device="cpu", copy=False),
+    flags=wp.array(np.asarray(w.flags), dtype=int, device="cpu", copy=False),
     home=win.home,
     qhome=win.qhome,
     dofadr=win.dofadr,

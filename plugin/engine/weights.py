@@ -6,6 +6,7 @@ flicker where a tool presses. MuJoCo 4.0 has it right, and is left alone.
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
+
 import functools
 
 import mujoco
@@ -14,7 +15,7 @@ import warp as wp
 from palpate.tissue.kernels import kernel
 from palpate.tissue.types import Array, doubles, ints, struct
 
-from . import apart, coupling, declare_windows, mjstruct
+from . import apart, coupling, mjstruct
 from .layout import FLAG
 
 _DATA = (
@@ -99,19 +100,23 @@ def are_wrong() -> bool:
   return not np.allclose(found, [1 - at[0] - at[1], at[0], at[1]], atol=1e-3)
 
 
-def make(w, model: int):
-  """Returns `Weights` of the model's organs, beside a workspace's.
+def make(model: int, data: int, flexes, flags: np.ndarray | None = None) -> Weights:
+  """Returns `Weights` of an mjModel and mjData.
 
-  Of all, since one that looks for contacts again in a step has those of the others found again.
+  Args:
+    model: address of the mjModel
+    data: address of the mjData
+    flexes: the flexes whose contacts get their weights
+    flags: where to report, see FLAG
   """
-  m = mjstruct.Model.from_address(model)
-  mine = np.zeros(m.nflex, np.int32)
-  mine[declare_windows.touching(model, w.instance)] = 1
-  out = coupling.mujoco_arrays(model, w.data, Weights)
-  out.nv = m.nv
-  out.memory = coupling.wrap(w.data, mjstruct.size(mjstruct.Data) // 8, wp.uint64)
-  out.mine = w.views["mine"] = wp.array(mine, dtype=int, device="cpu")
-  out.flags = wp.array(w.flags, dtype=int, device="cpu", copy=False)
+  mine = np.zeros(mjstruct.Model.from_address(model).nflex, np.int32)
+  mine[flexes] = 1
+  out = coupling.mujoco_arrays(model, data, Weights)
+  out.nv = mjstruct.Model.from_address(model).nv
+  out.memory = coupling.wrap(data, mjstruct.size(mjstruct.Data) // 8, wp.uint64)
+  out.mine = wp.array(mine, dtype=int, device="cpu")
+  flags = np.zeros(len(FLAG), np.int32) if flags is None else flags
+  out.flags = wp.array(flags, dtype=int, device="cpu", copy=False)
   return out
 
 

@@ -56,12 +56,13 @@ class Workspace:
     identity: tells that model from others
     chosen: whether the configuration was changed here, not by a copy
     turn: this mjData's part in the model's windows, or None
-    before, after: recorded graphs of a step's forces around the solve
-    solve: recorded graphs of the solve and what it needs, each on one device
+    before: recorded graph of a step's forces before the solve
+    solve: recorded graphs of the solve and what is around it, each on one device
+    after: recorded graph of the forces after it where the motion is on a device, else part of it
     leave: recorded graph that takes the contact forces after MuJoCo's step
     respond: recorded graphs of the organ's response to their change; none where the scheme has none
-    end: recorded graph that ends a step without that
-    advance: recorded graph of the plugin state's step
+    advance: recorded graph of the plugin state's step after that
+    end: recorded graph that ends a step without such a response, and steps the plugin state
     place: recorded graph that puts the windows where the plugin state says, or None
     resident: keeper of a motion that stays on the device, or None
     stiff: whether the response is needed, see `inertia.stiffness`
@@ -116,10 +117,8 @@ class Workspace:
   stiff: bool = False
   heaviest: np.ndarray = dataclasses.field(default_factory=lambda: np.ones(1))
   computed: bool = False
-  flags: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(len(FLAG), np.int32))
   policy: memoryview = dataclasses.field(default_factory=lambda: np.zeros(1, np.int32).data)
   counts: memoryview = dataclasses.field(default_factory=lambda: np.zeros(1, np.int32).data)
-  status: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(4, np.float32))
   error: str | None = None
   missed: tuple[int, int] = (0, 0)
   strange: bool = False
@@ -127,6 +126,8 @@ class Workspace:
   torn: bool = False
   watch: Watch = dataclasses.field(default_factory=Watch)
   # Views that every step looks at: an item of a memoryview costs a tenth of one of an array.
+  flags: memoryview = dataclasses.field(default_factory=lambda: np.zeros(len(FLAG), np.int32).data)
+  status: memoryview = dataclasses.field(default_factory=lambda: np.zeros(4, np.float32).data)
   warning: memoryview = dataclasses.field(default_factory=lambda: memoryview(b""))
   nefc: memoryview = dataclasses.field(default_factory=lambda: memoryview(b"\0"))
   nbad: int = 0
@@ -177,9 +178,9 @@ class Workspace:
       self.resident.send()
       graphs.launch_all(self.resident.left_to_do())
       self.resident.look()
+      wp.capture_launch(self.after)
     else:
       graphs.launch_all(self.solve)
-    wp.capture_launch(self.after)
     self.computed = True
 
   def _check_model(self):
@@ -272,9 +273,7 @@ class Workspace:
     self.flags[FLAG.answered] = responds
     if responds:
       self._answer()
-    else:
-      wp.capture_launch(self.end)
-    wp.capture_launch(self.advance)
+    wp.capture_launch(self.advance if responds else self.end)
     if self.resident:
       self.resident.step(computed)
 
@@ -372,7 +371,7 @@ def make(model: int, data: int, instance: int) -> Workspace:
 def _view(w: Workspace, d, m):
   """Takes views of an mjData that every step looks at."""
   fields, count = mjstruct.Data, len(d.warning)
-  w.status = w.host["status"].numpy()[0]
+  w.status = w.host["status"].numpy()[0].data
   w.warning = mjstruct.view(w.data + fields.warning.offset, 2 * count, np.int32).data
   w.nefc = mjstruct.view(w.data + fields.nefc.offset, 1, np.int32).data
   if w.organ.windows:

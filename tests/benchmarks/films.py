@@ -103,15 +103,27 @@ def build(case: Case, scheme: str, h: float, **keys) -> mujoco.MjModel:
 
 
 class Film:
-  """A run that can be advanced a stretch at a time."""
+  """A run that can be advanced a stretch at a time.
 
-  def __init__(self, case: Case, model: mujoco.MjModel, ours: bool = False):
+  Args:
+    case: its scene and nodes
+    model: of `build`
+    ours: whether there is an organ, not MuJoCo's own flex
+    weighs: whether a flex of MuJoCo's own gets the right weights of corners, see `scene.weigher`
+
+  Attributes:
+    passive: adds forces to a step of its data, or None
+  """
+
+  def __init__(self, case: Case, model: mujoco.MjModel, ours: bool = False, weighs: bool = False):
     self.script = SCRIPTS[case["scene"]]
     self.model, self.data = model, mujoco.MjData(model)
     self.h = model.opt.timestep
     self.mesh = scene.shape("sphere", case["nodes"])
     self.organ = scene.handle(model, self.data) if ours else None
     self.state = scene.Nodes(model, self.data, self.mesh, self.organ)
+    self.weigh = scene.weigher(model, self.data) if weighs else None
+    self.passive: Callable[[mujoco.MjData], None] | None = None
     self.overflow = 0  # nodes that a window had no room for
     self.probe = scene.probe_dofs(model) if self.script.probe else None
     self.force: list[np.ndarray] = []
@@ -123,6 +135,19 @@ class Film:
 
   def move(self, until: float, before=None, after=None):
     """Advances to a time, calling `before` and `after` around each step."""
+    mujoco.set_mjcb_passive(self._within if self.passive or self.weigh else None)
+    try:
+      self._move(until, before, after)
+    finally:
+      mujoco.set_mjcb_passive(None)
+
+  def _within(self, _, data: mujoco.MjData):
+    if self.passive:
+      self.passive(data)
+    if self.weigh:
+      self.weigh()
+
+  def _move(self, until: float, before, after):
     every = round(SAMPLE / self.h)
     while self.n < round(until / self.h):
       now = self.n * self.h

@@ -17,7 +17,8 @@ STYLES = {
   "neumann": ("#9467bd", "^", "--"),
   "explicit": ("#2ca02c", "v", "--"),
   "native": ("#c1442e", "D", "-"),
-  "native, Newton": ("#fdae61", "P", "-"),
+  "native, right weights": ("#f4a582", "D", "--"),
+  "native, Newton": ("#8c564b", "P", "-"),
 }
 
 

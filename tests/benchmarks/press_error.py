@@ -2,9 +2,8 @@
 
 RMS errors in % of the peak, of the whole and of its three parts, in the press of
 tests/engine/test_coupling.py against its explicit reference. The force is taken for that of the
-step's end, or its start. `touch` is the first 35 ms,
-in which the ball bounces on one node, `ramp` until it stops at 100 ms, `hold` the rest; their
-squares add up.
+step's end, or its start. `touch` is the first 35 ms, in which the ball lies on one node, `ramp`
+until it stops at 100 ms, `hold` the rest; their squares add up.
 """
 
 import argparse
@@ -59,13 +58,13 @@ def press(script: dict, h: float, ahead=True, extrapolate=0.0, armature=1.0, **k
     stepping.SCHEMES["implicit"] = dataclasses.replace(known, step=at_present)
   try:
     model = mujoco.MjModel.from_xml_string(xml)
+    data = mujoco.MjData(model)  # gives the nodes the right inertia, if they have not
     nodes = slice(0, model.nv - 1)
     mass = model.body_mass[model.dof_bodyid[nodes]]
     inertia = mass + model.dof_armature[nodes]
     if armature != 1:
       model.dof_armature[nodes] = np.maximum(armature * inertia - mass, 0)
       model.dof_M0[nodes] = mass + model.dof_armature[nodes]
-    data = mujoco.MjData(model)
   finally:
     stepping.SCHEMES["implicit"] = known
   lagged = data.plugin_state[layout.spans(layout.NodalState, {"nfree": model.nv - 1})["force"]]

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Callable
 
 import mujoco
 import numpy as np
+from palpate.engine import weights
 from palpate.models import mjcf
 from palpate.organ import Organ
 from palpate.tissue import mesh as topology
@@ -277,6 +279,15 @@ def probe_dofs(model: mujoco.MjModel) -> np.ndarray:
 def handle(model: mujoco.MjModel, data: mujoco.MjData) -> Organ:
   """Returns the organ's handle."""
   return Organ(model, data, "organ")
+
+
+def weigher(model: mujoco.MjModel, data: mujoco.MjData) -> Callable[[], None]:
+  """Returns what gives contacts with MuJoCo's own flexes the right weights of corners.
+
+  Where MuJoCo's are wrong, organs get them from the plugin; call this in `mjcb_passive` for others.
+  """
+  touched = weights.make(model._address, data._address, slice(None))
+  return lambda: weights.launch(touched)
 
 
 def put(data: mujoco.MjData, dofs: np.ndarray, position: np.ndarray, velocity: np.ndarray):

@@ -120,7 +120,7 @@ def film_of(name: str, where: str, h: float) -> Film:
   """Runs a scheme on a scene of the error bench."""
   case = {"scene": where, "nodes": NODES, "elements": "membrane"}
   model = films.build(case, "passive", h, solver="Newton", mj_tolerance=1e-10)
-  film = Film(case, model)
+  film = Film(case, model, weighs=True)
   dofs = film.state.dofs
   mass = model.body_mass[model.dof_bodyid[dofs[:, 0]]]
   scheme = Scheme(name, exact.Elastic(film.mesh, films.config_of("membrane")), mass, h)
@@ -131,7 +131,7 @@ def film_of(name: str, where: str, h: float) -> Film:
   model.dof_invweight0[:], model.body_invweight0[:] = weights
   now = {"f": np.zeros_like(film.mesh.rest)}
 
-  def passive(_, data):
+  def passive(data):
     x, v = data.qpos[dofs].copy(), data.qvel[dofs].copy()
     to, end = scheme.step(x, v, now["f"])
     data.qfrc_passive[dofs] += meets[:, None] * (to - v) / h - now["f"]
@@ -141,11 +141,8 @@ def film_of(name: str, where: str, h: float) -> Film:
     scheme.moved(now["x"], now["v"], now["end"], film.data.qvel[dofs] - now["to"])
     now["f"] = film.data.qfrc_constraint[dofs].copy()
 
-  mujoco.set_mjcb_passive(passive)
-  try:
-    film.move(film.script.duration, after=after)
-  finally:
-    mujoco.set_mjcb_passive(None)
+  film.passive = passive
+  film.move(film.script.duration, after=after)
   return film
 
 

@@ -4,6 +4,7 @@ import json
 
 import pytest
 from benchmarks import results, run
+from palpate.engine import weights
 
 
 def command(*words) -> int:
@@ -58,12 +59,18 @@ def test_short_forms_write_rows_and_a_page(tmp_path, name, words):
 
 
 def test_peer_is_beside_ours(tmp_path):
-  words = ("--nodes", 162, "--tolerance", 1e-3, "--refine", 2, "--repeats", 1, "--steps", 30)
+  words = ("--nodes", 162, "--tolerance", 1e-3, "--refine", 2, "--repeats", 1)
   assert command("peer", "--short", *words, "-o", tmp_path) == 0
   (row,) = results.read(tmp_path / "peer_cpu.csv")
   assert row["peer_ms"] > 0 and row["nodal_ms"] > 0 and row["window_ms"] > 0
+  assert row["peer_force_N"] > 0
   for side in ("nodal", "window"):
     assert row[f"{side}_force_N"] == pytest.approx(row["peer_force_N"], rel=0.3)
+    assert 0 < row[f"{side}_error"] < 0.05
+  if weights.are_wrong():
+    assert row["peer_error"] > 1.5 * row["peer_right_error"] > 0
+  else:
+    assert row["peer_error"] == pytest.approx(row["peer_right_error"], rel=1e-6)
 
 
 @pytest.mark.slow
