@@ -255,9 +255,10 @@ class Task(control.Task):
     self.progress, self.gain, self.best = 0.0, 0.0, 0.0
     self.peak, self._area = 0.0, 0.0
     self.cost, self.harm, self._price = safety.Cost(), 0.0, 0.0
-    physics.peak_force = physics.peak_shaft = 0.0  # else the last episode's are in the first step
+    physics.quiet()
     self._place_instrument(physics)
     self.begin(physics)
+    self.nodes0 = physics.nodes()
     self.start = physics.tip_pos()
 
   def _place_instrument(self, physics: Physics) -> None:
@@ -355,22 +356,25 @@ class Task(control.Task):
     """Returns the limits that the metrics need."""
     return Settings(
       force_limit=self.force_limit,
+      grip_limit=self.force_limit if self.jaws else None,
+      tip_cutoff=None,  # the simulation's positions are exact
       reference_length=self.reference_length(),
       contact_force=0.02,
       local_axis=(0.0, 0.0, -1.0),
     )
 
   def sample(self, physics: Physics) -> dict[str, Any]:
-    """Returns a sample for `Recorder.append`; `force` is the largest of the control step [N]."""
-    force = physics.peak_force
-    area = physics.contact_area() if force > 0 else 0.0
+    """Returns a sample for `Recorder.append`; the forces are those of every step of the physics."""
+    forces = physics.forces()
+    area = physics.contact_area() if forces["force"].any() else 0.0
     self._area = area if area > 0 else self._area
     return {
       "time": physics.data.ptr.time,
       "tip_pos": physics.tip_pos(),
       "quat": physics.tip_quat(),
-      "force": force,
-      "area": self._area if force > 0 else 0.0,
+      **forces,
+      "area": self._area if forces["force"][-1] > 0 else 0.0,
+      "strain": physics.strain(self.nodes0),
       "visible": float(physics.tip_visible()),
       **self.recorded(physics),
     }

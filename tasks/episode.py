@@ -94,7 +94,9 @@ def _begin(
   """Returns the recorder of an episode, with the constants and the sample of its start."""
   task: Any = env.task
   physics: Any = env.physics
-  recorder = Recorder([physics.prefix.rstrip("/")], task.settings(), task.watch)
+  recorder = Recorder(
+    [physics.prefix.rstrip("/")], task.settings(), task.watch, substeps=substeps(env)
+  )
   recorder.info = {
     "task": task.name,
     "seed": seed,
@@ -112,6 +114,11 @@ def _begin(
   first = {"state": physics.integration_state()} if states else None
   recorder.append(**task.sample(physics), arrays=first)
   return recorder
+
+
+def substeps(env: control.Environment) -> int:
+  """Returns how many steps the physics takes in a control step."""
+  return round(env.control_timestep() / env.physics.timestep())
 
 
 def environment(recording: Recording) -> control.Environment:

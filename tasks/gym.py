@@ -20,7 +20,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from . import registry, suite
+from . import episode, registry, suite
 from .display import Window
 from .recorder import Recorder
 from .scenes import CAMERA
@@ -114,7 +114,10 @@ class Exercise(gymnasium.Env):
     self._over = False
     self._recorder = None
     if self._record:
-      self._recorder = Recorder(["instrument"], self._task.settings(), self._task.watch)
+      self._recorder = Recorder(
+        ["instrument"], self._task.settings(), self._task.watch,
+        substeps=episode.substeps(self.environment),
+      )  # fmt: skip
       for name, value in self._task.constants(self._physics).items():
         self._recorder.attach(name, value)
       self._recorder.append(**self._task.sample(self._physics))

@@ -17,11 +17,16 @@ COLUMNS: dict[str, tuple[int, ...]] = {
   "quat": (4,),
   "axis": (3,),
   "force": (3,),
+  "grip_force": (),
+  "shaft_force": (),
   "area": (),
+  "strain": (),
   "grip": (),
   "held": (),
   "visible": (),
 }
+# Those that are measured faster: with substeps, magnitudes, one for each since the last sample.
+SIGNALS = ("force", "grip_force", "shaft_force")
 
 
 def measure(recording: Any, which: Sequence[int]) -> Metrics:
@@ -46,6 +51,7 @@ class Inputs:
 
   `time`, the recording's `COLUMNS` and `Settings`, the properties below and, for metrics of all
   instruments together, the other metrics. Of several instruments the columns are the first one's.
+  `SIGNALS` are at `force_time`; positions and orientations went through `Settings.tip_cutoff`.
   """
 
   def __init__(
@@ -54,6 +60,7 @@ class Inputs:
     """Makes the inputs of some instruments; `values` are metrics that are known already."""
     self._recording, self._which, self._values = recording, which, values or {}
     self._settings = dataclasses.asdict(recording.settings)
+    self._paths: dict[int, np.ndarray | None] = {}
     self.time = recording.time
 
   def value(self, name: str, spec: Spec) -> float:
@@ -80,23 +87,49 @@ class Inputs:
       return math.nan if value is None else value
     if name in self._values:
       return self._values[name]
+    if name in SIGNALS:
+      return self._signal(name)
     if name in COLUMNS:
       return self._recording.column(name, self._which[0])
     raise TypeError(f"metric {metric!r}: no input {name!r}, see {type(self).__name__}")
 
   @property
+  def tip_pos(self) -> np.ndarray | None:
+    """Tip position [m]  (nstep, 3)."""
+    return self._path(0)
+
+  @functools.cached_property
+  def _turned(self) -> np.ndarray | None:
+    quat, cutoff = self._recording.column("quat", self._which[0]), self._settings["tip_cutoff"]
+    return quat if quat is None or cutoff is None else m.low_pass_rotation(self.time, quat, cutoff)
+
+  @property
+  def quat(self) -> np.ndarray | None:
+    """Tip orientation, w x y z  (nstep, 4)."""
+    return self._turned
+
+  @property
   def axis(self) -> np.ndarray | None:
     """Direction of the shaft in the world  (nstep, 3)."""
-    axis, quat = (self._recording.column(name, self._which[0]) for name in ("axis", "quat"))
-    if axis is None and quat is not None:
-      return _rotate(quat, self._settings["local_axis"])
+    axis = self._recording.column("axis", self._which[0])
+    if axis is None and self.quat is not None:
+      return _rotate(self.quat, self._settings["local_axis"])
     return axis
 
   @property
   def moved(self) -> bool:
     """Whether the tip is known to have moved."""
-    pos = self._recording.column("tip_pos", self._which[0])
-    return pos is not None and not math.isnan(m.path_length(pos))
+    return self.tip_pos is not None and not math.isnan(m.path_length(self.tip_pos))
+
+  @property
+  def force_time(self) -> np.ndarray:
+    """Times of the forces' samples, `substeps` for one of the others [s]."""
+    return self._recording.signal_time
+
+  @property
+  def sampled_force(self) -> np.ndarray | None:
+    """Contact force at the samples [N]  (nstep,)."""
+    return None if (force := self._signal("force")) is None else force[:: self._recording.substeps]
 
   @property
   def speed(self) -> np.ndarray:
@@ -104,9 +137,14 @@ class Inputs:
     return self._speed(0)
 
   @property
-  def speeds(self) -> list[np.ndarray]:
+  def steady_speed(self) -> np.ndarray:
+    """Speed of the path under `Settings.movement_cutoff` [m/s]  (nstep - 1,)."""
+    return self._speed(0, steady=True)
+
+  @property
+  def steady_speeds(self) -> list[np.ndarray]:
     """The same of every instrument  (ninstrument, nstep - 1)."""
-    return [self._speed(k) for k in range(len(self._which))]
+    return [self._speed(k, steady=True) for k in range(len(self._which))]
 
   @property
   def first_speed(self) -> np.ndarray:
@@ -175,22 +213,33 @@ class Inputs:
 
   def _tracing(self, choose: Callable[[np.ndarray], Any]) -> np.ndarray:
     _ = self.curve  # without one nothing is traced
-    pos, force = self._position(0), self._recording.column("force", self._which[0])
-    if force is None:
+    pos = self._position(0)
+    if self._signal("force") is None:
       return pos
-    touch = (m.magnitude(force) > self._settings["contact_force"]).nonzero()[0]
+    touch = self._recording.touching(self._which[0]).nonzero()[0]
     if len(touch) == 0:
       raise UnknownError("no contact")
     return pos[choose(touch)]
 
+  def _signal(self, name: str) -> np.ndarray | None:
+    values = self._recording.signal(name, self._which[0])
+    return None if values is None else m.magnitude(values, name)
+
+  def _path(self, k: int) -> np.ndarray | None:
+    if k not in self._paths:
+      self._paths[k] = self._recording.tip_path(self._which[k])
+    return self._paths[k]
+
   def _position(self, k: int) -> np.ndarray:
-    pos = self._recording.column("tip_pos", self._which[k])
-    if pos is None:
+    if (pos := self._path(k)) is None:
       raise UnknownError("tip_pos not recorded")
     return pos
 
-  def _speed(self, k: int) -> np.ndarray:
-    return m.speed(self.time, self._position(k))
+  def _speed(self, k: int, steady: bool = False) -> np.ndarray:
+    pos = self._position(k)
+    if steady:
+      pos = m.low_pass(self.time, m.rows("tip_pos", pos, 3), self._settings["movement_cutoff"])
+    return m.speed(self.time, pos)
 
 
 def _combine(how: str, values: Sequence[float]) -> float:

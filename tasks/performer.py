@@ -1,4 +1,8 @@
-"""Scripted performers: an expert for every exercise, and novices that differ in stated ways.
+"""Scripted performers: an expert for every exercise, and people who differ in stated ways.
+
+`expert` makes no mistake that a script need not make. The novices each do one thing badly.
+`skilled` is a person, another with every seed, who does everything a little worse than the script:
+what is within a person's reach is measured against them.
 
 What to do is the task's method `expert`, beside the task; how it is done, the `Style`, is here.
 
@@ -13,6 +17,7 @@ Scripts see the simulation (targets, triangles, forces), not the observations on
 there to show that an exercise can be solved and to be measured against, not to be learned from.
 """
 
+import collections
 import dataclasses
 import importlib
 import math
@@ -42,6 +47,7 @@ class Style:
     force: factor on the forces that are pressed, pulled and gripped with [-]
     detour: how far a movement bends aside, as a share of its length [-]
     speed: factor on the speed of movements [-]
+    reaction: how late the hand follows what was decided, and so what was felt [s]
   """
 
   tremor: float = 0.0
@@ -50,6 +56,7 @@ class Style:
   force: float = 1.0
   detour: float = 0.0
   speed: float = 1.0
+  reaction: float = 0.0
 
 
 EXPERT = Style()
@@ -61,6 +68,18 @@ NOVICES = {
   "detour": Style(detour=0.5),
 }
 STYLES = {"expert": EXPERT, **NOVICES}
+# What is drawn for `skilled`: from a script's steady hand to a person's; ranges of `Style`. Tremor
+# of surgeons is 0.14 to 0.29 mm in all directions together (PMC3989364), 1.7 times less in each; a
+# long instrument shows more of it.
+SKILLED = {
+  "tremor": (0.0, 0.0002),
+  "overshoot": (0.0, 0.1),
+  "delay": (0.0, 0.4),
+  "force": (0.8, 1.2),
+  "detour": (0.0, 0.2),
+  "speed": (0.5, 1.2),
+  "reaction": (0.0, 0.2),
+}
 _WIDE = 1.0  # action of the jaw: wide open
 _GRIP = 2.4  # force that holds the organ [N]
 _TREMOR_HZ = np.array([4.0, 5.3, 7.1, 8.6, 10.0])
@@ -71,13 +90,15 @@ def make(env: control.Environment, who: str | Style = EXPERT, seed: int = 0) -> 
 
   Args:
     env: of one of the suite's tasks
-    who: a `Style`, a name of `STYLES`, or "module:object": a class is made with (env, seed) and its
-      object called with each time step; anything else is called with the observation
+    who: a `Style`, a name of `STYLES`, `skilled`, or "module:object": a class is made with (env,
+      seed) and its object called with each time step; anything else is called with the observation
     seed: of what is random in a scripted performer
   """
   if isinstance(who, Style):
     return Performer(env, who, seed)
   found = find(who)
+  if found is skilled:
+    found = skilled(seed)
   if isinstance(found, Style):
     return Performer(env, found, seed)
   if not isinstance(found, type):
@@ -88,6 +109,12 @@ def make(env: control.Environment, who: str | Style = EXPERT, seed: int = 0) -> 
     raise ValueError(f"policy {who!r}: {type(error).__name__}: {error}") from error
 
 
+def skilled(seed: int) -> Style:
+  """Returns a style drawn from `SKILLED`."""
+  random = np.random.RandomState(seed)
+  return Style(**{name: float(random.uniform(*span)) for name, span in SKILLED.items()})
+
+
 def find(who: str, *others: str) -> Any:
   """Returns the style or the object that a name stands for; ValueError says what is wrong with it.
 
@@ -95,9 +122,11 @@ def find(who: str, *others: str) -> Any:
     who: see `make`
     *others: names that the caller takes as well, for the message
   """
+  if who == skilled.__name__:
+    return skilled
   if ":" not in who:
     if who not in STYLES:
-      names = ", ".join((*STYLES, *others))
+      names = ", ".join((*STYLES, skilled.__name__, *others))
       raise ValueError(f"performer is {who!r}, expected one of {names} or module:object")
     return STYLES[who]
   module, _, name = who.partition(":")
@@ -138,6 +167,9 @@ class Performer:
       self.tip = trocar.forward(self.trocar, joints)  # where the tip is told to be
       self.roll = float(self.physics.drive_targets()[2])
       self.extra = np.zeros(len(self.task.components) - len(AXES))
+      late = round(self.style.reaction / self.dt)
+      still = self.tip, self.roll, self.extra.copy()
+      self._told = collections.deque([still] * late, maxlen=late + 1)
       self._phase = self.random.uniform(0, 2 * math.pi, (len(_TREMOR_HZ), 3))
       script: Script = self.task.expert(self)
       self._steps = script
@@ -151,14 +183,15 @@ class Performer:
 
   def step(self) -> np.ndarray:
     """Returns the action that takes the drives towards `tip`, `roll` and `extra`."""
-    tip = self.tip
+    self._told.append((self.tip, self.roll, self.extra.copy()))
+    tip, roll, extra = self._told[0]  # of the moment that the hand follows now
     if self.style.tremor:
       wave = np.sin(2 * math.pi * _TREMOR_HZ[:, None] * self.physics.time() + self._phase)
       tip = tip + self.style.tremor * math.sqrt(2 / len(_TREMOR_HZ)) * wave.sum(axis=0)
     pitch, yaw, insertion = trocar.inverse(self.trocar, tip, check=False)
-    goal = np.array([pitch, yaw, self.roll, insertion])
+    goal = np.array([pitch, yaw, roll, insertion])
     move = (goal - self.physics.drive_targets()) / (np.array(RATES) * self.dt)
-    return np.concatenate([np.clip(move, -1, 1), self.extra])
+    return np.concatenate([np.clip(move, -1, 1), extra])
 
   def wait(self, duration: float) -> Script:
     """Holds still for a time [s]."""
@@ -197,14 +230,19 @@ class Performer:
   def push(self, force: float, along: np.ndarray, until: Callable[[], bool], most=5.0) -> Script:
     """Presses with a force [N] along a direction until a condition or for `most` seconds."""
     contact = 0.0  # time in contact [s]
-    for _ in range(round(most / self.dt)):
+    for _ in range(round(most / self.care / self.dt)):
       if until():
         return
       measured = float(np.linalg.norm(self.physics.contact_force()))
       contact += self.dt if measured > 0.02 else 0.0
       speed = np.clip(0.06 * (force * self.excess(contact) - measured), -0.02, 0.012)
-      self.tip = self.tip + speed * self.dt * along
+      self.tip = self.tip + self.care * speed * self.dt * along
       yield self.step()
+
+  @property
+  def care(self) -> float:
+    """Factor on the speed of pressing: who reacts late and presses fast is always too late."""
+    return 1 / (1 + self.style.reaction / 0.05)
 
   def excess(self, contact: float) -> float:
     """Returns the factor on force: too much at first, then corrected within a second or two."""
@@ -213,13 +251,13 @@ class Performer:
   def sink(self, depth: float, point: np.ndarray, along: np.ndarray, until: Callable[[], bool]):
     """Presses to a depth [m] below a point until a condition, for 5 s at most."""
     contact = 0.0
-    for _ in range(round(5 / self.dt)):
+    for _ in range(round(5 / self.care / self.dt)):
       if until():
         return
       now = float((self.physics.tip_pos() - point) @ along)
       contact += self.dt if now > 0 else 0.0
       speed = np.clip(8 * (depth * self.excess(contact) - now), -0.02, 0.015)
-      self.tip = self.tip + speed * self.dt * along
+      self.tip = self.tip + self.care * speed * self.dt * along
       yield self.step()
 
   def close(self, site: int) -> Script:

@@ -12,6 +12,7 @@ from palpate.models import trocar
 
 from . import scenes
 from .jaws import Jaws
+from .metrics import surface_strain
 from .portable import Portable
 from .scenes import CAMERA, ORGAN
 from .stage import STATE
@@ -44,7 +45,7 @@ class Physics(Portable):
     if model is not self.model.ptr:
       self._reload_from_data(wrapper.MjData(wrapper.MjModel(model)))
     self.organ = Organ(model, self.data.ptr, organ)
-    self.peak_force = self.peak_shaft = 0.0
+    self.quiet()
     self._nodes: np.ndarray | None = None
     self._camera = model.camera(CAMERA).id
     self._sensors = {}
@@ -77,24 +78,41 @@ class Physics(Portable):
     """Advances the physics; keeps the largest contact forces on tip and shaft of all the steps."""
     with self.check_invalid_state():
       model, data = self.model.ptr, self.data.ptr
-      sensor, tip2, shaft2, left, right = data.sensordata.data, 0.0, 0.0, 0.0, 0.0
-      x, y = (self._sensors[f"{part}_force"].start for part in ("tip", "shaft"))
-      sides = [self._sensors[f"touch_{side}"].start for side in ("left", "right") if self.has_jaw]
+      self._steps = np.empty((nstep, model.nsensordata))
       for k in range(nstep):
         mj.mj_step2(model, data)
-        if data.ncon:  # in plain numbers: this runs every millisecond
-          tip2 = max(tip2, sensor[x] ** 2 + sensor[x + 1] ** 2 + sensor[x + 2] ** 2)
-          shaft2 = max(shaft2, sensor[y] ** 2 + sensor[y + 1] ** 2 + sensor[y + 2] ** 2)
-        if sides:
-          left += sensor[sides[0]]
-          right += sensor[sides[1]]
+        self._steps[k] = data.sensordata
         if self._jaws and k == nstep - 1:
           self._inner = self._jaws.inner_force(model, data)
         mj.mj_step1(model, data)
       # Pinched folds make single steps of large jaw force: the jaws' is a mean over the step.
-      self.peak_force = max(tip2**0.5, left / nstep, right / nstep)
-      self.peak_shaft = shaft2**0.5
+      grip, forces = self._jaw_forces().mean(axis=0).max(initial=0.0), self.forces()
+      self.peak_force = float(max(forces["force"].max(), grip))
+      self.peak_shaft = float(forces["shaft_force"].max())
       self.moved()
+
+  def forces(self) -> dict[str, np.ndarray]:
+    """Returns the force of the tip, the shaft and the jaws' grip in each step of the last `step`.
+
+    Magnitudes [N]  (nstep,), as `Recorder.append` takes them; a single 0 before the first.
+    """
+    out = {
+      name: np.linalg.norm(self._steps[:, self._sensors[sensor]], axis=1)
+      for name, sensor in (("force", "tip_force"), ("shaft_force", "shaft_force"))
+    }
+    if self.has_jaw:
+      out["grip_force"] = self._jaw_forces().max(axis=1)
+    return out
+
+  def _jaw_forces(self) -> np.ndarray:
+    """Returns the force on the left and right jaw in each step [N]  (nstep, 2), (nstep, 0)."""
+    sides = [self._sensors[f"touch_{side}"].start for side in ("left", "right") if self.has_jaw]
+    return self._steps[:, sides]
+
+  def quiet(self) -> None:
+    """Forgets the forces of the last `step`: they would be in the next episode's start."""
+    self.peak_force = self.peak_shaft = 0.0
+    self._steps = np.zeros((1, self.model.nsensordata))
 
   def forward(self) -> None:
     """Recomputes what depends on the state."""
@@ -191,6 +209,10 @@ class Physics(Portable):
       self._nodes = self._xpos0 + self.organ.displacement
       self._nodes.flags.writeable = False
     return self._nodes
+
+  def strain(self, rest: np.ndarray) -> float:
+    """Returns the largest strain of the organ's surface against its nodes `rest` [-]."""
+    return float(surface_strain(rest, self.nodes(), self.organ.elem).max())
 
   def nodes_near(self) -> np.ndarray:
     """Returns the organ's nodes nearest to the tip, from the tip [m]  (NEAR, 3)."""

@@ -3,7 +3,9 @@
 Needs matplotlib (`palpate[plot]`), which is imported when a figure is drawn and not before.
 """
 
+import contextlib
 import io
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -59,8 +61,8 @@ def _draw_tip(
   several = len(recording.instruments) > 1
   name, color = _label(recording.instruments[i]), _TIP[i % len(_TIP)]
   ax.plot(*path.T, color=color, linewidth=1.3, zorder=3, label=name if several else "tip")
-  touch = _touching(recording, i)
-  if touch.any():
+  touch = recording.touching(i)
+  if touch is not None and touch.any():
     held = np.where(touch[:, None], path, np.nan)
     label = f"{name} in contact" if several else "in contact"
     ax.plot(*held.T, color=color if several else _BAD, linewidth=2.2, zorder=4, label=label)
@@ -92,49 +94,35 @@ def _frame(ax: Any, points: np.ndarray) -> None:
     getattr(ax, f"{axis}axis").set_pane_color((0.97, 0.97, 0.98, 1.0))
   ax.locator_params(nbins=5)
   # A tall box would leave the figure.
-  ax.set_box_aspect(half, zoom=min(1.0, 0.72 * float(np.linalg.norm(half) / half[2])))
+  ax.set_box_aspect(half, zoom=min(1.0, 0.66 * float(np.linalg.norm(half) / half[2])))
   ax.view_init(elev=28, azim=-55)
 
 
 def force_figure(recording: Recording) -> "Figure | None":
-  """Returns the contact force over time with its limit; None where no force was recorded."""
-  forces = [recording.force(i) for i in range(len(recording.instruments))]
-  if all(f is None for f in forces) or len(recording.time) == 0:
+  """Returns the contact forces over time with their limit; None where none was recorded."""
+  lines = list(_force_lines(recording))
+  if not lines or len(recording.time) == 0:
     return None
   figure = _figure(9, 3.4)
   ax = figure.add_subplot()
-  time = recording.time - recording.time[0]
+  time = recording.signal_time - recording.time[0]
   limit = recording.settings.force_limit
-  top = max((np.nanmax(f) for f in forces if f is not None), default=0.0)
-  for i, force in enumerate(forces):
-    if force is None:
-      continue
-    color = _TIP[i % len(_TIP)]
-    name = _label(recording.instruments[i]) if len(forces) > 1 else "contact force"
-    ax.plot(time, force, color=color, linewidth=1.3, label=name)
-    if limit is not None:
-      over = np.nan_to_num(force) > limit
+  top = max(np.nanmax(force) for _, force, _ in lines)
+  shaded = False  # the legend names it once
+  for name, force, style in lines:
+    ax.plot(time, force, linewidth=1.3, label=name, **style)
+    over = np.nan_to_num(force) > (np.inf if limit is None else limit)
+    if limit is not None and over.any():
       ax.fill_between(
         time, limit, force, where=over.tolist(), interpolate=True, color=_BAD, alpha=0.35,
-        linewidth=0, label="over the limit" if i == 0 and over.any() else None,
+        linewidth=0, label=None if shaded else "over the limit",
       )  # fmt: skip
+      shaded = True
   if limit is not None:
     ax.axhline(limit, color=_BAD, linestyle="--", linewidth=1.2, label=f"limit {limit:g} N")
     top = max(top, limit)
   top = 1.25 * top if top > 0 else 1.0
-  marks: dict[float, list[str]] = {}  # events of one moment share a line
-  for event in recording.events:
-    marks.setdefault(event.time - recording.time[0], []).append(event.label or event.kind)
-  if len(marks) <= _MOST_MARKS:  # more would be a grey wall, drawn for minutes
-    ax.vlines(list(marks), 0, top, color=_FAINT, linewidth=0.8, linestyle=":")
-  if len(marks) <= 12:
-    for at, words in marks.items():
-      late = at > 0.96 * time[-1]  # its words would leave the plot
-      ax.annotate(
-        ", ".join(_label(word) for word in words), (at, top), xytext=(-3 if late else 3, -3),
-        textcoords="offset points", fontsize=8, color="#5d6472", rotation=90, va="top",
-        ha="right" if late else "left",
-      )  # fmt: skip
+  _mark_events(ax, recording, top, time[-1])
   ax.set_ylim(0, top)
   ax.set_xlim(0, max(time[-1], 1e-9))
   ax.set_xlabel("time [s]")
@@ -144,12 +132,76 @@ def force_figure(recording: Recording) -> "Figure | None":
   return figure
 
 
+def _force_lines(recording: Recording) -> Iterator[tuple[str, np.ndarray, dict[str, Any]]]:
+  """Yields label, force at `signal_time` [N] and style of what is there to draw."""
+  several = len(recording.instruments) > 1
+  for i, instrument in enumerate(recording.instruments):
+    color, name = _TIP[i % len(_TIP)], f"{_label(instrument)}: " if several else ""
+    force, grip = recording.force(i), recording.signal("grip_force", i)
+    shaft = recording.signal("shaft_force", i)
+    if force is not None:
+      text = "press or pull" if grip is not None else "contact force"
+      only = several and grip is None  # then the instrument's name says it
+      yield (_label(instrument) if only else name + text), force, {"color": color}
+    if grip is not None:
+      yield f"{name}grip", np.abs(grip), {"color": color, "alpha": 0.45}
+    if shaft is not None and np.nanmax(np.abs(shaft)) > recording.settings.contact_force:
+      yield f"{name}shaft", np.abs(shaft), {"color": _BAD, "linestyle": ":"}
+
+
+def _mark_events(ax: Any, recording: Recording, top: float, end: float) -> None:
+  """Draws a line at each event, from 0 to `top`, and its words while there is room for them."""
+  marks: dict[float, list[str]] = {}  # events of one moment share a line
+  for event in recording.events:
+    marks.setdefault(event.time - recording.time[0], []).append(event.label or event.kind)
+  if len(marks) <= _MOST_MARKS:  # more would be a grey wall, drawn for minutes
+    ax.vlines(list(marks), 0, top, color=_FAINT, linewidth=0.8, linestyle=":")
+  if len(marks) <= 12:
+    for at, words in marks.items():
+      late = at > 0.96 * end  # its words would leave the plot
+      ax.annotate(
+        ", ".join(_label(word) for word in words), (at, top), xytext=(-3 if late else 3, -3),
+        textcoords="offset points", fontsize=8, color="#5d6472", rotation=90, va="top",
+        ha="right" if late else "left",
+      )  # fmt: skip
+
+
+def compared_figure(recordings: Sequence[tuple[str, Recording]]) -> "Figure | None":
+  """Returns force and speed of several recordings over time; None where neither is known."""
+  figure = _figure(9, 5)
+  axes: Any = figure.subplots(2, 1, sharex=True)
+  for k, (name, recording) in enumerate(recordings):
+    style = {"color": _TIP[k % len(_TIP)], "linewidth": 1.2, "alpha": 0.85, "label": _label(name)}
+    if len(recording.time) < 2:
+      continue
+    start = recording.time[0]
+    if (force := recording.force()) is not None:
+      axes[0].plot(recording.signal_time - start, force, **style)
+    with contextlib.suppress(m.UnknownError):  # positions are missing
+      if (pos := recording.tip_path()) is not None:
+        middle = (recording.time[1:] + recording.time[:-1]) / 2 - start
+        axes[1].plot(middle, 1e3 * m.speed(recording.time, pos), **style)
+  if not any(ax.lines for ax in axes):
+    return None
+  limits = {r.settings.force_limit for _, r in recordings} - {None}
+  for limit in sorted(limits):
+    axes[0].axhline(limit, color=_BAD, linestyle="--", linewidth=1, label=f"limit {limit:g} N")
+  for ax, label in zip(axes, ("force [N]", "speed [mm/s]"), strict=True):
+    ax.set_ylabel(label)
+    ax.set_ylim(bottom=0)
+    _tidy(ax)
+  axes[1].set_xlim(left=0)
+  axes[1].set_xlabel("time [s]")
+  _legend_above(axes[0] if axes[0].lines else axes[1])
+  return figure
+
+
 def spectrum_figure(recording: Recording) -> "Figure | None":
   """Returns the speed spectrum with the cut-offs of SPARC; None where no tip moved."""
   spectra = []
   for i in range(len(recording.instruments)):
-    pos = recording.column("tip_pos", i)
     try:
+      pos = recording.tip_path(i)
       if pos is not None:
         values, rate = m.uniform_speed(recording.time, pos)
         spectra.append((i, m.sparc(values, rate), *m.speed_spectrum(values, rate)))
@@ -230,10 +282,3 @@ def _surface(recording: Recording) -> tuple[np.ndarray, np.ndarray] | None:
   if triangles.dtype.kind not in "iu" or triangles.min() < 0 or triangles.max() >= len(vertices):
     raise ValueError(f"triangles must be indices of the {len(vertices)} vertices")
   return vertices, triangles
-
-
-def _touching(recording: Recording, instrument: int) -> np.ndarray:
-  force = recording.force(instrument)
-  if force is None:
-    return np.zeros(len(recording.time), bool)
-  return np.nan_to_num(force) > recording.settings.contact_force

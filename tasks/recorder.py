@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .inputs import COLUMNS
+from .inputs import SIGNALS
 from .metrics import Metrics
 from .recording import (
   Event,
@@ -20,7 +20,9 @@ from .recording import (
   check_array,
   check_constant,
   check_event,
+  check_substeps,
   check_watch,
+  entry_shapes,
 )
 
 __all__ = ["Event", "Recorder", "Recording", "Settings"]
@@ -73,6 +75,7 @@ class Recorder:
     settings: Settings | None = None,
     watch: Sequence[str] = (),
     info: Mapping[str, Any] | None = None,
+    substeps: int = 1,
   ):
     """Starts an empty recording.
 
@@ -81,13 +84,17 @@ class Recorder:
       settings: limits and thresholds
       watch: kinds of event (`metrics.EVENTS`) that the caller looks for; without an event, a kind
         that is watched counts 0 and one that is not is unknown
-      info: the caller's own data (task, seed, performer), anything that JSON holds
+      info: the caller's own data (task, seed, performer), anything that JSON holds; without an
+        `outcome`, which is `success` or another word, there is no score
+      substeps: how many values of the forces come with each sample, for instance the physics' steps
+        in a control step
     """
     if isinstance(instruments, str) or not instruments:
       raise ValueError(f"instruments is {instruments!r}, expected a list of names")
     self.instruments = tuple(str(name) for name in instruments)
     self.settings = settings or Settings()
     self.watch = check_watch(watch)
+    self.substeps = check_substeps(substeps)
     try:
       self.info = json.loads(json.dumps(dict(info or {}), allow_nan=False))
     except (TypeError, ValueError) as error:
@@ -111,7 +118,10 @@ class Recorder:
     quat: ArrayLike | None = None,
     axis: ArrayLike | None = None,
     force: ArrayLike | None = None,
+    grip_force: ArrayLike | None = None,
+    shaft_force: ArrayLike | None = None,
     area: ArrayLike | None = None,
+    strain: ArrayLike | None = None,
     grip: ArrayLike | None = None,
     held: ArrayLike | None = None,
     visible: ArrayLike | None = None,
@@ -127,8 +137,12 @@ class Recorder:
       tip_pos: tip position in the world [m]  (3,) or (ninstrument, 3)
       quat: tip orientation, w x y z  (4,)
       axis: direction of the shaft in the world, if not `settings.local_axis` turned by quat  (3,)
-      force: contact force on the instrument [N]  (3,), or its magnitude  ()
+      force: contact force on the instrument [N]  (3,), or its magnitude  (); with `substeps` the
+        magnitudes since the last sample, evenly spaced, now the last  (substeps,), or one for all
+      grip_force: of the jaw that presses more [N]  (), or (substeps,)
+      shaft_force: magnitude of the contact force on the shaft [N]  (), or (substeps,)
       area: area of the organ's touched triangles [m^2]  ()
+      strain: largest of the tissue, see `metrics.surface_strain`  ()
       grip: above 0.5 where the jaw is told to close  ()
       held: above 0.5 where the jaw holds tissue  ()
       visible: 1 where the camera's view holds the tip, else 0  ()
@@ -139,9 +153,16 @@ class Recorder:
     if not (math.isfinite(time) and time > self._last):
       raise ValueError(f"sample {self._count}: time is {time}, expected above {self._last}")
     given = {"tip_pos": tip_pos, "quat": quat, "axis": axis, "force": force}
-    given |= {"area": area, "grip": grip, "held": held, "visible": visible}
+    given |= {"grip_force": grip_force, "shaft_force": shaft_force, "area": area, "strain": strain}
+    given |= {"grip": grip, "held": held, "visible": visible}
     columns = {k: self._entry(k, v) for k, v in given.items() if v is not None}
     own = {name: self._own(name, value) for name, value in arrays.items()} if arrays else {}
+    self._store(time, columns, own)
+
+  def _store(
+    self, time: float, columns: dict[str, np.ndarray], own: dict[str, np.ndarray]
+  ) -> None:
+    """Adds a sample whose entries were checked one by one."""
     k = self._count
     for name, buffer in self._arrays.items():
       if name not in own and buffer.values.dtype.kind != "f":
@@ -162,12 +183,14 @@ class Recorder:
   def _entry(self, name: str, value: ArrayLike) -> np.ndarray:
     count = len(self.instruments)
     array = np.asarray(value, np.float64)
+    if name in SIGNALS and self.substeps > 1 and array.shape in ((), (count,)):
+      array = np.repeat(array.reshape(-1, 1), self.substeps, axis=1)
     buffer = self._columns.get(name)
     if buffer is not None and (
       array.shape == buffer.shape or (count == 1 and array.shape == buffer.shape[1:])
     ):
       return array  # fits as it is
-    shapes = [COLUMNS[name]] + ([()] if name == "force" else [])
+    shapes = entry_shapes(name, self.substeps)
     if buffer is not None:
       shapes = [buffer.shape[1:]]
     for shape in shapes:
@@ -234,6 +257,7 @@ class Recorder:
       settings=self.settings,
       watch=self.watch,
       info=self.info,
+      substeps=self.substeps,
     )
 
   def metrics(self, instrument: int | None = None) -> Metrics:

@@ -9,6 +9,7 @@ import dataclasses
 import json
 import math
 import os
+import typing
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,11 +18,11 @@ from typing import Any
 import numpy as np
 
 from .files import replacing
-from .inputs import COLUMNS, measure
-from .metrics import EVENTS, Metrics, check_time
+from .inputs import COLUMNS, SIGNALS, measure
+from .metrics import EVENTS, Metrics, check_time, low_pass, rows
 
 FORMAT = "palpate-recording"
-VERSION = 1
+VERSION = 2
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,20 +31,30 @@ class Settings:
 
   Attributes:
     force_limit: F_max, the force that breaches and excess impulse are counted above [N]
+    grip_limit: the same for the force of the jaws [N]
     reference_length: length of the path that the task asks for, all instruments together [m]
+    tip_cutoff: where the low pass that positions and orientations go through cuts [Hz]; for those
+      of a tracker the 6 Hz of biomechanics (Winter 2009); None where they are exact
+    movement_cutoff: the same for counting movements and rest; 98.9 % of the power of a surgeon's
+      voluntary movement is below 2 Hz, and tremor is above (Riviere, Rader and Khosla 1997) [Hz]
     movement_speed: tip speed above which an instrument moves [m/s]
     movement_debounce: shortest movement, and shortest pause between two [s]
     idle_speed: tip speed below which an instrument rests [m/s]
     contact_force: force above which there is contact [N]
+    force_cutoff: where the low pass cuts that the force's rate is taken after [Hz]
     local_axis: direction of the shaft in the tip's own frame, used where no axis is recorded  (3,)
   """
 
   force_limit: float | None = None
+  grip_limit: float | None = None
   reference_length: float | None = None
+  tip_cutoff: float | None = 6.0
+  movement_cutoff: float = 2.0
   movement_speed: float = 0.05
   movement_debounce: float = 0.2
   idle_speed: float = 0.005
   contact_force: float = 0.0
+  force_cutoff: float = 20.0
   local_axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
 
   def __post_init__(self):
@@ -53,12 +64,14 @@ class Settings:
     object.__setattr__(self, "local_axis", axis)
     for field in dataclasses.fields(self)[:-1]:
       value = getattr(self, field.name)
-      if value is None and field.default is None:
+      if value is None and type(None) in typing.get_args(field.type):
         continue
       if isinstance(value, bool) or not isinstance(value, int | float | np.number):
         raise ValueError(f"{field.name} is {value!r}, expected a number")
       if not (math.isfinite(value) and value >= 0):
         raise ValueError(f"{field.name} is {value!r}, expected a finite number >= 0")
+      if value == 0 and field.name.endswith("_cutoff"):
+        raise ValueError(f"{field.name} is 0 Hz, expected a number > 0")
       object.__setattr__(self, field.name, float(value))
 
 
@@ -94,7 +107,8 @@ class Recording:
     instruments: their names
     settings: limits and thresholds
     watch: kinds of event that the caller looks for
-    info: the caller's own data (task, seed, performer); JSON
+    info: the caller's own data (task, seed, performer, outcome); JSON
+    substeps: how many values of the forces there are for each sample
   """
 
   time: np.ndarray
@@ -106,6 +120,28 @@ class Recording:
   settings: Settings
   watch: tuple[str, ...]
   info: dict[str, Any]
+  substeps: int = 1
+
+  @property
+  def outcome(self) -> str | None:
+    """How it ended: `success`, or what came in between; None where nobody said."""
+    outcome = self.info.get("outcome")
+    return None if outcome is None else str(outcome)
+
+  @property
+  def signal_time(self) -> np.ndarray:
+    """Times of `signal` [s]: even between samples, a sample's own is its last."""
+    if self.substeps == 1 or len(self.time) == 0:
+      return self.time
+    share = np.arange(1, self.substeps + 1) / self.substeps
+    between = self.time[:-1, None] + np.diff(self.time)[:, None] * share
+    between[:, -1] = self.time[1:]
+    return np.concatenate([self.time[:1], between.ravel()])
+
+  def signal(self, name: str, instrument: int = 0) -> np.ndarray | None:
+    """Returns one of `inputs.SIGNALS` at `signal_time`, or None where it was not recorded."""
+    values = self.column(name, instrument)
+    return values if values is None or self.substeps == 1 else values.ravel()[self.substeps - 1 :]
 
   def column(self, name: str, instrument: int = 0) -> np.ndarray | None:
     """Returns one instrument's column, or None where it was not recorded."""
@@ -114,12 +150,26 @@ class Recording:
     values = np.ascontiguousarray(self.columns[name][:, instrument])
     return None if np.isnan(values).all() and len(values) else values
 
+  def tip_path(self, instrument: int = 0) -> np.ndarray | None:
+    """Returns the tip positions as metrics take them: filtered at `Settings.tip_cutoff` [m]."""
+    pos, cutoff = self.column("tip_pos", instrument), self.settings.tip_cutoff
+    if pos is None or cutoff is None:
+      return pos
+    return low_pass(self.time, rows("tip_pos", pos, 3), cutoff)
+
   def force(self, instrument: int = 0) -> np.ndarray | None:
-    """Returns the force magnitude [N]  (nstep,), NaN where it is missing; None if all is."""
-    force = self.column("force", instrument)
+    """Returns the force magnitude at `signal_time` [N], NaN where it is missing; None if all is."""
+    force = self.signal("force", instrument)
     if force is None or force.ndim == 1:
       return force if force is None else np.abs(force)
     return np.linalg.norm(force, axis=1)
+
+  def touching(self, instrument: int = 0) -> np.ndarray | None:
+    """Returns whether there was contact since the sample before  (nstep,); None if unknown."""
+    if (force := self.force(instrument)) is None:
+      return None
+    touch = np.nan_to_num(force) > self.settings.contact_force
+    return np.concatenate([touch[:1], touch[1:].reshape(-1, self.substeps).any(axis=1)])
 
   def metrics(self, instrument: int | None = None) -> Metrics:
     """Returns the metrics of all instruments together, or of one.
@@ -149,6 +199,7 @@ class Recording:
       "watch": list(self.watch),
       "events": [dataclasses.asdict(e) for e in self.events],
       "info": self.info,
+      "substeps": self.substeps,
     }
     entries = {"meta": np.array(json.dumps(meta, allow_nan=False)), "time": self.time}
     for kind, table in _TABLES.items():
@@ -197,7 +248,7 @@ class Recording:
         if kind != "constant" and value.shape[:1] != time.shape:
           raise ValueError(f"{name} has shape {value.shape}, expected {len(time)} samples")
         if kind == "column":
-          _check_column(rest, value, len(meta["instruments"]))
+          _check_column(rest, value, len(meta["instruments"]), meta["substeps"])
         if kind == "constant":
           check_constant(rest, value)
         tables[_TABLES[kind]][rest] = value
@@ -226,10 +277,17 @@ def check_constant(name: str, value: np.ndarray) -> None:
     raise ValueError(f"constant {name!r} is not finite in row {int(bad.argmax())}")
 
 
-def _check_column(name: str, value: np.ndarray, count: int) -> None:
+def entry_shapes(name: str, substeps: int) -> list[tuple[int, ...]]:
+  """Returns the shapes that an instrument's entry of a column may have."""
+  if name in SIGNALS and substeps > 1:
+    return [(substeps,)]
+  return [COLUMNS[name], ()] if name == "force" else [COLUMNS[name]]
+
+
+def _check_column(name: str, value: np.ndarray, count: int, substeps: int) -> None:
   if name not in COLUMNS:
     raise ValueError(f"unknown column {name!r}, expected one of {', '.join(COLUMNS)}")
-  allowed = [(count, *COLUMNS[name])] + ([(count,)] if name == "force" else [])
+  allowed = [(count, *shape) for shape in entry_shapes(name, substeps)]
   if value.dtype != np.float64 or value.shape[1:] not in allowed:
     raise ValueError(f"column {name} is {value.dtype} {value.shape}, expected float64 {allowed}")
 
@@ -248,12 +306,20 @@ def _check_meta(meta: Any) -> dict[str, Any]:
   if not isinstance(meta["info"], dict):
     raise ValueError(f"info is {meta['info']!r}, expected an object")
   return {
+    "substeps": check_substeps(meta["substeps"]),
     "instruments": tuple(names),
     "settings": Settings(**meta["settings"]),
     "watch": check_watch(meta["watch"]),
     "events": events,
     "info": meta["info"],
   }
+
+
+def check_substeps(substeps: Any) -> int:
+  """Returns the number; ValueError unless it is a whole one above 0."""
+  if type(substeps) is not int or substeps < 1:
+    raise ValueError(f"substeps is {substeps!r}, expected a whole number >= 1")
+  return substeps
 
 
 def check_watch(watch: Sequence[str]) -> tuple[str, ...]:

@@ -3,41 +3,29 @@
 Needs matplotlib (`palpate[plot]`), which is imported when a page is written and not before.
 """
 
-import base64
-import html
 import math
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from . import page
 from .files import replacing
 from .metrics import METRICS, Metrics, Spec, Unknown, number
+from .page import text
 from .plots import force_figure, path_figure, png, spectrum_figure
 from .recording import Recording
-from .score import PROFICIENT_SD, WEIGHTS, Score, score
+from .score import CONSECUTIVE, FLOOR, PASSING, REPEATS, SUCCESS, WEIGHTS, Score, score
 
 _MOST_EVENTS = 50
-
-_STYLE = """
-:root { color-scheme: light; }
-body { font: 15px/1.5 system-ui, sans-serif; color: #1d2330; background: #fff;
-  max-width: 62rem; margin: 2rem auto; padding: 0 1rem; }
-h1 { font-size: 1.6rem; margin: 0; } h2 { font-size: 1.15rem; margin: 2rem 0 .6rem; }
-.faint { color: #5d6472; } .small { font-size: .88rem; }
-table { border-collapse: collapse; width: 100%; font-size: .92rem; }
-th, td { text-align: left; padding: .3rem .6rem; border-bottom: 1px solid #e4e7ec; }
-th { font-weight: 600; color: #5d6472; } td.n, th.n { text-align: right; white-space: nowrap;
-  font-variant-numeric: tabular-nums; }
-tr.group td { background: #f4f6f9; font-weight: 600; }
-.wide { overflow-x: auto; }
-.score { display: flex; gap: 1.5rem; align-items: baseline; flex-wrap: wrap; }
-.score b { font-size: 2.2rem; line-height: 1.2; }
-.good { color: #1c7a4d; } .bad { color: #b3213b; }
-img { max-width: 100%; height: auto; }
-dl { display: grid; grid-template-columns: max-content 1fr; gap: .1rem 1rem; margin: 0; }
-dt { color: #5d6472; } dd { margin: 0; overflow-wrap: anywhere; }
-"""
+_ENDS = {
+  SUCCESS: "Success",
+  "damage": "Failed: a force above what the tissue bears",
+  "missed": "Failed: reported a wrong place",
+  "time limit": "Failed: the time ran out",
+  "stopped": "Stopped before the end",
+  "error": "Failed: the performer or the simulation raised an error",
+}
 
 
 def write_report(
@@ -45,63 +33,67 @@ def write_report(
   folder: str | os.PathLike[str],
   reference: Mapping[str, Any] | None = None,
   title: str | None = None,
+  film: bytes | None = None,
 ) -> Path:
   """Writes `report.html` into a folder and returns its path.
 
   Args:
     recording: the exercise; its constants `vertices` and `triangles` are drawn under the path
     folder: made if it is missing
-    reference: of experts, see `score.make_reference`; without it there is no score
+    reference: see `score.make_reference`; without it there is no score
     title: heading; the recording's task by default
+    film: of the exercise, MP4
   """
-  page = render(recording, reference, title)
-  path = Path(folder) / "report.html"
+  return write_page(Path(folder) / "report.html", render(recording, reference, title, film))
+
+
+def write_page(path: Path, content: str) -> Path:
+  """Writes a page, its folder made if it is missing, and returns its path."""
   path.parent.mkdir(parents=True, exist_ok=True)
   with replacing(path) as file:
-    file.write(page)
+    file.write(content)
   return path
 
 
 def render(
-  recording: Recording, reference: Mapping[str, Any] | None = None, title: str | None = None
+  recording: Recording,
+  reference: Mapping[str, Any] | None = None,
+  title: str | None = None,
+  film: bytes | None = None,
 ) -> str:
   """Returns the page that `write_report` writes."""
   title = title or str(recording.info.get("task", "Exercise"))
   metrics = recording.metrics()
-  result = None if reference is None else score(metrics, reference)
+  result = None if reference is None else score(metrics, reference, recording.outcome)
   body = [
-    f"<h1>{_text(title)}</h1>",
-    f"<p class='faint'>{_text(_summary(recording))}</p>",
-    _score_part(result, reference),
+    f"<h1>{text(title)}</h1>",
+    _outcome(recording),
+    f"<p class='faint'>{text(_summary(recording))}</p>",
+    _score_part(result),
+    "" if film is None else f"<h2>Film</h2>{page.film(film, 'what the laparoscope saw')}",
     _plots(recording, metrics),
     _metric_table(recording, metrics, reference, result),
     _event_table(recording),
     _about(recording, reference),
   ]
-  return (
-    "<!doctype html>\n<html lang='en'><head><meta charset='utf-8'>"
-    "<meta name='viewport' content='width=device-width, initial-scale=1'>"
-    f"<title>{_text(title)}</title><style>{_STYLE}</style></head><body>\n"
-    + "\n".join(body)
-    + "\n</body></html>\n"
-  )
+  return page.document(title, body)
 
 
-def _text(value: Any) -> str:
-  return html.escape(str(value), quote=True)
+def ending(recording: Recording) -> str:
+  """Returns how an exercise ended, in words."""
+  outcome = recording.outcome
+  if outcome is None:
+    return "How it ended was not recorded"
+  words = _ENDS.get(outcome, f"Failed: {outcome}")
+  if len(recording.time):
+    words += f", after {number(float(recording.time[-1] - recording.time[0]))} s"
+  return f"{words}: {recording.info['error']}" if "error" in recording.info else words
 
 
-def _row(cells: Iterable[str], numbers: Iterable[int] = (), tag: str = "td") -> str:
-  """Returns a table row of finished HTML; `numbers` are the columns to align right."""
-  right = set(numbers)
-  return "<tr>" + "".join(
-    f"<{tag}{' class=n' if k in right else ''}>{cell}</{tag}>" for k, cell in enumerate(cells)
-  ) + "</tr>"  # fmt: skip
-
-
-def _table(head: Iterable[str], rows: Iterable[str], numbers: Iterable[int] = ()) -> str:
-  first, rest = _row(head, numbers, "th"), "".join(rows)
-  return f"<div class='wide'><table><thead>{first}</thead><tbody>{rest}</tbody></table></div>"
+def _outcome(recording: Recording) -> str:
+  outcome = recording.outcome
+  kind = "faint" if outcome is None else "good" if outcome == SUCCESS else "bad"
+  return f"<p class='outcome {kind}'>{text(ending(recording))}</p>"
 
 
 def _summary(recording: Recording) -> str:
@@ -115,44 +107,51 @@ def _summary(recording: Recording) -> str:
   )
 
 
-def _score_part(result: Score | None, reference: Mapping[str, Any] | None) -> str:
-  if result is None or reference is None:
-    return "<h2>Score</h2><p>No expert reference was given, so there is no score.</p>"
-  if math.isnan(result.composite):
-    reason = result.composite.reason if isinstance(result.composite, Unknown) else ""
-    head = f"<p><b>No composite score</b>: {_text(reason)}.</p>"
+def _score_part(result: Score | None) -> str:
+  if result is None:
+    return "<h2>Score</h2><p>No reference was given, so there is no score.</p>"
+  if isinstance(result.composite, Unknown):
+    head = f"<p><b>No composite score</b>: {text(result.composite.reason)}.</p>"
   else:
     value = number(round(result.composite, 2))
-    head = f"<div class='score'><b>{value}</b>{_verdict(result)}</div>"
+    kind = "good" if result.proficient else "bad"
+    head = f"<div class='score'><b>{value}</b>{page.mark(text(verdict(result)), kind)}</div>"
   rows = []
-  for name, weight in WEIGHTS.items():
+  # What a failure did well on the way is no part of its score.
+  for name, weight in WEIGHTS.items() if result.outcome == SUCCESS else ():
     value, applied = result.group[name], result.weight[name]
     known = math.isfinite(value)
     cells = [name, f"{100 * weight:.3g} %", f"{100 * applied:.3g} %", number(round(value, 2))]
-    rows.append(_row([*cells, number(round(applied * value, 2)) if known else "–"], range(1, 5)))
-  head += _table(["category", "weight", "applied", "mean z", "contribution"], rows, range(1, 5))
+    cells.append(number(round(applied * value, 2)) if known else "–")
+    rows.append(page.row(cells, range(1, 5)))
+  columns = ["category", "weight", "applied", "mean z", "contribution"]
+  categories = page.table(columns, rows, range(1, 5)) if rows else ""
   return (
-    f"<h2>Score</h2>{head}<p class='small faint'>The composite is the weighted mean of the "
-    "categories' mean z-scores. A z-score counts expert standard deviations; positive beats the "
-    "expert's mean, whatever the metric's direction; it is clipped to ±10. 0 is the expert's "
-    "average, −2 the limit of proficiency. Safety 67 % and efficiency 17 % are the weights of the "
+    f"<h2>Score</h2>{head}{categories}<p class='small faint'>"
+    f"An exercise that did not succeed scores {number(FLOOR)}, below every success. Else the score "
+    "is the weighted mean of the categories' mean z-scores. A z-score counts standard deviations "
+    "of a panel of skilled people of many styles; positive beats their mean, whatever the metric's "
+    "direction; it is clipped to ±10. Safety 67 % and efficiency 17 % are the weights of the "
     "Heidelberg VR score (10.1007/s00464-018-6480-x); its remaining 16 % are for time, dexterity "
     "and outcome, shared equally here. A category without a known metric drops out and the others "
-    "take its weight in proportion (column “applied”).</p>"
+    "take its weight in proportion (column “applied”). Proficient is a success within every limit, "
+    f"which {100 * PASSING:.0f} % of the panel are; a performer is proficient after {CONSECUTIVE} "
+    f"such episodes in a row and {REPEATS} more (Ritter and Scott 2007).</p>"
   )
 
 
-def _verdict(result: Score) -> str:
+def verdict(result: Score) -> str:
+  """Returns whether an episode is proficient, and why not."""
   if result.proficient:
-    return "<span class='good'>proficient: every metric within its limit</span>"
-  over = [METRICS[k].label for k in result.limit if result.z[k] < -PROFICIENT_SD]
-  missing = [METRICS[k].label for k in result.missing]
-  parts = []
-  if over:
-    parts.append(f"over the limit: {', '.join(over)}")
-  if missing:
-    parts.append(f"unknown: {', '.join(missing)}")
-  return f"<span class='bad'>not proficient; {_text('; '.join(parts) or 'no limits')}</span>"
+    return "proficient: every metric within its limit"
+  if result.outcome != SUCCESS:
+    return "not proficient; it did not succeed"
+  parts = [
+    f"{why}: {', '.join(METRICS[k].label for k in names)}"
+    for why, names in (("over the limit", result.over), ("unknown", result.missing))
+    if names
+  ]
+  return f"not proficient; {'; '.join(parts) or 'no limits'}"
 
 
 def _plots(recording: Recording, metrics: Metrics) -> str:
@@ -165,10 +164,9 @@ def _plots(recording: Recording, metrics: Metrics) -> str:
   ):
     figure = draw(recording)
     if figure is None:
-      parts.append(f"<h2>{title}</h2><p>Nothing to draw: {_text(reasons.get(absent, ''))}.</p>")
+      parts.append(f"<h2>{title}</h2><p>Nothing to draw: {text(reasons.get(absent, ''))}.</p>")
       continue
-    data = base64.b64encode(png(figure)).decode("ascii")
-    parts.append(f"<h2>{title}</h2><img alt='{alt}' src='data:image/png;base64,{data}'>")
+    parts.append(f"<h2>{title}</h2>{page.image(png(figure), alt)}")
   return "\n".join(parts)
 
 
@@ -180,52 +178,50 @@ def _metric_table(
 ) -> str:
   several = len(recording.instruments) > 1
   each = [recording.metrics(i) for i in range(len(recording.instruments))] if several else []
-  head = ["metric", "value", *(_text(name) for name in recording.instruments if several)]
+  head = ["metric", "value", *(text(name) for name in recording.instruments if several)]
   head += ["unit", "better"]
   numbers = list(range(1, 2 + len(each)))
   if result is not None:
     numbers += range(len(head), len(head) + 3)
-    head += ["expert mean ± SD", "limit", "z"]
+    head += ["panel mean ± SD", "limit", "z"]
   rows = []
   for group in WEIGHTS:
     names = [name for name, spec in METRICS.items() if spec.group == group]
     known = [n for n in names if math.isfinite(getattr(metrics, n))]
     missing = [n for n in names if result is not None and n in result.missing]
     if known or missing:
-      rows.append(f"<tr class='group'><td colspan='{len(head)}'>{group}</td></tr>")
+      rows.append(page.group(group, len(head)))
     for name in names:
       if name not in known and name not in missing:
         continue
       spec = METRICS[name]
-      label = f"<span title='{_text(spec.source)}'>{_text(spec.label)}</span>"
+      label = f"<span title='{text(spec.source)}'>{text(spec.label)}</span>"
       cells = [label, *(number(getattr(k, name), spec) for k in [metrics, *each])]
-      cells += [_text(spec.shown), spec.better]
+      cells += [text(spec.shown), spec.better if spec.better != "neither" else "–"]
       if reference is not None and result is not None:
-        cells += _expert_cells(name, spec, reference, result)
-      rows.append(_row(cells, numbers))
+        cells += _panel_cells(name, spec, reference, result)
+      rows.append(page.row(cells, numbers))
   unknown = "".join(
-    f"<dt>{_text(METRICS[n].label)}</dt><dd>{_text(r)}</dd>" for n, r in metrics.reasons().items()
+    f"<dt>{text(METRICS[n].label)}</dt><dd>{text(r)}</dd>" for n, r in metrics.reasons().items()
   )
-  page = f"<h2>Metrics</h2>{_table(head, rows, numbers)}"
-  return page + (f"<h2>Not known</h2><dl class='small'>{unknown}</dl>" if unknown else "")
+  found = f"<h2>Metrics</h2>{page.table(head, rows, numbers)}"
+  return found + (f"<h2>Not known</h2><dl class='small'>{unknown}</dl>" if unknown else "")
 
 
-def _expert_cells(
+def _panel_cells(
   name: str, spec: Spec, reference: Mapping[str, Any], result: Score
 ) -> list[str]:
   row = reference["metrics"].get(name)
   if row is None:
     return ["–", "–", "–"]
   sd = "?" if row.get("sd") is None else number(row["sd"], spec)
-  bound = "≤ " if spec.better == "lower" else "≥ "
-  limit = bound + number(result.limit[name], spec) if name in result.limit else "–"
+  limit = ("≤ " if spec.better == "lower" else "≥ ") + number(row["limit"], spec)
   z = result.z[name]
-  if not math.isfinite(z):
-    return [f"{number(row['mean'], spec)} ± {sd}", limit, "–"]
-  # The sign and the word say it too, for those who do not see the colour.
-  kind, word = ("bad", " over") if z < -PROFICIENT_SD else ("good", "") if z >= 0 else ("", "")
-  text = f"<span class='{kind}'>{number(round(z, 2))}{word}</span>"
-  return [f"{number(row['mean'], spec)} ± {sd}", limit, text]
+  # The word says it too, for those who do not see the colour.
+  over = name in result.over
+  kind = "bad" if over else "good" if z >= 0 and result.outcome == SUCCESS else ""
+  shown = page.mark(number(round(z, 2)) + " over" * over, kind)
+  return [f"{number(row['mean'], spec)} ± {sd}", limit, shown if over or math.isfinite(z) else "–"]
 
 
 def _event_table(recording: Recording) -> str:
@@ -240,11 +236,11 @@ def _event_table(recording: Recording) -> str:
       distance = f"{number(1e3 * event.value)} mm" if length else f"{event.value:g}"
     cells = [number(event.time - start), event.kind, distance]
     cells += [recording.instruments[event.instrument], event.label]
-    rows.append(_row(map(_text, cells), [0]))
+    rows.append(page.row(map(text, cells), [0]))
   more = len(recording.events) - _MOST_EVENTS
   tail = f"<p class='faint'>and {more} more</p>" if more > 0 else ""
   head = ["time [s]", "event", "value", "instrument", "label"]
-  return f"<h2>Events</h2>{_table(head, rows, [0])}{tail}"
+  return f"<h2>Events</h2>{page.table(head, rows, [0])}{tail}"
 
 
 def _about(recording: Recording, reference: Mapping[str, Any] | None) -> str:
@@ -255,12 +251,16 @@ def _about(recording: Recording, reference: Mapping[str, Any] | None) -> str:
     "reference path": "none"
     if set_.reference_length is None
     else f"{number(1e3 * set_.reference_length)} mm",
+    "positions": "as they are (exact)"
+    if set_.tip_cutoff is None
+    else f"without what is faster than {set_.tip_cutoff:g} Hz (measured)",
+    "movements": f"without what is faster than {set_.movement_cutoff:g} Hz (tremor)",
     "moving above": f"{1e3 * set_.movement_speed:g} mm/s for {set_.movement_debounce:g} s",
     "idle below": f"{1e3 * set_.idle_speed:g} mm/s",
-    "contact above": f"{set_.contact_force:g} N",
+    "contact above": f"{set_.contact_force:g} N, {recording.substeps} values a sample",
   }
   if reference is not None:
-    parts = [f"{k} {reference[k]}" for k in ("task", "n", "seed", "version") if k in reference]
-    lines["expert reference"] = ", ".join(parts)
-  items = "".join(f"<dt>{_text(k)}</dt><dd>{_text(v)}</dd>" for k, v in lines.items())
+    keys = ("task", "performer", "n", "seed", "palpate")
+    lines["reference"] = ", ".join(f"{k} {reference[k]}" for k in keys if k in reference)
+  items = "".join(f"<dt>{text(k)}</dt><dd>{text(v)}</dd>" for k, v in lines.items())
   return f"<h2>About</h2><dl class='small'>{items}</dl>"

@@ -1,25 +1,38 @@
-"""The score of a recording's metrics against an expert reference.
+"""The score of a recording against skilled performers, the outcome first.
+
+An exercise that did not succeed scores `FLOOR`, whatever its metrics: a short path is no merit of a
+hand that stopped. It is below every score of a success, and it is never proficient.
 
 A reference is plain data, so that it ships as JSON:
 
-    {"format": "palpate-reference", "version": 1, "task": "touch/easy", "seed": 0, "n": 50,
-     "metrics": {"time": {"mean": 12.3, "sd": 1.4, "n": 50}, ...}}
+    {"format": "palpate-reference", "version": 2, "task": "touch/easy", "performer": "skilled",
+     "seed": 0, "episodes": 100, "n": 99,
+     "metrics": {"time": {"mean": 12.3, "sd": 1.4, "n": 99, "limit": 15.2}, ...}}
+
+It comes from `n` successes of a panel of skilled people of many styles (`performer.skilled`), not
+from one hand that repeats itself.
 
 Score of one metric: z = (mean - value) / sd where lower is better, (value - mean) / sd where higher
-is better, so that a positive z beats the expert; clipped to [-10, 10] so that one metric cannot
-outweigh a category. Where the expert never varies (sd = 0) there is no scale: z is 0 for a value as
-good or better (within 1e-9, relative), -10 for a worse one.
+is better, so that a positive z beats the panel's mean; clipped to [-10, 10] so that one metric
+cannot outweigh a category. Where the panel never varies (sd = 0) there is no scale: z is 0 for a
+value as good or better (within 1e-9, relative), -10 for a worse one.
 
-Composite: the weighted mean over categories of the mean z of the category's known metrics. 0 is the
-expert's average; every category at its proficiency limit gives -2. A category without a known
-metric drops out and its weight is shared by the rest; where less than half of the weight is known,
-so always without safety, the composite is unknown.
+Composite: the weighted mean over categories of the mean z of the category's known metrics, 0 for
+the panel's average, -10 to 10. A category without a known metric drops out and its weight is shared
+by the rest; where less than half of the weight is known, so always without safety, the composite is
+unknown.
 
 Weights: safety 67 %, efficiency 17 % (Heidelberg VR score, 10.1007/s00464-018-6480-x). Its other
 16 % go to time, dexterity and outcome; the abstract does not say how, here they share it equally.
 
-Proficiency: the expert's mean + 2 SD in the worse direction (SAGES), for every metric that the
-reference has with an SD; a recording that lacks a metric of the reference is not proficient.
+Proficiency of an episode: success, and no metric over its limit. The limits cut the same number of
+the worst values off every metric, as many as leave `PASSING` of the panel's episodes within all of
+them at once; the mean + 2 SD of SAGES would fail many of them, since every metric may fail by
+itself. A metric that some of the panel's successes lack is not asked for.
+
+Proficiency of a performer: `CONSECUTIVE` proficient episodes in a row, then `REPEATS` more that
+need not be in a row: the 2 + 10 of the curriculum for the Fundamentals of Laparoscopic Surgery
+(Ritter and Scott 2007, 10.1177/1553350607302329), see `trained`.
 """
 
 import dataclasses
@@ -29,6 +42,8 @@ import math
 import pathlib
 from collections.abc import Mapping, Sequence
 from typing import Any
+
+import numpy as np
 
 from .metrics import METRICS, Metrics, Unknown, check_header, check_names
 
@@ -40,18 +55,25 @@ WEIGHTS = {
   "outcome": 0.16 / 3,
 }
 Z_LIMIT = 10.0
-PROFICIENT_SD = 2.0
+FLOOR = -20.0  # of an exercise that did not succeed; a success scores -10 or more
+PASSING = 0.95
+CONSECUTIVE, REPEATS = 2, 10
 LEAST_WEIGHT = 0.5
+SUCCESS = "success"
+_VERSION = 2
 
 
 def make_reference(results: Sequence[Metrics], task: str, seed: int) -> dict[str, Any]:
-  """Returns the expert reference of several recordings of one task.
+  """Returns the reference of several successful recordings of one task.
 
-  The mean and sample SD (n - 1) of the recordings where the metric is known. A metric that is known
-  nowhere is left out; the SD of a single value is null.
+  The mean and sample SD (n - 1) of the recordings where the metric is known, and the limit of
+  proficiency, see the module's head. A metric that is known nowhere, or of which neither more nor
+  less is better, is left out; the SD of a single value is null.
   """
-  table = {}
-  for name in METRICS:
+  table: dict[str, dict[str, Any]] = {}
+  for name, spec in METRICS.items():
+    if spec.better == "neither":
+      continue
     known = [float(v) for r in results if math.isfinite(v := getattr(r, name))]
     if not known:
       continue
@@ -62,9 +84,11 @@ def make_reference(results: Sequence[Metrics], task: str, seed: int) -> dict[str
     squares = 0.0 if constant else math.fsum((v - mean) ** 2 for v in known)
     sd = math.sqrt(squares / (len(known) - 1)) if len(known) > 1 else None
     table[name] = {"mean": mean, "sd": sd, "n": len(known)}
+  for name, limit in _limits(results, list(table)).items():
+    table[name]["limit"] = limit
   return {
     "format": "palpate-reference",
-    "version": 1,
+    "version": _VERSION,
     "task": task,
     "seed": seed,
     "n": len(results),
@@ -72,18 +96,37 @@ def make_reference(results: Sequence[Metrics], task: str, seed: int) -> dict[str
   }
 
 
+def _limits(results: Sequence[Metrics], names: Sequence[str]) -> dict[str, float]:
+  """Returns metric -> limit of proficiency [SI], see the module's head."""
+  signs = np.array([1.0 if METRICS[name].better == "lower" else -1.0 for name in names])
+  worse = np.array([[float(getattr(r, name)) for name in names] for r in results]) * signs
+  worse[~np.isfinite(worse)] = -np.inf  # what is not known is within any limit
+  order = np.sort(worse, axis=0)[::-1]
+  limit = order[:1].reshape(-1)
+  for cut in order[1:]:
+    cut = np.where(np.isfinite(cut), cut, limit)
+    if (worse <= cut).all(axis=1).mean() < PASSING:
+      break
+    limit = cut
+  return dict(zip(names, (limit * signs).tolist(), strict=True))
+
+
 def check_reference(reference: Any) -> None:
   """Raises ValueError naming the entry unless this is a reference to score against."""
-  check_header(reference, "palpate-reference")
+  check_header(reference, "palpate-reference", _VERSION)
   table = reference.get("metrics")
   if not isinstance(table, Mapping):
     raise ValueError("palpate-reference: 'metrics' is missing or not an object")
   check_names(table)
+  if neither := [name for name in table if METRICS[name].better == "neither"]:
+    raise ValueError(f"palpate-reference: {neither[0]} is not scored: neither is better")
   for name, row in table.items():
     row = row if isinstance(row, Mapping) else {}
     mean, sd = row.get("mean"), row.get("sd")
     if not _number(mean):
       raise ValueError(f"palpate-reference: {name}.mean is {mean!r}, expected a finite number")
+    if not _number(limit := row.get("limit")):
+      raise ValueError(f"palpate-reference: {name}.limit is {limit!r}, expected a finite number")
     if sd is not None and not (_number(sd) and sd >= 0):
       raise ValueError(f"palpate-reference: {name}.sd is {sd!r}, expected a number >= 0 or null")
 
@@ -115,75 +158,99 @@ def _number(value: Any) -> bool:
 
 @dataclasses.dataclass(frozen=True)
 class Score:
-  """A recording against an expert reference.
+  """A recording against a reference.
 
   Attributes:
-    composite: weighted z-score, 0 is the expert's average [-]; `Unknown` says why not
-    proficient: True when every metric of the reference is known and none is over its limit
-    z: metric -> z-score, positive beats the expert; `Unknown` where there is none [-]
-    limit: metric -> proficiency limit, expert mean + 2 SD in the worse direction [SI]
+    outcome: `success`, or what came in between; None where nobody said
+    composite: weighted z-score, 0 is the panel's average, `FLOOR` without success [-]; `Unknown`
+      says why there is none
+    proficient: True for a success that is within the limit of every metric
+    over: metrics that are over their limit
+    missing: metrics that all of the panel has and the recording has not
+    z: metric -> z-score, positive beats the panel's mean; `Unknown` where there is none [-]
     group: category -> mean z of its known metrics [-]
     weight: category -> weight as applied: 0 for a category without a known metric, sum 1 [-]
-    missing: metrics that the reference has and the recording has not
   """
 
+  outcome: str | None
   composite: float
   proficient: bool
+  over: tuple[str, ...]
+  missing: tuple[str, ...]
   z: dict[str, float]
-  limit: dict[str, float]
   group: dict[str, float]
   weight: dict[str, float]
-  missing: tuple[str, ...]
 
 
 def z_score(value: float, mean: float, sd: float | None, better: str) -> float:
-  """Returns by how many expert SDs a value beats the expert's mean [-], see the module's head."""
+  """Returns by how many SDs a value beats the panel's mean [-], see the module's head."""
   if not math.isfinite(value):
     return Unknown(value.reason if isinstance(value, Unknown) else f"the value is {value}")
   if sd is None:
     return Unknown("the reference has no SD (a single recording)")
-  ahead = value - mean if better == "higher" else mean - value
+  ahead = _ahead(value, mean, better)
   if sd == 0:
-    return 0.0 if ahead >= -1e-9 * max(abs(value), abs(mean)) else -Z_LIMIT
+    return 0.0 if _as_good(value, mean, better) else -Z_LIMIT
   return max(-Z_LIMIT, min(Z_LIMIT, ahead / sd))
 
 
+def _ahead(value: float, other: float, better: str) -> float:
+  return value - other if better == "higher" else other - value
+
+
+def _as_good(value: float, other: float, better: str) -> bool:
+  """Returns whether a value is as good as another, but for rounding."""
+  return _ahead(value, other, better) >= -1e-9 * max(abs(value), abs(other))
+
+
 def score(
-  metrics: Metrics, reference: Mapping[str, Any], weights: Mapping[str, float] | None = None
+  metrics: Metrics,
+  reference: Mapping[str, Any],
+  outcome: str | None,
+  weights: Mapping[str, float] | None = None,
 ) -> Score:
-  """Returns the score of a recording's metrics; the formula is at the module's head.
+  """Returns the score of a recording; the formula is at the module's head.
 
   Args:
     metrics: of the recording
     reference: see `make_reference`
+    outcome: of the recording; without one it may be neither proficient nor have a score
     weights: category -> weight >= 0, `WEIGHTS` by default; any scale
   """
   check_reference(reference)
   weights = WEIGHTS if weights is None else weights
   if set(weights) != set(WEIGHTS) or not all(_number(w) and w >= 0 for w in weights.values()):
     raise ValueError(f"weights are {dict(weights)}, expected numbers >= 0 for {', '.join(WEIGHTS)}")
-  total = sum(weights.values())
-  if total == 0:
+  if sum(weights.values()) == 0:
     raise ValueError("weights are all 0")
 
-  z: dict[str, float] = {}
-  limit: dict[str, float] = {}
-  missing, within = [], True
+  z, over, missing = {}, [], []
   for name, row in reference["metrics"].items():
     value, better = getattr(metrics, name), METRICS[name].better
     z[name] = z_score(value, row["mean"], row.get("sd"), better)
-    worse = 1 if better == "lower" else -1
-    if row.get("sd") is not None:
-      limit[name] = row["mean"] + worse * PROFICIENT_SD * row["sd"]
-      # By z, not by the limit: z knows about rounding where the SD is 0.
-      within = within and z[name] >= -PROFICIENT_SD
     if not math.isfinite(value):
-      missing.append(name)
+      if row.get("n") == reference.get("n"):
+        missing.append(name)
+    elif not _as_good(value, row["limit"], better):
+      over.append(name)
+  composite, group, applied = _composite(z, weights)
+  if outcome is None:
+    composite = Unknown("the recording does not say how it ended")
+  elif outcome != SUCCESS:
+    composite = FLOOR
+  proficient = outcome == SUCCESS and bool(z) and not over and not missing
+  return Score(outcome, composite, proficient, tuple(over), tuple(missing), z, group, applied)
 
+
+def _composite(
+  z: Mapping[str, float], weights: Mapping[str, float]
+) -> tuple[float, dict[str, float], dict[str, float]]:
+  """Returns composite, category -> mean z, and category -> weight as applied."""
   group: dict[str, float] = {}
   for name in WEIGHTS:
     known = [v for k, v in z.items() if METRICS[k].group == name and math.isfinite(v)]
     group[name] = math.fsum(known) / len(known) if known else Unknown("no known metric")
+  total = sum(weights.values())
   share = sum(weights[name] for name, v in group.items() if math.isfinite(v)) / total
   applied = {
     name: weights[name] / total / share if math.isfinite(v) and share > 0 else 0.0
@@ -191,8 +258,24 @@ def score(
   }
   if share < LEAST_WEIGHT:
     absent = ", ".join(n for n, v in group.items() if not math.isfinite(v) and weights[n] > 0)
-    composite = Unknown(f"only {100 * share:.0f} % of the weight is known; no {absent}")
-  else:
-    composite = math.fsum(applied[n] * v for n, v in group.items() if applied[n] > 0)
-  proficient = within and bool(limit) and not missing
-  return Score(composite, proficient, z, limit, group, applied, tuple(missing))
+    text = f"only {100 * share:.0f} % of the weight is known; no {absent}"
+    return Unknown(text), group, applied
+  return math.fsum(applied[n] * v for n, v in group.items() if applied[n] > 0), group, applied
+
+
+def trained(proficient: Sequence[bool]) -> int | None:
+  """Returns after how many episodes a performer is proficient, see the module's head; None if not.
+
+  Args:
+    proficient: of each episode, in order
+  """
+  run, since = 0, -1  # since the run was complete: proficient episodes after it
+  for k, passed in enumerate(proficient):
+    if since >= 0:
+      since += passed
+    else:
+      run = run + 1 if passed else 0
+      since = 0 if run == CONSECUTIVE else -1
+    if since == REPEATS:
+      return k + 1
+  return None

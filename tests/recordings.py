@@ -3,7 +3,10 @@
 import numpy as np
 from palpate.tasks.recorder import Recorder, Settings
 
-SETTINGS = Settings(force_limit=1.5, reference_length=0.1, idle_speed=0.06)
+SETTINGS = Settings(
+  force_limit=1.5, grip_limit=1.5, reference_length=0.1, idle_speed=0.06, tip_cutoff=None,
+  movement_cutoff=25.0,  # half the rate of the recordings below: nothing is cut
+)
 
 
 def exercise(steps=300, instruments=("left", "right"), seed=0):
@@ -22,6 +25,9 @@ def exercise(steps=300, instruments=("left", "right"), seed=0):
       pos[k],
       quat=[quat] * len(instruments),
       force=force,
+      grip_force=np.maximum(0, rng.randn(len(instruments))),
+      shaft_force=np.maximum(0, rng.randn(len(instruments))),
+      strain=rng.rand(len(instruments)),
       area=np.full(len(instruments), 2e-5),
       grip=np.full(len(instruments), k % 100 < 60),
       held=np.full(len(instruments), 10 < k % 100 < 40),

@@ -31,6 +31,7 @@ COMMANDS = {
   ("exercise",): ("exercise", "run an exercise, record it and write its report"),
   ("report",): ("report", "write the page about a recording"),
   ("evaluate",): ("evaluate", "score a policy over many episodes of an exercise"),
+  ("panel",): ("panel", "make the references of scores from many skilled performers"),
 }
 _GROUPS = {"run": "run a job on a scene"}
 

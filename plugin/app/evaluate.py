@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import argparse
+import collections
 import dataclasses
 import json
 import math
 import pathlib
-import signal
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import palpate
 
 from . import options
 from .console import CommandError, Interrupt, Progress, output, output_folder, writing
+from .workers import parallel
 
-_POLL = 0.2  # of Ctrl-C, while processes work [s]
+if TYPE_CHECKING:
+  from palpate.tasks.metrics import Metrics
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,13 +47,12 @@ def add_arguments(parser: argparse.ArgumentParser):
   """Declares the options."""
   add = parser.add_argument
   add("task", metavar="TASK", help="such as touch/easy; a domain alone is its standard task")
-  add("--policy", metavar="NAME", default="expert", help="module:object, or expert, tremor, ...")
+  add("--policy", metavar="NAME", default="expert", help="module:object, expert, skilled...")
   add("--episodes", metavar="N", type=int, default=10, help="how many (%(default)s)")
   add("--seed", metavar="N", type=int, default=0, help="of the first episode (%(default)s)")
   add("--processes", metavar="N", type=int, default=1, help="at a time (%(default)s)")
   options.add_argument(parser)
   add("--json", metavar="FILE", help="write every episode's metrics")
-  add("--reference", metavar="FILE", help="write an expert reference of these episodes")
   add("--recordings", metavar="FOLDER", help="keep every episode's recording, whole or not")
 
 
@@ -68,9 +69,7 @@ def main(args: argparse.Namespace) -> int:
     performer.find(args.policy)
   except ValueError as error:
     raise CommandError(str(error)) from None
-  files = {
-    key: output(key, getattr(args, key)) for key in ("json", "reference") if getattr(args, key)
-  }
+  file = output("json", args.json) if args.json else None
   if args.recordings:
     output_folder("recordings", args.recordings)
   task_kwargs = options.read(args.set)
@@ -87,13 +86,11 @@ def main(args: argparse.Namespace) -> int:
   progress.clear()
   if results:
     print(table(name, args.policy, results, score.reference(name)))
-  if "json" in files:
-    _write_json(files["json"], results)
+  if file is not None:
+    _write_json(file, results)
   if interrupt.seen:
     print(f"palpate: interrupted after {len(results)} of {args.episodes} episodes", file=sys.stderr)
     return 130
-  if "reference" in files:
-    write_reference(files["reference"], name, args.seed, results)
   errors = [r for r in results if r.outcome == "error"]
   if errors:
     raise CommandError(f"{len(errors)} episodes failed, the first: {errors[0].error}", code=1)
@@ -131,51 +128,27 @@ def evaluate(
     interrupt: once seen, the episodes that run are finished and no more are begun
     task_kwargs: options of the task, JSON
   """
-  interrupt = interrupt or Interrupt()
   kwargs = json.dumps(dict(task_kwargs or {}))
   jobs = [(name, policy, seed, recordings, kwargs) for seed in seeds]
-  if processes == 1:
-    for job in jobs:
-      if interrupt.seen:
-        return
-      yield _one(job)
-    return
-  import concurrent.futures
-  import multiprocessing
-
-  pool = concurrent.futures.ProcessPoolExecutor(
-    min(processes, len(jobs)), multiprocessing.get_context("spawn"), initializer=_ignore_interrupts
-  )
-  with pool:
-    futures = [pool.submit(_one, job) for job in jobs]
-    for seed, future in zip(seeds, futures, strict=True):
-      while not concurrent.futures.wait([future], _POLL).done:
-        if interrupt.seen:
-          pool.shutdown(wait=False, cancel_futures=True)
-      if future.cancelled():
-        return
-      try:
-        yield future.result()
-      except concurrent.futures.process.BrokenProcessPool:
-        yield Result(seed, "error", 0.0, 0.0, error="a process died, and with it what was left")
+  done = parallel(perform, jobs, processes, interrupt or Interrupt())
+  for seed, result in zip(seeds, done, strict=False):  # an interrupt leaves some out
+    died = Result(seed, "error", 0.0, 0.0, error="a process died, and with it what was left")
+    yield result or died
 
 
-def _ignore_interrupts():
-  """Leaves Ctrl-C to the parent."""
-  signal.signal(signal.SIGINT, signal.SIG_IGN)
+_environment: tuple[Any, Any] = (None, None)  # the last one of this process: each takes memory
 
 
-_environments: dict[tuple[str, str], Any] = {}  # of this process, by name and options
-
-
-def _one(job: tuple[str, str, int, str | None, str]) -> Result:
+def perform(job: tuple[str, str, int, str | None, str]) -> Result:
+  """Returns the result of an episode; a job is task, policy, seed, recordings' folder, options."""
+  global _environment
   name, policy, seed, folder, kwargs = job
   palpate.register()
   from palpate.tasks import episode, performer
 
-  if (name, kwargs) not in _environments:
-    _environments[name, kwargs] = options.load(name, json.loads(kwargs))
-  env = _environments[name, kwargs]
+  if _environment[0] != (name, kwargs):
+    _environment = (name, kwargs), options.load(name, json.loads(kwargs))
+  env = _environment[1]
   info = {"task_kwargs": json.loads(kwargs), "performer": policy}
   try:
     recording = episode.run(env, performer.make(env, policy, seed), seed, info)
@@ -203,7 +176,6 @@ def _one(job: tuple[str, str, int, str | None, str]) -> Result:
 def table(name: str, policy: str, results: list[Result], reference: dict | None) -> str:
   """Returns mean and spread of return, time and every known metric, for people."""
   from palpate.tasks.metrics import METRICS, Metrics
-  from palpate.tasks.score import score
 
   wins = sum(r.outcome == "success" for r in results)
   low, high = _wilson(wins, len(results))
@@ -221,32 +193,36 @@ def table(name: str, policy: str, results: list[Result], reference: dict | None)
     return f"{label:28} {mean:>10.4g} {sd:>10.3g} {len(values):>5}"
 
   lines.append(row("Return [-]", [r.total for r in results]))
-  metrics = [Metrics.from_json(r.metrics) for r in results if r.metrics]
+  metrics = [Metrics.from_json(r.metrics) if r.metrics else Metrics() for r in results]
+  if reference is not None:
+    outcomes = [r.outcome for r in results]
+    lines[2:2], scores = _proficiency(metrics, outcomes, reference)
+    lines.append(row("Composite score [-]", scores))
   for key, spec in METRICS.items():
     known = [v * spec.scale for m in metrics if math.isfinite(v := getattr(m, key))]
     if known:
       lines.append(row(f"{spec.label} [{spec.shown}]", known))
-  if reference is not None:
-    scores = [s for m in metrics if math.isfinite(s := score(m, reference).composite)]
-    if scores:
-      lines.append(row("Composite score [-]", scores))
   return "\n".join(lines)
 
 
-def write_reference(path: pathlib.Path, name: str, seed: int, results: list[Result]):
-  """Writes the reference of the episodes that succeeded, with seed and versions."""
-  import mujoco
-  from palpate.tasks.files import replacing
-  from palpate.tasks.metrics import Metrics
-  from palpate.tasks.score import make_reference
+def _proficiency(
+  metrics: Sequence[Metrics], outcomes: Sequence[str], reference: Mapping[str, Any]
+) -> tuple[list[str], list[float]]:
+  """Returns the lines about proficiency, and the scores that are known."""
+  from palpate.tasks.metrics import METRICS
+  from palpate.tasks.score import CONSECUTIVE, REPEATS, score, trained
 
-  good = [Metrics.from_json(r.metrics) for r in results if r.outcome == "success"]
-  if not good:
-    raise CommandError(f"{name}: no episode succeeded, so there is no reference", code=1)
-  data = make_reference(good, name, seed)
-  data |= {"palpate": palpate.__version__, "mujoco": mujoco.__version__, "episodes": len(results)}
-  with writing(path), replacing(path) as file:
-    file.write(json.dumps(data, indent=1) + "\n")
+  scores = [score(m, reference, o) for m, o in zip(metrics, outcomes, strict=True)]
+  passed = [s.proficient for s in scores]
+  over = collections.Counter(METRICS[k].label for s in scores for k in s.over)
+  rule = f"{CONSECUTIVE} in a row and {REPEATS} more"
+  after = trained(passed)
+  reached = f"reached after {after} episodes" if after else "not reached"
+  lines = [f"proficient  {sum(passed)}/{len(passed)}; {rule}: {reached}"]
+  if over:
+    most = ", ".join(f"{label} {count}" for label, count in over.most_common(5))
+    lines.append(f"over the limit most often: {most}")
+  return lines, [s.composite for s in scores if math.isfinite(s.composite)]
 
 
 def _mean_sd(values: list[float]) -> tuple[float, float]:

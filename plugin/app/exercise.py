@@ -6,10 +6,9 @@ import argparse
 import contextlib
 import dataclasses
 import functools
-import math
 import pathlib
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import palpate
@@ -17,7 +16,6 @@ import palpate
 from . import film, options
 from .console import CommandError, Interrupt, Progress, output, output_folder, writing
 
-_FPS = 25  # of the film
 _SIZE = (640, 480)  # of the film [pixels]
 
 
@@ -89,7 +87,7 @@ def _list() -> int:
 
   for domain, task in suite.ALL_TASKS:
     print(f"{f'{domain}/{task}':24} {suite.summary(domain, task)}")
-  print(f"performers: {', '.join(performer.STYLES)}, keyboard, module:object")
+  print(f"performers: {', '.join(performer.STYLES)}, skilled, keyboard, module:object")
   return 0
 
 
@@ -184,23 +182,6 @@ def _write(job: _Job, recording: Any, report: bool):
     print(f"film       {job.film}")
 
 
-@contextlib.contextmanager
-def _camera(path: pathlib.Path | None) -> Iterator[Callable[[Any], None]]:
-  """Gives a function that takes the laparoscope's picture for the film, if there is to be one."""
-  if path is None:
-    yield lambda env: None
-    return
-  from palpate.tasks.scenes import CAMERA
-
-  due = -math.inf
-  with film.write(path, _FPS) as write:
-
-    def shoot(env) -> None:
-      nonlocal due
-      if env.physics.time() >= due - 1e-9:
-        due = env.physics.time() + 1 / _FPS
-        width, height = _SIZE
-        camera = env.physics.model.ptr.camera(CAMERA).id
-        write(env.physics.render(height, width, camera_id=camera))
-
-    yield shoot
+def _camera(path: pathlib.Path | None) -> contextlib.AbstractContextManager[Callable[[Any], None]]:
+  """Gives a function that takes a picture for the film, if there is to be one."""
+  return contextlib.nullcontext(lambda env: None) if path is None else film.laparoscope(path, _SIZE)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import pathlib
+import tempfile
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +18,7 @@ if TYPE_CHECKING:
 
 FILMS = (".mp4", ".gif")
 PICTURES = (".png",)
+_FPS = 25  # of the laparoscope
 
 
 @contextlib.contextmanager
@@ -39,6 +42,43 @@ def write(path: pathlib.Path, fps: float) -> Iterator[Callable[[np.ndarray], Non
       options = {"fps": fps, "macro_block_size": 2, "quality": 8}
     with imageio.get_writer(path, **options) as writer:
       yield writer.append_data
+
+
+@contextlib.contextmanager
+def laparoscope(path: pathlib.Path, size: tuple[int, int]) -> Iterator[Callable[[Any], None]]:
+  """Gives a function that takes the laparoscope's picture of an environment, for a film.
+
+  Args:
+    path: of the film
+    size: width and height [pixels]
+  """
+  from palpate.tasks.scenes import CAMERA
+
+  due = -math.inf
+  with write(path, _FPS) as frame:
+
+    def shoot(env: Any) -> None:
+      nonlocal due
+      if env.physics.time() >= due - 1e-9:
+        due = env.physics.time() + 1 / _FPS
+        camera = env.physics.model.ptr.camera(CAMERA).id
+        frame(env.physics.render(size[1], size[0], camera_id=camera))
+
+    yield shoot
+
+
+def of_recording(recording: Any, size: tuple[int, int]) -> bytes:
+  """Returns the MP4 of a recorded exercise, run anew; CommandError if it comes out differently."""
+  from palpate.tasks import episode
+
+  check(".mp4")
+  with tempfile.TemporaryDirectory() as folder:
+    path = pathlib.Path(folder) / "film.mp4"
+    with laparoscope(path, size) as shoot:
+      again = episode.replay(recording, shoot)
+    if changed := episode.differences(recording, again):
+      raise CommandError(f"no film: the replay differs in {', '.join(changed)}", code=1)
+    return path.read_bytes()
 
 
 def check(suffix: str):

@@ -1,39 +1,77 @@
-"""`palpate report`: the page about a recording."""
+"""`palpate report`: the page about a recording, or about several side by side."""
 
 from __future__ import annotations
 
 import argparse
 import pathlib
+from collections.abc import Sequence
+from typing import Any
 
+import palpate
+
+from . import film
 from .console import CommandError, output_folder, writing
+
+_SIZE = (480, 360)  # of a film in a page [pixels]
 
 
 def add_arguments(parser: argparse.ArgumentParser):
   """Declares the options."""
   add = parser.add_argument
-  add("recording", metavar="FILE", help="a recording, .npz")
-  add("-o", "--out", metavar="FOLDER", help="where report.html goes (the recording's folder)")
-  add("--reference", metavar="FILE", help="expert reference, JSON (the task's own, if it has one)")
+  add("recordings", metavar="FILE", nargs="+", help="a recording, .npz; several are compared")
+  add(
+    "-o", "--out", metavar="FOLDER",
+    help="where report.html or comparison.html goes (the first recording's folder)",
+  )  # fmt: skip
+  add("--reference", metavar="FILE", help="reference, JSON (the task's own, if it has one)")
+  add("--film", action="store_true", help="run the exercise anew and put its film in the page")
 
 
 def main(args: argparse.Namespace) -> int:
   """Runs the job and returns its exit code."""
-  from palpate.tasks import score
-  from palpate.tasks.recording import Recording
-  from palpate.tasks.report import write_report
+  from palpate.tasks import comparison, report
 
-  path = pathlib.Path(args.recording)
+  paths = [pathlib.Path(name) for name in args.recordings]
+  if args.film:
+    film.check(".mp4")
+    palpate.register()
   try:
-    recording = Recording.load(path)
-    if args.reference:
-      reference = score.read_reference(pathlib.Path(args.reference))
-    else:
-      reference = score.reference(str(recording.info.get("task", "")))
-    folder = output_folder("out", args.out or path.parent)
+    entries = _entries(paths, args.reference, args.film)
+    folder = output_folder("out", args.out or paths[0].parent)
     with writing(folder):
-      print(write_report(recording, folder, reference))
+      if len(entries) > 1:
+        page = comparison.write_comparison(entries, folder)
+      else:
+        (one,) = entries
+        page = report.write_report(one.recording, folder, one.reference, film=one.film)
   except (OSError, ValueError) as error:
     raise CommandError(str(error)) from None
   except ImportError as error:
     raise CommandError(f"{error}; install palpate[plot]", code=1) from None
+  print(f"{comparison.as_text(entries)}\n{page}")
   return 0
+
+
+def _entries(paths: Sequence[pathlib.Path], reference: str | None, filmed: bool) -> list[Any]:
+  """Returns what is compared: recordings, references and films."""
+  from palpate.tasks import comparison, score
+  from palpate.tasks.recording import Recording
+
+  own = score.read_reference(pathlib.Path(reference)) if reference else None
+  entries = []
+  for name, path in zip(_names(paths), paths, strict=True):
+    recording = Recording.load(path)
+    known = own or score.reference(str(recording.info.get("task", "")))
+    shot = film.of_recording(recording, _SIZE) if filmed else None
+    entries.append(comparison.Entry(name, recording, known, shot))
+  return entries
+
+
+def _names(paths: Sequence[pathlib.Path]) -> list[str]:
+  """Returns the end of each path that tells it from the others."""
+  whole = [path.resolve().with_suffix("").parts for path in paths]
+  for length in range(1, max(map(len, whole)) + 1):
+    names = ["/".join(parts[-length:]) for parts in whole]
+    if len(set(names)) == len(names):
+      return names
+  return [f"{k + 1}: {path}" for k, path in enumerate(paths)]  # a file beside itself

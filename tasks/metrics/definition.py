@@ -10,7 +10,8 @@ from typing import ParamSpec
 P = ParamSpec("P")
 
 COMBINE = ("sum", "max", "mean", "all")
-_SHOWN = {"m": ("mm", 1e3), "rad": ("deg", 180 / math.pi), "Pa": ("kPa", 1e-3)}
+_SHOWN = {"m": ("mm", 1e3), "m/s": ("mm/s", 1e3), "rad": ("deg", 180 / math.pi)}
+_SHOWN |= {"Pa": ("kPa", 1e-3)}
 
 
 class Unknown(float):
@@ -55,7 +56,7 @@ class Spec:
     group: category of the composite score, a key of `score.WEIGHTS`
     combine: how several instruments make one value: `sum`, `max`, `mean`, or `all` (one value)
     source: where the definition comes from
-    better: `lower` or `higher`
+    better: `lower`, `higher`, or `neither`: shown, but neither scored nor limited
     shown: unit for people
     scale: shown value / SI value
     function: what computes it

@@ -59,12 +59,12 @@ def weights(time: np.ndarray) -> np.ndarray:
   return np.concatenate([half, [0.0]]) + np.concatenate([[0.0], half])
 
 
-def magnitude(force: ArrayLike) -> np.ndarray:
+def magnitude(force: ArrayLike, name: str = "force") -> np.ndarray:
   """Returns the magnitude of contact forces [N]  (nstep,); force (nstep,) or (nstep, 3)."""
   force = np.asarray(force, np.float64)
   if force.ndim == 2:
-    return np.linalg.norm(rows("force", force, 3), axis=1)
-  return np.abs(rows("force", force))
+    return np.linalg.norm(rows(name, force, 3), axis=1)
+  return np.abs(rows(name, force))
 
 
 def speed(time: ArrayLike, tip_pos: ArrayLike) -> np.ndarray:
@@ -87,6 +87,77 @@ def uniform_speed(time: ArrayLike, tip_pos: ArrayLike) -> tuple[np.ndarray, floa
     middle = (time[1:] + time[:-1]) / 2
     values = np.interp(middle[0] + mean * np.arange(len(middle)), middle, values)
   return values, float(1 / mean)
+
+
+def low_pass(time: ArrayLike, values: ArrayLike, cutoff: float) -> np.ndarray:
+  """Returns samples without what is faster than a cut-off, at the same times.
+
+  A Butterworth filter of order 4 run both ways (no lag), gain 1 / (1 + (f / cutoff)^8), over the
+  odd continuation at both ends: straight lines and the two ends stay as they are. Samples uneven by
+  more than 0.1 % are interpolated to even ones and back. At half the rate and above nothing is cut.
+
+  Args:
+    time: sample times [s]  (nstep,)
+    values: at those times  (nstep,) or (nstep, n)
+    cutoff: where the gain is a half [Hz]
+  """
+  time = check_time(time, least=1)
+  table = np.asarray(values, np.float64)
+  table = same("values", rows("values", table, *table.shape[1:]), time)
+  count = len(time) - 1
+  if count < 2 or cutoff >= count / (time[-1] - time[0]) / 2:
+    return table
+  even = np.linspace(time[0], time[-1], count + 1)
+  step = even[1] - even[0]
+  uneven = np.abs(np.diff(time) - step).max() > 1e-3 * step
+  flat = table.reshape(count + 1, -1).T
+  if uneven:
+    flat = np.stack([np.interp(even, time, column) for column in flat])
+  line = flat[:, :1] + (flat[:, -1:] - flat[:, :1]) * np.linspace(0, 1, count + 1)
+  rest = flat - line
+  odd = np.concatenate([rest, -rest[:, -2:0:-1]], axis=1)
+  gain = 1 / (1 + (np.fft.rfftfreq(2 * count, step) / cutoff) ** 8)
+  out = line + np.fft.irfft(np.fft.rfft(odd) * gain, 2 * count)[:, : count + 1]
+  if uneven:
+    out = np.stack([np.interp(time, even, column) for column in out])
+  return out.T.reshape(table.shape)
+
+
+def low_pass_rotation(time: ArrayLike, quat: ArrayLike, cutoff: float) -> np.ndarray:
+  """Returns orientations without what is faster than a cut-off, w x y z, see `low_pass`  (n, 4)."""
+  table = rows("quat", quat, 4)
+  # -q is the same rotation: the sign that jumps least.
+  flips = np.cumprod(np.where((table[1:] * table[:-1]).sum(axis=1) < 0, -1.0, 1.0))
+  smooth = low_pass(time, table * np.concatenate([[1.0], flips])[:, None], cutoff)
+  norm = np.linalg.norm(smooth, axis=1, keepdims=True)
+  return smooth / np.where(norm > 0, norm, 1.0)
+
+
+def surface_strain(rest: np.ndarray, now: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+  """Returns the largest principal strain of each triangle of a surface [-]  (ntri,).
+
+  The engineering strain lambda - 1 of the larger principal stretch lambda: lambda^2 is the larger
+  eigenvalue of C = F^T F in the triangle's plane (Bonet and Wood 2008, chapter 4). It says how much
+  longer the fibre that is stretched most has become, 0 for a rigid motion.
+
+  Args:
+    rest: corners at rest [m]  (nvert, 3)
+    now: the same now [m]  (nvert, 3)
+    triangles: their corners' indices  (ntri, 3)
+  """
+  # With the edges a, b as basis, C is G(now) in a basis with metric G(rest): a 2 x 2 problem.
+  (e, f, g), (x, y, z) = _metric(rest, triangles), _metric(now, triangles)
+  area2 = np.maximum(e * g - f * f, np.finfo(float).tiny)  # four times the squared area at rest
+  half = (x * g - 2 * y * f + z * e) / (2 * area2)
+  det = (x * z - y * y) / area2
+  return np.sqrt(half + np.sqrt(np.maximum(half * half - det, 0.0))) - 1
+
+
+def _metric(pos: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+  """Returns a.a, a.b and b.b of the edges a, b of triangles from their first corners."""
+  first = pos[triangles[:, 0]]
+  a, b = pos[triangles[:, 1]] - first, pos[triangles[:, 2]] - first
+  return (a * a).sum(axis=1), (a * b).sum(axis=1), (b * b).sum(axis=1)
 
 
 def speed_spectrum(even_speed: ArrayLike, rate: float) -> tuple[np.ndarray, np.ndarray, int]:

@@ -75,13 +75,13 @@ class Metrics:
     )
 
 
-def check_header(data: Any, name: str) -> None:
-  """Raises ValueError unless the data says that it is of format `name`, version 1."""
+def check_header(data: Any, name: str, version: int = 1) -> None:
+  """Raises ValueError unless the data says that it is of format `name` and of this version."""
   if not isinstance(data, Mapping) or data.get("format") != name:
     found = data.get("format") if isinstance(data, Mapping) else type(data).__name__
     raise ValueError(f"not {name}: format is {found!r}")
-  if data.get("version") != 1:
-    raise ValueError(f"{name}: version is {data.get('version')!r}, expected 1")
+  if data.get("version") != version:
+    raise ValueError(f"{name}: version is {data.get('version')!r}, expected {version}")
 
 
 def check_names(names: Mapping[str, Any]) -> None:

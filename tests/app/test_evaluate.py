@@ -1,11 +1,13 @@
 """`palpate evaluate`: scores, spread, and what is kept when something breaks."""
 
 import json
+import re
 import signal
 import sys
 
 import pytest
-from palpate.app import cli, console, evaluate
+from palpate.app import cli, console, evaluate, panel
+from palpate.tasks import score
 from palpate.tasks.recording import Recording
 
 
@@ -16,23 +18,60 @@ def _here(tmp_path, monkeypatch):
 
 
 def test_evaluate_prints_success_and_spread(capsys, tmp_path):
-  out = tmp_path / "reference.json"
-  assert cli.main(["evaluate", "touch/easy", "--episodes", "2", "--reference", str(out)]) == 0
+  assert cli.main(["evaluate", "touch/easy", "--episodes", "2"]) == 0
   text = capsys.readouterr().out
   assert "success  2/2" in text and "Path length [mm]" in text
-  data = json.loads(out.read_text())
-  assert data["task"] == "touch/easy" and data["n"] == 2 and data["seed"] == 0
+  assert re.search("proficient  [012]/2; 2 in a row and 10 more: not reached", text)
   kept = tmp_path / "kept"
   words = ["evaluate", "touch/easy", "--policy", "math:nan", "--episodes", "1"]
   assert cli.main([*words, "--recordings", str(kept)]) == 2
   assert "math:nan' is a float, expected something to call" in capsys.readouterr().err
   words = ["evaluate", "touch/easy", "--policy", "math:sqrt", "--episodes", "1"]
   assert cli.main([*words, "--recordings", str(kept)]) == 1
-  assert "1 episodes failed, the first: TypeError" in capsys.readouterr().err
+  said = capsys.readouterr()
+  assert "1 episodes failed, the first: TypeError" in said.err
+  assert "proficient  0/1" in said.out
+  assert re.search(r"Composite score \[-\] +-20 ", said.out)  # the floor
   assert Recording.load(kept / "0.npz").info["outcome"] == "error"
   assert cli.main(["evaluate", "touch/eazy"]) == 2
   assert "task is 'touch/eazy', expected one of" in capsys.readouterr().err
   assert cli.main(["evaluate", "touch/easy", "--policy", "nobody"]) == 2
+
+
+def test_standing_still_scores_the_floor(tmp_path, capsys):
+  text = "import numpy as np\ndef still(observation): return np.zeros(4)\n"
+  (tmp_path / "still.py").write_text(text)
+  assert cli.main(["evaluate", "touch/easy", "--policy", "still:still", "--episodes", "1"]) == 0
+  said = capsys.readouterr().out
+  assert "proficient  0/1" in said and re.search(r"Composite score \[-\] +-20 ", said)
+
+
+def test_references_are_made_in_parallel_and_resumed(tmp_path, capsys, monkeypatch):
+  words = ["panel", "touch/easy", "-o", "made", "--runs", "runs", "--processes", "2"]
+  assert cli.main([*words, "--episodes", "2"]) == 0
+  assert "touch/easy: 2 of 2 episodes succeeded" in capsys.readouterr().out
+  path = tmp_path / "made" / "touch_easy.json"
+  data = score.read_reference(path)
+  assert (data["task"], data["performer"]) == ("touch/easy", "skilled")
+  assert (data["n"], data["episodes"], data["seed"]) == (2, 2, 10000)
+  assert data["metrics"]["time"]["limit"] >= data["metrics"]["time"]["mean"]
+  (runs,) = (tmp_path / "runs").iterdir()
+  assert len(list(runs.iterdir())) == 2
+  ran = []
+  monkeypatch.setattr(panel, "perform", lambda job: ran.append(job) or evaluate.perform(job))
+  assert cli.main([*words[:-1], "1", "--episodes", "3"]) == 0
+  assert [job[2] for job in ran] == [10002]
+  assert score.read_reference(path)["n"] == 3
+  monkeypatch.setattr(panel, "fingerprint", lambda: "changed")
+  assert cli.main([*words[:-1], "1", "--episodes", "1"]) == 0
+  assert len(ran) == 2  # other sources, other episodes
+
+
+def test_references_need_successes(tmp_path, capsys):
+  words = ["panel", "touch/easy", "-o", "made", "--episodes", "1", "--processes", "1"]
+  assert cli.main([*words, "--performer", "math:sqrt"]) == 1
+  assert "0 of 1 episodes succeeded, too few for a reference; TypeError" in capsys.readouterr().err
+  assert cli.main([*words, "--performer", "nobody"]) == 2
 
 
 def test_processes_give_the_same_as_one():
@@ -66,7 +105,7 @@ def test_a_process_that_dies_ends_the_job_and_keeps_what_was_done(tmp_path, monk
 def test_outputs_that_cannot_be_written_are_said_before_the_work(tmp_path, monkeypatch, capsys):
   monkeypatch.setattr(evaluate, "evaluate", lambda *_: pytest.fail("it worked first"))
   (tmp_path / "file").touch()
-  for words in (["--json", "file/a.json"], ["--reference", "."], ["--recordings", "file"]):
+  for words in (["--json", "file/a.json"], ["--json", "."], ["--recordings", "file"]):
     assert cli.main(["evaluate", "touch/easy", *words]) == 1
     said = capsys.readouterr().err
     assert said.startswith(f"palpate: {words[0][2:]}: cannot write '") and said.count("\n") == 1

@@ -1,7 +1,9 @@
 """`palpate exercise`: its files, replays, the keyboard, and how it ends."""
 
+import base64
 import contextlib
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -46,7 +48,15 @@ def test_exercise_writes_recording_metrics_and_report(tmp_path, capsys):
   again = ["exercise", "--replay", f"{folder}/recording.npz", "-o", str(tmp_path / "b")]
   assert cli.main([*again, "--no-report"]) == 0
   assert "the same to the bit" in capsys.readouterr().out
+  capsys.readouterr()
   assert cli.main(["report", f"{folder}/recording.npz", "-o", str(tmp_path / "c")]) == 0
+  said = capsys.readouterr().out
+  assert "Outcome" in said and "report.html" in said and (tmp_path / "c" / "report.html").exists()
+  pair = [f"{folder}/recording.npz", str(tmp_path / "b" / "recording.npz")]
+  assert cli.main(["report", *pair, "-o", str(tmp_path / "d")]) == 0
+  said = capsys.readouterr().out
+  assert "out/recording" in said and "b/recording" in said and "Peak force [N]" in said
+  assert "b/recording" in (tmp_path / "d" / "comparison.html").read_text()
   (tmp_path / "foreign.npz").write_bytes(b"PK nonsense")
   assert cli.main(["exercise", "--replay", str(tmp_path / "foreign.npz")]) == 2
   assert "not a readable palpate-recording" in capsys.readouterr().err
@@ -58,6 +68,15 @@ def test_exercise_writes_recording_metrics_and_report(tmp_path, capsys):
   said = capsys.readouterr()
   assert "error after 0.00 s" in said.out and "step 0: TypeError" in said.err
   assert cli.main(["exercise", "nothing"]) == 2
+
+
+def test_a_report_has_a_film_on_request(tmp_path, capsys):
+  pytest.importorskip("imageio_ffmpeg")
+  assert cli.main([*EASY, "--out", "a"]) == 0
+  assert cli.main(["report", "a/recording.npz", "--film"]) == 0
+  page = (tmp_path / "a" / "report.html").read_text()
+  data = re.search(r"<video [^>]*src='data:video/mp4;base64,([^']*)'", page)[1]
+  assert base64.b64decode(data)[4:8] == b"ftyp"
 
 
 def test_film(tmp_path):

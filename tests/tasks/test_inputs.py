@@ -9,6 +9,7 @@ from palpate.app import evaluate
 from palpate.tasks import metrics as functions
 from palpate.tasks.metrics import METRICS, Metrics, Unknown, metric
 from palpate.tasks.recorder import Recorder
+from palpate.tasks.recording import Recording
 from palpate.tasks.score import make_reference, score
 from recordings import LINE, SETTINGS, exercise, plain
 
@@ -30,7 +31,7 @@ def test_a_metric_is_registered_by_its_definition():
     assert both.metrics().highest == 2
     assert Recorder().metrics().reasons()["highest"] == "the recording is empty"
     reference = make_reference([made, plain(LINE).metrics()], "touch/easy", 0)
-    assert score(made, reference).z["highest"] == pytest.approx(-math.sqrt(0.5))
+    assert score(made, reference, "success").z["highest"] == pytest.approx(-math.sqrt(0.5))
     result = evaluate.Result(0, "success", 1.0, 1.0, made.to_json())
     assert "Highest point [mm]" in evaluate.table("touch/easy", "expert", [result], None)
   finally:
@@ -201,3 +202,41 @@ def test_watched_events_without_an_event_are_a_known_zero():
   assert counts(["miss", "slip"]) == (0, 0)
   assert counts([], "drop", "slip", "slip", "miss", "target") == (2, 2)
   assert all(isinstance(v, Unknown) for v in counts(["target"]))
+
+
+def test_forces_between_the_samples_count():
+  # A tap of 2 N for 5 of every 20 ms: its maxima alone would make four times the impulse.
+  span = np.where(np.arange(20) < 5, 2.0, 0.0)
+  recorder = Recorder(settings=SETTINGS, substeps=20)
+  recorder.append(0.0, LINE[0], force=0.0, grip_force=0.0, shaft_force=0.0)
+  for k, point in enumerate(LINE[1:], 1):
+    recorder.append(k * 0.02, point, force=span, grip_force=3.0, shaft_force=span)
+  made, data = recorder.metrics(), recorder.recording()
+  assert len(data.signal_time) == 1 + 60 * 20 == len(data.signal("force"))
+  np.testing.assert_allclose(np.diff(data.signal_time), 1e-3, atol=1e-12)
+  np.testing.assert_array_equal(data.signal_time[::20], data.time)
+  assert made.force_time_product == pytest.approx(60 * 5e-3 * 2)
+  assert made.shaft_contact == pytest.approx(60 * 5e-3)
+  assert (made.peak_force, made.mean_force, made.rms_force) == (2, 2, 2)
+  assert made.force_breaches == 1  # 15 ms under the limit do not end it
+  assert made.peak_grip == 3 and made.grip_breaches == 1
+  assert made.grip_ratio == pytest.approx(3 / 2)  # while both act
+  assert data.touching().tolist() == [False] + [True] * 60
+
+
+def test_forces_between_the_samples_are_kept(tmp_path):
+  recorder = Recorder(("left", "right"), substeps=3)
+  values = np.arange(24.0).reshape(4, 2, 3)
+  for k, value in enumerate(values):
+    recorder.append(k * 0.3, np.zeros((2, 3)), force=value, shaft_force=[1.0, 2.0])
+  data = Recording.load(recorder.save(tmp_path / "a.npz"))
+  # The first sample ends no span: its last value is its own.
+  assert data.force(1).tolist() == [5, *values[1:, 1].ravel()]
+  assert data.signal_time.tolist() == pytest.approx(np.linspace(0, 0.9, 10).tolist())
+  assert data.signal("shaft_force", 1).tolist() == [2] * 10
+  assert data.metrics(1) == recorder.metrics(1)
+  for bad in (np.zeros((2, 3, 3)), np.zeros((2, 4))):
+    with pytest.raises(ValueError, match=r"force has shape .*, expected \(2, 3\)"):
+      recorder.append(2.0, np.zeros((2, 3)), force=bad)
+  with pytest.raises(ValueError, match="substeps is 0, expected a whole number >= 1"):
+    Recorder(substeps=0)

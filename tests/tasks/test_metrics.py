@@ -22,13 +22,6 @@ def _multiply(a, b):
   return np.concatenate([w, v], axis=1)
 
 
-def _triangles(peak=2.0, base=0.4, pulses=2, step=0.1):
-  """Triangular force pulses with a rest of the same length between them."""
-  time = np.arange(0, 2 * pulses * base + step / 2, step)
-  phase = np.mod(time, 2 * base)
-  return time, np.where(phase < base, peak * (1 - np.abs(2 * phase / base - 1)), 0.0)
-
-
 def _unknown(value, match):
   assert isinstance(value, metrics.Unknown) and math.isnan(value)
   assert match in value.reason
@@ -48,6 +41,22 @@ def test_path_length_of_a_circle():
   polygon = 100 * 2 * 0.02 * np.sin(np.pi / 100)  # the inscribed polygon, exactly
   assert metrics.path_length(circle) == pytest.approx(polygon, rel=1e-13)
   assert metrics.path_length(circle) == pytest.approx(2 * np.pi * 0.02, rel=2e-4)
+
+
+def test_speeds_and_economy_of_volume_of_a_box():
+  # Along three edges of a box of 20 x 40 x 50 mm: the cube root of 4e-5 m^3 over 110 mm.
+  corners = np.array([[0, 0, 0], [0.02, 0, 0], [0.02, 0.04, 0], [0.02, 0.04, 0.05]])
+  time = np.array([0.0, 1.0, 2.0, 3.0])
+  assert metrics.economy_of_volume(corners) == pytest.approx(4e-5 ** (1 / 3) / 0.11)
+  assert metrics.mean_speed(time, corners) == pytest.approx(0.11 / 3)
+  assert metrics.peak_speed(metrics.speed(time, corners)) == pytest.approx(0.05)
+  assert metrics.economy_of_volume(corners[:3]) == 0  # a path in a plane
+  for value in (
+    metrics.economy_of_volume(0 * corners),
+    metrics.mean_speed(time, 0 * corners),
+    metrics.peak_speed(np.zeros(3)),
+  ):
+    assert _unknown(value, "no motion")
 
 
 def test_path_inefficiency():
@@ -209,66 +218,6 @@ def test_out_of_view_and_in_view():
   assert metrics.in_view([[4, 5, 6], [6, 5, 6]], [5, 5, 6], mat, 40).tolist() == [True, False]
 
 
-# Force.
-
-
-def test_force_of_triangular_pulses():
-  time, force = _triangles()
-  assert metrics.peak_force(force) == pytest.approx(2.0)
-  assert metrics.force_time_product(time, force) == pytest.approx(2 * 2.0 * 0.4 / 2)
-  # Samples in contact, equal weights: 1, 2, 1 in each pulse.
-  assert metrics.mean_force(time, force) == pytest.approx(4 / 3)
-  assert metrics.rms_force(time, force) == pytest.approx(math.sqrt(2))
-  vector = force[:, None] * np.array([0.6, 0, -0.8])
-  assert metrics.peak_force(vector) == pytest.approx(2.0)
-  assert metrics.force_time_product(time, -force) == metrics.force_time_product(time, force)
-
-
-def test_mean_force_weighs_by_time():
-  # 1 N for half of [0, 2] and [2, 3], 4 N for half of [2, 3] and [3, 4].
-  assert metrics.mean_force([0, 2, 3, 4], [0, 1, 4, 0]) == pytest.approx((1.5 * 1 + 1 * 4) / 2.5)
-
-
-@pytest.mark.parametrize("step", [0.1, 0.05, 0.025])
-def test_excess_impulse_is_exact_between_samples(step):
-  time, force = _triangles(step=step)
-  # What is over the limit is a similar triangle: scaled by (2 - 1.5) / 2 in both directions.
-  expected = 2 * (0.5 * 2.0 * 0.4) * (0.5 / 2.0) ** 2
-  assert metrics.excess_impulse(time, force, 1.5) == pytest.approx(expected, rel=1e-9)
-  assert metrics.excess_impulse(time, force, 2.5) == 0
-  assert metrics.excess_impulse(time, force, 0.0) == pytest.approx(0.8, rel=1e-9)
-
-
-def test_force_breaches_counts_excursions():
-  assert metrics.force_breaches([0, 2, 2, 0, 2, 0, 0.5], 1.5) == 2
-  assert metrics.force_breaches([2, 1, 2], 1.5) == 2  # over the limit from the start
-  assert metrics.force_breaches([1.5, 1.5], 1.5) == 0  # at the limit is not over it
-  assert metrics.force_breaches([0.1, 0.2], 1.5) == 0  # touched gently: a known 0
-  assert _unknown(metrics.force_breaches([0.1, 0.2], float("nan")), "limit")
-
-
-def test_peak_pressure():
-  assert metrics.peak_pressure([0, 3, 2], [0, 3e-5, 1e-5]) == pytest.approx(2e5)
-  assert _unknown(metrics.peak_pressure([0, 3], [0, 0]), "sample 1")
-
-
-@pytest.mark.parametrize(
-  "value",
-  [
-    metrics.peak_force([0, 0]),
-    metrics.mean_force([0, 1], [0, 0]),
-    metrics.rms_force([0, 1], [0, 0]),
-    metrics.force_time_product([0, 1], [0, 0]),
-    metrics.force_breaches([0, 0], 1.0),
-    metrics.excess_impulse([0, 1], [0, 0], 1.0),
-    metrics.peak_pressure([0, 0], [1, 1]),
-    metrics.peak_force([0.01, 0.02], contact_force=0.05),
-  ],
-)
-def test_no_contact_is_unknown(value):
-  assert _unknown(value, "no contact") and not value.fault
-
-
 # Outcome.
 
 
@@ -379,7 +328,15 @@ def test_bad_samples_are_unknown_and_named(bad):
     metrics.response_orientation(quat),
     metrics.peak_force(force),
     metrics.mean_force(time, force),
-    metrics.force_breaches(force, 0.5),
+    metrics.force_breaches(time, force, 0.5),
+    metrics.force_rate(time, force, 2.0),
+    metrics.peak_grip(force),
+    metrics.grip_ratio(time, np.ones(6), force),
+    metrics.shaft_contact(time, force),
+    metrics.peak_strain(force),
+    metrics.economy_of_volume(pos),
+    metrics.mean_speed(time, pos),
+    metrics.peak_speed(force),
     metrics.excess_impulse(time, force, 0.5),
     metrics.peak_pressure(force, np.ones(6)),
     metrics.out_of_view(time, force),
@@ -432,12 +389,14 @@ def test_unknown_survives_a_process_boundary():
 
 
 def test_inputs_are_left_alone():
-  time, force = _triangles()
+  time = np.arange(17) * 0.1
+  force = np.abs(np.sin(4 * time))
   pos = np.random.RandomState(5).rand(len(time), 3)
   quat = np.random.RandomState(6).randn(len(time), 4)
   before = [a.copy() for a in (time, force, pos, quat)]
   metrics.excess_impulse(time, force, 1.0)
   metrics.rms_force(time, force)
+  metrics.force_rate(time, force, 2.0)
   metrics.sparc(force, 10.0)
   metrics.angular_path(quat)
   metrics.trace_frechet(pos, pos[:5])

@@ -71,6 +71,32 @@ def test_novices_differ_in_the_stated_way():
   )
 
 
+def test_a_late_reaction_moves_later():
+  env = tasks.load("touch", "easy", task_kwargs={"random": 0})
+
+  def begin(style):
+    env.task.random = np.random.RandomState(0)
+    act, timestep, actions = performer.make(env, style), env.reset(), []
+    for _ in range(15):
+      actions.append(act(timestep))
+      timestep = env.step(actions[-1])
+    return np.array(actions)
+
+  prompt, late = begin(performer.Style()), begin(performer.Style(reaction=0.1))
+  assert np.abs(late[:5]).max() < 1e-9 < np.abs(prompt[0]).max()
+  np.testing.assert_allclose(late[5:], prompt[:10], atol=0.02)
+
+
+def test_skilled_people_are_many_and_come_again():
+  styles = [performer.skilled(seed) for seed in range(50)]
+  assert len(set(styles)) == 50 and styles[3] == performer.skilled(3)
+  for name, (low, high) in performer.SKILLED.items():
+    values = [getattr(style, name) for style in styles]
+    assert low <= min(values) < max(values) <= high
+    assert np.ptp(values) > 0.8 * (high - low)
+  assert performer.find("skilled") is performer.skilled
+
+
 def test_a_task_without_an_expert_says_so():
   env = tasks.load("touch", "easy")
   env.task.expert = types.MethodType(base.Task.expert, env.task)

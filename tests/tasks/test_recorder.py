@@ -50,7 +50,7 @@ def test_the_file_needs_no_pickle(tmp_path):
   with np.load(path, allow_pickle=False) as archive:
     meta = json.loads(str(archive["meta"][()]))
     assert all(archive[name].dtype.kind in "fiubU" for name in archive.files)
-  assert (meta["format"], meta["version"]) == ("palpate-recording", 1)
+  assert (meta["format"], meta["version"]) == ("palpate-recording", 2)
 
 
 def test_empty_and_single_sample(tmp_path):
@@ -160,10 +160,12 @@ EVENT = {"kind": "drop", "time": 1.0, "value": None, "instrument": 0, "label": "
     (lambda e, m: e.pop("meta"), "no entry 'meta'"),
     (lambda e, m: e.pop("time"), "no entry 'time'"),
     (_set("meta", "format", "other"), "format is 'other'"),
-    (_set("meta", "version", 99), "version is 99, this program reads 1"),
+    (_set("meta", "version", 99), "version is 99, this program reads 2"),
     (_set("meta", "instruments", []), "instruments is"),
     (lambda e, m: m.update(instruments=["one"], events=[]), "column .* is float64"),
     (_set("meta", "info", 3), "info is 3"),
+    (_set("meta", "substeps", 0), "substeps is 0"),
+    (_set("meta", "substeps", 5), "column .*force is float64"),
     (_set("meta", "watch", ["explosion"]), "no event 'explosion'"),
     (_set("meta", "settings", {"force_limit": -1}), "force_limit is -1"),
     (_set("meta", "settings", {"gravity": 1}), "gravity"),

@@ -76,7 +76,7 @@ def _recorder(instruments=("probe",), limit=1.5, peak=2.0, **kwargs):
   recorder = Recorder(
     instruments,
     Settings(force_limit=limit, reference_length=0.1),
-    info={"task": "touch", "seed": 3},
+    info={"task": "touch", "seed": 3, "outcome": "success"},
     watch=["drop"],
     **kwargs,
   )
@@ -96,11 +96,16 @@ def _recorder(instruments=("probe",), limit=1.5, peak=2.0, **kwargs):
 
 
 def _reference(**rows):
-  table = {k: {"mean": mean, "sd": sd, "n": 9} for k, (mean, sd) in rows.items()}
+  worse = {name: -2 if spec.better == "higher" else 2 for name, spec in METRICS.items()}
+  table = {
+    k: {"mean": mean, "sd": sd, "n": 9, "limit": mean + worse[k] * (sd or 0)}
+    for k, (mean, sd) in rows.items()
+  }
   return {
     "format": "palpate-reference",
-    "version": 1,
+    "version": 2,
     "task": "touch",
+    "performer": "skilled",
     "seed": 41,
     "n": 9,
     "metrics": table,
@@ -135,7 +140,7 @@ def test_people_see_millimetres_and_degrees():
   assert page.row("Smoothness (SPARC)")[1].startswith("−")  # a minus, not a hyphen
   assert page.row("0.5") == ["0.5", "target", "1.5 mm", "probe", "first"]
   assert page.row("Target error")[1] == "1.5"
-  assert "No expert reference was given" in page.text()
+  assert "No reference was given" in page.text()
   assert "no curve to trace" in page.text()
   assert "z" not in page.row("metric")
 
@@ -143,7 +148,7 @@ def test_people_see_millimetres_and_degrees():
 def test_the_score_is_explained():
   reference = _reference(time=(1.0, 0.25), path_length=(0.1, 0.02), peak_force=(1.5, 0.5))
   page = _Page(report.render(_recorder().recording(), reference))
-  assert page.row("metric")[-3:] == ["expert mean ± SD", "limit", "z"]
+  assert page.row("metric")[-3:] == ["panel mean ± SD", "limit", "z"]
   assert page.row("Time to completion")[1:] == ["2", "s", "lower", "1 ± 0.25", "≤ 1.5", "−4 over"]
   assert page.row("Peak force")[-3:] == ["1.5 ± 0.5", "≤ 2.5", "−1"]
   assert page.row("Path length")[4:6] == ["100 ± 20", "≤ 140"]
@@ -154,7 +159,7 @@ def test_the_score_is_explained():
   text = page.text()
   assert "remaining 16 % are for time, dexterity and outcome" in text
   assert "not proficient; over the limit: Time to completion" in text
-  assert "task touch, n 9, seed 41, version 1" in text
+  assert "task touch, performer skilled, n 9, seed 41" in text
   total = sum(float(page.row(g)[4].replace("−", "-")) for g in ("safety", "efficiency", "time"))
   shown = float(re.search(r"Score (−?[\d.]+) not", text)[1].replace("−", "-"))
   assert shown == pytest.approx(total, abs=0.016)  # three roundings to 0.01
@@ -170,8 +175,57 @@ def test_what_the_expert_has_and_the_recording_lacks_is_shown():
   reference = _reference(peak_force=(1.5, 0.5), grasp_slips=(0.0, 0.0), trace_rms=(0.001, None))
   page = _Page(report.render(_recorder().recording(), reference))
   assert page.row("Grasp slips")[1:] == ["–", "count", "lower", "0 ± 0", "≤ 0", "–"]
-  assert page.row("Tracing error (RMS)")[4:] == ["1 ± ?", "–", "–"]
+  assert page.row("Tracing error (RMS)")[4:] == ["1 ± ?", "≤ 1", "–"]
   assert "unknown: Grasp slips, Tracing error (RMS)" in page.text()
+
+
+@pytest.mark.parametrize(
+  ("outcome", "said"),
+  [
+    ("damage", "Failed: a force above what the tissue bears, after 2 s"),
+    ("time limit", "Failed: the time ran out, after 2 s"),
+    ("missed", "Failed: reported a wrong place, after 2 s"),
+    ("stopped", "Stopped before the end, after 2 s"),
+    ("dropped the needle", "Failed: dropped the needle, after 2 s"),
+    ("error", "after 2 s: ValueError: action is nan"),
+  ],
+)
+def test_the_head_says_what_happened_and_a_failure_is_at_the_floor(outcome, said):
+  recorder = _recorder()
+  again = [_recorder(peak=p).metrics() for p in (1.8, 2.0, 2.2)]
+  recorder.info["outcome"] = outcome
+  if outcome == "error":
+    recorder.info["error"] = "ValueError: action is nan"
+  text = _Page(report.render(recorder.recording(), make_reference(again, "touch", 0))).text()
+  head = text[: text.index("Score")]
+  assert said in head and "Success" not in head
+  assert "Score −20 not proficient; it did not succeed" in text
+  recorder.info["outcome"] = "success"
+  assert "Success, after 2 s" in _Page(report.render(recorder.recording())).text()
+  del recorder.info["outcome"]
+  text = _Page(report.render(recorder.recording(), make_reference(again, "touch", 0))).text()
+  assert "How it ended was not recorded" in text
+  assert "No composite score : the recording does not say how it ended" in text
+
+
+def test_a_film_is_in_the_page():
+  text = report.render(_recorder().recording(), film=b"\0\0ftyp")
+  page = _Page(text)
+  assert "video" in page.tags and not page.tags & {"script", "link", "iframe", "object"}
+  data = re.search(r"<video [^>]*src='data:video/mp4;base64,([^']*)'", text)[1]
+  assert base64.b64decode(data, validate=True) == b"\0\0ftyp"
+  assert "Film" in page.text()
+  assert "Film" not in _Page(report.render(_recorder().recording())).text()
+
+
+def test_a_grasper_s_grip_and_pull_are_two_lines():
+  recorder = Recorder(settings=Settings(force_limit=4.0), substeps=20)
+  for k in range(50):
+    recorder.append(0.02 * k, [0.001 * k, 0, 0], force=0.4, grip_force=2.4, shaft_force=0.1)
+  axes = plots.force_figure(recorder.recording()).axes[0]
+  labels = [t.get_text() for t in axes.legend_.texts]
+  assert labels == ["press or pull", "grip", "shaft", "limit 4 N"]
+  assert len(axes.lines[0].get_xdata()) == 49 * 20 + 1  # at the physics' rate
 
 
 def test_a_good_performance_is_proficient():
@@ -241,6 +295,15 @@ def test_spectrum_figure_shows_the_cut_offs():
   assert selected.get_ydata()[-1] >= 0.05 and selected.get_xdata()[-1] <= 10
 
 
+def test_the_spectrum_of_a_noisy_tracker_is_that_of_the_metric():
+  recorder, rng = Recorder(), np.random.RandomState(0)
+  for k in range(400):
+    recorder.append(0.01 * k, [0.05 * np.sin(k / 60), *(5e-4 * rng.randn(2))])
+  recording = recorder.recording()
+  label = plots.spectrum_figure(recording).axes[0].legend_.texts[0].get_text()
+  assert label == f"SPARC {number(round(recording.metrics().sparc, 2))}"
+
+
 def test_path_figure_is_in_millimetres_over_the_surface():
   recorder = _recorder()
   recorder.attach("vertices", [[0, 0, 0], [0.2, 0, 0], [0, 0.3, 0], [0, 0, 0.05]])
@@ -270,7 +333,7 @@ def test_colour_marks_contact():
 
 
 def _odd(kind):
-  recorder = Recorder(settings=Settings(force_limit=1.0))
+  recorder = Recorder(settings=Settings(force_limit=1.0), info={"outcome": "success"})
   if kind == "one":
     recorder.append(0.0, [0, 0, 0], force=0.5)
   for k in range(20 if kind not in ("empty", "one") else 0):

@@ -4,16 +4,27 @@ import copy
 import json
 import math
 
+import numpy as np
 import pytest
 from palpate import tasks
 from palpate.tasks import score as scoring
 from palpate.tasks.metrics import METRICS, Metrics, Unknown
-from palpate.tasks.score import WEIGHTS, make_reference, score, z_score
+from palpate.tasks.score import SUCCESS, WEIGHTS, make_reference, score, z_score
+
+SCORED = [name for name, spec in METRICS.items() if spec.better != "neither"]
 
 
 def _reference(**rows):
-  table = {k: {"mean": m, "sd": s, "n": 5} for k, (m, s) in rows.items()}
-  return {"format": "palpate-reference", "version": 1, "seed": 0, "n": 5, "metrics": table}
+  """Of metric=(mean, sd), the limits being two SDs away in the worse direction."""
+  table = {}
+  for name, (mean, sd) in rows.items():
+    worse = -2 if METRICS[name].better == "higher" else 2
+    table[name] = {"mean": mean, "sd": sd, "n": 5, "limit": mean + worse * (sd or 0)}
+  return {"format": "palpate-reference", "version": 2, "seed": 0, "n": 5, "metrics": table}
+
+
+def _limits(reference):
+  return {name: row["limit"] for name, row in reference["metrics"].items()}
 
 
 def test_table_is_consistent():
@@ -21,7 +32,8 @@ def test_table_is_consistent():
   assert WEIGHTS["safety"] == 0.67 and WEIGHTS["efficiency"] == 0.17
   for name, spec in METRICS.items():
     assert spec.group in WEIGHTS, name
-    assert spec.better in ("lower", "higher") and spec.combine in ("sum", "max", "mean", "all")
+    assert spec.better in ("lower", "higher", "neither"), name
+    assert spec.combine in ("sum", "max", "mean", "all"), name
     assert spec.source and spec.label, name
   assert (METRICS["path_length"].shown, METRICS["path_length"].scale) == ("mm", 1000)
   assert METRICS["angular_path"].scale * math.pi == pytest.approx(180)
@@ -30,6 +42,7 @@ def test_table_is_consistent():
     "log_dimensionless_jerk",
     "bimanual_dexterity",
   }
+  assert set(METRICS) - set(SCORED) == {"mean_speed", "peak_speed", "economy_of_volume"}
 
 
 def test_metrics_json_round_trip_is_exact():
@@ -86,21 +99,82 @@ def test_make_reference():
   times, forces = [10.0, 12.0, 14.0], [1.0, Unknown("no contact"), 2.0]
   results = [Metrics(time=t, peak_force=f, errors=0.0) for t, f in zip(times, forces, strict=True)]
   made = make_reference(results, "touch", seed=7)
-  assert made["metrics"]["time"] == {"mean": 12.0, "sd": 2.0, "n": 3}
-  assert made["metrics"]["peak_force"] == pytest.approx({"mean": 1.5, "sd": math.sqrt(0.5), "n": 2})
-  assert made["metrics"]["errors"] == {"mean": 0.0, "sd": 0.0, "n": 3}
+  assert made["metrics"]["time"] == {"mean": 12.0, "sd": 2.0, "n": 3, "limit": 14.0}
+  force = {"mean": 1.5, "sd": math.sqrt(0.5), "n": 2, "limit": 2.0}
+  assert made["metrics"]["peak_force"] == pytest.approx(force)
+  assert made["metrics"]["errors"] == {"mean": 0.0, "sd": 0.0, "n": 3, "limit": 0.0}
   assert "path_length" not in made["metrics"]
-  assert (made["seed"], made["n"], made["task"], made["version"]) == (7, 3, "touch", 1)
+  assert (made["seed"], made["n"], made["task"], made["version"]) == (7, 3, "touch", 2)
   assert json.loads(json.dumps(made, allow_nan=False)) == made
   assert make_reference(results[:1], "touch", 7)["metrics"]["time"]["sd"] is None
   equal = make_reference([Metrics(time=0.1)] * 3, "touch", 7)["metrics"]["time"]
-  assert equal == {"mean": 0.1, "sd": 0.0, "n": 3}  # the sum of three 0.1 rounds
+  # The sum of three 0.1 rounds.
+  assert equal == {"mean": 0.1, "sd": 0.0, "n": 3, "limit": 0.1}
+  fast = make_reference([Metrics(time=1.0, peak_speed=0.1)] * 2, "touch", 7)
+  assert "peak_speed" not in fast["metrics"]
+
+
+def test_limits_leave_95_percent_of_the_panel_within_all_of_them():
+  rng = np.random.RandomState(0)
+  rows = {"time": 10 + rng.rand(200), "path_length": rng.gamma(2.0, size=200)}
+  rows |= {"sparc": -rng.rand(200)}
+  panel = [Metrics(**{k: v[i] for k, v in rows.items()}, errors=0.0) for i in range(200)]
+  reference = make_reference(panel, "touch", 0)
+  passed = sum(score(one, reference, SUCCESS).proficient for one in panel)
+  assert 190 <= passed <= 192
+  # The same number of each metric's values is over: none pays for another's tail.
+  over = {k: sum(k in score(one, reference, SUCCESS).over for one in panel) for k in rows}
+  assert len(set(over.values())) == 1 and over["time"] in (2, 3)
+  assert _limits(reference)["errors"] == 0
+  # One freak of a panel does not make a limit.
+  panel[7] = Metrics(time=900.0, path_length=1.0, sparc=-0.5, errors=3.0)
+  again = make_reference(panel, "touch", 0)
+  assert _limits(again)["time"] < 11 and _limits(again)["errors"] == 0
+  assert not score(panel[7], again, SUCCESS).proficient
+
+
+def test_a_metric_that_some_of_the_panel_lack_is_not_asked_for():
+  panel = [Metrics(time=10.0 + i, peak_force=1.0 if i else Unknown("no contact")) for i in range(4)]
+  reference = make_reference(panel, "touch", 0)
+  result = score(Metrics(time=10.0), reference, SUCCESS)
+  assert result.proficient and result.missing == ()
+  assert not score(Metrics(time=10.0, peak_force=1.1), reference, SUCCESS).proficient
+  assert score(Metrics(peak_force=1.0), reference, SUCCESS).missing == ("time",)
+
+
+# The outcome.
+
+
+@pytest.mark.parametrize("outcome", ["error", "stopped", "time limit", "damage", "missed"])
+def test_what_did_not_succeed_scores_the_floor(outcome):
+  reference = _reference(time=(10, 2), path_length=(0.2, 0.1), peak_force=(2, 0.5))
+  best = Metrics(time=0.1, path_length=0.0, peak_force=0.0)  # a hand that stopped at once
+  worst = score(Metrics(time=1e9, path_length=1e9, peak_force=1e9), reference, SUCCESS)
+  failed = score(best, reference, outcome)
+  assert failed.composite == scoring.FLOOR < worst.composite == -10
+  assert not failed.proficient and failed.over == ()
+  assert score(Metrics(), reference, outcome).composite == scoring.FLOOR  # nothing is known
+  assert score(best, reference, SUCCESS).proficient
+
+
+def test_without_an_outcome_there_is_no_score():
+  result = score(Metrics(time=1.0, peak_force=1.0), _reference(peak_force=(2, 0.5)), None)
+  assert "does not say how it ended" in result.composite.reason and not result.proficient
+
+
+def test_two_in_a_row_and_ten_more():
+  assert scoring.trained([True] * 12) == 12
+  assert scoring.trained([True] * 11) is None
+  assert scoring.trained([True, False] * 30) is None  # never two in a row
+  # The ten need not be in a row, nor do those before the two count.
+  assert scoring.trained([True, False, True, True] + [False, True] * 10) == 24
+  assert scoring.trained([]) is None
 
 
 def test_composite_by_hand():
   reference = _reference(time=(10, 2), path_length=(0.2, 0.1), peak_force=(2, 0.5), errors=(1, 1))
   made = Metrics(time=14.0, path_length=0.15, peak_force=3.0, errors=2.0)
-  result = score(made, reference)
+  result = score(made, reference, SUCCESS)
   # z: time -2, path +0.5, force -2, errors -1.
   assert result.z == pytest.approx({"time": -2, "path_length": 0.5, "peak_force": -2, "errors": -1})
   assert result.group["safety"] == pytest.approx(-1.5)
@@ -111,74 +185,74 @@ def test_composite_by_hand():
   assert result.weight["outcome"] == 0 and result.weight["safety"] == pytest.approx(
     0.67 / (0.84 + w)
   )
-  assert result.limit == pytest.approx(
-    {"time": 14, "path_length": 0.4, "peak_force": 3.0, "errors": 3}
-  )
-  assert result.proficient and not result.missing
+  assert _limits(reference) == {"time": 14, "path_length": 0.4, "peak_force": 3.0, "errors": 3}
+  assert result.proficient and not result.missing and not result.over
 
 
-def test_composite_of_the_expert_mean_is_zero_and_at_the_limit_minus_two():
-  names = list(METRICS)
-  reference = _reference(**{n: (1.5, 0.25) for n in names})
-  assert score(Metrics(**{n: 1.5 for n in names}), reference).composite == 0
-  limits = score(Metrics(**{n: 1.5 for n in names}), reference).limit
+def test_composite_of_the_mean_is_zero_and_at_the_limits_minus_two():
+  reference = _reference(**{n: (1.5, 0.25) for n in SCORED})
+  assert score(Metrics(**{n: 1.5 for n in SCORED}), reference, SUCCESS).composite == 0
+  limits = _limits(reference)
   assert limits["sparc"] == 1.0 and limits["time"] == 2.0  # each in its worse direction
-  at_limit = score(Metrics(**limits), reference)
+  at_limit = score(Metrics(**limits), reference, SUCCESS)
   assert at_limit.composite == pytest.approx(-2) and at_limit.proficient
-  over = score(Metrics(**{**limits, "peak_force": 2.01}), reference)
-  assert not over.proficient
+  over = score(Metrics(**{**limits, "peak_force": 2.01, "sparc": 0.99}), reference, SUCCESS)
+  assert not over.proficient and set(over.over) == {"peak_force", "sparc"}
+  rounded = {**limits, "time": 2.0 * (1 + 1e-12)}
+  assert score(Metrics(**rounded), reference, SUCCESS).proficient
 
 
 def test_safety_outweighs_the_rest():
-  names = list(METRICS)
-  reference = _reference(**{n: (1.5, 0.25) for n in names})
+  reference = _reference(**{n: (1.5, 0.25) for n in SCORED})
 
   def moved(unsafe, by):
+    worse = {n: 1 if METRICS[n].better == "lower" else -1 for n in SCORED}
     return Metrics(
       **{
-        n: 1.5
-        + (by if (s.group == "safety") == unsafe else -by) * (1 if s.better == "lower" else -1)
-        for n, s in METRICS.items()
+        n: 1.5 + worse[n] * (by if (METRICS[n].group == "safety") == unsafe else -by)
+        for n in SCORED
       }
     )
 
-  assert score(moved(True, 0.25), reference).composite < 0  # unsafe, better in all else
-  assert score(moved(False, 0.25), reference).composite > 0
+  # Unsafe, better in all else; and the other way round.
+  assert score(moved(True, 0.25), reference, SUCCESS).composite < 0
+  assert score(moved(False, 0.25), reference, SUCCESS).composite > 0
 
 
 def test_unknown_metrics_drop_out_and_safety_must_be_known():
   reference = _reference(time=(10, 2), peak_force=(2, 0.5), force_breaches=(1, 1))
-  partly = score(Metrics(time=10.0, peak_force=2.5, force_breaches=Unknown("no limit")), reference)
+  some = Metrics(time=10.0, peak_force=2.5, force_breaches=Unknown("no limit"))
+  partly = score(some, reference, SUCCESS)
   assert partly.group["safety"] == pytest.approx(-1)
   assert partly.missing == ("force_breaches",) and not partly.proficient
-  unsafe = score(Metrics(time=10.0), reference)
+  unsafe = score(Metrics(time=10.0), reference, SUCCESS)
   assert isinstance(unsafe.composite, Unknown)
   assert "safety" in unsafe.composite.reason and not unsafe.proficient
   assert unsafe.weight["safety"] == 0
-  no_spread = _reference(time=(10, 2), peak_force=(2, 0.5), path_length=(0.1, None))
-  assert not score(Metrics(time=10.0, peak_force=2.0), no_spread).proficient
-  assert score(Metrics(time=10.0, peak_force=2.0, path_length=9.0), no_spread).proficient
-  nothing = score(Metrics(), _reference())
+  nothing = score(Metrics(), _reference(), SUCCESS)
   assert math.isnan(nothing.composite) and not nothing.proficient
 
 
-def test_a_reference_of_one_recording_gives_no_score():
+def test_a_reference_of_one_recording_has_limits_and_no_scale():
   made = Metrics(time=10.0, peak_force=2.0)
-  result = score(made, make_reference([made], "touch", 0))
-  assert math.isnan(result.composite) and not result.proficient and not result.missing
-  assert result.limit == {}
+  reference = make_reference([made], "touch", 0)
+  result = score(made, reference, SUCCESS)
+  assert math.isnan(result.composite) and result.proficient
+  assert not score(Metrics(time=10.0, peak_force=2.1), reference, SUCCESS).proficient
 
 
 def test_own_weights():
   reference = _reference(time=(10, 2), peak_force=(2, 0.5))
   weights = dict.fromkeys(WEIGHTS, 0) | {"time": 5}
-  assert score(Metrics(time=12.0, peak_force=9.0), reference, weights).composite == -1
-  with pytest.raises(ValueError, match="all 0"):
-    score(Metrics(), reference, dict.fromkeys(WEIGHTS, 0))
-  with pytest.raises(ValueError, match="weights are"):
-    score(Metrics(), reference, {"safety": 1})
-  with pytest.raises(ValueError, match="weights are"):
-    score(Metrics(), reference, WEIGHTS | {"time": -1})
+  slow = Metrics(time=12.0, peak_force=9.0)
+  assert score(slow, reference, SUCCESS, weights).composite == -1
+  for weights, match in (
+    (dict.fromkeys(WEIGHTS, 0), "all 0"),
+    ({"safety": 1}, "weights are"),
+    (WEIGHTS | {"time": -1}, "weights are"),
+  ):
+    with pytest.raises(ValueError, match=match):
+      score(Metrics(), reference, SUCCESS, weights)
 
 
 @pytest.mark.parametrize(
@@ -192,6 +266,9 @@ def test_own_weights():
     (("metrics", "time", "mean"), math.nan, "time.mean is nan"),
     (("metrics", "time", "mean"), True, "time.mean is True"),
     (("metrics", "time", "sd"), -1, "time.sd is -1"),
+    (("metrics", "time", "limit"), None, "time.limit is None"),
+    (("version",), 1, "version is 1, expected 2"),
+    (("metrics", "peak_speed"), {"mean": 1, "sd": 1, "limit": 1}, "peak_speed is not scored"),
     (("metrics", "time"), 3, "time.mean is None"),
   ],
 )
@@ -202,7 +279,7 @@ def test_bad_references_are_named(path, value, match):
     place = place[key]
   place[path[-1]] = value
   with pytest.raises(ValueError, match=match):
-    score(Metrics(time=1.0), reference)
+    score(Metrics(time=1.0), reference, SUCCESS)
   with pytest.raises(ValueError, match="format is 'list'"):
     scoring.check_reference([])
 
@@ -213,4 +290,4 @@ def test_references_are_those_of_the_tasks():
     reference = scoring.reference(name)
     assert reference is not None, name
     assert reference["task"] == name and reference["n"] >= 5
-    assert {"seed", "palpate", "mujoco"} < set(reference)
+    assert {"seed", "episodes", "performer", "palpate", "mujoco"} < set(reference)
