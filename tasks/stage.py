@@ -12,7 +12,9 @@ from palpate import Organ
 from palpate.tissue.config import Config
 
 STATE = mj.mjtState.mjSTATE_INTEGRATION
-_SETTLE = 0.3  # [s]
+# An organ is at rest when its fastest node is slower than so much [m/s]; it is waited for so long,
+# and looked at so often [s].
+_STILL, _SETTLE, _LOOK = 1e-7, 3.0, 0.1
 # What an episode may change in the model.
 _CHANGED = (
   "body_pos",
@@ -65,20 +67,25 @@ def compile_spec(spec: mj.MjSpec) -> mj.MjModel:
 def build(model: mj.MjModel, prefix: str, organ: str) -> Stage:
   """Returns the stage of a model; arguments as of `Physics.use`."""
   data = mj.MjData(model)
-  settle(model, data, prefix)
+  handle = Organ(model, data, organ)
+  settle(handle, prefix)
   state = np.empty(mj.mj_stateSize(model, STATE))
   mj.mj_getState(model, data, state, STATE)
   nominal = {name: operator.attrgetter(name)(model).copy() for name in _CHANGED}
-  return Stage(model, state, Organ(model, data, organ).config, nominal)
+  return Stage(model, state, handle.config, nominal)
 
 
-def settle(model: mj.MjModel, data: mj.MjData, prefix: str) -> None:
+def settle(organ: Organ, prefix: str) -> None:
   """Lets the organ come to rest under its weight, the instrument withdrawn; time starts anew."""
+  model, data = organ.model, organ.data
   name = f"{prefix}insertion"
   low = model.actuator(name).ctrlrange[0]
   data.ctrl[model.actuator(name).id] = low
   data.qpos[model.joint(name).qposadr[0]] = low
-  mj.mj_step(model, data, round(_SETTLE / model.opt.timestep))
+  for _ in range(round(_SETTLE / _LOOK)):
+    mj.mj_step(model, data, round(_LOOK / model.opt.timestep))
+    if np.linalg.norm(organ.xvel, axis=1).max() < _STILL:
+      break
   data.qvel[:] = 0
   data.qacc_warmstart[:] = 0
   data.time = 0

@@ -256,7 +256,7 @@ def _miss(w: Workspace, nodes: int, triangles: int):
 def register() -> int:
   """Registers the plugin with MuJoCo, once a process; returns its slot."""
   mjstruct.check()
-  weights.are_wrong()  # compiles a model, which must not be done while another is compiled
+  weights.are_wrong()  # compiles a model, which cannot be done while another is, or in a callback
   lib = mjstruct.library()
   slot = C.c_int(-1)
   if lib.mjp_getPlugin(NAME.encode(), C.byref(slot)):

@@ -7,6 +7,8 @@ flicker where a tool presses. MuJoCo 4.0 has it right, and is left alone.
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
 
+import functools
+
 import mujoco
 import numpy as np
 import warp as wp
@@ -76,7 +78,8 @@ _weigh = kernel(
 MODULE = _weigh.module.name
 
 
-def _are_wrong() -> bool:
+@functools.cache
+def are_wrong() -> bool:
   """Returns whether MuJoCo's weights are not barycentric, by one contact with a triangle."""
   slides = "".join(f'<joint type="slide" axis="{axis}"/>' for axis in ("1 0 0", "0 1 0", "0 0 1"))
   corners = "".join(
@@ -95,10 +98,6 @@ def _are_wrong() -> bool:
   found = np.linalg.norm(data.efc_J.reshape(-1, 3, 3)[0], axis=1)
   at = data.contact.pos[0]
   return not np.allclose(found, [1 - at[0] - at[1], at[0], at[1]], atol=1e-3)
-
-
-# Found out at import: nothing can be compiled while a Python callback is set.
-ARE_WRONG = _are_wrong()
 
 
 def make(model: int, data: int, flexes, flags: np.ndarray | None = None) -> Weights:
@@ -123,7 +122,7 @@ def make(model: int, data: int, flexes, flags: np.ndarray | None = None) -> Weig
 
 def launch(weights):
   """Gives the contacts their weights, where MuJoCo's are wrong."""
-  if ARE_WRONG:
+  if are_wrong():
     wp.launch(_weigh, dim=(1, 1), inputs=[1, 0, weights], device="cpu")
 
 

@@ -19,6 +19,7 @@ BENCHES = {
   "learning": "SAC on touch/easy",
   "locality": "what leaving out solved nodes would save",
   "loop": "the whole loop, mj_step with a probe on a windowed organ",
+  "loopholes": "what a search finds in the exercises that does not do the work",
   "peer": "mj_step in contact against MuJoCo's native flex",
   "preconditioner": "iterations with block Jacobi and multilevel",
   "press_error": "what is left of the press's force error",

@@ -67,7 +67,7 @@ def test_peer_is_beside_ours(tmp_path):
   for side in ("nodal", "window"):
     assert row[f"{side}_force_N"] == pytest.approx(row["peer_force_N"], rel=0.3)
     assert 0 < row[f"{side}_error"] < 0.05
-  if weights.ARE_WRONG:
+  if weights.are_wrong():
     assert row["peer_error"] > 1.5 * row["peer_right_error"] > 0
   else:
     assert row["peer_error"] == pytest.approx(row["peer_right_error"], rel=1e-6)

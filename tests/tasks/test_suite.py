@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from dm_control.rl import control
 from palpate import models, tasks
-from palpate.tasks import metrics, registry, scenes, suite
+from palpate.tasks import metrics, performer, registry, scenes, suite
 
 IDS = ["/".join(pair) for pair in tasks.ALL_TASKS]
 _cache = {}
@@ -181,15 +181,59 @@ def test_quick_forms_agree_with_the_plain_ones():
   down = np.array([0, 0, 0, 0.6, 1.0])
   for _ in range(60):
     env.step(np.clip(down, spec.minimum, spec.maximum))
-    elements = physics.data.ptr.contact.elem
-    touched = np.unique(elements[elements >= 0])
-    if len(touched):
+    if physics.data.ptr.ncon:
       break
   np.testing.assert_array_equal(physics.nodes(), physics.organ.xpos)  # not those before the step
-  a, b, c = np.moveaxis(physics.organ.xpos[elem[touched]], 1, 0)
+  model, data = physics.model.ptr, physics.data.ptr
+  triangles = {frozenset(e) for e in elem.tolist()}
+  touched = set()
+  for contact in data.contact:  # with a triangle of the window, whose corners are nodes
+    flex = int(max(contact.flex))
+    start = model.flex_elemdataadr[flex] + 3 * int(max(contact.elem))
+    at = data.flexvert_xpos[model.flex_vertadr[flex] + model.flex_elem[start : start + 3]]
+    away = np.linalg.norm(physics.nodes()[:, None] - at, axis=2)
+    assert away.min(axis=0).max() < 1e-9
+    touched.add(frozenset(away.argmin(axis=0).tolist()))
+  assert touched <= triangles
+  a, b, c = np.moveaxis(physics.nodes()[[sorted(e) for e in touched]], 1, 0)
   area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
   assert area > 0
   np.testing.assert_allclose(physics.contact_area(), area, rtol=1e-9)
+
+
+def test_hidden_is_what_a_ray_says():
+  env = load("retract/easy")
+  env.reset()
+  physics = env.physics
+  eye = physics.camera()[0]
+  random = np.random.RandomState(0)
+  points = physics.nodes().mean(axis=0) + 0.03 * random.normal(size=(60, 3))
+  wanted = []
+  for point in points:
+    hits = False
+    for corners in physics.nodes()[physics.organ.elem]:
+      # eye + t (point - eye) = a + u (b - a) + v (c - a)
+      a, b, c = corners
+      u, v, t = np.linalg.solve(np.stack([b - a, c - a, eye - point], axis=1), eye - a)
+      hits = hits or (u >= 0 and v >= 0 and u + v <= 1 and 0 < t < 0.999)
+    wanted.append(hits)
+  assert 0 < sum(wanted) < len(wanted)
+  np.testing.assert_array_equal(physics.hidden(points), wanted)
+
+
+def test_an_episode_begins_at_rest_and_wakes_under_the_tool():
+  for name in ("touch/easy", "grasp/easy"):
+    env = load(name)
+    env.reset()
+    assert np.linalg.norm(env.physics.organ.xvel, axis=1).max() < 1e-6  # [m/s]
+    act = performer.make(env)
+    timestep = env.reset()
+    awake = False
+    while not timestep.last() and not awake:
+      timestep = env.step(act(timestep))
+      awake = not env.physics.organ.asleep and env.physics.data.ptr.ncon > 0
+    assert awake
+    assert env.physics.organ.window_warning is None and env.physics.organ.error is None
 
 
 def test_sparse_reward_pays_success_alone():
