@@ -50,11 +50,11 @@ class Portable(mujoco.Physics):
       share_model: whether both have one mjModel; then use them in one thread
     """
     twin: Any = super().copy(share_model)
-    twin.resume(self.data.ptr, copy.deepcopy(self._rest()), self.organ.config)
+    twin.resume(self.data.ptr, copy.deepcopy(self._others()), self.organ.config)
     return twin
 
   def __getstate__(self) -> tuple:
-    return self.data, self._rest(), self.organ.config
+    return self.data, self._others(), self.organ.config
 
   def __setstate__(self, state: tuple) -> None:
     data, rest, config = state
@@ -62,7 +62,7 @@ class Portable(mujoco.Physics):
     super().__setstate__(data)
     self.resume(now, rest, config)
 
-  def _rest(self) -> dict[str, Any]:
+  def _others(self) -> dict[str, Any]:
     return {name: value for name, value in vars(self).items() if name not in _OWN}
 
   def resume(self, data: mj.MjData, rest: dict[str, Any], config: Config) -> None:

@@ -67,23 +67,24 @@ def compile_spec(spec: mj.MjSpec) -> mj.MjModel:
 def build(model: mj.MjModel, prefix: str, organ: str) -> Stage:
   """Returns the stage of a model; arguments as of `Physics.use`."""
   data = mj.MjData(model)
-  settle(model, data, prefix, organ)
+  handle = Organ(model, data, organ)
+  settle(handle, prefix)
   state = np.empty(mj.mj_stateSize(model, STATE))
   mj.mj_getState(model, data, state, STATE)
   nominal = {name: operator.attrgetter(name)(model).copy() for name in _CHANGED}
-  return Stage(model, state, Organ(model, data, organ).config, nominal)
+  return Stage(model, state, handle.config, nominal)
 
 
-def settle(model: mj.MjModel, data: mj.MjData, prefix: str, organ: str) -> None:
+def settle(organ: Organ, prefix: str) -> None:
   """Lets the organ come to rest under its weight, the instrument withdrawn; time starts anew."""
+  model, data = organ.model, organ.data
   name = f"{prefix}insertion"
   low = model.actuator(name).ctrlrange[0]
   data.ctrl[model.actuator(name).id] = low
   data.qpos[model.joint(name).qposadr[0]] = low
-  handle = Organ(model, data, organ)
   for _ in range(round(_SETTLE / _LOOK)):
     mj.mj_step(model, data, round(_LOOK / model.opt.timestep))
-    if np.linalg.norm(handle.xvel, axis=1).max() < _STILL:
+    if np.linalg.norm(organ.xvel, axis=1).max() < _STILL:
       break
   data.qvel[:] = 0
   data.qacc_warmstart[:] = 0

@@ -9,17 +9,17 @@ import mujoco
 import numpy as np
 import palpate
 import pytest
-from palpate import tasks
-from palpate.tasks import scenes
+from palpate import models, tasks, windows
 
-PRESSED = 45  # control steps after which the tool presses
+PRESSED = 0.1  # force on the tool from which on it is copied [N]
 
 
-def own_scene(window):
-  spec = scenes.build(scenes.Scene(nodes=250, targets=1))
-  if window:
-    palpate.add_windows(spec, "organ")
-  return spec
+def nodal_scene():
+  """Options of a scene whose organ has no windows."""
+  spec = models.load("liver", nodes=250, instruments=("probe",))
+  assert not any(windows.organs(spec).values())
+  spec.worldbody.add_site(name="target0")
+  return {"model": spec, "organ": "liver/liver"}
 
 
 @pytest.fixture(scope="module", params=["nodal", "windowed", "jaws"])
@@ -28,15 +28,17 @@ def pressing(request):
   if request.param == "jaws":
     env = tasks.load("grasp", "easy", task_kwargs={"random": 0})
   else:
-    options = {"random": 0, "damage": 100.0, "model": own_scene(request.param == "windowed")}
-    env = tasks.load("touch", "easy", task_kwargs=options)
+    scene = nodal_scene() if request.param == "nodal" else {}
+    env = tasks.load("touch", "easy", task_kwargs={"random": 0, "damage": 100.0, **scene})
   env.reset()
   random, count = np.random.RandomState(1), len(env.task.components)
-  actions = np.c_[random.uniform(-0.1, 0.1, (60, 3)), np.full(60, 0.5), np.full(60, -0.5)]
-  for action in actions[:PRESSED, :count]:
-    env.step(action)
-  assert env.physics.data.ncon and env.physics.peak_force > 0
-  return env, actions[PRESSED:, :count]
+  actions = np.c_[random.uniform(-0.1, 0.1, (60, 3)), np.full(60, 0.3), np.full(60, -0.5)]
+  for _ in range(300):
+    if env.physics.peak_force > PRESSED:
+      break
+    env.step(np.array([0.0, 0.0, 0.0, 0.3, -0.5])[:count])
+  assert env.physics.data.ncon
+  return env, actions[:15, :count]
 
 
 def observe(env):
@@ -126,10 +128,9 @@ def test_what_was_configured_comes_along(pressing):
 
 
 def test_another_process_goes_on_to_the_bit(tmp_path):
-  options = {"random": 0, "model": own_scene(window=True)}
-  env = tasks.load("touch", "easy", task_kwargs=options)
+  env = tasks.load("touch", "easy", task_kwargs={"random": 0})
   env.reset()
-  for _ in range(PRESSED):
+  for _ in range(45):
     env.step(np.array([0.0, 0.0, 0.0, 0.5]))
   assert env.physics.data.ncon
   (tmp_path / "env.pkl").write_bytes(pickle.dumps(env))
@@ -150,13 +151,14 @@ sys.stdout.buffer.write(env.physics.integration_state().tobytes())
 def test_data_and_models_alone_come_out_of_a_pickle_alive(pressing):
   env, _ = pressing
   physics = copy.deepcopy(env).physics
+  name = physics.organ_name
   model, data = physics.model.ptr, physics.data.ptr
   mujoco.mj_step(model, data)
   twin = pickle.loads(pickle.dumps(data))
-  organ = palpate.Organ(twin.model, twin, "organ")
+  organ = palpate.Organ(twin.model, twin, name)
   for _ in range(20):
     mujoco.mj_step(model, data)
     mujoco.mj_step(twin.model, twin)
-  np.testing.assert_array_equal(organ.xpos, palpate.Organ(model, data, "organ").xpos)
+  np.testing.assert_array_equal(organ.xpos, palpate.Organ(model, data, name).xpos)
   mujoco.mj_resetData(twin.model, twin)
-  assert palpate.Organ(model, data, "organ").error is None and organ.error is None
+  assert palpate.Organ(model, data, name).error is None and organ.error is None
