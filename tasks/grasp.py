@@ -2,13 +2,19 @@
 
 Own observations: `target` (3,), from the tip to the site to grasp [m]; `height` (1,), of the
 site above its place at rest, towards the trocar, minus the height to lift to [m]; `held` (1,),
-share of the holding time done [-]; `grasped` (1,), whether both jaws press on something.
+share of the holding time done [-]; `grasped` (1,), whether the jaws hold the site.
 
-Progress: 0.2 * closeness until it is grasped; then 0.3 + 0.4
-* min(height / lift, 1) + 0.2 * held; 0.9 once held long enough, 1 on release. Grasped means that
-both jaws press within 12 mm of the site. Success: released below half of the height after
-holding. Slipping from closed jaws and letting go above half of the height start the holding
-again. Failure: a force above the damage limit, jaws included, or the time limit.
+Grasped means that there is tissue between the jaws, which are told to close on it: both inner
+faces press on it with 0.2 N or more, it keeps them open, and the site is within 12 mm of the tip.
+It stays grasped as long as all that is so and the site has not moved in the jaws by more than half
+of the lift, from where it was grasped, and again from where it was when the holding was done.
+
+Progress: 0.2 * closeness until it is grasped; then 0.3 + 0.4 * min(height / lift, 1) + 0.2 * held;
+0.9 + 0.05 * (1 - min(height / lift, 1)) once held long enough, 1 on release. Only time under the
+force limit counts as held. Lowered means to rest for 0.2 s, grasped, between a quarter of the lift
+below the site's place and 0.4 of the lift above it. Success: held, lowered, and let go with the
+site between there and half of the lift. Slipping from the jaws and letting go before it is lowered
+start the holding again. Failure: a force above the damage limit, jaws included, or the time limit.
 """
 
 import dataclasses
@@ -30,6 +36,8 @@ FUNDUS = Scene(
   camera=(-0.09, 0.072, 0.054),
 )
 REACH = 0.012  # of the jaws around the site [m]
+_REST = 0.2  # at a low height before release [s]
+_LOW = (-0.25, 0.4, 0.5)  # heights it rests between, and is let go below, as shares of the lift
 
 
 @SUITE.add("benchmarking", "easy")
@@ -57,10 +65,62 @@ def hard(time_limit=40, random=None, environment_kwargs=None, **kwargs):
   return base.make(task, time_limit, environment_kwargs)
 
 
-class Grasp(Task):
-  """Grasp, lift, hold, lower, release."""
+class Hold(Task):
+  """What the exercises of the grasper share: a site that is to be held between the jaws.
+
+  Attributes:
+    site: triangle to grasp
+    grasped: whether the jaws hold it, see the module's head
+    closing: whether they are told to close
+    slip: how far it may move in the jaws [m]
+  """
 
   watch = ("miss", "unintended_contact", "drop")
+  site: int
+  slip = 0.005
+
+  def begin(self, physics: Physics) -> None:
+    """Draws the site."""
+    place, _ = self.place_of_work(physics)
+    self.site = int(self.random.choice(place))
+    self.grasped, self.closing = False, False
+    self.distance0 = self.distance(physics)
+
+  def distance(self, physics: Physics) -> float:
+    """Returns how far the tip is from the site [m]."""
+    return float(np.linalg.norm(physics.point(self.site) - physics.tip_pos()))
+
+  def follow(self, physics: Physics) -> bool:
+    """Finds out whether the site is grasped; returns whether it was until now, and is no more."""
+    before, closing, distance = self.grasped, physics.closing(), self.distance(physics)
+    holds = closing and physics.holds()
+    if before:
+      moved = physics.from_tip(physics.point(self.site)) - self._place
+      self.grasped = holds and float(np.linalg.norm(moved)) < self.slip
+    elif holds and distance < REACH:
+      self.grasped = True
+      self.hold_here(physics)
+      self.event(physics, "target", distance, "grasp")
+    if closing and not self.closing and distance >= 2 * REACH:
+      self.event(physics, "miss", distance, "closed off the site")
+    self.closing = closing
+    return before and not self.grasped
+
+  def hold_here(self, physics: Physics) -> None:
+    """Takes where the site is in the jaws as the place that it may slip from."""
+    self._place = physics.from_tip(physics.point(self.site))
+
+  def dropped(self, physics: Physics) -> None:
+    """Reports that the tissue was lost."""
+    self.event(physics, "drop", label="slipped" if self.closing else "let go")
+
+  def recorded(self, physics: Physics) -> dict[str, float]:
+    """Returns whether the jaws are told to close and whether they hold."""
+    return {"grip": float(self.closing), "held": float(self.grasped)}
+
+
+class Grasp(Hold):
+  """Grasp, lift, hold, lower, release."""
 
   def __init__(self, scene: Scene, random=None, *, name: str, lift: float, hold: float, **kwargs):
     """Makes the task.
@@ -74,23 +134,26 @@ class Grasp(Task):
       **kwargs: see Task; the force limit counts the jaws too
     """
     self.name, self.targets, self.lift, self.hold = name, 1, lift, hold
+    self.slip = 0.5 * lift
     kwargs = {"spread": 0.012, "force_limit": 4.0, "damage": 8.0, **kwargs}
     super().__init__(dataclasses.replace(scene, targets=1), random, **kwargs)
 
   def begin(self, physics: Physics) -> None:
     """Draws the site."""
-    place, _ = self.place_of_work(physics)
-    self.site = int(self.random.choice(place))
+    super().begin(physics)
     self.rest = physics.point(self.site)
     self.up = physics.trocar().mat[:, 2]
-    self.held, self.done = 0.0, False
-    self.grasped, self._closing = False, False
-    self.distance0 = self.distance(physics)
+    self._again()
     physics.mark(0, self.rest)
 
-  def distance(self, physics: Physics) -> float:
-    """Returns how far the tip is from the site [m]."""
-    return float(np.linalg.norm(physics.point(self.site) - physics.tip_pos()))
+  def _again(self) -> None:
+    """Starts the holding again."""
+    self.held, self.done, self.lowered, self._letting = 0.0, False, 0.0, False
+
+  @property
+  def rests(self) -> bool:
+    """Whether the site was held, lowered and rests there, ready to be let go."""
+    return self.lowered >= _REST - 1e-9
 
   def height(self, physics: Physics) -> float:
     """Returns how far the site is above its place at rest, towards the trocar [m]."""
@@ -99,34 +162,39 @@ class Grasp(Task):
   def advance(self, physics: Physics) -> float:
     """Follows the grasp from closing to release."""
     physics.mark(0, physics.point(self.site))
-    height = self.height(physics)
-    closing = physics.closing()
-    grasped = physics.holds() and self.distance(physics) < REACH and closing
-    if self.grasped and not physics.holds():
-      low = height < 0.5 * self.lift
-      if self.done and low and not closing:
-        self.outcome = "success"
-        self.grasped = False
-        return 1.0
-      self.event(physics, "drop", label="slipped" if closing else "let go")
-      self.held, self.done = 0.0, False
-    if closing and not self._closing and self.distance(physics) >= 2 * REACH:
-      self.event(physics, "miss", self.distance(physics), "closed off the site")
-    if grasped and not self.grasped:
-      self.event(physics, "target", self.distance(physics), "grasp")
-    self.grasped = (grasped or self.grasped) and physics.holds()
-    self._closing = closing
-    if self.grasped and height >= self.lift:
-      self.held += base.CONTROL_TIMESTEP
-      self.done = self.done or self.held >= self.hold - 1e-9
-    elif not self.done:
-      self.held = 0.0
+    share = self.height(physics) / self.lift
+    if self.follow(physics):
+      self._letting = self.rests and not self.closing
+      if not self._letting:
+        self._lose(physics)
+    if self._letting and not _LOW[0] <= share <= _LOW[2]:
+      self._lose(physics)
+    if self._letting and not physics.holds():
+      self.outcome = "success"
+      return 1.0
+    if self.grasped:
+      self._count(physics, share)
+    share = float(np.clip(share, 0, 1))
     if self.done:
-      return 0.9
+      return 0.9 + 0.05 * (1 - share)
     if not self.grasped:
       return 0.2 * base.closeness(self.distance(physics), self.distance0)
-    share = float(np.clip(height / self.lift, 0, 1))
     return 0.3 + 0.4 * share + 0.2 * min(self.held / self.hold, 1.0)
+
+  def _lose(self, physics: Physics) -> None:
+    self.dropped(physics)
+    self._again()
+
+  def _count(self, physics: Physics, share: float) -> None:
+    """Counts the time that the site is held high, and then at rest low."""
+    gentle = physics.peak_force <= self.force_limit
+    if not self.done:
+      self.held = self.held + self.control_timestep * gentle if share >= 1 else 0.0
+      self.done = self.held >= self.hold - 1e-9
+      if self.done:
+        self.hold_here(physics)
+    low = self.done and _LOW[0] <= share <= _LOW[1]
+    self.lowered = self.lowered + self.control_timestep if low else 0.0
 
   def observe(self, physics: Physics) -> dict[str, np.ndarray]:
     """Returns target, height, held and grasped."""
@@ -136,10 +204,6 @@ class Grasp(Task):
       "held": np.array([min(self.held / self.hold, 1.0)]),
       "grasped": np.array([float(self.grasped)]),
     }
-
-  def recorded(self, physics: Physics) -> dict[str, float]:
-    """Returns whether the jaws are told to close and whether they hold."""
-    return {"grip": float(physics.closing()), "held": float(self.grasped)}
 
   def reference_length(self) -> float:
     """Returns the way to the site, up and down again [m]."""
@@ -155,14 +219,15 @@ class Grasp(Task):
       yield from p.wait(p.style.delay)
       goal = self.lift + 0.0015 + 0.3 * p.style.overshoot * self.lift
       while self.grasped and not self.done:  # up, and hold
-        contact += base.CONTROL_TIMESTEP
+        contact += self.control_timestep
         missing = goal - self.height(physics)
-        p.tip = p.tip + float(np.clip(3 * missing, -speed, speed)) * base.CONTROL_TIMESTEP * up
+        p.tip = p.tip + float(np.clip(3 * missing, -speed, speed)) * self.control_timestep * up
         p.grip(contact)
         yield p.step()
       yield from p.wait(p.style.delay)
-      while self.grasped and self.height(physics) > 0.2 * self.lift:
-        p.tip = p.tip - speed * base.CONTROL_TIMESTEP * up
+      while self.grasped and not self.rests:
+        if self.height(physics) > 0.2 * self.lift:
+          p.tip = p.tip - speed * self.control_timestep * up
         p.grip(contact)
         yield p.step()
       yield from p.open()

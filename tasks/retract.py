@@ -2,12 +2,13 @@
 
 Own observations: `target` (3,), from the tip to the site to grasp [m]; `hidden` (3,), from the
 tip to the hidden disc [m]; `visible` (1,), share of the disc that the laparoscope sees [-];
-`held` (1,), share of the holding time done [-]; `grasped` (1,), whether the jaws hold the organ.
+`held` (1,), share of the holding time done [-]; `grasped` (1,), whether the jaws hold the site, as
+in `grasp`; here it may slip by 5 mm.
 
-Progress: 0.15 * closeness until it is grasped; then 0.3 + 0.5
-* visible / wanted + 0.2 * held. Only the organ hides: instruments are not looked at. Success:
-the wanted share is seen for the holding time, the organ being held. Failure: a force above the
-damage limit, jaws included, or the time limit.
+Progress: 0.15 * closeness until it is grasped; then 0.3 + 0.5 * visible / wanted + 0.2 * held. Only
+the organ hides: instruments are not looked at. Success: the wanted share is seen for the holding
+time, the site being grasped and the force under its limit; what is above it does not count.
+Failure: a force above the damage limit, jaws included, or the time limit.
 """
 
 import dataclasses
@@ -16,8 +17,8 @@ import numpy as np
 from dm_control.utils import containers
 
 from . import base
-from .base import Physics, Task
-from .grasp import FUNDUS, REACH
+from .base import Physics
+from .grasp import FUNDUS, Hold
 from .performer import Performer, Script
 from .scenes import Scene
 
@@ -51,10 +52,8 @@ def hard(time_limit=40, random=None, environment_kwargs=None, **kwargs):
   return base.make(task, time_limit, environment_kwargs)
 
 
-class Retract(Task):
+class Retract(Hold):
   """Pull tissue aside and hold it."""
-
-  watch = ("miss", "unintended_contact", "drop")
 
   def __init__(
     self,
@@ -85,12 +84,10 @@ class Retract(Task):
 
   def begin(self, physics: Physics) -> None:
     """Draws the site to grasp and hides the disc behind the organ's edge, far from the trocar."""
-    place, center = self.place_of_work(physics)
-    self.site = int(self.random.choice(place))
+    super().begin(physics)
     self.held, self.visible = 0.0, 0.0
-    self.grasped, self._closing = False, False
+    _, center = self.place_of_work(physics)
     self.disc = self._hide(physics, center)
-    self.distance0 = self.distance(physics)
     physics.mark(0, self.disc[0], now=True, size=self.radius)
     physics.mark(1, physics.point(self.site))
 
@@ -112,30 +109,22 @@ class Retract(Task):
     ring = np.cos(turn)[:, None] * right + np.sin(turn)[:, None] * up
     return np.concatenate([middle[None], middle + 0.9 * self.radius * ring])
 
-  def distance(self, physics: Physics) -> float:
-    """Returns how far the tip is from the site to grasp [m]."""
-    return float(np.linalg.norm(physics.point(self.site) - physics.tip_pos()))
-
   def advance(self, physics: Physics) -> float:
     """Follows the grasp and what is seen."""
     physics.mark(1, physics.point(self.site))
-    closing = physics.closing()
-    holds = physics.holds()
-    if self.grasped and not holds:
-      self.event(physics, "drop", label="slipped" if closing else "let go")
-    if closing and not self._closing and self.distance(physics) >= 2 * REACH:
-      self.event(physics, "miss", self.distance(physics), "closed off the site")
-    grasped = holds and closing and (self.grasped or self.distance(physics) < REACH)
-    if grasped and not self.grasped:
-      self.event(physics, "target", self.distance(physics), "grasp")
-    self.grasped, self._closing = grasped, closing
+    if self.follow(physics):
+      self.dropped(physics)
     self.visible = 1 - float(physics.hidden(self.disc).mean())
     seen = self.visible >= self.wanted - 1e-9
-    self.held = self.held + base.CONTROL_TIMESTEP if seen and grasped else 0.0
+    gentle = physics.peak_force <= self.force_limit
+    if not (seen and self.grasped):
+      self.held = 0.0
+    elif gentle:
+      self.held += self.control_timestep
     if self.held >= self.hold - 1e-9:
       self.outcome = "success"
       return 1.0
-    if not grasped:
+    if not self.grasped:
       return 0.15 * base.closeness(self.distance(physics), self.distance0)
     return 0.3 + 0.5 * min(self.visible / self.wanted, 1.0) + 0.2 * self.held / self.hold
 
@@ -148,10 +137,6 @@ class Retract(Task):
       "held": np.array([min(self.held / self.hold, 1.0)]),
       "grasped": np.array([float(self.grasped)]),
     }
-
-  def recorded(self, physics: Physics) -> dict[str, float]:
-    """Returns whether the jaws are told to close and whether they hold."""
-    return {"grip": float(physics.closing()), "held": float(self.grasped)}
 
   def reference_length(self) -> float:
     """Returns the way to the site and aside by four radii of the disc [m]."""
@@ -170,13 +155,13 @@ class Retract(Task):
       far, extra = 0.0, 0.002 * (1 + 4 * p.style.overshoot)
       enough = None
       while self.grasped:
-        contact += base.CONTROL_TIMESTEP
+        contact += self.control_timestep
         if self.visible >= self.wanted - 1e-9:
           enough = far + extra if enough is None else enough
         elif enough is not None and far >= enough:
           enough = None  # the organ slid back
         if far < (0.035 if enough is None else enough):
-          far += speed * base.CONTROL_TIMESTEP
+          far += speed * self.control_timestep
         p.tip = start + far * along
         p.grip(contact)
         yield p.step()

@@ -59,7 +59,7 @@ class Scene:
     camera: from there to the camera [m]  (3,)
     targets: number of target sites
     inclusion: hidden stiff place: position in the world [m] (3), radius [m], factor on Young's
-      modulus and factor on the force; None for healthy tissue
+      modulus; None for healthy tissue. Without gravity: the organ would sag less where it is stiff
   """
 
   organ: str = "liver"
@@ -83,7 +83,8 @@ def surface(organ: str, nodes: int, variant: int | None) -> tuple[np.ndarray, np
 
 
 @functools.lru_cache(maxsize=32)
-def _pins(organ: str, nodes: int, variant: int | None) -> tuple[int, ...]:
+def pins(organ: str, nodes: int, variant: int | None) -> tuple[int, ...]:
+  """Returns the nodes that do not move."""
   vertices, _ = surface(organ, nodes, variant)
   patches = shapes.patches(organ, vertices @ _TURN, variant)
   return tuple(int(i) for i in np.unique(np.concatenate(list(patches.values()))))
@@ -120,13 +121,15 @@ def build(scene: Scene) -> mujoco.MjSpec:
     (vertices, triangles),
     config=tissue.keys() | {"young": young, "device": "cpu", "tolerance": _TOLERANCE},
     contact=_CONTACT,
-    pin=_pins(scene.organ, scene.nodes, scene.variant),
+    pin=pins(scene.organ, scene.nodes, scene.variant),
     digits=7,
     mass=tissue.mass,
     radius=0.001,
     rgba=catalog.entry(scene.organ).rgba,
   )
   spec = mujoco.MjSpec.from_string(_xml(flex, center, scene))
+  if scene.inclusion is not None:
+    spec.option.gravity = np.zeros(3)
   port = center + scene.port
   trocar.attach(
     spec, scene.instrument, f"{scene.instrument}/", pos=port, quat=trocar.aim(port, center)

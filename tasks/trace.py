@@ -3,10 +3,13 @@
 Own observations: `target` (3,), from the tip to the next point of the curve [m]; `ahead` (3, 3),
 from the tip to points 5, 10 and 15 mm further along the curve [m].
 
-Progress: 0.1 * closeness to the curve's start until the first point is touched, then 0.1 + 0.9 *
-share of the curve done. The curve is done up to a point when the tip presses with 0.02 N or more
-within the tolerance of it, in order. Success: all of it. Failure: a force above the damage limit,
-or the time limit.
+Progress: 0.1 * closeness to the curve's start until it is touched, then 0.1 + 0.9 * share of the
+curve's length traced. Tracing starts within the tolerance of the curve's start, and goes on as far
+as the tip gets along the curve while it presses with 0.02 N or more within the tolerance of it,
+step after step. Where contact is lost or the curve left, it goes on from what is traced already:
+what is skipped in the air does not count, but for gaps of 3 mm at most, together a tenth of the
+length. Success: all of it, to the last 1.5 mm. Failure: a force above the damage limit, or the time
+limit.
 """
 
 import dataclasses
@@ -25,6 +28,8 @@ SUITE = containers.TaggedTasks()
 STOMACH = Scene(organ="stomach", center="body", port=(0.03, 0.045, 0.12), camera=(-0.05, 0.1, 0.14))
 CONTACT = 0.02  # [N]
 _STEP = 0.0015  # between points of the curve [m]
+_GAP = (0.003, 0.1)  # largest gap in contact [m], and share of the length that all may add up to
+_WINDOW = 4  # points before and after the end of what is traced, to look for the tip between
 _ATTEMPTS = 40
 _FACING = 0.7  # least cosine between the surface's normal and the way to the trocar
 _MARKS = 30  # spheres that draw the curve
@@ -100,8 +105,10 @@ class Trace(Task):
     else:
       raise ValueError(f"{self.name}: no room for the curve under the shaft")
     gaps = np.linalg.norm(np.diff(self.curve, axis=0), axis=1)
-    self.length = float(gaps.sum())
-    self.done, self._touching = 0, False
+    self.arc = np.concatenate([[0.0], gaps.cumsum()])
+    self.traced, self.skipped = 0.0, 0.0
+    self.tracing, self._touching = False, False
+    self.now = self.curve
     self.distance0 = self.distance(physics)
     for i, k in enumerate(np.linspace(0, len(self.curve) - 1, _MARKS).round().astype(int)):
       physics.mark(i, self.curve[k], size=0.0015)
@@ -146,40 +153,67 @@ class Trace(Task):
     keep = np.unique(np.searchsorted(along, np.arange(0, along[-1], _STEP)))
     return np.array(points)[keep], np.array(triangles)[keep], np.array(weights)[keep]
 
-  def now(self, physics: Physics) -> np.ndarray:
-    """Returns where the curve is on the deformed organ [m]  (npoint, 3)."""
-    corner = physics.nodes()[physics.organ.elem[self.triangles]]
-    return np.einsum("ij,ijk->ik", self.weights, corner)
+  @property
+  def done(self) -> int:
+    """Number of points of the curve that are traced."""
+    return int(np.searchsorted(self.arc, self.traced, side="right")) if self.traced else 0
 
   def distance(self, physics: Physics) -> float:
     """Returns how far the tip is from the next point of the curve [m]."""
     k = min(self.done, len(self.curve) - 1)
-    return float(np.linalg.norm(self.now(physics)[k] - physics.tip_pos()))
+    return float(np.linalg.norm(self.now[k] - physics.tip_pos()))
 
   def advance(self, physics: Physics) -> float:
-    """Follows the tip along the curve."""
-    touching = physics.peak_force > CONTACT
-    curve, tip = self.now(physics), physics.tip_pos()
-    if touching:
-      while self.done < len(curve) and np.linalg.norm(curve[self.done] - tip) <= self.tolerance:
-        self.done += 1
-    elif self._touching and 0 < self.done < len(curve):
+    """Follows the tip along the curve, which moves with the organ."""
+    corner = physics.nodes()[physics.organ.elem[self.triangles]]
+    self.now = np.einsum("ij,ijk->ik", self.weights, corner)
+    tip = physics.tip_pos()
+    touching = float(np.linalg.norm(physics.contact_force())) > CONTACT
+    place, off = self._project(tip)
+    self._trace(place, touching and off <= self.tolerance)
+    if self._touching and not touching and self.traced:
       self.event(physics, "drop", label="contact lost")
     if touching and not self._touching:
-      off = float(cKDTree(curve).query(tip)[0])
+      off = float(cKDTree(self.now).query(tip)[0])
       if off > self.tolerance:
         self.event(physics, "miss", off)
     self._touching = touching
-    if self.done == len(curve):
+    if self.traced >= self.arc[-1] - _STEP:
       self.outcome = "success"
       return 1.0
-    if not self.done:
+    if not self.traced:
       return 0.1 * base.closeness(self.distance(physics), self.distance0)
-    return 0.1 + 0.9 * self.done / len(curve)
+    return 0.1 + 0.9 * self.traced / float(self.arc[-1])
+
+  def _trace(self, place: float, on: bool) -> None:
+    """Goes on to a place along the curve [m], where the tip presses on it."""
+    gap = place - self.traced
+    if on and not self.tracing and gap > 0:
+      if not self.traced:  # the start
+        on = place <= self.tolerance
+      else:
+        on = gap <= _GAP[0] and self.skipped + gap <= _GAP[1] * self.arc[-1]
+        self.skipped += gap * on
+    self.tracing = on
+    if on:
+      self.traced = max(self.traced, place)
+
+  def _project(self, tip: np.ndarray) -> tuple[float, float]:
+    """Returns how far along the curve the tip is, near what is traced, and how far off it [m]."""
+    k = max(self.done - 1, 0)
+    part = slice(max(k - _WINDOW, 0), k + _WINDOW + 1)
+    start, arc = self.now[part], self.arc[part]
+    along = np.diff(start, axis=0)
+    offset = tip - start[:-1]
+    share = np.einsum("ij,ij->i", offset, along) / np.einsum("ij,ij->i", along, along)
+    share = np.clip(share, 0.0, 1.0)
+    off = np.linalg.norm(offset - share[:, None] * along, axis=1)
+    i = int(off.argmin())
+    return float(arc[i] + share[i] * (arc[i + 1] - arc[i])), float(off[i])
 
   def observe(self, physics: Physics) -> dict[str, np.ndarray]:
     """Returns target and ahead."""
-    curve = self.now(physics) - physics.tip_pos()
+    curve = self.now - physics.tip_pos()
     last = len(curve) - 1
     further = [min(self.done + round(d / _STEP), last) for d in (0.005, 0.01, 0.015)]
     return {"target": curve[min(self.done, last)], "ahead": curve[further]}
@@ -190,23 +224,25 @@ class Trace(Task):
 
   def reference_length(self) -> float:
     """Returns the length of the curve and of the way to it [m]."""
-    return self.length + self.distance0
+    return float(self.arc[-1]) + self.distance0
 
   def expert(self, p: Performer) -> Script:
     """Goes along the curve in light contact."""
     physics = p.physics
     up = physics.trocar().mat[:, 2]
     yield from p.move(self.curve[0] + 0.01 * up)
-    yield from p.push(0.08, -up, lambda: self.done > 0, most=3.0)
+    yield from p.push(0.08, -up, lambda: self.tracing, most=3.0)
     # Pulls a point along the curve and keeps the force by its height.
     at, height, contact = 0.0, float((p.tip - self.curve[0]) @ up), 0.0
-    step = 0.02 * p.style.speed * base.CONTROL_TIMESTEP / _STEP
-    while self.done < len(self.curve):
-      contact += base.CONTROL_TIMESTEP
-      at = min(at + step, self.done + 2.0, len(self.curve) - 1)
+    step = 0.02 * p.style.speed * self.control_timestep / _STEP
+    while self.outcome is None:
+      contact += self.control_timestep
+      # Where contact was lost it waits, or goes back behind what is traced.
+      most = self.done + 3.0 if self.tracing else max(at - 0.5, self.done - 3.0)
+      at = min(at + step, max(most, 0.0), len(self.curve) - 1)
       force = float(np.linalg.norm(physics.contact_force()))
-      error = 0.12 * p.excess(contact) - force
-      height -= float(np.clip(0.08 * error, -0.01, 0.01)) * base.CONTROL_TIMESTEP
+      error = 0.15 * p.excess(contact) - force
+      height -= float(np.clip(0.08 * error, -0.01, 0.01)) * self.control_timestep
       k = int(at)
       ahead = self.curve[min(k + 1, len(self.curve) - 1)]
       rest = self.curve[k] + (at - k) * (ahead - self.curve[k])

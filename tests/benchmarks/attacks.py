@@ -16,7 +16,7 @@ from palpate import tasks
 
 FUZZ = ("configurations", "meshes", "files")
 THREADS = (2, 4, 16)
-BLOCK = 1000  # seeds a case
+BLOCK = 250  # seeds a case
 LIVES, ACTS = 8, 6000
 WHAT = {
   "configurations": "random keys",
@@ -112,4 +112,4 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
   return [results.page(out / "attacks.md", "What attacks break", about, lines)]
 
 
-BENCH = Bench("attacks", stages, run, report=report, arguments=arguments)
+BENCH = Bench("attacks", stages, run, report=report, arguments=arguments, limit=3600.0)

@@ -7,7 +7,7 @@ import subprocess
 import sys
 
 import pytest
-from benchmarks import performances, results, run, skill
+from benchmarks import loopholes, performances, results, run, skill
 
 HERE = pathlib.Path(__file__).parent
 
@@ -52,6 +52,26 @@ def test_kept_results_are_of_the_tasks():
     assert len(set(rows)) == len(rows) and set(rows) <= set(names)
   for row in table(HERE / "results" / "experts.csv"):
     assert float(row["percent"]) >= 95, row["task"]
+
+
+@pytest.mark.parametrize("kind", ["blind", "aimed"])
+def test_a_search_finds_no_success_without_the_work(kind):
+  pytest.importorskip("cma")
+  tried = loopholes.Attack("retract/easy", kind, length=0.4)
+  value = lambda policy: tried.play(policy, 0)[0]  # noqa: E731
+  for search in loopholes.SEARCHES.values():
+    best = search(value, tried.size, 3, 0)
+    total, won, honest = tried.play(best, 0)
+    assert abs(best).max() <= 1 and total < 0.3 and won == honest
+
+
+@pytest.mark.slow
+def test_loopholes_writes_its_page(tmp_path):
+  pytest.importorskip("cma")
+  assert command("loopholes", "--tries", 20, "--tasks", "retract/easy", "-o", tmp_path) == 0
+  rows = table(tmp_path / "loopholes.csv")
+  assert len(rows) == 4 and not any(row["policies_without_the_work"] for row in rows)
+  assert "| retract/easy | blind |" in (tmp_path / "loopholes.md").read_text()
 
 
 def test_learning_writes_table_and_curve(tmp_path):
