@@ -23,8 +23,13 @@ def register() -> int:
   """Registers the plugin with MuJoCo, once a process; returns its slot.
 
   `import palpate` does it, except in the `palpate` command, whose help needs neither MuJoCo nor
-  Warp. From here on Warp speaks of warnings and errors only; `warp.config.log_level` changes it.
+  Warp. Where there is no screen and MUJOCO_GL is not set, it is set to what draws without one;
+  MuJoCo reads it when it is imported. From here on Warp speaks of warnings and errors only;
+  `warp.config.log_level` changes it.
   """
+  from . import screen
+
+  screen.prepare_gl()  # before MuJoCo is imported
   from . import organ, windows
   from .engine import plugin
   from .tissue import device

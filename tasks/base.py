@@ -2,7 +2,7 @@
 # pyright: reportAttributeAccessIssue=false
 """What every exercise shares: `Physics` answers questions, `Task` decides.
 
-Action, every component in [-1, 1]; each step of 0.02 s moves the targets of the instrument's
+Action, every component in [-1, 1]; each control step (0.02 s) moves the targets of the instrument's
 position drives by the action times the rate:
 
 | component | moves the target of | at 1 |
@@ -14,37 +14,25 @@ position drives by the action times the rate:
 | 4 `jaw` (grasper) | opening of the jaws, not a rate: -1 squeezes closed jaws, 1 is wide open | |
 | 4 `report` (palpation) | above 0.5: the inclusion is here | |
 
-Observations, all float64 in SI units and world axes; every domain adds its own:
+Observations are in groups to choose from, see `observation` and docs/environments.md.
 
-| name | shape | what |
-|---|---|---|
-| `joints` | 4 | pitch, yaw, roll [rad], insertion [m] |
-| `joint_vel` | 4 | their velocities [rad/s], [m/s] |
-| `drive` | 4 | target of the drive minus position [rad], [m]: what the hand feels |
-| `tip_pos`, `tip_vel` | 3 | of the instrument's tip [m], [m/s] |
-| `contact_force` | 3 | on the instrument below the shaft [N] |
-| `peak_force` | 1 | since the last observation: largest force, or a jaw's mean if it is more [N] |
-| `gripper` | 4 | grasper only: opening [rad], its target [rad], force on the left, right jaw [N] |
-| `nodes_near` | (8, 3) | the organ's nodes nearest to the tip, from the tip [m], nearest first |
-| `surface` | (32, 3) | displacement from rest of 32 nodes spread over the organ [m] |
-| `progress` | 1 | progress, see below [-] |
-| `pixels` | (height, width, 3) | the laparoscope's picture, uint8; with `pixels=` only |
-
-Reward: a task measures its progress phi in [-1, 1], 0 at the start and 1 on success. `dense` (the
-default) pays its change, phi now - phi a step ago, so that what is lost costs what it had paid, but
-nothing for a gain made above the force limit; over an episode it adds up to 1 at most. This is the
-shaping of Ng, Harada and Russell 1999. `sparse` pays 1 on the step of success and 0 elsewhere.
+Reward: a task measures its progress phi in [-1, 1], 0 at the start, 1 on success, -1 on damage.
+`dense` (the default) pays its change, phi now - phi a step ago, so that what is lost costs what it
+had paid; this is the shaping of Ng, Harada and Russell 1999. It takes a tenth of the step's cost
+(`task.cost`, see `safety`: force over the limit, shaft against the organ, damage), until the costs
+of the episode have taken 1. Rewards then add up to the progress less that: at most 1, at least -2.
+`sparse` pays 1 on the step of success and 0 elsewhere.
 The domains' formulas of phi use closeness = max(1 - distance / distance at the start, -1).
 
-An episode ends with `task.outcome`: `success`, `damage` (a force above the damage limit, the
-discount is 0 as for success), `missed` (a wrong report), or None when the time limit ended it.
+An episode ends with `task.outcome`: `success`, `damage` (a force above the damage limit, of tip or
+shaft; the discount is 0 as for success), `missed` (a wrong report), or None when the time limit
+ended it.
 """
 
 import collections
 import dataclasses
 import os
-import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import mujoco as mj
@@ -52,22 +40,21 @@ import numpy as np
 from dm_control.mujoco import wrapper
 from dm_control.rl import control
 from dm_env import specs
-from palpate import Organ
 from palpate.models import trocar
 from scipy.spatial import cKDTree
 
-from . import scenes
-from .physics import AXES, JAWS, STATE, Physics, check_scene
+from . import observation, randomisation, safety, scenes, stage
+from .environment import CONTROL_TIMESTEP, Environment
+from .physics import AXES, JAWS, Physics, check_scene
+from .randomisation import Ranges
 from .recording import Event, Settings
-from .scenes import CAMERA, ORGAN, Scene
+from .scenes import ORGAN, Scene
+from .stage import STATE, Stage
 
-CONTROL_TIMESTEP = 0.02  # [s]
 RATES = (1.0, 1.0, 3.0, 0.12)  # pitch, yaw, roll [rad/s], insertion [m/s]
 REWARDS = ("dense", "sparse")
 
-# An organ is at rest when its fastest node is slower than so much [m/s]; it is waited for so long,
-# and looked at so often [s].
-_STILL, _SETTLE, _LOOK = 1e-7, 3.0, 0.1
+_PRICE = 0.1  # of a unit of cost, in the dense reward
 _FACING = 0.75  # least cosine between a target's normal and the way to the trocar
 _PIN_GAP = 0.012  # targets keep this far from pinned nodes [m]
 _SLACK = 1e-6  # what rounding may add to an action
@@ -79,9 +66,14 @@ class Task(control.Task):
   Attributes:
     name: domain and task, for instance "touch/easy"
     random: everything random comes from here
+    control_timestep: between actions [s]
+    observed: what is observed
+    drawn: what `randomisation` drew for this episode
     outcome: how the episode ended, see the module's head; None while it runs
     progress: see the module's head [-]
     best: best progress so far [-]
+    cost: of the last control step, see `safety`
+    harm: what costs have taken from the dense reward so far, 1 at most [-]
     events: since the last `take_events`
   """
 
@@ -100,7 +92,9 @@ class Task(control.Task):
     jitter: float = 0.0,
     variants: tuple[int | None, ...] | None = None,
     reward: str = "dense",
-    pixels: tuple[int, int] | None = None,
+    observations: Sequence[str] | None = None,
+    pixels: Sequence[int] | None = None,
+    randomise: Ranges | None = None,
     model: "str | os.PathLike[str] | mj.MjSpec | None" = None,
     organ: str = ORGAN,
   ):
@@ -109,13 +103,16 @@ class Task(control.Task):
     Args:
       scene: what it plays in
       random: a RandomState, a seed, or None for a seed of the system's
-      force_limit: breaches are counted above it, and progress pays nothing there [N]
+      force_limit: force above it is counted and costs [N]
       damage: the episode fails above it [N]
       spread: radius of the place on the organ that targets are drawn from [m]
       jitter: how far the trocar moves from episode to episode [m]; it also turns, 0.5 deg per mm
       variants: shapes that episodes are drawn from, None is the mean; the scene's alone by default
       reward: `dense` or `sparse`
-      pixels: height and width of the picture to observe
+      observations: groups (`sensors`, `state`), pictures (`pixels`, `depth`, `segmentation`,
+        `points`) and names of single observations; the two groups by default
+      pixels: height and width of pictures; given without a picture's name, `pixels` is observed
+      randomise: ranges of what is drawn anew for each episode, see `randomisation`
       model: a scene of your own, a file or an MjSpec, in place of `scene`: it has the instrument,
         the camera `laparoscope` and the sites `target0`, ... in the world
       organ: name of the organ in it
@@ -130,13 +127,21 @@ class Task(control.Task):
     self.force_limit, self.damage = float(force_limit), float(damage)
     self.spread, self.jitter = spread, jitter
     self.variants = (scene.variant,) if variants is None or model is not None else variants
-    self.reward, self.pixels = reward, pixels
-    self._own, self.organ = model, organ
-    self._models: dict[int | None, tuple[mj.MjModel, np.ndarray]] = {}
+    self.reward = reward
+    self.observed = observation.choose(observations, pixels)
+    self.control_timestep = CONTROL_TIMESTEP
+    self.ranges = randomisation.check(randomise or {})
+    self.drawn: dict[str, Any] = {}
+    self.organ = organ
+    self._models: dict[int | None, Stage] = {}
     self.visualize_reward = False
     self.outcome: str | None = None
     self.progress, self.best = 0.0, 0.0
+    self.cost, self.harm = safety.Cost(), 0.0
     self.events: list[Event] = []
+    if model is not None:
+      own: Any = model if isinstance(model, mj.MjSpec) else mj.MjSpec.from_file(os.fspath(model))
+      self._models[self.variants[0]] = self._stage(own.copy())
 
   # Scene.
 
@@ -152,50 +157,23 @@ class Task(control.Task):
 
   def physics(self) -> Physics:
     """Returns the physics of the scene, to make an environment of."""
-    model, _ = self._compiled(self.variants[0])
+    model = self._compiled(self.variants[0]).model
     physics = Physics.from_model(wrapper.MjModel(model))
     physics.use(model, self.prefix, self.targets, self.organ)
-    physics.keep_port()
     return physics
 
-  def _compiled(self, variant: int | None) -> tuple[mj.MjModel, np.ndarray]:
+  def _compiled(self, variant: int | None) -> Stage:
     if variant not in self._models:
-      if isinstance(self._own, mj.MjSpec):
-        own: Any = self._own
-        spec = own.copy()
-      elif self._own is not None:
-        spec = mj.MjSpec.from_file(os.fspath(self._own))
-      else:
-        spec = scenes.build(self._scene(variant))
-      with warnings.catch_warnings():  # the plugin's passive forces are unknown to the compiler
-        warnings.filterwarnings("ignore", ".*has no equality constraints or passive forces")
-        model = spec.compile()
-      check_scene(model, self.prefix, self.targets, self.organ)
-      self._models[variant] = self._settle(model)
+      self._models[variant] = self._stage(scenes.build(self._scene(variant)))
     return self._models[variant]
+
+  def _stage(self, spec: mj.MjSpec) -> Stage:
+    model = stage.compile_spec(spec)
+    check_scene(model, self.prefix, self.targets, self.organ)
+    return stage.build(model, self.prefix, self.organ)
 
   def _scene(self, variant: int | None) -> Scene:
     return dataclasses.replace(self.scene, variant=variant, targets=self.targets)
-
-  def _settle(self, model: mj.MjModel) -> tuple[mj.MjModel, np.ndarray]:
-    """Returns the model and the state in which the organ rests under its weight."""
-    data = mj.MjData(model)
-    names = [f"{self.prefix}insertion"]
-    for name in names:  # out of the way
-      low = model.actuator(name).ctrlrange[0]
-      data.ctrl[model.actuator(name).id] = low
-      data.qpos[model.joint(name).qposadr[0]] = low
-    organ = Organ(model, data, self.organ)
-    for _ in range(round(_SETTLE / _LOOK)):
-      mj.mj_step(model, data, round(_LOOK / model.opt.timestep))
-      if np.linalg.norm(organ.xvel, axis=1).max() < _STILL:
-        break
-    data.qvel[:] = 0
-    data.qacc_warmstart[:] = 0
-    data.time = 0
-    state = np.empty(mj.mj_stateSize(model, STATE))
-    mj.mj_getState(model, data, state, STATE)
-    return model, state
 
   def place_of_work(self, physics: Physics) -> tuple[np.ndarray, np.ndarray]:
     """Returns the triangles that targets are drawn from, and the middle of that place [m].
@@ -262,14 +240,13 @@ class Task(control.Task):
 
   def initialize_episode(self, physics: Physics) -> None:
     """Draws shape, trocar, pose and targets, and puts the organ at rest."""
-    model, state = self._compiled(self.choose())
-    if physics.model.ptr is not model:
-      if physics.prefix:
-        physics.move_port(np.zeros(3), np.zeros(3))
-      physics.use(model, self.prefix, self.targets, self.organ)
-      physics.keep_port()
-    mj.mj_setState(model, physics.data.ptr, state, STATE)
-    mj.mj_kinematics(model, physics.data.ptr)
+    place = self._compiled(self.choose())
+    if physics.model.ptr is not place.model:
+      physics.use(place.model, self.prefix, self.targets, self.organ)
+    place.restore()
+    mj.mj_setState(place.model, physics.data.ptr, place.state, STATE)
+    self.drawn = randomisation.apply(self.ranges, self.random, physics, place)
+    mj.mj_kinematics(place.model, physics.data.ptr)
     physics.moved()
     limit = self.jitter
     physics.move_port(
@@ -277,8 +254,9 @@ class Task(control.Task):
     )
     self.outcome, self.events = None, []
     self.progress, self.gain, self.best = 0.0, 0.0, 0.0
-    self.peak, self._area, self._shaft = 0.0, 0.0, False
-    physics.peak_force = 0.0  # the last episode's would be in the first observation
+    self.peak, self._area = 0.0, 0.0
+    self.cost, self.harm, self._price = safety.Cost(), 0.0, 0.0
+    physics.peak_force = physics.peak_shaft = 0.0  # else the last episode's are in the first step
     self._place_instrument(physics)
     self.begin(physics)
     self.start = physics.tip_pos()
@@ -320,7 +298,7 @@ class Task(control.Task):
     """Moves the drives' targets."""
     self.action = values = self.check_action(action)
     low, high = physics.drive_range.T
-    move = values[:4] * np.array(RATES) * CONTROL_TIMESTEP
+    move = values[:4] * np.array(RATES) * self.control_timestep
     physics.data.ctrl[physics.drives] = np.clip(physics.drive_targets() + move, low, high)
     if physics.jaw >= 0:
       low, high = physics.model.actuator_ctrlrange[physics.jaw]
@@ -330,45 +308,34 @@ class Task(control.Task):
     """Measures the progress and looks for errors and damage."""
     self.peak = max(self.peak, physics.peak_force)
     before, self.progress = self.progress, self.advance(physics)
-    self.gain = self.progress - before
-    self.best = max(self.best, self.progress)
-    shaft = physics.shaft_force() > 0.05
-    if shaft and not self._shaft:
-      self.event(physics, "unintended_contact", label="shaft")
-    self._shaft = shaft
-    if physics.peak_force > self.damage:
-      self.outcome = "damage"
-      self.event(physics, "note", label=f"damage: {physics.peak_force:.2f} N")
+    tip, shaft, lay = physics.peak_force, physics.peak_shaft, self.cost.shaft > 0
+    self.cost = safety.cost(tip, shaft, self.force_limit, self.damage)
+    if self.cost.shaft and not lay:
+      self.event(physics, "unintended_contact", shaft, label="shaft")
+    if self.cost.damage:
+      self.outcome, self.progress = "damage", -1.0
+      what = "damage" if tip > self.damage else "damage by the shaft"
+      self.event(physics, "note", label=f"{what}: {tip if tip > self.damage else shaft:.2f} N")
     elif self.outcome == "success":
       self.event(physics, "note", label="success")
+    self.gain = self.progress - before
+    self.best = max(self.best, self.progress)
+    self._price = min(_PRICE * self.cost.total, 1.0 - self.harm)
+    self.harm += self._price
 
   def get_observation(self, physics: Physics) -> collections.OrderedDict:
-    """Returns the observations at the module's head and the domain's own."""
-    out = collections.OrderedDict()
-    out["joints"] = physics.joints()
-    out["joint_vel"] = physics.joint_vel()
-    out["drive"] = physics.drive_targets() - physics.joints()
-    out["tip_pos"] = physics.tip_pos()
-    out["tip_vel"] = physics.tip_vel()
-    out["contact_force"] = physics.contact_force()
-    out["peak_force"] = np.array([physics.peak_force])
-    if self.jaws:
-      out["gripper"] = physics.gripper()
-    out["nodes_near"] = physics.nodes_near()
-    out["surface"] = physics.surface()
-    out["progress"] = np.array([self.progress])
-    out.update(self.observe(physics))
-    if self.pixels is not None:
-      height, width = self.pixels
-      out["pixels"] = physics.render(height, width, camera_id=physics.model.ptr.camera(CAMERA).id)
-    return out
+    """Returns what was chosen to be observed, see `observation`."""
+    return observation.take(self, physics)
+
+  def observation_spec(self, physics: Physics) -> collections.OrderedDict:
+    """Returns the specs of what is observed, by name."""
+    return observation.spec(self, physics)
 
   def get_reward(self, physics: Physics) -> float:
     """Returns the reward of the last step, see the module's head."""
     if self.reward == "sparse":
       return float(self.outcome == "success")
-    over = physics.peak_force > min(self.force_limit, self.damage)
-    return float(min(self.gain, 0.0) if over else self.gain)
+    return float(self.gain - self._price)
 
   def get_termination(self, physics: Physics) -> float | None:
     """Returns the final discount 0 once there is an outcome."""
@@ -415,16 +382,11 @@ def closeness(distance: float, start: float) -> float:
   return max(-1.0, 1.0 - distance / max(start, 1e-3))
 
 
-def make(task: Task, time_limit: float, environment_kwargs: Mapping | None) -> control.Environment:
+def make(task: Task, time_limit: float, environment_kwargs: Mapping | None) -> Environment:
   """Returns the environment of a task, in a state in which it can be observed."""
   physics, before = task.physics(), task.random.get_state()
   with physics.reset_context():
     task.initialize_episode(physics)
   task.random.set_state(before)
-  return control.Environment(
-    physics,
-    task,
-    time_limit=time_limit,
-    control_timestep=CONTROL_TIMESTEP,
-    **(environment_kwargs or {}),
-  )
+  observation.check(task, physics)
+  return Environment(physics, task, time_limit, **(environment_kwargs or {}))

@@ -1,36 +1,63 @@
-"""The screen: whether there is one, how to draw without, and MuJoCo's window on an exercise."""
+"""MuJoCo's window on an exercise."""
 
 from __future__ import annotations
 
 import atexit
-import ctypes.util
 import os
 import sys
 import threading
 from collections.abc import Callable
 from typing import Any
 
+from palpate.screen import has_display
+
 _PATIENCE = 5.0  # for the window's thread to end [s]
+# Modules that draw for MuJoCo, and what returns the present context.
+_CURRENT = {
+  "OpenGL.EGL": "eglGetCurrentContext",
+  "OpenGL.osmesa": "OSMesaGetCurrentContext",
+  "glfw": "get_current_context",
+}
+_drawn = False  # by this process
+_lost = False  # whether a process that had drawn was forked into this one
 
 
-def has_display() -> bool:
-  """Returns whether a window can be opened, as far as the environment tells."""
-  if not sys.platform.startswith("linux"):
-    return True
-  return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+def can_draw() -> bool:
+  """Returns whether drawing does not wait for threads that a fork has left behind."""
+  return not _lost
 
 
-def prepare_gl() -> None:
-  """Chooses a way to draw without a screen, unless MUJOCO_GL is set or there is a screen.
+def check_drawing() -> None:
+  """Notes that this process draws.
 
-  MuJoCo reads the variable once, when it is imported, and so does dm_control.
+  Raises:
+    RuntimeError: it cannot.
   """
-  if "MUJOCO_GL" in os.environ or has_display():
-    return
-  for backend, library in (("egl", "EGL"), ("osmesa", "OSMesa")):
-    if ctypes.util.find_library(library):
-      os.environ["MUJOCO_GL"] = backend
-      return
+  global _drawn
+  if _lost:
+    raise RuntimeError(
+      "this process was forked from one that had drawn, and OpenGL does not survive that; start "
+      "processes by 'forkserver' or 'spawn', such as vector_kwargs={'context': 'forkserver'} for "
+      "gymnasium.make_vec(..., vectorization_mode='async'), or draw nothing before"
+    )
+  _drawn = True
+
+
+def _look_for_contexts() -> None:
+  """Notes before a fork what others have drawn."""
+  global _drawn
+  for name, current in _CURRENT.items():
+    if name in sys.modules:
+      _drawn = _drawn or bool(getattr(sys.modules[name], current)())
+
+
+def _lose_contexts() -> None:
+  global _lost
+  _lost = _drawn
+
+
+if hasattr(os, "register_at_fork"):
+  os.register_at_fork(before=_look_for_contexts, after_in_child=_lose_contexts)
 
 
 class Window:

@@ -102,6 +102,8 @@ def _begin(
     "mujoco": mujoco.__version__,
     **json.loads(json.dumps(dict(info))),
   }
+  if task.drawn:
+    recorder.info["randomised"] = task.drawn
   recorder.attach("vertices", physics.nodes())
   recorder.attach("triangles", physics.organ.elem)
   recorder.attach("state_first", physics.integration_state())

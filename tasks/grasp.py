@@ -189,12 +189,12 @@ class Grasp(Hold):
     """Counts the time that the site is held high, and then at rest low."""
     gentle = physics.peak_force <= self.force_limit
     if not self.done:
-      self.held = self.held + base.CONTROL_TIMESTEP * gentle if share >= 1 else 0.0
+      self.held = self.held + self.control_timestep * gentle if share >= 1 else 0.0
       self.done = self.held >= self.hold - 1e-9
       if self.done:
         self.hold_here(physics)
     low = self.done and _LOW[0] <= share <= _LOW[1]
-    self.lowered = self.lowered + base.CONTROL_TIMESTEP if low else 0.0
+    self.lowered = self.lowered + self.control_timestep if low else 0.0
 
   def observe(self, physics: Physics) -> dict[str, np.ndarray]:
     """Returns target, height, held and grasped."""
@@ -219,15 +219,15 @@ class Grasp(Hold):
       yield from p.wait(p.style.delay)
       goal = self.lift + 0.0015 + 0.3 * p.style.overshoot * self.lift
       while self.grasped and not self.done:  # up, and hold
-        contact += base.CONTROL_TIMESTEP
+        contact += self.control_timestep
         missing = goal - self.height(physics)
-        p.tip = p.tip + float(np.clip(3 * missing, -speed, speed)) * base.CONTROL_TIMESTEP * up
+        p.tip = p.tip + float(np.clip(3 * missing, -speed, speed)) * self.control_timestep * up
         p.grip(contact)
         yield p.step()
       yield from p.wait(p.style.delay)
       while self.grasped and not self.rests:
         if self.height(physics) > 0.2 * self.lift:
-          p.tip = p.tip - speed * base.CONTROL_TIMESTEP * up
+          p.tip = p.tip - speed * self.control_timestep * up
         p.grip(contact)
         yield p.step()
       yield from p.open()

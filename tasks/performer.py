@@ -25,7 +25,7 @@ import numpy as np
 from dm_control.rl import control
 from palpate.models import trocar
 
-from .base import AXES, CONTROL_TIMESTEP, RATES
+from .base import AXES, RATES
 
 Act = Callable[[Any], Any]
 Script = Iterator[np.ndarray]
@@ -124,6 +124,7 @@ class Performer:
   def __init__(self, env: control.Environment, style: Style = EXPERT, seed: int = 0):
     """Makes a performer in a style; see `make`."""
     self.env, self.style = env, style
+    self.dt = env.control_timestep()  # [s]
     self.physics: Any = env.physics
     self.task: Any = env.task
     self.random = np.random.RandomState(seed)
@@ -156,12 +157,12 @@ class Performer:
       tip = tip + self.style.tremor * math.sqrt(2 / len(_TREMOR_HZ)) * wave.sum(axis=0)
     pitch, yaw, insertion = trocar.inverse(self.trocar, tip, check=False)
     goal = np.array([pitch, yaw, self.roll, insertion])
-    move = (goal - self.physics.drive_targets()) / (np.array(RATES) * CONTROL_TIMESTEP)
+    move = (goal - self.physics.drive_targets()) / (np.array(RATES) * self.dt)
     return np.concatenate([np.clip(move, -1, 1), self.extra])
 
   def wait(self, duration: float) -> Script:
     """Holds still for a time [s]."""
-    for _ in range(int(min(duration / CONTROL_TIMESTEP, 10**9))):
+    for _ in range(int(min(duration / self.dt, 10**9))):
       yield self.step()
 
   def move(self, goal: np.ndarray, speed: float = 0.05) -> Script:
@@ -187,7 +188,7 @@ class Performer:
 
   def _line(self, goal: np.ndarray, speed: float) -> Script:
     start = self.tip.copy()
-    steps = max(2, round(float(np.linalg.norm(goal - start)) / speed / CONTROL_TIMESTEP))
+    steps = max(2, round(float(np.linalg.norm(goal - start)) / speed / self.dt))
     for k in range(1, steps + 1):
       s = k / steps
       self.tip = start + (goal - start) * (10 * s**3 - 15 * s**4 + 6 * s**5)
@@ -196,13 +197,13 @@ class Performer:
   def push(self, force: float, along: np.ndarray, until: Callable[[], bool], most=5.0) -> Script:
     """Presses with a force [N] along a direction until a condition or for `most` seconds."""
     contact = 0.0  # time in contact [s]
-    for _ in range(round(most / CONTROL_TIMESTEP)):
+    for _ in range(round(most / self.dt)):
       if until():
         return
       measured = float(np.linalg.norm(self.physics.contact_force()))
-      contact += CONTROL_TIMESTEP if measured > 0.02 else 0.0
+      contact += self.dt if measured > 0.02 else 0.0
       speed = np.clip(0.06 * (force * self.excess(contact) - measured), -0.02, 0.012)
-      self.tip = self.tip + speed * CONTROL_TIMESTEP * along
+      self.tip = self.tip + speed * self.dt * along
       yield self.step()
 
   def excess(self, contact: float) -> float:
@@ -212,13 +213,13 @@ class Performer:
   def sink(self, depth: float, point: np.ndarray, along: np.ndarray, until: Callable[[], bool]):
     """Presses to a depth [m] below a point until a condition, for 5 s at most."""
     contact = 0.0
-    for _ in range(round(5 / CONTROL_TIMESTEP)):
+    for _ in range(round(5 / self.dt)):
       if until():
         return
       now = float((self.physics.tip_pos() - point) @ along)
-      contact += CONTROL_TIMESTEP if now > 0 else 0.0
+      contact += self.dt if now > 0 else 0.0
       speed = np.clip(8 * (depth * self.excess(contact) - now), -0.02, 0.015)
-      self.tip = self.tip + speed * CONTROL_TIMESTEP * along
+      self.tip = self.tip + speed * self.dt * along
       yield self.step()
 
   def close(self, site: int) -> Script:

@@ -6,29 +6,28 @@ import math
 
 import mujoco as mj
 import numpy as np
-from dm_control import mujoco
 from dm_control.mujoco import wrapper
 from palpate import Organ
 from palpate.models import trocar
 
 from . import scenes
 from .jaws import Jaws
+from .portable import Portable
 from .scenes import CAMERA, ORGAN
+from .stage import STATE
 
 AXES = ("pitch", "yaw", "roll", "insertion")
 JAWS = "grasper/"  # prefix of the instrument that has them
 NEAR, COARSE = 8, 32  # nodes in the observations
 HELD_FORCE = 0.2  # of the inner face of either jaw on tissue between them, to hold it [N]
 
-STATE = mj.mjtState.mjSTATE_INTEGRATION
 _CLOSING = 0.005  # the drive's target is that far below the opening [rad]
 _FOLD = (0.02, 0.15)  # least opening over a fold of tissue, largest target that grips one [rad]
 
 
-class Physics(mujoco.Physics):
+class Physics(Portable):
   """Physics of an exercise: one organ, one instrument on a trocar."""
 
-  organ: Organ
   prefix = ""
 
   def use(self, model: mj.MjModel, prefix: str, targets: int, organ: str = ORGAN) -> None:
@@ -40,12 +39,12 @@ class Physics(mujoco.Physics):
       targets: number of target sites needed
       organ: name of the organ
     """
-    self.prefix = prefix
+    self.prefix, self.organ_name = prefix, organ
     check_scene(model, prefix, targets, organ)
     if model is not self.model.ptr:
       self._reload_from_data(wrapper.MjData(wrapper.MjModel(model)))
     self.organ = Organ(model, self.data.ptr, organ)
-    self.peak_force = 0.0
+    self.peak_force = self.peak_shaft = 0.0
     self._nodes: np.ndarray | None = None
     self._camera = model.camera(CAMERA).id
     self._sensors = {}
@@ -54,19 +53,19 @@ class Physics(mujoco.Physics):
       if name.startswith(prefix):
         adr = int(model.sensor_adr[i])
         self._sensors[name[len(prefix) :]] = slice(adr, adr + int(model.sensor_dim[i]))
-    self._joint = [model.joint(prefix + axis) for axis in AXES]
-    self._qpos = np.array([int(j.qposadr[0]) for j in self._joint])
-    self._dof = np.array([int(j.dofadr[0]) for j in self._joint])
+    joints = [model.joint(prefix + axis) for axis in AXES]
+    self._qpos = np.array([int(joint.qposadr[0]) for joint in joints])
+    self._dof = np.array([int(joint.dofadr[0]) for joint in joints])
     self.drives = np.array([model.actuator(prefix + axis).id for axis in AXES])
     self.drive_range = model.actuator_ctrlrange[self.drives].copy()
     self.jaw = model.actuator(prefix + "jaw").id if self.has_jaw else -1
     self._jaws = Jaws(model, prefix) if self.has_jaw else None
     self._inner = np.zeros(2)
-    self._targets = [model.site(f"target{i}").id for i in range(targets)]
-    model.site_sameframe[self._targets] = 0  # else a site at its body's origin stays there
-    self._rest = self.organ.xpos0
-    self._coarse = _spread(self._rest, COARSE)
-    self._coarse0 = self._rest[self._coarse]
+    self.target_sites = [model.site(f"target{i}").id for i in range(targets)]
+    model.site_sameframe[self.target_sites] = 0  # else a site at its body's origin stays there
+    self._xpos0 = self.organ.xpos0
+    self._coarse = _spread(self._xpos0, COARSE)
+    self._coarse0 = self._xpos0[self._coarse]
     self._trocar = trocar.trocar(model, prefix)
 
   @property
@@ -75,16 +74,17 @@ class Physics(mujoco.Physics):
     return "jaw" in self._sensors
 
   def step(self, nstep: int = 1) -> None:
-    """Advances the physics and keeps the largest contact force of all the steps."""
+    """Advances the physics; keeps the largest contact forces on tip and shaft of all the steps."""
     with self.check_invalid_state():
       model, data = self.model.ptr, self.data.ptr
-      sensor, peak2, left, right = data.sensordata.data, 0.0, 0.0, 0.0
-      x = self._sensors["tip_force"].start
+      sensor, tip2, shaft2, left, right = data.sensordata.data, 0.0, 0.0, 0.0, 0.0
+      x, y = (self._sensors[f"{part}_force"].start for part in ("tip", "shaft"))
       sides = [self._sensors[f"touch_{side}"].start for side in ("left", "right") if self.has_jaw]
       for k in range(nstep):
         mj.mj_step2(model, data)
-        # In plain numbers: this runs every millisecond.
-        peak2 = max(peak2, sensor[x] ** 2 + sensor[x + 1] ** 2 + sensor[x + 2] ** 2)
+        if data.ncon:  # in plain numbers: this runs every millisecond
+          tip2 = max(tip2, sensor[x] ** 2 + sensor[x + 1] ** 2 + sensor[x + 2] ** 2)
+          shaft2 = max(shaft2, sensor[y] ** 2 + sensor[y + 1] ** 2 + sensor[y + 2] ** 2)
         if sides:
           left += sensor[sides[0]]
           right += sensor[sides[1]]
@@ -92,7 +92,8 @@ class Physics(mujoco.Physics):
           self._inner = self._jaws.inner_force(model, data)
         mj.mj_step1(model, data)
       # Pinched folds make single steps of large jaw force: the jaws' is a mean over the step.
-      self.peak_force = max(peak2**0.5, left / nstep, right / nstep)
+      self.peak_force = max(tip2**0.5, left / nstep, right / nstep)
+      self.peak_shaft = shaft2**0.5
       self.moved()
 
   def forward(self) -> None:
@@ -166,9 +167,9 @@ class Physics(mujoco.Physics):
     """Returns the contact force on the instrument below the shaft [N]  (3,)."""
     return -self.sensor("tip_force")
 
-  def shaft_force(self) -> float:
-    """Returns the magnitude of the contact force on the shaft [N]."""
-    return float(np.linalg.norm(self.sensor("shaft_force")))
+  def shaft_force(self) -> np.ndarray:
+    """Returns the contact force on the shaft [N]  (3,)."""
+    return -self.sensor("shaft_force")
 
   def gripper(self) -> np.ndarray:
     """Returns opening and its target [rad], force on the left and right jaw [N]  (4,)."""
@@ -187,7 +188,7 @@ class Physics(mujoco.Physics):
   def nodes(self) -> np.ndarray:
     """Returns the positions of the organ's nodes [m]  (nvert, 3); computed once a control step."""
     if self._nodes is None:
-      self._nodes = self._rest + self.organ.displacement
+      self._nodes = self._xpos0 + self.organ.displacement
       self._nodes.flags.writeable = False
     return self._nodes
 
@@ -284,14 +285,9 @@ class Physics(mujoco.Physics):
     quat, rotation = np.zeros(4), np.zeros(4)
     angle = float(np.linalg.norm(turn))
     mj.mju_axisAngle2Quat(rotation, turn / max(angle, 1e-12), angle)
-    mj.mju_mulQuat(quat, rotation, self._home[1])
-    body.pos[:], body.quat[:] = self._home[0] + shift, quat
+    mj.mju_mulQuat(quat, rotation, body.quat)
+    body.pos[:], body.quat[:] = body.pos + shift, quat
     self._trocar = trocar.trocar(model, self.prefix)
-
-  def keep_port(self) -> None:
-    """Takes the trocar's pose as the one that `move_port` starts from."""
-    body = self.model.ptr.body(f"{self.prefix}trocar")
-    self._home = body.pos.copy(), body.quat.copy()
 
   def mark(
     self,
@@ -302,7 +298,7 @@ class Physics(mujoco.Physics):
     size: float | None = None,
   ) -> None:
     """Puts target site `index` at `pos` [m], for the pictures; yellow where it is its turn now."""
-    site = self._targets[index]
+    site = self.target_sites[index]
     if size is not None:
       self.model.site_size[site] = size
     self.model.site_rgba[site, :3] = scenes.NOW if now else scenes.LATER

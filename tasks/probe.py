@@ -183,7 +183,7 @@ class Press(Task):
     self._pressing = force > (0.02 if self._pressing else 0.1)
     low, high = self.band
     inside = on_site and low <= self.level(physics) <= high and force > 0.02
-    self.held = self.held + base.CONTROL_TIMESTEP if inside else 0.0
+    self.held = self.held + self.control_timestep if inside else 0.0
     if self.held >= self.hold - 1e-9:
       self.event(physics, "target", self.distance(physics), str(self.done + 1))
       self.done += 1

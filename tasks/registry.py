@@ -10,19 +10,26 @@ import importlib.resources
 import re
 
 VERSION = 0
-_TASK = re.compile(r"^@SUITE\.add\([^)]*\)\ndef (\w+)\(", re.MULTILINE)
+_TASK = re.compile(r"^@SUITE\.add\([^)]*\)\ndef (\w+)\(time_limit=(\d+)", re.MULTILINE)
+_RATE = 50  # control steps a second
 
 
-def _find() -> dict[str, tuple[str, ...]]:
+def _find() -> dict[str, dict[str, float]]:
   # Read, not imported: dm_control takes a second, which nobody should wait for to see names.
   found, folder = {}, importlib.resources.files("palpate.tasks")
   for file in sorted(folder.iterdir(), key=lambda file: file.name):
     if file.name.endswith(".py") and (names := _TASK.findall(file.read_text(encoding="utf-8"))):
-      found[file.name.removesuffix(".py")] = tuple(names)
+      found[file.name.removesuffix(".py")] = {name: float(limit) for name, limit in names}
   return found
 
 
-TASKS = _find()  # domain -> its tasks
+TIME_LIMITS = _find()  # domain -> its tasks -> their time limit [s]
+TASKS = {domain: tuple(tasks) for domain, tasks in TIME_LIMITS.items()}  # domain -> its tasks
+
+
+def step_limit(domain: str, task: str) -> int:
+  """Returns how many control steps an episode has, unless it is told otherwise."""
+  return round(TIME_LIMITS[domain][task] * _RATE)
 
 
 def gym_id(domain: str, task: str) -> str:
@@ -41,5 +48,6 @@ def register() -> None:
         gymnasium.register(
           gym_id(domain, task),
           entry_point="palpate.tasks.gym:Exercise",
+          max_episode_steps=step_limit(domain, task),
           kwargs={"task": f"{domain}/{task}"},
         )

@@ -120,7 +120,7 @@ class Retract(Hold):
     if not (seen and self.grasped):
       self.held = 0.0
     elif gentle:
-      self.held += base.CONTROL_TIMESTEP
+      self.held += self.control_timestep
     if self.held >= self.hold - 1e-9:
       self.outcome = "success"
       return 1.0
@@ -155,13 +155,13 @@ class Retract(Hold):
       far, extra = 0.0, 0.002 * (1 + 4 * p.style.overshoot)
       enough = None
       while self.grasped:
-        contact += base.CONTROL_TIMESTEP
+        contact += self.control_timestep
         if self.visible >= self.wanted - 1e-9:
           enough = far + extra if enough is None else enough
         elif enough is not None and far >= enough:
           enough = None  # the organ slid back
         if far < (0.035 if enough is None else enough):
-          far += speed * base.CONTROL_TIMESTEP
+          far += speed * self.control_timestep
         p.tip = start + far * along
         p.grip(contact)
         yield p.step()

@@ -7,9 +7,8 @@ from typing import Any
 
 from dm_control.rl import control
 
-from . import display, registry
+from . import registry
 
-display.prepare_gl()  # before the domains import dm_control.mujoco
 DOMAINS = {name: importlib.import_module(f".{name}", __package__) for name in registry.TASKS}
 
 

@@ -234,15 +234,15 @@ class Trace(Task):
     yield from p.push(0.08, -up, lambda: self.tracing, most=3.0)
     # Pulls a point along the curve and keeps the force by its height.
     at, height, contact = 0.0, float((p.tip - self.curve[0]) @ up), 0.0
-    step = 0.02 * p.style.speed * base.CONTROL_TIMESTEP / _STEP
+    step = 0.02 * p.style.speed * self.control_timestep / _STEP
     while self.outcome is None:
-      contact += base.CONTROL_TIMESTEP
+      contact += self.control_timestep
       # Where contact was lost it waits, or goes back behind what is traced.
       most = self.done + 3.0 if self.tracing else max(at - 0.5, self.done - 3.0)
       at = min(at + step, max(most, 0.0), len(self.curve) - 1)
       force = float(np.linalg.norm(physics.contact_force()))
       error = 0.15 * p.excess(contact) - force
-      height -= float(np.clip(0.08 * error, -0.01, 0.01)) * base.CONTROL_TIMESTEP
+      height -= float(np.clip(0.08 * error, -0.01, 0.01)) * self.control_timestep
       k = int(at)
       ahead = self.curve[min(k + 1, len(self.curve) - 1)]
       rest = self.curve[k] + (at - k) * (ahead - self.curve[k])

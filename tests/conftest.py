@@ -1,10 +1,8 @@
 """What all tests share."""
 
+import palpate  # noqa: F401 - before MuJoCo is imported: it chooses how to draw
 import pytest
-import screen
-
-screen.choose()  # before MuJoCo is imported
-import scenes as builders  # noqa: E402
+import scenes as builders
 
 
 def pytest_addoption(parser):

@@ -69,8 +69,6 @@ def _parser(words: list[str]) -> argparse.ArgumentParser:
       place = groups[name[0]]
     command = place.add_parser(name[-1], help=text, description=text[0].upper() + text[1:] + ".")
     if tuple(words[: len(name)]) == name:
-      display = importlib.import_module("palpate.tasks.display")  # help alone is quicker without
-      display.prepare_gl()
       chosen = importlib.import_module(f".{module}", __package__)
       chosen.add_arguments(command)
       command.set_defaults(main=chosen.main)

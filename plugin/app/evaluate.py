@@ -9,11 +9,12 @@ import math
 import pathlib
 import signal
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import palpate
 
+from . import options
 from .console import CommandError, Interrupt, Progress, output, output_folder, writing
 
 _POLL = 0.2  # of Ctrl-C, while processes work [s]
@@ -48,6 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser):
   add("--episodes", metavar="N", type=int, default=10, help="how many (%(default)s)")
   add("--seed", metavar="N", type=int, default=0, help="of the first episode (%(default)s)")
   add("--processes", metavar="N", type=int, default=1, help="at a time (%(default)s)")
+  options.add_argument(parser)
   add("--json", metavar="FILE", help="write every episode's metrics")
   add("--reference", metavar="FILE", help="write an expert reference of these episodes")
   add("--recordings", metavar="FOLDER", help="keep every episode's recording, whole or not")
@@ -71,10 +73,15 @@ def main(args: argparse.Namespace) -> int:
   }
   if args.recordings:
     output_folder("recordings", args.recordings)
+  task_kwargs = options.read(args.set)
+  if task_kwargs:  # what is wrong with them is said once
+    options.load(name, task_kwargs)
   seeds = range(args.seed, args.seed + args.episodes)
   progress, results = Progress(), []
   with Interrupt() as interrupt:
-    for result in evaluate(name, args.policy, seeds, args.processes, args.recordings, interrupt):
+    for result in evaluate(
+      name, args.policy, seeds, args.processes, args.recordings, interrupt, task_kwargs
+    ):
       results.append(result)
       progress.show(f"{len(results)} of {args.episodes}")
   progress.clear()
@@ -111,6 +118,7 @@ def evaluate(
   processes: int = 1,
   recordings: str | None = None,
   interrupt: Interrupt | None = None,
+  task_kwargs: Mapping[str, Any] | None = None,
 ) -> Iterator[Result]:
   """Yields the result of each seed, in order; the processes are spawned, not forked.
 
@@ -121,9 +129,11 @@ def evaluate(
     processes: at a time
     recordings: folder to keep the recordings in, SEED.npz
     interrupt: once seen, the episodes that run are finished and no more are begun
+    task_kwargs: options of the task, JSON
   """
   interrupt = interrupt or Interrupt()
-  jobs = [(name, policy, seed, recordings) for seed in seeds]
+  kwargs = json.dumps(dict(task_kwargs or {}))
+  jobs = [(name, policy, seed, recordings, kwargs) for seed in seeds]
   if processes == 1:
     for job in jobs:
       if interrupt.seen:
@@ -155,18 +165,18 @@ def _ignore_interrupts():
   signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-_environments: dict[str, Any] = {}  # of this process
+_environments: dict[tuple[str, str], Any] = {}  # of this process, by name and options
 
 
-def _one(job: tuple[str, str, int, str | None]) -> Result:
-  name, policy, seed, folder = job
+def _one(job: tuple[str, str, int, str | None, str]) -> Result:
+  name, policy, seed, folder, kwargs = job
   palpate.register()
-  from palpate.tasks import episode, performer, suite
+  from palpate.tasks import episode, performer
 
-  if name not in _environments:
-    _environments[name] = suite.load(*suite.split(name), task_kwargs={"random": 0})
-  env = _environments[name]
-  info = {"task_kwargs": {}, "performer": policy}
+  if (name, kwargs) not in _environments:
+    _environments[name, kwargs] = options.load(name, json.loads(kwargs))
+  env = _environments[name, kwargs]
+  info = {"task_kwargs": json.loads(kwargs), "performer": policy}
   try:
     recording = episode.run(env, performer.make(env, policy, seed), seed, info)
   except episode.EpisodeError as error:

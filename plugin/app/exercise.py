@@ -14,7 +14,7 @@ from typing import Any
 
 import palpate
 
-from . import film
+from . import film, options
 from .console import CommandError, Interrupt, Progress, output, output_folder, writing
 
 _FPS = 25  # of the film
@@ -41,6 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser):
     help="where recording and report go (out/TASK; out/TASK_replay)",
   )  # fmt: skip
   add("--film", metavar="FILE", help="write a film too, .mp4 or .gif")
+  options.add_argument(parser)
   add("--states", action="store_true", help="keep the state of every step in the recording")
   add("--no-report", action="store_true", help="write the recording alone")
 
@@ -147,19 +148,19 @@ def _perform(args: argparse.Namespace):
   """Returns a task's name, and what runs an episode of it."""
   from palpate.tasks import episode, performer, suite
 
-  domain, task = suite.split(args.task)
-  info = {"task_kwargs": {}, "performer": args.performer}
+  name, task_kwargs = "/".join(suite.split(args.task)), options.read(args.set)
+  info = {"task_kwargs": task_kwargs, "performer": args.performer}
   if args.performer == "keyboard":
     from . import keyboard
 
-    env = suite.load(domain, task)
+    env = options.load(name, task_kwargs)
     run = functools.partial(keyboard.run, env, args.seed, info)
   else:
     performer.find(args.performer, "keyboard")
-    env = suite.load(domain, task)
+    env = options.load(name, task_kwargs)
     act = performer.make(env, args.performer, args.seed)
     run = functools.partial(episode.run, env, act, args.seed, info, args.states)
-  return f"{domain}/{task}", run
+  return name, run
 
 
 def _write(job: _Job, recording: Any, report: bool):

@@ -7,7 +7,7 @@ import math
 from typing import Any
 
 from palpate import register
-from palpate.tasks.display import has_display
+from palpate.screen import has_display
 
 from .console import CommandError
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import atexit
 import ctypes as C
 import functools
-import itertools
 from typing import Any
 
 import mujoco
@@ -63,8 +62,7 @@ class _Plugin(C.Structure):
 
 
 _workspaces: dict[tuple[int, int], Workspace] = {}  # by address of the mjData and plugin instance
-_handles: dict[int, Workspace] = {}  # by the number kept in mjData.plugin_data
-_next_handle = itertools.count(1)
+_states: dict[int, Workspace] = {}  # by address of the organ's numbers in mjData.plugin_state
 
 
 def find(data: int, instance: int) -> Workspace:
@@ -74,8 +72,8 @@ def find(data: int, instance: int) -> Workspace:
 
 def count() -> int:
   """Returns the number of organs in all mjData that there are."""
-  if len(_workspaces) != len(_handles):
-    raise RuntimeError(f"{len(_workspaces)} workspaces, {len(_handles)} handles")
+  if len(_workspaces) != len(_states):
+    raise RuntimeError(f"{len(_workspaces)} workspaces, {len(_states)} states")
   return len(_workspaces)
 
 
@@ -112,10 +110,7 @@ def _nstate(model: int, instance: int) -> int:
 def _init(model: int, data: int, instance: int) -> int:
   try:
     w = workspace.make(model, data, instance)
-    handle = next(_next_handle)
-    d = mjstruct.Data.from_address(data)
-    mjstruct.view(d.plugin_data, d.nplugin, np.uintp)[instance] = handle
-    _workspaces[data, instance] = _handles[handle] = w
+    _workspaces[data, instance] = _states[w.plugin_state.ctypes.data] = w
     return 0
   except BaseException as error:
     _say(error)
@@ -125,8 +120,8 @@ def _init(model: int, data: int, instance: int) -> int:
 @guard.watch
 def _destroy(data: int, instance: int):
   w = _workspaces.pop((data, instance), None)
-  for handle in [h for h, other in _handles.items() if other is w]:
-    del _handles[handle]
+  for state in [s for s, other in _states.items() if other is w]:
+    del _states[state]
 
 
 @guard.watch
@@ -140,11 +135,11 @@ def _copy(data: int, model: int, source: int, instance: int):
 
 
 @guard.watch
-def _reset(model: int, state: int, data: int | None, instance: int):
+def _reset(model: int, state: int, unused: int | None, instance: int):
   m = mjstruct.Model.from_address(model)
   size = int(mjstruct.view(m.plugin_statenum, m.nplugin, np.int32)[instance])
   mjstruct.view(state, size)[:] = 0
-  w = _handles.get(data or 0)
+  w = _states.get(state)  # mjData.plugin_data, the other argument, is copied by pickle
   if w is not None:
     w.forget()
     w.nbad = 0

@@ -85,3 +85,37 @@ def test_ctrl_c_keeps_the_episodes_that_were_done(tmp_path, monkeypatch, capsys)
   said = capsys.readouterr()
   assert "interrupted after 1 of 9 episodes" in said.err and "success  1/1" in said.out
   assert len(json.loads((tmp_path / "a.json").read_text())) == 1
+
+
+def test_options_of_the_task_are_passed_on(tmp_path, capsys):
+  text = "import numpy as np\nseen = []\ndef act(o):\n  seen.append(o['pixels'].shape)\n"
+  (tmp_path / "look.py").write_text(text + "  return np.array([0.0, 0.0, 0.0, -1.0])\n")
+  words = ["evaluate", "touch/easy", "--policy", "look:act", "--episodes", "1", "--seed", "5"]
+  words += ["--set", "time_limit=0.1", "--set", "pixels=[16, 24]", "--set", "reward=sparse"]
+  words += ["--set", 'randomise={"light": [0.5, 1.5]}', "--json", "a.json"]
+  assert cli.main([*words, "--recordings", str(tmp_path / "kept")]) == 0
+  (result,) = json.loads((tmp_path / "a.json").read_text())
+  assert result["outcome"] == "time limit" and result["time"] == pytest.approx(0.1)
+  assert result["total"] == 0 and sys.modules["look"].seen == [(16, 24, 3)] * 5
+  info = Recording.load(tmp_path / "kept" / "5.npz").info
+  assert info["task_kwargs"]["pixels"] == [16, 24] and 0.5 <= info["randomised"]["light"] <= 1.5
+  assert cli.main(["exercise", "--replay", str(tmp_path / "kept" / "5.npz"), "--no-report"]) == 0
+  assert "the replay is the same to the bit" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+  "words, said",
+  [
+    ("reward", "set is 'reward', expected NAME=VALUE"),
+    ("reward=dens", "reward is 'dens', expected one of dense, sparse"),
+    ("random=1", "set has 'random', expected --seed"),
+    ("rewards=dense", "unexpected keyword argument 'rewards'"),
+    ("time_limit=-1", "touch/easy: time_limit is -1, expected a number > 0 [s]"),
+    ("pixels=84", "pixels is 84, expected height and width"),
+  ],
+)
+def test_wrong_options_are_one_line(words, said, capsys):
+  for command in ("evaluate", "exercise"):
+    assert cli.main([command, "touch/easy", "--set", words]) == 2
+    message = capsys.readouterr().err
+    assert message.startswith("palpate: ") and said in message and message.count("\n") == 1

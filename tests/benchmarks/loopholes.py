@@ -23,7 +23,7 @@ import palpate
 from benchmarks import plots, results
 from benchmarks.runner import SEED, Bench, Case, Row
 from palpate import tasks
-from palpate.tasks import base, performer, suite
+from palpate.tasks import base, environment, performer, suite
 
 NAMES = ("probe/palpate_easy", "retract/easy", "retract/standard", "grasp/easy", "trace/easy")
 PHASES = 3
@@ -61,7 +61,7 @@ class Attack:
   def __init__(self, name: str, kind: str, length: float = LENGTH):
     """Loads the exercise; `kind` is `blind` or `aimed`, `length` that of an episode [s]."""
     self.env = tasks.load(*suite.split(name), {"random": 0, "time_limit": length})
-    self.kind, self.steps = kind, round(length / base.CONTROL_TIMESTEP)
+    self.kind, self.steps = kind, round(length / environment.CONTROL_TIMESTEP)
     extra = len(self.env.task.components) - len(base.AXES)
     self.width = extra + (len(base.AXES) if kind == "blind" else 3)
     self.size = PHASES * self.width
@@ -100,7 +100,7 @@ class Attack:
       goal = goal + _REACH * physics.trocar().mat @ row[:3]
       gap = goal - p.tip
       far = max(float(np.linalg.norm(gap)), 1e-9)
-      p.tip = p.tip + gap * min(1.0, _SPEED * base.CONTROL_TIMESTEP / far)
+      p.tip = p.tip + gap * min(1.0, _SPEED * environment.CONTROL_TIMESTEP / far)
       p.extra[:] = row[3:]
       yield p.step()
 

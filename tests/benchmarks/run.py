@@ -9,7 +9,6 @@ from collections.abc import Sequence
 
 sys.path.insert(0, str(pathlib.Path(__file__).parents[1]))  # `benchmarks`, `reference`, `scenes`
 
-import screen
 from benchmarks.results import BenchError
 
 BENCHES = {
@@ -42,7 +41,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     known = "\n".join(f"  {name:16}{text}" for name, text in BENCHES.items())
     print(f"usage: run.py BENCH [options]; run.py BENCH --help says which\n\n{known}")
     return 0 if words in (["-h"], ["--help"]) else 2
-  screen.choose()
+  importlib.import_module("palpate")  # before MuJoCo: it chooses how to draw without a screen
   from benchmarks import runner
 
   try:

@@ -1,5 +1,6 @@
 """Whole processes: what they print, how they end, and another MuJoCo."""
 
+import ctypes.util
 import os
 import pathlib
 import subprocess
@@ -90,3 +91,20 @@ print("stepped")
   done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
   assert (done.returncode, done.stdout.strip()) == (0, "stepped"), done.stderr
   assert "Exception" not in done.stderr and "Error" not in done.stderr
+
+
+def test_drawing_without_a_screen_and_without_being_told_how(monkeypatch):
+  for name in ("MUJOCO_GL", "PYOPENGL_PLATFORM", "DISPLAY", "WAYLAND_DISPLAY"):
+    monkeypatch.delenv(name, raising=False)
+  if not (ctypes.util.find_library("EGL") or ctypes.util.find_library("OSMesa")):
+    pytest.skip("no way to draw without a screen")
+  code = f"""
+import palpate, mujoco
+model = mujoco.MjModel.from_xml_path({str(SCENE)!r})
+data = mujoco.MjData(model)
+mujoco.mj_forward(model, data)
+with mujoco.Renderer(model, 48, 64) as renderer:
+  renderer.update_scene(data)
+  assert renderer.render().std() > 1
+"""
+  subprocess.run([sys.executable, "-c", code], check=True)

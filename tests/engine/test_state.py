@@ -2,6 +2,7 @@
 
 import copy
 import gc
+import pickle
 
 import mujoco
 import numpy as np
@@ -200,3 +201,27 @@ def test_deleted_data_and_models_leave_no_workspace(scenes):
     del model, datas, twin
     gc.collect()
     assert engine.count() == before
+
+
+@pytest.mark.parametrize("window", [False, True])
+def test_a_pickle_goes_on_to_the_bit_and_has_a_life_of_its_own(scenes, window):
+  model = mujoco.MjModel.from_xml_string(scenes.probed(window))
+  data = mujoco.MjData(model)
+  for k in range(60):
+    data.ctrl[:] = -1e-4 * k
+    mujoco.mj_step(model, data)
+  assert data.ncon
+  twin = pickle.loads(pickle.dumps(data))
+  for _ in range(20):
+    mujoco.mj_step(model, data)
+    mujoco.mj_step(twin.model, twin)
+  for field in ("qpos", "qvel", "plugin_state", "sensordata", "qfrc_constraint"):
+    np.testing.assert_array_equal(getattr(twin, field), getattr(data, field), err_msg=field)
+  # A reset is of one of them alone.
+  organ, other = (palpate.Organ(d.model, d, "organ") for d in (data, twin))
+  for d in (data, twin):
+    d.plugin_state[:] = np.nan
+    mujoco.mj_step(d.model, d)
+  assert organ.error and other.error
+  mujoco.mj_resetData(twin.model, twin)
+  assert organ.error and not other.error

@@ -77,10 +77,6 @@ def test_specs_and_observations(env):
     for name, value in timestep.observation.items():
       specs[name].validate(value)
       assert value.dtype == np.float64 and np.isfinite(value).all(), name
-  module = __import__(f"palpate.tasks.{type(env.task).__module__.split('.')[-1]}", fromlist="x")
-  base = __import__("palpate.tasks.base", fromlist="x")
-  for name in specs:  # every observation is in a table
-    assert f"`{name}`" in (module.__doc__ + base.__doc__), name
 
 
 def test_a_seed_decides_everything(env):
@@ -105,7 +101,7 @@ def test_rewards_are_finite_and_bounded_and_the_episode_can_start_anew(env):
     for timestep in steps[1:]:
       if timestep.first():  # an episode ended before
         break
-      assert np.isfinite(timestep.reward) and -1 <= timestep.reward <= 1
+      assert np.isfinite(timestep.reward) and -2 <= timestep.reward <= 1
       total += timestep.reward
     assert total <= 1 + 1e-9
   # From whatever state the physics is in:
@@ -144,15 +140,6 @@ def test_dense_reward_is_the_change_of_progress_and_takes_back_what_is_lost():
     np.testing.assert_allclose(total, timestep.observation["progress"][0], atol=1e-12)
   assert least < -0.01 and total < 0
   assert env.reset().observation["progress"] == 0
-
-
-def test_above_the_force_limit_progress_pays_nothing_but_may_cost():
-  env = load("touch/easy", force_limit=1e-9)
-  env.reset()
-  task, physics = env.task, env.physics
-  for gain, force, reward in ((0.2, 1.0, 0.0), (-0.2, 1.0, -0.2), (0.2, 0.0, 0.2)):
-    task.gain, physics.peak_force = gain, force
-    assert task.get_reward(physics) == reward
 
 
 def test_quick_forms_agree_with_the_plain_ones():
@@ -291,8 +278,7 @@ def test_every_organ_has_its_colour():
     ("liver", "right_lobe"), ("kidney", "anterior"), ("stomach", "body"), ("gallbladder", "fundus")
   ):  # fmt: skip
     model = scenes.build(scenes.Scene(organ, nodes=250, center=center)).compile()
-    (colour,) = model.flex_rgba
-    colours.append(colour)
+    colours.append(model.flex(scenes.ORGAN).rgba)
   for a, b in itertools.combinations(colours, 2):
     assert np.abs(a - b).max() > 0.02
 
@@ -310,7 +296,7 @@ def test_too_much_force_is_a_failure():
     if timestep.last():
       break
     task.outcome = None
-  assert timestep.last() and env.task.outcome in ("damage", "success")
+  assert timestep.last() and env.task.outcome == "damage" and env.task.progress == -1
 
 
 def test_a_wrong_report_is_a_miss():

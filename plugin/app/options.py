@@ -1,0 +1,49 @@
+"""Options of an exercise on the command line: `--set time_limit=5 --set 'pixels=[84,84]'`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from typing import Any
+
+from .console import CommandError
+
+
+def add_argument(parser: argparse.ArgumentParser):
+  """Declares the option."""
+  parser.add_argument(
+    "--set",
+    metavar="NAME=VALUE",
+    action="append",
+    default=[],
+    help="option of the exercise, such as reward=sparse, time_limit=5 or pixels=[84,84]; JSON or a "
+    "word, may be repeated",
+  )
+
+
+def read(texts: list[str]) -> dict[str, Any]:
+  """Returns the options as `task_kwargs`."""
+  found = {}
+  for text in texts:
+    name, equal, value = text.partition("=")
+    if not (equal and name.isidentifier()):
+      raise CommandError(f"set is {text!r}, expected NAME=VALUE")
+    if name == "random":
+      raise CommandError("set has 'random', expected --seed, which decides everything random")
+    try:
+      found[name] = json.loads(value)
+    except json.JSONDecodeError:
+      found[name] = value
+  return found
+
+
+def load(name: str, task_kwargs: dict[str, Any]):
+  """Returns the environment of a task with these options; CommandError says what is wrong."""
+  from palpate.tasks import suite
+
+  try:
+    return suite.load(*suite.split(name), task_kwargs={"random": 0, **task_kwargs})
+  except (ValueError, OSError) as error:
+    raise CommandError(str(error)) from None
+  except TypeError as error:  # an option that no exercise has
+    raise CommandError(f"{name}: set: {error}") from None

@@ -1,0 +1,323 @@
+# mujoco ships its bindings without type stubs:
+# pyright: reportAttributeAccessIssue=false
+"""What is observed: groups and pictures to choose from.
+
+`sensors` is what a robot has. `state` is privileged: what only a simulation knows of the organ, the
+targets and the progress, and everything a domain adds. Pictures are what the laparoscope sees,
+drawn when they are chosen. docs/environments.md has every name.
+"""
+
+import collections
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import mujoco as mj
+import numpy as np
+from dm_control import mujoco
+from dm_env import specs
+
+from .physics import COARSE, NEAR, Physics
+from .scenes import CAMERA
+
+GROUPS = ("sensors", "state")
+SIZE = (84, 84)  # of pictures, height and width [pixels]
+LABELS = {"organ": 1, "instrument": 2, "target": 3}  # of `segmentation`, 0 is anything else
+_MOST = 4096  # [pixels]
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+  """An observation that every exercise has.
+
+  Attributes:
+    group: it belongs to
+    shape: of the array
+    unit: of its numbers
+    what: it is
+    measure: takes task and physics, returns it
+    jaws: whether instruments with jaws alone have it
+  """
+
+  group: str
+  shape: tuple[int, ...]
+  unit: str
+  what: str
+  measure: Callable[[Any, Physics], np.ndarray]
+  jaws: bool = False
+
+
+ROWS = {
+  "joints": Row("sensors", (4,), "rad, m", "pitch, yaw, roll, insertion", lambda t, p: p.joints()),
+  "joint_vel": Row("sensors", (4,), "rad/s, m/s", "their velocities", lambda t, p: p.joint_vel()),
+  "drive": Row(
+    "sensors",
+    (4,),
+    "rad, m",
+    "target of the drives minus position: what the hand feels",
+    lambda t, p: p.drive_targets() - p.joints(),
+  ),
+  "tip_pos": Row("sensors", (3,), "m", "the tip, in the world", lambda t, p: p.tip_pos()),
+  "tip_quat": Row("sensors", (4,), "-", "its orientation, w x y z", lambda t, p: p.tip_quat()),
+  "tip_vel": Row("sensors", (3,), "m/s", "its velocity, in the world", lambda t, p: p.tip_vel()),
+  "contact_force": Row(
+    "sensors",
+    (3,),
+    "N",
+    "on the instrument below the shaft, in the world",
+    lambda t, p: p.contact_force(),
+  ),
+  "shaft_force": Row(
+    "sensors", (3,), "N", "on the shaft, in the world", lambda t, p: -p.sensor("shaft_force")
+  ),
+  "peak_force": Row(
+    "sensors",
+    (1,),
+    "N",
+    "largest force since the last observation, or a jaw's mean if that is more",
+    lambda t, p: np.array([p.peak_force]),
+  ),
+  "gripper": Row(
+    "sensors",
+    (4,),
+    "rad, rad, N, N",
+    "opening of the jaws, its target, force on the left and right jaw",
+    lambda t, p: p.gripper(),
+    jaws=True,
+  ),
+  "nodes_near": Row(
+    "state",
+    (NEAR, 3),
+    "m",
+    f"the {NEAR} nodes of the organ nearest to the tip, from the tip, nearest first",
+    lambda t, p: p.nodes_near(),
+  ),
+  "surface": Row(
+    "state",
+    (COARSE, 3),
+    "m",
+    f"displacement from rest of {COARSE} nodes spread over the organ",
+    lambda t, p: p.surface(),
+  ),
+  "progress": Row("state", (1,), "-", "of the task", lambda t, p: np.array([t.progress])),
+}
+
+
+def _pixels(camera: mujoco.Camera, physics: Physics) -> np.ndarray:
+  return camera.render().copy()  # the next picture is drawn into the same array
+
+
+def _depth(camera: mujoco.Camera, physics: Physics) -> np.ndarray:
+  # The sky is written into the depth too, and colours alone are smoothed when labels are drawn.
+  flags: Any = camera.scene.flags
+  flags[mj.mjtRndFlag.mjRND_SKYBOX], flags[mj.mjtRndFlag.mjRND_SEGMENT] = 0, 1
+  depth = camera.render(depth=True).copy()
+  flags[mj.mjtRndFlag.mjRND_SKYBOX], flags[mj.mjtRndFlag.mjRND_SEGMENT] = 1, 0
+  return depth
+
+
+def _points(camera: mujoco.Camera, physics: Physics) -> np.ndarray:
+  depth = _depth(camera, physics)
+  height, width = depth.shape
+  model = physics.model.ptr
+  fovy = float(model.cam_fovy[model.camera(CAMERA).id])
+  pixel = 2 * np.tan(np.radians(fovy) / 2) / height  # at a distance of 1
+  x = (np.arange(width) + 0.5 - width / 2) * pixel
+  y = (np.arange(height) + 0.5 - height / 2) * pixel
+  points = np.stack([depth * x, depth * y[:, None], depth], axis=2).astype(np.float32)
+  points[depth > 0.999 * far(physics)] = 0
+  return points
+
+
+def _segmentation(camera: mujoco.Camera, physics: Physics) -> np.ndarray:
+  model, found = physics.model.ptr, camera.render(segmentation=True)
+  kind, name = found[..., 1], found[..., 0]
+  out = np.zeros(kind.shape, np.uint8)
+  flex, site, geom = (mj.mjtObj.mjOBJ_FLEX, mj.mjtObj.mjOBJ_SITE, mj.mjtObj.mjOBJ_GEOM)
+  out[(kind == flex) & (name == mj.mj_name2id(model, flex, physics.organ_name))] = LABELS["organ"]
+  out[(kind == site) & np.isin(name, physics.target_sites)] = LABELS["target"]
+  bodies = [model.body(i).name.startswith(physics.prefix) for i in range(model.nbody)]
+  own = np.flatnonzero(np.array(bodies)[model.geom_bodyid])
+  out[(kind == geom) & np.isin(name, own)] = LABELS["instrument"]
+  return out
+
+
+@dataclasses.dataclass(frozen=True)
+class Picture:
+  """What the laparoscope sees.
+
+  Attributes:
+    unit: of its numbers
+    what: it is
+    dtype: of its numbers
+    shape: what follows height and width
+    low: least value
+    high: greatest value
+    draw: takes camera and physics, returns it
+  """
+
+  unit: str
+  what: str
+  dtype: type
+  shape: tuple[int, ...]
+  low: float
+  high: float
+  draw: Callable[[mujoco.Camera, Physics], np.ndarray]
+
+
+PICTURES = {
+  "pixels": Picture("-", "red, green, blue", np.uint8, (3,), 0, 255, _pixels),
+  "depth": Picture(
+    "m",
+    "distance from the camera's plane, the far plane's where nothing is",
+    np.float32,
+    (),
+    0,
+    np.inf,
+    _depth,
+  ),
+  "segmentation": Picture(
+    "-",
+    ", ".join(f"{value} {name}" for name, value in LABELS.items()) + ", 0 anything else",
+    np.uint8,
+    (),
+    0,
+    max(LABELS.values()),
+    _segmentation,
+  ),
+  "points": Picture(
+    "m",
+    "place in the camera's frame, x right, y down, z forward; 0 0 0 where nothing is",
+    np.float32,
+    (3,),
+    -np.inf,
+    np.inf,
+    _points,
+  ),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Choice:
+  """What is observed.
+
+  Attributes:
+    names: groups, pictures and single observations
+    size: of pictures, height and width [pixels]
+  """
+
+  names: tuple[str, ...]
+  size: tuple[int, int]
+
+  def has(self, name: str, group: str) -> bool:
+    """Returns whether an observation of a group was chosen."""
+    return name in self.names or group in self.names
+
+  @property
+  def pictures(self) -> list[str]:
+    """Names of the pictures that were chosen."""
+    return [name for name in PICTURES if name in self.names]
+
+
+def choose(names: Sequence[str] | None, size: Any) -> Choice:
+  """Returns what is observed; single names are known to `check` only.
+
+  Args:
+    names: groups, pictures and single observations; None for the groups
+    size: height and width of pictures; `pixels` is observed if it is given and no picture named
+  """
+  if isinstance(names, str) or not all(isinstance(name, str) for name in names or ()):
+    raise ValueError(f"observations is {names!r}, expected a list of names")
+  chosen = GROUPS if names is None else tuple(names)
+  if size is not None and not set(chosen) & set(PICTURES):
+    chosen = (*chosen, "pixels")
+  if not chosen:
+    raise ValueError(f"observations is empty, expected some of {_known()}")
+  size = SIZE if size is None else size
+  whole = isinstance(size, Sequence) and len(size) == 2 and all(isinstance(n, int) for n in size)
+  if not whole or not all(1 <= n <= _MOST for n in size):
+    raise ValueError(
+      f"pixels is {size!r}, expected height and width, both whole numbers in [1, {_MOST}]"
+    )
+  return Choice(chosen, (size[0], size[1]))
+
+
+def _known() -> str:
+  return ", ".join((*GROUPS, *PICTURES)) + " or single observations"
+
+
+def check(task: Any, physics: Physics) -> None:
+  """Raises ValueError for a name that is no group, picture or observation of a task."""
+  single = [*(n for n, row in ROWS.items() if task.jaws or not row.jaws), *task.observe(physics)]
+  for name in task.observed.names:
+    if name not in (*GROUPS, *PICTURES, *single):
+      raise ValueError(
+        f"{task.name}: observations has {name!r}, expected some of {_known()}: {', '.join(single)}"
+      )
+  model, (height, width) = physics.model.ptr, task.observed.size
+  most = model.vis.global_.offheight, model.vis.global_.offwidth
+  if task.observed.pictures and (height > most[0] or width > most[1]):
+    raise ValueError(
+      f"pixels is {height}, {width}, expected at most {most[0]}, {most[1]}: the model's offscreen "
+      "buffer"
+    )
+
+
+def take(task: Any, physics: Physics) -> collections.OrderedDict:
+  """Returns what a task observes."""
+  out = _numbers(task, physics)
+  names = task.observed.pictures
+  if names:
+    height, width = task.observed.size
+    camera = mujoco.Camera(physics, height, width, physics.model.ptr.camera(CAMERA).id)
+    for name in names:
+      out[name] = PICTURES[name].draw(camera, physics)
+    camera.scene.free()
+  return out
+
+
+def _numbers(task: Any, physics: Physics) -> collections.OrderedDict:
+  choice: Choice = task.observed
+  out = collections.OrderedDict()
+  for name, row in ROWS.items():
+    if choice.has(name, row.group) and (task.jaws or not row.jaws):
+      out[name] = row.measure(task, physics)
+  if set(choice.names) - set(ROWS) - set(PICTURES) - {"sensors"}:
+    own: Mapping[str, np.ndarray] = task.observe(physics)
+    out |= {name: value for name, value in own.items() if choice.has(name, "state")}
+  return out
+
+
+def spec(task: Any, physics: Physics) -> collections.OrderedDict:
+  """Returns the specs of what a task observes; no picture is drawn for it."""
+  out = collections.OrderedDict()
+  for name, value in _numbers(task, physics).items():
+    out[name] = specs.Array(value.shape, value.dtype, name=name)
+  for name in task.observed.pictures:
+    p = PICTURES[name]
+    shape = (*task.observed.size, *p.shape)
+    out[name] = specs.BoundedArray(shape, p.dtype, p.low, p.high, name=name)
+  return out
+
+
+def far(physics: Physics) -> float:
+  """Returns how far the camera sees [m]."""
+  model = physics.model.ptr
+  return float(model.vis.map.zfar * model.stat.extent)
+
+
+def table() -> str:
+  """Returns what every exercise has as a Markdown table."""
+  lines = ["| name | group | shape | type | unit | what |", "|---|---|---|---|---|---|"]
+  for name, row in ROWS.items():
+    what = f"{row.what}; with jaws only" if row.jaws else row.what
+    cells = f"`{row.group}` | {_text(*row.shape)} | float64 | {row.unit} | {what}"
+    lines.append(f"| `{name}` | {cells} |")
+  for name, p in PICTURES.items():
+    shape = _text("height", "width", *p.shape)
+    lines.append(f"| `{name}` | picture | {shape} | {p.dtype.__name__} | {p.unit} | {p.what} |")
+  return "\n".join(lines) + "\n"
+
+
+def _text(*shape: int | str) -> str:
+  return f"({', '.join(map(str, shape))}{',' * (len(shape) == 1)})"

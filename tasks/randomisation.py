@@ -1,0 +1,162 @@
+# mujoco ships its bindings without type stubs:
+# pyright: reportAttributeAccessIssue=false
+"""Domain randomisation: quantities drawn from ranges at the start of every episode.
+
+    tasks.load("touch", "easy", task_kwargs={"randomise": {"stiffness": (0.5, 2.0)}})
+
+Numbers are drawn uniformly from the task's random state, in the order of `QUANTITIES`; what was
+drawn is `task.drawn`, and in Gymnasium `info["randomised"]`.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import mujoco as mj
+import numpy as np
+
+from . import stage
+from .physics import Physics
+from .scenes import CAMERA
+
+Ranges = Mapping[str, tuple[float, float]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Quantity:
+  """What may be drawn.
+
+  Attributes:
+    what: it is, in Markdown
+    unit: of its numbers
+    low: least value allowed
+    high: greatest value allowed
+    count: how many numbers are drawn
+    apply: takes physics, stage and the numbers, and changes the model
+  """
+
+  what: str
+  unit: str
+  low: float
+  high: float
+  count: int
+  apply: Callable[[Physics, stage.Stage, np.ndarray], None]
+
+
+def _stiffness(physics: Physics, place: stage.Stage, factor: np.ndarray) -> None:
+  foundation = float(factor[0]) * place.config.foundation
+  physics.organ.configure(young_scale=float(factor[0]), foundation=foundation)
+  stage.settle(place.model, physics.data.ptr, physics.prefix, physics.organ.name)
+
+
+def _friction(physics: Physics, place: stage.Stage, factor: np.ndarray) -> None:
+  place.model.flex_friction[:, 0] *= factor[0]
+  place.model.geom_friction[:, 0] *= factor[0]
+
+
+def _camera_pos(physics: Physics, place: stage.Stage, shift: np.ndarray) -> None:
+  place.model.camera(CAMERA).pos[:] += shift
+
+
+def _camera_turn(physics: Physics, place: stage.Stage, angles: np.ndarray) -> None:
+  turn = np.zeros(4)
+  angle = math.radians(np.linalg.norm(angles))
+  mj.mju_axisAngle2Quat(turn, angles / max(np.linalg.norm(angles), 1e-12), angle)
+  quat = place.model.camera(CAMERA).quat
+  mj.mju_mulQuat(quat, quat.copy(), turn)
+
+
+def _light(physics: Physics, place: stage.Stage, factor: np.ndarray) -> None:
+  model, head = place.model, place.model.vis.headlight
+  for owner, prefix in ((model, "light_"), (head, "")):
+    for kind in ("ambient", "diffuse", "specular"):
+      getattr(owner, prefix + kind)[:] *= factor[0]
+
+
+def _light_pos(physics: Physics, place: stage.Stage, shift: np.ndarray) -> None:
+  place.model.light_pos[:] += shift
+
+
+def _colour(physics: Physics, place: stage.Stage, change: np.ndarray) -> None:
+  model = place.model
+  flex = mj.mj_name2id(model, mj.mjtObj.mjOBJ_FLEX, physics.organ_name)
+  material = int(model.flex_matid[flex])
+  rgba = model.flex_rgba[flex] if material < 0 else model.mat_rgba[material]
+  rgba[:3] = np.clip(rgba[:3] + change, 0, 1)
+
+
+QUANTITIES = {
+  "stiffness": Quantity(
+    "factor on the organ's Young's modulus and foundation; it is let sink under its weight anew",
+    "-", 0.1, 10.0, 1, _stiffness,
+  ),
+  "friction": Quantity(
+    "factor on the sliding friction of organ and instrument", "-", 0.0, 10.0, 1, _friction
+  ),
+  "camera_pos": Quantity(
+    "shift of the laparoscope along each axis of its body, the world's in the exercises' scenes",
+    "m", -0.05, 0.05, 3, _camera_pos,
+  ),
+  "camera_turn": Quantity(
+    "turn of the laparoscope, a rotation vector in its axes", "deg", -30.0, 30.0, 3, _camera_turn
+  ),
+  "light": Quantity("factor on the brightness of all lights", "-", 0.0, 5.0, 1, _light),
+  "light_pos": Quantity(
+    "shift of the lights along each axis", "m", -0.2, 0.2, 3, _light_pos
+  ),
+  "colour": Quantity(
+    "change of the organ's red, green and blue, which are in [0, 1]", "-", -1.0, 1.0, 3, _colour
+  ),
+}  # fmt: skip
+
+
+def check(ranges: Any) -> dict[str, tuple[float, float]]:
+  """Returns the ranges in the order they are drawn in; ValueError says what is wrong with one."""
+  if not isinstance(ranges, Mapping):
+    raise ValueError(f"randomise is {ranges!r}, expected ranges by name")
+  for name in ranges:
+    if name not in QUANTITIES:
+      raise ValueError(f"randomise has {name!r}, expected some of {', '.join(QUANTITIES)}")
+  return {name: _check(name, ranges[name]) for name in QUANTITIES if name in ranges}
+
+
+def _check(name: str, found: Any) -> tuple[float, float]:
+  quantity = QUANTITIES[name]
+  pair = isinstance(found, Sequence) and len(found) == 2 and not isinstance(found, str)
+  if pair and all(isinstance(value, int | float) for value in found):
+    low, high = float(found[0]), float(found[1])
+    if quantity.low <= low <= high <= quantity.high:
+      return low, high
+  raise ValueError(
+    f"randomise: {name} is {found!r}, expected low and high, low <= high, both in "
+    f"[{quantity.low:g}, {quantity.high:g}] [{quantity.unit}]"
+  )
+
+
+def apply(
+  ranges: Ranges, random: np.random.RandomState, physics: Physics, place: stage.Stage
+) -> dict[str, Any]:
+  """Draws the numbers of an episode, changes its model, and returns them, JSON.
+
+  Args:
+    ranges: of the quantities that are drawn
+    random: state to draw from
+    physics: at the start of the episode, the model as compiled
+    place: its stage
+  """
+  drawn = {}
+  for name, (low, high) in ranges.items():
+    quantity = QUANTITIES[name]
+    values = random.uniform(low, high, quantity.count)
+    quantity.apply(physics, place, values)
+    drawn[name] = values.tolist() if quantity.count > 1 else float(values[0])
+  return drawn
+
+
+def table() -> str:
+  """Returns the quantities as a Markdown table."""
+  lines = ["| name | numbers | unit | allowed | what |", "|---|---|---|---|---|"]
+  for name, q in QUANTITIES.items():
+    lines.append(f"| `{name}` | {q.count} | {q.unit} | [{q.low:g}, {q.high:g}] | {q.what} |")
+  return "\n".join(lines) + "\n"

@@ -1,0 +1,51 @@
+"""What a control step costs the patient: `cost` of constrained reinforcement learning.
+
+| part | what | size |
+|---|---|---|
+| `force` | the step's largest force over its limit, of the tip or the shaft | share of the limit |
+| `shaft` | the shaft lies against the organ, with more than `SHAFT_CONTACT` | force / limit, to 1 |
+| `damage` | a force above the damage limit | 1 |
+
+Their sum is the cost: 0 for a gentle step, 1 for one with twice the limit. A shaft has the limits
+of the tip, or `SHAFT_LIMIT` and `SHAFT_DAMAGE` where those are of jaws and higher.
+"""
+
+import dataclasses
+
+SHAFT_CONTACT = 0.05  # below it the shaft is as good as not in contact [N]
+SHAFT_LIMIT, SHAFT_DAMAGE = 1.5, 3.0  # [N]
+
+
+@dataclasses.dataclass(frozen=True)
+class Cost:
+  """The parts of a control step's cost, see the module's head."""
+
+  force: float = 0.0
+  shaft: float = 0.0
+  damage: float = 0.0
+
+  @property
+  def total(self) -> float:
+    """Their sum."""
+    return self.force + self.shaft + self.damage
+
+
+def cost(peak_force: float, shaft_force: float, limit: float, damage: float) -> Cost:
+  """Returns the cost of a control step.
+
+  Args:
+    peak_force: largest force on the tip, or on a jaw, in the step [N]
+    shaft_force: largest force on the shaft in it [N]
+    limit: of the force on the tip [N]
+    damage: force above which the tip damages [N]
+  """
+  limit = max(min(limit, damage), 1e-6)
+  shaft_limit = min(limit, SHAFT_LIMIT)
+  share = max(peak_force / limit, shaft_force / shaft_limit)
+  lies = shaft_force > SHAFT_CONTACT
+  harmed = peak_force > damage or shaft_force > min(damage, SHAFT_DAMAGE)
+  return Cost(
+    force=max(share - 1.0, 0.0),
+    shaft=min(shaft_force / shaft_limit, 1.0) if lies else 0.0,
+    damage=float(harmed),
+  )

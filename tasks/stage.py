@@ -1,0 +1,90 @@
+# mujoco ships its bindings without type stubs:
+# pyright: reportAttributeAccessIssue=false
+"""A compiled scene with its organ at rest: what every episode in it begins from."""
+
+import dataclasses
+import operator
+import warnings
+
+import mujoco as mj
+import numpy as np
+from palpate import Organ
+from palpate.tissue.config import Config
+
+STATE = mj.mjtState.mjSTATE_INTEGRATION
+# An organ is at rest when its fastest node is slower than so much [m/s]; it is waited for so long,
+# and looked at so often [s].
+_STILL, _SETTLE, _LOOK = 1e-7, 3.0, 0.1
+# What an episode may change in the model.
+_CHANGED = (
+  "body_pos",
+  "body_quat",
+  "cam_pos",
+  "cam_quat",
+  "flex_friction",
+  "flex_rgba",
+  "geom_friction",
+  "light_ambient",
+  "light_diffuse",
+  "light_pos",
+  "light_specular",
+  "mat_rgba",
+  "vis.headlight.ambient",
+  "vis.headlight.diffuse",
+  "vis.headlight.specular",
+)
+
+
+@dataclasses.dataclass(eq=False)
+class Stage:
+  """A scene to play in.
+
+  Attributes:
+    model: compiled
+    state: in which the organ rests under its weight and the instrument is out of the way
+    config: of the organ, as compiled
+    nominal: what episodes may change of the model, as compiled
+  """
+
+  model: mj.MjModel
+  state: np.ndarray
+  config: Config
+  nominal: dict[str, np.ndarray]
+
+  def restore(self) -> None:
+    """Undoes what an episode has changed in the model."""
+    for name, value in self.nominal.items():
+      operator.attrgetter(name)(self.model)[:] = value
+
+
+def compile_spec(spec: mj.MjSpec) -> mj.MjModel:
+  """Returns the model of a scene."""
+  with warnings.catch_warnings():  # the plugin's passive forces are unknown to the compiler
+    warnings.filterwarnings("ignore", ".*has no equality constraints or passive forces")
+    return spec.compile()
+
+
+def build(model: mj.MjModel, prefix: str, organ: str) -> Stage:
+  """Returns the stage of a model; arguments as of `Physics.use`."""
+  data = mj.MjData(model)
+  settle(model, data, prefix, organ)
+  state = np.empty(mj.mj_stateSize(model, STATE))
+  mj.mj_getState(model, data, state, STATE)
+  nominal = {name: operator.attrgetter(name)(model).copy() for name in _CHANGED}
+  return Stage(model, state, Organ(model, data, organ).config, nominal)
+
+
+def settle(model: mj.MjModel, data: mj.MjData, prefix: str, organ: str) -> None:
+  """Lets the organ come to rest under its weight, the instrument withdrawn; time starts anew."""
+  name = f"{prefix}insertion"
+  low = model.actuator(name).ctrlrange[0]
+  data.ctrl[model.actuator(name).id] = low
+  data.qpos[model.joint(name).qposadr[0]] = low
+  handle = Organ(model, data, organ)
+  for _ in range(round(_SETTLE / _LOOK)):
+    mj.mj_step(model, data, round(_LOOK / model.opt.timestep))
+    if np.linalg.norm(handle.xvel, axis=1).max() < _STILL:
+      break
+  data.qvel[:] = 0
+  data.qacc_warmstart[:] = 0
+  data.time = 0
