@@ -278,8 +278,8 @@ def test_every_organ_has_its_colour():
     ("liver", "right_lobe"), ("kidney", "anterior"), ("stomach", "body"), ("gallbladder", "fundus")
   ):  # fmt: skip
     model = scenes.build(scenes.Scene(organ, nodes=250, center=center)).compile()
-    organ_id = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_FLEX, scenes.ORGAN)
-    colours.append(model.flex_rgba[organ_id])
+    flex = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_FLEX, scenes.ORGAN)
+    colours.append(model.flex_rgba[flex])
   for a, b in itertools.combinations(colours, 2):
     assert np.abs(a - b).max() > 0.02
 
