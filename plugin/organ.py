@@ -27,11 +27,7 @@ class Organ:
   """
 
   def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, name: str):
-    organs = {}
-    for flex in range(model.nflex):
-      instance = _instance(model, flex)
-      if instance is not None:
-        organs[mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_FLEX, flex) or ""] = instance
+    organs = instances(model)
     if name not in organs:
       have = ", ".join(repr(key) for key in organs) or "none"
       raise ValueError(f"no organ {name!r} in the model, it has {have}")
@@ -224,6 +220,16 @@ class Organ:
     if not np.isfinite(array).all():
       raise ValueError(f"organ {self.name!r}: {what} holds numbers that are not finite")
     return array
+
+
+def instances(model: mujoco.MjModel) -> dict[str, int]:
+  """Returns the plugin instance of each organ of a model by the organ's name."""
+  found = {flex: _instance(model, flex) for flex in range(model.nflex)}
+  return {
+    mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_FLEX, flex) or "": instance
+    for flex, instance in found.items()
+    if instance is not None
+  }
 
 
 def _instance(model: mujoco.MjModel, flex: int) -> int | None:

@@ -17,7 +17,7 @@ _REACH = 4.0
 SLOW = 1e-5
 # Mass and inertia of a slot on a pinned node, in masses of the organ: a wall to tools. The more it
 # is, the less care MuJoCo's solver takes of light ones.
-_HELD = 1e3
+WALL = 1e3
 
 
 @struct
@@ -159,7 +159,7 @@ def make(w, model: int, sizes: dict[str, int]):
 
 def hold(organ, inertia: np.ndarray) -> np.ndarray:
   """Returns the inertia of the nodes, with that of a wall for pinned ones [kg], (nvert,)."""
-  return np.where(organ.free, inertia, _HELD * organ.windows.mass.sum())
+  return np.where(organ.free, inertia, WALL * organ.windows.mass.sum())
 
 
 def _edges(mesh) -> tuple[np.ndarray, np.ndarray]:

@@ -71,6 +71,7 @@ template <class Fields>
 PALPATE void hinge_angle(const Fields& f, Thread t, int stage) {
   const float* step = f.state.step.data + 4 * t.world;
   const float h = step[0], gv = weight_of_rate(stage, step);
+  const float young = numbers(f, t.world)[YOUNG_SCALE];
   const size_t base = 24 * (size_t)t.world * f.shape.nslice;
   const float* disp = f.system.disp_trial.data + base;
   const float* vel = f.system.vel_trial.data + base;
@@ -106,8 +107,8 @@ PALPATE void hinge_angle(const Fields& f, Thread t, int stage) {
     st(f.system.hinge_half.data + 8 * out, 0, now.half, lane);
     // What the bending matrix may leave out here, see elem_corner.
     const V fold = 4.0f - 4.0f * now.half * now.half + 2.0f * change * change;
-    st(f.system.hinge_rough.data + 8 * out, 0, ld(f.tissue.hinge_gain.data, 5 * s, lane) * fold,
-       lane);
+    const V gain = young * ld(f.tissue.hinge_gain.data, 5 * s, lane);
+    st(f.system.hinge_rough.data + 8 * out, 0, gain * fold, lane);
   });
 }
 
@@ -116,13 +117,14 @@ template <class Fields>
 PALPATE void hinge_moment(const Fields& f, Thread t, int) {
   const size_t base = (size_t)t.world * f.shape.nhingeslice;
   const float* angle = f.system.hinge_angle.data + 8 * base;
+  const float young = numbers(f, t.world)[YOUNG_SCALE];
   each_slice(t, f.shape.nhingeslice, [&](int s, Lane lane) {
     const int* near = f.shape.hinge_near.data + 32 * s;
     const float* gain = f.tissue.hinge_gain.data + 40 * s;
     V sum = ld(gain, 0, lane) * ld(angle, s, lane);
     for (int k = 0; k < 4; ++k) sum += ld(gain, k + 1, lane) * gather(angle, near + 8 * k, 0, lane);
     const V half = ld(f.system.hinge_half.data + 8 * base, s, lane);
-    st(f.system.hinge_moment.data + 8 * base, s, sum * half, lane);
+    st(f.system.hinge_moment.data + 8 * base, s, young * sum * half, lane);
   });
 }
 
@@ -270,7 +272,7 @@ struct Sum {
 struct Motion { const float* disp; const float* vel; V3 u, v; };
 
 // What is asked of a fan: g = h^2 + h damping; `normal` has the stiffness that covers bending.
-struct Wanted { float g, spring; bool matrix, areas, bending; const float* normal; };
+struct Wanted { float g, spring, young; bool matrix, areas, bending; const float* normal; };
 
 // Adds the triangle of entries a and b, at rest ra and rb, to the area vector.
 PALPATE void area(Sum& sum, Metric g, V3 a, V3 b) {
@@ -302,7 +304,7 @@ PALPATE Sum around(const Fan& fan, const Motion& m, const Wanted& want, Lane lan
     if (want.bending && want.matrix)
       over = select(g.g11 > zero, gather(want.normal, fan.corner + 8 * k, 3, lane), zero);
     if (want.spring == 0.0f) {
-      const Moduli c = moduli(g, ld(metric, 3, lane), ld(metric, 4, lane));
+      const Moduli c = moduli(g, want.young * ld(metric, 3, lane), want.young * ld(metric, 4, lane));
       const Stress s = stress(c, r, p, t, q);
       if (k > 0) sum.force += (s.s11 + s.s12) * a + (s.s12 + s.s22) * b;
       const Stress pulled = tensile(s, g);
@@ -356,7 +358,7 @@ PALPATE V3 bending(const Fan& fan, const float* normal, const float* corner, V3 
 template <class Fields>
 PALPATE void row(const Fields& f, Thread t, int stage) {
   const float* step = f.state.step.data + 4 * t.world;
-  const float* number = f.tissue.number.data;
+  const float* number = numbers(f, t.world);
   const float h = step[0], g = step[1], gv = weight_of_rate(stage, step);
   const float foundation = number[FOUNDATION];
   const size_t base = (size_t)t.world * f.shape.nslice;
@@ -367,7 +369,9 @@ PALPATE void row(const Fields& f, Thread t, int stage) {
   const float* corner = f.system.elem_corner.data + 24 * elem;
   const bool bends = f.shape.nhingeslice > 0;
   const bool areas = bends || number[BULK] != 0.0f || number[PRESSURE] != 0.0f;
-  const Wanted want = {g, number[STIFFNESS], stage == FIRST || stage == LATER, areas, bends, normal};
+  const float young = number[YOUNG_SCALE];
+  const bool matrix = stage == FIRST || stage == LATER;
+  const Wanted want = {g, number[STIFFNESS], young, matrix, areas, bends, normal};
   each_slice(t, f.shape.nslice, [&](int s, Lane lane) {
     const size_t at = base + s;
     const Fan fan = fan_of(f, t.world, s, lane);
@@ -386,7 +390,7 @@ PALPATE void row(const Fields& f, Thread t, int stage) {
       const V scale = vsqrt(sum.squeeze / vmax(dot(sum.area, sum.area), splat(1e-30f)));
       const V3 n = scale * sum.area;
       st3(f.system.normal.data + 24 * at, n, lane);
-      self = self + square(g * ld(f.tissue.bend_diag.data, s, lane), n);
+      self = self + square(young * g * ld(f.tissue.bend_diag.data, s, lane), n);
     }
     st3(f.system.rhs.data + 24 * at, b, lane);
     if (want.matrix) {

@@ -36,7 +36,8 @@ struct Pcg {
   const float* const areavec = f.system.areavec.data + at;
   const float* const warm = f.state.dvel_warm.data + at;
   const float* const step = f.state.step.data + 4 * world;
-  const float bulk = f.tissue.number.data[BULK];
+  const float* const number = numbers(f, world);
+  const float bulk = number[BULK];
   // What the volume term adds to a product is this times `along` along the area vectors.
   const float gain = bulk != 0.0f ? step[1] * bulk / f.shape.volume0 / 36.0f : 0.0f;
   typename Slices::Vector x{f.system.sol.data + at}, r{f.system.r.data + at};
@@ -71,7 +72,7 @@ struct Pcg {
   }
 
   PALPATE bool goes_on() const {
-    return residual > target && it < (int)f.tissue.number.data[ITERATIONS];
+    return residual > target && it < (int)number[ITERATIONS];
   }
 
   // r = b, its norm and the residual to reach; neighbours are shown where to start.
@@ -90,7 +91,7 @@ struct Pcg {
     });
     group.sum(bb, flux, norm, along);
     const float whole = stage == RESPONSE ? f.system.status.data[4 * world + 2] : norm;
-    const float floor = step[2], tolerance = f.tissue.number.data[TOLERANCE];
+    const float floor = step[2], tolerance = number[TOLERANCE];
     target = tolerance * tolerance * (whole > floor ? whole : floor);
     if (stage == RESPONSE && target < ENOUGH * ENOUGH * norm) target = ENOUGH * ENOUGH * norm;
   }

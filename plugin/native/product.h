@@ -16,7 +16,7 @@ struct Matrix {
   const int* bend_row;
   const int* bend_node;
   const float* bend_gain;
-  float bend;  // h^2 + h damping, by which the bending matrix counts
+  float bend;  // (h^2 + h damping) times the scale of Young's modulus, for the bending matrix
   bool bends;  // whether there is one
 };
 
@@ -27,7 +27,7 @@ PALPATE Matrix matrix(const Fields& f, int world) {
     f.system.block.data + 72 * (size_t)world * f.shape.nslot, f.system.diag.data + 8 * base,
     f.system.inverse.data + 48 * base, f.system.normal.data + 24 * base, f.shape.slot_adr.data,
     f.shape.fan_node.data, f.shape.bend_adr.data, f.shape.bend_node.data, f.tissue.bend_gain.data,
-    f.state.step.data[4 * world + 1], f.shape.nhingeslice > 0
+    f.state.step.data[4 * world + 1] * numbers(f, world)[YOUNG_SCALE], f.shape.nhingeslice > 0
   };
 }
 

@@ -96,11 +96,11 @@ struct Springs {
 };
 
 template <class Fields>
-PALPATE Springs springs(const Fields& f, int s, Lane lane) {
+PALPATE Springs springs(const Fields& f, int world, int s, Lane lane) {
   const int row = f.shape.slot_adr.data[s], width = f.shape.slot_adr.data[s + 1] - row;
   const float* k = f.tissue.fan_spring.data + 8 * row;
   const V area = ld(f.shape.area.data, s, lane);
-  V sum = f.tissue.number.data[FOUNDATION] * area;
+  V sum = numbers(f, world)[FOUNDATION] * area;
   for (int i = 0; i < width; ++i) sum += ld(k, i, lane);
   return {width, f.shape.fan_node.data + 8 * (row + 2 * s + 1), k, area, sum};
 }
@@ -120,7 +120,7 @@ PALPATE void direct(const Fields& f, Thread t, int stage) {
   Group<> group(t, f.system.partial.data);
   const float* step = f.state.step.data + 4 * t.world;
   const float g = step[1], gv = g - step[0] * step[0];
-  const float foundation = g * f.tissue.number.data[FOUNDATION];
+  const float foundation = g * numbers(f, t.world)[FOUNDATION];
   const size_t base = 24 * (size_t)t.world * f.shape.nslice;
   const float* vel = f.state.vel.data + base;
   const float* areavec = f.system.areavec.data + base;
@@ -134,7 +134,7 @@ PALPATE void direct(const Fields& f, Thread t, int stage) {
     if (impulse != 0.0f) b += impulse * ld3(areavec + 24 * s, lane);
     V d = splat(1.0f);
     if (stage == NEUMANN) {
-      const Springs k = springs(f, s, lane);
+      const Springs k = springs(f, t.world, s, lane);
       const V3 v = ld3(vel + 24 * s, lane);
       b = k.pulled(b - (foundation * k.area) * v, g, vel, v, lane);
       d += g * k.sum * inverse;
@@ -149,7 +149,7 @@ PALPATE void direct(const Fields& f, Thread t, int stage) {
     group.each(0, f.shape.nslice, [&](int s, Lane lane) {
       // With y = D^-1 (...) and W = D - N: y + D^-1 N y.
       const V inverse = lightness(f, t.world, s, lane);
-      const Springs k = springs(f, s, lane);
+      const Springs k = springs(f, t.world, s, lane);
       const V3 none = {splat(0.0f), splat(0.0f), splat(0.0f)};
       const V3 pull = k.pulled(none, 1.0f, first, none, lane);
       const V3 more = ((g * inverse) * pull) / (1.0f + g * k.sum * inverse);

@@ -254,6 +254,12 @@ PALPATE S3 square(V s, V3 a) {
 // One of the `nthread` threads that work on a world; on the CPU there is one.
 struct Thread { int world, tid, nthread; };
 
+// The numbers of a world that may change while running, see `Tissue.number`.
+template <class Fields>
+PALPATE const float* numbers(const Fields& f, int world) {
+  return f.tissue.number.data + NUMBERS * world;
+}
+
 #if ON_CUDA
 // Lane of a thread. That it is below eight is hidden from the compiler, which otherwise takes rows
 // for bits of one number and computes the address of each anew.

@@ -168,7 +168,7 @@ template <class Fields>
 PALPATE void solid_row(const Fields& f, Thread t, int stage) {
   const float* step = f.state.step.data + 4 * t.world;
   const float h = step[0], g = step[1], gv = weight_of_rate(stage, step);
-  const float foundation = f.tissue.number.data[FOUNDATION];
+  const float foundation = numbers(f, t.world)[FOUNDATION];
   const bool implicit = stage == FIRST || stage == LATER;
   const size_t base = (size_t)t.world * f.shape.nslice;
   const size_t tet = (size_t)t.world * f.shape.ntetslice;

@@ -12,7 +12,8 @@ template <class Fields, Meeting FOR>
 PALPATE float volume_impulse(
   const Fields& f, int world, Group<FOR>& group, const float* disp, const float* vel, float gv
 ) {
-  const float bulk = f.tissue.number.data[BULK], pressure = f.tissue.number.data[PRESSURE];
+  const float* number = numbers(f, world);
+  const float bulk = number[BULK], pressure = number[PRESSURE];
   if (bulk == 0.0f && pressure == 0.0f) return 0.0f;
   const float* areavec = f.system.areavec.data + 24 * (size_t)world * f.shape.nslice;
   const float* rest = f.shape.rest.data;

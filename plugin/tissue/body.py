@@ -10,6 +10,7 @@ import warp as wp
 
 from .device import WORDS
 from .types import (
+  DIMS,
   NUMBERS,
   Cycle,
   Fields,
@@ -146,7 +147,8 @@ def _sizes(values: dict[str, Any]) -> dict[str, int]:
 def _at_rest(values: dict[str, Any], sizes: dict[str, int], device: wp.Device, newton: int) -> Body:
   fields = Fields()
   fields.shape = fill(Shape, device, values, sizes)
-  fields.tissue = fill(Tissue, device, values, sizes)
+  once = values | {"number": values["number"][None]}
+  fields.tissue = fill(Tissue, device, once, sizes | {"nworld": 1})
   numbers = wp.array(values["number"], dtype=wp.float64, device="cpu")
   body = Body(fields, sizes, device, 0, numbers, newton)
   _put_state(body, 0)
@@ -179,6 +181,8 @@ def worlds(body: Body, nworld: int = 1) -> Body:
   fields.shape = body.shape
   for name in Tissue.vars:
     setattr(fields.tissue, name, wp.clone(getattr(body.tissue, name)))
+  number = np.repeat(body.tissue.number.numpy()[:1], max(nworld, 1), axis=0)
+  fields.tissue.number = wp.array(number, device=body.device)
   out = dataclasses.replace(body, fields=fields, levels=None)
   _put_state(out, nworld)
   if body.levels is not None:
@@ -186,11 +190,19 @@ def worlds(body: Body, nworld: int = 1) -> Body:
   return out
 
 
+def nbytes(body: Body) -> int:
+  """Returns how many bytes of memory the worlds of a body take, without what they share."""
+  kinds = ((State, body.state), (System, body.system))
+  total = sum(getattr(each, name).size * 4 for kind, each in kinds for name in DIMS[kind.key])
+  return total + (nbytes(body.levels.body) if body.levels is not None else 0)
+
+
 def renumber(body: Body, values: dict[str, float]):
   """Sets `NUMBERS`, in the device's memory too: graphs that are recorded go on with them."""
   numbers = np.array([values[name] for name in NUMBERS])
   body.numbers.numpy()[:] = numbers
-  body.tissue.number.assign(numbers.astype(np.float32))
+  rows = np.broadcast_to(numbers.astype(np.float32), body.tissue.number.shape)
+  body.tissue.number.assign(np.ascontiguousarray(rows))
 
 
 def retissue(body: Body, values: dict[str, Any]):

@@ -77,7 +77,7 @@ def renumber(body: Body, config: Config):
 
 
 def _numbers(config: Config) -> dict[str, float]:
-  values = {name: getattr(config, name) for name in NUMBERS}
+  values = {name: getattr(config, name, 1.0) for name in NUMBERS}
   return values | {"stiffness": config.stiffness if config.elements == "spring" else 0.0}
 
 

@@ -72,9 +72,10 @@ class Stage(enum.IntEnum):
   RESPONSE = 4
 
 
-# Numbers that may change while running, in the order of `Tissue.number`: configuration keys.
+# Numbers that may change while running, in the order of `Tissue.number`: configuration keys, and
+# what Young's modulus is a multiple of in a world, where worlds differ.
 NUMBERS = (
-  "foundation", "bulk", "pressure", "damping", "tolerance", "iterations", "stiffness"
+  "foundation", "bulk", "pressure", "damping", "tolerance", "iterations", "stiffness", "young_scale"
 )  # fmt: skip
 
 # What native code knows of these, as constexpr.
@@ -84,6 +85,7 @@ CONSTANTS: dict[str, int | float] = {
   "MAX_BLOCKS": MAX_BLOCKS,
   "WORDS": WORDS,
   **{stage.name: stage.value for stage in Stage},
+  "NUMBERS": len(NUMBERS),
   **{name.upper(): k for k, name in enumerate(NUMBERS)},
 }
 
@@ -147,7 +149,7 @@ class Shape:
 class Tissue:
   """Material on a shape; `number` may change while running, without a graph recorded anew."""
 
-  number: floats("nnumber")  # see NUMBERS
+  number: floats("nworld", "nnumber")  # see NUMBERS
   fan_metric: floats("nslot + nslice", 5, 8)  # rest metric [1/m^2]; mu, lambda' times volume [N m]
   fan_spring: floats("nslot", 8)  # spring that stands for an edge, for `neumann` [N/m]
   hinge_gain: floats("nhingeslice", 5, 8)  # stiffness to itself and to `hinge_near` [N m]

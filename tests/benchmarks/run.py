@@ -13,6 +13,7 @@ from benchmarks.results import BenchError
 
 BENCHES = {
   "attacks": "what random attacks break",
+  "batch": "world-steps a second of batches, and what a world takes",
   "error": "run time against error, beside MuJoCo's own flex",
   "experts": "how many of its episodes each expert solves; the references",
   "inertia": "what the effective inertia does to the contact force",

@@ -1,0 +1,289 @@
+"""What every batch is: the worlds of a scene as arrays, a row a world."""
+
+from __future__ import annotations
+
+import abc
+from typing import Any
+
+import mujoco
+import numpy as np
+import warp as wp
+
+
+class Batch(abc.ABC):
+  """Worlds of one scene.
+
+  Arrays are Warp arrays of float32 on `device`, a row a world; they keep their place, and torch and
+  JAX see the same memory (`torch.from_dlpack(batch.qpos)`). Those that tell a state are brought up
+  to date when they are asked for and are not to be written to.
+
+  Attributes:
+    model: the compiled scene, whose layout `qpos`, `qvel`, `ctrl` and `sensordata` have
+    nworld: number of worlds
+    device: Warp device of the arrays
+  """
+
+  model: mujoco.MjModel
+  nworld: int
+  device: Any
+
+  def __init__(self, model: mujoco.MjModel, nworld: int, device):
+    self.model, self.nworld, self.device = model, nworld, wp.get_device(device)
+    self._fresh = False
+
+  def _allocate(self):
+    """Makes the arrays, once it is known that there is room for them."""
+    model, nworld = self.model, self.nworld
+    sizes = {"ctrl": model.nu, "qpos": model.nq, "qvel": model.nv}
+    sizes |= {"sensordata": model.nsensordata}
+    self._arrays = {name: self._make(size) for name, size in sizes.items()}
+    self._arrays["time"] = wp.zeros(nworld, dtype=float, device=self.device)
+    self._counts = {
+      name: wp.zeros(nworld, dtype=int, device=self.device) for name in ("failures", "overflow")
+    }
+
+  def _make(self, *size: int) -> wp.array:
+    return wp.zeros((self.nworld, *size), dtype=float, device=self.device)
+
+  # States.
+
+  @property
+  def ctrl(self) -> wp.array:
+    """Controls, (nworld, nu); write into it, or assign an array of that shape."""
+    return self._arrays["ctrl"]
+
+  @ctrl.setter
+  def ctrl(self, values):
+    shape = tuple(np.shape(values))
+    if shape != self.ctrl.shape:
+      raise ValueError(f"ctrl has shape {shape}, expected {self.ctrl.shape} (nworld, nu)")
+    wp.copy(self.ctrl, on_device(values, wp.float32, self.device))
+
+  @property
+  def time(self) -> wp.array:
+    """Time [s], (nworld,)."""
+    return self._state("time")
+
+  @property
+  def qpos(self) -> wp.array:
+    """Positions in the model's layout, (nworld, nq); see docs/batch.md on windows."""
+    return self._state("qpos")
+
+  @property
+  def qvel(self) -> wp.array:
+    """Velocities in the model's layout, (nworld, nv)."""
+    return self._state("qvel")
+
+  @property
+  def sensordata(self) -> wp.array:
+    """Sensors of the last step, (nworld, nsensordata); zero in a world that was reset since."""
+    return self._state("sensordata")
+
+  @property
+  def failures(self) -> wp.array:
+    """How often each world had numbers that are not finite, and was reset for it, (nworld,)."""
+    return self._counts["failures"]
+
+  @property
+  def overflow(self) -> wp.array:
+    """Most touched triangles, or nodes, that windows had no room for so far, (nworld,)."""
+    return self._counts["overflow"]
+
+  def _state(self, name: str) -> wp.array:
+    if not self._fresh:
+      self._tell()
+      self._fresh = True
+    return self._arrays[name]
+
+  @abc.abstractmethod
+  def _tell(self):
+    """Brings the arrays of the state up to date."""
+
+  @property
+  @abc.abstractmethod
+  def organs(self) -> dict[str, Tissue]:
+    """The organs by name."""
+
+  def organ(self, name: str) -> Tissue:
+    """Returns an organ.
+
+    Raises:
+      ValueError: the scene has no organ of that name; the message lists those it has.
+    """
+    if name not in self.organs:
+      have = ", ".join(map(repr, self.organs)) or "none"
+      raise ValueError(f"no organ {name!r} in the batch, it has {have}")
+    return self.organs[name]
+
+  # Doing.
+
+  def step(self, n: int = 1):
+    """Steps all worlds n times with the controls in `ctrl`.
+
+    A world that ends with numbers that are not finite is reset and counted in `failures`.
+    """
+    if isinstance(n, bool) or not isinstance(n, int | np.integer) or n < 1:
+      raise ValueError(f"n is {n!r}, expected a whole number >= 1")
+    self._fresh = False
+    self._step(int(n))
+
+  @abc.abstractmethod
+  def _step(self, n: int):
+    """Steps all worlds."""
+
+  def reset(self, mask=None):
+    """Puts worlds at rest, their controls at zero.
+
+    Args:
+      mask: worlds to reset, (nworld,) of bool; None for all
+    """
+    self._fresh = False
+    self._reset(self._mask(mask))
+
+  @abc.abstractmethod
+  def _reset(self, mask: wp.array):
+    """Puts the worlds of a mask, which is on the device, at rest."""
+
+  def _mask(self, mask) -> wp.array:
+    if mask is None:
+      return wp.full(self.nworld, True, dtype=wp.bool, device=self.device)
+    if not isinstance(mask, wp.array):
+      mask = mask if hasattr(mask, "__cuda_array_interface__") else np.asarray(mask)
+    kind = getattr(mask.dtype, "__name__", str(mask.dtype)).rpartition(".")[2]
+    if tuple(mask.shape) != (self.nworld,) or kind != "bool":
+      what = f"shape {tuple(mask.shape)} of {kind}"
+      raise ValueError(f"mask has {what}, expected ({self.nworld},) of bool, one a world")
+    return on_device(mask, wp.bool, self.device)
+
+  def _world(self, world: int) -> int:
+    if isinstance(world, bool) or not isinstance(world, int | np.integer):
+      raise ValueError(f"world is {world!r}, expected a whole number")
+    if not 0 <= world < self.nworld:
+      raise ValueError(f"world is {world}, expected one in [0, {self.nworld})")
+    return int(world)
+
+  def _check(self, data: mujoco.MjData):
+    sizes = {"qpos": "nq", "qvel": "nv", "ctrl": "nu", "plugin_state": "npluginstate"}
+    if any(getattr(data, name).size != getattr(self.model, size) for name, size in sizes.items()):
+      raise ValueError("data is of another model, expected an MjData of the batch's `model`")
+
+  def get_state(self, world: int, data: mujoco.MjData):
+    """Writes the state of a world to an mjData of `model`, where the plugin goes on with it."""
+    world = self._world(world)
+    self._check(data)
+    self._get_state(world, data)
+
+  @abc.abstractmethod
+  def _get_state(self, world: int, data: mujoco.MjData):
+    """Writes the state of a world to an mjData."""
+
+  def set_state(self, world: int, data: mujoco.MjData):
+    """Gives a world the state of an mjData of `model`."""
+    world = self._world(world)
+    self._check(data)
+    self._fresh = False
+    self._set_state(world, data)
+
+  @abc.abstractmethod
+  def _set_state(self, world: int, data: mujoco.MjData):
+    """Gives a world the state of an mjData."""
+
+
+class Tissue(abc.ABC):
+  """One organ in all worlds of a batch; arrays as those of `Batch`, in world coordinates.
+
+  Attributes:
+    name: name of the flexcomp
+    nvert: number of vertices
+    elem: triangles, counter-clockwise from outside, (nelem, 3)
+  """
+
+  name: str
+  nvert: int
+  elem: np.ndarray
+
+  @property
+  @abc.abstractmethod
+  def xpos(self) -> wp.array:
+    """Positions [m], (nworld, nvert, 3)."""
+
+  @property
+  @abc.abstractmethod
+  def xvel(self) -> wp.array:
+    """Velocities [m/s], (nworld, nvert, 3)."""
+
+  @property
+  @abc.abstractmethod
+  def contact_force(self) -> wp.array:
+    """Constraint force on each vertex in the last step [N], (nworld, nvert, 3)."""
+
+  @property
+  @abc.abstractmethod
+  def residual(self) -> wp.array:
+    """Relative residual of the last step's solve, (nworld,)."""
+
+  @property
+  @abc.abstractmethod
+  def iterations(self) -> wp.array:
+    """PCG iterations of the last step, (nworld,)."""
+
+  @abc.abstractmethod
+  def configure(self, mask=None, **keys):
+    """Changes the tissue of worlds: keys of docs/configuration.md that may change while running.
+
+    A value is one number for all, or has a row a world. `young_scale` stands for `young` as a
+    multiple of the compiled one; `young` has one number, or one a triangle. `friction` is the
+    sliding friction of the organ's side of contacts.
+
+    Args:
+      mask: worlds to change, (nworld,) of bool; None for all
+      **keys: new values
+
+    Raises:
+      ValueError: a key may not change, or a value is not allowed.
+    """
+
+
+def count_of(nworld: int) -> int:
+  """Returns a number of worlds that is one."""
+  if isinstance(nworld, bool) or not isinstance(nworld, int | np.integer) or nworld < 1:
+    raise ValueError(f"nworld is {nworld!r}, expected a whole number >= 1")
+  return int(nworld)
+
+
+def on_device(values, dtype, device) -> wp.array:
+  """Returns values as a Warp array of that type on a device, the same memory where it is one."""
+  if isinstance(values, wp.array) and values.dtype is dtype and values.device == device:
+    return values
+  if isinstance(values, wp.array):
+    values = values.numpy()
+  if hasattr(values, "__cuda_array_interface__") and device.is_cuda:
+    return wp.array(values, dtype=dtype, device=device)
+  return wp.array(np.asarray(values), dtype=dtype, device=device)
+
+
+def spread(tissue: Tissue, key: str, value, nworld: int) -> np.ndarray:
+  """Returns a value of a key a world: (nworld,), or (nworld, nelem) where triangles differ."""
+  array = np.asarray(value, dtype=float)
+  nelem = len(tissue.elem)
+  per_triangle = key == "young" and array.ndim and array.shape[-1] == nelem
+  rows = array.ndim - int(bool(per_triangle))
+  if rows == 0:
+    array = np.broadcast_to(array, (nworld, *array.shape))
+  if rows > 1 or len(array) != nworld:
+    raise ValueError(
+      f"organ {tissue.name!r}: {key} has shape {np.shape(value)}, expected one number, or one a "
+      f"world ({nworld},)" + (f", each or one a triangle ({nelem},)" if key == "young" else "")
+    )
+  if key == "friction" and not (array >= 0).all():
+    raise ValueError(f"organ {tissue.name!r}: friction is {array.min()}, expected numbers >= 0")
+  return array
+
+
+def refuse_crowd(nworld: int, each: float, room: float, where: str):
+  """Raises ValueError where worlds of so many bytes do not fit; says how many do."""
+  if nworld * each > room:
+    raise ValueError(
+      f"nworld is {nworld}, which takes about {nworld * each / 1e9:.1f} GB, but {where} has "
+      f"{room / 1e9:.1f} GB free; expected at most {int(room / each)}"
+    )

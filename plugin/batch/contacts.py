@@ -1,0 +1,360 @@
+"""Contacts of an organ's window with tools, written where mujoco_warp makes constraints of them.
+
+Each slot has a place of its own for its contacts, so that which is where does not depend on who
+comes first, and worlds need nothing of each other.
+"""
+
+# Annotations here are objects, not text: no `from __future__ import annotations`.
+# pyright: reportInvalidTypeForm=false
+import functools
+
+import mujoco
+import numpy as np
+import warp as wp
+
+# All that depends on names inside of mujoco_warp: its tools against a triangle, and types.
+from mujoco_warp._src import collision_primitive_core as core
+from mujoco_warp._src.types import ContactType, vec5
+from palpate.tissue.types import Array, fill, floats, ints, struct
+
+from .patch import Patch
+
+_GEOM = mujoco.mjtGeom
+# Contacts of a triangle with a tool, at most, as mujoco_warp finds them.
+_EACH = {
+  int(_GEOM.mjGEOM_SPHERE): 1,
+  int(_GEOM.mjGEOM_ELLIPSOID): 1,
+  int(_GEOM.mjGEOM_CAPSULE): 5,
+  int(_GEOM.mjGEOM_BOX): 11,
+}
+_SPHERE, _ELLIPSOID, _CAPSULE, _BOX = (wp.constant(kind) for kind in _EACH)
+_FAR = wp.constant(1e10)  # what mujoco_warp says of a contact that is none
+_CONSTRAINT = wp.constant(int(ContactType.CONSTRAINT))
+_LEAST = 1e-5  # friction, as in MuJoCo
+# Whose sliding friction counts: the greater, or that of the one with priority.
+_GREATER, _TOOL, _ORGAN = wp.constant(0), wp.constant(1), wp.constant(2)
+
+
+@struct
+class Touch:
+  """How an organ's triangles touch each tool, and mujoco_warp's contacts."""
+
+  room: int  # contacts of a slot
+  flex: int  # the slots' flex
+  radius: float  # of that [m]
+  kind: ints("ntool")  # mjtGeom
+  size: Array(wp.vec3, ("ntool",))  # as geom_size
+  margin: floats("ntool")  # [m]
+  condim: ints("ntool")
+  whose: ints("ntool")  # whose sliding friction counts
+  slide: floats("ntool")  # the tool's
+  rough: floats("nworld")  # the organ's
+  friction: Array(vec5, ("ntool",))  # all of it, the sliding one as compiled
+  solref: Array(wp.vec2, ("ntool",))
+  solimp: Array(vec5, ("ntool",))
+  # mujoco_warp:
+  nacon: ints(1)
+  out_dist: floats("naconmax")
+  out_pos: Array(wp.vec3, ("naconmax",))
+  out_frame: Array(wp.mat33, ("naconmax",))
+  out_includemargin: floats("naconmax")
+  out_friction: Array(vec5, ("naconmax",))
+  out_solref: Array(wp.vec2, ("naconmax",))
+  out_solreffriction: Array(wp.vec2, ("naconmax",))
+  out_solimp: Array(vec5, ("naconmax",))
+  out_dim: ints("naconmax")
+  out_geom: Array(wp.vec2i, ("naconmax",))
+  out_flex: Array(wp.vec2i, ("naconmax",))
+  out_elem: Array(wp.vec2i, ("naconmax",))
+  out_vert: Array(wp.vec2i, ("naconmax",))
+  out_worldid: ints("naconmax")
+  out_type: ints("naconmax")
+  out_geomcollisionid: ints("naconmax")
+
+
+@wp.struct
+class Place:
+  """A triangle before a tool, and where its contacts go."""
+
+  world: int
+  first: int  # contact, -1 where they are counted alone
+  room: int
+  elem: int
+  tool: int  # which of the organ's
+  geom: int
+
+
+@wp.func
+def _choose(n: int, k: int):
+  """Returns n over k, k up to 3."""
+  if k == 2:
+    return n * (n - 1) // 2
+  return n * (n - 1) * (n - 2) // 6
+
+
+@wp.func
+def _triple(a: int, b: int, c: int, n: int):
+  """Returns the number of a triple of n in the order of `itertools.combinations`."""
+  low = wp.min(a, wp.min(b, c))
+  high = wp.max(a, wp.max(b, c))
+  middle = a + b + c - low - high
+  before = _choose(n, 3) - _choose(n - low, 3)
+  return before + _choose(n - low - 1, 2) - _choose(n - middle, 2) + high - middle - 1
+
+
+@wp.func
+def _where(p: Patch, world: int, i: int):
+  """Returns where a node is."""
+  s = i // 8
+  lane = i % 8
+  d = p.solve.disp
+  x = p.rest[i, 0] + wp.float64(d[world, s, 0, lane])
+  y = p.rest[i, 1] + wp.float64(d[world, s, 1, lane])
+  z = p.rest[i, 2] + wp.float64(d[world, s, 2, lane])
+  return wp.vec3(
+    float(p.origin[0] + p.frame[0, 0] * x + p.frame[0, 1] * y + p.frame[0, 2] * z),
+    float(p.origin[1] + p.frame[1, 0] * x + p.frame[1, 1] * y + p.frame[1, 2] * z),
+    float(p.origin[2] + p.frame[2, 0] * x + p.frame[2, 1] * y + p.frame[2, 2] * z),
+  )
+
+
+@wp.func
+def _axes(normal: wp.vec3):
+  """Returns the axes of a contact, its normal first."""
+  n = wp.normalize(normal)
+  side = wp.vec3(0.0, 1.0, 0.0)
+  if wp.abs(n[1]) >= 0.5:
+    side = wp.vec3(0.0, 0.0, 1.0)
+  t = wp.normalize(side - wp.dot(side, n) * n)
+  u = wp.cross(n, t)
+  return wp.mat33(n[0], n[1], n[2], t[0], t[1], t[2], u[0], u[1], u[2])
+
+
+@wp.func
+def _put(c: Touch, at: Place, n: int, dist: float, pos: wp.vec3, normal: wp.vec3):
+  """Writes a contact, if it is one and there is room; returns how many there are then."""
+  q = at.tool
+  if not dist < c.margin[q]:
+    return n
+  if at.first >= 0 and n < at.room:
+    k = at.first + n
+    c.out_dist[k] = dist
+    c.out_pos[k] = pos
+    c.out_frame[k] = _axes(normal)
+    c.out_includemargin[k] = c.margin[q]
+    slide = c.slide[q]
+    if c.whose[q] == _ORGAN:
+      slide = c.rough[at.world]
+    elif c.whose[q] == _GREATER:
+      slide = wp.max(slide, c.rough[at.world])
+    friction = c.friction[q]
+    friction[0] = wp.max(slide, _LEAST)
+    friction[1] = friction[0]
+    c.out_friction[k] = friction
+    c.out_solref[k] = c.solref[q]
+    c.out_solreffriction[k] = wp.vec2(0.0, 0.0)
+    c.out_solimp[k] = c.solimp[q]
+    c.out_dim[k] = c.condim[q]
+    c.out_geom[k] = wp.vec2i(at.geom, -1)
+    c.out_flex[k] = wp.vec2i(-1, c.flex)
+    c.out_elem[k] = wp.vec2i(-1, at.elem)
+    c.out_vert[k] = wp.vec2i(-1, -1)
+    c.out_type[k] = _CONSTRAINT
+    c.out_geomcollisionid[k] = n
+  return n + 1
+
+
+@wp.func
+def _ellipsoid(pos: wp.vec3, rot: wp.mat33, size: wp.vec3, a: wp.vec3, b: wp.vec3, d: wp.vec3):
+  """Returns distance, place and normal of the point of a triangle that is nearest to an ellipsoid.
+
+  Nearest is meant in units of its half axes; the distance is that of `native/geom.h`.
+  """
+  t = wp.transpose(rot)
+  la = wp.cw_div(t * (a - pos), size)
+  lb = wp.cw_div(t * (b - pos), size)
+  ld = wp.cw_div(t * (d - pos), size)
+  dist, nearest, _normal = core.sphere_triangle(wp.vec3(0.0), 0.0, la, lb, ld, 0.0, _FAR)
+  k = wp.normalize(nearest) * wp.max(dist, 1e-6)
+  r = wp.length(k)
+  gradient = wp.cw_div(k, size)
+  e = wp.length(gradient)
+  where = pos + rot * wp.cw_mul(k, size)
+  return r * (r - 1.0) / wp.max(e, 1e-12), where, rot * wp.normalize(gradient)
+
+
+@functools.cache
+def _against(kinds: frozenset[int]):
+  """Returns the function that finds a triangle's contacts with a tool of one of these kinds."""
+  sphere, ellipsoid = _SPHERE in kinds, _ELLIPSOID in kinds
+  capsule, box = _CAPSULE in kinds, _BOX in kinds
+
+  @wp.func
+  def against(p: Patch, c: Touch, at: Place, n: int, a: wp.vec3, b: wp.vec3, d: wp.vec3):
+    pos = p.geom_xpos[at.world, at.geom]
+    rot = p.geom_xmat[at.world, at.geom]
+    size = c.size[at.tool]
+    axis = wp.vec3(rot[0, 2], rot[1, 2], rot[2, 2])
+    kind = c.kind[at.tool]
+    margin = c.margin[at.tool]
+    if wp.static(sphere):
+      if kind == _SPHERE:
+        dist, x, normal = core.sphere_triangle(pos, size[0], a, b, d, c.radius, margin)
+        n = _put(c, at, n, dist, x, normal)
+    if wp.static(ellipsoid):
+      if kind == _ELLIPSOID:
+        far, y, out = _ellipsoid(pos, rot, size, a, b, d)
+        gap = far - c.radius
+        n = _put(c, at, n, gap, y - (c.radius + 0.5 * gap) * out, out)
+    if wp.static(capsule):
+      if kind == _CAPSULE:
+        dists, xs, normals = core.capsule_triangle(
+          pos, axis, size[0], size[1], a, b, d, c.radius, margin
+        )
+        for k in range(5):
+          n = _put(c, at, n, dists[k], xs[k], normals[k])
+    if wp.static(box):
+      if kind == _BOX:
+        dists2, xs2, normals2 = core.box_triangle(pos, rot, size, a, b, d, c.radius, margin)
+        for k in range(11):
+          n = _put(c, at, n, dists2[k], xs2[k], normals2[k])
+    return n
+
+  return against
+
+
+@wp.func
+def _owner(p: Patch, world: int, e: int):
+  """Returns the first corner of a triangle that has a slot, whose thread has the triangle."""
+  if p.node_slot[world, p.elem[e, 0]] >= 0:
+    return p.elem[e, 0]
+  if p.node_slot[world, p.elem[e, 1]] >= 0:
+    return p.elem[e, 1]
+  return p.elem[e, 2]
+
+
+@functools.cache
+def kernel(kinds: frozenset[int]) -> wp.Kernel:
+  """Returns the kernel that finds contacts with tools of these kinds, a thread a slot."""
+  against = _against(kinds)
+
+  @wp.kernel(module="unique", enable_backward=False)
+  def find(p: Patch, c: Touch):
+    world, slot = wp.tid()
+    at = Place()
+    at.world = world
+    at.room = c.room
+    first = c.nacon[0] + (world * p.nslot + slot) * c.room
+    n = int(0)  # noqa: RUF046, UP018 - a variable to Warp
+    i = p.slot_node[world, slot]
+    if i >= 0:
+      for q in range(p.near_adr[i], p.near_adr[i + 1]):
+        e = p.near[q]
+        va = p.elem[e, 0]
+        vb = p.elem[e, 1]
+        vd = p.elem[e, 2]
+        a = p.node_slot[world, va]
+        b = p.node_slot[world, vb]
+        d = p.node_slot[world, vd]
+        whole = a >= 0 and b >= 0 and d >= 0
+        if _owner(p, world, e) == i:
+          at.first = wp.where(whole, first, -1)
+          at.elem = 0
+          if whole:
+            at.elem = _triple(a, b, d, p.nslot)
+          lost = int(0)  # noqa: RUF046, UP018
+          xa = _where(p, world, va)
+          xb = _where(p, world, vb)
+          xd = _where(p, world, vd)
+          for tool in range(p.ntool):
+            at.tool = tool
+            at.geom = p.tool_geom[tool]
+            if whole:
+              n = against(p, c, at, n, xa, xb, xd)
+            else:
+              lost = against(p, c, at, lost, xa, xb, xd)
+          if lost > 0:
+            wp.atomic_add(p.missed, world, 1)
+    if n > c.room:
+      wp.atomic_add(p.missed, world, n - c.room)
+    for k in range(c.room):
+      c.out_worldid[first + k] = world
+      if k >= n:
+        c.out_type[first + k] = 0
+        c.out_dim[first + k] = 1
+        c.out_geom[first + k] = wp.vec2i(-1, -1)
+
+  return find
+
+
+@wp.kernel(enable_backward=False)
+def add(nacon: wp.array[int], count: int):
+  """Adds to the number of contacts, after all have seen it."""
+  nacon[0] = nacon[0] + count
+
+
+def room_of(model: mujoco.MjModel, tools: np.ndarray) -> int:
+  """Returns how many contacts a slot has room for: those of four triangles."""
+  each = max((_EACH[int(kind)] for kind in model.geom_type[tools]), default=1)
+  return min(4 * each, 16)
+
+
+def most_of(model: mujoco.MjModel, tools: np.ndarray, nslot: int) -> int:
+  """Returns how many contacts a world has rows for: two a slot, a patch's triangles, or more."""
+  each = max((_EACH[int(kind)] for kind in model.geom_type[tools]), default=1)
+  return nslot * min(2 * each, 4)
+
+
+def make(model: mujoco.MjModel, organ, tools: np.ndarray, flex: int, nworld: int, data):
+  """Returns how an organ touches its tools.
+
+  Args:
+    model: the compiled scene
+    organ: the organ's declaration
+    tools: geoms that its slots follow
+    flex: the slots' flex in the stripped model
+    nworld: number of worlds
+    data: mujoco_warp's
+  """
+  own = int(organ.windows.flex[0]) if organ.windows else organ.flex
+  rows = [_mix(model, int(g), own) for g in tools]
+  mixed = {name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else ())}
+  contact = {f"out_{name}": getattr(data.contact, name) for name in _written()}
+  values = mixed | contact | dict(
+    room=room_of(model, tools),
+    flex=flex,
+    radius=float(model.flex_radius[own]),
+    kind=model.geom_type[tools],
+    size=model.geom_size[tools],
+    rough=np.full(nworld, model.flex_friction[own, 0]),
+    nacon=data.nacon,
+  )  # fmt: skip
+  return fill(Touch, data.nacon.device, values)
+
+
+def _written() -> list[str]:
+  return [name.removeprefix("out_") for name in Touch.vars if name.startswith("out_")]
+
+
+def _mix(model, g: int, f: int) -> dict:
+  """Returns the parameters of a contact of a geom and a flex, as mj_contactParam mixes them."""
+  mine, other = int(model.geom_priority[g]), int(model.flex_priority[f])
+  solref = np.stack([model.geom_solref[g], model.flex_solref[f]])
+  solimp = np.stack([model.geom_solimp[g], model.flex_solimp[f]])
+  friction = np.stack([model.geom_friction[g], model.flex_friction[f]])
+  condim = np.array([model.geom_condim[g], model.flex_condim[f]])
+  margin = float(model.geom_margin[g] + model.flex_margin[f])
+  out = {"margin": margin, "slide": friction[0, 0], "whose": int(_GREATER)}
+  if mine != other:
+    k = int(other > mine)
+    parts = condim[k], solref[k], solimp[k], friction[k]
+    out["whose"] = int(_ORGAN if k else _TOOL)
+  else:
+    a, b = float(model.geom_solmix[g]), float(model.flex_solmix[f])
+    share = a / (a + b) if a + b > 0 else 0.5
+    mixed = share * solref[0] + (1 - share) * solref[1]
+    direct = (solref[:, 0] <= 0).any()
+    ref = solref.min(axis=0) if direct else mixed
+    parts = condim.max(), ref, share * solimp[0] + (1 - share) * solimp[1], friction.max(axis=0)
+  out |= dict(zip(("condim", "solref", "solimp"), parts[:3], strict=True))
+  return out | {"friction": np.maximum(parts[3][[0, 0, 1, 2, 2]], _LEAST)}

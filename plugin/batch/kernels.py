@@ -1,0 +1,135 @@
+"""Small kernels of batches on a device: resets, counts, and states in the user's layout."""
+
+# Annotations here are objects, not text: no `from __future__ import annotations`.
+import warp as wp
+from palpate.tissue.types import Array, floats, ints, struct
+
+from .patch import Patch
+
+
+@struct
+class Start:
+  """What of mujoco_warp's data a reset puts back, and where to."""
+
+  mask: Array(wp.bool, ("nworld",))  # worlds to reset
+  qpos0: floats("nq")
+  geom_xpos0: Array(wp.vec3, ("ngeom",))  # [m]
+  geom_xmat0: Array(wp.mat33, ("ngeom",))
+  mocap_pos0: Array(wp.vec3, ("nmocap",))
+  mocap_quat0: Array(wp.quat, ("nmocap",))
+  eq_active0: Array(wp.bool, ("neq",))
+  time: floats("nworld")
+  qpos: floats("nworld", "nq")
+  qvel: floats("nworld", "nv")
+  act: floats("nworld", "na")
+  ctrl: floats("nworld", "nu")
+  qacc: floats("nworld", "nv")
+  qacc_warmstart: floats("nworld", "nv")
+  qfrc_applied: floats("nworld", "nv")
+  xfrc_applied: Array(wp.spatial_vector, ("nworld", "nbody"))
+  sensordata: floats("nworld", "nsensordata")
+  eq_active: Array(wp.bool, ("nworld", "neq"))
+  mocap_pos: Array(wp.vec3, ("nworld", "nmocap"))
+  mocap_quat: Array(wp.quat, ("nworld", "nmocap"))
+  geom_xpos: Array(wp.vec3, ("nworld", "ngeom"))
+  geom_xmat: Array(wp.mat33, ("nworld", "ngeom"))
+  overflow: ints("nworld")
+
+
+@wp.kernel(enable_backward=False)
+def reset(s: Start):
+  """Puts the worlds of the mask where they were at first."""
+  w = wp.tid()
+  if not s.mask[w]:
+    return
+  s.time[w] = 0.0
+  s.overflow[w] = 0
+  for k in range(s.qpos.shape[1]):
+    s.qpos[w, k] = s.qpos0[k]
+  for k in range(s.qvel.shape[1]):
+    s.qvel[w, k] = 0.0
+    s.qacc[w, k] = 0.0
+    s.qacc_warmstart[w, k] = 0.0
+    s.qfrc_applied[w, k] = 0.0
+  for k in range(s.act.shape[1]):
+    s.act[w, k] = 0.0
+  for k in range(s.ctrl.shape[1]):
+    s.ctrl[w, k] = 0.0
+  for k in range(s.sensordata.shape[1]):
+    s.sensordata[w, k] = 0.0
+  for k in range(s.xfrc_applied.shape[1]):
+    s.xfrc_applied[w, k] = wp.spatial_vector()
+  for k in range(s.eq_active.shape[1]):
+    s.eq_active[w, k] = s.eq_active0[k]
+  for k in range(s.mocap_pos.shape[1]):
+    s.mocap_pos[w, k] = s.mocap_pos0[k]
+    s.mocap_quat[w, k] = s.mocap_quat0[k]
+  for k in range(s.geom_xpos.shape[1]):
+    s.geom_xpos[w, k] = s.geom_xpos0[k]
+    s.geom_xmat[w, k] = s.geom_xmat0[k]
+
+
+@wp.kernel(enable_backward=False)
+def note(bad: wp.array[int], mask: wp.array[bool], failures: wp.array[int]):
+  """Makes a mask of the bad worlds and counts them."""
+  w = wp.tid()
+  mask[w] = bad[w] != 0
+  failures[w] = failures[w] + bad[w]
+  bad[w] = 0
+
+
+@wp.kernel(enable_backward=False)
+def count(found: wp.array[int], bits: wp.array[int], lost: int, out: wp.array[int]):
+  """Keeps the most that windows had no room for, and what mujoco_warp says was lost."""
+  w = wp.tid()
+  most = found[w]
+  if bits[w] & lost:
+    most = wp.max(most, 1)
+  out[w] = wp.max(out[w], most)
+
+
+@wp.kernel(enable_backward=False)
+def spread(source: wp.array2d[float], at: wp.array[int], out: wp.array2d[float]):
+  """Writes columns of a row a world to their places."""
+  w, k = wp.tid()
+  out[w, at[k]] = source[w, k]
+
+
+@wp.kernel(enable_backward=False)
+def spread_nodes(p: Patch, adr: wp.array[int], velocity: int, out: wp.array2d[float]):
+  """Writes the motion of nodes that are dofs of the model to their places."""
+  w, i = wp.tid()
+  n = p.node[i]
+  for c in range(3):
+    if adr[i] >= 0:
+      if velocity == 1:
+        out[w, adr[i] + c] = p.solve.vel[w, n // 8, c, n % 8]
+      else:
+        out[w, adr[i] + c] = p.solve.disp[w, n // 8, c, n % 8]
+
+
+@wp.func
+def _lane(v: wp.array4d[float], w: int, n: int):
+  return wp.vec3(v[w, n // 8, 0, n % 8], v[w, n // 8, 1, n % 8], v[w, n // 8, 2, n % 8])
+
+
+@wp.kernel(enable_backward=False)
+def show(p: Patch, what: int, out: wp.array2d[wp.vec3]):
+  """Writes positions, velocities or contact forces of vertices, in the world's axes."""
+  w, i = wp.tid()
+  n = p.node[i]
+  f = p.frame
+  frame = wp.mat33(
+    float(f[0, 0]), float(f[0, 1]), float(f[0, 2]),
+    float(f[1, 0]), float(f[1, 1]), float(f[1, 2]),
+    float(f[2, 0]), float(f[2, 1]), float(f[2, 2]),
+  )  # fmt: skip
+  if what == 0:
+    x = _lane(p.solve.disp, w, n)
+    at = wp.vec3(float(p.rest[n, 0]), float(p.rest[n, 1]), float(p.rest[n, 2]))
+    origin = wp.vec3(float(p.origin[0]), float(p.origin[1]), float(p.origin[2]))
+    out[w, i] = origin + frame * (at + x)
+  elif what == 1:
+    out[w, i] = frame * _lane(p.solve.vel, w, n)
+  else:
+    out[w, i] = frame * wp.vec3(p.force[w, n, 0], p.force[w, n, 1], p.force[w, n, 2])

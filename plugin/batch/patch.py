@@ -1,0 +1,211 @@
+"""An organ in all worlds of a batch: its patch of slots, and the kernels over them."""
+
+# Annotations here are objects, not text: no `from __future__ import annotations`.
+# pyright: reportInvalidTypeForm=false
+import mujoco
+import numpy as np
+import warp as wp
+from palpate.engine import coupling
+from palpate.engine.coupling import Crossing
+from palpate.engine.layout import GEOM
+from palpate.tissue import step
+from palpate.tissue.types import Array, Tissue, doubles, fill, floats, ints, struct, vector
+
+_BLOCK = 128  # threads, whole warps
+_ENDLESS = 1e300  # square of a distance beyond all others [m^2]
+# Candidates for the slots, times the slots.
+_ROOM = 6
+# Steps of the scale of Young's modulus for which the effective inertia is known.
+GRADES = 2.0 ** np.arange(-4, 5)
+
+
+@struct
+class Patch:
+  """An organ, the slots that stand for it in mujoco_warp, and what they share.
+
+  Nodes are in the order of `Shape`, padding among them: neighbours in memory are neighbours there.
+  """
+
+  nnode: int  # nodes
+  nslice: int  # slices of nodes
+  nslot: int  # slots
+  most: int  # candidates for them
+  ntool: int  # geoms that the slots follow
+  ngeom: int  # geoms of the model
+  nq: int
+  nv: int
+  nbody: int
+  dofadr: int  # first dof of the slots
+  qposadr: int  # their first number in qpos
+  bodyid: int  # their first body
+  ngravity: int  # rows of `gravity`
+  ngrade: int  # rows of `inertia`
+  stiff: int  # whether the organ answers for itself, see `inertia.stiffness`
+  h: wp.float64  # time step [s]
+  rest_share: wp.float64  # see `step.REST`
+  weight: wp.float64  # mass of the organ [kg]
+  slot_mass: wp.float64  # mass of a slot's body [kg]
+  heaviest: wp.float64  # see `inertia.stiffness`
+  # The organ:
+  node: ints("nvert")  # node of a vertex
+  free: ints("nnode")  # whether a node moves
+  mass: doubles("nnode")  # mass [kg]
+  held: doubles("nnode")  # mass, of pinned ones that of a wall [kg]
+  rest: doubles("nnode", 3)  # rest position [m]
+  inertia: doubles("ngrade", "nnode")  # effective inertia at each of GRADES [kg]
+  touch: doubles("nnode")  # distance from a geom within which its triangles may touch it [m]
+  elem: ints("nelem", 3)  # nodes of a triangle
+  near_adr: ints("nnode + 1")  # first of a node's triangles in `near`
+  near: ints("nnear")  # triangles of the nodes
+  frame: doubles(3, 3)  # rotation from the organ's axes to the world's
+  origin: doubles(3)  # position of its frame [m]
+  tool_geom: ints("ntool")  # geoms that the slots follow
+  # What a world has of its own:
+  grade: floats("nworld")  # place in GRADES of the scale of Young's modulus
+  heavier: doubles("nworld")  # times its inertia at rest that a tool meets; 0 for once
+  force: floats("nworld", "nnode", 3)  # contact force of the last step [N]
+  last: vector  # last change of the velocity [m/s]
+  before: vector  # the one before it [m/s]
+  # Within a step:
+  tool: doubles("nworld", "ntool", len(GEOM))  # see GEOM
+  count: ints("nworld")  # candidates
+  candidate: ints("nworld", "most")  # their nodes
+  distance: floats("nworld", "most")  # from the nearest tool [m]
+  chosen: ints("nworld", "most")  # whether they have a slot
+  slot_node: ints("nworld", "nslot")  # node of a slot, -1 for none
+  node_slot: ints("nworld", "nnode")  # slot of a node, -1 for none
+  found: floats("nworld", "nslot", 3)  # contact force of this step [N]
+  missed: ints("nworld")  # contacts without room
+  overflow: ints("nworld")  # the most of these so far
+  bad: ints("nworld")  # whether a number is not finite
+  mask: Array(wp.bool, ("nworld",))  # worlds to reset
+  # mujoco_warp:
+  gravity: Array(wp.vec3, ("ngravity",))
+  geom_xpos: Array(wp.vec3, ("nworld", "ngeom"))
+  geom_xmat: Array(wp.mat33, ("nworld", "ngeom"))
+  qpos: floats("nworld", "nq")
+  qvel: floats("nworld", "nv")
+  qfrc_passive: floats("nworld", "nv")
+  qfrc_constraint: floats("nworld", "nv")
+  dof_armature: floats("nworld", "nv")
+  body_invweight0: Array(wp.vec2, ("nworld", "nbody"))
+  tissue: Tissue
+  solve: Crossing
+
+
+tell_tools, enter, rank, stand, push, take, follow, commit, find_bad, rest = coupling.kernels(
+  "worlds.h",
+  Patch,
+  *("tell_tools", "enter_worlds", "rank", "stand", "push_worlds", "take", "follow"),
+  *("commit_worlds", "find_bad", "rest_organ"),
+)
+MODULE = enter.module.name
+
+
+def launch(kernel, patch, nworld: int, count: int, device):
+  """Launches a kernel over `count` items of each world; one thread has a world on the CPU."""
+  nthread = -(-count // 32) * 32 if device.is_cuda else 1
+  inputs = [nthread, 0, patch]
+  wp.launch(kernel, dim=(nworld, nthread), block_dim=_BLOCK, inputs=inputs, device=device)
+
+
+def constants(body, organ, tools: np.ndarray, model: mujoco.MjModel, inertia, held) -> dict:
+  """Returns the fields of `Patch` that say what the organ is and which tools it meets.
+
+  Args:
+    body: its tissue in all worlds
+    organ: its declaration
+    tools: geoms that the slots follow
+    model: the compiled scene
+    inertia: effective inertia of every vertex [kg]
+    held: mass of every vertex, of pinned ones that of a wall [kg]
+  """
+  mesh, touch = organ.mesh, _touch(organ, tools, model)
+  node, nnode = body.shape.node.numpy(), body.shape.nnode
+  elem = node[mesh.elem]
+  count = np.bincount(elem.ravel(), minlength=nnode)
+
+  def by_node(values, padding=0.0):
+    out = np.full((nnode, *values.shape[1:]), padding)
+    out[node] = values
+    return out
+
+  return dict(
+    nnode=nnode,
+    nslice=body.shape.nslice,
+    ntool=len(tools),
+    ngeom=model.ngeom,
+    ngrade=len(GRADES),
+    h=model.opt.timestep,
+    rest_share=step.REST,
+    weight=float(organ.mass.sum()),
+    node=node,
+    free=by_node(organ.free),
+    mass=by_node(organ.mass),
+    held=by_node(held, 1.0),
+    rest=by_node(mesh.rest),
+    inertia=np.tile(by_node(inertia, 1.0), (len(GRADES), 1)),
+    touch=by_node(touch, -np.inf),  # padding is never near
+    elem=elem,
+    near_adr=np.concatenate([[0], np.cumsum(count)]),
+    near=np.argsort(elem.ravel(), kind="stable") // 3,
+    frame=organ.frame,
+    origin=organ.origin,
+    tool_geom=tools,
+    tool=np.tile(_tools(tools, model, float(touch.max())), (body.nworld, 1, 1)),
+  )  # fmt: skip
+
+
+def _touch(organ, tools: np.ndarray, model) -> np.ndarray:
+  """Returns the distance from a geom within which a vertex's triangles may touch it [m]."""
+  mesh = organ.mesh
+  edge = mesh.rest[mesh.elem[:, [1, 2, 0]]] - mesh.rest[mesh.elem]
+  length = np.linalg.norm(edge, axis=2)
+  longest = np.zeros(mesh.nvert)
+  for corner in (mesh.elem, mesh.elem[:, [1, 2, 0]]):
+    np.maximum.at(longest, corner.ravel(), length.ravel())
+  flex = organ.windows.flex if organ.windows else [organ.flex]
+  skin = float(model.flex_radius[flex].max() + model.flex_margin[flex].max())
+  return longest + skin + float(model.geom_margin[tools].max(initial=0.0))
+
+
+def _tools(tools: np.ndarray, model, reach: float) -> np.ndarray:
+  """Returns what is the same in all worlds of each tool, see GEOM."""
+  tool = np.zeros((len(tools), len(GEOM)))
+  tool[:, GEOM.type] = model.geom_type[tools]
+  tool[:, GEOM.size : GEOM.size + 3] = model.geom_size[tools]
+  tool[:, GEOM.box : GEOM.box + 3] = model.geom_aabb[tools, :3]
+  tool[:, GEOM.half : GEOM.half + 3] = model.geom_aabb[tools, 3:]
+  bound = model.geom_rbound[tools]
+  tool[:, GEOM.bound2] = np.where(bound > 0, (bound + reach) ** 2, _ENDLESS)
+  return tool
+
+
+def variables(nworld: int, nslot: int, nslice: int) -> dict:
+  """Returns the fields of `Patch` that worlds have of their own, at rest."""
+  nnode = 8 * nslice
+  most = min(nnode, _ROOM * nslot)
+  shape = (nworld, nslice, 3, 8)
+  return dict(
+    nslot=nslot,
+    most=most,
+    grade=np.full(nworld, np.log2(1.0 / GRADES[0])),
+    heavier=np.zeros(nworld),
+    force=np.zeros((nworld, nnode, 3)),
+    last=np.zeros(shape),
+    before=np.zeros(shape),
+    count=np.zeros(nworld),
+    candidate=np.zeros((nworld, most)),
+    distance=np.zeros((nworld, most)),
+    chosen=np.zeros((nworld, most)),
+    slot_node=np.full((nworld, nslot), -1),
+    node_slot=np.full((nworld, nnode), -1),
+    found=np.zeros((nworld, nslot, 3)),
+    missed=np.zeros(nworld),
+  )  # fmt: skip
+
+
+def make(values: dict, body):
+  """Returns the patch of a body in its worlds; `values` are the fields but those of the body."""
+  own = {"tissue": body.tissue, "solve": coupling.crossing(coupling.on_body(body))}
+  return fill(Patch, body.device, values | own)

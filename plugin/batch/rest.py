@@ -1,0 +1,59 @@
+"""Resets of worlds on a device: those of a mask, and those whose numbers are not finite."""
+
+from __future__ import annotations
+
+import mujoco
+import warp as wp
+from palpate.tissue.types import fill
+
+from . import kernels
+from .kernels import Start
+
+
+class Rest:
+  """Resets of the worlds of a batch.
+
+  Args:
+    batch: its worlds, with mujoco_warp's data at rest
+    bare: the model that mujoco_warp has
+  """
+
+  def __init__(self, batch, bare: mujoco.MjModel):
+    start = mujoco.MjData(bare)
+    mujoco.mj_forward(bare, start)
+    self._batch, self.mask = batch, batch.mask
+    d = batch.d
+    values = {name: getattr(d, name) for name in Start.vars if hasattr(d, name)}
+    values |= dict(
+      mask=batch.mask,
+      qpos0=bare.qpos0,
+      geom_xpos0=start.geom_xpos,
+      geom_xmat0=start.geom_xmat.reshape(-1, 3, 3),
+      mocap_pos0=start.mocap_pos,
+      mocap_quat0=start.mocap_quat,
+      eq_active0=bare.eq_active0.astype(bool),
+    )  # fmt: skip
+    self._start = fill(Start, batch.device, values)
+
+  def launch(self):
+    """Puts the worlds of the mask at rest."""
+    wp.launch(
+      kernels.reset, dim=self._batch.nworld, inputs=[self._start], device=self._batch.device
+    )
+    for organ in self._batch.organs.values():
+      organ.rest()
+
+  def find(self):
+    """Resets and counts the worlds with numbers that are not finite."""
+    batch = self._batch
+    for organ in batch.organs.values():
+      organ.find_bad()
+    inputs = [batch.bad, self.mask, batch.failures]
+    wp.launch(kernels.note, dim=batch.nworld, inputs=inputs, device=batch.device)
+    self.launch()
+
+  def count_lost(self, lost: int):
+    """Brings `overflow` up to date; `lost` are the bits of mujoco_warp's that count."""
+    batch = self._batch
+    inputs = [batch.lost, batch.d.overflow, lost, batch.counted]
+    wp.launch(kernels.count, dim=batch.nworld, inputs=inputs, device=batch.device)

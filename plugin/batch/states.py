@@ -1,0 +1,178 @@
+"""States of worlds on a device, as the model that the user gave has them."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import warp as wp
+from palpate.engine import coupling
+from palpate.engine import plugin as engine
+from palpate.engine.layout import TAIL
+from palpate.tissue.order import from_slices, to_slices
+
+from . import kernels
+from .organs import Organ
+
+_MOTION = ("disp", "vel", "last", "before")
+_PLAIN = ("act", "ctrl", "mocap_pos")
+
+
+def bytes_of(bare: mujoco.MjModel, njmax: int, ncon: int) -> float:
+  """Returns about how many bytes mujoco_warp takes for a world."""
+  nv = bare.nv + 32
+  floats = njmax * (nv + 20) + 2 * nv * nv + 60 * nv + 10 * bare.nflexedge + 80 * bare.nbody
+  return 4.0 * floats + 230.0 * ncon
+
+
+# Reading.
+
+
+def tell(batch):
+  """Writes qpos and qvel in the model's layout."""
+  for k, name in enumerate(("qpos", "qvel")):
+    kept, out = batch.kept[k], getattr(batch, name + "_out")
+    at = wp.array(kept, dtype=int, device=batch.device)
+    dim, source = (batch.nworld, len(kept)), getattr(batch.d, name)
+    wp.launch(kernels.spread, dim=dim, inputs=[source, at, out], device=batch.device)
+    for organ in batch.organs.values():
+      declared = organ.declared
+      if declared.windows is None:
+        adr = wp.array((declared.qposadr, declared.dofadr)[k], dtype=int, device=batch.device)
+        dim, inputs = (batch.nworld, organ.nvert), [organ.patch, adr, k, out]
+        wp.launch(kernels.spread_nodes, dim=dim, inputs=inputs, device=batch.device)
+
+
+# One world, to and from an mjData.
+
+
+def pull(batch, world: int, data: mujoco.MjData):
+  """Writes the state of a world to an mjData."""
+  model, d = batch.model, batch.d
+  mujoco.mj_resetData(model, data)
+  for k, name in enumerate(("qpos", "qvel")):
+    row = getattr(d, name)[world].numpy()
+    getattr(data, name)[batch.kept[k]] = row[: len(batch.kept[k])]
+  for name in _PLAIN:
+    if getattr(data, name).size:
+      getattr(data, name)[:] = getattr(d, name)[world].numpy()
+  if model.nmocap:
+    data.mocap_quat[:] = d.mocap_quat[world].numpy()
+  if model.neq:
+    data.eq_active[:] = d.eq_active[world].numpy()
+  data.time = d.time[world : world + 1].numpy()[0]
+  for organ in batch.organs.values():
+    _pull_organ(organ, world, model, data)
+  engine.place_windows(model, data)
+
+
+def _own(organ: Organ, model, data) -> tuple[np.ndarray, dict[str, slice]]:
+  """Returns an organ's part of the plugin state, and where its blocks lie."""
+  start = model.plugin_stateadr[organ.instance]
+  size = model.plugin_statenum[organ.instance]
+  return data.plugin_state[start : start + size], coupling.spans(organ.declared)
+
+
+def _vectors(organ: Organ) -> dict[str, wp.array]:
+  state = organ.body.state
+  return {
+    "disp": state.disp, "vel": state.vel, "last": organ.patch.last, "before": organ.patch.before
+  }  # fmt: skip
+
+
+def _pull_organ(organ: Organ, world: int, model, data):
+  declared, node = organ.declared, organ.body.shape.node.numpy()
+  own, spans = _own(organ, model, data)
+  motion = {
+    name: from_slices(array[world].numpy())[node].astype(float)
+    for name, array in _vectors(organ).items()
+  }
+  force = organ.patch.force[world].numpy()[node].astype(float)
+  heavier = float(organ.patch.heavier[world : world + 1].numpy()[0])
+  if declared.windows is None:
+    free = declared.free
+    data.qpos[declared.qposs] = motion["disp"][free].ravel()
+    data.qvel[declared.dofs] = motion["vel"][free].ravel()
+    for name, values in (("last", motion["last"]), ("before", motion["before"]), ("force", force)):
+      own[spans[name]] = values[free].ravel()
+    own[spans["heavier"]] = heavier
+  else:
+    for name in _MOTION:
+      own[spans[name]] = motion[name].ravel()
+    own[spans["tail"]] = 0.0
+    own[spans["tail"].start + TAIL.heavier] = heavier
+    _pull_slots(organ, world, own, spans, force)
+  own[spans["signature"]] = declared.signature
+
+
+def _pull_slots(organ: Organ, world: int, own, spans, force: np.ndarray):
+  """Gives the first window the nodes of the slots, those with the greatest forces first."""
+  win = organ.declared.windows
+  node = organ.patch.slot_node[world].numpy()
+  node = organ.body.shape.vert.numpy()[node[node >= 0]]  # vertices from here on
+  node = node[np.argsort(-np.linalg.norm(force[node], axis=1), kind="stable")]
+  node = node[: win.adr[1] - 1]  # the last slot of a window stays free
+  number, forces = np.full(win.nslot, -1.0), np.zeros((win.nslot, 3))
+  number[: len(node)], forces[: len(node)] = node + 1, force[node]
+  own[spans["slot"]], own[spans["force"]] = number, forces.ravel()
+
+
+def push(batch, world: int, data: mujoco.MjData):
+  """Gives a world the state of an mjData."""
+  model, d = batch.model, batch.d
+  engine.sync(model, data)
+  scratch = batch.scratch
+  mujoco.mj_resetData(model, scratch)
+  scratch.qpos[:], scratch.mocap_pos[:], scratch.mocap_quat[:] = (
+    data.qpos, data.mocap_pos, data.mocap_quat
+  )  # fmt: skip
+  mujoco.mj_kinematics(model, scratch)
+  for k, name in enumerate(("qpos", "qvel")):
+    array = getattr(d, name)
+    row = array[world].numpy()
+    row[: len(batch.kept[k])] = getattr(data, name)[batch.kept[k]]
+    _assign(array, world, row)
+  for name in _PLAIN:
+    _assign(getattr(d, name), world, getattr(data, name))
+  _assign(d.qacc_warmstart, world, np.zeros(d.qacc_warmstart.shape[1]))
+  _assign(d.mocap_quat, world, data.mocap_quat)
+  _assign(d.eq_active, world, data.eq_active.astype(bool))
+  _assign(d.geom_xpos, world, scratch.geom_xpos)
+  _assign(d.geom_xmat, world, scratch.geom_xmat.reshape(-1, 3, 3))
+  d.time[world : world + 1].assign(np.array([data.time], np.float32))
+  for organ in batch.organs.values():
+    _push_organ(organ, world, model, data)
+
+
+def _assign(array: wp.array, world: int, values: np.ndarray):
+  if values.size:
+    row = array[world]
+    row.assign(wp.array(values, dtype=array.dtype, device=array.device))
+
+
+def _push_organ(organ: Organ, world: int, model, data):
+  declared, node = organ.declared, organ.body.shape.node.numpy()
+  own, spans = _own(organ, model, data)
+  motion = {name: np.zeros((organ.nvert, 3)) for name in _MOTION}
+  force, free = np.zeros((organ.nvert, 3)), declared.free
+  if declared.windows is None:
+    motion["disp"][free] = data.qpos[declared.qposs].reshape(-1, 3)
+    motion["vel"][free] = data.qvel[declared.dofs].reshape(-1, 3)
+    for name, values in (("last", motion["last"]), ("before", motion["before"]), ("force", force)):
+      values[free] = own[spans[name]].reshape(-1, 3)
+    heavier = float(own[spans["heavier"]][0])
+  else:
+    for name in _MOTION:
+      motion[name][:] = own[spans[name]].reshape(-1, 3)
+    number = own[spans["slot"]].astype(int)
+    slot_node = np.where(number == 0, declared.windows.home, number - 1)
+    used = slot_node >= 0
+    force[slot_node[used]] = own[spans["force"]].reshape(-1, 3)[used]
+    heavier = float(own[spans["tail"].start + TAIL.heavier])
+  for name, array in _vectors(organ).items():
+    full = np.zeros((organ.body.shape.nnode, 3), np.float32)
+    full[node] = motion[name]
+    _assign(array, world, to_slices(full))
+  full = np.zeros((organ.body.shape.nnode, 3))
+  full[node] = force
+  _assign(organ.patch.force, world, full)
+  organ.patch.heavier[world : world + 1].assign(np.array([heavier]))

@@ -1,0 +1,238 @@
+# mujoco ships its bindings without type stubs:
+# pyright: reportAttributeAccessIssue=false
+"""What mujoco_warp gets of a scene: all but the organs, and slots in their place.
+
+The slots of an organ are the vertices of one flex whose triangles are all triples of slots, since
+mujoco_warp shares triangles between worlds: whichever nodes a window has, each of its triangles has
+an element.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+
+import mujoco
+import numpy as np
+from palpate import windows
+from palpate.engine import plugin as engine
+
+# Slots of an organ: all triples of more are too many.
+LEAST, MOST = 4, 48
+_USUAL = 24  # at most, unless told
+_INERTIA = 1e-8  # of a slot's body, which does not turn [kg m^2]
+_COUNTED = ("nu", "na", "nsensor", "nsensordata", "neq", "ntendon", "npair", "nexclude", "nmocap")
+_TOOLS = ("SPHERE", "CAPSULE", "ELLIPSOID", "BOX")
+
+
+@dataclasses.dataclass(frozen=True)
+class Slots:
+  """Where the stripped model has the slots of an organ."""
+
+  nslot: int
+  flex: int
+  body: int
+  dofadr: int
+  qposadr: int
+  mass: float
+
+
+def tools_of(model: mujoco.MjModel, organ) -> np.ndarray:
+  """Returns the geoms that an organ's slots follow.
+
+  Raises:
+    ValueError: one is not a tool that a batch knows, or it is not an organ that it can step.
+  """
+  if organ.config.elements == "solid":
+    raise ValueError(
+      f"organ {organ.name!r}: elements is 'solid', which a batch on a GPU cannot do; expected "
+      "'membrane' or 'spring'"
+    )
+  if organ.windows:
+    found = np.unique(organ.windows.geom)
+  else:
+    contype, conaffinity = model.flex_contype[organ.flex], model.flex_conaffinity[organ.flex]
+    meets = (model.geom_contype & conaffinity) | (model.geom_conaffinity & contype)
+    found = np.flatnonzero(meets)
+    fixed = [g for g in found if model.body_weldid[model.geom_bodyid[g]] == 0]
+    if fixed:
+      raise ValueError(
+        f"organ {organ.name!r} collides with {_geom(model, int(fixed[0]))}, which does not move; a "
+        "batch on a GPU follows what moves, expected contype and conaffinity that do not meet"
+      )
+  for g in found:
+    if mujoco.mjtGeom(model.geom_type[g]).name.removeprefix("mjGEOM_") not in _TOOLS:
+      kind = mujoco.mjtGeom(model.geom_type[g]).name.removeprefix("mjGEOM_").lower()
+      raise ValueError(
+        f"organ {organ.name!r} collides with {_geom(model, int(g))}, a {kind}; a batch on "
+        f"a GPU knows {', '.join(name.lower() for name in _TOOLS)}"
+      )
+  return found
+
+
+def slots_for(model, organ, tools: np.ndarray, nodes) -> int:
+  """Returns how many slots an organ has: the nodes that its tools touch, and their neighbours.
+
+  Args:
+    model: the compiled scene
+    organ: the organ's declaration
+    tools: geoms that the slots follow
+    nodes: a number, or one by name, or None for what the tools' sizes ask for
+  """
+  given = nodes.get(organ.name) if isinstance(nodes, dict) else nodes
+  nvert = organ.mesh.nvert
+  if given is not None:
+    if isinstance(given, bool) or not isinstance(given, int) or not LEAST <= given <= MOST:
+      raise ValueError(f"organ {organ.name!r}: nodes is {given!r}, expected [{LEAST}, {MOST}]")
+    return min(given, nvert)
+  edge = organ.mesh.rest[organ.mesh.elem[:, [1, 2, 0]]] - organ.mesh.rest[organ.mesh.elem]
+  edge = float(np.linalg.norm(edge, axis=2).mean())
+  many = 0.0
+  for g in tools:
+    low, middle, large = np.sort(model.geom_aabb[g, 3:])
+    r = (0.5 * (low + middle)) + edge
+    many += (math.pi * r * r + 2 * r * 2 * (large - middle)) / (math.sqrt(3) / 2 * edge * edge)
+  return int(min(np.clip(math.ceil(many), 8, _USUAL), nvert))
+
+
+def _geom(model, g: int) -> str:
+  name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, g)
+  body = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, int(model.geom_bodyid[g]))
+  return f"geom {name!r}" if name else f"a geom of body {body!r}"
+
+
+def strip(
+  spec: mujoco.MjSpec, model: mujoco.MjModel, organs: list, nslots: list[int]
+) -> tuple[mujoco.MjModel, list[Slots]]:
+  """Returns the model without organs and with slots, and where it has these.
+
+  Args:
+    spec: the scene
+    model: compiled from it
+    organs: its organs' declarations
+    nslots: slots of each
+  """
+  bare = spec.copy()
+  for key in list(bare.keys):
+    bare.delete(key)
+  bodies = {body.name: body for body in bare.bodies}
+  _take_plugins(bare)
+  for organ in organs:
+    _take_out(bare, bodies, organ, model)
+  masses = [_slot_mass(organ) for organ in organs]
+  for organ, nslot, mass in zip(organs, nslots, masses, strict=True):
+    _add_slots(bare, organ, nslot, mass, model)
+  bare.option.jacobian = mujoco.mjtJacobian.mjJAC_AUTO
+  _check_option(bare.option)
+  made = bare.compile()
+  made.flex_vert[:] = 0.0  # vertices are where their bodies are
+  made.flex_centered[:] = True
+  if made.nv <= 60 and made.opt.solver == mujoco.mjtSolver.mjSOL_NEWTON:
+    made.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+  _check(model, made, organs, nslots)
+  slots = []
+  for organ, nslot, mass in zip(organs, nslots, masses, strict=True):
+    first = made.body(f"{organ.name}_slot_0").id
+    slots.append(
+      Slots(
+        nslot,
+        mujoco.mj_name2id(made, mujoco.mjtObj.mjOBJ_FLEX, f"{organ.name}_slots"),
+        first,
+        int(made.body_dofadr[first]),
+        int(made.jnt_qposadr[made.body_jntadr[first]]),
+        mass,
+      )
+    )
+  return made, slots
+
+
+def _take_plugins(bare):
+  """Deletes the instances of the plugin, first from the bodies that refer to them."""
+  mine = [b for b in bare.bodies if b.plugin.active and b.plugin.plugin_name == engine.NAME]
+  instances = {body.plugin.name: body.plugin for body in mine}
+  for body in mine:
+    body.plugin.active = False
+  for instance in instances.values():
+    bare.delete(instance)
+
+
+def _check_option(option):
+  if option.integrator == mujoco.mjtIntegrator.mjINT_IMPLICIT:
+    raise ValueError("integrator is implicit, expected Euler or implicitfast for a batch on a GPU")
+  if option.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
+    raise ValueError("sleep is enabled, which a batch on a GPU does not know")
+
+
+def _slot_mass(organ) -> float:
+  """Returns the mass of a slot's body, which no node is lighter than [kg]."""
+  return 0.5 * float(organ.mass[organ.free].min())
+
+
+def _take_out(bare, bodies: dict, organ, model):
+  """Deletes an organ's flexes and the bodies of its nodes or windows."""
+  numbers = [organ.flex, *(organ.windows.flex if organ.windows else [])]
+  for number in numbers:
+    name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_FLEX, int(number))
+    flex = bare.flex(name)
+    mine = [bodies[body] for body in dict.fromkeys(flex.vertbody)]
+    bare.delete(flex)
+    moving = [body for body in mine if body.first_joint() is not None]
+    if not moving:
+      continue
+    # One by one they take MuJoCo quadratic time to delete.
+    doomed = moving[0].parent.add_frame()
+    for body in moving:
+      body.set_frame(doomed)
+    bare.delete(doomed)
+
+
+def _add_slots(bare, organ, nslot: int, mass: float, model):
+  flex = organ.windows.flex[0] if organ.windows else organ.flex
+  names = [f"{organ.name}_slot_{k}" for k in range(nslot)]
+  for name in names:
+    windows.add_node(bare.worldbody, name, np.zeros(3), mass, _INERTIA)
+  # No three points of a circle are in line, which MuJoCo wants of triangles.
+  angle = 2 * math.pi * np.arange(nslot) / nslot
+  points = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+  elem = np.array(list(itertools.combinations(range(nslot), 3)))
+  made = windows.make_flex(bare, f"{organ.name}_slots", points, names, elem)
+  made.contype = made.conaffinity = 0
+  made.selfcollide = mujoco.mjtFlexSelf.mjFLEXSELF_NONE
+  made.condim = int(model.flex_condim[flex])
+
+
+def _check(model, made, organs: list, nslots: list[int]):
+  """Raises ValueError where something of the scene hung on what was taken out."""
+  for name in _COUNTED:
+    before, after = getattr(model, name), getattr(made, name)
+    if before != after:
+      raise ValueError(
+        f"{name} is {before} and would be {after} without the organs' nodes: an actuator, sensor, "
+        "equality, tendon or pair refers to them, which a batch on a GPU cannot do"
+      )
+  gone = sum(organ.nfree if organ.windows is None else 3 * organ.windows.nslot for organ in organs)
+  if model.nv - gone != made.nv - 3 * sum(nslots) or model.ngeom != made.ngeom:
+    raise ValueError("the scene has other flexes or plugins, which a batch on a GPU cannot do")
+
+
+def tools_meet(bare: mujoco.MjModel) -> bool:
+  """Returns whether two geoms can touch, one of which moves."""
+  kind, meets, body = bare.geom_contype, bare.geom_conaffinity, bare.body_weldid[bare.geom_bodyid]
+  pairs = (kind[:, None] & meets) | (meets[:, None] & kind)
+  return bool((pairs.astype(bool) & (body[:, None] != body)).any()) or bare.npair > 0
+
+
+def rows_of(bare: mujoco.MjModel) -> int:
+  """Returns the most rows of constraints that a world has besides those of contacts."""
+  limits = int(bare.jnt_limited.sum()) + 2 * int(bare.tendon_limited.sum())
+  friction = int((bare.dof_frictionloss > 0).sum() + (bare.tendon_frictionloss > 0).sum())
+  return 2 * limits + friction + 6 * bare.neq
+
+
+def kept(model: mujoco.MjModel, organs: list) -> tuple[np.ndarray, np.ndarray]:
+  """Returns the numbers of qpos and of qvel that are not an organ's; they come first in both."""
+  qpos, dofs = np.ones(model.nq, bool), np.ones(model.nv, bool)
+  for organ in organs:
+    qpos[organ.qposs] = dofs[organ.dofs] = False
+  return np.flatnonzero(qpos), np.flatnonzero(dofs)

@@ -1,0 +1,202 @@
+"""Worlds on the threads of the CPU, each a copy of the model that the plugin steps."""
+
+from __future__ import annotations
+
+import copy
+import functools
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+import mujoco
+import numpy as np
+import warp as wp
+from palpate.engine import plugin as engine
+from palpate.organ import Organ, instances
+from palpate.tissue import body as bodies
+
+from .base import Batch, Tissue, refuse_crowd, spread
+
+_FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
+_CTRL = mujoco.mjtState.mjSTATE_CTRL
+_BAD = [
+  int(getattr(mujoco.mjtWarning, f"mjWARN_{name}"))
+  for name in ("BADQPOS", "BADQVEL", "BADQACC", "BADCTRL")
+]
+
+
+class Threads(Batch):
+  """A batch whose worlds are mjData of the plugin.
+
+  Args:
+    scene: an MjSpec or MjModel
+    nworld: number of worlds
+    nthread: threads that step them; None for as many as the machine has cores
+  """
+
+  def __init__(self, scene, nworld: int, nthread: int | None = None):
+    model = scene.compile() if isinstance(scene, mujoco.MjSpec) else scene
+    nthread = _threads(nthread)
+    super().__init__(model, nworld, "cpu")
+    # Windows, and the inertia that follows a tissue, are in the model: a world needs its own.
+    self.models = [copy.copy(model)]
+    self.datas = [mujoco.MjData(self.models[0])]
+    first = self.datas[0]
+    spaces = [engine.find(first._address, number) for number in instances(model).values()]
+    each = mujoco.mj_sizeModel(model) + first.nbuffer + sum(bodies.nbytes(w.body) for w in spaces)
+    refuse_crowd(nworld, each, _free_memory(), "this machine")
+    self._allocate()
+    self.models += [copy.copy(model) for _ in range(nworld - 1)]
+    self.datas += [mujoco.MjData(each) for each in self.models[1:]]
+    self._pool = ThreadPoolExecutor(min(nthread, nworld))
+    self._organs = {name: _Tissue(self, name, number) for name, number in instances(model).items()}
+
+  @property
+  def organs(self) -> dict[str, Tissue]:
+    """The organs by name."""
+    return dict(self._organs)
+
+  def each(self, work: Callable[[int], object], worlds=None):
+    """Does work(world) for all worlds, or some, on the threads."""
+    list(self._pool.map(work, range(self.nworld) if worlds is None else worlds))
+
+  def _step(self, n: int):
+    ctrl = self.ctrl.numpy()
+
+    def work(world: int):
+      data = self.datas[world]
+      data.ctrl[:] = ctrl[world]
+      mujoco.mj_step(self.models[world], data, n)
+      self._look(world)
+
+    self.each(work)
+
+  def _look(self, world: int):
+    """Counts what the windows had no room for, and resets a world that diverged."""
+    data, overflow, failed = self.datas[world], self.overflow.numpy(), False
+    for organ in self._organs.values():
+      overflow[world] = max(overflow[world], sum(organ.spaces[world].missed))
+      failed = failed or organ.handles[world].error is not None
+    if failed or any(data.warning[kind].number for kind in _BAD):
+      self.failures.numpy()[world] += 1
+      self._reset_world(world)
+
+  def _reset_world(self, world: int):
+    mujoco.mj_resetData(self.models[world], self.datas[world])
+    engine.place_windows(self.models[world], self.datas[world])
+    self.ctrl.numpy()[world] = 0.0
+
+  def _reset(self, mask: wp.array):
+    self.each(self._reset_world, np.flatnonzero(mask.numpy()))
+
+  def _tell(self):
+    for name in ("qpos", "qvel", "sensordata"):
+      out = self._arrays[name].numpy()
+      for world, data in enumerate(self.datas):
+        out[world] = getattr(data, name)
+    self._arrays["time"].numpy()[:] = [data.time for data in self.datas]
+
+  def _get_state(self, world: int, data: mujoco.MjData):
+    model, own = self.models[world], self.datas[world]
+    engine.sync(model, own)
+    _copy_state(model, own, self.model, data)
+
+  def _set_state(self, world: int, data: mujoco.MjData):
+    engine.sync(self.model, data)
+    _copy_state(self.model, data, self.models[world], self.datas[world])
+    self.ctrl.numpy()[world] = data.ctrl
+
+
+class _Tissue(Tissue):
+  """An organ of `Threads`."""
+
+  def __init__(self, batch: Threads, name: str, instance: int):
+    pairs = zip(batch.models, batch.datas, strict=True)
+    self.handles = [Organ(model, data, name) for model, data in pairs]
+    self.spaces = [engine.find(data._address, instance) for data in batch.datas]
+    self.name, self.nvert, self.elem = name, self.handles[0].nvert, self.handles[0].elem
+    self._batch = batch
+
+  @functools.cached_property
+  def _arrays(self) -> dict[str, wp.array]:
+    shape = (self._batch.nworld, self.nvert, 3)
+    arrays = {
+      name: wp.zeros(shape, dtype=float, device="cpu") for name in ("xpos", "xvel", "contact_force")
+    }
+    return arrays | {
+      name: wp.zeros(self._batch.nworld, dtype=float, device="cpu")
+      for name in ("residual", "iterations")
+    }
+
+  def _read(self, name: str) -> wp.array:
+    array = self._arrays[name]
+    out = array.numpy()
+    for world, handle in enumerate(self.handles):
+      out[world] = getattr(handle, name)
+    return array
+
+  @property
+  def xpos(self) -> wp.array:
+    """Positions [m], (nworld, nvert, 3)."""
+    return self._read("xpos")
+
+  @property
+  def xvel(self) -> wp.array:
+    """Velocities [m/s], (nworld, nvert, 3)."""
+    return self._read("xvel")
+
+  @property
+  def contact_force(self) -> wp.array:
+    """Constraint force on each vertex in the last step [N], (nworld, nvert, 3)."""
+    return self._read("contact_force")
+
+  @property
+  def residual(self) -> wp.array:
+    """Relative residual of the last step's solve, (nworld,)."""
+    return self._read("residual")
+
+  @property
+  def iterations(self) -> wp.array:
+    """PCG iterations of the last step, (nworld,)."""
+    return self._read("iterations")
+
+  def configure(self, mask=None, **keys):
+    """Changes the tissue of worlds, see `Tissue.configure`."""
+    worlds = np.flatnonzero(self._batch._mask(mask).numpy())
+    rows = {key: spread(self, key, value, self._batch.nworld) for key, value in keys.items()}
+
+    def work(world: int):
+      values = {key: value[world] for key, value in rows.items()}
+      if "friction" in values:
+        self._rub(world, float(values.pop("friction")))
+      self.handles[world].configure(**values)
+
+    self._batch.each(work, worlds)
+
+  def _rub(self, world: int, friction: float):
+    organ = self.spaces[world].organ
+    touching = organ.windows.flex if organ.windows else [organ.flex]
+    self._batch.models[world].flex_friction[touching, 0] = friction
+
+
+def _threads(nthread: int | None) -> int:
+  if nthread is None:
+    return os.cpu_count() or 1
+  if isinstance(nthread, bool) or not isinstance(nthread, int) or nthread < 1:
+    raise ValueError(f"nthread is {nthread!r}, expected a whole number >= 1")
+  return nthread
+
+
+def _copy_state(model, data, other_model, other):
+  for kind in (_FULL, _CTRL):
+    state = np.empty(mujoco.mj_stateSize(model, kind))
+    mujoco.mj_getState(model, data, state, kind)
+    mujoco.mj_setState(other_model, other, state, kind)
+  engine.place_windows(other_model, other)
+
+
+def _free_memory() -> float:
+  try:
+    return os.sysconf("SC_AVPHYS_PAGES") * float(os.sysconf("SC_PAGE_SIZE"))
+  except (AttributeError, ValueError, OSError):  # not on every system
+    return float("inf")

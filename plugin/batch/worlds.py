@@ -1,0 +1,235 @@
+"""Worlds on a GPU: tools and contacts by mujoco_warp, organs by the tissue's own kernels.
+
+A step, in all worlds at once: the slots stand on the nodes nearest to the tools, the tissue takes
+its step, mujoco_warp takes one with the windows' contacts and the force that brings the tissue's
+along (`native/formula.h`), and the nodes take over what contacts made of the slots.
+"""
+
+from __future__ import annotations
+
+import warnings
+
+import mujoco
+import mujoco_warp as mjw
+import numpy as np
+import warp as wp
+from mujoco_warp._src.types import DeterminismType, OverflowType
+from palpate.engine import plugin as engine
+from palpate.organ import instances
+from palpate.tissue import device as devices
+
+from . import contacts, states, strip
+from .base import Batch, Tissue, refuse_crowd
+from .organs import Organ
+from .rest import Rest
+
+_CONTACTS = 16  # of a world, of tools with each other and with what is fixed
+_LOST = int(OverflowType.NEFC | OverflowType.NJMAX_NNZ | OverflowType.NARROWPHASE)
+
+
+class Worlds(Batch):
+  """A batch in the memory of one device.
+
+  Args:
+    spec: the scene
+    nworld: number of worlds
+    device: Warp device
+    nodes: slots of an organ: the nodes that its tools touch at once, and their neighbours; one
+      number, or one by name; None for what the tools' sizes ask for
+    deterministic: whether runs repeat to the bit whatever the device does
+  """
+
+  def __init__(
+    self,
+    spec: mujoco.MjSpec,
+    nworld: int,
+    device: str,
+    nodes: int | dict[str, int] | None = None,
+    deterministic: bool = False,
+  ):
+    target = _resolve(device)
+    model = spec.compile()
+    super().__init__(model, nworld, target)
+    self.scratch = mujoco.MjData(model)  # its plugin knows what the organs are
+    spaces = {
+      name: engine.find(self.scratch._address, number) for name, number in instances(model).items()
+    }
+    declared = [w.organ for w in spaces.values()]
+    tools = [strip.tools_of(model, organ) for organ in declared]
+    nslots = [strip.slots_for(model, o, t, nodes) for o, t in zip(declared, tools, strict=True)]
+    bare, slots = strip.strip(spec, model, declared, nslots)
+    self._kept = strip.kept(model, declared)
+    with wp.ScopedDevice(target):
+      self._put(bare, nslots, tools, deterministic, spaces)
+      self._allocate()
+      self.bad, self.lost = wp.zeros(nworld, dtype=int), wp.zeros(nworld, dtype=int)
+      self.mask = wp.zeros(nworld, dtype=wp.bool)
+      self.qpos_out, self.qvel_out = self._arrays["qpos"], self._arrays["qvel"]
+      self._organs = {
+        name: Organ(self, w, s, t)
+        for (name, w), s, t in zip(spaces.items(), slots, tools, strict=True)
+      }
+      self._rest = Rest(self, bare)
+      self._alias()
+      self._callbacks()
+      self.record()
+    self._warned = False
+    self.reset()
+
+  def _put(self, bare, nslots, tools, deterministic, spaces):
+    """Makes mujoco_warp's model and data."""
+    model, nworld = self.model, self.nworld
+    cone = 1 if model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC else 2
+    most = [contacts.most_of(model, t, n) for t, n in zip(tools, nslots, strict=True)]
+    regions = [contacts.room_of(model, t) * n for t, n in zip(tools, nslots, strict=True)]
+    condim = int(max([1, *model.flex_condim, *model.geom_condim]))
+    each = 1 if condim == 1 else condim if cone == 1 else 2 * (condim - 1)
+    between = _CONTACTS if strip.tools_meet(bare) else 0
+    self.njmax = strip.rows_of(bare) + (between + sum(most)) * each
+    ncon = between + sum(regions)
+    size = states.bytes_of(bare, self.njmax, ncon) + sum(Organ.bytes_of(w) for w in spaces.values())
+    refuse_crowd(nworld, size, _room(self.device), str(self.device))
+    try:
+      sizes = {"dof_armature": nworld, "body_invweight0": nworld}
+      self.m = mjw.put_model(bare, batch_sizes=sizes)
+    except (NotImplementedError, ValueError) as error:
+      raise ValueError(f"mujoco_warp cannot have this scene: {error}") from None
+    start = mujoco.MjData(bare)
+    mujoco.mj_forward(bare, start)
+    # A row has the three slots of a triangle, and whatever hangs on a tool.
+    nonzero = self.njmax * (bare.nv - 3 * sum(nslots) + 9)
+    self.d = mjw.put_data(
+      bare, start, nworld=nworld, nconmax=ncon, njmax=self.njmax, njmax_nnz=nonzero
+    )
+    self.m.opt.warn_overflow = 0  # counted, see `overflow`
+    self.m.opt.deterministic = int(DeterminismType.ALL if deterministic else DeterminismType.NONE)
+    # The windows' triangles have no forces and contacts of mujoco_warp's own.
+    self.m.nflexelem = self.m.nflexedge = 0
+    gravity = np.tile(model.opt.gravity, (nworld, 1)).astype(np.float32)
+    self.m.opt.gravity = wp.array(gravity, dtype=wp.vec3)
+
+  def _alias(self):
+    """Lets controls, sensors and time be mujoco_warp's own arrays."""
+    for name in ("ctrl", "sensordata", "time"):
+      self._arrays[name] = getattr(self.d, name)
+
+  def _callbacks(self):
+    organs = list(self._organs.values())
+
+    def touch(m, d):
+      for organ in organs:
+        organ.touch()
+
+    def push(m, d):
+      for organ in organs:
+        organ.push()
+
+    self.m.callback.contactfilter = touch
+    self.m.callback.passive = push
+
+  def begin(self):
+    """Launches the part of a step before mujoco_warp's."""
+    for organ in self._organs.values():
+      organ.begin()
+
+  def step_tools(self):
+    """Launches mujoco_warp's step, with the windows' contacts."""
+    mjw.step(self.m, self.d)
+
+  def end(self):
+    """Launches the part after it."""
+    for organ in self._organs.values():
+      organ.end()
+
+  def _once(self):
+    self.begin()
+    self.step_tools()
+    self.end()
+
+  def _after(self):
+    """Launches what follows steps: worlds that are not finite are reset and counted."""
+    self._rest.find()
+
+  def record(self):
+    """Records the graphs, on a device that has them."""
+    self._graphs = {}
+    work = {"step": self._once, "after": self._after, "reset": self._rest.launch}
+    for organ in self._organs.values():
+      organ.load()
+    if not self.device.is_cuda:
+      self._graphs = {name: (None, each) for name, each in work.items()}
+      return
+    for each in work.values():
+      each()  # loads the kernels
+    for name, each in work.items():
+      with wp.ScopedCapture(self.device) as capture:
+        each()
+      self._graphs[name] = (capture.graph, each)
+
+  def _run(self, name: str):
+    graph, work = self._graphs[name]
+    with wp.ScopedDevice(self.device):
+      if graph is None:
+        work()
+      else:
+        wp.capture_launch(graph)
+
+  # Doing.
+
+  def _step(self, n: int):
+    for _ in range(n):
+      self._run("step")
+    self._run("after")
+
+  def _reset(self, mask: wp.array):
+    wp.copy(self.mask, mask)
+    self._run("reset")
+
+  def _tell(self):
+    states.tell(self)
+
+  def _get_state(self, world: int, data: mujoco.MjData):
+    states.pull(self, world, data)
+
+  def _set_state(self, world: int, data: mujoco.MjData):
+    states.push(self, world, data)
+
+  @property
+  def organs(self) -> dict[str, Tissue]:
+    """The organs by name."""
+    return dict(self._organs)
+
+  @property
+  def kept(self) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers of qpos and qvel in the model that are not an organ's."""
+    return self._kept
+
+  @property
+  def overflow(self) -> wp.array:
+    """Most touched triangles, or nodes, that windows had no room for so far, (nworld,)."""
+    self._rest.count_lost(_LOST)
+    counted = self._counts["overflow"]
+    if not self._warned and counted.numpy().any():
+      self._warned = True
+      warnings.warn(
+        f"in {np.count_nonzero(counted.numpy())} worlds windows had no room for what tools touch; "
+        "give `make` more nodes",
+        stacklevel=2,
+      )
+    return counted
+
+  @property
+  def counted(self) -> wp.array:
+    """Memory of `overflow`."""
+    return self._counts["overflow"]
+
+
+def _resolve(device: str):
+  devices.init()
+  if device == "warp-cpu":  # to test without a GPU
+    return wp.get_device("cpu")
+  return devices.resolve(device, 0)
+
+
+def _room(device) -> float:
+  return 0.95 * device.free_memory if device.is_cuda else float("inf")

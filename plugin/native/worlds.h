@@ -1,0 +1,290 @@
+// Batches: one organ in many worlds beside mujoco_warp, whose dofs of it are its slots: bodies that
+// stand on the nodes nearest to the tools, chosen anew in each step. A thread has a node or a slot.
+//
+// The coupling is that of `formula.h`. Slots move along the world's axes and their bodies have no
+// place of their own, so qpos is where they are; vectors of nodes are in the organ's frame.
+#pragma once
+#include "formula.h"
+#include "geom.h"
+
+namespace palpate {
+
+// Where a slot waits that no node has [m], and its inertia then [kg].
+constexpr float WAITING = 1e3f, IDLE = 1.0f;
+
+// Three floats of mujoco_warp's, as doubles.
+PALPATE D3 load_floats(const float* p) { return {p[0], p[1], p[2]}; }
+PALPATE void store_floats(float* p, D3 a) {
+  p[0] = (float)a.x;
+  p[1] = (float)a.y;
+  p[2] = (float)a.z;
+}
+// R x, with R row by row.
+PALPATE D3 turned(const double* R, D3 x) {
+  return {dot(load(R), x), dot(load(R + 3), x), dot(load(R + 6), x)};
+}
+// R^T x.
+PALPATE D3 turned_back(const double* R, D3 x) { return add_turned({0.0, 0.0, 0.0}, R, x); }
+
+// Where node i of a world starts in a vector of slices, and in one a node after the other.
+template <class Fields>
+PALPATE size_t at_node(const Fields& f, int world, int i) {
+  return 24 * (size_t)world * f.nslice + offset_of(i);
+}
+template <class Fields>
+PALPATE size_t in_row(const Fields& f, int world, int i) {
+  return (size_t)world * f.nnode + i;
+}
+template <class Fields>
+PALPATE int slot_dof(const Fields& f, int world, int slot) {
+  return world * f.nv + f.dofadr + 3 * slot;
+}
+template <class Fields>
+PALPATE D3 gravity(const Fields& f, int world) {
+  return load_floats((const float*)f.gravity.data + (f.ngravity > 1 ? 3 * world : 0));
+}
+template <class Fields>
+PALPATE bool succeeded(const Fields& f, int world) {
+  return f.solve.status.data[4 * world + 3] == 0.0f;
+}
+
+// The inertia that a tool meets at a node, which follows the scale of Young's modulus.
+template <class Fields>
+PALPATE double inertia_of(const Fields& f, int world, int i) {
+  const float grade = f.grade.data[world];
+  const int k = (int)grade < f.ngrade - 1 ? (int)grade : f.ngrade - 2;
+  const double t = grade - k, low = f.inertia.data[k * f.nnode + i];
+  const double total = low + t * (f.inertia.data[(k + 1) * f.nnode + i] - low);
+  const D3 force = load_floats(f.force.data + 3 * in_row(f, world, i));
+  return touched(force) && f.heavier.data[world] > 1.0 ? f.heavier.data[world] * total : total;
+}
+
+// Writes where the tools are, in the organ's frame.
+template <class Fields>
+PALPATE void tell_tools(const Fields& f, Thread t, int) {
+  if (t.tid == 0) f.count.data[t.world] = f.missed.data[t.world] = 0;
+  each_item(t, f.ntool, [&](int q) {
+    const size_t g = (size_t)t.world * f.ngeom + f.tool_geom.data[q];
+    const float* R = (const float*)f.geom_xmat.data + 9 * g;
+    const D3 from = load_floats((const float*)f.geom_xpos.data + 3 * g) - load(f.origin.data);
+    double* tool = f.tool.data + (size_t)GEOM_LENGTH * (t.world * f.ntool + q);
+    store(tool + GEOM_POS, turned_back(f.frame.data, from));
+    for (int a = 0; a < 3; ++a)
+      store(tool + GEOM_AXIS + 3 * a, turned_back(f.frame.data, {R[a], R[3 + a], R[6 + a]}));
+  });
+}
+
+// Fills the solver's input, and lists the nodes that a tool may touch.
+template <class Fields>
+PALPATE void enter_worlds(const Fields& f, Thread t, int) {
+  const int w = t.world;
+  const double h = f.h;
+  if (t.tid == 0) {
+    float* step = f.solve.step.data + 4 * w;
+    const double still = f.rest_share * 9.81 * h;
+    step[0] = (float)h;
+    step[1] = (float)(h * h + h * numbers(f, w)[DAMPING]);
+    step[2] = (float)(f.weight * still * still);
+  }
+  const D3 g = turned_back(f.frame.data, gravity(f, w));
+  const double* tool = f.tool.data + (size_t)GEOM_LENGTH * w * f.ntool;
+  each_item(t, f.nnode, [&](int i) {
+    const size_t at = at_node(f, w, i);
+    const D3 last = load_lane(f.last.data + at), before = load_lane(f.before.data + at);
+    const D3 contact = load_floats(f.force.data + 3 * in_row(f, w, i));
+    store_lane(f.solve.dvel_warm.data + at, forecast(last, before));
+    store_lane(f.solve.force_ext.data + at, f.mass.data[i] * g + contact);
+    f.node_slot.data[in_row(f, w, i)] = -1;
+    const D3 x = load(f.rest.data + 3 * i) + load_lane(f.solve.disp.data + at);
+    const double far = nearest(tool, f.ntool, x);
+    if (far > f.touch.data[i]) return;
+    const int q = append(f.count.data + w);
+    if (q >= f.most) return;
+    f.candidate.data[w * f.most + q] = i;
+    f.distance.data[w * f.most + q] = (float)far;
+  });
+}
+
+template <class Fields>
+PALPATE int candidates(const Fields& f, int world) {
+  const int all = f.count.data[world];
+  return all < f.most ? all : f.most;
+}
+
+// Chooses the candidates nearest to the tools; the order of nodes decides between equals.
+template <class Fields>
+PALPATE void rank(const Fields& f, Thread t, int) {
+  const int n = candidates(f, t.world);
+  const int* node = f.candidate.data + t.world * f.most;
+  const float* far = f.distance.data + t.world * f.most;
+  each_item(t, n, [&](int q) {
+    int nearer = 0;
+    for (int p = 0; p < n; ++p)
+      nearer += far[p] < far[q] || (far[p] == far[q] && node[p] < node[q]);
+    f.chosen.data[t.world * f.most + q] = nearer < f.nslot;
+  });
+}
+
+// Lets a slot wait where no tool is.
+template <class Fields>
+PALPATE void wait(const Fields& f, int world, int slot) {
+  const int adr = slot_dof(f, world, slot);
+  f.slot_node.data[world * f.nslot + slot] = -1;
+  store_floats(f.qpos.data + (size_t)world * f.nq + f.qposadr + 3 * slot, {0.0, 0.0, WAITING});
+  store_floats(f.qvel.data + adr, {0.0, 0.0, 0.0});
+  store_floats(f.dof_armature.data + adr, {IDLE, IDLE, IDLE});
+}
+
+// Puts a slot on a node, with its motion and effective inertia.
+template <class Fields>
+PALPATE void stand_on(const Fields& f, int world, int slot, int i) {
+  const int adr = slot_dof(f, world, slot);
+  const size_t at = at_node(f, world, i);
+  f.slot_node.data[world * f.nslot + slot] = i;
+  f.node_slot.data[in_row(f, world, i)] = slot;
+  const D3 x = load(f.rest.data + 3 * i) + load_lane(f.solve.disp.data + at);
+  const D3 v = load_lane(f.solve.vel.data + at);
+  store_floats(f.qpos.data + (size_t)world * f.nq + f.qposadr + 3 * slot,
+               load(f.origin.data) + turned(f.frame.data, x));
+  store_floats(f.qvel.data + adr, turned(f.frame.data, v));
+  const double more = inertia_of(f, world, i) - f.slot_mass;
+  store_floats(f.dof_armature.data + adr, {more, more, more});
+  float* inverse = (float*)f.body_invweight0.data + 2 * (world * f.nbody + f.bodyid + slot);
+  inverse[0] = (float)(1.0 / f.held.data[i]);
+}
+
+// Gives the slots to the chosen nodes, in their order.
+template <class Fields>
+PALPATE void stand(const Fields& f, Thread t, int) {
+  const int n = candidates(f, t.world), used = n < f.nslot ? n : f.nslot;
+  const int* node = f.candidate.data + t.world * f.most;
+  const int* chosen = f.chosen.data + t.world * f.most;
+  each_item(t, n, [&](int q) {
+    if (!chosen[q]) return;
+    int slot = 0;
+    for (int p = 0; p < n; ++p) slot += chosen[p] && node[p] < node[q];
+    stand_on(f, t.world, slot, node[q]);
+  });
+  each_item(t, f.nslot, [&](int k) {
+    if (k >= used) wait(f, t.world, k);
+  });
+}
+
+// Adds the passive force that carries v + dv to the slots' dofs.
+template <class Fields>
+PALPATE void push_worlds(const Fields& f, Thread t, int) {
+  const D3 weight = f.slot_mass * gravity(f, t.world);
+  each_item(t, f.nslot, [&](int k) {
+    const int adr = slot_dof(f, t.world, k), i = f.slot_node.data[t.world * f.nslot + k];
+    D3 rate = {0.0, 0.0, 0.0}, contact = rate;
+    if (i >= 0) {
+      const double Mhat = f.slot_mass + f.dof_armature.data[adr];
+      const D3 dv = load_lane(f.solve.dvel.data + at_node(f, t.world, i));
+      if (succeeded(f, t.world)) rate = (Mhat / f.h) * turned(f.frame.data, dv);
+      contact = turned(f.frame.data, load_floats(f.force.data + 3 * in_row(f, t.world, i)));
+    }
+    store_floats(f.qfrc_passive.data + adr, passive(rate, contact + weight));
+  });
+}
+
+// Takes the contact forces that MuJoCo found; where the organ answers, the impulses by which they
+// changed go to the solver's right-hand side, which is zero.
+template <class Fields>
+PALPATE void take(const Fields& f, Thread t, int) {
+  each_item(t, f.nslot, [&](int k) {
+    const int i = f.slot_node.data[t.world * f.nslot + k];
+    if (i < 0) return;
+    const D3 found = load_floats(f.qfrc_constraint.data + slot_dof(f, t.world, k));
+    const D3 now = f.free.data[i] ? turned_back(f.frame.data, found) : D3{0.0, 0.0, 0.0};
+    store_floats(f.found.data + 3 * (t.world * f.nslot + k), now);
+    if (!f.stiff) return;
+    const D3 change = now - load_floats(f.force.data + 3 * in_row(f, t.world, i));
+    store_lane(f.solve.rhs.data + at_node(f, t.world, i), (double)f.h * change);
+  });
+}
+
+// Follows the organ's answer with the inertia that tools meet.
+template <class Fields>
+PALPATE void follow(const Fields& f, Thread t, int) {
+  if (t.tid > 0) return;
+  Secant secant;
+  const double h = f.h;
+  for (int k = 0; k < f.nslot; ++k) {
+    const int i = f.slot_node.data[t.world * f.nslot + k];
+    if (i < 0) continue;
+    const D3 now = load_floats(f.found.data + 3 * (t.world * f.nslot + k));
+    const D3 df = now - load_floats(f.force.data + 3 * in_row(f, t.world, i));
+    const D3 answer = load_lane(f.solve.sol.data + at_node(f, t.world, i));
+    const double Mhat = f.slot_mass + f.dof_armature.data[slot_dof(f, t.world, k)];
+    secant.add(h * df, answer, h * h * dot(df, df) / Mhat, df, norm(now));
+  }
+  double* heavier = f.heavier.data + t.world;
+  *heavier = secant.heavier(*heavier > 1.0 ? *heavier : 1.0, f.heaviest);
+}
+
+// Ends the step.
+template <class Fields>
+PALPATE void commit_worlds(const Fields& f, Thread t, int) {
+  const int w = t.world;
+  const double ok = succeeded(f, w) ? 1.0 : 0.0, h = f.h;
+  if (t.tid == 0) {
+    const int crowd = f.count.data[w] - f.most, missed = f.missed.data[w] + (crowd > 0 ? crowd : 0);
+    if (missed > f.overflow.data[w]) f.overflow.data[w] = missed;
+  }
+  each_item(t, f.nnode, [&](int i) {
+    if (!f.free.data[i]) return;
+    const size_t at = at_node(f, w, i);
+    const int slot = f.node_slot.data[in_row(f, w, i)];
+    D3 dv = load_lane(f.solve.dvel.data + at), now = {0.0, 0.0, 0.0};
+    if (f.stiff) dv += load_lane(f.solve.sol.data + at);
+    dv = ok * dv;
+    D3 v = load_lane(f.solve.vel.data + at) + dv;
+    if (slot >= 0) {
+      now = load_floats(f.found.data + 3 * (w * f.nslot + slot));
+      if (!f.stiff)
+        v = turned_back(f.frame.data, load_floats(f.qvel.data + slot_dof(f, w, slot)));
+    }
+    store_lane(f.solve.disp.data + at, load_lane(f.solve.disp.data + at) + h * v);
+    store_lane(f.solve.vel.data + at, v);
+    store_lane(f.before.data + at, load_lane(f.last.data + at));
+    store_lane(f.last.data + at, dv);
+    store_floats(f.force.data + 3 * in_row(f, w, i), now);
+  });
+}
+
+// Flags the worlds with numbers that are not finite, or huge.
+template <class Fields>
+PALPATE void find_bad(const Fields& f, Thread t, int) {
+  const float most = 1e6f;
+  bool bad = false;
+  each_item(t, f.nnode, [&](int i) {
+    const size_t at = at_node(f, t.world, i);
+    const D3 u = vabs(load_lane(f.solve.disp.data + at));
+    const D3 v = vabs(load_lane(f.solve.vel.data + at));
+    bad = bad || !(u.x < most && u.y < most && u.z < most && v.x < most && v.y < most && v.z < most);
+  });
+  each_item(t, f.nq, [&](int k) { bad = bad || !(fabs(f.qpos.data[t.world * f.nq + k]) < 1e10f); });
+  each_item(t, f.nv, [&](int k) { bad = bad || !(fabs(f.qvel.data[t.world * f.nv + k]) < 1e10f); });
+  if (bad) f.bad.data[t.world] = 1;
+}
+
+// Puts the organ of the worlds of a mask at rest, and the tools where they are in qpos0.
+template <class Fields>
+PALPATE void rest_organ(const Fields& f, Thread t, int) {
+  const int w = t.world;
+  if (!f.mask.data[w]) return;
+  const D3 zero = {0.0, 0.0, 0.0};
+  if (t.tid == 0) f.heavier.data[w] = 0.0;
+  each_item(t, f.nnode, [&](int i) {
+    const size_t at = at_node(f, w, i);
+    store_lane(f.solve.disp.data + at, zero);
+    store_lane(f.solve.vel.data + at, zero);
+    store_lane(f.solve.dvel.data + at, zero);
+    store_lane(f.last.data + at, zero);
+    store_lane(f.before.data + at, zero);
+    store_floats(f.force.data + 3 * in_row(f, w, i), zero);
+  });
+  each_item(t, f.nslot, [&](int k) { wait(f, w, k); });
+}
+
+}  // namespace palpate

@@ -1,0 +1,202 @@
+"""Batches on any backend: many worlds of a scene, each as if it were alone."""
+
+import mujoco
+import numpy as np
+import palpate
+import palpate.batch
+import pytest
+from scenes import drive, load, needs_cuda, press, probed
+
+BACKENDS = [
+  "cpu",
+  pytest.param("warp-cpu", marks=pytest.mark.slow),  # mujoco_warp compiles for minutes
+  pytest.param("cuda:0", marks=needs_cuda),
+]
+
+
+def spec(made):
+  return mujoco.MjSpec.from_string(made)
+
+
+@pytest.fixture(params=BACKENDS)
+def make(request):
+  """Returns what makes a batch of MJCF on a backend."""
+
+  def on_backend(made, nworld, **options):
+    return palpate.batch.make(spec(made), nworld, device=request.param, **options)
+
+  on_backend.device = request.param
+  return on_backend
+
+
+def driven(batch, steps):
+  """Presses and slides the probes of `probed` with depths of their own; returns their forces."""
+  depth = np.linspace(0.004, 0.008, batch.nworld)
+  out = []
+  for k in range(steps):
+    t = k * batch.model.opt.timestep
+    aside = np.full(batch.nworld, 0.01 * np.clip(t / 0.1 - 1, 0, 1))
+    batch.ctrl = np.stack([-depth * min(1, t / 0.04), aside], 1)
+    batch.step()
+    out.append(batch.organ("organ").contact_force.numpy().sum(axis=1))
+  return np.array(out)
+
+
+@pytest.mark.parametrize("window", [True, False])
+def test_a_world_is_what_the_plugin_makes_of_it_alone(make, window):
+  model, data, organ = load(probed(window))
+  batch = make(probed(window), 3)
+  for _ in range(40):
+    data.ctrl[:] = -0.004, 0.001
+    batch.ctrl = np.outer([1, 0.5, 0], data.ctrl)
+    mujoco.mj_step(model, data)
+    batch.step()
+  own = slice(None) if make.device == "cpu" or not window else slice(-2, None)
+  np.testing.assert_allclose(batch.qpos.numpy()[0, own], data.qpos[own], atol=1e-6)
+  np.testing.assert_allclose(batch.qvel.numpy()[0, own], data.qvel[own], atol=1e-4)
+  np.testing.assert_allclose(batch.time.numpy(), data.time, rtol=1e-6)
+  tissue = batch.organ("organ")
+  for name in ("xpos", "xvel", "contact_force"):
+    np.testing.assert_allclose(getattr(tissue, name).numpy()[0], getattr(organ, name), atol=1e-4)
+  force = np.linalg.norm(tissue.contact_force.numpy().sum(axis=1), axis=1)
+  assert force[0] > 1.5 * force[1] > 0 == force[2]
+  assert tissue.iterations.numpy()[0] == organ.iterations > 0
+  np.testing.assert_allclose(tissue.residual.numpy()[0], organ.residual, rtol=0.3)
+
+
+def test_worlds_do_not_depend_on_the_threads():
+  made = [palpate.batch.make(spec(probed()), n, nthread=k) for n, k in ((3, 1), (3, 2), (3, 2))]
+  a, b, c = (driven(each, 60) for each in made)
+  assert np.array_equal(a, b) and np.array_equal(b, c) and np.abs(a[-1]).max() > 0.01
+
+
+def test_a_world_does_not_depend_on_how_many_others_there_are(make):
+  few, many = (make(probed(), n, deterministic=True) for n in (2, 5))
+  for k in range(40):
+    ctrl = np.array([[-0.0001 * k, 0.0], [-0.0002 * k, 0.0001 * k]])
+    few.ctrl, many.ctrl = ctrl, np.concatenate([ctrl, ctrl[:1], ctrl])
+    few.step()
+    many.step()
+  found = [each.organ("organ").xpos.numpy() for each in (few, many)]
+  assert np.array_equal(found[0], found[1][:2]) and np.array_equal(found[0], found[1][3:])
+
+
+def test_steps_at_once_are_those_one_by_one(make):
+  a, b = (make(probed(), 2, deterministic=True) for _ in range(2))
+  for batch in (a, b):
+    batch.ctrl = np.array([[-0.004, 0.0], [-0.006, 0.001]])
+  a.step(30)
+  for _ in range(30):
+    b.step()
+  assert np.array_equal(a.qpos.numpy(), b.qpos.numpy())
+
+
+def test_a_masked_reset_leaves_other_worlds_alone(make):
+  batch = make(probed(), 3, deterministic=True)
+  first = driven(batch, 30)
+  before = batch.qpos.numpy().copy()
+  batch.reset(np.array([True, False, True]))
+  after, tissue = batch.qpos.numpy(), batch.organ("organ")
+  assert np.array_equal(after[1], before[1]) and batch.ctrl.numpy()[1].any()
+  assert not after[::2, -2:].any() and not batch.ctrl.numpy()[::2].any()
+  assert not tissue.xvel.numpy()[::2].any() and tissue.xvel.numpy()[1].any()
+  np.testing.assert_allclose(batch.time.numpy(), [0, 0.03, 0], atol=1e-6)
+  batch.reset()
+  assert np.array_equal(driven(batch, 30), first)
+
+
+@pytest.mark.parametrize("window", [True, False])
+def test_a_world_goes_out_to_the_plugin_and_back(make, window):
+  batch = make(probed(window), 2)
+  driven(batch, 50)
+  data = mujoco.MjData(batch.model)
+  batch.get_state(1, data)
+  organ = palpate.Organ(batch.model, data, "organ")
+  np.testing.assert_allclose(organ.xpos, batch.organ("organ").xpos.numpy()[1], atol=1e-7)
+  alone = drive(batch.model, data, 5)
+  batch.set_state(0, data)
+  np.testing.assert_allclose(batch.qpos.numpy()[0, -2:], data.qpos[-2:], atol=1e-7)
+  np.testing.assert_allclose(batch.organ("organ").xvel.numpy()[0], organ.xvel, atol=1e-7)
+  assert np.isfinite(alone).all()
+
+
+def test_each_world_has_a_tissue_of_its_own(make):
+  batch = make(press(bend=0, foundation=2e4), 3)
+  tissue = batch.organ("organ")
+  tissue.configure(young_scale=[0.5, 1.0, 2.0])
+  tissue.configure(mask=[False, False, True], foundation=4e4, damping=0.004)
+  batch.ctrl = np.full((3, 1), -0.006)
+  batch.step(400)
+  force = np.linalg.norm(tissue.contact_force.numpy().sum(axis=1), axis=1)
+  assert 0 < force[0] < 0.95 * force[1] < 0.9 * force[2]
+
+
+def test_friction_is_that_of_a_world(make):
+  batch = make(probed(condim=3), 2)
+  batch.organ("organ").configure(friction=[0.5, 1.5])  # the probe's is 0.5, and the greater counts
+  most = np.zeros(2)
+  for k in range(100):
+    batch.ctrl = np.tile([-0.006, 0.01 * max(0, k / 50 - 1)], (2, 1))
+    batch.step()
+    force = batch.organ("organ").contact_force.numpy().sum(axis=1)
+    most = np.maximum(most, force[:, 0])
+  assert most[1] > 1.3 * most[0] > 0
+
+
+def test_a_world_that_is_not_finite_is_reset_and_counted(make):
+  batch, other = (make(probed(), 3, deterministic=True) for _ in range(2))
+  ctrl = np.tile([-0.004, 0.0], (3, 1))
+  for each, broken in ((batch, np.nan), (other, 0.0)):
+    each.ctrl = ctrl
+    each.step(5)
+    each.ctrl = ctrl + np.array([[0, 0], [broken, 0], [0, 0]])
+    each.step(5)
+  assert batch.failures.numpy().tolist() == [0, 1, 0] and not other.failures.numpy().any()
+  assert np.isfinite(batch.qpos.numpy()).all()
+  assert np.array_equal(batch.qpos.numpy()[::2], other.qpos.numpy()[::2])
+  batch.ctrl = ctrl
+  batch.step(5)
+  assert np.isfinite(batch.qpos.numpy()).all() and batch.failures.numpy()[1] == 1
+
+
+def test_what_windows_had_no_room_for_is_counted_a_world():
+  for count, missing in (("9 6 1", False), ("2 3 1", True)):
+    batch = palpate.batch.make(spec(probed(count=count)), 2)
+    batch.ctrl = np.array([[-0.006, 0.0], [-0.006, 0.0]])
+    batch.step(60)
+    assert (batch.overflow.numpy() > 0).tolist() == [missing, missing]
+
+
+def test_bad_input_is_named():
+  made = spec(probed())
+  for nworld in (0, -1, 1.5, True):
+    with pytest.raises(ValueError, match="nworld is"):
+      palpate.batch.make(made, nworld)
+  with pytest.raises(ValueError, match="scene is a str"):
+    palpate.batch.make("scene.xml", 2)
+  with pytest.raises(ValueError, match="device is 'tpu'"):
+    palpate.batch.make(made, 2, device="tpu")
+  with pytest.raises(ValueError, match=r"expected at most \d+"):
+    palpate.batch.make(made, 10**9)
+  batch = palpate.batch.make(made, 2)
+  with pytest.raises(ValueError, match=r"ctrl has shape \(2,\), expected \(2, 2\)"):
+    batch.ctrl = [0, 0]
+  for mask in ([0, 1], [True], np.ones(2), "yes"):
+    with pytest.raises(ValueError, match="expected \\(2,\\) of bool"):
+      batch.reset(mask)
+  for n in (0, 1.5, True):
+    with pytest.raises(ValueError, match="n is"):
+      batch.step(n)
+  with pytest.raises(ValueError, match="world is 2"):
+    batch.get_state(2, mujoco.MjData(batch.model))
+  with pytest.raises(ValueError, match="another model"):
+    batch.set_state(0, load(press())[1])
+  with pytest.raises(ValueError, match="no organ 'liver'"):
+    batch.organ("liver")
+  tissue = batch.organ("organ")
+  with pytest.raises(ValueError, match="cannot change while running"):
+    tissue.configure(bend=0.5)
+  with pytest.raises(ValueError, match="young_scale has shape"):
+    tissue.configure(young_scale=[1.0, 2.0, 3.0])
+  with pytest.raises(ValueError, match="friction"):
+    tissue.configure(friction=-1)
