@@ -11,7 +11,7 @@ import palpate
 from benchmarks import plots, results
 from benchmarks.runner import Bench, Case, Row
 from palpate import tasks
-from palpate.tasks import performer, suite
+from palpate.tasks import episode, performer, suite
 from palpate.tasks.recorder import Recorder
 
 NAMES = ["/".join(pair) for pair in tasks.ALL_TASKS]
@@ -38,7 +38,9 @@ def run(case: Case, out: pathlib.Path) -> list[Row]:
   stepping, recording, steps = 0.0, 0.0, 0
   while stepping < case["seconds"]:  # whole episodes, as the metrics at the end belong to them
     timestep = env.reset()
-    recorder = Recorder(["tip"], env.task.settings(), env.task.watch)
+    recorder = Recorder(
+      ["tip"], env.task.settings(), env.task.watch, substeps=episode.substeps(env)
+    )
     for key, value in env.task.constants(env.physics).items():
       recorder.attach(key, value)
     while not timestep.last():
