@@ -18,6 +18,7 @@ start the holding again. Failure: a force above the damage limit, jaws included,
 """
 
 import dataclasses
+import itertools
 
 import numpy as np
 from dm_control.utils import containers
@@ -212,8 +213,10 @@ class Grasp(Hold):
   def expert(self, p: Performer) -> Script:
     """Grasps, lifts, holds, lowers and lets go."""
     physics = p.physics
-    while self.outcome is None:
-      yield from p.close(self.site)
+    for again in itertools.count():
+      if self.outcome is not None:
+        return
+      yield from p.close(self.site, again)
       up = physics.trocar().mat[:, 2]
       speed, contact = 0.012 * p.style.speed, 0.0
       yield from p.wait(p.style.delay)

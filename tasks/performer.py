@@ -260,13 +260,19 @@ class Performer:
       self.tip = self.tip + self.care * speed * self.dt * along
       yield self.step()
 
-  def close(self, site: int) -> Script:
-    """Grasps a triangle: opens above it, goes down over it, and closes to a gentle force."""
+  def close(self, site: int, again: int = 0) -> Script:
+    """Grasps a triangle: opens above it, goes down over it, and closes to a gentle force.
+
+    Args:
+      site: the triangle
+      again: how often it was lost: it is taken deeper then
+    """
     physics, up = self.physics, self.physics.trocar().mat[:, 2]
     self.roll, self.extra[:] = 0.0, _WIDE
     yield from self.move(physics.point(site) + 0.012 * up)
     yield from self.wait(0.2)
-    yield from self.move(physics.point(site) - 0.009 * up, speed=0.03)
+    deep = min(0.009 + 0.0015 * again, 0.012)
+    yield from self.move(physics.point(site) - deep * up, speed=0.03)
     while self.extra[0] > -0.35:
       self.extra[0] -= 0.06
       yield self.step()
