@@ -274,7 +274,7 @@ except ValueError as error: print(error)
 """
   status, out, errors = process(code)
   assert status == 0, errors
-  assert "organ 'organ': vertex" in out and "is its scale right" in out
+  assert "organ 'organ': no vertex gives way" in out and "is its scale right" in out
 
 
 # Signals.
@@ -316,7 +316,12 @@ while True: mujoco.mj_step(m, d)
 def test_signals_while_contacts_are_found_again_do_no_harm(process):
   code = """
 class Late(Exception): pass
-def on_alarm(number, frame): raise Late
+armed = False  # not while one is handled
+def on_alarm(number, frame):
+  global armed
+  if armed:
+    armed = False
+    raise Late
 signal.signal(signal.SIGALRM, on_alarm)
 m, d, organ = load(probed())
 other, raised = mujoco.MjData(m), 0
@@ -324,8 +329,10 @@ signal.setitimer(signal.ITIMER_REAL, 0.001, 0.003)
 end = time.perf_counter() + 2
 while time.perf_counter() < end:
   try:
+    armed = True
     mujoco.mj_step(m, d)
     mujoco.mj_step(m, other)
+    armed = False
   except Late: raised += 1
 signal.setitimer(signal.ITIMER_REAL, 0)
 print(raised > 100, organ.error, bool(np.isfinite(organ.displacement).all()))
