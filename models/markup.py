@@ -120,7 +120,7 @@ def catalogued(
     solid: whether it is made of tetrahedra in place of a skin
   """
   entry = build.entry
-  config = entry.tissue.keys(solid) | {"young": build.young()}
+  config: dict = entry.tissue.keys(solid) | {"young": build.young()}
   if solid:
     config["elements"] = "solid"
   return organ(

@@ -183,8 +183,8 @@ def compared_figure(recordings: Sequence[tuple[str, Recording]]) -> "Figure | No
         axes[1].plot(middle, 1e3 * m.speed(recording.time, pos), **style)
   if not any(ax.lines for ax in axes):
     return None
-  limits = {r.settings.force_limit for _, r in recordings} - {None}
-  for limit in sorted(limits):
+  limits = {r.settings.force_limit for _, r in recordings}
+  for limit in sorted(limit for limit in limits if limit is not None):
     axes[0].axhline(limit, color=_BAD, linestyle="--", linewidth=1, label=f"limit {limit:g} N")
   for ax, label in zip(axes, ("force [N]", "speed [mm/s]"), strict=True):
     ax.set_ylabel(label)

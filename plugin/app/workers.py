@@ -10,7 +10,8 @@ from typing import TypeVar
 
 from .console import Interrupt
 
-Job, Out = TypeVar("Job"), TypeVar("Out")
+Job = TypeVar("Job")
+Out = TypeVar("Out")
 _POLL = 0.2  # of Ctrl-C, while processes work [s]
 
 

@@ -119,11 +119,12 @@ class Organ(Tissue):
   def end(self):
     """Ends the step with the contact forces that mujoco_warp found."""
     nslot = self.place.nslot
-    if self.patch.stiff:
+    respond = self._scheme.respond if self.patch.stiff else None
+    if respond:
       self.body.system.rhs.zero_()
     self._over(patch.take, nslot)
-    if self.patch.stiff:
-      self._scheme.respond(self.body)
+    if respond:
+      respond(self.body)
       self._over(patch.follow, 1)
     self._over(patch.commit, self.patch.nnode)
 

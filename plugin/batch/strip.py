@@ -16,7 +16,7 @@ import math
 import mujoco
 import numpy as np
 from palpate import windows
-from palpate.engine import plugin as engine
+from palpate.engine import mjstruct
 
 # Slots of an organ: all triples of more are too many.
 LEAST, MOST = 4, 48
@@ -149,7 +149,7 @@ def strip(
 
 def _take_plugins(bare):
   """Deletes the instances of the plugin, first from the bodies that refer to them."""
-  mine = [b for b in bare.bodies if b.plugin.active and b.plugin.plugin_name == engine.NAME]
+  mine = [b for b in bare.bodies if b.plugin.active and b.plugin.plugin_name == mjstruct.NAME]
   instances = {body.plugin.name: body.plugin for body in mine}
   for body in mine:
     body.plugin.active = False

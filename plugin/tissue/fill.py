@@ -111,7 +111,7 @@ def inside(mesh: Mesh, values: np.ndarray) -> np.ndarray:
   below = share[n:]
   matrix = sparse.eye_array(mesh.nvert - n) - below[:, n:]
   within = linalg.spsolve(sparse.csc_array(matrix), below[:, :n] @ values)
-  return np.concatenate([values, within.reshape(-1, 3)])
+  return np.concatenate([values, np.asarray(within).reshape(-1, 3)])
 
 
 @functools.lru_cache(maxsize=_KEPT)
