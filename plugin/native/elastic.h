@@ -353,6 +353,18 @@ PALPATE V3 bending(const Fan& fan, const float* normal, const float* corner, V3 
   return b;
 }
 
+// Writes what is on the diagonal of slice s, at place `at` of all worlds, and the inverse of `self`,
+// the block there.
+template <class Fields>
+PALPATE void put_diagonal(const Fields& f, size_t at, int s, V diag, S3 self, Lane lane) {
+  st(f.system.diag.data + 8 * at, 0, diag, lane);
+  // Zero where a node cannot move, which keeps it out of the solve.
+  const S3 inv = inverse(self, ld(f.shape.free.data, s, lane));
+  float* out = f.system.inverse.data + 48 * at;
+  st3(out, 0, {inv.xx, inv.xy, inv.xz}, lane);
+  st3(out, 3, {inv.yy, inv.yz, inv.zz}, lane);
+}
+
 // Right-hand side of each node and, for an implicit stage, its row of the matrix: one pass around
 // the fan of each node.
 template <class Fields>
@@ -393,14 +405,7 @@ PALPATE void row(const Fields& f, Thread t, int stage) {
       self = self + square(young * g * ld(f.tissue.bend_diag.data, s, lane), n);
     }
     st3(f.system.rhs.data + 24 * at, b, lane);
-    if (want.matrix) {
-      st(f.system.diag.data + 8 * at, 0, diag, lane);
-      // Zero where a node cannot move, which keeps it out of the solve.
-      const S3 inv = inverse(self, ld(f.shape.free.data, s, lane));
-      float* out = f.system.inverse.data + 48 * at;
-      st3(out, 0, {inv.xx, inv.xy, inv.xz}, lane);
-      st3(out, 3, {inv.yy, inv.yz, inv.zz}, lane);
-    }
+    if (want.matrix) put_diagonal(f, at, s, diag, self, lane);
   });
 }
 

@@ -200,12 +200,7 @@ PALPATE void solid_row(const Fields& f, Thread t, int stage) {
       st9(f.system.block.data + 72 * ((size_t)t.world * f.shape.nslot + j), splat(g) * block, lane);
       self = self + symmetric(block);
     }
-    st(f.system.diag.data + 8 * at, 0, diag, lane);
-    // Zero where a node cannot move, which keeps it out of the solve.
-    const S3 inv = inverse(splat(-g) * self + diag, ld(f.shape.free.data, s, lane));
-    float* out = f.system.inverse.data + 48 * at;
-    st3(out, 0, {inv.xx, inv.xy, inv.xz}, lane);
-    st3(out, 3, {inv.yy, inv.yz, inv.zz}, lane);
+    put_diagonal(f, at, s, diag, splat(-g) * self + diag, lane);
   });
 }
 

@@ -114,13 +114,8 @@ def solid(mesh: Mesh, config: Config, u: np.ndarray) -> float:
   swelling += (h[:, 0] * cofactor[:, 0]).sum(axis=1)
   mu, lam, averaged = solids.moduli(mesh, config)
   own = mu / 2 * (i - np.log1p(i / 4)) - 3 / 4 * mu * swelling + lam / 2 * swelling**2
-  share, corner = np.repeat(volume / 4, 4), mesh.tet.ravel()
-
-  def around(value: np.ndarray) -> np.ndarray:
-    return np.bincount(corner, share * np.repeat(value, 4), mesh.nvert)
-
-  total = around(np.ones(len(volume)))
-  mean, stiffness = around(swelling) / total, around(averaged)
+  mean = fill.vertex_volumes(mesh, swelling) / fill.vertex_volumes(mesh)
+  stiffness = fill.vertex_volumes(mesh, averaged)
   return float((volume * own).sum() + 0.5 * (stiffness * mean**2).sum())
 
 

@@ -17,7 +17,7 @@ from scipy import sparse
 from scipy.sparse import csgraph, linalg
 from scipy.spatial import Delaunay, KDTree
 
-from .mesh import Mesh
+from .mesh import Mesh, area_vectors, vertex_normals
 
 MOST = 1  # nodes inside for one on the surface; the plugin state has room for so many
 _COARSER = 1.7  # distance of nodes inside to that on the surface
@@ -83,9 +83,14 @@ def volumes(point: np.ndarray, tet: np.ndarray) -> np.ndarray:
   return np.linalg.det(corner[:, 1:] - corner[:, :1]) / 6
 
 
-def vertex_volumes(mesh: Mesh) -> np.ndarray:
-  """Returns a quarter of the volume of the tetrahedra around each vertex [m^3], (nvert,)."""
-  share = np.repeat(volumes(mesh.rest, mesh.tet) / 4, 4)
+def vertex_volumes(mesh: Mesh, value: np.ndarray | float = 1.0) -> np.ndarray:
+  """Returns a quarter of the volume of the tetrahedra around each vertex [m^3], (nvert,).
+
+  Args:
+    mesh: the solid
+    value: by which each tetrahedron's counts, (ntet,) or one for all
+  """
+  share = np.repeat(value * volumes(mesh.rest, mesh.tet) / 4, 4)
   return np.bincount(mesh.tet.ravel(), share, mesh.nvert)
 
 
@@ -139,8 +144,7 @@ def _fill(rest: bytes, elem: bytes) -> tuple[bytes, np.ndarray, int]:
 
 def _lattice(surface: np.ndarray, triangle: np.ndarray) -> np.ndarray:
   """Returns the points of a lattice inside, (n, 3); some that are outside may be among them."""
-  normal = np.zeros_like(surface)
-  np.add.at(normal, triangle.ravel(), np.repeat(_normals(surface, triangle), 3, axis=0))
+  normal = vertex_normals(surface, triangle)
   edge = np.linalg.norm(surface[triangle[:, [1, 2, 0]]] - surface[triangle], axis=2).mean()
   low, high = surface.min(axis=0), surface.max(axis=0)
   tree, side = KDTree(surface), _COARSER * edge * 2 / np.sqrt(3)  # neighbours: half a diagonal
@@ -154,12 +158,6 @@ def _lattice(surface: np.ndarray, triangle: np.ndarray) -> np.ndarray:
     if len(point) <= MOST * len(surface):
       return point
     side *= max(1.05, (len(point) / (MOST * len(surface))) ** (1 / 3))
-
-
-def _normals(point: np.ndarray, triangle: np.ndarray) -> np.ndarray:
-  """Returns the normals of triangles, as long as twice their areas, (n, 3)."""
-  arms = point[triangle[:, 1:]] - point[triangle[:, :1]]
-  return np.cross(arms[:, 0], arms[:, 1])
 
 
 def _middles(point: np.ndarray, tet: np.ndarray) -> np.ndarray:
@@ -200,7 +198,7 @@ def _inside(point: np.ndarray, triangle: np.ndarray, nsurface: int) -> tuple[np.
   order = np.argsort(wanted)
   at = order[np.searchsorted(wanted, known[which, corner], sorter=order)]
   side = point[tet[which, corner]] - point[triangle[at, 0]]
-  height = (side * _normals(point, triangle)[at]).sum(axis=1)
+  height = (side * area_vectors(point, triangle)[at]).sum(axis=1)
   sure = wanted[at] == _key(triangle[at], nsurface)  # others were flipped
   within = np.bincount(part[which], np.where(sure, np.sign(height), 0), count)[part] < 0
   volume = volumes(point, tet)

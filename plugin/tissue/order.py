@@ -101,13 +101,8 @@ def _patches(point: np.ndarray, size: int) -> np.ndarray:
 
 
 def _band(mesh: Mesh) -> np.ndarray:
-  if len(mesh.tet):
-    start, k = np.nonzero(mesh.ring >= 0)
-    end = mesh.ring[start, k]
-  else:
-    start, end = mesh.elem.ravel(), mesh.elem[:, [1, 2, 0]].ravel()
+  start, k = np.nonzero(mesh.ring >= 0)
   graph = sparse.coo_matrix(
-    (np.ones(2 * len(start)), (np.concatenate([start, end]), np.concatenate([end, start]))),
-    shape=(mesh.nvert, mesh.nvert),
+    (np.ones(len(start)), (start, mesh.ring[start, k])), shape=(mesh.nvert, mesh.nvert)
   ).tocsr()
   return csgraph.reverse_cuthill_mckee(graph, symmetric_mode=True).astype(np.int64)

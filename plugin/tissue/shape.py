@@ -43,8 +43,8 @@ def make(
   target = devices.resolve(device, mesh.nvert)
   finest = arrays(mesh, config, pinned, devices.patch(target, -(-mesh.nvert // LANES)))
   below = None
-  solid = config.elements == "solid"
-  if not solid and (np.isinf(scale) or coarsening.pay(finest, scale, coarsening.threshold(target))):
+  surface = len(mesh.tet) == 0
+  if surface and (np.isinf(scale) or coarsening.pay(finest, scale, coarsening.threshold(target))):
     below = _below(mesh, config, pinned, finest, target)
   body = bodies.constants(finest, target, config.newton, below)
   with wp.ScopedDevice(target):

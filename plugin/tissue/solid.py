@@ -9,7 +9,7 @@ from scipy.spatial import KDTree
 
 from . import config as configuration
 from .config import Config
-from .fill import volumes
+from .fill import vertex_volumes, volumes
 from .mesh import Mesh
 from .order import LANES, addresses, ellpack, offset, pad, to_slices
 from .types import empty
@@ -66,9 +66,8 @@ def arrays(mesh: Mesh, config: Config, vert: np.ndarray, node: np.ndarray) -> di
   share = np.repeat(volume / 4, 4)
   entry = np.arange(tet.size)
   width, entry, weight = ellpack(at.ravel(), entry, share, np.full_like(own, tet.size))
-  total = np.bincount(tet.ravel(), share, mesh.nvert)
-  stiff = np.bincount(tet.ravel(), share * np.repeat(averaged, 4), mesh.nvert) / total
-  gain = np.where(vert >= 0, (stiff / total)[vert], 0.0)
+  total = vertex_volumes(mesh)
+  gain = np.where(vert >= 0, (vertex_volumes(mesh, averaged) / total**2)[vert], 0.0)
   values = np.stack([volume, mu, lam, averaged], axis=1)
   gradient = gradients(mesh)[:, 1:].reshape(-1, 9)
   return {
