@@ -202,30 +202,34 @@ class Tissue(abc.ABC):
   nvert: int
   elem: np.ndarray
 
-  @property
   @abc.abstractmethod
+  def _read(self, name: str) -> wp.array:
+    """Returns the array of one of the properties below, brought up to date."""
+
+  @property
   def xpos(self) -> wp.array:
     """Positions [m], (nworld, nvert, 3)."""
+    return self._read("xpos")
 
   @property
-  @abc.abstractmethod
   def xvel(self) -> wp.array:
     """Velocities [m/s], (nworld, nvert, 3)."""
+    return self._read("xvel")
 
   @property
-  @abc.abstractmethod
   def contact_force(self) -> wp.array:
     """Constraint force on each vertex in the last step [N], (nworld, nvert, 3)."""
+    return self._read("contact_force")
 
   @property
-  @abc.abstractmethod
   def residual(self) -> wp.array:
     """Relative residual of the last step's solve, (nworld,)."""
+    return self._read("residual")
 
   @property
-  @abc.abstractmethod
   def iterations(self) -> wp.array:
     """PCG iterations of the last step, (nworld,)."""
+    return self._read("iterations")
 
   @abc.abstractmethod
   def configure(self, mask=None, **keys):

@@ -19,6 +19,7 @@ from .patch import GRADES, launch
 from .strip import Slots
 
 _WHAT = {"xpos": 0, "xvel": 1, "contact_force": 2}
+_STATUS = {"iterations": 0, "residual": 1}
 _KEYS = (*NUMBERS, "young", "friction")
 _FEW = 32  # values that are checked one by one
 
@@ -144,34 +145,11 @@ class Organ(Tissue):
     return {name: wp.zeros(shape, dtype=wp.vec3, device=self.body.device) for name in _WHAT}
 
   def _read(self, name: str) -> wp.array:
+    if name in _STATUS:
+      return self.body.system.status[:, _STATUS[name]]
     out, dim = self._out[name], (self._batch.nworld, self.nvert)
     wp.launch(kernels.show, dim=dim, inputs=[self.patch, _WHAT[name], out], device=self.body.device)
     return out.view(float)
-
-  @property
-  def xpos(self) -> wp.array:
-    """Positions [m], (nworld, nvert, 3)."""
-    return self._read("xpos")
-
-  @property
-  def xvel(self) -> wp.array:
-    """Velocities [m/s], (nworld, nvert, 3)."""
-    return self._read("xvel")
-
-  @property
-  def contact_force(self) -> wp.array:
-    """Constraint force on each vertex in the last step [N], (nworld, nvert, 3)."""
-    return self._read("contact_force")
-
-  @property
-  def residual(self) -> wp.array:
-    """Relative residual of the last step's solve, (nworld,)."""
-    return self.body.system.status[:, 1]
-
-  @property
-  def iterations(self) -> wp.array:
-    """PCG iterations of the last step, (nworld,)."""
-    return self.body.system.status[:, 0]
 
   # Changing.
 

@@ -135,31 +135,6 @@ class _Tissue(Tissue):
       out[world] = getattr(handle, name)
     return array
 
-  @property
-  def xpos(self) -> wp.array:
-    """Positions [m], (nworld, nvert, 3)."""
-    return self._read("xpos")
-
-  @property
-  def xvel(self) -> wp.array:
-    """Velocities [m/s], (nworld, nvert, 3)."""
-    return self._read("xvel")
-
-  @property
-  def contact_force(self) -> wp.array:
-    """Constraint force on each vertex in the last step [N], (nworld, nvert, 3)."""
-    return self._read("contact_force")
-
-  @property
-  def residual(self) -> wp.array:
-    """Relative residual of the last step's solve, (nworld,)."""
-    return self._read("residual")
-
-  @property
-  def iterations(self) -> wp.array:
-    """PCG iterations of the last step, (nworld,)."""
-    return self._read("iterations")
-
   def configure(self, mask=None, **keys):
     """Changes the tissue of worlds, see `Tissue.configure`."""
     worlds = np.flatnonzero(self._batch._mask(mask).numpy())
