@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import csv
 import importlib.util
@@ -24,6 +25,13 @@ class CommandError(Exception):
   def __init__(self, message: str, code: int = 2):
     super().__init__(" ".join(message.split()))
     self.code = code
+
+
+def check_counts(args: argparse.Namespace, *names: str):
+  """Raises CommandError where one of the options is no whole number >= 1."""
+  for name in names:
+    if getattr(args, name) < 1:
+      raise CommandError(f"{name} is {getattr(args, name)}, expected a whole number >= 1")
 
 
 class Interrupt:

@@ -15,7 +15,15 @@ from typing import TYPE_CHECKING, Any
 import palpate
 
 from . import options
-from .console import CommandError, Interrupt, Progress, output, output_folder, writing
+from .console import (
+  CommandError,
+  Interrupt,
+  Progress,
+  check_counts,
+  output,
+  output_folder,
+  writing,
+)
 from .workers import parallel
 
 if TYPE_CHECKING:
@@ -58,9 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser):
 
 def main(args: argparse.Namespace) -> int:
   """Runs the job and returns its exit code."""
-  for name in ("episodes", "processes"):
-    if getattr(args, name) < 1:
-      raise CommandError(f"{name} is {getattr(args, name)}, expected a whole number >= 1")
+  check_counts(args, "episodes", "processes")
   palpate.register()
   from palpate.tasks import performer, score, suite
 

@@ -18,7 +18,7 @@ from typing import Any
 
 import palpate
 
-from .console import CommandError, Interrupt, Progress, output_folder, writing
+from .console import CommandError, Interrupt, Progress, check_counts, output_folder, writing
 from .evaluate import Result, perform
 from .workers import parallel
 
@@ -42,9 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser):
 
 def main(args: argparse.Namespace) -> int:
   """Runs the job and returns its exit code."""
-  for name in ("episodes", "processes"):
-    if getattr(args, name) < 1:
-      raise CommandError(f"{name} is {getattr(args, name)}, expected a whole number >= 1")
+  check_counts(args, "episodes", "processes")
   palpate.register()
   from palpate.tasks import performer, suite
 
