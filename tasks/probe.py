@@ -264,9 +264,9 @@ class Palpate(Task):
     super().__init__(dataclasses.replace(scene, targets=1), random, **kwargs)
 
   @property
-  def components(self) -> tuple[str, ...]:
-    """Names of the action's components."""
-    return (*base.AXES, "report")
+  def extra(self) -> tuple[str, ...]:
+    """Names of the action's components that do not move the instrument."""
+    return ("report",)
 
   def choose(self) -> int | None:
     """Draws shape and inclusion, evenly over the field; the organ is compiled anew with it."""
@@ -315,7 +315,7 @@ class Palpate(Task):
   def advance(self, physics: Physics) -> float:
     """Follows what was felt, and judges the report."""
     force = float(np.linalg.norm(physics.contact_force()))
-    if self.action[4] > 0.5:
+    if self.action[..., -1].max() > 0.5:
       distance = self.distance(physics)
       found = distance <= self.tolerance and force >= _REPORT
       self.outcome = "success" if found else "missed"

@@ -60,6 +60,7 @@ class Scene:
     targets: number of target sites
     inclusion: hidden stiff place: position in the world [m] (3), radius [m], factor on Young's
       modulus; None for healthy tissue. Without gravity: the organ would sag less where it is stiff
+    handle: whether a handle pulls the instrument in place of position drives
   """
 
   organ: str = "liver"
@@ -71,6 +72,7 @@ class Scene:
   camera: tuple[float, float, float] = (-0.05, 0.15, 0.12)
   targets: int = 1
   inclusion: tuple[float, ...] | None = None
+  handle: bool = False
 
 
 @functools.lru_cache(maxsize=32)
@@ -131,9 +133,8 @@ def build(scene: Scene) -> mujoco.MjSpec:
   if scene.inclusion is not None:
     spec.option.gravity = np.zeros(3)
   port = center + scene.port
-  trocar.attach(
-    spec, scene.instrument, f"{scene.instrument}/", pos=port, quat=trocar.aim(port, center)
-  )
+  quat, prefix = trocar.aim(port, center), f"{scene.instrument}/"
+  trocar.attach(spec, scene.instrument, prefix, port, quat, scene.handle)
   slots = _SLOTS[scene.instrument] * max(1, -(-scene.nodes // 1000))
   palpate.add_windows(spec, ORGAN, nodes=slots)
   return spec

@@ -1,0 +1,130 @@
+# mujoco ships its bindings without type stubs:
+# pyright: reportAttributeAccessIssue=false
+"""The handle of an instrument with virtual coupling: where the hand holds it, and what it feels.
+
+The handle is a mocap body with the frame of the tip: its z is along the shaft, back to the hand.
+Spring and damper between the two are six site actuators, see `instruments/parts/coupling.xml`.
+"""
+
+import math
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+
+from . import trocar as ports
+
+Vector = Sequence[float] | np.ndarray
+AXES = ("x", "y", "z", "rx", "ry", "rz")
+
+
+class Handle:
+  """The handle of one instrument in one mjData; cheap enough for a loop of 1 kHz."""
+
+  def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, prefix: str = ""):
+    """Finds the handle of the instrument whose names start with `prefix`.
+
+    Raises:
+      ValueError: it has none.
+    """
+    try:
+      mocap = int(model.body(f"{prefix}handle").mocapid[0])
+      acts = [model.actuator(f"{prefix}coupling_{axis}").id for axis in AXES]
+      sensors = [int(model.sensor(f"{prefix}coupling_{axis}").adr[0]) for axis in AXES]
+    except KeyError:
+      raise ValueError(
+        f"instrument {prefix!r} has no handle, expected one of the models that end in _handle"
+      ) from None
+    self.prefix = prefix
+    self._pos, self._quat = data.mocap_pos[mocap], data.mocap_quat[mocap]
+    # They are six in a row, in every model that has them.
+    self._ctrl = data.ctrl[acts[0] : acts[0] + 6]
+    self._felt = data.sensordata[sensors[0] : sensors[0] + 6]
+    gain, damping = model.actuator_gainprm[acts, 0], -model.actuator_biasprm[acts, 2]
+    self._lead = (damping / gain).tolist()  # [s]
+
+  @property
+  def pos(self) -> np.ndarray:
+    """Where it is in the world [m]  (3,)."""
+    return self._pos.copy()
+
+  @property
+  def quat(self) -> np.ndarray:
+    """How it is turned, w x y z  (4,)."""
+    return self._quat.copy()
+
+  def move(
+    self,
+    pos: Vector,
+    quat: Vector | None = None,
+    vel: Vector | None = None,
+    spin: Vector | None = None,
+  ) -> None:
+    """Puts the handle somewhere.
+
+    Args:
+      pos: in the world [m]  (3,)
+      quat: orientation, w x y z; as it is if it is left out  (4,)
+      vel: its velocity [m/s]; the coupling's damper then acts on the velocity of the tip relative
+        to the handle, and without it on that of the tip alone  (3,)
+      spin: the same for its angular velocity in the world [rad/s]  (3,)
+    """
+    self._pos[:] = pos
+    if quat is not None:
+      self._quat[:] = quat
+    m = _rotation(*self._quat.tolist())
+    u, w = vel if vel is not None else (0, 0, 0), spin if spin is not None else (0, 0, 0)
+    a, b, c, d, e, f = self._lead
+    self._ctrl[:] = (
+      a * (m[0] * u[0] + m[3] * u[1] + m[6] * u[2]),
+      b * (m[1] * u[0] + m[4] * u[1] + m[7] * u[2]),
+      c * (m[2] * u[0] + m[5] * u[1] + m[8] * u[2]),
+      d * (m[0] * w[0] + m[3] * w[1] + m[6] * w[2]),
+      e * (m[1] * w[0] + m[4] * w[1] + m[7] * w[2]),
+      f * (m[2] * w[0] + m[5] * w[1] + m[8] * w[2]),
+    )
+
+  def wrench(self) -> tuple[float, float, float, float, float, float]:
+    """Returns force [N] and torque [N m] that the hand feels, in the world  (6,)."""
+    m = _rotation(*self._quat.tolist())
+    x, y, z, a, b, c = self._felt.tolist()
+    return (
+      -m[0] * x - m[1] * y - m[2] * z,
+      -m[3] * x - m[4] * y - m[5] * z,
+      -m[6] * x - m[7] * y - m[8] * z,
+      -m[0] * a - m[1] * b - m[2] * c,
+      -m[3] * a - m[4] * b - m[5] * c,
+      -m[6] * a - m[7] * b - m[8] * c,
+    )
+
+  def joints(self, trocar: ports.Trocar) -> np.ndarray:
+    """Returns the pitch, yaw, roll [rad] and insertion [m] that it asks for  (4,)."""
+    pitch, yaw, insertion = ports.inverse(trocar, self._pos, check=False)
+    straight, turn = ports.orientation(trocar, (pitch, yaw, insertion, 0.0)), np.zeros(4)
+    mujoco.mju_negQuat(straight, straight.copy())
+    mujoco.mju_mulQuat(turn, straight, self._quat)
+    roll = math.remainder(-2 * math.atan2(turn[3], turn[0]), 2 * math.pi)
+    return np.array([pitch, yaw, roll, insertion])
+
+
+def find(model: mujoco.MjModel, data: mujoco.MjData, prefix: str = "") -> Handle | None:
+  """Returns the handle of an instrument, None where position drives move it."""
+  known = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, f"{prefix}handle") >= 0
+  return Handle(model, data, prefix) if known else None
+
+
+def pose(trocar: ports.Trocar, pos: Vector, roll: float = 0.0) -> np.ndarray:
+  """Returns place and orientation, as the shaft has it there, of a handle at `pos` [m]  (7,)."""
+  joints = ports.inverse(trocar, pos, check=False)
+  return np.concatenate([pos, ports.orientation(trocar, (*joints, roll))])
+
+
+def _rotation(w: float, x: float, y: float, z: float) -> tuple[float, ...]:
+  """Returns the matrix of a unit quaternion, row by row."""
+  xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
+  wx, wy, wz = w * x, w * y, w * z
+  return (
+    1 - 2 * (yy + zz), 2 * (xy - wz), 2 * (xz + wy),
+    2 * (xy + wz), 1 - 2 * (xx + zz), 2 * (yz - wx),
+    2 * (xz - wy), 2 * (yz + wx), 1 - 2 * (xx + yy),
+  )  # fmt: skip
