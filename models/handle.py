@@ -15,6 +15,7 @@ import numpy as np
 from . import trocar as ports
 
 Vector = Sequence[float] | np.ndarray
+Quat = tuple[float, float, float, float]
 AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 
@@ -100,9 +101,8 @@ class Handle:
   def joints(self, trocar: ports.Trocar) -> np.ndarray:
     """Returns the pitch, yaw, roll [rad] and insertion [m] that it asks for  (4,)."""
     pitch, yaw, insertion = ports.inverse(trocar, self._pos, check=False)
-    straight, turn = ports.orientation(trocar, (pitch, yaw, insertion, 0.0)), np.zeros(4)
-    mujoco.mju_negQuat(straight, straight.copy())
-    mujoco.mju_mulQuat(turn, straight, self._quat)
+    w, x, y, z = Shaft(trocar).quat(self._pos.tolist())
+    turn = times((w, -x, -y, -z), tuple(self._quat.tolist()))
     roll = math.remainder(-2 * math.atan2(turn[3], turn[0]), 2 * math.pi)
     return np.array([pitch, yaw, roll, insertion])
 
@@ -113,10 +113,56 @@ def find(model: mujoco.MjModel, data: mujoco.MjData, prefix: str = "") -> Handle
   return Handle(model, data, prefix) if known else None
 
 
+class Shaft:
+  """How the shaft of an instrument stands, by where its tip is; for a loop of 1 kHz."""
+
+  def __init__(self, trocar: ports.Trocar):
+    """Takes the instrument's trocar."""
+    quat = np.zeros(4)
+    mujoco.mju_mat2Quat(quat, np.ascontiguousarray(trocar.mat).ravel())
+    self._pos, self._mat = trocar.pos.tolist(), trocar.mat.T.tolist()
+    self._quat = tuple(quat.tolist())
+    self.reach = tuple(float(trocar.depth + x) for x in trocar.ranges[2])  # of the tip [m]
+
+  def within(self, pos: Vector) -> list[float]:
+    """Returns the point within the reach of the insertion that is nearest to one [m]  (3,)."""
+    out = [a - b for a, b in zip(pos, self._pos, strict=True)]
+    far = math.sqrt(out[0] * out[0] + out[1] * out[1] + out[2] * out[2])
+    scale = min(max(far, self.reach[0]), self.reach[1]) / max(far, 1e-9)
+    return [b + scale * a for a, b in zip(out, self._pos, strict=True)]
+
+  def quat(self, pos: Vector, roll: float = 0.0) -> Quat:
+    """Returns the orientation with the tip at a point [m], rolled by an angle [rad]  (4,)."""
+    p, (a, b, c) = self._pos, self._mat
+    x, y, z = pos[0] - p[0], pos[1] - p[1], pos[2] - p[2]
+    u = a[0] * x + a[1] * y + a[2] * z
+    v = b[0] * x + b[1] * y + b[2] * z
+    w = c[0] * x + c[1] * y + c[2] * z
+    pitch, yaw = math.atan2(v, -w), math.atan2(u, math.sqrt(v * v + w * w))
+    turn = times(_about(0, pitch), times(_about(1, -yaw), _about(2, -roll)))
+    return times(self._quat, turn)
+
+
 def pose(trocar: ports.Trocar, pos: Vector, roll: float = 0.0) -> np.ndarray:
   """Returns place and orientation, as the shaft has it there, of a handle at `pos` [m]  (7,)."""
-  joints = ports.inverse(trocar, pos, check=False)
-  return np.concatenate([pos, ports.orientation(trocar, (*joints, roll))])
+  return np.array([*pos, *Shaft(trocar).quat(pos, roll)])
+
+
+def times(p: Quat, q: Quat) -> Quat:
+  """Returns the product of two quaternions."""
+  a, b, c, d = p
+  w, x, y, z = q
+  return (
+    a * w - b * x - c * y - d * z,
+    a * x + b * w + c * z - d * y,
+    a * y - b * z + c * w + d * x,
+    a * z + b * y - c * x + d * w,
+  )
+
+
+def _about(axis: int, angle: float) -> Quat:
+  s = math.sin(0.5 * angle)
+  return (math.cos(0.5 * angle), s * (axis == 0), s * (axis == 1), s * (axis == 2))
 
 
 def _rotation(w: float, x: float, y: float, z: float) -> tuple[float, ...]:

@@ -1,6 +1,6 @@
 # mujoco ships its bindings without type stubs:
 # pyright: reportAttributeAccessIssue=false
-"""Instruments on a trocar: attaching them, where the tip is, and how it is turned.
+"""Instruments on a trocar: attaching them, and where the tip is.
 
 The instrument's frame has the trocar point at its origin and the shaft along -z when every joint
 is zero, with the tip `DEPTH` below. `pitch` (about x) takes the tip to +y, `yaw` (about -y) to +x,
@@ -133,22 +133,6 @@ def forward(trocar: Trocar, joints) -> np.ndarray:
     [np.sin(yaw), np.cos(yaw) * np.sin(pitch), -np.cos(yaw) * np.cos(pitch)], axis=-1
   )
   return trocar.pos + depth[..., None] * (local @ trocar.mat.T)
-
-
-def orientation(trocar: Trocar, joints) -> np.ndarray:
-  """Returns the tip's orientation in the world, w x y z  (4,).
-
-  Args:
-    trocar: of the instrument
-    joints: pitch, yaw, insertion, roll  (4,)
-  """
-  pitch, yaw, _, roll = (0.5 * float(q) for q in joints)
-  quat, part = np.zeros(4), np.zeros(4)
-  mujoco.mju_mat2Quat(quat, np.ascontiguousarray(trocar.mat).ravel())
-  for half, axis in ((pitch, (1, 0, 0)), (yaw, (0, -1, 0)), (roll, (0, 0, -1))):
-    part[0], part[1:] = np.cos(half), np.sin(half) * np.array(axis)
-    mujoco.mju_mulQuat(quat, quat.copy(), part)
-  return quat
 
 
 def inverse(trocar: Trocar, tip_pos, check: bool = True) -> np.ndarray:

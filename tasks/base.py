@@ -14,8 +14,8 @@ position drives by the action times the rate:
 | 4 `jaw` (grasper) | opening of the jaws, not a rate: -1 squeezes closed jaws, 1 is wide open | |
 | 4 `report` (palpation) | above 0.5: the inclusion is here | |
 
-With `input="handle"` the action says where the hand holds the instrument in place of the first four,
-see `handle`; a spring and a damper pull the tip there, and the hand feels them.
+With `input="handle"` the action says where the hand holds the instrument, in place of the first
+four, see `handle`; a spring and a damper pull the tip there, and the hand feels them.
 
 Observations are in groups to choose from, see `observation` and docs/environments.md.
 

@@ -55,7 +55,7 @@ class Guide:
 
   def _between(self, at: float) -> np.ndarray:
     """Returns the row `at` rows behind where the action began; rows are at 1, 2, ..."""
-    i = min(int(math.ceil(at - 1e-9)), len(self._rows)) - 1
+    i = min(math.ceil(at - 1e-9), len(self._rows)) - 1
     end, start = self._rows[i], self._rows[i - 1] if i else self._before
     if len(start) < len(end):  # where the episode begins there are only poses
       start = np.concatenate([start, end[len(start) :]])

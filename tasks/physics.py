@@ -101,6 +101,7 @@ class Physics(Portable):
   def _lead(self, k: int, nstep: int) -> None:
     """Moves the handle before step k of `nstep`, and the jaws where the row has them."""
     row, vel, spin = self.guide.advance(k, nstep, self.timestep())
+    assert self.handle is not None
     self.handle.move(row[:3], row[3:7], vel, spin)
     if self.jaw >= 0 and len(row) > len(ROW):
       self.close_jaws(row[len(ROW)])
@@ -111,7 +112,7 @@ class Physics(Portable):
     self.data.ptr.ctrl[self.jaw] = low + (high - low) * (share + 1) / 2
 
   def felt(self) -> np.ndarray:
-    """Returns force [N] and torque [N m] on the hand in each step of the last `step`  (nstep, 6)."""
+    """Returns force [N], torque [N m] on the hand in each step of the last `step`  (nstep, 6)."""
     return self._felt
 
   def forces(self) -> dict[str, np.ndarray]:
