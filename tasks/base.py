@@ -103,6 +103,7 @@ class Task(control.Task):
     model: "str | os.PathLike[str] | mj.MjSpec | None" = None,
     organ: str = ORGAN,
     input: str = "drives",
+    nodes: int | None = None,
   ):
     """Makes the exercise.
 
@@ -123,6 +124,7 @@ class Task(control.Task):
         the camera `laparoscope` and the sites `target0`, ... in the world
       organ: name of the organ in it
       input: what an action moves: the instrument's position `drives`, or its `handle`
+      nodes: of the organ, in place of the scene's
     """
     if input not in INPUTS:
       raise ValueError(f"input is {input!r}, expected one of {', '.join(INPUTS)}")
@@ -131,7 +133,10 @@ class Task(control.Task):
     if not isinstance(random, np.random.RandomState):
       random = np.random.RandomState(random)
     self.random = random
-    self.scene = dataclasses.replace(scene, handle=input == "handle")
+    if nodes is not None and not (isinstance(nodes, int) and 100 <= nodes <= 20000):
+      raise ValueError(f"nodes is {nodes!r}, expected a whole number in [100, 20000], or None")
+    scene = dataclasses.replace(scene, handle=input == "handle", nodes=nodes or scene.nodes)
+    self.scene = scene
     self.prefix = f"{scene.instrument}/"
     self.force_limit, self.damage = float(force_limit), float(damage)
     self.spread, self.jitter = spread, jitter
@@ -228,6 +233,10 @@ class Task(control.Task):
   def advance(self, physics: Physics) -> float:
     """Returns the progress after a control step; sets `outcome` on success or failure."""
     raise NotImplementedError
+
+  def instruct(self, physics: Physics) -> str:
+    """Returns what a person is to do next, in words."""
+    return ""
 
   def observe(self, physics: Physics) -> Mapping[str, np.ndarray]:
     """Returns the domain's own observations."""
