@@ -102,7 +102,8 @@ class Handle:
     """Returns the pitch, yaw, roll [rad] and insertion [m] that it asks for  (4,)."""
     pitch, yaw, insertion = ports.inverse(trocar, self._pos, check=False)
     w, x, y, z = Shaft(trocar).quat(self._pos.tolist())
-    turn = times((w, -x, -y, -z), tuple(self._quat.tolist()))
+    a, b, c, d = self._quat.tolist()
+    turn = times((w, -x, -y, -z), (a, b, c, d))
     roll = math.remainder(-2 * math.atan2(turn[3], turn[0]), 2 * math.pi)
     return np.array([pitch, yaw, roll, insertion])
 
@@ -121,7 +122,8 @@ class Shaft:
     quat = np.zeros(4)
     mujoco.mju_mat2Quat(quat, np.ascontiguousarray(trocar.mat).ravel())
     self._pos, self._mat = trocar.pos.tolist(), trocar.mat.T.tolist()
-    self._quat = tuple(quat.tolist())
+    w, x, y, z = quat.tolist()
+    self._quat: Quat = (w, x, y, z)
     self.reach = tuple(float(trocar.depth + x) for x in trocar.ranges[2])  # of the tip [m]
 
   def within(self, pos: Vector) -> list[float]:

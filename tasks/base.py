@@ -57,7 +57,6 @@ from .stage import STATE, Stage
 
 RATES = (1.0, 1.0, 3.0, 0.12)  # pitch, yaw, roll [rad/s], insertion [m/s]
 REWARDS = ("dense", "sparse")
-INPUTS = ("drives", "handle")
 
 _PRICE = 0.1  # of a unit of cost, in the dense reward
 _FACING = 0.75  # least cosine between a target's normal and the way to the trocar
@@ -126,29 +125,20 @@ class Task(control.Task):
       input: what an action moves: the instrument's position `drives`, or its `handle`
       nodes: of the organ, in place of the scene's
     """
-    if input not in INPUTS:
-      raise ValueError(f"input is {input!r}, expected one of {', '.join(INPUTS)}")
     if reward not in REWARDS:
       raise ValueError(f"reward is {reward!r}, expected one of {', '.join(REWARDS)}")
-    if not isinstance(random, np.random.RandomState):
-      random = np.random.RandomState(random)
-    self.random = random
-    if nodes is not None and not (isinstance(nodes, int) and 100 <= nodes <= 20000):
-      raise ValueError(f"nodes is {nodes!r}, expected a whole number in [100, 20000], or None")
-    scene = dataclasses.replace(scene, handle=input == "handle", nodes=nodes or scene.nodes)
-    self.scene = scene
-    self.prefix = f"{scene.instrument}/"
+    drawn = isinstance(random, np.random.RandomState)
+    self.random: Any = random if drawn else np.random.RandomState(random)
+    self.scene, self.prefix = scenes.chosen(scene, input, nodes), f"{scene.instrument}/"
     self.force_limit, self.damage = float(force_limit), float(damage)
-    self.spread, self.jitter = spread, jitter
+    self.spread, self.jitter, self.organ = spread, jitter, organ
     self.variants = (scene.variant,) if variants is None or model is not None else variants
-    self.reward = reward
-    self.observed = observation.choose(observations, pixels)
+    self.reward, self.observed = reward, observation.choose(observations, pixels)
     self.control_timestep = CONTROL_TIMESTEP
     self.ranges = randomisation.check(randomise or {})
     self.drawn: dict[str, Any] = {}
-    self.organ = organ
-    self._models: dict[int | None, Stage] = {}
     self.visualize_reward = False
+    self._models: dict[int | None, Stage] = {}
     self.outcome: str | None = None
     self.progress, self.best, self.cost, self.harm = 0.0, 0.0, safety.Cost(), 0.0
     self.events: list[Event] = []

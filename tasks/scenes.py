@@ -23,6 +23,7 @@ from palpate.models.catalog import Tissue
 NOW, LATER = (1.0, 0.8, 0.1), (0.2, 0.75, 0.95)  # colours of targets
 ORGAN = "organ"
 CAMERA = "laparoscope"
+INPUTS = ("drives", "handle")
 # The organ's solref counts, not the instrument's: light nodes want stiff contacts.
 _CONTACT = {
   "condim": 3,
@@ -73,6 +74,17 @@ class Scene:
   targets: int = 1
   inclusion: tuple[float, ...] | None = None
   handle: bool = False
+
+
+def chosen(scene: Scene, input: str, nodes: int | None) -> Scene:
+  """Returns a scene as it was asked for; arguments as of `base.Task`."""
+  if input not in INPUTS:
+    raise ValueError(f"input is {input!r}, expected one of {', '.join(INPUTS)}")
+  if nodes is None:
+    nodes = scene.nodes
+  if not (isinstance(nodes, int) and 100 <= nodes <= 20000):
+    raise ValueError(f"nodes is {nodes!r}, expected a whole number in [100, 20000], or None")
+  return dataclasses.replace(scene, handle=input == "handle", nodes=nodes)
 
 
 @functools.lru_cache(maxsize=32)

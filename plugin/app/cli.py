@@ -29,6 +29,7 @@ COMMANDS = {
   ("render",): ("render", "make a picture or a film of a scene, without a screen"),
   ("wrap",): ("wrap", "make an organ of a mesh or a segmented volume, in a model folder"),
   ("exercise",): ("exercise", "run an exercise, record it and write its report"),
+  ("serve",): ("serve", "serve a page to train on, by mouse, keyboard, touch, gamepad or device"),
   ("report",): ("report", "write the page about a recording"),
   ("evaluate",): ("evaluate", "score a policy over many episodes of an exercise"),
   ("panel",): ("panel", "make the references of scores from many skilled performers"),

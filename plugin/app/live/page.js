@@ -5,12 +5,15 @@ import {View} from "./view.js";
 const $ = id => document.getElementById(id);
 const STATES = ["waiting", "ready", "clutch", "lost", "paused"];
 const SPAN = 300;  // frames in a plot
+const MEAN = 200;  // over which steps are counted [ms]
 const NOTE = [440, 0.08];  // of a warning [Hz], [s]
 
 const view = new View($("view"));
 let scene = null, frame = null, head = {}, running = false, paused = false, sound = null;
 const plots = {force: [], way: [], rate: []};
 const hand = new Hand($("view"), view, () => head);
+// For scripts that work through the page: numbers as `head` names them, targets after the geoms.
+window.palpate = () => ({scene, head, targets: targets()});
 
 const protocol = location.protocol === "https:" ? "wss:" : "ws:";
 const socket = new WebSocket(`${protocol}//${location.host}/socket${location.search}`);
@@ -88,10 +91,12 @@ function take(numbers) {
   const over = head.force > scene.force_limit;
   push("force", head.force);
   push("way", 1e3 * Math.hypot(...tip.map((x, i) => x - start[i])));
-  if (before && head.steps > before.steps) {
+  if (before && head.steps < before.steps) before = null;
+  if (before && now - before.now > MEAN) {
     push("rate", 1e3 * (head.steps - before.steps) / (now - before.now));
+    before = null;
   }
-  before = {steps: head.steps, now};
+  before ??= {steps: head.steps, now};
   const most = Math.max(scene.damage, 1.2 * scene.force_limit);
   $("force").classList.toggle("over", over);
   $("stage").classList.toggle("over", over);
@@ -103,6 +108,12 @@ function take(numbers) {
   const state = STATES[head.state];
   $("time").textContent = `${head.time.toFixed(1)} of ${scene.time_limit.toFixed(0)} s`
     + (state === "ready" ? "" : `, ${state}`);
+}
+
+function targets() {
+  if (!scene || !frame) return [];
+  const from = scene.head.length + 3 * scene.nodes + 12 * scene.geoms.length;
+  return Array.from({length: scene.targets}, (_, i) => [...frame.subarray(from + 8 * i, from + 8 * i + 8)]);
 }
 
 function push(name, value) {

@@ -9,7 +9,6 @@ from typing import Any
 import mujoco as mj
 import numpy as np
 import trimesh
-from palpate.tasks.scenes import CAMERA
 
 # Numbers at the head of a frame, before the nodes, the geoms' places and the targets.
 HEAD = (
@@ -45,8 +44,10 @@ def shapes(env: Any) -> dict[str, Any]:
 
 
 def _drawn(model: mj.MjModel) -> list[int]:
-  """Returns the geoms that are seen."""
-  shown = (model.geom_group <= 2) & (_colours(model)[:, 3] > 0.05)
+  """Returns the geoms that are seen; the handle would hide the tip."""
+  handles = [model.body(b).name.endswith("handle") for b in range(model.nbody)]
+  shown = ~np.array(handles)[model.geom_bodyid]
+  shown &= (model.geom_group <= 2) & (_colours(model)[:, 3] > 0.05)
   return [int(g) for g in np.flatnonzero(shown)]
 
 
@@ -94,8 +95,7 @@ class Camera:
     self._extra = len(self._geoms) * 12 + len(self._sites) * 8
 
   def frame(self, session: Any) -> bytes:
-    """Returns a frame: little-endian float32, as `HEAD`, nodes (x y z), geoms (place and matrix),
-    targets (place, colour, size)."""
+    """Returns a frame, float32: `HEAD`, nodes, geoms (place, matrix), targets (8 numbers each)."""
     env, physics = self._env, self._env.physics
     data, model, late = physics.data.ptr, self.model, session.pace.lateness
     wrench = physics.handle.wrench()

@@ -65,12 +65,16 @@ class Session:
     self._rows = np.zeros((episode.substeps(env), len(env.task.components)))
     self._due = 0.0
 
-  def run(self, realtime: bool = False) -> Recording:
+  def run(
+    self, realtime: bool = False, watch: Callable[[Any], Any] | None = None
+  ) -> Recording:
     """Does the exercise and returns its recording; always leaves the device without force.
 
     Args:
       realtime: see `pace.punctual`
+      watch: called with the environment after every control step; a true result ends the exercise
     """
+    self._look = watch
     device = self.link.device
     info = {"performer": f"device:{device.name}", **self._info}
     try:
@@ -123,4 +127,5 @@ class Session:
   def _watch(self, env: Any) -> bool:
     if self.coach is not None:
       self.coach.look(env)
-    return self.pace.stopped
+    ended = self._look is not None and self._look(env)
+    return bool(ended) or self.pace.stopped

@@ -111,7 +111,8 @@ class Worker:
     elif kind == "end":
       self._end()
     elif kind not in ("pause", "speed", "stop"):
-      raise ValueError(f"message is {str(message)[:60]!r}, expected hand, start, pause, speed, stop")
+      text = str(message)[:60]
+      raise ValueError(f"message is {text!r}, expected hand, start, pause, speed, stop")
 
   def _end(self) -> None:
     self._ended = True
