@@ -37,7 +37,6 @@ def follow(name, seed=0):
   ("name", "steps"),
   [
     ("touch/easy", ["Touch the yellow point gently, 1 of 1"]),
-    ("trace/easy", ["Touch the beginning", "Follow the line"]),
     ("grasp/easy", ["Open the jaws, go over", "Lift it by 6 mm", "Hold it", "Lower", "let go"]),
     ("probe/easy", ["Go to the yellow site", "Press more", "Hold it there"]),
   ],

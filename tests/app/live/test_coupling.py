@@ -40,7 +40,7 @@ def run(loop, duration, measure):
   return np.array(out)
 
 
-@pytest.mark.parametrize("rate", [30, 60, 1000])
+@pytest.mark.parametrize("rate", [30, 1000])
 def test_the_felt_force_has_no_steps(model, rate):
   """Pressed into the liver and over it at up to 63 mm/s; a handle that jumps 30 times a second
   makes steps of 1 N."""
@@ -50,7 +50,7 @@ def test_the_felt_force_has_no_steps(model, rate):
   )
   data = start(model)
   loop = couple(model, data, hand)
-  force = run(loop, 2.0, lambda loop: loop.links[0].force)
+  force = run(loop, 1.2, lambda loop: loop.links[0].force)
   assert np.linalg.norm(force, axis=1).max() > 0.2
   assert np.linalg.norm(np.diff(force, axis=0), axis=1).max() < 0.1
 
@@ -72,8 +72,8 @@ def thrown(model, rate, duration, mass=0.05, damping=0.0, stiffness=100.0):
 @pytest.mark.parametrize(
   ("rate", "duration"),
   [
-    (1000, 3),
-    (30, 5),
+    (1000, 1.5),
+    (30, 3),
     pytest.param(1000, 60, marks=pytest.mark.slow),
     pytest.param(30, 60, marks=pytest.mark.slow),
   ],
@@ -113,7 +113,7 @@ def test_forces_come_by_a_ramp_and_stay_below_the_limits(model):
   hand = live.Hand(lambda t: (0, 0, -0.05), stiffness=1000.0)
   hand.pos = (0.0, 0.0, 0.0)
   loop = couple(model, start(model, 30.0), hand, ramp=1.0, force_limit=0.8, passive=False)
-  force = np.linalg.norm(run(loop, 1.5, lambda loop: loop.links[0].force), axis=1)
+  force = np.linalg.norm(run(loop, 1.2, lambda loop: loop.links[0].force), axis=1)
   assert force[:40].max() < 0.4
   assert force.max() == pytest.approx(0.8)
   assert hand.force == (0.0, 0.0, 0.0)  # after the end
@@ -144,7 +144,7 @@ def test_two_hands(model):
   }
   tips = {p: data.site(f"{p}tip").xpos.copy() for p in hands}
   right, up = data.cam("laparoscope").xmat.reshape(3, 3)[:, :2].T
-  live.Loop(model, data, hands, pace=live.Pace.instant()).run(1.5)
+  live.Loop(model, data, hands, pace=live.Pace.instant()).run(1.2)
   for prefix, way in (("probe/", right), ("grasper/", up)):
     np.testing.assert_allclose(
       data.site(f"{prefix}tip").xpos - tips[prefix], 0.005 * way, atol=3e-4

@@ -20,6 +20,11 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 ANSWER = 120.0  # that a busy machine may take [s]
+LOOK = """(() => {
+  const {scene, head, targets} = window.palpate();
+  const text = document.getElementById("instruction").textContent;
+  return {head, targets, camera: scene.camera, text, ended: document.getElementById("card").open};
+})()"""
 
 
 @pytest.fixture
@@ -188,13 +193,13 @@ def wait(page, steps):
 
 
 def look(page, height):
-  """Returns the force, the way to the target in the picture's axes [m], and a pixel's size [m]."""
-  state = page.evaluate("window.palpate()")
-  head, camera = state["head"], state["scene"]["camera"]
+  """Returns the page's numbers, the way to the target in the picture [m], a pixel's size [m]."""
+  state = page.evaluate(LOOK)
+  head, camera = state["head"], state["camera"]
   tip, axes = [head[f"tip_{axis}"] for axis in "xyz"], np.array(camera["mat"]).reshape(3, 3)
   depth = (np.array(camera["pos"]) - tip) @ axes[:, 2]
   pixel = 2 * depth * np.tan(np.radians(camera["fovy"] / 2)) / height
-  return head["force"], axes.T @ (np.array(state["targets"][0][:3]) - tip), pixel
+  return state, axes.T @ (np.array(state["targets"][0][:3]) - tip), pixel
 
 
 @pytest.mark.slow
@@ -219,16 +224,17 @@ def test_an_exercise_is_done_through_the_page(serve, tmp_path):
     box = page.locator("#view").bounding_box()
     middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
     for _ in range(400):
-      if page.locator("#card[open]").count():
+      state, to, pixel = look(page, box["height"])
+      if state["ended"]:
         break
-      force, to, pixel = look(page, box["height"])
-      deep = 0.0
-      if force > 0.3:
-        deep = 0.0005
-      elif force < 0.05:  # else it is felt: stay
-        over = np.linalg.norm(to[:2]) < 0.0015
-        deep = np.clip(0.5 * (to[2] + (0.0 if over else 0.008)), -0.002, 0.002)
-        deep -= 0.0002 * (over and to[2] > -0.001)
+      force, deep = state["head"]["force"], 0.0
+      over = np.linalg.norm(to[:2]) < 0.0015
+      if force > 0.3 or "Let go" in state["text"]:
+        deep = 0.001
+      elif over and force < 0.05:  # else it is felt: stay
+        deep = -0.0015 if to[2] < -0.005 else -0.0003
+      elif force < 0.05:
+        deep = np.clip(to[2] + 0.008, -0.002, 0.002)
       if np.linalg.norm(to[:2]) > 0.001 and force < 0.05:
         x, y = 0.6 * to[:2] / pixel
         page.mouse.move(*middle)
@@ -236,7 +242,10 @@ def test_an_exercise_is_done_through_the_page(serve, tmp_path):
         page.mouse.move(middle[0] + x, middle[1] - y)
         page.mouse.up()
       page.mouse.wheel(0, float(deep / 2e-5))
-      page.wait_for_timeout(100)  # until it is seen
+      for _ in range(100):  # until it is seen
+        page.wait_for_timeout(30)
+        if page.evaluate("window.palpate().head.time") > state["head"]["time"] + 0.03:
+          break
     page.wait_for_selector("#card[open]", timeout=1e3 * ANSWER)
     page.screenshot(path=str(tmp_path / "card.png"))
     text = page.inner_text("#card")
