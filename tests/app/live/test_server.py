@@ -192,14 +192,15 @@ def wait(page, steps):
   raise AssertionError(f"{page.inner_text('#fault')!r}: no picture")
 
 
-def look(page, height):
-  """Returns the page's numbers, the way to the target in the picture [m], a pixel's size [m]."""
+def look(page, height, above):
+  """Returns the page's numbers, the way in the picture [m] to a place above the target, and the
+  size of a pixel [m]."""
   state = page.evaluate(LOOK)
   head, camera = state["head"], state["camera"]
   tip, axes = [head[f"tip_{axis}"] for axis in "xyz"], np.array(camera["mat"]).reshape(3, 3)
   depth = (np.array(camera["pos"]) - tip) @ axes[:, 2]
   pixel = 2 * depth * np.tan(np.radians(camera["fovy"] / 2)) / height
-  return state, axes.T @ (np.array(state["targets"][0][:3]) - tip), pixel
+  return state, axes.T @ (np.array(state["targets"][0][:3]) + np.array([0, 0, above]) - tip), pixel
 
 
 @pytest.mark.slow
@@ -223,25 +224,23 @@ def test_an_exercise_is_done_through_the_page(serve, tmp_path):
     assert page.inner_text("#instruction") == "Touch the yellow point gently, 1 of 1"
     box = page.locator("#view").bounding_box()
     middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    above = 0.01  # of the point, where the tip is taken [m]
     for _ in range(400):
-      state, to, pixel = look(page, box["height"])
+      state, to, pixel = look(page, box["height"], above)
       if state["ended"]:
         break
-      force, deep = state["head"]["force"], 0.0
-      over = np.linalg.norm(to[:2]) < 0.0015
+      force = state["head"]["force"]
       if force > 0.3 or "Let go" in state["text"]:
-        deep = 0.001
-      elif over and force < 0.05:  # else it is felt: stay
-        deep = -0.0015 if to[2] < -0.005 else -0.0003
-      elif force < 0.05:
-        deep = np.clip(to[2] + 0.008, -0.002, 0.002)
-      if np.linalg.norm(to[:2]) > 0.001 and force < 0.05:
-        x, y = 0.6 * to[:2] / pixel
+        above += 0.002
+      elif force < 0.05 and np.linalg.norm(to) < 0.0015:
+        above -= 0.001 if above > 0.003 else 0.0003
+      if np.linalg.norm(to[:2]) > 0.0005:
+        x, y = np.clip(0.6 * to[:2] / pixel, -40, 40)
         page.mouse.move(*middle)
         page.mouse.down()
         page.mouse.move(middle[0] + x, middle[1] - y)
         page.mouse.up()
-      page.mouse.wheel(0, float(deep / 2e-5))
+      page.mouse.wheel(0, float(np.clip(0.6 * to[2], -0.002, 0.002) / 2e-5))
       for _ in range(100):  # until it is seen
         page.wait_for_timeout(30)
         if page.evaluate("window.palpate().head.time") > state["head"]["time"] + 0.03:
