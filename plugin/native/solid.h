@@ -178,10 +178,12 @@ PALPATE void solid_row(const Fields& f, Thread t, int stage) {
   each_slice(t, f.shape.nslice, [&](int s, Lane lane) {
     const size_t at = base + s;
     const V mass = ld(f.state.mass.data + 8 * at, 0, lane);
-    const V kf = splat(foundation) * ld(f.shape.area.data, s, lane), diag = mass + g * kf;
+    const V kf = splat(foundation) * ld(f.shape.area.data, s, lane);
+    V diag = mass + g * kf;
     const V3 u = ld3(f.system.disp_trial.data + 24 * at, lane);
     const V3 v = ld3(f.system.vel_trial.data + 24 * at, lane);
     V3 b = h * (ld3(f.state.force_ext.data + 24 * at, lane) - kf * u) - gv * kf * v;
+    if (f.state.hold.data) diag += hold(f, t, stage, at, u, v, b, lane);
     if (stage == LATER) b -= mass * ld3(f.state.dvel.data + 24 * at, lane);
     for (int k = f.shape.around_adr.data[s]; k < f.shape.around_adr.data[s + 1]; ++k)
       b += gather_shared(impulse, f.shape.around_corner.data + 8 * k, lane);

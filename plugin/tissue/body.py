@@ -9,6 +9,7 @@ import numpy as np
 import warp as wp
 
 from .device import WORDS
+from .order import LANES
 from .types import (
   DIMS,
   NUMBERS,
@@ -137,6 +138,7 @@ def _sizes(values: dict[str, Any]) -> dict[str, int]:
     "nbendslice": out["nslice"] if bends else 0,
     "nareaslice": out["nslice"] if bends or values["closed"] else 0,
     "nquadslice": out["nslice"],
+    "nholdslice": 0,
     "ncycleslice": 0,
     "ncyclebendslice": 0,
     "nword": WORDS,
@@ -188,6 +190,16 @@ def worlds(body: Body, nworld: int = 1) -> Body:
   if body.levels is not None:
     out.levels = _levels(out, worlds(body.levels.body, nworld), body.levels.transfer)
   return out
+
+
+def hold(body: Body) -> wp.array:
+  """Returns `state.hold`, the springs that hold nodes, which a body gets when it is first asked."""
+  if not body.state.hold.size:
+    shape = (body.nworld, body.shape.nslice, LANES)
+    body.fields.state.hold = wp.zeros(shape, dtype=float, device=body.device)
+    if body.levels is not None:
+      body.levels.cycle.fine = body.fields
+  return body.state.hold
 
 
 def nbytes(body: Body) -> int:

@@ -168,6 +168,7 @@ class State:
   vel: vector  # velocity [m/s]
   mass: scalar  # mass [kg]
   force_ext: vector  # external and lagged contact force [N]
+  hold: floats("nworld", "nholdslice", 8)  # springs of `force_ext` that hold a node [N/m]
   dvel: vector  # change of velocity in this step [m/s]
   dvel_warm: vector  # what those of the last steps lead to, where PCG starts [m/s]
 
