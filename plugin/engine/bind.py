@@ -30,21 +30,35 @@ def bind(w, model: int):
   with graphs.lock:
     declare.check_frame(m, w.organ)
     load(w.body)
+    w.ties.load()
     if w.resident:
       w.resident.fetch()
     w.phases = does = side.Phases(w, model, w.instance)
     near = wp.get_device(does.side)
     crossing = device != near
 
-    touched = _touched(w, model)
+    touched, ties = _touched(w, model), w.ties
+    ties.bind(model)
 
     def before():
       weights.launch(touched)
       does.gather()
 
+    def enter():
+      does.enter()
+      if ties:
+        ties.enter()
+
+    def scatter():
+      does.scatter()
+      if ties:
+        ties.act()
+
     def solve():
       if crossing:
         _cross(w, _IN, to_device=True)
+      if ties:
+        ties.cross()
       scheme.step(w.body)
       if crossing:
         _cross(w, _OUT, to_device=False)
@@ -62,9 +76,9 @@ def bind(w, model: int):
       does.advance()
 
     # As few graphs as may be: a launch costs a small organ a hundredth of its step.
-    after = [] if w.resident else [(cpu, does.scatter)]
+    after = [] if w.resident else [(cpu, scatter)]
     w.before = graphs.record(cpu, before)
-    w.solve = graphs.record_all((near, does.enter), (device, solve), (near, does.look), *after)
+    w.solve = graphs.record_all((near, enter), (device, solve), (near, does.look), *after)
     w.after = graphs.record(cpu, does.scatter) if w.resident else None
     w.leave = graphs.record(cpu, does.leave)
     w.respond = []

@@ -14,6 +14,7 @@ from .step import SCHEMES
 # What takes a change while running: a number in the device's memory, the tissue's arrays, the graph
 # of the step anew. Other keys shape arrays or the model, and stay.
 NUMBER, TISSUE, GRAPH, FIXED = "number", "tissue", "graph", ""
+OWN = "own"  # as a carrier: the organ's own rigid motion
 _SHOWN = 40  # letters of a value in a message
 _SCALE = "young_scale"  # a key of `change` alone
 
@@ -121,6 +122,17 @@ def _groups(text: str, nelem: int) -> tuple[tuple[str, ...], ...]:
   return tuple(tuple(group.split()) for group in text.split(","))
 
 
+def _ties(text: str, nelem: int) -> tuple[tuple[str, float, tuple[int, ...]], ...]:
+  found = []
+  for group in text.split(","):
+    name, stiffness, *vertices = group.split()
+    value = _POSITIVE[0](stiffness, nelem)
+    found.append((name, value, _vertices(" ".join(vertices), nelem)))
+    if not vertices:
+      raise ValueError
+  return tuple(found)
+
+
 def _words(*values: str) -> tuple:
   return _choice({value: value for value in values})
 
@@ -202,6 +214,19 @@ class Config:
   pin: tuple[int, ...] = _row(
     (), (_vertices, "vertex numbers"), "vertices that do not move, with `window` alone"
   )
+  carrier: str = _row(
+    "",
+    (lambda text, nelem: text, "the name of a body, or `own`"),
+    "body that carries foundation and pins along ([attachments](authoring.md#attachments)); `own`: "
+    "the foundation goes with the organ's own rigid motion",
+  )
+  attach: tuple[tuple[str, float, tuple[int, ...]], ...] = _row(
+    (),
+    (_ties, "a body or organ, a stiffness > 0 and vertices, a comma between such groups"),
+    "springs from vertices to a body, or to the nearest vertices of another organ: "
+    "`rib 500 3 17 18, stomach 200 40 41`; the stiffness is that of a group",
+    "-, N/m, -",
+  )
   resident: bool = _row(
     False,
     _choice({"true": True, "false": False}),
@@ -243,7 +268,7 @@ def _default(key: str) -> str:
     except ValueError:
       return "-"
     return f"{value:g}"
-  return str(value).lower()
+  return str(value).lower() or "-"
 
 
 def parse(organ: str, texts: dict[str, str], nelem: int, closed: bool) -> Config:
@@ -333,6 +358,7 @@ def _check_combination(organ: str, config: Config, given: dict, closed: bool):
       raise ValueError(f"organ {organ!r}: {key} is set, allowed only with window")
   if config.elements == "solid":
     _check_solid(organ, config, given)
+  _check_ties(organ, config)
   if config.window and "mass" not in given and not config.mass:
     raise ValueError(f"organ {organ!r}: window is set and mass is missing [kg]")
   for key in ("bulk", "pressure"):
@@ -355,6 +381,18 @@ def _check_solid(organ: str, config: Config, given: dict):
       f"organ {organ!r}: integrator is {config.integrator!r}, allowed only where elements is not "
       "'solid'"
     )
+
+
+def _check_ties(organ: str, config: Config):
+  for key in ("carrier", "attach"):
+    if getattr(config, key) and config.resident:
+      raise ValueError(f"organ {organ!r}: {key} is set, allowed only without resident")
+    if getattr(config, key) and not SCHEMES[config.integrator].solids:
+      raise ValueError(
+        f"organ {organ!r}: integrator is {config.integrator!r}, allowed only without {key}"
+      )
+  if config.carrier == OWN and config.pin:
+    raise ValueError(f"organ {organ!r}: carrier is 'own', allowed only without pin")
 
 
 def lame(config: Config, nelem: int) -> tuple[np.ndarray, np.ndarray]:

@@ -78,7 +78,9 @@ def renumber(body: Body, config: Config):
 
 def _numbers(config: Config) -> dict[str, float]:
   values = {name: getattr(config, name, 1.0) for name in NUMBERS}
-  return values | {"stiffness": config.stiffness if config.elements == "spring" else 0.0}
+  values["stiffness"] = config.stiffness if config.elements == "spring" else 0.0
+  values["foundation"] = 0.0 if config.carrier else config.foundation  # its springs are held then
+  return values
 
 
 def _below(

@@ -263,13 +263,15 @@ class Scheme:
     respond: writes to `system.sol` how the impulses in `system.rhs` [N s] change the velocity in
       the step just computed; None where the scheme has no such answer
     levels: whether coarser meshes serve its solve
-    solids: whether it can step tetrahedra
+    ahead: whether it takes forces where the present velocity leads
+    solids: whether it can step tetrahedra, and springs that hold nodes
   """
 
   step: Callable[[Body], None]
   gain: Callable[[float, float], float]
   respond: Callable[[Body], None] | None = None
   levels: bool = False
+  ahead: bool = False
   solids: bool = True
 
   @property
@@ -283,7 +285,7 @@ def _whole(h: float, damping: float) -> float:
 
 
 SCHEMES = {
-  "implicit": Scheme(_implicit, _whole, _respond, levels=True),
+  "implicit": Scheme(_implicit, _whole, _respond, levels=True, ahead=True),
   "midpoint": Scheme(_midpoint, lambda h, b: 0.5 * _whole(h, b), _respond_centred, levels=True),
   "neumann": Scheme(_neumann, _whole, solids=False),
   "explicit": Scheme(_explicit, lambda h, b: 0.0),
