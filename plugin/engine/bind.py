@@ -31,14 +31,16 @@ def bind(w, model: int):
     declare.check_frame(m, w.organ)
     load(w.body)
     w.ties.load()
+    w.creep.load()
     if w.resident:
       w.resident.fetch()
     w.phases = does = side.Phases(w, model, w.instance)
     near = wp.get_device(does.side)
     crossing = device != near
 
-    touched, ties = _touched(w, model), w.ties
+    touched, ties, creep = _touched(w, model), w.ties, w.creep
     ties.bind(model)
+    creep.bind(model)
 
     def before():
       weights.launch(touched)
@@ -48,6 +50,8 @@ def bind(w, model: int):
       does.enter()
       if ties:
         ties.enter()
+      if creep:
+        creep.enter()
 
     def scatter():
       does.scatter()
@@ -71,8 +75,11 @@ def bind(w, model: int):
       if crossing:
         _cross(w, ("sol", "status"), to_device=False)
 
-    def end():
-      does.end()
+    def advance(ends: bool):
+      if creep:
+        creep.end()
+      if ends:
+        does.end()
       does.advance()
 
     # As few graphs as may be: a launch costs a small organ a hundredth of its step.
@@ -84,8 +91,8 @@ def bind(w, model: int):
     w.respond = []
     if scheme.respond:
       w.respond = graphs.record_all((near, does.push), (device, respond), (near, does.answer))
-    w.end = graphs.record(cpu, end)
-    w.advance = graphs.record(cpu, does.advance)
+    w.end = graphs.record(cpu, lambda: advance(ends=True))
+    w.advance = graphs.record(cpu, lambda: advance(ends=False))
     w.place = graphs.record(cpu, does.place) if w.organ.windows else None
     if w.resident:
       w.resident.foresee = graphs.record(cpu, does.foresee)

@@ -104,6 +104,7 @@ def _change(w, model: int, config: Config):
       shape.change(w.body, w.organ.mesh, config, ~w.organ.free)
     else:
       shape.renumber(w.body, config)
+    w.creep.renumber(config)
     if any(getattr(before, key) != getattr(config, key) for key in configuration.RECORDED):
       bind(w, model)
     if material:

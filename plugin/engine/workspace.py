@@ -28,6 +28,7 @@ from . import (
 )
 from .bind import bind
 from .coupling import Phases
+from .creep import Creep
 from .declare import Declaration
 from .layout import FLAG, HEAD
 from .pierce import Watch
@@ -66,6 +67,7 @@ class Workspace:
     end: recorded graph that ends a step without such a response, and steps the plugin state
     place: recorded graph that puts the windows where the plugin state says, or None
     ties: what the organ is tied to
+    creep: its stress relaxation
     resident: keeper of a motion that stays on the device, or None
     stiff: whether the response is needed, see `inertia.stiffness`
     heaviest: most times its inertia that a node in contact may have, see there  (1,)
@@ -116,6 +118,7 @@ class Workspace:
   advance: Any = None
   place: Any = None
   ties: Ties = dataclasses.field(init=False)
+  creep: Creep = dataclasses.field(init=False)
   resident: Resident | None = None
   stiff: bool = False
   heaviest: np.ndarray = dataclasses.field(default_factory=lambda: np.ones(1))
@@ -147,7 +150,7 @@ class Workspace:
   phases: Phases | None = None
 
   def __post_init__(self):
-    self.ties = Ties(self)
+    self.ties, self.creep = Ties(self), Creep(self)
 
   def run(self):
     """Computes the step's forces and adds them to qfrc_passive."""
@@ -342,11 +345,14 @@ def state_size(model: int, instance: int) -> int:
   """
   m = mjstruct.Model.from_address(model)
   names = mjstruct.config(model, instance, "window").split()
+  relaxes = bool(mjstruct.config(model, instance, "relax_share").strip())
   if names:
     # Asked before MuJoCo has filled in the flexes: what `windowed` needs is at most this.
     inside = fill.MOST if mjstruct.config(model, instance, "elements").strip() == "solid" else 0
-    return windowed.state_size((1 + inside) * m.nflexvert, 0, m.ngeom * len(names))
-  return nodal.state_size(3 * len(declare.moving_bodies(m, instance)))
+    most = (1 + inside) * m.nflexvert
+    return windowed.state_size(most, 0, m.ngeom * len(names), relaxes * most)
+  moving = len(declare.moving_bodies(m, instance))
+  return nodal.state_size(3 * moving, relaxes * moving)
 
 
 def make(model: int, data: int, instance: int) -> Workspace:

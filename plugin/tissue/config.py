@@ -186,6 +186,17 @@ class Config:
     0.0, _number(-math.inf), "inside minus outside; closed surfaces", "Pa", NUMBER
   )
   damping: float = _row(0.002, _NOT_NEGATIVE, "Rayleigh coefficient on the stiffness", "s", NUMBER)
+  relax_share: float = _row(
+    0.0,
+    _number(0.0, 1.0),
+    "share of the elastic forces that fades while a strain is held; `young` and the others are "
+    "those at once",
+    "-",
+    NUMBER,
+  )
+  relax_time: float = _row(
+    0.5, _POSITIVE, "time constant of that, exp(-t / relax_time)", "s", NUMBER
+  )
   integrator: str = _row(
     "implicit",
     _words(*SCHEMES),
@@ -319,6 +330,11 @@ def change(
     factor = _value(organ, _SCALE, scale, *_POSITIVE)
     values["young"] = tuple(factor * young for young in compiled.young)
   changed = dataclasses.replace(config, **values)
+  if bool(changed.relax_share) != bool(compiled.relax_share):
+    raise ValueError(
+      f"organ {organ!r}: relax_share is {changed.relax_share:g}, compiled as "
+      f"{compiled.relax_share:g}: it cannot begin or end while running"
+    )
   given = values | ({"stiffness": 0} if config.stiffness else {})
   _check_combination(organ, changed, given, closed)
   return changed
@@ -384,13 +400,15 @@ def _check_solid(organ: str, config: Config, given: dict):
 
 
 def _check_ties(organ: str, config: Config):
-  for key in ("carrier", "attach"):
+  for key in ("carrier", "attach", "relax_share"):
     if getattr(config, key) and config.resident:
       raise ValueError(f"organ {organ!r}: {key} is set, allowed only without resident")
     if getattr(config, key) and not SCHEMES[config.integrator].solids:
       raise ValueError(
         f"organ {organ!r}: integrator is {config.integrator!r}, allowed only without {key}"
       )
+  if config.relax_share and config.pressure:
+    raise ValueError(f"organ {organ!r}: relax_share is set, allowed only where pressure is 0")
   if config.carrier == OWN and config.pin:
     raise ValueError(f"organ {organ!r}: carrier is 'own', allowed only without pin")
 
