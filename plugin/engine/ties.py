@@ -21,8 +21,8 @@ from .layout import TAIL
 
 TO_POINT, TO_OWN_MOTION = -1, -2  # in place of a body
 _LEAST = 64  # ties that there is room for at once
-# Share of the organ's mass that its carried foundation may weigh for the last steps to lead it.
-_LEADS = 0.3
+# Share of what they hold that springs may weigh in a step for the last steps to lead them.
+_LEADS = 0.5
 
 
 @struct
@@ -40,6 +40,7 @@ class Bodies:
   xmat: doubles("nbody", 9)
   cvel: doubles("nbody", 6)
   cdof: doubles("nv", 6)
+  qacc_warmstart: doubles("nv")
   subtree_com: doubles("nbody", 3)
   qfrc_passive: doubles("nv")
 
@@ -49,7 +50,6 @@ class Tied:
   """The ties of an organ, those to one body in a row."""
 
   windowed: int  # whether the motion is in the plugin state
-  leads: int  # whether the organ's own rigid motion is that which the last steps lead to
   ahead: wp.float64  # share of the step's way at which its scheme takes forces
   gain: wp.float64  # how much of a step's stiffness its scheme has on dv
   count: ints(1)  # number of ties
@@ -57,6 +57,7 @@ class Tied:
   restless: ints(1)  # whether one leads to what may move while the organ sleeps
   vert: ints("ntie")  # vertex
   body: ints("ntie")  # body, or what `native/ties.h` has besides
+  leads: ints("ntie")  # whether the last steps say how fast the point will be
   stiffness: doubles("ntie")  # [N/m]
   anchor: doubles("ntie", 3)  # the point in its body's frame [m]
   point: doubles("ntie", 6)  # place and velocity of another point, in the world [m, m/s]
@@ -80,7 +81,7 @@ class Tied:
 
 _enter, _act = coupling.kernels("ties.h", Tied, "enter_ties", "act_ties")
 _OF_COUNT = ("count", "owned", "restless")
-_OF_TIE = ("vert", "body", "stiffness", "anchor", "point", "force")
+_OF_TIE = ("vert", "body", "leads", "stiffness", "anchor", "point", "force")
 
 
 @dataclasses.dataclass(eq=False)
@@ -154,6 +155,9 @@ class Ties:
     self._arrays["restless"].numpy()[0] = weld.any()
     self._arrays["owned"].numpy()[0] = any(g.body == TO_OWN_MOTION for g in self.groups)
     self._arrays["count"].numpy()[0] = total
+    parts = [np.full(len(g.vert), self._leads(g.body)) for g in self.groups]
+    if parts:
+      self._arrays["leads"].numpy()[:total] = np.concatenate(parts)
     self._arrays["force"].zero_()
     assert self._hold is not None
     self._hold.zero_()
@@ -180,7 +184,6 @@ class Ties:
     own = w.boxes["own"] if windowed else None
     values = self._arrays | dict(
       windowed=int(windowed),
-      leads=int(self._leads()),
       ahead=float(scheme.ahead),
       gain=scheme.gain(1.0, 0.0),
       node=w.body.shape.node.numpy(),
@@ -197,12 +200,15 @@ class Ties:
     values |= {n: w.host[n] for n in ("force_ext", "vel", "dvel", "dvel_warm", "status")}
     self._tied = fill(Tied, "cpu", values)
 
-  def _leads(self) -> bool:
-    """Returns whether it is stable that a carried foundation goes where the last steps lead."""
+  def _leads(self, body: int) -> bool:
+    """Returns whether it is stable that springs act where the last steps lead what they hold."""
     w = self._w
-    h = float(mjstruct.Model.from_address(w.model).opt.timestep)
-    stiffness = sum(g.stiffness.sum() for g in self.groups if g.body == TO_OWN_MOTION)
-    return h * (h + w.config.damping) * stiffness < _LEADS * w.organ.mass.sum()
+    m = mjstruct.Model.from_address(w.model)
+    gain = float(m.opt.timestep) * (float(m.opt.timestep) + w.config.damping)
+    weight = gain * sum(group.stiffness.sum() for group in self.groups if group.body == body)
+    if body == TO_OWN_MOTION:
+      return weight < _LEADS * w.organ.mass.sum()
+    return body > 0 and weight * mjstruct.view(m.body_invweight0, (m.nbody, 2))[body, 0] < _LEADS
 
   def enter(self):
     """Adds to the solver's input, after a coupling has filled it."""

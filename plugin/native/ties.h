@@ -74,7 +74,7 @@ PALPATE Rigid own_motion(const Fields& f) {
   double total = 0.0, A[9] = {}, I[9] = {};
   const D3 zero = {0.0, 0.0, 0.0};
   Rigid out = {{1, 0, 0, 0, 1, 0, 0, 0, 1}, zero, zero, zero, zero};
-  const double ahead = f.leads ? 1.0 : 0.0;
+  double ahead = 0.0;
   auto velocity = [&](int n) {
     const int at = offset_of(f.node.data[f.vert.data[n]]);
     return load_lane(f.vel.data + at) + ahead * load_lane(f.dvel_warm.data + at);
@@ -85,6 +85,7 @@ PALPATE Rigid own_motion(const Fields& f) {
     const double k = f.stiffness.data[n];
     const D3 X = load(f.rest.data + 3 * i);
     total += k;
+    ahead = f.leads.data[n] ? 1.0 : 0.0;
     out.rest += k * X;
     out.middle += k * (X + moved_by(f, i));
     out.vel += k * velocity(n);
@@ -116,15 +117,34 @@ PALPATE Rigid own_motion(const Fields& f) {
   return out;
 }
 
-// Where the point of a tie to a body is, and its velocity, in the world.
+// A velocity about the centre of mass of a body's tree: of turning, and of the centre.
+struct Twist { D3 spin, vel; };
+
+// The velocity of a body, and where `leads` says so what its last acceleration adds in the step.
 template <class Fields>
-PALPATE void point_of_body(const Fields& f, int n, D3& at, D3& vel) {
+PALPATE Twist twist(const Fields& f, int b, bool leads) {
   const auto& mj = f.mj;
+  Twist out = {load(mj.cvel.data + 6 * b), load(mj.cvel.data + 6 * b + 3)};
+  for (; leads && b > 0; b = mj.body_parentid.data[b])
+    for (int d = 0; d < mj.body_dofnum.data[b]; ++d) {
+      const int dof = mj.body_dofadr.data[b] + d;
+      const double dv = mj.timestep.data[0] * mj.qacc_warmstart.data[dof];
+      out.spin += dv * load(mj.cdof.data + 6 * dof);
+      out.vel += dv * load(mj.cdof.data + 6 * dof + 3);
+    }
+  return out;
+}
+
+// Where the point of a tie to a body is in the world, and from the centre of mass of its tree.
+template <class Fields>
+PALPATE D3 point_of_body(const Fields& f, int n) {
   const int b = f.body.data[n];
-  const double* cvel = mj.cvel.data + 6 * b;
-  at = load(mj.xpos.data + 3 * b) + turned(mj.xmat.data + 9 * b, load(f.anchor.data + 3 * n));
-  const D3 arm = at - load(mj.subtree_com.data + 3 * mj.body_rootid.data[b]);
-  vel = load(cvel + 3) + cross(load(cvel), arm);
+  return load(f.mj.xpos.data + 3 * b)
+    + turned(f.mj.xmat.data + 9 * b, load(f.anchor.data + 3 * n));
+}
+template <class Fields>
+PALPATE D3 arm_of(const Fields& f, int b, D3 point) {
+  return point - load(f.mj.subtree_com.data + 3 * f.mj.body_rootid.data[b]);
 }
 
 // Adds to the solver's input what pulls at the tied nodes.
@@ -136,13 +156,19 @@ PALPATE void enter_ties(const Fields& f, Thread, int) {
   const Rigid own = f.owned.data[0] ? own_motion(f) : Rigid{};
   if (f.windowed && f.restless.data[0]) f.tail.data[TAIL_QUIET] = 0.0;
   for (int n = 0; n < count; ++n) f.hold.data[f.node.data[f.vert.data[n]]] = 0.0f;
+  Twist moving = {zero, zero};
   for (int n = 0; n < count; ++n) {
     const int i = f.vert.data[n], node = f.node.data[i];
     const double k = f.stiffness.data[n];
     const D3 rest = load(f.rest.data + 3 * i);
     D3 to = load(f.point.data + 6 * n), vel = load(f.point.data + 6 * n + 3);
-    if (f.body.data[n] >= 0) point_of_body(f, n, to, vel);
-    if (f.body.data[n] == TO_OWN_MOTION) {
+    const int b = f.body.data[n];
+    if (b >= 0) {
+      if (n == 0 || b != f.body.data[n - 1]) moving = twist(f, b, f.leads.data[n]);
+      to = point_of_body(f, n);
+      vel = moving.vel + cross(moving.spin, arm_of(f, b, to));
+    }
+    if (b == TO_OWN_MOTION) {
       const D3 arm = turned(own.R, rest - own.rest);
       to = own.middle + arm;
       vel = own.vel + cross(own.spin, arm);
@@ -188,11 +214,9 @@ PALPATE void act_ties(const Fields& f, Thread, int) {
     store(f.force.data + 3 * n, F);
     store_lane(f.force_ext.data + at, load_lane(f.force_ext.data + at) - back);
     if (b < 0) continue;
-    D3 place, vel;
-    point_of_body(f, n, place, vel);
     const D3 push = zero - turned(f.frame.data, F);
     force += push;
-    torque += cross(place - load(mj.subtree_com.data + 3 * mj.body_rootid.data[b]), push);
+    torque += cross(arm_of(f, b, point_of_body(f, n)), push);
     if (n + 1 < f.count.data[0] && f.body.data[n + 1] == b) continue;
     push_body(f, b, force, torque);
     force = torque = zero;
