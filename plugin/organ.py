@@ -98,9 +98,9 @@ class Organ:
     return Attachment(change.attach(self._space, model, vertices, target, stiffness), model)
 
   def _body(self, body: str | int) -> int:
-    found = body if not isinstance(body, str) else mujoco.mj_name2id(
-      self.model, mujoco.mjtObj.mjOBJ_BODY, body
-    )
+    found = body
+    if isinstance(body, str):
+      found = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_BODY, body)
     if not 0 <= int(found) < self.model.nbody:
       raise ValueError(f"organ {self.name!r}: the model has no body {body!r} to attach to")
     return int(found)
@@ -186,6 +186,11 @@ class Organ:
   def force(self) -> np.ndarray:
     """Sum of `contact_force` [N], (3,)."""
     return self.contact_force.sum(axis=0)
+
+  @property
+  def support_force(self) -> np.ndarray:
+    """Sum of the forces of what the organ rests on (`support`) in the last step [N], (3,)."""
+    return self._space.rests.force().sum(axis=0)
 
   @property
   def energy(self) -> float:

@@ -192,6 +192,7 @@ def sizes(organ) -> dict[str, int]:
   if organ.windows is None:
     return out | {"nfree": organ.nfree}
   win = organ.windows
+  out["nrest"] = organ.mesh.nouter if organ.config.support else 0
   return out | {"nvert": organ.mesh.nvert, "nslot": win.nslot, "ngeom": win.geom.size}
 
 

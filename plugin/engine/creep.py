@@ -28,9 +28,11 @@ class Creeping:
   ncreep: int  # number of them
   node: ints("ncreep")  # node of each
   own: doubles("ncreep", 6)  # elastic force of the last step, and what has not faded of it [N]
+  held: int  # whether springs hold nodes
   number: doubles(2)  # share that relaxes [-], time constant [s]
   flags: ints(len(FLAG))  # see FLAG
   tail: doubles(len(TAIL))  # see TAIL
+  hold: floats("nworld", "nholdslice", 6, 8)
   mass: scalar
   force_ext: vector
   dvel: vector
@@ -80,6 +82,8 @@ class Creep:
       ptr=state.ptr + 8 * where.start, dtype=wp.float64, shape=(sizes["ncreep"], 6), device="cpu"
     )
     values = dict(
+      held=int(bool(w.hold)),
+      hold=w.hold.array if w.hold else np.zeros((0, 0, 6, 8)),
       windowed=int(organ.windows is not None),
       ncreep=sizes["ncreep"],
       node=w.body.shape.node.numpy()[np.flatnonzero(organ.free)],
@@ -94,8 +98,10 @@ class Creep:
 
   def enter(self):
     """Adds to the solver's input, after a coupling has filled it."""
-    wp.launch(_enter, dim=(1, 1), inputs=[1, 0, self._creeping], device="cpu")
+    if self:
+      wp.launch(_enter, dim=(1, 1), inputs=[1, 0, self._creeping], device="cpu")
 
   def end(self):
     """Takes what the step has made of the forces."""
-    wp.launch(_end, dim=(1, 1), inputs=[1, 0, self._creeping], device="cpu")
+    if self:
+      wp.launch(_end, dim=(1, 1), inputs=[1, 0, self._creeping], device="cpu")

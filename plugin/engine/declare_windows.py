@@ -236,10 +236,13 @@ def _check_neighbours(m, model, instance, name, windows: Windows, frame, origin,
   contype = mjstruct.view(m.flex_contype, m.nflex, np.int32)
   conaffinity = mjstruct.view(m.flex_conaffinity, m.nflex, np.int32)
   surface = _surfaces(model, m, instance, without=instance)
+  bearing = _bearing(model, m, instance, name)
   points = origin + rest @ frame.T
   room = _NEAR * float(np.linalg.norm(np.ptp(points, axis=0)))
   low, high = points.min(axis=0) - room, points.max(axis=0) + room
   for f in np.flatnonzero(~own):
+    if flexes.name(m, surface.get(int(f), int(f))) in bearing:
+      continue
     meets = (contype[f] & conaffinity[own]) | (conaffinity[f] & contype[own])
     other = flexes.rest_points(m, surface.get(int(f), int(f)))
     if meets.any() and (other.max(axis=0) > low).all() and (other.min(axis=0) < high).all():
@@ -248,6 +251,17 @@ def _check_neighbours(m, model, instance, name, windows: Windows, frame, origin,
         f"{flexes.name(m, surface.get(int(f), int(f)))!r} beside it; use nodal coupling, or "
         "contype and conaffinity that do not meet"
       )
+
+
+def _bearing(model, m, instance: int, name: str) -> set[str]:
+  """Returns the organs on which one rests, and those that rest on it."""
+  names = [flexes.name(m, f) for f in range(m.nflex)]
+  found = {}
+  for other in range(m.nplugin):
+    for flex in _rigid_flexes(m, other)[1]:
+      support = mjstruct.config(model, other, "support").split()
+      found[names[flex]] = {flexes.resolve(each, names[flex], names) for each in support}
+  return {each for each in names if name in found.get(each, ()) or each in found.get(name, ())}
 
 
 def touching(model: int, instance: int) -> np.ndarray:

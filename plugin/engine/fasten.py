@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 from palpate.tissue import mesh as topology
 from palpate.tissue.config import OWN
-from palpate.tissue.step import SCHEMES
 from scipy.spatial import KDTree
 
-from . import flexes, inertia, mjstruct
+from . import flexes, inertia, mjstruct, rests
 from .ties import TO_OWN_MOTION, TO_POINT, Group, is_mocap, motion
 
 # Times the mass of a vertex that its spring weighs in a step, where nothing else is said: it then
@@ -21,6 +20,7 @@ _LIGHT = 0.5
 def declare(w):
   """Ties an organ to the bodies that its configuration names."""
   made = carried(w)
+  rests.check(mjstruct.Model.from_address(w.model), w)
   m = mjstruct.Model.from_address(w.model)
   flex_names = [flexes.name(m, f) for f in range(m.nflex)]
   for name, stiffness, vertices in w.config.attach:
@@ -182,7 +182,7 @@ def _stiffness(w, vert: np.ndarray, stiffness: float | None, most: float) -> np.
     raise ValueError(f"organ {name!r}: stiffness is {stiffness}, expected a number > 0 [N/m]")
   if stiffness > most:
     raise ValueError(
-      f"organ {name!r}: stiffness is {stiffness:g}, expected at most {most:.3g} N/m for a body that "
-      "is so light in a step of that length"
+      f"organ {name!r}: stiffness is {stiffness:g}, expected at most {most:.3g} N/m for a body that"
+      " is so light in a step of that length"
     )
   return stiffness * share

@@ -186,6 +186,7 @@ class WindowState:
   motion: Motion
   force: doubles("nslot", 3)  # contact force of the last step on each slot [N]
   creep: doubles("ncreep", 6)  # see `creep`
+  slip: doubles("nrest", 3)  # how far nodes have slipped on what they rest on [m]
   slot: doubles("nslot")  # node + 1; 0: the slot's default node, -1: not used
   pose: doubles("ngeom", len(POSE))  # where the windows' geoms were, see POSE
   tail: doubles(len(TAIL))  # see TAIL

@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 from palpate.tissue.config import KEYS
 
-from . import change, fasten, guard, mjstruct, weights, windowed, workspace
+from . import change, fasten, guard, mjstruct, rests, weights, windowed, workspace
 from .layout import FLAG
 from .mjstruct import NAME, warn
 from .workspace import Workspace
@@ -112,7 +112,7 @@ def _init(model: int, data: int, instance: int) -> int:
     w = workspace.make(model, data, instance)
     _workspaces[data, instance] = _states[w.plugin_state.ctypes.data] = w
     mine = [each for (of, _), each in _workspaces.items() if of == data]
-    for each in fasten.declare_between(mine):
+    for each in (*fasten.declare_between(mine), *rests.meet(mine)):
       workspace.rebind(each)
     return 0
   except BaseException as error:

@@ -12,37 +12,17 @@ from typing import Any
 
 import numpy as np
 import warp as wp
-from palpate.tissue import body as bodies
 from palpate.tissue.step import SCHEMES
-from palpate.tissue.types import DIMS, doubles, fill, floats, ints, scalar, struct, vector
+from palpate.tissue.types import DIMS, doubles, fill, floats, ints, struct, vector
 
 from . import coupling, mjstruct
+from .hold import Bodies
 from .layout import TAIL
 
 TO_POINT, TO_OWN_MOTION = -1, -2  # in place of a body
 _LEAST = 64  # ties that there is room for at once
 # Share of what they hold that springs may weigh in a step for the last steps to lead them.
 _LEADS = 0.5
-
-
-@struct
-class Bodies:
-  """MuJoCo's own memory, under its own names."""
-
-  timestep: doubles(1)
-  qpos0: doubles("nq")
-  body_parentid: ints("nbody")
-  body_rootid: ints("nbody")
-  body_dofnum: ints("nbody")
-  body_dofadr: ints("nbody")
-  qpos: doubles("nq")
-  xpos: doubles("nbody", 3)
-  xmat: doubles("nbody", 9)
-  cvel: doubles("nbody", 6)
-  cdof: doubles("nv", 6)
-  qacc_warmstart: doubles("nv")
-  subtree_com: doubles("nbody", 3)
-  qfrc_passive: doubles("nv")
 
 
 @struct
@@ -70,7 +50,7 @@ class Tied:
   origin: doubles(3)  # position of its frame [m]
   number: doubles("nnumber")  # see `NUMBERS`
   tail: doubles(len(TAIL))  # see TAIL
-  hold: scalar
+  hold: floats("nworld", "nholdslice", 6, 8)
   force_ext: vector
   vel: vector
   dvel: vector
@@ -119,7 +99,6 @@ class Ties:
     self.groups: list[Group] = []
     self._room = 0
     self._arrays: dict[str, wp.array] = {}
-    self._hold: wp.array | None = None
     self._tied: Any = None
 
   def __bool__(self) -> bool:
@@ -142,9 +121,7 @@ class Ties:
     for name in (*_OF_COUNT, *_OF_TIE):
       shape = [sizes[n] if isinstance(n, str) else n for n in DIMS[Tied.key][name]]
       self._arrays[name] = wp.zeros(shape, dtype=Tied.vars[name].type.dtype, device="cpu")
-    body = self._w.body
-    there = bodies.hold(body)
-    self._hold = there if there.device.is_cpu else wp.zeros_like(there, device="cpu", pinned=True)
+    self._w.hold.need()
 
   def _write(self, total: int):
     for name in ("vert", "body", "stiffness", "anchor"):
@@ -159,8 +136,6 @@ class Ties:
     if parts:
       self._arrays["leads"].numpy()[:total] = np.concatenate(parts)
     self._arrays["force"].zero_()
-    assert self._hold is not None
-    self._hold.zero_()
 
   def _moves(self, group: Group) -> bool:
     m = mjstruct.Model.from_address(self._w.model)
@@ -194,7 +169,7 @@ class Ties:
       origin=organ.origin,
       number=w.body.numbers,
       tail=own.tail if own else np.zeros(len(TAIL)),
-      hold=self._hold,
+      hold=w.hold.array,
       mj=coupling.mujoco_arrays(model, w.data, Bodies),
     )
     values |= {n: w.host[n] for n in ("force_ext", "vel", "dvel", "dvel_warm", "status")}
@@ -212,24 +187,20 @@ class Ties:
 
   def enter(self):
     """Adds to the solver's input, after a coupling has filled it."""
-    wp.launch(_enter, dim=(1, 1), inputs=[1, 0, self._tied], device="cpu")
-
-  def cross(self):
-    """Brings the springs to the device of the solve."""
-    there = self._w.body.state.hold
-    if there is not self._hold:
-      wp.copy(there, self._hold)
+    if self:
+      wp.launch(_enter, dim=(1, 1), inputs=[1, 0, self._tied], device="cpu")
 
   def act(self):
     """Lets the bodies feel what the ties have pulled."""
-    wp.launch(_act, dim=(1, 1), inputs=[1, 0, self._tied], device="cpu")
+    if self:
+      wp.launch(_act, dim=(1, 1), inputs=[1, 0, self._tied], device="cpu")
 
   def aim(self):
     """Finds where the points on other organs are."""
     start = 0
     for group in self.groups:
       stop = start + len(group.vert)
-      if group.other is not None:
+      if group.other is not None and group.pair is not None:
         at, vel = motion(group.other, group.pair)
         self._arrays["point"].numpy()[start:stop] = np.hstack([at + group.anchor, vel])
       start = stop

@@ -25,9 +25,9 @@ from .resident import Resident
 ROOM = 16
 
 
-def state_size(nvert: int, nslot: int, ngeom: int, ncreep: int = 0) -> int:
+def state_size(nvert: int, nslot: int, ngeom: int, ncreep: int = 0, nrest: int = 0) -> int:
   """Returns the length of the plugin state; ngeom is summed over the windows."""
-  sizes = {"nvert": nvert, "nslot": nslot, "ngeom": ngeom, "ncreep": ncreep}
+  sizes = {"nvert": nvert, "nslot": nslot, "ngeom": ngeom, "ncreep": ncreep, "nrest": nrest}
   return layout.size(WindowState, sizes)
 
 

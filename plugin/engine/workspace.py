@@ -30,9 +30,11 @@ from .bind import bind
 from .coupling import Phases
 from .creep import Creep
 from .declare import Declaration
+from .hold import Hold
 from .layout import FLAG, HEAD
 from .pierce import Watch
 from .resident import Resident
+from .rests import Rests
 from .ties import Ties
 from .turns import Turn
 
@@ -66,7 +68,9 @@ class Workspace:
     advance: recorded graph of the plugin state's step after that
     end: recorded graph that ends a step without such a response, and steps the plugin state
     place: recorded graph that puts the windows where the plugin state says, or None
+    hold: springs that hold nodes
     ties: what the organ is tied to
+    rests: what it rests on
     creep: its stress relaxation
     resident: keeper of a motion that stays on the device, or None
     stiff: whether the response is needed, see `inertia.stiffness`
@@ -117,7 +121,9 @@ class Workspace:
   end: Any = None
   advance: Any = None
   place: Any = None
+  hold: Hold = dataclasses.field(init=False)
   ties: Ties = dataclasses.field(init=False)
+  rests: Rests = dataclasses.field(init=False)
   creep: Creep = dataclasses.field(init=False)
   resident: Resident | None = None
   stiff: bool = False
@@ -150,7 +156,8 @@ class Workspace:
   phases: Phases | None = None
 
   def __post_init__(self):
-    self.ties, self.creep = Ties(self), Creep(self)
+    self.hold, self.ties = Hold(self), Ties(self)
+    self.creep, self.rests = Creep(self), Rests(self)
 
   def run(self):
     """Computes the step's forces and adds them to qfrc_passive."""
@@ -350,7 +357,9 @@ def state_size(model: int, instance: int) -> int:
     # Asked before MuJoCo has filled in the flexes: what `windowed` needs is at most this.
     inside = fill.MOST if mjstruct.config(model, instance, "elements").strip() == "solid" else 0
     most = (1 + inside) * m.nflexvert
-    return windowed.state_size(most, 0, m.ngeom * len(names), relaxes * most)
+    rests = bool(mjstruct.config(model, instance, "support").strip())
+    sizes = relaxes * most, rests * m.nflexvert
+    return windowed.state_size(most, 0, m.ngeom * len(names), *sizes)
   moving = len(declare.moving_bodies(m, instance))
   return nodal.state_size(3 * moving, relaxes * moving)
 

@@ -9,7 +9,7 @@
 // so that the step has f_new, which is its own, and exp(-h / tau) q - g f as a force besides. What
 // f_new was is known from the momentum that it gave, without another evaluation.
 #pragma once
-#include "formula.h"
+#include "bodies.h"
 
 namespace palpate {
 
@@ -38,11 +38,13 @@ PALPATE void end_creep(const Fields& f, Thread, int) {
   const double per_h = 1.0 / f.mj.timestep.data[0];
   for (int i = 0; i < f.ncreep; ++i) {
     const int node = f.node.data[i], at = offset_of(node);
-    D3 impulse = (double)f.mass.data[node] * load_lane(f.dvel.data + at);
-    if (f.flags.data[FLAG_ANSWERED])
-      impulse += (double)f.mass.data[node] * load_lane(f.sol.data + at)
-        - load_lane(f.rhs.data + at);
-    const D3 force = per_h * impulse - load_lane(f.force_ext.data + at), left = faded(f, i);
+    D3 dv = load_lane(f.dvel.data + at), besides = load_lane(f.force_ext.data + at);
+    if (f.flags.data[FLAG_ANSWERED]) {
+      dv += load_lane(f.sol.data + at);
+      besides += per_h * load_lane(f.rhs.data + at);
+    }
+    if (f.held) besides = besides - per_h * (load_hold(hold_at(f.hold.data, node)) * dv);
+    const D3 force = (per_h * f.mass.data[node]) * dv - besides, left = faded(f, i);
     double* own = f.own.data + 6 * i;
     store(own, force);
     store(own + 3, left + f.number.data[0] * force);

@@ -353,15 +353,13 @@ PALPATE V3 bending(const Fan& fan, const float* normal, const float* corner, V3 
   return b;
 }
 
-// Springs that hold nodes: `force_ext` has their force on nodes that stand where the step begins.
-// Takes off what the way ahead changes of it and K v; returns what they add to the diagonal.
+// What springs that hold nodes add to the diagonal block; in `b` they have it for what later
+// iterations have changed already.
 template <class Fields>
-PALPATE V hold(const Fields& f, Thread t, int stage, size_t at, V3 ahead, V3 v, V3& b, Lane lane) {
-  const float* step = f.state.step.data + 4 * t.world;
-  const V k = ld(f.state.hold.data + 8 * at, 0, lane);
-  ahead -= ld3(f.state.disp.data + 24 * at, lane);
-  b -= k * (step[0] * ahead + weight_of_rate(stage, step) * v);
-  return step[1] * k;
+PALPATE S3 hold(const Fields& f, int stage, size_t at, V3& b, Lane lane) {
+  const S3 weight = ld6(f.state.hold.data + 48 * at, lane);
+  if (stage == LATER) b -= weight * ld3(f.state.dvel.data + 24 * at, lane);
+  return weight;
 }
 
 // Writes what is on the diagonal of slice s, at place `at` of all worlds, and the inverse of `self`,
@@ -401,13 +399,12 @@ PALPATE void row(const Fields& f, Thread t, int stage) {
     const Motion m = {disp, vel, ld3(disp + 24 * s, lane), ld3(vel + 24 * s, lane)};
     Sum sum = around(fan, m, want, lane);
     const V mass = ld(f.state.mass.data + 8 * at, 0, lane);
-    const V kf = splat(foundation) * ld(f.shape.area.data, s, lane);
-    V diag = mass + g * kf;
+    const V kf = splat(foundation) * ld(f.shape.area.data, s, lane), diag = mass + g * kf;
     V3 b = h * (sum.force + ld3(f.state.force_ext.data + 24 * at, lane) - kf * m.u)
       + gv * (sum.rate - kf * m.v);
-    if (f.state.hold.data) diag += hold(f, t, stage, at, m.u, m.v, b, lane);
     if (stage == LATER) b -= mass * ld3(f.state.dvel.data + 24 * at, lane);
     S3 self = splat(g) * sum.stiffness + diag;
+    if (f.state.hold.data) self = self + hold(f, stage, at, b, lane);
     if (areas) st3(f.system.areavec.data + 24 * at, sum.area, lane);
     if (bends) {
       b = bending(fan, normal, corner, b, lane);

@@ -5,10 +5,10 @@
 //
 //   F = k (p + (h + damping) p' - x - (h + damping) (v + dv))
 //
-// `force_ext` has what of it does not hang on v + dv, `hold` is k. What the step made of F acts on
-// the body the other way, so that momentum is kept.
+// `force_ext` has what of it does not hang on dv, `hold` the rest. What the step made of F acts on the
+// body the other way, so that momentum is kept.
 #pragma once
-#include "formula.h"
+#include "bodies.h"
 
 namespace palpate {
 
@@ -16,14 +16,6 @@ namespace palpate {
 constexpr int TO_POINT = -1, TO_OWN_MOTION = -2;
 
 struct Rigid { double R[9]; D3 middle, rest, vel, spin; };
-
-PALPATE D3 cross(D3 a, D3 b) {
-  return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
-}
-PALPATE D3 turned(const double* R, D3 x) {
-  return {R[0] * x.x + R[1] * x.y + R[2] * x.z, R[3] * x.x + R[4] * x.y + R[5] * x.z,
-          R[6] * x.x + R[7] * x.y + R[8] * x.z};
-}
 
 // Cofactors of a matrix row by row; returns its determinant.
 PALPATE double cofactors(const double* a, double* c) {
@@ -117,22 +109,12 @@ PALPATE Rigid own_motion(const Fields& f) {
   return out;
 }
 
-// A velocity about the centre of mass of a body's tree: of turning, and of the centre.
-struct Twist { D3 spin, vel; };
-
-// The velocity of a body, and where `leads` says so what its last acceleration adds in the step.
+// What the spring of a tie weighs on the change of its node's velocity [kg]; twice where another organ
+// is at the other end, whose step does not know of this one's.
 template <class Fields>
-PALPATE Twist twist(const Fields& f, int b, bool leads) {
-  const auto& mj = f.mj;
-  Twist out = {load(mj.cvel.data + 6 * b), load(mj.cvel.data + 6 * b + 3)};
-  for (; leads && b > 0; b = mj.body_parentid.data[b])
-    for (int d = 0; d < mj.body_dofnum.data[b]; ++d) {
-      const int dof = mj.body_dofadr.data[b] + d;
-      const double dv = mj.timestep.data[0] * mj.qacc_warmstart.data[dof];
-      out.spin += dv * load(mj.cdof.data + 6 * dof);
-      out.vel += dv * load(mj.cdof.data + 6 * dof + 3);
-    }
-  return out;
+PALPATE double weight_of(const Fields& f, int n) {
+  const double h = f.mj.timestep.data[0], twice = f.body.data[n] == TO_POINT ? 2.0 : 1.0;
+  return twice * f.stiffness.data[n] * f.gain * h * (h + f.number.data[DAMPING]);
 }
 
 // Where the point of a tie to a body is in the world, and from the centre of mass of its tree.
@@ -141,10 +123,6 @@ PALPATE D3 point_of_body(const Fields& f, int n) {
   const int b = f.body.data[n];
   return load(f.mj.xpos.data + 3 * b)
     + turned(f.mj.xmat.data + 9 * b, load(f.anchor.data + 3 * n));
-}
-template <class Fields>
-PALPATE D3 arm_of(const Fields& f, int b, D3 point) {
-  return point - load(f.mj.subtree_com.data + 3 * f.mj.body_rootid.data[b]);
 }
 
 // Adds to the solver's input what pulls at the tied nodes.
@@ -155,7 +133,6 @@ PALPATE void enter_ties(const Fields& f, Thread, int) {
   const D3 zero = {0.0, 0.0, 0.0};
   const Rigid own = f.owned.data[0] ? own_motion(f) : Rigid{};
   if (f.windowed && f.restless.data[0]) f.tail.data[TAIL_QUIET] = 0.0;
-  for (int n = 0; n < count; ++n) f.hold.data[f.node.data[f.vert.data[n]]] = 0.0f;
   Twist moving = {zero, zero};
   for (int n = 0; n < count; ++n) {
     const int i = f.vert.data[n], node = f.node.data[i];
@@ -164,9 +141,9 @@ PALPATE void enter_ties(const Fields& f, Thread, int) {
     D3 to = load(f.point.data + 6 * n), vel = load(f.point.data + 6 * n + 3);
     const int b = f.body.data[n];
     if (b >= 0) {
-      if (n == 0 || b != f.body.data[n - 1]) moving = twist(f, b, f.leads.data[n]);
+      if (n == 0 || b != f.body.data[n - 1]) moving = twist(f.mj, b, f.leads.data[n]);
       to = point_of_body(f, n);
-      vel = moving.vel + cross(moving.spin, arm_of(f, b, to));
+      vel = moving.vel + cross(moving.spin, arm_of(f.mj, b, to));
     }
     if (b == TO_OWN_MOTION) {
       const D3 arm = turned(own.R, rest - own.rest);
@@ -176,49 +153,34 @@ PALPATE void enter_ties(const Fields& f, Thread, int) {
       to = add_turned(zero, f.frame.data, to - load(f.origin.data));
       vel = add_turned(zero, f.frame.data, vel);
     }
+    vel = vel - load_lane(f.vel.data + offset_of(node));
     const D3 F = k * (to - rest - moved_by(f, i) + reach * vel);
+    const double weight = weight_of(f, n);
     store(f.force.data + 3 * n, F);
-    f.hold.data[node] += (float)k;
-    float* ext = f.force_ext.data + offset_of(node);
-    store_lane(ext, load_lane(ext) + F);
+    push_node(f, node, F, {weight, 0.0, 0.0, weight, 0.0, weight});
   }
 }
 
-// Adds a force at a point of a body, both in the world, to the passive forces.
-template <class Fields>
-PALPATE void push_body(const Fields& f, int b, D3 force, D3 torque) {
-  const auto& mj = f.mj;
-  for (; b > 0; b = mj.body_parentid.data[b])
-    for (int d = 0; d < mj.body_dofnum.data[b]; ++d) {
-      const int dof = mj.body_dofadr.data[b] + d;
-      const double* axis = mj.cdof.data + 6 * dof;
-      mj.qfrc_passive.data[dof] += dot(load(axis), torque) + dot(load(axis + 3), force);
-    }
-}
-
-// Ends the forces of the ties with what the step makes of the nodes' velocities, also in the
-// solver's input, and lets the bodies feel them.
+// Ends the forces of the ties with what the step makes of the nodes' velocities, and lets the bodies
+// feel them.
 template <class Fields>
 PALPATE void act_ties(const Fields& f, Thread, int) {
   const auto& mj = f.mj;
   const bool ok = f.status.data[3] == 0.0f;
-  const double h = mj.timestep.data[0], damping = f.number.data[DAMPING];
+  const double h = mj.timestep.data[0];
   const D3 zero = {0.0, 0.0, 0.0};
   D3 force = zero, torque = zero;
   for (int n = 0; n < f.count.data[0]; ++n) {
     const int at = offset_of(f.node.data[f.vert.data[n]]), b = f.body.data[n];
-    const D3 v = load_lane(f.vel.data + at), dv = load_lane(f.dvel.data + at);
-    const double on_v = f.ahead * h + damping, on_dv = f.gain * (h + damping);
-    const D3 back = f.stiffness.data[n] * (on_v * v + on_dv * dv);
+    const D3 back = (weight_of(f, n) / h) * load_lane(f.dvel.data + at);
     const D3 F = ok ? load(f.force.data + 3 * n) - back : zero;
     store(f.force.data + 3 * n, F);
-    store_lane(f.force_ext.data + at, load_lane(f.force_ext.data + at) - back);
     if (b < 0) continue;
     const D3 push = zero - turned(f.frame.data, F);
     force += push;
-    torque += cross(arm_of(f, b, point_of_body(f, n)), push);
+    torque += cross(arm_of(mj, b, point_of_body(f, n)), push);
     if (n + 1 < f.count.data[0] && f.body.data[n + 1] == b) continue;
-    push_body(f, b, force, torque);
+    push_body(mj, b, force, torque);
     force = torque = zero;
   }
 }

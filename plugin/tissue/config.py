@@ -118,6 +118,11 @@ def _names(text: str, nelem: int) -> tuple[str, ...]:
   return tuple(text.split())
 
 
+def _name(text: str, nelem: int) -> str:
+  (name,) = text.split()
+  return name
+
+
 def _groups(text: str, nelem: int) -> tuple[tuple[str, ...], ...]:
   return tuple(tuple(group.split()) for group in text.split(","))
 
@@ -189,8 +194,7 @@ class Config:
   relax_share: float = _row(
     0.0,
     _number(0.0, 1.0),
-    "share of the elastic forces that fades while a strain is held; `young` and the others are "
-    "those at once",
+    "share of the elastic forces that fades while a strain is held; `young` is that at once",
     "-",
     NUMBER,
   )
@@ -227,7 +231,7 @@ class Config:
   )
   carrier: str = _row(
     "",
-    (lambda text, nelem: text, "the name of a body, or `own`"),
+    (_name, "the name of a body, or 'own'"),
     "body that carries foundation and pins along ([attachments](authoring.md#attachments)); `own`: "
     "the foundation goes with the organ's own rigid motion",
   )
@@ -237,6 +241,12 @@ class Config:
     "springs from vertices to a body, or to the nearest vertices of another organ: "
     "`rib 500 3 17 18, stomach 200 40 41`; the stiffness is that of a group",
     "-, N/m, -",
+  )
+  support: tuple[str, ...] = _row(
+    (),
+    (_names, "names of geoms and organs"),
+    "with `window` alone: geoms and organs that bear the organ, with friction, by springs of its "
+    "surface in place of MuJoCo's contacts ([lying](authoring.md#lying-on-something))",
   )
   resident: bool = _row(
     False,
@@ -369,7 +379,7 @@ def _check_combination(organ: str, config: Config, given: dict, closed: bool):
     raise ValueError(
       f"organ {organ!r}: stiffness is {config.stiffness:g}, allowed only with elements='spring'"
     )
-  for key in ("follow", "mass", "pin", "resident"):
+  for key in ("follow", "mass", "pin", "resident", "support"):
     if key in given and not config.window:
       raise ValueError(f"organ {organ!r}: {key} is set, allowed only with window")
   if config.elements == "solid":
@@ -400,7 +410,7 @@ def _check_solid(organ: str, config: Config, given: dict):
 
 
 def _check_ties(organ: str, config: Config):
-  for key in ("carrier", "attach", "relax_share"):
+  for key in ("carrier", "attach", "relax_share", "support"):
     if getattr(config, key) and config.resident:
       raise ValueError(f"organ {organ!r}: {key} is set, allowed only without resident")
     if getattr(config, key) and not SCHEMES[config.integrator].solids:

@@ -130,6 +130,7 @@ def counts(values: dict[str, Any]) -> dict[str, int]:
     "nelemslice": len(values["elem_node"]),
     "nhingeslice": len(values["hinge_node"]),
     "ntetslice": len(values["tet_node"]),
+    "nedgeslice": len(values["edge_slot"]),
     "nslot": int(values["slot_adr"][-1]),
   }
 

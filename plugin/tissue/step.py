@@ -80,6 +80,7 @@ _row = _elastic("row")
 _tet_strain = _solid("tet_strain")
 _node_pressure = _solid("node_pressure")
 _tet_stress = _solid("tet_stress")
+_edge_block = _solid("edge_block")
 _solid_row = _solid("solid_row")
 _edge_change = _scheme("edge_change")
 _predict = _scheme("predict")
@@ -146,6 +147,8 @@ def assemble(body: Body, stage: Stage):
     _over(_tet_strain, body, shape.ntetslice, stage)
     _over(_node_pressure, body, shape.nslice)
     _over(_tet_stress, body, shape.ntetslice, stage)
+    if stage in (Stage.FIRST, Stage.LATER):
+      _over(_edge_block, body, shape.nedgeslice)
     _over(_solid_row, body, shape.nslice, stage)
     return
   if body.has_bending:

@@ -171,7 +171,7 @@ def test_a_carried_organ_turns_with_its_carrier(make):
 def test_a_foundation_of_its_own_motion_lets_an_organ_fall_and_turn(make, scenes):
   model, data, organ = make("", gravity=(0, 0, -9.81), foundation=1e4, carrier="own")
   spin = np.array([1.0, 2.0, 3.0])
-  organ.set_state(xvel=np.cross(spin, organ.xpos0) + [0.1, 0, 0])
+  organ.set_state(xvel=np.cross(spin, organ.xpos0) + np.array([0.1, 0, 0]))
   for _ in range(200):
     mujoco.mj_step(model, data)
   mass = _masses(organ, scenes)[:, None]

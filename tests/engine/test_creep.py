@@ -95,7 +95,7 @@ def test_numbers_of_relaxation_may_change_while_running(scenes):
   fast = _pull(model, data, grip, 0.2)[-1]
   model, data, organ, grip = _bar(scenes, "window")
   assert fast < 0.8 * _pull(model, data, grip, 0.2)[-1]
-  with pytest.raises(ValueError, match="relax_share is 0, compiled as 0.6"):
+  with pytest.raises(ValueError, match=r"relax_share is 0, compiled as 0\.6"):
     organ.configure(relax_share=0)
 
 
