@@ -55,7 +55,7 @@ class Test:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Sample:
+class Sample:
   """What is pressed.
 
   Attributes:
@@ -89,19 +89,19 @@ class Indentation:
     contact = _contact_radius(test, deepest)
     edge, around = test.edge or contact / _EDGES[test.tip], _AROUND * contact
     if test.organ:
-      self._sample = _of_catalogue(test, edge, around)
+      self.sample = _of_catalogue(test, edge, around)
     else:
-      self._sample = _block(test, edge, around, deepest)
+      self.sample = _block(test, edge, around, deepest)
 
   @property
   def nodes(self) -> int:
     """Vertices of the tissue's surface."""
-    return len(self._sample.mesh[0])
+    return len(self.sample.mesh[0])
 
   @property
   def keys(self) -> dict:
     """The tissue's configuration before any constant is changed."""
-    return self._sample.keys
+    return self.sample.keys
 
   def force(self, constants: Mapping[str, float]) -> np.ndarray:
     """Returns the tissue's push on the tool at the record's times [N], (n,)."""
@@ -130,7 +130,7 @@ class Indentation:
     return np.interp(record.time, time[1:], force)
 
   def _scene(self, constants: Mapping[str, float]) -> mujoco.MjSpec:
-    test, sample = self._test, self._sample
+    test, sample = self._test, self.sample
     spec = mujoco.MjSpec()
     spec.option.timestep = self.step
     spec.option.gravity = np.zeros(3)
@@ -187,7 +187,7 @@ def _facing(away: np.ndarray) -> np.ndarray:
   return quat
 
 
-def _block(test: Test, edge: float, around: float, deepest: float) -> _Sample:
+def _block(test: Test, edge: float, around: float, deepest: float) -> Sample:
   """Returns a block that stands on a table."""
   assert test.size is not None
   if deepest > _SUNK * test.size[2]:
@@ -200,10 +200,10 @@ def _block(test: Test, edge: float, around: float, deepest: float) -> _Sample:
   pin = np.flatnonzero(points[:, 2] < -test.size[2] / 2 + 1e-9)
   at, away = np.array([0, 0, test.size[2] / 2]), np.array([0.0, 0, 1])
   mass = catalog.TISSUES["liver"].mass_of(math.prod(test.size))
-  return _Sample((points, elem), pin, at, away, mass, {"elements": "solid"})
+  return Sample((points, elem), pin, at, away, mass, {"elements": "solid"})
 
 
-def _of_catalogue(test: Test, edge: float, around: float) -> _Sample:
+def _of_catalogue(test: Test, edge: float, around: float) -> Sample:
   """Returns an organ of the catalogue, solid where it is not hollow."""
   built = organs.build(test.organ, _NODES)
   at = built.landmarks[test.place]
@@ -217,4 +217,4 @@ def _of_catalogue(test: Test, edge: float, around: float) -> _Sample:
   at = at + float(((points - at) @ away)[np.linalg.norm(points - at, axis=1) < around].max()) * away
   solid = not built.entry.hollow
   keys = built.entry.tissue.keys(solid) | ({"elements": "solid"} if solid else {})
-  return _Sample((points, elem), pin, at, away, built.mass, keys)
+  return Sample((points, elem), pin, at, away, built.mass, keys)
