@@ -121,7 +121,7 @@ def _row(kind: str, what: str, ours: float, reference: float, unit: str, **more)
   return blank | row | {"error": error} | more
 
 
-def _held(test, depths) -> tuple[np.ndarray, int]:
+def held(test, depths) -> tuple[np.ndarray, int]:
   """Returns the force of a test held at these depths [N], (ndepth,), and its nodes."""
   from palpate.app.indentation import Indentation
   from palpate.app.measured import Record
@@ -142,7 +142,7 @@ def _press(edges: float) -> list[Row]:
   from reference import elements
 
   edge = math.sqrt(RADIUS * DEPTHS[1]) / edges
-  ours, nodes = _held(Test("sphere", RADIUS, SIZE, edge=edge, step=0.002), DEPTHS)
+  ours, nodes = held(Test("sphere", RADIUS, SIZE, edge=edge, step=0.002), DEPTHS)
   width = math.sqrt(SIZE[0] * SIZE[1] / math.pi)  # of a round block of the same area
   exact = elements.layer(SIZE[2], width, RADIUS, DEPTHS, YOUNG, POISSON, 2.5e-4)
   rows = []
