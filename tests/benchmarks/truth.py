@@ -57,11 +57,10 @@ PUBLISHED = (
 )  # fmt: skip
 
 
-def arguments(parser: argparse.ArgumentParser):
-  """Declares nothing of its own, but wants the other library."""
+def begin(args: argparse.Namespace):
+  """Raises BenchError where the other library is missing."""
   if importlib.util.find_spec("skfem") is None:
     raise BenchError("scikit-fem is not installed: pip install 'palpate[bench]'", code=1)
-  return parser
 
 
 def stages(args: argparse.Namespace) -> list[list[Case]]:
@@ -239,4 +238,4 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
   return [results.page(out / "truth.md", title, about, lines)]
 
 
-BENCH = Bench("truth", stages, run, columns=_COLUMNS, report=report, arguments=arguments)
+BENCH = Bench("truth", stages, run, columns=_COLUMNS, report=report, begin=begin)
