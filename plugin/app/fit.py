@@ -56,13 +56,17 @@ def main(args: argparse.Namespace) -> int:
   from . import fitting, indentation
 
   test = _test(args)
-  known = {"poisson": Config.poisson, "damping": Config.damping} | _known(args)
-  starts = {"young": indentation.first_guess(test, record, known["poisson"])} | known
-  free = [fitting.constant(name, starts.get(name)) for name in dict.fromkeys(args.free)]
+  known = _known(args)
   progress = Progress()
   progress.show("filling the tissue; the first time takes some seconds more", always=True)
-  start = starts | {each.name: each.start for each in free}
   simulation = indentation.Indentation(test, record)
+  starts = {"poisson": Config.poisson, "damping": Config.damping}
+  starts |= {key: value for key, value in simulation.keys.items() if isinstance(value, float)}
+  starts |= known
+  if "young" not in known:
+    starts["young"] = indentation.first_guess(test, record, starts["poisson"])
+  free = [fitting.constant(name, starts.get(name)) for name in dict.fromkeys(args.free)]
+  start = starts | {each.name: each.start for each in free}
 
   with Interrupt() as interrupt:
 

@@ -15,8 +15,8 @@ from scipy import optimize, stats
 from .console import CommandError
 
 _STEP = 0.02  # of the Jacobian, in the scaled constants: forces are in single precision
-_CLOSE = 1e-3  # relative change of a constant, or of its square of the residual, that is none
-_MOST = 60  # simulations for each constant
+_CLOSE = 1e-3  # relative change of a constant that is none
+_MOST = 60  # steps of the search
 _ALIKE = 0.98  # correlation from which two constants are not told apart
 _SOLVER = ("tolerance",)  # of the solve, not of the tissue
 
@@ -136,7 +136,8 @@ def fit(
     force = simulate(values)
     error = float(np.sqrt(np.mean((force - measured) ** 2)))
     seen.append((error, values, force))
-    tell(*min(seen, key=lambda one: one[0])[1::-1], len(seen))
+    best = min(seen, key=lambda one: one[0])
+    tell(best[1], best[0], len(seen))
     return (force - measured) / size
 
   def slopes(x: np.ndarray) -> np.ndarray:
@@ -148,23 +149,28 @@ def fit(
   whole = True
   try:
     optimize.least_squares(
-      lambda x: at(x.tobytes()), start, jac=slopes, xtol=_CLOSE, ftol=_CLOSE**2, gtol=1e-12,
+      lambda x: at(x.tobytes()),
+      start,
+      jac=slopes,  # pyright: ignore[reportArgumentType] - of stubs that are too narrow
+      xtol=_CLOSE,
+      ftol=_CLOSE**2,
+      gtol=1e-12,
       max_nfev=_MOST,
-    )  # fmt: skip
+    )
   except Stopped:
     whole = False
   if not seen:
     raise CommandError("it was stopped before the first simulation had ended", code=130)
   error, values, force = min(seen, key=lambda one: one[0])
   spread, alike = _spread(free, jacobian, error / size, level)
-  low, high = (
-    {
-      c.name: c.value(c.scaled(values[c.name]) + sign * s) if math.isfinite(s) else math.nan
-      for c, s in zip(free, spread, strict=True)
-    }
-    for sign in (-1, 1)
-  )
+  low, high = (_moved(free, values, sign * spread) for sign in (-1, 1))
   return Fit(values, low, high, force, error, len(seen), whole, alike)
+
+
+def _moved(free: list[Constant], values: dict[str, float], by: np.ndarray) -> dict[str, float]:
+  """Returns the constants moved by scaled amounts, nan where those are."""
+  moves = zip(free, by, strict=True)
+  return {c.name: c.value(c.scaled(values[c.name]) + s) if s == s else s for c, s in moves}
 
 
 def _spread(free: list[Constant], jacobian: list[np.ndarray], error: float, level: float):

@@ -60,3 +60,21 @@ def test_tetrahedra_are_small_where_triangles_are(finer):
 def test_what_is_not_allowed_is_named(block, bad, match):
   with pytest.raises(ValueError, match=match):
     refine.refine(*block, **({"at": AT, "radius": RADIUS, "edge": EDGE} | bad))
+
+
+def test_a_shipped_organ_is_finer_where_the_instruments_point():
+  import mujoco
+  from palpate import Organ, models
+
+  spec = models.load("kidney", coupling="window", interior="solid", fine=0.002)
+  model = spec.compile()
+  data = mujoco.MjData(model)
+  organ = Organ(model, data, "kidney/kidney")
+  mujoco.mj_forward(model, data)
+  assert 1000 < organ.nvert < 2000
+  for place in ("anterior", "lower_pole"):
+    at = data.site(f"kidney/kidney_{place}").xpos
+    near = np.linalg.norm(organ.xpos[organ.elem].mean(axis=1) - at, axis=1) < 0.004
+    assert lengths(organ.xpos, organ.elem)[near].max() < 0.00201
+  mujoco.mj_step(model, data)
+  assert organ.error is None
