@@ -6,9 +6,11 @@ as an edge. So what a small tool meets has to be finer than the rest.
 
 import numpy as np
 
+from .quality import normals
 from .remesh import Edges
 
 _WIDENS = 0.4  # by which edges grow with the distance from the region
+_ASIDE = 0.04  # from the middle of a halved edge: of vertices on one circle Delaunay says nothing
 _ROUNDS = 60
 _MOST = 200_000  # vertices
 
@@ -19,7 +21,8 @@ def refine(
   """Returns the same surface with edges of at most `edge` around a place, longer ones farther away.
 
   Triangles are halved at their longest edges (Rivara 1984, doi:10.1002/nme.1620200412): none gets
-  less than half the angles it had. Old vertices keep their numbers, new ones follow.
+  much less than half the angles it had. Where they lie in one plane they are then made Delaunay's.
+  Old vertices keep their numbers, new ones follow.
 
   Args:
     vertices: of a closed surface [m]                 (n, 3)
@@ -44,7 +47,7 @@ def refine(
     if len(vertices) > _MOST:
       break
     if not split.size:
-      return vertices, triangles
+      return vertices, _flipped(vertices, triangles)
     vertices, triangles = _halve(vertices, triangles, edges, split)
   raise ValueError(f"edge is {edge:g} m, expected more: {len(vertices)} vertices were not enough")
 
@@ -79,9 +82,40 @@ def _halve(vertices, triangles, edges: Edges, split: np.ndarray):
   """Returns the mesh with these edges halved, no two of which share a triangle."""
   (a, b), wing = edges.vert[split].T, edges.wing[split]
   new = len(vertices) + np.arange(len(split))
-  vertices = np.concatenate([vertices, (vertices[a] + vertices[b]) / 2])
+  share = 0.5 + _ASIDE * np.random.RandomState(len(vertices)).uniform(-1, 1, (len(split), 1))
+  vertices = np.concatenate([vertices, (1 - share) * vertices[a] + share * vertices[b]])
   keep = np.ones(len(triangles), bool)
   keep[edges.tri[split]] = False
   c, d = wing.T  # triangles (a, b, c) and (b, a, d)
   halves = [np.stack(t, 1) for t in ((a, new, c), (new, b, c), (b, new, d), (new, a, d))]
   return vertices, np.concatenate([triangles[keep], *halves])
+
+
+def _flipped(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+  """Returns the triangles, those in one plane Delaunay's (Lawson 1977): tetrahedra want it so."""
+  triangles = triangles.copy()
+  for _ in range(_ROUNDS):
+    edges = Edges(triangles, len(vertices))
+    (a, b), (c, d) = edges.vert.T, edges.wing.T
+    opposite = sum(_angle(vertices[a], vertices[apex], vertices[b]) for apex in (c, d))
+    one, two = normals(vertices, triangles)[edges.tri].transpose(1, 0, 2)
+    cosine = (one * two).sum(axis=1)
+    flat = cosine > (1 - 1e-9) * np.linalg.norm(one, axis=1) * np.linalg.norm(two, axis=1)
+    pick = np.flatnonzero(flat & (opposite > np.pi + 1e-6) & ~edges.has(c, d))
+    worst = np.full(len(triangles), -1.0)
+    np.maximum.at(worst, edges.tri[pick], opposite[pick, None])
+    pick = pick[(worst[edges.tri[pick]] == opposite[pick, None]).all(axis=1)]
+    _, first = np.unique(edges.tri[pick].min(axis=1), return_index=True)
+    pick = pick[first]
+    if not len(pick):
+      break
+    # Before: (a, b, c), (b, a, d).
+    triangles[edges.tri[pick, 0]] = np.stack([a[pick], d[pick], c[pick]], axis=1)
+    triangles[edges.tri[pick, 1]] = np.stack([d[pick], b[pick], c[pick]], axis=1)
+  return triangles
+
+
+def _angle(a: np.ndarray, apex: np.ndarray, b: np.ndarray) -> np.ndarray:
+  """Returns the angles at the apexes [rad], (n,)."""
+  u, v = a - apex, b - apex
+  return np.arctan2(np.linalg.norm(np.cross(u, v), axis=1), (u * v).sum(axis=1))
