@@ -12,6 +12,8 @@ from palpate import add_organ
 from palpate.models import block, catalog, organs, shapes
 from palpate.models.refine import refine
 from palpate.organ import Organ
+from palpate.tissue import fill
+from palpate.tissue import mesh as topology
 
 from .console import CommandError
 from .measured import Record
@@ -27,6 +29,7 @@ _WINDOW = 500  # vertices
 _SOFT = 0.02  # share of the radius of the tool that the organ's flex has
 _SUNK = 0.8  # of a block's height, that a tool may go
 _FOLLOW = 0.1  # of a change of that depth in a step, which contacts take three steps for
+_TRIES, _SMALLER = 6, 0.93  # of edges, where tetrahedra do not fill a mesh
 _HEAVY = 1e4  # times the organ's mass, so that contacts do not move the tool
 
 
@@ -88,10 +91,16 @@ class Indentation:
     deepest = float(record.depth.max())
     contact = _contact_radius(test, deepest)
     edge, around = test.edge or contact / _EDGES[test.tip], _AROUND * contact
-    if test.organ:
-      self.sample = _of_catalogue(test, edge, around)
-    else:
-      self.sample = _block(test, edge, around, deepest)
+    for _ in range(_TRIES):
+      if test.organ:
+        self.sample = _of_catalogue(test, edge, around)
+      else:
+        self.sample = _block(test, edge, around, deepest)
+      fault = _fault(self.sample)
+      if not fault:
+        return
+      edge *= _SMALLER
+    raise CommandError(f"{fault}; another --edge may do", code=1)
 
   @property
   def nodes(self) -> int:
@@ -147,6 +156,17 @@ class Indentation:
       windows={"nodes": min(_WINDOW, self.nodes)}, device="cpu", **sample.keys | dict(constants),
     )  # fmt: skip
     return spec
+
+
+def _fault(sample: Sample) -> str:
+  """Returns why tetrahedra cannot fill a sample, if they cannot."""
+  if sample.keys.get("elements") != "solid":
+    return ""
+  try:
+    fill.fill("tissue", topology.build("tissue", *sample.mesh))
+  except ValueError as error:
+    return str(error)
+  return ""
 
 
 def first_guess(test: Test, record: Record, poisson: float) -> float:

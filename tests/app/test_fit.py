@@ -103,10 +103,10 @@ def test_any_number_of_the_tissue_may_be_sought():
 def test_force_grows_with_depth_as_the_theory_of_the_tip_says(tip, power):
   time = np.linspace(0, 0.4, 60)
   way = measured.Record(time, 0.0015 * time / 0.4, np.ones_like(time))
-  test = indentation.Test(tip, 0.005, BLOCK, edge=0.003, step=0.002)
+  test = indentation.Test(tip, 0.005, BLOCK, edge=0.002, step=0.002)
   force = indentation.Indentation(test, way).force(TRUE | {"damping": 0.005})
   half, whole = (np.interp(t, time, force) for t in (0.15, 0.3))
-  assert np.log2(whole / half) == pytest.approx(power, abs=0.2)
+  assert np.log2(whole / half) == pytest.approx(power, abs=0.25)
   guess = indentation.first_guess(test, measured.Record(time, way.depth, force), 0.45)
   assert 0.9 < guess / TRUE["young"] < 2.5  # a block is stiffer than a half space
 
