@@ -97,7 +97,8 @@ def _flipped(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
   for _ in range(_ROUNDS):
     edges = Edges(triangles, len(vertices))
     (a, b), (c, d) = edges.vert.T, edges.wing.T
-    opposite = sum(_angle(vertices[a], vertices[apex], vertices[b]) for apex in (c, d))
+    ends = vertices[a], vertices[b]
+    opposite = _angle(*ends, vertices[c]) + _angle(*ends, vertices[d])
     one, two = normals(vertices, triangles)[edges.tri].transpose(1, 0, 2)
     cosine = (one * two).sum(axis=1)
     flat = cosine > (1 - 1e-9) * np.linalg.norm(one, axis=1) * np.linalg.norm(two, axis=1)
@@ -115,7 +116,7 @@ def _flipped(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
   return triangles
 
 
-def _angle(a: np.ndarray, apex: np.ndarray, b: np.ndarray) -> np.ndarray:
+def _angle(a: np.ndarray, b: np.ndarray, apex: np.ndarray) -> np.ndarray:
   """Returns the angles at the apexes [rad], (n,)."""
   u, v = a - apex, b - apex
   return np.arctan2(np.linalg.norm(np.cross(u, v), axis=1), (u * v).sum(axis=1))
