@@ -121,7 +121,8 @@ def _cross(w, fields: tuple[str, ...], to_device: bool):
 
 def load(body: Body):
   """Loads the modules of a step on a body's device, compiling them where the cache has none."""
-  for module in (*step.modules(body), nodes.MODULE):
-    wp.load_module(module, device=body.device)
-  for module in (*step.modules(body), nodes.MODULE, nodal.MODULE, slots.MODULE, weights.MODULE):
-    wp.load_module(module, device="cpu")
+  there = [*step.kernels(body), nodes.commit]
+  for kernel in there:
+    kernel.load(body.device)
+  for kernel in (*there, nodal.gather, slots.gather, weights.weigh):
+    kernel.load(wp.get_device("cpu"))

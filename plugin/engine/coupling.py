@@ -17,7 +17,7 @@ import numpy as np
 import warp as wp
 from palpate.tissue import types
 from palpate.tissue.body import Body
-from palpate.tissue.kernels import kernel
+from palpate.tissue.kernels import Kernel, kernel
 from palpate.tissue.types import DIMS, doubles, floats, ints, scalar, struct, vector
 
 from . import layout, mjstruct
@@ -136,7 +136,7 @@ CONSTANTS = {
 }  # fmt: skip
 
 
-def kernels(header: str, kind, *names: str) -> list[wp.Kernel]:
+def kernels(header: str, kind, *names: str) -> list[Kernel]:
   """Returns the kernels of a header that take a struct."""
   return [kernel(name, header, kind, CONSTANTS) for name in names]
 
