@@ -438,5 +438,7 @@ def refresh(w: Workspace):
       prepare.give_armature(m, w.organ, w.body, w.config)
     else:
       windowed.set_inertia(w, m)
+      if w.turn is not None and w.turn.mine:
+        place(w, w.model)
     _feel(w, m)
     w.time_step = float(m.opt.timestep)
