@@ -173,7 +173,7 @@ def _advance(model: int, data: int, instance: int):
       _miss(w, int(nodes), int(triangles))
     if w.model_step[0] != w.time_step:
       workspace.refresh(w)
-    if w.watch.due() and not (w.asleep or w.resident):
+    if w.watch.due():
       _watch(w)
   except BaseException as error:
     _fail(w, error)
@@ -235,8 +235,8 @@ def _note(w: Workspace, text: str):
 
 def _watch(w: Workspace):
   """Warns of tools that have come through the surface."""
-  m = mjstruct.Model.from_address(w.model)
   for geom in w.watch.look(w):
+    m = mjstruct.Model.from_address(w.model)
     name = mjstruct.name_of(m, m.name_geomadr, geom) or geom
     warn(
       f"organ {w.organ.name!r}: geom {name!r} has gone through its surface, where contacts do not "
