@@ -29,7 +29,7 @@ from . import (
 from .bind import bind
 from .coupling import Phases
 from .declare import Declaration
-from .layout import FLAG, HEAD
+from .layout import FLAG, HEAD, STAGE
 from .pierce import Watch
 from .resident import Resident
 from .turns import Turn
@@ -144,7 +144,11 @@ class Workspace:
   phases: Phases | None = None
 
   def run(self):
-    """Computes the step's forces and adds them to qfrc_passive."""
+    """Computes the step's forces and adds them to qfrc_passive.
+
+    As `step` it may be called again where a signal's handler ended it: `FLAG.stage` says how far it
+    came. Not where the motion is on a device, which may be a step ahead.
+    """
     self._check_model()
     self.strange = self.signature[0] != self.organ.signature
     if self.strange:
@@ -157,12 +161,16 @@ class Workspace:
         self._run()
 
   def _run(self):
+    if self.flags[FLAG.stage] == STAGE.pushed:
+      self.computed = True
+      return
     if self.turn is not None:
       # The model's windows may not be those of this state, which was set from outside or shares the
       # model with another: contacts must be found again with the windows in place.
       if self._is_astray() or not self.turn.mine:
         self._find_contacts_again()
-    wp.capture_launch(self.before)
+    if self.flags[FLAG.stage] < STAGE.gathered:
+      wp.capture_launch(self.before)
     if self.turn is not None:
       if self.flags[FLAG.stale]:
         self._find_contacts_again()
@@ -255,8 +263,9 @@ class Workspace:
         self.stood = self.qpos.tobytes()
 
   def _step(self):
-    computed, self.computed = self.computed, False
+    computed = self.computed
     if self.asleep:
+      self.computed = False
       if self.nefc[0]:  # contacts of a window that was left behind wake the organ
         wp.capture_launch(self.leave)
       if self.counts[0]:
@@ -265,17 +274,19 @@ class Workspace:
         windowed.let_sleep(self, True)
       return
     responds = bool(self.respond) and self.stiff and computed
-    if responds or self.turn is not None:
+    if (responds or self.turn is not None) and self.flags[FLAG.stage] < STAGE.left:
       wp.capture_launch(self.leave)
     if self.turn is not None:
       windowed.hide(self)
     responds = responds and bool(self.flags[FLAG.changed])
     self.flags[FLAG.answered] = responds
-    if responds:
-      self._answer()
-    wp.capture_launch(self.advance if responds else self.end)
+    if self.flags[FLAG.stage] < STAGE.ended:
+      if responds:
+        self._answer()
+      wp.capture_launch(self.advance if responds else self.end)
     if self.resident:
       self.resident.step(computed)
+    self.computed = False
 
   def _answer(self):
     """Ends the step with the organ's own response to the change of the contact forces."""
