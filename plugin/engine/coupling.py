@@ -24,6 +24,9 @@ from . import layout, mjstruct
 from .layout import NodalState, WindowState
 
 
+_HUGE = 1e6  # more than any displacement, velocity or force of an organ [m, m/s, N]
+
+
 class Phases:
   """What a coupling launches around the solve, in the order of a step.
 
@@ -192,6 +195,26 @@ def spans(organ) -> dict[str, slice]:
   win = organ.windows
   sizes = {"nvert": organ.mesh.nvert, "nslot": win.nslot, "ngeom": win.geom.size}
   return layout.spans(WindowState, sizes)
+
+
+def check_state(organ, state: np.ndarray):
+  """Makes sure that a plugin state that was set from outside is one of this organ.
+
+  Raises:
+    ValueError: it is not, or its numbers cannot be.
+  """
+  where = spans(organ)
+  if state[where["signature"]].any():
+    raise ValueError(
+      "plugin_state is not one of this organ, but saved from another model or damaged; reset the "
+      "data, or set a state that was saved from it"
+    )
+  # Forces come last of what is bounded.
+  last = "force" if organ.windows else "before"
+  if not (np.abs(state[: where[last].stop]) < _HUGE).all():
+    raise ValueError(
+      f"plugin_state has a number that is not finite or over {_HUGE:g}, expected what was saved"
+    )
 
 
 def plugin_state(model: int, data: int, instance: int, size: int) -> wp.array:

@@ -36,7 +36,6 @@ from .turns import Turn
 
 _ALLOWED = int(mujoco.mjtSleepPolicy.mjSLEEP_AUTO_ALLOWED)
 _RK4 = int(mujoco.mjtIntegrator.mjINT_RK4)
-_HUGE = 1e6  # more than any displacement, velocity or force of an organ [m, m/s, N]
 _ASTRAY = 1e-9  # distance of a slot from its node that rounding does not explain [m]
 
 
@@ -152,7 +151,7 @@ class Workspace:
     self._check_model()
     self.strange = self.signature[0] != self.organ.signature
     if self.strange:
-      self._check_state()
+      coupling.check_state(self.organ, self.plugin_state)
       self.strange = False
     if self.turn is None:
       self._run()
@@ -202,25 +201,6 @@ class Workspace:
     for place, was in self.static:
       if place.tobytes() != was:
         declare.check_frame(mjstruct.Model.from_address(self.model), self.organ)
-
-  def _check_state(self):
-    """Makes sure that a plugin state that was set from outside is one of this organ.
-
-    Raises:
-      ValueError: it is not, or its numbers cannot be.
-    """
-    if self.signature[0] != 0.0:
-      raise ValueError(
-        "plugin_state is not one of this organ, but saved from another model or damaged; reset the "
-        "data, or set a state that was saved from it"
-      )
-    # Forces come last of what is bounded.
-    where = coupling.spans(self.organ)
-    last = "force" if self.organ.windows else "before"
-    if not (np.abs(self.plugin_state[: where[last].stop]) < _HUGE).all():
-      raise ValueError(
-        f"plugin_state has a number that is not finite or over {_HUGE:g}, expected what was saved"
-      )
 
   def _is_astray(self) -> bool:
     """Returns whether qpos was set without the plugin state: slots are not on their nodes."""

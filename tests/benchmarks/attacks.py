@@ -73,7 +73,7 @@ def stages(args: argparse.Namespace) -> list[list[Case]]:
 def run(case: Case, out: pathlib.Path) -> list[Row]:
   """Returns the row of a case."""
   kind, first, count = case["kind"], case["first"], case["count"]
-  held, failed, through = [0, 0], {}, []
+  held, failed, said = [0, 0], {}, []
   try:
     if kind in FUZZ:
       failed = apart.sweep(kind, first + count, first)
@@ -83,7 +83,7 @@ def run(case: Case, out: pathlib.Path) -> list[Row]:
       held = apart.measure("steps.py", kind, count)
     elif kind == "exercises":
       seed, k = divmod(first, len(tasks.HARD))
-      through = soak.act(tasks.HARD[k], seed, count)
+      said = soak.act(tasks.HARD[k], seed, count)
     else:
       count = soak.step_on_threads(first, case["seconds"], kind == "one model")
   except AssertionError as error:
@@ -91,7 +91,7 @@ def run(case: Case, out: pathlib.Path) -> list[Row]:
   why = "; ".join(f"{seed}: {text}" for seed, text in failed.items())
   row = {"kind": kind, "tried": count, "failed": len(failed)}
   row |= {"early_kb": held[0], "late_kb": held[1], "why": " ".join(why.split())[:300]}
-  return [row | {"through": "; ".join(through)[:300]}]
+  return [row | {"said": " ".join("; ".join(said).split())[:300]}]
 
 
 def arguments(parser: argparse.ArgumentParser):
@@ -118,7 +118,7 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
     memory = ["-", "-"] if grown is None else [f"{grown:+,}", f"{1e5 * grown / late:+.0f}"]
     table.append([what, f"{tried:,}", str(failed), *memory])
   why = [f"- {row['case']}: {row['why']}" for row in rows if row["failed"]]
-  through = [f"- {row['case']}: {row['through']}" for row in rows if row.get("through")]
+  said = [f"- {row['case']}: {row['said']}" for row in rows if row.get("said")]
   lines = [
     "A case fails when it ends its process, is not finite without saying so, gives an error that "
     "is none of ours or names nothing, or, on threads and in repeated presses, is not the same to "
@@ -127,7 +127,7 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
     "",
     *plots.table(["attack", "tried", "failed", "memory [kB]", "in 100,000 [kB]"], table),
     *(["", "What failed:", "", *why] if why else []),
-    *(["", "Tools that went through an organ:", "", *through] if through else []),
+    *(["", "What was said of tools at full scale:", "", *said] if said else []),
   ]
   return [results.page(out / "attacks.md", "What attacks break", about, lines)]
 
