@@ -15,6 +15,7 @@ from . import (
   mjstruct,
   nodal,
   nodes,
+  pierce,
   slots,
   weights,
   windowed,
@@ -36,11 +37,7 @@ def bind(w, model: int):
     near = wp.get_device(does.side)
     crossing = device != near
 
-    touched = _touched(w, model)
-
-    def before():
-      weights.launch(touched)
-      does.gather()
+    before = _before(w, model)
 
     def solve():
       if crossing:
@@ -94,6 +91,21 @@ def _watch(w, model: int):
   w.static = [(view, view.tobytes()) for view in declare.static_places(m, w.organ)]
 
 
+def _before(w, model: int):
+  """Returns what launches a step's work before the solve."""
+  touched = _touched(w, model)
+  m = mjstruct.Model.from_address(model)
+  tools = pierce.speeds(m, model, w.data, w.organ, np.asarray(w.flags))
+
+  def launch():
+    weights.launch(touched)
+    if tools.ntool:
+      pierce.find_fast.launch("cpu", 1, 1, 0, tools)
+    w.phases.gather()
+
+  return launch
+
+
 def _touched(w, model: int) -> weights.Weights:
   """Returns what contacts with the organs of the model get weights by.
 
@@ -124,5 +136,5 @@ def load(body: Body):
   there = [*step.kernels(body), nodes.commit]
   for kernel in there:
     kernel.load(body.device)
-  for kernel in (*there, nodal.gather, slots.gather, weights.weigh):
+  for kernel in (*there, nodal.gather, slots.gather, weights.weigh, pierce.find_fast):
     kernel.load(wp.get_device("cpu"))

@@ -23,7 +23,6 @@ from palpate.tissue.types import DIMS, doubles, floats, ints, scalar, struct, ve
 from . import layout, mjstruct
 from .layout import NodalState, WindowState
 
-
 _HUGE = 1e6  # more than any displacement, velocity or force of an organ [m, m/s, N]
 
 

@@ -59,6 +59,7 @@ FLAG = Numbers(
   ("foreseen", 1, "-", "what acts on the organ is what was guessed"),
   ("weighed", 1, "-", "rows of contacts changed that MuJoCo has made use of"),
   ("stage", 1, "-", "how far the step is, see STAGE"),
+  ("fast", 1, "-", "a tool may go through the organ and out again between two looks"),
 )
 
 # What of a step is done that must not be done twice. These are values, not offsets.

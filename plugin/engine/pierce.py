@@ -4,20 +4,22 @@ MuJoCo looks for contacts once a step, on a surface without thickness: what pass
 radius in a step, or is pressed through, comes out inside.
 """
 
-from __future__ import annotations
-
-from typing import Any
+# Annotations here are objects, not text: no `from __future__ import annotations`.
+# pyright: reportInvalidTypeForm=false
 
 import mujoco
 import numpy as np
+import warp as wp
+from palpate.tissue.kernels import kernel
+from palpate.tissue.types import doubles, ints, struct
 
-from . import flexes, mjstruct
+from . import coupling, flexes, mjstruct
+from .layout import FLAG
 
 _EVERY = 500  # steps between looks at what is inside
-_GLANCE = (20, 0.02)  # steps, and seconds, between glances at where the tools are, at most
+_OFTEN = 5  # steps between looks along the way of a fast tool
 _FAST = 1.0  # speed above which a tool may be through and out again between looks [m/s]
-_LED = 4.0  # times the way that its speed now explains that a tool may have gone
-_PATH = 32  # points of the way of a fast tool
+_PATH = 16  # points of that way
 _LONG = (int(mujoco.mjtGeom.mjGEOM_CAPSULE), int(mujoco.mjtGeom.mjGEOM_CYLINDER))
 _MOST = 33  # points that stand for a long geom
 
@@ -51,6 +53,26 @@ def tools(m, organ) -> np.ndarray:
   return meets[weld[body[meets]] != 0]
 
 
+@struct
+class Speeds:
+  """The tools of an organ, and what MuJoCo knows of their speed, under its own names."""
+
+  ntool: int
+  tool: ints("ntool")  # their geoms
+  half: doubles("ntool")  # half the length of a long one's axis [m]
+  flags: ints(len(FLAG))  # see FLAG
+  # mjModel:
+  geom_bodyid: ints("ngeom")
+  body_rootid: ints("nbody")
+  # mjData:
+  geom_xpos: doubles("ngeom", 3)
+  cvel: doubles("nbody", 6)
+  subtree_com: doubles("nbody", 3)
+
+
+find_fast = kernel("find_fast", "tools.h", Speeds, coupling.CONSTANTS | {"FAST": _FAST})
+
+
 class Tools:
   """Where some geoms are: points along the axis of a long one, the centre of another.
 
@@ -63,39 +85,24 @@ class Tools:
 
   def __init__(self, m, d, organ, geoms: np.ndarray):
     self.geoms, self._organ = geoms, organ
-    self._pos = mjstruct.view(d.geom_xpos, (m.ngeom, 3))
-    self._mat = mjstruct.view(d.geom_xmat, (m.ngeom, 3, 3))
-    size = mjstruct.view(m.geom_size, (m.ngeom, 3))[geoms]
-    is_long = np.isin(mjstruct.view(m.geom_type, m.ngeom, np.int32)[geoms], _LONG)
-    self._half = np.where(is_long, size[:, 1], 0.0)
-    self._count = np.ones(len(geoms), int)
-    wide = 2 * np.ceil(self._half[is_long] / size[is_long, 0]) + 1
-    self._count[is_long] = np.minimum(wide, _MOST)
-    self._body = mjstruct.view(m.geom_bodyid, m.ngeom, np.int32)[geoms]
-    self._root = mjstruct.view(m.body_rootid, m.nbody, np.int32)[self._body]
-    self._vel = mjstruct.view(d.cvel, (m.nbody, 2, 3))
-    self._com = mjstruct.view(d.subtree_com, (m.nbody, 3))
-    arm = np.linalg.norm(self._pos[geoms] - self._com[self._root], axis=1) + self._half
-    self._reach = np.stack([arm, np.ones(len(geoms))], axis=1)[:, :, None]
+    self._pos = mjstruct.view(d.geom_xpos, (m.ngeom, 3))[geoms]
+    self._axis = mjstruct.view(d.geom_xmat, (m.ngeom, 3, 3))[geoms, :, 2]
+    self.half = half_lengths(m, geoms)
+    wide = 2 * np.ceil(self.half / mjstruct.view(m.geom_size, (m.ngeom, 3))[geoms, 0]) + 1
+    self._count = np.minimum(wide, _MOST).astype(int)
+    body = mjstruct.view(m.geom_bodyid, m.ngeom, np.int32)[geoms]
+    root = mjstruct.view(m.body_rootid, m.nbody, np.int32)[body]
+    self._spin, vel = np.moveaxis(mjstruct.view(d.cvel, (m.nbody, 2, 3))[body], 1, 0)
+    com = mjstruct.view(d.subtree_com, (m.nbody, 3))[root]
+    self._vel = vel + np.cross(self._spin, self._pos - com)
 
-  def pose(self) -> tuple[np.ndarray, np.ndarray]:
-    """Returns centres [m] and axes of all, (ntool, 3) each, in the world."""
-    return self._pos[self.geoms], self._mat[self.geoms, :, 2]
-
-  def may_be_fast(self) -> bool:
-    """Returns whether one may be faster than `_FAST`; cheap, and seldom wrong."""
-    return bool(np.abs(self._vel[self._body] * self._reach).max() > _FAST / np.sqrt(6))
-
-  def speed(self, k: int) -> float:
-    """Returns how fast tool k moves, at an end of a long one at most [m/s]."""
-    spin, vel = self._vel[self._body[k]]
-    arm = self._pos[self.geoms[k]] - self._com[self._root[k]]
-    return float(np.linalg.norm(vel + np.cross(spin, arm)) + np.linalg.norm(spin) * self._half[k])
-
-  def points(self, pose: tuple[np.ndarray, np.ndarray], k: int) -> np.ndarray:
-    """Returns the points of tool k in a pose, in the organ's frame [m], (npoint, 3)."""
-    along = np.linspace(-self._half[k], self._half[k], self._count[k])
-    return (pose[0][k] + along[:, None] * pose[1][k] - self._organ.origin) @ self._organ.frame
+  def points(self, k: int, before: float = 0.0) -> np.ndarray:
+    """Returns the points of tool k, now or so long before, in the organ's frame [m], (., 3)."""
+    along = np.linspace(-self.half[k], self.half[k], self._count[k])[:, None]
+    axis = self._axis[k] - before * np.cross(self._spin[k], self._axis[k])
+    return (self._pos[k] - before * self._vel[k] + along * axis - self._organ.origin) @ (
+      self._organ.frame
+    )
 
   def inside(self, disp: np.ndarray) -> list[int]:
     """Returns which of the geoms are inside of the organ.
@@ -103,33 +110,35 @@ class Tools:
     Args:
       disp: displacement of the vertices from rest, in the organ's frame [m], (nvert, 3)
     """
-    pos, pose = self._organ.mesh.rest + disp, self.pose()
+    pos, elem = self._organ.mesh.rest + disp, self._organ.mesh.elem
+    return [int(g) for k, g in enumerate(self.geoms) if any_inside(self.points(k), pos, elem)]
+
+  def passed(self, disp: np.ndarray, time: float) -> list[int]:
+    """Returns which of the fast ones were inside of it on their way within the last seconds."""
+    pos, elem = self._organ.mesh.rest + disp, self._organ.mesh.elem
+    speed = np.linalg.norm(self._vel, axis=1) + np.linalg.norm(self._spin, axis=1) * self.half
     return [
-      int(g)
-      for k, g in enumerate(self.geoms)
-      if any_inside(self.points(pose, k), pos, self._organ.mesh.elem)
+      int(self.geoms[k])
+      for k in map(int, np.flatnonzero(speed > _FAST))
+      if any(any_inside(self.points(k, t), pos, elem) for t in np.linspace(0, time, _PATH))
     ]
 
-  def passed(self, before, k: int, time: float, disp: np.ndarray) -> bool:
-    """Returns whether tool k was inside of the organ on the straight way from a pose before.
 
-    Not where its speed does not lead from there: it was put where it is.
+def half_lengths(m, geoms: np.ndarray) -> np.ndarray:
+  """Returns half the length of the axis of long geoms, 0 of others [m]."""
+  is_long = np.isin(mjstruct.view(m.geom_type, m.ngeom, np.int32)[geoms], _LONG)
+  return np.where(is_long, mjstruct.view(m.geom_size, (m.ngeom, 3))[geoms, 1], 0.0)
 
-    Args:
-      before: that pose
-      k: the tool
-      time: that has gone [s]
-      disp: as for `inside`
-    """
-    start, end, speed = self.points(before, k), self.points(self.pose(), k), self.speed(k)
-    far = np.linalg.norm(end - start, axis=1).max()
-    if speed < _FAST or far > _LED * speed * time:
-      return False
-    pos = self._organ.mesh.rest + disp
-    return any(
-      any_inside(start + share * (end - start), pos, self._organ.mesh.elem)
-      for share in np.linspace(0, 1, _PATH)
-    )
+
+def speeds(m, model: int, data: int, organ, flags: np.ndarray) -> Speeds:
+  """Returns `Speeds` of the tools of an organ."""
+  geoms = tools(m, organ)
+  out = coupling.mujoco_arrays(model, data, Speeds)
+  out.ntool = len(geoms)
+  out.tool = wp.array(geoms, dtype=int, device="cpu")
+  out.half = wp.array(half_lengths(m, geoms), dtype=wp.float64, device="cpu")
+  out.flags = wp.array(flags, dtype=int, device="cpu", copy=False)
+  return out
 
 
 def any_inside(point: np.ndarray, pos: np.ndarray, elem: np.ndarray) -> bool:
@@ -147,63 +156,42 @@ class Watch:
 
   def __init__(self):
     self.crossed: set[int] = set()
-    self._tools: Any = None  # `Tools`, from the first look on
-    self._pose: Any = None
+    self._tools: np.ndarray | None = None
     self._inside: set[int] | None = None
     self._said: set[int] = set()
-    self._until_glance, self._until_look = 1, 1
+    self._steps = 0
 
-  def due(self) -> bool:
-    """Counts a step; returns whether it is time for a glance."""
-    self._until_glance -= 1
-    return not self._until_glance
+  def due(self, fast: int) -> bool:
+    """Counts a step; returns whether it is time to look."""
+    self._steps += 1
+    return self._steps % (_OFTEN if fast else _EVERY) == 1
 
   def look(self, w) -> list[int]:
-    """Returns the geoms that have come through a workspace's organ since the last glance.
+    """Returns the geoms that have come through a workspace's organ since the last look.
 
     Each once; not those that were inside when this began to look.
     """
+    m, d = mjstruct.Model.from_address(w.model), mjstruct.Data.from_address(w.data)
     if self._tools is None:
-      m, d = mjstruct.Model.from_address(w.model), mjstruct.Data.from_address(w.data)
-      self._tools = Tools(m, d, w.organ, tools(m, w.organ))
-      self._pose = self._tools.pose()
-    if not len(self._tools.geoms):
+      self._tools = tools(m, w.organ)
+    if not len(self._tools):
       return []
-    before, self._pose = self._pose, self._tools.pose()
-    found = self._look_along(w, before) if self._tools.may_be_fast() else set()
-    self._until_glance = int(np.clip(_GLANCE[1] / w.model_step[0], 1, _GLANCE[0]))
-    self._until_look -= self._until_glance
-    if self._until_look <= 0 and not (w.asleep or w.resident):
-      self._until_look = _EVERY
-      found |= self._look_inside(w)
-    if not found:
-      return []
-    new = sorted(found - self._said)
+    seen, disp = Tools(m, d, w.organ, self._tools), _displacement(m, d, w)
+    found = set(seen.inside(disp))
+    before, self._inside = found if self._inside is None else self._inside, found
+    if w.flags[FLAG.fast]:
+      passed = set(seen.passed(disp, w.model_step[0] * _OFTEN)) - before
+      self.crossed |= passed
+      found = found | passed
+    new = sorted(found - before - self._said)
     self._said.update(new)
     return new
 
-  def _look_inside(self, w) -> set[int]:
-    """Returns the geoms that are inside and were not at the last look."""
-    found = set(self._tools.inside(_displacement(w)))
-    before, self._inside = found if self._inside is None else self._inside, found
-    return found - before
 
-  def _look_along(self, w, before) -> set[int]:
-    """Returns the geoms that were inside on their way from the pose before, fast ones alone."""
-    if w.resident:
-      return set()
-    time, disp = w.model_step[0] * _GLANCE[0], _displacement(w)
-    passed = [self._tools.passed(before, k, time, disp) for k in range(len(self._tools.geoms))]
-    found = set(map(int, self._tools.geoms[passed]))
-    self.crossed |= found
-    return found
-
-
-def _displacement(w) -> np.ndarray:
+def _displacement(m, d, w) -> np.ndarray:
   """Returns the displacement of the vertices from rest, in the organ's frame [m], (nvert, 3)."""
   if w.organ.windows:
     return w.boxes["own"].motion.disp.numpy()
-  m, d = mjstruct.Model.from_address(w.model), mjstruct.Data.from_address(w.data)
   out = np.zeros((w.organ.mesh.nvert, 3))
   moved = mjstruct.view(d.qpos, m.nq) - mjstruct.view(m.qpos0, m.nq)
   out[w.organ.free] = moved[w.organ.qposs].reshape(-1, 3)

@@ -194,7 +194,7 @@ def _end(w: Workspace):
     _miss(w, int(nodes), int(triangles))
   if w.model_step[0] != w.time_step:
     workspace.refresh(w)
-  if w.watch.due():
+  if w.watch.due(w.flags[FLAG.fast]) and not (w.asleep or w.resident):
     _watch(w)
 
 
