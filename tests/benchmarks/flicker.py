@@ -2,8 +2,8 @@
 
 From the first touch on, but for 20 ms: the share of steps without a force between organ and probe,
 and the root mean square of the change from one step to the next, in percent of the mean force. What
-is asked for is less than 0.5 % and less than 5 %. The probe slides while it presses, for the surfaces
-are not at right angles to it; why that matters: docs/physics.md, what MuJoCo sees.
+is asked for is less than 0.5 % and less than 5 %. The probe slides while it presses, for the
+surfaces are not at right angles to it; why that matters: docs/physics.md, what MuJoCo sees.
 """
 
 from __future__ import annotations
