@@ -46,6 +46,7 @@ class Patch:
   weight: wp.float64  # mass of the organ [kg]
   slot_mass: wp.float64  # mass of a slot's body [kg]
   heaviest: wp.float64  # see `inertia.stiffness`
+  skin: wp.float64  # distance from a geom within which a node touches it [m]
   # The organ:
   node: ints("nvert")  # node of a vertex
   free: ints("nnode")  # whether a node moves
@@ -120,7 +121,8 @@ def constants(body, organ, tools: np.ndarray, model: mujoco.MjModel, inertia, he
     inertia: effective inertia of every vertex [kg]
     held: mass of every vertex, of pinned ones that of a wall [kg]
   """
-  mesh, touch = organ.mesh, _touch(organ, tools, model)
+  mesh, skin = organ.mesh, _skin(organ, model)
+  touch = _touch(mesh, skin + float(model.geom_margin[tools].max(initial=0.0)))
   node, nnode = body.shape.node.numpy(), body.shape.nnode
   elem = node[mesh.elem]
   count = np.bincount(elem.ravel(), minlength=nnode)
@@ -139,6 +141,7 @@ def constants(body, organ, tools: np.ndarray, model: mujoco.MjModel, inertia, he
     h=model.opt.timestep,
     rest_share=step.REST,
     weight=float(organ.mass.sum()),
+    skin=skin,
     node=node,
     free=by_node(organ.free),
     mass=by_node(organ.mass),
@@ -156,17 +159,20 @@ def constants(body, organ, tools: np.ndarray, model: mujoco.MjModel, inertia, he
   )  # fmt: skip
 
 
-def _touch(organ, tools: np.ndarray, model) -> np.ndarray:
+def _skin(organ, model) -> float:
+  """Returns the distance from an organ's triangles within which it touches [m]."""
+  flex = organ.windows.flex if organ.windows else [organ.flex]
+  return float(model.flex_radius[flex].max() + model.flex_margin[flex].max())
+
+
+def _touch(mesh, reach: float) -> np.ndarray:
   """Returns the distance from a geom within which a vertex's triangles may touch it [m]."""
-  mesh = organ.mesh
   edge = mesh.rest[mesh.elem[:, [1, 2, 0]]] - mesh.rest[mesh.elem]
   length = np.linalg.norm(edge, axis=2)
   longest = np.zeros(mesh.nvert)
   for corner in (mesh.elem, mesh.elem[:, [1, 2, 0]]):
     np.maximum.at(longest, corner.ravel(), length.ravel())
-  flex = organ.windows.flex if organ.windows else [organ.flex]
-  skin = float(model.flex_radius[flex].max() + model.flex_margin[flex].max())
-  return longest + skin + float(model.geom_margin[tools].max(initial=0.0))
+  return longest + reach
 
 
 def _tools(tools: np.ndarray, model, reach: float) -> np.ndarray:

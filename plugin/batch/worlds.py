@@ -18,7 +18,7 @@ from palpate.engine import plugin as engine
 from palpate.organ import instances
 from palpate.tissue import device as devices
 
-from . import contacts, states, strip
+from . import contacts, convex, states, strip
 from .base import Batch, Tissue, refuse_crowd
 from .organs import Organ
 from .rest import Rest
@@ -88,6 +88,7 @@ class Worlds(Batch):
     self.njmax = strip.rows_of(bare) + (between + sum(most)) * each
     ncon = between + sum(regions)
     size = states.bytes_of(bare, self.njmax, ncon) + sum(Organ.bytes_of(w) for w in spaces.values())
+    size += sum(convex.bytes_of(model.geom_type[t], n) for t, n in zip(tools, nslots, strict=True))
     refuse_crowd(nworld, size, _room(self.device), str(self.device))
     try:
       sizes = {"dof_armature": nworld, "body_invweight0": nworld}

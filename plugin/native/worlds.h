@@ -111,7 +111,8 @@ PALPATE int candidates(const Fields& f, int world) {
   return all < f.most ? all : f.most;
 }
 
-// Chooses the candidates nearest to the tools; the order of nodes decides between equals.
+// Chooses the candidates nearest to the tools; the order of nodes decides between equals. Those that
+// touch and get no slot are counted.
 template <class Fields>
 PALPATE void rank(const Fields& f, Thread t, int) {
   const int n = candidates(f, t.world);
@@ -122,6 +123,7 @@ PALPATE void rank(const Fields& f, Thread t, int) {
     for (int p = 0; p < n; ++p)
       nearer += far[p] < far[q] || (far[p] == far[q] && node[p] < node[q]);
     f.chosen.data[t.world * f.most + q] = nearer < f.nslot;
+    if (nearer >= f.nslot && far[q] < f.skin) append(f.missed.data + t.world);
   });
 }
 
