@@ -200,3 +200,46 @@ def test_bad_input_is_named():
     tissue.configure(young_scale=[1.0, 2.0, 3.0])
   with pytest.raises(ValueError, match="friction"):
     tissue.configure(friction=-1)
+
+
+def test_sensors_are_summed_up_over_the_steps_of_a_call():
+  extra = '<sensor><jointpos joint="z"/><subtreelinvel body="tool"/></sensor>'
+  made = probed().replace("</mujoco>", extra + "</mujoco>")
+  batch, one = (palpate.batch.make(spec(made), 2) for _ in range(2))
+  model = batch.model
+  for each in (batch, one):
+    each.ctrl = np.array([[-0.004, 0.0], [-0.002, 0.001]])
+  batch.step(30)
+  seen = []
+  for _ in range(30):
+    one.step()
+    seen.append(one.sensordata.numpy().copy())
+  parts = [slice(a, a + n) for a, n in zip(model.sensor_adr, model.sensor_dim, strict=True)]
+  peak = np.stack([np.linalg.norm(np.array(seen)[..., p], axis=2).max(axis=0) for p in parts], 1)
+  np.testing.assert_allclose(batch.sensor_peak.numpy(), peak, rtol=1e-5)
+  np.testing.assert_allclose(batch.sensor_mean.numpy(), np.mean(seen, axis=0), rtol=1e-5, atol=1e-9)
+
+
+def test_reset_goes_to_the_state_it_was_given_and_joints_and_bodies_to_theirs():
+  made = spec(probed())
+  made.worldbody.add_body(name="mark", pos=[0, 0, 0])
+  batch = palpate.batch.make(made, 3)
+  model, data = batch.model, mujoco.MjData(batch.model)
+  drive(model, data, 60)
+  batch.start(data)
+  batch.step(5)
+  mask = np.array([True, False, True])
+  before = batch.qpos.numpy().copy()
+  batch.reset(mask)
+  np.testing.assert_allclose(batch.qpos.numpy()[::2], np.tile(data.qpos, (2, 1)), atol=1e-7)
+  assert np.array_equal(batch.qpos.numpy()[1], before[1]) and batch.time.numpy()[0] == 0
+  adr = [int(model.joint(name).qposadr[0]) for name in "zx"]
+  batch.pose("zx", np.arange(6.0).reshape(3, 2) * 1e-3, mask)
+  assert batch.qpos.numpy()[2, adr] == pytest.approx([0.004, 0.005])
+  assert np.array_equal(batch.qpos.numpy()[1], before[1])
+  with pytest.raises(ValueError, match=r"values has shape \(2,\), expected \(3, 2\)"):
+    batch.pose("zx", [0, 0])
+  batch.place("mark", np.tile([1.0, 2, 3], (3, 1)), np.tile([1.0, 0, 0, 0], (3, 1)), mask)
+  assert not batch.model.body("mark").pos.any()
+  with pytest.raises(ValueError, match="body 'tool' has joints"):
+    batch.place("tool", np.zeros((3, 3)), np.zeros((3, 4)))
