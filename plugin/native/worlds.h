@@ -270,21 +270,21 @@ PALPATE void find_bad(const Fields& f, Thread t, int) {
   if (bad) f.bad.data[t.world] = 1;
 }
 
-// Puts the organ of the worlds of a mask at rest, and the tools where they are in qpos0.
+// Puts the organ of the worlds of a mask where it starts.
 template <class Fields>
 PALPATE void rest_organ(const Fields& f, Thread t, int) {
   const int w = t.world;
   if (!f.mask.data[w]) return;
-  const D3 zero = {0.0, 0.0, 0.0};
-  if (t.tid == 0) f.heavier.data[w] = 0.0;
+  if (t.tid == 0) f.heavier.data[w] = f.heavier0.data[0];
   each_item(t, f.nnode, [&](int i) {
     const size_t at = at_node(f, w, i);
-    store_lane(f.solve.disp.data + at, zero);
-    store_lane(f.solve.vel.data + at, zero);
-    store_lane(f.solve.dvel.data + at, zero);
-    store_lane(f.last.data + at, zero);
-    store_lane(f.before.data + at, zero);
-    store_floats(f.force.data + 3 * in_row(f, w, i), zero);
+    const int from = offset_of(i);
+    store_lane(f.solve.disp.data + at, load_lane(f.disp0.data + from));
+    store_lane(f.solve.vel.data + at, load_lane(f.vel0.data + from));
+    store_lane(f.last.data + at, load_lane(f.last0.data + from));
+    store_lane(f.before.data + at, load_lane(f.before0.data + from));
+    store_lane(f.solve.dvel.data + at, {0.0, 0.0, 0.0});
+    store_floats(f.force.data + 3 * in_row(f, w, i), load_floats(f.force0.data + 3 * i));
   });
   each_item(t, f.nslot, [&](int k) { wait(f, w, k); });
 }
