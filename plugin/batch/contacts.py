@@ -243,7 +243,7 @@ def _against(kinds: frozenset[int]):
 
 @wp.func
 def _on_planes(p: Patch, c: Touch, at: Place, n: int, x: wp.vec3):
-  """Writes the contacts of a node with planes, which meet nodes; returns how many there are then."""
+  """Writes the contacts of a node with planes; returns how many there are then."""
   for tool in range(p.ntool):
     at.tool = tool
     at.geom = p.tool_geom[tool]

@@ -85,7 +85,7 @@ def touch(
   centre = (ta + tb + td) / 3.0
   around = wp.max(wp.length(ta - centre), wp.max(wp.length(tb - centre), wp.length(td - centre)))
   near = wp.transpose(rot) * centre - k.middle[tool]
-  dist = float(_APART)  # noqa: UP018 - a variable to Warp
+  dist = float(_APART)  # a variable to Warp
   middle = wp.vec3(0.0)
   normal = wp.normalize(wp.cross(tb - ta, td - ta))
   if wp.dot(normal, centre) < 0.0:

@@ -28,10 +28,7 @@ _MOST = 1024  # threads of a block that has a world to itself
 _STATIC = 4096  # bytes of its memory that others have [B]
 _REGISTERS = 65536 // 72  # threads of a multiprocessor that have 72 registers
 _DRIVER = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
-_NO_MOST = 1024  # threads of a block that has a world to itself
-_STATIC = 4096  # bytes of its memory that others have [B]
-_REGISTERS = 65536 // 72  # threads of a multiprocessor that have 72 registers
-_DRIVER = "Could not find or load the NVIDIA CUDA driver"
+_NO_DRIVER = "Could not find or load the NVIDIA CUDA driver"
 
 
 def lower_log_level():

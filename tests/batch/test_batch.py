@@ -247,7 +247,8 @@ def test_reset_goes_to_the_state_it_was_given_and_joints_and_bodies_to_theirs():
 
 def hung():
   """Returns `probed` with its probe on a post that has no joint, and sensors of the probe."""
-  made = probed().replace('<body name="tool"', '<body name="post" pos="0 0 0.001"><body name="tool"')
+  post = '<body name="post" pos="0 0 0.001"><body name="tool"'
+  made = probed().replace('<body name="tool"', post)
   made = made.replace('friction="0.5"/></body>', 'friction="0.5"/><site name="tip"/></body></body>')
   sensors = '<sensor><force site="tip"/><framelinvel objtype="site" objname="tip"/></sensor>'
   return made.replace("</mujoco>", sensors + "</mujoco>")
