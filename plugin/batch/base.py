@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import mujoco
@@ -211,6 +211,29 @@ class Batch(abc.ABC):
       raise ValueError(f"{name} has shape {values.shape}, expected ({self.nworld}, {count})")
     return values
 
+  def configure(self, mask=None, *, gravity=None, friction: Mapping[str, Any] | None = None):
+    """Changes what worlds have besides organs; a reset leaves it.
+
+    Args:
+      mask: worlds, (nworld,) of bool; None for all
+      gravity: gravity [m/s^2], (3,) or (nworld, 3)
+      friction: sliding friction of geoms by name, a number or (nworld,)
+    """
+    worlds = np.flatnonzero(self._mask(mask).numpy())
+    if gravity is not None:
+      gravity = self._rows(np.broadcast_to(gravity, (self.nworld, 3)), "gravity", 3)[worlds]
+    rough = {}
+    for name, values in (friction or {}).items():
+      values = np.broadcast_to(np.asarray(values, float), (self.nworld,))
+      if not (values >= 0).all():
+        raise ValueError(f"geom {name!r}: friction is {values.min()}, expected numbers >= 0")
+      rough[self.model.geom(name).id] = values[worlds]
+    self._configure(worlds, gravity, rough)
+
+  @abc.abstractmethod
+  def _configure(self, worlds: np.ndarray, gravity: np.ndarray | None, friction: dict):
+    """Changes some worlds; values have a row for each of these."""
+
   def _mask(self, mask) -> wp.array:
     if mask is None:
       return wp.full(self.nworld, True, dtype=wp.bool, device=self.device)
@@ -304,7 +327,7 @@ class Tissue(abc.ABC):
 
     A value is one number for all, or has a row a world. `young_scale` stands for `young` as a
     multiple of the compiled one; `young` has one number, or one a triangle. `friction` is the
-    sliding friction of the organ's side of contacts.
+    sliding friction of the organ's side of contacts. On a GPU also `mass`, of the whole organ [kg].
 
     Args:
       mask: worlds to change, (nworld,) of bool; None for all

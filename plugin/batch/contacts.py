@@ -54,7 +54,7 @@ class Touch:
   margin: floats("ntool")  # [m]
   condim: ints("ntool")
   whose: ints("ntool")  # whose sliding friction counts
-  slide: floats("ntool")  # the tool's
+  slide: floats("nworld", "ntool")  # the tool's
   rough: floats("nworld")  # the organ's
   friction: Array(vec5, ("ntool",))  # all of it, the sliding one as compiled
   solref: Array(wp.vec2, ("ntool",))
@@ -151,7 +151,7 @@ def _put(c: Touch, at: Place, n: int, dist: float, pos: wp.vec3, normal: wp.vec3
     c.out_pos[k] = pos
     c.out_frame[k] = _axes(normal)
     c.out_includemargin[k] = c.margin[q]
-    slide = c.slide[q]
+    slide = c.slide[at.world, q]
     if c.whose[q] == _ORGAN:
       slide = c.rough[at.world]
     elif c.whose[q] == _GREATER:
@@ -365,6 +365,7 @@ def make(model: mujoco.MjModel, organ, tools: np.ndarray, flex: int, nworld: int
     kind=model.geom_type[tools],
     size=model.geom_size[tools],
     rough=np.full(nworld, model.flex_friction[own, 0]),
+    slide=np.tile(mixed["slide"], (nworld, 1)) if rows else np.zeros((nworld, 0)),
     nacon=data.nacon,
   )  # fmt: skip
   return fill(Touch, data.nacon.device, values)

@@ -16,7 +16,7 @@ struct Matrix {
   const int* bend_row;
   const int* bend_node;
   const float* bend_gain;
-  float bend;  // (h^2 + h damping) times the scale of Young's modulus, for the bending matrix
+  float bend;  // (h^2 + h damping) times the scale of the plate, for the bending matrix
   bool bends;  // whether there is one
 
   // Runs body(blocks) for the blocks of a slice, which start at `row`.
@@ -26,12 +26,13 @@ struct Matrix {
 
 template <class Fields>
 PALPATE Matrix matrix(const Fields& f, int world) {
-  const size_t base = (size_t)world * f.shape.nslice;
+  const size_t base = (size_t)world * f.shape.nslice, nbend = f.shape.bend_adr.data[f.shape.nslice];
   return {
     f.system.block.data + 72 * (size_t)world * f.shape.nslot, f.system.diag.data + 8 * base,
     f.system.inverse.data + 48 * base, f.system.normal.data + 24 * base, f.shape.slot_adr.data,
-    f.shape.fan_node.data, f.shape.bend_adr.data, f.shape.bend_node.data, f.tissue.bend_gain.data,
-    f.state.step.data[4 * world + 1] * numbers(f, world)[YOUNG_SCALE], f.shape.nhingeslice > 0
+    f.shape.fan_node.data, f.shape.bend_adr.data, f.shape.bend_node.data,
+    f.lump.bend_gain.data ? f.lump.bend_gain.data + 8 * nbend * world : f.tissue.bend_gain.data,
+    f.state.step.data[4 * world + 1] * numbers(f, world)[PLATE], f.shape.nhingeslice > 0
   };
 }
 

@@ -14,6 +14,7 @@ from .types import (
   NUMBERS,
   Cycle,
   Fields,
+  Lump,
   Shape,
   State,
   System,
@@ -169,6 +170,7 @@ def _put_state(body: Body, nworld: int):
   body.nworld, sizes = nworld, body.sizes | {"nworld": nworld}
   body.fields.state = allocate(State, body.device, sizes)
   body.fields.system = allocate(System, body.device, sizes)
+  body.fields.lump = allocate(Lump, body.device, sizes | {"nlump": 0, "nhingeslice": 0})
   body.numbers = wp.clone(body.numbers)
 
 
