@@ -28,7 +28,8 @@ def _plan(body, config) -> devices.Plan | None:
   """Returns how a block takes a world's step; None where it is one that blocks do not know."""
   if config.integrator != "implicit" or body.newton > 1 or body.is_solid:
     return None
-  return devices.plan(body.device, body.shape.nslice, body.shape.nslot, body.has_bending)
+  nheld = int(body.shape.held_adr.numpy()[-1])
+  return devices.plan(body.device, body.shape.nslice, nheld, body.has_bending)
 
 
 class Organ(Tissue):

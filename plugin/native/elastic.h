@@ -247,16 +247,18 @@ PALPATE Spring spring(V k, V3 t, V3 q) {
 
 // Rows of the matrix.
 
-// What the rows of a world are made from, and where they go: the first `nheld` rows of blocks to
-// `held`, the others to `block`.
+// What the rows of a world are made from, and where they go: the blocks of the first slices to `held`,
+// as long as there is room, those of the others to `block`.
 struct Rows {
   const float* disp;
   const float* vel;
   float *rhs, *diag, *inverse, *areavec, *normal, *block, *held;
-  int nheld;
+  const int* held_adr;
+  int room;  // floats of `held`
 
-  PALPATE float* blocks(int row, int width) const {
-    return (row + width <= nheld ? held : block) + 72 * (size_t)row;
+  PALPATE bool holds(int s) const { return held_adr[s + 1] <= room; }
+  PALPATE float* blocks(int s, int row) const {
+    return holds(s) ? held + held_adr[s] : block + 72 * (size_t)row;
   }
 };
 
@@ -268,7 +270,7 @@ PALPATE Rows rows(const Fields& f, int world) {
     f.system.rhs.data + 24 * base, f.system.diag.data + 8 * base,
     f.system.inverse.data + 48 * base, f.system.areavec.data + 24 * base,
     f.system.normal.data + 24 * base,
-    f.system.block.data + 72 * (size_t)world * f.shape.nslot, nullptr, 0
+    f.system.block.data + 72 * (size_t)world * f.shape.nslot, nullptr, f.shape.held_adr.data, 0
   };
 }
 
@@ -298,7 +300,7 @@ PALPATE Fan fan_of(const Fields& f, int world, const Rows& at, int s, Lane lane)
     f.shape.fan_side.data + 8 * (row + s),
     f.lump.fan.data ? f.lump.fan.data + 8 * ((size_t)world * (f.shape.nslot + f.shape.nslice) + row + s)
                     : nullptr,
-    at.blocks(row, width),
+    at.blocks(s, row),
   };
 }
 

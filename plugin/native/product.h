@@ -19,9 +19,9 @@ struct Matrix {
   float bend;  // (h^2 + h damping) times the scale of the plate, for the bending matrix
   bool bends;  // whether there is one
 
-  // Runs body(blocks) for the blocks of a slice, which start at `row`.
+  // Runs body(blocks) for the blocks of slice s, whose first row is `row`.
   template <class Body>
-  PALPATE void with_blocks(int row, int, Body body) const { INLINED body(block + 72 * (size_t)row); }
+  PALPATE void with_blocks(int, int row, Body body) const { INLINED body(block + 72 * (size_t)row); }
 };
 
 template <class Fields>
@@ -44,7 +44,7 @@ PALPATE V3 product(const Any& a, const Vector& z, V3 own, int s, Lane lane) {
   Carried out = ld(a.diag, s, lane) * own;
   {
     const int row = a.slot[s], width = a.slot[s + 1] - row;
-    a.with_blocks(row, width, [&](const float* block) {
+    a.with_blocks(s, row, [&](const float* block) {
       z.each_near(a.fan + 8 * (row + 2 * s + 1), width, lane, [&](V3 near) {
         out = out + ld9(block, lane) * (near - own);
         block += 72;

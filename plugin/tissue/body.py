@@ -134,6 +134,7 @@ def _sizes(values: dict[str, Any]) -> dict[str, int]:
   return out | {
     "nsolidslice": out["nslice"] if solid else 0,
     "nedgeslot": out["nslot"] if solid else 0,
+    "nheld": len(values["held_adr"]),
     "naround": len(values["around_tet"]),
     "nedge": len(values["edge_tet"]),
     "nbend": len(values["bend_node"]),

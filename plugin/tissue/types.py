@@ -116,6 +116,7 @@ class Shape:
   vert: ints("nnode")  # vertex of each node, -1 for padding
   node: ints("nvert")  # node of each vertex
   slot_adr: ints("nslice + 1")  # first row of stiffness blocks
+  held_adr: ints("nheld")  # where a block keeps the blocks of each slice in its memory, in floats
   fan_node: ints("nslot + 2 nslice", 8)  # offset of each fan entry's node
   fan_rest: floats("nslot + 2 nslice", 3, 8)  # rest vector to each fan entry [m]
   fan_corner: ints("nslot + nslice", 8)  # offset of each fan triangle's normal
