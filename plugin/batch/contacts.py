@@ -61,6 +61,7 @@ class Touch:
   solimp: Array(vec5, ("ntool",))
   # mujoco_warp:
   nacon: ints(1)
+  start: ints(1)  # the organ's first contact
   out_dist: floats("naconmax")
   out_pos: Array(wp.vec3, ("naconmax",))
   out_frame: Array(wp.mat33, ("naconmax",))
@@ -326,8 +327,9 @@ def kernel(kinds: frozenset[int]) -> wp.Kernel:
 
 
 @wp.kernel(enable_backward=False)
-def add(nacon: wp.array[int], count: int):
-  """Adds to the number of contacts, after all have seen it."""
+def add(nacon: wp.array[int], start: wp.array[int], count: int):
+  """Adds an organ's to the number of contacts, after all have seen it."""
+  start[0] = nacon[0]
   nacon[0] = nacon[0] + count
 
 
@@ -367,6 +369,7 @@ def make(model: mujoco.MjModel, organ, tools: np.ndarray, flex: int, nworld: int
     rough=np.full(nworld, model.flex_friction[own, 0]),
     slide=np.tile(mixed["slide"], (nworld, 1)) if rows else np.zeros((nworld, 0)),
     nacon=data.nacon,
+    start=np.zeros(1),
   )  # fmt: skip
   return fill(Touch, data.nacon.device, values)
 

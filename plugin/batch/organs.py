@@ -13,7 +13,7 @@ from palpate.tissue import config as configuration
 from palpate.tissue import device as devices
 from palpate.tissue import order, shape, step
 
-from . import contacts, convex, kernels, patch
+from . import contacts, convex, kernels, patch, sliding
 from .base import Tissue, spread
 from .material import KEYS, Material
 from .patch import launch
@@ -133,11 +133,18 @@ class Organ(Tissue):
     dim, device = (self._batch.nworld, self.place.nslot), self.body.device
     inputs = [self.patch, self._touch, self._convex]
     wp.launch(self._find, dim=dim, inputs=inputs, device=device, block_dim=64)
-    wp.launch(contacts.add, dim=1, inputs=[self._touch.nacon, self._region], device=device)
+    inputs = [self._touch.nacon, self._touch.start, self._region]
+    wp.launch(contacts.add, dim=1, inputs=inputs, device=device)
 
   def push(self):
-    """Adds the passive force."""
+    """Adds the passive force, and keeps sliding contacts closed."""
     self._over(patch.push, self.place.nslot)
+    batch, c, many = self._batch, self._touch, self.place.nslot * self._touch.room
+    contact, paired = batch.d.contact, batch.paired
+    inputs = [c.start, many, paired, contact.dim, contact.friction, contact.efc_address]
+    inputs.append(batch.d.efc.aref)
+    dim = (batch.nworld, many)
+    wp.launch(sliding.keep_closed, dim=dim, inputs=inputs, device=self.body.device)
 
   def end(self):
     """Ends the step with the contact forces that mujoco_warp found."""

@@ -81,11 +81,11 @@ class Worlds(Batch):
   def _put(self, bare, nslots, tools, deterministic, spaces):
     """Makes mujoco_warp's model and data."""
     model, nworld = self.model, self.nworld
-    cone = 1 if model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC else 2
+    self.paired = model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
     most = [contacts.most_of(model, t, n) for t, n in zip(tools, nslots, strict=True)]
     regions = [contacts.room_of(model, t) * n for t, n in zip(tools, nslots, strict=True)]
     condim = int(max([1, *model.flex_condim, *model.geom_condim]))
-    each = 1 if condim == 1 else condim if cone == 1 else 2 * (condim - 1)
+    each = 1 if condim == 1 else 2 * (condim - 1) if self.paired else condim
     between = _CONTACTS if strip.tools_meet(bare) else 0
     self.njmax = strip.rows_of(bare) + (between + sum(most)) * each
     ncon = between + sum(regions)

@@ -131,6 +131,25 @@ def test_each_world_has_a_tissue_of_its_own(make):
   assert 0 < force[0] < 0.95 * force[1] < 0.9 * force[2]
 
 
+@pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
+def test_sliding_is_that_of_the_plugin(make, cone):
+  made = probed(cone=cone)
+  model, data, organ = load(made)
+  batch = make(made, 2)
+  found = []
+  for k in range(220):
+    data.ctrl[:] = -0.007 * min(1, k / 60), 0.01 * np.clip(k / 100 - 1, 0, 1)
+    batch.ctrl = np.tile(data.ctrl, (2, 1))
+    mujoco.mj_step(model, data)
+    batch.step()
+    force = batch.organ("organ").contact_force.numpy()[0].sum(axis=0)
+    found.append((force, organ.contact_force.sum(axis=0)))
+  found = np.array(found)
+  peak = np.abs(found[:, 1]).max()
+  assert np.sqrt(np.mean((found[:, 0] - found[:, 1]) ** 2)) < 0.005 * peak
+  assert np.abs(found[:, 1, 0]).max() > 0.2 * peak  # it slides
+
+
 TISSUES = [
   (0, {"poisson": [0.45, 0.2, 0.49], "thickness": [0.002, 0.003, 0.001]}),
   (1, {"thickness": [0.002, 0.004, 0.0015], "young": [2e4, 3e4, 4e4]}),
@@ -148,7 +167,8 @@ def test_tissues_of_worlds_are_those_of_the_plugin(make, bend, keys):
     tissue = batch.organ("organ")
     if isinstance(keys.get("young"), str):
       middle = tissue.xpos.numpy()[0][tissue.elem].mean(axis=1)
-      lump = np.linalg.norm(middle - [[[0, 0, RADIUS]], [[RADIUS, 0, 0]], [[0.02, 0, 0.045]]], axis=2)
+      places = [[[0, 0, RADIUS]], [[RADIUS, 0, 0]], [[0.02, 0, 0.045]]]
+      lump = np.linalg.norm(middle - places, axis=2)
       keys["young"] = np.where(lump < 0.025, 1.5e5, 3e4)
     tissue.configure(**keys)
     found = []
