@@ -13,11 +13,11 @@ from __future__ import annotations
 
 import mujoco
 
-from .base import Batch, Tissue, count_of
+from .base import Batch, Contacts, Tissue, count_of
 from .threads import Threads
 from .worlds import Worlds
 
-__all__ = ["Batch", "Tissue", "make"]
+__all__ = ["Batch", "Contacts", "Tissue", "make"]
 
 
 def make(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -279,6 +279,20 @@ class Batch(abc.ABC):
     """Gives a world the state of an mjData."""
 
 
+class Contacts(NamedTuple):
+  """Contacts of an organ with geoms in all worlds, as many in each; those that are none have -1.
+
+  Attributes:
+    geom: the geom, (nworld, n)
+    normal: from the geom to the tissue, (nworld, n, 3)
+    force: force along it [N], (nworld, n)
+  """
+
+  geom: wp.array
+  normal: wp.array
+  force: wp.array
+
+
 class Tissue(abc.ABC):
   """One organ in all worlds of a batch; arrays as those of `Batch`, in world coordinates.
 
@@ -320,6 +334,11 @@ class Tissue(abc.ABC):
   def iterations(self) -> wp.array:
     """PCG iterations of the last step, (nworld,)."""
     return self._read("iterations")
+
+  @property
+  def contacts(self) -> Contacts:
+    """Contacts of the last step; on a GPU alone, on the CPU they are in `Batch.datas`."""
+    raise ValueError(f"organ {self.name!r}: contacts are in `batch.datas` on the CPU")
 
   @abc.abstractmethod
   def configure(self, mask=None, **keys):

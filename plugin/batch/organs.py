@@ -14,7 +14,7 @@ from palpate.tissue import device as devices
 from palpate.tissue import order, shape, step
 
 from . import contacts, convex, kernels, patch, sliding
-from .base import Tissue, spread
+from .base import Contacts, Tissue, spread
 from .material import KEYS, Material
 from .patch import launch
 from .strip import Slots
@@ -184,6 +184,21 @@ class Organ(Tissue):
     out, dim = self._out[name], (self._batch.nworld, self.nvert)
     wp.launch(kernels.show, dim=dim, inputs=[self.patch, _WHAT[name], out], device=self.body.device)
     return out.view(float)
+
+  @property
+  def contacts(self) -> Contacts:
+    """Contacts of the last step."""
+    c, d, (nworld, many) = self._touch, self._batch.d, self._pressed.geom.shape
+    inputs = [c.start, many, self._batch.paired, d.contact.dim, d.contact.geom, d.contact.frame]
+    inputs += [d.contact.efc_address, d.efc.force, *self._pressed]
+    wp.launch(sliding.press, dim=(nworld, many), inputs=inputs, device=self.body.device)
+    return self._pressed._replace(normal=self._pressed.normal.view(float))
+
+  @functools.cached_property
+  def _pressed(self) -> Contacts:
+    shape = (self._batch.nworld, self.place.nslot * self._touch.room)
+    kinds = (int, wp.vec3, float)
+    return Contacts(*(wp.zeros(shape, dtype=kind, device=self.body.device) for kind in kinds))
 
   # Changing.
 

@@ -40,7 +40,7 @@ def keep_closed(
   for r in range(rows):
     if address[c, r] < 0:  # there was no room
       return
-  square = float(0.0)  # a variable to Warp
+  square = float(0.0)  # noqa: UP018 - a variable to Warp
   for r in range(n - 1):
     if paired:
       v = 0.5 * (aref[world, address[c, 2 * r]] - aref[world, address[c, 2 * r + 1]])
@@ -51,3 +51,34 @@ def keep_closed(
   for r in range(wp.where(paired, rows, 1)):
     row = address[c, r]
     aref[world, row] = aref[world, row] - wp.sqrt(square)
+
+
+@wp.kernel(enable_backward=False)
+def press(
+  start: wp.array[int],
+  many: int,
+  paired: bool,
+  dim: wp.array[int],
+  geom: wp.array[wp.vec2i],
+  frame: wp.array[wp.mat33],
+  address: wp.array2d[int],
+  force: wp.array2d[float],
+  out_geom: wp.array2d[int],
+  out_normal: wp.array2d[wp.vec3],
+  out_force: wp.array2d[float],
+):
+  """Writes the geoms, normals and normal forces of an organ's contacts; see `keep_closed`."""
+  world, k = wp.tid()
+  c = start[0] + world * many + k
+  out_geom[world, k] = -1
+  if geom[c][0] < 0 or address[c, 0] < 0:
+    out_force[world, k] = 0.0
+    return
+  rows = wp.where(paired and dim[c] > 1, 2 * (dim[c] - 1), 1)
+  total = float(0.0)  # noqa: UP018 - a variable to Warp
+  for r in range(rows):
+    if address[c, r] >= 0:
+      total += force[world, address[c, r]]
+  out_geom[world, k] = geom[c][0]
+  out_normal[world, k] = wp.vec3(frame[c][0, 0], frame[c][0, 1], frame[c][0, 2])
+  out_force[world, k] = total

@@ -150,6 +150,22 @@ def test_sliding_is_that_of_the_plugin(make, cone):
   assert np.abs(found[:, 1, 0]).max() > 0.2 * peak  # it slides
 
 
+@pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
+def test_contacts_have_the_normal_forces(make, cone):
+  batch = make(probed(cone=cone), 2)
+  tissue = batch.organ("organ")
+  if make.device == "cpu":
+    with pytest.raises(ValueError, match=r"batch\.datas"):
+      tissue.contacts  # noqa: B018
+    return
+  batch.ctrl = np.array([[-0.006, 0.0], [-0.004, 0.0]])
+  batch.step(150)
+  geom, normal, force = (array.numpy() for array in tissue.contacts)
+  assert set(geom[geom >= 0]) == {batch.model.geom("tip").id} and not force[geom < 0].any()
+  pushed = (normal * force[..., None] * (geom >= 0)[..., None]).sum(axis=1)
+  np.testing.assert_allclose(pushed[:, 2], tissue.contact_force.numpy().sum(axis=1)[:, 2], rtol=0.03)
+
+
 TISSUES = [
   (0, {"poisson": [0.45, 0.2, 0.49], "thickness": [0.002, 0.003, 0.001]}),
   (1, {"thickness": [0.002, 0.004, 0.0015], "young": [2e4, 3e4, 4e4]}),
