@@ -6,6 +6,7 @@ worlds is gathered on the first device; `parts` have theirs in place.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 import mujoco
@@ -42,7 +43,7 @@ class Several(Batch):
     if not 1 <= len(devices) <= nworld:
       raise ValueError(f"device has {len(devices)} names, expected from 1 to nworld, {nworld}")
     ends = np.linspace(0, nworld, len(devices) + 1).round().astype(int)
-    self.slices = [slice(int(a), int(b)) for a, b in zip(ends[:-1], ends[1:], strict=True)]
+    self.slices = [slice(int(a), int(b)) for a, b in itertools.pairwise(ends)]
     self.parts = [
       Worlds(spec, part.stop - part.start, device, nodes, deterministic)
       for part, device in zip(self.slices, devices, strict=True)
@@ -177,7 +178,7 @@ class _Gathered(Tissue):
     """Contacts of the last step."""
     parts = [part.contacts for part in self._parts]
     names = Contacts._fields
-    return Contacts(*(self._gather(name, each) for name, each in zip(names, zip(*parts, strict=True), strict=True)))
+    return Contacts(*(self._gather(name, [getattr(part, name) for part in parts]) for name in names))
 
   def configure(self, mask=None, **keys):
     """Changes the tissue of worlds, see `Tissue.configure`."""
