@@ -178,7 +178,8 @@ class _Gathered(Tissue):
     """Contacts of the last step."""
     parts = [part.contacts for part in self._parts]
     names = Contacts._fields
-    return Contacts(*(self._gather(name, [getattr(part, name) for part in parts]) for name in names))
+    every = {name: [getattr(part, name) for part in parts] for name in names}
+    return Contacts(*(self._gather(name, arrays) for name, arrays in every.items()))
 
   def configure(self, mask=None, **keys):
     """Changes the tissue of worlds, see `Tissue.configure`."""
