@@ -24,12 +24,18 @@ _STATUS = {"iterations": 0, "residual": 1}
 _FEW = 32  # values that are checked one by one
 
 
-def _plan(body, config) -> devices.Plan | None:
+def _plan(body, config, volumes: bool) -> devices.Plan | None:
   """Returns how a block takes a world's step; None where it is one that blocks do not know."""
   if config.integrator != "implicit" or body.newton > 1 or body.is_solid:
     return None
-  nheld = int(body.shape.held_adr.numpy()[-1])
-  return devices.plan(body.device, body.shape.nslice, nheld, body.has_bending)
+  return devices.plan(
+    body.device,
+    body.shape.nslice,
+    int(body.shape.held_adr.numpy()[-1]),
+    bends=body.has_bending,
+    springs=config.elements == "spring",
+    volumes=volumes,
+  )
 
 
 class Organ(Tissue):
@@ -50,7 +56,7 @@ class Organ(Tissue):
     self._batch, self._scheme = batch, step.SCHEMES[organ.config.integrator]
     still = shape.make(organ.mesh, organ.config, ~organ.free, str(device), nworld=0)
     self.body = bodies.worlds(still, nworld)
-    self.body.plan = _plan(self.body, organ.config)
+    self.body.plan = _plan(self.body, organ.config, bool(organ.config.bulk or organ.config.pressure))
     model, d, m = batch.model, batch.d, batch.m
     node = self.body.shape.node.numpy()
     mass = np.ones(self.body.shape.nnode, np.float32)
@@ -92,6 +98,10 @@ class Organ(Tissue):
     kinds = frozenset(int(kind) for kind in model.geom_type[tools])
     self._find, self._region = contacts.kernel(kinds), int(nworld * place.nslot * self._touch.room)
     self._material = Material(self, batch, self._touch)
+
+  def enclose(self):
+    """Lets the step know volume stiffness and pressure, from the next record on."""
+    self.body.plan = _plan(self.body, self.config, True)
 
   @property
   def responds(self):

@@ -87,6 +87,8 @@ CONSTANTS: dict[str, int | float] = {
   "WORDS": WORDS,
   **{stage.name: stage.value for stage in Stage},
   "NUMBERS": len(NUMBERS),
+  # Whether code for these is compiled; which of them there are is found as it runs.
+  **dict.fromkeys(("BENDING", "SPRINGS", "VOLUMES"), 1),
   **{name.upper(): k for k, name in enumerate(NUMBERS)},
 }
 
