@@ -123,6 +123,7 @@ class Plan:
     threads: of a block
     per_sm: blocks that a multiprocessor has at once
     nbytes: memory of a block
+    whole: whether the whole matrix has room there
     bends: whether there is bending
     springs: whether elements are springs
     volumes: whether there may be volume stiffness or pressure
@@ -132,6 +133,7 @@ class Plan:
   threads: int
   per_sm: int
   nbytes: int
+  whole: bool
   bends: bool
   springs: bool
   volumes: bool
@@ -147,7 +149,7 @@ def plan(device, nslice: int, nheld: int, **kinds: bool) -> Plan | None:
     **kinds: what the tissue has, see `Plan`
   """
   if not device.is_cuda:
-    return Plan(0, 1, 1, 0, **kinds)
+    return Plan(0, 1, 1, 0, False, **kinds)
   nodes = LANES * nslice
   own = 1 if nodes <= _FEW else 2 if nodes <= _MOST else 4
   threads = -(-nodes // (32 * own)) * 32
@@ -156,7 +158,7 @@ def plan(device, nslice: int, nheld: int, **kinds: bool) -> Plan | None:
   room = device.max_shared_memory_per_block - _STATIC
   wanted = 4 * (LANES * (16 if kinds["bends"] else 13) * nslice + nheld)
   per_sm = max(1, min(3, room // (wanted + _STATIC), _REGISTERS // threads))
-  return Plan(own, threads, per_sm, min(wanted, room), **kinds)
+  return Plan(own, threads, per_sm, min(wanted, room), wanted <= room, **kinds)
 
 
 def reserve(kernel: wp.Kernel, device, plan: Plan):

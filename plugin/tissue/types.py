@@ -274,11 +274,19 @@ class Cycle:
   transfer: Transfer
 
 
-def allocate(kind: Any, device, sizes: dict[str, int]):
-  """Returns a struct of zeroed arrays; `sizes` has the named sizes of their shapes."""
+def allocate(kind: Any, device, sizes: dict[str, int], spare: tuple[str, ...] = ()):
+  """Returns a struct of zeroed arrays.
+
+  Args:
+    kind: the struct
+    device: where they are
+    sizes: named sizes of their shapes
+    spare: fields that are empty, their first size 0
+  """
   out = kind()
   for name, dims in DIMS[kind.key].items():
     shape = tuple(_extent(dim, sizes) for dim in dims)
+    shape = (0, *shape[1:]) if name in spare else shape
     setattr(out, name, wp.zeros(shape, dtype=kind.vars[name].type.dtype, device=device))
   return out
 
