@@ -32,7 +32,7 @@ def plan_of(body, config, volumes: bool = False) -> devices.Plan | None:
     config: its configuration
     volumes: whether to be ready for volume stiffness or pressure that it does not have yet
   """
-  if config.integrator != "implicit" or body.newton > 1 or body.is_solid:
+  if not step.SCHEMES[config.integrator].whole or body.newton > 1 or body.is_solid:
     return None
   return devices.plan(
     body.device,
@@ -99,6 +99,7 @@ class Organ(Tissue):
     )  # fmt: skip
     self.patch = patch.make(values, self.body)
     self._touch = contacts.make(model, organ, tools, place.flex, nworld, d)
+    self._pressed = sliding.make(batch, self._touch, place.nslot)
     self._convex = convex.make(model, tools, nworld * place.nslot, m, d)
     kinds = frozenset(int(kind) for kind in model.geom_type[tools])
     self._find, self._region = contacts.kernel(kinds), int(nworld * place.nslot * self._touch.room)
@@ -155,12 +156,8 @@ class Organ(Tissue):
   def push(self):
     """Adds the passive force, and keeps sliding contacts closed."""
     self._over(patch.push, self.place.nslot)
-    batch, c, many = self._batch, self._touch, self.place.nslot * self._touch.room
-    contact, paired = batch.d.contact, batch.paired
-    inputs = [c.start, many, paired, contact.dim, contact.friction, contact.efc_address]
-    inputs.append(batch.d.efc.aref)
-    dim = (batch.nworld, many)
-    wp.launch(sliding.keep_closed, dim=dim, inputs=inputs, device=self.body.device)
+    dim = self._pressed.geom.shape
+    wp.launch(sliding.keep_closed, dim=dim, inputs=[self._pressed], device=self.body.device)
 
   def end(self):
     """Ends the step with the contact forces that mujoco_warp found."""
@@ -204,17 +201,9 @@ class Organ(Tissue):
   @property
   def contacts(self) -> Contacts:
     """Contacts of the last step."""
-    c, d, (nworld, many) = self._touch, self._batch.d, self._pressed.geom.shape
-    inputs = [c.start, many, self._batch.paired, d.contact.dim, d.contact.geom, d.contact.frame]
-    inputs += [d.contact.efc_address, d.efc.force, *self._pressed]
-    wp.launch(sliding.press, dim=(nworld, many), inputs=inputs, device=self.body.device)
-    return self._pressed._replace(normal=self._pressed.normal.view(float))
-
-  @functools.cached_property
-  def _pressed(self) -> Contacts:
-    shape = (self._batch.nworld, self.place.nslot * self._touch.room)
-    kinds = (int, wp.vec3, float)
-    return Contacts(*(wp.zeros(shape, dtype=kind, device=self.body.device) for kind in kinds))
+    p = self._pressed
+    wp.launch(sliding.press, dim=p.geom.shape, inputs=[p], device=self.body.device)
+    return Contacts(p.geom, p.normal.view(float), p.force)
 
   # Changing.
 
