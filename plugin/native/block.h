@@ -5,6 +5,9 @@
 
 namespace palpate {
 
+// Whether threads come in blocks.
+constexpr bool BLOCKS = ON_CUDA;
+
 #if ON_CUDA
 
 // Memory of a block: two sets of what its warps and shares of blocks sum up to, and x, y, z and the

@@ -47,10 +47,10 @@ template <class Fields>
 PALPATE Home home(const Fields& f, int world) {
   Rows at = rows(f, world);
   const size_t n = f.shape.nslice, base = world * n;
-  float* memory = block_memory();
-  if (!memory)
+  if constexpr (!BLOCKS)
     return {at, f.system.disp_trial.data + 24 * base, f.system.vel_trial.data + 24 * base,
             {{f.system.z.data + 24 * base, f.system.zn.data + 8 * base}}};
+  float* memory = block_memory();
   float *disp = memory, *vel = memory + 24 * n;
   at.disp = disp;
   at.vel = vel;
