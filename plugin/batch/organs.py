@@ -15,7 +15,7 @@ from palpate.tissue import order, shape, step
 
 from . import contacts, convex, kernels, patch, sliding
 from .base import Contacts, Tissue, spread
-from .material import KEYS, Material
+from .material import KEYS, MODULI, Material
 from .patch import launch
 from .strip import Slots
 
@@ -56,7 +56,7 @@ class Organ(Tissue):
 
   def __init__(self, batch, w, place: Slots, tools: np.ndarray):
     organ, device, nworld = w.organ, batch.device, batch.nworld
-    self.name, self.nvert, self.elem = organ.name, organ.mesh.nvert, organ.mesh.elem
+    self.name, self.nvert, self.elem = organ.name, organ.mesh.nouter, organ.mesh.elem
     self.declared, self.config, self.space, self.place = organ, organ.config, w, place
     self.instance = w.instance
     self._batch, self._scheme = batch, step.SCHEMES[organ.config.integrator]
@@ -213,8 +213,8 @@ class Organ(Tissue):
     chosen = np.flatnonzero(batch._mask(mask).numpy())
     rows = {key: spread(self, key, value, nworld)[chosen] for key, value in keys.items()}
     for key in rows:
-      if key not in KEYS or (key == "poisson" and self.body.has_bending):
-        why = " while tissue bends" if key in KEYS else ""
+      why = self._fixed(key)
+      if why is not None:
         raise ValueError(
           f"organ {self.name!r}: {key!r} cannot change in a batch on a GPU{why}, expected one of "
           f"{', '.join(KEYS)}"
@@ -223,6 +223,14 @@ class Organ(Tissue):
       if key != "friction" and key != "mass":
         self._check(key, values)
     self._material.change(chosen, rows)
+
+  def _fixed(self, key: str) -> str | None:
+    """Returns why a key cannot change, None where it can."""
+    if key not in KEYS:
+      return ""
+    if key == "poisson" and self.body.has_bending:
+      return " while tissue bends"
+    return " of a solid" if key in MODULI and self.body.is_solid else None
 
   def _check(self, key: str, values: np.ndarray):
     """Raises ValueError where a value of a key is not allowed."""

@@ -27,12 +27,6 @@ def test_a_tool_that_it_does_not_know():
     make(spec)
 
 
-def test_a_solid():
-  made = probed(keys={"elements": "solid", "young": 3e3, "foundation": None})
-  with pytest.raises(ValueError, match="elements is 'solid', which a batch on a GPU cannot do"):
-    make(made)
-
-
 @pytest.mark.parametrize(
   "extra",
   [
@@ -78,8 +72,16 @@ def test_more_worlds_than_memory():
 
 
 @pytest.mark.skipif(not wp.get_cuda_supported_archs(), reason="this Warp knows no CUDA")
-def test_the_kernels_compile_for_cuda(tmp_path):
+@pytest.mark.parametrize("which", ["patch", "whole"])
+def test_the_kernels_compile_for_cuda(tmp_path, scenes, which):
   from palpate.batch import patch
+  from palpate.tissue import device, step
 
-  wp.compile_aot_module(patch.MODULE, arch=90, module_dir=str(tmp_path), use_ptx=True)
+  module = patch.MODULE
+  if which == "whole":
+    _, _, body = scenes.kernels(*scenes.sphere(1))
+    kinds = {"bends": True, "springs": True, "volumes": True}
+    body.plan = device.Plan(own=2, threads=160, per_sm=2, nbytes=0, whole=True, **kinds)
+    (module,) = step.modules(body)
+  wp.compile_aot_module(module, arch=90, module_dir=str(tmp_path), use_ptx=True)
   assert any(tmp_path.iterdir())
