@@ -97,7 +97,7 @@ class Worlds(Batch):
     refuse_crowd(nworld, size, _room(self.device), str(self.device))
     try:
       own = ("dof_armature", "body_invweight0", "body_pos", "body_quat", "geom_friction")
-      sizes = dict.fromkeys(own, nworld)
+      sizes: dict[str, int] = {name: nworld for name in own}
       self.m = mjw.put_model(bare, batch_sizes=sizes)
     except (NotImplementedError, ValueError) as error:
       raise ValueError(f"mujoco_warp cannot have this scene: {error}") from None
@@ -222,13 +222,15 @@ class Worlds(Batch):
     self._run("look")
 
   def _configure(self, worlds: np.ndarray, gravity: np.ndarray | None, friction: dict):
-    changes = [] if gravity is None else [(self.m.opt.gravity, slice(None), gravity)]
+    changes: list[tuple[wp.array, tuple, np.ndarray]] = []
+    if gravity is not None:
+      changes.append((self.m.opt.gravity, (), gravity))
     for g, values in friction.items():
       changes.append((self.m.geom_friction, (g, 0), values))
       changes += [change for organ in self._organs.values() for change in organ.rubs(g, values)]
     for array, place, values in changes:
       whole = array.numpy()
-      whole[(worlds, *place) if isinstance(place, tuple) else worlds] = values
+      whole[(worlds, *place)] = values
       array.assign(whole)
 
   def _tell(self):
