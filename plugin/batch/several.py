@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -62,7 +63,7 @@ class Several(Batch):
     for part, array, batch in zip(self.slices, arrays, self.parts, strict=True):
       if array.size:
         wp.synchronize_device(batch.device)
-        wp.copy(out[part], array.contiguous())
+        wp.copy(_rows(out, part), array.contiguous())
     return out
 
   @property
@@ -93,7 +94,7 @@ class Several(Batch):
     wp.synchronize_device(self.device)  # who wrote the controls
     for at, part in zip(self.slices, self.parts, strict=True):
       if self.ctrl.size:
-        wp.copy(part.ctrl, self.ctrl[at])
+        wp.copy(part.ctrl, _rows(self.ctrl, at))
     for part in self.parts:
       part.step(n)
 
@@ -149,9 +150,13 @@ class Several(Batch):
   def _set_state(self, world: int, data: mujoco.MjData):
     part, own = self._find(world)
     part.set_state(own, data)
-    row = self.ctrl[world : world + 1]
-    if row.size:
-      wp.copy(row, part.ctrl[own : own + 1])
+    if self.ctrl.size:
+      wp.copy(_rows(self.ctrl, slice(world, world + 1)), _rows(part.ctrl, slice(own, own + 1)))
+
+
+def _rows(array: wp.array, at: slice) -> Any:
+  """Returns rows of an array, in its memory."""
+  return array[at]
 
 
 class _Gathered(Tissue):

@@ -75,7 +75,15 @@ class Worlds(Batch):
       self._sensors = wp.array([*model.sensor_adr, model.nsensordata], dtype=int)
       self._alias()
       self._callbacks(deterministic)
-      self.record()
+      try:
+        self.record()
+      except RuntimeError as error:
+        if not deterministic:
+          raise
+        raise ValueError(
+          f"nworld is {nworld}, too many for deterministic=True on {device}: mujoco_warp has no "
+          f"room to order its sums ({error}); expected fewer"
+        ) from None
     self._warned = False
     self.reset()
 

@@ -85,7 +85,7 @@ struct Rows {
   const int* held_adr;
   int room;  // floats of `held`
 
-  PALPATE bool holds(int s) const { return held_adr[s + 1] <= room; }
+  PALPATE bool holds(int s) const { return room > 0 && held_adr[s + 1] <= room; }
   PALPATE float* blocks(int s, int row) const {
     return holds(s) ? held + held_adr[s] : block + 72 * (size_t)row;
   }
