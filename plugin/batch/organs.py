@@ -105,11 +105,6 @@ class Organ(Tissue):
     self._find, self._region = contacts.kernel(kinds), int(nworld * place.nslot * self._touch.room)
     self._material = Material(self, batch, self._touch)
 
-  @property
-  def start(self) -> wp.array:
-    """The organ's first contact, (1,)."""
-    return self._touch.start
-
   def enclose(self):
     """Lets the step know volume stiffness and pressure, from the next record on."""
     self.body.plan = plan_of(self.body, self.config, True)

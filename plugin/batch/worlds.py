@@ -20,7 +20,6 @@ from palpate.tissue import device as devices
 
 from . import contacts, convex, kernels, states, strip
 from .base import Batch, Tissue, refuse_crowd
-from .order import Order
 from .organs import Organ
 from .rest import Rest
 
@@ -74,7 +73,7 @@ class Worlds(Batch):
       self._teller = states.Teller(self)
       self._sensors = wp.array([*model.sensor_adr, model.nsensordata], dtype=int)
       self._alias()
-      self._callbacks(deterministic)
+      self._callbacks()
       try:
         self.record()
       except RuntimeError as error:
@@ -117,8 +116,7 @@ class Worlds(Batch):
       bare, start, nworld=nworld, nconmax=ncon, njmax=self.njmax, njmax_nnz=nonzero
     )
     self.m.opt.warn_overflow = 0  # counted, see `overflow`
-    # Contacts and rows are put in order here, see `order`.
-    self.m.opt.deterministic = int(DeterminismType.ATOMICS if deterministic else 0)
+    self.m.opt.deterministic = int(DeterminismType.ALL if deterministic else DeterminismType.NONE)
     # The windows' triangles have no forces and contacts of mujoco_warp's own.
     self.m.nflexelem = self.m.nflexedge = 0
     gravity = np.tile(model.opt.gravity, (nworld, 1)).astype(np.float32)
@@ -129,17 +127,14 @@ class Worlds(Batch):
     for name in ("ctrl", "sensordata", "time"):
       self._arrays[name] = getattr(self.d, name)
 
-  def _callbacks(self, deterministic: bool):
+  def _callbacks(self):
     organs = list(self._organs.values())
-    order = Order(self, organs[0].start) if deterministic and organs else None
 
     def touch(m, d):
       for organ in organs:
         organ.touch()
 
     def push(m, d):
-      if order:
-        order.launch()
       for organ in organs:
         organ.push()
 

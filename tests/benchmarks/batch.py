@@ -156,8 +156,9 @@ def stages(args: argparse.Namespace) -> list[list[Case]]:
   keys = {"device": args.device, "tolerance": args.tolerance, "repeat": args.repeat}
   keys |= {"slots": args.slots}
   worlds = args.worlds or ([8] if args.device == "cpu" else [1024, 4096, 16384])
+  kind = f"{args.slots or 0}{'-repeat' * args.repeat}"
   cases = [
-    {"case": f"{n}-{w}-{bend:g}-{c}-{args.slots or 0}{'-repeat' * args.repeat}", "nodes": n, "nworld": w}
+    {"case": f"{n}-{w}-{bend:g}-{c}-{kind}", "nodes": n, "nworld": w}
     | {"bend": bend, "condim": c}
     | keys
     for bend, c, n, w in itertools.product(args.bend, args.condim, args.nodes, worlds)
