@@ -43,8 +43,13 @@ def tools_of(model: mujoco.MjModel, organ) -> np.ndarray:
   """Returns the geoms that an organ's slots follow.
 
   Raises:
-    ValueError: one is not a tool that a batch knows.
+    ValueError: one is not a tool that a batch knows, or it is not an organ that it can step.
   """
+  for key in ("carrier", "attach", "support", "relax_share"):
+    if getattr(organ.config, key):
+      raise ValueError(
+        f"organ {organ.name!r}: {key} is set, which a batch on a GPU cannot do; expected none"
+      )
   if organ.windows:
     found = np.unique(organ.windows.geom)
   else:

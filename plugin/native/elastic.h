@@ -233,6 +233,15 @@ PALPATE V3 bending(const Fan& fan, const float* normal, const float* corner, V3 
   return b;
 }
 
+// What springs that hold nodes add to the diagonal block; in `b` they have it for what later
+// iterations have changed already.
+template <class Fields>
+PALPATE S3 hold(const Fields& f, int stage, size_t at, V3& b, Lane lane) {
+  const S3 weight = ld6(f.state.hold.data + 48 * at, lane);
+  if (stage == LATER) b -= weight * ld3(f.state.dvel.data + 24 * at, lane);
+  return weight;
+}
+
 // Writes what is on the diagonal of a slice, and the inverse of `self`, the block there: zero where a
 // node cannot move, which keeps it out of the solve.
 PALPATE void put_diagonal(float* diags, float* inverses, V free, V diag, S3 self, Lane lane) {
@@ -276,6 +285,7 @@ struct Assembly {
       + gv * (sum.rate - kf * m.v);
     if (stage == LATER) b -= mass * ld3(f.state.dvel.data + 24 * own, lane);
     S3 self = splat(g) * sum.stiffness + diag;
+    if (f.state.hold.data) self = self + hold(f, stage, own, b, lane);
     if (areas) st3(at.areavec + 24 * s, sum.area, lane);
     if (bends) {
       b = bending(fan, normal, corner, b, lane);

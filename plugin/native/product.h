@@ -16,6 +16,7 @@ struct Matrix {
   const int* bend_row;
   const int* bend_node;
   const float* bend_gain;
+  const float* hold;  // of nodes that springs hold, or null
   float bend;  // (h^2 + h damping) times the scale of the plate, for the bending matrix
   bool bends;  // whether there is one
 
@@ -32,6 +33,7 @@ PALPATE Matrix matrix(const Fields& f, int world) {
     f.system.inverse.data + 48 * base, f.system.normal.data + 24 * base, f.shape.slot_adr.data,
     f.shape.fan_node.data, f.shape.bend_adr.data, f.shape.bend_node.data,
     f.lump.bend_gain.data ? f.lump.bend_gain.data + 8 * nbend * world : f.tissue.bend_gain.data,
+    f.state.hold.data ? f.state.hold.data + 48 * base : nullptr,
     f.state.step.data[4 * world + 1] * numbers(f, world)[PLATE], BENDING && f.shape.nhingeslice > 0
   };
 }
@@ -51,6 +53,7 @@ PALPATE V3 product(const Any& a, const Vector& z, V3 own, int s, Lane lane) {
       });
     });
   }
+  if (a.hold) out = out + ld6(a.hold + 48 * s, lane) * own;
   if (a.bends) {
     const int row = a.bend_row[s], width = a.bend_row[s + 1] - row;
     const float* gain = a.bend_gain + 8 * row;

@@ -19,10 +19,6 @@ PALPATE void store_floats(float* p, D3 a) {
   p[1] = (float)a.y;
   p[2] = (float)a.z;
 }
-// R x, with R row by row.
-PALPATE D3 turned(const double* R, D3 x) {
-  return {dot(load(R), x), dot(load(R + 3), x), dot(load(R + 6), x)};
-}
 // R^T x.
 PALPATE D3 turned_back(const double* R, D3 x) { return add_turned({0.0, 0.0, 0.0}, R, x); }
 

@@ -81,6 +81,7 @@ _row = _elastic("row")
 _tet_strain = _solid("tet_strain")
 _node_pressure = _solid("node_pressure")
 _tet_stress = _solid("tet_stress")
+_edge_block = _solid("edge_block")
 _solid_row = _solid("solid_row")
 _edge_change = _scheme("edge_change")
 _predict = _scheme("predict")
@@ -176,6 +177,8 @@ def assemble(body: Body, stage: Stage):
     _over(_tet_strain, body, shape.ntetslice, stage)
     _over(_node_pressure, body, shape.nslice)
     _over(_tet_stress, body, shape.ntetslice, stage)
+    if stage in (Stage.FIRST, Stage.LATER):
+      _over(_edge_block, body, shape.nedgeslice)
     _over(_solid_row, body, shape.nslice, stage)
     return
   if body.has_bending:
@@ -300,7 +303,8 @@ class Scheme:
       the step just computed; None where the scheme has no such answer
     levels: whether coarser meshes serve its solve
     whole: whether a block of threads can take a world's whole step
-    solids: whether it can step tetrahedra
+    ahead: whether it takes forces where the present velocity leads
+    solids: whether it can step tetrahedra, and springs that hold nodes
   """
 
   step: Callable[[Body], None]
@@ -308,6 +312,7 @@ class Scheme:
   respond: Callable[[Body], None] | None = None
   levels: bool = False
   whole: bool = False
+  ahead: bool = False
   solids: bool = True
 
   @property
@@ -321,7 +326,7 @@ def _whole(h: float, damping: float) -> float:
 
 
 SCHEMES = {
-  "implicit": Scheme(_implicit, _whole, _respond, levels=True, whole=True),
+  "implicit": Scheme(_implicit, _whole, _respond, levels=True, whole=True, ahead=True),
   "midpoint": Scheme(_midpoint, lambda h, b: 0.5 * _whole(h, b), _respond_centred, levels=True),
   "neumann": Scheme(_neumann, _whole, solids=False),
   "explicit": Scheme(_explicit, lambda h, b: 0.0),
