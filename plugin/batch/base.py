@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import abc
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -38,6 +39,9 @@ class Batch(abc.ABC):
     sizes |= {"sensordata": model.nsensordata}
     self._arrays = {name: self._make(size) for name, size in sizes.items()}
     self._arrays["time"] = wp.zeros(nworld, dtype=float, device=self.device)
+    self._summary = {
+      "peak": self._make(model.nsensor), "mean": self._make(model.nsensordata)
+    }  # fmt: skip
     self._counts = {
       name: wp.zeros(nworld, dtype=int, device=self.device) for name in ("failures", "overflow")
     }
@@ -78,6 +82,16 @@ class Batch(abc.ABC):
   def sensordata(self) -> wp.array:
     """Sensors of the last step, (nworld, nsensordata); zero in a world that was reset since."""
     return self._state("sensordata")
+
+  @property
+  def sensor_peak(self) -> wp.array:
+    """Largest norm of each sensor in the steps of the last call of `step`, (nworld, nsensor)."""
+    return self._summary["peak"]
+
+  @property
+  def sensor_mean(self) -> wp.array:
+    """Mean of the sensors over the steps of the last call of `step`, (nworld, nsensordata)."""
+    return self._summary["mean"]
 
   @property
   def failures(self) -> wp.array:
@@ -132,7 +146,7 @@ class Batch(abc.ABC):
     """Steps all worlds."""
 
   def reset(self, mask=None):
-    """Puts worlds at rest, their controls at zero.
+    """Puts worlds at rest, or in the state of `start`, their controls at zero.
 
     Args:
       mask: worlds to reset, (nworld,) of bool; None for all
@@ -143,6 +157,82 @@ class Batch(abc.ABC):
   @abc.abstractmethod
   def _reset(self, mask: wp.array):
     """Puts the worlds of a mask, which is on the device, at rest."""
+
+  def start(self, data: mujoco.MjData):
+    """Lets `reset` put worlds in the state of an mjData of `model` from now on, at time 0."""
+    self._check(data)
+    self._start(data)
+
+  def _start(self, data: mujoco.MjData):
+    raise ValueError("a batch on a GPU cannot start from a state of yours yet")
+
+  def pose(self, joints: Sequence[str], values, mask=None):
+    """Puts joints of worlds at positions, without velocity.
+
+    Args:
+      joints: names of hinges and slides
+      values: positions [rad, m], (nworld, number of joints)
+      mask: worlds, (nworld,) of bool; None for all
+    """
+    found = [self.model.joint(name) for name in joints]
+    for joint in found:
+      if int(joint.type[0]) < int(mujoco.mjtJoint.mjJNT_SLIDE):
+        raise ValueError(f"joint {joint.name!r} is neither a hinge nor a slide")
+    values = self._rows(values, "values", len(found))
+    self._fresh = False
+    adr = [(int(joint.qposadr[0]), int(joint.dofadr[0])) for joint in found]
+    self._pose(np.array(adr, int).reshape(-1, 2), values, self._mask(mask))
+
+  def _pose(self, adr: np.ndarray, values: np.ndarray, mask: wp.array):
+    raise ValueError("a batch on a GPU cannot pose joints yet")
+
+  def place(self, body: str, pos, quat, mask=None):
+    """Moves a body of worlds in its parent's frame, one that has no joint.
+
+    Args:
+      body: name
+      pos: positions [m], (nworld, 3)
+      quat: orientations, w x y z, (nworld, 4)
+      mask: worlds, (nworld,) of bool; None for all
+    """
+    number = self.model.body(body).id
+    if not number or self.model.body_jntnum[number]:
+      raise ValueError(f"body {body!r} has joints, expected one that is fixed to its parent")
+    pos, quat = self._rows(pos, "pos", 3), self._rows(quat, "quat", 4)
+    self._fresh = False
+    self._place(number, pos, quat, self._mask(mask))
+
+  def _place(self, body: int, pos: np.ndarray, quat: np.ndarray, mask: wp.array):
+    raise ValueError("a batch on a GPU cannot place bodies a world yet")
+
+  def _rows(self, values, name: str, count: int) -> np.ndarray:
+    values = np.asarray(values, float)
+    if values.shape != (self.nworld, count):
+      raise ValueError(f"{name} has shape {values.shape}, expected ({self.nworld}, {count})")
+    return values
+
+  def configure(self, mask=None, *, gravity=None, friction: Mapping[str, Any] | None = None):
+    """Changes what worlds have besides organs; a reset leaves it.
+
+    Args:
+      mask: worlds, (nworld,) of bool; None for all
+      gravity: gravity [m/s^2], (3,) or (nworld, 3)
+      friction: sliding friction of geoms by name, a number or (nworld,)
+    """
+    worlds = np.flatnonzero(self._mask(mask).numpy())
+    if gravity is not None:
+      gravity = self._rows(np.broadcast_to(gravity, (self.nworld, 3)), "gravity", 3)[worlds]
+    rough = {}
+    for name, values in (friction or {}).items():
+      values = np.broadcast_to(np.asarray(values, float), (self.nworld,))
+      if not (values >= 0).all():
+        raise ValueError(f"geom {name!r}: friction is {values.min()}, expected numbers >= 0")
+      rough[self.model.geom(name).id] = values[worlds]
+    self._configure(worlds, gravity, rough)
+
+  @abc.abstractmethod
+  def _configure(self, worlds: np.ndarray, gravity: np.ndarray | None, friction: dict):
+    """Changes some worlds; values have a row for each of these."""
 
   def _mask(self, mask) -> wp.array:
     if mask is None:
@@ -189,6 +279,20 @@ class Batch(abc.ABC):
     """Gives a world the state of an mjData."""
 
 
+class Contacts(NamedTuple):
+  """Contacts of an organ with geoms in all worlds, as many in each; those that are none have -1.
+
+  Attributes:
+    geom: the geom, (nworld, n)
+    normal: from the geom to the tissue, (nworld, n, 3)
+    force: force along it [N], (nworld, n)
+  """
+
+  geom: wp.array
+  normal: wp.array
+  force: wp.array
+
+
 class Tissue(abc.ABC):
   """One organ in all worlds of a batch; arrays as those of `Batch`, in world coordinates.
 
@@ -231,13 +335,18 @@ class Tissue(abc.ABC):
     """PCG iterations of the last step, (nworld,)."""
     return self._read("iterations")
 
+  @property
+  def contacts(self) -> Contacts:
+    """Contacts of the last step; on a GPU alone, on the CPU they are in `Batch.datas`."""
+    raise ValueError(f"organ {self.name!r}: contacts are in `batch.datas` on the CPU")
+
   @abc.abstractmethod
   def configure(self, mask=None, **keys):
     """Changes the tissue of worlds: keys of docs/configuration.md that may change while running.
 
     A value is one number for all, or has a row a world. `young_scale` stands for `young` as a
     multiple of the compiled one; `young` has one number, or one a triangle. `friction` is the
-    sliding friction of the organ's side of contacts.
+    sliding friction of the organ's side of contacts. On a GPU also `mass`, of the whole organ [kg].
 
     Args:
       mask: worlds to change, (nworld,) of bool; None for all

@@ -13,6 +13,8 @@ class Start:
 
   mask: Array(wp.bool, ("nworld",))  # worlds to reset
   qpos0: floats("nq")
+  qvel0: floats("nv")
+  act0: floats("na")
   geom_xpos0: Array(wp.vec3, ("ngeom",))  # [m]
   geom_xmat0: Array(wp.mat33, ("ngeom",))
   mocap_pos0: Array(wp.vec3, ("nmocap",))
@@ -47,12 +49,12 @@ def reset(s: Start):
   for k in range(s.qpos.shape[1]):
     s.qpos[w, k] = s.qpos0[k]
   for k in range(s.qvel.shape[1]):
-    s.qvel[w, k] = 0.0
+    s.qvel[w, k] = s.qvel0[k]
     s.qacc[w, k] = 0.0
     s.qacc_warmstart[w, k] = 0.0
     s.qfrc_applied[w, k] = 0.0
   for k in range(s.act.shape[1]):
-    s.act[w, k] = 0.0
+    s.act[w, k] = s.act0[k]
   for k in range(s.ctrl.shape[1]):
     s.ctrl[w, k] = 0.0
   for k in range(s.sensordata.shape[1]):
@@ -67,6 +69,78 @@ def reset(s: Start):
   for k in range(s.geom_xpos.shape[1]):
     s.geom_xpos[w, k] = s.geom_xpos0[k]
     s.geom_xmat[w, k] = s.geom_xmat0[k]
+
+
+@struct
+class Move:
+  """Where joints and bodies of the worlds of a mask are put, and geoms before that."""
+
+  mask: Array(wp.bool, ("nworld",))
+  at: ints("njoint", 2)  # places of joints in qpos and qvel
+  values: floats("nworld", "njoint")  # positions of joints [rad, m]
+  body: int  # a body
+  pos: Array(wp.vec3, ("nworld",))  # its position in its parent's frame [m]
+  quat: Array(wp.quat, ("nworld",))  # its orientation there
+  xpos: Array(wp.vec3, ("nworld", "ngeom"))  # of geoms [m]
+  xmat: Array(wp.mat33, ("nworld", "ngeom"))
+  # mujoco_warp:
+  qpos: floats("nworld", "nq")
+  qvel: floats("nworld", "nv")
+  body_pos: Array(wp.vec3, ("nworld", "nbody"))
+  body_quat: Array(wp.quat, ("nworld", "nbody"))
+  geom_xpos: Array(wp.vec3, ("nworld", "ngeom"))
+  geom_xmat: Array(wp.mat33, ("nworld", "ngeom"))
+
+
+@wp.kernel(enable_backward=False)
+def pose(m: Move):
+  """Puts joints at positions."""
+  w, k = wp.tid()
+  if m.mask[w]:
+    m.qpos[w, m.at[k, 0]] = m.values[w, k]
+    m.qvel[w, m.at[k, 1]] = 0.0
+
+
+@wp.kernel(enable_backward=False)
+def place(m: Move):
+  """Moves a body in its parent's frame."""
+  w = wp.tid()
+  if m.mask[w]:
+    m.body_pos[w, m.body] = m.pos[w]
+    m.body_quat[w, m.body] = m.quat[w]
+
+
+@wp.kernel(enable_backward=False)
+def put_back(m: Move):
+  """Puts geoms of the worlds that are not of the mask where they were."""
+  w, g = wp.tid()
+  if not m.mask[w]:
+    m.geom_xpos[w, g] = m.xpos[w, g]
+    m.geom_xmat[w, g] = m.xmat[w, g]
+
+
+@wp.kernel(enable_backward=False)
+def sum_up(
+  adr: wp.array[int], data: wp.array2d[float], peak: wp.array2d[float], mean: wp.array2d[float]
+):
+  """Adds the sensors of a step to their sums, and keeps the greatest squares of their norms."""
+  w, k = wp.tid()
+  square = float(0.0)  # noqa: UP018 - a variable to Warp
+  for i in range(adr[k], adr[k + 1]):
+    square += data[w, i] * data[w, i]
+    mean[w, i] = mean[w, i] + data[w, i]
+  peak[w, k] = wp.max(peak[w, k], square)
+
+
+@wp.kernel(enable_backward=False)
+def average(
+  adr: wp.array[int], steps: int, peak: wp.array2d[float], mean: wp.array2d[float]
+):
+  """Makes norms and means of the sums of some steps."""
+  w, k = wp.tid()
+  peak[w, k] = wp.sqrt(peak[w, k])
+  for i in range(adr[k], adr[k + 1]):
+    mean[w, i] = mean[w, i] / float(steps)
 
 
 @wp.kernel(enable_backward=False)

@@ -46,6 +46,7 @@ class Patch:
   weight: wp.float64  # mass of the organ [kg]
   slot_mass: wp.float64  # mass of a slot's body [kg]
   heaviest: wp.float64  # see `inertia.stiffness`
+  skin: wp.float64  # distance from a geom within which a node touches it [m]
   # The organ:
   node: ints("nvert")  # node of a vertex
   free: ints("nnode")  # whether a node moves
@@ -61,11 +62,20 @@ class Patch:
   origin: doubles(3)  # position of its frame [m]
   tool_geom: ints("ntool")  # geoms that the slots follow
   # What a world has of its own:
-  grade: floats("nworld")  # place in GRADES of the scale of Young's modulus
+  grade: floats("nworld")  # place in GRADES of the scale of stiffness over that of mass
+  mass_scale: doubles("nworld")  # times the masses below
+  lump: floats("nlump", "nnode")  # factor on Young's modulus around a node; none where all have 1
   heavier: doubles("nworld")  # times its inertia at rest that a tool meets; 0 for once
   force: floats("nworld", "nnode", 3)  # contact force of the last step [N]
   last: vector  # last change of the velocity [m/s]
   before: vector  # the one before it [m/s]
+  # Where a reset puts it:
+  disp0: floats("nslice", 3, 8)  # displacement [m]
+  vel0: floats("nslice", 3, 8)  # velocity [m/s]
+  last0: floats("nslice", 3, 8)
+  before0: floats("nslice", 3, 8)
+  force0: floats("nnode", 3)  # contact force [N]
+  heavier0: doubles(1)
   # Within a step:
   tool: doubles("nworld", "ntool", len(GEOM))  # see GEOM
   count: ints("nworld")  # candidates
@@ -118,7 +128,8 @@ def constants(body, organ, tools: np.ndarray, model: mujoco.MjModel, inertia, he
     inertia: effective inertia of every vertex [kg]
     held: mass of every vertex, of pinned ones that of a wall [kg]
   """
-  mesh, touch = organ.mesh, _touch(organ, tools, model)
+  mesh, skin = organ.mesh, _skin(organ, model)
+  touch = _touch(mesh, skin + float(model.geom_margin[tools].max(initial=0.0)))
   node, nnode = body.shape.node.numpy(), body.shape.nnode
   elem = node[mesh.elem]
   count = np.bincount(elem.ravel(), minlength=nnode)
@@ -137,6 +148,7 @@ def constants(body, organ, tools: np.ndarray, model: mujoco.MjModel, inertia, he
     h=model.opt.timestep,
     rest_share=step.REST,
     weight=float(organ.mass.sum()),
+    skin=skin,
     node=node,
     free=by_node(organ.free),
     mass=by_node(organ.mass),
@@ -154,17 +166,20 @@ def constants(body, organ, tools: np.ndarray, model: mujoco.MjModel, inertia, he
   )  # fmt: skip
 
 
-def _touch(organ, tools: np.ndarray, model) -> np.ndarray:
+def _skin(organ, model) -> float:
+  """Returns the distance from an organ's triangles within which it touches [m]."""
+  flex = organ.windows.flex if organ.windows else [organ.flex]
+  return float(model.flex_radius[flex].max() + model.flex_margin[flex].max())
+
+
+def _touch(mesh, reach: float) -> np.ndarray:
   """Returns the distance from a geom within which a vertex's triangles may touch it [m]."""
-  mesh = organ.mesh
   edge = mesh.rest[mesh.elem[:, [1, 2, 0]]] - mesh.rest[mesh.elem]
   length = np.linalg.norm(edge, axis=2)
   longest = np.zeros(mesh.nvert)
   for corner in (mesh.elem, mesh.elem[:, [1, 2, 0]]):
     np.maximum.at(longest, corner.ravel(), length.ravel())
-  flex = organ.windows.flex if organ.windows else [organ.flex]
-  skin = float(model.flex_radius[flex].max() + model.flex_margin[flex].max())
-  return longest + skin + float(model.geom_margin[tools].max(initial=0.0))
+  return longest + reach
 
 
 def _tools(tools: np.ndarray, model, reach: float) -> np.ndarray:
@@ -188,10 +203,15 @@ def variables(nworld: int, nslot: int, nslice: int) -> dict:
     nslot=nslot,
     most=most,
     grade=np.full(nworld, np.log2(1.0 / GRADES[0])),
+    mass_scale=np.ones(nworld),
+    lump=np.zeros((0, nnode)),
     heavier=np.zeros(nworld),
     force=np.zeros((nworld, nnode, 3)),
     last=np.zeros(shape),
     before=np.zeros(shape),
+    **{f"{name}0": np.zeros(shape[1:]) for name in ("disp", "vel", "last", "before")},
+    force0=np.zeros((nnode, 3)),
+    heavier0=np.zeros(1),
     count=np.zeros(nworld),
     candidate=np.zeros((nworld, most)),
     distance=np.zeros((nworld, most)),

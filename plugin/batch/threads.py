@@ -19,6 +19,7 @@ from .base import Batch, Tissue, refuse_crowd, spread
 
 _FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
 _CTRL = mujoco.mjtState.mjSTATE_CTRL
+_ALL = mujoco.mjtState.mjSTATE_INTEGRATION
 _BAD = [
   int(getattr(mujoco.mjtWarning, f"mjWARN_{name}"))
   for name in ("BADQPOS", "BADQVEL", "BADQACC", "BADCTRL")
@@ -49,6 +50,7 @@ class Threads(Batch):
     self.models += [copy.copy(model) for _ in range(nworld - 1)]
     self.datas += [mujoco.MjData(each) for each in self.models[1:]]
     self._pool = ThreadPoolExecutor(min(nthread, nworld))
+    self._begin: np.ndarray | None = None
     self._organs = {name: _Tissue(self, name, number) for name, number in instances(model).items()}
 
   @property
@@ -61,13 +63,22 @@ class Threads(Batch):
     list(self._pool.map(work, range(self.nworld) if worlds is None else worlds))
 
   def _step(self, n: int):
-    ctrl = self.ctrl.numpy()
+    ctrl, first = self.ctrl.numpy(), self.model.sensor_adr
+    peak, mean = self.sensor_peak.numpy(), self.sensor_mean.numpy()
 
     def work(world: int):
-      data = self.datas[world]
+      model, data = self.models[world], self.datas[world]
       data.ctrl[:] = ctrl[world]
-      mujoco.mj_step(self.models[world], data, n)
-      self._look(world)
+      if not len(first):
+        mujoco.mj_step(model, data, n)
+        return self._look(world)
+      most, total = np.zeros(model.nsensor), np.zeros(model.nsensordata)
+      for _ in range(n):
+        mujoco.mj_step(model, data)
+        total += data.sensordata
+        np.maximum(most, np.add.reduceat(data.sensordata**2, first), out=most)
+      peak[world], mean[world] = np.sqrt(most), total / n
+      return self._look(world)
 
     self.each(work)
 
@@ -82,12 +93,39 @@ class Threads(Batch):
       self._reset_world(world)
 
   def _reset_world(self, world: int):
-    mujoco.mj_resetData(self.models[world], self.datas[world])
-    engine.place_windows(self.models[world], self.datas[world])
+    model, data = self.models[world], self.datas[world]
+    mujoco.mj_resetData(model, data)
+    if self._begin is not None:
+      mujoco.mj_setState(model, data, self._begin, _ALL)
+      data.time, data.ctrl[:] = 0.0, 0.0
+    engine.place_windows(model, data)
     self.ctrl.numpy()[world] = 0.0
 
   def _reset(self, mask: wp.array):
     self.each(self._reset_world, np.flatnonzero(mask.numpy()))
+
+  def _start(self, data: mujoco.MjData):
+    engine.sync(self.model, data)
+    self._begin = np.empty(mujoco.mj_stateSize(self.model, _ALL))
+    mujoco.mj_getState(self.model, data, self._begin, _ALL)
+
+  def _pose(self, adr: np.ndarray, values: np.ndarray, mask: wp.array):
+    for world in np.flatnonzero(mask.numpy()):
+      data = self.datas[world]
+      data.qpos[adr[:, 0]], data.qvel[adr[:, 1]] = values[world], 0.0
+
+  def _place(self, body: int, pos: np.ndarray, quat: np.ndarray, mask: wp.array):
+    for world in np.flatnonzero(mask.numpy()):
+      model = self.models[world]
+      model.body_pos[body], model.body_quat[body] = pos[world], quat[world]
+
+  def _configure(self, worlds: np.ndarray, gravity: np.ndarray | None, friction: dict):
+    for k, world in enumerate(worlds):
+      model = self.models[world]
+      if gravity is not None:
+        model.opt.gravity[:] = gravity[k]
+      for g, values in friction.items():
+        model.geom_friction[g, 0] = values[k]
 
   def _tell(self):
     for name in ("qpos", "qvel", "sensordata"):

@@ -18,7 +18,7 @@ from palpate.engine import plugin as engine
 from palpate.organ import instances
 from palpate.tissue import device as devices
 
-from . import contacts, states, strip
+from . import contacts, convex, kernels, states, strip
 from .base import Batch, Tissue, refuse_crowd
 from .organs import Organ
 from .rest import Rest
@@ -69,28 +69,42 @@ class Worlds(Batch):
         name: Organ(self, w, s, t)
         for (name, w), s, t in zip(spaces.items(), slots, tools, strict=True)
       }
-      self._rest = Rest(self, bare)
+      self._rest, self._bare = Rest(self, bare), bare
+      self._teller = states.Teller(self)
+      self._sensors = wp.array([*model.sensor_adr, model.nsensordata], dtype=int)
       self._alias()
       self._callbacks()
-      self.record()
+      try:
+        self.record()
+      except RuntimeError as error:
+        if not deterministic:
+          raise
+        raise ValueError(
+          f"nworld is {nworld}, too many for deterministic=True on {device}: mujoco_warp has no "
+          f"room to order its sums ({error}); expected fewer"
+        ) from None
     self._warned = False
     self.reset()
 
   def _put(self, bare, nslots, tools, deterministic, spaces):
     """Makes mujoco_warp's model and data."""
     model, nworld = self.model, self.nworld
-    cone = 1 if model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC else 2
+    self.paired = model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
     most = [contacts.most_of(model, t, n) for t, n in zip(tools, nslots, strict=True)]
     regions = [contacts.room_of(model, t) * n for t, n in zip(tools, nslots, strict=True)]
     condim = int(max([1, *model.flex_condim, *model.geom_condim]))
-    each = 1 if condim == 1 else condim if cone == 1 else 2 * (condim - 1)
+    each = 1 if condim == 1 else 2 * (condim - 1) if self.paired else condim
     between = _CONTACTS if strip.tools_meet(bare) else 0
     self.njmax = strip.rows_of(bare) + (between + sum(most)) * each
     ncon = between + sum(regions)
-    size = states.bytes_of(bare, self.njmax, ncon) + sum(Organ.bytes_of(w) for w in spaces.values())
+    size = states.bytes_of(bare, self.njmax, ncon) + sum(
+      Organ.bytes_of(w, self.device) for w in spaces.values()
+    )
+    size += sum(convex.bytes_of(model.geom_type[t], n) for t, n in zip(tools, nslots, strict=True))
     refuse_crowd(nworld, size, _room(self.device), str(self.device))
     try:
-      sizes = {"dof_armature": nworld, "body_invweight0": nworld}
+      own = ("dof_armature", "body_invweight0", "body_pos", "body_quat", "geom_friction")
+      sizes: dict[str, int] = {name: nworld for name in own}
       self.m = mjw.put_model(bare, batch_sizes=sizes)
     except (NotImplementedError, ValueError) as error:
       raise ValueError(f"mujoco_warp cannot have this scene: {error}") from None
@@ -145,6 +159,13 @@ class Worlds(Batch):
     self.begin()
     self.step_tools()
     self.end()
+    self._sense(kernels.sum_up, self.d.sensordata)
+
+  def _sense(self, kernel, what):
+    if self.model.nsensor:
+      inputs = [self._sensors, what, self._summary["peak"], self._summary["mean"]]
+      dim = (self.nworld, self.model.nsensor)
+      wp.launch(kernel, dim=dim, inputs=inputs, device=self.device)
 
   def _after(self):
     """Launches what follows steps: worlds that are not finite are reset and counted."""
@@ -153,7 +174,8 @@ class Worlds(Batch):
   def record(self):
     """Records the graphs, on a device that has them."""
     self._graphs = {}
-    work = {"step": self._once, "after": self._after, "reset": self._rest.launch}
+    work = {"step": self._once, "after": self._after}
+    work |= {"reset": self._rest.launch, "look": self._rest.look}
     for organ in self._organs.values():
       organ.load()
     if not self.device.is_cuda:
@@ -177,16 +199,45 @@ class Worlds(Batch):
   # Doing.
 
   def _step(self, n: int):
+    for sums in self._summary.values():
+      sums.zero_()
     for _ in range(n):
       self._run("step")
+    self._sense(kernels.average, n)
     self._run("after")
 
   def _reset(self, mask: wp.array):
     wp.copy(self.mask, mask)
     self._run("reset")
 
+  def _start(self, data: mujoco.MjData):
+    states.keep(self, self._rest.start, data)
+
+  def _pose(self, adr: np.ndarray, values: np.ndarray, mask: wp.array):
+    at = [np.searchsorted(kept, numbers) for kept, numbers in zip(self._kept, adr.T, strict=True)]
+    wp.copy(self.mask, mask)
+    self._rest.pose(np.stack(at, 1), values)
+    self._run("look")
+
+  def _place(self, body: int, pos: np.ndarray, quat: np.ndarray, mask: wp.array):
+    wp.copy(self.mask, mask)
+    self._rest.place(self._bare.body(self.model.body(body).name).id, pos, quat)
+    self._run("look")
+
+  def _configure(self, worlds: np.ndarray, gravity: np.ndarray | None, friction: dict):
+    changes: list[tuple[wp.array, tuple, np.ndarray]] = []
+    if gravity is not None:
+      changes.append((self.m.opt.gravity, (), gravity))
+    for g, values in friction.items():
+      changes.append((self.m.geom_friction, (g, 0), values))
+      changes += [change for organ in self._organs.values() for change in organ.rubs(g, values)]
+    for array, place, values in changes:
+      whole = array.numpy()
+      whole[(worlds, *place)] = values
+      array.assign(whole)
+
   def _tell(self):
-    states.tell(self)
+    self._teller.tell()
 
   def _get_state(self, world: int, data: mujoco.MjData):
     states.pull(self, world, data)

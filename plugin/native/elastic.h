@@ -8,165 +8,9 @@
 // (thesis eq. 5.19 with Rayleigh damping). K is the Hessian of the elastic energy with the
 // compressive part of its geometric term left out, which keeps A positive definite.
 #pragma once
-#include "simd.h"
+#include "hinges.h"
 
 namespace palpate {
-
-// Weight of K v on the right-hand side of a stage; `step` is h, h^2 + h damping, ., share ahead.
-PALPATE float weight_of_rate(int stage, const float* step) {
-  if (stage == NEUMANN) return 0.0f;
-  return step[1] - (stage == FIRST ? step[3] : 1.0f) * step[0] * step[0];
-}
-
-// Triangles.
-
-// A triangle's edges from corner 0, present and at rest. Rest vector plus difference of
-// displacements: float32 keeps the digits of small strains.
-struct Triangle {
-  V3 a, b, rest_a, rest_b;
-
-  // One over twice the area, which counts as a tenth of that at rest where it is less.
-  PALPATE V scale() const {
-    const V3 n = cross(a, b), rn = cross(rest_a, rest_b);
-    return 1.0f / vsqrt(vmax(dot(n, n), 0.01f * dot(rn, rn) + 1e-30f));
-  }
-};
-
-PALPATE Triangle triangle(const float* disp, const int* node, const float* rest, Lane lane) {
-  const V3 ra = ld3(rest, 0, lane), rb = ld3(rest, 3, lane), u = gather3(disp, node, lane);
-  return {ra + gather3(disp, node + 8, lane) - u, rb + gather3(disp, node + 16, lane) - u, ra, rb};
-}
-
-// Unit normal of each triangle; below a tenth of its rest area it fades, and the hinge forces too.
-template <class Fields>
-PALPATE void elem_normal(const Fields& f, Thread t, int) {
-  const float* disp = f.system.disp_trial.data + 24 * (size_t)t.world * f.shape.nslice;
-  each_slice(t, f.shape.nelemslice, [&](int s, Lane lane) {
-    const int* node = f.shape.elem_node.data + 24 * s;
-    const Triangle e = triangle(disp, node, f.shape.elem_rest.data + 48 * s, lane);
-    float* out = f.system.elem_normal.data + 32 * ((size_t)t.world * f.shape.nelemslice + s);
-    st3(out, e.scale() * cross(e.a, e.b), lane);
-  });
-}
-
-// Hinges.
-
-// Angle psi = 2 sin(theta / 2) between the normals l and r about an edge e, and cos(theta / 2): no
-// inverse trigonometry, and bounded when folded. Past a right angle the half angle comes from its
-// sine, which is better conditioned there.
-struct Angle { V psi, half; };
-
-PALPATE Angle angle(V3 l, V3 r, V3 e, V length2) {
-  const V cosine = dot(l, r), sine = dot(cross(l, r), e) / vsqrt(length2);
-  const V chalf = vsqrt(vmax(0.5f + 0.5f * cosine, splat(1e-12f)));
-  const V shalf = vsqrt(vmax(0.5f - 0.5f * cosine, splat(1e-12f)));
-  const V zero = splat(0.0f), size = select(sine < zero, -sine, sine);
-  return {select(cosine > zero, sine / chalf, 2.0f * select(sine < zero, -shalf, shalf)),
-          select(cosine > zero, chalf, 0.5f * size / shalf)};
-}
-
-// Strain impulse of each hinge: h (psi - psi0) and what K v has of it, by the gradient of theta
-// with the apexes' heights and feet (Bergou et al. 2006, Grinspun et al. 2003).
-template <class Fields>
-PALPATE void hinge_angle(const Fields& f, Thread t, int stage) {
-  const float* step = f.state.step.data + 4 * t.world;
-  const float h = step[0], gv = weight_of_rate(stage, step);
-  const float young = numbers(f, t.world)[YOUNG_SCALE];
-  const size_t base = 24 * (size_t)t.world * f.shape.nslice;
-  const float* disp = f.system.disp_trial.data + base;
-  const float* vel = f.system.vel_trial.data + base;
-  const float* normal = f.system.elem_normal.data + 32 * (size_t)t.world * f.shape.nelemslice;
-  each_slice(t, f.shape.nhingeslice, [&](int s, Lane lane) {
-    const int* node = f.shape.hinge_node.data + 32 * s;
-    const int* elem = f.shape.hinge_elem.data + 16 * s;
-    const float* rest = f.shape.hinge_rest.data + 72 * s;
-    const V3 re = ld3(rest, 0, lane), ra = ld3(rest, 3, lane), rb = ld3(rest, 6, lane);
-    const V3 u = gather3(disp, node, lane);
-    const V3 e = re + gather3(disp, node + 8, lane) - u;
-    V3 a = ra + gather3(disp, node + 16, lane) - u;
-    V3 b = rb + gather3(disp, node + 24, lane) - u;
-    const V3 l = gather3(normal, elem, lane), r = gather3(normal, elem + 8, lane);
-    const V length2 = vmax(dot(e, e), splat(1e-30f));
-    const Angle now = angle(l, r, e, length2);
-    // From the apexes' feet on the edge to the apexes, and how these move against their feet.
-    const V foot_l = dot(a, e) / length2, foot_r = dot(b, e) / length2;
-    a -= foot_l * e;
-    b -= foot_r * e;
-    const V3 v = gather3(vel, node, lane), w = gather3(vel, node + 8, lane);
-    V3 c = gather3(vel, node + 16, lane), d = gather3(vel, node + 24, lane);
-    c -= v + foot_l * (w - v);
-    d -= v + foot_r * (w - v);
-    // Heights of the apexes, not below a tenth of those at rest.
-    const V3 na = cross(ra, re), nb = cross(rb, re);
-    const V rest2 = 0.01f / vmax(dot(re, re), splat(1e-30f));
-    const V rate = -dot(l, c) / vsqrt(vmax(dot(a, a), dot(na, na) * rest2 + 1e-30f))
-      - dot(r, d) / vsqrt(vmax(dot(b, b), dot(nb, nb) * rest2 + 1e-30f));
-    const size_t out = (size_t)t.world * f.shape.nhingeslice + s;
-    const V change = now.psi - ld(f.shape.hinge_angle0.data, s, lane);
-    st(f.system.hinge_angle.data + 8 * out, 0, h * change + gv * now.half * rate, lane);
-    st(f.system.hinge_half.data + 8 * out, 0, now.half, lane);
-    // What the bending matrix may leave out here, see elem_corner.
-    const V fold = 4.0f - 4.0f * now.half * now.half + 2.0f * change * change;
-    const V gain = young * ld(f.tissue.hinge_gain.data, 5 * s, lane);
-    st(f.system.hinge_rough.data + 8 * out, 0, gain * fold, lane);
-  });
-}
-
-// Moment impulse of each hinge: a plate's hinges of one triangle act on each other.
-template <class Fields>
-PALPATE void hinge_moment(const Fields& f, Thread t, int) {
-  const size_t base = (size_t)t.world * f.shape.nhingeslice;
-  const float* angle = f.system.hinge_angle.data + 8 * base;
-  const float young = numbers(f, t.world)[YOUNG_SCALE];
-  each_slice(t, f.shape.nhingeslice, [&](int s, Lane lane) {
-    const int* near = f.shape.hinge_near.data + 32 * s;
-    const float* gain = f.tissue.hinge_gain.data + 40 * s;
-    V sum = ld(gain, 0, lane) * ld(angle, s, lane);
-    for (int k = 0; k < 4; ++k) sum += ld(gain, k + 1, lane) * gather(angle, near + 8 * k, 0, lane);
-    const V half = ld(f.system.hinge_half.data + 8 * base, s, lane);
-    st(f.system.hinge_moment.data + 8 * base, s, young * sum * half, lane);
-  });
-}
-
-// A triangle's part of minus moment times grad theta lies along its normal: one number a corner.
-//
-// The bending matrix n Q n^T takes normals of nodes for those of triangles, and rest heights. The
-// step is stable while the matrix is at least half the true Hessian; on thick shells, folded,
-// crushed or curved like their thickness, it fell short by factors of 10 to 100. What it leaves out
-// grows with a hinge's angle squared, and with moment times change of angle in the Hessian's second
-// derivatives; over the heights squared that is a stiffness, which the triangle's edges get. It
-// acts on dv alone, so no rest state depends on it, and a product with the matrix costs the same.
-template <class Fields>
-PALPATE void elem_corner(const Fields& f, Thread t, int) {
-  const float* disp = f.system.disp_trial.data + 24 * (size_t)t.world * f.shape.nslice;
-  const float* moment = f.system.hinge_moment.data + 8 * (size_t)t.world * f.shape.nhingeslice;
-  const float* rough = f.system.hinge_rough.data + 8 * (size_t)t.world * f.shape.nhingeslice;
-  each_slice(t, f.shape.nelemslice, [&](int s, Lane lane) {
-    const int* node = f.shape.elem_node.data + 24 * s;
-    const int* hinge = f.shape.elem_hinge.data + 24 * s;
-    const Triangle e = triangle(disp, node, f.shape.elem_rest.data + 48 * s, lane);
-    const V3 a = e.a, b = e.b, c = b - a;
-    const V scale = e.scale();
-    const V aa = dot(a, a), bb = dot(b, b), cc = dot(c, c), ab = dot(a, b);
-    const V ac = dot(a, c), bc = dot(b, c);
-    // Moment over height, and shares of the edge's two ends: 1 / height = |edge| / (2 area).
-    const V m0 = gather(moment, hinge, 0, lane) * scale;
-    const V m1 = gather(moment, hinge + 8, 0, lane) * scale;
-    const V m2 = gather(moment, hinge + 16, 0, lane) * scale;
-    const V l0 = vsqrt(cc), l1 = vsqrt(bb), l2 = vsqrt(aa);
-    const V i0 = m0 / vmax(l0, splat(1e-15f)), i1 = m1 / vmax(l1, splat(1e-15f));
-    const V i2 = m2 / vmax(l2, splat(1e-15f));
-    const size_t at = (size_t)t.world * f.shape.nelemslice + s;
-    // Edge 1 -> 2 seen from 0, edge 2 -> 0 from 1, edge 0 -> 1 from 2.
-    st3(f.system.elem_corner.data + 24 * at,
-        {m0 * l0 - i1 * (bb - ab) - i2 * (aa - ab), m1 * l1 - i0 * bc - i2 * ab,
-         m2 * l2 + i0 * ac - i1 * ab}, lane);
-    const V cover = scale * scale
-      * (gather(rough, hinge, 0, lane) * cc + gather(rough, hinge + 8, 0, lane) * bb
-         + gather(rough, hinge + 16, 0, lane) * aa);
-    st(f.system.elem_normal.data + 32 * at, 3, cover, lane);
-  });
-}
 
 // Membrane: St. Venant-Kirchhoff plane stress in the covariant basis (e1, e2) of a triangle,
 // E_ab = (e_a . e_b - E_a . E_b) / 2, S = C : E,
@@ -232,6 +76,33 @@ PALPATE Spring spring(V k, V3 t, V3 q) {
 
 // Rows of the matrix.
 
+// What the rows of a world are made from, and where they go: the blocks of the first slices to `held`,
+// as long as there is room, those of the others to `block`.
+struct Rows {
+  const float* disp;
+  const float* vel;
+  float *rhs, *diag, *inverse, *areavec, *normal, *block, *held;
+  const int* held_adr;
+  int room;  // floats of `held`
+
+  PALPATE bool holds(int s) const { return room > 0 && held_adr[s + 1] <= room; }
+  PALPATE float* blocks(int s, int row) const {
+    return holds(s) ? held + held_adr[s] : block + 72 * (size_t)row;
+  }
+};
+
+template <class Fields>
+PALPATE Rows rows(const Fields& f, int world) {
+  const size_t base = (size_t)world * f.shape.nslice;
+  return {
+    f.system.disp_trial.data + 24 * base, f.system.vel_trial.data + 24 * base,
+    f.system.rhs.data + 24 * base, f.system.diag.data + 8 * base,
+    f.system.inverse.data + 48 * base, f.system.areavec.data + 24 * base,
+    f.system.normal.data + 24 * base,
+    f.system.block.data + 72 * (size_t)world * f.shape.nslot, nullptr, f.shape.held_adr.data, 0
+  };
+}
+
 // The fan of a slice's nodes, see `Shape`; entries [k] and [k + 1] are the k-th triangle.
 struct Fan {
   int width;
@@ -241,21 +112,24 @@ struct Fan {
   const float* metric;
   const int* corner;
   const int* side;
+  const float* factor;  // on the moduli of its triangles, or null
   float* block;
 };
 
 template <class Fields>
-PALPATE Fan fan_of(const Fields& f, int world, int s, Lane lane) {
-  const int row = f.shape.slot_adr.data[s];
+PALPATE Fan fan_of(const Fields& f, int world, const Rows& at, int s, Lane lane) {
+  const int row = f.shape.slot_adr.data[s], width = f.shape.slot_adr.data[s + 1] - row;
   return {
-    f.shape.slot_adr.data[s + 1] - row,
+    width,
     ld(f.shape.degree.data, s, lane),
     f.shape.fan_node.data + 8 * (row + 2 * s),
     f.shape.fan_rest.data + 24 * (row + 2 * s),
     f.tissue.fan_metric.data + 40 * (row + s),
     f.shape.fan_corner.data + 8 * (row + s),
     f.shape.fan_side.data + 8 * (row + s),
-    f.system.block.data + 72 * ((size_t)world * f.shape.nslot + row),
+    f.lump.fan.data ? f.lump.fan.data + 8 * ((size_t)world * (f.shape.nslot + f.shape.nslice) + row + s)
+                    : nullptr,
+    at.blocks(s, row),
   };
 }
 
@@ -272,7 +146,7 @@ struct Sum {
 struct Motion { const float* disp; const float* vel; V3 u, v; };
 
 // What is asked of a fan: g = h^2 + h damping; `normal` has the stiffness that covers bending.
-struct Wanted { float g, spring, young; bool matrix, areas, bending; const float* normal; };
+struct Wanted { float g, spring, shear, lame; bool matrix, areas, bending; const float* normal; };
 
 // Adds the triangle of entries a and b, at rest ra and rb, to the area vector.
 PALPATE void area(Sum& sum, Metric g, V3 a, V3 b) {
@@ -303,8 +177,14 @@ PALPATE Sum around(const Fan& fan, const Motion& m, const Wanted& want, Lane lan
     V over = zero;
     if (want.bending && want.matrix)
       over = select(g.g11 > zero, gather(want.normal, fan.corner + 8 * k, 3, lane), zero);
-    if (want.spring == 0.0f) {
-      const Moduli c = moduli(g, want.young * ld(metric, 3, lane), want.young * ld(metric, 4, lane));
+    if (!SPRINGS || want.spring == 0.0f) {
+      V mu = want.shear * ld(metric, 3, lane), lambda = want.lame * ld(metric, 4, lane);
+      if (fan.factor) {
+        const V factor = ld(fan.factor, k, lane);
+        mu = factor * mu;
+        lambda = factor * lambda;
+      }
+      const Moduli c = moduli(g, mu, lambda);
       const Stress s = stress(c, r, p, t, q);
       if (k > 0) sum.force += (s.s11 + s.s12) * a + (s.s12 + s.s22) * b;
       const Stress pulled = tensile(s, g);
@@ -362,61 +242,73 @@ PALPATE S3 hold(const Fields& f, int stage, size_t at, V3& b, Lane lane) {
   return weight;
 }
 
-// Writes what is on the diagonal of slice s, at place `at` of all worlds, and the inverse of `self`,
-// the block there.
-template <class Fields>
-PALPATE void put_diagonal(const Fields& f, size_t at, int s, V diag, S3 self, Lane lane) {
-  st(f.system.diag.data + 8 * at, 0, diag, lane);
-  // Zero where a node cannot move, which keeps it out of the solve.
-  const S3 inv = inverse(self, ld(f.shape.free.data, s, lane));
-  float* out = f.system.inverse.data + 48 * at;
-  st3(out, 0, {inv.xx, inv.xy, inv.xz}, lane);
-  st3(out, 3, {inv.yy, inv.yz, inv.zz}, lane);
+// Writes what is on the diagonal of a slice, and the inverse of `self`, the block there: zero where a
+// node cannot move, which keeps it out of the solve.
+PALPATE void put_diagonal(float* diags, float* inverses, V free, V diag, S3 self, Lane lane) {
+  st(diags, 0, diag, lane);
+  const S3 inv = inverse(self, free);
+  st3(inverses, 0, {inv.xx, inv.xy, inv.xz}, lane);
+  st3(inverses, 3, {inv.yy, inv.yz, inv.zz}, lane);
 }
 
 // Right-hand side of each node and, for an implicit stage, its row of the matrix: one pass around
 // the fan of each node.
 template <class Fields>
-PALPATE void row(const Fields& f, Thread t, int stage) {
-  const float* step = f.state.step.data + 4 * t.world;
-  const float* number = numbers(f, t.world);
+struct Assembly {
+  const Fields& f;
+  const int world, stage;
+  const Rows& at;
+
+  const float* const step = f.state.step.data + 4 * world;
+  const float* const number = numbers(f, world);
   const float h = step[0], g = step[1], gv = weight_of_rate(stage, step);
   const float foundation = number[FOUNDATION];
-  const size_t base = (size_t)t.world * f.shape.nslice;
-  const size_t elem = (size_t)t.world * f.shape.nelemslice;
-  const float* disp = f.system.disp_trial.data + 24 * base;
-  const float* vel = f.system.vel_trial.data + 24 * base;
-  const float* normal = f.system.elem_normal.data + 32 * elem;
-  const float* corner = f.system.elem_corner.data + 24 * elem;
-  const bool bends = f.shape.nhingeslice > 0;
-  const bool areas = bends || number[BULK] != 0.0f || number[PRESSURE] != 0.0f;
-  const float young = number[YOUNG_SCALE];
+  const bool bends = BENDING && f.shape.nhingeslice > 0;
+  const bool areas = bends || (VOLUMES && (number[BULK] != 0.0f || number[PRESSURE] != 0.0f));
   const bool matrix = stage == FIRST || stage == LATER;
-  const Wanted want = {g, number[STIFFNESS], young, matrix, areas, bends, normal};
-  each_slice(t, f.shape.nslice, [&](int s, Lane lane) {
-    const size_t at = base + s;
-    const Fan fan = fan_of(f, t.world, s, lane);
-    const Motion m = {disp, vel, ld3(disp + 24 * s, lane), ld3(vel + 24 * s, lane)};
+  const float* const normal =
+    f.system.elem_normal.data + 32 * (size_t)world * f.shape.nelemslice;
+  const float* const corner =
+    f.system.elem_corner.data + 24 * (size_t)world * f.shape.nelemslice;
+  const Wanted want = {
+    g, number[STIFFNESS], number[SHEAR], number[LAME], matrix, areas, bends, normal
+  };
+
+  PALPATE void row(int s, Lane lane) const {
+    const size_t own = (size_t)world * f.shape.nslice + s;
+    const Fan fan = fan_of(f, world, at, s, lane);
+    const Motion m = {at.disp, at.vel, ld3(at.disp + 24 * s, lane), ld3(at.vel + 24 * s, lane)};
     Sum sum = around(fan, m, want, lane);
-    const V mass = ld(f.state.mass.data + 8 * at, 0, lane);
+    const V mass = ld(f.state.mass.data + 8 * own, 0, lane);
     const V kf = splat(foundation) * ld(f.shape.area.data, s, lane), diag = mass + g * kf;
-    V3 b = h * (sum.force + ld3(f.state.force_ext.data + 24 * at, lane) - kf * m.u)
+    V3 b = h * (sum.force + ld3(f.state.force_ext.data + 24 * own, lane) - kf * m.u)
       + gv * (sum.rate - kf * m.v);
-    if (stage == LATER) b -= mass * ld3(f.state.dvel.data + 24 * at, lane);
+    if (stage == LATER) b -= mass * ld3(f.state.dvel.data + 24 * own, lane);
     S3 self = splat(g) * sum.stiffness + diag;
-    if (f.state.hold.data) self = self + hold(f, stage, at, b, lane);
-    if (areas) st3(f.system.areavec.data + 24 * at, sum.area, lane);
+    if (f.state.hold.data) self = self + hold(f, stage, own, b, lane);
+    if (areas) st3(at.areavec + 24 * s, sum.area, lane);
     if (bends) {
       b = bending(fan, normal, corner, b, lane);
       // Hinges of squeezed triangles are stiffer than at rest; the normal's length makes up for it.
       const V scale = vsqrt(sum.squeeze / vmax(dot(sum.area, sum.area), splat(1e-30f)));
       const V3 n = scale * sum.area;
-      st3(f.system.normal.data + 24 * at, n, lane);
-      self = self + square(young * g * ld(f.tissue.bend_diag.data, s, lane), n);
+      st3(at.normal + 24 * s, n, lane);
+      const float* bend = f.lump.bend_diag.data ? f.lump.bend_diag.data + 8 * own
+                                                : f.tissue.bend_diag.data + 8 * s;
+      self = self + square(number[PLATE] * g * ld(bend, 0, lane), n);
     }
-    st3(f.system.rhs.data + 24 * at, b, lane);
-    if (want.matrix) put_diagonal(f, at, s, diag, self, lane);
-  });
+    st3(at.rhs + 24 * s, b, lane);
+    if (!matrix) return;
+    const V free = ld(f.shape.free.data, s, lane);
+    put_diagonal(at.diag + 8 * s, at.inverse + 48 * s, free, diag, self, lane);
+  }
+};
+
+template <class Fields>
+PALPATE void row(const Fields& f, Thread t, int stage) {
+  const Rows at = rows(f, t.world);
+  const Assembly<Fields> assembly{f, t.world, stage, at};
+  each_slice(t, f.shape.nslice, [&](int s, Lane lane) { assembly.row(s, lane); });
 }
 
 }  // namespace palpate

@@ -11,7 +11,7 @@
 // BLOCK is the most threads of a block, MAX_BLOCKS the most blocks of a world, WORDS what a world
 // has of words. Otherwise everything here has the same name and meaning for both devices.
 #pragma once
-#include "simd.h"
+#include "block.h"
 
 namespace palpate {
 
@@ -45,83 +45,6 @@ class OwnVector {
 };
 
 #if ON_CUDA
-
-// Memory of a block: two sets of what its warps and shares of blocks sum up to, and x, y, z and the
-// normal component of a vector at its nodes.
-using WarpSums = float[6][32];
-PALPATE WarpSums* warp_sums() {
-  __shared__ WarpSums sums[2];
-  return sums;
-}
-using BlockNodes = float[4 * BLOCK];
-PALPATE BlockNodes* block_nodes() {
-  __shared__ BlockNodes nodes[4];
-  return nodes;
-}
-
-// Three numbers and a turn in 128 bits.
-class Word {
- public:
-  static constexpr int SIZE = 4;  // floats
-
-  PALPATE Word() : low(0), high(0) {}
-  PALPATE Word(V3 a, unsigned turn)
-    : low(pair(a.x, __float_as_uint(a.y))), high(pair(a.z, turn)) {}
-  // That of a node of this block.
-  PALPATE static Word near(int at, unsigned turn) {
-    const BlockNodes* p = block_nodes();
-    return Word({p[0][at], p[1][at], p[2][at]}, turn);
-  }
-  PALPATE V3 value() const {
-    return {__uint_as_float((unsigned)low), __uint_as_float((unsigned)(low >> 32)),
-            __uint_as_float((unsigned)high)};
-  }
-  PALPATE unsigned turn() const { return (unsigned)(high >> 32); }
-  PALPATE void put(float* p) const {
-    asm volatile("{.reg .b128 w; mov.b128 w, {%1, %2}; st.relaxed.gpu.global.b128 [%0], w;}"
-      :: "l"(p), "l"(low), "l"(high) : "memory");
-  }
-  PALPATE void get(const float* p, bool wanted = true) {
-    asm volatile("{.reg .b128 w; .reg .pred q; setp.ne.b32 q, %3, 0; mov.b128 w, {%0, %1};"
-      " @q ld.relaxed.gpu.global.b128 w, [%2]; mov.b128 {%0, %1}, w;}"
-      : "+l"(low), "+l"(high) : "l"(p), "r"((int)wanted) : "memory");
-  }
-  PALPATE static unsigned long long pair(float a, unsigned b) {
-    return (unsigned long long)b << 32 | __float_as_uint(a);
-  }
-
- private:
-  unsigned long long low, high;
-};
-
-// One number and a turn in 64 bits.
-class HalfWord {
- public:
-  static constexpr int SIZE = 2;
-
-  PALPATE HalfWord() : bits(0) {}
-  PALPATE HalfWord(float a, unsigned turn) : bits(Word::pair(a, turn)) {}
-  PALPATE static HalfWord near(int at, unsigned turn) {
-    return HalfWord(block_nodes()[3][at], turn);
-  }
-  PALPATE float value() const { return __uint_as_float((unsigned)bits); }
-  PALPATE unsigned turn() const { return (unsigned)(bits >> 32); }
-  PALPATE void put(float* p) const {
-    asm volatile("st.relaxed.gpu.global.b64 [%0], %1;" :: "l"(p), "l"(bits) : "memory");
-  }
-  PALPATE void get(const float* p, bool wanted = true) {
-    asm volatile("{.reg .pred q; setp.ne.b32 q, %2, 0; @q ld.relaxed.gpu.global.b64 %0, [%1];}"
-      : "+l"(bits) : "l"(p), "r"((int)wanted) : "memory");
-  }
-
- private:
-  unsigned long long bits;
-};
-
-PALPATE float warp_sum(float v) {
-  for (int o = 16; o > 0; o >>= 1) v += __shfl_xor_sync(0xffffffffu, v, o);
-  return v;
-}
 
 template <Meeting FOR = MEMORY>
 class Group {
@@ -165,6 +88,16 @@ class Group {
     a = sums[0]; b = sums[1]; c = sums[2];
   }
   PALPATE void sync() { sum(0.0f); }
+  // The greatest number >= 0 of the threads of one block.
+  PALPATE float most(V v) {
+    const int at = threadIdx.x & 31;
+    WarpSums& mine = warp_sums()[flip];
+    flip ^= 1;
+    v = warp_most(v);
+    if (at == 0) mine[0][threadIdx.x >> 5] = v;
+    __syncthreads();
+    return warp_most(at < blockDim.x >> 5 ? mine[0][at] : 0.0f);
+  }
 
   // Slices of each block where each has its own, and where they begin.
   PALPATE int share(int nslice) const { return (nslice + nblock - 1) / nblock; }
@@ -197,10 +130,7 @@ class Group {
       nsum = nwarp < (nblock + 31) / 32 ? nwarp : (nblock + 31) / 32;
       from = 3;
     }
-    for (int c = 0; c < N; ++c) {
-      v[c] = 0.0f;
-      for (int w = 0; w < nsum; ++w) v[c] += mine[from + c][w];
-    }
+    for (int c = 0; c < N; ++c) v[c] = warp_sum(at < nsum ? mine[from + c][at] : 0.0f);
   }
 
   // The first warp sums over its block and tells the others.
@@ -382,6 +312,7 @@ class Group {
   PALPATE void sum(V u, V v, float& a, float& b) { a = sum_of(u); b = sum_of(v); }
   PALPATE void sum(V u, V v, V w, float& a, float& b, float& c) { sum(u, v, a, b); c = sum_of(w); }
   PALPATE void sync() {}
+  PALPATE float most(V v) { return __builtin_reduce_max(v); }
 };
 
 template <int OWN>

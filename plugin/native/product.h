@@ -17,34 +17,40 @@ struct Matrix {
   const int* bend_node;
   const float* bend_gain;
   const float* hold;  // of nodes that springs hold, or null
-  float bend;  // (h^2 + h damping) times the scale of Young's modulus, for the bending matrix
+  float bend;  // (h^2 + h damping) times the scale of the plate, for the bending matrix
   bool bends;  // whether there is one
+
+  // Runs body(blocks) for the blocks of slice s, whose first row is `row`.
+  template <class Body>
+  PALPATE void with_blocks(int, int row, Body body) const { INLINED body(block + 72 * (size_t)row); }
 };
 
 template <class Fields>
 PALPATE Matrix matrix(const Fields& f, int world) {
-  const size_t base = (size_t)world * f.shape.nslice;
+  const size_t base = (size_t)world * f.shape.nslice, nbend = f.shape.bend_adr.data[f.shape.nslice];
   return {
     f.system.block.data + 72 * (size_t)world * f.shape.nslot, f.system.diag.data + 8 * base,
     f.system.inverse.data + 48 * base, f.system.normal.data + 24 * base, f.shape.slot_adr.data,
-    f.shape.fan_node.data, f.shape.bend_adr.data, f.shape.bend_node.data, f.tissue.bend_gain.data,
+    f.shape.fan_node.data, f.shape.bend_adr.data, f.shape.bend_node.data,
+    f.lump.bend_gain.data ? f.lump.bend_gain.data + 8 * nbend * world : f.tissue.bend_gain.data,
     f.state.hold.data ? f.state.hold.data + 48 * base : nullptr,
-    f.state.step.data[4 * world + 1] * numbers(f, world)[YOUNG_SCALE], f.shape.nhingeslice > 0
+    f.state.step.data[4 * world + 1] * numbers(f, world)[PLATE], BENDING && f.shape.nhingeslice > 0
   };
 }
 
 // Row s of A z, where z is `own`:
 //   diag own + sum_j block_j (z_j - own) + bend normal sum_j gain_j (normal_j . z_j),
 // the last term with bending only. `z` says how a vector is read: `Vectors` or `Quads`.
-template <class Vector>
-PALPATE V3 product(const Matrix& a, const Vector& z, V3 own, int s, Lane lane) {
+template <class Any, class Vector>
+PALPATE V3 product(const Any& a, const Vector& z, V3 own, int s, Lane lane) {
   Carried out = ld(a.diag, s, lane) * own;
   {
     const int row = a.slot[s], width = a.slot[s + 1] - row;
-    const float* block = a.block + 72 * (size_t)row;
-    z.each_near(a.fan + 8 * (row + 2 * s + 1), width, lane, [&](V3 near) {
-      out = out + ld9(block, lane) * (near - own);
-      block += 72;
+    a.with_blocks(s, row, [&](const float* block) {
+      z.each_near(a.fan + 8 * (row + 2 * s + 1), width, lane, [&](V3 near) {
+        out = out + ld9(block, lane) * (near - own);
+        block += 72;
+      });
     });
   }
   if (a.hold) out = out + ld6(a.hold + 48 * s, lane) * own;

@@ -220,7 +220,8 @@ PALPATE void solid_row(const Fields& f, Thread t, int stage) {
     const float* block = f.system.block.data + 72 * (size_t)t.world * f.shape.nslot;
     for (int j = f.shape.slot_adr.data[s]; j < f.shape.slot_adr.data[s + 1]; ++j)
       self = self + symmetric(ld9(block + 72 * (size_t)j, lane));
-    put_diagonal(f, at, s, diag, splat(-1.0f) * self + diag + held, lane);
+    put_diagonal(f.system.diag.data + 8 * at, f.system.inverse.data + 48 * at,
+                 ld(f.shape.free.data, s, lane), diag, splat(-1.0f) * self + diag + held, lane);
   });
 }
 

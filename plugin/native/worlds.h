@@ -19,10 +19,6 @@ PALPATE void store_floats(float* p, D3 a) {
   p[1] = (float)a.y;
   p[2] = (float)a.z;
 }
-// R x, with R row by row.
-PALPATE D3 turned(const double* R, D3 x) {
-  return {dot(load(R), x), dot(load(R + 3), x), dot(load(R + 6), x)};
-}
 // R^T x.
 PALPATE D3 turned_back(const double* R, D3 x) { return add_turned({0.0, 0.0, 0.0}, R, x); }
 
@@ -48,13 +44,17 @@ PALPATE bool succeeded(const Fields& f, int world) {
   return f.solve.status.data[4 * world + 3] == 0.0f;
 }
 
-// The inertia that a tool meets at a node, which follows the scale of Young's modulus.
+// The inertia that a tool meets at a node, which follows the scales of Young's modulus and of mass.
 template <class Fields>
 PALPATE double inertia_of(const Fields& f, int world, int i) {
-  const float grade = f.grade.data[world];
+  float grade = f.grade.data[world];
+  if (f.lump.data) grade += log2f(f.lump.data[in_row(f, world, i)]);
+  const float last = (float)(f.ngrade - 1);
+  grade = grade < 0.0f ? 0.0f : grade > last ? last : grade;
   const int k = (int)grade < f.ngrade - 1 ? (int)grade : f.ngrade - 2;
   const double t = grade - k, low = f.inertia.data[k * f.nnode + i];
-  const double total = low + t * (f.inertia.data[(k + 1) * f.nnode + i] - low);
+  const double more = t * (f.inertia.data[(k + 1) * f.nnode + i] - low);
+  const double total = f.mass_scale.data[world] * (low + more);
   const D3 force = load_floats(f.force.data + 3 * in_row(f, world, i));
   return touched(force) && f.heavier.data[world] > 1.0 ? f.heavier.data[world] * total : total;
 }
@@ -78,13 +78,13 @@ PALPATE void tell_tools(const Fields& f, Thread t, int) {
 template <class Fields>
 PALPATE void enter_worlds(const Fields& f, Thread t, int) {
   const int w = t.world;
-  const double h = f.h;
+  const double h = f.h, masses = f.mass_scale.data[w];
   if (t.tid == 0) {
     float* step = f.solve.step.data + 4 * w;
     const double still = f.rest_share * 9.81 * h;
     step[0] = (float)h;
     step[1] = (float)(h * h + h * numbers(f, w)[DAMPING]);
-    step[2] = (float)(f.weight * still * still);
+    step[2] = (float)(masses * f.weight * still * still);
   }
   const D3 g = turned_back(f.frame.data, gravity(f, w));
   const double* tool = f.tool.data + (size_t)GEOM_LENGTH * w * f.ntool;
@@ -93,7 +93,7 @@ PALPATE void enter_worlds(const Fields& f, Thread t, int) {
     const D3 last = load_lane(f.last.data + at), before = load_lane(f.before.data + at);
     const D3 contact = load_floats(f.force.data + 3 * in_row(f, w, i));
     store_lane(f.solve.dvel_warm.data + at, forecast(last, before));
-    store_lane(f.solve.force_ext.data + at, f.mass.data[i] * g + contact);
+    store_lane(f.solve.force_ext.data + at, (masses * f.mass.data[i]) * g + contact);
     f.node_slot.data[in_row(f, w, i)] = -1;
     const D3 x = load(f.rest.data + 3 * i) + load_lane(f.solve.disp.data + at);
     const double far = nearest(tool, f.ntool, x);
@@ -111,7 +111,8 @@ PALPATE int candidates(const Fields& f, int world) {
   return all < f.most ? all : f.most;
 }
 
-// Chooses the candidates nearest to the tools; the order of nodes decides between equals.
+// Chooses the candidates nearest to the tools; the order of nodes decides between equals. Those that
+// touch and get no slot are counted.
 template <class Fields>
 PALPATE void rank(const Fields& f, Thread t, int) {
   const int n = candidates(f, t.world);
@@ -122,6 +123,7 @@ PALPATE void rank(const Fields& f, Thread t, int) {
     for (int p = 0; p < n; ++p)
       nearer += far[p] < far[q] || (far[p] == far[q] && node[p] < node[q]);
     f.chosen.data[t.world * f.most + q] = nearer < f.nslot;
+    if (nearer >= f.nslot && far[q] < f.skin) append(f.missed.data + t.world);
   });
 }
 
@@ -150,7 +152,7 @@ PALPATE void stand_on(const Fields& f, int world, int slot, int i) {
   const double more = inertia_of(f, world, i) - f.slot_mass;
   store_floats(f.dof_armature.data + adr, {more, more, more});
   float* inverse = (float*)f.body_invweight0.data + 2 * (world * f.nbody + f.bodyid + slot);
-  inverse[0] = (float)(1.0 / f.held.data[i]);
+  inverse[0] = (float)(1.0 / (f.mass_scale.data[world] * f.held.data[i]));
 }
 
 // Gives the slots to the chosen nodes, in their order.
@@ -268,21 +270,21 @@ PALPATE void find_bad(const Fields& f, Thread t, int) {
   if (bad) f.bad.data[t.world] = 1;
 }
 
-// Puts the organ of the worlds of a mask at rest, and the tools where they are in qpos0.
+// Puts the organ of the worlds of a mask where it starts.
 template <class Fields>
 PALPATE void rest_organ(const Fields& f, Thread t, int) {
   const int w = t.world;
   if (!f.mask.data[w]) return;
-  const D3 zero = {0.0, 0.0, 0.0};
-  if (t.tid == 0) f.heavier.data[w] = 0.0;
+  if (t.tid == 0) f.heavier.data[w] = f.heavier0.data[0];
   each_item(t, f.nnode, [&](int i) {
     const size_t at = at_node(f, w, i);
-    store_lane(f.solve.disp.data + at, zero);
-    store_lane(f.solve.vel.data + at, zero);
-    store_lane(f.solve.dvel.data + at, zero);
-    store_lane(f.last.data + at, zero);
-    store_lane(f.before.data + at, zero);
-    store_floats(f.force.data + 3 * in_row(f, w, i), zero);
+    const int from = offset_of(i);
+    store_lane(f.solve.disp.data + at, load_lane(f.disp0.data + from));
+    store_lane(f.solve.vel.data + at, load_lane(f.vel0.data + from));
+    store_lane(f.last.data + at, load_lane(f.last0.data + from));
+    store_lane(f.before.data + at, load_lane(f.before0.data + from));
+    store_lane(f.solve.dvel.data + at, {0.0, 0.0, 0.0});
+    store_floats(f.force.data + 3 * in_row(f, w, i), load_floats(f.force0.data + 3 * i));
   });
   each_item(t, f.nslot, [&](int k) { wait(f, w, k); });
 }

@@ -2,9 +2,8 @@
 
 A kernel takes the number of threads that work on a world, one number that says what to do (a stage,
 a flag) and one struct, or where it is; its native function gets the struct, the `Thread` and that
-number. So an
-argument list is written once, as the fields of the struct (`types`). Numbers that both languages
-know are written in Python and printed as `constexpr` before the headers.
+number. So an argument list is written once, as the fields of the struct (`types`). Numbers that
+both languages know are written in Python and printed as `constexpr` before the headers.
 """
 
 from __future__ import annotations
@@ -82,6 +81,8 @@ def kernel(
   struct,
   constants: Mapping[str, int | float],
   bounds: tuple[int, int] | int | None = None,
+  tag: str = "",
+  fast: bool = False,
 ) -> Kernel:
   """Returns the kernel that calls palpate::name(fields, thread, arg) for each thread.
 
@@ -94,6 +95,8 @@ def kernel(
     struct: the Warp struct that it takes
     constants: numbers by name that the header knows
     bounds: threads of a block at most, and blocks that a multiprocessor must have room for
+    tag: what tells a module from others of the header with other constants
+    fast: whether quotients and roots may be off in the last digit on CUDA
   """
   known = tuple(constants.items())
 
@@ -115,16 +118,18 @@ def kernel(
 
   def made(entry, kind: str, bounds) -> wp.Kernel:
     entry.__name__ = entry.__qualname__ = name
-    entry.__module__ = module = _module(header, kind, known)
+    entry.__module__ = module = _module(header, kind, known, tag)
+    if fast and kind == "cuda":
+      wp.set_module_options({"fast_math": True}, module)
     return wp.kernel(enable_backward=False, launch_bounds=bounds, module=module)(entry)
 
   return Kernel(struct, made(brought, "cuda", bounds), made(pointed, "cpu", None))
 
 
 @functools.cache
-def _module(header: str, kind: str, constants: tuple) -> str:
+def _module(header: str, kind: str, constants: tuple, tag: str) -> str:
   """Declares the Warp module of a header for one kind of device and returns its name."""
-  name = f"palpate.{kind}.{header.removesuffix('.h')}"
+  name = f"palpate.{kind}.{header.removesuffix('.h')}{tag}"
   preamble = _constexpr(dict(constants)) + f'\n#include "{header}"\n'
   options = wp.ModuleBuildOptions(
     extra_cpu_include_dirs=[str(NATIVE)],

@@ -23,13 +23,14 @@ its first-order Neumann polynomial about D = diag W,
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
 import warp as wp
 
 from .body import Body
-from .device import BLOCK, block, group_size, threads
+from .device import BLOCK, Plan, block, group_size, reserve, threads
 from .kernels import Kernel, kernel
 from .types import CONSTANTS, Cycle, Fields, Stage
 
@@ -116,8 +117,31 @@ def _together(kernel: Kernel, body: Body, arg: int, fields: Any = None, per_sm: 
 
 def kernels(body: Body) -> list[Kernel]:
   """Returns a kernel of each module that a body's step needs."""
+  if body.plan:
+    return [_world_step(body.plan)]
   found = [_solid_row if body.is_solid else _row, _predict, _solve]
   return found if body.levels is None else [*found, _sample]
+
+
+def _world_step(plan: Plan) -> Kernel:
+  """Returns the kernel of a world's whole step by one block."""
+  return _world_kernel(dataclasses.replace(plan, nbytes=0))
+
+
+@functools.cache
+def _world_kernel(plan: Plan) -> Kernel:
+  kinds = {"BENDING": plan.bends, "SPRINGS": plan.springs, "VOLUMES": plan.volumes}
+  constants = _CONSTANTS | {"OWN": plan.own} | {name: int(kind) for name, kind in kinds.items()}
+  tag = f".{plan.own}.{plan.threads}.{plan.per_sm}." + "".join(str(int(k)) for k in kinds.values())
+  bounds = (plan.threads, plan.per_sm)
+  return kernel("step_world", "whole.h", Fields, constants, bounds, tag, fast=plan.own > 0)
+
+
+def _by_block(body: Body, plan: Plan, stage: Stage):
+  """Takes the step of `implicit`, or the answer to it, a block a world."""
+  step_world = _world_step(plan)
+  reserve(step_world.on(body.device), body.device, plan)
+  step_world.launch(body.device, body.nworld, plan.threads, stage, body.fields, plan.threads)
 
 
 # The linear system.
@@ -185,6 +209,9 @@ def solve(body: Body, stage: Stage):
 
 
 def _implicit(body: Body):
+  if body.plan:
+    _by_block(body, body.plan, Stage.FIRST)
+    return
   body.system.change.zero_()
   nslice = body.shape.nslice
   _over(_edge_change, body, nslice)
@@ -233,7 +260,10 @@ def _direct(body: Body, stage: Stage):
 
 
 def _respond(body: Body):
-  solve(body, Stage.RESPONSE)
+  if body.plan:
+    _by_block(body, body.plan, Stage.RESPONSE)
+  else:
+    solve(body, Stage.RESPONSE)
 
 
 def _respond_centred(body: Body):
@@ -254,6 +284,7 @@ class Scheme:
     respond: writes to `system.sol` how the impulses in `system.rhs` [N s] change the velocity in
       the step just computed; None where the scheme has no such answer
     levels: whether coarser meshes serve its solve
+    whole: whether a block of threads can take a world's whole step
     ahead: whether it takes forces where the present velocity leads
     solids: whether it can step tetrahedra, and springs that hold nodes
   """
@@ -262,6 +293,7 @@ class Scheme:
   gain: Callable[[float, float], float]
   respond: Callable[[Body], None] | None = None
   levels: bool = False
+  whole: bool = False
   ahead: bool = False
   solids: bool = True
 
@@ -276,7 +308,7 @@ def _whole(h: float, damping: float) -> float:
 
 
 SCHEMES = {
-  "implicit": Scheme(_implicit, _whole, _respond, levels=True, ahead=True),
+  "implicit": Scheme(_implicit, _whole, _respond, levels=True, whole=True, ahead=True),
   "midpoint": Scheme(_midpoint, lambda h, b: 0.5 * _whole(h, b), _respond_centred, levels=True),
   "neumann": Scheme(_neumann, _whole, solids=False),
   "explicit": Scheme(_explicit, lambda h, b: 0.0),

@@ -5,7 +5,7 @@ import numpy as np
 import palpate
 import palpate.batch
 import pytest
-from scenes import drive, load, needs_cuda, press, probed
+from scenes import RADIUS, drive, load, needs_cuda, press, probed
 
 BACKENDS = [
   "cpu",
@@ -131,9 +131,130 @@ def test_each_world_has_a_tissue_of_its_own(make):
   assert 0 < force[0] < 0.95 * force[1] < 0.9 * force[2]
 
 
-def test_friction_is_that_of_a_world(make):
+@pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
+def test_sliding_is_that_of_the_plugin(make, cone):
+  made = probed(cone=cone)
+  model, data, organ = load(made)
+  batch = make(made, 2)
+  found = []
+  for k in range(220):
+    data.ctrl[:] = -0.007 * min(1, k / 60), 0.01 * np.clip(k / 100 - 1, 0, 1)
+    batch.ctrl = np.tile(data.ctrl, (2, 1))
+    mujoco.mj_step(model, data)
+    batch.step()
+    force = batch.organ("organ").contact_force.numpy()[0].sum(axis=0)
+    found.append((force, organ.contact_force.sum(axis=0)))
+  found = np.array(found)
+  peak = np.abs(found[:, 1]).max()
+  assert np.sqrt(np.mean((found[:, 0] - found[:, 1]) ** 2)) < 0.005 * peak
+  assert np.abs(found[:, 1, 0]).max() > 0.2 * peak  # it slides
+
+
+@pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
+def test_contacts_have_the_normal_forces(make, cone):
+  batch = make(probed(cone=cone), 2)
+  tissue = batch.organ("organ")
+  if make.device == "cpu":
+    with pytest.raises(ValueError, match=r"batch\.datas"):
+      tissue.contacts  # noqa: B018
+    return
+  batch.ctrl = np.array([[-0.006, 0.0], [-0.004, 0.0]])
+  batch.step(150)
+  geom, normal, force = (array.numpy() for array in tissue.contacts)
+  assert set(geom[geom >= 0]) == {batch.model.geom("tip").id} and not force[geom < 0].any()
+  pushed = (normal * force[..., None] * (geom >= 0)[..., None]).sum(axis=1)
+  found = tissue.contact_force.numpy().sum(axis=1)
+  np.testing.assert_allclose(pushed[:, 2], found[:, 2], rtol=0.03)
+
+
+def test_a_solid_is_that_of_the_plugin(make):
+  made = probed(keys={"elements": "solid", "young": 3e3, "foundation": None})
+  model, data, organ = load(made)
+  batch = make(made, 2)
+  found = []
+  for k in range(100):
+    data.ctrl[:] = -0.007 * min(1, k / 60), 0.005 * np.clip(k / 70 - 1, 0, 1)
+    batch.ctrl = np.tile(data.ctrl, (2, 1))
+    mujoco.mj_step(model, data)
+    batch.step()
+    force = batch.organ("organ").contact_force.numpy()[0].sum(axis=0)
+    found.append((force, organ.contact_force.sum(axis=0)))
+  found = np.array(found)
+  assert np.sqrt(np.mean((found[:, 0] - found[:, 1]) ** 2)) < 0.005 * np.abs(found[:, 1]).max()
+  np.testing.assert_allclose(batch.organ("organ").xpos.numpy()[0], organ.xpos, atol=2e-5)
+  back = mujoco.MjData(batch.model)
+  batch.get_state(1, back)
+  batch.set_state(0, back)
+  assert np.isfinite(batch.organ("organ").xpos.numpy()).all()
+
+
+TISSUES = [
+  (0, {"poisson": [0.45, 0.2, 0.49], "thickness": [0.002, 0.003, 0.001]}),
+  (1, {"thickness": [0.002, 0.004, 0.0015], "young": [2e4, 3e4, 4e4]}),
+  (0, {"young": "lumps"}),
+  (1, {"young": "lumps"}),
+]
+
+
+@pytest.mark.parametrize(("bend", "keys"), TISSUES)
+def test_tissues_of_worlds_are_those_of_the_plugin(make, bend, keys):
+  made, keys = press(bend=bend, foundation=2e4), dict(keys)
+  forces = []
+  for device in (make.device, "cpu"):
+    batch = palpate.batch.make(spec(made), 3, device=device)
+    tissue = batch.organ("organ")
+    if isinstance(keys.get("young"), str):
+      middle = tissue.xpos.numpy()[0][tissue.elem].mean(axis=1)
+      places = [[[0, 0, RADIUS]], [[RADIUS, 0, 0]], [[0.02, 0, 0.045]]]
+      lump = np.linalg.norm(middle - places, axis=2)
+      keys["young"] = np.where(lump < 0.025, 1.5e5, 3e4)
+    tissue.configure(**keys)
+    found = []
+    for k in range(100):
+      batch.ctrl = np.full((3, 1), -0.008 * min(1, k / 60))
+      batch.step()
+      found.append(tissue.contact_force.numpy().sum(axis=1)[:, 2])
+    forces.append(np.array(found))
+  peak = np.abs(forces[1]).max(axis=0)
+  assert (np.sqrt(np.mean((forces[0] - forces[1]) ** 2, axis=0)) < 0.003 * peak).all()
+  assert np.ptp(peak) > 0.1 * peak.max()
+
+
+def test_a_mass_of_its_own_is_that_of_a_world(make):
+  if make.device == "cpu":
+    pytest.skip("the CPU's models have their masses")
+  batch = make(press(bend=0, foundation=2e4), 2)
+  batch.organ("organ").configure(mass=[0.05, 0.3])
+  models = [load(press(bend=0, foundation=2e4).replace('mass="0.1"', f'mass="{m}"'))
+            for m in (0.05, 0.3)]  # fmt: skip
+  for k in range(60):
+    batch.ctrl = np.full((2, 1), -0.0001 * k)
+    batch.step()
+    for model, data, _ in models:
+      data.ctrl[0] = -0.0001 * k
+      mujoco.mj_step(model, data)
+  found = batch.organ("organ").contact_force.numpy().sum(axis=1)
+  expected = [organ.contact_force.sum(axis=0) for _, _, organ in models]
+  np.testing.assert_allclose(found, expected, atol=0.005 * np.abs(expected).max())
+
+
+def test_gravity_is_that_of_a_world(make):
+  batch = make(press(bend=0, foundation=1e4), 3)
+  batch.configure([False, True, True], gravity=[[0, 0, 1], [0, 0, -9.81], [9.81, 0, 0]])
+  batch.ctrl = np.full((3, 1), 0.02)
+  batch.step(200)
+  moved = (batch.organ("organ").xpos.numpy() - batch.organ("organ").xpos.numpy()[:1]).mean(axis=1)
+  assert moved[1, 2] < -1e-3 and moved[2, 0] > 1e-3
+  assert abs(moved[1, 2] + moved[2, 0]) < 1e-4
+
+
+@pytest.mark.parametrize("side", ["organ", "probe"])
+def test_friction_is_that_of_a_world(make, side):
   batch = make(probed(condim=3), 2)
-  batch.organ("organ").configure(friction=[0.5, 1.5])  # the probe's is 0.5, and the greater counts
+  if side == "organ":
+    batch.organ("organ").configure(friction=[0.5, 1.5])  # the probe's is 0.5, the greater counts
+  else:
+    batch.configure(friction={"tip": [0.5, 1.5]})
   most = np.zeros(2)
   for k in range(100):
     batch.ctrl = np.tile([-0.006, 0.01 * max(0, k / 50 - 1)], (2, 1))
@@ -200,3 +321,114 @@ def test_bad_input_is_named():
     tissue.configure(young_scale=[1.0, 2.0, 3.0])
   with pytest.raises(ValueError, match="friction"):
     tissue.configure(friction=-1)
+
+
+def test_sensors_are_summed_up_over_the_steps_of_a_call():
+  extra = '<sensor><jointpos joint="z"/><subtreelinvel body="tool"/></sensor>'
+  made = probed().replace("</mujoco>", extra + "</mujoco>")
+  batch, one = (palpate.batch.make(spec(made), 2) for _ in range(2))
+  model = batch.model
+  for each in (batch, one):
+    each.ctrl = np.array([[-0.004, 0.0], [-0.002, 0.001]])
+  batch.step(30)
+  seen = []
+  for _ in range(30):
+    one.step()
+    seen.append(one.sensordata.numpy().copy())
+  parts = [slice(a, a + n) for a, n in zip(model.sensor_adr, model.sensor_dim, strict=True)]
+  peak = np.stack([np.linalg.norm(np.array(seen)[..., p], axis=2).max(axis=0) for p in parts], 1)
+  np.testing.assert_allclose(batch.sensor_peak.numpy(), peak, rtol=1e-5)
+  np.testing.assert_allclose(batch.sensor_mean.numpy(), np.mean(seen, axis=0), rtol=1e-5, atol=1e-9)
+
+
+def test_reset_goes_to_the_state_it_was_given_and_joints_and_bodies_to_theirs():
+  made = spec(probed())
+  made.worldbody.add_body(name="mark", pos=[0, 0, 0])
+  batch = palpate.batch.make(made, 3)
+  model, data = batch.model, mujoco.MjData(batch.model)
+  drive(model, data, 60)
+  batch.start(data)
+  batch.step(5)
+  mask = np.array([True, False, True])
+  before = batch.qpos.numpy().copy()
+  batch.reset(mask)
+  np.testing.assert_allclose(batch.qpos.numpy()[::2], np.tile(data.qpos, (2, 1)), atol=1e-7)
+  assert np.array_equal(batch.qpos.numpy()[1], before[1]) and batch.time.numpy()[0] == 0
+  adr = [int(model.joint(name).qposadr[0]) for name in "zx"]
+  batch.pose("zx", np.arange(6.0).reshape(3, 2) * 1e-3, mask)
+  assert batch.qpos.numpy()[2, adr] == pytest.approx([0.004, 0.005])
+  assert np.array_equal(batch.qpos.numpy()[1], before[1])
+  with pytest.raises(ValueError, match=r"values has shape \(2,\), expected \(3, 2\)"):
+    batch.pose("zx", [0, 0])
+  batch.place("mark", np.tile([1.0, 2, 3], (3, 1)), np.tile([1.0, 0, 0, 0], (3, 1)), mask)
+  assert not batch.model.body("mark").pos.any()
+  with pytest.raises(ValueError, match="body 'tool' has joints"):
+    batch.place("tool", np.zeros((3, 3)), np.zeros((3, 4)))
+
+
+def hung():
+  """Returns `probed` with its probe on a post that has no joint, and sensors of the probe."""
+  post = '<body name="post" pos="0 0 0.001"><body name="tool"'
+  made = probed().replace('<body name="tool"', post)
+  made = made.replace('friction="0.5"/></body>', 'friction="0.5"/><site name="tip"/></body></body>')
+  sensors = '<sensor><force site="tip"/><framelinvel objtype="site" objname="tip"/></sensor>'
+  return made.replace("</mujoco>", sensors + "</mujoco>")
+
+
+@pytest.fixture
+def both(make):
+  """Returns what makes a batch on the backend and one on the CPU."""
+  return lambda made, n: [
+    palpate.batch.make(spec(made), n, device=device) for device in (make.device, "cpu")
+  ]
+
+
+def test_worlds_start_where_they_are_told(both):
+  made = hung()
+  model, data, _ = load(made)
+  data.ctrl[:] = -0.007, 0.002
+  for _ in range(60):
+    mujoco.mj_step(model, data)
+  data.ctrl[:] = 0
+  found = []
+  for batch in both(made, 3):
+    batch.start(data)
+    batch.reset(np.array([True, False, True]))
+    at = batch.organ("organ").xpos.numpy().copy()
+    batch.ctrl = np.array([[-0.007, 0.0], [-0.007, 0.0], [-0.005, 0.001]])
+    batch.step(20)
+    found.append((at, batch.organ("organ").xpos.numpy(), batch.time.numpy()))
+  np.testing.assert_allclose(found[0][0], found[1][0], atol=1e-7)
+  np.testing.assert_allclose(found[0][1], found[1][1], atol=2e-6)
+  np.testing.assert_allclose(found[0][2], found[1][2], rtol=1e-5)
+  assert np.abs(found[0][0][0] - found[0][0][1]).max() > 1e-3
+
+
+def test_joints_and_bodies_are_put_somewhere_a_world(both):
+  found = []
+  for batch in both(hung(), 3):
+    mask = np.array([True, True, False])
+    turned = np.array([[1, 0, 0, 0], [0.9848, 0, 0.1736, 0], [1, 0, 0, 0]])
+    batch.place("post", [[0, 0, 0.001], [0, 0.002, 0.002], [1, 1, 1]], turned, mask)
+    batch.pose(["x", "z"], [[0.001, -0.001], [0.0, -0.002], [9, 9]], mask)
+    at = batch.qpos.numpy()[:, -2:].copy()
+    batch.ctrl = np.tile([-0.008, 0.001], (3, 1))
+    batch.step(60)
+    found.append((at, batch.organ("organ").contact_force.numpy().sum(axis=1), batch.qpos.numpy()))
+  np.testing.assert_allclose(found[0][0], [[-0.001, 0.001], [-0.002, 0], [0, 0]], atol=1e-7)
+  np.testing.assert_allclose(found[0][1], found[1][1], atol=2e-4)
+  np.testing.assert_allclose(found[0][2][:, -2:], found[1][2][:, -2:], atol=1e-6)
+  assert np.abs(found[0][1][:, 2]).min() > 0.02 and np.ptp(found[0][1][:, 2]) > 0.004
+
+
+def test_sensors_are_summed_up_over_a_call(both):
+  found = []
+  for batch in both(hung(), 2):
+    batch.ctrl = np.array([[-0.008, 0.0], [-0.004, 0.001]])
+    batch.step(30)
+    batch.step(20)
+    found.append([a.numpy() for a in (batch.sensor_peak, batch.sensor_mean, batch.sensordata)])
+  for a, b in zip(*found, strict=True):
+    np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4)
+  peak, _, last = found[0]
+  assert (peak[:, 1] >= np.linalg.norm(last[:, 3:], axis=1) * 0.999).all() and peak.min() > 0

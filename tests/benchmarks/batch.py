@@ -66,7 +66,7 @@ def measure(
   device: str,
   nodes: int,
   nworld: int,
-  slots: int,
+  slots: int | None,
   bend: float,
   condim: int,
   tolerance: float,
@@ -98,7 +98,7 @@ def measure(
     "device": device,
     "nodes": tissue.nvert,
     "nworld": nworld,
-    "slots": slots,
+    "slots": slots or 0,
     "bend": bend,
     "condim": condim,
     "tolerance": tolerance,
@@ -147,7 +147,7 @@ def arguments(parser: argparse.ArgumentParser):
   add("--bend", type=float, nargs="+", default=[0.0, 1.0])
   add("--condim", type=int, nargs="+", default=[1])
   add("--tolerance", type=float, default=1e-3)
-  add("--slots", type=int, default=16, help="nodes that the ball may touch (%(default)s)")
+  add("--slots", type=int, help="nodes that the ball may touch; what its size asks for")
   add("--repeat", action="store_true", help="runs that repeat to the bit whatever the GPU does")
 
 
@@ -156,8 +156,9 @@ def stages(args: argparse.Namespace) -> list[list[Case]]:
   keys = {"device": args.device, "tolerance": args.tolerance, "repeat": args.repeat}
   keys |= {"slots": args.slots}
   worlds = args.worlds or ([8] if args.device == "cpu" else [1024, 4096, 16384])
+  kind = f"{args.slots or 0}{'-repeat' * args.repeat}"
   cases = [
-    {"case": f"{n}-{w}-{bend:g}-{c}-{args.slots}{'-repeat' * args.repeat}", "nodes": n, "nworld": w}
+    {"case": f"{n}-{w}-{bend:g}-{c}-{kind}", "nodes": n, "nworld": w}
     | {"bend": bend, "condim": c}
     | keys
     for bend, c, n, w in itertools.product(args.bend, args.condim, args.nodes, worlds)
