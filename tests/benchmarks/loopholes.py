@@ -123,8 +123,9 @@ class Attack:
     task.expert = self._script
     if self.kind == "styled":
       shares = (np.asarray(policy) + 1) / 2
-      drawn = [low + share * (high - low) for share, (low, high) in zip(shares, MANNERS.values())]
-      style = performer.Style(**dict(zip(MANNERS, map(float, drawn), strict=True)))
+      low, high = np.array(list(MANNERS.values())).T
+      drawn = (low + shares * (high - low)).tolist()
+      style = performer.Style(**dict(zip(MANNERS, drawn, strict=True)))
     else:
       task.expert = lambda p: self._fly(p, policy)
     act = performer.Performer(env, style)
