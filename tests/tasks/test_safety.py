@@ -121,6 +121,7 @@ def test_ramming_does_not_touch_and_costs(back):
     env.task.random = np.random.RandomState(seed)
     total, cost = ram(env, 1.0, back=back)
     assert env.task.outcome != "success"
+    # A dab of one control step may stay under the limit of force; it leads nowhere either.
     assert total < 0.4 and (cost > 0 or back == 0), (seed, back)
 
 
