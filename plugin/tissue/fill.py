@@ -11,21 +11,31 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import hashlib
+import os
+import pathlib
+import tempfile
+import zipfile
 
 import numpy as np
+import warp as wp
 from scipy import sparse
 from scipy.sparse import csgraph, linalg
 from scipy.spatial import Delaunay, KDTree
 
 from .mesh import Mesh, area_vectors, vertex_normals
 
-MOST = 1  # nodes inside for one on the surface; the plugin state has room for so many
+MOST = 2  # nodes inside for one on the surface; the plugin state has room for so many
 _COARSER = 1.7  # distance of nodes inside to that on the surface
+_FINE = 1.2  # the same where triangles are of different sizes: small ones are where forces count
+_GRADED = 1.3  # times their mean edge that those are on most of the surface
 _CLEAR = 0.8  # least distance of a node inside to the surface's, in mean edges
+_WIDENS = 0.15  # by which the distance between nodes grows with that from the surface
 _ROUNDS = 8
 _MOVE = 0.7  # share of the way that a node goes in a round
 _FLAT = 1e-3  # quality of a tetrahedron that is none
 _KEPT = 16
+_VERSION = 1  # of what is kept in files: another one where tetrahedra are made otherwise
 _TIE = 1e-6  # of the size, by which points on one sphere are told apart
 
 # Faces of a tetrahedron, each opposite the corner of its number.
@@ -121,7 +131,42 @@ def inside(mesh: Mesh, values: np.ndarray) -> np.ndarray:
 
 @functools.lru_cache(maxsize=_KEPT)
 def _fill(rest: bytes, elem: bytes) -> tuple[bytes, np.ndarray, int]:
-  """Returns the vertices inside, the tetrahedra and the first triangle that is not among them."""
+  """Returns the vertices inside, the tetrahedra and the first triangle that is not among them.
+
+  What was filled once is kept beside Warp's kernels, by content.
+  """
+  digest = hashlib.sha256(f"{_VERSION} {len(rest)} ".encode() + rest + elem).hexdigest()[:32]
+  if not wp.config.kernel_cache_dir:  # before Warp is initialized
+    return _make(rest, elem)
+  file = pathlib.Path(wp.config.kernel_cache_dir) / f"fill_{digest}.npz"
+  try:
+    with np.load(file, allow_pickle=False) as kept:
+      return kept["inner"].tobytes(), kept["tet"], -1
+  except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+    pass
+  inner, tet, faulty = _make(rest, elem)
+  if faulty < 0:
+    _keep(file, inner=np.frombuffer(inner), tet=tet)
+  return inner, tet, faulty
+
+
+def forget():
+  """Forgets the surfaces that this process has filled."""
+  _fill.cache_clear()
+
+
+def _keep(file: pathlib.Path, **arrays):
+  """Writes arrays to a file, whole or not at all."""
+  try:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.NamedTemporaryFile(dir=file.parent, suffix=".part", delete=False) as part:
+      np.savez(part, **arrays)
+    os.replace(part.name, file)
+  except OSError:
+    pass  # it is made again then
+
+
+def _make(rest: bytes, elem: bytes) -> tuple[bytes, np.ndarray, int]:
   surface = np.frombuffer(rest).reshape(-1, 3)
   triangle = np.frombuffer(elem, np.int64).reshape(-1, 3)
   inner = _lattice(surface, triangle)
@@ -143,18 +188,33 @@ def _fill(rest: bytes, elem: bytes) -> tuple[bytes, np.ndarray, int]:
 
 
 def _lattice(surface: np.ndarray, triangle: np.ndarray) -> np.ndarray:
-  """Returns the points of a lattice inside, (n, 3); some that are outside may be among them."""
+  """Returns the points of a lattice inside, (n, 3); some that are outside may be among them.
+
+  It is half as wide wherever the surface's triangles are half as large, and widens inward.
+  """
   normal = vertex_normals(surface, triangle)
-  edge = np.linalg.norm(surface[triangle[:, [1, 2, 0]]] - surface[triangle], axis=2).mean()
+  length = np.linalg.norm(surface[triangle[:, [1, 2, 0]]] - surface[triangle], axis=2).mean(axis=1)
+  area = np.linalg.norm(area_vectors(surface, triangle), axis=1)
+  edge, widest = length.mean(), (area * length).sum() / area.sum()
+  corners = triangle.ravel()
+  local = np.bincount(corners, np.repeat(length, 3)) / np.bincount(corners)
   low, high = surface.min(axis=0), surface.max(axis=0)
-  tree, side = KDTree(surface), _COARSER * edge * 2 / np.sqrt(3)  # neighbours: half a diagonal
+  coarser = _FINE if widest > _GRADED * edge else _COARSER
+  tree, side = KDTree(surface), coarser * edge * 2 / np.sqrt(3)  # neighbours: half a diagonal
+  levels = range(*np.rint(np.log2([local.min() / edge, 2.83 * widest / edge])).astype(int))
   while True:
-    count = np.ceil((high - low) / side).astype(int) + 1
-    corner = low + side * np.stack(np.meshgrid(*map(np.arange, count), indexing="ij"), -1)
-    point = np.concatenate([corner.reshape(-1, 3), corner.reshape(-1, 3) + side / 2])
-    distance, nearest = tree.query(point)
-    beneath = ((point - surface[nearest]) * normal[nearest]).sum(axis=1) < 0
-    point = point[beneath & (distance > _CLEAR * edge)]
+    parts = []
+    for level in levels:
+      scale = 2.0**level
+      count = np.ceil((high - low) / (scale * side)).astype(int) + 1
+      corner = low + scale * side * np.stack(np.meshgrid(*map(np.arange, count), indexing="ij"), -1)
+      point = np.concatenate([corner.reshape(-1, 3), corner.reshape(-1, 3) + scale * side / 2])
+      distance, nearest = tree.query(point)
+      beneath = ((point - surface[nearest]) * normal[nearest]).sum(axis=1) < 0
+      wanted = np.minimum(local[nearest] + _WIDENS * distance, widest) / edge
+      here = np.clip(np.rint(np.log2(wanted)), levels[0], levels[-1]) == level
+      parts.append(point[beneath & here & (distance > _CLEAR * scale * edge)])
+    point = np.concatenate(parts)
     if len(point) <= MOST * len(surface):
       return point
     side *= max(1.05, (len(point) / (MOST * len(surface))) ** (1 / 3))
