@@ -23,7 +23,7 @@ import importlib
 import math
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from typing import Any
 
 import numpy as np
@@ -217,10 +217,11 @@ class Performer:
       over = goal + self.style.overshoot * (goal - start)
       points.insert(-1, over)
     for point in points:
-      yield from self._line(point, speed * self.style.speed)
+      yield from self.line(point, speed)
 
-  def _line(self, goal: np.ndarray, speed: float) -> Script:
-    start = self.tip.copy()
+  def line(self, goal: np.ndarray, speed: float) -> Script:
+    """Moves the tip along such a line at once and straight: a stroke that is known by heart."""
+    start, speed = self.tip.copy(), speed * self.style.speed
     steps = max(2, round(float(np.linalg.norm(goal - start)) / speed / self.dt))
     for k in range(1, steps + 1):
       s = k / steps
@@ -259,6 +260,13 @@ class Performer:
       speed = np.clip(8 * (depth * self.excess(contact) - now), -0.02, 0.015)
       self.tip = self.tip + self.care * speed * self.dt * along
       yield self.step()
+
+  def feel(self, point: np.ndarray, along: np.ndarray, depth: float) -> Generator[np.ndarray, None, float]:
+    """Presses to a depth [m] below a point in one stroke; returns the stiffness felt [N/m]."""
+    yield from self.line(point + depth * self.excess(0.0) * along, speed=0.03)
+    yield from self.wait(self.style.reaction + 0.1)
+    force = float(np.linalg.norm(self.physics.contact_force()))
+    return force / max(float((self.physics.tip_pos() - point) @ along), 1e-3)
 
   def close(self, site: int, again: int = 0) -> Script:
     """Grasps a triangle: opens above it, goes down over it, and closes to a gentle force.
