@@ -284,18 +284,21 @@ class Performer:
     while self.extra[0] > -0.35:
       self.extra[0] -= 0.06
       yield self.step()
-    for _ in range(100):
-      force = float(physics.gripper()[2:].max())
-      self.extra[0] -= float(np.clip(0.02 * (_GRIP * self.excess(0.0) - force), -0.01, 0.01))
+    for _ in range(round(100 / self.care)):
       yield self.step()
-      if abs(force - _GRIP * self.excess(0.0)) < 0.25 and physics.holds():
+      if abs(self._squeeze(0.0, 0.02)) < 0.25 and physics.holds():
         return
 
   def grip(self, contact: float) -> None:
     """Keeps the force of the jaws, which have held for a time [s]."""
-    force = float(self.physics.gripper()[2:].max())
-    self.extra[0] -= float(np.clip(0.01 * (_GRIP * self.excess(contact) - force), -0.005, 0.005))
-    self.extra[0] = float(np.clip(self.extra[0], -1, -0.3))
+    self._squeeze(contact, 0.01)
+
+  def _squeeze(self, contact: float, gain: float) -> float:
+    """Closes or opens the jaws towards their force; returns what is missing of it [N]."""
+    missing = _GRIP * self.excess(contact) - float(self.physics.gripper()[2:].max())
+    change = self.care * float(np.clip(gain * missing, -0.5 * gain, 0.5 * gain))
+    self.extra[0] = float(np.clip(self.extra[0] - change, -1, -0.3))
+    return missing
 
   def open(self) -> Script:
     """Lets go."""
