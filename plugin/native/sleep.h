@@ -132,7 +132,10 @@ PALPATE void leave_slots(const Fields& f, Thread, int) {
   }
   store(last + TAIL_LOW, load(f.outbox.summary.data + SUMMARY_LOW));
   store(last + TAIL_HIGH, load(f.outbox.summary.data + SUMMARY_HIGH));
-  const bool calm = take_contacts(f) && last[TAIL_QUIET] < QUIET;
+  // Roused by a tool that moved far, and by nothing else, it is at rest still.
+  const bool slept = last[TAIL_QUIET] >= QUIET;
+  const bool falls_anew = load(in + HEAD_GRAVITY) != load(last + TAIL_GRAVITY);
+  const bool calm = take_contacts(f) && !(slept && falls_anew);
   double quiet = calm ? last[TAIL_QUIET] + in[HEAD_STEP] : 0.0;
   last[TAIL_LEEWAY] = 0.0;
   if (quiet >= QUIET && f.flags.data[FLAG_NEAR]) {

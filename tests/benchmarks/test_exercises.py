@@ -5,8 +5,10 @@ import pathlib
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 from benchmarks import loopholes, performances, results, run, skill
+from palpate.tasks import performer, score
 
 HERE = pathlib.Path(__file__).parent
 
@@ -51,24 +53,45 @@ def test_kept_results_are_of_the_tasks():
     assert float(row["percent"]) >= least.get(row["task"], 95), row["task"]
 
 
-@pytest.mark.parametrize("kind", ["blind", "aimed"])
-def test_a_search_finds_no_success_without_the_work(kind):
+@pytest.mark.parametrize("kind", loopholes.KINDS)
+@pytest.mark.parametrize("search", loopholes.SEARCHES)
+def test_a_search_tries_policies_and_finds_no_success_without_the_work(kind, search):
   pytest.importorskip("cma")
-  tried = loopholes.Attack("retract/easy", kind, length=0.4)
-  value = lambda policy: tried.play(policy, 0)[0]  # noqa: E731
-  for search in loopholes.SEARCHES.values():
-    best = search(value, tried.size, 3, 0)
-    total, won, honest = tried.play(best, 0)
-    assert abs(best).max() <= 1 and total < 0.3 and won == honest
+  attack = loopholes.Attack("touch/easy", kind, length=0.4)
+  tried = loopholes.Log(attack, "score")
+  loopholes.SEARCHES[search](tried, attack.size, 2, 0)
+  assert len(tried.tried) == 2
+  policy, end = tried.best
+  assert abs(policy).max() <= 1 and (end.won == end.honest)
+  assert end.won or (end.paid < 0.5 and end.points == score.FLOOR and not end.proficient)
+  with pytest.raises(loopholes.OutOfTimeError):
+    loopholes.Log(attack, "reward", seconds=0.0)(policy)
+
+
+def test_the_expert_does_the_work():
+  attack = loopholes.Attack("touch/easy", "styled")
+  low, high = np.array(list(loopholes.MANNERS.values())).T
+  expert = np.array([getattr(performer.EXPERT, name) for name in loopholes.MANNERS])
+  end = attack.play(2 * (expert - low) / (high - low) - 1, 0)
+  assert end.honest and end.points > score.FLOOR and end.paid > 0.9
 
 
 @pytest.mark.slow
 def test_loopholes_writes_its_page(tmp_path):
   pytest.importorskip("cma")
-  assert command("loopholes", "--tries", 20, "--tasks", "retract/easy", "-o", tmp_path) == 0
+  words = ("--tries", 4, "--tasks", "retract/easy", "--kinds", "blind", "-o", tmp_path)
+  assert command("loopholes", *words) == 0
   rows = table(tmp_path / "loopholes.csv")
-  assert len(rows) == 4 and not any(row["policies_without_the_work"] for row in rows)
+  assert len(rows) == 3 and not any(row["policies_without_the_work"] for row in rows)
   assert "| retract/easy | blind |" in (tmp_path / "loopholes.md").read_text()
+
+
+def test_the_kept_search_found_no_loophole():
+  for row in table(HERE / "results" / "loopholes.csv"):
+    assert row["status"] == "ok", row["case"]
+    assert not row["policies_without_the_work"] and not row["failures_with_a_score"], row["case"]
+    paid = float(row["most_without_success"]), float(row["least_with_success"])
+    assert not paid[0] >= paid[1], row["case"]  # which may be unknown
 
 
 def test_learning_writes_table_and_curve(tmp_path):
