@@ -81,7 +81,8 @@ SKILLED = {
   "reaction": (0.0, 0.2),
 }
 _WIDE = 1.0  # action of the jaw: wide open
-_GRIP = 2.4  # force that holds the organ [N]
+_ROLL = 0.8  # of the jaws to grasp, across the gallbladder's slack [rad]
+_GRIP = 1.5  # force that holds the organ [N]
 _TREMOR_HZ = np.array([4.0, 5.3, 7.1, 8.6, 10.0])
 
 
@@ -276,7 +277,7 @@ class Performer:
       again: how often it was lost: it is taken deeper then
     """
     physics, up = self.physics, self.physics.trocar().mat[:, 2]
-    self.roll, self.extra[:] = 0.0, _WIDE
+    self.roll, self.extra[:] = _ROLL, _WIDE
     yield from self.move(physics.point(site) + 0.012 * up)
     yield from self.wait(0.2)
     deep = min(0.009 + 0.0015 * again, 0.012)
