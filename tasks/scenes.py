@@ -155,9 +155,8 @@ def _xml(flex: str, center: np.ndarray, scene: Scene) -> str:
   return f"""
 <mujoco model="exercise">
   <compiler autolimits="true"/>
-  <option timestep="0.001" integrator="implicitfast" cone="elliptic" impratio="{_IMPRATIO[scene.instrument]}">
-    <flag sleep="enable"/>
-  </option>
+  <option timestep="0.001" integrator="implicitfast" cone="elliptic"
+    impratio="{_IMPRATIO[scene.instrument]}"/>
   {mjcf.extension()}
   <visual>
     <global offwidth="1280" offheight="960"/>
