@@ -309,10 +309,6 @@ class Physics(Portable):
     mj.mju_axisAngle2Quat(rotation, turn / max(angle, 1e-12), angle)
     mj.mju_mulQuat(quat, rotation, body.quat)
     body.pos[:], body.quat[:] = body.pos + shift, quat
-    flags = model.opt.enableflags  # where bodies may sleep MuJoCo does not look at the static again
-    model.opt.enableflags = flags & ~int(mj.mjtEnableBit.mjENBL_SLEEP)
-    mj.mj_kinematics(model, self.data.ptr)
-    model.opt.enableflags = flags
     self._trocar = trocar.trocar(model, self.prefix)
 
   def mark(
