@@ -34,6 +34,7 @@ from .base import AXES, RATES
 
 Act = Callable[[Any], Any]
 Script = Iterator[np.ndarray]
+Feeling = Generator[np.ndarray, None, float]  # a script that returns what was felt
 
 
 @dataclasses.dataclass(frozen=True)
@@ -262,7 +263,7 @@ class Performer:
       self.tip = self.tip + self.care * speed * self.dt * along
       yield self.step()
 
-  def feel(self, point: np.ndarray, along: np.ndarray, depth: float) -> Generator[np.ndarray, None, float]:
+  def feel(self, point: np.ndarray, along: np.ndarray, depth: float) -> Feeling:
     """Presses to a depth [m] below a point in one stroke; returns the stiffness felt [N/m]."""
     yield from self.line(point + depth * self.excess(0.0) * along, speed=0.03)
     yield from self.wait(self.style.reaction + 0.1)

@@ -363,7 +363,7 @@ class Palpate(Task):
     return int(gap.argmax()) if gap.max() > _CLOSE else None
 
   def _guess(self, felt: dict[int, float]) -> int:
-    """Returns the place that a bell of stiffness fits best: least squares of a + b exp(-(d/w)^2)."""
+    """Returns the place that a bell of stiffness, a + b exp(-(d/w)^2), fits best on."""
     distance = np.linalg.norm(self.places[:, None] - self.places[list(felt)], axis=2)
     bell = np.exp(-((distance / (1.2 * self.radius)) ** 2))
     bell -= bell.mean(axis=1, keepdims=True)
@@ -389,4 +389,3 @@ def _lattice(points: np.ndarray, center: np.ndarray, gap: float) -> list[int]:
       return chosen
     near = np.linalg.norm(points[left] - points[chosen[-1]], axis=1)
     chosen.append(int(left[np.argmin(near)]))
-
