@@ -16,13 +16,14 @@ position drives by the action times the rate:
 
 Observations are in groups to choose from, see `observation` and docs/environments.md.
 
-Reward: a task measures its progress phi in [-1, 1], 0 at the start, 1 on success, -1 on damage.
-`dense` (the default) pays its change, phi now - phi a step ago, so that what is lost costs what it
-had paid; this is the shaping of Ng, Harada and Russell 1999. It takes a tenth of the step's cost
-(`task.cost`, see `safety`: force over the limit, shaft against the organ, damage), until the costs
-of the episode have taken 1. Rewards then add up to the progress less that: at most 1, at least -2.
+Reward: a task measures its progress in [-1, 1], 0 at the start, 1 on success, -1 on damage; while
+it runs, 0.4 of it is its potential phi, in the end all of it. `dense` (the default) pays the change
+of that, phi now - phi a step ago, so that what is lost costs what it had paid; this is the shaping
+of Ng, Harada and Russell 1999. It takes a tenth of the step's cost (`task.cost`, see `safety`:
+force over the limit, shaft against the organ, damage), until the costs of the episode have taken
+0.55. The rewards of a success add up to 0.45 to 1, those of any other episode to less than 0.4.
 `sparse` pays 1 on the step of success and 0 elsewhere.
-The domains' formulas of phi use closeness = max(1 - distance / distance at the start, -1).
+The domains' formulas of progress use closeness = max(1 - distance / distance at the start, -1).
 
 An episode ends with `task.outcome`: `success`, `damage` (a force above the damage limit, of tip or
 shaft; the discount is 0 as for success), `missed` (a wrong report), or None when the time limit
@@ -54,7 +55,10 @@ from .stage import STATE, Stage
 RATES = (1.0, 1.0, 3.0, 0.12)  # pitch, yaw, roll [rad/s], insertion [m/s]
 REWARDS = ("dense", "sparse")
 
-_PRICE = 0.1  # of a unit of cost, in the dense reward
+_RATES = np.array(RATES)
+# In the dense reward: share of the progress that is paid before the end, price of a unit of cost,
+# and most that costs take. Success with all costs pays more than any progress without.
+_SHARE, _PRICE, _MOST = 0.4, 0.1, 0.55
 _FACING = 0.75  # least cosine between a target's normal and the way to the trocar
 _PIN_GAP = 0.012  # targets keep this far from pinned nodes [m]
 _SLACK = 1e-6  # what rounding may add to an action
@@ -73,7 +77,7 @@ class Task(control.Task):
     progress: see the module's head [-]
     best: best progress so far [-]
     cost: of the last control step, see `safety`
-    harm: what costs have taken from the dense reward so far, 1 at most [-]
+    harm: what costs have taken from the dense reward so far, 0.55 at most [-]
     events: since the last `take_events`
   """
 
@@ -252,7 +256,7 @@ class Task(control.Task):
       self.random.uniform(-limit, limit, 3), 8.7 * self.random.uniform(-limit, limit, 3)
     )
     self.outcome, self.events = None, []
-    self.progress, self.gain, self.best = 0.0, 0.0, 0.0
+    self.progress, self.best, self._phi, self._gain = 0.0, 0.0, 0.0, 0.0
     self.peak, self._area = 0.0, 0.0
     self.cost, self.harm, self._price = safety.Cost(), 0.0, 0.0
     physics.quiet()
@@ -279,35 +283,35 @@ class Task(control.Task):
 
   def check_action(self, action: Any) -> np.ndarray:
     """Returns the action as float64; ValueError names the component, its value and the bounds."""
-    names = self.components
     values = np.asarray(getattr(action, "continuous_actions", action), np.float64)
-    if values.shape != (len(names),):
+    if values.shape != (len(self.components),):
       raise ValueError(
-        f"{self.name}: action has shape {values.shape}, expected ({len(names)},): "
-        + ", ".join(names)
+        f"{self.name}: action has shape {values.shape}, expected ({len(self.components)},): "
+        + ", ".join(self.components)
       )
-    bad = ~(np.abs(values) <= 1 + _SLACK)
-    if bad.any():
-      k = int(bad.argmax())
-      raise ValueError(
-        f"{self.name}: action {names[k]} is {values[k]}, expected a number in [-1, 1]"
-      )
-    return np.clip(values, -1.0, 1.0)
+    # In plain numbers: arrays of five take longer.
+    for k, value in enumerate(values.tolist()):
+      if not abs(value) <= 1 + _SLACK:
+        raise ValueError(
+          f"{self.name}: action {self.components[k]} is {value}, expected a number in [-1, 1]"
+        )
+    return values.clip(-1.0, 1.0)
 
   def before_step(self, action: Any, physics: Physics) -> None:
     """Moves the drives' targets."""
     self.action = values = self.check_action(action)
     low, high = physics.drive_range.T
-    move = values[:4] * np.array(RATES) * self.control_timestep
-    physics.data.ctrl[physics.drives] = np.clip(physics.drive_targets() + move, low, high)
+    move = values[:4] * _RATES * self.control_timestep
+    ctrl = physics.data.ptr.ctrl
+    ctrl[physics.drives] = (ctrl[physics.drives] + move).clip(low, high)
     if physics.jaw >= 0:
-      low, high = physics.model.actuator_ctrlrange[physics.jaw]
-      physics.data.ctrl[physics.jaw] = low + (high - low) * (values[4] + 1) / 2
+      low, high = physics.model.ptr.actuator_ctrlrange[physics.jaw]
+      ctrl[physics.jaw] = low + (high - low) * (values[4] + 1) / 2
 
   def after_step(self, physics: Physics) -> None:
     """Measures the progress and looks for errors and damage."""
     self.peak = max(self.peak, physics.peak_force)
-    before, self.progress = self.progress, self.advance(physics)
+    self.progress = self.advance(physics)
     tip, shaft, lay = physics.peak_force, physics.peak_shaft, self.cost.shaft > 0
     self.cost = safety.cost(tip, shaft, self.force_limit, self.damage)
     if self.cost.shaft and not lay:
@@ -318,9 +322,10 @@ class Task(control.Task):
       self.event(physics, "note", label=f"{what}: {tip if tip > self.damage else shaft:.2f} N")
     elif self.outcome == "success":
       self.event(physics, "note", label="success")
-    self.gain = self.progress - before
+    phi = self.progress if self.outcome in ("success", "damage") else _SHARE * self.progress
+    self._gain, self._phi = phi - self._phi, phi
     self.best = max(self.best, self.progress)
-    self._price = min(_PRICE * self.cost.total, 1.0 - self.harm)
+    self._price = min(_PRICE * self.cost.total, _MOST - self.harm)
     self.harm += self._price
 
   def get_observation(self, physics: Physics) -> collections.OrderedDict:
@@ -335,7 +340,7 @@ class Task(control.Task):
     """Returns the reward of the last step, see the module's head."""
     if self.reward == "sparse":
       return float(self.outcome == "success")
-    return float(self.gain - self._price)
+    return float(self._gain - self._price)
 
   def get_termination(self, physics: Physics) -> float | None:
     """Returns the final discount 0 once there is an outcome."""

@@ -9,6 +9,7 @@ drawn when they are chosen. docs/environments.md has every name.
 
 import collections
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -68,7 +69,7 @@ ROWS = {
     lambda t, p: p.contact_force(),
   ),
   "shaft_force": Row(
-    "sensors", (3,), "N", "on the shaft, in the world", lambda t, p: -p.sensor("shaft_force")
+    "sensors", (3,), "N", "on the shaft, in the world", lambda t, p: p.shaft_force()
   ),
   "peak_force": Row(
     "sensors",
@@ -277,15 +278,24 @@ def take(task: Any, physics: Physics) -> collections.OrderedDict:
 
 
 def _numbers(task: Any, physics: Physics) -> collections.OrderedDict:
-  choice: Choice = task.observed
-  out = collections.OrderedDict()
-  for name, row in ROWS.items():
-    if choice.has(name, row.group) and (task.jaws or not row.jaws):
-      out[name] = row.measure(task, physics)
-  if set(choice.names) - set(ROWS) - set(PICTURES) - {"sensors"}:
-    own: Mapping[str, np.ndarray] = task.observe(physics)
-    out |= {name: value for name, value in own.items() if choice.has(name, "state")}
+  rows, own = _plan(task.observed, task.jaws)
+  out = collections.OrderedDict((name, measure(task, physics)) for name, measure in rows)
+  if own:
+    observed: Mapping[str, np.ndarray] = task.observe(physics)
+    out |= {name: value for name, value in observed.items() if own == "all" or name in own}
   return out
+
+
+@functools.lru_cache
+def _plan(choice: Choice, jaws: bool) -> tuple[list, Any]:
+  """Returns names and measures of the rows that are chosen, and the domain's own names or "all"."""
+  rows = [
+    (name, row.measure)
+    for name, row in ROWS.items()
+    if choice.has(name, row.group) and (jaws or not row.jaws)
+  ]
+  own = set(choice.names) - set(ROWS) - set(PICTURES) - {"sensors"}
+  return rows, "all" if "state" in own else own
 
 
 def spec(task: Any, physics: Physics) -> collections.OrderedDict:

@@ -19,6 +19,7 @@ from .stage import STATE
 
 AXES = ("pitch", "yaw", "roll", "insertion")
 JAWS = "grasper/"  # prefix of the instrument that has them
+TOUCH = ("touch_left", "touch_right")  # sensors of the jaws
 NEAR, COARSE = 8, 32  # nodes in the observations
 HELD_FORCE = 0.2  # of the inner face of either jaw on tissue between them, to hold it [N]
 
@@ -45,7 +46,6 @@ class Physics(Portable):
     if model is not self.model.ptr:
       self._reload_from_data(wrapper.MjData(wrapper.MjModel(model)))
     self.organ = Organ(model, self.data.ptr, organ)
-    self.quiet()
     self._nodes: np.ndarray | None = None
     self._camera = model.camera(CAMERA).id
     self._sensors = {}
@@ -62,12 +62,16 @@ class Physics(Portable):
     self.jaw = model.actuator(prefix + "jaw").id if self.has_jaw else -1
     self._jaws = Jaws(model, prefix) if self.has_jaw else None
     self._inner = np.zeros(2)
+    signals = ["tip_force", "shaft_force", *(TOUCH if self.has_jaw else ())]
+    self._signals = np.concatenate([np.arange(*self._sensors[n].indices(10**6)) for n in signals])
     self.target_sites = [model.site(f"target{i}").id for i in range(targets)]
     model.site_sameframe[self.target_sites] = 0  # else a site at its body's origin stays there
     self._xpos0 = self.organ.xpos0
     self._coarse = _spread(self._xpos0, COARSE)
     self._coarse0 = self._xpos0[self._coarse]
+    self._elem = self.organ.elem
     self._trocar = trocar.trocar(model, prefix)
+    self.quiet()
 
   @property
   def has_jaw(self) -> bool:
@@ -75,44 +79,42 @@ class Physics(Portable):
     return "jaw" in self._sensors
 
   def step(self, nstep: int = 1) -> None:
-    """Advances the physics; keeps the largest contact forces on tip and shaft of all the steps."""
+    """Advances the physics; keeps the contact forces on tip, shaft and jaws of all the steps."""
     with self.check_invalid_state():
       model, data = self.model.ptr, self.data.ptr
-      self._steps = np.empty((nstep, model.nsensordata))
+      begin, end, sensors = mj.mj_step1, mj.mj_step2, data.sensordata
+      values = np.empty((nstep, model.nsensordata))
       for k in range(nstep):
-        mj.mj_step2(model, data)
-        self._steps[k] = data.sensordata
-        if self._jaws and k == nstep - 1:
+        end(model, data)
+        values[k] = sensors
+        if k == nstep - 1 and self._jaws:
           self._inner = self._jaws.inner_force(model, data)
-        mj.mj_step1(model, data)
-      # Pinched folds make single steps of large jaw force: the jaws' is a mean over the step.
-      grip, forces = self._jaw_forces().mean(axis=0).max(initial=0.0), self.forces()
-      self.peak_force = float(max(forces["force"].max(), grip))
-      self.peak_shaft = float(forces["shaft_force"].max())
+        begin(model, data)
+      self._keep(values)
       self.moved()
+
+  def _keep(self, sensors: np.ndarray) -> None:
+    """Keeps the forces of steps that had these sensor values  (nstep, nsensordata)."""
+    values = sensors[:, self._signals]
+    tip, shaft = np.sqrt(np.einsum("ijk,ijk->ji", *2 * (values[:, :6].reshape(-1, 2, 3),)))
+    self._forces = {"force": tip, "shaft_force": shaft}
+    self.peak_force, self.peak_shaft = float(tip.max()), float(shaft.max())
+    if self.has_jaw:
+      jaws = values[:, 6:]
+      self._forces["grip_force"] = jaws.max(axis=1)
+      # Pinched folds make single steps of large jaw force: the jaws' is a mean over the step.
+      self.peak_force = max(self.peak_force, float(jaws.sum(axis=0).max()) / len(jaws))
 
   def forces(self) -> dict[str, np.ndarray]:
     """Returns the force of the tip, the shaft and the jaws' grip in each step of the last `step`.
 
     Magnitudes [N]  (nstep,), as `Recorder.append` takes them; a single 0 before the first.
     """
-    out = {
-      name: np.linalg.norm(self._steps[:, self._sensors[sensor]], axis=1)
-      for name, sensor in (("force", "tip_force"), ("shaft_force", "shaft_force"))
-    }
-    if self.has_jaw:
-      out["grip_force"] = self._jaw_forces().max(axis=1)
-    return out
-
-  def _jaw_forces(self) -> np.ndarray:
-    """Returns the force on the left and right jaw in each step [N]  (nstep, 2), (nstep, 0)."""
-    sides = [self._sensors[f"touch_{side}"].start for side in ("left", "right") if self.has_jaw]
-    return self._steps[:, sides]
+    return dict(self._forces)
 
   def quiet(self) -> None:
     """Forgets the forces of the last `step`: they would be in the next episode's start."""
-    self.peak_force = self.peak_shaft = 0.0
-    self._steps = np.zeros((1, self.model.nsensordata))
+    self._keep(np.zeros((1, self.model.nsensordata)))
 
   def forward(self) -> None:
     """Recomputes what depends on the state."""
@@ -155,7 +157,7 @@ class Physics(Portable):
 
   def joints(self) -> np.ndarray:
     """Returns pitch, yaw, roll [rad] and insertion [m]  (4,)."""
-    return self.data.qpos[self._qpos]
+    return self.data.ptr.qpos[self._qpos]
 
   def set_joints(self, pose: np.ndarray) -> None:
     """Puts the instrument and its drives at a pose, as `joints`, with closed jaws."""
@@ -175,11 +177,11 @@ class Physics(Portable):
 
   def joint_vel(self) -> np.ndarray:
     """Returns the velocities of `joints`  (4,)."""
-    return self.data.qvel[self._dof]
+    return self.data.ptr.qvel[self._dof]
 
   def drive_targets(self) -> np.ndarray:
     """Returns the targets of the position drives, as `joints`  (4,)."""
-    return self.data.ctrl[self.drives]
+    return self.data.ptr.ctrl[self.drives]
 
   def contact_force(self) -> np.ndarray:
     """Returns the contact force on the instrument below the shaft [N]  (3,)."""
@@ -212,7 +214,7 @@ class Physics(Portable):
 
   def strain(self, rest: np.ndarray) -> float:
     """Returns the largest strain of the organ's surface against its nodes `rest` [-]."""
-    return float(surface_strain(rest, self.nodes(), self.organ.elem).max())
+    return float(surface_strain(rest, self.nodes(), self._elem).max())
 
   def nodes_near(self) -> np.ndarray:
     """Returns the organ's nodes nearest to the tip, from the tip [m]  (NEAR, 3)."""
@@ -227,17 +229,23 @@ class Physics(Portable):
 
   def point(self, triangle: int) -> np.ndarray:
     """Returns where the middle of one of the organ's triangles is [m]  (3,)."""
-    return self.nodes()[self.organ.elem[triangle]].mean(axis=0)
+    a, b, c = self.nodes()[self._elem[triangle]]
+    return (a + b + c) / 3
 
   def normals(self) -> np.ndarray:
     """Returns the outward unit normals of the organ's triangles  (nelem, 3)."""
-    normal = _twice_area(self.nodes(), self.organ.elem)
+    normal = _twice_area(self.nodes(), self._elem)
     return normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
   def normal(self, triangle: int) -> np.ndarray:
     """Returns the outward unit normal of one of the organ's triangles  (3,)."""
-    normal = _twice_area(self.nodes(), self.organ.elem[triangle][None])[0]
-    return normal / np.linalg.norm(normal)
+    # In plain numbers, as every step asks for one.
+    (ax, ay, az), b, c = self.nodes()[self._elem[triangle]].tolist()
+    ux, uy, uz = b[0] - ax, b[1] - ay, b[2] - az
+    vx, vy, vz = c[0] - ax, c[1] - ay, c[2] - az
+    x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+    length = math.sqrt(x * x + y * y + z * z)
+    return np.array([x / length, y / length, z / length])
 
   def contact_area(self) -> float:
     """Returns the area of the organ's triangles in contact with the instrument [m^2]."""
@@ -287,7 +295,7 @@ class Physics(Portable):
     Rays against triangles after Moeller and Trumbore 1997.
     """
     eye = self.camera()[0]
-    a, b, c = np.moveaxis(self.nodes()[self.organ.elem], 1, 0)
+    a, b, c = np.moveaxis(self.nodes()[self._elem], 1, 0)
     e1, e2, s = b - a, c - a, eye - a
     q = _cross(s, e1)
     # Each product of a ray with a vector of a triangle is an entry of a matrix (n, nelem).

@@ -87,10 +87,10 @@ def test_a_graspers_shaft_costs_by_its_force():
   for cost, force in zip(costs, forces, strict=True):
     assert (cost.force, cost.damage) == (0, 0)
     assert cost.shaft >= (force / safety.SHAFT_LIMIT if force > safety.SHAFT_CONTACT else 0)
-  # What an episode pays is its progress less a tenth of its costs.
-  price = 0.1 * sum(cost.total for cost in costs)
+  # What an episode pays until it succeeds is 0.4 of its progress less a tenth of its costs.
+  price = min(0.1 * sum(cost.total for cost in costs), 0.55)
   assert env.task.harm == pytest.approx(price) and price > 0
-  assert sum(rewards) == pytest.approx(env.task.progress - price)
+  assert sum(rewards) == pytest.approx(0.4 * env.task.progress - price)
 
 
 def ram(env, speed, deeper=0.003, back=None):
@@ -122,7 +122,7 @@ def test_ramming_does_not_touch_and_costs(back):
     total, cost = ram(env, 1.0, back=back)
     assert env.task.outcome != "success"
     # A dab of one control step may stay under the limit of force; it leads nowhere either.
-    assert total < 0.6 and (cost > 0 or back == 0), (seed, back)
+    assert total < 0.4 and (cost > 0 or back == 0), (seed, back)
 
 
 def test_a_touch_is_a_contact_of_a_tenth_of_a_second_from_its_start():
@@ -165,9 +165,31 @@ def test_success_above_the_limit_is_worth_less_and_damage_takes_back_what_was_pa
     physics.peak_force = force
     task.after_step(physics)
     paid.append(task.get_reward(physics))
-  assert paid == pytest.approx([0.3, 0.6 - 0.1])
+  assert paid == pytest.approx([0.4 * 0.3, 0.4 * 0.6 - 0.1])
   shares, physics.peak_force = iter([1.0]), 3.5
   task.after_step(physics)
   paid.append(task.get_reward(physics))
   assert task.outcome == "damage" and task.progress == -1
-  assert sum(paid) == pytest.approx(-1 - task.harm) and 0 < task.harm <= 1
+  assert sum(paid) == pytest.approx(-1 - task.harm) and 0 < task.harm <= 0.55
+
+
+@pytest.mark.parametrize("name", ["touch/easy", "grasp/easy"])
+def test_no_failure_pays_as_much_as_any_success(name):
+  """The most that is paid without success, and the least with it."""
+  env = load(name)
+  task, physics = env.task, env.physics
+  ends = []
+  for last, force in ((1.0 - 1e-6, 0.0), (1.0, task.damage * (1 - 1e-9))):
+    env.reset()
+    shares, paid = iter([0.5] * 200 + [last]), 0.0
+    task.advance = lambda physics, shares=shares: next(shares)
+    for _ in range(200):  # all that costs may take
+      physics.peak_force = force
+      task.after_step(physics)
+      paid += task.get_reward(physics)
+    task.outcome = "success" if last == 1.0 else None
+    task.after_step(physics)
+    ends.append(paid + task.get_reward(physics))
+  failure, success = ends
+  assert task.harm == pytest.approx(0.55)
+  assert failure < 0.4 and success == pytest.approx(0.45)
