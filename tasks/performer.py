@@ -84,6 +84,7 @@ SKILLED = {
 _WIDE = 1.0  # action of the jaw: wide open
 _ROLL = 0.8  # of the jaws to grasp, across the gallbladder's slack [rad]
 _GRIP = 1.5  # force that holds the organ [N]
+_FIRMER = 0.4  # by how much it is gripped more each time that it was lost [N]
 _TREMOR_HZ = np.array([4.0, 5.3, 7.1, 8.6, 10.0])
 
 
@@ -275,9 +276,10 @@ class Performer:
 
     Args:
       site: the triangle
-      again: how often it was lost: it is taken deeper then
+      again: how often it was lost: it is taken deeper then, and firmer
     """
     physics, up = self.physics, self.physics.trocar().mat[:, 2]
+    self.firm = _GRIP + _FIRMER * min(again, 2)
     self.roll, self.extra[:] = _ROLL, _WIDE
     yield from self.move(physics.point(site) + 0.012 * up)
     yield from self.wait(0.2)
@@ -297,7 +299,7 @@ class Performer:
 
   def _squeeze(self, contact: float, gain: float) -> float:
     """Closes or opens the jaws towards their force; returns what is missing of it [N]."""
-    missing = _GRIP * self.excess(contact) - float(self.physics.gripper()[2:].max())
+    missing = self.firm * self.excess(contact) - float(self.physics.gripper()[2:].max())
     change = self.care * float(np.clip(gain * missing, -0.5 * gain, 0.5 * gain))
     self.extra[0] = float(np.clip(self.extra[0] - change, -1, -0.3))
     return missing
