@@ -47,6 +47,7 @@ class Physics(Portable):
       self._reload_from_data(wrapper.MjData(wrapper.MjModel(model)))
     self.organ = Organ(model, self.data.ptr, organ)
     self._nodes: np.ndarray | None = None
+    self._points: dict[int, np.ndarray] = {}
     self._camera = model.camera(CAMERA).id
     self._sensors = {}
     for i in range(model.nsensor):
@@ -122,8 +123,8 @@ class Physics(Portable):
     self.moved()
 
   def moved(self) -> None:
-    """Forgets `nodes`: to be called when the state was changed from outside."""
-    self._nodes = None
+    """Forgets `nodes` and `point`: to be called when the state was changed from outside."""
+    self._nodes, self._points = None, {}
 
   def place(self, state: np.ndarray) -> None:
     """Puts the physics in an integration state, from which it goes on as it did before."""
@@ -228,9 +229,11 @@ class Physics(Portable):
     return self.nodes()[self._coarse] - self._coarse0
 
   def point(self, triangle: int) -> np.ndarray:
-    """Returns where the middle of one of the organ's triangles is [m]  (3,)."""
-    a, b, c = self.nodes()[self._elem[triangle]]
-    return (a + b + c) / 3
+    """Returns where the middle of one of the organ's triangles is [m]  (3,); as `nodes`."""
+    if triangle not in self._points:
+      a, b, c = self.nodes()[self._elem[triangle]]
+      self._points[triangle] = (a + b + c) / 3
+    return self._points[triangle].copy()
 
   def normals(self) -> np.ndarray:
     """Returns the outward unit normals of the organ's triangles  (nelem, 3)."""

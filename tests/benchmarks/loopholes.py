@@ -10,7 +10,7 @@ its best progress (`score`). What it found is tried on episodes that it has not 
 
 A success is honest when the work was done, judged apart from the exercise's own rules: contact as
 long and as often as the exercise has targets, jaws that were wide open before they held, a curve
-that was pressed nearly all the way, a field that was felt before the report. Needs `cma`.
+that was pressed on nearly everywhere, a field that was felt before the report. Needs `cma`.
 """
 
 from __future__ import annotations
@@ -123,8 +123,9 @@ class Attack:
     task.expert = self._script
     if self.kind == "styled":
       shares = (np.asarray(policy) + 1) / 2
-      drawn = [low + share * (high - low) for share, (low, high) in zip(shares, MANNERS.values())]
-      style = performer.Style(**dict(zip(MANNERS, map(float, drawn), strict=True)))
+      low, high = np.array(list(MANNERS.values())).T
+      drawn = (low + shares * (high - low)).tolist()
+      style = performer.Style(**dict(zip(MANNERS, drawn, strict=True)))
     else:
       task.expert = lambda p: self._fly(p, policy)
     act = performer.Performer(env, style)
@@ -164,7 +165,8 @@ class Work:
   """What was done in an episode, from forces and joints alone."""
 
   def __init__(self):
-    self.opened, self.pressed, self.since, self.touches, self._touching = 0.0, 0, 0, 0, False
+    self.opened, self.pressed, self.touches, self._touching = 0.0, 0, 0, False
+    self.places: set[int] = set()  # points of a curve that were nearest to the tip as it pressed
 
   def see(self, task, physics) -> None:
     """Takes a control step."""
@@ -173,15 +175,16 @@ class Work:
     touching = physics.peak_force > _CONTACT
     self.touches += touching and not self._touching
     self._touching = touching
-    self.since += bool(self.since or touching)
     self.pressed += touching
+    if touching and hasattr(task, "curve"):
+      self.places.add(int(np.linalg.norm(task.now - physics.tip_pos(), axis=1).argmin()))
 
   def done(self, task) -> bool:
     """Whether it was the work that the exercise asks for."""
     if task.jaws:
       return self.opened > 0.3
     if hasattr(task, "curve"):
-      return self.pressed > 0.8 * self.since
+      return len(self.places) > 0.8 * len(task.curve)
     if hasattr(task, "felt"):
       return task.felt() > 0.3
     each = getattr(task, "hold", 0.08) / task.control_timestep

@@ -101,6 +101,15 @@ def test_the_kept_search_found_no_loophole():
     assert not paid[0] >= paid[1], row["case"]  # which may be unknown
 
 
+@pytest.mark.slow
+def test_a_race_against_itself_is_even(tmp_path):
+  words = ("--tasks", "touch/easy", "--seconds", 0.1, "--against", sys.executable, "-o", tmp_path)
+  assert command("speed", *words) == 0
+  (row,) = table(tmp_path / "exercises_cpu.csv")
+  assert 0.5 < float(row["times"]) < 2 and row["solved"] == row["solved_before"] == 1
+  assert "times the tree before" in (tmp_path / "exercises.md").read_text()
+
+
 def test_learning_writes_table_and_curve(tmp_path):
   pytest.importorskip("stable_baselines3")
   # Of its own, and without drawing: Mesa's LLVM and the one that some builds of torch load clash.

@@ -327,7 +327,7 @@ def test_grip_force(integrator):
   """Closed on something at the middle of its pads, 12 mm from the pivot, each jaw gives 10 N."""
   spec = mujoco.MjSpec.from_file(str(trocar_lib.path("grasper")))
   spec.worldbody.add_geom(
-    type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.001, 0.003, 0.002], pos=[0, 0, -0.11]
+    type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.001, 0.003, 0.001], pos=[0, 0, -0.11]
   )
   model = spec.compile()
   model.opt.integrator = integrator
