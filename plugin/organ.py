@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import mujoco
 import numpy as np
-from palpate.engine import mjstruct, motion, pierce, windowed, workspace
+import numpy.typing as npt
+from palpate.engine import change, mjstruct, motion, pierce, windowed, workspace
 from palpate.engine import plugin as engine
 from palpate.engine.layout import FLAG
 from palpate.tissue import energy, fill
@@ -58,7 +59,7 @@ class Organ:
     texts = {}
     for key, value in keys.items():
       texts[key] = value if isinstance(value, str) else " ".join(map(str, np.ravel(value)))
-    workspace.configure(self._space, self.model._address, texts)
+    change.configure(self._space, self.model._address, texts)
 
   @property
   def integrator(self) -> str:
@@ -68,6 +69,50 @@ class Organ:
   @integrator.setter
   def integrator(self, name: str):
     self.configure(integrator=name)
+
+  def attach(
+    self, vertices: npt.ArrayLike, to: str | int | Organ, stiffness: float | None = None
+  ) -> Attachment:
+    """Ties vertices by springs to a body or another organ, where they are now.
+
+    An ideal grasp, a clip, a stitch, a ligament: the body feels the other end of each spring. It
+    holds until `detach`, or until the data is reset; a copy of the data has it too.
+
+    Args:
+      vertices: numbers of vertices that are not pinned
+      to: name or number of a body (fixed, mocap or with joints), or another organ of the same data,
+        to whose nearest vertices the springs lead
+      stiffness: of all springs together [N/m], spread by area; None for as firm as a step allows
+
+    Raises:
+      ValueError: a vertex, the body or the stiffness is not allowed; the message says what is. A
+        light body takes less stiffness: it feels springs a step late.
+    """
+    model = self.model._address
+    if isinstance(to, Organ):
+      if to.data is not self.data or to._space is self._space:
+        raise ValueError(f"organ {self.name!r}: expected another organ of the same data to attach")
+      target: object = to._space
+    else:
+      target = self._body(to)
+    return Attachment(change.attach(self._space, model, vertices, target, stiffness), model)
+
+  def _body(self, body: str | int) -> int:
+    found = body
+    if isinstance(body, str):
+      found = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_BODY, body)
+    if not 0 <= int(found) < self.model.nbody:
+      raise ValueError(f"organ {self.name!r}: the model has no body {body!r} to attach to")
+    return int(found)
+
+  def detach(self):
+    """Takes away what `attach` has made; what the model declares stays."""
+    made = [group for group in self._space.ties.groups if not group.by]
+    for group in made:
+      if group.other is not None:
+        theirs = [g for g in group.other.ties.groups if g.other is self._space and not g.by]
+        change.detach(group.other, self.model._address, theirs)
+    change.detach(self._space, self.model._address, made)
 
   @property
   def nvert(self) -> int:
@@ -141,6 +186,11 @@ class Organ:
   def force(self) -> np.ndarray:
     """Sum of `contact_force` [N], (3,)."""
     return self.contact_force.sum(axis=0)
+
+  @property
+  def support_force(self) -> np.ndarray:
+    """Sum of the forces of what the organ rests on (`support`) in the last step [N], (3,)."""
+    return self._space.rests.force().sum(axis=0)
 
   @property
   def energy(self) -> float:
@@ -220,6 +270,30 @@ class Organ:
     if not np.isfinite(array).all():
       raise ValueError(f"organ {self.name!r}: {what} holds numbers that are not finite")
     return array
+
+
+class Attachment:
+  """What `Organ.attach` has made."""
+
+  def __init__(self, made: list, model: int):
+    self._made = made
+    self._model = model
+
+  @property
+  def vertices(self) -> np.ndarray:
+    """Vertices of the organ that it holds, (n,)."""
+    return self._made[0][1].vert
+
+  @property
+  def force(self) -> np.ndarray:
+    """Force on the organ in the last step, in the world [N], (3,); zero when it is detached."""
+    space, group = self._made[0]
+    return space.ties.force(group).sum(axis=0)
+
+  def detach(self):
+    """Lets go."""
+    for space, group in self._made:
+      change.detach(space, self._model, [group])
 
 
 def instances(model: mujoco.MjModel) -> dict[str, int]:

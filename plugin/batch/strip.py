@@ -49,6 +49,11 @@ def tools_of(model: mujoco.MjModel, organ) -> np.ndarray:
       f"organ {organ.name!r}: elements is 'solid', which a batch on a GPU cannot do; expected "
       "'membrane' or 'spring'"
     )
+  for key in ("carrier", "attach", "support", "relax_share"):
+    if getattr(organ.config, key):
+      raise ValueError(
+        f"organ {organ.name!r}: {key} is set, which a batch on a GPU cannot do; expected none"
+      )
   if organ.windows:
     found = np.unique(organ.windows.geom)
   else:

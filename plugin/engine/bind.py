@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 import warp as wp
 from palpate.tissue import step
@@ -36,7 +38,8 @@ def bind(w, model: int):
     near = wp.get_device(does.side)
     crossing = device != near
 
-    touched = _touched(w, model)
+    touched, part = _touched(w, model), functools.partial
+    _bind_more(w, model)
 
     def before():
       weights.launch(touched)
@@ -45,6 +48,8 @@ def bind(w, model: int):
     def solve():
       if crossing:
         _cross(w, _IN, to_device=True)
+      if w.hold:
+        w.hold.cross()
       scheme.step(w.body)
       if crossing:
         _cross(w, _OUT, to_device=False)
@@ -57,21 +62,17 @@ def bind(w, model: int):
       if crossing:
         _cross(w, ("sol", "status"), to_device=False)
 
-    def end():
-      does.end()
-      does.advance()
-
     # As few graphs as may be: a launch costs a small organ a hundredth of its step.
-    after = [] if w.resident else [(cpu, does.scatter)]
+    after = [] if w.resident else [(cpu, part(_scatter, w, does))]
     w.before = graphs.record(cpu, before)
-    w.solve = graphs.record_all((near, does.enter), (device, solve), (near, does.look), *after)
+    enter = (near, part(_enter, w, does))
+    w.solve = graphs.record_all(enter, (device, solve), (near, does.look), *after)
     w.after = graphs.record(cpu, does.scatter) if w.resident else None
     w.leave = graphs.record(cpu, does.leave)
-    w.respond = []
-    if scheme.respond:
-      w.respond = graphs.record_all((near, does.push), (device, respond), (near, does.answer))
-    w.end = graphs.record(cpu, end)
-    w.advance = graphs.record(cpu, does.advance)
+    answer = (near, does.push), (device, respond), (near, does.answer)
+    w.respond = graphs.record_all(*answer) if scheme.respond else []
+    w.end = graphs.record(cpu, part(_advance, w, does, ends=True))
+    w.advance = graphs.record(cpu, part(_advance, w, does, ends=False))
     w.place = graphs.record(cpu, does.place) if w.organ.windows else None
     if w.resident:
       w.resident.foresee = graphs.record(cpu, does.foresee)
@@ -81,6 +82,37 @@ def bind(w, model: int):
     if w.turn is not None:
       w.turn.bind(model, w.organ.windows)
   _watch(w, model)
+
+
+# Phases of a coupling, with what acts on the organ beside it.
+
+
+def _bind_more(w, model: int):
+  for each in (w.ties, w.rests, w.creep):
+    each.load()
+    each.bind(model)
+
+
+def _enter(w, does):
+  does.enter()
+  if w.hold:
+    w.hold.clear()
+  for each in (w.ties, w.rests, w.creep):
+    each.enter()
+
+
+def _scatter(w, does):
+  does.scatter()
+  w.ties.act()
+  w.rests.act()
+
+
+def _advance(w, does, ends: bool):
+  w.creep.end()
+  w.rests.end()
+  if ends:
+    does.end()
+  does.advance()
 
 
 def _watch(w, model: int):

@@ -185,13 +185,20 @@ def mass_addresses(m, dofs: np.ndarray) -> np.ndarray:
   return rowadr + mjstruct.view(m.M_rownnz, m.nv, np.int32)[dofs] - 1
 
 
+def sizes(organ) -> dict[str, int]:
+  """Returns what the blocks of an organ's plugin state need."""
+  relaxes = organ.config.relax_share > 0
+  out = {"ncreep": int(organ.free.sum()) if relaxes else 0}
+  if organ.windows is None:
+    return out | {"nfree": organ.nfree}
+  win = organ.windows
+  out["nrest"] = organ.mesh.nouter if organ.config.support else 0
+  return out | {"nvert": organ.mesh.nvert, "nslot": win.nslot, "ngeom": win.geom.size}
+
+
 def spans(organ) -> dict[str, slice]:
   """Returns where the blocks of an organ's plugin state lie."""
-  if organ.windows is None:
-    return layout.spans(NodalState, {"nfree": organ.nfree})
-  win = organ.windows
-  sizes = {"nvert": organ.mesh.nvert, "nslot": win.nslot, "ngeom": win.geom.size}
-  return layout.spans(WindowState, sizes)
+  return layout.spans(WindowState if organ.windows else NodalState, sizes(organ))
 
 
 def plugin_state(model: int, data: int, instance: int, size: int) -> wp.array:

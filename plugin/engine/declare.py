@@ -160,6 +160,8 @@ def read(model: int, instance: int) -> Declaration:
   mesh = topology.build(name, rest, elem)
   config = configuration.parse(name, keys(model, instance), len(elem), mesh.closed)
   check_volume(name, mesh, config)
+  if config.carrier and not free.all():
+    raise ValueError(f"organ {name!r}: carrier is set and vertices are pinned, expected no <pin>")
   dofadr, qposadr = addresses(m, name, body, free)
   order = np.cumsum(free) - 1
   mass = mjstruct.view(m.body_mass, m.nbody)[body]
@@ -335,8 +337,8 @@ def static_frame(m, name: str, parent: int) -> tuple[np.ndarray, np.ndarray]:
       who = mjstruct.name_of(m, m.name_bodyadr, body)
       what = "has joints" if jntnum[body] else "is a mocap body"
       raise ValueError(
-        f"organ {name!r}: its parent body {who!r} {what}, expected a static frame "
-        "(parent bodies without joints)"
+        f"organ {name!r}: its parent body {who!r} {what}, expected a static frame (parent bodies "
+        f"without joints); carrier={who!r} lets it carry the organ's foundation and pins"
       )
     body = int(parentid[body])
   return flexes.body_frame(m, parent)

@@ -40,7 +40,7 @@ def read(model: int, instance: int) -> Declaration:
   for vertex in config.pin:
     if vertex >= nvert:
       raise ValueError(f"organ {name!r}: pin has {vertex}, expected vertices in [0, {nvert})")
-    free[vertex] = False
+    free[vertex] = bool(config.carrier)  # which holds them by springs
   if not free.any():
     raise ValueError(f"organ {name!r}: all vertices are pinned, expected some that move")
   share = fill.vertex_volumes(mesh) if len(mesh.tet) else topology.vertex_areas(rest, elem)
@@ -95,17 +95,6 @@ def _rigid_flexes(m, instance: int) -> tuple[np.ndarray, list[int]]:
   return bodies, [f for f in range(m.nflex) if rigid[f] and vertbody[start[f]] in bodies]
 
 
-def _resolve(name: str, organ: str, names: list[str]) -> str | None:
-  """Returns the name that an organ's configuration means, or None.
-
-  `<attach prefix="...">` renames flexes and bodies and leaves configurations alone: the longest
-  prefix that the organ has too counts.
-  """
-  prefixes = [other[: len(other) - len(name)] for other in names if other.endswith(name)]
-  prefixes = [prefix for prefix in prefixes if organ.startswith(prefix)]
-  return max(prefixes, key=len) + name if prefixes else None
-
-
 def _windows(model, m, instance, name, config, mesh, mass, place) -> Windows:
   """Returns the windows of an organ, and where they stand at rest."""
   found = _claimed(model, m, instance, name, config)
@@ -155,7 +144,7 @@ def _claimed(model, m, instance: int, name: str, config: Config) -> list[int]:
   out = []
   for window in config.window:
     what = f"organ {name!r}: window {window!r}"
-    found = _resolve(window, name, names)
+    found = flexes.resolve(window, name, names)
     if found is None:
       raise ValueError(f"{what} does not exist, expected a flexcomp; the model has {names}")
     if found in claimed:
@@ -203,7 +192,7 @@ def _followed(m, name: str, config: Config, flex: list[int]) -> tuple[np.ndarray
         )
       wanted = []
       for body in config.follow[k]:
-        found = _resolve(body, name, names)
+        found = flexes.resolve(body, name, names)
         if found is None:
           raise ValueError(f"organ {name!r}: follow names body {body!r}, which does not exist")
         wanted.append(names.index(found))
@@ -247,10 +236,13 @@ def _check_neighbours(m, model, instance, name, windows: Windows, frame, origin,
   contype = mjstruct.view(m.flex_contype, m.nflex, np.int32)
   conaffinity = mjstruct.view(m.flex_conaffinity, m.nflex, np.int32)
   surface = _surfaces(model, m, instance, without=instance)
+  bearing = _bearing(model, m, instance, name)
   points = origin + rest @ frame.T
   room = _NEAR * float(np.linalg.norm(np.ptp(points, axis=0)))
   low, high = points.min(axis=0) - room, points.max(axis=0) + room
   for f in np.flatnonzero(~own):
+    if flexes.name(m, surface.get(int(f), int(f))) in bearing:
+      continue
     meets = (contype[f] & conaffinity[own]) | (conaffinity[f] & contype[own])
     other = flexes.rest_points(m, surface.get(int(f), int(f)))
     if meets.any() and (other.max(axis=0) > low).all() and (other.min(axis=0) < high).all():
@@ -259,6 +251,17 @@ def _check_neighbours(m, model, instance, name, windows: Windows, frame, origin,
         f"{flexes.name(m, surface.get(int(f), int(f)))!r} beside it; use nodal coupling, or "
         "contype and conaffinity that do not meet"
       )
+
+
+def _bearing(model, m, instance: int, name: str) -> set[str]:
+  """Returns the organs on which one rests, and those that rest on it."""
+  names = [flexes.name(m, f) for f in range(m.nflex)]
+  found = {}
+  for other in range(m.nplugin):
+    for flex in _rigid_flexes(m, other)[1]:
+      support = mjstruct.config(model, other, "support").split()
+      found[names[flex]] = {flexes.resolve(each, names[flex], names) for each in support}
+  return {each for each in names if name in found.get(each, ()) or each in found.get(name, ())}
 
 
 def touching(model: int, instance: int) -> np.ndarray:
@@ -284,7 +287,7 @@ def _surfaces(model, m, instance: int, without: int = -1) -> dict[int, int]:
     if other != without and plugin[other] == plugin[instance]:
       for flex in _rigid_flexes(m, other)[1]:
         for window in mjstruct.config(model, other, "window").split():
-          resolved = _resolve(window, names[flex], names)
+          resolved = flexes.resolve(window, names[flex], names)
           if resolved in names:
             found[names.index(resolved)] = flex
   return found

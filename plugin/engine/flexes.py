@@ -66,3 +66,14 @@ def body_frame(m, body: int) -> tuple[np.ndarray, np.ndarray]:
     rotation, position = own @ rotation, pos[body] + own @ position
     body = int(parentid[body])
   return rotation, position
+
+
+def resolve(name: str, organ: str, names: list[str]) -> str | None:
+  """Returns the name that an organ's configuration means, or None.
+
+  `<attach prefix="...">` renames flexes and bodies and leaves configurations alone: the longest
+  prefix that the organ has too counts.
+  """
+  prefixes = [other[: len(other) - len(name)] for other in names if other.endswith(name)]
+  prefixes = [prefix for prefix in prefixes if organ.startswith(prefix)]
+  return max(prefixes, key=len) + name if prefixes else None

@@ -164,6 +164,7 @@ class NodalState:
   force: doubles("nfree")  # contact force of the last step [N]
   last: doubles("nfree")  # last change of the velocity [m/s]
   before: doubles("nfree")  # the one before it [m/s]
+  creep: doubles("ncreep", 6)  # see `creep`
   heavier: doubles(1)  # how many times its inertia at rest a tool meets; 0 for once [-]
   signature: doubles(1)  # of the organ, see `Declaration`; 0 where it was set by hand [-]
 
@@ -184,6 +185,8 @@ class WindowState:
 
   motion: Motion
   force: doubles("nslot", 3)  # contact force of the last step on each slot [N]
+  creep: doubles("ncreep", 6)  # see `creep`
+  slip: doubles("nrest", 3)  # how far nodes have slipped on what they rest on [m]
   slot: doubles("nslot")  # node + 1; 0: the slot's default node, -1: not used
   pose: doubles("ngeom", len(POSE))  # where the windows' geoms were, see POSE
   tail: doubles(len(TAIL))  # see TAIL

@@ -39,9 +39,9 @@ _gather, _scatter, _push, _remember = coupling.kernels(
 MODULE = _gather.module.name
 
 
-def state_size(nfree: int) -> int:
-  """Returns the length of the plugin state of `nfree` degrees of freedom."""
-  return layout.size(NodalState, {"nfree": nfree})
+def state_size(nfree: int, ncreep: int = 0) -> int:
+  """Returns the length of the plugin state of `nfree` degrees of freedom; see `coupling.sizes`."""
+  return layout.size(NodalState, {"nfree": nfree, "ncreep": ncreep})
 
 
 class Phases(coupling.Phases):
@@ -54,7 +54,8 @@ class Phases(coupling.Phases):
     vert = s.vert.numpy()
     dofadr = _in_node_order(organ.dofadr, vert)
     dofs = np.maximum(dofadr, 0)[:, None] + np.arange(3)
-    state = coupling.plugin_state(model, w.data, instance, state_size(organ.nfree))
+    sizes = coupling.sizes(organ)
+    state = coupling.plugin_state(model, w.data, instance, layout.size(NodalState, sizes))
     values = dict(
       nnode=s.nnode,
       rest_share=step.REST,
@@ -68,7 +69,7 @@ class Phases(coupling.Phases):
       number=w.body.numbers,
       flags=wp.array(np.asarray(w.flags), dtype=int, device="cpu", copy=False),
       lagged=w.lagged,
-      own=layout.carve(NodalState, state, {"nfree": organ.nfree}),
+      own=layout.carve(NodalState, state, sizes),
       mj=coupling.mujoco_arrays(model, w.data),
       solve=coupling.crossing(w.host),
     )

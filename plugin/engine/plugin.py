@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 from palpate.tissue.config import KEYS
 
-from . import guard, mjstruct, weights, windowed, workspace
+from . import change, fasten, guard, mjstruct, rests, weights, windowed, workspace
 from .layout import FLAG
 from .mjstruct import NAME, warn
 from .workspace import Workspace
@@ -111,6 +111,9 @@ def _init(model: int, data: int, instance: int) -> int:
   try:
     w = workspace.make(model, data, instance)
     _workspaces[data, instance] = _states[w.plugin_state.ctypes.data] = w
+    mine = [each for (of, _), each in _workspaces.items() if of == data]
+    for each in (*fasten.declare_between(mine), *rests.meet(mine)):
+      workspace.rebind(each)
     return 0
   except BaseException as error:
     _say(error)
@@ -128,7 +131,8 @@ def _destroy(data: int, instance: int):
 def _copy(data: int, model: int, source: int, instance: int):
   w = _workspaces[data, instance]
   try:
-    workspace.copy(w, model, _workspaces[source, instance])
+    twin = lambda each: _workspaces[data, each.instance]  # noqa: E731
+    change.copy(w, model, _workspaces[source, instance], twin)
   except BaseException as error:
     _fail(w, error)
   return guard.leave()
@@ -142,6 +146,7 @@ def _reset(model: int, state: int, unused: int | None, instance: int):
   w = _states.get(state)  # mjData.plugin_data, the other argument, is copied by pickle
   if w is not None:
     w.forget()
+    w.ties.put([group for group in w.ties.groups if group.by])
     w.nbad = 0
   return guard.leave()
 

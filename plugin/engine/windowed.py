@@ -25,9 +25,10 @@ from .resident import Resident
 ROOM = 16
 
 
-def state_size(nvert: int, nslot: int, ngeom: int) -> int:
+def state_size(nvert: int, nslot: int, ngeom: int, ncreep: int = 0, nrest: int = 0) -> int:
   """Returns the length of the plugin state; ngeom is summed over the windows."""
-  return layout.size(WindowState, {"nvert": nvert, "nslot": nslot, "ngeom": ngeom})
+  sizes = {"nvert": nvert, "nslot": nslot, "ngeom": ngeom, "ncreep": ncreep, "nrest": nrest}
+  return layout.size(WindowState, sizes)
 
 
 class Phases(coupling.Phases):
@@ -77,13 +78,7 @@ class Phases(coupling.Phases):
     most = nvert
     if self.side.is_cuda:
       most = min(nvert, ROOM * int(np.diff(win.adr).max()))
-    return {
-      "nvert": nvert,
-      "nslot": win.nslot,
-      "nwindow": len(win.flex),
-      "ngeom": win.geom.size,
-      "most": most,
-    }
+    return coupling.sizes(organ) | {"nwindow": len(win.flex), "most": most}
 
   def _over_slots(self, kernel):
     slots.launch(kernel, self._slots)

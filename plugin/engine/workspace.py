@@ -9,8 +9,7 @@ import mujoco
 import numpy as np
 import warp as wp
 from palpate.tissue import body as bodies
-from palpate.tissue import config as configuration
-from palpate.tissue import fill, shape
+from palpate.tissue import fill
 from palpate.tissue.body import Body
 from palpate.tissue.config import Config
 
@@ -18,6 +17,7 @@ from . import (
   coupling,
   declare,
   declare_windows,
+  fasten,
   graphs,
   inertia,
   mjstruct,
@@ -28,10 +28,14 @@ from . import (
 )
 from .bind import bind
 from .coupling import Phases
+from .creep import Creep
 from .declare import Declaration
+from .hold import Hold
 from .layout import FLAG, HEAD
 from .pierce import Watch
 from .resident import Resident
+from .rests import Rests
+from .ties import Ties
 from .turns import Turn
 
 _ALLOWED = int(mujoco.mjtSleepPolicy.mjSLEEP_AUTO_ALLOWED)
@@ -64,6 +68,10 @@ class Workspace:
     advance: recorded graph of the plugin state's step after that
     end: recorded graph that ends a step without such a response, and steps the plugin state
     place: recorded graph that puts the windows where the plugin state says, or None
+    hold: springs that hold nodes
+    ties: what the organ is tied to
+    rests: what it rests on
+    creep: its stress relaxation
     resident: keeper of a motion that stays on the device, or None
     stiff: whether the response is needed, see `inertia.stiffness`
     heaviest: most times its inertia that a node in contact may have, see there  (1,)
@@ -113,6 +121,10 @@ class Workspace:
   end: Any = None
   advance: Any = None
   place: Any = None
+  hold: Hold = dataclasses.field(init=False)
+  ties: Ties = dataclasses.field(init=False)
+  rests: Rests = dataclasses.field(init=False)
+  creep: Creep = dataclasses.field(init=False)
   resident: Resident | None = None
   stiff: bool = False
   heaviest: np.ndarray = dataclasses.field(default_factory=lambda: np.ones(1))
@@ -142,6 +154,10 @@ class Workspace:
   views: dict = dataclasses.field(default_factory=dict)
   boxes: dict = dataclasses.field(default_factory=dict)
   phases: Phases | None = None
+
+  def __post_init__(self):
+    self.hold, self.ties = Hold(self), Ties(self)
+    self.creep, self.rests = Creep(self), Rests(self)
 
   def run(self):
     """Computes the step's forces and adds them to qfrc_passive."""
@@ -174,6 +190,8 @@ class Workspace:
     if self.asleep:
       self.computed = True
       return  # what `after` does was done with `before`
+    if self.ties.aims:
+      self.ties.aim()
     if self.resident:
       self.resident.send()
       graphs.launch_all(self.resident.left_to_do())
@@ -316,6 +334,11 @@ def place(w: Workspace, model: int):
       w.stood = w.qpos.tobytes()
 
 
+def rebind(w: Workspace):
+  """Records the graphs of a workspace anew."""
+  bind(w, w.model)
+
+
 def attach(w: Workspace, model: int):
   """Makes a workspace fit a living model, which need not be the one that it last ran with."""
   if not w.identity.is_of(model):
@@ -329,11 +352,16 @@ def state_size(model: int, instance: int) -> int:
   """
   m = mjstruct.Model.from_address(model)
   names = mjstruct.config(model, instance, "window").split()
+  relaxes = bool(mjstruct.config(model, instance, "relax_share").strip())
   if names:
     # Asked before MuJoCo has filled in the flexes: what `windowed` needs is at most this.
     inside = fill.MOST if mjstruct.config(model, instance, "elements").strip() == "solid" else 0
-    return windowed.state_size((1 + inside) * m.nflexvert, 0, m.ngeom * len(names))
-  return nodal.state_size(3 * len(declare.moving_bodies(m, instance)))
+    most = (1 + inside) * m.nflexvert
+    rests = bool(mjstruct.config(model, instance, "support").strip())
+    sizes = relaxes * most, rests * m.nflexvert
+    return windowed.state_size(most, 0, m.ngeom * len(names), *sizes)
+  moving = len(declare.moving_bodies(m, instance))
+  return nodal.state_size(3 * moving, relaxes * moving)
 
 
 def make(model: int, data: int, instance: int) -> Workspace:
@@ -351,7 +379,7 @@ def make(model: int, data: int, instance: int) -> Workspace:
       host[field] = array
     size = organ.windows.nslot if organ.windows else s.nnode
     lagged = wp.zeros((size, 3), dtype=wp.float64, device="cpu")
-    w = Workspace(organ, organ.config, body, host, lagged, data, instance)
+    w = Workspace(organ, organ.config, body, host, lagged, data, instance, model)
     _view(w, mjstruct.Data.from_address(data), m)
     prepare.fit(m, organ, body)
     # Padding nodes have a mass so that nothing divides by zero.
@@ -359,12 +387,13 @@ def make(model: int, data: int, instance: int) -> Workspace:
     host["mass"].assign(mass)
     if organ.windows:
       w.turn = Turn()
+    fasten.declare(w)
     bind(w, model)
     w.plugin_state = w.views["plugin_state"].numpy()
     w.signature = w.plugin_state[coupling.spans(organ)["signature"]].data
     if w.turn is not None:
       windowed.settle(w, model)
-    _feel(w, m)
+    feel(w, m)
     return w
 
 
@@ -379,49 +408,10 @@ def _view(w: Workspace, d, m):
     w.qpos = mjstruct.view(d.qpos + 8 * first, 8 * (last - first), np.uint8).data
 
 
-def _feel(w: Workspace, m):
+def feel(w: Workspace, m):
   """Notes whether the organ is stiff for the present time step."""
   nodal = w.inertia(w.model)
   w.stiff, w.heaviest[0] = inertia.stiffness(m, w.organ, w.body, w.config, nodal)
-
-
-def configure(w: Workspace, model: int, texts: dict[str, str]):
-  """Changes configuration keys while running.
-
-  Raises:
-    ValueError: a key may not change, or its value is not allowed.
-  """
-  organ, mesh = w.organ, w.organ.mesh
-  arguments = texts, mesh.nelem, mesh.closed, organ.config
-  _change(w, model, configuration.change(organ.name, w.config, *arguments))
-  w.chosen = True
-
-
-def copy(w: Workspace, model: int, other: Workspace):
-  """Gives a copy of an mjData the configuration of the original, unless it was given one itself."""
-  if not w.chosen and w.config != other.config and w.organ.digest == other.organ.digest:
-    _change(w, model, other.config)
-
-
-def _change(w: Workspace, model: int, config: Config):
-  attach(w, model)
-  before, w.config = w.config, config
-  if w.resident:
-    w.resident.stop()
-  material = any(getattr(before, key) != getattr(config, key) for key in configuration.MATERIAL)
-  with graphs.lock:
-    if material:
-      shape.change(w.body, w.organ.mesh, config, ~w.organ.free)
-    else:
-      shape.renumber(w.body, config)
-    if any(getattr(before, key) != getattr(config, key) for key in configuration.RECORDED):
-      bind(w, model)
-    if material:
-      refresh(w)
-    else:
-      _feel(w, mjstruct.Model.from_address(model))
-  if w.turn is not None:
-    windowed.wake(w)
 
 
 def sync(w: Workspace):
@@ -438,5 +428,5 @@ def refresh(w: Workspace):
       prepare.give_armature(m, w.organ, w.body, w.config)
     else:
       windowed.set_inertia(w, m)
-    _feel(w, m)
+    feel(w, m)
     w.time_step = float(m.opt.timestep)

@@ -32,6 +32,14 @@ PALPATE D3 vmax(D3 a, D3 b) {
 }
 PALPATE D3 vabs(D3 a) { return {fabs(a.x), fabs(a.y), fabs(a.z)}; }
 PALPATE double norm(D3 a) { return sqrt(dot(a, a)); }
+PALPATE D3 cross(D3 a, D3 b) {
+  return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
+}
+// R x, with R row by row.
+PALPATE D3 turned(const double* R, D3 x) {
+  return {R[0] * x.x + R[1] * x.y + R[2] * x.z, R[3] * x.x + R[4] * x.y + R[5] * x.z,
+          R[6] * x.x + R[7] * x.y + R[8] * x.z};
+}
 // a + R^T x, with R row by row.
 PALPATE D3 add_turned(D3 a, const double* R, D3 x) {
   return {a.x + R[0] * x.x + R[3] * x.y + R[6] * x.z, a.y + R[1] * x.x + R[4] * x.y + R[7] * x.z,

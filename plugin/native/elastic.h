@@ -353,6 +353,15 @@ PALPATE V3 bending(const Fan& fan, const float* normal, const float* corner, V3 
   return b;
 }
 
+// What springs that hold nodes add to the diagonal block; in `b` they have it for what later
+// iterations have changed already.
+template <class Fields>
+PALPATE S3 hold(const Fields& f, int stage, size_t at, V3& b, Lane lane) {
+  const S3 weight = ld6(f.state.hold.data + 48 * at, lane);
+  if (stage == LATER) b -= weight * ld3(f.state.dvel.data + 24 * at, lane);
+  return weight;
+}
+
 // Writes what is on the diagonal of slice s, at place `at` of all worlds, and the inverse of `self`,
 // the block there.
 template <class Fields>
@@ -395,6 +404,7 @@ PALPATE void row(const Fields& f, Thread t, int stage) {
       + gv * (sum.rate - kf * m.v);
     if (stage == LATER) b -= mass * ld3(f.state.dvel.data + 24 * at, lane);
     S3 self = splat(g) * sum.stiffness + diag;
+    if (f.state.hold.data) self = self + hold(f, stage, at, b, lane);
     if (areas) st3(f.system.areavec.data + 24 * at, sum.area, lane);
     if (bends) {
       b = bending(fan, normal, corner, b, lane);

@@ -16,6 +16,7 @@ struct Matrix {
   const int* bend_row;
   const int* bend_node;
   const float* bend_gain;
+  const float* hold;  // of nodes that springs hold, or null
   float bend;  // (h^2 + h damping) times the scale of Young's modulus, for the bending matrix
   bool bends;  // whether there is one
 };
@@ -27,6 +28,7 @@ PALPATE Matrix matrix(const Fields& f, int world) {
     f.system.block.data + 72 * (size_t)world * f.shape.nslot, f.system.diag.data + 8 * base,
     f.system.inverse.data + 48 * base, f.system.normal.data + 24 * base, f.shape.slot_adr.data,
     f.shape.fan_node.data, f.shape.bend_adr.data, f.shape.bend_node.data, f.tissue.bend_gain.data,
+    f.state.hold.data ? f.state.hold.data + 48 * base : nullptr,
     f.state.step.data[4 * world + 1] * numbers(f, world)[YOUNG_SCALE], f.shape.nhingeslice > 0
   };
 }
@@ -45,6 +47,7 @@ PALPATE V3 product(const Matrix& a, const Vector& z, V3 own, int s, Lane lane) {
       block += 72;
     });
   }
+  if (a.hold) out = out + ld6(a.hold + 48 * s, lane) * own;
   if (a.bends) {
     const int row = a.bend_row[s], width = a.bend_row[s + 1] - row;
     const float* gain = a.bend_gain + 8 * row;

@@ -104,6 +104,19 @@ PALPATE void st9(float* p, M3 a, Lane lane) {
   st3(p, 3, {a.yx, a.yy, a.yz}, lane);
   st3(p, 6, {a.zx, a.zy, a.zz}, lane);
 }
+// Writes a matrix to eight places, in floats; a negative one is none.
+#if ON_CUDA
+PALPATE void put9(float* p, const int* at, M3 a, Lane lane) {
+  if (at[lane] >= 0) st9(p + at[lane] - lane, a, lane);
+}
+#else
+PALPATE void put9(float* p, const int* at, M3 a, Lane) {
+  const V rows[9] = {a.xx, a.xy, a.xz, a.yx, a.yy, a.yz, a.zx, a.zy, a.zz};
+  for (int l = 0; l < LANES; ++l)
+    if (at[l] >= 0)
+      for (int c = 0; c < 9; ++c) p[at[l] + LANES * c] = rows[c][l];
+}
+#endif
 PALPATE V3 gather3(const float* p, const int* at, Lane lane) {
   return {gather(p, at, 0, lane), gather(p, at, 1, lane), gather(p, at, 2, lane)};
 }

@@ -81,7 +81,7 @@ PALPATE void node_pressure(const Fields& f, Thread t, int) {
     for (int k = row; k < row + width; ++k)
       sum += ld(f.shape.around_share.data, k, lane)
         * gather(strain, f.shape.around_tet.data + 8 * k, 0, lane);
-    st(f.system.node_pressure.data, t.world * f.shape.nslice + s,
+    st(f.system.node_pressure.data, 3 * (t.world * f.shape.nslice + s),
        ld(f.tissue.pressure_gain.data, s, lane) * sum, lane);
   });
 }
@@ -96,7 +96,8 @@ PALPATE M3 turn(M3 x) {
     const V size2 = inner(x, x), cof2 = inner(cof, cof);
     const V least = 1e-4f * size2 * vsqrt(size2) + 1e-30f, zero = splat(0.0f);
     const V d = select(det < zero, vmin(det, -least), vmax(det, least));
-    const V scale = vsqrt(vsqrt(cof2 / (d * d * vmax(size2, splat(1e-30f)))));
+    // The last round is near enough to do without.
+    const V scale = k > 1 ? splat(1.0f) : vsqrt(vsqrt(cof2 / (d * d * vmax(size2, splat(1e-30f)))));
     x = (0.5f * scale) * x + (0.5f / (scale * d)) * cof;
   }
   return x;
@@ -105,8 +106,10 @@ PALPATE M3 turn(M3 x) {
 // What a tetrahedron gives to its corners: impulses, and for the matrix its turned gradients times
 // the root of its volume with the moduli lambda, mu and tension.
 //
-// The matrix is that of small strains in the turned frame, which leaves rotations free, with lambda
-// as large as the stretched faces make it. The stress adds a geometric stiffness between principal
+// The matrix is that of small strains in the turned frame, which leaves rotations free. A change of
+// volume C : dF hangs on the faces: their mean is in lambda, and what they differ by is covered by an
+// isotropic stiffness, lambda times its square, so that the matrix is at least half the true Hessian
+// for every direction ((a + b)^2 <= 2 a^2 + 2 b^2). The stress adds a geometric stiffness between principal
 // directions a and b: (P_a + P_b) / (s_a + s_b) of a tension to rotations, of which `tension` is an
 // upper bound, and the pressure times the third stretch to shear, which mu has. K v is without both.
 template <class Fields>
@@ -114,7 +117,7 @@ PALPATE void tet_stress(const Fields& f, Thread t, int stage) {
   const float* step = f.state.step.data + 4 * t.world;
   const float h = step[0], gv = weight_of_rate(stage, step);
   const bool implicit = stage == FIRST || stage == LATER;
-  const float* pressure = f.system.node_pressure.data + 8 * (size_t)t.world * f.shape.nslice;
+  const float* pressure = f.system.node_pressure.data + 24 * (size_t)t.world * f.shape.nslice;
   each_slice(t, f.shape.ntetslice, [&](int s, Lane lane) {
     const int* node = f.shape.tet_node.data + 32 * s;
     const float* g = f.shape.tet_gradient.data + 72 * s;
@@ -129,7 +132,7 @@ PALPATE void tet_stress(const Fields& f, Thread t, int stage) {
     const V i = 2.0f * trace(H) + inner(H, H), i4 = 4.0f + i;
     // Mean pressure of the corners.
     V p = splat(0.0f);
-    for (int k = 0; k < 4; ++k) p += gather_number(pressure, node + 8 * k, lane);
+    for (int k = 0; k < 4; ++k) p += gather(pressure, node + 8 * k, 0, lane);
     p = 0.25f * p;
     const M3 still = 0.75f * mu * (H + splat(-1.0f) * now.c) + (0.25f * mu * i / i4) * F
       + lam * now.j * C;
@@ -153,17 +156,42 @@ PALPATE void tet_stress(const Fields& f, Thread t, int stage) {
     const M3 stress = still + (p / h) * C;
     const V mean = inner(Q, stress) / 3.0f;
     const V rest = vmax(inner(stress, stress) - 3.0f * mean * mean, splat(0.0f));
-    const V faces = vmax(inner(C, C) - 2.0f, splat(1.0f));
+    const V even = inner(Q, C) / 3.0f, whole = lam - 0.625f * mu + ld(moduli, 3, lane);
+    const V uneven = vmax(inner(C, C) - 3.0f * even * even, splat(0.0f));
     const V squeezed = vmax(-lam * now.j - p / h, splat(0.0f)) * vsqrt(inner(F, F) / 3.0f);
     const V shear = 0.75f * mu + squeezed;
     share(f.system.tet_now.data + 32 * at,
-          {(lam - 0.625f * mu + ld(moduli, 3, lane)) * faces, shear,
-           vmax(mean + 0.40825f * vsqrt(rest), splat(0.0f))}, lane);
+          {whole * even * even, shear,
+           vmax(mean + 0.40825f * vsqrt(rest), splat(0.0f)) + whole * uneven}, lane);
   });
 }
 
-// Right-hand side of each node and, for an implicit stage, its row of the matrix: the tetrahedra
-// around the node, and those around each of its edges.
+// The blocks of each edge, one for either end, from the tetrahedra around it.
+template <class Fields>
+PALPATE void edge_block(const Fields& f, Thread t, int) {
+  const float g = f.state.step.data[4 * t.world + 1];
+  const size_t tet = (size_t)t.world * f.shape.ntetslice;
+  const float* arm = f.system.tet_arm.data + 128 * tet;
+  const float* moduli = f.system.tet_now.data + 32 * tet;
+  float* out = f.system.block.data + 72 * (size_t)t.world * f.shape.nslot;
+  each_slice(t, f.shape.nedgeslice, [&](int s, Lane lane) {
+    const V zero = splat(0.0f);
+    M3 block = {zero, zero, zero, zero, zero, zero, zero, zero, zero};
+    for (int k = f.shape.edge_adr.data[s]; k < f.shape.edge_adr.data[s + 1]; ++k) {
+      const V3 now = gather_shared(moduli, f.shape.edge_tet.data + 8 * k, lane);
+      const V3 a = gather_shared(arm, f.shape.edge_from.data + 8 * k, lane);
+      const V3 c = gather_shared(arm, f.shape.edge_to.data + 8 * k, lane);
+      block = block + outer(now.x * a, c) + outer(now.y * c, a) + (now.y + now.z) * dot(a, c);
+    }
+    block = splat(g) * block;
+    const int* at = f.shape.edge_slot.data + 16 * s;
+    put9(out, at, block, lane);
+    put9(out, at + 8, transposed(block), lane);
+  });
+}
+
+// Right-hand side of each node and, for an implicit stage, what is on the diagonal of the matrix: from
+// the tetrahedra around the node, and the blocks of its edges.
 template <class Fields>
 PALPATE void solid_row(const Fields& f, Thread t, int stage) {
   const float* step = f.state.step.data + 4 * t.world;
@@ -173,8 +201,6 @@ PALPATE void solid_row(const Fields& f, Thread t, int stage) {
   const size_t base = (size_t)t.world * f.shape.nslice;
   const size_t tet = (size_t)t.world * f.shape.ntetslice;
   const float* impulse = f.system.tet_impulse.data + 128 * tet;
-  const float* arm = f.system.tet_arm.data + 128 * tet;
-  const float* moduli = f.system.tet_now.data + 32 * tet;
   each_slice(t, f.shape.nslice, [&](int s, Lane lane) {
     const size_t at = base + s;
     const V mass = ld(f.state.mass.data + 8 * at, 0, lane);
@@ -185,22 +211,16 @@ PALPATE void solid_row(const Fields& f, Thread t, int stage) {
     if (stage == LATER) b -= mass * ld3(f.state.dvel.data + 24 * at, lane);
     for (int k = f.shape.around_adr.data[s]; k < f.shape.around_adr.data[s + 1]; ++k)
       b += gather_shared(impulse, f.shape.around_corner.data + 8 * k, lane);
+    const V zero = splat(0.0f);
+    S3 held = {zero, zero, zero, zero, zero, zero};
+    if (f.state.hold.data) held = hold(f, stage, at, b, lane);
     st3(f.system.rhs.data + 24 * at, b, lane);
     if (!implicit) return;
-    const V zero = splat(0.0f);
     S3 self = {zero, zero, zero, zero, zero, zero};
-    for (int j = f.shape.slot_adr.data[s]; j < f.shape.slot_adr.data[s + 1]; ++j) {
-      M3 block = {zero, zero, zero, zero, zero, zero, zero, zero, zero};
-      for (int k = f.shape.edge_adr.data[j]; k < f.shape.edge_adr.data[j + 1]; ++k) {
-        const V3 now = gather_shared(moduli, f.shape.edge_tet.data + 8 * k, lane);
-        const V3 a = gather_shared(arm, f.shape.edge_from.data + 8 * k, lane);
-        const V3 c = gather_shared(arm, f.shape.edge_to.data + 8 * k, lane);
-        block = block + outer(now.x * a, c) + outer(now.y * c, a) + (now.y + now.z) * dot(a, c);
-      }
-      st9(f.system.block.data + 72 * ((size_t)t.world * f.shape.nslot + j), splat(g) * block, lane);
-      self = self + symmetric(block);
-    }
-    put_diagonal(f, at, s, diag, splat(-g) * self + diag, lane);
+    const float* block = f.system.block.data + 72 * (size_t)t.world * f.shape.nslot;
+    for (int j = f.shape.slot_adr.data[s]; j < f.shape.slot_adr.data[s + 1]; ++j)
+      self = self + symmetric(ld9(block + 72 * (size_t)j, lane));
+    put_diagonal(f, at, s, diag, splat(-1.0f) * self + diag + held, lane);
   });
 }
 

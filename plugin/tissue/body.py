@@ -9,6 +9,7 @@ import numpy as np
 import warp as wp
 
 from .device import WORDS
+from .order import LANES
 from .types import (
   DIMS,
   NUMBERS,
@@ -125,18 +126,18 @@ def constants(
 
 def _sizes(values: dict[str, Any]) -> dict[str, int]:
   """Returns the named sizes of a body from the fields of `Shape` and `Tissue`, but nworld."""
-  shape = ("nvert", "nnode", "nslice", "nelemslice", "nhingeslice", "ntetslice", "nslot")
-  out = {name: values[name] for name in shape}
+  shape = ("nvert", "nnode", "nslice", "nelemslice", "nhingeslice", "ntetslice", "nedgeslice")
+  out = {name: values[name] for name in (*shape, "nslot")}
   bends, solid = out["nhingeslice"] > 0, out["ntetslice"] > 0
   return out | {
     "nsolidslice": out["nslice"] if solid else 0,
-    "nedgeslot": out["nslot"] if solid else 0,
     "naround": len(values["around_tet"]),
     "nedge": len(values["edge_tet"]),
     "nbend": len(values["bend_node"]),
     "nbendslice": out["nslice"] if bends else 0,
     "nareaslice": out["nslice"] if bends or values["closed"] else 0,
     "nquadslice": out["nslice"],
+    "nholdslice": 0,
     "ncycleslice": 0,
     "ncyclebendslice": 0,
     "nword": WORDS,
@@ -188,6 +189,16 @@ def worlds(body: Body, nworld: int = 1) -> Body:
   if body.levels is not None:
     out.levels = _levels(out, worlds(body.levels.body, nworld), body.levels.transfer)
   return out
+
+
+def hold(body: Body) -> wp.array:
+  """Returns `state.hold`, a symmetric matrix a node, which a body gets when it is first asked."""
+  if not body.state.hold.size:
+    shape = (body.nworld, body.shape.nslice, 6, LANES)
+    body.fields.state.hold = wp.zeros(shape, dtype=float, device=body.device)
+    if body.levels is not None:
+      body.levels.cycle.fine = body.fields
+  return body.state.hold
 
 
 def nbytes(body: Body) -> int:

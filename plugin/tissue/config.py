@@ -14,6 +14,7 @@ from .step import SCHEMES
 # What takes a change while running: a number in the device's memory, the tissue's arrays, the graph
 # of the step anew. Other keys shape arrays or the model, and stay.
 NUMBER, TISSUE, GRAPH, FIXED = "number", "tissue", "graph", ""
+OWN = "own"  # as a carrier: the organ's own rigid motion
 _SHOWN = 40  # letters of a value in a message
 _SCALE = "young_scale"  # a key of `change` alone
 
@@ -117,8 +118,24 @@ def _names(text: str, nelem: int) -> tuple[str, ...]:
   return tuple(text.split())
 
 
+def _name(text: str, nelem: int) -> str:
+  (name,) = text.split()
+  return name
+
+
 def _groups(text: str, nelem: int) -> tuple[tuple[str, ...], ...]:
   return tuple(tuple(group.split()) for group in text.split(","))
+
+
+def _ties(text: str, nelem: int) -> tuple[tuple[str, float, tuple[int, ...]], ...]:
+  found = []
+  for group in text.split(","):
+    name, stiffness, *vertices = group.split()
+    value = _POSITIVE[0](stiffness, nelem)
+    found.append((name, value, _vertices(" ".join(vertices), nelem)))
+    if not vertices:
+      raise ValueError
+  return tuple(found)
 
 
 def _words(*values: str) -> tuple:
@@ -174,6 +191,16 @@ class Config:
     0.0, _number(-math.inf), "inside minus outside; closed surfaces", "Pa", NUMBER
   )
   damping: float = _row(0.002, _NOT_NEGATIVE, "Rayleigh coefficient on the stiffness", "s", NUMBER)
+  relax_share: float = _row(
+    0.0,
+    _number(0.0, 1.0),
+    "share of the elastic forces that fades while a strain is held; `young` is that at once",
+    "-",
+    NUMBER,
+  )
+  relax_time: float = _row(
+    0.5, _POSITIVE, "time constant of that, exp(-t / relax_time)", "s", NUMBER
+  )
   integrator: str = _row(
     "implicit",
     _words(*SCHEMES),
@@ -201,6 +228,25 @@ class Config:
   mass: float = _row(0.0, _POSITIVE, "mass of the organ, with `window` alone", "kg")
   pin: tuple[int, ...] = _row(
     (), (_vertices, "vertex numbers"), "vertices that do not move, with `window` alone"
+  )
+  carrier: str = _row(
+    "",
+    (_name, "the name of a body, or 'own'"),
+    "body that carries foundation and pins along ([attachments](authoring.md#attachments)); `own`: "
+    "the foundation goes with the organ's own rigid motion",
+  )
+  attach: tuple[tuple[str, float, tuple[int, ...]], ...] = _row(
+    (),
+    (_ties, "a body or organ, a stiffness > 0 and vertices, a comma between such groups"),
+    "springs from vertices to a body, or to the nearest vertices of another organ: "
+    "`rib 500 3 17 18, stomach 200 40 41`; the stiffness is that of a group",
+    "-, N/m, -",
+  )
+  support: tuple[str, ...] = _row(
+    (),
+    (_names, "names of geoms and organs"),
+    "with `window` alone: geoms and organs that bear the organ, with friction, by springs of its "
+    "surface in place of MuJoCo's contacts ([lying](authoring.md#lying-on-something))",
   )
   resident: bool = _row(
     False,
@@ -243,7 +289,7 @@ def _default(key: str) -> str:
     except ValueError:
       return "-"
     return f"{value:g}"
-  return str(value).lower()
+  return str(value).lower() or "-"
 
 
 def parse(organ: str, texts: dict[str, str], nelem: int, closed: bool) -> Config:
@@ -294,6 +340,11 @@ def change(
     factor = _value(organ, _SCALE, scale, *_POSITIVE)
     values["young"] = tuple(factor * young for young in compiled.young)
   changed = dataclasses.replace(config, **values)
+  if bool(changed.relax_share) != bool(compiled.relax_share):
+    raise ValueError(
+      f"organ {organ!r}: relax_share is {changed.relax_share:g}, compiled as "
+      f"{compiled.relax_share:g}: it cannot begin or end while running"
+    )
   given = values | ({"stiffness": 0} if config.stiffness else {})
   _check_combination(organ, changed, given, closed)
   return changed
@@ -328,11 +379,12 @@ def _check_combination(organ: str, config: Config, given: dict, closed: bool):
     raise ValueError(
       f"organ {organ!r}: stiffness is {config.stiffness:g}, allowed only with elements='spring'"
     )
-  for key in ("follow", "mass", "pin", "resident"):
+  for key in ("follow", "mass", "pin", "resident", "support"):
     if key in given and not config.window:
       raise ValueError(f"organ {organ!r}: {key} is set, allowed only with window")
   if config.elements == "solid":
     _check_solid(organ, config, given)
+  _check_ties(organ, config)
   if config.window and "mass" not in given and not config.mass:
     raise ValueError(f"organ {organ!r}: window is set and mass is missing [kg]")
   for key in ("bulk", "pressure"):
@@ -355,6 +407,20 @@ def _check_solid(organ: str, config: Config, given: dict):
       f"organ {organ!r}: integrator is {config.integrator!r}, allowed only where elements is not "
       "'solid'"
     )
+
+
+def _check_ties(organ: str, config: Config):
+  for key in ("carrier", "attach", "relax_share", "support"):
+    if getattr(config, key) and config.resident:
+      raise ValueError(f"organ {organ!r}: {key} is set, allowed only without resident")
+    if getattr(config, key) and not SCHEMES[config.integrator].solids:
+      raise ValueError(
+        f"organ {organ!r}: integrator is {config.integrator!r}, allowed only without {key}"
+      )
+  if config.relax_share and config.pressure:
+    raise ValueError(f"organ {organ!r}: relax_share is set, allowed only where pressure is 0")
+  if config.carrier == OWN and config.pin:
+    raise ValueError(f"organ {organ!r}: carrier is 'own', allowed only without pin")
 
 
 def lame(config: Config, nelem: int) -> tuple[np.ndarray, np.ndarray]:

@@ -87,7 +87,9 @@ def bending(mesh: Mesh, config: Config, u: np.ndarray) -> float:
 
 
 def foundation(mesh: Mesh, config: Config, u: np.ndarray) -> float:
-  """Returns the energy of the Winkler foundation, 1/2 foundation area |u|^2 [J]."""
+  """Returns the energy of the Winkler foundation, 1/2 foundation area |u|^2 [J]; 0 if carried."""
+  if config.carrier:
+    return 0.0
   area = topology.vertex_areas(mesh.rest, mesh.elem)
   return float(0.5 * config.foundation * (area[:, None] * u * u).sum())
 

@@ -11,8 +11,14 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import hashlib
+import os
+import pathlib
+import tempfile
+import zipfile
 
 import numpy as np
+import warp as wp
 from scipy import sparse
 from scipy.sparse import csgraph, linalg
 from scipy.spatial import Delaunay, KDTree
@@ -26,6 +32,7 @@ _ROUNDS = 8
 _MOVE = 0.7  # share of the way that a node goes in a round
 _FLAT = 1e-3  # quality of a tetrahedron that is none
 _KEPT = 16
+_VERSION = 1  # of what is kept in files: another one where tetrahedra are made otherwise
 _TIE = 1e-6  # of the size, by which points on one sphere are told apart
 
 # Faces of a tetrahedron, each opposite the corner of its number.
@@ -121,7 +128,42 @@ def inside(mesh: Mesh, values: np.ndarray) -> np.ndarray:
 
 @functools.lru_cache(maxsize=_KEPT)
 def _fill(rest: bytes, elem: bytes) -> tuple[bytes, np.ndarray, int]:
-  """Returns the vertices inside, the tetrahedra and the first triangle that is not among them."""
+  """Returns the vertices inside, the tetrahedra and the first triangle that is not among them.
+
+  What was filled once is kept beside Warp's kernels, by content.
+  """
+  digest = hashlib.sha256(f"{_VERSION} {len(rest)} ".encode() + rest + elem).hexdigest()[:32]
+  if not wp.config.kernel_cache_dir:  # before Warp is initialized
+    return _make(rest, elem)
+  file = pathlib.Path(wp.config.kernel_cache_dir) / f"fill_{digest}.npz"
+  try:
+    with np.load(file, allow_pickle=False) as kept:
+      return kept["inner"].tobytes(), kept["tet"], -1
+  except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+    pass
+  inner, tet, faulty = _make(rest, elem)
+  if faulty < 0:
+    _keep(file, inner=np.frombuffer(inner), tet=tet)
+  return inner, tet, faulty
+
+
+def forget():
+  """Forgets the surfaces that this process has filled."""
+  _fill.cache_clear()
+
+
+def _keep(file: pathlib.Path, **arrays):
+  """Writes arrays to a file, whole or not at all."""
+  try:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.NamedTemporaryFile(dir=file.parent, suffix=".part", delete=False) as part:
+      np.savez(part, **arrays)
+    os.replace(part.name, file)
+  except OSError:
+    pass  # it is made again then
+
+
+def _make(rest: bytes, elem: bytes) -> tuple[bytes, np.ndarray, int]:
   surface = np.frombuffer(rest).reshape(-1, 3)
   triangle = np.frombuffer(elem, np.int64).reshape(-1, 3)
   inner = _lattice(surface, triangle)

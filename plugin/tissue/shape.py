@@ -78,7 +78,9 @@ def renumber(body: Body, config: Config):
 
 def _numbers(config: Config) -> dict[str, float]:
   values = {name: getattr(config, name, 1.0) for name in NUMBERS}
-  return values | {"stiffness": config.stiffness if config.elements == "spring" else 0.0}
+  values["stiffness"] = config.stiffness if config.elements == "spring" else 0.0
+  values["foundation"] = 0.0 if config.carrier else config.foundation  # its springs are held then
+  return values
 
 
 def _below(
@@ -128,6 +130,7 @@ def counts(values: dict[str, Any]) -> dict[str, int]:
     "nelemslice": len(values["elem_node"]),
     "nhingeslice": len(values["hinge_node"]),
     "ntetslice": len(values["tet_node"]),
+    "nedgeslice": len(values["edge_slot"]),
     "nslot": int(values["slot_adr"][-1]),
   }
 

@@ -89,28 +89,44 @@ def _corner(tet: np.ndarray, corner: np.ndarray) -> np.ndarray:
 
 
 def _edges(mesh: Mesh, vert: np.ndarray, node: np.ndarray) -> dict[str, np.ndarray]:
-  """Returns the tetrahedra around each edge, by the rows of stiffness blocks."""
-  a, b = np.nonzero(~np.eye(4, dtype=bool))
-  start, end = mesh.tet[:, a].ravel(), mesh.tet[:, b].ravel()
-  # Which entry of the ring of `start` is `end`.
-  entry = (mesh.ring[start] == end[:, None]).argmax(axis=1)
-  degree = np.where(vert >= 0, mesh.degree[vert], 0).reshape(-1, LANES)
-  first = addresses(degree.max(axis=1))
-  row = (first[node[start] // LANES] + entry) * LANES + node[start] % LANES
-  absent = np.full((int(first[-1]), LANES), len(start))  # corners of the padding
-  width, pair, _ = ellpack(row, np.arange(len(start)), np.ones(len(start)), absent)
-  tet, which = pair // len(a), pair % len(a)
+  """Returns the tetrahedra around each edge, and where its blocks are among those of the nodes."""
+  a, b = np.triu_indices(4, 1)
+  ends = np.sort(mesh.tet[:, np.stack([a, b], axis=1)].reshape(-1, 2), axis=1)
+  # The first end is that of the lower number.
+  swap = (mesh.tet[:, a] > mesh.tet[:, b]).ravel()
+  first, last = np.tile(a, len(mesh.tet)), np.tile(b, len(mesh.tet))
+  first, last = np.where(swap, last, first), np.where(swap, first, last)
+  edge, which, count = np.unique(ends, axis=0, return_inverse=True, return_counts=True)
+  # Those of as many tetrahedra together, so that slices are full; near ones near each other.
+  order = np.lexsort((node[edge[:, 0]], -count))
+  place = np.empty(len(edge), np.int64)
+  place[order] = np.arange(len(edge))
+  absent = np.full((-(-len(edge) // LANES), LANES), len(ends))  # of corners of the padding
+  width, pair, _ = ellpack(place[which.ravel()], np.arange(len(ends)), np.ones(len(ends)), absent)
+  tet = pair // len(a)
+  first, last = np.append(first, 0), np.append(last, 0)
+  slots = [_slot(mesh, vert, node, edge[order]), _slot(mesh, vert, node, edge[order][:, ::-1])]
   return {
     "edge_adr": addresses(width),
     "edge_tet": tet.astype(np.int32),
-    "edge_from": _corner(tet, a[which]),
-    "edge_to": _corner(tet, b[which]),
+    "edge_from": _corner(tet, first[pair]),
+    "edge_to": _corner(tet, last[pair]),
+    "edge_slot": to_slices(pad(np.stack(slots, axis=1), -1)).astype(np.int32),
   }
+
+
+def _slot(mesh: Mesh, vert: np.ndarray, node: np.ndarray, edge: np.ndarray) -> np.ndarray:
+  """Returns where the block of each edge's first end starts, in floats."""
+  start, end = edge.T
+  entry = (mesh.ring[start] == end[:, None]).argmax(axis=1)
+  degree = np.where(vert >= 0, mesh.degree[vert], 0).reshape(-1, LANES)
+  row = addresses(degree.max(axis=1))[node[start] // LANES] + entry
+  return row * 9 * LANES + node[start] % LANES
 
 
 def none(nslice: int) -> dict[str, np.ndarray]:
   """Returns the arrays of `arrays` for a surface."""
-  sizes = ("ntetslice", "naround", "nedge", "nsolidslice")
+  sizes = ("ntetslice", "naround", "nedge", "nedgeslice", "nsolidslice")
   return {
     "around_adr": np.zeros(nslice + 1, np.int32),
     "edge_adr": np.zeros(1, np.int32),

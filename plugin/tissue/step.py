@@ -80,6 +80,7 @@ _row = _elastic("row")
 _tet_strain = _solid("tet_strain")
 _node_pressure = _solid("node_pressure")
 _tet_stress = _solid("tet_stress")
+_edge_block = _solid("edge_block")
 _solid_row = _solid("solid_row")
 _edge_change = _scheme("edge_change")
 _predict = _scheme("predict")
@@ -146,6 +147,8 @@ def assemble(body: Body, stage: Stage):
     _over(_tet_strain, body, shape.ntetslice, stage)
     _over(_node_pressure, body, shape.nslice)
     _over(_tet_stress, body, shape.ntetslice, stage)
+    if stage in (Stage.FIRST, Stage.LATER):
+      _over(_edge_block, body, shape.nedgeslice)
     _over(_solid_row, body, shape.nslice, stage)
     return
   if body.has_bending:
@@ -263,13 +266,15 @@ class Scheme:
     respond: writes to `system.sol` how the impulses in `system.rhs` [N s] change the velocity in
       the step just computed; None where the scheme has no such answer
     levels: whether coarser meshes serve its solve
-    solids: whether it can step tetrahedra
+    ahead: whether it takes forces where the present velocity leads
+    solids: whether it can step tetrahedra, and springs that hold nodes
   """
 
   step: Callable[[Body], None]
   gain: Callable[[float, float], float]
   respond: Callable[[Body], None] | None = None
   levels: bool = False
+  ahead: bool = False
   solids: bool = True
 
   @property
@@ -283,7 +288,7 @@ def _whole(h: float, damping: float) -> float:
 
 
 SCHEMES = {
-  "implicit": Scheme(_implicit, _whole, _respond, levels=True),
+  "implicit": Scheme(_implicit, _whole, _respond, levels=True, ahead=True),
   "midpoint": Scheme(_midpoint, lambda h, b: 0.5 * _whole(h, b), _respond_centred, levels=True),
   "neumann": Scheme(_neumann, _whole, solids=False),
   "explicit": Scheme(_explicit, lambda h, b: 0.0),

@@ -109,6 +109,7 @@ class Shape:
   nelemslice: int  # slices of triangles; 0 without bending
   nhingeslice: int  # slices of hinges; 0 without bending
   ntetslice: int  # slices of tetrahedra; 0 but for solids
+  nedgeslice: int  # slices of their edges; 0 but for solids
   nslot: int  # rows of stiffness blocks
   closed: int  # whether the surface encloses a volume
   volume0: float  # rest volume [m^3]; 0 for an open surface
@@ -139,10 +140,11 @@ class Shape:
   around_tet: ints("naround", 8)  # each tetrahedron around a node
   around_corner: ints("naround", 8)  # number of its corner there
   around_share: floats("naround", 8)  # a quarter of its volume [m^3]; 0 for padding
-  edge_adr: ints("nedgeslot + 1")  # first row of each row of blocks in the three below
+  edge_adr: ints("nedgeslice + 1")  # first row of each slice of edges in the three below
   edge_tet: ints("nedge", 8)  # each tetrahedron around an edge
-  edge_from: ints("nedge", 8)  # number of its corner at the node
-  edge_to: ints("nedge", 8)  # number of its corner at the neighbour
+  edge_from: ints("nedge", 8)  # number of its corner at the edge's first end
+  edge_to: ints("nedge", 8)  # number of its corner at the other
+  edge_slot: ints("nedgeslice", 2, 8)  # where the blocks of both ends start; -1 for padding
 
 
 @struct
@@ -168,6 +170,7 @@ class State:
   vel: vector  # velocity [m/s]
   mass: scalar  # mass [kg]
   force_ext: vector  # external and lagged contact force [N]
+  hold: floats("nworld", "nholdslice", 6, 8)  # what springs in `force_ext` weigh on dv [kg]
   dvel: vector  # change of velocity in this step [m/s]
   dvel_warm: vector  # what those of the last steps lead to, where PCG starts [m/s]
 
@@ -192,7 +195,7 @@ class System:
   hinge_moment: floats("nworld", "nhingeslice", 8)  # moment impulse [N m s]
   hinge_rough: floats("nworld", "nhingeslice", 8)  # what the bending matrix may leave out [N m]
   tet_strain: floats("nworld", "ntetslice", 8)  # impulse of the change of volume [s]
-  node_pressure: floats("nworld", "nsolidslice", 8)  # averaged pressure impulse [Pa s]
+  node_pressure: floats("nworld", "nsolidslice", 3, 8)  # averaged pressure impulse, first [Pa s]
   tet_impulse: floats("nworld", "ntetslice", 16, 8)  # impulse on each corner [N s]
   tet_arm: floats("nworld", "ntetslice", 16, 8)  # turned gradient of each corner [m^(1/2)]
   tet_now: floats("nworld", "ntetslice", 4, 8)  # lambda, mu, tension of the matrix [Pa]

@@ -44,6 +44,11 @@ REFUSED = [
   ("elements", "tetrahedron", "'membrane' or 'spring'"),
   ("mass", "0", "> 0"),
   ("pin", "1 -2", "vertex numbers"),
+  ("relax_share", "1", "[0, 1)"),
+  ("relax_time", "0", "> 0"),
+  ("attach", "rib 500", "a stiffness > 0 and vertices"),
+  ("attach", "rib soft 3", "a stiffness > 0 and vertices"),
+  ("carrier", "two words", "the name of a body"),
   ("resident", "yes", "'true' or 'false'"),
 ]
 
@@ -59,7 +64,7 @@ def test_a_bad_value_is_refused_with_organ_key_value_and_what_is_allowed(key, va
 
 
 def test_every_key_has_a_refused_value_in_this_file():
-  in_the_model = {"window", "follow"}  # names; test_window.py has their refusals
+  in_the_model = {"window", "follow", "support"}  # names; see test_window.py and test_rests.py
   assert set(KEYS) == {key for key, _, _ in REFUSED} | in_the_model
 
 

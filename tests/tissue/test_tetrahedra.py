@@ -1,5 +1,7 @@
 """Solids: tetrahedra inside a surface, against closed forms of elasticity."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from palpate.models import shapes
@@ -96,8 +98,9 @@ def test_equal_tension_everywhere_swells_by_the_bulk_modulus(scenes, device):
 
 
 @pytest.mark.parametrize("start", ["squeezed", "turned inside out", "random"])
-@pytest.mark.parametrize("poisson", [0.3, 0.45])
-def test_a_crushed_solid_does_not_gain_energy(scenes, start, poisson):
+@pytest.mark.parametrize("poisson", [0.3, 0.45, 0.49])
+@pytest.mark.parametrize("h", [1e-3, 5e-3])
+def test_a_crushed_solid_does_not_gain_energy(scenes, start, poisson, h):
   points, elem = scenes.sphere(2)
   made = {"elements": "solid", "poisson": poisson, "young": (YOUNG,)}
   mesh, config, body = scenes.kernels(points, elem, damping=0.002, **made)
@@ -109,11 +112,11 @@ def test_a_crushed_solid_does_not_gain_energy(scenes, start, poisson):
   }[start]
   mass, v = _masses(mesh), np.zeros_like(u)
   at_first = energy.total(mesh, config, u)
-  for _ in range(60):
-    v = v + scenes.step(body, 1e-3, u, v, mass)
-    u = u + 1e-3 * v
+  for _ in range(40):
+    v = v + scenes.step(body, h, u, v, mass)
+    u = u + h * v
     kinetic = 0.5 * (mass[:, None] * v**2).sum()
-    assert energy.total(mesh, config, u) + kinetic < 1.02 * at_first
+    assert energy.total(mesh, config, u) + kinetic < 1.001 * at_first
 
 
 def test_a_modulus_of_each_triangle_goes_as_deep_as_it_is_nearest(scenes):
@@ -143,6 +146,21 @@ def test_tetrahedra_fill_an_organ_and_end_at_its_triangles(name):
   assert (np.bincount(solid.tet.ravel(), minlength=solid.nvert) > 0).all()
   again = fill.fill(name, mesh)
   np.testing.assert_array_equal(again.tet, solid.tet)
+
+
+def test_tetrahedra_are_kept_and_made_again_where_a_file_is_damaged(monkeypatch, tmp_path):
+  monkeypatch.setattr(fill.wp.config, "kernel_cache_dir", str(tmp_path))
+  points, elem = shapes.kidney(150)
+  mesh = topology.build("kidney", np.asarray(points) * 1.01, np.asarray(elem))
+  made = fill.fill("kidney", mesh)
+  (file,) = tmp_path.iterdir()
+  with np.load(file) as kept:
+    np.testing.assert_array_equal(kept["tet"], made.tet)
+  for text in (b"", b"damaged", file.read_bytes()):
+    file.write_bytes(text)
+    moved = dataclasses.replace(mesh, rest=mesh.rest + 0.0)
+    fill.forget()
+    np.testing.assert_array_equal(fill.fill("kidney", moved).tet, made.tet)
 
 
 def test_a_surface_that_cuts_itself_has_no_inside(scenes):

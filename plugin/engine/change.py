@@ -1,0 +1,119 @@
+"""What changes of an organ while it runs: configuration keys, and what it is tied to."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+from palpate.tissue import config as configuration
+from palpate.tissue import shape
+from palpate.tissue.config import Config
+from palpate.tissue.step import SCHEMES
+
+from . import fasten, graphs, mjstruct, windowed, workspace
+from .bind import bind
+from .ties import Group
+
+
+def configure(w, model: int, texts: dict[str, str]):
+  """Changes configuration keys while running.
+
+  Raises:
+    ValueError: a key may not change, or its value is not allowed.
+  """
+  organ, mesh = w.organ, w.organ.mesh
+  arguments = texts, mesh.nelem, mesh.closed, organ.config
+  _change(w, model, configuration.change(organ.name, w.config, *arguments))
+  w.chosen = True
+
+
+def copy(w, model: int, other, twin):
+  """Gives a copy of an mjData the configuration of the original, unless it was given one itself.
+
+  Args:
+    w: workspace of the copy
+    model: the mjModel
+    other: workspace of the original
+    twin: returns the workspace of the copy for one of the original
+  """
+  if w.organ.digest != other.organ.digest:
+    return
+  if not w.chosen and w.config != other.config:
+    _change(w, model, other.config)
+  if w.ties.groups or other.ties.groups:
+    groups = [dataclasses.replace(g, other=g.other and twin(g.other)) for g in other.ties.groups]
+    tie(w, model, groups)
+
+
+def attach(w, model: int, vertices, to, stiffness: float | None) -> list[tuple[Any, Group]]:
+  """Ties vertices to a body, or to another organ's vertices nearest to them, where they are.
+
+  Args:
+    w: the workspace of the organ
+    model: address of the mjModel
+    vertices: some vertices
+    to: number of the body, or workspace of the other organ
+    stiffness: of all together [N/m], None for as firm as a step allows
+
+  Returns:
+    what was made, with the workspace that it belongs to
+
+  Raises:
+    ValueError: vertices, stiffness or configuration do not allow it.
+  """
+  vert = fasten.check_vertices(w, vertices)
+  spaces = [w] if isinstance(to, int) else [w, to]
+  for each in spaces:
+    workspace.attach(each, model)
+    if each.config.resident or not SCHEMES[each.config.integrator].solids:
+      raise ValueError(
+        f"organ {each.organ.name!r}: resident or integrator='neumann' is set, allowed only without "
+        "attachments"
+      )
+  if isinstance(to, int):
+    made = [fasten.to_body(w, vert, to, stiffness)]
+  else:
+    made = list(fasten.to_organ(w, vert, to, stiffness))
+  for each, group in zip(spaces, made, strict=True):
+    tie(each, model, [*each.ties.groups, group])
+  return list(zip(spaces, made, strict=True))
+
+
+def detach(w, model: int, groups: list[Group]):
+  """Takes ties away."""
+  tie(w, model, [group for group in w.ties.groups if group not in groups])
+
+
+def tie(w, model: int, groups: list[Group]):
+  """Makes these the ties of an organ."""
+  with graphs.lock:
+    if w.ties.put(groups):
+      bind(w, model)
+  if w.turn is not None:
+    windowed.wake(w)
+
+
+def _change(w, model: int, config: Config):
+  workspace.attach(w, model)
+  before, w.config = w.config, config
+  if w.resident:
+    w.resident.stop()
+  material = any(getattr(before, key) != getattr(config, key) for key in configuration.MATERIAL)
+  with graphs.lock:
+    if material:
+      shape.change(w.body, w.organ.mesh, config, ~w.organ.free)
+    else:
+      shape.renumber(w.body, config)
+    w.creep.renumber(config)
+    if any(getattr(before, key) != getattr(config, key) for key in configuration.RECORDED):
+      bind(w, model)
+    if material:
+      workspace.refresh(w)
+    else:
+      workspace.feel(w, mjstruct.Model.from_address(model))
+  if config.foundation != before.foundation and config.carrier:
+    tie(w, model, [*fasten.carried(w), *(g for g in w.ties.groups if g.by != "carrier")])
+  if w.turn is not None:
+    windowed.wake(w)
+
+

@@ -1,0 +1,269 @@
+"""What an organ rests on: geoms and other organs that bear it by springs; see `native/rests.h`."""
+
+# Annotations here are objects, not text: no `from __future__ import annotations`.
+# pyright: reportInvalidTypeForm=false
+from typing import Any
+
+import numpy as np
+import warp as wp
+from palpate.tissue import mesh as topology
+from palpate.tissue.types import doubles, fill, floats, ints, struct, vector
+
+from . import coupling, flexes, mjstruct
+from .hold import Bodies
+from .layout import TAIL
+
+# Stiffness of the springs, by area, in Young's moduli an edge: an organ of that size sinks in by a
+# hundredth of what its own weight makes of it.
+_FIRM = 10.0
+_CELLS = 1024  # as in the header
+
+
+@struct
+class Resting:
+  """An organ's nodes as those that rest on something see them."""
+
+  nouter: int  # vertices on the surface
+  rest: doubles("nvert", 3)  # rest position [m]
+  disp: doubles("nvert", 3)  # displacement [m]
+  vel: doubles("nvert", 3)  # velocity [m/s]
+  frame: doubles(3, 3)  # rotation from the organ's axes to the world
+  origin: doubles(3)  # position of its frame [m]
+
+
+@struct
+class Pushed:
+  """What an organ's solver is given."""
+
+  node: ints("nvert")  # node of each vertex
+  tail: doubles(len(TAIL))  # see TAIL
+  hold: floats("nworld", "nholdslice", 6, 8)
+  force_ext: vector
+  dvel: vector
+
+
+@struct
+class Rest:
+  """An organ that rests on geoms, and on one other organ."""
+
+  ngeom: int  # geoms that it rests on
+  restless: int  # whether what it rests on may move while it sleeps
+  skin: wp.float64  # distance from which it is borne [m]
+  cell: wp.float64  # length of a cell; farther apart no nodes meet [m]
+  mu: wp.float64  # friction with the other organ
+  own: Resting
+  solve: Pushed
+  geom: ints("ngeom")  # geoms
+  friction: doubles("ngeom")  # friction with each
+  free: ints("nvert")  # whether a node moves
+  stiffness: doubles("nouter")  # of each node's spring [N/m]
+  slip: doubles("nouter", 3)  # how far a node has slipped, in the plugin state [m]
+  slipped: doubles("nouter", 3)  # what it will be
+  on: ints("nouter")  # what a node rests on
+  force: doubles("nouter", 3)  # force on it, in the world [N]
+  hardness: doubles("nouter", 6)  # what its spring weighs on the change of its velocity [kg]
+  corner: ints("nouter", 3)  # nodes of the other organ that bear it
+  weight: doubles("nouter", 3)  # their shares
+  other: Resting
+  below: Pushed
+  elem: ints("nelem", 3)  # triangles of the other organ
+  near_adr: ints("nvert + 1")  # first of a node's triangles in `near`
+  near: ints("nnear")  # triangles of its nodes
+  where: doubles("nvert", 3)  # where they are in the world [m]
+  next: ints("nvert")  # next node in the same cell, -1 for none
+  first: ints(_CELLS)  # first node of a cell
+  mj: Bodies
+
+
+_find_geoms, _find_organ, _press, _act, _bear, _keep = coupling.kernels(
+  "rests.h", Rest, "find_geoms", "find_organ", "press", "act_rests", "bear", "keep"
+)
+
+
+class Rests:
+  """What a workspace's organ rests on, and what rests on it.
+
+  Args:
+    w: the workspace
+  """
+
+  def __init__(self, w):
+    self._w = w
+    self.below: list = []  # workspaces of organs that it rests on
+    self.above: list = []  # of organs that rest on it
+    self._arrays: dict[str, Any] = {}
+    self._alone: Any = None
+    self._on: list = []
+
+  def __bool__(self) -> bool:
+    return bool(self._w.organ.config.support)
+
+  @property
+  def any(self) -> bool:
+    """Whether it rests on something, or something on it."""
+    return bool(self) or bool(self.above)
+
+  def load(self):
+    """Loads the kernels, if there is something to do for them."""
+    if self.any:
+      wp.load_module(_press.module.name, device="cpu")
+
+  def bind(self, model: int):
+    """Points the kernels at the arrays of a model and of the workspace's mjData."""
+    if self.any:
+      self._w.hold.need()
+    if not self:
+      return
+    w, organ = self._w, self._w.organ
+    m = mjstruct.Model.from_address(model)
+    corner = organ.mesh.rest[organ.mesh.elem]
+    edge = np.linalg.norm(corner - corner[:, [1, 2, 0]], axis=2)
+    n, geoms = organ.mesh.nouter, self._geoms(m)
+    area = topology.vertex_areas(organ.mesh.rest, organ.mesh.elem)[:n]
+    young = float(np.mean(w.config.young))
+    flex = int(organ.windows.flex[0])
+    if not self._arrays:
+      shapes = {"slipped": (n, 3), "force": (n, 3), "weight": (n, 3), "hardness": (n, 6)}
+      self._arrays = {k: wp.zeros(s, dtype=wp.float64, device="cpu") for k, s in shapes.items()}
+      self._arrays |= {"on": wp.full(n, -1, dtype=int, device="cpu")}
+      self._arrays |= {"corner": wp.zeros((n, 3), dtype=int, device="cpu")}
+    common = self._arrays | dict(
+      ngeom=len(geoms),
+      restless=int(bool(self.below) or self._moves(m, geoms)),
+      skin=float(mjstruct.view(m.flex_radius, m.nflex)[flex]),
+      cell=2.0 * float(edge.max()),
+      own=_resting(w),
+      solve=_pushed(w),
+      geom=geoms,
+      friction=np.maximum(mjstruct.view(m.geom_friction, (m.ngeom, 3))[geoms, 0], _mu(m, flex)),
+      free=organ.free,
+      stiffness=_FIRM * young / float(edge.mean()) * area,
+      slip=w.boxes["own"].slip,
+      mj=coupling.mujoco_arrays(model, w.data, Bodies),
+    )
+    self._alone = fill(Rest, "cpu", common | _nothing() | {"other": Resting(), "below": Pushed()})
+    self._on = [fill(Rest, "cpu", common | self._other(m, other)) for other in self.below]
+
+  def _geoms(self, m) -> np.ndarray:
+    names = [mjstruct.name_of(m, m.name_geomadr, g) for g in range(m.ngeom)]
+    organ = self._w.organ
+    found = [flexes.resolve(name, organ.name, names) for name in organ.config.support]
+    return np.array([names.index(name) for name in found if name is not None], int)
+
+  def _moves(self, m, geoms: np.ndarray) -> bool:
+    body = mjstruct.view(m.geom_bodyid, m.ngeom, np.int32)[geoms]
+    weld = mjstruct.view(m.body_weldid, m.nbody, np.int32)[body]
+    mocap = mjstruct.view(m.body_mocapid, m.nbody, np.int32)[weld]
+    return bool((weld > 0).any() or (mocap >= 0).any())
+
+  def _other(self, m, other) -> dict[str, Any]:
+    """Returns the fields of an organ that this one rests on."""
+    mesh = other.organ.mesh
+    mine, theirs = (int(w.organ.windows.flex[0]) for w in (self._w, other))
+    count = np.bincount(mesh.elem.ravel(), minlength=mesh.nouter)
+    return dict(
+      mu=max(_mu(m, mine), _mu(m, theirs)),
+      other=_resting(other),
+      below=_pushed(other),
+      elem=mesh.elem,
+      near_adr=np.concatenate([[0], np.cumsum(count)]),
+      near=np.argsort(mesh.elem.ravel(), kind="stable") // 3,
+      where=np.zeros((mesh.nouter, 3)),
+      next=np.zeros(mesh.nouter),
+      first=np.zeros(_CELLS),
+    )
+
+  def find(self):
+    """Finds what each node rests on."""
+    _launch(_find_geoms, self._alone)
+    for k, each in enumerate(self._on):
+      _launch(_find_organ, each, k)
+
+  def enter(self):
+    """Adds to the solver's input, after a coupling has filled it."""
+    if self:
+      self.find()
+      _launch(_press, self._alone)
+    for each in self.above:
+      each.rests.find()
+      which = each.rests.below.index(self._w)
+      _launch(_bear, each.rests._on[which], which)
+
+  def act(self):
+    """Lets the bodies feel what rests on them."""
+    if self:
+      _launch(_act, self._alone)
+
+  def end(self):
+    """Keeps how far the nodes have slipped."""
+    if self:
+      _launch(_keep, self._alone)
+
+  def force(self) -> np.ndarray:
+    """Returns the force on each vertex in the last step, in the world [N], (nouter, 3)."""
+    out = np.zeros((self._w.organ.mesh.nouter, 3))
+    if self._arrays:
+      on = self._arrays["on"].numpy() != -1
+      out[on] = self._arrays["force"].numpy()[on]
+    return out
+
+
+def meet(spaces: list) -> list:
+  """Lets the organs of an mjData meet that rest on each other.
+
+  Args:
+    spaces: workspaces of the organs that there are so far, the one that has come last
+
+  Returns:
+    those whose graphs have to be recorded anew, in this order
+  """
+  named = {w.organ.name: w for w in spaces}
+  changed = []
+  for w in spaces:
+    for name in w.config.support:
+      other = named.get(flexes.resolve(name, w.organ.name, list(named)) or "")
+      if other is not None and other is not w and spaces[-1] in (w, other):
+        w.rests.below.append(other)
+        other.rests.above.append(w)
+        other.hold.need()
+        changed += [w, other]
+  return changed
+
+
+def check(m, w):
+  """Raises ValueError where an organ names as its support what does not exist."""
+  names = [mjstruct.name_of(m, m.name_geomadr, g) for g in range(m.ngeom)]
+  names += [flexes.name(m, f) for f in range(m.nflex)]
+  for name in w.config.support:
+    if flexes.resolve(name, w.organ.name, names) is None:
+      raise ValueError(
+        f"organ {w.organ.name!r}: support names {name!r}, which does not exist, expected a geom or "
+        "another organ"
+      )
+
+
+def _launch(kernel, rest, arg: int = 0):
+  wp.launch(kernel, dim=(1, 1), inputs=[1, arg, rest], device="cpu")
+
+
+def _mu(m, flex: int) -> float:
+  return float(mjstruct.view(m.flex_friction, (m.nflex, 3))[flex, 0])
+
+
+def _resting(w):
+  motion, mesh = w.boxes["own"].motion, w.organ.mesh
+  values = dict(nouter=mesh.nouter, rest=mesh.rest, disp=motion.disp, vel=motion.vel)
+  return fill(Resting, "cpu", values | {"frame": w.organ.frame, "origin": w.organ.origin})
+
+
+def _pushed(w):
+  values = {name: w.host[name] for name in ("force_ext", "dvel")}
+  node = w.body.shape.node.numpy()
+  more = {"node": node, "tail": w.boxes["own"].tail, "hold": w.hold.array}
+  return fill(Pushed, "cpu", values | more)
+
+
+def _nothing() -> dict[str, Any]:
+  """Returns the fields of no other organ."""
+  none = {"elem": (0, 3), "near_adr": 1, "near": 0, "where": (0, 3), "next": 0, "first": _CELLS}
+  return {name: np.zeros(shape) for name, shape in none.items()} | {"mu": 0.0}

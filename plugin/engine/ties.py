@@ -1,0 +1,252 @@
+"""Ties: springs from vertices of an organ to bodies, to other organs, or to its own rigid motion.
+
+They hold what grows on to something that moves, what is stitched, clipped or held by an ideal
+grasp, and what lies on a foundation that is carried. The organ's step has them in its matrix, and
+the bodies feel what they have pulled; see `native/ties.h`.
+"""
+
+# Annotations here are objects, not text: no `from __future__ import annotations`.
+# pyright: reportInvalidTypeForm=false
+import dataclasses
+from typing import Any
+
+import numpy as np
+import warp as wp
+from palpate.tissue.step import SCHEMES
+from palpate.tissue.types import DIMS, doubles, fill, floats, ints, struct, vector
+
+from . import coupling, mjstruct
+from .hold import Bodies
+from .layout import TAIL
+
+TO_POINT, TO_OWN_MOTION = -1, -2  # in place of a body
+_LEAST = 64  # ties that there is room for at once
+# Share of what they hold that springs may weigh in a step for the last steps to lead them.
+_LEADS = 0.5
+
+
+@struct
+class Tied:
+  """The ties of an organ, those to one body in a row."""
+
+  windowed: int  # whether the motion is in the plugin state
+  ahead: wp.float64  # share of the step's way at which its scheme takes forces
+  gain: wp.float64  # how much of a step's stiffness its scheme has on dv
+  count: ints(1)  # number of ties
+  owned: ints(1)  # whether any leads to the organ's own motion
+  restless: ints(1)  # whether one leads to what may move while the organ sleeps
+  vert: ints("ntie")  # vertex
+  body: ints("ntie")  # body, or what `native/ties.h` has besides
+  leads: ints("ntie")  # whether the last steps say how fast the point will be
+  stiffness: doubles("ntie")  # [N/m]
+  anchor: doubles("ntie", 3)  # the point in its body's frame [m]
+  point: doubles("ntie", 6)  # place and velocity of another point, in the world [m, m/s]
+  force: doubles("ntie", 3)  # on the node, in the organ's frame [N]
+  node: ints("nvert")  # node of each vertex
+  rest: doubles("nvert", 3)  # rest position [m]
+  disp: doubles("nvert", 3)  # displacement, of an organ with windows [m]
+  qposadr: ints("nvert")  # first qpos, of one without
+  frame: doubles(3, 3)  # rotation from the organ's axes to the world
+  origin: doubles(3)  # position of its frame [m]
+  number: doubles("nnumber")  # see `NUMBERS`
+  tail: doubles(len(TAIL))  # see TAIL
+  hold: floats("nworld", "nholdslice", 6, 8)
+  force_ext: vector
+  vel: vector
+  dvel: vector
+  dvel_warm: vector
+  status: floats("nworld", 4)
+  mj: Bodies
+
+
+_enter, _act = coupling.kernels("ties.h", Tied, "enter_ties", "act_ties")
+_OF_COUNT = ("count", "owned", "restless")
+_OF_TIE = ("vert", "body", "leads", "stiffness", "anchor", "point", "force")
+
+
+@dataclasses.dataclass(eq=False)
+class Group:
+  """Ties that were made together.
+
+  Attributes:
+    vert: vertices                                        (n,)
+    body: body that they lead to, or a number below 0 for what `native/ties.h` has besides
+    stiffness: of each [N/m]                              (n,)
+    anchor: points in the body's frame, or for another organ what their vertices are off [m] (n, 3)
+    other: workspace of the other organ, or None
+    pair: its vertices                                    (n,)
+    by: key of the configuration that declares it, or "" where it was made while running
+  """
+
+  vert: np.ndarray
+  body: int
+  stiffness: np.ndarray
+  anchor: np.ndarray
+  other: Any = None
+  pair: np.ndarray | None = None
+  by: str = ""
+
+
+class Ties:
+  """The ties of a workspace's organ, none at first.
+
+  Args:
+    w: the workspace
+  """
+
+  def __init__(self, w):
+    self._w = w
+    self.groups: list[Group] = []
+    self._room = 0
+    self._arrays: dict[str, wp.array] = {}
+    self._tied: Any = None
+
+  def __bool__(self) -> bool:
+    return self._room > 0
+
+  def put(self, groups: list[Group]) -> bool:
+    """Makes these the ties; returns whether the step's graphs have to be recorded anew."""
+    self.groups = sorted(groups, key=lambda group: group.body)
+    total = sum(len(group.vert) for group in groups)
+    grown = total > self._room
+    if grown:
+      self._room = max(_LEAST, 2 * total)
+      self._allocate()
+    if self._room:
+      self._write(total)
+    return grown
+
+  def _allocate(self):
+    sizes = {"ntie": self._room}
+    for name in (*_OF_COUNT, *_OF_TIE):
+      shape = [sizes[n] if isinstance(n, str) else n for n in DIMS[Tied.key][name]]
+      self._arrays[name] = wp.zeros(shape, dtype=Tied.vars[name].type.dtype, device="cpu")
+    self._w.hold.need()
+
+  def _write(self, total: int):
+    for name in ("vert", "body", "stiffness", "anchor"):
+      parts = [np.broadcast_to(getattr(g, name), _rows(g, name)) for g in self.groups]
+      if parts:
+        self._arrays[name].numpy()[:total] = np.concatenate(parts)
+    weld = np.array([self._moves(group) for group in self.groups], bool)
+    self._arrays["restless"].numpy()[0] = weld.any()
+    self._arrays["owned"].numpy()[0] = any(g.body == TO_OWN_MOTION for g in self.groups)
+    self._arrays["count"].numpy()[0] = total
+    parts = [np.full(len(g.vert), self._leads(g.body)) for g in self.groups]
+    if parts:
+      self._arrays["leads"].numpy()[:total] = np.concatenate(parts)
+    self._arrays["force"].zero_()
+
+  def _moves(self, group: Group) -> bool:
+    m = mjstruct.Model.from_address(self._w.model)
+    if group.body < 0:
+      return True
+    weld = mjstruct.view(m.body_weldid, m.nbody, np.int32)[group.body]
+    return bool(weld) or is_mocap(m, group.body)
+
+  def load(self):
+    """Loads the kernels, if there is something to do for them."""
+    if self:
+      wp.load_module(_enter.module.name, device="cpu")
+
+  def bind(self, model: int):
+    """Points the kernels at the arrays of a model and of the workspace's mjData."""
+    if not self:
+      return
+    w, organ = self._w, self._w.organ
+    scheme = SCHEMES[w.config.integrator]
+    windowed = organ.windows is not None
+    own = w.boxes["own"] if windowed else None
+    values = self._arrays | dict(
+      windowed=int(windowed),
+      ahead=float(scheme.ahead),
+      gain=scheme.gain(1.0, 0.0),
+      node=w.body.shape.node.numpy(),
+      rest=organ.mesh.rest,
+      disp=own.motion.disp if own else np.zeros((0, 3)),
+      qposadr=organ.qposadr,
+      frame=organ.frame,
+      origin=organ.origin,
+      number=w.body.numbers,
+      tail=own.tail if own else np.zeros(len(TAIL)),
+      hold=w.hold.array,
+      mj=coupling.mujoco_arrays(model, w.data, Bodies),
+    )
+    values |= {n: w.host[n] for n in ("force_ext", "vel", "dvel", "dvel_warm", "status")}
+    self._tied = fill(Tied, "cpu", values)
+
+  def _leads(self, body: int) -> bool:
+    """Returns whether it is stable that springs act where the last steps lead what they hold."""
+    w = self._w
+    m = mjstruct.Model.from_address(w.model)
+    gain = float(m.opt.timestep) * (float(m.opt.timestep) + w.config.damping)
+    weight = gain * sum(group.stiffness.sum() for group in self.groups if group.body == body)
+    if body == TO_OWN_MOTION:
+      return weight < _LEADS * w.organ.mass.sum()
+    return body > 0 and weight * mjstruct.view(m.body_invweight0, (m.nbody, 2))[body, 0] < _LEADS
+
+  def enter(self):
+    """Adds to the solver's input, after a coupling has filled it."""
+    if self:
+      wp.launch(_enter, dim=(1, 1), inputs=[1, 0, self._tied], device="cpu")
+
+  def act(self):
+    """Lets the bodies feel what the ties have pulled."""
+    if self:
+      wp.launch(_act, dim=(1, 1), inputs=[1, 0, self._tied], device="cpu")
+
+  def aim(self):
+    """Finds where the points on other organs are."""
+    start = 0
+    for group in self.groups:
+      stop = start + len(group.vert)
+      if group.other is not None and group.pair is not None:
+        at, vel = motion(group.other, group.pair)
+        self._arrays["point"].numpy()[start:stop] = np.hstack([at + group.anchor, vel])
+      start = stop
+
+  @property
+  def aims(self) -> bool:
+    """Whether any lead to another organ."""
+    return any(group.other is not None for group in self.groups)
+
+  def force(self, group: Group) -> np.ndarray:
+    """Returns the force of a group's ties on its vertices in the last step [N], (n, 3)."""
+    start = 0
+    for each in self.groups:
+      stop = start + len(each.vert)
+      if each is group:
+        return self._arrays["force"].numpy()[start:stop] @ self._w.organ.frame.T
+      start = stop
+    return np.zeros((len(group.vert), 3))
+
+
+def _rows(group: Group, name: str) -> tuple[int, ...]:
+  return (len(group.vert), 3) if name == "anchor" else (len(group.vert),)
+
+
+def motion(w, vert: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+  """Returns places and velocities of an organ's vertices in the world [m, m/s], (n, 3) each."""
+  organ = w.organ
+  if organ.windows:
+    own = w.boxes["own"].motion
+    u, v = own.disp.numpy()[vert], own.vel.numpy()[vert]
+  else:
+    m, d = mjstruct.Model.from_address(w.model), mjstruct.Data.from_address(w.data)
+    free = organ.free[vert][:, None]
+    qpos = np.maximum(organ.qposadr[vert], 0)[:, None] + np.arange(3)
+    dofs = np.maximum(organ.dofadr[vert], 0)[:, None] + np.arange(3)
+    u = mjstruct.view(d.qpos, m.nq)[qpos] - mjstruct.view(m.qpos0, m.nq)[qpos]
+    u, v = free * u, free * mjstruct.view(d.qvel, m.nv)[dofs]
+  return organ.origin + (organ.mesh.rest[vert] + u) @ organ.frame.T, v @ organ.frame.T
+
+
+def is_mocap(m, body: int) -> bool:
+  """Returns whether a body or one above it is a mocap body."""
+  mocap = mjstruct.view(m.body_mocapid, m.nbody, np.int32)
+  parent = mjstruct.view(m.body_parentid, m.nbody, np.int32)
+  while body > 0:
+    if mocap[body] >= 0:
+      return True
+    body = int(parent[body])
+  return False
