@@ -224,12 +224,13 @@ class Log:
   def __init__(self, attack: Attack, aim: str, seconds: float = math.inf):
     self.attack, self.aim = attack, aim
     self.tried: list[tuple[np.ndarray, End]] = []
-    self._end = time.monotonic() + seconds
+    self._seconds, self._start = seconds, 0.0
 
   def __call__(self, policy: np.ndarray) -> float:
     """Returns what a policy is worth."""
-    if time.monotonic() > self._end:
+    if self.tried and time.monotonic() - self._start > self._seconds:
       raise OutOfTimeError
+    self._start = self._start or time.monotonic()
     end = self.attack.play(policy, _SEEN)
     self.tried.append((policy, end))
     return end.worth(self.aim)
