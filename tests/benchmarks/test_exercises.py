@@ -7,7 +7,7 @@ import sys
 
 import numpy as np
 import pytest
-from benchmarks import experts, loopholes, performances, results, run, skill
+from benchmarks import loopholes, performances, results, run, skill
 from palpate.tasks import performer, score
 
 HERE = pathlib.Path(__file__).parent
