@@ -305,7 +305,7 @@ def keyframes(
       deep = port.gap + 0.01 if key == "press" and i == 0 else near
       opening = 0.7 if jaws and key != "home" else 0.0
       qpos += [0, 0, near, 0] + [opening / 2] * 2 * jaws
-      ctrl += [0, 0, 0, 0] if handle else [0, 0, deep, 0]
+      ctrl += [0] * 6 if handle else [0, 0, deep, 0]
       ctrl += [opening] * jaws
       pos, quat = _place(build, port)
       shaft = np.zeros(3)

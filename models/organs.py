@@ -1,11 +1,15 @@
 """An organ of the catalogue made at a resolution: its mesh, where it is held, its named places."""
 
+import copy
 import functools
 
 import numpy as np
 
 from . import catalog, quality, shapes
 from .catalog import DEFAULT, Entry
+from .refine import refine
+
+_REACH = 0.006  # around a place that an instrument points at, of its finer triangles [m]
 
 
 class Build:
@@ -26,8 +30,18 @@ class Build:
     else:
       vertices, self.triangles = shapes.mesh(shapes.anatomy(entry.shape, seed), nodes)
     self.vertices = np.round(vertices, 6) + 0.0
+    self._seed = seed
     self.patches = shapes.patches(entry.shape, self.vertices, seed)
     self.landmarks = shapes.landmarks(entry.shape, seed)
+
+  def finer(self, edge: float) -> "Build":
+    """Returns it with edges of at most `edge` [m] around the places that instruments point at."""
+    places = [self.landmarks[port.landmark] for port in self.entry.ports]
+    out = copy.copy(self)
+    vertices, out.triangles = refine(self.vertices, self.triangles, places, _REACH, edge)
+    out.vertices = np.round(vertices, 6) + 0.0
+    out.patches = shapes.patches(self.entry.shape, out.vertices, self._seed)
+    return out
 
   @property
   def pins(self) -> np.ndarray:

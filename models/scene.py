@@ -18,6 +18,7 @@ from .organs import Build
 
 INSTRUMENTS = trocar.NAMES
 COUPLINGS = ("nodal", "window")
+_ROOM = 300  # vertices of a window where triangles are finer under the instruments
 
 
 def path(name: str, scene: bool = True) -> pathlib.Path:
@@ -38,6 +39,7 @@ def load(
   grid: int | None = None,
   coupling: str = "nodal",
   interior: str = "none",
+  fine: float | None = None,
 ) -> mujoco.MjSpec:
   """Returns a scene: the organ, instruments, light, laparoscope, targets and keyframes.
 
@@ -51,14 +53,17 @@ def load(
     coupling: `nodal`, or `window` where MuJoCo knows the nodes near the instruments alone
     interior: `solid` for tetrahedra inside, with `coupling="window"`; `none` for the surface alone,
       on a foundation and with a bulk modulus that stand for what is inside
+    fine: longest edge of the triangles within 6 mm of the places that instruments point at [m], for
+      forces of small tools; None for triangles of one size
   """
-  build = _build(name, nodes, seed, grid)
+  build = _build(name, nodes, seed, grid, fine)
   _check_instruments(instruments)
   spec = mujoco.MjSpec.from_string(markup.scene(build, name, instruments, handle, root=None))
   spec.attach(_organ(build, name, coupling, interior), prefix=f"{name}/", frame=spec.frame(name))
   free = None
   if coupling == "window":
-    window = author.add_windows(spec, f"{name}/{name}")[0]
+    room = None if fine is None else _ROOM
+    window = author.add_windows(spec, f"{name}/{name}", nodes=room)[0]
     free = 3 * len(spec.flex(window).vertbody)
     spec.memory = markup.megabytes(free // 3) << 20
   for key, (qpos, ctrl, mocap) in markup.keyframes(build, instruments, handle, free).items():
@@ -104,7 +109,9 @@ def targets(name: str) -> tuple[str, ...]:
   return tuple(shapes.anatomy(catalog.entry(name).shape).landmarks)
 
 
-def _build(name: str, nodes: int, seed: int | None, grid: int | None) -> Build:
+def _build(
+  name: str, nodes: int, seed: int | None, grid: int | None, fine: float | None = None
+) -> Build:
   catalog.entry(name)
   if nodes not in RESOLUTIONS:
     choices = ", ".join(map(str, RESOLUTIONS))
@@ -114,7 +121,8 @@ def _build(name: str, nodes: int, seed: int | None, grid: int | None) -> Build:
     raise ValueError(f"organ {name!r}: grid is {grid!r}, expected one of {choices}, or None")
   if seed is not None and not 0 <= seed < 2**32:
     raise ValueError(f"organ {name!r}: seed is {seed!r}, expected a number in [0, 2^32), or None")
-  return organs.build(name, 0 if grid else nodes, grid or 0, seed)
+  built = organs.build(name, 0 if grid else nodes, grid or 0, seed)
+  return built if fine is None else built.finer(fine)
 
 
 def _check_instruments(instruments: Sequence[str]):

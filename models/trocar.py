@@ -1,6 +1,6 @@
 # mujoco ships its bindings without type stubs:
 # pyright: reportAttributeAccessIssue=false
-"""Instruments on a trocar: attaching them, where the tip is, and moving the handle.
+"""Instruments on a trocar: attaching them, and where the tip is.
 
 The instrument's frame has the trocar point at its origin and the shaft along -z when every joint
 is zero, with the tip `DEPTH` below. `pitch` (about x) takes the tip to +y, `yaw` (about -y) to +x,
@@ -167,42 +167,3 @@ def inverse(trocar: Trocar, tip_pos, check: bool = True) -> np.ndarray:
       f"{tip_pos[index[:-1]]}, expected a number in [{low[index[-1]]:g}, {high[index[-1]]:g}]"
     )
   return np.clip(joints, low, high)
-
-
-def move_handle(model: mujoco.MjModel, data: mujoco.MjData, prefix: str, pos, vel=None) -> None:
-  """Puts the handle of an instrument with virtual coupling at `pos`.
-
-  Args:
-    model: the scene
-    data: its state, changed in place
-    prefix: of the instrument
-    pos: position of the handle in the world [m]  (3,)
-    vel: its velocity [m/s]; the coupling's damper then acts on the velocity of the tip relative to
-      the handle, and without it on that of the tip alone  (3,)
-  """
-  mocap = _mocap(model, prefix)
-  data.mocap_pos[mocap] = pos
-  mat = np.zeros(9)
-  mujoco.mju_quat2Mat(mat, data.mocap_quat[mocap])
-  local = np.zeros(3) if vel is None else np.asarray(vel, dtype=float) @ mat.reshape(3, 3)
-  for axis, v in zip("xyz", local, strict=True):
-    actuator = model.actuator(f"{prefix}coupling_{axis}").id
-    lead = -model.actuator_biasprm[actuator, 2] / model.actuator_gainprm[actuator, 0]  # kv / kp
-    data.ctrl[actuator] = v * lead
-
-
-def handle_force(model: mujoco.MjModel, data: mujoco.MjData, prefix: str = "") -> np.ndarray:
-  """Returns the force the hand feels, from the coupling on the handle, in the world [N]  (3,)."""
-  mat = np.zeros(9)
-  mujoco.mju_quat2Mat(mat, data.mocap_quat[_mocap(model, prefix)])
-  force = [data.sensor(f"{prefix}coupling_{axis}").data[0] for axis in "xyz"]
-  return -mat.reshape(3, 3) @ np.array(force)
-
-
-def _mocap(model: mujoco.MjModel, prefix: str) -> int:
-  try:
-    return int(model.body(f"{prefix}handle").mocapid[0])
-  except KeyError:
-    raise ValueError(
-      f"instrument {prefix!r} has no handle, expected one of the models that end in _handle"
-    ) from None

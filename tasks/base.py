@@ -14,6 +14,9 @@ position drives by the action times the rate:
 | 4 `jaw` (grasper) | opening of the jaws, not a rate: -1 squeezes closed jaws, 1 is wide open | |
 | 4 `report` (palpation) | above 0.5: the inclusion is here | |
 
+With `input="handle"` the action says where the hand holds the instrument, in place of the first
+four, see `handle`; a spring and a damper pull the tip there, and the hand feels them.
+
 Observations are in groups to choose from, see `observation` and docs/environments.md.
 
 Reward: a task measures its progress in [-1, 1], 0 at the start, 1 on success, -1 on damage; while
@@ -46,6 +49,7 @@ from scipy.spatial import cKDTree
 
 from . import observation, randomisation, safety, scenes, stage
 from .environment import CONTROL_TIMESTEP, Environment
+from .handle import ROW
 from .physics import AXES, JAWS, Physics, check_scene
 from .randomisation import Ranges
 from .recording import Event, Settings
@@ -101,6 +105,8 @@ class Task(control.Task):
     randomise: Ranges | None = None,
     model: "str | os.PathLike[str] | mj.MjSpec | None" = None,
     organ: str = ORGAN,
+    input: str = "drives",
+    nodes: int | None = None,
   ):
     """Makes the exercise.
 
@@ -120,25 +126,23 @@ class Task(control.Task):
       model: a scene of your own, a file or an MjSpec, in place of `scene`: it has the instrument,
         the camera `laparoscope` and the sites `target0`, ... in the world
       organ: name of the organ in it
+      input: what an action moves: the instrument's position `drives`, or its `handle`
+      nodes: of the organ, in place of the scene's
     """
     if reward not in REWARDS:
       raise ValueError(f"reward is {reward!r}, expected one of {', '.join(REWARDS)}")
-    if not isinstance(random, np.random.RandomState):
-      random = np.random.RandomState(random)
-    self.random = random
-    self.scene = scene
-    self.prefix = f"{scene.instrument}/"
+    drawn = isinstance(random, np.random.RandomState)
+    self.random: Any = random if drawn else np.random.RandomState(random)
+    self.scene, self.prefix = scenes.chosen(scene, input, nodes), f"{scene.instrument}/"
     self.force_limit, self.damage = float(force_limit), float(damage)
-    self.spread, self.jitter = spread, jitter
+    self.spread, self.jitter, self.organ = spread, jitter, organ
     self.variants = (scene.variant,) if variants is None or model is not None else variants
-    self.reward = reward
-    self.observed = observation.choose(observations, pixels)
+    self.reward, self.observed = reward, observation.choose(observations, pixels)
     self.control_timestep = CONTROL_TIMESTEP
     self.ranges = randomisation.check(randomise or {})
     self.drawn: dict[str, Any] = {}
-    self.organ = organ
-    self._models: dict[int | None, Stage] = {}
     self.visualize_reward = False
+    self._models: dict[int | None, Stage] = {}
     self.outcome: str | None = None
     self.progress, self.best, self.cost, self.harm = 0.0, 0.0, safety.Cost(), 0.0
     self.events: list[Event] = []
@@ -156,7 +160,12 @@ class Task(control.Task):
   @property
   def components(self) -> tuple[str, ...]:
     """Names of the action's components."""
-    return AXES + (("jaw",) if self.jaws else ())
+    return (ROW if self.scene.handle else AXES) + self.extra
+
+  @property
+  def extra(self) -> tuple[str, ...]:
+    """Names of those that do not move the instrument as a whole."""
+    return ("jaw",) if self.jaws else ()
 
   def physics(self) -> Physics:
     """Returns the physics of the scene, to make an environment of."""
@@ -172,7 +181,7 @@ class Task(control.Task):
 
   def _stage(self, spec: mj.MjSpec) -> Stage:
     model = stage.compile_spec(spec)
-    check_scene(model, self.prefix, self.targets, self.organ)
+    check_scene(model, self.prefix, self.targets, self.organ, self.scene.handle)
     return stage.build(model, self.prefix, self.organ)
 
   def _scene(self, variant: int | None) -> Scene:
@@ -219,6 +228,10 @@ class Task(control.Task):
     """Returns the progress after a control step; sets `outcome` on success or failure."""
     raise NotImplementedError
 
+  def instruct(self, physics: Physics) -> str:
+    """Returns what a person is to do next, in words."""
+    return ""
+
   def observe(self, physics: Physics) -> Mapping[str, np.ndarray]:
     """Returns the domain's own observations."""
     return {}
@@ -226,6 +239,10 @@ class Task(control.Task):
   def recorded(self, physics: Physics) -> Mapping[str, Any]:
     """Returns further columns of a sample, see `Recorder.append`."""
     return {}
+
+  def arrays(self, physics: Physics) -> dict[str, np.ndarray]:
+    """Returns the arrays of a control step for a recording: the action, and what the hand felt."""
+    return {"action": self.action} | ({"felt": physics.felt()} if self.scene.handle else {})
 
   def constants(self, physics: Physics) -> Mapping[str, np.ndarray]:
     """Returns further constants of a recording, see `Recorder.attach`."""
@@ -284,29 +301,32 @@ class Task(control.Task):
   def check_action(self, action: Any) -> np.ndarray:
     """Returns the action as float64; ValueError names the component, its value and the bounds."""
     values = np.asarray(getattr(action, "continuous_actions", action), np.float64)
-    if values.shape != (len(self.components),):
+    names = self.components
+    if values.shape[-1:] != (len(names),) or values.ndim > (2 if self.scene.handle else 1):
       raise ValueError(
-        f"{self.name}: action has shape {values.shape}, expected ({len(self.components)},): "
-        + ", ".join(self.components)
+        f"{self.name}: action has shape {values.shape}, expected ({len(names)},): "
+        + ", ".join(names)
       )
     # In plain numbers: arrays of five take longer.
-    for k, value in enumerate(values.tolist()):
+    for k, value in enumerate(values.ravel().tolist()):
       if not abs(value) <= 1 + _SLACK:
         raise ValueError(
-          f"{self.name}: action {self.components[k]} is {value}, expected a number in [-1, 1]"
+          f"{self.name}: action {names[k % len(names)]} is {value}, expected a number in [-1, 1]"
         )
     return values.clip(-1.0, 1.0)
 
   def before_step(self, action: Any, physics: Physics) -> None:
-    """Moves the drives' targets."""
+    """Moves the drives' targets, or tells the handle where to go."""
     self.action = values = self.check_action(action)
+    if self.scene.handle:
+      physics.guide.follow(values.reshape(-1, values.shape[-1]))
+      return
     low, high = physics.drive_range.T
     move = values[:4] * _RATES * self.control_timestep
     ctrl = physics.data.ptr.ctrl
     ctrl[physics.drives] = (ctrl[physics.drives] + move).clip(low, high)
     if physics.jaw >= 0:
-      low, high = physics.model.ptr.actuator_ctrlrange[physics.jaw]
-      ctrl[physics.jaw] = low + (high - low) * (values[4] + 1) / 2
+      physics.close_jaws(values[4])
 
   def after_step(self, physics: Physics) -> None:
     """Measures the progress and looks for errors and damage."""

@@ -76,7 +76,7 @@ def run(
       text = f"{task.name}: step {len(recorder) - 1}: {recorder.info['error']}"
       raise EpisodeError(text, finish()) from error
     total += timestep.reward
-    arrays = {"action": action, "reward": np.float64(timestep.reward)}
+    arrays = task.arrays(physics) | {"reward": np.float64(timestep.reward)}
     if states:
       arrays["state"] = physics.integration_state()
     recorder.append(**task.sample(physics), arrays=arrays)

@@ -182,6 +182,18 @@ class Grasp(Hold):
       return 0.2 * base.closeness(self.distance(physics), self.distance0)
     return 0.3 + 0.4 * share + 0.2 * min(self.held / self.hold, 1.0)
 
+  def instruct(self, physics: Physics) -> str:
+    """Says to grasp, lift, hold, lower or let go."""
+    if not self.grasped:
+      return "Open the jaws, go over the marked fold and close them gently"
+    if self.rests:
+      return "Open the jaws to let go"
+    if self.done:
+      return "Lower it to where it was"
+    if self.height(physics) < self.lift:
+      return f"Lift it by {1e3 * self.lift:.0f} mm, towards the trocar"
+    return f"Hold it there for {max(self.hold - self.held, 0.0):.1f} s more"
+
   def _lose(self, physics: Physics) -> None:
     self.dropped(physics)
     self._again()

@@ -30,7 +30,7 @@ import numpy as np
 from dm_control.rl import control
 from palpate.models import trocar
 
-from .base import AXES, RATES
+from .base import RATES
 
 Act = Callable[[Any], Any]
 Script = Iterator[np.ndarray]
@@ -169,7 +169,7 @@ class Performer:
       joints = self.physics.drive_targets()[[0, 1, 3]]
       self.tip = trocar.forward(self.trocar, joints)  # where the tip is told to be
       self.roll = float(self.physics.drive_targets()[2])
-      self.extra = np.zeros(len(self.task.components) - len(AXES))
+      self.extra = np.zeros(len(self.task.extra))
       late = round(self.style.reaction / self.dt)
       still = self.tip, self.roll, self.extra.copy()
       self._told = collections.deque([still] * late, maxlen=late + 1)
@@ -185,12 +185,14 @@ class Performer:
   # Words of the scripts.
 
   def step(self) -> np.ndarray:
-    """Returns the action that takes the drives towards `tip`, `roll` and `extra`."""
+    """Returns the action that takes the drives, or the handle, towards `tip`, `roll`, `extra`."""
     self._told.append((self.tip, self.roll, self.extra.copy()))
     tip, roll, extra = self._told[0]  # of the moment that the hand follows now
     if self.style.tremor:
       wave = np.sin(2 * math.pi * _TREMOR_HZ[:, None] * self.physics.time() + self._phase)
       tip = tip + self.style.tremor * math.sqrt(2 / len(_TREMOR_HZ)) * wave.sum(axis=0)
+    if self.physics.handle:
+      return np.concatenate([self.physics.handle_row(tip, roll), extra])
     pitch, yaw, insertion = trocar.inverse(self.trocar, tip, check=False)
     goal = np.array([pitch, yaw, roll, insertion])
     move = (goal - self.physics.drive_targets()) / (np.array(RATES) * self.dt)

@@ -9,8 +9,10 @@ import numpy as np
 from dm_control.mujoco import wrapper
 from palpate import Organ
 from palpate.models import trocar
+from palpate.models.handle import find, pose
 
 from . import scenes
+from .handle import ROW, Guide
 from .jaws import Jaws
 from .metrics import surface_strain
 from .portable import Portable
@@ -30,8 +32,6 @@ _FOLD = (0.02, 0.15)  # least opening over a fold of tissue, largest target that
 class Physics(Portable):
   """Physics of an exercise: one organ, one instrument on a trocar."""
 
-  prefix = ""
-
   def use(self, model: mj.MjModel, prefix: str, targets: int, organ: str = ORGAN) -> None:
     """Takes a compiled scene; ValueError names what it lacks.
 
@@ -42,7 +42,8 @@ class Physics(Portable):
       organ: name of the organ
     """
     self.prefix, self.organ_name = prefix, organ
-    check_scene(model, prefix, targets, organ)
+    held = mj.mj_name2id(model, mj.mjtObj.mjOBJ_BODY, f"{prefix}handle") >= 0
+    check_scene(model, prefix, targets, organ, held)
     if model is not self.model.ptr:
       self._reload_from_data(wrapper.MjData(wrapper.MjModel(model)))
     self.organ = Organ(model, self.data.ptr, organ)
@@ -58,7 +59,9 @@ class Physics(Portable):
     joints = [model.joint(prefix + axis) for axis in AXES]
     self._qpos = np.array([int(joint.qposadr[0]) for joint in joints])
     self._dof = np.array([int(joint.dofadr[0]) for joint in joints])
-    self.drives = np.array([model.actuator(prefix + axis).id for axis in AXES])
+    self.handle, self.guide = find(model, self.data.ptr, prefix), Guide()
+    driven = () if self.handle else AXES
+    self.drives = np.array([model.actuator(prefix + axis).id for axis in driven], int)
     self.drive_range = model.actuator_ctrlrange[self.drives].copy()
     self.jaw = model.actuator(prefix + "jaw").id if self.has_jaw else -1
     self._jaws = Jaws(model, prefix) if self.has_jaw else None
@@ -85,11 +88,15 @@ class Physics(Portable):
       model, data = self.model.ptr, self.data.ptr
       begin, end, sensors = mj.mj_step1, mj.mj_step2, data.sensordata
       values = np.empty((nstep, model.nsensordata))
+      self._felt = np.zeros((nstep, 6))
       for k in range(nstep):
         end(model, data)
         values[k] = sensors
         if k == nstep - 1 and self._jaws:
           self._inner = self._jaws.inner_force(model, data)
+        if self.handle:
+          self._felt[k] = self.handle.wrench()
+          self._lead(k, nstep)
         begin(model, data)
       self._keep(values)
       self.moved()
@@ -106,6 +113,23 @@ class Physics(Portable):
       # Pinched folds make single steps of large jaw force: the jaws' is a mean over the step.
       self.peak_force = max(self.peak_force, float(jaws.sum(axis=0).max()) / len(jaws))
 
+  def _lead(self, k: int, nstep: int) -> None:
+    """Moves the handle before step k of `nstep`, and the jaws where the row has them."""
+    row, vel, spin = self.guide.advance(k, nstep, self.timestep())
+    assert self.handle is not None
+    self.handle.move(row[:3], row[3:7], vel, spin)
+    if self.jaw >= 0 and len(row) > len(ROW):
+      self.close_jaws(row[len(ROW)])
+
+  def close_jaws(self, share: float) -> None:
+    """Gives the jaws their target: 1 is wide open, -1 squeezes closed jaws."""
+    low, high = self.model.ptr.actuator_ctrlrange[self.jaw]
+    self.data.ptr.ctrl[self.jaw] = low + (high - low) * (share + 1) / 2
+
+  def felt(self) -> np.ndarray:
+    """Returns force [N], torque [N m] on the hand in each step of the last `step`  (nstep, 6)."""
+    return self._felt
+
   def forces(self) -> dict[str, np.ndarray]:
     """Returns the force of the tip, the shaft and the jaws' grip in each step of the last `step`.
 
@@ -115,6 +139,7 @@ class Physics(Portable):
 
   def quiet(self) -> None:
     """Forgets the forces of the last `step`: they would be in the next episode's start."""
+    self._felt = np.zeros((1, 6))
     self._keep(np.zeros((1, self.model.nsensordata)))
 
   def forward(self) -> None:
@@ -160,10 +185,19 @@ class Physics(Portable):
     """Returns pitch, yaw, roll [rad] and insertion [m]  (4,)."""
     return self.data.ptr.qpos[self._qpos]
 
-  def set_joints(self, pose: np.ndarray) -> None:
+  def handle_row(self, tip: np.ndarray, roll: float) -> np.ndarray:
+    """Returns the row of an action that holds the tip at a place [m], rolled by an angle  (7,)."""
+    return pose(self._trocar, tip, roll)
+
+  def set_joints(self, joints: np.ndarray) -> None:
     """Puts the instrument and its drives at a pose, as `joints`, with closed jaws."""
-    self.data.qpos[self._qpos] = pose
-    self.data.ctrl[self.drives] = pose
+    self.data.qpos[self._qpos] = joints
+    if self.handle:
+      row = self.handle_row(trocar.forward(self._trocar, joints[[0, 1, 3]]), joints[2])
+      self.handle.move(row[:3], row[3:])
+      self.guide.put(row)
+    else:
+      self.data.ctrl[self.drives] = joints
     if self.jaw >= 0:
       self.data.ctrl[self.jaw] = 0.0
     self._inner = np.zeros(2)
@@ -181,8 +215,8 @@ class Physics(Portable):
     return self.data.ptr.qvel[self._dof]
 
   def drive_targets(self) -> np.ndarray:
-    """Returns the targets of the position drives, as `joints`  (4,)."""
-    return self.data.ptr.ctrl[self.drives]
+    """Returns the targets of the position drives, or where the handle is, as `joints`  (4,)."""
+    return self.handle.joints(self._trocar) if self.handle else self.data.ptr.ctrl[self.drives]
 
   def contact_force(self) -> np.ndarray:
     """Returns the contact force on the instrument below the shaft [N]  (3,)."""
@@ -340,13 +374,16 @@ class Physics(Portable):
     self.model.site_rgba[site, 3] = 0.9 if shown else 0.0
 
 
-def check_scene(model: mj.MjModel, prefix: str, targets: int, organ: str) -> None:
+def check_scene(
+  model: mj.MjModel, prefix: str, targets: int, organ: str, handle: bool = False
+) -> None:
   """Raises ValueError naming what a scene lacks for an exercise; arguments as `Physics.use`."""
   jaw, touch = (("jaw",), ("jaw", "touch_left", "touch_right")) if prefix == JAWS else ((), ())
+  drives = () if handle else AXES
   for kind, names in (
-    ("body", [f"{prefix}trocar"]),
+    ("body", [f"{prefix}trocar", *([f"{prefix}handle"] if handle else [])]),
     ("site", [f"{prefix}tip", *(f"target{i}" for i in range(targets))]),
-    ("actuator", [prefix + name for name in (*AXES, *jaw)]),
+    ("actuator", [prefix + name for name in (*drives, *jaw)]),
     ("sensor", [prefix + name for name in ("tip_pos", "tip_force", "shaft_force", *touch)]),
     ("camera", [CAMERA]),
     ("flex", [organ]),

@@ -9,13 +9,14 @@ from typing import Any
 import mujoco as mj
 from dm_control import mujoco
 from palpate import Organ
+from palpate.models.handle import Handle, find
 from palpate.tissue.config import Config
 
 from . import display
 from .scenes import ORGAN
 
 # What belongs to one process or is made anew from the data.
-_OWN = {"_contexts", "_contexts_lock", "_data", "_named", "organ"}
+_OWN = {"_contexts", "_contexts_lock", "_data", "_named", "organ", "handle"}
 _OWN |= {"_warnings", "_warnings_before", "_new_warnings"}
 
 
@@ -27,9 +28,13 @@ class Portable(mujoco.Physics):
   Attributes:
     organ: the handle on the organ
     organ_name: its name in the model
+    prefix: of the instrument
+    handle: that of the instrument, None where position drives move it
   """
 
   organ: Organ
+  prefix = ""
+  handle: Handle | None = None
   organ_name = ORGAN
 
   @property
@@ -75,7 +80,7 @@ class Portable(mujoco.Physics):
     """
     vars(self).update(rest)
     model, own = self.model.ptr, self.data.ptr
-    self.organ = Organ(model, own, self.organ_name)
+    self.organ, self.handle = Organ(model, own, self.organ_name), find(model, own, self.prefix)
     now = self.organ.config
     names = [field.name for field in dataclasses.fields(Config)]
     changed = {n: getattr(config, n) for n in names if getattr(config, n) != getattr(now, n)}

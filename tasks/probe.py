@@ -197,6 +197,17 @@ class Press(Task):
     near = base.closeness(self.distance(physics), self.distance0)
     return (self.done + 0.4 * near + 0.5 * self.held / self.hold) / self.targets
 
+  def instruct(self, physics: Physics) -> str:
+    """Says where to press, and how much."""
+    if self.distance(physics) > 2 * self.tolerance:
+      return f"Go to the yellow site, {min(self.done + 1, self.targets)} of {self.targets}"
+    level, (low, high) = self.level(physics), self.band
+    if level < low:
+      return "Press more"
+    if level > high:
+      return "Press less"
+    return f"Hold it there for {max(self.hold - self.held, 0.0):.1f} s more"
+
   def observe(self, physics: Physics) -> dict[str, np.ndarray]:
     """Returns target, normal, level and held."""
     return {
@@ -267,9 +278,9 @@ class Palpate(Task):
     super().__init__(dataclasses.replace(scene, targets=1), random, **kwargs)
 
   @property
-  def components(self) -> tuple[str, ...]:
-    """Names of the action's components."""
-    return (*base.AXES, "report")
+  def extra(self) -> tuple[str, ...]:
+    """Names of the action's components that do not move the instrument."""
+    return ("report",)
 
   def choose(self) -> int | None:
     """Draws shape and inclusion, evenly over the field; the organ is compiled anew with it."""
@@ -318,7 +329,7 @@ class Palpate(Task):
   def advance(self, physics: Physics) -> float:
     """Follows what was felt, and judges the report."""
     force = float(np.linalg.norm(physics.contact_force()))
-    if self.action[4] > 0.5:
+    if self.action[..., -1].max() > 0.5:
       distance = self.distance(physics)
       found = distance <= self.tolerance and force >= _REPORT
       self.outcome = "success" if found else "missed"
@@ -328,6 +339,11 @@ class Palpate(Task):
     if force >= _FELT[0]:
       self._felt |= np.linalg.norm(self.places - physics.tip_pos(), axis=1) < _FELT[1]
     return 0.3 * self.felt()
+
+  def instruct(self, physics: Physics) -> str:
+    """Says to feel, and to report."""
+    share = f"{100 * self.felt():.0f} % of the field is felt"
+    return f"Press here and there, and report where it is stiff while you press: {share}"
 
   def observe(self, physics: Physics) -> dict[str, np.ndarray]:
     """Returns field and felt."""

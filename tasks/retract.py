@@ -129,6 +129,14 @@ class Retract(Hold):
       return 0.15 * base.closeness(self.distance(physics), self.distance0)
     return 0.3 + 0.5 * min(self.visible / self.wanted, 1.0) + 0.2 * self.held / self.hold
 
+  def instruct(self, physics: Physics) -> str:
+    """Says to grasp, pull aside or hold."""
+    if not self.grasped:
+      return "Open the jaws, go over the marked fold and close them gently"
+    if self.visible < self.wanted:
+      return f"Pull it aside: {100 * self.visible:.0f} of {100 * self.wanted:.0f} % are seen"
+    return f"Hold it there for {max(self.hold - self.held, 0.0):.1f} s more"
+
   def observe(self, physics: Physics) -> dict[str, np.ndarray]:
     """Returns target, hidden, visible, held and grasped."""
     return {

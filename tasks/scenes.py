@@ -23,6 +23,7 @@ from palpate.models.catalog import Tissue
 NOW, LATER = (1.0, 0.8, 0.1), (0.2, 0.75, 0.95)  # colours of targets
 ORGAN = "organ"
 CAMERA = "laparoscope"
+INPUTS = ("drives", "handle")
 # The organ's solref counts, not the instrument's: light nodes want stiff contacts.
 _CONTACT = {
   "condim": 3,
@@ -62,6 +63,7 @@ class Scene:
     targets: number of target sites
     inclusion: hidden stiff place: position in the world [m] (3), radius [m], factor on Young's
       modulus; None for healthy tissue. Without gravity: the organ would sag less where it is stiff
+    handle: whether a handle pulls the instrument in place of position drives
   """
 
   organ: str = "liver"
@@ -73,6 +75,18 @@ class Scene:
   camera: tuple[float, float, float] = (-0.05, 0.15, 0.12)
   targets: int = 1
   inclusion: tuple[float, ...] | None = None
+  handle: bool = False
+
+
+def chosen(scene: Scene, input: str, nodes: int | None) -> Scene:
+  """Returns a scene as it was asked for; arguments as of `base.Task`."""
+  if input not in INPUTS:
+    raise ValueError(f"input is {input!r}, expected one of {', '.join(INPUTS)}")
+  if nodes is None:
+    nodes = scene.nodes
+  if not (isinstance(nodes, int) and 100 <= nodes <= 20000):
+    raise ValueError(f"nodes is {nodes!r}, expected a whole number in [100, 20000], or None")
+  return dataclasses.replace(scene, handle=input == "handle", nodes=nodes)
 
 
 @functools.lru_cache(maxsize=32)
@@ -133,9 +147,8 @@ def build(scene: Scene) -> mujoco.MjSpec:
   if scene.inclusion is not None:
     spec.option.gravity = np.zeros(3)
   port = center + scene.port
-  trocar.attach(
-    spec, scene.instrument, f"{scene.instrument}/", pos=port, quat=trocar.aim(port, center)
-  )
+  quat, prefix = trocar.aim(port, center), f"{scene.instrument}/"
+  trocar.attach(spec, scene.instrument, prefix, port, quat, scene.handle)
   slots = _SLOTS[scene.instrument] * max(1, -(-scene.nodes // 1000))
   palpate.add_windows(spec, ORGAN, nodes=slots)
   return spec

@@ -9,6 +9,7 @@ import warnings
 import mujoco as mj
 import numpy as np
 from palpate import Organ
+from palpate.models import handle, trocar
 from palpate.tissue.config import Config
 
 STATE = mj.mjtState.mjSTATE_INTEGRATION
@@ -67,21 +68,26 @@ def compile_spec(spec: mj.MjSpec) -> mj.MjModel:
 def build(model: mj.MjModel, prefix: str, organ: str) -> Stage:
   """Returns the stage of a model; arguments as of `Physics.use`."""
   data = mj.MjData(model)
-  handle = Organ(model, data, organ)
-  settle(handle, prefix)
+  tissue = Organ(model, data, organ)
+  settle(tissue, prefix)
   state = np.empty(mj.mj_stateSize(model, STATE))
   mj.mj_getState(model, data, state, STATE)
   nominal = {name: operator.attrgetter(name)(model).copy() for name in _CHANGED}
-  return Stage(model, state, handle.config, nominal)
+  return Stage(model, state, tissue.config, nominal)
 
 
 def settle(organ: Organ, prefix: str) -> None:
   """Lets the organ come to rest under its weight, the instrument withdrawn; time starts anew."""
   model, data = organ.model, organ.data
   name = f"{prefix}insertion"
-  low = model.actuator(name).ctrlrange[0]
-  data.ctrl[model.actuator(name).id] = low
+  low = model.joint(name).range[0]
   data.qpos[model.joint(name).qposadr[0]] = low
+  held = handle.find(model, data, prefix)
+  if held is None:
+    data.ctrl[model.actuator(name).id] = low
+  else:
+    port = trocar.trocar(model, prefix)
+    held.move(trocar.forward(port, (0.0, 0.0, low)))
   for _ in range(round(_SETTLE / _LOOK)):
     mj.mj_step(model, data, round(_LOOK / model.opt.timestep))
     if np.linalg.norm(organ.xvel, axis=1).max() < _STILL:

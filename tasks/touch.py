@@ -111,6 +111,12 @@ class Touch(Task):
     near = base.closeness(self.distance(physics), self.distance0)
     return (self.done + 0.5 * near + 0.2 * self.held / DWELL) / self.targets
 
+  def instruct(self, physics: Physics) -> str:
+    """Says which point is next, and to let go."""
+    if self.pressing and self.spoilt:
+      return "Let go of the organ"
+    return f"Touch the yellow point gently, {self.done + 1} of {self.targets}"
+
   def observe(self, physics: Physics) -> dict[str, np.ndarray]:
     """Returns target, normal and held."""
     goal = self.goal()

@@ -211,6 +211,14 @@ class Trace(Task):
     i = int(off.argmin())
     return float(arc[i] + share[i] * (arc[i + 1] - arc[i])), float(off[i])
 
+  def instruct(self, physics: Physics) -> str:
+    """Says where to begin, or to go on."""
+    if not self.traced:
+      return "Touch the beginning of the line"
+    if not self._touching:
+      return "Touch the line where you have left it, and go on"
+    return f"Follow the line in light contact, {100 * self.traced / float(self.arc[-1]):.0f} % done"
+
   def observe(self, physics: Physics) -> dict[str, np.ndarray]:
     """Returns target and ahead."""
     curve = self.now - physics.tip_pos()

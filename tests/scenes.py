@@ -11,6 +11,7 @@ import trimesh
 import warp as wp
 from palpate.engine import plugin as engine
 from palpate.models import mjcf
+from palpate.models.block import box  # noqa: F401 - of `scenes`
 from palpate.tissue import fill, shape
 from palpate.tissue import mesh as topology
 from palpate.tissue import step as stepping
@@ -44,27 +45,6 @@ def strip(length, width, nx, ny):
   first = np.where(odd, np.stack([a, b, d], 1), np.stack([a, b, c], 1))
   second = np.where(odd, np.stack([b, c, d], 1), np.stack([a, c, d], 1))
   return points.reshape(-1, 3), np.concatenate([first, second])
-
-
-def box(size, spacing):
-  """Returns a closed box about the origin, of even right triangles: points, triangles."""
-  count = [max(1, round(s / spacing)) for s in size]
-  lines = [np.linspace(-s / 2, s / 2, n + 1) for s, n in zip(size, count, strict=True)]
-  index: dict[tuple, int] = {}
-  elem = []
-  for axis in range(3):
-    u, v = (axis + 1) % 3, (axis + 2) % 3
-    for side in (0, count[axis]):
-      for i, j in np.ndindex(count[u], count[v]):
-        at = []
-        for di, dj in ((0, 0), (1, 0), (1, 1), (0, 1)):
-          key = [0, 0, 0]
-          key[axis], key[u], key[v] = side, i + di, j + dj
-          at.append(index.setdefault(tuple(key), len(index)))
-        a, b, c, d = at if side else at[::-1]
-        elem += [(a, b, c), (a, c, d)] if (i + j) % 2 else [(a, b, d), (b, c, d)]
-  points = np.array([[line[k] for line, k in zip(lines, key, strict=True)] for key in index])
-  return points, np.array(elem)
 
 
 def triangular(length, width, nx, ny, jitter=0.0, seed=0):

@@ -22,6 +22,7 @@ _EXTRAS = {
   "imageio-ffmpeg": "video",
   "gymnasium": "gym",
   "scikit-image": "image",
+  "websockets": "live",
 }
 _TIMEOUT = 60  # [s]
 _DRAW = """

@@ -32,6 +32,12 @@ def add_arguments(parser: argparse.ArgumentParser):
     "--performer", metavar="NAME", default="expert",
     help="expert, tremor, ..., keyboard, or a policy as module:object",
   )  # fmt: skip
+  add(
+    "--device", metavar="NAME",
+    help="do it by hand, live: mouse, keyboard or touch on a page; gamepad, spacemouse, udp, "
+    "openhaptics, forcedimension, haply, hand",
+  )  # fmt: skip
+  add("--scale", metavar="X", type=float, default=1.0, help="of a device's movements (%(default)s)")
   add("--seed", metavar="N", type=int, default=0, help="of the episode (%(default)s)")
   add("--replay", metavar="FILE", help="repeat a recording and check that it comes out the same")
   add(
@@ -53,6 +59,16 @@ def main(args: argparse.Namespace) -> int:
 
   if args.list:
     return _list()
+  if args.device:
+    if not args.task:
+      raise CommandError("device is given without a TASK; a replay needs none")
+    from .live import devices
+
+    try:
+      if devices.on_page(args.device):
+        return _page(args)
+    except ValueError as error:
+      raise CommandError(str(error)) from None
   job = _prepare(args)
   progress, failure = Progress(), None
   with Interrupt() as interrupt, _camera(job.film) as shoot:
@@ -69,6 +85,13 @@ def main(args: argparse.Namespace) -> int:
     finally:
       progress.clear()
   _write(job, recording, report=not args.no_report)
+  if "live" in recording.info:
+    live = recording.info["live"]
+    print(
+      f"steps      {100 * live['on_time']:.2f} % on time, 99 % within {live['p99_us']:.0f} us; "
+      f"{live['work_us']:.0f} us of work each"
+    )
+    print("\n".join(f"palpate: {fault}" for fault in live["faults"]), end="", file=sys.stderr)
   if interrupt.seen:
     print("palpate: interrupted; the recording up to there is kept", file=sys.stderr)
     return 130
@@ -80,6 +103,19 @@ def main(args: argparse.Namespace) -> int:
       raise CommandError(f"the replay differs in {', '.join(changed)}", code=1)
     print("the replay is the same to the bit")
   return 0
+
+
+def _page(args: argparse.Namespace) -> int:
+  """Opens the page on the exercise."""
+  from palpate.tasks import suite
+
+  from . import serve
+
+  try:
+    name = "/".join(suite.split(args.task))
+  except ValueError as error:
+    raise CommandError(str(error)) from None
+  return serve.run(pathlib.Path(args.out or "out/live"), device=args.device, task=name)
 
 
 def _list() -> int:
@@ -147,6 +183,8 @@ def _perform(args: argparse.Namespace):
   from palpate.tasks import episode, performer, suite
 
   name, task_kwargs = "/".join(suite.split(args.task)), options.read(args.set)
+  if args.device:
+    return name, _by_hand(args, name, task_kwargs)
   info = {"task_kwargs": task_kwargs, "performer": args.performer}
   if args.performer == "keyboard":
     from . import keyboard
@@ -159,6 +197,20 @@ def _perform(args: argparse.Namespace):
     act = performer.make(env, args.performer, args.seed)
     run = functools.partial(episode.run, env, act, args.seed, info, args.states)
   return name, run
+
+
+def _by_hand(args: argparse.Namespace, name: str, task_kwargs: dict[str, Any]):
+  """Returns what runs an episode of a task with a device."""
+  from . import live
+
+  task_kwargs = {"observations": ["joints"], **task_kwargs, "input": "handle"}
+  env = options.load(name, task_kwargs)
+  try:
+    device, coupled = live.device(args.device), live.Options(scale=args.scale)
+  except live.DeviceError as error:
+    raise CommandError(str(error), code=1) from None
+  session = live.Session(env, device, args.seed, {"task_kwargs": task_kwargs}, coupled)
+  return lambda watch: session.run(watch=watch)
 
 
 def _write(job: _Job, recording: Any, report: bool):

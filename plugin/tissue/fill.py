@@ -25,9 +25,12 @@ from scipy.spatial import Delaunay, KDTree
 
 from .mesh import Mesh, area_vectors, vertex_normals
 
-MOST = 1  # nodes inside for one on the surface; the plugin state has room for so many
+MOST = 2  # nodes inside for one on the surface; the plugin state has room for so many
 _COARSER = 1.7  # distance of nodes inside to that on the surface
+_FINE = 1.2  # the same where triangles are of different sizes: small ones are where forces count
+_GRADED = 1.3  # times their mean edge that those are on most of the surface
 _CLEAR = 0.8  # least distance of a node inside to the surface's, in mean edges
+_WIDENS = 0.15  # by which the distance between nodes grows with that from the surface
 _ROUNDS = 8
 _MOVE = 0.7  # share of the way that a node goes in a round
 _FLAT = 1e-3  # quality of a tetrahedron that is none
@@ -185,18 +188,33 @@ def _make(rest: bytes, elem: bytes) -> tuple[bytes, np.ndarray, int]:
 
 
 def _lattice(surface: np.ndarray, triangle: np.ndarray) -> np.ndarray:
-  """Returns the points of a lattice inside, (n, 3); some that are outside may be among them."""
+  """Returns the points of a lattice inside, (n, 3); some that are outside may be among them.
+
+  It is half as wide wherever the surface's triangles are half as large, and widens inward.
+  """
   normal = vertex_normals(surface, triangle)
-  edge = np.linalg.norm(surface[triangle[:, [1, 2, 0]]] - surface[triangle], axis=2).mean()
+  length = np.linalg.norm(surface[triangle[:, [1, 2, 0]]] - surface[triangle], axis=2).mean(axis=1)
+  area = np.linalg.norm(area_vectors(surface, triangle), axis=1)
+  edge, widest = length.mean(), (area * length).sum() / area.sum()
+  corners = triangle.ravel()
+  local = np.bincount(corners, np.repeat(length, 3)) / np.bincount(corners)
   low, high = surface.min(axis=0), surface.max(axis=0)
-  tree, side = KDTree(surface), _COARSER * edge * 2 / np.sqrt(3)  # neighbours: half a diagonal
+  coarser = _FINE if widest > _GRADED * edge else _COARSER
+  tree, side = KDTree(surface), coarser * edge * 2 / np.sqrt(3)  # neighbours: half a diagonal
+  levels = range(*np.rint(np.log2([local.min() / edge, 2.83 * widest / edge])).astype(int))
   while True:
-    count = np.ceil((high - low) / side).astype(int) + 1
-    corner = low + side * np.stack(np.meshgrid(*map(np.arange, count), indexing="ij"), -1)
-    point = np.concatenate([corner.reshape(-1, 3), corner.reshape(-1, 3) + side / 2])
-    distance, nearest = tree.query(point)
-    beneath = ((point - surface[nearest]) * normal[nearest]).sum(axis=1) < 0
-    point = point[beneath & (distance > _CLEAR * edge)]
+    parts = []
+    for level in levels:
+      scale = 2.0**level
+      count = np.ceil((high - low) / (scale * side)).astype(int) + 1
+      corner = low + scale * side * np.stack(np.meshgrid(*map(np.arange, count), indexing="ij"), -1)
+      point = np.concatenate([corner.reshape(-1, 3), corner.reshape(-1, 3) + scale * side / 2])
+      distance, nearest = tree.query(point)
+      beneath = ((point - surface[nearest]) * normal[nearest]).sum(axis=1) < 0
+      wanted = np.minimum(local[nearest] + _WIDENS * distance, widest) / edge
+      here = np.clip(np.rint(np.log2(wanted)), levels[0], levels[-1]) == level
+      parts.append(point[beneath & here & (distance > _CLEAR * scale * edge)])
+    point = np.concatenate(parts)
     if len(point) <= MOST * len(surface):
       return point
     side *= max(1.05, (len(point) / (MOST * len(surface))) ** (1 / 3))

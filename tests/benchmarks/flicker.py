@@ -2,7 +2,7 @@
 
 From the first touch on, but for 20 ms: the share of steps without a force between organ and probe,
 and the root mean square of the change from one step to the next, in percent of the mean force. What
-is asked for is less than 0.5 % and less than 5 %. The probe slides while it presses, for the surfaces
+is asked for is less than 0.5 % and less than 5 %. The probe slides while it presses, for surfaces
 are not at right angles to it; why that matters: docs/physics.md, what MuJoCo sees.
 """
 
@@ -81,7 +81,7 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
   good = [r for r in rows if r["status"] == "ok"]
   over = [r for r in good if any(r[key] >= most for key, most in ALLOWED.items())]
   table = []
-  for key in dict.fromkeys((r["organ"], r["nodes"], r["coupling"]) for r in reversed(good)):
+  for key in sorted({(r["organ"], r["nodes"], r["coupling"]) for r in good}):
     mine = {r["h"]: r for r in good if (r["organ"], r["nodes"], r["coupling"]) == key}
     cells = [
       f"{mine[h]['without']:.1f} / {mine[h]['change']:.1f}" if h in mine else "-" for h in H

@@ -7,7 +7,8 @@ import mujoco
 import numpy as np
 import pytest
 from palpate.models import trocar as trocar_lib
-from palpate.models.trocar import NAMES, aim, attach, forward, handle_force, inverse, move_handle
+from palpate.models.handle import Handle, pose
+from palpate.models.trocar import NAMES, aim, attach, forward, inverse
 
 JAWED = ("grasper", "scissors")
 VARIANTS = [(name, handle) for name in NAMES for handle in (False, True)]
@@ -165,7 +166,7 @@ def test_out_of_reach_says_what_and_why():
   with pytest.raises(ValueError, match="no instrument with the prefix 'x/'"):
     trocar_lib.trocar(model, "x/")
   with pytest.raises(ValueError, match="has no handle"):
-    move_handle(model, data, "", [0, 0, 0])
+    Handle(model, data)
   with pytest.raises(ValueError, match="target"):
     aim([0, 0, 1], [0, 0, 1])
 
@@ -358,16 +359,16 @@ def test_coupling_is_the_stated_spring(name):
   for force in rng.uniform(-2, 2, size=(4, 3)):
     mujoco.mj_resetData(model, data)
     handle = forward(trocar, rng.uniform([-0.5, -0.5, -0.04], [0.5, 0.5, 0.08]))
-    move_handle(model, data, "", handle)
-    data.mocap_quat[0] = rng.randn(4)
-    data.mocap_quat[0] /= np.linalg.norm(data.mocap_quat[0])
+    held = Handle(model, data)
+    held.move(handle, pose(trocar, handle, rng.uniform(-1, 1))[3:])
     for _ in range(1500):
       _push(model, data, force)
       mujoco.mj_step(model, data)
+    # Near the trocar the springs against swinging take up to 1.5 % of it.
     np.testing.assert_allclose(
-      data.site("tip").xpos - handle, force / STIFFNESS, atol=1e-3 * 2 / STIFFNESS
+      data.site("tip").xpos - handle, force / STIFFNESS, atol=0.015 * 2 / STIFFNESS
     )
-    np.testing.assert_allclose(handle_force(model, data), force, atol=2e-3)
+    np.testing.assert_allclose(held.wrench()[:3], force, atol=0.015 * 2)
 
 
 def test_coupling_is_the_stated_damper():
@@ -377,11 +378,12 @@ def test_coupling_is_the_stated_damper():
   mujoco.mj_forward(model, data)
   velocity = data.sensor("tip_vel").data.copy()
   assert np.linalg.norm(velocity) > 0.1
-  np.testing.assert_allclose(handle_force(model, data), DAMPING * velocity, rtol=1e-9)
+  np.testing.assert_allclose(Handle(model, data).wrench()[:3], DAMPING * velocity, rtol=1e-9)
   handle = np.array([0.02, 0.1, -0.05])
-  move_handle(model, data, "", data.site("tip").xpos, handle)
+  held = Handle(model, data)
+  held.move(data.site("tip").xpos, vel=handle)
   mujoco.mj_forward(model, data)
-  np.testing.assert_allclose(handle_force(model, data), DAMPING * (velocity - handle), rtol=1e-9)
+  np.testing.assert_allclose(held.wrench()[:3], DAMPING * (velocity - handle), rtol=1e-9)
 
 
 def test_coupling_decays_as_spring_damper_and_mass_do():
@@ -411,7 +413,8 @@ def test_coupling_settles(insertion, integrator, timestep):
   mujoco.mj_forward(model, data)
   start = data.site("tip").xpos.copy()
   inwards = [0.005, 0.003, 0.004 if insertion > 0 else -0.004]
-  move_handle(model, data, "", start + inwards)
+  goal = start + inwards
+  Handle(model, data).move(goal, pose(trocar_lib.trocar(model), goal)[3:])
   peak = 0.0
   for _ in range(round(1 / timestep)):
     mujoco.mj_step(model, data)
@@ -428,10 +431,10 @@ def test_dragging_the_handle_moves_the_tip(name):
   data = mujoco.MjData(model)
   trocar = trocar_lib.trocar(model, "a/")
   center = forward(trocar, [0.1, -0.1, 0.0])
-  lag = []
+  lag, held = [], Handle(model, data, "a/")
   for t in np.arange(0, 1.5, model.opt.timestep):
     pos = center + 0.02 * np.array([np.sin(4 * t), np.cos(4 * t), 0])
-    move_handle(model, data, "a/", pos, 0.08 * np.array([np.cos(4 * t), -np.sin(4 * t), 0]))
+    held.move(pos, pose(trocar, pos)[3:], 0.08 * np.array([np.cos(4 * t), -np.sin(4 * t), 0]))
     mujoco.mj_step(model, data)
     lag.append(np.linalg.norm(data.site("a/tip").xpos - pos))
   assert np.max(lag[250:]) < 2e-3

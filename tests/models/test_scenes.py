@@ -9,6 +9,7 @@ import palpate
 import pytest
 from palpate import models
 from palpate.models import catalog, measure, trocar
+from palpate.models.handle import Handle
 
 NAMES = models.NAMES
 CAMERAS = ["laparoscope", "overview", "side"]
@@ -135,7 +136,7 @@ def test_instruments_and_handles(instruments, handle):
     mujoco.mj_resetDataKeyframe(model, data, 0)
     mujoco.mj_forward(model, data)
     goal = data.site(f"{prefix}tip").xpos + np.array([0.01, 0.005, 0.0])
-    trocar.move_handle(model, data, prefix, goal)
+    Handle(model, data, prefix).move(goal)
     for _ in range(600):
       mujoco.mj_step(model, data)
     np.testing.assert_allclose(data.site(f"{prefix}tip").xpos, goal, atol=2e-4)

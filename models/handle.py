@@ -1,0 +1,178 @@
+# mujoco ships its bindings without type stubs:
+# pyright: reportAttributeAccessIssue=false
+"""The handle of an instrument with virtual coupling: where the hand holds it, and what it feels.
+
+The handle is a mocap body with the frame of the tip: its z is along the shaft, back to the hand.
+Spring and damper between the two are six site actuators, see `instruments/parts/coupling.xml`.
+"""
+
+import math
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+
+from . import trocar as ports
+
+Vector = Sequence[float] | np.ndarray
+Quat = tuple[float, float, float, float]
+AXES = ("x", "y", "z", "rx", "ry", "rz")
+
+
+class Handle:
+  """The handle of one instrument in one mjData; cheap enough for a loop of 1 kHz."""
+
+  def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, prefix: str = ""):
+    """Finds the handle of the instrument whose names start with `prefix`.
+
+    Raises:
+      ValueError: it has none.
+    """
+    try:
+      mocap = int(model.body(f"{prefix}handle").mocapid[0])
+      acts = [model.actuator(f"{prefix}coupling_{axis}").id for axis in AXES]
+      sensors = [int(model.sensor(f"{prefix}coupling_{axis}").adr[0]) for axis in AXES]
+    except KeyError:
+      raise ValueError(
+        f"instrument {prefix!r} has no handle, expected one of the models that end in _handle"
+      ) from None
+    self.prefix = prefix
+    self._pos, self._quat = data.mocap_pos[mocap], data.mocap_quat[mocap]
+    # They are six in a row, in every model that has them.
+    self._ctrl = data.ctrl[acts[0] : acts[0] + 6]
+    self._felt = data.sensordata[sensors[0] : sensors[0] + 6]
+    gain, damping = model.actuator_gainprm[acts, 0], -model.actuator_biasprm[acts, 2]
+    self._lead = (damping / gain).tolist()  # [s]
+
+  @property
+  def pos(self) -> np.ndarray:
+    """Where it is in the world [m]  (3,)."""
+    return self._pos.copy()
+
+  @property
+  def quat(self) -> np.ndarray:
+    """How it is turned, w x y z  (4,)."""
+    return self._quat.copy()
+
+  def move(
+    self,
+    pos: Vector,
+    quat: Vector | None = None,
+    vel: Vector | None = None,
+    spin: Vector | None = None,
+  ) -> None:
+    """Puts the handle somewhere.
+
+    Args:
+      pos: in the world [m]  (3,)
+      quat: orientation, w x y z; as it is if it is left out  (4,)
+      vel: its velocity [m/s]; the coupling's damper then acts on the velocity of the tip relative
+        to the handle, and without it on that of the tip alone  (3,)
+      spin: the same for its angular velocity in the world [rad/s]  (3,)
+    """
+    self._pos[:] = pos
+    if quat is not None:
+      self._quat[:] = quat
+    m = _rotation(*self._quat.tolist())
+    u, w = vel if vel is not None else (0, 0, 0), spin if spin is not None else (0, 0, 0)
+    a, b, c, d, e, f = self._lead
+    self._ctrl[:] = (
+      a * (m[0] * u[0] + m[3] * u[1] + m[6] * u[2]),
+      b * (m[1] * u[0] + m[4] * u[1] + m[7] * u[2]),
+      c * (m[2] * u[0] + m[5] * u[1] + m[8] * u[2]),
+      d * (m[0] * w[0] + m[3] * w[1] + m[6] * w[2]),
+      e * (m[1] * w[0] + m[4] * w[1] + m[7] * w[2]),
+      f * (m[2] * w[0] + m[5] * w[1] + m[8] * w[2]),
+    )
+
+  def wrench(self) -> tuple[float, float, float, float, float, float]:
+    """Returns force [N] and torque [N m] that the hand feels, in the world  (6,)."""
+    m = _rotation(*self._quat.tolist())
+    x, y, z, a, b, c = self._felt.tolist()
+    return (
+      -m[0] * x - m[1] * y - m[2] * z,
+      -m[3] * x - m[4] * y - m[5] * z,
+      -m[6] * x - m[7] * y - m[8] * z,
+      -m[0] * a - m[1] * b - m[2] * c,
+      -m[3] * a - m[4] * b - m[5] * c,
+      -m[6] * a - m[7] * b - m[8] * c,
+    )
+
+  def joints(self, trocar: ports.Trocar) -> np.ndarray:
+    """Returns the pitch, yaw, roll [rad] and insertion [m] that it asks for  (4,)."""
+    pitch, yaw, insertion = ports.inverse(trocar, self._pos, check=False)
+    w, x, y, z = Shaft(trocar).quat(self._pos.tolist())
+    a, b, c, d = self._quat.tolist()
+    turn = times((w, -x, -y, -z), (a, b, c, d))
+    roll = math.remainder(-2 * math.atan2(turn[3], turn[0]), 2 * math.pi)
+    return np.array([pitch, yaw, roll, insertion])
+
+
+def find(model: mujoco.MjModel, data: mujoco.MjData, prefix: str = "") -> Handle | None:
+  """Returns the handle of an instrument, None where position drives move it."""
+  known = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, f"{prefix}handle") >= 0
+  return Handle(model, data, prefix) if known else None
+
+
+class Shaft:
+  """How the shaft of an instrument stands, by where its tip is; for a loop of 1 kHz."""
+
+  def __init__(self, trocar: ports.Trocar):
+    """Takes the instrument's trocar."""
+    quat = np.zeros(4)
+    mujoco.mju_mat2Quat(quat, np.ascontiguousarray(trocar.mat).ravel())
+    self._pos, self._mat = trocar.pos.tolist(), trocar.mat.T.tolist()
+    w, x, y, z = quat.tolist()
+    self._quat: Quat = (w, x, y, z)
+    self.reach = tuple(float(trocar.depth + x) for x in trocar.ranges[2])  # of the tip [m]
+
+  def within(self, pos: Vector) -> list[float]:
+    """Returns the point within the reach of the insertion that is nearest to one [m]  (3,)."""
+    out = [a - b for a, b in zip(pos, self._pos, strict=True)]
+    far = math.sqrt(out[0] * out[0] + out[1] * out[1] + out[2] * out[2])
+    scale = min(max(far, self.reach[0]), self.reach[1]) / max(far, 1e-9)
+    return [b + scale * a for a, b in zip(out, self._pos, strict=True)]
+
+  def quat(self, pos: Vector, roll: float = 0.0) -> Quat:
+    """Returns the orientation with the tip at a point [m], rolled by an angle [rad]  (4,)."""
+    p, (a, b, c) = self._pos, self._mat
+    x, y, z = pos[0] - p[0], pos[1] - p[1], pos[2] - p[2]
+    u = a[0] * x + a[1] * y + a[2] * z
+    v = b[0] * x + b[1] * y + b[2] * z
+    w = c[0] * x + c[1] * y + c[2] * z
+    pitch, yaw = math.atan2(v, -w), math.atan2(u, math.sqrt(v * v + w * w))
+    turn = times(_about(0, pitch), times(_about(1, -yaw), _about(2, -roll)))
+    return times(self._quat, turn)
+
+
+def pose(trocar: ports.Trocar, pos: Vector, roll: float = 0.0) -> np.ndarray:
+  """Returns place and orientation, as the shaft has it there, of a handle at `pos` [m]  (7,)."""
+  return np.array([*pos, *Shaft(trocar).quat(pos, roll)])
+
+
+def times(p: Quat, q: Quat) -> Quat:
+  """Returns the product of two quaternions."""
+  a, b, c, d = p
+  w, x, y, z = q
+  return (
+    a * w - b * x - c * y - d * z,
+    a * x + b * w + c * z - d * y,
+    a * y - b * z + c * w + d * x,
+    a * z + b * y - c * x + d * w,
+  )
+
+
+def _about(axis: int, angle: float) -> Quat:
+  s = math.sin(0.5 * angle)
+  return (math.cos(0.5 * angle), s * (axis == 0), s * (axis == 1), s * (axis == 2))
+
+
+def _rotation(w: float, x: float, y: float, z: float) -> tuple[float, ...]:
+  """Returns the matrix of a unit quaternion, row by row."""
+  xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
+  wx, wy, wz = w * x, w * y, w * z
+  return (
+    1 - 2 * (yy + zz), 2 * (xy - wz), 2 * (xz + wy),
+    2 * (xy + wz), 1 - 2 * (xx + zz), 2 * (yz - wx),
+    2 * (xz - wy), 2 * (yz + wx), 1 - 2 * (xx + yy),
+  )  # fmt: skip

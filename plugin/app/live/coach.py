@@ -1,0 +1,173 @@
+"""The coach: says what to do next and what goes wrong, and afterwards what to do better."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from palpate.tasks.metrics import METRICS, number
+from palpate.tasks.recording import Recording
+from palpate.tasks.report import ending
+from palpate.tasks.score import SUCCESS, score
+
+_STAYS = 0.6  # how long a warning is shown [s]
+# What helps, by metric; those that are left out say so by their names.
+_ADVICE = {
+  "peak_force": "approach slowly and stop at the first resistance",
+  "mean_force": "stay in light contact, less is enough",
+  "force_breaches": "watch the force bar, and ease off before it turns red",
+  "excess_impulse": "ease off at once when the force bar turns red",
+  "force_rate": "press and let go gradually",
+  "peak_grip": "close the jaws only until they hold",
+  "mean_grip": "close the jaws only until they hold",
+  "shaft_contact": "keep the shaft away from the organ; look at more than the tip",
+  "peak_shaft_force": "keep the shaft away from the organ; look at more than the tip",
+  "time": "plan the next movement during the present one",
+  "path_length": "go straight to the target",
+  "path_inefficiency": "go straight to the target",
+  "sparc": "make one smooth movement in place of several corrections",
+  "log_dimensionless_jerk": "make one smooth movement in place of several corrections",
+  "angular_path": "turn the instrument less",
+  "depth_path": "find the depth first, then go in once",
+  "number_of_movements": "make fewer, longer movements",
+  "idle_time": "plan the next movement during the present one",
+  "idle_share": "plan the next movement during the present one",
+  "out_of_view": "keep the tip in the picture",
+  "errors": "touch only what is asked for",
+  "grasp_slips": "take more tissue between the jaws before you pull",
+  "target_error": "look at the target from where the light shows its place, then touch",
+  "trace_frechet": "slow down in the bends of the line",
+  "trace_rms": "slow down in the bends of the line",
+}
+
+
+class Coach:
+  """Looks on and speaks, or, in an assessment, looks on alone.
+
+  Attributes:
+    instruction: what to do next; empty in an assessment
+    warning: what goes wrong now; empty where nothing does, and in an assessment
+  """
+
+  def __init__(self, assessment: bool = False):
+    """Makes a coach; in an `assessment` it says nothing."""
+    self.assessment = assessment
+    self.instruction, self.warning = "", ""
+    self._said: list[dict[str, Any]] = []
+    self._until = -math.inf
+
+  def begin(self, env: Any) -> None:
+    """Starts with an episode."""
+    self._said, self._until, self.warning = [], -math.inf, ""
+    self.look(env)
+
+  def look(self, env: Any) -> None:
+    """Looks at what a control step has made."""
+    if self.assessment:
+      return
+    task, physics, now = env.task, env.physics, float(env.physics.time())
+    instruction = task.instruct(physics)
+    # "2 s more" and "1.9 s more" are one hint.
+    if _words(instruction) != _words(self.instruction):
+      self._say("instruction", now, instruction)
+    self.instruction = instruction
+    warning = self._warning(task, physics)
+    if warning and _words(warning) != _words(self.warning):
+      self._say("warning", now, warning)
+    if warning or now > self._until:
+      self.warning = warning
+      self._until = now + _STAYS
+
+  def _warning(self, task: Any, physics: Any) -> str:
+    peak, limit = physics.peak_force, task.force_limit
+    if peak > limit:
+      return f"Too much force: {peak:.1f} N, expected at most {limit:.1f} N"
+    if task.cost.shaft:
+      return f"The shaft presses on the organ with {physics.peak_shaft:.1f} N"
+    if not physics.tip_visible():
+      return "The tip is out of the picture"
+    return ""
+
+  def _say(self, kind: str, time: float, text: str) -> None:
+    self._said.append({"kind": kind, "time": round(time, 3), "text": text})
+
+  def log(self) -> dict[str, Any]:
+    """Returns what was said, for the recording."""
+    return {"assessment": self.assessment, "hints": self._said}
+
+
+def _lower(label: str) -> str:
+  return label[0].lower() + label[1:]
+
+
+def _words(text: str) -> str:
+  return "".join(c for c in text if not c.isdigit() and c != ".")
+
+
+def advice(
+  recording: Recording, reference: Mapping[str, Any] | None, most: int = 4
+) -> list[str]:
+  """Returns sentences about an exercise: how it ended, what to do better, what was good.
+
+  Args:
+    recording: of the exercise
+    reference: of skilled people, see `score.make_reference`; without it only the end is known
+    most: sentences about what to do better
+  """
+  said = [f"{ending(recording)}."]
+  if reference is None or not len(recording.time):
+    return said
+  metrics = recording.metrics()
+  result = score(metrics, reference, recording.outcome)
+  order = sorted(result.over, key=lambda name: result.z[name])
+  for name in order[:most]:
+    spec, row = METRICS[name], reference["metrics"][name]
+    unit = "" if spec.shown in ("-", "count") else f" {spec.shown}"
+    bound = "at most" if spec.better == "lower" else "at least"
+    text = (
+      f"{spec.label} was {number(getattr(metrics, name), spec)}{unit}, skilled people have {bound} "
+      f"{number(row['limit'], spec)}{unit}"
+    )
+    said.append(f"{text}: {_ADVICE[name]}." if name in _ADVICE else f"{text}.")
+  if recording.outcome == SUCCESS:
+    good = [k for k, z in result.z.items() if math.isfinite(z) and z > 0.5 and k not in result.over]
+    good.sort(key=lambda name: -result.z[name])
+    if good:
+      labels = ", ".join(_lower(METRICS[name].label) for name in good[:3])
+      said.append(f"Better than most skilled people: {labels}.")
+    if result.proficient:
+      said.append("Every metric is within its limit: this was a proficient episode.")
+  return said
+
+
+def card(recording: Recording, reference: Mapping[str, Any] | None) -> dict[str, Any]:
+  """Returns the score card of an exercise, JSON."""
+  metrics = recording.metrics()
+  result = None
+  if reference is not None and len(recording.time):
+    result = score(metrics, reference, recording.outcome)
+  rows = []
+  for name, spec in METRICS.items():
+    value = getattr(metrics, name)
+    if not math.isfinite(value):
+      continue
+    limit = "" if result is None else reference["metrics"].get(name)  # pyright: ignore
+    rows.append({
+      "label": spec.label,
+      "group": spec.group,
+      "value": number(value, spec),
+      "unit": spec.shown,
+      "limit": number(limit["limit"], spec) if limit else "",
+      "over": result is not None and name in result.over,
+    })  # fmt: skip
+  composite = None
+  if result is not None and math.isfinite(result.composite):
+    composite = round(result.composite, 2)
+  return {
+    "outcome": recording.outcome,
+    "advice": advice(recording, reference),
+    "composite": composite,
+    "proficient": result is not None and result.proficient,
+    "rows": rows,
+  }

@@ -1,0 +1,383 @@
+"""Couples a hand to the handle of an instrument.
+
+From hand to handle: scaling, clutch, and an anchor without steps between slow readings. Back: the
+coupling's force and torque, limited, with a ramp at the start, and never with more energy than the
+hand has given: its account is that of Hannaford and Ryu 2002, and a force that could overdraw it
+before the next reading is made smaller. The spring and the damper themselves
+are in the model, see `models.handle`.
+
+In a loop of 1 kHz all of this costs a few microseconds: plain numbers, no arrays.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from palpate.models.handle import Shaft, times
+
+from .device import Device, DeviceError, Four, Guard, Reading, Three
+
+STILL: Three = (0.0, 0.0, 0.0)
+_SAME: Four = (1.0, 0.0, 0.0, 0.0)
+_CLOSE, _OPEN = 2.0, -0.6  # speed of the jaws by button [1/s], and where they grip
+_RETRY = 0.5  # between tries to find a device again [s]
+# Energy that the hand may get before it gives any, and most that is kept account of [J].
+_LENT, _CREDIT = 1e-3, 0.05
+_LIGHTEST = 0.05  # of hands with a device [kg]
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+  """How a hand is coupled.
+
+  Attributes:
+    scale: movement of the instrument for one of the hand [-]
+    force_scale: force on the hand for one of the coupling [-]
+    force_limit: largest force on the hand, below the device's own [N]
+    ramp: how long forces take to come after a start, a pause or a clutch [s]
+    leash: how far the anchor may be ahead of the tip with a device that gives no forces [m]
+    patience: how long a device may say nothing, beyond its own rate, before it counts as gone [s]
+    passive: whether forces keep to the energy that the hand has given
+  """
+
+  scale: float = 1.0
+  force_scale: float = 1.0
+  force_limit: float = 20.0
+  ramp: float = 0.5
+  leash: float = 0.012
+  patience: float = 0.25
+  passive: bool = True
+
+  def __post_init__(self):
+    for field in dataclasses.fields(self)[:-1]:
+      value, least = getattr(self, field.name), field.name in ("scale", "leash", "patience")
+      if not (math.isfinite(value) and (value > 0 if least else value >= 0)):
+        raise ValueError(f"{field.name} is {value}, expected a number {'>' if least else '>='} 0")
+
+
+class Track:
+  """An anchor that moves without steps of place or speed between slow readings.
+
+  It goes in a straight line to each reading while it waits for the next, and a low pass of half of
+  that time rounds the corners: 1.5 times the interval between readings late, and with readings as
+  frequent as the steps not late at all.
+  """
+
+  def __init__(self, h: float):
+    """Takes the step [s]."""
+    self._h = h
+    self.put([0.0] * 3, 1e-3)
+
+  def put(self, value: list[float], interval: float) -> None:
+    """Starts anew at a value, with readings about `interval` [s] apart."""
+    self.value, self._line, self._goal = value, value, value
+    self._left, self._interval, self._since = 0, max(interval, self._h), 0
+
+  def aim(self, goal: list[float]) -> None:
+    """Takes a reading."""
+    span = min(self._since * self._h, 0.2) or self._h
+    self._interval = max(span, 0.9 * self._interval)  # readings come unevenly
+    self._goal, self._since = goal, 0
+    slow = self._interval / self._h
+    # The next one comes before it is there.
+    self._left = 1 if slow < 1.5 else round(1.25 * slow) + 1
+
+  def advance(self) -> list[float]:
+    """Returns the value of the next step."""
+    self._since += 1
+    line, goal, n = self._line, self._goal, self._left
+    if n > 1:
+      line = [a + (b - a) / n for a, b in zip(line, goal, strict=True)]
+      self._left = n - 1
+    else:
+      line = goal
+    self._line = line
+    slow = self._interval / self._h
+    if slow < 2.5:
+      self.value = line
+    else:
+      share = 1 / (1 + 0.5 * slow)
+      self.value = [a + share * (b - a) for a, b in zip(self.value, line, strict=True)]
+    return self.value
+
+
+class Link:
+  """One device and the handle it moves.
+
+  Attributes:
+    device: the hand's
+    options: of the coupling
+    state: `ready`, `clutch`, `lost` or `waiting` for the first reading
+    message: the last fault, for people
+    row: place [m] and orientation of the anchor  (7,)
+    jaw: opening of the jaws [-]
+    report: whether a place is reported now
+    force: last force sent [N], in the device's axes
+    energy: what the hand has given, less what it got, and what it is lent at the start [J]
+    paused: whether the hand has asked for a pause
+  """
+
+  def __init__(self, device: Device, options: Options | None = None, h: float = 1e-3):
+    """Couples a device.
+
+    Args:
+      device: the hand's
+      options: of the coupling
+      h: step of the loop [s]
+    """
+    self.device, self.options, self._h = device, options or Options(), h
+    self.guard = Guard(device)
+    self.force: Three = STILL
+    self.state, self.message = "waiting", ""
+    self.row, self.jaw, self.report, self.paused = [0.0] * 3 + list(_SAME), 1.0, False, False
+    self.energy, self._asked = _LENT, False
+    self._place, self._turn = Track(h), Track(h)
+    self._heard, self._tried, self._gain = 0.0, 0.0, 0.0
+    self._reference: tuple[Reading, list[float], Four, float] | None = None
+    self._roll = 0.0
+    self.attach(None, STILL, _SAME, np.eye(3))
+    self.quiet()
+
+  def attach(
+    self, shaft: Shaft | None, pos: Sequence[float], quat: Sequence[float], axes: np.ndarray
+  ) -> None:
+    """Takes the instrument that it moves, where it is: nothing moves by this.
+
+    Args:
+      shaft: of the instrument, None for a free body
+      pos: of the handle [m]  (3,)
+      quat: its orientation  (4,)
+      axes: the device's axes in the world, in columns  (3, 3)
+    """
+    self._shaft, self._axes = shaft, [float(x) for x in np.asarray(axes).ravel()]
+    self._hold([float(x) for x in pos], tuple(float(x) for x in quat))
+    self.state = "waiting"
+
+  def _hold(self, pos: list[float], quat: tuple[float, ...]) -> None:
+    self.row = [*pos, *quat]
+    self._place.put(pos, 1 / self.device.rate)
+    self._turn.put(list(quat), 1 / self.device.rate)
+    self._reference, self._gain = None, 0.0
+
+  def hold(self) -> None:
+    """Lets the hand move freely while the handle stays; forces are zero."""
+    self._hold(self.row[:3], tuple(self.row[3:]))
+    self.quiet()
+
+  def quiet(self) -> None:
+    """Sets the forces to zero; they come back by the ramp."""
+    self._gain, self.force = 0.0, STILL
+    self._felt_at: Three | None = None
+    self._pushed, self._fast = [0.0, 0.0, 0.0, 0.0], 0.0
+    self._send(STILL, STILL)
+
+  # From hand to handle.
+
+  def poll(self, now: float, tip: Sequence[float] | None = None) -> bool:
+    """Reads the device; returns whether the exercise can go on.
+
+    Args:
+      now: time of the loop [s]
+      tip: of the instrument [m]; the leash is tied there  (3,)
+    """
+    if self.state == "lost" and not self._find(now):
+      return False
+    try:
+      reading = self.device.read(now)
+    except DeviceError as error:
+      return self._lose(now, str(error))
+    if reading is not None:
+      verdict = self.guard.check(reading, now)
+      if verdict == "bad":
+        reading, self.message = None, self.guard.last
+      elif verdict == "jump":
+        self._hold(self.row[:3], tuple(self.row[3:]))
+        self._felt_at, self.message = None, self.guard.last
+    if reading is not None:
+      self._heard = now
+      self._take(reading, tip)
+    elif self.state == "waiting":
+      return False
+    elif now - self._heard > self.options.patience + 1 / self.device.rate:
+      return self._lose(now, f"{self.device.name}: no reading for {now - self._heard:.2f} s")
+    self._advance()
+    return True
+
+  def _take(self, reading: Reading, tip: Sequence[float] | None) -> None:
+    """Aims the anchor at what the hand does."""
+    asks, self._asked = not self._asked, "pause" in reading.buttons
+    self.paused ^= asks and self._asked
+    self.report = "report" in reading.buttons
+    if reading.jaw is not None:
+      self.jaw = min(max(reading.jaw, -1.0), 1.0)
+    else:
+      step, target = _CLOSE / self.device.rate, _OPEN if "grip" in reading.buttons else 1.0
+      self.jaw += min(max(target - self.jaw, -step), step)
+    if "clutch" in reading.buttons:
+      self.state, self._reference = "clutch", None
+      return
+    self.state = "ready"
+    self._motion(reading)
+    if self._reference is None:
+      row = self.row
+      self._reference = reading, row[:3], tuple(row[3:]), self._roll - reading.roll
+      return
+    first, center, turned, roll = self._reference
+    m, scale = self._axes, self.options.scale
+    x, y, z = (scale * (a - b) for a, b in zip(reading.pos, first.pos, strict=True))
+    goal = [
+      center[0] + m[0] * x + m[1] * y + m[2] * z,
+      center[1] + m[3] * x + m[4] * y + m[5] * z,
+      center[2] + m[6] * x + m[7] * y + m[8] * z,
+    ]
+    held = self._bound(goal, tip)
+    if self.device.relative and held != goal:  # a mouse that goes on moves nothing; back, it does
+      shift = [a + b - c for a, b, c in zip(center, held, goal, strict=True)]
+      self._reference = first, shift, turned, roll
+    self._roll = min(max(roll + reading.roll, -3.1), 3.1)
+    if reading.quat is not None:
+      self._turn.aim(list(_nearest(self._turned(reading, first, turned), self._turn.value)))
+    self._place.aim(held)
+
+  def _bound(self, goal: list[float], tip: Sequence[float] | None) -> list[float]:
+    if self._shaft is not None:
+      goal = self._shaft.within(goal)
+    if tip is not None and not self.device.force_limit:
+      far = math.dist(goal, tip)
+      if far > self.options.leash:
+        share = self.options.leash / far
+        goal = [b + share * (a - b) for a, b in zip(goal, tip, strict=True)]
+    return [min(max(x, -1.0), 1.0) for x in goal]
+
+  def _turned(self, reading: Reading, first: Reading, turned: Four) -> Four:
+    """Returns the handle's orientation for a device that knows its own."""
+    w, x, y, z = first.quat or _SAME
+    w, x, y, z = times(reading.quat or _SAME, (w, -x, -y, -z))
+    m = self._axes
+    turn = (
+      w,
+      m[0] * x + m[1] * y + m[2] * z,
+      m[3] * x + m[4] * y + m[5] * z,
+      m[6] * x + m[7] * y + m[8] * z,
+    )
+    return times(turn, turned)
+
+  def _advance(self) -> None:
+    pos = self._place.advance()
+    if self._shaft is not None and (self._reference is None or self._reference[0].quat is None):
+      quat = _nearest(self._shaft.quat(pos, self._roll), self.row[3:])
+      self._turn.value = list(quat)
+    else:
+      w, x, y, z = self._turn.advance()
+      scale = 1 / math.sqrt(w * w + x * x + y * y + z * z)
+      quat = (w * scale, x * scale, y * scale, z * scale)
+    self.row = [*pos, *quat]
+
+  # Faults.
+
+  def _lose(self, now: float, message: str) -> bool:
+    self.state, self.message, self._tried = "lost", message, now
+    self.hold()
+    self.guard.forget()
+    return False
+
+  def _find(self, now: float) -> bool:
+    if now - self._tried < _RETRY:
+      return False
+    self._tried = now
+    try:
+      there = self.device.reopen()
+    except DeviceError as error:
+      self.message, there = str(error), False
+    if there:
+      self.state, self._heard = "waiting", now
+    return there
+
+  # From handle to hand.
+
+  def _motion(self, reading: Reading) -> None:
+    """Takes account of the energy since the last reading."""
+    before, self._felt_at = self._felt_at, reading.pos
+    if before is None:
+      return
+    moved = [a - b for a, b in zip(reading.pos, before, strict=True)]
+    x, y, z, count = self._pushed  # summed over the steps since then
+    given = -(x * moved[0] + y * moved[1] + z * moved[2]) / max(count, 1.0)
+    self._pushed = [0.0, 0.0, 0.0, 0.0]
+    self.energy = min(self.energy + given, _CREDIT)
+    self._fast = self.device.rate * math.hypot(*moved)
+
+  def feel(self, wrench: Sequence[float]) -> None:
+    """Makes the hand feel what the handle feels.
+
+    Args:
+      wrench: force [N] and torque [N m] on the handle, in the world  (6,)
+    """
+    device, options = self.device, self.options
+    if not device.force_limit or self.state != "ready":
+      self.force = STILL
+      return
+    self._gain = min(self._gain + self._h / max(options.ramp, self._h), 1.0)
+    m, scale = self._axes, self._gain * options.force_scale
+    force = _into(m, wrench[0], wrench[1], wrench[2], scale)
+    force = _limited(force, min(device.force_limit, options.force_limit))
+    if options.passive:
+      force = _limited(force, self._affordable(force))
+    torque = STILL
+    if device.torque_limit:
+      torque = _into(m, wrench[3], wrench[4], wrench[5], scale)
+      torque = _limited(torque, device.torque_limit)
+    self.force = force
+    pushed = self._pushed
+    self._pushed = [pushed[0] + force[0], pushed[1] + force[1], pushed[2] + force[2], pushed[3] + 1]
+    self._send(force, torque)
+
+  def _affordable(self, force: Three) -> float:
+    """Returns the largest force that cannot give the hand more energy than there is [N].
+
+    Until the next reading the hand goes no further than its speed takes it, and the force itself
+    takes the lightest of hands.
+    """
+    x, y, z = force
+    size = math.sqrt(x * x + y * y + z * z)
+    if size < 1e-9:
+      return size
+    interval = 1 / self.device.rate
+    far = (self._fast + size * interval / _LIGHTEST) * interval
+    return max(self.energy, 0.0) / max(far, 1e-9)
+
+  def _send(self, force: Three, torque: Three) -> None:
+    if self.device.force_limit:
+      try:
+        self.device.send(force, torque)
+      except DeviceError as error:
+        self.state, self.message, self.force = "lost", str(error), STILL
+
+
+def _into(m: list[float], x: float, y: float, z: float, scale: float) -> Three:
+  """Returns a vector of the world in the device's axes, scaled."""
+  return (
+    scale * (m[0] * x + m[3] * y + m[6] * z),
+    scale * (m[1] * x + m[4] * y + m[7] * z),
+    scale * (m[2] * x + m[5] * y + m[8] * z),
+  )
+
+
+def _limited(vector: Three, most: float) -> Three:
+  """Returns a vector that is no longer than `most`."""
+  x, y, z = vector
+  length = math.sqrt(x * x + y * y + z * z)
+  if length <= most:
+    return vector
+  scale = most / length
+  return (x * scale, y * scale, z * scale)
+
+
+def _nearest(quat: Four, like: Sequence[float]) -> Four:
+  """Returns of the two quaternions of a rotation the one nearer to another."""
+  w, x, y, z = quat
+  same = w * like[0] + x * like[1] + y * like[2] + z * like[3] >= 0
+  return quat if same else (-w, -x, -y, -z)

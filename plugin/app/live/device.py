@@ -1,0 +1,149 @@
+"""What a device for the hand is, and the check of what it says.
+
+Axes of a device: x to the right, y up, z towards the person, as the laparoscope's picture has them.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple, Protocol
+
+Three = tuple[float, float, float]
+Four = tuple[float, float, float, float]
+
+
+class DeviceError(RuntimeError):
+  """A device that cannot be opened, or that has vanished."""
+
+
+class Reading(NamedTuple):
+  """What a hand does now.
+
+  Attributes:
+    pos: place [m], in the device's axes
+    quat: orientation, w x y z; None where the device knows none: the shaft then stands as its place
+      has it, turned by `roll`
+    roll: about the shaft [rad]
+    jaw: opening of the jaws, 1 is wide open, -1 squeezes; None where the button `grip` closes them
+    buttons: those that are held: `clutch` (the instrument stays while the hand moves), `grip`,
+      `report`, `pause`
+  """
+
+  pos: Three
+  quat: Four | None = None
+  roll: float = 0.0
+  jaw: float | None = None
+  buttons: frozenset[str] = frozenset()
+
+
+class Device(Protocol):
+  """A device for one hand.
+
+  Attributes:
+    name: for people
+    rate: readings a second
+    workspace: lower and upper corner of where the hand can be [m]
+    force_limit: largest force it gives [N], 0 for one that gives none
+    torque_limit: the same for torque [N m]
+    relative: whether only its movements mean something, so that its zero may drift
+  """
+
+  name: str
+  rate: float
+  workspace: tuple[Three, Three]
+  force_limit: float
+  torque_limit: float
+  relative: bool
+
+  def read(self, now: float) -> Reading | None:
+    """Returns the latest reading, None where there is none since the last; never waits.
+
+    Args:
+      now: time of the loop [s]
+
+    Raises:
+      DeviceError: it is gone.
+    """
+    ...
+
+  def send(self, force: Three, torque: Three) -> None:
+    """Makes the hand feel a force [N] and a torque [N m], in the device's axes; never waits.
+
+    Raises:
+      DeviceError: it is gone.
+    """
+    ...
+
+  def reopen(self) -> bool:
+    """Tries to find a device again that was gone; returns whether it is there."""
+    ...
+
+  def close(self) -> None:
+    """Sets the forces to zero and lets go of it."""
+    ...
+
+
+class Silent:
+  """What devices without forces share."""
+
+  name = "device"
+  rate = 1000.0
+  workspace: tuple[Three, Three] = ((-0.2, -0.2, -0.2), (0.2, 0.2, 0.2))
+  force_limit = 0.0
+  torque_limit = 0.0
+  relative = True
+
+  def send(self, force: Three, torque: Three) -> None:
+    """Does nothing."""
+
+  def reopen(self) -> bool:
+    """Returns True: it is always there."""
+    return True
+
+  def close(self) -> None:
+    """Does nothing."""
+
+
+FASTEST = 3.0  # a hand's speed; what is faster is a jump [m/s]
+_STEP = 0.01  # which no reading need explain [m]
+
+
+class Guard:
+  """Finds what is no movement of a hand.
+
+  Attributes:
+    bad: readings that were not finite
+    jumps: readings that no hand could have moved to
+    last: the last fault, for people; empty without one
+  """
+
+  def __init__(self, device: Device):
+    self._device, self._before, self._time = device, None, 0.0
+    self.bad, self.jumps, self.last = 0, 0, ""
+
+  def forget(self) -> None:
+    """Takes the next reading as the first one."""
+    self._before = None
+
+  def check(self, reading: Reading, now: float) -> str:
+    """Returns `good`, `jump` for a movement that no hand makes, `bad` for what is no pose."""
+    x, y, z = reading.pos
+    numbers = x + y + z + reading.roll + sum(reading.quat or ()) + (reading.jaw or 0.0)
+    if not math.isfinite(numbers) or (reading.quat and sum(q * q for q in reading.quat) < 1e-6):
+      self.bad += 1
+      self.last = f"{self._device.name}: pose is {_text(reading)}, expected finite numbers"
+      return "bad"
+    before, self._before = self._before, reading.pos
+    span, self._time = now - self._time, now
+    if before is None:
+      return "good"
+    moved = math.dist(before, reading.pos)
+    if moved <= _STEP + FASTEST * span:
+      return "good"
+    self.jumps += 1
+    self.last = f"{self._device.name}: jumped {1e3 * moved:.0f} mm in {1e3 * span:.0f} ms"
+    return "jump"
+
+
+def _text(reading: Reading) -> str:
+  return f"{reading.pos}" if reading.quat is None else f"{reading.pos} {reading.quat}"

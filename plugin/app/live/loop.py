@@ -1,0 +1,117 @@
+"""The loop: its thread owns the simulation, everything else is elsewhere."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+from palpate.models import trocar
+from palpate.models.handle import Handle, Shaft
+from palpate.tasks.handle import spin
+
+from .coupling import Link, Options
+from .device import Device
+from .pace import Pace, punctual
+
+
+def tick(pace: Pace, links: Sequence[Link], tips: Sequence[Sequence[float]]) -> bool:
+  """Waits for the next step and reads the hands; returns False once the loop is to end.
+
+  In a pause, and while a device is gone, nothing moves, forces are zero, and the devices are still
+  read.
+  """
+  pace.wait()
+  while not pace.stopped:
+    ready = [link.poll(pace.now, tip) for link, tip in zip(links, tips, strict=True)]
+    if all(ready) and not pace.paused and not any(link.paused for link in links):
+      return True
+    for link in links:
+      link.hold()
+    pace.rest()
+  for link in links:
+    link.quiet()
+  return False
+
+
+def axes(model: mujoco.MjModel, data: mujoco.MjData, camera: str = "laparoscope") -> np.ndarray:
+  """Returns the device's axes in the world, those of a camera's picture, in columns  (3, 3)."""
+  return data.cam_xmat[model.camera(camera).id].reshape(3, 3).copy()
+
+
+class Loop:
+  """Steps a scene with hands on the handles of its instruments.
+
+  Attributes:
+    pace: to pause, slow down and stop it from another thread
+    links: one for each instrument
+  """
+
+  def __init__(
+    self,
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    hands: Mapping[str, Device],
+    options: Options | None = None,
+    pace: Pace | None = None,
+    camera: str = "laparoscope",
+  ):
+    """Couples the hands, their instruments where they are.
+
+    Args:
+      model: the scene
+      data: its state, which the loop's thread owns from now on
+      hands: device of each instrument, by its prefix, such as "probe/"
+      options: of the coupling
+      pace: 1 kHz, or the model's own time step, by default
+      camera: that the devices' axes are of
+    """
+    self._model, self._data = model, data
+    self.pace = pace or Pace(model.opt.timestep)
+    h = model.opt.timestep
+    mujoco.mj_forward(model, data)
+    self.links, self._handles, self._tips = [], [], []
+    for prefix, device in hands.items():
+      port, handle = trocar.trocar(model, prefix), Handle(model, data, prefix)
+      site = model.site(f"{prefix}tip").id
+      link, shaft = Link(device, options, h), Shaft(port)
+      tip = data.site_xpos[site].tolist()
+      link.attach(shaft, tip, shaft.quat(tip), axes(model, data, camera))
+      handle.move(tip, link.row[3:])
+      self.links.append(link)
+      self._handles.append(handle)
+      self._tips.append(data.site_xpos[site])
+
+  def run(
+    self,
+    duration: float = float("inf"),
+    watch: Callable[[Loop], Any] | None = None,
+    realtime: bool = False,
+  ) -> None:
+    """Runs until a time of the simulation [s] has passed, or `pace.stopped`.
+
+    Args:
+      duration: of the simulation [s]
+      watch: called after every step
+      realtime: see `pace.punctual`
+    """
+    model, data, h = self._model, self._data, self._model.opt.timestep
+    steps, k = duration / h, 0
+    rows = [link.row for link in self.links]
+    try:
+      with punctual(realtime):
+        while k < steps and tick(self.pace, self.links, [tip.tolist() for tip in self._tips]):
+          for i, (link, handle) in enumerate(zip(self.links, self._handles, strict=True)):
+            row, before, rows[i] = link.row, rows[i], link.row
+            vel = [(a - b) / h for a, b in zip(row[:3], before[:3], strict=True)]
+            handle.move(row[:3], row[3:], vel, spin(before[3:], row[3:], h))
+          mujoco.mj_step(model, data)
+          for link, handle in zip(self.links, self._handles, strict=True):
+            link.feel(handle.wrench())
+          k += 1
+          if watch is not None:
+            watch(self)
+    finally:
+      for link in self.links:
+        link.quiet()

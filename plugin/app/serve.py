@@ -1,0 +1,92 @@
+"""`palpate serve`: a page to train on."""
+
+from __future__ import annotations
+
+import argparse
+import pathlib
+import threading
+import webbrowser
+
+from .console import CommandError, Interrupt, check_counts, need, output_folder
+
+_LOOK = 0.2  # between looks at whether Ctrl-C was pressed [s]
+
+
+def add_arguments(parser: argparse.ArgumentParser):
+  """Declares the options."""
+  parser.epilog = (
+    "The page is reached from this machine alone. With another --host it is reached from others "
+    "too, by the printed address with its token, and unencrypted: put it behind a proxy that "
+    "encrypts."
+  )
+  add = parser.add_argument
+  add("--host", default="127.0.0.1", help="address to listen on (%(default)s)")
+  add("--port", type=int, default=8090, help="0 for any that is free (%(default)s)")
+  add("--token", help="that a page must know; one is made up where others can reach the page")
+  add(
+    "--device", metavar="NAME", default="mouse",
+    help="mouse for all that is on the page, or gamepad, spacemouse, udp, openhaptics, "
+    "forcedimension, haply, hand (%(default)s)",
+  )  # fmt: skip
+  add("--pages", metavar="N", type=int, default=2, help="that may be open at a time (%(default)s)")
+  add("-o", "--out", metavar="FOLDER", default="out/live", help="of recordings (%(default)s)")
+  add("--open", action="store_true", help="open the page in a browser")
+
+
+def main(args: argparse.Namespace) -> int:
+  """Runs the job and returns its exit code."""
+  from .live import devices
+
+  try:
+    devices.check(args.device)
+  except ValueError as error:
+    raise CommandError(str(error)) from None
+  if not 0 <= args.port < 65536:
+    raise CommandError(f"port is {args.port}, expected a whole number in [0, 65535]")
+  check_counts(args, "pages")
+  return run(
+    pathlib.Path(args.out), args.host, args.port, args.token, args.device, args.pages, args.open
+  )
+
+
+def run(
+  folder: pathlib.Path,
+  host: str = "127.0.0.1",
+  port: int = 0,
+  token: str | None = None,
+  device: str = "mouse",
+  pages: int = 2,
+  show: bool = True,
+  task: str = "",
+) -> int:
+  """Serves until Ctrl-C and returns the exit code; arguments as the options.
+
+  Args:
+    folder: of recordings
+    host: address to listen on
+    port: 0 for any that is free
+    token: that a page must know
+    device: its name
+    pages: that may be open at a time
+    show: whether a browser is opened
+    task: that is chosen at first
+  """
+  need("live", "websockets")
+  from .live.server import Server
+
+  folder = output_folder("out", folder)
+  try:
+    server = Server(folder, host, port, token, device, pages)
+  except OSError as error:
+    raise CommandError(f"cannot listen on {host}:{port}: {error}", code=1) from None
+  url = f"{server.url}#task={task}" if task else server.url
+  thread = threading.Thread(target=server.run, daemon=True)
+  with Interrupt() as interrupt:
+    thread.start()
+    print(f"page       {url}\nrecordings {folder}\nCtrl-C ends", flush=True)
+    if show:
+      webbrowser.open(url)
+    while not interrupt.seen and thread.is_alive():
+      thread.join(_LOOK)
+    server.close()
+  return 0

@@ -1,0 +1,94 @@
+"""The coach: what it says while one works, and afterwards."""
+
+import copy
+import dataclasses
+
+import numpy as np
+import palpate
+import pytest
+from palpate.app.live.coach import Coach, advice, card
+from palpate.tasks import episode, performer, suite
+from palpate.tasks.score import reference
+
+
+def load(name, **kwargs):
+  palpate.register()
+  return suite.load(*suite.split(name), task_kwargs={"random": 0, **kwargs})
+
+
+def follow(name, seed=0):
+  """Returns what a coach said to the expert, in order."""
+  env, coach = load(name), Coach()
+  act = performer.make(env, seed=seed)
+
+  def watch(env):
+    coach.look(env)
+
+  def first(timestep):
+    if timestep.first():
+      coach.begin(env)
+    return act(timestep)
+
+  made = episode.run(env, first, seed, {"task_kwargs": {}}, watch=watch)
+  return coach, made
+
+
+@pytest.mark.parametrize(
+  ("name", "steps"),
+  [
+    ("touch/easy", ["Touch the yellow point gently, 1 of 1"]),
+    ("grasp/easy", ["Open the jaws, go over", "Lift it by 6 mm", "Hold it", "Lower", "let go"]),
+    ("probe/easy", ["Go to the yellow site", "Press more", "Hold it there"]),
+  ],
+)
+def test_instructions_follow_the_phases(name, steps):
+  coach, made = follow(name)
+  assert made.outcome == "success"
+  said = [hint["text"] for hint in coach.log()["hints"] if hint["kind"] == "instruction"]
+  at = -1
+  for step in steps:
+    at = next((i for i, text in enumerate(said) if i > at and step in text), None)
+    assert at is not None, (step, said)
+
+
+def test_warnings_name_force_and_view():
+  env, coach = load("touch/easy"), Coach()
+  env.reset()
+  coach.begin(env)
+  assert coach.warning == "" and "yellow point" in coach.instruction
+  env.task.force_limit = -1.0
+  coach.look(env)
+  assert coach.warning == "Too much force: 0.0 N, expected at most -1.0 N"
+  env.task.force_limit = 1.0
+  env.physics.move_port(np.array([0.2, 0.0, 0.0]), np.zeros(3))
+  env.physics.forward()
+  env.physics.set_joints(env.physics.joints())
+  coach.look(env)
+  assert coach.warning == "The tip is out of the picture"
+  assert [hint["kind"] for hint in coach.log()["hints"]] == ["instruction", "warning", "warning"]
+
+
+def test_an_assessment_is_silent():
+  env, coach = load("touch/easy"), Coach(assessment=True)
+  env.reset()
+  coach.begin(env)
+  env.task.force_limit = -1.0
+  coach.look(env)
+  assert (coach.instruction, coach.warning) == ("", "")
+  assert coach.log() == {"assessment": True, "hints": []}
+
+
+def test_advice_names_what_is_over_its_limit_and_what_helps():
+  env = load("touch/easy")
+  made = episode.run(env, performer.make(env, seed=0), 0, {"task_kwargs": {}})
+  strict = copy.deepcopy(reference("touch/easy"))
+  strict["metrics"]["path_length"]["limit"] = 0.001  # [m]
+  said = advice(made, strict)
+  assert said[0].startswith("Success, after")
+  assert any("skilled people have at most 1 mm: go straight" in text for text in said)
+  assert advice(made, None) == said[:1]
+  shown = card(made, strict)
+  over = {row["label"] for row in shown["rows"] if row["over"]}
+  assert over == {"Path length"} and shown["outcome"] == "success" and not shown["proficient"]
+  stopped = dataclasses.replace(made, info={**made.info, "outcome": "damage"})
+  assert "Failed: a force above" in advice(stopped, reference("touch/easy"))[0]

@@ -1,0 +1,306 @@
+"""The page's server: who may come in, what is refused, and an exercise over its socket."""
+
+import json
+import pathlib
+import shutil
+import threading
+import time
+import urllib.error
+import urllib.request
+
+import numpy as np
+import pytest
+from palpate.app import cli
+from palpate.tasks import episode
+from palpate.tasks.recording import Recording
+
+pytest.importorskip("websockets")
+from palpate.app.live.server import Server
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+
+ANSWER = 120.0  # that a busy machine may take [s]
+LOOK = """(() => {
+  const {scene, head, targets} = window.palpate();
+  const text = document.getElementById("instruction").textContent;
+  return {head, targets, camera: scene.camera, text, ended: document.getElementById("card").open};
+})()"""
+
+
+@pytest.fixture
+def serve(tmp_path):
+  running = []
+
+  def start(**kwargs):
+    server = Server(tmp_path / "out", **kwargs)
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    running.append((server, thread))
+    return server
+
+  yield start
+  for server, thread in running:
+    server.close()
+    thread.join(30)
+    assert not thread.is_alive()
+
+
+def get(server, path="/", host=None):
+  """Returns status and text of a page."""
+  request = urllib.request.Request(f"http://127.0.0.1:{server.port}{path}")
+  if host:
+    request.add_header("Host", host)
+  try:
+    with urllib.request.urlopen(request, timeout=10) as found:
+      return found.status, found.read().decode()
+  except urllib.error.HTTPError as error:
+    return error.code, error.read().decode()
+
+
+def socket(server, query="", origin=None):
+  url = f"ws://127.0.0.1:{server.port}/socket{query}"
+  return connect(url, origin=origin or f"http://127.0.0.1:{server.port}", open_timeout=30)
+
+
+def hear(page, kind):
+  """Returns the next message of a kind, and the frames before it."""
+  frames = []
+  while True:
+    message = page.recv(timeout=ANSWER)
+    if isinstance(message, bytes):
+      frames.append(np.frombuffer(message, np.float32))
+      if kind == "frame":
+        return frames[-1], frames
+      continue
+    words = json.loads(message)
+    if words["type"] == kind:
+      return words, frames
+    assert words["type"] != "error", words
+
+
+def tell(page, **message):
+  page.send(json.dumps(message))
+
+
+def test_the_page_and_its_files_are_there_and_nothing_else(serve):
+  server = serve()
+  status, text = get(server)
+  assert status == 200 and "Palpate" in text and server.url == f"http://127.0.0.1:{server.port}/"
+  for path in ("/page.js", "/view.js", "/hand.js", "/page.css"):
+    assert get(server, path)[0] == 200
+  for path in ("/server.py", "/../server.py", "/%2e%2e/server.py", "/socketx"):
+    assert get(server, path)[0] == 404
+
+
+def test_strangers_are_refused(serve):
+  server = serve()
+  assert get(server, host="evil.example")[0] == 403  # a name that was made to lead here
+  assert get(server, host=f"localhost:{server.port}")[0] == 200
+  for origin in ("http://evil.example", f"http://127.0.0.1:{server.port + 1}", "null"):
+    with pytest.raises(InvalidStatus) as refused:
+      socket(server, origin=origin)
+    assert refused.value.response.status_code == 403
+
+
+def test_what_others_can_reach_wants_a_token(serve):
+  server = serve(host="0.0.0.0")
+  assert len(server.token) > 20 and server.url.endswith(f"?token={server.token}")
+  assert get(server)[0] == 403 and get(server, "/?token=wrong")[0] == 403
+  assert get(server, f"/?token={server.token}")[0] == 200
+  for query in ("", "?token=wrong"):
+    with pytest.raises(InvalidStatus):
+      socket(server, query)
+
+
+def test_a_session_over_the_socket(serve, tmp_path):
+  """Bad words are named and change nothing; the exercise is moved, paused, stopped, kept."""
+  server = serve(most=1)
+  with socket(server) as page:
+    menu, _ = hear(page, "menu")
+    assert menu["tasks"]["touch/easy"] and 1000 in menu["nodes"]
+    with socket(server) as other:
+      assert "all places are taken" in json.loads(other.recv(timeout=ANSWER))["text"]
+    for words, said in (
+      ("{", "Expecting"),
+      ("[1]", "message is '[1]'"),
+      ('{"type": "shell"}', "expected hand, start"),
+      ('{"type": "start", "task": "touch/none"}', "task is 'touch/none', expected one of"),
+      ('{"type": "start", "task": "touch/easy", "nodes": 7}', "nodes is '7', expected one of"),
+      ('{"type": "start", "task": "touch/easy", "seed": -1}', "seed is -1"),
+      ('{"type": "start", "task": "touch/easy", "scale": 1e9}', "scale is 1000000000.0"),
+      ('{"type": "start", "task": "touch/easy", "person": "\\u0000"}', "person is"),
+    ):
+      page.send(words)
+      assert said in json.loads(page.recv(timeout=ANSWER))["text"]
+    tell(page, type="start", task="touch/easy", seed=3, nodes=250, person="Ada")
+    scene, _ = hear(page, "scene")
+    assert scene["force_limit"] == 0.5 and len(scene["geoms"]) > 3
+    size = len(scene["head"]) + 3 * scene["nodes"] + 12 * len(scene["geoms"]) + 8 * scene["targets"]
+    head = {name: i for i, name in enumerate(scene["head"])}
+    first, _ = hear(page, "frame")
+    assert first.shape == (size,)
+    nodes = first[len(head) : len(head) + 3 * scene["nodes"]].reshape(-1, 3)
+    assert np.ptp(nodes, axis=0).max() == pytest.approx(0.2, abs=0.05)  # a liver
+    tell(page, type="hand", move=[0.01, 0, 0, 0], rate=[0, 0, 0, 0], buttons=[])
+    right = np.array(scene["camera"]["mat"]).reshape(3, 3)[:, 0]
+    place = [head[f"tip_{axis}"] for axis in "xyz"]
+    for _ in range(300):
+      now, _ = hear(page, "frame")
+      if np.dot(now[place] - first[place], right) > 0.008:
+        break
+    assert np.dot(now[place] - first[place], right) == pytest.approx(0.01, abs=0.0025)
+    tell(page, type="pause", on=True)
+    time.sleep(0.5)
+    tell(page, type="stop")
+    card, _ = hear(page, "card")
+    assert card["outcome"] == "stopped" and card["advice"][0].startswith("Stopped before the end")
+  made = Recording.load(card["path"])
+  assert pathlib.Path(card["path"]).parent == tmp_path / "out"
+  assert made.info["person"] == "Ada" and made.info["seed"] == 3
+  assert episode.differences(made, episode.replay(made)) == []
+
+
+def test_a_closed_tab_keeps_its_recording(serve, tmp_path):
+  server = serve()
+  with socket(server) as page:
+    hear(page, "menu")
+    tell(page, type="start", task="touch/easy", assessment=True)
+    hear(page, "frame")
+  for _ in range(600):
+    if kept := list((tmp_path / "out").glob("*.npz")):
+      break
+    time.sleep(0.1)
+  made = Recording.load(kept[0])
+  assert made.outcome == "stopped" and made.info["coach"] == {"assessment": True, "hints": []}
+
+
+def chromium():
+  """Returns a browser and its page; skips without."""
+  api = pytest.importorskip("playwright.sync_api")
+  path = shutil.which("chromium") or shutil.which("google-chrome")
+  if path is None:
+    pytest.skip("no chromium")
+  return api, path
+
+
+def wait(page, steps):
+  """Waits until the page shows an exercise after some steps; the page lets nobody evaluate text."""
+  for _ in range(int(10 * ANSWER)):
+    if page.evaluate("window.palpate().head.steps ?? 0") >= steps:
+      return
+    page.wait_for_timeout(100)
+  raise AssertionError(f"{page.inner_text('#fault')!r}: no picture")
+
+
+def look(page, height, above):
+  """Returns the page's numbers, the way in the picture [m] to a place above the target, and the
+  size of a pixel [m]."""
+  state = page.evaluate(LOOK)
+  head, camera = state["head"], state["camera"]
+  tip, axes = [head[f"tip_{axis}"] for axis in "xyz"], np.array(camera["mat"]).reshape(3, 3)
+  depth = (np.array(camera["pos"]) - tip) @ axes[:, 2]
+  pixel = 2 * depth * np.tan(np.radians(camera["fovy"] / 2)) / height
+  return state, axes.T @ (np.array(state["targets"][0][:3]) + np.array([0, 0, above]) - tip), pixel
+
+
+@pytest.mark.slow
+def test_an_exercise_is_done_through_the_page(serve, tmp_path):
+  """A script at a headless browser touches the point with mouse and wheel, and sees its score."""
+  api, path = chromium()
+  server = serve()
+  flags = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+  with api.sync_playwright() as play:
+    browser = play.chromium.launch(executable_path=path, args=flags)
+    page = browser.new_page(viewport={"width": 900, "height": 600})
+    wrong = []
+    page.on("pageerror", lambda error: wrong.append(error))
+    page.goto(server.url)
+    page.wait_for_selector("#start:enabled", timeout=1e3 * ANSWER)
+    page.select_option("#task", "touch/easy")
+    page.select_option("#speed", "0.1")
+    page.click("#start")
+    page.wait_for_selector("#stop:enabled", timeout=1e3 * ANSWER)
+    wait(page, 1)
+    assert page.inner_text("#instruction") == "Touch the yellow point gently, 1 of 1"
+    box = page.locator("#view").bounding_box()
+    middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    above = 0.01  # of the point, where the tip is taken [m]
+    for _ in range(400):
+      state, to, pixel = look(page, box["height"], above)
+      if state["ended"]:
+        break
+      force = state["head"]["force"]
+      if force > 0.3 or "Let go" in state["text"]:
+        above += 0.002
+      elif force < 0.05 and np.linalg.norm(to) < 0.0015:
+        above -= 0.001 if above > 0.003 else 0.0003
+      if np.linalg.norm(to[:2]) > 0.0005:
+        x, y = np.clip(0.6 * to[:2] / pixel, -40, 40)
+        page.mouse.move(*middle)
+        page.mouse.down()
+        page.mouse.move(middle[0] + x, middle[1] - y)
+        page.mouse.up()
+      page.mouse.wheel(0, float(np.clip(0.6 * to[2], -0.002, 0.002) / 2e-5))
+      for _ in range(100):  # until it is seen
+        page.wait_for_timeout(30)
+        if page.evaluate("window.palpate().head.time") > state["head"]["time"] + 0.03:
+          break
+    page.wait_for_selector("#card[open]", timeout=1e3 * ANSWER)
+    page.screenshot(path=str(tmp_path / "card.png"))
+    text = page.inner_text("#card")
+    browser.close()
+  assert wrong == [] and "Success, after" in text and "Path length" in text
+  made = Recording.load(next((tmp_path / "out").glob("*.npz")))
+  assert made.outcome == "success"
+
+
+def test_the_page_draws_an_organ(serve, tmp_path):
+  """Short form of the above: the picture has the organ's red, the liver stays where it is."""
+  api, path = chromium()
+  imageio = pytest.importorskip("imageio.v3")
+  server = serve()
+  flags = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+  with api.sync_playwright() as play:
+    browser = play.chromium.launch(executable_path=path, args=flags)
+    page = browser.new_page(viewport={"width": 700, "height": 500})
+    wrong = []
+    page.on("pageerror", lambda error: wrong.append(error))
+    page.goto(f"{server.url}#task=touch/easy")
+    page.wait_for_selector("#start:enabled", timeout=1e3 * ANSWER)
+    assert page.input_value("#task") == "touch/easy"
+    page.click("#start")
+    wait(page, 100)
+    shot = imageio.imread(page.locator("#view").screenshot(), extension=".png")[..., :3]
+    page.click("#stop")
+    page.wait_for_selector("#card[open]", timeout=1e3 * ANSWER)
+    assert "Stopped before the end" in page.inner_text("#card")
+    browser.close()
+  assert wrong == []
+  red = (shot[..., 0] > 70) & (shot[..., 0] > 1.5 * shot[..., 1].astype(int))
+  assert red.mean() > 0.1
+
+
+@pytest.mark.parametrize(
+  ("words", "said"),
+  [
+    (["serve", "--port", "70000"], "port is 70000"),
+    (["serve", "--device", "glove"], "device is 'glove'"),
+    (["serve", "--pages", "0"], "pages is 0"),
+    (["exercise", "touch/easy", "--device", "glove"], "device is 'glove'"),
+    (["exercise", "touch/none", "--device", "mouse"], "task is 'touch/none'"),
+    (["exercise", "--replay", "x", "--device", "mouse"], "device is given without a TASK"),
+  ],
+)
+def test_wrong_options_are_one_line(words, said, capsys):
+  assert cli.main(words) == 2
+  error = capsys.readouterr().err
+  assert said in error and error.count("\n") == 1
+
+
+def test_an_exercise_by_a_device_from_the_command_line(tmp_path, capsys, monkeypatch):
+  monkeypatch.chdir(tmp_path)
+  words = ["exercise", "touch/easy", "--device", "hand", "--no-report", "--set", "time_limit=1"]
+  assert cli.main([*words, "-o", "a"]) == 0
+  assert "on time, 99 % within" in capsys.readouterr().out
+  assert cli.main(["exercise", "--replay", "a/recording.npz", "--no-report", "-o", "b"]) == 0
+  assert "the same to the bit" in capsys.readouterr().out

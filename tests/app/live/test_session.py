@@ -1,0 +1,112 @@
+"""An exercise by a simulated hand: done, recorded, replayed to the bit, paused, stopped."""
+
+import math
+
+import numpy as np
+import palpate
+import pytest
+from palpate.app import live
+from palpate.tasks import episode, suite
+from palpate.tasks.recording import Recording
+
+KWARGS = {"input": "handle", "time_limit": 10}
+
+
+def load(name="touch/easy", **kwargs):
+  palpate.register()
+  return suite.load(*suite.split(name), task_kwargs={"random": 0, **KWARGS, **kwargs})
+
+
+def session(env, hand, **kwargs):
+  pace = live.Pace.instant(env.physics.timestep())
+  return live.Session(env, hand, 0, {"task_kwargs": KWARGS}, pace=pace, **kwargs)
+
+
+class Toucher(live.Hand):
+  """A person who brings the tip above the target, and presses until it is felt."""
+
+  def __init__(self, env, **kwargs):
+    self.env, self.shift, self._last, self._above = env, np.zeros(3), 0.0, False
+    super().__init__(lambda t: tuple(self.shift), stiffness=400.0, damping=10.0, **kwargs)
+
+  def read(self, now):
+    physics, task = self.env.physics, self.env.task
+    if now - self._last >= 0.02:
+      self._last = now
+      normal = physics.normal(task.goal())
+      to = physics.point(task.goal()) + 0.006 * normal - physics.tip_pos()
+      self._above = self._above or np.linalg.norm(to) < 0.001
+      if self._above:
+        to = -3e-4 * normal * (np.linalg.norm(physics.contact_force()) < 0.12)
+      step = physics.camera()[1].T @ to
+      self.shift = self.shift + step * min(1.0, 8e-4 / max(np.linalg.norm(step), 1e-9))
+    return super().read(now)
+
+
+def test_an_exercise_is_done_by_hand_recorded_and_replayed(tmp_path):
+  env = load()
+  made = session(env, Toucher(env)).run()
+  assert made.outcome == "success" and made.info["performer"] == "device:hand"
+  assert made.info["live"]["steps"] == 20 * (len(made.time) - 1)
+  assert made.info["live"]["faults"] == []
+  old = Recording.load(made.save(tmp_path / "a.npz"))
+  assert episode.differences(old, episode.replay(old)) == []
+  assert math.isfinite(old.metrics().path_length)
+
+
+def test_stopping_keeps_the_recording_and_lets_go():
+  env = load()
+  hand = live.Hand(lambda t: (0.0, 0.0, -0.01 * t))
+  live_session = session(env, hand)
+  live_session.coach = Stopper(live_session, 30)
+  made = live_session.run()
+  assert made.outcome == "stopped" and len(made.time) == 31
+  assert hand.force == (0.0, 0.0, 0.0)
+
+
+class Stopper:
+  """Stops after some control steps."""
+
+  def __init__(self, live_session, count):
+    self.session, self.count = live_session, count
+
+  def begin(self, env):
+    pass
+
+  def look(self, env):
+    self.count -= 1
+    self.session.pace.stopped = self.count <= 0
+
+  def log(self):
+    return {}
+
+
+def test_a_pause_takes_no_time_of_the_exercise():
+  """The hand presses its button twice: in between the clock of the exercise stands."""
+  env = load(time_limit=1)
+  held = lambda t: frozenset({"pause"} if 0.3 < t < 0.4 or 2.3 < t < 2.4 else ())  # noqa: E731
+  hand = live.Hand(lambda t: (0.0, 0.0, 0.0), buttons=held)
+  made = session(env, hand).run()
+  assert made.time[-1] == pytest.approx(1.0) and made.outcome == "time limit"
+
+
+def test_a_device_that_stumbles_is_in_the_recording():
+  env = load(time_limit=1)
+  hand = live.Hand(lambda t: (0.0, 0.0, 0.0) if t < 0.5 else (math.nan, 0.0, 0.0), damping=20.0)
+  live_session = session(env, hand)
+  live_session.coach = Stopper(live_session, 30)
+  made = live_session.run()
+  assert any("expected finite numbers" in fault for fault in made.info["live"]["faults"])
+
+
+def test_pictures_are_of_thirty_moments_a_second():
+  env = load(time_limit=1)
+  times = []
+  session(env, live.Hand(), publish=lambda s: times.append(s.env.physics.time())).run()
+  assert 28 <= len(times) <= 32
+
+
+def test_drives_are_refused():
+  env = suite.load("touch", "easy", task_kwargs={"random": 0})
+  with pytest.raises(ValueError, match="input is 'drives', expected 'handle'"):
+    live.Session(env, live.Hand())

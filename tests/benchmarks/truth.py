@@ -1,0 +1,235 @@
+"""Forces of tissue against closed forms, another library's finite elements, and measurements.
+
+Ours over the reference, case by case, with the error in percent. A sphere presses a solid block
+without friction, as `palpate fit` simulates it; its references are Hertz's half space with the
+correction for a layer that is bonded at its bottom (Dimitriadis et al. 2002,
+doi:10.1016/S0006-3495(02)75620-8, eq. 14) and fine quadratic finite elements of scikit-fem of small
+strains. `edges` is the number of triangles' edges in the contact's radius. Closed forms of a bar, a
+beam and Lame's hollow sphere follow. Then organs under the shipped 5 mm probe: the reference is a
+solid of the measured modulus with edges of 1.5 mm under the probe, by the rows above some 10 % too
+stiff itself; beside it solids of even triangles, and the shipped skins, whose foundation stands for
+their inside.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import math
+import pathlib
+
+import numpy as np
+from benchmarks import plots, results
+from benchmarks.results import BenchError
+from benchmarks.runner import Bench, Case, Row
+from palpate import models, register
+from palpate.models import catalog
+from reference import closed
+
+YOUNG, POISSON = 5000.0, 0.45
+SIZE, RADIUS = (0.08, 0.08, 0.04), 0.01  # of the block and the sphere [m]
+DEPTHS = (5e-4, 1e-3, 2e-3)  # [m]; a twentieth to a fifth of the radius
+EDGES = (1.0, 2.0, 3.0, 4.0)  # in the contact's radius at the middle depth
+PROBE = 0.0025  # [m], the shipped probe's radius
+FINE = 0.0015  # edges of the organs that are the reference [m]
+NODES = 1000  # of the others
+ORGAN_DEPTHS = (2e-3, 4e-3)  # [m]
+ALLOWED = {"hertz": 3.0, "elements": 3.0, "bar": 3.0, "cantilever": 5.0, "lame": 5.0, "organ": 10.0}
+_COLUMNS = ("kind", "what", "edges", "nodes", "depth_mm", "reference", "ours", "unit", "error")
+
+# What was published and what stands in the way of a row above: (source, what it has, why not).
+PUBLISHED = (
+  ("Truth Cube, Kerdok et al. 2003, doi:10.1016/s1361-8415(03)00008-2; page "
+   "biorobotics.harvard.edu/truthcube, no licence seen",
+   "silicone cube of 80 mm: 798 N/m by indentation, 780 with beads",
+   "neither the indenter nor Young's modulus is on the page"),
+  ("PMC6925591, table 1",
+   "shear moduli: pig liver 1.8 (0.4) kPa, gallbladder 85 (8.2), stomach 0.64",
+   "the catalogue's constants are these; they are no forces"),
+  ("Kerdok et al. 2006, doi:10.1016/j.jbiomech.2005.07.005",
+   "perfused pig liver: creep under 6.9 to 34.7 kPa, strains up to 50 %, over 1.86 and 51.3 s",
+   "the abstract has no force at a depth; the figures could not be read here"),
+  ("Samur et al. 2007, doi:10.1016/j.media.2007.04.001", "pig liver in vivo, force at a depth",
+   "the figures could not be read here"),
+  ("Rosen et al. 2008, J Biomech Eng", "seven pig organs in a grasper, stress and strain",
+   "the fits could not be read here"),
+  ("Malik et al. 2022, doi:10.1371/journal.pone.0268608, CC BY", "pig organs in and ex vivo",
+   "the data files could not be had here"),
+  ("Zhang et al. 2024, doi:10.1371/journal.pone.0307778, CC BY", "pig kidney cortex in tension",
+   "the data files could not be had here"),
+)  # fmt: skip
+
+
+def begin(args: argparse.Namespace):
+  """Raises BenchError where the other library is missing."""
+  if importlib.util.find_spec("skfem") is None:
+    raise BenchError("scikit-fem is not installed: pip install 'palpate[bench]'", code=1)
+
+
+def stages(args: argparse.Namespace) -> list[list[Case]]:
+  """Returns the cases, the slow ones first."""
+  cases: list[Case] = []
+  if not args.short:
+    cases += [
+      {"case": f"organ {name}", "kind": "organ", "organ": name} for name in ("liver", "kidney")
+    ]
+  cases += [
+    {"case": f"press {edges:g}", "kind": "press", "edges": edges}
+    for edges in (EDGES[:1] if args.short else EDGES[::-1])
+  ]
+  nus = (0.45,) if args.short else (0.3, 0.45, 0.49)
+  cases += [{"case": f"bar {nu}", "kind": "bar", "nu": nu} for nu in nus]
+  spacings = (0.02,) if args.short else (0.02, 0.01, 0.00667)
+  cases += [
+    {"case": f"cantilever {nu} {spacing}", "kind": "cantilever", "nu": nu, "spacing": spacing}
+    for nu in nus
+    for spacing in spacings
+  ]
+  levels = (2,) if args.short else (3, 4)
+  cases += [
+    {"case": f"lame {nu} {level}", "kind": "lame", "nu": nu, "level": level}
+    for nu in nus
+    for level in levels
+  ]
+  return [cases]
+
+
+def run(case: Case, out: pathlib.Path) -> list[Row]:
+  """Returns the rows of a case."""
+  register()
+  if case["kind"] == "press":
+    return _press(case["edges"])
+  if case["kind"] == "organ":
+    return _organ(case["organ"])
+  if case["kind"] == "bar":
+    found = closed.bar(case["nu"])
+    what = f"bar in tension, nu {case['nu']}: strain", ""
+  elif case["kind"] == "cantilever":
+    found = closed.cantilever(case["nu"], case["spacing"])
+    across = round(closed.SIDE / case["spacing"])
+    what = f"cantilever of {across} elements across, nu {case['nu']}: sag", "m"
+  else:
+    found = closed.hollow_sphere(case["nu"], case["level"])
+    what = f"Lame's hollow sphere, level {case['level']}, nu {case['nu']}: growth", "m"
+  return [_row(case["kind"], what[0], *found, what[1])]
+
+
+def _row(kind: str, what: str, ours: float, reference: float, unit: str, **more) -> Row:
+  error = 100 * (ours / reference - 1)
+  blank = {"edges": "", "nodes": "", "depth_mm": ""}
+  row = {"kind": kind, "what": what, "reference": reference, "ours": ours, "unit": unit}
+  return blank | row | {"error": error} | more
+
+
+def held(test, depths) -> tuple[np.ndarray, int]:
+  """Returns the force of a test held at these depths [N], (ndepth,), and its nodes."""
+  from palpate.app.indentation import Indentation
+  from palpate.app.measured import Record
+
+  go, stay = 0.1, 0.15  # [s]
+  time, depth = [0.0], [0.0]
+  for each in depths:
+    time += [time[-1] + go, time[-1] + go + stay]
+    depth += [each, each]
+  times = np.array(time)
+  sim = Indentation(test, Record(times, np.array(depth), np.ones_like(times)))
+  return sim.force({"young": YOUNG, "poisson": POISSON, "damping": 0.005})[2::2], sim.nodes
+
+
+def _press(edges: float) -> list[Row]:
+  """Returns rows of the block, against the closed form and the finite elements."""
+  from palpate.app.indentation import Test
+  from reference import elements
+
+  edge = math.sqrt(RADIUS * DEPTHS[1]) / edges
+  ours, nodes = held(Test("sphere", RADIUS, SIZE, edge=edge, step=0.002), DEPTHS)
+  width = math.sqrt(SIZE[0] * SIZE[1] / math.pi)  # of a round block of the same area
+  exact = elements.layer(SIZE[2], width, RADIUS, DEPTHS, YOUNG, POISSON, 2.5e-4)
+  rows = []
+  for depth, force, fine in zip(DEPTHS, ours, exact, strict=True):
+    more = {"edges": math.sqrt(RADIUS * depth) / edge, "nodes": nodes, "depth_mm": 1e3 * depth}
+    theory = hertz(RADIUS, depth, SIZE[2])
+    rows.append(_row("hertz", "sphere on a block, Hertz", float(force), theory, "N", **more))
+    what = "sphere on a block, scikit-fem"
+    rows.append(_row("elements", what, float(force), float(fine), "N", **more))
+  return rows
+
+
+def hertz(radius: float, depth: float, height: float) -> float:
+  """Returns the force on a sphere in a layer that is bonded at its bottom [N]."""
+  a0 = -(1.2876 - 1.4678 * POISSON + 1.3442 * POISSON**2) / (1 - POISSON)
+  b0 = (0.6387 - 1.0277 * POISSON + 1.5164 * POISSON**2) / (1 - POISSON)
+  x, pi = math.sqrt(radius * depth) / height, math.pi
+  factor = 1 - 2 * a0 / pi * x + 4 * a0**2 / pi**2 * x**2
+  factor -= 8 / pi**3 * (a0**3 + 4 * pi**2 / 15 * b0) * x**3
+  factor += 16 * a0 / pi**4 * (a0**3 + 3 * pi**2 / 5 * b0) * x**4
+  return factor * 4 / 3 * YOUNG / (1 - POISSON**2) * math.sqrt(radius * depth**3)
+
+
+def _organ(name: str) -> list[Row]:
+  """Returns rows of an organ as it ships and filled, against a solid that is fine at the probe."""
+  from palpate.app.indentation import Test
+
+  place = catalog.entry(name).ports[0].landmark
+  fine, _ = _solid(Test("sphere", PROBE, organ=name, place=place, edge=FINE, step=5e-4), name)
+  rows = []
+  for interior, coupling in (("none", "nodal"), ("solid", "window")):
+    ours = _shipped(name, interior, coupling)
+    for depth, force, reference in zip(ORGAN_DEPTHS, ours, fine, strict=True):
+      what = f"{name}, {'skin on foundation' if interior == 'none' else 'solid, even triangles'}"
+      more = {"nodes": NODES, "depth_mm": 1e3 * depth}
+      rows.append(_row("organ", what, float(force), float(reference), "N", **more))
+  return rows
+
+
+def _solid(test, name: str) -> tuple[np.ndarray, int]:
+  """Returns the force on a probe that is held in a solid of the catalogue's constants [N]."""
+  from palpate.app.indentation import Indentation
+  from palpate.app.measured import Record
+
+  go, stay = 0.2, 0.2
+  times = np.array([0, go, go + stay, 2 * go + stay, 2 * (go + stay)])
+  one, two = ORGAN_DEPTHS
+  sim = Indentation(test, Record(times, np.array([0, one, one, two, two]), np.ones_like(times)))
+  tissue = catalog.TISSUES[name]
+  keys = {"young": tissue.young, "poisson": tissue.poisson, "damping": tissue.damping}
+  return sim.force(keys)[[2, 4]], sim.nodes
+
+
+def _shipped(name: str, interior: str, coupling: str) -> list[float]:
+  """Returns the force of the shipped probe at depths along the way of its keyframes [N]."""
+  from palpate.models import measure
+
+  spec = models.load(name, nodes=NODES, coupling=coupling, interior=interior)
+  model = spec.compile()
+  return [measure.press(model, name, depth).force for depth in ORGAN_DEPTHS]
+
+
+def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
+  """Writes the page."""
+  good = [r for r in rows if r["status"] == "ok"]
+  lines = [str(__doc__).partition("\n\n")[2], ""]
+  head = ["", "edges", "nodes", "depth [mm]", "reference", "ours", "error [%]", ""]
+  for kind, most in ALLOWED.items():
+    mine = [r for r in good if r["kind"] == kind]
+    mine.sort(key=lambda r: (r["what"], str(r["nodes"])))
+    if not mine:
+      continue
+    table = []
+    for r in mine:
+      verdict = "" if abs(r["error"]) <= most else f"outside of {most:g} %"
+      numbers = [f"{r[key]:.3g} {r['unit']}" for key in ("reference", "ours")]
+      edges = f"{r['edges']:.1f}" if r["edges"] != "" else ""
+      cells = [r["what"], edges, r["nodes"], r["depth_mm"], *numbers, f"{r['error']:+.1f}", verdict]
+      table.append(cells)
+    outside = sum(abs(r["error"]) > most for r in mine)
+    lines += [f"## {kind}: {outside} of {len(mine)} outside of {most:g} %", ""]
+    lines += [*plots.table(head, table), ""]
+  lines += ["## Measurements that are no rows above", ""]
+  lines += [*plots.table(["source", "what it has", "why"], PUBLISHED), ""]
+  lines += [results.link(out / "truth.csv")]
+  title = "Forces against theory, other finite elements, measurements"
+  return [results.page(out / "truth.md", title, about, lines)]
+
+
+BENCH = Bench("truth", stages, run, columns=_COLUMNS, report=report, begin=begin)
