@@ -171,16 +171,17 @@ class Organ:
 
   @property
   def pierced(self) -> tuple[str, ...]:
-    """Geoms that move, touch this organ, and are inside of it: they have gone through its surface.
+    """Geoms that move, touch this organ, and have gone through its surface: they are inside.
 
-    Of a long geom some point of the axis is inside, of others the centre. A warning names one that
-    comes through while the organ runs; an open surface has no inside.
+    Of a long geom some point of the axis is inside, of others the centre. Faster than 1 m/s a tool
+    may be in and out again between two looks: one that was stays named until the organ is reset. A
+    warning names what comes through while the organ runs; an open surface has no inside.
     """
     m = mjstruct.Model.from_address(self.model._address)
     d = mjstruct.Data.from_address(self.data._address)
-    tools = pierce.tools(m, self._organ)
-    found = pierce.inside(m, d, self._organ, tools, self._deformation)
-    return tuple(self.model.geom(geom).name or f"geom {geom}" for geom in found)
+    tools = pierce.Tools(m, d, self._organ, pierce.tools(m, self._organ))
+    found = {*tools.inside(self._deformation), *self._space.watch.crossed}
+    return tuple(self.model.geom(geom).name or f"geom {geom}" for geom in sorted(found))
 
   @property
   def force(self) -> np.ndarray:

@@ -47,7 +47,6 @@ class Quantity:
 def _stiffness(physics: Physics, place: stage.Stage, factor: np.ndarray) -> None:
   foundation = float(factor[0]) * place.config.foundation
   physics.organ.configure(young_scale=float(factor[0]), foundation=foundation)
-  physics.organ.set_state()  # windows get the inertia of this stiffness, not the last episode's
   stage.settle(physics.organ, physics.prefix)
 
 

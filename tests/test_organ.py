@@ -253,6 +253,38 @@ def test_a_tool_that_goes_through_the_surface_is_named_once(scenes, windowed):
   assert organ.pierced == ()
 
 
+@pytest.mark.parametrize("windowed", [False, True], ids=["nodal", "window"])
+def test_a_tool_that_flies_through_the_organ_is_named(scenes, windowed):
+  build = scenes.windowed if windowed else scenes.organ
+  made = build(*scenes.sphere(2), mass=0.5, radius=0.001, young=5e3, foundation=2e5)
+  tool = """<body name="ball" pos="0.0003 0.0002 0.5"><joint name="z" type="slide" axis="0 0 1"/>
+    <geom name="shot" size="0.002" mass="0.02"/></body>"""
+  model, data, organ = scenes.load(scenes.world(tool, made))
+  joint = model.joint("z")
+  with scenes.Warnings() as log:
+    mujoco.mj_step(model, data, nstep=33)
+    assert organ.pierced == ()
+    data.qvel[joint.dofadr[0]] = -10.0
+    mujoco.mj_step(model, data, nstep=100)
+    text = log()
+  assert data.qpos[joint.qposadr[0]] < -0.8  # on the other side
+  assert text.count("geom 'shot' has gone through its surface") == 1
+  assert organ.pierced == ("shot",)
+  organ.reset()
+  assert organ.pierced == ()
+
+
+def test_a_tool_that_is_put_on_the_other_side_has_not_gone_through(scenes):
+  made = scenes.windowed(*scenes.sphere(2), mass=0.5, radius=0.001, young=5e3, foundation=2e5)
+  tool = """<body name="ball" pos="0 0 0.1"><joint name="z" type="slide" axis="0 0 1"/>
+    <geom name="shot" size="0.002" mass="0.02"/></body>"""
+  model, data, organ = scenes.load(scenes.world(tool, made))
+  mujoco.mj_step(model, data, nstep=33)
+  data.qpos[model.joint("z").qposadr[0]] = -0.2
+  mujoco.mj_step(model, data, nstep=50)
+  assert organ.pierced == ()
+
+
 def test_an_unknown_name_lists_the_organs(scenes):
   model, data, _ = scenes.load(scenes.press())
   with pytest.raises(ValueError, match=r"no organ 'liver' in the model, it has 'organ'"):

@@ -28,7 +28,7 @@ def main(args: argparse.Namespace) -> int:
     raise CommandError(f"no device {args.device!r}, expected one of {', '.join(known)}")
   progress, rows, total = Progress(), [], 0.0
   for device in [args.device] if args.device else known:
-    for module in kernels.MODULES:
+    for module in kernels.MODULES["cpu" if device == "cpu" else "cuda"]:
       progress.show(f"{module.rpartition('.')[2]} on {device}", always=True)
       start = time.perf_counter()
       wp.load_module(module, device=device)

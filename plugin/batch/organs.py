@@ -92,8 +92,8 @@ class Organ(Tissue):
 
   def load(self):
     """Loads the kernels, compiling them where the cache has none."""
-    for module in (*step.modules(self.body), patch.MODULE):
-      wp.load_module(module, device=self.body.device)
+    for kernel in (*step.kernels(self.body), patch.enter):
+      kernel.load(self.body.device)
 
   def _over(self, kernel, count: int):
     launch(kernel, self.patch, self._batch.nworld, count, self.body.device)

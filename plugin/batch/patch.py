@@ -99,14 +99,12 @@ tell_tools, enter, rank, stand, push, take, follow, commit, find_bad, rest = cou
   *("tell_tools", "enter_worlds", "rank", "stand", "push_worlds", "take", "follow"),
   *("commit_worlds", "find_bad", "rest_organ"),
 )
-MODULE = enter.module.name
 
 
 def launch(kernel, patch, nworld: int, count: int, device):
   """Launches a kernel over `count` items of each world; one thread has a world on the CPU."""
   nthread = -(-count // 32) * 32 if device.is_cuda else 1
-  inputs = [nthread, 0, patch]
-  wp.launch(kernel, dim=(nworld, nthread), block_dim=_BLOCK, inputs=inputs, device=device)
+  kernel.launch(device, nworld, nthread, 0, patch, _BLOCK)
 
 
 def constants(body, organ, tools: np.ndarray, model: mujoco.MjModel, inertia, held) -> dict:

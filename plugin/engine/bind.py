@@ -17,6 +17,7 @@ from . import (
   mjstruct,
   nodal,
   nodes,
+  pierce,
   slots,
   weights,
   windowed,
@@ -38,12 +39,8 @@ def bind(w, model: int):
     near = wp.get_device(does.side)
     crossing = device != near
 
-    touched, part = _touched(w, model), functools.partial
+    before, part = _before(w, model), functools.partial
     _bind_more(w, model)
-
-    def before():
-      weights.launch(touched)
-      does.gather()
 
     def solve():
       if crossing:
@@ -126,6 +123,21 @@ def _watch(w, model: int):
   w.static = [(view, view.tobytes()) for view in declare.static_places(m, w.organ)]
 
 
+def _before(w, model: int):
+  """Returns what launches a step's work before the solve."""
+  touched = _touched(w, model)
+  m = mjstruct.Model.from_address(model)
+  tools = pierce.speeds(m, model, w.data, w.organ, np.asarray(w.flags))
+
+  def launch():
+    weights.launch(touched)
+    if tools.ntool:
+      pierce.find_fast.launch("cpu", 1, 1, 0, tools)
+    w.phases.gather()
+
+  return launch
+
+
 def _touched(w, model: int) -> weights.Weights:
   """Returns what contacts with the organs of the model get weights by.
 
@@ -153,7 +165,8 @@ def _cross(w, fields: tuple[str, ...], to_device: bool):
 
 def load(body: Body):
   """Loads the modules of a step on a body's device, compiling them where the cache has none."""
-  for module in (*step.modules(body), nodes.MODULE):
-    wp.load_module(module, device=body.device)
-  for module in (*step.modules(body), nodes.MODULE, nodal.MODULE, slots.MODULE, weights.MODULE):
-    wp.load_module(module, device="cpu")
+  there = [*step.kernels(body), nodes.commit]
+  for kernel in there:
+    kernel.load(body.device)
+  for kernel in (*there, nodal.gather, slots.gather, weights.weigh, pierce.find_fast):
+    kernel.load(wp.get_device("cpu"))

@@ -17,11 +17,13 @@ import numpy as np
 import warp as wp
 from palpate.tissue import types
 from palpate.tissue.body import Body
-from palpate.tissue.kernels import kernel
+from palpate.tissue.kernels import Kernel, kernel
 from palpate.tissue.types import DIMS, doubles, floats, ints, scalar, struct, vector
 
 from . import layout, mjstruct
 from .layout import NodalState, WindowState
+
+_HUGE = 1e6  # more than any displacement, velocity or force of an organ [m, m/s, N]
 
 
 class Phases:
@@ -136,7 +138,7 @@ CONSTANTS = {
 }  # fmt: skip
 
 
-def kernels(header: str, kind, *names: str) -> list[wp.Kernel]:
+def kernels(header: str, kind, *names: str) -> list[Kernel]:
   """Returns the kernels of a header that take a struct."""
   return [kernel(name, header, kind, CONSTANTS) for name in names]
 
@@ -199,6 +201,26 @@ def sizes(organ) -> dict[str, int]:
 def spans(organ) -> dict[str, slice]:
   """Returns where the blocks of an organ's plugin state lie."""
   return layout.spans(WindowState if organ.windows else NodalState, sizes(organ))
+
+
+def check_state(organ, state: np.ndarray):
+  """Makes sure that a plugin state that was set from outside is one of this organ.
+
+  Raises:
+    ValueError: it is not, or its numbers cannot be.
+  """
+  where = spans(organ)
+  if state[where["signature"]].any():
+    raise ValueError(
+      "plugin_state is not one of this organ, but saved from another model or damaged; reset the "
+      "data, or set a state that was saved from it"
+    )
+  # Forces come last of what is bounded.
+  last = "force" if organ.windows else "before"
+  if not (np.abs(state[: where[last].stop]) < _HUGE).all():
+    raise ValueError(
+      f"plugin_state has a number that is not finite or over {_HUGE:g}, expected what was saved"
+    )
 
 
 def plugin_state(model: int, data: int, instance: int, size: int) -> wp.array:

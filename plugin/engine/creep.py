@@ -68,7 +68,7 @@ class Creep:
   def load(self):
     """Loads the kernels, if there is something to do for them."""
     if self:
-      wp.load_module(_enter.module.name, device="cpu")
+      _enter.load(wp.get_device("cpu"))
 
   def bind(self, model: int):
     """Points the kernels at the arrays of a model and of the workspace's mjData."""
@@ -99,9 +99,9 @@ class Creep:
   def enter(self):
     """Adds to the solver's input, after a coupling has filled it."""
     if self:
-      wp.launch(_enter, dim=(1, 1), inputs=[1, 0, self._creeping], device="cpu")
+      _enter.launch("cpu", 1, 1, 0, self._creeping)
 
   def end(self):
     """Takes what the step has made of the forces."""
     if self:
-      wp.launch(_end, dim=(1, 1), inputs=[1, 0, self._creeping], device="cpu")
+      _end.launch("cpu", 1, 1, 0, self._creeping)

@@ -58,6 +58,18 @@ FLAG = Numbers(
   ("answered", 1, "-", "the organ responded to that"),
   ("foreseen", 1, "-", "what acts on the organ is what was guessed"),
   ("weighed", 1, "-", "rows of contacts changed that MuJoCo has made use of"),
+  ("stage", 1, "-", "how far the step is, see STAGE"),
+  ("fast", 1, "-", "a tool may go through the organ and out again between two looks"),
+)
+
+# What of a step is done that must not be done twice. These are values, not offsets.
+STAGE = Numbers(
+  "STAGE",
+  ("begun", 1, "-", "nothing"),
+  ("gathered", 1, "-", "contacts got their weights, and what acts was read"),
+  ("pushed", 1, "-", "the passive force was added"),
+  ("left", 1, "-", "contact forces and motion were taken from MuJoCo"),
+  ("ended", 1, "-", "the plugin state was stepped"),
 )
 
 # How the last step ends on the nodes' side. These are values, not offsets.
@@ -149,7 +161,7 @@ TAIL = Numbers(
   ("leeway", 1, "m", "how far a tool may go from where it was when the organ fell asleep"),
 )
 
-TABLES = (FLAG, MODE, HEAD, MOVED, PUSHED, GEOM, SUMMARY, ANSWER, RECORD, POSE, TAIL)
+TABLES = (FLAG, STAGE, MODE, HEAD, MOVED, PUSHED, GEOM, SUMMARY, ANSWER, RECORD, POSE, TAIL)
 CONSTANTS = {
   "MAX_WINDOWS": MAX_WINDOWS,
   "MAX_GEOMS": MAX_GEOMS,

@@ -33,10 +33,9 @@ class Nodal:
   solve: Crossing
 
 
-_gather, _scatter, _push, _remember = coupling.kernels(
+gather, scatter, push, remember = coupling.kernels(
   "nodal.h", Nodal, "gather_nodes", "scatter_nodes", "push_nodes", "remember_nodes"
 )
-MODULE = _gather.module.name
 
 
 def state_size(nfree: int, ncreep: int = 0) -> int:
@@ -77,23 +76,23 @@ class Phases(coupling.Phases):
     self._nodal = fill(Nodal, "cpu", values)
 
   def _launch(self, kernel):
-    wp.launch(kernel, dim=(1, 1), inputs=[1, 0, self._nodal], device="cpu")
+    kernel.launch("cpu", 1, 1, 0, self._nodal)
 
   def gather(self):
     """Reads MuJoCo's arrays into the solver's state."""
-    self._launch(_gather)
+    self._launch(gather)
 
   def scatter(self):
     """Adds the passive force."""
-    self._launch(_scatter)
+    self._launch(scatter)
 
   def leave(self):
     """Fills the right-hand side with the impulses by which the contact forces changed."""
-    self._launch(_push)
+    self._launch(push)
 
   def advance(self):
     """Steps the plugin state, and ends the step with the response where there was one."""
-    self._launch(_remember)
+    self._launch(remember)
 
 
 def _in_node_order(values: np.ndarray, vert: np.ndarray) -> np.ndarray:

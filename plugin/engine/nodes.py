@@ -39,7 +39,6 @@ commit, move_slots, enter, push_slots, push_impulses, search, report = coupling.
   Nodes,
   *("commit", "move_slots", "enter", "push_slots", "push_impulses", "search", "report"),
 )
-MODULE = commit.module.name
 
 
 def make(w, side, motion, boxes: tuple[wp.array, wp.array], sizes: dict[str, int]):
@@ -80,5 +79,4 @@ def make(w, side, motion, boxes: tuple[wp.array, wp.array], sizes: dict[str, int
 def launch(kernel, nodes, count: int, device):
   """Launches a kernel over `count` items: one thread each on CUDA, one for all on the CPU."""
   nthread = -(-count // _BLOCK) * _BLOCK if wp.get_device(device).is_cuda else 1
-  inputs = [nthread, 0, nodes]
-  wp.launch(kernel, dim=(1, nthread), block_dim=_BLOCK, inputs=inputs, device=device)
+  kernel.launch(device, 1, nthread, 0, nodes, _BLOCK)

@@ -16,7 +16,7 @@ import numpy as np
 from palpate.tissue.config import KEYS
 
 from . import change, fasten, guard, mjstruct, rests, weights, windowed, workspace
-from .layout import FLAG
+from .layout import FLAG, STAGE
 from .mjstruct import NAME, warn
 from .workspace import Workspace
 
@@ -154,35 +154,53 @@ def _reset(model: int, state: int, unused: int | None, instance: int):
 @guard.watch
 def _compute(model: int, data: int, instance: int, capability: int):
   w = _workspaces[data, instance]
-  try:
-    guard.enter()
-    if not w.identity.is_of(model):
-      workspace.attach(w, model)
-    if _count_bad(w) > w.nbad:
-      _find_bad_state(w)
-    w.run()
-    if w.status[3]:
-      _note(w, f"the {w.config.integrator} step has no finite solution: the motion diverged")
-  except BaseException as error:
-    _fail(w, error)
+  w.flags[FLAG.stage] = STAGE.begun
+  again = True
+  while again:
+    try:
+      _push(w, model)
+      again = False
+    except BaseException as error:
+      again = _fail(w, error)
   return guard.leave()
+
+
+def _push(w: Workspace, model: int):
+  """Adds the passive force."""
+  guard.enter()
+  if not w.identity.is_of(model):
+    workspace.attach(w, model)
+  if _count_bad(w) > w.nbad:
+    _find_bad_state(w)
+  w.run()
+  if w.status[3]:
+    _note(w, f"the {w.config.integrator} step has no finite solution: the motion diverged")
 
 
 @guard.watch
 def _advance(model: int, data: int, instance: int):
   w = _workspaces[data, instance]
-  try:
-    w.step()
-    nodes, triangles = w.flags[FLAG.missed_nodes], w.flags[FLAG.missed_elements]
-    if nodes > w.missed[0] or triangles > w.missed[1]:
-      _miss(w, int(nodes), int(triangles))
-    if w.model_step[0] != w.time_step:
-      workspace.refresh(w)
-    if w.watch.due() and not (w.asleep or w.resident):
-      _watch(w)
-  except BaseException as error:
-    _fail(w, error)
+  w.flags[FLAG.stage] = STAGE.pushed
+  again = True
+  while again:
+    try:
+      _end(w)
+      again = False
+    except BaseException as error:
+      again = _fail(w, error)
   return guard.leave()
+
+
+def _end(w: Workspace):
+  """Ends the step, and looks at what came of it."""
+  w.step()
+  nodes, triangles = w.flags[FLAG.missed_nodes], w.flags[FLAG.missed_elements]
+  if nodes > w.missed[0] or triangles > w.missed[1]:
+    _miss(w, int(nodes), int(triangles))
+  if w.model_step[0] != w.time_step:
+    workspace.refresh(w)
+  if w.watch.due(w.flags[FLAG.fast]) and not (w.asleep or w.resident):
+    _watch(w)
 
 
 @guard.watch
@@ -222,13 +240,18 @@ def _say(error: BaseException):
   warn(str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}")
 
 
-def _fail(w: Workspace, error: BaseException):
-  """Makes an error of an exception in a callback."""
-  if guard.is_foreign(error):
-    guard.raise_later(error)
-    w.torn = True
-  else:
+def _fail(w: Workspace, error: BaseException) -> bool:
+  """Makes an error of an exception in a callback; returns whether the callback is to go on.
+
+  It is where a signal's handler ended it, but not where the motion is on a device: that may be a
+  step ahead.
+  """
+  if not guard.is_foreign(error):
     _note(w, f"{type(error).__name__}: {error}")
+    return False
+  guard.raise_later(error)
+  w.torn = w.resident is not None
+  return not w.torn
 
 
 def _note(w: Workspace, text: str):
@@ -240,8 +263,8 @@ def _note(w: Workspace, text: str):
 
 def _watch(w: Workspace):
   """Warns of tools that have come through the surface."""
-  m = mjstruct.Model.from_address(w.model)
   for geom in w.watch.look(w):
+    m = mjstruct.Model.from_address(w.model)
     name = mjstruct.name_of(m, m.name_geomadr, geom) or geom
     warn(
       f"organ {w.organ.name!r}: geom {name!r} has gone through its surface, where contacts do not "

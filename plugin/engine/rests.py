@@ -106,7 +106,7 @@ class Rests:
   def load(self):
     """Loads the kernels, if there is something to do for them."""
     if self.any:
-      wp.load_module(_press.module.name, device="cpu")
+      _press.load(wp.get_device("cpu"))
 
   def bind(self, model: int):
     """Points the kernels at the arrays of a model and of the workspace's mjData."""
@@ -243,7 +243,7 @@ def check(m, w):
 
 
 def _launch(kernel, rest, arg: int = 0):
-  wp.launch(kernel, dim=(1, 1), inputs=[1, arg, rest], device="cpu")
+  kernel.launch("cpu", 1, 1, arg, rest)
 
 
 def _mu(m, flex: int) -> float:

@@ -85,7 +85,6 @@ place, gather, scatter, leave, choose, foresee = coupling.kernels(
   Slots,
   *("place", "gather_slots", "scatter_slots", "leave_slots", "choose", "foresee"),
 )
-MODULE = gather.module.name
 
 
 def scratch(nvert: int, nslot: int) -> dict[str, wp.array]:
@@ -177,4 +176,4 @@ def _edges(mesh) -> tuple[np.ndarray, np.ndarray]:
 
 def launch(kernel, slots):
   """Launches a kernel over all slots."""
-  wp.launch(kernel, dim=(1, 1), inputs=[1, 0, slots], device="cpu")
+  kernel.launch("cpu", 1, 1, 0, slots)

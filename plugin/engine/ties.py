@@ -147,7 +147,7 @@ class Ties:
   def load(self):
     """Loads the kernels, if there is something to do for them."""
     if self:
-      wp.load_module(_enter.module.name, device="cpu")
+      _enter.load(wp.get_device("cpu"))
 
   def bind(self, model: int):
     """Points the kernels at the arrays of a model and of the workspace's mjData."""
@@ -188,12 +188,12 @@ class Ties:
   def enter(self):
     """Adds to the solver's input, after a coupling has filled it."""
     if self:
-      wp.launch(_enter, dim=(1, 1), inputs=[1, 0, self._tied], device="cpu")
+      _enter.launch("cpu", 1, 1, 0, self._tied)
 
   def act(self):
     """Lets the bodies feel what the ties have pulled."""
     if self:
-      wp.launch(_act, dim=(1, 1), inputs=[1, 0, self._tied], device="cpu")
+      _act.launch("cpu", 1, 1, 0, self._tied)
 
   def aim(self):
     """Finds where the points on other organs are."""

@@ -62,7 +62,7 @@ def _offsets(prefix: str, kind, names) -> dict[str, int]:
   return {f"{prefix}_{name.upper()}": getattr(kind, name).offset for name in names}
 
 
-_weigh = kernel(
+weigh = kernel(
   "weigh",
   "weights.h",
   Weights,
@@ -80,7 +80,6 @@ _weigh = kernel(
     "ENABLE_DIAGEXACT": int(mujoco.mjtEnableBit.mjENBL_DIAGEXACT),
   },
 )
-MODULE = _weigh.module.name
 
 
 @functools.cache
@@ -128,7 +127,7 @@ def make(model: int, data: int, flexes, flags: np.ndarray | None = None) -> Weig
 
 def launch(weights):
   """Gives the contacts their weights, where MuJoCo's are wrong, and keeps sliding ones closed."""
-  wp.launch(_weigh, dim=(1, 1), inputs=[1, 0, weights], device="cpu")
+  weigh.launch("cpu", 1, 1, 0, weights)
 
 
 def project(model: int, data: int):

@@ -31,7 +31,7 @@ from .coupling import Phases
 from .creep import Creep
 from .declare import Declaration
 from .hold import Hold
-from .layout import FLAG, HEAD
+from .layout import FLAG, HEAD, STAGE
 from .pierce import Watch
 from .resident import Resident
 from .rests import Rests
@@ -40,7 +40,6 @@ from .turns import Turn
 
 _ALLOWED = int(mujoco.mjtSleepPolicy.mjSLEEP_AUTO_ALLOWED)
 _RK4 = int(mujoco.mjtIntegrator.mjINT_RK4)
-_HUGE = 1e6  # more than any displacement, velocity or force of an organ [m, m/s, N]
 _ASTRAY = 1e-9  # distance of a slot from its node that rounding does not explain [m]
 
 
@@ -160,11 +159,15 @@ class Workspace:
     self.creep, self.rests = Creep(self), Rests(self)
 
   def run(self):
-    """Computes the step's forces and adds them to qfrc_passive."""
+    """Computes the step's forces and adds them to qfrc_passive.
+
+    As `step` it may be called again where a signal's handler ended it: `FLAG.stage` says how far it
+    came. Not where the motion is on a device, which may be a step ahead.
+    """
     self._check_model()
     self.strange = self.signature[0] != self.organ.signature
     if self.strange:
-      self._check_state()
+      coupling.check_state(self.organ, self.plugin_state)
       self.strange = False
     if self.turn is None:
       self._run()
@@ -173,12 +176,16 @@ class Workspace:
         self._run()
 
   def _run(self):
+    if self.flags[FLAG.stage] == STAGE.pushed:
+      self.computed = True
+      return
     if self.turn is not None:
       # The model's windows may not be those of this state, which was set from outside or shares the
       # model with another: contacts must be found again with the windows in place.
       if self._is_astray() or not self.turn.mine:
         self._find_contacts_again()
-    wp.capture_launch(self.before)
+    if self.flags[FLAG.stage] < STAGE.gathered:
+      wp.capture_launch(self.before)
     if self.turn is not None:
       if self.flags[FLAG.stale]:
         self._find_contacts_again()
@@ -212,25 +219,6 @@ class Workspace:
     for place, was in self.static:
       if place.tobytes() != was:
         declare.check_frame(mjstruct.Model.from_address(self.model), self.organ)
-
-  def _check_state(self):
-    """Makes sure that a plugin state that was set from outside is one of this organ.
-
-    Raises:
-      ValueError: it is not, or its numbers cannot be.
-    """
-    if self.signature[0] != 0.0:
-      raise ValueError(
-        "plugin_state is not one of this organ, but saved from another model or damaged; reset the "
-        "data, or set a state that was saved from it"
-      )
-    # Forces come last of what is bounded.
-    where = coupling.spans(self.organ)
-    last = "force" if self.organ.windows else "before"
-    if not (np.abs(self.plugin_state[: where[last].stop]) < _HUGE).all():
-      raise ValueError(
-        f"plugin_state has a number that is not finite or over {_HUGE:g}, expected what was saved"
-      )
 
   def _is_astray(self) -> bool:
     """Returns whether qpos was set without the plugin state: slots are not on their nodes."""
@@ -273,8 +261,9 @@ class Workspace:
         self.stood = self.qpos.tobytes()
 
   def _step(self):
-    computed, self.computed = self.computed, False
+    computed = self.computed
     if self.asleep:
+      self.computed = False
       if self.nefc[0]:  # contacts of a window that was left behind wake the organ
         wp.capture_launch(self.leave)
       if self.counts[0]:
@@ -283,17 +272,19 @@ class Workspace:
         windowed.let_sleep(self, True)
       return
     responds = bool(self.respond) and self.stiff and computed
-    if responds or self.turn is not None:
+    if (responds or self.turn is not None) and self.flags[FLAG.stage] < STAGE.left:
       wp.capture_launch(self.leave)
     if self.turn is not None:
       windowed.hide(self)
     responds = responds and bool(self.flags[FLAG.changed])
     self.flags[FLAG.answered] = responds
-    if responds:
-      self._answer()
-    wp.capture_launch(self.advance if responds else self.end)
+    if self.flags[FLAG.stage] < STAGE.ended:
+      if responds:
+        self._answer()
+      wp.capture_launch(self.advance if responds else self.end)
     if self.resident:
       self.resident.step(computed)
+    self.computed = False
 
   def _answer(self):
     """Ends the step with the organ's own response to the change of the contact forces."""
@@ -428,5 +419,7 @@ def refresh(w: Workspace):
       prepare.give_armature(m, w.organ, w.body, w.config)
     else:
       windowed.set_inertia(w, m)
+      if w.turn is not None and w.turn.mine:
+        place(w, w.model)
     feel(w, m)
     w.time_step = float(m.opt.timestep)

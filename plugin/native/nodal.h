@@ -42,6 +42,7 @@ PALPATE void gather_nodes(const Fields& f, Thread, int) {
   // Residual floor: with D ~ mass, sqrt(r^T D^-1 r) of this share of the weight's impulse.
   const double rest = f.rest_share * 9.81 * h;
   solve.step.data[2] = (float)(weight * rest * rest);
+  f.flags.data[FLAG_STAGE] = STAGE_GATHERED;
 }
 
 // Adds the passive force.
@@ -64,6 +65,7 @@ PALPATE void scatter_nodes(const Fields& f, Thread, int) {
     double* out = mj.qfrc_passive.data + adr;
     store(out, load(out) + passive(ok ? rate : D3{0.0, 0.0, 0.0}, load(f.lagged.data + 3 * i)));
   }
+  f.flags.data[FLAG_STAGE] = STAGE_PUSHED;
 }
 
 // Writes the impulses by which the contact forces changed to the solver's right-hand side.
@@ -117,6 +119,7 @@ PALPATE void remember_nodes(const Fields& f, Thread, int) {
     store(last, dv);
   }
   if (answered) f.own.heavier.data[0] = secant.heavier(heavy, f.heaviest.data[0]);
+  f.flags.data[FLAG_STAGE] = STAGE_ENDED;
 }
 
 }  // namespace palpate

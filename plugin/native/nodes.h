@@ -174,6 +174,7 @@ PALPATE void report(const Fields& n, Thread t, int) {
   });
   if (t.tid > 0) return;
   for (int k = 0; k < 4; ++k) n.outbox.summary.data[SUMMARY_STATUS + k] = n.solve.status.data[k];
+  if (answered) n.inbox.head.data[HEAD_MODE] = MODE_STILL;  // the answer has ended the step
   for (int w = 0; w < n.nwindow; ++w) {
     n.outbox.found.data[w] = n.count.data[w];
     n.count.data[w] = 0;

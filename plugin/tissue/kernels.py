@@ -1,22 +1,79 @@
 """The binding: functions of `native/*.h` become Warp kernels, all with one signature.
 
 A kernel takes the number of threads that work on a world, one number that says what to do (a stage,
-a flag) and one struct; its native function gets the struct, the `Thread` and that number. So an
+a flag) and one struct, or where it is; its native function gets the struct, the `Thread` and that
+number. So an
 argument list is written once, as the fields of the struct (`types`). Numbers that both languages
 know are written in Python and printed as `constexpr` before the headers.
 """
 
 from __future__ import annotations
 
+import ctypes
+import dataclasses
 import functools
 import pathlib
 import re
 from collections.abc import Mapping
+from typing import Any
 
 import warp as wp
 
 NATIVE = pathlib.Path(__file__).parents[1] / "native"
-MODULES: list[str] = []  # Warp modules of the kernels, in the order in which they were declared
+# Warp modules of the kernels by kind of device, in the order in which they were declared.
+MODULES: dict[str, list[str]] = {"cpu": [], "cuda": []}
+
+
+@dataclasses.dataclass(frozen=True)
+class Kernel:
+  """A native function as kernels of Warp: on CUDA a launch brings its struct along.
+
+  On the CPU it says where the struct is: Warp copies and checks what a recorded launch brings in
+  every replay, which for a struct of 50 arrays takes as long as small organs' shorter passes.
+
+  Attributes:
+    struct: what it takes
+    cuda: kernel of nthread, arg, the struct
+    cpu: kernel of nthread, arg, an array of one struct
+  """
+
+  struct: Any
+  cuda: wp.Kernel
+  cpu: wp.Kernel
+
+  def on(self, device: wp.Device) -> wp.Kernel:
+    """Returns the kernel for a device."""
+    return self.cuda if device.is_cuda else self.cpu
+
+  def load(self, device: wp.Device):
+    """Loads its module on a device, compiling it where the cache has none."""
+    wp.load_module(self.on(device).module.name, device=device)
+
+  def launch(
+    self, device, nworld: int, nthread: int, arg: int, fields, block_dim: int | None = None
+  ):
+    """Launches the kernel.
+
+    Args:
+      device: where
+      nworld: number of worlds
+      nthread: threads that work on a world
+      arg: what to do
+      fields: the struct; what is recorded on the CPU reads it when it is replayed
+      block_dim: threads of a block; Warp's choice where None
+    """
+    device = wp.get_device(device)
+    inputs = [nthread, arg, fields if device.is_cuda else _reference(self.struct, fields)]
+    dim = nworld, nthread
+    wp.launch(self.on(device), dim=dim, inputs=inputs, device=device, block_dim=block_dim)
+
+
+def _reference(struct, fields) -> wp.array:
+  """Returns an array of the struct's own memory, which it keeps."""
+  address = ctypes.addressof(fields.__ctype__())
+  out = wp.array(ptr=address, dtype=struct, shape=1, device="cpu")
+  out.fields = fields
+  return out
 
 
 def kernel(
@@ -25,11 +82,11 @@ def kernel(
   struct,
   constants: Mapping[str, int | float],
   bounds: tuple[int, int] | int | None = None,
-) -> wp.Kernel:
+) -> Kernel:
   """Returns the kernel that calls palpate::name(fields, thread, arg) for each thread.
 
-  Its arguments are nthread, arg and the struct, its launch dimension (nworld, nthread). Kernels of
-  one header are one Warp module, which is compiled when its first kernel is loaded.
+  Kernels of one header and one kind of device are one Warp module, which is compiled when its first
+  kernel is loaded.
 
   Args:
     name: the native function, a template on the struct
@@ -38,28 +95,36 @@ def kernel(
     constants: numbers by name that the header knows
     bounds: threads of a block at most, and blocks that a multiprocessor must have room for
   """
-  module = _module(header, tuple(constants.items()))
-  call = f"palpate::{name}(f, palpate::Thread{{world, tid, nthread}}, arg);"
+  known = tuple(constants.items())
 
   def native(world: int, tid: int, nthread: int, arg: int, f: struct): ...
 
-  def entry(nthread: int, arg: int, f: struct):
+  def brought(nthread: int, arg: int, f: struct):
     world, tid = wp.tid()
     native(world, tid, nthread, arg, f)
 
+  def pointed(nthread: int, arg: int, f: wp.array(dtype=struct)):
+    world, tid = wp.tid()
+    native(world, tid, nthread, arg, f[0])
+
   native.__name__ = native.__qualname__ = f"{name}_native"
-  entry.__name__ = entry.__qualname__ = name
-  for function in (native, entry):
-    function.__annotations__["f"] = struct
-    function.__module__ = module
+  native.__annotations__["f"] = brought.__annotations__["f"] = struct
+  pointed.__annotations__["f"] = wp.array(dtype=struct)
+  call = f"palpate::{name}(f, palpate::Thread{{world, tid, nthread}}, arg);"
   native = wp.func_native(call)(native)
-  return wp.kernel(enable_backward=False, launch_bounds=bounds, module=module)(entry)
+
+  def made(entry, kind: str, bounds) -> wp.Kernel:
+    entry.__name__ = entry.__qualname__ = name
+    entry.__module__ = module = _module(header, kind, known)
+    return wp.kernel(enable_backward=False, launch_bounds=bounds, module=module)(entry)
+
+  return Kernel(struct, made(brought, "cuda", bounds), made(pointed, "cpu", None))
 
 
 @functools.cache
-def _module(header: str, constants: tuple) -> str:
-  """Declares the Warp module of a header and returns its name."""
-  name = f"palpate.native.{header.removesuffix('.h')}"
+def _module(header: str, kind: str, constants: tuple) -> str:
+  """Declares the Warp module of a header for one kind of device and returns its name."""
+  name = f"palpate.{kind}.{header.removesuffix('.h')}"
   preamble = _constexpr(dict(constants)) + f'\n#include "{header}"\n'
   options = wp.ModuleBuildOptions(
     extra_cpu_include_dirs=[str(NATIVE)],
@@ -69,7 +134,7 @@ def _module(header: str, constants: tuple) -> str:
     extra_build_dependencies=[str(NATIVE / each) for each in _includes(header)],
   )
   wp.set_module_options({"extra_build_options": options, "enable_backward": False}, name)
-  MODULES.append(name)
+  MODULES[kind].append(name)
   return name
 
 

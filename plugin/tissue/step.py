@@ -30,7 +30,7 @@ import warp as wp
 
 from .body import Body
 from .device import BLOCK, block, group_size, threads
-from .kernels import kernel
+from .kernels import Kernel, kernel
 from .types import CONSTANTS, Cycle, Fields, Stage
 
 # A right-hand side below this share of the weight's impulse is at rest: residuals count against it.
@@ -60,15 +60,15 @@ _CONSTANTS = CONSTANTS | {
 }
 
 
-def _elastic(name: str) -> wp.Kernel:
+def _elastic(name: str) -> Kernel:
   return kernel(name, "elastic.h", Fields, CONSTANTS)
 
 
-def _solid(name: str) -> wp.Kernel:
+def _solid(name: str) -> Kernel:
   return kernel(name, "solid.h", Fields, CONSTANTS)
 
 
-def _scheme(name: str, bounds: int | None = None) -> wp.Kernel:
+def _scheme(name: str, bounds: int | None = None) -> Kernel:
   return kernel(name, "schemes.h", Fields, _CONSTANTS, bounds)
 
 
@@ -92,18 +92,13 @@ _sample = kernel("sample", "multigrid.h", Cycle, _CONSTANTS)
 _solve_cycles = kernel("solve_cycles", "multigrid.h", Cycle, _CONSTANTS, (BLOCK, _CYCLES_PER_SM))
 
 
-def _over(kernel: wp.Kernel, body: Body, nslice: int, arg: int = 0, fields: Any = None):
+def _over(kernel: Kernel, body: Body, nslice: int, arg: int = 0, fields: Any = None):
   """Launches a kernel over `nslice` slices of every world; it takes the body's fields or others."""
   size = threads(body.device, nslice)
-  wp.launch(
-    kernel,
-    dim=(body.nworld, size),
-    inputs=[size, arg, body.fields if fields is None else fields],
-    device=body.device,
-  )
+  kernel.launch(body.device, body.nworld, size, arg, body.fields if fields is None else fields)
 
 
-def _together(kernel: wp.Kernel, body: Body, arg: int, fields=None, per_sm: int = 1):
+def _together(kernel: Kernel, body: Body, arg: int, fields: Any = None, per_sm: int = 1):
   """Launches a kernel in which the threads of a world work together; see native/group.h.
 
   Args:
@@ -115,21 +110,14 @@ def _together(kernel: wp.Kernel, body: Body, arg: int, fields=None, per_sm: int 
   """
   nslice = body.shape.nslice
   size = group_size(body.device, nslice, body.nworld, per_sm)
-  wp.launch(
-    kernel,
-    dim=(body.nworld, size),
-    inputs=[size, arg, body.fields if fields is None else fields],
-    device=body.device,
-    block_dim=block(body.device, nslice),
-  )
+  fields = body.fields if fields is None else fields
+  kernel.launch(body.device, body.nworld, size, arg, fields, block(body.device, nslice))
 
 
-def modules(body: Body) -> list[str]:
-  """Returns the Warp modules that a body's step needs."""
-  kernels = [_solid_row if body.is_solid else _row, _predict, _solve]
-  if body.levels is not None:
-    kernels.append(_sample)
-  return [kernel.module.name for kernel in kernels]
+def kernels(body: Body) -> list[Kernel]:
+  """Returns a kernel of each module that a body's step needs."""
+  found = [_solid_row if body.is_solid else _row, _predict, _solve]
+  return found if body.levels is None else [*found, _sample]
 
 
 # The linear system.

@@ -80,5 +80,5 @@ def test_more_worlds_than_memory():
 def test_the_kernels_compile_for_cuda(tmp_path):
   from palpate.batch import patch
 
-  wp.compile_aot_module(patch.MODULE, arch=90, module_dir=str(tmp_path), use_ptx=True)
+  wp.compile_aot_module(patch.enter.cuda.module, arch=90, module_dir=str(tmp_path), use_ptx=True)
   assert any(tmp_path.iterdir())

@@ -57,6 +57,28 @@ def test_midpoint_has_coarse_meshes(scenes):
   assert found["midpoint"] < 1.5 * found["implicit"]
 
 
+def test_windows_that_stand_get_the_inertia_of_a_changed_material(scenes):
+  states = []
+  for compiled in (HARD, {}):
+    model, data, organ = scenes.load(scenes.probed(keys=compiled))
+    mujoco.mj_step(model, data)
+    if not compiled:
+      organ.configure(**HARD)
+    states.append(model.dof_armature.copy())
+  np.testing.assert_array_equal(*states)
+
+
+def test_windows_that_stand_get_the_inertia_of_a_changed_time_step(scenes):
+  states = []
+  for h in (4e-3, 1e-3):
+    model, data, _ = scenes.load(scenes.probed(h=h))
+    mujoco.mj_step(model, data)
+    model.opt.timestep = 4e-3
+    mujoco.mj_step(model, data)
+    states.append(model.dof_armature.copy())
+  np.testing.assert_array_equal(*states)
+
+
 @pytest.mark.parametrize("window", [False, True], ids=["nodal", "window"])
 @pytest.mark.parametrize("keys", [SOFT, HARD], ids=["soft", "hard"])
 def test_a_changed_material_is_the_compiled_one(scenes, device, window, keys):

@@ -1,5 +1,6 @@
 """The implicit step under stress: thick, stiff, light shells from crushed and torn shapes."""
 
+import mujoco
 import numpy as np
 import pytest
 from palpate.tissue import energy
@@ -50,3 +51,33 @@ def test_the_stabilising_stiffness_acts_on_the_change_of_velocity_only(scenes, h
   v = np.cross([0, 0, 0.1], points)  # slow: no stretch to speak of
   found = scenes.step(body, h, np.zeros_like(points), v, 1e-4)
   assert np.abs(found).max() < 1e-3 * np.abs(v).max()
+
+
+@pytest.mark.parametrize("windowed", [False, True], ids=["nodal", "window"])
+@pytest.mark.parametrize("young", [8e3, 3e5])
+def test_jaws_that_pierce_an_organ_give_it_no_more_energy_than_their_work(scenes, windowed, young):
+  points, elem = scenes.sphere(2)
+  z = points[:, 2].max() - 0.001
+  jaws = "".join(
+    f"""<body pos="{x} 0 {z}"><joint name="{name}" type="slide" axis="{sign} 0 0" damping="0.5"
+      limited="true" range="-0.01 0.0138"/><joint name="{name}_z" type="slide" axis="0 0 1"/>
+      <geom type="capsule" euler="90 0 0" size="0.002 0.01" mass="0.05" condim="4"/></body>"""
+    for name, x, sign in (("left", -0.014, 1), ("right", 0.014, -1))
+  )
+  build = scenes.windowed if windowed else scenes.organ
+  made = build(points, elem, contact={"condim": 4}, young=young, foundation=1e4)
+  model, data, organ = scenes.load(scenes.world(made, jaws))
+  shut, down = (
+    [model.joint(name + way).dofadr[0] for name in ("left", "right")] for way in ("", "_z")
+  )
+  moving, work, had, pierced = shut + down, 0.0, 0.0, False
+  for _ in range(250):
+    data.qfrc_applied[shut] = 16.0 * min(1, data.time / 0.05)  # [N]
+    data.qfrc_applied[down] = -200 * 0.004 * min(1, data.time / 0.05) - 2 * data.qvel[down]
+    mujoco.mj_step(model, data)
+    work += model.opt.timestep * float(data.qfrc_applied[moving] @ data.qvel[moving])
+    energy = organ.energy
+    assert energy - had < 0.01
+    assert energy + 0.5 * 0.05 * (data.qvel[moving] ** 2).sum() < 1.01 * work + 1e-4
+    had, pierced = energy, pierced or bool(organ.pierced)
+  assert organ.error is None and pierced

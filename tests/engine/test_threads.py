@@ -340,6 +340,43 @@ print(raised > 100, organ.error, bool(np.isfinite(organ.displacement).all()))
   assert process(code)[:2] == (0, "True None True")
 
 
+def test_what_a_signals_handler_raises_tears_no_step(process):
+  # Signals nearly always fall into a callback, between any two instructions of it.
+  code = """
+class Late(Exception): pass
+armed, raised = False, 0  # not while one is handled
+def on_alarm(number, frame):
+  global armed, raised
+  if armed:
+    armed, raised = False, raised + 1
+    raise Late
+signal.signal(signal.SIGALRM, on_alarm)
+def drive(windowed, young, shared, alarms):
+  global armed
+  m, d, organ = load(probed(windowed, keys={"young": young}))
+  datas, end = [d, mujoco.MjData(m)][: 1 + shared], 0
+  signal.setitimer(signal.ITIMER_REAL, 0.001, 0.0009)
+  while end < 250:
+    end += 1 if shared else 250
+    for data in datas:
+      while data.time < (end - 0.5) * m.opt.timestep:
+        data.ctrl[0] = -0.004 * min(1, data.time / 0.1)
+        try:
+          armed = alarms
+          mujoco.mj_step(m, data)
+          armed = False
+        except Late: pass
+  signal.setitimer(signal.ITIMER_REAL, 0)
+  assert organ.error is None
+  return d.qpos.tobytes() + d.qvel.tobytes() + d.plugin_state.tobytes()
+for case in ((True, 3e4, False), (False, 3e4, False), (True, 3e6, False), (True, 3e4, True)):
+  print(drive(*case, True) == drive(*case, False), raised > 10)
+  raised = 0
+"""
+  status, out, errors = process(code)
+  assert (status, out.split("\n")) == (0, 4 * ["True True"]), errors
+
+
 def test_an_exception_sent_to_a_thread_ends_its_loop_of_steps(process):
   code = """
 import ctypes
