@@ -23,7 +23,7 @@ import importlib
 import math
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from typing import Any
 
 import numpy as np
@@ -34,6 +34,7 @@ from .base import RATES
 
 Act = Callable[[Any], Any]
 Script = Iterator[np.ndarray]
+Feeling = Generator[np.ndarray, None, float]  # a script that returns what was felt
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,7 +82,9 @@ SKILLED = {
   "reaction": (0.0, 0.2),
 }
 _WIDE = 1.0  # action of the jaw: wide open
-_GRIP = 2.4  # force that holds the organ [N]
+_ROLL = 0.8  # of the jaws to grasp, across the gallbladder's slack [rad]
+_GRIP = 1.5  # force that holds the organ [N]
+_FIRMER = 0.4  # by how much it is gripped more each time that it was lost [N]
 _TREMOR_HZ = np.array([4.0, 5.3, 7.1, 8.6, 10.0])
 
 
@@ -219,10 +222,11 @@ class Performer:
       over = goal + self.style.overshoot * (goal - start)
       points.insert(-1, over)
     for point in points:
-      yield from self._line(point, speed * self.style.speed)
+      yield from self.line(point, speed)
 
-  def _line(self, goal: np.ndarray, speed: float) -> Script:
-    start = self.tip.copy()
+  def line(self, goal: np.ndarray, speed: float) -> Script:
+    """Moves the tip along such a line at once and straight: a stroke that is known by heart."""
+    start, speed = self.tip.copy(), speed * self.style.speed
     steps = max(2, round(float(np.linalg.norm(goal - start)) / speed / self.dt))
     for k in range(1, steps + 1):
       s = k / steps
@@ -262,15 +266,23 @@ class Performer:
       self.tip = self.tip + self.care * speed * self.dt * along
       yield self.step()
 
+  def feel(self, point: np.ndarray, along: np.ndarray, depth: float) -> Feeling:
+    """Presses to a depth [m] below a point in one stroke; returns the stiffness felt [N/m]."""
+    yield from self.line(point + depth * self.excess(0.0) * along, speed=0.03)
+    yield from self.wait(self.style.reaction + 0.1)
+    force = float(np.linalg.norm(self.physics.contact_force()))
+    return force / max(float((self.physics.tip_pos() - point) @ along), 1e-3)
+
   def close(self, site: int, again: int = 0) -> Script:
     """Grasps a triangle: opens above it, goes down over it, and closes to a gentle force.
 
     Args:
       site: the triangle
-      again: how often it was lost: it is taken deeper then
+      again: how often it was lost: it is taken deeper then, and firmer
     """
     physics, up = self.physics, self.physics.trocar().mat[:, 2]
-    self.roll, self.extra[:] = 0.0, _WIDE
+    self.firm = _GRIP + _FIRMER * min(again, 2)
+    self.roll, self.extra[:] = _ROLL, _WIDE
     yield from self.move(physics.point(site) + 0.012 * up)
     yield from self.wait(0.2)
     deep = min(0.009 + 0.0015 * again, 0.012)
@@ -278,18 +290,21 @@ class Performer:
     while self.extra[0] > -0.35:
       self.extra[0] -= 0.06
       yield self.step()
-    for _ in range(100):
-      force = float(physics.gripper()[2:].max())
-      self.extra[0] -= float(np.clip(0.02 * (_GRIP * self.excess(0.0) - force), -0.01, 0.01))
+    for _ in range(round(100 / self.care)):
       yield self.step()
-      if abs(force - _GRIP * self.excess(0.0)) < 0.25 and physics.holds():
+      if abs(self._squeeze(0.0, 0.02)) < 0.25 and physics.holds():
         return
 
   def grip(self, contact: float) -> None:
     """Keeps the force of the jaws, which have held for a time [s]."""
-    force = float(self.physics.gripper()[2:].max())
-    self.extra[0] -= float(np.clip(0.01 * (_GRIP * self.excess(contact) - force), -0.005, 0.005))
-    self.extra[0] = float(np.clip(self.extra[0], -1, -0.3))
+    self._squeeze(contact, 0.01)
+
+  def _squeeze(self, contact: float, gain: float) -> float:
+    """Closes or opens the jaws towards their force; returns what is missing of it [N]."""
+    missing = self.firm * self.excess(contact) - float(self.physics.gripper()[2:].max())
+    change = self.care * float(np.clip(gain * missing, -0.5 * gain, 0.5 * gain))
+    self.extra[0] = float(np.clip(self.extra[0] - change, -1, -0.3))
+    return missing
 
   def open(self) -> Script:
     """Lets go."""

@@ -18,7 +18,6 @@ Progress: 0.3 * felt; on the report 1 or 0.
 """
 
 import dataclasses
-import math
 
 import numpy as np
 from dm_control.utils import containers
@@ -38,6 +37,10 @@ _FACING = 0.75  # least cosine between the field's normal and the way to the tro
 _PIN_GAP = 0.02  # the field keeps that far from pinned nodes [m]
 _FELT = (0.1, 0.008)  # force [N] that feels, and what lies within that distance [m]
 _REPORT = 0.05  # least force at the report [N]
+# Of the expert: how far above a place it begins, how deep it feels, how far apart places to feel
+# are, first and around what is stiff, and how far around that it feels [m].
+_ABOVE, _DEPTH, _SWEEP, _CLOSE, _AROUND = 0.004, 0.004, 0.014, 0.006, 0.009
+_STIFF = 1.3  # times what is soft: what is worth a closer look [-]
 
 
 @SUITE.add("benchmarking", "easy")
@@ -347,41 +350,47 @@ class Palpate(Task):
     return {"field": self.center - physics.tip_pos(), "felt": np.array([self.felt()])}
 
   def expert(self, p: Performer) -> Script:
-    """Feels all over the field, then closer around the stiffest place, and reports that.
+    """Feels over the field until something is stiff, then around it, and reports the middle.
 
     It knows where the organ's triangles are and presses their middles: on the coarse mesh corners
     feel stiffer. Where the inclusion is it learns from forces and depths alone.
     """
-    physics, places = p.physics, self.places
-    normals = physics.normals()[self.field]
-    spots, stiffness = [], []
-
-    def feel(k: int) -> Script:
-      yield from self._hop(p, places[k] + 0.004 * normals[k])
-      end = physics.time() + 0.55
-      yield from p.sink(0.004, places[k], -normals[k], lambda: physics.time() > end)
-      depth = float((places[k] - physics.tip_pos()) @ normals[k])
-      spots.append(k)
-      stiffness.append(float(np.linalg.norm(physics.contact_force())) / max(depth, 1e-3))
-      yield from p.move(places[k] + 0.004 * normals[k])
-
-    for k in _lattice(places, self.center, 0.0105):
-      yield from feel(k)
-    for _ in range(8):  # look closer around the stiffest place
-      guess = _stiffest(places, places[spots], np.array(stiffness), 1.2 * self.radius)
-      near = np.linalg.norm(places - places[guess], axis=1) < 0.012
-      gap = np.linalg.norm(places[:, None] - places[spots], axis=2).min(axis=1)
-      yield from feel(int(np.argmax(np.where(near, gap, -1.0))))
-    k = _stiffest(places, places[spots], np.array(stiffness), 1.2 * self.radius)
-    yield from self._hop(p, places[k] + 0.004 * normals[k])
-    yield from p.push(0.12, -normals[k], lambda: math.hypot(*physics.contact_force()) > 0.1)
+    normals = p.physics.normals()[self.field]
+    felt: dict[int, float] = {}  # place -> stiffness [N/m]
+    sweep = iter(_lattice(self.places, self.center, _SWEEP))
+    while (k := self._unsure(felt)) is not None or (k := next(sweep, None)) is not None:
+      yield from self._hop(p, self.places[k] + _ABOVE * normals[k])
+      felt[k] = yield from p.feel(self.places[k], -normals[k], _DEPTH)
+      yield from p.line(self.places[k] + _ABOVE * normals[k], 0.03)
+    k = self._guess(felt)
+    yield from self._hop(p, self.places[k] + _ABOVE * normals[k])
+    yield from p.feel(self.places[k], -normals[k], 0.5 * _DEPTH)
     p.extra[:] = 1.0
     yield p.step()
+
+  def _unsure(self, felt: dict[int, float]) -> int | None:
+    """Returns the place to feel for to be sure of what is stiff, None where nothing is, or all."""
+    stiffness = np.array(list(felt.values()))
+    if not len(felt) or stiffness.max() < _STIFF * np.quantile(stiffness, 0.25):
+      return None
+    spots = self.places[list(felt)]
+    near = np.linalg.norm(self.places - self.places[self._guess(felt)], axis=1) < _AROUND
+    gap = np.linalg.norm(self.places[:, None] - spots, axis=2).min(axis=1) * near
+    return int(gap.argmax()) if gap.max() > _CLOSE else None
+
+  def _guess(self, felt: dict[int, float]) -> int:
+    """Returns the place that a bell of stiffness, a + b exp(-(d/w)^2), fits best on."""
+    distance = np.linalg.norm(self.places[:, None] - self.places[list(felt)], axis=2)
+    bell = np.exp(-((distance / (1.2 * self.radius)) ** 2))
+    bell -= bell.mean(axis=1, keepdims=True)
+    stiffness = np.array(list(felt.values()))
+    gain = bell @ (stiffness - stiffness.mean())  # what the bell explains
+    return int(np.argmax(gain / np.maximum(np.linalg.norm(bell, axis=1), 1e-9)))
 
   def _hop(self, p: Performer, goal: np.ndarray) -> Script:
     """Moves to a point, in an arch over the organ where it is far."""
     far = float(np.linalg.norm(goal - p.tip))
-    if far > 0.016:
+    if far > 0.025:
       yield from p.move((goal + p.tip) / 2 + 0.35 * far * p.physics.trocar().mat[:, 2])
     yield from p.move(goal)
 
@@ -396,13 +405,3 @@ def _lattice(points: np.ndarray, center: np.ndarray, gap: float) -> list[int]:
       return chosen
     near = np.linalg.norm(points[left] - points[chosen[-1]], axis=1)
     chosen.append(int(left[np.argmin(near)]))
-
-
-def _stiffest(places: np.ndarray, spots: np.ndarray, stiffness: np.ndarray, width: float) -> int:
-  """Returns which place a bell of stiffness stands on: least squares of a + b exp(-(d/width)^2)."""
-  distance = np.linalg.norm(places[:, None] - spots, axis=2)
-  bell = np.exp(-((distance / width) ** 2))
-  bell -= bell.mean(axis=1, keepdims=True)
-  felt = stiffness - stiffness.mean()
-  gain = bell @ felt / np.maximum(np.linalg.norm(bell, axis=1), 1e-9)  # what the bell explains
-  return int(np.argmax(gain))

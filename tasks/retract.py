@@ -12,6 +12,7 @@ Failure: a force above the damage limit, jaws included, or the time limit.
 """
 
 import dataclasses
+import itertools
 
 import numpy as np
 from dm_control.utils import containers
@@ -153,8 +154,10 @@ class Retract(Hold):
   def expert(self, p: Performer) -> Script:
     """Grasps and pulls aside, a little up, until enough is seen."""
     physics = p.physics
-    while self.outcome is None:
-      yield from p.close(self.site)
+    for again in itertools.count():
+      if self.outcome is not None:
+        return
+      yield from p.close(self.site, again)
       up = physics.trocar().mat[:, 2]
       yield from p.wait(p.style.delay)
       along = self.right + 0.15 * up

@@ -25,10 +25,12 @@ unknown.
 Weights: safety 67 %, efficiency 17 % (Heidelberg VR score, 10.1007/s00464-018-6480-x). Its other
 16 % go to time, dexterity and outcome; the abstract does not say how, here they share it equally.
 
-Proficiency of an episode: success, and no metric over its limit. The limits cut the same number of
-the worst values off every metric, as many as leave `PASSING` of the panel's episodes within all of
-them at once; the mean + 2 SD of SAGES would fail many of them, since every metric may fail by
-itself. A metric that some of the panel's successes lack is not asked for.
+Proficiency of an episode: success, and no metric over its limit. A limit is the panel's mean and so
+many SDs, the same number for every metric, that of the panel's episodes `PASSING` pass limits that
+are made of the others: a new person of the panel's skill then passes as often. The worst episodes
+beyond that count neither in mean nor SD. The mean + 2 SD of SAGES would fail half of the panel,
+since each of thirty metrics may fail by itself, and so would the panel's worst values the next
+person. A metric that some of the panel's successes lack is not asked for.
 
 Proficiency of a performer: `CONSECUTIVE` proficient episodes in a row, then `REPEATS` more that
 need not be in a row: the 2 + 10 of the curriculum for the Fundamentals of Laparoscopic Surgery
@@ -68,15 +70,16 @@ def make_reference(results: Sequence[Metrics], task: str, seed: int) -> dict[str
 
   The mean and sample SD (n - 1) of the recordings where the metric is known, and the limit of
   proficiency, see the module's head. A metric that is known nowhere, or of which neither more nor
-  less is better, is left out; the SD of a single value is null.
+  less is better, is left out, and so are movements where some make none; the SD of a single value
+  is null.
   """
   table: dict[str, dict[str, Any]] = {}
   for name, spec in METRICS.items():
     if spec.better == "neither":
       continue
     known = [float(v) for r in results if math.isfinite(v := getattr(r, name))]
-    if not known:
-      continue
+    if not known or (name == "number_of_movements" and min(known) == 0):
+      continue  # a hand too slow for any movement to count would make a faster one the worse
     mean = math.fsum(known) / len(known)
     # The mean of equal values may round: without the test their SD would be 1e-17, not 0.
     constant = min(known) == max(known)
@@ -99,16 +102,34 @@ def make_reference(results: Sequence[Metrics], task: str, seed: int) -> dict[str
 def _limits(results: Sequence[Metrics], names: Sequence[str]) -> dict[str, float]:
   """Returns metric -> limit of proficiency [SI], see the module's head."""
   signs = np.array([1.0 if METRICS[name].better == "lower" else -1.0 for name in names])
-  worse = np.array([[float(getattr(r, name)) for name in names] for r in results]) * signs
-  worse[~np.isfinite(worse)] = -np.inf  # what is not known is within any limit
-  order = np.sort(worse, axis=0)[::-1]
-  limit = order[:1].reshape(-1)
-  for cut in order[1:]:
-    cut = np.where(np.isfinite(cut), cut, limit)
-    if (worse <= cut).all(axis=1).mean() < PASSING:
-      break
-    limit = cut
-  return dict(zip(names, (limit * signs).tolist(), strict=True))
+  values = np.array([[float(getattr(r, name)) for name in names] for r in results])
+  asked = np.isfinite(values).all(axis=0)
+  worst = np.max(values * signs, axis=0, where=np.isfinite(values), initial=-np.inf)
+  panel = values[:, asked] * signs[asked]
+  far = _ahead_of_others(panel)
+  kept = panel[np.argsort(far, kind="stable")[: math.ceil(PASSING * len(panel))]]
+  most = max(0.0, float(_ahead_of_others(kept).max(initial=0.0)))
+  spread = kept.std(axis=0, ddof=1) if len(kept) > 1 else 0.0
+  high, low = kept.max(axis=0), kept.min(axis=0)
+  # The mean of equal values may round, as above.
+  limit = np.where(high > low, kept.mean(axis=0) + most * spread, high)
+  worst[asked] = np.maximum(limit, high)
+  return dict(zip(names, (worst * signs).tolist(), strict=True))
+
+
+def _ahead_of_others(panel: np.ndarray) -> np.ndarray:
+  """Returns by how many SDs each episode's worst metric is over the mean of all others  (n,).
+
+  Args:
+    panel: metrics of each episode, more is worse  (n, nmetric)
+  """
+  far = np.zeros(len(panel))
+  for k in range(len(panel) if len(panel) > 2 else 0):
+    others = np.delete(panel, k, axis=0)
+    spread, over = others.std(axis=0, ddof=1), panel[k] - others.mean(axis=0)
+    scaled = spread > 1e-9 * np.abs(others).max(axis=0)  # else all others are the same
+    far[k] = np.max(over[scaled] / spread[scaled], initial=0.0)
+  return far
 
 
 def check_reference(reference: Any) -> None:

@@ -250,7 +250,7 @@ class Trace(Task):
       at = min(at + step, max(most, 0.0), len(self.curve) - 1)
       force = float(np.linalg.norm(physics.contact_force()))
       error = 0.15 * p.excess(contact) - force
-      height -= float(np.clip(0.08 * error, -0.01, 0.01)) * self.control_timestep
+      height -= p.care * float(np.clip(0.08 * error, -0.01, 0.01)) * self.control_timestep
       k = int(at)
       ahead = self.curve[min(k + 1, len(self.curve) - 1)]
       rest = self.curve[k] + (at - k) * (ahead - self.curve[k])

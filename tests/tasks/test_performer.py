@@ -6,6 +6,7 @@ import types
 import numpy as np
 import pytest
 from palpate import tasks
+from palpate.models import trocar
 from palpate.tasks import base, episode, performer, suite
 
 EASY = ["/".join(pair) for pair in tasks.EASY]
@@ -85,6 +86,16 @@ def test_a_late_reaction_moves_later():
   prompt, late = begin(performer.Style()), begin(performer.Style(reaction=0.1))
   assert np.abs(late[:5]).max() < 1e-9 < np.abs(prompt[0]).max()
   np.testing.assert_allclose(late[5:], prompt[:10], atol=0.02)
+
+
+@pytest.mark.parametrize("name", ["probe/standard", "grasp/standard"])
+def test_the_tip_is_where_the_moved_trocar_says(name):
+  env = tasks.load(*suite.split(name), task_kwargs={"random": 3})
+  for _ in range(2):
+    env.reset()
+    physics = env.physics
+    told = trocar.forward(physics.trocar(), physics.joints()[[0, 1, 3]])
+    np.testing.assert_allclose(physics.tip_pos(), told, atol=1e-6)
 
 
 def test_skilled_people_are_many_and_come_again():
