@@ -54,10 +54,10 @@ from .stage import STATE, Stage
 RATES = (1.0, 1.0, 3.0, 0.12)  # pitch, yaw, roll [rad/s], insertion [m/s]
 REWARDS = ("dense", "sparse")
 
-_PRICE = 0.1  # of a unit of cost, in the dense reward
+PRICE = 0.1  # of a unit of cost, in the dense reward
 _FACING = 0.75  # least cosine between a target's normal and the way to the trocar
 _PIN_GAP = 0.012  # targets keep this far from pinned nodes [m]
-_SLACK = 1e-6  # what rounding may add to an action
+SLACK = 1e-6  # what rounding may add to an action
 
 
 class Task(control.Task):
@@ -156,15 +156,20 @@ class Task(control.Task):
 
   def physics(self) -> Physics:
     """Returns the physics of the scene, to make an environment of."""
-    model = self._compiled(self.variants[0]).model
+    model = self.compiled(self.variants[0]).model
     physics = Physics.from_model(wrapper.MjModel(model))
     physics.use(model, self.prefix, self.targets, self.organ)
     return physics
 
-  def _compiled(self, variant: int | None) -> Stage:
+  def compiled(self, variant: int | None) -> Stage:
+    """Returns the stage of a shape."""
     if variant not in self._models:
-      self._models[variant] = self._stage(scenes.build(self._scene(variant)))
+      self._models[variant] = self._stage(self.spec(variant))
     return self._models[variant]
+
+  def spec(self, variant: int | None) -> mj.MjSpec:
+    """Returns the scene of a shape, not that of `model`."""
+    return scenes.build(self._scene(variant))
 
   def _stage(self, spec: mj.MjSpec) -> Stage:
     model = stage.compile_spec(spec)
@@ -239,7 +244,7 @@ class Task(control.Task):
 
   def initialize_episode(self, physics: Physics) -> None:
     """Draws shape, trocar, pose and targets, and puts the organ at rest."""
-    place = self._compiled(self.choose())
+    place = self.compiled(self.choose())
     if physics.model.ptr is not place.model:
       physics.use(place.model, self.prefix, self.targets, self.organ)
     place.restore()
@@ -286,7 +291,7 @@ class Task(control.Task):
         f"{self.name}: action has shape {values.shape}, expected ({len(names)},): "
         + ", ".join(names)
       )
-    bad = ~(np.abs(values) <= 1 + _SLACK)
+    bad = ~(np.abs(values) <= 1 + SLACK)
     if bad.any():
       k = int(bad.argmax())
       raise ValueError(
@@ -320,7 +325,7 @@ class Task(control.Task):
       self.event(physics, "note", label="success")
     self.gain = self.progress - before
     self.best = max(self.best, self.progress)
-    self._price = min(_PRICE * self.cost.total, 1.0 - self.harm)
+    self._price = min(PRICE * self.cost.total, 1.0 - self.harm)
     self.harm += self._price
 
   def get_observation(self, physics: Physics) -> collections.OrderedDict:

@@ -65,8 +65,8 @@ class Physics(Portable):
     self.target_sites = [model.site(f"target{i}").id for i in range(targets)]
     model.site_sameframe[self.target_sites] = 0  # else a site at its body's origin stays there
     self._xpos0 = self.organ.xpos0
-    self._coarse = _spread(self._xpos0, COARSE)
-    self._coarse0 = self._xpos0[self._coarse]
+    self.coarse = _spread(self._xpos0, COARSE)
+    self._coarse0 = self._xpos0[self.coarse]
     self._trocar = trocar.trocar(model, prefix)
 
   @property
@@ -223,7 +223,7 @@ class Physics(Portable):
 
   def surface(self) -> np.ndarray:
     """Returns the displacement of nodes spread over the organ [m]  (COARSE, 3)."""
-    return self.nodes()[self._coarse] - self._coarse0
+    return self.nodes()[self.coarse] - self._coarse0
 
   def point(self, triangle: int) -> np.ndarray:
     """Returns where the middle of one of the organ's triangles is [m]  (3,)."""

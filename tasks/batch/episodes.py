@@ -1,0 +1,101 @@
+# mujoco ships its bindings without type stubs:
+# pyright: reportAttributeAccessIssue=false
+"""Episodes are drawn on the host, by the exercise itself in a scene that rests."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import gymnasium
+import mujoco as mj
+import numpy as np
+from dm_control.mujoco import wrapper
+from palpate.models import trocar
+from palpate.tasks.base import Task
+from palpate.tasks.physics import Physics
+
+from .domain import Domain
+
+FRAME = {"body_pos", "body_quat", "pose"}  # what every exercise draws: trocar and joints
+
+
+class Resting(Physics):
+  """The physics of an exercise while its organ rests, which is not stepped to answer."""
+
+  def use(self, *args: Any) -> None:
+    """Takes a compiled scene, see `Physics.use`."""
+    self._rest_normals: np.ndarray | None = None
+    super().use(*args)
+
+  def set_joints(self, pose: np.ndarray) -> None:
+    """Takes the instrument's pose at the start of an episode."""
+    self.pose = np.array(pose)
+
+  def tip_pos(self) -> np.ndarray:
+    """Returns where that puts the tip [m]  (3,)."""
+    return trocar.forward(self.trocar(), self.pose[[0, 1, 3]])
+
+  def moved(self) -> None:
+    """Does nothing: the organ stays where it is."""
+
+  def normals(self) -> np.ndarray:
+    """Returns the outward unit normals of the organ's triangles  (nelem, 3)."""
+    if self._rest_normals is None:
+      self._rest_normals = super().normals()
+    return self._rest_normals
+
+  def mark(self, *args: Any, **kwargs: Any) -> None:
+    """Does nothing: no picture is made."""
+
+
+class Episodes:
+  """The next episodes of worlds, each drawn from a random state of its own.
+
+  Attributes:
+    physics: of the scene at rest
+    rows: what was drawn by name, (nworld, ...) each
+  """
+
+  def __init__(self, task: Task, domain: type[Domain], nworld: int):
+    model = task.compiled(task.variants[0]).model
+    self.physics: Any = Resting.from_model(wrapper.MjModel(model))
+    self.physics.use(model, task.prefix, task.targets, task.organ)
+    self._task, self._domain = task, domain
+    self._random: list[np.random.RandomState | None] = [None] * nworld
+    self.rows: dict[str, np.ndarray] = {}
+
+  def seed(self, seeds: Sequence[int | None], worlds: np.ndarray) -> None:
+    """Seeds worlds as `reset` of a single environment does; with None those that have no state."""
+    for world in worlds:
+      seed = seeds[world]
+      if seed is not None or self._random[world] is None:
+        random, _ = gymnasium.utils.seeding.np_random(seed)
+        self._random[world] = np.random.RandomState(random.integers(2**31))
+
+  def draw(self, worlds: np.ndarray) -> None:
+    """Draws an episode for each of some worlds."""
+    for world in worlds:
+      self._task.random = self._random[world]
+      self._task.initialize_episode(self.physics)
+      for name, row in self._row().items():
+        if name not in self.rows:
+          self.rows[name] = np.zeros((len(self._random), *np.shape(row)), np.asarray(row).dtype)
+        self.rows[name][world] = row
+
+  def _row(self) -> Mapping[str, Any]:
+    model = self.physics.model.ptr
+    body = model.body(f"{self._task.prefix}trocar")
+    if body.parentid[0]:
+      raise ValueError(f"{self._task.name}: the trocar hangs on a body, expected the world")
+    frame = {"body_pos": body.pos.copy(), "body_quat": body.quat.copy(), "pose": self.physics.pose}
+    return frame | dict(self._domain.draw(self._task, self.physics))
+
+
+def at_rest(model: mj.MjModel, state: np.ndarray, kind: int) -> mj.MjData:
+  """Returns data in a state."""
+  data = mj.MjData(model)
+  mj.mj_setState(model, data, state, kind)
+  mj.mj_forward(model, data)
+  mj.mj_setState(model, data, state, kind)
+  return data
