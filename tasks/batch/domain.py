@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from palpate.tasks.base import Task
 from palpate.tasks.physics import Physics
 
 
@@ -15,26 +14,38 @@ class Domain:
 
   Attributes:
     struct: of Warp, its state
-    observed: fields that are observed, by the names they have in the exercise
     begin: kernel (fields, own): begins the episodes of `begun`, once the instrument is measured
     advance: kernel (fields, own): what `Task.advance` is; it ends with `kernels.judge`
     observe: kernel (fields, own, beginning): what `Task.observe` is
   """
 
   struct: Any
-  observed: tuple[str, ...]
   begin: Any
   advance: Any
   observe: Any
 
   @staticmethod
-  def numbers(task: Task) -> dict[str, float | int]:
+  def prepare(task: Any) -> None:
+    """Changes the task before its scene is made for all worlds."""
+
+  @staticmethod
+  def numbers(task: Any) -> dict[str, float | int]:
     """Returns the struct's numbers."""
     return {}
 
   @staticmethod
   def sizes(task: Any, physics: Physics) -> dict[str, int]:
     """Returns the named sizes of its arrays."""
+    return {}
+
+  @staticmethod
+  def constants(task: Any, physics: Physics) -> Mapping[str, np.ndarray]:
+    """Returns arrays of the struct that all worlds share."""
+    return {}
+
+  @staticmethod
+  def tissue(task: Any, rows: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
+    """Returns keys of the organ's tissue that episodes change, a row a world."""
     return {}
 
   @staticmethod

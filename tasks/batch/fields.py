@@ -13,7 +13,7 @@ vectors = Array(wp.vec3, ("nworld",))
 
 
 @struct
-class Fields:
+class Common:
   """Scene and state.
 
   `outcome` is a number of `OUTCOMES`.
@@ -86,7 +86,7 @@ class Fields:
 
 OUTCOMES = (None, "success", "damage", "missed")
 RUNNING, SUCCESS, DAMAGED, MISSED = wp.constant(0), wp.constant(1), wp.constant(2), wp.constant(3)
-# Fields by the names of the observations and of Gymnasium's information, where those differ.
+# Common by the names of the observations and of Gymnasium's information, where those differ.
 OBSERVED = {"drive": "drive_error"}
 INFO = {
   name: name

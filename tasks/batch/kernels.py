@@ -5,7 +5,7 @@ import warp as wp
 from palpate.tasks import base, safety
 from palpate.tasks.physics import NEAR
 
-from .fields import DAMAGED, RUNNING, SUCCESS, Fields
+from .fields import DAMAGED, RUNNING, SUCCESS, Common
 
 closeness, parts = wp.func(base.closeness), wp.func(safety.parts)
 
@@ -33,20 +33,20 @@ def put(values: wp.array(dtype=float, ndim=2), w: int, v: wp.vec3):
 
 
 @wp.func
-def node(s: Fields, w: int, k: int):
+def node(s: Common, w: int, k: int):
   """Returns the position of a node [m]."""
   return wp.vec3(s.xpos[w, k, 0], s.xpos[w, k, 1], s.xpos[w, k, 2])
 
 
 @wp.func
-def point(s: Fields, w: int, triangle: int):
+def point(s: Common, w: int, triangle: int):
   """Returns the middle of a triangle [m]."""
   a, b = node(s, w, s.elem[triangle, 0]), node(s, w, s.elem[triangle, 1])
   return (a + b + node(s, w, s.elem[triangle, 2])) / 3.0
 
 
 @wp.func
-def normal(s: Fields, w: int, triangle: int):
+def normal(s: Common, w: int, triangle: int):
   """Returns the outward unit normal of a triangle."""
   a, b = node(s, w, s.elem[triangle, 0]), node(s, w, s.elem[triangle, 1])
   return wp.normalize(wp.cross(b - a, node(s, w, s.elem[triangle, 2]) - a))
@@ -64,7 +64,7 @@ def find_bad(action: wp.array(dtype=float, ndim=2), bad: wp.array(dtype=int)):
 
 
 @wp.kernel(enable_backward=False)
-def act(s: Fields):
+def act(s: Common):
   """Moves the drives' targets."""
   w = wp.tid()
   for k in range(4):
@@ -76,7 +76,7 @@ def act(s: Fields):
 
 
 @wp.kernel(enable_backward=False)
-def begin(s: Fields):
+def begin(s: Common):
   """Begins episodes: in the worlds of `begun`."""
   w = wp.tid()
   if not s.begun[w]:
@@ -98,7 +98,7 @@ def begin(s: Fields):
 
 
 @wp.kernel(enable_backward=False)
-def measure(s: Fields, beginning: bool):
+def measure(s: Common, beginning: bool):
   """Measures the instrument: after a step, or where an episode begins."""
   w = wp.tid()
   if beginning and not s.begun[w]:
@@ -132,7 +132,7 @@ def measure(s: Fields, beginning: bool):
 
 
 @wp.func
-def place(s: Fields, w: int):
+def place(s: Common, w: int):
   """Finds the tip from the joints, see `models.trocar`."""
   pitch, yaw, roll = s.joints[w, 0], s.joints[w, 1], s.joints[w, 2]
   sp, cp, sy, cy = wp.sin(pitch), wp.cos(pitch), wp.sin(yaw), wp.cos(yaw)
@@ -153,7 +153,7 @@ def place(s: Fields, w: int):
 
 
 @wp.func
-def judge(s: Fields, w: int, progress: float, outcome: int):
+def judge(s: Common, w: int, progress: float, outcome: int):
   """Ends a control step that came to a progress and an outcome."""
   peak, shaft = s.peak_force[w, 0], s.shaft_peak[w]
   over, lies, harmed = parts(peak, shaft, s.force_limit, s.damage)
@@ -193,7 +193,7 @@ def judge(s: Fields, w: int, progress: float, outcome: int):
 
 
 @wp.kernel(enable_backward=False)
-def look(s: Fields, beginning: bool):
+def look(s: Common, beginning: bool):
   """Finds the nodes nearest to the tip, nearest first."""
   w = wp.tid()
   if beginning and not s.begun[w]:
@@ -220,7 +220,7 @@ def look(s: Fields, beginning: bool):
 
 
 @wp.kernel(enable_backward=False)
-def survey(s: Fields, beginning: bool):
+def survey(s: Common, beginning: bool):
   """Finds the displacement of the nodes of `surface`."""
   w, k = wp.tid()
   if beginning and not s.begun[w]:

@@ -9,7 +9,7 @@ from palpate.tasks import touch
 from palpate.tissue.types import floats, ints, struct
 
 from . import domain
-from .fields import RUNNING, SUCCESS, Fields, flags
+from .fields import RUNNING, SUCCESS, Common, flags
 from .kernels import closeness, judge, normal, point, put, vector
 
 follow, progress = wp.func(touch.follow), wp.func(touch.progress)
@@ -17,7 +17,7 @@ _DWELL, _SLACK = wp.constant(touch.DWELL), wp.constant(touch.SLACK)
 
 
 @struct
-class Own:
+class TouchState:
   """State of the domain."""
 
   tolerance: float  # [m]
@@ -33,19 +33,19 @@ class Own:
 
 
 @wp.func
-def goal(s: Fields, o: Own, w: int):
+def goal(s: Common, o: TouchState, w: int):
   """Returns the triangle to touch next; the last one when all are done."""
   return o.goals[w, wp.min(o.done[w], o.goals.shape[1] - 1)]
 
 
 @wp.func
-def distance(s: Fields, o: Own, w: int):
+def distance(s: Common, o: TouchState, w: int):
   """Returns how far the tip is from the point to touch [m]."""
   return wp.length(point(s, w, goal(s, o, w)) - vector(s.tip_pos, w))
 
 
 @wp.kernel(enable_backward=False)
-def begin(s: Fields, o: Own):
+def begin(s: Common, o: TouchState):
   """Begins episodes."""
   w = wp.tid()
   if not s.begun[w]:
@@ -58,7 +58,7 @@ def begin(s: Fields, o: Own):
 
 
 @wp.kernel(enable_backward=False)
-def advance(s: Fields, o: Own):
+def advance(s: Common, o: TouchState):
   """Counts touches."""
   w = wp.tid()
   force = s.peak_force[w, 0]
@@ -83,7 +83,7 @@ def advance(s: Fields, o: Own):
 
 
 @wp.kernel(enable_backward=False)
-def observe(s: Fields, o: Own, beginning: bool):
+def observe(s: Common, o: TouchState, beginning: bool):
   """Writes target, normal and held."""
   w = wp.tid()
   if beginning and not s.begun[w]:
@@ -97,8 +97,7 @@ def observe(s: Fields, o: Own, beginning: bool):
 class Touch(domain.Domain):
   """The domain."""
 
-  struct = Own
-  observed = ("target", "normal", "held")
+  struct = TouchState
   begin, advance, observe = begin, advance, observe
 
   @staticmethod

@@ -20,16 +20,18 @@ import warp as wp
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from palpate.batch.base import count_of, on_device
-from palpate.tasks import suite
 from palpate.tasks.gym import Exercise
 from palpate.tasks.observation import ROWS
 
 from .domain import Domain
 from .fields import INFO, OBSERVED, OUTCOMES
+from .palpate import Palpate
+from .press import Press
 from .touch import Touch
 from .worlds import Worlds
 
-DOMAINS: dict[str, type[Domain]] = {"touch": Touch}
+# Exercises that are vectorised, by the class of their task.
+DOMAINS: dict[str, type[Domain]] = {"Touch": Touch, "Press": Press, "Palpate": Palpate}
 _ELSE = 'vectorization_mode="sync" runs single environments side by side'
 OUTPUTS = ("numpy", "torch", "warp")
 
@@ -86,7 +88,7 @@ class Exercises(VectorEnv):
       limit = min(limit, max_episode_steps)
     if device is None:
       device = "cuda:0" if wp.is_cuda_available() else "cpu"
-    domain = DOMAINS[task.partition("/")[0]]
+    domain = DOMAINS[type(environment.task).__name__]
     options = {} if device == "cpu" else {"nodes": nodes}
     self.worlds = Worlds(environment, domain, self.num_envs, device, limit, **options)
     self.device, self.max_episode_steps = self.worlds.device, limit
@@ -190,15 +192,16 @@ def _mask(options: Mapping[str, Any] | None, count: int) -> np.ndarray:
 
 def _refuse(task: str, kwargs: Mapping[str, Any]) -> None:
   """Raises ValueError for what a vectorised exercise cannot do, naming it."""
-  domain = "/".join(suite.split(task)).partition("/")[0]
-  if domain not in DOMAINS:
-    raise ValueError(f"{task} is not vectorised yet, expected one of {', '.join(DOMAINS)}; {_ELSE}")
   for name in ("render_mode", "record", "model", "randomise"):
     if kwargs.get(name):
       raise ValueError(f"{task}: {name} is given, which a vectorised exercise cannot do; {_ELSE}")
 
 
 def _refuse_task(task: Any) -> None:
+  kind = type(task).__name__
+  if kind not in DOMAINS:
+    have = ", ".join(name.lower() for name in DOMAINS)
+    raise ValueError(f"{task.name} is not vectorised yet, {have} are; {_ELSE}")
   if task.observed.pictures:
     raise ValueError(
       f"{task.name}: observations has {task.observed.pictures[0]!r}, but a vectorised exercise "

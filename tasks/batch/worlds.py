@@ -21,7 +21,7 @@ from palpate.tissue.types import allocate
 from . import kernels
 from .domain import Domain
 from .episodes import FRAME, Episodes, at_rest
-from .fields import Fields
+from .fields import Common
 
 _SENSORS = ("tip_force", "shaft_force", "touch_left", "touch_right")
 
@@ -57,6 +57,7 @@ class Worlds:
     """
     task: Any = environment.task
     self._task, self._domain, self.nworld = task, domain, nworld
+    domain.prepare(task)
     stage = task.compiled(task.variants[0])
     with warnings.catch_warnings():  # the plugin's passive forces are unknown to the compiler
       warnings.filterwarnings("ignore", ".*has no equality constraints or passive forces")
@@ -71,6 +72,8 @@ class Worlds:
     self.own = allocate(domain.struct, self.device, sizes)
     for name, value in domain.numbers(task).items():
       setattr(self.own, name, value)
+    for name, value in domain.constants(task, self.episodes.physics).items():
+      getattr(self.own, name).assign(value)
     self._bad = wp.zeros(1, dtype=int, device=self.device)
 
   def _make(self, task: Any, dt: float, limit: int) -> Any:
@@ -80,7 +83,7 @@ class Worlds:
       nv=model.nv, nu=model.nu, nsensor=model.nsensor, nsensordata=model.nsensordata,
       naction=len(task.components),
     )  # fmt: skip
-    s = allocate(Fields, self.device, sizes)
+    s = allocate(Common, self.device, sizes)
     s.dt, s.limit, s.sparse = dt, limit, int(task.reward == "sparse")
     s.force_limit, s.damage = task.force_limit, task.damage
     s.depth = trocar.trocar(model, task.prefix).depth
@@ -163,6 +166,9 @@ class Worlds:
     if self._task.jitter:
       self.batch.place(trocar_body, rows["body_pos"], rows["body_quat"], mask)
     self.batch.pose([self._task.prefix + axis for axis in base.AXES], rows["pose"], mask)
+    tissue = self._domain.tissue(self._task, rows)
+    if tissue:
+      self._organ.configure(mask, **tissue)
     self.fields.begun.assign(mask)
     self.fields.port_pos.assign(rows["body_pos"])
     self.fields.port_quat.assign(rows["body_quat"][:, [1, 2, 3, 0]])
