@@ -30,6 +30,7 @@ COMMANDS = {
   ("wrap",): ("wrap", "make an organ of a mesh or a segmented volume, in a model folder"),
   ("exercise",): ("exercise", "run an exercise, record it and write its report"),
   ("report",): ("report", "write the page about a recording"),
+  ("train",): ("train", "learn an exercise in many worlds at once"),
   ("evaluate",): ("evaluate", "score a policy over many episodes of an exercise"),
   ("panel",): ("panel", "make the references of scores from many skilled performers"),
 }

@@ -42,6 +42,8 @@ class Exercises(VectorEnv):
   Attributes:
     worlds: their arrays
     device: Warp device of these
+    output: what is told, see `__init__`
+    max_episode_steps: of an episode
   """
 
   metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}  # noqa: RUF012
@@ -73,7 +75,7 @@ class Exercises(VectorEnv):
     """
     if output not in OUTPUTS:
       raise ValueError(f"output is {output!r}, expected one of {', '.join(OUTPUTS)}")
-    self.num_envs, self._output = count_of(num_envs), output
+    self.num_envs, self.output = count_of(num_envs), output
     _refuse(task, kwargs)
     single = Exercise(task, **kwargs)
     environment = single.environment
@@ -124,6 +126,7 @@ class Exercises(VectorEnv):
     shape = tuple(np.shape(actions))
     if shape != self.action_space.shape:
       raise ValueError(f"actions have shape {shape}, expected {self.action_space.shape}")
+    self._wait()
     over = worlds.step(on_device(actions, wp.float32, self.device))
     fields = worlds.fields
     told = [self._tell(fields.reward, np.float64)]
@@ -139,18 +142,24 @@ class Exercises(VectorEnv):
 
   def _tell(self, array: wp.array, dtype: Any = np.float64) -> Any:
     """Returns a copy of an array as users want it."""
-    if self._output == "warp":
+    if self.output == "warp":
       return wp.clone(array)
-    if self._output == "torch":
+    if self.output == "torch":
       return wp.to_torch(array).clone()
     return array.numpy().astype(dtype)
 
+  def _wait(self) -> None:
+    """Waits for what is on the device: torch does not wait for Warp, nor Warp for torch."""
+    if self.output == "torch":
+      wp.synchronize_device(self.device)
+
   def _observations(self) -> dict[str, Any]:
+    self._wait()
     return {name: self._tell(array) for name, array in self._observed.items()}
 
   def _final(self, over: np.ndarray) -> Any:
     seen = self._observations()
-    if self._output != "numpy":
+    if self.output != "numpy":
       return seen
     final = np.full(self.num_envs, None, dtype=object)
     for world in np.flatnonzero(over):
@@ -161,7 +170,7 @@ class Exercises(VectorEnv):
     """Returns what `info` is of a single environment; with a mask that is not of all worlds."""
     fields = self.worlds.fields
     found = {name: self._tell(getattr(fields, field)) for name, field in INFO.items()}
-    if self._output != "numpy":
+    if self.output != "numpy":
       return found
     found["success"] = fields.success.numpy().copy()
     found["outcome"] = np.array([OUTCOMES[k] for k in fields.outcome.numpy()], object)

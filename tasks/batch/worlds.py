@@ -34,6 +34,7 @@ class Worlds:
     own: what the domain has
     batch: the physics
     device: of the arrays
+    task: draws the episodes
   """
 
   def __init__(
@@ -56,7 +57,7 @@ class Worlds:
       **options: of `palpate.batch.make`
     """
     task: Any = environment.task
-    self._task, self._domain, self.nworld = task, domain, nworld
+    self.task, self._domain, self.nworld = task, domain, nworld
     domain.prepare(task)
     stage = task.compiled(task.variants[0])
     with warnings.catch_warnings():  # the plugin's passive forces are unknown to the compiler
@@ -132,11 +133,11 @@ class Worlds:
     self._launch(kernels.find_bad, action.shape, [action, self._bad])
     bad = int(self._bad.numpy()[0]) - 1
     if bad >= 0:
-      names = self._task.components
+      names = self.task.components
       world, k = divmod(bad, len(names))
       value = action.numpy()[world, k]
       raise ValueError(
-        f"{self._task.name}: action {names[k]} of world {world} is {value}, expected a number in "
+        f"{self.task.name}: action {names[k]} of world {world} is {value}, expected a number in "
         "[-1, 1]"
       )
 
@@ -162,11 +163,11 @@ class Worlds:
     self.episodes.draw(worlds)
     rows = self.episodes.rows
     self.batch.reset(mask)
-    trocar_body = f"{self._task.prefix}trocar"
-    if self._task.jitter:
+    trocar_body = f"{self.task.prefix}trocar"
+    if self.task.jitter:
       self.batch.place(trocar_body, rows["body_pos"], rows["body_quat"], mask)
-    self.batch.pose([self._task.prefix + axis for axis in base.AXES], rows["pose"], mask)
-    tissue = self._domain.tissue(self._task, rows)
+    self.batch.pose([self.task.prefix + axis for axis in base.AXES], rows["pose"], mask)
+    tissue = self._domain.tissue(self.task, rows)
     if tissue:
       self._organ.configure(mask, **tissue)
     self.fields.begun.assign(mask)
