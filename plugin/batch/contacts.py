@@ -17,6 +17,8 @@ from mujoco_warp._src import collision_primitive_core as core
 from mujoco_warp._src.types import ContactType, vec5
 from palpate.tissue.types import Array, fill, floats, ints, struct
 
+from . import convex
+from .convex import Convex
 from .patch import Patch
 
 _GEOM = mujoco.mjtGeom
@@ -26,8 +28,13 @@ _EACH = {
   int(_GEOM.mjGEOM_ELLIPSOID): 1,
   int(_GEOM.mjGEOM_CAPSULE): 5,
   int(_GEOM.mjGEOM_BOX): 11,
+  int(_GEOM.mjGEOM_PLANE): 1,  # a corner, see `find`
+  int(_GEOM.mjGEOM_CYLINDER): 1,
+  int(_GEOM.mjGEOM_MESH): 1,
 }
-_SPHERE, _ELLIPSOID, _CAPSULE, _BOX = (wp.constant(kind) for kind in _EACH)
+KINDS = tuple(_EACH)  # of tools that a batch knows
+_SPHERE, _ELLIPSOID, _CAPSULE, _BOX, _PLANE = (wp.constant(kind) for kind in KINDS[:5])
+_CYLINDER, _MESH = KINDS[5:]
 _FAR = wp.constant(1e10)  # what mujoco_warp says of a contact that is none
 _CONSTRAINT = wp.constant(int(ContactType.CONSTRAINT))
 _LEAST = 1e-5  # friction, as in MuJoCo
@@ -79,7 +86,9 @@ class Place:
   world: int
   first: int  # contact, -1 where they are counted alone
   room: int
-  elem: int
+  thread: int  # of all slots of all worlds
+  elem: int  # -1 for a corner alone
+  vert: int  # -1 for a triangle
   tool: int  # which of the organ's
   geom: int
 
@@ -158,7 +167,7 @@ def _put(c: Touch, at: Place, n: int, dist: float, pos: wp.vec3, normal: wp.vec3
     c.out_geom[k] = wp.vec2i(at.geom, -1)
     c.out_flex[k] = wp.vec2i(-1, c.flex)
     c.out_elem[k] = wp.vec2i(-1, at.elem)
-    c.out_vert[k] = wp.vec2i(-1, -1)
+    c.out_vert[k] = wp.vec2i(-1, at.vert)
     c.out_type[k] = _CONSTRAINT
     c.out_geomcollisionid[k] = n
   return n + 1
@@ -188,9 +197,12 @@ def _against(kinds: frozenset[int]):
   """Returns the function that finds a triangle's contacts with a tool of one of these kinds."""
   sphere, ellipsoid = _SPHERE in kinds, _ELLIPSOID in kinds
   capsule, box = _CAPSULE in kinds, _BOX in kinds
+  solid = bool(convex.KINDS & kinds)
 
   @wp.func
-  def against(p: Patch, c: Touch, at: Place, n: int, a: wp.vec3, b: wp.vec3, d: wp.vec3):
+  def against(
+    p: Patch, c: Touch, v: Convex, at: Place, n: int, a: wp.vec3, b: wp.vec3, d: wp.vec3
+  ):
     pos = p.geom_xpos[at.world, at.geom]
     rot = p.geom_xmat[at.world, at.geom]
     size = c.size[at.tool]
@@ -218,9 +230,29 @@ def _against(kinds: frozenset[int]):
         dists2, xs2, normals2 = core.box_triangle(pos, rot, size, a, b, d, c.radius, margin)
         for k in range(11):
           n = _put(c, at, n, dists2[k], xs2[k], normals2[k])
+    if wp.static(solid):
+      if kind == wp.static(_CYLINDER) or kind == wp.static(_MESH):
+        far3, x3, normal3 = convex.touch(
+          v, at.tool, kind, size, pos, rot, margin + c.radius, at.thread, at.world, a, b, d
+        )
+        n = _put(c, at, n, far3 - c.radius, x3 - 0.5 * c.radius * normal3, normal3)
     return n
 
   return against
+
+
+@wp.func
+def _on_planes(p: Patch, c: Touch, at: Place, n: int, x: wp.vec3):
+  """Writes the contacts of a node with planes; returns how many there are then."""
+  for tool in range(p.ntool):
+    at.tool = tool
+    at.geom = p.tool_geom[tool]
+    if c.kind[tool] == _PLANE:
+      rot = p.geom_xmat[at.world, at.geom]
+      out = wp.vec3(rot[0, 2], rot[1, 2], rot[2, 2])
+      gap = wp.dot(out, x - p.geom_xpos[at.world, at.geom]) - c.radius
+      n = _put(c, at, n, gap, x - (c.radius + 0.5 * gap) * out, out)
+  return n
 
 
 @wp.func
@@ -239,10 +271,11 @@ def kernel(kinds: frozenset[int]) -> wp.Kernel:
   against = _against(kinds)
 
   @wp.kernel(module="unique", enable_backward=False)
-  def find(p: Patch, c: Touch):
+  def find(p: Patch, c: Touch, v: Convex):
     world, slot = wp.tid()
     at = Place()
     at.world = world
+    at.thread = world * p.nslot + slot
     at.room = c.room
     first = c.nacon[0] + (world * p.nslot + slot) * c.room
     n = int(0)  # noqa: RUF046, UP018 - a variable to Warp
@@ -259,22 +292,27 @@ def kernel(kinds: frozenset[int]) -> wp.Kernel:
         whole = a >= 0 and b >= 0 and d >= 0
         if _owner(p, world, e) == i:
           at.first = wp.where(whole, first, -1)
+          at.vert = -1
           at.elem = 0
           if whole:
             at.elem = _triple(a, b, d, p.nslot)
-          lost = int(0)  # noqa: RUF046, UP018
+          more = wp.where(whole, n, 0)
           xa = _where(p, world, va)
           xb = _where(p, world, vb)
           xd = _where(p, world, vd)
           for tool in range(p.ntool):
             at.tool = tool
             at.geom = p.tool_geom[tool]
-            if whole:
-              n = against(p, c, at, n, xa, xb, xd)
-            else:
-              lost = against(p, c, at, lost, xa, xb, xd)
-          if lost > 0:
+            more = against(p, c, v, at, more, xa, xb, xd)
+          if whole:
+            n = more
+          elif more > 0:
             wp.atomic_add(p.missed, world, 1)
+      if wp.static(_PLANE in kinds):
+        at.first = first
+        at.elem = -1
+        at.vert = slot
+        n = _on_planes(p, c, at, n, _where(p, world, i))
     if n > c.room:
       wp.atomic_add(p.missed, world, n - c.room)
     for k in range(c.room):

@@ -13,6 +13,8 @@ class Start:
 
   mask: Array(wp.bool, ("nworld",))  # worlds to reset
   qpos0: floats("nq")
+  qvel0: floats("nv")
+  act0: floats("na")
   geom_xpos0: Array(wp.vec3, ("ngeom",))  # [m]
   geom_xmat0: Array(wp.mat33, ("ngeom",))
   mocap_pos0: Array(wp.vec3, ("nmocap",))
@@ -47,12 +49,12 @@ def reset(s: Start):
   for k in range(s.qpos.shape[1]):
     s.qpos[w, k] = s.qpos0[k]
   for k in range(s.qvel.shape[1]):
-    s.qvel[w, k] = 0.0
+    s.qvel[w, k] = s.qvel0[k]
     s.qacc[w, k] = 0.0
     s.qacc_warmstart[w, k] = 0.0
     s.qfrc_applied[w, k] = 0.0
   for k in range(s.act.shape[1]):
-    s.act[w, k] = 0.0
+    s.act[w, k] = s.act0[k]
   for k in range(s.ctrl.shape[1]):
     s.ctrl[w, k] = 0.0
   for k in range(s.sensordata.shape[1]):
@@ -67,6 +69,76 @@ def reset(s: Start):
   for k in range(s.geom_xpos.shape[1]):
     s.geom_xpos[w, k] = s.geom_xpos0[k]
     s.geom_xmat[w, k] = s.geom_xmat0[k]
+
+
+@wp.kernel(enable_backward=False)
+def pose(
+  mask: wp.array[bool],
+  at: wp.array2d[int],
+  values: wp.array2d[float],
+  qpos: wp.array2d[float],
+  qvel: wp.array2d[float],
+):
+  """Puts joints of the worlds of a mask at positions; `at` has their places in qpos and qvel."""
+  w, k = wp.tid()
+  if mask[w]:
+    qpos[w, at[k, 0]] = values[w, k]
+    qvel[w, at[k, 1]] = 0.0
+
+
+@wp.kernel(enable_backward=False)
+def place(
+  mask: wp.array[bool],
+  body: int,
+  pos: wp.array[wp.vec3],
+  quat: wp.array[wp.quat],
+  body_pos: wp.array2d[wp.vec3],
+  body_quat: wp.array2d[wp.quat],
+):
+  """Moves a body of the worlds of a mask in its parent's frame."""
+  w = wp.tid()
+  if mask[w]:
+    body_pos[w, body] = pos[w]
+    body_quat[w, body] = quat[w]
+
+
+@wp.kernel(enable_backward=False)
+def put_back(
+  mask: wp.array[bool],
+  xpos: wp.array2d[wp.vec3],
+  xmat: wp.array2d[wp.mat33],
+  geom_xpos: wp.array2d[wp.vec3],
+  geom_xmat: wp.array2d[wp.mat33],
+):
+  """Puts geoms of the worlds that are not of a mask where they were."""
+  w, g = wp.tid()
+  if not mask[w]:
+    geom_xpos[w, g] = xpos[w, g]
+    geom_xmat[w, g] = xmat[w, g]
+
+
+@wp.kernel(enable_backward=False)
+def sum_up(
+  adr: wp.array[int], data: wp.array2d[float], peak: wp.array2d[float], mean: wp.array2d[float]
+):
+  """Adds the sensors of a step to their sums, and keeps the greatest squares of their norms."""
+  w, k = wp.tid()
+  square = float(0.0)  # noqa: UP018 - a variable to Warp
+  for i in range(adr[k], adr[k + 1]):
+    square += data[w, i] * data[w, i]
+    mean[w, i] = mean[w, i] + data[w, i]
+  peak[w, k] = wp.max(peak[w, k], square)
+
+
+@wp.kernel(enable_backward=False)
+def average(
+  adr: wp.array[int], steps: int, peak: wp.array2d[float], mean: wp.array2d[float]
+):
+  """Makes norms and means of the sums of some steps."""
+  w, k = wp.tid()
+  peak[w, k] = wp.sqrt(peak[w, k])
+  for i in range(adr[k], adr[k + 1]):
+    mean[w, i] = mean[w, i] / float(steps)
 
 
 @wp.kernel(enable_backward=False)

@@ -10,10 +10,11 @@ import warp as wp
 from palpate.engine import inertia, mjstruct, slots
 from palpate.tissue import body as bodies
 from palpate.tissue import config as configuration
+from palpate.tissue import device as devices
 from palpate.tissue import order, shape, step
 from palpate.tissue.types import NUMBERS
 
-from . import contacts, kernels, patch
+from . import contacts, convex, kernels, patch
 from .base import Tissue, spread
 from .patch import GRADES, launch
 from .strip import Slots
@@ -22,6 +23,13 @@ _WHAT = {"xpos": 0, "xvel": 1, "contact_force": 2}
 _STATUS = {"iterations": 0, "residual": 1}
 _KEYS = (*NUMBERS, "young", "friction")
 _FEW = 32  # values that are checked one by one
+
+
+def _plan(body, config) -> devices.Plan | None:
+  """Returns how a block takes a world's step; None where it is one that blocks do not know."""
+  if config.integrator != "implicit" or body.newton > 1 or body.is_solid:
+    return None
+  return devices.plan(body.device, body.shape.nslice, body.shape.nslot, body.has_bending)
 
 
 class Organ(Tissue):
@@ -42,6 +50,7 @@ class Organ(Tissue):
     self._batch, self._scheme = batch, step.SCHEMES[organ.config.integrator]
     still = shape.make(organ.mesh, organ.config, ~organ.free, str(device), nworld=0)
     self.body = bodies.worlds(still, nworld)
+    self.body.plan = _plan(self.body, organ.config)
     model, d, m = batch.model, batch.d, batch.m
     node = self.body.shape.node.numpy()
     mass = np.ones(self.body.shape.nnode, np.float32)
@@ -78,6 +87,7 @@ class Organ(Tissue):
     )  # fmt: skip
     self.patch = patch.make(values, self.body)
     self._touch = contacts.make(model, organ, tools, place.flex, nworld, d)
+    self._convex = convex.make(model, tools, nworld * place.nslot, m, d)
     kinds = frozenset(int(kind) for kind in model.geom_type[tools])
     self._find, self._region = contacts.kernel(kinds), int(nworld * place.nslot * self._touch.room)
     self._graded = False
@@ -110,7 +120,8 @@ class Organ(Tissue):
   def touch(self):
     """Writes the window's contacts."""
     dim, device = (self._batch.nworld, self.place.nslot), self.body.device
-    wp.launch(self._find, dim=dim, inputs=[self.patch, self._touch], device=device, block_dim=64)
+    inputs = [self.patch, self._touch, self._convex]
+    wp.launch(self._find, dim=dim, inputs=inputs, device=device, block_dim=64)
     wp.launch(contacts.add, dim=1, inputs=[self._touch.nacon, self._region], device=device)
 
   def push(self):

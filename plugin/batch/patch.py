@@ -46,6 +46,7 @@ class Patch:
   weight: wp.float64  # mass of the organ [kg]
   slot_mass: wp.float64  # mass of a slot's body [kg]
   heaviest: wp.float64  # see `inertia.stiffness`
+  skin: wp.float64  # distance from a geom within which a node touches it [m]
   # The organ:
   node: ints("nvert")  # node of a vertex
   free: ints("nnode")  # whether a node moves
@@ -66,6 +67,13 @@ class Patch:
   force: floats("nworld", "nnode", 3)  # contact force of the last step [N]
   last: vector  # last change of the velocity [m/s]
   before: vector  # the one before it [m/s]
+  # Where a reset puts it:
+  disp0: floats("nslice", 3, 8)  # displacement [m]
+  vel0: floats("nslice", 3, 8)  # velocity [m/s]
+  last0: floats("nslice", 3, 8)
+  before0: floats("nslice", 3, 8)
+  force0: floats("nnode", 3)  # contact force [N]
+  heavier0: doubles(1)
   # Within a step:
   tool: doubles("nworld", "ntool", len(GEOM))  # see GEOM
   count: ints("nworld")  # candidates
@@ -120,7 +128,8 @@ def constants(body, organ, tools: np.ndarray, model: mujoco.MjModel, inertia, he
     inertia: effective inertia of every vertex [kg]
     held: mass of every vertex, of pinned ones that of a wall [kg]
   """
-  mesh, touch = organ.mesh, _touch(organ, tools, model)
+  mesh, skin = organ.mesh, _skin(organ, model)
+  touch = _touch(mesh, skin + float(model.geom_margin[tools].max(initial=0.0)))
   node, nnode = body.shape.node.numpy(), body.shape.nnode
   elem = node[mesh.elem]
   count = np.bincount(elem.ravel(), minlength=nnode)
@@ -139,6 +148,7 @@ def constants(body, organ, tools: np.ndarray, model: mujoco.MjModel, inertia, he
     h=model.opt.timestep,
     rest_share=step.REST,
     weight=float(organ.mass.sum()),
+    skin=skin,
     node=node,
     free=by_node(organ.free),
     mass=by_node(organ.mass),
@@ -156,17 +166,20 @@ def constants(body, organ, tools: np.ndarray, model: mujoco.MjModel, inertia, he
   )  # fmt: skip
 
 
-def _touch(organ, tools: np.ndarray, model) -> np.ndarray:
+def _skin(organ, model) -> float:
+  """Returns the distance from an organ's triangles within which it touches [m]."""
+  flex = organ.windows.flex if organ.windows else [organ.flex]
+  return float(model.flex_radius[flex].max() + model.flex_margin[flex].max())
+
+
+def _touch(mesh, reach: float) -> np.ndarray:
   """Returns the distance from a geom within which a vertex's triangles may touch it [m]."""
-  mesh = organ.mesh
   edge = mesh.rest[mesh.elem[:, [1, 2, 0]]] - mesh.rest[mesh.elem]
   length = np.linalg.norm(edge, axis=2)
   longest = np.zeros(mesh.nvert)
   for corner in (mesh.elem, mesh.elem[:, [1, 2, 0]]):
     np.maximum.at(longest, corner.ravel(), length.ravel())
-  flex = organ.windows.flex if organ.windows else [organ.flex]
-  skin = float(model.flex_radius[flex].max() + model.flex_margin[flex].max())
-  return longest + skin + float(model.geom_margin[tools].max(initial=0.0))
+  return longest + reach
 
 
 def _tools(tools: np.ndarray, model, reach: float) -> np.ndarray:
@@ -194,6 +207,9 @@ def variables(nworld: int, nslot: int, nslice: int) -> dict:
     force=np.zeros((nworld, nnode, 3)),
     last=np.zeros(shape),
     before=np.zeros(shape),
+    **{f"{name}0": np.zeros(shape[1:]) for name in ("disp", "vel", "last", "before")},
+    force0=np.zeros((nnode, 3)),
+    heavier0=np.zeros(1),
     count=np.zeros(nworld),
     candidate=np.zeros((nworld, most)),
     distance=np.zeros((nworld, most)),

@@ -1,8 +1,13 @@
-"""Resets of worlds on a device: those of a mask, and those whose numbers are not finite."""
+"""Resets of worlds on a device: those of a mask, and those whose numbers are not finite.
+
+Where worlds start is in arrays of its own: at first what `qpos0` has, or any state since.
+"""
 
 from __future__ import annotations
 
 import mujoco
+import mujoco_warp as mjw
+import numpy as np
 import warp as wp
 from palpate.tissue.types import fill
 
@@ -27,21 +32,33 @@ class Rest:
     values |= dict(
       mask=batch.mask,
       qpos0=bare.qpos0,
+      qvel0=np.zeros(bare.nv),
+      act0=np.zeros(bare.na),
       geom_xpos0=start.geom_xpos,
       geom_xmat0=start.geom_xmat.reshape(-1, 3, 3),
       mocap_pos0=start.mocap_pos,
       mocap_quat0=start.mocap_quat,
       eq_active0=bare.eq_active0.astype(bool),
     )  # fmt: skip
-    self._start = fill(Start, batch.device, values)
+    self.start = fill(Start, batch.device, values)
+    self._kept = wp.clone(d.geom_xpos), wp.clone(d.geom_xmat)
 
   def launch(self):
     """Puts the worlds of the mask at rest."""
     wp.launch(
-      kernels.reset, dim=self._batch.nworld, inputs=[self._start], device=self._batch.device
+      kernels.reset, dim=self._batch.nworld, inputs=[self.start], device=self._batch.device
     )
     for organ in self._batch.organs.values():
       organ.rest()
+
+  def look(self):
+    """Finds where geoms are in the worlds of the mask, whose joints or bodies have been moved."""
+    d, device = self._batch.d, self._batch.device
+    for kept, array in zip(self._kept, (d.geom_xpos, d.geom_xmat), strict=True):
+      wp.copy(kept, array)
+    mjw.kinematics(self._batch.m, d)
+    inputs = [self.mask, *self._kept, d.geom_xpos, d.geom_xmat]
+    wp.launch(kernels.put_back, dim=d.geom_xpos.shape, inputs=inputs, device=device)
 
   def find(self):
     """Resets and counts the worlds with numbers that are not finite."""

@@ -15,6 +15,7 @@ from .organs import Organ
 
 _MOTION = ("disp", "vel", "last", "before")
 _PLAIN = ("act", "ctrl", "mocap_pos")
+_STARTS = ("qpos", "qvel", "act", "mocap_pos", "mocap_quat", "eq_active", "geom_xpos", "geom_xmat")
 
 
 def bytes_of(bare: mujoco.MjModel, njmax: int, ncon: int) -> float:
@@ -27,19 +28,32 @@ def bytes_of(bare: mujoco.MjModel, njmax: int, ncon: int) -> float:
 # Reading.
 
 
-def tell(batch):
-  """Writes qpos and qvel in the model's layout."""
-  for k, name in enumerate(("qpos", "qvel")):
-    kept, out = batch.kept[k], getattr(batch, name + "_out")
-    at = wp.array(kept, dtype=int, device=batch.device)
-    dim, source = (batch.nworld, len(kept)), getattr(batch.d, name)
-    wp.launch(kernels.spread, dim=dim, inputs=[source, at, out], device=batch.device)
-    for organ in batch.organs.values():
-      declared = organ.declared
-      if declared.windows is None:
-        adr = wp.array((declared.qposadr, declared.dofadr)[k], dtype=int, device=batch.device)
-        dim, inputs = (batch.nworld, organ.nvert), [organ.patch, adr, k, out]
-        wp.launch(kernels.spread_nodes, dim=dim, inputs=inputs, device=batch.device)
+class Teller:
+  """Writes qpos and qvel of a batch in the model's layout."""
+
+  def __init__(self, batch):
+    def put(values):
+      return wp.array(values, dtype=int, device=batch.device)
+
+    self._batch = batch
+    self._kept = [put(numbers) for numbers in batch.kept]
+    nodal = [organ for organ in batch.organs.values() if organ.declared.windows is None]
+    self._nodes = [
+      (organ, (put(organ.declared.qposadr), put(organ.declared.dofadr))) for organ in nodal
+    ]
+
+  def tell(self):
+    """Brings both up to date."""
+    batch, device = self._batch, self._batch.device
+    outs = (batch.qpos_out, batch.qvel_out)
+    for k, (at, source, out) in enumerate(
+      zip(self._kept, (batch.d.qpos, batch.d.qvel), outs, strict=True)
+    ):
+      dim = (batch.nworld, at.size)
+      wp.launch(kernels.spread, dim=dim, inputs=[source, at, out], device=device)
+      for organ, adr in self._nodes:
+        dim, inputs = (batch.nworld, organ.nvert), [organ.patch, adr[k], k, out]
+        wp.launch(kernels.spread_nodes, dim=dim, inputs=inputs, device=device)
 
 
 # One world, to and from an mjData.
@@ -141,6 +155,24 @@ def push(batch, world: int, data: mujoco.MjData):
   d.time[world : world + 1].assign(np.array([data.time], np.float32))
   for organ in batch.organs.values():
     _push_organ(organ, world, model, data)
+
+
+def keep(batch, start, data: mujoco.MjData):
+  """Lets worlds start in the state of an mjData; `start` is what resets have of it."""
+  d, organs = batch.d, batch.organs.values()
+  pairs = [(getattr(d, name), getattr(start, f"{name}0")) for name in _STARTS]
+  for organ in organs:
+    own = _vectors(organ) | {"force": organ.patch.force, "heavier": organ.patch.heavier}
+    pairs += [(array, getattr(organ.patch, f"{name}0")) for name, array in own.items()]
+  # The first world has it for a moment.
+  changed = [array for array, _ in pairs] + [d.ctrl, d.time, d.qacc_warmstart]
+  saved = [(array, wp.clone(array[:1])) for array in changed if array.size]
+  push(batch, 0, data)
+  for array, kept in pairs:
+    if array.size:
+      wp.copy(kept.flatten(), array[:1].flatten())
+  for array, row in saved:
+    wp.copy(array[:1], row)
 
 
 def _assign(array: wp.array, world: int, values: np.ndarray):

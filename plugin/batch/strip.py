@@ -18,12 +18,13 @@ import numpy as np
 from palpate import windows
 from palpate.engine import mjstruct
 
+from .contacts import KINDS
+
 # Slots of an organ: all triples of more are too many.
 LEAST, MOST = 4, 48
 _USUAL = 24  # at most, unless told
 _INERTIA = 1e-8  # of a slot's body, which does not turn [kg m^2]
 _COUNTED = ("nu", "na", "nsensor", "nsensordata", "neq", "ntendon", "npair", "nexclude", "nmocap")
-_TOOLS = ("SPHERE", "CAPSULE", "ELLIPSOID", "BOX")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,18 +56,11 @@ def tools_of(model: mujoco.MjModel, organ) -> np.ndarray:
     contype, conaffinity = model.flex_contype[organ.flex], model.flex_conaffinity[organ.flex]
     meets = (model.geom_contype & conaffinity) | (model.geom_conaffinity & contype)
     found = np.flatnonzero(meets)
-    fixed = [g for g in found if model.body_weldid[model.geom_bodyid[g]] == 0]
-    if fixed:
-      raise ValueError(
-        f"organ {organ.name!r} collides with {_geom(model, int(fixed[0]))}, which does not move; a "
-        "batch on a GPU follows what moves, expected contype and conaffinity that do not meet"
-      )
   for g in found:
-    if mujoco.mjtGeom(model.geom_type[g]).name.removeprefix("mjGEOM_") not in _TOOLS:
-      kind = mujoco.mjtGeom(model.geom_type[g]).name.removeprefix("mjGEOM_").lower()
+    if int(model.geom_type[g]) not in KINDS:
       raise ValueError(
-        f"organ {organ.name!r} collides with {_geom(model, int(g))}, a {kind}; a batch on "
-        f"a GPU knows {', '.join(name.lower() for name in _TOOLS)}"
+        f"organ {organ.name!r} collides with {_geom(model, int(g))}, of type "
+        f"{_kind(model.geom_type[g])}; a batch on a GPU knows {', '.join(map(_kind, KINDS))}"
       )
   return found
 
@@ -94,6 +88,10 @@ def slots_for(model, organ, tools: np.ndarray, nodes) -> int:
     r = (0.5 * (low + middle)) + edge
     many += (math.pi * r * r + 2 * r * 2 * (large - middle)) / (math.sqrt(3) / 2 * edge * edge)
   return int(min(np.clip(math.ceil(many), 8, _USUAL), nvert))
+
+
+def _kind(kind: int) -> str:
+  return mujoco.mjtGeom(int(kind)).name.removeprefix("mjGEOM_").lower()
 
 
 def _geom(model, g: int) -> str:

@@ -18,7 +18,7 @@ from palpate.engine import plugin as engine
 from palpate.organ import instances
 from palpate.tissue import device as devices
 
-from . import contacts, states, strip
+from . import contacts, convex, kernels, states, strip
 from .base import Batch, Tissue, refuse_crowd
 from .organs import Organ
 from .rest import Rest
@@ -69,7 +69,9 @@ class Worlds(Batch):
         name: Organ(self, w, s, t)
         for (name, w), s, t in zip(spaces.items(), slots, tools, strict=True)
       }
-      self._rest = Rest(self, bare)
+      self._rest, self._bare = Rest(self, bare), bare
+      self._teller = states.Teller(self)
+      self._sensors = wp.array([*model.sensor_adr, model.nsensordata], dtype=int)
       self._alias()
       self._callbacks()
       self.record()
@@ -88,9 +90,11 @@ class Worlds(Batch):
     self.njmax = strip.rows_of(bare) + (between + sum(most)) * each
     ncon = between + sum(regions)
     size = states.bytes_of(bare, self.njmax, ncon) + sum(Organ.bytes_of(w) for w in spaces.values())
+    size += sum(convex.bytes_of(model.geom_type[t], n) for t, n in zip(tools, nslots, strict=True))
     refuse_crowd(nworld, size, _room(self.device), str(self.device))
     try:
-      sizes = {"dof_armature": nworld, "body_invweight0": nworld}
+      own = ("dof_armature", "body_invweight0", "body_pos", "body_quat")
+      sizes = dict.fromkeys(own, nworld)
       self.m = mjw.put_model(bare, batch_sizes=sizes)
     except (NotImplementedError, ValueError) as error:
       raise ValueError(f"mujoco_warp cannot have this scene: {error}") from None
@@ -145,6 +149,13 @@ class Worlds(Batch):
     self.begin()
     self.step_tools()
     self.end()
+    self._sense(kernels.sum_up, self.d.sensordata)
+
+  def _sense(self, kernel, what):
+    if self.model.nsensor:
+      inputs = [self._sensors, what, self._summary["peak"], self._summary["mean"]]
+      dim = (self.nworld, self.model.nsensor)
+      wp.launch(kernel, dim=dim, inputs=inputs, device=self.device)
 
   def _after(self):
     """Launches what follows steps: worlds that are not finite are reset and counted."""
@@ -153,7 +164,8 @@ class Worlds(Batch):
   def record(self):
     """Records the graphs, on a device that has them."""
     self._graphs = {}
-    work = {"step": self._once, "after": self._after, "reset": self._rest.launch}
+    work = {"step": self._once, "after": self._after}
+    work |= {"reset": self._rest.launch, "look": self._rest.look}
     for organ in self._organs.values():
       organ.load()
     if not self.device.is_cuda:
@@ -177,16 +189,44 @@ class Worlds(Batch):
   # Doing.
 
   def _step(self, n: int):
+    for sums in self._summary.values():
+      sums.zero_()
     for _ in range(n):
       self._run("step")
+    self._sense(kernels.average, n)
     self._run("after")
 
   def _reset(self, mask: wp.array):
     wp.copy(self.mask, mask)
     self._run("reset")
 
+  def _start(self, data: mujoco.MjData):
+    states.keep(self, self._rest.start, data)
+
+  def _pose(self, adr: np.ndarray, values: np.ndarray, mask: wp.array):
+    at = [np.searchsorted(kept, numbers) for kept, numbers in zip(self._kept, adr.T, strict=True)]
+    at, values = self._put_rows(np.stack(at, 1), int), self._put_rows(values, float)
+    inputs = [mask, at, values, self.d.qpos, self.d.qvel]
+    wp.launch(kernels.pose, dim=values.shape, inputs=inputs, device=self.device)
+    self._look(mask)
+
+  def _place(self, body: int, pos: np.ndarray, quat: np.ndarray, mask: wp.array):
+    number = self._bare.body(self.model.body(body).name).id
+    pos = self._put_rows(pos, wp.vec3)
+    quat = self._put_rows(quat, wp.quat)  # w first, as mujoco_warp has them
+    inputs = [mask, number, pos, quat, self.m.body_pos, self.m.body_quat]
+    wp.launch(kernels.place, dim=self.nworld, inputs=inputs, device=self.device)
+    self._look(mask)
+
+  def _look(self, mask: wp.array):
+    wp.copy(self.mask, mask)
+    self._run("look")
+
+  def _put_rows(self, values: np.ndarray, dtype) -> wp.array:
+    return wp.array(values, dtype=dtype, device=self.device)
+
   def _tell(self):
-    states.tell(self)
+    self._teller.tell()
 
   def _get_state(self, world: int, data: mujoco.MjData):
     states.pull(self, world, data)

@@ -232,6 +232,31 @@ PALPATE Spring spring(V k, V3 t, V3 q) {
 
 // Rows of the matrix.
 
+// What the rows of a world are made from, and where they go: the first `nheld` rows of blocks to
+// `held`, the others to `block`.
+struct Rows {
+  const float* disp;
+  const float* vel;
+  float *rhs, *diag, *inverse, *areavec, *normal, *block, *held;
+  int nheld;
+
+  PALPATE float* blocks(int row, int width) const {
+    return (row + width <= nheld ? held : block) + 72 * (size_t)row;
+  }
+};
+
+template <class Fields>
+PALPATE Rows rows(const Fields& f, int world) {
+  const size_t base = (size_t)world * f.shape.nslice;
+  return {
+    f.system.disp_trial.data + 24 * base, f.system.vel_trial.data + 24 * base,
+    f.system.rhs.data + 24 * base, f.system.diag.data + 8 * base,
+    f.system.inverse.data + 48 * base, f.system.areavec.data + 24 * base,
+    f.system.normal.data + 24 * base,
+    f.system.block.data + 72 * (size_t)world * f.shape.nslot, nullptr, 0
+  };
+}
+
 // The fan of a slice's nodes, see `Shape`; entries [k] and [k + 1] are the k-th triangle.
 struct Fan {
   int width;
@@ -245,17 +270,17 @@ struct Fan {
 };
 
 template <class Fields>
-PALPATE Fan fan_of(const Fields& f, int world, int s, Lane lane) {
-  const int row = f.shape.slot_adr.data[s];
+PALPATE Fan fan_of(const Fields& f, const Rows& at, int s, Lane lane) {
+  const int row = f.shape.slot_adr.data[s], width = f.shape.slot_adr.data[s + 1] - row;
   return {
-    f.shape.slot_adr.data[s + 1] - row,
+    width,
     ld(f.shape.degree.data, s, lane),
     f.shape.fan_node.data + 8 * (row + 2 * s),
     f.shape.fan_rest.data + 24 * (row + 2 * s),
     f.tissue.fan_metric.data + 40 * (row + s),
     f.shape.fan_corner.data + 8 * (row + s),
     f.shape.fan_side.data + 8 * (row + s),
-    f.system.block.data + 72 * ((size_t)world * f.shape.nslot + row),
+    at.blocks(row, width),
   };
 }
 
@@ -353,60 +378,68 @@ PALPATE V3 bending(const Fan& fan, const float* normal, const float* corner, V3 
   return b;
 }
 
-// Writes what is on the diagonal of slice s, at place `at` of all worlds, and the inverse of `self`,
-// the block there.
-template <class Fields>
-PALPATE void put_diagonal(const Fields& f, size_t at, int s, V diag, S3 self, Lane lane) {
-  st(f.system.diag.data + 8 * at, 0, diag, lane);
-  // Zero where a node cannot move, which keeps it out of the solve.
-  const S3 inv = inverse(self, ld(f.shape.free.data, s, lane));
-  float* out = f.system.inverse.data + 48 * at;
-  st3(out, 0, {inv.xx, inv.xy, inv.xz}, lane);
-  st3(out, 3, {inv.yy, inv.yz, inv.zz}, lane);
+// Writes what is on the diagonal of a slice, and the inverse of `self`, the block there: zero where a
+// node cannot move, which keeps it out of the solve.
+PALPATE void put_diagonal(float* diags, float* inverses, V free, V diag, S3 self, Lane lane) {
+  st(diags, 0, diag, lane);
+  const S3 inv = inverse(self, free);
+  st3(inverses, 0, {inv.xx, inv.xy, inv.xz}, lane);
+  st3(inverses, 3, {inv.yy, inv.yz, inv.zz}, lane);
 }
 
 // Right-hand side of each node and, for an implicit stage, its row of the matrix: one pass around
 // the fan of each node.
 template <class Fields>
-PALPATE void row(const Fields& f, Thread t, int stage) {
-  const float* step = f.state.step.data + 4 * t.world;
-  const float* number = numbers(f, t.world);
+struct Assembly {
+  const Fields& f;
+  const int world, stage;
+  const Rows& at;
+
+  const float* const step = f.state.step.data + 4 * world;
+  const float* const number = numbers(f, world);
   const float h = step[0], g = step[1], gv = weight_of_rate(stage, step);
-  const float foundation = number[FOUNDATION];
-  const size_t base = (size_t)t.world * f.shape.nslice;
-  const size_t elem = (size_t)t.world * f.shape.nelemslice;
-  const float* disp = f.system.disp_trial.data + 24 * base;
-  const float* vel = f.system.vel_trial.data + 24 * base;
-  const float* normal = f.system.elem_normal.data + 32 * elem;
-  const float* corner = f.system.elem_corner.data + 24 * elem;
+  const float foundation = number[FOUNDATION], young = number[YOUNG_SCALE];
   const bool bends = f.shape.nhingeslice > 0;
   const bool areas = bends || number[BULK] != 0.0f || number[PRESSURE] != 0.0f;
-  const float young = number[YOUNG_SCALE];
   const bool matrix = stage == FIRST || stage == LATER;
+  const float* const normal =
+    f.system.elem_normal.data + 32 * (size_t)world * f.shape.nelemslice;
+  const float* const corner =
+    f.system.elem_corner.data + 24 * (size_t)world * f.shape.nelemslice;
   const Wanted want = {g, number[STIFFNESS], young, matrix, areas, bends, normal};
-  each_slice(t, f.shape.nslice, [&](int s, Lane lane) {
-    const size_t at = base + s;
-    const Fan fan = fan_of(f, t.world, s, lane);
-    const Motion m = {disp, vel, ld3(disp + 24 * s, lane), ld3(vel + 24 * s, lane)};
+
+  PALPATE void row(int s, Lane lane) const {
+    const size_t own = (size_t)world * f.shape.nslice + s;
+    const Fan fan = fan_of(f, at, s, lane);
+    const Motion m = {at.disp, at.vel, ld3(at.disp + 24 * s, lane), ld3(at.vel + 24 * s, lane)};
     Sum sum = around(fan, m, want, lane);
-    const V mass = ld(f.state.mass.data + 8 * at, 0, lane);
+    const V mass = ld(f.state.mass.data + 8 * own, 0, lane);
     const V kf = splat(foundation) * ld(f.shape.area.data, s, lane), diag = mass + g * kf;
-    V3 b = h * (sum.force + ld3(f.state.force_ext.data + 24 * at, lane) - kf * m.u)
+    V3 b = h * (sum.force + ld3(f.state.force_ext.data + 24 * own, lane) - kf * m.u)
       + gv * (sum.rate - kf * m.v);
-    if (stage == LATER) b -= mass * ld3(f.state.dvel.data + 24 * at, lane);
+    if (stage == LATER) b -= mass * ld3(f.state.dvel.data + 24 * own, lane);
     S3 self = splat(g) * sum.stiffness + diag;
-    if (areas) st3(f.system.areavec.data + 24 * at, sum.area, lane);
+    if (areas) st3(at.areavec + 24 * s, sum.area, lane);
     if (bends) {
       b = bending(fan, normal, corner, b, lane);
       // Hinges of squeezed triangles are stiffer than at rest; the normal's length makes up for it.
       const V scale = vsqrt(sum.squeeze / vmax(dot(sum.area, sum.area), splat(1e-30f)));
       const V3 n = scale * sum.area;
-      st3(f.system.normal.data + 24 * at, n, lane);
+      st3(at.normal + 24 * s, n, lane);
       self = self + square(young * g * ld(f.tissue.bend_diag.data, s, lane), n);
     }
-    st3(f.system.rhs.data + 24 * at, b, lane);
-    if (want.matrix) put_diagonal(f, at, s, diag, self, lane);
-  });
+    st3(at.rhs + 24 * s, b, lane);
+    if (!matrix) return;
+    const V free = ld(f.shape.free.data, s, lane);
+    put_diagonal(at.diag + 8 * s, at.inverse + 48 * s, free, diag, self, lane);
+  }
+};
+
+template <class Fields>
+PALPATE void row(const Fields& f, Thread t, int stage) {
+  const Rows at = rows(f, t.world);
+  const Assembly<Fields> assembly{f, t.world, stage, at};
+  each_slice(t, f.shape.nslice, [&](int s, Lane lane) { assembly.row(s, lane); });
 }
 
 }  // namespace palpate

@@ -44,6 +44,23 @@ class OwnVector {
   V3 own[Own<OWN>::SIZE];
 };
 
+// The memory of a block that has a world to itself, as many floats as the launch gives it; none on the
+// CPU.
+#if ON_CUDA
+PALPATE float* block_memory() {
+  extern __shared__ float palpate_memory[];
+  return palpate_memory;
+}
+PALPATE int block_room() {
+  unsigned bytes;
+  asm("mov.u32 %0, %%dynamic_smem_size;" : "=r"(bytes));
+  return bytes / 4;
+}
+PALPATE void meet_block() { __syncthreads(); }
+#else
+PALPATE void meet_block() {}
+#endif
+
 #if ON_CUDA
 
 // Memory of a block: two sets of what its warps and shares of blocks sum up to, and x, y, z and the
@@ -165,6 +182,16 @@ class Group {
     a = sums[0]; b = sums[1]; c = sums[2];
   }
   PALPATE void sync() { sum(0.0f); }
+  // The greatest number >= 0 of the threads of one block.
+  PALPATE float most(V v) {
+    for (int o = 16; o > 0; o >>= 1) v = fmaxf(v, __shfl_xor_sync(0xffffffffu, v, o));
+    WarpSums& mine = warp_sums()[flip];
+    flip ^= 1;
+    if ((threadIdx.x & 31) == 0) mine[0][threadIdx.x >> 5] = v;
+    __syncthreads();
+    for (int w = 0; w < blockDim.x >> 5; ++w) v = fmaxf(v, mine[0][w]);
+    return v;
+  }
 
   // Slices of each block where each has its own, and where they begin.
   PALPATE int share(int nslice) const { return (nslice + nblock - 1) / nblock; }
@@ -382,6 +409,7 @@ class Group {
   PALPATE void sum(V u, V v, float& a, float& b) { a = sum_of(u); b = sum_of(v); }
   PALPATE void sum(V u, V v, V w, float& a, float& b, float& c) { sum(u, v, a, b); c = sum_of(w); }
   PALPATE void sync() {}
+  PALPATE float most(V v) { return __builtin_reduce_max(v); }
 };
 
 template <int OWN>

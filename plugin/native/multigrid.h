@@ -229,8 +229,9 @@ PALPATE void solve_cycles(const Cycle& f, Thread t, int stage) {
   const size_t base = (size_t)t.world * f.fine.shape.nslice;
   const Slices<0> slices(group, f.fine.shape.nslice);
   Vectors z{f.fine.system.z.data + 24 * base, f.fine.system.zn.data + 8 * base};
-  using Solve = Pcg<Fields, Group<MEMORY>, Slices<0>, Vectors>;
-  Solve pcg{f.fine, t.world, stage, group, slices, z};
+  using Solve = Pcg<Fields, Group<MEMORY>, Slices<0>, Vectors, Matrix>;
+  const Matrix a = matrix(f.fine, t.world);
+  Solve pcg{f.fine, t.world, stage, group, slices, z, a};
   const Level levels[2] = {level(f.fine, t.world), level(f.coarse, t.world)};
   Multigrid<Cycle, Solve> cycles(f, levels, pcg);
   pcg.solve(cycles);

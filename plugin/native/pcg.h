@@ -23,15 +23,15 @@ struct Part { V rr, along; };
 //   before(pcg, part)              before the product: says whether to go on
 //   after(pcg, part, zw, curved)   after it: sums zw to `curved`, z^T A z; says whether to go on
 // One of both sets rz = r^T z, the residual and `along` from the part.
-template <class Fields, class Team, class Slices, class Vector>
+template <class Fields, class Team, class Slices, class Vector, class Any>
 struct Pcg {
   const Fields& f;
   const int world, stage;
   Team& group;
   const Slices& slices;
   Vector& z;
+  const Any& a;  // the matrix
 
-  const Matrix a = matrix(f, world);
   const size_t at = 24 * (size_t)world * f.shape.nslice;
   const float* const areavec = f.system.areavec.data + at;
   const float* const warm = f.state.dvel_warm.data + at;
@@ -239,8 +239,10 @@ PALPATE void solve(const Fields& f, Thread t, int stage) {
     using Vector = Quads<decltype(own)::COUNT>;
     const Mine slices(group, f.shape.nslice);
     Vector z(f, t.world, slices);
+    const Matrix a = matrix(f, t.world);
     Jacobi jacobi;
-    Pcg<Fields, Group<SUMS>, Mine, Vector>{f, t.world, stage, group, slices, z}.solve(jacobi);
+    Pcg<Fields, Group<SUMS>, Mine, Vector, Matrix>{f, t.world, stage, group, slices, z, a}.solve(
+      jacobi);
   });
 }
 

@@ -18,6 +18,10 @@ struct Matrix {
   const float* bend_gain;
   float bend;  // (h^2 + h damping) times the scale of Young's modulus, for the bending matrix
   bool bends;  // whether there is one
+
+  // Runs body(blocks) for the blocks of a slice, which start at `row`.
+  template <class Body>
+  PALPATE void with_blocks(int row, int, Body body) const { INLINED body(block + 72 * (size_t)row); }
 };
 
 template <class Fields>
@@ -34,15 +38,16 @@ PALPATE Matrix matrix(const Fields& f, int world) {
 // Row s of A z, where z is `own`:
 //   diag own + sum_j block_j (z_j - own) + bend normal sum_j gain_j (normal_j . z_j),
 // the last term with bending only. `z` says how a vector is read: `Vectors` or `Quads`.
-template <class Vector>
-PALPATE V3 product(const Matrix& a, const Vector& z, V3 own, int s, Lane lane) {
+template <class Any, class Vector>
+PALPATE V3 product(const Any& a, const Vector& z, V3 own, int s, Lane lane) {
   Carried out = ld(a.diag, s, lane) * own;
   {
     const int row = a.slot[s], width = a.slot[s + 1] - row;
-    const float* block = a.block + 72 * (size_t)row;
-    z.each_near(a.fan + 8 * (row + 2 * s + 1), width, lane, [&](V3 near) {
-      out = out + ld9(block, lane) * (near - own);
-      block += 72;
+    a.with_blocks(row, width, [&](const float* block) {
+      z.each_near(a.fan + 8 * (row + 2 * s + 1), width, lane, [&](V3 near) {
+        out = out + ld9(block, lane) * (near - own);
+        block += 72;
+      });
     });
   }
   if (a.bends) {

@@ -4,30 +4,41 @@
 
 namespace palpate {
 
-// How fast edges change: the largest (rate of an edge's ends over its length)^2.
+// How fast the edges of a slice's nodes change: the largest (rate of an edge's ends over its
+// length)^2.
+template <class Fields>
+PALPATE V fastest(const Fields& f, const float* vel, int s, Lane lane) {
+  const int first = f.shape.slot_adr.data[s], width = f.shape.slot_adr.data[s + 1] - first;
+  const int* node = f.shape.fan_node.data + 8 * (first + 2 * s + 1);
+  const float* rest = f.shape.fan_rest.data + 24 * (first + 2 * s + 1);
+  const V3 v = ld3(vel + 24 * s, lane);
+  V most = splat(0.0f);
+  for (int k = 0; k < width; ++k, node += 8, rest += 24) {
+    const V3 d = gather3(vel, node, lane) - v, r = ld3(rest, lane);
+    most = vmax(most, dot(d, d) / vmax(dot(r, r), splat(1e-30f)));
+  }
+  return most;
+}
+
 template <class Fields>
 PALPATE void edge_change(const Fields& f, Thread t, int) {
   const float* vel = f.state.vel.data + 24 * (size_t)t.world * f.shape.nslice;
   each_slice(t, f.shape.nslice, [&](int s, Lane lane) {
-    const int first = f.shape.slot_adr.data[s], width = f.shape.slot_adr.data[s + 1] - first;
-    const int* node = f.shape.fan_node.data + 8 * (first + 2 * s + 1);
-    const float* rest = f.shape.fan_rest.data + 24 * (first + 2 * s + 1);
-    const V3 v = ld3(vel + 24 * s, lane);
-    V most = splat(0.0f);
-    for (int k = 0; k < width; ++k, node += 8, rest += 24) {
-      const V3 d = gather3(vel, node, lane) - v, r = ld3(rest, lane);
-      most = vmax(most, dot(d, d) / vmax(dot(r, r), splat(1e-30f)));
-    }
-    put_most(f.system.change.data + t.world, most);
+    put_most(f.system.change.data + t.world, fastest(f, vel, s, lane));
   });
 }
 
-// Where the first Newton iteration stands: as much of h v ahead as the edges allow.
+// The share of h v that the first Newton iteration looks ahead: as much as the edges allow.
+PALPATE float share_ahead(float h, float change) {
+  const float most = h * sqrtf(change);
+  return most > AHEAD ? AHEAD / most : 1.0f;
+}
+
+// Where the first Newton iteration stands.
 template <class Fields>
 PALPATE void predict(const Fields& f, Thread t, int) {
   float* step = f.state.step.data + 4 * t.world;
-  const float h = step[0], most = h * sqrtf(f.system.change.data[t.world]);
-  const float share = most > AHEAD ? AHEAD / most : 1.0f;
+  const float h = step[0], share = share_ahead(h, f.system.change.data[t.world]);
   each_slice(t, f.shape.nslice, [&](int s, Lane lane) {
     const size_t at = 24 * ((size_t)t.world * f.shape.nslice + s);
     const V3 v = ld3(f.state.vel.data + at, lane);

@@ -280,6 +280,18 @@ PALPATE void each_slice(Thread t, int nslice, Body body) {
 #endif
 }
 
+// Runs body(thread) as often as the threads of one block take for n slices, then lets them meet.
+template <class Body>
+PALPATE void each_pass(Thread t, int nslice, Body body) {
+#if ON_CUDA
+  for (int from = 0; from < LANES * nslice; from += t.nthread)
+    body(Thread{t.world, t.tid + from, t.nthread});
+  __syncthreads();
+#else
+  INLINED body(t);
+#endif
+}
+
 // Runs body(i) for n items, whichever of the threads has them.
 template <class Body>
 PALPATE void each_item(Thread t, int n, Body body) {

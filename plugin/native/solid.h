@@ -200,7 +200,8 @@ PALPATE void solid_row(const Fields& f, Thread t, int stage) {
       st9(f.system.block.data + 72 * ((size_t)t.world * f.shape.nslot + j), splat(g) * block, lane);
       self = self + symmetric(block);
     }
-    put_diagonal(f, at, s, diag, splat(-g) * self + diag, lane);
+    put_diagonal(f.system.diag.data + 8 * at, f.system.inverse.data + 48 * at,
+                 ld(f.shape.free.data, s, lane), diag, splat(-g) * self + diag, lane);
   });
 }
 

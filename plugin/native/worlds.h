@@ -111,7 +111,8 @@ PALPATE int candidates(const Fields& f, int world) {
   return all < f.most ? all : f.most;
 }
 
-// Chooses the candidates nearest to the tools; the order of nodes decides between equals.
+// Chooses the candidates nearest to the tools; the order of nodes decides between equals. Those that
+// touch and get no slot are counted.
 template <class Fields>
 PALPATE void rank(const Fields& f, Thread t, int) {
   const int n = candidates(f, t.world);
@@ -122,6 +123,7 @@ PALPATE void rank(const Fields& f, Thread t, int) {
     for (int p = 0; p < n; ++p)
       nearer += far[p] < far[q] || (far[p] == far[q] && node[p] < node[q]);
     f.chosen.data[t.world * f.most + q] = nearer < f.nslot;
+    if (nearer >= f.nslot && far[q] < f.skin) append(f.missed.data + t.world);
   });
 }
 
@@ -268,21 +270,21 @@ PALPATE void find_bad(const Fields& f, Thread t, int) {
   if (bad) f.bad.data[t.world] = 1;
 }
 
-// Puts the organ of the worlds of a mask at rest, and the tools where they are in qpos0.
+// Puts the organ of the worlds of a mask where it starts.
 template <class Fields>
 PALPATE void rest_organ(const Fields& f, Thread t, int) {
   const int w = t.world;
   if (!f.mask.data[w]) return;
-  const D3 zero = {0.0, 0.0, 0.0};
-  if (t.tid == 0) f.heavier.data[w] = 0.0;
+  if (t.tid == 0) f.heavier.data[w] = f.heavier0.data[0];
   each_item(t, f.nnode, [&](int i) {
     const size_t at = at_node(f, w, i);
-    store_lane(f.solve.disp.data + at, zero);
-    store_lane(f.solve.vel.data + at, zero);
-    store_lane(f.solve.dvel.data + at, zero);
-    store_lane(f.last.data + at, zero);
-    store_lane(f.before.data + at, zero);
-    store_floats(f.force.data + 3 * in_row(f, w, i), zero);
+    const int from = offset_of(i);
+    store_lane(f.solve.disp.data + at, load_lane(f.disp0.data + from));
+    store_lane(f.solve.vel.data + at, load_lane(f.vel0.data + from));
+    store_lane(f.last.data + at, load_lane(f.last0.data + from));
+    store_lane(f.before.data + at, load_lane(f.before0.data + from));
+    store_lane(f.solve.dvel.data + at, {0.0, 0.0, 0.0});
+    store_floats(f.force.data + 3 * in_row(f, w, i), load_floats(f.force0.data + 3 * i));
   });
   each_item(t, f.nslot, [&](int k) { wait(f, w, k); });
 }

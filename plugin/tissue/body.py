@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from .device import WORDS
+from .device import WORDS, Plan
 from .types import (
   DIMS,
   NUMBERS,
@@ -36,6 +36,7 @@ class Body:
     numbers: those of `tissue.number` on the host, float64   (nnumber,)
     newton: Newton iterations a step
     levels: coarser meshes for the multilevel preconditioner, or None
+    plan: how a block of threads takes a world's whole step, or None where kernels share it
   """
 
   fields: Any
@@ -45,6 +46,7 @@ class Body:
   numbers: wp.array
   newton: int
   levels: Levels | None = None
+  plan: Plan | None = None
 
   @property
   def shape(self) -> Any:

@@ -8,12 +8,14 @@ error whatever the log level is. `palpate doctor` lists the devices.
 from __future__ import annotations
 
 import ctypes
+import dataclasses
 import functools
 import os
 import sys
 import tempfile
 
 import warp as wp
+from warp._src import context as warp_context
 
 from .order import LANES
 
@@ -22,6 +24,9 @@ _CUDA_FROM = 2000
 BLOCK = 512  # threads of a block, at most
 MAX_BLOCKS = 512  # of one world
 WORDS = 2 * MAX_BLOCKS + 1  # of 128 bits that a world's threads exchange
+_MOST = 1024  # threads of a block that has a world to itself
+_STATIC = 4096  # bytes of its memory that others have [B]
+_REGISTERS = 65536 // 72  # threads of a multiprocessor that have 72 registers
 _DRIVER = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
 _NO_DRIVER = "Could not find or load the NVIDIA CUDA driver"
 
@@ -106,6 +111,56 @@ def patch(device, nslice: int) -> int:
   if not device.is_cuda:
     return 0
   return LANES * -(-nslice // (group_size(device, nslice, 1) // block(device, nslice)))
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+  """How a block takes a world's whole step, see native/whole.h.
+
+  Attributes:
+    own: nodes of a thread, 0 on the CPU
+    threads: of a block
+    per_sm: blocks that a multiprocessor has at once
+    nbytes: memory of a block
+  """
+
+  own: int
+  threads: int
+  per_sm: int
+  nbytes: int
+
+
+def plan(device, nslice: int, nrow: int, bends: bool) -> Plan | None:
+  """Returns how a block takes the whole step of a world; None where a block has too few threads.
+
+  Args:
+    device: where it runs
+    nslice: slices of nodes
+    nrow: rows of stiffness blocks
+    bends: whether there is bending
+  """
+  if not device.is_cuda:
+    return Plan(0, 1, 1, 0)
+  own = 1 if LANES * nslice <= _MOST // 2 else 2 if LANES * nslice <= _MOST else 4
+  threads = -(-LANES * nslice // (32 * own)) * 32
+  if threads > _MOST:
+    return None
+  room = device.max_shared_memory_per_block - _STATIC
+  wanted = 4 * LANES * ((16 if bends else 13) * nslice + 9 * nrow)
+  per_sm = max(1, min(3, room // (wanted + _STATIC), _REGISTERS // threads))
+  return Plan(own, threads, per_sm, min(wanted, room))
+
+
+def reserve(kernel: wp.Kernel, device, plan: Plan):
+  """Gives the launches of a kernel that follow the memory of a plan."""
+  if not device.is_cuda:
+    return
+  # Warp knows no other way than tiles, whose sizes are compiled in.
+  hooks = kernel.module.load(device, plan.threads).get_kernel_hooks(kernel)
+  core = warp_context.runtime.core
+  if not core.wp_cuda_configure_kernel_shared_memory(hooks.forward, plan.nbytes):
+    raise RuntimeError(f"{device} has no {plan.nbytes} bytes of shared memory for a block")
+  hooks.forward_smem_bytes = plan.nbytes
 
 
 def threads(device, nslice: int) -> int:

@@ -25,6 +25,7 @@ def kernel(
   struct,
   constants: Mapping[str, int | float],
   bounds: tuple[int, int] | int | None = None,
+  tag: str = "",
 ) -> wp.Kernel:
   """Returns the kernel that calls palpate::name(fields, thread, arg) for each thread.
 
@@ -37,8 +38,9 @@ def kernel(
     struct: the Warp struct that it takes
     constants: numbers by name that the header knows
     bounds: threads of a block at most, and blocks that a multiprocessor must have room for
+    tag: what tells a module from others of the header with other constants
   """
-  module = _module(header, tuple(constants.items()))
+  module = _module(header, tuple(constants.items()), tag)
   call = f"palpate::{name}(f, palpate::Thread{{world, tid, nthread}}, arg);"
 
   def native(world: int, tid: int, nthread: int, arg: int, f: struct): ...
@@ -57,9 +59,9 @@ def kernel(
 
 
 @functools.cache
-def _module(header: str, constants: tuple) -> str:
+def _module(header: str, constants: tuple, tag: str) -> str:
   """Declares the Warp module of a header and returns its name."""
-  name = f"palpate.native.{header.removesuffix('.h')}"
+  name = f"palpate.native.{header.removesuffix('.h')}{tag}"
   preamble = _constexpr(dict(constants)) + f'\n#include "{header}"\n'
   options = wp.ModuleBuildOptions(
     extra_cpu_include_dirs=[str(NATIVE)],

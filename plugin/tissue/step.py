@@ -23,13 +23,14 @@ its first-order Neumann polynomial about D = diag W,
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
 import warp as wp
 
 from .body import Body
-from .device import BLOCK, block, group_size, threads
+from .device import BLOCK, Plan, block, group_size, reserve, threads
 from .kernels import kernel
 from .types import CONSTANTS, Cycle, Fields, Stage
 
@@ -123,8 +124,31 @@ def _together(kernel: wp.Kernel, body: Body, arg: int, fields=None, per_sm: int 
   )
 
 
+@functools.cache
+def _world_step(plan: Plan) -> wp.Kernel:
+  """Returns the kernel of a world's whole step by one block."""
+  constants = _CONSTANTS | {"OWN": plan.own}
+  tag = f".{plan.own}.{plan.threads}.{plan.per_sm}"
+  return kernel("step_world", "whole.h", Fields, constants, (plan.threads, plan.per_sm), tag)
+
+
+def _by_block(body: Body, stage: Stage):
+  """Takes the step of `implicit`, or the answer to it, a block a world."""
+  plan, step_world = body.plan, _world_step(body.plan)
+  reserve(step_world, body.device, plan)
+  wp.launch(
+    step_world,
+    dim=(body.nworld, plan.threads),
+    inputs=[plan.threads, stage, body.fields],
+    device=body.device,
+    block_dim=plan.threads,
+  )
+
+
 def modules(body: Body) -> list[str]:
   """Returns the Warp modules that a body's step needs."""
+  if body.plan:
+    return [_world_step(body.plan).module.name]
   kernels = [_solid_row if body.is_solid else _row, _predict, _solve]
   if body.levels is not None:
     kernels.append(_sample)
@@ -194,6 +218,9 @@ def solve(body: Body, stage: Stage):
 
 
 def _implicit(body: Body):
+  if body.plan:
+    _by_block(body, Stage.FIRST)
+    return
   body.system.change.zero_()
   nslice = body.shape.nslice
   _over(_edge_change, body, nslice)
@@ -242,7 +269,10 @@ def _direct(body: Body, stage: Stage):
 
 
 def _respond(body: Body):
-  solve(body, Stage.RESPONSE)
+  if body.plan:
+    _by_block(body, Stage.RESPONSE)
+  else:
+    solve(body, Stage.RESPONSE)
 
 
 def _respond_centred(body: Body):

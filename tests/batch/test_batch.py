@@ -243,3 +243,71 @@ def test_reset_goes_to_the_state_it_was_given_and_joints_and_bodies_to_theirs():
   assert not batch.model.body("mark").pos.any()
   with pytest.raises(ValueError, match="body 'tool' has joints"):
     batch.place("tool", np.zeros((3, 3)), np.zeros((3, 4)))
+
+
+def hung():
+  """Returns `probed` with its probe on a post that has no joint, and sensors of the probe."""
+  post = '<body name="post" pos="0 0 0.001"><body name="tool"'
+  made = probed().replace('<body name="tool"', post)
+  made = made.replace('friction="0.5"/></body>', 'friction="0.5"/><site name="tip"/></body></body>')
+  sensors = '<sensor><force site="tip"/><framelinvel objtype="site" objname="tip"/></sensor>'
+  return made.replace("</mujoco>", sensors + "</mujoco>")
+
+
+@pytest.fixture
+def both(make):
+  """Returns what makes a batch on the backend and one on the CPU."""
+  return lambda made, n: [
+    palpate.batch.make(spec(made), n, device=device) for device in (make.device, "cpu")
+  ]
+
+
+def test_worlds_start_where_they_are_told(both):
+  made = hung()
+  model, data, _ = load(made)
+  data.ctrl[:] = -0.007, 0.002
+  for _ in range(60):
+    mujoco.mj_step(model, data)
+  data.ctrl[:] = 0
+  found = []
+  for batch in both(made, 3):
+    batch.start(data)
+    batch.reset(np.array([True, False, True]))
+    at = batch.organ("organ").xpos.numpy().copy()
+    batch.ctrl = np.array([[-0.007, 0.0], [-0.007, 0.0], [-0.005, 0.001]])
+    batch.step(20)
+    found.append((at, batch.organ("organ").xpos.numpy(), batch.time.numpy()))
+  np.testing.assert_allclose(found[0][0], found[1][0], atol=1e-7)
+  np.testing.assert_allclose(found[0][1], found[1][1], atol=2e-6)
+  np.testing.assert_allclose(found[0][2], found[1][2], rtol=1e-5)
+  assert np.abs(found[0][0][0] - found[0][0][1]).max() > 1e-3
+
+
+def test_joints_and_bodies_are_put_somewhere_a_world(both):
+  found = []
+  for batch in both(hung(), 3):
+    mask = np.array([True, True, False])
+    turned = np.array([[1, 0, 0, 0], [0.9848, 0, 0.1736, 0], [1, 0, 0, 0]])
+    batch.place("post", [[0, 0, 0.001], [0, 0.002, 0.002], [1, 1, 1]], turned, mask)
+    batch.pose(["x", "z"], [[0.001, -0.001], [0.0, -0.002], [9, 9]], mask)
+    at = batch.qpos.numpy()[:, -2:].copy()
+    batch.ctrl = np.tile([-0.008, 0.001], (3, 1))
+    batch.step(60)
+    found.append((at, batch.organ("organ").contact_force.numpy().sum(axis=1), batch.qpos.numpy()))
+  np.testing.assert_allclose(found[0][0], [[-0.001, 0.001], [-0.002, 0], [0, 0]], atol=1e-7)
+  np.testing.assert_allclose(found[0][1], found[1][1], atol=2e-4)
+  np.testing.assert_allclose(found[0][2][:, -2:], found[1][2][:, -2:], atol=1e-6)
+  assert np.abs(found[0][1][:, 2]).min() > 0.02 and np.ptp(found[0][1][:, 2]) > 0.004
+
+
+def test_sensors_are_summed_up_over_a_call(both):
+  found = []
+  for batch in both(hung(), 2):
+    batch.ctrl = np.array([[-0.008, 0.0], [-0.004, 0.001]])
+    batch.step(30)
+    batch.step(20)
+    found.append([a.numpy() for a in (batch.sensor_peak, batch.sensor_mean, batch.sensordata)])
+  for a, b in zip(*found, strict=True):
+    np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4)
+  peak, _, last = found[0]
+  assert (peak[:, 1] >= np.linalg.norm(last[:, 3:], axis=1) * 0.999).all() and peak.min() > 0

@@ -1,0 +1,128 @@
+// The implicit step of a world in one kernel, by one block: what nodes tell each other and as many
+// rows of the matrix as there is room for stay in the block's memory.
+//
+// OWN is how many nodes a thread has, 0 on the CPU. There the world has one thread, and all is in the
+// body's own arrays.
+#pragma once
+#include "elastic.h"
+#include "pcg.h"
+#include "schemes.h"
+
+namespace palpate {
+
+// A matrix whose first rows are elsewhere.
+struct Split : Matrix {
+  const float* held;
+  int nheld;
+
+  template <class Body>
+  PALPATE void with_blocks(int row, int width, Body body) const {
+    if (row + width <= nheld)
+      INLINED body(held + 72 * (size_t)row);
+    else
+      INLINED body(block + 72 * (size_t)row);
+  }
+};
+
+// A vector in memory which neighbours read after the block has met.
+struct Shown : Vectors {
+  PALPATE void shown() { meet_block(); }
+};
+
+// Where the block has its world.
+struct Home {
+  Rows rows;
+  float *disp, *vel;  // those of `rows`
+  Shown z;  // in place of `disp` and `vel`, when rows are made
+
+  PALPATE Split matrix(const Matrix& a) const {
+    Split out{a, rows.held, rows.nheld};
+    out.diag = rows.diag;
+    out.inverse = rows.inverse;
+    out.normal = rows.normal;
+    return out;
+  }
+};
+
+template <class Fields>
+PALPATE Home home(const Fields& f, int world) {
+  Rows at = rows(f, world);
+  const int n = f.shape.nslice;
+#if ON_CUDA
+  float* memory = block_memory();
+  float *disp = memory, *vel = memory + 24 * n;
+  at.disp = disp;
+  at.vel = vel;
+  at.diag = memory + 48 * n;
+  at.inverse = memory + 56 * n;
+  at.held = memory + 104 * n;
+  if (f.shape.nhingeslice > 0) {
+    at.normal = at.held;
+    at.held += 24 * n;
+  }
+  at.nheld = (block_room() - (int)(at.held - memory)) / 72;
+  return {at, disp, vel, {{disp, vel}}};
+#else
+  const size_t base = (size_t)world * n;
+  return {at, f.system.disp_trial.data + 24 * base, f.system.vel_trial.data + 24 * base,
+          {{f.system.z.data + 24 * base, f.system.zn.data + 8 * base}}};
+#endif
+}
+
+// The trial state, see `predict`; in the body's arrays too, where others than `Assembly` need it.
+template <class Fields, class Team, class Mine>
+PALPATE void stand_ahead(const Fields& f, int world, Team& group, const Mine& slices, const Home& at) {
+  const size_t base = 24 * (size_t)world * f.shape.nslice;
+  float* step = f.state.step.data + 4 * world;
+  const float h = step[0];
+  slices.each([&](int s, Lane lane, int) {
+    st3(at.vel + 24 * s, ld3(f.state.vel.data + base + 24 * s, lane), lane);
+  });
+  meet_block();
+  V fast = splat(0.0f);
+  slices.each([&](int s, Lane lane, int) { fast = vmax(fast, fastest(f, at.vel, s, lane)); });
+  const float share = share_ahead(h, group.most(fast)), *number = numbers(f, world);
+  const bool told =
+    f.shape.nhingeslice > 0 || number[BULK] != 0.0f || number[PRESSURE] != 0.0f;
+  slices.each([&](int s, Lane lane, int) {
+    const V3 v = ld3(at.vel + 24 * s, lane);
+    const V3 x = ld3(f.state.disp.data + base + 24 * s, lane) + share * h * v;
+    st3(at.disp + 24 * s, x, lane);
+    if (!told) return;
+    st3(f.system.disp_trial.data + base + 24 * s, x, lane);
+    st3(f.system.vel_trial.data + base + 24 * s, v, lane);
+  });
+  if (group.is_first()) step[3] = share;
+  meet_block();
+}
+
+// The step, or with RESPONSE the answer to the impulses in `rhs`, for which the matrix is made anew.
+template <class Fields>
+PALPATE void step_world(const Fields& f, Thread t, int stage) {
+  using Mine = Slices<OWN>;
+  const size_t base = 24 * (size_t)t.world * f.shape.nslice;
+  Group<SUMS> group(t, f.system.partial.data);
+  const Mine slices(group, f.shape.nslice);
+  Home at = home(f, t.world);
+  if (stage == RESPONSE) at.rows.rhs = f.system.r.data + base;
+  stand_ahead(f, t.world, group, slices, at);
+  if (f.shape.nhingeslice > 0) {
+    each_pass(t, f.shape.nelemslice, [&](Thread pass) { elem_normal(f, pass, 0); });
+    each_pass(t, f.shape.nhingeslice, [&](Thread pass) { hinge_angle(f, pass, FIRST); });
+    each_pass(t, f.shape.nhingeslice, [&](Thread pass) { hinge_moment(f, pass, 0); });
+    each_pass(t, f.shape.nelemslice, [&](Thread pass) { elem_corner(f, pass, 0); });
+  }
+  const Assembly<Fields> assembly{f, t.world, FIRST, at.rows};
+  slices.each([&](int s, Lane lane, int) { assembly.row(s, lane); });
+  meet_block();
+  const Split a = at.matrix(matrix(f, t.world));
+  Jacobi jacobi;
+  Pcg<Fields, Group<SUMS>, Mine, Shown, Split>{f, t.world, stage, group, slices, at.z, a}.solve(
+    jacobi);
+  if (stage == RESPONSE) return;
+  slices.each([&](int s, Lane lane, int) {
+    st3(f.state.dvel.data + base + 24 * s, ld3(f.system.sol.data + base + 24 * s, lane), lane);
+  });
+}
+
+}  // namespace palpate

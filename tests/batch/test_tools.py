@@ -1,0 +1,96 @@
+"""Every kind of tool in a batch meets tissue as it does under the plugin."""
+
+import mujoco
+import numpy as np
+import palpate.batch
+import pytest
+from scenes import RADIUS, load, needs_cuda, organ, sphere, world
+
+DEVICES = [
+  pytest.param("warp-cpu", marks=pytest.mark.slow),  # mujoco_warp compiles for minutes
+  pytest.param("cuda:0", marks=needs_cuda),
+]
+POINTS = "-1 -1 -3 1 -1 -3 1 1 -3 -1 1 -3 -1 -1 3 1 -1 3 1 1 3 -1 1 3"
+KINDS = {
+  "sphere": 'size=".006"',
+  "cylinder": 'type="cylinder" size=".006 .02"',
+  "shaft": 'type="cylinder" size=".003 .02" euler="0 60 0"',
+  "capsule": 'type="capsule" size=".006 .02"',
+  "ellipsoid": 'type="ellipsoid" size=".006 .005 .02"',
+  "box": 'type="box" size=".006 .006 .02"',
+  "mesh": 'type="mesh" mesh="block"',
+}
+
+
+def pressed(geom: str, still: str = "", deep: float = 0.006):
+  """Returns a sphere of tissue under a tool on a slide."""
+  points, elem = sphere(2)
+  tissue = organ(points, elem, young=3e4, foundation=1e5, tolerance=1e-6, bend=0)
+  tool = f"""<body name="tool" pos="0.001 0.0005 {RADIUS + 0.024}">
+    <joint name="z" type="slide" axis="0 0 1"/>
+    <geom {geom} mass="0.05" condim="1" solref="0.004 1"/></body>"""
+  scale = "0.006 0.006 0.0067"
+  extra = f"""<asset><mesh name="block" vertex="{POINTS}" scale="{scale}"/></asset>
+    <actuator><position joint="z" kp="500" kv="10"/></actuator>"""
+  return world(tissue, tool, still, tolerance=1e-8, extra=extra)
+
+
+def heights(kind: str, k: int) -> float:
+  start = {"sphere": -0.017, "shaft": -0.019}.get(kind, -0.003)
+  return start - 0.006 * min(1.0, k / 60)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_tool_presses_as_under_the_plugin(device, kind):
+  made = pressed(KINDS[kind])
+  model, data, handle = load(made)
+  batch = palpate.batch.make(mujoco.MjSpec.from_string(made), 2, device=device, nodes=24)
+  tissue, found, expected = batch.organ("organ"), [], []
+  for k in range(100):
+    batch.ctrl = np.full((2, 1), heights(kind, k))
+    data.ctrl[:] = heights(kind, k)
+    mujoco.mj_step(model, data)
+    batch.step()
+    found.append(tissue.contact_force.numpy().sum(axis=1))
+    expected.append(handle.contact_force.sum(axis=0))
+  found, expected = np.array(found), np.array(expected)
+  peak = np.abs(expected).max()
+  assert peak > 0.1 and not batch.overflow.numpy().any() and not batch.failures.numpy().any()
+  assert np.sqrt(np.mean((found[:, 0] - expected) ** 2)) < 0.01 * peak
+  assert np.array_equal(found[:, 0], found[:, 1])
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("still", ["plane", "ball"])
+def test_an_organ_rests_on_what_does_not_move(device, still):
+  points, elem = sphere(2)
+  tissue = organ(points, elem, young=3e4, bulk=1e5, damping=0.01, tolerance=1e-6, bend=0)
+  z = -RADIUS - 0.0008
+  floor = {
+    "plane": f'<geom type="plane" size="1 1 1" condim="1" solref="0.01 1" pos="0 0 {z}"/>',
+    "ball": f'<geom size="0.02" condim="1" solref="0.01 1" pos="0 0 {z - 0.02}"/>',
+  }[still]
+  made = world(tissue, floor, gravity=(0, 0, -9.81), tolerance=1e-8)
+  model, data, handle = load(made)
+  batch = palpate.batch.make(mujoco.MjSpec.from_string(made), 2, device=device, nodes=32)
+  found = np.zeros((150, 2))
+  for k in range(150):
+    mujoco.mj_step(model, data)
+    batch.step()
+    total = batch.organ("organ").contact_force.numpy()[0].sum(axis=0)
+    found[k] = total[2], handle.contact_force.sum(axis=0)[2]
+  assert not batch.overflow.numpy().any() and found[:, 1].max() > 0.1
+  assert np.sqrt(np.mean((found[:, 0] - found[:, 1]) ** 2)) < 0.01 * found[:, 1].max()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_nodes_on_a_plane_that_have_no_slot_are_counted(device):
+  points, elem = sphere(2)
+  tissue = organ(points, elem, young=3e4, bulk=1e4, bend=0)
+  floor = f'<geom type="plane" size="1 1 1" condim="1" pos="0 0 {-0.9 * RADIUS}"/>'
+  made = mujoco.MjSpec.from_string(world(tissue, floor))
+  batch = palpate.batch.make(made, 2, device=device, nodes=8)
+  batch.step()
+  with pytest.warns(UserWarning, match="windows had no room"):
+    assert (batch.overflow.numpy() > 0).all()
