@@ -22,8 +22,8 @@ JAWS = "grasper/"  # prefix of the instrument that has them
 NEAR, COARSE = 8, 32  # nodes in the observations
 HELD_FORCE = 0.2  # of the inner face of either jaw on tissue between them, to hold it [N]
 
-_CLOSING = 0.005  # the drive's target is that far below the opening [rad]
-_FOLD = (0.02, 0.15)  # least opening over a fold of tissue, largest target that grips one [rad]
+CLOSING = 0.005  # the drive's target is that far below the opening [rad]
+FOLD, GRIPPING = 0.02, 0.15  # least opening over a fold of tissue, largest target that grips one [rad]
 
 
 class Physics(Portable):
@@ -197,11 +197,11 @@ class Physics(Portable):
   def closing(self) -> bool:
     """Whether the jaws are told to close: on a fold of tissue at most, and below the opening."""
     opening, target = float(self.sensor("jaw")[0]), float(self.data.ctrl[self.jaw])
-    return target < min(opening - _CLOSING, _FOLD[1])
+    return target < min(opening - CLOSING, GRIPPING)
 
   def holds(self) -> bool:
     """Whether tissue is between the jaws: it keeps them open, both inner faces press on it."""
-    return bool(self._inner.min() > HELD_FORCE and self.sensor("jaw")[0] > _FOLD[0])
+    return bool(self._inner.min() > HELD_FORCE and self.sensor("jaw")[0] > FOLD)
 
   def nodes(self) -> np.ndarray:
     """Returns the positions of the organ's nodes [m]  (nvert, 3); computed once a control step."""

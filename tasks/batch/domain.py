@@ -39,8 +39,12 @@ class Domain:
     return {}
 
   @staticmethod
-  def constants(task: Any, physics: Physics) -> Mapping[str, np.ndarray]:
-    """Returns arrays of the struct that all worlds share."""
+  def sense(worlds: Any) -> None:
+    """Measures after a step what the domain alone wants to know."""
+
+  @staticmethod
+  def constants(task: Any, physics: Physics) -> Mapping[str, Any]:
+    """Returns arrays and vectors of the struct that all worlds share."""
     return {}
 
   @staticmethod

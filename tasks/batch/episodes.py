@@ -27,6 +27,7 @@ class Resting(Physics):
     """Takes a compiled scene, see `Physics.use`."""
     self._rest_normals: np.ndarray | None = None
     super().use(*args)
+    mj.mj_forward(self.model.ptr, self.data.ptr)  # the camera is where it is
 
   def set_joints(self, pose: np.ndarray) -> None:
     """Takes the instrument's pose at the start of an episode."""

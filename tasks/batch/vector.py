@@ -25,13 +25,17 @@ from palpate.tasks.observation import ROWS
 
 from .domain import Domain
 from .fields import INFO, OBSERVED, OUTCOMES
+from .grasp import Grasp
 from .palpate import Palpate
 from .press import Press
+from .retract import Retract
 from .touch import Touch
 from .worlds import Worlds
 
 # Exercises that are vectorised, by the class of their task.
-DOMAINS: dict[str, type[Domain]] = {"Touch": Touch, "Press": Press, "Palpate": Palpate}
+DOMAINS: dict[str, type[Domain]] = {
+  "Touch": Touch, "Press": Press, "Palpate": Palpate, "Grasp": Grasp, "Retract": Retract
+}  # fmt: skip
 _ELSE = 'vectorization_mode="sync" runs single environments side by side'
 OUTPUTS = ("numpy", "torch", "warp")
 

@@ -74,7 +74,10 @@ class Worlds:
     for name, value in domain.numbers(task).items():
       setattr(self.own, name, value)
     for name, value in domain.constants(task, self.episodes.physics).items():
-      getattr(self.own, name).assign(value)
+      if isinstance(value, np.ndarray):
+        getattr(self.own, name).assign(value)
+      else:
+        setattr(self.own, name, value)
     self._bad = wp.zeros(1, dtype=int, device=self.device)
 
   def _make(self, task: Any, dt: float, limit: int) -> Any:
@@ -130,7 +133,7 @@ class Worlds:
   def check(self, action: wp.array) -> None:
     """Raises ValueError where an action is not in [-1, 1]; it names world and component."""
     self._bad.zero_()
-    self._launch(kernels.find_bad, action.shape, [action, self._bad])
+    self.launch(kernels.find_bad, action.shape, [action, self._bad])
     bad = int(self._bad.numpy()[0]) - 1
     if bad >= 0:
       names = self.task.components
@@ -149,6 +152,7 @@ class Worlds:
     self.batch.step(self._substeps)
     self._read(self.fields)
     self._over(kernels.measure, False)
+    self._domain.sense(self)
     self._over(self._domain.advance, self.own)
     self._observe(False)
     return self.fields.terminated.numpy() | self.fields.truncated.numpy()
@@ -185,11 +189,12 @@ class Worlds:
   def _observe(self, beginning: bool) -> None:
     self._over(kernels.look, beginning)
     dim = (self.nworld, self.fields.coarse.shape[0])
-    self._launch(kernels.survey, dim, [self.fields, beginning])
+    self.launch(kernels.survey, dim, [self.fields, beginning])
     self._over(self._domain.observe, self.own, beginning)
 
   def _over(self, kernel: Any, *inputs: Any) -> None:
-    self._launch(kernel, self.nworld, [self.fields, *inputs])
+    self.launch(kernel, self.nworld, [self.fields, *inputs])
 
-  def _launch(self, kernel: Any, dim: Any, inputs: list) -> None:
+  def launch(self, kernel: Any, dim: Any, inputs: list) -> None:
+    """Launches a kernel."""
     wp.launch(kernel, dim=dim, inputs=inputs, device=self.device, block_dim=64)
