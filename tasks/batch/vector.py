@@ -30,11 +30,13 @@ from .palpate import Palpate
 from .press import Press
 from .retract import Retract
 from .touch import Touch
+from .trace import Trace
 from .worlds import Worlds
 
 # Exercises that are vectorised, by the class of their task.
 DOMAINS: dict[str, type[Domain]] = {
-  "Touch": Touch, "Press": Press, "Palpate": Palpate, "Grasp": Grasp, "Retract": Retract
+  "Touch": Touch, "Press": Press, "Palpate": Palpate, "Grasp": Grasp, "Retract": Retract,
+  "Trace": Trace,
 }  # fmt: skip
 _ELSE = 'vectorization_mode="sync" runs single environments side by side'
 OUTPUTS = ("numpy", "torch", "warp")
