@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 import gymnasium
@@ -37,6 +38,9 @@ class Resting(Physics):
     """Returns where that puts the tip [m]  (3,)."""
     return trocar.forward(self.trocar(), self.pose[[0, 1, 3]])
 
+  def mark(self, *args: Any, **kwargs: Any) -> None:
+    """Does nothing: no picture is made."""
+
   def moved(self) -> None:
     """Does nothing: the organ stays where it is."""
 
@@ -46,16 +50,16 @@ class Resting(Physics):
       self._rest_normals = super().normals()
     return self._rest_normals
 
-  def mark(self, *args: Any, **kwargs: Any) -> None:
-    """Does nothing: no picture is made."""
-
 
 class Episodes:
   """The next episodes of worlds, each drawn from a random state of its own.
 
+  What a world begins with next does not depend on how it plays: it is drawn ahead, while others
+  step.
+
   Attributes:
     physics: of the scene at rest
-    rows: what was drawn by name, (nworld, ...) each
+    rows: what the worlds began with by name, (nworld, ...) each
   """
 
   def __init__(self, task: Task, domain: type[Domain], nworld: int):
@@ -65,24 +69,60 @@ class Episodes:
     self._task, self._domain = task, domain
     self._random: list[np.random.RandomState | None] = [None] * nworld
     self.rows: dict[str, np.ndarray] = {}
+    self._next: dict[str, np.ndarray] = {}
+    self._ready = np.zeros(nworld, bool)
+    self._ahead: Future | None = None
+    self._pool = ThreadPoolExecutor(1)
+    self._where: tuple[bytes, Any] = (b"", None)
+    self._place_of_work, task.place_of_work = task.place_of_work, self._remember
+
+  def _remember(self, physics: Physics) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the task's place of work, which depends on the trocar alone while the organ rests."""
+    port = physics.trocar()
+    key = port.pos.tobytes() + port.mat.tobytes()
+    if self._where[0] != key:
+      self._where = key, self._place_of_work(physics)
+    return self._where[1]
 
   def seed(self, seeds: Sequence[int | None], worlds: np.ndarray) -> None:
     """Seeds worlds as `reset` of a single environment does; with None those that have no state."""
+    self._wait()
     for world in worlds:
       seed = seeds[world]
       if seed is not None or self._random[world] is None:
         random, _ = gymnasium.utils.seeding.np_random(seed)
         self._random[world] = np.random.RandomState(random.integers(2**31))
+        self._ready[world] = False
 
-  def draw(self, worlds: np.ndarray) -> None:
-    """Draws an episode for each of some worlds."""
+  def take(self, worlds: np.ndarray) -> dict[str, np.ndarray]:
+    """Returns `rows` with the next episodes of some worlds, and draws those after these."""
+    self._wait()
+    self._draw(worlds[~self._ready[worlds]])
+    for name, values in self._next.items():
+      self.rows.setdefault(name, np.zeros_like(values))[worlds] = values[worlds]
+    self._ready[worlds] = False
+    self._ahead = self._pool.submit(self._draw, worlds)
+    return self.rows
+
+  def _wait(self) -> None:
+    if self._ahead is not None:
+      self._ahead.result()
+    self._ahead = None
+
+  def _draw(self, worlds: np.ndarray) -> None:
     for world in worlds:
       self._task.random = self._random[world]
       self._task.initialize_episode(self.physics)
       for name, row in self._row().items():
-        if name not in self.rows:
-          self.rows[name] = np.zeros((len(self._random), *np.shape(row)), np.asarray(row).dtype)
-        self.rows[name][world] = row
+        if name not in self._next:
+          count = len(self._random)
+          self._next[name] = np.zeros((count, *np.shape(row)), np.asarray(row).dtype)
+        self._next[name][world] = row
+      self._ready[world] = True
+
+  def close(self) -> None:
+    """Ends the thread that draws."""
+    self._pool.shutdown(cancel_futures=True)
 
   def _row(self) -> Mapping[str, Any]:
     model = self.physics.model.ptr

@@ -144,6 +144,10 @@ class Exercises(VectorEnv):
       worlds.begin(over)
     return (self._observations(), *told, self._infos() | infos)
 
+  def close_extras(self, **kwargs: Any) -> None:
+    """Ends what runs beside."""
+    self.worlds.episodes.close()
+
   # What is told.
 
   def _tell(self, array: wp.array, dtype: Any = np.float64) -> Any:

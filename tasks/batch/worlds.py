@@ -164,8 +164,7 @@ class Worlds:
     worlds = np.flatnonzero(mask)
     if seeds is not None:
       self.episodes.seed(seeds, worlds)
-    self.episodes.draw(worlds)
-    rows = self.episodes.rows
+    rows = self.episodes.take(worlds)
     self.batch.reset(mask)
     trocar_body = f"{self.task.prefix}trocar"
     if self.task.jitter:
