@@ -60,7 +60,7 @@ class Settings:
   epochs: int = 5
   minibatches: int = 4
   spread: float = 0.5
-  entropy: float = 0.002
+  entropy: float = 0.005
   learning_rate: float = 1e-3
 
 
@@ -99,6 +99,17 @@ class Learner:
       entropy_coef=settings.entropy, learning_rate=settings.learning_rate,
     )  # fmt: skip
     self._ppo.train_mode()
+    self._look()
+
+  def _look(self) -> None:
+    """Learns how large observations are: later it would change the policy at once."""
+    seen = []
+    with torch.inference_mode():
+      for _ in range(self._count):
+        seen.append(self.env.get_observations())
+        self.env.step(self._ppo.actor(seen[-1], stochastic_output=True))
+      for model in (self._ppo.actor, self._ppo.critic):
+        model.update_normalization(torch.cat(seen))
 
   def iterate(self, stop: Callable[[], bool] = lambda: False) -> dict[str, float] | None:
     """Learns from some steps of all worlds; returns `ROW`, or None if it was to stop."""
