@@ -19,7 +19,7 @@ import numpy as np
 import warp as wp
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
-from palpate.batch.base import count_of, on_device
+from palpate.batch.base import on_device
 from palpate.tasks.gym import Exercise
 from palpate.tasks.observation import ROWS
 
@@ -81,7 +81,9 @@ class Exercises(VectorEnv):
     """
     if output not in OUTPUTS:
       raise ValueError(f"output is {output!r}, expected one of {', '.join(OUTPUTS)}")
-    self.num_envs, self.output = count_of(num_envs), output
+    if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer) or num_envs < 1:
+      raise ValueError(f"num_envs is {num_envs!r}, expected a whole number >= 1")
+    self.num_envs, self.output = int(num_envs), output
     _refuse(task, kwargs)
     single = Exercise(task, **kwargs)
     environment = single.environment
