@@ -1,7 +1,7 @@
-"""Contacts with an organ's triangles get the weights of their corners, see `native/weights.h`.
+"""Contacts with an organ: weights of a triangle's corners, and sliding, see `native/weights.h`.
 
 MuJoCo 3.17 weighs the corners of a touched triangle by inverse distance: forces are off and
-flicker where a tool presses. MuJoCo 4.0 has it right, and is left alone.
+flicker where a tool presses. MuJoCo 4.0 has it right. Both part what slides.
 """
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
@@ -20,9 +20,12 @@ from .layout import FLAG
 
 _DATA = (
   *("contact", "ncon", "nefc", "nisland", "efc_type", "efc_J", "efc_J_rownnz", "efc_J_rowadr"),
-  *("efc_J_colind", "efc_diagA", "efc_R", "efc_D", "map_efc2iefc", "iefc_R", "iefc_D"),
+  *("efc_J_colind", "efc_pos", "efc_KBIP", "efc_diagA", "efc_R", "efc_D"),
+  *("map_efc2iefc", "iefc_R", "iefc_D"),
 )
-_CONTACT = ("pos", "dim", "geom", "flex", "elem", "vert", "exclude", "efc_address")
+_CONTACT = (
+  *("dist", "pos", "friction", "dim", "geom", "flex", "elem", "vert", "exclude", "efc_address"),
+)
 _SPARSE_FROM = 60  # dofs from which MuJoCo's rows are sparse where it may choose
 
 
@@ -31,6 +34,7 @@ class Weights:
   """The organs' flexes and MuJoCo's memory under its own names."""
 
   nv: int  # dofs of the model
+  wrong: int  # whether MuJoCo's weights are
   memory: Array(wp.uint64, ("nword",))  # the mjData itself
   mine: ints("nflex")  # whether a flex is an organ's, or a window of one
   flags: ints(len(FLAG))  # see FLAG
@@ -50,6 +54,7 @@ class Weights:
   flex_elem: ints("nflexelemdata")
   flex_elemdataadr: ints("nflex")
   # mjData:
+  qvel: doubles("nv")
   flexvert_xpos: doubles("nflexvert", 3)
 
 
@@ -113,6 +118,7 @@ def make(model: int, data: int, flexes, flags: np.ndarray | None = None) -> Weig
   mine[flexes] = 1
   out = coupling.mujoco_arrays(model, data, Weights)
   out.nv = mjstruct.Model.from_address(model).nv
+  out.wrong = are_wrong()
   out.memory = coupling.wrap(data, mjstruct.size(mjstruct.Data) // 8, wp.uint64)
   out.mine = wp.array(mine, dtype=int, device="cpu")
   flags = np.zeros(len(FLAG), np.int32) if flags is None else flags
@@ -121,9 +127,8 @@ def make(model: int, data: int, flexes, flags: np.ndarray | None = None) -> Weig
 
 
 def launch(weights):
-  """Gives the contacts their weights, where MuJoCo's are wrong."""
-  if are_wrong():
-    wp.launch(_weigh, dim=(1, 1), inputs=[1, 0, weights], device="cpu")
+  """Gives the contacts their weights, where MuJoCo's are wrong, and keeps sliding ones closed."""
+  wp.launch(_weigh, dim=(1, 1), inputs=[1, 0, weights], device="cpu")
 
 
 def project(model: int, data: int):

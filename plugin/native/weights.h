@@ -1,6 +1,10 @@
 // Contacts with triangles: a contact acts on the corners of a triangle by the barycentric weights of
 // where it is. MuJoCo 3.17 weighs them by inverse distance, as if the contact were at another point.
 // Its rows are made when this runs, their reference accelerations are not.
+//
+// And contacts that slide stay closed. MuJoCo's friction is convex: a sliding contact parts, by its
+// friction times how fast it is braked. On light nodes that lifts a tool off within a step, and the
+// force flickers.
 #pragma once
 #include "d3.h"
 
@@ -61,15 +65,20 @@ PALPATE Rows rows_of(const Fields& f, const char* contact) {
   return {first, count, paired};
 }
 
+// Whether MuJoCo's rows have all columns.
+template <class Fields>
+PALPATE bool is_dense(const Fields& f) {
+  const int jacobian = f.jacobian.data[0];
+  return jacobian == JACOBIAN_DENSE || (jacobian == JACOBIAN_AUTO && f.nv < SPARSE_FROM);
+}
+
 // Where a row has the three columns of a body's dofs, or null.
 template <class Fields>
 PALPATE double* columns(const Fields& f, int row, int body) {
-  const int adr = f.body_dofadr.data[body], nv = f.nv;
+  const int adr = f.body_dofadr.data[body];
   double* J = datum<double*>(f, DATA_EFC_J);
-  const int jacobian = f.jacobian.data[0];
   if (f.body_dofnum.data[body] != 3) return nullptr;
-  if (jacobian == JACOBIAN_DENSE || (jacobian == JACOBIAN_AUTO && nv < SPARSE_FROM))
-    return J + (long long)nv * row + adr;
+  if (is_dense(f)) return J + (long long)f.nv * row + adr;
   const int start = datum<int*>(f, DATA_EFC_J_ROWADR)[row];
   const int count = datum<int*>(f, DATA_EFC_J_ROWNNZ)[row];
   const int* colind = datum<int*>(f, DATA_EFC_J_COLIND) + start;
@@ -153,6 +162,62 @@ PALPATE bool weigh_side(const Fields& f, char* contact, Rows rows, int side) {
   return changed;
 }
 
+// The velocity of a row.
+template <class Fields>
+PALPATE double velocity(const Fields& f, int row) {
+  const double *J = datum<double*>(f, DATA_EFC_J), *qvel = f.qvel.data;
+  double sum = 0.0;
+  if (is_dense(f)) {
+    for (int k = 0; k < f.nv; ++k) sum += J[(long long)f.nv * row + k] * qvel[k];
+    return sum;
+  }
+  const int start = datum<int*>(f, DATA_EFC_J_ROWADR)[row];
+  const int count = datum<int*>(f, DATA_EFC_J_ROWNNZ)[row];
+  const int* colind = datum<int*>(f, DATA_EFC_J_COLIND) + start;
+  for (int k = 0; k < count; ++k) sum += J[start + k] * qvel[colind[k]];
+  return sum;
+}
+
+// How fast MuJoCo brakes what slides at a contact, times friction [m/s^2]: with D the damping of a
+// row, |D mu v| over the directions in the contact's plane. The rows of a pyramid, n + mu t and
+// n - mu t, part by less where they share it.
+template <class Fields>
+PALPATE double parting(const Fields& f, const char* contact, Rows rows) {
+  const double* friction = (const double*)(contact + CONTACT_FRICTION);
+  double sum = 0.0;
+  for (int r = rows.first + !rows.paired; r < rows.first + rows.count; r += 1 + rows.paired) {
+    const double damping = datum<double*>(f, DATA_EFC_KBIP)[4 * r + 1];
+    const double v = rows.paired ? 0.5 * (velocity(f, r) - velocity(f, r + 1))
+                                 : friction[r - rows.first - 1] * velocity(f, r);
+    sum += damping * v * damping * v;
+  }
+  return sqrt(sum);
+}
+
+// Moves the contact's gap by as much as takes that parting away: sliding then has the gap, and the
+// force, of standing (de Saxce and Feng 1998, doi:10.1016/S0895-7177(98)00119-8, with the velocity
+// that the step begins with). Done twice it does nothing.
+template <class Fields>
+PALPATE void keep_closed(const Fields& f, const char* contact, Rows rows) {
+  if (rows.count < 2) return;
+  const double* row = datum<double*>(f, DATA_EFC_KBIP) + 4 * rows.first;
+  const double stiffness = row[0] * row[2];
+  if (!(stiffness > 0.0)) return;
+  const double gap = *(const double*)(contact + CONTACT_DIST) + parting(f, contact, rows) / stiffness;
+  for (int r = rows.first; r < rows.first + (rows.paired ? rows.count : 1); ++r)
+    datum<double*>(f, DATA_EFC_POS)[r] = gap;
+}
+
+// Whether one of the two sides of a contact is an organ's.
+template <class Fields>
+PALPATE bool is_mine(const Fields& f, const char* contact) {
+  for (int side = 0; side < 2; ++side) {
+    const int flex = side_of(contact, CONTACT_FLEX, side);
+    if (flex >= 0 && f.mine.data[flex]) return true;
+  }
+  return false;
+}
+
 // Gives the contacts of an organ's triangles their weights, and flags that what MuJoCo has computed
 // of the rows for its dual solvers has to be computed again. Done twice it does nothing.
 template <class Fields>
@@ -161,10 +226,10 @@ PALPATE void weigh(const Fields& f, Thread, int) {
   char* contact = datum<char*>(f, DATA_CONTACT);
   const int ncon = datum<int>(f, DATA_NEFC) > 0 ? datum<int>(f, DATA_NCON) : 0;
   for (int c = 0; c < ncon; ++c, contact += CONTACT_LENGTH) {
-    const bool soft = side_of(contact, CONTACT_FLEX, 0) >= 0 || side_of(contact, CONTACT_FLEX, 1) >= 0;
-    const Rows rows = soft ? rows_of(f, contact) : Rows{0, 0, false};
-    for (int side = 0; side < 2 && rows.count; ++side)
+    const Rows rows = is_mine(f, contact) ? rows_of(f, contact) : Rows{0, 0, false};
+    for (int side = 0; side < 2 && rows.count && f.wrong; ++side)
       changed = weigh_side(f, contact, rows, side) || changed;
+    keep_closed(f, contact, rows);
   }
   const bool projects = f.solver.data[0] == SOLVER_PGS || f.noslip_iterations.data[0] > 0 ||
                         (f.enableflags.data[0] & ENABLE_DIAGEXACT);

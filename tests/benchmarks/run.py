@@ -16,6 +16,7 @@ BENCHES = {
   "batch": "world-steps a second of batches, and what a world takes",
   "error": "run time against error, beside MuJoCo's own flex",
   "experts": "how many of its episodes each expert solves; the references",
+  "flicker": "steps without force while a probe presses the organs that ship",
   "inertia": "what the effective inertia does to the contact force",
   "learning": "SAC on touch/easy",
   "locality": "what leaving out solved nodes would save",
@@ -32,6 +33,7 @@ BENCHES = {
   "speed": "control steps a second of the exercises",
   "stability": "where each scheme breaks, over a thousand runs",
   "thesis": "the tables and figures of the thesis, measured today",
+  "truth": "organ forces against closed forms, other finite elements and published measurements",
 }
 
 
