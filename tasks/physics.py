@@ -23,7 +23,8 @@ NEAR, COARSE = 8, 32  # nodes in the observations
 HELD_FORCE = 0.2  # of the inner face of either jaw on tissue between them, to hold it [N]
 
 CLOSING = 0.005  # the drive's target is that far below the opening [rad]
-FOLD, GRIPPING = 0.02, 0.15  # least opening over a fold of tissue, largest target that grips one [rad]
+# Least opening over a fold of tissue, largest target that grips one [rad].
+FOLD, GRIPPING = 0.02, 0.15
 
 
 class Physics(Portable):

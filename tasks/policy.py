@@ -3,8 +3,8 @@
     policy = load("policy.safetensors")
     action = policy(timestep.observation)
 
-A file is one of safetensors: a network of `tanh` layers, what its input is normalised by, and in the
-header as JSON the exercise, its action and the names of what it observes. NumPy is enough to run it.
+A file is one of safetensors: a network of `tanh` layers, what its input is normalised by, and in
+the header as JSON the exercise, its action and what it observes. NumPy is enough to run it.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ def load(path: str | os.PathLike[str]) -> Policy:
   try:
     with safe_open(os.fspath(path), "np") as file:
       header = (file.metadata() or {}).get(_KEY)
-      arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+      arrays = {name: file.get_tensor(name) for name in file.keys()}
   except (OSError, SafetensorError) as error:
     raise ValueError(f"policy {os.fspath(path)!r}: {error}") from None
   if header is None:

@@ -171,5 +171,5 @@ class Retract(Hold):
 
 
 def progress(grasped: bool, near: float, seen: float, held: float) -> float:
-  """Returns the progress, see the module's head: of closeness, shares of what is wanted and time."""
+  """Returns the progress, see the module's head: of closeness, shares of disc and time."""
   return 0.3 + 0.5 * min(seen, 1.0) + 0.2 * held if grasped else 0.15 * near

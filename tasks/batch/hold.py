@@ -74,7 +74,7 @@ def follow(s: Common, o: HoldState, w: int):
   before = o.grasped[w, 0] == 1.0
   closing = s.gripper[w, 1] < wp.min(s.gripper[w, 0] - _CLOSING, _GRIPPING)
   pressed = closing and holds(s, o, w)
-  now = bool(False)
+  now = wp.bool(False)
   if before:
     now = pressed and wp.length(from_tip(s, o, w) - o.where[w]) < o.slip
   elif pressed and distance(s, o, w) < _REACH:

@@ -7,6 +7,7 @@ A checkpoint is a file of safetensors: weights and optimiser, in the header how 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import math
 import pathlib
@@ -33,7 +34,7 @@ ROW = (
   "learning_rate",
 )  # fmt: skip
 _KEY = "palpate training"
-_LEAST = 2048  # control steps of an iteration, in all worlds
+LEAST = 2048  # control steps of an iteration, in all worlds
 _SHORT = 24  # of a world, at least
 
 
@@ -78,7 +79,7 @@ class Learner:
     torch.manual_seed(settings.seed)
     self.settings, self.env = settings, RslRl(env, settings.seed)
     self.iteration, self.steps, self.seconds = 0, 0, 0.0
-    self._count = max(_SHORT, math.ceil(_LEAST / env.num_envs))
+    self._count = max(_SHORT, math.ceil(LEAST / env.num_envs))
     seen, groups = self.env.get_observations(), list(self.env.groups)
     sets = {"actor": groups, "critic": groups}
     common = {
@@ -104,7 +105,7 @@ class Learner:
   def _look(self) -> None:
     """Learns how large observations are: later it would change the policy at once."""
     seen = []
-    with torch.inference_mode():
+    with torch.no_grad():
       for _ in range(self._count):
         seen.append(self.env.get_observations())
         self.env.step(self._ppo.actor(seen[-1], stochastic_output=True))
@@ -155,7 +156,7 @@ class Learner:
       **dataclasses.asdict(self.settings),
     }  # fmt: skip
     about = policy.About(
-      task.name, tuple(task.components), sum(self.env.groups.values(), []),
+      task.name, tuple(task.components), [*itertools.chain(*self.env.groups.values())],
       task.control_timestep, task_kwargs, training,
     )  # fmt: skip
     return policy.Policy(
@@ -185,7 +186,7 @@ class Learner:
     try:
       with safe_open(str(path), "pt", device=self.env.device) as file:
         done = json.loads((file.metadata() or {}).get(_KEY, "{}"))
-        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        tensors = {name: file.get_tensor(name) for name in file.keys()}
     except Exception as error:
       raise ValueError(f"{path}: {error}") from None
     if done.get("task") != task:

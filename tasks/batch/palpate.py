@@ -54,7 +54,7 @@ def advance(s: Common, o: PalpateState):
       outcome = SUCCESS
       found = 1.0
   else:
-    count = int(0)
+    count = wp.int32(0)
     for k in range(o.places.shape[0]):
       if force >= _FEELING and wp.length(o.places[k] - tip) < _FELT:
         o.touched[w, k] = True

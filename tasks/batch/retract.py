@@ -18,7 +18,7 @@ _SLACK, _SEEN = wp.constant(touch.SLACK), wp.constant(retract.SEEN)
 def hide(s: Common, o: HoldState):
   """Finds which points of the disc the organ hides: rays against triangles, as `Physics.hidden`."""
   w, k = wp.tid()
-  covered = bool(False)
+  covered = wp.bool(False)
   ray = o.disc[w, k] - o.eye
   for i in range(s.elem.shape[0]):
     a = node(s, w, s.elem[i, 0])

@@ -1,7 +1,9 @@
 # pyright: reportMissingImports=false
 """Vectorised exercises for Stable-Baselines3, whose `VecEnv` this is.
 
-    model = PPO("MultiInputPolicy", Sb3(gymnasium.make_vec("palpate/TouchEasy-v0", num_envs=64)))
+    env = Sb3(gymnasium.make_vec("palpate/TouchEasy-v0", num_envs=64))
+
+Its policy is `MultiInputPolicy`, for observations have names.
 """
 
 from __future__ import annotations

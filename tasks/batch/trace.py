@@ -47,7 +47,7 @@ def point(s: Common, o: TraceState, w: int, k: int):
 @wp.func
 def done(o: TraceState, w: int):
   """Returns the number of points that are traced."""
-  found = int(0)
+  found = wp.int32(0)
   if o.traced[w] > 0.0:
     for k in range(o.count[w]):
       if o.arc[w, k] <= o.traced[w]:
