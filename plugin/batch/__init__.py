@@ -11,19 +11,22 @@ The same code runs with `device="cpu"`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import mujoco
 
-from .base import Batch, Tissue, count_of
+from .base import Batch, Contacts, Tissue, count_of
+from .several import Several
 from .threads import Threads
 from .worlds import Worlds
 
-__all__ = ["Batch", "Tissue", "make"]
+__all__ = ["Batch", "Contacts", "Tissue", "make"]
 
 
 def make(
   scene: mujoco.MjSpec | mujoco.MjModel,
   nworld: int,
-  device: str = "cpu",
+  device: str | Sequence[str] = "cpu",
   *,
   nodes: int | dict[str, int] | None = None,
   deterministic: bool = False,
@@ -37,7 +40,8 @@ def make(
     nworld: number of worlds
     device: `cpu`, where the plugin steps copies of the model on threads; `cuda:N`, where
       mujoco_warp steps tools and contacts, and the organs' kernels all worlds in one launch;
-      `warp-cpu`, the same kernels without a GPU, to test and slow
+      `warp-cpu`, the same kernels without a GPU, to test and slow; or several of these, which share
+      the worlds
     nodes: on a GPU, the most nodes of an organ that tools touch at once, and their neighbours: a
       number, or one by the organ's name; None for what the tools' sizes ask for
     deterministic: on a GPU, whether runs repeat to the bit whatever it does, at a cost; on the CPU
@@ -59,4 +63,6 @@ def make(
       f"scene is a compiled model, which cannot be taken apart for device {device!r}; expected "
       "the mujoco.MjSpec"
     )
+  if not isinstance(device, str):
+    return Several(scene, nworld, list(device), nodes, deterministic)
   return Worlds(scene, nworld, device, nodes, deterministic)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -211,6 +211,29 @@ class Batch(abc.ABC):
       raise ValueError(f"{name} has shape {values.shape}, expected ({self.nworld}, {count})")
     return values
 
+  def configure(self, mask=None, *, gravity=None, friction: Mapping[str, Any] | None = None):
+    """Changes what worlds have besides organs; a reset leaves it.
+
+    Args:
+      mask: worlds, (nworld,) of bool; None for all
+      gravity: gravity [m/s^2], (3,) or (nworld, 3)
+      friction: sliding friction of geoms by name, a number or (nworld,)
+    """
+    worlds = np.flatnonzero(self._mask(mask).numpy())
+    if gravity is not None:
+      gravity = self._rows(np.broadcast_to(gravity, (self.nworld, 3)), "gravity", 3)[worlds]
+    rough = {}
+    for name, values in (friction or {}).items():
+      values = np.broadcast_to(np.asarray(values, float), (self.nworld,))
+      if not (values >= 0).all():
+        raise ValueError(f"geom {name!r}: friction is {values.min()}, expected numbers >= 0")
+      rough[self.model.geom(name).id] = values[worlds]
+    self._configure(worlds, gravity, rough)
+
+  @abc.abstractmethod
+  def _configure(self, worlds: np.ndarray, gravity: np.ndarray | None, friction: dict):
+    """Changes some worlds; values have a row for each of these."""
+
   def _mask(self, mask) -> wp.array:
     if mask is None:
       return wp.full(self.nworld, True, dtype=wp.bool, device=self.device)
@@ -256,6 +279,20 @@ class Batch(abc.ABC):
     """Gives a world the state of an mjData."""
 
 
+class Contacts(NamedTuple):
+  """Contacts of an organ with geoms in all worlds, as many in each; those that are none have -1.
+
+  Attributes:
+    geom: the geom, (nworld, n)
+    normal: from the geom to the tissue, (nworld, n, 3)
+    force: force along it [N], (nworld, n)
+  """
+
+  geom: wp.array
+  normal: wp.array
+  force: wp.array
+
+
 class Tissue(abc.ABC):
   """One organ in all worlds of a batch; arrays as those of `Batch`, in world coordinates.
 
@@ -298,13 +335,18 @@ class Tissue(abc.ABC):
     """PCG iterations of the last step, (nworld,)."""
     return self._read("iterations")
 
+  @property
+  def contacts(self) -> Contacts:
+    """Contacts of the last step; on a GPU alone, on the CPU they are in `Batch.datas`."""
+    raise ValueError(f"organ {self.name!r}: contacts are in `batch.datas` on the CPU")
+
   @abc.abstractmethod
   def configure(self, mask=None, **keys):
     """Changes the tissue of worlds: keys of docs/configuration.md that may change while running.
 
     A value is one number for all, or has a row a world. `young_scale` stands for `young` as a
     multiple of the compiled one; `young` has one number, or one a triangle. `friction` is the
-    sliding friction of the organ's side of contacts.
+    sliding friction of the organ's side of contacts. On a GPU also `mass`, of the whole organ [kg].
 
     Args:
       mask: worlds to change, (nworld,) of bool; None for all

@@ -54,13 +54,14 @@ class Touch:
   margin: floats("ntool")  # [m]
   condim: ints("ntool")
   whose: ints("ntool")  # whose sliding friction counts
-  slide: floats("ntool")  # the tool's
+  slide: floats("nworld", "ntool")  # the tool's
   rough: floats("nworld")  # the organ's
   friction: Array(vec5, ("ntool",))  # all of it, the sliding one as compiled
   solref: Array(wp.vec2, ("ntool",))
   solimp: Array(vec5, ("ntool",))
   # mujoco_warp:
   nacon: ints(1)
+  start: ints(1)  # the organ's first contact
   out_dist: floats("naconmax")
   out_pos: Array(wp.vec3, ("naconmax",))
   out_frame: Array(wp.mat33, ("naconmax",))
@@ -151,7 +152,7 @@ def _put(c: Touch, at: Place, n: int, dist: float, pos: wp.vec3, normal: wp.vec3
     c.out_pos[k] = pos
     c.out_frame[k] = _axes(normal)
     c.out_includemargin[k] = c.margin[q]
-    slide = c.slide[q]
+    slide = c.slide[at.world, q]
     if c.whose[q] == _ORGAN:
       slide = c.rough[at.world]
     elif c.whose[q] == _GREATER:
@@ -326,8 +327,9 @@ def kernel(kinds: frozenset[int]) -> wp.Kernel:
 
 
 @wp.kernel(enable_backward=False)
-def add(nacon: wp.array[int], count: int):
-  """Adds to the number of contacts, after all have seen it."""
+def add(nacon: wp.array[int], start: wp.array[int], count: int):
+  """Adds an organ's to the number of contacts, after all have seen it."""
+  start[0] = nacon[0]
   nacon[0] = nacon[0] + count
 
 
@@ -365,7 +367,9 @@ def make(model: mujoco.MjModel, organ, tools: np.ndarray, flex: int, nworld: int
     kind=model.geom_type[tools],
     size=model.geom_size[tools],
     rough=np.full(nworld, model.flex_friction[own, 0]),
+    slide=np.tile(mixed["slide"], (nworld, 1)) if rows else np.zeros((nworld, 0)),
     nacon=data.nacon,
+    start=np.zeros(1),
   )  # fmt: skip
   return fill(Touch, data.nacon.device, values)
 

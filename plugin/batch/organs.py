@@ -7,21 +7,20 @@ import functools
 
 import numpy as np
 import warp as wp
-from palpate.engine import inertia, mjstruct, slots
+from palpate.engine import slots
 from palpate.tissue import body as bodies
 from palpate.tissue import config as configuration
 from palpate.tissue import device as devices
 from palpate.tissue import order, shape, step
-from palpate.tissue.types import NUMBERS
 
-from . import contacts, convex, kernels, patch
-from .base import Tissue, spread
-from .patch import GRADES, launch
+from . import contacts, convex, kernels, patch, sliding
+from .base import Contacts, Tissue, spread
+from .material import KEYS, Material
+from .patch import launch
 from .strip import Slots
 
 _WHAT = {"xpos": 0, "xvel": 1, "contact_force": 2}
 _STATUS = {"iterations": 0, "residual": 1}
-_KEYS = (*NUMBERS, "young", "friction")
 _FEW = 32  # values that are checked one by one
 
 
@@ -29,7 +28,8 @@ def _plan(body, config) -> devices.Plan | None:
   """Returns how a block takes a world's step; None where it is one that blocks do not know."""
   if config.integrator != "implicit" or body.newton > 1 or body.is_solid:
     return None
-  return devices.plan(body.device, body.shape.nslice, body.shape.nslot, body.has_bending)
+  nheld = int(body.shape.held_adr.numpy()[-1])
+  return devices.plan(body.device, body.shape.nslice, nheld, body.has_bending)
 
 
 class Organ(Tissue):
@@ -55,6 +55,7 @@ class Organ(Tissue):
     node = self.body.shape.node.numpy()
     mass = np.ones(self.body.shape.nnode, np.float32)
     mass[node] = organ.mass
+    self.mass = wp.array(order.to_slices(mass), dtype=float, device=device)  # of any world at first
     self.body.state.mass.assign(np.tile(order.to_slices(mass), (nworld, 1, 1)))
     held = organ.mass if organ.windows else np.where(organ.free, organ.mass, organ.mass.mean())
     nodal = w.inertia(model._address)
@@ -90,7 +91,17 @@ class Organ(Tissue):
     self._convex = convex.make(model, tools, nworld * place.nslot, m, d)
     kinds = frozenset(int(kind) for kind in model.geom_type[tools])
     self._find, self._region = contacts.kernel(kinds), int(nworld * place.nslot * self._touch.room)
-    self._graded = False
+    self._material = Material(self, batch, self._touch)
+
+  @property
+  def responds(self):
+    """What launches the answer to impulses, or None."""
+    return self._scheme.respond
+
+  @property
+  def spreads(self) -> bool:
+    """Whether a push on one node moves others within a step."""
+    return self._scheme.spreads
 
   @staticmethod
   def bytes_of(w) -> float:
@@ -122,11 +133,18 @@ class Organ(Tissue):
     dim, device = (self._batch.nworld, self.place.nslot), self.body.device
     inputs = [self.patch, self._touch, self._convex]
     wp.launch(self._find, dim=dim, inputs=inputs, device=device, block_dim=64)
-    wp.launch(contacts.add, dim=1, inputs=[self._touch.nacon, self._region], device=device)
+    inputs = [self._touch.nacon, self._touch.start, self._region]
+    wp.launch(contacts.add, dim=1, inputs=inputs, device=device)
 
   def push(self):
-    """Adds the passive force."""
+    """Adds the passive force, and keeps sliding contacts closed."""
     self._over(patch.push, self.place.nslot)
+    batch, c, many = self._batch, self._touch, self.place.nslot * self._touch.room
+    contact, paired = batch.d.contact, batch.paired
+    inputs = [c.start, many, paired, contact.dim, contact.friction, contact.efc_address]
+    inputs.append(batch.d.efc.aref)
+    dim = (batch.nworld, many)
+    wp.launch(sliding.keep_closed, dim=dim, inputs=inputs, device=self.body.device)
 
   def end(self):
     """Ends the step with the contact forces that mujoco_warp found."""
@@ -148,6 +166,11 @@ class Organ(Tissue):
     """Puts the worlds of the mask at rest."""
     self._over(patch.rest, self.patch.nnode)
 
+  def rubs(self, geom: int, friction: np.ndarray):
+    """Returns which array has the friction of a geom, where, and its new values a world."""
+    tools = self.patch.tool_geom.numpy().tolist()
+    return [(self._touch.slide, (tools.index(geom),), friction)] if geom in tools else []
+
   # Reading.
 
   @functools.cached_property
@@ -162,81 +185,43 @@ class Organ(Tissue):
     wp.launch(kernels.show, dim=dim, inputs=[self.patch, _WHAT[name], out], device=self.body.device)
     return out.view(float)
 
+  @property
+  def contacts(self) -> Contacts:
+    """Contacts of the last step."""
+    c, d, (nworld, many) = self._touch, self._batch.d, self._pressed.geom.shape
+    inputs = [c.start, many, self._batch.paired, d.contact.dim, d.contact.geom, d.contact.frame]
+    inputs += [d.contact.efc_address, d.efc.force, *self._pressed]
+    wp.launch(sliding.press, dim=(nworld, many), inputs=inputs, device=self.body.device)
+    return self._pressed._replace(normal=self._pressed.normal.view(float))
+
+  @functools.cached_property
+  def _pressed(self) -> Contacts:
+    shape = (self._batch.nworld, self.place.nslot * self._touch.room)
+    kinds = (int, wp.vec3, float)
+    return Contacts(*(wp.zeros(shape, dtype=kind, device=self.body.device) for kind in kinds))
+
   # Changing.
 
   def configure(self, mask=None, **keys):
     """Changes the tissue of worlds, see `Tissue.configure`."""
     batch, nworld = self._batch, self._batch.nworld
-    chosen = batch._mask(mask).numpy()
-    rows = {key: spread(self, key, value, nworld) for key, value in keys.items()}
-    for key, values in rows.items():
-      if key not in _KEYS:
+    chosen = np.flatnonzero(batch._mask(mask).numpy())
+    rows = {key: spread(self, key, value, nworld)[chosen] for key, value in keys.items()}
+    for key in rows:
+      if key not in KEYS or (key == "poisson" and self.body.has_bending):
+        why = " while tissue bends" if key in KEYS else ""
         raise ValueError(
-          f"organ {self.name!r}: {key!r} cannot change in a batch on a GPU, expected one of "
-          f"{', '.join(_KEYS)}"
+          f"organ {self.name!r}: {key!r} cannot change in a batch on a GPU{why}, expected one of "
+          f"{', '.join(KEYS)}"
         )
-      if key != "friction":
-        self._check(key, np.unique(values[chosen], axis=0))
-    if "young" in rows:
-      rows["young_scale"] = rows.pop("young") / self._young()
-    number = self.body.tissue.number.numpy()
     for key, values in rows.items():
-      if key == "friction":
-        rough = self._touch.rough.numpy()
-        rough[chosen] = values[chosen]
-        self._touch.rough.assign(rough)
-      else:
-        number[chosen, NUMBERS.index(key)] = values[chosen]
-    self.body.tissue.number.assign(number)
-    if "young_scale" in rows:
-      self._grade(number[:, NUMBERS.index("young_scale")])
-
-  def _young(self) -> float:
-    if len(set(self.config.young)) > 1:
-      raise ValueError(f"organ {self.name!r}: its triangles differ in young, expected young_scale")
-    return self.config.young[0]
+      if key != "friction" and key != "mass":
+        self._check(key, values)
+    self._material.change(chosen, rows)
 
   def _check(self, key: str, values: np.ndarray):
     """Raises ValueError where a value of a key is not allowed."""
-    if values.ndim > 1:
-      raise ValueError(
-        f"organ {self.name!r}: young of each triangle, which a batch on a GPU cannot have, "
-        "expected one number a world"
-      )
-    mesh = self.declared.mesh
+    mesh, values = self.declared.mesh, np.unique(values)
     for value in values if len(values) < _FEW else (values.min(), values.max()):
       text = {key: f"{int(value)}" if key == "iterations" else f"{value:.9g}"}
       configuration.change(self.name, self.config, text, mesh.nelem, mesh.closed, self.config)
-
-  def _grade(self, scale: np.ndarray):
-    """Lets tools meet the inertia of tissue of that scale of Young's modulus."""
-    if scale.min() < 0.999 * GRADES[0] or scale.max() > 1.001 * GRADES[-1]:
-      raise ValueError(
-        f"organ {self.name!r}: young_scale is in [{scale.min():g}, {scale.max():g}], expected "
-        f"[{GRADES[0]:g}, {GRADES[-1]:g}]"
-      )
-    w, batch = self.space, self._batch
-    m = mjstruct.Model.from_address(batch.model._address)
-    if not self._graded and self._scheme.spreads:
-      flex = int(w.organ.windows.flex[0]) if w.organ.windows else w.organ.flex
-      mass = inertia.masses(m, w.organ)
-      table, node = self.patch.inertia.numpy(), self.body.shape.node.numpy()
-      for k, grade in enumerate(GRADES):
-        found = inertia.of_nodes(m, w.organ, w.body, self._scaled(grade), mass, flex)
-        table[k, node] = np.where(self.declared.free, found, table[k, node])
-      self.patch.inertia.assign(table)
-      self._graded = True
-    self.patch.grade.assign(np.log2(scale / GRADES[0]).astype(np.float32))
-    stiff = self.patch.stiff
-    if not stiff and self._scheme.respond is not None:
-      nodal = w.inertia(batch.model._address)
-      config = self._scaled(float(scale.max()))
-      stiff, _ = inertia.stiffness(m, w.organ, w.body, config, nodal)
-      if stiff:
-        self.patch.stiff = 1
-        batch.record()
-
-  def _scaled(self, scale: float):
-    young = tuple(scale * each for each in self.config.young)
-    stiffness = self.config.stiffness
-    return dataclasses.replace(self.config, young=young, stiffness=stiffness)

@@ -62,7 +62,9 @@ class Patch:
   origin: doubles(3)  # position of its frame [m]
   tool_geom: ints("ntool")  # geoms that the slots follow
   # What a world has of its own:
-  grade: floats("nworld")  # place in GRADES of the scale of Young's modulus
+  grade: floats("nworld")  # place in GRADES of the scale of stiffness over that of mass
+  mass_scale: doubles("nworld")  # times the masses below
+  lump: floats("nlump", "nnode")  # factor on Young's modulus around a node; none where all have 1
   heavier: doubles("nworld")  # times its inertia at rest that a tool meets; 0 for once
   force: floats("nworld", "nnode", 3)  # contact force of the last step [N]
   last: vector  # last change of the velocity [m/s]
@@ -203,6 +205,8 @@ def variables(nworld: int, nslot: int, nslice: int) -> dict:
     nslot=nslot,
     most=most,
     grade=np.full(nworld, np.log2(1.0 / GRADES[0])),
+    mass_scale=np.ones(nworld),
+    lump=np.zeros((0, nnode)),
     heavier=np.zeros(nworld),
     force=np.zeros((nworld, nnode, 3)),
     last=np.zeros(shape),

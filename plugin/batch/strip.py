@@ -163,8 +163,8 @@ def _check_option(option):
 
 
 def _slot_mass(organ) -> float:
-  """Returns the mass of a slot's body, which no node is lighter than [kg]."""
-  return 0.5 * float(organ.mass[organ.free].min())
+  """Returns the mass of a slot's body, lighter than a node whatever its world's masses [kg]."""
+  return 0.1 * float(organ.mass[organ.free].min())
 
 
 def _take_out(bare, bodies: dict, organ, model):

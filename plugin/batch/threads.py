@@ -119,6 +119,14 @@ class Threads(Batch):
       model = self.models[world]
       model.body_pos[body], model.body_quat[body] = pos[world], quat[world]
 
+  def _configure(self, worlds: np.ndarray, gravity: np.ndarray | None, friction: dict):
+    for k, world in enumerate(worlds):
+      model = self.models[world]
+      if gravity is not None:
+        model.opt.gravity[:] = gravity[k]
+      for g, values in friction.items():
+        model.geom_friction[g, 0] = values[k]
+
   def _tell(self):
     for name in ("qpos", "qvel", "sensordata"):
       out = self._arrays[name].numpy()

@@ -81,11 +81,11 @@ class Worlds(Batch):
   def _put(self, bare, nslots, tools, deterministic, spaces):
     """Makes mujoco_warp's model and data."""
     model, nworld = self.model, self.nworld
-    cone = 1 if model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC else 2
+    self.paired = model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
     most = [contacts.most_of(model, t, n) for t, n in zip(tools, nslots, strict=True)]
     regions = [contacts.room_of(model, t) * n for t, n in zip(tools, nslots, strict=True)]
     condim = int(max([1, *model.flex_condim, *model.geom_condim]))
-    each = 1 if condim == 1 else condim if cone == 1 else 2 * (condim - 1)
+    each = 1 if condim == 1 else 2 * (condim - 1) if self.paired else condim
     between = _CONTACTS if strip.tools_meet(bare) else 0
     self.njmax = strip.rows_of(bare) + (between + sum(most)) * each
     ncon = between + sum(regions)
@@ -93,7 +93,7 @@ class Worlds(Batch):
     size += sum(convex.bytes_of(model.geom_type[t], n) for t, n in zip(tools, nslots, strict=True))
     refuse_crowd(nworld, size, _room(self.device), str(self.device))
     try:
-      own = ("dof_armature", "body_invweight0", "body_pos", "body_quat")
+      own = ("dof_armature", "body_invweight0", "body_pos", "body_quat", "geom_friction")
       sizes = dict.fromkeys(own, nworld)
       self.m = mjw.put_model(bare, batch_sizes=sizes)
     except (NotImplementedError, ValueError) as error:
@@ -217,6 +217,16 @@ class Worlds(Batch):
     inputs = [mask, number, pos, quat, self.m.body_pos, self.m.body_quat]
     wp.launch(kernels.place, dim=self.nworld, inputs=inputs, device=self.device)
     self._look(mask)
+
+  def _configure(self, worlds: np.ndarray, gravity: np.ndarray | None, friction: dict):
+    changes = [] if gravity is None else [(self.m.opt.gravity, slice(None), gravity)]
+    for g, values in friction.items():
+      changes.append((self.m.geom_friction, (g, 0), values))
+      changes += [change for organ in self._organs.values() for change in organ.rubs(g, values)]
+    for array, place, values in changes:
+      whole = array.numpy()
+      whole[(worlds, *place) if isinstance(place, tuple) else worlds] = values
+      array.assign(whole)
 
   def _look(self, mask: wp.array):
     wp.copy(self.mask, mask)

@@ -71,7 +71,7 @@ template <class Fields>
 PALPATE void hinge_angle(const Fields& f, Thread t, int stage) {
   const float* step = f.state.step.data + 4 * t.world;
   const float h = step[0], gv = weight_of_rate(stage, step);
-  const float young = numbers(f, t.world)[YOUNG_SCALE];
+  const float plate = numbers(f, t.world)[PLATE];
   const size_t base = 24 * (size_t)t.world * f.shape.nslice;
   const float* disp = f.system.disp_trial.data + base;
   const float* vel = f.system.vel_trial.data + base;
@@ -107,7 +107,11 @@ PALPATE void hinge_angle(const Fields& f, Thread t, int stage) {
     st(f.system.hinge_half.data + 8 * out, 0, now.half, lane);
     // What the bending matrix may leave out here, see elem_corner.
     const V fold = 4.0f - 4.0f * now.half * now.half + 2.0f * change * change;
-    const V gain = young * ld(f.tissue.hinge_gain.data, 5 * s, lane);
+    V gain = plate * ld(f.tissue.hinge_gain.data, 5 * s, lane);
+    if (f.lump.hinge.data) {
+      const float* factor = f.lump.hinge.data + 16 * out;
+      gain = gain * vmax(ld(factor, 0, lane), ld(factor, 1, lane));
+    }
     st(f.system.hinge_rough.data + 8 * out, 0, gain * fold, lane);
   });
 }
@@ -117,14 +121,25 @@ template <class Fields>
 PALPATE void hinge_moment(const Fields& f, Thread t, int) {
   const size_t base = (size_t)t.world * f.shape.nhingeslice;
   const float* angle = f.system.hinge_angle.data + 8 * base;
-  const float young = numbers(f, t.world)[YOUNG_SCALE];
+  const float plate = numbers(f, t.world)[PLATE];
   each_slice(t, f.shape.nhingeslice, [&](int s, Lane lane) {
     const int* near = f.shape.hinge_near.data + 32 * s;
     const float* gain = f.tissue.hinge_gain.data + 40 * s;
-    V sum = ld(gain, 0, lane) * ld(angle, s, lane);
-    for (int k = 0; k < 4; ++k) sum += ld(gain, k + 1, lane) * gather(angle, near + 8 * k, 0, lane);
+    const V own = ld(angle, s, lane);
+    V sum = ld(gain, 0, lane) * own;
+    if (f.lump.hinge.data) {
+      // Two neighbours are the left triangle's, two the right one's.
+      const float* factor = f.lump.hinge.data + 16 * (base + s);
+      const V l = ld(factor, 0, lane), r = ld(factor, 1, lane);
+      sum = r * sum + (l - r) * ld(f.lump.hinge_left.data, s, lane) * own;
+      for (int k = 0; k < 4; ++k)
+        sum += (k < 2 ? l : r) * ld(gain, k + 1, lane) * gather(angle, near + 8 * k, 0, lane);
+    } else {
+      for (int k = 0; k < 4; ++k)
+        sum += ld(gain, k + 1, lane) * gather(angle, near + 8 * k, 0, lane);
+    }
     const V half = ld(f.system.hinge_half.data + 8 * base, s, lane);
-    st(f.system.hinge_moment.data + 8 * base, s, young * sum * half, lane);
+    st(f.system.hinge_moment.data + 8 * base, s, plate * sum * half, lane);
   });
 }
 
@@ -232,16 +247,18 @@ PALPATE Spring spring(V k, V3 t, V3 q) {
 
 // Rows of the matrix.
 
-// What the rows of a world are made from, and where they go: the first `nheld` rows of blocks to
-// `held`, the others to `block`.
+// What the rows of a world are made from, and where they go: the blocks of the first slices to `held`,
+// as long as there is room, those of the others to `block`.
 struct Rows {
   const float* disp;
   const float* vel;
   float *rhs, *diag, *inverse, *areavec, *normal, *block, *held;
-  int nheld;
+  const int* held_adr;
+  int room;  // floats of `held`
 
-  PALPATE float* blocks(int row, int width) const {
-    return (row + width <= nheld ? held : block) + 72 * (size_t)row;
+  PALPATE bool holds(int s) const { return held_adr[s + 1] <= room; }
+  PALPATE float* blocks(int s, int row) const {
+    return holds(s) ? held + held_adr[s] : block + 72 * (size_t)row;
   }
 };
 
@@ -253,7 +270,7 @@ PALPATE Rows rows(const Fields& f, int world) {
     f.system.rhs.data + 24 * base, f.system.diag.data + 8 * base,
     f.system.inverse.data + 48 * base, f.system.areavec.data + 24 * base,
     f.system.normal.data + 24 * base,
-    f.system.block.data + 72 * (size_t)world * f.shape.nslot, nullptr, 0
+    f.system.block.data + 72 * (size_t)world * f.shape.nslot, nullptr, f.shape.held_adr.data, 0
   };
 }
 
@@ -266,11 +283,12 @@ struct Fan {
   const float* metric;
   const int* corner;
   const int* side;
+  const float* factor;  // on the moduli of its triangles, or null
   float* block;
 };
 
 template <class Fields>
-PALPATE Fan fan_of(const Fields& f, const Rows& at, int s, Lane lane) {
+PALPATE Fan fan_of(const Fields& f, int world, const Rows& at, int s, Lane lane) {
   const int row = f.shape.slot_adr.data[s], width = f.shape.slot_adr.data[s + 1] - row;
   return {
     width,
@@ -280,7 +298,9 @@ PALPATE Fan fan_of(const Fields& f, const Rows& at, int s, Lane lane) {
     f.tissue.fan_metric.data + 40 * (row + s),
     f.shape.fan_corner.data + 8 * (row + s),
     f.shape.fan_side.data + 8 * (row + s),
-    at.blocks(row, width),
+    f.lump.fan.data ? f.lump.fan.data + 8 * ((size_t)world * (f.shape.nslot + f.shape.nslice) + row + s)
+                    : nullptr,
+    at.blocks(s, row),
   };
 }
 
@@ -297,7 +317,7 @@ struct Sum {
 struct Motion { const float* disp; const float* vel; V3 u, v; };
 
 // What is asked of a fan: g = h^2 + h damping; `normal` has the stiffness that covers bending.
-struct Wanted { float g, spring, young; bool matrix, areas, bending; const float* normal; };
+struct Wanted { float g, spring, shear, lame; bool matrix, areas, bending; const float* normal; };
 
 // Adds the triangle of entries a and b, at rest ra and rb, to the area vector.
 PALPATE void area(Sum& sum, Metric g, V3 a, V3 b) {
@@ -329,7 +349,13 @@ PALPATE Sum around(const Fan& fan, const Motion& m, const Wanted& want, Lane lan
     if (want.bending && want.matrix)
       over = select(g.g11 > zero, gather(want.normal, fan.corner + 8 * k, 3, lane), zero);
     if (want.spring == 0.0f) {
-      const Moduli c = moduli(g, want.young * ld(metric, 3, lane), want.young * ld(metric, 4, lane));
+      V mu = want.shear * ld(metric, 3, lane), lambda = want.lame * ld(metric, 4, lane);
+      if (fan.factor) {
+        const V factor = ld(fan.factor, k, lane);
+        mu = factor * mu;
+        lambda = factor * lambda;
+      }
+      const Moduli c = moduli(g, mu, lambda);
       const Stress s = stress(c, r, p, t, q);
       if (k > 0) sum.force += (s.s11 + s.s12) * a + (s.s12 + s.s22) * b;
       const Stress pulled = tensile(s, g);
@@ -398,7 +424,7 @@ struct Assembly {
   const float* const step = f.state.step.data + 4 * world;
   const float* const number = numbers(f, world);
   const float h = step[0], g = step[1], gv = weight_of_rate(stage, step);
-  const float foundation = number[FOUNDATION], young = number[YOUNG_SCALE];
+  const float foundation = number[FOUNDATION];
   const bool bends = f.shape.nhingeslice > 0;
   const bool areas = bends || number[BULK] != 0.0f || number[PRESSURE] != 0.0f;
   const bool matrix = stage == FIRST || stage == LATER;
@@ -406,11 +432,13 @@ struct Assembly {
     f.system.elem_normal.data + 32 * (size_t)world * f.shape.nelemslice;
   const float* const corner =
     f.system.elem_corner.data + 24 * (size_t)world * f.shape.nelemslice;
-  const Wanted want = {g, number[STIFFNESS], young, matrix, areas, bends, normal};
+  const Wanted want = {
+    g, number[STIFFNESS], number[SHEAR], number[LAME], matrix, areas, bends, normal
+  };
 
   PALPATE void row(int s, Lane lane) const {
     const size_t own = (size_t)world * f.shape.nslice + s;
-    const Fan fan = fan_of(f, at, s, lane);
+    const Fan fan = fan_of(f, world, at, s, lane);
     const Motion m = {at.disp, at.vel, ld3(at.disp + 24 * s, lane), ld3(at.vel + 24 * s, lane)};
     Sum sum = around(fan, m, want, lane);
     const V mass = ld(f.state.mass.data + 8 * own, 0, lane);
@@ -426,7 +454,9 @@ struct Assembly {
       const V scale = vsqrt(sum.squeeze / vmax(dot(sum.area, sum.area), splat(1e-30f)));
       const V3 n = scale * sum.area;
       st3(at.normal + 24 * s, n, lane);
-      self = self + square(young * g * ld(f.tissue.bend_diag.data, s, lane), n);
+      const float* bend = f.lump.bend_diag.data ? f.lump.bend_diag.data + 8 * own
+                                                : f.tissue.bend_diag.data + 8 * s;
+      self = self + square(number[PLATE] * g * ld(bend, 0, lane), n);
     }
     st3(at.rhs + 24 * s, b, lane);
     if (!matrix) return;

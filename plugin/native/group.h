@@ -57,8 +57,13 @@ PALPATE int block_room() {
   return bytes / 4;
 }
 PALPATE void meet_block() { __syncthreads(); }
+// Fetches what is read after the next meetings.
+PALPATE void soon(const float* p, Lane lane) {
+  asm volatile("prefetch.global.L2 [%0];" :: "l"(p + lane));
+}
 #else
 PALPATE void meet_block() {}
+PALPATE void soon(const float*, Lane) {}
 #endif
 
 #if ON_CUDA
@@ -140,6 +145,11 @@ PALPATE float warp_sum(float v) {
   return v;
 }
 
+PALPATE float warp_most(float v) {
+  for (int o = 16; o > 0; o >>= 1) v = fmaxf(v, __shfl_xor_sync(0xffffffffu, v, o));
+  return v;
+}
+
 template <Meeting FOR = MEMORY>
 class Group {
  public:
@@ -184,13 +194,13 @@ class Group {
   PALPATE void sync() { sum(0.0f); }
   // The greatest number >= 0 of the threads of one block.
   PALPATE float most(V v) {
-    for (int o = 16; o > 0; o >>= 1) v = fmaxf(v, __shfl_xor_sync(0xffffffffu, v, o));
+    const int at = threadIdx.x & 31;
     WarpSums& mine = warp_sums()[flip];
     flip ^= 1;
-    if ((threadIdx.x & 31) == 0) mine[0][threadIdx.x >> 5] = v;
+    v = warp_most(v);
+    if (at == 0) mine[0][threadIdx.x >> 5] = v;
     __syncthreads();
-    for (int w = 0; w < blockDim.x >> 5; ++w) v = fmaxf(v, mine[0][w]);
-    return v;
+    return warp_most(at < blockDim.x >> 5 ? mine[0][at] : 0.0f);
   }
 
   // Slices of each block where each has its own, and where they begin.
@@ -224,10 +234,7 @@ class Group {
       nsum = nwarp < (nblock + 31) / 32 ? nwarp : (nblock + 31) / 32;
       from = 3;
     }
-    for (int c = 0; c < N; ++c) {
-      v[c] = 0.0f;
-      for (int w = 0; w < nsum; ++w) v[c] += mine[from + c][w];
-    }
+    for (int c = 0; c < N; ++c) v[c] = warp_sum(at < nsum ? mine[from + c][at] : 0.0f);
   }
 
   // The first warp sums over its block and tells the others.

@@ -16,22 +16,23 @@ struct Matrix {
   const int* bend_row;
   const int* bend_node;
   const float* bend_gain;
-  float bend;  // (h^2 + h damping) times the scale of Young's modulus, for the bending matrix
+  float bend;  // (h^2 + h damping) times the scale of the plate, for the bending matrix
   bool bends;  // whether there is one
 
-  // Runs body(blocks) for the blocks of a slice, which start at `row`.
+  // Runs body(blocks) for the blocks of slice s, whose first row is `row`.
   template <class Body>
-  PALPATE void with_blocks(int row, int, Body body) const { INLINED body(block + 72 * (size_t)row); }
+  PALPATE void with_blocks(int, int row, Body body) const { INLINED body(block + 72 * (size_t)row); }
 };
 
 template <class Fields>
 PALPATE Matrix matrix(const Fields& f, int world) {
-  const size_t base = (size_t)world * f.shape.nslice;
+  const size_t base = (size_t)world * f.shape.nslice, nbend = f.shape.bend_adr.data[f.shape.nslice];
   return {
     f.system.block.data + 72 * (size_t)world * f.shape.nslot, f.system.diag.data + 8 * base,
     f.system.inverse.data + 48 * base, f.system.normal.data + 24 * base, f.shape.slot_adr.data,
-    f.shape.fan_node.data, f.shape.bend_adr.data, f.shape.bend_node.data, f.tissue.bend_gain.data,
-    f.state.step.data[4 * world + 1] * numbers(f, world)[YOUNG_SCALE], f.shape.nhingeslice > 0
+    f.shape.fan_node.data, f.shape.bend_adr.data, f.shape.bend_node.data,
+    f.lump.bend_gain.data ? f.lump.bend_gain.data + 8 * nbend * world : f.tissue.bend_gain.data,
+    f.state.step.data[4 * world + 1] * numbers(f, world)[PLATE], f.shape.nhingeslice > 0
   };
 }
 
@@ -43,7 +44,7 @@ PALPATE V3 product(const Any& a, const Vector& z, V3 own, int s, Lane lane) {
   Carried out = ld(a.diag, s, lane) * own;
   {
     const int row = a.slot[s], width = a.slot[s + 1] - row;
-    a.with_blocks(row, width, [&](const float* block) {
+    a.with_blocks(s, row, [&](const float* block) {
       z.each_near(a.fan + 8 * (row + 2 * s + 1), width, lane, [&](V3 near) {
         out = out + ld9(block, lane) * (near - own);
         block += 72;

@@ -10,17 +10,16 @@
 
 namespace palpate {
 
-// A matrix whose first rows are elsewhere.
+// A matrix whose rows are where they were made.
 struct Split : Matrix {
-  const float* held;
-  int nheld;
+  Rows rows;
 
   template <class Body>
-  PALPATE void with_blocks(int row, int width, Body body) const {
-    if (row + width <= nheld)
-      INLINED body(held + 72 * (size_t)row);
+  PALPATE void with_blocks(int s, int row, Body body) const {
+    if (rows.holds(s))
+      INLINED body(rows.held + rows.held_adr[s]);
     else
-      INLINED body(block + 72 * (size_t)row);
+      INLINED body(rows.block + 72 * (size_t)row);
   }
 };
 
@@ -36,7 +35,7 @@ struct Home {
   Shown z;  // in place of `disp` and `vel`, when rows are made
 
   PALPATE Split matrix(const Matrix& a) const {
-    Split out{a, rows.held, rows.nheld};
+    Split out{a, rows};
     out.diag = rows.diag;
     out.inverse = rows.inverse;
     out.normal = rows.normal;
@@ -60,7 +59,7 @@ PALPATE Home home(const Fields& f, int world) {
     at.normal = at.held;
     at.held += 24 * n;
   }
-  at.nheld = (block_room() - (int)(at.held - memory)) / 72;
+  at.room = block_room() - (int)(at.held - memory);
   return {at, disp, vel, {{disp, vel}}};
 #else
   const size_t base = (size_t)world * n;
@@ -77,6 +76,10 @@ PALPATE void stand_ahead(const Fields& f, int world, Team& group, const Mine& sl
   const float h = step[0];
   slices.each([&](int s, Lane lane, int) {
     st3(at.vel + 24 * s, ld3(f.state.vel.data + base + 24 * s, lane), lane);
+    st3(at.disp + 24 * s, ld3(f.state.disp.data + base + 24 * s, lane), lane);
+    soon(f.state.force_ext.data + base + 24 * s, lane);
+    soon(f.state.dvel_warm.data + base + 24 * s, lane);
+    soon(f.state.mass.data + base / 3 + 8 * s, lane);
   });
   meet_block();
   V fast = splat(0.0f);
@@ -86,7 +89,7 @@ PALPATE void stand_ahead(const Fields& f, int world, Team& group, const Mine& sl
     f.shape.nhingeslice > 0 || number[BULK] != 0.0f || number[PRESSURE] != 0.0f;
   slices.each([&](int s, Lane lane, int) {
     const V3 v = ld3(at.vel + 24 * s, lane);
-    const V3 x = ld3(f.state.disp.data + base + 24 * s, lane) + share * h * v;
+    const V3 x = ld3(at.disp + 24 * s, lane) + share * h * v;
     st3(at.disp + 24 * s, x, lane);
     if (!told) return;
     st3(f.system.disp_trial.data + base + 24 * s, x, lane);

@@ -48,13 +48,17 @@ PALPATE bool succeeded(const Fields& f, int world) {
   return f.solve.status.data[4 * world + 3] == 0.0f;
 }
 
-// The inertia that a tool meets at a node, which follows the scale of Young's modulus.
+// The inertia that a tool meets at a node, which follows the scales of Young's modulus and of mass.
 template <class Fields>
 PALPATE double inertia_of(const Fields& f, int world, int i) {
-  const float grade = f.grade.data[world];
+  float grade = f.grade.data[world];
+  if (f.lump.data) grade += log2f(f.lump.data[in_row(f, world, i)]);
+  const float last = (float)(f.ngrade - 1);
+  grade = grade < 0.0f ? 0.0f : grade > last ? last : grade;
   const int k = (int)grade < f.ngrade - 1 ? (int)grade : f.ngrade - 2;
   const double t = grade - k, low = f.inertia.data[k * f.nnode + i];
-  const double total = low + t * (f.inertia.data[(k + 1) * f.nnode + i] - low);
+  const double more = t * (f.inertia.data[(k + 1) * f.nnode + i] - low);
+  const double total = f.mass_scale.data[world] * (low + more);
   const D3 force = load_floats(f.force.data + 3 * in_row(f, world, i));
   return touched(force) && f.heavier.data[world] > 1.0 ? f.heavier.data[world] * total : total;
 }
@@ -78,13 +82,13 @@ PALPATE void tell_tools(const Fields& f, Thread t, int) {
 template <class Fields>
 PALPATE void enter_worlds(const Fields& f, Thread t, int) {
   const int w = t.world;
-  const double h = f.h;
+  const double h = f.h, masses = f.mass_scale.data[w];
   if (t.tid == 0) {
     float* step = f.solve.step.data + 4 * w;
     const double still = f.rest_share * 9.81 * h;
     step[0] = (float)h;
     step[1] = (float)(h * h + h * numbers(f, w)[DAMPING]);
-    step[2] = (float)(f.weight * still * still);
+    step[2] = (float)(masses * f.weight * still * still);
   }
   const D3 g = turned_back(f.frame.data, gravity(f, w));
   const double* tool = f.tool.data + (size_t)GEOM_LENGTH * w * f.ntool;
@@ -93,7 +97,7 @@ PALPATE void enter_worlds(const Fields& f, Thread t, int) {
     const D3 last = load_lane(f.last.data + at), before = load_lane(f.before.data + at);
     const D3 contact = load_floats(f.force.data + 3 * in_row(f, w, i));
     store_lane(f.solve.dvel_warm.data + at, forecast(last, before));
-    store_lane(f.solve.force_ext.data + at, f.mass.data[i] * g + contact);
+    store_lane(f.solve.force_ext.data + at, (masses * f.mass.data[i]) * g + contact);
     f.node_slot.data[in_row(f, w, i)] = -1;
     const D3 x = load(f.rest.data + 3 * i) + load_lane(f.solve.disp.data + at);
     const double far = nearest(tool, f.ntool, x);
@@ -152,7 +156,7 @@ PALPATE void stand_on(const Fields& f, int world, int slot, int i) {
   const double more = inertia_of(f, world, i) - f.slot_mass;
   store_floats(f.dof_armature.data + adr, {more, more, more});
   float* inverse = (float*)f.body_invweight0.data + 2 * (world * f.nbody + f.bodyid + slot);
-  inverse[0] = (float)(1.0 / f.held.data[i]);
+  inverse[0] = (float)(1.0 / (f.mass_scale.data[world] * f.held.data[i]));
 }
 
 // Gives the slots to the chosen nodes, in their order.

@@ -14,6 +14,7 @@ from .types import (
   NUMBERS,
   Cycle,
   Fields,
+  Lump,
   Shape,
   State,
   System,
@@ -133,6 +134,7 @@ def _sizes(values: dict[str, Any]) -> dict[str, int]:
   return out | {
     "nsolidslice": out["nslice"] if solid else 0,
     "nedgeslot": out["nslot"] if solid else 0,
+    "nheld": len(values["held_adr"]),
     "naround": len(values["around_tet"]),
     "nedge": len(values["edge_tet"]),
     "nbend": len(values["bend_node"]),
@@ -169,6 +171,7 @@ def _put_state(body: Body, nworld: int):
   body.nworld, sizes = nworld, body.sizes | {"nworld": nworld}
   body.fields.state = allocate(State, body.device, sizes)
   body.fields.system = allocate(System, body.device, sizes)
+  body.fields.lump = allocate(Lump, body.device, sizes | {"nlump": 0, "nhingeslice": 0})
   body.numbers = wp.clone(body.numbers)
 
 

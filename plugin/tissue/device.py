@@ -130,13 +130,13 @@ class Plan:
   nbytes: int
 
 
-def plan(device, nslice: int, nrow: int, bends: bool) -> Plan | None:
+def plan(device, nslice: int, nheld: int, bends: bool) -> Plan | None:
   """Returns how a block takes the whole step of a world; None where a block has too few threads.
 
   Args:
     device: where it runs
     nslice: slices of nodes
-    nrow: rows of stiffness blocks
+    nheld: floats of all stiffness blocks, see `order.banks`
     bends: whether there is bending
   """
   if not device.is_cuda:
@@ -146,7 +146,7 @@ def plan(device, nslice: int, nrow: int, bends: bool) -> Plan | None:
   if threads > _MOST:
     return None
   room = device.max_shared_memory_per_block - _STATIC
-  wanted = 4 * LANES * ((16 if bends else 13) * nslice + 9 * nrow)
+  wanted = 4 * (LANES * (16 if bends else 13) * nslice + nheld)
   per_sm = max(1, min(3, room // (wanted + _STATIC), _REGISTERS // threads))
   return Plan(own, threads, per_sm, min(wanted, room))
 

@@ -26,6 +26,7 @@ def kernel(
   constants: Mapping[str, int | float],
   bounds: tuple[int, int] | int | None = None,
   tag: str = "",
+  fast: bool = False,
 ) -> wp.Kernel:
   """Returns the kernel that calls palpate::name(fields, thread, arg) for each thread.
 
@@ -39,8 +40,11 @@ def kernel(
     constants: numbers by name that the header knows
     bounds: threads of a block at most, and blocks that a multiprocessor must have room for
     tag: what tells a module from others of the header with other constants
+    fast: whether quotients and roots may be off in the last digit on CUDA
   """
   module = _module(header, tuple(constants.items()), tag)
+  if fast:
+    wp.set_module_options({"fast_math": True}, module)
   call = f"palpate::{name}(f, palpate::Thread{{world, tid, nthread}}, arg);"
 
   def native(world: int, tid: int, nthread: int, arg: int, f: struct): ...

@@ -67,6 +67,26 @@ def addresses(width: np.ndarray) -> np.ndarray:
   return np.concatenate([[0], np.cumsum(width)]).astype(np.int32)
 
 
+def banks(width: np.ndarray) -> np.ndarray:
+  """Returns where slices of so many blocks start in memory of 32 banks, in floats, and the end.
+
+  Four slices that follow one another, which a warp reads at once, start in banks of their own.
+
+  Args:
+    width: blocks of each slice, 72 floats each (nslice,)
+  """
+  best = None
+  for turn in (1, 3):
+    start, at = [], 0
+    for s, w in enumerate(width):
+      at += (turn * s - at) % 4
+      start.append(at)
+      at += 9 * int(w)
+    if best is None or at < best[-1]:
+      best = [*start, at]
+  return LANES * np.array(best or [0], np.int32)
+
+
 def node_order(mesh: Mesh, patch: int = 0) -> np.ndarray:
   """Returns vertices in the order of the solver, padded with -1 to whole slices.
 

@@ -17,7 +17,7 @@ from . import plate, solid, step
 from .body import Body
 from .config import Config
 from .mesh import Mesh
-from .order import LANES, addresses, ellpack, node_order, offset, pad, to_slices
+from .order import LANES, addresses, banks, ellpack, node_order, offset, pad, to_slices
 from .types import NUMBERS, empty
 
 
@@ -159,6 +159,7 @@ def _fans(mesh: Mesh, config: Config, vert: np.ndarray, node: np.ndarray) -> dic
 
   return {
     "slot_adr": addresses(width),
+    "held_adr": banks(width),
     "fan_node": rows(offset(neighbour), 2).astype(np.int32),
     "fan_rest": rows(toward, 2).astype(np.float32),
     "fan_metric": rows(metric, 1).astype(np.float32),

@@ -129,7 +129,8 @@ def _world_step(plan: Plan) -> wp.Kernel:
   """Returns the kernel of a world's whole step by one block."""
   constants = _CONSTANTS | {"OWN": plan.own}
   tag = f".{plan.own}.{plan.threads}.{plan.per_sm}"
-  return kernel("step_world", "whole.h", Fields, constants, (plan.threads, plan.per_sm), tag)
+  bounds = (plan.threads, plan.per_sm)
+  return kernel("step_world", "whole.h", Fields, constants, bounds, tag, fast=plan.own > 0)
 
 
 def _by_block(body: Body, stage: Stage):

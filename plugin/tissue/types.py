@@ -73,9 +73,10 @@ class Stage(enum.IntEnum):
 
 
 # Numbers that may change while running, in the order of `Tissue.number`: configuration keys, and
-# what Young's modulus is a multiple of in a world, where worlds differ.
+# where worlds differ what the triangles' mu and lambda' and the plate's rigidity are multiples of.
 NUMBERS = (
-  "foundation", "bulk", "pressure", "damping", "tolerance", "iterations", "stiffness", "young_scale"
+  "foundation", "bulk", "pressure", "damping", "tolerance", "iterations", "stiffness",
+  "shear", "lame", "plate",
 )  # fmt: skip
 
 # What native code knows of these, as constexpr.
@@ -115,6 +116,7 @@ class Shape:
   vert: ints("nnode")  # vertex of each node, -1 for padding
   node: ints("nvert")  # node of each vertex
   slot_adr: ints("nslice + 1")  # first row of stiffness blocks
+  held_adr: ints("nheld")  # where a block keeps the blocks of each slice in its memory, in floats
   fan_node: ints("nslot + 2 nslice", 8)  # offset of each fan entry's node
   fan_rest: floats("nslot + 2 nslice", 3, 8)  # rest vector to each fan entry [m]
   fan_corner: ints("nslot + nslice", 8)  # offset of each fan triangle's normal
@@ -212,6 +214,20 @@ class System:
 
 
 @struct
+class Lump:
+  """Factors on Young's modulus of the triangles of each world; empty where worlds do not differ.
+
+  Those of a fan's triangles and of a hinge's two, and the bending matrix with them.
+  """
+
+  fan: floats("nlump", "nslot + nslice", 8)
+  hinge: floats("nlump", "nhingeslice", 2, 8)
+  hinge_left: floats("nhingeslice", 8)  # stiffness to itself by the left triangle [N m]
+  bend_gain: floats("nlump", "nbend", 8)  # as in `Tissue` [N/m]
+  bend_diag: floats("nlump", "nbendslice", 8)  # as in `Tissue` [N/m]
+
+
+@struct
 class Fields:
   """What every kernel of a body takes."""
 
@@ -219,6 +235,7 @@ class Fields:
   tissue: Tissue
   state: State
   system: System
+  lump: Lump
 
 
 @struct

@@ -5,7 +5,7 @@ import numpy as np
 import palpate
 import palpate.batch
 import pytest
-from scenes import drive, load, needs_cuda, press, probed
+from scenes import RADIUS, drive, load, needs_cuda, press, probed
 
 BACKENDS = [
   "cpu",
@@ -131,9 +131,109 @@ def test_each_world_has_a_tissue_of_its_own(make):
   assert 0 < force[0] < 0.95 * force[1] < 0.9 * force[2]
 
 
-def test_friction_is_that_of_a_world(make):
+@pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
+def test_sliding_is_that_of_the_plugin(make, cone):
+  made = probed(cone=cone)
+  model, data, organ = load(made)
+  batch = make(made, 2)
+  found = []
+  for k in range(220):
+    data.ctrl[:] = -0.007 * min(1, k / 60), 0.01 * np.clip(k / 100 - 1, 0, 1)
+    batch.ctrl = np.tile(data.ctrl, (2, 1))
+    mujoco.mj_step(model, data)
+    batch.step()
+    force = batch.organ("organ").contact_force.numpy()[0].sum(axis=0)
+    found.append((force, organ.contact_force.sum(axis=0)))
+  found = np.array(found)
+  peak = np.abs(found[:, 1]).max()
+  assert np.sqrt(np.mean((found[:, 0] - found[:, 1]) ** 2)) < 0.005 * peak
+  assert np.abs(found[:, 1, 0]).max() > 0.2 * peak  # it slides
+
+
+@pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
+def test_contacts_have_the_normal_forces(make, cone):
+  batch = make(probed(cone=cone), 2)
+  tissue = batch.organ("organ")
+  if make.device == "cpu":
+    with pytest.raises(ValueError, match=r"batch\.datas"):
+      tissue.contacts  # noqa: B018
+    return
+  batch.ctrl = np.array([[-0.006, 0.0], [-0.004, 0.0]])
+  batch.step(150)
+  geom, normal, force = (array.numpy() for array in tissue.contacts)
+  assert set(geom[geom >= 0]) == {batch.model.geom("tip").id} and not force[geom < 0].any()
+  pushed = (normal * force[..., None] * (geom >= 0)[..., None]).sum(axis=1)
+  found = tissue.contact_force.numpy().sum(axis=1)
+  np.testing.assert_allclose(pushed[:, 2], found[:, 2], rtol=0.03)
+
+
+TISSUES = [
+  (0, {"poisson": [0.45, 0.2, 0.49], "thickness": [0.002, 0.003, 0.001]}),
+  (1, {"thickness": [0.002, 0.004, 0.0015], "young": [2e4, 3e4, 4e4]}),
+  (0, {"young": "lumps"}),
+  (1, {"young": "lumps"}),
+]
+
+
+@pytest.mark.parametrize(("bend", "keys"), TISSUES)
+def test_tissues_of_worlds_are_those_of_the_plugin(make, bend, keys):
+  made, keys = press(bend=bend, foundation=2e4), dict(keys)
+  forces = []
+  for device in (make.device, "cpu"):
+    batch = palpate.batch.make(spec(made), 3, device=device)
+    tissue = batch.organ("organ")
+    if isinstance(keys.get("young"), str):
+      middle = tissue.xpos.numpy()[0][tissue.elem].mean(axis=1)
+      places = [[[0, 0, RADIUS]], [[RADIUS, 0, 0]], [[0.02, 0, 0.045]]]
+      lump = np.linalg.norm(middle - places, axis=2)
+      keys["young"] = np.where(lump < 0.025, 1.5e5, 3e4)
+    tissue.configure(**keys)
+    found = []
+    for k in range(100):
+      batch.ctrl = np.full((3, 1), -0.008 * min(1, k / 60))
+      batch.step()
+      found.append(tissue.contact_force.numpy().sum(axis=1)[:, 2])
+    forces.append(np.array(found))
+  peak = np.abs(forces[1]).max(axis=0)
+  assert (np.sqrt(np.mean((forces[0] - forces[1]) ** 2, axis=0)) < 0.003 * peak).all()
+  assert np.ptp(peak) > 0.1 * peak.max()
+
+
+def test_a_mass_of_its_own_is_that_of_a_world(make):
+  if make.device == "cpu":
+    pytest.skip("the CPU's models have their masses")
+  batch = make(press(bend=0, foundation=2e4), 2)
+  batch.organ("organ").configure(mass=[0.05, 0.3])
+  models = [load(press(bend=0, foundation=2e4).replace('mass="0.1"', f'mass="{m}"'))
+            for m in (0.05, 0.3)]  # fmt: skip
+  for k in range(60):
+    batch.ctrl = np.full((2, 1), -0.0001 * k)
+    batch.step()
+    for model, data, _ in models:
+      data.ctrl[0] = -0.0001 * k
+      mujoco.mj_step(model, data)
+  found = batch.organ("organ").contact_force.numpy().sum(axis=1)
+  expected = [organ.contact_force.sum(axis=0) for _, _, organ in models]
+  np.testing.assert_allclose(found, expected, atol=0.005 * np.abs(expected).max())
+
+
+def test_gravity_is_that_of_a_world(make):
+  batch = make(press(bend=0, foundation=1e4), 3)
+  batch.configure([False, True, True], gravity=[[0, 0, 1], [0, 0, -9.81], [9.81, 0, 0]])
+  batch.ctrl = np.full((3, 1), 0.02)
+  batch.step(200)
+  moved = (batch.organ("organ").xpos.numpy() - batch.organ("organ").xpos.numpy()[:1]).mean(axis=1)
+  assert moved[1, 2] < -1e-3 and moved[2, 0] > 1e-3
+  assert abs(moved[1, 2] + moved[2, 0]) < 1e-4
+
+
+@pytest.mark.parametrize("side", ["organ", "probe"])
+def test_friction_is_that_of_a_world(make, side):
   batch = make(probed(condim=3), 2)
-  batch.organ("organ").configure(friction=[0.5, 1.5])  # the probe's is 0.5, and the greater counts
+  if side == "organ":
+    batch.organ("organ").configure(friction=[0.5, 1.5])  # the probe's is 0.5, the greater counts
+  else:
+    batch.configure(friction={"tip": [0.5, 1.5]})
   most = np.zeros(2)
   for k in range(100):
     batch.ctrl = np.tile([-0.006, 0.01 * max(0, k / 50 - 1)], (2, 1))

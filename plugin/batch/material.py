@@ -1,0 +1,165 @@
+"""What the tissue of each world is made of, and what follows from it for tools."""
+
+# Annotations here are objects, not text: no `from __future__ import annotations`.
+import dataclasses
+
+import numpy as np
+import warp as wp
+from palpate.engine import inertia, mjstruct
+from palpate.tissue.types import NUMBERS
+
+from .lumps import Lumps
+from .patch import GRADES
+
+_PLAIN = ("foundation", "bulk", "pressure", "damping", "tolerance", "iterations", "stiffness")
+# What may change: numbers of the tissue, what its moduli follow from, and what else.
+KEYS = (*_PLAIN, "young", "young_scale", "poisson", "thickness", "mass", "friction")
+_LIGHTEST, _HEAVIEST = 0.25, 4.0  # times the compiled mass
+
+
+@wp.kernel(enable_backward=False)
+def weigh(
+  mass0: wp.array2d[float], world: wp.array[int], scale: wp.array[float], mass: wp.array3d[float]
+):
+  """Gives some worlds multiples of the masses at first."""
+  k, s, lane = wp.tid()
+  mass[world[k], s, lane] = scale[k] * mass0[s, lane]
+
+
+class Material:
+  """What an organ's worlds are made of.
+
+  Args:
+    organ: the organ in all worlds
+    batch: these worlds
+    touch: how it touches tools
+  """
+
+  def __init__(self, organ, batch, touch):
+    config, nworld = organ.config, batch.nworld
+    self._organ, self._batch, self._touch = organ, batch, touch
+    self._young = np.broadcast_to(config.young, (organ.declared.mesh.nelem,))
+    full = {"scale": 1.0, "poisson": config.poisson, "thickness": config.thickness, "mass": 1.0}
+    self._worlds = {name: np.full(nworld, value) for name, value in full.items()}
+    self._most = np.ones(nworld)  # greatest factor of a triangle
+    self._lumps: Lumps | None = None
+    self._graded = False
+
+  def change(self, worlds: np.ndarray, rows: dict[str, np.ndarray]):
+    """Changes worlds; `rows` has a value of each key for each of them."""
+    if not len(worlds):
+      return
+    own, rows = self._worlds, dict(rows)
+    if "friction" in rows:
+      self._put(self._touch.rough, worlds, rows.pop("friction"))
+    if "mass" in rows:
+      self._weigh(worlds, rows["mass"] / self._organ.declared.mass.sum())
+    if "young" in rows or "young_scale" in rows:
+      self._stiffen(worlds, rows)
+    for key in ("poisson", "thickness"):
+      if key in rows:
+        own[key][worlds] = rows[key]
+    numbers = {key: values for key, values in rows.items() if key in _PLAIN}
+    if rows.keys() - numbers.keys():
+      numbers |= self._moduli(worlds)
+      self._grade()
+    number = self._organ.body.tissue.number.numpy()
+    for key, values in numbers.items():
+      number[worlds, NUMBERS.index(key)] = values
+    self._organ.body.tissue.number.assign(number)
+
+  def _put(self, array: wp.array, worlds: np.ndarray, values: np.ndarray):
+    whole = array.numpy()
+    whole[worlds] = values
+    array.assign(whole)
+
+  def _moduli(self, worlds: np.ndarray) -> dict[str, np.ndarray]:
+    """Returns the scales of mu, lambda' and the plate's rigidity."""
+    config = self._organ.config
+    scale, nu, thick = (self._worlds[key][worlds] for key in ("scale", "poisson", "thickness"))
+    thick, nu0 = thick / config.thickness, config.poisson
+    squeeze, squeeze0 = nu / (1 - nu**2), nu0 / (1 - nu0**2)
+    if squeeze0 == 0 and squeeze.any():
+      raise ValueError(
+        f"organ {self._organ.name!r}: poisson was compiled as 0, which cannot change in a batch "
+        "on a GPU"
+      )
+    return {
+      "shear": scale * thick * (1 + nu0) / (1 + nu),
+      "lame": scale * thick * (squeeze / squeeze0 if squeeze0 else 1.0),
+      "plate": scale * thick**3,
+    }
+
+  def _stiffen(self, worlds: np.ndarray, rows: dict[str, np.ndarray]):
+    """Takes Young's modulus, of the whole or of each triangle."""
+    scale, factor = rows.get("young_scale"), np.ones((len(worlds), 1))
+    if "young" in rows:
+      factor = np.atleast_2d(rows["young"].T).T / self._young  # (worlds, nelem)
+      if (factor == factor[:, :1]).all():
+        scale, factor = factor[:, 0], np.ones((len(worlds), 1))
+    self._worlds["scale"][worlds] = 1.0 if scale is None else scale
+    self._most[worlds] = factor.max(axis=1)
+    if self._lumps is None:
+      if factor.shape[1] == 1:
+        return
+      self._lumps = Lumps(self._organ.declared, self._organ.body)
+      self._organ.patch.lump = self._lumps.node
+      self._lumps.put(worlds, factor)
+      self._batch.record()
+    else:
+      self._lumps.put(worlds, factor)
+
+  def _weigh(self, worlds: np.ndarray, scale: np.ndarray):
+    if not (_LIGHTEST <= scale.min() and scale.max() <= _HEAVIEST):
+      whole = float(self._organ.declared.mass.sum())
+      raise ValueError(
+        f"organ {self._organ.name!r}: mass is in [{whole * scale.min():g}, "
+        f"{whole * scale.max():g}], expected [{_LIGHTEST * whole:g}, {_HEAVIEST * whole:g}]"
+      )
+    self._worlds["mass"][worlds] = scale
+    organ, mass = self._organ, self._organ.body.state.mass
+    self._put(organ.patch.mass_scale, worlds, scale)
+    at = wp.array(worlds, dtype=int, device=mass.device)
+    factor = wp.array(scale, dtype=float, device=mass.device)
+    dim = (len(worlds), *mass.shape[1:])
+    wp.launch(weigh, dim=dim, inputs=[organ.mass, at, factor, mass], device=mass.device)
+
+  def _grade(self):
+    """Lets tools meet the inertia of the worlds' tissue."""
+    own, organ = self._worlds, self._organ
+    scale = own["scale"] * own["thickness"] / organ.config.thickness
+    low, high = scale.min(), (scale * self._most).max()
+    if low < 0.999 * GRADES[0] or high > 1.001 * GRADES[-1]:
+      raise ValueError(
+        f"organ {organ.name!r}: young times thickness is in [{low:g}, {high:g}] times the "
+        f"compiled one, expected [{GRADES[0]:g}, {GRADES[-1]:g}]"
+      )
+    m = mjstruct.Model.from_address(self._batch.model._address)
+    self._find_inertia(m)
+    organ.patch.grade.assign(np.log2(scale / own["mass"] / GRADES[0]).astype(np.float32))
+    if organ.patch.stiff or organ.responds is None:
+      return
+    nodal = organ.space.inertia(self._batch.model._address)
+    config = self._scaled(float(high))
+    stiff, _ = inertia.stiffness(m, organ.space.organ, organ.space.body, config, nodal)
+    if stiff:
+      organ.patch.stiff = 1
+      self._batch.record()
+
+  def _find_inertia(self, m):
+    """Fills the effective inertia at each of GRADES, once."""
+    organ, w = self._organ, self._organ.space
+    if self._graded or not organ.spreads:
+      return
+    flex = int(w.organ.windows.flex[0]) if w.organ.windows else w.organ.flex
+    mass = inertia.masses(m, w.organ)
+    table, node = organ.patch.inertia.numpy(), organ.body.shape.node.numpy()
+    for k, grade in enumerate(GRADES):
+      found = inertia.of_nodes(m, w.organ, w.body, self._scaled(grade), mass, flex)
+      table[k, node] = np.where(organ.declared.free, found, table[k, node])
+    organ.patch.inertia.assign(table)
+    self._graded = True
+
+  def _scaled(self, scale: float):
+    config = self._organ.config
+    return dataclasses.replace(config, young=tuple(scale * young for young in config.young))
