@@ -17,6 +17,8 @@ from typing import Any
 
 import numpy as np
 
+from .files import replacing
+
 SUFFIX = ".safetensors"
 _KEY = "palpate"  # of the header
 _FORMAT = 1
@@ -92,8 +94,6 @@ class Policy:
 def save(path: str | os.PathLike[str], policy: Policy) -> None:
   """Writes a policy."""
   from safetensors.numpy import save as dump
-
-  from .files import replacing
 
   arrays = {"mean": policy.mean, "scale": policy.scale}
   for k, (weight, bias) in enumerate(policy.layers):

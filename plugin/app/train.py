@@ -13,7 +13,16 @@ from typing import TYPE_CHECKING, Any
 import palpate
 
 from . import options
-from .console import CommandError, Interrupt, Progress, check_counts, need, output_folder, writing
+from .console import (
+  CommandError,
+  Interrupt,
+  Progress,
+  check_counts,
+  csv_rows,
+  need,
+  output_folder,
+  writing,
+)
 
 if TYPE_CHECKING:
   from palpate.tasks.batch.learning import Learner
@@ -133,26 +142,28 @@ def _kept(folder: pathlib.Path, iteration: int) -> list[dict[str, float]]:
   if not iteration or not path.exists():
     return []
   with path.open(newline="", encoding="utf-8") as file:
-    rows = [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)]
+    rows = [{key: _number(value) for key, value in row.items()} for row in csv.DictReader(file)]
   return [row for row in rows if row["iteration"] <= iteration]
+
+
+def _number(text: str) -> float:
+  return int(text) if text.isdigit() else float(text)
 
 
 def _save(folder: pathlib.Path, learner: Learner, task: Any, kwargs: dict[str, Any], rows: list):
   """Writes checkpoint, policy, licence and curves."""
   from palpate.tasks import policy
   from palpate.tasks.batch import learning
-  from palpate.tasks.files import replacing
 
   with writing(folder):
     learner.save(folder / learning.CHECKPOINT, task.name)
     policy.save(folder / learning.POLICY, learner.policy(task, json.loads(json.dumps(kwargs))))
     (folder / "LICENSE").write_text(_LICENCE, encoding="utf-8")
-    with replacing(folder / "curve.csv") as file:
-      writer = csv.DictWriter(file, learning.ROW, lineterminator="\n")
-      writer.writeheader()
-      writer.writerows(rows)
     if rows:
       _plot(folder / "curve.png", task.name, rows)
+  with csv_rows(folder / "curve.csv", learning.ROW) as write:
+    for row in rows:
+      write(row[name] for name in learning.ROW)
 
 
 def _plot(path: pathlib.Path, name: str, rows: list[dict[str, float]]):

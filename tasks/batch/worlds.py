@@ -15,6 +15,7 @@ import warp as wp
 from palpate.models import trocar
 from palpate.tasks import base, episode
 from palpate.tasks.environment import Environment
+from palpate.tasks.physics import AXES
 from palpate.tasks.stage import STATE
 from palpate.tissue.types import allocate
 
@@ -92,7 +93,7 @@ class Worlds:
     s.force_limit, s.damage = task.force_limit, task.damage
     s.depth = trocar.trocar(model, task.prefix).depth
     self._point_at(s, task, model)
-    drives = [model.actuator(task.prefix + axis).id for axis in base.AXES]
+    drives = [model.actuator(task.prefix + axis).id for axis in AXES]
     controls = model.actuator_ctrlrange[[*drives, s.jaw if task.jaws else drives[0]]]
     coarse = physics.coarse
     constants = {
@@ -111,7 +112,7 @@ class Worlds:
   @staticmethod
   def _point_at(s: Any, task: Any, model: mj.MjModel) -> None:
     """Writes where the instrument's joints and sensors are."""
-    joints = [model.joint(task.prefix + axis) for axis in base.AXES]
+    joints = [model.joint(task.prefix + axis) for axis in AXES]
     s.qposadr.assign(np.array([int(joint.qposadr[0]) for joint in joints]))
     s.dofadr.assign(np.array([int(joint.dofadr[0]) for joint in joints]))
     s.jaw = model.actuator(f"{task.prefix}jaw").id if task.jaws else -1
@@ -169,7 +170,7 @@ class Worlds:
     trocar_body = f"{self.task.prefix}trocar"
     if self.task.jitter:
       self.batch.place(trocar_body, rows["body_pos"], rows["body_quat"], mask)
-    self.batch.pose([self.task.prefix + axis for axis in base.AXES], rows["pose"], mask)
+    self.batch.pose([self.task.prefix + axis for axis in AXES], rows["pose"], mask)
     tissue = self._domain.tissue(self.task, rows)
     if tissue:
       self._organ.configure(mask, **tissue)
