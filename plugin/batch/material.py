@@ -63,6 +63,10 @@ class Material:
     if rows.keys() - numbers.keys():
       numbers |= self._moduli(worlds)
       self._grade()
+    plan, inside = self._organ.body.plan, ("bulk", "pressure")
+    if plan and not plan.volumes and any(np.any(rows[key]) for key in inside if key in rows):
+      self._organ.enclose()
+      self._batch.record()
     number = self._organ.body.tissue.number.numpy()
     for key, values in numbers.items():
       number[worlds, NUMBERS.index(key)] = values

@@ -24,12 +24,24 @@ _STATUS = {"iterations": 0, "residual": 1}
 _FEW = 32  # values that are checked one by one
 
 
-def _plan(body, config) -> devices.Plan | None:
-  """Returns how a block takes a world's step; None where it is one that blocks do not know."""
+def plan_of(body, config, volumes: bool = False) -> devices.Plan | None:
+  """Returns how a block takes a world's step; None where it is one that blocks do not know.
+
+  Args:
+    body: the tissue
+    config: its configuration
+    volumes: whether to be ready for volume stiffness or pressure that it does not have yet
+  """
   if config.integrator != "implicit" or body.newton > 1 or body.is_solid:
     return None
-  nheld = int(body.shape.held_adr.numpy()[-1])
-  return devices.plan(body.device, body.shape.nslice, nheld, body.has_bending)
+  return devices.plan(
+    body.device,
+    body.shape.nslice,
+    int(body.shape.held_adr.numpy()[-1]),
+    bends=body.has_bending,
+    springs=config.elements == "spring",
+    volumes=bool(volumes or config.bulk or config.pressure),
+  )
 
 
 class Organ(Tissue):
@@ -49,8 +61,7 @@ class Organ(Tissue):
     self.instance = w.instance
     self._batch, self._scheme = batch, step.SCHEMES[organ.config.integrator]
     still = shape.make(organ.mesh, organ.config, ~organ.free, str(device), nworld=0)
-    self.body = bodies.worlds(still, nworld)
-    self.body.plan = _plan(self.body, organ.config)
+    self.body = bodies.worlds(still, nworld, plan_of(still, organ.config))
     model, d, m = batch.model, batch.d, batch.m
     node = self.body.shape.node.numpy()
     mass = np.ones(self.body.shape.nnode, np.float32)
@@ -93,6 +104,10 @@ class Organ(Tissue):
     self._find, self._region = contacts.kernel(kinds), int(nworld * place.nslot * self._touch.room)
     self._material = Material(self, batch, self._touch)
 
+  def enclose(self):
+    """Lets the step know volume stiffness and pressure, from the next record on."""
+    self.body.plan = plan_of(self.body, self.config, True)
+
   @property
   def responds(self):
     """What launches the answer to impulses, or None."""
@@ -104,9 +119,10 @@ class Organ(Tissue):
     return self._scheme.spreads
 
   @staticmethod
-  def bytes_of(w) -> float:
+  def bytes_of(w, device) -> float:
     """Returns about how many bytes a world takes of the organ of a workspace."""
-    alone = dataclasses.replace(w.body, levels=None)
+    there = dataclasses.replace(w.body, device=device)
+    alone = dataclasses.replace(w.body, levels=None, plan=plan_of(there, w.organ.config))
     return bodies.nbytes(alone) + 44.0 * w.organ.mesh.nvert
 
   # Within a step.

@@ -89,7 +89,9 @@ class Worlds(Batch):
     between = _CONTACTS if strip.tools_meet(bare) else 0
     self.njmax = strip.rows_of(bare) + (between + sum(most)) * each
     ncon = between + sum(regions)
-    size = states.bytes_of(bare, self.njmax, ncon) + sum(Organ.bytes_of(w) for w in spaces.values())
+    size = states.bytes_of(bare, self.njmax, ncon) + sum(
+      Organ.bytes_of(w, self.device) for w in spaces.values()
+    )
     size += sum(convex.bytes_of(model.geom_type[t], n) for t, n in zip(tools, nslots, strict=True))
     refuse_crowd(nworld, size, _room(self.device), str(self.device))
     try:

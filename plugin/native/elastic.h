@@ -348,7 +348,7 @@ PALPATE Sum around(const Fan& fan, const Motion& m, const Wanted& want, Lane lan
     V over = zero;
     if (want.bending && want.matrix)
       over = select(g.g11 > zero, gather(want.normal, fan.corner + 8 * k, 3, lane), zero);
-    if (want.spring == 0.0f) {
+    if (!SPRINGS || want.spring == 0.0f) {
       V mu = want.shear * ld(metric, 3, lane), lambda = want.lame * ld(metric, 4, lane);
       if (fan.factor) {
         const V factor = ld(fan.factor, k, lane);
@@ -425,8 +425,8 @@ struct Assembly {
   const float* const number = numbers(f, world);
   const float h = step[0], g = step[1], gv = weight_of_rate(stage, step);
   const float foundation = number[FOUNDATION];
-  const bool bends = f.shape.nhingeslice > 0;
-  const bool areas = bends || number[BULK] != 0.0f || number[PRESSURE] != 0.0f;
+  const bool bends = BENDING && f.shape.nhingeslice > 0;
+  const bool areas = bends || (VOLUMES && (number[BULK] != 0.0f || number[PRESSURE] != 0.0f));
   const bool matrix = stage == FIRST || stage == LATER;
   const float* const normal =
     f.system.elem_normal.data + 32 * (size_t)world * f.shape.nelemslice;

@@ -37,7 +37,7 @@ struct Pcg {
   const float* const warm = f.state.dvel_warm.data + at;
   const float* const step = f.state.step.data + 4 * world;
   const float* const number = numbers(f, world);
-  const float bulk = number[BULK];
+  const float bulk = VOLUMES ? number[BULK] : 0.0f;
   // What the volume term adds to a product is this times `along` along the area vectors.
   const float gain = bulk != 0.0f ? step[1] * bulk / f.shape.volume0 / 36.0f : 0.0f;
   typename Slices::Vector x{f.system.sol.data + at}, r{f.system.r.data + at};
@@ -205,14 +205,15 @@ struct Pcg {
   }
 };
 
-// The inverse of the diagonal blocks alone. The norm of the residual is then all there is to sum:
-// at no cost on the CPU, and on CUDA together with z^T A z, after one product more than it takes.
+// The inverse of the diagonal blocks alone. The norm of the residual is then all there is to sum: by
+// itself, or where SUMS_COST together with z^T A z, after one product more than it takes.
+template <bool SUMS_COST>
 struct Jacobi {
   PALPATE V3 scaled(V3 z) const { return z; }
 
   template <class Pcg>
   PALPATE bool before(Pcg& s, const Part& part) const {
-    if (s.group.SUMS_COST) return true;
+    if (SUMS_COST) return true;
     s.group.sum(part.rr, part.along, s.residual, s.along);
     s.rz = s.residual;
     return s.goes_on();
@@ -220,7 +221,7 @@ struct Jacobi {
 
   template <class Pcg>
   PALPATE bool after(Pcg& s, const Part& part, V zw, float& curved) const {
-    if (!s.group.SUMS_COST) {
+    if (!SUMS_COST) {
       curved = s.group.sum(zw);
       return true;
     }
@@ -240,7 +241,7 @@ PALPATE void solve(const Fields& f, Thread t, int stage) {
     const Mine slices(group, f.shape.nslice);
     Vector z(f, t.world, slices);
     const Matrix a = matrix(f, t.world);
-    Jacobi jacobi;
+    Jacobi<Group<SUMS>::SUMS_COST> jacobi;
     Pcg<Fields, Group<SUMS>, Mine, Vector, Matrix>{f, t.world, stage, group, slices, z, a}.solve(
       jacobi);
   });

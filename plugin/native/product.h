@@ -32,7 +32,7 @@ PALPATE Matrix matrix(const Fields& f, int world) {
     f.system.inverse.data + 48 * base, f.system.normal.data + 24 * base, f.shape.slot_adr.data,
     f.shape.fan_node.data, f.shape.bend_adr.data, f.shape.bend_node.data,
     f.lump.bend_gain.data ? f.lump.bend_gain.data + 8 * nbend * world : f.tissue.bend_gain.data,
-    f.state.step.data[4 * world + 1] * numbers(f, world)[PLATE], f.shape.nhingeslice > 0
+    f.state.step.data[4 * world + 1] * numbers(f, world)[PLATE], BENDING && f.shape.nhingeslice > 0
   };
 }
 

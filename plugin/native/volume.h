@@ -14,7 +14,7 @@ PALPATE float volume_impulse(
 ) {
   const float* number = numbers(f, world);
   const float bulk = number[BULK], pressure = number[PRESSURE];
-  if (bulk == 0.0f && pressure == 0.0f) return 0.0f;
+  if (!VOLUMES || (bulk == 0.0f && pressure == 0.0f)) return 0.0f;
   const float* areavec = f.system.areavec.data + 24 * (size_t)world * f.shape.nslice;
   const float* rest = f.shape.rest.data;
   V vol = splat(0.0f), rate = splat(0.0f);

@@ -55,7 +55,7 @@ PALPATE Home home(const Fields& f, int world) {
   at.diag = memory + 48 * n;
   at.inverse = memory + 56 * n;
   at.held = memory + 104 * n;
-  if (f.shape.nhingeslice > 0) {
+  if (BENDING && f.shape.nhingeslice > 0) {
     at.normal = at.held;
     at.held += 24 * n;
   }
@@ -85,8 +85,8 @@ PALPATE void stand_ahead(const Fields& f, int world, Team& group, const Mine& sl
   V fast = splat(0.0f);
   slices.each([&](int s, Lane lane, int) { fast = vmax(fast, fastest(f, at.vel, s, lane)); });
   const float share = share_ahead(h, group.most(fast)), *number = numbers(f, world);
-  const bool told =
-    f.shape.nhingeslice > 0 || number[BULK] != 0.0f || number[PRESSURE] != 0.0f;
+  const bool told = (BENDING && f.shape.nhingeslice > 0)
+    || (VOLUMES && (number[BULK] != 0.0f || number[PRESSURE] != 0.0f));
   slices.each([&](int s, Lane lane, int) {
     const V3 v = ld3(at.vel + 24 * s, lane);
     const V3 x = ld3(at.disp + 24 * s, lane) + share * h * v;
@@ -109,7 +109,7 @@ PALPATE void step_world(const Fields& f, Thread t, int stage) {
   Home at = home(f, t.world);
   if (stage == RESPONSE) at.rows.rhs = f.system.r.data + base;
   stand_ahead(f, t.world, group, slices, at);
-  if (f.shape.nhingeslice > 0) {
+  if (BENDING && f.shape.nhingeslice > 0) {
     each_pass(t, f.shape.nelemslice, [&](Thread pass) { elem_normal(f, pass, 0); });
     each_pass(t, f.shape.nhingeslice, [&](Thread pass) { hinge_angle(f, pass, FIRST); });
     each_pass(t, f.shape.nhingeslice, [&](Thread pass) { hinge_moment(f, pass, 0); });
@@ -119,7 +119,7 @@ PALPATE void step_world(const Fields& f, Thread t, int stage) {
   slices.each([&](int s, Lane lane, int) { assembly.row(s, lane); });
   meet_block();
   const Split a = at.matrix(matrix(f, t.world));
-  Jacobi jacobi;
+  Jacobi<false> jacobi;
   Pcg<Fields, Group<SUMS>, Mine, Shown, Split>{f, t.world, stage, group, slices, at.z, a}.solve(
     jacobi);
   if (stage == RESPONSE) return;

@@ -170,17 +170,28 @@ def _levels(body: Body, coarse: Body, transfer: Any) -> Levels:
 def _put_state(body: Body, nworld: int):
   body.nworld, sizes = nworld, body.sizes | {"nworld": nworld}
   body.fields.state = allocate(State, body.device, sizes)
-  body.fields.system = allocate(System, body.device, sizes)
+  spared = spare(body)
+  body.fields.system = allocate(System, body.device, sizes, spared)
   body.fields.lump = allocate(Lump, body.device, sizes | {"nlump": 0, "nhingeslice": 0})
   body.numbers = wp.clone(body.numbers)
 
 
-def worlds(body: Body, nworld: int = 1) -> Body:
+def spare(body: Body) -> tuple[str, ...]:
+  """Returns the fields of `System` that a body has no use for: what its blocks keep themselves."""
+  plan = body.plan
+  if plan is None or not plan.own:
+    return ()
+  whole = ("block",) if plan.whole else ()
+  return ("diag", "inverse", "normal", "p", "q", "z", "t", "zn", "quad", *whole)
+
+
+def worlds(body: Body, nworld: int = 1, plan: Plan | None = None) -> Body:
   """Returns a body of the same shape with a tissue of its own and zeroed states.
 
   Args:
     body: the body whose shape it has
     nworld: number of worlds
+    plan: how a block of threads takes a world's whole step, or None
   """
   fields = Fields()
   fields.shape = body.shape
@@ -188,7 +199,7 @@ def worlds(body: Body, nworld: int = 1) -> Body:
     setattr(fields.tissue, name, wp.clone(getattr(body.tissue, name)))
   number = np.repeat(body.tissue.number.numpy()[:1], max(nworld, 1), axis=0)
   fields.tissue.number = wp.array(number, device=body.device)
-  out = dataclasses.replace(body, fields=fields, levels=None)
+  out = dataclasses.replace(body, fields=fields, levels=None, plan=plan)
   _put_state(out, nworld)
   if body.levels is not None:
     out.levels = _levels(out, worlds(body.levels.body, nworld), body.levels.transfer)
@@ -198,7 +209,8 @@ def worlds(body: Body, nworld: int = 1) -> Body:
 def nbytes(body: Body) -> int:
   """Returns how many bytes of memory the worlds of a body take, without what they share."""
   kinds = ((State, body.state), (System, body.system))
-  total = sum(getattr(each, name).size * 4 for kind, each in kinds for name in DIMS[kind.key])
+  names = [(each, name) for kind, each in kinds for name in DIMS[kind.key]]
+  total = sum(getattr(each, name).size * 4 for each, name in names if name not in spare(body))
   return total + (nbytes(body.levels.body) if body.levels is not None else 0)
 
 

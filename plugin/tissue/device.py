@@ -25,8 +25,9 @@ BLOCK = 512  # threads of a block, at most
 MAX_BLOCKS = 512  # of one world
 WORDS = 2 * MAX_BLOCKS + 1  # of 128 bits that a world's threads exchange
 _MOST = 1024  # threads of a block that has a world to itself
+_FEW = 128  # nodes of which a thread has one
 _STATIC = 4096  # bytes of its memory that others have [B]
-_REGISTERS = 65536 // 72  # threads of a multiprocessor that have 72 registers
+_REGISTERS = 65536 // 128  # threads of a multiprocessor that have 128 registers
 _DRIVER = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
 _NO_DRIVER = "Could not find or load the NVIDIA CUDA driver"
 
@@ -122,33 +123,42 @@ class Plan:
     threads: of a block
     per_sm: blocks that a multiprocessor has at once
     nbytes: memory of a block
+    whole: whether the whole matrix has room there
+    bends: whether there is bending
+    springs: whether elements are springs
+    volumes: whether there may be volume stiffness or pressure
   """
 
   own: int
   threads: int
   per_sm: int
   nbytes: int
+  whole: bool
+  bends: bool
+  springs: bool
+  volumes: bool
 
 
-def plan(device, nslice: int, nheld: int, bends: bool) -> Plan | None:
+def plan(device, nslice: int, nheld: int, **kinds: bool) -> Plan | None:
   """Returns how a block takes the whole step of a world; None where a block has too few threads.
 
   Args:
     device: where it runs
     nslice: slices of nodes
     nheld: floats of all stiffness blocks, see `order.banks`
-    bends: whether there is bending
+    **kinds: what the tissue has, see `Plan`
   """
   if not device.is_cuda:
-    return Plan(0, 1, 1, 0)
-  own = 1 if LANES * nslice <= _MOST // 2 else 2 if LANES * nslice <= _MOST else 4
-  threads = -(-LANES * nslice // (32 * own)) * 32
+    return Plan(0, 1, 1, 0, False, **kinds)
+  nodes = LANES * nslice
+  own = 1 if nodes <= _FEW else 2 if nodes <= _MOST else 4
+  threads = -(-nodes // (32 * own)) * 32
   if threads > _MOST:
     return None
   room = device.max_shared_memory_per_block - _STATIC
-  wanted = 4 * (LANES * (16 if bends else 13) * nslice + nheld)
+  wanted = 4 * (LANES * (16 if kinds["bends"] else 13) * nslice + nheld)
   per_sm = max(1, min(3, room // (wanted + _STATIC), _REGISTERS // threads))
-  return Plan(own, threads, per_sm, min(wanted, room))
+  return Plan(own, threads, per_sm, min(wanted, room), wanted <= room, **kinds)
 
 
 def reserve(kernel: wp.Kernel, device, plan: Plan):

@@ -124,11 +124,16 @@ def _together(kernel: wp.Kernel, body: Body, arg: int, fields=None, per_sm: int 
   )
 
 
-@functools.cache
 def _world_step(plan: Plan) -> wp.Kernel:
   """Returns the kernel of a world's whole step by one block."""
-  constants = _CONSTANTS | {"OWN": plan.own}
-  tag = f".{plan.own}.{plan.threads}.{plan.per_sm}"
+  return _world_kernel(dataclasses.replace(plan, nbytes=0))
+
+
+@functools.cache
+def _world_kernel(plan: Plan) -> wp.Kernel:
+  kinds = {"BENDING": plan.bends, "SPRINGS": plan.springs, "VOLUMES": plan.volumes}
+  constants = _CONSTANTS | {"OWN": plan.own} | {name: int(kind) for name, kind in kinds.items()}
+  tag = f".{plan.own}.{plan.threads}.{plan.per_sm}." + "".join(str(int(k)) for k in kinds.values())
   bounds = (plan.threads, plan.per_sm)
   return kernel("step_world", "whole.h", Fields, constants, bounds, tag, fast=plan.own > 0)
 

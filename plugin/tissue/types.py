@@ -87,6 +87,8 @@ CONSTANTS: dict[str, int | float] = {
   "WORDS": WORDS,
   **{stage.name: stage.value for stage in Stage},
   "NUMBERS": len(NUMBERS),
+  # Whether code for these is compiled; which of them there are is found as it runs.
+  **dict.fromkeys(("BENDING", "SPRINGS", "VOLUMES"), 1),
   **{name.upper(): k for k, name in enumerate(NUMBERS)},
 }
 
@@ -272,11 +274,19 @@ class Cycle:
   transfer: Transfer
 
 
-def allocate(kind: Any, device, sizes: dict[str, int]):
-  """Returns a struct of zeroed arrays; `sizes` has the named sizes of their shapes."""
+def allocate(kind: Any, device, sizes: dict[str, int], spare: tuple[str, ...] = ()):
+  """Returns a struct of zeroed arrays.
+
+  Args:
+    kind: the struct
+    device: where they are
+    sizes: named sizes of their shapes
+    spare: fields that are empty, their first size 0
+  """
   out = kind()
   for name, dims in DIMS[kind.key].items():
     shape = tuple(_extent(dim, sizes) for dim in dims)
+    shape = (0, *shape[1:]) if name in spare else shape
     setattr(out, name, wp.zeros(shape, dtype=kind.vars[name].type.dtype, device=device))
   return out
 
