@@ -233,9 +233,16 @@ def _against(kinds: frozenset[int]):
           n = _put(c, at, n, dists2[k], xs2[k], normals2[k])
     if wp.static(solid):
       if kind == wp.static(_CYLINDER) or kind == wp.static(_MESH):
-        far3, x3, normal3 = convex.touch(
-          v, at.tool, kind, size, pos, rot, margin + c.radius, at.thread, at.world, a, b, d
-        )
+        before = convex.Before()
+        before.tool = at.tool
+        before.kind = kind
+        before.size = size
+        before.pos = pos
+        before.rot = rot
+        before.reach = margin + c.radius
+        before.thread = at.thread
+        before.world = at.world
+        far3, x3, normal3 = convex.touch(v, before, a, b, d)
         n = _put(c, at, n, far3 - c.radius, x3 - 0.5 * c.radius * normal3, normal3)
     return n
 

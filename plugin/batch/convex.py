@@ -48,75 +48,74 @@ def _beyond(box: wp.vec3, x: wp.vec3):
 
 
 @wp.func
-def touch(
-  k: Convex,
-  tool: int,
-  kind: int,
-  size: wp.vec3,
-  pos: wp.vec3,
-  rot: wp.mat33,
-  reach: float,
-  thread: int,
-  world: int,
-  a: wp.vec3,
-  b: wp.vec3,
-  d: wp.vec3,
-):
-  """Returns distance, middle and normal between a convex tool and a triangle without skin.
+def _tool(k: Convex, tool: int, kind: int, size: wp.vec3, rot: wp.mat33):
+  """Returns a tool about the origin."""
+  out = Geom()
+  out.pos = wp.vec3(0.0)
+  out.rot = rot
+  out.size = size
+  out.margin = 0.0
+  out.index = -1
+  if kind == _MESH:
+    mesh = k.mesh[tool]
+    out.vertadr = k.vertadr[mesh]
+    out.vertnum = k.vertnum[mesh]
+    out.graphadr = k.graphadr[mesh]
+    out.vert = k.vert
+    out.graph = k.graph
+  return out
 
-  Args:
-    k: convex tools
-    tool: number of the tool
-    kind: its mjtGeom
-    size: as geom_size
-    pos: where it is
-    rot: its axes
-    reach: distance beyond which no more is asked than that it is
-    thread: whose memory EPA has
-    world: the world
-    a: corner of the triangle
-    b: the next
-    d: the last
-  """
+
+@wp.func
+def _triangle(a: wp.vec3, b: wp.vec3, d: wp.vec3):
+  """Returns a triangle."""
+  out = Geom()
+  out.pos = wp.vec3(0.0)
+  out.rot = wp.mat33(a[0], a[1], a[2], b[0], b[1], b[2], d[0], d[1], d[2])
+  out.margin = 0.0
+  out.index = -1
+  return out
+
+
+@wp.struct
+class Before:
+  """A tool before a triangle: what `touch` is asked about."""
+
+  tool: int  # number of the tool
+  kind: int  # its mjtGeom
+  size: wp.vec3  # as geom_size
+  pos: wp.vec3  # where it is
+  rot: wp.mat33  # its axes
+  reach: float  # distance beyond which no more is asked than that it is
+  thread: int  # whose memory EPA has
+  world: int
+
+
+@wp.func
+def touch(k: Convex, t: Before, a: wp.vec3, b: wp.vec3, d: wp.vec3):
+  """Returns distance, middle and normal between a convex tool and a triangle without skin."""
   # About the tool, where float32 has the most digits.
-  ta = a - pos
-  tb = b - pos
-  td = d - pos
+  ta = a - t.pos
+  tb = b - t.pos
+  td = d - t.pos
   centre = (ta + tb + td) / 3.0
   around = wp.max(wp.length(ta - centre), wp.max(wp.length(tb - centre), wp.length(td - centre)))
-  near = wp.transpose(rot) * centre - k.middle[tool]
+  near = wp.transpose(t.rot) * centre - k.middle[t.tool]
   dist = float(_APART)  # a variable to Warp
   middle = wp.vec3(0.0)
   normal = wp.normalize(wp.cross(tb - ta, td - ta))
   if wp.dot(normal, centre) < 0.0:
     normal = -normal
-  if _beyond(k.half[tool], near) < around + reach:
-    one = Geom()
-    one.pos = wp.vec3(0.0)
-    one.rot = rot
-    one.size = size
-    one.margin = 0.0
-    one.index = -1
-    if kind == _MESH:
-      mesh = k.mesh[tool]
-      one.vertadr = k.vertadr[mesh]
-      one.vertnum = k.vertnum[mesh]
-      one.graphadr = k.graphadr[mesh]
-      one.vert = k.vert
-      one.graph = k.graph
-    other = Geom()
-    other.pos = wp.vec3(0.0)
-    other.rot = wp.mat33(ta[0], ta[1], ta[2], tb[0], tb[1], tb[2], td[0], td[1], td[2])
-    other.margin = 0.0
-    other.index = -1
+  if _beyond(k.half[t.tool], near) < around + t.reach:
+    i = t.thread
     found, n, x, y, _index = ccd(
-      _TOLERANCE, reach, _ROUNDS, _ROUNDS, one, other, kind, _TRIANGLE, wp.vec3(0.0), centre,
-      k.point[thread], k.index[thread], k.face[thread], k.onto[thread], k.norm2[thread],
-      k.horizon[thread], False, world, k.lost,
+      _TOLERANCE, t.reach, _ROUNDS, _ROUNDS, _tool(k, t.tool, t.kind, t.size, t.rot),
+      _triangle(ta, tb, td), t.kind, _TRIANGLE, wp.vec3(0.0), centre, k.point[i], k.index[i],
+      k.face[i], k.onto[i], k.norm2[i], k.horizon[i], False, t.world, k.lost,
     )  # fmt: skip
-    if n > 0 and found < reach:
+    if n > 0 and found < t.reach:
       dist = found
-      middle = pos + 0.5 * (x + y)
+      middle = t.pos + 0.5 * (x + y)
       apart = y - x
       if found < 0.0:
         apart = x - y

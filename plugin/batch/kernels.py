@@ -71,50 +71,52 @@ def reset(s: Start):
     s.geom_xmat[w, k] = s.geom_xmat0[k]
 
 
+@struct
+class Move:
+  """Where joints and bodies of the worlds of a mask are put, and geoms before that."""
+
+  mask: Array(wp.bool, ("nworld",))
+  at: ints("njoint", 2)  # places of joints in qpos and qvel
+  values: floats("nworld", "njoint")  # positions of joints [rad, m]
+  body: int  # a body
+  pos: Array(wp.vec3, ("nworld",))  # its position in its parent's frame [m]
+  quat: Array(wp.quat, ("nworld",))  # its orientation there
+  xpos: Array(wp.vec3, ("nworld", "ngeom"))  # of geoms [m]
+  xmat: Array(wp.mat33, ("nworld", "ngeom"))
+  # mujoco_warp:
+  qpos: floats("nworld", "nq")
+  qvel: floats("nworld", "nv")
+  body_pos: Array(wp.vec3, ("nworld", "nbody"))
+  body_quat: Array(wp.quat, ("nworld", "nbody"))
+  geom_xpos: Array(wp.vec3, ("nworld", "ngeom"))
+  geom_xmat: Array(wp.mat33, ("nworld", "ngeom"))
+
+
 @wp.kernel(enable_backward=False)
-def pose(
-  mask: wp.array[bool],
-  at: wp.array2d[int],
-  values: wp.array2d[float],
-  qpos: wp.array2d[float],
-  qvel: wp.array2d[float],
-):
-  """Puts joints of the worlds of a mask at positions; `at` has their places in qpos and qvel."""
+def pose(m: Move):
+  """Puts joints at positions."""
   w, k = wp.tid()
-  if mask[w]:
-    qpos[w, at[k, 0]] = values[w, k]
-    qvel[w, at[k, 1]] = 0.0
+  if m.mask[w]:
+    m.qpos[w, m.at[k, 0]] = m.values[w, k]
+    m.qvel[w, m.at[k, 1]] = 0.0
 
 
 @wp.kernel(enable_backward=False)
-def place(
-  mask: wp.array[bool],
-  body: int,
-  pos: wp.array[wp.vec3],
-  quat: wp.array[wp.quat],
-  body_pos: wp.array2d[wp.vec3],
-  body_quat: wp.array2d[wp.quat],
-):
-  """Moves a body of the worlds of a mask in its parent's frame."""
+def place(m: Move):
+  """Moves a body in its parent's frame."""
   w = wp.tid()
-  if mask[w]:
-    body_pos[w, body] = pos[w]
-    body_quat[w, body] = quat[w]
+  if m.mask[w]:
+    m.body_pos[w, m.body] = m.pos[w]
+    m.body_quat[w, m.body] = m.quat[w]
 
 
 @wp.kernel(enable_backward=False)
-def put_back(
-  mask: wp.array[bool],
-  xpos: wp.array2d[wp.vec3],
-  xmat: wp.array2d[wp.mat33],
-  geom_xpos: wp.array2d[wp.vec3],
-  geom_xmat: wp.array2d[wp.mat33],
-):
-  """Puts geoms of the worlds that are not of a mask where they were."""
+def put_back(m: Move):
+  """Puts geoms of the worlds that are not of the mask where they were."""
   w, g = wp.tid()
-  if not mask[w]:
-    geom_xpos[w, g] = xpos[w, g]
-    geom_xmat[w, g] = xmat[w, g]
+  if not m.mask[w]:
+    m.geom_xpos[w, g] = m.xpos[w, g]
+    m.geom_xmat[w, g] = m.xmat[w, g]
 
 
 @wp.kernel(enable_backward=False)

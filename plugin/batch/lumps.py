@@ -5,29 +5,32 @@ compiled with, so that a world's numbers are products with sparse matrices.
 """
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
+# pyright: reportInvalidTypeForm=false
 import numpy as np
 import warp as wp
 from palpate.tissue import config as configuration
 from palpate.tissue import plate
 from palpate.tissue.order import LANES, ellpack
-from palpate.tissue.types import Lump, allocate
+from palpate.tissue.types import Lump, allocate, fill, floats, ints, struct
 from scipy import sparse
 
 
+@struct
+class Map:
+  """A sparse matrix from the factors of triangles."""
+
+  adr: ints("nrow + 1")
+  elem: ints("nentry")
+  share: floats("nentry")
+
+
 @wp.kernel(enable_backward=False)
-def mix(
-  adr: wp.array[int],
-  elem: wp.array[int],
-  share: wp.array[float],
-  factor: wp.array2d[float],
-  world: wp.array[int],
-  out: wp.array2d[float],
-):
-  """Writes the product of a sparse matrix with the factors of some worlds' triangles."""
+def mix(m: Map, factor: wp.array2d[float], world: wp.array[int], out: wp.array2d[float]):
+  """Writes the product of a matrix with the factors of some worlds' triangles."""
   k, i = wp.tid()
   total = float(0.0)  # noqa: UP018 - a variable to Warp
-  for q in range(adr[i], adr[i + 1]):
-    total += share[q] * factor[k, elem[q]]
+  for q in range(m.adr[i], m.adr[i + 1]):
+    total += m.share[q] * factor[k, m.elem[q]]
   out[world[k], i] = total
 
 
@@ -59,9 +62,9 @@ class Lumps:
     lump.hinge_left.assign(maps["hinge_left"])
     self.put(np.arange(body.nworld), np.ones((1, self._nelem), np.float32))
 
-  def _put(self, map: sparse.csr_matrix) -> list[wp.array]:
-    arrays = ((map.indptr, int), (map.indices, int), (map.data, float))
-    return [wp.array(values, dtype=dtype, device=self._device) for values, dtype in arrays]
+  def _put(self, matrix: sparse.csr_matrix):
+    values = {"adr": matrix.indptr, "elem": matrix.indices, "share": matrix.data}
+    return fill(Map, self._device, values)
 
   def put(self, worlds: np.ndarray, factors: np.ndarray):
     """Gives some worlds the factors of their triangles, (worlds, nelem), or (1, nelem) for all."""
@@ -70,7 +73,7 @@ class Lumps:
     given = wp.array(factors, dtype=float, device=self._device)
     for map, out in self._maps:
       dim = (len(worlds), out.shape[1])
-      wp.launch(mix, dim=dim, inputs=[*map, given, rows, out], device=self._device)
+      wp.launch(mix, dim=dim, inputs=[map, given, rows, out], device=self._device)
 
 
 def _rows(array: wp.array) -> wp.array:

@@ -13,7 +13,8 @@ from .patch import GRADES
 
 _PLAIN = ("foundation", "bulk", "pressure", "damping", "tolerance", "iterations", "stiffness")
 # What may change: numbers of the tissue, what its moduli follow from, and what else.
-KEYS = (*_PLAIN, "young", "young_scale", "poisson", "thickness", "mass", "friction")
+MODULI = ("young", "young_scale", "poisson", "thickness")
+KEYS = (*_PLAIN, *MODULI, "mass", "friction")
 _LIGHTEST, _HEAVIEST = 0.25, 4.0  # times the compiled mass
 
 

@@ -15,7 +15,7 @@ from palpate.tissue import order, shape, step
 
 from . import contacts, convex, kernels, patch, sliding
 from .base import Contacts, Tissue, spread
-from .material import KEYS, Material
+from .material import KEYS, MODULI, Material
 from .patch import launch
 from .strip import Slots
 
@@ -32,7 +32,7 @@ def plan_of(body, config, volumes: bool = False) -> devices.Plan | None:
     config: its configuration
     volumes: whether to be ready for volume stiffness or pressure that it does not have yet
   """
-  if config.integrator != "implicit" or body.newton > 1 or body.is_solid:
+  if not step.SCHEMES[config.integrator].whole or body.newton > 1 or body.is_solid:
     return None
   return devices.plan(
     body.device,
@@ -56,7 +56,7 @@ class Organ(Tissue):
 
   def __init__(self, batch, w, place: Slots, tools: np.ndarray):
     organ, device, nworld = w.organ, batch.device, batch.nworld
-    self.name, self.nvert, self.elem = organ.name, organ.mesh.nvert, organ.mesh.elem
+    self.name, self.nvert, self.elem = organ.name, organ.mesh.nouter, organ.mesh.elem
     self.declared, self.config, self.space, self.place = organ, organ.config, w, place
     self.instance = w.instance
     self._batch, self._scheme = batch, step.SCHEMES[organ.config.integrator]
@@ -99,6 +99,7 @@ class Organ(Tissue):
     )  # fmt: skip
     self.patch = patch.make(values, self.body)
     self._touch = contacts.make(model, organ, tools, place.flex, nworld, d)
+    self._pressed = sliding.make(batch, self._touch, place.nslot)
     self._convex = convex.make(model, tools, nworld * place.nslot, m, d)
     kinds = frozenset(int(kind) for kind in model.geom_type[tools])
     self._find, self._region = contacts.kernel(kinds), int(nworld * place.nslot * self._touch.room)
@@ -155,12 +156,8 @@ class Organ(Tissue):
   def push(self):
     """Adds the passive force, and keeps sliding contacts closed."""
     self._over(patch.push, self.place.nslot)
-    batch, c, many = self._batch, self._touch, self.place.nslot * self._touch.room
-    contact, paired = batch.d.contact, batch.paired
-    inputs = [c.start, many, paired, contact.dim, contact.friction, contact.efc_address]
-    inputs.append(batch.d.efc.aref)
-    dim = (batch.nworld, many)
-    wp.launch(sliding.keep_closed, dim=dim, inputs=inputs, device=self.body.device)
+    dim = self._pressed.geom.shape
+    wp.launch(sliding.keep_closed, dim=dim, inputs=[self._pressed], device=self.body.device)
 
   def end(self):
     """Ends the step with the contact forces that mujoco_warp found."""
@@ -204,17 +201,9 @@ class Organ(Tissue):
   @property
   def contacts(self) -> Contacts:
     """Contacts of the last step."""
-    c, d, (nworld, many) = self._touch, self._batch.d, self._pressed.geom.shape
-    inputs = [c.start, many, self._batch.paired, d.contact.dim, d.contact.geom, d.contact.frame]
-    inputs += [d.contact.efc_address, d.efc.force, *self._pressed]
-    wp.launch(sliding.press, dim=(nworld, many), inputs=inputs, device=self.body.device)
-    return self._pressed._replace(normal=self._pressed.normal.view(float))
-
-  @functools.cached_property
-  def _pressed(self) -> Contacts:
-    shape = (self._batch.nworld, self.place.nslot * self._touch.room)
-    kinds = (int, wp.vec3, float)
-    return Contacts(*(wp.zeros(shape, dtype=kind, device=self.body.device) for kind in kinds))
+    p = self._pressed
+    wp.launch(sliding.press, dim=p.geom.shape, inputs=[p], device=self.body.device)
+    return Contacts(p.geom, p.normal.view(float), p.force)
 
   # Changing.
 
@@ -224,8 +213,8 @@ class Organ(Tissue):
     chosen = np.flatnonzero(batch._mask(mask).numpy())
     rows = {key: spread(self, key, value, nworld)[chosen] for key, value in keys.items()}
     for key in rows:
-      if key not in KEYS or (key == "poisson" and self.body.has_bending):
-        why = " while tissue bends" if key in KEYS else ""
+      why = self._fixed(key)
+      if why is not None:
         raise ValueError(
           f"organ {self.name!r}: {key!r} cannot change in a batch on a GPU{why}, expected one of "
           f"{', '.join(KEYS)}"
@@ -234,6 +223,14 @@ class Organ(Tissue):
       if key != "friction" and key != "mass":
         self._check(key, values)
     self._material.change(chosen, rows)
+
+  def _fixed(self, key: str) -> str | None:
+    """Returns why a key cannot change, None where it can."""
+    if key not in KEYS:
+      return ""
+    if key == "poisson" and self.body.has_bending:
+      return " while tissue bends"
+    return " of a solid" if key in MODULI and self.body.is_solid else None
 
   def _check(self, key: str, values: np.ndarray):
     """Raises ValueError where a value of a key is not allowed."""

@@ -41,7 +41,12 @@ class Rest:
       eq_active0=bare.eq_active0.astype(bool),
     )  # fmt: skip
     self.start = fill(Start, batch.device, values)
-    self._kept = wp.clone(d.geom_xpos), wp.clone(d.geom_xmat)
+    self._move = move = kernels.Move()
+    for name in kernels.Move.vars:
+      source = d if hasattr(d, name) else batch.m
+      if hasattr(source, name):
+        setattr(move, name, getattr(source, name))
+    move.mask, move.xpos, move.xmat = batch.mask, wp.clone(d.geom_xpos), wp.clone(d.geom_xmat)
 
   def launch(self):
     """Puts the worlds of the mask at rest."""
@@ -51,14 +56,28 @@ class Rest:
     for organ in self._batch.organs.values():
       organ.rest()
 
+  def pose(self, at: np.ndarray, values: np.ndarray):
+    """Puts joints of the worlds of the mask at positions; `at` has their places."""
+    move, device = self._move, self._batch.device
+    move.at = wp.array(at, dtype=int, device=device)
+    move.values = wp.array(values, dtype=float, device=device)
+    wp.launch(kernels.pose, dim=values.shape, inputs=[move], device=device)
+
+  def place(self, body: int, pos: np.ndarray, quat: np.ndarray):
+    """Moves a body of the worlds of the mask; quaternions have w first."""
+    move, device = self._move, self._batch.device
+    move.body = body
+    move.pos = wp.array(pos, dtype=wp.vec3, device=device)
+    move.quat = wp.array(quat, dtype=wp.quat, device=device)
+    wp.launch(kernels.place, dim=self._batch.nworld, inputs=[move], device=device)
+
   def look(self):
     """Finds where geoms are in the worlds of the mask, whose joints or bodies have been moved."""
-    d, device = self._batch.d, self._batch.device
-    for kept, array in zip(self._kept, (d.geom_xpos, d.geom_xmat), strict=True):
-      wp.copy(kept, array)
+    d, move = self._batch.d, self._move
+    wp.copy(move.xpos, d.geom_xpos)
+    wp.copy(move.xmat, d.geom_xmat)
     mjw.kinematics(self._batch.m, d)
-    inputs = [self.mask, *self._kept, d.geom_xpos, d.geom_xmat]
-    wp.launch(kernels.put_back, dim=d.geom_xpos.shape, inputs=inputs, device=device)
+    wp.launch(kernels.put_back, dim=move.xpos.shape, inputs=[move], device=self._batch.device)
 
   def find(self):
     """Resets and counts the worlds with numbers that are not finite."""

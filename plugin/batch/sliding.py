@@ -1,84 +1,108 @@
-"""Contacts that slide stay closed, as `keep_closed` of native/weights.h has it on the CPU.
+"""Rows of an organ's contacts: what slides stays closed, and how hard contacts press.
 
-That widens the gap of a contact by D mu |v| over its stiffness, D the damping of its rows. A gap is
-in the normal's reference acceleration as stiffness times gap, and a row of friction has -D v there:
-so what the gap adds follows from those rows.
+Contacts that slide stay closed as `keep_closed` of native/weights.h has it on the CPU: it widens
+the gap of a contact by D mu |v| over its stiffness, D the damping of its rows. A gap is in the
+normal's reference acceleration as stiffness times gap, and a row of friction has -D v there: so
+what the gap adds follows from those rows.
 """
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
+# pyright: reportInvalidTypeForm=false
 import warp as wp
 from mujoco_warp._src.types import vec5
+from palpate.tissue.types import Array, floats, ints, struct
+
+
+@struct
+class Pressed:
+  """An organ's contacts in mujoco_warp's arrays, and what is told of them."""
+
+  many: int  # contacts of a world
+  paired: int  # whether the cone is a pyramid
+  start: ints(1)  # the organ's first contact
+  dim: ints("naconmax")  # rows of a contact, or pairs of them and one
+  contact_geom: Array(wp.vec2i, ("naconmax",))
+  frame: Array(wp.mat33, ("naconmax",))
+  friction: Array(vec5, ("naconmax",))
+  efc_address: ints("naconmax", "nrow")  # -1 for none
+  aref: floats("nworld", "njmax")  # reference acceleration of the rows [m/s^2]
+  row_force: floats("nworld", "njmax")  # force of the rows [N]
+  # See `Contacts`:
+  geom: ints("nworld", "many")
+  normal: Array(wp.vec3, ("nworld", "many"))
+  force: floats("nworld", "many")
+
+
+@wp.func
+def _rows(p: Pressed, c: int):
+  """Returns how many rows a contact has."""
+  n = p.dim[c]
+  return wp.where(p.paired == 1 and n > 1, 2 * (n - 1), n)
+
+
+@wp.func
+def _has_rows(p: Pressed, c: int):
+  """Returns whether there was room for all rows of a contact."""
+  for r in range(_rows(p, c)):
+    if p.efc_address[c, r] < 0:
+      return False
+  return p.contact_geom[c][0] >= 0
 
 
 @wp.kernel(enable_backward=False)
-def keep_closed(
-  start: wp.array[int],
-  many: int,
-  paired: bool,
-  dim: wp.array[int],
-  friction: wp.array[vec5],
-  address: wp.array2d[int],
-  aref: wp.array2d[float],
-):
-  """Takes the parting of an organ's sliding contacts off their reference accelerations.
-
-  Args:
-    start: the organ's first contact
-    many: its contacts in a world
-    paired: whether the cone is a pyramid
-    dim: rows of a contact, or pairs of them and one
-    friction: its friction
-    address: its rows, -1 for none
-    aref: reference acceleration of the rows [m/s^2]
-  """
+def keep_closed(p: Pressed):
+  """Takes the parting of sliding contacts off their reference accelerations."""
   world, k = wp.tid()
-  c = start[0] + world * many + k
-  n = dim[c]
-  if n < 2 or address[c, 0] < 0:
+  c = p.start[0] + world * p.many + k
+  n = p.dim[c]
+  if n < 2 or not _has_rows(p, c):
     return
-  rows = wp.where(paired, 2 * (n - 1), n)
-  for r in range(rows):
-    if address[c, r] < 0:  # there was no room
-      return
   square = float(0.0)  # noqa: UP018 - a variable to Warp
   for r in range(n - 1):
-    if paired:
-      v = 0.5 * (aref[world, address[c, 2 * r]] - aref[world, address[c, 2 * r + 1]])
+    if p.paired == 1:
+      plus = p.aref[world, p.efc_address[c, 2 * r]]
+      v = 0.5 * (plus - p.aref[world, p.efc_address[c, 2 * r + 1]])
       square += v * v
     else:
-      v = friction[c][r] * aref[world, address[c, r + 1]]
+      v = p.friction[c][r] * p.aref[world, p.efc_address[c, r + 1]]
       square += v * v
-  for r in range(wp.where(paired, rows, 1)):
-    row = address[c, r]
-    aref[world, row] = aref[world, row] - wp.sqrt(square)
+  for r in range(wp.where(p.paired == 1, _rows(p, c), 1)):
+    row = p.efc_address[c, r]
+    p.aref[world, row] = p.aref[world, row] - wp.sqrt(square)
 
 
 @wp.kernel(enable_backward=False)
-def press(
-  start: wp.array[int],
-  many: int,
-  paired: bool,
-  dim: wp.array[int],
-  geom: wp.array[wp.vec2i],
-  frame: wp.array[wp.mat33],
-  address: wp.array2d[int],
-  force: wp.array2d[float],
-  out_geom: wp.array2d[int],
-  out_normal: wp.array2d[wp.vec3],
-  out_force: wp.array2d[float],
-):
-  """Writes the geoms, normals and normal forces of an organ's contacts; see `keep_closed`."""
+def press(p: Pressed):
+  """Writes the geoms, normals and normal forces of contacts."""
   world, k = wp.tid()
-  c = start[0] + world * many + k
-  out_geom[world, k] = -1
-  if geom[c][0] < 0 or address[c, 0] < 0:
-    out_force[world, k] = 0.0
+  c = p.start[0] + world * p.many + k
+  p.geom[world, k] = -1
+  p.force[world, k] = 0.0
+  if not _has_rows(p, c):
     return
-  rows = wp.where(paired and dim[c] > 1, 2 * (dim[c] - 1), 1)
   total = float(0.0)  # noqa: UP018 - a variable to Warp
-  for r in range(rows):
-    if address[c, r] >= 0:
-      total += force[world, address[c, r]]
-  out_geom[world, k] = geom[c][0]
-  out_normal[world, k] = wp.vec3(frame[c][0, 0], frame[c][0, 1], frame[c][0, 2])
-  out_force[world, k] = total
+  for r in range(wp.where(p.paired == 1, _rows(p, c), 1)):
+    total += p.row_force[world, p.efc_address[c, r]]
+  p.geom[world, k] = p.contact_geom[c][0]
+  p.normal[world, k] = wp.vec3(p.frame[c][0, 0], p.frame[c][0, 1], p.frame[c][0, 2])
+  p.force[world, k] = total
+
+
+def make(batch, touch, nslot: int):
+  """Returns the contacts of an organ's slots.
+
+  Args:
+    batch: the worlds, with mujoco_warp's data
+    touch: how the organ touches its tools
+    nslot: its slots
+  """
+  out, d = Pressed(), batch.d
+  out.many, out.paired, out.start = nslot * touch.room, int(batch.paired), touch.start
+  for name in ("dim", "frame", "friction", "efc_address"):
+    setattr(out, name, getattr(d.contact, name))
+  out.contact_geom, out.aref, out.row_force = d.contact.geom, d.efc.aref, d.efc.force
+  shape = (batch.nworld, out.many)
+  out.geom, out.normal, out.force = (
+    wp.zeros(shape, dtype=kind, device=batch.device) for kind in (int, wp.vec3, float)
+  )
+  return out

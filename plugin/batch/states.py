@@ -184,8 +184,8 @@ def _assign(array: wp.array, world: int, values: np.ndarray):
 def _push_organ(organ: Organ, world: int, model, data):
   declared, node = organ.declared, organ.body.shape.node.numpy()
   own, spans = _own(organ, model, data)
-  motion = {name: np.zeros((organ.nvert, 3)) for name in _MOTION}
-  force, free = np.zeros((organ.nvert, 3)), declared.free
+  motion = {name: np.zeros((declared.mesh.nvert, 3)) for name in _MOTION}
+  force, free = np.zeros((declared.mesh.nvert, 3)), declared.free
   if declared.windows is None:
     motion["disp"][free] = data.qpos[declared.qposs].reshape(-1, 3)
     motion["vel"][free] = data.qvel[declared.dofs].reshape(-1, 3)

@@ -43,13 +43,8 @@ def tools_of(model: mujoco.MjModel, organ) -> np.ndarray:
   """Returns the geoms that an organ's slots follow.
 
   Raises:
-    ValueError: one is not a tool that a batch knows, or it is not an organ that it can step.
+    ValueError: one is not a tool that a batch knows.
   """
-  if organ.config.elements == "solid":
-    raise ValueError(
-      f"organ {organ.name!r}: elements is 'solid', which a batch on a GPU cannot do; expected "
-      "'membrane' or 'spring'"
-    )
   if organ.windows:
     found = np.unique(organ.windows.geom)
   else:

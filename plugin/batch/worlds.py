@@ -207,18 +207,14 @@ class Worlds(Batch):
 
   def _pose(self, adr: np.ndarray, values: np.ndarray, mask: wp.array):
     at = [np.searchsorted(kept, numbers) for kept, numbers in zip(self._kept, adr.T, strict=True)]
-    at, values = self._put_rows(np.stack(at, 1), int), self._put_rows(values, float)
-    inputs = [mask, at, values, self.d.qpos, self.d.qvel]
-    wp.launch(kernels.pose, dim=values.shape, inputs=inputs, device=self.device)
-    self._look(mask)
+    wp.copy(self.mask, mask)
+    self._rest.pose(np.stack(at, 1), values)
+    self._run("look")
 
   def _place(self, body: int, pos: np.ndarray, quat: np.ndarray, mask: wp.array):
-    number = self._bare.body(self.model.body(body).name).id
-    pos = self._put_rows(pos, wp.vec3)
-    quat = self._put_rows(quat, wp.quat)  # w first, as mujoco_warp has them
-    inputs = [mask, number, pos, quat, self.m.body_pos, self.m.body_quat]
-    wp.launch(kernels.place, dim=self.nworld, inputs=inputs, device=self.device)
-    self._look(mask)
+    wp.copy(self.mask, mask)
+    self._rest.place(self._bare.body(self.model.body(body).name).id, pos, quat)
+    self._run("look")
 
   def _configure(self, worlds: np.ndarray, gravity: np.ndarray | None, friction: dict):
     changes = [] if gravity is None else [(self.m.opt.gravity, slice(None), gravity)]
@@ -229,13 +225,6 @@ class Worlds(Batch):
       whole = array.numpy()
       whole[(worlds, *place) if isinstance(place, tuple) else worlds] = values
       array.assign(whole)
-
-  def _look(self, mask: wp.array):
-    wp.copy(self.mask, mask)
-    self._run("look")
-
-  def _put_rows(self, values: np.ndarray, dtype) -> wp.array:
-    return wp.array(values, dtype=dtype, device=self.device)
 
   def _tell(self):
     self._teller.tell()

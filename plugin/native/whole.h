@@ -46,8 +46,10 @@ struct Home {
 template <class Fields>
 PALPATE Home home(const Fields& f, int world) {
   Rows at = rows(f, world);
-  const int n = f.shape.nslice;
-#if ON_CUDA
+  const size_t n = f.shape.nslice, base = world * n;
+  if constexpr (!BLOCKS)
+    return {at, f.system.disp_trial.data + 24 * base, f.system.vel_trial.data + 24 * base,
+            {{f.system.z.data + 24 * base, f.system.zn.data + 8 * base}}};
   float* memory = block_memory();
   float *disp = memory, *vel = memory + 24 * n;
   at.disp = disp;
@@ -61,11 +63,6 @@ PALPATE Home home(const Fields& f, int world) {
   }
   at.room = block_room() - (int)(at.held - memory);
   return {at, disp, vel, {{disp, vel}}};
-#else
-  const size_t base = (size_t)world * n;
-  return {at, f.system.disp_trial.data + 24 * base, f.system.vel_trial.data + 24 * base,
-          {{f.system.z.data + 24 * base, f.system.zn.data + 8 * base}}};
-#endif
 }
 
 // The trial state, see `predict`; in the body's arrays too, where others than `Assembly` need it.

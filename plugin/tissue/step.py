@@ -299,6 +299,7 @@ class Scheme:
     respond: writes to `system.sol` how the impulses in `system.rhs` [N s] change the velocity in
       the step just computed; None where the scheme has no such answer
     levels: whether coarser meshes serve its solve
+    whole: whether a block of threads can take a world's whole step
     solids: whether it can step tetrahedra
   """
 
@@ -306,6 +307,7 @@ class Scheme:
   gain: Callable[[float, float], float]
   respond: Callable[[Body], None] | None = None
   levels: bool = False
+  whole: bool = False
   solids: bool = True
 
   @property
@@ -319,7 +321,7 @@ def _whole(h: float, damping: float) -> float:
 
 
 SCHEMES = {
-  "implicit": Scheme(_implicit, _whole, _respond, levels=True),
+  "implicit": Scheme(_implicit, _whole, _respond, levels=True, whole=True),
   "midpoint": Scheme(_midpoint, lambda h, b: 0.5 * _whole(h, b), _respond_centred, levels=True),
   "neumann": Scheme(_neumann, _whole, solids=False),
   "explicit": Scheme(_explicit, lambda h, b: 0.0),

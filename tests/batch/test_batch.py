@@ -167,6 +167,27 @@ def test_contacts_have_the_normal_forces(make, cone):
   np.testing.assert_allclose(pushed[:, 2], found[:, 2], rtol=0.03)
 
 
+def test_a_solid_is_that_of_the_plugin(make):
+  made = probed(keys={"elements": "solid", "young": 3e3, "foundation": None})
+  model, data, organ = load(made)
+  batch = make(made, 2)
+  found = []
+  for k in range(100):
+    data.ctrl[:] = -0.007 * min(1, k / 60), 0.005 * np.clip(k / 70 - 1, 0, 1)
+    batch.ctrl = np.tile(data.ctrl, (2, 1))
+    mujoco.mj_step(model, data)
+    batch.step()
+    force = batch.organ("organ").contact_force.numpy()[0].sum(axis=0)
+    found.append((force, organ.contact_force.sum(axis=0)))
+  found = np.array(found)
+  assert np.sqrt(np.mean((found[:, 0] - found[:, 1]) ** 2)) < 0.005 * np.abs(found[:, 1]).max()
+  np.testing.assert_allclose(batch.organ("organ").xpos.numpy()[0], organ.xpos, atol=2e-5)
+  back = mujoco.MjData(batch.model)
+  batch.get_state(1, back)
+  batch.set_state(0, back)
+  assert np.isfinite(batch.organ("organ").xpos.numpy()).all()
+
+
 TISSUES = [
   (0, {"poisson": [0.45, 0.2, 0.49], "thickness": [0.002, 0.003, 0.001]}),
   (1, {"thickness": [0.002, 0.004, 0.0015], "young": [2e4, 3e4, 4e4]}),

@@ -4,7 +4,7 @@ import mujoco
 import palpate.batch
 import pytest
 import warp as wp
-from scenes import RADIUS, load, needs_cuda, organ, press, probed, sphere, world
+from scenes import load, needs_cuda, press, probed
 
 DEVICE = "warp-cpu"  # what mujoco_warp gets is the same
 
@@ -14,33 +14,17 @@ def make(made, **options):
   return palpate.batch.make(spec, 2, device=DEVICE, **options)
 
 
-def with_tool(kind: str, size: list[float]):
-  spec = mujoco.MjSpec.from_string(press())
-  spec.geoms[0].type = getattr(mujoco.mjtGeom, f"mjGEOM_{kind}")
-  spec.geoms[0].size = size
-  return spec
-
-
 def test_a_compiled_model():
   with pytest.raises(ValueError, match=r"expected the mujoco\.MjSpec"):
     palpate.batch.make(load(press())[0], 2, device=DEVICE)
 
 
 def test_a_tool_that_it_does_not_know():
-  with pytest.raises(ValueError, match="a cylinder; a batch on a GPU knows sphere, capsule"):
-    make(with_tool("CYLINDER", [0.005, 0.005, 0]))
-
-
-def test_a_solid():
-  made = probed(keys={"elements": "solid", "young": 3e3, "foundation": None})
-  with pytest.raises(ValueError, match="elements is 'solid', which a batch on a GPU cannot do"):
-    make(made)
-
-
-def test_what_does_not_move():
-  made = world(organ(*sphere(1)), f'<geom type="plane" size="1 1 1" pos="0 0 {-2 * RADIUS}"/>')
-  with pytest.raises(ValueError, match="which does not move"):
-    make(made)
+  spec = mujoco.MjSpec.from_string(press())
+  spec.add_hfield(name="hills", nrow=2, ncol=2, size=[1, 1, 1, 1], userdata=[0, 0, 0, 0])
+  spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname="hills", pos=[0, 0, -3])
+  with pytest.raises(ValueError, match="of type hfield; a batch on a GPU knows sphere, ellipsoid"):
+    make(spec)
 
 
 @pytest.mark.parametrize(
@@ -53,6 +37,17 @@ def test_what_does_not_move():
 def test_what_hangs_on_an_organs_nodes(extra):
   with pytest.raises(ValueError, match="without the organs' nodes"):
     make(press(subdivisions=1).replace("</mujoco>", extra + "</mujoco>"))
+
+
+def test_tissues_of_worlds_without_a_gpu_to_step_them():
+  batch = palpate.batch.make(mujoco.MjSpec.from_string(probed()), 2)
+  tissue = batch.organ("organ")
+  with pytest.raises(ValueError, match="'mass' cannot change while running"):
+    tissue.configure(mass=0.2)
+  with pytest.raises(ValueError, match="geom 'tip': friction is -1"):
+    batch.configure(friction={"tip": -1})
+  with pytest.raises(ValueError, match=r"gravity|broadcast"):
+    batch.configure(gravity=[0, 0])
 
 
 def test_options():
@@ -77,8 +72,16 @@ def test_more_worlds_than_memory():
 
 
 @pytest.mark.skipif(not wp.get_cuda_supported_archs(), reason="this Warp knows no CUDA")
-def test_the_kernels_compile_for_cuda(tmp_path):
+@pytest.mark.parametrize("which", ["patch", "whole"])
+def test_the_kernels_compile_for_cuda(tmp_path, scenes, which):
   from palpate.batch import patch
+  from palpate.tissue import device, step
 
-  wp.compile_aot_module(patch.MODULE, arch=90, module_dir=str(tmp_path), use_ptx=True)
+  module = patch.MODULE
+  if which == "whole":
+    _, _, body = scenes.kernels(*scenes.sphere(1))
+    kinds = {"bends": True, "springs": True, "volumes": True}
+    body.plan = device.Plan(own=2, threads=160, per_sm=2, nbytes=0, whole=True, **kinds)
+    (module,) = step.modules(body)
+  wp.compile_aot_module(module, arch=90, module_dir=str(tmp_path), use_ptx=True)
   assert any(tmp_path.iterdir())
