@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 _FEW = 16  # worlds on a CPU
 _MANY = 4096  # on a GPU
 _SAVE = 60.0  # seconds between checkpoints
+_RECENT = 200  # episodes that tell how well it goes
+_JUDGE = 5  # iterations between looks at the policy without spread
 _LICENCE = """SPDX-License-Identifier: Apache-2.0
 
 The weights in this folder are licensed under the Apache License, version 2.0, as Palpate is, in
@@ -44,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser):
   add("-o", "--out", metavar="FOLDER", required=True, help="of policy, checkpoint and curves")
   add("--iterations", metavar="N", type=int, default=1000, help="at most (%(default)s)")
   add("--minutes", metavar="T", type=float, default=math.inf, help="at most, in all")
-  add("--success", metavar="SHARE", type=float, default=math.inf, help="enough, of 200 episodes")
+  add("--success", metavar="SHARE", type=float, default=math.inf, help="enough, without spread")
   add("--seed", metavar="N", type=int, default=0, help="of all that is random (%(default)s)")
   add("--num-envs", metavar="N", type=int, help=f"worlds ({_FEW} on a CPU, {_MANY} on a GPU)")
   add("--device", metavar="NAME", help="cpu or cuda:N; a GPU where there is one")
@@ -72,8 +74,12 @@ def main(args: argparse.Namespace) -> int:
   progress = Progress()
   with Interrupt() as interrupt:
     last = learner.seconds
-    while not _enough(args, learner, rows):
-      row = learner.iterate(lambda: interrupt.seen)
+
+    def stop() -> bool:
+      return interrupt.seen
+
+    while not interrupt.seen and not _enough(args, learner, rows, stop):
+      row = learner.iterate(stop)
       if row is None:
         break
       rows.append(row)
@@ -114,17 +120,24 @@ def _learner(name: str, args: argparse.Namespace, kwargs: dict[str, Any], folder
   return learner, env.worlds.task
 
 
-def _enough(args: argparse.Namespace, learner: Learner, rows: list[dict[str, float]]) -> bool:
+def _enough(args: argparse.Namespace, learner: Learner, rows: list, stop: Any) -> bool:
   if learner.iteration >= args.iterations or learner.seconds >= 60 * args.minutes:
     return True
+  # With the spread of learning a policy may succeed that alone does not.
+  wins = _recent(rows) >= args.success and learner.iteration % _JUDGE == 0
+  return wins and learner.judge(stop) >= args.success
+
+
+def _recent(rows: list[dict[str, float]]) -> float:
+  """Returns the share of successes of the last episodes; NaN while there are too few."""
   episodes = wins = 0.0
   for row in reversed(rows):
     if row["episodes"]:
       episodes += row["episodes"]
       wins += row["episodes"] * row["success"]
-    if episodes >= 200:
-      return wins / episodes >= args.success
-  return False
+    if episodes >= _RECENT:
+      return wins / episodes
+  return math.nan
 
 
 def _line(row: dict[str, float]) -> str:

@@ -39,6 +39,7 @@ DOMAINS: dict[str, type[Domain]] = {
   "Trace": Trace,
 }  # fmt: skip
 _ELSE = 'vectorization_mode="sync" runs single environments side by side'
+NODES = {"probe": 16, "grasper": 44}  # of an organ under the instrument, at most, on a GPU
 OUTPUTS = ("numpy", "torch", "warp")
 
 
@@ -73,7 +74,7 @@ class Exercises(VectorEnv):
       device: `cpu`, `cuda:N`, or None for a GPU where there is one; see `palpate.batch.make`
       output: what observations, rewards and flags are: `numpy`, or arrays of the device of `torch`
         or `warp`; all are copies
-      nodes: see `palpate.batch.make`
+      nodes: see `palpate.batch.make`; None for what the instruments of the exercises touch
       **kwargs: of `Exercise`, such as `reward="sparse"`
 
     Raises:
@@ -99,7 +100,8 @@ class Exercises(VectorEnv):
     if device is None:
       device = "cuda:0" if wp.is_cuda_available() else "cpu"
     domain = DOMAINS[type(environment.task).__name__]
-    options = {} if device == "cpu" else {"nodes": nodes}
+    usual = NODES[environment.task.scene.instrument]
+    options = {} if device == "cpu" else {"nodes": nodes or usual}
     self.worlds = Worlds(environment, domain, self.num_envs, device, limit, **options)
     self.device, self.max_episode_steps = self.worlds.device, limit
     self._observed = {
