@@ -5,7 +5,7 @@
 import mujoco as mj
 import numpy as np
 
-FACING = 0.5  # least cosine between a contact's normal and that of the inner face
+_FACING = 0.5  # least cosine between a contact's normal and that of the inner face
 
 
 class Jaws:
@@ -14,15 +14,10 @@ class Jaws:
   def __init__(self, model: mj.MjModel, prefix: str):
     """Finds the jaws `jaw_left` and `jaw_right` of an instrument, say "grasper/"."""
     self._bodies = [model.body(f"{prefix}jaw_{side}").id for side in ("left", "right")]
-    # By geom, -1 (none) is the last.
+    # By geom, -1 (none) is the last: +1 on the left jaw, -1 on the right, 0 elsewhere.
     self._side = np.zeros(model.ngeom + 1)
     for body, side in zip(self._bodies, (1.0, -1.0), strict=True):
       self._side[:-1][model.geom_bodyid == body] = side
-
-  @property
-  def side(self) -> np.ndarray:
-    """Of each geom 1 on the left jaw, -1 on the right, 0 elsewhere  (ngeom,)."""
-    return self._side[:-1]
 
   def inner_force(self, model: mj.MjModel, data: mj.MjData) -> np.ndarray:
     """Returns the normal force of the inner faces on what is between them, left and right [N] (2,).
@@ -44,5 +39,5 @@ class Jaws:
     elliptic = model.opt.cone == mj.mjtCone.mjCONE_ELLIPTIC
     count = np.where(elliptic | (dim == 1), 1, 2 * (dim - 1))
     total = np.concatenate([[0.0], data.efc_force.cumsum()])
-    force = (total[start + count] - total[start]) * along * (along > FACING)
+    force = (total[start + count] - total[start]) * along * (along > _FACING)
     return np.array([force[side > 0].sum(), force[side < 0].sum()])

@@ -5,8 +5,7 @@ from typing import Any
 
 import numpy as np
 import warp as wp
-from palpate.batch.threads import Threads
-from palpate.tasks import grasp, jaws, physics
+from palpate.tasks import grasp, physics
 from palpate.tasks.jaws import Jaws
 from palpate.tissue.types import Array, floats, ints, struct
 
@@ -16,7 +15,7 @@ from .kernels import point, put, vector
 
 _CLOSING, _GRIPPING = wp.constant(physics.CLOSING), wp.constant(physics.GRIPPING)
 _FOLD, _FORCE = wp.constant(physics.FOLD), wp.constant(physics.HELD_FORCE)
-_REACH, _FACING = wp.constant(grasp.REACH), wp.constant(jaws.FACING)
+_REACH = wp.constant(grasp.REACH)
 
 
 @struct
@@ -33,7 +32,6 @@ class HoldState:
   up: vectors  # grasp: towards the trocar
   disc: Array(wp.vec3, ("nworld", "nsample"))  # retract: points of it [m]
   covered: Array(wp.bool, ("nworld", "nsample"))  # retract: whether the organ hides them
-  side: floats("ngeom")  # 1 of the left jaw, -1 of the right, 0 elsewhere
   inner: floats("nworld", 2)  # force of the jaws' inner faces [N]
   closing: flags
   where: vectors  # the site in the frame of the tip, where it was grasped [m]
@@ -102,33 +100,6 @@ def show(s: Common, o: HoldState, w: int):
   o.held[w, 0] = wp.min(o.time[w] / o.hold, 1.0)
 
 
-@wp.kernel(enable_backward=False)
-def press(
-  s: Common,
-  o: HoldState,
-  geom: wp.array(dtype=int, ndim=2),
-  normal: wp.array(dtype=wp.vec3, ndim=2),
-  force: wp.array(dtype=float, ndim=2),
-):
-  """Sums up the force of the jaws' inner faces from contacts, see `Jaws.inner_force`."""
-  w = wp.tid()
-  q = wp.quat(s.tip_quat[w, 1], s.tip_quat[w, 2], s.tip_quat[w, 3], s.tip_quat[w, 0])
-  left, right = wp.float32(0.0), wp.float32(0.0)
-  for k in range(geom.shape[1]):
-    if geom[w, k] >= 0 and o.side[geom[w, k]] != 0.0:
-      side = o.side[geom[w, k]]
-      opening = s.qpos[w, s.opening + wp.where(side > 0.0, 0, 1)]
-      across = wp.quat_rotate(q, wp.vec3(wp.cos(opening), 0.0, side * wp.sin(opening)))
-      along = -side * wp.dot(normal[w, k], across)  # the normal leads away from the jaw
-      if along > _FACING:
-        if side > 0.0:
-          left += force[w, k] * along
-        else:
-          right += force[w, k] * along
-  o.inner[w, 0] = left
-  o.inner[w, 1] = right
-
-
 class Hold(domain.Domain):
   """What the domains share."""
 
@@ -137,12 +108,7 @@ class Hold(domain.Domain):
   @staticmethod
   def sizes(task: Any, physics):
     """Returns the named sizes of its arrays."""
-    return {"nsample": 1, "ngeom": physics.model.ngeom}
-
-  @staticmethod
-  def constants(task: Any, physics) -> dict[str, Any]:
-    """Returns what all worlds share."""
-    return {"side": Jaws(physics.model.ptr, task.prefix).side}
+    return {"nsample": 1}
 
   @staticmethod
   def draw(task: Any, physics) -> dict[str, Any]:
@@ -151,15 +117,11 @@ class Hold(domain.Domain):
 
   @staticmethod
   def sense(worlds: Any) -> None:
-    """Measures what the jaws have between them."""
+    """Measures what the jaws have between them, on the CPU's threads."""
     batch, own = worlds.batch, worlds.own
-    if not isinstance(batch, Threads):
-      c = batch.organ(worlds.task.organ).contacts
-      inputs = [worlds.fields, own, c.geom, c.normal.view(wp.vec3), c.force]
-      return worlds.launch(press, worlds.nworld, inputs)
     found, inner = Jaws(batch.model, worlds.task.prefix), own.inner.numpy()
 
     def work(world: int):
       inner[world] = found.inner_force(batch.models[world], batch.datas[world])
 
-    return batch.each(work)
+    batch.each(work)

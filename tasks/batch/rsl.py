@@ -30,7 +30,7 @@ class RslRl(VecEnv):
       raise ValueError("env is no vectorised exercise with output='torch', expected one")
     self.env, self.cfg = found, {}
     self.num_envs, self.max_episode_length = found.num_envs, found.max_episode_steps
-    self.num_actions = found.action_space.shape[1]
+    self.num_actions = len(found.worlds.task.components)
     self.device = str(wp.device_to_torch(found.device))
     self.groups = groups(found.single_observation_space)
     self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)

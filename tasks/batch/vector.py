@@ -39,7 +39,7 @@ DOMAINS: dict[str, type[Domain]] = {
   "Trace": Trace,
 }  # fmt: skip
 _ELSE = 'vectorization_mode="sync" runs single environments side by side'
-NODES = {"probe": 16, "grasper": 44}  # of an organ under the instrument, at most, on a GPU
+NODES = 16  # of an organ that a probe touches, at most, on a GPU
 OUTPUTS = ("numpy", "torch", "warp")
 
 
@@ -74,7 +74,7 @@ class Exercises(VectorEnv):
       device: `cpu`, `cuda:N`, or None for a GPU where there is one; see `palpate.batch.make`
       output: what observations, rewards and flags are: `numpy`, or arrays of the device of `torch`
         or `warp`; all are copies
-      nodes: see `palpate.batch.make`; None for what the instruments of the exercises touch
+      nodes: on a GPU, see `palpate.batch.make`; None for what a probe touches
       **kwargs: of `Exercise`, such as `reward="sparse"`
 
     Raises:
@@ -88,7 +88,9 @@ class Exercises(VectorEnv):
     _refuse(task, kwargs)
     single = Exercise(task, **kwargs)
     environment = single.environment
-    _refuse_task(environment.task)
+    if device is None:
+      device = "cuda:0" if wp.is_cuda_available() else "cpu"
+    _refuse_task(environment.task, device)
     self.single_observation_space, self.single_action_space = (
       single.observation_space, single.action_space
     )  # fmt: skip
@@ -97,11 +99,8 @@ class Exercises(VectorEnv):
     limit = environment.step_limit
     if max_episode_steps is not None and max_episode_steps > 0:
       limit = min(limit, max_episode_steps)
-    if device is None:
-      device = "cuda:0" if wp.is_cuda_available() else "cpu"
     domain = DOMAINS[type(environment.task).__name__]
-    usual = NODES[environment.task.scene.instrument]
-    options = {} if device == "cpu" else {"nodes": nodes or usual}
+    options = {} if device == "cpu" else {"nodes": nodes or NODES}
     self.worlds = Worlds(environment, domain, self.num_envs, device, limit, **options)
     self.device, self.max_episode_steps = self.worlds.device, limit
     self._observed = {
@@ -220,7 +219,7 @@ def _refuse(task: str, kwargs: Mapping[str, Any]) -> None:
       raise ValueError(f"{task}: {name} is given, which a vectorised exercise cannot do; {_ELSE}")
 
 
-def _refuse_task(task: Any) -> None:
+def _refuse_task(task: Any, device: str) -> None:
   kind = type(task).__name__
   if kind not in DOMAINS:
     have = ", ".join(name.lower() for name in DOMAINS)
@@ -229,6 +228,11 @@ def _refuse_task(task: Any) -> None:
     raise ValueError(
       f"{task.name}: observations has {task.observed.pictures[0]!r}, but a vectorised exercise "
       f"makes no pictures; {_ELSE}"
+    )
+  if task.jaws and device != "cpu":
+    raise ValueError(
+      f"{task.name}: device is {device!r}, expected 'cpu': what jaws hold on a GPU does not agree "
+      "with the CPU yet"
     )
   if len(task.variants) > 1:
     raise ValueError(
