@@ -1,7 +1,8 @@
 """Contacts of an organ's window with tools, written where mujoco_warp makes constraints of them.
 
-Each slot has a place of its own for its contacts, so that which is where does not depend on who
-comes first, and worlds need nothing of each other.
+Each slot notes its contacts by itself; then those of a world are written one after the other, by
+slots, to places that the world has for itself. So which is where does not depend on who comes
+first, and worlds need nothing of each other.
 """
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
@@ -47,6 +48,7 @@ class Touch:
   """How an organ's triangles touch each tool, and mujoco_warp's contacts."""
 
   room: int  # contacts of a slot
+  most: int  # contacts of a world
   flex: int  # the slots' flex
   radius: float  # of that [m]
   kind: ints("ntool")  # mjtGeom
@@ -59,6 +61,12 @@ class Touch:
   friction: Array(vec5, ("ntool",))  # all of it, the sliding one as compiled
   solref: Array(wp.vec2, ("ntool",))
   solimp: Array(vec5, ("ntool",))
+  # What slots note:
+  count: ints("nworld", "nslot")  # contacts
+  dist: floats("nthread", "room")  # [m]
+  pos: Array(wp.vec3, ("nthread", "room"))  # [m]
+  normal: Array(wp.vec3, ("nthread", "room"))  # from the tool to the tissue
+  which: Array(wp.vec3i, ("nthread", "room"))  # tool, triangle and slot, -1 for none
   # mujoco_warp:
   nacon: ints(1)
   start: ints(1)  # the organ's first contact
@@ -82,12 +90,11 @@ class Touch:
 
 @wp.struct
 class Place:
-  """A triangle before a tool, and where its contacts go."""
+  """A triangle before a tool, and whose contacts they are."""
 
   world: int
-  first: int  # contact, -1 where they are counted alone
-  room: int
   thread: int  # of all slots of all worlds
+  whole: int  # 0 for a triangle whose contacts are counted alone
   elem: int  # -1 for a corner alone
   vert: int  # -1 for a triangle
   tool: int  # which of the organ's
@@ -142,36 +149,69 @@ def _axes(normal: wp.vec3):
 
 @wp.func
 def _put(c: Touch, at: Place, n: int, dist: float, pos: wp.vec3, normal: wp.vec3):
-  """Writes a contact, if it is one and there is room; returns how many there are then."""
-  q = at.tool
-  if not dist < c.margin[q]:
+  """Notes a contact, if it is one and there is room; returns how many there are then."""
+  if not dist < c.margin[at.tool]:
     return n
-  if at.first >= 0 and n < at.room:
-    k = at.first + n
-    c.out_dist[k] = dist
-    c.out_pos[k] = pos
-    c.out_frame[k] = _axes(normal)
-    c.out_includemargin[k] = c.margin[q]
-    slide = c.slide[at.world, q]
-    if c.whose[q] == _ORGAN:
-      slide = c.rough[at.world]
-    elif c.whose[q] == _GREATER:
-      slide = wp.max(slide, c.rough[at.world])
-    friction = c.friction[q]
-    friction[0] = wp.max(slide, _LEAST)
-    friction[1] = friction[0]
-    c.out_friction[k] = friction
-    c.out_solref[k] = c.solref[q]
-    c.out_solreffriction[k] = wp.vec2(0.0, 0.0)
-    c.out_solimp[k] = c.solimp[q]
-    c.out_dim[k] = c.condim[q]
-    c.out_geom[k] = wp.vec2i(at.geom, -1)
-    c.out_flex[k] = wp.vec2i(-1, c.flex)
-    c.out_elem[k] = wp.vec2i(-1, at.elem)
-    c.out_vert[k] = wp.vec2i(-1, at.vert)
-    c.out_type[k] = _CONSTRAINT
-    c.out_geomcollisionid[k] = n
+  if at.whole == 1 and n < c.room:
+    c.dist[at.thread, n] = dist
+    c.pos[at.thread, n] = pos
+    c.normal[at.thread, n] = normal
+    c.which[at.thread, n] = wp.vec3i(at.tool, at.elem, at.vert)
   return n + 1
+
+
+@wp.func
+def _write(p: Patch, c: Touch, world: int, thread: int, n: int, k: int):
+  """Writes the n-th contact of a slot as mujoco_warp's contact k."""
+  which = c.which[thread, n]
+  q = which[0]
+  slide = c.slide[world, q]
+  if c.whose[q] == _ORGAN:
+    slide = c.rough[world]
+  elif c.whose[q] == _GREATER:
+    slide = wp.max(slide, c.rough[world])
+  friction = c.friction[q]
+  friction[0] = wp.max(slide, _LEAST)
+  friction[1] = friction[0]
+  c.out_dist[k] = c.dist[thread, n]
+  c.out_pos[k] = c.pos[thread, n]
+  c.out_frame[k] = _axes(c.normal[thread, n])
+  c.out_includemargin[k] = c.margin[q]
+  c.out_friction[k] = friction
+  c.out_solref[k] = c.solref[q]
+  c.out_solreffriction[k] = wp.vec2(0.0, 0.0)
+  c.out_solimp[k] = c.solimp[q]
+  c.out_dim[k] = c.condim[q]
+  c.out_geom[k] = wp.vec2i(p.tool_geom[q], -1)
+  c.out_flex[k] = wp.vec2i(-1, c.flex)
+  c.out_elem[k] = wp.vec2i(-1, which[1])
+  c.out_vert[k] = wp.vec2i(-1, which[2])
+  c.out_type[k] = _CONSTRAINT
+  c.out_geomcollisionid[k] = n
+
+
+@wp.kernel(enable_backward=False)
+def pack(p: Patch, c: Touch):
+  """Writes the contacts that slots noted, and that the other places have none."""
+  world, slot = wp.tid()
+  before = int(0)  # noqa: RUF046, UP018 - a variable to Warp
+  total = int(0)  # noqa: RUF046, UP018
+  for s in range(p.nslot):
+    if s == slot:
+      before = total
+    total += c.count[world, s]
+  first = c.nacon[0] + world * c.most
+  for n in range(c.count[world, slot]):
+    if before + n < c.most:
+      _write(p, c, world, world * p.nslot + slot, n, first + before + n)
+  for k in range(slot, c.most, p.nslot):
+    c.out_worldid[first + k] = world
+    if k >= total:
+      c.out_type[first + k] = 0
+      c.out_dim[first + k] = 1
+      c.out_geom[first + k] = wp.vec2i(-1, -1)
+  if slot == 0 and total > c.most:
+    wp.atomic_add(p.missed, world, total - c.most)
 
 
 @wp.func
@@ -284,8 +324,6 @@ def kernel(kinds: frozenset[int]) -> wp.Kernel:
     at = Place()
     at.world = world
     at.thread = world * p.nslot + slot
-    at.room = c.room
-    first = c.nacon[0] + (world * p.nslot + slot) * c.room
     n = int(0)  # noqa: RUF046, UP018 - a variable to Warp
     i = p.slot_node[world, slot]
     if i >= 0:
@@ -299,7 +337,7 @@ def kernel(kinds: frozenset[int]) -> wp.Kernel:
         d = p.node_slot[world, vd]
         whole = a >= 0 and b >= 0 and d >= 0
         if _owner(p, world, e) == i:
-          at.first = wp.where(whole, first, -1)
+          at.whole = wp.where(whole, 1, 0)
           at.vert = -1
           at.elem = 0
           if whole:
@@ -317,18 +355,13 @@ def kernel(kinds: frozenset[int]) -> wp.Kernel:
           elif more > 0:
             wp.atomic_add(p.missed, world, 1)
       if wp.static(_PLANE in kinds):
-        at.first = first
+        at.whole = 1
         at.elem = -1
         at.vert = slot
         n = _on_planes(p, c, at, n, _where(p, world, i))
     if n > c.room:
       wp.atomic_add(p.missed, world, n - c.room)
-    for k in range(c.room):
-      c.out_worldid[first + k] = world
-      if k >= n:
-        c.out_type[first + k] = 0
-        c.out_dim[first + k] = 1
-        c.out_geom[first + k] = wp.vec2i(-1, -1)
+    c.count[world, slot] = wp.min(n, c.room)
 
   return find
 
@@ -352,24 +385,31 @@ def most_of(model: mujoco.MjModel, tools: np.ndarray, nslot: int) -> int:
   return nslot * min(2 * each, 4)
 
 
-def make(model: mujoco.MjModel, organ, tools: np.ndarray, flex: int, nworld: int, data):
+def make(model: mujoco.MjModel, organ, tools: np.ndarray, place, data):
   """Returns how an organ touches its tools.
 
   Args:
     model: the compiled scene
     organ: the organ's declaration
     tools: geoms that its slots follow
-    flex: the slots' flex in the stripped model
-    nworld: number of worlds
+    place: where the stripped model has its slots
     data: mujoco_warp's
   """
   own = int(organ.windows.flex[0]) if organ.windows else organ.flex
   rows = [_mix(model, int(g), own) for g in tools]
   mixed = {name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else ())}
   contact = {f"out_{name}": getattr(data.contact, name) for name in _written()}
+  nworld, nslot, room = data.nworld, place.nslot, room_of(model, tools)
+  noted = {"dist": float, "pos": wp.vec3, "normal": wp.vec3, "which": wp.vec3i}
   values = mixed | contact | dict(
-    room=room_of(model, tools),
-    flex=flex,
+    room=room,
+    most=most_of(model, tools, nslot),
+    count=wp.zeros((nworld, nslot), dtype=int, device=data.nacon.device),
+    **{
+      name: wp.empty((nworld * nslot, room), dtype=kind, device=data.nacon.device)
+      for name, kind in noted.items()
+    },
+    flex=place.flex,
     radius=float(model.flex_radius[own]),
     kind=model.geom_type[tools],
     size=model.geom_size[tools],

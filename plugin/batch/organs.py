@@ -98,12 +98,17 @@ class Organ(Tissue):
         "geom_xpos", "geom_xmat", "qpos", "qvel", "qfrc_passive", "qfrc_constraint")},
     )  # fmt: skip
     self.patch = patch.make(values, self.body)
-    self._touch = contacts.make(model, organ, tools, place.flex, nworld, d)
-    self._pressed = sliding.make(batch, self._touch, place.nslot)
+    self._touch = contacts.make(model, organ, tools, place, d)
+    self._pressed = sliding.make(batch, self._touch)
     self._convex = convex.make(model, tools, nworld * place.nslot, m, d)
     kinds = frozenset(int(kind) for kind in model.geom_type[tools])
-    self._find, self._region = contacts.kernel(kinds), int(nworld * place.nslot * self._touch.room)
+    self._find, self._region = contacts.kernel(kinds), int(nworld * self._touch.most)
     self._material = Material(self, batch, self._touch)
+
+  @property
+  def start(self) -> wp.array:
+    """The organ's first contact, (1,)."""
+    return self._touch.start
 
   def enclose(self):
     """Lets the step know volume stiffness and pressure, from the next record on."""
@@ -150,6 +155,7 @@ class Organ(Tissue):
     dim, device = (self._batch.nworld, self.place.nslot), self.body.device
     inputs = [self.patch, self._touch, self._convex]
     wp.launch(self._find, dim=dim, inputs=inputs, device=device, block_dim=64)
+    wp.launch(contacts.pack, dim=dim, inputs=inputs[:2], device=device)
     inputs = [self._touch.nacon, self._touch.start, self._region]
     wp.launch(contacts.add, dim=1, inputs=inputs, device=device)
 

@@ -88,16 +88,15 @@ def press(p: Pressed):
   p.force[world, k] = total
 
 
-def make(batch, touch, nslot: int):
-  """Returns the contacts of an organ's slots.
+def make(batch, touch):
+  """Returns an organ's contacts.
 
   Args:
     batch: the worlds, with mujoco_warp's data
     touch: how the organ touches its tools
-    nslot: its slots
   """
   out, d = Pressed(), batch.d
-  out.many, out.paired, out.start = nslot * touch.room, int(batch.paired), touch.start
+  out.many, out.paired, out.start = touch.most, int(batch.paired), touch.start
   for name in ("dim", "frame", "friction", "efc_address"):
     setattr(out, name, getattr(d.contact, name))
   out.contact_geom, out.aref, out.row_force = d.contact.geom, d.efc.aref, d.efc.force

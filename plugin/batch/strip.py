@@ -23,6 +23,8 @@ from .contacts import KINDS
 # Slots of an organ: all triples of more are too many.
 LEAST, MOST = 4, 48
 _USUAL = 24  # at most, unless told
+_LONG = 2.0  # edges of the organ along a tool that its slots are for, unless told
+_DENSE = 60  # dofs up to which mujoco_warp's matrices are dense, several times as fast
 _INERTIA = 1e-8  # of a slot's body, which does not turn [kg m^2]
 _COUNTED = ("nu", "na", "nsensor", "nsensordata", "neq", "ntendon", "npair", "nexclude", "nmocap")
 
@@ -81,8 +83,11 @@ def slots_for(model, organ, tools: np.ndarray, nodes) -> int:
   for g in tools:
     low, middle, large = np.sort(model.geom_aabb[g, 3:])
     r = (0.5 * (low + middle)) + edge
-    many += (math.pi * r * r + 2 * r * 2 * (large - middle)) / (math.sqrt(3) / 2 * edge * edge)
-  return int(min(np.clip(math.ceil(many), 8, _USUAL), nvert))
+    length = min(2 * (large - middle), _LONG * edge)
+    many += (math.pi * r * r + 2 * r * length) / (math.sqrt(3) / 2 * edge * edge)
+  others = model.nv - (organ.nfree if organ.windows is None else 3 * organ.windows.nslot)
+  usual = max(8, min(_USUAL, (_DENSE - others) // 3))
+  return int(min(np.clip(math.ceil(many), 8, usual), nvert))
 
 
 def _kind(kind: int) -> str:

@@ -20,6 +20,7 @@ from palpate.tissue import device as devices
 
 from . import contacts, convex, kernels, states, strip
 from .base import Batch, Tissue, refuse_crowd
+from .order import Order
 from .organs import Organ
 from .rest import Rest
 
@@ -73,7 +74,7 @@ class Worlds(Batch):
       self._teller = states.Teller(self)
       self._sensors = wp.array([*model.sensor_adr, model.nsensordata], dtype=int)
       self._alias()
-      self._callbacks()
+      self._callbacks(deterministic)
       self.record()
     self._warned = False
     self.reset()
@@ -83,20 +84,20 @@ class Worlds(Batch):
     model, nworld = self.model, self.nworld
     self.paired = model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
     most = [contacts.most_of(model, t, n) for t, n in zip(tools, nslots, strict=True)]
-    regions = [contacts.room_of(model, t) * n for t, n in zip(tools, nslots, strict=True)]
+    noted = [contacts.room_of(model, t) * n for t, n in zip(tools, nslots, strict=True)]
     condim = int(max([1, *model.flex_condim, *model.geom_condim]))
     each = 1 if condim == 1 else 2 * (condim - 1) if self.paired else condim
     between = _CONTACTS if strip.tools_meet(bare) else 0
     self.njmax = strip.rows_of(bare) + (between + sum(most)) * each
-    ncon = between + sum(regions)
-    size = states.bytes_of(bare, self.njmax, ncon) + sum(
+    ncon = between + sum(most)
+    size = states.bytes_of(bare, self.njmax, ncon) + 40.0 * sum(noted) + sum(
       Organ.bytes_of(w, self.device) for w in spaces.values()
     )
     size += sum(convex.bytes_of(model.geom_type[t], n) for t, n in zip(tools, nslots, strict=True))
     refuse_crowd(nworld, size, _room(self.device), str(self.device))
     try:
       own = ("dof_armature", "body_invweight0", "body_pos", "body_quat", "geom_friction")
-      sizes = dict.fromkeys(own, nworld)
+      sizes: dict[str, int] = {name: nworld for name in own}
       self.m = mjw.put_model(bare, batch_sizes=sizes)
     except (NotImplementedError, ValueError) as error:
       raise ValueError(f"mujoco_warp cannot have this scene: {error}") from None
@@ -108,7 +109,8 @@ class Worlds(Batch):
       bare, start, nworld=nworld, nconmax=ncon, njmax=self.njmax, njmax_nnz=nonzero
     )
     self.m.opt.warn_overflow = 0  # counted, see `overflow`
-    self.m.opt.deterministic = int(DeterminismType.ALL if deterministic else DeterminismType.NONE)
+    # Contacts and rows are put in order here, see `order`.
+    self.m.opt.deterministic = int(DeterminismType.ATOMICS if deterministic else 0)
     # The windows' triangles have no forces and contacts of mujoco_warp's own.
     self.m.nflexelem = self.m.nflexedge = 0
     gravity = np.tile(model.opt.gravity, (nworld, 1)).astype(np.float32)
@@ -119,14 +121,17 @@ class Worlds(Batch):
     for name in ("ctrl", "sensordata", "time"):
       self._arrays[name] = getattr(self.d, name)
 
-  def _callbacks(self):
+  def _callbacks(self, deterministic: bool):
     organs = list(self._organs.values())
+    order = Order(self, organs[0].start) if deterministic and organs else None
 
     def touch(m, d):
       for organ in organs:
         organ.touch()
 
     def push(m, d):
+      if order:
+        order.launch()
       for organ in organs:
         organ.push()
 
@@ -217,13 +222,15 @@ class Worlds(Batch):
     self._run("look")
 
   def _configure(self, worlds: np.ndarray, gravity: np.ndarray | None, friction: dict):
-    changes = [] if gravity is None else [(self.m.opt.gravity, slice(None), gravity)]
+    changes: list[tuple[wp.array, tuple, np.ndarray]] = []
+    if gravity is not None:
+      changes.append((self.m.opt.gravity, (), gravity))
     for g, values in friction.items():
       changes.append((self.m.geom_friction, (g, 0), values))
       changes += [change for organ in self._organs.values() for change in organ.rubs(g, values)]
     for array, place, values in changes:
       whole = array.numpy()
-      whole[(worlds, *place) if isinstance(place, tuple) else worlds] = values
+      whole[(worlds, *place)] = values
       array.assign(whole)
 
   def _tell(self):

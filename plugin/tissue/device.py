@@ -166,7 +166,9 @@ def reserve(kernel: wp.Kernel, device, plan: Plan):
   if not device.is_cuda:
     return
   # Warp knows no other way than tiles, whose sizes are compiled in.
-  hooks = kernel.module.load(device, plan.threads).get_kernel_hooks(kernel)
+  module = kernel.module.load(device, plan.threads)
+  assert module is not None  # else loading has raised
+  hooks = module.get_kernel_hooks(kernel)
   core = warp_context.runtime.core
   if not core.wp_cuda_configure_kernel_shared_memory(hooks.forward, plan.nbytes):
     raise RuntimeError(f"{device} has no {plan.nbytes} bytes of shared memory for a block")

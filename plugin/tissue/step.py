@@ -138,9 +138,9 @@ def _world_kernel(plan: Plan) -> wp.Kernel:
   return kernel("step_world", "whole.h", Fields, constants, bounds, tag, fast=plan.own > 0)
 
 
-def _by_block(body: Body, stage: Stage):
+def _by_block(body: Body, plan: Plan, stage: Stage):
   """Takes the step of `implicit`, or the answer to it, a block a world."""
-  plan, step_world = body.plan, _world_step(body.plan)
+  step_world = _world_step(plan)
   reserve(step_world, body.device, plan)
   wp.launch(
     step_world,
@@ -225,7 +225,7 @@ def solve(body: Body, stage: Stage):
 
 def _implicit(body: Body):
   if body.plan:
-    _by_block(body, Stage.FIRST)
+    _by_block(body, body.plan, Stage.FIRST)
     return
   body.system.change.zero_()
   nslice = body.shape.nslice
@@ -276,7 +276,7 @@ def _direct(body: Body, stage: Stage):
 
 def _respond(body: Body):
   if body.plan:
-    _by_block(body, Stage.RESPONSE)
+    _by_block(body, body.plan, Stage.RESPONSE)
   else:
     solve(body, Stage.RESPONSE)
 
