@@ -37,8 +37,6 @@ _KEY = "palpate training"
 _JUDGED = 1_000_000  # seed of the first world's episode when a policy is judged
 LEAST = 2048  # control steps of an iteration, in all worlds
 _SHORT = 24  # of a world, at least
-_STILL = 1e-4  # standard deviation of what has not changed
-_SLOWEST = 1e-4  # learning rate at the start of an iteration, at least
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,7 +62,7 @@ class Settings:
   epochs: int = 5
   minibatches: int = 4
   spread: float = 0.5
-  entropy: float = 0.001
+  entropy: float = 0.005
   learning_rate: float = 1e-3
 
 
@@ -114,10 +112,6 @@ class Learner:
         self.env.step(self._ppo.actor(seen[-1], stochastic_output=True))
       for model in (self._ppo.actor, self._ppo.critic):
         model.update_normalization(torch.cat(seen))
-        # What has not changed so far, forces for instance, is left as large as it will be.
-        state = model.obs_normalizer.state_dict()
-        still = state["_std"] < _STILL
-        state["_var"][still] = state["_std"][still] = 1.0
 
   def iterate(self, stop: Callable[[], bool] = lambda: False) -> dict[str, float] | None:
     """Learns from some steps of all worlds; returns `ROW`, or None if it was to stop."""
@@ -134,7 +128,6 @@ class Learner:
         if extras["log"]:
           ended.append(extras["log"])
       ppo.compute_returns(env.get_observations())
-    self._quicken()
     ppo.update()
     self.iteration += 1
     self.steps += self._count * env.num_envs
@@ -150,13 +143,6 @@ class Learner:
       "spread": float(ppo.actor.distribution.log_std_param.detach().exp().mean()),
       "learning_rate": ppo.learning_rate,
     }  # fmt: skip
-
-  def _quicken(self) -> None:
-    """Keeps the learning rate from staying low after one iteration that changed much."""
-    ppo = self._ppo
-    ppo.learning_rate = max(ppo.learning_rate, _SLOWEST)
-    for group in ppo.optimizer.param_groups:
-      group["lr"] = ppo.learning_rate
 
   def judge(self, stop: Callable[[], bool] = lambda: False) -> float:
     """Returns the share of successes without spread, of an episode in each world."""

@@ -39,7 +39,6 @@ DOMAINS: dict[str, type[Domain]] = {
   "Trace": Trace,
 }  # fmt: skip
 _ELSE = 'vectorization_mode="sync" runs single environments side by side'
-NODES = 16  # of an organ that a probe touches, at most, on a GPU
 OUTPUTS = ("numpy", "torch", "warp")
 
 
@@ -74,7 +73,7 @@ class Exercises(VectorEnv):
       device: `cpu`, `cuda:N`, or None for a GPU where there is one; see `palpate.batch.make`
       output: what observations, rewards and flags are: `numpy`, or arrays of the device of `torch`
         or `warp`; all are copies
-      nodes: on a GPU, see `palpate.batch.make`; None for what a probe touches
+      nodes: on a GPU, see `palpate.batch.make`
       **kwargs: of `Exercise`, such as `reward="sparse"`
 
     Raises:
@@ -100,7 +99,7 @@ class Exercises(VectorEnv):
     if max_episode_steps is not None and max_episode_steps > 0:
       limit = min(limit, max_episode_steps)
     domain = DOMAINS[type(environment.task).__name__]
-    options = {} if device == "cpu" else {"nodes": nodes or NODES}
+    options = {} if device == "cpu" else {"nodes": nodes}
     self.worlds = Worlds(environment, domain, self.num_envs, device, limit, **options)
     self.device, self.max_episode_steps = self.worlds.device, limit
     self._observed = {

@@ -8,7 +8,7 @@ from palpate.app import cli
 for name in ("gymnasium", "torch", "rsl_rl", "safetensors"):
   pytest.importorskip(name)
 
-from palpate.tasks.batch import learning  # noqa: E402
+from palpate.tasks.batch import learning, vector  # noqa: E402
 
 SMALL = ["--device", "cpu", "--num-envs", "2", "--set", "time_limit=0.4"]
 
@@ -44,6 +44,13 @@ def test_training_goes_on_where_it_stopped_and_its_policy_is_evaluated(tmp_path,
   assert "time limit 1" in capsys.readouterr().out
   assert cli.main(["evaluate", "touch/standard", *words]) == 1
   assert "the policy is of touch/easy, not of touch/standard" in capsys.readouterr().err
+
+
+def test_a_policy_is_judged_by_an_episode_in_each_world():
+  env = vector.Exercises(3, "touch/easy", device="cpu", output="torch", time_limit=0.1)
+  learner = learning.Learner(env, learning.Settings())
+  assert learner.judge() == 0.0 and learner.judge(lambda: True) == 0.0
+  env.close()
 
 
 def test_what_is_wrong_is_said_before_the_work(tmp_path, capsys):
