@@ -62,10 +62,10 @@ REWARDS = ("dense", "sparse")
 _RATES = np.array(RATES)
 # In the dense reward: share of the progress that is paid before the end, price of a unit of cost,
 # and most that costs take. Success with all costs pays more than any progress without.
-_SHARE, _PRICE, _MOST = 0.4, 0.1, 0.55
+SHARE, PRICE, MOST = 0.4, 0.1, 0.55
 _FACING = 0.75  # least cosine between a target's normal and the way to the trocar
 _PIN_GAP = 0.012  # targets keep this far from pinned nodes [m]
-_SLACK = 1e-6  # what rounding may add to an action
+SLACK = 1e-6  # what rounding may add to an action
 
 
 class Task(control.Task):
@@ -169,15 +169,20 @@ class Task(control.Task):
 
   def physics(self) -> Physics:
     """Returns the physics of the scene, to make an environment of."""
-    model = self._compiled(self.variants[0]).model
+    model = self.compiled(self.variants[0]).model
     physics = Physics.from_model(wrapper.MjModel(model))
     physics.use(model, self.prefix, self.targets, self.organ)
     return physics
 
-  def _compiled(self, variant: int | None) -> Stage:
+  def compiled(self, variant: int | None) -> Stage:
+    """Returns the stage of a shape."""
     if variant not in self._models:
-      self._models[variant] = self._stage(scenes.build(self._scene(variant)))
+      self._models[variant] = self._stage(self.spec(variant))
     return self._models[variant]
+
+  def spec(self, variant: int | None) -> mj.MjSpec:
+    """Returns the scene of a shape, not that of `model`."""
+    return scenes.build(self._scene(variant))
 
   def _stage(self, spec: mj.MjSpec) -> Stage:
     model = stage.compile_spec(spec)
@@ -260,7 +265,7 @@ class Task(control.Task):
 
   def initialize_episode(self, physics: Physics) -> None:
     """Draws shape, trocar, pose and targets, and puts the organ at rest."""
-    place = self._compiled(self.choose())
+    place = self.compiled(self.choose())
     if physics.model.ptr is not place.model:
       physics.use(place.model, self.prefix, self.targets, self.organ)
     place.restore()
@@ -309,7 +314,7 @@ class Task(control.Task):
       )
     # In plain numbers: arrays of five take longer.
     for k, value in enumerate(values.ravel().tolist()):
-      if not abs(value) <= 1 + _SLACK:
+      if not abs(value) <= 1 + SLACK:
         raise ValueError(
           f"{self.name}: action {names[k % len(names)]} is {value}, expected a number in [-1, 1]"
         )
@@ -342,10 +347,10 @@ class Task(control.Task):
       self.event(physics, "note", label=f"{what}: {tip if tip > self.damage else shaft:.2f} N")
     elif self.outcome == "success":
       self.event(physics, "note", label="success")
-    phi = self.progress if self.outcome in ("success", "damage") else _SHARE * self.progress
+    phi = self.progress if self.outcome in ("success", "damage") else SHARE * self.progress
     self._gain, self._phi = phi - self._phi, phi
     self.best = max(self.best, self.progress)
-    self._price = min(_PRICE * self.cost.total, _MOST - self.harm)
+    self._price = min(PRICE * self.cost.total, MOST - self.harm)
     self.harm += self._price
 
   def get_observation(self, physics: Physics) -> collections.OrderedDict:

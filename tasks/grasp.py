@@ -27,6 +27,7 @@ from . import base
 from .base import Physics, Task
 from .performer import Performer, Script
 from .scenes import Scene
+from .touch import SLACK
 
 SUITE = containers.TaggedTasks()
 FUNDUS = Scene(
@@ -37,8 +38,9 @@ FUNDUS = Scene(
   camera=(-0.09, 0.072, 0.054),
 )
 REACH = 0.012  # of the jaws around the site [m]
-_REST = 0.2  # at a low height before release [s]
-_LOW = (-0.25, 0.4, 0.5)  # heights it rests between, and is let go below, as shares of the lift
+REST = 0.2  # at a low height before release [s]
+# Heights that it rests between, and is let go below, as shares of the lift.
+LOW, RESTING, LETTING = -0.25, 0.4, 0.5
 
 
 @SUITE.add("benchmarking", "easy")
@@ -120,6 +122,13 @@ class Hold(Task):
     return {"grip": float(self.closing), "held": float(self.grasped)}
 
 
+def progress(done: bool, grasped: bool, near: float, share: float, held: float) -> float:
+  """Returns the progress, see the module's head: of closeness, shares of lift and time."""
+  high = max(min(share, 1.0), 0.0)
+  low = 0.9 + 0.05 * (1.0 - high) if done else 0.2 * near
+  return 0.3 + 0.4 * high + 0.2 * min(held, 1.0) if grasped and not done else low
+
+
 class Grasp(Hold):
   """Grasp, lift, hold, lower, release."""
 
@@ -154,7 +163,7 @@ class Grasp(Hold):
   @property
   def rests(self) -> bool:
     """Whether the site was held, lowered and rests there, ready to be let go."""
-    return self.lowered >= _REST - 1e-9
+    return self.lowered >= REST - SLACK
 
   def height(self, physics: Physics) -> float:
     """Returns how far the site is above its place at rest, towards the trocar [m]."""
@@ -168,19 +177,15 @@ class Grasp(Hold):
       self._letting = self.rests and not self.closing
       if not self._letting:
         self._lose(physics)
-    if self._letting and not _LOW[0] <= share <= _LOW[2]:
+    if self._letting and not LOW <= share <= LETTING:
       self._lose(physics)
     if self._letting and not physics.holds():
       self.outcome = "success"
       return 1.0
     if self.grasped:
       self._count(physics, share)
-    share = float(np.clip(share, 0, 1))
-    if self.done:
-      return 0.9 + 0.05 * (1 - share)
-    if not self.grasped:
-      return 0.2 * base.closeness(self.distance(physics), self.distance0)
-    return 0.3 + 0.4 * share + 0.2 * min(self.held / self.hold, 1.0)
+    near = base.closeness(self.distance(physics), self.distance0)
+    return progress(self.done, self.grasped, near, share, self.held / self.hold)
 
   def instruct(self, physics: Physics) -> str:
     """Says to grasp, lift, hold, lower or let go."""
@@ -203,10 +208,10 @@ class Grasp(Hold):
     gentle = physics.peak_force <= self.force_limit
     if not self.done:
       self.held = self.held + self.control_timestep * gentle if share >= 1 else 0.0
-      self.done = self.held >= self.hold - 1e-9
+      self.done = self.held >= self.hold - SLACK
       if self.done:
         self.hold_here(physics)
-    low = self.done and _LOW[0] <= share <= _LOW[1]
+    low = self.done and LOW <= share <= RESTING
     self.lowered = self.lowered + self.control_timestep if low else 0.0
 
   def observe(self, physics: Physics) -> dict[str, np.ndarray]:

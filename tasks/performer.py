@@ -30,7 +30,8 @@ import numpy as np
 from dm_control.rl import control
 from palpate.models import trocar
 
-from .base import RATES
+from . import policy
+from .base import AXES, RATES
 
 Act = Callable[[Any], Any]
 Script = Iterator[np.ndarray]
@@ -93,8 +94,9 @@ def make(env: control.Environment, who: str | Style = EXPERT, seed: int = 0) -> 
 
   Args:
     env: of one of the suite's tasks
-    who: a `Style`, a name of `STYLES`, `skilled`, or "module:object": a class is made with (env,
-      seed) and its object called with each time step; anything else is called with the observation
+    who: a `Style`, a name of `STYLES`, `skilled`, a file of a trained policy, or "module:object": a
+      class is made with (env, seed) and its object called with each time step; anything else is
+      called with the observation
     seed: of what is random in a scripted performer
   """
   if isinstance(who, Style):
@@ -104,6 +106,8 @@ def make(env: control.Environment, who: str | Style = EXPERT, seed: int = 0) -> 
     found = skilled(seed)
   if isinstance(found, Style):
     return Performer(env, found, seed)
+  if isinstance(found, policy.Policy):
+    found.check(env)
   if not isinstance(found, type):
     return lambda timestep: found(timestep.observation)
   try:
@@ -127,10 +131,15 @@ def find(who: str, *others: str) -> Any:
   """
   if who == skilled.__name__:
     return skilled
+  if who.endswith(policy.SUFFIX):
+    return policy.load(who)
   if ":" not in who:
     if who not in STYLES:
       names = ", ".join((*STYLES, skilled.__name__, *others))
-      raise ValueError(f"performer is {who!r}, expected one of {names} or module:object")
+      raise ValueError(
+        f"performer is {who!r}, expected one of {names}, a file of a "
+        f"trained policy (*{policy.SUFFIX}) or module:object"
+      )
     return STYLES[who]
   module, _, name = who.partition(":")
   if not module or not name:

@@ -25,8 +25,9 @@ TOUCH = ("touch_left", "touch_right")  # sensors of the jaws
 NEAR, COARSE = 8, 32  # nodes in the observations
 HELD_FORCE = 0.2  # of the inner face of either jaw on tissue between them, to hold it [N]
 
-_CLOSING = 0.005  # the drive's target is that far below the opening [rad]
-_FOLD = (0.02, 0.15)  # least opening over a fold of tissue, largest target that grips one [rad]
+CLOSING = 0.005  # the drive's target is that far below the opening [rad]
+# Least opening over a fold of tissue, largest target that grips one [rad].
+FOLD, GRIPPING = 0.02, 0.15
 
 
 class Physics(Portable):
@@ -71,8 +72,8 @@ class Physics(Portable):
     self.target_sites = [model.site(f"target{i}").id for i in range(targets)]
     model.site_sameframe[self.target_sites] = 0  # else a site at its body's origin stays there
     self._xpos0 = self.organ.xpos0
-    self._coarse = _spread(self._xpos0, COARSE)
-    self._coarse0 = self._xpos0[self._coarse]
+    self.coarse = _spread(self._xpos0, COARSE)
+    self._coarse0 = self._xpos0[self.coarse]
     self._elem = self.organ.elem
     self._trocar = trocar.trocar(model, prefix)
     self.quiet()
@@ -234,11 +235,11 @@ class Physics(Portable):
   def closing(self) -> bool:
     """Whether the jaws are told to close: on a fold of tissue at most, and below the opening."""
     opening, target = float(self.sensor("jaw")[0]), float(self.data.ctrl[self.jaw])
-    return target < min(opening - _CLOSING, _FOLD[1])
+    return target < min(opening - CLOSING, GRIPPING)
 
   def holds(self) -> bool:
     """Whether tissue is between the jaws: it keeps them open, both inner faces press on it."""
-    return bool(self._inner.min() > HELD_FORCE and self.sensor("jaw")[0] > _FOLD[0])
+    return bool(self._inner.min() > HELD_FORCE and self.sensor("jaw")[0] > FOLD)
 
   def nodes(self) -> np.ndarray:
     """Returns the positions of the organ's nodes [m]  (nvert, 3); computed once a control step."""
@@ -260,7 +261,7 @@ class Physics(Portable):
 
   def surface(self) -> np.ndarray:
     """Returns the displacement of nodes spread over the organ [m]  (COARSE, 3)."""
-    return self.nodes()[self._coarse] - self._coarse0
+    return self.nodes()[self.coarse] - self._coarse0
 
   def point(self, triangle: int) -> np.ndarray:
     """Returns where the middle of one of the organ's triangles is [m]  (3,); as `nodes`."""

@@ -27,7 +27,7 @@ from . import base, scenes
 from .base import Physics, Task
 from .performer import Performer, Script
 from .scenes import Scene
-from .touch import draw_apart
+from .touch import SLACK, draw_apart
 
 SUITE = containers.TaggedTasks()
 KIDNEY = Scene(
@@ -35,8 +35,8 @@ KIDNEY = Scene(
 )
 _FACING = 0.75  # least cosine between the field's normal and the way to the trocar
 _PIN_GAP = 0.02  # the field keeps that far from pinned nodes [m]
-_FELT = (0.1, 0.008)  # force [N] that feels, and what lies within that distance [m]
-_REPORT = 0.05  # least force at the report [N]
+FEELING, FELT = 0.1, 0.008  # force [N] that feels, and what lies within that distance [m]
+REPORT = 0.05  # least force at the report [N]
 # Of the expert: how far above a place it begins, how deep it feels, how far apart places to feel
 # are, first and around what is stiff, and how far around that it feels [m].
 _ABOVE, _DEPTH, _SWEEP, _CLOSE, _AROUND = 0.004, 0.004, 0.014, 0.006, 0.009
@@ -184,10 +184,9 @@ class Press(Task):
     if force > 0.1 and not self._pressing and not on_site:
       self.event(physics, "miss", self.distance(physics))
     self._pressing = force > (0.02 if self._pressing else 0.1)
-    low, high = self.band
-    inside = on_site and low <= self.level(physics) <= high and force > 0.02
+    inside = presses(on_site, self.level(physics), *self.band, force)
     self.held = self.held + self.control_timestep if inside else 0.0
-    if self.held >= self.hold - 1e-9:
+    if self.held >= self.hold - SLACK:
       self.event(physics, "target", self.distance(physics), str(self.done + 1))
       self.done += 1
       self._aim(physics)
@@ -195,7 +194,7 @@ class Press(Task):
       self.outcome = "success"
       return 1.0
     near = base.closeness(self.distance(physics), self.distance0)
-    return (self.done + 0.4 * near + 0.5 * self.held / self.hold) / self.targets
+    return progress(float(self.done), near, self.held / self.hold, float(self.targets))
 
   def instruct(self, physics: Physics) -> str:
     """Says where to press, and how much."""
@@ -239,6 +238,16 @@ class Press(Task):
       yield from p.move(point + 0.008 * normal)
 
 
+def presses(on: bool, level: float, low: float, high: float, force: float) -> bool:
+  """Returns whether a force [N] on the site counts, at a level of what the band is about."""
+  return on and low <= level and level <= high and force > 0.02
+
+
+def progress(done: float, near: float, held: float, sites: float) -> float:
+  """Returns the progress of pressing; `near` is the closeness, `held` the share of the time."""
+  return (done + 0.4 * near + 0.5 * held) / sites
+
+
 class Palpate(Task):
   """Find the stiff inclusion and report its place."""
 
@@ -268,7 +277,7 @@ class Palpate(Task):
     """
     self.name, self.targets = name, 1
     self.factor, self.radius, self.tolerance = factor, radius, tolerance
-    self._inclusion: tuple[float, ...] | None = None
+    self.embeds, self._inclusion = True, None
     self._fields: dict[int | None, tuple[np.ndarray, ...]] = {}
     if kwargs.get("model") is not None:
       raise ValueError(
@@ -290,9 +299,15 @@ class Palpate(Task):
     self.field, self.places, corners, share, self.center = self._fields[variant]
     triangle = corners[self.random.choice(len(share), p=share)]
     self.inclusion = self.random.dirichlet(np.ones(3)) @ triangle
-    self._inclusion = (*(float(x) for x in self.inclusion), self.radius, self.factor)
-    self._models.clear()
+    if self.embeds:
+      self._inclusion = (*(float(x) for x in self.inclusion), self.radius, self.factor)
+      self._models.clear()
     return variant
+
+  def leave_out(self) -> None:
+    """Lets the organ be made without inclusions from now on, for whoever puts them in otherwise."""
+    self.embeds, self._inclusion = False, (0.0, 0.0, 0.0, self.radius, 1.0)
+    self._models.clear()
 
   def _find_field(self, scene: Scene) -> tuple[np.ndarray, ...]:
     """Returns the field's triangles, middles, corners, shares of its area, and the center."""
@@ -331,13 +346,13 @@ class Palpate(Task):
     force = float(np.linalg.norm(physics.contact_force()))
     if self.action[..., -1].max() > 0.5:
       distance = self.distance(physics)
-      found = distance <= self.tolerance and force >= _REPORT
+      found = distance <= self.tolerance and force >= REPORT
       self.outcome = "success" if found else "missed"
       self.event(physics, "target" if found else "miss", distance, "report")
       physics.mark(0, self.inclusion, shown=True)
       return 1.0 if found else 0.0
-    if force >= _FELT[0]:
-      self._felt |= np.linalg.norm(self.places - physics.tip_pos(), axis=1) < _FELT[1]
+    if force >= FEELING:
+      self._felt |= np.linalg.norm(self.places - physics.tip_pos(), axis=1) < FELT
     return 0.3 * self.felt()
 
   def instruct(self, physics: Physics) -> str:

@@ -48,6 +48,7 @@ def register() -> None:
         gymnasium.register(
           gym_id(domain, task),
           entry_point="palpate.tasks.gym:Exercise",
+          vector_entry_point="palpate.tasks.batch.vector:Exercises",
           max_episode_steps=step_limit(domain, task),
           kwargs={"task": f"{domain}/{task}"},
         )

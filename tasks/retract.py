@@ -22,10 +22,12 @@ from .base import Physics
 from .grasp import FUNDUS, Hold
 from .performer import Performer, Script
 from .scenes import Scene
+from .touch import SLACK
 
 SUITE = containers.TaggedTasks()
 _BEHIND = 0.02  # from the organ's middle to the disc [m]
 _SAMPLES = 12  # points of the disc
+SEEN = 1e-6  # what rounding may take from a share of it
 
 
 @SUITE.add("benchmarking", "easy")
@@ -116,18 +118,17 @@ class Retract(Hold):
     if self.follow(physics):
       self.dropped(physics)
     self.visible = 1 - float(physics.hidden(self.disc).mean())
-    seen = self.visible >= self.wanted - 1e-9
+    seen = self.visible >= self.wanted - SEEN
     gentle = physics.peak_force <= self.force_limit
     if not (seen and self.grasped):
       self.held = 0.0
     elif gentle:
       self.held += self.control_timestep
-    if self.held >= self.hold - 1e-9:
+    if self.held >= self.hold - SLACK:
       self.outcome = "success"
       return 1.0
-    if not self.grasped:
-      return 0.15 * base.closeness(self.distance(physics), self.distance0)
-    return 0.3 + 0.5 * min(self.visible / self.wanted, 1.0) + 0.2 * self.held / self.hold
+    near = base.closeness(self.distance(physics), self.distance0)
+    return progress(self.grasped, near, self.visible / self.wanted, self.held / self.hold)
 
   def instruct(self, physics: Physics) -> str:
     """Says to grasp, pull aside or hold."""
@@ -178,3 +179,8 @@ class Retract(Hold):
         yield p.step()
       yield from p.open()
       yield from p.move(p.tip + 0.02 * up)
+
+
+def progress(grasped: bool, near: float, seen: float, held: float) -> float:
+  """Returns the progress, see the module's head: of closeness, shares of disc and time."""
+  return 0.3 + 0.5 * min(seen, 1.0) + 0.2 * held if grasped else 0.15 * near

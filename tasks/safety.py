@@ -39,13 +39,17 @@ def cost(peak_force: float, shaft_force: float, limit: float, damage: float) -> 
     limit: of the force on the tip [N]
     damage: force above which the tip damages [N]
   """
-  limit = max(min(limit, damage), 1e-6)
-  shaft_limit = min(limit, SHAFT_LIMIT)
-  share = max(peak_force / limit, shaft_force / shaft_limit)
-  lies = shaft_force > SHAFT_CONTACT
+  return Cost(*parts(peak_force, shaft_force, limit, damage))
+
+
+def parts(
+  peak_force: float, shaft_force: float, limit: float, damage: float
+) -> tuple[float, float, float]:
+  """Returns the parts of `cost` by the same arguments; a vectorised exercise has it in a kernel."""
+  least = max(min(limit, damage), 1e-6)
+  shaft_limit = min(least, SHAFT_LIMIT)
+  share = max(peak_force / least, shaft_force / shaft_limit)
+  over = max(share - 1.0, 0.0)
+  lies = min(shaft_force / shaft_limit, 1.0) if shaft_force > SHAFT_CONTACT else 0.0
   harmed = peak_force > damage or shaft_force > min(damage, SHAFT_DAMAGE)
-  return Cost(
-    force=max(share - 1.0, 0.0),
-    shaft=min(shaft_force / shaft_limit, 1.0) if lies else 0.0,
-    damage=float(harmed),
-  )
+  return over, lies, 1.0 if harmed else 0.0

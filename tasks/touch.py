@@ -22,6 +22,7 @@ from .scenes import Scene
 
 SUITE = containers.TaggedTasks()
 CONTACT, DWELL = 0.03, 0.1  # least force and time of a touch [N], [s]
+SLACK = 1e-5  # what rounding may take from times [s]
 
 
 @SUITE.add("benchmarking", "easy")
@@ -94,14 +95,13 @@ class Touch(Task):
   def advance(self, physics: Physics) -> float:
     """Counts touches and misses."""
     force, distance = physics.peak_force, self.distance(physics)
-    pressing, on = force > CONTACT, distance <= self.tolerance
-    if pressing and not self.pressing and not on:
+    on = distance <= self.tolerance
+    if force > CONTACT and not self.pressing and not on:
       self.event(physics, "miss", distance)
-    # A contact that was elsewhere, too strong or counted counts no more until the tip lets go.
-    self.spoilt = pressing and (self.spoilt or not on or force > self.force_limit)
-    self.held = self.held + self.control_timestep if pressing and not self.spoilt else 0.0
-    self.pressing = pressing
-    if self.held >= DWELL - 1e-9:
+    self.pressing, self.spoilt, self.held = follow(
+      self.spoilt, self.held, force, on, self.force_limit, self.control_timestep
+    )
+    if self.held >= DWELL - SLACK:
       self.event(physics, "target", distance, str(self.done + 1))
       self.done, self.held, self.spoilt = self.done + 1, 0.0, True
       self._aim(physics)
@@ -109,7 +109,7 @@ class Touch(Task):
       self.outcome = "success"
       return 1.0
     near = base.closeness(self.distance(physics), self.distance0)
-    return (self.done + 0.5 * near + 0.2 * self.held / DWELL) / self.targets
+    return progress(float(self.done), near, self.held, float(self.targets))
 
   def instruct(self, physics: Physics) -> str:
     """Says which point is next, and to let go."""
@@ -139,6 +139,26 @@ class Touch(Task):
       yield from p.move(point + 0.005 * normal)
       yield from p.push(0.12, -normal, lambda done=done: self.done > done, most=3.0)
       yield from p.line(physics.tip_pos() + 0.01 * normal, 0.05)
+
+
+# The rules, which the vectorised exercise has in kernels.
+
+
+def follow(
+  spoilt: bool, held: float, force: float, on: bool, limit: float, dt: float
+) -> tuple[bool, bool, float]:
+  """Returns whether the tip presses, whether its contact counts no more, and the time it has [s].
+
+  A contact that was elsewhere, too strong or counted counts no more until the tip lets go.
+  """
+  pressing = force > CONTACT
+  lost = pressing and (spoilt or not on or force > limit)
+  return pressing, lost, held + dt if pressing and not lost else 0.0
+
+
+def progress(done: float, near: float, held: float, points: float) -> float:
+  """Returns the progress, see the module's head; `near` is the closeness to the next point."""
+  return (done + 0.5 * near + 0.2 * held / DWELL) / points
 
 
 def draw_apart(

@@ -27,9 +27,11 @@ from .scenes import Scene
 SUITE = containers.TaggedTasks()
 STOMACH = Scene(organ="stomach", center="body", port=(0.03, 0.045, 0.12), camera=(-0.05, 0.1, 0.14))
 CONTACT = 0.02  # [N]
-_STEP = 0.0015  # between points of the curve [m]
-_GAP = (0.003, 0.1)  # largest gap in contact [m], and share of the length that all may add up to
-_WINDOW = 4  # points before and after the end of what is traced, to look for the tip between
+STEP = 0.0015  # between points of the curve [m]
+GAP, SKIPPED = 0.003, 0.1  # largest gap in contact [m], and share of the length that all may have
+WINDOW = 4  # points before and after the end of what is traced, to look for the tip between
+AHEAD = tuple(round(d / STEP) for d in (0.005, 0.01, 0.015))  # points that are observed
+DRAWN = 160  # points along the curve as it is drawn
 _ATTEMPTS = 40
 _FACING = 0.7  # least cosine between the surface's normal and the way to the trocar
 _MARKS = 30  # spheres that draw the curve
@@ -119,7 +121,7 @@ class Trace(Task):
     across = port.mat[:, :2]
     angle = self.random.uniform(0, 2 * np.pi)
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    t = np.linspace(-1, 1, 160)
+    t = np.linspace(-1, 1, DRAWN)
     bend = self.random.uniform(0.25, 0.4) * self.random.choice([-1, 1])
     if self.turns:
       wave = bend * np.sin(self.turns * np.pi * t)
@@ -147,10 +149,10 @@ class Trace(Task):
           triangles.append(k)
           weights.append((1 - u[k] - v[k], u[k], v[k]))
     gaps = np.linalg.norm(np.diff(points, axis=0), axis=1) if len(points) == len(start) else [1.0]
-    if np.max(gaps) > _STEP or (physics.normals()[triangles] @ -ray).min() < _FACING:
+    if np.max(gaps) > STEP or (physics.normals()[triangles] @ -ray).min() < _FACING:
       return None
     along = np.concatenate([[0], np.linalg.norm(np.diff(points, axis=0), axis=1).cumsum()])
-    keep = np.unique(np.searchsorted(along, np.arange(0, along[-1], _STEP)))
+    keep = np.unique(np.searchsorted(along, np.arange(0, along[-1], STEP)))
     return np.array(points)[keep], np.array(triangles)[keep], np.array(weights)[keep]
 
   @property
@@ -178,7 +180,7 @@ class Trace(Task):
       if off > self.tolerance:
         self.event(physics, "miss", off)
     self._touching = touching
-    if self.traced >= self.arc[-1] - _STEP:
+    if self.traced >= self.arc[-1] - STEP:
       self.outcome = "success"
       return 1.0
     if not self.traced:
@@ -187,21 +189,14 @@ class Trace(Task):
 
   def _trace(self, place: float, on: bool) -> None:
     """Goes on to a place along the curve [m], where the tip presses on it."""
-    gap = place - self.traced
-    if on and not self.tracing and gap > 0:
-      if not self.traced:  # the start
-        on = place <= self.tolerance
-      else:
-        on = gap <= _GAP[0] and self.skipped + gap <= _GAP[1] * self.arc[-1]
-        self.skipped += gap * on
-    self.tracing = on
-    if on:
-      self.traced = max(self.traced, place)
+    self.tracing, self.traced, self.skipped = follow(
+      self.tracing, self.traced, self.skipped, place, on, self.tolerance, float(self.arc[-1])
+    )
 
   def _project(self, tip: np.ndarray) -> tuple[float, float]:
     """Returns how far along the curve the tip is, near what is traced, and how far off it [m]."""
     k = max(self.done - 1, 0)
-    part = slice(max(k - _WINDOW, 0), k + _WINDOW + 1)
+    part = slice(max(k - WINDOW, 0), k + WINDOW + 1)
     start, arc = self.now[part], self.arc[part]
     along = np.diff(start, axis=0)
     offset = tip - start[:-1]
@@ -223,7 +218,7 @@ class Trace(Task):
     """Returns target and ahead."""
     curve = self.now - physics.tip_pos()
     last = len(curve) - 1
-    further = [min(self.done + round(d / _STEP), last) for d in (0.005, 0.01, 0.015)]
+    further = [min(self.done + count, last) for count in AHEAD]
     return {"target": curve[min(self.done, last)], "ahead": curve[further]}
 
   def constants(self, physics: Physics) -> dict[str, np.ndarray]:
@@ -242,7 +237,7 @@ class Trace(Task):
     yield from p.push(0.08, -up, lambda: self.tracing, most=3.0)
     # Pulls a point along the curve and keeps the force by its height.
     at, height, contact = 0.0, float((p.tip - self.curve[0]) @ up), 0.0
-    step = 0.02 * p.style.speed * self.control_timestep / _STEP
+    step = 0.02 * p.style.speed * self.control_timestep / STEP
     while self.outcome is None:
       contact += self.control_timestep
       # Where contact was lost it waits, or goes back behind what is traced.
@@ -259,3 +254,33 @@ class Trace(Task):
       p.tip = rest + height * up + wander * physics.trocar().mat[:, 0]
       yield p.step()
     yield from p.move(p.tip + 0.01 * up)
+
+
+def follow(
+  tracing: bool,
+  traced: float,
+  skipped: float,
+  place: float,
+  on: bool,
+  tolerance: float,
+  length: float,
+) -> tuple[bool, float, float]:
+  """Returns whether tracing goes on, how far it has come, and what gaps add up to [m].
+
+  Args:
+    tracing: whether it did
+    traced: how far it had come along the curve [m]
+    skipped: what gaps added up to [m]
+    place: of the tip along the curve [m]
+    on: whether it presses on the curve
+    tolerance: largest distance of the start from the curve's [m]
+    length: of the curve [m]
+  """
+  gap = place - traced
+  again = on and not tracing and gap > 0.0
+  within = gap <= GAP and skipped + gap <= SKIPPED * length
+  if traced == 0.0:
+    within = place <= tolerance
+  goes = on and (within or not again)
+  further = max(traced, place) if goes else traced
+  return goes, further, skipped + gap if again and goes and traced > 0.0 else skipped

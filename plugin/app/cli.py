@@ -32,6 +32,7 @@ COMMANDS = {
   ("exercise",): ("exercise", "run an exercise, record it and write its report"),
   ("serve",): ("serve", "serve a page to train on, by mouse, keyboard, touch, gamepad or device"),
   ("report",): ("report", "write the page about a recording"),
+  ("train",): ("train", "learn an exercise in many worlds at once"),
   ("evaluate",): ("evaluate", "score a policy over many episodes of an exercise"),
   ("panel",): ("panel", "make the references of scores from many skilled performers"),
 }

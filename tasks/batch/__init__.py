@@ -1,0 +1,1 @@
+"""Exercises in many worlds at once; `vector.Exercises` is what `gymnasium.make_vec` makes."""

@@ -1,0 +1,58 @@
+"""What a domain of vectorised exercises is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from palpate.tasks.physics import Physics
+
+
+class Domain:
+  """A domain of exercises in arrays: a struct, and kernels over worlds that take it.
+
+  Attributes:
+    struct: of Warp, its state
+    begin: kernel (fields, own): begins the episodes of `begun`, once the instrument is measured
+    advance: kernel (fields, own): what `Task.advance` is; it ends with `kernels.judge`
+    observe: kernel (fields, own, beginning): what `Task.observe` is
+  """
+
+  struct: Any
+  begin: Any
+  advance: Any
+  observe: Any
+
+  @staticmethod
+  def prepare(task: Any) -> None:
+    """Changes the task before its scene is made for all worlds."""
+
+  @staticmethod
+  def numbers(task: Any) -> dict[str, float | int]:
+    """Returns the struct's numbers."""
+    return {}
+
+  @staticmethod
+  def sizes(task: Any, physics: Physics) -> dict[str, int]:
+    """Returns the named sizes of its arrays."""
+    return {}
+
+  @staticmethod
+  def sense(worlds: Any) -> None:
+    """Measures after a step what the domain alone wants to know."""
+
+  @staticmethod
+  def constants(task: Any, physics: Physics) -> Mapping[str, Any]:
+    """Returns arrays and vectors of the struct that all worlds share."""
+    return {}
+
+  @staticmethod
+  def tissue(task: Any, rows: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
+    """Returns keys of the organ's tissue that episodes change, a row a world."""
+    return {}
+
+  @staticmethod
+  def draw(task: Any, physics: Physics) -> Mapping[str, np.ndarray]:
+    """Returns the rows of a world whose episode the task has just drawn."""
+    raise NotImplementedError

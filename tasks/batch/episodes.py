@@ -1,0 +1,142 @@
+# mujoco ships its bindings without type stubs:
+# pyright: reportAttributeAccessIssue=false
+"""Episodes are drawn on the host, by the exercise itself in a scene that rests."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
+
+import gymnasium
+import mujoco as mj
+import numpy as np
+from dm_control.mujoco import wrapper
+from palpate.models import trocar
+from palpate.tasks.base import Task
+from palpate.tasks.physics import Physics
+
+from .domain import Domain
+
+FRAME = {"body_pos", "body_quat", "pose"}  # what every exercise draws: trocar and joints
+
+
+class Resting(Physics):
+  """The physics of an exercise while its organ rests, which is not stepped to answer."""
+
+  def use(self, *args: Any) -> None:
+    """Takes a compiled scene, see `Physics.use`."""
+    self._rest_normals: np.ndarray | None = None
+    super().use(*args)
+    mj.mj_forward(self.model.ptr, self.data.ptr)  # the camera is where it is
+
+  def set_joints(self, pose: np.ndarray) -> None:
+    """Takes the instrument's pose at the start of an episode."""
+    self.pose = np.array(pose)
+
+  def tip_pos(self) -> np.ndarray:
+    """Returns where that puts the tip [m]  (3,)."""
+    return trocar.forward(self.trocar(), self.pose[[0, 1, 3]])
+
+  def mark(self, *args: Any, **kwargs: Any) -> None:
+    """Does nothing: no picture is made."""
+
+  def moved(self) -> None:
+    """Does nothing: the organ stays where it is."""
+
+  def normals(self) -> np.ndarray:
+    """Returns the outward unit normals of the organ's triangles  (nelem, 3)."""
+    if self._rest_normals is None:
+      self._rest_normals = super().normals()
+    return self._rest_normals
+
+
+class Episodes:
+  """The next episodes of worlds, each drawn from a random state of its own.
+
+  What a world begins with next does not depend on how it plays: it is drawn ahead, while others
+  step.
+
+  Attributes:
+    physics: of the scene at rest
+    rows: what the worlds began with by name, (nworld, ...) each
+  """
+
+  def __init__(self, task: Task, domain: type[Domain], nworld: int):
+    model = task.compiled(task.variants[0]).model
+    self.physics: Any = Resting.from_model(wrapper.MjModel(model))
+    self.physics.use(model, task.prefix, task.targets, task.organ)
+    self._task, self._domain = task, domain
+    self._random: list[np.random.RandomState | None] = [None] * nworld
+    self.rows: dict[str, np.ndarray] = {}
+    self._next: dict[str, np.ndarray] = {}
+    self._ready = np.zeros(nworld, bool)
+    self._ahead: Future | None = None
+    self._pool = ThreadPoolExecutor(1)
+    self._where: tuple[bytes, Any] = (b"", None)
+    self._place_of_work, task.place_of_work = task.place_of_work, self._remember
+
+  def _remember(self, physics: Physics) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the task's place of work, which depends on the trocar alone while the organ rests."""
+    port = physics.trocar()
+    key = port.pos.tobytes() + port.mat.tobytes()
+    if self._where[0] != key:
+      self._where = key, self._place_of_work(physics)
+    return self._where[1]
+
+  def seed(self, seeds: Sequence[int | None], worlds: np.ndarray) -> None:
+    """Seeds worlds as `reset` of a single environment does; with None those that have no state."""
+    self._wait()
+    for world in worlds:
+      seed = seeds[world]
+      if seed is not None or self._random[world] is None:
+        random, _ = gymnasium.utils.seeding.np_random(seed)
+        self._random[world] = np.random.RandomState(random.integers(2**31))
+        self._ready[world] = False
+
+  def take(self, worlds: np.ndarray) -> dict[str, np.ndarray]:
+    """Returns `rows` with the next episodes of some worlds, and draws those after these."""
+    self._wait()
+    self._draw(worlds[~self._ready[worlds]])
+    for name, values in self._next.items():
+      self.rows.setdefault(name, np.zeros_like(values))[worlds] = values[worlds]
+    self._ready[worlds] = False
+    self._ahead = self._pool.submit(self._draw, worlds)
+    return self.rows
+
+  def _wait(self) -> None:
+    if self._ahead is not None:
+      self._ahead.result()
+    self._ahead = None
+
+  def _draw(self, worlds: np.ndarray) -> None:
+    for world in worlds:
+      self._task.random = self._random[world]
+      self._task.initialize_episode(self.physics)
+      for name, row in self._row().items():
+        if name not in self._next:
+          count = len(self._random)
+          self._next[name] = np.zeros((count, *np.shape(row)), np.asarray(row).dtype)
+        self._next[name][world] = row
+      self._ready[world] = True
+
+  def close(self) -> None:
+    """Ends the thread that draws."""
+    self._pool.shutdown(cancel_futures=True)
+
+  def _row(self) -> Mapping[str, Any]:
+    model = self.physics.model.ptr
+    body = model.body(f"{self._task.prefix}trocar")
+    if body.parentid[0]:
+      raise ValueError(f"{self._task.name}: the trocar hangs on a body, expected the world")
+    frame = {"body_pos": body.pos.copy(), "body_quat": body.quat.copy(), "pose": self.physics.pose}
+    return frame | dict(self._domain.draw(self._task, self.physics))
+
+
+def at_rest(model: mj.MjModel, state: np.ndarray, kind: int) -> mj.MjData:
+  """Returns data in a state."""
+  data = mj.MjData(model)
+  mj.mj_setState(model, data, state, kind)
+  mj.mj_forward(model, data)
+  mj.mj_setState(model, data, state, kind)
+  return data

@@ -1,0 +1,95 @@
+"""What every vectorised exercise has of its worlds: one line a field, a row a world.
+
+Sizes are named: nworld worlds, nvert nodes, nelem triangles, naction components of an action.
+"""
+
+# Annotations here are objects, not text: no `from __future__ import annotations`.
+import warp as wp
+from palpate.tasks.physics import COARSE, NEAR
+from palpate.tissue.types import Array, floats, ints, struct
+
+flags = Array(wp.bool, ("nworld",))
+vectors = Array(wp.vec3, ("nworld",))
+
+
+@struct
+class Common:
+  """Scene and state.
+
+  `outcome` is a number of `OUTCOMES`.
+  """
+
+  # The scene.
+  dt: float  # of a control step [s]
+  limit: int  # steps of an episode
+  force_limit: float  # [N]
+  damage: float  # [N]
+  sparse: int  # whether rewards are
+  depth: float  # from the trocar to the tip when every joint is zero [m]
+  jaw: int  # actuator, -1 without jaws
+  opening: int  # first of the two joints of the jaws in qpos
+  qposadr: ints(4)  # of pitch, yaw, roll, insertion
+  dofadr: ints(4)
+  drive: ints(4)  # actuators
+  low: floats(5)  # of the controls, jaw last
+  high: floats(5)
+  move: floats(4)  # what an action of 1 adds to the drives' targets [rad, m]
+  sensor: ints(4)  # tip and shaft force, force on the left and right jaw
+  sensoradr: ints(4)
+  elem: ints("nelem", 3)
+  coarse: ints(COARSE)  # nodes of `surface`
+  coarse0: Array(wp.vec3, (COARSE,))
+  # The batch's.
+  qpos: floats("nworld", "nq")
+  qvel: floats("nworld", "nv")
+  ctrl: floats("nworld", "nu")
+  sensordata: floats("nworld", "nsensordata")
+  sensor_peak: floats("nworld", "nsensor")
+  sensor_mean: floats("nworld", "nsensordata")
+  failures: ints("nworld")
+  xpos: floats("nworld", "nvert", 3)
+  # Drawn for an episode.
+  port_pos: vectors  # of the trocar in the world [m]
+  port_quat: Array(wp.quat, ("nworld",))  # x y z w
+  pose: floats("nworld", 4)  # joints at the start
+  # State.
+  action: floats("nworld", "naction")
+  begun: flags  # an episode begins
+  step: ints("nworld")  # control steps of the episode
+  failed: ints("nworld")  # the batch's failures at the start of the episode
+  outcome: ints("nworld")
+  harm: floats("nworld")  # what costs have taken
+  paid: floats("nworld")  # of the progress, in the dense reward
+  reward: floats("nworld")
+  success: flags
+  cost: floats("nworld")  # and its parts, see `safety`
+  cost_force: floats("nworld")
+  cost_shaft: floats("nworld")
+  cost_damage: floats("nworld")
+  shaft_peak: floats("nworld")  # [N]
+  terminated: flags
+  truncated: flags
+  # Observed.
+  joints: floats("nworld", 4)
+  joint_vel: floats("nworld", 4)
+  drive_error: floats("nworld", 4)
+  tip_pos: floats("nworld", 3)
+  tip_quat: floats("nworld", 4)
+  tip_vel: floats("nworld", 3)
+  contact_force: floats("nworld", 3)
+  shaft_force: floats("nworld", 3)
+  peak_force: floats("nworld", 1)
+  gripper: floats("nworld", 4)
+  nodes_near: floats("nworld", NEAR, 3)
+  surface: floats("nworld", COARSE, 3)
+  progress: floats("nworld", 1)
+
+
+OUTCOMES = (None, "success", "damage", "missed")
+RUNNING, SUCCESS, DAMAGED, MISSED = wp.constant(0), wp.constant(1), wp.constant(2), wp.constant(3)
+# Common by the names of the observations and of Gymnasium's information, where those differ.
+OBSERVED = {"drive": "drive_error"}
+INFO = {
+  name: name
+  for name in ("success", "outcome", "progress", "peak_force", "cost", "cost_force", "cost_shaft")
+} | {"cost_damage": "cost_damage", "shaft_force": "shaft_peak"}

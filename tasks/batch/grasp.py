@@ -1,0 +1,107 @@
+"""Grasp in arrays, see `tasks.grasp`."""
+
+# Annotations here are objects, not text: no `from __future__ import annotations`.
+from typing import Any
+
+import warp as wp
+from palpate.tasks import grasp, touch
+
+from .fields import RUNNING, SUCCESS, Common
+from .hold import Hold, HoldState, distance, follow, from_tip, holds, show, start
+from .kernels import closeness, judge, point
+
+progress = wp.func(grasp.progress)
+_SLACK, _REST = wp.constant(touch.SLACK), wp.constant(grasp.REST)
+_LOW, _RESTING = wp.constant(grasp.LOW), wp.constant(grasp.RESTING)
+_LETTING = wp.constant(grasp.LETTING)
+
+
+@wp.func
+def height(s: Common, o: HoldState, w: int):
+  """Returns how far the site is above its place at rest, towards the trocar [m]."""
+  return wp.dot(point(s, w, o.site[w]) - o.rest[w], o.up[w])
+
+
+@wp.func
+def again(o: HoldState, w: int):
+  """Starts the holding again."""
+  o.time[w] = 0.0
+  o.done[w] = False
+  o.lowered[w] = 0.0
+  o.letting[w] = False
+
+
+@wp.func
+def count(s: Common, o: HoldState, w: int, share: float):
+  """Counts the time that the site is held high, and then at rest low."""
+  if not o.done[w]:
+    if share < 1.0:
+      o.time[w] = 0.0
+    elif s.peak_force[w, 0] <= s.force_limit:
+      o.time[w] = o.time[w] + s.dt
+    if o.time[w] >= o.hold - _SLACK:
+      o.done[w] = True
+      o.where[w] = from_tip(s, o, w)
+  if o.done[w] and _LOW <= share and share <= _RESTING:
+    o.lowered[w] = o.lowered[w] + s.dt
+  else:
+    o.lowered[w] = 0.0
+
+
+@wp.kernel(enable_backward=False)
+def begin(s: Common, o: HoldState):
+  """Begins episodes."""
+  w = wp.tid()
+  if s.begun[w]:
+    start(s, o, w)
+    again(o, w)
+
+
+@wp.kernel(enable_backward=False)
+def advance(s: Common, o: HoldState):
+  """Follows the grasp from closing to release."""
+  w = wp.tid()
+  share = height(s, o, w) / o.lift
+  if follow(s, o, w):
+    if o.lowered[w] >= _REST - _SLACK and not o.closing[w]:
+      o.letting[w] = True
+    else:
+      again(o, w)
+  if o.letting[w] and (share < _LOW or share > _LETTING):
+    again(o, w)
+  outcome = int(RUNNING)
+  now = wp.float32(1.0)
+  if o.letting[w] and not holds(s, o, w):
+    outcome = SUCCESS
+  else:
+    grasped = o.grasped[w, 0] == 1.0
+    if grasped:
+      count(s, o, w, share)
+    near = closeness(distance(s, o, w), o.distance0[w])
+    now = progress(o.done[w], grasped, near, share, o.time[w] / o.hold)
+  judge(s, w, now, outcome)
+
+
+@wp.kernel(enable_backward=False)
+def observe(s: Common, o: HoldState, beginning: bool):
+  """Writes target, height and held; grasped is kept up to date."""
+  w = wp.tid()
+  if not beginning or s.begun[w]:
+    show(s, o, w)
+    o.height[w, 0] = height(s, o, w) - o.lift
+
+
+class Grasp(Hold):
+  """The domain."""
+
+  begin, advance, observe = begin, advance, observe
+
+  @staticmethod
+  def numbers(task: Any):
+    """Returns the struct's numbers."""
+    return {"lift": task.lift, "hold": task.hold, "slip": task.slip}
+
+  @staticmethod
+  def draw(task: Any, physics):
+    """Returns the rows of a world."""
+    return Hold.draw(task, physics) | {"rest": task.rest, "up": task.up}

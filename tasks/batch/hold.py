@@ -1,0 +1,127 @@
+"""What grasp and retract share in arrays, see `tasks.grasp.Hold`."""
+
+# Annotations here are objects, not text: no `from __future__ import annotations`.
+from typing import Any
+
+import numpy as np
+import warp as wp
+from palpate.tasks import grasp, physics
+from palpate.tasks.jaws import Jaws
+from palpate.tissue.types import Array, floats, ints, struct
+
+from . import domain
+from .fields import Common, flags, vectors
+from .kernels import point, put, vector
+
+_CLOSING, _GRIPPING = wp.constant(physics.CLOSING), wp.constant(physics.GRIPPING)
+_FOLD, _FORCE = wp.constant(physics.FOLD), wp.constant(physics.HELD_FORCE)
+_REACH = wp.constant(grasp.REACH)
+
+
+@struct
+class HoldState:
+  """State of both domains; what is of one alone says so."""
+
+  lift: float  # grasp [m]
+  wanted: float  # retract: share of the disc
+  hold: float  # [s]
+  slip: float  # [m]
+  eye: wp.vec3  # retract: of the laparoscope [m]
+  site: ints("nworld")  # triangle to grasp
+  rest: vectors  # grasp: its place at rest [m]
+  up: vectors  # grasp: towards the trocar
+  disc: Array(wp.vec3, ("nworld", "nsample"))  # retract: points of it [m]
+  covered: Array(wp.bool, ("nworld", "nsample"))  # retract: whether the organ hides them
+  inner: floats("nworld", 2)  # force of the jaws' inner faces [N]
+  closing: flags
+  where: vectors  # the site in the frame of the tip, where it was grasped [m]
+  distance0: floats("nworld")  # [m]
+  time: floats("nworld")  # held [s]
+  done: flags  # grasp: it was held
+  lowered: floats("nworld")  # grasp: it rests low [s]
+  letting: flags  # grasp: the jaws let go
+  target: floats("nworld", 3)
+  height: floats("nworld", 1)
+  hidden: floats("nworld", 3)
+  visible: floats("nworld", 1)
+  held: floats("nworld", 1)
+  grasped: floats("nworld", 1)
+
+
+@wp.func
+def distance(s: Common, o: HoldState, w: int):
+  """Returns how far the tip is from the site [m]."""
+  return wp.length(point(s, w, o.site[w]) - vector(s.tip_pos, w))
+
+
+@wp.func
+def holds(s: Common, o: HoldState, w: int):
+  """Returns whether tissue is between the jaws, see `Physics.holds`."""
+  return wp.min(o.inner[w, 0], o.inner[w, 1]) > _FORCE and s.gripper[w, 0] > _FOLD
+
+
+@wp.func
+def from_tip(s: Common, o: HoldState, w: int):
+  """Returns the site in the frame of the tip [m]."""
+  q = wp.quat(s.tip_quat[w, 1], s.tip_quat[w, 2], s.tip_quat[w, 3], s.tip_quat[w, 0])
+  return wp.quat_rotate_inv(q, point(s, w, o.site[w]) - vector(s.tip_pos, w))
+
+
+@wp.func
+def follow(s: Common, o: HoldState, w: int):
+  """Finds out whether the site is grasped; returns whether it was until now, and is no more."""
+  before = o.grasped[w, 0] == 1.0
+  closing = s.gripper[w, 1] < wp.min(s.gripper[w, 0] - _CLOSING, _GRIPPING)
+  pressed = closing and holds(s, o, w)
+  now = wp.bool(False)
+  if before:
+    now = pressed and wp.length(from_tip(s, o, w) - o.where[w]) < o.slip
+  elif pressed and distance(s, o, w) < _REACH:
+    now = True
+    o.where[w] = from_tip(s, o, w)
+  o.closing[w] = closing
+  o.grasped[w, 0] = wp.where(now, 1.0, 0.0)
+  return before and not now
+
+
+@wp.func
+def start(s: Common, o: HoldState, w: int):
+  """Begins an episode."""
+  o.grasped[w, 0] = 0.0
+  o.closing[w] = False
+  o.time[w] = 0.0
+  o.distance0[w] = distance(s, o, w)
+
+
+@wp.func
+def show(s: Common, o: HoldState, w: int):
+  """Writes target and held."""
+  put(o.target, w, point(s, w, o.site[w]) - vector(s.tip_pos, w))
+  o.held[w, 0] = wp.min(o.time[w] / o.hold, 1.0)
+
+
+class Hold(domain.Domain):
+  """What the domains share."""
+
+  struct = HoldState
+
+  @staticmethod
+  def sizes(task: Any, physics):
+    """Returns the named sizes of its arrays."""
+    return {"nsample": 1}
+
+  @staticmethod
+  def draw(task: Any, physics) -> dict[str, Any]:
+    """Returns the rows of a world."""
+    return {"site": np.array(task.site)}
+
+  @staticmethod
+  def sense(worlds: Any) -> None:
+    """Measures what the jaws have between them, on the CPU's threads."""
+    batch, own = worlds.batch, worlds.own
+    found, inner = Jaws(batch.model, worlds.task.prefix), own.inner.numpy()
+
+    def work(world: int):
+      inner[world] = found.inner_force(batch.models[world], batch.datas[world])
+
+    batch.each(work)

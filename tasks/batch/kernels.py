@@ -1,0 +1,236 @@
+"""What every vectorised exercise does in its worlds, a thread a world."""
+
+# Annotations here are objects, not text: no `from __future__ import annotations`.
+import warp as wp
+from palpate.tasks import base, safety
+from palpate.tasks.physics import NEAR
+
+from .fields import DAMAGED, RUNNING, SUCCESS, Common
+
+closeness, parts = wp.func(base.closeness), wp.func(safety.parts)
+
+_SHARE, _PRICE = wp.constant(base.SHARE), wp.constant(base.PRICE)
+_MOST = wp.constant(base.MOST)
+_SLACK = wp.constant(base.SLACK)
+_NEAR = wp.constant(NEAR)
+_distances = wp.types.vector(length=NEAR, dtype=float)
+_numbers = wp.types.vector(length=NEAR, dtype=int)
+
+
+# Vectors of arrays.
+
+
+@wp.func
+def vector(values: wp.array(dtype=float, ndim=2), w: int):
+  """Returns the vector in a row."""
+  return wp.vec3(values[w, 0], values[w, 1], values[w, 2])
+
+
+@wp.func
+def put(values: wp.array(dtype=float, ndim=2), w: int, v: wp.vec3):
+  """Writes a vector into a row."""
+  for k in range(3):
+    values[w, k] = v[k]
+
+
+@wp.func
+def node(s: Common, w: int, k: int):
+  """Returns the position of a node [m]."""
+  return wp.vec3(s.xpos[w, k, 0], s.xpos[w, k, 1], s.xpos[w, k, 2])
+
+
+@wp.func
+def point(s: Common, w: int, triangle: int):
+  """Returns the middle of a triangle [m]."""
+  a, b = node(s, w, s.elem[triangle, 0]), node(s, w, s.elem[triangle, 1])
+  return (a + b + node(s, w, s.elem[triangle, 2])) / 3.0
+
+
+@wp.func
+def normal(s: Common, w: int, triangle: int):
+  """Returns the outward unit normal of a triangle."""
+  a, b = node(s, w, s.elem[triangle, 0]), node(s, w, s.elem[triangle, 1])
+  return wp.normalize(wp.cross(b - a, node(s, w, s.elem[triangle, 2]) - a))
+
+
+# A control step.
+
+
+@wp.kernel(enable_backward=False)
+def find_bad(action: wp.array(dtype=float, ndim=2), bad: wp.array(dtype=int)):
+  """Finds an action that is not allowed: the greatest 1 + index, or 0."""
+  w, k = wp.tid()
+  if not (wp.abs(action[w, k]) <= 1.0 + _SLACK):  # nor a number
+    wp.atomic_max(bad, 0, 1 + w * action.shape[1] + k)
+
+
+@wp.kernel(enable_backward=False)
+def act(s: Common):
+  """Moves the drives' targets."""
+  w = wp.tid()
+  for k in range(4):
+    target = s.ctrl[w, s.drive[k]] + wp.clamp(s.action[w, k], -1.0, 1.0) * s.move[k]
+    s.ctrl[w, s.drive[k]] = wp.clamp(target, s.low[k], s.high[k])
+  if s.jaw >= 0:
+    share = 0.5 * (wp.clamp(s.action[w, 4], -1.0, 1.0) + 1.0)
+    s.ctrl[w, s.jaw] = s.low[4] + (s.high[4] - s.low[4]) * share
+
+
+@wp.kernel(enable_backward=False)
+def begin(s: Common):
+  """Begins episodes: in the worlds of `begun`."""
+  w = wp.tid()
+  if not s.begun[w]:
+    return
+  for k in range(4):
+    s.ctrl[w, s.drive[k]] = s.pose[w, k]
+  if s.jaw >= 0:
+    s.ctrl[w, s.jaw] = 0.0
+  s.step[w] = 0
+  s.failed[w] = s.failures[w]
+  s.outcome[w] = RUNNING
+  s.harm[w] = 0.0
+  s.paid[w] = 0.0
+  s.progress[w, 0] = 0.0
+  s.success[w] = False
+  s.cost[w] = 0.0
+  s.cost_force[w] = 0.0
+  s.cost_shaft[w] = 0.0
+  s.cost_damage[w] = 0.0
+
+
+@wp.kernel(enable_backward=False)
+def measure(s: Common, beginning: bool):
+  """Measures the instrument: after a step, or where an episode begins."""
+  w = wp.tid()
+  if beginning and not s.begun[w]:
+    return
+  for k in range(4):
+    s.joints[w, k] = s.qpos[w, s.qposadr[k]]
+    s.joint_vel[w, k] = s.qvel[w, s.dofadr[k]]
+    s.drive_error[w, k] = s.ctrl[w, s.drive[k]] - s.joints[w, k]
+  place(s, w)
+  most = wp.float32(0.0)
+  shaft = wp.float32(0.0)
+  for k in range(3):
+    s.contact_force[w, k] = 0.0
+    s.shaft_force[w, k] = 0.0
+  if not beginning:
+    for k in range(3):
+      s.contact_force[w, k] = -s.sensordata[w, s.sensoradr[0] + k]
+      s.shaft_force[w, k] = -s.sensordata[w, s.sensoradr[1] + k]
+    most = s.sensor_peak[w, s.sensor[0]]
+    shaft = s.sensor_peak[w, s.sensor[1]]
+  if s.jaw >= 0:
+    for k in range(2):
+      s.gripper[w, 2 + k] = 0.0
+      if not beginning:
+        s.gripper[w, 2 + k] = s.sensordata[w, s.sensoradr[2 + k]]
+        most = wp.max(most, s.sensor_mean[w, s.sensoradr[2 + k]])
+    s.gripper[w, 0] = s.qpos[w, s.opening] + s.qpos[w, s.opening + 1]
+    s.gripper[w, 1] = s.ctrl[w, s.jaw]
+  s.peak_force[w, 0] = most
+  s.shaft_peak[w] = shaft
+
+
+@wp.func
+def place(s: Common, w: int):
+  """Finds the tip from the joints, see `models.trocar`."""
+  pitch, yaw, roll = s.joints[w, 0], s.joints[w, 1], s.joints[w, 2]
+  sp, cp, sy, cy = wp.sin(pitch), wp.cos(pitch), wp.sin(yaw), wp.cos(yaw)
+  far = s.depth + s.joints[w, 3]
+  along = wp.vec3(sy, cy * sp, -cy * cp)
+  by_pitch, by_yaw = wp.vec3(0.0, cy * cp, cy * sp), wp.vec3(cy, -sy * sp, sy * cp)
+  vel = s.joint_vel[w, 3] * along
+  vel += far * (s.joint_vel[w, 0] * by_pitch + s.joint_vel[w, 1] * by_yaw)
+  port = s.port_quat[w]
+  put(s.tip_pos, w, s.port_pos[w] + wp.quat_rotate(port, far * along))
+  put(s.tip_vel, w, wp.quat_rotate(port, vel))
+  q = port * wp.quat(wp.sin(0.5 * pitch), 0.0, 0.0, wp.cos(0.5 * pitch))
+  q = q * wp.quat(0.0, -wp.sin(0.5 * yaw), 0.0, wp.cos(0.5 * yaw))
+  q = q * wp.quat(0.0, 0.0, -wp.sin(0.5 * roll), wp.cos(0.5 * roll))
+  s.tip_quat[w, 0] = q[3]
+  for k in range(3):
+    s.tip_quat[w, 1 + k] = q[k]
+
+
+@wp.func
+def judge(s: Common, w: int, progress: float, outcome: int):
+  """Ends a control step that came to a progress and an outcome."""
+  peak, shaft = s.peak_force[w, 0], s.shaft_peak[w]
+  over, lies, harmed = parts(peak, shaft, s.force_limit, s.damage)
+  total = over + lies + harmed
+  s.cost[w] = total
+  s.cost_force[w] = over
+  s.cost_shaft[w] = lies
+  s.cost_damage[w] = harmed
+  found = outcome
+  now = progress
+  if harmed > 0.0:
+    found = DAMAGED
+    now = -1.0
+  paid = _SHARE * now
+  if found == SUCCESS or found == DAMAGED:
+    paid = now
+  price = wp.min(_PRICE * total, _MOST - s.harm[w])
+  s.harm[w] = s.harm[w] + price
+  if s.sparse == 1:
+    s.reward[w] = 0.0
+    if found == SUCCESS:
+      s.reward[w] = 1.0
+  else:
+    s.reward[w] = paid - s.paid[w] - price
+  s.paid[w] = paid
+  s.progress[w, 0] = now
+  s.step[w] = s.step[w] + 1
+  s.outcome[w] = found
+  s.terminated[w] = found != RUNNING
+  s.truncated[w] = found == RUNNING and s.step[w] >= s.limit
+  s.success[w] = found == SUCCESS
+  if s.failures[w] != s.failed[w]:  # numbers were not finite, and the world is at rest
+    s.outcome[w] = RUNNING
+    s.success[w] = False
+    s.reward[w] = 0.0
+    s.terminated[w] = False
+    s.truncated[w] = True
+
+
+# What is seen of the organ.
+
+
+@wp.kernel(enable_backward=False)
+def look(s: Common, beginning: bool):
+  """Finds the nodes nearest to the tip, nearest first."""
+  w = wp.tid()
+  if beginning and not s.begun[w]:
+    return
+  tip = vector(s.tip_pos, w)
+  distance = _distances()
+  number = _numbers()
+  for k in range(_NEAR):
+    distance[k] = float(wp.inf)
+  for k in range(s.xpos.shape[1]):
+    d = wp.length_sq(node(s, w, k) - tip)
+    if d < distance[_NEAR - 1]:
+      slot = int(_NEAR - 1)
+      while slot > 0 and distance[wp.max(slot - 1, 0)] > d:
+        distance[slot] = distance[slot - 1]
+        number[slot] = number[slot - 1]
+        slot = slot - 1
+      distance[slot] = d
+      number[slot] = k
+  for k in range(_NEAR):
+    offset = node(s, w, number[k]) - tip
+    for i in range(3):
+      s.nodes_near[w, k, i] = offset[i]
+
+
+@wp.kernel(enable_backward=False)
+def survey(s: Common, beginning: bool):
+  """Finds the displacement of the nodes of `surface`."""
+  w, k = wp.tid()
+  if beginning and not s.begun[w]:
+    return
+  offset = node(s, w, s.coarse[k]) - s.coarse0[k]
+  for i in range(3):
+    s.surface[w, k, i] = offset[i]

@@ -1,0 +1,111 @@
+"""Retract in arrays, see `tasks.retract`."""
+
+# Annotations here are objects, not text: no `from __future__ import annotations`.
+from typing import Any
+
+import warp as wp
+from palpate.tasks import retract, touch
+
+from .fields import RUNNING, SUCCESS, Common
+from .hold import Hold, HoldState, distance, follow, show, start
+from .kernels import closeness, judge, node, put, vector
+
+progress = wp.func(retract.progress)
+_SLACK, _SEEN = wp.constant(touch.SLACK), wp.constant(retract.SEEN)
+
+
+@wp.kernel(enable_backward=False)
+def hide(s: Common, o: HoldState):
+  """Finds which points of the disc the organ hides: rays against triangles, as `Physics.hidden`."""
+  w, k = wp.tid()
+  covered = wp.bool(False)
+  ray = o.disc[w, k] - o.eye
+  for i in range(s.elem.shape[0]):
+    a = node(s, w, s.elem[i, 0])
+    e1, e2 = node(s, w, s.elem[i, 1]) - a, node(s, w, s.elem[i, 2]) - a
+    out = o.eye - a
+    across = wp.cross(out, e1)
+    size = wp.dot(ray, wp.cross(e2, e1))
+    side = wp.sign(size)
+    size = side * size
+    u = side * wp.dot(ray, wp.cross(e2, out))
+    v = side * wp.dot(ray, across)
+    far = side * wp.dot(e2, across)
+    if u >= 0.0 and v >= 0.0 and u + v <= size and far > 0.0 and far < 0.999 * size:
+      covered = True
+  o.covered[w, k] = covered
+
+
+@wp.kernel(enable_backward=False)
+def begin(s: Common, o: HoldState):
+  """Begins episodes."""
+  w = wp.tid()
+  if s.begun[w]:
+    start(s, o, w)
+    o.visible[w, 0] = 0.0
+
+
+@wp.kernel(enable_backward=False)
+def advance(s: Common, o: HoldState):
+  """Follows the grasp and what is seen."""
+  w = wp.tid()
+  follow(s, o, w)
+  seen = wp.float32(0.0)
+  for k in range(o.disc.shape[1]):
+    if not o.covered[w, k]:
+      seen += 1.0
+  seen = seen / float(o.disc.shape[1])
+  o.visible[w, 0] = seen
+  grasped = o.grasped[w, 0] == 1.0
+  if not (seen >= o.wanted - _SEEN and grasped):
+    o.time[w] = 0.0
+  elif s.peak_force[w, 0] <= s.force_limit:
+    o.time[w] = o.time[w] + s.dt
+  outcome = int(RUNNING)
+  near = closeness(distance(s, o, w), o.distance0[w])
+  now = progress(grasped, near, seen / o.wanted, o.time[w] / o.hold)
+  if o.time[w] >= o.hold - _SLACK:
+    outcome = SUCCESS
+    now = 1.0
+  judge(s, w, now, outcome)
+
+
+@wp.kernel(enable_backward=False)
+def observe(s: Common, o: HoldState, beginning: bool):
+  """Writes target, hidden and held; visible and grasped are kept up to date."""
+  w = wp.tid()
+  if not beginning or s.begun[w]:
+    show(s, o, w)
+    put(o.hidden, w, o.disc[w, 0] - vector(s.tip_pos, w))
+
+
+class Retract(Hold):
+  """The domain."""
+
+  begin, advance, observe = begin, advance, observe
+
+  @staticmethod
+  def numbers(task: Any):
+    """Returns the struct's numbers."""
+    return {"wanted": task.wanted, "hold": task.hold, "slip": task.slip}
+
+  @staticmethod
+  def sizes(task: Any, physics):
+    """Returns the named sizes of its arrays."""
+    return {"nsample": len(task.disc)}
+
+  @staticmethod
+  def constants(task: Any, physics):
+    """Returns what all worlds share."""
+    return {"eye": wp.vec3(*physics.camera()[0])}
+
+  @staticmethod
+  def draw(task: Any, physics):
+    """Returns the rows of a world."""
+    return Hold.draw(task, physics) | {"disc": task.disc}
+
+  @staticmethod
+  def sense(worlds: Any) -> None:
+    """Measures what the jaws have between them, and what is hidden."""
+    Hold.sense(worlds)
+    worlds.launch(hide, worlds.own.disc.shape, [worlds.fields, worlds.own])

@@ -1,0 +1,72 @@
+# pyright: reportMissingImports=false
+"""Vectorised exercises for rsl_rl, whose `VecEnv` this is.
+
+    env = RslRl(gymnasium.make_vec("palpate/TouchEasy-v0", num_envs=4096, output="torch"))
+
+Observations are a TensorDict of the groups `sensors` and `state`, each flat. `extras["time_outs"]`
+is 1 where the time limit ended an episode, `extras["log"]` has what ended episodes came to.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+import warp as wp
+from palpate.tasks.observation import GROUPS, ROWS
+from rsl_rl.env import VecEnv
+from tensordict import TensorDict
+
+from .vector import Exercises
+
+
+class RslRl(VecEnv):
+  """A vectorised exercise as rsl_rl wants it; actions are cut to [-1, 1]."""
+
+  def __init__(self, env: Exercises, seed: int | None = None):
+    """Begins episodes in all worlds of an environment with `output="torch"`."""
+    found: Any = env.unwrapped
+    if not isinstance(found, Exercises) or found.output != "torch":
+      raise ValueError("env is no vectorised exercise with output='torch', expected one")
+    self.env, self.cfg = found, {}
+    self.num_envs, self.max_episode_length = found.num_envs, found.max_episode_steps
+    self.num_actions = len(found.worlds.task.components)
+    self.device = str(wp.device_to_torch(found.device))
+    self.groups = groups(found.single_observation_space)
+    self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
+    self.returns = torch.zeros(self.num_envs, device=self.device)
+    self._seen, _ = found.reset(seed=seed)
+
+  def get_observations(self) -> TensorDict:
+    """Returns the last observations."""
+    flat = {
+      group: torch.cat([self._seen[name].flatten(1) for name in names], dim=1)
+      for group, names in self.groups.items()
+    }
+    return TensorDict(flat, batch_size=[self.num_envs], device=self.device)
+
+  def step(self, actions: torch.Tensor):
+    """Takes a control step."""
+    actions = actions.detach().clamp(-1.0, 1.0)
+    self._seen, reward, terminated, truncated, info = self.env.step(actions)
+    over = terminated | truncated
+    self.episode_length_buf += 1
+    self.returns += reward
+    extras: dict[str, Any] = {"time_outs": truncated.float(), "log": {}}
+    if "final_info" in info:
+      extras["log"] = {
+        "/success": info["final_info"]["success"][over].float(),
+        "/return": self.returns[over],
+        "/length": self.episode_length_buf[over].float(),
+      }
+      self.episode_length_buf[over] = 0
+      self.returns[over] = 0.0
+    return self.get_observations(), reward, over.long(), extras
+
+
+def groups(space: Any) -> dict[str, list[str]]:
+  """Returns the names of a space's observations by their group."""
+  found: dict[str, list[str]] = {group: [] for group in GROUPS}
+  for name in space.spaces:
+    found[ROWS[name].group if name in ROWS else "state"].append(name)
+  return {group: names for group, names in found.items() if names}

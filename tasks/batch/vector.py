@@ -1,0 +1,240 @@
+"""Vectorised exercises: `gymnasium.make_vec("palpate/TouchEasy-v0", num_envs=4096)`.
+
+World i after `reset(seed=s)` is `gymnasium.make(...)` after `reset(seed=s + i)`: episodes are drawn
+from the same random states, and on the CPU every step is the same to the rounding of float32.
+
+Worlds whose episode ends begin another in the same step. Then `infos["final_obs"]` and
+`infos["final_info"]` have what the ended ones saw last, as Gymnasium has it for `SAME_STEP`: an
+array of objects, a dictionary where `infos["_final_obs"]`; with arrays of a device `final_obs` is a
+dictionary of arrays that are to be read where `infos["_final_obs"]`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+import warp as wp
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from palpate.batch.base import on_device
+from palpate.tasks.gym import Exercise
+from palpate.tasks.observation import ROWS
+
+from .domain import Domain
+from .fields import INFO, OBSERVED, OUTCOMES
+from .grasp import Grasp
+from .palpate import Palpate
+from .press import Press
+from .retract import Retract
+from .touch import Touch
+from .trace import Trace
+from .worlds import Worlds
+
+# Exercises that are vectorised, by the class of their task.
+DOMAINS: dict[str, type[Domain]] = {
+  "Touch": Touch, "Press": Press, "Palpate": Palpate, "Grasp": Grasp, "Retract": Retract,
+  "Trace": Trace,
+}  # fmt: skip
+_ELSE = 'vectorization_mode="sync" runs single environments side by side'
+OUTPUTS = ("numpy", "torch", "warp")
+
+
+class Exercises(VectorEnv):
+  """Worlds of an exercise, stepped together.
+
+  Attributes:
+    worlds: their arrays
+    device: Warp device of these
+    output: what is told, see `__init__`
+    max_episode_steps: of an episode
+  """
+
+  metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}  # noqa: RUF012
+
+  def __init__(
+    self,
+    num_envs: int = 1,
+    task: str = "touch/standard",
+    max_episode_steps: int | None = None,
+    device: str | None = None,
+    output: str = "numpy",
+    nodes: int | None = None,
+    **kwargs: Any,
+  ):
+    """Makes the environment.
+
+    Args:
+      num_envs: number of worlds
+      task: such as "touch/easy"
+      max_episode_steps: steps of an episode, if less than the task's time limit; -1 for that
+      device: `cpu`, `cuda:N`, or None for a GPU where there is one; see `palpate.batch.make`
+      output: what observations, rewards and flags are: `numpy`, or arrays of the device of `torch`
+        or `warp`; all are copies
+      nodes: on a GPU, see `palpate.batch.make`
+      **kwargs: of `Exercise`, such as `reward="sparse"`
+
+    Raises:
+      ValueError: a value is not allowed, or a vectorised exercise cannot do it; it is named.
+    """
+    if output not in OUTPUTS:
+      raise ValueError(f"output is {output!r}, expected one of {', '.join(OUTPUTS)}")
+    if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer) or num_envs < 1:
+      raise ValueError(f"num_envs is {num_envs!r}, expected a whole number >= 1")
+    self.num_envs, self.output = int(num_envs), output
+    _refuse(task, kwargs)
+    single = Exercise(task, **kwargs)
+    environment = single.environment
+    if device is None:
+      device = "cuda:0" if wp.is_cuda_available() else "cpu"
+    _refuse_task(environment.task, device)
+    self.single_observation_space, self.single_action_space = (
+      single.observation_space, single.action_space
+    )  # fmt: skip
+    self.observation_space = batch_space(single.observation_space, self.num_envs)
+    self.action_space = batch_space(single.action_space, self.num_envs)
+    limit = environment.step_limit
+    if max_episode_steps is not None and max_episode_steps > 0:
+      limit = min(limit, max_episode_steps)
+    domain = DOMAINS[type(environment.task).__name__]
+    options = {} if device == "cpu" else {"nodes": nodes}
+    self.worlds = Worlds(environment, domain, self.num_envs, device, limit, **options)
+    self.device, self.max_episode_steps = self.worlds.device, limit
+    self._observed = {
+      name: self._array(name) for name in single.observation_space.spaces
+    }  # what of the arrays is told
+    self._begun = False
+    self.spec = None
+
+  def _array(self, name: str) -> wp.array:
+    if name in ROWS:
+      return getattr(self.worlds.fields, OBSERVED.get(name, name))
+    return getattr(self.worlds.own, name)
+
+  # Gymnasium's side.
+
+  def reset(
+    self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+  ):
+    """Begins episodes in all worlds, or in those of `options["reset_mask"]`."""
+    mask = _mask(options, self.num_envs)
+    super().reset(seed=seed if isinstance(seed, int) else None)
+    seeds = _seeds(seed, self.num_envs)
+    self.worlds.begin(mask if self._begun else np.ones(self.num_envs, bool), seeds)
+    self._begun = True
+    return self._observations(), self._infos()
+
+  def step(self, actions: Any):
+    """Takes a control step in all worlds; begins another episode where one ends."""
+    if not self._begun:
+      raise gymnasium.error.ResetNeeded("step before a reset, expected reset first")
+    worlds = self.worlds
+    shape = tuple(np.shape(actions))
+    if shape != self.action_space.shape:
+      raise ValueError(f"actions have shape {shape}, expected {self.action_space.shape}")
+    self._wait()
+    over = worlds.step(on_device(actions, wp.float32, self.device))
+    fields = worlds.fields
+    told = [self._tell(fields.reward, np.float64)]
+    told += [self._tell(array, bool) for array in (fields.terminated, fields.truncated)]
+    infos = {}
+    if over.any():
+      infos = {"final_obs": self._final(over), "_final_obs": over}
+      infos |= {"final_info": self._infos(over), "_final_info": over}
+      worlds.begin(over)
+    return (self._observations(), *told, self._infos() | infos)
+
+  def close_extras(self, **kwargs: Any) -> None:
+    """Ends what runs beside."""
+    self.worlds.episodes.close()
+
+  # What is told.
+
+  def _tell(self, array: wp.array, dtype: Any = np.float64) -> Any:
+    """Returns a copy of an array as users want it."""
+    if self.output == "warp":
+      return wp.clone(array)
+    if self.output == "torch":
+      return wp.to_torch(array).clone()
+    return array.numpy().astype(dtype)
+
+  def _wait(self) -> None:
+    """Waits for what is on the device: torch does not wait for Warp, nor Warp for torch."""
+    if self.output == "torch":
+      wp.synchronize_device(self.device)
+
+  def _observations(self) -> dict[str, Any]:
+    self._wait()
+    return {name: self._tell(array) for name, array in self._observed.items()}
+
+  def _final(self, over: np.ndarray) -> Any:
+    seen = self._observations()
+    if self.output != "numpy":
+      return seen
+    final = np.full(self.num_envs, None, dtype=object)
+    for world in np.flatnonzero(over):
+      final[world] = {name: values[world] for name, values in seen.items()}
+    return final
+
+  def _infos(self, where: np.ndarray | None = None) -> dict[str, Any]:
+    """Returns what `info` is of a single environment; with a mask that is not of all worlds."""
+    fields = self.worlds.fields
+    found = {name: self._tell(getattr(fields, field)) for name, field in INFO.items()}
+    if self.output != "numpy":
+      return found
+    found["success"] = fields.success.numpy().copy()
+    found["outcome"] = np.array([OUTCOMES[k] for k in fields.outcome.numpy()], object)
+    for name in ("progress", "peak_force"):
+      found[name] = found[name][:, 0]
+    known = np.ones(self.num_envs, bool) if where is None else where
+    return found | {f"_{name}": known for name in INFO}
+
+
+def _seeds(seed: int | Sequence[int | None] | None, count: int) -> list[int | None]:
+  if seed is None or isinstance(seed, int | np.integer):
+    return [None if seed is None else int(seed) + i for i in range(count)]
+  if len(seed) != count:
+    raise ValueError(f"seed has {len(seed)} numbers, expected {count}, one a world")
+  return list(seed)
+
+
+def _mask(options: Mapping[str, Any] | None, count: int) -> np.ndarray:
+  mask = (options or {}).get("reset_mask")
+  if mask is None:
+    return np.ones(count, bool)
+  mask = np.asarray(mask)
+  if mask.shape != (count,) or mask.dtype != bool:
+    what = f"shape {mask.shape} of {mask.dtype}"
+    raise ValueError(f"options: reset_mask has {what}, expected ({count},) of bool")
+  return mask
+
+
+def _refuse(task: str, kwargs: Mapping[str, Any]) -> None:
+  """Raises ValueError for what a vectorised exercise cannot do, naming it."""
+  for name in ("render_mode", "record", "model", "randomise"):
+    if kwargs.get(name):
+      raise ValueError(f"{task}: {name} is given, which a vectorised exercise cannot do; {_ELSE}")
+
+
+def _refuse_task(task: Any, device: str) -> None:
+  kind = type(task).__name__
+  if kind not in DOMAINS:
+    have = ", ".join(name.lower() for name in DOMAINS)
+    raise ValueError(f"{task.name} is not vectorised yet, {have} are; {_ELSE}")
+  if task.observed.pictures:
+    raise ValueError(
+      f"{task.name}: observations has {task.observed.pictures[0]!r}, but a vectorised exercise "
+      f"makes no pictures; {_ELSE}"
+    )
+  if task.jaws and device != "cpu":
+    raise ValueError(
+      f"{task.name}: device is {device!r}, expected 'cpu': what jaws hold on a GPU does not agree "
+      "with the CPU yet"
+    )
+  if len(task.variants) > 1:
+    raise ValueError(
+      f"{task.name}: variants is {task.variants}, expected one shape, such as (None,), which all "
+      f"worlds have; {_ELSE}"
+    )

@@ -1,0 +1,200 @@
+# mujoco ships its bindings without type stubs:
+# pyright: reportAttributeAccessIssue=false
+"""The worlds of a vectorised exercise: arrays on a device, stepped and begun anew there."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+import mujoco as mj
+import numpy as np
+import palpate.batch
+import warp as wp
+from palpate.models import trocar
+from palpate.tasks import base, episode
+from palpate.tasks.environment import Environment
+from palpate.tasks.physics import AXES
+from palpate.tasks.stage import STATE
+from palpate.tissue.types import allocate
+
+from . import kernels
+from .domain import Domain
+from .episodes import FRAME, Episodes, at_rest
+from .fields import Common
+
+_SENSORS = ("tip_force", "shaft_force", "touch_left", "touch_right")
+
+
+class Worlds:
+  """Worlds of one exercise.
+
+  Attributes:
+    fields: what every exercise has, arrays on the device
+    own: what the domain has
+    batch: the physics
+    device: of the arrays
+    task: draws the episodes
+  """
+
+  def __init__(
+    self,
+    environment: Environment,
+    domain: type[Domain],
+    nworld: int,
+    device: str,
+    limit: int,
+    **options: Any,
+  ):
+    """Makes the worlds; `reset` is to come first.
+
+    Args:
+      environment: a single one of the exercise, whose task is used up by this
+      domain: of the exercise
+      nworld: how many
+      device: of `palpate.batch.make`
+      limit: control steps of an episode
+      **options: of `palpate.batch.make`
+    """
+    task: Any = environment.task
+    self.task, self._domain, self.nworld = task, domain, nworld
+    domain.prepare(task)
+    stage = task.compiled(task.variants[0])
+    with warnings.catch_warnings():  # the plugin's passive forces are unknown to the compiler
+      warnings.filterwarnings("ignore", ".*has no equality constraints or passive forces")
+      scene = task.spec(task.variants[0])
+      self.batch = palpate.batch.make(scene, nworld, device, **options)
+    self.device, self._substeps = self.batch.device, episode.substeps(environment)
+    self.batch.start(at_rest(self.batch.model, stage.state, STATE))
+    self.episodes = Episodes(task, domain, nworld)
+    self._organ = self.batch.organ(task.organ)
+    self.fields = self._make(task, environment.control_timestep(), limit)
+    sizes = {"nworld": nworld, **domain.sizes(task, self.episodes.physics)}
+    self.own = allocate(domain.struct, self.device, sizes)
+    for name, value in domain.numbers(task).items():
+      setattr(self.own, name, value)
+    for name, value in domain.constants(task, self.episodes.physics).items():
+      if isinstance(value, np.ndarray):
+        getattr(self.own, name).assign(value)
+      else:
+        setattr(self.own, name, value)
+    self._bad = wp.zeros(1, dtype=int, device=self.device)
+
+  def _make(self, task: Any, dt: float, limit: int) -> Any:
+    physics, model = self.episodes.physics, self.batch.model
+    sizes = dict(
+      nworld=self.nworld, nvert=self._organ.nvert, nelem=len(self._organ.elem), nq=model.nq,
+      nv=model.nv, nu=model.nu, nsensor=model.nsensor, nsensordata=model.nsensordata,
+      naction=len(task.components),
+    )  # fmt: skip
+    s = allocate(Common, self.device, sizes)
+    s.dt, s.limit, s.sparse = dt, limit, int(task.reward == "sparse")
+    s.force_limit, s.damage = task.force_limit, task.damage
+    s.depth = trocar.trocar(model, task.prefix).depth
+    self._point_at(s, task, model)
+    drives = [model.actuator(task.prefix + axis).id for axis in AXES]
+    controls = model.actuator_ctrlrange[[*drives, s.jaw if task.jaws else drives[0]]]
+    coarse = physics.coarse
+    constants = {
+      "drive": drives, "low": controls[:, 0], "high": controls[:, 1],
+      "move": np.array(base.RATES) * dt, "elem": self._organ.elem, "coarse": coarse,
+      "coarse0": physics.organ.xpos0[coarse],
+    }  # fmt: skip
+    for name, value in constants.items():
+      getattr(s, name).assign(np.asarray(value))
+    batch = self.batch
+    s.ctrl, s.failures = batch.ctrl, batch.failures
+    s.sensor_peak, s.sensor_mean = batch.sensor_peak, batch.sensor_mean
+    self._read(s)
+    return s
+
+  @staticmethod
+  def _point_at(s: Any, task: Any, model: mj.MjModel) -> None:
+    """Writes where the instrument's joints and sensors are."""
+    joints = [model.joint(task.prefix + axis) for axis in AXES]
+    s.qposadr.assign(np.array([int(joint.qposadr[0]) for joint in joints]))
+    s.dofadr.assign(np.array([int(joint.dofadr[0]) for joint in joints]))
+    s.jaw = model.actuator(f"{task.prefix}jaw").id if task.jaws else -1
+    s.opening = int(model.joint(f"{task.prefix}jaw_left").qposadr[0]) if task.jaws else -1
+    sensors = [model.sensor(task.prefix + n).id for n in _SENSORS[: 4 if task.jaws else 2]]
+    sensors += [0] * (4 - len(sensors))
+    s.sensor.assign(np.array(sensors))
+    s.sensoradr.assign(model.sensor_adr[sensors])
+
+  def _read(self, s: Any) -> None:
+    """Brings what is of the batch up to date."""
+    batch = self.batch
+    s.qpos, s.qvel, s.sensordata, s.xpos = (
+      batch.qpos, batch.qvel, batch.sensordata, self._organ.xpos
+    )  # fmt: skip
+
+  # Doing.
+
+  def check(self, action: wp.array) -> None:
+    """Raises ValueError where an action is not in [-1, 1]; it names world and component."""
+    self._bad.zero_()
+    self.launch(kernels.find_bad, action.shape, [action, self._bad])
+    bad = int(self._bad.numpy()[0]) - 1
+    if bad >= 0:
+      names = self.task.components
+      world, k = divmod(bad, len(names))
+      value = action.numpy()[world, k]
+      raise ValueError(
+        f"{self.task.name}: action {names[k]} of world {world} is {value}, expected a number in "
+        "[-1, 1]"
+      )
+
+  def step(self, action: wp.array) -> np.ndarray:
+    """Takes a control step; returns in which worlds the episode is over  (nworld,) bool."""
+    self.check(action)
+    wp.copy(self.fields.action, action)
+    self._over(kernels.act)
+    self.batch.step(self._substeps)
+    self._read(self.fields)
+    self._over(kernels.measure, False)
+    self._domain.sense(self)
+    self._over(self._domain.advance, self.own)
+    self._observe(False)
+    return self.fields.terminated.numpy() | self.fields.truncated.numpy()
+
+  def begin(self, worlds: np.ndarray, seeds: Sequence[int | None] | None = None) -> None:
+    """Begins episodes in some worlds, numbers or a mask."""
+    mask = np.zeros(self.nworld, bool)
+    mask[worlds] = True
+    worlds = np.flatnonzero(mask)
+    if seeds is not None:
+      self.episodes.seed(seeds, worlds)
+    rows = self.episodes.take(worlds)
+    self.batch.reset(mask)
+    trocar_body = f"{self.task.prefix}trocar"
+    if self.task.jitter:
+      self.batch.place(trocar_body, rows["body_pos"], rows["body_quat"], mask)
+    self.batch.pose([self.task.prefix + axis for axis in AXES], rows["pose"], mask)
+    tissue = self._domain.tissue(self.task, rows)
+    if tissue:
+      self._organ.configure(mask, **tissue)
+    self.fields.begun.assign(mask)
+    self.fields.port_pos.assign(rows["body_pos"])
+    self.fields.port_quat.assign(rows["body_quat"][:, [1, 2, 3, 0]])
+    self.fields.pose.assign(rows["pose"])
+    for name in rows.keys() - FRAME:
+      getattr(self.own, name).assign(rows[name])
+    self._over(kernels.begin)
+    self._read(self.fields)
+    self._over(kernels.measure, True)
+    self._over(self._domain.begin, self.own)
+    self._observe(True)
+
+  def _observe(self, beginning: bool) -> None:
+    self._over(kernels.look, beginning)
+    dim = (self.nworld, self.fields.coarse.shape[0])
+    self.launch(kernels.survey, dim, [self.fields, beginning])
+    self._over(self._domain.observe, self.own, beginning)
+
+  def _over(self, kernel: Any, *inputs: Any) -> None:
+    self.launch(kernel, self.nworld, [self.fields, *inputs])
+
+  def launch(self, kernel: Any, dim: Any, inputs: list) -> None:
+    """Launches a kernel."""
+    wp.launch(kernel, dim=dim, inputs=inputs, device=self.device, block_dim=64)

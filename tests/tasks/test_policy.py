@@ -1,0 +1,72 @@
+"""Files of trained policies."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+pytest.importorskip("safetensors")
+
+from palpate.tasks import performer, policy, suite
+from safetensors.numpy import save_file
+
+NAMES = ("target", "held")
+
+
+def made(task="touch/easy", **changes):
+  about = policy.About(task, ("pitch", "yaw", "roll", "insertion"), NAMES, 0.02)
+  random = np.random.RandomState(0)
+  layers = [(random.randn(n, k), random.randn(n)) for n, k in ((5, 4), (4, 5))]
+  fields = {"about": about, "mean": random.randn(4), "scale": random.rand(4), "layers": layers}
+  return policy.Policy(**(fields | changes))
+
+
+def test_a_policy_is_what_was_saved(tmp_path):
+  made_, path = made(), tmp_path / "policy.safetensors"
+  policy.save(path, made_)
+  loaded = policy.load(path)
+  seen = {"held": np.array([0.5]), "target": np.array([0.01, 0.02, 0.03]), "other": np.zeros(3)}
+  x = (np.array([0.01, 0.02, 0.03, 0.5]) - made_.mean) * made_.scale
+  (a, b), (c, d) = made_.layers
+  expected = np.clip(c @ np.tanh(a @ x + b) + d, -1, 1)
+  np.testing.assert_allclose(loaded(seen), expected, rtol=1e-5)
+  assert loaded.about.task == "touch/easy" and loaded.about.licence == "Apache-2.0"
+  env = suite.load("touch", "easy", task_kwargs={"random": 0})
+  act = performer.make(env, str(path))
+  assert env.step(act(env.reset())).reward is not None
+
+
+def test_a_policy_of_something_else_is_refused_by_name(tmp_path):
+  path = tmp_path / "policy.safetensors"
+  env = suite.load("touch", "easy", task_kwargs={"random": 0})
+  about = made().about
+  for changes, said in (
+    ({"task": "probe/easy"}, "the policy is of probe/easy, not of touch/easy"),
+    ({"control_timestep": 0.1}, "acts each 0.1 s, not each 0.02 s"),
+    ({"observations": ("target", "felt")}, "observes felt, which observations lack"),
+    ({"observations": ("target", "normal")}, "takes 4 numbers, the exercise has 6"),
+  ):
+    policy.save(path, made(about=dataclasses.replace(about, **changes)))
+    with pytest.raises(ValueError, match=said):
+      performer.make(env, str(path))
+
+
+def test_a_file_that_is_none_is_refused(tmp_path):
+  path = tmp_path / "policy.safetensors"
+  with pytest.raises(ValueError, match=r"policy.safetensors"):
+    policy.load(path)
+  path.write_bytes(b"weights")
+  with pytest.raises(ValueError, match=r"policy '.*policy.safetensors'"):
+    policy.load(path)
+  save_file({"mean": np.zeros(3, np.float32)}, path)
+  with pytest.raises(ValueError, match="is not one of Palpate's"):
+    policy.load(path)
+  (a, b), last = made().layers
+  for layers, said in (
+    ([(a[:, :3], b), last], r"weight0 has shape \(5, 3\), expected \(5, 4\)"),
+    ([(a, b)], "it ends in 5 numbers, expected 4"),
+    ([(a * np.nan, b), last], "not finite"),
+  ):
+    policy.save(path, made(layers=layers))
+    with pytest.raises(ValueError, match=said):
+      policy.load(path)

@@ -1,0 +1,241 @@
+"""Vectorised exercises: each world is the single environment of its seed, step by step."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+gymnasium = pytest.importorskip("gymnasium")
+
+from gymnasium.vector import AutoresetMode  # noqa: E402
+from gymnasium.wrappers.vector import RecordEpisodeStatistics  # noqa: E402
+from palpate.tasks import performer, registry  # noqa: E402
+
+# float32 of the batch against float64; jaws on a fold of tissue magnify it.
+LIMITS = {"contact_force": 0.02, "shaft_force": 0.02, "peak_force": 0.02, "gripper": 0.1}
+LIMITS |= {"joint_vel": 5e-3}
+
+
+def ids(task):
+  return registry.gym_id(*task.split("/"))
+
+
+def make(task, num_envs=2, **options):
+  return gymnasium.make_vec(ids(task), num_envs=num_envs, **{"device": "cpu", **options})
+
+
+def single(task, **options):
+  return gymnasium.make(ids(task), disable_env_checker=True, **options)
+
+
+class Experts:
+  """Single environments, and who acts in them."""
+
+  def __init__(self, task, count, seed, **options):
+    self.envs = [single(task, **options) for _ in range(count)]
+    self.seen = [env.reset(seed=seed + k)[0] for k, env in enumerate(self.envs)]
+    self.acts = [performer.make(env.unwrapped.environment) for env in self.envs]
+    self.first = [True] * count
+
+  def action(self):
+    steps = [
+      SimpleNamespace(first=lambda k=k: self.first[k], observation=seen)
+      for k, seen in enumerate(self.seen)
+    ]
+    return np.array([act(step) for act, step in zip(self.acts, steps, strict=True)]).clip(-1, 1)
+
+  def step(self, action):
+    """Yields for each what Gymnasium's step returns; begins again where an episode is over."""
+    for k, env in enumerate(self.envs):
+      found = env.step(action[k])
+      self.first[k] = found[2] or found[3]
+      self.seen[k] = env.reset()[0] if self.first[k] else found[0]
+      yield found
+
+
+def distances(name, values):
+  """Returns what is compared: which of two nodes as far is nearer is rounding."""
+  return np.linalg.norm(values, axis=-1) if name == "nodes_near" else values
+
+
+def compare(seen, expected):
+  for name, values in expected.items():
+    a, b = (distances(name, np.asarray(v)) for v in (seen[name], values))
+    np.testing.assert_allclose(a, b, atol=LIMITS.get(name, 2e-4), err_msg=name)
+
+
+@pytest.mark.parametrize(
+  "task, count, steps, options",
+  [
+    ("touch/easy", 2, 130, {}),
+    ("touch/hard", 2, 40, {"variants": (1,)}),
+    ("probe/easy", 2, 90, {}),
+    ("probe/depth", 1, 60, {"reward": "sparse"}),
+    ("probe/palpate_easy", 2, 60, {}),
+    ("trace/easy", 1, 280, {}),
+    ("grasp/easy", 1, 235, {}),
+    ("retract/easy", 1, 195, {}),
+  ],
+)
+def test_each_world_is_the_single_environment_of_its_seed(task, count, steps, options):
+  env, experts = make(task, count, **options), Experts(task, count, 3, **options)
+  seen, _ = env.reset(seed=3)
+  compare({k: v[0] for k, v in seen.items()}, experts.seen[0])
+  ended = []
+  for _ in range(steps):
+    action = experts.action()
+    seen, reward, terminated, truncated, info = env.step(action)
+    for k, (last, paid, end, cut, said) in enumerate(experts.step(action)):
+      assert (end, cut) == (terminated[k], truncated[k])
+      assert reward[k] == pytest.approx(paid, abs=2e-3)
+      told = {name: values[k] for name, values in info.items() if name[:5] != "final"}
+      if end or cut:
+        compare(info["final_obs"][k], last)
+        told = {name: values[k] for name, values in info["final_info"].items()}
+        ended.append(said["outcome"])
+      compare({name: values[k] for name, values in seen.items()}, experts.seen[k])
+      for name in ("success", "outcome"):
+        assert told[name] == said[name]
+      for name in ("progress", "cost", "peak_force", "shaft_force"):
+        assert told[name] == pytest.approx(said[name], abs=LIMITS["peak_force"])
+  if task in ("touch/easy", "trace/easy", "grasp/easy", "retract/easy"):
+    assert "success" in ended and set(ended) == {"success"}
+  env.close()
+
+
+def test_a_report_of_palpation_ends_the_episode():
+  env, alone = make("probe/palpate_easy"), single("probe/palpate_easy")
+  env.reset(seed=0)
+  alone.reset(seed=0)
+  action = np.array([[0, 0, 0, 0, 1.0], [0, 0, 0, 0, -1.0]])
+  _, reward, terminated, _, info = env.step(action)
+  *_, said = alone.step(action[0])
+  assert terminated.tolist() == [True, False] and said["outcome"] == "missed"
+  assert info["final_info"]["outcome"][0] == "missed" and reward[0] == 0
+
+
+def test_damage_and_its_cost_are_those_of_the_single_environment():
+  env, alone = make("touch/easy", 1), single("touch/easy")
+  env.reset(seed=2)
+  alone.reset(seed=2)
+  for _ in range(200):
+    _, reward, terminated, _, info = env.step(np.array([[0, 0, 0, 1.0]]))
+    _, paid, ended, _, said = alone.step(np.array([0, 0, 0, 1.0]))
+    assert terminated[0] == ended and reward[0] == pytest.approx(paid, abs=1e-3)
+    if ended:
+      break
+  final = info["final_info"]
+  assert final["outcome"][0] == said["outcome"] == "damage"
+  for name in ("cost", "cost_force", "cost_shaft", "cost_damage"):
+    assert final[name][0] == pytest.approx(said[name], abs=1e-3)
+
+
+# Gymnasium.
+
+
+def test_spaces_and_metadata_are_gymnasiums():
+  env, alone = make("touch/easy", 3), single("touch/easy")
+  assert env.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP and env.num_envs == 3
+  assert env.single_observation_space == alone.observation_space
+  assert env.single_action_space == alone.action_space
+  seen, info = env.reset(seed=0)
+  assert env.observation_space.contains(seen) and not info["success"].any()
+  seen, reward, terminated, truncated, info = env.step(env.action_space.sample() * 0.1)
+  assert env.observation_space.contains(seen)
+  assert reward.dtype == np.float64 and terminated.dtype == truncated.dtype == bool
+  assert info["outcome"].tolist() == [None] * 3 and info["_outcome"].all()
+  assert env.spec.id == "palpate/TouchEasy-v0"
+
+
+def test_only_what_was_chosen_is_observed():
+  env = make("touch/easy", observations=["target", "joints"])
+  seen, _ = env.reset(seed=0)
+  assert set(seen) == {"target", "joints"} == set(env.single_observation_space)
+
+
+def test_the_time_limit_cuts_and_gymnasiums_statistics_see_it():
+  env = RecordEpisodeStatistics(make("touch/easy", time_limit=0.1))
+  env.reset(seed=0)
+  for count in range(1, 6):
+    *_, truncated, info = env.step(np.zeros((2, 4)))
+    assert truncated.all() == (count == 5)
+  assert info["episode"]["l"].tolist() == [5, 5] and info["_final_obs"].all()
+  env = make("touch/easy", max_episode_steps=2)
+  env.reset(seed=0)
+  env.step(np.zeros((2, 4)))
+  assert env.step(np.zeros((2, 4)))[3].all()
+
+
+def test_seeds_repeat_and_worlds_differ():
+  env = make("touch/standard", 3)
+  first = env.reset(seed=[7, 8, 7])[0]["tip_pos"]
+  assert np.array_equal(first[0], first[2]) and not np.array_equal(first[0], first[1])
+  second = env.reset()[0]["tip_pos"]
+  assert not np.array_equal(first, second) and np.array_equal(second[0], second[2])
+  assert np.array_equal(env.reset(seed=[7, 8, 7])[0]["tip_pos"], first)
+
+
+def test_a_mask_resets_some_worlds():
+  env = make("touch/easy", 3)
+  env.reset(seed=0)
+  action = np.tile([0.2, 0, 0, 0.3], (3, 1))
+  seen = env.step(action)[0]
+  after = env.reset(options={"reset_mask": np.array([False, True, False])})[0]
+  same = [np.array_equal(seen["tip_pos"][k], after["tip_pos"][k]) for k in range(3)]
+  assert same == [True, False, True]
+  with pytest.raises(ValueError, match=r"reset_mask has shape \(2,\) of bool, expected \(3,\)"):
+    env.reset(options={"reset_mask": np.array([True, False])})
+
+
+def test_a_world_whose_numbers_are_not_finite_begins_again_and_others_do_not_notice():
+  env, other = (make("touch/easy", 2) for _ in range(2))
+  env.reset(seed=0)
+  other.reset(seed=0)
+  broken = np.array([True, False])
+  env.unwrapped.worlds.batch.pose(["probe/pitch"], np.full((2, 1), np.nan), broken)
+  found = [each.step(np.full((2, 4), 0.1)) for each in (env, other)]
+  assert found[0][3].tolist() == [True, False] and found[0][1][0] == 0
+  assert np.isfinite(found[0][0]["tip_pos"]).all()
+  assert np.array_equal(found[0][0]["tip_pos"][1], found[1][0]["tip_pos"][1])
+
+
+def test_bad_input_is_named():
+  with pytest.raises(ValueError, match="num_envs is 0"):
+    make("touch/easy", 0)
+  with pytest.raises(ValueError, match="output is 'jax', expected one of numpy"):
+    make("touch/easy", output="jax")
+  with pytest.raises(ValueError, match="device is 'tpu'"):
+    make("touch/easy", device="tpu")
+  for options, what in (
+    ({"pixels": (8, 8)}, "makes no pictures"),
+    ({"randomise": {"friction": (1, 2)}}, "randomise is given"),
+    ({"record": True}, "record is given"),
+    ({"variants": (None, 1)}, "expected one shape"),
+  ):
+    with pytest.raises(ValueError, match=f"{what}.*vectorization_mode"):
+      make("touch/easy", **options)
+  with pytest.raises(ValueError, match="expected 'cpu': what jaws hold"):
+    make("grasp/easy", device="warp-cpu")
+  env = make("touch/easy")
+  with pytest.raises(gymnasium.error.ResetNeeded):
+    env.step(np.zeros((2, 4)))
+  env.reset(seed=0)
+  with pytest.raises(ValueError, match=r"actions have shape \(2, 5\), expected \(2, 4\)"):
+    env.step(np.zeros((2, 5)))
+  for bad in (1.5, np.nan):
+    action = np.zeros((2, 4))
+    action[1, 3] = bad
+    with pytest.raises(ValueError, match="action insertion of world 1 is"):
+      env.step(action)
+  with pytest.raises(ValueError, match="seed has 3 numbers, expected 2"):
+    env.reset(seed=[1, 2, 3])
+
+
+def test_arrays_of_warp():
+  env, plain = make("touch/easy", output="warp"), make("touch/easy")
+  seen, _ = env.reset(seed=0)
+  expected, _ = plain.reset(seed=0)
+  before = seen["tip_pos"].numpy().copy()
+  after = env.step(np.full((2, 4), 0.2))
+  np.testing.assert_allclose(before, expected["tip_pos"], atol=1e-7)
+  assert np.array_equal(seen["tip_pos"].numpy(), before) and after[1].shape == (2,)
