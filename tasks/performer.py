@@ -31,7 +31,7 @@ from dm_control.rl import control
 from palpate.models import trocar
 
 from . import policy
-from .base import AXES, RATES
+from .base import RATES
 
 Act = Callable[[Any], Any]
 Script = Iterator[np.ndarray]
