@@ -116,7 +116,7 @@ def test_two_steps_back_tell_where_the_solve_starts(window):
     if window:
       where = layout.spans(layout.Motion, {"nvert": organ.nvert})
     else:
-      where = layout.spans(layout.NodalState, {"nfree": 3 * organ.nvert})
+      where = layout.spans(layout.NodalState, {"nfree": 3 * organ.nvert, "ncreep": 0})
     before = where["before"]
     forces.append([])
     counts.append([])
