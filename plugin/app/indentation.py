@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -150,10 +151,11 @@ class Indentation:
     tool = spec.worldbody.add_body(name="tool", pos=at, quat=_facing(sample.away))
     tool.add_joint(name="tool", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 0, -1])
     _add_tip(tool, test, soft, _HEAVY * sample.mass)
+    keys: dict[str, Any] = {**sample.keys, **constants}
     add_organ(
-      spec, sample.mesh, "tissue", mass=sample.mass, pin=sample.pin, radius=soft,
+      spec, sample.mesh, "tissue", mass=sample.mass, pin=sample.pin.tolist(), radius=soft,
       contact={"condim": 1, "solref": (3 * self.step, 1), "solimp": (0.99, 0.999, 1e-4)},
-      windows={"nodes": min(_WINDOW, self.nodes)}, device="cpu", **sample.keys | dict(constants),
+      windows={"nodes": min(_WINDOW, self.nodes)}, device="cpu", **keys,
     )  # fmt: skip
     return spec
 

@@ -51,7 +51,7 @@ class Hold:
     """Makes it."""
     if self.array is None:
       there = bodies.hold(self._w.body)
-      cuda = there.device.is_cuda
+      cuda = self._w.body.device.is_cuda
       self.array = wp.zeros_like(there, device="cpu", pinned=True) if cuda else there
 
   def clear(self):

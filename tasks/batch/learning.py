@@ -22,7 +22,7 @@ from palpate.tasks.files import replacing
 from rsl_rl.algorithms import PPO
 from rsl_rl.models import MLPModel
 from rsl_rl.storage import RolloutStorage
-from safetensors.torch import safe_open
+from safetensors import safe_open
 from safetensors.torch import save as dump
 
 from .rsl import RslRl
