@@ -36,7 +36,7 @@ _CONTACT = {
 _TOLERANCE = 1e-2
 # Slots of the organ's window for each 1000 nodes; the experts' instruments touch 15 and 38 at most.
 _SLOTS = {"probe": 40, "grasper": 48}
-# More than MuJoCo's 1 makes friction creep less: 2.4 N of grip then hold 3.5 N, with 3 only 2 N.
+# More than MuJoCo's 1 makes friction creep less: 2.4 N of grip then hold 3 N, with 3 only 2 N.
 _IMPRATIO = {"probe": 3, "grasper": 10}
 _TURN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # organ's frame to world
 
