@@ -17,21 +17,18 @@ class Domain:
     begin: kernel (fields, own): begins the episodes of `begun`, once the instrument is measured
     advance: kernel (fields, own): what `Task.advance` is; it ends with `kernels.judge`
     observe: kernel (fields, own, beginning): what `Task.observe` is
+    takes: numbers of the task that the struct has under the same names
   """
 
   struct: Any
   begin: Any
   advance: Any
   observe: Any
+  takes: tuple[str, ...] = ()
 
   @staticmethod
   def prepare(task: Any) -> None:
     """Changes the task before its scene is made for all worlds."""
-
-  @staticmethod
-  def numbers(task: Any) -> dict[str, float | int]:
-    """Returns the struct's numbers."""
-    return {}
 
   @staticmethod
   def sizes(task: Any, physics: Physics) -> dict[str, int]:
@@ -44,7 +41,7 @@ class Domain:
 
   @staticmethod
   def constants(task: Any, physics: Physics) -> Mapping[str, Any]:
-    """Returns arrays and vectors of the struct that all worlds share."""
+    """Returns what else of the struct all worlds share: arrays, vectors, numbers."""
     return {}
 
   @staticmethod

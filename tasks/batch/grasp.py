@@ -70,7 +70,7 @@ def advance(s: Common, o: HoldState):
   if o.letting[w] and (share < _LOW or share > _LETTING):
     again(o, w)
   outcome = int(RUNNING)
-  now = wp.float32(1.0)
+  now = wp.float32(0.0)
   if o.letting[w] and not holds(s, o, w):
     outcome = SUCCESS
   else:
@@ -95,11 +95,7 @@ class Grasp(Hold):
   """The domain."""
 
   begin, advance, observe = begin, advance, observe
-
-  @staticmethod
-  def numbers(task: Any):
-    """Returns the struct's numbers."""
-    return {"lift": task.lift, "hold": task.hold, "slip": task.slip}
+  takes = ("lift", "hold", "slip")
 
   @staticmethod
   def draw(task: Any, physics):

@@ -156,7 +156,7 @@ def place(s: Common, w: int):
 
 @wp.func
 def judge(s: Common, w: int, progress: float, outcome: int):
-  """Ends a control step that came to a progress and an outcome."""
+  """Ends a control step that came to a progress and an outcome; a success is all of it."""
   peak, shaft = s.peak_force[w, 0], s.shaft_peak[w]
   over, lies, harmed = parts(peak, shaft, s.force_limit, s.damage)
   total = over + lies + harmed
@@ -166,6 +166,8 @@ def judge(s: Common, w: int, progress: float, outcome: int):
   s.cost_damage[w] = harmed
   found = outcome
   now = progress
+  if found == SUCCESS:
+    now = 1.0
   if harmed > 0.0:
     found = DAMAGED
     now = -1.0

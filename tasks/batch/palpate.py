@@ -52,7 +52,6 @@ def advance(s: Common, o: PalpateState):
     outcome = MISSED
     if wp.length(tip - o.inclusion[w]) <= o.tolerance and force >= _REPORT:
       outcome = SUCCESS
-      found = 1.0
   else:
     count = wp.int32(0)
     for k in range(o.places.shape[0]):
@@ -78,16 +77,12 @@ class Palpate(domain.Domain):
 
   struct = PalpateState
   begin, advance, observe = begin, advance, observe
+  takes = ("tolerance",)
 
   @staticmethod
   def prepare(task: Any):
     """Lets the worlds' tissue have the inclusions, not the scene."""
     task.leave_out()
-
-  @staticmethod
-  def numbers(task: Any):
-    """Returns the struct's numbers."""
-    return {"tolerance": task.tolerance, "center": wp.vec3(*task.center)}
 
   @staticmethod
   def sizes(task: Any, physics):
@@ -96,8 +91,8 @@ class Palpate(domain.Domain):
 
   @staticmethod
   def constants(task: Any, physics):
-    """Returns arrays that all worlds share."""
-    return {"places": task.places}
+    """Returns what else all worlds share."""
+    return {"places": task.places, "center": wp.vec3(*task.center)}
 
   @staticmethod
   def draw(task: Any, physics):

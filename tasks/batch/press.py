@@ -92,7 +92,6 @@ def advance(s: Common, o: PressState):
   found = progress(float(o.done[w]), near, o.time[w] / o.hold, float(o.goals.shape[1]))
   if o.done[w] == o.goals.shape[1]:
     outcome = SUCCESS
-    found = 1.0
   judge(s, w, found, outcome)
 
 
@@ -114,13 +113,13 @@ class Press(domain.Domain):
 
   struct = PressState
   begin, advance, observe = begin, advance, observe
+  takes = ("tolerance", "hold")
 
   @staticmethod
-  def numbers(task: Any):
-    """Returns the struct's numbers."""
+  def constants(task: Any, physics):
+    """Returns what else all worlds share."""
     low, high = task.band
-    found = {"low": low, "high": high, "by_depth": int(task.by_depth)}
-    return found | {"tolerance": task.tolerance, "hold": task.hold}
+    return {"low": low, "high": high, "by_depth": int(task.by_depth)}
 
   @staticmethod
   def sizes(task: Any, physics):

@@ -66,7 +66,6 @@ def advance(s: Common, o: HoldState):
   now = progress(grasped, near, seen / o.wanted, o.time[w] / o.hold)
   if o.time[w] >= o.hold - _SLACK:
     outcome = SUCCESS
-    now = 1.0
   judge(s, w, now, outcome)
 
 
@@ -83,11 +82,7 @@ class Retract(Hold):
   """The domain."""
 
   begin, advance, observe = begin, advance, observe
-
-  @staticmethod
-  def numbers(task: Any):
-    """Returns the struct's numbers."""
-    return {"wanted": task.wanted, "hold": task.hold, "slip": task.slip}
+  takes = ("wanted", "hold", "slip")
 
   @staticmethod
   def sizes(task: Any, physics):

@@ -78,7 +78,6 @@ def advance(s: Common, o: TouchState):
   now = progress(float(o.done[w]), near, o.time[w], points)
   if o.done[w] == o.goals.shape[1]:
     outcome = SUCCESS
-    now = 1.0
   judge(s, w, now, outcome)
 
 
@@ -99,11 +98,7 @@ class Touch(domain.Domain):
 
   struct = TouchState
   begin, advance, observe = begin, advance, observe
-
-  @staticmethod
-  def numbers(task: Any):
-    """Returns the struct's numbers."""
-    return {"tolerance": task.tolerance}
+  takes = ("tolerance",)
 
   @staticmethod
   def sizes(task: Any, physics):

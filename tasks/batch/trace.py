@@ -111,7 +111,6 @@ def advance(s: Common, o: TraceState):
     now = 0.1 * closeness(distance(s, o, w), o.distance0[w])
   if traced >= length - _STEP:
     outcome = SUCCESS
-    now = 1.0
   judge(s, w, now, outcome)
 
 
@@ -134,11 +133,7 @@ class Trace(domain.Domain):
 
   struct = TraceState
   begin, advance, observe = begin, advance, observe
-
-  @staticmethod
-  def numbers(task: Any):
-    """Returns the struct's numbers."""
-    return {"tolerance": task.tolerance}
+  takes = ("tolerance",)
 
   @staticmethod
   def sizes(task: Any, physics):

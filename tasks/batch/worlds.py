@@ -72,9 +72,9 @@ class Worlds:
     self.fields = self._make(task, environment.control_timestep(), limit)
     sizes = {"nworld": nworld, **domain.sizes(task, self.episodes.physics)}
     self.own = allocate(domain.struct, self.device, sizes)
-    for name, value in domain.numbers(task).items():
-      setattr(self.own, name, value)
-    for name, value in domain.constants(task, self.episodes.physics).items():
+    shared: dict[str, Any] = {name: getattr(task, name) for name in domain.takes}
+    shared.update(domain.constants(task, self.episodes.physics))
+    for name, value in shared.items():
       if isinstance(value, np.ndarray):
         getattr(self.own, name).assign(value)
       else:
