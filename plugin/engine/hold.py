@@ -2,9 +2,12 @@
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
+import numpy as np
 import warp as wp
 from palpate.tissue import body as bodies
 from palpate.tissue.types import doubles, ints, struct
+
+from . import mjstruct
 
 
 @struct
@@ -64,3 +67,8 @@ class Hold:
     there = self._w.body.state.hold
     if there.device.is_cuda and self.array is not None:
       wp.copy(there, self.array)
+
+
+def may_move(m, body) -> bool:
+  """Returns whether one of these bodies may move: all but what is welded to the world."""
+  return bool(mjstruct.view(m.body_weldid, m.nbody, np.int32)[body].any())

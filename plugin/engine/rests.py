@@ -10,7 +10,7 @@ from palpate.tissue import mesh as topology
 from palpate.tissue.types import doubles, fill, floats, ints, struct, vector
 
 from . import coupling, flexes, mjstruct
-from .hold import Bodies
+from .hold import Bodies, may_move
 from .layout import TAIL
 
 # Stiffness of the springs, by area, in Young's moduli an edge: an organ of that size sinks in by a
@@ -129,7 +129,7 @@ class Rests:
       self._arrays |= {"corner": wp.zeros((n, 3), dtype=int, device="cpu")}
     common = self._arrays | dict(
       ngeom=len(geoms),
-      restless=int(bool(self.below) or self._moves(m, geoms)),
+      restless=int(bool(self.below) or may_move(m, _body(m, geoms))),
       skin=float(mjstruct.view(m.flex_radius, m.nflex)[flex]),
       cell=2.0 * float(edge.max()),
       own=_resting(w),
@@ -145,16 +145,9 @@ class Rests:
     self._on = [fill(Rest, "cpu", common | self._other(m, other)) for other in self.below]
 
   def _geoms(self, m) -> np.ndarray:
-    names = [mjstruct.name_of(m, m.name_geomadr, g) for g in range(m.ngeom)]
-    organ = self._w.organ
+    names, organ = _geom_names(m), self._w.organ
     found = [flexes.resolve(name, organ.name, names) for name in organ.config.support]
     return np.array([names.index(name) for name in found if name is not None], int)
-
-  def _moves(self, m, geoms: np.ndarray) -> bool:
-    body = mjstruct.view(m.geom_bodyid, m.ngeom, np.int32)[geoms]
-    weld = mjstruct.view(m.body_weldid, m.nbody, np.int32)[body]
-    mocap = mjstruct.view(m.body_mocapid, m.nbody, np.int32)[weld]
-    return bool((weld > 0).any() or (mocap >= 0).any())
 
   def _other(self, m, other) -> dict[str, Any]:
     """Returns the fields of an organ that this one rests on."""
@@ -232,14 +225,21 @@ def meet(spaces: list) -> list:
 
 def check(m, w):
   """Raises ValueError where an organ names as its support what does not exist."""
-  names = [mjstruct.name_of(m, m.name_geomadr, g) for g in range(m.ngeom)]
-  names += [flexes.name(m, f) for f in range(m.nflex)]
+  names = _geom_names(m) + [flexes.name(m, f) for f in range(m.nflex)]
   for name in w.config.support:
     if flexes.resolve(name, w.organ.name, names) is None:
       raise ValueError(
         f"organ {w.organ.name!r}: support names {name!r}, which does not exist, expected a geom or "
         "another organ"
       )
+
+
+def _geom_names(m) -> list[str]:
+  return [mjstruct.name_of(m, m.name_geomadr, g) for g in range(m.ngeom)]
+
+
+def _body(m, geoms: np.ndarray) -> np.ndarray:
+  return mjstruct.view(m.geom_bodyid, m.ngeom, np.int32)[geoms]
 
 
 def _launch(kernel, rest, arg: int = 0):

@@ -16,7 +16,7 @@ from palpate.tissue.step import SCHEMES
 from palpate.tissue.types import DIMS, doubles, fill, floats, ints, struct, vector
 
 from . import coupling, mjstruct
-from .hold import Bodies
+from .hold import Bodies, may_move
 from .layout import TAIL
 
 TO_POINT, TO_OWN_MOTION = -1, -2  # in place of a body
@@ -128,8 +128,7 @@ class Ties:
       parts = [np.broadcast_to(getattr(g, name), _rows(g, name)) for g in self.groups]
       if parts:
         self._arrays[name].numpy()[:total] = np.concatenate(parts)
-    weld = np.array([self._moves(group) for group in self.groups], bool)
-    self._arrays["restless"].numpy()[0] = weld.any()
+    self._arrays["restless"].numpy()[0] = any(self._moves(group.body) for group in self.groups)
     self._arrays["owned"].numpy()[0] = any(g.body == TO_OWN_MOTION for g in self.groups)
     self._arrays["count"].numpy()[0] = total
     parts = [np.full(len(g.vert), self._leads(g.body)) for g in self.groups]
@@ -137,12 +136,8 @@ class Ties:
       self._arrays["leads"].numpy()[:total] = np.concatenate(parts)
     self._arrays["force"].zero_()
 
-  def _moves(self, group: Group) -> bool:
-    m = mjstruct.Model.from_address(self._w.model)
-    if group.body < 0:
-      return True
-    weld = mjstruct.view(m.body_weldid, m.nbody, np.int32)[group.body]
-    return bool(weld) or is_mocap(m, group.body)
+  def _moves(self, body: int) -> bool:
+    return body < 0 or may_move(mjstruct.Model.from_address(self._w.model), body)
 
   def load(self):
     """Loads the kernels, if there is something to do for them."""
