@@ -19,7 +19,6 @@ from palpate.tissue import mesh as topology
 from .console import CommandError
 from .measured import Record
 
-TIPS = ("sphere", "flat")
 _STEPS = 600  # of a record, unless the time step is given
 _LEAST, _MOST = 2.5e-4, {"sphere": 4e-3, "flat": 1e-3}  # time step [s]
 # In the radius of the contact, of the finest triangles; a flat tool has a rim.
@@ -39,7 +38,7 @@ class Test:
   """An indentation.
 
   Attributes:
-    tip: of the tool, one of `TIPS`
+    tip: of the tool, sphere or flat
     radius: of the tool [m]
     size: of a block, held at its bottom and pressed in the middle of its top [m]; or
     organ: of the catalogue, and

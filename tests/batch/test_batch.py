@@ -42,6 +42,25 @@ def driven(batch, steps):
   return np.array(out)
 
 
+def slid_beside(make, made, steps, aside, wait):
+  """Presses a probe in and moves it aside in a batch and under the plugin alone.
+
+  Returns:
+    the batch, the plugin's organ, forces of the first world and of the plugin [N]  (steps, 2, 3)
+  """
+  model, data, organ = load(made)
+  batch = make(made, 2)
+  found = []
+  for k in range(steps):
+    data.ctrl[:] = -0.007 * min(1, k / 60), aside * np.clip(k / wait - 1, 0, 1)
+    batch.ctrl = np.tile(data.ctrl, (2, 1))
+    mujoco.mj_step(model, data)
+    batch.step()
+    force = batch.organ("organ").contact_force.numpy()[0].sum(axis=0)
+    found.append((force, organ.contact_force.sum(axis=0)))
+  return batch, organ, np.array(found)
+
+
 @pytest.mark.parametrize("window", [True, False])
 def test_a_world_is_what_the_plugin_makes_of_it_alone(make, window):
   model, data, organ = load(probed(window))
@@ -133,18 +152,7 @@ def test_each_world_has_a_tissue_of_its_own(make):
 
 @pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
 def test_sliding_is_that_of_the_plugin(make, cone):
-  made = probed(cone=cone)
-  model, data, organ = load(made)
-  batch = make(made, 2)
-  found = []
-  for k in range(220):
-    data.ctrl[:] = -0.007 * min(1, k / 60), 0.01 * np.clip(k / 100 - 1, 0, 1)
-    batch.ctrl = np.tile(data.ctrl, (2, 1))
-    mujoco.mj_step(model, data)
-    batch.step()
-    force = batch.organ("organ").contact_force.numpy()[0].sum(axis=0)
-    found.append((force, organ.contact_force.sum(axis=0)))
-  found = np.array(found)
+  _, _, found = slid_beside(make, probed(cone=cone), 220, aside=0.01, wait=100)
   peak = np.abs(found[:, 1]).max()
   assert np.sqrt(np.mean((found[:, 0] - found[:, 1]) ** 2)) < 0.005 * peak
   assert np.abs(found[:, 1, 0]).max() > 0.2 * peak  # it slides
@@ -169,17 +177,7 @@ def test_contacts_have_the_normal_forces(make, cone):
 
 def test_a_solid_is_that_of_the_plugin(make):
   made = probed(keys={"elements": "solid", "young": 3e3, "foundation": None})
-  model, data, organ = load(made)
-  batch = make(made, 2)
-  found = []
-  for k in range(100):
-    data.ctrl[:] = -0.007 * min(1, k / 60), 0.005 * np.clip(k / 70 - 1, 0, 1)
-    batch.ctrl = np.tile(data.ctrl, (2, 1))
-    mujoco.mj_step(model, data)
-    batch.step()
-    force = batch.organ("organ").contact_force.numpy()[0].sum(axis=0)
-    found.append((force, organ.contact_force.sum(axis=0)))
-  found = np.array(found)
+  batch, organ, found = slid_beside(make, made, 100, aside=0.005, wait=70)
   assert np.sqrt(np.mean((found[:, 0] - found[:, 1]) ** 2)) < 0.005 * np.abs(found[:, 1]).max()
   np.testing.assert_allclose(batch.organ("organ").xpos.numpy()[0], organ.xpos, atol=2e-5)
   back = mujoco.MjData(batch.model)

@@ -161,7 +161,9 @@ def execute(bench: Bench, args: argparse.Namespace) -> bool:
   seconds = round(time.perf_counter() - started, 1)
   if args.resume:
     seconds += results.notes(path).get("seconds", 0)
-  mine = {key: str(value) for key, value in vars(args).items() if key not in _COMMON}
+  mine = {key: value for key, value in vars(args).items() if key not in _COMMON}
+  # Of a path the name alone: where things lie on a machine is nobody's business.
+  mine = {k: v.name if isinstance(v, pathlib.Path) else str(v) for k, v in mine.items()}
   results.note(path, results.machine() | {
     "bench": bench.name,
     "short": args.short,

@@ -29,7 +29,7 @@ def arguments(parser: argparse.ArgumentParser):
   add = parser.add_argument
   add("--tasks", nargs="+", metavar="TASK", choices=NAMES, default=NAMES)
   add("--seconds", type=float, default=4.0, help="of stepping a task (%(default)s)")
-  add("--against", metavar="PYTHON", default="", help="of another installation, to race")
+  add("--against", metavar="PYTHON", type=pathlib.Path, help="of another installation, to race")
   add("--episodes", type=int, default=1, help="of a race (%(default)s)")
 
 
@@ -59,7 +59,7 @@ for line in sys.stdin:
 """
 
 
-def race(task: str, other: str, episodes: int) -> Row:
+def race(task: str, other: pathlib.Path, episodes: int) -> Row:
   """Returns how this installation and another do an exercise in turn: CPU time and outcomes."""
   environment = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "MUJOCO_GL")}
   mine = environment | {"PYTHONPATH": os.environ.get("PYTHONPATH", "")}
@@ -165,8 +165,8 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
   if raced:
     head += ["times the tree before", "solved"]
     text += (
-      "The fifth compares it with the commit before windows and shafts that touch, in stretches of "
-      "10 control steps in turn. "
+      "The fifth compares it with commit 198529a, before windows and shafts that touch, in stretches "
+      "of 10 control steps in turn: `--against` the Python of a venv that has that commit. "
     )
   lines = [text + results.link(out / "exercises_cpu.csv"), "", *plots.table(head, table)]
   return [results.page(out / "exercises.md", "How fast the exercises run", about, lines)]

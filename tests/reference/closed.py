@@ -1,4 +1,4 @@
-"""Closed forms of elasticity beside what a solid's kernels give: (ours, theory) of each."""
+"""Closed forms of elasticity beside what a solid's kernels give: ours, theory of each."""
 
 from __future__ import annotations
 
@@ -41,14 +41,15 @@ def end_share(mesh, x: float) -> np.ndarray:
   return share / share.sum()
 
 
-def bar(poisson: float, spacing: float = 0.02, device="cpu") -> tuple[float, float]:
-  """Returns the strain of a bar that is pulled at both ends: F / (E A)."""
+def bar(poisson: float, spacing: float = 0.02, device="cpu") -> tuple[float, float, float]:
+  """Returns the strain of a bar that is pulled at both ends, F / (E A), and Poisson's ratio."""
   mesh, body = solid(*scenes.box((LENGTH, SIDE, SIDE), spacing), poisson, device=device)
   pull, force = 0.02, np.zeros((mesh.nvert, 3))
-  for sign in (-1, 1):
+  for sign in (-1, 1):  # so that nothing hinders it from getting thinner
     force[:, 0] += sign * pull * end_share(mesh, sign * LENGTH / 2)
   u = settled(mesh, body, force)
-  return float(np.polyfit(mesh.rest[:, 0], u[:, 0], 1)[0]), pull / (YOUNG * SIDE**2)
+  stretch, thinner = (float(np.polyfit(mesh.rest[:, k], u[:, k], 1)[0]) for k in (0, 1))
+  return stretch, pull / (YOUNG * SIDE**2), -thinner / stretch
 
 
 def cantilever(poisson: float, spacing: float) -> tuple[float, float]:

@@ -112,14 +112,12 @@ class Guard:
   """Finds what is no movement of a hand.
 
   Attributes:
-    bad: readings that were not finite
-    jumps: readings that no hand could have moved to
     last: the last fault, for people; empty without one
   """
 
   def __init__(self, device: Device):
     self._device, self._before, self._time = device, None, 0.0
-    self.bad, self.jumps, self.last = 0, 0, ""
+    self.last = ""
 
   def forget(self) -> None:
     """Takes the next reading as the first one."""
@@ -130,7 +128,6 @@ class Guard:
     x, y, z = reading.pos
     numbers = x + y + z + reading.roll + sum(reading.quat or ()) + (reading.jaw or 0.0)
     if not math.isfinite(numbers) or (reading.quat and sum(q * q for q in reading.quat) < 1e-6):
-      self.bad += 1
       self.last = f"{self._device.name}: pose is {_text(reading)}, expected finite numbers"
       return "bad"
     before, self._before = self._before, reading.pos
@@ -140,7 +137,6 @@ class Guard:
     moved = math.dist(before, reading.pos)
     if moved <= _STEP + FASTEST * span:
       return "good"
-    self.jumps += 1
     self.last = f"{self._device.name}: jumped {1e3 * moved:.0f} mm in {1e3 * span:.0f} ms"
     return "jump"
 

@@ -92,7 +92,6 @@ class Camera:
     self._env, model = env, env.physics.model.ptr
     self.model = model
     self._geoms, self._sites = _drawn(model), env.physics.target_sites
-    self._extra = len(self._geoms) * 12 + len(self._sites) * 8
 
   def frame(self, session: Any) -> bytes:
     """Returns a frame, float32: `HEAD`, nodes, geoms (place, matrix), targets (8 numbers each)."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 import ipaddress
 import json
 import multiprocessing
@@ -181,8 +180,3 @@ def _names(host: str, port: int) -> tuple[str, ...]:
   if not _own(host):
     return ()
   return tuple(f"{name}:{port}" for name in (host, "localhost", "127.0.0.1", "[::1]"))
-
-
-def installed() -> bool:
-  """Returns whether what the page needs is installed."""
-  return importlib.util.find_spec("websockets") is not None
