@@ -165,8 +165,9 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
   if raced:
     head += ["times the tree before", "solved"]
     text += (
-      "The fifth compares it with commit 198529a, before windows and shafts that touch, in stretches "
-      "of 10 control steps in turn: `--against` the Python of a venv that has that commit. "
+      "The fifth compares it with commit 198529a, before windows and shafts that touch, in "
+      "stretches of 10 control steps in turn: `--against` the Python of a venv that has that "
+      "commit. "
     )
   lines = [text + results.link(out / "exercises_cpu.csv"), "", *plots.table(head, table)]
   return [results.page(out / "exercises.md", "How fast the exercises run", about, lines)]
