@@ -105,7 +105,8 @@ class Physics(Portable):
   def _keep(self, sensors: np.ndarray) -> None:
     """Keeps the forces of steps that had these sensor values  (nstep, nsensordata)."""
     values = sensors[:, self._signals]
-    tip, shaft = np.sqrt(np.einsum("ijk,ijk->ji", *2 * (values[:, :6].reshape(-1, 2, 3),)))
+    parts = values[:, :6].reshape(-1, 2, 3)
+    tip, shaft = np.sqrt(np.einsum("ijk,ijk->ji", parts, parts))
     self._forces = {"force": tip, "shaft_force": shaft}
     self.peak_force, self.peak_shaft = float(tip.max()), float(shaft.max())
     if self.has_jaw:

@@ -35,6 +35,10 @@ PALPATE void push_node(const Solve& s, int node, D3 force, const Sym& weight) {
 // A velocity about the centre of mass of a body's tree: of turning, and of the centre.
 struct Twist { D3 spin, vel; };
 
+// The velocity of a point that is `arm` from where a motion has its velocity.
+template <class Motion>
+PALPATE D3 velocity_at(const Motion& m, D3 arm) { return m.vel + cross(m.spin, arm); }
+
 // The velocity of a body, and where `leads` says so what its last acceleration adds in the step.
 template <class Arrays>
 PALPATE Twist twist(const Arrays& mj, int b, bool leads) {

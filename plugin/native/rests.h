@@ -97,7 +97,7 @@ PALPATE void find_geoms(const Fields& f, Thread, int) {
       const double depth = f.skin - distance(geom, d);
       if (!(depth > 0.0)) continue;
       const D3 n = up(geom, d, 0.1 * f.skin), arm = arm_of(f.mj, b, x.at);
-      const D3 vel = moving.vel + cross(moving.spin, arm);
+      const D3 vel = velocity_at(moving, arm);
       if (rest(f, i, x, depth, n, vel, f.friction.data[q])) f.on.data[i] = ON_GEOM - q;
     }
   }

@@ -143,12 +143,12 @@ PALPATE void enter_ties(const Fields& f, Thread, int) {
     if (b >= 0) {
       if (n == 0 || b != f.body.data[n - 1]) moving = twist(f.mj, b, f.leads.data[n]);
       to = point_of_body(f, n);
-      vel = moving.vel + cross(moving.spin, arm_of(f.mj, b, to));
+      vel = velocity_at(moving, arm_of(f.mj, b, to));
     }
     if (b == TO_OWN_MOTION) {
       const D3 arm = turned(own.R, rest - own.rest);
       to = own.middle + arm;
-      vel = own.vel + cross(own.spin, arm);
+      vel = velocity_at(own, arm);
     } else {
       to = add_turned(zero, f.frame.data, to - load(f.origin.data));
       vel = add_turned(zero, f.frame.data, vel);
