@@ -169,6 +169,7 @@ def _rows(free, found, record, simulation) -> list[tuple[str, str]]:
 def _write(out: pathlib.Path, args, simulation, record, free, found, constants):
   """Writes fit.json and fit.xml."""
   from palpate.models import mjcf
+  from palpate.tasks.files import replacing
 
   numbers = {
     name: {
@@ -198,12 +199,12 @@ def _write(out: pathlib.Path, args, simulation, record, free, found, constants):
     "alike": found.alike,
   }
   path = out / "fit.json"
-  with writing(path):
-    path.write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
+  with writing(path), replacing(path) as file:
+    file.write(json.dumps(about, indent=2) + "\n")
   path = out / "fit.xml"
-  with writing(path):
-    text = mjcf.plugin(simulation.keys | {key: float(f"{v:.5g}") for key, v in constants.items()})
-    path.write_text(text + "\n", encoding="utf-8")
+  text = mjcf.plugin(simulation.keys | {key: float(f"{v:.5g}") for key, v in constants.items()})
+  with writing(path), replacing(path) as file:
+    file.write(text + "\n")
 
 
 def _or_none(value: float) -> float | None:

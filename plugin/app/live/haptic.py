@@ -13,6 +13,9 @@ import threading
 import time
 from typing import Any
 
+import mujoco
+import numpy as np
+
 from .device import DeviceError, Four, Reading, Silent, Three
 
 STILL: Three = (0.0, 0.0, 0.0)
@@ -203,18 +206,10 @@ class OpenHaptics(Servo):
 
 def quaternion(mat: list[list[float]]) -> Four:
   """Returns the quaternion of a rotation matrix, w x y z."""
-  (a, b, c), (d, e, f), (g, h, i) = mat
-  squares = (1 + a + e + i, 1 + a - e - i, 1 - a + e - i, 1 - a - e + i)
-  k = max(range(4), key=squares.__getitem__)
-  s = 0.5 / math.sqrt(max(squares[k], 1e-12))
-  rows = (
-    (squares[0], h - f, c - g, d - b),
-    (h - f, squares[1], b + d, c + g),
-    (c - g, b + d, squares[2], f + h),
-    (d - b, c + g, f + h, squares[3]),
-  )
-  w, x, y, z = rows[k]
-  return (s * w, s * x, s * y, s * z)
+  quat = np.empty(4)
+  mujoco.mju_mat2Quat(quat, np.ravel(mat))
+  w, x, y, z = quat.tolist()
+  return (w, x, y, z)
 
 
 def library(module: str, extra: str) -> Any:
