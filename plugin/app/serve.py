@@ -7,6 +7,8 @@ import pathlib
 import threading
 import webbrowser
 
+from palpate import register
+
 from .console import CommandError, Interrupt, check_counts, need, output_folder
 
 _LOOK = 0.2  # between looks at whether Ctrl-C was pressed [s]
@@ -35,6 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser):
 
 def main(args: argparse.Namespace) -> int:
   """Runs the job and returns its exit code."""
+  register()
   from .live import devices
 
   try:

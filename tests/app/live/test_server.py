@@ -3,6 +3,9 @@
 import json
 import pathlib
 import shutil
+import signal
+import subprocess
+import sys
 import threading
 import time
 import urllib.error
@@ -295,6 +298,22 @@ def test_wrong_options_are_one_line(words, said, capsys):
   assert cli.main(words) == 2
   error = capsys.readouterr().err
   assert said in error and error.count("\n") == 1
+
+
+def test_the_command_serves_until_it_is_interrupted(tmp_path):
+  # In a process of its own: `import palpate` registers nothing in the command.
+  words = [sys.executable, "-m", "palpate", "serve", "--port", "0", "-o", str(tmp_path / "out")]
+  pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+  with subprocess.Popen(words, **pipes) as process:
+    assert process.stdout
+    line = process.stdout.readline()
+    said = "" if line else process.communicate()[1]
+    assert line.startswith("page "), said
+    with urllib.request.urlopen(line.split()[1], timeout=ANSWER) as answer:
+      assert "<canvas" in answer.read().decode()
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=ANSWER)
+  assert (process.returncode, said) in ((0, ""), (130, ""))
 
 
 def test_an_exercise_by_a_device_from_the_command_line(tmp_path, capsys, monkeypatch):
