@@ -42,7 +42,10 @@ def register() -> int:
 
 
 def __getattr__(name: str):
-  """Brings `add_organ`, and with it what reads meshes, when it is asked for."""
+  """Brings what is asked for first: `add_organ`, with what reads meshes, and in the command all."""
+  if name in ("Organ", "add_windows"):
+    register()
+    return globals()[name]
   if name != "add_organ":
     raise AttributeError(f"module 'palpate' has no attribute {name!r}")
   from .authoring import add_organ

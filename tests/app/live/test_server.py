@@ -301,16 +301,24 @@ def test_wrong_options_are_one_line(words, said, capsys):
 
 
 def test_the_command_serves_until_it_is_interrupted(tmp_path):
-  # In a process of its own: `import palpate` registers nothing in the command.
-  words = [sys.executable, "-m", "palpate", "serve", "--port", "0", "-o", str(tmp_path / "out")]
+  # As installed: `import palpate` registers nothing in a program of that name, nor in its workers.
+  script = tmp_path / "palpate"
+  script.write_text(
+    "import sys\nfrom palpate.app.cli import main\nif __name__ == '__main__':\n  sys.exit(main())\n"
+  )
+  words = [sys.executable, script, "serve", "--port", "0", "-o", tmp_path / "out"]
   pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
   with subprocess.Popen(words, **pipes) as process:
     assert process.stdout
     line = process.stdout.readline()
     said = "" if line else process.communicate()[1]
     assert line.startswith("page "), said
-    with urllib.request.urlopen(line.split()[1], timeout=ANSWER) as answer:
+    url = line.split()[1]
+    with urllib.request.urlopen(url, timeout=ANSWER) as answer:
       assert "<canvas" in answer.read().decode()
+    way = url.replace("http", "ws", 1) + "socket"
+    with connect(way, origin=url.rstrip("/"), open_timeout=30) as page:
+      assert "touch/easy" in hear(page, "menu")[0]["tasks"]
     process.send_signal(signal.SIGINT)
     _, said = process.communicate(timeout=ANSWER)
   assert (process.returncode, said) in ((0, ""), (130, ""))
