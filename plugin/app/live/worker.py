@@ -16,6 +16,7 @@ from typing import Any
 
 import palpate
 
+from ..trainee.keeping import Keeping, references
 from . import devices, picture
 from .coach import Coach, card
 from .coupling import Options
@@ -28,17 +29,18 @@ SPEEDS = (0.1, 0.25, 0.5, 1.0)
 _STATUS = 0.1  # between words about the exercise [s]
 
 
-def main(conn: Connection, folder: str, device: str) -> None:
+def main(conn: Connection, folder: str, device: str, kept: Keeping | None = None) -> None:
   """Serves one page until it says `end`.
 
   Args:
     conn: to the server
     folder: where recordings are kept
     device: name of the device; one of the page's own is moved by its messages
+    kept: the record that recordings go to, None for the folder
   """
   palpate.register()
   try:
-    Worker(conn, pathlib.Path(folder), device).serve()
+    Worker(conn, pathlib.Path(folder), device, kept).serve()
   except KeyboardInterrupt:
     pass
 
@@ -46,8 +48,12 @@ def main(conn: Connection, folder: str, device: str) -> None:
 class Worker:
   """Runs the exercises that a page asks for, one after another."""
 
-  def __init__(self, conn: Connection, folder: pathlib.Path, device: str):
+  def __init__(
+    self, conn: Connection, folder: pathlib.Path, device: str, kept: Keeping | None = None
+  ):
     """Takes the arguments of `main`."""
+    self._kept = kept
+    self._use: Any = kept.session() if kept else None
     self._conn, self._folder, self._device = conn, folder, device
     self._jobs: queue.SimpleQueue[dict | None] = queue.SimpleQueue()
     self._session: Session | None = None
@@ -161,8 +167,10 @@ class Worker:
   # Exercises.
 
   def _exercise(self, job: dict[str, Any]) -> None:
-    from palpate.tasks import score, suite
+    from palpate.tasks import suite
 
+    if self._kept:
+      self._kept.check(job["task"])
     kwargs = {"input": "handle", "observations": ["joints"]}
     kwargs |= {"nodes": job["nodes"]} if job["nodes"] else {}
     self._tell({"type": "loading", "task": job["task"]})
@@ -180,8 +188,14 @@ class Worker:
       recording = session.run()
     finally:
       self._session = self._desk = None
-    path, fault = self._keep(recording, job["task"])
-    shown = card(recording, score.reference(job["task"]))
+    known = references(self._kept.references if self._kept else None)
+    shown = card(recording, known(job["task"]))
+    if self._kept and (self._kept.trainee or job["person"]):
+      made = self._kept.keep(recording, self._use, job["person"])
+      path, fault = made.path, made.fault
+      shown["advice"] += made.said
+    else:
+      path, fault = self._keep(recording, job["task"])
     self._tell({"type": "card", "path": str(path), "fault": fault, **shown})
 
   def _open(self) -> Device:
