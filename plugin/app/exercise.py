@@ -243,8 +243,8 @@ def _write(job: _Job, recording: Any, report: bool) -> str:
     print(f"film       {job.film}")
   if job.keeping is None:
     return ""
-  kept = job.keeping.keep(recording, job.keeping.session())
-  print(f"recording  {kept.path}")
+  kept = job.keeping.begin().keep(recording)
+  print(f"recording  {kept.path or 'lost'}")
   print("\n".join(kept.said), end="\n" * bool(kept.said))
   return kept.fault
 

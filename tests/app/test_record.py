@@ -277,18 +277,19 @@ def test_what_is_no_record_is_left_alone(folder, capsys):
 def test_a_full_disk_is_named_and_loses_nothing(folder, tmp_path):
   """A limit on the size of files: a large recording does not fit; then the database's log."""
   before = fill(folder, "Ada", 3)
-  keep = keeping.Keeping(folder, "Ada")
+  keep = keeping.Keeping(folder, "Ada").begin().keep
   large, limit = made(9, samples=3000), resource.getrlimit(resource.RLIMIT_FSIZE)
   try:
     resource.setrlimit(resource.RLIMIT_FSIZE, (40_000, limit[1]))
-    with pytest.raises(Exception, match=r"not kept: .*File too large.*cannot write"):
-      keep.keep(large, Session())  # nor is there room among the temporary files
+    kept = keep(large)
+    assert re.search("not kept in .*File too large; nor among the temporary files", kept.fault)
+    assert kept.path is None
     assert episodes(folder, "Ada") == before
     with Record(folder):  # while it is open, the write-ahead log grows
       for k in range(3, 9):
-        kept = keep.keep(made(k), Session())
-        assert folder in kept.path.parents
-      assert "disk I/O error" in kept.fault and "is kept, its row follows" in kept.fault
+        kept = keep(made(k))
+        assert folder in kept.path.parents and not kept.fault
+      assert "disk I/O error" in kept.said[0] and "is kept, its row follows" in kept.said[0]
     assert Recording.load(kept.path).info["seed"] == 8
   finally:
     resource.setrlimit(resource.RLIMIT_FSIZE, limit)
@@ -301,7 +302,7 @@ def test_a_recording_that_cannot_be_kept_goes_elsewhere(folder, monkeypatch):
   fill(folder, "Ada", 1)
   (folder / database.FILE).unlink()
   (folder / database.FILE).mkdir()  # nothing can be opened there
-  kept = keeping.Keeping(folder, "Ada").keep(made(1), Session())
+  kept = keeping.Keeping(folder, "Ada").begin().keep(made(1))
   assert kept.fault.startswith(f"not kept in {folder}: ")
   assert Recording.load(kept.path).info["seed"] == 1 and folder not in kept.path.parents
 
@@ -322,7 +323,7 @@ def test_a_name_on_a_page_adds_and_tells_nothing(folder):
   fill(folder, "Ada", 3)
   keep = keeping.Keeping(folder)
   for name in ("Ada", "New"):
-    kept = keep.keep(made(1, person=name), Session(), name)
+    kept = keep.begin().keep(made(1, person=name), name)
     assert (kept.said, kept.fault) == ((), "")
     assert "person" not in Recording.load(kept.path).info
   assert len(episodes(folder, "Ada")) == 4 and len(episodes(folder, "New")) == 1
@@ -339,7 +340,7 @@ def test_what_the_coach_said_and_errors(folder):
     broken = dataclasses.replace(made(2), info={"task": 3, "seed": "x", "coach": "y"})
     last = record.keep(person, broken, Session(), KNOWN)
   assert (last.task, last.seed, last.outcome) == ("3", None, "not recorded")
-  kept = keeping.Keeping(folder, "Ada").keep(made(5), Session())
+  kept = keeping.Keeping(folder, "Ada").begin().keep(made(5))
   assert kept.said[0].startswith("Attempt 2 at touch/easy")  # an error is no attempt
 
 

@@ -51,7 +51,7 @@ _SCHEMA = (
 )
 
 
-class RecordError(Exception):
+class RecordError(RuntimeError):
   """Something about a record that people should know, in one line."""
 
 

@@ -11,7 +11,7 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from ..console import CommandError, writing
+from ..console import CommandError
 
 if TYPE_CHECKING:
   from palpate.tasks.limits import Lookup
@@ -87,12 +87,12 @@ class Kept:
   """What became of a recording.
 
   Attributes:
-    path: where it is
-    fault: why it is not in the record, or its row is missing; empty where all went well
+    path: where it is, None where it could not be kept anywhere
+    fault: why it is not in the record; empty where it is
     said: what it means for the person, in sentences
   """
 
-  path: pathlib.Path
+  path: pathlib.Path | None
   fault: str = ""
   said: tuple[str, ...] = ()
 
@@ -117,7 +117,7 @@ class Keeping:
     return f"{self.folder}, of {self.trainee or 'the name on the page'}"
 
   def check(self, task: str) -> None:
-    """Raises ValueError unless the task is open to the trainee."""
+    """Raises ValueError unless the task is open to the trainee, RecordError without a record."""
     from palpate.tasks import curriculum
 
     from . import history
@@ -125,7 +125,7 @@ class Keeping:
 
     if not (task and self.trainee) or self.any_task:
       return
-    with one_line(), Record(self.folder) as record:
+    with Record(self.folder) as record:
       person = record.find(self.trainee)
       met = curriculum.done(history.passed(record.episodes(person)))
     if before := curriculum.locked(task, met):
@@ -134,13 +134,28 @@ class Keeping:
         f"{curriculum.RULE}; --any-task does not ask"
       )
 
-  def session(self) -> Session:
-    """Returns a new session, of one use of the program."""
+  def begin(self) -> Sitting:
+    """Returns a use of the program, which is a session of the record."""
     from .record import Session
 
-    return Session()
+    return Sitting(self, Session(), references(self.references))
 
-  def keep(self, recording: Recording, session: Session, person: str = "") -> Kept:
+
+@dataclasses.dataclass(frozen=True)
+class Sitting:
+  """One use of the program: what is kept in it is of one session.
+
+  Attributes:
+    keeping: where
+    session: of the record
+    references: what finds the references of tasks
+  """
+
+  keeping: Keeping
+  session: Session
+  references: Lookup
+
+  def keep(self, recording: Recording, person: str = "") -> Kept:
     """Keeps a recording, in the record or, where that cannot be, among the temporary files.
 
     What is said tells of the person's other exercises, and only where there is a `trainee`: who
@@ -148,26 +163,28 @@ class Keeping:
 
     Args:
       recording: of an exercise that ended
-      session: of this use of the program
       person: who did it, where there is no `trainee`; added to the record if new
     """
     from .database import PendingError, RecordError
     from .record import Record
 
-    known = references(self.references)
+    folder, trainee = self.keeping.folder, self.keeping.trainee
     try:
-      with Record(self.folder, known) as record:
-        who = record.find(self.trainee) if self.trainee else record.add(person)
-        episode = record.keep(who, recording, session, known)
-        said = _progress(record.episodes(who), episode.task) if self.trainee else ()
+      with Record(folder, self.references) as record:
+        who = record.find(trainee) if trainee else record.add(person)
+        episode = record.keep(who, recording, self.session, self.references)
+        said = _progress(record.episodes(who), episode.task) if trainee else ()
         tell(record)
         return Kept(record.path(episode), "", said)
     except PendingError as error:
-      return Kept(error.path, str(error))
+      return Kept(error.path, "", (str(error),))
     except (RecordError, ValueError) as error:
+      fault = f"not kept in {folder}: {error}"
+    try:
       spare = pathlib.Path(tempfile.mkdtemp(prefix="palpate-")) / "recording.npz"
-      with writing(spare, f"not kept: {error}; "):
-        return Kept(recording.save(spare), f"not kept in {self.folder}: {error}")
+      return Kept(recording.save(spare), fault)
+    except OSError as error:
+      return Kept(None, f"{fault}; nor among the temporary files: {error.strerror or error}")
 
 
 def read(args: argparse.Namespace, task: str = "", pages: bool = False) -> Keeping | None:
