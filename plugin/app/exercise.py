@@ -120,7 +120,7 @@ def _page(args: argparse.Namespace) -> int:
     name = "/".join(suite.split(args.task))
   except ValueError as error:
     raise CommandError(str(error)) from None
-  kept = keeping.read(args, name)
+  kept = keeping.read(args, name, pages=True)
   out = pathlib.Path(args.out or "out/live")
   return serve.run(out, device=args.device, task=name, kept=kept)
 

@@ -91,7 +91,8 @@ def run(
   thread = threading.Thread(target=server.run, daemon=True)
   with Interrupt() as interrupt:
     thread.start()
-    print(f"page       {url}\nrecordings {kept or folder}\nCtrl-C ends", flush=True)
+    place = kept if kept and kept.folder else folder
+    print(f"page       {url}\nrecordings {place}\nCtrl-C ends", flush=True)
     if show:
       webbrowser.open(url)
     while not interrupt.seen and thread.is_alive():

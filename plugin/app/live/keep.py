@@ -41,7 +41,7 @@ class Finished:
     if self.path is not None and not self.fault:
       return True
     person = str(self.recording.info.get("person", ""))
-    if record is not None and (record.keeping.trainee or person):
+    if record is not None and record.keeping.knows(person):
       kept = record.keep(self.recording, person)
       self.path, self.fault, self.said = kept.path or self.path, kept.fault, kept.said
       return self.path is not None

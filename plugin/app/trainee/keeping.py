@@ -102,13 +102,13 @@ class Keeping:
   """Where exercises are kept, and whose they are; goes to other processes as it is.
 
   Attributes:
-    folder: of the record
+    folder: of the record, None without one
     trainee: who does them all; empty where each exercise says who does it
     references: file of references, None for those that ship
     any_task: whether exercises that are not open to the trainee may be done
   """
 
-  folder: pathlib.Path
+  folder: pathlib.Path | None
   trainee: str = ""
   references: str | None = None
   any_task: bool = False
@@ -123,7 +123,7 @@ class Keeping:
     from . import history
     from .record import Record
 
-    if not (task and self.trainee) or self.any_task:
+    if self.folder is None or not (task and self.trainee) or self.any_task:
       return
     with Record(self.folder) as record:
       person = record.find(self.trainee)
@@ -133,6 +133,10 @@ class Keeping:
         f"task is {task!r}, which is not open to {person.name!r} yet: {before} comes first, "
         f"{curriculum.RULE}; --any-task does not ask"
       )
+
+  def knows(self, person: str) -> bool:
+    """Returns whether what a person did goes to a record; a trainee does everything."""
+    return self.folder is not None and bool(self.trainee or person)
 
   def begin(self) -> Sitting:
     """Returns a use of the program, which is a session of the record."""
@@ -169,6 +173,7 @@ class Sitting:
     from .record import Record
 
     folder, trainee = self.keeping.folder, self.keeping.trainee
+    assert folder is not None, "there is no record"
     try:
       with Record(folder, self.references) as record:
         who = record.find(trainee) if trainee else record.add(person)
@@ -188,7 +193,7 @@ class Sitting:
 
 
 def read(args: argparse.Namespace, task: str = "", pages: bool = False) -> Keeping | None:
-  """Returns what the options of `add_arguments` say; None where nothing is kept.
+  """Returns what the options of `add_arguments` say; None where that is nothing.
 
   CommandError says what is wrong with them, and whether the task is not open to the trainee.
 
@@ -204,7 +209,7 @@ def read(args: argparse.Namespace, task: str = "", pages: bool = False) -> Keepi
     for name, given in (("record", args.record is not None), ("any-task", args.any_task)):
       if given:
         raise CommandError(f"{name} is given without --trainee")
-    return None
+    return Keeping(None, references=args.references) if pages and args.references else None
   name = ""
   with one_line():
     if args.trainee is None:

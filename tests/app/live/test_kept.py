@@ -77,6 +77,15 @@ def test_an_exercise_on_the_page_is_kept_and_what_is_locked_refused(page, folder
   assert len({e.session for e in done}) == 1 and done[0].performer == "device:mouse"
 
 
+def test_references_need_no_record(page, tmp_path):
+  reference = limits.lookup()("touch/easy")
+  lax = reference | {"metrics": {"time": reference["metrics"]["time"] | {"limit": 1e-9}}}
+  (tmp_path / "own.json").write_text(limits.to_json({"touch/easy": lax}))
+  card = do(page(keeping.Keeping(None, references=str(tmp_path / "own.json"))), task="touch/easy")
+  assert pathlib.Path(card["path"]).parent == tmp_path / "live"
+  assert [row["label"] for row in card["rows"] if row["over"]] == ["Time to completion"]
+
+
 def test_a_name_on_a_page_is_kept_apart_and_nothing_is_told(page, folder, tmp_path):
   one = page(keeping.Keeping(folder))
   cards = [do(one, task="touch/easy", person=name) for name in ("Ada", "Bo", "")]
