@@ -227,12 +227,12 @@ def test_two_writers_keep_all(folder):
   processes = []
   for name in ("Ada", "Bo"):
     words = {"path": [str(pathlib.Path(__file__).parent)], "folder": str(folder), "name": name}
-    script = WRITER.format(**words, count=15)
+    script = WRITER.format(**words, count=8)
     processes.append(subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE))
   for process in processes:
-    assert process.communicate()[0].split()[-1] == b"14" and process.returncode == 0
+    assert process.communicate()[0].split()[-1] == b"7" and process.returncode == 0
   for name in ("Ada", "Bo"):
-    assert [e.seed for e in episodes(folder, name)] == list(range(15))
+    assert [e.seed for e in episodes(folder, name)] == list(range(8))
 
 
 @pytest.mark.parametrize("damage", ["text", "cut", "page"])

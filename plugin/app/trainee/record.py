@@ -380,5 +380,6 @@ def _episode(row: tuple) -> Episode:
     for name, number in found["values"].items()
     if name in METRICS  # not one of another version's
   }
-  head: tuple = outcome, value, bool(proficient), bool(assessment), Metrics(**values)
-  return Episode(*head, *middle, json.loads(versions))
+  head = [outcome, value, bool(proficient), bool(assessment), Metrics(**values)]
+  columns: list[Any] = [*head, *middle, json.loads(versions)]
+  return Episode(*columns)
