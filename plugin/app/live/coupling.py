@@ -338,6 +338,8 @@ class Link:
       wrench: force [N] and torque [N m] on the handle, in the world  (6,)
     """
     device, options = self.device, self.options
+    if not math.isfinite(sum(wrench)):  # of a motion that diverged
+      return self.quiet()
     if not device.force_limit or self.state != "ready":
       self.force = STILL
       return

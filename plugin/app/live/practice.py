@@ -137,8 +137,8 @@ class Practice:
   def _restart(self) -> None:
     mj.mj_resetDataKeyframe(self.model, self.data, self.model.key(KEY).id)
     self.organ.reset()
-    self._loop.attach()
     mj.mj_forward(self.model, self.data)
+    self._loop.attach()
 
   def _note(self, fault: str) -> None:
     if fault and (not self.faults or self.faults[-1] != fault):

@@ -130,6 +130,16 @@ def test_forces_come_by_a_ramp_and_stay_below_the_limits(model):
   assert hand.force == (0.0, 0.0, 0.0)  # after the end
 
 
+def test_a_motion_that_diverges_is_not_felt(model):
+  hand = live.Hand(lambda t: (0, 0, -0.02))
+  loop = couple(model, start(model), hand, ramp=0.0)
+  loop.run(0.1)
+  loop.links[0].feel([0.05] * 6)
+  assert np.linalg.norm(hand.force) > 0.01
+  loop.links[0].feel([math.nan] * 6)
+  assert hand.force == (0.0, 0.0, 0.0)
+
+
 def test_orientation_turns_the_shaft_and_is_felt(model):
   data = start(model)
   shaft = data.site("probe/tip").xmat.reshape(3, 3)[:, 2].copy()
