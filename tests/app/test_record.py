@@ -158,12 +158,13 @@ def test_deletion_leaves_nothing(folder, capsys):
   kept = fill(folder, "Ada", 2)
   with Record(folder) as record:
     ident = record.find(name).id
-  with Record(folder):  # a reader that is there has a write-ahead log open
-    said = say(capsys, "trainee", "delete", name, code=2)
-    assert "6 episodes" in said and "nothing is deleted without --yes" in said
-  said = say(capsys, "trainee", "delete", name, "--yes")
+  said = say(capsys, "trainee", "delete", name, code=2)
+  assert "6 episodes" in said and "nothing is deleted without --yes" in said
+  with Record(folder):  # another program has it open, and with it the write-ahead log
+    said = say(capsys, "trainee", "delete", name, "--yes")
+    left = everything(folder)
   assert "6 episodes in 1 sessions, 7 files" in said
-  left = everything(folder)
+  left += everything(folder)
   assert name.encode() not in left and b"Hopper" not in left and ident.encode() not in left
   assert [e.path for e in episodes(folder, "Ada")] == [e.path for e in kept]
   assert all((folder / e.path).is_file() for e in kept)
@@ -317,6 +318,37 @@ def test_a_path_in_the_database_cannot_lead_out(folder, tmp_path, capsys):
   assert "'../../secret' is outside" in say(capsys, "trainee", "export", "Ada", "-o", "a", code=1)
   assert cli.main(["trainee", "delete", "Ada", "--yes"]) == 0
   assert (tmp_path / "secret").read_text() == "mine"
+
+
+def test_a_foreign_recording_is_named_and_harms_nothing(folder):
+  (first, *_) = fill(folder, "Ada", 2)
+  place = (folder / first.path).parent
+  (place / "broken.npz").write_bytes(b"PK broken")
+  odd = {"coach": {"hints": 5}, "record": {"session": first.session, "ended": 3}, "task": None}
+  made(7, **odd).save(place / "odd.npz")
+  (folder / "recordings" / "notes").mkdir()
+  with Record(folder, KNOWN) as record:
+    assert [text for text in record.said if "broken.npz: not entered" in text]
+    bo = record.add("Bo")
+    made(8, record={"session": first.session}).save(folder / "recordings" / bo.id / "theirs.npz")
+  with Record(folder, KNOWN) as record:
+    assert [e.seed for e in record.episodes(record.find("Ada"))] == [0, 1, 7]
+    (other,) = record.episodes(record.find("Bo"))
+    assert other.seed == 8 and other.session != first.session
+
+
+def test_a_page_shows_what_was_typed_as_text(folder, capsys, tmp_path):
+  pytest.importorskip("matplotlib")
+  name = "<script>alert('x')</script> & $\\frac{1"
+  fill(folder, name, 2, task="touch/<b>easy</b>")
+  with Record(folder, KNOWN) as record:
+    record.add("nothing yet")
+  say(capsys, "trainee", "show", name, "-o", "a.html")
+  page = (tmp_path / "a.html").read_text()
+  assert "<script" not in page and "<b>easy" not in page and "&lt;script&gt;" in page
+  assert "0 exercises done, next is touch/easy" in say(
+    capsys, "trainee", "show", "nothing yet", "-o", "b.html"
+  )
 
 
 def test_a_name_on_a_page_adds_and_tells_nothing(folder):

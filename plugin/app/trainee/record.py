@@ -277,8 +277,8 @@ class Record:
         try:
           self._enter(person, path, Recording.load(path), references)
           count += 1
-        except (ValueError, OSError) as error:
-          self.said.append(f"not entered: {error}")
+        except (ValueError, TypeError, KeyError, OSError) as error:  # whoever put it there
+          self.said.append(f"{path}: not entered: {error}")
     if count:
       self.said.append(f"{count} recordings had no row in {self._path}, they have now")
 
@@ -353,7 +353,8 @@ def _facts(recording: Recording, references: Lookup) -> dict[str, Any]:
   """Returns the columns of a recording's row that follow from it."""
   info, metrics = recording.info, recording.metrics()
   task, coach = str(info.get("task", "")), info.get("coach")
-  coach = coach if isinstance(coach, dict) else {"assessment": True, "hints": []}
+  coach = coach if isinstance(coach, dict) else {"assessment": True}
+  hints = coach.get("hints")
   reference = references(task)
   judged = None if reference is None else score(metrics, reference, recording.outcome)
   seed = info.get("seed")
@@ -366,7 +367,7 @@ def _facts(recording: Recording, references: Lookup) -> dict[str, Any]:
     "score": judged.composite if judged and math.isfinite(judged.composite) else None,
     "proficient": judged is not None and judged.proficient,
     "assessment": coach.get("assessment") is True,
-    "hints": len(coach.get("hints") or []),
+    "hints": len(hints) if isinstance(hints, list) else 0,
     "metrics": json.dumps({"values": values, "unknown": metrics.reasons()}, allow_nan=False),
     "versions": json.dumps({k: str(info[k]) for k in ("palpate", "mujoco") if k in info}),
   }

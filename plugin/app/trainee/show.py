@@ -10,7 +10,9 @@ from ..console import CommandError, output, writing
 from . import history, keeping
 
 if TYPE_CHECKING:
-  from .record import Episode, Trainee
+  from palpate.tasks.limits import Lookup
+
+  from .record import Episode
 
 
 def add_arguments(parser: argparse.ArgumentParser):
@@ -43,19 +45,20 @@ def main(args: argparse.Namespace) -> int:
       episodes = record.episodes(person)
   if args.references:
     episodes = history.judged(episodes, known)
+  then = _next(episodes)
   attempts = history.attempts(episodes, args.assessments)
   if absent := [task for task in args.task if task not in attempts]:
     done = ", ".join(attempts) or "nothing"
     raise CommandError(f"task is {absent[0]!r}, {person.name!r} has done {done}")
   shown = {task: attempts[task] for task in args.task or attempts}
-  print(summary(person, attempts, shown))
+  print(summary(f"{person.name}, {then}", shown))
   if path is None:
     return 0
   try:
     if path.suffix.lower() == ".png":
       data = _picture(shown, known, metrics)
     else:
-      data = page(person, attempts, shown, known, metrics).encode()
+      data = page(person.name, then, shown, known, metrics).encode()
   except ImportError as error:
     raise CommandError(f"{error}; install palpate[plot]", code=1) from None
   with writing(path):
@@ -65,13 +68,9 @@ def main(args: argparse.Namespace) -> int:
   return 0
 
 
-def summary(
-  person: Trainee,
-  attempts: Mapping[str, Sequence[Episode]],
-  shown: Mapping[str, Sequence[Episode]],
-) -> str:
+def summary(head: str, shown: Mapping[str, Sequence[Episode]]) -> str:
   """Returns the standing in words, for a terminal."""
-  lines = [f"{person.name}, {_next(attempts)}"]
+  lines = [head]
   if shown:
     lines.append(f"{'':22} attempts success proficient")
   for task, done in shown.items():
@@ -97,16 +96,18 @@ def standing(done: Sequence[Episode]) -> tuple[str, str]:
   return rule, f"CUSUM: {word} attempt {crossed[-1]}"
 
 
-def _next(attempts: Mapping[str, Sequence[Episode]]) -> str:
+def _next(episodes: Sequence[Episode]) -> str:
   """Returns what to do next, in words."""
   from palpate.tasks import curriculum
 
-  met = curriculum.done({task: [e.proficient for e in done] for task, done in attempts.items()})
+  met = curriculum.done(history.passed(episodes))
   then = curriculum.following(met)
   return f"{len(met)} exercises done, " + (f"next is {then}" if then else "nothing is left")
 
 
-def _picture(shown, known, metrics: Sequence[str]) -> bytes:
+def _picture(
+  shown: Mapping[str, Sequence[Episode]], known: Lookup, metrics: Sequence[str]
+) -> bytes:
   """Returns the plots of the one task that is shown, PNG."""
   from palpate.tasks import curves, plots
 
@@ -117,12 +118,25 @@ def _picture(shown, known, metrics: Sequence[str]) -> bytes:
   return plots.png(curves.learning_figure(done, known(task), metrics))
 
 
-def page(person: Trainee, attempts, shown, known, metrics: Sequence[str]) -> str:
-  """Returns the page: arguments as in `main`."""
+def page(
+  name: str,
+  then: str,
+  shown: Mapping[str, Sequence[Episode]],
+  known: Lookup,
+  metrics: Sequence[str],
+) -> str:
+  """Returns the page.
+
+  Args:
+    name: of the person
+    then: what is next, in words
+    shown: task -> attempts
+    known: what finds the references of tasks
+    metrics: names of those that are drawn
+  """
   from palpate.tasks import curriculum, curves, cusum, page, plots
 
-  head = f"<p class='outcome'>{page.text(_next(attempts))}</p>"
-  body = [f"<h1>{page.text(person.name)}</h1>", head]
+  body = [f"<h1>{page.text(name)}</h1>", f"<p class='outcome'>{page.text(then)}</p>"]
   rows = []
   for task, done in shown.items():
     wins, good = (sum(e.outcome == "success" for e in done), sum(e.proficient for e in done))
@@ -145,4 +159,4 @@ def page(person: Trainee, attempts, shown, known, metrics: Sequence[str]) -> str
     f"fails at the unacceptable rate is called competent within 30 attempts with a chance of "
     f"{risk:.2g} %, who fails at the acceptable one with {find:.2g} %.</p>"
   )
-  return page.document(f"{person.name}: learning curves", body)
+  return page.document(f"{name}: learning curves", body)
