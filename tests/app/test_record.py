@@ -346,7 +346,7 @@ def test_a_page_shows_what_was_typed_as_text(folder, capsys, tmp_path):
   say(capsys, "trainee", "show", name, "-o", "a.html")
   page = (tmp_path / "a.html").read_text()
   assert "<script" not in page and "<b>easy" not in page and "&lt;script&gt;" in page
-  assert "0 exercises done, next is touch/easy" in say(
+  assert "exercises done: 0, next is touch/easy" in say(
     capsys, "trainee", "show", "nothing yet", "-o", "b.html"
   )
 

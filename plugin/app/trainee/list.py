@@ -25,5 +25,5 @@ def main(args: argparse.Namespace) -> int:
       last = f", last {episodes[-1].ended[:10]}" if episodes else ""
       count = f"{len(episodes)} episode{'' if len(episodes) == 1 else 's'}{last}"
       then = curriculum.following(met) or "none"
-      print(f"{person.name:24} {count}; {len(met)} exercises done, next {then}")
+      print(f"{person.name:24} {count}; exercises done: {len(met)}, next {then}")
   return 0

@@ -102,7 +102,7 @@ def _next(episodes: Sequence[Episode]) -> str:
 
   met = curriculum.done(history.passed(episodes))
   then = curriculum.following(met)
-  return f"{len(met)} exercises done, " + (f"next is {then}" if then else "nothing is left")
+  return f"exercises done: {len(met)}, " + (f"next is {then}" if then else "nothing is left")
 
 
 def _picture(
