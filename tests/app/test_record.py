@@ -11,6 +11,7 @@ import sqlite3
 import stat
 import subprocess
 import sys
+import tempfile
 import zipfile
 
 import numpy as np
@@ -52,6 +53,7 @@ def made(seed=0, task="touch/easy", outcome="success", samples=20, **info):
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
   monkeypatch.chdir(tmp_path)
+  monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
   return tmp_path / "out" / "record"
 
 
