@@ -107,6 +107,7 @@ class Task(control.Task):
     organ: str = ORGAN,
     input: str = "drives",
     nodes: int | None = None,
+    surroundings: str | None = None,
   ):
     """Makes the exercise.
 
@@ -128,12 +129,13 @@ class Task(control.Task):
       organ: name of the organ in it
       input: what an action moves: the instrument's position `drives`, or its `handle`
       nodes: of the organ, in place of the scene's
+      surroundings: what is drawn around it, `abdomen` or `none`; in place of the scene's
     """
     if reward not in REWARDS:
       raise ValueError(f"reward is {reward!r}, expected one of {', '.join(REWARDS)}")
     drawn = isinstance(random, np.random.RandomState)
     self.random: Any = random if drawn else np.random.RandomState(random)
-    self.scene, self.prefix = scenes.chosen(scene, input, nodes), f"{scene.instrument}/"
+    self.scene, self.prefix = scenes.chosen(scene, input, nodes, surroundings), f"{scene.instrument}/"
     self.force_limit, self.damage = float(force_limit), float(damage)
     self.spread, self.jitter, self.organ = spread, jitter, organ
     self.variants = (scene.variant,) if variants is None or model is not None else variants
