@@ -280,7 +280,7 @@ NAMES = tuple(ENTRIES)
 
 # Where organs are in the abdomen [m], in the liver's frame, with the source of each.
 PLACES: Mapping[str, tuple[tuple[float, float, float], str]] = {
-  "liver": ((0.0, 0.0, 0.0), "the frame; its vena cava and falciform ligament put the midline 1 cm left"),
+  "liver": ((0.0, 0.0, 0.0), "the frame: by vena cava and falciform ligament, midline 1 cm left"),
   "gallbladder": ((0.020, 0.008, -0.066), "ours: in the fossa of the liver's shape"),
   "stomach": (
     (-0.045, -0.040, -0.030),

@@ -271,6 +271,7 @@ def _ports(build: Build, instruments: Sequence[str]) -> str:
 
 
 def prefixes(instruments: Sequence[str]) -> list[str]:
+  """Returns the prefixes of the names of a scene's instruments."""
   if len(instruments) == 2 and instruments[0] == instruments[1]:
     return [f"right_{instruments[0]}/", f"left_{instruments[1]}/"]
   return [f"{instrument}/" for instrument in instruments]

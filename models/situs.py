@@ -21,7 +21,7 @@ from .scenery import Surface
 
 NAMES = ("liver", "gallbladder", "stomach")  # organs, in the order they are drawn
 CAMERA, LIGHT = "laparoscope", "endoscope"
-_GROUP = 2  # of the scenery
+GROUP = 2  # of the scenery
 _LEVELS = {"liver": 1, "gallbladder": 0, "stomach": 1}  # of the smooth surfaces of scenery
 # By eye after photographs of operations; a texture takes 14 % off.
 COLOURS = {
@@ -32,6 +32,8 @@ COLOURS = {
   "fat": (1.0, 0.84, 0.46, 1.0),
   "wall": (0.92, 0.56, 0.47, 1.0),
 }
+# Specular share of wet surfaces; by eye. Much of it turns yellow and pink ones green.
+_SHEEN = {"fat": 0.2, "wall": 0.15, "stomach": 0.35}
 # What the fixed renderer's light loses on its way, 1 at 15 cm: 0.55 + 0.45 (d / 15 cm)^2.
 _FADE = (0.55, 0.0, 0.45 / 0.15**2)
 _VIEW = ((0.0, 0.175, 0.135), (0.0, 0.03, 0.005))  # of `abdomen`'s camera: from, to [m]
@@ -195,12 +197,14 @@ def furnish(
     surface = scenery.tube(path, np.full(len(path), duct.diameter / 2))
     kind = "stomach" if name == "duodenum" else None
     skin = _material(spec, name, duct.rgba, kind, look)
-    lift = held.lifts.get("gallbladder", (0, 0, 0)) if name != "duodenum" else (0, 0, 0)
+    goes_with = "stomach" if name == "duodenum" else "gallbladder"
+    lift = held.lifts.get(goes_with, (0, 0, 0))
     _draw(spec, name, surface, skin, np.array(lift) - origin)
   fat = scenery.sheet(_fat, (-0.17, -0.06), (0.15, 0.27), (54, 56))
-  _draw(spec, "fat", fat, _material(spec, "fat", COLOURS["fat"], "fat", look, 2), [0, 0, held.fat] - origin)
+  skin = _material(spec, "fat", COLOURS["fat"], "fat", look, 2)
+  _draw(spec, "fat", fat, skin, [0, 0, held.fat] - origin)
   wall = scenery.shell((-0.01, 0.09, 0.035), (0.175, 0.21, 0.175), 2.4, (44, 30))
-  _draw(spec, "wall", wall, _material(spec, "wall", COLOURS["wall"], "wall", look, 1), -origin)
+  _draw(spec, "wall", wall, _material(spec, "wall", COLOURS["wall"], "wall", look), -origin)
 
 
 def _fat(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -242,7 +246,7 @@ def _material(spec, name: str, rgba, kind: str | None, look: int, repeat: float 
   name = f"abdomen_{name}"
   if spec.material(name) is not None:
     return name
-  made = spec.add_material(name=name, rgba=rgba, specular=0.55, shininess=0.75)
+  made = spec.add_material(name=name, rgba=rgba, specular=_SHEEN.get(kind, 0.5), shininess=0.75)
   made.texrepeat = [repeat, repeat]
   if kind is not None:
     paper = f"abdomen_{kind}"
@@ -278,7 +282,7 @@ def _draw(spec, name: str, surface: Surface, material: str, pos) -> None:
     meshname=f"abdomen_{name}",
     material=material,
     pos=pos,
-    group=_GROUP,
+    group=GROUP,
     contype=0,
     conaffinity=0,
     mass=0.0,

@@ -55,7 +55,8 @@ def add_skin(
   points = smooth(rest)
   above = np.broadcast_to(np.asarray(height, float), (count,))
   points = points + above[:, None] * vertex_normals(points, smooth.elem)
-  look = {"rgba": flex.rgba, "material": material or flex.material}
+  # A colour of its own would count, not the material's.
+  look = {"material": material} if material else {"rgba": flex.rgba, "material": flex.material}
   if texcoord is not None:
     look["texcoord"] = _fine(organ, texcoord, smooth, len(rest), count).ravel()
   skin = spec.add_skin(

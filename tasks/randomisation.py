@@ -84,9 +84,11 @@ def _light_pos(physics: Physics, place: stage.Stage, shift: np.ndarray) -> None:
 def _colour(physics: Physics, place: stage.Stage, change: np.ndarray) -> None:
   model = place.model
   flex, skin = mj.mj_name2id(model, mj.mjtObj.mjOBJ_FLEX, physics.organ_name), physics.organ.skin
-  of_skin = -1 if skin is None else int(model.skin_matid[skin])
-  for material in {int(model.flex_matid[flex]), of_skin}:
-    rgba = model.flex_rgba[flex] if material < 0 else model.mat_rgba[material]
+  shown = {int(model.flex_matid[flex]): model.flex_rgba[flex]}
+  if skin is not None:
+    shown[int(model.skin_matid[skin])] = model.skin_rgba[skin]
+  for material, own in shown.items():
+    rgba = own if material < 0 else model.mat_rgba[material]
     rgba[:3] = np.clip(rgba[:3] + change, 0, 1)
 
 

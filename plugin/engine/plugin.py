@@ -15,11 +15,7 @@ import mujoco
 import numpy as np
 from palpate.tissue.config import KEYS
 
-<<<<<<< HEAD
-from . import change, fasten, guard, mjstruct, rests, skin, weights, windowed, workspace
-=======
-from . import adhere, change, fasten, guard, mjstruct, rests, weights, windowed, workspace
->>>>>>> main
+from . import adhere, change, fasten, guard, mjstruct, rests, skin, weights, windowed, workspace
 from .layout import FLAG, STAGE
 from .mjstruct import NAME, warn
 from .workspace import Workspace

@@ -175,7 +175,9 @@ class Config:
     "is brought up to date by `Organ.sync` alone ([internals](internals.md#resident))",
   )
   skin: str = _row(
-    "", (_name, "the name of a skin"), "drawn for the organ: its surface made smooth (`add_skin`)"
+    "",
+    (reading.name, "the name of a skin"),
+    "drawn for the organ: its surface made smooth (`add_skin`)",
   )
   device: str = _row(
     "auto",
