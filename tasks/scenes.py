@@ -17,13 +17,15 @@ from collections.abc import Mapping
 import mujoco
 import numpy as np
 import palpate
-from palpate.models import catalog, mjcf, shapes, trocar
+from palpate.models import catalog, mjcf, scenery, shapes, situs, trocar
 from palpate.models.catalog import Tissue
 
 NOW, LATER = (1.0, 0.8, 0.1), (0.2, 0.75, 0.95)  # colours of targets
 ORGAN = "organ"
 CAMERA = "laparoscope"
+LIGHT = situs.LIGHT
 INPUTS = ("drives", "handle")
+SURROUNDINGS = ("abdomen", "none")
 # The organ's solref counts, not the instrument's: light nodes want stiff contacts.
 _CONTACT = {
   "condim": 3,
@@ -64,6 +66,7 @@ class Scene:
     inclusion: hidden stiff place: position in the world [m] (3), radius [m], factor on Young's
       modulus; None for healthy tissue. Without gravity: the organ would sag less where it is stiff
     handle: whether a handle pulls the instrument in place of position drives
+    surroundings: what is drawn around the organ, one of SURROUNDINGS; it touches nothing
   """
 
   organ: str = "liver"
@@ -76,17 +79,25 @@ class Scene:
   targets: int = 1
   inclusion: tuple[float, ...] | None = None
   handle: bool = False
+  surroundings: str = "abdomen"
 
 
-def chosen(scene: Scene, input: str, nodes: int | None) -> Scene:
+def chosen(scene: Scene, input: str, nodes: int | None, surroundings: str | None) -> Scene:
   """Returns a scene as it was asked for; arguments as of `base.Task`."""
+  if surroundings is None:
+    surroundings = scene.surroundings
+  if surroundings not in SURROUNDINGS:
+    choices = ", ".join(SURROUNDINGS)
+    raise ValueError(f"surroundings is {surroundings!r}, expected one of {choices}")
   if input not in INPUTS:
     raise ValueError(f"input is {input!r}, expected one of {', '.join(INPUTS)}")
   if nodes is None:
     nodes = scene.nodes
   if not (isinstance(nodes, int) and 100 <= nodes <= 20000):
     raise ValueError(f"nodes is {nodes!r}, expected a whole number in [100, 20000], or None")
-  return dataclasses.replace(scene, handle=input == "handle", nodes=nodes)
+  return dataclasses.replace(
+    scene, handle=input == "handle", nodes=nodes, surroundings=surroundings
+  )
 
 
 @functools.lru_cache(maxsize=32)
@@ -151,6 +162,9 @@ def build(scene: Scene) -> mujoco.MjSpec:
   trocar.attach(spec, scene.instrument, prefix, port, quat, scene.handle)
   slots = _SLOTS[scene.instrument] * max(1, -(-scene.nodes // 1000))
   palpate.add_windows(spec, ORGAN, nodes=slots)
+  if scene.surroundings == "abdomen":
+    uv = scenery.texcoord(scene.organ, vertices @ _TURN, triangles)
+    situs.surround(spec, ORGAN, scene.organ, uv, (center + scene.camera, center))
   return spec
 
 
