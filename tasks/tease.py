@@ -50,7 +50,7 @@ def standard(time_limit=60, random=None, environment_kwargs=None, **kwargs):
 @SUITE.add("benchmarking", "hard")
 def hard(time_limit=80, random=None, environment_kwargs=None, **kwargs):
   """Returns the task to free 70 % of a dense one with less force."""
-  kwargs = {"wanted": 0.7, "law": DENSE, "jitter": 0.005, "force_limit": 1.0, **kwargs}
+  kwargs = {"wanted": 0.7, "law": DENSE, "jitter": 0.005, "force_limit": 1.2, **kwargs}
   return base.make(Tease(SCENE, random, name="tease/hard", **kwargs), time_limit,
                    environment_kwargs)  # fmt: skip
 
