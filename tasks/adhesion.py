@@ -12,7 +12,8 @@ from . import scenes
 from .scenes import BED, Scene
 
 LENGTH, WIDTH, FLAP = 0.05, 0.024, 0.018  # of what lies, across, and of what stands [m]
-_BEND, _RISE = 0.01, 0.75  # radius of the bend from which it goes on straight, and how steep [m, rad]
+# Radius of the bend [m], and how steep the flap then goes on [rad].
+_BEND, _RISE = 0.01, 0.75
 _SKIN = 0.001  # radius of the flex [m]
 _NEAR = 0.0015  # distance from the bed at which it has grown on [m]
 # Ours: a sheet of peritoneum with some fat, as soft as the exercises' organs, of 3 g.
