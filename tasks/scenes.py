@@ -17,14 +17,16 @@ from collections.abc import Mapping
 import mujoco
 import numpy as np
 import palpate
-from palpate.models import catalog, mjcf, shapes, trocar
+from palpate.models import catalog, mjcf, scenery, shapes, situs, trocar
 from palpate.models.catalog import Tissue
 
 NOW, LATER = (1.0, 0.8, 0.1), (0.2, 0.75, 0.95)  # colours of targets
 ORGAN = "organ"
 BED = "bed"  # patch of the gallbladder, and the body that is in the liver's place
 CAMERA = "laparoscope"
+LIGHT = situs.LIGHT
 INPUTS = ("drives", "handle")
+SURROUNDINGS = ("abdomen", "none")
 # The organ's solref counts, not the instrument's: light nodes want stiff contacts.
 CONTACT = {
   "condim": 3,
@@ -69,6 +71,7 @@ class Scene:
     handle: whether a handle pulls the instrument in place of position drives
     bonds: stiffness [N/m^3], strength [Pa], energy [J/m^2] of what holds the organ in its bed; None
       where it is pinned there
+    surroundings: what is drawn around the organ, one of SURROUNDINGS; it touches nothing
   """
 
   organ: str = "liver"
@@ -82,17 +85,25 @@ class Scene:
   inclusion: tuple[float, ...] | None = None
   handle: bool = False
   bonds: tuple[float, float, float] | None = None
+  surroundings: str = "abdomen"
 
 
-def chosen(scene: Scene, input: str, nodes: int | None) -> Scene:
+def chosen(scene: Scene, input: str, nodes: int | None, surroundings: str | None) -> Scene:
   """Returns a scene as it was asked for; arguments as of `base.Task`."""
+  if surroundings is None:
+    surroundings = scene.surroundings
+  if surroundings not in SURROUNDINGS:
+    choices = ", ".join(SURROUNDINGS)
+    raise ValueError(f"surroundings is {surroundings!r}, expected one of {choices}")
   if input not in INPUTS:
     raise ValueError(f"input is {input!r}, expected one of {', '.join(INPUTS)}")
   if nodes is None:
     nodes = scene.nodes
   if not (isinstance(nodes, int) and 100 <= nodes <= 20000):
     raise ValueError(f"nodes is {nodes!r}, expected a whole number in [100, 20000], or None")
-  return dataclasses.replace(scene, handle=input == "handle", nodes=nodes)
+  return dataclasses.replace(
+    scene, handle=input == "handle", nodes=nodes, surroundings=surroundings
+  )
 
 
 @functools.lru_cache(maxsize=32)
@@ -169,6 +180,9 @@ def build(scene: Scene) -> mujoco.MjSpec:
   spec = furnish(scene, flex, center)
   if scene.inclusion is not None:
     spec.option.gravity = np.zeros(3)
+  if scene.surroundings == "abdomen":
+    uv = scenery.texcoord(scene.organ, vertices @ _TURN, triangles)
+    situs.surround(spec, ORGAN, scene.organ, uv, (center + scene.camera, center))
   return spec
 
 

@@ -26,7 +26,13 @@ from .scenes import Scene
 SUITE = containers.TaggedTasks()
 # Stiffness [N/m^3], strength [Pa] and energy [J/m^2]: ours, we know of no measurement.
 FILMY, DENSE = (1e7, 6e3, 6.0), (1e7, 8e3, 12.0)
-SCENE = Scene(organ="adhesion", nodes=250, port=(0.0, -0.13, 0.065), camera=(-0.07, -0.06, 0.06))
+SCENE = Scene(
+  organ="adhesion",
+  nodes=250,
+  port=(0.0, -0.13, 0.065),
+  camera=(-0.07, -0.06, 0.06),
+  surroundings="none",
+)
 # Of the expert: where the tip is over the bed and behind the front before a stroke, how far a
 # stroke goes beyond the front [m], how fast it is [m/s], and how wide a lane is [m].
 _OVER, _BEHIND, _BEYOND, _SPEED, _LANE = 0.0015, 0.006, 0.006, 0.03, 0.006
