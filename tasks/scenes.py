@@ -182,7 +182,9 @@ def build(scene: Scene) -> mujoco.MjSpec:
     spec.option.gravity = np.zeros(3)
   if scene.surroundings == "abdomen":
     uv = scenery.texcoord(scene.organ, vertices @ _TURN, triangles)
-    situs.surround(spec, ORGAN, scene.organ, uv, (center + scene.camera, center))
+    held = situs.Arrangement() if scene.bonds else None  # what it has grown on to is in its place
+    view = center + scene.camera, center
+    situs.surround(spec, ORGAN, scene.organ, uv, view, arrangement=held)
   return spec
 
 
