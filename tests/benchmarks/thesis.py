@@ -314,8 +314,8 @@ def summarize(rows: list[Row]) -> list[str]:
     f"Under 1 kHz: {', '.join(slow) or 'nothing'}. Slower than the thesis: "
     f"{'; '.join(behind) or 'nothing'}. Not stable at 1 ms: {', '.join(names) or 'nothing'}. Of "
     f"{len(held)} forces (every 20th cycle) while the node is held, {gone} are gone (figures 7.6 "
-    "to 7.14: [trace](thesis_trace.png), whose steps are the inertia of a tool of 20 g where the hand "
-    "starts and stops; rates: [rate](thesis_rate.png)).",
+    "to 7.14: [trace](thesis_trace.png), whose steps are the inertia of a tool of 20 g where the "
+    "hand starts and stops; rates: [rate](thesis_rate.png)).",
   ]
 
 
