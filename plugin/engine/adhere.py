@@ -141,7 +141,7 @@ def _group(w, vert, area, law, body, anchor, normal, other, corner, weight, decl
       f"organ {w.organ.name!r}: vertex {twice[0]} is bonded already, expected one bond a vertex"
     )
   slot = (np.cumsum(w.organ.free) - 1)[vert]
-  return Group(vert, slot, area, law, body, anchor, normal, other, corner, weight, declared)
+  return Group(w, vert, slot, area, law, body, anchor, normal, other, corner, weight, declared)
 
 
 def _free(w) -> np.ndarray:

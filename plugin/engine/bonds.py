@@ -19,6 +19,7 @@ from .hold import Beside, Bodies, Input, Nodes, may_move, nodes, solver
 from .layout import BOND
 
 ON_ORGAN = -1  # in place of a body
+_OF_GROUP = ("vert", "slot", "area", "anchor", "normal", "corner", "weight")
 
 
 @struct
@@ -64,6 +65,7 @@ class Group:
   """Bonds that were made together.
 
   Attributes:
+    own: workspace of the organ
     vert: vertices                                        (n,)
     slot: their rows in the plugin state                  (n,)
     area: of each [m^2]                                   (n,)
@@ -79,6 +81,7 @@ class Group:
     bonded: what they take
   """
 
+  own: Any
   vert: np.ndarray
   slot: np.ndarray
   area: np.ndarray
@@ -90,14 +93,36 @@ class Group:
   corner: np.ndarray
   weight: np.ndarray
   declared: bool
-  arrays: dict[str, wp.array] = dataclasses.field(default_factory=dict)
-  bonded: Any = None
+  arrays: dict[str, wp.array] = dataclasses.field(init=False)
+  bonded: Any = dataclasses.field(default=None, init=False)
 
   def __post_init__(self):
     n = len(self.vert)
     shapes = {"next": (n, len(BOND)), "stretch": (n, 3), "force": (n, 3), "hardness": n}
     self.arrays = {k: wp.zeros(s, dtype=wp.float64, device="cpu") for k, s in shapes.items()}
     self.arrays["live"] = wp.ones(1, dtype=int, device="cpu")
+
+  def bind(self, model: int):
+    """Points what the kernels take at the arrays of a model, in place: both organs launch them."""
+    w, other = self.own, self.other
+    m, scheme = mjstruct.Model.from_address(model), SCHEMES[w.config.integrator]
+    law = dict(zip(("stiffness", "strength", "energy"), self.law, strict=True))
+    values = law | {name: getattr(self, name) for name in _OF_GROUP} | self.arrays
+    values |= dict(
+      nbond=len(self.vert),
+      body=self.body,
+      restless=int(other is not None or may_move(m, self.body)),
+      ahead=float(scheme.ahead),
+      gain=scheme.gain(1.0, 0.0),
+      state=w.bonds.rows,
+      own=nodes(w),
+      solve=solver(w),
+      other=Nodes() if other is None else nodes(other),
+      below=Input() if other is None else solver(other),
+      number=w.body.numbers,
+      mj=coupling.mujoco_arrays(model, w.data, Bodies),
+    )
+    self.bonded = fill(Bonded, "cpu", values, into=self.bonded)
 
   def launch(self, kernel):
     """Launches one of the kernels above over it."""
@@ -138,9 +163,11 @@ class Bonds(Beside):
   @property
   def state(self) -> np.ndarray:
     """Damage and more of each vertex that moves, in the plugin state, (nfree, len(BOND))."""
-    return self._state().numpy()
+    return self.rows.numpy()
 
-  def _state(self) -> wp.array:
+  @property
+  def rows(self) -> wp.array:
+    """The same, as kernels take it."""
     w = self._w
     where, n = coupling.spans(w.organ)["bond"], coupling.sizes(w.organ)["nbond"]
     address = w.views["plugin_state"].ptr + 8 * where.start
@@ -152,29 +179,9 @@ class Bonds(Beside):
       _enter.load(wp.get_device("cpu"))
 
   def bind(self, model: int):
-    """See `Beside`."""
-    w = self._w
-    m, scheme = mjstruct.Model.from_address(model), SCHEMES[w.config.integrator]
-    for group in self.groups:
-      other = group.other
-      law = dict(zip(("stiffness", "strength", "energy"), group.law, strict=True))
-      arrays = {name: getattr(group, name) for name in _OF_GROUP}
-      values = law | arrays | group.arrays
-      values |= dict(
-        nbond=len(group.vert),
-        body=group.body,
-        restless=int(other is not None or may_move(m, group.body)),
-        ahead=float(scheme.ahead),
-        gain=scheme.gain(1.0, 0.0),
-        state=self._state(),
-        own=nodes(w),
-        solve=solver(w),
-        other=Nodes() if other is None else nodes(other),
-        below=Input() if other is None else solver(other),
-        number=w.body.numbers,
-        mj=coupling.mujoco_arrays(model, w.data, Bodies),
-      )
-      group.bonded = fill(Bonded, "cpu", values)
+    """See `Beside`; also those of other organs, which this one's graphs launch."""
+    for group in (*self.groups, *self.borne):
+      group.bind(model)
 
   def enter(self):
     """See `Beside`."""
@@ -195,5 +202,3 @@ class Bonds(Beside):
     for group in self.groups:
       group.launch(_keep)
 
-
-_OF_GROUP = ("vert", "slot", "area", "anchor", "normal", "corner", "weight")

@@ -43,7 +43,7 @@ def copy(w, model: int, other, twin):
     _change(w, model, other.config)
   w.bonds.let_go()
   for group in [g for g in other.bonds.groups if not g.declared]:
-    _put(w, dataclasses.replace(group, other=group.other and twin(group.other)))
+    _put(w, dataclasses.replace(group, own=w, other=group.other and twin(group.other)))
   if w.ties.groups or other.ties.groups:
     groups = [dataclasses.replace(g, other=g.other and twin(g.other)) for g in other.ties.groups]
     tie(w, model, groups)

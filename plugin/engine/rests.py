@@ -87,11 +87,15 @@ class Rests(Beside):
       _press.load(wp.get_device("cpu"))
 
   def bind(self, model: int):
-    """See `Beside`."""
+    """See `Beside`; also of organs that rest on this one, whose forces its graphs find."""
     if self.any:
       self._w.hold.need()
-    if not self:
-      return
+    for rests in (self, *(each.rests for each in self.above)):
+      if rests:
+        rests._bind(model)
+
+  def _bind(self, model: int):
+    """Points what the kernels take at the arrays of a model, in place: both organs launch them."""
     w, organ = self._w, self._w.organ
     m = mjstruct.Model.from_address(model)
     corner = organ.mesh.rest[organ.mesh.elem]
@@ -120,8 +124,13 @@ class Rests(Beside):
       slip=w.boxes["own"].slip,
       mj=coupling.mujoco_arrays(model, w.data, Bodies),
     )
-    self._alone = fill(Rest, "cpu", common | _nothing() | {"other": Nodes(), "below": Input()})
-    self._on = [fill(Rest, "cpu", common | self._other(m, other)) for other in self.below]
+    alone = common | _nothing() | {"other": Nodes(), "below": Input()}
+    self._alone = fill(Rest, "cpu", alone, into=self._alone)
+    self._on += [None] * (len(self.below) - len(self._on))
+    self._on = [
+      fill(Rest, "cpu", common | self._other(m, other), into=on)
+      for other, on in zip(self.below, self._on, strict=True)
+    ]
 
   def _geoms(self, m) -> np.ndarray:
     names, organ = _geom_names(m), self._w.organ

@@ -294,7 +294,9 @@ def allocate(kind: Any, device, sizes: dict[str, int], spare: tuple[str, ...] = 
   return out
 
 
-def fill(kind: Any, device, values: dict[str, Any], sizes: dict[str, int] | None = None):
+def fill(
+  kind: Any, device, values: dict[str, Any], sizes: dict[str, int] | None = None, into: Any = None
+):
   """Returns a struct with its fields from `values`, arrays copied to the device.
 
   Args:
@@ -302,8 +304,9 @@ def fill(kind: Any, device, values: dict[str, Any], sizes: dict[str, int] | None
     device: where the arrays are put
     values: numbers and arrays by field; others are left out
     sizes: named sizes that the arrays must have, or None where it has none
+    into: struct to fill anew, which graphs on the CPU may have recorded; None makes one
   """
-  out = kind()
+  out = kind() if into is None else into
   for name, var in kind.vars.items():
     value = values[name]
     if isinstance(value, np.ndarray):
