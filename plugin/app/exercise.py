@@ -30,8 +30,8 @@ def add_arguments(parser: argparse.ArgumentParser):
   add("task", metavar="TASK", nargs="?", help="such as touch/easy; a domain alone is its standard")
   add("--list", action="store_true", help="list the exercises and performers")
   add(
-    "--performer", metavar="NAME", default="expert",
-    help="expert, tremor, ..., keyboard, or a policy as module:object",
+    "--performer", metavar="NAME",
+    help="expert, tremor, ..., keyboard, or a policy as module:object (expert)",
   )  # fmt: skip
   add(
     "--device", metavar="NAME",
@@ -62,9 +62,8 @@ def main(args: argparse.Namespace) -> int:
 
   if args.list:
     return _list()
+  _check_who(args)
   if args.device:
-    if not args.task:
-      raise CommandError("device is given without a TASK; a replay needs none")
     from .live import devices
 
     try:
@@ -108,6 +107,26 @@ def main(args: argparse.Namespace) -> int:
       raise CommandError(f"the replay differs in {', '.join(changed)}", code=1)
     print("the replay is the same to the bit")
   return 0
+
+
+def _check_who(args: argparse.Namespace):
+  """Raises CommandError where the options do not agree on who does what."""
+  if args.device and not args.task:
+    raise CommandError("device is given without a TASK; a replay needs none")
+  if args.device and args.performer:
+    raise CommandError(f"performer is {args.performer!r} and device is {args.device!r}, expected "
+                       "one of them")  # fmt: skip
+  if args.trainee is None or args.replay:
+    return
+  if not (args.device or args.performer):
+    raise CommandError(
+      f"trainee is {args.trainee!r} without --device NAME: the expert's script would do it in "
+      "that name; --performer expert if that is meant"
+    )
+  if args.set:
+    raise CommandError(
+      f"set is {args.set[0]!r} with --trainee: an attempt is at the exercise as it is"
+    )
 
 
 def _page(args: argparse.Namespace) -> int:
@@ -205,16 +224,17 @@ def _perform(args: argparse.Namespace):
   name, task_kwargs = "/".join(suite.split(args.task)), options.read(args.set)
   if args.device:
     return name, _by_hand(args, name, task_kwargs)
-  info = {"task_kwargs": task_kwargs, "performer": args.performer}
-  if args.performer == "keyboard":
+  who = args.performer or "expert"
+  info = {"task_kwargs": task_kwargs, "performer": who}
+  if who == "keyboard":
     from . import keyboard
 
     env = options.load(name, task_kwargs)
     run = functools.partial(keyboard.run, env, args.seed, info)
   else:
-    performer.find(args.performer, "keyboard")
+    performer.find(who, "keyboard")
     env = options.load(name, task_kwargs)
-    act = performer.make(env, args.performer, args.seed)
+    act = performer.make(env, who, args.seed)
     run = functools.partial(episode.run, env, act, args.seed, info, args.states)
   return name, run
 

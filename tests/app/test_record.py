@@ -87,16 +87,15 @@ def test_a_trainee_through_the_commands(folder, capsys, tmp_path):
   say(capsys, "trainee", "add", "Ada")
   words = ["exercise", "touch/easy", "--trainee", "Ada", "--seed"]
   assert "not open to 'Ada' yet: touch/easy comes first" in say(
-    capsys, "exercise", "touch/standard", "--trainee", "Ada", code=2
+    capsys, "exercise", "touch/standard", "--trainee", "Ada", "--performer", "expert", code=2
   )
-  for k in range(12):
-    say(capsys, *words, str(k), "--set", "time_limit=0.04")
+  fill(folder, "Ada", 12, outcome="time limit")
   for k in range(12, 30):
     said = say(capsys, *words, str(k), "--performer", "expert")
   assert "Attempt 30 at touch/easy" in said and "next is probe/easy" in said
   assert not (tmp_path / "out" / "touch_easy").exists()  # in the record alone
   done = episodes(folder, "Ada")
-  assert [e.seed for e in done] == list(range(30)) and len({e.session for e in done}) == 30
+  assert [e.seed for e in done] == list(range(30)) and len({e.session for e in done}) == 1 + 18
   assert [e.outcome for e in done] == ["time limit"] * 12 + ["success"] * 18
   assert all(e.assessment and e.score == -20 for e in done[:12])
   again = Recording.load(folder / done[20].path)
@@ -381,7 +380,11 @@ def test_what_the_coach_said_and_errors(folder):
 @pytest.mark.parametrize(
   ("words", "said"),
   [
-    ("exercise touch/easy --trainee Bo", "no trainee 'Bo' in 'out/record', it has 'Ada'"),
+    ("exercise touch/easy --trainee Ada", "trainee is 'Ada' without --device NAME: the expert's"),
+    ("exercise touch/easy --trainee Ada --device hand --set damage=9", "set is 'damage=9' with"),
+    ("exercise touch/easy --trainee Ada --device mouse --set nodes=9", "set is 'nodes=9' with"),
+    ("exercise touch/easy --device hand --performer expert", "expected one of them"),
+    ("exercise touch/easy --trainee Bo --device hand", "no trainee 'Bo' in 'out/record', it has"),
     ("exercise touch/easy --record out/record", "record is given without --trainee"),
     ("exercise touch/easy --any-task", "any-task is given without --trainee"),
     ("exercise --replay x.npz --trainee Ada", "trainee is given with --replay"),

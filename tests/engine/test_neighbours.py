@@ -1,4 +1,4 @@
-"""Organs that are bonded to or rest on each other, where one's step launches the other's springs."""
+"""Organs bonded to or resting on each other, where one's step launches the other's springs."""
 
 import copy
 
@@ -26,7 +26,8 @@ def bonded(below="none"):
 def resting():
   """A ball of tissue on another one."""
   spec = mujoco.MjSpec.from_string("""<mujoco><worldbody>
-    <body name="finger" mocap="true" pos="0 0 0.3"><geom size="0.005"/></body></worldbody></mujoco>""")
+    <body name="finger" mocap="true" pos="0 0 0.3"><geom size="0.005"/></body>
+    </worldbody></mujoco>""")
   vertices, triangles = grid.octasphere(3)
   keys = {"young": 8e3, "foundation": 1e5, "windows": {"tools": ["finger"]}}
   palpate.add_organ(spec, (0.03 * vertices, triangles), "lower", **keys)
