@@ -81,8 +81,9 @@ class Dissect(Freeing, Hold):
       traction: limit of the pull on the liver [N]
       **kwargs: see Task; the force limit counts the jaws too
     """
-    self.name, self.targets, self.wanted, self.limit = name, 1, wanted, traction
+    self.name, self.targets = name, 1
     kwargs = {"spread": 0.012, "force_limit": 4.0, "damage": 8.0, **kwargs}
+    kwargs |= {"wanted": wanted, "traction": traction}
     super().__init__(dataclasses.replace(scene, targets=1), random, **kwargs)
 
   def begin(self, physics: Physics) -> None:

@@ -1,8 +1,11 @@
 """What `dissect` and `tease` share: bonds that come free as they should, or are torn."""
 
+import math
+
 import numpy as np
 
 from .base import Physics, Task
+from .scenes import Scene
 
 _SEEN = 1e-6  # what rounding may take from a share
 
@@ -21,6 +24,23 @@ class Freeing(Task):
 
   wanted: float
   limit: float
+
+  def __init__(self, scene: Scene, random=None, *, wanted: float, traction: float, **kwargs):
+    """Makes the task.
+
+    Args:
+      scene: what it plays in, with bonds
+      random: see Task
+      wanted: share of their area that must come free as it should [-]
+      traction: limit of the pull on what the organ is bonded to [N]
+      **kwargs: see Task
+    """
+    if not 0 < wanted <= 1:
+      raise ValueError(f"wanted is {wanted}, expected a share in (0, 1]")
+    if not 0 < traction < math.inf:
+      raise ValueError(f"traction is {traction}, expected a number > 0 [N]")
+    self.wanted, self.limit = wanted, traction
+    super().__init__(scene, random, **kwargs)
 
   def whole(self, physics: Physics) -> None:
     """Begins with bonds that are whole."""

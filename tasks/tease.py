@@ -88,7 +88,8 @@ class Tease(Freeing):
       traction: limit of the pull on what is under it [N]
       **kwargs: see Task
     """
-    self.name, self.wanted, self.limit = name, wanted, traction
+    self.name = name
+    kwargs |= {"wanted": wanted, "traction": traction}
     super().__init__(dataclasses.replace(scene, bonds=law), random, **kwargs)
 
   def spec(self, variant: int | None) -> mujoco.MjSpec:
