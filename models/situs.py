@@ -267,23 +267,17 @@ def _material(spec, name: str, rgba, kind: str | None, look: int, repeat: float 
 
 
 def _draw(spec, name: str, surface: Surface, material: str, pos) -> None:
-  """Adds a surface to the world that meets nothing."""
-  spec.add_mesh(
+  """Adds a surface to the world: a skin, which no contact, ray or state knows of."""
+  count = len(surface.vertices)
+  skin = spec.add_skin(
     name=f"abdomen_{name}",
-    uservert=surface.vertices.ravel(),
-    userface=surface.triangles.ravel(),
-    usertexcoord=surface.texcoord.ravel(),
-    smoothnormal=True,
-    inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
-  )
-  spec.worldbody.add_geom(
-    name=f"abdomen_{name}",
-    type=mujoco.mjtGeom.mjGEOM_MESH,
-    meshname=f"abdomen_{name}",
+    vert=(surface.vertices + pos).ravel(),
+    face=surface.triangles.ravel(),
+    texcoord=surface.texcoord.ravel(),
     material=material,
-    pos=pos,
+    bodyname=["world"],
+    bindpos=[0.0, 0.0, 0.0],
+    bindquat=[1.0, 0.0, 0.0, 0.0],
     group=GROUP,
-    contype=0,
-    conaffinity=0,
-    mass=0.0,
   )
+  skin.vertid, skin.vertweight = [np.arange(count)], [np.ones(count)]
