@@ -27,13 +27,13 @@ _LEVELS = {"liver": 1, "gallbladder": 0, "stomach": 1}  # of the smooth surfaces
 COLOURS = {
   "liver": (0.62, 0.22, 0.17, 1.0),
   "gallbladder": (0.60, 0.65, 0.46, 1.0),
-  "stomach": (0.95, 0.66, 0.58, 1.0),
+  "stomach": (0.86, 0.60, 0.53, 1.0),
   "kidney": (0.62, 0.27, 0.23, 1.0),
   "fat": (1.0, 0.84, 0.46, 1.0),
   "wall": (0.92, 0.56, 0.47, 1.0),
 }
 # Specular share of wet surfaces; by eye. Much of it turns yellow and pink ones green.
-_SHEEN = {"fat": 0.2, "wall": 0.15, "stomach": 0.35}
+_SHEEN = {"fat": 0.2, "wall": 0.15, "stomach": 0.3, "gallbladder": 0.4}
 # What the fixed renderer's light loses on its way, 1 at 15 cm: 0.55 + 0.45 (d / 15 cm)^2.
 _FADE = (0.55, 0.0, 0.45 / 0.15**2)
 _VIEW = ((0.0, 0.175, 0.135), (0.0, 0.03, 0.005))  # of `abdomen`'s camera: from, to [m]
@@ -210,12 +210,14 @@ def furnish(
 def _fat(x: np.ndarray, y: np.ndarray) -> np.ndarray:
   """Returns the height of the omentum over the bowel [m]; ours, in lumps of 2 to 4 cm.
 
-  It rises to the liver around bile duct, artery and portal vein: the hepatoduodenal ligament.
+  It rises to the liver around bile duct, artery and portal vein, the hepatoduodenal ligament, and
+  is cleared off cystic duct and artery.
   """
   base = -0.022 - 0.5 * np.maximum(np.abs(x + 0.01) - 0.10, 0) - 0.08 * np.maximum(y - 0.12, 0)
   large, small = scenery.bumps(1, 0.085, 0.012), scenery.bumps(2, 0.036, 0.0035)
   rise = 0.024 * np.exp(-((x + 0.02) ** 2 + (y - 0.034) ** 2) / (2 * 0.013**2))
-  return base + rise + large(x, y) + small(x, y)
+  clear = 0.02 * np.exp(-((x + 0.002) ** 2 + (y - 0.058) ** 2) / (2 * 0.012**2))
+  return base + rise - clear + large(x, y) + small(x, y)
 
 
 def light(spec: mujoco.MjSpec, pos, target) -> None:
@@ -235,8 +237,8 @@ def light(spec: mujoco.MjSpec, pos, target) -> None:
     exponent=2,
     attenuation=_FADE,
     ambient=[0.05, 0.045, 0.045],
-    diffuse=[0.98, 0.94, 0.89],
-    specular=[0.8, 0.8, 0.8],
+    diffuse=[0.92, 0.89, 0.85],
+    specular=[0.7, 0.7, 0.7],
     castshadow=False,
   )
 
