@@ -248,7 +248,9 @@ def _material(spec, name: str, rgba, kind: str | None, look: int, repeat: float 
   name = f"abdomen_{name}"
   if spec.material(name) is not None:
     return name
-  made = spec.add_material(name=name, rgba=rgba, specular=_SHEEN.get(kind, 0.5), shininess=0.75)
+  made = spec.add_material(
+    name=name, rgba=rgba, specular=_SHEEN.get(kind or "", 0.5), shininess=0.75
+  )
   made.texrepeat = [repeat, repeat]
   if kind is not None:
     paper = f"abdomen_{kind}"
