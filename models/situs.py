@@ -147,7 +147,15 @@ def cover(spec: mujoco.MjSpec, organ: str, kind: str, look: int = 0, uv=None) ->
   return skins.add_skin(spec, organ, material=material, texcoord=uv)
 
 
-def surround(spec: mujoco.MjSpec, organ: str, kind: str, uv: np.ndarray, view, look: int = 0):
+def surround(
+  spec: mujoco.MjSpec,
+  organ: str,
+  kind: str,
+  uv: np.ndarray,
+  view,
+  look: int = 0,
+  arrangement: Arrangement | None = None,
+):
   """Puts a scene's only organ, which is at the world's origin, into an abdomen.
 
   Args:
@@ -157,9 +165,11 @@ def surround(spec: mujoco.MjSpec, organ: str, kind: str, uv: np.ndarray, view, l
     uv: texture coordinates of its vertices  (n, 2)
     view: where the camera is and what it looks at [m]
     look: seed of spots and vessels
+    arrangement: what is held aside, None for that of ARRANGEMENTS
   """
   cover(spec, organ, kind, look, uv)
-  furnish(spec, [name for name in NAMES if name != kind], kind, ARRANGEMENTS[kind], look)
+  held = arrangement or ARRANGEMENTS[kind]
+  furnish(spec, [name for name in NAMES if name != kind], kind, held, look)
   for lamp in list(spec.lights):
     spec.delete(lamp)
   light(spec, *view)
