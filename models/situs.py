@@ -9,6 +9,7 @@ scenes, the liver's frame turned so that anterior is up and superior is -y.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Mapping, Sequence
 
 import mujoco
@@ -210,11 +211,17 @@ def furnish(
     goes_with = "stomach" if name == "duodenum" else "gallbladder"
     lift = held.lifts.get(goes_with, (0, 0, 0))
     _draw(spec, name, surface, skin, np.array(lift) - origin)
-  fat = scenery.sheet(_fat, (-0.17, -0.06), (0.15, 0.27), (54, 56))
+  fat, wall = _bounds()
   skin = _material(spec, "fat", COLOURS["fat"], "fat", look, 2)
   _draw(spec, "fat", fat, skin, [0, 0, held.fat] - origin)
-  wall = scenery.shell((-0.01, 0.09, 0.035), (0.175, 0.21, 0.175), 2.4, (44, 30))
   _draw(spec, "wall", wall, _material(spec, "wall", COLOURS["wall"], "wall", look), -origin)
+
+
+@functools.cache
+def _bounds() -> tuple[Surface, Surface]:
+  """Returns the fat and the wall; ours."""
+  fat = scenery.sheet(_fat, (-0.17, -0.06), (0.15, 0.27), (54, 56))
+  return fat, scenery.shell((-0.01, 0.09, 0.035), (0.175, 0.21, 0.175), 2.4, (44, 30))
 
 
 def _fat(x: np.ndarray, y: np.ndarray) -> np.ndarray:
