@@ -90,13 +90,13 @@ def foundation(mesh: Mesh, config: Config, u: np.ndarray) -> float:
   """Returns the energy of the Winkler foundation, 1/2 foundation area |u|^2 [J]; 0 if carried."""
   if config.carrier:
     return 0.0
-  area = topology.vertex_areas(mesh.rest, mesh.elem)
+  area = topology.held_areas(mesh)
   return float(0.5 * config.foundation * (area[:, None] * u * u).sum())
 
 
 def enclosed(mesh: Mesh, config: Config, u: np.ndarray) -> float:
   """Returns bulk/2 (V - V0)^2 / V0 - pressure (V - V0) [J]."""
-  if config.bulk == 0 and config.pressure == 0:
+  if (config.bulk == 0 and config.pressure == 0) or not mesh.closed:
     return 0.0
   centre = mesh.rest.mean(axis=0)
   rest = topology.volume(mesh.rest - centre, mesh.elem)
