@@ -174,7 +174,7 @@ def _push(w: Workspace, model: int):
     _find_bad_state(w)
   w.run()
   if w.status[3]:
-    _note(w, f"the {w.config.integrator} step has no finite solution: the motion diverged")
+    w.note(f"the {w.config.integrator} step has no finite solution: the motion diverged")
 
 
 @guard.watch
@@ -207,6 +207,9 @@ def _end(w: Workspace):
 def _visualize(model: int, data: int, option: int, scene: int, instance: int):
   w = _workspaces[data, instance]
   try:
+    if w.cuts:
+      w.cuts.follow()
+      w.cuts.show()
     if w.organ.windows:
       windowed.draw(w, model, data)
   except BaseException as error:
@@ -230,7 +233,7 @@ def _find_bad_state(w: Workspace):
   for kind, name, own in zip(_BAD, names, (organ.qposs, organ.dofs, organ.dofs), strict=True):
     index, count = w.warning[2 * kind : 2 * kind + 2]
     if count and index in own:
-      _note(w, f"{name} {index}) is not finite or huge; the motion diverged")
+      w.note(f"{name} {index}) is not finite or huge; the motion diverged")
 
 
 def _say(error: BaseException):
@@ -247,18 +250,11 @@ def _fail(w: Workspace, error: BaseException) -> bool:
   step ahead.
   """
   if not guard.is_foreign(error):
-    _note(w, f"{type(error).__name__}: {error}")
+    w.note(f"{type(error).__name__}: {error}")
     return False
   guard.raise_later(error)
   w.torn = w.resident is not None
   return not w.torn
-
-
-def _note(w: Workspace, text: str):
-  """Keeps the first error and says it."""
-  if w.error is None:
-    w.error = f"organ {w.organ.name!r}: {text}"
-    warn(w.error)
 
 
 def _watch(w: Workspace):

@@ -139,6 +139,11 @@ class Ties:
   def _moves(self, body: int) -> bool:
     return body < 0 or may_move(mjstruct.Model.from_address(self._w.model), body)
 
+  def reshape(self):
+    """Takes the rest positions that the organ has now."""
+    if self._tied is not None:
+      self._tied.rest.assign(_base(self._w.organ))
+
   def load(self):
     """Loads the kernels, if there is something to do for them."""
     if self:
@@ -157,7 +162,7 @@ class Ties:
       ahead=float(scheme.ahead),
       gain=scheme.gain(1.0, 0.0),
       node=w.body.shape.node.numpy(),
-      rest=organ.mesh.rest,
+      rest=_base(organ),
       disp=own.motion.disp if own else np.zeros((0, 3)),
       qposadr=organ.qposadr,
       frame=organ.frame,
@@ -233,7 +238,12 @@ def motion(w, vert: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     dofs = np.maximum(organ.dofadr[vert], 0)[:, None] + np.arange(3)
     u = mjstruct.view(d.qpos, m.nq)[qpos] - mjstruct.view(m.qpos0, m.nq)[qpos]
     u, v = free * u, free * mjstruct.view(d.qvel, m.nv)[dofs]
-  return organ.origin + (organ.mesh.rest[vert] + u) @ organ.frame.T, v @ organ.frame.T
+  return organ.origin + (_base(organ)[vert] + u) @ organ.frame.T, v @ organ.frame.T
+
+
+def _base(organ) -> np.ndarray:
+  """Returns what displacements here are from: nodal, qpos0 whatever was cut [m], (nvert, 3)."""
+  return organ.mesh.rest if organ.windows else organ.mesh.whole.rest
 
 
 def is_mocap(m, body: int) -> bool:

@@ -29,6 +29,7 @@ from . import (
 from .bind import bind
 from .coupling import Phases
 from .creep import Creep
+from .cuts import Cuts
 from .declare import Declaration
 from .hold import Hold
 from .layout import FLAG, HEAD, STAGE
@@ -71,6 +72,7 @@ class Workspace:
     ties: what the organ is tied to
     rests: what it rests on
     creep: its stress relaxation
+    cuts: its mesh as it is now
     resident: keeper of a motion that stays on the device, or None
     stiff: whether the response is needed, see `inertia.stiffness`
     heaviest: most times its inertia that a node in contact may have, see there  (1,)
@@ -124,6 +126,7 @@ class Workspace:
   ties: Ties = dataclasses.field(init=False)
   rests: Rests = dataclasses.field(init=False)
   creep: Creep = dataclasses.field(init=False)
+  cuts: Cuts = dataclasses.field(init=False)
   resident: Resident | None = None
   stiff: bool = False
   heaviest: np.ndarray = dataclasses.field(default_factory=lambda: np.ones(1))
@@ -157,6 +160,7 @@ class Workspace:
   def __post_init__(self):
     self.hold, self.ties = Hold(self), Ties(self)
     self.creep, self.rests = Creep(self), Rests(self)
+    self.cuts = Cuts(self)
 
   def run(self):
     """Computes the step's forces and adds them to qfrc_passive.
@@ -169,11 +173,25 @@ class Workspace:
     if self.strange:
       coupling.check_state(self.organ, self.plugin_state)
       self.strange = False
+    changed = bool(self.cuts) and self.cuts.renewed()
     if self.turn is None:
-      self._run()
+      if self.cuts:
+        self._run_cut(changed)
+      else:
+        self._run()
     else:
       with self.turn.lock:
+        if changed:
+          self._find_contacts_again()
         self._run()
+
+  def _run_cut(self, changed: bool):
+    """Runs an organ that may be cut: the model's triangles must be its own."""
+    with self.cuts.lock:
+      if self.flags[FLAG.stage] < STAGE.gathered and (changed or not self.cuts.shown):
+        self.cuts.show()
+        windowed.find_contacts_again(self)
+      self._run()
 
   def _run(self):
     if self.flags[FLAG.stage] == STAGE.pushed:
@@ -296,6 +314,11 @@ class Workspace:
       self.resident.look()
 
   @property
+  def declared(self) -> Declaration:
+    """The organ before the first cut."""
+    return self.cuts.declared if self.cuts else self.organ
+
+  @property
   def asleep(self) -> bool:
     """Whether the organ is at rest and its solve was skipped."""
     return bool(self.flags[FLAG.asleep])
@@ -310,6 +333,18 @@ class Workspace:
     if self.organ.windows:
       return self.views["inertia"].numpy().copy()
     return inertia.of_dofs(mjstruct.Model.from_address(model), self.organ)
+
+  def forget_motion(self):
+    """Forgets motion and forces of the past, but not what was cut."""
+    kept = self.cuts.copy()
+    self.plugin_state[:] = 0
+    self.cuts.put(kept)
+
+  def note(self, text: str):
+    """Keeps the first error and says it."""
+    if self.error is None:
+      self.error = f"organ {self.organ.name!r}: {text}"
+      mjstruct.warn(self.error)
 
   def forget(self):
     """Forgets what went wrong."""
@@ -344,15 +379,17 @@ def state_size(model: int, instance: int) -> int:
   m = mjstruct.Model.from_address(model)
   names = mjstruct.config(model, instance, "window").split()
   relaxes = bool(mjstruct.config(model, instance, "relax_share").strip())
+  spare = mjstruct.config(model, instance, "spare").strip() not in ("", "0")
+  cuts = coupling.cut_sizes(m.nflexelem, m.nflexvert, spare * m.nflexvert)
   if names:
     # Asked before MuJoCo has filled in the flexes: what `windowed` needs is at most this.
     inside = fill.MOST if mjstruct.config(model, instance, "elements").strip() == "solid" else 0
     most = (1 + inside) * m.nflexvert
     rests = bool(mjstruct.config(model, instance, "support").strip())
     sizes = relaxes * most, rests * m.nflexvert
-    return windowed.state_size(most, 0, m.ngeom * len(names), *sizes)
+    return windowed.state_size(most, 0, m.ngeom * len(names), *sizes, **cuts)
   moving = len(declare.moving_bodies(m, instance))
-  return nodal.state_size(3 * moving, relaxes * moving)
+  return nodal.state_size(3 * moving, relaxes * moving, **cuts)
 
 
 def make(model: int, data: int, instance: int) -> Workspace:
@@ -402,7 +439,7 @@ def _view(w: Workspace, d, m):
 def feel(w: Workspace, m):
   """Notes whether the organ is stiff for the present time step."""
   nodal = w.inertia(w.model)
-  w.stiff, w.heaviest[0] = inertia.stiffness(m, w.organ, w.body, w.config, nodal)
+  w.stiff, w.heaviest[0] = inertia.stiffness(m, w.declared, w.body, w.config, nodal)
 
 
 def sync(w: Workspace):
@@ -416,7 +453,8 @@ def refresh(w: Workspace):
   m = mjstruct.Model.from_address(w.model)
   with graphs.lock:
     if w.organ.windows is None:
-      prepare.give_armature(m, w.organ, w.body, w.config)
+      prepare.give_armature(m, w.declared, w.body, w.config)
+      w.cuts.spread()
     else:
       windowed.set_inertia(w, m)
       if w.turn is not None and w.turn.mine:

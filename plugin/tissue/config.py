@@ -14,6 +14,7 @@ from .step import SCHEMES
 # What takes a change while running: a number in the device's memory, the tissue's arrays, the graph
 # of the step anew. Other keys shape arrays or the model, and stay.
 NUMBER, TISSUE, GRAPH, FIXED = "number", "tissue", "graph", ""
+AUTO = -1  # spare vertices: as many as there are
 OWN = "own"  # as a carrier: the organ's own rigid motion
 _SHOWN = 40  # letters of a value in a message
 _SCALE = "young_scale"  # a key of `change` alone
@@ -138,6 +139,13 @@ def _ties(text: str, nelem: int) -> tuple[tuple[str, float, tuple[int, ...]], ..
   return tuple(found)
 
 
+def _spare(text: str, nelem: int) -> int:
+  value = int(_plain(text)) if text != "auto" else AUTO
+  if value < 0 and text != "auto":
+    raise ValueError
+  return value
+
+
 def _words(*values: str) -> tuple:
   return _choice({value: value for value in values})
 
@@ -247,6 +255,12 @@ class Config:
     (_names, "names of geoms and organs"),
     "with `window` alone: geoms and organs that bear the organ, with friction, by springs of its "
     "surface in place of MuJoCo's contacts ([lying](authoring.md#lying-on-something))",
+  )
+  spare: int = _row(
+    0,
+    (_spare, "a whole number >= 0 or 'auto'"),
+    "vertices without triangles, after the others, that cuts make use of ([cutting](cutting.md)); "
+    "`auto`: as many as there are; `add_organ` and `add_spare` make them",
   )
   resident: bool = _row(
     False,
@@ -385,6 +399,7 @@ def _check_combination(organ: str, config: Config, given: dict, closed: bool):
   if config.elements == "solid":
     _check_solid(organ, config, given)
   _check_ties(organ, config)
+  _check_spare(organ, config)
   if config.window and "mass" not in given and not config.mass:
     raise ValueError(f"organ {organ!r}: window is set and mass is missing [kg]")
   for key in ("bulk", "pressure"):
@@ -407,6 +422,26 @@ def _check_solid(organ: str, config: Config, given: dict):
       f"organ {organ!r}: integrator is {config.integrator!r}, allowed only where elements is not "
       "'solid'"
     )
+
+
+def spare(organ: str, text: str, there: int) -> int:
+  """Returns how many vertices `spare` sets aside, `auto` meaning those that are there."""
+  value = _value(organ, "spare", text, *_row_of("spare")) if text else 0
+  return there if value == AUTO else value
+
+
+def _row_of(key: str) -> tuple:
+  return ROWS[key].read, ROWS[key].allowed
+
+
+def _check_spare(organ: str, config: Config):
+  if not config.spare:
+    return
+  for key in ("carrier", "attach", "relax_share", "support", "resident"):
+    if getattr(config, key):
+      raise ValueError(f"organ {organ!r}: {key} is set, allowed only where spare is 0")
+  if config.elements == "solid":
+    raise ValueError(f"organ {organ!r}: elements is 'solid', allowed only where spare is 0")
 
 
 def _check_ties(organ: str, config: Config):

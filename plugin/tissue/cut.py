@@ -9,6 +9,7 @@ triangle stays, and so does the room that arrays need.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 from scipy import sparse, spatial
@@ -26,8 +27,14 @@ _KEEP = 0.9
 _TURN = 0.95  # least cosine between a triangle's normals before and after
 _CORNER = -0.8  # greatest cosine between the boundary's edges at a vertex that may slide on it
 _TRIES = 10
+_RISE = 1.01  # times its energy that the tissue around a vertex may have when it was moved
 _LESS = 0.7
 _NEAR = 6  # vertices nearest to a point around which its triangle is looked for
+
+
+# Energy of triangles [J], (n,), from their corners at rest and the displacements of these, (n, 3, 3)
+# each, and their numbers (n,).
+Energy = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,7 +82,14 @@ class _Run:
     return len(self.chain) > 3 and self.chain[0] == self.chain[-1]
 
 
-def cut(organ: str, mesh: Mesh, position: np.ndarray, points: np.ndarray, pinned: np.ndarray) -> Cut:
+def cut(
+  organ: str,
+  mesh: Mesh,
+  position: np.ndarray,
+  points: np.ndarray,
+  pinned: np.ndarray,
+  energy: Energy | None = None,
+) -> Cut:
   """Returns the mesh cut along the path on the surface that is nearest to points.
 
   Args:
@@ -84,6 +98,7 @@ def cut(organ: str, mesh: Mesh, position: np.ndarray, points: np.ndarray, pinned
     position: where its vertices are now [m]     (nvert, 3)
     points: the path, in the same frame [m]      (n, 3)
     pinned: vertices that do not move            (nvert,) bool
+    energy: of triangles, which moving vertices must not raise, or None
 
   Raises:
     ValueError: points are off the surface, or the path goes through pinned vertices or is too short.
@@ -93,15 +108,18 @@ def cut(organ: str, mesh: Mesh, position: np.ndarray, points: np.ndarray, pinned
   for run in runs:
     run.chain = _chain(mesh, run, edge)
   _check(organ, runs, pinned)
-  moved, corner, weight = _snap(mesh, runs, pinned)
+  edges, stopped = _room(mesh, [pair for run in runs for pair in _pairs(run.chain)])
+  there = {v for pair in edges for v in pair}
+  moved, corner, weight = _snap(mesh, runs, pinned, position, energy, there)
   rest = mesh.rest.copy()
   rest[moved] = np.einsum("nk,nkj->nj", weight, mesh.rest[corner])
-  edges, stopped = _room(mesh, [pair for run in runs for pair in _pairs(run.chain)])
   elem, group, member = _split(mesh, edges)
   rest[member] = rest[group]
-  new, touched = topology.recut(mesh, rest, elem)
+  new, touched = topology.recut(mesh, rest, elem, mesh.loose)
+  new = topology.come_loose(new)
   path = _lines(rest, edges)
-  far = [_distance(run.at, rest[run.chain])[0].max() for run in runs if run.chain]
+  cut_chains = [(run, [v for v in run.chain if v in there]) for run in runs]
+  far = [_distance(run.at, rest[chain])[0].max() for run, chain in cut_chains if chain]
   length = sum(float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum()) for line in path)
   deviation = float(max(far, default=0.0))
   return Cut(new, touched, moved, corner, weight, group, member, path, length, deviation, stopped)
@@ -306,8 +324,11 @@ def _check(organ: str, runs: list[_Run], pinned: np.ndarray):
 # Snapping.
 
 
-def _snap(mesh: Mesh, runs: list[_Run], pinned: np.ndarray):
-  """Returns vertices that move at rest, and where they lie: corners of a triangle and weights."""
+def _snap(mesh: Mesh, runs: list[_Run], pinned, position, energy: Energy | None, there: set[int]):
+  """Returns vertices that move at rest, and where they lie: corners of a triangle and weights.
+
+  Those of the runs that are `there`.
+  """
   vert, goal = [np.zeros(0, int)], [np.zeros((0, 3))]
   for run in runs:
     chain = np.array(run.chain, int)
@@ -321,7 +342,7 @@ def _snap(mesh: Mesh, runs: list[_Run], pinned: np.ndarray):
   vert, first = np.unique(np.concatenate(vert), return_index=True)
   goal = np.concatenate(goal)[first]
   goal, free = _on_rim(mesh, vert, goal)
-  free &= ~pinned[vert]
+  free &= ~pinned[vert] & np.isin(vert, list(there))
   vert, goal = vert[free], goal[free]
   around = mesh.ring_elem[vert]
   elem = np.where(around >= 0, around, around[:, :1]) // 3
@@ -330,7 +351,8 @@ def _snap(mesh: Mesh, runs: list[_Run], pinned: np.ndarray):
   best, row = np.argmin(far, axis=1), np.arange(len(vert))
   elem, weight = elem[row, best], weight[row, best]
   own = (mesh.elem[elem] == vert[:, None]).astype(float)
-  weight = own + _shares(mesh, vert, elem, weight)[:, None] * (weight - own)
+  u = position - mesh.rest
+  weight = own + _shares(mesh, vert, elem, weight, u, energy)[:, None] * (weight - own)
   moved = (weight != own).any(axis=1)
   return vert[moved], mesh.elem[elem[moved]], weight[moved]
 
@@ -349,14 +371,22 @@ def _on_rim(mesh: Mesh, vert: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray,
   return np.where(rim[:, None], slid, goal), free
 
 
-def _shares(mesh: Mesh, vert: np.ndarray, elem: np.ndarray, weight: np.ndarray) -> np.ndarray:
-  """Returns how far of its way each vertex goes so that no triangle gets thin or turns, (n,)."""
+def _shares(mesh: Mesh, vert, elem, weight, u: np.ndarray, energy: Energy | None) -> np.ndarray:
+  """Returns how far of its way each vertex goes, (n,).
+
+  So far that no triangle gets thin or turns, and that the energy around none rises: a vertex gets
+  the displacement of where it goes to, and an uneven strain is another one after it.
+  """
   around = mesh.ring_elem[vert]
   tri = np.unique(around[around >= 0] // 3)
   before = mesh.rest[mesh.elem[tri]]
   normal, shape = _form(before)
   least = np.minimum(_SHAPE, _KEEP * shape)
-  way = np.einsum("nk,nkj->nj", weight, mesh.rest[mesh.elem[elem]]) - mesh.rest[vert]
+  way, lead = (
+    np.einsum("nk,nkj->nj", weight, values[mesh.elem[elem]]) - values[vert]
+    for values in (mesh.rest, u)
+  )
+  had = None if energy is None else energy(before, u[mesh.elem[tri]], tri)
   share = np.ones(len(vert))
   number = np.full(mesh.nvert, -1)
   number[vert] = np.arange(len(vert))
@@ -365,10 +395,18 @@ def _shares(mesh: Mesh, vert: np.ndarray, elem: np.ndarray, weight: np.ndarray) 
     rest[vert] += share[:, None] * way
     turned, now = _form(rest[mesh.elem[tri]])
     bad = (now < least) | ((turned * normal).sum(1) < _TURN)
-    if not bad.any():
+    who = number[mesh.elem[tri]]
+    less = np.unique(who[bad])
+    if energy is not None:
+      moved = u.copy()
+      moved[vert] += share[:, None] * lead
+      has = energy(rest[mesh.elem[tri]], moved[mesh.elem[tri]], tri)
+      old, new = (np.bincount(who.ravel() + 1, np.repeat(e, 3), len(vert) + 1) for e in (had, has))
+      less = np.union1d(less, np.flatnonzero(new > _RISE * old) - 1)
+    less = less[less >= 0]
+    if not less.size:
       break
-    who = number[mesh.elem[tri[bad]]]
-    share[np.unique(who[who >= 0])] *= _LESS if k + 1 < _TRIES else 0.0
+    share[less] *= _LESS if k + 1 < _TRIES else 0.0
   return share
 
 
@@ -410,6 +448,7 @@ def _room(mesh: Mesh, pairs: list[tuple[int, int]]) -> tuple[list[tuple[int, int
     verts = dict.fromkeys(v for pair in pairs[:count] for v in pair)
     need = sum(len(_fans(mesh, v, cuts)) - 1 for v in verts)
     if need <= left:
+      count *= need > 0
       break
     count -= max(1, min(count, need - left))
   return pairs[:count], count < len(pairs)

@@ -25,6 +25,7 @@ class Mesh:
     tet: corners of each tetrahedron, of positive volume, see `fill`(ntet, 4)
     spare: the last so many vertices may have no triangle yet: room for cuts
     uncut: the mesh before the first cut, None for one that has none
+    loose: triangles that were cut free of the foundation, None for none    (nelem,) bool
   """
 
   rest: np.ndarray
@@ -37,6 +38,7 @@ class Mesh:
   tet: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 4), np.int64))
   spare: int = 0
   uncut: Mesh | None = None
+  loose: np.ndarray | None = None
 
   @property
   def whole(self) -> Mesh:
@@ -115,24 +117,26 @@ def pieces(mesh: Mesh) -> np.ndarray:
 
 
 def held_areas(mesh: Mesh) -> np.ndarray:
-  """Returns the areas of the vertices that the foundation holds [m^2], (nvert,).
+  """Returns the areas of the vertices that the foundation holds [m^2], (nvert,)."""
+  elem = mesh.elem if mesh.loose is None else mesh.elem[~mesh.loose]
+  return vertex_areas(mesh.rest, elem)
 
-  Of what was one piece before the first cut, the largest piece that is left: others came free.
+
+def come_loose(mesh: Mesh) -> Mesh:
+  """Returns the mesh with its triangles marked that a cut has freed from the foundation.
+
+  Of what it held together until now, it goes on to hold the largest piece.
   """
-  area = vertex_areas(mesh.rest, mesh.elem)
-  if mesh.uncut is None:
-    return area
-  piece, whole = pieces(mesh), pieces(mesh.uncut)
-  used = np.flatnonzero(piece >= 0)
-  size = np.bincount(piece[used], area[used])
-  home = np.full(len(size), -1)
-  old = used[used < mesh.nvert - mesh.spare]
-  home[piece[old]] = whole[old]
+  whole = mesh.whole
+  loose = np.zeros(mesh.nelem, bool) if mesh.loose is None else mesh.loose.copy()
+  area = np.linalg.norm(area_vectors(mesh.rest, mesh.elem), axis=1)
+  piece, home = pieces(mesh)[mesh.elem[:, 0]], pieces(whole)[whole.elem[:, 0]]
   for part in np.unique(home):
-    rivals = np.flatnonzero(home == part)
-    lost = rivals[rivals != rivals[np.argmax(size[rivals])]]
-    area[np.isin(piece, lost)] = 0.0
-  return area
+    held = (home == part) & ~loose
+    size = np.bincount(piece[held], area[held])
+    if (size > 0).sum() > 1:
+      loose |= held & (piece != np.argmax(size))
+  return dataclasses.replace(mesh, loose=loose)
 
 
 def vertex_normals(position: np.ndarray, elem: np.ndarray) -> np.ndarray:
@@ -268,13 +272,16 @@ def _rings(organ, elem, twin, nvert, vert=None):
   return np.stack(ring, axis=1), np.stack(ring_elem, axis=1), degree
 
 
-def recut(mesh: Mesh, rest: np.ndarray, elem: np.ndarray) -> tuple[Mesh, np.ndarray]:
+def recut(
+  mesh: Mesh, rest: np.ndarray, elem: np.ndarray, loose: np.ndarray | None = None
+) -> tuple[Mesh, np.ndarray]:
   """Returns a mesh with other rest positions and other corners, by cuts of the same whole.
 
   Args:
     mesh: what is like it in most places, of the same whole
     rest: rest positions [m]  (nvert, 3)
     elem: triangles: those of the whole, cut along edges  (nelem, 3)
+    loose: see `Mesh`
 
   Returns:
     the mesh, and the vertices of triangles that are not as they were
@@ -288,7 +295,13 @@ def recut(mesh: Mesh, rest: np.ndarray, elem: np.ndarray) -> tuple[Mesh, np.ndar
     joined = (other >= 0) & (start == end[other]) & (end == start[other])
     twin = np.where(joined, other, -1)
     new = dataclasses.replace(
-      mesh, rest=rest, elem=elem, twin=twin, closed=bool((twin >= 0).all()), uncut=whole
+      mesh,
+      rest=rest,
+      elem=elem,
+      twin=twin,
+      closed=bool((twin >= 0).all()),
+      uncut=whole,
+      loose=loose,
     )
   corners = (mesh.elem != new.elem).any(axis=1)
   edges = (mesh.twin != new.twin).reshape(-1, 3).any(axis=1)
@@ -297,7 +310,7 @@ def recut(mesh: Mesh, rest: np.ndarray, elem: np.ndarray) -> tuple[Mesh, np.ndar
   cut = corners | edges
   touched = np.unique(np.concatenate([mesh.elem[cut | moved], new.elem[cut | moved]]))
   if new is whole or not touched.size:
-    return (new if new is whole else mesh), touched
+    return (new if new is whole else dataclasses.replace(mesh, loose=loose)), touched
   walk = np.unique(np.concatenate([mesh.elem[cut], new.elem[cut]]))
   ring, ring_elem, degree = mesh.ring.copy(), mesh.ring_elem.copy(), mesh.degree.copy()
   if walk.size:

@@ -125,9 +125,17 @@ def _stiffness(
   length2 = (toward[:, 1:-1] ** 2).sum(-1)
   spring = (strength[:, :-1] + strength[:, 1:]) / np.where(length2 > 0, length2, 1.0)
   if config.elements == "spring":
-    spring = np.full_like(spring, config.stiffness)
+    spring = config.stiffness * np.where(_is_cut(mesh, half), 0.5, 1.0)  # a half for each side
   spring[np.arange(spring.shape[1]) >= degree[:, None]] = 0
   return metric, spring
+
+
+def _is_cut(mesh: Mesh, half: np.ndarray) -> np.ndarray:
+  """Returns whether the edges of fans, but for those that repeat, were cut, (n, most)."""
+  before, after = half[:, :-1], half[:, 1:]
+  alone = (before < 0) != (after < 0)
+  own = np.where(after >= 0, after, before - before % 3 + (before + 2) % 3)
+  return alone & (mesh.whole.twin[own] >= 0)
 
 
 def elements(

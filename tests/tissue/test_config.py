@@ -49,6 +49,8 @@ REFUSED = [
   ("attach", "rib 500", "a stiffness > 0 and vertices"),
   ("attach", "rib soft 3", "a stiffness > 0 and vertices"),
   ("carrier", "two words", "the name of a body"),
+  ("spare", "-1", "a whole number >= 0 or 'auto'"),
+  ("spare", "some", "a whole number >= 0 or 'auto'"),
   ("resident", "yes", "'true' or 'false'"),
 ]
 
