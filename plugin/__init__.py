@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
   from .authoring import add_organ
   from .organ import Organ
-  from .windows import add_windows
+  from .windows import add_spare, add_windows
 
-__all__ = ["Organ", "__version__", "add_organ", "add_windows", "register"]
+__all__ = ["Organ", "__version__", "add_organ", "add_spare", "add_windows", "register"]
 __version__ = "0.1.0"
 
 
@@ -37,13 +37,14 @@ def register() -> int:
   if "Organ" not in globals():
     globals()["Organ"] = organ.Organ
     globals()["add_windows"] = windows.add_windows
+    globals()["add_spare"] = windows.add_spare
     device.lower_log_level()
   return plugin.register()
 
 
 def __getattr__(name: str):
   """Brings what is asked for first: `add_organ`, with what reads meshes, and in the command all."""
-  if name in ("Organ", "add_windows"):
+  if name in ("Organ", "add_spare", "add_windows"):
     register()
     return globals()[name]
   if name != "add_organ":

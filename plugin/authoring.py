@@ -77,11 +77,8 @@ def add_organ(
     ValueError: a key, value, name or the mesh is not allowed; the message says what is.
   """
   _, vertices, triangles = meshes.read(mesh, scale, sized=not isinstance(mesh, tuple | list))
-  surface = _surface(name, *meshes.merge(vertices, triangles))
-  pins, mass = _pins(name, pin, surface.nvert), _mass(name, mass, surface)
-  surface = _with_spare(name, surface, spare)
-  if surface.spare:
-    config["spare"] = surface.spare
+  surface = _with_spare(name, _surface(name, *meshes.merge(vertices, triangles)), spare)
+  pins, mass = _pins(name, pin, surface), _mass(name, mass, surface)
   windowed, options = windows is not False, _windows(name, windows)
   texts = _texts(name, config, surface, mass if windowed else None)
   look = _look(name, radius, rgba) | _contact(name, {**CONTACT, **(contact or {})})
@@ -141,7 +138,8 @@ def _surface(name: str, vertices: np.ndarray, triangles: np.ndarray) -> topology
   return made
 
 
-def _pins(name: str, pin: Sequence[int], nvert: int) -> np.ndarray:
+def _pins(name: str, pin: Sequence[int], surface: topology.Mesh) -> np.ndarray:
+  nvert = surface.nvert - surface.spare
   pins = np.unique(np.asarray(pin, dtype=float))
   bad = pins[(pins != np.floor(pins)) | (pins < 0) | (pins >= nvert)]
   if bad.size:
@@ -174,6 +172,7 @@ def _mass(name: str, mass: float | None, surface: topology.Mesh) -> float:
 def _texts(name: str, config: dict, surface: topology.Mesh, mass: float | None) -> dict[str, str]:
   """Returns the texts of the plugin's keys, checked; a mass is that of an organ with windows."""
   texts = {key: text(value, 17) for key, value in config.items()}
+  texts |= {"spare": str(surface.spare)} if surface.spare else {}
   for key in ("window", "follow"):
     if key in texts:
       raise ValueError(f"organ {name!r}: {key} is set, expected windows=True or its options")

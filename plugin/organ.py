@@ -130,8 +130,8 @@ class Organ:
     and copies of the data, have them.
 
     Args:
-      points: the path in the world, where the organ is now [m], (n, 3); to cut to an edge of an open
-        surface, let it begin or end there; the same first and last point cut out a piece
+      points: the path in the world, where the organ is now [m], (n, 3); to cut to an edge of an
+        open surface, let it begin or end there; the same first and last point cut out a piece
 
     Returns:
       What the cut has done. With too few spare vertices it ends early: `stopped`, and a warning.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from palpate.tissue import config as configuration
 from palpate.tissue import device as devices
 from palpate.tissue import fill
 from palpate.tissue import mesh as topology

@@ -104,7 +104,6 @@ class Phases(coupling.Phases):
     """Steps the plugin state, and ends the step with the response where there was one."""
     self._launch(remember)
 
-
   # Cuts.
 
   def reshape(self):

@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 from palpate.tissue.config import KEYS
 
-from . import change, fasten, guard, mjstruct, rests, weights, windowed, workspace
+from . import change, fasten, guard, mjstruct, rests, room, weights, windowed, workspace
 from .layout import FLAG, STAGE
 from .mjstruct import NAME, warn
 from .workspace import Workspace
@@ -100,7 +100,7 @@ def place_windows(model: mujoco.MjModel, data: mujoco.MjData):
 @guard.watch
 def _nstate(model: int, instance: int) -> int:
   try:
-    return workspace.state_size(model, instance)
+    return room.state_size(model, instance)
   except BaseException as error:
     _say(error)
     return 0

@@ -9,7 +9,6 @@ import mujoco
 import numpy as np
 import warp as wp
 from palpate.tissue import body as bodies
-from palpate.tissue import fill
 from palpate.tissue.body import Body
 from palpate.tissue.config import Config
 
@@ -21,7 +20,6 @@ from . import (
   graphs,
   inertia,
   mjstruct,
-  nodal,
   prepare,
   weights,
   windowed,
@@ -369,27 +367,6 @@ def attach(w: Workspace, model: int):
   """Makes a workspace fit a living model, which need not be the one that it last ran with."""
   if not w.identity.is_of(model):
     bind(w, model)
-
-
-def state_size(model: int, instance: int) -> int:
-  """Returns the length of the plugin state.
-
-  Contact force, last dv and the one before of each moving vertex, or what `windowed` says.
-  """
-  m = mjstruct.Model.from_address(model)
-  names = mjstruct.config(model, instance, "window").split()
-  relaxes = bool(mjstruct.config(model, instance, "relax_share").strip())
-  spare = mjstruct.config(model, instance, "spare").strip() not in ("", "0")
-  cuts = coupling.cut_sizes(m.nflexelem, m.nflexvert, spare * m.nflexvert)
-  if names:
-    # Asked before MuJoCo has filled in the flexes: what `windowed` needs is at most this.
-    inside = fill.MOST if mjstruct.config(model, instance, "elements").strip() == "solid" else 0
-    most = (1 + inside) * m.nflexvert
-    rests = bool(mjstruct.config(model, instance, "support").strip())
-    sizes = relaxes * most, rests * m.nflexvert
-    return windowed.state_size(most, 0, m.ngeom * len(names), *sizes, **cuts)
-  moving = len(declare.moving_bodies(m, instance))
-  return nodal.state_size(3 * moving, relaxes * moving, **cuts)
 
 
 def make(model: int, data: int, instance: int) -> Workspace:

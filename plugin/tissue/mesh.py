@@ -54,7 +54,9 @@ class Mesh:
   @functools.cached_property
   def edge_length(self) -> float:
     """Mean length of the triangles' edges at rest [m]."""
-    return float(np.linalg.norm(self.rest[self.elem[:, [1, 2, 0]]] - self.rest[self.elem], axis=2).mean())
+    return float(
+      np.linalg.norm(self.rest[self.elem[:, [1, 2, 0]]] - self.rest[self.elem], axis=2).mean()
+    )
 
   @functools.cached_property
   def interior(self) -> np.ndarray:

@@ -97,8 +97,9 @@ def banks(width: np.ndarray) -> np.ndarray:
 def node_order(mesh: Mesh, patch: int = 0) -> np.ndarray:
   """Returns vertices in the order of the solver, padded with -1 to whole slices.
 
-  Spare vertices come last, and a cut changes nothing. Reverse Cuthill-McKee keeps neighbours close in memory, patches keep most of them in one block of
-  threads; sorting by degree within a window keeps the slices full.
+  Spare vertices come last, and a cut changes nothing. Reverse Cuthill-McKee keeps neighbours close
+  in memory, patches keep most of them in one block of threads; sorting by degree within a window
+  keeps the slices full.
 
   Args:
     mesh: the surface

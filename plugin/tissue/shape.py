@@ -17,9 +17,8 @@ from . import plate, rows, solid, step
 from .body import Body
 from .config import Config
 from .mesh import Mesh
-from .order import LANES, addresses, banks, ellpack, node_order, offset, pad, to_slices
+from .order import LANES, addresses, banks, ellpack, node_order, pad, to_slices
 from .types import NUMBERS, empty
-
 
 _BEND_MORE = 4  # entries that a cut may add to a row of the bending matrix
 
@@ -97,7 +96,7 @@ def _numbers(config: Config, closed: bool = True) -> dict[str, float]:
 
 
 def rerate(levels: bodies.Levels, mesh: Mesh):
-  """Lets coarser meshes serve the solve, or not: they know of no cut, and block Jacobi does then."""
+  """Lets coarser meshes serve the solve before the first cut; they know of none."""
   rate = levels.rate.copy()
   rate[:, 0] *= mesh.uncut is None
   levels.transfer.rate.assign(rate)

@@ -129,16 +129,15 @@ def test_a_strip_that_is_cut_across_lets_its_loose_half_go():
 def test_mass_and_momentum_are_kept_and_energy_does_not_rise(windows, kind):
   keys = {"plate": {}, "membrane": {"bend": 0}, "spring": {"elements": "spring", "stiffness": 40}}
   points, elem = strip()
-  model, data = scene((points, elem), windows, tool=False if not windows else True, **keys[kind])
+  model, data = scene((points, elem), windows, tool=windows, **keys[kind])
   organ = handle(model, data)
   x = organ.xpos
   stretched = x + 0.004 * np.sin(40 * x[:, [1, 0, 0]])
   organ.set_state(stretched, 0.3 * np.sin(50 * x[:, [0, 0, 1]]) + [0.1, 0, 0])
   before = motion(model, organ)
   for path in ([[0.02, -0.005, 0], [0.1, 0.008, 0]], [[0.06, -0.02, 0], [0.06, 0.02, 0]]):
-    moved = cKDTree(x).query(np.linspace(*path, 40))[1]
-    organ.cut(organ.xpos[np.unique(moved, return_index=True)[0][np.argsort(
-      np.unique(moved, return_index=True)[1])]])  # fmt: skip
+    near = cKDTree(x).query(np.linspace(*path, 40))[1]
+    organ.cut(organ.xpos[near[np.append(True, np.diff(near) != 0)]])
   after = motion(model, organ)
   assert organ.nvert > len(points) + 10
   for name in ("mass", "momentum", "spin"):
@@ -376,6 +375,34 @@ def random_cut(organ, r, last):
   try:
     organ.cut(x[near])
   except ValueError as error:
-    assert "shorter" in str(error) or "shape" in str(error)  # noqa: PT017
+    assert "shorter" in str(error) or "shape" in str(error)
     return last
   return max(last, 0.0) * 1.01
+
+
+@BOTH
+def test_an_organ_of_mjcf_gets_room_by_add_spare(windows):
+  points, elem = sphere()
+  xml = scenes.world(scenes.organ(points, elem, mass=0.2, foundation=1e4))
+  spec = mujoco.MjSpec.from_string(xml)
+  palpate.add_spare(spec, "organ", 60)
+  if windows:
+    palpate.add_windows(spec, "organ", nodes=30)
+  model = spec.compile()
+  data = mujoco.MjData(model)
+  organ = handle(model, data)
+  assert organ.nvert == len(points)
+  organ.cut(cap())
+  mujoco.mj_step(model, data, 5)
+  assert organ.error is None and len(organ.pieces) == 2
+  assert sum(piece.mass for piece in organ.pieces) == pytest.approx(0.2)
+  again = mujoco.MjSpec.from_string(xml)
+  with pytest.raises(ValueError, match="spare is 0, expected a number > 0"):
+    palpate.add_spare(again, "organ", 0)
+
+
+def test_a_declared_spare_without_vertices_is_refused():
+  points, elem = sphere()
+  xml = scenes.world(scenes.organ(points, elem, spare=20))
+  with pytest.raises(ValueError, match=r"spare is 20 and vertex .* has triangles"):
+    mujoco.MjModel.from_xml_string(xml)

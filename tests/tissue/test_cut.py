@@ -5,8 +5,10 @@ import pytest
 import scenes
 from palpate.tissue import body as bodies
 from palpate.tissue import cut as cutting
+from palpate.tissue import device as devices
 from palpate.tissue import energy, refill, shape
 from palpate.tissue import mesh as topology
+from palpate.tissue import path as paths
 from palpate.tissue.config import Config
 
 SPARE = 120
@@ -144,14 +146,15 @@ def test_the_foundation_holds_the_largest_piece_of_what_it_held():
   assert not (topology.held_areas(mesh) > 0)[free].any()
 
 
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda:0", marks=scenes.needs_cuda)])
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_refilled_body_is_one_made_anew_to_the_bit(kind):
+def test_a_refilled_body_is_one_made_anew_to_the_bit(kind, device):
   config = KINDS[kind]
   points, elem = scenes.sphere(2) if kind == "closed" else scenes.triangular(0.1, 0.08, 16, 14, 0.2)
   mesh = whole = with_spare(points, elem)
   pinned = np.zeros(mesh.nvert, bool)
   pinned[:3] = True
-  body = shape.make(mesh, config, pinned, "cpu", np.inf if kind == "plate" else 0.0)
+  body = shape.make(mesh, config, pinned, device, np.inf if kind == "plate" else 0.0)
   bodies.unshare(body)
   filler = refill.Refill(body, mesh)
   first = fields(body)
@@ -169,7 +172,8 @@ def test_a_refilled_body_is_one_made_anew_to_the_bit(kind):
     mesh = found.mesh
   assert mesh.nouter > len(points) + 5
   width = np.diff(body.shape.bend_adr.numpy())
-  anew = shape.arrays(mesh, config, pinned, 0, width)
+  patch = devices.patch(body.device, body.shape.nslice)
+  anew = shape.arrays(mesh, config, pinned, patch, width)
   now = fields(body)
   for name in now.keys() - {"hinge_angle0"}:
     assert np.array_equal(now[name].reshape(-1), np.ravel(anew[name]).astype(now[name].dtype)), name
@@ -197,8 +201,8 @@ def test_uneven_strain_does_not_rise_by_moving_vertices():
   u[mesh.nouter :] = 0
   mask = np.zeros(mesh.nvert, bool)
   path = [[0.02, -0.02, 0], [0.13, 0.03, 0]]
-  points = [x + share * u for share in (1.0,)][0]
-  way = cutting.nearest(mesh, mesh.rest, np.linspace(*path, 60))
+  points = x + u
+  way = paths.nearest(mesh, mesh.rest, np.linspace(*path, 60))
   now = np.einsum("nk,nkj->nj", way[1], points[mesh.elem[way[0]]])
   by = lambda rest, disp, which: energy.of_triangles(config, rest, disp, which)  # noqa: E731
   found = cutting.cut("organ", mesh, mesh.rest + u, now, mask, by)
@@ -245,7 +249,7 @@ def test_pinned_tissue_is_refused_and_never_moved():
   mesh = sheet(30, spare=SPARE)
   line = np.linspace([0.03, 0, 0], [0.12, 0, 0], 60)
   close = np.flatnonzero(np.abs(mesh.rest[: mesh.nouter, 1]) < 0.006)
-  with pytest.raises(ValueError, match="goes through vertex .* pinned"):
+  with pytest.raises(ValueError, match=r"goes through vertex .* pinned"):
     cut(mesh, line, pinned=close)
   ends = cut(mesh, line).path[0][[0, -1]]
   near = [int(np.linalg.norm(mesh.rest[: mesh.nouter] - end, axis=1).argmin()) for end in ends]
