@@ -72,8 +72,8 @@ class Phases:
     """Returns displacement and velocity of the vertices, in the organ's frame, (nvert, 3) each."""
     raise NotImplementedError
 
-  def reshape(self):
-    """Takes the mesh and the masses that the organ has now."""
+  def reshape(self, touched: np.ndarray | None = None):
+    """Takes the mesh and the masses that the organ has now; `touched` as in `cut`, None for all."""
 
   def carry(self, changed, disp, vel, group, member, share):
     """Gives vertices the motion that they have after a cut, and those that were one their part.

@@ -165,7 +165,7 @@ class Cuts:
     self._refill.write(mesh, touched, w.config, ~w.organ.free)
     self.mass, self.source, self.stamp = mass, source, stamp
     w.organ = dataclasses.replace(self.declared, mesh=mesh, mass=mass)
-    self.spread()
+    w.phases.reshape(touched)
     w.ties.reshape()
 
   def spread(self):
@@ -228,9 +228,8 @@ class Cuts:
     w, old, mesh = self._w, self.mesh, found.mesh
     group, member = found.group, found.member
     mass, source = self.mass.copy(), self.source.copy()
-    area = topology.vertex_areas(mesh.rest, mesh.elem)
-    total = np.bincount(group, area[member], mesh.nvert)
-    share = area[member] / total[group]
+    area = topology.areas_of(mesh, member)
+    share = area / np.bincount(group, area, mesh.nvert)[group]
     mass[member] = share * self.mass[group]
     source[member] = source[group]
     now, speed = u.copy(), v.copy()

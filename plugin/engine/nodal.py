@@ -106,7 +106,7 @@ class Phases(coupling.Phases):
 
   # Cuts.
 
-  def reshape(self):
+  def reshape(self, touched: np.ndarray | None = None):
     """Takes the mesh and the masses that the organ has now."""
     w, organ, n = self._w, self._w.organ, self._nodal
     node = w.body.shape.node.numpy()

@@ -155,14 +155,15 @@ def make(w, model: int, sizes: dict[str, int]):
   return fill(Slots, "cpu", values)
 
 
-def reshape(w, slots):
+def reshape(w, slots, touched: np.ndarray):
   """Gives slots the mesh and the masses that the organ has now; triangles keep their number."""
   organ, mesh, m = w.organ, w.organ.mesh, mjstruct.Model.from_address(w.model)
   radius = float(mjstruct.view(m.flex_radius, m.nflex)[organ.windows.flex].max())
-  _, longest = _edges(mesh)
-  slots.rest.assign(mesh.rest)
-  slots.elem.assign(mesh.elem.astype(np.int32))
-  slots.touch.assign(longest + radius)
+  slots.rest.numpy()[:] = mesh.rest
+  slots.elem.numpy()[:] = mesh.elem
+  arm = mesh.rest[mesh.ring[touched]] - mesh.rest[touched][:, None]
+  longest = np.where(mesh.ring[touched] >= 0, np.linalg.norm(arm, axis=2), 0.0).max(axis=1)
+  slots.touch.numpy()[touched] = longest + radius
   slots.node_mass.assign(hold(organ, organ.mass))
   adr, near = _around(mesh)
   slots.near_adr.assign(adr.astype(np.int32))

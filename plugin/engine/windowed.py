@@ -76,10 +76,11 @@ class Phases(coupling.Phases):
 
   # Cuts.
 
-  def reshape(self):
+  def reshape(self, touched: np.ndarray | None = None):
     """Takes the mesh and the masses that the organ has now."""
     organ, nodes_ = self._w.organ, self._nodes
-    slots.reshape(self._w, self._slots)
+    touched = np.arange(organ.mesh.nvert) if touched is None else touched
+    slots.reshape(self._w, self._slots, touched)
     share_inertia(self._w)
     nodes_.rest.assign(organ.mesh.rest)
     nodes_.nouter = organ.mesh.nouter

@@ -83,7 +83,7 @@ def cut(
   Raises:
     ValueError: points are off the surface; the path goes through pinned vertices, or is too short.
   """
-  edge = mesh.edge_length
+  edge = mesh.whole.edge_length
   runs = paths.trace(organ, mesh, position, points, edge)
   for run in runs:
     run.chain = paths.chain(mesh, run, edge)
@@ -96,7 +96,8 @@ def cut(
   elem, group, member = _split(mesh, edges)
   rest[member] = rest[group]
   new, touched = topology.recut(mesh, rest, elem, mesh.loose)
-  new = topology.come_loose(new)
+  if any(_may_separate(run, group) for run in runs):
+    new = topology.come_loose(new)
   path = _lines(rest, edges)
   cut_chains = [(run, [v for v in run.chain if v in there]) for run in runs]
   far = [paths.distance(run.at, rest[chain])[0].max() for run, chain in cut_chains if chain]
@@ -190,7 +191,7 @@ def _shares(mesh: Mesh, vert, elem, weight, u: np.ndarray, energy: Energy | None
     np.einsum("nk,nkj->nj", weight, values[mesh.elem[elem]]) - values[vert]
     for values in (mesh.rest, u)
   )
-  had = None if energy is None else energy(before, u[mesh.elem[tri]], tri)
+  had = np.zeros(0) if energy is None else energy(before, u[mesh.elem[tri]], tri)
   share = np.ones(len(vert))
   number = np.full(mesh.nvert, -1)
   number[vert] = np.arange(len(vert))
@@ -202,9 +203,10 @@ def _shares(mesh: Mesh, vert, elem, weight, u: np.ndarray, energy: Energy | None
     who = number[mesh.elem[tri]]
     less = np.unique(who[bad])
     if energy is not None:
-      moved = u.copy()
+      moved, fine = u.copy(), ~bad
       moved[vert] += share[:, None] * lead
-      has = energy(rest[mesh.elem[tri]], moved[mesh.elem[tri]], tri)
+      corner, has = mesh.elem[tri[fine]], had.copy()
+      has[fine] = energy(rest[corner], moved[corner], tri[fine])
       old, new = (np.bincount(who.ravel() + 1, np.repeat(e, 3), len(vert) + 1) for e in (had, has))
       less = np.union1d(less, np.flatnonzero(new > _RISE * old) - 1)
     less = less[less >= 0]
@@ -241,6 +243,11 @@ def _fans(mesh: Mesh, vert: int, cuts: set[tuple[int, int]]) -> list[list[int]]:
   if closed and len(parts) > 1 and not is_cut[0]:
     parts[0] = parts.pop() + parts[0]
   return [part for part in parts if part]
+
+
+def _may_separate(run: paths.Run, group: np.ndarray) -> bool:
+  """Returns whether a cut along a run may make two pieces: not where an end of it is inside."""
+  return run.closes or bool(np.isin(run.chain[:1] + run.chain[-1:], group).all())
 
 
 def _room(mesh: Mesh, pairs: list[tuple[int, int]]) -> tuple[list[tuple[int, int]], bool]:

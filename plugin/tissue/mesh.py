@@ -59,6 +59,11 @@ class Mesh:
     )
 
   @functools.cached_property
+  def home(self) -> np.ndarray:
+    """Number of the piece of surface that each triangle is in, (nelem,)."""
+    return pieces(self)[self.elem[:, 0]]
+
+  @functools.cached_property
   def interior(self) -> np.ndarray:
     """The half-edges that stand for the edges between two triangles, ascending."""
     return np.flatnonzero((self.twin >= 0) & (np.arange(len(self.twin)) < self.twin))
@@ -124,6 +129,21 @@ def held_areas(mesh: Mesh) -> np.ndarray:
   return vertex_areas(mesh.rest, elem)
 
 
+def areas_of(mesh: Mesh, vert: np.ndarray, held: bool = False) -> np.ndarray:
+  """Returns the areas of some vertices, to the bit as `vertex_areas` and `held_areas` [m^2]."""
+  around = np.sort(np.where(mesh.ring_elem[vert] >= 0, mesh.ring_elem[vert] // 3, mesh.nelem))
+  elem, where = np.unique(around, return_inverse=True)
+  size = np.zeros(len(elem))
+  there = elem < mesh.nelem
+  size[there] = np.linalg.norm(area_vectors(mesh.rest, mesh.elem[elem[there]]), axis=1) / 3
+  if held and mesh.loose is not None:
+    size[there] *= ~mesh.loose[elem[there]]
+  out = np.zeros(len(vert))
+  for column in size[where].reshape(around.shape).T:  # one after the other, as bincount adds
+    out += column
+  return out
+
+
 def come_loose(mesh: Mesh) -> Mesh:
   """Returns the mesh with its triangles marked that a cut has freed from the foundation.
 
@@ -132,7 +152,7 @@ def come_loose(mesh: Mesh) -> Mesh:
   whole = mesh.whole
   loose = np.zeros(mesh.nelem, bool) if mesh.loose is None else mesh.loose.copy()
   area = np.linalg.norm(area_vectors(mesh.rest, mesh.elem), axis=1)
-  piece, home = pieces(mesh)[mesh.elem[:, 0]], pieces(whole)[whole.elem[:, 0]]
+  piece, home = pieces(mesh)[mesh.elem[:, 0]], whole.home
   for part in np.unique(home):
     held = (home == part) & ~loose
     size = np.bincount(piece[held], area[held])

@@ -9,7 +9,6 @@ import numpy as np
 from scipy import sparse, spatial
 from scipy.sparse import csgraph
 
-from . import mesh as topology
 from .mesh import Mesh
 
 _STEP = 0.25  # between samples of the path, in edges
@@ -52,9 +51,8 @@ def trace(organ: str, mesh: Mesh, position, points, edge: float) -> list[Run]:
     )
   at = np.einsum("nk,nkj->nj", weight, mesh.rest[mesh.elem[elem]])
   # Where the path crosses an older cut, or leaps, it begins anew.
-  label = topology.pieces(mesh)[mesh.elem[elem, 0]]
   leap = np.linalg.norm(np.diff(at, axis=0), axis=1) > 2 * edge
-  parts = np.flatnonzero(leap | (np.diff(label) != 0) | _crosses(mesh, elem)) + 1
+  parts = np.flatnonzero(leap | _crosses(mesh, elem)) + 1
   runs = [Run(a, e) for a, e in zip(np.split(at, parts), np.split(elem, parts), strict=True)]
   return [run for run in runs if len(run.at) > 1]
 

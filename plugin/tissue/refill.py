@@ -81,9 +81,12 @@ class Refill:
       out[name] = [(_lane(at, lane[i], dense[name].ndim), dense[name][i, k])]
     for name in ("degree", "rest"):
       out[name] = [(_lane(s, lane, dense[name].ndim + 1), dense[name])]
-    every = self._node // LANES, self._node % LANES
-    out["area"] = [(every, topology.held_areas(mesh))]
-    out["free"] = [(every, np.where(pinned | mesh.unused, 0.0, 1.0))]
+    out["free"] = [((s, lane), np.where(pinned | mesh.unused, 0.0, 1.0)[touched])]
+    which = touched
+    if self.mesh.loose is not mesh.loose:  # all that has come free of the foundation
+      which = np.arange(mesh.nvert)
+    own = self._node[which]
+    out["area"] = [((own // LANES, own % LANES), topology.areas_of(mesh, which, held=True))]
     return out
 
   def _plate(self, mesh: Mesh, touched: np.ndarray, config: Config):
