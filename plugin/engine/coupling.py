@@ -212,6 +212,7 @@ def sizes(organ) -> dict[str, int]:
   out = {"ncreep": int(organ.free.sum()) if relaxes else 0}
   whole = organ.mesh.whole
   out |= cut_sizes(whole.nelem, whole.nvert, whole.spare)
+  out["nbond"] = int(organ.free[: organ.mesh.nouter].sum()) if organ.config.bonded else 0
   if organ.windows is None:
     return out | {"nfree": organ.nfree}
   win = organ.windows

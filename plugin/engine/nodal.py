@@ -42,9 +42,10 @@ gather, scatter, push, remember = coupling.kernels(
 )
 
 
-def state_size(nfree: int, ncreep: int = 0, **cuts: int) -> int:
+def state_size(nfree: int, **more: int) -> int:
   """Returns the length of the plugin state of `nfree` degrees of freedom; see `coupling.sizes`."""
-  return layout.size(NodalState, {"nfree": nfree, "ncreep": ncreep} | cuts)
+  sizes = {"nfree": nfree, "ncreep": 0, "nbond": 0} | layout.NO_CUTS
+  return layout.size(NodalState, sizes | more)
 
 
 class Phases(coupling.Phases):

@@ -14,15 +14,18 @@ def state_size(model: int, instance: int) -> int:
   """
   m = mjstruct.Model.from_address(model)
   names = mjstruct.config(model, instance, "window").split()
-  relaxes = bool(mjstruct.config(model, instance, "relax_share").strip())
+  relaxes, rests, bonded = (
+    bool(mjstruct.config(model, instance, key).strip())
+    for key in ("relax_share", "support", "bonds")
+  )
   spare = mjstruct.config(model, instance, "spare").strip() not in ("", "0")
   cuts = coupling.cut_sizes(m.nflexelem, m.nflexvert, spare * m.nflexvert)
   if names:
     # Asked before MuJoCo has filled in the flexes: what `windowed` needs is at most this.
     inside = fill.MOST if mjstruct.config(model, instance, "elements").strip() == "solid" else 0
     most = (1 + inside) * m.nflexvert
-    rests = bool(mjstruct.config(model, instance, "support").strip())
-    sizes = relaxes * most, rests * m.nflexvert
-    return windowed.state_size(most, 0, m.ngeom * len(names), *sizes, **cuts)
+    outer = {"nrest": rests * m.nflexvert, "nbond": bonded * m.nflexvert}
+    outer |= {"ncreep": relaxes * most} | cuts
+    return windowed.state_size(most, 0, m.ngeom * len(names), **outer)
   moving = len(declare.moving_bodies(m, instance))
-  return nodal.state_size(3 * moving, relaxes * moving, **cuts)
+  return nodal.state_size(3 * moving, ncreep=relaxes * moving, nbond=bonded * moving, **cuts)

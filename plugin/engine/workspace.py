@@ -13,6 +13,7 @@ from palpate.tissue.body import Body
 from palpate.tissue.config import Config
 
 from . import (
+  adhere,
   coupling,
   declare,
   declare_windows,
@@ -25,11 +26,12 @@ from . import (
   windowed,
 )
 from .bind import bind
+from .bonds import Bonds
 from .coupling import Phases
 from .creep import Creep
 from .cuts import Cuts
 from .declare import Declaration
-from .hold import Hold
+from .hold import Beside, Hold
 from .layout import FLAG, HEAD, STAGE
 from .pierce import Watch
 from .resident import Resident
@@ -68,6 +70,7 @@ class Workspace:
     place: recorded graph that puts the windows where the plugin state says, or None
     hold: springs that hold nodes
     ties: what the organ is tied to
+    bonds: what it has grown on to
     rests: what it rests on
     creep: its stress relaxation
     cuts: its mesh as it is now
@@ -122,6 +125,7 @@ class Workspace:
   place: Any = None
   hold: Hold = dataclasses.field(init=False)
   ties: Ties = dataclasses.field(init=False)
+  bonds: Bonds = dataclasses.field(init=False)
   rests: Rests = dataclasses.field(init=False)
   creep: Creep = dataclasses.field(init=False)
   cuts: Cuts = dataclasses.field(init=False)
@@ -157,8 +161,13 @@ class Workspace:
 
   def __post_init__(self):
     self.hold, self.ties = Hold(self), Ties(self)
-    self.creep, self.rests = Creep(self), Rests(self)
+    self.bonds, self.rests, self.creep = Bonds(self), Rests(self), Creep(self)
     self.cuts = Cuts(self)
+
+  @property
+  def beside(self) -> tuple[Beside, ...]:
+    """What acts on the organ beside its tissue, in the order in which it does."""
+    return self.ties, self.bonds, self.rests, self.creep
 
   def run(self):
     """Computes the step's forces and adds them to qfrc_passive.
@@ -332,12 +341,6 @@ class Workspace:
       return self.views["inertia"].numpy().copy()
     return inertia.of_dofs(mjstruct.Model.from_address(model), self.organ)
 
-  def forget_motion(self):
-    """Forgets motion and forces of the past, but not what was cut."""
-    kept = self.cuts.copy()
-    self.plugin_state[:] = 0
-    self.cuts.put(kept)
-
   def note(self, text: str):
     """Keeps the first error and says it."""
     if self.error is None:
@@ -393,6 +396,7 @@ def make(model: int, data: int, instance: int) -> Workspace:
     if organ.windows:
       w.turn = Turn()
     fasten.declare(w)
+    adhere.declare(w)
     bind(w, model)
     w.plugin_state = w.views["plugin_state"].numpy()
     w.signature = w.plugin_state[coupling.spans(organ)["signature"]].data

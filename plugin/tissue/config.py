@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from . import readers
+from . import reading
+from .reading import BondRow
 from .step import SCHEMES
 
 # What takes a change while running: a number in the device's memory, the tissue's arrays, the graph
@@ -51,127 +52,144 @@ class Config:
 
   elements: str = _row(
     "membrane",
-    readers.words("membrane", "spring", "solid"),
+    reading.words("membrane", "spring", "solid"),
     "`membrane` (St. Venant-Kirchhoff triangles, plane stress), `spring` (edge springs) or `solid` "
     "(neo-Hookean tetrahedra inside, made when the model is compiled; with `window` alone)",
   )
   young: tuple[float, ...] = _row(
     (5000.0,),
-    (readers.numbers, "a number > 0"),
+    (reading.numbers, "a number > 0"),
     "Young's modulus of membrane and plate; one value, or one for each triangle",
     "Pa",
     TISSUE,
   )
-  poisson: float = _row(0.45, readers.number(0.0, 0.5), "Poisson's ratio", "-", TISSUE)
-  thickness: float = _row(0.002, readers.POSITIVE, "thickness of membrane and plate", "m", TISSUE)
+  poisson: float = _row(0.45, reading.number(0.0, 0.5), "Poisson's ratio", "-", TISSUE)
+  thickness: float = _row(0.002, reading.POSITIVE, "thickness of membrane and plate", "m", TISSUE)
   stiffness: float = _row(
     0.0,
-    readers.POSITIVE,
+    reading.POSITIVE,
     'constant of the edge springs, with `elements="spring"` alone',
     "N/m",
     TISSUE,
   )
   bend: float = _row(
     1.0,
-    readers.NOT_NEGATIVE,
+    reading.NOT_NEGATIVE,
     "factor on the plate's rigidity E t^3 / (12 (1 - nu^2)); 0 switches bending off",
   )
   foundation: float = _row(
     0.0,
-    readers.NOT_NEGATIVE,
+    reading.NOT_NEGATIVE,
     "restoring force per area and displacement: stands for the interior and ligaments",
     "Pa/m",
     NUMBER,
   )
   bulk: float = _row(
     0.0,
-    readers.NOT_NEGATIVE,
+    reading.NOT_NEGATIVE,
     "volume preservation, energy bulk/2 (V - V0)^2 / V0; closed surfaces",
     "Pa",
     NUMBER,
   )
   pressure: float = _row(
-    0.0, readers.number(-math.inf), "inside minus outside; closed surfaces", "Pa", NUMBER
+    0.0, reading.number(-math.inf), "inside minus outside; closed surfaces", "Pa", NUMBER
   )
   damping: float = _row(
-    0.002, readers.NOT_NEGATIVE, "Rayleigh coefficient on the stiffness", "s", NUMBER
+    0.002, reading.NOT_NEGATIVE, "Rayleigh coefficient on the stiffness", "s", NUMBER
   )
   relax_share: float = _row(
     0.0,
-    readers.number(0.0, 1.0),
+    reading.number(0.0, 1.0),
     "share of the elastic forces that fades while a strain is held; `young` is that at once",
     "-",
     NUMBER,
   )
   relax_time: float = _row(
-    0.5, readers.POSITIVE, "time constant of that, exp(-t / relax_time)", "s", NUMBER
+    0.5, reading.POSITIVE, "time constant of that, exp(-t / relax_time)", "s", NUMBER
   )
   integrator: str = _row(
     "implicit",
-    readers.words(*SCHEMES),
+    reading.words(*SCHEMES),
     "`implicit`; `midpoint` for free motion ([accuracy](accuracy.md)); `neumann`, `explicit` to "
     "compare with",
     change=GRAPH,
   )
   iterations: int = _row(
-    200, readers.count(1, 10000), "most PCG iterations of a solve", change=NUMBER
+    200, reading.whole(1, 10000), "most PCG iterations of a solve", change=NUMBER
   )
   tolerance: float = _row(
-    1e-4, readers.number(1e-10, 1.0), "relative residual at which PCG stops", change=NUMBER
+    1e-4, reading.number(1e-10, 1.0), "relative residual at which PCG stops", change=NUMBER
   )
-  newton: int = _row(1, readers.count(1, 100), "Newton iterations a step", change=GRAPH)
+  newton: int = _row(1, reading.whole(1, 100), "Newton iterations a step", change=GRAPH)
   window: tuple[str, ...] = _row(
     (),
-    (readers.names, "names of flexcomps"),
+    (reading.names, "names of flexcomps"),
     "flexcomps that follow the tools over the organ, which is rigid then (`add_windows` sets it); "
     "none where the vertices are MuJoCo's dofs",
   )
   follow: tuple[tuple[str, ...], ...] = _row(
     (),
-    (readers.groups, "names of bodies"),
+    (reading.groups, "names of bodies"),
     "bodies that each window follows, a comma between windows; left out, all that moves and "
     "collides",
   )
-  mass: float = _row(0.0, readers.POSITIVE, "mass of the organ, with `window` alone", "kg")
+  mass: float = _row(0.0, reading.POSITIVE, "mass of the organ, with `window` alone", "kg")
   pin: tuple[int, ...] = _row(
-    (), (readers.vertices, "vertex numbers"), "vertices that do not move, with `window` alone"
+    (), (reading.vertices, "vertex numbers"), "vertices that do not move, with `window` alone"
   )
   carrier: str = _row(
     "",
-    (readers.name, "the name of a body, or 'own'"),
+    (reading.name, "the name of a body, or 'own'"),
     "body that carries foundation and pins along ([attachments](authoring.md#attachments)); `own`: "
     "the foundation goes with the organ's own rigid motion",
   )
   attach: tuple[tuple[str, float, tuple[int, ...]], ...] = _row(
     (),
-    (readers.ties, "a body or organ, a stiffness > 0 and vertices, a comma between such groups"),
+    (reading.ties, "a body or organ, a stiffness > 0 and vertices, a comma between such groups"),
     "springs from vertices to a body, or to the nearest vertices of another organ: "
     "`rib 500 3 17 18, stomach 200 40 41`; the stiffness is that of a group",
     "-, N/m, -",
   )
+  bonds: tuple[BondRow, ...] | None = _row(
+    None,
+    (
+      reading.bonds,
+      "'none', or a body or organ, stiffness, strength, energy, and 'near' and a distance or 'at' "
+      "and vertices, a comma between such groups",
+    ),
+    "springs from vertices to points of a body or of another organ's surface, which soften and "
+    "break ([bonds](authoring.md#bonds)): `liver 1e7 3e3 5 near 0.003, rib 1e7 3e3 5 at 17 18`; "
+    "`none` lets `Organ.bond` make some",
+    "-, N/m³, Pa, J/m², m",
+  )
   support: tuple[str, ...] = _row(
     (),
-    (readers.names, "names of geoms and organs"),
+    (reading.names, "names of geoms and organs"),
     "with `window` alone: geoms and organs that bear the organ, with friction, by springs of its "
     "surface in place of MuJoCo's contacts ([lying](authoring.md#lying-on-something))",
   )
   spare: int = _row(
     0,
-    (readers.spare, "a whole number >= 0 or 'auto'"),
+    (reading.spare, "a whole number >= 0 or 'auto'"),
     "vertices without triangles, after the others, that cuts make use of ([cutting](cutting.md)); "
     "`auto`: as many as there are; `add_organ` and `add_spare` make them",
   )
   resident: bool = _row(
     False,
-    readers.choice({"true": True, "false": False}),
+    reading.choice({"true": True, "false": False}),
     "with `window` alone: the motion stays on the CUDA device between steps, and the plugin state "
     "is brought up to date by `Organ.sync` alone ([internals](internals.md#resident))",
   )
   device: str = _row(
     "auto",
-    (readers.device, "'cpu', 'cuda:0' or 'auto'"),
+    (reading.device, "'cpu', 'cuda:0' or 'auto'"),
     "`cpu`, `cuda:N`, or `auto`: CUDA where there is a device and enough nodes",
   )
+
+  @property
+  def bonded(self) -> bool:
+    """Whether there are bonds, or room for some."""
+    return self.bonds is not None
 
 
 ROWS: dict[str, Row] = {each.name: each.metadata["row"] for each in dataclasses.fields(Config)}
@@ -202,7 +220,7 @@ def _default(key: str) -> str:
     except ValueError:
       return "-"
     return f"{value:g}"
-  return str(value).lower() or "-"
+  return "-" if value is None else str(value).lower() or "-"
 
 
 def parse(organ: str, texts: dict[str, str], nelem: int, closed: bool) -> Config:
@@ -250,7 +268,7 @@ def change(
   scale = texts.pop(_SCALE, None)
   values = _values(organ, texts, nelem)
   if scale is not None:
-    factor = _value(organ, _SCALE, scale, *readers.POSITIVE)
+    factor = _value(organ, _SCALE, scale, *reading.POSITIVE)
     values["young"] = tuple(factor * young for young in compiled.young)
   changed = dataclasses.replace(config, **values)
   if bool(changed.relax_share) != bool(compiled.relax_share):
@@ -325,29 +343,29 @@ def _check_solid(organ: str, config: Config, given: dict):
 
 def spare(organ: str, text: str, there: int) -> int:
   """Returns how many vertices `spare` sets aside, `auto` meaning those that are there."""
-  value = _value(organ, "spare", text, *_row_of("spare")) if text else 0
-  return there if value == readers.AUTO else value
-
-
-def _row_of(key: str) -> tuple:
-  return ROWS[key].read, ROWS[key].allowed
+  row = ROWS["spare"]
+  value = _value(organ, "spare", text, row.read, row.allowed) if text else 0
+  return there if value == reading.AUTO else value
 
 
 def _check_spare(organ: str, config: Config):
   if not config.spare:
     return
-  for key in ("carrier", "attach", "relax_share", "support", "resident"):
+  for key in ("carrier", "attach", "relax_share", "support", "resident", "bonded"):
     if getattr(config, key):
-      raise ValueError(f"organ {organ!r}: {key} is set, allowed only where spare is 0")
+      name = key.replace("bonded", "bonds")
+      raise ValueError(f"organ {organ!r}: {name} is set, allowed only where spare is 0")
   if config.elements == "solid":
     raise ValueError(f"organ {organ!r}: elements is 'solid', allowed only where spare is 0")
 
 
 def _check_ties(organ: str, config: Config):
-  for key in ("carrier", "attach", "relax_share", "support"):
-    if getattr(config, key) and config.resident:
+  for key in ("carrier", "attach", "bonds", "relax_share", "support"):
+    if not getattr(config, key) and not (key == "bonds" and config.bonded):
+      continue
+    if config.resident:
       raise ValueError(f"organ {organ!r}: {key} is set, allowed only without resident")
-    if getattr(config, key) and not SCHEMES[config.integrator].solids:
+    if not SCHEMES[config.integrator].solids:
       raise ValueError(
         f"organ {organ!r}: integrator is {config.integrator!r}, allowed only without {key}"
       )
