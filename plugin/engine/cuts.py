@@ -90,6 +90,11 @@ class Cuts:
     return self.whole.spare > 0
 
   @property
+  def full(self) -> bool:
+    """Whether there is no spare vertex left."""
+    return self.mesh.nouter == self.mesh.nvert
+
+  @property
   def mesh(self) -> Mesh:
     """The mesh as it is now."""
     return self._w.organ.mesh

@@ -196,6 +196,8 @@ def _advance(model: int, data: int, instance: int):
 def _end(w: Workspace):
   """Ends the step, and looks at what came of it."""
   w.step()
+  if w.tear and w.tear.act():
+    workspace.place(w, w.model)
   nodes, triangles = w.flags[FLAG.missed_nodes], w.flags[FLAG.missed_elements]
   if nodes > w.missed[0] or triangles > w.missed[1]:
     _miss(w, int(nodes), int(triangles))

@@ -35,6 +35,7 @@ from .hold import Beside, Hold
 from .layout import FLAG, HEAD, STAGE
 from .pierce import Watch
 from .resident import Resident
+from .tear import Tear
 from .rests import Rests
 from .ties import Ties
 from .turns import Turn
@@ -74,6 +75,7 @@ class Workspace:
     rests: what it rests on
     creep: its stress relaxation
     cuts: its mesh as it is now
+    tear: looks whether it tears
     resident: keeper of a motion that stays on the device, or None
     stiff: whether the response is needed, see `inertia.stiffness`
     heaviest: most times its inertia that a node in contact may have, see there  (1,)
@@ -129,6 +131,7 @@ class Workspace:
   rests: Rests = dataclasses.field(init=False)
   creep: Creep = dataclasses.field(init=False)
   cuts: Cuts = dataclasses.field(init=False)
+  tear: Tear = dataclasses.field(init=False)
   resident: Resident | None = None
   stiff: bool = False
   heaviest: np.ndarray = dataclasses.field(default_factory=lambda: np.ones(1))
@@ -162,7 +165,7 @@ class Workspace:
   def __post_init__(self):
     self.hold, self.ties = Hold(self), Ties(self)
     self.bonds, self.rests, self.creep = Bonds(self), Rests(self), Creep(self)
-    self.cuts = Cuts(self)
+    self.cuts, self.tear = Cuts(self), Tear(self)
 
   @property
   def beside(self) -> tuple[Beside, ...]:

@@ -174,6 +174,12 @@ class Config:
     "vertices without triangles, after the others, that cuts make use of ([cutting](cutting.md)); "
     "`auto`: as many as there are; `add_organ` and `add_spare` make them",
   )
+  tear: float = _row(
+    0.0,
+    reading.NOT_NEGATIVE,
+    "greatest principal strain, length over rest length less 1, beyond which tissue tears across "
+    "it, with `spare` ([cutting](cutting.md#tearing)); 0: never",
+  )
   resident: bool = _row(
     False,
     reading.choice({"true": True, "false": False}),
@@ -349,6 +355,8 @@ def spare(organ: str, text: str, there: int) -> int:
 
 
 def _check_spare(organ: str, config: Config):
+  if config.tear and not config.spare:
+    raise ValueError(f"organ {organ!r}: tear is {config.tear:g}, allowed only with spare")
   if not config.spare:
     return
   for key in ("carrier", "attach", "relax_share", "support", "resident", "bonded"):
