@@ -21,6 +21,7 @@ from palpate.tissue.mesh import Mesh
 from palpate.tissue.refill import Refill
 
 from . import coupling, flexes, mjstruct, turns
+from .tear import Tear
 
 _FOREIGN = "plugin_state has cuts that are not of this organ; set a state that was saved from it"
 
@@ -76,6 +77,7 @@ class Cuts:
     self.stamp = 0.0
     self._fresh = False
     self.reports: list[Report] = []
+    self.tear = Tear(w)
     if not self:
       return
     bodies.unshare(w.body)

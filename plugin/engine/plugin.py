@@ -15,7 +15,19 @@ import mujoco
 import numpy as np
 from palpate.tissue.config import KEYS
 
-from . import adhere, change, fasten, guard, mjstruct, rests, room, weights, windowed, workspace
+from . import (
+  adhere,
+  change,
+  fasten,
+  guard,
+  mjstruct,
+  rests,
+  room,
+  skin,
+  weights,
+  windowed,
+  workspace,
+)
 from .layout import FLAG, STAGE
 from .mjstruct import NAME, warn
 from .workspace import Workspace
@@ -196,7 +208,7 @@ def _advance(model: int, data: int, instance: int):
 def _end(w: Workspace):
   """Ends the step, and looks at what came of it."""
   w.step()
-  if w.tear and w.tear.act():
+  if w.cuts.tear and w.cuts.tear.act():
     workspace.place(w, w.model)
   nodes, triangles = w.flags[FLAG.missed_nodes], w.flags[FLAG.missed_elements]
   if nodes > w.missed[0] or triangles > w.missed[1]:
@@ -216,9 +228,19 @@ def _visualize(model: int, data: int, option: int, scene: int, instance: int):
       w.cuts.show()
     if w.organ.windows:
       windowed.draw(w, model, data)
+    if w.skin is not None:
+      _draw_skin(w, model, data)
   except BaseException as error:
     _fail(w, error)
   return guard.leave()
+
+
+def _draw_skin(w: Workspace, model: int, data: int):
+  whole = w.organ.mesh.uncut is None
+  if w.cuts:  # a skin knows of no cut: the organ's own surface is drawn then
+    skin.show(w, model, shown=whole)
+  if whole:
+    skin.draw(w, model, data)
 
 
 # What went wrong.

@@ -96,5 +96,11 @@ def drawn(mesh) -> int:
   return mesh.nvert if mesh.spare else mesh.nouter
 
 
+def group(m, skin: int, flex: int, groups: tuple[int, int]):
+  """Puts an organ's skin and its own surface into groups, which viewers draw or do not."""
+  mjstruct.view(m.skin_group, m.nskin, np.int32)[skin] = groups[0]
+  mjstruct.view(m.flex_group, m.nflex, np.int32)[flex] = groups[1]
+
+
 def _digest(values: np.ndarray) -> bytes:
   return hashlib.sha256(np.ascontiguousarray(values).tobytes()).digest()

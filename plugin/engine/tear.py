@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from palpate.tissue import path as paths
 
@@ -18,6 +20,8 @@ class Tear:
 
   def __init__(self, w):
     self._w = w
+    self._mesh: Any = None
+    self._rest: tuple = ()
 
   def __bool__(self) -> bool:
     return self._w.config.tear > 0
@@ -26,8 +30,9 @@ class Tear:
     """Tears the organ at its most stretched triangle, if that is too far; returns whether."""
     w, mesh = self._w, self._w.organ.mesh
     x = mesh.rest + w.phases.motion()[0]
-    stretch = _squares(mesh.rest[mesh.elem], x[mesh.elem])
-    stretch[~w.organ.free[mesh.elem].all(axis=1)] = 0.0
+    if mesh is not self._mesh:
+      self._mesh, self._rest = mesh, _metric(mesh.rest[mesh.elem])
+    stretch = _squares(self._rest, _metric(x[mesh.elem]))
     worst = int(np.argmax(stretch))
     if not stretch[worst] > (1 + w.config.tear) ** 2 or self._w.cuts.full:
       return False
@@ -55,18 +60,18 @@ class Tear:
     return np.einsum("nk,nkj->nj", weight, x[mesh.elem[elem]])
 
 
-def _squares(rest: np.ndarray, now: np.ndarray) -> np.ndarray:
-  """Returns the square of the greatest principal stretch of triangles (n, 3, 3), (n,)."""
-  metric, turned = _metrics(rest), _metrics(now)
-  product = np.linalg.solve(metric, turned)
-  half = 0.5 * (product[:, 0, 0] + product[:, 1, 1])
-  det = product[:, 0, 0] * product[:, 1, 1] - product[:, 0, 1] * product[:, 1, 0]
-  return half + np.sqrt(np.maximum(half * half - det, 0.0))
+def _metric(corner: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+  """Returns the squares of two edges of triangles and their product, (n,) each."""
+  a, b = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
+  return tuple(np.einsum("ij,ij->i", p, q) for p, q in ((a, a), (a, b), (b, b)))
 
 
-def _metrics(corner: np.ndarray) -> np.ndarray:
-  arm = corner[:, 1:] - corner[:, :1]
-  return arm @ arm.transpose(0, 2, 1)
+def _squares(rest: tuple, now: tuple) -> np.ndarray:
+  """Returns the squares of the greatest principal stretches of triangles from their metrics."""
+  (r11, r12, r22), (n11, n12, n22) = rest, now
+  det = r11 * r22 - r12 * r12
+  half = 0.5 * (r22 * n11 - 2 * r12 * n12 + r11 * n22) / det
+  return half + np.sqrt(np.maximum(half * half - (n11 * n22 - n12 * n12) / det, 0.0))
 
 
 def _across(rest: np.ndarray, now: np.ndarray) -> np.ndarray:

@@ -22,6 +22,7 @@ from . import (
   inertia,
   mjstruct,
   prepare,
+  skin,
   weights,
   windowed,
 )
@@ -35,7 +36,6 @@ from .hold import Beside, Hold
 from .layout import FLAG, HEAD, STAGE
 from .pierce import Watch
 from .resident import Resident
-from .tear import Tear
 from .rests import Rests
 from .ties import Ties
 from .turns import Turn
@@ -75,7 +75,6 @@ class Workspace:
     rests: what it rests on
     creep: its stress relaxation
     cuts: its mesh as it is now
-    tear: looks whether it tears
     resident: keeper of a motion that stays on the device, or None
     stiff: whether the response is needed, see `inertia.stiffness`
     heaviest: most times its inertia that a node in contact may have, see there  (1,)
@@ -102,6 +101,7 @@ class Workspace:
     plugin_state: the organ's own numbers
     signature: the last of them, see `Declaration`
     views: what a coupling keeps when its graphs are recorded anew
+    skin: what is drawn for it, or None
     boxes: blocks of the plugin state and of what crosses in a step, see `layout`; windows
     phases: what the graphs launch
   """
@@ -131,7 +131,6 @@ class Workspace:
   rests: Rests = dataclasses.field(init=False)
   creep: Creep = dataclasses.field(init=False)
   cuts: Cuts = dataclasses.field(init=False)
-  tear: Tear = dataclasses.field(init=False)
   resident: Resident | None = None
   stiff: bool = False
   heaviest: np.ndarray = dataclasses.field(default_factory=lambda: np.ones(1))
@@ -159,13 +158,14 @@ class Workspace:
   plugin_state: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))
   signature: Any = dataclasses.field(default_factory=lambda: memoryview(b"\0"))
   views: dict = dataclasses.field(default_factory=dict)
+  skin: skin.Skin | None = None
   boxes: dict = dataclasses.field(default_factory=dict)
   phases: Phases | None = None
 
   def __post_init__(self):
     self.hold, self.ties = Hold(self), Ties(self)
     self.bonds, self.rests, self.creep = Bonds(self), Rests(self), Creep(self)
-    self.cuts, self.tear = Cuts(self), Tear(self)
+    self.cuts = Cuts(self)
 
   @property
   def beside(self) -> tuple[Beside, ...]:
@@ -398,6 +398,7 @@ def make(model: int, data: int, instance: int) -> Workspace:
     host["mass"].assign(mass)
     if organ.windows:
       w.turn = Turn()
+    w.skin = skin.read(m, organ)
     fasten.declare(w)
     adhere.declare(w)
     bind(w, model)
