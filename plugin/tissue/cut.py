@@ -88,7 +88,7 @@ def cut(
   for run in runs:
     run.chain = paths.chain(mesh, run, edge)
   _check(organ, runs, pinned)
-  edges, stopped = _room(mesh, [pair for run in runs for pair in paths.pairs(run.chain)])
+  edges, stopped = _room(mesh, [pair for run in runs for pair in _uncut(mesh, run.chain)])
   there = {v for pair in edges for v in pair}
   moved, corner, weight = _snap(mesh, runs, pinned, position, energy, there)
   rest = mesh.rest.copy()
@@ -250,6 +250,25 @@ def _may_separate(run: paths.Run, group: np.ndarray) -> bool:
   return run.closes or bool(np.isin(run.chain[:1] + run.chain[-1:], group).all())
 
 
+def _uncut(mesh: Mesh, chain: list[int]) -> list[tuple[int, int]]:
+  """Returns the edges of a chain that have tissue on both sides.
+
+  Where it goes along an older cut, single edges between are not a way into the tissue.
+  """
+  pairs = paths.pairs(chain)
+  inner = [_is_inner(mesh, *pair) for pair in pairs]
+  if all(inner):
+    return pairs
+  beside = [False, *inner, False]
+  return [p for k, p in enumerate(pairs) if inner[k] and (beside[k] or beside[k + 2])]
+
+
+def _is_inner(mesh: Mesh, a: int, b: int) -> bool:
+  """Returns whether an edge has a triangle on both sides."""
+  halves = mesh.ring_elem[a][mesh.ring[a] == b]
+  return bool(len(halves)) and halves[0] >= 0 and mesh.twin[halves[0]] >= 0
+
+
 def _room(mesh: Mesh, pairs: list[tuple[int, int]]) -> tuple[list[tuple[int, int]], bool]:
   """Returns as many of the edges, from the first one, as there are spare vertices for."""
   left = mesh.nvert - mesh.nouter
@@ -258,8 +277,9 @@ def _room(mesh: Mesh, pairs: list[tuple[int, int]]) -> tuple[list[tuple[int, int
     cuts = {(min(p), max(p)) for p in pairs[:count]}
     verts = dict.fromkeys(v for pair in pairs[:count] for v in pair)
     need = sum(len(_fans(mesh, v, cuts)) - 1 for v in verts)
+    if not need:  # nothing comes apart: it was cut already, or there is no room at all
+      return [], count < len(pairs)
     if need <= left:
-      count *= need > 0
       break
     count -= max(1, min(count, need - left))
   return pairs[:count], count < len(pairs)

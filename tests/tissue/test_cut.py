@@ -230,6 +230,12 @@ def test_a_cut_stops_where_no_spare_vertices_are_left():
   assert again.stopped and again.length == 0.0 and not again.moved.size
 
 
+def test_a_cut_along_an_older_one_does_nothing():
+  mesh = cut(sheet(30, spare=SPARE), [[0.03, 0, 0], [0.12, 0, 0]]).mesh
+  again = cut(mesh, [[0.05, 0, 0], [0.1, 0, 0]])
+  assert not again.stopped and again.length == 0.0 and again.mesh.nouter == mesh.nouter
+
+
 REFUSED = {
   "shape": ([[0.0, 0.0]], "shape \\(1, 2\\), expected \\(n, 3\\), n >= 2"),
   "finite": ([[0.05, 0, 0], [np.nan, 0, 0]], "point 1 is .* expected finite"),
