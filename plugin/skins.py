@@ -56,10 +56,9 @@ def add_skin(
   points = smooth(rest)
   above = np.broadcast_to(np.asarray(height, float), (count,))
   points = points + above[:, None] * vertex_normals(points, smooth.elem)
-  # A colour of its own would count, not the material's.
-  look: dict = (
-    {"material": material} if material else {"rgba": flex.rgba, "material": flex.material}
-  )
+  look: dict = {"material": material or flex.material}
+  if not material:  # a colour of its own would count, not the material's
+    look["rgba"] = flex.rgba
   if texcoord is not None:
     look["texcoord"] = _fine(organ, texcoord, smooth, len(rest), count).ravel()
   skin = spec.add_skin(
