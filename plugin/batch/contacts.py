@@ -1,12 +1,14 @@
 """Contacts of an organ's window with tools, written where mujoco_warp makes constraints of them.
 
-Each slot has a place of its own for its contacts, so that which is where does not depend on who
-comes first, and worlds need nothing of each other.
+Each slot notes its contacts in a place of its own; then those of all worlds are written one after
+the other, so that mujoco_warp's kernels, which run over all contacts, meet none that is none. Which
+is where does not depend on who comes first.
 """
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
 import functools
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -333,11 +335,97 @@ def kernel(kinds: frozenset[int]) -> wp.Kernel:
   return find
 
 
+@struct
+class Pack:
+  """What slots noted, and where mujoco_warp has the contacts of each world."""
+
+  most: int  # contacts of a world
+  many: ints("nworld", "nslot")  # contacts of a slot
+  count: ints("nworld")  # of a world
+  first: ints("nworld")  # contacts of the worlds before it
+  missed: ints("nworld")  # see `Patch`
+  start: ints(1)  # the organ's first contact
+  nacon: ints(1)
+  dist: floats("naconmax")
+  pos: Array(wp.vec3, ("naconmax",))
+  frame: Array(wp.mat33, ("naconmax",))
+  includemargin: floats("naconmax")
+  friction: Array(vec5, ("naconmax",))
+  solref: Array(wp.vec2, ("naconmax",))
+  solreffriction: Array(wp.vec2, ("naconmax",))
+  solimp: Array(vec5, ("naconmax",))
+  dim: ints("naconmax")
+  geom: Array(wp.vec2i, ("naconmax",))
+  flex: Array(wp.vec2i, ("naconmax",))
+  elem: Array(wp.vec2i, ("naconmax",))
+  vert: Array(wp.vec2i, ("naconmax",))
+  worldid: ints("naconmax")
+  type: ints("naconmax")
+  geomcollisionid: ints("naconmax")
+
+
 @wp.kernel(enable_backward=False)
-def add(nacon: wp.array[int], start: wp.array[int], count: int):
+def count(c: Touch, k: Pack):
+  """Counts the contacts of a slot."""
+  world, slot = wp.tid()
+  first = (world * k.many.shape[1] + slot) * c.room
+  n = int(0)  # noqa: RUF046, UP018 - a variable to Warp
+  for i in range(c.room):
+    if c.out_type[first + i] == _CONSTRAINT:
+      n += 1
+  k.many[world, slot] = n
+
+
+@wp.kernel(enable_backward=False)
+def total(k: Pack):
+  """Adds up the contacts of a world."""
+  world = wp.tid()
+  n = int(0)  # noqa: RUF046, UP018 - a variable to Warp
+  for slot in range(k.many.shape[1]):
+    n += k.many[world, slot]
+  if n > k.most:
+    k.missed[world] = k.missed[world] + n - k.most
+  k.count[world] = wp.min(n, k.most)
+
+
+@wp.kernel(enable_backward=False)
+def pack(c: Touch, k: Pack):
+  """Writes the contacts of a slot after those of the slots and worlds before it."""
+  world, slot = wp.tid()
+  n = int(0)  # noqa: RUF046, UP018 - a variable to Warp
+  for s in range(slot):
+    n += k.many[world, s]
+  first = k.nacon[0] + k.first[world]
+  place = (world * k.many.shape[1] + slot) * c.room
+  for q in range(place, place + k.many[world, slot]):
+    if n >= k.most:
+      return
+    i = first + n
+    k.dist[i] = c.out_dist[q]
+    k.pos[i] = c.out_pos[q]
+    k.frame[i] = c.out_frame[q]
+    k.includemargin[i] = c.out_includemargin[q]
+    k.friction[i] = c.out_friction[q]
+    k.solref[i] = c.out_solref[q]
+    k.solreffriction[i] = c.out_solreffriction[q]
+    k.solimp[i] = c.out_solimp[q]
+    k.dim[i] = c.out_dim[q]
+    k.geom[i] = c.out_geom[q]
+    k.flex[i] = c.out_flex[q]
+    k.elem[i] = c.out_elem[q]
+    k.vert[i] = c.out_vert[q]
+    k.worldid[i] = world
+    k.type[i] = c.out_type[q]
+    k.geomcollisionid[i] = c.out_geomcollisionid[q]
+    n += 1
+
+
+@wp.kernel(enable_backward=False)
+def add(k: Pack):
   """Adds an organ's to the number of contacts, after all have seen it."""
-  start[0] = nacon[0]
-  nacon[0] = nacon[0] + count
+  last = k.count.shape[0] - 1
+  k.start[0] = k.nacon[0]
+  k.nacon[0] = k.nacon[0] + k.first[last] + k.count[last]
 
 
 def room_of(model: mujoco.MjModel, tools: np.ndarray) -> int:
@@ -352,7 +440,9 @@ def most_of(model: mujoco.MjModel, tools: np.ndarray, nslot: int) -> int:
   return nslot * min(2 * each, 4)
 
 
-def make(model: mujoco.MjModel, organ, tools: np.ndarray, flex: int, nworld: int, data):
+def make(
+  model: mujoco.MjModel, organ, tools: np.ndarray, flex: int, nworld: int, nslot: int, data
+):
   """Returns how an organ touches its tools.
 
   Args:
@@ -361,28 +451,51 @@ def make(model: mujoco.MjModel, organ, tools: np.ndarray, flex: int, nworld: int
     tools: geoms that its slots follow
     flex: the slots' flex in the stripped model
     nworld: number of worlds
+    nslot: slots of the organ
     data: mujoco_warp's
   """
   own = int(organ.windows.flex[0]) if organ.windows else organ.flex
   rows = [_mix(model, int(g), own) for g in tools]
   mixed = {name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else ())}
-  contact = {f"out_{name}": getattr(data.contact, name) for name in _written()}
-  values = mixed | contact | dict(
-    room=room_of(model, tools),
+  device, room = data.nacon.device, room_of(model, tools)
+  noted = {
+    f"out_{name}": wp.zeros(nworld * nslot * room, dtype=kind, device=device)
+    for name, kind in _written().items()
+  }
+  values = mixed | noted | dict(
+    room=room,
     flex=flex,
     radius=float(model.flex_radius[own]),
     kind=model.geom_type[tools],
     size=model.geom_size[tools],
     rough=np.full(nworld, model.flex_friction[own, 0]),
     slide=np.tile(mixed["slide"], (nworld, 1)) if rows else np.zeros((nworld, 0)),
-    nacon=data.nacon,
+    nacon=np.zeros(1),
     start=np.zeros(1),
   )  # fmt: skip
-  return fill(Touch, data.nacon.device, values)
+  return fill(Touch, device, values)
 
 
-def _written() -> list[str]:
-  return [name.removeprefix("out_") for name in Touch.vars if name.startswith("out_")]
+def packing(touch, patch, most: int, data):
+  """Returns where the contacts that `touch` has are packed, `most` of a world."""
+  names = [*_written(), "nacon"]
+  contact = {n: getattr(data if n == "nacon" else data.contact, n) for n in names}
+  nworld, nslot = patch.slot_node.shape
+  values = contact | dict(
+    most=most,
+    many=np.zeros((nworld, nslot)),
+    count=np.zeros(nworld),
+    first=np.zeros(nworld),
+    missed=patch.missed,
+    start=np.zeros(1),
+  )  # fmt: skip
+  return fill(Pack, data.nacon.device, values)
+
+
+def _written() -> dict[str, Any]:
+  """Returns the types of what slots note."""
+  found = {n.removeprefix("out_"): v.type.dtype for n, v in Touch.vars.items() if n[:4] == "out_"}
+  return found
 
 
 def _mix(model, g: int, f: int) -> dict:

@@ -19,7 +19,10 @@ class Pressed:
 
   many: int  # contacts of a world
   paired: int  # whether the cone is a pyramid
+  flex: int  # the slots' flex
   start: ints(1)  # the organ's first contact
+  first: ints("nworld")  # its contacts in the worlds before
+  count: ints("nworld")  # its contacts
   dim: ints("naconmax")  # rows of a contact, or pairs of them and one
   contact_geom: Array(wp.vec2i, ("naconmax",))
   frame: Array(wp.mat33, ("naconmax",))
@@ -53,7 +56,9 @@ def _has_rows(p: Pressed, c: int):
 def keep_closed(p: Pressed):
   """Takes the parting of sliding contacts off their reference accelerations."""
   world, k = wp.tid()
-  c = p.start[0] + world * p.many + k
+  if k >= p.count[world]:
+    return
+  c = p.start[0] + p.first[world] + k
   n = p.dim[c]
   if n < 2 or not _has_rows(p, c):
     return
@@ -75,10 +80,10 @@ def keep_closed(p: Pressed):
 def press(p: Pressed):
   """Writes the geoms, normals and normal forces of contacts."""
   world, k = wp.tid()
-  c = p.start[0] + world * p.many + k
+  c = p.start[0] + p.first[world] + k
   p.geom[world, k] = -1
   p.force[world, k] = 0.0
-  if not _has_rows(p, c):
+  if k >= p.count[world] or not _has_rows(p, c):
     return
   total = float(0.0)  # noqa: UP018 - a variable to Warp
   for r in range(wp.where(p.paired == 1, _rows(p, c), 1)):
@@ -88,16 +93,17 @@ def press(p: Pressed):
   p.force[world, k] = total
 
 
-def make(batch, touch, nslot: int):
+def make(batch, pack, flex: int):
   """Returns the contacts of an organ's slots.
 
   Args:
     batch: the worlds, with mujoco_warp's data
-    touch: how the organ touches its tools
-    nslot: its slots
+    pack: where its contacts are
+    flex: its slots' flex
   """
   out, d = Pressed(), batch.d
-  out.many, out.paired, out.start = nslot * touch.room, int(batch.paired), touch.start
+  out.many, out.paired, out.flex = pack.most, int(batch.paired), flex
+  out.start, out.first, out.count = pack.start, pack.first, pack.count
   for name in ("dim", "frame", "friction", "efc_address"):
     setattr(out, name, getattr(d.contact, name))
   out.contact_geom, out.aref, out.row_force = d.contact.geom, d.efc.aref, d.efc.force

@@ -91,13 +91,13 @@ class Worlds(Batch):
     model, nworld = self.model, self.nworld
     self.paired = model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
     most = [contacts.most_of(model, t, n) for t, n in zip(tools, nslots, strict=True)]
-    regions = [contacts.room_of(model, t) * n for t, n in zip(tools, nslots, strict=True)]
+    noted = [contacts.room_of(model, t) * n for t, n in zip(tools, nslots, strict=True)]
     condim = int(max([1, *model.flex_condim, *model.geom_condim]))
     each = 1 if condim == 1 else 2 * (condim - 1) if self.paired else condim
     between = _CONTACTS if strip.tools_meet(bare) else 0
     self.njmax = strip.rows_of(bare) + (between + sum(most)) * each
-    ncon = between + sum(regions)
-    size = states.bytes_of(bare, self.njmax, ncon) + sum(
+    ncon = between + sum(most)
+    size = states.bytes_of(bare, self.njmax, ncon + sum(noted)) + sum(
       Organ.bytes_of(w, self.device) for w in spaces.values()
     )
     size += sum(convex.bytes_of(model.geom_type[t], n) for t, n in zip(tools, nslots, strict=True))
@@ -176,9 +176,9 @@ class Worlds(Batch):
     self._graphs = {}
     work = {"step": self._once, "after": self._after}
     work |= {"reset": self._rest.launch, "look": self._rest.look}
-    for organ in self._organs.values():
-      organ.load()
     if not self.device.is_cuda:
+      for organ in self._organs.values():
+        organ.load()
       self._graphs = {name: (None, each) for name, each in work.items()}
       return
     for each in work.values():
