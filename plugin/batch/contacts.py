@@ -1,14 +1,13 @@
 """Contacts of an organ's window with tools, written where mujoco_warp makes constraints of them.
 
-Each slot notes its contacts in a place of its own; then those of all worlds are written one after
-the other, so that mujoco_warp's kernels, which run over all contacts, meet none that is none. Which
-is where does not depend on who comes first.
+They are looked for twice: counted, then written one after the other, by worlds and slots. So no
+place is left empty, which mujoco_warp's kernels would run over, and which contact is where does not
+depend on who comes first.
 """
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
 import functools
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -19,7 +18,7 @@ from mujoco_warp._src import collision_primitive_core as core
 from mujoco_warp._src.types import ContactType, vec5
 from palpate.tissue.types import Array, fill, floats, ints, struct
 
-from . import convex
+from . import convex, cylinder
 from .convex import Convex
 from .patch import Patch
 
@@ -48,7 +47,7 @@ _GREATER, _TOOL, _ORGAN = wp.constant(0), wp.constant(1), wp.constant(2)
 class Touch:
   """How an organ's triangles touch each tool, and mujoco_warp's contacts."""
 
-  room: int  # contacts of a slot
+  most: int  # contacts of a world
   flex: int  # the slots' flex
   radius: float  # of that [m]
   kind: ints("ntool")  # mjtGeom
@@ -61,9 +60,13 @@ class Touch:
   friction: Array(vec5, ("ntool",))  # all of it, the sliding one as compiled
   solref: Array(wp.vec2, ("ntool",))
   solimp: Array(vec5, ("ntool",))
+  many: ints("nworld", "nslot")  # contacts of a slot
+  count: ints("nworld")  # of a world
+  before: ints("nworld")  # of the worlds before it
+  missed: ints("nworld")  # see `Patch`
+  start: ints(1)  # the organ's first contact
   # mujoco_warp:
   nacon: ints(1)
-  start: ints(1)  # the organ's first contact
   out_dist: floats("naconmax")
   out_pos: Array(wp.vec3, ("naconmax",))
   out_frame: Array(wp.mat33, ("naconmax",))
@@ -87,8 +90,8 @@ class Place:
   """A triangle before a tool, and where its contacts go."""
 
   world: int
-  first: int  # contact, -1 where they are counted alone
-  room: int
+  first: int  # contact
+  room: int  # for how many, 0 where they are counted alone
   thread: int  # of all slots of all worlds
   elem: int  # -1 for a corner alone
   vert: int  # -1 for a triangle
@@ -148,7 +151,7 @@ def _put(c: Touch, at: Place, n: int, dist: float, pos: wp.vec3, normal: wp.vec3
   q = at.tool
   if not dist < c.margin[q]:
     return n
-  if at.first >= 0 and n < at.room:
+  if n < at.room:
     k = at.first + n
     c.out_dist[k] = dist
     c.out_pos[k] = pos
@@ -171,6 +174,7 @@ def _put(c: Touch, at: Place, n: int, dist: float, pos: wp.vec3, normal: wp.vec3
     c.out_flex[k] = wp.vec2i(-1, c.flex)
     c.out_elem[k] = wp.vec2i(-1, at.elem)
     c.out_vert[k] = wp.vec2i(-1, at.vert)
+    c.out_worldid[k] = at.world
     c.out_type[k] = _CONSTRAINT
     c.out_geomcollisionid[k] = n
   return n + 1
@@ -212,6 +216,8 @@ def _against(kinds: frozenset[int]):
     axis = wp.vec3(rot[0, 2], rot[1, 2], rot[2, 2])
     kind = c.kind[at.tool]
     margin = c.margin[at.tool]
+    if convex.is_beyond(v, at.tool, pos, rot, margin + c.radius, a, b, d):
+      return n
     if wp.static(sphere):
       if kind == _SPHERE:
         dist, x, normal = core.sphere_triangle(pos, size[0], a, b, d, c.radius, margin)
@@ -233,8 +239,13 @@ def _against(kinds: frozenset[int]):
         dists2, xs2, normals2 = core.box_triangle(pos, rot, size, a, b, d, c.radius, margin)
         for k in range(11):
           n = _put(c, at, n, dists2[k], xs2[k], normals2[k])
+    if wp.static(_CYLINDER in kinds):
+      if kind == wp.static(_CYLINDER):
+        far4, x4, normal4 = cylinder.touch(pos, rot, size, margin + c.radius, a, b, d)
+        gap4 = far4 - c.radius
+        n = _put(c, at, n, gap4, x4 - (c.radius + 0.5 * gap4) * normal4, normal4)
     if wp.static(solid):
-      if kind == wp.static(_CYLINDER) or kind == wp.static(_MESH):
+      if kind == wp.static(_MESH):
         before = convex.Before()
         before.tool = at.tool
         before.kind = kind
@@ -277,19 +288,26 @@ def _owner(p: Patch, world: int, e: int):
 
 @functools.cache
 def kernel(kinds: frozenset[int]) -> wp.Kernel:
-  """Returns the kernel that finds contacts with tools of these kinds, a thread a slot."""
+  """Returns the kernel that counts or writes contacts with tools of these kinds, by slots."""
   against = _against(kinds)
 
   @wp.kernel(module="unique", enable_backward=False)
-  def find(p: Patch, c: Touch, v: Convex):
+  def find(p: Patch, c: Touch, v: Convex, writes: bool):
     world, slot = wp.tid()
     at = Place()
     at.world = world
     at.thread = world * p.nslot + slot
-    at.room = c.room
-    first = c.nacon[0] + (world * p.nslot + slot) * c.room
-    n = int(0)  # noqa: RUF046, UP018 - a variable to Warp
+    at.room = 0
+    first = int(0)  # noqa: RUF046, UP018 - a variable to Warp
+    n = int(0)  # noqa: RUF046, UP018
     i = p.slot_node[world, slot]
+    if writes:
+      if c.many[world, slot] == 0:
+        return
+      for s in range(slot):
+        first += c.many[world, s]
+      at.room = c.most - first
+      first += c.nacon[0] + c.before[world]
     if i >= 0:
       for q in range(p.near_adr[i], p.near_adr[i + 1]):
         e = p.near[q]
@@ -300,8 +318,8 @@ def kernel(kinds: frozenset[int]) -> wp.Kernel:
         b = p.node_slot[world, vb]
         d = p.node_slot[world, vd]
         whole = a >= 0 and b >= 0 and d >= 0
-        if _owner(p, world, e) == i:
-          at.first = wp.where(whole, first, -1)
+        if _owner(p, world, e) == i and (whole or not writes):
+          at.first = first
           at.vert = -1
           at.elem = 0
           if whole:
@@ -323,179 +341,73 @@ def kernel(kinds: frozenset[int]) -> wp.Kernel:
         at.elem = -1
         at.vert = slot
         n = _on_planes(p, c, at, n, _where(p, world, i))
-    if n > c.room:
-      wp.atomic_add(p.missed, world, n - c.room)
-    for k in range(c.room):
-      c.out_worldid[first + k] = world
-      if k >= n:
-        c.out_type[first + k] = 0
-        c.out_dim[first + k] = 1
-        c.out_geom[first + k] = wp.vec2i(-1, -1)
+    if not writes:
+      c.many[world, slot] = n
 
   return find
 
 
-@struct
-class Pack:
-  """What slots noted, and where mujoco_warp has the contacts of each world."""
-
-  most: int  # contacts of a world
-  many: ints("nworld", "nslot")  # contacts of a slot
-  count: ints("nworld")  # of a world
-  first: ints("nworld")  # contacts of the worlds before it
-  missed: ints("nworld")  # see `Patch`
-  start: ints(1)  # the organ's first contact
-  nacon: ints(1)
-  dist: floats("naconmax")
-  pos: Array(wp.vec3, ("naconmax",))
-  frame: Array(wp.mat33, ("naconmax",))
-  includemargin: floats("naconmax")
-  friction: Array(vec5, ("naconmax",))
-  solref: Array(wp.vec2, ("naconmax",))
-  solreffriction: Array(wp.vec2, ("naconmax",))
-  solimp: Array(vec5, ("naconmax",))
-  dim: ints("naconmax")
-  geom: Array(wp.vec2i, ("naconmax",))
-  flex: Array(wp.vec2i, ("naconmax",))
-  elem: Array(wp.vec2i, ("naconmax",))
-  vert: Array(wp.vec2i, ("naconmax",))
-  worldid: ints("naconmax")
-  type: ints("naconmax")
-  geomcollisionid: ints("naconmax")
-
-
 @wp.kernel(enable_backward=False)
-def count(c: Touch, k: Pack):
-  """Counts the contacts of a slot."""
-  world, slot = wp.tid()
-  first = (world * k.many.shape[1] + slot) * c.room
-  n = int(0)  # noqa: RUF046, UP018 - a variable to Warp
-  for i in range(c.room):
-    if c.out_type[first + i] == _CONSTRAINT:
-      n += 1
-  k.many[world, slot] = n
-
-
-@wp.kernel(enable_backward=False)
-def total(k: Pack):
-  """Adds up the contacts of a world."""
+def count(c: Touch):
+  """Adds up the contacts of a world; those beyond its room are missed."""
   world = wp.tid()
   n = int(0)  # noqa: RUF046, UP018 - a variable to Warp
-  for slot in range(k.many.shape[1]):
-    n += k.many[world, slot]
-  if n > k.most:
-    k.missed[world] = k.missed[world] + n - k.most
-  k.count[world] = wp.min(n, k.most)
+  for slot in range(c.many.shape[1]):
+    n += c.many[world, slot]
+  c.count[world] = wp.min(n, c.most)
+  c.missed[world] = c.missed[world] + n - c.count[world]
 
 
 @wp.kernel(enable_backward=False)
-def pack(c: Touch, k: Pack):
-  """Writes the contacts of a slot after those of the slots and worlds before it."""
-  world, slot = wp.tid()
-  n = int(0)  # noqa: RUF046, UP018 - a variable to Warp
-  for s in range(slot):
-    n += k.many[world, s]
-  first = k.nacon[0] + k.first[world]
-  place = (world * k.many.shape[1] + slot) * c.room
-  for q in range(place, place + k.many[world, slot]):
-    if n >= k.most:
-      return
-    i = first + n
-    k.dist[i] = c.out_dist[q]
-    k.pos[i] = c.out_pos[q]
-    k.frame[i] = c.out_frame[q]
-    k.includemargin[i] = c.out_includemargin[q]
-    k.friction[i] = c.out_friction[q]
-    k.solref[i] = c.out_solref[q]
-    k.solreffriction[i] = c.out_solreffriction[q]
-    k.solimp[i] = c.out_solimp[q]
-    k.dim[i] = c.out_dim[q]
-    k.geom[i] = c.out_geom[q]
-    k.flex[i] = c.out_flex[q]
-    k.elem[i] = c.out_elem[q]
-    k.vert[i] = c.out_vert[q]
-    k.worldid[i] = world
-    k.type[i] = c.out_type[q]
-    k.geomcollisionid[i] = c.out_geomcollisionid[q]
-    n += 1
-
-
-@wp.kernel(enable_backward=False)
-def add(k: Pack):
+def add(c: Touch):
   """Adds an organ's to the number of contacts, after all have seen it."""
-  last = k.count.shape[0] - 1
-  k.start[0] = k.nacon[0]
-  k.nacon[0] = k.nacon[0] + k.first[last] + k.count[last]
-
-
-def room_of(model: mujoco.MjModel, tools: np.ndarray) -> int:
-  """Returns how many contacts a slot has room for: those of four triangles."""
-  each = max((_EACH[int(kind)] for kind in model.geom_type[tools]), default=1)
-  return min(4 * each, 16)
+  last = c.count.shape[0] - 1
+  c.start[0] = c.nacon[0]
+  c.nacon[0] = c.nacon[0] + c.before[last] + c.count[last]
 
 
 def most_of(model: mujoco.MjModel, tools: np.ndarray, nslot: int) -> int:
   """Returns how many contacts a world has rows for: two a slot, a patch's triangles, or more."""
-  each = max((_EACH[int(kind)] for kind in model.geom_type[tools]), default=1)
+  each = sum(_EACH[int(kind)] for kind in model.geom_type[tools])
   return nslot * min(2 * each, 4)
 
 
-def make(
-  model: mujoco.MjModel, organ, tools: np.ndarray, flex: int, nworld: int, nslot: int, data
-):
+def make(model: mujoco.MjModel, organ, tools: np.ndarray, place, missed: wp.array, data):
   """Returns how an organ touches its tools.
 
   Args:
     model: the compiled scene
     organ: the organ's declaration
     tools: geoms that its slots follow
-    flex: the slots' flex in the stripped model
-    nworld: number of worlds
-    nslot: slots of the organ
+    place: where the stripped model has these
+    missed: see `Patch`
     data: mujoco_warp's
   """
+  nworld, nslot, flex = len(missed), place.nslot, place.flex
   own = int(organ.windows.flex[0]) if organ.windows else organ.flex
   rows = [_mix(model, int(g), own) for g in tools]
   mixed = {name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else ())}
-  device, room = data.nacon.device, room_of(model, tools)
-  noted = {
-    f"out_{name}": wp.zeros(nworld * nslot * room, dtype=kind, device=device)
-    for name, kind in _written().items()
-  }
-  values = mixed | noted | dict(
-    room=room,
+  contact = {f"out_{name}": getattr(data.contact, name) for name in _written()}
+  values = mixed | contact | dict(
+    most=most_of(model, tools, nslot),
     flex=flex,
     radius=float(model.flex_radius[own]),
     kind=model.geom_type[tools],
     size=model.geom_size[tools],
     rough=np.full(nworld, model.flex_friction[own, 0]),
     slide=np.tile(mixed["slide"], (nworld, 1)) if rows else np.zeros((nworld, 0)),
-    nacon=np.zeros(1),
-    start=np.zeros(1),
-  )  # fmt: skip
-  return fill(Touch, device, values)
-
-
-def packing(touch, patch, most: int, data):
-  """Returns where the contacts that `touch` has are packed, `most` of a world."""
-  names = [*_written(), "nacon"]
-  contact = {n: getattr(data if n == "nacon" else data.contact, n) for n in names}
-  nworld, nslot = patch.slot_node.shape
-  values = contact | dict(
-    most=most,
     many=np.zeros((nworld, nslot)),
     count=np.zeros(nworld),
-    first=np.zeros(nworld),
-    missed=patch.missed,
+    before=np.zeros(nworld),
+    missed=missed,
     start=np.zeros(1),
+    nacon=data.nacon,
   )  # fmt: skip
-  return fill(Pack, data.nacon.device, values)
+  return fill(Touch, data.nacon.device, values)
 
 
-def _written() -> dict[str, Any]:
-  """Returns the types of what slots note."""
-  found = {n.removeprefix("out_"): v.type.dtype for n, v in Touch.vars.items() if n[:4] == "out_"}
-  return found
+def _written() -> list[str]:
+  return [name.removeprefix("out_") for name in Touch.vars if name.startswith("out_")]
 
 
 def _mix(model, g: int, f: int) -> dict:

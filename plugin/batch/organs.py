@@ -98,10 +98,8 @@ class Organ(Tissue):
         "geom_xpos", "geom_xmat", "qpos", "qvel", "qfrc_passive", "qfrc_constraint")},
     )  # fmt: skip
     self.patch = patch.make(values, self.body)
-    self._touch = contacts.make(model, organ, tools, place.flex, nworld, place.nslot, d)
-    most = contacts.most_of(model, tools, place.nslot)
-    self._pack = contacts.packing(self._touch, self.patch, most, d)
-    self._pressed = sliding.make(batch, self._pack, place.flex)
+    self._touch = contacts.make(model, organ, tools, place, self.patch.missed, d)
+    self._pressed = sliding.make(batch, self._touch)
     self._convex = convex.make(model, tools, nworld * place.nslot, m, d)
     kinds = frozenset(int(kind) for kind in model.geom_type[tools])
     self._find = contacts.kernel(kinds)
@@ -150,14 +148,12 @@ class Organ(Tissue):
   def touch(self):
     """Writes the window's contacts."""
     dim, device = (self._batch.nworld, self.place.nslot), self.body.device
-    inputs = [self.patch, self._touch, self._convex]
-    wp.launch(self._find, dim=dim, inputs=inputs, device=device, block_dim=64)
-    touch, pack = self._touch, self._pack
-    wp.launch(contacts.count, dim=dim, inputs=[touch, pack], device=device)
-    wp.launch(contacts.total, dim=dim[0], inputs=[pack], device=device)
-    wp.utils.array_scan(pack.count, pack.first, inclusive=False)
-    wp.launch(contacts.pack, dim=dim, inputs=[touch, pack], device=device)
-    wp.launch(contacts.add, dim=1, inputs=[pack], device=device)
+    inputs, touch = [self.patch, self._touch, self._convex], self._touch
+    wp.launch(self._find, dim=dim, inputs=[*inputs, False], device=device, block_dim=64)
+    wp.launch(contacts.count, dim=dim[0], inputs=[touch], device=device)
+    wp.utils.array_scan(touch.count, touch.before, inclusive=False)
+    wp.launch(self._find, dim=dim, inputs=[*inputs, True], device=device, block_dim=64)
+    wp.launch(contacts.add, dim=1, inputs=[touch], device=device)
 
   def push(self):
     """Adds the passive force, and keeps sliding contacts closed."""

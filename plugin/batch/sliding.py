@@ -19,9 +19,8 @@ class Pressed:
 
   many: int  # contacts of a world
   paired: int  # whether the cone is a pyramid
-  flex: int  # the slots' flex
   start: ints(1)  # the organ's first contact
-  first: ints("nworld")  # its contacts in the worlds before
+  before: ints("nworld")  # its contacts in the worlds before
   count: ints("nworld")  # its contacts
   dim: ints("naconmax")  # rows of a contact, or pairs of them and one
   contact_geom: Array(wp.vec2i, ("naconmax",))
@@ -58,7 +57,7 @@ def keep_closed(p: Pressed):
   world, k = wp.tid()
   if k >= p.count[world]:
     return
-  c = p.start[0] + p.first[world] + k
+  c = p.start[0] + p.before[world] + k
   n = p.dim[c]
   if n < 2 or not _has_rows(p, c):
     return
@@ -80,7 +79,7 @@ def keep_closed(p: Pressed):
 def press(p: Pressed):
   """Writes the geoms, normals and normal forces of contacts."""
   world, k = wp.tid()
-  c = p.start[0] + p.first[world] + k
+  c = p.start[0] + p.before[world] + k
   p.geom[world, k] = -1
   p.force[world, k] = 0.0
   if k >= p.count[world] or not _has_rows(p, c):
@@ -93,17 +92,16 @@ def press(p: Pressed):
   p.force[world, k] = total
 
 
-def make(batch, pack, flex: int):
-  """Returns the contacts of an organ's slots.
+def make(batch, touch):
+  """Returns the contacts of an organ.
 
   Args:
     batch: the worlds, with mujoco_warp's data
-    pack: where its contacts are
-    flex: its slots' flex
+    touch: how the organ touches its tools
   """
   out, d = Pressed(), batch.d
-  out.many, out.paired, out.flex = pack.most, int(batch.paired), flex
-  out.start, out.first, out.count = pack.start, pack.first, pack.count
+  out.many, out.paired = touch.most, int(batch.paired)
+  out.start, out.before, out.count = touch.start, touch.before, touch.count
   for name in ("dim", "frame", "friction", "efc_address"):
     setattr(out, name, getattr(d.contact, name))
   out.contact_geom, out.aref, out.row_force = d.contact.geom, d.efc.aref, d.efc.force

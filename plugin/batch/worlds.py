@@ -8,6 +8,7 @@ along (`native/formula.h`), and the nodes take over what contacts made of the sl
 from __future__ import annotations
 
 import warnings
+from typing import Any
 
 import mujoco
 import mujoco_warp as mjw
@@ -91,13 +92,12 @@ class Worlds(Batch):
     model, nworld = self.model, self.nworld
     self.paired = model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
     most = [contacts.most_of(model, t, n) for t, n in zip(tools, nslots, strict=True)]
-    noted = [contacts.room_of(model, t) * n for t, n in zip(tools, nslots, strict=True)]
     condim = int(max([1, *model.flex_condim, *model.geom_condim]))
     each = 1 if condim == 1 else 2 * (condim - 1) if self.paired else condim
     between = _CONTACTS if strip.tools_meet(bare) else 0
     self.njmax = strip.rows_of(bare) + (between + sum(most)) * each
     ncon = between + sum(most)
-    size = states.bytes_of(bare, self.njmax, ncon + sum(noted)) + sum(
+    size = states.bytes_of(bare, self.njmax, ncon) + sum(
       Organ.bytes_of(w, self.device) for w in spaces.values()
     )
     size += sum(convex.bytes_of(model.geom_type[t], n) for t, n in zip(tools, nslots, strict=True))
@@ -254,6 +254,11 @@ class Worlds(Batch):
   def kept(self) -> tuple[np.ndarray, np.ndarray]:
     """Numbers of qpos and qvel in the model that are not an organ's."""
     return self._kept
+
+  def xmat(self, body: str) -> wp.array:
+    """Returns the axes of a body in the last step, (nworld,) of mat33."""
+    found: Any = self.d.xmat
+    return found[:, self._bare.body(body).id]
 
   @property
   def overflow(self) -> wp.array:
