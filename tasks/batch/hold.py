@@ -101,30 +101,34 @@ def show(s: Common, o: HoldState, w: int):
   o.held[w, 0] = wp.min(o.time[w] / o.hold, 1.0)
 
 
+@struct
+class Between:
+  """What the jaws touch."""
+
+  left: Array(wp.mat33, ("nworld",))  # axes of the jaws
+  right: Array(wp.mat33, ("nworld",))
+  geom: ints("nworld", "ncontact")  # see `palpate.batch.Contacts`
+  normal: floats("nworld", "ncontact", 3)
+  force: floats("nworld", "ncontact")  # [N]
+
+
 @wp.kernel(enable_backward=False)
-def press(
-  o: HoldState,
-  left: wp.array(dtype=wp.mat33),
-  right: wp.array(dtype=wp.mat33),
-  geom: wp.array(dtype=int, ndim=2),
-  normal: wp.array(dtype=float, ndim=3),
-  force: wp.array(dtype=float, ndim=2),
-):
+def press(o: HoldState, b: Between):
   """Adds up the force of the jaws' inner faces on the organ, see `Jaws.inner_force`."""
   w = wp.tid()
   both = wp.vec2(0.0, 0.0)
-  for k in range(geom.shape[1]):
-    g = geom[w, k]
+  for k in range(b.geom.shape[1]):
+    g = b.geom[w, k]
     if g >= 0 and o.side[g] != 0.0:
-      n = -wp.vec3(normal[w, k, 0], normal[w, k, 1], normal[w, k, 2])
+      n = -wp.vec3(b.normal[w, k, 0], b.normal[w, k, 1], b.normal[w, k, 2])
       jaw = int(0)  # noqa: RUF046, UP018 - a variable to Warp
-      axes = left[w]
+      axes = b.left[w]
       if o.side[g] < 0.0:
         jaw = 1
-        axes = right[w]
+        axes = b.right[w]
       along = o.side[g] * (n[0] * axes[0, 0] + n[1] * axes[1, 0] + n[2] * axes[2, 0])
       if along > _FACING:
-        both[jaw] = both[jaw] + force[w, k] * along
+        both[jaw] = both[jaw] + b.force[w, k] * along
   o.inner[w, 0] = both[0]
   o.inner[w, 1] = both[1]
 
@@ -156,8 +160,10 @@ class Hold(domain.Domain):
     batch, own = worlds.batch, worlds.own
     found = jaws.Jaws(batch.model, worlds.task.prefix)
     if not isinstance(batch, Threads):
-      axes = [batch.xmat(name) for name in found.names]
-      worlds.launch(press, worlds.nworld, [own, *axes, *worlds.organ.contacts])
+      between: Any = Between()
+      between.left, between.right = (batch.xmat(name) for name in found.names)
+      between.geom, between.normal, between.force = worlds.organ.contacts
+      worlds.launch(press, worlds.nworld, [own, between])
       return
     inner = own.inner.numpy()
 

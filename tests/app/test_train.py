@@ -70,7 +70,7 @@ def test_the_curve_counts_the_last_whole_episode_of_each_world():
   for _ in range(10):
     _, _, over, extras = seen.step(torch.zeros(4, 4))
     assert not extras["log"] or (extras["log"]["/length"] == 10).all()
-  assert not seen.won.any() and not fields.success.numpy().any()  # none touched, the last one counts
+  assert not seen.won.any() and not fields.success.numpy().any()  # none touched
   env.close()
 
 
