@@ -39,6 +39,7 @@ _CYLINDER, _MESH = KINDS[5:]
 _FAR = wp.constant(1e10)  # what mujoco_warp says of a contact that is none
 _CONSTRAINT = wp.constant(int(ContactType.CONSTRAINT))
 _LEAST = 1e-5  # friction, as in MuJoCo
+_FEW = 4  # tools; more of them share triangles
 # Whose sliding friction counts: the greater, or that of the one with priority.
 _GREATER, _TOOL, _ORGAN = wp.constant(0), wp.constant(1), wp.constant(2)
 
@@ -216,8 +217,6 @@ def _against(kinds: frozenset[int]):
     axis = wp.vec3(rot[0, 2], rot[1, 2], rot[2, 2])
     kind = c.kind[at.tool]
     margin = c.margin[at.tool]
-    if convex.is_beyond(v, at.tool, pos, rot, margin + c.radius, a, b, d):
-      return n
     if wp.static(sphere):
       if kind == _SPHERE:
         dist, x, normal = core.sphere_triangle(pos, size[0], a, b, d, c.radius, margin)
@@ -328,10 +327,16 @@ def kernel(kinds: frozenset[int]) -> wp.Kernel:
           xa = _where(p, world, va)
           xb = _where(p, world, vb)
           xd = _where(p, world, vd)
+          centre = (xa + xb + xd) / 3.0
+          far = wp.max(wp.length_sq(xa - centre), wp.length_sq(xb - centre))
+          around = wp.sqrt(wp.max(far, wp.length_sq(xd - centre))) + c.radius
           for tool in range(p.ntool):
             at.tool = tool
             at.geom = p.tool_geom[tool]
-            more = against(p, c, v, at, more, xa, xb, xd)
+            pos = p.geom_xpos[world, at.geom]
+            rot = p.geom_xmat[world, at.geom]
+            if not convex.is_beyond(v, tool, pos, rot, centre, around + c.margin[tool]):
+              more = against(p, c, v, at, more, xa, xb, xd)
           if whole:
             n = more
           elif more > 0:
@@ -368,8 +373,8 @@ def add(c: Touch):
 
 def most_of(model: mujoco.MjModel, tools: np.ndarray, nslot: int) -> int:
   """Returns how many contacts a world has rows for: two a slot, a patch's triangles, or more."""
-  each = sum(_EACH[int(kind)] for kind in model.geom_type[tools])
-  return nslot * min(2 * each, 4)
+  each = max((_EACH[int(kind)] for kind in model.geom_type[tools]), default=1)
+  return nslot * (4 if each > _EACH[int(_GEOM.mjGEOM_CAPSULE)] else 3 if len(tools) > _FEW else 2)
 
 
 def make(model: mujoco.MjModel, organ, tools: np.ndarray, place, missed: wp.array, data):

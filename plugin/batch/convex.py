@@ -41,22 +41,11 @@ class Convex:
 
 
 @wp.func
-def is_beyond(
-  k: Convex,
-  tool: int,
-  pos: wp.vec3,
-  rot: wp.mat33,
-  reach: float,
-  a: wp.vec3,
-  b: wp.vec3,
-  d: wp.vec3,
-):
-  """Returns whether a triangle is farther than `reach` from the box about a tool."""
-  centre = (a + b + d) / 3.0
-  around = wp.max(wp.length(a - centre), wp.max(wp.length(b - centre), wp.length(d - centre)))
+def is_beyond(k: Convex, tool: int, pos: wp.vec3, rot: wp.mat33, centre: wp.vec3, around: float):
+  """Returns whether a ball is beyond the box about a tool."""
   near = wp.transpose(rot) * (centre - pos) - k.middle[tool]
   far = wp.max(wp.abs(near) - k.half[tool], wp.vec3(0.0))
-  return wp.length(far) >= around + reach
+  return wp.length_sq(far) >= around * around
 
 
 @wp.func

@@ -81,6 +81,7 @@ class Organ(Tissue):
       nq=m.nq,
       nv=m.nv,
       nbody=m.nbody,
+      ngeom=m.ngeom,
       dofadr=place.dofadr,
       qposadr=place.qposadr,
       bodyid=place.body,

@@ -25,6 +25,7 @@ from .organs import Organ
 from .rest import Rest
 
 _CONTACTS = 16  # of a world, of tools with each other and with what is fixed
+_ITERATIONS = 8  # of the constraint solver, at most
 _LOST = int(OverflowType.NEFC | OverflowType.NJMAX_NNZ | OverflowType.NARROWPHASE)
 
 
@@ -116,6 +117,8 @@ class Worlds(Batch):
       bare, start, nworld=nworld, nconmax=ncon, njmax=self.njmax, njmax_nnz=nonzero
     )
     self.m.opt.warn_overflow = 0  # counted, see `overflow`
+    # All worlds wait for the one that takes longest.
+    self.m.opt.iterations = min(self.m.opt.iterations, _ITERATIONS)
     self.m.opt.deterministic = int(DeterminismType.ALL if deterministic else DeterminismType.NONE)
     # The windows' triangles have no forces and contacts of mujoco_warp's own.
     self.m.nflexelem = self.m.nflexedge = 0

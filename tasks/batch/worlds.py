@@ -152,6 +152,7 @@ class Worlds:
     wp.copy(self.fields.action, action)
     self._over(kernels.act)
     self.batch.step(self._substeps)
+    self.episodes.draw_ahead()
     self._read(self.fields)
     self._over(kernels.measure, False)
     self._domain.sense(self)

@@ -115,6 +115,31 @@ def test_an_organ_rests_on_what_does_not_move(device, still):
 
 
 @pytest.mark.parametrize("device", DEVICES)
+def test_a_touch_sensor_feels_its_own_body_alone(device):
+  points, elem = sphere(2)
+  tissue = organ(points, elem, young=3e4, foundation=1e5, tolerance=1e-6, bend=0)
+  tools = "".join(
+    f"""<body name="{name}" pos="{x} 0 {RADIUS + 0.0055}"><joint name="{name}" type="slide"
+    axis="0 0 1"/><geom size="0.006" mass="0.05" condim="1"/><site name="{name}" size="0.05"/></body>
+    """
+    for name, x in (("left", -0.001), ("right", 0.001))
+  )
+  extra = """<actuator><position joint="left" kp="500" kv="10"/><position joint="right" kp="500"
+    kv="10"/></actuator><contact><exclude body1="left" body2="right"/></contact>
+    <sensor><touch site="left"/><touch site="right"/></sensor>"""
+  made = world(tissue, tools, tolerance=1e-8, extra=extra)
+  model, data, _ = load(made)
+  batch = palpate.batch.make(mujoco.MjSpec.from_string(made), 2, device=device, nodes=24)
+  data.ctrl[:] = -0.002, 0.02
+  batch.ctrl = np.tile(data.ctrl, (2, 1))
+  for _ in range(60):
+    mujoco.mj_step(model, data)
+    batch.step()
+  assert data.sensordata[0] > 0.05 and data.sensordata[1] == 0
+  np.testing.assert_allclose(batch.sensordata.numpy(), np.tile(data.sensordata, (2, 1)), rtol=0.02)
+
+
+@pytest.mark.parametrize("device", DEVICES)
 def test_nodes_on_a_plane_that_have_no_slot_are_counted(device):
   points, elem = sphere(2)
   tissue = organ(points, elem, young=3e4, bulk=1e4, bend=0)

@@ -151,20 +151,21 @@ def arguments(parser: argparse.ArgumentParser):
   add("--bend", type=float, nargs="+", default=[0.0, 1.0])
   add("--condim", type=int, nargs="+", default=[1])
   add("--tolerance", type=float, default=1e-3)
-  add("--slots", type=int, help="nodes that the ball may touch; what its size asks for")
+  add("--slots", type=int, nargs="+", help="nodes that the ball may touch, one a size or for all")
   add("--repeat", action="store_true", help="runs that repeat to the bit whatever the GPU does")
 
 
 def stages(args: argparse.Namespace) -> list[list[Case]]:
   """Returns a case a size, number of worlds, and kind of tissue and contact."""
   keys = {"device": args.device, "tolerance": args.tolerance, "repeat": args.repeat}
-  keys |= {"slots": args.slots}
+  slots = args.slots or [None]
+  slots = dict(zip(args.nodes, slots * (len(args.nodes) // len(slots)), strict=True))
   worlds = args.worlds or ([8] if args.device == "cpu" else [1024, 4096, 16384])
-  kind = f"{args.slots or 0}{'-repeat' * args.repeat}"
+  kind = "-repeat" * args.repeat
   many = f"-x{args.device.count('+') + 1}" * ("+" in args.device)
   cases = [
-    {"case": f"{n}-{w}-{bend:g}-{c}-{kind}{many}", "nodes": n, "nworld": w}
-    | {"bend": bend, "condim": c}
+    {"case": f"{n}-{w}-{bend:g}-{c}-{slots[n] or 0}{kind}{many}", "nodes": n, "nworld": w}
+    | {"bend": bend, "condim": c, "slots": slots[n]}
     | keys
     for bend, c, n, w in itertools.product(args.bend, args.condim, args.nodes, worlds)
   ]
