@@ -73,7 +73,7 @@ class Exercises(VectorEnv):
       device: `cpu`, `cuda:N`, or None for a GPU where there is one; see `palpate.batch.make`
       output: what observations, rewards and flags are: `numpy`, or arrays of the device of `torch`
         or `warp`; all are copies
-      nodes: on a GPU, see `palpate.batch.make`
+      nodes: on a GPU, see `palpate.batch.make`; None for what the instrument touches
       **kwargs: of `Exercise`, such as `reward="sparse"`
 
     Raises:

@@ -119,13 +119,12 @@ def test_a_touch_sensor_feels_its_own_body_alone(device):
   points, elem = sphere(2)
   tissue = organ(points, elem, young=3e4, foundation=1e5, tolerance=1e-6, bend=0)
   tools = "".join(
-    f"""<body name="{name}" pos="{x} 0 {RADIUS + 0.0055}"><joint name="{name}" type="slide"
-    axis="0 0 1"/><geom size="0.006" mass="0.05" condim="1"/><site name="{name}" size="0.05"/></body>
-    """
+    f"""<body pos="{x} 0 {RADIUS + 0.0055}"><joint name="{name}" type="slide" axis="0 0 1"/>
+    <geom size="0.006" mass="0.05" condim="1"/><site name="{name}" size="0.05"/></body>"""
     for name, x in (("left", -0.001), ("right", 0.001))
   )
   extra = """<actuator><position joint="left" kp="500" kv="10"/><position joint="right" kp="500"
-    kv="10"/></actuator><contact><exclude body1="left" body2="right"/></contact>
+    kv="10"/></actuator>
     <sensor><touch site="left"/><touch site="right"/></sensor>"""
   made = world(tissue, tools, tolerance=1e-8, extra=extra)
   model, data, _ = load(made)
