@@ -72,7 +72,10 @@ def test_a_file_that_is_none_is_refused(tmp_path):
       policy.load(path)
 
 
-@pytest.mark.parametrize("path", sorted(policy.FOLDER.glob(f"*{policy.SUFFIX}")), ids=lambda p: p.stem)
+SHIPPED = sorted(policy.FOLDER.glob(f"*{policy.SUFFIX}"))
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
 def test_policies_that_come_along_solve_their_exercise(path):
   task = policy.load(path).about.task
   env = suite.load(*task.split("/"), task_kwargs={"random": 7})
