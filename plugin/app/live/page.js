@@ -19,12 +19,12 @@ try {
   throw error;
 }
 let scene = null, frame = null, head = {}, rest = null, running = false, paused = false, sound = null;
-let fresh = false, echoed = 0, before = null, trace = null, trouble = "";
+let fresh = false, drawn = "", echoed = 0, before = null, trace = null, trouble = "", late = null;
 const plots = {force: new Plot("force"), way: new Plot("way"), rate: new Plot("rate")};
 const ways = [], pictures = [];  // from hand to picture [ms]; when pictures were drawn
 const hand = new Hand($("view"), $("pad"), view, () => head);
 // For scripts that work through the page: numbers as `head` names them, targets after the geoms.
-window.palpate = () => ({scene, head, targets: targets(), ways, pictures, ghost: trace?.time.length ?? 0});
+window.palpate = () => ({scene, head, targets: targets(), ways, pictures, late, ghost: trace?.time.length ?? 0});
 
 // The program.
 
@@ -123,7 +123,8 @@ const HEAR = {
   kept({path, fault}) {
     $("kept")?.replaceWith(kept(path, fault));
   },
-  idle() {
+  idle(message) {
+    late = message.late;
     run(false);
   },
   error({text}) {
@@ -256,7 +257,10 @@ function draw() {
   requestAnimationFrame(draw);
   if (running) hand.say().forEach(say);
   if (!frame) return;
-  view.draw(frame, head, trace && $("ghost").getAttribute("aria-pressed") === "true" ? trace : null);
+  const expert = trace && $("ghost").getAttribute("aria-pressed") === "true" ? trace : null, shown = view.state();
+  if (!fresh && !expert && shown === drawn) return;
+  drawn = shown;
+  view.draw(frame, head, expert);
   if (!fresh) return;
   fresh = false;
   const now = performance.now();
