@@ -14,6 +14,7 @@ from palpate.tissue.body import Body
 from palpate.tissue.config import Config
 
 from . import (
+  adhere,
   coupling,
   declare,
   declare_windows,
@@ -23,14 +24,16 @@ from . import (
   mjstruct,
   nodal,
   prepare,
+  skin,
   weights,
   windowed,
 )
 from .bind import bind
+from .bonds import Bonds
 from .coupling import Phases
 from .creep import Creep
 from .declare import Declaration
-from .hold import Hold
+from .hold import Beside, Hold
 from .layout import FLAG, HEAD, STAGE
 from .pierce import Watch
 from .resident import Resident
@@ -69,6 +72,7 @@ class Workspace:
     place: recorded graph that puts the windows where the plugin state says, or None
     hold: springs that hold nodes
     ties: what the organ is tied to
+    bonds: what it has grown on to
     rests: what it rests on
     creep: its stress relaxation
     resident: keeper of a motion that stays on the device, or None
@@ -97,6 +101,7 @@ class Workspace:
     plugin_state: the organ's own numbers
     signature: the last of them, see `Declaration`
     views: what a coupling keeps when its graphs are recorded anew
+    skin: what is drawn for it, or None
     boxes: blocks of the plugin state and of what crosses in a step, see `layout`; windows
     phases: what the graphs launch
   """
@@ -122,6 +127,7 @@ class Workspace:
   place: Any = None
   hold: Hold = dataclasses.field(init=False)
   ties: Ties = dataclasses.field(init=False)
+  bonds: Bonds = dataclasses.field(init=False)
   rests: Rests = dataclasses.field(init=False)
   creep: Creep = dataclasses.field(init=False)
   resident: Resident | None = None
@@ -151,12 +157,18 @@ class Workspace:
   plugin_state: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))
   signature: Any = dataclasses.field(default_factory=lambda: memoryview(b"\0"))
   views: dict = dataclasses.field(default_factory=dict)
+  skin: skin.Skin | None = None
   boxes: dict = dataclasses.field(default_factory=dict)
   phases: Phases | None = None
 
   def __post_init__(self):
     self.hold, self.ties = Hold(self), Ties(self)
-    self.creep, self.rests = Creep(self), Rests(self)
+    self.bonds, self.rests, self.creep = Bonds(self), Rests(self), Creep(self)
+
+  @property
+  def beside(self) -> tuple[Beside, ...]:
+    """What acts on the organ beside its tissue, in the order in which it does."""
+    return self.ties, self.bonds, self.rests, self.creep
 
   def run(self):
     """Computes the step's forces and adds them to qfrc_passive.
@@ -343,16 +355,18 @@ def state_size(model: int, instance: int) -> int:
   """
   m = mjstruct.Model.from_address(model)
   names = mjstruct.config(model, instance, "window").split()
-  relaxes = bool(mjstruct.config(model, instance, "relax_share").strip())
+  relaxes, rests, bonded = (
+    bool(mjstruct.config(model, instance, key).strip())
+    for key in ("relax_share", "support", "bonds")
+  )
   if names:
     # Asked before MuJoCo has filled in the flexes: what `windowed` needs is at most this.
     inside = fill.MOST if mjstruct.config(model, instance, "elements").strip() == "solid" else 0
     most = (1 + inside) * m.nflexvert
-    rests = bool(mjstruct.config(model, instance, "support").strip())
-    sizes = relaxes * most, rests * m.nflexvert
-    return windowed.state_size(most, 0, m.ngeom * len(names), *sizes)
+    outer = {"nrest": rests * m.nflexvert, "nbond": bonded * m.nflexvert}
+    return windowed.state_size(most, 0, m.ngeom * len(names), ncreep=relaxes * most, **outer)
   moving = len(declare.moving_bodies(m, instance))
-  return nodal.state_size(3 * moving, relaxes * moving)
+  return nodal.state_size(3 * moving, relaxes * moving, bonded * moving)
 
 
 def make(model: int, data: int, instance: int) -> Workspace:
@@ -378,7 +392,9 @@ def make(model: int, data: int, instance: int) -> Workspace:
     host["mass"].assign(mass)
     if organ.windows:
       w.turn = Turn()
+    w.skin = skin.read(m, organ)
     fasten.declare(w)
+    adhere.declare(w)
     bind(w, model)
     w.plugin_state = w.views["plugin_state"].numpy()
     w.signature = w.plugin_state[coupling.spans(organ)["signature"]].data

@@ -19,7 +19,7 @@ try {
   throw error;
 }
 let scene = null, frame = null, head = {}, rest = null, running = false, paused = false, sound = null;
-let fresh = false, drawn = "", echoed = 0, before = null, trace = null, trouble = "", late = null;
+let fresh = false, drawn = "", echoed = 0, before = null, trace = null, trouble = "", warned = "", late = null;
 const plots = {force: new Plot("force"), way: new Plot("way"), rate: new Plot("rate")};
 const ways = [], pictures = [];  // from hand to picture [ms]; when pictures were drawn
 const hand = new Hand($("view"), $("pad"), view, () => head);
@@ -96,7 +96,8 @@ const HEAR = {
   },
   status({instruction, warning, kind, fault, scheme}) {
     $("instruction").textContent = scene?.assessment ? "Assessment: no help" : instruction;
-    if (warning && kind !== $("stage").dataset.warning) beep(kind);
+    if (kind && kind !== warned) beep(kind);
+    warned = kind;
     $("warning").textContent = warning;
     $("stage").dataset.warning = kind;
     if (fault !== trouble) tell(trouble = fault);
