@@ -11,7 +11,7 @@ from palpate.tasks.recording import Recording
 pytest.importorskip("websockets")
 from palpate.app.live.server import Server
 
-ANSWER = 40.0  # that a busy machine may take [s]
+ANSWER = 90.0  # that a busy machine may take [s]
 FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 LOOK = """(() => {
   const {scene, head, targets} = window.palpate();
@@ -76,8 +76,7 @@ class Pages:
 
   def stop(self):
     """Stops an exercise and returns what its card says."""
-    if self.page.is_enabled("#stop"):
-      self.page.click("#stop")
+    self.page.dispatch_event("#stop", "click")  # the card may come meanwhile
     self.page.wait_for_selector("#card[open]", timeout=1e3 * ANSWER)
     text = self.page.inner_text("#card")
     self.page.click("#card button:text('Close')")
@@ -139,13 +138,15 @@ def test_too_much_force_and_a_lost_tip_are_seen_and_heard(pages):
   """Each in a colour and with a tone of its own, and noted in the recording."""
   page = pages.page
   page.evaluate(WATCH)
-  for key, kind, speed in (("d", "view", "1"), ("q", "force", "0.25")):
+  for keys, kind, speed in (("d", "view", "1"), ("qs", "force", "0.1")):
     pages.speed(speed)
     pages.start()
     page.focus("#view")
-    page.keyboard.down(key)
+    for key in keys:
+      page.keyboard.down(key)
     pages.until(f"seen.has('{kind}') && seen.has('tone {kind}')", f"no warning of {kind}")
-    page.keyboard.up(key)
+    for key in keys:
+      page.keyboard.up(key)
     pages.stop()
   pages.speed("1")
   kept = max(pages.folder.glob("*.npz"), key=lambda path: path.stat().st_mtime)
