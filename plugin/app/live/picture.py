@@ -125,10 +125,11 @@ def _organ_colour(model: mj.MjModel, name: str) -> list[float]:
 
 
 def _drawn(model: mj.MjModel) -> list[int]:
-  """Returns the geoms that are seen; the handle would hide the tip."""
+  """Returns the geoms that are seen: not the abdomen, nor the handle, which would hide the tip."""
   handles = [model.body(b).name.endswith("handle") for b in range(model.nbody)]
   shown = ~np.array(handles)[model.geom_bodyid]
-  shown &= (model.geom_group < situs.GROUP) & (_colours(model)[:, 3] > 0.05)
+  shown &= (model.geom_group < situs.GROUP) | (model.geom_bodyid > 0) & (model.geom_group <= 2)
+  shown &= _colours(model)[:, 3] > 0.05
   return [int(g) for g in np.flatnonzero(shown)]
 
 
