@@ -99,8 +99,8 @@ def test_peeling_a_strip_takes_the_force_of_its_fracture_energy(scenes):
 # Reactions.
 
 
-def test_an_organ_and_a_free_body_bonded_together_keep_their_momentum(make, scenes):
-  model, data, organ = make(LOOSE, bonds=f"hand {TEXT} near 0.025")
+def test_an_organ_and_a_free_body_bonded_together_keep_their_momentum(make, scenes, device):
+  model, data, organ = make(LOOSE, bonds=f"hand {TEXT} near 0.025", device=device)
   mujoco.mj_forward(model, data)
   dof, adr = model.joint("free").dofadr[0], model.joint("free").qposadr[0]
   data.qvel[dof : dof + 3] = 0.1, 0, 0.2
