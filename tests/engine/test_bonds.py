@@ -152,6 +152,42 @@ def test_a_pull_frees_an_organ_from_another(scenes):
   assert np.abs(grip.force).max() < 0.05 and upper.error is None and lower.error is None
 
 
+def _pair(scenes, kinds):
+  """Returns the bonds' force on an organ, and that of a hand on the one it is bonded to."""
+  points, elem = scenes.box((0.04, 0.04, 0.02), 0.01)
+  points[:, 2] -= points[:, 2].min()
+  organs = []
+  for kind, name, down in zip(kinds, ("upper", "lower"), (0.0, 0.021), strict=True):
+    keys = SOFT | {"damping": 0.01, "bulk": 1e4, "contact": {"contype": 1, "conaffinity": 2}}
+    if name == "upper":
+      keys |= {"bonds": "lower 1e6 1e3 1 near 0.002", "foundation": 1e5}
+    body = points - [0, 0, down], elem, name
+    windows = {"grid": f"{name}_window", "count": "3 3 1"}
+    organs.append(
+      scenes.windowed(*body, **windows, **keys) if kind else scenes.organ(*body, **keys)
+    )
+  model, data, upper = scenes.load(
+    scenes.world(*organs, scenes.ball(1.0, joint=False), HAND), "upper"
+  )
+  mujoco.mj_forward(model, data)
+  lower = palpate.Organ(model, data, "lower")
+  grip = lower.attach(np.flatnonzero(lower.xpos0[:, 2] < -0.0205), "hand")
+  for k in range(250):
+    data.mocap_pos[0, 2] -= 1e-5 if k < 100 else 0.0
+    mujoco.mj_step(model, data)
+  return upper.bonds.force.sum(axis=0), grip.force
+
+
+def test_what_pulls_at_one_organ_pulls_back_at_the_other_in_each_coupling(scenes):
+  found = []
+  for kinds in ((False, False), (False, True), (True, False)):
+    force, grip = _pair(scenes, kinds)
+    np.testing.assert_allclose(force, grip, atol=0.02 * np.abs(force).max())
+    found.append(force)
+  assert found[0][2] < -0.1
+  np.testing.assert_allclose(found[1:], [found[0]] * 2, atol=0.005 * np.abs(found[0]).max())
+
+
 # Pressing.
 
 
