@@ -308,6 +308,10 @@ def test_bonds_of_python_are_copied_and_end_with_a_reset(make):
       mujoco.mj_step(model, each)
   np.testing.assert_array_equal(twin.xpos, organ.xpos)
   assert len(twin.bonds) == 3 and np.abs(twin.bonds.force[2]).max() > 0
+  organ.bond("hand", *LAW, vertices=[41])
+  for _ in range(2):
+    mujoco.mj_copyData(other, model, data)
+    assert len(twin.bonds) == 4
   mujoco.mj_resetData(model, data)
   data.mocap_pos[0] += [0, 0, 0.005]
   mujoco.mj_step(model, data)
