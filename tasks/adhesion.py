@@ -19,7 +19,7 @@ _NEAR = 0.0015  # distance from the bed at which it has grown on [m]
 # Ours: a sheet of peritoneum with some fat, as soft as the exercises' organs, of 3 g.
 _TISSUE = {"young": 1e5, "thickness": 0.002, "damping": 0.005}
 _MASS = 0.003  # [kg]
-_SLOTS = 72  # of its window: the expert's probe touches fewer, folds and all
+_SLOTS = 100  # of its window: the expert's probe touches fewer, folds and all
 _COLOUR, _UNDER = (0.85, 0.62, 0.5, 1.0), "0.52 0.17 0.13 1"
 
 
