@@ -9,7 +9,7 @@ NAMES = ["/".join(pair) for pair in tasks.ALL_TASKS]
 # Not 95 % yet: folds that slip or are pinched, an inclusion at the edge of the field.
 LEAST = {"retract/hard": 0.7, "grasp/standard": 0.85, "probe/palpate_standard": 0.85}
 
-# Exercises whose panel is not recorded yet: `palpate panel` makes them, and their names go from here.
+# Exercises that wait for their panel, see `palpate panel`, and have no score until then.
 UNRECORDED = {
   "dissect/standard", "dissect/hard", "tease/easy", "tease/standard", "tease/hard",
 }  # fmt: skip
