@@ -84,8 +84,9 @@ SKILLED = {
 }
 _WIDE = 1.0  # action of the jaw: wide open
 _ROLL = 0.8  # of the jaws to grasp, across the gallbladder's slack [rad]
-_GRIP = 1.5  # force that holds the organ [N]
 _FIRMER = 0.4  # by how much it is gripped more each time that it was lost [N]
+_SLID = 0.001  # what may move in the jaws unnoticed [m]
+_REFLEX, _FIRMEST = 400.0, 3.0  # force for each metre that slides further [N/m], and at most [N]
 _TREMOR_HZ = np.array([4.0, 5.3, 7.1, 8.6, 10.0])
 
 
@@ -282,15 +283,16 @@ class Performer:
     force = float(np.linalg.norm(self.physics.contact_force()))
     return force / max(float((self.physics.tip_pos() - point) @ along), 1e-3)
 
-  def close(self, site: int, again: int = 0) -> Script:
+  def close(self, site: int, again: int = 0, grip: float = 1.5) -> Script:
     """Grasps a triangle: opens above it, goes down over it, and closes to a gentle force.
 
     Args:
       site: the triangle
       again: how often it was lost: it is taken deeper then, and firmer
+      grip: force that holds it [N]
     """
     physics, up = self.physics, self.physics.trocar().mat[:, 2]
-    self.firm = _GRIP + _FIRMER * min(again, 2)
+    self.firm = self._enough = grip + _FIRMER * min(again, 2)
     self.roll, self.extra[:] = _ROLL, _WIDE
     yield from self.move(physics.point(site) + 0.012 * up)
     yield from self.wait(0.2)
@@ -305,7 +307,9 @@ class Performer:
         return
 
   def grip(self, contact: float) -> None:
-    """Keeps the force of the jaws, which have held for a time [s]."""
+    """Keeps the force of the jaws, which have held for a time [s]; more where the tissue slides."""
+    slid = max(self.task.slid(self.physics) - _SLID, 0.0) if self.task.grasped else 0.0
+    self.firm = max(self.firm, min(self._enough + _REFLEX * slid, _FIRMEST))
     self._squeeze(contact, 0.01)
 
   def _squeeze(self, contact: float, gain: float) -> float:
@@ -316,7 +320,7 @@ class Performer:
     return missing
 
   def open(self) -> Script:
-    """Lets go."""
+    """Lets go, gently until nothing is held: a pinched fold would jump."""
     while self.extra[0] < 0.1:
-      self.extra[0] += 0.06
+      self.extra[0] += 0.02 if self.physics.gripper()[2:].any() else 0.06
       yield self.step()
