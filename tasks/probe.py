@@ -394,13 +394,13 @@ class Palpate(Task):
     return int(gap.argmax()) if gap.max() > _CLOSE else None
 
   def _guess(self, felt: dict[int, float]) -> int:
-    """Returns the place that a bell of stiffness, a + b exp(-(d/w)^2), fits best on."""
-    distance = np.linalg.norm(self.places[:, None] - self.places[list(felt)], axis=2)
-    bell = np.exp(-((distance / (1.2 * self.radius)) ** 2))
-    bell -= bell.mean(axis=1, keepdims=True)
-    stiffness = np.array(list(felt.values()))
-    gain = bell @ (stiffness - stiffness.mean())  # what the bell explains
-    return int(np.argmax(gain / np.maximum(np.linalg.norm(bell, axis=1), 1e-9)))
+    """Returns the place nearest to the middle of what is stiff, around the stiffest place."""
+    places, stiffness = self.places[list(felt)], np.array(list(felt.values()))
+    soft, top = np.quantile(stiffness, 0.25), stiffness.max()
+    more = np.maximum(stiffness - 0.7 * soft - 0.3 * top, 0.0)
+    more *= np.linalg.norm(places - places[stiffness.argmax()], axis=1) < 1.7 * self.radius
+    middle = (more @ places) / more.sum() if more.any() else places[stiffness.argmax()]
+    return int(np.linalg.norm(self.places - middle, axis=1).argmin())
 
   def _hop(self, p: Performer, goal: np.ndarray) -> Script:
     """Moves to a point, in an arch over the organ where it is far."""

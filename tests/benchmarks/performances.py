@@ -1,4 +1,4 @@
-"""Episodes of performers: run once for a state of the code, and kept, as those of `palpate panel`."""
+"""Episodes of performers: run once for a state of the code, and kept as by `palpate panel`."""
 
 from __future__ import annotations
 
