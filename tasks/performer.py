@@ -1,8 +1,9 @@
 """Scripted performers: an expert for every exercise, and people who differ in stated ways.
 
-`expert` makes no mistake that a script need not make. The novices each do one thing badly.
-`skilled` is a person, another with every seed, who does everything a little worse than the script:
-what is within a person's reach is measured against them.
+`expert` makes no mistake that a script need not make. `tremor`, `overshoot`, `delay`, `force` and
+`detour` are scripts that each do one thing badly. `skilled` is a person, another with every seed,
+who does everything a little worse than the script: what is within a person's reach is measured
+against them. `novice` is a person who does everything worse still.
 
 What to do is the task's method `expert`, beside the task; how it is done, the `Style`, is here.
 
@@ -85,6 +86,16 @@ SKILLED = {
   "speed": (0.7, 1.2),
   "reaction": (0.0, 0.15),
 }
+# What is drawn for `novice`: from where skilled people end to what `NOVICES` do.
+NOVICE = {
+  "tremor": (0.0002, 0.0006),
+  "overshoot": (0.08, 0.5),
+  "delay": (0.25, 1.0),
+  "force": (1.15, 2.0),
+  "detour": (0.15, 1.0),
+  "speed": (0.4, 0.7),
+  "reaction": (0.15, 0.3),
+}
 _WIDE = 1.0  # action of the jaw: wide open
 _ROLL = 0.8  # of the jaws to grasp, across the gallbladder's slack [rad]
 _FIRMER = 0.4  # by how much it is gripped more each time that it was lost [N]
@@ -98,16 +109,16 @@ def make(env: control.Environment, who: str | Style = EXPERT, seed: int = 0) -> 
 
   Args:
     env: of one of the suite's tasks
-    who: a `Style`, a name of `STYLES`, `skilled`, a file of a trained policy, or "module:object": a
-      class is made with (env, seed) and its object called with each time step; anything else is
-      called with the observation
+    who: a `Style`, a name of `STYLES` or of `PEOPLE`, a file of a trained policy, or
+      "module:object": a class is made with (env, seed) and its object called with each time step;
+      anything else is called with the observation
     seed: of what is random in a scripted performer
   """
   if isinstance(who, Style):
     return Performer(env, who, seed)
   found = find(who)
-  if found is skilled:
-    found = skilled(seed)
+  if found in PEOPLE.values():
+    found = found(seed)
   if isinstance(found, Style):
     return Performer(env, found, seed)
   if isinstance(found, policy.Policy):
@@ -122,8 +133,20 @@ def make(env: control.Environment, who: str | Style = EXPERT, seed: int = 0) -> 
 
 def skilled(seed: int) -> Style:
   """Returns a style drawn from `SKILLED`."""
+  return _drawn(SKILLED, seed)
+
+
+def novice(seed: int) -> Style:
+  """Returns a style drawn from `NOVICE`."""
+  return _drawn(NOVICE, seed)
+
+
+PEOPLE = {"skilled": skilled, "novice": novice}
+
+
+def _drawn(ranges: dict[str, tuple[float, float]], seed: int) -> Style:
   random = np.random.RandomState(seed)
-  return Style(**{name: float(random.uniform(*span)) for name, span in SKILLED.items()})
+  return Style(**{name: float(random.uniform(*span)) for name, span in ranges.items()})
 
 
 def find(who: str, *others: str) -> Any:
@@ -133,13 +156,13 @@ def find(who: str, *others: str) -> Any:
     who: see `make`
     *others: names that the caller takes as well, for the message
   """
-  if who == skilled.__name__:
-    return skilled
+  if who in PEOPLE:
+    return PEOPLE[who]
   if who.endswith(policy.SUFFIX):
     return policy.load(who)
   if ":" not in who:
     if who not in STYLES:
-      names = ", ".join((*STYLES, skilled.__name__, *others))
+      names = ", ".join((*STYLES, *PEOPLE, *others))
       raise ValueError(
         f"performer is {who!r}, expected one of {names}, a file of a "
         f"trained policy (*{policy.SUFFIX}) or module:object"

@@ -123,7 +123,7 @@ def _list() -> int:
 
   for domain, task in suite.ALL_TASKS:
     print(f"{f'{domain}/{task}':24} {suite.summary(domain, task)}")
-  print(f"performers: {', '.join(performer.STYLES)}, skilled, keyboard, module:object")
+  print(f"performers: {', '.join((*performer.STYLES, *performer.PEOPLE))}, keyboard, module:object")
   return 0
 
 

@@ -1,5 +1,6 @@
 """How many of their episodes experts, skilled people and novices solve, and are proficient in.
 
+`one fault` are scripts that do one thing as badly as novices do, and all else as experts.
 Seeds from 0 on, which no reference is made from: those are of `palpate panel`, and of other people.
 Episodes are kept in `--runs` and what is there is not run again: stop and go on at will.
 """
@@ -25,7 +26,8 @@ NAMES = ["/".join(pair) for pair in tasks.ALL_TASKS]
 GROUPS = {
   "expert": (("expert",), 50),
   "skilled": (("skilled",), 20),
-  "novices": (tuple(performer.NOVICES), 3),
+  "novice": (("novice",), 10),
+  "one fault": (tuple(performer.NOVICES), 3),
 }
 _BLOCK = 3  # episodes of a case: few enough that processes end together
 
