@@ -162,6 +162,11 @@ class Organ:
     return self._organ.mesh.elem
 
   @property
+  def skin(self) -> int | None:
+    """Number of the skin that is drawn for it, None where its own surface is; see `add_skin`."""
+    return None if self._space.skin is None else self._space.skin.index
+
+  @property
   def free(self) -> np.ndarray:
     """Whether a vertex moves, (nvert,) bool; the others are pinned."""
     return self._organ.free[: self.nvert]

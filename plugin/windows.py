@@ -56,9 +56,7 @@ def add_windows(
   Raises:
     ValueError: there is no such organ or body, or it cannot have windows.
   """
-  flex = _flex(spec, organ)
-  bodies = {body.name: body for body in spec.bodies}
-  plugin = _plugin(spec, organ, [bodies[name] for name in dict.fromkeys(flex.vertbody)])
+  flex, plugin, bodies = find_organ(spec, organ)
   config = {key: value for key, value in plugin.config.items() if value}
   groups = _groups(organ, bodies, tools)
   many = len(groups) if groups else 1
@@ -85,13 +83,18 @@ def add_windows(
   return tuple(names)
 
 
-def _flex(spec, organ: str):
-  """Returns the flex of an organ."""
+def find_organ(spec: mujoco.MjSpec, organ: str):
+  """Returns flex and plugin of an organ, and the spec's bodies by name; it may name the plugin.
+
+  Raises:
+    ValueError: there is no such flex, or it is no organ.
+  """
   flex = spec.flex(organ)
   if flex is None:
     have = ", ".join(repr(f.name) for f in spec.flexes) or "none"
     raise ValueError(f"no flexcomp {organ!r} in the spec, it has {have}")
-  return flex
+  bodies = {body.name: body for body in spec.bodies}
+  return flex, _plugin(spec, organ, [bodies[name] for name in dict.fromkeys(flex.vertbody)]), bodies
 
 
 def _check(spec, flex, config: dict[str, str], names: list[str], nodes: int | None):

@@ -24,6 +24,7 @@ from .console import (
   output_folder,
   writing,
 )
+from .trainee import keeping
 from .workers import parallel
 
 if TYPE_CHECKING:
@@ -60,6 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser):
   add("--seed", metavar="N", type=int, default=0, help="of the first episode (%(default)s)")
   add("--processes", metavar="N", type=int, default=1, help="at a time (%(default)s)")
   options.add_argument(parser)
+  keeping.add_references(parser)
   add("--json", metavar="FILE", help="write every episode's metrics")
   add("--recordings", metavar="FOLDER", help="keep every episode's recording, whole or not")
 
@@ -68,8 +70,9 @@ def main(args: argparse.Namespace) -> int:
   """Runs the job and returns its exit code."""
   check_counts(args, "episodes", "processes")
   palpate.register()
-  from palpate.tasks import performer, score, suite
+  from palpate.tasks import performer, suite
 
+  known = keeping.references(args.references)
   try:
     name = "/".join(suite.split(args.task))
     performer.find(args.policy)
@@ -91,7 +94,7 @@ def main(args: argparse.Namespace) -> int:
       progress.show(f"{len(results)} of {args.episodes}")
   progress.clear()
   if results:
-    print(table(name, args.policy, results, score.reference(name)))
+    print(table(name, args.policy, results, known(name)))
   if file is not None:
     _write_json(file, results)
   if interrupt.seen:
@@ -179,7 +182,7 @@ def perform(job: tuple[str, str, int, str | None, str]) -> Result:
   return result
 
 
-def table(name: str, policy: str, results: list[Result], reference: dict | None) -> str:
+def table(name: str, policy: str, results: list[Result], reference: Mapping | None) -> str:
   """Returns mean and spread of return, time and every known metric, for people."""
   from palpate.tasks.metrics import METRICS, Metrics
 

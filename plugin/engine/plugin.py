@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 from palpate.tissue.config import KEYS
 
-from . import adhere, change, fasten, guard, mjstruct, rests, weights, windowed, workspace
+from . import adhere, change, fasten, guard, mjstruct, rests, skin, weights, windowed, workspace
 from .layout import FLAG, STAGE
 from .mjstruct import NAME, warn
 from .workspace import Workspace
@@ -211,6 +211,8 @@ def _visualize(model: int, data: int, option: int, scene: int, instance: int):
   try:
     if w.organ.windows:
       windowed.draw(w, model, data)
+    if w.skin is not None:
+      skin.draw(w, model, data)
   except BaseException as error:
     _fail(w, error)
   return guard.leave()

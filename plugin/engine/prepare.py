@@ -86,5 +86,11 @@ def show(m, organ: Declaration, shown: bool):
   body[1:] = body[0] if shown else 0
 
 
+def group(m, skin: int, flex: int, groups: tuple[int, int]):
+  """Puts an organ's skin and its own surface into groups, which viewers draw or do not."""
+  mjstruct.view(m.skin_group, m.nskin, np.int32)[skin] = groups[0]
+  mjstruct.view(m.flex_group, m.nflex, np.int32)[flex] = groups[1]
+
+
 def _digest(values: np.ndarray) -> bytes:
   return hashlib.sha256(np.ascontiguousarray(values).tobytes()).digest()

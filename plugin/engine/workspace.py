@@ -24,6 +24,7 @@ from . import (
   mjstruct,
   nodal,
   prepare,
+  skin,
   weights,
   windowed,
 )
@@ -100,6 +101,7 @@ class Workspace:
     plugin_state: the organ's own numbers
     signature: the last of them, see `Declaration`
     views: what a coupling keeps when its graphs are recorded anew
+    skin: what is drawn for it, or None
     boxes: blocks of the plugin state and of what crosses in a step, see `layout`; windows
     phases: what the graphs launch
   """
@@ -155,6 +157,7 @@ class Workspace:
   plugin_state: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))
   signature: Any = dataclasses.field(default_factory=lambda: memoryview(b"\0"))
   views: dict = dataclasses.field(default_factory=dict)
+  skin: skin.Skin | None = None
   boxes: dict = dataclasses.field(default_factory=dict)
   phases: Phases | None = None
 
@@ -389,6 +392,7 @@ def make(model: int, data: int, instance: int) -> Workspace:
     host["mass"].assign(mass)
     if organ.windows:
       w.turn = Turn()
+    w.skin = skin.read(m, organ)
     fasten.declare(w)
     adhere.declare(w)
     bind(w, model)

@@ -174,6 +174,11 @@ class Config:
     "with `window` alone: the motion stays on the CUDA device between steps, and the plugin state "
     "is brought up to date by `Organ.sync` alone ([internals](internals.md#resident))",
   )
+  skin: str = _row(
+    "",
+    (reading.name, "the name of a skin"),
+    "drawn for the organ: its surface made smooth (`add_skin`)",
+  )
   device: str = _row(
     "auto",
     (reading.device, "'cpu', 'cuda:0' or 'auto'"),
