@@ -41,6 +41,7 @@ def test_table_is_consistent():
     "sparc",
     "log_dimensionless_jerk",
     "bimanual_dexterity",
+    "share_freed",
   }
   assert set(METRICS) - set(SCORED) == {"mean_speed", "peak_speed", "economy_of_volume"}
 
