@@ -1,5 +1,10 @@
 """`palpate view` and `palpate render`."""
 
+import pathlib
+import shutil
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -48,6 +53,16 @@ def test_picture_shows_a_press():
 def test_options_draw_something(option):
   words = ["kidney", "--nodes", "250", "--keyframe", "press", "--seconds", "0.2"]
   assert (np.abs(_render(*words) - _render(*words, option)).max(axis=2) > 20).mean() > 2e-4
+
+
+def test_a_command_without_a_screen_chooses_how_to_draw(monkeypatch):
+  monkeypatch.delenv("MUJOCO_GL", raising=False)
+  command = shutil.which("palpate", path=str(pathlib.Path(sys.executable).parent))
+  if command is None:
+    pytest.skip("the palpate command is not installed")
+  words = ["render", "press", "-o", "drawn.png", *SIZE]
+  subprocess.run([command, *words], check=True, timeout=300)
+  assert np.ptp(imageio.imread("drawn.png")) > 100
 
 
 def test_cameras_differ():
