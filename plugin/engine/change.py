@@ -41,9 +41,11 @@ def copy(w, model: int, other, twin):
     return
   if not w.chosen and w.config != other.config:
     _change(w, model, other.config)
-  w.bonds.let_go()
-  for group in [g for g in other.bonds.groups if not g.declared]:
-    _put(w, dataclasses.replace(group, other=group.other and twin(group.other)))
+  mine, theirs = ([g for g in each.bonds.groups if not g.declared] for each in (w, other))
+  if len(mine) != len(theirs) or not all(map(bonds.alike, mine, theirs)):
+    w.bonds.let_go()
+    for group in theirs:
+      _put(w, dataclasses.replace(group, other=group.other and twin(group.other)))
   if w.ties.groups or other.ties.groups:
     groups = [dataclasses.replace(g, other=g.other and twin(g.other)) for g in other.ties.groups]
     tie(w, model, groups)
