@@ -276,6 +276,14 @@ def _on_planes(p: Patch, c: Touch, at: Place, n: int, x: wp.vec3):
 
 
 @wp.func
+def _ball(a: wp.vec3, b: wp.vec3, d: wp.vec3):
+  """Returns middle and radius of a ball about a triangle."""
+  centre = (a + b + d) / 3.0
+  far = wp.max(wp.length_sq(a - centre), wp.length_sq(b - centre))
+  return centre, wp.sqrt(wp.max(far, wp.length_sq(d - centre)))
+
+
+@wp.func
 def _owner(p: Patch, world: int, e: int):
   """Returns the first corner of a triangle that has a slot, whose thread has the triangle."""
   if p.node_slot[world, p.elem[e, 0]] >= 0:
@@ -310,12 +318,8 @@ def kernel(kinds: frozenset[int]) -> wp.Kernel:
     if i >= 0:
       for q in range(p.near_adr[i], p.near_adr[i + 1]):
         e = p.near[q]
-        va = p.elem[e, 0]
-        vb = p.elem[e, 1]
-        vd = p.elem[e, 2]
-        a = p.node_slot[world, va]
-        b = p.node_slot[world, vb]
-        d = p.node_slot[world, vd]
+        va, vb, vd = p.elem[e, 0], p.elem[e, 1], p.elem[e, 2]
+        a, b, d = p.node_slot[world, va], p.node_slot[world, vb], p.node_slot[world, vd]
         whole = a >= 0 and b >= 0 and d >= 0
         if _owner(p, world, e) == i and (whole or not writes):
           at.first = first
@@ -327,15 +331,13 @@ def kernel(kinds: frozenset[int]) -> wp.Kernel:
           xa = _where(p, world, va)
           xb = _where(p, world, vb)
           xd = _where(p, world, vd)
-          centre = (xa + xb + xd) / 3.0
-          far = wp.max(wp.length_sq(xa - centre), wp.length_sq(xb - centre))
-          around = wp.sqrt(wp.max(far, wp.length_sq(xd - centre))) + c.radius
+          centre, around = _ball(xa, xb, xd)
           for tool in range(p.ntool):
             at.tool = tool
             at.geom = p.tool_geom[tool]
             pos = p.geom_xpos[world, at.geom]
             rot = p.geom_xmat[world, at.geom]
-            if not convex.is_beyond(v, tool, pos, rot, centre, around + c.margin[tool]):
+            if not convex.is_beyond(v, tool, pos, rot, centre, around + c.radius + c.margin[tool]):
               more = against(p, c, v, at, more, xa, xb, xd)
           if whole:
             n = more

@@ -1,6 +1,9 @@
 """A triangle before a cylinder: where a convex function, the distance from it, is least."""
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
+# Vectors of Warp's are not known to type checkers:
+# pyright: reportOperatorIssue=false, reportCallIssue=false, reportArgumentType=false
+# pyright: reportIndexIssue=false, reportAttributeAccessIssue=false
 import warp as wp
 
 _HALVINGS = wp.constant(20)  # of an edge: to 1e-6 of its length

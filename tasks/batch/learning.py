@@ -127,7 +127,8 @@ class Learner:
 
   def _least(self) -> torch.Tensor:
     """Returns how much each number that is observed varies at least."""
-    out, space = [], self.env.env.single_observation_space
+    out: list[float] = []
+    space: Any = self.env.env.single_observation_space
     for name in itertools.chain(*self.env.groups.values()):
       count = math.prod(space[name].shape)
       units = ROWS[name].unit.split(", ") if name in ROWS else []
