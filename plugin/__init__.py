@@ -14,9 +14,17 @@ if TYPE_CHECKING:
   from .authoring import add_organ
   from .organ import Organ
   from .skins import add_skin
-  from .windows import add_windows
+  from .windows import add_spare, add_windows
 
-__all__ = ["Organ", "__version__", "add_organ", "add_skin", "add_windows", "register"]
+__all__ = [
+  "Organ",
+  "__version__",
+  "add_organ",
+  "add_skin",
+  "add_spare",
+  "add_windows",
+  "register",
+]
 __version__ = "0.1.0"
 
 
@@ -38,6 +46,7 @@ def register() -> int:
   if "Organ" not in globals():
     globals()["Organ"] = organ.Organ
     globals()["add_windows"] = windows.add_windows
+    globals()["add_spare"] = windows.add_spare
     globals()["add_skin"] = skins.add_skin
     device.lower_log_level()
   return plugin.register()
@@ -45,7 +54,7 @@ def register() -> int:
 
 def __getattr__(name: str):
   """Brings what is asked for first: `add_organ`, with what reads meshes, and in the command all."""
-  if name in ("Organ", "add_skin", "add_windows"):
+  if name in ("Organ", "add_skin", "add_spare", "add_windows"):
     register()
     return globals()[name]
   if name != "add_organ":

@@ -19,6 +19,7 @@ _NEAR = 0.0015  # distance from the bed at which it has grown on [m]
 # Ours: a sheet of peritoneum with some fat, as soft as the exercises' organs, of 3 g.
 _TISSUE = {"young": 1e5, "thickness": 0.002, "damping": 0.005}
 _MASS = 0.003  # [kg]
+_SLOTS = 100  # of its window: the expert's probe touches fewer, folds and all
 _COLOUR, _UNDER = (0.85, 0.62, 0.5, 1.0), "0.52 0.17 0.13 1"
 
 
@@ -64,6 +65,6 @@ def build(scene: Scene) -> mujoco.MjSpec:
     f'<geom name="{BED}" type="ellipsoid" size="0.12 0.14 0.05" pos="0 0 {-0.05 - _SKIN}" '
     f'rgba="{_UNDER}" contype="0" conaffinity="1"/>'
   )
-  spec = scenes.furnish(scene, flex, np.zeros(3), bed, slots=len(vertices) // 2)
+  spec = scenes.furnish(scene, flex, np.zeros(3), bed, slots=_SLOTS)
   spec.option.gravity = np.zeros(3)
   return spec

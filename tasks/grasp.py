@@ -98,8 +98,7 @@ class Hold(Task):
     before, closing, distance = self.grasped, physics.closing(), self.distance(physics)
     holds = closing and physics.holds()
     if before:
-      moved = physics.from_tip(physics.point(self.site)) - self._place
-      self.grasped = holds and float(np.linalg.norm(moved)) < self.slip
+      self.grasped = holds and self.slid(physics) < self.slip
     elif holds and distance < REACH:
       self.grasped = True
       self.hold_here(physics)
@@ -112,6 +111,10 @@ class Hold(Task):
   def hold_here(self, physics: Physics) -> None:
     """Takes where the site is in the jaws as the place that it may slip from."""
     self._place = physics.from_tip(physics.point(self.site))
+
+  def slid(self, physics: Physics) -> float:
+    """Returns how far the site has moved in the jaws from that place [m]."""
+    return float(np.linalg.norm(physics.from_tip(physics.point(self.site)) - self._place))
 
   def dropped(self, physics: Physics) -> None:
     """Reports that the tissue was lost."""

@@ -1,8 +1,9 @@
 """Scripted performers: an expert for every exercise, and people who differ in stated ways.
 
-`expert` makes no mistake that a script need not make. The novices each do one thing badly.
-`skilled` is a person, another with every seed, who does everything a little worse than the script:
-what is within a person's reach is measured against them.
+`expert` makes no mistake that a script need not make. `tremor`, `overshoot`, `delay`, `force` and
+`detour` are scripts that each do one thing badly. `skilled` is a person, another with every seed,
+who does everything a little worse than the script: what is within a person's reach is measured
+against them. `novice` is a person who does everything worse still.
 
 What to do is the task's method `expert`, beside the task; how it is done, the `Style`, is here.
 
@@ -62,12 +63,15 @@ class Style:
 
 
 EXPERT = Style()
+# Each does one thing as badly as novices do: experts sutured three to four times faster on paths a
+# third as long (van Sickle et al. 2005, 10.1007/s00464-004-8274-6), and with half the force
+# (10.1007/s00464-010-1096-9).
 NOVICES = {
   "tremor": Style(tremor=0.0008),
-  "overshoot": Style(overshoot=0.25),
-  "delay": Style(delay=0.6, speed=0.6),
+  "overshoot": Style(overshoot=0.5),
+  "delay": Style(delay=1.0, speed=0.4),
   "force": Style(force=2.0),
-  "detour": Style(detour=0.5),
+  "detour": Style(detour=1.0),
 }
 STYLES = {"expert": EXPERT, **NOVICES}
 # What is drawn for `skilled`: from a script's steady hand to a person's; ranges of `Style`. Tremor
@@ -75,17 +79,28 @@ STYLES = {"expert": EXPERT, **NOVICES}
 # long instrument shows more of it.
 SKILLED = {
   "tremor": (0.0, 0.0002),
-  "overshoot": (0.0, 0.1),
-  "delay": (0.0, 0.4),
-  "force": (0.8, 1.2),
-  "detour": (0.0, 0.2),
-  "speed": (0.5, 1.2),
-  "reaction": (0.0, 0.2),
+  "overshoot": (0.0, 0.08),
+  "delay": (0.0, 0.25),
+  "force": (0.85, 1.15),
+  "detour": (0.0, 0.15),
+  "speed": (0.7, 1.2),
+  "reaction": (0.0, 0.15),
+}
+# What is drawn for `novice`: from where skilled people end to what `NOVICES` do.
+NOVICE = {
+  "tremor": (0.0002, 0.0006),
+  "overshoot": (0.08, 0.5),
+  "delay": (0.25, 1.0),
+  "force": (1.15, 2.0),
+  "detour": (0.15, 1.0),
+  "speed": (0.4, 0.7),
+  "reaction": (0.15, 0.3),
 }
 _WIDE = 1.0  # action of the jaw: wide open
 _ROLL = 0.8  # of the jaws to grasp, across the gallbladder's slack [rad]
-_GRIP = 1.5  # force that holds the organ [N]
 _FIRMER = 0.4  # by how much it is gripped more each time that it was lost [N]
+_SLID = 0.001  # what may move in the jaws unnoticed [m]
+_REFLEX, _FIRMEST = 400.0, 3.0  # force for each metre that slides further [N/m], and at most [N]
 _TREMOR_HZ = np.array([4.0, 5.3, 7.1, 8.6, 10.0])
 
 
@@ -94,16 +109,18 @@ def make(env: control.Environment, who: str | Style = EXPERT, seed: int = 0) -> 
 
   Args:
     env: of one of the suite's tasks
-    who: a `Style`, a name of `STYLES`, `skilled`, a file of a trained policy, or "module:object": a
-      class is made with (env, seed) and its object called with each time step; anything else is
-      called with the observation
+    who: a `Style`, a name of `STYLES` or of `PEOPLE`, `trained` for the policy that comes with the
+      exercise, a file of another, or "module:object": a class is made with (env, seed) and its
+      object called with each time step; anything else is called with the observation
     seed: of what is random in a scripted performer
   """
   if isinstance(who, Style):
     return Performer(env, who, seed)
   found = find(who)
-  if found is skilled:
-    found = skilled(seed)
+  if found in PEOPLE.values():
+    found = found(seed)
+  if found is trained:
+    found = trained(env)
   if isinstance(found, Style):
     return Performer(env, found, seed)
   if isinstance(found, policy.Policy):
@@ -118,8 +135,25 @@ def make(env: control.Environment, who: str | Style = EXPERT, seed: int = 0) -> 
 
 def skilled(seed: int) -> Style:
   """Returns a style drawn from `SKILLED`."""
+  return _drawn(SKILLED, seed)
+
+
+def novice(seed: int) -> Style:
+  """Returns a style drawn from `NOVICE`."""
+  return _drawn(NOVICE, seed)
+
+
+PEOPLE = {"skilled": skilled, "novice": novice}
+
+
+def _drawn(ranges: dict[str, tuple[float, float]], seed: int) -> Style:
   random = np.random.RandomState(seed)
-  return Style(**{name: float(random.uniform(*span)) for name, span in SKILLED.items()})
+  return Style(**{name: float(random.uniform(*span)) for name, span in ranges.items()})
+
+
+def trained(env: control.Environment) -> policy.Policy:
+  """Returns the policy that comes with an exercise."""
+  return policy.shipped(env.task.name)
 
 
 def find(who: str, *others: str) -> Any:
@@ -129,13 +163,14 @@ def find(who: str, *others: str) -> Any:
     who: see `make`
     *others: names that the caller takes as well, for the message
   """
-  if who == skilled.__name__:
-    return skilled
+  for found in (*PEOPLE.values(), trained):
+    if who == found.__name__:
+      return found
   if who.endswith(policy.SUFFIX):
     return policy.load(who)
   if ":" not in who:
     if who not in STYLES:
-      names = ", ".join((*STYLES, skilled.__name__, *others))
+      names = ", ".join((*STYLES, *PEOPLE, trained.__name__, *others))
       raise ValueError(
         f"performer is {who!r}, expected one of {names}, a file of a "
         f"trained policy (*{policy.SUFFIX}) or module:object"
@@ -282,15 +317,16 @@ class Performer:
     force = float(np.linalg.norm(self.physics.contact_force()))
     return force / max(float((self.physics.tip_pos() - point) @ along), 1e-3)
 
-  def close(self, site: int, again: int = 0) -> Script:
+  def close(self, site: int, again: int = 0, grip: float = 1.5) -> Script:
     """Grasps a triangle: opens above it, goes down over it, and closes to a gentle force.
 
     Args:
       site: the triangle
       again: how often it was lost: it is taken deeper then, and firmer
+      grip: force that holds it [N]
     """
     physics, up = self.physics, self.physics.trocar().mat[:, 2]
-    self.firm = _GRIP + _FIRMER * min(again, 2)
+    self.firm = self._enough = grip + _FIRMER * min(again, 2)
     self.roll, self.extra[:] = _ROLL, _WIDE
     yield from self.move(physics.point(site) + 0.012 * up)
     yield from self.wait(0.2)
@@ -305,7 +341,9 @@ class Performer:
         return
 
   def grip(self, contact: float) -> None:
-    """Keeps the force of the jaws, which have held for a time [s]."""
+    """Keeps the force of the jaws, which have held for a time [s]; more where the tissue slides."""
+    slid = max(self.task.slid(self.physics) - _SLID, 0.0) if self.task.grasped else 0.0
+    self.firm = max(self.firm, min(self._enough + _REFLEX * slid, _FIRMEST))
     self._squeeze(contact, 0.01)
 
   def _squeeze(self, contact: float, gain: float) -> float:
@@ -316,7 +354,7 @@ class Performer:
     return missing
 
   def open(self) -> Script:
-    """Lets go."""
+    """Lets go, gently until nothing is held: a pinched fold would jump."""
     while self.extra[0] < 0.1:
-      self.extra[0] += 0.06
+      self.extra[0] += 0.02 if self.physics.gripper()[2:].any() else 0.06
       yield self.step()

@@ -14,7 +14,7 @@ from palpate.models.handle import find, pose
 from . import scenes
 from .handle import ROW, Guide
 from .jaws import Jaws
-from .metrics import surface_strain
+from .metrics.samples import Stretch
 from .portable import Portable
 from .scenes import CAMERA, ORGAN
 from .stage import STATE
@@ -75,6 +75,7 @@ class Physics(Portable):
     self.coarse = _spread(self._xpos0, COARSE)
     self._coarse0 = self._xpos0[self.coarse]
     self._elem = self.organ.elem
+    self._stretch: tuple[np.ndarray, Stretch] | None = None
     self._trocar = trocar.trocar(model, prefix)
     self.quiet()
 
@@ -251,7 +252,9 @@ class Physics(Portable):
 
   def strain(self, rest: np.ndarray) -> float:
     """Returns the largest strain of the organ's surface against its nodes `rest` [-]."""
-    return float(surface_strain(rest, self.nodes(), self._elem).max())
+    if self._stretch is None or self._stretch[0] is not rest:
+      self._stretch = rest, Stretch(rest, self._elem)
+    return self._stretch[1].most(self.nodes())
 
   def nodes_near(self) -> np.ndarray:
     """Returns the organ's nodes nearest to the tip, from the tip [m]  (NEAR, 3)."""

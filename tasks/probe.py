@@ -40,6 +40,7 @@ REPORT = 0.05  # least force at the report [N]
 # Of the expert: how far above a place it begins, how deep it feels, how far apart places to feel
 # are, first and around what is stiff, and how far around that it feels [m].
 _ABOVE, _DEPTH, _SWEEP, _CLOSE, _AROUND = 0.004, 0.004, 0.014, 0.006, 0.009
+_NOISE = 8.0  # of what it feels: triangles differ [N/m]
 _STIFF = 1.3  # times what is soft: what is worth a closer look [-]
 
 
@@ -394,13 +395,20 @@ class Palpate(Task):
     return int(gap.argmax()) if gap.max() > _CLOSE else None
 
   def _guess(self, felt: dict[int, float]) -> int:
-    """Returns the place that a bell of stiffness, a + b exp(-(d/w)^2), fits best on."""
+    """Returns the place nearest to where the inclusion is to be expected.
+
+    Each place is as likely as a bell of stiffness on it, h exp(-(d/w)^2) above what is soft, fits
+    what was felt. The best fit alone may be a far one of several that are nearly as good.
+    """
+    stiffness = np.array(list(felt.values()))
+    more = stiffness - np.quantile(stiffness, 0.25)
     distance = np.linalg.norm(self.places[:, None] - self.places[list(felt)], axis=2)
     bell = np.exp(-((distance / (1.2 * self.radius)) ** 2))
-    bell -= bell.mean(axis=1, keepdims=True)
-    stiffness = np.array(list(felt.values()))
-    gain = bell @ (stiffness - stiffness.mean())  # what the bell explains
-    return int(np.argmax(gain / np.maximum(np.linalg.norm(bell, axis=1), 1e-9)))
+    height = np.maximum(bell @ more / np.maximum((bell**2).sum(axis=1), 1e-9), 0.0)
+    error = ((more - height[:, None] * bell) ** 2).sum(axis=1)
+    chance = np.exp((error.min() - error) / (2 * _NOISE**2))
+    middle = chance @ self.places / chance.sum()
+    return int(np.linalg.norm(self.places - middle, axis=1).argmin())
 
   def _hop(self, p: Performer, goal: np.ndarray) -> Script:
     """Moves to a point, in an arch over the organ where it is far."""

@@ -27,6 +27,7 @@ from .touch import SLACK
 SUITE = containers.TaggedTasks()
 _BEHIND = 0.02  # from the organ's middle to the disc [m]
 _SAMPLES = 12  # points of the disc
+_GRIP = 1.8  # of the expert, more than to lift: what is pulled aside slides [N]
 SEEN = 1e-6  # what rounding may take from a share of it
 
 
@@ -158,7 +159,7 @@ class Retract(Hold):
     for again in itertools.count():
       if self.outcome is not None:
         return
-      yield from p.close(self.site, again)
+      yield from p.close(self.site, again, _GRIP)
       up = physics.trocar().mat[:, 2]
       yield from p.wait(p.style.delay)
       along = self.right + 0.15 * up
@@ -170,9 +171,10 @@ class Retract(Hold):
         contact += self.control_timestep
         if self.visible >= self.wanted - 1e-9:
           enough = far + extra if enough is None else enough
-        elif enough is not None and far >= enough:
+        elif enough is not None and far >= enough + self.slid(physics):
           enough = None  # the organ slid back
-        if far < (0.035 if enough is None else enough):
+        # What slides in the jaws is pulled in again before the disc is covered by it.
+        if far < (0.035 if enough is None else enough + self.slid(physics)):
           far += speed * self.control_timestep
         p.tip = start + far * along
         p.grip(contact)

@@ -28,9 +28,11 @@ Weights: safety 67 %, efficiency 17 % (Heidelberg VR score, 10.1007/s00464-018-6
 Proficiency of an episode: success, and no metric over its limit. A limit is the panel's mean and so
 many SDs, the same number for every metric, that of the panel's episodes `PASSING` pass limits that
 are made of the others: a new person of the panel's skill then passes as often. The worst episodes
-beyond that count neither in mean nor SD. The mean + 2 SD of SAGES would fail half of the panel,
-since each of thirty metrics may fail by itself, and so would the panel's worst values the next
-person. A metric that some of the panel's successes lack is not asked for.
+beyond that count neither in mean nor SD. Both are of log(1 + value / median) where no value is
+negative: forces, times and paths vary by factors, and their long tails are no normal one's. The
+mean + 2 SD of SAGES would fail half of the panel, since each of thirty metrics may fail by itself,
+and so would the panel's worst values the next person. A metric that some of the panel's successes
+lack is not asked for.
 
 Proficiency of a performer: `CONSECUTIVE` proficient episodes in a row, then `REPEATS` more that
 need not be in a row: the 2 + 10 of the curriculum for the Fundamentals of Laparoscopic Surgery
@@ -106,6 +108,9 @@ def _limits(results: Sequence[Metrics], names: Sequence[str]) -> dict[str, float
   asked = np.isfinite(values).all(axis=0)
   worst = np.max(values * signs, axis=0, where=np.isfinite(values), initial=-np.inf)
   panel = values[:, asked] * signs[asked]
+  middle = np.median(panel, axis=0)
+  unit = np.where((panel >= 0).all(axis=0) & (middle > 0), middle, np.inf)  # inf: as it is
+  panel = np.where(np.isfinite(unit), np.log1p(np.maximum(panel, 0.0) / unit), panel)
   far = _ahead_of_others(panel)
   kept = panel[np.argsort(far, kind="stable")[: math.ceil(PASSING * len(panel))]]
   most = max(0.0, float(_ahead_of_others(kept).max(initial=0.0)))
@@ -113,7 +118,10 @@ def _limits(results: Sequence[Metrics], names: Sequence[str]) -> dict[str, float
   high, low = kept.max(axis=0), kept.min(axis=0)
   # The mean of equal values may round, as above.
   limit = np.where(high > low, kept.mean(axis=0) + most * spread, high)
-  worst[asked] = np.maximum(limit, high)
+  limit = np.maximum(limit, high)
+  factors = np.isfinite(unit)
+  limit[factors] = unit[factors] * np.expm1(limit[factors])
+  worst[asked] = limit
   return dict(zip(names, (worst * signs).tolist(), strict=True))
 
 
@@ -121,7 +129,7 @@ def _ahead_of_others(panel: np.ndarray) -> np.ndarray:
   """Returns by how many SDs each episode's worst metric is over the mean of all others  (n,).
 
   Args:
-    panel: metrics of each episode, more is worse  (n, nmetric)
+    panel: metrics of each episode, or logarithms of them, more is worse  (n, nmetric)
   """
   far = np.zeros(len(panel))
   for k in range(len(panel) if len(panel) > 2 else 0):

@@ -47,16 +47,16 @@ def easy(time_limit=40, random=None, environment_kwargs=None, **kwargs):
 
 @SUITE.add("benchmarking")
 def standard(time_limit=60, random=None, environment_kwargs=None, **kwargs):
-  """Returns the task to free 60 % of it."""
-  kwargs = {"wanted": 0.6, "law": FILMY, "jitter": 0.003, **kwargs}
+  """Returns the task to free half of it."""
+  kwargs = {"wanted": 0.5, "law": FILMY, "jitter": 0.003, **kwargs}
   return base.make(Tease(SCENE, random, name="tease/standard", **kwargs), time_limit,
                    environment_kwargs)  # fmt: skip
 
 
 @SUITE.add("benchmarking", "hard")
 def hard(time_limit=80, random=None, environment_kwargs=None, **kwargs):
-  """Returns the task to free 70 % of a dense one with less force."""
-  kwargs = {"wanted": 0.7, "law": DENSE, "jitter": 0.005, "force_limit": 1.2, **kwargs}
+  """Returns the task to free 60 % of a dense one with less force."""
+  kwargs = {"wanted": 0.6, "law": DENSE, "jitter": 0.005, "force_limit": 1.2, **kwargs}
   return base.make(Tease(SCENE, random, name="tease/hard", **kwargs), time_limit,
                    environment_kwargs)  # fmt: skip
 

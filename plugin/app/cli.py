@@ -16,7 +16,7 @@ import os
 import sys
 from collections.abc import Sequence
 
-from palpate import __version__
+from palpate import __version__, screen
 
 from .console import CommandError
 
@@ -82,6 +82,7 @@ def _parser(words: list[str]) -> argparse.ArgumentParser:
       place = groups[name[0]]
     command = place.add_parser(name[-1], help=text, description=text[0].upper() + text[1:] + ".")
     if tuple(words[: len(name)]) == name:
+      screen.prepare_gl()  # before MuJoCo is imported
       chosen = importlib.import_module(f".{module}", __package__)
       chosen.add_arguments(command)
       command.set_defaults(main=chosen.main)

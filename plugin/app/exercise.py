@@ -149,7 +149,8 @@ def _list() -> int:
 
   for domain, task in suite.ALL_TASKS:
     print(f"{f'{domain}/{task}':24} {suite.summary(domain, task)}")
-  print(f"performers: {', '.join(performer.STYLES)}, skilled, keyboard, module:object")
+  names = (*performer.STYLES, *performer.PEOPLE, "trained", "keyboard", "module:object")
+  print(f"performers: {', '.join(names)}")
   return 0
 
 

@@ -57,7 +57,7 @@ def main(args: argparse.Namespace) -> int:
   jobs = [("/".join(pair), args.performer, seed, str(runs)) for pair in pairs for seed in seeds]
   progress, results = Progress(), []
   with Interrupt() as interrupt:
-    for job, result in zip(jobs, parallel(_kept, jobs, args.processes, interrupt), strict=False):
+    for job, result in zip(jobs, parallel(kept, jobs, args.processes, interrupt), strict=False):
       if result is None:
         raise CommandError("a process died; go on with the same command", code=1)
       results.append(result)
@@ -88,7 +88,7 @@ def fingerprint() -> str:
   return digest.hexdigest()[:12]
 
 
-def _kept(job: tuple[str, str, int, str]) -> Result:
+def kept(job: tuple[str, str, int, str]) -> Result:
   """Returns the result of an episode: task, performer, seed, folder; from there if it was run."""
   from palpate.tasks.files import replacing
 

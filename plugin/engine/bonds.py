@@ -129,6 +129,13 @@ class Group:
     kernel.launch("cpu", 1, 1, 0, self.bonded)
 
 
+def alike(a: Group, b: Group) -> bool:
+  """Returns whether bonds of two mjData of a model are the same."""
+  arrays = all(np.array_equal(getattr(a, name), getattr(b, name)) for name in _OF_GROUP)
+  others = (group.other and group.other.organ.name for group in (a, b))
+  return arrays and (a.body, a.law) == (b.body, b.law) and len(set(others)) == 1
+
+
 class Bonds(Beside):
   """The bonds of a workspace's organ, and those that others have to it.
 

@@ -23,7 +23,7 @@ def configure(w, model: int, texts: dict[str, str]):
     ValueError: a key may not change, or its value is not allowed.
   """
   organ, mesh = w.organ, w.organ.mesh
-  arguments = texts, mesh.nelem, mesh.closed, organ.config
+  arguments = texts, mesh.nelem, mesh.whole.closed, organ.config
   _change(w, model, configuration.change(organ.name, w.config, *arguments))
   w.chosen = True
 
@@ -41,9 +41,11 @@ def copy(w, model: int, other, twin):
     return
   if not w.chosen and w.config != other.config:
     _change(w, model, other.config)
-  w.bonds.let_go()
-  for group in [g for g in other.bonds.groups if not g.declared]:
-    _put(w, dataclasses.replace(group, own=w, other=group.other and twin(group.other)))
+  mine, theirs = ([g for g in each.bonds.groups if not g.declared] for each in (w, other))
+  if len(mine) != len(theirs) or not all(map(bonds.alike, mine, theirs)):
+    w.bonds.let_go()
+    for group in theirs:
+      _put(w, dataclasses.replace(group, own=w, other=group.other and twin(group.other)))
   if w.ties.groups or other.ties.groups:
     groups = [dataclasses.replace(g, other=g.other and twin(g.other)) for g in other.ties.groups]
     tie(w, model, groups)
@@ -151,7 +153,7 @@ def _change(w, model: int, config: Config):
     if material:
       shape.change(w.body, w.organ.mesh, config, ~w.organ.free)
     else:
-      shape.renumber(w.body, config)
+      shape.renumber(w.body, config, w.organ.mesh.closed or not w.cuts)
     w.creep.renumber(config)
     if any(getattr(before, key) != getattr(config, key) for key in configuration.RECORDED):
       bind(w, model)

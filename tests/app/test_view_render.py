@@ -1,5 +1,10 @@
 """`palpate view` and `palpate render`."""
 
+import pathlib
+import shutil
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -50,6 +55,16 @@ def test_options_draw_something(option):
   assert (np.abs(_render(*words) - _render(*words, option)).max(axis=2) > 20).mean() > 2e-4
 
 
+def test_a_command_without_a_screen_chooses_how_to_draw(monkeypatch):
+  monkeypatch.delenv("MUJOCO_GL", raising=False)
+  command = shutil.which("palpate", path=str(pathlib.Path(sys.executable).parent))
+  if command is None:
+    pytest.skip("the palpate command is not installed")
+  words = ["render", "press", "-o", "drawn.png", *SIZE]
+  subprocess.run([command, *words], check=True, timeout=300)
+  assert np.ptp(imageio.imread("drawn.png")) > 100
+
+
 def test_cameras_differ():
   words = ["kidney", "--nodes", "250", "--camera"]
   laparoscope, side, free = (_render(*words, name) for name in ("laparoscope", "side", "free"))
@@ -86,7 +101,7 @@ def test_help_lists_the_scenes(capsys):
     with pytest.raises(SystemExit):
       cli.main([command, "--help"])
     said = " ".join(capsys.readouterr().out.split())
-    assert f"{', '.join(models.NAMES)} or press; an MJCF file; a folder" in said
+    assert f"{', '.join(models.NAMES)}, abdomen or press; an exercise such as" in said
     assert "250 or 1000" in said and "probe,grasper" in said
 
 

@@ -1,43 +1,30 @@
-"""Episodes of experts and novices, kept as recordings."""
+"""Episodes of performers: run once for a state of the code, and kept as by `palpate panel`."""
 
 from __future__ import annotations
 
 import argparse
 import pathlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
-from palpate.tasks import episode, performer, suite
-from palpate.tasks.recording import Recording
-
-_environments = {}  # the last one of this process
+from palpate.app import panel
+from palpate.app.evaluate import Result
 
 
 def arguments(parser: argparse.ArgumentParser):
   """Declares the options of benches of episodes."""
   add = parser.add_argument
   add("--episodes", type=int, help="of each performer (experts 50, skill 10)")
-  add("--runs", default="out/episodes", help="recordings, kept (%(default)s)")
+  add("--runs", default="out/panel", help="episodes, kept, as of palpate panel (%(default)s)")
 
 
-def performances(name: str, style: str, episodes: int, folder: str) -> Iterator[Recording]:
-  """Yields the recordings of the seeds 0, 1, ..., run unless they are in the folder."""
-  for seed in range(episodes):
-    yield _perform(name, style, seed, pathlib.Path(folder))
+def folder(args: argparse.Namespace) -> str:
+  """Returns where the episodes of the code as it is are kept."""
+  path = pathlib.Path(args.runs).resolve() / panel.fingerprint()
+  path.mkdir(parents=True, exist_ok=True)
+  return str(path)
 
 
-def _perform(name: str, style: str, seed: int, folder: pathlib.Path) -> Recording:
-  path = folder / name.replace("/", "_") / f"{style}_{seed}.npz"
-  if path.exists():
-    return Recording.load(path)
-  if name not in _environments:
-    _environments.clear()
-    _environments[name] = suite.load(*suite.split(name), task_kwargs={"random": 0})
-  env = _environments[name]
-  info = {"task_kwargs": {}, "performer": style}
-  try:
-    recording = episode.run(env, performer.make(env, style, seed), seed, info)
-  except episode.EpisodeError as error:
-    recording = error.recording
-  path.parent.mkdir(parents=True, exist_ok=True)
-  recording.save(path)
-  return recording
+def performances(name: str, style: str, seeds: Iterable[int], kept: str) -> Iterator[Result]:
+  """Yields the results of seeds, run unless they are in the folder."""
+  for seed in seeds:
+    yield panel.kept((name, style, seed, kept))

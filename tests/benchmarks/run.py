@@ -19,6 +19,7 @@ BENCHES = {
   "flicker": "steps without force while a probe presses the organs that ship",
   "inertia": "what the effective inertia does to the contact force",
   "learning": "SAC on touch/easy",
+  "live": "how punctual a live loop is while a page shows it, and how late its pictures are",
   "locality": "what leaving out solved nodes would save",
   "loop": "the whole loop, mj_step with a probe on a windowed organ",
   "loopholes": "what a search finds in the exercises that does not do the work",

@@ -1,7 +1,6 @@
 """Every metric over the same seeds for the expert and each novice; the effect size is Cohen's d.
 
-Each episode's recording is kept in `--runs` and what is there is not run again; remove that folder
-when the code has changed.
+Episodes are kept in `--runs` and what is there is not run again.
 """
 
 from __future__ import annotations
@@ -12,10 +11,10 @@ import pathlib
 
 import numpy as np
 from benchmarks import results
-from benchmarks.performances import arguments, performances
+from benchmarks.performances import arguments, folder, performances
 from benchmarks.runner import Bench, Case, Row
 from palpate.tasks import performer
-from palpate.tasks.metrics import METRICS
+from palpate.tasks.metrics import METRICS, Metrics
 
 SKILL_TASKS = ("touch/standard", "probe/easy", "grasp/easy", "trace/easy", "retract/easy")
 # What each novice does differently, and the metrics that must show it.
@@ -47,7 +46,7 @@ LARGE = 0.8  # Cohen's d
 def stages(args: argparse.Namespace) -> list[list[Case]]:
   """Returns a case an exercise and performer."""
   keys = {"episodes": args.episodes or (2 if args.short else 10)}
-  keys |= {"runs": str(pathlib.Path(args.runs).resolve())}
+  keys |= {"runs": folder(args)}
   return [
     [
       {"case": f"{task}, {style}", "task": task, "style": style} | keys
@@ -59,13 +58,13 @@ def stages(args: argparse.Namespace) -> list[list[Case]]:
 
 def run(case: Case, out: pathlib.Path) -> list[Row]:
   """Returns a row an episode: its outcome and metrics."""
-  runs = performances(case["task"], case["style"], case["episodes"], case["runs"])
+  runs = performances(case["task"], case["style"], range(case["episodes"]), case["runs"])
   rows = []
-  for seed, recording in enumerate(runs):
+  for seed, result in enumerate(runs):
     row = {"task": case["task"], "style": case["style"], "seed": seed}
-    metrics = recording.metrics()
+    metrics = Metrics.from_json(result.metrics)
     values = {name: float(getattr(metrics, name)) for name in METRICS}
-    rows.append(row | {"outcome": recording.info["outcome"]} | values)
+    rows.append(row | {"outcome": result.outcome} | values)
   return rows
 
 

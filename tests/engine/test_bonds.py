@@ -99,8 +99,8 @@ def test_peeling_a_strip_takes_the_force_of_its_fracture_energy(scenes):
 # Reactions.
 
 
-def test_an_organ_and_a_free_body_bonded_together_keep_their_momentum(make, scenes):
-  model, data, organ = make(LOOSE, bonds=f"hand {TEXT} near 0.025")
+def test_an_organ_and_a_free_body_bonded_together_keep_their_momentum(make, scenes, device):
+  model, data, organ = make(LOOSE, bonds=f"hand {TEXT} near 0.025", device=device)
   mujoco.mj_forward(model, data)
   dof, adr = model.joint("free").dofadr[0], model.joint("free").qposadr[0]
   data.qvel[dof : dof + 3] = 0.1, 0, 0.2
@@ -150,6 +150,42 @@ def test_a_pull_frees_an_organ_from_another(scenes):
   assert shares[-1] == 1.0 and np.all(np.diff(shares) >= 0)
   assert upper.bonds.energy == pytest.approx(energy * upper.bonds.area.sum(), rel=0.05)
   assert np.abs(grip.force).max() < 0.05 and upper.error is None and lower.error is None
+
+
+def _pair(scenes, kinds):
+  """Returns the bonds' force on an organ, and that of a hand on the one it is bonded to."""
+  points, elem = scenes.box((0.04, 0.04, 0.02), 0.01)
+  points[:, 2] -= points[:, 2].min()
+  organs = []
+  for kind, name, down in zip(kinds, ("upper", "lower"), (0.0, 0.021), strict=True):
+    keys = SOFT | {"damping": 0.01, "bulk": 1e4, "contact": {"contype": 1, "conaffinity": 2}}
+    if name == "upper":
+      keys |= {"bonds": "lower 1e6 1e3 1 near 0.002", "foundation": 1e5}
+    body = points - [0, 0, down], elem, name
+    windows = {"grid": f"{name}_window", "count": "3 3 1"}
+    organs.append(
+      scenes.windowed(*body, **windows, **keys) if kind else scenes.organ(*body, **keys)
+    )
+  model, data, upper = scenes.load(
+    scenes.world(*organs, scenes.ball(1.0, joint=False), HAND), "upper"
+  )
+  mujoco.mj_forward(model, data)
+  lower = palpate.Organ(model, data, "lower")
+  grip = lower.attach(np.flatnonzero(lower.xpos0[:, 2] < -0.0205), "hand")
+  for k in range(250):
+    data.mocap_pos[0, 2] -= 1e-5 if k < 100 else 0.0
+    mujoco.mj_step(model, data)
+  return upper.bonds.force.sum(axis=0), grip.force
+
+
+def test_what_pulls_at_one_organ_pulls_back_at_the_other_in_each_coupling(scenes):
+  found = []
+  for kinds in ((False, False), (False, True), (True, False)):
+    force, grip = _pair(scenes, kinds)
+    np.testing.assert_allclose(force, grip, atol=0.02 * np.abs(force).max())
+    found.append(force)
+  assert found[0][2] < -0.1
+  np.testing.assert_allclose(found[1:], [found[0]] * 2, atol=0.005 * np.abs(found[0]).max())
 
 
 # Pressing.
@@ -272,6 +308,10 @@ def test_bonds_of_python_are_copied_and_end_with_a_reset(make):
       mujoco.mj_step(model, each)
   np.testing.assert_array_equal(twin.xpos, organ.xpos)
   assert len(twin.bonds) == 3 and np.abs(twin.bonds.force[2]).max() > 0
+  organ.bond("hand", *LAW, vertices=[41])
+  for _ in range(2):
+    mujoco.mj_copyData(other, model, data)
+    assert len(twin.bonds) == 4
   mujoco.mj_resetData(model, data)
   data.mocap_pos[0] += [0, 0, 0.005]
   mujoco.mj_step(model, data)

@@ -134,6 +134,11 @@ def test_shaft_contact():
   assert metrics.shaft_contact(time, np.zeros(6)) == 0 == metrics.peak_shaft_force(np.zeros(6))
 
 
+def test_peak_traction():
+  assert metrics.peak_traction([0.1, 0.9, 0.2]) == 0.9
+  assert _unknown(metrics.peak_traction([]), "too few samples: 0,")
+
+
 def test_peak_strain():
   assert metrics.peak_strain([0.0, 0.31, 0.2]) == 0.31
   assert _unknown(metrics.peak_strain([]), "too few samples: 0,")

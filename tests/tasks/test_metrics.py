@@ -246,6 +246,11 @@ def test_trace_rms_of_an_offset_line():
   assert metrics.trace_rms(pos[::-1], curve) == pytest.approx(0.002)
 
 
+def test_share_freed_is_the_last():
+  assert metrics.share_freed([0.0, 0.2, 0.6]) == 0.6
+  assert _unknown(metrics.share_freed([]), "too few samples: 0,")
+
+
 def test_trace_frechet_of_an_offset_line_and_of_a_detour():
   curve = np.array([[0, 0, 0], [0.1, 0, 0]], float)
   x = np.linspace(0, 0.1, 257)

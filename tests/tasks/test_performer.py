@@ -106,6 +106,11 @@ def test_skilled_people_are_many_and_come_again():
     assert low <= min(values) < max(values) <= high
     assert np.ptp(values) > 0.8 * (high - low)
   assert performer.find("skilled") is performer.skilled
+  novices = [performer.novice(seed) for seed in range(20)]
+  for name, (low, high) in performer.SKILLED.items():
+    end = low if name == "speed" else high  # novices begin where skilled people end
+    worse = [getattr(novice, name) <= end for novice in novices]
+    assert all(worse) if name == "speed" else not any(worse)
 
 
 def test_a_task_without_an_expert_says_so():

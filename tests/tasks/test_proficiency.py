@@ -6,8 +6,6 @@ from palpate import tasks
 from palpate.tasks import episode, performer, score, suite
 
 NAMES = ["/".join(pair) for pair in tasks.ALL_TASKS]
-# Not 95 % yet: folds that slip or are pinched, an inclusion at the edge of the field.
-LEAST = {"retract/hard": 0.7, "grasp/standard": 0.85, "probe/palpate_standard": 0.85}
 
 
 def scores(name, who, seeds):
@@ -31,8 +29,8 @@ def mean(results):
 @pytest.mark.parametrize("name", ["touch/easy", "trace/easy"])
 def test_fresh_performers_rank_as_they_should(name):
   expert, people = scores(name, "expert", range(60, 63)), scores(name, "skilled", range(60, 63))
-  novice = scores(name, "force", range(60, 62)) + scores(name, "tremor", range(60, 62))
-  assert share(expert) == 1 and share(people) >= 0.5 > share(novice)
+  novice = scores(name, "novice", range(60, 63))
+  assert share(expert) == 1 and share(people) >= 0.5 and share(novice) == 0
   assert mean(expert) > mean(people) > mean(novice)
 
 
@@ -40,13 +38,14 @@ def test_fresh_performers_rank_as_they_should(name):
 def test_every_exercise_has_a_panel_of_skilled_people(name):
   reference = score.reference(name)
   assert reference["performer"] == "skilled"
-  assert reference["n"] >= 0.8 * reference["episodes"] and reference["episodes"] >= 30
+  assert reference["n"] >= 0.8 * reference["episodes"] and reference["episodes"] >= 12
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
-def test_fresh_experts_are_proficient_and_skilled_people_often(name):
-  assert share(scores(name, "expert", range(60, 80))) >= LEAST.get(name, 0.95)
+def test_fresh_experts_are_proficient_skilled_people_often_and_novices_never(name):
+  assert share(scores(name, "expert", range(60, 80))) >= 0.9  # 95 % of more: one of 20 may be two
+  assert not share(scores(name, "novice", range(60, 65)))
   people = scores(name, "skilled", range(60, 80))
   assert np.mean([result.outcome == score.SUCCESS for result in people]) >= 0.8
   assert share(people) >= 0.6

@@ -41,6 +41,7 @@ def test_table_is_consistent():
     "sparc",
     "log_dimensionless_jerk",
     "bimanual_dexterity",
+    "share_freed",
   }
   assert set(METRICS) - set(SCORED) == {"mean_speed", "peak_speed", "economy_of_volume"}
 
@@ -99,8 +100,10 @@ def test_make_reference():
   times, forces = [10.0, 12.0, 14.0], [1.0, Unknown("no contact"), 2.0]
   results = [Metrics(time=t, peak_force=f, errors=0.0) for t, f in zip(times, forces, strict=True)]
   made = make_reference(results, "touch", seed=7)
-  # The others of 14 are 10 and 12: it is 3 over their mean of 11, their SD is the root of 2.
-  limit = pytest.approx(12 + 2 * 3 / math.sqrt(2))
+  # By log(1 + t / 12): so many SDs of 10 and 12 as 14 is over their mean, over that of all three.
+  a, b, c = (math.log1p(t / 12) for t in times)
+  most = (c - (a + b) / 2) / np.std([a, b], ddof=1)
+  limit = pytest.approx(12 * math.expm1((a + b + c) / 3 + most * np.std([a, b, c], ddof=1)))
   assert made["metrics"]["time"] == {"mean": 12.0, "sd": 2.0, "n": 3, "limit": limit}
   force = {"mean": 1.5, "sd": math.sqrt(0.5), "n": 2, "limit": 2.0}
   assert made["metrics"]["peak_force"] == pytest.approx(force)

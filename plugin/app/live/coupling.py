@@ -243,8 +243,8 @@ class Link:
     self.state = "ready"
     self._motion(reading)
     if self._reference is None:
-      row = self.row
-      self._reference = reading, row[:3], tuple(row[3:]), self._roll - reading.roll
+      w, x, y, z = self.row[3:]
+      self._reference = reading, self.row[:3], (w, x, y, z), self._roll - reading.roll
       return
     first, center, turned, roll = self._reference
     m, scale = self._axes, self.options.scale

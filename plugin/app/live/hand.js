@@ -22,6 +22,7 @@ export class Hand {
     this.fingers = new Map();
     this.pressed = new Set();  // buttons of the page
     this.said = {};
+    this.since = null;  // of the first movement that was not told yet
     this.left = "";  // what is in the left hand: keyboard, pad
     canvas.addEventListener("pointerdown", event => this.press(canvas, event));
     canvas.addEventListener("pointermove", event => this.drag(event));
@@ -76,6 +77,7 @@ export class Hand {
     if (!last) return;
     const [x, y] = [event.clientX - last[0], event.clientY - last[1]], view = this.view;
     const before = this.span();
+    this.since ??= event.timeStamp;
     this.fingers.set(event.pointerId, [event.clientX, event.clientY]);
     const two = this.fingers.size > 1, now = this.span();
     if (view.free) {
@@ -103,6 +105,7 @@ export class Hand {
 
   wheel(event) {
     event.preventDefault();
+    this.since ??= event.timeStamp;
     if (this.view.free) this.view.scale(Math.exp(1e-3 * event.deltaY));
     else this.move[2] += DEPTH * event.deltaY;
   }
@@ -157,6 +160,7 @@ export class Hand {
     const out = [this.words("right", right, move)];
     if (left === "keyboard") out.push(this.words("left", [keys], [0, 0, 0, 0]));
     if (left === "pad") out.push(this.words("left", [pads], [0, 0, 0, 0]));
+    this.since = null;
     return out.filter(Boolean);
   }
 
@@ -166,6 +170,6 @@ export class Hand {
     const buttons = [...new Set(sources.flatMap(s => s.held))], rest = JSON.stringify([rate, buttons]);
     if (rest === this.said[which] && move.every(x => x === 0)) return null;
     this.said[which] = rest;
-    return {type: "hand", which, move, rate, buttons, at: performance.now() % CLOCK};
+    return {type: "hand", which, move, rate, buttons, at: (this.since ?? performance.now()) % CLOCK};
   }
 }

@@ -10,6 +10,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 
@@ -62,8 +63,8 @@ class Lateness:
       for a, b in itertools.pairwise(edges)
     ]
 
-  def summary(self) -> dict[str, float]:
-    """Returns the numbers for a recording."""
+  def summary(self) -> dict[str, Any]:
+    """Returns the numbers for a recording; `late` has (at least [us], steps) of the histogram."""
     return {
       "steps": self.steps,
       "missed": self.missed,
@@ -73,6 +74,7 @@ class Lateness:
       "worst_us": 1e6 * self.worst,
       "skipped_s": self.skipped,
       "work_us": 1e6 * self.work / max(self.steps, 1),
+      "late": [[round(1e6 * low), count] for low, _, count in self.histogram()],
     }
 
   def text(self) -> str:

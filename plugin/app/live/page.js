@@ -19,12 +19,12 @@ try {
   throw error;
 }
 let scene = null, frame = null, head = {}, rest = null, running = false, paused = false, sound = null;
-let fresh = false, echoed = 0, before = null, trace = null, trouble = "";
+let fresh = false, drawn = "", echoed = 0, before = null, trace = null, trouble = "", warned = "", late = null;
 const plots = {force: new Plot("force"), way: new Plot("way"), rate: new Plot("rate")};
 const ways = [], pictures = [];  // from hand to picture [ms]; when pictures were drawn
 const hand = new Hand($("view"), $("pad"), view, () => head);
 // For scripts that work through the page: numbers as `head` names them, targets after the geoms.
-window.palpate = () => ({scene, head, targets: targets(), ways, pictures, ghost: trace?.time.length ?? 0});
+window.palpate = () => ({scene, head, targets: targets(), ways, pictures, late, ghost: trace?.time.length ?? 0});
 
 // The program.
 
@@ -96,7 +96,8 @@ const HEAR = {
   },
   status({instruction, warning, kind, fault, scheme}) {
     $("instruction").textContent = scene?.assessment ? "Assessment: no help" : instruction;
-    if (warning && kind !== $("stage").dataset.warning) beep(kind);
+    if (kind && kind !== warned) beep(kind);
+    warned = kind;
     $("warning").textContent = warning;
     $("stage").dataset.warning = kind;
     if (fault !== trouble) tell(trouble = fault);
@@ -123,7 +124,8 @@ const HEAR = {
   kept({path, fault}) {
     $("kept")?.replaceWith(kept(path, fault));
   },
-  idle() {
+  idle(message) {
+    late = message.late;
     run(false);
   },
   error({text}) {
@@ -256,7 +258,10 @@ function draw() {
   requestAnimationFrame(draw);
   if (running) hand.say().forEach(say);
   if (!frame) return;
-  view.draw(frame, head, trace && $("ghost").getAttribute("aria-pressed") === "true" ? trace : null);
+  const expert = trace && $("ghost").getAttribute("aria-pressed") === "true" ? trace : null, shown = view.state();
+  if (!fresh && !expert && shown === drawn) return;
+  drawn = shown;
+  view.draw(frame, head, expert);
   if (!fresh) return;
   fresh = false;
   const now = performance.now();

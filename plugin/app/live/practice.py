@@ -49,6 +49,7 @@ class Practice:
     scheme: str = SAFE,
     options: Options | None = None,
     publish: Callable[[Practice], None] | None = None,
+    pace: Pace | None = None,
   ):
     """Prepares the scene.
 
@@ -60,6 +61,7 @@ class Practice:
       scheme: time stepping, see `integrator` in docs/configuration.md
       options: of the coupling
       publish: called 30 times a second at most, in the loop's thread, to copy what pictures need
+      pace: real time by default
     """
     spec = models.load(organ, instruments=tuple(hands), handle=True, coupling="window", **size)  # pyright: ignore
     self.model: Any = spec.compile()
@@ -69,7 +71,7 @@ class Practice:
     mj.mj_forward(self.model, self.data)
     self.organ = Organ(self.model, self.data, f"{organ}/{organ}")
     self._wanted, self._publish, self._due = scheme, publish, 0.0
-    self.pace, self.faults = Pace(step), []
+    self.pace, self.faults = pace or Pace(step), []
     named = {f"{name}/": device for name, device in hands.items()}
     self._loop = Loop(self.model, self.data, named, options, self.pace)
     self.links: list[Link] = self._loop.links
@@ -84,12 +86,16 @@ class Practice:
     """Takes another scheme with the next step."""
     self._wanted = scheme
 
-  def run(self, realtime: bool = False) -> None:
+  def run(
+    self, realtime: bool = False, watch: Callable[[Practice], None] | None = None
+  ) -> None:
     """Runs until `pace.stopped`; always leaves the devices without force.
 
     Args:
       realtime: whether the system lets the loop go first, if it leaves time to others
+      watch: called after every step
     """
+    self._look = watch
     try:
       first = realtime and self._spare()
       self._loop.run(watch=self._watch, realtime=first)
@@ -107,6 +113,8 @@ class Practice:
     return spent < _BUSY * self.pace.period
 
   def _watch(self, loop: Loop) -> None:
+    if self._look is not None:
+      self._look(self)
     if self._wanted != self.organ.integrator:
       self._switch()
     if self.pace.now < self._due:

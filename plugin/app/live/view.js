@@ -58,6 +58,12 @@ export class View {
     this.zoom = 1;
   }
 
+  // What the picture depends on beside the frame.
+  state() {
+    const {canvas, wire, free, turn, shift, zoom} = this;
+    return JSON.stringify([canvas.clientWidth, canvas.clientHeight, wire, free, turn, shift, zoom]);
+  }
+
   scale(factor) {
     this.zoom = Math.min(Math.max(this.zoom * factor, 0.2), 5);
   }

@@ -297,7 +297,7 @@ class Worker:
       )  # fmt: skip
       stack.pop_all()
     self._run(practice, job, lambda: practice.run(realtime=True))
-    self._tell({"type": "idle"})
+    self._tell({"type": "idle", "late": practice.pace.lateness.summary()})
 
   def _picture(self, practice: Practice) -> None:
     """Shows free practice."""

@@ -174,8 +174,8 @@ def test_two_hands(model):
 
 def test_jaws_close_with_the_hand(model):
   data = start(model)
-  grip = lambda t: frozenset({"grip"} if t > 0.5 else ())  # noqa: E731
-  hand = live.Hand(lambda t: (0.0, 0.0, 0.0), buttons=grip)
+  held = lambda t: frozenset({"grip"} if t > 0.5 else ())  # noqa: E731
+  hand = live.Hand(lambda t: (0.0, 0.0, 0.0), buttons=held)
   loop = live.Loop(model, data, {"grasper/": hand}, pace=live.Pace.instant())
   opening = run(loop, 1.5, lambda loop: data.sensor("grasper/jaw").data[0])
   assert opening[450] > 0.5 and opening[-1] < 0.1

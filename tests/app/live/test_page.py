@@ -1,0 +1,304 @@
+"""The page in a headless browser: looked at, and used as a trainee would."""
+
+import pathlib
+import shutil
+import threading
+
+import numpy as np
+import pytest
+from palpate.tasks.recording import Recording
+
+pytest.importorskip("websockets")
+from palpate.app.live.server import Server
+
+ANSWER = 90.0  # that a busy machine may take [s]
+FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+LOOK = """(() => {
+  const {scene, head, targets} = window.palpate();
+  const text = document.getElementById("instruction").textContent;
+  return {head, targets, camera: scene.camera, text, ended: document.getElementById("card").open};
+})()"""
+# Every warning and tone that was shown.
+WATCH = """(() => {
+  const {body} = document, stage = document.getElementById("stage");
+  const seen = (window.seen = new Set());
+  const look = () => seen.add(`${stage.dataset.warning}`).add(`tone ${body.dataset.tone}`);
+  for (const each of [stage, body]) new MutationObserver(look).observe(each, {attributes: true});
+})()"""
+# A gamepad that a test moves.
+PAD = "window.pads = []; navigator.getGamepads = () => window.pads;"
+
+
+class Pages:
+  """A server, a browser, and one page that the tests share."""
+
+  def __init__(self, folder, browser):
+    self.folder, self.wrong = folder, []
+    self.serve()
+    self.page = page = browser.new_page(viewport={"width": 900, "height": 600})
+    page.on("pageerror", lambda error: self.wrong.append(error))
+    page.add_init_script(PAD)
+    page.goto(f"{self.server.url}#task=touch/easy")
+    page.wait_for_selector("#start:enabled", timeout=1e3 * ANSWER)
+
+  def serve(self, port=0):
+    self.server = Server(self.folder, port=port)
+    self.thread = threading.Thread(target=self.server.run)
+    self.thread.start()
+
+  def close(self):
+    self.server.close()
+    self.thread.join(30)
+
+  def until(self, what, text):
+    """Waits until an expression of the page is true; the page lets nobody evaluate text itself."""
+    for _ in range(int(10 * ANSWER)):
+      if self.page.evaluate(what):
+        return
+      self.page.wait_for_timeout(100)
+    raise AssertionError(f"{text}; the page says {self.page.inner_text('#fault')!r}")
+
+  def speed(self, value):
+    """Chooses one, among what is not always shown."""
+    self.page.click("#more summary")
+    self.page.select_option("#speed", value)
+    self.page.click("#more summary")
+
+  def start(self):
+    """Starts what is chosen, and waits for its first pictures."""
+    if self.page.is_visible("#card[open]"):  # a test before this one has failed
+      self.page.click("#card button:text('Close')")
+    if self.page.is_enabled("#stop"):
+      self.stop()
+    self.page.click("#start")
+    self.page.wait_for_selector("#stop:enabled", timeout=1e3 * ANSWER)
+    self.until("window.palpate().head.steps > 50", "no picture")
+
+  def stop(self):
+    """Stops an exercise and returns what its card says."""
+    self.page.dispatch_event("#stop", "click")  # the card may come meanwhile
+    self.page.wait_for_selector("#card[open]", timeout=1e3 * ANSWER)
+    text = self.page.inner_text("#card")
+    self.page.click("#card button:text('Close')")
+    return text
+
+  def middle(self):
+    box = self.page.locator("#view").bounding_box()
+    return box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+
+  def drag(self, x, y, button="left"):
+    a, b = self.middle()
+    self.page.mouse.move(a, b)
+    self.page.mouse.down(button=button)
+    self.page.mouse.move(a + x, b + y)
+    self.page.mouse.up(button=button)
+
+  def picture(self):
+    imageio = pytest.importorskip("imageio.v3")
+    shot = self.page.locator("#view").screenshot()
+    return imageio.imread(shot, extension=".png")[..., :3].astype(int)
+
+  def ink(self, name):
+    """Whether a plot shows a curve."""
+    found = f"""(() => {{
+      const canvas = document.getElementById("plot-{name}");
+      const pixels = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data;
+      return pixels.some((x, i) => i % 4 === 1 && x > 190);
+    }})()"""
+    return self.page.evaluate(found)
+
+
+@pytest.fixture(scope="module")
+def pages(tmp_path_factory):
+  api = pytest.importorskip("playwright.sync_api")
+  path = shutil.which("chromium") or shutil.which("google-chrome")
+  if path is None:
+    pytest.skip("no chromium")
+  with api.sync_playwright() as play:
+    browser = play.chromium.launch(executable_path=path, args=FLAGS)
+    made = Pages(tmp_path_factory.mktemp("live") / "out", browser)
+    yield made
+    browser.close()
+    made.close()
+  assert made.wrong == []
+
+
+def test_the_page_draws_an_organ(pages):
+  """The picture has the organ's red, the liver stays where it is; the card ends it."""
+  assert pages.page.input_value("#task") == "touch/easy"
+  pages.start()
+  shot = pages.picture()
+  assert "Touch the yellow point gently" in pages.page.inner_text("#instruction")
+  assert "Stopped before the end" in pages.stop()
+  red = (shot[..., 0] > 70) & (shot[..., 0] > 1.5 * shot[..., 1])
+  assert red.mean() > 0.1
+
+
+def test_too_much_force_and_a_lost_tip_are_seen_and_heard(pages):
+  """Each in a colour and with a tone of its own, and noted in the recording."""
+  page = pages.page
+  page.evaluate(WATCH)
+  for keys, kind, speed in (("d", "view", "1"), ("qs", "force", "0.1")):
+    pages.speed(speed)
+    pages.start()
+    page.focus("#view")
+    for key in keys:
+      page.keyboard.down(key)
+    pages.until(f"seen.has('{kind}') && seen.has('tone {kind}')", f"no warning of {kind}")
+    for key in keys:
+      page.keyboard.up(key)
+    pages.stop()
+  pages.speed("1")
+  kept = max(pages.folder.glob("*.npz"), key=lambda path: path.stat().st_mtime)
+  hints = Recording.load(kept).info["coach"]["hints"]
+  assert any(hint["kind"] == "warning" and "Too much force" in hint["text"] for hint in hints)
+
+
+def test_an_assessment_is_without_help(pages):
+  page = pages.page
+  page.check("#assessment")
+  pages.start()
+  page.mouse.move(*pages.middle())
+  page.mouse.wheel(0, -1000)
+  pages.until("window.palpate().head.time > 0.5", "no time")
+  assert not page.is_visible("#force") and not page.is_visible("#ghost")
+  assert page.inner_text("#warning") == "" and "no help" in page.inner_text("#instruction")
+  assert page.evaluate("document.getElementById('stage').dataset.warning") == ""
+  pages.stop()
+  page.uncheck("#assessment")
+
+
+def test_the_expert_is_drawn_on_request(pages):
+  page = pages.page
+  pages.start()
+  page.click("#pause")
+  before = pages.picture()
+  page.click("#ghost")
+  pages.until("window.palpate().ghost > 0", "no expert")
+  page.wait_for_timeout(300)
+  green = pages.picture() - before
+  assert ((green[..., 1] > 40) & (green[..., 1] > green[..., 0])).sum() > 100
+  pages.stop()
+
+
+def test_free_practice_on_the_page(pages):
+  """Everything is changed while it runs; the picture turns, moves, scales, shows the mesh."""
+  page = pages.page
+  page.click("#tab-practice")
+  page.select_option("#mesh", "16 x 16")
+  pages.start()
+  for name in ("force", "way", "rate"):
+    assert page.is_visible(f"#plot-{name}")
+  pages.until("window.palpate().head.time > 0.5", "no time")
+  assert pages.ink("rate") and "steps a second" in page.inner_text("#loop")
+  shots = [pages.picture()]
+  page.click("#wire")
+  for act in (
+    lambda: None,
+    lambda: (page.click("#free"), pages.drag(120, 40)),
+    lambda: pages.drag(80, 0, "right"),
+    lambda: page.mouse.wheel(0, 400),
+  ):
+    act()
+    page.wait_for_timeout(200)
+    shots.append(pages.picture())
+    assert np.abs(shots[-1] - shots[-2]).mean() > 1
+  page.click("#free")
+  page.click("#wire")
+  page.wait_for_timeout(200)
+  assert np.abs(pages.picture() - shots[0]).mean() < 1  # where it was
+  page.select_option("#scheme", "neumann")
+  page.select_option("#mesh", "32 x 32")
+  pages.until("window.palpate().scene.nodes === 1026", "no other mesh")
+  pages.until("window.palpate().head.steps > 0", "no steps")
+  assert page.input_value("#scheme") == "neumann"
+
+
+def test_keys_gamepad_and_buttons_move_the_tip(pages):
+  """In the free practice of the test before."""
+  page = pages.page
+  tip = "((h) => [h.tip_x, h.tip_y, h.tip_z])(window.palpate().head)"
+  page.focus("#view")
+  for on, off in (
+    (lambda: page.keyboard.down("w"), lambda: page.keyboard.up("w")),
+    (
+      lambda: page.evaluate("void (window.pads = [{axes: [0.9, 0, 0, 0], buttons: []}])"),
+      lambda: page.evaluate("void (window.pads = [])"),
+    ),
+    (
+      lambda: page.dispatch_event("[data-rate='2,1']", "pointerdown"),
+      lambda: page.dispatch_event("[data-rate='2,1']", "pointerup"),
+    ),
+  ):
+    before = np.array(page.evaluate(tip))
+    on()
+    for _ in range(int(10 * ANSWER)):
+      page.wait_for_timeout(100)
+      if np.linalg.norm(np.array(page.evaluate(tip)) - before) > 0.005:
+        break
+    off()
+    assert np.linalg.norm(np.array(page.evaluate(tip)) - before) > 0.005
+  page.click("#stop")
+  page.wait_for_selector("#start:enabled", timeout=1e3 * ANSWER)
+  page.click("#tab-exercise")
+
+
+def look(page, height, above):
+  """Returns the page's numbers, the way in the picture [m] to a place above the target, and the
+  size of a pixel [m]."""
+  state = page.evaluate(LOOK)
+  head, camera = state["head"], state["camera"]
+  tip, axes = [head[f"tip_{axis}"] for axis in "xyz"], np.array(camera["mat"]).reshape(3, 3)
+  depth = (np.array(camera["pos"]) - tip) @ axes[:, 2]
+  pixel = 2 * depth * np.tan(np.radians(camera["fovy"] / 2)) / height
+  return state, axes.T @ (np.array(state["targets"][0][:3]) + np.array([0, 0, above]) - tip), pixel
+
+
+@pytest.mark.slow
+def test_an_exercise_is_done_through_the_page(pages, tmp_path):
+  """A script touches the point with mouse and wheel, and sees its score."""
+  page = pages.page
+  pages.speed("0.1")
+  pages.start()
+  assert page.inner_text("#instruction") == "Touch the yellow point gently, 1 of 1"
+  box = page.locator("#view").bounding_box()
+  middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+  above = 0.01  # of the point, where the tip is taken [m]
+  for _ in range(400):
+    state, to, pixel = look(page, box["height"], above)
+    if state["ended"]:
+      break
+    force = state["head"]["force"]
+    if force > 0.3 or "Let go" in state["text"]:
+      above += 0.002
+    elif force < 0.05 and np.linalg.norm(to) < 0.0015:
+      above -= 0.001 if above > 0.003 else 0.0003
+    if np.linalg.norm(to[:2]) > 0.0005:
+      x, y = np.clip(0.6 * to[:2] / pixel, -40, 40)
+      page.mouse.move(*middle)
+      page.mouse.down()
+      page.mouse.move(middle[0] + x, middle[1] - y)
+      page.mouse.up()
+    page.mouse.wheel(0, float(np.clip(0.6 * to[2], -0.002, 0.002) / 2e-5))
+    for _ in range(100):  # until it is seen
+      page.wait_for_timeout(30)
+      if page.evaluate("window.palpate().head.time") > state["head"]["time"] + 0.03:
+        break
+
+  page.wait_for_selector("#card[open]", timeout=1e3 * ANSWER)
+  page.screenshot(path=str(tmp_path / "card.png"))
+  text = pages.stop()
+  assert "Success, after" in text and "Path length" in text
+  kept = max(pages.folder.glob("*.npz"), key=lambda path: path.stat().st_mtime)
+  assert Recording.load(kept).outcome == "success" and pathlib.Path(kept).parent == pages.folder
+  pages.speed("1")
+
+
+def test_a_program_that_ends_is_named_and_found_again(pages):
+  pages.close()
+  said = "document.getElementById('fault').textContent.includes('not to be reached')"
+  pages.until(said, "nothing said")
+  assert not pages.page.is_enabled("#start")
+  pages.serve(pages.server.port)
+  pages.page.wait_for_selector("#start:enabled", timeout=1e3 * ANSWER)
+  assert pages.page.inner_text("#fault") == ""
