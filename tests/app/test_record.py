@@ -375,6 +375,8 @@ def test_what_the_coach_said_and_errors(folder):
   assert (last.task, last.seed, last.outcome) == ("3", None, "not recorded")
   kept = keeping.Keeping(folder, "Ada").begin().keep(made(5))
   assert kept.said[0].startswith("Attempt 2 at touch/easy")  # an error is no attempt
+  kept = keeping.Keeping(folder, "Ada").begin().keep(made(5, task="press/own"))
+  assert "Attempt 1 at press/own, which has no limits" in kept.said[0]
 
 
 @pytest.mark.parametrize(

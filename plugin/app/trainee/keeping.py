@@ -178,7 +178,8 @@ class Sitting:
       with Record(folder, self.references) as record:
         who = record.find(trainee) if trainee else record.add(person)
         episode = record.keep(who, recording, self.session, self.references)
-        said = _progress(record.episodes(who), episode.task) if trainee else ()
+        judged = self.references(episode.task) is not None
+        said = _progress(record.episodes(who), episode.task, judged) if trainee else ()
         tell(record)
         return Kept(record.path(episode), "", said)
     except PendingError as error:
@@ -222,8 +223,8 @@ def read(args: argparse.Namespace, task: str = "", pages: bool = False) -> Keepi
   return keeping
 
 
-def _progress(episodes: Sequence[Any], task: str) -> tuple[str, ...]:
-  """Returns what the last episode, of a task, means for the person."""
+def _progress(episodes: Sequence[Any], task: str, judged: bool) -> tuple[str, ...]:
+  """Returns what the last episode, of a task that has limits or not, means for the person."""
   from palpate.tasks import curriculum
 
   from . import history
@@ -231,6 +232,8 @@ def _progress(episodes: Sequence[Any], task: str) -> tuple[str, ...]:
   passed: Mapping[str, Sequence[bool]] = history.passed(episodes)
   mine, met = passed.get(task, []), curriculum.done(passed)
   before = curriculum.done({**passed, task: mine[:-1]})
+  if not judged:
+    return (f"Attempt {len(mine)} at {task}, which has no limits; --references FILE gives some.",)
   said = f"Attempt {len(mine)} at {task}, {sum(mine)} of them proficient"
   if task not in met:
     return (f"{said}; {curriculum.left(mine)} more, if all are, meet the rule of proficiency.",)
