@@ -82,7 +82,9 @@ class Bonds:
     Args:
       amount: what is added to the damage of each, or of all [-]
     """
-    add = np.broadcast_to(np.asarray(amount, float), (len(self),))
+    add, count = np.asarray(amount, float), len(self)
+    if add.shape not in ((), (count,)):
+      raise ValueError(f"amount has shape {add.shape}, expected () or ({count},)")
     if not (add >= 0).all():
       raise ValueError(f"amount is {add.min()}, expected numbers >= 0")
     state, slot = self._space.bonds.state, self._all("slot").astype(int)

@@ -103,7 +103,7 @@ class Organ:
     """Returns the workspace of another organ, or the number of a body."""
     if isinstance(to, Organ):
       if to.data is not self.data or to._space is self._space:
-        raise ValueError(f"organ {self.name!r}: expected another organ of the same data to attach")
+        raise ValueError(f"organ {self.name!r}: expected another organ of the same data")
       return to._space
     return self._body(to)
 
@@ -111,8 +111,8 @@ class Organ:
     found = body
     if isinstance(body, str):
       found = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_BODY, body)
-    if not 0 <= int(found) < self.model.nbody:
-      raise ValueError(f"organ {self.name!r}: the model has no body {body!r} to attach to")
+    if not (isinstance(found, int | np.integer) and 0 <= found < self.model.nbody):
+      raise ValueError(f"organ {self.name!r}: the model has no body {body!r}")
     return int(found)
 
   def bond(

@@ -138,11 +138,11 @@ def check_vertices(w, vertices) -> np.ndarray:
   bad = vert[(vert != np.floor(vert)) | (vert < 0) | (vert >= count)]
   if bad.size or not vert.size:
     what = f"{bad[0]:g}" if bad.size else "none"
-    raise ValueError(f"organ {name!r}: attached vertices have {what}, expected in [0, {count})")
+    raise ValueError(f"organ {name!r}: vertices have {what}, expected in [0, {count})")
   vert = vert.astype(int)
   held = vert[~w.organ.free[vert]]
   if held.size:
-    raise ValueError(f"organ {name!r}: attached vertex {held[0]} is pinned, expected free ones")
+    raise ValueError(f"organ {name!r}: vertex {held[0]} is pinned, expected free ones")
   return vert
 
 

@@ -394,6 +394,14 @@ def test_what_cannot_be_bonded_is_named(make, arguments, message):
     organ.bond(*arguments)
 
 
+def test_what_cannot_weaken_is_named(make):
+  bonds = make(BED, bonds=f"bed {TEXT} near 0.004")[2].bonds
+  for amount, message in ((-1.0, "amount is -1"), (np.nan, "nan"), ([1, 2], "has shape ")):
+    with pytest.raises(ValueError, match=message):
+      bonds.weaken(amount)
+  assert not bonds.damage.any()
+
+
 def test_an_organ_without_the_key_has_no_room(make):
   organ = make()[2]
   with pytest.raises(ValueError, match="key bonds is not set"):
