@@ -221,8 +221,7 @@ def _refuse(task: str, kwargs: Mapping[str, Any]) -> None:
 def _refuse_task(task: Any) -> None:
   kind = type(task).__name__
   if kind not in DOMAINS:
-    have = ", ".join(name.lower() for name in DOMAINS)
-    raise ValueError(f"{task.name} is not vectorised yet, {have} are; {_ELSE}")
+    raise ValueError(f"{task.name} is not vectorised yet; {_ELSE}")
   if task.observed.pictures:
     raise ValueError(
       f"{task.name}: observations has {task.observed.pictures[0]!r}, but a vectorised exercise "

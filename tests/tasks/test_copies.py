@@ -22,11 +22,13 @@ def nodal_scene():
   return {"model": spec, "organ": "liver/liver"}
 
 
-@pytest.fixture(scope="module", params=["nodal", "windowed", "jaws"])
+@pytest.fixture(scope="module", params=["nodal", "windowed", "jaws", "bonds"])
 def pressing(request):
   """An environment whose tool presses on the organ, and the actions that follow."""
   if request.param == "jaws":
     env = tasks.load("grasp", "easy", task_kwargs={"random": 0})
+  elif request.param == "bonds":
+    env = tasks.load("dissect", "easy", task_kwargs={"random": 0})
   else:
     scene = nodal_scene() if request.param == "nodal" else {}
     env = tasks.load("touch", "easy", task_kwargs={"random": 0, "damage": 100.0, **scene})
