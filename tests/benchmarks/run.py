@@ -46,10 +46,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0 if words in (["-h"], ["--help"]) else 2
   importlib.import_module("palpate")  # before MuJoCo: it chooses how to draw without a screen
   from benchmarks import runner
+  from palpate.app.console import CommandError
 
   try:
     return runner.main(importlib.import_module(f"benchmarks.{words[0]}").BENCH, words[1:])
-  except BenchError as error:
+  except (BenchError, CommandError) as error:
     print(f"run.py: {error}", file=sys.stderr)
     return error.code
   except KeyboardInterrupt:
