@@ -34,6 +34,7 @@ COMMANDS = {
   ("report",): ("report", "write the page about a recording"),
   ("train",): ("train", "learn an exercise in many worlds at once"),
   ("evaluate",): ("evaluate", "score a policy over many episodes of an exercise"),
+  ("export",): ("export", "make a data set of demonstrations to learn from"),
   ("panel",): ("panel", "make the references of scores from many skilled performers"),
 }
 _GROUPS = {"run": "run a job on a scene"}
