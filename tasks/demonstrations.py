@@ -102,7 +102,8 @@ def perform(
     noise: SD of what is added to the instrument's motion; the actions that are kept are those
       that were meant, so that they show how to come back (DART: Laskey et al. 2017) [-]
   """
-  watched, random, meant = _Watched(env), np.random.RandomState(seed), []
+  watched: Any = _Watched(env)
+  random, meant = np.random.RandomState(seed), []
   moves = np.isin(watched.task.components, AXES)
 
   def shaken(timestep: Any) -> np.ndarray:
@@ -126,7 +127,7 @@ def repeat(env: control.Environment, recording: Recording) -> Demonstration:
   Raises:
     ValueError: it comes out otherwise than it was.
   """
-  watched = _Watched(env)
+  watched: Any = _Watched(env)
   again = episode.replay(recording, env=watched)
   if changed := episode.differences(recording, again):
     raise ValueError(f"the replay differs in {', '.join(changed)}")

@@ -191,15 +191,17 @@ def _recordings(names: Sequence[str]) -> tuple[str, dict[str, Any], list[tuple[s
   if not paths:
     raise ValueError(f"recordings: no .npz in {', '.join(names)}")
   infos = [Recording.load(path).info for path in paths]
-  task, kwargs = infos[0].get("task"), infos[0].get("task_kwargs")
   for path, info in zip(paths, infos, strict=True):
     if not isinstance(info.get("task_kwargs"), dict) or not isinstance(info.get("task"), str):
       raise ValueError(f"{path}: the recording is not one of an exercise")
-    if info["task"] != task or info["task_kwargs"].get("input") != kwargs.get("input"):
-      raise ValueError(f"{path} is of {info['task']}, by {info['task_kwargs'].get('input')}, the "
-                       f"first of {task}, by {kwargs.get('input')}: expected one kind")  # fmt: skip
-  own = [(str(path.absolute()), info["task_kwargs"]) for path, info in zip(paths, infos)]  # noqa: B905
-  return task, kwargs, own
+  kinds = [(info["task"], info["task_kwargs"].get("input", "drives")) for info in infos]
+  for path, (task, way) in zip(paths, kinds, strict=True):
+    if (task, way) != kinds[0]:
+      raise ValueError(f"{path} is of {task}, by {way}, expected {kinds[0][0]}, by {kinds[0][1]}, "
+                       "as in the first one")  # fmt: skip
+  own = [info["task_kwargs"] for info in infos]
+  names = [str(path.absolute()) for path in paths]
+  return kinds[0][0], own[0], list(zip(names, own, strict=True))
 
 
 def _jobs(

@@ -3,13 +3,15 @@
 import errno
 import json
 import os
+import pathlib
 import re
+import runpy
 import signal
 import sys
 
 import numpy as np
 import pytest
-from palpate.app import cli, console
+from palpate.app import cli, console, live
 from palpate.app import export as command
 from palpate.tasks import demonstrations, performer, suite
 from palpate.tasks.recording import Recording
@@ -199,6 +201,23 @@ def test_recordings_are_run_anew_and_one_that_differs_is_left_out(tmp_path, caps
   assert "of their own, expected none" in capsys.readouterr().err
 
 
+def test_what_a_hand_did_live_becomes_a_data_set(tmp_path, capsys):
+  kwargs = {"input": "handle", "observations": ["joints"], "time_limit": 0.2}
+  env = suite.load("touch", "easy", task_kwargs={"random": 0, **kwargs})
+  pace = live.Pace.instant(env.physics.timestep())
+  hand = live.Hand(lambda t: (0.01 * t, 0.0, 0.0))
+  old = live.Session(env, hand, 3, {"task_kwargs": kwargs}, pace=pace).run()
+  old.save("live.npz")
+  words = ["--recordings", "live.npz", "-o", "out", "--format", "robomimic", "--processes", "1"]
+  assert export(*words, "--failures") == 0
+  assert "not in it: a hand's path between two control steps" in capsys.readouterr().out
+  with h5py.File("out/demos.hdf5") as file:
+    demo = file["data/demo_0"]
+    np.testing.assert_array_equal(demo["actions"], old.arrays["action"][1:, -1])
+    np.testing.assert_array_equal(demo["obs/tip_pos"][1:], old.columns["tip_pos"][1:-1, 0])
+    assert demo["obs/surface"].shape[1:] == (32, 3)
+
+
 def test_episodes_without_success_are_left_out_or_marked(tmp_path, capsys):
   (tmp_path / "still.py").write_text(STILL)
   words = ["touch/easy", "-o", "out", "--performer", "still:act", "--set", "time_limit=0.1"]
@@ -219,6 +238,20 @@ def test_noise_shakes_what_is_done_and_keeps_what_was_meant():
   )
   assert (shaken.actions == 0.1).all() and shaken.info["noise"] == 0.3
   assert np.abs(shaken.observations["drive"][1:5] - calm.observations["drive"][1:5]).max() > 1e-4
+
+
+def test_the_page_clones_an_expert(tmp_path, capsys):
+  for name in ("sklearn", "safetensors"):
+    pytest.importorskip(name)
+  page = (pathlib.Path(__file__).parents[2] / "docs/datasets.md").read_text(encoding="utf-8")
+  words = re.search(r"^palpate (export touch/standard .*) --episodes 200 (.*)$", page, re.M)
+  text = next(t for t in re.findall(r"```python\n(.*?)```", page, re.S) if "MLPRegressor" in t)
+  assert cli.main([*words[1].split(), *words[2].split(), "--episodes", "1"]) == 0
+  (tmp_path / "clone.py").write_text(text.replace("max_iter=40", "max_iter=2"))
+  runpy.run_path("clone.py")
+  words = ["--episodes", "1", "--set", "time_limit=0.1"]
+  assert cli.main(["evaluate", "touch/standard", "--policy", "clone.safetensors", *words]) == 0
+  assert "time limit 1" in capsys.readouterr().out
 
 
 # What goes wrong.

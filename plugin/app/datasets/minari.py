@@ -63,7 +63,8 @@ def _buffer(demo: Demonstration) -> Any:
   from minari.data_collector.episode_buffer import EpisodeBuffer
 
   last = np.arange(len(demo)) == len(demo) - 1
-  return EpisodeBuffer(
+  new: Any = EpisodeBuffer  # whose lists may be arrays
+  return new(
     seed=demo.info["seed"],
     observations=demo.observations,
     actions=demo.actions,
