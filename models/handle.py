@@ -101,10 +101,7 @@ class Handle:
   def joints(self, trocar: ports.Trocar) -> np.ndarray:
     """Returns the pitch, yaw, roll [rad] and insertion [m] that it asks for  (4,)."""
     pitch, yaw, insertion = ports.inverse(trocar, self._pos, check=False)
-    w, x, y, z = Shaft(trocar).quat(self._pos.tolist())
-    a, b, c, d = self._quat.tolist()
-    turn = times((w, -x, -y, -z), (a, b, c, d))
-    roll = math.remainder(-2 * math.atan2(turn[3], turn[0]), 2 * math.pi)
+    roll = Shaft(trocar).roll(self._pos.tolist(), self._quat.tolist())
     return np.array([pitch, yaw, roll, insertion])
 
 
@@ -143,6 +140,13 @@ class Shaft:
     pitch, yaw = math.atan2(v, -w), math.atan2(u, math.sqrt(v * v + w * w))
     turn = times(_about(0, pitch), times(_about(1, -yaw), _about(2, -roll)))
     return times(self._quat, turn)
+
+  def roll(self, pos: Vector, quat: Vector) -> float:
+    """Returns the angle about the shaft of an orientation with the tip at a point [rad]."""
+    w, x, y, z = self.quat(pos)
+    a, b, c, d = quat
+    turn = times((w, -x, -y, -z), (a, b, c, d))
+    return math.remainder(-2 * math.atan2(turn[3], turn[0]), 2 * math.pi)
 
 
 def pose(trocar: ports.Trocar, pos: Vector, roll: float = 0.0) -> np.ndarray:

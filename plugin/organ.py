@@ -12,6 +12,8 @@ from palpate.tissue import energy, fill
 from palpate.tissue import mesh as topology
 from palpate.tissue.config import Config
 
+from .bonds import Bonds
+
 
 class Organ:
   """Positions, forces and measures of an organ, in world coordinates and SI units.
@@ -88,14 +90,16 @@ class Organ:
       ValueError: a vertex, the body or the stiffness is not allowed; the message says what is. A
         light body takes less stiffness: it feels springs a step late.
     """
-    model = self.model._address
+    model, target = self.model._address, self._target(to)
+    return Attachment(change.attach(self._space, model, vertices, target, stiffness), model)
+
+  def _target(self, to: str | int | Organ):
+    """Returns the workspace of another organ, or the number of a body."""
     if isinstance(to, Organ):
       if to.data is not self.data or to._space is self._space:
         raise ValueError(f"organ {self.name!r}: expected another organ of the same data to attach")
-      target: object = to._space
-    else:
-      target = self._body(to)
-    return Attachment(change.attach(self._space, model, vertices, target, stiffness), model)
+      return to._space
+    return self._body(to)
 
   def _body(self, body: str | int) -> int:
     found = body
@@ -104,6 +108,39 @@ class Organ:
     if not 0 <= int(found) < self.model.nbody:
       raise ValueError(f"organ {self.name!r}: the model has no body {body!r} to attach to")
     return int(found)
+
+  def bond(
+    self,
+    to: str | int | Organ,
+    stiffness: float,
+    strength: float,
+    energy: float,
+    near: float | None = None,
+    vertices: npt.ArrayLike | None = None,
+  ):
+    """Bonds vertices to a body or another organ, where they are now: springs that break.
+
+    Room for their damage is in the plugin state where the key `bonds` is set, be it to `none`. They
+    hold until the data is reset; a copy of the data has them too.
+
+    Args:
+      to: name or number of a body, or another organ of the same data, to whose surface they lead
+      stiffness: by area [N/m^3]
+      strength: traction at which a bond begins to soften [Pa]
+      energy: that it takes to free an area [J/m^2]
+      near: distance from the body's geoms, or the organ, within which vertices are bonded [m]
+      vertices: or their numbers
+
+    Raises:
+      ValueError: a vertex, the body or a number is not allowed; the message says what is.
+    """
+    law, target = (stiffness, strength, energy), self._target(to)
+    change.bond(self._space, self.model._address, target, str(to), law, near, vertices)
+
+  @property
+  def bonds(self) -> Bonds:
+    """What it has grown on to: how much is free, damage, energy, forces."""
+    return Bonds(self._space)
 
   def detach(self):
     """Takes away what `attach` has made; what the model declares stays."""
@@ -259,7 +296,9 @@ class Organ:
     workspace.sync(self._space)
 
   def reset(self):
-    """Puts the organ at rest; the rest of the model stays as it is."""
+    """Puts the organ at rest, its bonds whole; the rest of the model stays as it is."""
+    if self._organ.config.bonded:
+      self._space.bonds.state[:] = 0.0
     self.set_state(self.xpos0, np.zeros((self.nvert, 3)))
 
   def _checked(self, what: str, values: np.ndarray) -> np.ndarray:

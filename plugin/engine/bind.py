@@ -85,7 +85,7 @@ def bind(w, model: int):
 
 
 def _bind_more(w, model: int):
-  for each in (w.ties, w.rests, w.creep):
+  for each in w.beside:
     each.load()
     each.bind(model)
 
@@ -94,19 +94,19 @@ def _enter(w, does):
   does.enter()
   if w.hold:
     w.hold.clear()
-  for each in (w.ties, w.rests, w.creep):
+  for each in w.beside:
     each.enter()
 
 
 def _scatter(w, does):
   does.scatter()
-  w.ties.act()
-  w.rests.act()
+  for each in w.beside:
+    each.act()
 
 
 def _advance(w, does, ends: bool):
-  w.creep.end()
-  w.rests.end()
+  for each in w.beside:
+    each.end()
   if ends:
     does.end()
   does.advance()

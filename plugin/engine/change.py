@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Any
 
 from palpate.tissue import config as configuration
-from palpate.tissue import shape
+from palpate.tissue import reading, shape
 from palpate.tissue.config import Config
 from palpate.tissue.step import SCHEMES
 
-from . import fasten, graphs, mjstruct, windowed, workspace
+from . import adhere, bonds, fasten, graphs, mjstruct, windowed, workspace
 from .bind import bind
 from .ties import Group
 
@@ -40,6 +41,9 @@ def copy(w, model: int, other, twin):
     return
   if not w.chosen and w.config != other.config:
     _change(w, model, other.config)
+  w.bonds.let_go()
+  for group in [g for g in other.bonds.groups if not g.declared]:
+    _put(w, dataclasses.replace(group, other=group.other and twin(group.other)))
   if w.ties.groups or other.ties.groups:
     groups = [dataclasses.replace(g, other=g.other and twin(g.other)) for g in other.ties.groups]
     tie(w, model, groups)
@@ -93,6 +97,50 @@ def tie(w, model: int, groups: list[Group]):
     windowed.wake(w)
 
 
+def bond(w, model: int, to, name: str, law, near: float | None, vertices):
+  """Bonds an organ to a body or another organ, where its vertices are.
+
+  Args:
+    w: the workspace of the organ
+    model: address of the mjModel
+    to: number of the body, or workspace of the other organ
+    name: what messages call it
+    law: stiffness, strength and energy, see `reading.Law`
+    near: distance within which vertices are bonded [m], or None for those in `vertices`
+    vertices: numbers of vertices, or None
+
+  Raises:
+    ValueError: a vertex or a number is not allowed, or the model has no room for bonds.
+  """
+  organ = w.organ.name
+  if not w.config.bonded:
+    raise ValueError(f"organ {organ!r}: the key bonds is not set, expected 'none' or more to bond")
+  if (near is None) == (vertices is None):
+    raise ValueError(f"organ {organ!r}: expected either near or vertices to bond")
+  if near is not None and not (math.isfinite(near) and near > 0):
+    raise ValueError(f"organ {organ!r}: near is {near}, expected a number > 0 [m]")
+  try:
+    how = reading.law(*law), near or 0.0, vertices
+  except ValueError as error:
+    raise ValueError(f"organ {organ!r}: a bond {error}") from None
+  for each in [w] if isinstance(to, int) else [w, to]:
+    workspace.attach(each, model)
+  if isinstance(to, int):
+    group = adhere.to_body(w, to, name, *how)
+  else:
+    group = adhere.to_organ(w, to, *how)
+  _put(w, group)
+
+
+def _put(w, group: bonds.Group):
+  w.bonds.put(group)
+  for each in [w] if group.other is None else [w, group.other]:
+    with graphs.lock:
+      bind(each, each.model)
+    if each.turn is not None:
+      windowed.wake(each)
+
+
 def _change(w, model: int, config: Config):
   workspace.attach(w, model)
   before, w.config = w.config, config
@@ -115,5 +163,3 @@ def _change(w, model: int, config: Config):
     tie(w, model, [*fasten.carried(w), *(g for g in w.ties.groups if g.by != "carrier")])
   if w.turn is not None:
     windowed.wake(w)
-
-

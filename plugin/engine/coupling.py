@@ -191,6 +191,7 @@ def sizes(organ) -> dict[str, int]:
   """Returns what the blocks of an organ's plugin state need."""
   relaxes = organ.config.relax_share > 0
   out = {"ncreep": int(organ.free.sum()) if relaxes else 0}
+  out["nbond"] = int(organ.free[: organ.mesh.nouter].sum()) if organ.config.bonded else 0
   if organ.windows is None:
     return out | {"nfree": organ.nfree}
   win = organ.windows

@@ -10,6 +10,7 @@ from palpate.tissue.config import Config
 from palpate.tissue.types import doubles, fill, floats, ints, scalar, struct, vector
 
 from . import coupling
+from .hold import Beside
 from .layout import FLAG, TAIL
 
 
@@ -45,7 +46,7 @@ class Creeping:
 _enter, _end = coupling.kernels("creep.h", Creeping, "enter_creep", "end_creep")
 
 
-class Creep:
+class Creep(Beside):
   """Stress relaxation of a workspace's organ.
 
   Args:
@@ -53,7 +54,7 @@ class Creep:
   """
 
   def __init__(self, w):
-    self._w = w
+    super().__init__(w)
     self._number = wp.zeros(2, dtype=wp.float64, device="cpu")
     self._creeping: Any = None
     self.renumber(w.config)
@@ -66,12 +67,12 @@ class Creep:
     self._number.numpy()[:] = config.relax_share, config.relax_time
 
   def load(self):
-    """Loads the kernels, if there is something to do for them."""
+    """See `Beside`."""
     if self:
       _enter.load(wp.get_device("cpu"))
 
   def bind(self, model: int):
-    """Points the kernels at the arrays of a model and of the workspace's mjData."""
+    """See `Beside`."""
     if not self:
       return
     w, organ = self._w, self._w.organ
@@ -97,11 +98,11 @@ class Creep:
     self._creeping = fill(Creeping, "cpu", values | {name: w.host[name] for name in names})
 
   def enter(self):
-    """Adds to the solver's input, after a coupling has filled it."""
+    """See `Beside`."""
     if self:
       _enter.launch("cpu", 1, 1, 0, self._creeping)
 
   def end(self):
-    """Takes what the step has made of the forces."""
+    """See `Beside`."""
     if self:
       _end.launch("cpu", 1, 1, 0, self._creeping)

@@ -321,9 +321,7 @@ def find_turn(m, name: str, body: np.ndarray) -> np.ndarray:
   quats = mjstruct.view(m.body_quat, (m.nbody, 4))[body]
   if np.abs(quats - quats[0]).max() > 1e-9:
     raise ValueError(f"organ {name!r}: its vertices' bodies are rotated, expected all alike")
-  turn = np.zeros(9)
-  mujoco.mju_quat2Mat(turn, quats[0].copy())
-  return turn.reshape(3, 3)
+  return flexes.matrix(quats[0])
 
 
 def static_frame(m, name: str, parent: int) -> tuple[np.ndarray, np.ndarray]:

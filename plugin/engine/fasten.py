@@ -25,7 +25,7 @@ def declare(w):
   flex_names = [flexes.name(m, f) for f in range(m.nflex)]
   for name, stiffness, vertices in w.config.attach:
     if flexes.resolve(name, w.organ.name, flex_names) is None:
-      body = _find_body(w, m, "attach", name)
+      body = find_body(w, m, "attach", name)
       made.append(to_body(w, check_vertices(w, vertices), body, stiffness, now=False))
   w.ties.put(made)
 
@@ -67,13 +67,13 @@ def to_body(w, vert: np.ndarray, body: int, stiffness: float | None, now: bool =
     ValueError: vertices or stiffness are not allowed.
   """
   m, d = mjstruct.Model.from_address(w.model), mjstruct.Data.from_address(w.data)
-  each = _stiffness(w, vert, stiffness, _most(w, m, body))
+  each = _stiffness(w, vert, stiffness, most(w, m, body))
   if now:
     at = motion(w, vert)[0]
     turn = mjstruct.view(d.xmat, (m.nbody, 3, 3))[body]
     origin = mjstruct.view(d.xpos, (m.nbody, 3))[body]
   else:
-    at = _rest(w, vert)
+    at = at_rest(w, vert)
     turn, origin = flexes.body_frame(m, body)
   return Group(vert, body, each, (at - origin) @ turn, by="" if now else "attach")
 
@@ -84,7 +84,7 @@ def to_organ(w, vert: np.ndarray, other, stiffness: float | None, now: bool = Tr
   They keep the distances that there are, now or at rest. Arguments as for `to_body`.
   """
   outer = np.flatnonzero(other.organ.free[: other.organ.mesh.nouter])
-  place = (lambda space, which: motion(space, which)[0]) if now else _rest
+  place = (lambda space, which: motion(space, which)[0]) if now else at_rest
   mine, theirs = place(w, vert), place(other, outer)
   pair = outer[KDTree(theirs).query(mine)[1]]
   gap = mine - place(other, pair)
@@ -104,7 +104,7 @@ def carried(w) -> list[Group]:
   mesh = organ.mesh
   area = topology.vertex_areas(mesh.rest, mesh.elem)
   m = mjstruct.Model.from_address(w.model)
-  body = TO_OWN_MOTION if name == OWN else _find_body(w, m, "carrier", name)
+  body = TO_OWN_MOTION if name == OWN else find_body(w, m, "carrier", name)
   pins = np.array(sorted(w.config.pin), int)
   stiffness = w.config.foundation * area
   stiffness[pins] = _firm(w)[pins]
@@ -114,11 +114,11 @@ def carried(w) -> list[Group]:
   anchor = np.zeros((len(vert), 3))
   if body >= 0:
     turn, origin = flexes.body_frame(m, body)
-    anchor = (_rest(w, vert) - origin) @ turn
+    anchor = (at_rest(w, vert) - origin) @ turn
   return [Group(vert, body, stiffness[vert], anchor, by="carrier")]
 
 
-def _find_body(w, m, key: str, name: str) -> int:
+def find_body(w, m, key: str, name: str) -> int:
   """Returns the body that an organ's configuration names, by its own name or with its prefix."""
   names = [mjstruct.name_of(m, m.name_bodyadr, b) for b in range(m.nbody)]
   found = flexes.resolve(name, w.organ.name, names)
@@ -146,7 +146,8 @@ def check_vertices(w, vertices) -> np.ndarray:
   return vert
 
 
-def _rest(w, vert: np.ndarray) -> np.ndarray:
+def at_rest(w, vert: np.ndarray) -> np.ndarray:
+  """Returns where vertices are in the world at rest [m], (n, 3)."""
   return w.organ.origin + w.organ.mesh.rest[vert] @ w.organ.frame.T
 
 
@@ -162,7 +163,7 @@ def _firm(w) -> np.ndarray:
   return _FIRM * inertia.masses(m, w.organ) / _gain(w)
 
 
-def _most(w, m, body: int) -> float:
+def most(w, m, body: int) -> float:
   """Returns the most that springs to a body may have together [N/m]."""
   if is_mocap(m, body) or not mjstruct.view(m.body_weldid, m.nbody, np.int32)[body]:
     return np.inf

@@ -60,12 +60,17 @@ def body_frame(m, body: int) -> tuple[np.ndarray, np.ndarray]:
   quat = mjstruct.view(m.body_quat, (m.nbody, 4))
   pos = mjstruct.view(m.body_pos, (m.nbody, 3))
   while body > 0:
-    own = np.zeros(9)
-    mujoco.mju_quat2Mat(own, quat[body].copy())
-    own = own.reshape(3, 3)
+    own = matrix(quat[body])
     rotation, position = own @ rotation, pos[body] + own @ position
     body = int(parentid[body])
   return rotation, position
+
+
+def matrix(quat: np.ndarray) -> np.ndarray:
+  """Returns the rotation of a quaternion, (3, 3)."""
+  out = np.zeros(9)
+  mujoco.mju_quat2Mat(out, quat.copy())
+  return out.reshape(3, 3)
 
 
 def resolve(name: str, organ: str, names: list[str]) -> str | None:

@@ -1,13 +1,18 @@
-"""Springs that hold an organ's nodes beside what the tissue does, and the bodies that feel them."""
+"""What acts on an organ beside its tissue: springs that hold its nodes, and what feels them.
+
+`Beside` is what ties, bonds, supports and relaxation are to a step. All of them run on the CPU,
+over an organ's `Nodes` and its solver's `Input`, and cost nothing where they are not used.
+"""
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
 import numpy as np
 import warp as wp
 from palpate.tissue import body as bodies
-from palpate.tissue.types import doubles, ints, struct
+from palpate.tissue.types import doubles, fill, floats, ints, struct, vector
 
 from . import mjstruct
+from .layout import TAIL
 
 
 @struct
@@ -25,6 +30,7 @@ class Bodies:
   geom_size: doubles("ngeom", 3)
   geom_aabb: doubles("ngeom", 6)
   qpos: doubles("nq")
+  qvel: doubles("nv")
   xpos: doubles("nbody", 3)
   xmat: doubles("nbody", 9)
   cvel: doubles("nbody", 6)
@@ -34,6 +40,86 @@ class Bodies:
   geom_xpos: doubles("ngeom", 3)
   geom_xmat: doubles("ngeom", 9)
   qfrc_passive: doubles("nv")
+
+
+@struct
+class Nodes:
+  """Where an organ's vertices are: in MuJoCo's memory, or with windows in the plugin state."""
+
+  windowed: int  # whether it is in the plugin state
+  rest: doubles("nvert", 3)  # rest position [m]
+  disp: doubles("nvert", 3)  # displacement, of an organ with windows [m]
+  vel: doubles("nvert", 3)  # velocity, of one with windows [m/s]
+  qposadr: ints("nvert")  # first qpos, of one without; -1 for pinned ones
+  dofadr: ints("nvert")  # first dof
+  frame: doubles(3, 3)  # rotation from the organ's axes to the world
+  origin: doubles(3)  # position of its frame [m]
+
+
+@struct
+class Input:
+  """What an organ's solver is given, and what it finds."""
+
+  node: ints("nvert")  # node of each vertex
+  tail: doubles(len(TAIL))  # see TAIL
+  hold: floats("nworld", "nholdslice", 6, 8)
+  force_ext: vector
+  vel: vector
+  dvel: vector
+  status: floats("nworld", 4)
+
+
+class Beside:
+  """What acts on a workspace's organ beside its tissue; by itself nothing.
+
+  Args:
+    w: the workspace
+  """
+
+  def __init__(self, w):
+    self._w = w
+
+  def load(self):
+    """Loads the kernels, if there is something to do for them."""
+
+  def bind(self, model: int):
+    """Points the kernels at the arrays of a model and of the workspace's mjData."""
+
+  def enter(self):
+    """Adds to the solver's input, after a coupling has filled it."""
+
+  def act(self):
+    """Lets bodies feel what has acted."""
+
+  def end(self):
+    """Takes into the plugin state what the step has made of it."""
+
+
+def nodes(w):
+  """Returns `Nodes` of a workspace."""
+  organ = w.organ
+  windowed = organ.windows is not None
+  motion = w.boxes["own"].motion if windowed else None
+  none = np.zeros((0, 3))
+  values = dict(
+    windowed=int(windowed),
+    rest=organ.mesh.rest,
+    disp=motion.disp if motion else none,
+    vel=motion.vel if motion else none,
+    qposadr=organ.qposadr,
+    dofadr=organ.dofadr,
+    frame=organ.frame,
+    origin=organ.origin,
+  )
+  return fill(Nodes, "cpu", values)
+
+
+def solver(w):
+  """Returns `Input` of a workspace."""
+  values = {name: w.host[name] for name in ("force_ext", "vel", "dvel", "status")}
+  tail = w.boxes["own"].tail if w.organ.windows else np.zeros(len(TAIL))
+  node = w.body.shape.node.numpy()
+  return fill(Input, "cpu", values | {"node": node, "tail": tail, "hold": w.hold.array})
 
 
 class Hold:

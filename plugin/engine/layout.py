@@ -149,6 +149,13 @@ RECORD = Numbers(
 # Of the plugin state of a windowed organ: where a geom was when the organ fell asleep, as in GEOM.
 POSE = Numbers("POSE", ("pos", 3, "m", "centre"), ("axis", 9, "-", "its three axes"))
 
+# Of the plugin state: the bond of a vertex.
+BOND = Numbers(
+  "BOND",
+  ("damage", 1, "-", "0 whole, 1 free"),
+  ("released", 1, "J", "what damage has taken of its energy"),
+)
+
 # The last numbers of the plugin state of a windowed organ.
 TAIL = Numbers(
   "TAIL",
@@ -161,7 +168,7 @@ TAIL = Numbers(
   ("leeway", 1, "m", "how far a tool may go from where it was when the organ fell asleep"),
 )
 
-TABLES = (FLAG, STAGE, MODE, HEAD, MOVED, PUSHED, GEOM, SUMMARY, ANSWER, RECORD, POSE, TAIL)
+TABLES = (FLAG, STAGE, MODE, HEAD, MOVED, PUSHED, GEOM, SUMMARY, ANSWER, RECORD, POSE, BOND, TAIL)
 CONSTANTS = {
   "MAX_WINDOWS": MAX_WINDOWS,
   "MAX_GEOMS": MAX_GEOMS,
@@ -177,6 +184,7 @@ class NodalState:
   last: doubles("nfree")  # last change of the velocity [m/s]
   before: doubles("nfree")  # the one before it [m/s]
   creep: doubles("ncreep", 6)  # see `creep`
+  bond: doubles("nbond", len(BOND))  # of each vertex that moves, see BOND
   heavier: doubles(1)  # how many times its inertia at rest a tool meets; 0 for once [-]
   signature: doubles(1)  # of the organ, see `Declaration`; 0 where it was set by hand [-]
 
@@ -198,6 +206,7 @@ class WindowState:
   motion: Motion
   force: doubles("nslot", 3)  # contact force of the last step on each slot [N]
   creep: doubles("ncreep", 6)  # see `creep`
+  bond: doubles("nbond", len(BOND))  # of each vertex that moves, see BOND
   slip: doubles("nrest", 3)  # how far nodes have slipped on what they rest on [m]
   slot: doubles("nslot")  # node + 1; 0: the slot's default node, -1: not used
   pose: doubles("ngeom", len(POSE))  # where the windows' geoms were, see POSE

@@ -39,7 +39,7 @@ class Nodal:
       data.qpos[self._qpos] = model.qpos0[self._qpos] + u[self._moving]
     if v is not None:
       data.qvel[self._dofs] = v[self._moving]
-    self._w.plugin_state[:] = 0
+    _forget(self._w)
 
   def _spread(self, values: np.ndarray) -> np.ndarray:
     out = np.zeros((len(self._w.organ.free), 3))
@@ -77,7 +77,7 @@ class Windowed:
     for old, values in zip(new, (u, v), strict=True):
       if values is not None:
         old[free] = values[free]
-    w.plugin_state[:] = 0
+    _forget(w)
     self._own("disp")[:], self._own("vel")[:] = new
     workspace.place(w, model._address)
 
@@ -85,6 +85,14 @@ class Windowed:
     """Returns a vector of the motion in the plugin state."""
     workspace.sync(self._w)
     return getattr(self._w.boxes["own"].motion, name).numpy()
+
+
+def _forget(w: Workspace):
+  """Clears the plugin state, but for what has come apart."""
+  kept = w.bonds.state.copy() if w.config.bonded else None
+  w.plugin_state[:] = 0
+  if kept is not None:
+    w.bonds.state[:] = kept
 
 
 def of(w: Workspace) -> Nodal | Windowed:

@@ -38,9 +38,9 @@ gather, scatter, push, remember = coupling.kernels(
 )
 
 
-def state_size(nfree: int, ncreep: int = 0) -> int:
+def state_size(nfree: int, ncreep: int = 0, nbond: int = 0) -> int:
   """Returns the length of the plugin state of `nfree` degrees of freedom; see `coupling.sizes`."""
-  return layout.size(NodalState, {"nfree": nfree, "ncreep": ncreep})
+  return layout.size(NodalState, {"nfree": nfree, "ncreep": ncreep, "nbond": nbond})
 
 
 class Phases(coupling.Phases):

@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 from palpate.tissue.config import KEYS
 
-from . import change, fasten, guard, mjstruct, rests, weights, windowed, workspace
+from . import adhere, change, fasten, guard, mjstruct, rests, weights, windowed, workspace
 from .layout import FLAG, STAGE
 from .mjstruct import NAME, warn
 from .workspace import Workspace
@@ -112,7 +112,8 @@ def _init(model: int, data: int, instance: int) -> int:
     w = workspace.make(model, data, instance)
     _workspaces[data, instance] = _states[w.plugin_state.ctypes.data] = w
     mine = [each for (of, _), each in _workspaces.items() if of == data]
-    for each in (*fasten.declare_between(mine), *rests.meet(mine)):
+    changed = fasten.declare_between(mine) + adhere.declare_between(mine) + rests.meet(mine)
+    for each in {id(each): each for each in changed}.values():
       workspace.rebind(each)
     return 0
   except BaseException as error:
@@ -147,6 +148,7 @@ def _reset(model: int, state: int, unused: int | None, instance: int):
   if w is not None:
     w.forget()
     w.ties.put([group for group in w.ties.groups if group.by])
+    w.bonds.let_go()
     w.nbad = 0
   return guard.leave()
 

@@ -7,11 +7,10 @@ from typing import Any
 import numpy as np
 import warp as wp
 from palpate.tissue import mesh as topology
-from palpate.tissue.types import doubles, fill, floats, ints, struct, vector
+from palpate.tissue.types import doubles, fill, ints, struct
 
 from . import coupling, flexes, mjstruct
-from .hold import Bodies, may_move
-from .layout import TAIL
+from .hold import Beside, Bodies, Input, Nodes, may_move, nodes, solver
 
 # Stiffness of the springs, by area, in Young's moduli an edge: an organ of that size sinks in by a
 # hundredth of what its own weight makes of it.
@@ -20,39 +19,18 @@ _CELLS = 1024  # as in the header
 
 
 @struct
-class Resting:
-  """An organ's nodes as those that rest on something see them."""
-
-  nouter: int  # vertices on the surface
-  rest: doubles("nvert", 3)  # rest position [m]
-  disp: doubles("nvert", 3)  # displacement [m]
-  vel: doubles("nvert", 3)  # velocity [m/s]
-  frame: doubles(3, 3)  # rotation from the organ's axes to the world
-  origin: doubles(3)  # position of its frame [m]
-
-
-@struct
-class Pushed:
-  """What an organ's solver is given."""
-
-  node: ints("nvert")  # node of each vertex
-  tail: doubles(len(TAIL))  # see TAIL
-  hold: floats("nworld", "nholdslice", 6, 8)
-  force_ext: vector
-  dvel: vector
-
-
-@struct
 class Rest:
   """An organ that rests on geoms, and on one other organ."""
 
   ngeom: int  # geoms that it rests on
+  nouter: int  # vertices on the surface
+  nother: int  # vertices on that of the other organ
   restless: int  # whether what it rests on may move while it sleeps
   skin: wp.float64  # distance from which it is borne [m]
   cell: wp.float64  # length of a cell; farther apart no nodes meet [m]
   mu: wp.float64  # friction with the other organ
-  own: Resting
-  solve: Pushed
+  own: Nodes
+  solve: Input
   geom: ints("ngeom")  # geoms
   friction: doubles("ngeom")  # friction with each
   free: ints("nvert")  # whether a node moves
@@ -64,8 +42,8 @@ class Rest:
   hardness: doubles("nouter", 6)  # what its spring weighs on the change of its velocity [kg]
   corner: ints("nouter", 3)  # nodes of the other organ that bear it
   weight: doubles("nouter", 3)  # their shares
-  other: Resting
-  below: Pushed
+  other: Nodes
+  below: Input
   elem: ints("nelem", 3)  # triangles of the other organ
   near_adr: ints("nvert + 1")  # first of a node's triangles in `near`
   near: ints("nnear")  # triangles of its nodes
@@ -80,7 +58,7 @@ _find_geoms, _find_organ, _press, _act, _bear, _keep = coupling.kernels(
 )
 
 
-class Rests:
+class Rests(Beside):
   """What a workspace's organ rests on, and what rests on it.
 
   Args:
@@ -88,7 +66,7 @@ class Rests:
   """
 
   def __init__(self, w):
-    self._w = w
+    super().__init__(w)
     self.below: list = []  # workspaces of organs that it rests on
     self.above: list = []  # of organs that rest on it
     self._arrays: dict[str, Any] = {}
@@ -104,12 +82,12 @@ class Rests:
     return bool(self) or bool(self.above)
 
   def load(self):
-    """Loads the kernels, if there is something to do for them."""
+    """See `Beside`."""
     if self.any:
       _press.load(wp.get_device("cpu"))
 
   def bind(self, model: int):
-    """Points the kernels at the arrays of a model and of the workspace's mjData."""
+    """See `Beside`."""
     if self.any:
       self._w.hold.need()
     if not self:
@@ -129,11 +107,12 @@ class Rests:
       self._arrays |= {"corner": wp.zeros((n, 3), dtype=int, device="cpu")}
     common = self._arrays | dict(
       ngeom=len(geoms),
+      nouter=n,
       restless=int(bool(self.below) or may_move(m, _body(m, geoms))),
       skin=float(mjstruct.view(m.flex_radius, m.nflex)[flex]),
       cell=2.0 * float(edge.max()),
-      own=_resting(w),
-      solve=_pushed(w),
+      own=nodes(w),
+      solve=solver(w),
       geom=geoms,
       friction=np.maximum(mjstruct.view(m.geom_friction, (m.ngeom, 3))[geoms, 0], _mu(m, flex)),
       free=organ.free,
@@ -141,7 +120,7 @@ class Rests:
       slip=w.boxes["own"].slip,
       mj=coupling.mujoco_arrays(model, w.data, Bodies),
     )
-    self._alone = fill(Rest, "cpu", common | _nothing() | {"other": Resting(), "below": Pushed()})
+    self._alone = fill(Rest, "cpu", common | _nothing() | {"other": Nodes(), "below": Input()})
     self._on = [fill(Rest, "cpu", common | self._other(m, other)) for other in self.below]
 
   def _geoms(self, m) -> np.ndarray:
@@ -156,8 +135,9 @@ class Rests:
     count = np.bincount(mesh.elem.ravel(), minlength=mesh.nouter)
     return dict(
       mu=max(_mu(m, mine), _mu(m, theirs)),
-      other=_resting(other),
-      below=_pushed(other),
+      nother=mesh.nouter,
+      other=nodes(other),
+      below=solver(other),
       elem=mesh.elem,
       near_adr=np.concatenate([[0], np.cumsum(count)]),
       near=np.argsort(mesh.elem.ravel(), kind="stable") // 3,
@@ -173,7 +153,7 @@ class Rests:
       _launch(_find_organ, each, k)
 
   def enter(self):
-    """Adds to the solver's input, after a coupling has filled it."""
+    """See `Beside`."""
     if self:
       self.find()
       _launch(_press, self._alone)
@@ -250,20 +230,7 @@ def _mu(m, flex: int) -> float:
   return float(mjstruct.view(m.flex_friction, (m.nflex, 3))[flex, 0])
 
 
-def _resting(w):
-  motion, mesh = w.boxes["own"].motion, w.organ.mesh
-  values = dict(nouter=mesh.nouter, rest=mesh.rest, disp=motion.disp, vel=motion.vel)
-  return fill(Resting, "cpu", values | {"frame": w.organ.frame, "origin": w.organ.origin})
-
-
-def _pushed(w):
-  values = {name: w.host[name] for name in ("force_ext", "dvel")}
-  node = w.body.shape.node.numpy()
-  more = {"node": node, "tail": w.boxes["own"].tail, "hold": w.hold.array}
-  return fill(Pushed, "cpu", values | more)
-
-
 def _nothing() -> dict[str, Any]:
   """Returns the fields of no other organ."""
   none = {"elem": (0, 3), "near_adr": 1, "near": 0, "where": (0, 3), "next": 0, "first": _CELLS}
-  return {name: np.zeros(shape) for name, shape in none.items()} | {"mu": 0.0}
+  return {name: np.zeros(shape) for name, shape in none.items()} | {"mu": 0.0, "nother": 0}

@@ -13,11 +13,10 @@ from typing import Any
 import numpy as np
 import warp as wp
 from palpate.tissue.step import SCHEMES
-from palpate.tissue.types import DIMS, doubles, fill, floats, ints, struct, vector
+from palpate.tissue.types import DIMS, doubles, fill, ints, struct, vector
 
 from . import coupling, mjstruct
-from .hold import Bodies, may_move
-from .layout import TAIL
+from .hold import Beside, Bodies, Input, Nodes, may_move, nodes, solver
 
 TO_POINT, TO_OWN_MOTION = -1, -2  # in place of a body
 _LEAST = 64  # ties that there is room for at once
@@ -29,7 +28,6 @@ _LEADS = 0.5
 class Tied:
   """The ties of an organ, those to one body in a row."""
 
-  windowed: int  # whether the motion is in the plugin state
   ahead: wp.float64  # share of the step's way at which its scheme takes forces
   gain: wp.float64  # how much of a step's stiffness its scheme has on dv
   count: ints(1)  # number of ties
@@ -42,20 +40,10 @@ class Tied:
   anchor: doubles("ntie", 3)  # the point in its body's frame [m]
   point: doubles("ntie", 6)  # place and velocity of another point, in the world [m, m/s]
   force: doubles("ntie", 3)  # on the node, in the organ's frame [N]
-  node: ints("nvert")  # node of each vertex
-  rest: doubles("nvert", 3)  # rest position [m]
-  disp: doubles("nvert", 3)  # displacement, of an organ with windows [m]
-  qposadr: ints("nvert")  # first qpos, of one without
-  frame: doubles(3, 3)  # rotation from the organ's axes to the world
-  origin: doubles(3)  # position of its frame [m]
+  own: Nodes
+  solve: Input
   number: doubles("nnumber")  # see `NUMBERS`
-  tail: doubles(len(TAIL))  # see TAIL
-  hold: floats("nworld", "nholdslice", 6, 8)
-  force_ext: vector
-  vel: vector
-  dvel: vector
   dvel_warm: vector
-  status: floats("nworld", 4)
   mj: Bodies
 
 
@@ -87,7 +75,7 @@ class Group:
   by: str = ""
 
 
-class Ties:
+class Ties(Beside):
   """The ties of a workspace's organ, none at first.
 
   Args:
@@ -95,7 +83,7 @@ class Ties:
   """
 
   def __init__(self, w):
-    self._w = w
+    super().__init__(w)
     self.groups: list[Group] = []
     self._room = 0
     self._arrays: dict[str, wp.array] = {}
@@ -140,34 +128,25 @@ class Ties:
     return body < 0 or may_move(mjstruct.Model.from_address(self._w.model), body)
 
   def load(self):
-    """Loads the kernels, if there is something to do for them."""
+    """See `Beside`."""
     if self:
       _enter.load(wp.get_device("cpu"))
 
   def bind(self, model: int):
-    """Points the kernels at the arrays of a model and of the workspace's mjData."""
+    """See `Beside`."""
     if not self:
       return
-    w, organ = self._w, self._w.organ
+    w = self._w
     scheme = SCHEMES[w.config.integrator]
-    windowed = organ.windows is not None
-    own = w.boxes["own"] if windowed else None
     values = self._arrays | dict(
-      windowed=int(windowed),
       ahead=float(scheme.ahead),
       gain=scheme.gain(1.0, 0.0),
-      node=w.body.shape.node.numpy(),
-      rest=organ.mesh.rest,
-      disp=own.motion.disp if own else np.zeros((0, 3)),
-      qposadr=organ.qposadr,
-      frame=organ.frame,
-      origin=organ.origin,
+      own=nodes(w),
+      solve=solver(w),
       number=w.body.numbers,
-      tail=own.tail if own else np.zeros(len(TAIL)),
-      hold=w.hold.array,
+      dvel_warm=w.host["dvel_warm"],
       mj=coupling.mujoco_arrays(model, w.data, Bodies),
     )
-    values |= {n: w.host[n] for n in ("force_ext", "vel", "dvel", "dvel_warm", "status")}
     self._tied = fill(Tied, "cpu", values)
 
   def _leads(self, body: int) -> bool:
@@ -181,12 +160,12 @@ class Ties:
     return body > 0 and weight * mjstruct.view(m.body_invweight0, (m.nbody, 2))[body, 0] < _LEADS
 
   def enter(self):
-    """Adds to the solver's input, after a coupling has filled it."""
+    """See `Beside`."""
     if self:
       _enter.launch("cpu", 1, 1, 0, self._tied)
 
   def act(self):
-    """Lets the bodies feel what the ties have pulled."""
+    """See `Beside`."""
     if self:
       _act.launch("cpu", 1, 1, 0, self._tied)
 

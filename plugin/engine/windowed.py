@@ -25,10 +25,10 @@ from .resident import Resident
 ROOM = 16
 
 
-def state_size(nvert: int, nslot: int, ngeom: int, ncreep: int = 0, nrest: int = 0) -> int:
+def state_size(nvert: int, nslot: int, ngeom: int, **more: int) -> int:
   """Returns the length of the plugin state; ngeom is summed over the windows."""
-  sizes = {"nvert": nvert, "nslot": nslot, "ngeom": ngeom, "ncreep": ncreep, "nrest": nrest}
-  return layout.size(WindowState, sizes)
+  sizes = {"ncreep": 0, "nrest": 0, "nbond": 0} | more
+  return layout.size(WindowState, {"nvert": nvert, "nslot": nslot, "ngeom": ngeom} | sizes)
 
 
 class Phases(coupling.Phases):

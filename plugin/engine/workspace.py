@@ -14,6 +14,7 @@ from palpate.tissue.body import Body
 from palpate.tissue.config import Config
 
 from . import (
+  adhere,
   coupling,
   declare,
   declare_windows,
@@ -27,10 +28,11 @@ from . import (
   windowed,
 )
 from .bind import bind
+from .bonds import Bonds
 from .coupling import Phases
 from .creep import Creep
 from .declare import Declaration
-from .hold import Hold
+from .hold import Beside, Hold
 from .layout import FLAG, HEAD, STAGE
 from .pierce import Watch
 from .resident import Resident
@@ -69,6 +71,7 @@ class Workspace:
     place: recorded graph that puts the windows where the plugin state says, or None
     hold: springs that hold nodes
     ties: what the organ is tied to
+    bonds: what it has grown on to
     rests: what it rests on
     creep: its stress relaxation
     resident: keeper of a motion that stays on the device, or None
@@ -122,6 +125,7 @@ class Workspace:
   place: Any = None
   hold: Hold = dataclasses.field(init=False)
   ties: Ties = dataclasses.field(init=False)
+  bonds: Bonds = dataclasses.field(init=False)
   rests: Rests = dataclasses.field(init=False)
   creep: Creep = dataclasses.field(init=False)
   resident: Resident | None = None
@@ -156,7 +160,12 @@ class Workspace:
 
   def __post_init__(self):
     self.hold, self.ties = Hold(self), Ties(self)
-    self.creep, self.rests = Creep(self), Rests(self)
+    self.bonds, self.rests, self.creep = Bonds(self), Rests(self), Creep(self)
+
+  @property
+  def beside(self) -> tuple[Beside, ...]:
+    """What acts on the organ beside its tissue, in the order in which it does."""
+    return self.ties, self.bonds, self.rests, self.creep
 
   def run(self):
     """Computes the step's forces and adds them to qfrc_passive.
@@ -343,16 +352,18 @@ def state_size(model: int, instance: int) -> int:
   """
   m = mjstruct.Model.from_address(model)
   names = mjstruct.config(model, instance, "window").split()
-  relaxes = bool(mjstruct.config(model, instance, "relax_share").strip())
+  relaxes, rests, bonded = (
+    bool(mjstruct.config(model, instance, key).strip())
+    for key in ("relax_share", "support", "bonds")
+  )
   if names:
     # Asked before MuJoCo has filled in the flexes: what `windowed` needs is at most this.
     inside = fill.MOST if mjstruct.config(model, instance, "elements").strip() == "solid" else 0
     most = (1 + inside) * m.nflexvert
-    rests = bool(mjstruct.config(model, instance, "support").strip())
-    sizes = relaxes * most, rests * m.nflexvert
-    return windowed.state_size(most, 0, m.ngeom * len(names), *sizes)
+    outer = {"nrest": rests * m.nflexvert, "nbond": bonded * m.nflexvert}
+    return windowed.state_size(most, 0, m.ngeom * len(names), ncreep=relaxes * most, **outer)
   moving = len(declare.moving_bodies(m, instance))
-  return nodal.state_size(3 * moving, relaxes * moving)
+  return nodal.state_size(3 * moving, relaxes * moving, bonded * moving)
 
 
 def make(model: int, data: int, instance: int) -> Workspace:
@@ -379,6 +390,7 @@ def make(model: int, data: int, instance: int) -> Workspace:
     if organ.windows:
       w.turn = Turn()
     fasten.declare(w)
+    adhere.declare(w)
     bind(w, model)
     w.plugin_state = w.views["plugin_state"].numpy()
     w.signature = w.plugin_state[coupling.spans(organ)["signature"]].data

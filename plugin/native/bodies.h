@@ -22,6 +22,27 @@ PALPATE Sym load_hold(const float* p) {
   return {p[0], p[LANES], p[2 * LANES], p[3 * LANES], p[4 * LANES], p[5 * LANES]};
 }
 
+struct Place { D3 at, vel; };
+
+// Displacement of a vertex from rest, in the organ's frame.
+template <class Arrays, class Nodes>
+PALPATE D3 moved_by(const Arrays& mj, const Nodes& o, int i) {
+  if (o.windowed) return load(o.disp.data + 3 * i);
+  const int adr = o.qposadr.data[i];
+  return adr < 0 ? D3{0.0, 0.0, 0.0} : load(mj.qpos.data + adr) - load(mj.qpos0.data + adr);
+}
+
+// Where a vertex is in the world, and its velocity.
+template <class Arrays, class Nodes>
+PALPATE Place place_of(const Arrays& mj, const Nodes& o, int i) {
+  const double* R = o.frame.data;
+  const int dof = o.windowed ? 0 : o.dofadr.data[i];
+  const D3 vel = dof < 0 ? D3{0.0, 0.0, 0.0}
+    : load(o.windowed ? o.vel.data + 3 * i : mj.qvel.data + dof);
+  return {load(o.origin.data) + turned(R, load(o.rest.data + 3 * i) + moved_by(mj, o, i)),
+          turned(R, vel)};
+}
+
 // Adds to the solver's input a force on a node that falls by `weight` dv / h in the step.
 template <class Solve>
 PALPATE void push_node(const Solve& s, int node, D3 force, const Sym& weight) {

@@ -15,15 +15,6 @@ namespace palpate {
 constexpr int ON_NOTHING = -1, ON_GEOM = -2;  // and below, by geoms; others are organs
 constexpr int CELLS = 1024;
 
-struct Place { D3 at, vel; };
-
-template <class Organ>
-PALPATE Place place_of(const Organ& o, int i) {
-  const double* R = o.frame.data;
-  return {load(o.origin.data) + turned(R, load(o.rest.data + 3 * i) + load(o.disp.data + 3 * i)),
-          turned(R, load(o.vel.data + 3 * i))};
-}
-
 // n n^T times a, and the rest of the identity times b.
 PALPATE Sym along_and_across(D3 n, double a, double b) {
   const double c = a - b;
@@ -84,15 +75,15 @@ PALPATE void read_geom(const Fields& f, int g, double* geom) {
 // Finds what of the geoms each node rests on.
 template <class Fields>
 PALPATE void find_geoms(const Fields& f, Thread, int) {
-  for (int i = 0; i < f.own.nouter; ++i) f.on.data[i] = ON_NOTHING;
+  for (int i = 0; i < f.nouter; ++i) f.on.data[i] = ON_NOTHING;
   for (int q = 0; q < f.ngeom; ++q) {
     const int g = f.geom.data[q], b = f.mj.geom_bodyid.data[g];
     double geom[GEOM_LENGTH];
     read_geom(f, g, geom);
     const Twist moving = twist(f.mj, b, false);
-    for (int i = 0; i < f.own.nouter; ++i) {
+    for (int i = 0; i < f.nouter; ++i) {
       if (f.on.data[i] != ON_NOTHING || !f.free.data[i]) continue;
-      const Place x = place_of(f.own, i);
+      const Place x = place_of(f.mj, f.own, i);
       const D3 d = x.at - load(geom + GEOM_POS);
       const double depth = f.skin - distance(geom, d);
       if (!(depth > 0.0)) continue;
@@ -173,10 +164,10 @@ struct Bounds {
 template <class Fields>
 PALPATE Bounds sort_nodes(const Fields& f) {
   Bounds mine, near;
-  for (int i = 0; i < f.own.nouter; ++i) mine.add(place_of(f.own, i).at);
+  for (int i = 0; i < f.nouter; ++i) mine.add(place_of(f.mj, f.own, i).at);
   for (int c = 0; c < CELLS; ++c) f.first.data[c] = -1;
-  for (int j = 0; j < f.other.nouter; ++j) {
-    const D3 x = place_of(f.other, j).at;
+  for (int j = 0; j < f.nother; ++j) {
+    const D3 x = place_of(f.mj, f.other, j).at;
     store(f.where.data + 3 * j, x);
     if (!mine.has(x, f.cell)) continue;
     int c[3];
@@ -193,9 +184,9 @@ PALPATE Bounds sort_nodes(const Fields& f) {
 template <class Fields>
 PALPATE void find_organ(const Fields& f, Thread, int which) {
   const Bounds near = sort_nodes(f);
-  for (int i = 0; i < f.own.nouter; ++i) {
+  for (int i = 0; i < f.nouter; ++i) {
     if (f.on.data[i] != ON_NOTHING || !f.free.data[i]) continue;
-    const Place x = place_of(f.own, i);
+    const Place x = place_of(f.mj, f.own, i);
     const int j = near.has(x.at, f.cell) ? nearest_node(f, x.at) : -1;
     if (j < 0) continue;
     D3 w, point;
@@ -205,8 +196,8 @@ PALPATE void find_organ(const Fields& f, Thread, int which) {
     const double length = norm(n);
     if (!(length > 0.0)) continue;
     n = (1.0 / length) * n;
-    const D3 vel = w.x * place_of(f.other, e[0]).vel + w.y * place_of(f.other, e[1]).vel
-      + w.z * place_of(f.other, e[2]).vel;
+    const D3 vel = w.x * place_of(f.mj, f.other, e[0]).vel + w.y * place_of(f.mj, f.other, e[1]).vel
+      + w.z * place_of(f.mj, f.other, e[2]).vel;
     const double depth = f.skin - dot(x.at - point, n);
     if (!(depth > 0.0) || !rest(f, i, x, depth, n, vel, f.mu)) continue;
     f.on.data[i] = which;
@@ -231,7 +222,7 @@ PALPATE void press(const Fields& f, Thread, int) {
   const D3 zero = {0, 0, 0};
   const double* R = f.own.frame.data;
   if (f.restless) f.solve.tail.data[TAIL_QUIET] = 0.0;
-  for (int i = 0; i < f.own.nouter; ++i) {
+  for (int i = 0; i < f.nouter; ++i) {
     if (f.on.data[i] == ON_NOTHING) continue;
     push_node(f.solve, f.solve.node.data[i], add_turned(zero, R, load(f.force.data + 3 * i)),
               turned_back(R, hardness(f, i)));
@@ -247,14 +238,14 @@ PALPATE void act_rests(const Fields& f, Thread, int) {
   for (int q = 0; q < f.ngeom; ++q) {
     const int b = f.mj.geom_bodyid.data[f.geom.data[q]];
     D3 force = zero, torque = zero;
-    for (int i = 0; i < f.own.nouter; ++i) {
+    for (int i = 0; i < f.nouter; ++i) {
       if (f.on.data[i] != ON_GEOM - q) continue;
       const D3 dv = turned(f.own.frame.data,
                            load_lane(f.solve.dvel.data + offset_of(f.solve.node.data[i])));
       const D3 push = load(f.force.data + 3 * i) - per_h * (hardness(f, i) * dv);
       store(f.force.data + 3 * i, push);
       force = force - push;
-      torque = torque - cross(arm_of(f.mj, b, place_of(f.own, i).at), push);
+      torque = torque - cross(arm_of(f.mj, b, place_of(f.mj, f.own, i).at), push);
     }
     push_body(f.mj, b, force, torque);
   }
@@ -265,7 +256,7 @@ template <class Fields>
 PALPATE void bear(const Fields& f, Thread, int which) {
   const double* R = f.other.frame.data;
   f.below.tail.data[TAIL_QUIET] = 0.0;
-  for (int i = 0; i < f.own.nouter; ++i) {
+  for (int i = 0; i < f.nouter; ++i) {
     if (f.on.data[i] != which) continue;
     const D3 push = add_turned({0, 0, 0}, R, D3{0, 0, 0} - load(f.force.data + 3 * i));
     const Sym weight = turned_back(R, hardness(f, i));
@@ -280,7 +271,7 @@ PALPATE void bear(const Fields& f, Thread, int which) {
 template <class Fields>
 PALPATE void keep(const Fields& f, Thread, int) {
   const D3 zero = {0, 0, 0};
-  for (int i = 0; i < f.own.nouter; ++i)
+  for (int i = 0; i < f.nouter; ++i)
     store(f.slip.data + 3 * i, f.on.data[i] == ON_NOTHING ? zero : load(f.slipped.data + 3 * i));
 }
 

@@ -48,16 +48,6 @@ PALPATE void make_rotation(double* a) {
     for (int k = 0; k < 9; ++k) a[k] = k % 4 == 0;
 }
 
-// Displacement of a tied node from rest.
-template <class Fields>
-PALPATE D3 moved_by(const Fields& f, int i) {
-  if (!f.windowed) {
-    const int adr = f.qposadr.data[i];
-    return load(f.mj.qpos.data + adr) - load(f.mj.qpos0.data + adr);
-  }
-  return load(f.disp.data + 3 * i);
-}
-
 // The rigid motion that is nearest to that of the nodes which are tied to it (shape matching,
 // Mueller et al. 2005, doi:10.1145/1073204.1073216), by the ties' stiffness: their forces then have
 // neither sum nor moment. Its velocity is that which the last steps lead to.
@@ -68,18 +58,18 @@ PALPATE Rigid own_motion(const Fields& f) {
   Rigid out = {{1, 0, 0, 0, 1, 0, 0, 0, 1}, zero, zero, zero, zero};
   double ahead = 0.0;
   auto velocity = [&](int n) {
-    const int at = offset_of(f.node.data[f.vert.data[n]]);
-    return load_lane(f.vel.data + at) + ahead * load_lane(f.dvel_warm.data + at);
+    const int at = offset_of(f.solve.node.data[f.vert.data[n]]);
+    return load_lane(f.solve.vel.data + at) + ahead * load_lane(f.dvel_warm.data + at);
   };
   for (int n = 0; n < f.count.data[0]; ++n) {
     if (f.body.data[n] != TO_OWN_MOTION) continue;
     const int i = f.vert.data[n];
     const double k = f.stiffness.data[n];
-    const D3 X = load(f.rest.data + 3 * i);
+    const D3 X = load(f.own.rest.data + 3 * i);
     total += k;
     ahead = f.leads.data[n] ? 1.0 : 0.0;
     out.rest += k * X;
-    out.middle += k * (X + moved_by(f, i));
+    out.middle += k * (X + moved_by(f.mj, f.own, i));
     out.vel += k * velocity(n);
   }
   if (!(total > 0.0)) return out;
@@ -91,8 +81,8 @@ PALPATE Rigid own_motion(const Fields& f) {
     if (f.body.data[n] != TO_OWN_MOTION) continue;
     const int i = f.vert.data[n];
     const double k = f.stiffness.data[n];
-    const D3 X = load(f.rest.data + 3 * i) - out.rest;
-    const D3 x = load(f.rest.data + 3 * i) + moved_by(f, i) - out.middle;
+    const D3 X = load(f.own.rest.data + 3 * i) - out.rest;
+    const D3 x = load(f.own.rest.data + 3 * i) + moved_by(f.mj, f.own, i) - out.middle;
     const double a[3] = {x.x, x.y, x.z}, b[3] = {X.x, X.y, X.z};
     for (int r = 0; r < 3; ++r)
       for (int c = 0; c < 3; ++c) {
@@ -132,12 +122,12 @@ PALPATE void enter_ties(const Fields& f, Thread, int) {
   const double h = f.mj.timestep.data[0], reach = f.ahead * h + f.number.data[DAMPING];
   const D3 zero = {0.0, 0.0, 0.0};
   const Rigid own = f.owned.data[0] ? own_motion(f) : Rigid{};
-  if (f.windowed && f.restless.data[0]) f.tail.data[TAIL_QUIET] = 0.0;
+  if (f.own.windowed && f.restless.data[0]) f.solve.tail.data[TAIL_QUIET] = 0.0;
   Twist moving = {zero, zero};
   for (int n = 0; n < count; ++n) {
-    const int i = f.vert.data[n], node = f.node.data[i];
+    const int i = f.vert.data[n], node = f.solve.node.data[i];
     const double k = f.stiffness.data[n];
-    const D3 rest = load(f.rest.data + 3 * i);
+    const D3 rest = load(f.own.rest.data + 3 * i);
     D3 to = load(f.point.data + 6 * n), vel = load(f.point.data + 6 * n + 3);
     const int b = f.body.data[n];
     if (b >= 0) {
@@ -150,14 +140,14 @@ PALPATE void enter_ties(const Fields& f, Thread, int) {
       to = own.middle + arm;
       vel = velocity_at(own, arm);
     } else {
-      to = add_turned(zero, f.frame.data, to - load(f.origin.data));
-      vel = add_turned(zero, f.frame.data, vel);
+      to = add_turned(zero, f.own.frame.data, to - load(f.own.origin.data));
+      vel = add_turned(zero, f.own.frame.data, vel);
     }
-    vel = vel - load_lane(f.vel.data + offset_of(node));
-    const D3 F = k * (to - rest - moved_by(f, i) + reach * vel);
+    vel = vel - load_lane(f.solve.vel.data + offset_of(node));
+    const D3 F = k * (to - rest - moved_by(f.mj, f.own, i) + reach * vel);
     const double weight = weight_of(f, n);
     store(f.force.data + 3 * n, F);
-    push_node(f, node, F, {weight, 0.0, 0.0, weight, 0.0, weight});
+    push_node(f.solve, node, F, {weight, 0.0, 0.0, weight, 0.0, weight});
   }
 }
 
@@ -166,17 +156,17 @@ PALPATE void enter_ties(const Fields& f, Thread, int) {
 template <class Fields>
 PALPATE void act_ties(const Fields& f, Thread, int) {
   const auto& mj = f.mj;
-  const bool ok = f.status.data[3] == 0.0f;
+  const bool ok = f.solve.status.data[3] == 0.0f;
   const double h = mj.timestep.data[0];
   const D3 zero = {0.0, 0.0, 0.0};
   D3 force = zero, torque = zero;
   for (int n = 0; n < f.count.data[0]; ++n) {
-    const int at = offset_of(f.node.data[f.vert.data[n]]), b = f.body.data[n];
-    const D3 back = (weight_of(f, n) / h) * load_lane(f.dvel.data + at);
+    const int at = offset_of(f.solve.node.data[f.vert.data[n]]), b = f.body.data[n];
+    const D3 back = (weight_of(f, n) / h) * load_lane(f.solve.dvel.data + at);
     const D3 F = ok ? load(f.force.data + 3 * n) - back : zero;
     store(f.force.data + 3 * n, F);
     if (b < 0) continue;
-    const D3 push = zero - turned(f.frame.data, F);
+    const D3 push = zero - turned(f.own.frame.data, F);
     force += push;
     torque += cross(arm_of(mj, b, point_of_body(f, n)), push);
     if (n + 1 < f.count.data[0] && f.body.data[n + 1] == b) continue;

@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from . import reading
+from .reading import BondRow
 from .step import SCHEMES
 
 # What takes a change while running: a number in the device's memory, the tissue's arrays, the graph
@@ -44,221 +46,144 @@ def _row(default, kind: tuple, meaning: str, unit: str = "-", change: str = FIXE
   return dataclasses.field(default=default, metadata={"row": row})
 
 
-# What a key may hold: how it is read, and what a message says of it.
-
-
-def _plain(word: str) -> str:
-  """Returns a word of a number; Python alone reads 1_0 and digits of other scripts as one."""
-  if not word.isascii() or "_" in word:
-    raise ValueError
-  return word
-
-
-def _number(low: float, high: float = math.inf, closed: bool = True) -> tuple:
-  def read(text: str, nelem: int) -> float:
-    value = float(_plain(text))
-    inside = (value >= low if closed else value > low) and value < high
-    if not (math.isfinite(value) and inside):
-      raise ValueError
-    return value
-
-  if not math.isfinite(low):
-    return read, "a finite number"
-  if not math.isfinite(high):
-    return read, f"a number {'>=' if closed else '>'} {low:g}"
-  return read, f"a number in {'[' if closed else '('}{low:g}, {high:g})"
-
-
-def _numbers(text: str, nelem: int) -> tuple[float, ...]:
-  words = text.split()
-  values = tuple(float(_plain(word)) for word in words)
-  for k, value in enumerate(values):
-    if not (math.isfinite(value) and value > 0):
-      if len(values) > 1:
-        raise ValueError(f"has {words[k]} for element {k}, expected numbers > 0")
-      raise ValueError
-  if len(values) not in (1, nelem):
-    raise ValueError(f"has {len(values)} values, expected 1 or {nelem} (one an element)")
-  return values
-
-
-def _count(low: int, high: int) -> tuple:
-  def read(text: str, nelem: int) -> int:
-    value = int(_plain(text))
-    if not low <= value <= high:
-      raise ValueError
-    return value
-
-  return read, f"a whole number in [{low}, {high}]"
-
-
-def _choice(values: dict[str, Any]) -> tuple:
-  def read(text: str, nelem: int):
-    if text not in values:
-      raise ValueError
-    return values[text]
-
-  return read, " or ".join(repr(text) for text in values)
-
-
-def _device(text: str, nelem: int) -> str:
-  kind, _, index = text.partition(":")
-  if text in ("auto", "cpu", "cuda") or (kind == "cuda" and _plain(index).isdigit()):
-    return "cuda:0" if text == "cuda" else text
-  raise ValueError
-
-
-def _vertices(text: str, nelem: int) -> tuple[int, ...]:
-  if not all(_plain(word).isdigit() for word in text.split()):
-    raise ValueError
-  return tuple(int(word) for word in text.split())
-
-
-def _names(text: str, nelem: int) -> tuple[str, ...]:
-  return tuple(text.split())
-
-
-def _name(text: str, nelem: int) -> str:
-  (name,) = text.split()
-  return name
-
-
-def _groups(text: str, nelem: int) -> tuple[tuple[str, ...], ...]:
-  return tuple(tuple(group.split()) for group in text.split(","))
-
-
-def _ties(text: str, nelem: int) -> tuple[tuple[str, float, tuple[int, ...]], ...]:
-  found = []
-  for group in text.split(","):
-    name, stiffness, *vertices = group.split()
-    value = _POSITIVE[0](stiffness, nelem)
-    found.append((name, value, _vertices(" ".join(vertices), nelem)))
-    if not vertices:
-      raise ValueError
-  return tuple(found)
-
-
-def _words(*values: str) -> tuple:
-  return _choice({value: value for value in values})
-
-
-_POSITIVE = _number(0.0, closed=False)
-_NOT_NEGATIVE = _number(0.0)
-
-
 @dataclasses.dataclass(frozen=True)
 class Config:
   """Configuration of one organ, one field a `<config>` key; see its row for what it means."""
 
   elements: str = _row(
     "membrane",
-    _words("membrane", "spring", "solid"),
+    reading.words("membrane", "spring", "solid"),
     "`membrane` (St. Venant-Kirchhoff triangles, plane stress), `spring` (edge springs) or `solid` "
     "(neo-Hookean tetrahedra inside, made when the model is compiled; with `window` alone)",
   )
   young: tuple[float, ...] = _row(
     (5000.0,),
-    (_numbers, "a number > 0"),
+    (reading.numbers, "a number > 0"),
     "Young's modulus of membrane and plate; one value, or one for each triangle",
     "Pa",
     TISSUE,
   )
-  poisson: float = _row(0.45, _number(0.0, 0.5), "Poisson's ratio", "-", TISSUE)
-  thickness: float = _row(0.002, _POSITIVE, "thickness of membrane and plate", "m", TISSUE)
+  poisson: float = _row(0.45, reading.number(0.0, 0.5), "Poisson's ratio", "-", TISSUE)
+  thickness: float = _row(0.002, reading.POSITIVE, "thickness of membrane and plate", "m", TISSUE)
   stiffness: float = _row(
-    0.0, _POSITIVE, 'constant of the edge springs, with `elements="spring"` alone', "N/m", TISSUE
+    0.0,
+    reading.POSITIVE,
+    'constant of the edge springs, with `elements="spring"` alone',
+    "N/m",
+    TISSUE,
   )
   bend: float = _row(
     1.0,
-    _NOT_NEGATIVE,
+    reading.NOT_NEGATIVE,
     "factor on the plate's rigidity E t^3 / (12 (1 - nu^2)); 0 switches bending off",
   )
   foundation: float = _row(
     0.0,
-    _NOT_NEGATIVE,
+    reading.NOT_NEGATIVE,
     "restoring force per area and displacement: stands for the interior and ligaments",
     "Pa/m",
     NUMBER,
   )
   bulk: float = _row(
     0.0,
-    _NOT_NEGATIVE,
+    reading.NOT_NEGATIVE,
     "volume preservation, energy bulk/2 (V - V0)^2 / V0; closed surfaces",
     "Pa",
     NUMBER,
   )
   pressure: float = _row(
-    0.0, _number(-math.inf), "inside minus outside; closed surfaces", "Pa", NUMBER
+    0.0, reading.number(-math.inf), "inside minus outside; closed surfaces", "Pa", NUMBER
   )
-  damping: float = _row(0.002, _NOT_NEGATIVE, "Rayleigh coefficient on the stiffness", "s", NUMBER)
+  damping: float = _row(
+    0.002, reading.NOT_NEGATIVE, "Rayleigh coefficient on the stiffness", "s", NUMBER
+  )
   relax_share: float = _row(
     0.0,
-    _number(0.0, 1.0),
+    reading.number(0.0, 1.0),
     "share of the elastic forces that fades while a strain is held; `young` is that at once",
     "-",
     NUMBER,
   )
   relax_time: float = _row(
-    0.5, _POSITIVE, "time constant of that, exp(-t / relax_time)", "s", NUMBER
+    0.5, reading.POSITIVE, "time constant of that, exp(-t / relax_time)", "s", NUMBER
   )
   integrator: str = _row(
     "implicit",
-    _words(*SCHEMES),
+    reading.words(*SCHEMES),
     "`implicit`; `midpoint` for free motion ([accuracy](accuracy.md)); `neumann`, `explicit` to "
     "compare with",
     change=GRAPH,
   )
-  iterations: int = _row(200, _count(1, 10000), "most PCG iterations of a solve", change=NUMBER)
-  tolerance: float = _row(
-    1e-4, _number(1e-10, 1.0), "relative residual at which PCG stops", change=NUMBER
+  iterations: int = _row(
+    200, reading.whole(1, 10000), "most PCG iterations of a solve", change=NUMBER
   )
-  newton: int = _row(1, _count(1, 100), "Newton iterations a step", change=GRAPH)
+  tolerance: float = _row(
+    1e-4, reading.number(1e-10, 1.0), "relative residual at which PCG stops", change=NUMBER
+  )
+  newton: int = _row(1, reading.whole(1, 100), "Newton iterations a step", change=GRAPH)
   window: tuple[str, ...] = _row(
     (),
-    (_names, "names of flexcomps"),
+    (reading.names, "names of flexcomps"),
     "flexcomps that follow the tools over the organ, which is rigid then (`add_windows` sets it); "
     "none where the vertices are MuJoCo's dofs",
   )
   follow: tuple[tuple[str, ...], ...] = _row(
     (),
-    (_groups, "names of bodies"),
+    (reading.groups, "names of bodies"),
     "bodies that each window follows, a comma between windows; left out, all that moves and "
     "collides",
   )
-  mass: float = _row(0.0, _POSITIVE, "mass of the organ, with `window` alone", "kg")
+  mass: float = _row(0.0, reading.POSITIVE, "mass of the organ, with `window` alone", "kg")
   pin: tuple[int, ...] = _row(
-    (), (_vertices, "vertex numbers"), "vertices that do not move, with `window` alone"
+    (), (reading.vertices, "vertex numbers"), "vertices that do not move, with `window` alone"
   )
   carrier: str = _row(
     "",
-    (_name, "the name of a body, or 'own'"),
+    (reading.name, "the name of a body, or 'own'"),
     "body that carries foundation and pins along ([attachments](authoring.md#attachments)); `own`: "
     "the foundation goes with the organ's own rigid motion",
   )
   attach: tuple[tuple[str, float, tuple[int, ...]], ...] = _row(
     (),
-    (_ties, "a body or organ, a stiffness > 0 and vertices, a comma between such groups"),
+    (reading.ties, "a body or organ, a stiffness > 0 and vertices, a comma between such groups"),
     "springs from vertices to a body, or to the nearest vertices of another organ: "
     "`rib 500 3 17 18, stomach 200 40 41`; the stiffness is that of a group",
     "-, N/m, -",
   )
+  bonds: tuple[BondRow, ...] | None = _row(
+    None,
+    (
+      reading.bonds,
+      "'none', or a body or organ, stiffness, strength, energy, and 'near' and a distance or 'at' "
+      "and vertices, a comma between such groups",
+    ),
+    "springs from vertices to points of a body or of another organ's surface, which soften and "
+    "break ([bonds](authoring.md#bonds)): `liver 1e7 3e3 5 near 0.003, rib 1e7 3e3 5 at 17 18`; "
+    "`none` lets `Organ.bond` make some",
+    "-, N/m³, Pa, J/m², m",
+  )
   support: tuple[str, ...] = _row(
     (),
-    (_names, "names of geoms and organs"),
+    (reading.names, "names of geoms and organs"),
     "with `window` alone: geoms and organs that bear the organ, with friction, by springs of its "
     "surface in place of MuJoCo's contacts ([lying](authoring.md#lying-on-something))",
   )
   resident: bool = _row(
     False,
-    _choice({"true": True, "false": False}),
+    reading.choice({"true": True, "false": False}),
     "with `window` alone: the motion stays on the CUDA device between steps, and the plugin state "
     "is brought up to date by `Organ.sync` alone ([internals](internals.md#resident))",
   )
   device: str = _row(
     "auto",
-    (_device, "'cpu', 'cuda:0' or 'auto'"),
+    (reading.device, "'cpu', 'cuda:0' or 'auto'"),
     "`cpu`, `cuda:N`, or `auto`: CUDA where there is a device and enough nodes",
   )
+
+  @property
+  def bonded(self) -> bool:
+    """Whether there are bonds, or room for some."""
+    return self.bonds is not None
 
 
 ROWS: dict[str, Row] = {each.name: each.metadata["row"] for each in dataclasses.fields(Config)}
@@ -289,7 +214,7 @@ def _default(key: str) -> str:
     except ValueError:
       return "-"
     return f"{value:g}"
-  return str(value).lower() or "-"
+  return "-" if value is None else str(value).lower() or "-"
 
 
 def parse(organ: str, texts: dict[str, str], nelem: int, closed: bool) -> Config:
@@ -337,7 +262,7 @@ def change(
   scale = texts.pop(_SCALE, None)
   values = _values(organ, texts, nelem)
   if scale is not None:
-    factor = _value(organ, _SCALE, scale, *_POSITIVE)
+    factor = _value(organ, _SCALE, scale, *reading.POSITIVE)
     values["young"] = tuple(factor * young for young in compiled.young)
   changed = dataclasses.replace(config, **values)
   if bool(changed.relax_share) != bool(compiled.relax_share):
@@ -410,10 +335,12 @@ def _check_solid(organ: str, config: Config, given: dict):
 
 
 def _check_ties(organ: str, config: Config):
-  for key in ("carrier", "attach", "relax_share", "support"):
-    if getattr(config, key) and config.resident:
+  for key in ("carrier", "attach", "bonds", "relax_share", "support"):
+    if not getattr(config, key) and not (key == "bonds" and config.bonded):
+      continue
+    if config.resident:
       raise ValueError(f"organ {organ!r}: {key} is set, allowed only without resident")
-    if getattr(config, key) and not SCHEMES[config.integrator].solids:
+    if not SCHEMES[config.integrator].solids:
       raise ValueError(
         f"organ {organ!r}: integrator is {config.integrator!r}, allowed only without {key}"
       )

@@ -48,6 +48,8 @@ REFUSED = [
   ("relax_time", "0", "> 0"),
   ("attach", "rib 500", "a stiffness > 0 and vertices"),
   ("attach", "rib soft 3", "a stiffness > 0 and vertices"),
+  ("bonds", "bed 1e7 2e3", "'near' and a distance"),
+  ("bonds", "bed 1e7 2e3 2 by 0.01", "'near' and a distance"),
   ("carrier", "two words", "the name of a body"),
   ("resident", "yes", "'true' or 'false'"),
 ]

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from palpate.tasks.metrics import METRICS, number
+from palpate.tasks.metrics import METRICS, Spec, number
 from palpate.tasks.recording import Recording
 from palpate.tasks.report import ending
 from palpate.tasks.score import SUCCESS, score
@@ -48,46 +48,53 @@ class Coach:
   Attributes:
     instruction: what to do next; empty in an assessment
     warning: what goes wrong now; empty where nothing does, and in an assessment
+    kind: of the warning: `force`, `shaft`, `view`
   """
 
   def __init__(self, assessment: bool = False):
     """Makes a coach; in an `assessment` it says nothing."""
     self.assessment = assessment
-    self.instruction, self.warning = "", ""
+    self.instruction, self.warning, self.kind = "", "", ""
+    self._now = 0.0
     self._said: list[dict[str, Any]] = []
     self._until = -math.inf
 
   def begin(self, env: Any) -> None:
     """Starts with an episode."""
-    self._said, self._until, self.warning = [], -math.inf, ""
+    self._said, self._until, self.warning, self.kind = [], -math.inf, "", ""
     self.look(env)
 
   def look(self, env: Any) -> None:
     """Looks at what a control step has made."""
+    self._now = now = float(env.physics.time())
     if self.assessment:
       return
-    task, physics, now = env.task, env.physics, float(env.physics.time())
+    task, physics = env.task, env.physics
     instruction = task.instruct(physics)
     # "2 s more" and "1.9 s more" are one hint.
     if _words(instruction) != _words(self.instruction):
       self._say("instruction", now, instruction)
     self.instruction = instruction
-    warning = self._warning(task, physics)
+    kind, warning = self._warning(task, physics)
     if warning and _words(warning) != _words(self.warning):
       self._say("warning", now, warning)
     if warning or now > self._until:
-      self.warning = warning
+      self.kind, self.warning = kind, warning
       self._until = now + _STAYS
 
-  def _warning(self, task: Any, physics: Any) -> str:
+  def hint(self, text: str) -> None:
+    """Notes a hint that was given on request, for the recording."""
+    self._say("hint", self._now, text)
+
+  def _warning(self, task: Any, physics: Any) -> tuple[str, str]:
     peak, limit = physics.peak_force, task.force_limit
     if peak > limit:
-      return f"Too much force: {peak:.1f} N, expected at most {limit:.1f} N"
+      return "force", f"Too much force: {peak:.1f} N, expected at most {limit:.1f} N"
     if task.cost.shaft:
-      return f"The shaft presses on the organ with {physics.peak_shaft:.1f} N"
+      return "shaft", f"The shaft presses on the organ with {physics.peak_shaft:.1f} N"
     if not physics.tip_visible():
-      return "The tip is out of the picture"
-    return ""
+      return "view", "The tip is out of the picture"
+    return "", ""
 
   def _say(self, kind: str, time: float, text: str) -> None:
     self._said.append({"kind": kind, "time": round(time, 3), "text": text})
@@ -95,6 +102,12 @@ class Coach:
   def log(self) -> dict[str, Any]:
     """Returns what was said, for the recording."""
     return {"assessment": self.assessment, "hints": self._said}
+
+
+def _shown(value: float, spec: Spec) -> str:
+  """Returns a number for people, who take what is next to nothing for nothing."""
+  text = number(value, spec)
+  return "0" if "e\N{MINUS SIGN}" in text else text
 
 
 def _lower(label: str) -> str:
@@ -120,7 +133,7 @@ def advice(
     return said
   metrics = recording.metrics()
   result = score(metrics, reference, recording.outcome)
-  order = sorted(result.over, key=lambda name: result.z[name])
+  order, given = sorted(result.over, key=lambda name: result.z[name]), set()
   for name in order[:most]:
     spec, row = METRICS[name], reference["metrics"][name]
     unit = "" if spec.shown in ("-", "count") else f" {spec.shown}"
@@ -129,7 +142,9 @@ def advice(
       f"{spec.label} was {number(getattr(metrics, name), spec)}{unit}, skilled people have {bound} "
       f"{number(row['limit'], spec)}{unit}"
     )
-    said.append(f"{text}: {_ADVICE[name]}." if name in _ADVICE else f"{text}.")
+    what = _ADVICE.get(name, "")
+    said.append(f"{text}: {what}." if what and what not in given else f"{text}.")  # once
+    given.add(what)
   if recording.outcome == SUCCESS:
     good = [k for k, z in result.z.items() if math.isfinite(z) and z > 0.5 and k not in result.over]
     good.sort(key=lambda name: -result.z[name])
@@ -156,7 +171,7 @@ def card(recording: Recording, reference: Mapping[str, Any] | None) -> dict[str,
     rows.append({
       "label": spec.label,
       "group": spec.group,
-      "value": number(value, spec),
+      "value": _shown(value, spec),
       "unit": spec.shown,
       "limit": number(limit["limit"], spec) if limit else "",
       "over": result is not None and name in result.over,

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import threading
 from collections.abc import Sequence
 
 import numpy as np
@@ -27,6 +28,8 @@ _RETRY = 0.5  # between tries to find a device again [s]
 # Energy that the hand may get before it gives any, and most that is kept account of [J].
 _LENT, _CREDIT = 1e-3, 0.05
 _LIGHTEST = 0.05  # of hands with a device [kg]
+_SLOW = 2.5  # steps between readings from which on a device is a slow one
+_EDGE = 0.08  # most by which the force on a slow one changes in a step [N]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,7 +99,7 @@ class Track:
       line = goal
     self._line = line
     slow = self._interval / self._h
-    if slow < 2.5:
+    if slow < _SLOW:
       self.value = line
     else:
       share = 1 / (1 + 0.5 * slow)
@@ -138,6 +141,7 @@ class Link:
     self._heard, self._tried, self._gain = 0.0, 0.0, 0.0
     self._reference: tuple[Reading, list[float], Four, float] | None = None
     self._roll = 0.0
+    self._next: Device | None = None
     self.attach(None, STILL, _SAME, np.eye(3))
     self.quiet()
 
@@ -153,6 +157,8 @@ class Link:
       axes: the device's axes in the world, in columns  (3, 3)
     """
     self._shaft, self._axes = shaft, [float(x) for x in np.asarray(axes).ravel()]
+    if shaft is not None:
+      self._roll = shaft.roll(pos, quat)
     self._hold([float(x) for x in pos], tuple(float(x) for x in quat))
     self.state = "waiting"
 
@@ -174,6 +180,19 @@ class Link:
     self._pushed, self._fast = [0.0, 0.0, 0.0, 0.0], 0.0
     self._send(STILL, STILL)
 
+  def change(self, device: Device) -> None:
+    """Takes another device with its next reading; to be called from any thread."""
+    self._next = device
+
+  def _change(self, device: Device) -> None:
+    self.quiet()
+    before, self.device, self._next = self.device, device, None
+    # A library may take its time over it.
+    threading.Thread(target=before.close, daemon=True).start()
+    self.guard, self.message = Guard(self.device), ""
+    self._hold(self.row[:3], tuple(self.row[3:]))
+    self.state = "waiting"
+
   # From hand to handle.
 
   def poll(self, now: float, tip: Sequence[float] | None = None) -> bool:
@@ -183,6 +202,8 @@ class Link:
       now: time of the loop [s]
       tip: of the instrument [m]; the leash is tied there  (3,)
     """
+    if self._next is not None:
+      self._change(self._next)
     if self.state == "lost" and not self._find(now):
       return False
     try:
@@ -317,6 +338,8 @@ class Link:
       wrench: force [N] and torque [N m] on the handle, in the world  (6,)
     """
     device, options = self.device, self.options
+    if not math.isfinite(sum(wrench)):  # of a motion that diverged
+      return self.quiet()
     if not device.force_limit or self.state != "ready":
       self.force = STILL
       return
@@ -324,6 +347,8 @@ class Link:
     m, scale = self._axes, self._gain * options.force_scale
     force = _into(m, wrench[0], wrench[1], wrench[2], scale)
     force = _limited(force, min(device.force_limit, options.force_limit))
+    if device.rate * self._h * _SLOW < 1:
+      force = _towards(self.force, force, _EDGE)
     if options.passive:
       force = _limited(force, self._affordable(force))
     torque = STILL
@@ -374,6 +399,16 @@ def _limited(vector: Three, most: float) -> Three:
     return vector
   scale = most / length
   return (x * scale, y * scale, z * scale)
+
+
+def _towards(start: Three, goal: Three, most: float) -> Three:
+  """Returns where one is on the way from start to goal, `most` further."""
+  x, y, z = (b - a for a, b in zip(start, goal, strict=True))
+  length = math.sqrt(x * x + y * y + z * z)
+  if length <= most:
+    return goal
+  share = most / length
+  return (start[0] + share * x, start[1] + share * y, start[2] + share * z)
 
 
 def _nearest(quat: Four, like: Sequence[float]) -> Four:

@@ -29,6 +29,7 @@ class Desk(Silent):
     self._rate: Sequence[float] = (0.0,) * 4
     self._held: frozenset[str] = frozenset()
     self._jaw: float | None = None
+    self._at = 0.0
     self._pos, self._time = [0.0] * 4, None
 
   def feed(
@@ -37,6 +38,7 @@ class Desk(Silent):
     rate: Sequence[float] = (),
     buttons: Iterable[str] = (),
     jaw: float | None = None,
+    at: float = 0.0,
   ) -> None:
     """Takes what the hand does; ValueError says what is no such thing.
 
@@ -45,6 +47,7 @@ class Desk(Silent):
       rate: its speed from now on, in shares of the full one, each in [-1, 1]  (4,)
       buttons: those that are held now, of `BUTTONS`
       jaw: opening of the jaws in [-1, 1], None for the button `grip`
+      at: when it was so, by any clock, 1e9 at most
     """
     held = frozenset(buttons)
     if not held <= BUTTONS:
@@ -52,12 +55,13 @@ class Desk(Silent):
     far, fast = _numbers("move", move, math.pi), _numbers("rate", rate, 1.0)
     if jaw is not None:
       jaw = _numbers("jaw", [jaw] * 4, 1.0)[0]
+    at = _numbers("at", [at] * 4, 1e9)[0]
     with self._lock:
       most = (_MOST, _MOST, _MOST, math.pi)
       self._moved = [
         a + min(max(b, -m), m) for a, b, m in zip(self._moved, far, most, strict=True)
       ]
-      self._rate, self._held, self._jaw = fast, held, jaw
+      self._rate, self._held, self._jaw, self._at = fast, held, jaw, at
 
   def read(self, now: float) -> Reading:
     """Returns where the hand is."""
@@ -65,7 +69,7 @@ class Desk(Silent):
     self._time = now
     with self._lock:
       moved, rate, held, jaw = self._moved, self._rate, self._held, self._jaw
-      self._moved = [0.0] * 4
+      self._moved, self.stamp = [0.0] * 4, self._at
     full = (SPEED, SPEED, SPEED, ROLL)
     self._pos = [
       p + m + span * r * f for p, m, r, f in zip(self._pos, moved, rate, full, strict=True)

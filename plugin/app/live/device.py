@@ -46,6 +46,7 @@ class Device(Protocol):
     force_limit: largest force it gives [N], 0 for one that gives none
     torque_limit: the same for torque [N m]
     relative: whether only its movements mean something, so that its zero may drift
+    stamp: of the last reading, by the clock of whoever made it, for the way from hand to picture
   """
 
   name: str
@@ -54,6 +55,7 @@ class Device(Protocol):
   force_limit: float
   torque_limit: float
   relative: bool
+  stamp: float
 
   def read(self, now: float) -> Reading | None:
     """Returns the latest reading, None where there is none since the last; never waits.
@@ -92,6 +94,7 @@ class Silent:
   force_limit = 0.0
   torque_limit = 0.0
   relative = True
+  stamp = 0.0
 
   def send(self, force: Three, torque: Three) -> None:
     """Does nothing."""

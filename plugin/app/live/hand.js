@@ -1,4 +1,4 @@
-// What the hand does: mouse, touch, keys and gamepad, as displacements [m] and speeds.
+// What the hands do: mouse, touch, keys, buttons and gamepad, as displacements [m] and speeds.
 
 const KEYS = {
   ArrowLeft: [0, -1], ArrowRight: [0, 1], ArrowDown: [1, -1], ArrowUp: [1, 1], a: [0, -1], d: [0, 1],
@@ -10,16 +10,19 @@ const PINCH = 3e-4;  // of two fingers [m]
 const ROLL = 0.01;  // [rad]
 const MOST = 0.04;  // in a message [m]
 const DEAD = 0.1;
+export const CLOCK = 1e6;  // in which the clock of messages goes round [ms]
 
 export class Hand {
-  constructor(canvas, view, head) {
+  constructor(canvas, pad, view, head) {
     this.view = view;
     this.head = head;
     this.move = [0, 0, 0, 0];
     this.down = new Set();
     this.grip = false;
     this.fingers = new Map();
-    this.said = "";
+    this.pressed = new Set();  // buttons of the page
+    this.said = {};
+    this.left = "";  // what is in the left hand: keyboard, pad
     canvas.addEventListener("pointerdown", event => this.press(canvas, event));
     canvas.addEventListener("pointermove", event => this.drag(event));
     for (const kind of ["pointerup", "pointercancel"]) {
@@ -33,26 +36,56 @@ export class Hand {
     canvas.addEventListener("keydown", event => this.key(event, true));
     canvas.addEventListener("keyup", event => this.key(event, false));
     canvas.addEventListener("blur", () => this.down.clear());
+    for (const button of pad.querySelectorAll("button")) this.button(button);
+  }
+
+  // A button is held; the one that grips stays closed until it is pressed again.
+  button(button) {
+    const hold = on => {
+      button.classList.toggle("held", on);
+      if (on) this.pressed.add(button);
+      else this.pressed.delete(button);
+    };
+    button.addEventListener("contextmenu", event => event.preventDefault());
+    button.addEventListener("pointerdown", event => {
+      event.preventDefault();
+      hold(button.dataset.hold !== "grip" || !this.pressed.has(button));
+    });
+    for (const kind of ["pointerup", "pointercancel", "pointerleave"]) {
+      button.addEventListener(kind, () => button.dataset.hold !== "grip" && hold(false));
+    }
+  }
+
+  release() {
+    for (const button of this.pressed) button.classList.remove("held");
+    this.pressed.clear();
+    this.said = {};
   }
 
   press(canvas, event) {
     canvas.focus();
-    canvas.setPointerCapture(event.pointerId);
+    if (event.isTrusted) canvas.setPointerCapture(event.pointerId);
+    if (event.pointerType === "touch") document.body.classList.add("touch");
     this.fingers.set(event.pointerId, [event.clientX, event.clientY]);
-    this.grip = event.button === 2;
+    this.grip = event.button === 2 && !this.view.free;
+    this.aside = event.button === 2 || event.shiftKey;
   }
 
   drag(event) {
     const last = this.fingers.get(event.pointerId);
     if (!last) return;
     const [x, y] = [event.clientX - last[0], event.clientY - last[1]], view = this.view;
+    const before = this.span();
     this.fingers.set(event.pointerId, [event.clientX, event.clientY]);
+    const two = this.fingers.size > 1, now = this.span();
     if (view.free) {
-      const part = event.shiftKey ? view.shift : view.turn;
-      part[0] -= 0.005 * x;
-      part[1] += 0.005 * y;
-    } else if (this.fingers.size > 1) {
+      if (two) view.scale(before.far / Math.max(now.far, 1));
+      const part = two || this.aside ? view.shift : view.turn, share = two ? 0.0012 : 0.005;
+      part[0] -= share * x;
+      part[1] += share * y;
+    } else if (two) {
       this.move[2] += PINCH * y / this.fingers.size;
+      this.move[3] += Math.atan2(Math.sin(now.angle - before.angle), Math.cos(now.angle - before.angle));
     } else if (event.shiftKey) {
       this.move[3] += ROLL * x;
     } else {
@@ -62,9 +95,15 @@ export class Hand {
     }
   }
 
+  // How far two fingers are apart [pixels], and the angle of the line between them.
+  span() {
+    const [a, b] = [...this.fingers.values()];
+    return b ? {far: Math.hypot(b[0] - a[0], b[1] - a[1]), angle: Math.atan2(a[1] - b[1], b[0] - a[0])} : {far: 1, angle: 0};
+  }
+
   wheel(event) {
     event.preventDefault();
-    if (this.view.free) this.view.zoom = Math.min(Math.max(this.view.zoom * Math.exp(1e-3 * event.deltaY), 0.2), 5);
+    if (this.view.free) this.view.scale(Math.exp(1e-3 * event.deltaY));
     else this.move[2] += DEPTH * event.deltaY;
   }
 
@@ -76,25 +115,57 @@ export class Hand {
     else this.down.delete(name);
   }
 
-  // Returns what to tell, null where nothing is new.
-  say() {
-    const rate = [0, 0, 0, 0], held = new Set(this.grip ? ["grip"] : []);
+  keys() {
+    const rate = [0, 0, 0, 0], held = [];
     for (const name of this.down) {
       if (name in KEYS) rate[KEYS[name][0]] += KEYS[name][1];
-      else held.add(HOLD[name]);
+      else held.push(HOLD[name]);
     }
+    return {rate, held};
+  }
+
+  pads() {
+    const rate = [0, 0, 0, 0], held = [];
     for (const pad of navigator.getGamepads?.() ?? []) {
       if (!pad) continue;
       const stick = i => Math.abs(pad.axes[i] ?? 0) < DEAD ? 0 : pad.axes[i];
       [stick(0), -stick(1), stick(3), stick(2)].forEach((value, i) => rate[i] += value);
-      ["grip", "report", "clutch"].forEach((name, i) => pad.buttons[i]?.pressed && held.add(name));
+      ["grip", "report", "clutch"].forEach((name, i) => pad.buttons[i]?.pressed && held.push(name));
     }
+    return {rate, held};
+  }
+
+  buttons() {
+    const rate = [0, 0, 0, 0], held = this.grip ? ["grip"] : [];
+    for (const {dataset} of this.pressed) {
+      if (dataset.hold) held.push(dataset.hold);
+      else {
+        const [axis, way] = dataset.rate.split(",").map(Number);
+        rate[axis] += way;
+      }
+    }
+    return {rate, held};
+  }
+
+  // Returns what to tell.
+  say() {
+    const {left} = this, keys = this.keys(), pads = this.pads(), right = [this.buttons()];
     const move = this.move.map((x, i) => Math.min(Math.max(x, i < 3 ? -MOST : -3), i < 3 ? MOST : 3));
     this.move = [0, 0, 0, 0];
-    const words = {type: "hand", move, rate: rate.map(x => Math.min(Math.max(x, -1), 1)), buttons: [...held]};
-    const rest = JSON.stringify([words.rate, words.buttons]);
-    if (rest === this.said && move.every(x => x === 0)) return null;
-    this.said = rest;
-    return words;
+    if (left !== "keyboard") right.push(keys);
+    if (left !== "pad") right.push(pads);
+    const out = [this.words("right", right, move)];
+    if (left === "keyboard") out.push(this.words("left", [keys], [0, 0, 0, 0]));
+    if (left === "pad") out.push(this.words("left", [pads], [0, 0, 0, 0]));
+    return out.filter(Boolean);
+  }
+
+  // Returns the message about a hand, null where nothing is new.
+  words(which, sources, move) {
+    const rate = [0, 1, 2, 3].map(i => Math.min(Math.max(sources.reduce((sum, s) => sum + s.rate[i], 0), -1), 1));
+    const buttons = [...new Set(sources.flatMap(s => s.held))], rest = JSON.stringify([rate, buttons]);
+    if (rest === this.said[which] && move.every(x => x === 0)) return null;
+    this.said[which] = rest;
+    return {type: "hand", which, move, rate, buttons, at: performance.now() % CLOCK};
   }
 }

@@ -1,3 +1,5 @@
+# mujoco ships its bindings without type stubs:
+# pyright: reportAttributeAccessIssue=false
 """The loop: its thread owns the simulation, everything else is elsewhere."""
 
 from __future__ import annotations
@@ -67,21 +69,26 @@ class Loop:
       pace: 1 kHz, or the model's own time step, by default
       camera: that the devices' axes are of
     """
-    self._model, self._data = model, data
+    self._model, self._data, self._camera = model, data, camera
     self.pace = pace or Pace(model.opt.timestep)
-    h = model.opt.timestep
     mujoco.mj_forward(model, data)
-    self.links, self._handles, self._tips = [], [], []
-    for prefix, device in hands.items():
-      port, handle = trocar.trocar(model, prefix), Handle(model, data, prefix)
-      site = model.site(f"{prefix}tip").id
-      link, shaft = Link(device, options, h), Shaft(port)
-      tip = data.site_xpos[site].tolist()
-      link.attach(shaft, tip, shaft.quat(tip), axes(model, data, camera))
-      handle.move(tip, link.row[3:])
-      self.links.append(link)
-      self._handles.append(handle)
-      self._tips.append(data.site_xpos[site])
+    self.links = [Link(device, options, model.opt.timestep) for device in hands.values()]
+    self._handles = [Handle(model, data, prefix) for prefix in hands]
+    self._shafts = [Shaft(trocar.trocar(model, prefix)) for prefix in hands]
+    self._tips = [data.site_xpos[model.site(f"{prefix}tip").id] for prefix in hands]
+    self._jaws = [
+      mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, f"{prefix}jaw") for prefix in hands
+    ]
+    self.attach()
+
+  def attach(self) -> None:
+    """Couples the hands to their instruments where these are: nothing moves by this."""
+    turn = axes(self._model, self._data, self._camera)
+    for i, link in enumerate(self.links):
+      tip, shaft = self._tips[i].tolist(), self._shafts[i]
+      link.attach(shaft, tip, shaft.quat(tip), turn)
+      self._handles[i].move(tip, link.row[3:])
+    self._rows = [link.row for link in self.links]
 
   def run(
     self,
@@ -98,14 +105,14 @@ class Loop:
     """
     model, data, h = self._model, self._data, self._model.opt.timestep
     steps, k = duration / h, 0
-    rows = [link.row for link in self.links]
     try:
       with punctual(realtime):
         while k < steps and tick(self.pace, self.links, [tip.tolist() for tip in self._tips]):
           for i, (link, handle) in enumerate(zip(self.links, self._handles, strict=True)):
-            row, before, rows[i] = link.row, rows[i], link.row
+            row, before, self._rows[i] = link.row, self._rows[i], link.row
             vel = [(a - b) / h for a, b in zip(row[:3], before[:3], strict=True)]
             handle.move(row[:3], row[3:], vel, spin(before[3:], row[3:], h))
+          self._close_jaws()
           mujoco.mj_step(model, data)
           for link, handle in zip(self.links, self._handles, strict=True):
             link.feel(handle.wrench())
@@ -115,3 +122,10 @@ class Loop:
     finally:
       for link in self.links:
         link.quiet()
+
+  def _close_jaws(self) -> None:
+    """Opens and closes those that have some, as the hands do."""
+    for link, jaw in zip(self.links, self._jaws, strict=True):
+      if jaw >= 0:
+        low, high = self._model.actuator_ctrlrange[jaw]
+        self._data.ctrl[jaw] = low + (high - low) * (link.jaw + 1) / 2

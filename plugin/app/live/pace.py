@@ -172,7 +172,7 @@ def punctual(realtime: bool = False) -> Iterator[None]:
   interval = sys.getswitchinterval()
   collecting = gc.isenabled()
   slack = _timer_slack(1)
-  before = _first() if realtime else None
+  before = first() if realtime else None
   gc.collect()
   gc.disable()
   sys.setswitchinterval(1e-4)  # another thread's computing delays this one by no more
@@ -197,13 +197,18 @@ def _timer_slack(nanoseconds: int) -> int:
   return before if library.prctl(_SLACK, nanoseconds, 0, 0, 0) == 0 else 0
 
 
-def _first() -> tuple[int, os.sched_param] | None:
-  """Asks for this thread to go first; returns what was, None where it may not."""
+def first(priority: int = 10) -> tuple[int, os.sched_param] | None:
+  """Asks for this thread to go before other programs; returns what was, None where it may not.
+
+  Args:
+    priority: over other threads that do, in [1, 99]
+  """
   if not hasattr(os, "sched_setscheduler"):
     return None
   before = os.sched_getscheduler(0), os.sched_getparam(0)
   try:
-    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(10))
+    # What this thread starts goes as everybody else.
+    os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
   except OSError:
     return None
   return before

@@ -1,75 +1,157 @@
-// The page: picks an exercise, shows it and sends what the hand does.
-import {Hand} from "./hand.js";
+// The page: picks an exercise, shows it and sends what the hands do.
+import {kept, show} from "./card.js";
+import {CLOCK, Hand} from "./hand.js";
+import {Plot} from "./plots.js";
 import {View} from "./view.js";
 
 const $ = id => document.getElementById(id);
 const STATES = ["waiting", "ready", "clutch", "lost", "paused"];
-const SPAN = 300;  // frames in a plot
-const MEAN = 200;  // over which steps are counted [ms]
-const NOTE = [440, 0.08];  // of a warning [Hz], [s]
+const MEAN = 0.3;  // over which steps are counted [s]
+const AGAIN = 2000;  // between tries to reach the program [ms]
+const KEPT = 5000;  // of the times from hand to picture
+const TONES = {force: [880, 0.1], shaft: [660, 0.1], view: [330, 0.15], end: [523, 0.3]};  // [Hz], [s]
 
-const view = new View($("view"));
-let scene = null, frame = null, head = {}, running = false, paused = false, sound = null;
-const plots = {force: [], way: [], rate: []};
-const hand = new Hand($("view"), view, () => head);
+let view;
+try {
+  view = new View($("view"));
+} catch (error) {
+  $("welcome").textContent = `${error.message}: try another browser, or switch on its hardware acceleration`;
+  throw error;
+}
+let scene = null, frame = null, head = {}, rest = null, running = false, paused = false, sound = null;
+let fresh = false, echoed = 0, before = null, trace = null, trouble = "";
+const plots = {force: new Plot("force"), way: new Plot("way"), rate: new Plot("rate")};
+const ways = [], pictures = [];  // from hand to picture [ms]; when pictures were drawn
+const hand = new Hand($("view"), $("pad"), view, () => head);
 // For scripts that work through the page: numbers as `head` names them, targets after the geoms.
-window.palpate = () => ({scene, head, targets: targets()});
+window.palpate = () => ({scene, head, targets: targets(), ways, pictures, ghost: trace?.time.length ?? 0});
 
-const protocol = location.protocol === "https:" ? "wss:" : "ws:";
-const socket = new WebSocket(`${protocol}//${location.host}/socket${location.search}`);
-socket.binaryType = "arraybuffer";
+// The program.
+
+let socket = null;
+function connect() {
+  const protocol = location.protocol === "https:" ? "wss:" : "ws:";
+  socket = new WebSocket(`${protocol}//${location.host}/socket${location.search}`);
+  socket.binaryType = "arraybuffer";
+  socket.onmessage = event => {
+    if (event.data instanceof ArrayBuffer) take(new Float32Array(event.data));
+    else {
+      const message = JSON.parse(event.data);
+      HEAR[message.type]?.(message);
+    }
+  };
+  socket.onclose = () => {
+    run(false);
+    $("start").disabled = true;
+    if (!trouble) tell("The program is not to be reached; what was recorded is kept. Trying again");
+    setTimeout(connect, AGAIN);
+  };
+}
+connect();
 const say = message => socket.readyState === WebSocket.OPEN && socket.send(JSON.stringify(message));
-socket.onmessage = event => {
-  if (event.data instanceof ArrayBuffer) take(new Float32Array(event.data));
-  else {
-    const message = JSON.parse(event.data);
-    HEAR[message.type]?.(message);
-  }
-};
-socket.onclose = () => {
-  $("fault").textContent = "The program has ended; what was recorded is kept";
-  run(false);
-  $("start").disabled = true;
-};
+const tell = text => $("fault").textContent = text;
 
 const HEAR = {
-  menu({tasks, nodes, speeds, device}) {
-    fill($("task"), Object.entries(tasks).map(([name, what]) => [name, `${name}: ${what}`]));
-    fill($("nodes"), [["", "the exercise's"], ...nodes.map(n => [n, n])]);
-    fill($("speed"), speeds.map(s => [s, s === 1 ? "real time" : `${s} of real time`]).reverse());
+  menu(menu) {
+    trouble = "";
+    tell("");
+    const groups = Object.groupBy?.(Object.keys(menu.tasks), name => name.split("/")[0]) ?? {"": Object.keys(menu.tasks)};
+    keep("task", () => $("task").replaceChildren(...Object.entries(groups).map(([domain, names]) => {
+      const group = document.createElement("optgroup");
+      group.label = domain;
+      group.append(...names.map(name => new Option(`${name}: ${menu.tasks[name]}`, name)));
+      return group;
+    })));
+    fill("nodes", [["", "the exercise's"], ...menu.nodes.map(n => [n, `${n} nodes`])]);
+    fill("speed", menu.speeds.map(s => [s, s === 1 ? "real time" : `${s} of real time`]).reverse());
+    fill("scale", [1, 0.5, 0.25, 2].map(s => [s, s === 1 ? "as the hand's" : `${s} of the hand's`]));
+    fill("device", menu.devices.map(name => [name, name === "page" ? "mouse, touch, keys, gamepad" : name]));
+    fill("left", menu.lefts.map(name => [name, {"": "nothing", keyboard: "keys of the page", pad: "gamepad of the page"}[name] ?? name]));
+    for (const name of ["organ", "mesh", "scheme", "instrument"]) {
+      fill(name, menu[`${name === "mesh" ? "meshe" : name}s`].map(value => [value, value.replace("_", " ")]));
+    }
+    fill("step", menu.steps.map(value => [value, `${value} ms`]));
+    if (!scene) [$("step").value, $("mesh").value] = [1, "1000 nodes"];
+    if (menu.devices.includes(menu.device)) $("device").value = menu.device;
     const wanted = new URLSearchParams(location.hash.slice(1)).get("task");
-    if (wanted in tasks) $("task").value = wanted;
+    if (wanted in menu.tasks) $("task").value = wanted;
     $("start").disabled = false;
-    document.body.dataset.device = device;
+    document.body.dataset.device = menu.device;
   },
-  loading({task}) {
-    $("instruction").textContent = `${task} is being made ready`;
+  loading({text}) {
+    tell("");
+    $("instruction").textContent = `${text} is being made ready`;
   },
   scene(message) {
     scene = message;
+    frame = rest = trace = before = null;
+    pressed("ghost", false);
     view.load(scene);
-    for (const values of Object.values(plots)) values.length = 0;
-    start = null;
+    for (const plot of Object.values(plots)) plot.clear();
+    $("instruction").textContent = "";
+    document.body.classList.toggle("assessment", scene.assessment);
+    $("pad-grip").hidden = !scene.jaws;
+    $("pad-report").hidden = !scene.report;
     run(true);
   },
-  status({instruction, warning, fault}) {
-    $("instruction").textContent = instruction;
-    if (warning && warning !== $("warning").textContent) beep();
+  status({instruction, warning, kind, fault, scheme}) {
+    $("instruction").textContent = scene?.assessment ? "Assessment: no help" : instruction;
+    if (warning && kind !== $("stage").dataset.warning) beep(kind);
     $("warning").textContent = warning;
-    $("fault").textContent = fault;
+    $("stage").dataset.warning = kind;
+    if (fault !== trouble) tell(trouble = fault);
+    if (scheme) $("scheme").value = scheme;
+  },
+  ghost(message) {
+    trace = message;
+    tell("");
+    const path = [];
+    for (const pose of trace.pose) {
+      const last = path.at(-1) ?? [1, 1, 1];
+      if (Math.hypot(pose[0] - last[0], pose[1] - last[1], pose[2] - last[2]) > 0.002) path.push(pose.slice(0, 3));
+    }
+    trace.path = path;
+    trace.since = performance.now();
   },
   card(message) {
     run(false);
-    show(message);
+    beep("end");
+    const save = message.fault ? [["Save again", () => say({type: "keep"})]] : [];
+    const again = ["Once more", () => ($("card").close(), start())];
+    show($("card"), message, [...save, again, ["Close", () => $("card").close()]]);
+  },
+  kept({path, fault}) {
+    $("kept")?.replaceWith(kept(path, fault));
+  },
+  idle() {
+    run(false);
   },
   error({text}) {
-    $("fault").textContent = text;
-    if (!running) $("start").disabled = false;
+    tell(text);
+    if (!running && socket.readyState === WebSocket.OPEN) $("start").disabled = false;
+    if (text.startsWith("all places")) trouble = text;
+    if (!trace) pressed("ghost", false);
   },
 };
 
-function fill(select, rows) {
-  select.replaceChildren(...rows.map(([value, text]) => new Option(text, value)));
+// Fills a choice and keeps what was chosen.
+function fill(name, rows) {
+  keep(name, () => $(name).replaceChildren(...rows.map(([value, text]) => new Option(text, value))));
+}
+function keep(name, change) {
+  const {value} = $(name);
+  change();
+  if ([...$(name).options].some(option => option.value === value)) $(name).value = value;
+}
+
+// What runs.
+
+const practice = () => document.body.dataset.mode === "practice";
+function mode(name) {
+  document.body.dataset.mode = name;
+  for (const each of ["exercise", "practice"]) $(`tab-${each}`).setAttribute("aria-selected", each === name);
+  $("welcome").textContent = name === "practice" ? "Choose an organ and press Start; everything may be changed while it runs."
+    : "Choose an exercise and press Start.";
 }
 
 function run(on) {
@@ -78,36 +160,90 @@ function run(on) {
   $("pause").textContent = "Pause";
   $("pause").disabled = $("stop").disabled = !on;
   $("start").disabled = on;
-  if (!on) $("instruction").textContent = $("warning").textContent = "";
+  $("ghost").disabled = !on || !scene || scene.practice || scene.assessment;
+  $("welcome").hidden = on || Boolean(frame);
+  hand.release();
+  if (on) $("welcome").textContent = "";
+  else {
+    $("instruction").textContent = $("warning").textContent = "";
+    $("stage").dataset.warning = "";
+    pressed("ghost", false);
+  }
 }
 
-let start = null, before = null;
+function start() {
+  $("start").disabled = true;
+  $("more").open = false;
+  tell("");
+  $("welcome").textContent = "";
+  const common = {speed: Number($("speed").value), scale: Number($("scale").value)};
+  if (practice()) {
+    hand.left = $("left").value;
+    say({
+      type: "practice", organ: $("organ").value, mesh: $("mesh").value, scheme: $("scheme").value, left: hand.left,
+      instrument: $("instrument").value, step: Number($("step").value), ...common,
+    });
+  } else {
+    hand.left = "";
+    say({
+      type: "start", task: $("task").value, seed: Number($("seed").value), person: $("person").value,
+      nodes: $("nodes").value ? Number($("nodes").value) : null, assessment: $("assessment").checked, ...common,
+    });
+  }
+  $("view").focus();
+}
+
 function take(numbers) {
   if (!scene) return;
-  frame = numbers;
+  const from = scene.head.length, nodes = numbers.subarray(from, from + 3 * scene.nodes);
   head = Object.fromEntries(scene.head.map((name, i) => [name, numbers[i]]));
-  const tip = [head.tip_x, head.tip_y, head.tip_z], now = performance.now();
-  start ??= tip;
-  const over = head.force > scene.force_limit;
-  push("force", head.force);
-  push("way", 1e3 * Math.hypot(...tip.map((x, i) => x - start[i])));
-  if (before && head.steps < before.steps) before = null;
-  if (before && now - before.now > MEAN) {
-    push("rate", 1e3 * (head.steps - before.steps) / (now - before.now));
-    before = null;
+  frame = numbers;
+  fresh = true;
+  rest ??= nodes.slice();
+  const {force_limit: limit} = scene;
+  plots.force.push(head.force);
+  plots.way.push(1e3 * displacement(nodes));
+  before ??= head;
+  const span = head.clock - before.clock;
+  if (span > MEAN) {
+    const steps = head.steps - before.steps;
+    plots.rate.push(steps / span);
+    report(steps / span, 1 - (head.missed - before.missed) / Math.max(steps, 1), (head.time - before.time) / span);
+    before = head;
   }
-  before ??= {steps: head.steps, now};
-  const most = Math.max(scene.damage, 1.2 * scene.force_limit);
-  $("force").classList.toggle("over", over);
-  $("stage").classList.toggle("over", over);
+  const most = Math.max(scene.damage, 1.2 * limit);
+  $("force").classList.toggle("near", head.force > 0.75 * limit);
+  $("force").classList.toggle("over", head.force > limit);
+  if (head.force > limit && !scene.assessment && !$("stage").dataset.warning) $("stage").dataset.warning = "force";
+  else if (!$("warning").textContent && head.force <= limit) $("stage").dataset.warning = "";
   $("force").firstElementChild.style.width = `${Math.min(100 * head.force / most, 100)}%`;
-  $("force").lastElementChild.style.left = `${100 * scene.force_limit / most}%`;
-  $("force-text").textContent = `${head.force.toFixed(2)} N of ${scene.force_limit} N`;
+  $("force").lastElementChild.style.left = `${100 * limit / most}%`;
+  $("force-text").textContent = `${head.force.toFixed(2)} N, limit ${limit} N`;
   $("progress").value = Math.max(head.progress, 0);
-  $("progress-text").textContent = `${Math.round(100 * head.progress)} %`;
-  const state = STATES[head.state];
-  $("time").textContent = `${head.time.toFixed(1)} of ${scene.time_limit.toFixed(0)} s`
-    + (state === "ready" ? "" : `, ${state}`);
+  $("progress-text").textContent = `${Math.round(100 * Math.max(head.progress, 0))} %`;
+  const state = STATES[head.state], limited = scene.time_limit ? ` of ${scene.time_limit.toFixed(0)}` : "";
+  $("time").textContent = `${head.time.toFixed(1)}${limited} s${state === "ready" ? "" : `, ${state}`}`;
+}
+
+// How far the node that is nearest to the tip is from where it was at first [m].
+function displacement(nodes) {
+  const {tip_x: x, tip_y: y, tip_z: z} = head;
+  let best = Infinity, at = 0;
+  for (let i = 0; i < nodes.length; i += 3) {
+    const [u, v, w] = [nodes[i] - x, nodes[i + 1] - y, nodes[i + 2] - z], far = u * u + v * v + w * w;
+    if (far < best) [best, at] = [far, i];
+  }
+  return Math.hypot(nodes[at] - rest[at], nodes[at + 1] - rest[at + 1], nodes[at + 2] - rest[at + 2]);
+}
+
+function report(steps, punctual, share) {
+  const now = performance.now(), late = ways.slice(-30).sort((a, b) => a - b);
+  const words = [`${Math.round(steps)} steps a second`, `${(100 * punctual).toFixed(1)} % on time`];
+  const wanted = Number($("speed").value);
+  if (share < 0.95 * wanted) words.push(`${share.toPrecision(2)} of real time`);
+  words.push(`${pictures.filter(t => now - t < 1000).length} pictures a second`);
+  if (late.length) words.push(`hand to picture ${Math.round(late[late.length >> 1])} ms`);
+  $("loop").textContent = words.join(", ");
 }
 
 function targets() {
@@ -116,91 +252,61 @@ function targets() {
   return Array.from({length: scene.targets}, (_, i) => [...frame.subarray(from + 8 * i, from + 8 * i + 8)]);
 }
 
-function push(name, value) {
-  plots[name].push(value);
-  if (plots[name].length > SPAN) plots[name].shift();
-}
-
-function plot(name, limit) {
-  const canvas = $(`plot-${name}`), pen = canvas.getContext("2d"), values = plots[name];
-  const {width, height} = canvas, most = Math.max(...values, 1.2 * (limit ?? 0), 1e-3);
-  pen.clearRect(0, 0, width, height);
-  const y = value => height - 4 - (height - 16) * value / most;
-  if (limit) {
-    pen.strokeStyle = "#e5484d";
-    pen.beginPath();
-    pen.moveTo(0, y(limit));
-    pen.lineTo(width, y(limit));
-    pen.stroke();
-  }
-  pen.strokeStyle = "#4cd39b";
-  pen.beginPath();
-  values.forEach((value, i) => pen.lineTo(width * i / SPAN, y(value)));
-  pen.stroke();
-  pen.fillStyle = "#9fb0b8";
-  pen.fillText(`${values.at(-1)?.toPrecision(3) ?? ""}  (top ${most.toPrecision(3)})`, 4, 10);
-}
-
 function draw() {
-  if (running) {
-    const words = hand.say();
-    if (words) say(words);
-  }
-  if (frame) {
-    view.draw(frame, head);
-    plot("force", scene.force_limit);
-    plot("way");
-    plot("rate");
-  }
   requestAnimationFrame(draw);
+  if (running) hand.say().forEach(say);
+  if (!frame) return;
+  view.draw(frame, head, trace && $("ghost").getAttribute("aria-pressed") === "true" ? trace : null);
+  if (!fresh) return;
+  fresh = false;
+  const now = performance.now();
+  pictures.push(now);
+  if (pictures.length > KEPT) pictures.shift();
+  if (head.echo !== echoed) {
+    echoed = head.echo;
+    ways.push((now - echoed + CLOCK) % CLOCK);
+    if (ways.length > KEPT) ways.shift();
+  }
+  plots.force.draw(scene.force_limit);
+  plots.way.draw();
+  plots.rate.draw(undefined, 0);
 }
 requestAnimationFrame(draw);
 
-function show({advice, composite, proficient, rows, path, fault}) {
-  const card = $("card"), make = (tag, text, kind) => {
-    const element = document.createElement(tag);
-    element.textContent = text;
-    if (kind) element.className = kind;
-    return element;
-  };
-  const table = document.createElement("table");
-  const line = (tag, cells, kind) => {
-    const row = document.createElement("tr");
-    row.append(...cells.map(cell => make(tag, cell, kind)));
-    table.append(row);
-  };
-  line("th", ["metric", "value", "limit", "unit"]);
-  rows.forEach(r => line("td", [r.label, r.value, r.limit, r.unit], r.over ? "bad" : ""));
-  const close = make("button", "Close");
-  close.onclick = () => card.close();
-  card.replaceChildren(
-    make("h2", composite === null ? "No score" : `Score ${composite}`, proficient ? "good" : ""),
-    ...advice.map(text => make("p", text)), table, make("p", `Recording: ${path}`),
-    ...(fault ? [make("p", fault, "bad")] : []), close,
-  );
-  card.showModal();
-}
-
-function beep() {
+function beep(kind) {
   if (!$("sound").checked) return;
   sound ??= new AudioContext();
-  const tone = sound.createOscillator(), [pitch, length] = NOTE;
+  const tone = sound.createOscillator(), gain = sound.createGain(), [pitch, length] = TONES[kind] ?? TONES.force;
+  document.body.dataset.tone = kind;  // for those who do not hear it, and for tests
   tone.frequency.value = pitch;
-  tone.connect(sound.destination);
+  gain.gain.value = 0.2;
+  tone.connect(gain).connect(sound.destination);
   tone.start();
   tone.stop(sound.currentTime + length);
 }
 
-$("start").onclick = () => {
-  $("start").disabled = true;
-  $("fault").textContent = "";
-  say({
-    type: "start", task: $("task").value, seed: Number($("seed").value), person: $("person").value,
-    nodes: $("nodes").value ? Number($("nodes").value) : null, speed: Number($("speed").value),
-    assessment: $("assessment").checked,
-  });
+// The buttons.
+
+const pressed = (id, on) => $(id).setAttribute("aria-pressed", on);
+const toggle = (id, act) => $(id).onclick = () => {
+  const on = $(id).getAttribute("aria-pressed") !== "true";
+  pressed(id, on);
+  act(on);
   $("view").focus();
 };
+toggle("wire", on => view.wire = on);
+toggle("free", on => {
+  view.free = on;
+  if (!on) view.home();
+});
+toggle("ghost", on => {
+  if (!on) return;
+  say({type: "ghost", known: Boolean(trace)});
+  if (trace) trace.since = performance.now();
+  else tell("The expert's way is being worked out");
+});
+for (const name of ["exercise", "practice"]) $(`tab-${name}`).onclick = () => mode(name);
+$("start").onclick = start;
 $("stop").onclick = () => say({type: "stop"});
 $("pause").onclick = () => {
   paused = !paused;
@@ -209,6 +315,16 @@ $("pause").onclick = () => {
   $("view").focus();
 };
 $("speed").onchange = () => running && say({type: "speed", value: Number($("speed").value)});
-$("wire").onchange = () => view.wire = $("wire").checked;
-$("free").onchange = () => view.free = $("free").checked;
-$("view").addEventListener("keydown", event => event.key === "p" && running && $("pause").click());
+$("device").onchange = () => say({type: "device", value: $("device").value});
+$("scheme").onchange = () => running && scene.practice && say({type: "scheme", value: $("scheme").value});
+// Another organ, mesh, ... is another scene.
+for (const name of ["organ", "mesh", "instrument", "step", "left"]) {
+  $(name).onchange = () => running && scene.practice && start();
+}
+$("view").addEventListener("keydown", event => {
+  if (!running) return;
+  if (event.key === "p") $("pause").click();
+  if (event.key === "h" && !$("ghost").disabled) $("ghost").click();
+});
+document.addEventListener("pointerdown", event => $("more").contains(event.target) || ($("more").open = false));
+if (matchMedia("(pointer: coarse)").matches) document.body.classList.add("touch");

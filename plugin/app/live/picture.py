@@ -4,43 +4,123 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from typing import Any
 
 import mujoco as mj
 import numpy as np
 import trimesh
+from palpate import Organ
 
-# Numbers at the head of a frame, before the nodes, the geoms' places and the targets.
+from .coupling import Link
+from .pace import Pace
+
+# Numbers at the head of a frame, before the nodes, the geoms' places and the targets; `echo` is the
+# page's own clock when it sent the movement that is shown, `clock` the loop's [s].
 HEAD = (
-  "time", "progress", "force", "shaft", "felt", "push", "missed", "steps", "state",
-  "tip_x", "tip_y", "tip_z",
+  "time", "progress", "force", "shaft", "felt", "push", "missed", "steps", "state", "echo", "clock",
+  "tip_x", "tip_y", "tip_z", "tip_qw", "tip_qx", "tip_qy", "tip_qz",
 )  # fmt: skip
 STATES = ("waiting", "ready", "clutch", "lost", "paused")
+_SENSORS = ("tip_force", "shaft_force", "tip_pos", "tip_quat")
 
 
-def shapes(env: Any) -> dict[str, Any]:
-  """Returns what is drawn of an exercise, JSON: organ, geoms, targets, camera and limits."""
-  physics, task = env.physics, env.task
-  model = physics.model.ptr
-  eye, turn, fovy = physics.camera()
-  flex = mj.mj_name2id(model, mj.mjtObj.mjOBJ_FLEX, physics.organ_name)
-  drawn = _drawn(model)
-  return {
-    "type": "scene",
-    "task": task.name,
-    "nodes": len(physics.nodes()),
-    "triangles": physics.organ.elem.ravel().tolist(),
-    "organ": [round(float(c), 3) for c in model.flex_rgba[flex]],
-    "geoms": [_geom(model, g) for g in drawn],
-    "targets": len(physics.target_sites),
-    "camera": {"pos": eye.tolist(), "mat": turn.ravel().tolist(), "fovy": fovy},
-    "force_limit": task.force_limit,
-    "damage": task.damage,
-    "time_limit": env.step_limit * env.control_timestep(),
-    "jaws": task.jaws,
-    "report": "report" in task.extra,
-    "head": HEAD,
-  }
+class Camera:
+  """Takes frames of one model; for the loop's thread, some tens of microseconds each.
+
+  Attributes:
+    model: that it takes them of
+    peak: largest force of the tip in the frames so far [N]
+  """
+
+  def __init__(
+    self, model: mj.MjModel, data: mj.MjData, organ: Organ, prefix: str, sites: Sequence[int] = ()
+  ):
+    """Takes the scene as it is now.
+
+    Args:
+      model: the scene
+      data: its state
+      organ: that is drawn
+      prefix: of the instrument in the right hand
+      sites: of targets
+    """
+    self.model, self._data, self._organ = model, data, organ
+    self._prefix, self._geoms, self._sites = prefix, _drawn(model), list(sites)
+    self._sensors = []
+    for name in _SENSORS:
+      sensor = model.sensor(prefix + name)
+      adr = int(sensor.adr[0])
+      self._sensors.append(data.sensordata[adr : adr + int(sensor.dim[0])])
+    self._rest, self.peak, self._begun = organ.xpos0, 0.0, 0.0
+
+  @classmethod
+  def of(cls, env: Any) -> Camera:
+    """Returns the camera of an exercise."""
+    physics = env.physics
+    args = physics.model.ptr, physics.data.ptr, physics.organ, physics.prefix
+    return cls(*args, physics.target_sites)
+
+  def shapes(self, **more: Any) -> dict[str, Any]:
+    """Returns what is drawn, JSON: organ, geoms, targets, camera, and what the caller adds."""
+    model, data = self.model, self._data
+    eye = model.camera("laparoscope").id
+    return {
+      "type": "scene",
+      "nodes": self._organ.nvert,
+      "triangles": self._organ.elem.ravel().tolist(),
+      "organ": _organ_colour(model, self._organ.name),
+      "geoms": [_geom(model, g) | {"mine": self._mine(g)} for g in self._geoms],
+      "targets": len(self._sites),
+      "camera": {
+        "pos": data.cam_xpos[eye].tolist(),
+        "mat": data.cam_xmat[eye].ravel().tolist(),
+        "fovy": float(model.cam_fovy[eye]),
+      },
+      "head": HEAD,
+      **more,
+    }
+
+  def _mine(self, g: int) -> bool:
+    """Whether a geom goes where the tip goes: what hangs on the shaft's joint, not the port."""
+    model, body = self.model, int(self.model.geom_bodyid[g])
+    shaft = int(model.joint(f"{self._prefix}insertion").bodyid[0])
+    while body and body != shaft:
+      body = int(model.body_parentid[body])
+    return body == shaft
+
+  def frame(self, link: Link, pace: Pace, progress: float = 0.0) -> bytes:
+    """Returns a frame, float32: `HEAD`, nodes, geoms (place, matrix), targets (8 numbers each)."""
+    data, model, late = self._data, self.model, pace.lateness
+    tip, shaft, pos, quat = self._sensors
+    force = float(np.linalg.norm(tip))
+    self.peak = max(self.peak, force)
+    self._begun = self._begun or pace.now
+    state = "paused" if pace.paused or link.paused else link.state
+    felt = math.hypot(*link.force)
+    head = (
+      data.time, progress, force, float(np.linalg.norm(shaft)), felt, self.peak, late.missed,
+      late.steps, STATES.index(state), link.device.stamp, pace.now - self._begun,
+      *pos, *quat,
+    )  # fmt: skip
+    geoms, sites = self._geoms, self._sites
+    parts = (
+      head,
+      (self._rest + self._organ.displacement).ravel(),
+      np.hstack([data.geom_xpos[geoms], data.geom_xmat[geoms]]).ravel(),
+      np.hstack(
+        [data.site_xpos[sites], model.site_rgba[sites], model.site_size[sites, :1]]
+      ).ravel(),
+    )
+    return np.concatenate(parts, dtype=np.float32, casting="unsafe").tobytes()
+
+
+def _organ_colour(model: mj.MjModel, name: str) -> list[float]:
+  flex = mj.mj_name2id(model, mj.mjtObj.mjOBJ_FLEX, name)
+  skin = int(model.flex_matid[flex])
+  colour = model.mat_rgba[skin] if skin >= 0 else model.flex_rgba[flex]
+  return [round(float(c), 3) for c in colour]
 
 
 def _drawn(model: mj.MjModel) -> list[int]:
@@ -82,36 +162,3 @@ def _geom(model: mj.MjModel, g: int) -> dict[str, Any]:
     "triangles": np.asarray(triangles).ravel().tolist(),
     "rgba": [round(float(c), 3) for c in _colours(model)[g]],
   }
-
-
-class Camera:
-  """Takes frames of one model; for the loop's thread, some tens of microseconds each."""
-
-  def __init__(self, env: Any):
-    """Takes the scene as it is now."""
-    self._env, model = env, env.physics.model.ptr
-    self.model = model
-    self._geoms, self._sites = _drawn(model), env.physics.target_sites
-
-  def frame(self, session: Any) -> bytes:
-    """Returns a frame, float32: `HEAD`, nodes, geoms (place, matrix), targets (8 numbers each)."""
-    env, physics = self._env, self._env.physics
-    data, model, late = physics.data.ptr, self.model, session.pace.lateness
-    wrench = physics.handle.wrench()
-    tip, nodes = physics.tip_pos(), physics.nodes()
-    state = "paused" if session.pace.paused or session.link.paused else session.link.state
-    head = (
-      data.time, env.task.progress, float(np.linalg.norm(physics.contact_force())),
-      float(np.linalg.norm(physics.shaft_force())), float(np.linalg.norm(wrench[:3])),
-      env.task.peak, late.missed, late.steps, STATES.index(state), *tip,
-    )  # fmt: skip
-    geoms, sites = self._geoms, self._sites
-    parts = (
-      head,
-      nodes.ravel(),
-      np.hstack([data.geom_xpos[geoms], data.geom_xmat[geoms]]).ravel(),
-      np.hstack(
-        [data.site_xpos[sites], model.site_rgba[sites], model.site_size[sites, :1]]
-      ).ravel(),
-    )
-    return np.concatenate(parts, dtype=np.float32, casting="unsafe").tobytes()

@@ -20,13 +20,13 @@ from websockets.sync.server import ServerConnection, serve
 
 from . import worker
 
-_FILES = {
-  "/": ("page.html", "text/html"),
-  "/page.js": ("page.js", "text/javascript"),
-  "/view.js": ("view.js", "text/javascript"),
-  "/hand.js": ("hand.js", "text/javascript"),
-  "/page.css": ("page.css", "text/css"),
-}
+_KINDS = {"js": "text/javascript", "css": "text/css", "svg": "image/svg+xml"}
+_FILES = {"/": ("page.html", "text/html")} | {
+  f"/{name}": (name, _KINDS[name.rpartition(".")[2]])
+  for name in (
+    "page.js", "card.js", "hand.js", "plots.js", "view.js", "page.css", "icon.svg",
+  )
+}  # fmt: skip
 _LARGEST = 4096  # message from a page [bytes]
 _PATIENCE = 10.0  # for a page's process to keep its recording [s]
 _POLICY = "default-src 'self'; connect-src 'self' ws: wss:; frame-ancestors 'none'"

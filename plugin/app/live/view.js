@@ -47,10 +47,19 @@ export class View {
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA);
     this.wire = this.free = false;
+    this.home();
+    this.ball = this.shape(...sphere(12));
+  }
+
+  // The free view where the laparoscope is.
+  home() {
     this.turn = [0, 0];
     this.shift = [0, 0];
     this.zoom = 1;
-    this.ball = this.shape(...sphere(12));
+  }
+
+  scale(factor) {
+    this.zoom = Math.min(Math.max(this.zoom * factor, 0.2), 5);
   }
 
   shape(places, triangles) {
@@ -102,9 +111,10 @@ export class View {
     return {at, axes, fovy};
   }
 
-  draw(frame, head) {
+  draw(frame, head, expert) {
     const gl = this.gl, {canvas, scene} = this;
-    const width = canvas.clientWidth, height = canvas.clientHeight;
+    const fine = Math.min(devicePixelRatio || 1, 2);
+    const width = Math.round(fine * canvas.clientWidth), height = Math.round(fine * canvas.clientHeight);
     if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
     gl.viewport(0, 0, width, height);
     gl.clearColor(0.07, 0.02, 0.02, 1);
@@ -113,6 +123,7 @@ export class View {
     gl.uniformMatrix4fv(this.at("clip"), false, clip(at, axes, fovy, width / height));
     gl.uniform3fv(this.at("eye"), at);
     let from = scene.head.length;
+    const places = from + 3 * scene.nodes;
     this.put(this.organ, frame.subarray(from, from += 3 * scene.nodes));
     this.paint(this.organ, UNIT, scene.organ, this.wire);
     this.geoms.forEach((geom, i) => {
@@ -123,6 +134,22 @@ export class View {
       const p = frame.subarray(from, from += 8);
       if (p[6] > 0.05) this.paint(this.ball, ball(p), p.subarray(3, 7), false);
     }
+    if (expert) this.show(expert, frame, places, head);
+  }
+
+  // The expert's way, and the instrument where the expert has it now.
+  show({time, pose: poses, path, since}, frame, from, head) {
+    const now = (performance.now() - since) / 1e3 % (time.at(-1) + 1);
+    path.forEach(([x, y, z]) => this.paint(this.ball, ball([x, y, z, 0, 0, 0, 0, 0.0006]), WAY, false));
+    let k = time.findIndex(t => t >= now);
+    if (k < 0) k = time.length - 1;
+    const [x, y, z, ...quat] = poses[k];
+    const tip = inverse(rigid([head.tip_x, head.tip_y, head.tip_z], [head.tip_qw, head.tip_qx, head.tip_qy, head.tip_qz]));
+    const move = times(rigid([x, y, z], quat), tip);
+    this.scene.geoms.forEach((geom, i) => {
+      const p = frame.subarray(from + 12 * i, from + 12 * i + 12);
+      if (geom.mine) this.paint(this.geoms[i], times(move, pose(p, p.subarray(3))), GHOST, false);
+    });
   }
 
   paint(shape, matrix, colour, wire) {
@@ -147,6 +174,7 @@ export class View {
   }
 }
 
+const WAY = [0.35, 0.95, 0.75, 1], GHOST = [0.35, 0.95, 0.75, 0.4];
 const UNIT = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1];
 const add = (a, b) => a.map((x, i) => x + b[i]);
 const sub = (a, b) => a.map((x, i) => x - b[i]);
@@ -156,6 +184,21 @@ const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 // Columns of a matrix in rows, as MuJoCo has it, and a place.
 const pose = (p, m) => [m[0], m[3], m[6], 0, m[1], m[4], m[7], 0, m[2], m[5], m[8], 0, p[0], p[1], p[2], 1];
 const ball = p => [p[7], 0, 0, 0, 0, p[7], 0, 0, 0, 0, p[7], 0, p[0], p[1], p[2], 1];
+
+// Motions as matrices in columns.
+function rigid([x, y, z], [a, b, c, d]) {
+  return [1 - 2 * (c * c + d * d), 2 * (b * c + a * d), 2 * (b * d - a * c), 0,
+    2 * (b * c - a * d), 1 - 2 * (b * b + d * d), 2 * (c * d + a * b), 0,
+    2 * (b * d + a * c), 2 * (c * d - a * b), 1 - 2 * (b * b + c * c), 0, x, y, z, 1];
+}
+function times(a, b) {
+  return Array.from({length: 16}, (_, k) => [0, 1, 2, 3].reduce((sum, i) => sum + a[4 * i + k % 4] * b[4 * (k >> 2) + i], 0));
+}
+function inverse(m) {
+  const [x, y, z] = [m[12], m[13], m[14]];
+  return [m[0], m[4], m[8], 0, m[1], m[5], m[9], 0, m[2], m[6], m[10], 0,
+    -(m[0] * x + m[1] * y + m[2] * z), -(m[4] * x + m[5] * y + m[6] * z), -(m[8] * x + m[9] * y + m[10] * z), 1];
+}
 
 function clip(at, [r, u, b], fovy, aspect, near = 0.005, far = 2) {
   const f = 1 / Math.tan(fovy * Math.PI / 360), [p, q] = [-dot(r, at), -dot(u, at)], s = -dot(b, at);

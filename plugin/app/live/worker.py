@@ -5,10 +5,12 @@ Messages to here are JSON; from here JSON (`T` before it) or frames of a picture
 
 from __future__ import annotations
 
+import contextlib
 import json
 import pathlib
 import queue
-import tempfile
+import subprocess
+import sys
 import threading
 import time
 from multiprocessing.connection import Connection
@@ -16,16 +18,21 @@ from typing import Any
 
 import palpate
 
-from . import devices, picture
+from . import devices, ghost, menu
 from .coach import Coach, card
 from .coupling import Options
 from .desk import Desk
 from .device import Device, DeviceError
+from .keep import Finished
+from .pace import first
+from .picture import Camera
+from .practice import DAMAGE, LIMIT, Practice
 from .session import Session
 
-NODES = (250, 500, 1000, 2000, 4000)
-SPEEDS = (0.1, 0.25, 0.5, 1.0)
 _STATUS = 0.1  # between words about the exercise [s]
+_WORDS = (
+  "hand", "start", "practice", "scheme", "device", "ghost", "keep", "pause", "speed", "stop",
+)  # fmt: skip
 
 
 def main(conn: Connection, folder: str, device: str) -> None:
@@ -48,26 +55,36 @@ class Worker:
 
   def __init__(self, conn: Connection, folder: pathlib.Path, device: str):
     """Takes the arguments of `main`."""
-    self._conn, self._folder, self._device = conn, folder, device
+    self._conn, self._folder, self._own = conn, folder, device
+    self._device = "page" if devices.on_page(device) else device
     self._jobs: queue.SimpleQueue[dict | None] = queue.SimpleQueue()
-    self._session: Session | None = None
-    self._desk: Desk | None = None
+    self._now: Session | Practice | None = None  # what runs
+    self._job: dict[str, Any] = {}
+    self._desks: dict[str, Desk] = {}  # hands on the page, by the message's `which`
     self._lock = threading.Lock()  # of the connection
     self._frame: bytes | None = None
     self._fresh = threading.Event()
-    self._camera: picture.Camera | None = None
+    self._camera: Camera | None = None
+    self._unkept: Finished | None = None
+    self._expert: subprocess.Popen | None = None
     self._ended = False
 
   def serve(self) -> None:
     """Works until the end."""
     for target in (self._receive, self._show):
       threading.Thread(target=target, daemon=True).start()
-    self._tell(menu(self._device))
+    self._tell(menu.offer(self._own))
     while (job := self._jobs.get()) is not None:
+      if not self._jobs.empty():  # something else was asked for since
+        continue
       try:
-        self._exercise(job)
-      except (ValueError, TypeError, OSError, DeviceError) as error:
+        self._job = job
+        self._exercise(job) if job["type"] == "start" else self._practise(job)
+      except (ValueError, TypeError, OSError, DeviceError, RuntimeError) as error:
         self._fault(error)
+        self._tell({"type": "idle"})
+    if self._unkept is not None and not self._unkept.keep(self._folder):
+      print(f"palpate: a recording is lost: {self._unkept.fault}", file=sys.stderr)
 
   # Words.
 
@@ -76,175 +93,237 @@ class Worker:
       if not self._ended:
         self._conn.send_bytes(b"T" + json.dumps(message).encode())
 
-  def _fault(self, error: Exception) -> None:
+  def _fault(self, error: Exception | str) -> None:
     self._tell({"type": "error", "text": " ".join(str(error).split())})
 
   def _receive(self) -> None:
     """Takes messages, in a thread of its own."""
+    first(1)  # behind the loop's, before other programs: the loop may wait for it
     while not self._ended:
       try:
         message = json.loads(self._conn.recv_bytes())
         self._obey(message)
       except (EOFError, OSError):
         self._end()
-      except (ValueError, TypeError, KeyError) as error:
+      except (ValueError, TypeError, KeyError, DeviceError) as error:
         self._fault(error)
 
   def _obey(self, message: Any) -> None:
     kind = message.get("type") if isinstance(message, dict) else None
-    session = self._session
-    if kind == "hand":
-      if self._desk is not None:
-        given = {k: message[k] for k in ("move", "rate", "buttons", "jaw") if k in message}
-        self._desk.feed(**given)
-    elif kind == "start":
-      job = check(message)
-      if session is not None:
-        session.pace.stopped = True
-      self._jobs.put(job)
-    elif kind == "pause" and session is not None:
-      session.pace.paused = message.get("on") is True
-    elif kind == "speed" and session is not None:
-      session.pace.speed = _choice("speed", message.get("value"), SPEEDS)
-    elif kind == "stop" and session is not None:
-      session.pace.stopped = True
-    elif kind == "end":
+    if kind == "end":
       self._end()
-    elif kind not in ("pause", "speed", "stop"):
-      text = str(message)[:60]
-      raise ValueError(f"message is {text!r}, expected hand, start, pause, speed, stop")
+    elif kind in _WORDS:
+      getattr(self, f"_on_{kind}")(message)
+    else:
+      raise ValueError(f"message is {str(message)[:60]!r}, expected {', '.join(_WORDS)}")
+
+  def _on_hand(self, message: dict[str, Any]) -> None:
+    desk = self._desks.get(message.get("which", "right"))
+    if desk is not None:
+      desk.feed(**{k: message[k] for k in ("move", "rate", "buttons", "jaw", "at") if k in message})
+
+  def _on_start(self, message: dict[str, Any]) -> None:
+    self._put(menu.exercise(message))
+
+  def _on_practice(self, message: dict[str, Any]) -> None:
+    self._put(menu.practice(message, self._own))
+
+  def _put(self, job: dict[str, Any]) -> None:
+    self._stop()
+    if self._expert is not None:
+      self._expert.kill()
+    self._jobs.put(job)
+
+  def _on_scheme(self, message: dict[str, Any]) -> None:
+    scheme = menu.choice("scheme", message.get("value"), menu.SCHEMES)
+    if not isinstance(self._now, Practice):
+      raise ValueError("the scheme may change in free practice alone")
+    self._now.change(scheme)
+
+  def _on_device(self, message: dict[str, Any]) -> None:
+    name = menu.choice("device", message.get("value"), menu.devices(self._own))
+    if self._now is None:
+      self._device = name
+    elif name != self._device:
+      self._now.link.change(self._open(name))
+      self._device = name
+
+  def _on_ghost(self, message: dict[str, Any]) -> None:
+    session = self._now
+    if not isinstance(session, Session) or self._job["assessment"]:
+      raise ValueError("the expert is shown in exercises alone, and not in an assessment")
+    session.coach.hint("the expert was shown")
+    if self._expert is None and message.get("known") is not True:
+      threading.Thread(target=self._show_expert, args=(self._job,), daemon=True).start()
+
+  def _on_keep(self, message: dict[str, Any]) -> None:
+    if self._unkept is not None:
+      done = self._unkept
+      self._unkept = None if done.keep(self._folder) and not done.fault else done
+      self._tell({"type": "kept", "path": str(done.path or ""), "fault": done.fault})
+
+  def _on_pause(self, message: dict[str, Any]) -> None:
+    if self._now is not None:
+      self._now.pace.paused = message.get("on") is True
+
+  def _on_speed(self, message: dict[str, Any]) -> None:
+    speed = menu.choice("speed", message.get("value"), menu.SPEEDS)
+    if self._now is not None:
+      self._now.pace.speed = speed
+
+  def _on_stop(self, message: dict[str, Any]) -> None:
+    self._stop()
+
+  def _stop(self) -> None:
+    if self._now is not None:
+      self._now.pace.stopped = True
 
   def _end(self) -> None:
     self._ended = True
-    if self._session is not None:
-      self._session.pace.stopped = True
+    self._stop()
+    if self._expert is not None:
+      self._expert.kill()
     self._fresh.set()
     self._jobs.put(None)
 
   # Pictures.
 
-  def _publish(self, session: Session) -> None:
-    """Copies what the page draws, in the loop's thread."""
-    if self._camera is None or self._camera.model is not session.env.physics.model.ptr:
-      self._camera = picture.Camera(session.env)
-      self._tell(picture.shapes(session.env))
-    if not self._fresh.is_set():  # what was not sent yet is not made anew
-      self._frame = self._camera.frame(session)
+  def _publish(self, frame: Any) -> None:
+    """Hands on a frame, made by `frame` in the loop's thread if the last one was sent."""
+    if not self._fresh.is_set():
+      self._frame = frame()
       self._fresh.set()
 
   def _show(self) -> None:
     """Sends pictures and words, in a thread of its own."""
+    first(1)
     due, said = 0.0, None
     while not self._ended:
       self._fresh.wait()
-      frame, session, self._frame = self._frame, self._session, None
+      frame, now, self._frame = self._frame, self._now, None
       self._fresh.clear()
       try:
         if frame is not None:
           with self._lock:
             self._conn.send_bytes(b"B" + frame)
-        if session is not None and time.monotonic() > due:
+        if now is not None and time.monotonic() > due:
           due = time.monotonic() + _STATUS
-          coach, link = session.coach, session.link
-          words = {
-            "type": "status",
-            "instruction": coach.instruction,
-            "warning": coach.warning,
-            "fault": link.message if link.state == "lost" else "",
-          }
+          words = _status(now)
           if words != said:
             said = words
             self._tell(words)
       except OSError:
         self._end()
 
+  def _show_expert(self, job: dict[str, Any]) -> None:
+    """Has the expert's way worked out, in a thread of its own."""
+    self._expert = process = ghost.ask(job["task"], job["seed"], _kwargs(job))
+    text, _ = process.communicate()
+    if self._expert is process:
+      self._expert = None
+    if self._ended or job is not self._job:
+      return
+    if process.returncode:
+      self._fault("the expert could not be shown")
+    else:
+      self._tell({"type": "ghost", **json.loads(text)})
+
   # Exercises.
 
   def _exercise(self, job: dict[str, Any]) -> None:
     from palpate.tasks import score, suite
 
-    kwargs = {"input": "handle", "observations": ["joints"]}
-    kwargs |= {"nodes": job["nodes"]} if job["nodes"] else {}
-    self._tell({"type": "loading", "task": job["task"]})
+    self._tell({"type": "loading", "text": job["task"]})
+    kwargs = _kwargs(job)
     env = suite.load(*suite.split(job["task"]), task_kwargs={"random": 0, **kwargs})
-    device = self._open()
     info = {"task_kwargs": kwargs, "person": job["person"], "seed": job["seed"]}
-    self._camera = None
     session = Session(
-      env, device, job["seed"], info, Options(scale=job["scale"]),
-      coach=Coach(job["assessment"]), publish=self._publish,
+      env, self._open(self._device), job["seed"], info, Options(scale=job["scale"]),
+      coach=Coach(job["assessment"]), publish=self._draw,
     )  # fmt: skip
-    session.pace.speed = job["speed"]
-    self._session = session
-    try:
-      recording = session.run()
-    finally:
-      self._session = self._desk = None
-    path, fault = self._keep(recording, job["task"])
+    recording = self._run(session, job, lambda: session.run(realtime=True))
+    done = Finished(recording)
+    self._unkept = None if done.keep(self._folder) and not done.fault else done
     shown = card(recording, score.reference(job["task"]))
-    self._tell({"type": "card", "path": str(path), "fault": fault, **shown})
+    self._tell({"type": "card", "path": str(done.path or ""), "fault": done.fault, **shown})
 
-  def _open(self) -> Device:
-    device = devices.device(self._device)
-    if isinstance(device, Desk) and devices.on_page(self._device):
-      self._desk = device
-    return device
-
-  def _keep(self, recording: Any, task: str) -> tuple[pathlib.Path, str]:
-    """Saves a recording; where that fails, among the temporary files, and says so."""
-    name = f"{time.strftime('%Y%m%d-%H%M%S')}_{task.replace('/', '_')}"
+  def _run(self, made: Session | Practice, job: dict[str, Any], run: Any) -> Any:
+    """Runs what was made, so that messages reach it."""
+    made.pace.speed, self._camera = job["speed"], None
+    made.pace.stopped = not self._jobs.empty()  # something else was asked for meanwhile
+    self._now = made
     try:
-      self._folder.mkdir(parents=True, exist_ok=True)
-      return recording.save(_free(self._folder, name)), ""
-    except OSError as error:
-      folder = pathlib.Path(tempfile.mkdtemp(prefix="palpate-"))
-      return recording.save(_free(folder, name)), f"not kept in {self._folder}: {error}"
+      return run()
+    finally:
+      self._now, self._desks = None, {}
+
+  def _draw(self, session: Session) -> None:
+    """Shows an exercise."""
+    env = session.env
+    if self._camera is None or self._camera.model is not env.physics.model.ptr:
+      self._camera = Camera.of(env)
+      task = env.task
+      limits = {"force_limit": task.force_limit, "damage": task.damage, "jaws": task.jaws}
+      self._tell(self._camera.shapes(
+        time_limit=env.step_limit * env.control_timestep(), report="report" in task.extra,
+        assessment=self._job["assessment"], practice=False, step=env.physics.timestep(), **limits,
+      ))  # fmt: skip
+    camera, link, pace = self._camera, session.link, session.pace
+    self._publish(lambda: camera.frame(link, pace, env.task.progress))
+
+  def _practise(self, job: dict[str, Any]) -> None:
+    self._tell({"type": "loading", "text": f"{job['organ']}, {job['mesh']}"})
+    right, left = job["instrument"], job["left"]
+    hands = {}
+    with contextlib.ExitStack() as stack:
+      hands[right] = self._open(self._device)
+      stack.callback(hands[right].close)
+      if left:
+        other = "grasper" if right != "grasper" else "probe"
+        hands[other] = self._open("page" if left in menu.OTHER else left, "left")
+        stack.callback(hands[other].close)
+      practice = Practice(
+        job["organ"], job["size"], hands, 1e-3 * job["step"], job["scheme"],
+        Options(scale=job["scale"]), self._picture,
+      )  # fmt: skip
+      stack.pop_all()
+    self._run(practice, job, lambda: practice.run(realtime=True))
+    self._tell({"type": "idle"})
+
+  def _picture(self, practice: Practice) -> None:
+    """Shows free practice."""
+    camera = practice.camera
+    if self._camera is not camera:
+      self._camera = camera
+      self._tell(camera.shapes(
+        force_limit=LIMIT, damage=DAMAGE, jaws=self._job["instrument"] != "probe", time_limit=None,
+        report=False, assessment=False, practice=True, step=1e-3 * self._job["step"],
+      ))  # fmt: skip
+    self._publish(lambda: camera.frame(practice.link, practice.pace))
+
+  def _open(self, name: str, which: str = "right") -> Device:
+    """Opens a device for a hand."""
+    if name != "page":
+      self._desks.pop(which, None)
+      return devices.device(name)
+    own = self._own if devices.on_page(self._own) else "mouse"
+    self._desks[which] = desk = Desk(own)
+    return desk
 
 
-def _free(folder: pathlib.Path, name: str) -> pathlib.Path:
-  """Returns a path that is not taken."""
-  path, k = folder / f"{name}.npz", 1
-  while path.exists():
-    path, k = folder / f"{name}-{k}.npz", k + 1
-  return path
+def _kwargs(job: dict[str, Any]) -> dict[str, Any]:
+  """Returns the options of an exercise's environment."""
+  nodes = {"nodes": job["nodes"]} if job["nodes"] else {}
+  return {"input": "handle", "observations": ["joints"], **nodes}
 
 
-def menu(device: str) -> dict[str, Any]:
-  """Returns what a page offers."""
-  from palpate.tasks import suite
-
-  tasks = {f"{d}/{t}": suite.summary(d, t) for d, t in suite.ALL_TASKS}
-  return {"type": "menu", "tasks": tasks, "nodes": NODES, "speeds": SPEEDS, "device": device}
-
-
-def check(message: dict[str, Any]) -> dict[str, Any]:
-  """Returns the exercise that a message asks for; ValueError names what is wrong with it."""
-  from palpate.tasks import suite
-
-  task = message.get("task")
-  if not isinstance(task, str):
-    raise ValueError(f"task is {task!r}, expected a name")
-  person = message.get("person", "")
-  if not isinstance(person, str) or len(person) > 40 or not person.isprintable():
-    raise ValueError(f"person is {str(person)[:50]!r}, expected a name of at most 40 letters")
-  seed = message.get("seed", 0)
-  if type(seed) is not int or not 0 <= seed < 2**31:
-    raise ValueError(f"seed is {seed!r}, expected a whole number in [0, 2^31)")
-  scale = message.get("scale", 1.0)
-  if type(scale) not in (int, float) or not 0.1 <= scale <= 5:
-    raise ValueError(f"scale is {scale!r}, expected a number in [0.1, 5]")
-  return {
-    "task": "/".join(suite.split(task)),
-    "person": person.strip(),
-    "seed": seed,
-    "scale": float(scale),
-    "nodes": _choice("nodes", message.get("nodes"), (None, *NODES)),
-    "speed": _choice("speed", message.get("speed", 1.0), SPEEDS),
-    "assessment": message.get("assessment") is True,
-  }
-
-
-def _choice(name: str, value: Any, choices: tuple) -> Any:
-  if isinstance(value, bool) or value not in choices:
-    raise ValueError(f"{name} is {str(value)[:40]!r}, expected one of {choices}")
-  return value
+def _status(now: Session | Practice) -> dict[str, Any]:
+  """Returns the words about what runs."""
+  link = now.link
+  lost = link.message if link.state == "lost" else ""
+  words = {"type": "status", "instruction": "", "warning": "", "kind": "", "fault": lost}
+  if isinstance(now, Practice):
+    return words | {"fault": lost or "; ".join(now.faults[-1:]), "scheme": now.organ.integrator}
+  coach = now.coach
+  said = {"instruction": coach.instruction, "warning": coach.warning, "kind": coach.kind}
+  return words | said

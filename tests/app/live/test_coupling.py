@@ -1,6 +1,7 @@
 """The coupling of a hand: steps, energy, clutch, scaling, limits, two hands, failing devices."""
 
 import math
+import time
 
 import mujoco
 import numpy as np
@@ -53,6 +54,16 @@ def test_the_felt_force_has_no_steps(model, rate):
   force = run(loop, 1.2, lambda loop: loop.links[0].force)
   assert np.linalg.norm(force, axis=1).max() > 0.2
   assert np.linalg.norm(np.diff(force, axis=0), axis=1).max() < 0.1
+
+
+def test_a_slow_device_feels_no_edge_from_a_fast_hand(model):
+  """At 0.3 m/s and 30 Hz; without the limit the force on it has steps of 0.12 N."""
+  w = 2 * math.pi * 3
+  hand = live.Hand(lambda t: (0.01 * math.sin(w * t), 0, -0.005 * (1 - math.cos(w * t))), rate=30)
+  loop = couple(model, start(model), hand)
+  made = run(loop, 0.9, lambda loop: (*loop.links[0].force, math.hypot(*hand.vel)))
+  assert made[:, 3].max() > 0.3 and np.linalg.norm(made[:, :3], axis=1).max() > 0.3
+  assert np.linalg.norm(np.diff(made[:, :3], axis=0), axis=1).max() < 0.1
 
 
 def thrown(model, rate, duration, mass=0.05, damping=0.0, stiffness=100.0):
@@ -119,6 +130,16 @@ def test_forces_come_by_a_ramp_and_stay_below_the_limits(model):
   assert hand.force == (0.0, 0.0, 0.0)  # after the end
 
 
+def test_a_motion_that_diverges_is_not_felt(model):
+  hand = live.Hand(lambda t: (0, 0, -0.02))
+  loop = couple(model, start(model), hand, ramp=0.0)
+  loop.run(0.1)
+  loop.links[0].feel([0.05] * 6)
+  assert np.linalg.norm(hand.force) > 0.01
+  loop.links[0].feel([math.nan] * 6)
+  assert hand.force == (0.0, 0.0, 0.0)
+
+
 def test_orientation_turns_the_shaft_and_is_felt(model):
   data = start(model)
   shaft = data.site("probe/tip").xmat.reshape(3, 3)[:, 2].copy()
@@ -149,6 +170,35 @@ def test_two_hands(model):
     np.testing.assert_allclose(
       data.site(f"{prefix}tip").xpos - tips[prefix], 0.005 * way, atol=3e-4
     )
+
+
+def test_jaws_close_with_the_hand(model):
+  data = start(model)
+  hand = live.Hand(lambda t: (0.0, 0.0, 0.0), buttons=lambda t: frozenset({"grip"} if t > 0.5 else ()))
+  loop = live.Loop(model, data, {"grasper/": hand}, pace=live.Pace.instant())
+  opening = run(loop, 1.5, lambda loop: data.sensor("grasper/jaw").data[0])
+  assert opening[450] > 0.5 and opening[-1] < 0.1
+
+
+def test_another_device_takes_over_where_the_first_one_left(model):
+  data = start(model)
+  closed = []
+  first = live.Hand(lambda t: (0.005 * min(t, 1), 0, 0))
+  first.close = lambda: closed.append(1)
+  loop = couple(model, data, first)
+  path = run(loop, 0.5, lambda loop: data.site("probe/tip").xpos.copy())
+  second = live.Hand(lambda t: (0.1, 0.004 * min(t / 0.4, 1), 0.2))  # it is somewhere else
+  loop.links[0].change(second)
+  after = run(loop, 0.8, lambda loop: data.site("probe/tip").xpos.copy())
+  up = data.cam("laparoscope").xmat.reshape(3, 3)[:, 1]
+  assert np.linalg.norm(np.diff([path[-1], *after], axis=0), axis=1).max() < 1e-4
+  np.testing.assert_allclose(after[-1] - path[-1], 0.004 * up, atol=4e-4)
+  assert loop.links[0].device is second
+  for _ in range(100):
+    if closed:
+      break
+    time.sleep(0.01)
+  assert closed == [1] and first.force == (0.0, 0.0, 0.0)
 
 
 def test_a_device_that_vanishes_in_mid_motion(model):

@@ -2,7 +2,6 @@
 
 import json
 import pathlib
-import shutil
 import signal
 import subprocess
 import sys
@@ -23,12 +22,6 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 ANSWER = 120.0  # that a busy machine may take [s]
-LOOK = """(() => {
-  const {scene, head, targets} = window.palpate();
-  const text = document.getElementById("instruction").textContent;
-  return {head, targets, camera: scene.camera, text, ended: document.getElementById("card").open};
-})()"""
-
 
 @pytest.fixture
 def serve(tmp_path):
@@ -175,112 +168,6 @@ def test_a_closed_tab_keeps_its_recording(serve, tmp_path):
     time.sleep(0.1)
   made = Recording.load(kept[0])
   assert made.outcome == "stopped" and made.info["coach"] == {"assessment": True, "hints": []}
-
-
-def chromium():
-  """Returns a browser and its page; skips without."""
-  api = pytest.importorskip("playwright.sync_api")
-  path = shutil.which("chromium") or shutil.which("google-chrome")
-  if path is None:
-    pytest.skip("no chromium")
-  return api, path
-
-
-def wait(page, steps):
-  """Waits until the page shows an exercise after some steps; the page lets nobody evaluate text."""
-  for _ in range(int(10 * ANSWER)):
-    if page.evaluate("window.palpate().head.steps ?? 0") >= steps:
-      return
-    page.wait_for_timeout(100)
-  raise AssertionError(f"{page.inner_text('#fault')!r}: no picture")
-
-
-def look(page, height, above):
-  """Returns the page's numbers, the way in the picture [m] to a place above the target, and the
-  size of a pixel [m]."""
-  state = page.evaluate(LOOK)
-  head, camera = state["head"], state["camera"]
-  tip, axes = [head[f"tip_{axis}"] for axis in "xyz"], np.array(camera["mat"]).reshape(3, 3)
-  depth = (np.array(camera["pos"]) - tip) @ axes[:, 2]
-  pixel = 2 * depth * np.tan(np.radians(camera["fovy"] / 2)) / height
-  return state, axes.T @ (np.array(state["targets"][0][:3]) + np.array([0, 0, above]) - tip), pixel
-
-
-@pytest.mark.slow
-def test_an_exercise_is_done_through_the_page(serve, tmp_path):
-  """A script at a headless browser touches the point with mouse and wheel, and sees its score."""
-  api, path = chromium()
-  server = serve()
-  flags = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-  with api.sync_playwright() as play:
-    browser = play.chromium.launch(executable_path=path, args=flags)
-    page = browser.new_page(viewport={"width": 900, "height": 600})
-    wrong = []
-    page.on("pageerror", lambda error: wrong.append(error))
-    page.goto(server.url)
-    page.wait_for_selector("#start:enabled", timeout=1e3 * ANSWER)
-    page.select_option("#task", "touch/easy")
-    page.select_option("#speed", "0.1")
-    page.click("#start")
-    page.wait_for_selector("#stop:enabled", timeout=1e3 * ANSWER)
-    wait(page, 1)
-    assert page.inner_text("#instruction") == "Touch the yellow point gently, 1 of 1"
-    box = page.locator("#view").bounding_box()
-    middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
-    above = 0.01  # of the point, where the tip is taken [m]
-    for _ in range(400):
-      state, to, pixel = look(page, box["height"], above)
-      if state["ended"]:
-        break
-      force = state["head"]["force"]
-      if force > 0.3 or "Let go" in state["text"]:
-        above += 0.002
-      elif force < 0.05 and np.linalg.norm(to) < 0.0015:
-        above -= 0.001 if above > 0.003 else 0.0003
-      if np.linalg.norm(to[:2]) > 0.0005:
-        x, y = np.clip(0.6 * to[:2] / pixel, -40, 40)
-        page.mouse.move(*middle)
-        page.mouse.down()
-        page.mouse.move(middle[0] + x, middle[1] - y)
-        page.mouse.up()
-      page.mouse.wheel(0, float(np.clip(0.6 * to[2], -0.002, 0.002) / 2e-5))
-      for _ in range(100):  # until it is seen
-        page.wait_for_timeout(30)
-        if page.evaluate("window.palpate().head.time") > state["head"]["time"] + 0.03:
-          break
-    page.wait_for_selector("#card[open]", timeout=1e3 * ANSWER)
-    page.screenshot(path=str(tmp_path / "card.png"))
-    text = page.inner_text("#card")
-    browser.close()
-  assert wrong == [] and "Success, after" in text and "Path length" in text
-  made = Recording.load(next((tmp_path / "out").glob("*.npz")))
-  assert made.outcome == "success"
-
-
-def test_the_page_draws_an_organ(serve, tmp_path):
-  """Short form of the above: the picture has the organ's red, the liver stays where it is."""
-  api, path = chromium()
-  imageio = pytest.importorskip("imageio.v3")
-  server = serve()
-  flags = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-  with api.sync_playwright() as play:
-    browser = play.chromium.launch(executable_path=path, args=flags)
-    page = browser.new_page(viewport={"width": 700, "height": 500})
-    wrong = []
-    page.on("pageerror", lambda error: wrong.append(error))
-    page.goto(f"{server.url}#task=touch/easy")
-    page.wait_for_selector("#start:enabled", timeout=1e3 * ANSWER)
-    assert page.input_value("#task") == "touch/easy"
-    page.click("#start")
-    wait(page, 100)
-    shot = imageio.imread(page.locator("#view").screenshot(), extension=".png")[..., :3]
-    page.click("#stop")
-    page.wait_for_selector("#card[open]", timeout=1e3 * ANSWER)
-    assert "Stopped before the end" in page.inner_text("#card")
-    browser.close()
-  assert wrong == []
-  red = (shot[..., 0] > 70) & (shot[..., 0] > 1.5 * shot[..., 1].astype(int))
-  assert red.mean() > 0.1
 
 
 @pytest.mark.parametrize(

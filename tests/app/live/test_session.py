@@ -54,6 +54,14 @@ def test_an_exercise_is_done_by_hand_recorded_and_replayed(tmp_path):
   assert math.isfinite(old.metrics().path_length)
 
 
+def test_a_hand_without_orientation_leaves_the_shaft_as_it_is_turned():
+  """The drawn pose has a roll: to take hold of the instrument must not undo it."""
+  env = load(time_limit=1)
+  made = session(env, live.Hand(lambda t: (0.0, 0.0, 0.0))).run()
+  turn = np.abs(made.columns["quat"].reshape(-1, 4) @ made.columns["quat"].reshape(-1, 4)[0])
+  assert 2 * np.degrees(np.arccos(np.minimum(turn, 1.0))).max() < 1.0
+
+
 def test_stopping_keeps_the_recording_and_lets_go():
   env = load()
   hand = live.Hand(lambda t: (0.0, 0.0, -0.01 * t))

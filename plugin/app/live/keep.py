@@ -1,0 +1,57 @@
+"""Keeps what a finished exercise hands over, whatever the disk says."""
+
+from __future__ import annotations
+
+import dataclasses
+import pathlib
+import tempfile
+import time
+
+from palpate.tasks.recording import Recording
+
+
+@dataclasses.dataclass
+class Finished:
+  """What a finished exercise hands over.
+
+  Attributes:
+    recording: with actions, metrics and outcome; its `info` has `task`, `task_kwargs`, `seed`,
+      `person` (may be empty), `coach` (`assessment`, `hints`) and `live` (`faults`, how punctual)
+    path: of its file, None while it could not be kept anywhere
+    fault: what went wrong with that, for people; empty where nothing did
+  """
+
+  recording: Recording
+  path: pathlib.Path | None = None
+  fault: str = ""
+
+  def keep(self, folder: pathlib.Path) -> bool:
+    """Saves it in a folder, or else among the temporary files; returns whether it is in a file.
+
+    It may be called again: what is in the folder stays as it is.
+    """
+    if self.path is not None and not self.fault:
+      return True
+    task = str(self.recording.info.get("task", "exercise")).replace("/", "_")
+    name = f"{time.strftime('%Y%m%d-%H%M%S')}_{task}"
+    try:
+      folder.mkdir(parents=True, exist_ok=True)
+      self.path, self.fault = self.recording.save(_free(folder, name)), ""
+      return True
+    except OSError as error:
+      self.fault = f"not kept in {folder}: {error.strerror or error}"
+    if self.path is None:
+      try:
+        beside = pathlib.Path(tempfile.mkdtemp(prefix="palpate-"))
+        self.path = self.recording.save(_free(beside, name))
+      except OSError as error:
+        self.fault += f"; nor among the temporary files: {error.strerror or error}"
+    return self.path is not None
+
+
+def _free(folder: pathlib.Path, name: str) -> pathlib.Path:
+  """Returns a path that is not taken."""
+  path, k = folder / f"{name}.npz", 1
+  while path.exists():
+    path, k = folder / f"{name}-{k}.npz", k + 1
+  return path

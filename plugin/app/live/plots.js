@@ -1,0 +1,47 @@
+// Curves against time, as wide as their canvases.
+const SPAN = 300;  // frames in a plot
+
+export class Plot {
+  constructor(name) {
+    this.canvas = document.getElementById(`plot-${name}`);
+    this.text = document.getElementById(`text-${name}`);
+    this.values = [];
+  }
+
+  push(value) {
+    this.values.push(value);
+    if (this.values.length > SPAN) this.values.shift();
+  }
+
+  clear() {
+    this.values.length = 0;
+  }
+
+  draw(limit, digits = 2) {
+    const {canvas, values} = this, pen = canvas.getContext("2d"), scale = devicePixelRatio || 1;
+    const width = canvas.clientWidth, height = canvas.clientHeight;
+    if (!width) return;
+    if (canvas.width !== Math.round(width * scale)) {
+      [canvas.width, canvas.height] = [Math.round(width * scale), Math.round(height * scale)];
+    }
+    const most = Math.max(...values, 1.2 * (limit ?? 0), 1e-3);
+    pen.setTransform(scale, 0, 0, scale, 0, 0);
+    pen.clearRect(0, 0, width, height);
+    const y = value => height - 4 - (height - 18) * value / most;
+    const line = (colour, points) => {
+      pen.strokeStyle = colour;
+      pen.lineWidth = 1.5;
+      pen.beginPath();
+      points.forEach(([a, b]) => pen.lineTo(a, b));
+      pen.stroke();
+    };
+    if (limit) line("#e5484d", [[0, y(limit)], [width, y(limit)]]);
+    line("#4cd39b", values.map((value, i) => [width * i / SPAN, y(value)]));
+    pen.fillStyle = "#b4c0c6";
+    pen.font = "12px system-ui, sans-serif";
+    pen.fillText(short(most, digits), 4, 12);
+    this.text.textContent = values.length ? short(values.at(-1), digits) : "";
+  }
+}
+
+export const short = (value, digits) => value >= 100 ? Math.round(value).toLocaleString("en") : value.toFixed(digits);

@@ -1,0 +1,117 @@
+"""`Bonds`: what an organ has grown on to, and how much of it is free."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from palpate.engine.bonds import Group
+from palpate.engine.layout import BOND
+from palpate.engine.ties import motion
+
+
+class Bonds:
+  """The bonds of an organ as they are now; none of its arrays is a view.
+
+  Args:
+    space: the organ's workspace
+  """
+
+  def __init__(self, space):
+    self._space = space
+
+  @property
+  def _groups(self) -> list[Group]:
+    return self._space.bonds.groups
+
+  def _all(self, name: str, width: tuple[int, ...] = ()) -> np.ndarray:
+    parts = [np.asarray(getattr(group, name)) for group in self._groups]
+    return np.concatenate([np.zeros((0, *width)), *parts])
+
+  @property
+  def _state(self) -> np.ndarray:
+    slot = self._all("slot").astype(int)
+    return self._space.bonds.state[slot] if len(slot) else np.zeros((0, len(BOND)))
+
+  def __len__(self) -> int:
+    return len(self.vertices)
+
+  @property
+  def count(self) -> int:
+    """How many there are, free ones too."""
+    return len(self)
+
+  @property
+  def vertices(self) -> np.ndarray:
+    """Vertex of each, (n,)."""
+    return self._all("vert").astype(int)
+
+  @property
+  def area(self) -> np.ndarray:
+    """Area that each stands for [m^2], (n,)."""
+    return self._all("area")
+
+  @property
+  def damage(self) -> np.ndarray:
+    """Of each: 0 while it is whole, 1 when it is free [-], (n,)."""
+    return self._state[:, BOND.damage].clip(0.0, 1.0)
+
+  @property
+  def free(self) -> np.ndarray:
+    """Whether each has broken, (n,) bool."""
+    return self.damage >= 1.0
+
+  @property
+  def share_freed(self) -> float:
+    """Share of the area whose bonds have broken [-]; 0 where there are none."""
+    area = self.area
+    return float(area[self.free].sum() / area.sum()) if len(area) else 0.0
+
+  @property
+  def released(self) -> np.ndarray:
+    """Energy that damage has taken of each [J], (n,); its area times `energy` once pulled free."""
+    return self._state[:, BOND.released].copy()
+
+  @property
+  def energy(self) -> float:
+    """Sum of `released` [J]."""
+    return float(self.released.sum())
+
+  def weaken(self, amount: npt.ArrayLike):
+    """Adds damage, as a hook's current does; what a bond had stored of energy goes with it.
+
+    Args:
+      amount: what is added to the damage of each, or of all [-]
+    """
+    add = np.broadcast_to(np.asarray(amount, float), (len(self),))
+    if not (add >= 0).all():
+      raise ValueError(f"amount is {add.min()}, expected numbers >= 0")
+    state, slot = self._space.bonds.state, self._all("slot").astype(int)
+    state[slot, BOND.damage] = np.minimum(state[slot, BOND.damage] + add, 1.0)
+
+  @property
+  def positions(self) -> np.ndarray:
+    """Where their vertices are now [m], (n, 3)."""
+    return motion(self._space, self.vertices)[0]
+
+  @property
+  def stretch(self) -> np.ndarray:
+    """How far each was from what it leads to as the last step began, in the world [m], (n, 3)."""
+    return self._written("stretch")
+
+  @property
+  def stored(self) -> float:
+    """Elastic energy that they had then, less what the step's damage took of it [J]."""
+    stiffness = np.repeat(
+      [g.law.stiffness for g in self._groups], [len(g.vert) for g in self._groups]
+    )
+    far2 = (self.stretch**2).sum(axis=1)
+    return float((0.5 * stiffness * self.area * (1.0 - self.damage) * far2).sum())
+
+  @property
+  def force(self) -> np.ndarray:
+    """Force of each on its vertex in the last step, in the world [N], (n, 3)."""
+    return self._written("force")
+
+  def _written(self, name: str) -> np.ndarray:
+    parts = [group.arrays[name].numpy() for group in self._groups]
+    return np.concatenate([np.zeros((0, 3)), *parts])

@@ -1,0 +1,199 @@
+"""Bonds: springs from an organ to what it has grown on to, which soften and break.
+
+The kernels are in `native/bonds.h`; what is bonded to what is found in `adhere`.
+"""
+
+# Annotations here are objects, not text: no `from __future__ import annotations`.
+# pyright: reportInvalidTypeForm=false
+import dataclasses
+from typing import Any
+
+import numpy as np
+import warp as wp
+from palpate.tissue.reading import Law
+from palpate.tissue.step import SCHEMES
+from palpate.tissue.types import doubles, fill, ints, struct
+
+from . import coupling, mjstruct
+from .hold import Beside, Bodies, Input, Nodes, may_move, nodes, solver
+from .layout import BOND
+
+ON_ORGAN = -1  # in place of a body
+
+
+@struct
+class Bonded:
+  """Bonds of an organ that were made together, to one body or to one other organ."""
+
+  nbond: int  # number of them
+  body: int  # body, or ON_ORGAN
+  restless: int  # whether what they lead to may move while the organ sleeps
+  ahead: wp.float64  # share of the step's way at which its scheme takes forces
+  gain: wp.float64  # how much of a step's stiffness its scheme has on dv
+  stiffness: wp.float64  # by area [N/m^3]
+  strength: wp.float64  # [Pa]
+  energy: wp.float64  # by area, of a bond from whole to free [J/m^2]
+  live: ints(1)  # whether there are any
+  vert: ints("nbond")  # vertex
+  slot: ints("nbond")  # its row in `state`
+  area: doubles("nbond")  # [m^2]
+  anchor: doubles("nbond", 3)  # what it leads to in the axes of body or triangle [m]
+  normal: doubles("nbond", 3)  # away from its bed in these axes; 0 where pressing opens it too
+  corner: ints("nbond", 3)  # vertices of the other organ that hold it
+  weight: doubles("nbond", 3)  # their shares
+  state: doubles("nfree", len(BOND))  # see BOND
+  next: doubles("nbond", len(BOND))  # what it will be
+  stretch: doubles("nbond", 3)  # how far it is from what it leads to [m]
+  force: doubles("nbond", 3)  # on the vertex, in the world [N]
+  hardness: doubles("nbond")  # what its spring weighs on the change of its velocity [kg]
+  own: Nodes
+  solve: Input
+  other: Nodes
+  below: Input
+  number: doubles("nnumber")  # see `NUMBERS`
+  mj: Bodies
+
+
+_stretch, _enter, _bear, _act, _keep = coupling.kernels(
+  "bonds.h", Bonded, "stretch_bonds", "enter_bonds", "bear_bonds", "act_bonds", "keep_bonds"
+)
+
+
+@dataclasses.dataclass(eq=False)
+class Group:
+  """Bonds that were made together.
+
+  Attributes:
+    vert: vertices                                        (n,)
+    slot: their rows in the plugin state                  (n,)
+    area: of each [m^2]                                   (n,)
+    law: how they hold and break
+    body: body that they lead to, or ON_ORGAN
+    anchor: what each leads to in the axes of body or triangle [m] (n, 3)
+    normal: away from its bed in these axes, or 0         (n, 3)
+    other: workspace of the other organ, or None
+    corner: its vertices that hold each                   (n, 3)
+    weight: their shares                                  (n, 3)
+    declared: whether the model has them, not somebody who made them while running
+    arrays: what the kernels write
+    bonded: what they take
+  """
+
+  vert: np.ndarray
+  slot: np.ndarray
+  area: np.ndarray
+  law: Law
+  body: int
+  anchor: np.ndarray
+  normal: np.ndarray
+  other: Any
+  corner: np.ndarray
+  weight: np.ndarray
+  declared: bool
+  arrays: dict[str, wp.array] = dataclasses.field(default_factory=dict)
+  bonded: Any = None
+
+  def __post_init__(self):
+    n = len(self.vert)
+    shapes = {"next": (n, len(BOND)), "stretch": (n, 3), "force": (n, 3), "hardness": n}
+    self.arrays = {k: wp.zeros(s, dtype=wp.float64, device="cpu") for k, s in shapes.items()}
+    self.arrays["live"] = wp.ones(1, dtype=int, device="cpu")
+
+  def launch(self, kernel):
+    """Launches one of the kernels above over it."""
+    kernel.launch("cpu", 1, 1, 0, self.bonded)
+
+
+class Bonds(Beside):
+  """The bonds of a workspace's organ, and those that others have to it.
+
+  Args:
+    w: the workspace
+  """
+
+  def __init__(self, w):
+    super().__init__(w)
+    self.groups: list[Group] = []
+    self.borne: list[Group] = []  # of other organs, which lead to this one
+
+  def __bool__(self) -> bool:
+    return bool(self.groups or self.borne)
+
+  def put(self, group: Group):
+    """Adds bonds; the graphs of both organs have to be recorded anew."""
+    self.groups.append(group)
+    self._w.hold.need()
+    if group.other is not None:
+      group.other.bonds.borne.append(group)
+      group.other.hold.need()
+
+  def let_go(self):
+    """Takes away what was made while running."""
+    for group in [g for g in self.groups if not g.declared]:
+      group.arrays["live"].zero_()
+      self.groups.remove(group)
+      if group.other is not None:
+        group.other.bonds.borne.remove(group)
+
+  @property
+  def state(self) -> np.ndarray:
+    """Damage and more of each vertex that moves, in the plugin state, (nfree, len(BOND))."""
+    return self._state().numpy()
+
+  def _state(self) -> wp.array:
+    w = self._w
+    where, n = coupling.spans(w.organ)["bond"], coupling.sizes(w.organ)["nbond"]
+    address = w.views["plugin_state"].ptr + 8 * where.start
+    return wp.array(ptr=address, dtype=wp.float64, shape=(n, len(BOND)), device="cpu")
+
+  def load(self):
+    """See `Beside`."""
+    if self:
+      _enter.load(wp.get_device("cpu"))
+
+  def bind(self, model: int):
+    """See `Beside`."""
+    w = self._w
+    m, scheme = mjstruct.Model.from_address(model), SCHEMES[w.config.integrator]
+    for group in self.groups:
+      other = group.other
+      law = dict(zip(("stiffness", "strength", "energy"), group.law, strict=True))
+      arrays = {name: getattr(group, name) for name in _OF_GROUP}
+      values = law | arrays | group.arrays
+      values |= dict(
+        nbond=len(group.vert),
+        body=group.body,
+        restless=int(other is not None or may_move(m, group.body)),
+        ahead=float(scheme.ahead),
+        gain=scheme.gain(1.0, 0.0),
+        state=self._state(),
+        own=nodes(w),
+        solve=solver(w),
+        other=Nodes() if other is None else nodes(other),
+        below=Input() if other is None else solver(other),
+        number=w.body.numbers,
+        mj=coupling.mujoco_arrays(model, w.data, Bodies),
+      )
+      group.bonded = fill(Bonded, "cpu", values)
+
+  def enter(self):
+    """See `Beside`."""
+    for group in self.groups:
+      group.launch(_stretch)
+      group.launch(_enter)
+    for group in self.borne:
+      group.launch(_stretch)
+      group.launch(_bear)
+
+  def act(self):
+    """See `Beside`."""
+    for group in self.groups:
+      group.launch(_act)
+
+  def end(self):
+    """See `Beside`."""
+    for group in self.groups:
+      group.launch(_keep)
+
+
+_OF_GROUP = ("vert", "slot", "area", "anchor", "normal", "corner", "weight")

@@ -1,0 +1,214 @@
+"""The process of a page, in this one: free practice, the expert, devices, a disk that is full."""
+
+import errno
+import json
+import multiprocessing
+import pathlib
+import socket
+import threading
+import time
+
+import numpy as np
+import palpate
+import pytest
+from palpate.app.live.worker import Worker
+from palpate.tasks.recording import Recording
+
+ANSWER = 120.0  # that a busy machine may take [s]
+
+
+class Page:
+  """What a page says and hears, without a browser."""
+
+  def __init__(self, folder, device="mouse"):
+    palpate.register()
+    self.near, far = multiprocessing.Pipe()
+    self.worker = Worker(far, folder, device)
+    self.thread = threading.Thread(target=self.worker.serve)
+    self.thread.start()
+    self.frame = None
+
+  def tell(self, kind, **words):
+    self.near.send_bytes(json.dumps({"type": kind, **words}).encode())
+
+  def hear(self, kind, faults=False):
+    """Returns the next message of a kind, `frame` for a picture's numbers."""
+    due = time.monotonic() + ANSWER
+    while time.monotonic() < due:
+      if not self.near.poll(0.1):
+        continue
+      message = self.near.recv_bytes()
+      if message[:1] == b"B":
+        self.frame = np.frombuffer(message[1:], np.float32)
+        if kind == "frame":
+          return self.frame
+        continue
+      words = json.loads(message[1:])
+      if words["type"] == "scene":
+        self.scene = words
+        self.place = [words["head"].index(f"tip_{axis}") for axis in "xyz"]
+      if words["type"] == kind:
+        return words
+      assert faults or words["type"] != "error", words
+    raise AssertionError(f"no {kind}")
+
+  def value(self, name):
+    return float(self.hear("frame")[self.scene["head"].index(name)])
+
+  def tip(self):
+    return self.hear("frame")[self.place].astype(float)
+
+  def close(self):
+    self.tell("end")
+    for _ in range(int(10 * ANSWER)):
+      if not self.thread.is_alive():
+        return
+      while self.near.poll():
+        self.near.recv_bytes()
+      self.thread.join(0.1)
+    raise AssertionError("it goes on")
+
+
+@pytest.fixture
+def page(tmp_path):
+  pages = []
+
+  def start(device="mouse"):
+    pages.append(Page(tmp_path / "out", device))
+    return pages[-1]
+
+  yield start
+  for each in pages:
+    each.close()
+
+
+def exercise(page, **words):
+  page.tell("start", task="touch/easy", **words)
+  page.hear("scene")
+  page.hear("frame")
+
+
+def finish(page):
+  page.tell("stop")
+  return page.hear("card")
+
+
+def test_free_practice_changes_while_it_runs(page):
+  """Scheme, device, mesh and organ; a scheme that diverges is named and left."""
+  one = page()
+  menu = one.hear("menu")
+  assert {"16 x 16", "256 x 256", "1000 nodes"} <= set(menu["meshes"])
+  assert menu["schemes"] == ["implicit", "midpoint", "neumann", "explicit"]
+  one.tell("practice", organ="liver", mesh="32 x 32", speed=1.0)
+  scene = one.hear("scene")
+  assert scene["practice"] and scene["nodes"] == 1026 and scene["time_limit"] is None
+  one.tell("scheme", value="neumann")
+  while one.hear("status").get("scheme") != "neumann":
+    pass
+  one.tell("scheme", value="explicit")
+  while "explicit: the motion diverged" not in (words := one.hear("status"))["fault"]:
+    pass
+  assert words["scheme"] == "implicit" and np.isfinite(one.hear("frame")).all()
+  before = one.tip()
+  one.tell("device", value="hand")
+  while np.linalg.norm(one.tip() - before) < 0.003:
+    pass
+  one.tell("device", value="page")
+  one.tell("practice", organ="kidney", mesh="16 x 16", instrument="grasper", scheme="neumann")
+  assert one.hear("scene")["nodes"] == 258 and one.scene["jaws"]
+  assert one.value("steps") < 5000  # another loop
+  one.tell("stop")
+  one.hear("idle")
+  for words, said in (
+    ({"organ": "heart"}, "organ is 'heart', expected one of"),
+    ({"mesh": "7 x 7"}, "mesh is '7 x 7'"),
+    ({"scheme": "magic"}, "scheme is 'magic'"),
+    ({"step": 0.3}, "step is '0.3'"),
+    ({"left": "../x"}, "left is '../x'"),
+  ):
+    one.tell("practice", **words)
+    assert said in one.hear("error")["text"]
+  one.tell("device", value="udp:0.0.0.0:1")
+  assert "device is 'udp:0.0.0.0:1', expected one of" in one.hear("error")["text"]
+
+
+def test_two_hands_on_one_page(page):
+  one = page()
+  one.tell("practice", organ="liver", mesh="16 x 16", left="keyboard")
+  one.hear("scene")
+  first = one.hear("frame")
+  one.tell("hand", which="left", rate=[1, 0, 0, 0])
+  size = len(one.scene["head"]) + 3 * one.scene["nodes"]
+  geoms = first[size:].reshape(-1, 12)[:, :3]
+  moved = np.zeros(len(geoms))
+  while moved.max() < 0.01:
+    moved = np.linalg.norm(one.hear("frame")[size:].reshape(-1, 12)[:, :3] - geoms, axis=1)
+  mine = np.array([geom["mine"] for geom in one.scene["geoms"]])
+  assert moved[mine].max() < 1e-3  # the right one stays
+
+
+def test_the_expert_is_shown_on_request_and_noted(page):
+  one = page()
+  exercise(one)
+  one.tell("pause", on=True)
+  one.tell("ghost")
+  shown = one.hear("ghost")
+  assert shown["outcome"] == "success" and len(shown["time"]) == len(shown["pose"]) > 20
+  np.testing.assert_allclose(shown["pose"][0][:3], one.frame[one.place], atol=1e-3)
+  made = Recording.load(finish(one)["path"])
+  assert ["the expert was shown"] == [
+    hint["text"] for hint in made.info["coach"]["hints"] if hint["kind"] == "hint"
+  ]
+  exercise(one, assessment=True)
+  one.tell("ghost")
+  assert "not in an assessment" in one.hear("error")["text"]
+
+
+def test_a_full_disk_loses_nothing(page, tmp_path, monkeypatch):
+  """Kept beside where that goes, in memory where it does not, and saved when there is room."""
+  one, full = page(), ["out", "palpate-"]
+  save = Recording.save
+
+  def limited(self, path):
+    if any(name in str(path) for name in full):
+      raise OSError(errno.ENOSPC, "No space left on device")
+    return save(self, path)
+
+  monkeypatch.setattr(Recording, "save", limited)
+  exercise(one, person="Ada")
+  card = finish(one)
+  assert card["path"] == "" and card["fault"].count("No space left on device") == 2
+  one.tell("keep")
+  assert one.hear("kept")["path"] == ""
+  full.remove("palpate-")
+  one.tell("keep")
+  assert "palpate-" in one.hear("kept")["path"]
+  full.clear()
+  one.tell("keep")
+  kept = one.hear("kept")
+  assert kept["fault"] == "" and pathlib.Path(kept["path"]).parent == tmp_path / "out"
+  assert Recording.load(kept["path"]).info["person"] == "Ada"
+
+
+def test_a_tab_that_closes_with_a_full_disk_saves_when_it_ends(page, tmp_path, monkeypatch):
+  one = page()
+  save = Recording.save
+  full = lambda self, path: (_ for _ in ()).throw(OSError(errno.ENOSPC, "full"))  # noqa: E731
+  monkeypatch.setattr(Recording, "save", full)
+  exercise(one)
+  assert finish(one)["path"] == ""
+  monkeypatch.setattr(Recording, "save", save)
+  one.close()
+  assert len(list((tmp_path / "out").glob("*.npz"))) == 1
+
+
+def test_a_device_that_another_tab_has_is_named(page):
+  with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+    other.bind(("127.0.0.1", 0))
+    one = page(f"udp:{other.getsockname()[1]}")
+    one.tell("start", task="touch/easy")
+    assert "cannot listen on" in one.hear("error")["text"]
+    one.hear("idle")
+    one.tell("device", value="page")
+    exercise(one)
+    assert one.value("state") == 1.0  # goes on by mouse
