@@ -167,11 +167,23 @@ def _todo(args: argparse.Namespace) -> tuple[str, dict[str, Any], list[tuple[str
       performer.find(args.performer)
     else:
       raise ValueError("neither TASK nor --recordings is given")
-    kwargs = kwargs | chosen
-    datasets.of(args.format).check(options.environment(task, json.dumps(kwargs)))
+    kwargs = kwargs | chosen if args.recordings else chosen | kwargs
+    env = options.environment(task, json.dumps(kwargs))
+    datasets.of(args.format).check(env)
   except (ValueError, OSError) as error:
     raise CommandError(str(error)) from None
+  _check_drawing(env)
   return task, kwargs, [(path, own | chosen) for path, own in found]
+
+
+def _check_drawing(env: Any):
+  if not env.task.observed.pictures:
+    return
+  try:
+    env.physics.render(16, 16)
+  except Exception as error:  # each backend of OpenGL has its own
+    text = f"{type(error).__name__}: {error}"
+    raise CommandError(f"no way to draw pictures ({text}); see palpate doctor", code=1) from None
 
 
 def _size(text: str) -> list[int]:

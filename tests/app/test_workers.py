@@ -42,7 +42,7 @@ def test_a_process_that_dies_takes_one_job_with_it(tmp_path):
 def test_errors_limits_and_deadlines():
   with pytest.raises(ValueError, match="-3 is no number"):
     list(workers.parallel(square, [1, 2, -3], PROCESSES))
-  ended = {e.index: e.status for e in PROCESSES.run(nap, [0.0, 60.0], limit=3.0)}
+  ended = {e.index: e.status for e in PROCESSES.run(nap, [0.0, 60.0], limit=2.0)}
   assert ended == {0: "ok", 1: "timeout"}
   late = time.monotonic() + 1.0
   assert list(PROCESSES.run(nap, [60.0, 60.0, 60.0], deadline=late)) == []

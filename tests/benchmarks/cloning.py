@@ -54,6 +54,7 @@ def learn(
 ) -> tuple[policy.Policy, float]:
   """Returns the policy that does what was done, and what is left of the squared error."""
   from sklearn.neural_network import MLPRegressor
+  from threadpoolctl import threadpool_limits
 
   mean, scale = seen.mean(axis=0), 1 / np.maximum(seen.std(axis=0), 1e-6)
   x, y = ((seen - mean) * scale).astype(np.float32), done.astype(np.float32)
@@ -64,7 +65,8 @@ def learn(
   for epoch in range(epochs):
     network.set_params(learning_rate_init=RATE * (1 - epoch / epochs))
     order = random.permutation(len(x))
-    network.partial_fit(x[order], y[order])
+    with threadpool_limits(1):  # its matrices are small
+      network.partial_fit(x[order], y[order])
   layers = [(w.T, b) for w, b in zip(network.coefs_, network.intercepts_, strict=True)]
   return policy.Policy(about, mean, scale, layers), float(network.loss_)
 
