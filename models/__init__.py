@@ -2,5 +2,8 @@
 
 from .catalog import GRIDS, NAMES, RESOLUTIONS
 from .scene import INSTRUMENTS, load, organ, path, targets
+from .situs import abdomen
 
-__all__ = ["GRIDS", "INSTRUMENTS", "NAMES", "RESOLUTIONS", "load", "organ", "path", "targets"]
+__all__ = [
+  "GRIDS", "INSTRUMENTS", "NAMES", "RESOLUTIONS", "abdomen", "load", "organ", "path", "targets",
+]  # fmt: skip

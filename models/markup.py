@@ -260,7 +260,7 @@ def _backdrop(entry: catalog.Entry, root: str) -> tuple[str, str]:
 def _ports(build: Build, instruments: Sequence[str]) -> str:
   """Returns the instruments in their trocars."""
   text = ""
-  placed = zip(instruments, _prefixes(instruments), build.entry.ports, strict=False)
+  placed = zip(instruments, prefixes(instruments), build.entry.ports, strict=False)
   for instrument, prefix, port in placed:
     pos, quat = _place(build, port)
     text += (
@@ -270,7 +270,8 @@ def _ports(build: Build, instruments: Sequence[str]) -> str:
   return text
 
 
-def _prefixes(instruments: Sequence[str]) -> list[str]:
+def prefixes(instruments: Sequence[str]) -> list[str]:
+  """Returns the prefixes of the names of a scene's instruments."""
   if len(instruments) == 2 and instruments[0] == instruments[1]:
     return [f"right_{instruments[0]}/", f"left_{instruments[1]}/"]
   return [f"{instrument}/" for instrument in instruments]

@@ -57,7 +57,7 @@ def load(
       forces of small tools; None for triangles of one size
   """
   build = _build(name, nodes, seed, grid, fine)
-  _check_instruments(instruments)
+  check_instruments(instruments)
   spec = mujoco.MjSpec.from_string(markup.scene(build, name, instruments, handle, root=None))
   spec.attach(_organ(build, name, coupling, interior), prefix=f"{name}/", frame=spec.frame(name))
   free = None
@@ -125,7 +125,8 @@ def _build(
   return built if fine is None else built.finer(fine)
 
 
-def _check_instruments(instruments: Sequence[str]):
+def check_instruments(instruments: Sequence[str]):
+  """Raises ValueError where a scene cannot have these instruments."""
   if isinstance(instruments, str):
     raise ValueError(f"instruments is {instruments!r}, expected a tuple such as ({instruments!r},)")
   for instrument in instruments:

@@ -13,9 +13,18 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
   from .authoring import add_organ
   from .organ import Organ
-  from .windows import add_windows
+  from .skins import add_skin
+  from .windows import add_spare, add_windows
 
-__all__ = ["Organ", "__version__", "add_organ", "add_windows", "register"]
+__all__ = [
+  "Organ",
+  "__version__",
+  "add_organ",
+  "add_skin",
+  "add_spare",
+  "add_windows",
+  "register",
+]
 __version__ = "0.1.0"
 
 
@@ -30,20 +39,22 @@ def register() -> int:
   from . import screen
 
   screen.prepare_gl()  # before MuJoCo is imported
-  from . import organ, windows
+  from . import organ, skins, windows
   from .engine import plugin
   from .tissue import device
 
   if "Organ" not in globals():
     globals()["Organ"] = organ.Organ
     globals()["add_windows"] = windows.add_windows
+    globals()["add_spare"] = windows.add_spare
+    globals()["add_skin"] = skins.add_skin
     device.lower_log_level()
   return plugin.register()
 
 
 def __getattr__(name: str):
   """Brings what is asked for first: `add_organ`, with what reads meshes, and in the command all."""
-  if name in ("Organ", "add_windows"):
+  if name in ("Organ", "add_skin", "add_spare", "add_windows"):
     register()
     return globals()[name]
   if name != "add_organ":

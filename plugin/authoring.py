@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import mujoco
@@ -17,6 +18,7 @@ from .tissue import config as configuration
 from .tissue import mesh as topology
 
 _DENSITY = 1060.0  # [kg/m^3], of most soft tissue
+_CUTS = 8  # times the square root of its vertices is what `spare="auto"` gives an organ
 _BOX = 0.005  # [m]; half the side of the box whose inertia a node's body has, as in a flexcomp
 _SELF = {
   word: getattr(mujoco.mjtFlexSelf, f"mjFLEXSELF_{word.upper()}")
@@ -42,6 +44,7 @@ def add_organ(
   rgba: Sequence[float] | None = None,
   contact: Mapping[str, object] | None = None,
   windows: bool | Mapping[str, object] = False,
+  spare: int | str = 0,
   **config,
 ) -> mujoco.MjsFlex:
   """Adds an organ to a spec, in a body of its name; what a <flexcomp> with the plugin does in MJCF.
@@ -64,6 +67,7 @@ def add_organ(
     contact: attributes of <contact> that are not as in CONTACT, which suits instruments
     windows: whether MuJoCo has dofs under the tools alone, which are in the spec; or how: `tools`
       and `nodes` of `add_windows`
+    spare: vertices that cuts can make use of, or `auto` for some eight cuts across the organ
     **config: the plugin's configuration keys: young, poisson, thickness, foundation, bulk, ...
 
   Returns:
@@ -73,8 +77,8 @@ def add_organ(
     ValueError: a key, value, name or the mesh is not allowed; the message says what is.
   """
   _, vertices, triangles = meshes.read(mesh, scale, sized=not isinstance(mesh, tuple | list))
-  surface = _surface(name, *meshes.merge(vertices, triangles))
-  pins, mass = _pins(name, pin, surface.nvert), _mass(name, mass, surface)
+  surface = _with_spare(name, _surface(name, *meshes.merge(vertices, triangles)), spare)
+  pins, mass = _pins(name, pin, surface), _mass(name, mass, surface)
   windowed, options = windows is not False, _windows(name, windows)
   texts = _texts(name, config, surface, mass if windowed else None)
   look = _look(name, radius, rgba) | _contact(name, {**CONTACT, **(contact or {})})
@@ -90,7 +94,7 @@ def _add_nodal(spec, body, surface: topology.Mesh, pins, mass: float, texts: dic
   """Adds plugin, nodes and flex of an organ whose nodes are MuJoCo's; returns the flex."""
   _instance(spec, body.name, texts)
   points, bodies = surface.rest.copy(), [body.name] * surface.nvert
-  share = mass / surface.nvert
+  share = mass / (surface.nvert - surface.spare)
   for k in np.setdiff1d(np.arange(surface.nvert), pins):
     bodies[k] = f"{body.name}_{k}"
     node = author.add_node(body, bodies[k], points[k], share, 2 / 3 * share * _BOX**2)
@@ -134,7 +138,8 @@ def _surface(name: str, vertices: np.ndarray, triangles: np.ndarray) -> topology
   return made
 
 
-def _pins(name: str, pin: Sequence[int], nvert: int) -> np.ndarray:
+def _pins(name: str, pin: Sequence[int], surface: topology.Mesh) -> np.ndarray:
+  nvert = surface.nvert - surface.spare
   pins = np.unique(np.asarray(pin, dtype=float))
   bad = pins[(pins != np.floor(pins)) | (pins < 0) | (pins >= nvert)]
   if bad.size:
@@ -142,6 +147,16 @@ def _pins(name: str, pin: Sequence[int], nvert: int) -> np.ndarray:
   if len(pins) == nvert:
     raise ValueError(f"organ {name!r}: all vertices are pinned, expected some that move")
   return pins.astype(int)
+
+
+def _with_spare(name: str, surface: topology.Mesh, spare: int | str) -> topology.Mesh:
+  """Returns a surface with vertices that wait for cuts, in its middle, where nothing meets them."""
+  if spare == "auto":
+    spare = math.ceil(_CUTS * math.sqrt(surface.nvert))
+  if not isinstance(spare, int) or isinstance(spare, bool) or spare < 0:
+    raise ValueError(f"organ {name!r}: spare is {spare!r}, expected a whole number >= 0 or 'auto'")
+  rest = np.concatenate([surface.rest, np.tile(surface.rest.mean(axis=0), (spare, 1))])
+  return topology.build(name, rest, surface.elem, spare) if spare else surface
 
 
 def _mass(name: str, mass: float | None, surface: topology.Mesh) -> float:
@@ -157,6 +172,7 @@ def _mass(name: str, mass: float | None, surface: topology.Mesh) -> float:
 def _texts(name: str, config: dict, surface: topology.Mesh, mass: float | None) -> dict[str, str]:
   """Returns the texts of the plugin's keys, checked; a mass is that of an organ with windows."""
   texts = {key: text(value, 17) for key, value in config.items()}
+  texts |= {"spare": str(surface.spare)} if surface.spare else {}
   for key in ("window", "follow"):
     if key in texts:
       raise ValueError(f"organ {name!r}: {key} is set, expected windows=True or its options")

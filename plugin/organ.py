@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 from palpate.engine import change, mjstruct, motion, pierce, windowed, workspace
 from palpate.engine import plugin as engine
+from palpate.engine.cuts import Piece, Report
 from palpate.engine.layout import FLAG
 from palpate.tissue import energy, fill
 from palpate.tissue import mesh as topology
@@ -38,8 +39,13 @@ class Organ:
     self.data = data
     self.name = name
     self._space = engine.find(data._address, organs[name])
-    self._organ = self._space.organ
     self._motion = motion.of(self._space)
+
+  @property
+  def _organ(self):
+    """The organ as it is now, cut or not."""
+    self._space.cuts.follow()
+    return self._space.organ
 
   @property
   def config(self) -> Config:
@@ -151,15 +157,61 @@ class Organ:
         change.detach(group.other, self.model._address, theirs)
     change.detach(self._space, self.model._address, made)
 
+  def cut(self, points: npt.ArrayLike) -> Report:
+    """Cuts the organ, through its wall, along the path on its surface that is nearest to points.
+
+    Vertices near the path are moved onto it at rest, and the mesh comes apart along its edges:
+    vertices are doubled, and triangles keep their numbers. Mass and momentum are kept. What is cut
+    free has no foundation any more, and a closed surface that is cut through encloses nothing:
+    `bulk` and `pressure` end. A reset of the data heals all cuts; mj_getState and mj_setState,
+    and copies of the data, have them.
+
+    Args:
+      points: the path in the world, where the organ is now [m], (n, 3); to cut to an edge of an
+        open surface, let it begin or end there; the same first and last point cut out a piece
+
+    Returns:
+      What the cut has done. With too few spare vertices it ends early: `stopped`, and a warning.
+
+    Raises:
+      ValueError: the organ has no `spare`; points are off the surface; the path is too short, or
+        goes through pinned vertices.
+    """
+    report = self._space.cuts.cut(np.asarray(points, dtype=float))
+    workspace.place(self._space, self.model._address)
+    return report
+
+  @property
+  def cuts(self) -> tuple[Report, ...]:
+    """What `cut` has done in this data, but not what a state that was set or copied brought."""
+    self._space.cuts.follow()
+    return tuple(self._space.cuts.reports)
+
+  @property
+  def pieces(self) -> tuple[Piece, ...]:
+    """The parts of the organ that hang together, the heaviest first."""
+    self._space.cuts.follow()
+    return tuple(self._space.cuts.pieces())
+
   @property
   def nvert(self) -> int:
-    """Number of vertices, those on the surface of a solid."""
+    """Number of vertices, those on the surface of a solid; more where it was cut."""
     return self._organ.mesh.nouter
 
   @property
   def elem(self) -> np.ndarray:
     """Triangles, counter-clockwise from outside, (nelem, 3)."""
     return self._organ.mesh.elem
+
+  @property
+  def mass(self) -> np.ndarray:
+    """Mass of each vertex [kg], (nvert,); a cut divides it."""
+    return self._organ.mass[: self.nvert].copy()
+
+  @property
+  def skin(self) -> int | None:
+    """Number of the skin that is drawn for it, None where its own surface is; see `add_skin`."""
+    return None if self._space.skin is None else self._space.skin.index
 
   @property
   def free(self) -> np.ndarray:

@@ -56,9 +56,7 @@ def add_windows(
   Raises:
     ValueError: there is no such organ or body, or it cannot have windows.
   """
-  flex = _flex(spec, organ)
-  bodies = {body.name: body for body in spec.bodies}
-  plugin = _plugin(spec, organ, [bodies[name] for name in dict.fromkeys(flex.vertbody)])
+  flex, plugin, bodies = find_organ(spec, organ)
   config = {key: value for key, value in plugin.config.items() if value}
   groups = _groups(organ, bodies, tools)
   many = len(groups) if groups else 1
@@ -85,13 +83,52 @@ def add_windows(
   return tuple(names)
 
 
-def _flex(spec, organ: str):
-  """Returns the flex of an organ."""
+def add_spare(spec: mujoco.MjSpec, organ: str, spare: int):
+  """Gives an organ vertices without triangles, which cuts make use of.
+
+  They wait in its middle. What `add_organ(..., spare=)` does to an organ that MJCF declares: the
+  vertices of a <flexcomp> that no triangle has would be left out.
+
+  Args:
+    spec: changed in place
+    organ: name of the flexcomp
+    spare: how many
+
+  Raises:
+    ValueError: there is no such organ, or it has spare vertices already.
+  """
+  flex, plugin, bodies = find_organ(spec, organ)
+  if plugin.config.get("spare") or isinstance(spare, bool) or int(spare) < 1:
+    raise ValueError(f"organ {organ!r}: spare is {spare}, expected a number > 0 for one without")
+  vertbody = list(flex.vertbody)
+  free = np.array([bodies[name].first_joint() is not None for name in vertbody])
+  own = [bodies[name] for name, moves in zip(vertbody, free, strict=True) if moves]
+  rest = _rest(flex, free, own)
+  points = np.reshape(flex.vert, (-1, 3)) if len(flex.vert) else np.zeros_like(rest)
+  middle = rest.mean(axis=0)
+  for k in range(spare):
+    if own:
+      made = add_node(own[0].parent, f"{organ}_spare_{k}", middle, own[0].mass, own[0].inertia[0])
+      made.plugin.name, made.plugin.plugin_name = plugin.name, engine.NAME
+      made.plugin.active = True
+    vertbody.append(f"{organ}_spare_{k}" if own else vertbody[0])
+  more = np.zeros((spare, 3)) + (0.0 if own else middle)
+  flex.vert, flex.vertbody = np.concatenate([points, more]).ravel(), vertbody
+  plugin.config = {k: v for k, v in plugin.config.items() if v} | {"spare": str(spare)}
+
+
+def find_organ(spec: mujoco.MjSpec, organ: str):
+  """Returns flex and plugin of an organ, and the spec's bodies by name; it may name the plugin.
+
+  Raises:
+    ValueError: there is no such flex, or it is no organ.
+  """
   flex = spec.flex(organ)
   if flex is None:
     have = ", ".join(repr(f.name) for f in spec.flexes) or "none"
     raise ValueError(f"no flexcomp {organ!r} in the spec, it has {have}")
-  return flex
+  bodies = {body.name: body for body in spec.bodies}
+  return flex, _plugin(spec, organ, [bodies[name] for name in dict.fromkeys(flex.vertbody)]), bodies
 
 
 def _check(spec, flex, config: dict[str, str], names: list[str], nodes: int | None):
@@ -203,15 +240,22 @@ def _own_bodies(flex, bodies: dict) -> list:
   return own
 
 
+def _rest(flex, free: np.ndarray, own: list) -> np.ndarray:
+  """Returns where vertices are in the body that an organ is in [m], (nvert, 3)."""
+  rest = np.zeros((len(free), 3))
+  rest += np.reshape(flex.vert, (-1, 3)) if len(flex.vert) else 0.0  # none: all on their bodies
+  rest[free] += [body.pos for body in own]
+  return rest
+
+
 def _make_rigid(spec, flex, own: list, plugin, config: dict[str, str]):
   """Makes a nodal organ's flex rigid; returns the body it is in."""
   vertbody = list(flex.vertbody)
   free = np.isin(vertbody, [body.name for body in own])
   parent = own[0].parent
-  rest = np.zeros((len(vertbody), 3))
-  rest += np.reshape(flex.vert, (-1, 3)) if len(flex.vert) else 0.0  # none: all on their bodies
-  rest[free] += [body.pos for body in own]
-  config["mass"] = f"{len(rest) * np.mean([body.mass for body in own]):.9g}"
+  rest = _rest(flex, free, own)
+  nvert = len(rest) - int(config.get("spare", 0))
+  config["mass"] = f"{nvert * np.mean([body.mass for body in own]):.9g}"
   if not free.all():
     config["pin"] = " ".join(map(str, np.flatnonzero(~free)))
   surface = parent

@@ -87,6 +87,7 @@ class Task(control.Task):
 
   name = "task"
   watch = ("miss", "unintended_contact")
+  control_timestep = CONTROL_TIMESTEP
   targets = 1
 
   def __init__(
@@ -107,6 +108,7 @@ class Task(control.Task):
     organ: str = ORGAN,
     input: str = "drives",
     nodes: int | None = None,
+    surroundings: str | None = None,
   ):
     """Makes the exercise.
 
@@ -128,20 +130,19 @@ class Task(control.Task):
       organ: name of the organ in it
       input: what an action moves: the instrument's position `drives`, or its `handle`
       nodes: of the organ, in place of the scene's
+      surroundings: `abdomen` or `none`, in place of the scene's
     """
     if reward not in REWARDS:
       raise ValueError(f"reward is {reward!r}, expected one of {', '.join(REWARDS)}")
     drawn = isinstance(random, np.random.RandomState)
     self.random: Any = random if drawn else np.random.RandomState(random)
-    self.scene, self.prefix = scenes.chosen(scene, input, nodes), f"{scene.instrument}/"
-    self.force_limit, self.damage = float(force_limit), float(damage)
-    self.spread, self.jitter, self.organ = spread, jitter, organ
+    self.scene = chosen = scenes.chosen(scene, input, nodes, surroundings)
+    self.force_limit, self.damage, self.organ = float(force_limit), float(damage), organ
+    self.spread, self.jitter, self.visualize_reward = spread, jitter, False
     self.variants = (scene.variant,) if variants is None or model is not None else variants
-    self.reward, self.observed = reward, observation.choose(observations, pixels)
-    self.control_timestep = CONTROL_TIMESTEP
-    self.ranges = randomisation.check(randomise or {})
-    self.drawn: dict[str, Any] = {}
-    self.visualize_reward = False
+    self.reward, self.prefix = reward, f"{chosen.instrument}/"
+    self.observed = observation.choose(observations, pixels)
+    self.ranges, self.drawn = randomisation.check(randomise or {}), dict[str, Any]()
     self._models: dict[int | None, Stage] = {}
     self.outcome: str | None = None
     self.progress, self.best, self.cost, self.harm = 0.0, 0.0, safety.Cost(), 0.0

@@ -24,6 +24,8 @@ COLUMNS: dict[str, tuple[int, ...]] = {
   "grip": (),
   "held": (),
   "visible": (),
+  "freed": (),
+  "traction": (),
 }
 # Those that are measured faster: with substeps, magnitudes, one for each since the last sample.
 SIGNALS = ("force", "grip_force", "shaft_force")

@@ -136,6 +136,7 @@ def _segmentation(camera: mujoco.Camera, physics: Physics) -> np.ndarray:
   out = np.zeros(kind.shape, np.uint8)
   flex, site, geom = (mj.mjtObj.mjOBJ_FLEX, mj.mjtObj.mjOBJ_SITE, mj.mjtObj.mjOBJ_GEOM)
   out[(kind == flex) & (name == mj.mj_name2id(model, flex, physics.organ_name))] = LABELS["organ"]
+  out[(kind == mj.mjtObj.mjOBJ_SKIN) & (name == physics.organ.skin)] = LABELS["organ"]
   out[(kind == site) & np.isin(name, physics.target_sites)] = LABELS["target"]
   bodies = [model.body(i).name.startswith(physics.prefix) for i in range(model.nbody)]
   own = np.flatnonzero(np.array(bodies)[model.geom_bodyid])

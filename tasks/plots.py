@@ -27,7 +27,7 @@ def path_figure(recording: Recording) -> "Figure | None":
   paths = [None if p is None or not np.isfinite(p).all(axis=1).any() else 1e3 * p for p in paths]
   if all(p is None for p in paths):
     return None
-  figure = _figure(7.5, 6.2)
+  figure = blank(7.5, 6.2)
   from matplotlib import rc_context
 
   with rc_context({"grid.color": "#dfe3e8"}):
@@ -103,7 +103,7 @@ def force_figure(recording: Recording) -> "Figure | None":
   lines = list(_force_lines(recording))
   if not lines or len(recording.time) == 0:
     return None
-  figure = _figure(9, 3.4)
+  figure = blank(9, 3.4)
   ax = figure.add_subplot()
   time = recording.signal_time - recording.time[0]
   limit = recording.settings.force_limit
@@ -127,8 +127,8 @@ def force_figure(recording: Recording) -> "Figure | None":
   ax.set_xlim(0, max(time[-1], 1e-9))
   ax.set_xlabel("time [s]")
   ax.set_ylabel("force [N]")
-  _tidy(ax)
-  _legend_above(ax)
+  tidy(ax)
+  legend_above(ax)
   return figure
 
 
@@ -168,7 +168,7 @@ def _mark_events(ax: Any, recording: Recording, top: float, end: float) -> None:
 
 def compared_figure(recordings: Sequence[tuple[str, Recording]]) -> "Figure | None":
   """Returns force and speed of several recordings over time; None where neither is known."""
-  figure = _figure(9, 5)
+  figure = blank(9, 5)
   axes: Any = figure.subplots(2, 1, sharex=True)
   for k, (name, recording) in enumerate(recordings):
     style = {"color": _TIP[k % len(_TIP)], "linewidth": 1.2, "alpha": 0.85, "label": _label(name)}
@@ -189,10 +189,10 @@ def compared_figure(recordings: Sequence[tuple[str, Recording]]) -> "Figure | No
   for ax, label in zip(axes, ("force [N]", "speed [mm/s]"), strict=True):
     ax.set_ylabel(label)
     ax.set_ylim(bottom=0)
-    _tidy(ax)
+    tidy(ax)
   axes[1].set_xlim(left=0)
   axes[1].set_xlabel("time [s]")
-  _legend_above(axes[0] if axes[0].lines else axes[1])
+  legend_above(axes[0] if axes[0].lines else axes[1])
   return figure
 
 
@@ -209,7 +209,7 @@ def spectrum_figure(recording: Recording) -> "Figure | None":
       continue
   if not spectra:
     return None
-  figure = _figure(9, 3.4)
+  figure = blank(9, 3.4)
   ax = figure.add_subplot()
   for i, value, freq, amplitude, cut in spectra:
     color = _TIP[i % len(_TIP)]
@@ -232,8 +232,8 @@ def spectrum_figure(recording: Recording) -> "Figure | None":
   ax.set_yticks([0.01, 0.05, 0.1, 0.5, 1], ["0.01", "0.05", "0.1", "0.5", "1"], minor=False)
   ax.set_xlabel("frequency [Hz]")
   ax.set_ylabel("normalised speed amplitude")
-  _tidy(ax)
-  _legend_above(ax)
+  tidy(ax)
+  legend_above(ax)
   return figure
 
 
@@ -244,7 +244,8 @@ def png(figure: "Figure") -> bytes:
   return buffer.getvalue()
 
 
-def _figure(width: float, height: float) -> "Figure":
+def blank(width: float, height: float) -> "Figure":
+  """Returns an empty figure, inches."""
   try:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -256,13 +257,15 @@ def _figure(width: float, height: float) -> "Figure":
   return figure
 
 
-def _tidy(ax: Any) -> None:
+def tidy(ax: Any) -> None:
+  """Takes away what distracts."""
   ax.spines[["top", "right"]].set_visible(False)
   ax.grid(color="#e4e7ec", linewidth=0.7)
   ax.set_axisbelow(True)
 
 
-def _legend_above(ax: Any) -> None:
+def legend_above(ax: Any) -> None:
+  """Puts the legend outside."""
   # Above the plot, where it can hide neither a peak nor an event.
   ax.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=6, fontsize=9, frameon=False)
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from . import stage
 from .physics import Physics
-from .scenes import CAMERA
+from .scenes import CAMERA, LIGHT
 
 Ranges = Mapping[str, tuple[float, float]]
 
@@ -57,6 +57,9 @@ def _friction(physics: Physics, place: stage.Stage, factor: np.ndarray) -> None:
 
 def _camera_pos(physics: Physics, place: stage.Stage, shift: np.ndarray) -> None:
   place.model.camera(CAMERA).pos[:] += shift
+  lamp = mj.mj_name2id(place.model, mj.mjtObj.mjOBJ_LIGHT, LIGHT)
+  if lamp >= 0:  # an endoscope's light goes with it
+    place.model.light_pos[lamp] += shift
 
 
 def _camera_turn(physics: Physics, place: stage.Stage, angles: np.ndarray) -> None:
@@ -80,10 +83,13 @@ def _light_pos(physics: Physics, place: stage.Stage, shift: np.ndarray) -> None:
 
 def _colour(physics: Physics, place: stage.Stage, change: np.ndarray) -> None:
   model = place.model
-  flex = mj.mj_name2id(model, mj.mjtObj.mjOBJ_FLEX, physics.organ_name)
-  material = int(model.flex_matid[flex])
-  rgba = model.flex_rgba[flex] if material < 0 else model.mat_rgba[material]
-  rgba[:3] = np.clip(rgba[:3] + change, 0, 1)
+  flex, skin = mj.mj_name2id(model, mj.mjtObj.mjOBJ_FLEX, physics.organ_name), physics.organ.skin
+  shown = {int(model.flex_matid[flex]): model.flex_rgba[flex]}
+  if skin is not None:
+    shown[int(model.skin_matid[skin])] = model.skin_rgba[skin]
+  for material, own in shown.items():
+    rgba = own if material < 0 else model.mat_rgba[material]
+    rgba[:3] = np.clip(rgba[:3] + change, 0, 1)
 
 
 QUANTITIES = {

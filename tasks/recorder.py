@@ -125,6 +125,8 @@ class Recorder:
     grip: ArrayLike | None = None,
     held: ArrayLike | None = None,
     visible: ArrayLike | None = None,
+    freed: ArrayLike | None = None,
+    traction: ArrayLike | None = None,
     arrays: Mapping[str, ArrayLike] | None = None,
   ) -> None:
     """Adds one sample; with several instruments each argument has a row (or a number) for each.
@@ -146,6 +148,8 @@ class Recorder:
       grip: above 0.5 where the jaw is told to close  ()
       held: above 0.5 where the jaw holds tissue  ()
       visible: 1 where the camera's view holds the tip, else 0  ()
+      freed: share of what is bonded that came free as it should  ()
+      traction: pull on what it is bonded to [N]  ()
       arrays: the caller's own, of any shape and number type, the same in every sample; arrays that
         are not floating point may not miss a sample
     """
@@ -154,7 +158,7 @@ class Recorder:
       raise ValueError(f"sample {self._count}: time is {time}, expected above {self._last}")
     given = {"tip_pos": tip_pos, "quat": quat, "axis": axis, "force": force}
     given |= {"grip_force": grip_force, "shaft_force": shaft_force, "area": area, "strain": strain}
-    given |= {"grip": grip, "held": held, "visible": visible}
+    given |= {"grip": grip, "held": held, "visible": visible, "freed": freed, "traction": traction}
     columns = {k: self._entry(k, v) for k, v in given.items() if v is not None}
     own = {name: self._own(name, value) for name, value in arrays.items()} if arrays else {}
     self._store(time, columns, own)

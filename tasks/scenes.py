@@ -17,15 +17,18 @@ from collections.abc import Mapping
 import mujoco
 import numpy as np
 import palpate
-from palpate.models import catalog, mjcf, shapes, trocar
+from palpate.models import catalog, mjcf, scenery, shapes, situs, trocar
 from palpate.models.catalog import Tissue
 
 NOW, LATER = (1.0, 0.8, 0.1), (0.2, 0.75, 0.95)  # colours of targets
 ORGAN = "organ"
+BED = "bed"  # patch of the gallbladder, and the body that is in the liver's place
 CAMERA = "laparoscope"
+LIGHT = situs.LIGHT
 INPUTS = ("drives", "handle")
+SURROUNDINGS = ("abdomen", "none")
 # The organ's solref counts, not the instrument's: light nodes want stiff contacts.
-_CONTACT = {
+CONTACT = {
   "condim": 3,
   "selfcollide": "none",
   "solref": (0.002, 1),
@@ -33,11 +36,13 @@ _CONTACT = {
   "solmix": 1e4,
 }
 # Residual of the organ's solve; 1e-4, the plugin's own, changes contact forces by 0.1 %.
-_TOLERANCE = 1e-2
+TOLERANCE = 1e-2
 # Slots of the organ's window for each 1000 nodes; the experts' instruments touch 15 and 38 at most.
 _SLOTS = {"probe": 40, "grasper": 48}
 # More than MuJoCo's 1 makes friction creep less: 2.4 N of grip then hold 3 N, with 3 only 2 N.
 _IMPRATIO = {"probe": 3, "grasper": 10}
+# Foundation of an organ that comes away from its bed [Pa/m]; ours: what lies around it lets go too.
+_LOOSE = 3e3
 _TURN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # organ's frame to world
 
 
@@ -64,6 +69,9 @@ class Scene:
     inclusion: hidden stiff place: position in the world [m] (3), radius [m], factor on Young's
       modulus; None for healthy tissue. Without gravity: the organ would sag less where it is stiff
     handle: whether a handle pulls the instrument in place of position drives
+    bonds: stiffness [N/m^3], strength [Pa], energy [J/m^2] of what holds the organ in its bed; None
+      where it is pinned there
+    surroundings: what is drawn around the organ, one of SURROUNDINGS; it touches nothing
   """
 
   organ: str = "liver"
@@ -76,17 +84,26 @@ class Scene:
   targets: int = 1
   inclusion: tuple[float, ...] | None = None
   handle: bool = False
+  bonds: tuple[float, float, float] | None = None
+  surroundings: str = "abdomen"
 
 
-def chosen(scene: Scene, input: str, nodes: int | None) -> Scene:
+def chosen(scene: Scene, input: str, nodes: int | None, surroundings: str | None) -> Scene:
   """Returns a scene as it was asked for; arguments as of `base.Task`."""
+  if surroundings is None:
+    surroundings = scene.surroundings
+  if surroundings not in SURROUNDINGS:
+    choices = ", ".join(SURROUNDINGS)
+    raise ValueError(f"surroundings is {surroundings!r}, expected one of {choices}")
   if input not in INPUTS:
     raise ValueError(f"input is {input!r}, expected one of {', '.join(INPUTS)}")
   if nodes is None:
     nodes = scene.nodes
   if not (isinstance(nodes, int) and 100 <= nodes <= 20000):
     raise ValueError(f"nodes is {nodes!r}, expected a whole number in [100, 20000], or None")
-  return dataclasses.replace(scene, handle=input == "handle", nodes=nodes)
+  return dataclasses.replace(
+    scene, handle=input == "handle", nodes=nodes, surroundings=surroundings
+  )
 
 
 @functools.lru_cache(maxsize=32)
@@ -99,11 +116,23 @@ def surface(organ: str, nodes: int, variant: int | None) -> tuple[np.ndarray, np
 
 
 @functools.lru_cache(maxsize=32)
-def pins(organ: str, nodes: int, variant: int | None) -> tuple[int, ...]:
-  """Returns the nodes that do not move."""
+def pins(organ: str, nodes: int, variant: int | None, but: str = "") -> tuple[int, ...]:
+  """Returns the nodes that do not move, without those of one patch."""
+  patches = _patches(organ, nodes, variant)
+  found = [patch for name, patch in patches.items() if name != but]
+  return tuple(int(i) for i in np.unique(np.concatenate(found)))
+
+
+@functools.lru_cache(maxsize=32)
+def bed(organ: str, nodes: int, variant: int | None) -> tuple[int, ...]:
+  """Returns the nodes that lie in the bed and do not belong to another patch."""
+  held = pins(organ, nodes, variant, BED)
+  return tuple(sorted({int(i) for i in _patches(organ, nodes, variant)[BED]} - set(held)))
+
+
+def _patches(organ: str, nodes: int, variant: int | None) -> dict[str, np.ndarray]:
   vertices, _ = surface(organ, nodes, variant)
-  patches = shapes.patches(organ, vertices @ _TURN, variant)
-  return tuple(int(i) for i in np.unique(np.concatenate(list(patches.values()))))
+  return shapes.patches(organ, vertices @ _TURN, variant)
 
 
 @functools.lru_cache(maxsize=32)
@@ -132,29 +161,55 @@ def build(scene: Scene) -> mujoco.MjSpec:
       vertices, triangles, np.array(place), radius, tissue.young, factor * tissue.young
     )
   center = landmark(scene, scene.center)
+  shape, config = (scene.organ, scene.nodes, scene.variant), tissue.keys()
+  config = config | {"young": young, "device": "cpu", "tolerance": TOLERANCE}
+  if scene.bonds is not None:
+    law, grown = mjcf.numbers(scene.bonds), " ".join(map(str, bed(*shape)))
+    config |= {"bonds": f"{BED} {law} at {grown}", "foundation": _LOOSE}
   flex = mjcf.flexcomp(
     ORGAN,
     (vertices, triangles),
-    config=tissue.keys() | {"young": young, "device": "cpu", "tolerance": _TOLERANCE},
-    contact=_CONTACT,
-    pin=pins(scene.organ, scene.nodes, scene.variant),
+    config=config,
+    contact=CONTACT,
+    pin=pins(*shape, BED if scene.bonds else ""),
     digits=7,
     mass=tissue.mass,
     radius=0.001,
     rgba=catalog.entry(scene.organ).rgba,
   )
-  spec = mujoco.MjSpec.from_string(_xml(flex, center, scene))
+  spec = furnish(scene, flex, center)
   if scene.inclusion is not None:
     spec.option.gravity = np.zeros(3)
+  if scene.surroundings == "abdomen":
+    uv = scenery.texcoord(scene.organ, vertices @ _TURN, triangles)
+    held = situs.Arrangement() if scene.bonds else None  # what it has grown on to is in its place
+    view = center + scene.camera, center
+    situs.surround(spec, ORGAN, scene.organ, uv, view, arrangement=held)
+  return spec
+
+
+def furnish(
+  scene: Scene, organ: str, center: np.ndarray, bed: str = "", slots: int | None = None
+) -> mujoco.MjSpec:
+  """Returns an organ with instrument, camera, light and targets around it.
+
+  Args:
+    scene: instrument, ports and number of targets
+    organ: flexcomp of the organ
+    center: what port and camera are from [m]  (3,)
+    bed: what is in the body that the organ is bonded to
+    slots: of the organ's window, None for what experts touch
+  """
+  spec = mujoco.MjSpec.from_string(_xml(organ, center, scene, bed))
   port = center + scene.port
   quat, prefix = trocar.aim(port, center), f"{scene.instrument}/"
   trocar.attach(spec, scene.instrument, prefix, port, quat, scene.handle)
-  slots = _SLOTS[scene.instrument] * max(1, -(-scene.nodes // 1000))
+  slots = slots or _SLOTS[scene.instrument] * max(1, -(-scene.nodes // 1000))
   palpate.add_windows(spec, ORGAN, nodes=slots)
   return spec
 
 
-def _xml(flex: str, center: np.ndarray, scene: Scene) -> str:
+def _xml(flex: str, center: np.ndarray, scene: Scene, bed: str) -> str:
   def numbers(values) -> str:
     return mjcf.numbers(values, digits=7)
 
@@ -187,6 +242,7 @@ def _xml(flex: str, center: np.ndarray, scene: Scene) -> str:
     <camera name="{CAMERA}" pos="{numbers(camera)}" fovy="50"
       xyaxes="{numbers(right)} {numbers(np.cross(right, back))}"/>
     {sites}
+    <body name="{BED}">{bed}</body>
     {flex}
   </worldbody>
 </mujoco>"""

@@ -30,6 +30,7 @@ _CHANGED = (
   "light_pos",
   "light_specular",
   "mat_rgba",
+  "skin_rgba",
   "vis.headlight.ambient",
   "vis.headlight.diffuse",
   "vis.headlight.specular",

@@ -35,9 +35,18 @@ COMMANDS = {
   ("train",): ("train", "learn an exercise in many worlds at once"),
   ("evaluate",): ("evaluate", "score a policy over many episodes of an exercise"),
   ("export",): ("export", "make a data set of demonstrations to learn from"),
+  ("trainee", "add"): ("trainee.add", "add people to a record"),
+  ("trainee", "list"): ("trainee.list", "list the people of a record"),
+  ("trainee", "show"): ("trainee.show", "show a person's learning curves and standing"),
+  ("trainee", "export"): ("trainee.export", "write all of a person's data"),
+  ("trainee", "delete"): ("trainee.delete", "delete all of a person's data"),
+  ("trainee", "limits"): ("trainee.limits", "make proficiency limits of experts' recordings"),
   ("panel",): ("panel", "make the references of scores from many skilled performers"),
 }
-_GROUPS = {"run": "run a job on a scene"}
+_GROUPS = {
+  "run": "run a job on a scene",
+  "trainee": "people who train: a record of what they do, learning curves, their data",
+}
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -25,6 +25,7 @@ from .console import (
   output_folder,
   writing,
 )
+from .trainee import keeping
 
 if TYPE_CHECKING:
   from palpate.tasks.metrics import Metrics
@@ -60,6 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser):
   add("--seed", metavar="N", type=int, default=0, help="of the first episode (%(default)s)")
   workers.add_arguments(parser, 1)
   options.add_argument(parser)
+  keeping.add_references(parser)
   add("--json", metavar="FILE", help="write every episode's metrics")
   add("--recordings", metavar="FOLDER", help="keep every episode's recording, whole or not")
 
@@ -69,8 +71,9 @@ def main(args: argparse.Namespace) -> int:
   check_counts(args, "episodes")
   crew = workers.chosen(args)
   palpate.register()
-  from palpate.tasks import performer, score, suite
+  from palpate.tasks import performer, suite
 
+  known = keeping.references(args.references)
   try:
     name = "/".join(suite.split(args.task))
     performer.find(args.policy)
@@ -92,7 +95,7 @@ def main(args: argparse.Namespace) -> int:
       progress.show(f"{len(results)} of {args.episodes}")
   progress.clear()
   if results:
-    print(table(name, args.policy, results, score.reference(name)))
+    print(table(name, args.policy, results, known(name)))
   if file is not None:
     _write_json(file, results)
   if interrupt.seen:
@@ -174,7 +177,7 @@ def perform(job: tuple[str, str, int, str | None, str]) -> Result:
   return result
 
 
-def table(name: str, policy: str, results: list[Result], reference: dict | None) -> str:
+def table(name: str, policy: str, results: list[Result], reference: Mapping | None) -> str:
   """Returns mean and spread of return, time and every known metric, for people."""
   from palpate.tasks.metrics import METRICS, Metrics
 

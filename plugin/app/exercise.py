@@ -15,6 +15,7 @@ import palpate
 
 from . import film, options
 from .console import CommandError, Interrupt, Progress, output, output_folder, writing
+from .trainee import keeping
 
 _SIZE = (640, 480)  # of the film [pixels]
 
@@ -42,10 +43,12 @@ def add_arguments(parser: argparse.ArgumentParser):
   add("--replay", metavar="FILE", help="repeat a recording and check that it comes out the same")
   add(
     "-o", "--out", metavar="FOLDER",
-    help="where recording and report go (out/TASK; out/TASK_replay)",
+    help="where recording and report go (out/TASK; out/TASK_replay; with --trainee nowhere but in "
+    "the record)",
   )  # fmt: skip
   add("--film", metavar="FILE", help="write a film too, .mp4 or .gif")
   options.add_argument(parser)
+  keeping.add_arguments(parser)
   add("--states", action="store_true", help="keep the state of every step in the recording")
   add("--no-report", action="store_true", help="write the recording alone")
 
@@ -84,7 +87,7 @@ def main(args: argparse.Namespace) -> int:
       recording, failure = error.recording, error
     finally:
       progress.clear()
-  _write(job, recording, report=not args.no_report)
+  fault = _write(job, recording, report=not args.no_report)
   if "live" in recording.info:
     live = recording.info["live"]
     print(
@@ -97,6 +100,8 @@ def main(args: argparse.Namespace) -> int:
     return 130
   if failure is not None:
     raise CommandError(str(failure), code=1)
+  if fault:
+    raise CommandError(fault, code=1)
   if job.old is not None:
     changed = episode.differences(job.old, recording)
     if changed:
@@ -115,7 +120,9 @@ def _page(args: argparse.Namespace) -> int:
     name = "/".join(suite.split(args.task))
   except ValueError as error:
     raise CommandError(str(error)) from None
-  return serve.run(pathlib.Path(args.out or "out/live"), device=args.device, task=name)
+  kept = keeping.read(args, name, pages=True)
+  out = pathlib.Path(args.out or "out/live")
+  return serve.run(out, device=args.device, task=name, kept=kept)
 
 
 def _list() -> int:
@@ -136,36 +143,49 @@ class _Job:
     seed: of the episode
     run: runs it and returns its recording; takes what is called after every step
     old: the recording that is replayed, None for a new one
-    folder: of the files
+    folder: of the files, None where they are in a record alone
     film: file of the film, None without one
+    references: what finds the references of tasks
+    keeping: of a record, None without one
   """
 
   name: str
   seed: int
   run: Callable[[Callable[[Any], bool]], Any]
   old: Any
-  folder: pathlib.Path
+  folder: pathlib.Path | None
   film: pathlib.Path | None
+  references: Any
+  keeping: keeping.Keeping | None
 
 
 def _prepare(args: argparse.Namespace) -> _Job:
   """Returns the job, everything that can be wrong with it checked."""
-  old = None
+  from palpate.tasks import suite
+
+  old, kept = None, None
+  references = keeping.references(args.references)
   try:
     if args.replay:
+      if args.trainee is not None:
+        raise CommandError("trainee is given with --replay, which is no attempt")
       old, run = _replay(args.replay)
       name, seed = old.info["task"], old.info["seed"]
     else:
+      kept = keeping.read(args, "/".join(suite.split(args.task)))
       (name, run), seed = _perform(args), args.seed
   except (ValueError, OSError) as error:
     raise CommandError(str(error)) from None
-  folder = pathlib.Path(args.out or f"out/{name.replace('/', '_')}{'_replay' if old else ''}")
-  if old and (folder / "recording.npz").resolve() == pathlib.Path(args.replay).resolve():
+  folder = None
+  if args.out or not kept:
+    default = f"out/{name.replace('/', '_')}{'_replay' if old else ''}"
+    folder = output_folder("out", pathlib.Path(args.out or default))
+  if old and folder and (folder / "recording.npz").resolve() == pathlib.Path(args.replay).resolve():
     raise CommandError(f"out is {str(folder)!r}, the folder of the recording that is replayed")
   shot = output("film", args.film, film.FILMS) if args.film else None
   if shot:
     film.check(shot.suffix)
-  return _Job(name, seed, run, old, output_folder("out", folder), shot)
+  return _Job(name, seed, run, old, folder, shot, references, kept)
 
 
 def _replay(path: str):
@@ -213,25 +233,36 @@ def _by_hand(args: argparse.Namespace, name: str, task_kwargs: dict[str, Any]):
   return lambda watch: session.run(watch=watch)
 
 
-def _write(job: _Job, recording: Any, report: bool):
-  """Writes recording, metrics and report, and says where they are."""
-  from palpate.tasks.files import replacing
-  from palpate.tasks.report import write_report
-  from palpate.tasks.score import reference
-
+def _write(job: _Job, recording: Any, report: bool) -> str:
+  """Writes recording, metrics and report, says where they are, and returns what went wrong."""
   end = recording.time[-1] if len(recording.time) else 0.0
   print(f"{job.name}, seed {job.seed}: {recording.info['outcome']} after {end:.2f} s")
-  with writing(job.folder):
-    print(f"recording  {recording.save(job.folder / 'recording.npz')}")
-    with replacing(job.folder / "metrics.json") as file:
+  if job.folder:
+    _write_files(job, job.folder, recording, report)
+  if job.film:
+    print(f"film       {job.film}")
+  if job.keeping is None:
+    return ""
+  kept = job.keeping.begin().keep(recording)
+  print(f"recording  {kept.path or 'lost'}")
+  print("\n".join(kept.said), end="\n" * bool(kept.said))
+  return kept.fault
+
+
+def _write_files(job: _Job, folder: pathlib.Path, recording: Any, report: bool) -> None:
+  """Writes recording, metrics and report to a folder."""
+  from palpate.tasks.files import replacing
+  from palpate.tasks.report import write_report
+
+  with writing(folder):
+    print(f"recording  {recording.save(folder / 'recording.npz')}")
+    with replacing(folder / "metrics.json") as file:
       file.write(recording.metrics().to_json(1) + "\n")
     if report and len(recording.time):
       try:
-        print(f"report     {write_report(recording, job.folder, reference(job.name))}")
+        print(f"report     {write_report(recording, folder, job.references(job.name))}")
       except ImportError as error:
         print(f"no report: {error}; install palpate[plot]", file=sys.stderr)
-  if job.film:
-    print(f"film       {job.film}")
 
 
 def _camera(path: pathlib.Path | None) -> contextlib.AbstractContextManager[Callable[[Any], None]]:

@@ -5,12 +5,16 @@ from __future__ import annotations
 import argparse
 import pathlib
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import palpate
 
 from . import film
 from .console import CommandError, output_folder, writing
+from .trainee import keeping
+
+if TYPE_CHECKING:
+  from palpate.tasks.limits import Lookup
 
 _SIZE = (480, 360)  # of a film in a page [pixels]
 
@@ -23,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser):
     "-o", "--out", metavar="FOLDER",
     help="where report.html or comparison.html goes (the first recording's folder)",
   )  # fmt: skip
-  add("--reference", metavar="FILE", help="reference, JSON (the task's own, if it has one)")
+  keeping.add_references(parser)
   add("--film", action="store_true", help="run the exercise anew and put its film in the page")
 
 
@@ -36,7 +40,7 @@ def main(args: argparse.Namespace) -> int:
     film.check(".mp4")
     palpate.register()
   try:
-    entries = _entries(paths, args.reference, args.film)
+    entries = _entries(paths, keeping.references(args.references), args.film)
     folder = output_folder("out", args.out or paths[0].parent)
     with writing(folder):
       if len(entries) > 1:
@@ -52,16 +56,15 @@ def main(args: argparse.Namespace) -> int:
   return 0
 
 
-def _entries(paths: Sequence[pathlib.Path], reference: str | None, filmed: bool) -> list[Any]:
+def _entries(paths: Sequence[pathlib.Path], references: Lookup, filmed: bool) -> list[Any]:
   """Returns what is compared: recordings, references and films."""
-  from palpate.tasks import comparison, score
+  from palpate.tasks import comparison
   from palpate.tasks.recording import Recording
 
-  own = score.read_reference(pathlib.Path(reference)) if reference else None
   entries = []
   for name, path in zip(_names(paths), paths, strict=True):
     recording = Recording.load(path)
-    known = own or score.reference(str(recording.info.get("task", "")))
+    known = references(str(recording.info.get("task", "")))
     shot = film.of_recording(recording, _SIZE) if filmed else None
     entries.append(comparison.Entry(name, recording, known, shot))
   return entries

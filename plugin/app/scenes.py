@@ -18,7 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser):
   parser.add_argument(
     "scene",
     metavar="SCENE",
-    help=f"{', '.join(models.NAMES)} or press; an MJCF file; a folder with a scene.xml",
+    help=f"{', '.join(models.NAMES)}, abdomen or press; an MJCF file; a folder with a scene.xml",
   )
   parser.add_argument(
     "--nodes",
@@ -53,6 +53,8 @@ def load(args: argparse.Namespace, handle: bool) -> tuple[mujoco.MjModel, mujoco
       if args.instruments is not None:
         choices["instruments"] = [name for name in args.instruments.split(",") if name]
       model = models.load(args.scene, **choices).compile()
+    elif args.scene == "abdomen" and not pathlib.Path(args.scene).exists():
+      model = _abdomen(args, handle)
     elif given:
       raise CommandError(f"--{given[0]} goes with a named organ: {', '.join(models.NAMES)}")
     else:
@@ -62,6 +64,18 @@ def load(args: argparse.Namespace, handle: bool) -> tuple[mujoco.MjModel, mujoco
   data = mujoco.MjData(model)
   reset(model, data, args.keyframe)
   return model, data
+
+
+def _abdomen(args: argparse.Namespace, handle: bool) -> mujoco.MjModel:
+  from palpate import models
+
+  if args.coupling == "nodal":
+    raise CommandError("coupling is 'nodal', expected window: that of the abdomen's organs")
+  nodes = args.nodes or models.RESOLUTIONS[1]
+  choices: dict = {"soft": {"liver": nodes, "gallbladder": nodes}, "handle": handle}
+  if args.instruments is not None:
+    choices["instruments"] = [name for name in args.instruments.split(",") if name]
+  return models.abdomen(**choices, seed=args.seed).compile()
 
 
 def file(name: str) -> pathlib.Path:
@@ -74,7 +88,7 @@ def file(name: str) -> pathlib.Path:
   if path.is_dir() and (path / "scene.xml").is_file():
     return path / "scene.xml"
   if not path.is_file():
-    names = ", ".join((*models.NAMES, "press"))
+    names = ", ".join((*models.NAMES, "abdomen", "press"))
     raise CommandError(
       f"scene is {name!r}, expected one of {names}, an MJCF file or a folder with a scene.xml"
     )

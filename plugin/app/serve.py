@@ -10,6 +10,7 @@ import webbrowser
 from palpate import register
 
 from .console import CommandError, Interrupt, check_counts, need, output_folder
+from .trainee import keeping
 
 _LOOK = 0.2  # between looks at whether Ctrl-C was pressed [s]
 
@@ -32,6 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser):
   )  # fmt: skip
   add("--pages", metavar="N", type=int, default=2, help="that may be open at a time (%(default)s)")
   add("-o", "--out", metavar="FOLDER", default="out/live", help="of recordings (%(default)s)")
+  keeping.add_arguments(parser)
   add("--open", action="store_true", help="open the page in a browser")
 
 
@@ -48,8 +50,9 @@ def main(args: argparse.Namespace) -> int:
     raise CommandError(f"port is {args.port}, expected a whole number in [0, 65535]")
   check_counts(args, "pages")
   return run(
-    pathlib.Path(args.out), args.host, args.port, args.token, args.device, args.pages, args.open
-  )
+    pathlib.Path(args.out), args.host, args.port, args.token, args.device, args.pages, args.open,
+    kept=keeping.read(args, pages=True),
+  )  # fmt: skip
 
 
 def run(
@@ -61,6 +64,7 @@ def run(
   pages: int = 2,
   show: bool = True,
   task: str = "",
+  kept: keeping.Keeping | None = None,
 ) -> int:
   """Serves until Ctrl-C and returns the exit code; arguments as the options.
 
@@ -73,20 +77,22 @@ def run(
     pages: that may be open at a time
     show: whether a browser is opened
     task: that is chosen at first
+    kept: the record that recordings go to, None for the folder
   """
   need("live", "websockets")
   from .live.server import Server
 
   folder = output_folder("out", folder)
   try:
-    server = Server(folder, host, port, token, device, pages)
+    server = Server(folder, host, port, token, device, pages, kept)
   except OSError as error:
     raise CommandError(f"cannot listen on {host}:{port}: {error}", code=1) from None
   url = f"{server.url}#task={task}" if task else server.url
   thread = threading.Thread(target=server.run, daemon=True)
   with Interrupt() as interrupt:
     thread.start()
-    print(f"page       {url}\nrecordings {folder}\nCtrl-C ends", flush=True)
+    place = kept if kept and kept.folder else folder
+    print(f"page       {url}\nrecordings {place}\nCtrl-C ends", flush=True)
     if show:
       webbrowser.open(url)
     while not interrupt.seen and thread.is_alive():

@@ -36,6 +36,7 @@ def bind(w, model: int):
     if w.resident:
       w.resident.fetch()
     w.phases = does = side.Phases(w, model, w.instance)
+    w.cuts.bind(model)
     near = wp.get_device(does.side)
     crossing = device != near
 

@@ -23,7 +23,7 @@ def configure(w, model: int, texts: dict[str, str]):
     ValueError: a key may not change, or its value is not allowed.
   """
   organ, mesh = w.organ, w.organ.mesh
-  arguments = texts, mesh.nelem, mesh.closed, organ.config
+  arguments = texts, mesh.nelem, mesh.whole.closed, organ.config
   _change(w, model, configuration.change(organ.name, w.config, *arguments))
   w.chosen = True
 
@@ -151,7 +151,7 @@ def _change(w, model: int, config: Config):
     if material:
       shape.change(w.body, w.organ.mesh, config, ~w.organ.free)
     else:
-      shape.renumber(w.body, config)
+      shape.renumber(w.body, config, w.organ.mesh.closed or not w.cuts)
     w.creep.renumber(config)
     if any(getattr(before, key) != getattr(config, key) for key in configuration.RECORDED):
       bind(w, model)

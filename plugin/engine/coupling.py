@@ -68,6 +68,25 @@ class Phases:
   def advance(self):
     """Steps the plugin state."""
 
+  def motion(self) -> tuple[np.ndarray, np.ndarray]:
+    """Returns displacement and velocity of the vertices, in the organ's frame, (nvert, 3) each."""
+    raise NotImplementedError
+
+  def reshape(self, touched: np.ndarray | None = None):
+    """Takes the mesh and the masses that the organ has now; `touched` as in `cut`, None for all."""
+
+  def carry(self, changed, disp, vel, group, member, share):
+    """Gives vertices the motion that they have after a cut, and those that were one their part.
+
+    Args:
+      changed: vertices that lie elsewhere at rest, or are new
+      disp: displacement of all vertices [m]   (nvert, 3)
+      vel: velocity of all vertices [m/s]      (nvert, 3)
+      group: of vertices that were one, which  (n,)
+      member: those vertices                   (n,)
+      share: their part of its mass            (n,)
+    """
+
   def foresee(self):
     """Guesses what the next `gather` reads."""
 
@@ -191,12 +210,21 @@ def sizes(organ) -> dict[str, int]:
   """Returns what the blocks of an organ's plugin state need."""
   relaxes = organ.config.relax_share > 0
   out = {"ncreep": int(organ.free.sum()) if relaxes else 0}
+  whole = organ.mesh.whole
+  out |= cut_sizes(whole.nelem, whole.nvert, whole.spare)
   out["nbond"] = int(organ.free[: organ.mesh.nouter].sum()) if organ.config.bonded else 0
   if organ.windows is None:
     return out | {"nfree": organ.nfree}
   win = organ.windows
   out["nrest"] = organ.mesh.nouter if organ.config.support else 0
   return out | {"nvert": organ.mesh.nvert, "nslot": win.nslot, "ngeom": win.geom.size}
+
+
+def cut_sizes(nelem: int, nvert: int, spare: int) -> dict[str, int]:
+  """Returns what the mesh of an organ needs in the plugin state: nothing without room for cuts."""
+  if not spare:
+    return dict(layout.NO_CUTS)
+  return {"ncorner": nelem, "nplace": nvert, "nspare": spare, "ncuts": 1}
 
 
 def spans(organ) -> dict[str, slice]:

@@ -75,7 +75,8 @@ class Declaration:
   def signature(self) -> float:
     """Marks plugin states of this organ: nodes, triangles, pins and slots; over 2^50."""
     digest = hashlib.sha256(repr((self.windows is None, self.mesh.rest.shape)).encode())
-    for part in (self.mesh.rest, self.mesh.elem, self.free, self.windows and self.windows.home):
+    whole = self.mesh.whole
+    for part in (whole.rest, whole.elem, self.free, self.windows and self.windows.home):
       digest.update(np.ascontiguousarray(part if part is not None else 0).tobytes())
     return float(2**50 + int.from_bytes(digest.digest()[:6], "big"))
 
@@ -156,9 +157,7 @@ def read(model: int, instance: int) -> Declaration:
   frame = frame @ turn
   rest = np.where(free[:, None], mjstruct.view(m.body_pos, (m.nbody, 3))[body] @ turn, 0.0)
   rest += np.where(free[:, None], local, local @ turn)
-  elem = flexes.elements(m, flex)
-  mesh = topology.build(name, rest, elem)
-  config = configuration.parse(name, keys(model, instance), len(elem), mesh.closed)
+  config, mesh = read_mesh(m, name, keys(model, instance), rest, flex)
   check_volume(name, mesh, config)
   if config.carrier and not free.all():
     raise ValueError(f"organ {name!r}: carrier is set and vertices are pinned, expected no <pin>")
@@ -181,6 +180,22 @@ def read(model: int, instance: int) -> Declaration:
     origin=origin,
     mass=mass,
   )
+
+
+def read_mesh(
+  m, name: str, texts: dict[str, str], rest: np.ndarray, flex: int
+) -> tuple[Config, Mesh]:
+  """Returns configuration and mesh of an organ as compiled, from its keys and rest positions."""
+  text = texts.get("spare", "").strip()
+  elem = flexes.compiled_elements(m, flex) if text else flexes.elements(m, flex)
+  spare = configuration.spare(name, text, len(rest) - int(elem.max(initial=-1)) - 1)
+  if spare and len(rest) > flexes.MOST:
+    raise ValueError(
+      f"organ {name!r}: spare is {spare} and it has {len(rest)} vertices, expected at most "
+      f"{flexes.MOST}"
+    )
+  mesh = topology.build(name, rest, elem, spare)
+  return configuration.parse(name, texts, len(elem), mesh.closed), mesh
 
 
 def cached(

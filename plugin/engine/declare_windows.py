@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from palpate.tissue import config as configuration
 from palpate.tissue import device as devices
 from palpate.tissue import fill
 from palpate.tissue import mesh as topology
@@ -30,9 +29,8 @@ def read(model: int, instance: int) -> Declaration:
   nvert = flexes.vertices(m, flex)
   start = int(mjstruct.view(m.flex_vertadr, m.nflex, np.int32)[flex])
   rest = mjstruct.view(m.flex_vert, (m.nflexvert, 3))[start : start + nvert].copy()
-  elem = flexes.elements(m, flex)
-  mesh = topology.build(name, rest, elem)
-  config = configuration.parse(name, declare.keys(model, instance), len(elem), mesh.closed)
+  config, mesh = declare.read_mesh(m, name, declare.keys(model, instance), rest, flex)
+  elem = mesh.elem
   declare.check_volume(name, mesh, config)
   if config.elements == "solid":
     mesh = fill.fill(name, mesh)

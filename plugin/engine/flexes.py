@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import hashlib
+from typing import Any
+
 import mujoco
 import numpy as np
 
 from . import mjstruct
+
+_BITS = 17  # of the number of a vertex
+MOST = 2**_BITS  # vertices that an organ with room for cuts may have
 
 
 def name(m, flex: int) -> str:
@@ -47,10 +53,40 @@ def _extent(addresses: int | None, nflex: int, total: int, flex: int) -> int:
 
 def elements(m, flex: int) -> np.ndarray:
   """Returns the triangles of a flex, (nelem, 3)."""
+  return element_data(m, flex).copy()
+
+
+def element_data(m, flex: int) -> np.ndarray:
+  """Returns MuJoCo's own memory of the triangles of a flex, (nelem, 3)."""
   adr = int(mjstruct.view(m.flex_elemdataadr, m.nflex, np.int32)[flex])
   num = _extent(m.flex_elemadr, m.nflex, m.nflexelem, flex)
-  data = mjstruct.view(m.flex_elem, m.nflexelemdata, np.int32)
-  return data[adr : adr + 3 * num].reshape(num, 3).copy()
+  return mjstruct.view(m.flex_elem, m.nflexelemdata, np.int32)[adr : adr + 3 * num].reshape(num, 3)
+
+
+def marks(m, flex: int, nelem: int) -> np.ndarray:
+  """Returns numbers of a flex that MuJoCo does not use, and that are copied and saved with it.
+
+  They are inverse weights of edges that no equality holds: for each triangle the corners that it
+  was compiled with, packed, what marks these, and the stamp of those in place; see `cuts`.
+  """
+  edge = int(mjstruct.view(m.flex_edgeadr, m.nflex, np.int32)[flex])
+  return mjstruct.view(m.flexedge_invweight0, m.nflexedge)[edge : edge + nelem + 2]
+
+
+def compiled_elements(m, flex: int) -> np.ndarray:
+  """Returns the triangles that a flex with room for cuts was compiled with, (nelem, 3)."""
+  now = elements(m, flex)
+  packed, mark, _ = np.split(marks(m, flex, len(now)), [len(now), len(now) + 1])
+  return unpack(packed)[0] if mark.size and mark[0] == stamp(packed) else now
+
+
+def mark_compiled(m, flex: int):
+  """Notes the triangles of a flex, before the first cut, for `compiled_elements`."""
+  elem = elements(m, flex)
+  packed, mark, shown = np.split(marks(m, flex, len(elem)), [len(elem), len(elem) + 1])
+  if mark[0] != stamp(packed):
+    packed[:] = pack(elem)
+    mark[0], shown[0] = stamp(packed), 0.0
 
 
 def body_frame(m, body: int) -> tuple[np.ndarray, np.ndarray]:
@@ -82,3 +118,24 @@ def resolve(name: str, organ: str, names: list[str]) -> str | None:
   prefixes = [other[: len(other) - len(name)] for other in names if other.endswith(name)]
   prefixes = [prefix for prefix in prefixes if organ.startswith(prefix)]
   return max(prefixes, key=len) + name if prefixes else None
+
+
+def pack(elem: np.ndarray, loose: np.ndarray | None = None) -> np.ndarray:
+  """Returns corners of triangles and a mark as one number each, exact in a double, (nelem,)."""
+  packed = (elem.astype(np.int64) << (_BITS * np.arange(3))).sum(axis=1)
+  return (packed if loose is None else packed + (loose.astype(np.int64) << 3 * _BITS)).astype(float)
+
+
+def unpack(packed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+  """Returns the corners of triangles, (nelem, 3), and which are marked, (nelem,) bool."""
+  there = np.abs(packed) < 2.0 ** (3 * _BITS + 1)
+  whole = np.where(there, packed, 0.0).astype(np.int64)
+  return (whole[:, None] >> (_BITS * np.arange(3))) & (MOST - 1), whole >> 3 * _BITS > 0
+
+
+def stamp(*parts: Any) -> float:
+  """Returns a number that tells meshes apart, over 2^50."""
+  digest = hashlib.blake2b(digest_size=6)
+  for part in parts:
+    digest.update(np.ascontiguousarray(part, dtype=np.float64).tobytes())
+  return float(2**50 + int.from_bytes(digest.digest(), "big"))

@@ -103,7 +103,7 @@ def nodes(w):
   none = np.zeros((0, 3))
   values = dict(
     windowed=int(windowed),
-    rest=organ.mesh.rest,
+    rest=base(organ),
     disp=motion.disp if motion else none,
     vel=motion.vel if motion else none,
     qposadr=organ.qposadr,
@@ -112,6 +112,11 @@ def nodes(w):
     origin=organ.origin,
   )
   return fill(Nodes, "cpu", values)
+
+
+def base(organ) -> np.ndarray:
+  """Returns what displacements here are from: nodal, qpos0 whatever was cut [m], (nvert, 3)."""
+  return organ.mesh.rest if organ.windows else organ.mesh.whole.rest
 
 
 def solver(w):

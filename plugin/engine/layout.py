@@ -177,6 +177,20 @@ CONSTANTS = {
 
 
 @struct
+class Topology:
+  """The mesh of an organ with room for cuts, see `cuts`; zero before the first one."""
+
+  corner: doubles("ncorner")  # corners of each triangle, packed [-]
+  place: doubles("nplace", 3)  # rest position of each vertex, in the organ's frame [m]
+  weight: doubles("nplace")  # its mass [kg]
+  source: doubles("nspare")  # what vertex each spare one comes from [-]
+  stamp: doubles("ncuts")  # of all these; 0 before the first cut [-]
+
+
+NO_CUTS = {"ncorner": 0, "nplace": 0, "nspare": 0, "ncuts": 0}  # its sizes where there is no room
+
+
+@struct
 class NodalState:
   """Plugin state of an organ whose nodes are degrees of freedom of MuJoCo."""
 
@@ -185,6 +199,7 @@ class NodalState:
   before: doubles("nfree")  # the one before it [m/s]
   creep: doubles("ncreep", 6)  # see `creep`
   bond: doubles("nbond", len(BOND))  # of each vertex that moves, see BOND
+  cuts: Topology
   heavier: doubles(1)  # how many times its inertia at rest a tool meets; 0 for once [-]
   signature: doubles(1)  # of the organ, see `Declaration`; 0 where it was set by hand [-]
 
@@ -209,6 +224,7 @@ class WindowState:
   bond: doubles("nbond", len(BOND))  # of each vertex that moves, see BOND
   slip: doubles("nrest", 3)  # how far nodes have slipped on what they rest on [m]
   slot: doubles("nslot")  # node + 1; 0: the slot's default node, -1: not used
+  cuts: Topology
   pose: doubles("ngeom", len(POSE))  # where the windows' geoms were, see POSE
   tail: doubles(len(TAIL))  # see TAIL
   signature: doubles(1)  # of the organ, see `Declaration`; 0 where it was set by hand [-]

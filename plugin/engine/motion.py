@@ -23,7 +23,13 @@ class Nodal:
 
   def displacement(self, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
     """Returns the displacement from rest [m], (nvert, 3)."""
-    return self._spread(data.qpos[self._qpos] - model.qpos0[self._qpos])
+    return self._spread(data.qpos[self._qpos] - model.qpos0[self._qpos] - self._shift)
+
+  @property
+  def _shift(self) -> np.ndarray:
+    """How far cuts have moved rest positions [m], of the vertices that move."""
+    mesh = self._w.organ.mesh
+    return (mesh.rest - mesh.whole.rest)[self._moving] if mesh.uncut is not None else np.zeros(3)
 
   def velocity(self, data: mujoco.MjData) -> np.ndarray:
     """Returns the velocity [m/s], (nvert, 3)."""
@@ -36,7 +42,7 @@ class Nodal:
   def put(self, model, data, u: np.ndarray | None, v: np.ndarray | None):
     """Sets displacement and velocity of the vertices that move and forgets forces of the past."""
     if u is not None:
-      data.qpos[self._qpos] = model.qpos0[self._qpos] + u[self._moving]
+      data.qpos[self._qpos] = model.qpos0[self._qpos] + self._shift + u[self._moving]
     if v is not None:
       data.qvel[self._dofs] = v[self._moving]
     _forget(self._w)
@@ -90,7 +96,9 @@ class Windowed:
 def _forget(w: Workspace):
   """Clears the plugin state, but for what has come apart."""
   kept = w.bonds.state.copy() if w.config.bonded else None
+  cut = w.cuts.copy()
   w.plugin_state[:] = 0
+  w.cuts.put(cut)
   if kept is not None:
     w.bonds.state[:] = kept
 

@@ -7,7 +7,7 @@ import warp as wp
 from palpate.tissue import step
 from palpate.tissue.types import doubles, fill, ints, struct
 
-from . import coupling, layout, mjstruct
+from . import coupling, inertia, layout, mjstruct
 from .coupling import Crossing, Mujoco
 from .layout import FLAG, NodalState
 
@@ -24,6 +24,10 @@ class Nodal:
   stateadr: ints("nnode")  # its first number in a block of the plugin state
   massadr: ints("nnode", 3)  # where M has the diagonals of its dofs
   frame: doubles(3, 3)  # rotation from the slides' axes to the world
+  cuts: int  # whether it has room for cuts; the next three are there then
+  weight: doubles("ncut")  # mass of a node [kg]
+  inertia: doubles("ncut")  # its inertia to MuJoCo [kg]
+  shift: doubles("ncut", 3)  # rest position now less that of the compiled model [m]
   heaviest: doubles(1)  # see `Workspace`
   number: doubles("nnumber")  # see `NUMBERS`
   flags: ints(len(FLAG))  # see FLAG
@@ -38,9 +42,10 @@ gather, scatter, push, remember = coupling.kernels(
 )
 
 
-def state_size(nfree: int, ncreep: int = 0, nbond: int = 0) -> int:
+def state_size(nfree: int, **more: int) -> int:
   """Returns the length of the plugin state of `nfree` degrees of freedom; see `coupling.sizes`."""
-  return layout.size(NodalState, {"nfree": nfree, "ncreep": ncreep, "nbond": nbond})
+  sizes = {"nfree": nfree, "ncreep": 0, "nbond": 0} | layout.NO_CUTS
+  return layout.size(NodalState, sizes | more)
 
 
 class Phases(coupling.Phases):
@@ -64,6 +69,10 @@ class Phases(coupling.Phases):
       stateadr=_in_node_order(organ.stateadr, vert),
       massadr=np.where(dofadr[:, None] >= 0, coupling.mass_addresses(m, dofs), -1),
       frame=organ.frame,
+      cuts=int(organ.mesh.spare > 0),
+      weight=np.zeros(len(vert) if organ.mesh.spare else 0),
+      inertia=np.zeros(len(vert) if organ.mesh.spare else 0),
+      shift=np.zeros((len(vert) if organ.mesh.spare else 0, 3)),
       heaviest=wp.array(w.heaviest, dtype=wp.float64, device="cpu", copy=False),
       number=w.body.numbers,
       flags=wp.array(np.asarray(w.flags), dtype=int, device="cpu", copy=False),
@@ -73,7 +82,9 @@ class Phases(coupling.Phases):
       solve=coupling.crossing(w.host),
     )
     w.views["plugin_state"] = state
-    self._nodal = fill(Nodal, "cpu", values)
+    self._nodal, self._w, self._model = fill(Nodal, "cpu", values), w, m
+    if organ.mesh.spare:
+      self.reshape()
 
   def _launch(self, kernel):
     kernel.launch("cpu", 1, 1, 0, self._nodal)
@@ -93,6 +104,48 @@ class Phases(coupling.Phases):
   def advance(self):
     """Steps the plugin state, and ends the step with the response where there was one."""
     self._launch(remember)
+
+  # Cuts.
+
+  def reshape(self, touched: np.ndarray | None = None):
+    """Takes the mesh and the masses that the organ has now."""
+    w, organ, n = self._w, self._w.organ, self._nodal
+    node = w.body.shape.node.numpy()
+    mass = np.where(organ.mass > 0, organ.mass, 1.0)
+    n.weight.numpy()[node] = mass
+    n.inertia.numpy()[node] = w.cuts.share(inertia.of_dofs(self._model, organ))
+    n.shift.numpy()[node] = organ.mesh.rest - organ.mesh.whole.rest
+
+  def _views(self) -> tuple[np.ndarray, np.ndarray]:
+    """Returns MuJoCo's qpos and qvel."""
+    m, d = self._model, mjstruct.Data.from_address(self._w.data)
+    return mjstruct.view(d.qpos, m.nq), mjstruct.view(d.qvel, m.nv)
+
+  def motion(self) -> tuple[np.ndarray, np.ndarray]:
+    """Returns displacement and velocity of the vertices, in the organ's frame, (nvert, 3) each."""
+    organ, (qpos, qvel) = self._w.organ, self._views()
+    qpos0 = mjstruct.view(self._model.qpos0, self._model.nq)
+    shift = organ.mesh.rest - organ.mesh.whole.rest
+    disp, vel = np.zeros((organ.mesh.nvert, 3)), np.zeros((organ.mesh.nvert, 3))
+    at, dofs = organ.qposs.reshape(-1, 3), organ.dofs.reshape(-1, 3)
+    disp[organ.free] = qpos[at] - qpos0[at] - shift[organ.free]
+    vel[organ.free] = qvel[dofs]
+    return disp, vel
+
+  def carry(self, changed, disp, vel, group, member, share):
+    """Gives vertices their motion after a cut, see `coupling.Phases`."""
+    organ, (qpos, qvel) = self._w.organ, self._views()
+    qpos0 = mjstruct.view(self._model.qpos0, self._model.nq)
+    shift = organ.mesh.rest - organ.mesh.whole.rest
+    mine = changed[organ.free[changed]]
+    at = organ.qposadr[mine, None] + np.arange(3)
+    qpos[at] = qpos0[at] + shift[mine] + disp[mine]
+    qvel[organ.dofadr[mine, None] + np.arange(3)] = vel[mine]
+    own = organ.stateadr[:, None] + np.arange(3)
+    for name in ("force", "last", "before"):
+      block = getattr(self._nodal.own, name).numpy()
+      part = share[:, None] if name == "force" else 1.0
+      block[own[member]] = part * block[own[group]]
 
 
 def _in_node_order(values: np.ndarray, vert: np.ndarray) -> np.ndarray:

@@ -53,10 +53,6 @@ def make(w, side, motion, boxes: tuple[wp.array, wp.array], sizes: dict[str, int
   """
   organ, s = w.organ, w.body.shape
   node = s.node.numpy()
-  mass = np.ones(s.nnode)
-  mass[node] = organ.windows.mass
-  w.host["mass"].assign(order.to_slices(mass)[None].astype(np.float32))
-  wp.copy(w.body.state.mass, w.host["mass"])
   values = dict(
     nvert=sizes["nvert"],
     nouter=organ.mesh.nouter,
@@ -64,7 +60,7 @@ def make(w, side, motion, boxes: tuple[wp.array, wp.array], sizes: dict[str, int
     nwindow=sizes["nwindow"],
     most=sizes["most"],
     node=order.offset(node),
-    mass=organ.windows.mass,
+    mass=organ.mass,
     rest=organ.mesh.rest,
     count=np.zeros(sizes["nwindow"]),
     extent=np.full(7, -(2**31)),  # nothing put
@@ -73,7 +69,19 @@ def make(w, side, motion, boxes: tuple[wp.array, wp.array], sizes: dict[str, int
     outbox=layout.carve(Outbox, boxes[1], sizes),
     solve=coupling.crossing(coupling.on_body(w.body) if w.config.resident else w.host),
   )
-  return fill(Nodes, side, values)
+  out = fill(Nodes, side, values)
+  weigh(w, out)
+  return out
+
+
+def weigh(w, nodes):
+  """Gives the nodes, and the solver's, the masses that the organ has now."""
+  s, mass = w.body.shape, w.organ.mass
+  nodes.mass.assign(mass)
+  every = np.ones(s.nnode)
+  every[s.node.numpy()] = np.where(mass > 0, mass, 1.0)
+  w.host["mass"].assign(order.to_slices(every)[None].astype(np.float32))
+  wp.copy(w.body.state.mass, w.host["mass"])
 
 
 def launch(kernel, nodes, count: int, device):

@@ -174,7 +174,7 @@ class Watch:
     m, d = mjstruct.Model.from_address(w.model), mjstruct.Data.from_address(w.data)
     if self._tools is None:
       self._tools = tools(m, w.organ)
-    if not len(self._tools):
+    if not len(self._tools) or not w.organ.mesh.closed:  # a cut opens it
       return []
     seen, disp = Tools(m, d, w.organ, self._tools), _displacement(m, d, w)
     found = set(seen.inside(disp))

@@ -15,7 +15,19 @@ import mujoco
 import numpy as np
 from palpate.tissue.config import KEYS
 
-from . import adhere, change, fasten, guard, mjstruct, rests, weights, windowed, workspace
+from . import (
+  adhere,
+  change,
+  fasten,
+  guard,
+  mjstruct,
+  rests,
+  room,
+  skin,
+  weights,
+  windowed,
+  workspace,
+)
 from .layout import FLAG, STAGE
 from .mjstruct import NAME, warn
 from .workspace import Workspace
@@ -100,7 +112,7 @@ def place_windows(model: mujoco.MjModel, data: mujoco.MjData):
 @guard.watch
 def _nstate(model: int, instance: int) -> int:
   try:
-    return workspace.state_size(model, instance)
+    return room.state_size(model, instance)
   except BaseException as error:
     _say(error)
     return 0
@@ -176,7 +188,7 @@ def _push(w: Workspace, model: int):
     _find_bad_state(w)
   w.run()
   if w.status[3]:
-    _note(w, f"the {w.config.integrator} step has no finite solution: the motion diverged")
+    w.note(f"the {w.config.integrator} step has no finite solution: the motion diverged")
 
 
 @guard.watch
@@ -196,6 +208,8 @@ def _advance(model: int, data: int, instance: int):
 def _end(w: Workspace):
   """Ends the step, and looks at what came of it."""
   w.step()
+  if w.cuts.tear and w.cuts.tear.act():
+    workspace.place(w, w.model)
   nodes, triangles = w.flags[FLAG.missed_nodes], w.flags[FLAG.missed_elements]
   if nodes > w.missed[0] or triangles > w.missed[1]:
     _miss(w, int(nodes), int(triangles))
@@ -209,11 +223,24 @@ def _end(w: Workspace):
 def _visualize(model: int, data: int, option: int, scene: int, instance: int):
   w = _workspaces[data, instance]
   try:
+    if w.cuts:
+      w.cuts.follow()
+      w.cuts.show()
     if w.organ.windows:
       windowed.draw(w, model, data)
+    if w.skin is not None:
+      _draw_skin(w, model, data)
   except BaseException as error:
     _fail(w, error)
   return guard.leave()
+
+
+def _draw_skin(w: Workspace, model: int, data: int):
+  whole = w.organ.mesh.uncut is None
+  if w.cuts:  # a skin knows of no cut: the organ's own surface is drawn then
+    skin.show(w, model, shown=whole)
+  if whole:
+    skin.draw(w, model, data)
 
 
 # What went wrong.
@@ -232,7 +259,7 @@ def _find_bad_state(w: Workspace):
   for kind, name, own in zip(_BAD, names, (organ.qposs, organ.dofs, organ.dofs), strict=True):
     index, count = w.warning[2 * kind : 2 * kind + 2]
     if count and index in own:
-      _note(w, f"{name} {index}) is not finite or huge; the motion diverged")
+      w.note(f"{name} {index}) is not finite or huge; the motion diverged")
 
 
 def _say(error: BaseException):
@@ -249,18 +276,11 @@ def _fail(w: Workspace, error: BaseException) -> bool:
   step ahead.
   """
   if not guard.is_foreign(error):
-    _note(w, f"{type(error).__name__}: {error}")
+    w.note(f"{type(error).__name__}: {error}")
     return False
   guard.raise_later(error)
   w.torn = w.resident is not None
   return not w.torn
-
-
-def _note(w: Workspace, text: str):
-  """Keeps the first error and says it."""
-  if w.error is None:
-    w.error = f"organ {w.organ.name!r}: {text}"
-    warn(w.error)
 
 
 def _watch(w: Workspace):

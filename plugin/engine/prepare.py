@@ -15,8 +15,10 @@ from palpate.tissue.step import SCHEMES
 
 from . import inertia, mjstruct
 from .declare import Declaration
+from .flexes import mark_compiled
 
 _KNOWN = 64
+_PARTS = 8  # that cuts may make of a node
 _made_for: dict[bytes, tuple] = {}  # digest of an armature of ours -> time step and material
 
 
@@ -26,6 +28,8 @@ def fit(m, organ: Declaration, body: Body):
   # costs nothing while running. The plugin's own damping acts instead.
   flexes = organ.windows.flex if organ.windows else [organ.flex]
   mjstruct.view(m.flex_edgedamping, m.nflex)[flexes] = 0.0
+  if organ.mesh.spare:
+    mark_compiled(m, organ.flex)
   if organ.windows is None:
     give_armature(m, organ, body, organ.config)
     return
@@ -33,7 +37,8 @@ def fit(m, organ: Declaration, body: Body):
   mjstruct.view(m.body_pos, (m.nbody, 3))[win.body] = win.stand
   # A slot must be no heavier than the lightest node that it may stand on.
   mass = mjstruct.view(m.body_mass, m.nbody)
-  mass[win.body] = np.minimum(mass[win.body], win.mass.min())
+  light = win.mass[win.mass > 0].min() / (_PARTS if organ.mesh.spare else 1)
+  mass[win.body] = np.minimum(mass[win.body], light)
 
 
 def give_armature(m, organ: Declaration, body: Body, config: Config):
@@ -74,16 +79,27 @@ def show(m, organ: Declaration, shown: bool):
   boxes and bounding volumes in every step, which can take longer than the organ's step. A scene has
   room for the flex whether it was made with the one or the other: 2 (shells + elements).
   """
-  flex, mesh = organ.flex, organ.mesh
-  shells = int((mesh.twin < 0).sum())
-  counts = (mesh.nouter, mesh.nelem, shells) if shown else (0, 0, shells + mesh.nelem)
+  flex, mesh = organ.flex, organ.mesh.whole
+  nvert, shells = drawn(mesh), int((mesh.twin < 0).sum())
+  counts = (nvert, mesh.nelem, shells) if shown else (0, 0, shells + mesh.nelem)
   names = ("flex_vertnum", "flex_elemnum", "flex_shellnum", "flex_bvhnum", "flex_bvhadr")
   for name, count in zip(names, (*counts, 0, -1), strict=True):
     mjstruct.view(getattr(m, name), m.nflex, np.int32)[flex] = count
   # The broad phase passes over vertices of the world; the first one still tells whose they are.
   start = int(mjstruct.view(m.flex_vertadr, m.nflex, np.int32)[flex])
-  body = mjstruct.view(m.flex_vertbodyid, m.nflexvert, np.int32)[start : start + mesh.nouter]
+  body = mjstruct.view(m.flex_vertbodyid, m.nflexvert, np.int32)[start : start + nvert]
   body[1:] = body[0] if shown else 0
+
+
+def drawn(mesh) -> int:
+  """Returns how many vertices of an organ a flex has: those on the surface, and spare ones."""
+  return mesh.nvert if mesh.spare else mesh.nouter
+
+
+def group(m, skin: int, flex: int, groups: tuple[int, int]):
+  """Puts an organ's skin and its own surface into groups, which viewers draw or do not."""
+  mjstruct.view(m.skin_group, m.nskin, np.int32)[skin] = groups[0]
+  mjstruct.view(m.flex_group, m.nflex, np.int32)[flex] = groups[1]
 
 
 def _digest(values: np.ndarray) -> bytes:

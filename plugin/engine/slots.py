@@ -112,8 +112,7 @@ def make(w, model: int, sizes: dict[str, int]):
   margin = float(mjstruct.view(m.flex_margin, m.nflex)[win.flex].max())
   margin += float(mjstruct.view(m.geom_margin, m.ngeom)[win.geom].max(initial=0.0))
   dofs = win.dofadr[:, None] + np.arange(3)
-  incidence = np.argsort(mesh.elem.ravel(), kind="stable") // 3
-  count = np.bincount(mesh.elem.ravel(), minlength=mesh.nvert)
+  adr, near = _around(mesh)
   values = w.boxes | {name: w.views[name] for name in scratch(0, 0)} | dict(
     nvert=sizes["nvert"],
     nslot=sizes["nslot"],
@@ -127,12 +126,12 @@ def make(w, model: int, sizes: dict[str, int]):
     skin=radius + margin,
     weight=float(win.mass.sum()),
     free=organ.free,
-    node_mass=hold(organ, win.mass),
+    node_mass=hold(organ, organ.mass),
     rest=mesh.rest,
     touch=longest + radius,
     elem=mesh.elem,
-    near_adr=np.concatenate([[0], np.cumsum(count)]),
-    near=incidence,
+    near_adr=adr,
+    near=near,
     frame=organ.frame,
     origin=organ.origin,
     heaviest=wp.array(w.heaviest, dtype=wp.float64, device="cpu", copy=False),
@@ -154,6 +153,28 @@ def make(w, model: int, sizes: dict[str, int]):
     mj=coupling.mujoco_arrays(model, w.data),
   )  # fmt: skip
   return fill(Slots, "cpu", values)
+
+
+def reshape(w, slots, touched: np.ndarray):
+  """Gives slots the mesh and the masses that the organ has now; triangles keep their number."""
+  organ, mesh, m = w.organ, w.organ.mesh, mjstruct.Model.from_address(w.model)
+  radius = float(mjstruct.view(m.flex_radius, m.nflex)[organ.windows.flex].max())
+  slots.rest.numpy()[:] = mesh.rest
+  slots.elem.numpy()[:] = mesh.elem
+  arm = mesh.rest[mesh.ring[touched]] - mesh.rest[touched][:, None]
+  longest = np.where(mesh.ring[touched] >= 0, np.linalg.norm(arm, axis=2), 0.0).max(axis=1)
+  slots.touch.numpy()[touched] = longest + radius
+  slots.node_mass.assign(hold(organ, organ.mass))
+  adr, near = _around(mesh)
+  slots.near_adr.assign(adr.astype(np.int32))
+  slots.near.assign(near.astype(np.int32))
+
+
+def _around(mesh) -> tuple[np.ndarray, np.ndarray]:
+  """Returns the first of each node's triangles, (nvert + 1,), and all of these, (3 nelem,)."""
+  count = np.bincount(mesh.elem.ravel(), minlength=mesh.nvert)
+  adr = np.concatenate([[0], np.cumsum(count)])
+  return adr, np.argsort(mesh.elem.ravel(), kind="stable") // 3
 
 
 def hold(organ, inertia: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ from palpate.tissue.step import SCHEMES
 from palpate.tissue.types import DIMS, doubles, fill, ints, struct, vector
 
 from . import coupling, mjstruct
-from .hold import Beside, Bodies, Input, Nodes, may_move, nodes, solver
+from .hold import Beside, Bodies, Input, Nodes, base, may_move, nodes, solver
 
 TO_POINT, TO_OWN_MOTION = -1, -2  # in place of a body
 _LEAST = 64  # ties that there is room for at once
@@ -127,6 +127,11 @@ class Ties(Beside):
   def _moves(self, body: int) -> bool:
     return body < 0 or may_move(mjstruct.Model.from_address(self._w.model), body)
 
+  def reshape(self):
+    """Takes the rest positions that the organ has now."""
+    if self._tied is not None:
+      self._tied.own.rest.assign(base(self._w.organ))
+
   def load(self):
     """See `Beside`."""
     if self:
@@ -212,7 +217,7 @@ def motion(w, vert: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     dofs = np.maximum(organ.dofadr[vert], 0)[:, None] + np.arange(3)
     u = mjstruct.view(d.qpos, m.nq)[qpos] - mjstruct.view(m.qpos0, m.nq)[qpos]
     u, v = free * u, free * mjstruct.view(d.qvel, m.nv)[dofs]
-  return organ.origin + (organ.mesh.rest[vert] + u) @ organ.frame.T, v @ organ.frame.T
+  return organ.origin + (base(organ)[vert] + u) @ organ.frame.T, v @ organ.frame.T
 
 
 def is_mocap(m, body: int) -> bool:

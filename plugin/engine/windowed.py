@@ -27,8 +27,8 @@ ROOM = 16
 
 def state_size(nvert: int, nslot: int, ngeom: int, **more: int) -> int:
   """Returns the length of the plugin state; ngeom is summed over the windows."""
-  sizes = {"ncreep": 0, "nrest": 0, "nbond": 0} | more
-  return layout.size(WindowState, {"nvert": nvert, "nslot": nslot, "ngeom": ngeom} | sizes)
+  sizes = {"nvert": nvert, "nslot": nslot, "ngeom": ngeom, "ncreep": 0, "nrest": 0, "nbond": 0}
+  return layout.size(WindowState, sizes | layout.NO_CUTS | more)
 
 
 class Phases(coupling.Phases):
@@ -59,7 +59,7 @@ class Phases(coupling.Phases):
       "outbox": layout.carve(Outbox, v["outbox"], sizes),
       "foreseen": layout.carve(Inbox, v["foreseen"], sizes),
     }
-    self._slots = slots.make(w, model, sizes)
+    self._slots, self._w = slots.make(w, model, sizes), w
     # The boxes here and on `side`, which may be the same.
     self._near, self._foreseen = (v["inbox"], v["outbox"]), v["foreseen"]
     self._far, motion = self._near, w.boxes["own"].motion
@@ -71,6 +71,31 @@ class Phases(coupling.Phases):
       motion = layout.carve(Motion, self._motion, sizes)
       w.resident = Resident(w, self._motion, self._end_now, self.look_ahead)
     self._nodes = nodes.make(w, self.side, motion, self._far, sizes)
+
+  # Cuts.
+
+  def reshape(self, touched: np.ndarray | None = None):
+    """Takes the mesh and the masses that the organ has now."""
+    organ, nodes_ = self._w.organ, self._nodes
+    touched = np.arange(organ.mesh.nvert) if touched is None else touched
+    slots.reshape(self._w, self._slots, touched)
+    share_inertia(self._w)
+    nodes_.rest.assign(organ.mesh.rest)
+    nodes_.nouter = organ.mesh.nouter
+    nodes.weigh(self._w, nodes_)
+    wake(self._w)
+
+  def motion(self) -> tuple[np.ndarray, np.ndarray]:
+    """Returns displacement and velocity of the vertices, in the organ's frame, (nvert, 3) each."""
+    motion = self._w.boxes["own"].motion
+    return motion.disp.numpy().copy(), motion.vel.numpy().copy()
+
+  def carry(self, changed, disp, vel, group, member, share):
+    """Gives vertices their motion after a cut, see `coupling.Phases`; slots keep their forces."""
+    motion = self._w.boxes["own"].motion
+    motion.disp.numpy()[changed], motion.vel.numpy()[changed] = disp[changed], vel[changed]
+    for values in (motion.last.numpy(), motion.before.numpy()):
+      values[member] = values[group]
 
   def _sizes(self, organ) -> dict[str, int]:
     """Returns what the blocks of `layout` need."""
@@ -241,11 +266,18 @@ def wake(w):
 
 def set_inertia(w, m):
   """Stores the effective inertia of every node for the present time step."""
-  organ, win = w.organ, w.organ.windows
+  organ, win = w.declared, w.organ.windows
   nodal = win.mass
   if step.SCHEMES[w.config.integrator].spreads:
     nodal = inertia.of_nodes(m, organ, w.body, w.config, win.mass, int(win.flex[0]))
-  w.views["inertia"].assign(slots.hold(organ, nodal))
+  w.views["whole"] = nodal
+  share_inertia(w)
+
+
+def share_inertia(w):
+  """Gives vertices that were one their part of its inertia."""
+  nodal = w.views["whole"]
+  w.views["inertia"].assign(slots.hold(w.organ, w.cuts.share(nodal) if w.cuts else nodal))
 
 
 def shortage(w) -> str | None:
@@ -265,7 +297,7 @@ def draw(w, model: int, data: int):
   m, d = mjstruct.Model.from_address(model), mjstruct.Data.from_address(data)
   organ = w.organ
   start = int(mjstruct.view(m.flex_vertadr, m.nflex, np.int32)[organ.flex])
-  n = organ.mesh.nouter
+  n = prepare.drawn(organ.mesh)
   prepare.show(m, organ, shown=True)
   if w.resident:
     w.resident.fetch()

@@ -9,7 +9,6 @@ import mujoco
 import numpy as np
 import warp as wp
 from palpate.tissue import body as bodies
-from palpate.tissue import fill
 from palpate.tissue.body import Body
 from palpate.tissue.config import Config
 
@@ -22,8 +21,8 @@ from . import (
   graphs,
   inertia,
   mjstruct,
-  nodal,
   prepare,
+  skin,
   weights,
   windowed,
 )
@@ -31,6 +30,7 @@ from .bind import bind
 from .bonds import Bonds
 from .coupling import Phases
 from .creep import Creep
+from .cuts import Cuts
 from .declare import Declaration
 from .hold import Beside, Hold
 from .layout import FLAG, HEAD, STAGE
@@ -74,6 +74,7 @@ class Workspace:
     bonds: what it has grown on to
     rests: what it rests on
     creep: its stress relaxation
+    cuts: its mesh as it is now
     resident: keeper of a motion that stays on the device, or None
     stiff: whether the response is needed, see `inertia.stiffness`
     heaviest: most times its inertia that a node in contact may have, see there  (1,)
@@ -100,6 +101,7 @@ class Workspace:
     plugin_state: the organ's own numbers
     signature: the last of them, see `Declaration`
     views: what a coupling keeps when its graphs are recorded anew
+    skin: what is drawn for it, or None
     boxes: blocks of the plugin state and of what crosses in a step, see `layout`; windows
     phases: what the graphs launch
   """
@@ -128,6 +130,7 @@ class Workspace:
   bonds: Bonds = dataclasses.field(init=False)
   rests: Rests = dataclasses.field(init=False)
   creep: Creep = dataclasses.field(init=False)
+  cuts: Cuts = dataclasses.field(init=False)
   resident: Resident | None = None
   stiff: bool = False
   heaviest: np.ndarray = dataclasses.field(default_factory=lambda: np.ones(1))
@@ -155,12 +158,14 @@ class Workspace:
   plugin_state: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))
   signature: Any = dataclasses.field(default_factory=lambda: memoryview(b"\0"))
   views: dict = dataclasses.field(default_factory=dict)
+  skin: skin.Skin | None = None
   boxes: dict = dataclasses.field(default_factory=dict)
   phases: Phases | None = None
 
   def __post_init__(self):
     self.hold, self.ties = Hold(self), Ties(self)
     self.bonds, self.rests, self.creep = Bonds(self), Rests(self), Creep(self)
+    self.cuts = Cuts(self)
 
   @property
   def beside(self) -> tuple[Beside, ...]:
@@ -178,11 +183,25 @@ class Workspace:
     if self.strange:
       coupling.check_state(self.organ, self.plugin_state)
       self.strange = False
+    changed = bool(self.cuts) and self.cuts.renewed()
     if self.turn is None:
-      self._run()
+      if self.cuts:
+        self._run_cut(changed)
+      else:
+        self._run()
     else:
       with self.turn.lock:
+        if changed:
+          self._find_contacts_again()
         self._run()
+
+  def _run_cut(self, changed: bool):
+    """Runs an organ that may be cut: the model's triangles must be its own."""
+    with self.cuts.lock:
+      if self.flags[FLAG.stage] < STAGE.gathered and (changed or not self.cuts.shown):
+        self.cuts.show()
+        windowed.find_contacts_again(self)
+      self._run()
 
   def _run(self):
     if self.flags[FLAG.stage] == STAGE.pushed:
@@ -305,6 +324,11 @@ class Workspace:
       self.resident.look()
 
   @property
+  def declared(self) -> Declaration:
+    """The organ before the first cut."""
+    return self.cuts.declared if self.cuts else self.organ
+
+  @property
   def asleep(self) -> bool:
     """Whether the organ is at rest and its solve was skipped."""
     return bool(self.flags[FLAG.asleep])
@@ -319,6 +343,12 @@ class Workspace:
     if self.organ.windows:
       return self.views["inertia"].numpy().copy()
     return inertia.of_dofs(mjstruct.Model.from_address(model), self.organ)
+
+  def note(self, text: str):
+    """Keeps the first error and says it."""
+    if self.error is None:
+      self.error = f"organ {self.organ.name!r}: {text}"
+      mjstruct.warn(self.error)
 
   def forget(self):
     """Forgets what went wrong."""
@@ -345,27 +375,6 @@ def attach(w: Workspace, model: int):
     bind(w, model)
 
 
-def state_size(model: int, instance: int) -> int:
-  """Returns the length of the plugin state.
-
-  Contact force, last dv and the one before of each moving vertex, or what `windowed` says.
-  """
-  m = mjstruct.Model.from_address(model)
-  names = mjstruct.config(model, instance, "window").split()
-  relaxes, rests, bonded = (
-    bool(mjstruct.config(model, instance, key).strip())
-    for key in ("relax_share", "support", "bonds")
-  )
-  if names:
-    # Asked before MuJoCo has filled in the flexes: what `windowed` needs is at most this.
-    inside = fill.MOST if mjstruct.config(model, instance, "elements").strip() == "solid" else 0
-    most = (1 + inside) * m.nflexvert
-    outer = {"nrest": rests * m.nflexvert, "nbond": bonded * m.nflexvert}
-    return windowed.state_size(most, 0, m.ngeom * len(names), ncreep=relaxes * most, **outer)
-  moving = len(declare.moving_bodies(m, instance))
-  return nodal.state_size(3 * moving, relaxes * moving, bonded * moving)
-
-
 def make(model: int, data: int, instance: int) -> Workspace:
   """Returns the workspace of an organ in a fresh mjData; makes the model fit the organ."""
   has_windows = bool(mjstruct.config(model, instance, "window"))
@@ -389,6 +398,7 @@ def make(model: int, data: int, instance: int) -> Workspace:
     host["mass"].assign(mass)
     if organ.windows:
       w.turn = Turn()
+    w.skin = skin.read(m, organ)
     fasten.declare(w)
     adhere.declare(w)
     bind(w, model)
@@ -414,7 +424,7 @@ def _view(w: Workspace, d, m):
 def feel(w: Workspace, m):
   """Notes whether the organ is stiff for the present time step."""
   nodal = w.inertia(w.model)
-  w.stiff, w.heaviest[0] = inertia.stiffness(m, w.organ, w.body, w.config, nodal)
+  w.stiff, w.heaviest[0] = inertia.stiffness(m, w.declared, w.body, w.config, nodal)
 
 
 def sync(w: Workspace):
@@ -428,7 +438,8 @@ def refresh(w: Workspace):
   m = mjstruct.Model.from_address(w.model)
   with graphs.lock:
     if w.organ.windows is None:
-      prepare.give_armature(m, w.organ, w.body, w.config)
+      prepare.give_armature(m, w.declared, w.body, w.config)
+      w.cuts.spread()
     else:
       windowed.set_inertia(w, m)
       if w.turn is not None and w.turn.mine:

@@ -4,10 +4,24 @@
 
 namespace palpate {
 
+// The mass of a node: where there may be cuts not MuJoCo's, which is the same in every mjData.
+template <class Fields>
+PALPATE double mass_of(const Fields& f, int i) {
+  return f.cuts ? f.weight.data[i] : f.mj.body_mass.data[f.bodyid.data[i]];
+}
+
 // The inertia of dof `k`, less than three, of a node whose dofs start at `adr`.
 template <class Fields>
-PALPATE double inertia(const Fields& f, double mass, int adr, int k) {
-  return mass + f.mj.dof_armature.data[adr + k];
+PALPATE double inertia(const Fields& f, int i, int adr, int k) {
+  if (f.cuts) return f.inertia.data[i];
+  return f.mj.body_mass.data[f.bodyid.data[i]] + f.mj.dof_armature.data[adr + k];
+}
+
+// Displacement of a node from rest, whose place a cut may have moved.
+template <class Fields>
+PALPATE D3 displacement(const Fields& f, int i, int qadr) {
+  const D3 u = load(f.mj.qpos.data + qadr) - load(f.mj.qpos0.data + qadr);
+  return f.cuts ? u - load(f.shift.data + 3 * i) : u;
 }
 
 // Reads MuJoCo's arrays into the solver's state and keeps what acts on the nodes.
@@ -26,15 +40,15 @@ PALPATE void gather_nodes(const Fields& f, Thread, int) {
     const int at = offset_of(i), adr = f.dofadr.data[i];
     if (adr < 0) continue;
     const int qadr = f.qposadr.data[i], body = f.bodyid.data[i], own = f.stateadr.data[i];
-    const double m = mj.body_mass.data[body];
+    const double m = mass_of(f, i), theirs = mj.body_mass.data[body];
     solve.mass.data[i] = (float)m;
     weight += m;
-    const D3 along = m * g + load(mj.qfrc_applied.data + adr) + load(mj.qfrc_passive.data + adr);
+    const D3 along = theirs * g + load(mj.qfrc_applied.data + adr) + load(mj.qfrc_passive.data + adr);
     const D3 f_ext = external(along, R, mj.xfrc_applied.data + 6 * body);
     const D3 lagged = f_ext + load(f.own.force.data + own);
     store(f.lagged.data + 3 * i, lagged);
-    store_lane(solve.force_ext.data + at, lagged);
-    store_lane(solve.disp.data + at, load(mj.qpos.data + qadr) - load(mj.qpos0.data + qadr));
+    store_lane(solve.force_ext.data + at, f.cuts ? lagged + (m - theirs) * g : lagged);
+    store_lane(solve.disp.data + at, displacement(f, i, qadr));
     store_lane(solve.vel.data + at, load(mj.qvel.data + adr));
     const D3 next = forecast(load(f.own.last.data + own), load(f.own.before.data + own));
     store_lane(solve.dvel_warm.data + at, next);
@@ -55,11 +69,10 @@ PALPATE void scatter_nodes(const Fields& f, Thread, int) {
   for (int i = 0; i < f.nnode; ++i) {
     const int adr = f.dofadr.data[i], own = f.stateadr.data[i];
     if (adr < 0) continue;
-    const double m = mj.body_mass.data[f.bodyid.data[i]];
     const double gain = heavy > 1.0 && touched(load(f.own.force.data + own)) ? heavy : 1.0;
-    const D3 Mhat = {gain * inertia(f, m, adr, 0), gain * inertia(f, m, adr, 1),
-                     gain * inertia(f, m, adr, 2)};
-    if (gain > 1.0) set_inertia(mj, f.massadr.data + 3 * i, adr, Mhat);
+    const D3 Mhat = {gain * inertia(f, i, adr, 0), gain * inertia(f, i, adr, 1),
+                     gain * inertia(f, i, adr, 2)};
+    if (gain > 1.0 || f.cuts) set_inertia(mj, f.massadr.data + 3 * i, adr, Mhat);
     const D3 dv = load_lane(f.solve.dvel.data + offset_of(i));
     const D3 rate = {Mhat.x * dv.x * per_h, Mhat.y * dv.y * per_h, Mhat.z * dv.z * per_h};
     double* out = mj.qfrc_passive.data + adr;
@@ -103,8 +116,7 @@ PALPATE void remember_nodes(const Fields& f, Thread, int) {
     D3 dv = {0.0, 0.0, 0.0};
     if (ok) dv = load_lane(f.solve.dvel.data + at);
     if (answered) {
-      const double m = mj.body_mass.data[f.bodyid.data[i]];
-      const double Mhat = (touched(load(force)) ? heavy : 1.0) * inertia(f, m, adr, 0);
+      const double Mhat = (touched(load(force)) ? heavy : 1.0) * inertia(f, i, adr, 0);
       const D3 answer = load_lane(f.solve.sol.data + at);
       secant.add(h * df, answer, h * h * dot(df, df) / Mhat, df, norm(now));
       dv += answer;

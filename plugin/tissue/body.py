@@ -92,10 +92,12 @@ class Levels:
   Attributes:
     body: these meshes one after the other; shares `number` and `step`
     cycle: what the kernels of the preconditioner take
+    rate: `Transfer.rate` before the first cut, on the host
   """
 
   body: Body
   cycle: Any
+  rate: np.ndarray
 
   @property
   def transfer(self) -> Any:
@@ -165,7 +167,7 @@ def _levels(body: Body, coarse: Body, transfer: Any) -> Levels:
   coarse.state.step = body.state.step
   cycle = Cycle()
   cycle.fine, cycle.coarse, cycle.transfer = body.fields, coarse.fields, transfer
-  return Levels(coarse, cycle)
+  return Levels(coarse, cycle, transfer.rate.numpy().copy())
 
 
 def _put_state(body: Body, nworld: int):
@@ -205,6 +207,21 @@ def worlds(body: Body, nworld: int = 1, plan: Plan | None = None) -> Body:
   if body.levels is not None:
     out.levels = _levels(out, worlds(body.levels.body, nworld), body.levels.transfer)
   return out
+
+
+def unshare(body: Body):
+  """Gives a body arrays of its own for what a cut changes."""
+  shape, own = body.shape, Shape()
+  for name, var in Shape.vars.items():
+    value = getattr(shape, name)
+    setattr(own, name, wp.clone(value) if hasattr(var.type, "dtype") else value)
+  body.fields.shape = own
+  if body.levels is not None:
+    old, transfer = body.levels.transfer, Transfer()
+    for name in Transfer.vars:
+      setattr(transfer, name, getattr(old, name))
+    transfer.rate = wp.clone(old.rate)
+    body.levels.cycle.fine, body.levels.cycle.transfer = body.fields, transfer
 
 
 def hold(body: Body) -> wp.array:

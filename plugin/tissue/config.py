@@ -168,11 +168,28 @@ class Config:
     "with `window` alone: geoms and organs that bear the organ, with friction, by springs of its "
     "surface in place of MuJoCo's contacts ([lying](authoring.md#lying-on-something))",
   )
+  spare: int = _row(
+    0,
+    (reading.spare, "a whole number >= 0 or 'auto'"),
+    "vertices without triangles, after the others, that cuts make use of ([cutting](cutting.md)); "
+    "`auto`: as many as there are; `add_organ` and `add_spare` make them",
+  )
+  tear: float = _row(
+    0.0,
+    reading.NOT_NEGATIVE,
+    "greatest principal strain, length over rest length less 1, beyond which tissue tears across "
+    "it, with `spare` ([cutting](cutting.md#tearing)); 0: never",
+  )
   resident: bool = _row(
     False,
     reading.choice({"true": True, "false": False}),
     "with `window` alone: the motion stays on the CUDA device between steps, and the plugin state "
     "is brought up to date by `Organ.sync` alone ([internals](internals.md#resident))",
+  )
+  skin: str = _row(
+    "",
+    (reading.name, "the name of a skin"),
+    "drawn for the organ: its surface made smooth (`add_skin`)",
   )
   device: str = _row(
     "auto",
@@ -310,6 +327,7 @@ def _check_combination(organ: str, config: Config, given: dict, closed: bool):
   if config.elements == "solid":
     _check_solid(organ, config, given)
   _check_ties(organ, config)
+  _check_spare(organ, config)
   if config.window and "mass" not in given and not config.mass:
     raise ValueError(f"organ {organ!r}: window is set and mass is missing [kg]")
   for key in ("bulk", "pressure"):
@@ -332,6 +350,26 @@ def _check_solid(organ: str, config: Config, given: dict):
       f"organ {organ!r}: integrator is {config.integrator!r}, allowed only where elements is not "
       "'solid'"
     )
+
+
+def spare(organ: str, text: str, there: int) -> int:
+  """Returns how many vertices `spare` sets aside, `auto` meaning those that are there."""
+  row = ROWS["spare"]
+  value = _value(organ, "spare", text, row.read, row.allowed) if text else 0
+  return there if value == reading.AUTO else value
+
+
+def _check_spare(organ: str, config: Config):
+  if config.tear and not config.spare:
+    raise ValueError(f"organ {organ!r}: tear is {config.tear:g}, allowed only with spare")
+  if not config.spare:
+    return
+  for key in ("carrier", "attach", "relax_share", "support", "resident", "bonded"):
+    if getattr(config, key):
+      name = key.replace("bonded", "bonds")
+      raise ValueError(f"organ {organ!r}: {name} is set, allowed only where spare is 0")
+  if config.elements == "solid":
+    raise ValueError(f"organ {organ!r}: elements is 'solid', allowed only where spare is 0")
 
 
 def _check_ties(organ: str, config: Config):

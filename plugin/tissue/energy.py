@@ -6,6 +6,8 @@ inside a step.
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 
 from . import config as configuration
@@ -28,9 +30,22 @@ def membrane(mesh: Mesh, config: Config, u: np.ndarray) -> float:
   """
   if config.elements != "membrane":
     return 0.0
-  a, b, c = mesh.elem.T
-  r1, r2 = mesh.rest[b] - mesh.rest[a], mesh.rest[c] - mesh.rest[a]
-  p1, p2 = u[b] - u[a], u[c] - u[a]
+  return float(of_membrane(config, mesh.rest[mesh.elem], u[mesh.elem]).sum())
+
+
+def of_membrane(
+  config: Config, rest: np.ndarray, u: np.ndarray, which: np.ndarray | None = None
+) -> np.ndarray:
+  """Returns the membrane's energy in triangles [J], (n,).
+
+  Args:
+    config: material
+    rest: their corners at rest [m]             (n, 3, 3)
+    u: displacement of these [m]                (n, 3, 3)
+    which: their numbers, None for all there are (n,)
+  """
+  r1, r2 = rest[:, 1] - rest[:, 0], rest[:, 2] - rest[:, 0]
+  p1, p2 = u[:, 1] - u[:, 0], u[:, 2] - u[:, 0]
 
   def dot(x, y):
     return (x * y).sum(axis=1)
@@ -43,25 +58,37 @@ def membrane(mesh: Mesh, config: Config, u: np.ndarray) -> float:
   trace = np.trace(strain, axis1=1, axis2=2)
   square = np.einsum("tij,tji->t", strain, strain)
   area = 0.5 * np.sqrt(np.linalg.det(metric))
-  lam, mu = configuration.lame(config, mesh.nelem)
-  return float((area * config.thickness * (0.5 * lam * trace**2 + mu * square)).sum())
+  modulus = config if which is None or len(config.young) == 1 else dataclasses.replace(
+    config, young=tuple(np.asarray(config.young)[which])
+  )
+  lam, mu = configuration.lame(modulus, len(rest))
+  return area * config.thickness * (0.5 * lam * trace**2 + mu * square)
+
+
+def of_triangles(config: Config, rest: np.ndarray, u: np.ndarray, which: np.ndarray) -> np.ndarray:
+  """Returns what triangles have of the energy of the skin [J], (n,); arguments as `of_membrane`."""
+  if config.elements == "membrane":
+    return of_membrane(config, rest, u, which)
+  stretch = [np.linalg.norm(x[:, [1, 2, 0]] - x, axis=2) for x in (rest, rest + u)]
+  return 0.25 * config.stiffness * ((stretch[1] - stretch[0]) ** 2).sum(axis=1)
 
 
 def springs(mesh: Mesh, config: Config, u: np.ndarray) -> float:
   """Returns the energy of the edge springs k/2 (l - r)^2 [J], thesis eq. 5.1."""
   if config.elements != "spring":
     return 0.0
-  i, j = _edges(mesh)
+  i, j, half = _edges(mesh)
   rest = np.linalg.norm(mesh.rest[j] - mesh.rest[i], axis=1)
   x = mesh.rest + u
   length = np.linalg.norm(x[j] - x[i], axis=1)
-  return float(0.5 * config.stiffness * ((length - rest) ** 2).sum())
+  share = np.where((mesh.twin[half] < 0) & (mesh.whole.twin[half] >= 0), 0.5, 1.0)  # where cut
+  return float(0.5 * config.stiffness * (share * (length - rest) ** 2).sum())
 
 
-def _edges(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+def _edges(mesh: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
   half = np.arange(len(mesh.twin))
   once = (mesh.twin < 0) | (half < mesh.twin)
-  return mesh.elem.ravel()[once], mesh.elem[:, [1, 2, 0]].ravel()[once]
+  return mesh.elem.ravel()[once], mesh.elem[:, [1, 2, 0]].ravel()[once], half[once]
 
 
 def hinge_angles(mesh: Mesh, hinge: plate.Hinges, u: np.ndarray) -> np.ndarray:
@@ -90,13 +117,13 @@ def foundation(mesh: Mesh, config: Config, u: np.ndarray) -> float:
   """Returns the energy of the Winkler foundation, 1/2 foundation area |u|^2 [J]; 0 if carried."""
   if config.carrier:
     return 0.0
-  area = topology.vertex_areas(mesh.rest, mesh.elem)
+  area = topology.held_areas(mesh)
   return float(0.5 * config.foundation * (area[:, None] * u * u).sum())
 
 
 def enclosed(mesh: Mesh, config: Config, u: np.ndarray) -> float:
   """Returns bulk/2 (V - V0)^2 / V0 - pressure (V - V0) [J]."""
-  if config.bulk == 0 and config.pressure == 0:
+  if (config.bulk == 0 and config.pressure == 0) or not mesh.closed:
     return 0.0
   centre = mesh.rest.mean(axis=0)
   rest = topology.volume(mesh.rest - centre, mesh.elem)

@@ -118,8 +118,8 @@ def inside(mesh: Mesh, values: np.ndarray) -> np.ndarray:
   A vertex inside has the mean of those around it.
   """
   n = mesh.nouter
-  if n == mesh.nvert:
-    return values
+  if not len(mesh.tet):  # what else there is waits for cuts
+    return np.concatenate([values, np.zeros((mesh.nvert - n, 3))])
   start, k = np.nonzero(mesh.ring >= 0)
   ones = np.ones(len(start))
   share = sparse.csr_array((ones / mesh.degree[start], (start, mesh.ring[start, k])))

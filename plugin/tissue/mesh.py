@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import numpy as np
+from scipy import sparse
+from scipy.sparse import csgraph
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,6 +23,9 @@ class Mesh:
     ring_elem: half-edge vertex -> ring[k]; -1 where it has no face (nvert, most)
     degree: number of neighbours                                    (nvert,)
     tet: corners of each tetrahedron, of positive volume, see `fill`(ntet, 4)
+    spare: the last so many vertices may have no triangle yet: room for cuts
+    uncut: the mesh before the first cut, None for one that has none
+    loose: triangles that were cut free of the foundation, None for none    (nelem,) bool
   """
 
   rest: np.ndarray
@@ -30,6 +36,50 @@ class Mesh:
   ring_elem: np.ndarray
   degree: np.ndarray
   tet: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 4), np.int64))
+  spare: int = 0
+  uncut: Mesh | None = None
+  loose: np.ndarray | None = None
+
+  @property
+  def whole(self) -> Mesh:
+    """The mesh before the first cut."""
+    return self if self.uncut is None else self.uncut
+
+  @property
+  def centre(self) -> np.ndarray:
+    """Mean of the rest positions before the first cut [m], (3,)."""
+    rest = self.whole.rest
+    return rest[: len(rest) - self.spare].mean(axis=0)
+
+  @functools.cached_property
+  def edge_length(self) -> float:
+    """Mean length of the triangles' edges at rest [m]."""
+    return float(
+      np.linalg.norm(self.rest[self.elem[:, [1, 2, 0]]] - self.rest[self.elem], axis=2).mean()
+    )
+
+  @functools.cached_property
+  def home(self) -> np.ndarray:
+    """Number of the piece of surface that each triangle is in, (nelem,)."""
+    return pieces(self)[self.elem[:, 0]]
+
+  @functools.cached_property
+  def interior(self) -> np.ndarray:
+    """The half-edges that stand for the edges between two triangles, ascending."""
+    return np.flatnonzero((self.twin >= 0) & (np.arange(len(self.twin)) < self.twin))
+
+  @property
+  def without_spare(self) -> Mesh:
+    """The mesh without vertices that wait for a cut, where there is none yet."""
+    if not self.spare:
+      return self
+    parts = {name: getattr(self, name)[: -self.spare] for name in _BY_VERTEX}
+    return dataclasses.replace(self, spare=0, **parts)
+
+  @property
+  def unused(self) -> np.ndarray:
+    """Whether a vertex waits for a cut, (nvert,) bool."""
+    return (np.arange(self.nvert) >= self.nvert - self.spare) & (self.degree == 0)
 
   @property
   def nouter(self) -> int:
@@ -47,6 +97,9 @@ class Mesh:
     return len(self.elem)
 
 
+_BY_VERTEX = ("rest", "ring", "ring_elem", "degree")
+
+
 def area_vectors(position: np.ndarray, elem: np.ndarray) -> np.ndarray:
   """Returns the normal of each triangle times its area [m^2], (nelem, 3)."""
   a, b, c = (position[elem[:, k]] for k in range(3))
@@ -57,6 +110,55 @@ def vertex_areas(position: np.ndarray, elem: np.ndarray) -> np.ndarray:
   """Returns a third of the area of the triangles around each vertex [m^2], (nvert,)."""
   area = np.linalg.norm(area_vectors(position, elem), axis=1)
   return np.bincount(elem.ravel(), np.repeat(area / 3, 3), len(position))
+
+
+def pieces(mesh: Mesh) -> np.ndarray:
+  """Returns the number of the piece of surface that each vertex is in, -1 if unused, (nvert,)."""
+  a, b = mesh.elem.T[:2].ravel(), mesh.elem.T[1:].ravel()
+  graph = sparse.coo_array((np.ones(len(a), np.int8), (a, b)), shape=(mesh.nvert, mesh.nvert))
+  label = csgraph.connected_components(graph, directed=False)[1]
+  label[mesh.unused] = -1
+  _, first, number = np.unique(label, return_index=True, return_inverse=True)
+  order = np.argsort(np.argsort(np.where(label[first] < 0, -1, first)))  # by their first vertices
+  return order[number] - int((label < 0).any())
+
+
+def held_areas(mesh: Mesh) -> np.ndarray:
+  """Returns the areas of the vertices that the foundation holds [m^2], (nvert,)."""
+  elem = mesh.elem if mesh.loose is None else mesh.elem[~mesh.loose]
+  return vertex_areas(mesh.rest, elem)
+
+
+def areas_of(mesh: Mesh, vert: np.ndarray, held: bool = False) -> np.ndarray:
+  """Returns the areas of some vertices, to the bit as `vertex_areas` and `held_areas` [m^2]."""
+  around = np.sort(np.where(mesh.ring_elem[vert] >= 0, mesh.ring_elem[vert] // 3, mesh.nelem))
+  elem, where = np.unique(around, return_inverse=True)
+  size = np.zeros(len(elem))
+  there = elem < mesh.nelem
+  size[there] = np.linalg.norm(area_vectors(mesh.rest, mesh.elem[elem[there]]), axis=1) / 3
+  if held and mesh.loose is not None:
+    size[there] *= ~mesh.loose[elem[there]]
+  out = np.zeros(len(vert))
+  for column in size[where].reshape(around.shape).T:  # one after the other, as bincount adds
+    out += column
+  return out
+
+
+def come_loose(mesh: Mesh) -> Mesh:
+  """Returns the mesh with its triangles marked that a cut has freed from the foundation.
+
+  Of what it held together until now, it goes on to hold the largest piece.
+  """
+  whole = mesh.whole
+  loose = np.zeros(mesh.nelem, bool) if mesh.loose is None else mesh.loose.copy()
+  area = np.linalg.norm(area_vectors(mesh.rest, mesh.elem), axis=1)
+  piece, home = pieces(mesh)[mesh.elem[:, 0]], whole.home
+  for part in np.unique(home):
+    held = (home == part) & ~loose
+    size = np.bincount(piece[held], area[held])
+    if (size > 0).sum() > 1:
+      loose |= held & (piece != np.argmax(size))
+  return dataclasses.replace(mesh, loose=loose)
 
 
 def vertex_normals(position: np.ndarray, elem: np.ndarray) -> np.ndarray:
@@ -74,8 +176,14 @@ def volume(position: np.ndarray, elem: np.ndarray) -> float:
   return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
 
 
-def build(organ: str, rest: np.ndarray, elem: np.ndarray) -> Mesh:
+def build(organ: str, rest: np.ndarray, elem: np.ndarray, spare: int = 0) -> Mesh:
   """Returns the topology of a surface.
+
+  Args:
+    organ: its name, for messages
+    rest: rest positions [m]                  (nvert, 3)
+    elem: triangles                           (nelem, 3)
+    spare: the last so many vertices are room for cuts and have no triangle
 
   Raises:
     ValueError: a triangle is degenerate, a vertex is isolated, the winding is inconsistent, or the
@@ -98,6 +206,7 @@ def build(organ: str, rest: np.ndarray, elem: np.ndarray) -> Mesh:
       f"{area[t]:.3g} m^2 with a longest edge of {longest[t]:.3g} m; remesh the surface"
     )
   isolated = np.flatnonzero(np.bincount(elem.ravel(), minlength=nvert) == 0)
+  isolated = _beside_spare(organ, isolated, nvert, spare)
   if isolated.size:
     raise ValueError(
       f"organ {organ!r}: vertex {int(isolated[0])} belongs to no triangle "
@@ -105,7 +214,22 @@ def build(organ: str, rest: np.ndarray, elem: np.ndarray) -> Mesh:
     )
   twin = _twins(organ, elem, nvert)
   ring, ring_elem, degree = _rings(organ, elem, twin, nvert)
-  return Mesh(rest, elem, bool((twin >= 0).all()), twin, ring, ring_elem, degree)
+  if spare:  # a fan that a cut ends in has one more neighbour than triangles
+    more = np.full((nvert, 1), -1)
+    ring, ring_elem = np.hstack([ring, more]), np.hstack([ring_elem, more])
+  return Mesh(rest, elem, bool((twin >= 0).all()), twin, ring, ring_elem, degree, spare=spare)
+
+
+def _beside_spare(organ: str, isolated: np.ndarray, nvert: int, spare: int) -> np.ndarray:
+  """Returns the vertices without a triangle that are not spare."""
+  used = np.setdiff1d(np.arange(nvert - spare, nvert), isolated)
+  if spare >= nvert or used.size:
+    what = f"vertex {used[0]} has triangles" if used.size else f"there are {nvert} vertices"
+    raise ValueError(
+      f"organ {organ!r}: spare is {spare} and {what}, expected so many vertices without triangles "
+      "after the others; palpate.add_organ and palpate.add_spare make them"
+    )
+  return isolated[isolated < nvert - spare]
 
 
 def _twins(organ: str, elem: np.ndarray, nvert: int) -> np.ndarray:
@@ -133,36 +257,86 @@ def _twins(organ: str, elem: np.ndarray, nvert: int) -> np.ndarray:
   return np.where(ordered[found] == reverse, order[found], -1)
 
 
-def _rings(organ, elem, twin, nvert):
-  """Walks around every vertex at once, one step for all of them in each pass."""
+def _rings(organ, elem, twin, nvert, vert=None):
+  """Walks around vertices at once, one step for all of them in each pass; `vert` None for all."""
   nhalf = elem.size
   half = np.arange(nhalf)
-  previous = half - half % 3 + (half + 2) % 3
   start, end, apex = elem.ravel(), elem[:, [1, 2, 0]].ravel(), elem[:, [2, 0, 1]].ravel()
-  following = twin[previous]  # the next spoke counter-clockwise
+  vert = np.arange(nvert) if vert is None else vert
   first = np.full(nvert, nhalf, np.int64)
   np.minimum.at(first, start, half)
   boundary = half[twin < 0]
   first[start[boundary]] = boundary
-  spokes = np.bincount(start, minlength=nvert)
+  first[first == nhalf] = -1  # of a vertex without triangles
+  first = first[vert]
+  spokes = np.bincount(start, minlength=nvert)[vert]
   ring, ring_elem = [], []
   current = first.copy()
-  walked = np.zeros(nvert, np.int64)
-  degree = np.zeros(nvert, np.int64)
-  tail = np.full(nvert, -1, np.int64)  # last neighbour on a boundary, reached by no half-edge
+  walked = np.zeros(len(vert), np.int64)
+  degree = np.zeros(len(vert), np.int64)
+  tail = np.full(len(vert), -1, np.int64)  # last neighbour on a boundary, reached by no half-edge
   while (current >= 0).any() or (tail >= 0).any():
     on = current >= 0
     ring.append(np.where(on, end[current], tail))
     ring_elem.append(np.where(on, current, -1))
     degree += ring[-1] >= 0
     walked += on
-    after = np.where(on, following[current], -1)
+    previous = current - current % 3 + (current + 2) % 3
+    after = np.where(on, twin[previous], -1)  # the next spoke counter-clockwise
     tail = np.where(on & (after < 0), apex[current], -1)
     current = np.where(after == first, -1, after)
   bowtie = np.flatnonzero(walked != spokes)
   if bowtie.size:
     raise ValueError(
-      f"organ {organ!r}: vertex {int(bowtie[0])} joins surfaces that share no edge there, "
+      f"organ {organ!r}: vertex {int(vert[bowtie[0]])} joins surfaces that share no edge there, "
       "expected a manifold surface; split the vertex"
     )
   return np.stack(ring, axis=1), np.stack(ring_elem, axis=1), degree
+
+
+def recut(
+  mesh: Mesh, rest: np.ndarray, elem: np.ndarray, loose: np.ndarray | None = None
+) -> tuple[Mesh, np.ndarray]:
+  """Returns a mesh with other rest positions and other corners, by cuts of the same whole.
+
+  Args:
+    mesh: what is like it in most places, of the same whole
+    rest: rest positions [m]  (nvert, 3)
+    elem: triangles: those of the whole, cut along edges  (nelem, 3)
+    loose: see `Mesh`
+
+  Returns:
+    the mesh, and the vertices of triangles that are not as they were
+  """
+  whole = mesh.whole
+  if np.array_equal(elem, whole.elem) and np.array_equal(rest, whole.rest):
+    new = whole
+  else:
+    start, end = elem.ravel(), elem[:, [1, 2, 0]].ravel()
+    other = whole.twin
+    joined = (other >= 0) & (start == end[other]) & (end == start[other])
+    twin = np.where(joined, other, -1)
+    new = dataclasses.replace(
+      mesh,
+      rest=rest,
+      elem=elem,
+      twin=twin,
+      closed=bool((twin >= 0).all()),
+      uncut=whole,
+      loose=loose,
+    )
+  corners = (mesh.elem != new.elem).any(axis=1)
+  edges = (mesh.twin != new.twin).reshape(-1, 3).any(axis=1)
+  moved = (mesh.rest != new.rest).any(axis=1)
+  moved = moved[mesh.elem].any(axis=1) | moved[new.elem].any(axis=1)
+  cut = corners | edges
+  touched = np.unique(np.concatenate([mesh.elem[cut | moved], new.elem[cut | moved]]))
+  if new is whole or not touched.size:
+    return (new if new is whole else dataclasses.replace(mesh, loose=loose)), touched
+  walk = np.unique(np.concatenate([mesh.elem[cut], new.elem[cut]]))
+  ring, ring_elem, degree = mesh.ring.copy(), mesh.ring_elem.copy(), mesh.degree.copy()
+  if walk.size:
+    part, part_elem, degree[walk] = _rings("cut", elem, new.twin, len(rest), walk)
+    ring[walk], ring_elem[walk] = -1, -1
+    ring[walk, : part.shape[1]], ring_elem[walk, : part.shape[1]] = part, part_elem
+  return dataclasses.replace(new, ring=ring, ring_elem=ring_elem, degree=degree), touched

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from scipy import sparse
 from scipy.sparse import csgraph
@@ -36,7 +38,11 @@ def offset(index: np.ndarray, size: int = 3) -> np.ndarray:
 
 
 def ellpack(
-  row: np.ndarray, index: np.ndarray, value: np.ndarray, fill: np.ndarray
+  row: np.ndarray,
+  index: np.ndarray,
+  value: np.ndarray,
+  fill: np.ndarray,
+  room: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
   """Returns the lists of all nodes as sliced ELLPACK: row k of a slice has their k-th entries.
 
@@ -45,6 +51,7 @@ def ellpack(
     index: what it points at    (n,)
     value: its value            (n,)
     fill: what the entries that pad a node's list point at, with value 0 (nslice, 8)
+    room: returns the rows of each slice from the numbers of entries, None for as few as may be
 
   Returns:
     rows of each slice (nslice,), entries and values (rows, 8)
@@ -52,7 +59,7 @@ def ellpack(
   by_row = np.lexsort((index, row))
   row, index, value = row[by_row], index[by_row], value[by_row]
   count = np.bincount(row, minlength=fill.size)
-  width = count.reshape(-1, LANES).max(axis=1)
+  width = count.reshape(-1, LANES).max(axis=1) if room is None else room(count)
   within = np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count)
   place = (np.cumsum(width) - width)[row // LANES] + within
   entry = np.repeat(fill, width, axis=0)
@@ -90,17 +97,21 @@ def banks(width: np.ndarray) -> np.ndarray:
 def node_order(mesh: Mesh, patch: int = 0) -> np.ndarray:
   """Returns vertices in the order of the solver, padded with -1 to whole slices.
 
-  Reverse Cuthill-McKee keeps neighbours close in memory, patches keep most of them in one block of
-  threads; sorting by degree within a window keeps the slices full.
+  Spare vertices come last, and a cut changes nothing. Reverse Cuthill-McKee keeps neighbours close
+  in memory, patches keep most of them in one block of threads; sorting by degree within a window
+  keeps the slices full.
 
   Args:
     mesh: the surface
     patch: nodes of a block of threads that works on a patch of the surface, 0 for no patches
   """
-  order = _patches(mesh.rest, patch) if patch else _band(mesh)
-  window = np.arange(mesh.nvert) // (8 * LANES)
-  order = order[np.lexsort((np.arange(mesh.nvert), -mesh.degree[order], window))]
-  return np.concatenate([order, np.full(-mesh.nvert % LANES, -1)])
+  mesh = mesh.whole
+  n = mesh.nvert - mesh.spare
+  order = _patches(mesh.rest[:n], patch) if patch else _band(mesh)
+  order = order[order < n]
+  window = np.arange(n) // (8 * LANES)
+  order = order[np.lexsort((np.arange(n), -mesh.degree[order], window))]
+  return np.concatenate([order, np.arange(n, mesh.nvert), np.full(-mesh.nvert % LANES, -1)])
 
 
 def _patches(point: np.ndarray, size: int) -> np.ndarray:

@@ -15,21 +15,27 @@ class Hinges:
   """Interior edges with the plate stiffness of the triangles beside them.
 
   Attributes:
+    half: half-edge that it is in the left triangle                            (nhinge,)
     vert: edge p0, p1 (direction of the left triangle), left apex, right apex  (nhinge, 4)
     elem: left and right triangle                                              (nhinge, 2)
+    which: triangles that the next two are of                                  (nelem,)
     of_elem: hinge of each triangle's half-edge, -1 on the boundary            (nelem, 3)
     gain: stiffness between the hinges of one triangle [N m]                   (nelem, 3, 3)
     rows: hinge angle per normal displacement at rest [1/m]             sparse (nhinge, nvert)
   """
 
+  half: np.ndarray
   vert: np.ndarray
   elem: np.ndarray
+  which: np.ndarray
   of_elem: np.ndarray
   gain: np.ndarray
   rows: sparse.csr_matrix
 
 
-def hinges(mesh: Mesh, rigidity: np.ndarray, poisson: float) -> Hinges:
+def hinges(
+  mesh: Mesh, rigidity: np.ndarray, poisson: float, which: np.ndarray | None = None
+) -> Hinges:
   """Returns the hinges of a surface and the stiffness that makes them a Kirchhoff plate.
 
   The three angles of a triangle's hinges fix a constant curvature (kxx, kyy, kxy) of the patch of
@@ -43,23 +49,28 @@ def hinges(mesh: Mesh, rigidity: np.ndarray, poisson: float) -> Hinges:
     mesh: the surface
     rigidity: plate bending rigidity [N m], (nelem,)
     poisson: Poisson's ratio [-]
+    which: triangles whose hinges are meant, ascending; None for all
   """
   elem, twin = mesh.elem, mesh.twin
-  half = np.flatnonzero((twin >= 0) & (np.arange(len(twin)) < twin))
+  which = np.arange(mesh.nelem) if which is None else which
+  mine = 3 * which[:, None] + np.arange(3)
+  across = twin[mine]
+  half = np.unique(np.where(across >= 0, np.minimum(mine, across), -1))
+  half = half[half >= 0]
   other = twin[half]
   start, end, apex = elem.ravel(), elem[:, [1, 2, 0]].ravel(), elem[:, [2, 0, 1]].ravel()
   vert = np.stack([start[half], end[half], apex[half], apex[other]], axis=1)
   of_half = np.full(len(twin), -1, np.int64)
   of_half[half] = of_half[other] = np.arange(len(half))
   rows = _rows(mesh, half, other, vert)
-  present = (twin >= 0).reshape(-1, 3)
-  gain, area = _gain(_angles(mesh), present, poisson), _area(mesh)
-  gain = gain * (area * rigidity)[:, None, None]
-  return Hinges(vert, np.stack([half // 3, other // 3], axis=1), of_half.reshape(-1, 3), gain, rows)
+  gain, area = _gain(_angles(mesh, which), across >= 0, poisson), _area(mesh, which)
+  gain = gain * (area * rigidity[which])[:, None, None]
+  sides = np.stack([half // 3, other // 3], axis=1)
+  return Hinges(half, vert, sides, which, of_half[mine], gain, rows)
 
 
-def _area(mesh: Mesh) -> np.ndarray:
-  return np.linalg.norm(area_vectors(mesh.rest, mesh.elem), axis=1)
+def _area(mesh: Mesh, which: np.ndarray) -> np.ndarray:
+  return np.linalg.norm(area_vectors(mesh.rest, mesh.elem[which]), axis=1)
 
 
 def _foot(mesh: Mesh, half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -89,29 +100,29 @@ def _rows(mesh: Mesh, half: np.ndarray, other: np.ndarray, vert: np.ndarray) -> 
   return sparse.csr_matrix((weight.ravel(), (index, vert.ravel())), shape=(len(half), mesh.nvert))
 
 
-def _unfolded(mesh: Mesh) -> np.ndarray:
-  """Returns the corners of each triangle in its own plane, (nelem, 3, 2)."""
-  corner = mesh.rest[mesh.elem]
+def _unfolded(mesh: Mesh, which: np.ndarray) -> np.ndarray:
+  """Returns the corners of triangles in their own planes, (n, 3, 2)."""
+  corner = mesh.rest[mesh.elem[which]]
   x_axis = corner[:, 1] - corner[:, 0]
   x_axis /= np.linalg.norm(x_axis, axis=1, keepdims=True)
-  normal = area_vectors(mesh.rest, mesh.elem)
+  normal = area_vectors(mesh.rest, mesh.elem[which])
   area = np.linalg.norm(normal, axis=1)
   y_axis = np.cross(normal / area[:, None], x_axis)
   arm = corner - corner[:, :1]
   return np.stack([(arm * x_axis[:, None]).sum(-1), (arm * y_axis[:, None]).sum(-1)], axis=-1)
 
 
-def _angles(mesh: Mesh) -> np.ndarray:
-  """Returns C: the angles of each triangle's hinges by curvature kxx, kyy, kxy, (nelem, 3, 3)."""
-  flat, twin = _unfolded(mesh), mesh.twin
+def _angles(mesh: Mesh, which: np.ndarray) -> np.ndarray:
+  """Returns C: the angles of triangles' hinges by curvature kxx, kyy, kxy, (n, 3, 3)."""
+  flat, twin = _unfolded(mesh, which), mesh.twin
 
   def modes(point):
     x, y = point[..., 0], point[..., 1]
     return np.stack([x * x / 2, y * y / 2, x * y], axis=-1)
 
-  angle = np.zeros((mesh.nelem, 3, 3))
+  angle = np.zeros((len(which), 3, 3))
   for c in range(3):
-    h = 3 * np.arange(mesh.nelem) + c
+    h = 3 * which + c
     p0, p1, inner = flat[:, c], flat[:, (c + 1) % 3], flat[:, (c + 2) % 3]
     share, height = _foot(mesh, h)
     share_o, height_o = _foot(mesh, np.where(twin[h] >= 0, twin[h], h))
@@ -158,13 +169,17 @@ def bending_matrix(mesh: Mesh, hinge: Hinges) -> sparse.csr_matrix:
 
 
 def neighbours(hinge: Hinges) -> tuple[np.ndarray, np.ndarray]:
-  """Returns each hinge's four neighbours in its two triangles, and the gains to itself and them."""
+  """Returns each hinge's four neighbours in its two triangles, and the gains to itself and them.
+
+  Those of a hinge with a triangle that is not in `Hinges.which` mean nothing.
+  """
   nhinge = len(hinge.vert)
   near = np.zeros((nhinge, 4), np.int64)
   gain = np.zeros((nhinge, 5))
   own = np.arange(nhinge)
+  last = len(hinge.which) - 1
   for side in range(2):
-    elem = hinge.elem[:, side]
+    elem = np.minimum(np.searchsorted(hinge.which, hinge.elem[:, side]), last)
     c = np.argmax(hinge.of_elem[elem] == own[:, None], axis=1)
     gain[:, 0] += hinge.gain[elem, c, c]
     for k in range(2):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
+AUTO = -1  # spare vertices: as many as there are
 NOTHING = "none"  # as bonds: they are made while running
 
 
@@ -110,6 +111,13 @@ def ties(text: str, nelem: int) -> tuple[tuple[str, float, tuple[int, ...]], ...
     if not some:
       raise ValueError
   return tuple(found)
+
+
+def spare(text: str, nelem: int) -> int:
+  """Returns a number of spare vertices."""
+  if text == "auto":
+    return AUTO
+  return whole(0, 10**9)[0](text, nelem)
 
 
 class Law(NamedTuple):

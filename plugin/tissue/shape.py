@@ -13,12 +13,14 @@ from . import coarse as coarsening
 from . import config as configuration
 from . import device as devices
 from . import mesh as topology
-from . import plate, solid, step
+from . import plate, rows, solid, step
 from .body import Body
 from .config import Config
 from .mesh import Mesh
-from .order import LANES, addresses, banks, ellpack, node_order, offset, pad, to_slices
+from .order import LANES, addresses, banks, ellpack, node_order, pad, to_slices
 from .types import NUMBERS, empty
+
+_BEND_MORE = 4  # entries that a cut may add to a row of the bending matrix
 
 
 def make(
@@ -61,32 +63,52 @@ def change(body: Body, mesh: Mesh, config: Config, pinned: np.ndarray):
     config: configuration of the same elements, with bending as before on or off
     pinned: vertices that do not move, (nvert,) bool
   """
-  finest = arrays(mesh, config, pinned, devices.patch(body.device, body.shape.nslice))
+  width = np.diff(body.shape.bend_adr.numpy())
+  finest = arrays(mesh, config, pinned, devices.patch(body.device, body.shape.nslice), width)
   bodies.retissue(body, finest)
   below = _below(mesh, config, pinned, finest, body.device) if body.levels else None
   if body.levels and below:
     bodies.retissue(body.levels.body, below)
-    body.levels.transfer.rate.assign(below["rate"])
-  renumber(body, config)
+    body.levels.rate[:] = below["rate"]
+    rerate(body.levels, mesh)
+  renumber(body, config, mesh.closed)
 
 
-def renumber(body: Body, config: Config):
-  """Gives a body the numbers of a configuration that may change while running."""
-  bodies.renumber(body, _numbers(config))
+def renumber(body: Body, config: Config, closed: bool = True):
+  """Gives a body the numbers of a configuration that may change while running.
+
+  Args:
+    body: the body
+    config: its configuration
+    closed: whether its surface encloses a volume still
+  """
+  bodies.renumber(body, _numbers(config, closed))
   body.newton = config.newton
 
 
-def _numbers(config: Config) -> dict[str, float]:
+def _numbers(config: Config, closed: bool = True) -> dict[str, float]:
   values = {name: getattr(config, name, 1.0) for name in NUMBERS}
+  if not closed:  # allowed only where it was, before a cut
+    values["bulk"] = values["pressure"] = 0.0
   values["stiffness"] = config.stiffness if config.elements == "spring" else 0.0
   values["foundation"] = 0.0 if config.carrier else config.foundation  # its springs are held then
   return values
+
+
+def rerate(levels: bodies.Levels, mesh: Mesh):
+  """Lets coarser meshes serve the solve before the first cut; they know of none."""
+  rate = levels.rate.copy()
+  rate[:, 0] *= mesh.uncut is None
+  levels.transfer.rate.assign(rate)
 
 
 def _below(
   mesh: Mesh, config: Config, pinned: np.ndarray, finest: dict[str, Any], device: wp.Device
 ) -> dict[str, Any] | None:
   """Returns the fields of all coarser meshes together and of `Transfer`, None without such."""
+  mesh = mesh.whole
+  nvert = mesh.nvert
+  mesh = mesh.without_spare
   levels = coarsening.build(mesh)
   if not levels:
     return None
@@ -96,27 +118,43 @@ def _below(
     arrays(level.mesh, dataclasses.replace(config, young=e), mask)
     for level, e, mask in zip(levels, young, masks[1:], strict=True)
   ]
+  levels[0].weight.resize((nvert, levels[0].mesh.nvert))
+  masks[0] = pinned | (np.arange(nvert) >= mesh.nvert)
   joined = coarsening.join(parts[1:])
   joined |= solid.none(len(joined["area"]))
   return joined | counts(joined) | coarsening.transfer(levels, parts, masks, device)
 
 
-def arrays(mesh: Mesh, config: Config, pinned: np.ndarray, patch: int = 0) -> dict[str, Any]:
-  """Returns the fields of `Shape` and `Tissue` by name; for `patch` see `order.node_order`."""
+def arrays(
+  mesh: Mesh,
+  config: Config,
+  pinned: np.ndarray,
+  patch: int = 0,
+  bend_width: np.ndarray | None = None,
+) -> dict[str, Any]:
+  """Returns the fields of `Shape` and `Tissue` by name.
+
+  Args:
+    mesh: the surface
+    config: its configuration
+    pinned: vertices that do not move, (nvert,) bool
+    patch: see `order.node_order`
+    bend_width: rows of each slice of the bending matrix, where it has room for cuts; None for new
+  """
   vert = node_order(mesh, patch)
   node = np.empty(mesh.nvert, np.int64)
   node[vert[vert >= 0]] = np.flatnonzero(vert >= 0)
   out = {
     **_fans(mesh, config, vert, node),
-    **_bending(mesh, config, node, len(vert) // LANES),
+    **_bending(mesh, config, node, len(vert) // LANES, bend_width),
     **(solid.arrays(mesh, config, vert, node) if len(mesh.tet) else solid.none(len(vert) // LANES)),
     "vert": vert.astype(np.int32),
     "node": node.astype(np.int32),
-    "area": _node_values(topology.vertex_areas(mesh.rest, mesh.elem), vert),
-    "free": _node_values(np.where(pinned, 0.0, 1.0), vert),
+    "area": _node_values(topology.held_areas(mesh), vert),
+    "free": _node_values(np.where(pinned | mesh.unused, 0.0, 1.0), vert),
     "closed": int(mesh.closed),
     "volume0": topology.volume(mesh.rest, mesh.elem) if mesh.closed else 0.0,
-    "number": np.array(list(_numbers(config).values())),
+    "number": np.array(list(_numbers(config, mesh.closed).values())),
   }
   return out | counts(out)
 
@@ -142,143 +180,73 @@ def _node_values(values: np.ndarray, vert: np.ndarray) -> np.ndarray:
 def _fans(mesh: Mesh, config: Config, vert: np.ndarray, node: np.ndarray) -> dict[str, np.ndarray]:
   """Returns the arrays of fans; see `types.Shape`."""
   nslice = len(vert) // LANES
-  real = vert >= 0
-  degree = np.where(real, mesh.degree[vert], 0)
+  degree = np.where(vert >= 0, rows.room(mesh)[vert] if mesh.spare else mesh.degree[vert], 0)
   width = degree.reshape(nslice, LANES).max(axis=1)
-  fan, half = _rings(mesh, vert, degree)
-  neighbour = np.where(fan >= 0, node[fan], np.arange(len(vert))[:, None])
-  rest = mesh.rest - mesh.rest.mean(axis=0)
-  here = rest[np.where(real, vert, 0)]
-  toward = np.where((fan >= 0)[..., None], rest[fan] - here[:, None], 0.0)
-  metric, spring = _stiffness(mesh, config, toward, half, degree)
-  corner = np.where(half >= 0, half, 0)
+  dense = rows.fans(mesh, config, vert, np.arange(len(vert)), node, int(degree.max()))
 
-  def rows(dense, extra):
+  def sliced(name):
     """Returns rows 0 .. width + extra - 1 of every slice, slice after slice."""
-    sliced = to_slices(dense)  # (nslice, most + ., ..., 8)
+    extra = rows.EXTRA[name]
     take = np.concatenate([np.arange(w + extra) for w in width])
     which = np.repeat(np.arange(nslice), width + extra)
-    return sliced[which, take]
+    return to_slices(dense[name])[which, take]
 
   return {
     "slot_adr": addresses(width),
     "held_adr": banks(width),
-    "fan_node": rows(offset(neighbour), 2).astype(np.int32),
-    "fan_rest": rows(toward, 2).astype(np.float32),
-    "fan_metric": rows(metric, 1).astype(np.float32),
-    "fan_spring": rows(spring, 0).astype(np.float32),
-    "fan_corner": rows(offset(corner // 3, 4), 1).astype(np.int32),
-    # Corner forces are (nelemslice, 3, 8): component c of vector t.
-    "fan_side": rows(offset(corner // 3) + corner % 3 * LANES, 1).astype(np.int32),
-    "degree": to_slices(degree.astype(np.float32)),
-    "rest": to_slices(np.where(real[:, None], here, 0.0).astype(np.float32)),
+    **{name: sliced(name) for name in rows.EXTRA},
+    "degree": to_slices(dense["degree"]),
+    "rest": to_slices(dense["rest"]),
   }
 
 
-def _rings(mesh: Mesh, vert: np.ndarray, degree: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-  """Returns the vertices of each node's fan and the half-edges to them, -1 for none.
-
-  Entry 0 is the last neighbour again where the fan closes, and the first one follows the last.
-  """
-  real, most = vert >= 0, int(degree.max())
-  own = np.arange(len(vert))
-  ring = np.where(real[:, None], mesh.ring[vert], -1)
-  ring_elem = np.where(real[:, None], mesh.ring_elem[vert], -1)
-  fan = np.full((len(vert), most + 2), -1, np.int64)
-  half = np.full((len(vert), most + 1), -1, np.int64)
-  fan[:, 1 : 1 + ring.shape[1]] = ring[:, : most + 1]
-  half[:, 1 : 1 + ring.shape[1]] = ring_elem[:, :most]
-  last = np.maximum(degree - 1, 0)
-  wraps = real & (ring_elem[own, last] >= 0)
-  fan[:, 0] = np.where(wraps, ring[own, last], -1)
-  half[:, 0] = np.where(wraps, ring_elem[own, last], -1)
-  closing = np.where(wraps, degree + 1, 0)
-  fan[own[wraps], closing[wraps]] = ring[wraps, 0]
-  return fan, half
-
-
-def _stiffness(
-  mesh: Mesh, config: Config, toward: np.ndarray, half: np.ndarray, degree: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-  """Returns metric and moduli of each node's triangles, and the springs of its edges.
-
-  Args:
-    mesh: the surface
-    config: its configuration
-    toward: rest vector to each entry of a node's fan [m]    (nnode, most + 2, 3)
-    half: half-edge to each, but the last one; -1 for none   (nnode, most + 1)
-    degree: number of neighbours                             (nnode,)
-
-  Returns:
-    `fan_metric` (nnode, most + 1, 5), `fan_spring` (nnode, most)
-  """
-  # Contravariant metric of the triangle (i, fan[k], fan[k + 1]).
-  has = half >= 0
-  e1, e2 = toward[:, :-1], toward[:, 1:]
-  g11, g12, g22 = (e1 * e1).sum(-1), (e1 * e2).sum(-1), (e2 * e2).sum(-1)
-  det = np.where(has, g11 * g22 - g12 * g12, 1.0)
-  volume = 0.5 * np.sqrt(det) * config.thickness
-  lam, mu = configuration.lame(config, mesh.nelem)
-  if config.elements == "spring":
-    lam, mu = 0 * lam, 0 * mu
-  elem = np.where(has, half // 3, 0)
-  metric = np.stack([g22 / det, -g12 / det, g11 / det, mu[elem] * volume, lam[elem] * volume], -1)
-  metric[~has] = 0
-  # Van Gelder 1998: springs like a triangle mesh of modulus E, E t area / length^2 on each side.
-  young = np.broadcast_to(np.asarray(config.young), (mesh.nelem,))
-  strength = np.where(has, young[elem] * volume, 0.0)
-  length2 = (toward[:, 1:-1] ** 2).sum(-1)
-  spring = (strength[:, :-1] + strength[:, 1:]) / np.where(length2 > 0, length2, 1.0)
-  if config.elements == "spring":
-    spring = np.full_like(spring, config.stiffness)
-  spring[np.arange(spring.shape[1]) >= degree[:, None]] = 0
-  return metric, spring
-
-
-def _bending(mesh: Mesh, config: Config, node: np.ndarray, nslice: int) -> dict[str, np.ndarray]:
+def _bending(
+  mesh: Mesh, config: Config, node: np.ndarray, nslice: int, width: np.ndarray | None
+) -> dict[str, np.ndarray]:
   """Returns the arrays of triangles, hinges and the bending matrix, empty where bending is off."""
   if config.bend == 0:
     return _no_bending(nslice)
   rigidity = configuration.rigidity(config, mesh.nelem)
   hinge = plate.hinges(mesh, rigidity, config.poisson)
-  rest = mesh.rest - mesh.rest.mean(axis=0)
-  corner = rest[mesh.elem]
-  arms = np.concatenate([corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]], axis=1)
-  # The hinge opposite corner c is that of the half-edge after it; a boundary edge gets the first
-  # padding hinge, which has no gain.
-  nhinge = len(hinge.vert)
-  opposite = np.where(hinge.of_elem < 0, nhinge, hinge.of_elem)[:, [1, 2, 0]]
-  at = rest[hinge.vert]
-  hinge_rest = (at[:, 1:] - at[:, :1]).reshape(-1, 9)
-  near, gain = plate.neighbours(hinge)
-  matrix = plate.bending_matrix(mesh, hinge)
-  coo = matrix.tocoo()
+  number, nhinge = rows.numbers(mesh, hinge.half), len(mesh.whole.interior)
+  of_elem = np.where(hinge.of_elem >= 0, number[hinge.of_elem], -1)
+  out = rows.elements(mesh, np.arange(mesh.nelem), node, of_elem, nhinge)
+  dense = rows.hinges(mesh, hinge, node, number)
+  # The hinges that padding adds have no gain; nor have those that were cut.
+  for name, values in dense.items():
+    every = np.zeros((nhinge, *values.shape[1:]), values.dtype)
+    every[number] = values
+    out[name] = pad(every, 0, 1)
+  out["elem_hinge"] = pad(out["elem_hinge"], nhinge)
+  out = {name: to_slices(values if len(values) % LANES == 0 else pad(values))
+         for name, values in out.items()}  # fmt: skip
+  coo = rows.matrix(mesh, hinge)
   own = np.arange(nslice * LANES).reshape(nslice, LANES)
-  width, bend_node, bend_gain = ellpack(node[coo.row], node[coo.col], coo.data, own)
+
+  def room(entries: np.ndarray) -> np.ndarray:
+    return _bend_room(mesh, node, entries) if width is None else width
+
+  wide = room if mesh.spare else None
+  widths, bend_node, bend_gain = ellpack(node[coo.row], node[coo.col], coo.data, own, wide)
   diag = np.zeros(own.size)
-  diag[node] = matrix.diagonal()
-
-  def ints(values, fill=0, least=0):
-    return to_slices(pad(values, fill, least)).astype(np.int32)
-
-  def floats(values, least=0):
-    return to_slices(pad(values, 0, least)).astype(np.float32)
-
-  return {
-    "elem_node": ints(offset(node[mesh.elem])),
-    "elem_rest": floats(arms),
-    "elem_hinge": ints(opposite, nhinge),
-    "hinge_node": ints(offset(node[hinge.vert]), least=1),
-    "hinge_rest": floats(hinge_rest, 1),
-    "hinge_elem": ints(offset(hinge.elem, 4), least=1),
-    "hinge_near": ints(near, least=1),
-    "hinge_gain": floats(gain, 1),
-    "hinge_angle0": floats(np.zeros(nhinge), 1),
-    "bend_adr": addresses(width),
+  np.add.at(diag, node[coo.row], np.where(coo.row == coo.col, coo.data, 0.0))
+  return out | {
+    "hinge_angle0": np.zeros((len(out["hinge_node"]), LANES), np.float32),
+    "bend_adr": addresses(widths),
     "bend_node": bend_node,
     "bend_gain": bend_gain,
     "bend_diag": to_slices(diag).astype(np.float32),
   }
+
+
+def _bend_room(mesh: Mesh, node: np.ndarray, entries: np.ndarray) -> np.ndarray:
+  """Returns the rows of each slice of the bending matrix where cuts may come.
+
+  A node near the end of a cut has vertices of both its sides around it.
+  """
+  room = entries + np.where(entries > 0, _BEND_MORE, 0)
+  room[node[mesh.nvert - mesh.spare :]] = room.max()
+  return room.reshape(-1, LANES).max(axis=1)
 
 
 def _no_bending(nslice: int) -> dict[str, np.ndarray]:

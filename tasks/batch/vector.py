@@ -85,7 +85,7 @@ class Exercises(VectorEnv):
       raise ValueError(f"num_envs is {num_envs!r}, expected a whole number >= 1")
     self.num_envs, self.output = int(num_envs), output
     _refuse(task, kwargs)
-    single = Exercise(task, **kwargs)
+    single = Exercise(task, **{"surroundings": "none", **kwargs})  # it draws nothing
     environment = single.environment
     if device is None:
       device = "cuda:0" if wp.is_cuda_available() else "cpu"

@@ -217,6 +217,16 @@ def peak_shaft_force(shaft_force: ArrayLike) -> float:
   return magnitude(shaft_force).max()
 
 
+@metric("Peak traction", "N", "safety", "max", "as peak force: Horeman et al. 2010")
+def peak_traction(traction: ArrayLike) -> float:
+  """Returns the largest pull on what an organ is bonded to [N], lower is better.
+
+  Args:
+    traction: magnitude of the bonds' sum [N]  (nstep,)
+  """
+  return float(rows("traction", traction).max())
+
+
 @metric("Peak tissue strain", "-", "safety", "max", "Rosen et al. 2008 (10.1115/1.2898712)")
 def peak_strain(strain: ArrayLike) -> float:
   """Returns how far the tissue was stretched at most [-], lower is better.

@@ -74,6 +74,16 @@ def target_error(target_distance: ArrayLike) -> float:
   return float(touched.mean())
 
 
+@metric("Share freed", "-", "outcome", "all", "VTE: teasing (Kotamraju 2008)", better="higher")
+def share_freed(freed: ArrayLike) -> float:
+  """Returns the share of the bonds' area that came free as it should [-], higher is better.
+
+  Args:
+    freed: share so far [-]  (nstep,)
+  """
+  return float(rows("freed", freed)[-1])
+
+
 @metric("Tracing error (Frechet)", "m", "outcome", "all", "Perk Tutor; Eiter and Mannila 1994")
 def trace_frechet(traced_pos: ArrayLike, curve: ArrayLike) -> float:
   """Returns the discrete Frechet distance of the tip's path to a curve [m], lower is better.

@@ -155,58 +155,65 @@ def timed(w, spent: dict):
 
 def parts(w) -> dict:
   """Returns what each part of a step's work on the organ's device takes, medians in ms."""
-  body = w.body
+  median = {name: float(np.median(each)) for name, each in times(w).items()}
+  rest_of_step = median["step"] - median["assemble"] - median["solve"]
+  return {
+    "search_ms": median["search"],
+    "transfer_ms": median.get("to", 0.0) + median.get("from", 0.0),
+    "assemble_ms": median["assemble"],
+    "solve_ms": median["solve"],
+    "integrate_ms": median["enter"] + median["end"] + max(0.0, rest_of_step),
+  }
+
+
+def times(w, count: int = 20, clock=time.perf_counter) -> dict[str, np.ndarray]:
+  """Returns how long the parts of a step's work on the organ's device take [ms], (count,) each.
+
+  `step` is the scheme's, with `assemble` and `solve` in it where it has them; `to` and `from` are
+  what crosses to a device and back.
+  """
+  body, scheme = w.body, w.config.integrator
   workspace.sync(w)
   state = w.views["plugin_state"].numpy()
   kept = state.copy()
-  solving = replay(
-    body.device,
-    assemble=lambda: stepping.assemble(body, Stage.FIRST),
-    solve=lambda: stepping.solve(body, Stage.FIRST),
-    step=lambda: stepping.step(body),
-  )
+  works = {"step": lambda: stepping.step(body, scheme)}
+  if stepping.SCHEMES[scheme].respond:
+    works["assemble"] = lambda: stepping.assemble(body, Stage.FIRST)
+    works["solve"] = lambda: stepping.solve(body, Stage.FIRST)
+  out = replay(body.device, works, count, clock)
   phases = windowed.Phases(w, w.model, 0)
   side = wp.get_device(phases.side)
   boxes = [(wp.clone(w.views[name], device=side), w.views[name]) for name in ("inbox", "outbox")]
   w.boxes["inbox"].head.numpy()[HEAD.mode] = MODE.commit  # there is a step to end
-  around = replay(
-    side,
-    transfer=lambda: (wp.copy(*boxes[0]), wp.copy(*reversed(boxes[1]))),
-    enter=phases.enter,
-    search=phases.look,
-    end=phases.end,
-  )
+  works = {"enter": phases.enter, "search": phases.look, "end": phases.end}
+  if side.is_cuda:
+    works["to"] = lambda: wp.copy(*boxes[0])
+    works["from"] = lambda: wp.copy(*reversed(boxes[1]))
+  out |= replay(side, works, count, clock)
   state[:] = kept
   workspace.bind(w, w.model)
-  rest_of_step = solving["step"] - solving["assemble"] - solving["solve"]
-  return {
-    "search_ms": around["search"],
-    "transfer_ms": around["transfer"] if side.is_cuda else 0.0,
-    "assemble_ms": solving["assemble"],
-    "solve_ms": solving["solve"],
-    "integrate_ms": around["enter"] + around["end"] + max(0.0, rest_of_step),
-  }
+  return out
 
 
-def replay(device, **works) -> dict[str, float]:
-  """Returns the median times of recorded graphs of `works`, in turn, in ms."""
-  graphs, times = {}, {name: [] for name in works}
+def replay(device, works: dict, count: int, clock=time.perf_counter) -> dict[str, np.ndarray]:
+  """Returns the times of recorded graphs of `works`, in turn [ms], (count,) each."""
+  graphs, spent = {}, {name: [] for name in works}
   for name, work in works.items():
     with wp.ScopedDevice(device), wp.ScopedCapture(device=device) as capture:
       work()
     graphs[name] = capture.graph
-  for name in 20 * list(works):
+  for name in count * list(works):
     if device.is_cuda:
       start, end = (wp.Event(device, enable_timing=True) for _ in range(2))
       wp.record_event(start)
       wp.capture_launch(graphs[name])
       wp.record_event(end)
-      times[name].append(wp.get_event_elapsed_time(start, end))
+      spent[name].append(wp.get_event_elapsed_time(start, end))
     else:
-      before = time.perf_counter()
+      before = clock()
       wp.capture_launch(graphs[name])
-      times[name].append(1e3 * (time.perf_counter() - before))
-  return {name: float(np.median(each)) for name, each in times.items()}
+      spent[name].append(1e3 * (clock() - before))
+  return {name: np.array(each) for name, each in spent.items()}
 
 
 def rest(m, d, organ) -> float:

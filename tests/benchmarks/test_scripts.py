@@ -59,9 +59,13 @@ def test_short_forms_write_rows_and_a_page(tmp_path, name, words):
 
 
 def test_peer_is_beside_ours(tmp_path):
-  words = ("--nodes", 162, "--tolerance", 1e-3, "--refine", 2, "--repeats", 1)
+  words = ("--nodes", 162, "--bent-nodes", "--solid-nodes", 162)
+  words += ("--tolerance", 1e-3, "--refine", 2, "--repeats", 1)
   assert command("peer", "--short", *words, "-o", tmp_path) == 0
-  (row,) = results.read(tmp_path / "peer_cpu.csv")
+  row, solid = results.read(tmp_path / "peer_cpu.csv")
+  assert solid["kind"] == "solid" and solid["nodal_ms"] == ""
+  assert 0 < solid["window_error"] < 0.05
+  assert solid["window_force_N"] == pytest.approx(solid["peer_force_N"], rel=0.3)
   assert row["peer_ms"] > 0 and row["nodal_ms"] > 0 and row["window_ms"] > 0
   assert row["peer_force_N"] > 0
   for side in ("nodal", "window"):

@@ -9,7 +9,7 @@ from palpate.engine import layout
 from scenes import probed
 
 SIZES = {"nfree": 21, "nvert": 9, "nslot": 5, "nwindow": 2, "ngeom": 3, "most": 7}
-SIZES |= {"ncreep": 4, "nrest": 6}
+SIZES |= {"ncreep": 4, "nrest": 6, "nbond": 3, "ncorner": 8, "nplace": 10, "nspare": 2, "ncuts": 1}
 BLOCKS = (layout.NodalState, layout.WindowState, layout.Inbox, layout.Outbox)
 
 
@@ -35,7 +35,7 @@ def test_the_plugin_state_has_room_for_its_table(window):
   m = mujoco.MjModel.from_xml_string(probed(window=window))
   organ = palpate.Organ(m, mujoco.MjData(m), "organ")
   sizes = {"nvert": organ.nvert, "nfree": 3 * organ.nvert, "nslot": 54, "ngeom": 1}
-  sizes |= {"ncreep": 0, "nrest": 0}
+  sizes |= layout.NO_CUTS | {"ncreep": 0, "nrest": 0, "nbond": 0}
   needed = layout.size(layout.WindowState if window else layout.NodalState, sizes)
   # It is asked for before the windows are known.
   assert m.npluginstate >= needed if window else m.npluginstate == needed

@@ -116,7 +116,8 @@ def test_two_steps_back_tell_where_the_solve_starts(window):
     if window:
       where = layout.spans(layout.Motion, {"nvert": organ.nvert})
     else:
-      where = layout.spans(layout.NodalState, {"nfree": 3 * organ.nvert, "ncreep": 0})
+      sizes = layout.NO_CUTS | {"nfree": 3 * organ.nvert, "ncreep": 0, "nbond": 0}
+      where = layout.spans(layout.NodalState, sizes)
     before = where["before"]
     forces.append([])
     counts.append([])

@@ -107,8 +107,9 @@ def test_single_observations_can_be_chosen():
   assert list(env.reset().observation) == ["tip_pos", "pixels"]
 
 
-def test_pictures_agree_with_each_other_and_with_the_scene():
-  env = load("grasp/easy", observations=PICTURES, pixels=(60, 80))
+@pytest.mark.parametrize("surroundings", ["none", "abdomen"])
+def test_pictures_agree_with_each_other_and_with_the_scene(surroundings):
+  env = load("grasp/easy", observations=PICTURES, pixels=(60, 80), surroundings=surroundings)
   seen = env.reset().observation
   assert list(seen) == list(PICTURES)
   label, depth, points = seen["segmentation"], seen["depth"], seen["points"]
@@ -117,7 +118,11 @@ def test_pictures_agree_with_each_other_and_with_the_scene():
   # Colours: the organ's mean is not the background's.
   assert np.abs(seen["pixels"][organ].mean(0) - seen["pixels"][label == 0].mean(0)).max() > 20
   np.testing.assert_array_equal(points[..., 2][label > 0], depth[label > 0])
-  assert (points[label == 0] == 0).all() and np.ptp(depth[label == 0]) == 0
+  if surroundings == "none":
+    assert (points[label == 0] == 0).all() and np.ptp(depth[label == 0]) == 0
+  else:  # the wall is everywhere behind
+    assert (depth > 0).all() and depth.max() < 0.5
+    np.testing.assert_array_equal(points[..., 2], depth)
   # In the world, points of the organ lie on its nodes, up to an edge, and the tip's on the tip.
   pos, axes, _ = env.physics.camera()
   world = points * [1, -1, -1] @ axes.T + pos

@@ -51,6 +51,10 @@ REFUSED = [
   ("bonds", "bed 1e7 2e3", "'near' and a distance"),
   ("bonds", "bed 1e7 2e3 2 by 0.01", "'near' and a distance"),
   ("carrier", "two words", "the name of a body"),
+  ("skin", "two words", "the name of a skin"),
+  ("tear", "-0.1", "a number >= 0"),
+  ("spare", "-1", "a whole number >= 0 or 'auto'"),
+  ("spare", "some", "a whole number >= 0 or 'auto'"),
   ("resident", "yes", "'true' or 'false'"),
 ]
 

@@ -18,6 +18,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 from websockets.sync.server import ServerConnection, serve
 
+from ..trainee.keeping import Keeping
 from . import worker
 
 _KINDS = {"js": "text/javascript", "css": "text/css", "svg": "image/svg+xml"}
@@ -48,6 +49,7 @@ class Server:
     token: str | None = None,
     device: str = "mouse",
     most: int = 2,
+    kept: Keeping | None = None,
   ):
     """Listens.
 
@@ -58,9 +60,10 @@ class Server:
       token: that a page must know; made up where others can reach it and none is given
       device: see `devices.device`
       most: pages at a time
+      kept: the record that recordings go to, None for the folder
     """
     self.token = token or ("" if _own(host) else secrets.token_urlsafe(16))
-    self._folder, self._device = folder, device
+    self._folder, self._device, self._kept = folder, device, kept
     self._places = threading.BoundedSemaphore(most)
     self._open: set[ServerConnection] = set()
     self._server = serve(
@@ -122,7 +125,7 @@ class Server:
     context = multiprocessing.get_context("spawn")
     near, far = context.Pipe()
     process = context.Process(
-      target=worker.main, args=(far, str(self._folder), self._device), daemon=True
+      target=worker.main, args=(far, str(self._folder), self._device, self._kept), daemon=True
     )
     process.start()
     far.close()

@@ -18,6 +18,7 @@ from typing import Any
 
 import palpate
 
+from ..trainee.keeping import Keeping, references
 from . import devices, ghost, menu
 from .coach import Coach, card
 from .coupling import Options
@@ -35,17 +36,18 @@ _WORDS = (
 )  # fmt: skip
 
 
-def main(conn: Connection, folder: str, device: str) -> None:
+def main(conn: Connection, folder: str, device: str, kept: Keeping | None = None) -> None:
   """Serves one page until it says `end`.
 
   Args:
     conn: to the server
     folder: where recordings are kept
     device: name of the device; one of the page's own is moved by its messages
+    kept: the record that recordings go to, None for the folder
   """
   palpate.register()
   try:
-    Worker(conn, pathlib.Path(folder), device).serve()
+    Worker(conn, pathlib.Path(folder), device, kept).serve()
   except KeyboardInterrupt:
     pass
 
@@ -53,8 +55,12 @@ def main(conn: Connection, folder: str, device: str) -> None:
 class Worker:
   """Runs the exercises that a page asks for, one after another."""
 
-  def __init__(self, conn: Connection, folder: pathlib.Path, device: str):
+  def __init__(
+    self, conn: Connection, folder: pathlib.Path, device: str, kept: Keeping | None = None
+  ):
     """Takes the arguments of `main`."""
+    self._record = kept.begin() if kept else None
+    self._references = self._record.references if self._record else references(None)
     self._conn, self._folder, self._own = conn, folder, device
     self._device = "page" if devices.on_page(device) else device
     self._jobs: queue.SimpleQueue[dict | None] = queue.SimpleQueue()
@@ -83,7 +89,7 @@ class Worker:
       except (ValueError, TypeError, OSError, DeviceError, RuntimeError) as error:
         self._fault(error)
         self._tell({"type": "idle"})
-    if self._unkept is not None and not self._unkept.keep(self._folder):
+    if self._unkept is not None and not self._unkept.keep(self._folder, self._record):
       print(f"palpate: a recording is lost: {self._unkept.fault}", file=sys.stderr)
 
   # Words.
@@ -159,7 +165,7 @@ class Worker:
   def _on_keep(self, message: dict[str, Any]) -> None:
     if self._unkept is not None:
       done = self._unkept
-      self._unkept = None if done.keep(self._folder) and not done.fault else done
+      self._unkept = None if done.keep(self._folder, self._record) and not done.fault else done
       self._tell({"type": "kept", "path": str(done.path or ""), "fault": done.fault})
 
   def _on_pause(self, message: dict[str, Any]) -> None:
@@ -231,8 +237,10 @@ class Worker:
   # Exercises.
 
   def _exercise(self, job: dict[str, Any]) -> None:
-    from palpate.tasks import score, suite
+    from palpate.tasks import suite
 
+    if self._record is not None:
+      self._record.keeping.check(job["task"])
     self._tell({"type": "loading", "text": job["task"]})
     kwargs = _kwargs(job)
     env = suite.load(*suite.split(job["task"]), task_kwargs={"random": 0, **kwargs})
@@ -243,8 +251,9 @@ class Worker:
     )  # fmt: skip
     recording = self._run(session, job, lambda: session.run(realtime=True))
     done = Finished(recording)
-    self._unkept = None if done.keep(self._folder) and not done.fault else done
-    shown = card(recording, score.reference(job["task"]))
+    self._unkept = None if done.keep(self._folder, self._record) and not done.fault else done
+    shown = card(recording, self._references(job["task"]))
+    shown["advice"] += done.said
     self._tell({"type": "card", "path": str(done.path or ""), "fault": done.fault, **shown})
 
   def _run(self, made: Session | Practice, job: dict[str, Any], run: Any) -> Any:

@@ -1,0 +1,299 @@
+# mujoco ships its bindings without type stubs:
+# pyright: reportAttributeAccessIssue=false
+"""One abdomen: any of its organs soft, the others scenery, lit by an endoscope.
+
+Scenery is drawn and nothing else: it has no contacts and no dofs. World: that of the catalogue's
+scenes, the liver's frame turned so that anterior is up and superior is -y.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+
+import mujoco
+import numpy as np
+from palpate import skins
+from palpate import windows as author
+
+from . import catalog, markup, scene, scenery, texture, trocar
+from .scenery import Surface
+
+NAMES = ("liver", "gallbladder", "stomach")  # organs, in the order they are drawn
+CAMERA, LIGHT = "laparoscope", "endoscope"
+GROUP = 2  # of the scenery
+_LEVELS = {"liver": 1, "gallbladder": 0, "stomach": 1}  # of the smooth surfaces of scenery
+# By eye after photographs of operations; a texture takes 14 % off.
+COLOURS = {
+  "liver": (0.62, 0.22, 0.17, 1.0),
+  "gallbladder": (0.60, 0.65, 0.46, 1.0),
+  "stomach": (0.95, 0.66, 0.58, 1.0),
+  "kidney": (0.62, 0.27, 0.23, 1.0),
+  "fat": (1.0, 0.84, 0.46, 1.0),
+  "wall": (0.92, 0.56, 0.47, 1.0),
+}
+# Specular share of wet surfaces; by eye. Much of it turns yellow and pink ones green.
+_SHEEN = {"fat": 0.2, "wall": 0.15, "stomach": 0.35}
+# What the fixed renderer's light loses on its way, 1 at 15 cm: 0.55 + 0.45 (d / 15 cm)^2.
+_FADE = (0.55, 0.0, 0.45 / 0.15**2)
+_VIEW = ((0.0, 0.175, 0.135), (0.0, 0.03, 0.005))  # of `abdomen`'s camera: from, to [m]
+
+
+@dataclasses.dataclass(frozen=True)
+class Arrangement:
+  """What assistants hold aside so that an organ is seen.
+
+  Attributes:
+    lifts: how far other organs are from their places, in the world [m]
+    fat: how far the fat is from its place, upward [m]
+    without: organs and ducts that would be in the way
+  """
+
+  lifts: Mapping[str, tuple[float, float, float]] = dataclasses.field(default_factory=dict)
+  fat: float = 0.0
+  without: tuple[str, ...] = ()
+
+
+# By the organ that is worked on; all ours.
+ARRANGEMENTS: Mapping[str, Arrangement] = {
+  "liver": Arrangement(),
+  "gallbladder": Arrangement({"liver": (0.0, -0.012, 0.01)}),
+  "stomach": Arrangement(
+    {"liver": (0.03, -0.05, 0.03), "gallbladder": (0.03, -0.05, 0.03)},
+    fat=-0.02, without=("cystic_duct", "cystic_artery"),
+  ),
+  "kidney": Arrangement(
+    {"liver": (0.0, -0.06, 0.03), "gallbladder": (0.0, -0.06, 0.03)},
+    fat=-0.05, without=("stomach", "duodenum", "cystic_duct", "cystic_artery"),
+  ),
+}  # fmt: skip
+
+
+def abdomen(
+  soft: Mapping[str, int] | Sequence[str] = ("liver", "gallbladder"),
+  instruments: Sequence[str] = ("grasper", "probe"),
+  handle: bool = False,
+  seed: int | None = None,
+  look: int = 0,
+) -> mujoco.MjSpec:
+  """Returns a scene of the whole upper abdomen.
+
+  Args:
+    soft: organs of NAMES that are tissue, and their nodes, one of `RESOLUTIONS`; names alone have
+      1000. The others are scenery
+    instruments: of `INSTRUMENTS`, at most two, the right hand's first
+    handle: whether mocap handles pull the instruments in place of position actuators
+    seed: of the soft organs' shapes, None for the mean ones
+    look: seed of spots and vessels
+  """
+  if isinstance(soft, str):
+    raise ValueError(f"soft is {soft!r}, expected a tuple such as ({soft!r},)")
+  nodes = dict(soft) if isinstance(soft, Mapping) else dict.fromkeys(soft, catalog.DEFAULT)
+  for name in nodes:
+    if name not in NAMES:
+      raise ValueError(f"soft has {name!r}, expected some of {', '.join(NAMES)}")
+  scene.check_instruments(instruments)
+  spec = mujoco.MjSpec.from_string(_BASE)
+  for name, count in nodes.items():
+    frame = spec.worldbody.add_frame(pos=place(name), quat=catalog.SUPINE_QUAT)
+    spec.attach(scene.organ(name, count, seed), prefix=f"{name}/", frame=frame)
+  for instrument, prefix, (port, aim) in zip(
+    instruments, markup.prefixes(instruments), _PORTS, strict=False
+  ):
+    trocar.attach(spec, instrument, prefix, np.array(port), trocar.aim(port, aim), handle)
+  for name in nodes:
+    spec.flex(f"{name}/{name}").contype = 0  # tools meet it, other organs do not
+    author.add_windows(spec, f"{name}/{name}")
+    cover(spec, f"{name}/{name}", name, look)
+  furnish(spec, [name for name in NAMES if name not in nodes], look=look)
+  light(spec, *_VIEW)
+  return spec
+
+
+_PORTS = (((0.09, 0.09, 0.15), (0.05, 0.06, 0.03)), ((-0.07, 0.09, 0.15), (-0.01, 0.05, 0.03)))
+_BASE = f"""<mujoco model="abdomen">
+  <compiler autolimits="true"/>
+  <option timestep="0.001" gravity="0 0 0" integrator="implicitfast" cone="elliptic"/>
+  <size memory="128M"/>
+  <statistic center="0 0.04 0" extent="0.3"/>
+  <visual><global offwidth="1280" offheight="960"/><map znear="0.01" zfar="10"/></visual>
+  <worldbody>
+    <camera name="{CAMERA}" pos="{markup.numbers(_VIEW[0])}" fovy="62"
+      xyaxes="{markup.look(*_VIEW)}"/>
+  </worldbody>
+</mujoco>"""
+
+
+def place(name: str, of: str = "liver") -> np.ndarray:
+  """Returns where an organ is from another one, in the world [m]  (3,)."""
+  here, there = (np.array(catalog.PLACES[each][0]) for each in (name, of))
+  return catalog.to_world(here - there)
+
+
+def cover(spec: mujoco.MjSpec, organ: str, kind: str, look: int = 0, uv=None) -> str:
+  """Gives an organ of a spec a skin with the look of its kind; returns the skin's name.
+
+  Args:
+    spec: changed in place
+    organ: name of the flexcomp
+    kind: of the catalogue
+    look: seed of spots and vessels
+    uv: texture coordinates of its vertices (n, 2); None makes them
+  """
+  material = _material(spec, kind, COLOURS[kind], kind, look)
+  flex = spec.flex(organ)
+  if uv is None:
+    uv = scenery.texcoord(kind, np.reshape(flex.vert, (-1, 3)), np.reshape(flex.elem, (-1, 3)))
+  return skins.add_skin(spec, organ, material=material, texcoord=uv)
+
+
+def surround(
+  spec: mujoco.MjSpec,
+  organ: str,
+  kind: str,
+  uv: np.ndarray,
+  view,
+  look: int = 0,
+  arrangement: Arrangement | None = None,
+):
+  """Puts a scene's only organ, which is at the world's origin, into an abdomen.
+
+  Args:
+    spec: changed in place
+    organ: name of the flexcomp
+    kind: of PLACES
+    uv: texture coordinates of its vertices  (n, 2)
+    view: where the camera is and what it looks at [m]
+    look: seed of spots and vessels
+    arrangement: what is held aside, None for that of ARRANGEMENTS
+  """
+  cover(spec, organ, kind, look, uv)
+  held = arrangement or ARRANGEMENTS[kind]
+  furnish(spec, [name for name in NAMES if name != kind], kind, held, look)
+  for lamp in list(spec.lights):
+    spec.delete(lamp)
+  light(spec, *view)
+
+
+def furnish(
+  spec: mujoco.MjSpec,
+  organs: Sequence[str] = NAMES,
+  around: str = "liver",
+  arrangement: Arrangement | None = None,
+  look: int = 0,
+):
+  """Adds what is only drawn: organs, ducts, fat and the wall.
+
+  Args:
+    spec: changed in place
+    organs: which ones
+    around: organ whose origin is the world's
+    arrangement: what is held aside
+    look: seed of spots and vessels
+  """
+  held = arrangement or Arrangement()
+  origin = place(around)
+  for name in organs:
+    if name in held.without:
+      continue
+    skin = _material(spec, name, COLOURS[name], name, look)
+    lift = held.lifts.get(name, (0, 0, 0))
+    surface = scenery.to_world(scenery.organ(name, _LEVELS[name]))
+    _draw(spec, name, surface, skin, place(name) - origin + lift)
+  for name, duct in catalog.DUCTS.items():
+    if name in held.without:
+      continue
+    path = catalog.to_world(np.array(duct.points))
+    surface = scenery.tube(path, np.full(len(path), duct.diameter / 2))
+    kind = "stomach" if name == "duodenum" else None
+    skin = _material(spec, name, duct.rgba, kind, look)
+    goes_with = "stomach" if name == "duodenum" else "gallbladder"
+    lift = held.lifts.get(goes_with, (0, 0, 0))
+    _draw(spec, name, surface, skin, np.array(lift) - origin)
+  fat = scenery.sheet(_fat, (-0.17, -0.06), (0.15, 0.27), (54, 56))
+  skin = _material(spec, "fat", COLOURS["fat"], "fat", look, 2)
+  _draw(spec, "fat", fat, skin, [0, 0, held.fat] - origin)
+  wall = scenery.shell((-0.01, 0.09, 0.035), (0.175, 0.21, 0.175), 2.4, (44, 30))
+  _draw(spec, "wall", wall, _material(spec, "wall", COLOURS["wall"], "wall", look), -origin)
+
+
+def _fat(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+  """Returns the height of the omentum over the bowel [m]; ours, in lumps of 2 to 4 cm.
+
+  It rises to the liver around bile duct, artery and portal vein: the hepatoduodenal ligament.
+  """
+  base = -0.022 - 0.5 * np.maximum(np.abs(x + 0.01) - 0.10, 0) - 0.08 * np.maximum(y - 0.12, 0)
+  large, small = scenery.bumps(1, 0.085, 0.012), scenery.bumps(2, 0.036, 0.0035)
+  rise = 0.024 * np.exp(-((x + 0.02) ** 2 + (y - 0.034) ** 2) / (2 * 0.013**2))
+  return base + rise + large(x, y) + small(x, y)
+
+
+def light(spec: mujoco.MjSpec, pos, target) -> None:
+  """Lights a scene as an endoscope does: from the camera, ever less with the distance."""
+  head = spec.visual.headlight
+  head.ambient, head.diffuse, head.specular = [0.2] * 3, [0.12] * 3, [0.0] * 3
+  forward = np.subtract(target, pos)
+  # Beside the lens: what reflects it is not all in the picture's middle.
+  beside = np.cross(forward, [0.0, 0.0, 1.0])
+  beside *= 0.006 / np.linalg.norm(beside)
+  spec.worldbody.add_light(
+    name=LIGHT,
+    pos=np.asarray(pos) + beside,
+    dir=forward,
+    type=mujoco.mjtLightType.mjLIGHT_SPOT,
+    cutoff=70,
+    exponent=2,
+    attenuation=_FADE,
+    ambient=[0.05, 0.045, 0.045],
+    diffuse=[0.98, 0.94, 0.89],
+    specular=[0.8, 0.8, 0.8],
+    castshadow=False,
+  )
+
+
+def _material(spec, name: str, rgba, kind: str | None, look: int, repeat: float = 1.0) -> str:
+  """Returns the name of the material of a tissue, made unless the spec has it."""
+  name = f"abdomen_{name}"
+  if spec.material(name) is not None:
+    return name
+  made = spec.add_material(name=name, rgba=rgba, specular=_SHEEN.get(kind, 0.5), shininess=0.75)
+  made.texrepeat = [repeat, repeat]
+  if kind is not None:
+    paper = f"abdomen_{kind}"
+    if spec.texture(paper) is None:
+      pixels = texture.texture(kind, look)
+      spec.add_texture(
+        name=paper,
+        type=mujoco.mjtTexture.mjTEXTURE_2D,
+        width=pixels.shape[1],
+        height=pixels.shape[0],
+        nchannel=3,
+        data=pixels.ravel(),
+      )
+    roles = list(made.textures)
+    roles[int(mujoco.mjtTextureRole.mjTEXROLE_RGB)] = paper
+    made.textures = roles
+  return name
+
+
+def _draw(spec, name: str, surface: Surface, material: str, pos) -> None:
+  """Adds a surface to the world that meets nothing."""
+  spec.add_mesh(
+    name=f"abdomen_{name}",
+    uservert=surface.vertices.ravel(),
+    userface=surface.triangles.ravel(),
+    usertexcoord=surface.texcoord.ravel(),
+    smoothnormal=True,
+    inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
+  )
+  spec.worldbody.add_geom(
+    name=f"abdomen_{name}",
+    type=mujoco.mjtGeom.mjGEOM_MESH,
+    meshname=f"abdomen_{name}",
+    material=material,
+    pos=pos,
+    group=GROUP,
+    contype=0,
+    conaffinity=0,
+    mass=0.0,
+  )

@@ -1,0 +1,241 @@
+"""Keeps what a person does in a record: options of the commands, and what they call at the end."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import dataclasses
+import pathlib
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from ..console import CommandError
+
+if TYPE_CHECKING:
+  from palpate.tasks.limits import Lookup
+  from palpate.tasks.recording import Recording
+
+  from .record import Record, Session
+
+FOLDER = "out/record"  # where a record is unless a command is told otherwise
+
+
+def add_record(parser: argparse.ArgumentParser):
+  """Declares the option that says where the record is."""
+  text = f"where trainees and what they did are kept ({FOLDER})"
+  parser.add_argument("--record", metavar="FOLDER", help=text)
+
+
+def add_references(parser: argparse.ArgumentParser):
+  """Declares the option that says what is scored against."""
+  parser.add_argument(
+    "--references", metavar="FILE",
+    help="references of scores and limits, of `palpate trainee limits` or `palpate panel` (those "
+    "that ship)",
+  )  # fmt: skip
+
+
+def add_arguments(parser: argparse.ArgumentParser):
+  """Declares the options of a command whose exercises are kept."""
+  add = parser.add_argument
+  add("--trainee", metavar="NAME", help="who does it: it is kept in the record")
+  add_record(parser)
+  add("--any-task", action="store_true", help="also exercises that are not open to the trainee")
+  add_references(parser)
+
+
+def folder(args: argparse.Namespace) -> pathlib.Path:
+  """Returns where the record is."""
+  return pathlib.Path(args.record or FOLDER)
+
+
+def references(path: str | pathlib.Path | None) -> Lookup:
+  """Returns what finds the references of tasks; CommandError says what is wrong with the file."""
+  from palpate.tasks import limits
+
+  try:
+    return limits.lookup(None if path is None else pathlib.Path(path))
+  except OSError as error:
+    raise CommandError(f"references: {path}: {error.strerror or error}") from None
+  except ValueError as error:
+    raise CommandError(f"references: {error}") from None
+
+
+@contextlib.contextmanager
+def one_line():
+  """Turns what is wrong with a record into one line."""
+  from .database import RecordError
+
+  try:
+    yield
+  except RecordError as error:
+    raise CommandError(str(error), code=1) from None
+  except ValueError as error:
+    raise CommandError(str(error)) from None
+
+
+def tell(record: Record) -> None:
+  """Says what people should know about a record that was opened."""
+  for text in record.said:
+    print(f"palpate: {text}", file=sys.stderr)
+
+
+@dataclasses.dataclass(frozen=True)
+class Kept:
+  """What became of a recording.
+
+  Attributes:
+    path: where it is, None where it could not be kept anywhere
+    fault: why it is not in the record; empty where it is
+    said: what it means for the person, in sentences
+  """
+
+  path: pathlib.Path | None
+  fault: str = ""
+  said: tuple[str, ...] = ()
+
+
+@dataclasses.dataclass(frozen=True)
+class Keeping:
+  """Where exercises are kept, and whose they are; goes to other processes as it is.
+
+  Attributes:
+    folder: of the record, None without one
+    trainee: who does them all; empty where each exercise says who does it
+    references: file of references, None for those that ship
+    any_task: whether exercises that are not open to the trainee may be done
+  """
+
+  folder: pathlib.Path | None
+  trainee: str = ""
+  references: str | None = None
+  any_task: bool = False
+
+  def __str__(self) -> str:
+    return f"{self.folder}, of {self.trainee or 'the name on the page'}"
+
+  def check(self, task: str) -> None:
+    """Raises ValueError unless the task is open to the trainee, RecordError without a record."""
+    from palpate.tasks import curriculum
+
+    from . import history
+    from .record import Record
+
+    if self.folder is None or not (task and self.trainee) or self.any_task:
+      return
+    with Record(self.folder) as record:
+      person = record.find(self.trainee)
+      met = curriculum.done(history.passed(record.episodes(person)))
+    if before := curriculum.locked(task, met):
+      raise ValueError(
+        f"task is {task!r}, which is not open to {person.name!r} yet: {before} comes first, "
+        f"{curriculum.RULE}; --any-task does not ask"
+      )
+
+  def knows(self, person: str) -> bool:
+    """Returns whether what a person did goes to a record; a trainee does everything."""
+    return self.folder is not None and bool(self.trainee or person)
+
+  def begin(self) -> Sitting:
+    """Returns a use of the program, which is a session of the record."""
+    from .record import Session
+
+    return Sitting(self, Session(), references(self.references))
+
+
+@dataclasses.dataclass(frozen=True)
+class Sitting:
+  """One use of the program: what is kept in it is of one session.
+
+  Attributes:
+    keeping: where
+    session: of the record
+    references: what finds the references of tasks
+  """
+
+  keeping: Keeping
+  session: Session
+  references: Lookup
+
+  def keep(self, recording: Recording, person: str = "") -> Kept:
+    """Keeps a recording, in the record or, where that cannot be, among the temporary files.
+
+    What is said tells of the person's other exercises, and only where there is a `trainee`: who
+    gives a name on a page learns nothing about whom it belongs to.
+
+    Args:
+      recording: of an exercise that ended
+      person: who did it, where there is no `trainee`; added to the record if new
+    """
+    from .database import PendingError, RecordError
+    from .record import Record
+
+    folder, trainee = self.keeping.folder, self.keeping.trainee
+    assert folder is not None, "there is no record"
+    try:
+      with Record(folder, self.references) as record:
+        who = record.find(trainee) if trainee else record.add(person)
+        episode = record.keep(who, recording, self.session, self.references)
+        said = _progress(record.episodes(who), episode.task) if trainee else ()
+        tell(record)
+        return Kept(record.path(episode), "", said)
+    except PendingError as error:
+      return Kept(error.path, "", (str(error),))
+    except (RecordError, ValueError) as error:
+      fault = f"not kept in {folder}: {error}"
+    try:
+      spare = pathlib.Path(tempfile.mkdtemp(prefix="palpate-")) / "recording.npz"
+      return Kept(recording.save(spare), fault)
+    except OSError as error:
+      return Kept(None, f"{fault}; nor among the temporary files: {error.strerror or error}")
+
+
+def read(args: argparse.Namespace, task: str = "", pages: bool = False) -> Keeping | None:
+  """Returns what the options of `add_arguments` say; None where that is nothing.
+
+  CommandError says what is wrong with them, and whether the task is not open to the trainee.
+
+  Args:
+    args: of the command
+    task: that is done; empty where it is chosen later
+    pages: whether a person gives a name on a page where there is no trainee
+  """
+  from .record import Record
+
+  references(args.references)
+  if args.trainee is None and (pages is False or args.record is None):
+    for name, given in (("record", args.record is not None), ("any-task", args.any_task)):
+      if given:
+        raise CommandError(f"{name} is given without --trainee")
+    return Keeping(None, references=args.references) if pages and args.references else None
+  name = ""
+  with one_line():
+    if args.trainee is None:
+      Record(folder(args), references(None)).close()  # what is wrong with it is said now
+    else:
+      with Record(folder(args)) as record:
+        name = record.find(args.trainee).name
+    keeping = Keeping(folder(args), name, args.references, args.any_task)
+    keeping.check(task)
+  return keeping
+
+
+def _progress(episodes: Sequence[Any], task: str) -> tuple[str, ...]:
+  """Returns what the last episode, of a task, means for the person."""
+  from palpate.tasks import curriculum
+
+  from . import history
+
+  passed: Mapping[str, Sequence[bool]] = history.passed(episodes)
+  mine, met = passed.get(task, []), curriculum.done(passed)
+  before = curriculum.done({**passed, task: mine[:-1]})
+  said = f"Attempt {len(mine)} at {task}, {sum(mine)} of them proficient"
+  if task not in met:
+    return (f"{said}; {curriculum.left(mine)} more, if all are, meet the rule of proficiency.",)
+  then = curriculum.following(met)
+  opened = f"next is {then}" if then else "all exercises are done"
+  if task in before:
+    return (f"{said}; {opened}.",)
+  return (f"{said}: the rule of proficiency is met ({curriculum.RULE}), {opened}.",)

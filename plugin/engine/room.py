@@ -1,0 +1,31 @@
+"""How long an organ's part of mjData.plugin_state is, before MuJoCo has filled in the flexes."""
+
+from __future__ import annotations
+
+from palpate.tissue import fill
+
+from . import coupling, declare, mjstruct, nodal, windowed
+
+
+def state_size(model: int, instance: int) -> int:
+  """Returns the length of the plugin state.
+
+  Contact force, last dv and the one before of each moving vertex, or what `windowed` says.
+  """
+  m = mjstruct.Model.from_address(model)
+  names = mjstruct.config(model, instance, "window").split()
+  relaxes, rests, bonded = (
+    bool(mjstruct.config(model, instance, key).strip())
+    for key in ("relax_share", "support", "bonds")
+  )
+  spare = mjstruct.config(model, instance, "spare").strip() not in ("", "0")
+  cuts = coupling.cut_sizes(m.nflexelem, m.nflexvert, spare * m.nflexvert)
+  if names:
+    # Asked before MuJoCo has filled in the flexes: what `windowed` needs is at most this.
+    inside = fill.MOST if mjstruct.config(model, instance, "elements").strip() == "solid" else 0
+    most = (1 + inside) * m.nflexvert
+    outer = {"nrest": rests * m.nflexvert, "nbond": bonded * m.nflexvert}
+    outer |= {"ncreep": relaxes * most} | cuts
+    return windowed.state_size(most, 0, m.ngeom * len(names), **outer)
+  moving = len(declare.moving_bodies(m, instance))
+  return nodal.state_size(3 * moving, ncreep=relaxes * moving, nbond=bonded * moving, **cuts)

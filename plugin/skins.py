@@ -1,0 +1,109 @@
+# mujoco ships its bindings without type stubs:
+# pyright: reportAttributeAccessIssue=false
+"""Smooth organs in pictures: gives an organ of an `mujoco.MjSpec` a skin."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from .engine.skin import HIDDEN
+from .tissue import subdivide
+from .tissue.mesh import vertex_normals
+from .windows import find_organ
+
+_ENOUGH = 3500  # vertices of a skin, unless told how many
+
+
+def add_skin(
+  spec: mujoco.MjSpec,
+  organ: str,
+  levels: int | None = None,
+  *,
+  material: str | None = None,
+  texcoord: np.ndarray | None = None,
+  height: np.ndarray | float = 0.0,
+) -> str:
+  """Lets an organ be drawn as a smooth surface through its vertices, in every way MuJoCo draws.
+
+  The organ's triangles are divided in four `levels` times, by Loop's scheme. What a step computes
+  and what it costs stay the same: the skin is made when a picture is. The organ's own surface goes
+  to group 4, which nobody draws who does not ask for it.
+
+  Args:
+    spec: changed in place; afterwards it can be compiled, saved as XML and attached
+    organ: name of the flexcomp
+    levels: one of 1, 2, 3, 4; None for the first that makes 3500 vertices or more
+    material: of the skin; None for the organ's material and colour
+    texcoord: texture coordinates of the organ's vertices  (n, 2), or of the skin's (nskin, 2)
+    height: of the skin's vertices over the smooth surface, such as grain [m]  (nskin,)
+
+  Returns:
+    The name of the skin.
+
+  Raises:
+    ValueError: there is no such organ, it has a skin, or an argument is not allowed.
+  """
+  flex, plugin, bodies = find_organ(spec, organ)
+  config = {key: value for key, value in plugin.config.items() if value}
+  name, have = f"{organ}_skin", config.get("skin")
+  if have:
+    raise ValueError(f"organ {organ!r} has skin {have!r} already, expected none")
+  smooth = _smooth(organ, np.reshape(flex.elem, (-1, 3)), levels)
+  count = smooth.weight.shape[0]
+  rest, parent = _rest(flex, bodies)
+  rest = rest[: smooth.weight.shape[1]]  # without vertices that wait for cuts
+  points = smooth(rest)
+  above = np.broadcast_to(np.asarray(height, float), (count,))
+  points = points + above[:, None] * vertex_normals(points, smooth.elem)
+  # A colour of its own would count, not the material's.
+  look = {"material": material} if material else {"rgba": flex.rgba, "material": flex.material}
+  if texcoord is not None:
+    look["texcoord"] = _fine(organ, texcoord, smooth, len(rest), count).ravel()
+  skin = spec.add_skin(
+    name=name,
+    vert=points.ravel(),
+    face=smooth.elem.ravel(),
+    bodyname=[parent],
+    bindpos=[0.0, 0.0, 0.0],
+    bindquat=[1.0, 0.0, 0.0, 0.0],
+    group=flex.group,
+    **look,
+  )
+  skin.vertid, skin.vertweight = [np.arange(count)], [np.ones(count)]
+  flex.group, config["skin"] = HIDDEN, name
+  plugin.config = config
+  return name
+
+
+def _smooth(organ: str, elem: np.ndarray, levels: int | None) -> subdivide.Smooth:
+  if levels is None:
+    sizes = zip(subdivide.LEVELS, subdivide.counts(elem), strict=True)
+    levels = next((level for level, size in sizes if size >= _ENOUGH), subdivide.LEVELS[-1])
+  if levels not in subdivide.LEVELS:
+    raise ValueError(f"organ {organ!r}: levels is {levels!r}, expected one of 1, 2, 3, 4")
+  return subdivide.smooth(elem, levels)
+
+
+def _rest(flex, bodies: dict) -> tuple[np.ndarray, str]:
+  """Returns an organ's vertices in the body that it is in [m]  (n, 3), and that body's name."""
+  names = list(flex.vertbody)
+  on_bodies = not len(flex.vert)
+  rest = np.zeros((len(names), 3)) if on_bodies else np.reshape(flex.vert, (-1, 3)).copy()
+  own = [k for k, name in enumerate(names) if bodies[name].first_joint() is not None]
+  if not own:  # it is rigid, and has windows
+    return rest, names[0]
+  rest[own] += [bodies[names[k]].pos for k in own]
+  return rest, bodies[names[own[0]]].parent.name
+
+
+def _fine(organ: str, texcoord, smooth, coarse: int, count: int) -> np.ndarray:
+  texcoord = np.asarray(texcoord, float)
+  if texcoord.shape == (count, 2):
+    return texcoord
+  if texcoord.shape != (coarse, 2):
+    raise ValueError(
+      f"organ {organ!r}: texcoord has shape {texcoord.shape}, expected ({coarse}, 2), one a vertex "
+      f"of the organ, or ({count}, 2), one a vertex of its skin"
+    )
+  return smooth(texcoord)

@@ -1,0 +1,146 @@
+"""Dissect: grasp the gallbladder and pull it out of its bed on the liver, bond by bond.
+
+Own observations: `target` (3,), from the tip to the site to grasp [m]; `front` (3,), from the tip
+to the middle of the bonds that still hold [m]; `freed` (1,), share of the bed's area that is free
+[-]; `traction` (1,), pull on the liver [N]; `grasped` (1,), whether the jaws hold the site, as in
+`grasp`; here it may slip by 6 mm.
+
+What comes free while the site is grasped, with the force and the traction under their limits, is
+`clean`; the rest is `torn`. Progress: 0.1 * closeness until it is grasped, 0.1 then, and besides
+0.8 * clean / wanted. Success: the wanted share is clean. Failure: a force above the damage limit,
+jaws included, a traction above twice its limit, which tears the liver, so much torn that too little
+is left, or the time limit.
+
+The bed stands: the liver is what its bonds pull at.
+"""
+
+import dataclasses
+import itertools
+
+import numpy as np
+from dm_control.utils import containers
+
+from . import base
+from .base import Physics
+from .freeing import Freeing
+from .grasp import FUNDUS, Hold
+from .performer import Performer, Script
+from .scenes import Scene
+
+SUITE = containers.TaggedTasks()
+# Stiffness [N/m^3], strength [Pa] and energy [J/m^2] of the bed, and of a tough one. Ours: we know
+# of no measurement; the bed bears the organ, and comes away under half a newton or one.
+BED, TOUGH = (1e7, 6e3, 8.0), (1e7, 7e3, 10.0)
+# Of the expert: how far it pulls at most [m], how fast [m/s], and how much towards the trocar.
+_FAR, _SPEED, _UP = 0.045, 0.01, 0.5
+
+
+@SUITE.add("benchmarking", "easy")
+def easy(time_limit=30, random=None, environment_kwargs=None, **kwargs):
+  """Returns the task to free half of the gallbladder's bed."""
+  kwargs = {"wanted": 0.5, **kwargs}
+  scene = dataclasses.replace(FUNDUS, nodes=250, bonds=BED)
+  task = Dissect(scene, random, name="dissect/easy", **kwargs)
+  return base.make(task, time_limit, environment_kwargs)
+
+
+@SUITE.add("benchmarking")
+def standard(time_limit=40, random=None, environment_kwargs=None, **kwargs):
+  """Returns the task to free 80 % of it."""
+  kwargs = {"wanted": 0.8, "jitter": 0.003, **kwargs}
+  scene = dataclasses.replace(FUNDUS, nodes=250, bonds=BED)
+  task = Dissect(scene, random, name="dissect/standard", **kwargs)
+  return base.make(task, time_limit, environment_kwargs)
+
+
+@SUITE.add("benchmarking", "hard")
+def hard(time_limit=60, random=None, environment_kwargs=None, **kwargs):
+  """Returns the task to free 85 % of a tough bed with less force, on varying organs."""
+  kwargs = {"wanted": 0.85, "jitter": 0.005, "variants": (None, 1, 2), **kwargs}
+  kwargs = {"force_limit": 3.4, "damage": 6.0, "traction": 1.2, **kwargs}
+  scene = dataclasses.replace(FUNDUS, nodes=500, bonds=TOUGH)
+  task = Dissect(scene, random, name="dissect/hard", **kwargs)
+  return base.make(task, time_limit, environment_kwargs)
+
+
+class Dissect(Freeing, Hold):
+  """Free an organ from its bed by traction."""
+
+  slip = 0.006
+
+  def __init__(
+    self, scene: Scene, random=None, *, name: str, wanted: float, traction: float = 1.5, **kwargs
+  ):
+    """Makes the task.
+
+    Args:
+      scene: what it plays in, with bonds
+      random: see Task
+      name: domain and task
+      wanted: share of the bed that must come free cleanly [-]
+      traction: limit of the pull on the liver [N]
+      **kwargs: see Task; the force limit counts the jaws too
+    """
+    self.name, self.targets, self.wanted, self.limit = name, 1, wanted, traction
+    kwargs = {"spread": 0.012, "force_limit": 4.0, "damage": 8.0, **kwargs}
+    super().__init__(dataclasses.replace(scene, targets=1), random, **kwargs)
+
+  def begin(self, physics: Physics) -> None:
+    """Draws the site to grasp."""
+    super().begin(physics)
+    self.whole(physics)
+    physics.mark(0, physics.point(self.site), now=True)
+
+  def advance(self, physics: Physics) -> float:
+    """Follows the grasp and what comes free."""
+    physics.mark(0, physics.point(self.site), now=True)
+    if self.follow(physics):
+      self.dropped(physics)
+    self.count(physics, self.grasped)
+    near = base.closeness(self.distance(physics), self.distance0)
+    return self.earned(1.0 if self.grasped else near)
+
+  def instruct(self, physics: Physics) -> str:
+    """Says to grasp, or to pull."""
+    if not self.grasped:
+      return "Open the jaws, go over the marked fold and close them gently"
+    if self.traction > self.limit:
+      return "Pull less: the liver gives"
+    return f"Pull it off its bed: {100 * self.clean:.0f} of {100 * self.wanted:.0f} % are free"
+
+  def observe(self, physics: Physics) -> dict[str, np.ndarray]:
+    """Returns target, front, freed, traction and grasped."""
+    return {
+      "target": physics.point(self.site) - physics.tip_pos(),
+      "front": self.front(physics) - physics.tip_pos(),
+      "freed": np.array([self.freed]),
+      "traction": np.array([self.traction]),
+      "grasped": np.array([float(self.grasped)]),
+    }
+
+  def reference_length(self) -> float:
+    """Returns the way to the site and off the bed [m]."""
+    return self.distance0 + 0.03
+
+  def expert(self, p: Performer) -> Script:
+    """Grasps and pulls away from the bed, and grasps again what slipped."""
+    physics, up = p.physics, p.physics.trocar().mat[:, 2]
+    for again in itertools.count():
+      if self.outcome is not None:
+        return
+      yield from p.close(self.site, again)
+      yield from p.wait(p.style.delay)
+      away = physics.point(self.site) - self.front(physics)
+      along = away / np.linalg.norm(away) + _UP * up
+      along /= np.linalg.norm(along)
+      start, far, contact = p.tip.copy(), 0.0, 0.0
+      most = _FAR * (1 + 0.3 * p.style.overshoot)
+      while self.grasped and self.outcome is None:
+        contact += self.control_timestep
+        if self.traction < 0.8 * self.limit:
+          far = min(far + _SPEED * p.style.speed * self.control_timestep, most)
+        p.tip = start + far * along
+        p.grip(contact)
+        yield p.step()
+      yield from p.open()
+      yield from p.move(p.tip + 0.02 * up)

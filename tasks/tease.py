@@ -1,0 +1,167 @@
+"""Tease: free a strip of tissue from what it has grown on to, by blunt strokes under it.
+
+Own observations: `target` (3,), from the tip to the front of what still holds, in the middle of its
+width [m]; `freed` (1,), share of the strip's area that is free [-]; `traction` (1,), pull on what
+is under it [N].
+
+What comes free while the force is under its limit is `clean`; the rest is `torn`. Progress: 0.1 *
+closeness to the first front, at its best, + 0.8 * clean / wanted. Success: the wanted share is
+clean. Failure: a force above the damage limit, so much torn that too little is left, or the time
+limit.
+"""
+
+import dataclasses
+import itertools
+
+import mujoco
+import numpy as np
+from dm_control.utils import containers
+
+from . import adhesion, base
+from .base import Physics
+from .freeing import Freeing
+from .performer import Performer, Script
+from .scenes import Scene
+
+SUITE = containers.TaggedTasks()
+# Stiffness [N/m^3], strength [Pa] and energy [J/m^2]: ours, we know of no measurement.
+FILMY, DENSE = (1e7, 6e3, 6.0), (1e7, 8e3, 12.0)
+SCENE = Scene(
+  organ="adhesion",
+  nodes=250,
+  port=(0.0, -0.13, 0.065),
+  camera=(-0.07, -0.06, 0.06),
+  surroundings="none",
+)
+# Of the expert: where the tip is over the bed and behind the front before a stroke, how far a
+# stroke goes beyond the front [m], how fast it is [m/s], and how wide a lane is [m].
+_OVER, _BEHIND, _BEYOND, _SPEED, _LANE = 0.0015, 0.006, 0.006, 0.03, 0.006
+
+
+@SUITE.add("benchmarking", "easy")
+def easy(time_limit=40, random=None, environment_kwargs=None, **kwargs):
+  """Returns the task to free 40 % of a filmy adhesion."""
+  task = Tease(SCENE, random, name="tease/easy", **{"wanted": 0.4, "law": FILMY, **kwargs})
+  return base.make(task, time_limit, environment_kwargs)
+
+
+@SUITE.add("benchmarking")
+def standard(time_limit=60, random=None, environment_kwargs=None, **kwargs):
+  """Returns the task to free 60 % of it."""
+  kwargs = {"wanted": 0.6, "law": FILMY, "jitter": 0.003, **kwargs}
+  return base.make(Tease(SCENE, random, name="tease/standard", **kwargs), time_limit,
+                   environment_kwargs)  # fmt: skip
+
+
+@SUITE.add("benchmarking", "hard")
+def hard(time_limit=80, random=None, environment_kwargs=None, **kwargs):
+  """Returns the task to free 70 % of a dense one with less force."""
+  kwargs = {"wanted": 0.7, "law": DENSE, "jitter": 0.005, "force_limit": 1.2, **kwargs}
+  return base.make(Tease(SCENE, random, name="tease/hard", **kwargs), time_limit,
+                   environment_kwargs)  # fmt: skip
+
+
+class Tease(Freeing):
+  """Free a strip by blunt strokes."""
+
+  watch = ("unintended_contact",)
+
+  def __init__(
+    self,
+    scene: Scene,
+    random=None,
+    *,
+    name: str,
+    wanted: float,
+    law: tuple[float, float, float],
+    traction: float = 2.0,
+    **kwargs,
+  ):
+    """Makes the task.
+
+    Args:
+      scene: what it plays in
+      random: see Task
+      name: domain and task
+      wanted: share of the strip that must come free cleanly [-]
+      law: stiffness [N/m^3], strength [Pa] and energy [J/m^2] of what holds it
+      traction: limit of the pull on what is under it [N]
+      **kwargs: see Task
+    """
+    self.name, self.wanted, self.limit = name, wanted, traction
+    super().__init__(dataclasses.replace(scene, bonds=law), random, **kwargs)
+
+  def spec(self, variant: int | None) -> mujoco.MjSpec:
+    """Returns the scene, which has no other shapes."""
+    return adhesion.build(self._scene(variant))
+
+  def place_of_work(self, physics: Physics) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the triangles, and where the strip begins to hold [m]."""
+    return np.arange(len(physics.organ.elem)), self.front(physics)
+
+  def begin(self, physics: Physics) -> None:
+    """Marks the front."""
+    self.whole(physics)
+    self._goal = self.front(physics)
+    self.distance0 = self.distance(physics)
+    self.nearest = 0.0
+    physics.mark(0, self._goal, now=True)
+
+  def front(self, physics: Physics) -> np.ndarray:
+    """Returns the middle of the first row of bonds that hold [m]  (3,)."""
+    bonds = physics.organ.bonds
+    holds = ~bonds.free
+    where = bonds.positions[holds if holds.any() else slice(None)]
+    row = where[where[:, 1] < where[:, 1].min() + 0.5 * _LANE]
+    return np.array([0.0, row[:, 1].min(), row[:, 2].mean()])
+
+  def distance(self, physics: Physics) -> float:
+    """Returns how far the tip is from the front [m]."""
+    return float(np.linalg.norm(self._goal - physics.tip_pos()))
+
+  def advance(self, physics: Physics) -> float:
+    """Follows what comes free."""
+    self.count(physics)
+    self._goal = self.front(physics)
+    physics.mark(0, self._goal, now=True)
+    near = base.closeness(self.distance(physics), self.distance0)
+    self.nearest = max(self.nearest, near)
+    return self.earned(self.nearest)
+
+  def instruct(self, physics: Physics) -> str:
+    """Says to stroke."""
+    share = f"{100 * self.clean:.0f} of {100 * self.wanted:.0f} % are free"
+    return f"Go under the flap and push gently along, side by side: {share}"
+
+  def observe(self, physics: Physics) -> dict[str, np.ndarray]:
+    """Returns target, freed and traction."""
+    return {
+      "target": self._goal - physics.tip_pos(),
+      "freed": np.array([self.freed]),
+      "traction": np.array([self.traction]),
+    }
+
+  def reference_length(self) -> float:
+    """Returns the way to the strip and there and back along its lanes [m]."""
+    return self.distance0 + 2 * self.wanted * adhesion.LENGTH * adhesion.WIDTH / _LANE
+
+  def expert(self, p: Performer) -> Script:
+    """Strokes under the strip, lane by lane, a little beyond where it holds."""
+    physics, sides = p.physics, (0.0, -_LANE, _LANE)
+    along, far = np.array([0.0, 1.0, 0.0]), _BEHIND + _BEYOND * (1 + p.style.overshoot)
+    for turn in itertools.count():
+      if self.outcome is not None:
+        return
+      x = sides[turn % len(sides)]
+      bonds = physics.organ.bonds
+      where = bonds.positions[~bonds.free]
+      lane = where[np.abs(where[:, 0] - x) < 0.75 * _LANE]
+      if not len(lane):
+        continue
+      front = lane[:, 1].min()
+      start = np.array([x, front - _BEHIND, _OVER])
+      if not turn:
+        yield from p.move(start - 0.025 * along)
+      yield from p.move(start)
+      yield from p.move(start + far * along, speed=_SPEED)
+      yield from p.move(start, speed=0.04)
