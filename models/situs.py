@@ -9,6 +9,7 @@ scenes, the liver's frame turned so that anterior is up and superior is -y.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Mapping, Sequence
 
 import mujoco
@@ -27,13 +28,13 @@ _LEVELS = {"liver": 1, "gallbladder": 0, "stomach": 1}  # of the smooth surfaces
 COLOURS = {
   "liver": (0.62, 0.22, 0.17, 1.0),
   "gallbladder": (0.60, 0.65, 0.46, 1.0),
-  "stomach": (0.95, 0.66, 0.58, 1.0),
+  "stomach": (0.86, 0.60, 0.53, 1.0),
   "kidney": (0.62, 0.27, 0.23, 1.0),
   "fat": (1.0, 0.84, 0.46, 1.0),
   "wall": (0.92, 0.56, 0.47, 1.0),
 }
 # Specular share of wet surfaces; by eye. Much of it turns yellow and pink ones green.
-_SHEEN = {"fat": 0.2, "wall": 0.15, "stomach": 0.35}
+_SHEEN = {"fat": 0.2, "wall": 0.15, "stomach": 0.3, "gallbladder": 0.4}
 # What the fixed renderer's light loses on its way, 1 at 15 cm: 0.55 + 0.45 (d / 15 cm)^2.
 _FADE = (0.55, 0.0, 0.45 / 0.15**2)
 _VIEW = ((0.0, 0.175, 0.135), (0.0, 0.03, 0.005))  # of `abdomen`'s camera: from, to [m]
@@ -210,22 +211,30 @@ def furnish(
     goes_with = "stomach" if name == "duodenum" else "gallbladder"
     lift = held.lifts.get(goes_with, (0, 0, 0))
     _draw(spec, name, surface, skin, np.array(lift) - origin)
-  fat = scenery.sheet(_fat, (-0.17, -0.06), (0.15, 0.27), (54, 56))
+  fat, wall = _bounds()
   skin = _material(spec, "fat", COLOURS["fat"], "fat", look, 2)
   _draw(spec, "fat", fat, skin, [0, 0, held.fat] - origin)
-  wall = scenery.shell((-0.01, 0.09, 0.035), (0.175, 0.21, 0.175), 2.4, (44, 30))
   _draw(spec, "wall", wall, _material(spec, "wall", COLOURS["wall"], "wall", look), -origin)
+
+
+@functools.cache
+def _bounds() -> tuple[Surface, Surface]:
+  """Returns the fat and the wall; ours."""
+  fat = scenery.sheet(_fat, (-0.17, -0.06), (0.15, 0.27), (54, 56))
+  return fat, scenery.shell((-0.01, 0.09, 0.035), (0.175, 0.21, 0.175), 2.4, (44, 30))
 
 
 def _fat(x: np.ndarray, y: np.ndarray) -> np.ndarray:
   """Returns the height of the omentum over the bowel [m]; ours, in lumps of 2 to 4 cm.
 
-  It rises to the liver around bile duct, artery and portal vein: the hepatoduodenal ligament.
+  It rises to the liver around bile duct, artery and portal vein, the hepatoduodenal ligament, and
+  is cleared off cystic duct and artery.
   """
   base = -0.022 - 0.5 * np.maximum(np.abs(x + 0.01) - 0.10, 0) - 0.08 * np.maximum(y - 0.12, 0)
   large, small = scenery.bumps(1, 0.085, 0.012), scenery.bumps(2, 0.036, 0.0035)
   rise = 0.024 * np.exp(-((x + 0.02) ** 2 + (y - 0.034) ** 2) / (2 * 0.013**2))
-  return base + rise + large(x, y) + small(x, y)
+  clear = 0.02 * np.exp(-((x + 0.002) ** 2 + (y - 0.058) ** 2) / (2 * 0.012**2))
+  return base + rise - clear + large(x, y) + small(x, y)
 
 
 def light(spec: mujoco.MjSpec, pos, target) -> None:
@@ -245,8 +254,8 @@ def light(spec: mujoco.MjSpec, pos, target) -> None:
     exponent=2,
     attenuation=_FADE,
     ambient=[0.05, 0.045, 0.045],
-    diffuse=[0.98, 0.94, 0.89],
-    specular=[0.8, 0.8, 0.8],
+    diffuse=[0.92, 0.89, 0.85],
+    specular=[0.7, 0.7, 0.7],
     castshadow=False,
   )
 
@@ -256,7 +265,9 @@ def _material(spec, name: str, rgba, kind: str | None, look: int, repeat: float 
   name = f"abdomen_{name}"
   if spec.material(name) is not None:
     return name
-  made = spec.add_material(name=name, rgba=rgba, specular=_SHEEN.get(kind, 0.5), shininess=0.75)
+  made = spec.add_material(
+    name=name, rgba=rgba, specular=_SHEEN.get(kind or "", 0.5), shininess=0.75
+  )
   made.texrepeat = [repeat, repeat]
   if kind is not None:
     paper = f"abdomen_{kind}"
@@ -277,23 +288,17 @@ def _material(spec, name: str, rgba, kind: str | None, look: int, repeat: float 
 
 
 def _draw(spec, name: str, surface: Surface, material: str, pos) -> None:
-  """Adds a surface to the world that meets nothing."""
-  spec.add_mesh(
+  """Adds a surface to the world: a skin, which no contact, ray or state knows of."""
+  count = len(surface.vertices)
+  skin = spec.add_skin(
     name=f"abdomen_{name}",
-    uservert=surface.vertices.ravel(),
-    userface=surface.triangles.ravel(),
-    usertexcoord=surface.texcoord.ravel(),
-    smoothnormal=True,
-    inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
-  )
-  spec.worldbody.add_geom(
-    name=f"abdomen_{name}",
-    type=mujoco.mjtGeom.mjGEOM_MESH,
-    meshname=f"abdomen_{name}",
+    vert=(surface.vertices + pos).ravel(),
+    face=surface.triangles.ravel(),
+    texcoord=surface.texcoord.ravel(),
     material=material,
-    pos=pos,
+    bodyname=["world"],
+    bindpos=[0.0, 0.0, 0.0],
+    bindquat=[1.0, 0.0, 0.0, 0.0],
     group=GROUP,
-    contype=0,
-    conaffinity=0,
-    mass=0.0,
   )
+  skin.vertid, skin.vertweight = [np.arange(count)], [np.ones(count)]

@@ -182,7 +182,7 @@ def _tree(is_round: bool, leaves: int, way: float, random) -> tuple[np.ndarray, 
   away, near = KDTree(net).query(net, k=9)
   cost = away[:, 1:] * random.uniform(0.5, 1.5, (len(net), 8))
   row = np.repeat(np.arange(len(net)), 8)
-  graph = csr_array((cost.ravel(), (row, near[:, 1:].ravel())), shape=(len(net),) * 2)
+  graph = csr_array((cost.ravel(), (row, np.asarray(near)[:, 1:].ravel())), shape=(len(net),) * 2)
   far, before = dijkstra(graph, directed=False, indices=root, return_predecessors=True)
   reached = np.flatnonzero(np.isfinite(far) & (far < np.quantile(far[np.isfinite(far)], _REACH)))
   flow, main = np.zeros(len(net)), np.full(len(net), -1)

@@ -50,14 +50,15 @@ def add_skin(
   if have:
     raise ValueError(f"organ {organ!r} has skin {have!r} already, expected none")
   smooth = _smooth(organ, np.reshape(flex.elem, (-1, 3)), levels)
-  count = smooth.weight.shape[0]
+  count = smooth.count
   rest, parent = _rest(flex, bodies)
   rest = rest[: smooth.weight.shape[1]]  # without vertices that wait for cuts
   points = smooth(rest)
   above = np.broadcast_to(np.asarray(height, float), (count,))
   points = points + above[:, None] * vertex_normals(points, smooth.elem)
-  # A colour of its own would count, not the material's.
-  look = {"material": material} if material else {"rgba": flex.rgba, "material": flex.material}
+  look: dict = {"material": material or flex.material}
+  if not material:  # a colour of its own would count, not the material's
+    look["rgba"] = flex.rgba
   if texcoord is not None:
     look["texcoord"] = _fine(organ, texcoord, smooth, len(rest), count).ravel()
   skin = spec.add_skin(

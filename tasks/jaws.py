@@ -5,19 +5,25 @@
 import mujoco as mj
 import numpy as np
 
-_FACING = 0.5  # least cosine between a contact's normal and that of the inner face
+FACING = 0.5  # least cosine between a contact's normal and that of the inner face
 
 
 class Jaws:
-  """The two jaws of a grasper: bodies whose x is across them, the left one on the side of +x."""
+  """The two jaws of a grasper: bodies whose x is across them, the left one on the side of +x.
+
+  Attributes:
+    names: of the bodies, left and right
+    side: of each geom, +1 on the left jaw, -1 on the right, 0 elsewhere and in the last place, that
+      of no geom, -1
+  """
 
   def __init__(self, model: mj.MjModel, prefix: str):
     """Finds the jaws `jaw_left` and `jaw_right` of an instrument, say "grasper/"."""
-    self._bodies = [model.body(f"{prefix}jaw_{side}").id for side in ("left", "right")]
-    # By geom, -1 (none) is the last: +1 on the left jaw, -1 on the right, 0 elsewhere.
-    self._side = np.zeros(model.ngeom + 1)
+    self.names = [f"{prefix}jaw_{side}" for side in ("left", "right")]
+    self._bodies = [model.body(name).id for name in self.names]
+    self.side = np.zeros(model.ngeom + 1)
     for body, side in zip(self._bodies, (1.0, -1.0), strict=True):
-      self._side[:-1][model.geom_bodyid == body] = side
+      self.side[:-1][model.geom_bodyid == body] = side
 
   def inner_force(self, model: mj.MjModel, data: mj.MjData) -> np.ndarray:
     """Returns the normal force of the inner faces on what is between them, left and right [N] (2,).
@@ -26,7 +32,7 @@ class Jaws:
     away from the other counts: a side that leans on tissue, or tips pressed into it, do not.
     """
     contact = data.contact
-    geom = self._side[contact.geom]
+    geom = self.side[contact.geom]
     mine = np.flatnonzero(geom.any(axis=1) & (contact.efc_address >= 0))
     if not len(mine):
       return np.zeros(2)
@@ -39,5 +45,5 @@ class Jaws:
     elliptic = model.opt.cone == mj.mjtCone.mjCONE_ELLIPTIC
     count = np.where(elliptic | (dim == 1), 1, 2 * (dim - 1))
     total = np.concatenate([[0.0], data.efc_force.cumsum()])
-    force = (total[start + count] - total[start]) * along * (along > _FACING)
+    force = (total[start + count] - total[start]) * along * (along > FACING)
     return np.array([force[side > 0].sum(), force[side < 0].sum()])

@@ -94,9 +94,9 @@ def make(env: control.Environment, who: str | Style = EXPERT, seed: int = 0) -> 
 
   Args:
     env: of one of the suite's tasks
-    who: a `Style`, a name of `STYLES`, `skilled`, a file of a trained policy, or "module:object": a
-      class is made with (env, seed) and its object called with each time step; anything else is
-      called with the observation
+    who: a `Style`, a name of `STYLES`, `skilled`, `trained` for the policy that comes with the
+      exercise, a file of another, or "module:object": a class is made with (env, seed) and its
+      object called with each time step; anything else is called with the observation
     seed: of what is random in a scripted performer
   """
   if isinstance(who, Style):
@@ -104,6 +104,8 @@ def make(env: control.Environment, who: str | Style = EXPERT, seed: int = 0) -> 
   found = find(who)
   if found is skilled:
     found = skilled(seed)
+  if found is trained:
+    found = trained(env)
   if isinstance(found, Style):
     return Performer(env, found, seed)
   if isinstance(found, policy.Policy):
@@ -122,6 +124,11 @@ def skilled(seed: int) -> Style:
   return Style(**{name: float(random.uniform(*span)) for name, span in SKILLED.items()})
 
 
+def trained(env: control.Environment) -> policy.Policy:
+  """Returns the policy that comes with an exercise."""
+  return policy.shipped(env.task.name)
+
+
 def find(who: str, *others: str) -> Any:
   """Returns the style or the object that a name stands for; ValueError says what is wrong with it.
 
@@ -129,13 +136,14 @@ def find(who: str, *others: str) -> Any:
     who: see `make`
     *others: names that the caller takes as well, for the message
   """
-  if who == skilled.__name__:
-    return skilled
+  for found in (skilled, trained):
+    if who == found.__name__:
+      return found
   if who.endswith(policy.SUFFIX):
     return policy.load(who)
   if ":" not in who:
     if who not in STYLES:
-      names = ", ".join((*STYLES, skilled.__name__, *others))
+      names = ", ".join((*STYLES, skilled.__name__, trained.__name__, *others))
       raise ValueError(
         f"performer is {who!r}, expected one of {names}, a file of a "
         f"trained policy (*{policy.SUFFIX}) or module:object"

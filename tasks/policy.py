@@ -12,6 +12,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import pathlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -20,6 +21,7 @@ import numpy as np
 from .files import replacing
 
 SUFFIX = ".safetensors"
+FOLDER = pathlib.Path(__file__).parent / "policies"  # of those that come with exercises
 _KEY = "palpate"  # of the header
 _FORMAT = 1
 
@@ -129,6 +131,15 @@ def load(path: str | os.PathLike[str]) -> Policy:
   except (ValueError, KeyError, TypeError, AttributeError) as error:
     raise ValueError(f"policy {os.fspath(path)!r}: {error}") from None
   return made
+
+
+def shipped(task: str) -> Policy:
+  """Returns the policy that comes with an exercise; ValueError names those there are."""
+  path = FOLDER / f"{task.replace('/', '_')}{SUFFIX}"
+  if not path.exists():
+    have = ", ".join(sorted(found.stem.replace("_", "/", 1) for found in FOLDER.glob(f"*{SUFFIX}")))
+    raise ValueError(f"no trained policy comes with {task}, expected one of {have or 'none'}")
+  return load(path)
 
 
 def _check_shapes(policy: Policy) -> None:

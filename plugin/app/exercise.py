@@ -130,7 +130,7 @@ def _list() -> int:
 
   for domain, task in suite.ALL_TASKS:
     print(f"{f'{domain}/{task}':24} {suite.summary(domain, task)}")
-  print(f"performers: {', '.join(performer.STYLES)}, skilled, keyboard, module:object")
+  print(f"performers: {', '.join(performer.STYLES)}, skilled, trained, keyboard, module:object")
   return 0
 
 

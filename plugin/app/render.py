@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterator
 
 import numpy as np
-from palpate import register
+from palpate import register, screen
 
 from . import film
 from .console import CommandError, Interrupt, Progress, output
@@ -21,6 +21,7 @@ _INK = np.array([0.12, 0.05, 0.05, 1.0], np.float32)  # of edges
 
 def add_arguments(parser: argparse.ArgumentParser):
   """Declares the options."""
+  screen.prepare_gl()  # before MuJoCo is imported
   from . import scenes
 
   scenes.add_arguments(parser)
@@ -138,7 +139,10 @@ def _draw_edges(model, data, scene, option):
   for flex in range(model.nflex):
     first, count = model.flex_vertadr[flex], model.flex_vertnum[flex]
     adr, nelem = model.flex_elemdataadr[flex], model.flex_elemnum[flex]
-    if model.flex_dim[flex] != 2 or not option.flexgroup[model.flex_group[flex]]:
+    skin = f"{mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_FLEX, flex)}_skin"
+    covered = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SKIN, skin) >= 0
+    shown = covered or option.flexgroup[model.flex_group[flex]]
+    if model.flex_dim[flex] != 2 or not shown:
       continue
     pos = data.flexvert_xpos[first : first + count]
     elem = model.flex_elem[adr : adr + 3 * nelem].reshape(nelem, 3)

@@ -18,7 +18,8 @@ def add_arguments(parser: argparse.ArgumentParser):
   parser.add_argument(
     "scene",
     metavar="SCENE",
-    help=f"{', '.join(models.NAMES)}, abdomen or press; an MJCF file; a folder with a scene.xml",
+    help=f"{', '.join(models.NAMES)}, abdomen or press; an exercise such as touch/easy; an MJCF "
+    "file; a folder with a scene.xml",
   )
   parser.add_argument(
     "--nodes",
@@ -46,6 +47,8 @@ def load(args: argparse.Namespace, handle: bool) -> tuple[mujoco.MjModel, mujoco
 
   options = ("nodes", "seed", "instruments", "coupling")
   given = [option for option in options if getattr(args, option) is not None]
+  if not given and (found := _exercise(args.scene)):
+    return found
   try:
     if args.scene in models.NAMES:
       choices = {"nodes": args.nodes or models.RESOLUTIONS[1], "seed": args.seed, "handle": handle}
@@ -64,6 +67,18 @@ def load(args: argparse.Namespace, handle: bool) -> tuple[mujoco.MjModel, mujoco
   data = mujoco.MjData(model)
   reset(model, data, args.keyframe)
   return model, data
+
+
+def _exercise(name: str) -> tuple[mujoco.MjModel, mujoco.MjData] | None:
+  """Returns model and data at the start of an exercise of seed 0, None where it is none."""
+  from palpate import tasks
+
+  domain, _, task = name.partition("/")
+  if (domain, task) not in tasks.ALL_TASKS or pathlib.Path(name).exists():
+    return None
+  env = tasks.load(domain, task, task_kwargs={"random": 0})
+  env.reset()
+  return env.physics.model.ptr, env.physics.data.ptr
 
 
 def _abdomen(args: argparse.Namespace, handle: bool) -> mujoco.MjModel:

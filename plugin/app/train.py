@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 _FEW = 16  # worlds on a CPU
 _MANY = 4096  # on a GPU
 _SAVE = 60.0  # seconds between checkpoints
-_RECENT = 200  # episodes that tell how well it goes
 _JUDGE = 5  # iterations between looks at the policy without spread
 _LICENCE = """SPDX-License-Identifier: Apache-2.0
 
@@ -124,20 +123,8 @@ def _enough(args: argparse.Namespace, learner: Learner, rows: list, stop: Any) -
   if learner.iteration >= args.iterations or learner.seconds >= 60 * args.minutes:
     return True
   # With the spread of learning a policy may succeed that alone does not.
-  wins = _recent(rows) >= args.success and learner.iteration % _JUDGE == 0
-  return wins and learner.judge(stop) >= args.success
-
-
-def _recent(rows: list[dict[str, float]]) -> float:
-  """Returns the share of successes of the last episodes; NaN while there are too few."""
-  episodes = wins = 0.0
-  for row in reversed(rows):
-    if row["episodes"]:
-      episodes += row["episodes"]
-      wins += row["episodes"] * row["success"]
-    if episodes >= _RECENT:
-      return wins / episodes
-  return math.nan
+  wins = rows and rows[-1]["success"] >= args.success and learner.iteration % _JUDGE == 0
+  return bool(wins) and learner.judge(stop) >= args.success
 
 
 def _line(row: dict[str, float]) -> str:

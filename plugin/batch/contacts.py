@@ -1,7 +1,8 @@
 """Contacts of an organ's window with tools, written where mujoco_warp makes constraints of them.
 
-Each slot has a place of its own for its contacts, so that which is where does not depend on who
-comes first, and worlds need nothing of each other.
+They are looked for twice: counted, then written one after the other, by worlds and slots. So no
+place is left empty, which mujoco_warp's kernels would run over, and which contact is where does not
+depend on who comes first.
 """
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
@@ -17,7 +18,7 @@ from mujoco_warp._src import collision_primitive_core as core
 from mujoco_warp._src.types import ContactType, vec5
 from palpate.tissue.types import Array, fill, floats, ints, struct
 
-from . import convex
+from . import convex, cylinder
 from .convex import Convex
 from .patch import Patch
 
@@ -38,6 +39,7 @@ _CYLINDER, _MESH = KINDS[5:]
 _FAR = wp.constant(1e10)  # what mujoco_warp says of a contact that is none
 _CONSTRAINT = wp.constant(int(ContactType.CONSTRAINT))
 _LEAST = 1e-5  # friction, as in MuJoCo
+_FEW = 4  # tools; more of them share triangles
 # Whose sliding friction counts: the greater, or that of the one with priority.
 _GREATER, _TOOL, _ORGAN = wp.constant(0), wp.constant(1), wp.constant(2)
 
@@ -46,7 +48,7 @@ _GREATER, _TOOL, _ORGAN = wp.constant(0), wp.constant(1), wp.constant(2)
 class Touch:
   """How an organ's triangles touch each tool, and mujoco_warp's contacts."""
 
-  room: int  # contacts of a slot
+  most: int  # contacts of a world
   flex: int  # the slots' flex
   radius: float  # of that [m]
   kind: ints("ntool")  # mjtGeom
@@ -59,9 +61,13 @@ class Touch:
   friction: Array(vec5, ("ntool",))  # all of it, the sliding one as compiled
   solref: Array(wp.vec2, ("ntool",))
   solimp: Array(vec5, ("ntool",))
+  many: ints("nworld", "nslot")  # contacts of a slot
+  count: ints("nworld")  # of a world
+  before: ints("nworld")  # of the worlds before it
+  missed: ints("nworld")  # see `Patch`
+  start: ints(1)  # the organ's first contact
   # mujoco_warp:
   nacon: ints(1)
-  start: ints(1)  # the organ's first contact
   out_dist: floats("naconmax")
   out_pos: Array(wp.vec3, ("naconmax",))
   out_frame: Array(wp.mat33, ("naconmax",))
@@ -85,8 +91,8 @@ class Place:
   """A triangle before a tool, and where its contacts go."""
 
   world: int
-  first: int  # contact, -1 where they are counted alone
-  room: int
+  first: int  # contact
+  room: int  # for how many, 0 where they are counted alone
   thread: int  # of all slots of all worlds
   elem: int  # -1 for a corner alone
   vert: int  # -1 for a triangle
@@ -146,7 +152,7 @@ def _put(c: Touch, at: Place, n: int, dist: float, pos: wp.vec3, normal: wp.vec3
   q = at.tool
   if not dist < c.margin[q]:
     return n
-  if at.first >= 0 and n < at.room:
+  if n < at.room:
     k = at.first + n
     c.out_dist[k] = dist
     c.out_pos[k] = pos
@@ -169,6 +175,7 @@ def _put(c: Touch, at: Place, n: int, dist: float, pos: wp.vec3, normal: wp.vec3
     c.out_flex[k] = wp.vec2i(-1, c.flex)
     c.out_elem[k] = wp.vec2i(-1, at.elem)
     c.out_vert[k] = wp.vec2i(-1, at.vert)
+    c.out_worldid[k] = at.world
     c.out_type[k] = _CONSTRAINT
     c.out_geomcollisionid[k] = n
   return n + 1
@@ -231,8 +238,13 @@ def _against(kinds: frozenset[int]):
         dists2, xs2, normals2 = core.box_triangle(pos, rot, size, a, b, d, c.radius, margin)
         for k in range(11):
           n = _put(c, at, n, dists2[k], xs2[k], normals2[k])
+    if wp.static(_CYLINDER in kinds):
+      if kind == wp.static(_CYLINDER):
+        far4, x4, normal4 = cylinder.touch(pos, rot, size, margin + c.radius, a, b, d)
+        gap4 = far4 - c.radius
+        n = _put(c, at, n, gap4, x4 - (c.radius + 0.5 * gap4) * normal4, normal4)
     if wp.static(solid):
-      if kind == wp.static(_CYLINDER) or kind == wp.static(_MESH):
+      if kind == wp.static(_MESH):
         before = convex.Before()
         before.tool = at.tool
         before.kind = kind
@@ -275,19 +287,26 @@ def _owner(p: Patch, world: int, e: int):
 
 @functools.cache
 def kernel(kinds: frozenset[int]) -> wp.Kernel:
-  """Returns the kernel that finds contacts with tools of these kinds, a thread a slot."""
+  """Returns the kernel that counts or writes contacts with tools of these kinds, by slots."""
   against = _against(kinds)
 
   @wp.kernel(module="unique", enable_backward=False)
-  def find(p: Patch, c: Touch, v: Convex):
+  def find(p: Patch, c: Touch, v: Convex, writes: bool):
     world, slot = wp.tid()
     at = Place()
     at.world = world
     at.thread = world * p.nslot + slot
-    at.room = c.room
-    first = c.nacon[0] + (world * p.nslot + slot) * c.room
-    n = int(0)  # noqa: RUF046, UP018 - a variable to Warp
+    at.room = 0
+    first = int(0)  # noqa: RUF046, UP018 - a variable to Warp
+    n = int(0)  # noqa: RUF046, UP018
     i = p.slot_node[world, slot]
+    if writes:
+      if c.many[world, slot] == 0:
+        return
+      for s in range(slot):
+        first += c.many[world, s]
+      at.room = c.most - first
+      first += c.nacon[0] + c.before[world]
     if i >= 0:
       for q in range(p.near_adr[i], p.near_adr[i + 1]):
         e = p.near[q]
@@ -298,8 +317,8 @@ def kernel(kinds: frozenset[int]) -> wp.Kernel:
         b = p.node_slot[world, vb]
         d = p.node_slot[world, vd]
         whole = a >= 0 and b >= 0 and d >= 0
-        if _owner(p, world, e) == i:
-          at.first = wp.where(whole, first, -1)
+        if _owner(p, world, e) == i and (whole or not writes):
+          at.first = first
           at.vert = -1
           at.elem = 0
           if whole:
@@ -308,10 +327,16 @@ def kernel(kinds: frozenset[int]) -> wp.Kernel:
           xa = _where(p, world, va)
           xb = _where(p, world, vb)
           xd = _where(p, world, vd)
+          centre = (xa + xb + xd) / 3.0
+          far = wp.max(wp.length_sq(xa - centre), wp.length_sq(xb - centre))
+          around = wp.sqrt(wp.max(far, wp.length_sq(xd - centre))) + c.radius
           for tool in range(p.ntool):
             at.tool = tool
             at.geom = p.tool_geom[tool]
-            more = against(p, c, v, at, more, xa, xb, xd)
+            pos = p.geom_xpos[world, at.geom]
+            rot = p.geom_xmat[world, at.geom]
+            if not convex.is_beyond(v, tool, pos, rot, centre, around + c.margin[tool]):
+              more = against(p, c, v, at, more, xa, xb, xd)
           if whole:
             n = more
           elif more > 0:
@@ -321,62 +346,67 @@ def kernel(kinds: frozenset[int]) -> wp.Kernel:
         at.elem = -1
         at.vert = slot
         n = _on_planes(p, c, at, n, _where(p, world, i))
-    if n > c.room:
-      wp.atomic_add(p.missed, world, n - c.room)
-    for k in range(c.room):
-      c.out_worldid[first + k] = world
-      if k >= n:
-        c.out_type[first + k] = 0
-        c.out_dim[first + k] = 1
-        c.out_geom[first + k] = wp.vec2i(-1, -1)
+    if not writes:
+      c.many[world, slot] = n
 
   return find
 
 
 @wp.kernel(enable_backward=False)
-def add(nacon: wp.array[int], start: wp.array[int], count: int):
+def count(c: Touch):
+  """Adds up the contacts of a world; those beyond its room are missed."""
+  world = wp.tid()
+  n = int(0)  # noqa: RUF046, UP018 - a variable to Warp
+  for slot in range(c.many.shape[1]):
+    n += c.many[world, slot]
+  c.count[world] = wp.min(n, c.most)
+  c.missed[world] = c.missed[world] + n - c.count[world]
+
+
+@wp.kernel(enable_backward=False)
+def add(c: Touch):
   """Adds an organ's to the number of contacts, after all have seen it."""
-  start[0] = nacon[0]
-  nacon[0] = nacon[0] + count
-
-
-def room_of(model: mujoco.MjModel, tools: np.ndarray) -> int:
-  """Returns how many contacts a slot has room for: those of four triangles."""
-  each = max((_EACH[int(kind)] for kind in model.geom_type[tools]), default=1)
-  return min(4 * each, 16)
+  last = c.count.shape[0] - 1
+  c.start[0] = c.nacon[0]
+  c.nacon[0] = c.nacon[0] + c.before[last] + c.count[last]
 
 
 def most_of(model: mujoco.MjModel, tools: np.ndarray, nslot: int) -> int:
   """Returns how many contacts a world has rows for: two a slot, a patch's triangles, or more."""
   each = max((_EACH[int(kind)] for kind in model.geom_type[tools]), default=1)
-  return nslot * min(2 * each, 4)
+  return nslot * (4 if each > _EACH[int(_GEOM.mjGEOM_CAPSULE)] else 3 if len(tools) > _FEW else 2)
 
 
-def make(model: mujoco.MjModel, organ, tools: np.ndarray, flex: int, nworld: int, data):
+def make(model: mujoco.MjModel, organ, tools: np.ndarray, place, missed: wp.array, data):
   """Returns how an organ touches its tools.
 
   Args:
     model: the compiled scene
     organ: the organ's declaration
     tools: geoms that its slots follow
-    flex: the slots' flex in the stripped model
-    nworld: number of worlds
+    place: where the stripped model has these
+    missed: see `Patch`
     data: mujoco_warp's
   """
+  nworld, nslot, flex = len(missed), place.nslot, place.flex
   own = int(organ.windows.flex[0]) if organ.windows else organ.flex
   rows = [_mix(model, int(g), own) for g in tools]
   mixed = {name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else ())}
   contact = {f"out_{name}": getattr(data.contact, name) for name in _written()}
   values = mixed | contact | dict(
-    room=room_of(model, tools),
+    most=most_of(model, tools, nslot),
     flex=flex,
     radius=float(model.flex_radius[own]),
     kind=model.geom_type[tools],
     size=model.geom_size[tools],
     rough=np.full(nworld, model.flex_friction[own, 0]),
     slide=np.tile(mixed["slide"], (nworld, 1)) if rows else np.zeros((nworld, 0)),
-    nacon=data.nacon,
+    many=np.zeros((nworld, nslot)),
+    count=np.zeros(nworld),
+    before=np.zeros(nworld),
+    missed=missed,
     start=np.zeros(1),
+    nacon=data.nacon,
   )  # fmt: skip
   return fill(Touch, data.nacon.device, values)
 

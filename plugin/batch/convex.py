@@ -1,4 +1,4 @@
-"""A triangle before a convex tool, a cylinder or a mesh, by mujoco_warp's GJK and EPA."""
+"""A triangle before a mesh, by mujoco_warp's GJK and EPA, and before the box about any tool."""
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
@@ -12,7 +12,7 @@ from mujoco_warp._src.collision_gjk import ccd
 from mujoco_warp._src.types import MJ_MAX_EPAFACES, MJ_MAX_EPAHORIZON, GeomType
 from palpate.tissue.types import Array, fill, floats, ints, struct
 
-KINDS = {int(mujoco.mjtGeom.mjGEOM_CYLINDER), int(mujoco.mjtGeom.mjGEOM_MESH)}
+KINDS = {int(mujoco.mjtGeom.mjGEOM_MESH)}
 _ROUNDS = wp.constant(16)  # of GJK and of EPA, at most
 _MESH, _TRIANGLE = wp.constant(int(GeomType.MESH)), wp.constant(int(GeomType.TRIANGLE))
 _TOLERANCE = wp.constant(1e-6)  # [m]
@@ -21,7 +21,7 @@ _APART = wp.constant(1e10)  # distance of what does not touch
 
 @struct
 class Convex:
-  """Convex tools, and what EPA needs of memory for each slot of each world."""
+  """Tools, and what EPA needs of memory for each slot of each world."""
 
   middle: Array(wp.vec3, ("ntool",))  # of a tool's box, in its frame [m]
   half: Array(wp.vec3, ("ntool",))  # half its sides [m]
@@ -41,10 +41,11 @@ class Convex:
 
 
 @wp.func
-def _beyond(box: wp.vec3, x: wp.vec3):
-  """Returns the distance of a point from a box about the origin."""
-  far = wp.max(wp.abs(x) - box, wp.vec3(0.0))
-  return wp.length(far)
+def is_beyond(k: Convex, tool: int, pos: wp.vec3, rot: wp.mat33, centre: wp.vec3, around: float):
+  """Returns whether a ball is beyond the box about a tool."""
+  near = wp.transpose(rot) * (centre - pos) - k.middle[tool]
+  far = wp.max(wp.abs(near) - k.half[tool], wp.vec3(0.0))
+  return wp.length_sq(far) >= around * around
 
 
 @wp.func
@@ -93,34 +94,31 @@ class Before:
 
 @wp.func
 def touch(k: Convex, t: Before, a: wp.vec3, b: wp.vec3, d: wp.vec3):
-  """Returns distance, middle and normal between a convex tool and a triangle without skin."""
+  """Returns distance, middle and normal between a mesh and a triangle without skin."""
   # About the tool, where float32 has the most digits.
   ta = a - t.pos
   tb = b - t.pos
   td = d - t.pos
   centre = (ta + tb + td) / 3.0
-  around = wp.max(wp.length(ta - centre), wp.max(wp.length(tb - centre), wp.length(td - centre)))
-  near = wp.transpose(t.rot) * centre - k.middle[t.tool]
   dist = float(_APART)  # a variable to Warp
   middle = wp.vec3(0.0)
   normal = wp.normalize(wp.cross(tb - ta, td - ta))
   if wp.dot(normal, centre) < 0.0:
     normal = -normal
-  if _beyond(k.half[t.tool], near) < around + t.reach:
-    i = t.thread
-    found, n, x, y, _index = ccd(
-      _TOLERANCE, t.reach, _ROUNDS, _ROUNDS, _tool(k, t.tool, t.kind, t.size, t.rot),
-      _triangle(ta, tb, td), t.kind, _TRIANGLE, wp.vec3(0.0), centre, k.point[i], k.index[i],
-      k.face[i], k.onto[i], k.norm2[i], k.horizon[i], False, t.world, k.lost,
-    )  # fmt: skip
-    if n > 0 and found < t.reach:
-      dist = found
-      middle = t.pos + 0.5 * (x + y)
-      apart = y - x
-      if found < 0.0:
-        apart = x - y
-      if wp.length(apart) > _TOLERANCE:
-        normal = wp.normalize(apart)
+  i = t.thread
+  found, n, x, y, _index = ccd(
+    _TOLERANCE, t.reach, _ROUNDS, _ROUNDS, _tool(k, t.tool, t.kind, t.size, t.rot),
+    _triangle(ta, tb, td), t.kind, _TRIANGLE, wp.vec3(0.0), centre, k.point[i], k.index[i],
+    k.face[i], k.onto[i], k.norm2[i], k.horizon[i], False, t.world, k.lost,
+  )  # fmt: skip
+  if n > 0 and found < t.reach:
+    dist = found
+    middle = t.pos + 0.5 * (x + y)
+    apart = y - x
+    if found < 0.0:
+      apart = x - y
+    if wp.length(apart) > _TOLERANCE:
+      normal = wp.normalize(apart)
   return dist, middle, normal
 
 

@@ -81,6 +81,7 @@ class Organ(Tissue):
       nq=m.nq,
       nv=m.nv,
       nbody=m.nbody,
+      ngeom=m.ngeom,
       dofadr=place.dofadr,
       qposadr=place.qposadr,
       bodyid=place.body,
@@ -98,11 +99,11 @@ class Organ(Tissue):
         "geom_xpos", "geom_xmat", "qpos", "qvel", "qfrc_passive", "qfrc_constraint")},
     )  # fmt: skip
     self.patch = patch.make(values, self.body)
-    self._touch = contacts.make(model, organ, tools, place.flex, nworld, d)
-    self._pressed = sliding.make(batch, self._touch, place.nslot)
+    self._touch = contacts.make(model, organ, tools, place, self.patch.missed, d)
+    self._pressed = sliding.make(batch, self._touch)
     self._convex = convex.make(model, tools, nworld * place.nslot, m, d)
     kinds = frozenset(int(kind) for kind in model.geom_type[tools])
-    self._find, self._region = contacts.kernel(kinds), int(nworld * place.nslot * self._touch.room)
+    self._find = contacts.kernel(kinds)
     self._material = Material(self, batch, self._touch)
 
   def enclose(self):
@@ -148,10 +149,12 @@ class Organ(Tissue):
   def touch(self):
     """Writes the window's contacts."""
     dim, device = (self._batch.nworld, self.place.nslot), self.body.device
-    inputs = [self.patch, self._touch, self._convex]
-    wp.launch(self._find, dim=dim, inputs=inputs, device=device, block_dim=64)
-    inputs = [self._touch.nacon, self._touch.start, self._region]
-    wp.launch(contacts.add, dim=1, inputs=inputs, device=device)
+    inputs, touch = [self.patch, self._touch, self._convex], self._touch
+    wp.launch(self._find, dim=dim, inputs=[*inputs, False], device=device, block_dim=64)
+    wp.launch(contacts.count, dim=dim[0], inputs=[touch], device=device)
+    wp.utils.array_scan(touch.count, touch.before, inclusive=False)
+    wp.launch(self._find, dim=dim, inputs=[*inputs, True], device=device, block_dim=64)
+    wp.launch(contacts.add, dim=1, inputs=[touch], device=device)
 
   def push(self):
     """Adds the passive force, and keeps sliding contacts closed."""

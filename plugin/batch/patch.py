@@ -143,7 +143,6 @@ def constants(body, organ, tools: np.ndarray, model: mujoco.MjModel, inertia, he
     nnode=nnode,
     nslice=body.shape.nslice,
     ntool=len(tools),
-    ngeom=model.ngeom,
     ngrade=len(GRADES),
     h=model.opt.timestep,
     rest_share=step.REST,

@@ -20,6 +20,8 @@ class Pressed:
   many: int  # contacts of a world
   paired: int  # whether the cone is a pyramid
   start: ints(1)  # the organ's first contact
+  before: ints("nworld")  # its contacts in the worlds before
+  count: ints("nworld")  # its contacts
   dim: ints("naconmax")  # rows of a contact, or pairs of them and one
   contact_geom: Array(wp.vec2i, ("naconmax",))
   frame: Array(wp.mat33, ("naconmax",))
@@ -53,7 +55,9 @@ def _has_rows(p: Pressed, c: int):
 def keep_closed(p: Pressed):
   """Takes the parting of sliding contacts off their reference accelerations."""
   world, k = wp.tid()
-  c = p.start[0] + world * p.many + k
+  if k >= p.count[world]:
+    return
+  c = p.start[0] + p.before[world] + k
   n = p.dim[c]
   if n < 2 or not _has_rows(p, c):
     return
@@ -75,10 +79,10 @@ def keep_closed(p: Pressed):
 def press(p: Pressed):
   """Writes the geoms, normals and normal forces of contacts."""
   world, k = wp.tid()
-  c = p.start[0] + world * p.many + k
+  c = p.start[0] + p.before[world] + k
   p.geom[world, k] = -1
   p.force[world, k] = 0.0
-  if not _has_rows(p, c):
+  if k >= p.count[world] or not _has_rows(p, c):
     return
   total = float(0.0)  # noqa: UP018 - a variable to Warp
   for r in range(wp.where(p.paired == 1, _rows(p, c), 1)):
@@ -88,16 +92,16 @@ def press(p: Pressed):
   p.force[world, k] = total
 
 
-def make(batch, touch, nslot: int):
-  """Returns the contacts of an organ's slots.
+def make(batch, touch):
+  """Returns the contacts of an organ.
 
   Args:
     batch: the worlds, with mujoco_warp's data
     touch: how the organ touches its tools
-    nslot: its slots
   """
   out, d = Pressed(), batch.d
-  out.many, out.paired, out.start = nslot * touch.room, int(batch.paired), touch.start
+  out.many, out.paired = touch.most, int(batch.paired)
+  out.start, out.before, out.count = touch.start, touch.before, touch.count
   for name in ("dim", "frame", "friction", "efc_address"):
     setattr(out, name, getattr(d.contact, name))
   out.contact_geom, out.aref, out.row_force = d.contact.geom, d.efc.aref, d.efc.force

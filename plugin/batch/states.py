@@ -150,8 +150,10 @@ def push(batch, world: int, data: mujoco.MjData):
   _assign(d.qacc_warmstart, world, np.zeros(d.qacc_warmstart.shape[1]))
   _assign(d.mocap_quat, world, data.mocap_quat)
   _assign(d.eq_active, world, data.eq_active.astype(bool))
-  _assign(d.geom_xpos, world, scratch.geom_xpos)
-  _assign(d.geom_xmat, world, scratch.geom_xmat.reshape(-1, 3, 3))
+  for array, values in ((d.geom_xpos, scratch.geom_xpos), (d.geom_xmat, scratch.geom_xmat)):
+    row = array[world].numpy()
+    row[: model.ngeom] = values.reshape(model.ngeom, *row.shape[1:])
+    _assign(array, world, row)
   d.time[world : world + 1].assign(np.array([data.time], np.float32))
   for organ in batch.organs.values():
     _push_organ(organ, world, model, data)

@@ -121,6 +121,8 @@ def strip(
   masses = [_slot_mass(organ) for organ in organs]
   for organ, nslot, mass in zip(organs, nslots, masses, strict=True):
     _add_slots(bare, organ, nslot, mass, model)
+  if any(sensor.type == mujoco.mjtSensor.mjSENS_TOUCH for sensor in bare.sensors):
+    _add_last(bare, f"{organs[-1].name}_slot_{nslots[-1] - 1}")
   bare.option.jacobian = mujoco.mjtJacobian.mjJAC_AUTO
   _check_option(bare.option)
   made = bare.compile()
@@ -200,6 +202,14 @@ def _add_slots(bare, organ, nslot: int, mass: float, model):
   made.condim = int(model.flex_condim[flex])
 
 
+def _add_last(bare, body: str):
+  """Adds a geom that touches nothing, after all others.
+
+  mujoco_warp's touch sensors take the other side of a flex's contact, geom -1, for the last geom.
+  """
+  bare.body(body).add_geom(size=[1e-6, 0, 0], mass=0.0, contype=0, conaffinity=0)
+
+
 def _check(model, made, organs: list, nslots: list[int]):
   """Raises ValueError where something of the scene hung on what was taken out."""
   for name in _COUNTED:
@@ -210,7 +220,8 @@ def _check(model, made, organs: list, nslots: list[int]):
         "equality, tendon or pair refers to them, which a batch on a GPU cannot do"
       )
   gone = sum(organ.nfree if organ.windows is None else 3 * organ.windows.nslot for organ in organs)
-  if model.nv - gone != made.nv - 3 * sum(nslots) or model.ngeom != made.ngeom:
+  more = made.ngeom - model.ngeom
+  if model.nv - gone != made.nv - 3 * sum(nslots) or more not in (0, 1):
     raise ValueError("the scene has other flexes or plugins, which a batch on a GPU cannot do")
 
 

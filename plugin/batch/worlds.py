@@ -8,6 +8,7 @@ along (`native/formula.h`), and the nodes take over what contacts made of the sl
 from __future__ import annotations
 
 import warnings
+from typing import Any
 
 import mujoco
 import mujoco_warp as mjw
@@ -24,6 +25,7 @@ from .organs import Organ
 from .rest import Rest
 
 _CONTACTS = 16  # of a world, of tools with each other and with what is fixed
+_ITERATIONS = 8  # of the constraint solver, at most
 _LOST = int(OverflowType.NEFC | OverflowType.NJMAX_NNZ | OverflowType.NARROWPHASE)
 
 
@@ -91,12 +93,11 @@ class Worlds(Batch):
     model, nworld = self.model, self.nworld
     self.paired = model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
     most = [contacts.most_of(model, t, n) for t, n in zip(tools, nslots, strict=True)]
-    regions = [contacts.room_of(model, t) * n for t, n in zip(tools, nslots, strict=True)]
     condim = int(max([1, *model.flex_condim, *model.geom_condim]))
     each = 1 if condim == 1 else 2 * (condim - 1) if self.paired else condim
     between = _CONTACTS if strip.tools_meet(bare) else 0
     self.njmax = strip.rows_of(bare) + (between + sum(most)) * each
-    ncon = between + sum(regions)
+    ncon = between + sum(most)
     size = states.bytes_of(bare, self.njmax, ncon) + sum(
       Organ.bytes_of(w, self.device) for w in spaces.values()
     )
@@ -116,6 +117,8 @@ class Worlds(Batch):
       bare, start, nworld=nworld, nconmax=ncon, njmax=self.njmax, njmax_nnz=nonzero
     )
     self.m.opt.warn_overflow = 0  # counted, see `overflow`
+    # All worlds wait for the one that takes longest.
+    self.m.opt.iterations = min(self.m.opt.iterations, _ITERATIONS)
     self.m.opt.deterministic = int(DeterminismType.ALL if deterministic else DeterminismType.NONE)
     # The windows' triangles have no forces and contacts of mujoco_warp's own.
     self.m.nflexelem = self.m.nflexedge = 0
@@ -176,9 +179,9 @@ class Worlds(Batch):
     self._graphs = {}
     work = {"step": self._once, "after": self._after}
     work |= {"reset": self._rest.launch, "look": self._rest.look}
-    for organ in self._organs.values():
-      organ.load()
     if not self.device.is_cuda:
+      for organ in self._organs.values():
+        organ.load()
       self._graphs = {name: (None, each) for name, each in work.items()}
       return
     for each in work.values():
@@ -254,6 +257,11 @@ class Worlds(Batch):
   def kept(self) -> tuple[np.ndarray, np.ndarray]:
     """Numbers of qpos and qvel in the model that are not an organ's."""
     return self._kept
+
+  def xmat(self, body: str) -> wp.array:
+    """Returns the axes of a body in the last step, (nworld,) of mat33."""
+    found: Any = self.d.xmat
+    return found[:, self._bare.body(body).id]
 
   @property
   def overflow(self) -> wp.array:

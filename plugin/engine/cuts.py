@@ -109,10 +109,10 @@ class Cuts:
     state, where = w.views["plugin_state"].numpy(), coupling.spans(w.organ)
     names = ("corner", "place", "weight", "source", "stamp")
     self._own = {name: state[where[name]] for name in names}
-    self._found = self._own["stamp"].data
+    self._found: Any = self._own["stamp"].data
     self.lock = turns.lock_of(model)
     self._elem = flexes.element_data(m, w.organ.flex)
-    self._mark = flexes.marks(m, w.organ.flex, self.whole.nelem)[-1:].data
+    self._mark: Any = flexes.marks(m, w.organ.flex, self.whole.nelem)[-1:].data
 
   # What the state says.
 

@@ -80,18 +80,13 @@ def read(m, organ) -> Skin | None:
   held = int(mjstruct.view(m.skin_bonevertnum, m.nskinbone, np.int32)[bone])
   if bones != 1 or held != count:
     raise ValueError(f"{who} has {bones} bones, expected one that has all vertices")
-  groups = [
-    int(mjstruct.view(each, size, np.int32)[index])
-    for each, size, index in (
-      (m.skin_group, m.nskin, k),
-      (m.flex_group, m.nflex, organ.flex),
-    )
-  ]
+  group = int(mjstruct.view(m.skin_group, m.nskin, np.int32)[k])
+  own = int(mjstruct.view(m.flex_group, m.nflex, np.int32)[organ.flex])
   rest = organ.mesh.rest[: organ.mesh.nouter]
-  return Skin(k, smooth, _height(m, k, bone, adr, smooth, rest), adr, bone, tuple(groups))
+  return Skin(k, smooth, _height(m, adr, smooth, rest), adr, bone, (group, own))
 
 
-def _height(m, skin: int, bone: int, adr: int, smooth: Smooth, rest: np.ndarray) -> np.ndarray:
+def _height(m, adr: int, smooth: Smooth, rest: np.ndarray) -> np.ndarray:
   """Returns how far the skin's vertices, as they are declared, lie above the smooth surface [m].
 
   Both are in the frame of the body that the organ is in; a skin is bound to that.

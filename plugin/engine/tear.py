@@ -78,6 +78,6 @@ def _across(rest: np.ndarray, now: np.ndarray) -> np.ndarray:
   """Returns the unit vector in a triangle, as it is now, across its greatest stretch."""
   arm, before = now[1:] - now[0], rest[1:] - rest[0]
   value, vector = np.linalg.eig(np.linalg.solve(before @ before.T, arm @ arm.T))
-  along = vector[:, int(np.argmax(value))].real @ arm
+  along = np.real(vector[:, int(np.argmax(value))]) @ arm
   across = np.cross(np.cross(arm[0], arm[1]), along)
   return across / np.linalg.norm(across)

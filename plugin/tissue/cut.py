@@ -266,7 +266,7 @@ def _uncut(mesh: Mesh, chain: list[int]) -> list[tuple[int, int]]:
 def _is_inner(mesh: Mesh, a: int, b: int) -> bool:
   """Returns whether an edge has a triangle on both sides."""
   halves = mesh.ring_elem[a][mesh.ring[a] == b]
-  return bool(len(halves)) and halves[0] >= 0 and mesh.twin[halves[0]] >= 0
+  return bool(len(halves) and halves[0] >= 0 and mesh.twin[halves[0]] >= 0)
 
 
 def _room(mesh: Mesh, pairs: list[tuple[int, int]]) -> tuple[list[tuple[int, int]], bool]:

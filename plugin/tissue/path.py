@@ -94,7 +94,7 @@ def nearest(
     triangles (n,), weights of their corners (n, 3), distances [m] (n,)
   """
   used = mesh.nouter
-  _, near = spatial.cKDTree(position[:used]).query(points, k=min(_NEAR, used))
+  _, near = spatial.KDTree(position[:used]).query(points, k=min(_NEAR, used))
   around = mesh.ring_elem[near].reshape(len(points), -1)
   elem = np.where(around >= 0, around // 3, around.max(axis=1, keepdims=True) // 3)
   corner = position[mesh.elem[elem]]

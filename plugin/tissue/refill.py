@@ -166,13 +166,13 @@ def _around(mesh: Mesh, vert: np.ndarray) -> np.ndarray:
   """Returns which triangles have one of these corners, (nelem,) bool."""
   mine = np.zeros(mesh.nvert, bool)
   mine[vert] = True
-  return mine[mesh.elem].any(axis=1)
+  return np.any(mine[mesh.elem], axis=1)
 
 
 def _beside(mesh: Mesh, elem: np.ndarray) -> np.ndarray:
   """Returns which triangles share an edge with these, (nelem,) bool."""
   other = mesh.twin.reshape(-1, 3)
-  return ((other >= 0) & elem[other // 3]).any(axis=1)
+  return np.any((other >= 0) & elem[other // 3], axis=1)
 
 
 def _patch(mesh: Mesh, elem: np.ndarray) -> np.ndarray:

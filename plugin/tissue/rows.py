@@ -182,6 +182,6 @@ def numbers(mesh: Mesh, half: np.ndarray) -> np.ndarray:
   return np.searchsorted(mesh.whole.interior, half)
 
 
-def matrix(mesh: Mesh, hinge: plate.Hinges) -> sparse.coo_matrix:
+def matrix(mesh: Mesh, hinge: plate.Hinges) -> sparse.coo_array:
   """Returns the bending matrix by vertices; see `plate.bending_matrix`."""
   return plate.bending_matrix(mesh, hinge).tocoo()

@@ -32,6 +32,11 @@ class Smooth:
   weight: csr_array
   control: SuperLU
 
+  @property
+  def count(self) -> int:
+    """Number of its vertices."""
+    return int(self.elem.max()) + 1
+
   def __call__(self, values: np.ndarray) -> np.ndarray:
     """Returns values at the fine vertices (nfine, k) of those at the coarse ones (ncoarse, k)."""
     return self.weight @ self.control.solve(np.ascontiguousarray(values, dtype=float))

@@ -17,6 +17,8 @@ class Domain:
     begin: kernel (fields, own): begins the episodes of `begun`, once the instrument is measured
     advance: kernel (fields, own): what `Task.advance` is; it ends with `kernels.judge`
     observe: kernel (fields, own, beginning): what `Task.observe` is
+    nodes: of the organ that its instrument touches at once, and some more: the slots of a GPU's
+      window
     takes: numbers of the task that the struct has under the same names
   """
 
@@ -24,6 +26,7 @@ class Domain:
   begin: Any
   advance: Any
   observe: Any
+  nodes: int = 12
   takes: tuple[str, ...] = ()
 
   @staticmethod

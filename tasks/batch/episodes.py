@@ -18,6 +18,7 @@ from palpate.tasks.physics import Physics
 
 from .domain import Domain
 
+_AHEAD = 64  # episodes that are drawn while a device steps
 FRAME = {"body_pos", "body_quat", "pose"}  # what every exercise draws: trocar and joints
 
 
@@ -95,14 +96,20 @@ class Episodes:
         self._ready[world] = False
 
   def take(self, worlds: np.ndarray) -> dict[str, np.ndarray]:
-    """Returns `rows` with the next episodes of some worlds, and draws those after these."""
+    """Returns `rows` with the next episodes of some worlds."""
     self._wait()
     self._draw(worlds[~self._ready[worlds]])
     for name, values in self._next.items():
       self.rows.setdefault(name, np.zeros_like(values))[worlds] = values[worlds]
     self._ready[worlds] = False
-    self._ahead = self._pool.submit(self._draw, worlds)
     return self.rows
+
+  def draw_ahead(self) -> None:
+    """Draws some of the episodes after these, while the caller waits for a device."""
+    if self._ahead is not None and self._ahead.done():
+      self._wait()
+    if self._ahead is None and not self._ready.all():
+      self._ahead = self._pool.submit(self._draw, np.flatnonzero(~self._ready)[:_AHEAD])
 
   def _wait(self) -> None:
     if self._ahead is not None:

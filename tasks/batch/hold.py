@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 import warp as wp
-from palpate.tasks import grasp, physics
-from palpate.tasks.jaws import Jaws
+from palpate.batch.threads import Threads
+from palpate.tasks import grasp, jaws, physics
 from palpate.tissue.types import Array, floats, ints, struct
 
 from . import domain
@@ -15,7 +15,7 @@ from .kernels import point, put, vector
 
 _CLOSING, _GRIPPING = wp.constant(physics.CLOSING), wp.constant(physics.GRIPPING)
 _FOLD, _FORCE = wp.constant(physics.FOLD), wp.constant(physics.HELD_FORCE)
-_REACH = wp.constant(grasp.REACH)
+_REACH, _FACING = wp.constant(grasp.REACH), wp.constant(jaws.FACING)
 
 
 @struct
@@ -27,6 +27,7 @@ class HoldState:
   hold: float  # [s]
   slip: float  # [m]
   eye: wp.vec3  # retract: of the laparoscope [m]
+  side: floats("nside")  # of a geom, see `Jaws`
   site: ints("nworld")  # triangle to grasp
   rest: vectors  # grasp: its place at rest [m]
   up: vectors  # grasp: towards the trocar
@@ -100,15 +101,53 @@ def show(s: Common, o: HoldState, w: int):
   o.held[w, 0] = wp.min(o.time[w] / o.hold, 1.0)
 
 
+@struct
+class Between:
+  """What the jaws touch."""
+
+  left: Array(wp.mat33, ("nworld",))  # axes of the jaws
+  right: Array(wp.mat33, ("nworld",))
+  geom: ints("nworld", "ncontact")  # see `palpate.batch.Contacts`
+  normal: floats("nworld", "ncontact", 3)
+  force: floats("nworld", "ncontact")  # [N]
+
+
+@wp.kernel(enable_backward=False)
+def press(o: HoldState, b: Between):
+  """Adds up the force of the jaws' inner faces on the organ, see `Jaws.inner_force`."""
+  w = wp.tid()
+  both = wp.vec2(0.0, 0.0)
+  for k in range(b.geom.shape[1]):
+    g = b.geom[w, k]
+    if g >= 0 and o.side[g] != 0.0:
+      n = -wp.vec3(b.normal[w, k, 0], b.normal[w, k, 1], b.normal[w, k, 2])
+      jaw = int(0)  # noqa: RUF046, UP018 - a variable to Warp
+      axes = b.left[w]
+      if o.side[g] < 0.0:
+        jaw = 1
+        axes = b.right[w]
+      along = o.side[g] * (n[0] * axes[0, 0] + n[1] * axes[1, 0] + n[2] * axes[2, 0])
+      if along > _FACING:
+        both[jaw] = both[jaw] + b.force[w, k] * along
+  o.inner[w, 0] = both[0]
+  o.inner[w, 1] = both[1]
+
+
 class Hold(domain.Domain):
   """What the domains share."""
 
   struct = HoldState
+  nodes = 24
 
   @staticmethod
   def sizes(task: Any, physics):
     """Returns the named sizes of its arrays."""
-    return {"nsample": 1}
+    return {"nsample": 1, "nside": physics.model.ngeom + 1}
+
+  @staticmethod
+  def constants(task: Any, physics) -> dict[str, Any]:
+    """Returns what all worlds share."""
+    return {"side": jaws.Jaws(physics.model.ptr, task.prefix).side}
 
   @staticmethod
   def draw(task: Any, physics) -> dict[str, Any]:
@@ -117,9 +156,16 @@ class Hold(domain.Domain):
 
   @staticmethod
   def sense(worlds: Any) -> None:
-    """Measures what the jaws have between them, on the CPU's threads."""
+    """Measures what the jaws have between them."""
     batch, own = worlds.batch, worlds.own
-    found, inner = Jaws(batch.model, worlds.task.prefix), own.inner.numpy()
+    found = jaws.Jaws(batch.model, worlds.task.prefix)
+    if not isinstance(batch, Threads):
+      between: Any = Between()
+      between.left, between.right = (batch.xmat(name) for name in found.names)
+      between.geom, between.normal, between.force = worlds.organ.contacts
+      worlds.launch(press, worlds.nworld, [own, between])
+      return
+    inner = own.inner.numpy()
 
     def work(world: int):
       inner[world] = found.inner_force(batch.models[world], batch.datas[world])

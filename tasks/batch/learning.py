@@ -19,6 +19,7 @@ import palpate
 import torch
 from palpate.tasks import policy
 from palpate.tasks.files import replacing
+from palpate.tasks.observation import ROWS
 from rsl_rl.algorithms import PPO
 from rsl_rl.models import MLPModel
 from rsl_rl.storage import RolloutStorage
@@ -37,6 +38,10 @@ _KEY = "palpate training"
 _JUDGED = 1_000_000  # seed of the first world's episode when a policy is judged
 LEAST = 2048  # control steps of an iteration, in all worlds
 _SHORT = 24  # of a world, at least
+# How much observations vary at least, by their unit: tissue that is not touched yet will be.
+_VARY = {"m": 0.005, "m/s": 0.01, "rad": 0.05, "rad/s": 0.1, "N": 0.3, "-": 0.3}
+_STILL = 1e-6  # standard deviation of what has not changed, and may be anything
+_SLOWEST = 1e-4  # learning rate at the start of an iteration, at least
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,7 +67,7 @@ class Settings:
   epochs: int = 5
   minibatches: int = 4
   spread: float = 0.5
-  entropy: float = 0.005
+  entropy: float = 0.002
   learning_rate: float = 1e-3
 
 
@@ -102,16 +107,35 @@ class Learner:
     )  # fmt: skip
     self._ppo.train_mode()
     self._look()
+    self.env.stagger(torch.Generator().manual_seed(settings.seed))
 
   def _look(self) -> None:
-    """Learns how large observations are: later it would change the policy at once."""
+    """Learns how large observations are, once: what changed it later would change the policy."""
     seen = []
     with torch.no_grad():
       for _ in range(self._count):
         seen.append(self.env.get_observations())
         self.env.step(self._ppo.actor(seen[-1], stochastic_output=True))
-      for model in (self._ppo.actor, self._ppo.critic):
-        model.update_normalization(torch.cat(seen))
+    every = torch.cat([torch.cat(seen)[group] for group in self.env.groups], dim=1)
+    std = every.std(dim=0)
+    std = torch.where(std < _STILL, torch.full_like(std, _VARY["-"]), std)
+    std = torch.maximum(std, self._least().to(std))
+    for model in (self._ppo.actor, self._ppo.critic):
+      known, model.obs_normalizer.eps = model.obs_normalizer.state_dict(), 0.0
+      known["_mean"][:], known["_std"][:], known["_var"][:] = every.mean(dim=0), std, std.square()
+      model.obs_normalizer.until = 0
+
+  def _least(self) -> torch.Tensor:
+    """Returns how much each number that is observed varies at least."""
+    out, space = [], self.env.env.single_observation_space
+    for name in itertools.chain(*self.env.groups.values()):
+      count = math.prod(space[name].shape)
+      units = ROWS[name].unit.split(", ") if name in ROWS else []
+      least = [_VARY[unit] for unit in units] or [0.0]
+      if len(least) == 2:  # three angles and the insertion
+        least = 3 * least[:1] + least[1:]
+      out += least * (count // len(least))
+    return torch.tensor(out)
 
   def iterate(self, stop: Callable[[], bool] = lambda: False) -> dict[str, float] | None:
     """Learns from some steps of all worlds; returns `ROW`, or None if it was to stop."""
@@ -128,6 +152,7 @@ class Learner:
         if extras["log"]:
           ended.append(extras["log"])
       ppo.compute_returns(env.get_observations())
+    ppo.learning_rate = max(ppo.learning_rate, _SLOWEST)
     ppo.update()
     self.iteration += 1
     self.steps += self._count * env.num_envs
@@ -138,7 +163,7 @@ class Learner:
 
     return {
       "iteration": self.iteration, "steps": self.steps, "seconds": self.seconds,
-      "episodes": sum(len(each["/return"]) for each in ended), "success": mean("/success"),
+      "episodes": sum(len(each["/return"]) for each in ended), "success": float(env.won.mean()),
       "return": mean("/return"), "length": mean("/length"),
       "spread": float(ppo.actor.distribution.log_std_param.detach().exp().mean()),
       "learning_rate": ppo.learning_rate,

@@ -87,12 +87,12 @@ class Retract(Hold):
   @staticmethod
   def sizes(task: Any, physics):
     """Returns the named sizes of its arrays."""
-    return {"nsample": len(task.disc)}
+    return Hold.sizes(task, physics) | {"nsample": len(task.disc)}
 
   @staticmethod
   def constants(task: Any, physics):
     """Returns what all worlds share."""
-    return {"eye": wp.vec3(*physics.camera()[0])}
+    return Hold.constants(task, physics) | {"eye": wp.vec3(*physics.camera()[0])}
 
   @staticmethod
   def draw(task: Any, physics):

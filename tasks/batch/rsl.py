@@ -4,7 +4,8 @@
     env = RslRl(gymnasium.make_vec("palpate/TouchEasy-v0", num_envs=4096, output="torch"))
 
 Observations are a TensorDict of the groups `sensors` and `state`, each flat. `extras["time_outs"]`
-is 1 where the time limit ended an episode, `extras["log"]` has what ended episodes came to.
+is 1 where the time limit ended an episode, `extras["log"]` has what ended episodes came to, but for
+those that `stagger` has cut short.
 """
 
 from __future__ import annotations
@@ -21,7 +22,13 @@ from .vector import Exercises
 
 
 class RslRl(VecEnv):
-  """A vectorised exercise as rsl_rl wants it; actions are cut to [-1, 1]."""
+  """A vectorised exercise as rsl_rl wants it; actions are cut to [-1, 1].
+
+  Attributes:
+    returns: of the episodes so far
+    whole: whether an episode has all its time, which `stagger` takes from it
+    won: 1 where the last whole episode of a world that has ended was a success, else 0
+  """
 
   def __init__(self, env: Exercises, seed: int | None = None):
     """Begins episodes in all worlds of an environment with `output="torch"`."""
@@ -35,6 +42,8 @@ class RslRl(VecEnv):
     self.groups = groups(found.single_observation_space)
     self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
     self.returns = torch.zeros(self.num_envs, device=self.device)
+    self.whole = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
+    self.won = torch.zeros(self.num_envs, device=self.device)
     self._seen, _ = found.reset(seed=seed)
 
   def get_observations(self) -> TensorDict:
@@ -45,6 +54,14 @@ class RslRl(VecEnv):
     }
     return TensorDict(flat, batch_size=[self.num_envs], device=self.device)
 
+  def stagger(self, generator: torch.Generator | None = None) -> None:
+    """Lets worlds be at moments of an episode that differ, so that not all end at once."""
+    limit = self.max_episode_length
+    steps = torch.randint(0, limit, (self.num_envs,), generator=generator)
+    self.env.worlds.fields.step.assign(steps.int().numpy())
+    self.episode_length_buf[:] = steps.to(self.device)
+    self.whole[:] = False
+
   def step(self, actions: torch.Tensor):
     """Takes a control step."""
     actions = actions.detach().clamp(-1.0, 1.0)
@@ -54,11 +71,15 @@ class RslRl(VecEnv):
     self.returns += reward
     extras: dict[str, Any] = {"time_outs": truncated.float(), "log": {}}
     if "final_info" in info:
+      told = over & self.whole
+      success = info["final_info"]["success"].float()
+      self.won[told] = success[told]
       extras["log"] = {
-        "/success": info["final_info"]["success"][over].float(),
-        "/return": self.returns[over],
-        "/length": self.episode_length_buf[over].float(),
+        "/success": success[told],
+        "/return": self.returns[told],
+        "/length": self.episode_length_buf[told].float(),
       }
+      self.whole[over] = True
       self.episode_length_buf[over] = 0
       self.returns[over] = 0.0
     return self.get_observations(), reward, over.long(), extras

@@ -73,7 +73,7 @@ class Exercises(VectorEnv):
       device: `cpu`, `cuda:N`, or None for a GPU where there is one; see `palpate.batch.make`
       output: what observations, rewards and flags are: `numpy`, or arrays of the device of `torch`
         or `warp`; all are copies
-      nodes: on a GPU, see `palpate.batch.make`
+      nodes: on a GPU, see `palpate.batch.make`; None for what the instrument touches
       **kwargs: of `Exercise`, such as `reward="sparse"`
 
     Raises:
@@ -89,7 +89,7 @@ class Exercises(VectorEnv):
     environment = single.environment
     if device is None:
       device = "cuda:0" if wp.is_cuda_available() else "cpu"
-    _refuse_task(environment.task, device)
+    _refuse_task(environment.task)
     self.single_observation_space, self.single_action_space = (
       single.observation_space, single.action_space
     )  # fmt: skip
@@ -99,7 +99,7 @@ class Exercises(VectorEnv):
     if max_episode_steps is not None and max_episode_steps > 0:
       limit = min(limit, max_episode_steps)
     domain = DOMAINS[type(environment.task).__name__]
-    options = {} if device == "cpu" else {"nodes": nodes}
+    options = {} if device == "cpu" else {"nodes": domain.nodes if nodes is None else nodes}
     self.worlds = Worlds(environment, domain, self.num_envs, device, limit, **options)
     self.device, self.max_episode_steps = self.worlds.device, limit
     self._observed = {
@@ -218,7 +218,7 @@ def _refuse(task: str, kwargs: Mapping[str, Any]) -> None:
       raise ValueError(f"{task}: {name} is given, which a vectorised exercise cannot do; {_ELSE}")
 
 
-def _refuse_task(task: Any, device: str) -> None:
+def _refuse_task(task: Any) -> None:
   kind = type(task).__name__
   if kind not in DOMAINS:
     have = ", ".join(name.lower() for name in DOMAINS)
@@ -227,11 +227,6 @@ def _refuse_task(task: Any, device: str) -> None:
     raise ValueError(
       f"{task.name}: observations has {task.observed.pictures[0]!r}, but a vectorised exercise "
       f"makes no pictures; {_ELSE}"
-    )
-  if task.jaws and device != "cpu":
-    raise ValueError(
-      f"{task.name}: device is {device!r}, expected 'cpu': what jaws hold on a GPU does not agree "
-      "with the CPU yet"
     )
   if len(task.variants) > 1:
     raise ValueError(

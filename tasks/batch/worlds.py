@@ -34,6 +34,7 @@ class Worlds:
     fields: what every exercise has, arrays on the device
     own: what the domain has
     batch: the physics
+    organ: the organ in it
     device: of the arrays
     task: draws the episodes
   """
@@ -68,7 +69,7 @@ class Worlds:
     self.device, self._substeps = self.batch.device, episode.substeps(environment)
     self.batch.start(at_rest(self.batch.model, stage.state, STATE))
     self.episodes = Episodes(task, domain, nworld)
-    self._organ = self.batch.organ(task.organ)
+    self.organ = self.batch.organ(task.organ)
     self.fields = self._make(task, environment.control_timestep(), limit)
     sizes = {"nworld": nworld, **domain.sizes(task, self.episodes.physics)}
     self.own = allocate(domain.struct, self.device, sizes)
@@ -84,7 +85,7 @@ class Worlds:
   def _make(self, task: Any, dt: float, limit: int) -> Any:
     physics, model = self.episodes.physics, self.batch.model
     sizes = dict(
-      nworld=self.nworld, nvert=self._organ.nvert, nelem=len(self._organ.elem), nq=model.nq,
+      nworld=self.nworld, nvert=self.organ.nvert, nelem=len(self.organ.elem), nq=model.nq,
       nv=model.nv, nu=model.nu, nsensor=model.nsensor, nsensordata=model.nsensordata,
       naction=len(task.components),
     )  # fmt: skip
@@ -98,7 +99,7 @@ class Worlds:
     coarse = physics.coarse
     constants = {
       "drive": drives, "low": controls[:, 0], "high": controls[:, 1],
-      "move": np.array(base.RATES) * dt, "elem": self._organ.elem, "coarse": coarse,
+      "move": np.array(base.RATES) * dt, "elem": self.organ.elem, "coarse": coarse,
       "coarse0": physics.organ.xpos0[coarse],
     }  # fmt: skip
     for name, value in constants.items():
@@ -126,7 +127,7 @@ class Worlds:
     """Brings what is of the batch up to date."""
     batch = self.batch
     s.qpos, s.qvel, s.sensordata, s.xpos = (
-      batch.qpos, batch.qvel, batch.sensordata, self._organ.xpos
+      batch.qpos, batch.qvel, batch.sensordata, self.organ.xpos
     )  # fmt: skip
 
   # Doing.
@@ -151,6 +152,7 @@ class Worlds:
     wp.copy(self.fields.action, action)
     self._over(kernels.act)
     self.batch.step(self._substeps)
+    self.episodes.draw_ahead()
     self._read(self.fields)
     self._over(kernels.measure, False)
     self._domain.sense(self)
@@ -173,7 +175,7 @@ class Worlds:
     self.batch.pose([self.task.prefix + axis for axis in AXES], rows["pose"], mask)
     tissue = self._domain.tissue(self.task, rows)
     if tissue:
-      self._organ.configure(mask, **tissue)
+      self.organ.configure(mask, **tissue)
     self.fields.begun.assign(mask)
     self.fields.port_pos.assign(rows["body_pos"])
     self.fields.port_quat.assign(rows["body_quat"][:, [1, 2, 3, 0]])

@@ -8,7 +8,8 @@ from palpate.app import cli
 for name in ("gymnasium", "torch", "rsl_rl", "safetensors"):
   pytest.importorskip(name)
 
-from palpate.tasks.batch import learning, vector  # noqa: E402
+import torch  # noqa: E402
+from palpate.tasks.batch import learning, rsl, vector  # noqa: E402
 
 SMALL = ["--device", "cpu", "--num-envs", "2", "--set", "time_limit=0.4"]
 
@@ -50,6 +51,26 @@ def test_a_policy_is_judged_by_an_episode_in_each_world():
   env = vector.Exercises(3, "touch/easy", device="cpu", output="torch", time_limit=0.1)
   learner = learning.Learner(env, learning.Settings())
   assert learner.judge() == 0.0 and learner.judge(lambda: True) == 0.0
+  env.close()
+
+
+def test_the_curve_counts_the_last_whole_episode_of_each_world():
+  env = vector.Exercises(4, "touch/easy", device="cpu", output="torch", time_limit=0.2)
+  seen = rsl.RslRl(env, 0)
+  seen.stagger(torch.Generator().manual_seed(0))
+  began, told = seen.episode_length_buf.clone(), []
+  assert len(set(began.tolist())) > 1
+  for k in range(1, 11):
+    _, _, over, extras = seen.step(torch.zeros(4, 4))
+    assert torch.equal(over.bool(), k == 10 - began)  # each ends in its own time
+    told += [extras["log"]["/length"]] if extras["log"] else []
+  assert not torch.cat(told).numel()  # what began in the middle does not count
+  fields = env.worlds.fields
+  seen.won[:] = 1.0
+  for _ in range(10):
+    _, _, over, extras = seen.step(torch.zeros(4, 4))
+    assert not extras["log"] or (extras["log"]["/length"] == 10).all()
+  assert not seen.won.any() and not fields.success.numpy().any()  # none touched
   env.close()
 
 

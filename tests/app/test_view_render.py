@@ -86,7 +86,7 @@ def test_help_lists_the_scenes(capsys):
     with pytest.raises(SystemExit):
       cli.main([command, "--help"])
     said = " ".join(capsys.readouterr().out.split())
-    assert f"{', '.join(models.NAMES)} or press; an MJCF file; a folder" in said
+    assert f"{', '.join(models.NAMES)}, abdomen or press; an exercise such as" in said
     assert "250 or 1000" in said and "probe,grasper" in said
 
 

@@ -62,6 +62,36 @@ def test_a_tool_presses_as_under_the_plugin(device, kind):
 
 
 @pytest.mark.parametrize("device", DEVICES)
+def test_a_row_of_geoms_on_a_triangle_loses_none(device):
+  points, elem = sphere(2)
+  tissue = organ(points, elem, young=3e4, foundation=1e5, tolerance=1e-6, bend=0)
+  row = "".join(
+    f'<geom size="0.0015" pos="{0.0012 * k - 0.0048} 0 0" mass="0.005" condim="1" '
+    'solref="0.004 1"/>'
+    for k in range(9)
+  )
+  tool = f"""<body name="tool" pos="0.001 0.0005 {RADIUS + 0.004}">
+    <joint name="z" type="slide" axis="0 0 1"/>{row}</body>"""
+  extra = '<actuator><position joint="z" kp="500" kv="10"/></actuator>'
+  made = world(tissue, tool, tolerance=1e-8, extra=extra)
+  model, data, handle = load(made)
+  batch = palpate.batch.make(mujoco.MjSpec.from_string(made), 2, device=device)
+  found, most = [], 0
+  for k in range(80):
+    data.ctrl[:] = -0.006 * min(1.0, k / 60)
+    batch.ctrl = np.full((2, 1), data.ctrl[0])
+    mujoco.mj_step(model, data)
+    batch.step()
+    total = batch.organ("organ").contact_force.numpy()[0].sum(axis=0)
+    found.append((total, handle.contact_force.sum(axis=0)))
+    most = max(most, int((batch.organ("organ").contacts.geom.numpy()[0] >= 0).sum()))
+  found = np.array(found)
+  assert not batch.overflow.numpy().any() and most > 8
+  peak = np.abs(found[:, 1]).max()
+  assert np.sqrt(np.mean((found[:, 0] - found[:, 1]) ** 2)) < 0.01 * peak
+
+
+@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("still", ["plane", "ball"])
 def test_an_organ_rests_on_what_does_not_move(device, still):
   points, elem = sphere(2)
@@ -82,6 +112,30 @@ def test_an_organ_rests_on_what_does_not_move(device, still):
     found[k] = total[2], handle.contact_force.sum(axis=0)[2]
   assert not batch.overflow.numpy().any() and found[:, 1].max() > 0.01
   assert np.sqrt(np.mean((found[:, 0] - found[:, 1]) ** 2)) < 0.01 * found[:, 1].max()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_touch_sensor_feels_its_own_body_alone(device):
+  points, elem = sphere(2)
+  tissue = organ(points, elem, young=3e4, foundation=1e5, tolerance=1e-6, bend=0)
+  tools = "".join(
+    f"""<body pos="{x} 0 {RADIUS + 0.0055}"><joint name="{name}" type="slide" axis="0 0 1"/>
+    <geom size="0.006" mass="0.05" condim="1"/><site name="{name}" size="0.05"/></body>"""
+    for name, x in (("left", -0.001), ("right", 0.001))
+  )
+  extra = """<actuator><position joint="left" kp="500" kv="10"/><position joint="right" kp="500"
+    kv="10"/></actuator>
+    <sensor><touch site="left"/><touch site="right"/></sensor>"""
+  made = world(tissue, tools, tolerance=1e-8, extra=extra)
+  model, data, _ = load(made)
+  batch = palpate.batch.make(mujoco.MjSpec.from_string(made), 2, device=device, nodes=24)
+  data.ctrl[:] = -0.002, 0.02
+  batch.ctrl = np.tile(data.ctrl, (2, 1))
+  for _ in range(60):
+    mujoco.mj_step(model, data)
+    batch.step()
+  assert data.sensordata[0] > 0.05 and data.sensordata[1] == 0
+  np.testing.assert_allclose(batch.sensordata.numpy(), np.tile(data.sensordata, (2, 1)), rtol=0.02)
 
 
 @pytest.mark.parametrize("device", DEVICES)

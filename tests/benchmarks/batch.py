@@ -7,7 +7,8 @@ pressed by a ball of 6 mm on a slide, to depths of up to 6 mm that differ from w
 whole steps are timed, while every ten steps the balls are driven 1 mm up or down. `force_rms` is
 the difference of the probe's force from that of the plugin on the CPU over the press of the world
 that is pressed deepest, as a share of the greatest. On CUDA the parts of a step are timed by
-themselves afterwards: the organ's before and after mujoco_warp's step, and that.
+themselves afterwards: the organ's before and after mujoco_warp's step, and that. Several devices
+share the worlds: `--device cuda:0+cuda:1`.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ import numpy as np
 import palpate.batch
 import scenes
 import warp as wp
-from benchmarks import results
+from benchmarks import plots, results
 from benchmarks.runner import Bench, Case, Row
 from palpate.models import grid
 
@@ -74,22 +75,25 @@ def measure(
 ) -> dict:
   """Returns what steps of a batch take."""
   spec = scene(nodes, bend, condim, tolerance)
-  start, target = time.perf_counter(), wp.get_device(device if "cuda" in device else "cpu")
+  names = device.split("+")
+  start, target = time.perf_counter(), wp.get_device(names[0] if "cuda" in names[0] else "cpu")
   free = target.free_memory if target.is_cuda else 0
-  batch = palpate.batch.make(spec, nworld, device, nodes=slots, deterministic=repeat)
+  where = names if len(names) > 1 else device
+  batch = palpate.batch.make(spec, nworld, where, nodes=slots, deterministic=repeat)
   made, rms = time.perf_counter() - start, float("nan")
   if nworld <= 1024 and condim == 1:
     found, expected = press(batch, record=True), alone(scene(nodes, bend, condim, tolerance))
     rms = float(np.sqrt(np.mean((found - expected) ** 2)) / np.abs(expected).max())
   else:
     press(batch)
-  wp.synchronize_device(target)
-  used = (free - target.free_memory) / nworld if target.is_cuda else float("nan")
+  wp.synchronize()
+  here = nworld / len(names)
+  used = (free - target.free_memory) / here if target.is_cuda else float("nan")
   before = time.perf_counter()
   for k in range(STEPS // 10):
     batch.ctrl = -(depths(nworld) - 0.001 * (k % 2))[:, None]
     batch.step(10)
-  wp.synchronize_device(target)
+  wp.synchronize()
   step = (time.perf_counter() - before) / (STEPS // 10 * 10)
   tissue = batch.organ("organ")
   residual, iterations = tissue.residual.numpy(), tissue.iterations.numpy()
@@ -113,7 +117,7 @@ def measure(
     "overflow": int(batch.overflow.numpy().max()),
     "failures": int(batch.failures.numpy().sum()),
     "make_s": made,
-  } | (parts(batch) if target.is_cuda else dict.fromkeys(_PARTS, float("nan")))
+  } | (parts(batch) if where == device and target.is_cuda else dict.fromkeys(_PARTS, float("nan")))
 
 
 _PARTS = ("before_ms", "mujoco_warp_ms", "after_ms")
@@ -141,25 +145,27 @@ def parts(batch) -> dict[str, float]:
 def arguments(parser: argparse.ArgumentParser):
   """Declares the options."""
   add = parser.add_argument
-  add("--device", default="cpu", help="cpu or cuda:0 (%(default)s)")
+  add("--device", default="cpu", help="cpu, cuda:0, or several, cuda:0+cuda:1 (%(default)s)")
   add("--nodes", type=int, nargs="+", default=[258, 678, 1026])
   add("--worlds", type=int, nargs="+", help="8 on the CPU; 1024, 4096 and 16384 on CUDA")
   add("--bend", type=float, nargs="+", default=[0.0, 1.0])
   add("--condim", type=int, nargs="+", default=[1])
   add("--tolerance", type=float, default=1e-3)
-  add("--slots", type=int, help="nodes that the ball may touch; what its size asks for")
+  add("--slots", type=int, nargs="+", help="nodes that the ball may touch, one a size or for all")
   add("--repeat", action="store_true", help="runs that repeat to the bit whatever the GPU does")
 
 
 def stages(args: argparse.Namespace) -> list[list[Case]]:
   """Returns a case a size, number of worlds, and kind of tissue and contact."""
   keys = {"device": args.device, "tolerance": args.tolerance, "repeat": args.repeat}
-  keys |= {"slots": args.slots}
+  slots = args.slots or [None]
+  slots = dict(zip(args.nodes, slots * (len(args.nodes) // len(slots)), strict=True))
   worlds = args.worlds or ([8] if args.device == "cpu" else [1024, 4096, 16384])
-  kind = f"{args.slots or 0}{'-repeat' * args.repeat}"
+  kind = "-repeat" * args.repeat
+  many = f"-x{args.device.count('+') + 1}" * ("+" in args.device)
   cases = [
-    {"case": f"{n}-{w}-{bend:g}-{c}-{kind}", "nodes": n, "nworld": w}
-    | {"bend": bend, "condim": c}
+    {"case": f"{n}-{w}-{bend:g}-{c}-{slots[n] or 0}{kind}{many}", "nodes": n, "nworld": w}
+    | {"bend": bend, "condim": c, "slots": slots[n]}
     | keys
     for bend, c, n, w in itertools.product(args.bend, args.condim, args.nodes, worlds)
   ]
@@ -203,10 +209,30 @@ def table(out: pathlib.Path) -> list[str]:
   return lines
 
 
+def draw(out: pathlib.Path) -> pathlib.Path:
+  """Draws world-steps a second over the number of worlds on a GPU."""
+  figure, (axes,) = plots.grid(1, 1, 6.4, 3.6)
+  path = out / "batch_cuda.csv"
+  found = [row for row in results.read(path) if row["status"] == "ok"] if path.exists() else []
+  for bend, line in ((0, "o-"), (1, "s--")):
+    for nodes in sorted({row["nodes"] for row in found}):
+      mine = [r for r in found if (r["nodes"], r["bend"], r["device"]) == (nodes, bend, "cuda:0")]
+      mine.sort(key=lambda row: row["nworld"])
+      label = f"{nodes} nodes{', bending' * bend}"
+      axes.plot([r["nworld"] for r in mine], [r["rate"] / 1e6 for r in mine], line, label=label)
+  axes.set(xscale="log", yscale="log", xlabel="worlds", ylabel="million world-steps a second")
+  plots.plain(axes.xaxis)
+  plots.plain(axes.yaxis)
+  axes.legend(frameon=False, fontsize=8)
+  return plots.save(figure, out / "batch.png", "Batches on one GPU")
+
+
 def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
   """Writes the page, of all devices that there are results of."""
-  return [results.page(out / "batch.md", "How many worlds a batch steps a second", about,
-                       table(out))]  # fmt: skip
+  title, lines = "How many worlds a batch steps a second", table(out)
+  picture = draw(out)
+  lines += ["", "![world-steps a second over worlds](batch.png)"]
+  return [picture, results.page(out / "batch.md", title, about, lines)]
 
 
 BENCH = Bench("batch", stages, run, report=report, arguments=arguments, file="batch_{device}")

@@ -132,7 +132,7 @@ def test_bad_skins_are_named():
     spec.compile()
   spec = scene()
   other = subdivide.smooth(grid.octasphere(5)[1], 2)
-  skin, count = spec.skins[0], other.weight.shape[0]
+  skin, count = spec.skins[0], other.count
   skin.vert, skin.face = np.zeros(3 * count), other.elem.ravel()
   skin.vertid, skin.vertweight = [np.arange(count)], [np.ones(count)]
   with pytest.raises(ValueError, match=f"has {count} vertices, expected one of 578, 2306"):

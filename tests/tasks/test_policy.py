@@ -70,3 +70,24 @@ def test_a_file_that_is_none_is_refused(tmp_path):
     policy.save(path, made(layers=layers))
     with pytest.raises(ValueError, match=said):
       policy.load(path)
+
+
+SHIPPED = sorted(policy.FOLDER.glob(f"*{policy.SUFFIX}"))
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+def test_policies_that_come_along_solve_their_exercise(path):
+  task = policy.load(path).about.task
+  env = suite.load(*task.split("/"), task_kwargs={"random": 7})
+  for _ in range(3):
+    timestep = env.reset()
+    act = performer.make(env, "trained")
+    while not timestep.last():
+      timestep = env.step(act(timestep))
+    assert env.task.outcome == "success"
+  assert (policy.FOLDER / "LICENSE").exists()
+
+
+def test_an_exercise_without_a_policy_says_which_have_one():
+  with pytest.raises(ValueError, match=r"no trained policy comes with sew/easy, .* touch/easy"):
+    policy.shipped("sew/easy")

@@ -12,7 +12,6 @@ import mujoco as mj
 import numpy as np
 import trimesh
 from palpate import Organ
-from palpate.models import situs
 
 from .coupling import Link
 from .pace import Pace
@@ -128,7 +127,7 @@ def _drawn(model: mj.MjModel) -> list[int]:
   """Returns the geoms that are seen; the handle would hide the tip."""
   handles = [model.body(b).name.endswith("handle") for b in range(model.nbody)]
   shown = ~np.array(handles)[model.geom_bodyid]
-  shown &= (model.geom_group < situs.GROUP) & (_colours(model)[:, 3] > 0.05)
+  shown &= (model.geom_group <= 2) & (_colours(model)[:, 3] > 0.05)
   return [int(g) for g in np.flatnonzero(shown)]
 
 
