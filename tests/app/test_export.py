@@ -26,7 +26,7 @@ import pyarrow.parquet as pq  # noqa: E402
 
 SHORT = ["--episodes", "2", "--processes", "1"]
 SEEN = ["--observations", "sensors", "state", "pixels", "--size", "32x48"]
-STILL = "import numpy as np\ndef act(observation): return np.zeros(4)\n"
+IDLE = "import numpy as np\ndef act(observation): return np.zeros(4)\n"
 
 
 def export(*words) -> int:
@@ -219,8 +219,8 @@ def test_what_a_hand_did_live_becomes_a_data_set(tmp_path, capsys):
 
 
 def test_episodes_without_success_are_left_out_or_marked(tmp_path, capsys):
-  (tmp_path / "still.py").write_text(STILL)
-  words = ["touch/easy", "-o", "out", "--performer", "still:act", "--set", "time_limit=0.1"]
+  (tmp_path / "idle.py").write_text(IDLE)
+  words = ["touch/easy", "-o", "out", "--performer", "idle:act", "--set", "time_limit=0.1"]
   words += ["--format", "robomimic", *SHORT]
   assert export(*words) == 1
   assert "no episode succeeded, the first: seed 0 (time limit)" in capsys.readouterr().err
