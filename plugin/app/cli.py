@@ -34,6 +34,7 @@ COMMANDS = {
   ("report",): ("report", "write the page about a recording"),
   ("train",): ("train", "learn an exercise in many worlds at once"),
   ("evaluate",): ("evaluate", "score a policy over many episodes of an exercise"),
+  ("export",): ("export", "make a data set of demonstrations to learn from"),
   ("trainee", "add"): ("trainee.add", "add people to a record"),
   ("trainee", "list"): ("trainee.list", "list the people of a record"),
   ("trainee", "show"): ("trainee.show", "show a person's learning curves and standing"),

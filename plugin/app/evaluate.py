@@ -7,6 +7,7 @@ import collections
 import dataclasses
 import json
 import math
+import os
 import pathlib
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import palpate
 
-from . import options
+from . import options, workers
 from .console import (
   CommandError,
   Interrupt,
@@ -25,7 +26,6 @@ from .console import (
   writing,
 )
 from .trainee import keeping
-from .workers import parallel
 
 if TYPE_CHECKING:
   from palpate.tasks.metrics import Metrics
@@ -59,7 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser):
   add("--policy", metavar="NAME", default="expert", help="module:object, expert, skilled...")
   add("--episodes", metavar="N", type=int, default=10, help="how many (%(default)s)")
   add("--seed", metavar="N", type=int, default=0, help="of the first episode (%(default)s)")
-  add("--processes", metavar="N", type=int, default=1, help="at a time (%(default)s)")
+  workers.add_arguments(parser, 1)
   options.add_argument(parser)
   keeping.add_references(parser)
   add("--json", metavar="FILE", help="write every episode's metrics")
@@ -68,7 +68,8 @@ def add_arguments(parser: argparse.ArgumentParser):
 
 def main(args: argparse.Namespace) -> int:
   """Runs the job and returns its exit code."""
-  check_counts(args, "episodes", "processes")
+  check_counts(args, "episodes")
+  crew = workers.chosen(args)
   palpate.register()
   from palpate.tasks import performer, suite
 
@@ -88,7 +89,7 @@ def main(args: argparse.Namespace) -> int:
   progress, results = Progress(), []
   with Interrupt() as interrupt:
     for result in evaluate(
-      name, args.policy, seeds, args.processes, args.recordings, interrupt, task_kwargs
+      name, args.policy, seeds, crew, args.recordings, interrupt, task_kwargs
     ):
       results.append(result)
       progress.show(f"{len(results)} of {args.episodes}")
@@ -121,43 +122,37 @@ def evaluate(
   name: str,
   policy: str,
   seeds: Sequence[int],
-  processes: int = 1,
+  crew: workers.Workers = workers.HERE,
   recordings: str | None = None,
   interrupt: Interrupt | None = None,
   task_kwargs: Mapping[str, Any] | None = None,
 ) -> Iterator[Result]:
-  """Yields the result of each seed, in order; the processes are spawned, not forked.
+  """Yields the result of each seed, in order.
 
   Args:
     name: of the task, such as "touch/easy"
     policy: see `performer.make`
     seeds: of the episodes
-    processes: at a time
+    crew: who runs them; this process by default
     recordings: folder to keep the recordings in, SEED.npz
     interrupt: once seen, the episodes that run are finished and no more are begun
     task_kwargs: options of the task, JSON
   """
   kwargs = json.dumps(dict(task_kwargs or {}))
-  jobs = [(name, policy, seed, recordings, kwargs) for seed in seeds]
-  done = parallel(perform, jobs, processes, interrupt or Interrupt())
+  folder = recordings and os.path.abspath(recordings)  # workers of a cluster stand elsewhere
+  jobs = [(name, policy, seed, folder, kwargs) for seed in seeds]
+  done = workers.parallel(perform, jobs, crew, interrupt)
   for seed, result in zip(seeds, done, strict=False):  # an interrupt leaves some out
-    died = Result(seed, "error", 0.0, 0.0, error="a process died, and with it what was left")
-    yield result or died
-
-
-_environment: tuple[Any, Any] = (None, None)  # the last one of this process: each takes memory
+    yield result or Result(seed, "error", 0.0, 0.0, error="a process died in it")
 
 
 def perform(job: tuple[str, str, int, str | None, str]) -> Result:
   """Returns the result of an episode; a job is task, policy, seed, recordings' folder, options."""
-  global _environment
   name, policy, seed, folder, kwargs = job
   palpate.register()
   from palpate.tasks import episode, performer
 
-  if _environment[0] != (name, kwargs):
-    _environment = (name, kwargs), options.load(name, json.loads(kwargs))
-  env = _environment[1]
+  env = options.environment(name, kwargs)
   info = {"task_kwargs": json.loads(kwargs), "performer": policy}
   try:
     recording = episode.run(env, performer.make(env, policy, seed), seed, info)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 from typing import Any
 
@@ -47,3 +48,9 @@ def load(name: str, task_kwargs: dict[str, Any]):
     raise CommandError(str(error)) from None
   except TypeError as error:  # an option that no exercise has
     raise CommandError(f"{name}: set: {error}") from None
+
+
+@functools.lru_cache(maxsize=1)  # each takes memory
+def environment(name: str, task_kwargs: str):
+  """Returns the environment of a task with these options as JSON, the last one again."""
+  return load(name, json.loads(task_kwargs))

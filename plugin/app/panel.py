@@ -18,9 +18,9 @@ from typing import Any
 
 import palpate
 
+from . import workers
 from .console import CommandError, Interrupt, Progress, check_counts, output_folder, writing
 from .evaluate import Result, perform
-from .workers import parallel
 
 _SEED = 10_000  # far from the seeds that people and tests use: those stay fresh
 _LEAST = 5  # successes to make a reference of
@@ -36,13 +36,13 @@ def add_arguments(parser: argparse.ArgumentParser):
   add("--performer", metavar="NAME", default="skilled", help="as evaluate's policy (%(default)s)")
   add("--episodes", metavar="N", type=int, default=100, help="of each task (%(default)s)")
   add("--seed", metavar="N", type=int, default=_SEED, help="of the first episode (%(default)s)")
-  count = os.cpu_count() or 1
-  add("--processes", metavar="N", type=int, default=count, help="at a time (%(default)s)")
+  workers.add_arguments(parser, os.cpu_count() or 1)
 
 
 def main(args: argparse.Namespace) -> int:
   """Runs the job and returns its exit code."""
-  check_counts(args, "episodes", "processes")
+  check_counts(args, "episodes")
+  crew = workers.chosen(args)
   palpate.register()
   from palpate.tasks import performer, suite
 
@@ -52,12 +52,12 @@ def main(args: argparse.Namespace) -> int:
   except ValueError as error:
     raise CommandError(str(error)) from None
   out = output_folder("out", args.out)
-  runs = output_folder("runs", pathlib.Path(args.runs) / fingerprint())
+  runs = output_folder("runs", pathlib.Path(args.runs).absolute() / fingerprint())
   seeds = range(args.seed, args.seed + args.episodes)
   jobs = [("/".join(pair), args.performer, seed, str(runs)) for pair in pairs for seed in seeds]
   progress, results = Progress(), []
   with Interrupt() as interrupt:
-    for job, result in zip(jobs, parallel(kept, jobs, args.processes, interrupt), strict=False):
+    for job, result in zip(jobs, workers.parallel(kept, jobs, crew, interrupt), strict=False):
       if result is None:
         raise CommandError("a process died; go on with the same command", code=1)
       results.append(result)

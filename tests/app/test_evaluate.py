@@ -6,7 +6,7 @@ import signal
 import sys
 
 import pytest
-from palpate.app import cli, console, evaluate, panel
+from palpate.app import cli, console, evaluate, panel, workers
 from palpate.tasks import score
 from palpate.tasks.recording import Recording
 
@@ -76,7 +76,7 @@ def test_references_need_successes(tmp_path, capsys):
 
 def test_processes_give_the_same_as_one():
   one = list(evaluate.evaluate("touch/easy", "expert", range(2)))
-  two = list(evaluate.evaluate("touch/easy", "expert", range(2), processes=2))
+  two = list(evaluate.evaluate("touch/easy", "expert", range(2), workers.Processes(2)))
   assert one == two
 
 

@@ -14,6 +14,7 @@ from benchmarks.results import BenchError
 BENCHES = {
   "attacks": "what random attacks break",
   "batch": "world-steps a second of batches, and what a world takes",
+  "cloning": "behaviour cloning: success over the number of demonstrations",
   "error": "run time against error, beside MuJoCo's own flex",
   "experts": "how many of its episodes each expert solves; the references",
   "flicker": "steps without force while a probe presses the organs that ship",
@@ -47,10 +48,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0 if words in (["-h"], ["--help"]) else 2
   importlib.import_module("palpate")  # before MuJoCo: it chooses how to draw without a screen
   from benchmarks import runner
+  from palpate.app.console import CommandError
 
   try:
     return runner.main(importlib.import_module(f"benchmarks.{words[0]}").BENCH, words[1:])
-  except BenchError as error:
+  except (BenchError, CommandError) as error:
     print(f"run.py: {error}", file=sys.stderr)
     return error.code
   except KeyboardInterrupt:

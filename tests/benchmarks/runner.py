@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterator
 
 from benchmarks import results, workers
 from benchmarks.results import BenchError, Row
+from palpate.app.workers import Cluster, Processes
 
 Case = dict
 SEED = 20080401  # of every random draw of the benches
@@ -75,6 +76,8 @@ def options(bench: Bench, words: list[str]) -> argparse.Namespace:
   add("--resume", action="store_true", help="continue: skip what the output folder already has")
   add("--jobs", metavar="N", type=int, default=bench.jobs,
       help="processes, 0 to stay in this one (%(default)s)")  # fmt: skip
+  add("--ray", metavar="ADDRESS", nargs="?", const="",
+      help="on a Ray cluster, or on a cluster of this machine alone; --jobs at a time")  # fmt: skip
   add("--minutes", metavar="M", type=float, default=math.inf,
       help="stop after so long; --resume goes on from there")  # fmt: skip
   add("--draw", action="store_true", help="only draw figures and page from the rows there are")
@@ -179,7 +182,7 @@ def execute(bench: Bench, args: argparse.Namespace) -> bool:
   return finished >= total
 
 
-_COMMON = ("out", "short", "resume", "jobs", "minutes", "draw", "only")
+_COMMON = ("out", "short", "resume", "jobs", "ray", "minutes", "draw", "only")
 
 
 def _work(
@@ -187,8 +190,9 @@ def _work(
 ) -> Iterator[tuple[Case, str, list[Row]]]:
   """Yields (case, status, rows) as cases end."""
   out = args.out.resolve()  # the workers stand elsewhere
-  if args.jobs:
-    yield from workers.work(bench.run, out, cases, args.jobs, deadline, bench.limit)
+  if args.jobs or args.ray is not None:
+    crew = Processes(args.jobs) if args.ray is None else Cluster(args.ray, args.jobs or None)
+    yield from workers.work(bench.run, out, cases, crew, deadline, bench.limit)
     return
   for case in cases:
     if time.monotonic() > deadline:

@@ -8,9 +8,9 @@ import sys
 
 import numpy as np
 import pytest
-from benchmarks import experts, loopholes, results, run, skill
+from benchmarks import cloning, experts, loopholes, results, run, skill
 from palpate.app import panel
-from palpate.tasks import performer, score
+from palpate.tasks import performer, policy, score
 
 HERE = pathlib.Path(__file__).parent
 
@@ -145,3 +145,14 @@ def test_the_kept_agent_learned():
   assert first["policy"] == "random" and int(last["episodes"]) >= 20
   assert float(last["return_mean"]) > float(first["return_mean"]) + 0.5
   assert float(last["success_percent"]) > float(first["success_percent"]) + 50
+
+
+def test_a_clone_does_what_was_done():
+  pytest.importorskip("sklearn")
+  seen = np.random.RandomState(0).normal(size=(4000, 2)) * [1.0, 1e-3] + [5.0, 0.0]
+  done = np.stack([np.tanh(seen[:, 0] - 5), 300 * seen[:, 1]], axis=1).clip(-1, 1)
+  about = policy.About("touch/standard", ["pitch", "yaw"], ["a", "b"], 0.02)
+  made, loss = cloning.learn(seen, done, about, epochs=20)
+  assert loss < 0.01
+  some = np.array([made({"a": row[:1], "b": row[1:]}) for row in seen[:200]])
+  assert np.abs(some - done[:200]).mean() < 0.1
