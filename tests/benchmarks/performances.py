@@ -14,12 +14,13 @@ def arguments(parser: argparse.ArgumentParser):
   """Declares the options of benches of episodes."""
   add = parser.add_argument
   add("--episodes", type=int, help="of each performer (experts 50, skill 10)")
-  add("--runs", default="out/panel", help="episodes, kept, as of palpate panel (%(default)s)")
+  add("--runs", type=pathlib.Path, default=pathlib.Path("out", "panel"),
+      help="episodes, kept, as of palpate panel (%(default)s)")  # fmt: skip
 
 
 def folder(args: argparse.Namespace) -> str:
   """Returns where the episodes of the code as it is are kept."""
-  path = pathlib.Path(args.runs).resolve() / panel.fingerprint()
+  path = args.runs.resolve() / panel.fingerprint()
   path.mkdir(parents=True, exist_ok=True)
   return str(path)
 
