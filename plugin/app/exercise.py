@@ -139,6 +139,9 @@ def _page(args: argparse.Namespace) -> int:
     name = "/".join(suite.split(args.task))
   except ValueError as error:
     raise CommandError(str(error)) from None
+  for option in ("set", "film", "states"):
+    if getattr(args, option):
+      raise CommandError(f"{option} is given with --device {args.device}, whose page has none")
   kept = keeping.read(args, name, pages=True)
   out = pathlib.Path(args.out or "out/live")
   return serve.run(out, device=args.device, task=name, kept=kept)

@@ -385,6 +385,7 @@ def test_what_the_coach_said_and_errors(folder):
     ("exercise touch/easy --trainee Ada", "trainee is 'Ada' without --device NAME: the expert's"),
     ("exercise touch/easy --trainee Ada --device hand --set damage=9", "set is 'damage=9' with"),
     ("exercise touch/easy --trainee Ada --device mouse --set nodes=9", "set is 'nodes=9' with"),
+    ("exercise touch/easy --device mouse --set nodes=9", "set is given with --device mouse"),
     ("exercise touch/easy --device hand --performer expert", "expected one of them"),
     ("exercise touch/easy --trainee Bo --device hand", "no trainee 'Bo' in 'out/record', it has"),
     ("exercise touch/easy --record out/record", "record is given without --trainee"),
