@@ -52,7 +52,7 @@ def add_skin(
   smooth = _smooth(organ, np.reshape(flex.elem, (-1, 3)), levels)
   count = smooth.count
   rest, parent = _rest(flex, bodies)
-  rest = rest[: smooth.weight.shape[1]]  # without vertices that wait for cuts
+  rest = rest[: np.max(flex.elem) + 1]  # without vertices that wait for cuts
   points = smooth(rest)
   above = np.broadcast_to(np.asarray(height, float), (count,))
   points = points + above[:, None] * vertex_normals(points, smooth.elem)
