@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterator
 
 import numpy as np
-from palpate import register, screen
+from palpate import register
 
 from . import film
 from .console import CommandError, Interrupt, Progress, output
@@ -21,7 +21,6 @@ _INK = np.array([0.12, 0.05, 0.05, 1.0], np.float32)  # of edges
 
 def add_arguments(parser: argparse.ArgumentParser):
   """Declares the options."""
-  screen.prepare_gl()  # before MuJoCo is imported
   from . import scenes
 
   scenes.add_arguments(parser)
