@@ -34,8 +34,10 @@ SCENE = Scene(
   surroundings="none",
 )
 # Of the expert: where the tip is over the bed and behind the front before a stroke, how far a
-# stroke goes beyond the front [m], how fast it is [m/s], and how wide a lane is [m].
-_OVER, _BEHIND, _BEYOND, _SPEED, _LANE = 0.0015, 0.006, 0.006, 0.03, 0.006
+# stroke goes beyond the front, how wide a lane is [m], and how fast a stroke and the way back are
+# [m/s]. Back faster, the tip leaves what it held up, and the strip falls on the shaft behind it.
+_OVER, _BEHIND, _BEYOND, _LANE = 0.002, 0.006, 0.006, 0.006
+_SPEED, _BACK = 0.03, 0.015
 
 
 @SUITE.add("benchmarking", "easy")
@@ -165,4 +167,4 @@ class Tease(Freeing):
         yield from p.move(start - 0.025 * along)
       yield from p.move(start)
       yield from p.move(start + far * along, speed=_SPEED)
-      yield from p.move(start, speed=0.04)
+      yield from p.move(start, speed=_BACK)

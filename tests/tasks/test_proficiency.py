@@ -34,6 +34,12 @@ def test_fresh_performers_rank_as_they_should(name):
   assert mean(expert) > mean(people) > mean(novice)
 
 
+def test_the_expert_teases_with_the_tip_alone():
+  env = tasks.load("tease", "easy", task_kwargs={"random": 0})
+  metrics = episode.run(env, performer.make(env), 60).metrics()
+  assert metrics.shaft_contact <= 0.01 and metrics.peak_shaft_force < 0.05
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_every_exercise_has_a_panel_of_skilled_people(name):
   reference = score.reference(name)
