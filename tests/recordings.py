@@ -29,6 +29,8 @@ def exercise(steps=300, instruments=("left", "right"), seed=0):
       shaft_force=np.maximum(0, rng.randn(len(instruments))),
       strain=rng.rand(len(instruments)),
       area=np.full(len(instruments), 2e-5),
+      freed=k / steps,
+      traction=rng.rand(),
       grip=np.full(len(instruments), k % 100 < 60),
       held=np.full(len(instruments), 10 < k % 100 < 40),
       visible=rng.rand(len(instruments)) > 0.1,

@@ -209,7 +209,8 @@ def _bending(
   rigidity = configuration.rigidity(config, mesh.nelem)
   hinge = plate.hinges(mesh, rigidity, config.poisson)
   number, nhinge = rows.numbers(mesh, hinge.half), len(mesh.whole.interior)
-  of_elem = np.where(hinge.of_elem >= 0, number[hinge.of_elem], -1)
+  of_elem = np.full(hinge.of_elem.shape, -1)  # a surface of one triangle has no hinge
+  of_elem[hinge.of_elem >= 0] = number[hinge.of_elem[hinge.of_elem >= 0]]
   out = rows.elements(mesh, np.arange(mesh.nelem), node, of_elem, nhinge)
   dense = rows.hinges(mesh, hinge, node, number)
   # The hinges that padding adds have no gain; nor have those that were cut.
