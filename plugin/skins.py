@@ -56,7 +56,9 @@ def add_skin(
   points = smooth(rest)
   above = np.broadcast_to(np.asarray(height, float), (count,))
   points = points + above[:, None] * vertex_normals(points, smooth.elem)
-  look: dict = {"material": material or flex.material}
+  # MuJoCo 4.0 has a list of them.
+  own = flex.material if isinstance(flex.material, str) else next(iter(flex.material), "")
+  look: dict = {"material": material or own}
   if not material:  # a colour of its own would count, not the material's
     look["rgba"] = flex.rgba
   if texcoord is not None:
