@@ -56,9 +56,7 @@ def add_skin(
   points = smooth(rest)
   above = np.broadcast_to(np.asarray(height, float), (count,))
   points = points + above[:, None] * vertex_normals(points, smooth.elem)
-  # MuJoCo 4.0 has a list of them.
-  own = flex.material if isinstance(flex.material, str) else next(iter(flex.material), "")
-  look: dict = {"material": material or own}
+  look: dict = {"material": material or _material(flex)}
   if not material:  # a colour of its own would count, not the material's
     look["rgba"] = flex.rgba
   if texcoord is not None:
@@ -77,6 +75,11 @@ def add_skin(
   flex.group, config["skin"] = HIDDEN, name
   plugin.config = config
   return name
+
+
+def _material(flex) -> str:
+  """Returns the material of a flex, of which MuJoCo 4.0 has a list."""
+  return flex.material if isinstance(flex.material, str) else next(iter(flex.material), "")
 
 
 def _smooth(organ: str, elem: np.ndarray, levels: int | None) -> subdivide.Smooth:
