@@ -134,6 +134,7 @@ def test_the_page_draws_an_organ(pages):
   assert red.mean() > 0.1
 
 
+@pytest.mark.slow
 def test_too_much_force_and_a_lost_tip_are_seen_and_heard(pages):
   """Each in a colour and with a tone of its own, and noted in the recording."""
   page = pages.page
@@ -154,6 +155,7 @@ def test_too_much_force_and_a_lost_tip_are_seen_and_heard(pages):
   assert any(hint["kind"] == "warning" and "Too much force" in hint["text"] for hint in hints)
 
 
+@pytest.mark.slow
 def test_an_assessment_is_without_help(pages):
   page = pages.page
   page.check("#assessment")
@@ -168,6 +170,7 @@ def test_an_assessment_is_without_help(pages):
   page.uncheck("#assessment")
 
 
+@pytest.mark.slow
 def test_the_expert_is_drawn_on_request(pages):
   page = pages.page
   pages.start()
@@ -181,6 +184,7 @@ def test_the_expert_is_drawn_on_request(pages):
   pages.stop()
 
 
+@pytest.mark.slow
 def test_free_practice_on_the_page(pages):
   """Everything is changed while it runs; the picture turns, moves, scales, shows the mesh."""
   page = pages.page
@@ -214,6 +218,7 @@ def test_free_practice_on_the_page(pages):
   assert page.input_value("#scheme") == "neumann"
 
 
+@pytest.mark.slow
 def test_keys_gamepad_and_buttons_move_the_tip(pages):
   """In the free practice of the test before."""
   page = pages.page
@@ -294,6 +299,7 @@ def test_an_exercise_is_done_through_the_page(pages, tmp_path):
   pages.speed("1")
 
 
+@pytest.mark.slow
 def test_a_program_that_ends_is_named_and_found_again(pages):
   pages.close()
   said = "document.getElementById('fault').textContent.includes('not to be reached')"
