@@ -333,6 +333,33 @@ def settle(model, data, organ, steps=200, still=1e-5):
   raise AssertionError(f"still moving by {moved} m a step after {steps} steps")
 
 
+def beside(coupling, bodies, points=None, elem=None, h=1e-3, gravity=(0, 0, 0), **keys):
+  """Returns model, data and organ of tissue, a ball unless given, beside bodies.
+
+  Args:
+    coupling: `nodal` or `window`
+    bodies: MJCF
+    points: (nvert, 3)
+    elem: triangles
+    h: time step
+    gravity: of the world
+    **keys: the plugin's
+  """
+  if points is None:
+    points, elem = sphere(2)
+  if coupling == "window":
+    body = windowed(points, elem, **keys) + ball(1.0, joint=False)
+  else:
+    body = organ(points, elem, **keys)
+  return load(world(body + bodies, h=h, gravity=gravity))
+
+
+def masses(organ):
+  """Returns the mass of each vertex, (nvert,)."""
+  windows = workspace(organ).organ.windows
+  return organ.model.body_mass[bodies(organ)] if windows is None else windows.mass
+
+
 # Kernels without MuJoCo.
 
 

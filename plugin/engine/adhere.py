@@ -57,15 +57,10 @@ def declare_between(spaces: list) -> list:
   Returns:
     those whose graphs have to be recorded anew
   """
-  named = {w.organ.name: w for w in spaces}
   changed = []
-  for w in spaces:
-    for row in w.config.bonds or ():
-      other = named.get(flexes.resolve(row.to, w.organ.name, list(named)) or "")
-      if other is None or spaces[-1] not in (w, other):
-        continue
-      w.bonds.put(to_organ(w, other, row.law, row.near, row.vertices, now=False))
-      changed += [w, other]
+  for w, other, row in flexes.named(spaces, lambda c: [(b.to, b) for b in c.bonds or ()]):
+    w.bonds.put(to_organ(w, other, row.law, row.near, row.vertices, now=False))
+    changed += [w, other]
   return changed
 
 

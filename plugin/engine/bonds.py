@@ -208,4 +208,3 @@ class Bonds(Beside):
     """See `Beside`."""
     for group in self.groups:
       group.launch(_keep)
-

@@ -39,17 +39,15 @@ def declare_between(spaces: list) -> list:
   Returns:
     those whose graphs have to be recorded anew
   """
-  named = {w.organ.name: w for w in spaces}
   changed = []
-  for w in spaces:
-    for name, stiffness, vertices in w.config.attach:
-      other = named.get(flexes.resolve(name, w.organ.name, list(named)) or "")
-      if other is None or other is w or spaces[-1] not in (w, other):
-        continue
-      pair = to_organ(w, check_vertices(w, vertices), other, stiffness, now=False)
-      for space, group in zip((w, other), pair, strict=True):
-        space.ties.put([*space.ties.groups, group])
-        changed.append(space)
+  for w, other, row in flexes.named(spaces, lambda c: [(a[0], a) for a in c.attach]):
+    if other is w:
+      continue
+    _, stiffness, vertices = row
+    pair = to_organ(w, check_vertices(w, vertices), other, stiffness, now=False)
+    for space, group in zip((w, other), pair, strict=True):
+      space.ties.put([*space.ties.groups, group])
+      changed.append(space)
   return changed
 
 

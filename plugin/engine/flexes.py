@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import mujoco
@@ -118,6 +119,27 @@ def resolve(name: str, organ: str, names: list[str]) -> str | None:
   prefixes = [other[: len(other) - len(name)] for other in names if other.endswith(name)]
   prefixes = [prefix for prefix in prefixes if organ.startswith(prefix)]
   return max(prefixes, key=len) + name if prefixes else None
+
+
+def named(
+  spaces: list, rows: Callable[[Any], Iterable[tuple[str, Any]]]
+) -> Iterator[tuple[Any, Any, Any]]:
+  """Yields where the configuration of an organ names an organ of the same mjData, maybe itself.
+
+  Args:
+    spaces: workspaces of the organs that there are so far; where the last one has no part is left
+      out, since that was found before
+    rows: returns the names in a configuration, each with what it says of them
+
+  Yields:
+    the workspace of the one, that of the other, and what is said
+  """
+  known = {w.organ.name: w for w in spaces}
+  for w in spaces:
+    for name, row in rows(w.config):
+      other = known.get(resolve(name, w.organ.name, list(known)) or "")
+      if other is not None and spaces[-1] in (w, other):
+        yield w, other, row
 
 
 def pack(elem: np.ndarray, loose: np.ndarray | None = None) -> np.ndarray:

@@ -199,16 +199,13 @@ def meet(spaces: list) -> list:
   Returns:
     those whose graphs have to be recorded anew, in this order
   """
-  named = {w.organ.name: w for w in spaces}
   changed = []
-  for w in spaces:
-    for name in w.config.support:
-      other = named.get(flexes.resolve(name, w.organ.name, list(named)) or "")
-      if other is not None and other is not w and spaces[-1] in (w, other):
-        w.rests.below.append(other)
-        other.rests.above.append(w)
-        other.hold.need()
-        changed += [w, other]
+  for w, other, _ in flexes.named(spaces, lambda c: [(name, None) for name in c.support]):
+    if other is not w:
+      w.rests.below.append(other)
+      other.rests.above.append(w)
+      other.hold.need()
+      changed += [w, other]
   return changed
 
 

@@ -18,21 +18,7 @@ CART = """<body name="cart"><joint name="x" type="slide" axis="1 0 0"/>
 @pytest.fixture(params=["nodal", "window"])
 def make(request, scenes):
   """Returns a function that returns model, data and organ of a ball of tissue beside bodies."""
-
-  def made(bodies, h=1e-3, gravity=(0, 0, 0), **keys):
-    points, elem = scenes.sphere(2)
-    if request.param == "window":
-      body = scenes.windowed(points, elem, **SOFT | keys) + scenes.ball(1.0, joint=False)
-    else:
-      body = scenes.organ(points, elem, **SOFT | keys)
-    return scenes.load(scenes.world(body + bodies, h=h, gravity=gravity))
-
-  return made
-
-
-def _masses(organ, scenes):
-  windows = scenes.workspace(organ).organ.windows
-  return organ.model.body_mass[scenes.bodies(organ)] if windows is None else windows.mass
+  return lambda bodies, **keys: scenes.beside(request.param, bodies, **SOFT | keys)
 
 
 def _top(organ):
@@ -49,7 +35,7 @@ def test_an_organ_and_a_free_body_tied_together_keep_their_momentum(make, scenes
   grip = organ.attach(_top(organ), "hook", stiffness=500)
   dof, adr = model.joint("free").dofadr[0], model.joint("free").qposadr[0]
   data.qvel[dof : dof + 3] = 0.5, 0, 0.5
-  mass = _masses(organ, scenes)
+  mass = scenes.masses(organ)
   pulls = []
   for _ in range(300):
     mujoco.mj_step(model, data)
@@ -89,7 +75,7 @@ def test_a_declared_attachment_holds_what_hangs_from_it(make, scenes):
   for _ in range(1500):
     mujoco.mj_step(model, data)
   # The spring of the slide carries both.
-  weight = 9.81 * (0.5 + _masses(organ, scenes).sum())
+  weight = 9.81 * (0.5 + scenes.masses(organ).sum())
   assert 1000 * -_place(model, data, "s") == pytest.approx(weight, rel=0.01)
   assert organ.xpos[:, 2].max() > 0 and organ.error is None
 
@@ -174,7 +160,7 @@ def test_a_foundation_of_its_own_motion_lets_an_organ_fall_and_turn(make, scenes
   organ.set_state(xvel=np.cross(spin, organ.xpos0) + np.array([0.1, 0, 0]))
   for _ in range(200):
     mujoco.mj_step(model, data)
-  mass = _masses(organ, scenes)[:, None]
+  mass = scenes.masses(organ)[:, None]
   middle, vel = ((mass * each).sum(0) / mass.sum() for each in (organ.xpos, organ.xvel))
   np.testing.assert_allclose(vel, [0.1, 0, -9.81 * 0.2], atol=2e-3)
   now = np.cross(organ.xpos - middle, mass * (organ.xvel - vel)).sum(0)

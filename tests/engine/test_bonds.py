@@ -20,22 +20,9 @@ BED = """<body name="bed" pos="0 0 -0.0605"><geom name="bed" type="box" size="0.
 @pytest.fixture(params=["nodal", "window"])
 def make(request, scenes):
   """Returns a function that returns model, data and organ of tissue beside bodies."""
-
-  def made(bodies=HAND, points=None, elem=None, h=1e-3, gravity=(0, 0, 0), **keys):
-    if points is None:
-      points, elem = scenes.sphere(2)
-    if request.param == "window":
-      body = scenes.windowed(points, elem, **SOFT | keys) + scenes.ball(1.0, joint=False)
-    else:
-      body = scenes.organ(points, elem, **SOFT | keys)
-    return scenes.load(scenes.world(body + bodies, h=h, gravity=gravity))
-
-  return made
-
-
-def _masses(organ, scenes):
-  windows = scenes.workspace(organ).organ.windows
-  return organ.model.body_mass[scenes.bodies(organ)] if windows is None else windows.mass
+  return lambda bodies=HAND, *shape, **keys: scenes.beside(
+    request.param, bodies, *shape, **SOFT | keys
+  )
 
 
 def _lift(model, data, organ, grip, speed, height):
@@ -107,7 +94,7 @@ def test_an_organ_and_a_free_body_bonded_together_keep_their_momentum(make, scen
   for _ in range(200):
     mujoco.mj_step(model, data)
   assert 0.1 < organ.bonds.damage.mean()
-  momentum = (_masses(organ, scenes)[:, None] * organ.xvel).sum(0)
+  momentum = (scenes.masses(organ)[:, None] * organ.xvel).sum(0)
   momentum += 0.5 * data.qvel[dof : dof + 3]
   np.testing.assert_allclose(momentum, [0.05, 0, 0.1], atol=2e-5)
   assert np.isfinite(data.qpos[adr]) and organ.error is None
