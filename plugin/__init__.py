@@ -6,6 +6,7 @@ MJCF is then a deformable organ in `mujoco.mj_step` and everything that is built
 
 from __future__ import annotations
 
+import importlib as _importlib
 import os as _os
 import sys as _sys
 from typing import TYPE_CHECKING
@@ -26,6 +27,8 @@ __all__ = [
   "register",
 ]
 __version__ = "0.1.0"
+# Modules of what `register` brings.
+_BROUGHT = {"Organ": "organ", "add_skin": "skins", "add_spare": "windows", "add_windows": "windows"}
 
 
 def register() -> int:
@@ -39,22 +42,19 @@ def register() -> int:
   from . import screen
 
   screen.prepare_gl()  # before MuJoCo is imported
-  from . import organ, skins, windows
   from .engine import plugin
   from .tissue import device
 
   if "Organ" not in globals():
-    globals()["Organ"] = organ.Organ
-    globals()["add_windows"] = windows.add_windows
-    globals()["add_spare"] = windows.add_spare
-    globals()["add_skin"] = skins.add_skin
+    for name, module in _BROUGHT.items():
+      globals()[name] = getattr(_importlib.import_module(f".{module}", __name__), name)
     device.lower_log_level()
   return plugin.register()
 
 
 def __getattr__(name: str):
   """Brings what is asked for first: `add_organ`, with what reads meshes, and in the command all."""
-  if name in ("Organ", "add_skin", "add_spare", "add_windows"):
+  if name in _BROUGHT:
     register()
     return globals()[name]
   if name != "add_organ":
