@@ -253,30 +253,33 @@ def _rates(rows: list[Row], out: pathlib.Path) -> pathlib.Path:
 
 
 def _traces(rows: list[Row], out: pathlib.Path) -> pathlib.Path:
+  """Draws a panel a scheme and size; the CPU's lines, and dots of CUDA, which lie on them."""
   traces = [r for r in rows if r["kind"] == "trace"]
-  kinds = [w for w in _COLOURS if any((r["scheme"], r["device"]) == w for r in traces)]
   sides = sorted({r["side"] for r in traces})
-  figure, axes = plots.grid(max(1, len(kinds)), max(1, len(sides)), 3.2 * max(1, len(sides)),
-                            2.2 * max(1, len(kinds)) + 0.4)  # fmt: skip
-  axes = np.reshape(axes, (max(1, len(kinds)), -1))
-  for line, which in zip(axes, kinds, strict=False):
-    for ax, side in zip(line, sides, strict=True):
-      mine = [r for r in traces if (r["scheme"], r["device"], r["side"]) == (*which, side)]
-      cycles = [r["cycle"] for r in mine]
+  figure, axes = plots.grid(len(SCHEMES), max(1, len(sides)), 3.2 * max(1, len(sides)), 7.0)
+  for line, scheme in zip(axes.reshape(len(SCHEMES), -1), SCHEMES, strict=True):
+    for ax, side in zip(line, sides, strict=False):
       right = ax.twinx()
-      for axis, style in (("", "-"), ("_x", "--")):
-        ax.plot(cycles, [r[f"node{axis}_mm"] for r in mine], style, color="#2f6f9f", lw=1.4)
-        right.plot(cycles, [r[f"force{axis}_N"] for r in mine], style, color="#c1442e", lw=1.2)
+      for device, marks in (("cpu", ("-", "--")), ("cuda", (".", "."))):
+        mine = [
+          r for r in traces if (r["scheme"], r["device"], r["side"]) == (scheme, device, side)
+        ]
+        cycles = [r["cycle"] for r in mine]
+        for axis, mark in zip(("", "_x"), marks, strict=True):
+          ax.plot(cycles, [r[f"node{axis}_mm"] for r in mine], mark, color="#2f6f9f", lw=1.4, ms=3)
+          right.plot(
+            cycles, [r[f"force{axis}_N"] for r in mine], mark, color="#c1442e", lw=1.2, ms=3
+          )
       right.tick_params(labelsize=8)
       right.spines["top"].set_visible(False)
-      ax.set_title(f"{which[0]}, {which[1]}, {side} x {side}", loc="left", fontsize=9)
+      ax.set_title(f"{scheme}, {side} x {side}", loc="left", fontsize=9)
       if side == sides[0]:
         ax.set_ylabel("pulled node [mm]", color="#2f6f9f", fontsize=7)
       if side == sides[-1]:
         right.set_ylabel("force [N]", color="#c1442e", fontsize=8)
-      if which == kinds[-1]:
+      if scheme == SCHEMES[-1]:
         ax.set_xlabel("haptic cycle", fontsize=8)
-  about = "Displacement and force of the pulled node, up and (dashed) across (figures 7.6-7.14)"
+  about = "The pulled node, up and (dashed) across; dots: CUDA (figures 7.6-7.14)"
   return plots.save(figure, out / "thesis_trace.png", about)
 
 
