@@ -20,9 +20,24 @@ PALPATE V fastest(const Fields& f, const float* vel, int s, Lane lane) {
   return most;
 }
 
+// Whether the nodes are so slow that no edge changes by more than AHEAD in a step, whichever way
+// they move: seen without neighbours, and nearly always so. Not where threads share the nodes.
+template <class Fields>
+PALPATE bool slow(const Fields& f, const float* vel, float h) {
+  if (BLOCKS) return false;
+  V most = splat(0.0f);
+  for (int s = 0; s < f.shape.nslice; ++s) {
+    const V3 v = ld3(vel + 24 * s, Lane());
+    most = vmax(most, dot(v, v));
+  }
+  const float speed = AHEAD * f.shape.shortest / (2.0f * h);
+  return !any_above(most, speed * speed);
+}
+
 template <class Fields>
 PALPATE void edge_change(const Fields& f, Thread t, int) {
   const float* vel = f.state.vel.data + 24 * (size_t)t.world * f.shape.nslice;
+  if (slow(f, vel, f.state.step.data[4 * t.world])) return;
   each_slice(t, f.shape.nslice, [&](int s, Lane lane) {
     put_most(f.system.change.data + t.world, fastest(f, vel, s, lane));
   });

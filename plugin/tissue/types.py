@@ -116,6 +116,7 @@ class Shape:
   nslot: int  # rows of stiffness blocks
   closed: int  # whether the surface encloses a volume
   volume0: float  # rest volume [m^3]; 0 for an open surface
+  shortest: float  # no edge is shorter at rest [m]; 0 where cuts may come
   vert: ints("nnode")  # vertex of each node, -1 for padding
   node: ints("nvert")  # node of each vertex
   slot_adr: ints("nslice + 1")  # first row of stiffness blocks
