@@ -64,7 +64,8 @@ template <class Fields>
 PALPATE void stay(const Fields& f, Thread t, int) {
   each_slice(t, f.shape.nslice, [&](int s, Lane lane) {
     const size_t at = (size_t)t.world * f.shape.nslice + s;
-    stand(f, at, ld3(f.state.disp.data + 24 * at, lane), ld3(f.state.vel.data + 24 * at, lane), lane);
+    const V3 u = ld3(f.state.disp.data + 24 * at, lane);
+    stand(f, at, u, ld3(f.state.vel.data + 24 * at, lane), lane);
   });
 }
 

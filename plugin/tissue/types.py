@@ -199,8 +199,8 @@ class System:
   hinge_moment: floats("nworld", "nhingeslice", 8)  # moment impulse [N m s]
   hinge_rough: floats("nworld", "nhingeslice", 8)  # what the bending matrix may leave out [N m]
   tet_strain: floats("nworld", "ntetslice", 8)  # impulse of the change of volume [s]
-  node_disp: floats("nworld", "nsolidslice", 4, 8)  # `disp_trial` as shared vectors [m]
-  node_vel: floats("nworld", "nsolidslice", 4, 8)  # `vel_trial` as shared vectors [m/s]
+  node_disp: floats("nworld", "nsolidslice", 4, 8)  # that of `disp_trial`, as shared vectors [m]
+  node_vel: floats("nworld", "nsolidslice", 4, 8)  # that of `vel_trial`, as shared vectors [m/s]
   node_pressure: floats("nworld", "nsolidslice", 8)  # averaged pressure impulse [Pa s]
   tet_impulse: floats("nworld", "ntetslice", 16, 8)  # impulse on each corner [N s]
   tet_arm: floats("nworld", "ntetslice", 16, 8)  # turned gradient of each corner [kg^(1/2)], moduli
