@@ -17,6 +17,7 @@ SAMPLE = 1e-2  # between compared positions [s]; a multiple of every time step
 ELEMENTS = {
   "membrane": Tissue(),
   "spring": Tissue(elements="spring", stiffness=60.0),
+  "solid": Tissue(elements="solid", young=1e4, poisson=0.45, mass=0.5),
 }
 
 
@@ -74,7 +75,7 @@ SCRIPTS = {
 def config_of(elements: str) -> Config:
   """Returns the configuration of one of ELEMENTS."""
   t = ELEMENTS[elements]
-  return Config(**{k: v for k, v in t.keys().items() if k != "young"}, young=(t.young,))
+  return Config(**{"bend": 0} | t.keys() | {"young": (t.young,)})
 
 
 def build(case: Case, scheme: str, h: float, **keys) -> mujoco.MjModel:
