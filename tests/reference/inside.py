@@ -30,6 +30,7 @@ class Inside:
     tet = self.mesh.tet
     self.volume = fill.volumes(self.mesh.rest, tet)
     self.gradient = solid.gradients(self.mesh)
+    self._weighed = self.volume[:, None, None] * self.gradient
     self.mu, self.lam, averaged = solid.moduli(self.mesh, config)
     share = np.repeat(self.volume / 4, 4)
     shape = (self.mesh.nvert, len(tet))
@@ -46,9 +47,9 @@ class Inside:
     """Returns elastic force and damping on each node [N], (nvert, 3)."""
     beta = self.config.damping
     tet = self.mesh.tet
-    slope, rate = (np.einsum("tki,tkj->tij", x[tet], self.gradient) for x in (u, v))
+    slope, rate = (x[tet].transpose(0, 2, 1) @ self.gradient for x in (u, v))
     F = slope + np.eye(3)
-    C = np.stack([np.cross(F[:, k - 2], F[:, k - 1]) for k in range(3)], axis=1)
+    C = _cofactors(F)
     j = (F[:, 0] * C[:, 0]).sum(axis=1) - 1
     i = (F * F).sum(axis=(1, 2)) - 3
     mu, lam = self.mu[:, None, None], self.lam[:, None, None]
@@ -63,12 +64,24 @@ class Inside:
     moving = 0.75 * mu * (strain + strain.transpose(0, 2, 1))
     moving += (lam - 0.625 * mu) * trace * np.eye(3)
     stress += beta * Q @ moving
-    corner = np.einsum("t,tij,tkj->tki", self.volume, stress, self.gradient).reshape(-1, 3)
+    corner = (self._weighed @ stress.transpose(0, 2, 1)).reshape(-1, 3)
     return -(self._sum @ corner) - self.foundation * (u + beta * v)
+
+
+def _cofactors(F: np.ndarray) -> np.ndarray:
+  """Returns det(F) F^-T, (n, 3, 3)."""
+  (a, b, c), (d, e, f), (g, h, i) = (F[:, k].T for k in range(3))
+  rows = (e * i - f * h, f * g - d * i, d * h - e * g, c * h - b * i, a * i - c * g,
+          b * g - a * h, b * f - c * e, c * d - a * f, a * e - b * d)  # fmt: skip
+  return np.stack(rows, axis=1).reshape(-1, 3, 3)
 
 
 def _turns(F: np.ndarray) -> np.ndarray:
   """Returns the rotation nearest to each matrix, (n, 3, 3), by Newton's iteration."""
   for _ in range(_TURNS):
-    F = 0.5 * (F + np.linalg.inv(F).transpose(0, 2, 1))
+    C = _cofactors(F)
+    step = 0.5 * (C / (F[:, 0] * C[:, 0]).sum(axis=1)[:, None, None] - F)
+    F = F + step
+    if np.abs(step).max() < 1e-9:  # the next one would be of its square
+      break
   return F
