@@ -51,8 +51,8 @@ def fill(organ: str, mesh: Mesh) -> Mesh:
     mesh: its surface
 
   Raises:
-    ValueError: the surface encloses nothing, or its triangles are faces of no Delaunay
-      tetrahedra.
+    ValueError: the surface encloses nothing, its triangles are faces of no Delaunay tetrahedra, or
+      it has no room for these.
   """
   if not mesh.closed:
     raise ValueError(f"organ {organ!r}: elements is 'solid', expected a closed surface")
@@ -62,6 +62,12 @@ def fill(organ: str, mesh: Mesh) -> Mesh:
       f"organ {organ!r}: elements is 'solid', and triangle {missing} (vertices "
       f"{mesh.elem[missing].tolist()}) cannot be the face of a tetrahedron; expected a surface of "
       "even triangles that does not cut itself: `palpate wrap` makes one"
+    )
+  bare = np.setdiff1d(np.arange(mesh.nvert), tet)
+  if bare.size:
+    raise ValueError(
+      f"organ {organ!r}: elements is 'solid', and at vertex {bare[0]} there is no room for "
+      "tetrahedra; expected a surface that is thicker than a hundredth of its edges"
     )
   return joined(mesh, np.frombuffer(inner).reshape(-1, 3), tet)
 

@@ -131,6 +131,12 @@ def test_a_surface_that_cuts_itself_has_no_inside(scenes):
     fill.fill("organ", topology.build("organ", points, elem))
 
 
+def test_a_surface_as_thin_as_paper_has_no_room_inside(scenes):
+  points, elem = scenes.sphere(2)
+  with pytest.raises(ValueError, match=r"'organ'.* at vertex \d+ there is no room for tetrahedra"):
+    fill.fill("organ", topology.build("organ", points * [1, 1, 1e-4], elem))
+
+
 def test_an_open_surface_has_no_inside(scenes):
   points, elem = scenes.strip(0.1, 0.05, 4, 3)
   with pytest.raises(ValueError, match="expected a closed surface"):
