@@ -152,6 +152,7 @@ def _change(w, model: int, config: Config):
   with graphs.lock:
     if material:
       shape.change(w.body, w.organ.mesh, config, ~w.organ.free)
+      w.cuts.forget()
     else:
       shape.renumber(w.body, config, w.organ.mesh.closed or not w.cuts)
     w.creep.renumber(config)

@@ -175,6 +175,11 @@ class Cuts:
     w.phases.reshape(touched)
     w.ties.reshape()
 
+  def forget(self):
+    """Forgets what the body's arrays hold: the material has changed."""
+    if self:
+      self._refill.forget()
+
   def spread(self):
     """Tells the coupling what nodes there are now, and their masses."""
     if self:

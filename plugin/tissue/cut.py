@@ -95,7 +95,8 @@ def cut(
   rest[moved] = np.einsum("nk,nkj->nj", weight, mesh.rest[corner])
   elem, group, member = _split(mesh, edges)
   rest[member] = rest[group]
-  new, touched = topology.recut(mesh, rest, elem, mesh.loose)
+  near = topology.around(mesh, np.union1d(np.array(sorted(there), int), moved))
+  new, touched = topology.recut(mesh, rest, elem, mesh.loose, near)
   if any(_may_separate(run, group) for run in runs):
     new = topology.come_loose(new)
   path = _lines(rest, edges)
@@ -182,31 +183,34 @@ def _shares(mesh: Mesh, vert, elem, weight, u: np.ndarray, energy: Energy | None
   So far that no triangle gets thin or turns, and that the energy around none rises: a vertex gets
   the displacement of where it goes to, and an uneven strain is another one after it.
   """
-  around = mesh.ring_elem[vert]
-  tri = np.unique(around[around >= 0] // 3)
-  before = mesh.rest[mesh.elem[tri]]
+  tri = topology.around(mesh, vert)
+  own, corner = np.unique(mesh.elem[tri], return_inverse=True)
+  corner = corner.reshape(-1, 3)
+  number = np.searchsorted(own, vert)
+  rest0, u0 = mesh.rest[own], u[own]
+  before = rest0[corner]
   normal, shape = _form(before)
   least = np.minimum(_SHAPE, _KEEP * shape)
   way, lead = (
     np.einsum("nk,nkj->nj", weight, values[mesh.elem[elem]]) - values[vert]
     for values in (mesh.rest, u)
   )
-  had = np.zeros(0) if energy is None else energy(before, u[mesh.elem[tri]], tri)
+  had = np.zeros(0) if energy is None else energy(before, u0[corner], tri)
   share = np.ones(len(vert))
-  number = np.full(mesh.nvert, -1)
-  number[vert] = np.arange(len(vert))
+  mover = np.full(len(own), -1)
+  mover[number] = np.arange(len(vert))
+  who = mover[corner]
   for k in range(_TRIES + 1):
-    rest = mesh.rest.copy()
-    rest[vert] += share[:, None] * way
-    turned, now = _form(rest[mesh.elem[tri]])
+    rest = rest0.copy()
+    rest[number] += share[:, None] * way
+    turned, now = _form(rest[corner])
     bad = (now < least) | ((turned * normal).sum(1) < _TURN)
-    who = number[mesh.elem[tri]]
     less = np.unique(who[bad])
     if energy is not None:
-      moved, fine = u.copy(), ~bad
-      moved[vert] += share[:, None] * lead
-      corner, has = mesh.elem[tri[fine]], had.copy()
-      has[fine] = energy(rest[corner], moved[corner], tri[fine])
+      moved, fine = u0.copy(), ~bad
+      moved[number] += share[:, None] * lead
+      has = had.copy()
+      has[fine] = energy(rest[corner[fine]], moved[corner[fine]], tri[fine])
       old, new = (np.bincount(who.ravel() + 1, np.repeat(e, 3), len(vert) + 1) for e in (had, has))
       less = np.union1d(less, np.flatnonzero(new > _RISE * old) - 1)
     less = less[less >= 0]

@@ -15,6 +15,7 @@ _STEP = 0.25  # between samples of the path, in edges
 _OFF = 2.0  # edges from the surface from which a point is off it
 _WAY = 8.0  # edges between vertices that the chain must pass
 _RIM = 0.5  # edges: a cut that ends closer to a boundary opens it
+_BOX = 3.0  # edges from the path within which they are found sooner
 _NEAR = 6  # vertices nearest to a point around which its triangle is looked for
 
 
@@ -93,8 +94,7 @@ def nearest(
   Returns:
     triangles (n,), weights of their corners (n, 3), distances [m] (n,)
   """
-  used = mesh.nouter
-  _, near = spatial.KDTree(position[:used]).query(points, k=min(_NEAR, used))
+  near = _nearest_vertices(mesh, position[: mesh.nouter], points)
   around = mesh.ring_elem[near].reshape(len(points), -1)
   elem = np.where(around >= 0, around // 3, around.max(axis=1, keepdims=True) // 3)
   corner = position[mesh.elem[elem]]
@@ -102,6 +102,18 @@ def nearest(
   best = np.argmin(far, axis=1)
   row = np.arange(len(points))
   return elem[row, best], weight[row, best], far[row, best]
+
+
+def _nearest_vertices(mesh: Mesh, position: np.ndarray, points: np.ndarray) -> np.ndarray:
+  """Returns the few positions nearest to points, looked for in a box around them first."""
+  count, room = min(_NEAR, len(position)), _BOX * mesh.whole.edge_length
+  low, high = points.min(axis=0) - room, points.max(axis=0) + room
+  box = np.flatnonzero(((position >= low) & (position <= high)).all(axis=1))
+  if len(box) >= count:
+    far, near = spatial.KDTree(position[box]).query(points, k=count)
+    if far.max() <= room:
+      return box[near].reshape(len(points), -1)
+  return spatial.KDTree(position).query(points, k=count)[1].reshape(len(points), -1)
 
 
 def closest(p, a, b, c) -> tuple[np.ndarray, np.ndarray]:
