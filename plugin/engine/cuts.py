@@ -159,9 +159,9 @@ class Cuts:
     for name, values in kept.items():
       self._own[name][:] = values
 
-  def _write(self):
+  def _write(self, corner: np.ndarray):
     own, mesh = self._own, self.mesh
-    own["corner"][:] = flexes.pack(mesh.elem, mesh.loose)
+    own["corner"][:] = corner
     own["place"][:] = mesh.rest.ravel()
     own["weight"][:] = self.mass
     own["source"][:] = self.source[mesh.nvert - mesh.spare :]
@@ -170,6 +170,7 @@ class Cuts:
   def _become(self, mesh: Mesh, touched: np.ndarray, mass, source, stamp: float):
     w = self._w
     self._refill.write(mesh, touched, w.config, ~w.organ.free)
+    touched = np.union1d(touched, np.flatnonzero(mass != self.mass))
     self.mass, self.source, self.stamp = mass, source, stamp
     w.organ = dataclasses.replace(self.declared, mesh=mesh, mass=mass)
     w.phases.reshape(touched)
@@ -250,9 +251,9 @@ class Cuts:
     was, goes = (old.rest + u)[near], (mesh.rest + now)[near]
     speed[near] = _keep_spin(self.mass[near], was, goes, v[near])
     now[member], speed[member] = now[group], speed[group]
-    stamp = flexes.stamp(flexes.pack(mesh.elem, mesh.loose), mesh.rest, mass)
-    self._become(mesh, found.touched, mass, source, stamp)
-    self._write()
+    corner = flexes.pack(mesh.elem, mesh.loose)
+    self._become(mesh, found.touched, mass, source, flexes.stamp(corner, mesh.rest, mass))
+    self._write(corner)
     changed = np.unique(np.concatenate([near, member]))
     w.phases.carry(changed, now, speed, group, member, share)
     self.show()

@@ -144,8 +144,9 @@ def named(
 
 def pack(elem: np.ndarray, loose: np.ndarray | None = None) -> np.ndarray:
   """Returns corners of triangles and a mark as one number each, exact in a double, (nelem,)."""
-  packed = (elem.astype(np.int64) << (_BITS * np.arange(3))).sum(axis=1)
-  return (packed if loose is None else packed + (loose.astype(np.int64) << 3 * _BITS)).astype(float)
+  a, b, c = elem.T.astype(float)
+  packed = a + 2.0**_BITS * (b + 2.0**_BITS * c)
+  return packed if loose is None else packed + 2.0 ** (3 * _BITS) * loose
 
 
 def unpack(packed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -86,7 +86,8 @@ def cut(
   edge = mesh.whole.edge_length
   runs = paths.trace(organ, mesh, position, points, edge)
   for run in runs:
-    run.chain = paths.chain(mesh, run, edge)
+    if not run.open:
+      run.chain = paths.chain(mesh, run, edge)
   _check(organ, runs, pinned)
   edges, stopped = _room(mesh, [pair for run in runs for pair in _uncut(mesh, run.chain)])
   there = {v for pair in edges for v in pair}
@@ -108,7 +109,7 @@ def cut(
 
 
 def _check(organ: str, runs: list[paths.Run], pinned: np.ndarray):
-  if not any(len(run.chain) > 2 for run in runs):
+  if not any(run.open or len(run.chain) > 2 for run in runs):
     raise ValueError(
       f"organ {organ!r}: the path is shorter than two edges of the mesh there, expected a longer "
       "one"
@@ -251,7 +252,8 @@ def _fans(mesh: Mesh, vert: int, cuts: set[tuple[int, int]]) -> list[list[int]]:
 
 def _may_separate(run: paths.Run, group: np.ndarray) -> bool:
   """Returns whether a cut along a run may make two pieces: not where an end of it is inside."""
-  return run.closes or bool(np.isin(run.chain[:1] + run.chain[-1:], group).all())
+  ends = {run.chain[0], run.chain[-1]} if run.chain else {-1}
+  return run.closes or ends <= set(group.tolist())
 
 
 def _uncut(mesh: Mesh, chain: list[int]) -> list[tuple[int, int]]:

@@ -9,22 +9,31 @@ import numpy as np
 from scipy import sparse, spatial
 from scipy.sparse import csgraph
 
-from .mesh import Mesh
+from .mesh import Mesh, corners
 
 _STEP = 0.25  # between samples of the path, in edges
 _OFF = 2.0  # edges from the surface from which a point is off it
 _WAY = 8.0  # edges between vertices that the chain must pass
 _RIM = 0.5  # edges: a cut that ends closer to a boundary opens it
+_ALONG = 0.2  # edges from an older cut within which a path goes along it
 _BOX = 3.0  # edges from the path within which they are found sooner
 _NEAR = 6  # vertices nearest to a point around which its triangle is looked for
 
 
 @dataclasses.dataclass
 class Run:
-  """A part of a path without gaps: samples at rest (n, 3), their triangles, chain of vertices."""
+  """A part of a path without gaps.
+
+  Attributes:
+    at: samples at rest [m]      (n, 3)
+    elem: their triangles        (n,)
+    open: whether they lie along an older cut, so that there is nothing to cut
+    chain: the vertices along which it is cut
+  """
 
   at: np.ndarray
   elem: np.ndarray
+  open: bool = False
   chain: list[int] = dataclasses.field(default_factory=list)
 
   @property
@@ -53,8 +62,10 @@ def trace(organ: str, mesh: Mesh, position, points, edge: float) -> list[Run]:
   at = np.einsum("nk,nkj->nj", weight, mesh.rest[mesh.elem[elem]])
   # Where the path crosses an older cut, or leaps, it begins anew.
   leap = np.linalg.norm(np.diff(at, axis=0), axis=1) > 2 * edge
-  parts = np.flatnonzero(leap | _crosses(mesh, elem)) + 1
-  runs = [Run(a, e) for a, e in zip(np.split(at, parts), np.split(elem, parts), strict=True)]
+  is_open = _is_open(mesh, elem, at, edge)
+  new = leap | (_crosses(mesh, elem) & ~is_open[1:]) | (is_open[1:] != is_open[:-1])
+  parts = np.split(np.arange(len(elem)), np.flatnonzero(new) + 1)
+  runs = [Run(at[part], elem[part], bool(is_open[part[0]])) for part in parts]
   return [run for run in runs if len(run.at) > 1]
 
 
@@ -79,6 +90,23 @@ def _crosses(mesh: Mesh, elem: np.ndarray) -> np.ndarray:
     return (m.elem[a][:, :, None] == m.elem[b][:, None]).any(axis=(1, 2))
 
   return (a != b) & shares(whole) & ~shares(mesh)
+
+
+def _is_open(mesh: Mesh, elem: np.ndarray, at: np.ndarray, edge: float) -> np.ndarray:
+  """Returns which samples go along an edge that came apart before, more than across it, (n,)."""
+  out = np.zeros(len(elem), bool)
+  half = 3 * elem[:, None] + np.arange(3)
+  is_cut = (mesh.twin[half] < 0) & (mesh.whole.twin[half] >= 0)
+  which, k = np.nonzero(is_cut)
+  if not which.size:
+    return out
+  ends = [mesh.rest[corners(mesh, half[which, k], c)] for c in (0, 1)]
+  way, arm = ends[1] - ends[0], at[which] - ends[0]
+  share = np.clip((arm * way).sum(1) / (way * way).sum(1), 0.0, 1.0)
+  out[which[np.linalg.norm(arm - share[:, None] * way, axis=1) < _ALONG * edge]] = True
+  for part in np.split(np.arange(len(out)), np.flatnonzero(np.diff(out)) + 1):
+    out[part] &= len(part) * _STEP >= 1.0
+  return out
 
 
 def nearest(
@@ -134,8 +162,9 @@ def closest(p, a, b, c) -> tuple[np.ndarray, np.ndarray]:
   t = np.clip((bp * bc).sum(-1) / np.maximum((bc * bc).sum(-1), 1e-300), 0, 1)
   found.append(np.stack([0 * t, 1 - t, t], -1))
   weight = np.stack(found, -2)  # (..., 4, 3)
-  at = weight @ np.stack([a, b, c], -2)
-  far = np.linalg.norm(at - p[..., None, :], axis=-1)
+  off = weight[..., 1:2] * ab[..., None, :] + weight[..., 2:] * ac[..., None, :]
+  off -= ap[..., None, :]
+  far = np.sqrt((off * off).sum(-1))
   far[..., 0] = np.where(inside, far[..., 0], np.inf)
   best = np.argmin(far, axis=-1)[..., None]
   return (
