@@ -131,8 +131,8 @@ class Cuts:
     if not self or self._found[0] == self.stamp:
       return
     elem, loose, rest, mass, source = self._read()
-    mesh, touched = topology.recut(self.mesh, rest, elem, loose)
-    self._become(mesh, touched, mass, source, self._found[0])
+    mesh, changed = topology.recut(self.mesh, rest, elem, loose)
+    self._become(mesh, changed, mass, source, self._found[0])
     self.reports = []
     self._fresh = True
 
@@ -167,10 +167,11 @@ class Cuts:
     own["source"][:] = self.source[mesh.nvert - mesh.spare :]
     self._found[0] = self.stamp
 
-  def _become(self, mesh: Mesh, touched: np.ndarray, mass, source, stamp: float):
+  def _become(self, mesh: Mesh, changed: np.ndarray, mass, source, stamp: float):
     w = self._w
-    self._refill.write(mesh, touched, w.config, ~w.organ.free)
+    touched = topology.touched(self.mesh, mesh, changed)
     touched = np.union1d(touched, np.flatnonzero(mass != self.mass))
+    self._refill.write(mesh, changed, w.config, ~w.organ.free)
     self.mass, self.source, self.stamp = mass, source, stamp
     w.organ = dataclasses.replace(self.declared, mesh=mesh, mass=mass)
     w.phases.reshape(touched)
@@ -224,7 +225,7 @@ class Cuts:
         f"the cut stops early: no spare vertices are left of {mesh.spare}; give the organ more"
       )
     report = self._report(found)
-    if found.touched.size:
+    if found.changed.size:
       self._take(found, u, v)
     self.reports.append(report)
     return report
@@ -247,12 +248,13 @@ class Cuts:
     source[member] = source[group]
     now, speed = u.copy(), v.copy()
     now[found.moved] = np.einsum("nk,nkj->nj", found.weight, u[found.corner])
-    near = found.touched[w.organ.free[found.touched] & ~old.unused[found.touched]]
+    near = np.unique(old.elem[found.changed])
+    near = near[w.organ.free[near]]
     was, goes = (old.rest + u)[near], (mesh.rest + now)[near]
     speed[near] = _keep_spin(self.mass[near], was, goes, v[near])
     now[member], speed[member] = now[group], speed[group]
     corner = flexes.pack(mesh.elem, mesh.loose)
-    self._become(mesh, found.touched, mass, source, flexes.stamp(corner, mesh.rest, mass))
+    self._become(mesh, found.changed, mass, source, flexes.stamp(corner, mesh.rest, mass))
     self._write(corner)
     changed = np.unique(np.concatenate([near, member]))
     w.phases.carry(changed, now, speed, group, member, share)

@@ -37,7 +37,7 @@ class Cut:
 
   Attributes:
     mesh: the mesh, cut
-    touched: vertices of triangles that are not as they were
+    changed: triangles that are not as they were                        (n,)
     moved: vertices that lie elsewhere at rest                          (n,)
     corner: where they lie in the mesh before: corners of a triangle    (n, 3)
     weight: and their weights                                           (n, 3)
@@ -50,7 +50,7 @@ class Cut:
   """
 
   mesh: Mesh
-  touched: np.ndarray
+  changed: np.ndarray
   moved: np.ndarray
   corner: np.ndarray
   weight: np.ndarray
@@ -97,7 +97,7 @@ def cut(
   elem, group, member = _split(mesh, edges)
   rest[member] = rest[group]
   near = topology.around(mesh, np.union1d(np.array(sorted(there), int), moved))
-  new, touched = topology.recut(mesh, rest, elem, mesh.loose, near)
+  new, changed = topology.recut(mesh, rest, elem, mesh.loose, near)
   if any(_may_separate(run, group) for run in runs):
     new = topology.come_loose(new)
   path = _lines(rest, edges)
@@ -105,7 +105,7 @@ def cut(
   far = [paths.distance(run.at, rest[chain])[0].max() for run, chain in cut_chains if chain]
   length = sum(float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum()) for line in path)
   deviation = float(max(far, default=0.0))
-  return Cut(new, touched, moved, corner, weight, group, member, path, length, deviation, stopped)
+  return Cut(new, changed, moved, corner, weight, group, member, path, length, deviation, stopped)
 
 
 def _check(organ: str, runs: list[paths.Run], pinned: np.ndarray):

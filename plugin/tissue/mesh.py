@@ -335,7 +335,7 @@ def recut(
     near: triangles around all vertices that have moved or come apart, None for any
 
   Returns:
-    the mesh, and the vertices of triangles that are not as they were
+    the mesh, and the triangles that are not as they were, ascending
   """
   whole = mesh.whole
   if near is None:
@@ -352,10 +352,9 @@ def recut(
   edges = (mesh.twin.reshape(-1, 3)[near] != new.twin.reshape(-1, 3)[near]).any(axis=1)
   cut = (before != after).any(axis=1) | edges
   moved = (mesh.rest[before] != new.rest[before]) | (mesh.rest[after] != new.rest[after])
-  differs = cut | moved.any(axis=(1, 2))
-  touched = np.unique(np.concatenate([before[differs], after[differs]]))
-  if new is whole or not touched.size:
-    return (new if new is whole else dataclasses.replace(mesh, loose=loose)), touched
+  changed = near[cut | moved.any(axis=(1, 2))]
+  if new is whole or not changed.size:
+    return (new if new is whole else dataclasses.replace(mesh, loose=loose)), changed
   walk = np.unique(np.concatenate([before[cut], after[cut]]))
   ring, ring_elem, degree = mesh.ring.copy(), mesh.ring_elem.copy(), mesh.degree.copy()
   if walk.size:
@@ -363,7 +362,12 @@ def recut(
     part, part_elem, degree[walk] = _rings("cut", elem, new.twin, len(rest), walk, near)
     ring[walk], ring_elem[walk] = -1, -1
     ring[walk, : part.shape[1]], ring_elem[walk, : part.shape[1]] = part, part_elem
-  return dataclasses.replace(new, ring=ring, ring_elem=ring_elem, degree=degree), touched
+  return dataclasses.replace(new, ring=ring, ring_elem=ring_elem, degree=degree), changed
+
+
+def touched(old: Mesh, new: Mesh, changed: np.ndarray) -> np.ndarray:
+  """Returns the corners that triangles had or have, ascending."""
+  return np.unique(np.concatenate([old.elem[changed], new.elem[changed]]))
 
 
 def _joined(mesh: Mesh, near: np.ndarray) -> np.ndarray:

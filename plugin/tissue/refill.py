@@ -48,26 +48,27 @@ class Refill:
     """Forgets what the arrays hold: others have written into them."""
     self._host = {}
 
-  def write(self, mesh: Mesh, touched: np.ndarray, config: Config, pinned: np.ndarray):
+  def write(self, mesh: Mesh, changed: np.ndarray, config: Config, pinned: np.ndarray):
     """Makes the body that of another mesh.
 
     Args:
       mesh: of the same whole
-      touched: vertices of triangles that are not as in the mesh so far
+      changed: triangles that are not as in the mesh so far
       config: configuration in force
       pinned: vertices that do not move, (nvert,) bool
 
     Raises:
       ValueError: the bending matrix has no room; nothing has changed then.
     """
-    if not touched.size:
+    if not changed.size:
       return
-    changed: dict[str, tuple] = self._fans(mesh, touched, config, pinned)
+    touched = topology.touched(self.mesh, mesh, changed)
+    puts: dict[str, list] = self._fans(mesh, touched, config, pinned)
     if self._body.has_bending:
-      changed |= self._plate(mesh, touched, config)
-    for name, puts in changed.items():
+      puts |= self._plate(mesh, changed, config)
+    for name, parts in puts.items():
       host = self._on_host(name)
-      for where, values in puts:
+      for where, values in parts:
         host[where] = values
       if self._body.device.is_cuda:
         self._arrays[name].assign(host)
@@ -100,10 +101,11 @@ class Refill:
     out["area"] = [((own // LANES, own % LANES), topology.areas_of(mesh, which, held=True))]
     return out
 
-  def _plate(self, mesh: Mesh, touched: np.ndarray, config: Config):
+  def _plate(self, mesh: Mesh, changed: np.ndarray, config: Config):
     old, most = self.mesh, self._body.shape.nhingeslice * LANES
-    near = np.union1d(topology.around(old, touched), topology.around(mesh, touched))
-    near = np.union1d(topology.with_beside(old, near), topology.with_beside(mesh, near))
+    # A triangle's plate is that of the patch of it and its neighbours.
+    near = np.concatenate([topology.with_beside(m, changed) for m in (old, mesh)])
+    near = np.unique(near)
     vert = np.concatenate([m.elem[topology.with_beside(m, near)].ravel() for m in (old, mesh)])
     vert = np.unique(vert)
     which = topology.with_beside(mesh, topology.around(mesh, vert))
