@@ -170,7 +170,7 @@ class Cuts:
   def _become(self, mesh: Mesh, changed: np.ndarray, mass, source, stamp: float):
     w = self._w
     touched = topology.touched(self.mesh, mesh, changed)
-    touched = np.union1d(touched, np.flatnonzero(mass != self.mass))
+    touched = topology.distinct(touched, np.flatnonzero(mass != self.mass))
     self._refill.write(mesh, changed, w.config, ~w.organ.free)
     self.mass, self.source, self.stamp = mass, source, stamp
     w.organ = dataclasses.replace(self.declared, mesh=mesh, mass=mass)
@@ -248,7 +248,7 @@ class Cuts:
     source[member] = source[group]
     now, speed = u.copy(), v.copy()
     now[found.moved] = np.einsum("nk,nkj->nj", found.weight, u[found.corner])
-    near = np.unique(old.elem[found.changed])
+    near = topology.distinct(old.elem[found.changed])
     near = near[w.organ.free[near]]
     was, goes = (old.rest + u)[near], (mesh.rest + now)[near]
     speed[near] = _keep_spin(self.mass[near], was, goes, v[near])
@@ -256,7 +256,7 @@ class Cuts:
     corner = flexes.pack(mesh.elem, mesh.loose)
     self._become(mesh, found.changed, mass, source, flexes.stamp(corner, mesh.rest, mass))
     self._write(corner)
-    changed = np.unique(np.concatenate([near, member]))
+    changed = topology.distinct(near, member)
     w.phases.carry(changed, now, speed, group, member, share)
     self.show()
 
@@ -282,8 +282,8 @@ def _keep_spin(mass: np.ndarray, was: np.ndarray, now: np.ndarray, v: np.ndarray
   """
   if len(mass) < 3:
     return v
-  spin = (mass[:, None] * np.cross(was - now, v)).sum(axis=0)
+  spin = (mass[:, None] * topology.cross(was - now, v)).sum(axis=0)
   arm = now - (mass[:, None] * now).sum(axis=0) / mass.sum()
   inertia = (mass * (arm**2).sum(axis=1)).sum() * np.eye(3) - (mass * arm.T) @ arm
   omega = np.linalg.lstsq(inertia, spin, rcond=1e-6)[0]
-  return v + np.cross(omega, arm)
+  return v + topology.cross(omega[None], arm)

@@ -96,7 +96,7 @@ def cut(
   rest[moved] = np.einsum("nk,nkj->nj", weight, mesh.rest[corner])
   elem, group, member = _split(mesh, edges)
   rest[member] = rest[group]
-  near = topology.around(mesh, np.union1d(np.array(sorted(there), int), moved))
+  near = topology.around(mesh, topology.distinct(np.array(list(there), int), moved))
   new, changed = topology.recut(mesh, rest, elem, mesh.loose, near)
   if any(_may_separate(run, group) for run in runs):
     new = topology.come_loose(new)
@@ -206,14 +206,14 @@ def _shares(mesh: Mesh, vert, elem, weight, u: np.ndarray, energy: Energy | None
     rest[number] += share[:, None] * way
     turned, now = _form(rest[corner])
     bad = (now < least) | ((turned * normal).sum(1) < _TURN)
-    less = np.unique(who[bad])
+    less = topology.distinct(who[bad])
     if energy is not None:
       moved, fine = u0.copy(), ~bad
       moved[number] += share[:, None] * lead
       has = had.copy()
       has[fine] = energy(rest[corner[fine]], moved[corner[fine]], tri[fine])
       old, new = (np.bincount(who.ravel() + 1, np.repeat(e, 3), len(vert) + 1) for e in (had, has))
-      less = np.union1d(less, np.flatnonzero(new > _RISE * old) - 1)
+      less = topology.distinct(less, np.flatnonzero(new > _RISE * old) - 1)
     less = less[less >= 0]
     if not less.size:
       break
@@ -224,8 +224,8 @@ def _shares(mesh: Mesh, vert, elem, weight, u: np.ndarray, energy: Energy | None
 def _form(corner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
   """Returns unit normals and shapes of triangles (n, 3, 3); an equilateral one has shape 1."""
   a, b, c = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 1], corner[:, 0] - corner[:, 2]
-  area = np.cross(a, -c)
-  size = np.linalg.norm(area, axis=1)
+  area = topology.cross(a, -c)
+  size = topology.lengths(area)
   length2 = (a * a).sum(1) + (b * b).sum(1) + (c * c).sum(1)
   return area / np.maximum(size, 1e-300)[:, None], 2 * np.sqrt(3) * size / length2
 

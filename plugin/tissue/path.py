@@ -9,7 +9,7 @@ import numpy as np
 from scipy import sparse, spatial
 from scipy.sparse import csgraph
 
-from .mesh import Mesh, corners
+from .mesh import Mesh, corners, distinct, lengths
 
 _STEP = 0.25  # between samples of the path, in edges
 _OFF = 2.0  # edges from the surface from which a point is off it
@@ -17,6 +17,7 @@ _WAY = 8.0  # edges between vertices that the chain must pass
 _RIM = 0.5  # edges: a cut that ends closer to a boundary opens it
 _ALONG = 0.2  # edges from an older cut within which a path goes along it
 _BOX = 3.0  # edges from the path within which they are found sooner
+_FEW = 1000  # of these, all are compared
 _NEAR = 6  # vertices nearest to a point around which its triangle is looked for
 
 
@@ -45,7 +46,7 @@ class Run:
 def trace(organ: str, mesh: Mesh, position, points, edge: float) -> list[Run]:
   """Returns the parts of the path on the surface, in the rest shape."""
   _check_points(organ, points)
-  gap = np.linalg.norm(np.diff(points, axis=0), axis=1)
+  gap = lengths(np.diff(points, axis=0))
   steps = np.maximum(np.ceil(gap / (_STEP * edge)).astype(int), 1)
   share = np.concatenate([np.arange(n) / n for n in steps] + [[0.0]])
   k = np.append(np.repeat(np.arange(len(steps)), steps), len(steps) - 1)
@@ -61,7 +62,7 @@ def trace(organ: str, mesh: Mesh, position, points, edge: float) -> list[Run]:
     )
   at = np.einsum("nk,nkj->nj", weight, mesh.rest[mesh.elem[elem]])
   # Where the path crosses an older cut, or leaps, it begins anew.
-  leap = np.linalg.norm(np.diff(at, axis=0), axis=1) > 2 * edge
+  leap = lengths(np.diff(at, axis=0)) > 2 * edge
   is_open = _is_open(mesh, elem, at, edge)
   new = leap | (_crosses(mesh, elem) & ~is_open[1:]) | (is_open[1:] != is_open[:-1])
   parts = np.split(np.arange(len(elem)), np.flatnonzero(new) + 1)
@@ -103,7 +104,7 @@ def _is_open(mesh: Mesh, elem: np.ndarray, at: np.ndarray, edge: float) -> np.nd
   ends = [mesh.rest[corners(mesh, half[which, k], c)] for c in (0, 1)]
   way, arm = ends[1] - ends[0], at[which] - ends[0]
   share = np.clip((arm * way).sum(1) / (way * way).sum(1), 0.0, 1.0)
-  out[which[np.linalg.norm(arm - share[:, None] * way, axis=1) < _ALONG * edge]] = True
+  out[which[lengths(arm - share[:, None] * way) < _ALONG * edge]] = True
   for part in np.split(np.arange(len(out)), np.flatnonzero(np.diff(out)) + 1):
     out[part] &= len(part) * _STEP >= 1.0
   return out
@@ -136,11 +137,13 @@ def _nearest_vertices(mesh: Mesh, position: np.ndarray, points: np.ndarray) -> n
   """Returns the few positions nearest to points, looked for in a box around them first."""
   count, room = min(_NEAR, len(position)), _BOX * mesh.whole.edge_length
   low, high = points.min(axis=0) - room, points.max(axis=0) + room
-  box = np.flatnonzero(((position >= low) & (position <= high)).all(axis=1))
-  if len(box) >= count:
-    far, near = spatial.KDTree(position[box]).query(points, k=count)
-    if far.max() <= room:
-      return box[near].reshape(len(points), -1)
+  inside = (position >= low) & (position <= high)
+  box = np.flatnonzero(inside[:, 0] & inside[:, 1] & inside[:, 2])
+  if count <= len(box) <= _FEW:
+    far = lengths(points[:, None] - position[box])
+    near = np.argpartition(far, count - 1, axis=1)[:, :count]
+    if np.take_along_axis(far, near, 1).max() <= room:
+      return box[near]
   return spatial.KDTree(position).query(points, k=count)[1].reshape(len(points), -1)
 
 
@@ -178,7 +181,7 @@ def distance(line: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarr
   a, d = line[:-1], np.diff(line, axis=0)
   t = ((points[:, None] - a) * d).sum(-1) / np.maximum((d * d).sum(-1), 1e-300)
   at = a + np.clip(t, 0, 1)[..., None] * d
-  far = np.linalg.norm(points[:, None] - at, axis=-1)
+  far = lengths(points[:, None] - at)
   best = np.argmin(far, axis=1)
   row = np.arange(len(points))
   return far[row, best], at[row, best]
@@ -189,9 +192,9 @@ def distance(line: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 def chain(mesh: Mesh, run: Run, edge: float) -> list[int]:
   """Returns vertices near a path, each a neighbour of the one before."""
-  near = np.unique(mesh.elem[run.elem])
+  near = distinct(mesh.elem[run.elem])
   ring = mesh.ring[near]
-  band = np.unique(np.append(ring[ring >= 0], near))
+  band = distinct(ring[ring >= 0], near)
   far, _ = distance(run.at, mesh.rest[band])
   band, far = band[far < 1.5 * edge], far[far < 1.5 * edge]
   if len(band) < 2:
@@ -201,7 +204,7 @@ def chain(mesh: Mesh, run: Run, edge: float) -> list[int]:
   ring = mesh.ring[band]
   a, k = np.nonzero((ring >= 0) & (number[ring] >= 0))
   b = number[ring[a, k]]
-  size = np.linalg.norm(mesh.rest[band[a]] - mesh.rest[band[b]], axis=1)
+  size = lengths(mesh.rest[band[a]] - mesh.rest[band[b]])
   cost = size * (0.05 + (far[a] ** 2 + far[b] ** 2) / edge**2)
   graph = sparse.csr_array((cost, (a, b)), shape=(len(band), len(band)))
   way = _ways(mesh, run, band, edge)
@@ -218,13 +221,13 @@ def chain(mesh: Mesh, run: Run, edge: float) -> list[int]:
 
 def _ways(mesh: Mesh, run: Run, band: np.ndarray, edge: float) -> list[int]:
   """Returns numbers of vertices of the band that the chain passes, its ends among them."""
-  along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(run.at, axis=0), axis=1))])
+  along = np.concatenate([[0], np.cumsum(lengths(np.diff(run.at, axis=0)))])
   parts = max(1, round(along[-1] / (_WAY * edge)))
   closes = along[-1] > 3 * edge and np.linalg.norm(run.at[-1] - run.at[0]) < _STEP * edge
   parts = max(parts, 3) if closes else parts
   where = np.searchsorted(along, np.linspace(0, along[-1], parts + 1)).clip(0, len(along) - 1)
   rest = mesh.rest[band]
-  far = np.linalg.norm(run.at[where][:, None] - rest, axis=2)
+  far = lengths(run.at[where][:, None] - rest)
   way = [int(k) for k in np.argmin(far, axis=1)]
   if closes:
     return [*way[:-1], way[0]]

@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from .mesh import Mesh, area_vectors, corners
+from .mesh import Mesh, area_vectors, corners, cross, distinct, lengths
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,8 +55,7 @@ def hinges(
   which = np.arange(mesh.nelem) if which is None else which
   mine = 3 * which[:, None] + np.arange(3)
   across = twin[mine]
-  half = np.unique(np.where(across >= 0, np.minimum(mine, across), -1))
-  half = half[half >= 0]
+  half = distinct(np.minimum(mine, across)[across >= 0])
   other = twin[half]
   ends = [corners(mesh, half, k) for k in range(3)]
   vert = np.stack([*ends, corners(mesh, other, 2)], axis=1)
@@ -70,7 +69,7 @@ def hinges(
 
 
 def _area(mesh: Mesh, which: np.ndarray) -> np.ndarray:
-  return np.linalg.norm(area_vectors(mesh.rest, mesh.elem[which]), axis=1)
+  return lengths(area_vectors(mesh.rest, mesh.elem[which]))
 
 
 def _foot(mesh: Mesh, half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -78,17 +77,17 @@ def _foot(mesh: Mesh, half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
   start, end, apex = (mesh.rest[corners(mesh, half, k)] for k in range(3))
   edge, arm = end - start, apex - start
   share = (arm * edge).sum(-1) / (edge * edge).sum(-1)
-  return share, np.linalg.norm(arm - share[..., None] * edge, axis=-1)
+  return share, lengths(arm - share[..., None] * edge)
 
 
 def _unfolded(mesh: Mesh, which: np.ndarray) -> np.ndarray:
   """Returns the corners of triangles in their own planes, (n, 3, 2)."""
   corner = mesh.rest[mesh.elem[which]]
   x_axis = corner[:, 1] - corner[:, 0]
-  x_axis /= np.linalg.norm(x_axis, axis=1, keepdims=True)
+  x_axis /= lengths(x_axis)[:, None]
   normal = area_vectors(mesh.rest, mesh.elem[which])
-  area = np.linalg.norm(normal, axis=1)
-  y_axis = np.cross(normal / area[:, None], x_axis)
+  area = lengths(normal)
+  y_axis = cross(normal / area[:, None], x_axis)
   arm = corner - corner[:, :1]
   return np.stack([(arm * x_axis[:, None]).sum(-1), (arm * y_axis[:, None]).sum(-1)], axis=-1)
 
@@ -110,7 +109,7 @@ def _angles(mesh: Mesh, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
   share_o, height_o = _foot(mesh, np.where(twin[h] >= 0, twin[h], h))
   share_o = 1 - share_o
   inward = inner - p0 - share[..., None] * (p1 - p0)
-  inward /= np.linalg.norm(inward, axis=-1, keepdims=True)
+  inward /= lengths(inward)[..., None]
   outer = p0 + share_o[..., None] * (p1 - p0) - height_o[..., None] * inward
   ends = modes(p0), modes(p1)
 

@@ -104,10 +104,8 @@ class Refill:
   def _plate(self, mesh: Mesh, changed: np.ndarray, config: Config):
     old, most = self.mesh, self._body.shape.nhingeslice * LANES
     # A triangle's plate is that of the patch of it and its neighbours.
-    near = np.concatenate([topology.with_beside(m, changed) for m in (old, mesh)])
-    near = np.unique(near)
-    vert = np.concatenate([m.elem[topology.with_beside(m, near)].ravel() for m in (old, mesh)])
-    vert = np.unique(vert)
+    near = topology.distinct(*(topology.with_beside(m, changed) for m in (old, mesh)))
+    vert = topology.distinct(*(m.elem[topology.with_beside(m, near)] for m in (old, mesh)))
     which = topology.with_beside(mesh, topology.around(mesh, vert))
     rigidity = configuration.rigidity(config, mesh.nelem)
     hinge = plate.hinges(mesh, rigidity, config.poisson, which)
@@ -135,7 +133,7 @@ class Refill:
     whole = self.mesh.whole
     half = 3 * near[:, None] + np.arange(3)
     other = whole.twin[half]
-    half = np.unique(np.minimum(half, other)[other >= 0])
+    half = topology.distinct(np.minimum(half, other)[other >= 0])
     return np.searchsorted(whole.interior, half)
 
   def _rows(self, mesh: Mesh, hinge: plate.Hinges, vert: np.ndarray):
