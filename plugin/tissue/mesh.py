@@ -102,7 +102,7 @@ _BY_VERTEX = ("rest", "ring", "ring_elem", "degree")
 
 
 def distinct(*numbers: np.ndarray) -> np.ndarray:
-  """Returns the different ones of whole numbers, ascending: `np.unique` for the short lists here."""
+  """Returns the different ones of whole numbers, ascending, as `np.unique` but for short lists."""
   every = np.sort(np.concatenate([each.ravel() for each in numbers]))
   first = np.ones(len(every), bool)
   np.not_equal(every[1:], every[:-1], out=first[1:])

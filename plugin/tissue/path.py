@@ -17,7 +17,7 @@ _WAY = 8.0  # edges between vertices that the chain must pass
 _RIM = 0.5  # edges: a cut that ends closer to a boundary opens it
 _ALONG = 0.2  # edges from an older cut within which a path goes along it
 _BOX = 3.0  # edges from the path within which they are found sooner
-_FEW = 1000  # of these, all are compared
+_FEW = 20_000  # pairs that are all compared
 _NEAR = 6  # vertices nearest to a point around which its triangle is looked for
 
 
@@ -139,51 +139,65 @@ def _nearest_vertices(mesh: Mesh, position: np.ndarray, points: np.ndarray) -> n
   low, high = points.min(axis=0) - room, points.max(axis=0) + room
   inside = (position >= low) & (position <= high)
   box = np.flatnonzero(inside[:, 0] & inside[:, 1] & inside[:, 2])
-  if count <= len(box) <= _FEW:
-    far = lengths(points[:, None] - position[box])
-    near = np.argpartition(far, count - 1, axis=1)[:, :count]
-    if np.take_along_axis(far, near, 1).max() <= room:
+  if len(box) >= count:
+    near, far = _neighbours(position[box], points, count)
+    if far.max() <= room:
       return box[near]
-  return spatial.KDTree(position).query(points, k=count)[1].reshape(len(points), -1)
+  return _neighbours(position, points, count)[0]
+
+
+def _neighbours(position: np.ndarray, points: np.ndarray, count: int):
+  """Returns which positions are nearest to points, and how far they are, (n, count) each."""
+  if len(position) * len(points) > _FEW:
+    far, near = spatial.KDTree(position).query(points, k=count)
+    return tuple(np.reshape(each, (len(points), count)) for each in (near, far))
+  far = lengths(points[:, None] - position)
+  near = np.argpartition(far, count - 1, axis=1)[:, :count]
+  return near, np.take_along_axis(far, near, 1)
 
 
 def closest(p, a, b, c) -> tuple[np.ndarray, np.ndarray]:
   """Returns weights of the point of triangles that is nearest to points, and its distance."""
   ab, ac, ap = b - a, c - a, p - a
-  d11, d12, d22 = (ab * ab).sum(-1), (ab * ac).sum(-1), (ac * ac).sum(-1)
-  e1, e2 = (ap * ab).sum(-1), (ap * ac).sum(-1)
+
+  def dot(x, y):
+    return np.einsum("...i,...i->...", x, y)
+
+  d11, d12, d22, e1, e2 = dot(ab, ab), dot(ab, ac), dot(ac, ac), dot(ap, ab), dot(ap, ac)
+  square, bc2 = dot(ap, ap), np.maximum(d11 - 2 * d12 + d22, 1e-300)
   det = np.maximum(d11 * d22 - d12 * d12, 1e-300)
   v, w = (d22 * e1 - d12 * e2) / det, (d11 * e2 - d12 * e1) / det
-  found = [np.stack([1 - v - w, v, w], -1)]
-  inside = (found[0] >= 0).all(axis=-1)
-  # On the edges.
-  t = np.clip(e1 / np.maximum(d11, 1e-300), 0, 1)
-  found.append(np.stack([1 - t, t, 0 * t], -1))
-  t = np.clip(e2 / np.maximum(d22, 1e-300), 0, 1)
-  found.append(np.stack([1 - t, 0 * t, t], -1))
-  bc, bp = c - b, p - b
-  t = np.clip((bp * bc).sum(-1) / np.maximum((bc * bc).sum(-1), 1e-300), 0, 1)
-  found.append(np.stack([0 * t, 1 - t, t], -1))
-  weight = np.stack(found, -2)  # (..., 4, 3)
-  off = weight[..., 1:2] * ab[..., None, :] + weight[..., 2:] * ac[..., None, :]
-  off -= ap[..., None, :]
-  far = np.sqrt((off * off).sum(-1))
-  far[..., 0] = np.where(inside, far[..., 0], np.inf)
-  best = np.argmin(far, axis=-1)[..., None]
-  return (
-    np.take_along_axis(weight, best[..., None], -2)[..., 0, :],
-    np.take_along_axis(far, best, -1)[..., 0],
-  )
+  on_ab = np.clip(e1 / np.maximum(d11, 1e-300), 0, 1)
+  on_ac = np.clip(e2 / np.maximum(d22, 1e-300), 0, 1)
+  on_bc = np.clip((e2 - e1 - d12 + d11) / bc2, 0, 1)
+  none = np.zeros_like(v)
+  v = np.stack([v, on_ab, none, 1 - on_bc])
+  w = np.stack([w, none, on_ac, on_bc])
+  u = np.stack([1 - v[0] - w[0], 1 - on_ab, 1 - on_ac, none])
+  gap2 = square - 2 * (v * e1 + w * e2) + v * v * d11 + 2 * v * w * d12 + w * w * d22
+  outside = (u[0] < 0) | (v[0] < 0) | (w[0] < 0)
+  gap2[0, outside] = np.inf
+  best = np.argmin(gap2, axis=0)[None]
+  weight = np.stack([np.take_along_axis(x, best, 0)[0] for x in (u, v, w)], axis=-1)
+  return weight, np.sqrt(np.maximum(np.take_along_axis(gap2, best, 0)[0], 0.0))
 
 
 def distance(line: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-  """Returns the distances of points from a polyline, and its points there (n,), (n, 3)."""
-  a, d = line[:-1], np.diff(line, axis=0)
-  t = ((points[:, None] - a) * d).sum(-1) / np.maximum((d * d).sum(-1), 1e-300)
-  at = a + np.clip(t, 0, 1)[..., None] * d
+  """Returns the distances of points from a polyline of dense samples, and its points there.
+
+  Only what is beside the nearest sample is looked at.
+
+  Returns:
+    distances (n,), points (n, 3)
+  """
+  near = _neighbours(line, points, 1)[0]
+  begin = np.clip(near + np.array([-1, 0]), 0, len(line) - 2)
+  a, way = line[begin], line[begin + 1] - line[begin]
+  arm = points[:, None] - a
+  t = (arm * way).sum(-1) / np.maximum((way * way).sum(-1), 1e-300)
+  at = a + np.clip(t, 0, 1)[..., None] * way
   far = lengths(points[:, None] - at)
-  best = np.argmin(far, axis=1)
-  row = np.arange(len(points))
+  best, row = np.argmin(far, axis=1), np.arange(len(points))
   return far[row, best], at[row, best]
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+from scipy import sparse
 
 from .mesh import Mesh, area_vectors, corners, cross, distinct, lengths
 
@@ -142,16 +143,13 @@ def _gain(angle: np.ndarray, present: np.ndarray, poisson: float) -> np.ndarray:
 
 def bending_matrix(
   mesh: Mesh, hinge: Hinges, vert: np.ndarray | None = None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-  """Returns the plate stiffness on normal displacements at rest by vertices [N/m].
+) -> sparse.coo_array:
+  """Returns the plate stiffness on normal displacements at rest [N/m], (nvert, nvert).
 
   Args:
     mesh: the surface
     hinge: its hinges
     vert: vertices whose rows are meant, of which all hinges are there; None for all
-
-  Returns:
-    row, column and value of its entries, row by row  (n,) each
   """
   which, c = hinge.which, np.arange(3)
   angle = np.zeros((len(which), 3, 6))  # by the triangle's corners and the apexes beside it
@@ -159,9 +157,9 @@ def bending_matrix(
     angle[:, c, at] = hinge.weight[:, :, k]
   value = angle.transpose(0, 2, 1) @ hinge.gain @ angle
   across = mesh.twin.reshape(-1, 3)[which]
-  there = across >= 0
+  there: np.ndarray = across >= 0
   apex = np.where(there, corners(mesh, across, 2), -1)
-  own = np.where(there.any(axis=1)[:, None], mesh.elem[which], -1)
+  own = np.where(there.any(axis=1, keepdims=True), mesh.elem[which], -1)
   patch = np.hstack([own, apex])
   mine = np.ones(mesh.nvert, bool)
   if vert is not None:
@@ -169,7 +167,8 @@ def bending_matrix(
     mine[vert] = True
   t, i, j = np.nonzero(((patch >= 0) & mine[patch])[:, :, None] & (patch >= 0)[:, None])
   key, number = np.unique(patch[t, i] * mesh.nvert + patch[t, j], return_inverse=True)
-  return key // mesh.nvert, key % mesh.nvert, np.bincount(number, value[t, i, j])
+  at = key // mesh.nvert, key % mesh.nvert
+  return sparse.coo_array((np.bincount(number, value[t, i, j]), at), (mesh.nvert, mesh.nvert))
 
 
 def neighbours(hinge: Hinges) -> tuple[np.ndarray, np.ndarray]:

@@ -138,7 +138,8 @@ class Refill:
 
   def _rows(self, mesh: Mesh, hinge: plate.Hinges, vert: np.ndarray):
     """Returns rows of the bending matrix."""
-    row, col, value = plate.bending_matrix(mesh, hinge, vert)
+    coo = plate.bending_matrix(mesh, hinge, vert)
+    row, col, value = coo.row, coo.col, coo.data
     diag = np.zeros(len(vert))
     diag[np.searchsorted(vert, row[row == col])] = value[row == col]
     row, col = self._node[row], self._node[col]

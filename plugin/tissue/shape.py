@@ -221,7 +221,8 @@ def _bending(
   out["elem_hinge"] = pad(out["elem_hinge"], nhinge)
   out = {name: to_slices(values if len(values) % LANES == 0 else pad(values))
          for name, values in out.items()}  # fmt: skip
-  row, col, value = plate.bending_matrix(mesh, hinge)
+  coo = plate.bending_matrix(mesh, hinge)
+  row, col, value = coo.row, coo.col, coo.data
   own = np.arange(nslice * LANES).reshape(nslice, LANES)
 
   def room(entries: np.ndarray) -> np.ndarray:
