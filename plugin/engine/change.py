@@ -47,7 +47,9 @@ def copy(w, model: int, other, twin):
     for group in theirs:
       _put(w, dataclasses.replace(group, own=w, other=group.other and twin(group.other)))
   if w.ties.groups or other.ties.groups:
-    groups = [dataclasses.replace(g, other=g.other and twin(g.other)) for g in other.ties.groups]
+    groups = [
+      dataclasses.replace(g, own=w, other=g.other and twin(g.other)) for g in other.ties.groups
+    ]
     tie(w, model, groups)
 
 

@@ -20,7 +20,8 @@ from palpate.tissue import mesh as topology
 from palpate.tissue.mesh import Mesh
 from palpate.tissue.refill import Refill
 
-from . import coupling, flexes, mjstruct, turns
+from . import coupling, flexes, graphs, mjstruct, turns
+from .bind import bind
 from .tear import Tear
 
 _FOREIGN = "plugin_state has cuts that are not of this organ; set a state that was saved from it"
@@ -175,7 +176,9 @@ class Cuts:
     self.mass, self.source, self.stamp = mass, source, stamp
     w.organ = dataclasses.replace(self.declared, mesh=mesh, mass=mass)
     w.phases.reshape(touched)
-    w.ties.reshape()
+    for grown in [space for each in w.beside for space in each.reshape()]:
+      with graphs.lock:
+        bind(grown, grown.model)
 
   def forget(self):
     """Forgets what the body's arrays hold: the material has changed."""
@@ -219,7 +222,8 @@ class Cuts:
     local = (np.asarray(points, float) - organ.origin) @ organ.frame
     u, v = w.phases.motion()
     of_triangles = functools.partial(energy.of_triangles, w.config)
-    found = cutting.cut(organ.name, mesh, mesh.rest + u, local, ~organ.free, of_triangles)
+    energies = of_triangles, self._held()
+    found = cutting.cut(organ.name, mesh, mesh.rest + u, local, ~organ.free, *energies)
     if found.stopped:
       w.note(
         f"the cut stops early: no spare vertices are left of {mesh.spare}; give the organ more"
@@ -229,6 +233,23 @@ class Cuts:
       self._take(found, u, v)
     self.reports.append(report)
     return report
+
+  def _held(self) -> cutting.Held | None:
+    """Returns what tells the energy of ties and bonds, None where there are none."""
+    springs = [*self._w.ties.springs(), *self._w.bonds.springs()]
+    if not springs:
+      return None
+    n = self.mesh.nvert
+    whole, pull, hard = np.zeros(n), np.zeros((n, 3)), np.zeros(n)
+    for vert, stiffness, stretch in springs:
+      np.add.at(whole, vert, 0.5 * stiffness * (stretch**2).sum(axis=1))
+      np.add.at(pull, vert, stiffness[:, None] * stretch)
+      np.add.at(hard, vert, stiffness)
+
+    def held(vert: np.ndarray, way: np.ndarray) -> np.ndarray:
+      return whole[vert] + (way * pull[vert]).sum(1) + 0.5 * hard[vert] * (way**2).sum(1)
+
+    return held
 
   def _report(self, found: cutting.Cut) -> Report:
     organ = self._w.organ
@@ -253,6 +274,8 @@ class Cuts:
     was, goes = (old.rest + u)[near], (mesh.rest + now)[near]
     speed[near] = _keep_spin(self.mass[near], was, goes, v[near])
     now[member], speed[member] = now[group], speed[group]
+    for each in w.beside:
+      each.carry(group, member, share)
     corner = flexes.pack(mesh.elem, mesh.loose)
     self._become(mesh, found.changed, mass, source, flexes.stamp(corner, mesh.rest, mass))
     self._write(corner)

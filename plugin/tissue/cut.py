@@ -30,6 +30,10 @@ _LESS = 0.7
 # (n, 3, 3) each, and their numbers (n,).
 Energy = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
+# Energy of springs that hold vertices [J], (n,), from these (n,) and by how much their displacements
+# change (n, 3).
+Held = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
 
 @dataclasses.dataclass(frozen=True)
 class Cut:
@@ -69,6 +73,7 @@ def cut(
   points: np.ndarray,
   pinned: np.ndarray,
   energy: Energy | None = None,
+  held: Held | None = None,
 ) -> Cut:
   """Returns the mesh cut along the path on the surface that is nearest to points.
 
@@ -79,6 +84,7 @@ def cut(
     points: the path, in the same frame [m]      (n, 3)
     pinned: vertices that do not move            (nvert,) bool
     energy: of triangles, which moving vertices must not raise, or None
+    held: that of what holds vertices, for which the same is true, or None
 
   Raises:
     ValueError: points are off the surface; the path goes through pinned vertices, or is too short.
@@ -91,7 +97,7 @@ def cut(
   _check(organ, runs, pinned)
   edges, stopped = _room(mesh, [pair for run in runs for pair in _uncut(mesh, run.chain)])
   there = {v for pair in edges for v in pair}
-  moved, corner, weight = _snap(mesh, runs, pinned, position, energy, there)
+  moved, corner, weight = _snap(mesh, runs, pinned, position, (energy, held), there)
   rest = mesh.rest.copy()
   rest[moved] = np.einsum("nk,nkj->nj", weight, mesh.rest[corner])
   elem, group, member = _split(mesh, edges)
@@ -128,7 +134,7 @@ def _check(organ: str, runs: list[paths.Run], pinned: np.ndarray):
 
 
 def _snap(
-  mesh: Mesh, runs: list[paths.Run], pinned, position, energy: Energy | None, there: set[int]
+  mesh: Mesh, runs: list[paths.Run], pinned, position, energy: tuple, there: set[int]
 ):
   """Returns vertices that move at rest, and where they lie: corners of a triangle and weights.
 
@@ -178,12 +184,13 @@ def _on_rim(mesh: Mesh, vert: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray,
   return np.where(rim[:, None], slid, goal), free
 
 
-def _shares(mesh: Mesh, vert, elem, weight, u: np.ndarray, energy: Energy | None) -> np.ndarray:
+def _shares(mesh: Mesh, vert, elem, weight, u: np.ndarray, energies: tuple) -> np.ndarray:
   """Returns how far of its way each vertex goes, (n,).
 
   So far that no triangle gets thin or turns, and that the energy around none rises: a vertex gets
   the displacement of where it goes to, and an uneven strain is another one after it.
   """
+  energy, held = energies
   tri = topology.around(mesh, vert)
   own, corner = np.unique(mesh.elem[tri], return_inverse=True)
   corner = corner.reshape(-1, 3)
@@ -212,8 +219,12 @@ def _shares(mesh: Mesh, vert, elem, weight, u: np.ndarray, energy: Energy | None
       moved[number] += share[:, None] * lead
       has = had.copy()
       has[fine] = energy(rest[corner[fine]], moved[corner[fine]], tri[fine])
-      old, new = (np.bincount(who.ravel() + 1, np.repeat(e, 3), len(vert) + 1) for e in (had, has))
-      less = topology.distinct(less, np.flatnonzero(new > _RISE * old) - 1)
+      old, new = (
+        np.bincount(who.ravel() + 1, np.repeat(e, 3), len(vert) + 1)[1:] for e in (had, has)
+      )
+      if held is not None:
+        old, new = old + held(vert, 0 * lead), new + held(vert, share[:, None] * lead)
+      less = topology.distinct(less, np.flatnonzero(new > _RISE * old))
     less = less[less >= 0]
     if not less.size:
       break
