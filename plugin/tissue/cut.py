@@ -30,8 +30,8 @@ _LESS = 0.7
 # (n, 3, 3) each, and their numbers (n,).
 Energy = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
-# Energy of springs that hold vertices [J], (n,), from these (n,) and by how much their displacements
-# change (n, 3).
+# Energy of springs that hold vertices [J], (n,), from these (n,) and the changes of their
+# displacements (n, 3).
 Held = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
