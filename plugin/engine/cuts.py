@@ -113,6 +113,8 @@ class Cuts:
     self._found: Any = self._own["stamp"].data
     self.lock = turns.lock_of(model)
     self._elem = flexes.element_data(m, w.organ.flex)
+    self._border = np.flatnonzero(self.whole.twin < 0)
+    self._rim = flexes.rim_data(m, w.organ.flex, len(self._border))
     self._mark: Any = flexes.marks(m, w.organ.flex, self.whole.nelem)[-1:].data
 
   # What the state says.
@@ -206,6 +208,7 @@ class Cuts:
     """Gives the model the triangles of this organ."""
     if not self.shown:
       self._elem[:] = self.mesh.elem
+      self._rim[:] = np.stack([topology.corners(self.mesh, self._border, k) for k in (0, 1)], 1)
       self._mark[0] = self.stamp
 
   # Cutting.

@@ -64,6 +64,13 @@ def element_data(m, flex: int) -> np.ndarray:
   return mjstruct.view(m.flex_elem, m.nflexelemdata, np.int32)[adr : adr + 3 * num].reshape(num, 3)
 
 
+def rim_data(m, flex: int, count: int) -> np.ndarray:
+  """Returns MuJoCo's own memory of the edges at the boundary of a flex, drawn as sides, (n, 2)."""
+  adr = int(mjstruct.view(m.flex_shelldataadr, m.nflex, np.int32)[flex]) if count else 0
+  shell = mjstruct.view(m.flex_shell, m.nflexshelldata, np.int32)
+  return shell[adr : adr + 2 * count].reshape(-1, 2)
+
+
 def marks(m, flex: int, nelem: int) -> np.ndarray:
   """Returns numbers of a flex that MuJoCo does not use, and that are copied and saved with it.
 

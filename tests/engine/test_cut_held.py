@@ -1,4 +1,4 @@
-"""Cutting what is bonded, tied or carried: what holds it follows."""
+"""Cutting what is bonded, tied, carried or grasped: what holds it follows."""
 
 import copy
 
@@ -7,6 +7,7 @@ import numpy as np
 import palpate
 import pytest
 import scenes
+from scipy import ndimage
 
 FULL = mujoco.mjtState.mjSTATE_INTEGRATION
 HAND = '<body name="hand" mocap="true"/>'
@@ -195,3 +196,55 @@ def test_what_is_cut_off_rests_on_what_the_organ_rested_on(below):
   mujoco.mj_step(model, data, 60)
   assert organ.error is None and organ.support_force[2] > 0
   assert np.abs(organ.xpos[:, 2] - x[:, 2].mean()).max() < 1.5e-3
+
+
+JAWS = """<mujoco><option timestep="0.002"/><worldbody><body name="hand" pos="0.068 0 0">
+  <joint name="lift" type="slide" axis="0 0 1"/><inertial pos="0 0 0" mass=".1" diaginertia="1 1 1"
+  />
+  <body name="upper" pos="0 0 0.009"><joint name="upper" type="slide" axis="0 0 1"/>
+    <geom type="box" size="0.006 0.006 0.002" mass="0.02"/></body>
+  <body name="lower" pos="0 0 -0.009"><joint name="lower" type="slide" axis="0 0 -1"/>
+    <geom type="box" size="0.006 0.006 0.002" mass="0.02"/></body>
+  </body></worldbody><actuator><position joint="lift" kp="400" kv="20"/>
+  <position joint="upper" kp="200" kv="5"/><position joint="lower" kp="200" kv="5"/>
+</actuator></mujoco>"""
+
+
+def parts_in_a_picture(model, data):
+  """Returns how many parts of tissue a viewer sees; skips without OpenGL."""
+  camera = mujoco.MjvCamera()
+  camera.lookat, camera.distance, camera.azimuth, camera.elevation = [0.04, 0, 0.02], 0.16, 120, -20
+  try:
+    renderer = mujoco.Renderer(model, 120, 160)
+  except Exception as error:
+    pytest.skip(f"no OpenGL here: {error}")
+  with renderer:
+    renderer.enable_segmentation_rendering()
+    renderer.update_scene(data, camera)
+    return ndimage.label(renderer.render()[..., 1] == mujoco.mjtObj.mjOBJ_FLEX)[1]
+
+
+def test_jaws_take_away_what_was_cut_off_and_a_picture_shows_it():
+  spec = mujoco.MjSpec.from_string(JAWS)
+  points, elem = scenes.triangular(0.08, 0.03, 24, 10, 0.2)
+  pin = np.flatnonzero(points[:, 0] < 0.03)
+  keys = {"mass": 0.01, "young": 2e5, "thickness": 0.002, "damping": 0.02, "device": "cpu"}
+  palpate.add_organ(spec, (points, elem), "organ", windows=True, pin=pin, spare=60, **keys)
+  model = spec.compile()
+  data = mujoco.MjData(model)
+  organ = palpate.Organ(model, data, "organ")
+
+  def hold(steps, height):
+    data.ctrl[:] = height, -0.0085, -0.0085
+    mujoco.mj_step(model, data, steps)
+
+  hold(100, 0.0)
+  x = organ.xpos[:, 2].mean()
+  organ.cut([[0.05, -0.015, x], [0.052, 0.015, x]])
+  large, small = organ.pieces
+  for height in np.linspace(0, 0.04, 20):
+    hold(10, height)
+  hold(60, 0.04)
+  assert organ.error is None and organ.xpos[small.vertices, 2].min() > 0.03
+  assert organ.xpos[large.vertices, 2].max() < 0.005
+  assert parts_in_a_picture(model, data) == 2
