@@ -374,12 +374,11 @@ def _check_spare(organ: str, config: Config):
     raise ValueError(f"organ {organ!r}: tear is {config.tear:g}, allowed only with spare")
   if not config.spare:
     return
-  for key in ("carrier", "attach", "relax_share", "support", "resident", "bonded"):
-    if getattr(config, key):
-      name = key.replace("bonded", "bonds")
-      raise ValueError(f"organ {organ!r}: {name} is set, allowed only where spare is 0")
-  if config.elements == "solid":
-    raise ValueError(f"organ {organ!r}: elements is 'solid', allowed only where spare is 0")
+  if config.resident:
+    raise ValueError(f"organ {organ!r}: resident is set, allowed only where spare is 0")
+  for key, text in (("elements", "solid"), ("carrier", OWN)):
+    if getattr(config, key) == text:
+      raise ValueError(f"organ {organ!r}: {key} is {text!r}, allowed only where spare is 0")
 
 
 def _check_ties(organ: str, config: Config):
