@@ -174,6 +174,7 @@ class Cuts:
     w.organ = dataclasses.replace(self.declared, mesh=mesh, mass=mass)
     w.phases.reshape(touched)
     w.ties.reshape()
+    w.cutters.reshape()
 
   def spread(self):
     """Tells the coupling what nodes there are now, and their masses."""
@@ -200,8 +201,8 @@ class Cuts:
 
   # Cutting.
 
-  def cut(self, points: np.ndarray) -> Report:
-    """Cuts the organ along points in the world, (n, 3) [m]; see `Organ.cut`."""
+  def cut(self, points: np.ndarray, given: float = 0.0) -> Report:
+    """Cuts the organ along points in the world, (n, 3) [m]; see `Organ.cut`, and `cutting.cut`."""
     w, organ = self._w, self._w.organ
     if not self:
       raise ValueError(
@@ -212,7 +213,7 @@ class Cuts:
     local = (np.asarray(points, float) - organ.origin) @ organ.frame
     u, v = w.phases.motion()
     of_triangles = functools.partial(energy.of_triangles, w.config)
-    found = cutting.cut(organ.name, mesh, mesh.rest + u, local, ~organ.free, of_triangles)
+    found = cutting.cut(organ.name, mesh, mesh.rest + u, local, ~organ.free, of_triangles, given)
     if found.stopped:
       w.note(
         f"the cut stops early: no spare vertices are left of {mesh.spare}; give the organ more"

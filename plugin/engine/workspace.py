@@ -30,6 +30,7 @@ from .bind import bind
 from .bonds import Bonds
 from .coupling import Phases
 from .creep import Creep
+from .cutters import Cutters
 from .cuts import Cuts
 from .declare import Declaration
 from .hold import Beside, Hold
@@ -75,6 +76,7 @@ class Workspace:
     rests: what it rests on
     creep: its stress relaxation
     cuts: its mesh as it is now
+    cutters: what cuts it
     resident: keeper of a motion that stays on the device, or None
     stiff: whether the response is needed, see `inertia.stiffness`
     heaviest: most times its inertia that a node in contact may have, see there  (1,)
@@ -131,6 +133,7 @@ class Workspace:
   rests: Rests = dataclasses.field(init=False)
   creep: Creep = dataclasses.field(init=False)
   cuts: Cuts = dataclasses.field(init=False)
+  cutters: Cutters = dataclasses.field(init=False)
   resident: Resident | None = None
   stiff: bool = False
   heaviest: np.ndarray = dataclasses.field(default_factory=lambda: np.ones(1))
@@ -165,12 +168,12 @@ class Workspace:
   def __post_init__(self):
     self.hold, self.ties = Hold(self), Ties(self)
     self.bonds, self.rests, self.creep = Bonds(self), Rests(self), Creep(self)
-    self.cuts = Cuts(self)
+    self.cuts, self.cutters = Cuts(self), Cutters(self)
 
   @property
   def beside(self) -> tuple[Beside, ...]:
     """What acts on the organ beside its tissue, in the order in which it does."""
-    return self.ties, self.bonds, self.rests, self.creep
+    return self.ties, self.bonds, self.rests, self.creep, self.cutters
 
   def run(self):
     """Computes the step's forces and adds them to qfrc_passive.
@@ -401,6 +404,7 @@ def make(model: int, data: int, instance: int) -> Workspace:
     w.skin = skin.read(m, organ)
     fasten.declare(w)
     adhere.declare(w)
+    w.cutters.declare()
     bind(w, model)
     w.plugin_state = w.views["plugin_state"].numpy()
     w.signature = w.plugin_state[coupling.spans(organ)["signature"]].data
@@ -445,4 +449,5 @@ def refresh(w: Workspace):
       if w.turn is not None and w.turn.mine:
         place(w, w.model)
     feel(w, m)
+    w.cutters.refresh()
     w.time_step = float(m.opt.timestep)

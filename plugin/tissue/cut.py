@@ -69,6 +69,7 @@ def cut(
   points: np.ndarray,
   pinned: np.ndarray,
   energy: Energy | None = None,
+  given: float = 0.0,
 ) -> Cut:
   """Returns the mesh cut along the path on the surface that is nearest to points.
 
@@ -79,6 +80,7 @@ def cut(
     points: the path, in the same frame [m]      (n, 3)
     pinned: vertices that do not move            (nvert,) bool
     energy: of triangles, which moving vertices must not raise, or None
+    given: but by so much around each, since what cuts has brought it [J]
 
   Raises:
     ValueError: points are off the surface; the path goes through pinned vertices, or is too short.
@@ -87,10 +89,10 @@ def cut(
   runs = paths.trace(organ, mesh, position, points, edge)
   for run in runs:
     run.chain = paths.chain(mesh, run, edge)
-  _check(organ, runs, pinned)
+  _check(organ, mesh, runs, pinned)
   edges, stopped = _room(mesh, [pair for run in runs for pair in _uncut(mesh, run.chain)])
   there = {v for pair in edges for v in pair}
-  moved, corner, weight = _snap(mesh, runs, pinned, position, energy, there)
+  moved, corner, weight = _snap(mesh, runs, pinned, position, energy, there, given)
   rest = mesh.rest.copy()
   rest[moved] = np.einsum("nk,nkj->nj", weight, mesh.rest[corner])
   elem, group, member = _split(mesh, edges)
@@ -106,8 +108,14 @@ def cut(
   return Cut(new, touched, moved, corner, weight, group, member, path, length, deviation, stopped)
 
 
-def _check(organ: str, runs: list[paths.Run], pinned: np.ndarray):
-  if not any(len(run.chain) > 2 for run in runs):
+def _ends_on_rim(mesh: Mesh, chain: list[int]) -> bool:
+  ends = np.array(chain[:2] if len(chain) == 2 else [], int)
+  return bool((mesh.ring_elem[ends, mesh.degree[ends] - 1] < 0).any())
+
+
+def _check(organ: str, mesh: Mesh, runs: list[paths.Run], pinned: np.ndarray):
+  # One edge is enough where it ends on a boundary, or at the end of an older cut.
+  if not any(len(run.chain) > 2 or _ends_on_rim(mesh, run.chain) for run in runs):
     raise ValueError(
       f"organ {organ!r}: the path is shorter than two edges of the mesh there, expected a longer "
       "one"
@@ -126,7 +134,13 @@ def _check(organ: str, runs: list[paths.Run], pinned: np.ndarray):
 
 
 def _snap(
-  mesh: Mesh, runs: list[paths.Run], pinned, position, energy: Energy | None, there: set[int]
+  mesh: Mesh,
+  runs: list[paths.Run],
+  pinned,
+  position,
+  energy: Energy | None,
+  there: set[int],
+  given: float,
 ):
   """Returns vertices that move at rest, and where they lie: corners of a triangle and weights.
 
@@ -155,7 +169,7 @@ def _snap(
   elem, weight = elem[row, best], weight[row, best]
   own = (mesh.elem[elem] == vert[:, None]).astype(float)
   u = position - mesh.rest
-  weight = own + _shares(mesh, vert, elem, weight, u, energy)[:, None] * (weight - own)
+  weight = own + _shares(mesh, vert, elem, weight, u, energy, given)[:, None] * (weight - own)
   moved = (weight != own).any(axis=1)
   return vert[moved], mesh.elem[elem[moved]], weight[moved]
 
@@ -176,7 +190,9 @@ def _on_rim(mesh: Mesh, vert: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray,
   return np.where(rim[:, None], slid, goal), free
 
 
-def _shares(mesh: Mesh, vert, elem, weight, u: np.ndarray, energy: Energy | None) -> np.ndarray:
+def _shares(
+  mesh: Mesh, vert, elem, weight, u: np.ndarray, energy: Energy | None, given: float
+) -> np.ndarray:
   """Returns how far of its way each vertex goes, (n,).
 
   So far that no triangle gets thin or turns, and that the energy around none rises: a vertex gets
@@ -208,7 +224,7 @@ def _shares(mesh: Mesh, vert, elem, weight, u: np.ndarray, energy: Energy | None
       corner, has = mesh.elem[tri[fine]], had.copy()
       has[fine] = energy(rest[corner], moved[corner], tri[fine])
       old, new = (np.bincount(who.ravel() + 1, np.repeat(e, 3), len(vert) + 1) for e in (had, has))
-      less = np.union1d(less, np.flatnonzero(new > _RISE * old) - 1)
+      less = np.union1d(less, np.flatnonzero(new > _RISE * old + given) - 1)
     less = less[less >= 0]
     if not less.size:
       break

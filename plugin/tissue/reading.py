@@ -178,6 +178,29 @@ def bonds(text: str, nelem: int) -> tuple[BondRow, ...]:
   return tuple(found)
 
 
+class CutterRow(NamedTuple):
+  """What cuts, as a configuration declares it.
+
+  Attributes:
+    geoms: name of a geom, or of the two blades of scissors
+    energy: that it takes to open an area [J/m^2]
+  """
+
+  geoms: tuple[str, ...]
+  energy: float
+
+
+def cutters(text: str, nelem: int) -> tuple[CutterRow, ...]:
+  """Returns groups of one or two geoms and an energy."""
+  found = []
+  for group in text.split(","):
+    *geoms, energy = group.split()
+    if len(geoms) not in (1, 2):
+      raise ValueError
+    found.append(CutterRow(tuple(geoms), POSITIVE[0](energy, nelem)))
+  return tuple(found)
+
+
 def words(*values: str) -> tuple:
   """Returns how one of some words is read, and the words for it."""
   return choice({value: value for value in values})
