@@ -277,6 +277,8 @@ class Cutters(Beside):
   def read(self) -> list[Cutter]:
     """Returns what the cutters do."""
     out = []
+    if not self:
+      return out
     for names, row, force in zip(self.names, self.state, self._forces(), strict=True):
       stage, energy, length = row[[BLADE.stage, BLADE.work, BLADE.opened]]
       out.append(Cutter(names, bool(stage), force, float(energy), float(length)))

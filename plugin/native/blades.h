@@ -253,9 +253,11 @@ PALPATE void bear(const Fields& f, int i, const Line& line) {
   }
   if (s[BLADE_STAGE] == PIERCING) {
     const bool low = place < later.length - place;
-    const double press = k * ((low ? place : later.length - place) - s[BLADE_DEPTH]);
-    if (press > 0.0) force += ((low ? -1.0 : 1.0) * (press < law[LAW_PIERCE] ? press : law[LAW_PIERCE])) * later.along;
-    if (press > 0.0 && press < law[LAW_PIERCE]) hold = without(hold, -weight, later.along);
+    const double goes = place + dot(lag, later.along), limit = law[LAW_PIERCE];
+    const double press = k * ((low ? goes : later.length - goes) - s[BLADE_DEPTH]);
+    const double bears = press < 0.0 ? 0.0 : press < limit ? press : limit;
+    force += (low ? -bears : bears) * later.along;
+    if (press > 0.0 && press < limit) hold = without(hold, -weight, later.along);
   }
   store(f.force.data + 3 * i, force);
   store(f.point.data + 3 * i, at.at + then.pull);

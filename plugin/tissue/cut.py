@@ -109,8 +109,10 @@ def cut(
 
 
 def _ends_on_rim(mesh: Mesh, chain: list[int]) -> bool:
-  ends = np.array(chain[:2] if len(chain) == 2 else [], int)
-  return bool((mesh.ring_elem[ends, mesh.degree[ends] - 1] < 0).any())
+  if len(chain) != 2:
+    return False
+  ends = np.array(chain)
+  return bool((mesh.ring_elem[ends, mesh.degree[ends] - 1] < 0).any()) and _is_inner(mesh, *chain)
 
 
 def _check(organ: str, mesh: Mesh, runs: list[paths.Run], pinned: np.ndarray):
