@@ -188,11 +188,13 @@ PALPATE void give_way(const Fields& f, int i, const Line& line) {
   const double* law = f.law.data + LAW_LENGTH * i;
   Seated at = seated(f, s);
   const double place = dot(at.at - line.from, line.along);
-  bool out = place < 0.0 || place > line.length || line.length == 0.0;
+  const double slack = law[LAW_FORCE] / law[LAW_STIFFNESS];
+  const double before = s[BLADE_STAGE] == PIERCING ? slack : 0.0;
+  bool out = place < -before || place > line.length + before || line.length == 0.0;
   if (!out) {
     const D3 pull = line.from + place * line.along - at.at;
     const Stretch now = stretch_of(pull, line.along, at, load(s + BLADE_TOWARD));
-    const double size = norm(now.flat), slack = law[LAW_FORCE] / law[LAW_STIFFNESS];
+    const double size = norm(now.flat);
     if (size > slack) {
       const D3 unit = (1.0 / size) * now.flat;
       const double tilt = dot(unit, line.along), level = 1.0 - tilt * tilt;
@@ -253,11 +255,14 @@ PALPATE void bear(const Fields& f, int i, const Line& line) {
   }
   if (s[BLADE_STAGE] == PIERCING) {
     const bool low = place < later.length - place;
-    const double goes = place + dot(lag, later.along), limit = law[LAW_PIERCE];
-    const double press = k * ((low ? goes : later.length - goes) - s[BLADE_DEPTH]);
-    const double bears = press < 0.0 ? 0.0 : press < limit ? press : limit;
-    force += (low ? -bears : bears) * later.along;
-    if (press > 0.0 && press < limit) hold = without(hold, -weight, later.along);
+    const D3 tip = (low ? -1.0 : 1.0) * later.along;
+    const double press = k * ((low ? place : later.length - place) - s[BLADE_DEPTH]);
+    if (press > 0.0 && press < law[LAW_PIERCE]) {
+      force += (press - k * dot(lag, tip)) * tip;
+      hold = without(hold, -weight, tip);
+    } else if (press > 0.0) {
+      force += law[LAW_PIERCE] * tip;
+    }
   }
   store(f.force.data + 3 * i, force);
   store(f.point.data + 3 * i, at.at + then.pull);
