@@ -1,4 +1,4 @@
-"""Geoms that cut an organ: blades, and the two blades of scissors; the forces are `native/blades.h`.
+"""Geoms that cut an organ: blades, and the two of scissors; their forces are `native/blades.h`.
 
 A blade's path grows in the plugin state, step by step; here the mesh comes apart along it, a few
 edges at a time, since the mesh cannot do so by less.
@@ -17,21 +17,19 @@ from palpate.tissue.step import SCHEMES
 from palpate.tissue.types import doubles, fill, ints, struct
 
 from . import coupling, fasten, flexes, mjstruct
+from .current import Current
 from .hold import Beside, Bodies, Input, Nodes, base, nodes, solver
 from .layout import BLADE, LAW, TRAIL
 
 _SLACK = 0.1  # edges of the mesh by which a blade's spring is stretched where it cuts
 _MORE = 0.5  # edges after which what could not come apart is tried again
-# Edges of a path that come apart at once at least, and that do not yet, behind the blade; and what a
-# vertex may be farther from the path for an edge that is opened more.
+# Edges of a path that come apart at once at least, and that do not yet, behind the blade; and what
+# a vertex may be farther from the path for an edge that is opened more.
 _FIRST, _LAST, _FARTHER = 0.9, 0.3, 0.15
 # Share of the work on an edge that moving a vertex may turn into strain: without it none could move
-# on the blade's path, where tissue is stretched.
+# on to the blade's path, where tissue is stretched.
 _GIVEN = 0.1
-_SHAPES = {
-  int(mujoco.mjtGeom.mjGEOM_CAPSULE): (2, 1, 0),  # long axis, its place in the size, that of the width
-  int(mujoco.mjtGeom.mjGEOM_CYLINDER): (2, 1, 0),
-}
+_ROUND = (int(mujoco.mjtGeom.mjGEOM_CAPSULE), int(mujoco.mjtGeom.mjGEOM_CYLINDER))
 _BOX = int(mujoco.mjtGeom.mjGEOM_BOX)
 
 
@@ -66,7 +64,9 @@ class Blades:
 _enter, _act, _keep = coupling.kernels(
   "blades.h", Blades, "enter_blades", "act_blades", "keep_blades"
 )
-_ENDED = 2  # as in the header: the blade is out of the tissue
+# As in the header: the blade is out of the tissue; edges between points of a path, and that come
+# apart at once.
+_ENDED, _SPACING, _BATCH = 2, 0.4, 1.8
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,6 +100,7 @@ class Cutters(Beside):
     self.names: list[tuple[str, ...]] = []
     self._arrays: dict[str, np.ndarray] = {}
     self._width = np.zeros(0)
+    self._currents: dict[int, Current] = {}
     self._blades: Any = None
     self._due: Any = ()
     self._said = False
@@ -117,7 +118,8 @@ class Cutters(Beside):
     if not w.config.cutters:
       return
     m = mjstruct.Model.from_address(w.model)
-    found = [[_find(w, m, name) for name in row.geoms] for row in w.config.cutters]
+    rows = w.config.cutters
+    found = [[_find(w, m, name, bool(row.current)) for name in row.geoms] for row in rows]
     n = len(found)
     geom, half, axis = np.full((n, 2), -1), np.zeros((n, 2)), np.zeros((n, 2), int)
     self._width = np.zeros(n)
@@ -126,6 +128,9 @@ class Cutters(Beside):
         geom[i, k] = g
         axis[i, k], half[i, k], width = _shape(w, m, g)
         self._width[i] = max(self._width[i], width)
+      if rows[i].current:
+        actuator, shape = _find_actuator(w, m, rows[i].current), _shape(w, m, geoms[0])
+        self._currents[i] = Current(w, geoms[0], actuator, rows[i].energy, shape)
     self.names = [tuple(_name(m, g) for g in geoms) for geoms in found]
     self._arrays = {"geom": geom, "axis": axis, "half": half}
     w.hold.need()
@@ -135,6 +140,9 @@ class Cutters(Beside):
     w, rows = self._w, []
     for i, row in enumerate(w.config.cutters):
       force = row.energy * w.config.thickness
+      if row.current:
+        rows.append((0.0, 0.0, 0.0, w.config.thickness))
+        continue
       stiff = force / (_SLACK * w.organ.mesh.whole.edge_length)
       for g in self._arrays["geom"][i]:
         if g >= 0:
@@ -153,7 +161,8 @@ class Cutters(Beside):
     w = self._w
     where = coupling.spans(w.organ)["blade"]
     address = w.views["plugin_state"].ptr + 8 * where.start
-    return wp.array(ptr=address, dtype=wp.float64, shape=(len(self.names), len(BLADE)), device="cpu")
+    shape = len(self.names), len(BLADE)
+    return wp.array(ptr=address, dtype=wp.float64, shape=shape, device="cpu")
 
   def load(self):
     """See `Beside`."""
@@ -218,12 +227,29 @@ class Cutters(Beside):
   def open(self) -> bool:
     """Lets the mesh come apart along the paths that are long enough, or ended; returns whether."""
     opened, mesh = False, self._w.organ.mesh
+    for i, current in self._currents.items():
+      self._due[i] = self._follow(current, self.state[i])
     for i, due in enumerate(self._due):
       if due:
         given = _GIVEN * self._blades.law.numpy()[i, LAW.force] * mesh.whole.edge_length
         opened = self._open(self.state[i], due == _ENDED, given) or opened
         self._due[i] = 0
     return opened
+
+  def _follow(self, current: Current, row: np.ndarray) -> int:
+    """Lets a path follow a current; returns what is due, as the header says it of blades."""
+    if current.act(row):
+      return _ENDED
+    count, at = int(row[BLADE.count]), row[BLADE.at : BLADE.at + 3]
+    if not row[BLADE.stage]:
+      return 0
+    edge = self._w.organ.mesh.whole.edge_length
+    start, last = (row[k : k + 3] for k in (BLADE.trail, BLADE.trail + 3 * (count - 1)))
+    if count < TRAIL and np.linalg.norm(at - last) > _SPACING * edge:
+      row[BLADE.trail + 3 * count : BLADE.trail + 3 * count + 3] = at
+      row[BLADE.count] += 1
+    wait = row[BLADE.wait] or _BATCH * edge
+    return int(np.linalg.norm(at - start) > wait or row[BLADE.count] == TRAIL)
 
   def _open(self, row: np.ndarray, ended: bool, given: float) -> bool:
     """Opens the path of a blade; returns whether the mesh is another.
@@ -291,7 +317,7 @@ class Cutters(Beside):
 def _part(mesh, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
   """Returns the part of a path that comes apart now, and the rest; nothing where there is none.
 
-  It ends where a vertex is near, so that the mesh need not be bent to where the blade happens to be.
+  It ends where a vertex is near, so that the mesh need not be bent to where the blade is just now.
   """
   edge = mesh.whole.edge_length
   size = np.linalg.norm(np.diff(path, axis=0), axis=1)
@@ -313,7 +339,17 @@ def _name(m, geom: int) -> str:
   return mjstruct.name_of(m, m.name_geomadr, geom)
 
 
-def _find(w, m, name: str) -> int:
+def _find_actuator(w, m, name: str) -> int:
+  names = [mjstruct.name_of(m, m.name_actuatoradr, a) for a in range(m.nu)]
+  found = flexes.resolve(name, w.organ.name, names)
+  if found is None:
+    raise ValueError(
+      f"organ {w.organ.name!r}: cutters names {name!r}, which is no actuator of the model"
+    )
+  return names.index(found)
+
+
+def _find(w, m, name: str, current: bool) -> int:
   names = [_name(m, g) for g in range(m.ngeom)]
   found = flexes.resolve(name, w.organ.name, names)
   if found is None:
@@ -322,7 +358,12 @@ def _find(w, m, name: str) -> int:
     )
   geom = names.index(found)
   flex = w.organ.windows.flex if w.organ.windows else [w.organ.flex]
-  if any(geom in flexes.meeting_geoms(m, int(f)) for f in flex):
+  if not current and not w.cuts:
+    raise ValueError(
+      f"organ {w.organ.name!r}: cutters names {name!r}, which cuts by its edge, allowed only with "
+      "spare"
+    )
+  if not current and any(geom in flexes.meeting_geoms(m, int(f)) for f in flex):
     raise ValueError(
       f"organ {w.organ.name!r}: cutters names {name!r}, which collides with it, expected a geom "
       "with contype='0' conaffinity='0': what cuts goes through"
@@ -337,10 +378,9 @@ def _shape(w, m, geom: int) -> tuple[int, float, float]:
   if kind == _BOX:
     order = np.argsort(size)
     return int(order[2]), float(size[order[2]]), 2 * float(size[order[1]])
-  if kind not in _SHAPES:
+  if kind not in _ROUND:
     raise ValueError(
       f"organ {w.organ.name!r}: cutters names {_name(m, geom)!r}, expected a capsule, cylinder or "
       "box, whose longest axis is the edge"
     )
-  axis, half, width = _SHAPES[kind]
-  return axis, float(size[half]), 2 * float(size[width])
+  return 2, float(size[1]), 2 * float(size[0])

@@ -157,7 +157,7 @@ BOND = Numbers(
   ("released", 1, "J", "what damage has taken of its energy"),
 )
 
-# Of the plugin state: a geom that cuts, and its seat in the tissue; places are those of the rest shape.
+# Of the plugin state: a geom that cuts, and its seat in the tissue; places are at rest.
 BLADE = Numbers(
   "BLADE",
   ("stage", 1, "-", "0 away, 1 at the surface, 2 through the wall"),
@@ -216,7 +216,8 @@ class Topology:
   stamp: doubles("ncuts")  # of all these; 0 before the first cut [-]
 
 
-NO_CUTS = {"ncorner": 0, "nplace": 0, "nspare": 0, "ncuts": 0}  # its sizes where there is no room
+# Its sizes where there is no room, and that of what cuts.
+NO_CUTS = {"nblade": 0, "ncorner": 0, "nplace": 0, "nspare": 0, "ncuts": 0}
 
 
 @struct

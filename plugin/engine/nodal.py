@@ -44,7 +44,7 @@ gather, scatter, push, remember = coupling.kernels(
 
 def state_size(nfree: int, **more: int) -> int:
   """Returns the length of the plugin state of `nfree` degrees of freedom; see `coupling.sizes`."""
-  sizes = {"nfree": nfree, "ncreep": 0, "nbond": 0, "nblade": 0} | layout.NO_CUTS
+  sizes = {"nfree": nfree, "ncreep": 0, "nbond": 0} | layout.NO_CUTS
   return layout.size(NodalState, sizes | more)
 
 

@@ -27,8 +27,7 @@ ROOM = 16
 
 def state_size(nvert: int, nslot: int, ngeom: int, **more: int) -> int:
   """Returns the length of the plugin state; ngeom is summed over the windows."""
-  sizes = {"nvert": nvert, "nslot": nslot, "ngeom": ngeom}
-  sizes |= {"ncreep": 0, "nrest": 0, "nbond": 0, "nblade": 0}
+  sizes = {"nvert": nvert, "nslot": nslot, "ngeom": ngeom, "ncreep": 0, "nrest": 0, "nbond": 0}
   return layout.size(WindowState, sizes | layout.NO_CUTS | more)
 
 

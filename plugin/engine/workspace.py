@@ -30,8 +30,8 @@ from .bind import bind
 from .bonds import Bonds
 from .coupling import Phases
 from .creep import Creep
-from .cutters import Cutters
 from .cuts import Cuts
+from .cutters import Cutters
 from .declare import Declaration
 from .hold import Beside, Hold
 from .layout import FLAG, HEAD, STAGE
@@ -75,8 +75,7 @@ class Workspace:
     bonds: what it has grown on to
     rests: what it rests on
     creep: its stress relaxation
-    cuts: its mesh as it is now
-    cutters: what cuts it
+    cuts: its mesh as it is now; cutters: what cuts it
     resident: keeper of a motion that stays on the device, or None
     stiff: whether the response is needed, see `inertia.stiffness`
     heaviest: most times its inertia that a node in contact may have, see there  (1,)
@@ -94,12 +93,10 @@ class Workspace:
     torn: whether a signal's handler has ended a callback of the last step
     watch: looks whether tools come through the surface
     nbad: MuJoCo's warnings of bad states that were looked at since the last reset
-    model_step: the model's time step comes first [s]
-    time_step: time step that the armature is for [s]
+    model_step: the model's time step comes first; time_step: that the armature is for [s]
     integrator: MuJoCo's comes first
     static: places of the bodies that the organ hangs on, and what they were
-    qpos: numbers of qpos that the slots have, as bytes
-    stood: what they were after the last step, or None
+    qpos: numbers of qpos that the slots have, as bytes; stood: after the last step, or None
     plugin_state: the organ's own numbers
     signature: the last of them, see `Declaration`
     views: what a coupling keeps when its graphs are recorded anew
@@ -178,8 +175,8 @@ class Workspace:
   def run(self):
     """Computes the step's forces and adds them to qfrc_passive.
 
-    As `step` it may be called again where a signal's handler ended it: `FLAG.stage` says how far it
-    came. Not where the motion is on a device, which may be a step ahead.
+    As `step` it may be called again where a signal's handler ended it (`FLAG.stage`), but not where
+    the motion is on a device, which may be a step ahead.
     """
     self._check_model()
     self.strange = self.signature[0] != self.organ.signature

@@ -114,12 +114,13 @@ PALPATE D3 carried(D3 way, const D3* x, const D3* to) {
 
 // What stretches a blade's spring: across the blade, and along the surface; not what is behind the end
 // of the cut, along `back`, where the blade came from.
-struct Stretch { D3 pull, flat, back; bool behind; };
+struct Stretch { D3 pull, flat, back; bool behind; double far; };
 
 PALPATE Stretch stretch_of(D3 pull, D3 blade, const Seated& at, D3 toward) {
   const D3 goes = unit_of(carried(toward, at.rest, at.x));
-  Stretch s = {pull, across(pull, at.normal), unit_of(across(goes, blade)), false};
-  s.behind = dot(s.flat, goes) < 0.0;
+  Stretch s = {pull, across(pull, at.normal), unit_of(across(goes, blade)), false, 0.0};
+  s.far = -dot(s.flat, goes);
+  s.behind = s.far > 0.0;
   if (s.behind) {
     s.pull = across(s.pull, s.back);
     s.flat = across(s.pull, at.normal);
@@ -141,20 +142,23 @@ PALPATE void note_path(double* s, double spacing) {
 template <class Fields>
 PALPATE void sit_down(const Fields& f, int i, const Line& line) {
   double* s = f.next.data + BLADE_LENGTH * i;
-  const D3 zero = {0.0, 0.0, 0.0};
+  const D3 zero = {0.0, 0.0, 0.0}, toward = cuts_toward(f, i);
+  const bool shears = f.geom.data[2 * i + 1] >= 0;
+  if (shears && toward == zero) return;
   int elem = 0;
-  D3 weight, rest[3];
+  D3 weight, rest[3], x[3];
   const double beyond = enters(f, line, elem, weight);
   if (beyond < 0.0) return;
   corners_at_rest(f, elem, rest);
+  corners_now(f, elem, x);
   const Line later = line_of(f, i, f.mj.timestep.data[0]);
   const double fast = 2.0 * norm(later.from - line.from);
-  const bool sideways = beyond > f.law.data[LAW_LENGTH * i + LAW_WALL] + fast || f.geom.data[2 * i + 1] >= 0;
+  const bool sideways = beyond > f.law.data[LAW_LENGTH * i + LAW_WALL] + fast || shears;
   s[BLADE_STAGE] = sideways ? THROUGH : PIERCING;
   s[BLADE_ELEM] = elem;
   s[BLADE_DEPTH] = s[BLADE_COUNT] = 0.0;
   store(s + BLADE_AT, blend(rest, weight));
-  store(s + BLADE_TOWARD, zero);
+  store(s + BLADE_TOWARD, unit_of(carried(toward, x, rest)));
   if (sideways) note_path(s, 0.0);
 }
 
@@ -195,7 +199,8 @@ PALPATE void give_way(const Fields& f, int i, const Line& line) {
     const D3 pull = line.from + place * line.along - at.at;
     const Stretch now = stretch_of(pull, line.along, at, load(s + BLADE_TOWARD));
     const double size = norm(now.flat);
-    if (size > slack) {
+    out = now.far > LEAP * f.edge;  // it has been drawn back
+    if (!out && size > slack) {
       const D3 unit = (1.0 / size) * now.flat;
       const double tilt = dot(unit, line.along), level = 1.0 - tilt * tilt;
       const double far = (size - slack) / (level > LEVEL ? level : LEVEL), most = LEAP * f.edge;
@@ -286,6 +291,7 @@ PALPATE void enter_blades(const Fields& f, Thread, int) {
     for (int c = 0; c < BLADE_LENGTH; ++c) s[c] = f.state.data[BLADE_LENGTH * i + c];
     store(f.force.data + 3 * i, zero);
     f.due.data[i] = NOTHING;
+    if (f.law.data[LAW_LENGTH * i + LAW_STIFFNESS] == 0.0) continue;  // it cuts by its current
     const Line line = line_of(f, i, 0.0);
     if (s[BLADE_STAGE] == AWAY && line.length > 0.0) sit_down(f, i, line);
     if (s[BLADE_STAGE] == AWAY) continue;
@@ -307,7 +313,7 @@ PALPATE void act_blades(const Fields& f, Thread, int) {
   const D3 zero = {0.0, 0.0, 0.0};
   for (int i = 0; i < f.nblade; ++i) {
     const double* s = f.next.data + BLADE_LENGTH * i;
-    if (s[BLADE_STAGE] == AWAY) continue;
+    if (s[BLADE_STAGE] == AWAY || f.law.data[LAW_LENGTH * i + LAW_STIFFNESS] == 0.0) continue;
     D3 dv = zero;
     for (int c = 0; c < 3; ++c) {
       const int v = f.elem.data[3 * (int)s[BLADE_ELEM] + c];
@@ -326,7 +332,7 @@ PALPATE void act_blades(const Fields& f, Thread, int) {
 // Keeps the blades' state.
 template <class Fields>
 PALPATE void keep_blades(const Fields& f, Thread, int) {
-  for (int c = 0; c < BLADE_LENGTH * f.nblade; ++c) f.state.data[c] = f.next.data[c];
+  for (int i = 0; i < BLADE_LENGTH * f.nblade; ++i) f.state.data[i] = f.next.data[i];
 }
 
 }  // namespace palpate

@@ -29,12 +29,22 @@ PALPATE Line line_of_geom(const Fields& f, int i, int which, double ahead) {
   return {from, unit_of(to - from), norm(to - from)};
 }
 
+// The same from the end that is nearer to where its body turns.
+template <class Fields>
+PALPATE Line line_outward(const Fields& f, int i, int which, double ahead) {
+  const Line s = line_of_geom(f, i, which, ahead);
+  const D3 to = s.from + s.length * s.along, zero = {0.0, 0.0, 0.0};
+  const int b = f.mj.geom_bodyid.data[f.geom.data[2 * i + which]];
+  const D3 pivot = load(f.mj.xpos.data + 3 * b);
+  return norm(s.from - pivot) <= norm(to - pivot) ? s : Line{to, zero - s.along, s.length};
+}
+
 // Where the edges of scissors cross, in the world, seen along what they turn about.
 struct Shear { D3 at, about, one, two; bool meets; };
 
 template <class Fields>
 PALPATE Shear shear_of(const Fields& f, int i, double ahead) {
-  const Line p = line_of_geom(f, i, 0, ahead), q = line_of_geom(f, i, 1, ahead);
+  const Line p = line_outward(f, i, 0, ahead), q = line_outward(f, i, 1, ahead);
   const double c = dot(p.along, q.along), det = 1.0 - c * c;
   Shear s = {p.from, unit_of(cross(p.along, q.along)), p.along, q.along, false};
   if (det < 1e-6) return s;
@@ -61,6 +71,16 @@ PALPATE Line line_of(const Fields& f, int i, double ahead) {
   line.from = add_turned(zero, f.own.frame.data, line.from - load(f.own.origin.data));
   line.along = add_turned(zero, f.own.frame.data, line.along);
   return line;
+}
+
+// Which way scissors cut, in the organ's frame: 0 while they open. Of blades 0 too, which cut any way.
+template <class Fields>
+PALPATE D3 cuts_toward(const Fields& f, int i) {
+  const D3 zero = {0.0, 0.0, 0.0};
+  if (f.geom.data[2 * i + 1] < 0) return zero;
+  const Shear now = shear_of(f, i, 0.0), then = shear_of(f, i, f.mj.timestep.data[0]);
+  const D3 out = unit_of(now.one + now.two);
+  return dot(then.at - now.at, out) > 0.0 ? add_turned(zero, f.own.frame.data, out) : zero;
 }
 
 template <class Fields>

@@ -182,10 +182,15 @@ class Config:
   )
   cutters: tuple[CutterRow, ...] = _row(
     (),
-    (reading.cutters, "a geom, or two of scissors, and an energy > 0, a comma between such groups"),
-    "with `spare`: geoms without contacts that cut the wall where they are driven through it, and the "
-    "energy that it takes to open an area ([cutters](cutting.md#cutters)): "
-    "`scalpel/edge 160, scissors/edge_left scissors/edge_right 160`",
+    (
+      reading.cutters,
+      "a geom, or two of scissors, and an energy > 0, and for a current 'by' and an actuator, a "
+      "comma between such groups",
+    ),
+    "geoms that cut the wall where they are driven through it (with `spare`), and the energy that "
+    "it takes to open an area, or that cut and free bonds by a current "
+    "([cutters](cutting.md#cutters)): `scalpel/edge 160, scissors/edge_left scissors/edge_right "
+    "160, hook/hook_toe 1.1e6 by current`",
     "-, J/m²",
   )
   resident: bool = _row(
@@ -370,8 +375,8 @@ def spare(organ: str, text: str, there: int) -> int:
 def _check_spare(organ: str, config: Config):
   if config.tear and not config.spare:
     raise ValueError(f"organ {organ!r}: tear is {config.tear:g}, allowed only with spare")
-  if config.cutters and not config.spare:
-    raise ValueError(f"organ {organ!r}: cutters is set, allowed only with spare")
+  if config.cutters and not config.spare and not config.bonded:
+    raise ValueError(f"organ {organ!r}: cutters is set, allowed only with spare, or bonds to free")
   if not config.spare:
     return
   for key in ("carrier", "attach", "relax_share", "support", "resident", "bonded"):

@@ -5,6 +5,7 @@ import numpy as np
 import palpate
 import pytest
 import scenes
+from palpate.models import trocar
 
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 BOTH = pytest.mark.parametrize("windows", [False, True], ids=["nodal", "windows"])
@@ -131,6 +132,75 @@ def test_a_state_in_the_middle_of_a_cut_goes_on_to_the_bit():
   assert not organ.cutters[0].inside and organ.cutters[0].energy == 0
 
 
+def test_scissors_cut_as_far_as_they_close():
+  def add(spec, x, z):
+    turn = (np.sqrt(0.5), 0, -np.sqrt(0.5), 0)
+    trocar.attach(spec, "scissors", "s/", pos=(x - 0.12, 0, z), quat=turn)
+
+  none = {"contype": 0, "conaffinity": 0}
+  cutters = f"s/edge_left s/edge_right {ENERGY}"
+  model, data, organ = scene(x=0.025, add=add, cutters=cutters, contact=none)
+  jaw = data.actuator("s/jaw")
+
+  def close(opening, seconds):
+    for _ in range(round(seconds / model.opt.timestep)):
+      jaw.ctrl[0] += np.clip(opening - jaw.ctrl[0], -0.004, 0.004)
+      mujoco.mj_step(model, data)
+
+  data.joint("s/jaw_left").qpos[0] = data.joint("s/jaw_right").qpos[0] = 0.4
+  jaw.ctrl[0] = 0.8
+  close(0.8, 0.1)
+  assert not organ.cutters[0].inside  # they are open
+  close(0.1, 0.9)
+  (cutter,) = organ.cutters
+  assert cutter.inside and 0.002 < cutter.length < 0.017
+  np.testing.assert_allclose(cutter.force, [FORCE, 0, 0], atol=0.03 * FORCE)  # away from the hand
+  # The edges run from 1.1 mm off the middle, 3 mm from the pivot, to 0.2 mm at 21.8 mm: they cross
+  # at 1.244 mm / (angle + 0.0479), and what the jaws feel is the force on that way.
+  angle = data.joint("s/jaw_left").qpos[0] + 0.0479
+  felt = -data.actuator("s/jaw").force[0]
+  assert felt == pytest.approx(FORCE * 0.5 * 1.244e-3 / angle**2, rel=0.05)
+  close(-0.1, 0.3)
+  assert organ.cutters[0].energy == pytest.approx(FORCE * organ.cutters[0].length, rel=0.1)
+  line = np.concatenate([line for report in organ.cuts for line in report.path])
+  assert line[:, 0].max() == pytest.approx(0.0235, abs=2e-3)  # nearly to the tips, at 0.025
+  before = organ.cutters[0].energy
+  close(0.8, 0.4)
+  assert organ.cutters[0].energy == before  # nothing as they open
+
+
+def current(spec, x, z):
+  """Adds a ball on slides with a power."""
+  scalpel(spec, x, z)
+  spec.geom("edge").size = [0.001, 0.001, 0]
+  spec.add_actuator(name="power", target="x", trntype=mujoco.mjtTrn.mjTRN_JOINT)
+  spec.actuator("power").gainprm = 10 * [0]
+
+
+def test_a_current_cuts_as_fast_as_its_power_allows():
+  burn = 1.1e6  # [J/m^2]
+  power = 0.01 * burn * THICKNESS  # [W], for 10 mm/s
+  given = {"add": current, "x": 0.01, "cutters": f"edge {burn} by power"}
+  for share, length in ((1.0, 0.01), (0.0, 0.0), (-1.0, 0.0)):
+    model, data, organ = scene(**given)
+    follow(model, data, organ, lambda t, p=share * power: (0.009 * t, 0, p), 1.2)
+    assert organ.cutters[0].length == pytest.approx(length, abs=1.2e-3)
+    assert bool(organ.cuts) == (length > 0)
+
+
+def test_a_current_frees_bonds():
+  model, data, organ = scene(
+    add=current, x=0.025, spare=0, bonds="none", cutters="edge 1e6 by power"
+  )
+  mujoco.mj_forward(model, data)
+  vertices = np.flatnonzero(organ.free)
+  organ.bond("world", 1e7, 6e3, 6.0, vertices=vertices)
+  near = np.linalg.norm(organ.bonds.positions - [0.025, 0, 0], axis=1) < 0.002
+  assert near.any()
+  follow(model, data, organ, lambda t: (0, 0, -80.0), 0.4)
+  assert organ.bonds.free[near].all() and not organ.bonds.free[~near].any()
+
+
 def test_where_no_vertex_is_left_a_blade_goes_on_without_cutting():
   model, data, organ = scene(spare=3)
   for _ in range(700):
@@ -146,6 +216,7 @@ def test_where_no_vertex_is_left_a_blade_goes_on_without_cutting():
     ({"cutters": "knife 160"}, "cutters names 'knife', which is no geom"),
     ({"cutters": "edge"}, "cutters is 'edge', expected a geom"),
     ({"cutters": "edge -1"}, "expected a geom, or two of scissors, and an energy > 0"),
+    ({"cutters": "edge 160 by current"}, "cutters names 'current', which is no actuator"),
     ({"spare": 0}, "cutters is set, allowed only with spare"),
     ({"integrator": "neumann"}, "allowed only without cutters"),
   ],
