@@ -75,10 +75,11 @@ class Cutter:
 
   Attributes:
     geoms: their names
-    inside: whether it is in the tissue
+    inside: whether it has gone through the wall and is there
     force: on the tissue in the last step, in the world [N]  (3,)
     energy: that opening the tissue has taken [J]
     length: of its paths so far, at rest [m]
+    seat: where it is in the tissue at rest, in the world [m]  (3,)
   """
 
   geoms: tuple[str, ...]
@@ -86,6 +87,7 @@ class Cutter:
   force: np.ndarray
   energy: float
   length: float
+  seat: np.ndarray
 
 
 class Cutters(Beside):
@@ -307,7 +309,9 @@ class Cutters(Beside):
       return out
     for names, row, force in zip(self.names, self.state, self._forces(), strict=True):
       stage, energy, length = row[[BLADE.stage, BLADE.work, BLADE.opened]]
-      out.append(Cutter(names, bool(stage), force, float(energy), float(length)))
+      organ = self._w.organ
+      seat = organ.origin + organ.frame @ row[BLADE.at : BLADE.at + 3]
+      out.append(Cutter(names, stage == 2, force, float(energy), float(length), seat))
     return out
 
   def _forces(self) -> np.ndarray:
