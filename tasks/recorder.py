@@ -127,6 +127,10 @@ class Recorder:
     visible: ArrayLike | None = None,
     freed: ArrayLike | None = None,
     traction: ArrayLike | None = None,
+    deviation: ArrayLike | None = None,
+    farthest: ArrayLike | None = None,
+    excess: ArrayLike | None = None,
+    jagged: ArrayLike | None = None,
     arrays: Mapping[str, ArrayLike] | None = None,
   ) -> None:
     """Adds one sample; with several instruments each argument has a row (or a number) for each.
@@ -150,6 +154,10 @@ class Recorder:
       visible: 1 where the camera's view holds the tip, else 0  ()
       freed: share of what is bonded that came free as it should  ()
       traction: pull on what it is bonded to [N]  ()
+      deviation: mean distance of a cut from its line so far [m]  ()
+      farthest: the largest so far [m]  ()
+      excess: area between the two so far [m^2]  ()
+      jagged: length of the cut so far that is more than 2 mm off [m]  ()
       arrays: the caller's own, of any shape and number type, the same in every sample; arrays that
         are not floating point may not miss a sample
     """
@@ -159,6 +167,7 @@ class Recorder:
     given = {"tip_pos": tip_pos, "quat": quat, "axis": axis, "force": force}
     given |= {"grip_force": grip_force, "shaft_force": shaft_force, "area": area, "strain": strain}
     given |= {"grip": grip, "held": held, "visible": visible, "freed": freed, "traction": traction}
+    given |= {"deviation": deviation, "farthest": farthest, "excess": excess, "jagged": jagged}
     columns = {k: self._entry(k, v) for k, v in given.items() if v is not None}
     own = {name: self._own(name, value) for name, value in arrays.items()} if arrays else {}
     self._store(time, columns, own)
