@@ -2,7 +2,9 @@
 # pyright: reportAttributeAccessIssue=false
 """The physics of an exercise: one organ, one instrument on a trocar, and what one asks of them."""
 
+import functools
 import math
+from collections.abc import Callable
 
 import mujoco as mj
 import numpy as np
@@ -31,7 +33,14 @@ FOLD, GRIPPING = 0.02, 0.15
 
 
 class Physics(Portable):
-  """Physics of an exercise: one organ, one instrument on a trocar."""
+  """Physics of an exercise: one organ, one instrument on a trocar.
+
+  Attributes:
+    meanwhile: called in the middle of every `step`, with what need not be done at its end, where a
+      live exercise has least time; None for nothing
+  """
+
+  meanwhile: Callable[[], None] | None = None
 
   def use(self, model: mj.MjModel, prefix: str, targets: int, organ: str = ORGAN) -> None:
     """Takes a compiled scene; ValueError names what it lacks.
@@ -99,6 +108,8 @@ class Physics(Portable):
         if self.handle:
           self._felt[k] = self.handle.wrench()
           self._lead(k, nstep)
+        if k == nstep // 2 and self.meanwhile is not None:
+          self.meanwhile()
         begin(model, data)
       self._keep(values)
       self.moved()
@@ -250,11 +261,15 @@ class Physics(Portable):
       self._nodes.flags.writeable = False
     return self._nodes
 
-  def strain(self, rest: np.ndarray) -> float:
-    """Returns the largest strain of the organ's surface against its nodes `rest` [-]."""
+  def strain(self, rest: np.ndarray) -> Callable[[], float]:
+    """Returns what works out the largest strain of the organ's surface as it is now [-].
+
+    Args:
+      rest: nodes against which [m]  (nvert, 3)
+    """
     if self._stretch is None or self._stretch[0] is not rest:
       self._stretch = rest, Stretch(rest, self._elem)
-    return self._stretch[1].most(self.nodes())
+    return functools.partial(self._stretch[1].most, self.nodes())
 
   def nodes_near(self) -> np.ndarray:
     """Returns the organ's nodes nearest to the tip, from the tip [m]  (NEAR, 3)."""
