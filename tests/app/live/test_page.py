@@ -12,7 +12,7 @@ pytest.importorskip("websockets")
 from palpate.app.live.server import Server
 
 ANSWER = 90.0  # that a busy machine may take [s]
-FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+FLAGS = ("--no-sandbox", "--enable-unsafe-swiftshader")
 LOOK = """(() => {
   const {scene, head, targets} = window.palpate();
   const text = document.getElementById("instruction").textContent;
