@@ -210,3 +210,4 @@ def _push_organ(organ: Organ, world: int, model, data):
   full[node] = force
   _assign(organ.patch.force, world, full)
   organ.patch.heavier[world : world + 1].assign(np.array([heavier]))
+  organ.wake([world])

@@ -238,6 +238,8 @@ class Worlds(Batch):
       whole = array.numpy()
       whole[(worlds, *place)] = values
       array.assign(whole)
+    for organ in self._organs.values():
+      organ.wake(worlds)
 
   def _tell(self):
     self._teller.tell()
