@@ -49,8 +49,8 @@ class Common:
   failures: ints("nworld")
   xpos: floats("nworld", "nvert", 3)
   # Drawn for an episode.
-  port_pos: vectors  # of the trocar in the world [m]
-  port_quat: Array(wp.quat, ("nworld",))  # x y z w
+  body_pos: floats("nworld", 3)  # of the trocar in the world [m]
+  body_quat: floats("nworld", 4)  # w x y z
   pose: floats("nworld", 4)  # joints at the start
   # State.
   action: floats("nworld", "naction")

@@ -53,6 +53,13 @@ def normal(s: Common, w: int, triangle: int):
   return wp.normalize(wp.cross(b - a, node(s, w, s.elem[triangle, 2]) - a))
 
 
+@wp.kernel(enable_backward=False)
+def write(at: wp.array[int], rows: wp.array2d[int], out: wp.array2d[int]):
+  """Writes rows to their places."""
+  k, i = wp.tid()
+  out[at[k], i] = rows[k, i]
+
+
 # A control step.
 
 
@@ -143,8 +150,8 @@ def place(s: Common, w: int):
   by_pitch, by_yaw = wp.vec3(0.0, cy * cp, cy * sp), wp.vec3(cy, -sy * sp, sy * cp)
   vel = s.joint_vel[w, 3] * along
   vel += far * (s.joint_vel[w, 0] * by_pitch + s.joint_vel[w, 1] * by_yaw)
-  port = s.port_quat[w]
-  put(s.tip_pos, w, s.port_pos[w] + wp.quat_rotate(port, far * along))
+  port = wp.quat(s.body_quat[w, 1], s.body_quat[w, 2], s.body_quat[w, 3], s.body_quat[w, 0])
+  put(s.tip_pos, w, vector(s.body_pos, w) + wp.quat_rotate(port, far * along))
   put(s.tip_vel, w, wp.quat_rotate(port, vel))
   q = port * wp.quat(wp.sin(0.5 * pitch), 0.0, 0.0, wp.cos(0.5 * pitch))
   q = q * wp.quat(0.0, -wp.sin(0.5 * yaw), 0.0, wp.cos(0.5 * yaw))

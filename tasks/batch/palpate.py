@@ -3,7 +3,6 @@
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 from typing import Any
 
-import numpy as np
 import warp as wp
 from palpate.models import shapes
 from palpate.tasks import probe, scenes
@@ -78,6 +77,7 @@ class Palpate(domain.Domain):
   struct = PalpateState
   begin, advance, observe = begin, advance, observe
   takes = ("tolerance",)
+  tissue = ("young",)
 
   @staticmethod
   def prepare(task: Any):
@@ -97,16 +97,9 @@ class Palpate(domain.Domain):
   @staticmethod
   def draw(task: Any, physics):
     """Returns the rows of a world."""
-    return {"inclusion": task.inclusion}
-
-  @staticmethod
-  def tissue(task: Any, rows):
-    """Returns what `Tissue.configure` gives the worlds."""
-    scene = task.scene
+    scene, place = task.scene, task.inclusion
     vertices, triangles = scenes.surface(scene.organ, scene.nodes, task.variants[0])
     young = scenes.TISSUES[scene.organ].young
-    stiff = [
-      shapes.inclusion_young(vertices, triangles, place, task.radius, young, task.factor * young)
-      for place in rows["inclusion"]
-    ]
-    return {"young": np.array(stiff)}
+    stiff = task.factor * young
+    lump = shapes.inclusion_young(vertices, triangles, place, task.radius, young, stiff)
+    return {"inclusion": place, "young": lump}
