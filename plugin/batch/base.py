@@ -93,6 +93,19 @@ class Batch(abc.ABC):
     """Mean of the sensors over the steps of the last call of `step`, (nworld, nsensordata)."""
     return self._summary["mean"]
 
+  def watch(self, steps: int) -> wp.array:
+    """Returns where the sensors of each step will be, in calls of `step` of so many steps at most.
+
+    Returns:
+      (nworld, steps, nsensordata), which keeps its place
+    """
+    if isinstance(steps, bool) or not isinstance(steps, int | np.integer) or steps < 1:
+      raise ValueError(f"steps is {steps!r}, expected a whole number >= 1")
+    return self._watch(self._make(int(steps), self.model.nsensordata))
+
+  def _watch(self, out: wp.array) -> wp.array:
+    raise ValueError("worlds on several devices cannot be watched; their `parts` can")
+
   @property
   def failures(self) -> wp.array:
     """How often each world had numbers that are not finite, and was reset for it, (nworld,)."""

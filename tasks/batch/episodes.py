@@ -17,7 +17,8 @@ from palpate.tasks.physics import Physics
 
 from .domain import Domain
 
-FRAME = ("body_pos", "body_quat", "pose")  # what every exercise draws: trocar and joints
+# What every exercise draws: trocar, joints, length of the path.
+FRAME = ("body_pos", "body_quat", "pose", "reference")
 
 
 class Resting(Physics):
@@ -122,6 +123,7 @@ class Episodes:
     if body.parentid[0]:
       raise ValueError(f"{self._task.name}: the trocar hangs on a body, expected the world")
     frame = {"body_pos": body.pos.copy(), "body_quat": body.quat.copy(), "pose": self.physics.pose}
+    frame["reference"] = np.array(self._task.reference_length() or 0.0)
     return frame | dict(self._domain.draw(self._task, self.physics))
 
 

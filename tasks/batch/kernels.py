@@ -104,6 +104,11 @@ def begin(s: Common):
   s.cost_force[w] = 0.0
   s.cost_shaft[w] = 0.0
   s.cost_damage[w] = 0.0
+  s.errors[w] = 0
+  s.targets[w] = 0
+  s.missed_by[w] = 0.0
+  s.grasps[w] = 0
+  s.slips[w] = 0
 
 
 @wp.kernel(enable_backward=False)
@@ -161,11 +166,29 @@ def place(s: Common, w: int):
     s.tip_quat[w, 1 + k] = q[k]
 
 
+# Events, see `Task.event`.
+
+
+@wp.func
+def error(s: Common, w: int):
+  """Counts a miss, a drop or a contact that was not meant."""
+  s.errors[w] = s.errors[w] + 1
+
+
+@wp.func
+def reach(s: Common, w: int, distance: float):
+  """Counts a target that was reached, at a distance from it [m]."""
+  s.targets[w] = s.targets[w] + 1
+  s.missed_by[w] = s.missed_by[w] + distance
+
+
 @wp.func
 def judge(s: Common, w: int, progress: float, outcome: int):
   """Ends a control step that came to a progress and an outcome; a success is all of it."""
   peak, shaft = s.peak_force[w, 0], s.shaft_peak[w]
   over, lies, harmed = parts(peak, shaft, s.force_limit, s.damage)
+  if lies > 0.0 and s.cost_shaft[w] == 0.0:
+    error(s, w)
   total = over + lies + harmed
   s.cost[w] = total
   s.cost_force[w] = over

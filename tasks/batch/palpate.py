@@ -10,7 +10,7 @@ from palpate.tissue.types import Array, floats, struct
 
 from . import domain
 from .fields import MISSED, RUNNING, SUCCESS, Common
-from .kernels import judge, put, vector
+from .kernels import error, judge, put, reach, vector
 
 _FEELING, _FELT = wp.constant(probe.FEELING), wp.constant(probe.FELT)
 _REPORT = wp.constant(probe.REPORT)
@@ -49,8 +49,12 @@ def advance(s: Common, o: PalpateState):
   found = wp.float32(0.0)
   if s.action[w, 4] > 0.5:
     outcome = MISSED
-    if wp.length(tip - o.inclusion[w]) <= o.tolerance and force >= _REPORT:
+    off = wp.length(tip - o.inclusion[w])
+    if off <= o.tolerance and force >= _REPORT:
       outcome = SUCCESS
+      reach(s, w, off)
+    else:
+      error(s, w)
   else:
     count = wp.int32(0)
     for k in range(o.places.shape[0]):

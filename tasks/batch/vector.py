@@ -25,6 +25,7 @@ from gymnasium.vector.utils import batch_space
 from palpate.batch.base import on_device
 from palpate.tasks.gym import Exercise
 
+from . import tally
 from .domain import Domain
 from .fields import INFO, OBSERVED, OUTCOMES
 from .grasp import Grasp
@@ -165,7 +166,7 @@ class Exercises(VectorEnv):
     infos = {}
     if over.any():
       infos = {"final_obs": self._final(over), "_final_obs": over}
-      infos |= {"final_info": self._infos(over), "_final_info": over}
+      infos |= {"final_info": self._infos(over) | {"metrics": self._metrics()}, "_final_info": over}
       self._begin(over)
     return (self._observations(), *told, self._infos() | infos)
 
@@ -208,6 +209,13 @@ class Exercises(VectorEnv):
     for world in np.flatnonzero(over):
       final[world] = {name: values[world] for name, values in seen.items()}
     return final
+
+  def _metrics(self) -> dict[str, Any]:
+    """Returns the metrics of the episodes so far, NaN where they are unknown."""
+    values, names = self._tell("values"), tally.names(self.task.jaws)
+    if self.output != "warp":
+      return {name: values[:, k] for k, name in enumerate(names)}
+    return {name: wp.clone(values[:, k]) for k, name in enumerate(names)}
 
   def _infos(self, where: np.ndarray | None = None) -> dict[str, Any]:
     """Returns what `info` is of a single environment; with a mask that is not of all worlds."""

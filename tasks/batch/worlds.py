@@ -19,7 +19,7 @@ from palpate.tasks.physics import AXES
 from palpate.tasks.stage import STATE
 from palpate.tissue.types import allocate
 
-from . import kernels
+from . import kernels, tally
 from .domain import Domain
 from .episodes import FRAME, Episodes, at_rest
 from .fields import Common
@@ -33,6 +33,7 @@ class Worlds:
   Attributes:
     fields: what every exercise has, arrays on the device
     own: what the domain has
+    tally: what metrics are made of
     batch: the physics
     organ: the organ in it
     device: of the arrays
@@ -80,6 +81,7 @@ class Worlds:
         getattr(self.own, name).assign(value)
       else:
         setattr(self.own, name, value)
+    self.tally = self._count(task)
     self._bad = wp.zeros(1, dtype=int, device=self.device)
     self._done, self._graphs = set[str](), dict[str, Any]()
 
@@ -111,6 +113,17 @@ class Worlds:
     self._read(s)
     return s
 
+  def _count(self, task: Any) -> Any:
+    """Returns the sums that metrics are made of."""
+    steps = self.batch.watch(self._substeps)
+    sizes = dict(
+      nworld=self.nworld, nstep=self._substeps, nsensordata=self.batch.model.nsensordata
+    )  # fmt: skip
+    t = allocate(tally.Tally, self.device, sizes)
+    t.contact, t.limit = task.settings().contact_force, task.force_limit
+    t.h, t.sensor_steps = self.batch.model.opt.timestep, steps
+    return t
+
   @staticmethod
   def _point_at(s: Any, task: Any, model: mj.MjModel) -> None:
     """Writes where the instrument's joints and sensors are."""
@@ -134,8 +147,10 @@ class Worlds:
   # Doing.
 
   def array(self, name: str) -> wp.array:
-    """Returns one of the arrays of `fields` or `own`."""
-    return getattr(self.fields if name in Common.vars else self.own, name)
+    """Returns one of the arrays of `fields`, `own` or `tally`."""
+    if name in Common.vars:
+      return getattr(self.fields, name)
+    return getattr(self.own if name in self._domain.struct.vars else self.tally, name)
 
   def check(self, action: wp.array, first: int = 0) -> None:
     """Raises ValueError where an action is not in [-1, 1]; it names world and component.
@@ -182,6 +197,7 @@ class Worlds:
     self._over(kernels.measure, False)
     self._domain.sense(self)
     self._over(self._domain.advance, self.own)
+    self._over(tally.add, self.tally)
     self._observe(False)
 
   def begin(self, worlds: np.ndarray, seeds: Sequence[int | None] | None = None) -> None:
@@ -200,7 +216,7 @@ class Worlds:
       self._write(getattr(s if name in FRAME else self.own, name), at, values[worlds])
     # The plugin's worlds take them as they were drawn, in float64.
     pos, quat, pose = (
-      rows[name] if self.device.is_cpu else getattr(s, name) for name in FRAME
+      rows[name] if self.device.is_cpu else getattr(s, name) for name in FRAME[:3]
     )  # fmt: skip
     self.batch.reset(s.begun)
     if self.task.jitter:
@@ -225,6 +241,7 @@ class Worlds:
     self._read(self.fields)
     self._over(kernels.measure, True)
     self._over(self._domain.begin, self.own)
+    self._over(tally.start, self.tally)
     self._observe(True)
 
   def _run(self, work: Callable[[], None]) -> None:
