@@ -185,9 +185,9 @@ class Organ(Tissue):
 
   def wake(self, worlds):
     """Lets the organ of some worlds step that may have slept."""
-    stirred = self.patch.stirred.numpy()
-    stirred[worlds] = 1
-    self.patch.stirred.assign(stirred)
+    calm = self.patch.calm.numpy()
+    calm[worlds] = 0.0
+    self.patch.calm.assign(calm)
 
   def rubs(self, geom: int, friction: np.ndarray):
     """Returns which array has the friction of a geom, where, and its new values a world."""

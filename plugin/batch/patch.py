@@ -69,7 +69,7 @@ class Patch:
   lump: floats("nlump", "nnode")  # factor on Young's modulus around a node; none where all have 1
   heavier: doubles("nworld")  # times its inertia at rest that a tool meets; 0 for once
   calm: doubles("nworld")  # how long it has been at rest [s]
-  stirred: ints("nworld")  # whether it moves, is touched, or was changed
+  stirred: ints("nworld")  # whether it moved or was touched in the last step
   force: floats("nworld", "nnode", 3)  # contact force of the last step [N]
   last: vector  # last change of the velocity [m/s]
   before: vector  # the one before it [m/s]
@@ -80,6 +80,7 @@ class Patch:
   before0: floats("nslice", 3, 8)
   force0: floats("nnode", 3)  # contact force [N]
   heavier0: doubles(1)
+  calm0: doubles(1)  # [s]
   # Within a step:
   tool: doubles("nworld", "ntool", len(GEOM))  # see GEOM
   count: ints("nworld")  # candidates
@@ -211,13 +212,14 @@ def variables(nworld: int, nslot: int, nslice: int) -> dict:
     lump=np.zeros((0, nnode)),
     heavier=np.zeros(nworld),
     calm=np.zeros(nworld),
-    stirred=np.ones(nworld),
+    stirred=np.zeros(nworld),
     force=np.zeros((nworld, nnode, 3)),
     last=np.zeros(shape),
     before=np.zeros(shape),
     **{f"{name}0": np.zeros(shape[1:]) for name in ("disp", "vel", "last", "before")},
     force0=np.zeros((nnode, 3)),
     heavier0=np.zeros(1),
+    calm0=np.zeros(1),
     count=np.zeros(nworld),
     candidate=np.zeros((nworld, most)),
     distance=np.zeros((nworld, most)),

@@ -299,8 +299,11 @@ template <class Fields>
 PALPATE void rest_organ(const Fields& f, Thread t, int) {
   const int w = t.world;
   if (!f.mask.data[w]) return;
-  if (t.tid == 0) f.heavier.data[w] = f.heavier0.data[0];
-  if (t.tid == 0) f.stirred.data[w] = 1;
+  if (t.tid == 0) {
+    f.heavier.data[w] = f.heavier0.data[0];
+    f.calm.data[w] = f.calm0.data[0];
+    f.stirred.data[w] = 0;
+  }
   each_item(t, f.nnode, [&](int i) {
     const size_t at = at_node(f, w, i);
     const int from = offset_of(i);

@@ -103,10 +103,10 @@ class Exercises(VectorEnv):
     self.single_observation_space, self.single_action_space = (
       single.observation_space, single.action_space
     )  # fmt: skip
-    self.observation_space = batch_space(single.observation_space, self.num_envs)
-    self.action_space = batch_space(single.action_space, self.num_envs)
     devices = [device] if isinstance(device, str) else list(device)
     self._make(single, task, kwargs, devices, limit, nodes)
+    self.observation_space = batch_space(single.observation_space, self.num_envs)
+    self.action_space = batch_space(single.action_space, self.num_envs)
     self.device, self.max_episode_steps = self.parts[0].device, limit
     self._observed = [*environment.observation_spec()]
     self._begun = False
