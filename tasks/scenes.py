@@ -65,6 +65,8 @@ class Scene:
     center: the organ's landmark that ports and camera look at
     port: from there to the trocar [m]  (3,)
     camera: from there to the camera [m]  (3,)
+    second: instrument of the other hand, "" for none
+    second_port: from the landmark to its trocar [m]  (3,)
     targets: number of target sites
     inclusion: hidden stiff place: position in the world [m] (3), radius [m], factor on Young's
       modulus; None for healthy tissue. Without gravity: the organ would sag less where it is stiff
@@ -81,6 +83,8 @@ class Scene:
   center: str = "right_lobe"
   port: tuple[float, float, float] = (0.03, 0.05, 0.125)
   camera: tuple[float, float, float] = (-0.05, 0.15, 0.12)
+  second: str = ""
+  second_port: tuple[float, float, float] = (-0.05, 0.0, 0.12)
   targets: int = 1
   inclusion: tuple[float, ...] | None = None
   handle: bool = False
@@ -201,9 +205,10 @@ def furnish(
     slots: of the organ's window, None for what experts touch
   """
   spec = mujoco.MjSpec.from_string(_xml(organ, center, scene, bed))
-  port = center + scene.port
-  quat, prefix = trocar.aim(port, center), f"{scene.instrument}/"
-  trocar.attach(spec, scene.instrument, prefix, port, quat, scene.handle)
+  for name, offset in ((scene.instrument, scene.port), (scene.second, scene.second_port)):
+    port = center + offset
+    if name:
+      trocar.attach(spec, name, f"{name}/", port, trocar.aim(port, center), scene.handle)
   slots = slots or _SLOTS[scene.instrument] * max(1, -(-scene.nodes // 1000))
   palpate.add_windows(spec, ORGAN, nodes=slots)
   return spec

@@ -15,7 +15,7 @@ import warp as wp
 from palpate.models import trocar
 from palpate.tasks import base, episode
 from palpate.tasks.environment import Environment
-from palpate.tasks.physics import AXES
+from palpate.tasks.instrument import AXES
 from palpate.tasks.stage import STATE
 from palpate.tissue.types import allocate
 
