@@ -43,14 +43,14 @@ SCENE = dataclasses.replace(
 _FAR, _SPEED, _MORE, _SHARE, _OFF, _WAITS, _UP = 0.03, 0.01, 0.3, 0.7, 0.0015, 0.01, 0.5
 
 
-@SUITE.add("benchmarking", "easy")
+@SUITE.add("benchmarking", "easy", "bimanual")
 def easy(time_limit=40, random=None, environment_kwargs=None, **kwargs):
   """Returns the task to hold the gallbladder and divide half of its bed with a hook."""
   task = Bimanual(SCENE, random, name="bimanual/easy", **{"wanted": 0.5, **kwargs})
   return base.make(task, time_limit, environment_kwargs)
 
 
-@SUITE.add("benchmarking")
+@SUITE.add("benchmarking", "bimanual")
 def standard(time_limit=60, random=None, environment_kwargs=None, **kwargs):
   """Returns the task to divide 80 % of it."""
   kwargs = {"wanted": 0.8, "jitter": 0.003, **kwargs}
@@ -58,7 +58,7 @@ def standard(time_limit=60, random=None, environment_kwargs=None, **kwargs):
   return base.make(task, time_limit, environment_kwargs)
 
 
-@SUITE.add("benchmarking", "hard")
+@SUITE.add("benchmarking", "hard", "bimanual")
 def hard(time_limit=80, random=None, environment_kwargs=None, **kwargs):
   """Returns the task to divide 90 % of it with less force, on varying organs."""
   kwargs = {"wanted": 0.9, "jitter": 0.005, "variants": (None, 1, 2), **kwargs}
