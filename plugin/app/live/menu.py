@@ -20,9 +20,10 @@ def offer(device: str) -> dict[str, Any]:
   from palpate import models
   from palpate.tasks import suite
 
+  single = [pair for pair in suite.ALL_TASKS if pair not in suite.BIMANUAL]
   return {
     "type": "menu",
-    "tasks": {f"{d}/{t}": suite.summary(d, t) for d, t in suite.ALL_TASKS if (d, t) not in suite.BIMANUAL},
+    "tasks": {f"{d}/{t}": suite.summary(d, t) for d, t in single},
     "nodes": NODES,
     "speeds": SPEEDS,
     "device": device,
