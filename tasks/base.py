@@ -140,8 +140,7 @@ class Task(control.Task):
     self.force_limit, self.damage, self.organ = float(force_limit), float(damage), organ
     self.spread, self.jitter, self.visualize_reward = spread, jitter, False
     self.variants = (scene.variant,) if variants is None or model is not None else variants
-    self.reward, self.prefix = reward, f"{chosen.instrument}/"
-    self.second = f"{chosen.second}/" if chosen.second else ""
+    self.reward, self.prefix, self.second = reward, *chosen.prefixes
     self.observed = observation.choose(observations, pixels)
     self.ranges, self.drawn = randomisation.check(randomise or {}), dict[str, Any]()
     self._models: dict[int | None, Stage] = {}

@@ -199,7 +199,7 @@ class Recorder:
   def _entry(self, name: str, value: ArrayLike) -> np.ndarray:
     count = len(self.instruments)
     array = np.asarray(value, np.float64)
-    if name in SIGNALS and self.substeps > 1 and array.shape in ((), (count,)):
+    if name in SIGNALS and self.substeps > 1 and array.shape in ((), (count,), (count, 1)):
       array = np.repeat(array.reshape(-1, 1), self.substeps, axis=1)
     buffer = self._columns.get(name)
     if buffer is not None and (

@@ -91,6 +91,11 @@ class Scene:
   bonds: tuple[float, float, float] | None = None
   surroundings: str = "abdomen"
 
+  @property
+  def prefixes(self) -> tuple[str, str]:
+    """Prefixes of the instruments; "" in place of the second where there is none."""
+    return f"{self.instrument}/", f"{self.second}/" if self.second else ""
+
 
 def chosen(scene: Scene, input: str, nodes: int | None, surroundings: str | None) -> Scene:
   """Returns a scene as it was asked for; arguments as of `base.Task`."""
