@@ -38,7 +38,7 @@ CONTACT = {
 # Residual of the organ's solve; 1e-4, the plugin's own, changes contact forces by 0.1 %.
 TOLERANCE = 1e-2
 # Slots of the organ's window for each 1000 nodes; the experts' instruments touch 15 and 38 at most.
-_SLOTS = {"probe": 40, "grasper": 48}
+_SLOTS = {"probe": 40, "grasper": 48, "hook": 24}
 # More than MuJoCo's 1 makes friction creep less: 2.4 N of grip then hold 3 N, with 3 only 2 N.
 _IMPRATIO = {"probe": 3, "grasper": 10}
 # Foundation of an organ that comes away from its bed [Pa/m]; ours: what lies around it lets go too.
@@ -214,7 +214,8 @@ def furnish(
     port = center + offset
     if name:
       trocar.attach(spec, name, f"{name}/", port, trocar.aim(port, center), scene.handle)
-  slots = slots or _SLOTS[scene.instrument] * max(1, -(-scene.nodes // 1000))
+  touched = sum(_SLOTS[name] for name in (scene.instrument, scene.second) if name)
+  slots = slots or touched * max(1, -(-scene.nodes // 1000))
   palpate.add_windows(spec, ORGAN, nodes=slots)
   return spec
 
