@@ -305,7 +305,6 @@ def test_a_state_of_another_model_or_with_other_cuts_is_refused():
   [
     ({"spare": -1}, "spare is -1, expected a whole number"),
     ({"spare": "many"}, "spare is 'many'"),
-    ({"resident": True, "windows": True}, "resident is set, allowed only where spare is 0"),
     ({"carrier": "own"}, "carrier is 'own', allowed only where spare is 0"),
     ({"elements": "solid", "windows": True}, "'solid', allowed only where spare is 0"),
   ],
