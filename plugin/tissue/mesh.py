@@ -206,6 +206,13 @@ def vertex_normals(position: np.ndarray, elem: np.ndarray) -> np.ndarray:
   return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
 
 
+def shortest(mesh: Mesh) -> float:
+  """Returns the length of the shortest edge at rest [m], those inside of a solid too."""
+  start, k = np.nonzero(mesh.ring >= 0)
+  edge = mesh.rest[mesh.ring[start, k]] - mesh.rest[start]
+  return float(np.linalg.norm(edge, axis=1).min(initial=np.inf))
+
+
 def volume(position: np.ndarray, elem: np.ndarray) -> float:
   """Returns the enclosed volume of a closed surface [m^3]; the winding gives the sign."""
   a, b, c = (position[elem[:, k]] for k in range(3))
