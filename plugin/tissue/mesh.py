@@ -103,10 +103,19 @@ _BY_VERTEX = ("rest", "ring", "ring_elem", "degree")
 
 def distinct(*numbers: np.ndarray) -> np.ndarray:
   """Returns the different ones of whole numbers, ascending, as `np.unique` but for short lists."""
-  every = np.sort(np.concatenate([each.ravel() for each in numbers]))
-  first = np.ones(len(every), bool)
+  every = np.concatenate([each.ravel() for each in numbers])
+  every.sort()
+  first = np.empty(len(every), bool)
+  first[:1] = True
   np.not_equal(every[1:], every[:-1], out=first[1:])
   return every[first]
+
+
+def among(count: int, numbers: np.ndarray | list[int]) -> np.ndarray:
+  """Returns which of the numbers under `count` are some of these, (count,) bool."""
+  out = np.zeros(count, bool)
+  out[numbers] = True
+  return out
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
