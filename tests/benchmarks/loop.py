@@ -266,7 +266,7 @@ def table(out: pathlib.Path) -> list[str]:
     *_rows(out, "loop_c*.csv"),
   ]
   solids = _rows(out, "loop_solid_c*.csv")
-  about = "The filled liver, `--solid`; nodes on its surface. From loop_solid_c*.csv."
+  about = "The filled liver, `--solid`; nodes on its surface. Measured beside other work."
   return lines + (["", "## Solids", "", about, "", *solids] if len(solids) > 2 else [])
 
 
