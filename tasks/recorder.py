@@ -30,6 +30,18 @@ __all__ = ["Event", "Recorder", "Recording", "Settings"]
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*")
 
 
+def together(*hands: Mapping[str, Any]) -> Mapping[str, Any]:
+  """Returns the entries of a sample of several instruments, each as of one; NaN where one has none.
+
+  Args:
+    *hands: entries of `Recorder.append` by name, the main instrument first
+  """
+  if len(hands) == 1:
+    return hands[0]
+  blank = {name: np.nan * np.asarray(value) for hand in hands for name, value in hand.items()}
+  return {name: np.stack([hand.get(name, none) for hand in hands]) for name, none in blank.items()}
+
+
 class _Buffer:
   """An array that grows by doubling."""
 
@@ -128,6 +140,10 @@ class Recorder:
     visible: ArrayLike | None = None,
     freed: ArrayLike | None = None,
     traction: ArrayLike | None = None,
+    deviation: ArrayLike | None = None,
+    farthest: ArrayLike | None = None,
+    excess: ArrayLike | None = None,
+    jagged: ArrayLike | None = None,
     arrays: Mapping[str, ArrayLike] | None = None,
   ) -> None:
     """Adds one sample; with several instruments each argument has a row (or a number) for each.
@@ -152,6 +168,10 @@ class Recorder:
       visible: 1 where the camera's view holds the tip, else 0  ()
       freed: share of what is bonded that came free as it should  ()
       traction: pull on what it is bonded to [N]  ()
+      deviation: mean distance of a cut from its line so far [m]  ()
+      farthest: the largest so far [m]  ()
+      excess: area between the two so far [m^2]  ()
+      jagged: length of the cut so far that is more than 2 mm off [m]  ()
       arrays: the caller's own, of any shape and number type, the same in every sample; arrays that
         are not floating point may not miss a sample
     """
@@ -159,12 +179,12 @@ class Recorder:
     if not (math.isfinite(time) and time > self._last):
       raise ValueError(f"sample {self._count}: time is {time}, expected above {self._last}")
     self.settle()
-    owed = None
-    if callable(strain):
-      owed, strain = strain, math.nan
+    owed = strain if callable(strain) else None
+    strain = strain if owed is None else math.nan
     given = {"tip_pos": tip_pos, "quat": quat, "axis": axis, "force": force}
     given |= {"grip_force": grip_force, "shaft_force": shaft_force, "area": area, "strain": strain}
     given |= {"grip": grip, "held": held, "visible": visible, "freed": freed, "traction": traction}
+    given |= {"deviation": deviation, "farthest": farthest, "excess": excess, "jagged": jagged}
     columns = {k: self._entry(k, v) for k, v in given.items() if v is not None}
     own = {name: self._own(name, value) for name, value in arrays.items()} if arrays else {}
     self._store(time, columns, own)
@@ -204,7 +224,7 @@ class Recorder:
     if type(value) is float and buffer is not None and buffer.shape == (1,):
       return value
     array = np.asarray(value, np.float64)
-    if name in SIGNALS and self.substeps > 1 and array.shape in ((), (count,)):
+    if name in SIGNALS and self.substeps > 1 and array.shape in ((), (count,), (count, 1)):
       array = np.repeat(array.reshape(-1, 1), self.substeps, axis=1)
     if buffer is not None and (
       array.shape == buffer.shape or (count == 1 and array.shape == buffer.shape[1:])
