@@ -5,8 +5,8 @@ draws; a script in the page moves the mouse. `hand` is the exercise with a simul
 page. A step is on time when it has ended before the next one is due. From hand to picture: from the
 mouse's event to the end of drawing the first picture that has it; a screen adds its own. `beside`
 is the processor's time of a step of the loop less that of its physics alone, `mesh` the steps a
-second that free practice reaches on one core, in its own processor time. For figures of a machine
-that has nothing else to do: the load is that of the minute before.
+second that free practice reaches on one core, in its own processor time. The load is that of the
+minute before: on a machine with nothing else to do it is what this bench itself makes.
 """
 
 from __future__ import annotations
