@@ -11,12 +11,8 @@ from palpate.tasks import base, episode, performer, suite
 
 EASY = ["/".join(pair) for pair in tasks.EASY]
 OTHERS = ["/".join(pair) for pair in tasks.ALL_TASKS if pair not in tasks.EASY]
-# Constant while an expert works without a fault, and why: nothing.
-LONG = {
-  "probe/palpate_easy",
-  "probe/palpate_standard",
-  "probe/palpate_hard",
-}  # 16 to 30 s of search
+# 16 to 30 s of search.
+LONG = {"probe/palpate_easy", "probe/palpate_standard", "probe/palpate_hard"}
 
 
 def wins(name, seeds):
@@ -32,10 +28,10 @@ def wins(name, seeds):
       total += timestep.reward
     count += env.task.outcome == "success"
     assert total <= 1 + 1e-9
-    for key in set(timestep.observation) - {"shaft_force"}:  # which is to stay 0
+    for key in timestep.observation:
       values = np.array([observation[key] for observation in seen])
-      if key == "shaft_force":  # an expert's does not touch
-        assert not values.any()
+      if key == "shaft_force":  # an expert's hardly touches
+        assert np.linalg.norm(values, axis=1).max() < 0.05
       else:
         assert np.ptp(values, axis=0).max() > 0, f"observation {key} is constant"
   return count
@@ -43,7 +39,8 @@ def wins(name, seeds):
 
 @pytest.mark.parametrize("name", EASY)
 def test_expert_solves_the_easy_tasks(name):
-  assert wins(name, range(1 if name in LONG else 3)) == (1 if name in LONG else 3)
+  seeds = range(1 if name in LONG else 2)
+  assert wins(name, seeds) == len(seeds)
 
 
 @pytest.mark.parametrize("name", [name for name in OTHERS if name not in LONG])
