@@ -218,6 +218,7 @@ def sizes(organ) -> dict[str, int]:
   whole = organ.mesh.whole
   out |= cut_sizes(whole.nelem, whole.nvert, whole.spare)
   out["nbond"] = int(organ.free[: outer(organ)].sum()) if organ.config.bonded else 0
+  out["nblade"] = len(organ.config.cutters)
   if organ.windows is None:
     return out | {"nfree": organ.nfree}
   win = organ.windows

@@ -213,8 +213,8 @@ class Cuts:
 
   # Cutting.
 
-  def cut(self, points: np.ndarray) -> Report:
-    """Cuts the organ along points in the world, (n, 3) [m]; see `Organ.cut`."""
+  def cut(self, points: np.ndarray, given: float = 0.0) -> Report:
+    """Cuts the organ along points in the world, (n, 3) [m]; see `Organ.cut`, and `cutting.cut`."""
     w, organ = self._w, self._w.organ
     if not self:
       raise ValueError(
@@ -226,7 +226,7 @@ class Cuts:
     u, v = w.phases.motion()
     of_triangles = functools.partial(energy.of_triangles, w.config)
     energies = of_triangles, self._held()
-    found = cutting.cut(organ.name, mesh, mesh.rest + u, local, ~organ.free, *energies)
+    found = cutting.cut(organ.name, mesh, mesh.rest + u, local, ~organ.free, *energies, given)
     if found.stopped:
       w.note(
         f"the cut stops early: no spare vertices are left of {mesh.spare}; give the organ more"

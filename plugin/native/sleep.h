@@ -4,8 +4,6 @@
 
 namespace palpate {
 
-// Time without motion and force after which an organ sleeps [s].
-constexpr double QUIET = 0.2;
 // A triangle that may be the nearest to a tool is sampled at this many points along an edge. No
 // point of a triangle is farther from a corner than its longest edge over the root of 3.
 constexpr int FINE = 16;

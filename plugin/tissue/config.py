@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from . import reading
-from .reading import BondRow
+from .reading import BondRow, CutterRow
 from .step import SCHEMES
 
 # What takes a change while running: a number in the device's memory, the tissue's arrays, the graph
@@ -185,6 +185,19 @@ class Config:
     reading.NOT_NEGATIVE,
     "greatest principal strain, length over rest length less 1, beyond which tissue tears across "
     "it, with `spare` ([cutting](cutting.md#tearing)); 0: never",
+  )
+  cutters: tuple[CutterRow, ...] = _row(
+    (),
+    (
+      reading.cutters,
+      "a geom, or two of scissors, and an energy > 0, and for a current 'by' and an actuator, a "
+      "comma between such groups",
+    ),
+    "geoms that cut the wall where they are driven through it (with `spare`), and the energy that "
+    "it takes to open an area, or that cut and free bonds by a current "
+    "([cutters](cutting.md#cutters)): `scalpel/edge 160, scissors/edge_left scissors/edge_right "
+    "160, hook/hook_toe 1.1e6 by current`",
+    "-, J/m²",
   )
   resident: bool = _row(
     False,
@@ -372,6 +385,8 @@ def spare(organ: str, text: str, there: int) -> int:
 def _check_spare(organ: str, config: Config):
   if config.tear and not config.spare:
     raise ValueError(f"organ {organ!r}: tear is {config.tear:g}, allowed only with spare")
+  if config.cutters and not config.spare and not config.bonded:
+    raise ValueError(f"organ {organ!r}: cutters is set, allowed only with spare, or bonds to free")
   if not config.spare:
     return
   if config.resident:
@@ -382,7 +397,7 @@ def _check_spare(organ: str, config: Config):
 
 
 def _check_ties(organ: str, config: Config):
-  for key in ("carrier", "attach", "bonds", "relax_share", "support"):
+  for key in ("carrier", "attach", "bonds", "relax_share", "support", "cutters"):
     if not getattr(config, key) and not (key == "bonds" and config.bonded):
       continue
     if config.resident:

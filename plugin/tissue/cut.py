@@ -74,6 +74,7 @@ def cut(
   pinned: np.ndarray,
   energy: Energy | None = None,
   held: Held | None = None,
+  given: float = 0.0,
 ) -> Cut:
   """Returns the mesh cut along the path on the surface that is nearest to points.
 
@@ -85,6 +86,7 @@ def cut(
     pinned: vertices that do not move            (nvert,) bool
     energy: of triangles, which moving vertices must not raise, or None
     held: that of what holds vertices, for which the same is true, or None
+    given: but by so much around each, since what cuts has brought it [J]
 
   Raises:
     ValueError: points are off the surface; the path goes through pinned vertices, or is too short.
@@ -94,10 +96,10 @@ def cut(
   for run in runs:
     if not run.open:
       run.chain = paths.chain(mesh, run, edge)
-  _check(organ, runs, pinned)
+  _check(organ, mesh, runs, pinned)
   edges, stopped = _room(mesh, [pair for run in runs for pair in _uncut(mesh, run.chain)])
   there = {v for pair in edges for v in pair}
-  moved, corner, weight = _snap(mesh, runs, pinned, position, (energy, held), there)
+  moved, corner, weight = _snap(mesh, runs, pinned, position, (energy, held, given), there)
   rest = mesh.rest.copy()
   rest[moved] = np.einsum("nk,nkj->nj", weight, mesh.rest[corner])
   elem, group, member = _split(mesh, edges)
@@ -114,8 +116,18 @@ def cut(
   return Cut(new, changed, moved, corner, weight, group, member, path, length, deviation, stopped)
 
 
-def _check(organ: str, runs: list[paths.Run], pinned: np.ndarray):
-  if not any(run.open or len(run.chain) > 2 for run in runs):
+def _ends_on_rim(mesh: Mesh, chain: list[int]) -> bool:
+  if len(chain) != 2:
+    return False
+  ends = np.array(chain)
+  return bool((mesh.ring_elem[ends, mesh.degree[ends] - 1] < 0).any()) and _is_inner(mesh, *chain)
+
+
+def _check(organ: str, mesh: Mesh, runs: list[paths.Run], pinned: np.ndarray):
+  # One edge is enough where it ends on a boundary, or at the end of an older cut.
+  if not any(
+    run.open or len(run.chain) > 2 or _ends_on_rim(mesh, run.chain) for run in runs
+  ):
     raise ValueError(
       f"organ {organ!r}: the path is shorter than two edges of the mesh there, expected a longer "
       "one"
@@ -134,7 +146,7 @@ def _check(organ: str, runs: list[paths.Run], pinned: np.ndarray):
 
 
 def _snap(
-  mesh: Mesh, runs: list[paths.Run], pinned, position, energy: tuple, there: set[int]
+  mesh: Mesh, runs: list[paths.Run], pinned, position, energies: tuple, there: set[int]
 ):
   """Returns vertices that move at rest, and where they lie: corners of a triangle and weights.
 
@@ -163,7 +175,7 @@ def _snap(
   elem, weight = elem[row, best], weight[row, best]
   own = (mesh.elem[elem] == vert[:, None]).astype(float)
   u = position - mesh.rest
-  weight = own + _shares(mesh, vert, elem, weight, u, energy)[:, None] * (weight - own)
+  weight = own + _shares(mesh, vert, elem, weight, u, energies)[:, None] * (weight - own)
   moved = (weight != own).any(axis=1)
   return vert[moved], mesh.elem[elem[moved]], weight[moved]
 
@@ -190,7 +202,7 @@ def _shares(mesh: Mesh, vert, elem, weight, u: np.ndarray, energies: tuple) -> n
   So far that no triangle gets thin or turns, and that the energy around none rises: a vertex gets
   the displacement of where it goes to, and an uneven strain is another one after it.
   """
-  energy, held = energies
+  energy, held, given = energies
   tri = topology.around(mesh, vert)
   own, corner = np.unique(mesh.elem[tri], return_inverse=True)
   corner = corner.reshape(-1, 3)
@@ -224,7 +236,7 @@ def _shares(mesh: Mesh, vert, elem, weight, u: np.ndarray, energies: tuple) -> n
       )
       if held is not None:
         old, new = old + held(vert, 0 * lead), new + held(vert, share[:, None] * lead)
-      less = topology.distinct(less, np.flatnonzero(new > _RISE * old))
+      less = topology.distinct(less, np.flatnonzero(new > _RISE * old + given))
     less = less[less >= 0]
     if not less.size:
       break

@@ -247,7 +247,8 @@ def _ways(mesh: Mesh, run: Run, band: np.ndarray, edge: float) -> list[int]:
     return [*way[:-1], way[0]]
   rim = mesh.ring_elem[band, np.maximum(mesh.degree[band] - 1, 0)] < 0
   for end in (0, -1):
-    at_rim = np.where(rim, far[end], np.inf)
+    other = way[-1 - end]
+    at_rim = np.where(rim & (np.arange(len(band)) != other), far[end], np.inf)
     if at_rim.min(initial=np.inf) < _RIM * edge:
       way[end] = int(np.argmin(at_rim))
   return way

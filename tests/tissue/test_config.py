@@ -54,6 +54,7 @@ REFUSED = [
   ("carrier", "two words", "the name of a body"),
   ("skin", "two words", "the name of a skin"),
   ("tear", "-0.1", "a number >= 0"),
+  ("cutters", "a b c 160", "a geom, or two of scissors, and an energy > 0"),
   ("spare", "-1", "a whole number >= 0 or 'auto'"),
   ("spare", "some", "a whole number >= 0 or 'auto'"),
   ("resident", "yes", "'true' or 'false'"),
