@@ -206,7 +206,7 @@ def cached(
 ) -> Declaration:
   """Returns the organ with its constants on the device, the same object for the same content."""
   digest = hashlib.sha256(repr((h, name, fields["flex"], config)).encode())
-  for part in (mesh.rest, mesh.elem, free, *fields.values()):
+  for part in (mesh.rest, mesh.elem, mesh.tet, free, *fields.values()):
     if isinstance(part, np.ndarray):
       digest.update(np.ascontiguousarray(part).tobytes())
     elif isinstance(part, Windows):
