@@ -2,7 +2,9 @@
 # pyright: reportAttributeAccessIssue=false
 """The physics of an exercise: one organ, one instrument on a trocar, and what one asks of them."""
 
+import functools
 import math
+from collections.abc import Callable
 
 import mujoco as mj
 import numpy as np
@@ -31,7 +33,14 @@ FOLD, GRIPPING = 0.02, 0.15
 
 
 class Physics(Portable):
-  """Physics of an exercise: one organ, one instrument on a trocar."""
+  """Physics of an exercise: one organ, one instrument on a trocar.
+
+  Attributes:
+    meanwhile: called in the middle of every `step`, with what need not be done at its end, where a
+      live exercise has least time; None for nothing
+  """
+
+  meanwhile: Callable[[], None] | None = None
 
   def use(self, model: mj.MjModel, prefix: str, targets: int, organ: str = ORGAN) -> None:
     """Takes a compiled scene; ValueError names what it lacks.
@@ -74,8 +83,8 @@ class Physics(Portable):
     self._xpos0 = self.organ.xpos0
     self.coarse = _spread(self._xpos0, COARSE)
     self._coarse0 = self._xpos0[self.coarse]
-    self._elem = self.organ.elem
-    self._stretch: tuple[np.ndarray, Stretch] | None = None
+    self._stretch: tuple[np.ndarray, np.ndarray, Stretch] | None = None
+    self._cuts = bool(self.organ.config.cutters)
     self._trocar = trocar.trocar(model, prefix)
     self.quiet()
 
@@ -94,11 +103,16 @@ class Physics(Portable):
       for k in range(nstep):
         end(model, data)
         values[k] = sensors
+        if self._cuts:  # MuJoCo's contacts know nothing of it
+          self._edge = np.sum([cutter.force for cutter in self.organ.cutters], axis=0)
+          values[k, self._sensors["tip_force"]] += self._edge
         if k == nstep - 1 and self._jaws:
           self._inner = self._jaws.inner_force(model, data)
         if self.handle:
           self._felt[k] = self.handle.wrench()
           self._lead(k, nstep)
+        if k == nstep // 2 and self.meanwhile is not None:
+          self.meanwhile()
         begin(model, data)
       self._keep(values)
       self.moved()
@@ -142,7 +156,7 @@ class Physics(Portable):
 
   def quiet(self) -> None:
     """Forgets the forces of the last `step`: they would be in the next episode's start."""
-    self._felt = np.zeros((1, 6))
+    self._felt, self._edge = np.zeros((1, 6)), np.zeros(3)
     self._keep(np.zeros((1, self.model.nsensordata)))
 
   def forward(self) -> None:
@@ -222,8 +236,8 @@ class Physics(Portable):
     return self.handle.joints(self._trocar) if self.handle else self.data.ptr.ctrl[self.drives]
 
   def contact_force(self) -> np.ndarray:
-    """Returns the contact force on the instrument below the shaft [N]  (3,)."""
-    return -self.sensor("tip_force")
+    """Returns the force of the tissue on the instrument below the shaft [N]  (3,)."""
+    return -self.sensor("tip_force") - self._edge
 
   def shaft_force(self) -> np.ndarray:
     """Returns the contact force on the shaft [N]  (3,)."""
@@ -246,15 +260,23 @@ class Physics(Portable):
   def nodes(self) -> np.ndarray:
     """Returns the positions of the organ's nodes [m]  (nvert, 3); computed once a control step."""
     if self._nodes is None:
-      self._nodes = self._xpos0 + self.organ.displacement
+      moved = self.organ.displacement
+      rest = self._xpos0 if len(moved) == len(self._xpos0) else self.organ.xpos0  # it is cut
+      self._nodes = rest + moved
       self._nodes.flags.writeable = False
     return self._nodes
 
-  def strain(self, rest: np.ndarray) -> float:
-    """Returns the largest strain of the organ's surface against its nodes `rest` [-]."""
-    if self._stretch is None or self._stretch[0] is not rest:
-      self._stretch = rest, Stretch(rest, self._elem)
-    return self._stretch[1].most(self.nodes())
+  def strain(self, rest: np.ndarray) -> Callable[[], float]:
+    """Returns what works out the largest strain of the organ's surface as it is now [-].
+
+    Args:
+      rest: nodes against which, of an organ that is cut its shape at rest [m]  (nvert, 3)
+    """
+    now, elem = self.nodes(), self.organ.elem
+    if self._stretch is None or self._stretch[0] is not rest or self._stretch[1] is not elem:
+      same = len(now) == len(rest)
+      self._stretch = rest, elem, Stretch(rest if same else self.organ.xpos0, elem)
+    return functools.partial(self._stretch[2].most, now)
 
   def nodes_near(self) -> np.ndarray:
     """Returns the organ's nodes nearest to the tip, from the tip [m]  (NEAR, 3)."""
@@ -270,19 +292,19 @@ class Physics(Portable):
   def point(self, triangle: int) -> np.ndarray:
     """Returns where the middle of one of the organ's triangles is [m]  (3,); as `nodes`."""
     if triangle not in self._points:
-      a, b, c = self.nodes()[self._elem[triangle]]
+      a, b, c = self.nodes()[self.organ.elem[triangle]]
       self._points[triangle] = (a + b + c) / 3
     return self._points[triangle].copy()
 
   def normals(self) -> np.ndarray:
     """Returns the outward unit normals of the organ's triangles  (nelem, 3)."""
-    normal = _twice_area(self.nodes(), self._elem)
+    normal = _twice_area(self.nodes(), self.organ.elem)
     return normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
   def normal(self, triangle: int) -> np.ndarray:
     """Returns the outward unit normal of one of the organ's triangles  (3,)."""
     # In plain numbers, as every step asks for one.
-    (ax, ay, az), b, c = self.nodes()[self._elem[triangle]].tolist()
+    (ax, ay, az), b, c = self.nodes()[self.organ.elem[triangle]].tolist()
     ux, uy, uz = b[0] - ax, b[1] - ay, b[2] - az
     vx, vy, vz = c[0] - ax, c[1] - ay, c[2] - az
     x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
@@ -337,7 +359,7 @@ class Physics(Portable):
     Rays against triangles after Moeller and Trumbore 1997.
     """
     eye = self.camera()[0]
-    a, b, c = np.moveaxis(self.nodes()[self._elem], 1, 0)
+    a, b, c = np.moveaxis(self.nodes()[self.organ.elem], 1, 0)
     e1, e2, s = b - a, c - a, eye - a
     q = _cross(s, e1)
     # Each product of a ray with a vector of a triangle is an entry of a matrix (n, nelem).

@@ -38,9 +38,9 @@ CONTACT = {
 # Residual of the organ's solve; 1e-4, the plugin's own, changes contact forces by 0.1 %.
 TOLERANCE = 1e-2
 # Slots of the organ's window for each 1000 nodes; the experts' instruments touch 15 and 38 at most.
-_SLOTS = {"probe": 40, "grasper": 48}
+_SLOTS = {"probe": 40, "grasper": 48, "scalpel": 40}
 # More than MuJoCo's 1 makes friction creep less: 2.4 N of grip then hold 3 N, with 3 only 2 N.
-_IMPRATIO = {"probe": 3, "grasper": 10}
+_IMPRATIO = {"probe": 3, "grasper": 10, "scalpel": 3}
 # Foundation of an organ that comes away from its bed [Pa/m]; ours: what lies around it lets go too.
 _LOOSE = 3e3
 _TURN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # organ's frame to world
@@ -59,7 +59,7 @@ class Scene:
 
   Attributes:
     organ: one of `TISSUES`
-    instrument: `probe` or `grasper`
+    instrument: `probe`, `grasper` or `scalpel`
     nodes: number of the organ's nodes
     variant: seed of the organ's shape, None for the mean shape
     center: the organ's landmark that ports and camera look at
