@@ -195,7 +195,10 @@ def find(who: str, *others: str) -> Any:
 
 
 class Performer:
-  """Follows the script of the environment's task; starts it again with each episode."""
+  """Follows the script of the environment's task; starts it again with each episode.
+
+  Called first in the middle of an episode, it does what is left to do.
+  """
 
   def __init__(self, env: control.Environment, style: Style = EXPERT, seed: int = 0):
     """Makes a performer in a style; see `make`."""
@@ -327,6 +330,10 @@ class Performer:
     """
     physics, up = self.physics, self.physics.trocar().mat[:, 2]
     self.firm = self._enough = grip + _FIRMER * min(again, 2)
+    if self.task.grasped:  # by who had the instrument before
+      low, high = physics.model.ptr.actuator_ctrlrange[physics.jaw]
+      self.extra[:] = 2 * (physics.gripper()[1] - low) / (high - low) - 1
+      return
     self.roll, self.extra[:] = _ROLL, _WIDE
     yield from self.move(physics.point(site) + 0.012 * up)
     yield from self.wait(0.2)

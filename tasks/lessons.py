@@ -1,0 +1,91 @@
+"""Lessons: what an expert does, alone or where a policy has come to.
+
+The script of an expert makes a plan of what is left to do, from wherever it begins. So a policy may
+play the start of an episode and an expert the rest: who learns from that learns the way back from
+mistakes of its own (Ross, Gordon and Bagnell 2011, 10.48550/arXiv.1011.0686).
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from dm_control.rl import control
+
+from .performer import Performer
+from .physics import AXES
+
+SHAKEN, CALM = 50, 125  # control steps that noise lasts, and that follow without
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Lesson:
+  """What an expert did in an episode, a row a control step.
+
+  Attributes:
+    seen: what was observed, flat, in the order of the names  (nstep, nseen)
+    done: what the expert meant to do  (nstep, naction)
+    returns: discounted sum of the rewards from there on  (nstep,)
+    outcome: of the episode, `time limit` without one
+  """
+
+  seen: np.ndarray
+  done: np.ndarray
+  returns: np.ndarray
+  outcome: str
+
+
+def give(
+  env: control.Environment,
+  names: Sequence[str],
+  seed: int,
+  gamma: float,
+  noise: float = 0.0,
+  learner: Any = None,
+  turn: int = 0,
+) -> Lesson:
+  """Returns the lesson of an episode.
+
+  Args:
+    env: of the suite
+    names: of what is observed
+    seed: of the episode
+    gamma: discount of a control step [-]
+    noise: SD of what is added to the expert's motion now and then; what is kept is what it meant
+      to do (DART: Laskey et al. 2017, 10.48550/arXiv.1703.09327) [-]
+    learner: called with an observation, returns the action until the expert's turn
+    turn: control steps until then
+  """
+  task: Any = env.task
+  task.random, random = np.random.RandomState(seed), np.random.RandomState(seed)
+  moves = noise * np.isin(task.components, AXES)
+  timestep, expert, begun = env.reset(), Performer(env), 0
+  phase = random.randint(SHAKEN + CALM)
+  seen, done, rewards = [], [], []
+  while not timestep.last():
+    if begun < turn and learner is not None:
+      action, begun = learner(timestep.observation), begun + 1
+    else:
+      action = np.asarray(expert(timestep), float)
+      seen.append(flat(timestep.observation, names))
+      done.append(action)
+      shakes = (len(done) + phase) % (SHAKEN + CALM) < SHAKEN
+      action = np.clip(action + shakes * moves * random.normal(size=len(moves)), -1, 1)
+    timestep = env.step(action)
+    if done:
+      rewards.append(float(timestep.reward))
+  returns = np.zeros(len(done))
+  for k in reversed(range(len(done))):
+    returns[k] = rewards[k] + (gamma * returns[k + 1] if k + 1 < len(done) else 0.0)
+  width = sum(int(np.prod(env.observation_spec()[name].shape)) for name in names)
+  return Lesson(
+    np.array(seen, np.float32).reshape(-1, width),
+    np.array(done, np.float32).reshape(-1, len(moves)),
+    returns.astype(np.float32),
+    task.outcome or "time limit",
+  )
+
+
+def flat(observation: Any, names: Sequence[str]) -> np.ndarray:
+  """Returns what was observed as one array."""
+  return np.concatenate([np.ravel(observation[name]) for name in names])
