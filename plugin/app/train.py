@@ -52,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser):
     "--lessons", metavar="N", type=int, default=_LESSONS,
     help=f"of an expert, in each of {_ROUNDS} rounds (%(default)s); 0 for practice alone",
   )  # fmt: skip
-  add("--iterations", metavar="N", type=int, default=1000, help="of practice, at most (%(default)s)")
+  add("--iterations", metavar="N", type=int, default=1000, help="of practice (%(default)s)")
   add("--minutes", metavar="T", type=float, default=math.inf, help="at most, in all")
   add("--success", metavar="SHARE", type=float, default=math.inf, help="enough, without spread")
   add("--seed", metavar="N", type=int, default=0, help="of all that is random (%(default)s)")
