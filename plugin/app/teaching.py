@@ -110,10 +110,10 @@ class School:
     self.seconds += time.perf_counter() - start
     wins = sum(lesson is not None and lesson.outcome == "success" for lesson in given)
     steps = sum(len(lesson.done) for lesson in self.lessons)
-    progress.show(
+    print(
       f"lessons, round {self.rounds}: {wins} of {count} were a success; {steps} steps to learn "
-      f"from, error {error:.3f}, {self.seconds:.0f} s", always=True,
-    )  # fmt: skip
+      f"from, error {error:.3f}, {self.seconds:.0f} s"
+    )
     return not interrupt.seen
 
   def _jobs(self, count: int, gamma: float) -> list[Job]:
