@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from dm_control.rl import control
 
-from .performer import Performer
+from .performer import Performer, Script
 from .physics import AXES
 
 SHAKEN, CALM = 50, 125  # control steps that noise lasts, and that follow without
@@ -33,6 +33,18 @@ class Lesson:
   done: np.ndarray
   returns: np.ndarray
   outcome: str
+
+
+class Teacher(Performer):
+  """An expert that moves evenly: who sees no velocity cannot tell a slow start from an end."""
+
+  def line(self, goal: np.ndarray, speed: float) -> Script:
+    """Moves the tip along a straight line."""
+    start, way = self.tip, np.asarray(goal, float) - self.tip
+    steps = max(1, round(float(np.linalg.norm(way)) / speed / self.dt))
+    for k in range(1, steps + 1):
+      self.tip = start + way * k / steps
+      yield self.step()
 
 
 def give(
@@ -59,7 +71,7 @@ def give(
   task: Any = env.task
   task.random, random = np.random.RandomState(seed), np.random.RandomState(seed)
   moves = noise * np.isin(task.components, AXES)
-  timestep, expert, begun = env.reset(), Performer(env), 0
+  timestep, expert, begun = env.reset(), Teacher(env), 0
   phase = random.randint(SHAKEN + CALM)
   seen, done, rewards = [], [], []
   while not timestep.last():
