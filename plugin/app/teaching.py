@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 LESSONS = "lessons.npz"
 _FIRST = 10_000_000  # seed of the first lesson
 _NOISE = 0.2  # SD of what shakes the expert in every other lesson, at most [-]
-_LATE = 1.2  # the expert's turn comes before that many of its own lengths have gone by
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,8 +35,7 @@ class Job:
     seed: of the episode
     gamma: discount [-]
     noise: see `lessons.give`
-    policy: file of who plays until the expert's turn, or empty
-    turn: control steps until then
+    policy: file of who takes turns with the expert, or empty
   """
 
   task: str
@@ -47,7 +45,6 @@ class Job:
   gamma: float
   noise: float = 0.0
   policy: str = ""
-  turn: int = 0
 
 
 def give(job: Job) -> Lesson:
@@ -57,7 +54,7 @@ def give(job: Job) -> Lesson:
 
   env = options.environment(job.task, job.task_kwargs)
   learner = policy.load(job.policy) if job.policy else None
-  return lessons.give(env, job.names, job.seed, job.gamma, job.noise, learner, job.turn)
+  return lessons.give(env, job.names, job.seed, job.gamma, job.noise, learner)
 
 
 class School:
@@ -128,9 +125,7 @@ class School:
       if k % 2:
         job = dataclasses.replace(job, noise=float(random.uniform(0, _NOISE)))
       if self.rounds and env.task.resumes:
-        length = _LATE * float(np.mean([len(lesson.done) for lesson in self.lessons]))
-        policy = str((self.path.parent / POLICY).resolve())
-        job = dataclasses.replace(job, policy=policy, turn=int(random.uniform(0, length)))
+        job = dataclasses.replace(job, policy=str((self.path.parent / POLICY).resolve()))
       jobs.append(job)
     return jobs
 

@@ -110,8 +110,8 @@ class Training:
     self.school = School(folder, name, self.kwargs, args.seed)
     if args.resume and not (self.school.rounds or (folder / learning.CHECKPOINT).exists()):
       raise CommandError(f"out has no {learning.CHECKPOINT} to go on with")
-    taught = learning.TAUGHT if args.lessons or self.school.rounds else {}
-    self.settings = learning.Settings(seed=args.seed, **taught)
+    taught = bool(args.lessons or self.school.rounds)
+    self.settings = learning.Settings(seed=args.seed, **(learning.TAUGHT if taught else {}))
     single: Any = options.environment(name, self.school.task_kwargs)
     self.task, spec = single.task, single.observation_spec()
     if self.task.observed.pictures:
@@ -119,7 +119,7 @@ class Training:
     device = "cpu" if self.device == "cpu" else str(wp.device_to_torch(self.device))
     self.networks = networks.Networks(
       {key: tuple(spec[key].shape) for key in spec}, len(self.task.components),
-      self.settings.hidden, self.settings.spread, args.seed, device,
+      self.settings.hidden, self.settings.spread, args.seed, device, taught,
     )  # fmt: skip
     if self.school.rounds:
       self.networks.remember(self.school.lessons)

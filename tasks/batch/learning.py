@@ -70,7 +70,7 @@ class Settings:
 
 
 # After lessons, so that what was taught is not tried away.
-TAUGHT = {"spread": 0.15, "calm": 0.06, "entropy": 0.0, "learning_rate": 3e-4}
+TAUGHT = {"spread": 0.25, "calm": 0.08, "entropy": 0.0, "learning_rate": 3e-4}
 
 
 class Learner:
@@ -164,7 +164,7 @@ class Learner:
       networks.actor.load_state_dict(kept)
       ppo.learning_rate = settings.learning_rate
     else:
-      networks.rehearse()
+      networks.rehearse(ppo.learning_rate)
     # The more often it succeeds, the less it tries: what acts in the end has no spread.
     networks.calm(settings.spread ** (1 - success) * settings.calm**success)
 

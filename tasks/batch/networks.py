@@ -1,9 +1,9 @@
 # pyright: reportMissingImports=false
-"""The networks that learn: an actor, which goes into a policy, and a critic, which sees more.
+"""The networks that learn: an actor, which goes into a policy, and a critic.
 
-An actor does not see velocities and what the drives are behind: they tell what was done before, and
-who copies an expert by that does not look (de Haan, Jayaraman and Levine 2019,
-10.48550/arXiv.1905.11979). Nor does it see the far parts of the organ.
+An actor that is taught does not see velocities and what the drives are behind: they tell what was
+done before, and who copies an expert by that does not look (de Haan, Jayaraman and Levine 2019,
+10.48550/arXiv.1905.11979). Nor does it see the far parts of the organ. A critic sees all.
 """
 
 from __future__ import annotations
@@ -19,20 +19,24 @@ from palpate.tasks.lessons import Lesson
 from palpate.tasks.observation import ROWS
 from rsl_rl.models import MLPModel
 from tensordict import TensorDict
+from torch.nn.functional import smooth_l1_loss
 
-HIDDEN = ("joint_vel", "drive", "tip_vel", "surface")  # from the actor
+HIDDEN = ("joint_vel", "drive", "tip_vel", "surface")  # from an actor that is taught
 ACTING, MORE = "acting", "more"  # groups of observations
 CLONING = 3000  # steps of the optimiser at most
 _BATCH, _RATE = 1024, 2e-3
-_REHEARSAL, _REHEARSING = 2e-4, 10  # learning rate, steps an iteration
+_FINE = 0.05  # errors above count by their size, not their square: a touch is small motion [-]
+_KNOWN = 0.05  # share of `_VARY` that is enough where lessons have shown the whole
+_REHEARSING, _CAREFUL = 10, 0.2  # steps an iteration, learning rate over that of practice
 # How much observations vary at least, by their unit: tissue that is not touched yet will be.
 _VARY = {"m": 0.005, "m/s": 0.01, "rad": 0.05, "rad/s": 0.1, "N": 0.3, "-": 0.3}
 _STILL = 1e-6  # standard deviation of what has not changed, and may be anything
 
 
-def grouped(names: Sequence[str]) -> dict[str, list[str]]:
+def grouped(names: Sequence[str], taught: bool) -> dict[str, list[str]]:
   """Returns what is observed in the groups of the networks."""
-  found = {ACTING: [n for n in names if n not in HIDDEN], MORE: [n for n in names if n in HIDDEN]}
+  hidden = [name for name in names if taught and name in HIDDEN]
+  found = {ACTING: [name for name in names if name not in hidden], MORE: hidden}
   return {group: chosen for group, chosen in found.items() if chosen}
 
 
@@ -54,6 +58,7 @@ class Networks:
     spread: float,
     seed: int,
     device: str,
+    taught: bool = True,
   ):
     """Makes networks that know nothing.
 
@@ -64,9 +69,10 @@ class Networks:
       spread: standard deviation of the actions [-]
       seed: of the weights, and of the order of what is learned
       device: of torch
+      taught: whether there will be lessons
     """
     torch.manual_seed(seed)
-    self.groups, self.device, self.lessons = grouped(list(shapes)), device, 0
+    self.groups, self.device, self.lessons = grouped(list(shapes), taught), device, 0
     self._shapes: dict[str, tuple[int, ...]] = dict(shapes)
     self._memory: Any = None
     seen = TensorDict(
@@ -79,7 +85,7 @@ class Networks:
       seen, sets, "actor", count, distribution_cfg=gaussian, **common
     ).to(device)  # fmt: skip
     self.critic: Any = MLPModel(seen, sets, "critic", 1, **common).to(device)
-    self._last: Any = torch.optim.Adam(self.actor.mlp.parameters(), lr=_REHEARSAL)
+    self._last: Any = torch.optim.Adam(self.actor.mlp.parameters())
 
   def _width(self, names: Sequence[str]) -> int:
     return sum(math.prod(self._shapes[name]) for name in names)
@@ -91,7 +97,8 @@ class Networks:
       names = [name for group in model.obs_groups for name in self.groups[group]]
       std = every.std(dim=0)
       std = torch.where(std < _STILL, torch.full_like(std, _VARY["-"]), std)
-      std = torch.maximum(std, self._least(names).to(std))
+      share = _KNOWN if self.lessons else 1.0
+      std = torch.maximum(std, share * self._least(names).to(std))
       known, model.obs_normalizer.eps = model.obs_normalizer.state_dict(), 0.0
       known["_mean"][:], known["_std"][:], known["_var"][:] = every.mean(dim=0), std, std.square()
       model.obs_normalizer.until = 0
@@ -110,7 +117,7 @@ class Networks:
   # Lessons.
 
   def learn(self, lessons: Sequence[Lesson], stop: Callable[[], bool] = lambda: False) -> float:
-    """Learns to do what was done in lessons, and what comes of it; returns the squared error."""
+    """Learns to do what was done in lessons, and what comes of it; returns the error."""
     self.remember(lessons)
     seen, done, returns = self._memory
     parameters = [*self.actor.mlp.parameters(), *self.critic.mlp.parameters()]
@@ -122,7 +129,7 @@ class Networks:
         break
       rows = torch.randint(len(done), (min(_BATCH, len(done)),), device=self.device)
       some = seen[rows]
-      loss = (self.actor(some) - done[rows]).square().mean()
+      loss = smooth_l1_loss(self.actor(some), done[rows], beta=_FINE)
       both = loss + (self.critic(some) - returns[rows]).square().mean()
       optimiser.zero_grad()
       both.backward()
@@ -145,14 +152,19 @@ class Networks:
     self._memory = seen.to(self.device), done.to(self.device), returns.to(self.device)
     self.normalise(self._memory[0])
 
-  def rehearse(self) -> None:
-    """Goes over some of what it was taught, so that practice does not make it forget the manner."""
+  def rehearse(self, rate: float) -> None:
+    """Goes over some of what it was taught, so that practice does not make it forget the manner.
+
+    Args:
+      rate: learning rate of the practice
+    """
     if self._memory is None:
       return
+    self._last.param_groups[0]["lr"] = _CAREFUL * rate
     seen, done, _ = self._memory
     for _ in range(_REHEARSING):
       rows = torch.randint(len(done), (min(4 * _BATCH, len(done)),), device=self.device)
-      loss = (self.actor(seen[rows]) - done[rows]).square().mean()
+      loss = smooth_l1_loss(self.actor(seen[rows]), done[rows], beta=_FINE)
       self._last.zero_grad()
       loss.backward()
       self._last.step()

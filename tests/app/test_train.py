@@ -66,7 +66,7 @@ def test_an_expert_teaches_before_practice(tmp_path, capsys):
   with np.load(folder / "lessons.npz") as file:
     lengths, before = file["lengths"], file["seen"]
   assert len(lengths) == 3 * 2 and (lengths[:2] == 20).all()
-  assert (lengths[2:] < 20).any()  # an expert goes on where the policy has come to
+  assert (lengths[2:] < 20).any()  # the policy takes turns with the expert
   assert train(folder, lessons=2) == 2  # nothing is written over
   assert train(folder, "--iterations", "1", "--resume", lessons=2) == 0
   assert [row["iteration"] for row in rows(folder)] == [1]
