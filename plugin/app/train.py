@@ -137,9 +137,11 @@ class Training:
         return False
       school.save()
       with writing(self.folder):
-        made = networks.policy(
-          self.task, self._told(), {"algorithm": "lessons", "lessons": networks.lessons}
-        )  # fmt: skip
+        training = {
+          "algorithm": "lessons", "lessons": networks.lessons, "rounds": school.rounds,
+          "seconds": round(school.seconds, 1), "seed": self.args.seed,
+        }  # fmt: skip
+        made = networks.policy(self.task, self._told(), training)
         policy.save(self.folder / learning.POLICY, made)
         (self.folder / "LICENSE").write_text(_LICENCE, encoding="utf-8")
     return not interrupt.seen
