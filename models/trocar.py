@@ -17,7 +17,7 @@ import pathlib
 import mujoco
 import numpy as np
 
-NAMES = ("probe", "grasper", "scissors", "hook")
+NAMES = ("probe", "grasper", "scissors", "hook", "scalpel")
 JOINTS = ("pitch", "yaw", "insertion", "roll")
 DEPTH = 0.12  # from the trocar to the tip when every joint is zero [m]
 RANGES = ((-1.0472, 1.0472), (-1.0472, 1.0472), (-0.08, 0.13), (-3.1416, 3.1416))  # as JOINTS

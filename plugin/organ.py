@@ -8,6 +8,7 @@ import numpy.typing as npt
 from palpate.engine import change, mjstruct, motion, pierce, windowed, workspace
 from palpate.engine import plugin as engine
 from palpate.engine.cuts import Piece, Report
+from palpate.engine.cutters import Cutter
 from palpate.engine.layout import FLAG
 from palpate.tissue import energy, fill
 from palpate.tissue import mesh as topology
@@ -186,6 +187,11 @@ class Organ:
     """What `cut` has done in this data, but not what a state that was set or copied brought."""
     self._space.cuts.follow()
     return tuple(self._space.cuts.reports)
+
+  @property
+  def cutters(self) -> tuple[Cutter, ...]:
+    """What cuts it (key `cutters`): whether it is in the tissue, its force, energy and length."""
+    return tuple(self._space.cutters.read())
 
   @property
   def pieces(self) -> tuple[Piece, ...]:

@@ -244,7 +244,7 @@ def _rest(flex, free: np.ndarray, own: list) -> np.ndarray:
   """Returns where vertices are in the body that an organ is in [m], (nvert, 3)."""
   rest = np.zeros((len(free), 3))
   rest += np.reshape(flex.vert, (-1, 3)) if len(flex.vert) else 0.0  # none: all on their bodies
-  rest[free] += [body.pos for body in own]
+  rest[free] += np.reshape([body.pos for body in own], (-1, 3))
   return rest
 
 

@@ -18,6 +18,8 @@ AFTER: dict[str, str | None] = {
   "retract/easy": "grasp/easy",
   "tease/easy": "probe/easy",
   "dissect/easy": "retract/easy",
+  "cut/easy": "trace/easy",
+  "bimanual/easy": "dissect/easy",
   "touch/standard": "touch/easy",
   "probe/standard": "probe/easy",
   "probe/depth": "probe/easy",
@@ -26,6 +28,8 @@ AFTER: dict[str, str | None] = {
   "retract/standard": "retract/easy",
   "tease/standard": "tease/easy",
   "dissect/standard": "dissect/easy",
+  "cut/standard": "cut/easy",
+  "bimanual/standard": "bimanual/easy",
   "probe/palpate_easy": "probe/standard",
   "probe/palpate_standard": "probe/palpate_easy",
   "touch/hard": "touch/standard",
@@ -35,6 +39,8 @@ AFTER: dict[str, str | None] = {
   "retract/hard": "retract/standard",
   "tease/hard": "tease/standard",
   "dissect/hard": "dissect/standard",
+  "cut/hard": "cut/standard",
+  "bimanual/hard": "bimanual/standard",
   "probe/palpate_hard": "probe/palpate_standard",
 }
 RULE = f"{CONSECUTIVE} proficient attempts in a row and {REPEATS} more"

@@ -59,9 +59,11 @@ def run(
   task.random = np.random.RandomState(seed)
   timestep = env.reset()
   recorder = _begin(env, seed, info or {}, states)
+  physics.meanwhile = recorder.settle
   total = 0.0
 
   def finish() -> Recording:
+    physics.meanwhile = None
     recorder.info |= {"outcome": task.outcome or "time limit", "return": total}
     recorder.attach("state_last", physics.integration_state())
     return recorder.recording()
@@ -94,9 +96,8 @@ def _begin(
   """Returns the recorder of an episode, with the constants and the sample of its start."""
   task: Any = env.task
   physics: Any = env.physics
-  recorder = Recorder(
-    [physics.prefix.rstrip("/")], task.settings(), task.watch, substeps=substeps(env)
-  )
+  names = [hand.prefix.rstrip("/") for hand in physics.hands]
+  recorder = Recorder(names, task.settings(), task.watch, substeps=substeps(env))
   recorder.info = {
     "task": task.name,
     "seed": seed,

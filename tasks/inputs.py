@@ -26,6 +26,10 @@ COLUMNS: dict[str, tuple[int, ...]] = {
   "visible": (),
   "freed": (),
   "traction": (),
+  "deviation": (),
+  "farthest": (),
+  "excess": (),
+  "jagged": (),
 }
 # Those that are measured faster: with substeps, magnitudes, one for each since the last sample.
 SIGNALS = ("force", "grip_force", "shaft_force")

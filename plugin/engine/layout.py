@@ -15,6 +15,7 @@ from palpate.tissue.types import DIMS, doubles, struct
 
 MAX_WINDOWS = 64  # of an organ
 MAX_GEOMS = 32  # of a window
+TRAIL = 12  # points of the path of a blade that has not come apart yet
 
 
 class Numbers:
@@ -156,6 +157,30 @@ BOND = Numbers(
   ("released", 1, "J", "what damage has taken of its energy"),
 )
 
+# Of the plugin state: a geom that cuts, and its seat in the tissue; places are at rest.
+BLADE = Numbers(
+  "BLADE",
+  ("stage", 1, "-", "0 away, 1 at the surface, 2 through the wall"),
+  ("depth", 1, "m", "how far it has pierced the wall"),
+  ("elem", 1, "-", "triangle of its seat"),
+  ("at", 3, "m", "its seat"),
+  ("toward", 3, "-", "which way it cut last, 0 before"),
+  ("work", 1, "J", "what it has spent"),
+  ("opened", 1, "m", "what it has cut"),
+  ("wait", 1, "m", "how far it goes before the mesh comes apart"),
+  ("count", 1, "-", "points of `trail`"),
+  ("trail", 3 * TRAIL, "m", "its path since the mesh came apart"),
+)
+
+# What a geom that cuts meets.
+LAW = Numbers(
+  "LAW",
+  ("force", 1, "N", "to cut, along the surface"),
+  ("pierce", 1, "N", "to pierce the wall, along the blade"),
+  ("stiffness", 1, "N/m", "of the spring to its seat"),
+  ("wall", 1, "m", "thickness of the wall"),
+)
+
 # The last numbers of the plugin state of a windowed organ.
 TAIL = Numbers(
   "TAIL",
@@ -168,10 +193,14 @@ TAIL = Numbers(
   ("leeway", 1, "m", "how far a tool may go from where it was when the organ fell asleep"),
 )
 
-TABLES = (FLAG, STAGE, MODE, HEAD, MOVED, PUSHED, GEOM, SUMMARY, ANSWER, RECORD, POSE, BOND, TAIL)
+TABLES = (
+  FLAG, STAGE, MODE, HEAD, MOVED, PUSHED, GEOM, SUMMARY, ANSWER, RECORD, POSE, BOND, BLADE, LAW,
+  TAIL,
+)  # fmt: skip
 CONSTANTS = {
   "MAX_WINDOWS": MAX_WINDOWS,
   "MAX_GEOMS": MAX_GEOMS,
+  "TRAIL": TRAIL,
   **{name: value for table in TABLES for name, value in table.constants().items()},
 }
 
@@ -187,7 +216,8 @@ class Topology:
   stamp: doubles("ncuts")  # of all these; 0 before the first cut [-]
 
 
-NO_CUTS = {"ncorner": 0, "nplace": 0, "nspare": 0, "ncuts": 0}  # its sizes where there is no room
+# Its sizes where there is no room, and that of what cuts.
+NO_CUTS = {"nblade": 0, "ncorner": 0, "nplace": 0, "nspare": 0, "ncuts": 0}
 
 
 @struct
@@ -199,6 +229,7 @@ class NodalState:
   before: doubles("nfree")  # the one before it [m/s]
   creep: doubles("ncreep", 6)  # see `creep`
   bond: doubles("nbond", len(BOND))  # of each vertex that moves, see BOND
+  blade: doubles("nblade", len(BLADE))  # of each geom that cuts, see BLADE
   cuts: Topology
   heavier: doubles(1)  # how many times its inertia at rest a tool meets; 0 for once [-]
   signature: doubles(1)  # of the organ, see `Declaration`; 0 where it was set by hand [-]
@@ -222,6 +253,7 @@ class WindowState:
   force: doubles("nslot", 3)  # contact force of the last step on each slot [N]
   creep: doubles("ncreep", 6)  # see `creep`
   bond: doubles("nbond", len(BOND))  # of each vertex that moves, see BOND
+  blade: doubles("nblade", len(BLADE))  # of each geom that cuts, see BLADE
   slip: doubles("nrest", 3)  # how far nodes have slipped on what they rest on [m]
   slot: doubles("nslot")  # node + 1; 0: the slot's default node, -1: not used
   cuts: Topology

@@ -208,7 +208,7 @@ def _advance(model: int, data: int, instance: int):
 def _end(w: Workspace):
   """Ends the step, and looks at what came of it."""
   w.step()
-  if w.cuts.tear and w.cuts.tear.act():
+  if (w.cuts.tear and w.cuts.tear.act()) or (w.cutters and w.cutters.open()):
     workspace.place(w, w.model)
   nodes, triangles = w.flags[FLAG.missed_nodes], w.flags[FLAG.missed_elements]
   if nodes > w.missed[0] or triangles > w.missed[1]:

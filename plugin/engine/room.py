@@ -20,6 +20,8 @@ def state_size(model: int, instance: int) -> int:
   )
   spare = mjstruct.config(model, instance, "spare").strip() not in ("", "0")
   cuts = coupling.cut_sizes(m.nflexelem, m.nflexvert, spare * m.nflexvert)
+  cutters = mjstruct.config(model, instance, "cutters").strip()
+  cuts |= {"nblade": cutters.count(",") + 1 if cutters else 0}
   if names:
     # Asked before MuJoCo has filled in the flexes: what `windowed` needs is at most this.
     inside = fill.MOST if mjstruct.config(model, instance, "elements").strip() == "solid" else 0

@@ -31,6 +31,7 @@ from .bonds import Bonds
 from .coupling import Phases
 from .creep import Creep
 from .cuts import Cuts
+from .cutters import Cutters
 from .declare import Declaration
 from .hold import Beside, Hold
 from .layout import FLAG, HEAD, STAGE
@@ -74,7 +75,7 @@ class Workspace:
     bonds: what it has grown on to
     rests: what it rests on
     creep: its stress relaxation
-    cuts: its mesh as it is now
+    cuts: its mesh as it is now; cutters: what cuts it
     resident: keeper of a motion that stays on the device, or None
     stiff: whether the response is needed, see `inertia.stiffness`
     heaviest: most times its inertia that a node in contact may have, see there  (1,)
@@ -92,12 +93,10 @@ class Workspace:
     torn: whether a signal's handler has ended a callback of the last step
     watch: looks whether tools come through the surface
     nbad: MuJoCo's warnings of bad states that were looked at since the last reset
-    model_step: the model's time step comes first [s]
-    time_step: time step that the armature is for [s]
+    model_step: the model's time step comes first; time_step: that the armature is for [s]
     integrator: MuJoCo's comes first
     static: places of the bodies that the organ hangs on, and what they were
-    qpos: numbers of qpos that the slots have, as bytes
-    stood: what they were after the last step, or None
+    qpos: numbers of qpos that the slots have, as bytes; stood: after the last step, or None
     plugin_state: the organ's own numbers
     signature: the last of them, see `Declaration`
     views: what a coupling keeps when its graphs are recorded anew
@@ -131,6 +130,7 @@ class Workspace:
   rests: Rests = dataclasses.field(init=False)
   creep: Creep = dataclasses.field(init=False)
   cuts: Cuts = dataclasses.field(init=False)
+  cutters: Cutters = dataclasses.field(init=False)
   resident: Resident | None = None
   stiff: bool = False
   heaviest: np.ndarray = dataclasses.field(default_factory=lambda: np.ones(1))
@@ -165,18 +165,18 @@ class Workspace:
   def __post_init__(self):
     self.hold, self.ties = Hold(self), Ties(self)
     self.bonds, self.rests, self.creep = Bonds(self), Rests(self), Creep(self)
-    self.cuts = Cuts(self)
+    self.cuts, self.cutters = Cuts(self), Cutters(self)
 
   @property
   def beside(self) -> tuple[Beside, ...]:
     """What acts on the organ beside its tissue, in the order in which it does."""
-    return self.ties, self.bonds, self.rests, self.creep
+    return self.ties, self.bonds, self.rests, self.creep, self.cutters
 
   def run(self):
     """Computes the step's forces and adds them to qfrc_passive.
 
-    As `step` it may be called again where a signal's handler ended it: `FLAG.stage` says how far it
-    came. Not where the motion is on a device, which may be a step ahead.
+    As `step` it may be called again where a signal's handler ended it (`FLAG.stage`), but not where
+    the motion is on a device, which may be a step ahead.
     """
     self._check_model()
     self.strange = self.signature[0] != self.organ.signature
@@ -401,6 +401,7 @@ def make(model: int, data: int, instance: int) -> Workspace:
     w.skin = skin.read(m, organ)
     fasten.declare(w)
     adhere.declare(w)
+    w.cutters.declare()
     bind(w, model)
     w.plugin_state = w.views["plugin_state"].numpy()
     w.signature = w.plugin_state[coupling.spans(organ)["signature"]].data
@@ -445,4 +446,5 @@ def refresh(w: Workspace):
       if w.turn is not None and w.turn.mine:
         place(w, w.model)
     feel(w, m)
+    w.cutters.refresh()
     w.time_step = float(m.opt.timestep)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from . import reading
-from .reading import BondRow
+from .reading import BondRow, CutterRow
 from .step import SCHEMES
 
 # What takes a change while running: a number in the device's memory, the tissue's arrays, the graph
@@ -55,6 +55,12 @@ class Config:
     reading.words("membrane", "spring", "solid"),
     "`membrane` (St. Venant-Kirchhoff triangles, plane stress), `spring` (edge springs) or `solid` "
     "(neo-Hookean tetrahedra inside, made when the model is compiled; with `window` alone)",
+  )
+  tetrahedra: str = _row(
+    "",
+    reading.PATH,
+    "Gmsh file, as text, whose tetrahedra a solid has inside: their nodes on the surface are its "
+    "vertices, in its frame [m]; none makes them",
   )
   young: tuple[float, ...] = _row(
     (5000.0,),
@@ -179,6 +185,19 @@ class Config:
     reading.NOT_NEGATIVE,
     "greatest principal strain, length over rest length less 1, beyond which tissue tears across "
     "it, with `spare` ([cutting](cutting.md#tearing)); 0: never",
+  )
+  cutters: tuple[CutterRow, ...] = _row(
+    (),
+    (
+      reading.cutters,
+      "a geom, or two of scissors, and an energy > 0, and for a current 'by' and an actuator, a "
+      "comma between such groups",
+    ),
+    "geoms that cut the wall where they are driven through it (with `spare`), and the energy that "
+    "it takes to open an area, or that cut and free bonds by a current "
+    "([cutters](cutting.md#cutters)): `scalpel/edge 160, scissors/edge_left scissors/edge_right "
+    "160, hook/hook_toe 1.1e6 by current`",
+    "-, J/m²",
   )
   resident: bool = _row(
     False,
@@ -326,6 +345,10 @@ def _check_combination(organ: str, config: Config, given: dict, closed: bool):
       raise ValueError(f"organ {organ!r}: {key} is set, allowed only with window")
   if config.elements == "solid":
     _check_solid(organ, config, given)
+  elif config.tetrahedra:
+    raise ValueError(
+      f"organ {organ!r}: tetrahedra is {config.tetrahedra!r}, allowed only with elements='solid'"
+    )
   _check_ties(organ, config)
   _check_spare(organ, config)
   if config.window and "mass" not in given and not config.mass:
@@ -362,18 +385,19 @@ def spare(organ: str, text: str, there: int) -> int:
 def _check_spare(organ: str, config: Config):
   if config.tear and not config.spare:
     raise ValueError(f"organ {organ!r}: tear is {config.tear:g}, allowed only with spare")
+  if config.cutters and not config.spare and not config.bonded:
+    raise ValueError(f"organ {organ!r}: cutters is set, allowed only with spare, or bonds to free")
   if not config.spare:
     return
-  for key in ("carrier", "attach", "relax_share", "support", "resident", "bonded"):
-    if getattr(config, key):
-      name = key.replace("bonded", "bonds")
-      raise ValueError(f"organ {organ!r}: {name} is set, allowed only where spare is 0")
-  if config.elements == "solid":
-    raise ValueError(f"organ {organ!r}: elements is 'solid', allowed only where spare is 0")
+  if config.resident:
+    raise ValueError(f"organ {organ!r}: resident is set, allowed only where spare is 0")
+  for key, text in (("elements", "solid"), ("carrier", OWN)):
+    if getattr(config, key) == text:
+      raise ValueError(f"organ {organ!r}: {key} is {text!r}, allowed only where spare is 0")
 
 
 def _check_ties(organ: str, config: Config):
-  for key in ("carrier", "attach", "bonds", "relax_share", "support"):
+  for key in ("carrier", "attach", "bonds", "relax_share", "support", "cutters"):
     if not getattr(config, key) and not (key == "bonds" and config.bonded):
       continue
     if config.resident:

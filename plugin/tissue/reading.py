@@ -178,10 +178,39 @@ def bonds(text: str, nelem: int) -> tuple[BondRow, ...]:
   return tuple(found)
 
 
+class CutterRow(NamedTuple):
+  """What cuts, as a configuration declares it.
+
+  Attributes:
+    geoms: name of a geom, or of the two blades of scissors
+    energy: that it takes to open an area [J/m^2]
+    current: name of the actuator whose control is its power, "" for one that cuts by its edge
+  """
+
+  geoms: tuple[str, ...]
+  energy: float
+  current: str
+
+
+def cutters(text: str, nelem: int) -> tuple[CutterRow, ...]:
+  """Returns groups of one or two geoms and an energy, or with `by` and an actuator."""
+  found = []
+  for group in text.split(","):
+    words, current = group.split(), ""
+    if len(words) > 2 and words[-2] == "by":
+      *words, _, current = words
+    *geoms, energy = words
+    if len(geoms) not in ((1,) if current else (1, 2)):
+      raise ValueError
+    found.append(CutterRow(tuple(geoms), POSITIVE[0](energy, nelem), current))
+  return tuple(found)
+
+
 def words(*values: str) -> tuple:
   """Returns how one of some words is read, and the words for it."""
   return choice({value: value for value in values})
 
 
+PATH = (lambda text, nelem: text, "a path")
 POSITIVE = number(0.0, closed=False)
 NOT_NEGATIVE = number(0.0)

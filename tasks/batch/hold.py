@@ -6,15 +6,15 @@ from typing import Any
 import numpy as np
 import warp as wp
 from palpate.batch.threads import Threads
-from palpate.tasks import grasp, jaws, physics
+from palpate.tasks import grasp, instrument, jaws
 from palpate.tissue.types import Array, floats, ints, struct
 
 from . import domain
 from .fields import Common, flags, vectors
-from .kernels import point, put, vector
+from .kernels import error, point, put, reach, vector
 
-_CLOSING, _GRIPPING = wp.constant(physics.CLOSING), wp.constant(physics.GRIPPING)
-_FOLD, _FORCE = wp.constant(physics.FOLD), wp.constant(physics.HELD_FORCE)
+_CLOSING, _GRIPPING = wp.constant(instrument.CLOSING), wp.constant(instrument.GRIPPING)
+_FOLD, _FORCE = wp.constant(instrument.FOLD), wp.constant(instrument.HELD_FORCE)
 _REACH, _FACING = wp.constant(grasp.REACH), wp.constant(jaws.FACING)
 
 
@@ -80,6 +80,12 @@ def follow(s: Common, o: HoldState, w: int):
   elif pressed and distance(s, o, w) < _REACH:
     now = True
     o.where[w] = from_tip(s, o, w)
+    reach(s, w, distance(s, o, w))
+    s.grasps[w] = s.grasps[w] + 1
+  if closing and not o.closing[w] and distance(s, o, w) >= 2.0 * _REACH:
+    error(s, w)
+  if before and not now and closing:
+    s.slips[w] = s.slips[w] + 1
   o.closing[w] = closing
   o.grasped[w, 0] = wp.where(now, 1.0, 0.0)
   return before and not now

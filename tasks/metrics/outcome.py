@@ -84,6 +84,46 @@ def share_freed(freed: ArrayLike) -> float:
   return float(rows("freed", freed)[-1])
 
 
+@metric("Mean deviation", "m", "outcome", "all", "FLS: 2 mm, 10.1177/1553350607302329")
+def cut_deviation(deviation: ArrayLike) -> float:
+  """Returns the mean distance of a cut from its line [m], lower is better (FLS).
+
+  Args:
+    deviation: mean so far [m]  (nstep,)
+  """
+  return float(rows("deviation", deviation)[-1])
+
+
+@metric("Largest deviation", "m", "outcome", "max", "FLS: 2 mm, 10.1177/1553350607302329")
+def cut_farthest(farthest: ArrayLike) -> float:
+  """Returns the largest distance of a cut from its line [m], lower is better (FLS).
+
+  Args:
+    farthest: largest so far [m]  (nstep,)
+  """
+  return float(rows("farthest", farthest)[-1])
+
+
+@metric("Excess tissue", "m^2", "outcome", "all", "MISTELS: area of deviation")
+def cut_excess(excess: ArrayLike) -> float:
+  """Returns the area between a cut and its line [m^2], lower is better (MISTELS).
+
+  Args:
+    excess: so far [m^2]  (nstep,)
+  """
+  return float(rows("excess", excess)[-1])
+
+
+@metric("Jagged length", "m", "outcome", "all", "FLS: 2 mm, 10.1177/1553350607302329")
+def cut_jagged(jagged: ArrayLike) -> float:
+  """Returns the length of a cut more than 2 mm from its line [m], lower is better (FLS).
+
+  Args:
+    jagged: so far [m]  (nstep,)
+  """
+  return float(rows("jagged", jagged)[-1])
+
+
 @metric("Tracing error (Frechet)", "m", "outcome", "all", "Perk Tutor; Eiter and Mannila 1994")
 def trace_frechet(traced_pos: ArrayLike, curve: ArrayLike) -> float:
   """Returns the discrete Frechet distance of the tip's path to a curve [m], lower is better.

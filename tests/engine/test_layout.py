@@ -9,7 +9,8 @@ from palpate.engine import layout
 from scenes import probed
 
 SIZES = {"nfree": 21, "nvert": 9, "nslot": 5, "nwindow": 2, "ngeom": 3, "most": 7}
-SIZES |= {"ncreep": 4, "nrest": 6, "nbond": 3, "ncorner": 8, "nplace": 10, "nspare": 2, "ncuts": 1}
+SIZES |= {"ncreep": 4, "nrest": 6, "nbond": 3, "nblade": 2}
+SIZES |= {"ncorner": 8, "nplace": 10, "nspare": 2, "ncuts": 1}
 BLOCKS = (layout.NodalState, layout.WindowState, layout.Inbox, layout.Outbox)
 
 

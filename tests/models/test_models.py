@@ -286,8 +286,8 @@ def test_bad_input():
     models.load("liver", 300)
   with pytest.raises(ValueError, match="'liver': grid is 20, expected one of 16, 32, 64, 128, 256"):
     models.organ("liver", grid=20)
-  with pytest.raises(ValueError, match="'scalpel', expected one of probe, grasper, scissors, hook"):
-    models.load("liver", instruments=("scalpel",))
+  with pytest.raises(ValueError, match="'drill', expected one of probe, grasper, scissors, hook"):
+    models.load("liver", instruments=("drill",))
   with pytest.raises(ValueError, match="3 names, expected at most two"):
     models.load("liver", instruments=("probe",) * 3)
   with pytest.raises(ValueError, match="expected a tuple such as"):

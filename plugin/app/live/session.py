@@ -57,6 +57,8 @@ class Session:
     """
     if not env.task.scene.handle:
       raise ValueError(f"{env.task.name}: input is 'drives', expected 'handle' for a device")
+    if env.task.second:
+      raise ValueError(f"{env.task.name}: it takes two hands, expected one for a single device")
     self.env, self.seed, self.coach = env, seed, coach
     self.pace = pace or Pace(env.physics.timestep())
     self.link = Link(device, options, env.physics.timestep())
@@ -122,7 +124,7 @@ class Session:
       rows[k, 7] = float(link.report)
     # Not beside what a control step does at its end.
     if 0 < k < len(rows) - 1 and self._publish is not None and self.pace.now >= self._due:
-      self._due = self.pace.now + 1 / _FPS
+      self._due = max(self._due + 1 / _FPS, self.pace.now)
       self._publish(self)
 
   def _watch(self, env: Any) -> bool:

@@ -1,0 +1,93 @@
+"""Geoms that cut by their current, such as a hook: what is near them comes apart, or comes free.
+
+An actuator's control is the power, in watts: above 0 it cuts the wall and frees bonds, below 0 it
+coagulates, which frees bonds alone. What it touches takes `energy` an area: a path in the wall
+grows by power / (energy * thickness) a second, and bonds near it lose their hold by power /
+(energy * area).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from palpate.tissue import path as paths
+
+from . import mjstruct
+from .layout import BLADE, BOND
+from .ties import motion
+
+_SPARK = 0.001  # how far from its surface, in air and tissue, a current acts [m]
+
+
+class Current:
+  """A geom of a workspace's organ that has a current.
+
+  Args:
+    w: the workspace
+    geom: the geom
+    actuator: whose control is its power [W]
+    energy: that an area takes [J/m^2]
+    shape: axis along which it is long, half that length and its width [m]
+  """
+
+  def __init__(self, w, geom: int, actuator: int, energy: float, shape: tuple[int, float, float]):
+    self._w, self._geom, self._actuator = w, geom, actuator
+    self._energy, (self._axis, self._half, width) = energy, shape
+    self._reach = 0.5 * width + _SPARK
+
+  def act(self, row: np.ndarray) -> bool:
+    """Does what a step's current does; returns whether the path has ended.
+
+    Args:
+      row: of the blades' state
+    """
+    w = self._w
+    m, d = mjstruct.Model.from_address(w.model), mjstruct.Data.from_address(w.data)
+    power = float(mjstruct.view(d.ctrl, m.nu)[self._actuator])
+    given = abs(power) * float(m.opt.timestep)  # [J]
+    if given:
+      self._free(d, m, given)
+    if power > 0 and w.cuts and self._burn(row, *self._line(d, m), given):
+      return False
+    row[BLADE.stage] = 0
+    return bool(row[BLADE.count])
+
+  def _line(self, d, m) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the ends of its axis in the world [m]."""
+    middle = mjstruct.view(d.geom_xpos, (m.ngeom, 3))[self._geom]
+    axis = mjstruct.view(d.geom_xmat, (m.ngeom, 3, 3))[self._geom][:, self._axis]
+    return middle - self._half * axis, middle + self._half * axis
+
+  def _free(self, d, m, given: float):
+    """Weakens the bonds that are near."""
+    w = self._w
+    for group in w.bonds.groups:
+      damage = w.bonds.state[group.slot, BOND.damage]
+      far = paths.distance(np.array(self._line(d, m)), motion(w, group.vert)[0])[0]
+      near = (far < self._reach) & (damage < 1)
+      if near.any():
+        slot = group.slot[near]
+        more = given / (self._energy * group.area[near].sum())
+        w.bonds.state[slot, BOND.damage] = np.minimum(damage[near] + more, 1.0)
+
+  def _burn(self, row: np.ndarray, low: np.ndarray, high: np.ndarray, given: float) -> bool:
+    """Lets the path follow the geom; returns whether it touches the wall."""
+    w, organ, mesh = self._w, self._w.organ, self._w.organ.mesh
+    local = (np.linspace(low, high, 5) - organ.origin) @ organ.frame
+    elem, weight, far = paths.nearest(mesh, mesh.rest + w.phases.motion()[0], local)
+    k = int(np.argmin(far))
+    if far[k] > self._reach:
+      return False
+    goal = weight[k] @ mesh.rest[mesh.elem[elem[k]]]
+    at = row[BLADE.at : BLADE.at + 3]
+    if not row[BLADE.stage]:
+      row[BLADE.stage], row[BLADE.elem], row[BLADE.count] = 2, elem[k], 1
+      at[:] = goal
+      row[BLADE.trail : BLADE.trail + 3] = goal
+    way = goal - at
+    size = float(np.linalg.norm(way))
+    goes = min(size, given / (self._energy * w.config.thickness))
+    if goes > 0:
+      at += goes / size * way
+      row[BLADE.work] += goes * self._energy * w.config.thickness
+      row[BLADE.opened] += goes
+    return True

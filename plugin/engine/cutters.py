@@ -1,0 +1,391 @@
+"""Geoms that cut an organ: blades, and the two of scissors; their forces are `native/blades.h`.
+
+A blade's path grows in the plugin state, step by step; here the mesh comes apart along it, a few
+edges at a time, since the mesh cannot do so by less.
+"""
+
+# Annotations here are objects, not text: no `from __future__ import annotations`.
+# pyright: reportInvalidTypeForm=false
+import dataclasses
+from typing import Any
+
+import mujoco
+import numpy as np
+import warp as wp
+from palpate.tissue import path as paths
+from palpate.tissue.step import SCHEMES
+from palpate.tissue.types import doubles, fill, ints, struct
+
+from . import coupling, fasten, flexes, mjstruct
+from .current import Current
+from .hold import Beside, Bodies, Input, Nodes, base, nodes, solver
+from .layout import BLADE, LAW, TRAIL
+
+_SLACK = 0.1  # edges of the mesh by which a blade's spring is stretched where it cuts
+_MORE = 0.5  # edges after which what could not come apart is tried again
+# Edges of a path that come apart at once at least, and that do not yet, behind the blade; and what
+# a vertex may be farther from the path for an edge that is opened more.
+_FIRST, _LAST, _FARTHER = 0.9, 0.3, 0.15
+# Share of the work on an edge that moving a vertex may turn into strain: without it none could move
+# on to the blade's path, where tissue is stretched.
+_GIVEN = 0.1
+_ROUND = (int(mujoco.mjtGeom.mjGEOM_CAPSULE), int(mujoco.mjtGeom.mjGEOM_CYLINDER))
+_BOX = int(mujoco.mjtGeom.mjGEOM_BOX)
+
+
+@struct
+class Blades:
+  """The geoms that cut an organ."""
+
+  nblade: int  # number of them
+  nelem: int  # triangles of the organ
+  ahead: wp.float64  # share of the step's way at which its scheme takes forces
+  gain: wp.float64  # how much of a step's stiffness its scheme has on dv
+  edge: wp.float64  # mean length of the mesh's edges [m]
+  geom: ints("nblade", 2)  # its geoms, the second of scissors alone; else -1
+  axis: ints("nblade", 2)  # axis of each along which its edge is
+  half: doubles("nblade", 2)  # half the edge's length [m]
+  law: doubles("nblade", len(LAW))  # see LAW
+  elem: ints("nelem", 3)  # triangles
+  flat: doubles("nvert", 3)  # rest positions as the cuts have them [m]
+  state: doubles("nblade", len(BLADE))  # see BLADE
+  next: doubles("nblade", len(BLADE))  # what it will be
+  force: doubles("nblade", 3)  # on the tissue, in the organ's frame [N]
+  point: doubles("nblade", 3)  # where it acts [m]
+  share: doubles("nblade", 3)  # of the corners of the triangle
+  hold: doubles("nblade", 6)  # what weighs on the change of the seat's velocity [kg]
+  due: ints("nblade")  # whether the path is to come apart, and how
+  own: Nodes
+  solve: Input
+  number: doubles("nnumber")  # see `NUMBERS`
+  mj: Bodies
+
+
+_enter, _act, _keep = coupling.kernels(
+  "blades.h", Blades, "enter_blades", "act_blades", "keep_blades"
+)
+# As in the header: the blade is out of the tissue; edges between points of a path, and that come
+# apart at once.
+_ENDED, _SPACING, _BATCH = 2, 0.4, 1.8
+
+
+@dataclasses.dataclass(frozen=True)
+class Cutter:
+  """A geom, or two, that cut an organ.
+
+  Attributes:
+    geoms: their names
+    inside: whether it has gone through the wall and is there
+    force: on the tissue in the last step, in the world [N]  (3,)
+    energy: that opening the tissue has taken [J]
+    length: of its paths so far, at rest [m]
+    seat: where it is in the tissue at rest, in the world [m]  (3,)
+  """
+
+  geoms: tuple[str, ...]
+  inside: bool
+  force: np.ndarray
+  energy: float
+  length: float
+  seat: np.ndarray
+
+
+class Cutters(Beside):
+  """What cuts a workspace's organ; false where nothing does.
+
+  Args:
+    w: the workspace
+  """
+
+  def __init__(self, w):
+    super().__init__(w)
+    self.names: list[tuple[str, ...]] = []
+    self._arrays: dict[str, np.ndarray] = {}
+    self._width = np.zeros(0)
+    self._currents: dict[int, Current] = {}
+    self._blades: Any = None
+    self._due: Any = ()
+    self._said = False
+
+  def __bool__(self) -> bool:
+    return bool(self.names)
+
+  def declare(self):
+    """Finds the geoms that the configuration names.
+
+    Raises:
+      ValueError: one does not exist, has no edge, or collides with the organ.
+    """
+    w = self._w
+    if not w.config.cutters:
+      return
+    m = mjstruct.Model.from_address(w.model)
+    rows = w.config.cutters
+    found = [[_find(w, m, name, bool(row.current)) for name in row.geoms] for row in rows]
+    n = len(found)
+    geom, half, axis = np.full((n, 2), -1), np.zeros((n, 2)), np.zeros((n, 2), int)
+    self._width = np.zeros(n)
+    for i, geoms in enumerate(found):
+      for k, g in enumerate(geoms):
+        geom[i, k] = g
+        axis[i, k], half[i, k], width = _shape(w, m, g)
+        self._width[i] = max(self._width[i], width)
+      if rows[i].current:
+        actuator, shape = _find_actuator(w, m, rows[i].current), _shape(w, m, geoms[0])
+        self._currents[i] = Current(w, geoms[0], actuator, rows[i].energy, shape)
+    self.names = [tuple(_name(m, g) for g in geoms) for geoms in found]
+    self._arrays = {"geom": geom, "axis": axis, "half": half}
+    w.hold.need()
+
+  def _law(self, m) -> np.ndarray:
+    """Returns the rows of `Blades.law`."""
+    w, rows = self._w, []
+    for i, row in enumerate(w.config.cutters):
+      force = row.energy * w.config.thickness
+      if row.current:
+        rows.append((0.0, 0.0, 0.0, w.config.thickness))
+        continue
+      stiff = force / (_SLACK * w.organ.mesh.whole.edge_length)
+      for g in self._arrays["geom"][i]:
+        if g >= 0:
+          body = int(mjstruct.view(m.geom_bodyid, m.ngeom, np.int32)[g])
+          stiff = min(stiff, fasten.most(w, m, body))
+      rows.append((force, row.energy * self._width[i], stiff, w.config.thickness))
+    return np.array(rows)
+
+  @property
+  def state(self) -> np.ndarray:
+    """Where each is in the tissue, in the plugin state, (nblade, len(BLADE))."""
+    return self._rows.numpy()
+
+  @property
+  def _rows(self) -> wp.array:
+    w = self._w
+    where = coupling.spans(w.organ)["blade"]
+    address = w.views["plugin_state"].ptr + 8 * where.start
+    shape = len(self.names), len(BLADE)
+    return wp.array(ptr=address, dtype=wp.float64, shape=shape, device="cpu")
+
+  def load(self):
+    """See `Beside`."""
+    if self:
+      _enter.load(wp.get_device("cpu"))
+
+  def bind(self, model: int):
+    """See `Beside`."""
+    if not self:
+      return
+    w, n, mesh = self._w, len(self.names), self._w.organ.mesh
+    m, scheme = mjstruct.Model.from_address(model), SCHEMES[w.config.integrator]
+    shapes = {"force": 3, "point": 3, "share": 3, "hold": 6, "next": len(BLADE)}
+    values = {name: np.zeros((n, width)) for name, width in shapes.items()}
+    values |= self._arrays | dict(
+      nblade=n,
+      nelem=mesh.nelem,
+      ahead=float(scheme.ahead),
+      gain=scheme.gain(1.0, 0.0),
+      edge=float(mesh.whole.edge_length),
+      law=self._law(m),
+      elem=mesh.elem,
+      flat=mesh.rest,
+      state=self._rows,
+      due=np.zeros(n),
+      own=nodes(w),
+      solve=solver(w),
+      number=w.body.numbers,
+      mj=coupling.mujoco_arrays(model, w.data, Bodies),
+    )
+    self._blades = fill(Blades, "cpu", values)
+    self._due = self._blades.due.numpy().data
+
+  def refresh(self):
+    """Takes the thickness that the wall has now."""
+    if self._blades is not None:
+      self._blades.law.assign(self._law(mjstruct.Model.from_address(self._w.model)))
+
+  def reshape(self) -> list:
+    """See `Beside`."""
+    if self._blades is not None:
+      mesh = self._w.organ.mesh
+      self._blades.elem.assign(mesh.elem)
+      self._blades.flat.assign(mesh.rest)
+      self._blades.own.rest.assign(base(self._w.organ))
+    return []
+
+  def enter(self):
+    """See `Beside`."""
+    if self:
+      _enter.launch("cpu", 1, 1, 0, self._blades)
+
+  def act(self):
+    """See `Beside`."""
+    if self:
+      _act.launch("cpu", 1, 1, 0, self._blades)
+
+  def end(self):
+    """See `Beside`."""
+    if self:
+      _keep.launch("cpu", 1, 1, 0, self._blades)
+
+  def open(self) -> bool:
+    """Lets the mesh come apart along the paths that are long enough, or ended; returns whether."""
+    opened, mesh = False, self._w.organ.mesh
+    for i, current in self._currents.items():
+      self._due[i] = self._follow(current, self.state[i])
+    for i, due in enumerate(self._due):
+      if due:
+        given = _GIVEN * self._blades.law.numpy()[i, LAW.force] * mesh.whole.edge_length
+        opened = self._open(self.state[i], due == _ENDED, given) or opened
+        self._due[i] = 0
+    return opened
+
+  def _follow(self, current: Current, row: np.ndarray) -> int:
+    """Lets a path follow a current; returns what is due, as the header says it of blades."""
+    if current.act(row):
+      return _ENDED
+    count, at = int(row[BLADE.count]), row[BLADE.at : BLADE.at + 3]
+    if not row[BLADE.stage]:
+      return 0
+    edge = self._w.organ.mesh.whole.edge_length
+    start, last = (row[k : k + 3] for k in (BLADE.trail, BLADE.trail + 3 * (count - 1)))
+    if count < TRAIL and np.linalg.norm(at - last) > _SPACING * edge:
+      row[BLADE.trail + 3 * count : BLADE.trail + 3 * count + 3] = at
+      row[BLADE.count] += 1
+    wait = row[BLADE.wait] or _BATCH * edge
+    return int(np.linalg.norm(at - start) > wait or row[BLADE.count] == TRAIL)
+
+  def _open(self, row: np.ndarray, ended: bool, given: float) -> bool:
+    """Opens the path of a blade; returns whether the mesh is another.
+
+    Args:
+      row: of the state
+      ended: whether all of it comes apart
+      given: energy that moving a vertex may bring [J]
+    """
+    w, mesh = self._w, self._w.organ.mesh
+    count, at = int(row[BLADE.count]), row[BLADE.at : BLADE.at + 3]
+    trail = row[BLADE.trail : BLADE.trail + 3 * count].reshape(-1, 3)
+    path, rest = np.vstack([trail, at]), at[None]
+    if not ended:
+      path, rest = _part(mesh, path)
+    try:
+      report = w.cuts.cut(self._now(mesh, path), given) if len(path) > 1 else None
+    except ValueError as error:
+      if "pinned" in str(error) and not self._said:
+        self._said = True
+        mjstruct.warn(str(error))
+      report = None
+    if ended:
+      row[BLADE.count] = 0
+    elif report is None:
+      self._wait(row, at, count == TRAIL)
+    else:
+      tip = (report.path[-1][-1] - w.organ.origin) @ w.organ.frame if report.path else path[-1]
+      trail = np.vstack([tip, rest[:-1]])[:TRAIL]
+      row[BLADE.count], row[BLADE.wait] = len(trail), 0.0
+      row[BLADE.trail : BLADE.trail + trail.size] = trail.ravel()
+      row[BLADE.elem] = paths.nearest(w.organ.mesh, w.organ.mesh.rest, at[None])[0][0]
+    return report is not None and report.nodes > 0
+
+  def _now(self, mesh, path: np.ndarray) -> np.ndarray:
+    """Returns where points of the rest shape are in the world."""
+    organ = self._w.organ
+    elem, weight, _ = paths.nearest(mesh, mesh.rest, path)
+    position = mesh.rest + self._w.phases.motion()[0]
+    local = np.einsum("nk,nkj->nj", weight, position[mesh.elem[elem]])
+    return organ.origin + local @ organ.frame.T
+
+  def _wait(self, row: np.ndarray, at: np.ndarray, full: bool):
+    """Lets a path grow that could not come apart, or forgets it where there is no more room."""
+    start = row[BLADE.trail : BLADE.trail + 3]
+    row[BLADE.wait] = np.linalg.norm(at - start) + _MORE * self._w.organ.mesh.whole.edge_length
+    if full:
+      row[BLADE.count], row[BLADE.wait] = 1, 0.0
+      start[:] = at
+
+  def read(self) -> list[Cutter]:
+    """Returns what the cutters do."""
+    out = []
+    if not self:
+      return out
+    for names, row, force in zip(self.names, self.state, self._forces(), strict=True):
+      stage, energy, length = row[[BLADE.stage, BLADE.work, BLADE.opened]]
+      organ = self._w.organ
+      seat = organ.origin + organ.frame @ row[BLADE.at : BLADE.at + 3]
+      out.append(Cutter(names, stage == 2, force, float(energy), float(length), seat))
+    return out
+
+  def _forces(self) -> np.ndarray:
+    return self._blades.force.numpy() @ self._w.organ.frame.T
+
+
+def _part(mesh, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+  """Returns the part of a path that comes apart now, and the rest; nothing where there is none.
+
+  It ends where a vertex is near, so that the mesh need not be bent to where the blade is just now.
+  """
+  edge = mesh.whole.edge_length
+  size = np.linalg.norm(np.diff(path, axis=0), axis=1)
+  arc = np.concatenate([[0.0], np.cumsum(size)])
+  way = np.arange(_FIRST * edge, arc[-1] - _LAST * edge, 0.1 * edge)
+  point = np.stack([np.interp(way, arc, path[:, c]) for c in range(3)], axis=1)
+  if not len(point):
+    return path[:0], path
+  elem, _, _ = paths.nearest(mesh, mesh.rest, point)
+  vert = np.unique(mesh.elem[elem])
+  far = np.linalg.norm(point[:, None] - mesh.rest[vert], axis=2).min(axis=1)
+  stop = int(np.argmin(far - _FARTHER * way))
+  k = int(np.searchsorted(arc, way[stop]))
+  end = point[stop][None]
+  return np.vstack([path[:k], end]), np.vstack([path[k:]])
+
+
+def _name(m, geom: int) -> str:
+  return mjstruct.name_of(m, m.name_geomadr, geom)
+
+
+def _find_actuator(w, m, name: str) -> int:
+  names = [mjstruct.name_of(m, m.name_actuatoradr, a) for a in range(m.nu)]
+  found = flexes.resolve(name, w.organ.name, names)
+  if found is None:
+    raise ValueError(
+      f"organ {w.organ.name!r}: cutters names {name!r}, which is no actuator of the model"
+    )
+  return names.index(found)
+
+
+def _find(w, m, name: str, current: bool) -> int:
+  names = [_name(m, g) for g in range(m.ngeom)]
+  found = flexes.resolve(name, w.organ.name, names)
+  if found is None:
+    raise ValueError(
+      f"organ {w.organ.name!r}: cutters names {name!r}, which is no geom of the model"
+    )
+  geom = names.index(found)
+  flex = w.organ.windows.flex if w.organ.windows else [w.organ.flex]
+  if not current and not w.cuts:
+    raise ValueError(
+      f"organ {w.organ.name!r}: cutters names {name!r}, which cuts by its edge, allowed only with "
+      "spare"
+    )
+  if not current and any(geom in flexes.meeting_geoms(m, int(f)) for f in flex):
+    raise ValueError(
+      f"organ {w.organ.name!r}: cutters names {name!r}, which collides with it, expected a geom "
+      "with contype='0' conaffinity='0': what cuts goes through"
+    )
+  return geom
+
+
+def _shape(w, m, geom: int) -> tuple[int, float, float]:
+  """Returns the axis of a geom along which its edge is, half its length and its width [m]."""
+  kind = int(mjstruct.view(m.geom_type, m.ngeom, np.int32)[geom])
+  size = mjstruct.view(m.geom_size, (m.ngeom, 3))[geom]
+  if kind == _BOX:
+    order = np.argsort(size)
+    return int(order[2]), float(size[order[2]]), 2 * float(size[order[1]])
+  if kind not in _ROUND:
+    raise ValueError(
+      f"organ {w.organ.name!r}: cutters names {_name(m, geom)!r}, expected a capsule, cylinder or "
+      "box, whose longest axis is the edge"
+    )
+  return 2, float(size[1]), 2 * float(size[0])

@@ -1,0 +1,338 @@
+// Blades that cut: a segment goes through the wall of an organ without contact, and a spring holds it
+// to a point of the tissue, its seat. Doubles, on the CPU beside MuJoCo.
+//
+// With G the energy that it takes to open an area and t the thickness of the wall, a length dl takes
+// G t dl. So the tissue bears a blade up to the force G t along the surface, and there the seat goes on
+// through the tissue as far as brings the spring back to it: a return mapping, as of a slider that is
+// ideally plastic, which takes G t of energy a length whatever the step and the speed. What the seat goes
+// through is the path of the cut. A blade that comes from above pierces the wall first, with up to G
+// times its width along itself, over the wall's thickness. On its way back it meets nothing.
+//
+// Places are in the organ's frame; a blade slides freely along itself.
+#pragma once
+#include "lines.h"
+#include "triangle.h"
+
+namespace palpate {
+
+// Shares of an edge of the mesh: between points of a path, and the most that a seat goes in a step.
+constexpr double SPACING = 0.4, LEAP = 1.0;
+constexpr double BATCH = 1.8;  // edges that come apart at once, at least
+constexpr double LEVEL = 0.05;  // least share of a way along the surface that is across the blade
+constexpr double BLOCKED = 0.3;  // share of its way that a seat goes where it is not at a boundary
+enum { AWAY, PIERCING, THROUGH };  // stages
+enum { NOTHING, LONG, ENDED };  // what is due
+
+PALPATE D3 blend(const D3* x, D3 w) { return w.x * x[0] + w.y * x[1] + w.z * x[2]; }
+
+template <class Fields>
+PALPATE void corners_at_rest(const Fields& f, int t, D3* x) {
+  for (int c = 0; c < 3; ++c) x[c] = load(f.flat.data + 3 * f.elem.data[3 * t + c]);
+}
+
+template <class Fields>
+PALPATE void corners_now(const Fields& f, int t, D3* x) {
+  for (int c = 0; c < 3; ++c) {
+    const int v = f.elem.data[3 * t + c];
+    x[c] = load(f.own.rest.data + 3 * v) + moved_by(f.mj, f.own, v);
+  }
+}
+
+// Where a line goes through a triangle: how far from its end, or -1 where it does not.
+PALPATE double crossing(const Line& s, const D3* x, D3& weight) {
+  const D3 e = x[1] - x[0], g = x[2] - x[0], p = cross(s.along, g);
+  const double det = dot(e, p);
+  if (!(fabs(det) > 0.0)) return -1.0;
+  const D3 r = s.from - x[0], q = cross(r, e);
+  const double v = dot(r, p) / det, w = dot(s.along, q) / det, t = dot(g, q) / det;
+  weight = {1.0 - v - w, v, w};
+  return v < 0.0 || w < 0.0 || v + w > 1.0 || t > s.length ? -1.0 : t;
+}
+
+// Finds where a blade goes through the surface, nearest to one of its ends; returns how far that end is
+// beyond it, or -1.
+template <class Fields>
+PALPATE double enters(const Fields& f, const Line& s, int& elem, D3& weight) {
+  const D3 half = (0.5 * s.length) * s.along, middle = s.from + half, reach = vabs(half);
+  const D3 zero = {0.0, 0.0, 0.0};
+  double least = -1.0;
+  for (int t = 0; t < f.nelem; ++t) {
+    D3 x[3], w;
+    corners_now(f, t, x);
+    const D3 low = zero - vmax(vmax(zero - x[0], zero - x[1]), zero - x[2]);
+    const D3 high = vmax(vmax(x[0], x[1]), x[2]), off = vmax(low - middle, middle - high) - reach;
+    if (off.x > 0.0 || off.y > 0.0 || off.z > 0.0) continue;
+    const double at = crossing(s, x, w), beyond = at < s.length - at ? at : s.length - at;
+    if (at < 0.0 || (least >= 0.0 && beyond >= least)) continue;
+    least = beyond, elem = t, weight = w;
+  }
+  return least;
+}
+
+// Finds the point of the surface at rest that is nearest to a place: its triangle and weights.
+template <class Fields>
+PALPATE void find_seat(const Fields& f, D3 place, int& elem, D3& weight) {
+  double least = 1e300;
+  for (int t = 0; t < f.nelem; ++t) {
+    D3 x[3];
+    corners_at_rest(f, t, x);
+    const double far = norm(x[0] - place) - norm(x[1] - x[0]) - norm(x[2] - x[0]);
+    if (far > 0.0 && far * far > least) continue;
+    const D3 w = barycentric(place, x), off = blend(x, w) - place;
+    if (!(dot(off, off) < least)) continue;
+    least = dot(off, off), elem = t, weight = w;
+  }
+}
+
+// Where the seat of a blade is: triangle, weights, place now, velocity, and normal.
+struct Seated { D3 x[3], rest[3], weight, at, vel, normal; };
+
+template <class Fields>
+PALPATE Seated seated(const Fields& f, const double* s) {
+  Seated out;
+  const int elem = (int)s[BLADE_ELEM];
+  corners_now(f, elem, out.x);
+  corners_at_rest(f, elem, out.rest);
+  out.weight = barycentric(load(s + BLADE_AT), out.rest);
+  out.at = blend(out.x, out.weight);
+  out.normal = unit_of(cross(out.x[1] - out.x[0], out.x[2] - out.x[0]));
+  D3 vel[3];
+  for (int c = 0; c < 3; ++c)
+    vel[c] = load_lane(f.solve.vel.data + offset_of(f.solve.node.data[f.elem.data[3 * elem + c]]));
+  out.vel = blend(vel, out.weight);
+  return out;
+}
+
+// A way along a triangle, as it is in another shape of the triangle.
+PALPATE D3 carried(D3 way, const D3* x, const D3* to) {
+  const D3 e = x[1] - x[0], g = x[2] - x[0];
+  const double ee = dot(e, e), eg = dot(e, g), gg = dot(g, g), ew = dot(e, way), gw = dot(g, way);
+  const double det = ee * gg - eg * eg;
+  if (!(det > 0.0)) return {0.0, 0.0, 0.0};
+  return ((gg * ew - eg * gw) / det) * (to[1] - to[0]) + ((ee * gw - eg * ew) / det) * (to[2] - to[0]);
+}
+
+// What stretches a blade's spring: across the blade, and along the surface; not what is behind the end
+// of the cut, along `back`, where the blade came from.
+struct Stretch { D3 pull, flat, back; bool behind; double far; };
+
+PALPATE Stretch stretch_of(D3 pull, D3 blade, const Seated& at, D3 toward) {
+  const D3 goes = unit_of(carried(toward, at.rest, at.x));
+  Stretch s = {pull, across(pull, at.normal), unit_of(across(goes, blade)), false, 0.0};
+  s.far = -dot(s.flat, goes);
+  s.behind = s.far > 0.0;
+  if (s.behind) {
+    s.pull = across(s.pull, s.back);
+    s.flat = across(s.pull, at.normal);
+  }
+  return s;
+}
+
+// Adds the seat to the path, where it is far enough from the last point.
+PALPATE void note_path(double* s, double spacing) {
+  const int count = (int)s[BLADE_COUNT];
+  const D3 at = load(s + BLADE_AT);
+  if (count == TRAIL) return;
+  if (count && norm(at - load(s + BLADE_TRAIL + 3 * (count - 1))) < spacing) return;
+  store(s + BLADE_TRAIL + 3 * count, at);
+  s[BLADE_COUNT] += 1.0;
+}
+
+// Puts a blade that goes through the surface on its seat there.
+template <class Fields>
+PALPATE void sit_down(const Fields& f, int i, const Line& line) {
+  double* s = f.next.data + BLADE_LENGTH * i;
+  const D3 zero = {0.0, 0.0, 0.0}, toward = cuts_toward(f, i);
+  const bool shears = f.geom.data[2 * i + 1] >= 0;
+  if (shears && toward == zero) return;
+  int elem = 0;
+  D3 weight, rest[3], x[3];
+  const double beyond = enters(f, line, elem, weight);
+  if (beyond < 0.0) return;
+  corners_at_rest(f, elem, rest);
+  corners_now(f, elem, x);
+  const Line later = line_of(f, i, f.mj.timestep.data[0]);
+  const double fast = 2.0 * norm(later.from - line.from);
+  const bool sideways = beyond > f.law.data[LAW_LENGTH * i + LAW_WALL] + fast || shears;
+  s[BLADE_STAGE] = sideways ? THROUGH : PIERCING;
+  s[BLADE_ELEM] = elem;
+  s[BLADE_DEPTH] = s[BLADE_COUNT] = 0.0;
+  store(s + BLADE_AT, blend(rest, weight));
+  store(s + BLADE_TOWARD, unit_of(carried(toward, x, rest)));
+  if (sideways) note_path(s, 0.0);
+}
+
+// Moves the seat of a blade along the surface; returns whether it could.
+template <class Fields>
+PALPATE bool advance(const Fields& f, int i, D3 way, const Seated& from) {
+  double* s = f.next.data + BLADE_LENGTH * i;
+  const D3 was = load(s + BLADE_AT), goes = carried(way, from.x, from.rest);
+  int elem = (int)s[BLADE_ELEM];
+  D3 weight, rest[3];
+  find_seat(f, was + goes, elem, weight);
+  corners_at_rest(f, elem, rest);
+  const D3 now = blend(rest, weight);
+  const double gone = norm(now - was);
+  if (!(gone > BLOCKED * norm(goes))) return false;
+  s[BLADE_ELEM] = elem;
+  store(s + BLADE_AT, now);
+  if (s[BLADE_STAGE] == PIERCING) return true;
+  store(s + BLADE_TOWARD, unit_of(now - was));
+  s[BLADE_WORK] += f.law.data[LAW_LENGTH * i + LAW_FORCE] * norm(way);
+  s[BLADE_OPENED] += gone;
+  note_path(s, SPACING * f.edge);
+  return true;
+}
+
+// Brings the spring of a blade that sits to what the tissue bears; ends the cut where the blade is out
+// of the tissue, or cuts another way.
+template <class Fields>
+PALPATE void give_way(const Fields& f, int i, const Line& line) {
+  double* s = f.next.data + BLADE_LENGTH * i;
+  const double* law = f.law.data + LAW_LENGTH * i;
+  Seated at = seated(f, s);
+  const double place = dot(at.at - line.from, line.along);
+  const double slack = law[LAW_FORCE] / law[LAW_STIFFNESS];
+  const double before = s[BLADE_STAGE] == PIERCING ? slack : 0.0;
+  bool out = place < -before || place > line.length + before || line.length == 0.0;
+  if (!out) {
+    const D3 pull = line.from + place * line.along - at.at;
+    const Stretch now = stretch_of(pull, line.along, at, load(s + BLADE_TOWARD));
+    const double size = norm(now.flat);
+    out = now.far > LEAP * f.edge;  // it has been drawn back
+    if (!out && size > slack) {
+      const D3 unit = (1.0 / size) * now.flat;
+      const double tilt = dot(unit, line.along), level = 1.0 - tilt * tilt;
+      const double far = (size - slack) / (level > LEVEL ? level : LEVEL), most = LEAP * f.edge;
+      out = now.behind || !advance(f, i, (far < most ? far : most) * unit, at);
+    }
+  }
+  if (out) {
+    s[BLADE_STAGE] = AWAY;
+  } else if (s[BLADE_STAGE] == PIERCING) {
+    const double beyond = place < line.length - place ? place : line.length - place;
+    const double depth = beyond - law[LAW_PIERCE] / law[LAW_STIFFNESS];
+    if (depth > s[BLADE_DEPTH]) {
+      const double goes = depth < law[LAW_WALL] ? depth : law[LAW_WALL];
+      s[BLADE_WORK] += law[LAW_PIERCE] * (goes - s[BLADE_DEPTH]);
+      s[BLADE_DEPTH] = goes;
+    }
+    if (s[BLADE_DEPTH] >= law[LAW_WALL]) {
+      s[BLADE_STAGE] = THROUGH;
+      note_path(s, 0.0);
+    }
+  }
+}
+
+// What is left of a spring's matrix across some directions.
+PALPATE Sym without(const Sym& m, double k, D3 a) {
+  return {m.xx - k * a.x * a.x, m.xy - k * a.x * a.y, m.xz - k * a.x * a.z,
+          m.yy - k * a.y * a.y, m.yz - k * a.y * a.z, m.zz - k * a.z * a.z};
+}
+
+// The force of a blade on its seat at the end of the step, and what of its spring weighs on the change
+// of the seat's velocity. Where it would be more than the tissue bears it is that, and does not weigh
+// along itself.
+template <class Fields>
+PALPATE void bear(const Fields& f, int i, const Line& line) {
+  const double* s = f.next.data + BLADE_LENGTH * i;
+  const double* law = f.law.data + LAW_LENGTH * i;
+  const double h = f.mj.timestep.data[0], damping = f.number.data[DAMPING];
+  const double reach = f.ahead * h + damping, k = law[LAW_STIFFNESS], weight = k * f.gain * h * (h + damping);
+  const Seated at = seated(f, s);
+  Line later = line_of(f, i, reach);
+  if (later.length == 0.0) later = line;
+  // Whether the seat will give way is told by the blade alone: where it does, tissue is at rest.
+  const D3 off = at.at - later.from, lag = reach * at.vel;
+  const double place = dot(off, later.along);
+  const Stretch then = stretch_of(place * later.along - off, later.along, at, load(s + BLADE_TOWARD));
+  D3 force = k * (then.pull - across(lag, later.along));
+  Sym hold = without({weight, 0.0, 0.0, weight, 0.0, weight}, weight, later.along);
+  if (then.behind) {
+    hold = without(hold, weight, then.back);
+    force = across(force, then.back);
+  }
+  const double size = k * norm(then.flat);
+  if (size > law[LAW_FORCE]) {
+    const double share = law[LAW_FORCE] / size;
+    hold = share * without(hold, weight, unit_of(then.pull));
+    force = (share * k) * then.pull;
+  }
+  if (s[BLADE_STAGE] == PIERCING) {
+    const bool low = place < later.length - place;
+    const D3 tip = (low ? -1.0 : 1.0) * later.along;
+    const double press = k * ((low ? place : later.length - place) - s[BLADE_DEPTH]);
+    if (press > 0.0 && press < law[LAW_PIERCE]) {
+      force += (press - k * dot(lag, tip)) * tip;
+      hold = without(hold, -weight, tip);
+    } else if (press > 0.0) {
+      force += law[LAW_PIERCE] * tip;
+    }
+  }
+  store(f.force.data + 3 * i, force);
+  store(f.point.data + 3 * i, at.at + then.pull);
+  const double entries[6] = {hold.xx, hold.xy, hold.xz, hold.yy, hold.yz, hold.zz};
+  for (int c = 0; c < 6; ++c) f.hold.data[6 * i + c] = entries[c];
+  const double share[3] = {at.weight.x, at.weight.y, at.weight.z};
+  for (int c = 0; c < 3; ++c) {
+    const int v = f.elem.data[3 * (int)s[BLADE_ELEM] + c];
+    f.share.data[3 * i + c] = share[c];
+    push_node(f.solve, f.solve.node.data[v], share[c] * force, share[c] * hold);
+  }
+}
+
+// Adds the blades' forces to the solver's input, and finds what state they will be in.
+template <class Fields>
+PALPATE void enter_blades(const Fields& f, Thread, int) {
+  const D3 zero = {0.0, 0.0, 0.0};
+  if (f.own.windowed) f.solve.tail.data[TAIL_QUIET] = 0.0;
+  for (int i = 0; i < f.nblade; ++i) {
+    double* s = f.next.data + BLADE_LENGTH * i;
+    for (int c = 0; c < BLADE_LENGTH; ++c) s[c] = f.state.data[BLADE_LENGTH * i + c];
+    store(f.force.data + 3 * i, zero);
+    f.due.data[i] = NOTHING;
+    if (f.law.data[LAW_LENGTH * i + LAW_STIFFNESS] == 0.0) continue;  // it cuts by its current
+    const Line line = line_of(f, i, 0.0);
+    if (s[BLADE_STAGE] == AWAY && line.length > 0.0) sit_down(f, i, line);
+    if (s[BLADE_STAGE] == AWAY) continue;
+    give_way(f, i, line);
+    if (s[BLADE_COUNT] > 0.0) {
+      const double far = norm(load(s + BLADE_AT) - load(s + BLADE_TRAIL));
+      const double wait = s[BLADE_WAIT] > 0.0 ? s[BLADE_WAIT] : BATCH * f.edge;
+      if (far > wait || s[BLADE_COUNT] == TRAIL) f.due.data[i] = LONG;
+      if (s[BLADE_STAGE] == AWAY) f.due.data[i] = ENDED;
+    }
+    if (s[BLADE_STAGE] != AWAY) bear(f, i, line);
+  }
+}
+
+// Ends the forces with what the step made of the seats' velocities, and lets the blades feel them.
+template <class Fields>
+PALPATE void act_blades(const Fields& f, Thread, int) {
+  const bool ok = f.solve.status.data[3] == 0.0f;
+  const D3 zero = {0.0, 0.0, 0.0};
+  for (int i = 0; i < f.nblade; ++i) {
+    const double* s = f.next.data + BLADE_LENGTH * i;
+    if (s[BLADE_STAGE] == AWAY || f.law.data[LAW_LENGTH * i + LAW_STIFFNESS] == 0.0) continue;
+    D3 dv = zero;
+    for (int c = 0; c < 3; ++c) {
+      const int v = f.elem.data[3 * (int)s[BLADE_ELEM] + c];
+      dv += f.share.data[3 * i + c] * load_lane(f.solve.dvel.data + offset_of(f.solve.node.data[v]));
+    }
+    const double* p = f.hold.data + 6 * i;
+    const Sym hold = {p[0], p[1], p[2], p[3], p[4], p[5]};
+    const D3 pull = (1.0 / f.mj.timestep.data[0]) * (hold * dv);
+    const D3 force = ok ? load(f.force.data + 3 * i) - pull : zero;
+    store(f.force.data + 3 * i, force);
+    const D3 point = load(f.own.origin.data) + turned(f.own.frame.data, load(f.point.data + 3 * i));
+    push_blade(f, i, point, zero - turned(f.own.frame.data, force));
+  }
+}
+
+// Keeps the blades' state.
+template <class Fields>
+PALPATE void keep_blades(const Fields& f, Thread, int) {
+  for (int i = 0; i < BLADE_LENGTH * f.nblade; ++i) f.state.data[i] = f.next.data[i];
+}
+
+}  // namespace palpate

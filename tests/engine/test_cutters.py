@@ -1,0 +1,243 @@
+"""What cuts in a scene: blades and scissors, the force that they need, and what is refused."""
+
+import mujoco
+import numpy as np
+import palpate
+import pytest
+import scenes
+from palpate.models import trocar
+
+STATE = mujoco.mjtState.mjSTATE_INTEGRATION
+BOTH = pytest.mark.parametrize("windows", [False, True], ids=["nodal", "windows"])
+ENERGY, THICKNESS, WIDTH = 160.0, 2e-3, 1e-3  # [J/m^2], of the wall, of the blade [m]
+FORCE = ENERGY * THICKNESS  # [N]
+HINGE, SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
+CAPSULE, SPHERE = mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_SPHERE
+
+
+def drive(spec, joint, gain):
+  spec.add_actuator(
+    name=joint,
+    target=joint,
+    trntype=mujoco.mjtTrn.mjTRN_JOINT,
+    biastype=mujoco.mjtBias.mjBIAS_AFFINE,
+    gainprm=[gain] + 9 * [0],
+    biasprm=[0, -gain, 0] + 7 * [0],
+  )
+
+
+def strip():
+  """Returns a strip along x whose long sides are to be pinned."""
+  points, elem = scenes.triangular(0.05, 0.026, 18, 11, 0.2)
+  return points, elem, np.flatnonzero(np.abs(np.abs(points[:, 1]) - 0.013) < 1e-9)
+
+
+def scalpel(spec, x, z):
+  """Adds an upright blade that slides along x and z, 2000 N/m each."""
+  body = spec.worldbody.add_body(name="scalpel", pos=[x, 0, z])
+  for name, axis in (("x", [1, 0, 0]), ("z", [0, 0, 1])):
+    body.add_joint(type=SLIDE, axis=axis, name=name, damping=4)
+    drive(spec, name, 2000)
+  free = {"contype": 0, "conaffinity": 0}
+  body.add_geom(type=SPHERE, size=[0.004, 0, 0], pos=[0, 0, 0.02], mass=0.1, **free)
+  body.add_geom(name="edge", type=CAPSULE, size=[WIDTH / 2, 0.006, 0], mass=1e-3, **free)
+
+
+def scene(windows=False, x=-0.004, z=0.0, add=scalpel, **keys):
+  spec = mujoco.MjSpec()
+  spec.option.timestep, spec.option.gravity = 2e-3, (0, 0, 0)
+  add(spec, x, z)
+  points, elem, pin = strip()
+  given = {"mass": 0.005, "young": 2e5, "thickness": THICKNESS, "spare": 60, "pin": pin}
+  given |= {"cutters": f"edge {ENERGY}", "device": "cpu"}
+  palpate.add_organ(spec, (points, elem), "organ", windows=windows, **given | keys)
+  model = spec.compile()
+  data = mujoco.MjData(model)
+  return model, data, palpate.Organ(model, data, "organ")
+
+
+def follow(model, data, organ, way, seconds):
+  """Moves the blade; returns its force on the tissue in each step [N]  (n, 3)."""
+  out = []
+  for _ in range(round(seconds / model.opt.timestep)):
+    data.ctrl[:] = way(data.time)
+    mujoco.mj_step(model, data)
+    out.append(organ.cutters[0].force)
+  assert organ.error is None
+  return np.array(out)
+
+
+@BOTH
+def test_a_blade_needs_the_toughness_times_the_thickness(windows):
+  model, data, organ = scene(windows)
+  speed = 0.04
+  force = follow(model, data, organ, lambda t: (speed * t, 0), 0.06 / speed)
+  (cutter,), reports = organ.cutters, organ.cuts
+  steady = force[len(force) // 3 : 2 * len(force) // 3]
+  assert steady[:, 0].mean() == pytest.approx(FORCE, rel=0.02)
+  # Energy is of the area as it was stretched; a hundredth of the strip is between two steps.
+  assert cutter.energy == pytest.approx(FORCE * 0.05, rel=0.04)
+  assert cutter.length == pytest.approx(0.05, rel=0.02)
+  assert len(organ.pieces) == 2 and not cutter.inside
+  line = np.concatenate([line for report in reports for line in report.path])
+  assert np.abs(line[:, 1]).max() < 1e-3  # of edges of 2.8 mm
+  assert sum(report.length for report in reports) == pytest.approx(0.05, rel=0.05)
+
+
+def test_the_blade_feels_what_the_tissue_feels():
+  model, data, organ = scene()
+  follow(model, data, organ, lambda t: (0.04 * t, 0), 0.5)
+  joint = data.qvel[model.joint("x").dofadr[0]]
+  felt = data.actuator("x").force[0] - 4 * joint  # less the joint's damping
+  assert felt == pytest.approx(organ.cutters[0].force[0], rel=0.1)
+
+
+def test_what_is_pushed_too_little_does_not_cut():
+  model, data, organ = scene(x=-0.0003)
+  model.actuator("x").biasprm[:] = 0
+  model.actuator("x").gainprm[0] = 1.0  # the control is a force [N]
+  force = follow(model, data, organ, lambda t: (0.8 * FORCE * min(t, 1), 0), 1.4)
+  assert organ.cutters[0].inside and not organ.cuts and organ.cutters[0].energy == 0
+  assert force[-100:, 0].mean() == pytest.approx(0.8 * FORCE, rel=0.02)
+  follow(model, data, organ, lambda t: (1.3 * FORCE, 0), 0.5)
+  assert organ.cutters[0].length > 0.005
+
+
+def test_a_blade_from_above_pierces_the_wall_first():
+  model, data, organ = scene(x=0.025, z=0.0062)
+  model.actuator("z").biasprm[:] = 0
+  model.actuator("z").gainprm[0] = 1.0
+  pierce = ENERGY * WIDTH
+  force = follow(model, data, organ, lambda t: (0, -0.7 * pierce * min(2 * t, 1)), 0.7)
+  assert force[-1, 2] == pytest.approx(-0.7 * pierce, rel=0.05)
+  assert organ.cutters[0].energy == 0
+  follow(model, data, organ, lambda t: (0, -1.5 * pierce if t < 0.85 else 0.0), 0.4)
+  assert organ.cutters[0].energy == pytest.approx(pierce * THICKNESS, rel=1e-6)
+  assert not organ.cuts  # it has gone through, but nowhere along
+
+
+def test_a_state_in_the_middle_of_a_cut_goes_on_to_the_bit():
+  model, data, organ = scene()
+  follow(model, data, organ, lambda t: (0.04 * t, 0), 0.5)
+  state = np.zeros(mujoco.mj_stateSize(model, STATE))
+  mujoco.mj_getState(model, data, state, STATE)
+  ends = []
+  for _ in range(2):
+    mujoco.mj_setState(model, data, state, STATE)
+    follow(model, data, organ, lambda t: (0.04 * t, 0), 0.2)
+    ends.append((organ.xpos, organ.cutters[0].energy))
+  np.testing.assert_array_equal(ends[0][0], ends[1][0])
+  assert ends[0][1] == ends[1][1] > 0
+  mujoco.mj_resetData(model, data)
+  assert not organ.cutters[0].inside and organ.cutters[0].energy == 0
+
+
+def test_scissors_cut_as_far_as_they_close():
+  def add(spec, x, z):
+    turn = (np.sqrt(0.5), 0, -np.sqrt(0.5), 0)
+    trocar.attach(spec, "scissors", "s/", pos=(x - 0.12, 0, z), quat=turn)
+
+  none = {"contype": 0, "conaffinity": 0}
+  cutters = f"s/edge_left s/edge_right {ENERGY}"
+  model, data, organ = scene(x=0.025, add=add, cutters=cutters, contact=none)
+  jaw = data.actuator("s/jaw")
+
+  def close(opening, seconds):
+    for _ in range(round(seconds / model.opt.timestep)):
+      jaw.ctrl[0] += np.clip(opening - jaw.ctrl[0], -0.004, 0.004)
+      mujoco.mj_step(model, data)
+
+  data.joint("s/jaw_left").qpos[0] = data.joint("s/jaw_right").qpos[0] = 0.4
+  jaw.ctrl[0] = 0.8
+  close(0.8, 0.1)
+  assert not organ.cutters[0].inside  # they are open
+  close(0.1, 0.9)
+  (cutter,) = organ.cutters
+  assert cutter.inside and 0.002 < cutter.length < 0.017
+  np.testing.assert_allclose(cutter.force, [FORCE, 0, 0], atol=0.03 * FORCE)  # away from the hand
+  # The edges run from 1.1 mm off the middle, 3 mm from the pivot, to 0.2 mm at 21.8 mm: they cross
+  # at 1.244 mm / (angle + 0.0479), and what the jaws feel is the force on that way.
+  angle = data.joint("s/jaw_left").qpos[0] + 0.0479
+  felt = -data.actuator("s/jaw").force[0]
+  assert felt == pytest.approx(FORCE * 0.5 * 1.244e-3 / angle**2, rel=0.05)
+  close(-0.1, 0.3)
+  assert organ.cutters[0].energy == pytest.approx(FORCE * organ.cutters[0].length, rel=0.1)
+  line = np.concatenate([line for report in organ.cuts for line in report.path])
+  assert line[:, 0].max() == pytest.approx(0.0235, abs=2e-3)  # nearly to the tips, at 0.025
+  before = organ.cutters[0].energy
+  close(0.8, 0.4)
+  assert organ.cutters[0].energy == before  # nothing as they open
+
+
+def current(spec, x, z):
+  """Adds a ball on slides with a power."""
+  scalpel(spec, x, z)
+  spec.geom("edge").size = [0.001, 0.001, 0]
+  spec.add_actuator(name="power", target="x", trntype=mujoco.mjtTrn.mjTRN_JOINT)
+  spec.actuator("power").gainprm = 10 * [0]
+
+
+def test_a_current_cuts_as_fast_as_its_power_allows():
+  burn = 1.1e6  # [J/m^2]
+  power = 0.01 * burn * THICKNESS  # [W], for 10 mm/s
+  given = {"add": current, "x": 0.01, "cutters": f"edge {burn} by power"}
+  for share, length in ((1.0, 0.01), (0.0, 0.0), (-1.0, 0.0)):
+    model, data, organ = scene(**given)
+    follow(model, data, organ, lambda t, p=share * power: (0.009 * t, 0, p), 1.2)
+    assert organ.cutters[0].length == pytest.approx(length, abs=1.2e-3)
+    assert bool(organ.cuts) == (length > 0)
+
+
+def test_a_current_frees_bonds():
+  model, data, organ = scene(
+    add=current, x=0.025, spare=0, bonds="none", cutters="edge 1e6 by power"
+  )
+  mujoco.mj_forward(model, data)
+  vertices = np.flatnonzero(organ.free)
+  organ.bond("world", 1e7, 6e3, 6.0, vertices=vertices)
+  near = np.linalg.norm(organ.bonds.positions - [0.025, 0, 0], axis=1) < 0.002
+  assert near.any()
+  follow(model, data, organ, lambda t: (0, 0, -80.0), 0.4)
+  assert organ.bonds.free[near].all() and not organ.bonds.free[~near].any()
+
+
+def test_where_no_vertex_is_left_a_blade_goes_on_without_cutting():
+  model, data, organ = scene(spare=3)
+  for _ in range(700):
+    data.ctrl[0] = 0.04 * data.time
+    mujoco.mj_step(model, data)
+  assert "no spare vertices are left" in organ.error
+  assert np.isfinite(organ.xpos).all() and len(organ.pieces) == 1
+
+
+@pytest.mark.parametrize(
+  ("keys", "match"),
+  [
+    ({"cutters": "knife 160"}, "cutters names 'knife', which is no geom"),
+    ({"cutters": "edge"}, "cutters is 'edge', expected a geom"),
+    ({"cutters": "edge -1"}, "expected a geom, or two of scissors, and an energy > 0"),
+    ({"cutters": "edge 160 by current"}, "cutters names 'current', which is no actuator"),
+    ({"spare": 0}, "cutters is set, allowed only with spare"),
+    ({"integrator": "neumann"}, "allowed only without cutters"),
+  ],
+)
+def test_what_cannot_cut_is_named(keys, match):
+  with pytest.raises(ValueError, match=match):
+    scene(**keys)
+
+
+@pytest.mark.parametrize(
+  ("geom", "match"),
+  [
+    ({"contype": 1}, "which collides with it, expected"),
+    ({"type": SPHERE}, "expected a capsule, cylinder or box"),
+  ],
+)
+def test_a_geom_that_cannot_be_an_edge_is_named(geom, match):
+  def add(spec, x, z):
+    scalpel(spec, x, z)
+    for name, value in geom.items():
+      setattr(spec.geom("edge"), name, value)
+
+  with pytest.raises(ValueError, match=match):
+    scene(add=add)
