@@ -99,13 +99,15 @@ class School:
     progress.clear()
     if interrupt.seen:
       return False
-    self.lessons += [lesson for lesson in given if lesson is not None]
+    whole = [lesson for lesson in given if lesson is not None]
+    # What an expert could not bring to a good end may have been past helping.
+    self.lessons += [lesson for lesson in whole if lesson.outcome == "success"] or whole
     if not any(len(lesson.done) for lesson in self.lessons):
       raise CommandError(f"{self.task}: no lesson was given: the workers died", code=1)
     error = networks.learn(self.lessons, lambda: interrupt.seen)
     self.rounds += 1
     self.seconds += time.perf_counter() - start
-    wins = sum(lesson is not None and lesson.outcome == "success" for lesson in given)
+    wins = sum(lesson.outcome == "success" for lesson in whole)
     steps = sum(len(lesson.done) for lesson in self.lessons)
     print(
       f"lessons, round {self.rounds}: {wins} of {count} were a success; {steps} steps to learn "
