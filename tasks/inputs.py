@@ -11,6 +11,15 @@ import numpy as np
 from . import metrics as m
 from .metrics import METRICS, Metrics, Spec, Unknown, UnknownError
 
+# What some tasks measure: of a sample, a number each.
+OF_TASKS = {
+  "freed": "share of what is bonded that came free as it should",
+  "traction": "pull on what it is bonded to [N]",
+  "deviation": "mean distance of a cut from its line so far [m]",
+  "farthest": "the largest so far [m]",
+  "excess": "area between the two so far [m^2]",
+  "jagged": "length of the cut so far that is more than 2 mm off [m]",
+}
 # What is recorded of each instrument, and the width of an entry; force is a vector or a magnitude.
 COLUMNS: dict[str, tuple[int, ...]] = {
   "tip_pos": (3,),
@@ -24,12 +33,7 @@ COLUMNS: dict[str, tuple[int, ...]] = {
   "grip": (),
   "held": (),
   "visible": (),
-  "freed": (),
-  "traction": (),
-  "deviation": (),
-  "farthest": (),
-  "excess": (),
-  "jagged": (),
+  **dict.fromkeys(OF_TASKS, ()),
 }
 # Those that are measured faster: with substeps, magnitudes, one for each since the last sample.
 SIGNALS = ("force", "grip_force", "shaft_force")

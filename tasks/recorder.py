@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .inputs import SIGNALS
+from .inputs import OF_TASKS, SIGNALS
 from .metrics import Metrics
 from .recording import (
   Event,
@@ -125,13 +125,8 @@ class Recorder:
     grip: ArrayLike | None = None,
     held: ArrayLike | None = None,
     visible: ArrayLike | None = None,
-    freed: ArrayLike | None = None,
-    traction: ArrayLike | None = None,
-    deviation: ArrayLike | None = None,
-    farthest: ArrayLike | None = None,
-    excess: ArrayLike | None = None,
-    jagged: ArrayLike | None = None,
     arrays: Mapping[str, ArrayLike] | None = None,
+    **more: ArrayLike | None,
   ) -> None:
     """Adds one sample; with several instruments each argument has a row (or a number) for each.
 
@@ -152,22 +147,18 @@ class Recorder:
       grip: above 0.5 where the jaw is told to close  ()
       held: above 0.5 where the jaw holds tissue  ()
       visible: 1 where the camera's view holds the tip, else 0  ()
-      freed: share of what is bonded that came free as it should  ()
-      traction: pull on what it is bonded to [N]  ()
-      deviation: mean distance of a cut from its line so far [m]  ()
-      farthest: the largest so far [m]  ()
-      excess: area between the two so far [m^2]  ()
-      jagged: length of the cut so far that is more than 2 mm off [m]  ()
       arrays: the caller's own, of any shape and number type, the same in every sample; arrays that
         are not floating point may not miss a sample
+      **more: of `OF_TASKS`, each  ()
     """
     time = float(time)
     if not (math.isfinite(time) and time > self._last):
       raise ValueError(f"sample {self._count}: time is {time}, expected above {self._last}")
     given = {"tip_pos": tip_pos, "quat": quat, "axis": axis, "force": force}
     given |= {"grip_force": grip_force, "shaft_force": shaft_force, "area": area, "strain": strain}
-    given |= {"grip": grip, "held": held, "visible": visible, "freed": freed, "traction": traction}
-    given |= {"deviation": deviation, "farthest": farthest, "excess": excess, "jagged": jagged}
+    given |= {"grip": grip, "held": held, "visible": visible} | more
+    if not more.keys() <= OF_TASKS.keys():
+      raise TypeError(f"append has no {min(more.keys() - OF_TASKS.keys())!r}")
     columns = {k: self._entry(k, v) for k, v in given.items() if v is not None}
     own = {name: self._own(name, value) for name, value in arrays.items()} if arrays else {}
     self._store(time, columns, own)
