@@ -34,15 +34,17 @@ def box(size, spacing: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def specimen(
-  size, radius: float, edge: float, spacing: float | None = None
+  size, radius: float, edge: float, spacing: float | None = None, both: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
-  """Returns a box with finer triangles around the middle of its top.
+  """Returns a box with finer triangles around the middle of its top, or of top and bottom.
 
   Args:
     size: along x, y and z [m]  (3,)
     radius: of the finer region [m]
     edge: longest edge there [m]
     spacing: of the nodes elsewhere [m]; None for a sixth of the shortest side
+    both: whether the bottom has such a place too
   """
   points, elem = box(size, spacing or min(size) / _COARSE)
-  return refine(points, elem, (0.0, 0.0, size[2] / 2), radius, edge)
+  places = [(0.0, 0.0, sign * size[2] / 2) for sign in (1, -1)[: 1 + both]]
+  return refine(points, elem, places, radius, edge)

@@ -17,6 +17,7 @@ from . import trocar as ports
 Vector = Sequence[float] | np.ndarray
 Quat = tuple[float, float, float, float]
 AXES = ("x", "y", "z", "rx", "ry", "rz")
+_STILL = (0.0, 0.0, 0.0)
 
 
 class Handle:
@@ -37,22 +38,24 @@ class Handle:
         f"instrument {prefix!r} has no handle, expected one of the models that end in _handle"
       ) from None
     self.prefix = prefix
-    self._pos, self._quat = data.mocap_pos[mocap], data.mocap_quat[mocap]
+    # Views whose numbers are taken and set one by one: a third of the time of arrays so short.
+    self._pos, self._quat = data.mocap_pos[mocap].data, data.mocap_quat[mocap].data
     # They are six in a row, in every model that has them.
-    self._ctrl = data.ctrl[acts[0] : acts[0] + 6]
-    self._felt = data.sensordata[sensors[0] : sensors[0] + 6]
+    self._ctrl = data.ctrl[acts[0] : acts[0] + 6].data
+    self._felt = data.sensordata[sensors[0] : sensors[0] + 6].data
     gain, damping = model.actuator_gainprm[acts, 0], -model.actuator_biasprm[acts, 2]
     self._lead = (damping / gain).tolist()  # [s]
+    self._turned: tuple[list[float], tuple[float, ...]] = ([], ())  # an orientation and its matrix
 
   @property
   def pos(self) -> np.ndarray:
     """Where it is in the world [m]  (3,)."""
-    return self._pos.copy()
+    return np.array(self._pos)
 
   @property
   def quat(self) -> np.ndarray:
     """How it is turned, w x y z  (4,)."""
-    return self._quat.copy()
+    return np.array(self._quat)
 
   def move(
     self,
@@ -70,24 +73,24 @@ class Handle:
         to the handle, and without it on that of the tip alone  (3,)
       spin: the same for its angular velocity in the world [rad/s]  (3,)
     """
-    self._pos[:] = pos
+    place, ctrl = self._pos, self._ctrl
+    place[0], place[1], place[2] = pos
     if quat is not None:
-      self._quat[:] = quat
-    m = _rotation(*self._quat.tolist())
-    u, w = vel if vel is not None else (0, 0, 0), spin if spin is not None else (0, 0, 0)
+      turn = self._quat
+      turn[0], turn[1], turn[2], turn[3] = quat
+    m = self._matrix()
+    (x, y, z), (u, v, w) = vel if vel is not None else _STILL, spin if spin is not None else _STILL
     a, b, c, d, e, f = self._lead
-    self._ctrl[:] = (
-      a * (m[0] * u[0] + m[3] * u[1] + m[6] * u[2]),
-      b * (m[1] * u[0] + m[4] * u[1] + m[7] * u[2]),
-      c * (m[2] * u[0] + m[5] * u[1] + m[8] * u[2]),
-      d * (m[0] * w[0] + m[3] * w[1] + m[6] * w[2]),
-      e * (m[1] * w[0] + m[4] * w[1] + m[7] * w[2]),
-      f * (m[2] * w[0] + m[5] * w[1] + m[8] * w[2]),
-    )
+    ctrl[0] = a * (m[0] * x + m[3] * y + m[6] * z)
+    ctrl[1] = b * (m[1] * x + m[4] * y + m[7] * z)
+    ctrl[2] = c * (m[2] * x + m[5] * y + m[8] * z)
+    ctrl[3] = d * (m[0] * u + m[3] * v + m[6] * w)
+    ctrl[4] = e * (m[1] * u + m[4] * v + m[7] * w)
+    ctrl[5] = f * (m[2] * u + m[5] * v + m[8] * w)
 
   def wrench(self) -> tuple[float, float, float, float, float, float]:
     """Returns force [N] and torque [N m] that the hand feels, in the world  (6,)."""
-    m = _rotation(*self._quat.tolist())
+    m = self._matrix()
     x, y, z, a, b, c = self._felt.tolist()
     return (
       -m[0] * x - m[1] * y - m[2] * z,
@@ -97,6 +100,13 @@ class Handle:
       -m[3] * a - m[4] * b - m[5] * c,
       -m[6] * a - m[7] * b - m[8] * c,
     )
+
+  def _matrix(self) -> tuple[float, ...]:
+    """Returns its orientation as a matrix, row by row."""
+    quat = self._quat.tolist()
+    if quat != self._turned[0]:
+      self._turned = quat, _rotation(*quat)
+    return self._turned[1]
 
   def joints(self, trocar: ports.Trocar) -> np.ndarray:
     """Returns the pitch, yaw, roll [rad] and insertion [m] that it asks for  (4,)."""
@@ -125,10 +135,11 @@ class Shaft:
 
   def within(self, pos: Vector) -> list[float]:
     """Returns the point within the reach of the insertion that is nearest to one [m]  (3,)."""
-    out = [a - b for a, b in zip(pos, self._pos, strict=True)]
-    far = math.sqrt(out[0] * out[0] + out[1] * out[1] + out[2] * out[2])
+    p = self._pos
+    x, y, z = pos[0] - p[0], pos[1] - p[1], pos[2] - p[2]
+    far = math.sqrt(x * x + y * y + z * z)
     scale = min(max(far, self.reach[0]), self.reach[1]) / max(far, 1e-9)
-    return [b + scale * a for a, b in zip(out, self._pos, strict=True)]
+    return [p[0] + scale * x, p[1] + scale * y, p[2] + scale * z]
 
   def quat(self, pos: Vector, roll: float = 0.0) -> Quat:
     """Returns the orientation with the tip at a point [m], rolled by an angle [rad]  (4,)."""
@@ -137,8 +148,13 @@ class Shaft:
     u = a[0] * x + a[1] * y + a[2] * z
     v = b[0] * x + b[1] * y + b[2] * z
     w = c[0] * x + c[1] * y + c[2] * z
-    pitch, yaw = math.atan2(v, -w), math.atan2(u, math.sqrt(v * v + w * w))
-    turn = times(_about(0, pitch), times(_about(1, -yaw), _about(2, -roll)))
+    # Half of pitch about x, of -yaw about y, of -roll about z.
+    p, q, r = 0.5 * math.atan2(v, -w), -0.5 * math.atan2(u, math.sqrt(v * v + w * w)), -0.5 * roll
+    (cp, sp), (cq, sq), (cr, sr) = (
+      (math.cos(p), math.sin(p)), (math.cos(q), math.sin(q)), (math.cos(r), math.sin(r))
+    )  # fmt: skip
+    a, b, c, d = cq * cr, sq * sr, sq * cr, cq * sr
+    turn = (cp * a - sp * b, cp * b + sp * a, cp * c - sp * d, cp * d + sp * c)
     return times(self._quat, turn)
 
   def roll(self, pos: Vector, quat: Vector) -> float:
@@ -164,11 +180,6 @@ def times(p: Quat, q: Quat) -> Quat:
     a * y - b * z + c * w + d * x,
     a * z + b * y - c * x + d * w,
   )
-
-
-def _about(axis: int, angle: float) -> Quat:
-  s = math.sin(0.5 * angle)
-  return (math.cos(0.5 * angle), s * (axis == 0), s * (axis == 1), s * (axis == 2))
 
 
 def _rotation(w: float, x: float, y: float, z: float) -> tuple[float, ...]:

@@ -8,6 +8,7 @@ it points at, at 20 mm/s to 10 mm, and held.
 
 import argparse
 import dataclasses
+import math
 import time
 from collections.abc import Sequence
 
@@ -27,6 +28,7 @@ class Press:
   Attributes:
     force: of the probe on the organ at the end [N]
     depth: of the tip under the place it touched [m]
+    touch: of the tip over that place at the first contact, as the surface is thick [m]
     penetration: deepest overlap of probe and organ's surface at any time [m]
     contacts: most at a time
     realtime: simulated time over processor time of the steps [-]
@@ -34,6 +36,7 @@ class Press:
 
   force: float
   depth: float
+  touch: float
   penetration: float
   contacts: int
   realtime: float
@@ -51,7 +54,7 @@ def press(model: mujoco.MjModel, name: str, depth: float = DEPTH, speed: float =
   start = trocar.inverse(tool, target + AWAY * normal, check=False)
   data.joint("probe/pitch").qpos, data.joint("probe/yaw").qpos = start[:2]
   data.joint("probe/insertion").qpos = start[2]
-  penetration, contacts, elapsed = 0.0, 0, 0.0
+  penetration, contacts, elapsed, touch = 0.0, 0, 0.0, math.nan
   steps = round(((AWAY + depth) / speed + HOLD) / model.opt.timestep)
   for i in range(steps):
     at = max(AWAY - speed * i * model.opt.timestep, -depth)
@@ -59,14 +62,16 @@ def press(model: mujoco.MjModel, name: str, depth: float = DEPTH, speed: float =
     begin = time.thread_time()
     mujoco.mj_step(model, data)
     elapsed += time.thread_time() - begin
-    contacts = max(contacts, data.ncon)
     if data.ncon:
+      touch = float((data.site("probe/tip").xpos - target) @ normal) if contacts == 0 else touch
       penetration = max(penetration, -float(data.contact.dist.min()))
+      contacts = max(contacts, data.ncon)
   if organ.error:
     raise RuntimeError(organ.error)
   return Press(
     force=float(np.linalg.norm(data.sensor("probe/tip_force").data)),
     depth=float((target - data.site("probe/tip").xpos) @ normal),
+    touch=touch,
     penetration=penetration,
     contacts=contacts,
     realtime=steps * model.opt.timestep / elapsed,

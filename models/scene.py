@@ -19,6 +19,8 @@ from .organs import Build
 INSTRUMENTS = trocar.NAMES
 COUPLINGS = ("nodal", "window")
 _ROOM = 300  # vertices of a window where triangles are finer under the instruments
+# Of contacts there: those of light vertices are soft, and a tool would sink in.
+_FIRM = (0.99, 0.999, 1e-4)
 
 
 def path(name: str, scene: bool = True) -> pathlib.Path:
@@ -54,12 +56,15 @@ def load(
     interior: `solid` for tetrahedra inside, with `coupling="window"`; `none` for the surface alone,
       on a foundation and with a bulk modulus that stand for what is inside
     fine: longest edge of the triangles within 6 mm of the places that instruments point at [m], for
-      forces of small tools; None for triangles of one size
+      forces of small tools, with contacts that do not let them sink in; a skin wants it longer than
+      it is thick; None for triangles of one size
   """
   build = _build(name, nodes, seed, grid, fine)
   check_instruments(instruments)
   spec = mujoco.MjSpec.from_string(markup.scene(build, name, instruments, handle, root=None))
   spec.attach(_organ(build, name, coupling, interior), prefix=f"{name}/", frame=spec.frame(name))
+  if fine is not None:
+    spec.flex(f"{name}/{name}").solimp[: len(_FIRM)] = _FIRM
   free = None
   if coupling == "window":
     room = None if fine is None else _ROOM

@@ -115,5 +115,5 @@ class Bonds:
     return self._written("force")
 
   def _written(self, name: str) -> np.ndarray:
-    parts = [group.arrays[name].numpy() for group in self._groups]
+    parts = [group.arrays[name].numpy()[: len(group.vert)] for group in self._groups]
     return np.concatenate([np.zeros((0, 3)), *parts])

@@ -313,12 +313,13 @@ class Task(control.Task):
         f"{self.name}: action has shape {values.shape}, expected ({len(names)},): "
         + ", ".join(names)
       )
-    # In plain numbers: arrays of five take longer.
-    for k, value in enumerate(values.ravel().tolist()):
-      if not abs(value) <= 1 + SLACK:
-        raise ValueError(
-          f"{self.name}: action {names[k % len(names)]} is {value}, expected a number in [-1, 1]"
-        )
+    if not np.abs(values).max(initial=0.0) <= 1 + SLACK:
+      wrong = ~(np.abs(values.ravel()) <= 1 + SLACK)
+      k = int(wrong.argmax())
+      raise ValueError(
+        f"{self.name}: action {names[k % len(names)]} is {values.ravel()[k]}, expected a number in "
+        "[-1, 1]"
+      )
     return values.clip(-1.0, 1.0)
 
   def before_step(self, action: Any, physics: Physics) -> None:

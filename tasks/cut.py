@@ -6,8 +6,9 @@ that is cut [-]; `deviation` (1,), largest distance of the cut from the line so 
 
 Progress: 0.1 * closeness to the line, at its best, + 0.9 * share of the line that is cut. A point
 of the line is cut where the edge has gone through the wall within the tolerance of it; moving
-along without cutting counts nothing. Success: 98 % of it, and the piece is free. Failure: more than 10 mm cut farther
-from the line than the tolerance, a force above the damage limit, or the time limit.
+along without cutting counts nothing. Success: 98 % of it, and the piece is free. Failure: more than
+10 mm cut farther from the line than the tolerance, a force above the damage limit, or the time
+limit.
 
 That is the pattern cut of FLS: a circle of 4 cm, and all of the cut within 2 mm of the line (Ritter
 and Scott 2007, 10.1177/1553350607302329), with a scalpel in place of scissors and a grasper.

@@ -59,9 +59,11 @@ def run(
   task.random = np.random.RandomState(seed)
   timestep = env.reset()
   recorder = _begin(env, seed, info or {}, states)
+  physics.meanwhile = recorder.settle
   total = 0.0
 
   def finish() -> Recording:
+    physics.meanwhile = None
     recorder.info |= {"outcome": task.outcome or "time limit", "return": total}
     recorder.attach("state_last", physics.integration_state())
     return recorder.recording()

@@ -13,8 +13,8 @@ experts' successes:
                    (10.1007/s00464-018-6480-x). Each metric has its own 2 % of failures, so that
                    with thirty metrics about half of the experts' own episodes fail one
     percentile:P   the value that P % of the experts' episodes are as good as, interpolated between
-                   order statistics; a share of peers as benchmark as in von Websky et al. 2012
-                   (J Surg Educ 69:459)
+                   order statistics; a share of peers as benchmark as in von Websky et al. 2013
+                   (World J Surg 37:2534)
 """
 
 import json

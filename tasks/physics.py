@@ -2,7 +2,9 @@
 # pyright: reportAttributeAccessIssue=false
 """The physics of an exercise: one organ, one instrument on a trocar, and what one asks of them."""
 
+import functools
 import math
+from collections.abc import Callable
 
 import mujoco as mj
 import numpy as np
@@ -31,7 +33,14 @@ FOLD, GRIPPING = 0.02, 0.15
 
 
 class Physics(Portable):
-  """Physics of an exercise: one organ, one instrument on a trocar."""
+  """Physics of an exercise: one organ, one instrument on a trocar.
+
+  Attributes:
+    meanwhile: called in the middle of every `step`, with what need not be done at its end, where a
+      live exercise has least time; None for nothing
+  """
+
+  meanwhile: Callable[[], None] | None = None
 
   def use(self, model: mj.MjModel, prefix: str, targets: int, organ: str = ORGAN) -> None:
     """Takes a compiled scene; ValueError names what it lacks.
@@ -102,6 +111,8 @@ class Physics(Portable):
         if self.handle:
           self._felt[k] = self.handle.wrench()
           self._lead(k, nstep)
+        if k == nstep // 2 and self.meanwhile is not None:
+          self.meanwhile()
         begin(model, data)
       self._keep(values)
       self.moved()
@@ -255,16 +266,17 @@ class Physics(Portable):
       self._nodes.flags.writeable = False
     return self._nodes
 
-  def strain(self, rest: np.ndarray) -> float:
-    """Returns the largest strain of the organ's surface against its nodes `rest` [-].
+  def strain(self, rest: np.ndarray) -> Callable[[], float]:
+    """Returns what works out the largest strain of the organ's surface as it is now [-].
 
-    Of an organ that is cut, against its shape at rest.
+    Args:
+      rest: nodes against which, of an organ that is cut its shape at rest [m]  (nvert, 3)
     """
     now, elem = self.nodes(), self.organ.elem
     if self._stretch is None or self._stretch[0] is not rest or self._stretch[1] is not elem:
       same = len(now) == len(rest)
       self._stretch = rest, elem, Stretch(rest if same else self.organ.xpos0, elem)
-    return self._stretch[2].most(now)
+    return functools.partial(self._stretch[2].most, now)
 
   def nodes_near(self) -> np.ndarray:
     """Returns the organ's nodes nearest to the tip, from the tip [m]  (NEAR, 3)."""

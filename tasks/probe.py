@@ -35,6 +35,7 @@ KIDNEY = Scene(
 )
 _FACING = 0.75  # least cosine between the field's normal and the way to the trocar
 _PIN_GAP = 0.02  # the field keeps that far from pinned nodes [m]
+PRESSES, LEAVES = 0.1, 0.02  # force above which a press begins, and below which it ends [N]
 FEELING, FELT = 0.1, 0.008  # force [N] that feels, and what lies within that distance [m]
 REPORT = 0.05  # least force at the report [N]
 # Of the expert: how far above a place it begins, how deep it feels, how far apart places to feel
@@ -182,9 +183,9 @@ class Press(Task):
     """Counts the time in the band."""
     force = float(np.linalg.norm(physics.contact_force()))
     on_site = self.distance(physics) <= self.tolerance
-    if force > 0.1 and not self._pressing and not on_site:
+    if force > PRESSES and not self._pressing and not on_site:
       self.event(physics, "miss", self.distance(physics))
-    self._pressing = force > (0.02 if self._pressing else 0.1)
+    self._pressing = force > (LEAVES if self._pressing else PRESSES)
     inside = presses(on_site, self.level(physics), *self.band, force)
     self.held = self.held + self.control_timestep if inside else 0.0
     if self.held >= self.hold - SLACK:

@@ -4,7 +4,7 @@ import json
 import math
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -106,6 +106,7 @@ class Recorder:
     self._arrays: dict[str, _Buffer] = {}
     self._constants: dict[str, np.ndarray] = {}
     self._events: list[Event] = []
+    self._owed: Callable[[], float] | None = None  # the last sample's strain
 
   def __len__(self) -> int:
     return self._count
@@ -121,7 +122,7 @@ class Recorder:
     grip_force: ArrayLike | None = None,
     shaft_force: ArrayLike | None = None,
     area: ArrayLike | None = None,
-    strain: ArrayLike | None = None,
+    strain: ArrayLike | Callable[[], float] | None = None,
     grip: ArrayLike | None = None,
     held: ArrayLike | None = None,
     visible: ArrayLike | None = None,
@@ -143,7 +144,8 @@ class Recorder:
       grip_force: of the jaw that presses more [N]  (), or (substeps,)
       shaft_force: magnitude of the contact force on the shaft [N]  (), or (substeps,)
       area: area of the organ's touched triangles [m^2]  ()
-      strain: largest of the tissue, see `metrics.surface_strain`  ()
+      strain: largest of the tissue, see `metrics.surface_strain`  (); or, with one instrument, what
+        returns it, which is called by `settle`
       grip: above 0.5 where the jaw is told to close  ()
       held: above 0.5 where the jaw holds tissue  ()
       visible: 1 where the camera's view holds the tip, else 0  ()
@@ -154,6 +156,10 @@ class Recorder:
     time = float(time)
     if not (math.isfinite(time) and time > self._last):
       raise ValueError(f"sample {self._count}: time is {time}, expected above {self._last}")
+    self.settle()
+    owed = None
+    if callable(strain):
+      owed, strain = strain, math.nan
     given = {"tip_pos": tip_pos, "quat": quat, "axis": axis, "force": force}
     given |= {"grip_force": grip_force, "shaft_force": shaft_force, "area": area, "strain": strain}
     given |= {"grip": grip, "held": held, "visible": visible} | more
@@ -162,9 +168,16 @@ class Recorder:
     columns = {k: self._entry(k, v) for k, v in given.items() if v is not None}
     own = {name: self._own(name, value) for name, value in arrays.items()} if arrays else {}
     self._store(time, columns, own)
+    self._owed = owed
+
+  def settle(self) -> None:
+    """Works out what the last sample was given as a function; at the latest the next one does."""
+    if self._owed is not None:
+      owed, self._owed = self._owed, None
+      self._columns["strain"].put(self._count - 1, owed())
 
   def _store(
-    self, time: float, columns: dict[str, np.ndarray], own: dict[str, np.ndarray]
+    self, time: float, columns: dict[str, np.ndarray | float], own: dict[str, np.ndarray]
   ) -> None:
     """Adds a sample whose entries were checked one by one."""
     k = self._count
@@ -178,18 +191,21 @@ class Recorder:
             buffer.skip(k, k + 1)
         for name, value in entries.items():
           if name not in table:
-            table[name] = _Buffer(value.shape, value.dtype, k)
+            first = np.asarray(value)
+            table[name] = _Buffer(first.shape, first.dtype, k)
       for name, value in entries.items():
         table[name].put(k, value)
     self._time.put(k, time)
     self._count, self._last = k + 1, time
 
-  def _entry(self, name: str, value: ArrayLike) -> np.ndarray:
+  def _entry(self, name: str, value: ArrayLike) -> np.ndarray | float:
     count = len(self.instruments)
+    buffer = self._columns.get(name)
+    if type(value) is float and buffer is not None and buffer.shape == (1,):
+      return value
     array = np.asarray(value, np.float64)
     if name in SIGNALS and self.substeps > 1 and array.shape in ((), (count,)):
       array = np.repeat(array.reshape(-1, 1), self.substeps, axis=1)
-    buffer = self._columns.get(name)
     if buffer is not None and (
       array.shape == buffer.shape or (count == 1 and array.shape == buffer.shape[1:])
     ):
@@ -204,11 +220,12 @@ class Recorder:
     raise ValueError(f"sample {self._count}: {name} has shape {array.shape}, expected {wanted}")
 
   def _own(self, name: str, value: ArrayLike) -> np.ndarray:
-    array = np.asarray(value)
+    array, buffer = np.asarray(value), self._arrays.get(name)
+    if buffer and array.shape == buffer.shape and array.dtype == buffer.values.dtype:
+      return array  # fits as it is
     if not _NAME.fullmatch(name):
       raise ValueError(f"array name {name!r}, expected letters, digits, _ . -")
     check_array(f"array {name!r}", array)
-    buffer = self._arrays.get(name)
     if buffer is None:
       if self._count and array.dtype.kind != "f":
         raise ValueError(f"array {name!r} is {array.dtype} and misses the samples so far")
@@ -250,6 +267,7 @@ class Recorder:
 
   def recording(self) -> Recording:
     """Returns what was recorded so far; read-only views, cheap."""
+    self.settle()
     n = self._count
     return Recording(
       time=self._time.view(n),

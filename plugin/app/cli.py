@@ -28,7 +28,7 @@ COMMANDS = {
   ("view",): ("view", "open MuJoCo's viewer on a scene, its instruments draggable"),
   ("render",): ("render", "make a picture or a film of a scene, without a screen"),
   ("wrap",): ("wrap", "make an organ of a mesh or a segmented volume, in a model folder"),
-  ("fit",): ("fit", "find constants of tissue by a measured indentation"),
+  ("fit",): ("fit", "find constants of tissue by a measured indentation or grasp"),
   ("exercise",): ("exercise", "run an exercise, record it and write its report"),
   ("serve",): ("serve", "serve a page to train on, by mouse, keyboard, touch, gamepad or device"),
   ("report",): ("report", "write the page about a recording"),

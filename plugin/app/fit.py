@@ -1,4 +1,4 @@
-"""`palpate fit`: constants of tissue from a measured indentation."""
+"""`palpate fit`: constants of tissue from a measured indentation or grasp."""
 
 from __future__ import annotations
 
@@ -27,11 +27,12 @@ def add_arguments(parser: argparse.ArgumentParser):
   )
   add = parser.add_argument
   add("data", metavar="DATA.csv", help="time, depth and force")
-  add("--test", choices=("indentation",), default="indentation", help="(%(default)s)")
+  add("--test", choices=("indentation", "grasp"), default="indentation",
+      help="by a tool, or by two that face each other and close (%(default)s)")  # fmt: skip
   add("--tip", choices=("sphere", "flat"), default="sphere", help="of the tool (%(default)s)")
   add("--radius", metavar="M", type=float, required=True, help="of the tool")
   add("--sample-size", metavar="M", type=float, nargs=3,
-      help="of a block that is held at its bottom: width, depth, height")  # fmt: skip
+      help="of a block: width, depth, height; held at its bottom, grasped: at one end")  # fmt: skip
   add("--organ", metavar="NAME[:PLACE]", help="an organ of the catalogue instead of a block")
   add("--free", metavar="KEY", nargs="+", default=["young", "damping"],
       help="constants to find, keys of the configuration (young damping)")  # fmt: skip
@@ -102,6 +103,8 @@ def _check(args: argparse.Namespace):
       raise CommandError(f"{name} is {value:g}, expected a number in (0, 1); {_SI}")
   if (args.sample_size is None) == (args.organ is None):
     raise CommandError("expected either --sample-size or --organ: what was pressed")
+  if args.test == "grasp" and args.organ:
+    raise CommandError("--test grasp with --organ, expected --sample-size: a block is grasped")
   for value in args.sample_size or ():
     if not (math.isfinite(value) and 0 < value < 1):
       raise CommandError(f"sample-size has {value:g}, expected numbers in (0, 1); {_SI}")
@@ -128,7 +131,7 @@ def _test(args: argparse.Namespace):
     if place not in places:
       raise CommandError(f"organ {name!r}: place is {place!r}, expected one of {', '.join(places)}")
   size = tuple(args.sample_size) if args.sample_size else None
-  return Test(args.tip, args.radius, size, name, place, args.edge, args.h)
+  return Test(args.tip, args.radius, size, name, place, args.edge, args.h, args.test == "grasp")
 
 
 def _known(args: argparse.Namespace) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""The same indentation as a measured one, simulated: a tool goes the way that was measured."""
+"""The same test as a measured one, simulated: a tool, or two, go the way that was measured."""
 
 from __future__ import annotations
 
@@ -35,17 +35,19 @@ _HEAVY = 1e4  # times the organ's mass, so that contacts do not move the tool
 
 @dataclasses.dataclass(frozen=True)
 class Test:
-  """An indentation.
+  """An indentation, or a grasp: two tools opposite each other, each of which goes half the way.
 
   Attributes:
     tip: of the tool, sphere or flat
     radius: of the tool [m]
-    size: of a block, held at its bottom and pressed in the middle of its top [m]; or
+    size: of a block, held at its bottom and pressed in the middle of its top, or held at one side
+      and grasped in the middle of top and bottom [m]; or
     organ: of the catalogue, and
     place: where on it
     edge: longest edge of a triangle under the tool [m]; None for a third of the contact's radius,
       a fifth for a flat tool
     step: time step [s]; None to take some 600 for the record
+    grasp: whether it is one, of a block
   """
 
   tip: str
@@ -55,6 +57,12 @@ class Test:
   place: str = ""
   edge: float | None = None
   step: float | None = None
+  grasp: bool = False
+
+  @property
+  def share(self) -> float:
+    """What each tool goes of the way that was measured."""
+    return 0.5 if self.grasp else 1.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,15 +72,14 @@ class Sample:
   Attributes:
     mesh: vertices [m] and triangles
     pin: vertices that are held
-    at, away: where the tool touches first [m], and from where it comes
+    touch: where each tool touches first [m], and from where it comes
     mass: [kg]
     keys: the plugin's configuration
   """
 
   mesh: tuple[np.ndarray, np.ndarray]
   pin: np.ndarray
-  at: np.ndarray
-  away: np.ndarray
+  touch: list[tuple[np.ndarray, np.ndarray]]
   mass: float
   keys: dict
 
@@ -88,7 +95,7 @@ class Indentation:
   def __init__(self, test: Test, record: Record):
     self._test, self._record = test, record
     self.step = test.step or float(np.clip(record.time[-1] / _STEPS, _LEAST, _MOST[test.tip]))
-    deepest = float(record.depth.max())
+    deepest = test.share * float(record.depth.max())
     contact = _contact_radius(test, deepest)
     edge, around = test.edge or contact / _EDGES[test.tip], _AROUND * contact
     for _ in range(_TRIES):
@@ -101,6 +108,10 @@ class Indentation:
         return
       edge *= _SMALLER
     raise CommandError(f"{fault}; another --edge may do", code=1)
+
+  @property
+  def _tools(self) -> list[str]:
+    return [f"tool{k}" for k in range(len(self.sample.touch))]
 
   @property
   def nodes(self) -> int:
@@ -121,17 +132,17 @@ class Indentation:
       organ = Organ(model, data, "tissue")
     except (ValueError, mujoco.FatalError) as error:
       raise CommandError(str(error).strip().splitlines()[-1]) from None
-    joint, record, h = model.joint("tool"), self._record, self.step
-    qpos, dof = int(joint.qposadr[0]), int(joint.dofadr[0])
+    joints, record, h = [model.joint(name) for name in self._tools], self._record, self.step
+    qpos, dof = ([int(getattr(joint, adr)[0]) for joint in joints] for adr in ("qposadr", "dofadr"))
     time = h * np.arange(math.ceil(record.time[-1] / h) + 2)
-    depth = np.interp(time, record.time, record.depth)
+    depth = self._test.share * np.interp(time, record.time, record.depth)
     force, sunk = np.zeros(len(time) - 1), 0.0
     for k in range(len(force)):
-      data.qpos[qpos] = depth[k] + sunk  # contacts are soft: it sinks into them
+      data.qpos[qpos] = depth[k] + sunk
       data.qvel[dof] = (depth[k + 1] - depth[k]) / h
       mujoco.mj_step(model, data)
-      force[k] = -data.qfrc_constraint[dof]
-      sunk += _FOLLOW * (max(0.0, -float(data.contact.dist.min(initial=0.0))) - sunk)
+      force[k] = -data.qfrc_constraint[dof].mean()
+      sunk += _FOLLOW * (_sunk(data) - sunk)
     if organ.error or not np.isfinite(force).all():
       raise CommandError(f"the simulation broke off: {organ.error or 'a force is nan'}", code=1)
     if not force[depth[1:].argmax()] > 0:
@@ -146,17 +157,28 @@ class Indentation:
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.memory = 500 << 20
     soft = _SOFT * test.radius
-    at = sample.at + soft * sample.away
-    tool = spec.worldbody.add_body(name="tool", pos=at, quat=_facing(sample.away))
-    tool.add_joint(name="tool", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 0, -1])
-    _add_tip(tool, test, soft, _HEAVY * sample.mass)
+    for name, (at, away) in zip(self._tools, sample.touch, strict=True):
+      tool = spec.worldbody.add_body(name=name, pos=at + soft * away, quat=_facing(away))
+      tool.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 0, -1])
+      _add_tip(tool, test, soft, _HEAVY * sample.mass)
     keys: dict[str, Any] = {**sample.keys, **constants}
     add_organ(
       spec, sample.mesh, "tissue", mass=sample.mass, pin=sample.pin.tolist(), radius=soft,
       contact={"condim": 1, "solref": (3 * self.step, 1), "solimp": (0.99, 0.999, 1e-4)},
-      windows={"nodes": min(_WINDOW, self.nodes)}, device="cpu", **keys,
+      windows={"nodes": min(len(sample.touch) * _WINDOW, self.nodes)}, device="cpu", **keys,
     )  # fmt: skip
     return spec
+
+
+def _sunk(data: mujoco.MjData) -> float:
+  """Returns how far the tool has sunk into the contacts, which are soft [m].
+
+  The mean over their forces: by reciprocity that is what a little compliance on a surface adds to
+  the way of a tool whose force is given.
+  """
+  row = np.maximum(data.contact.efc_address, 0)
+  force = np.where(data.contact.efc_address < 0, 0.0, data.efc_force[row] if data.nefc else 0.0)
+  return -float(force @ data.contact.dist) / max(float(force.sum()), 1e-12)
 
 
 def _fault(sample: Sample) -> str:
@@ -177,7 +199,7 @@ def first_guess(test: Test, record: Record, poisson: float) -> float:
   eq. 4.23 and 3.36), with E* = E / (1 - nu^2).
   """
   k = int(record.depth.argmax())
-  depth, force = float(record.depth[k]), float(record.force[k])
+  depth, force = test.share * float(record.depth[k]), float(record.force[k])
   if test.tip == "sphere":
     reduced = 0.75 * force / math.sqrt(test.radius * depth**3)
   else:
@@ -209,19 +231,24 @@ def _facing(away: np.ndarray) -> np.ndarray:
 
 
 def _block(test: Test, edge: float, around: float, deepest: float) -> Sample:
-  """Returns a block that stands on a table."""
+  """Returns a block that stands on a table, or that is held at one side."""
   assert test.size is not None
-  if deepest > _SUNK * test.size[2]:
+  if deepest > _SUNK * test.share * test.size[2]:
     raise CommandError(
-      f"depth is up to {deepest:g} m, expected at most {_SUNK:g} of sample-size's height, "
-      f"{test.size[2]:g} m"
+      f"depth is up to {deepest / test.share:g} m, expected at most {_SUNK:g} of sample-size's "
+      f"height, {test.size[2]:g} m"
     )
   spacing = min(max(min(test.size) / 6, 1.5 * edge), min(test.size) / 2)
-  points, elem = block.specimen(test.size, around, min(edge, spacing), spacing)
-  pin = np.flatnonzero(points[:, 2] < -test.size[2] / 2 + 1e-9)
-  at, away = np.array([0, 0, test.size[2] / 2]), np.array([0.0, 0, 1])
+  points, elem = block.specimen(test.size, around, min(edge, spacing), spacing, test.grasp)
+  half = np.array(test.size) / 2
+  if test.grasp:
+    pin = np.flatnonzero((np.abs(points[:, :2]) > half[:2] - 1e-9).any(axis=1))
+  else:
+    pin = np.flatnonzero(points[:, 2] < -half[2] + 1e-9)
+  up = np.array([0.0, 0.0, 1.0])
+  touch = [(sign * half[2] * up, sign * up) for sign in (1, -1)[: 1 + test.grasp]]
   mass = catalog.TISSUES["liver"].mass_of(math.prod(test.size))
-  return Sample((points, elem), pin, at, away, mass, {"elements": "solid"})
+  return Sample((points, elem), pin, touch, mass, {"elements": "solid"})
 
 
 def _of_catalogue(test: Test, edge: float, around: float) -> Sample:
@@ -238,4 +265,4 @@ def _of_catalogue(test: Test, edge: float, around: float) -> Sample:
   at = at + float(((points - at) @ away)[np.linalg.norm(points - at, axis=1) < around].max()) * away
   solid = not built.entry.hollow
   keys = built.entry.tissue.keys(solid) | ({"elements": "solid"} if solid else {})
-  return Sample((points, elem), pin, at, away, built.mass, keys)
+  return Sample((points, elem), pin, [(at, away)], built.mass, keys)

@@ -116,7 +116,7 @@ def _learner(name: str, args: argparse.Namespace, kwargs: dict[str, Any], folder
       learner.load(path, name)
   except (ValueError, TypeError) as error:
     raise CommandError(str(error)) from None
-  return learner, env.worlds.task
+  return learner, env.task
 
 
 def _enough(args: argparse.Namespace, learner: Learner, rows: list, stop: Any) -> bool:

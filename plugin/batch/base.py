@@ -93,6 +93,19 @@ class Batch(abc.ABC):
     """Mean of the sensors over the steps of the last call of `step`, (nworld, nsensordata)."""
     return self._summary["mean"]
 
+  def watch(self, steps: int) -> wp.array:
+    """Returns where the sensors of each step will be, in calls of `step` of so many steps at most.
+
+    Returns:
+      (nworld, steps, nsensordata), which keeps its place
+    """
+    if isinstance(steps, bool) or not isinstance(steps, int | np.integer) or steps < 1:
+      raise ValueError(f"steps is {steps!r}, expected a whole number >= 1")
+    return self._watch(self._make(int(steps), self.model.nsensordata))
+
+  def _watch(self, out: wp.array) -> wp.array:
+    raise ValueError("worlds on several devices cannot be watched; their `parts` can")
+
   @property
   def failures(self) -> wp.array:
     """How often each world had numbers that are not finite, and was reset for it, (nworld,)."""
@@ -171,7 +184,7 @@ class Batch(abc.ABC):
 
     Args:
       joints: names of hinges and slides
-      values: positions [rad, m], (nworld, number of joints)
+      values: positions [rad, m], (nworld, number of joints), here or on the device
       mask: worlds, (nworld,) of bool; None for all
     """
     found = [self.model.joint(name) for name in joints]
@@ -183,7 +196,7 @@ class Batch(abc.ABC):
     adr = [(int(joint.qposadr[0]), int(joint.dofadr[0])) for joint in found]
     self._pose(np.array(adr, int).reshape(-1, 2), values, self._mask(mask))
 
-  def _pose(self, adr: np.ndarray, values: np.ndarray, mask: wp.array):
+  def _pose(self, adr: np.ndarray, values: Any, mask: wp.array):
     raise ValueError("a batch on a GPU cannot pose joints yet")
 
   def place(self, body: str, pos, quat, mask=None):
@@ -191,7 +204,7 @@ class Batch(abc.ABC):
 
     Args:
       body: name
-      pos: positions [m], (nworld, 3)
+      pos: positions [m], (nworld, 3), here or on the device
       quat: orientations, w x y z, (nworld, 4)
       mask: worlds, (nworld,) of bool; None for all
     """
@@ -202,11 +215,12 @@ class Batch(abc.ABC):
     self._fresh = False
     self._place(number, pos, quat, self._mask(mask))
 
-  def _place(self, body: int, pos: np.ndarray, quat: np.ndarray, mask: wp.array):
+  def _place(self, body: int, pos: Any, quat: Any, mask: wp.array):
     raise ValueError("a batch on a GPU cannot place bodies a world yet")
 
-  def _rows(self, values, name: str, count: int) -> np.ndarray:
-    values = np.asarray(values, float)
+  def _rows(self, values, name: str, count: int) -> Any:
+    if not (isinstance(values, wp.array) and self.device.is_cuda):
+      values = np.asarray(values, float)
     if values.shape != (self.nworld, count):
       raise ValueError(f"{name} has shape {values.shape}, expected ({self.nworld}, {count})")
     return values

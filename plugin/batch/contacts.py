@@ -49,6 +49,7 @@ class Touch:
   """How an organ's triangles touch each tool, and mujoco_warp's contacts."""
 
   most: int  # contacts of a world
+  ring: int  # threads that share the triangles about a slot's node
   flex: int  # the slots' flex
   radius: float  # of that [m]
   kind: ints("ntool")  # mjtGeom
@@ -61,7 +62,7 @@ class Touch:
   friction: Array(vec5, ("ntool",))  # all of it, the sliding one as compiled
   solref: Array(wp.vec2, ("ntool",))
   solimp: Array(vec5, ("ntool",))
-  many: ints("nworld", "nslot")  # contacts of a slot
+  many: ints("nworld", "nthread")  # contacts that a thread finds, `ring` of them for a slot
   count: ints("nworld")  # of a world
   before: ints("nworld")  # of the worlds before it
   missed: ints("nworld")  # see `Patch`
@@ -93,7 +94,7 @@ class Place:
   world: int
   first: int  # contact
   room: int  # for how many, 0 where they are counted alone
-  thread: int  # of all slots of all worlds
+  thread: int  # slot, of those of all worlds
   elem: int  # -1 for a corner alone
   vert: int  # -1 for a triangle
   tool: int  # which of the organ's
@@ -295,12 +296,13 @@ def _owner(p: Patch, world: int, e: int):
 
 @functools.cache
 def kernel(kinds: frozenset[int]) -> wp.Kernel:
-  """Returns the kernel that counts or writes contacts with tools of these kinds, by slots."""
+  """Returns the kernel that counts or writes contacts with tools of these kinds, `ring` a slot."""
   against = _against(kinds)
 
   @wp.kernel(module="unique", enable_backward=False)
   def find(p: Patch, c: Touch, v: Convex, writes: bool):
-    world, slot = wp.tid()
+    world, k = wp.tid()
+    slot = k // c.ring
     at = Place()
     at.world = world
     at.thread = world * p.nslot + slot
@@ -309,14 +311,14 @@ def kernel(kinds: frozenset[int]) -> wp.Kernel:
     n = int(0)  # noqa: RUF046, UP018
     i = p.slot_node[world, slot]
     if writes:
-      if c.many[world, slot] == 0:
+      if c.many[world, k] == 0:
         return
-      for s in range(slot):
-        first += c.many[world, s]
+      for before in range(k):
+        first += c.many[world, before]
       at.room = c.most - first
       first += c.nacon[0] + c.before[world]
     if i >= 0:
-      for q in range(p.near_adr[i], p.near_adr[i + 1]):
+      for q in range(p.near_adr[i] + k % c.ring, p.near_adr[i + 1], c.ring):
         e = p.near[q]
         va, vb, vd = p.elem[e, 0], p.elem[e, 1], p.elem[e, 2]
         a, b, d = p.node_slot[world, va], p.node_slot[world, vb], p.node_slot[world, vd]
@@ -344,12 +346,13 @@ def kernel(kinds: frozenset[int]) -> wp.Kernel:
           elif more > 0:
             wp.atomic_add(p.missed, world, 1)
       if wp.static(_PLANE in kinds):
-        at.first = first
-        at.elem = -1
-        at.vert = slot
-        n = _on_planes(p, c, at, n, _where(p, world, i))
+        if k % c.ring == 0:
+          at.first = first
+          at.elem = -1
+          at.vert = slot
+          n = _on_planes(p, c, at, n, _where(p, world, i))
     if not writes:
-      c.many[world, slot] = n
+      c.many[world, k] = n
 
   return find
 
@@ -359,8 +362,8 @@ def count(c: Touch):
   """Adds up the contacts of a world; those beyond its room are missed."""
   world = wp.tid()
   n = int(0)  # noqa: RUF046, UP018 - a variable to Warp
-  for slot in range(c.many.shape[1]):
-    n += c.many[world, slot]
+  for k in range(c.many.shape[1]):
+    n += c.many[world, k]
   c.count[world] = wp.min(n, c.most)
   c.missed[world] = c.missed[world] + n - c.count[world]
 
@@ -379,7 +382,7 @@ def most_of(model: mujoco.MjModel, tools: np.ndarray, nslot: int) -> int:
   return nslot * (4 if each > _EACH[int(_GEOM.mjGEOM_CAPSULE)] else 3 if len(tools) > _FEW else 2)
 
 
-def make(model: mujoco.MjModel, organ, tools: np.ndarray, place, missed: wp.array, data):
+def make(model: mujoco.MjModel, organ, tools: np.ndarray, place, patch, data):
   """Returns how an organ touches its tools.
 
   Args:
@@ -387,10 +390,13 @@ def make(model: mujoco.MjModel, organ, tools: np.ndarray, place, missed: wp.arra
     organ: the organ's declaration
     tools: geoms that its slots follow
     place: where the stripped model has these
-    missed: see `Patch`
+    patch: the organ's slots
     data: mujoco_warp's
   """
-  nworld, nslot, flex = len(missed), place.nslot, place.flex
+  nworld, nslot, flex = len(patch.missed), place.nslot, place.flex
+  # EPA has memory for one triangle of a slot at a time.
+  alone = convex.KINDS & set(model.geom_type[tools].tolist())
+  ring = 1 if alone else int(np.diff(patch.near_adr.numpy()).max())
   own = int(organ.windows.flex[0]) if organ.windows else organ.flex
   rows = [_mix(model, int(g), own) for g in tools]
   mixed = {name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else ())}
@@ -403,10 +409,11 @@ def make(model: mujoco.MjModel, organ, tools: np.ndarray, place, missed: wp.arra
     size=model.geom_size[tools],
     rough=np.full(nworld, model.flex_friction[own, 0]),
     slide=np.tile(mixed["slide"], (nworld, 1)) if rows else np.zeros((nworld, 0)),
-    many=np.zeros((nworld, nslot)),
+    ring=ring,
+    many=np.zeros((nworld, ring * nslot)),
     count=np.zeros(nworld),
     before=np.zeros(nworld),
-    missed=missed,
+    missed=patch.missed,
     start=np.zeros(1),
     nacon=data.nacon,
   )  # fmt: skip

@@ -119,28 +119,43 @@ def put_back(m: Move):
     m.geom_xmat[w, g] = m.xmat[w, g]
 
 
+@struct
+class Sensed:
+  """What the sensors of the steps of a call come to."""
+
+  adr: ints("nsensor + 1")  # first number of a sensor
+  data: floats("nworld", "nsensordata")
+  peak: floats("nworld", "nsensor")
+  mean: floats("nworld", "nsensordata")
+  seen: floats("nworld", "nstep", "nsensordata")  # in each step, see `Batch.watch`
+  count: ints("nworld")  # steps so far
+
+
 @wp.kernel(enable_backward=False)
-def sum_up(
-  adr: wp.array[int], data: wp.array2d[float], peak: wp.array2d[float], mean: wp.array2d[float]
-):
+def sum_up(s: Sensed):
   """Adds the sensors of a step to their sums, and keeps the greatest squares of their norms."""
-  w, k = wp.tid()
-  square = float(0.0)  # noqa: UP018 - a variable to Warp
-  for i in range(adr[k], adr[k + 1]):
-    square += data[w, i] * data[w, i]
-    mean[w, i] = mean[w, i] + data[w, i]
-  peak[w, k] = wp.max(peak[w, k], square)
+  w = wp.tid()
+  n = s.count[w]
+  s.count[w] = n + 1
+  for k in range(s.peak.shape[1]):
+    square = float(0.0)  # noqa: UP018 - a variable to Warp
+    for i in range(s.adr[k], s.adr[k + 1]):
+      square += s.data[w, i] * s.data[w, i]
+      s.mean[w, i] = s.mean[w, i] + s.data[w, i]
+      if n < s.seen.shape[1]:
+        s.seen[w, n, i] = s.data[w, i]
+    s.peak[w, k] = wp.max(s.peak[w, k], square)
 
 
 @wp.kernel(enable_backward=False)
-def average(
-  adr: wp.array[int], steps: int, peak: wp.array2d[float], mean: wp.array2d[float]
-):
+def average(s: Sensed):
   """Makes norms and means of the sums of some steps."""
-  w, k = wp.tid()
-  peak[w, k] = wp.sqrt(peak[w, k])
-  for i in range(adr[k], adr[k + 1]):
-    mean[w, i] = mean[w, i] / float(steps)
+  w = wp.tid()
+  for k in range(s.peak.shape[1]):
+    s.peak[w, k] = wp.sqrt(s.peak[w, k])
+    for i in range(s.adr[k], s.adr[k + 1]):
+      s.mean[w, i] = s.mean[w, i] / float(s.count[w])
+  s.count[w] = 0
 
 
 @wp.kernel(enable_backward=False)

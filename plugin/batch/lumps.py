@@ -118,9 +118,7 @@ def _plate_maps(hinge: plate.Hinges, body, node: np.ndarray) -> dict:
   corner = np.argmax(hinge.of_elem[left] == own[:, None], axis=1)
   gain_left = np.zeros(body.fields.lump.hinge_left.size)
   gain_left[:nhinge] = hinge.gain[left, corner, corner]
-  weight = hinge.rows.tocsr()
-  weight.sort_indices()
-  vert, weight = weight.indices.reshape(nhinge, 4), weight.data.reshape(nhinge, 4)
+  vert, weight = hinge.vert, hinge.weight[left, corner]
   row, col, value, elem = [], [], [], []
   for a in range(3):
     for b in range(3):

@@ -86,6 +86,7 @@ class Organ(Tissue):
       qposadr=place.qposadr,
       bodyid=place.body,
       slot_mass=place.mass,
+      sleeps=int(self.body.plan is not None),
       stiff=int(w.stiff and self._scheme.respond is not None),
       heaviest=float(w.heaviest[0]),
       ngravity=nworld,
@@ -99,7 +100,7 @@ class Organ(Tissue):
         "geom_xpos", "geom_xmat", "qpos", "qvel", "qfrc_passive", "qfrc_constraint")},
     )  # fmt: skip
     self.patch = patch.make(values, self.body)
-    self._touch = contacts.make(model, organ, tools, place, self.patch.missed, d)
+    self._touch = contacts.make(model, organ, tools, place, self.patch, d)
     self._pressed = sliding.make(batch, self._touch)
     self._convex = convex.make(model, tools, nworld * place.nslot, m, d)
     kinds = frozenset(int(kind) for kind in model.geom_type[tools])
@@ -148,8 +149,8 @@ class Organ(Tissue):
 
   def touch(self):
     """Writes the window's contacts."""
-    dim, device = (self._batch.nworld, self.place.nslot), self.body.device
     inputs, touch = [self.patch, self._touch, self._convex], self._touch
+    dim, device = touch.many.shape, self.body.device
     wp.launch(self._find, dim=dim, inputs=[*inputs, False], device=device, block_dim=64)
     wp.launch(contacts.count, dim=dim[0], inputs=[touch], device=device)
     wp.utils.array_scan(touch.count, touch.before, inclusive=False)
@@ -181,6 +182,12 @@ class Organ(Tissue):
   def rest(self):
     """Puts the worlds of the mask at rest."""
     self._over(patch.rest, self.patch.nnode)
+
+  def wake(self, worlds):
+    """Lets the organ of some worlds step that may have slept."""
+    calm = self.patch.calm.numpy()
+    calm[worlds] = 0.0
+    self.patch.calm.assign(calm)
 
   def rubs(self, geom: int, friction: np.ndarray):
     """Returns which array has the friction of a geom, where, and its new values a world."""
@@ -226,6 +233,7 @@ class Organ(Tissue):
       if key != "friction" and key != "mass":
         self._check(key, values)
     self._material.change(chosen, rows)
+    self.wake(chosen)
 
   def _fixed(self, key: str) -> str | None:
     """Returns why a key cannot change, None where it can."""

@@ -5,7 +5,7 @@
 import mujoco
 import numpy as np
 import warp as wp
-from palpate.engine import coupling
+from palpate.engine import coupling, slots
 from palpate.engine.coupling import Crossing
 from palpate.engine.layout import GEOM
 from palpate.tissue import step
@@ -41,6 +41,8 @@ class Patch:
   ngravity: int  # rows of `gravity`
   ngrade: int  # rows of `inertia`
   stiff: int  # whether the organ answers for itself, see `inertia.stiffness`
+  sleeps: int  # whether it may sleep
+  slow: float  # speed below which a node is at rest [m/s]
   h: wp.float64  # time step [s]
   rest_share: wp.float64  # see `step.REST`
   weight: wp.float64  # mass of the organ [kg]
@@ -66,6 +68,8 @@ class Patch:
   mass_scale: doubles("nworld")  # times the masses below
   lump: floats("nlump", "nnode")  # factor on Young's modulus around a node; none where all have 1
   heavier: doubles("nworld")  # times its inertia at rest that a tool meets; 0 for once
+  calm: doubles("nworld")  # how long it has been at rest [s]
+  stirred: ints("nworld")  # whether it moved or was touched in the last step
   force: floats("nworld", "nnode", 3)  # contact force of the last step [N]
   last: vector  # last change of the velocity [m/s]
   before: vector  # the one before it [m/s]
@@ -76,6 +80,7 @@ class Patch:
   before0: floats("nslice", 3, 8)
   force0: floats("nnode", 3)  # contact force [N]
   heavier0: doubles(1)
+  calm0: doubles(1)  # [s]
   # Within a step:
   tool: doubles("nworld", "ntool", len(GEOM))  # see GEOM
   count: ints("nworld")  # candidates
@@ -148,6 +153,7 @@ def constants(body, organ, tools: np.ndarray, model: mujoco.MjModel, inertia, he
     rest_share=step.REST,
     weight=float(organ.mass.sum()),
     skin=skin,
+    slow=slots.SLOW * float(np.linalg.norm(np.ptp(mesh.rest, axis=0))),
     node=node,
     free=by_node(organ.free),
     mass=by_node(organ.mass),
@@ -205,12 +211,15 @@ def variables(nworld: int, nslot: int, nslice: int) -> dict:
     mass_scale=np.ones(nworld),
     lump=np.zeros((0, nnode)),
     heavier=np.zeros(nworld),
+    calm=np.zeros(nworld),
+    stirred=np.zeros(nworld),
     force=np.zeros((nworld, nnode, 3)),
     last=np.zeros(shape),
     before=np.zeros(shape),
     **{f"{name}0": np.zeros(shape[1:]) for name in ("disp", "vel", "last", "before")},
     force0=np.zeros((nnode, 3)),
     heavier0=np.zeros(1),
+    calm0=np.zeros(1),
     count=np.zeros(nworld),
     candidate=np.zeros((nworld, most)),
     distance=np.zeros((nworld, most)),

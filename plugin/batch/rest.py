@@ -12,6 +12,7 @@ import warp as wp
 from palpate.tissue.types import fill
 
 from . import kernels
+from .base import on_device
 from .kernels import Start
 
 
@@ -56,19 +57,19 @@ class Rest:
     for organ in self._batch.organs.values():
       organ.rest()
 
-  def pose(self, at: np.ndarray, values: np.ndarray):
+  def pose(self, at: np.ndarray, values):
     """Puts joints of the worlds of the mask at positions; `at` has their places."""
     move, device = self._move, self._batch.device
     move.at = wp.array(at, dtype=int, device=device)
-    move.values = wp.array(values, dtype=float, device=device)
+    move.values = on_device(values, wp.float32, device)
     wp.launch(kernels.pose, dim=values.shape, inputs=[move], device=device)
 
-  def place(self, body: int, pos: np.ndarray, quat: np.ndarray):
+  def place(self, body: int, pos, quat):
     """Moves a body of the worlds of the mask; quaternions have w first."""
     move, device = self._move, self._batch.device
     move.body = body
-    move.pos = wp.array(pos, dtype=wp.vec3, device=device)
-    move.quat = wp.array(quat, dtype=wp.quat, device=device)
+    move.pos = on_device(pos, wp.float32, device).view(wp.vec3)
+    move.quat = on_device(quat, wp.float32, device).view(wp.quat)
     wp.launch(kernels.place, dim=self._batch.nworld, inputs=[move], device=device)
 
   def look(self):

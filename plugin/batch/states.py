@@ -164,7 +164,9 @@ def keep(batch, start, data: mujoco.MjData):
   d, organs = batch.d, batch.organs.values()
   pairs = [(getattr(d, name), getattr(start, f"{name}0")) for name in _STARTS]
   for organ in organs:
-    own = _vectors(organ) | {"force": organ.patch.force, "heavier": organ.patch.heavier}
+    own = _vectors(organ) | {
+      name: getattr(organ.patch, name) for name in ("force", "heavier", "calm")
+    }
     pairs += [(array, getattr(organ.patch, f"{name}0")) for name, array in own.items()]
   # The first world has it for a moment.
   changed = [array for array, _ in pairs] + [d.ctrl, d.time, d.qacc_warmstart]
@@ -193,7 +195,7 @@ def _push_organ(organ: Organ, world: int, model, data):
     motion["vel"][free] = data.qvel[declared.dofs].reshape(-1, 3)
     for name, values in (("last", motion["last"]), ("before", motion["before"]), ("force", force)):
       values[free] = own[spans[name]].reshape(-1, 3)
-    heavier = float(own[spans["heavier"]][0])
+    heavier, calm = float(own[spans["heavier"]][0]), 0.0
   else:
     for name in _MOTION:
       motion[name][:] = own[spans[name]].reshape(-1, 3)
@@ -201,7 +203,7 @@ def _push_organ(organ: Organ, world: int, model, data):
     slot_node = np.where(number == 0, declared.windows.home, number - 1)
     used = slot_node >= 0
     force[slot_node[used]] = own[spans["force"]].reshape(-1, 3)[used]
-    heavier = float(own[spans["tail"].start + TAIL.heavier])
+    heavier, calm = (float(own[spans["tail"].start + k]) for k in (TAIL.heavier, TAIL.quiet))
   for name, array in _vectors(organ).items():
     full = np.zeros((organ.body.shape.nnode, 3), np.float32)
     full[node] = motion[name]
@@ -209,4 +211,5 @@ def _push_organ(organ: Organ, world: int, model, data):
   full = np.zeros((organ.body.shape.nnode, 3))
   full[node] = force
   _assign(organ.patch.force, world, full)
-  organ.patch.heavier[world : world + 1].assign(np.array([heavier]))
+  for array, value in ((organ.patch.heavier, heavier), (organ.patch.calm, calm)):
+    array[world : world + 1].assign(np.array([value]))

@@ -73,8 +73,12 @@ class Worlds(Batch):
       }
       self._rest, self._bare = Rest(self, bare), bare
       self._teller = states.Teller(self)
-      self._sensors = wp.array([*model.sensor_adr, model.nsensordata], dtype=int)
       self._alias()
+      self._sensed: Any = kernels.Sensed()
+      self._sensed.adr = wp.array([*model.sensor_adr, model.nsensordata], dtype=int)
+      self._sensed.data, self._sensed.count = self.d.sensordata, wp.zeros(nworld, dtype=int)
+      self._sensed.peak, self._sensed.mean = self._summary["peak"], self._summary["mean"]
+      self._sensed.seen = self._make(0, model.nsensordata)
       self._callbacks()
       try:
         self.record()
@@ -162,13 +166,16 @@ class Worlds(Batch):
     self.begin()
     self.step_tools()
     self.end()
-    self._sense(kernels.sum_up, self.d.sensordata)
+    self._sense(kernels.sum_up)
 
-  def _sense(self, kernel, what):
+  def _sense(self, kernel):
     if self.model.nsensor:
-      inputs = [self._sensors, what, self._summary["peak"], self._summary["mean"]]
-      dim = (self.nworld, self.model.nsensor)
-      wp.launch(kernel, dim=dim, inputs=inputs, device=self.device)
+      wp.launch(kernel, dim=self.nworld, inputs=[self._sensed], device=self.device, block_dim=64)
+
+  def _watch(self, out: wp.array) -> wp.array:
+    self._sensed.seen = out
+    self.record()
+    return out
 
   def _after(self):
     """Launches what follows steps: worlds that are not finite are reset and counted."""
@@ -206,7 +213,7 @@ class Worlds(Batch):
       sums.zero_()
     for _ in range(n):
       self._run("step")
-    self._sense(kernels.average, n)
+    self._sense(kernels.average)
     self._run("after")
 
   def _reset(self, mask: wp.array):
@@ -238,6 +245,8 @@ class Worlds(Batch):
       whole = array.numpy()
       whole[(worlds, *place)] = values
       array.assign(whole)
+    for organ in self._organs.values():
+      organ.wake(worlds)
 
   def _tell(self):
     self._teller.tell()

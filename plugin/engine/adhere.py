@@ -8,8 +8,9 @@ from palpate.tissue import mesh as topology
 from palpate.tissue.reading import Law
 from palpate.tissue.types import doubles, fill, ints, struct
 
-from . import coupling, fasten, flexes, mjstruct
+from . import coupling, fasten, flexes, follow, mjstruct
 from .bonds import ON_ORGAN, Group
+from .follow import Grip, Spots
 from .layout import GEOM
 from .ties import motion
 
@@ -100,8 +101,9 @@ def to_body(w, body: int, name: str, law: Law, near: float, vertices, now: bool 
       f"{law.stiffness * area.sum():.3g} N/m together, expected at most {most:.3g} N/m for a body "
       "that is so light in a step of that length"
     )
-  none = np.zeros((len(vert), 3))
-  return _group(w, vert, area, law, body, local, normal, None, none, none, not now)
+  made = {"area": area, "anchor": local, "normal": normal}
+  made["turn"] = np.tile(turn.T @ w.organ.frame, (len(vert), 1, 1))
+  return _group(w, vert, made, law, body, not now)
 
 
 def to_organ(w, other, law: Law, near: float, vertices, now: bool = True) -> Group:
@@ -117,26 +119,25 @@ def to_organ(w, other, law: Law, near: float, vertices, now: bool = True) -> Gro
   area = _areas(w, vert, name, near)
   corner = mesh.elem[elem]
   x = theirs[corner]
-  axes = _axes(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0])
+  axes = follow.axes(x)
   gap = _places(w, vert, now) - np.einsum("nc,ncd->nd", weight, x)
   side = np.ones(len(vert))
   if not mesh.closed:
     facing = -np.einsum("nd,nd->n", _normals(w, now)[vert], axes[:, 2])
     side = np.sign(facing) if w.organ.mesh.closed else np.zeros(len(vert))
-  normal = side[:, None] * [0.0, 0.0, 1.0]
-  anchor = np.einsum("nad,nd->na", axes, gap)
-  return _group(w, vert, area, law, ON_ORGAN, anchor, normal, other, corner, weight, not now)
+  made = {"area": area, "anchor": np.einsum("nad,nd->na", axes, gap)}
+  made |= {"normal": side[:, None] * [0.0, 0.0, 1.0], "turn": axes @ w.organ.frame}
+  return _group(w, vert, made, law, ON_ORGAN, not now, other, Spots(mesh, elem, weight))
 
 
-def _group(w, vert, area, law, body, anchor, normal, other, corner, weight, declared) -> Group:
+def _group(w, vert, made, law, body: int, declared: bool, other=None, spots=None) -> Group:
   bonded = [g.vert for g in w.bonds.groups]
   twice = np.intersect1d(vert, np.concatenate(bonded)) if bonded else vert[:0]
   if twice.size:
     raise ValueError(
       f"organ {w.organ.name!r}: vertex {twice[0]} is bonded already, expected one bond a vertex"
     )
-  slot = (np.cumsum(w.organ.free) - 1)[vert]
-  return Group(w, vert, slot, area, law, body, anchor, normal, other, corner, weight, declared)
+  return Group(w, Grip(w.organ.mesh, vert), made, law, body, other, spots, declared)
 
 
 def _free(w) -> np.ndarray:
@@ -165,13 +166,6 @@ def _normals(w, now: bool) -> np.ndarray:
   out = np.zeros((mesh.nouter, 3))
   np.add.at(out, mesh.elem, topology.area_vectors(x, mesh.elem)[:, None])
   return out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-300)
-
-
-def _axes(edge: np.ndarray, other: np.ndarray) -> np.ndarray:
-  """Returns the axes of triangles, as `set_axes` in the header, row by row, (n, 3, 3)."""
-  area = np.cross(edge, other)
-  x, z = (a / np.maximum(np.linalg.norm(a, axis=1, keepdims=True), 1e-300) for a in (edge, area))
-  return np.stack([x, np.cross(z, x), z], axis=1)
 
 
 def _far_from_geoms(m, body: int, points: np.ndarray) -> np.ndarray:

@@ -15,7 +15,8 @@ from palpate.tissue.step import SCHEMES
 from palpate.tissue.types import doubles, fill, ints, struct
 
 from . import coupling, mjstruct
-from .hold import Beside, Bodies, Input, Nodes, may_move, nodes, solver
+from .follow import Grip, Spots
+from .hold import Beside, Bodies, Input, Nodes, base, may_move, nodes, solver
 from .layout import BOND
 
 ON_ORGAN = -1  # in place of a body
@@ -66,50 +67,89 @@ class Group:
 
   Attributes:
     own: workspace of the organ
-    vert: vertices                                        (n,)
-    slot: their rows in the plugin state                  (n,)
-    area: of each [m^2]                                   (n,)
+    grip: its vertices that were bonded
+    made: as they were made: area of each [m^2] (n,), and in the axes of body or triangle what it
+      leads to [m] (n, 3), away from its bed, or 0 (n, 3), and the organ's axes (n, 3, 3)
     law: how they hold and break
     body: body that they lead to, or ON_ORGAN
+    other: workspace of the other organ, or None
+    spots: the points of it that they lead to
+    declared: whether the model has them, not somebody who made them while running
+    vert: vertices that they are on now                   (n,)
+    slot: their rows in the plugin state                  (n,)
+    area: of each [m^2]                                   (n,)
     anchor: what each leads to in the axes of body or triangle [m] (n, 3)
     normal: away from its bed in these axes, or 0         (n, 3)
-    other: workspace of the other organ, or None
-    corner: its vertices that hold each                   (n, 3)
+    corner: vertices of the other organ that hold each    (n, 3)
     weight: their shares                                  (n, 3)
-    declared: whether the model has them, not somebody who made them while running
-    arrays: what the kernels write
+    arrays: what the kernels write, with room for cuts
     bonded: what they take
   """
 
   own: Any
-  vert: np.ndarray
-  slot: np.ndarray
-  area: np.ndarray
+  grip: Grip
+  made: dict[str, np.ndarray]
   law: Law
   body: int
-  anchor: np.ndarray
-  normal: np.ndarray
   other: Any
-  corner: np.ndarray
-  weight: np.ndarray
+  spots: Spots | None
   declared: bool
+  vert: np.ndarray = dataclasses.field(init=False)
+  slot: np.ndarray = dataclasses.field(init=False)
+  area: np.ndarray = dataclasses.field(init=False)
+  anchor: np.ndarray = dataclasses.field(init=False)
+  normal: np.ndarray = dataclasses.field(init=False)
+  corner: np.ndarray = dataclasses.field(init=False)
+  weight: np.ndarray = dataclasses.field(init=False)
   arrays: dict[str, wp.array] = dataclasses.field(init=False)
   bonded: Any = dataclasses.field(default=None, init=False)
 
   def __post_init__(self):
-    n = len(self.vert)
+    n = len(self.grip.vert) + self.own.organ.mesh.spare
     shapes = {"next": (n, len(BOND)), "stretch": (n, 3), "force": (n, 3), "hardness": n}
     self.arrays = {k: wp.zeros(s, dtype=wp.float64, device="cpu") for k, s in shapes.items()}
     self.arrays["live"] = wp.ones(1, dtype=int, device="cpu")
+    self._find()
+
+  def _find(self):
+    """Finds what became of the vertices, and of what they lead to."""
+    organ, made = self.own.organ, self.made
+    held = self.grip.now(organ.mesh)
+    row, self.vert = held.row, held.vert
+    self.slot = (np.cumsum(organ.free) - 1)[self.vert]
+    self.area, self.normal = made["area"][row] * held.share, made["normal"][row]
+    self.anchor = made["anchor"][row] + np.einsum("nij,nj->ni", made["turn"][row], held.shift)
+    self.corner = self.weight = np.zeros((len(row), 3))
+    if self.spots is not None:
+      corner, weight, turn = (each[row] for each in self.spots.now(self.other.organ.mesh))
+      self.corner, self.weight = corner, weight
+      self.anchor = np.einsum("nij,nj->ni", turn, self.anchor)
+
+  def reshape(self):
+    """Follows the organs, one of which was cut, in the arrays that graphs know."""
+    self._find()
+    bonded, n = self.bonded, len(self.vert)
+    if bonded is None:
+      return
+    bonded.nbond = n
+    for name in _OF_GROUP:
+      getattr(bonded, name).numpy()[:n] = getattr(self, name)
+    bonded.own.rest.numpy()[:] = base(self.own.organ)
+    if self.other is not None:
+      bonded.other.rest.numpy()[:] = base(self.other.organ)
 
   def bind(self, model: int):
     """Points what the kernels take at the arrays of a model, in place: both organs launch them."""
     w, other = self.own, self.other
     m, scheme = mjstruct.Model.from_address(model), SCHEMES[w.config.integrator]
-    law = dict(zip(("stiffness", "strength", "energy"), self.law, strict=True))
-    values = law | {name: getattr(self, name) for name in _OF_GROUP} | self.arrays
+    n, room = len(self.vert), self.arrays["hardness"].size
+    values: dict[str, Any] = dict(zip(("stiffness", "strength", "energy"), self.law, strict=True))
+    for name in _OF_GROUP:
+      value = getattr(self, name)
+      values[name] = np.concatenate([value, np.zeros((room - n, *value.shape[1:]))])
+    values |= self.arrays
     values |= dict(
-      nbond=len(self.vert),
+      nbond=n,
       body=self.body,
       restless=int(other is not None or may_move(m, self.body)),
       ahead=float(scheme.ahead),
@@ -131,7 +171,8 @@ class Group:
 
 def alike(a: Group, b: Group) -> bool:
   """Returns whether bonds of two mjData of a model are the same."""
-  arrays = all(np.array_equal(getattr(a, name), getattr(b, name)) for name in _OF_GROUP)
+  arrays = all(np.array_equal(a.made[name], b.made[name]) for name in a.made)
+  arrays = arrays and np.array_equal(a.grip.vert, b.grip.vert)
   others = (group.other and group.other.organ.name for group in (a, b))
   return arrays and (a.body, a.law) == (b.body, b.law) and len(set(others)) == 1
 
@@ -166,6 +207,31 @@ class Bonds(Beside):
       self.groups.remove(group)
       if group.other is not None:
         group.other.bonds.borne.remove(group)
+
+  def springs(self) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Returns vertices, stiffness [N/m], and stretch in the organ's frame now [m] of its bonds."""
+    out = []
+    for group in self.groups:
+      group.launch(_stretch)
+      whole = 1.0 - self.state[group.slot, BOND.damage].clip(0.0, 1.0)
+      stretch = group.arrays["stretch"].numpy()[: len(group.vert)] @ self._w.organ.frame
+      out.append((group.vert, group.law.stiffness * group.area * whole, stretch))
+    return out
+
+  def reshape(self) -> list:
+    """See `Beside`."""
+    for group in (*self.groups, *self.borne):
+      group.reshape()
+    return []
+
+  def carry(self, group: np.ndarray, member: np.ndarray, share: np.ndarray):
+    """See `Beside`."""
+    if not self._w.config.bonded:
+      return
+    slot, state = np.cumsum(self._w.organ.free) - 1, self.state
+    damage, released = BOND.damage, BOND.released
+    state[slot[member], damage] = state[slot[group], damage]
+    state[slot[member], released] = share * state[slot[group], released]
 
   @property
   def state(self) -> np.ndarray:

@@ -47,7 +47,9 @@ def copy(w, model: int, other, twin):
     for group in theirs:
       _put(w, dataclasses.replace(group, own=w, other=group.other and twin(group.other)))
   if w.ties.groups or other.ties.groups:
-    groups = [dataclasses.replace(g, other=g.other and twin(g.other)) for g in other.ties.groups]
+    groups = [
+      dataclasses.replace(g, own=w, other=g.other and twin(g.other)) for g in other.ties.groups
+    ]
     tie(w, model, groups)
 
 
@@ -152,6 +154,7 @@ def _change(w, model: int, config: Config):
   with graphs.lock:
     if material:
       shape.change(w.body, w.organ.mesh, config, ~w.organ.free)
+      w.cuts.forget()
     else:
       shape.renumber(w.body, config, w.organ.mesh.closed or not w.cuts)
     w.creep.renumber(config)

@@ -206,18 +206,23 @@ def mass_addresses(m, dofs: np.ndarray) -> np.ndarray:
   return rowadr + mjstruct.view(m.M_rownnz, m.nv, np.int32)[dofs] - 1
 
 
+def outer(organ) -> int:
+  """Returns how many vertices there are on an organ's surface, or may be by cuts."""
+  return organ.mesh.nvert if organ.mesh.spare else organ.mesh.nouter
+
+
 def sizes(organ) -> dict[str, int]:
   """Returns what the blocks of an organ's plugin state need."""
   relaxes = organ.config.relax_share > 0
   out = {"ncreep": int(organ.free.sum()) if relaxes else 0}
   whole = organ.mesh.whole
   out |= cut_sizes(whole.nelem, whole.nvert, whole.spare)
-  out["nbond"] = int(organ.free[: organ.mesh.nouter].sum()) if organ.config.bonded else 0
+  out["nbond"] = int(organ.free[: outer(organ)].sum()) if organ.config.bonded else 0
   out["nblade"] = len(organ.config.cutters)
   if organ.windows is None:
     return out | {"nfree": organ.nfree}
   win = organ.windows
-  out["nrest"] = organ.mesh.nouter if organ.config.support else 0
+  out["nrest"] = outer(organ) if organ.config.support else 0
   return out | {"nvert": organ.mesh.nvert, "nslot": win.nslot, "ngeom": win.geom.size}
 
 

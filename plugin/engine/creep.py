@@ -97,6 +97,12 @@ class Creep(Beside):
     names = ("mass", "force_ext", "dvel", "sol", "rhs", "status")
     self._creeping = fill(Creeping, "cpu", values | {name: w.host[name] for name in names})
 
+  def carry(self, group: np.ndarray, member: np.ndarray, share: np.ndarray):
+    """See `Beside`."""
+    if self:
+      own, at = self._creeping.own.numpy(), np.cumsum(self._w.organ.free) - 1
+      own[at[member]] = share[:, None] * own[at[group]]
+
   def enter(self):
     """See `Beside`."""
     if self:

@@ -20,7 +20,8 @@ from palpate.tissue import mesh as topology
 from palpate.tissue.mesh import Mesh
 from palpate.tissue.refill import Refill
 
-from . import coupling, flexes, mjstruct, turns
+from . import coupling, flexes, graphs, mjstruct, turns
+from .bind import bind
 from .tear import Tear
 
 _FOREIGN = "plugin_state has cuts that are not of this organ; set a state that was saved from it"
@@ -112,6 +113,8 @@ class Cuts:
     self._found: Any = self._own["stamp"].data
     self.lock = turns.lock_of(model)
     self._elem = flexes.element_data(m, w.organ.flex)
+    self._border = np.flatnonzero(self.whole.twin < 0)
+    self._rim = flexes.rim_data(m, w.organ.flex, len(self._border))
     self._mark: Any = flexes.marks(m, w.organ.flex, self.whole.nelem)[-1:].data
 
   # What the state says.
@@ -131,8 +134,8 @@ class Cuts:
     if not self or self._found[0] == self.stamp:
       return
     elem, loose, rest, mass, source = self._read()
-    mesh, touched = topology.recut(self.mesh, rest, elem, loose)
-    self._become(mesh, touched, mass, source, self._found[0])
+    mesh, changed = topology.recut(self.mesh, rest, elem, loose)
+    self._become(mesh, changed, mass, source, self._found[0])
     self.reports = []
     self._fresh = True
 
@@ -159,22 +162,30 @@ class Cuts:
     for name, values in kept.items():
       self._own[name][:] = values
 
-  def _write(self):
+  def _write(self, corner: np.ndarray):
     own, mesh = self._own, self.mesh
-    own["corner"][:] = flexes.pack(mesh.elem, mesh.loose)
+    own["corner"][:] = corner
     own["place"][:] = mesh.rest.ravel()
     own["weight"][:] = self.mass
     own["source"][:] = self.source[mesh.nvert - mesh.spare :]
     self._found[0] = self.stamp
 
-  def _become(self, mesh: Mesh, touched: np.ndarray, mass, source, stamp: float):
+  def _become(self, mesh: Mesh, changed: np.ndarray, mass, source, stamp: float):
     w = self._w
-    self._refill.write(mesh, touched, w.config, ~w.organ.free)
+    touched = topology.touched(self.mesh, mesh, changed)
+    touched = topology.distinct(touched, np.flatnonzero(mass != self.mass))
+    self._refill.write(mesh, changed, w.config, ~w.organ.free)
     self.mass, self.source, self.stamp = mass, source, stamp
     w.organ = dataclasses.replace(self.declared, mesh=mesh, mass=mass)
     w.phases.reshape(touched)
-    w.ties.reshape()
-    w.cutters.reshape()
+    for grown in [space for each in w.beside for space in each.reshape()]:
+      with graphs.lock:
+        bind(grown, grown.model)
+
+  def forget(self):
+    """Forgets what the body's arrays hold: the material has changed."""
+    if self:
+      self._refill.forget()
 
   def spread(self):
     """Tells the coupling what nodes there are now, and their masses."""
@@ -197,6 +208,7 @@ class Cuts:
     """Gives the model the triangles of this organ."""
     if not self.shown:
       self._elem[:] = self.mesh.elem
+      self._rim[:] = np.stack([topology.corners(self.mesh, self._border, k) for k in (0, 1)], 1)
       self._mark[0] = self.stamp
 
   # Cutting.
@@ -213,16 +225,34 @@ class Cuts:
     local = (np.asarray(points, float) - organ.origin) @ organ.frame
     u, v = w.phases.motion()
     of_triangles = functools.partial(energy.of_triangles, w.config)
-    found = cutting.cut(organ.name, mesh, mesh.rest + u, local, ~organ.free, of_triangles, given)
+    energies = of_triangles, self._held()
+    found = cutting.cut(organ.name, mesh, mesh.rest + u, local, ~organ.free, *energies, given)
     if found.stopped:
       w.note(
         f"the cut stops early: no spare vertices are left of {mesh.spare}; give the organ more"
       )
     report = self._report(found)
-    if found.touched.size:
+    if found.changed.size:
       self._take(found, u, v)
     self.reports.append(report)
     return report
+
+  def _held(self) -> cutting.Held | None:
+    """Returns what tells the energy of ties and bonds, None where there are none."""
+    springs = [*self._w.ties.springs(), *self._w.bonds.springs()]
+    if not springs:
+      return None
+    n = self.mesh.nvert
+    whole, pull, hard = np.zeros(n), np.zeros((n, 3)), np.zeros(n)
+    for vert, stiffness, stretch in springs:
+      np.add.at(whole, vert, 0.5 * stiffness * (stretch**2).sum(axis=1))
+      np.add.at(pull, vert, stiffness[:, None] * stretch)
+      np.add.at(hard, vert, stiffness)
+
+    def held(vert: np.ndarray, way: np.ndarray) -> np.ndarray:
+      return whole[vert] + (way * pull[vert]).sum(1) + 0.5 * hard[vert] * (way**2).sum(1)
+
+    return held
 
   def _report(self, found: cutting.Cut) -> Report:
     organ = self._w.organ
@@ -242,14 +272,17 @@ class Cuts:
     source[member] = source[group]
     now, speed = u.copy(), v.copy()
     now[found.moved] = np.einsum("nk,nkj->nj", found.weight, u[found.corner])
-    near = found.touched[w.organ.free[found.touched] & ~old.unused[found.touched]]
+    near = topology.distinct(old.elem[found.changed])
+    near = near[w.organ.free[near]]
     was, goes = (old.rest + u)[near], (mesh.rest + now)[near]
     speed[near] = _keep_spin(self.mass[near], was, goes, v[near])
     now[member], speed[member] = now[group], speed[group]
-    stamp = flexes.stamp(flexes.pack(mesh.elem, mesh.loose), mesh.rest, mass)
-    self._become(mesh, found.touched, mass, source, stamp)
-    self._write()
-    changed = np.unique(np.concatenate([near, member]))
+    for each in w.beside:
+      each.carry(group, member, share)
+    corner = flexes.pack(mesh.elem, mesh.loose)
+    self._become(mesh, found.changed, mass, source, flexes.stamp(corner, mesh.rest, mass))
+    self._write(corner)
+    changed = topology.distinct(near, member)
     w.phases.carry(changed, now, speed, group, member, share)
     self.show()
 
@@ -275,8 +308,8 @@ def _keep_spin(mass: np.ndarray, was: np.ndarray, now: np.ndarray, v: np.ndarray
   """
   if len(mass) < 3:
     return v
-  spin = (mass[:, None] * np.cross(was - now, v)).sum(axis=0)
+  spin = (mass[:, None] * topology.cross(was - now, v)).sum(axis=0)
   arm = now - (mass[:, None] * now).sum(axis=0) / mass.sum()
   inertia = (mass * (arm**2).sum(axis=1)).sum() * np.eye(3) - (mass * arm.T) @ arm
   omega = np.linalg.lstsq(inertia, spin, rcond=1e-6)[0]
-  return v + np.cross(omega, arm)
+  return v + topology.cross(omega[None], arm)

@@ -203,13 +203,14 @@ class Cutters(Beside):
     if self._blades is not None:
       self._blades.law.assign(self._law(mjstruct.Model.from_address(self._w.model)))
 
-  def reshape(self):
-    """Takes the mesh that the organ has now."""
+  def reshape(self) -> list:
+    """See `Beside`."""
     if self._blades is not None:
       mesh = self._w.organ.mesh
       self._blades.elem.assign(mesh.elem)
       self._blades.flat.assign(mesh.rest)
       self._blades.own.rest.assign(base(self._w.organ))
+    return []
 
   def enter(self):
     """See `Beside`."""

@@ -13,8 +13,8 @@ import mujoco
 import numpy as np
 from palpate.tissue import config as configuration
 from palpate.tissue import device as devices
+from palpate.tissue import diagonals, shape
 from palpate.tissue import mesh as topology
-from palpate.tissue import shape
 from palpate.tissue.body import Body
 from palpate.tissue.config import Config
 from palpate.tissue.mesh import Mesh
@@ -195,7 +195,10 @@ def read_mesh(
       f"{flexes.MOST}"
     )
   mesh = topology.build(name, rest, elem, spare)
-  return configuration.parse(name, texts, len(elem), mesh.closed), mesh
+  config = configuration.parse(name, texts, len(elem), mesh.closed)
+  if config.elements == "membrane" and config.bend and not spare:  # a cut goes along given edges
+    mesh = diagonals.parallel(name, mesh, np.asarray(config.young))
+  return config, mesh
 
 
 def cached(
@@ -203,7 +206,7 @@ def cached(
 ) -> Declaration:
   """Returns the organ with its constants on the device, the same object for the same content."""
   digest = hashlib.sha256(repr((h, name, fields["flex"], config)).encode())
-  for part in (mesh.rest, mesh.elem, free, *fields.values()):
+  for part in (mesh.rest, mesh.elem, mesh.tet, free, *fields.values()):
     if isinstance(part, np.ndarray):
       digest.update(np.ascontiguousarray(part).tobytes())
     elif isinstance(part, Windows):

@@ -8,6 +8,7 @@ from palpate.tissue.config import OWN
 from scipy.spatial import KDTree
 
 from . import flexes, inertia, mjstruct, rests
+from .follow import Grip
 from .ties import TO_OWN_MOTION, TO_POINT, Group, is_mocap, motion
 
 # Times the mass of a vertex that its spring weighs in a step, where nothing else is said: it then
@@ -73,7 +74,8 @@ def to_body(w, vert: np.ndarray, body: int, stiffness: float | None, now: bool =
   else:
     at = at_rest(w, vert)
     turn, origin = flexes.body_frame(m, body)
-  return Group(vert, body, each, (at - origin) @ turn, by="" if now else "attach")
+  made = {"stiffness": each, "anchor": (at - origin) @ turn, "turn": turn.T @ w.organ.frame}
+  return Group(w, Grip(w.organ.mesh, vert), body, made, by="" if now else "attach")
 
 
 def to_organ(w, vert: np.ndarray, other, stiffness: float | None, now: bool = True):
@@ -87,11 +89,15 @@ def to_organ(w, vert: np.ndarray, other, stiffness: float | None, now: bool = Tr
   pair = outer[KDTree(theirs).query(mine)[1]]
   gap = mine - place(other, pair)
   each = _stiffness(w, vert, stiffness, np.inf)
-  by = "" if now else "attach"
-  return (
-    Group(vert, TO_POINT, each, gap, other, pair, by),
-    Group(pair, TO_POINT, each, -gap, w, vert, by),
-  )
+  grips = Grip(w.organ.mesh, vert), Grip(other.organ.mesh, pair)
+  ends = (w, grips[0], gap, other, grips[1]), (other, grips[1], -gap, w, grips[0])
+  return tuple(
+    Group(
+      space, grip, TO_POINT, {"stiffness": each, "anchor": off, "turn": space.organ.frame}, to,
+      theirs, "" if now else "attach",
+    )
+    for space, grip, off, to, theirs in ends
+  )  # fmt: skip
 
 
 def carried(w) -> list[Group]:
@@ -99,7 +105,7 @@ def carried(w) -> list[Group]:
   name, organ = w.config.carrier, w.organ
   if not name:
     return []
-  mesh = organ.mesh
+  mesh = organ.mesh.whole
   area = topology.vertex_areas(mesh.rest, mesh.elem)
   m = mjstruct.Model.from_address(w.model)
   body = TO_OWN_MOTION if name == OWN else find_body(w, m, "carrier", name)
@@ -109,11 +115,13 @@ def carried(w) -> list[Group]:
   vert = np.flatnonzero(stiffness > 0)
   if not len(vert):
     return []
-  anchor = np.zeros((len(vert), 3))
+  anchor, axes = np.zeros((len(vert), 3)), np.zeros((3, 3))
   if body >= 0:
     turn, origin = flexes.body_frame(m, body)
-    anchor = (at_rest(w, vert) - origin) @ turn
-  return [Group(vert, body, stiffness[vert], anchor, by="carrier")]
+    place = organ.origin + mesh.rest[vert] @ organ.frame.T
+    anchor, axes = (place - origin) @ turn, turn.T @ organ.frame
+  made = {"stiffness": stiffness[vert], "anchor": anchor, "turn": axes}
+  return [Group(w, Grip(mesh, vert), body, made, by="carrier")]
 
 
 def find_body(w, m, key: str, name: str) -> int:

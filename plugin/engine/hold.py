@@ -85,6 +85,23 @@ class Beside:
   def bind(self, model: int):
     """Points the kernels at the arrays of a model and of the workspace's mjData."""
 
+  def carry(self, group: np.ndarray, member: np.ndarray, share: np.ndarray):
+    """Gives vertices that a cut has divided their part of what the plugin state has of them.
+
+    Args:
+      group: of vertices that were one, which  (n,)
+      member: those vertices                   (n,)
+      share: their part of its area            (n,)
+    """
+
+  def reshape(self) -> list:
+    """Follows the organ's mesh, which was cut or has healed.
+
+    Returns:
+      workspaces whose graphs have to be recorded anew: there was no more room
+    """
+    return []
+
   def enter(self):
     """Adds to the solver's input, after a coupling has filled it."""
 

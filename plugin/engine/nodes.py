@@ -70,17 +70,22 @@ def make(w, side, motion, boxes: tuple[wp.array, wp.array], sizes: dict[str, int
     solve=coupling.crossing(coupling.on_body(w.body) if w.config.resident else w.host),
   )
   out = fill(Nodes, side, values)
-  weigh(w, out)
+  _weigh(w, np.arange(organ.mesh.nvert))
   return out
 
 
-def weigh(w, nodes):
-  """Gives the nodes, and the solver's, the masses that the organ has now."""
-  s, mass = w.body.shape, w.organ.mass
-  nodes.mass.assign(mass)
-  every = np.ones(s.nnode)
-  every[s.node.numpy()] = np.where(mass > 0, mass, 1.0)
-  w.host["mass"].assign(order.to_slices(every)[None].astype(np.float32))
+def reshape(w, nodes, vert: np.ndarray):
+  """Gives the nodes, on the CPU, the rest places and masses that vertices have now."""
+  nodes.nouter = w.organ.mesh.nouter
+  nodes.rest.numpy()[vert] = w.organ.mesh.rest[vert]
+  nodes.mass.numpy()[vert] = w.organ.mass[vert]
+  _weigh(w, vert)
+
+
+def _weigh(w, vert: np.ndarray):
+  """Gives the solver's nodes the masses that vertices have now."""
+  node, mass = w.body.shape.node.numpy()[vert], w.organ.mass[vert]
+  w.host["mass"].numpy()[0, node // order.LANES, node % order.LANES] = np.where(mass > 0, mass, 1.0)
   wp.copy(w.body.state.mass, w.host["mass"])
 
 

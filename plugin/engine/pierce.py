@@ -24,22 +24,61 @@ _LONG = (int(mujoco.mjtGeom.mjGEOM_CAPSULE), int(mujoco.mjtGeom.mjGEOM_CYLINDER)
 _MOST = 33  # points that stand for a long geom
 
 
-def winding(point: np.ndarray, pos: np.ndarray, elem: np.ndarray) -> np.ndarray:
-  """Returns the winding number of a closed surface around points, (npoint,): 1 inside, 0 outside.
+def inside(point: np.ndarray, pos: np.ndarray, elem: np.ndarray) -> np.ndarray:
+  """Returns which points are inside of a closed surface, (npoint,) bool.
 
-  The solid angles of its triangles, by tan(angle / 2) (Van Oosterom and Strackee 1983,
-  doi:10.1109/TBME.1983.325207), over 4 pi.
+  A ray along z leaves the surface once more often than it comes in. Exact where the ray meets an
+  edge or a vertex: of the triangles around it, it goes through one.
 
   Args:
     point: [m], (npoint, 3)
     pos: vertices [m], (nvert, 3)
     elem: triangles, counter-clockwise from outside, (nelem, 3)
   """
-  a, b, c = np.moveaxis(pos[elem][None] - point[:, None, None], 2, 0)
-  la, lb, lc = (np.linalg.norm(side, axis=-1) for side in (a, b, c))
-  volume = (a * np.cross(b, c)).sum(axis=-1)
-  rest = la * lb * lc + (a * b).sum(axis=-1) * lc + (b * c).sum(axis=-1) * la
-  return np.arctan2(volume, rest + (c * a).sum(axis=-1) * lb).sum(axis=1) / (2 * np.pi)
+  found = ((point > pos.min(axis=0)) & (point < pos.max(axis=0))).all(axis=1)
+  if found.any():
+    found[found] = _crossings(point[found], pos, elem) > 0.5
+  return found
+
+
+def _crossings(point: np.ndarray, pos: np.ndarray, elem: np.ndarray) -> np.ndarray:
+  """Returns how often a ray from each point leaves a surface, less how often it comes in."""
+  # In the time of a step: of all triangles only what a ray may meet is looked at closely.
+  low, high = point.min(axis=0), point.max(axis=0)
+  (x0, x1), (y0, y1), (_, z1) = (_span(pos[:, k], elem) for k in range(3))
+  near = np.flatnonzero(
+    (x0 <= high[0]) & (x1 >= low[0]) & (y0 <= high[1]) & (y1 >= low[1]) & (z1 >= low[2])
+  )
+  x0, x1, y0, y1 = x0[near], x1[near], y0[near], y1[near]
+  x, y = point[:, :1], point[:, 1:2]
+  k, t = np.nonzero((x0 <= x) & (x1 >= x) & (y0 <= y) & (y1 >= y))
+  at, corner = point[k], pos[elem[near[t]]]
+  through = np.zeros(len(k), bool)
+  for i in range(3):
+    through ^= _right_of(at, corner[:, i - 1], corner[:, i])
+  (ux, uy, uz), (vx, vy, vz) = (corner[:, 1] - corner[:, 0]).T, (corner[:, 2] - corner[:, 0]).T
+  normal = np.stack([uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx], axis=1)
+  out = np.sign(normal[:, 2])
+  above = ((corner[:, 0] - at) * normal).sum(axis=1) * out > 0
+  return np.bincount(k, out * (through & above), len(point))
+
+
+def _span(x: np.ndarray, elem: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+  """Returns the least and the largest of a coordinate in each triangle, (nelem,)."""
+  a, b, c = x.take(elem.T)
+  return np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
+
+
+def _right_of(point: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+  """Returns whether edges, seen along z, are met on the way from points along x, (n,) bool.
+
+  To the bit the same from a to b as from b to a.
+  """
+  up = (a[:, 1] <= b[:, 1])[:, None]
+  (x0, y0, _), (x1, y1, _) = np.where(up, a, b).T, np.where(up, b, a).T
+  x, y, _ = point.T
+  meets = (y0 <= y) & (y < y1)
+  return meets & (x < x0 + (y - y0) * (x1 - x0) / np.where(meets, y1 - y0, 1.0))
 
 
 def tools(m, organ) -> np.ndarray:
@@ -90,19 +129,7 @@ class Tools:
     self.half = half_lengths(m, geoms)
     wide = 2 * np.ceil(self.half / mjstruct.view(m.geom_size, (m.ngeom, 3))[geoms, 0]) + 1
     self._count = np.minimum(wide, _MOST).astype(int)
-    body = mjstruct.view(m.geom_bodyid, m.ngeom, np.int32)[geoms]
-    root = mjstruct.view(m.body_rootid, m.nbody, np.int32)[body]
-    self._spin, vel = np.moveaxis(mjstruct.view(d.cvel, (m.nbody, 2, 3))[body], 1, 0)
-    com = mjstruct.view(d.subtree_com, (m.nbody, 3))[root]
-    self._vel = vel + np.cross(self._spin, self._pos - com)
-
-  def points(self, k: int, before: float = 0.0) -> np.ndarray:
-    """Returns the points of tool k, now or so long before, in the organ's frame [m], (., 3)."""
-    along = np.linspace(-self.half[k], self.half[k], self._count[k])[:, None]
-    axis = self._axis[k] - before * np.cross(self._spin[k], self._axis[k])
-    return (self._pos[k] - before * self._vel[k] + along * axis - self._organ.origin) @ (
-      self._organ.frame
-    )
+    self._m, self._d = m, d
 
   def inside(self, disp: np.ndarray) -> list[int]:
     """Returns which of the geoms are inside of the organ.
@@ -110,23 +137,45 @@ class Tools:
     Args:
       disp: displacement of the vertices from rest, in the organ's frame [m], (nvert, 3)
     """
-    pos, elem = self._organ.mesh.rest + disp, self._organ.mesh.elem
-    return [int(g) for k, g in enumerate(self.geoms) if any_inside(self.points(k), pos, elem)]
+    found = self._inside(range(len(self.geoms)), self._pos, self._axis, disp)
+    return [int(g) for g, is_in in zip(self.geoms, found, strict=True) if is_in]
 
   def passed(self, disp: np.ndarray, time: float) -> list[int]:
     """Returns which of the fast ones were inside of it on their way within the last seconds."""
-    pos, elem = self._organ.mesh.rest + disp, self._organ.mesh.elem
-    speed = np.linalg.norm(self._vel, axis=1) + np.linalg.norm(self._spin, axis=1) * self.half
-    return [
-      int(self.geoms[k])
-      for k in map(int, np.flatnonzero(speed > _FAST))
-      if any(any_inside(self.points(k, t), pos, elem) for t in np.linspace(0, time, _PATH))
+    spin, vel = self._motion()
+    speed = np.linalg.norm(vel, axis=1) + np.linalg.norm(spin, axis=1) * self.half
+    fast, found = np.flatnonzero(speed > _FAST), np.zeros(len(self.geoms), bool)
+    turn = np.cross(spin, self._axis)
+    for t in np.linspace(0, time, _PATH):
+      found[fast] |= self._inside(fast, self._pos - t * vel, self._axis - t * turn, disp)
+    return [int(g) for g in self.geoms[found]]
+
+  def _inside(self, tools, pos: np.ndarray, axis: np.ndarray, disp: np.ndarray) -> np.ndarray:
+    """Returns whether any point of each of some tools is inside, (ntool,) bool."""
+    organ = self._organ
+    points = [
+      pos[k] + np.linspace(-self.half[k], self.half[k], self._count[k])[:, None] * axis[k]
+      for k in tools
     ]
+    corner = organ.mesh.rest + disp
+    found = inside((np.concatenate(points) - organ.origin) @ organ.frame, corner, organ.mesh.elem)
+    ends = np.cumsum([len(p) for p in points])[:-1]
+    return np.array([part.any() for part in np.split(found, ends)])
+
+  def _motion(self) -> tuple[np.ndarray, np.ndarray]:
+    """Returns angular velocity [rad/s] and velocity [m/s], (ngeom, 3) both."""
+    m, d = self._m, self._d
+    body = mjstruct.view(m.geom_bodyid, m.ngeom, np.int32)[self.geoms]
+    root = mjstruct.view(m.body_rootid, m.nbody, np.int32)[body]
+    spin, vel = np.moveaxis(mjstruct.view(d.cvel, (m.nbody, 2, 3))[body], 1, 0)
+    com = mjstruct.view(d.subtree_com, (m.nbody, 3))[root]
+    return spin, vel + np.cross(spin, self._pos - com)
 
 
 def half_lengths(m, geoms: np.ndarray) -> np.ndarray:
   """Returns half the length of the axis of long geoms, 0 of others [m]."""
-  is_long = np.isin(mjstruct.view(m.geom_type, m.ngeom, np.int32)[geoms], _LONG)
+  kind = mjstruct.view(m.geom_type, m.ngeom, np.int32)[geoms]
+  is_long = (kind == _LONG[0]) | (kind == _LONG[1])
   return np.where(is_long, mjstruct.view(m.geom_size, (m.ngeom, 3))[geoms, 1], 0.0)
 
 
@@ -139,12 +188,6 @@ def speeds(m, model: int, data: int, organ, flags: np.ndarray) -> Speeds:
   out.half = wp.array(half_lengths(m, geoms), dtype=wp.float64, device="cpu")
   out.flags = wp.array(flags, dtype=int, device="cpu", copy=False)
   return out
-
-
-def any_inside(point: np.ndarray, pos: np.ndarray, elem: np.ndarray) -> bool:
-  """Returns whether one of some points is inside of a closed surface; arguments as `winding`'s."""
-  point = point[((point > pos.min(axis=0)) & (point < pos.max(axis=0))).all(axis=1)]
-  return bool(len(point)) and bool((winding(point, pos, elem) > 0.5).any())
 
 
 class Watch:

@@ -100,7 +100,7 @@ class Rests(Beside):
     m = mjstruct.Model.from_address(model)
     corner = organ.mesh.rest[organ.mesh.elem]
     edge = np.linalg.norm(corner - corner[:, [1, 2, 0]], axis=2)
-    n, geoms = organ.mesh.nouter, self._geoms(m)
+    n, geoms = coupling.outer(organ), self._geoms(m)
     area = topology.vertex_areas(organ.mesh.rest, organ.mesh.elem)[:n]
     young = float(np.mean(w.config.young))
     flex = int(organ.windows.flex[0])
@@ -111,7 +111,7 @@ class Rests(Beside):
       self._arrays |= {"corner": wp.zeros((n, 3), dtype=int, device="cpu")}
     common = self._arrays | dict(
       ngeom=len(geoms),
-      nouter=n,
+      nouter=organ.mesh.nouter,
       restless=int(bool(self.below) or may_move(m, _body(m, geoms))),
       skin=float(mjstruct.view(m.flex_radius, m.nflex)[flex]),
       cell=2.0 * float(edge.max()),
@@ -155,6 +155,20 @@ class Rests(Beside):
       first=np.zeros(_CELLS),
     )
 
+  def carry(self, group: np.ndarray, member: np.ndarray, share: np.ndarray):
+    """See `Beside`."""
+    if self:
+      slip = self._w.boxes["own"].slip.numpy()
+      slip[member] = slip[group]
+
+  def reshape(self) -> list:
+    """See `Beside`."""
+    if self.any and self._alone is not None:
+      for rests in (self, *(each.rests for each in self.above)):
+        if rests:
+          rests._bind(self._w.model)
+    return []
+
   def find(self):
     """Finds what each node rests on."""
     _launch(_find_geoms, self._alone)
@@ -185,7 +199,7 @@ class Rests(Beside):
     """Returns the force on each vertex in the last step, in the world [N], (nouter, 3)."""
     out = np.zeros((self._w.organ.mesh.nouter, 3))
     if self._arrays:
-      on = self._arrays["on"].numpy() != -1
+      on = np.flatnonzero(self._arrays["on"].numpy()[: len(out)] != -1)
       out[on] = self._arrays["force"].numpy()[on]
     return out
 

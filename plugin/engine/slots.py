@@ -4,6 +4,7 @@
 # pyright: reportInvalidTypeForm=false
 import numpy as np
 import warp as wp
+from palpate.tissue import mesh as topology
 from palpate.tissue import step
 from palpate.tissue.types import doubles, fill, floats, ints, struct
 
@@ -42,8 +43,8 @@ class Slots:
   inertia: doubles("nvert")  # effective inertia, of pinned nodes that of a wall [kg]
   touch: doubles("nvert")  # distance from a geom within which a node's triangles may touch it [m]
   elem: ints("nelem", 3)  # nodes of a triangle
-  near_adr: ints("nvert + 1")  # first of a node's triangles in `near`
-  near: ints("nnear")  # triangles of the nodes
+  begin: ints("nvert")  # first of the triangles whose first corner a node is, -1 for none
+  following: ints("nelem")  # the next one with the same first corner, -1 for none
   frame: doubles(3, 3)  # rotation from the organ's axes to the world's
   origin: doubles(3)  # position of its frame [m]
   heaviest: doubles(1)  # see `Workspace`
@@ -112,7 +113,6 @@ def make(w, model: int, sizes: dict[str, int]):
   margin = float(mjstruct.view(m.flex_margin, m.nflex)[win.flex].max())
   margin += float(mjstruct.view(m.geom_margin, m.ngeom)[win.geom].max(initial=0.0))
   dofs = win.dofadr[:, None] + np.arange(3)
-  adr, near = _around(mesh)
   values = w.boxes | {name: w.views[name] for name in scratch(0, 0)} | dict(
     nvert=sizes["nvert"],
     nslot=sizes["nslot"],
@@ -130,8 +130,8 @@ def make(w, model: int, sizes: dict[str, int]):
     rest=mesh.rest,
     touch=longest + radius,
     elem=mesh.elem,
-    near_adr=adr,
-    near=near,
+    begin=np.full(mesh.nvert, -1),
+    following=np.full(mesh.nelem, -1),
     frame=organ.frame,
     origin=organ.origin,
     heaviest=wp.array(w.heaviest, dtype=wp.float64, device="cpu", copy=False),
@@ -152,29 +152,36 @@ def make(w, model: int, sizes: dict[str, int]):
     status=w.host["status"],
     mj=coupling.mujoco_arrays(model, w.data),
   )  # fmt: skip
-  return fill(Slots, "cpu", values)
+  out = fill(Slots, "cpu", values)
+  _list_triangles(out, mesh, np.arange(mesh.nvert), np.arange(mesh.nelem))
+  return out
 
 
-def reshape(w, slots, touched: np.ndarray):
-  """Gives slots the mesh and the masses that the organ has now; triangles keep their number."""
+def reshape(w, slots, vert: np.ndarray):
+  """Gives slots the mesh and the masses that vertices have now; triangles keep their number."""
   organ, mesh, m = w.organ, w.organ.mesh, mjstruct.Model.from_address(w.model)
   radius = float(mjstruct.view(m.flex_radius, m.nflex)[organ.windows.flex].max())
-  slots.rest.numpy()[:] = mesh.rest
-  slots.elem.numpy()[:] = mesh.elem
-  arm = mesh.rest[mesh.ring[touched]] - mesh.rest[touched][:, None]
-  longest = np.where(mesh.ring[touched] >= 0, np.linalg.norm(arm, axis=2), 0.0).max(axis=1)
-  slots.touch.numpy()[touched] = longest + radius
-  slots.node_mass.assign(hold(organ, organ.mass))
-  adr, near = _around(mesh)
-  slots.near_adr.assign(adr.astype(np.int32))
-  slots.near.assign(near.astype(np.int32))
+  elem = topology.around(mesh, vert)
+  slots.rest.numpy()[vert] = mesh.rest[vert]
+  slots.elem.numpy()[elem] = mesh.elem[elem]
+  arm = mesh.rest[mesh.ring[vert]] - mesh.rest[vert][:, None]
+  length = np.where(mesh.ring[vert] >= 0, np.linalg.norm(arm, axis=2), 0.0)
+  slots.touch.numpy()[vert] = length.max(axis=1) + radius
+  slots.node_mass.numpy()[vert] = hold(organ, organ.mass)[vert]
+  _list_triangles(slots, mesh, vert, elem)
 
 
-def _around(mesh) -> tuple[np.ndarray, np.ndarray]:
-  """Returns the first of each node's triangles, (nvert + 1,), and all of these, (3 nelem,)."""
-  count = np.bincount(mesh.elem.ravel(), minlength=mesh.nvert)
-  adr = np.concatenate([[0], np.cumsum(count)])
-  return adr, np.argsort(mesh.elem.ravel(), kind="stable") // 3
+def _list_triangles(slots, mesh, vert: np.ndarray, elem: np.ndarray):
+  """Lists the triangles whose first corners these vertices are; `elem`: all that they have."""
+  begin, following = slots.begin.numpy(), slots.following.numpy()
+  first = mesh.elem[elem, 0]
+  elem = elem[np.isin(first, vert)]
+  order = np.lexsort((elem, mesh.elem[elem, 0]))
+  elem = elem[order]
+  first = mesh.elem[elem, 0]
+  begin[vert] = -1
+  begin[first[::-1]] = elem[::-1]
+  following[elem] = np.append(np.where(first[1:] == first[:-1], elem[1:], -1), -1)[: len(elem)]
 
 
 def hold(organ, inertia: np.ndarray) -> np.ndarray:

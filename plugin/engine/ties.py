@@ -12,10 +12,13 @@ from typing import Any
 
 import numpy as np
 import warp as wp
+from palpate.tissue import mesh as topology
+from palpate.tissue.mesh import Mesh
 from palpate.tissue.step import SCHEMES
 from palpate.tissue.types import DIMS, doubles, fill, ints, struct, vector
 
 from . import coupling, mjstruct
+from .follow import Grip, Held, pairs
 from .hold import Beside, Bodies, Input, Nodes, base, may_move, nodes, solver
 
 TO_POINT, TO_OWN_MOTION = -1, -2  # in place of a body
@@ -57,22 +60,59 @@ class Group:
   """Ties that were made together.
 
   Attributes:
-    vert: vertices                                        (n,)
+    own: workspace of the organ
+    grip: its vertices that were tied
     body: body that they lead to, or a number below 0 for what `native/ties.h` has besides
-    stiffness: of each [N/m]                              (n,)
-    anchor: points in the body's frame, or for another organ what their vertices are off [m] (n, 3)
+    made: as they were made: stiffness of each [N/m] (n,), points in the body's frame, or for
+      another organ what their vertices are off [m] (n, 3), and the axes of these in the organ's
+      (3, 3)
     other: workspace of the other organ, or None
-    pair: its vertices                                    (n,)
+    theirs: its vertices
     by: key of the configuration that declares it, or "" where it was made while running
+    vert: vertices that they are on now                   (n,)
+    stiffness: of each [N/m]                              (n,)
+    anchor: as in `made`, now [m]                         (n, 3)
+    pair: the other organ's vertices                      (n,)
   """
 
-  vert: np.ndarray
+  own: Any
+  grip: Grip
   body: int
-  stiffness: np.ndarray
-  anchor: np.ndarray
+  made: dict[str, np.ndarray]
   other: Any = None
-  pair: np.ndarray | None = None
+  theirs: Grip | None = None
   by: str = ""
+  vert: np.ndarray = dataclasses.field(init=False)
+  stiffness: np.ndarray = dataclasses.field(init=False)
+  anchor: np.ndarray = dataclasses.field(init=False)
+  pair: np.ndarray | None = dataclasses.field(default=None, init=False)
+
+  def __post_init__(self):
+    self.find()
+
+  def find(self):
+    """Finds what became of the vertices."""
+    organ, made = self.own.organ, self.made
+    held = self.grip.now(organ.mesh)
+    share, shift = held.share, held.shift @ made["turn"].T
+    if self.other is not None and self.theirs is not None:
+      other = self.other.organ
+      far = self.theirs.now(other.mesh)
+      k, j = pairs(held, far)
+      held, self.pair = Held(held.row[k], held.vert[k], held.share[k], held.shift[k]), far.vert[j]
+      share, shift = share[k] * far.share[j], shift[k] - far.shift[j] @ other.frame.T
+    elif self.by == "carrier":  # the bed lets go of what is cut free
+      share = share * _held_share(organ.mesh, held.vert, organ.config.pin)
+    self.vert, self.stiffness = held.vert, made["stiffness"][held.row] * share
+    self.anchor = made["anchor"][held.row] + shift
+
+
+def _held_share(mesh: Mesh, vert: np.ndarray, pins: tuple[int, ...]) -> np.ndarray:
+  """Returns the shares of vertices' areas that the foundation holds; all of those of pins."""
+  if mesh.loose is None:
+    return np.ones(len(vert))
+  held = topology.areas_of(mesh, vert, held=True) / topology.areas_of(mesh, vert)
+  return np.where(np.isin(vert, pins), 1.0, held)
 
 
 class Ties(Beside):
@@ -98,7 +138,7 @@ class Ties(Beside):
     total = sum(len(group.vert) for group in groups)
     grown = total > self._room
     if grown:
-      self._room = max(_LEAST, 2 * total)
+      self._room = max(_LEAST, 2 * total) + len(groups) * self._w.organ.mesh.spare
       self._allocate()
     if self._room:
       self._write(total)
@@ -127,10 +167,29 @@ class Ties(Beside):
   def _moves(self, body: int) -> bool:
     return body < 0 or may_move(mjstruct.Model.from_address(self._w.model), body)
 
-  def reshape(self):
-    """Takes the rest positions that the organ has now."""
+  def reshape(self) -> list:
+    """See `Beside`."""
     if self._tied is not None:
-      self._tied.own.rest.assign(base(self._w.organ))
+      self._tied.own.rest.numpy()[:] = base(self._w.organ)
+    spaces = [self._w, *{id(g.other): g.other for g in self.groups if g.other}.values()]
+    grown = []
+    for w in spaces:
+      groups = [g for g in w.ties.groups if w is self._w or g.other is self._w]
+      for group in groups:
+        group.find()
+      if groups and w.ties.put(w.ties.groups):
+        grown.append(w)
+    return grown
+
+  def springs(self) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Returns vertices, stiffness [N/m], and last stretch in the organ's frame [m] of its ties."""
+    out, start = [], 0
+    for group in self.groups:
+      stop = start + len(group.vert)
+      stiff = np.maximum(group.stiffness, 1e-30)[:, None]
+      out.append((group.vert, group.stiffness, -self._arrays["force"].numpy()[start:stop] / stiff))
+      start = stop
+    return out
 
   def load(self):
     """See `Beside`."""

@@ -76,13 +76,10 @@ class Phases(coupling.Phases):
 
   def reshape(self, touched: np.ndarray | None = None):
     """Takes the mesh and the masses that the organ has now."""
-    organ, nodes_ = self._w.organ, self._nodes
-    touched = np.arange(organ.mesh.nvert) if touched is None else touched
+    touched = np.arange(self._w.organ.mesh.nvert) if touched is None else touched
     slots.reshape(self._w, self._slots, touched)
     share_inertia(self._w)
-    nodes_.rest.assign(organ.mesh.rest)
-    nodes_.nouter = organ.mesh.nouter
-    nodes.weigh(self._w, nodes_)
+    nodes.reshape(self._w, self._nodes, touched)
     wake(self._w)
 
   def motion(self) -> tuple[np.ndarray, np.ndarray]:
@@ -277,7 +274,7 @@ def set_inertia(w, m):
 def share_inertia(w):
   """Gives vertices that were one their part of its inertia."""
   nodal = w.views["whole"]
-  w.views["inertia"].assign(slots.hold(w.organ, w.cuts.share(nodal) if w.cuts else nodal))
+  w.views["inertia"].numpy()[:] = slots.hold(w.organ, w.cuts.share(nodal) if w.cuts else nodal)
 
 
 def shortage(w) -> str | None:

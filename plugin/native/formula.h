@@ -17,6 +17,9 @@ namespace palpate {
 // them, and the share of it that does not cancel; and the most that it may make more in a step.
 constexpr double CHANGE = 0.005, COHERENT = 0.7, FASTER = 2.0;
 
+// Time without motion and force after which an organ sleeps [s].
+constexpr double QUIET = 0.2;
+
 PALPATE bool touched(D3 contact) { return contact != D3{0.0, 0.0, 0.0}; }
 
 // What MuJoCo adds to a node's dofs by itself, in the organ's frame: forces along them, and one on

@@ -20,9 +20,24 @@ PALPATE V fastest(const Fields& f, const float* vel, int s, Lane lane) {
   return most;
 }
 
+// Whether the nodes are so slow that no edge changes by more than AHEAD in a step, whichever way
+// they move: seen without neighbours, and nearly always so. Not where threads share the nodes.
+template <class Fields>
+PALPATE bool slow(const Fields& f, const float* vel, float h) {
+  if (BLOCKS) return false;
+  V most = splat(0.0f);
+  for (int s = 0; s < f.shape.nslice; ++s) {
+    const V3 v = ld3(vel + 24 * s, Lane());
+    most = vmax(most, dot(v, v));
+  }
+  const float speed = AHEAD * f.shape.shortest / (2.0f * h);
+  return !any_above(most, speed * speed);
+}
+
 template <class Fields>
 PALPATE void edge_change(const Fields& f, Thread t, int) {
   const float* vel = f.state.vel.data + 24 * (size_t)t.world * f.shape.nslice;
+  if (slow(f, vel, f.state.step.data[4 * t.world])) return;
   each_slice(t, f.shape.nslice, [&](int s, Lane lane) {
     put_most(f.system.change.data + t.world, fastest(f, vel, s, lane));
   });
@@ -34,16 +49,35 @@ PALPATE float share_ahead(float h, float change) {
   return most > AHEAD ? AHEAD / most : 1.0f;
 }
 
+// Puts the trial state of a slice, also where tetrahedra gather it.
+template <class Fields>
+PALPATE void stand(const Fields& f, size_t at, V3 u, V3 v, Lane lane) {
+  st3(f.system.disp_trial.data + 24 * at, u, lane);
+  st3(f.system.vel_trial.data + 24 * at, v, lane);
+  if (!f.shape.ntetslice) return;
+  share(f.system.node_disp.data + 32 * at, u, lane);
+  share(f.system.node_vel.data + 32 * at, v, lane);
+}
+
+// The trial state is the present one.
+template <class Fields>
+PALPATE void stay(const Fields& f, Thread t, int) {
+  each_slice(t, f.shape.nslice, [&](int s, Lane lane) {
+    const size_t at = (size_t)t.world * f.shape.nslice + s;
+    const V3 u = ld3(f.state.disp.data + 24 * at, lane);
+    stand(f, at, u, ld3(f.state.vel.data + 24 * at, lane), lane);
+  });
+}
+
 // Where the first Newton iteration stands.
 template <class Fields>
 PALPATE void predict(const Fields& f, Thread t, int) {
   float* step = f.state.step.data + 4 * t.world;
   const float h = step[0], share = share_ahead(h, f.system.change.data[t.world]);
   each_slice(t, f.shape.nslice, [&](int s, Lane lane) {
-    const size_t at = 24 * ((size_t)t.world * f.shape.nslice + s);
-    const V3 v = ld3(f.state.vel.data + at, lane);
-    st3(f.system.vel_trial.data + at, v, lane);
-    st3(f.system.disp_trial.data + at, ld3(f.state.disp.data + at, lane) + share * h * v, lane);
+    const size_t at = (size_t)t.world * f.shape.nslice + s;
+    const V3 v = ld3(f.state.vel.data + 24 * at, lane);
+    stand(f, at, ld3(f.state.disp.data + 24 * at, lane) + share * h * v, v, lane);
   });
   if (t.tid == 0) step[3] = share;
 }
@@ -53,14 +87,13 @@ template <class Fields>
 PALPATE void newton_update(const Fields& f, Thread t, int flags) {
   const float h = f.state.step.data[4 * t.world];
   each_slice(t, f.shape.nslice, [&](int s, Lane lane) {
-    const size_t at = 24 * ((size_t)t.world * f.shape.nslice + s);
+    const size_t own = (size_t)t.world * f.shape.nslice + s, at = 24 * own;
     V3 dv = ld3(f.system.sol.data + at, lane);
     if (!(flags & IS_FIRST)) dv += ld3(f.state.dvel.data + at, lane);
     st3(f.state.dvel.data + at, dv, lane);
     if (flags & IS_MORE) {
       const V3 v = ld3(f.state.vel.data + at, lane) + dv;
-      st3(f.system.vel_trial.data + at, v, lane);
-      st3(f.system.disp_trial.data + at, ld3(f.state.disp.data + at, lane) + h * v, lane);
+      stand(f, own, ld3(f.state.disp.data + at, lane) + h * v, v, lane);
     }
   });
 }

@@ -130,7 +130,7 @@ PALPATE M3 ld9(const float* p, Lane lane) {
 }
 
 #if !ON_CUDA
-// Quads: x, y, z and 0 of a node side by side, at four times its offset in vectors of slices. Eight
+// Quads: x, y, z and w, or 0, of a node side by side, at four times its offset in vectors of slices. Eight
 // of them are read in eight loads and seven shuffles, where gather3 takes 24 and 21; on the CPU
 // gathering is most of an iteration.
 #define PICK __builtin_shufflevector
@@ -144,14 +144,18 @@ PALPATE V lows(V a, V b) { return PICK(a, b, 0, 8, 1, 9, 4, 12, 5, 13); }
 PALPATE V highs(V a, V b) { return PICK(a, b, 2, 10, 3, 11, 6, 14, 7, 15); }
 PALPATE V fronts(V a, V b) { return PICK(a, b, 0, 1, 8, 9, 4, 5, 12, 13); }
 PALPATE V backs(V a, V b) { return PICK(a, b, 2, 3, 10, 11, 6, 7, 14, 15); }
-PALPATE V3 gather_quads(const float* quads, const int* at) {
+PALPATE V3 gather_quads(const float* quads, const int* at, V& w) {
   const V a = two_quads(quads, at, 0), b = two_quads(quads, at, 1);
   const V c = two_quads(quads, at, 2), d = two_quads(quads, at, 3);
-  const V ab = lows(a, b), cd = lows(c, d);
-  return {fronts(ab, cd), backs(ab, cd), fronts(highs(a, b), highs(c, d))};
+  const V ab = lows(a, b), cd = lows(c, d), ab2 = highs(a, b), cd2 = highs(c, d);
+  w = backs(ab2, cd2);
+  return {fronts(ab, cd), backs(ab, cd), fronts(ab2, cd2)};
 }
-PALPATE void put_quads(float* quads, V3 v) {
-  const V w = {};
+PALPATE V3 gather_quads(const float* quads, const int* at) {
+  V w;
+  return gather_quads(quads, at, w);
+}
+PALPATE void put_quads(float* quads, V3 v, V w = V{}) {
   const V xy = lows(v.x, v.y), zw = lows(v.z, w), xy2 = highs(v.x, v.y), zw2 = highs(v.z, w);
   const V a = fronts(xy, zw), b = backs(xy, zw), c = fronts(xy2, zw2), d = backs(xy2, zw2);
   st(quads, 0, PICK(a, b, 0, 1, 2, 3, 8, 9, 10, 11), Lane());
@@ -162,17 +166,46 @@ PALPATE void put_quads(float* quads, V3 v) {
 #undef PICK
 #endif
 
-// Vectors that others gather: numbered, each with room for four numbers. Vector i of eight that begin
+// Vectors that others gather: numbered, each with room for a fourth number. Vector i of eight that begin
 // at 8 n starts at 4 i on the CPU, as quads, and at 32 n + i on CUDA, as rows.
 #if ON_CUDA
-PALPATE V3 gather_shared(const float* p, const int* at, Lane lane) {
+PALPATE V3 gather_shared(const float* p, const int* at, V& w, Lane lane) {
   p += 4 * LANES * (at[lane] / LANES) + at[lane] % LANES;
+  w = p[3 * LANES];
   return {p[0], p[LANES], p[2 * LANES]};
 }
 PALPATE void share(float* p, V3 a, Lane lane) { st3(p, a, lane); }
+PALPATE void share(float* p, V3 a, V w, Lane lane) { share(p, a, lane); st(p, 3, w, lane); }
 #else
-PALPATE V3 gather_shared(const float* p, const int* at, Lane) { return gather_quads(p, at); }
+PALPATE V3 gather_shared(const float* p, const int* at, V& w, Lane) {
+  return gather_quads(p, at, w);
+}
 PALPATE void share(float* p, V3 a, Lane) { put_quads(p, a); }
+PALPATE void share(float* p, V3 a, V w, Lane) { put_quads(p, a, w); }
+#endif
+PALPATE V3 gather_shared(const float* p, const int* at, Lane lane) {
+  V w;
+  return gather_shared(p, at, w, lane);
+}
+
+// Two numbers in one, of eight bits each, and these again.
+#if ON_CUDA
+PALPATE V two(V a, V b) {
+  return __uint_as_float((__float_as_uint(a) + 0x8000u & 0xffff0000u)
+                         | (__float_as_uint(b) + 0x8000u >> 16));
+}
+PALPATE V first_of(V pair) { return __uint_as_float(__float_as_uint(pair) & 0xffff0000u); }
+PALPATE V second_of(V pair) { return __uint_as_float(__float_as_uint(pair) << 16); }
+#else
+typedef unsigned Bits __attribute__((ext_vector_type(8)));
+PALPATE V two(V a, V b) {
+  const Bits x = __builtin_bit_cast(Bits, a) + 0x8000u, y = __builtin_bit_cast(Bits, b) + 0x8000u;
+  return __builtin_bit_cast(V, (x & 0xffff0000u) | (y >> 16));
+}
+PALPATE V first_of(V pair) {
+  return __builtin_bit_cast(V, __builtin_bit_cast(Bits, pair) & 0xffff0000u);
+}
+PALPATE V second_of(V pair) { return __builtin_bit_cast(V, __builtin_bit_cast(Bits, pair) << 16); }
 #endif
 
 // Numbers.
@@ -186,6 +219,12 @@ PALPATE V vmin(V a, V b) { return fminf(a, b); }
 PALPATE V vsqrt(V a) { return __builtin_elementwise_sqrt(a); }
 PALPATE V vmax(V a, V b) { return __builtin_elementwise_max(a, b); }
 PALPATE V vmin(V a, V b) { return __builtin_elementwise_min(a, b); }
+#endif
+// Whether any of eight numbers on the CPU, or this one, is above another.
+#if ON_CUDA
+PALPATE bool any_above(V a, float least) { return a > least; }
+#else
+PALPATE bool any_above(V a, float least) { return __builtin_reduce_max(a) > least; }
 #endif
 template <class C>
 PALPATE V select(C condition, V a, V b) { return condition ? a : b; }

@@ -4,8 +4,6 @@
 
 namespace palpate {
 
-// Time without motion and force after which an organ sleeps [s].
-constexpr double QUIET = 0.2;
 // A triangle that may be the nearest to a tool is sampled at this many points along an edge. No
 // point of a triangle is farther from a corner than its longest edge over the root of 3.
 constexpr int FINE = 16;
@@ -57,10 +55,10 @@ PALPATE double clearance(const Fields& f) {
     for (int q = 0; q < count; ++q) f.claim.data[node_at(q)] = q;
     for (int q = 0; q < count; ++q) {
       const int i = node_at(q);
-      for (int t = f.near_adr.data[i]; t < f.near_adr.data[i + 1]; ++t) {
-        const int* e = f.elem.data + 3 * f.near.data[t];
+      for (int t = f.begin.data[i]; t >= 0; t = f.following.data[t]) {
+        const int* e = f.elem.data + 3 * t;
         const int b = f.claim.data[e[1]], c = f.claim.data[e[2]];
-        if (e[0] != i || b < 0 || c < 0) continue;
+        if (b < 0 || c < 0) continue;
         const double* corner[3] = {record + RECORD_LENGTH * q, record + RECORD_LENGTH * b,
                                    record + RECORD_LENGTH * c};
         const double at = clearance(f, w, corner, least);

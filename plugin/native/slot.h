@@ -71,9 +71,8 @@ PALPATE void list_triangles(const Fields& f) {
     for (int k = first; k < last; ++k) {
       const int i = f.placed.data[k];
       if (i < 0) continue;
-      for (int q = f.near_adr.data[i]; q < f.near_adr.data[i + 1]; ++q) {
-        const int* e = f.elem.data + 3 * f.near.data[q];
-        if (e[0] != i) continue;
+      for (int t = f.begin.data[i]; t >= 0; t = f.following.data[t]) {
+        const int* e = f.elem.data + 3 * t;
         const int b = f.taken.data[e[1]], c = f.taken.data[e[2]];
         if (b < first || b >= last || c < first || c >= last) continue;
         if (count == most) {

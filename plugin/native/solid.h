@@ -35,10 +35,10 @@ PALPATE M3 cofactors(const M3& a) {
 // Gradient of a vector field in a tetrahedron, sum_k x_k g_k^T over its corners 1, 2, 3, relative to
 // corner 0.
 PALPATE M3 gradient(const float* field, const int* node, const float* g, Lane lane) {
-  const V3 x0 = gather3(field, node, lane);
-  const M3 a = outer(gather3(field, node + 8, lane) - x0, ld3(g, 0, lane));
-  const M3 b = outer(gather3(field, node + 16, lane) - x0, ld3(g, 3, lane));
-  return a + b + outer(gather3(field, node + 24, lane) - x0, ld3(g, 6, lane));
+  const V3 x0 = gather_shared(field, node, lane);
+  const M3 a = outer(gather_shared(field, node + 8, lane) - x0, ld3(g, 0, lane));
+  const M3 b = outer(gather_shared(field, node + 16, lane) - x0, ld3(g, 3, lane));
+  return a + b + outer(gather_shared(field, node + 24, lane) - x0, ld3(g, 6, lane));
 }
 
 // Changes of volume: j, and c with cof F = I + c.
@@ -57,12 +57,12 @@ template <class Fields>
 PALPATE void tet_strain(const Fields& f, Thread t, int stage) {
   const float* step = f.state.step.data + 4 * t.world;
   const float h = step[0], gv = weight_of_rate(stage, step);
-  const size_t base = 24 * (size_t)t.world * f.shape.nslice;
+  const size_t base = 32 * (size_t)t.world * f.shape.nslice;
   each_slice(t, f.shape.ntetslice, [&](int s, Lane lane) {
     const int* node = f.shape.tet_node.data + 32 * s;
     const float* g = f.shape.tet_gradient.data + 72 * s;
-    const M3 H = gradient(f.system.disp_trial.data + base, node, g, lane);
-    const M3 rate = gradient(f.system.vel_trial.data + base, node, g, lane);
+    const M3 H = gradient(f.system.node_disp.data + base, node, g, lane);
+    const M3 rate = gradient(f.system.node_vel.data + base, node, g, lane);
     const Swelling now = swelling(H);
     const size_t at = (size_t)t.world * f.shape.ntetslice + s;
     st9(f.system.tet_arm.data + 128 * at, H, lane);
@@ -81,30 +81,49 @@ PALPATE void node_pressure(const Fields& f, Thread t, int) {
     for (int k = row; k < row + width; ++k)
       sum += ld(f.shape.around_share.data, k, lane)
         * gather(strain, f.shape.around_tet.data + 8 * k, 0, lane);
-    st(f.system.node_pressure.data, 3 * (t.world * f.shape.nslice + s),
+    st(f.system.node_pressure.data + 8 * (size_t)t.world * f.shape.nslice, s,
        ld(f.tissue.pressure_gain.data, s, lane) * sum, lane);
   });
 }
 
 // The rotation nearest to F, by Newton's iteration with Higham's scaling (Higham 1986,
-// doi:10.1137/0907079): three of them, of a stretch of two to 1e-3, for the matrix alone. Of a
-// tetrahedron inside out it is a reflection, which serves as well.
-PALPATE M3 turn(M3 x) {
-  for (int k = 0; k < 3; ++k) {
-    const M3 cof = cofactors(x);
-    const V det = x.xx * cof.xx + x.xy * cof.xy + x.xz * cof.xz;
-    const V size2 = inner(x, x), cof2 = inner(cof, cof);
+// doi:10.1137/0907079): two or three of them, of a stretch of two to 1e-3, for the matrix and damping
+// alone. Of a tetrahedron inside out it is a reflection, which serves as well.
+struct Turn {
+  M3 x, cof;
+  V det, size2;  // of x
+
+  // One more; the last is near enough to do without scaling.
+  PALPATE void next(bool scaled) {
     const V least = 1e-4f * size2 * vsqrt(size2) + 1e-30f, zero = splat(0.0f);
     const V d = select(det < zero, vmin(det, -least), vmax(det, least));
-    // The last round is near enough to do without.
-    const V scale = k > 1 ? splat(1.0f) : vsqrt(vsqrt(cof2 / (d * d * vmax(size2, splat(1e-30f)))));
+    const V part = inner(cof, cof) / (d * d * vmax(size2, splat(1e-30f)));
+    const V scale = scaled ? vsqrt(vsqrt(part)) : splat(1.0f);
     x = (0.5f * scale) * x + (0.5f / (scale * d)) * cof;
   }
-  return x;
+  PALPATE void measure() {
+    cof = cofactors(x);
+    det = x.xx * cof.xx + x.xy * cof.xy + x.xz * cof.xz;
+  }
+};
+
+PALPATE M3 turn(const M3& F, const M3& cof, V det, V size2) {
+  constexpr float NEAR = 0.03f;  // of the squares of the stretches, of 3: the last makes 1e-4 of it
+  Turn turn = {F, cof, det, size2};
+  turn.next(true);
+  turn.measure();
+  turn.size2 = inner(turn.x, turn.x);
+  if (any_above(turn.size2, 3.0f + NEAR)) {
+    turn.next(true);
+    turn.measure();
+    turn.size2 = inner(turn.x, turn.x);
+  }
+  turn.next(false);
+  return turn.x;
 }
 
 // What a tetrahedron gives to its corners: impulses, and for the matrix its turned gradients times
-// the root of its volume with the moduli lambda, mu and tension.
+// the root of g volume and of the modulus mu, beside which are lambda and 1 + tension over mu.
 //
 // The matrix is that of small strains in the turned frame, which leaves rotations free. A change of
 // volume C : dF hangs on the faces: their mean is in lambda, and what they differ by is covered by an
@@ -115,9 +134,9 @@ PALPATE M3 turn(M3 x) {
 template <class Fields>
 PALPATE void tet_stress(const Fields& f, Thread t, int stage) {
   const float* step = f.state.step.data + 4 * t.world;
-  const float h = step[0], gv = weight_of_rate(stage, step);
+  const float h = step[0], weight = step[1], gv = weight_of_rate(stage, step);
   const bool implicit = stage == FIRST || stage == LATER;
-  const float* pressure = f.system.node_pressure.data + 24 * (size_t)t.world * f.shape.nslice;
+  const float* pressure = f.system.node_pressure.data + 8 * (size_t)t.world * f.shape.nslice;
   each_slice(t, f.shape.ntetslice, [&](int s, Lane lane) {
     const int* node = f.shape.tet_node.data + 32 * s;
     const float* g = f.shape.tet_gradient.data + 72 * s;
@@ -129,61 +148,54 @@ PALPATE void tet_stress(const Fields& f, Thread t, int stage) {
     const M3 H = ld9(arm, lane), rate = ld9(impulse, lane);
     const Swelling now = swelling(H);
     const M3 F = H + splat(1.0f), C = now.c + splat(1.0f);
-    const V i = 2.0f * trace(H) + inner(H, H), i4 = 4.0f + i;
-    // Mean pressure of the corners.
+    const V i = 2.0f * trace(H) + inner(H, H), size2 = 3.0f + i;
+    // Mean pressure of the corners, and with the tetrahedron's own.
     V p = splat(0.0f);
     for (int k = 0; k < 4; ++k) p += gather(pressure, node + 8 * k, 0, lane);
-    p = 0.25f * p;
-    const M3 still = 0.75f * mu * (H + splat(-1.0f) * now.c) + (0.25f * mu * i / i4) * F
-      + lam * now.j * C;
-    const M3 Q = turn(F), strain = transposed(Q) * rate;
-    const M3 moving = Q * (0.75f * mu * (strain + transposed(strain))
-      + (lam - 0.625f * mu) * trace(strain));
-    const M3 P = splat(h) * still + splat(gv) * moving + p * C;
+    p = 0.25f * p + (h * lam) * now.j;
+    const M3 stress = (0.75f * h * mu) * (H + splat(-1.0f) * now.c)
+      + (0.25f * h * mu * i / (4.0f + i)) * F + p * C;
+    const M3 Q = turn(F, C, now.j + 1.0f, size2), strain = transposed(Q) * rate;
+    const M3 moving = (0.75f * gv * mu) * (strain + transposed(strain))
+      + gv * (lam - 0.625f * mu) * trace(strain);
+    const M3 P = splat(-1.0f) * volume * (stress + Q * moving);
     const V3 g1 = ld3(g, 0, lane), g2 = ld3(g, 3, lane), g3 = ld3(g, 6, lane);
-    const V3 b1 = -volume * (P * g1), b2 = -volume * (P * g2), b3 = -volume * (P * g3);
+    const V3 b1 = P * g1, b2 = P * g2, b3 = P * g3;
     share(impulse, splat(-1.0f) * (b1 + b2 + b3), lane);
     share(impulse + 32, b1, lane);
     share(impulse + 64, b2, lane);
     share(impulse + 96, b3, lane);
     if (!implicit) return;
-    const V root = vsqrt(volume);
-    const V3 a1 = root * (Q * g1), a2 = root * (Q * g2), a3 = root * (Q * g3);
-    share(arm, splat(-1.0f) * (a1 + a2 + a3), lane);
-    share(arm + 32, a1, lane);
-    share(arm + 64, a2, lane);
-    share(arm + 96, a3, lane);
-    const M3 stress = still + (p / h) * C;
-    const V mean = inner(Q, stress) / 3.0f;
-    const V rest = vmax(inner(stress, stress) - 3.0f * mean * mean, splat(0.0f));
-    const V even = inner(Q, C) / 3.0f, whole = lam - 0.625f * mu + ld(moduli, 3, lane);
-    const V uneven = vmax(inner(C, C) - 3.0f * even * even, splat(0.0f));
-    const V squeezed = vmax(-lam * now.j - p / h, splat(0.0f)) * vsqrt(inner(F, F) / 3.0f);
-    const V shear = 0.75f * mu + squeezed;
-    share(f.system.tet_now.data + 32 * at,
-          {whole * even * even, shear,
-           vmax(mean + 0.40825f * vsqrt(rest), splat(0.0f)) + whole * uneven}, lane);
+    const V zero = splat(0.0f), mean = inner(Q, stress) / 3.0f, even = inner(Q, C) / 3.0f;
+    const V rest = vmax(inner(stress, stress) - 3.0f * mean * mean, zero);
+    const V uneven = vmax(inner(C, C) - 3.0f * even * even, zero);
+    const V whole = lam - 0.625f * mu + ld(moduli, 3, lane);
+    const V shear = 0.75f * mu + vmax(-p, zero) * vsqrt(size2 / 3.0f) / h;
+    const V tension = vmax(mean + 0.40825f * vsqrt(rest), zero) / h + whole * uneven;
+    const V beside = two(whole * even * even / shear, 1.0f + tension / shear);
+    const M3 scaled = vsqrt(weight * volume * shear) * Q;
+    const V3 a1 = scaled * g1, a2 = scaled * g2, a3 = scaled * g3;
+    share(arm, splat(-1.0f) * (a1 + a2 + a3), beside, lane);
+    share(arm + 32, a1, beside, lane);
+    share(arm + 64, a2, beside, lane);
+    share(arm + 96, a3, beside, lane);
   });
 }
 
 // The blocks of each edge, one for either end, from the tetrahedra around it.
 template <class Fields>
 PALPATE void edge_block(const Fields& f, Thread t, int) {
-  const float g = f.state.step.data[4 * t.world + 1];
-  const size_t tet = (size_t)t.world * f.shape.ntetslice;
-  const float* arm = f.system.tet_arm.data + 128 * tet;
-  const float* moduli = f.system.tet_now.data + 32 * tet;
+  const float* arm = f.system.tet_arm.data + 128 * (size_t)t.world * f.shape.ntetslice;
   float* out = f.system.block.data + 72 * (size_t)t.world * f.shape.nslot;
   each_slice(t, f.shape.nedgeslice, [&](int s, Lane lane) {
     const V zero = splat(0.0f);
     M3 block = {zero, zero, zero, zero, zero, zero, zero, zero, zero};
     for (int k = f.shape.edge_adr.data[s]; k < f.shape.edge_adr.data[s + 1]; ++k) {
-      const V3 now = gather_shared(moduli, f.shape.edge_tet.data + 8 * k, lane);
-      const V3 a = gather_shared(arm, f.shape.edge_from.data + 8 * k, lane);
+      V beside;
+      const V3 a = gather_shared(arm, f.shape.edge_from.data + 8 * k, beside, lane);
       const V3 c = gather_shared(arm, f.shape.edge_to.data + 8 * k, lane);
-      block = block + outer(now.x * a, c) + outer(now.y * c, a) + (now.y + now.z) * dot(a, c);
+      block = block + outer(first_of(beside) * a, c) + outer(c, a) + second_of(beside) * dot(a, c);
     }
-    block = splat(g) * block;
     const int* at = f.shape.edge_slot.data + 16 * s;
     put9(out, at, block, lane);
     put9(out, at + 8, transposed(block), lane);

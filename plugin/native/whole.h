@@ -96,10 +96,16 @@ PALPATE void stand_ahead(const Fields& f, int world, Team& group, const Mine& sl
   meet_block();
 }
 
-// The step, or with RESPONSE the answer to the impulses in `rhs`, for which the matrix is made anew.
+// The step, or with RESPONSE the answer to the impulses in `rhs`, for which the matrix is made anew;
+// nothing of a world whose step has no length.
 template <class Fields>
 PALPATE void step_world(const Fields& f, Thread t, int stage) {
   using Mine = Slices<OWN>;
+  if (f.state.step.data[4 * t.world] == 0.0f) {
+    float* status = f.system.status.data + 4 * t.world;
+    if (t.tid == 0) status[0] = status[1] = status[3] = 0.0f;
+    return;
+  }
   const size_t base = 24 * (size_t)t.world * f.shape.nslice;
   Group<SUMS> group(t, f.system.partial.data);
   const Mine slices(group, f.shape.nslice);

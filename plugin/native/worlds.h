@@ -3,6 +3,9 @@
 //
 // The coupling is that of `formula.h`. Slots move along the world's axes and their bodies have no
 // place of their own, so qpos is where they are; vectors of nodes are in the organ's frame.
+//
+// An organ that has been at rest for QUIET, with no tool so near that a node may get a slot, sleeps:
+// its step has no length until one comes, or something of the world changes.
 #pragma once
 #include "formula.h"
 #include "geom.h"
@@ -44,6 +47,17 @@ PALPATE bool succeeded(const Fields& f, int world) {
   return f.solve.status.data[4 * world + 3] == 0.0f;
 }
 
+// Whether a world's organ would sleep if no tool were near, and whether it does, known once `rank` has
+// run.
+template <class Fields>
+PALPATE bool is_calm(const Fields& f, int world) {
+  return f.sleeps && f.calm.data[world] >= QUIET;
+}
+template <class Fields>
+PALPATE bool sleeps(const Fields& f, int world) {
+  return f.solve.step.data[4 * world] == 0.0f;
+}
+
 // The inertia that a tool meets at a node, which follows the scales of Young's modulus and of mass.
 template <class Fields>
 PALPATE double inertia_of(const Fields& f, int world, int i) {
@@ -59,10 +73,14 @@ PALPATE double inertia_of(const Fields& f, int world, int i) {
   return touched(force) && f.heavier.data[world] > 1.0 ? f.heavier.data[world] * total : total;
 }
 
-// Writes where the tools are, in the organ's frame.
+// Writes where the tools are, in the organ's frame, and how long the organ has been at rest.
 template <class Fields>
 PALPATE void tell_tools(const Fields& f, Thread t, int) {
-  if (t.tid == 0) f.count.data[t.world] = f.missed.data[t.world] = 0;
+  if (t.tid == 0) {
+    f.count.data[t.world] = f.missed.data[t.world] = 0;
+    f.calm.data[t.world] = f.stirred.data[t.world] ? 0.0 : f.calm.data[t.world] + f.h;
+    f.stirred.data[t.world] = 0;
+  }
   each_item(t, f.ntool, [&](int q) {
     const size_t g = (size_t)t.world * f.ngeom + f.tool_geom.data[q];
     const float* R = (const float*)f.geom_xmat.data + 9 * g;
@@ -112,10 +130,12 @@ PALPATE int candidates(const Fields& f, int world) {
 }
 
 // Chooses the candidates nearest to the tools; the order of nodes decides between equals. Those that
-// touch and get no slot are counted.
+// touch and get no slot are counted. An organ without candidates may sleep.
 template <class Fields>
 PALPATE void rank(const Fields& f, Thread t, int) {
   const int n = candidates(f, t.world);
+  if (t.tid == 0 && n > 0) f.calm.data[t.world] = 0.0;
+  if (t.tid == 0 && is_calm(f, t.world)) f.solve.step.data[4 * t.world] = 0.0f;
   const int* node = f.candidate.data + t.world * f.most;
   const float* far = f.distance.data + t.world * f.most;
   each_item(t, n, [&](int q) {
@@ -233,6 +253,8 @@ PALPATE void commit_worlds(const Fields& f, Thread t, int) {
     const int crowd = f.count.data[w] - f.most, missed = f.missed.data[w] + (crowd > 0 ? crowd : 0);
     if (missed > f.overflow.data[w]) f.overflow.data[w] = missed;
   }
+  const bool asleep = sleeps(f, w);
+  if (asleep && f.calm.data[w] > QUIET + h) return;  // it stands still already
   each_item(t, f.nnode, [&](int i) {
     if (!f.free.data[i]) return;
     const size_t at = at_node(f, w, i);
@@ -241,6 +263,7 @@ PALPATE void commit_worlds(const Fields& f, Thread t, int) {
     if (f.stiff) dv += load_lane(f.solve.sol.data + at);
     dv = ok * dv;
     D3 v = load_lane(f.solve.vel.data + at) + dv;
+    if (asleep) v = dv = now;
     if (slot >= 0) {
       now = load_floats(f.found.data + 3 * (w * f.nslot + slot));
       if (!f.stiff)
@@ -248,9 +271,10 @@ PALPATE void commit_worlds(const Fields& f, Thread t, int) {
     }
     store_lane(f.solve.disp.data + at, load_lane(f.solve.disp.data + at) + h * v);
     store_lane(f.solve.vel.data + at, v);
-    store_lane(f.before.data + at, load_lane(f.last.data + at));
+    store_lane(f.before.data + at, asleep ? now : load_lane(f.last.data + at));
     store_lane(f.last.data + at, dv);
     store_floats(f.force.data + 3 * in_row(f, w, i), now);
+    if (touched(now) || dot(v, v) > f.slow * f.slow) f.stirred.data[w] = 1;
   });
 }
 
@@ -275,7 +299,11 @@ template <class Fields>
 PALPATE void rest_organ(const Fields& f, Thread t, int) {
   const int w = t.world;
   if (!f.mask.data[w]) return;
-  if (t.tid == 0) f.heavier.data[w] = f.heavier0.data[0];
+  if (t.tid == 0) {
+    f.heavier.data[w] = f.heavier0.data[0];
+    f.calm.data[w] = f.calm0.data[0];
+    f.stirred.data[w] = 0;
+  }
   each_item(t, f.nnode, [&](int i) {
     const size_t at = at_node(f, w, i);
     const int from = offset_of(i);

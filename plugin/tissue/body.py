@@ -138,7 +138,7 @@ def _sizes(values: dict[str, Any]) -> dict[str, int]:
     "nsolidslice": out["nslice"] if solid else 0,
     "nheld": len(values["held_adr"]),
     "naround": len(values["around_tet"]),
-    "nedge": len(values["edge_tet"]),
+    "nedge": len(values["edge_from"]),
     "nbend": len(values["bend_node"]),
     "nbendslice": out["nslice"] if bends else 0,
     "nareaslice": out["nslice"] if bends or values["closed"] else 0,

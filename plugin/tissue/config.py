@@ -56,6 +56,12 @@ class Config:
     "`membrane` (St. Venant-Kirchhoff triangles, plane stress), `spring` (edge springs) or `solid` "
     "(neo-Hookean tetrahedra inside, made when the model is compiled; with `window` alone)",
   )
+  tetrahedra: str = _row(
+    "",
+    reading.PATH,
+    "Gmsh file, as text, whose tetrahedra a solid has inside: their nodes on the surface are its "
+    "vertices, in its frame [m]; none makes them",
+  )
   young: tuple[float, ...] = _row(
     (5000.0,),
     (reading.numbers, "a number > 0"),
@@ -339,6 +345,10 @@ def _check_combination(organ: str, config: Config, given: dict, closed: bool):
       raise ValueError(f"organ {organ!r}: {key} is set, allowed only with window")
   if config.elements == "solid":
     _check_solid(organ, config, given)
+  elif config.tetrahedra:
+    raise ValueError(
+      f"organ {organ!r}: tetrahedra is {config.tetrahedra!r}, allowed only with elements='solid'"
+    )
   _check_ties(organ, config)
   _check_spare(organ, config)
   if config.window and "mass" not in given and not config.mass:
@@ -379,12 +389,11 @@ def _check_spare(organ: str, config: Config):
     raise ValueError(f"organ {organ!r}: cutters is set, allowed only with spare, or bonds to free")
   if not config.spare:
     return
-  for key in ("carrier", "attach", "relax_share", "support", "resident", "bonded"):
-    if getattr(config, key):
-      name = key.replace("bonded", "bonds")
-      raise ValueError(f"organ {organ!r}: {name} is set, allowed only where spare is 0")
-  if config.elements == "solid":
-    raise ValueError(f"organ {organ!r}: elements is 'solid', allowed only where spare is 0")
+  if config.resident:
+    raise ValueError(f"organ {organ!r}: resident is set, allowed only where spare is 0")
+  for key, text in (("elements", "solid"), ("carrier", OWN)):
+    if getattr(config, key) == text:
+      raise ValueError(f"organ {organ!r}: {key} is {text!r}, allowed only where spare is 0")
 
 
 def _check_ties(organ: str, config: Config):

@@ -30,6 +30,10 @@ _LESS = 0.7
 # (n, 3, 3) each, and their numbers (n,).
 Energy = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
+# Energy of springs that hold vertices [J], (n,), from these (n,) and the changes of their
+# displacements (n, 3).
+Held = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
 
 @dataclasses.dataclass(frozen=True)
 class Cut:
@@ -37,7 +41,7 @@ class Cut:
 
   Attributes:
     mesh: the mesh, cut
-    touched: vertices of triangles that are not as they were
+    changed: triangles that are not as they were                        (n,)
     moved: vertices that lie elsewhere at rest                          (n,)
     corner: where they lie in the mesh before: corners of a triangle    (n, 3)
     weight: and their weights                                           (n, 3)
@@ -50,7 +54,7 @@ class Cut:
   """
 
   mesh: Mesh
-  touched: np.ndarray
+  changed: np.ndarray
   moved: np.ndarray
   corner: np.ndarray
   weight: np.ndarray
@@ -69,6 +73,7 @@ def cut(
   points: np.ndarray,
   pinned: np.ndarray,
   energy: Energy | None = None,
+  held: Held | None = None,
   given: float = 0.0,
 ) -> Cut:
   """Returns the mesh cut along the path on the surface that is nearest to points.
@@ -80,6 +85,7 @@ def cut(
     points: the path, in the same frame [m]      (n, 3)
     pinned: vertices that do not move            (nvert,) bool
     energy: of triangles, which moving vertices must not raise, or None
+    held: that of what holds vertices, for which the same is true, or None
     given: but by so much around each, since what cuts has brought it [J]
 
   Raises:
@@ -88,16 +94,18 @@ def cut(
   edge = mesh.whole.edge_length
   runs = paths.trace(organ, mesh, position, points, edge)
   for run in runs:
-    run.chain = paths.chain(mesh, run, edge)
+    if not run.open:
+      run.chain = paths.chain(mesh, run, edge)
   _check(organ, mesh, runs, pinned)
   edges, stopped = _room(mesh, [pair for run in runs for pair in _uncut(mesh, run.chain)])
   there = {v for pair in edges for v in pair}
-  moved, corner, weight = _snap(mesh, runs, pinned, position, energy, there, given)
+  moved, corner, weight = _snap(mesh, runs, pinned, position, (energy, held, given), there)
   rest = mesh.rest.copy()
   rest[moved] = np.einsum("nk,nkj->nj", weight, mesh.rest[corner])
   elem, group, member = _split(mesh, edges)
   rest[member] = rest[group]
-  new, touched = topology.recut(mesh, rest, elem, mesh.loose)
+  near = topology.around(mesh, topology.distinct(np.array(list(there), int), moved))
+  new, changed = topology.recut(mesh, rest, elem, mesh.loose, near)
   if any(_may_separate(run, group) for run in runs):
     new = topology.come_loose(new)
   path = _lines(rest, edges)
@@ -105,7 +113,7 @@ def cut(
   far = [paths.distance(run.at, rest[chain])[0].max() for run, chain in cut_chains if chain]
   length = sum(float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum()) for line in path)
   deviation = float(max(far, default=0.0))
-  return Cut(new, touched, moved, corner, weight, group, member, path, length, deviation, stopped)
+  return Cut(new, changed, moved, corner, weight, group, member, path, length, deviation, stopped)
 
 
 def _ends_on_rim(mesh: Mesh, chain: list[int]) -> bool:
@@ -117,7 +125,9 @@ def _ends_on_rim(mesh: Mesh, chain: list[int]) -> bool:
 
 def _check(organ: str, mesh: Mesh, runs: list[paths.Run], pinned: np.ndarray):
   # One edge is enough where it ends on a boundary, or at the end of an older cut.
-  if not any(len(run.chain) > 2 or _ends_on_rim(mesh, run.chain) for run in runs):
+  if not any(
+    run.open or len(run.chain) > 2 or _ends_on_rim(mesh, run.chain) for run in runs
+  ):
     raise ValueError(
       f"organ {organ!r}: the path is shorter than two edges of the mesh there, expected a longer "
       "one"
@@ -136,13 +146,7 @@ def _check(organ: str, mesh: Mesh, runs: list[paths.Run], pinned: np.ndarray):
 
 
 def _snap(
-  mesh: Mesh,
-  runs: list[paths.Run],
-  pinned,
-  position,
-  energy: Energy | None,
-  there: set[int],
-  given: float,
+  mesh: Mesh, runs: list[paths.Run], pinned, position, energies: tuple, there: set[int]
 ):
   """Returns vertices that move at rest, and where they lie: corners of a triangle and weights.
 
@@ -171,7 +175,7 @@ def _snap(
   elem, weight = elem[row, best], weight[row, best]
   own = (mesh.elem[elem] == vert[:, None]).astype(float)
   u = position - mesh.rest
-  weight = own + _shares(mesh, vert, elem, weight, u, energy, given)[:, None] * (weight - own)
+  weight = own + _shares(mesh, vert, elem, weight, u, energies)[:, None] * (weight - own)
   moved = (weight != own).any(axis=1)
   return vert[moved], mesh.elem[elem[moved]], weight[moved]
 
@@ -192,41 +196,47 @@ def _on_rim(mesh: Mesh, vert: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray,
   return np.where(rim[:, None], slid, goal), free
 
 
-def _shares(
-  mesh: Mesh, vert, elem, weight, u: np.ndarray, energy: Energy | None, given: float
-) -> np.ndarray:
+def _shares(mesh: Mesh, vert, elem, weight, u: np.ndarray, energies: tuple) -> np.ndarray:
   """Returns how far of its way each vertex goes, (n,).
 
   So far that no triangle gets thin or turns, and that the energy around none rises: a vertex gets
   the displacement of where it goes to, and an uneven strain is another one after it.
   """
-  around = mesh.ring_elem[vert]
-  tri = np.unique(around[around >= 0] // 3)
-  before = mesh.rest[mesh.elem[tri]]
+  energy, held, given = energies
+  tri = topology.around(mesh, vert)
+  own, corner = np.unique(mesh.elem[tri], return_inverse=True)
+  corner = corner.reshape(-1, 3)
+  number = np.searchsorted(own, vert)
+  rest0, u0 = mesh.rest[own], u[own]
+  before = rest0[corner]
   normal, shape = _form(before)
   least = np.minimum(_SHAPE, _KEEP * shape)
   way, lead = (
     np.einsum("nk,nkj->nj", weight, values[mesh.elem[elem]]) - values[vert]
     for values in (mesh.rest, u)
   )
-  had = np.zeros(0) if energy is None else energy(before, u[mesh.elem[tri]], tri)
+  had = np.zeros(0) if energy is None else energy(before, u0[corner], tri)
   share = np.ones(len(vert))
-  number = np.full(mesh.nvert, -1)
-  number[vert] = np.arange(len(vert))
+  mover = np.full(len(own), -1)
+  mover[number] = np.arange(len(vert))
+  who = mover[corner]
   for k in range(_TRIES + 1):
-    rest = mesh.rest.copy()
-    rest[vert] += share[:, None] * way
-    turned, now = _form(rest[mesh.elem[tri]])
+    rest = rest0.copy()
+    rest[number] += share[:, None] * way
+    turned, now = _form(rest[corner])
     bad = (now < least) | ((turned * normal).sum(1) < _TURN)
-    who = number[mesh.elem[tri]]
-    less = np.unique(who[bad])
+    less = topology.distinct(who[bad])
     if energy is not None:
-      moved, fine = u.copy(), ~bad
-      moved[vert] += share[:, None] * lead
-      corner, has = mesh.elem[tri[fine]], had.copy()
-      has[fine] = energy(rest[corner], moved[corner], tri[fine])
-      old, new = (np.bincount(who.ravel() + 1, np.repeat(e, 3), len(vert) + 1) for e in (had, has))
-      less = np.union1d(less, np.flatnonzero(new > _RISE * old + given) - 1)
+      moved, fine = u0.copy(), ~bad
+      moved[number] += share[:, None] * lead
+      has = had.copy()
+      has[fine] = energy(rest[corner[fine]], moved[corner[fine]], tri[fine])
+      old, new = (
+        np.bincount(who.ravel() + 1, np.repeat(e, 3), len(vert) + 1)[1:] for e in (had, has)
+      )
+      if held is not None:
+        old, new = old + held(vert, 0 * lead), new + held(vert, share[:, None] * lead)
+      less = topology.distinct(less, np.flatnonzero(new > _RISE * old + given))
     less = less[less >= 0]
     if not less.size:
       break
@@ -237,8 +247,8 @@ def _shares(
 def _form(corner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
   """Returns unit normals and shapes of triangles (n, 3, 3); an equilateral one has shape 1."""
   a, b, c = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 1], corner[:, 0] - corner[:, 2]
-  area = np.cross(a, -c)
-  size = np.linalg.norm(area, axis=1)
+  area = topology.cross(a, -c)
+  size = topology.lengths(area)
   length2 = (a * a).sum(1) + (b * b).sum(1) + (c * c).sum(1)
   return area / np.maximum(size, 1e-300)[:, None], 2 * np.sqrt(3) * size / length2
 
@@ -265,7 +275,8 @@ def _fans(mesh: Mesh, vert: int, cuts: set[tuple[int, int]]) -> list[list[int]]:
 
 def _may_separate(run: paths.Run, group: np.ndarray) -> bool:
   """Returns whether a cut along a run may make two pieces: not where an end of it is inside."""
-  return run.closes or bool(np.isin(run.chain[:1] + run.chain[-1:], group).all())
+  ends = {run.chain[0], run.chain[-1]} if run.chain else {-1}
+  return run.closes or ends <= set(group.tolist())
 
 
 def _uncut(mesh: Mesh, chain: list[int]) -> list[tuple[int, int]]:

@@ -33,13 +33,13 @@ _CLEAR = 0.8  # least distance of a node inside to the surface's, in mean edges
 _WIDENS = 0.15  # by which the distance between nodes grows with that from the surface
 _ROUNDS = 8
 _MOVE = 0.7  # share of the way that a node goes in a round
-_FLAT = 1e-3  # quality of a tetrahedron that is none
+FLAT = 1e-3  # quality of a tetrahedron that is none
 _KEPT = 16
 _VERSION = 1  # of what is kept in files: another one where tetrahedra are made otherwise
 _TIE = 1e-6  # of the size, by which points on one sphere are told apart
 
 # Faces of a tetrahedron, each opposite the corner of its number.
-_FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
+FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
 _EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
 
 
@@ -51,8 +51,8 @@ def fill(organ: str, mesh: Mesh) -> Mesh:
     mesh: its surface
 
   Raises:
-    ValueError: the surface encloses nothing, or its triangles are faces of no Delaunay
-      tetrahedra.
+    ValueError: the surface encloses nothing, its triangles are faces of no Delaunay tetrahedra, or
+      it has no room for these.
   """
   if not mesh.closed:
     raise ValueError(f"organ {organ!r}: elements is 'solid', expected a closed surface")
@@ -62,6 +62,12 @@ def fill(organ: str, mesh: Mesh) -> Mesh:
       f"organ {organ!r}: elements is 'solid', and triangle {missing} (vertices "
       f"{mesh.elem[missing].tolist()}) cannot be the face of a tetrahedron; expected a surface of "
       "even triangles that does not cut itself: `palpate wrap` makes one"
+    )
+  bare = np.setdiff1d(np.arange(mesh.nvert), tet)
+  if bare.size:
+    raise ValueError(
+      f"organ {organ!r}: elements is 'solid', and at vertex {bare[0]} there is no room for "
+      "tetrahedra; expected a surface that is thicker than a hundredth of its edges"
     )
   return joined(mesh, np.frombuffer(inner).reshape(-1, 3), tet)
 
@@ -241,7 +247,7 @@ def _inside(point: np.ndarray, triangle: np.ndarray, nsurface: int) -> tuple[np.
   shaken = point + _TIE * size * np.random.RandomState(0).uniform(-1, 1, point.shape)
   made = Delaunay(shaken)
   tet, neighbour = made.simplices.astype(np.int64), made.neighbors
-  face = tet[:, _FACES]
+  face = tet[:, FACES]
   has = (face < nsurface).all(axis=2)
   known = np.where(has, _key(np.minimum(face, nsurface - 1), nsurface), -1)
   wanted, faulty = _flipped(triangle, np.unique(known), nsurface)
@@ -263,7 +269,7 @@ def _inside(point: np.ndarray, triangle: np.ndarray, nsurface: int) -> tuple[np.
   within = np.bincount(part[which], np.where(sure, np.sign(height), 0), count)[part] < 0
   volume = volumes(point, tet)
   tet = np.where((volume < 0)[:, None], tet[:, [0, 2, 1, 3]], tet)[within]
-  return tet[quality(point, tet) > _FLAT], -1
+  return tet[quality(point, tet) > FLAT], -1
 
 
 def _key(corner: np.ndarray, n: int) -> np.ndarray:

@@ -45,11 +45,12 @@ class Mesh:
     """The mesh before the first cut."""
     return self if self.uncut is None else self.uncut
 
-  @property
+  @functools.cached_property
   def centre(self) -> np.ndarray:
     """Mean of the rest positions before the first cut [m], (3,)."""
-    rest = self.whole.rest
-    return rest[: len(rest) - self.spare].mean(axis=0)
+    if self.uncut is not None:
+      return self.uncut.centre
+    return self.rest[: self.nvert - self.spare].mean(axis=0)
 
   @functools.cached_property
   def edge_length(self) -> float:
@@ -81,7 +82,7 @@ class Mesh:
     """Whether a vertex waits for a cut, (nvert,) bool."""
     return (np.arange(self.nvert) >= self.nvert - self.spare) & (self.degree == 0)
 
-  @property
+  @functools.cached_property
   def nouter(self) -> int:
     """Number of vertices on the surface, which come first."""
     return int(self.elem.max()) + 1
@@ -100,10 +101,28 @@ class Mesh:
 _BY_VERTEX = ("rest", "ring", "ring_elem", "degree")
 
 
+def distinct(*numbers: np.ndarray) -> np.ndarray:
+  """Returns the different ones of whole numbers, ascending, as `np.unique` but for short lists."""
+  every = np.sort(np.concatenate([each.ravel() for each in numbers]))
+  first = np.ones(len(every), bool)
+  np.not_equal(every[1:], every[:-1], out=first[1:])
+  return every[first]
+
+
+def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+  """Returns cross products of vectors: `np.cross`, which takes its time over a few of them."""
+  return a[..., [1, 2, 0]] * b[..., [2, 0, 1]] - a[..., [2, 0, 1]] * b[..., [1, 2, 0]]
+
+
+def lengths(vector: np.ndarray) -> np.ndarray:
+  """Returns the lengths of vectors, (...) of (..., n)."""
+  return np.sqrt(np.einsum("...i,...i->...", vector, vector))
+
+
 def area_vectors(position: np.ndarray, elem: np.ndarray) -> np.ndarray:
   """Returns the normal of each triangle times its area [m^2], (nelem, 3)."""
   a, b, c = (position[elem[:, k]] for k in range(3))
-  return 0.5 * np.cross(b - a, c - a)
+  return 0.5 * cross(b - a, c - a)
 
 
 def vertex_areas(position: np.ndarray, elem: np.ndarray) -> np.ndarray:
@@ -123,6 +142,23 @@ def pieces(mesh: Mesh) -> np.ndarray:
   return order[number] - int((label < 0).any())
 
 
+def corners(mesh: Mesh, half: np.ndarray, k: int = 0) -> np.ndarray:
+  """Returns where half-edges start; 1 for `k`: where they end; 2: what is opposite to them."""
+  return mesh.elem.reshape(-1)[half - half % 3 + (half + k) % 3]
+
+
+def around(mesh: Mesh, vert: np.ndarray) -> np.ndarray:
+  """Returns the triangles that have a corner among these vertices, ascending."""
+  half = mesh.ring_elem[vert]
+  return distinct(half[half >= 0] // 3)
+
+
+def with_beside(mesh: Mesh, elem: np.ndarray) -> np.ndarray:
+  """Returns these triangles and those that share an edge with one of them, ascending."""
+  other = mesh.twin.reshape(-1, 3)[elem]
+  return distinct(other[other >= 0] // 3, elem)
+
+
 def held_areas(mesh: Mesh) -> np.ndarray:
   """Returns the areas of the vertices that the foundation holds [m^2], (nvert,)."""
   elem = mesh.elem if mesh.loose is None else mesh.elem[~mesh.loose]
@@ -135,7 +171,7 @@ def areas_of(mesh: Mesh, vert: np.ndarray, held: bool = False) -> np.ndarray:
   elem, where = np.unique(around, return_inverse=True)
   size = np.zeros(len(elem))
   there = elem < mesh.nelem
-  size[there] = np.linalg.norm(area_vectors(mesh.rest, mesh.elem[elem[there]]), axis=1) / 3
+  size[there] = lengths(area_vectors(mesh.rest, mesh.elem[elem[there]])) / 3
   if held and mesh.loose is not None:
     size[there] *= ~mesh.loose[elem[there]]
   out = np.zeros(len(vert))
@@ -168,6 +204,13 @@ def vertex_normals(position: np.ndarray, elem: np.ndarray) -> np.ndarray:
     [np.bincount(elem.ravel(), weighted[:, k], len(position)) for k in range(3)], axis=1
   )
   return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+
+
+def shortest(mesh: Mesh) -> float:
+  """Returns the length of the shortest edge at rest [m], those inside of a solid too."""
+  start, k = np.nonzero(mesh.ring >= 0)
+  edge = mesh.rest[mesh.ring[start, k]] - mesh.rest[start]
+  return float(np.linalg.norm(edge, axis=1).min(initial=np.inf))
 
 
 def volume(position: np.ndarray, elem: np.ndarray) -> float:
@@ -257,17 +300,22 @@ def _twins(organ: str, elem: np.ndarray, nvert: int) -> np.ndarray:
   return np.where(ordered[found] == reverse, order[found], -1)
 
 
-def _rings(organ, elem, twin, nvert, vert=None):
-  """Walks around vertices at once, one step for all of them in each pass; `vert` None for all."""
-  nhalf = elem.size
-  half = np.arange(nhalf)
-  start, end, apex = elem.ravel(), elem[:, [1, 2, 0]].ravel(), elem[:, [2, 0, 1]].ravel()
-  vert = np.arange(nvert) if vert is None else vert
-  first = np.full(nvert, nhalf, np.int64)
-  np.minimum.at(first, start, half)
-  boundary = half[twin < 0]
-  first[start[boundary]] = boundary
-  first[first == nhalf] = -1  # of a vertex without triangles
+def _rings(organ, elem, twin, nvert, vert=None, near=None):
+  """Walks around vertices at once, one step for all of them in each pass.
+
+  Around `vert` alone where it is not None; `near` has the triangles that these have.
+  """
+  corner = elem.reshape(-1)
+  half = np.arange(elem.size)
+  if vert is None:
+    vert = np.arange(nvert)
+  else:
+    half = (3 * near[:, None] + np.arange(3)).ravel()
+  start = corner[half]
+  first = np.full(nvert, -1, np.int64)  # of a vertex without triangles
+  first[start[::-1]] = half[::-1]  # the first one is written last
+  boundary = twin[half] < 0
+  first[start[boundary]] = half[boundary]
   first = first[vert]
   spokes = np.bincount(start, minlength=nvert)[vert]
   ring, ring_elem = [], []
@@ -277,13 +325,14 @@ def _rings(organ, elem, twin, nvert, vert=None):
   tail = np.full(len(vert), -1, np.int64)  # last neighbour on a boundary, reached by no half-edge
   while (current >= 0).any() or (tail >= 0).any():
     on = current >= 0
-    ring.append(np.where(on, end[current], tail))
+    base = current - current % 3
+    ring.append(np.where(on, corner[base + (current + 1) % 3], tail))
     ring_elem.append(np.where(on, current, -1))
     degree += ring[-1] >= 0
     walked += on
-    previous = current - current % 3 + (current + 2) % 3
+    previous = base + (current + 2) % 3
     after = np.where(on, twin[previous], -1)  # the next spoke counter-clockwise
-    tail = np.where(on & (after < 0), apex[current], -1)
+    tail = np.where(on & (after < 0), corner[previous], -1)
     current = np.where(after == first, -1, after)
   bowtie = np.flatnonzero(walked != spokes)
   if bowtie.size:
@@ -295,7 +344,11 @@ def _rings(organ, elem, twin, nvert, vert=None):
 
 
 def recut(
-  mesh: Mesh, rest: np.ndarray, elem: np.ndarray, loose: np.ndarray | None = None
+  mesh: Mesh,
+  rest: np.ndarray,
+  elem: np.ndarray,
+  loose: np.ndarray | None = None,
+  near: np.ndarray | None = None,
 ) -> tuple[Mesh, np.ndarray]:
   """Returns a mesh with other rest positions and other corners, by cuts of the same whole.
 
@@ -304,39 +357,53 @@ def recut(
     rest: rest positions [m]  (nvert, 3)
     elem: triangles: those of the whole, cut along edges  (nelem, 3)
     loose: see `Mesh`
+    near: triangles around all vertices that have moved or come apart, None for any
 
   Returns:
-    the mesh, and the vertices of triangles that are not as they were
+    the mesh, and the triangles that are not as they were, ascending
   """
   whole = mesh.whole
-  if np.array_equal(elem, whole.elem) and np.array_equal(rest, whole.rest):
-    new = whole
-  else:
-    start, end = elem.ravel(), elem[:, [1, 2, 0]].ravel()
-    other = whole.twin
-    joined = (other >= 0) & (start == end[other]) & (end == start[other])
-    twin = np.where(joined, other, -1)
-    new = dataclasses.replace(
-      mesh,
-      rest=rest,
-      elem=elem,
-      twin=twin,
-      closed=bool((twin >= 0).all()),
-      uncut=whole,
-      loose=loose,
-    )
-  corners = (mesh.elem != new.elem).any(axis=1)
-  edges = (mesh.twin != new.twin).reshape(-1, 3).any(axis=1)
-  moved = (mesh.rest != new.rest).any(axis=1)
-  moved = moved[mesh.elem].any(axis=1) | moved[new.elem].any(axis=1)
-  cut = corners | edges
-  touched = np.unique(np.concatenate([mesh.elem[cut | moved], new.elem[cut | moved]]))
-  if new is whole or not touched.size:
-    return (new if new is whole else dataclasses.replace(mesh, loose=loose)), touched
-  walk = np.unique(np.concatenate([mesh.elem[cut], new.elem[cut]]))
+  if near is None:
+    near = np.arange(mesh.nelem)
+    if np.array_equal(elem, whole.elem) and np.array_equal(rest, whole.rest):
+      elem, rest = whole.elem, whole.rest
+  new = whole
+  if elem is not whole.elem:
+    new = dataclasses.replace(mesh, rest=rest, elem=elem, uncut=whole, loose=loose)
+    twin = _joined(new, near)
+    closed = bool((twin >= 0).all())
+    new = dataclasses.replace(new, twin=twin, closed=closed)
+  before, after = mesh.elem[near], new.elem[near]
+  edges = (mesh.twin.reshape(-1, 3)[near] != new.twin.reshape(-1, 3)[near]).any(axis=1)
+  cut = (before != after).any(axis=1) | edges
+  moved = (mesh.rest[before] != new.rest[before]) | (mesh.rest[after] != new.rest[after])
+  changed = near[cut | moved.any(axis=(1, 2))]
+  if new is whole or not changed.size:
+    return (new if new is whole else dataclasses.replace(mesh, loose=loose)), changed
+  walk = distinct(before[cut], after[cut])
   ring, ring_elem, degree = mesh.ring.copy(), mesh.ring_elem.copy(), mesh.degree.copy()
   if walk.size:
-    part, part_elem, degree[walk] = _rings("cut", elem, new.twin, len(rest), walk)
+    near = around(mesh, distinct(before[cut]))
+    part, part_elem, degree[walk] = _rings("cut", elem, new.twin, len(rest), walk, near)
     ring[walk], ring_elem[walk] = -1, -1
     ring[walk, : part.shape[1]], ring_elem[walk, : part.shape[1]] = part, part_elem
-  return dataclasses.replace(new, ring=ring, ring_elem=ring_elem, degree=degree), touched
+  return dataclasses.replace(new, ring=ring, ring_elem=ring_elem, degree=degree), changed
+
+
+def touched(old: Mesh, new: Mesh, changed: np.ndarray) -> np.ndarray:
+  """Returns the corners that triangles had or have, ascending."""
+  return distinct(old.elem[changed], new.elem[changed])
+
+
+def _joined(mesh: Mesh, near: np.ndarray) -> np.ndarray:
+  """Returns the half-edges on the other side, of triangles of the whole some of which were cut.
+
+  Only those of `near` are not as `mesh.twin` has them.
+  """
+  half = (3 * near[:, None] + np.arange(3)).ravel()
+  other = mesh.whole.twin[half]
+  joined = (other >= 0) & (corners(mesh, half) == corners(mesh, other, 1))
+  joined &= corners(mesh, half, 1) == corners(mesh, other)
+  twin = mesh.twin.copy()
+  twin[half] = np.where(joined, other, -1)
+  return twin

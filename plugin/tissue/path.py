@@ -9,21 +9,32 @@ import numpy as np
 from scipy import sparse, spatial
 from scipy.sparse import csgraph
 
-from .mesh import Mesh
+from .mesh import Mesh, corners, distinct, lengths
 
 _STEP = 0.25  # between samples of the path, in edges
 _OFF = 2.0  # edges from the surface from which a point is off it
 _WAY = 8.0  # edges between vertices that the chain must pass
 _RIM = 0.5  # edges: a cut that ends closer to a boundary opens it
+_ALONG = 0.2  # edges from an older cut within which a path goes along it
+_BOX = 3.0  # edges from the path within which they are found sooner
+_FEW = 20_000  # pairs that are all compared
 _NEAR = 6  # vertices nearest to a point around which its triangle is looked for
 
 
 @dataclasses.dataclass
 class Run:
-  """A part of a path without gaps: samples at rest (n, 3), their triangles, chain of vertices."""
+  """A part of a path without gaps.
+
+  Attributes:
+    at: samples at rest [m]      (n, 3)
+    elem: their triangles        (n,)
+    open: whether they lie along an older cut, so that there is nothing to cut
+    chain: the vertices along which it is cut
+  """
 
   at: np.ndarray
   elem: np.ndarray
+  open: bool = False
   chain: list[int] = dataclasses.field(default_factory=list)
 
   @property
@@ -35,7 +46,7 @@ class Run:
 def trace(organ: str, mesh: Mesh, position, points, edge: float) -> list[Run]:
   """Returns the parts of the path on the surface, in the rest shape."""
   _check_points(organ, points)
-  gap = np.linalg.norm(np.diff(points, axis=0), axis=1)
+  gap = lengths(np.diff(points, axis=0))
   steps = np.maximum(np.ceil(gap / (_STEP * edge)).astype(int), 1)
   share = np.concatenate([np.arange(n) / n for n in steps] + [[0.0]])
   k = np.append(np.repeat(np.arange(len(steps)), steps), len(steps) - 1)
@@ -51,9 +62,11 @@ def trace(organ: str, mesh: Mesh, position, points, edge: float) -> list[Run]:
     )
   at = np.einsum("nk,nkj->nj", weight, mesh.rest[mesh.elem[elem]])
   # Where the path crosses an older cut, or leaps, it begins anew.
-  leap = np.linalg.norm(np.diff(at, axis=0), axis=1) > 2 * edge
-  parts = np.flatnonzero(leap | _crosses(mesh, elem)) + 1
-  runs = [Run(a, e) for a, e in zip(np.split(at, parts), np.split(elem, parts), strict=True)]
+  leap = lengths(np.diff(at, axis=0)) > 2 * edge
+  is_open = _is_open(mesh, elem, at, edge)
+  new = leap | (_crosses(mesh, elem) & ~is_open[1:]) | (is_open[1:] != is_open[:-1])
+  parts = np.split(np.arange(len(elem)), np.flatnonzero(new) + 1)
+  runs = [Run(at[part], elem[part], bool(is_open[part[0]])) for part in parts]
   return [run for run in runs if len(run.at) > 1]
 
 
@@ -80,6 +93,23 @@ def _crosses(mesh: Mesh, elem: np.ndarray) -> np.ndarray:
   return (a != b) & shares(whole) & ~shares(mesh)
 
 
+def _is_open(mesh: Mesh, elem: np.ndarray, at: np.ndarray, edge: float) -> np.ndarray:
+  """Returns which samples go along an edge that came apart before, more than across it, (n,)."""
+  out = np.zeros(len(elem), bool)
+  half = 3 * elem[:, None] + np.arange(3)
+  is_cut = (mesh.twin[half] < 0) & (mesh.whole.twin[half] >= 0)
+  which, k = np.nonzero(is_cut)
+  if not which.size:
+    return out
+  ends = [mesh.rest[corners(mesh, half[which, k], c)] for c in (0, 1)]
+  way, arm = ends[1] - ends[0], at[which] - ends[0]
+  share = np.clip((arm * way).sum(1) / (way * way).sum(1), 0.0, 1.0)
+  out[which[lengths(arm - share[:, None] * way) < _ALONG * edge]] = True
+  for part in np.split(np.arange(len(out)), np.flatnonzero(np.diff(out)) + 1):
+    out[part] &= len(part) * _STEP >= 1.0
+  return out
+
+
 def nearest(
   mesh: Mesh, position: np.ndarray, points: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -93,8 +123,7 @@ def nearest(
   Returns:
     triangles (n,), weights of their corners (n, 3), distances [m] (n,)
   """
-  used = mesh.nouter
-  _, near = spatial.KDTree(position[:used]).query(points, k=min(_NEAR, used))
+  near = _nearest_vertices(mesh, position[: mesh.nouter], points)
   around = mesh.ring_elem[near].reshape(len(points), -1)
   elem = np.where(around >= 0, around // 3, around.max(axis=1, keepdims=True) // 3)
   corner = position[mesh.elem[elem]]
@@ -104,42 +133,71 @@ def nearest(
   return elem[row, best], weight[row, best], far[row, best]
 
 
+def _nearest_vertices(mesh: Mesh, position: np.ndarray, points: np.ndarray) -> np.ndarray:
+  """Returns the few positions nearest to points, looked for in a box around them first."""
+  count, room = min(_NEAR, len(position)), _BOX * mesh.whole.edge_length
+  low, high = points.min(axis=0) - room, points.max(axis=0) + room
+  inside = (position >= low) & (position <= high)
+  box = np.flatnonzero(inside[:, 0] & inside[:, 1] & inside[:, 2])
+  if len(box) >= count:
+    near, far = _neighbours(position[box], points, count)
+    if far.max() <= room:
+      return box[near]
+  return _neighbours(position, points, count)[0]
+
+
+def _neighbours(position: np.ndarray, points: np.ndarray, count: int):
+  """Returns which positions are nearest to points, and how far they are, (n, count) each."""
+  if len(position) * len(points) > _FEW:
+    far, near = spatial.KDTree(position).query(points, k=count)
+    return tuple(np.reshape(each, (len(points), count)) for each in (near, far))
+  far = lengths(points[:, None] - position)
+  near = np.argpartition(far, count - 1, axis=1)[:, :count]
+  return near, np.take_along_axis(far, near, 1)
+
+
 def closest(p, a, b, c) -> tuple[np.ndarray, np.ndarray]:
   """Returns weights of the point of triangles that is nearest to points, and its distance."""
   ab, ac, ap = b - a, c - a, p - a
-  d11, d12, d22 = (ab * ab).sum(-1), (ab * ac).sum(-1), (ac * ac).sum(-1)
-  e1, e2 = (ap * ab).sum(-1), (ap * ac).sum(-1)
+
+  def dot(x, y):
+    return np.einsum("...i,...i->...", x, y)
+
+  d11, d12, d22, e1, e2 = dot(ab, ab), dot(ab, ac), dot(ac, ac), dot(ap, ab), dot(ap, ac)
+  square, bc2 = dot(ap, ap), np.maximum(d11 - 2 * d12 + d22, 1e-300)
   det = np.maximum(d11 * d22 - d12 * d12, 1e-300)
   v, w = (d22 * e1 - d12 * e2) / det, (d11 * e2 - d12 * e1) / det
-  found = [np.stack([1 - v - w, v, w], -1)]
-  inside = (found[0] >= 0).all(axis=-1)
-  # On the edges.
-  t = np.clip(e1 / np.maximum(d11, 1e-300), 0, 1)
-  found.append(np.stack([1 - t, t, 0 * t], -1))
-  t = np.clip(e2 / np.maximum(d22, 1e-300), 0, 1)
-  found.append(np.stack([1 - t, 0 * t, t], -1))
-  bc, bp = c - b, p - b
-  t = np.clip((bp * bc).sum(-1) / np.maximum((bc * bc).sum(-1), 1e-300), 0, 1)
-  found.append(np.stack([0 * t, 1 - t, t], -1))
-  weight = np.stack(found, -2)  # (..., 4, 3)
-  at = weight @ np.stack([a, b, c], -2)
-  far = np.linalg.norm(at - p[..., None, :], axis=-1)
-  far[..., 0] = np.where(inside, far[..., 0], np.inf)
-  best = np.argmin(far, axis=-1)[..., None]
-  return (
-    np.take_along_axis(weight, best[..., None], -2)[..., 0, :],
-    np.take_along_axis(far, best, -1)[..., 0],
-  )
+  on_ab = np.clip(e1 / np.maximum(d11, 1e-300), 0, 1)
+  on_ac = np.clip(e2 / np.maximum(d22, 1e-300), 0, 1)
+  on_bc = np.clip((e2 - e1 - d12 + d11) / bc2, 0, 1)
+  none = np.zeros_like(v)
+  v = np.stack([v, on_ab, none, 1 - on_bc])
+  w = np.stack([w, none, on_ac, on_bc])
+  u = np.stack([1 - v[0] - w[0], 1 - on_ab, 1 - on_ac, none])
+  gap2 = square - 2 * (v * e1 + w * e2) + v * v * d11 + 2 * v * w * d12 + w * w * d22
+  outside = (u[0] < 0) | (v[0] < 0) | (w[0] < 0)
+  gap2[0, outside] = np.inf
+  best = np.argmin(gap2, axis=0)[None]
+  weight = np.stack([np.take_along_axis(x, best, 0)[0] for x in (u, v, w)], axis=-1)
+  return weight, np.sqrt(np.maximum(np.take_along_axis(gap2, best, 0)[0], 0.0))
 
 
 def distance(line: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-  """Returns the distances of points from a polyline, and its points there (n,), (n, 3)."""
-  a, d = line[:-1], np.diff(line, axis=0)
-  t = ((points[:, None] - a) * d).sum(-1) / np.maximum((d * d).sum(-1), 1e-300)
-  at = a + np.clip(t, 0, 1)[..., None] * d
-  far = np.linalg.norm(points[:, None] - at, axis=-1)
-  best = np.argmin(far, axis=1)
-  row = np.arange(len(points))
+  """Returns the distances of points from a polyline of dense samples, and its points there.
+
+  Only what is beside the nearest sample is looked at.
+
+  Returns:
+    distances (n,), points (n, 3)
+  """
+  near = _neighbours(line, points, 1)[0]
+  begin = np.clip(near + np.array([-1, 0]), 0, len(line) - 2)
+  a, way = line[begin], line[begin + 1] - line[begin]
+  arm = points[:, None] - a
+  t = (arm * way).sum(-1) / np.maximum((way * way).sum(-1), 1e-300)
+  at = a + np.clip(t, 0, 1)[..., None] * way
+  far = lengths(points[:, None] - at)
+  best, row = np.argmin(far, axis=1), np.arange(len(points))
   return far[row, best], at[row, best]
 
 
@@ -148,9 +206,9 @@ def distance(line: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 def chain(mesh: Mesh, run: Run, edge: float) -> list[int]:
   """Returns vertices near a path, each a neighbour of the one before."""
-  near = np.unique(mesh.elem[run.elem])
+  near = distinct(mesh.elem[run.elem])
   ring = mesh.ring[near]
-  band = np.unique(np.append(ring[ring >= 0], near))
+  band = distinct(ring[ring >= 0], near)
   far, _ = distance(run.at, mesh.rest[band])
   band, far = band[far < 1.5 * edge], far[far < 1.5 * edge]
   if len(band) < 2:
@@ -160,7 +218,7 @@ def chain(mesh: Mesh, run: Run, edge: float) -> list[int]:
   ring = mesh.ring[band]
   a, k = np.nonzero((ring >= 0) & (number[ring] >= 0))
   b = number[ring[a, k]]
-  size = np.linalg.norm(mesh.rest[band[a]] - mesh.rest[band[b]], axis=1)
+  size = lengths(mesh.rest[band[a]] - mesh.rest[band[b]])
   cost = size * (0.05 + (far[a] ** 2 + far[b] ** 2) / edge**2)
   graph = sparse.csr_array((cost, (a, b)), shape=(len(band), len(band)))
   way = _ways(mesh, run, band, edge)
@@ -177,13 +235,13 @@ def chain(mesh: Mesh, run: Run, edge: float) -> list[int]:
 
 def _ways(mesh: Mesh, run: Run, band: np.ndarray, edge: float) -> list[int]:
   """Returns numbers of vertices of the band that the chain passes, its ends among them."""
-  along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(run.at, axis=0), axis=1))])
+  along = np.concatenate([[0], np.cumsum(lengths(np.diff(run.at, axis=0)))])
   parts = max(1, round(along[-1] / (_WAY * edge)))
   closes = along[-1] > 3 * edge and np.linalg.norm(run.at[-1] - run.at[0]) < _STEP * edge
   parts = max(parts, 3) if closes else parts
   where = np.searchsorted(along, np.linspace(0, along[-1], parts + 1)).clip(0, len(along) - 1)
   rest = mesh.rest[band]
-  far = np.linalg.norm(run.at[where][:, None] - rest, axis=2)
+  far = lengths(run.at[where][:, None] - rest)
   way = [int(k) for k in np.argmin(far, axis=1)]
   if closes:
     return [*way[:-1], way[0]]

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 from scipy import sparse
 
-from .mesh import Mesh, area_vectors
+from .mesh import Mesh, area_vectors, corners, cross, distinct, lengths
 
 
 @dataclasses.dataclass(frozen=True)
@@ -21,7 +21,8 @@ class Hinges:
     which: triangles that the next two are of                                  (nelem,)
     of_elem: hinge of each triangle's half-edge, -1 on the boundary            (nelem, 3)
     gain: stiffness between the hinges of one triangle [N m]                   (nelem, 3, 3)
-    rows: hinge angle per normal displacement at rest [1/m]             sparse (nhinge, nvert)
+    weight: angle of each triangle's hinge by normal displacements of the half-edge's start and end,
+      the triangle's apex and the other one [1/m]                              (nelem, 3, 4)
   """
 
   half: np.ndarray
@@ -30,7 +31,7 @@ class Hinges:
   which: np.ndarray
   of_elem: np.ndarray
   gain: np.ndarray
-  rows: sparse.csr_matrix
+  weight: np.ndarray
 
 
 def hinges(
@@ -51,92 +52,76 @@ def hinges(
     poisson: Poisson's ratio [-]
     which: triangles whose hinges are meant, ascending; None for all
   """
-  elem, twin = mesh.elem, mesh.twin
+  twin = mesh.twin
   which = np.arange(mesh.nelem) if which is None else which
   mine = 3 * which[:, None] + np.arange(3)
   across = twin[mine]
-  half = np.unique(np.where(across >= 0, np.minimum(mine, across), -1))
-  half = half[half >= 0]
+  half = distinct(np.minimum(mine, across)[across >= 0])
   other = twin[half]
-  start, end, apex = elem.ravel(), elem[:, [1, 2, 0]].ravel(), elem[:, [2, 0, 1]].ravel()
-  vert = np.stack([start[half], end[half], apex[half], apex[other]], axis=1)
+  ends = [corners(mesh, half, k) for k in range(3)]
+  vert = np.stack([*ends, corners(mesh, other, 2)], axis=1)
   of_half = np.full(len(twin), -1, np.int64)
   of_half[half] = of_half[other] = np.arange(len(half))
-  rows = _rows(mesh, half, other, vert)
-  gain, area = _gain(_angles(mesh, which), across >= 0, poisson), _area(mesh, which)
-  gain = gain * (area * rigidity[which])[:, None, None]
+  angle, weight = _angles(mesh, which)
+  size = _area(mesh, which) * rigidity[which]
+  gain = _gain(angle, across >= 0, poisson) * size[:, None, None]
   sides = np.stack([half // 3, other // 3], axis=1)
-  return Hinges(half, vert, sides, which, of_half[mine], gain, rows)
+  return Hinges(half, vert, sides, which, of_half[mine], gain, weight)
 
 
 def _area(mesh: Mesh, which: np.ndarray) -> np.ndarray:
-  return np.linalg.norm(area_vectors(mesh.rest, mesh.elem[which]), axis=1)
+  return lengths(area_vectors(mesh.rest, mesh.elem[which]))
 
 
 def _foot(mesh: Mesh, half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
   """Returns where the apexes of half-edges have their feet, as shares of the edges, and heights."""
-  rest, elem = mesh.rest, mesh.elem
-  start, end, apex = elem.ravel(), elem[:, [1, 2, 0]].ravel(), elem[:, [2, 0, 1]].ravel()
-  edge, arm = rest[end[half]] - rest[start[half]], rest[apex[half]] - rest[start[half]]
+  start, end, apex = (mesh.rest[corners(mesh, half, k)] for k in range(3))
+  edge, arm = end - start, apex - start
   share = (arm * edge).sum(-1) / (edge * edge).sum(-1)
-  return share, np.linalg.norm(arm - share[..., None] * edge, axis=-1)
-
-
-def _rows(mesh: Mesh, half: np.ndarray, other: np.ndarray, vert: np.ndarray) -> sparse.csr_matrix:
-  """Returns `Hinges.rows` of hinges between half-edges `half` and `other` with vertices `vert`."""
-  share_l, height_l = _foot(mesh, half)
-  share_r, height_r = _foot(mesh, other)
-  share_r = 1 - share_r
-  weight = np.stack(
-    [
-      (1 - share_l) / height_l + (1 - share_r) / height_r,
-      share_l / height_l + share_r / height_r,
-      -1 / height_l,
-      -1 / height_r,
-    ],
-    axis=1,
-  )
-  index = np.repeat(np.arange(len(half)), 4)
-  return sparse.csr_matrix((weight.ravel(), (index, vert.ravel())), shape=(len(half), mesh.nvert))
+  return share, lengths(arm - share[..., None] * edge)
 
 
 def _unfolded(mesh: Mesh, which: np.ndarray) -> np.ndarray:
   """Returns the corners of triangles in their own planes, (n, 3, 2)."""
   corner = mesh.rest[mesh.elem[which]]
   x_axis = corner[:, 1] - corner[:, 0]
-  x_axis /= np.linalg.norm(x_axis, axis=1, keepdims=True)
+  x_axis /= lengths(x_axis)[:, None]
   normal = area_vectors(mesh.rest, mesh.elem[which])
-  area = np.linalg.norm(normal, axis=1)
-  y_axis = np.cross(normal / area[:, None], x_axis)
+  area = lengths(normal)
+  y_axis = cross(normal / area[:, None], x_axis)
   arm = corner - corner[:, :1]
   return np.stack([(arm * x_axis[:, None]).sum(-1), (arm * y_axis[:, None]).sum(-1)], axis=-1)
 
 
-def _angles(mesh: Mesh, which: np.ndarray) -> np.ndarray:
-  """Returns C: the angles of triangles' hinges by curvature kxx, kyy, kxy, (n, 3, 3)."""
+def _angles(mesh: Mesh, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+  """Returns C, the angles of triangles' hinges by curvature kxx, kyy, kxy, and `Hinges.weight`.
+
+  Those of hinges that are not there mean nothing.
+  """
   flat, twin = _unfolded(mesh, which), mesh.twin
 
   def modes(point):
     x, y = point[..., 0], point[..., 1]
     return np.stack([x * x / 2, y * y / 2, x * y], axis=-1)
 
-  angle = np.zeros((len(which), 3, 3))
-  for c in range(3):
-    h = 3 * which + c
-    p0, p1, inner = flat[:, c], flat[:, (c + 1) % 3], flat[:, (c + 2) % 3]
-    share, height = _foot(mesh, h)
-    share_o, height_o = _foot(mesh, np.where(twin[h] >= 0, twin[h], h))
-    share_o = 1 - share_o
-    inward = inner - p0 - share[:, None] * (p1 - p0)
-    inward /= np.linalg.norm(inward, axis=1, keepdims=True)
-    outer = p0 + share_o[:, None] * (p1 - p0) - height_o[:, None] * inward
+  h = 3 * which[:, None] + np.arange(3)
+  p0, p1, inner = flat, flat[:, [1, 2, 0]], flat[:, [2, 0, 1]]
+  share, height = _foot(mesh, h)
+  share_o, height_o = _foot(mesh, np.where(twin[h] >= 0, twin[h], h))
+  share_o = 1 - share_o
+  inward = inner - p0 - share[..., None] * (p1 - p0)
+  inward /= lengths(inward)[..., None]
+  outer = p0 + share_o[..., None] * (p1 - p0) - height_o[..., None] * inward
+  ends = modes(p0), modes(p1)
 
-    def bend(apex_point, s, height, p0=p0, p1=p1):
-      at_foot = (1 - s)[:, None] * modes(p0) + s[:, None] * modes(p1)
-      return (modes(apex_point) - at_foot) / height[:, None]
+  def bend(apex_point, s, height):
+    at_foot = (1 - s)[..., None] * ends[0] + s[..., None] * ends[1]
+    return (modes(apex_point) - at_foot) / height[..., None]
 
-    angle[:, c] = -bend(inner, share, height) - bend(outer, share_o, height_o)
-  return angle
+  start = (1 - share) / height + (1 - share_o) / height_o
+  end = share / height + share_o / height_o
+  weight = np.stack([start, end, -1 / height, -1 / height_o], axis=-1)
+  return -bend(inner, share, height) - bend(outer, share_o, height_o), weight
 
 
 def _gain(angle: np.ndarray, present: np.ndarray, poisson: float) -> np.ndarray:
@@ -156,16 +141,34 @@ def _gain(angle: np.ndarray, present: np.ndarray, poisson: float) -> np.ndarray:
   return np.where(both, np.einsum("tik,tk,tjk->tij", vector, inverse, vector), 0)
 
 
-def bending_matrix(mesh: Mesh, hinge: Hinges) -> sparse.csr_matrix:
-  """Returns the plate stiffness on normal displacements at rest [N/m], (nvert, nvert)."""
-  h = hinge.of_elem
-  row, col = np.repeat(h, 3, axis=1).ravel(), np.tile(h, (1, 3)).ravel()
-  keep = (row >= 0) & (col >= 0)
-  nhinge = len(hinge.vert)
-  gain = sparse.csr_matrix(
-    (hinge.gain.ravel()[keep], (row[keep], col[keep])), shape=(nhinge, nhinge)
-  )
-  return sparse.csr_matrix(hinge.rows.T @ gain @ hinge.rows)
+def bending_matrix(
+  mesh: Mesh, hinge: Hinges, vert: np.ndarray | None = None
+) -> sparse.coo_array:
+  """Returns the plate stiffness on normal displacements at rest [N/m], (nvert, nvert).
+
+  Args:
+    mesh: the surface
+    hinge: its hinges
+    vert: vertices whose rows are meant, of which all hinges are there; None for all
+  """
+  which, c = hinge.which, np.arange(3)
+  angle = np.zeros((len(which), 3, 6))  # by the triangle's corners and the apexes beside it
+  for k, at in enumerate((c, (c + 1) % 3, (c + 2) % 3, 3 + c)):
+    angle[:, c, at] = hinge.weight[:, :, k]
+  value = angle.transpose(0, 2, 1) @ hinge.gain @ angle
+  across = mesh.twin.reshape(-1, 3)[which]
+  there: np.ndarray = across >= 0
+  apex = np.where(there, corners(mesh, across, 2), -1)
+  own = np.where(there.any(axis=1, keepdims=True), mesh.elem[which], -1)
+  patch = np.hstack([own, apex])
+  mine = np.ones(mesh.nvert, bool)
+  if vert is not None:
+    mine = np.zeros(mesh.nvert, bool)
+    mine[vert] = True
+  t, i, j = np.nonzero(((patch >= 0) & mine[patch])[:, :, None] & (patch >= 0)[:, None])
+  key, number = np.unique(patch[t, i] * mesh.nvert + patch[t, j], return_inverse=True)
+  at = key // mesh.nvert, key % mesh.nvert
+  return sparse.coo_array((np.bincount(number, value[t, i, j]), at), (mesh.nvert, mesh.nvert))
 
 
 def neighbours(hinge: Hinges) -> tuple[np.ndarray, np.ndarray]:

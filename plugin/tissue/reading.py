@@ -211,5 +211,6 @@ def words(*values: str) -> tuple:
   return choice({value: value for value in values})
 
 
+PATH = (lambda text, nelem: text, "a path")
 POSITIVE = number(0.0, closed=False)
 NOT_NEGATIVE = number(0.0)

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy import sparse
 
 from . import config as configuration
 from . import plate
@@ -32,9 +31,9 @@ def fans(
   degree = np.where(real, mesh.degree[vert], 0)
   fan, half = _rings(mesh, vert, degree, most)
   neighbour = np.where(fan >= 0, node[fan], own[:, None])
-  rest = mesh.rest - mesh.centre
-  here = rest[np.where(real, vert, 0)]
-  toward = np.where((fan >= 0)[..., None], rest[fan] - here[:, None], 0.0)
+  here = mesh.rest[np.where(real, vert, 0)] - mesh.centre
+  toward = mesh.rest[fan] - mesh.centre - here[:, None]
+  toward[fan < 0] = 0.0
   metric, spring = _stiffness(mesh, config, toward, half, degree)
   corner = np.where(half >= 0, half, 0)
   return {
@@ -150,8 +149,7 @@ def elements(
     hinge: number of the hinge of each of their half-edges, -1 on the boundary (n, 3)
     none: number of a hinge that has no gain
   """
-  rest = mesh.rest - mesh.centre
-  corner = rest[mesh.elem[which]]
+  corner = mesh.rest[mesh.elem[which]] - mesh.centre
   arms = np.concatenate([corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]], axis=1)
   # The hinge opposite corner c is that of the half-edge after it.
   opposite = np.where(hinge < 0, none, hinge)[:, [1, 2, 0]]
@@ -166,7 +164,7 @@ def hinges(
   mesh: Mesh, hinge: plate.Hinges, node: np.ndarray, number: np.ndarray
 ) -> dict[str, np.ndarray]:
   """Returns what hinges have, those of `hinge` in its order; `number` has their numbers."""
-  at = (mesh.rest - mesh.centre)[hinge.vert]
+  at = mesh.rest[hinge.vert] - mesh.centre
   near, gain = plate.neighbours(hinge)
   return {
     "hinge_node": offset(node[hinge.vert]).astype(np.int32),
@@ -180,8 +178,3 @@ def hinges(
 def numbers(mesh: Mesh, half: np.ndarray) -> np.ndarray:
   """Returns the numbers of hinges by their half-edges: those of the mesh before the first cut."""
   return np.searchsorted(mesh.whole.interior, half)
-
-
-def matrix(mesh: Mesh, hinge: plate.Hinges) -> sparse.coo_array:
-  """Returns the bending matrix by vertices; see `plate.bending_matrix`."""
-  return plate.bending_matrix(mesh, hinge).tocoo()

@@ -154,6 +154,7 @@ def arrays(
     "free": _node_values(np.where(pinned | mesh.unused, 0.0, 1.0), vert),
     "closed": int(mesh.closed),
     "volume0": topology.volume(mesh.rest, mesh.elem) if mesh.closed else 0.0,
+    "shortest": 0.0 if mesh.spare else topology.shortest(mesh),
     "number": np.array(list(_numbers(config, mesh.closed).values())),
   }
   return out | counts(out)
@@ -221,16 +222,17 @@ def _bending(
   out["elem_hinge"] = pad(out["elem_hinge"], nhinge)
   out = {name: to_slices(values if len(values) % LANES == 0 else pad(values))
          for name, values in out.items()}  # fmt: skip
-  coo = rows.matrix(mesh, hinge)
+  coo = plate.bending_matrix(mesh, hinge)
+  row, col, value = coo.row, coo.col, coo.data
   own = np.arange(nslice * LANES).reshape(nslice, LANES)
 
   def room(entries: np.ndarray) -> np.ndarray:
     return _bend_room(mesh, node, entries) if width is None else width
 
   wide = room if mesh.spare else None
-  widths, bend_node, bend_gain = ellpack(node[coo.row], node[coo.col], coo.data, own, wide)
+  widths, bend_node, bend_gain = ellpack(node[row], node[col], value, own, wide)
   diag = np.zeros(own.size)
-  np.add.at(diag, node[coo.row], np.where(coo.row == coo.col, coo.data, 0.0))
+  diag[node[row[row == col]]] = value[row == col]
   return out | {
     "hinge_angle0": np.zeros((len(out["hinge_node"]), LANES), np.float32),
     "bend_adr": addresses(widths),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from . import config as configuration
 from .config import Config
 from .fill import vertex_volumes, volumes
 from .mesh import Mesh
-from .order import LANES, addresses, ellpack, offset, pad, to_slices
+from .order import LANES, addresses, ellpack, pad, to_slices
 from .types import empty
 
 # Poisson's ratio up to which the resistance to a change of volume is each tetrahedron's own. What
@@ -19,6 +20,7 @@ from .types import empty
 # doi:10.1002/(SICI)1099-0887(199805)14:5<437::AID-CNM162>3.0.CO;2-W), and averages alone let
 # neighbours shrink and grow in turn (Puso and Solberg 2006, doi:10.1002/nme.1457).
 _OWN_POISSON = 0.3
+_WINDOW = 64 * LANES  # edges that are sorted by the number of their tetrahedra
 
 
 def gradients(mesh: Mesh) -> np.ndarray:
@@ -58,6 +60,9 @@ def arrays(mesh: Mesh, config: Config, vert: np.ndarray, node: np.ndarray) -> di
     vert: vertex of each node, -1 for padding   (nnode,)
     node: node of each vertex                   (nvert,)
   """
+  # In the order of their nodes, so that who gathers from them finds them near each other.
+  order = np.lexsort(np.sort(node[mesh.tet], axis=1).T[::-1])
+  mesh = dataclasses.replace(mesh, tet=mesh.tet[order])
   tet = mesh.tet
   volume = volumes(mesh.rest, tet)
   mu, lam, averaged = moduli(mesh, config)
@@ -68,12 +73,13 @@ def arrays(mesh: Mesh, config: Config, vert: np.ndarray, node: np.ndarray) -> di
   width, entry, weight = ellpack(at.ravel(), entry, share, np.full_like(own, tet.size))
   total = vertex_volumes(mesh)
   gain = np.where(vert >= 0, (vertex_volumes(mesh, averaged) / total**2)[vert], 0.0)
-  values = np.stack([volume, mu, lam, averaged], axis=1)
+  values = pad(np.stack([volume, mu, lam, averaged], axis=1), least=1)
+  values[len(tet) :, 1] = 1.0  # padding has no volume, but quotients
   gradient = gradients(mesh)[:, 1:].reshape(-1, 9)
   return {
-    "tet_node": to_slices(pad(offset(at), least=1)).astype(np.int32),
+    "tet_node": to_slices(pad(at, least=1)).astype(np.int32),
     "tet_gradient": to_slices(pad(gradient, least=1)).astype(np.float32),
-    "tet_moduli": to_slices(pad(values, least=1)).astype(np.float32),
+    "tet_moduli": to_slices(values).astype(np.float32),
     "around_adr": addresses(width),
     "around_tet": (entry // 4).astype(np.int32),
     "around_corner": _corner(entry // 4, entry % 4),
@@ -97,8 +103,10 @@ def _edges(mesh: Mesh, vert: np.ndarray, node: np.ndarray) -> dict[str, np.ndarr
   first, last = np.tile(a, len(mesh.tet)), np.tile(b, len(mesh.tet))
   first, last = np.where(swap, last, first), np.where(swap, first, last)
   edge, which, count = np.unique(ends, axis=0, return_inverse=True, return_counts=True)
-  # Those of as many tetrahedra together, so that slices are full; near ones near each other.
-  order = np.lexsort((node[edge[:, 0]], -count))
+  # Near ones near each other; within a window those of as many tetrahedra, so that slices are full.
+  near = np.lexsort(np.sort(node[edge], axis=1).T[::-1])
+  window = np.arange(len(edge)) // _WINDOW
+  order = near[np.lexsort((np.arange(len(edge)), -count[near], window))]
   place = np.empty(len(edge), np.int64)
   place[order] = np.arange(len(edge))
   absent = np.full((-(-len(edge) // LANES), LANES), len(ends))  # of corners of the padding
@@ -108,7 +116,6 @@ def _edges(mesh: Mesh, vert: np.ndarray, node: np.ndarray) -> dict[str, np.ndarr
   slots = [_slot(mesh, vert, node, edge[order]), _slot(mesh, vert, node, edge[order][:, ::-1])]
   return {
     "edge_adr": addresses(width),
-    "edge_tet": tet.astype(np.int32),
     "edge_from": _corner(tet, first[pair]),
     "edge_to": _corner(tet, last[pair]),
     "edge_slot": to_slices(pad(np.stack(slots, axis=1), -1)).astype(np.int32),

@@ -85,6 +85,7 @@ _edge_block = _solid("edge_block")
 _solid_row = _solid("solid_row")
 _edge_change = _scheme("edge_change")
 _predict = _scheme("predict")
+_stay = _scheme("stay")
 _newton_update = _scheme("newton_update")
 _centre_step = _scheme("centre", BLOCK)
 _direct_step = _scheme("direct", BLOCK)
@@ -224,14 +225,8 @@ def _implicit(body: Body):
     _over(_newton_update, body, nslice, flags)
 
 
-def _at_present(body: Body):
-  """Puts the trial state where the body is."""
-  wp.copy(body.system.disp_trial, body.state.disp)
-  wp.copy(body.system.vel_trial, body.state.vel)
-
-
 def _midpoint(body: Body):
-  _at_present(body)
+  _over(_stay, body, body.shape.nslice)
   _centre(body)
   assemble(body, Stage.FIRST)
   solve(body, Stage.FIRST)
@@ -253,7 +248,7 @@ def _neumann(body: Body):
 
 
 def _direct(body: Body, stage: Stage):
-  _at_present(body)
+  _over(_stay, body, body.shape.nslice)
   assemble(body, stage)
   _together(_direct_step, body, stage)
   wp.copy(body.state.dvel, body.system.sol)

@@ -116,6 +116,7 @@ class Shape:
   nslot: int  # rows of stiffness blocks
   closed: int  # whether the surface encloses a volume
   volume0: float  # rest volume [m^3]; 0 for an open surface
+  shortest: float  # no edge is shorter at rest [m]; 0 where cuts may come
   vert: ints("nnode")  # vertex of each node, -1 for padding
   node: ints("nvert")  # node of each vertex
   slot_adr: ints("nslice + 1")  # first row of stiffness blocks
@@ -138,16 +139,15 @@ class Shape:
   hinge_angle0: floats("nhingeslice", 8)  # rest angle 2 sin(theta / 2) [-]
   bend_adr: ints("nslice + 1")  # first row of the bending matrix
   bend_node: ints("nbend", 8)  # node of each entry
-  tet_node: ints("ntetslice", 4, 8)  # offset of each corner's node
+  tet_node: ints("ntetslice", 4, 8)  # each corner's node
   tet_gradient: floats("ntetslice", 9, 8)  # of the shares of corners 1, 2, 3 at rest [1/m]
   around_adr: ints("nslice + 1")  # first row of each slice in the three below, for solids
   around_tet: ints("naround", 8)  # each tetrahedron around a node
   around_corner: ints("naround", 8)  # number of its corner there
   around_share: floats("naround", 8)  # a quarter of its volume [m^3]; 0 for padding
-  edge_adr: ints("nedgeslice + 1")  # first row of each slice of edges in the three below
-  edge_tet: ints("nedge", 8)  # each tetrahedron around an edge
-  edge_from: ints("nedge", 8)  # number of its corner at the edge's first end
-  edge_to: ints("nedge", 8)  # number of its corner at the other
+  edge_adr: ints("nedgeslice + 1")  # first row of each slice of edges in the two below
+  edge_from: ints("nedge", 8)  # of each tetrahedron around an edge, its corner at the first end
+  edge_to: ints("nedge", 8)  # its corner at the other
   edge_slot: ints("nedgeslice", 2, 8)  # where the blocks of both ends start; -1 for padding
 
 
@@ -199,10 +199,11 @@ class System:
   hinge_moment: floats("nworld", "nhingeslice", 8)  # moment impulse [N m s]
   hinge_rough: floats("nworld", "nhingeslice", 8)  # what the bending matrix may leave out [N m]
   tet_strain: floats("nworld", "ntetslice", 8)  # impulse of the change of volume [s]
-  node_pressure: floats("nworld", "nsolidslice", 3, 8)  # averaged pressure impulse, first [Pa s]
+  node_disp: floats("nworld", "nsolidslice", 4, 8)  # that of `disp_trial`, as shared vectors [m]
+  node_vel: floats("nworld", "nsolidslice", 4, 8)  # that of `vel_trial`, as shared vectors [m/s]
+  node_pressure: floats("nworld", "nsolidslice", 8)  # averaged pressure impulse [Pa s]
   tet_impulse: floats("nworld", "ntetslice", 16, 8)  # impulse on each corner [N s]
-  tet_arm: floats("nworld", "ntetslice", 16, 8)  # turned gradient of each corner [m^(1/2)]
-  tet_now: floats("nworld", "ntetslice", 4, 8)  # lambda, mu, tension of the matrix [Pa]
+  tet_arm: floats("nworld", "ntetslice", 16, 8)  # turned gradient of each corner [kg^(1/2)], moduli
   total: floats("nworld", 2)  # volume difference [m^3], areavec . vel
   sol: vector  # PCG solution [m/s]
   r: vector  # PCG residual

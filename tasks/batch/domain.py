@@ -20,6 +20,7 @@ class Domain:
     nodes: of the organ that its instrument touches at once, and some more: the slots of a GPU's
       window
     takes: numbers of the task that the struct has under the same names
+    tissue: keys of the organ's tissue among the rows of `draw`, which the struct does not have
   """
 
   struct: Any
@@ -28,6 +29,7 @@ class Domain:
   observe: Any
   nodes: int = 12
   takes: tuple[str, ...] = ()
+  tissue: tuple[str, ...] = ()
 
   @staticmethod
   def prepare(task: Any) -> None:
@@ -45,11 +47,6 @@ class Domain:
   @staticmethod
   def constants(task: Any, physics: Physics) -> Mapping[str, Any]:
     """Returns what else of the struct all worlds share: arrays, vectors, numbers."""
-    return {}
-
-  @staticmethod
-  def tissue(task: Any, rows: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
-    """Returns keys of the organ's tissue that episodes change, a row a world."""
     return {}
 
   @staticmethod

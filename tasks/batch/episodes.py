@@ -4,8 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import gymnasium
@@ -18,8 +17,8 @@ from palpate.tasks.physics import Physics
 
 from .domain import Domain
 
-_AHEAD = 64  # episodes that are drawn while a device steps
-FRAME = {"body_pos", "body_quat", "pose"}  # what every exercise draws: trocar and joints
+# What every exercise draws: trocar, joints, length of the path.
+FRAME = ("body_pos", "body_quat", "pose", "reference")
 
 
 class Resting(Physics):
@@ -55,8 +54,8 @@ class Resting(Physics):
 class Episodes:
   """The next episodes of worlds, each drawn from a random state of its own.
 
-  What a world begins with next does not depend on how it plays: it is drawn ahead, while others
-  step.
+  What a world begins with next does not depend on how it plays: it is drawn ahead, while a device
+  steps.
 
   Attributes:
     physics: of the scene at rest
@@ -72,8 +71,6 @@ class Episodes:
     self.rows: dict[str, np.ndarray] = {}
     self._next: dict[str, np.ndarray] = {}
     self._ready = np.zeros(nworld, bool)
-    self._ahead: Future | None = None
-    self._pool = ThreadPoolExecutor(1)
     self._where: tuple[bytes, Any] = (b"", None)
     self._place_of_work, task.place_of_work = task.place_of_work, self._remember
 
@@ -87,7 +84,6 @@ class Episodes:
 
   def seed(self, seeds: Sequence[int | None], worlds: np.ndarray) -> None:
     """Seeds worlds as `reset` of a single environment does; with None those that have no state."""
-    self._wait()
     for world in worlds:
       seed = seeds[world]
       if seed is not None or self._random[world] is None:
@@ -97,39 +93,29 @@ class Episodes:
 
   def take(self, worlds: np.ndarray) -> dict[str, np.ndarray]:
     """Returns `rows` with the next episodes of some worlds."""
-    self._wait()
-    self._draw(worlds[~self._ready[worlds]])
+    for world in worlds[~self._ready[worlds]]:
+      self._draw(world)
     for name, values in self._next.items():
       self.rows.setdefault(name, np.zeros_like(values))[worlds] = values[worlds]
     self._ready[worlds] = False
     return self.rows
 
-  def draw_ahead(self) -> None:
-    """Draws some of the episodes after these, while the caller waits for a device."""
-    if self._ahead is not None and self._ahead.done():
-      self._wait()
-    if self._ahead is None and not self._ready.all():
-      self._ahead = self._pool.submit(self._draw, np.flatnonzero(~self._ready)[:_AHEAD])
+  def draw_ahead(self, waits: Callable[[], bool]) -> None:
+    """Draws episodes after these for as long as the caller waits for a device."""
+    for world in np.flatnonzero(~self._ready):
+      if not waits():
+        return
+      self._draw(world)
 
-  def _wait(self) -> None:
-    if self._ahead is not None:
-      self._ahead.result()
-    self._ahead = None
-
-  def _draw(self, worlds: np.ndarray) -> None:
-    for world in worlds:
-      self._task.random = self._random[world]
-      self._task.initialize_episode(self.physics)
-      for name, row in self._row().items():
-        if name not in self._next:
-          count = len(self._random)
-          self._next[name] = np.zeros((count, *np.shape(row)), np.asarray(row).dtype)
-        self._next[name][world] = row
-      self._ready[world] = True
-
-  def close(self) -> None:
-    """Ends the thread that draws."""
-    self._pool.shutdown(cancel_futures=True)
+  def _draw(self, world: Any) -> None:
+    self._task.random = self._random[world]
+    self._task.initialize_episode(self.physics)
+    for name, row in self._row().items():
+      if name not in self._next:
+        count = len(self._random)
+        self._next[name] = np.zeros((count, *np.shape(row)), np.asarray(row).dtype)
+      self._next[name][world] = row
+    self._ready[world] = True
 
   def _row(self) -> Mapping[str, Any]:
     model = self.physics.model.ptr
@@ -137,6 +123,7 @@ class Episodes:
     if body.parentid[0]:
       raise ValueError(f"{self._task.name}: the trocar hangs on a body, expected the world")
     frame = {"body_pos": body.pos.copy(), "body_quat": body.quat.copy(), "pose": self.physics.pose}
+    frame["reference"] = np.array(self._task.reference_length() or 0.0)
     return frame | dict(self._domain.draw(self._task, self.physics))
 
 

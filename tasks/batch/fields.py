@@ -49,9 +49,10 @@ class Common:
   failures: ints("nworld")
   xpos: floats("nworld", "nvert", 3)
   # Drawn for an episode.
-  port_pos: vectors  # of the trocar in the world [m]
-  port_quat: Array(wp.quat, ("nworld",))  # x y z w
+  body_pos: floats("nworld", 3)  # of the trocar in the world [m]
+  body_quat: floats("nworld", 4)  # w x y z
   pose: floats("nworld", 4)  # joints at the start
+  reference: floats("nworld")  # length of the path that it asks for, 0 where it asks for none [m]
   # State.
   action: floats("nworld", "naction")
   begun: flags  # an episode begins
@@ -67,6 +68,11 @@ class Common:
   cost_shaft: floats("nworld")
   cost_damage: floats("nworld")
   shaft_peak: floats("nworld")  # [N]
+  errors: ints("nworld")  # misses, drops, contacts of the shaft
+  targets: ints("nworld")  # that were reached
+  missed_by: floats("nworld")  # sum of the distances from these [m]
+  grasps: ints("nworld")
+  slips: ints("nworld")  # grasps that were lost in closed jaws
   terminated: flags
   truncated: flags
   # Observed.

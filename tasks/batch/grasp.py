@@ -8,7 +8,7 @@ from palpate.tasks import grasp, touch
 
 from .fields import RUNNING, SUCCESS, Common
 from .hold import Hold, HoldState, distance, follow, from_tip, holds, show, start
-from .kernels import closeness, judge, point
+from .kernels import closeness, error, judge, point
 
 progress = wp.func(grasp.progress)
 _SLACK, _REST = wp.constant(touch.SLACK), wp.constant(grasp.REST)
@@ -66,8 +66,10 @@ def advance(s: Common, o: HoldState):
     if o.lowered[w] >= _REST - _SLACK and not o.closing[w]:
       o.letting[w] = True
     else:
+      error(s, w)
       again(o, w)
   if o.letting[w] and (share < _LOW or share > _LETTING):
+    error(s, w)
     again(o, w)
   outcome = int(RUNNING)
   now = wp.float32(0.0)

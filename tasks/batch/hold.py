@@ -11,7 +11,7 @@ from palpate.tissue.types import Array, floats, ints, struct
 
 from . import domain
 from .fields import Common, flags, vectors
-from .kernels import point, put, vector
+from .kernels import error, point, put, reach, vector
 
 _CLOSING, _GRIPPING = wp.constant(physics.CLOSING), wp.constant(physics.GRIPPING)
 _FOLD, _FORCE = wp.constant(physics.FOLD), wp.constant(physics.HELD_FORCE)
@@ -80,6 +80,12 @@ def follow(s: Common, o: HoldState, w: int):
   elif pressed and distance(s, o, w) < _REACH:
     now = True
     o.where[w] = from_tip(s, o, w)
+    reach(s, w, distance(s, o, w))
+    s.grasps[w] = s.grasps[w] + 1
+  if closing and not o.closing[w] and distance(s, o, w) >= 2.0 * _REACH:
+    error(s, w)
+  if before and not now and closing:
+    s.slips[w] = s.slips[w] + 1
   o.closing[w] = closing
   o.grasped[w, 0] = wp.where(now, 1.0, 0.0)
   return before and not now

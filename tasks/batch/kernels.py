@@ -53,6 +53,13 @@ def normal(s: Common, w: int, triangle: int):
   return wp.normalize(wp.cross(b - a, node(s, w, s.elem[triangle, 2]) - a))
 
 
+@wp.kernel(enable_backward=False)
+def write(at: wp.array[int], rows: wp.array2d[int], out: wp.array2d[int]):
+  """Writes rows to their places."""
+  k, i = wp.tid()
+  out[at[k], i] = rows[k, i]
+
+
 # A control step.
 
 
@@ -97,6 +104,11 @@ def begin(s: Common):
   s.cost_force[w] = 0.0
   s.cost_shaft[w] = 0.0
   s.cost_damage[w] = 0.0
+  s.errors[w] = 0
+  s.targets[w] = 0
+  s.missed_by[w] = 0.0
+  s.grasps[w] = 0
+  s.slips[w] = 0
 
 
 @wp.kernel(enable_backward=False)
@@ -143,8 +155,8 @@ def place(s: Common, w: int):
   by_pitch, by_yaw = wp.vec3(0.0, cy * cp, cy * sp), wp.vec3(cy, -sy * sp, sy * cp)
   vel = s.joint_vel[w, 3] * along
   vel += far * (s.joint_vel[w, 0] * by_pitch + s.joint_vel[w, 1] * by_yaw)
-  port = s.port_quat[w]
-  put(s.tip_pos, w, s.port_pos[w] + wp.quat_rotate(port, far * along))
+  port = wp.quat(s.body_quat[w, 1], s.body_quat[w, 2], s.body_quat[w, 3], s.body_quat[w, 0])
+  put(s.tip_pos, w, vector(s.body_pos, w) + wp.quat_rotate(port, far * along))
   put(s.tip_vel, w, wp.quat_rotate(port, vel))
   q = port * wp.quat(wp.sin(0.5 * pitch), 0.0, 0.0, wp.cos(0.5 * pitch))
   q = q * wp.quat(0.0, -wp.sin(0.5 * yaw), 0.0, wp.cos(0.5 * yaw))
@@ -154,11 +166,29 @@ def place(s: Common, w: int):
     s.tip_quat[w, 1 + k] = q[k]
 
 
+# Events, see `Task.event`.
+
+
+@wp.func
+def error(s: Common, w: int):
+  """Counts a miss, a drop or a contact that was not meant."""
+  s.errors[w] = s.errors[w] + 1
+
+
+@wp.func
+def reach(s: Common, w: int, distance: float):
+  """Counts a target that was reached, at a distance from it [m]."""
+  s.targets[w] = s.targets[w] + 1
+  s.missed_by[w] = s.missed_by[w] + distance
+
+
 @wp.func
 def judge(s: Common, w: int, progress: float, outcome: int):
   """Ends a control step that came to a progress and an outcome; a success is all of it."""
   peak, shaft = s.peak_force[w, 0], s.shaft_peak[w]
   over, lies, harmed = parts(peak, shaft, s.force_limit, s.damage)
+  if lies > 0.0 and s.cost_shaft[w] == 0.0:
+    error(s, w)
   total = over + lies + harmed
   s.cost[w] = total
   s.cost_force[w] = over

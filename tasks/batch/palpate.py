@@ -3,7 +3,6 @@
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 from typing import Any
 
-import numpy as np
 import warp as wp
 from palpate.models import shapes
 from palpate.tasks import probe, scenes
@@ -11,7 +10,7 @@ from palpate.tissue.types import Array, floats, struct
 
 from . import domain
 from .fields import MISSED, RUNNING, SUCCESS, Common
-from .kernels import judge, put, vector
+from .kernels import error, judge, put, reach, vector
 
 _FEELING, _FELT = wp.constant(probe.FEELING), wp.constant(probe.FELT)
 _REPORT = wp.constant(probe.REPORT)
@@ -50,8 +49,12 @@ def advance(s: Common, o: PalpateState):
   found = wp.float32(0.0)
   if s.action[w, 4] > 0.5:
     outcome = MISSED
-    if wp.length(tip - o.inclusion[w]) <= o.tolerance and force >= _REPORT:
+    off = wp.length(tip - o.inclusion[w])
+    if off <= o.tolerance and force >= _REPORT:
       outcome = SUCCESS
+      reach(s, w, off)
+    else:
+      error(s, w)
   else:
     count = wp.int32(0)
     for k in range(o.places.shape[0]):
@@ -78,6 +81,7 @@ class Palpate(domain.Domain):
   struct = PalpateState
   begin, advance, observe = begin, advance, observe
   takes = ("tolerance",)
+  tissue = ("young",)
 
   @staticmethod
   def prepare(task: Any):
@@ -97,16 +101,9 @@ class Palpate(domain.Domain):
   @staticmethod
   def draw(task: Any, physics):
     """Returns the rows of a world."""
-    return {"inclusion": task.inclusion}
-
-  @staticmethod
-  def tissue(task: Any, rows):
-    """Returns what `Tissue.configure` gives the worlds."""
-    scene = task.scene
+    scene, place = task.scene, task.inclusion
     vertices, triangles = scenes.surface(scene.organ, scene.nodes, task.variants[0])
     young = scenes.TISSUES[scene.organ].young
-    stiff = [
-      shapes.inclusion_young(vertices, triangles, place, task.radius, young, task.factor * young)
-      for place in rows["inclusion"]
-    ]
-    return {"young": np.array(stiff)}
+    stiff = task.factor * young
+    lump = shapes.inclusion_young(vertices, triangles, place, task.radius, young, stiff)
+    return {"inclusion": place, "young": lump}

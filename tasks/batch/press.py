@@ -9,11 +9,12 @@ from palpate.tasks import probe, touch
 from palpate.tissue.types import Array, floats, ints, struct
 
 from . import domain
-from .fields import RUNNING, SUCCESS, Common
-from .kernels import closeness, judge, normal, put, vector
+from .fields import RUNNING, SUCCESS, Common, flags
+from .kernels import closeness, error, judge, normal, put, reach, vector
 
 presses, progress = wp.func(probe.presses), wp.func(probe.progress)
 _SLACK = wp.constant(touch.SLACK)
+_PRESSES, _LEAVES = wp.constant(probe.PRESSES), wp.constant(probe.LEAVES)
 
 
 @struct
@@ -30,6 +31,7 @@ class PressState:
   normals: Array(wp.vec3, ("nworld", "nsite"))
   done: ints("nworld")
   time: floats("nworld")  # in the band [s]
+  pressing: flags
   distance0: floats("nworld")  # [m]
   target: floats("nworld", 3)
   normal: floats("nworld", 3)
@@ -70,6 +72,7 @@ def begin(s: Common, o: PressState):
     return
   o.done[w] = 0
   o.time[w] = 0.0
+  o.pressing[w] = False
   o.distance0[w] = distance(s, o, w)
 
 
@@ -79,11 +82,15 @@ def advance(s: Common, o: PressState):
   w = wp.tid()
   force = wp.length(vector(s.contact_force, w))
   on = distance(s, o, w) <= o.tolerance
+  if force > _PRESSES and not o.pressing[w] and not on:
+    error(s, w)
+  o.pressing[w] = force > wp.where(o.pressing[w], _LEAVES, _PRESSES)
   if presses(on, level(s, o, w), o.low, o.high, force):
     o.time[w] = o.time[w] + s.dt
   else:
     o.time[w] = 0.0
   if o.time[w] >= o.hold - _SLACK:
+    reach(s, w, distance(s, o, w))
     o.done[w] = o.done[w] + 1
     o.time[w] = 0.0
     o.distance0[w] = distance(s, o, w)

@@ -8,7 +8,7 @@ from palpate.tasks import retract, touch
 
 from .fields import RUNNING, SUCCESS, Common
 from .hold import Hold, HoldState, distance, follow, show, start
-from .kernels import closeness, judge, node, put, vector
+from .kernels import closeness, error, judge, node, put, vector
 
 progress = wp.func(retract.progress)
 _SLACK, _SEEN = wp.constant(touch.SLACK), wp.constant(retract.SEEN)
@@ -49,7 +49,8 @@ def begin(s: Common, o: HoldState):
 def advance(s: Common, o: HoldState):
   """Follows the grasp and what is seen."""
   w = wp.tid()
-  follow(s, o, w)
+  if follow(s, o, w):
+    error(s, w)
   seen = wp.float32(0.0)
   for k in range(o.disc.shape[1]):
     if not o.covered[w, k]:

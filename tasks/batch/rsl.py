@@ -37,7 +37,7 @@ class RslRl(VecEnv):
       raise ValueError("env is no vectorised exercise with output='torch', expected one")
     self.env, self.cfg = found, {}
     self.num_envs, self.max_episode_length = found.num_envs, found.max_episode_steps
-    self.num_actions = len(found.worlds.task.components)
+    self.num_actions = len(found.task.components)
     self.device = str(wp.device_to_torch(found.device))
     self.groups = groups(found.single_observation_space)
     self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
@@ -58,7 +58,8 @@ class RslRl(VecEnv):
     """Lets worlds be at moments of an episode that differ, so that not all end at once."""
     limit = self.max_episode_length
     steps = torch.randint(0, limit, (self.num_envs,), generator=generator)
-    self.env.worlds.fields.step.assign(steps.int().numpy())
+    for part, at in zip(self.env.parts, self.env.slices, strict=True):
+      part.fields.step.assign(steps[at].int().numpy())
     self.episode_length_buf[:] = steps.to(self.device)
     self.whole[:] = False
 

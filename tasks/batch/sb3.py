@@ -15,6 +15,7 @@ import gymnasium
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
+from .fields import INFO
 from .vector import Exercises
 
 
@@ -46,7 +47,8 @@ class Sb3(VecEnv):
     infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
     for world in np.flatnonzero(terminated | truncated):
       final = info["final_info"]
-      infos[world] = {name: final[name][world] for name in final if name[0] != "_"}
+      infos[world] = {name: final[name][world] for name in INFO}
+      infos[world]["metrics"] = {name: v[world] for name, v in final["metrics"].items()}
       infos[world]["terminal_observation"] = info["final_obs"][world]
       infos[world]["TimeLimit.truncated"] = bool(truncated[world])
     return seen, reward.astype(np.float32), terminated | truncated, infos

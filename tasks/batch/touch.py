@@ -10,10 +10,11 @@ from palpate.tissue.types import floats, ints, struct
 
 from . import domain
 from .fields import RUNNING, SUCCESS, Common, flags
-from .kernels import closeness, judge, normal, point, put, vector
+from .kernels import closeness, error, judge, normal, point, put, reach, vector
 
 follow, progress = wp.func(touch.follow), wp.func(touch.progress)
 _DWELL, _SLACK = wp.constant(touch.DWELL), wp.constant(touch.SLACK)
+_CONTACT = wp.constant(touch.CONTACT)
 
 
 @struct
@@ -63,11 +64,14 @@ def advance(s: Common, o: TouchState):
   w = wp.tid()
   force = s.peak_force[w, 0]
   on = distance(s, o, w) <= o.tolerance
+  if force > _CONTACT and not o.pressing[w] and not on:
+    error(s, w)
   pressing, spoilt, time = follow(o.spoilt[w], o.time[w], force, on, s.force_limit, s.dt)
   o.pressing[w] = pressing
   o.spoilt[w] = spoilt
   o.time[w] = time
   if time >= _DWELL - _SLACK:
+    reach(s, w, distance(s, o, w))
     o.done[w] = o.done[w] + 1
     o.time[w] = 0.0
     o.spoilt[w] = True

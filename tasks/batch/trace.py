@@ -10,7 +10,7 @@ from palpate.tissue.types import Array, floats, ints, struct
 
 from . import domain
 from .fields import RUNNING, SUCCESS, Common, flags
-from .kernels import closeness, judge, node, put, vector
+from .kernels import closeness, error, judge, node, put, vector
 
 follow = wp.func(trace.follow)
 _CONTACT, _STEP = wp.constant(trace.CONTACT), wp.constant(trace.STEP)
@@ -30,6 +30,7 @@ class TraceState:
   traced: floats("nworld")  # [m]
   skipped: floats("nworld")  # [m]
   tracing: flags
+  touching: flags
   distance0: floats("nworld")  # [m]
   target: floats("nworld", 3)
   ahead: floats("nworld", len(trace.AHEAD), 3)
@@ -80,6 +81,15 @@ def project(s: Common, o: TraceState, w: int):
   return place, off
 
 
+@wp.func
+def aside(s: Common, o: TraceState, w: int):
+  """Returns how far the tip is from the nearest point of the curve [m]."""
+  off = wp.float32(wp.inf)
+  for k in range(o.count[w]):
+    off = wp.min(off, wp.length(point(s, o, w, k) - vector(s.tip_pos, w)))
+  return off
+
+
 @wp.kernel(enable_backward=False)
 def begin(s: Common, o: TraceState):
   """Begins episodes."""
@@ -89,6 +99,7 @@ def begin(s: Common, o: TraceState):
   o.traced[w] = 0.0
   o.skipped[w] = 0.0
   o.tracing[w] = False
+  o.touching[w] = False
   o.distance0[w] = distance(s, o, w)
 
 
@@ -98,13 +109,19 @@ def advance(s: Common, o: TraceState):
   w = wp.tid()
   length = o.arc[w, o.count[w] - 1]
   place, off = project(s, o, w)
-  on = wp.length(vector(s.contact_force, w)) > _CONTACT and off <= o.tolerance
+  touching = wp.length(vector(s.contact_force, w)) > _CONTACT
+  on = touching and off <= o.tolerance
   tracing, traced, skipped = follow(
     o.tracing[w], o.traced[w], o.skipped[w], place, on, o.tolerance, length
   )
   o.tracing[w] = tracing
   o.traced[w] = traced
   o.skipped[w] = skipped
+  if o.touching[w] and not touching and traced > 0.0:
+    error(s, w)
+  if touching and not o.touching[w] and aside(s, o, w) > o.tolerance:
+    error(s, w)
+  o.touching[w] = touching
   outcome = int(RUNNING)
   now = 0.1 + 0.9 * traced / length
   if traced == 0.0:

@@ -1,7 +1,9 @@
 """Vectorised exercises: `gymnasium.make_vec("palpate/TouchEasy-v0", num_envs=4096)`.
 
 World i after `reset(seed=s)` is `gymnasium.make(...)` after `reset(seed=s + i)`: episodes are drawn
-from the same random states, and on the CPU every step is the same to the rounding of float32.
+from the same random states, and on the CPU every step is the same to the rounding of float32. Where
+an exercise has several shapes, each is that of a share of the worlds, in their order and for good:
+these are the single environments with `variants=(that shape,)`.
 
 Worlds whose episode ends begin another in the same step. Then `infos["final_obs"]` and
 `infos["final_info"]` have what the ended ones saw last, as Gymnasium has it for `SAME_STEP`: an
@@ -11,6 +13,7 @@ dictionary of arrays that are to be read where `infos["_final_obs"]`.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -21,8 +24,8 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from palpate.batch.base import on_device
 from palpate.tasks.gym import Exercise
-from palpate.tasks.observation import ROWS
 
+from . import tally
 from .domain import Domain
 from .fields import INFO, OBSERVED, OUTCOMES
 from .grasp import Grasp
@@ -46,7 +49,9 @@ class Exercises(VectorEnv):
   """Worlds of an exercise, stepped together.
 
   Attributes:
-    worlds: their arrays
+    parts: the worlds of each shape on each device
+    slices: which of all worlds these are
+    task: of the first of them
     device: Warp device of these
     output: what is told, see `__init__`
     max_episode_steps: of an episode
@@ -59,7 +64,7 @@ class Exercises(VectorEnv):
     num_envs: int = 1,
     task: str = "touch/standard",
     max_episode_steps: int | None = None,
-    device: str | None = None,
+    device: str | Sequence[str] | None = None,
     output: str = "numpy",
     nodes: int | None = None,
     **kwargs: Any,
@@ -70,7 +75,8 @@ class Exercises(VectorEnv):
       num_envs: number of worlds
       task: such as "touch/easy"
       max_episode_steps: steps of an episode, if less than the task's time limit; -1 for that
-      device: `cpu`, `cuda:N`, or None for a GPU where there is one; see `palpate.batch.make`
+      device: `cpu`, `cuda:N`, several of these, which share the worlds, or None for a GPU where
+        there is one; see `palpate.batch.make`
       output: what observations, rewards and flags are: `numpy`, or arrays of the device of `torch`
         or `warp`; all are copies
       nodes: on a GPU, see `palpate.batch.make`; None for what the instrument touches
@@ -85,33 +91,45 @@ class Exercises(VectorEnv):
       raise ValueError(f"num_envs is {num_envs!r}, expected a whole number >= 1")
     self.num_envs, self.output = int(num_envs), output
     _refuse(task, kwargs)
-    single = Exercise(task, **{"surroundings": "none", **kwargs})  # it draws nothing
+    kwargs = {"surroundings": "none", **kwargs}  # it draws nothing
+    single = Exercise(task, **kwargs)
     environment = single.environment
+    self.task, limit = environment.task, environment.step_limit
+    _refuse_task(self.task)
+    if max_episode_steps is not None and max_episode_steps > 0:
+      limit = min(limit, max_episode_steps)
     if device is None:
       device = "cuda:0" if wp.is_cuda_available() else "cpu"
-    _refuse_task(environment.task)
     self.single_observation_space, self.single_action_space = (
       single.observation_space, single.action_space
     )  # fmt: skip
+    devices = [device] if isinstance(device, str) else list(device)
+    self._make(single, task, kwargs, devices, limit, nodes)
     self.observation_space = batch_space(single.observation_space, self.num_envs)
     self.action_space = batch_space(single.action_space, self.num_envs)
-    limit = environment.step_limit
-    if max_episode_steps is not None and max_episode_steps > 0:
-      limit = min(limit, max_episode_steps)
-    domain = DOMAINS[type(environment.task).__name__]
-    options = {} if device == "cpu" else {"nodes": domain.nodes if nodes is None else nodes}
-    self.worlds = Worlds(environment, domain, self.num_envs, device, limit, **options)
-    self.device, self.max_episode_steps = self.worlds.device, limit
-    self._observed = {
-      name: self._array(name) for name in single.observation_space.spaces
-    }  # what of the arrays is told
+    self.device, self.max_episode_steps = self.parts[0].device, limit
+    self._observed = [*environment.observation_spec()]
     self._begun = False
     self.spec = None
 
-  def _array(self, name: str) -> wp.array:
-    if name in ROWS:
-      return getattr(self.worlds.fields, OBSERVED.get(name, name))
-    return getattr(self.worlds.own, name)
+  def _make(
+    self, single: Exercise, task: str, kwargs: dict[str, Any], devices: list[str], limit: int,
+    nodes: int | None,
+  ) -> None:  # fmt: skip
+    """Makes the parts: each shape on each device has as many worlds as another."""
+    domain = DOMAINS[type(self.task).__name__]
+    kinds = list(itertools.product(devices, self.task.variants))
+    ends = np.linspace(0, self.num_envs, len(kinds) + 1).round().astype(int).tolist()
+    self.parts, self.slices = list[Worlds](), list[slice]()
+    for (where, variant), start, end in zip(kinds, ends, ends[1:], strict=False):
+      if end > start:
+        of_part = single
+        if len(kinds) > 1:
+          of_part = Exercise(task, **{**kwargs, "variants": (variant,)})
+        options = {} if where == "cpu" else {"nodes": domain.nodes if nodes is None else nodes}
+        count = end - start
+        self.parts.append(Worlds(of_part.environment, domain, count, where, limit, **options))
+        self.slices.append(slice(start, end))
 
   # Gymnasium's side.
 
@@ -122,7 +140,7 @@ class Exercises(VectorEnv):
     mask = _mask(options, self.num_envs)
     super().reset(seed=seed if isinstance(seed, int) else None)
     seeds = _seeds(seed, self.num_envs)
-    self.worlds.begin(mask if self._begun else np.ones(self.num_envs, bool), seeds)
+    self._begin(mask if self._begun else np.ones(self.num_envs, bool), seeds)
     self._begun = True
     return self._observations(), self._infos()
 
@@ -130,35 +148,49 @@ class Exercises(VectorEnv):
     """Takes a control step in all worlds; begins another episode where one ends."""
     if not self._begun:
       raise gymnasium.error.ResetNeeded("step before a reset, expected reset first")
-    worlds = self.worlds
     shape = tuple(np.shape(actions))
     if shape != self.action_space.shape:
       raise ValueError(f"actions have shape {shape}, expected {self.action_space.shape}")
     self._wait()
-    over = worlds.step(on_device(actions, wp.float32, self.device))
-    fields = worlds.fields
-    told = [self._tell(fields.reward, np.float64)]
-    told += [self._tell(array, bool) for array in (fields.terminated, fields.truncated)]
+    rows = [
+      on_device(actions[at], wp.float32, part.device)
+      for part, at in zip(self.parts, self.slices, strict=True)
+    ]
+    for part, at, row in zip(self.parts, self.slices, rows, strict=True):
+      part.check(row, at.start)
+    for part, row in zip(self.parts, rows, strict=True):
+      part.launch_step(row)
+    over = np.concatenate([part.wait() for part in self.parts])
+    told = [self._tell("reward", np.float64)]
+    told += [self._tell(name, bool) for name in ("terminated", "truncated")]
     infos = {}
     if over.any():
       infos = {"final_obs": self._final(over), "_final_obs": over}
-      infos |= {"final_info": self._infos(over), "_final_info": over}
-      worlds.begin(over)
+      infos |= {"final_info": self._infos(over) | {"metrics": self._metrics()}, "_final_info": over}
+      self._begin(over)
     return (self._observations(), *told, self._infos() | infos)
 
-  def close_extras(self, **kwargs: Any) -> None:
-    """Ends what runs beside."""
-    self.worlds.episodes.close()
+  def _begin(self, mask: np.ndarray, seeds: list[int | None] | None = None) -> None:
+    """Begins episodes in the worlds of a mask."""
+    for part, at in zip(self.parts, self.slices, strict=True):
+      if mask[at].any():
+        part.begin(mask[at], seeds and seeds[at])
 
   # What is told.
 
-  def _tell(self, array: wp.array, dtype: Any = np.float64) -> Any:
-    """Returns a copy of an array as users want it."""
-    if self.output == "warp":
-      return wp.clone(array)
+  def _tell(self, name: str, dtype: Any = np.float64) -> Any:
+    """Returns a copy of an array of all worlds as users want it."""
+    arrays = [part.array(name) for part in self.parts]
+    if self.output == "numpy":
+      return np.concatenate([array.numpy() for array in arrays]).astype(dtype)
     if self.output == "torch":
-      return wp.to_torch(array).clone()
-    return array.numpy().astype(dtype)
+      return _cat(arrays)
+    whole: Any = wp.empty(
+      (self.num_envs, *arrays[0].shape[1:]), dtype=arrays[0].dtype, device=self.device
+    )
+    for at, array in zip(self.slices, arrays, strict=True):
+      wp.copy(whole[at], array)
+    return whole
 
   def _wait(self) -> None:
     """Waits for what is on the device: torch does not wait for Warp, nor Warp for torch."""
@@ -167,7 +199,7 @@ class Exercises(VectorEnv):
 
   def _observations(self) -> dict[str, Any]:
     self._wait()
-    return {name: self._tell(array) for name, array in self._observed.items()}
+    return {name: self._tell(OBSERVED.get(name, name)) for name in self._observed}
 
   def _final(self, over: np.ndarray) -> Any:
     seen = self._observations()
@@ -178,18 +210,32 @@ class Exercises(VectorEnv):
       final[world] = {name: values[world] for name, values in seen.items()}
     return final
 
+  def _metrics(self) -> dict[str, Any]:
+    """Returns the metrics of the episodes so far, NaN where they are unknown."""
+    values, names = self._tell("values"), tally.names(self.task.jaws)
+    if self.output != "warp":
+      return {name: values[:, k] for k, name in enumerate(names)}
+    return {name: wp.clone(values[:, k]) for k, name in enumerate(names)}
+
   def _infos(self, where: np.ndarray | None = None) -> dict[str, Any]:
     """Returns what `info` is of a single environment; with a mask that is not of all worlds."""
-    fields = self.worlds.fields
-    found = {name: self._tell(getattr(fields, field)) for name, field in INFO.items()}
+    found = {name: self._tell(field) for name, field in INFO.items()}
     if self.output != "numpy":
       return found
-    found["success"] = fields.success.numpy().copy()
-    found["outcome"] = np.array([OUTCOMES[k] for k in fields.outcome.numpy()], object)
+    found["success"] = found["success"].astype(bool)
+    found["outcome"] = np.array([OUTCOMES[int(k)] for k in found["outcome"]], object)
     for name in ("progress", "peak_force"):
       found[name] = found[name][:, 0]
     known = np.ones(self.num_envs, bool) if where is None else where
     return found | {f"_{name}": known for name in INFO}
+
+
+def _cat(arrays: list[wp.array]) -> Any:
+  """Returns arrays one after the other as a torch tensor on the device of the first."""
+  import torch
+
+  tensors = [wp.to_torch(array) for array in arrays]
+  return torch.cat([tensor.to(tensors[0].device) for tensor in tensors])
 
 
 def _seeds(seed: int | Sequence[int | None] | None, count: int) -> list[int | None]:
@@ -226,9 +272,4 @@ def _refuse_task(task: Any) -> None:
     raise ValueError(
       f"{task.name}: observations has {task.observed.pictures[0]!r}, but a vectorised exercise "
       f"makes no pictures; {_ELSE}"
-    )
-  if len(task.variants) > 1:
-    raise ValueError(
-      f"{task.name}: variants is {task.variants}, expected one shape, such as (None,), which all "
-      f"worlds have; {_ELSE}"
     )

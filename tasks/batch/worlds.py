@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import mujoco as mj
@@ -19,7 +19,7 @@ from palpate.tasks.physics import AXES
 from palpate.tasks.stage import STATE
 from palpate.tissue.types import allocate
 
-from . import kernels
+from . import kernels, tally
 from .domain import Domain
 from .episodes import FRAME, Episodes, at_rest
 from .fields import Common
@@ -33,6 +33,7 @@ class Worlds:
   Attributes:
     fields: what every exercise has, arrays on the device
     own: what the domain has
+    tally: what metrics are made of
     batch: the physics
     organ: the organ in it
     device: of the arrays
@@ -80,7 +81,9 @@ class Worlds:
         getattr(self.own, name).assign(value)
       else:
         setattr(self.own, name, value)
+    self.tally = self._count(task)
     self._bad = wp.zeros(1, dtype=int, device=self.device)
+    self._done, self._graphs = set[str](), dict[str, Any]()
 
   def _make(self, task: Any, dt: float, limit: int) -> Any:
     physics, model = self.episodes.physics, self.batch.model
@@ -110,6 +113,17 @@ class Worlds:
     self._read(s)
     return s
 
+  def _count(self, task: Any) -> Any:
+    """Returns the sums that metrics are made of."""
+    steps = self.batch.watch(self._substeps)
+    sizes = dict(
+      nworld=self.nworld, nstep=self._substeps, nsensordata=self.batch.model.nsensordata
+    )  # fmt: skip
+    t = allocate(tally.Tally, self.device, sizes)
+    t.contact, t.limit = task.settings().contact_force, task.force_limit
+    t.h, t.sensor_steps = self.batch.model.opt.timestep, steps
+    return t
+
   @staticmethod
   def _point_at(s: Any, task: Any, model: mj.MjModel) -> None:
     """Writes where the instrument's joints and sensors are."""
@@ -132,8 +146,19 @@ class Worlds:
 
   # Doing.
 
-  def check(self, action: wp.array) -> None:
-    """Raises ValueError where an action is not in [-1, 1]; it names world and component."""
+  def array(self, name: str) -> wp.array:
+    """Returns one of the arrays of `fields`, `own` or `tally`."""
+    if name in Common.vars:
+      return getattr(self.fields, name)
+    return getattr(self.own if name in self._domain.struct.vars else self.tally, name)
+
+  def check(self, action: wp.array, first: int = 0) -> None:
+    """Raises ValueError where an action is not in [-1, 1]; it names world and component.
+
+    Args:
+      action: of each world
+      first: number of the first of these worlds, for people
+    """
     self._bad.zero_()
     self.launch(kernels.find_bad, action.shape, [action, self._bad])
     bad = int(self._bad.numpy()[0]) - 1
@@ -142,23 +167,38 @@ class Worlds:
       world, k = divmod(bad, len(names))
       value = action.numpy()[world, k]
       raise ValueError(
-        f"{self.task.name}: action {names[k]} of world {world} is {value}, expected a number in "
-        "[-1, 1]"
+        f"{self.task.name}: action {names[k]} of world {first + world} is {value}, expected a "
+        "number in [-1, 1]"
       )
 
   def step(self, action: wp.array) -> np.ndarray:
     """Takes a control step; returns in which worlds the episode is over  (nworld,) bool."""
     self.check(action)
+    self.launch_step(action)
+    return self.wait()
+
+  def launch_step(self, action: wp.array) -> None:
+    """Begins a control step with actions that are allowed."""
     wp.copy(self.fields.action, action)
     self._over(kernels.act)
     self.batch.step(self._substeps)
-    self.episodes.draw_ahead()
+    self._run(self._judge)
+
+  def wait(self) -> np.ndarray:
+    """Ends a control step; returns in which worlds the episode is over  (nworld,) bool."""
+    if self.device.is_cuda:
+      done = self.device.stream.record_event()
+      self.episodes.draw_ahead(lambda: not done.is_complete)
+    return self.fields.terminated.numpy() | self.fields.truncated.numpy()
+
+  def _judge(self) -> None:
+    """Launches what follows the steps of the physics."""
     self._read(self.fields)
     self._over(kernels.measure, False)
     self._domain.sense(self)
     self._over(self._domain.advance, self.own)
+    self._over(tally.add, self.tally)
     self._observe(False)
-    return self.fields.terminated.numpy() | self.fields.truncated.numpy()
 
   def begin(self, worlds: np.ndarray, seeds: Sequence[int | None] | None = None) -> None:
     """Begins episodes in some worlds, numbers or a mask."""
@@ -167,26 +207,55 @@ class Worlds:
     worlds = np.flatnonzero(mask)
     if seeds is not None:
       self.episodes.seed(seeds, worlds)
-    rows = self.episodes.take(worlds)
-    self.batch.reset(mask)
-    trocar_body = f"{self.task.prefix}trocar"
+    rows, s = self.episodes.take(worlds), self.fields
+    s.begun.assign(mask)
+    at = wp.array(worlds, dtype=int, device=self.device)
+    for name, values in rows.items():
+      if name in self._domain.tissue:
+        continue
+      self._write(getattr(s if name in FRAME else self.own, name), at, values[worlds])
+    # The plugin's worlds take them as they were drawn, in float64.
+    pos, quat, pose = (
+      rows[name] if self.device.is_cpu else getattr(s, name) for name in FRAME[:3]
+    )  # fmt: skip
+    self.batch.reset(s.begun)
     if self.task.jitter:
-      self.batch.place(trocar_body, rows["body_pos"], rows["body_quat"], mask)
-    self.batch.pose([self.task.prefix + axis for axis in AXES], rows["pose"], mask)
-    tissue = self._domain.tissue(self.task, rows)
-    if tissue:
-      self.organ.configure(mask, **tissue)
-    self.fields.begun.assign(mask)
-    self.fields.port_pos.assign(rows["body_pos"])
-    self.fields.port_quat.assign(rows["body_quat"][:, [1, 2, 3, 0]])
-    self.fields.pose.assign(rows["pose"])
-    for name in rows.keys() - FRAME:
-      getattr(self.own, name).assign(rows[name])
+      self.batch.place(f"{self.task.prefix}trocar", pos, quat, s.begun)
+    self.batch.pose([self.task.prefix + axis for axis in AXES], pose, s.begun)
+    if self._domain.tissue:
+      self.organ.configure(mask, **{key: rows[key] for key in self._domain.tissue})
+    self._run(self._open)
+
+  def _write(self, out: wp.array, at: wp.array, rows: np.ndarray) -> None:
+    """Writes rows of some worlds to an array on the device."""
+    words = out.size * wp.types.type_size_in_bytes(out.dtype) // 4 // self.nworld
+    rows = np.ascontiguousarray(rows, np.float32 if rows.dtype.kind == "f" else np.int32)
+    rows = rows.view(np.int32).reshape(len(rows), words)
+    source = wp.array(rows, dtype=int, device=self.device)
+    whole = wp.array(ptr=out.ptr, dtype=int, shape=(self.nworld, words), device=self.device)
+    self.launch(kernels.write, rows.shape, [at, source, whole])
+
+  def _open(self) -> None:
+    """Launches what follows the beginning of episodes."""
     self._over(kernels.begin)
     self._read(self.fields)
     self._over(kernels.measure, True)
     self._over(self._domain.begin, self.own)
+    self._over(tally.start, self.tally)
     self._observe(True)
+
+  def _run(self, work: Callable[[], None]) -> None:
+    """Launches work; on CUDA it is recorded the second time, and replayed from then on."""
+    name = work.__name__
+    if self.device.is_cuda and name in self._done and name not in self._graphs:
+      with wp.ScopedCapture(self.device) as capture:
+        work()
+      self._graphs[name] = capture.graph
+    if name in self._graphs:
+      wp.capture_launch(self._graphs[name])
+    else:
+      work()
+    self._done.add(name)
 
   def _observe(self, beginning: bool) -> None:
     self._over(kernels.look, beginning)

@@ -17,7 +17,7 @@ from .samples import check_time, low_pass, magnitude, rows, same, weights
 _FORCE = "Horeman et al. 2010; Barrie et al. 2018"
 _GRIP = "Heijnsdijk et al. 2004 (10.1007/s00464-003-9244-0)"
 _SHAFT = "10.1186/s12893-020-00839-z"
-_SETTLE = 0.1  # an excursion ends once the force was under the limit for this long [s]
+SETTLE = 0.1  # an excursion ends once the force was under the limit for this long [s]
 
 
 @metric("Peak force", "N", "safety", "max", _FORCE)
@@ -242,11 +242,11 @@ def peak_strain(strain: ArrayLike) -> float:
 
 
 def _excursions(time: ArrayLike, force: np.ndarray, limit: float) -> int:
-  """Returns how often a force rose above the limit, at least `_SETTLE` after it last was."""
+  """Returns how often a force rose above the limit, at least `SETTLE` after it last was."""
   time = check_time(time, least=1)
   over = same("force", force, time) > _limit(limit)
   at = over.nonzero()[0]
-  gap = (np.diff(at) > 1) & (np.diff(time[at]) > _SETTLE)
+  gap = (np.diff(at) > 1) & (np.diff(time[at]) > SETTLE)
   return int(len(at) > 0) + int(np.count_nonzero(gap))
 
 

@@ -22,15 +22,24 @@ TEST = indentation.Test("sphere", 0.006, BLOCK, edge=0.004, step=0.003)
 WORDS = ["--radius", "0.006", "--sample-size", *map(str, BLOCK), "--edge", "0.004", "--h", "0.003"]
 
 
-@pytest.fixture(scope="module")
-def record():
-  """A press, a hold and a release, with 2 % of noise."""
+GRASP = indentation.Test("sphere", 0.006, (0.03, 0.02, 0.012), edge=0.004, step=0.003, grasp=True)
+GRASPED = ["--test", "grasp", "--radius", "0.006", "--sample-size", "0.03", "0.02", "0.012",
+           "--edge", "0.004", "--h", "0.003"]  # fmt: skip
+
+
+def noisy(test):
+  """Returns the record of a press, a hold and a release, with 2 % of noise."""
   time = np.linspace(0, 0.3, 2000)
   depth = 0.0025 * np.clip(np.minimum(time / 0.1, (0.28 - time) / 0.08), 0, 1)
   way = measured.Record(time, depth, np.ones_like(time))
-  force = indentation.Indentation(TEST, way).force(TRUE)
+  force = indentation.Indentation(test, way).force(TRUE)
   noise = 0.02 * force.max() * np.random.RandomState(0).standard_normal(time.size)
   return measured.Record(time, depth, force + noise)
+
+
+@pytest.fixture(scope="module")
+def record():
+  return noisy(TEST)
 
 
 def written(path, record, header="time [s],depth [mm],force [mN]"):
@@ -44,9 +53,13 @@ def run(capsys, *words):
   return code, capsys.readouterr()
 
 
-def test_constants_of_simulated_data_come_back(tmp_path, capsys, record):
+@pytest.mark.parametrize(
+  ("test", "words"), [(TEST, WORDS), (GRASP, GRASPED)], ids=["press", "grasp"]
+)
+def test_constants_of_simulated_data_come_back(tmp_path, capsys, test, words):
+  record = noisy(test)
   data, out = written(tmp_path / "data.csv", record), tmp_path / "out"
-  code, shown = run(capsys, data, *WORDS, "--out", out)
+  code, shown = run(capsys, data, *words, "--out", out)
   assert code == 0, shown.err
   about = json.loads((out / "fit.json").read_text())
   for name in ("young", "damping"):
@@ -117,8 +130,7 @@ def test_an_organ_may_be_what_was_pressed():
   test = indentation.Test("sphere", 0.005, organ="kidney", place="anterior", edge=0.004, step=0.005)
   keys = {"young": 5000.0, "damping": 0.005}
   soft, hard = (
-    indentation.Indentation(test, way).force(keys | {"young": young})
-    for young in (5000.0, 10000.0)
+    indentation.Indentation(test, way).force(keys | {"young": young}) for young in (5000.0, 10000.0)
   )
   assert 0.005 < soft[-1] < 0.2
   assert hard[-1] == pytest.approx(2 * soft[-1], rel=0.05)
@@ -182,6 +194,7 @@ def test_numbers_that_cannot_be_are_named(tmp_path, capsys, change, match):
     (["--radius", ".03", "--sample-size", ".04", ".04", ".02"], "at most half of sample-size"),
     (["--radius", ".005", "--organ", "spleen"], "organ is 'spleen', expected one of liver"),
     (["--radius", ".005", "--organ", "liver:back"], "place is 'back', expected one of"),
+    (["--radius", ".005", "--organ", "liver", "--test", "grasp"], "grasp with --organ, expected"),
     ([*WORDS, "--free", "colour"], "free is 'colour', expected some of young"),
     ([*WORDS, "--set", "poisson=0.6"], r"poisson is '0.6', expected a number in \[0, 0.5\)"),
     ([*WORDS, "--set", "window=1"], "expected KEY=VALUE with one of young"),

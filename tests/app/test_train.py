@@ -65,7 +65,7 @@ def test_the_curve_counts_the_last_whole_episode_of_each_world():
     assert torch.equal(over.bool(), k == 10 - began)  # each ends in its own time
     told += [extras["log"]["/length"]] if extras["log"] else []
   assert not torch.cat(told).numel()  # what began in the middle does not count
-  fields = env.worlds.fields
+  fields = env.parts[0].fields
   seen.won[:] = 1.0
   for _ in range(10):
     _, _, over, extras = seen.step(torch.zeros(4, 4))

@@ -6,6 +6,7 @@ import functools
 import math
 import pathlib
 import time
+from collections.abc import Callable
 
 import mujoco
 import numpy as np
@@ -14,6 +15,7 @@ from benchmarks.films import SAMPLE, SCRIPTS, Film
 from benchmarks.runner import Case, Row
 from benchmarks.scene import NATIVE
 from reference import exact
+from reference.inside import Inside
 
 H = (0.125e-3, 0.25e-3, 0.5e-3, 1e-3, 2e-3, 5e-3, 1e-2)  # [s]
 TAU = 3.125e-5  # time step of the finest reference [s]; every H is a whole number of them
@@ -51,12 +53,12 @@ def reference(case: Case, out: pathlib.Path) -> list[Row]:
   """Steps a scene explicitly in float64 through MuJoCo's passive callback and stores it."""
   h = case["level"] * TAU
   model = films.build(case, "passive", h, solver="Newton", mj_tolerance=1e-12)
-  elastic = exact.Elastic(scene.shape("sphere", case["nodes"]), films.config_of(case["elements"]))
   film = Film(case, model, weighs=True)
   nodes = film.state.dofs
+  force = _within(case, h) if case["elements"] == "solid" else _on(case)
 
   def passive(data):
-    data.qfrc_passive[nodes] += elastic.force(data.qpos[nodes], data.qvel[nodes])
+    data.qfrc_passive[nodes] += force(data.qpos[nodes], data.qvel[nodes])
 
   began = time.perf_counter()
   film.passive = passive
@@ -72,6 +74,29 @@ def reference(case: Case, out: pathlib.Path) -> list[Row]:
   row |= {k: case[k] for k in ("scene", "nodes", "elements")}
   row["total_s"] = time.perf_counter() - began
   return [row | {"finite": int(film.good())}]
+
+
+def _on(case: Case) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+  """Returns the force on the nodes of a surface, from their displacement and velocity."""
+  mesh = scene.shape("sphere", case["nodes"])
+  return exact.Elastic(mesh, films.config_of(case["elements"])).force
+
+
+def _within(case: Case, h: float) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+  """Returns that of a solid; each call takes the step of the nodes inside, at rest at first."""
+  mesh, tissue = scene.shape("sphere", case["nodes"]), films.ELEMENTS[case["elements"]]
+  elastic = Inside(mesh, films.config_of(case["elements"]))
+  n, mass = mesh.nvert, scene.masses(mesh, tissue)[:, None]
+  u, v = np.zeros((2, elastic.mesh.nvert, 3))
+
+  def force(disp: np.ndarray, vel: np.ndarray) -> np.ndarray:
+    u[:n], v[:n] = disp, vel
+    f = elastic.force(u, v)
+    v[n:] += h * f[n:] / mass[n:]
+    u[n:] += h * v[n:]
+    return f[:n]
+
+  return force
 
 
 @functools.lru_cache(maxsize=2)
@@ -228,6 +253,8 @@ def _applies(case: Case, scheme: str, settings: dict) -> bool:
   """Returns whether a run of RUNS is made in a case."""
   script, large = SCRIPTS[case["scene"]], case["nodes"] > 642
   newton = settings.get("solver") == "Newton"
+  if case["elements"] == "solid" and not settings.get("window"):
+    return False
   if scheme == NATIVE and case["elements"] == "spring":
     return False  # MuJoCo's flex has no such element that its implicit step knows
   if settings.get("window") and (large or script.joined or not script.probe):

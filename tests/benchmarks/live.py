@@ -36,7 +36,7 @@ SECONDS = 60.0
 SCHEMES = ("implicit", "neumann", "explicit")
 PICTURES, WAY, ON_TIME, BESIDE = 30, 0.1, 0.999, 30e-6  # asked for
 _BINS = (0, 20, 40, 60, 80, 100, 150, 200, 500, 1000, 10000)  # from hand to picture [ms]
-_FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+_FLAGS = ("--no-sandbox", "--enable-unsafe-swiftshader")  # as where there is no graphics card
 # Circles over the organ, and in and out of it.
 _MOVE = """(() => {
   const canvas = document.getElementById("view"), box = canvas.getBoundingClientRect();

@@ -1,12 +1,14 @@
 """Times the whole loop, mj_step with a probe in contact with a windowed organ, and where it goes.
 
     python tests/benchmarks/run.py loop --device cuda:0 --nodes 16384 65536 262144
+    python tests/benchmarks/run.py loop --solid --nodes 1000 4000 --tip 0.005
     python tests/benchmarks/run.py loop --draw
 
 An octahedral sphere of radius 5 cm (E = 30 kPa, t = 2 mm, 0.1 kg, foundation 1e5 Pa/m, h = 1 ms),
 pinned below, is pressed 1.5 mm deep by a probe of 5 mm, or as thick as `--tip` says, and slid
-over, solved to the tolerance given. On CUDA the motion stays on the device (`resident`). Bending is
-off unless `--bend 1`. The last columns are medians of what one step spends: MuJoCo itself, the
+over, solved to the tolerance given. With `--solid` it is the liver, filled (E = 5 kPa, nu = 0.45,
+1.2 kg), pressed 6 mm deep. On CUDA the motion stays on the device (`resident`). Bending is off
+unless `--bend 1`. The last columns are medians of what one step spends: MuJoCo itself, the
 CPU's side of the coupling, and waiting for the device (search, transfer and what is left of the
 solve, which a resident organ begins before MuJoCo looks for contacts); `rest_ms` is a step with the
 probe away and the organ asleep. The parts of the device's work are timed by themselves after the
@@ -27,38 +29,58 @@ from benchmarks import results
 from benchmarks.runner import Bench, Case, Row
 from palpate.engine import windowed, workspace
 from palpate.engine.layout import HEAD, MODE
-from palpate.models import grid
+from palpate.models import grid, shapes
 from palpate.tissue import step as stepping
 from palpate.tissue.types import Stage
 
 RADIUS, H = 0.05, 1e-3
+DEEP = 0.006  # of the press on a solid [m]
+SHELL = {"young": 3e4, "poisson": 0.3, "foundation": 1e5}
+SOLID = {"elements": "solid", "young": 5e3, "poisson": 0.45, "mass": 1.2, "damping": 0.002}
 
 
-def model(
-  nodes: int, device: str, tolerance: float, bend: float, slots: int, condim: int, tip: float
-) -> mujoco.MjModel:
-  """Returns a sphere of about `nodes` nodes with a window under a probe of radius `tip`."""
+def shape(nodes: int, solid: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+  """Returns points and triangles of an organ of about `nodes` nodes, and which are held."""
+  if solid:
+    point, elem = shapes.liver(nodes)
+    point = point - point.mean(axis=0)
+    height = point[:, 2] - point[:, 2].min()
+    return point, elem, height < 0.3 * height.max()
   point, elem = grid.octasphere(max(2, round(np.sqrt((nodes - 2) / 4))))
   # In random order: MuJoCo's compiler hashes edges, and neighbours with near numbers collide.
   order = np.random.default_rng(0).permutation(len(point))
   point, elem = np.asarray(point)[order] * RADIUS, np.argsort(order)[np.asarray(elem)]
+  return point, elem, point[:, 2] < -0.9 * RADIUS
+
+
+def model(
+  nodes: int,
+  device: str,
+  tolerance: float,
+  bend: float,
+  slots: int,
+  condim: int,
+  tip: float,
+  solid: str = "",
+) -> mujoco.MjModel:
+  """Returns an organ of about `nodes` nodes with a window under a probe of radius `tip`."""
+  point, elem, held = shape(nodes, solid)
   side = round(np.sqrt(slots))
+  tissue = SOLID if solid else SHELL | {"bend": bend}
   organ = scenes.windowed(
     point,
     elem,
     count=f"{side} {side} 1",
     radius=0.0002,
     contact={"condim": condim, "solimp": "0.99 0.999 0.001"},
-    young=3e4,
-    poisson=0.3,
-    foundation=1e5,
-    bend=bend,
     device=device,
     tolerance=tolerance,
     resident=str(device != "cpu").lower(),
-    pin=" ".join(map(str, np.flatnonzero(point[:, 2] < -0.9 * RADIUS))),
+    pin=" ".join(map(str, np.flatnonzero(held))),
+    **tissue,
   )
-  probe = f"""<body pos="0 0 {RADIUS + tip + 0.0002}"><joint name="z" type="slide" axis="0 0 1"/>
+  x, y, top = point[point[:, 2].argmax()] if solid else (0, 0, RADIUS)
+  probe = f"""<body pos="{x} {y} {top + tip + 0.0002}"><joint name="z" type="slide" axis="0 0 1"/>
     <joint name="x" type="slide" axis="1 0 0"/><geom size="{tip}" mass="0.05" condim="1"/></body>"""
   drive = """<actuator><position joint="z" kp="500" kv="10"/>
     <position joint="x" kp="500" kv="10"/></actuator>"""
@@ -75,10 +97,11 @@ def measure(
   condim: int,
   tip: float,
   steps: int,
+  solid: str = "",
 ) -> dict:
   """Returns medians over the last half of `steps` steps, in ms."""
   start = time.perf_counter()
-  m = model(nodes, device, tolerance, bend, slots, condim, tip)
+  m = model(nodes, device, tolerance, bend, slots, condim, tip, solid)
   d = mujoco.MjData(m)
   made = time.perf_counter() - start
   organ = palpate.Organ(m, d, "organ")
@@ -87,7 +110,7 @@ def measure(
   timed(w, spent)
   rows, iterations, contacts = [], [], []
   for k in range(steps):
-    d.ctrl[0] = -0.0015 * min(1.0, k / (0.3 * steps))
+    d.ctrl[0] = -(DEEP if solid else 0.0015) * min(1.0, k / (0.3 * steps))
     d.ctrl[1] = 0.002 * max(0.0, k / steps - 0.4)
     spent["cpu"] = spent["device"] = 0.0
     before = time.perf_counter()
@@ -238,11 +261,21 @@ def table(out: pathlib.Path) -> list[str]:
     "the device's work in ns. From loop_cpu.csv and loop_cuda.csv; `tests/benchmarks/loop.py` says",
     "how they were measured.",
     "",
+    *_rows(out, "loop_c*.csv"),
+  ]
+  solids = _rows(out, "loop_solid_c*.csv")
+  about = "The filled liver, `--solid`; nodes on its surface. From loop_solid_c*.csv."
+  return lines + (["", "## Solids", "", about, "", *solids] if len(solids) > 2 else [])
+
+
+def _rows(out: pathlib.Path, files: str) -> list[str]:
+  """Returns the table of the rows in files."""
+  lines = [
     f"| device | nodes | condim | contacts | iterations | mj_step | rate | {' | '.join(_COLUMNS)} "
     "| device per node | asleep |",
     "|" + "---|" * (9 + len(_COLUMNS)),
   ]
-  for path in sorted(out.glob("loop_c*.csv")):
+  for path in sorted(out.glob(files)):
     for row in results.read(path):
       cost = [1e3 * float(row[f"{name}_ms"]) for name in _COLUMNS.values()]
       own = sum(cost[2:]) * 1e3 / row["nodes"]
@@ -280,11 +313,12 @@ def arguments(parser: argparse.ArgumentParser):
   add("--condim", type=int, nargs="+", default=[3], help="1 is without friction")
   add("--tip", type=float, nargs="+", default=[0.0025], help="radius [m]")
   add("--steps", type=int, default=400)
+  add("--solid", action="store_const", const="_solid", default="", help="the filled liver")
 
 
 def stages(args: argparse.Namespace) -> list[list[Case]]:
   """Returns a case a size, tip and kind of contact."""
-  keys = {k: getattr(args, k) for k in ("device", "tolerance", "bend", "slots", "steps")}
+  keys = {k: getattr(args, k) for k in ("device", "tolerance", "bend", "slots", "steps", "solid")}
   nodes = args.nodes[:1] if args.short else args.nodes
   return [
     [
@@ -305,4 +339,4 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
                        table(out))]  # fmt: skip
 
 
-BENCH = Bench("loop", stages, run, report=report, arguments=arguments, file="loop_{device}")
+BENCH = Bench("loop", stages, run, report=report, arguments=arguments, file="loop{solid}_{device}")

@@ -178,15 +178,19 @@ class Side:
 
   def step(self, step: int, parts: int = 1):
     """Moves the instrument on and takes a step of `H`, in parts."""
-    m, d = self.model, self.data
-    d.ctrl[0] = -0.05 * H * step - 0.001
-    mujoco.set_mjcb_passive(self.passive)
+    self.data.ctrl[0] = -0.05 * H * step - 0.001
     for _ in range(parts):
-      start = time.perf_counter()
-      mujoco.mj_step(m, d)
-      self.times.append(time.perf_counter() - start)
-      self.forces.append(float(d.qfrc_constraint[m.nv - 1]))
+      self.take()
+
+  def take(self):
+    """Takes a step of the model."""
+    m, d = self.model, self.data
+    mujoco.set_mjcb_passive(self.passive)
+    start = time.thread_time()
+    mujoco.mj_step(m, d)
+    self.times.append(time.thread_time() - start)
     mujoco.set_mjcb_passive(None)
+    self.forces.append(float(d.qfrc_constraint[m.nv - 1]))
     if self.organ:
       self.iterations.append(self.organ.iterations)
       self.residuals.append(self.organ.residual)

@@ -31,6 +31,7 @@ BENCHES = {
   "second_order": "schemes of second order, in float64",
   "skill": "metrics: expert against novices",
   "skipping": "what switching each feature off saves",
+  "solids": "run time against error of a solid, beside MuJoCo's tetrahedral flex",
   "solver": "the implicit step alone, device by device",
   "speed": "control steps a second of the exercises",
   "stability": "where each scheme breaks, over a thousand runs",

@@ -60,7 +60,8 @@ class Bench:
   def path(self, args: argparse.Namespace) -> pathlib.Path:
     """Returns the path of the CSV."""
     device = getattr(args, "device", "cpu").partition(":")[0]
-    return args.out.resolve() / f"{(self.file or self.name).format(device=device)}.csv"
+    name = (self.file or self.name).format(**vars(args) | {"device": device})
+    return args.out.resolve() / f"{name}.csv"
 
 
 def options(bench: Bench, words: list[str]) -> argparse.Namespace:

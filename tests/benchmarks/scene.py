@@ -11,6 +11,7 @@ import numpy as np
 from palpate.engine import weights
 from palpate.models import mjcf
 from palpate.organ import Organ
+from palpate.tissue import fill
 from palpate.tissue import mesh as topology
 from palpate.tissue.mesh import Mesh
 from scenes import RADIUS, flex, organ, windowed, world
@@ -79,7 +80,7 @@ class Tissue:
     bend: 1 with bending (native `elastic2d="both"`), 0 without (`stretch`)
     bulk: volume stiffness [Pa]; ours only
     mass: of the whole organ [kg]
-    elements: `membrane` or `spring`; ours only
+    elements: `membrane`, `spring` or `solid`; ours only
     stiffness: of the springs [N/m]
   """
 
@@ -96,6 +97,9 @@ class Tissue:
 
   def keys(self) -> dict:
     """Returns the plugin's configuration keys."""
+    if self.elements == "solid":
+      names = ("young", "poisson", "damping", "foundation", "elements")
+      return {k: getattr(self, k) for k in names}
     keys = {k: getattr(self, k) for k in ("young", "poisson", "thickness", "damping")}
     keys |= {k: getattr(self, k) for k in ("foundation", "bend", "bulk", "elements")}
     return keys | ({"stiffness": self.stiffness} if self.elements == "spring" else {})
@@ -166,15 +170,25 @@ def build(
 def _adjust(model: mujoco.MjModel, mesh: Mesh, tissue: Tissue, scheme: str, lumped: bool):
   """Writes what MJCF has no words for: masses by area, and the foundation of the native flex."""
   if lumped:
-    area = topology.vertex_areas(mesh.rest, mesh.elem)
     bodies = model.dof_bodyid[node_dofs(model, mesh.nvert)[:, 0]]
-    model.body_mass[bodies] = tissue.mass * area / area.sum()
+    model.body_mass[bodies] = masses(mesh, tissue)[: mesh.nvert]
     mujoco.mj_setConst(model, mujoco.MjData(model))
   if scheme == NATIVE and tissue.foundation:
     dofs = node_dofs(model, mesh.nvert)
     gain = tissue.foundation * topology.vertex_areas(mesh.rest, mesh.elem)
     model.jnt_stiffness[model.dof_jntid[dofs]] = gain[:, None]
     model.dof_damping[dofs] = tissue.damping * gain[:, None]
+
+
+def masses(mesh: Mesh, tissue: Tissue) -> np.ndarray:
+  """Returns the mass of each node in windows, those inside a solid last [kg], (n,)."""
+  solid = tissue.elements == "solid"
+  share = (
+    fill.vertex_volumes(fill.fill("organ", mesh))
+    if solid
+    else topology.vertex_areas(mesh.rest, mesh.elem)
+  )
+  return tissue.mass * share / share.sum()
 
 
 def _organ(

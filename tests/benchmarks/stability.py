@@ -27,6 +27,11 @@ SIDES = {
   "explicit": ("explicit", "nodal"),
   "MuJoCo flex": (scene.NATIVE, "nodal"),
 }
+# Solids on the map, with a window, and what they are made of.
+SOLIDS = {
+  f"solid, nu {nu:g}": {"elements": "solid", "poisson": nu, "mass": 0.5} for nu in (0.3, 0.45, 0.49)
+}
+SIDES |= dict.fromkeys(SOLIDS, ("implicit", "window"))
 STARTS = ("flattened", "crushed", "folded", "inverted", "scattered")
 DRAWS = 1000
 BLOCK = 40  # draws that are run together, the slow ones first
@@ -67,10 +72,13 @@ def stages(args: argparse.Namespace) -> list[list[Case]]:
   """
   maps, starts, cube = [], [], []
   small = 162 if args.short else 642
-  for side in ("implicit", "MuJoCo flex") if args.short else SIDES:
+  for side in ("implicit", "MuJoCo flex", "solid, nu 0.49") if args.short else SIDES:
     for h in H[1::3] if args.short else H:
       for young in YOUNG[1::3] if args.short else YOUNG:
-        maps.append(USUAL | _of("map", side, h=h, young=young) | {"nodes": small})
+        if args.short and side in SOLIDS and (h, young) != (H[4], YOUNG[1]):
+          continue
+        what = {"nodes": small} | SOLIDS.get(side, {})
+        maps.append(USUAL | _of("map", side, h=h, young=young) | what)
   for start in ("flattened", "scattered") if args.short else (*STARTS, "sliver"):
     for shape in scene.SHAPES[:1] if args.short or start == "sliver" else scene.SHAPES:
       for h in (2e-3,) if args.short else (1e-3, 5e-3, 2e-2):
@@ -113,6 +121,7 @@ def _of(group: str, side: str, **what) -> Case:
   scheme, coupling = SIDES[side]
   words = [f"{v:g}" if isinstance(v, float) else str(v) for v in what.values()]
   name = scheme if coupling == "nodal" else f"{scheme}-{coupling}"
+  name = side.replace(", nu ", "-") if side in SOLIDS else name
   start = {"set": group, "case": "-".join([group, name, *words]), "side": side}
   return start | {"scheme": scheme, "coupling": coupling} | what
 

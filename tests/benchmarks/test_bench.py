@@ -14,6 +14,7 @@ from palpate.engine import weights
 from palpate.tissue import energy
 from palpate.tissue.config import Config
 from reference import exact
+from reference.inside import Inside
 
 ELEMENTS = {"membrane": {}, "spring": {"elements": "spring", "stiffness": 50.0}}
 
@@ -68,6 +69,22 @@ def test_float64_force_is_minus_the_gradient_of_the_energy(elements):
   v = random.standard_normal((mesh.nvert, 3))
   damped = -config.damping * (k @ v.ravel()).reshape(-1, 3)
   np.testing.assert_allclose(own.force(u, v) - own.force(u), damped, atol=1e-9 * abs(damped).max())
+
+
+def test_float64_force_of_a_solid_is_that_of_the_energy_and_of_the_kernels(scenes):
+  surface, config = scene.shape("sphere", 162), films.config_of("solid")
+  own = Inside(surface, config)
+  random = np.random.RandomState(0)
+  u, v, along = 1e-3 * random.standard_normal((3, own.mesh.nvert, 3))
+  ends = [energy.total(own.mesh, config, u + sign * 1e-7 * along) for sign in (-1, 1)]
+  slope = -(own.force(u, 0 * u) * along).sum()
+  assert slope == pytest.approx((ends[1] - ends[0]) / 2e-7, rel=1e-6)
+  keys = ("elements", "young", "poisson", "foundation", "damping")
+  made = {key: getattr(config, key) for key in keys}
+  body = scenes.kernels(surface.rest, surface.elem, **made)[2]
+  force, mass = own.force(u, 100 * v), np.ones(len(u))
+  found = scenes.step(body, 1e-5, u, 100 * v, mass, scheme="explicit") / 1e-5
+  np.testing.assert_allclose(found, force, atol=1e-5 * np.abs(force).max())
 
 
 @pytest.mark.parametrize("newton", [1, 3])

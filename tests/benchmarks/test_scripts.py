@@ -48,6 +48,7 @@ def test_loop_touches_says_where_time_goes_and_sleeps(tmp_path):
     ("locality", ("--steps", 48)),
     ("preconditioner", ("--nodes", 162, "--young", 3e4)),
     pytest.param("second_order", (), marks=pytest.mark.slow),
+    pytest.param("solids", (), marks=pytest.mark.slow),
   ],
 )
 def test_short_forms_write_rows_and_a_page(tmp_path, name, words):

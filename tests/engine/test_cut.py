@@ -256,6 +256,20 @@ def test_a_scene_is_drawn_with_the_triangles_of_its_data():
   assert not np.array_equal(seen[0], seen[1]) and np.array_equal(seen[0], seen[2])
 
 
+def test_the_sides_of_an_open_organ_are_drawn_on_both_pieces():
+  model, data = scene(strip())
+  organ = handle(model, data)
+  whole = model.flex_shell.reshape(-1, 2)
+  outline = {tuple(edge) for edge in whole.tolist()}
+  organ.cut([[0.06, -0.02, 0], [0.062, 0.02, 0]])
+  edges = model.flex_shell.reshape(-1, 2)
+  sides = [np.isin(edges, piece.vertices) for piece in organ.pieces]
+  assert len(sides) == 2 and all((side[:, 0] == side[:, 1]).all() for side in sides)
+  mujoco.mj_resetData(model, data)
+  mujoco.mj_forward(model, data)
+  assert {tuple(edge) for edge in model.flex_shell.reshape(-1, 2).tolist()} == outline
+
+
 def test_without_spare_vertices_a_cut_ends_early_and_nothing_breaks():
   model, data = scene(sphere(), foundation=1e4, spare=5)
   organ = handle(model, data)
@@ -291,7 +305,8 @@ def test_a_state_of_another_model_or_with_other_cuts_is_refused():
   [
     ({"spare": -1}, "spare is -1, expected a whole number"),
     ({"spare": "many"}, "spare is 'many'"),
-    ({"relax_share": 0.2}, "relax_share is set, allowed only where spare is 0"),
+    ({"resident": True, "windows": True}, "resident is set, allowed only where spare is 0"),
+    ({"carrier": "own"}, "carrier is 'own', allowed only where spare is 0"),
     ({"elements": "solid", "windows": True}, "'solid', allowed only where spare is 0"),
   ],
 )

@@ -100,6 +100,14 @@ def test_what_a_solid_has_not_is_refused(scenes, keys, message):
     scenes.load(_resting(scenes, **keys))
 
 
+def test_a_file_of_tetrahedra_is_for_solids(scenes):
+  with pytest.raises(ValueError, match="tetrahedra is 'a': No such file"):
+    scenes.load(_resting(scenes, tetrahedra="a"))
+  points, elem = scenes.sphere(1)
+  with pytest.raises(ValueError, match="tetrahedra is 'a', allowed only with elements='solid'"):
+    scenes.load(scenes.world(scenes.organ(points, elem, tetrahedra="a")))
+
+
 def test_a_solid_needs_windows(scenes):
   points, elem = scenes.sphere(1)
   with pytest.raises(ValueError, match="elements is 'solid', expected window too"):

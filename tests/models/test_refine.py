@@ -78,3 +78,4 @@ def test_a_shipped_organ_is_finer_where_the_instruments_point():
     assert lengths(organ.xpos, organ.elem)[near].max() < 0.00201
   mujoco.mj_step(model, data)
   assert organ.error is None
+  assert (model.flex_solimp[:, :2] == [0.99, 0.999]).all()  # of organ and window

@@ -246,6 +246,23 @@ def test_what_is_given_is_copied():
     assert not values.any()
 
 
+def test_a_strain_given_as_a_function_is_worked_out_once_and_in_time():
+  asked = []
+
+  def strain(k):
+    return lambda: asked.append(k) or 0.1 * k
+
+  made, plain = Recorder(), Recorder()
+  for k in range(4):
+    made.append(k, (0, 0, k), strain=strain(k))
+    plain.append(k, (0, 0, k), strain=0.1 * k)
+    assert asked == list(range(k))
+  made.settle()
+  made.settle()
+  assert asked == list(range(4))
+  _same_bits(made.recording().columns["strain"], plain.recording().columns["strain"])
+
+
 def test_missing_samples_are_nan_and_make_the_metric_unknown():
   recorder = Recorder(settings=SETTINGS)
   recorder.append(0.0, [0, 0, 0])

@@ -32,7 +32,9 @@ class Experts:
   """Single environments, and who acts in them."""
 
   def __init__(self, task, count, seed, **options):
-    self.envs = [single(task, **options) for _ in range(count)]
+    shapes = options.pop("variants", None)  # a world each
+    each = [{"variants": shapes[k : k + 1]} if shapes else {} for k in range(count)]
+    self.envs = [single(task, record=True, **options, **own) for own in each]
     self.seen = [env.reset(seed=seed + k)[0] for k, env in enumerate(self.envs)]
     self.acts = [performer.make(env.unwrapped.environment) for env in self.envs]
     self.first = [True] * count
@@ -64,11 +66,19 @@ def compare(seen, expected):
     np.testing.assert_allclose(a, b, atol=LIMITS.get(name, 2e-4), err_msg=name)
 
 
+def compare_metrics(told, k, expected):
+  """Compares the metrics of a world that has ended with those of a recording."""
+  assert {"time", "path_length", "peak_force", "force_time_product", "errors"} < set(told)
+  for name, values in told.items():
+    value = expected.get(name, np.nan)  # recordings leave out what is unknown
+    assert values[k] == pytest.approx(value, rel=0.01, abs=1e-4, nan_ok=True), name
+
+
 @pytest.mark.parametrize(
   "task, count, steps, options",
   [
     ("touch/easy", 2, 130, {}),
-    ("touch/hard", 2, 40, {"variants": (1,)}),
+    ("touch/hard", 2, 40, {"variants": (None, 1)}),
     ("probe/easy", 2, 90, {}),
     ("probe/depth", 1, 60, {"reward": "sparse"}),
     ("probe/palpate_easy", 2, 60, {}),
@@ -91,8 +101,10 @@ def test_each_world_is_the_single_environment_of_its_seed(task, count, steps, op
       told = {name: values[k] for name, values in info.items() if name[:5] != "final"}
       if end or cut:
         compare(info["final_obs"][k], last)
-        told = {name: values[k] for name, values in info["final_info"].items()}
+        final = info["final_info"]
+        told = {name: final[name][k] for name in final if name != "metrics"}
         ended.append(said["outcome"])
+        compare_metrics(final["metrics"], k, said["metrics"])
       compare({name: values[k] for name, values in seen.items()}, experts.seen[k])
       for name in ("success", "outcome"):
         assert told[name] == said[name]
@@ -115,7 +127,7 @@ def test_a_report_of_palpation_ends_the_episode():
 
 
 def test_damage_and_its_cost_are_those_of_the_single_environment():
-  env, alone = make("touch/easy", 1), single("touch/easy")
+  env, alone = make("touch/easy", 1), single("touch/easy", record=True)
   env.reset(seed=2)
   alone.reset(seed=2)
   for _ in range(200):
@@ -128,6 +140,9 @@ def test_damage_and_its_cost_are_those_of_the_single_environment():
   assert final["outcome"][0] == said["outcome"] == "damage"
   for name in ("cost", "cost_force", "cost_shaft", "cost_damage"):
     assert final[name][0] == pytest.approx(said[name], abs=1e-3)
+  compare_metrics(final["metrics"], 0, said["metrics"])
+  assert final["metrics"]["force_breaches"][0] == 1
+  assert final["metrics"]["excess_impulse"][0] > 0
 
 
 # Gymnasium.
@@ -192,7 +207,7 @@ def test_a_world_whose_numbers_are_not_finite_begins_again_and_others_do_not_not
   env.reset(seed=0)
   other.reset(seed=0)
   broken = np.array([True, False])
-  env.unwrapped.worlds.batch.pose(["probe/pitch"], np.full((2, 1), np.nan), broken)
+  env.unwrapped.parts[0].batch.pose(["probe/pitch"], np.full((2, 1), np.nan), broken)
   found = [each.step(np.full((2, 4), 0.1)) for each in (env, other)]
   assert found[0][3].tolist() == [True, False] and found[0][1][0] == 0
   assert np.isfinite(found[0][0]["tip_pos"]).all()
@@ -210,7 +225,6 @@ def test_bad_input_is_named():
     ({"pixels": (8, 8)}, "makes no pictures"),
     ({"randomise": {"friction": (1, 2)}}, "randomise is given"),
     ({"record": True}, "record is given"),
-    ({"variants": (None, 1)}, "expected one shape"),
   ):
     with pytest.raises(ValueError, match=f"{what}.*vectorization_mode"):
       make("touch/easy", **options)

@@ -65,7 +65,7 @@ def test_experts_hold_tissue_in_a_batch(device, task):
   count = 1 if device == "cpu" else 6
   env = vector.Exercises(count, task, device=device)
   env.reset(seed=SEED)
-  worlds, playing = env.worlds, set(range(count))
+  worlds, playing = env.parts[0], set(range(count))
   besides, outcomes = [Beside(worlds, k) for k in range(count)], {}
   while playing:
     actions = np.array([beside.action() for beside in besides], np.float32)

@@ -42,6 +42,7 @@ REFUSED = [
   ("device", "tpu", "'cpu'"),
   ("device", "cuda:x", "'cpu'"),
   ("elements", "tetrahedron", "'membrane' or 'spring'"),
+  ("tetrahedra", "inside.msh", "only with elements='solid'"),
   ("mass", "0", "> 0"),
   ("pin", "1 -2", "vertex numbers"),
   ("relax_share", "1", "[0, 1)"),

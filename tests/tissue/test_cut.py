@@ -168,7 +168,7 @@ def test_a_refilled_body_is_one_made_anew_to_the_bit(kind, device):
       found = cutting.cut("organ", mesh, mesh.rest, path, pinned)
     except ValueError:  # through a pin, or too short
       continue
-    filler.write(found.mesh, found.touched, config, pinned)
+    filler.write(found.mesh, found.changed, config, pinned)
     mesh = found.mesh
   assert mesh.nouter > len(points) + 5
   width = np.diff(body.shape.bend_adr.numpy())
@@ -178,8 +178,8 @@ def test_a_refilled_body_is_one_made_anew_to_the_bit(kind, device):
   for name in now.keys() - {"hinge_angle0"}:
     assert np.array_equal(now[name].reshape(-1), np.ravel(anew[name]).astype(now[name].dtype)), name
   assert energy.total(mesh, config, np.zeros((mesh.nvert, 3))) == 0.0
-  back, touched = topology.recut(mesh, whole.rest, whole.elem)
-  filler.write(back, touched, config, pinned)
+  back, changed = topology.recut(mesh, whole.rest, whole.elem)
+  filler.write(back, changed, config, pinned)
   healed = fields(body)
   assert all(np.array_equal(first[name], healed[name]) for name in first)
 

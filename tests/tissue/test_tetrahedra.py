@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from palpate.models import shapes
 from palpate.tissue import config as configuration
-from palpate.tissue import energy, fill
+from palpate.tissue import energy, fill, gmsh
 from palpate.tissue import mesh as topology
 from reference import closed
 from reference.closed import YOUNG
@@ -131,7 +131,85 @@ def test_a_surface_that_cuts_itself_has_no_inside(scenes):
     fill.fill("organ", topology.build("organ", points, elem))
 
 
+def test_a_surface_as_thin_as_paper_has_no_room_inside(scenes):
+  points, elem = scenes.sphere(2)
+  with pytest.raises(ValueError, match=r"'organ'.* at vertex \d+ there is no room for tetrahedra"):
+    fill.fill("organ", topology.build("organ", points * [1, 1, 1e-4], elem))
+
+
 def test_an_open_surface_has_no_inside(scenes):
   points, elem = scenes.strip(0.1, 0.05, 4, 3)
   with pytest.raises(ValueError, match="expected a closed surface"):
     fill.fill("organ", topology.build("organ", points, elem))
+
+
+# Tetrahedra from a file.
+
+
+def _blocks(point, tet):
+  """Returns a Gmsh file of version 4.1, the nodes numbered from 10 and in reverse."""
+  tags = np.arange(len(point))[::-1] + 10
+  lines = ["$MeshFormat", "4.1 0 8", "$EndMeshFormat", "$Nodes", f"1 {len(point)} 10 99999"]
+  lines += [f"3 1 0 {len(point)}", *map(str, tags)]
+  lines += [" ".join(map(repr, row)) for row in point.tolist()]
+  lines += ["$EndNodes", "$Elements", f"2 {len(tet) + 1} 1 99999", f"0 1 15 1\n1 {tags[0]}"]
+  lines += [f"3 1 4 {len(tet)}"]
+  lines += [f"{k + 2} " + " ".join(map(str, tags[row])) for k, row in enumerate(tet)]
+  return "\n".join([*lines, "$EndElements"])
+
+
+def _lines(point, tet):
+  """Returns one of version 2.2."""
+  lines = ["$MeshFormat", "2.2 0 8", "$EndMeshFormat", "$Nodes", str(len(point))]
+  lines += [f"{k + 1} " + " ".join(map(repr, row)) for k, row in enumerate(point.tolist())]
+  lines += ["$EndNodes", "$Elements", str(len(tet) + 1), "1 2 2 0 1 1 2 3"]
+  lines += [f"{k + 2} 4 2 0 1 " + " ".join(map(str, row + 1)) for k, row in enumerate(tet)]
+  return "\n".join([*lines, "$EndElements"])
+
+
+@pytest.mark.parametrize("text", [_blocks, _lines])
+def test_tetrahedra_of_a_file_are_those_of_the_organ(scenes, tmp_path, text):
+  mesh = topology.build("organ", *scenes.sphere(1))
+  made = fill.fill("organ", mesh)
+  file = tmp_path / "inside.msh"
+  file.write_text(text(made.rest, made.tet[:, [0, 2, 1, 3]]))  # turned inside out
+  found = gmsh.read("organ", str(file), mesh)
+  np.testing.assert_array_equal(found.rest[: mesh.nvert], mesh.rest)
+  assert len(found.tet) == len(made.tet) and found.nvert == made.nvert
+  total = fill.volumes(found.rest, found.tet).sum()
+  assert total == pytest.approx(fill.volumes(made.rest, made.tet).sum(), rel=1e-9)
+
+
+def _flat(point, tet):
+  inner = tet[0].max()  # to where the tetrahedron's other corners have their middle
+  others = np.setdiff1d(tet[0], inner)
+  return np.where(np.arange(len(point))[:, None] == inner, point[others].mean(0), point), tet
+
+
+@pytest.mark.parametrize(
+  ("change", "message"),
+  [
+    (lambda point, tet: (1000 * point, tet), r"nearest node to vertex \d+ is .* m away"),
+    (lambda point, tet: (point, tet[:-1]), "tetrahedron or of two|end at"),
+    (lambda point, tet: (point, tet[:0]), "has no tetrahedra"),
+    (lambda point, tet: (point * np.nan, tet), "not finite"),
+    (_flat, r"tetrahedron \d+ is flat"),
+  ],
+)
+def test_a_file_that_does_not_fit_is_refused(scenes, tmp_path, change, message):
+  mesh = topology.build("organ", *scenes.sphere(1))
+  made = fill.fill("organ", mesh)
+  file = tmp_path / "inside.msh"
+  file.write_text(_lines(*change(made.rest, made.tet)))
+  with pytest.raises(ValueError, match=f"'organ': tetrahedra is '.*msh'.*({message})"):
+    gmsh.read("organ", str(file), mesh)
+
+
+@pytest.mark.parametrize("text", ["", "$MeshFormat 4.1 1 8", "$MeshFormat 2.2 0 8 $Nodes -3"])
+def test_a_file_that_cannot_be_read_is_refused(scenes, tmp_path, text):
+  mesh = topology.build("organ", *scenes.sphere(1))
+  (tmp_path / "inside.msh").write_text(text)
+  with pytest.raises(ValueError, match="expected a Gmsh file as text"):
+    gmsh.read("organ", str(tmp_path / "inside.msh"), mesh)
+  with pytest.raises(ValueError, match="No such file"):
+    gmsh.read("organ", str(tmp_path / "other.msh"), mesh)

@@ -72,11 +72,11 @@ class Coach:
     task, physics = env.task, env.physics
     instruction = task.instruct(physics)
     # "2 s more" and "1.9 s more" are one hint.
-    if _words(instruction) != _words(self.instruction):
+    if instruction != self.instruction and _words(instruction) != _words(self.instruction):
       self._say("instruction", now, instruction)
     self.instruction = instruction
     kind, warning = self._warning(task, physics)
-    if warning and _words(warning) != _words(self.warning):
+    if warning and warning != self.warning and _words(warning) != _words(self.warning):
       self._say("warning", now, warning)
     if warning or now > self._until:
       self.kind, self.warning = kind, warning

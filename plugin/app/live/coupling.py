@@ -81,10 +81,11 @@ class Track:
 
   def aim(self, goal: list[float]) -> None:
     """Takes a reading."""
-    span = min(self._since * self._h, 0.2) or self._h
-    self._interval = max(span, 0.9 * self._interval)  # readings come unevenly
+    h = self._h
+    span = min(self._since * h, 0.2) or h
+    self._interval = interval = max(span, 0.9 * self._interval)  # readings come unevenly
     self._goal, self._since = goal, 0
-    slow = self._interval / self._h
+    slow = interval / h
     # The next one comes before it is there.
     self._left = 1 if slow < 1.5 else round(1.25 * slow) + 1
 
@@ -92,6 +93,9 @@ class Track:
     """Returns the value of the next step."""
     self._since += 1
     line, goal, n = self._line, self._goal, self._left
+    if n <= 1 and self._interval < _SLOW * self._h:  # as most devices are in most steps
+      self._line = self.value = goal
+      return goal
     if n > 1:
       line = [a + (b - a) / n for a, b in zip(line, goal, strict=True)]
       self._left = n - 1
@@ -177,7 +181,7 @@ class Link:
     """Sets the forces to zero; they come back by the ramp."""
     self._gain, self.force = 0.0, STILL
     self._felt_at: Three | None = None
-    self._pushed, self._fast = [0.0, 0.0, 0.0, 0.0], 0.0
+    self._pushed, self._fast = (0.0, 0.0, 0.0, 0.0), 0.0
     self._send(STILL, STILL)
 
   def change(self, device: Device) -> None:
@@ -229,26 +233,27 @@ class Link:
 
   def _take(self, reading: Reading, tip: Sequence[float] | None) -> None:
     """Aims the anchor at what the hand does."""
-    asks, self._asked = not self._asked, "pause" in reading.buttons
+    pos, quat, roll, jaw, buttons = reading
+    asks, self._asked = not self._asked, "pause" in buttons
     self.paused ^= asks and self._asked
-    self.report = "report" in reading.buttons
-    if reading.jaw is not None:
-      self.jaw = min(max(reading.jaw, -1.0), 1.0)
-    else:
-      step, target = _CLOSE / self.device.rate, _OPEN if "grip" in reading.buttons else 1.0
+    self.report = "report" in buttons
+    if jaw is not None:
+      self.jaw = min(max(jaw, -1.0), 1.0)
+    elif buttons or self.jaw != 1.0:
+      step, target = _CLOSE / self.device.rate, _OPEN if "grip" in buttons else 1.0
       self.jaw += min(max(target - self.jaw, -step), step)
-    if "clutch" in reading.buttons:
+    if "clutch" in buttons:
       self.state, self._reference = "clutch", None
       return
     self.state = "ready"
     self._motion(reading)
     if self._reference is None:
       w, x, y, z = self.row[3:]
-      self._reference = reading, self.row[:3], (w, x, y, z), self._roll - reading.roll
+      self._reference = reading, self.row[:3], (w, x, y, z), self._roll - roll
       return
-    first, center, turned, roll = self._reference
-    m, scale = self._axes, self.options.scale
-    x, y, z = (scale * (a - b) for a, b in zip(reading.pos, first.pos, strict=True))
+    first, center, turned, turn = self._reference
+    m, scale, (a, b, c) = self._axes, self.options.scale, first.pos
+    x, y, z = scale * (pos[0] - a), scale * (pos[1] - b), scale * (pos[2] - c)
     goal = [
       center[0] + m[0] * x + m[1] * y + m[2] * z,
       center[1] + m[3] * x + m[4] * y + m[5] * z,
@@ -257,9 +262,9 @@ class Link:
     held = self._bound(goal, tip)
     if self.device.relative and held != goal:  # a mouse that goes on moves nothing; back, it does
       shift = [a + b - c for a, b, c in zip(center, held, goal, strict=True)]
-      self._reference = first, shift, turned, roll
-    self._roll = min(max(roll + reading.roll, -3.1), 3.1)
-    if reading.quat is not None:
+      self._reference = first, shift, turned, turn
+    self._roll = min(max(turn + roll, -3.1), 3.1)
+    if quat is not None:
       self._turn.aim(list(_nearest(self._turned(reading, first, turned), self._turn.value)))
     self._place.aim(held)
 
@@ -271,7 +276,10 @@ class Link:
       if far > self.options.leash:
         share = self.options.leash / far
         goal = [b + share * (a - b) for a, b in zip(goal, tip, strict=True)]
-    return [min(max(x, -1.0), 1.0) for x in goal]
+    x, y, z = goal
+    if -1.0 <= x <= 1.0 and -1.0 <= y <= 1.0 and -1.0 <= z <= 1.0:
+      return goal
+    return [min(max(x, -1.0), 1.0), min(max(y, -1.0), 1.0), min(max(z, -1.0), 1.0)]
 
   def _turned(self, reading: Reading, first: Reading, turned: Four) -> Four:
     """Returns the handle's orientation for a device that knows its own."""
@@ -324,12 +332,13 @@ class Link:
     before, self._felt_at = self._felt_at, reading.pos
     if before is None:
       return
-    moved = [a - b for a, b in zip(reading.pos, before, strict=True)]
+    (a, b, c), (d, e, f) = reading.pos, before
+    u, v, w = a - d, b - e, c - f
     x, y, z, count = self._pushed  # summed over the steps since then
-    given = -(x * moved[0] + y * moved[1] + z * moved[2]) / max(count, 1.0)
-    self._pushed = [0.0, 0.0, 0.0, 0.0]
+    given = -(x * u + y * v + z * w) / max(count, 1.0)
+    self._pushed = (0.0, 0.0, 0.0, 0.0)
     self.energy = min(self.energy + given, _CREDIT)
-    self._fast = self.device.rate * math.hypot(*moved)
+    self._fast = self.device.rate * math.sqrt(u * u + v * v + w * w)
 
   def feel(self, wrench: Sequence[float]) -> None:
     """Makes the hand feel what the handle feels.
@@ -337,17 +346,18 @@ class Link:
     Args:
       wrench: force [N] and torque [N m] on the handle, in the world  (6,)
     """
-    device, options = self.device, self.options
+    device, options, h = self.device, self.options, self._h
     if not math.isfinite(sum(wrench)):  # of a motion that diverged
       return self.quiet()
     if not device.force_limit or self.state != "ready":
       self.force = STILL
       return
-    self._gain = min(self._gain + self._h / max(options.ramp, self._h), 1.0)
+    if self._gain < 1.0:
+      self._gain = min(self._gain + h / max(options.ramp, h), 1.0)
     m, scale = self._axes, self._gain * options.force_scale
     force = _into(m, wrench[0], wrench[1], wrench[2], scale)
     force = _limited(force, min(device.force_limit, options.force_limit))
-    if device.rate * self._h * _SLOW < 1:
+    if device.rate * h * _SLOW < 1:
       force = _towards(self.force, force, _EDGE)
     if options.passive:
       force = _limited(force, self._affordable(force))
@@ -356,8 +366,8 @@ class Link:
       torque = _into(m, wrench[3], wrench[4], wrench[5], scale)
       torque = _limited(torque, device.torque_limit)
     self.force = force
-    pushed = self._pushed
-    self._pushed = [pushed[0] + force[0], pushed[1] + force[1], pushed[2] + force[2], pushed[3] + 1]
+    (x, y, z), (a, b, c, count) = force, self._pushed
+    self._pushed = a + x, b + y, c + z, count + 1
     self._send(force, torque)
 
   def _affordable(self, force: Three) -> float:
@@ -375,9 +385,10 @@ class Link:
     return max(self.energy, 0.0) / max(far, 1e-9)
 
   def _send(self, force: Three, torque: Three) -> None:
-    if self.device.force_limit:
+    device = self.device
+    if device.force_limit:
       try:
-        self.device.send(force, torque)
+        device.send(force, torque)
       except DeviceError as error:
         self.state, self.message, self.force = "lost", str(error), STILL
 

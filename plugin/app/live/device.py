@@ -128,16 +128,16 @@ class Guard:
 
   def check(self, reading: Reading, now: float) -> str:
     """Returns `good`, `jump` for a movement that no hand makes, `bad` for what is no pose."""
-    x, y, z = reading.pos
-    numbers = x + y + z + reading.roll + sum(reading.quat or ()) + (reading.jaw or 0.0)
-    if not math.isfinite(numbers) or (reading.quat and sum(q * q for q in reading.quat) < 1e-6):
+    pos, quat, roll, jaw, _ = reading
+    numbers = pos[0] + pos[1] + pos[2] + roll + sum(quat or ()) + (jaw or 0.0)
+    if not math.isfinite(numbers) or (quat and sum(q * q for q in quat) < 1e-6):
       self.last = f"{self._device.name}: pose is {_text(reading)}, expected finite numbers"
       return "bad"
-    before, self._before = self._before, reading.pos
+    before, self._before = self._before, pos
     span, self._time = now - self._time, now
     if before is None:
       return "good"
-    moved = math.dist(before, reading.pos)
+    moved = math.dist(before, pos)
     if moved <= _STEP + FASTEST * span:
       return "good"
     self.last = f"{self._device.name}: jumped {1e3 * moved:.0f} mm in {1e3 * span:.0f} ms"

@@ -72,15 +72,13 @@ class Hand(Silent):
     t = now - self._start
     goal = STILL if self._goal is None else self._goal(t)
     pull = 0.0 if self._goal is None else self.stiffness
-    pos, vel = [], []
-    for x, v, f, g in zip(self.pos, self.vel, self.force, goal, strict=True):
-      # Implicit in the hand's own spring and damper.
-      v = (v + h / self.mass * (f + pull * (g - x))) / (
-        1 + h * self.damping / self.mass + h * h * pull / self.mass
-      )
-      vel.append(v)
-      pos.append(x + h * v)
-    self.pos, self.vel = tuple(pos), tuple(vel)
+    # Implicit in the hand's own spring and damper; axis by axis in words, as each step asks for it.
+    a, b = h / self.mass, 1 + h * self.damping / self.mass + h * h * pull / self.mass
+    (x, y, z), (u, v, w), (f, g, k) = self.pos, self.vel, self.force
+    u = (u + a * (f + pull * (goal[0] - x))) / b
+    v = (v + a * (g + pull * (goal[1] - y))) / b
+    w = (w + a * (k + pull * (goal[2] - z))) / b
+    self.vel, self.pos = (u, v, w), (x + h * u, y + h * v, z + h * w)
     if t < self._due - 1e-9:
       return None
     self._due += 1 / self.rate

@@ -26,8 +26,10 @@ def tick(pace: Pace, links: Sequence[Link], tips: Sequence[Sequence[float]]) -> 
   """
   pace.wait()
   while not pace.stopped:
-    ready = [link.poll(pace.now, tip) for link, tip in zip(links, tips, strict=True)]
-    if all(ready) and not pace.paused and not any(link.paused for link in links):
+    ready = not pace.paused
+    for link, tip in zip(links, tips, strict=True):
+      ready = link.poll(pace.now, tip) and not link.paused and ready
+    if ready:
       return True
     for link in links:
       link.hold()
@@ -75,10 +77,11 @@ class Loop:
     self.links = [Link(device, options, model.opt.timestep) for device in hands.values()]
     self._handles = [Handle(model, data, prefix) for prefix in hands]
     self._shafts = [Shaft(trocar.trocar(model, prefix)) for prefix in hands]
-    self._tips = [data.site_xpos[model.site(f"{prefix}tip").id] for prefix in hands]
-    self._jaws = [
+    self._tips = [data.site_xpos[model.site(f"{prefix}tip").id].data for prefix in hands]
+    jaws = [
       mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, f"{prefix}jaw") for prefix in hands
     ]
+    self._jaws = [(link, jaw) for link, jaw in zip(self.links, jaws, strict=True) if jaw >= 0]
     self.attach()
 
   def attach(self) -> None:
@@ -110,7 +113,7 @@ class Loop:
         while k < steps and tick(self.pace, self.links, [tip.tolist() for tip in self._tips]):
           for i, (link, handle) in enumerate(zip(self.links, self._handles, strict=True)):
             row, before, self._rows[i] = link.row, self._rows[i], link.row
-            vel = [(a - b) / h for a, b in zip(row[:3], before[:3], strict=True)]
+            vel = (row[0] - before[0]) / h, (row[1] - before[1]) / h, (row[2] - before[2]) / h
             handle.move(row[:3], row[3:], vel, spin(before[3:], row[3:], h))
           self._close_jaws()
           mujoco.mj_step(model, data)
@@ -125,7 +128,6 @@ class Loop:
 
   def _close_jaws(self) -> None:
     """Opens and closes those that have some, as the hands do."""
-    for link, jaw in zip(self.links, self._jaws, strict=True):
-      if jaw >= 0:
-        low, high = self._model.actuator_ctrlrange[jaw]
-        self._data.ctrl[jaw] = low + (high - low) * (link.jaw + 1) / 2
+    for link, jaw in self._jaws:
+      low, high = self._model.actuator_ctrlrange[jaw]
+      self._data.ctrl[jaw] = low + (high - low) * (link.jaw + 1) / 2

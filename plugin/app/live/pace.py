@@ -142,21 +142,21 @@ class Pace:
 
   def wait(self) -> None:
     """Ends a step, and waits until the next one is due; the first one is due at once."""
-    now, late = self._clock(), self.lateness
-    if self._due is None:
-      self._due = now
+    now, late, due = self._clock(), self.lateness, self._due
+    if due is None:
+      due = now
     else:
       late.work += now - self.now
-      self._due += self.period / self.speed
-      late.missed += now > self._due
-    if now < self._due:
-      self._sleep(self._due - now)
+      due += self.period / self.speed
+      late.missed += now > due
+    if now < due:
+      self._sleep(due - now)
       now = self._clock()
-    elif now - self._due > _LOST:
-      late.skipped += now - self._due
-      self._due = now
-    late.add(now - self._due)
-    self.now = now
+    elif now - due > _LOST:
+      late.skipped += now - due
+      due = now
+    late.add(now - due)
+    self.now, self._due = now, due
 
   def rest(self, seconds: float = 0.01) -> None:
     """Waits in a pause; the time counts nowhere, and the next step is due at once."""

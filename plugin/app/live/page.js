@@ -8,6 +8,8 @@ const $ = id => document.getElementById(id);
 const STATES = ["waiting", "ready", "clutch", "lost", "paused"];
 const MEAN = 0.3;  // over which steps are counted [s]
 const AGAIN = 2000;  // between tries to reach the program [ms]
+const WORDS = 100;  // between numbers in words, which are laid out anew [ms]
+const ENOUGH = 40, PROMPT = 0.9;  // frames to judge by whether most of them are drawn
 const KEPT = 5000;  // of the times from hand to picture
 const TONES = {force: [880, 0.1], shaft: [660, 0.1], view: [330, 0.15], end: [523, 0.3]};  // [Hz], [s]
 
@@ -20,6 +22,7 @@ try {
 }
 let scene = null, frame = null, head = {}, rest = null, running = false, paused = false, sound = null;
 let fresh = false, drawn = "", echoed = 0, before = null, trace = null, trouble = "", warned = "", late = null;
+let turn = 0, told = 0, came = 0, shown = 0;
 const plots = {force: new Plot("force"), way: new Plot("way"), rate: new Plot("rate")};
 const ways = [], pictures = [];  // from hand to picture [ms]; when pictures were drawn
 const hand = new Hand($("view"), $("pad"), view, () => head);
@@ -85,6 +88,7 @@ const HEAR = {
   scene(message) {
     scene = message;
     frame = rest = trace = before = null;
+    came = shown = 0;
     pressed("ghost", false);
     view.load(scene);
     for (const plot of Object.values(plots)) plot.clear();
@@ -201,6 +205,7 @@ function take(numbers) {
   head = Object.fromEntries(scene.head.map((name, i) => [name, numbers[i]]));
   frame = numbers;
   fresh = true;
+  came++;
   rest ??= nodes.slice();
   const {force_limit: limit} = scene;
   plots.force.push(head.force);
@@ -220,6 +225,8 @@ function take(numbers) {
   else if (!$("warning").textContent && head.force <= limit) $("stage").dataset.warning = "";
   $("force").firstElementChild.style.width = `${Math.min(100 * head.force / most, 100)}%`;
   $("force").lastElementChild.style.left = `${100 * limit / most}%`;
+  if (performance.now() - told < WORDS) return;
+  told = performance.now();
   $("force-text").textContent = `${head.force.toFixed(2)} N, limit ${limit} N`;
   $("progress").value = Math.max(head.progress, 0);
   $("progress-text").textContent = `${Math.round(100 * Math.max(head.progress, 0))} %`;
@@ -239,6 +246,10 @@ function displacement(nodes) {
 }
 
 function report(steps, punctual, share) {
+  if (came > ENOUGH) {
+    if (shown < PROMPT * came) view.hurry();
+    came = shown = 0;
+  }
   const now = performance.now(), late = ways.slice(-30).sort((a, b) => a - b);
   const words = [`${Math.round(steps)} steps a second`, `${(100 * punctual).toFixed(1)} % on time`];
   const wanted = Number($("speed").value);
@@ -258,23 +269,23 @@ function draw() {
   requestAnimationFrame(draw);
   if (running) hand.say().forEach(say);
   if (!frame) return;
-  const expert = trace && $("ghost").getAttribute("aria-pressed") === "true" ? trace : null, shown = view.state();
-  if (!fresh && !expert && shown === drawn) return;
-  drawn = shown;
+  const expert = trace && $("ghost").getAttribute("aria-pressed") === "true" ? trace : null, state = view.state();
+  if (!fresh && !expert && state === drawn) return;
+  drawn = state;
   view.draw(frame, head, expert);
   if (!fresh) return;
   fresh = false;
   const now = performance.now();
   pictures.push(now);
+  shown++;
   if (pictures.length > KEPT) pictures.shift();
   if (head.echo !== echoed) {
     echoed = head.echo;
     ways.push((now - echoed + CLOCK) % CLOCK);
     if (ways.length > KEPT) ways.shift();
   }
-  plots.force.draw(scene.force_limit);
-  plots.way.draw();
-  plots.rate.draw(undefined, 0);
+  // One a picture: ten times a second is enough for curves.
+  [() => plots.force.draw(scene.force_limit), () => plots.way.draw(), () => plots.rate.draw(undefined, 0)][turn++ % 3]();
 }
 requestAnimationFrame(draw);
 

@@ -119,7 +119,7 @@ class Practice:
       self._switch()
     if self.pace.now < self._due:
       return
-    self._due = self.pace.now + 1 / _FPS
+    self._due = max(self._due + 1 / _FPS, self.pace.now)
     error = self.organ.error
     if error or not np.abs(self.organ.displacement).max() < _FAR:
       self._diverged()

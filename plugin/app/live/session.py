@@ -122,7 +122,7 @@ class Session:
       rows[k, 7] = float(link.report)
     # Not beside what a control step does at its end.
     if 0 < k < len(rows) - 1 and self._publish is not None and self.pace.now >= self._due:
-      self._due = self.pace.now + 1 / _FPS
+      self._due = max(self._due + 1 / _FPS, self.pace.now)
       self._publish(self)
 
   def _watch(self, env: Any) -> bool:

@@ -27,7 +27,8 @@ void main() {
 export class View {
   constructor(canvas) {
     this.canvas = canvas;
-    this.gl = canvas.getContext("webgl2", {antialias: true, preserveDrawingBuffer: true});
+    this.slow = drawnByProcessor();
+    this.gl = canvas.getContext("webgl2", {antialias: !this.slow, alpha: false});
     if (!this.gl) throw new Error("this browser draws no WebGL 2");
     const gl = this.gl;
     const program = gl.createProgram();
@@ -91,7 +92,13 @@ export class View {
     gl.bufferData(gl.ARRAY_BUFFER, normals(places, shape.triangles), gl.DYNAMIC_DRAW);
   }
 
+  // Draws with fewer pixels from now on, where the processor draws and is too slow at it.
+  hurry() {
+    if (this.slow) this.fine = Math.max(0.7 * this.fine, 0.5);
+  }
+
   load(scene) {
+    this.fine = 1;  // pixels for one of the page
     for (const old of this.scene ? [this.organ, ...this.geoms] : []) {
       old.buffers.forEach(buffer => this.gl.deleteBuffer(buffer));
     }
@@ -119,7 +126,7 @@ export class View {
 
   draw(frame, head, expert) {
     const gl = this.gl, {canvas, scene} = this;
-    const fine = Math.min(devicePixelRatio || 1, 2);
+    const fine = this.slow ? this.fine : Math.min(devicePixelRatio || 1, 2);
     const width = Math.round(fine * canvas.clientWidth), height = Math.round(fine * canvas.clientHeight);
     if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
     gl.viewport(0, 0, width, height);
@@ -178,6 +185,15 @@ export class View {
     const depth = dot(sub(at, [head.tip_x, head.tip_y, head.tip_z]), axes[2]);
     return 2 * Math.max(depth, 0.02) * Math.tan(fovy * Math.PI / 360) / this.canvas.clientHeight;
   }
+}
+
+// Whether there is no graphics card to draw with: smooth edges would then cost every third picture.
+function drawnByProcessor() {
+  const gl = document.createElement("canvas").getContext("webgl2");
+  const about = gl?.getExtension("WEBGL_debug_renderer_info");
+  const name = about ? gl.getParameter(about.UNMASKED_RENDERER_WEBGL) : "";
+  gl?.getExtension("WEBGL_lose_context")?.loseContext();
+  return /swiftshader|llvmpipe|softpipe|software|basic render/i.test(name);
 }
 
 const WAY = [0.35, 0.95, 0.75, 1], GHOST = [0.35, 0.95, 0.75, 0.4];

@@ -1,0 +1,139 @@
+"""Tetrahedra of an organ from a Gmsh file, in place of those that `fill` makes."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from . import fill
+from .mesh import Mesh
+
+_CLOSE = 1e-5  # of the organ's size, within which a node of the file is a vertex
+_TETRAHEDRON = 4  # Gmsh's number of that kind of element
+
+
+def read(organ: str, file: str, mesh: Mesh) -> Mesh:
+  """Returns a surface with the inside that a file says.
+
+  Args:
+    organ: name of the organ, for messages
+    file: path of a Gmsh file as text, version 2 or 4.1, in metres and in the surface's frame
+    mesh: the surface
+
+  Raises:
+    ValueError: the file cannot be read, or its tetrahedra do not fit the surface.
+  """
+  where = f"organ {organ!r}: tetrahedra is {file!r}"
+  try:
+    with open(file, encoding="ascii") as stream:
+      point, tet = _parse(stream.read().split())
+  except OSError as error:
+    raise ValueError(f"{where}: {error.strerror}, expected a Gmsh file") from None
+  except (ValueError, IndexError, KeyError):
+    raise ValueError(
+      f"{where}, which cannot be read: expected a Gmsh file as text, version 2 or 4.1"
+    ) from None
+  if not len(tet):
+    raise ValueError(f"{where}, which has no tetrahedra")
+  return _fitted(where, mesh, point, tet)
+
+
+def _parse(words: list[str]) -> tuple[np.ndarray, np.ndarray]:
+  """Returns nodes (n, 3) and tetrahedra (m, 4) of the words of a file."""
+  version = words[words.index("$MeshFormat") + 1]
+  if words[words.index("$MeshFormat") + 2] != "0" or version not in ("2", "2.1", "2.2", "4.1"):
+    raise ValueError
+  parse = _blocks if version == "4.1" else _lines
+  parts = [words[words.index(f"${part}") + 1 :] for part in ("Nodes", "Elements")]
+  names, point, tet = parse(*parts)
+  number = {name: k for k, name in enumerate(names)}
+  corner = [[number[name] for name in four] for four in tet]
+  return np.array(point, float).reshape(-1, 3), np.array(corner, np.int64).reshape(-1, 4)
+
+
+def _lines(nodes: list[str], elements: list[str]) -> tuple[list, list, list]:
+  """Returns names and places of nodes, and names of tetrahedra's corners, of version 2."""
+  rows = [nodes[k : k + 4] for k in range(1, 4 * int(nodes[0]) + 1, 4)]
+  tet, at = [], 1
+  for _ in range(int(elements[0])):
+    kind, tags = int(elements[at + 1]), int(elements[at + 2])
+    end = at + 3 + tags + _CORNERS[kind]
+    if kind == _TETRAHEDRON:
+      tet.append(elements[end - 4 : end])
+    at = end
+  return [row[0] for row in rows], [row[1:] for row in rows], tet
+
+
+def _blocks(nodes: list[str], elements: list[str]) -> tuple[list, list, list]:
+  """Returns the same of version 4.1, where both come in blocks."""
+  names, point, at = [], [], 4
+  for _ in range(int(nodes[0])):
+    count = int(nodes[at + 3])
+    if nodes[at + 2] != "0":  # with parameters behind the places
+      raise ValueError
+    at += 4
+    names += nodes[at : at + count]
+    point += [nodes[k : k + 3] for k in range(at + count, at + 4 * count, 3)]
+    at += 4 * count
+  tet, at = [], 4
+  for _ in range(int(elements[0])):
+    kind, count = int(elements[at + 2]), int(elements[at + 3])
+    at += 4
+    step = 1 + _CORNERS[kind]
+    if kind == _TETRAHEDRON:
+      tet += [elements[k + 1 : k + step] for k in range(at, at + step * count, step)]
+    at += step * count
+  return names, point, tet
+
+
+# Corners of Gmsh's elements of first order: line, triangle, quadrangle, tetrahedron and so on; 15
+# is a point.
+_CORNERS = {1: 2, 2: 3, 3: 4, _TETRAHEDRON: 4, 5: 8, 6: 6, 7: 5, 15: 1}
+
+
+def _fitted(where: str, mesh: Mesh, point: np.ndarray, tet: np.ndarray) -> Mesh:
+  """Returns the surface with tetrahedra between nodes of a file, which must end at it."""
+  if not np.isfinite(point).all():
+    raise ValueError(f"{where}, which has nodes that are not finite")
+  size = float(np.ptp(mesh.rest, axis=0).max())
+  far, node = KDTree(point).query(mesh.rest)
+  worst = int(np.argmax(far))
+  if far[worst] > _CLOSE * size:
+    raise ValueError(
+      f"{where}, whose nearest node to vertex {worst} is {far[worst]:.3g} m away; expected a node "
+      "at each vertex of the surface, in metres and in its frame"
+    )
+  # The surface's vertices first, then what else tetrahedra use.
+  place = np.full(len(point), -1)
+  place[node] = np.arange(mesh.nvert)
+  others = np.setdiff1d(tet, node)
+  place[others] = mesh.nvert + np.arange(len(others))
+  if len(others) > fill.MOST * mesh.nvert:
+    raise ValueError(
+      f"{where}, which has {len(others)} nodes inside, expected at most {fill.MOST * mesh.nvert}"
+    )
+  tet, rest = place[tet], np.concatenate([mesh.rest, point[others]])
+  turned = fill.volumes(rest, tet) < 0
+  tet[turned] = tet[turned][:, [0, 2, 1, 3]]
+  flat = np.flatnonzero(fill.quality(rest, tet) <= fill.FLAT)
+  if flat.size:
+    raise ValueError(f"{where}, whose tetrahedron {flat[0]} is flat")
+  _check_faces(where, mesh, tet)
+  return fill.joined(mesh, point[others], tet)
+
+
+def _check_faces(where: str, mesh: Mesh, tet: np.ndarray):
+  """Makes sure that tetrahedra end at the surface's triangles and nowhere else."""
+  face = np.sort(tet[:, fill.FACES].reshape(-1, 3), axis=1)
+  face, count = np.unique(face, axis=0, return_counts=True)
+  ends = {tuple(each) for each in face[count == 1].tolist()}
+  for k, corner in enumerate(np.sort(mesh.elem, axis=1).tolist()):
+    if tuple(corner) not in ends:
+      raise ValueError(
+        f"{where}, where triangle {k} (vertices {mesh.elem[k].tolist()}) is the face of no "
+        "tetrahedron or of two"
+      )
+  if len(ends) > mesh.nelem or (count > 2).any():
+    raise ValueError(
+      f"{where}, whose tetrahedra end at {len(ends)} faces, expected the {mesh.nelem} triangles"
+    )
