@@ -50,16 +50,16 @@ from scipy.spatial import cKDTree
 from . import observation, randomisation, safety, scenes, stage
 from .environment import CONTROL_TIMESTEP, Environment
 from .handle import ROW
-from .physics import AXES, JAWS, Physics, check_scene
+from .instrument import AXES, JAWS
+from .physics import Physics, check_scene
 from .randomisation import Ranges
+from .recorder import together
 from .recording import Event, Settings
 from .scenes import ORGAN, Scene
 from .stage import STATE, Stage
 
-RATES = (1.0, 1.0, 3.0, 0.12)  # pitch, yaw, roll [rad/s], insertion [m/s]
 REWARDS = ("dense", "sparse")
 
-_RATES = np.array(RATES)
 # In the dense reward: share of the progress that is paid before the end, price of a unit of cost,
 # and most that costs take. Success with all costs pays more than any progress without.
 SHARE, PRICE, MOST = 0.4, 0.1, 0.55
@@ -140,7 +140,7 @@ class Task(control.Task):
     self.force_limit, self.damage, self.organ = float(force_limit), float(damage), organ
     self.spread, self.jitter, self.visualize_reward = spread, jitter, False
     self.variants = (scene.variant,) if variants is None or model is not None else variants
-    self.reward, self.prefix = reward, f"{chosen.instrument}/"
+    self.reward, self.prefix, self.second = reward, *chosen.prefixes
     self.observed = observation.choose(observations, pixels)
     self.ranges, self.drawn = randomisation.check(randomise or {}), dict[str, Any]()
     self._models: dict[int | None, Stage] = {}
@@ -161,18 +161,25 @@ class Task(control.Task):
   @property
   def components(self) -> tuple[str, ...]:
     """Names of the action's components."""
-    return (ROW if self.scene.handle else AXES) + self.extra
+    moved = ROW if self.scene.handle else AXES
+    other = self.second.replace("/", "_")
+    return moved + self.extra + tuple(other + name for name in (*moved, *self.other) if other)
 
   @property
   def extra(self) -> tuple[str, ...]:
     """Names of those that do not move the instrument as a whole."""
     return ("jaw",) if self.jaws else ()
 
+  @property
+  def other(self) -> tuple[str, ...]:
+    """Those of the other hand's instrument."""
+    return ()
+
   def physics(self) -> Physics:
     """Returns the physics of the scene, to make an environment of."""
     model = self.compiled(self.variants[0]).model
     physics = Physics.from_model(wrapper.MjModel(model))
-    physics.use(model, self.prefix, self.targets, self.organ)
+    physics.use(model, self.prefix, self.targets, self.organ, self.second)
     return physics
 
   def compiled(self, variant: int | None) -> Stage:
@@ -187,8 +194,10 @@ class Task(control.Task):
 
   def _stage(self, spec: mj.MjSpec) -> Stage:
     model = stage.compile_spec(spec)
-    check_scene(model, self.prefix, self.targets, self.organ, self.scene.handle)
-    return stage.build(model, self.prefix, self.organ)
+    hands = [prefix for prefix in (self.prefix, self.second) if prefix]
+    for prefix in hands:
+      check_scene(model, prefix, self.targets, self.organ, self.scene.handle)
+    return stage.build(model, hands, self.organ)
 
   def _scene(self, variant: int | None) -> Scene:
     return dataclasses.replace(self.scene, variant=variant, targets=self.targets)
@@ -268,16 +277,17 @@ class Task(control.Task):
     """Draws shape, trocar, pose and targets, and puts the organ at rest."""
     place = self.compiled(self.choose())
     if physics.model.ptr is not place.model:
-      physics.use(place.model, self.prefix, self.targets, self.organ)
+      physics.use(place.model, self.prefix, self.targets, self.organ, self.second)
     place.restore()
     mj.mj_setState(place.model, physics.data.ptr, place.state, STATE)
     self.drawn = randomisation.apply(self.ranges, self.random, physics, place)
     mj.mj_kinematics(place.model, physics.data.ptr)
     physics.moved()
     limit = self.jitter
-    physics.move_port(
-      self.random.uniform(-limit, limit, 3), 8.7 * self.random.uniform(-limit, limit, 3)
-    )
+    for hand in physics.hands:
+      hand.move_port(
+        self.random.uniform(-limit, limit, 3), 8.7 * self.random.uniform(-limit, limit, 3)
+      )
     self.outcome, self.events = None, []
     self.progress, self.best, self._phi, self._gain = 0.0, 0.0, 0.0, 0.0
     self.peak, self._area = 0.0, 0.0
@@ -290,13 +300,14 @@ class Task(control.Task):
 
   def _place_instrument(self, physics: Physics) -> None:
     _, center = self.place_of_work(physics)
-    port = physics.trocar()
-    away = (port.pos - center) / np.linalg.norm(port.pos - center)
-    aside = self.random.uniform(-0.015, 0.015, 3)
-    tip = center + self.random.uniform(0.03, 0.045) * away + aside
-    joints = trocar.inverse(port, tip)
-    pose = np.array([joints[0], joints[1], self.random.uniform(-0.5, 0.5), joints[2]])
-    physics.set_joints(pose)
+    for hand in physics.hands:
+      port = hand.trocar()
+      away = (port.pos - center) / np.linalg.norm(port.pos - center)
+      aside = self.random.uniform(-0.015, 0.015, 3)
+      tip = center + self.random.uniform(0.03, 0.045) * away + aside
+      joints = trocar.inverse(port, tip)
+      pose = np.array([joints[0], joints[1], self.random.uniform(-0.5, 0.5), joints[2]])
+      hand.set_joints(pose)
 
   def action_spec(self, physics: Physics) -> specs.BoundedArray:
     """Returns the bounds of the action; the components are at the module's head."""
@@ -325,15 +336,11 @@ class Task(control.Task):
   def before_step(self, action: Any, physics: Physics) -> None:
     """Moves the drives' targets, or tells the handle where to go."""
     self.action = values = self.check_action(action)
-    if self.scene.handle:
-      physics.guide.follow(values.reshape(-1, values.shape[-1]))
-      return
-    low, high = physics.drive_range.T
-    move = values[:4] * _RATES * self.control_timestep
-    ctrl = physics.data.ptr.ctrl
-    ctrl[physics.drives] = (ctrl[physics.drives] + move).clip(low, high)
-    if physics.jaw >= 0:
-      physics.close_jaws(values[4])
+    first = 0
+    for hand, extra in zip(physics.hands, (self.extra, self.other), strict=False):
+      count = len(ROW if self.scene.handle else AXES) + len(extra)
+      hand.act(values[..., first : first + count], self.control_timestep)
+      first += count
 
   def after_step(self, physics: Physics) -> None:
     """Measures the progress and looks for errors and damage."""
@@ -397,19 +404,24 @@ class Task(control.Task):
 
   def sample(self, physics: Physics) -> dict[str, Any]:
     """Returns a sample for `Recorder.append`; the forces are those of every step of the physics."""
-    forces = physics.forces()
+    forces, strain = physics.forces(), physics.strain(self.nodes0)  # of the main hand
     area = physics.contact_area() if forces["force"].any() else 0.0
     self._area = area if area > 0 else self._area
-    return {
-      "time": physics.data.ptr.time,
-      "tip_pos": physics.tip_pos(),
-      "quat": physics.tip_quat(),
-      **forces,
+    own = {
       "area": self._area if forces["force"][-1] > 0 else 0.0,
-      "strain": physics.strain(self.nodes0),
-      "visible": float(physics.tip_visible()),
+      "strain": strain() if physics.second else strain,
       **self.recorded(physics),
     }
+    hands = [
+      {
+        "tip_pos": hand.tip_pos(),
+        "quat": hand.tip_quat(),
+        "visible": float(physics.visible(hand.tip_pos())),
+        **hand.forces(),
+      }
+      for hand in physics.hands
+    ]
+    return {"time": physics.data.ptr.time} | together(hands[0] | own, *hands[1:])
 
 
 def closeness(distance: float, start: float) -> float:

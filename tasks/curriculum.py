@@ -19,6 +19,7 @@ AFTER: dict[str, str | None] = {
   "tease/easy": "probe/easy",
   "dissect/easy": "retract/easy",
   "cut/easy": "trace/easy",
+  "bimanual/easy": "dissect/easy",
   "touch/standard": "touch/easy",
   "probe/standard": "probe/easy",
   "probe/depth": "probe/easy",
@@ -28,6 +29,7 @@ AFTER: dict[str, str | None] = {
   "tease/standard": "tease/easy",
   "dissect/standard": "dissect/easy",
   "cut/standard": "cut/easy",
+  "bimanual/standard": "bimanual/easy",
   "probe/palpate_easy": "probe/standard",
   "probe/palpate_standard": "probe/palpate_easy",
   "touch/hard": "touch/standard",
@@ -38,6 +40,7 @@ AFTER: dict[str, str | None] = {
   "tease/hard": "tease/standard",
   "dissect/hard": "dissect/standard",
   "cut/hard": "cut/standard",
+  "bimanual/hard": "bimanual/standard",
   "probe/palpate_hard": "probe/palpate_standard",
 }
 RULE = f"{CONSECUTIVE} proficient attempts in a row and {REPEATS} more"

@@ -15,11 +15,12 @@ learning begins anew from 0. This is the CUSUM by which training programmes watc
 (Bolsin and Colson 2000, 10.1093/intqhc/12.5.433), with the same weights.
 
 h = `LIMIT` for both. Of a single test, which may decide for the one or the other, Wald's bound is
-log((1 - beta) / alpha): 3.58 for the errors alpha = 0.025 and beta = 0.1. A sum that is held at 0 is
-many tests in a row and errs more often, so that h goes by what comes of it in 30 attempts, exactly
-(`chance`): who fails in 0.3 is called competent with a chance of 3.9 %, who fails in 0.1 with 70 %
-(in 50 attempts 94 %). A competent person who fails in 0.1 loses the name with 4.5 %, one who fails
-in 0.3 with 82 %. At h = 3.5, which fourteen successes in a row reach, the first would be 5.1 %.
+log((1 - beta) / alpha): 3.58 for the errors alpha = 0.025 and beta = 0.1. A sum that is held at 0
+is many tests in a row and errs more often, so that h goes by what comes of it in 30 attempts,
+exactly (`chance`): who fails in 0.3 is called competent with a chance of 3.9 %, who fails in 0.1
+with 70 % (in 50 attempts 94 %). A competent person who fails in 0.1 loses the name with 4.5 %, one
+who fails in 0.3 with 82 %. At h = 3.5, which fourteen successes in a row reach, the first would be
+5.1 %.
 """
 
 import dataclasses

@@ -17,8 +17,8 @@ from dm_control.rl import control
 from . import episode, observation, suite
 from .files import replacing
 from .inputs import SIGNALS
+from .instrument import AXES
 from .performer import Act
-from .physics import AXES
 from .recording import Recording
 
 OPEN = ("time limit", "stopped")  # outcomes of an episode that could have gone on

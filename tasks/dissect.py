@@ -97,9 +97,13 @@ class Dissect(Freeing, Hold):
     physics.mark(0, physics.point(self.site), now=True)
     if self.follow(physics):
       self.dropped(physics)
-    self.count(physics, self.grasped)
+    self.count(physics, self.fair(physics))
     near = base.closeness(self.distance(physics), self.distance0)
     return self.earned(1.0 if self.grasped else near)
+
+  def fair(self, physics: Physics) -> bool:
+    """Whether what comes free now counts as clean."""
+    return self.grasped
 
   def instruct(self, physics: Physics) -> str:
     """Says to grasp, or to pull."""

@@ -96,9 +96,8 @@ def _begin(
   """Returns the recorder of an episode, with the constants and the sample of its start."""
   task: Any = env.task
   physics: Any = env.physics
-  recorder = Recorder(
-    [physics.prefix.rstrip("/")], task.settings(), task.watch, substeps=substeps(env)
-  )
+  names = [hand.prefix.rstrip("/") for hand in physics.hands]
+  recorder = Recorder(names, task.settings(), task.watch, substeps=substeps(env))
   recorder.info = {
     "task": task.name,
     "seed": seed,

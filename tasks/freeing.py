@@ -61,11 +61,12 @@ class Freeing(Task):
     if self.clean >= self.wanted - _SEEN:
       self.outcome = "success"
     elif self.torn > 1.0 - self.wanted + _SEEN:
-      self._harm(physics, f"torn off: {100 * self.torn:.0f} %")
+      self.harm_done(physics, f"torn off: {100 * self.torn:.0f} %")
     elif self.traction > 2 * self.limit:
-      self._harm(physics, f"torn by a pull of {self.traction:.2f} N")
+      self.harm_done(physics, f"torn by a pull of {self.traction:.2f} N")
 
-  def _harm(self, physics: Physics, what: str) -> None:
+  def harm_done(self, physics: Physics, what: str) -> None:
+    """Ends the episode with damage, and says by what."""
     self.outcome = "damage"
     self.event(physics, "note", label=what)
 

@@ -18,6 +18,7 @@ import numpy as np
 from dm_control import mujoco
 from dm_env import specs
 
+from .instrument import JAWS
 from .physics import COARSE, NEAR, Physics
 from .scenes import CAMERA
 
@@ -36,7 +37,7 @@ class Row:
     shape: of the array
     unit: of its numbers
     what: it is
-    measure: takes task and physics, returns it
+    measure: takes task and physics, or the other hand's instrument for a sensor, returns it
     jaws: whether instruments with jaws alone have it
   """
 
@@ -138,7 +139,8 @@ def _segmentation(camera: mujoco.Camera, physics: Physics) -> np.ndarray:
   out[(kind == flex) & (name == mj.mj_name2id(model, flex, physics.organ_name))] = LABELS["organ"]
   out[(kind == mj.mjtObj.mjOBJ_SKIN) & (name == physics.organ.skin)] = LABELS["organ"]
   out[(kind == site) & np.isin(name, physics.target_sites)] = LABELS["target"]
-  bodies = [model.body(i).name.startswith(physics.prefix) for i in range(model.nbody)]
+  hands = tuple(hand.prefix for hand in physics.hands)
+  bodies = [model.body(i).name.startswith(hands) for i in range(model.nbody)]
   own = np.flatnonzero(np.array(bodies)[model.geom_bodyid])
   out[(kind == geom) & np.isin(name, own)] = LABELS["instrument"]
   return out
@@ -250,7 +252,7 @@ def _known() -> str:
 
 def check(task: Any, physics: Physics) -> None:
   """Raises ValueError for a name that is no group, picture or observation of a task."""
-  single = [*(n for n, row in ROWS.items() if task.jaws or not row.jaws), *task.observe(physics)]
+  single = [*(name for name, *_ in _rows(task.prefix, task.second)), *task.observe(physics)]
   for name in task.observed.names:
     if name not in (*GROUPS, *PICTURES, *single):
       raise ValueError(
@@ -279,23 +281,30 @@ def take(task: Any, physics: Physics) -> collections.OrderedDict:
 
 
 def _numbers(task: Any, physics: Physics) -> collections.OrderedDict:
-  rows, own = _plan(task.observed, task.jaws)
-  out = collections.OrderedDict((name, measure(task, physics)) for name, measure in rows)
+  rows, own = _plan(task.observed, task.prefix, task.second)
+  hands = physics.hands
+  out = collections.OrderedDict((name, measure(task, hands[k])) for name, measure, k in rows)
   if own:
     observed: Mapping[str, np.ndarray] = task.observe(physics)
     out |= {name: value for name, value in observed.items() if own == "all" or name in own}
   return out
 
 
+def _rows(first: str, second: str) -> list[tuple[str, Row, int]]:
+  """Returns names, rows and hands of instruments with these prefixes; the second's is sensors."""
+  out = [(name, row, 0) for name, row in ROWS.items() if first == JAWS or not row.jaws]
+  for name, row in ROWS.items() if second else ():
+    if row.group == "sensors" and (second == JAWS or not row.jaws):
+      out.append((f"{second.rstrip('/')}_{name}", row, 1))
+  return out
+
+
 @functools.lru_cache
-def _plan(choice: Choice, jaws: bool) -> tuple[list, Any]:
-  """Returns names and measures of the rows that are chosen, and the domain's own names or "all"."""
-  rows = [
-    (name, row.measure)
-    for name, row in ROWS.items()
-    if choice.has(name, row.group) and (jaws or not row.jaws)
-  ]
-  own = set(choice.names) - set(ROWS) - set(PICTURES) - {"sensors"}
+def _plan(choice: Choice, first: str, second: str) -> tuple[list, Any]:
+  """Returns names, measures, hands of the chosen rows, and the domain's own names or "all"."""
+  known = _rows(first, second)
+  rows = [(name, row.measure, k) for name, row, k in known if choice.has(name, row.group)]
+  own = set(choice.names) - {name for name, *_ in known} - set(PICTURES) - {"sensors"}
   return rows, "all" if "state" in own else own
 
 

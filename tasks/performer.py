@@ -32,7 +32,7 @@ from dm_control.rl import control
 from palpate.models import trocar
 
 from . import policy
-from .base import RATES
+from .instrument import RATES
 
 Act = Callable[[Any], Any]
 Script = Iterator[np.ndarray]
@@ -195,36 +195,53 @@ def find(who: str, *others: str) -> Any:
 
 
 class Performer:
-  """Follows the script of the environment's task; starts it again with each episode."""
+  """Follows the script of the environment's task; starts it again with each episode.
 
-  def __init__(self, env: control.Environment, style: Style = EXPERT, seed: int = 0):
-    """Makes a performer in a style; see `make`."""
-    self.env, self.style = env, style
+  Attributes:
+    hand: the instrument that it moves
+    other: who moves the other hand's, None where there is none
+  """
+
+  def __init__(self, env: control.Environment, style: Style = EXPERT, seed: int = 0, hand: int = 0):
+    """Makes a performer in a style, see `make`; `hand` is which of the instruments it moves."""
+    self.env, self.style, self._which = env, style, hand
     self.dt = env.control_timestep()  # [s]
     self.physics: Any = env.physics
     self.task: Any = env.task
     self.random = np.random.RandomState(seed)
     self._steps: Script | None = None
+    second = self.task.second and not hand
+    self.other = Performer(env, style, seed + 1, hand=1) if second else None
 
   def __call__(self, timestep: Any) -> np.ndarray:
     """Returns the action for a time step."""
     if timestep.first() or self._steps is None:
-      self.trocar = self.physics.trocar()
-      joints = self.physics.drive_targets()[[0, 1, 3]]
-      self.tip = trocar.forward(self.trocar, joints)  # where the tip is told to be
-      self.roll = float(self.physics.drive_targets()[2])
-      self.extra = np.zeros(len(self.task.extra))
-      late = round(self.style.reaction / self.dt)
-      still = self.tip, self.roll, self.extra.copy()
-      self._told = collections.deque([still] * late, maxlen=late + 1)
-      self._phase = self.random.uniform(0, 2 * math.pi, (len(_TREMOR_HZ), 3))
+      self.begin()
+      if self.other:
+        self.other.begin()
       script: Script = self.task.expert(self)
       self._steps = script
     try:
-      return next(self._steps)
+      action = next(self._steps)
     except StopIteration:
       self._steps = self.wait(math.inf)
-      return next(self._steps)
+      action = next(self._steps)
+    # A script that speaks of one hand leaves the other where it is.
+    alone = self.other and len(action) < len(self.task.components)
+    return np.concatenate([action, self.other.step()]) if alone else action
+
+  def begin(self) -> None:
+    """Takes the instrument as it is when an episode begins."""
+    self.hand: Any = self.physics.hands[self._which]
+    self.trocar = self.hand.trocar()
+    joints = self.hand.drive_targets()[[0, 1, 3]]
+    self.tip = trocar.forward(self.trocar, joints)  # where the tip is told to be
+    self.roll = float(self.hand.drive_targets()[2])
+    self.extra = np.zeros(len(self.task.other if self._which else self.task.extra))
+    late = round(self.style.reaction / self.dt)
+    still = self.tip, self.roll, self.extra.copy()
+    self._told = collections.deque([still] * late, maxlen=late + 1)
+    self._phase = self.random.uniform(0, 2 * math.pi, (len(_TREMOR_HZ), 3))
 
   # Words of the scripts.
 
@@ -235,12 +252,22 @@ class Performer:
     if self.style.tremor:
       wave = np.sin(2 * math.pi * _TREMOR_HZ[:, None] * self.physics.time() + self._phase)
       tip = tip + self.style.tremor * math.sqrt(2 / len(_TREMOR_HZ)) * wave.sum(axis=0)
-    if self.physics.handle:
-      return np.concatenate([self.physics.handle_row(tip, roll), extra])
+    if self.hand.handle:
+      return np.concatenate([self.hand.handle_row(tip, roll), extra])
     pitch, yaw, insertion = trocar.inverse(self.trocar, tip, check=False)
     goal = np.array([pitch, yaw, roll, insertion])
-    move = (goal - self.physics.drive_targets()) / (np.array(RATES) * self.dt)
+    move = (goal - self.hand.drive_targets()) / (np.array(RATES) * self.dt)
     return np.concatenate([np.clip(move, -1, 1), extra])
+
+  def both(self, mine: Script, others: Script) -> Script:
+    """Does one script with this hand and another with the other, until both are done."""
+    assert self.other
+    while True:
+      first, second = next(mine, None), next(others, None)
+      if first is None and second is None:
+        return
+      first = self.step() if first is None else first
+      yield np.concatenate([first, self.other.step() if second is None else second])
 
   def wait(self, duration: float) -> Script:
     """Holds still for a time [s]."""
@@ -283,7 +310,7 @@ class Performer:
     for _ in range(round(most / self.care / self.dt)):
       if until():
         return
-      measured = float(np.linalg.norm(self.physics.contact_force()))
+      measured = float(np.linalg.norm(self.hand.contact_force()))
       contact += self.dt if measured > 0.02 else 0.0
       speed = np.clip(0.06 * (force * self.excess(contact) - measured), -0.02, 0.012)
       self.tip = self.tip + self.care * speed * self.dt * along
@@ -304,7 +331,7 @@ class Performer:
     for _ in range(round(5 / self.care / self.dt)):
       if until():
         return
-      now = float((self.physics.tip_pos() - point) @ along)
+      now = float((self.hand.tip_pos() - point) @ along)
       contact += self.dt if now > 0 else 0.0
       speed = np.clip(8 * (depth * self.excess(contact) - now), -0.02, 0.015)
       self.tip = self.tip + self.care * speed * self.dt * along
@@ -314,8 +341,8 @@ class Performer:
     """Presses to a depth [m] below a point in one stroke; returns the stiffness felt [N/m]."""
     yield from self.line(point + depth * self.excess(0.0) * along, speed=0.03)
     yield from self.wait(self.style.reaction + 0.1)
-    force = float(np.linalg.norm(self.physics.contact_force()))
-    return force / max(float((self.physics.tip_pos() - point) @ along), 1e-3)
+    force = float(np.linalg.norm(self.hand.contact_force()))
+    return force / max(float((self.hand.tip_pos() - point) @ along), 1e-3)
 
   def close(self, site: int, again: int = 0, grip: float = 1.5) -> Script:
     """Grasps a triangle: opens above it, goes down over it, and closes to a gentle force.
@@ -325,7 +352,7 @@ class Performer:
       again: how often it was lost: it is taken deeper then, and firmer
       grip: force that holds it [N]
     """
-    physics, up = self.physics, self.physics.trocar().mat[:, 2]
+    physics, up = self.physics, self.hand.trocar().mat[:, 2]
     self.firm = self._enough = grip + _FIRMER * min(again, 2)
     self.roll, self.extra[:] = _ROLL, _WIDE
     yield from self.move(physics.point(site) + 0.012 * up)
@@ -337,7 +364,7 @@ class Performer:
       yield self.step()
     for _ in range(round(100 / self.care)):
       yield self.step()
-      if abs(self._squeeze(0.0, 0.02)) < 0.25 and physics.holds():
+      if abs(self._squeeze(0.0, 0.02)) < 0.25 and self.hand.holds():
         return
 
   def grip(self, contact: float) -> None:
@@ -348,7 +375,7 @@ class Performer:
 
   def _squeeze(self, contact: float, gain: float) -> float:
     """Closes or opens the jaws towards their force; returns what is missing of it [N]."""
-    missing = self.firm * self.excess(contact) - float(self.physics.gripper()[2:].max())
+    missing = self.firm * self.excess(contact) - float(self.hand.gripper()[2:].max())
     change = self.care * float(np.clip(gain * missing, -0.5 * gain, 0.5 * gain))
     self.extra[0] = float(np.clip(self.extra[0] - change, -1, -0.3))
     return missing
@@ -356,5 +383,5 @@ class Performer:
   def open(self) -> Script:
     """Lets go, gently until nothing is held: a pinched fold would jump."""
     while self.extra[0] < 0.1:
-      self.extra[0] += 0.02 if self.physics.gripper()[2:].any() else 0.06
+      self.extra[0] += 0.02 if self.hand.gripper()[2:].any() else 0.06
       yield self.step()

@@ -1,48 +1,46 @@
 # mujoco ships its bindings without type stubs:
 # pyright: reportAttributeAccessIssue=false
-"""The physics of an exercise: one organ, one instrument on a trocar, and what one asks of them."""
+"""The physics of an exercise: one organ, an instrument or two, and what one asks of them."""
 
 import functools
 import math
 from collections.abc import Callable
+from typing import Any
 
 import mujoco as mj
 import numpy as np
 from dm_control.mujoco import wrapper
 from palpate import Organ
-from palpate.models import trocar
-from palpate.models.handle import find, pose
+from palpate.tissue.config import Config
 
 from . import scenes
-from .handle import ROW, Guide
-from .jaws import Jaws
+from .instrument import AXES, JAWS, Instrument, Second
 from .metrics.samples import Stretch
 from .portable import Portable
 from .scenes import CAMERA, ORGAN
 from .stage import STATE
 
-AXES = ("pitch", "yaw", "roll", "insertion")
-JAWS = "grasper/"  # prefix of the instrument that has them
-TOUCH = ("touch_left", "touch_right")  # sensors of the jaws
 NEAR, COARSE = 8, 32  # nodes in the observations
-HELD_FORCE = 0.2  # of the inner face of either jaw on tissue between them, to hold it [N]
-
-CLOSING = 0.005  # the drive's target is that far below the opening [rad]
-# Least opening over a fold of tissue, largest target that grips one [rad].
-FOLD, GRIPPING = 0.02, 0.15
 
 
-class Physics(Portable):
-  """Physics of an exercise: one organ, one instrument on a trocar.
+class Physics(Instrument, Portable):
+  """Physics of an exercise: one organ, and its instrument on a trocar.
+
+  It is that instrument itself, where one asks for its tip and forces; where there are two, the
+  other is `second`, and the largest forces are those of both.
 
   Attributes:
+    second: the instrument of the other hand, None where there is none
     meanwhile: called in the middle of every `step`, with what need not be done at its end, where a
       live exercise has least time; None for nothing
   """
 
+  second: Second | None = None
   meanwhile: Callable[[], None] | None = None
 
-  def use(self, model: mj.MjModel, prefix: str, targets: int, organ: str = ORGAN) -> None:
+  def use(
+    self, model: mj.MjModel, prefix: str, targets: int, organ: str = ORGAN, second: str = ""
+  ) -> None:
     """Takes a compiled scene; ValueError names what it lacks.
 
     Args:
@@ -50,34 +48,18 @@ class Physics(Portable):
       prefix: of the instrument, for instance "probe/"
       targets: number of target sites needed
       organ: name of the organ
+      second: prefix of the other hand's instrument, "" where there is none
     """
-    self.prefix, self.organ_name = prefix, organ
-    held = mj.mj_name2id(model, mj.mjtObj.mjOBJ_BODY, f"{prefix}handle") >= 0
-    check_scene(model, prefix, targets, organ, held)
+    self.organ_name = organ
+    for name in filter(None, (prefix, second)):
+      held = mj.mj_name2id(model, mj.mjtObj.mjOBJ_BODY, f"{name}handle") >= 0
+      check_scene(model, name, targets, organ, held)
     if model is not self.model.ptr:
       self._reload_from_data(wrapper.MjData(wrapper.MjModel(model)))
     self.organ = Organ(model, self.data.ptr, organ)
     self._nodes: np.ndarray | None = None
     self._points: dict[int, np.ndarray] = {}
     self._camera = model.camera(CAMERA).id
-    self._sensors = {}
-    for i in range(model.nsensor):
-      name = model.sensor(i).name
-      if name.startswith(prefix):
-        adr = int(model.sensor_adr[i])
-        self._sensors[name[len(prefix) :]] = slice(adr, adr + int(model.sensor_dim[i]))
-    joints = [model.joint(prefix + axis) for axis in AXES]
-    self._qpos = np.array([int(joint.qposadr[0]) for joint in joints])
-    self._dof = np.array([int(joint.dofadr[0]) for joint in joints])
-    self.handle, self.guide = find(model, self.data.ptr, prefix), Guide()
-    driven = () if self.handle else AXES
-    self.drives = np.array([model.actuator(prefix + axis).id for axis in driven], int)
-    self.drive_range = model.actuator_ctrlrange[self.drives].copy()
-    self.jaw = model.actuator(prefix + "jaw").id if self.has_jaw else -1
-    self._jaws = Jaws(model, prefix) if self.has_jaw else None
-    self._inner = np.zeros(2)
-    signals = ["tip_force", "shaft_force", *(TOUCH if self.has_jaw else ())]
-    self._signals = np.concatenate([np.arange(*self._sensors[n].indices(10**6)) for n in signals])
     self.target_sites = [model.site(f"target{i}").id for i in range(targets)]
     model.site_sameframe[self.target_sites] = 0  # else a site at its body's origin stays there
     self._xpos0 = self.organ.xpos0
@@ -85,13 +67,14 @@ class Physics(Portable):
     self._coarse0 = self._xpos0[self.coarse]
     self._stretch: tuple[np.ndarray, np.ndarray, Stretch] | None = None
     self._cuts = bool(self.organ.config.cutters)
-    self._trocar = trocar.trocar(model, prefix)
+    self.equip(prefix)
+    self.second = Second(self, second) if second else None
     self.quiet()
 
   @property
-  def has_jaw(self) -> bool:
-    """Whether the instrument has jaws."""
-    return "jaw" in self._sensors
+  def hands(self) -> tuple[Instrument, ...]:
+    """The instruments, the main one first."""
+    return (self, self.second) if self.second else (self,)
 
   def step(self, nstep: int = 1) -> None:
     """Advances the physics; keeps the contact forces on tip, shaft and jaws of all the steps."""
@@ -99,65 +82,42 @@ class Physics(Portable):
       model, data = self.model.ptr, self.data.ptr
       begin, end, sensors = mj.mj_step1, mj.mj_step2, data.sensordata
       values = np.empty((nstep, model.nsensordata))
-      self._felt = np.zeros((nstep, 6))
+      hands, h = self.hands, self.timestep()
+      for hand in hands:
+        hand.begin(nstep)
       for k in range(nstep):
         end(model, data)
         values[k] = sensors
         if self._cuts:  # MuJoCo's contacts know nothing of it
-          self._edge = np.sum([cutter.force for cutter in self.organ.cutters], axis=0)
-          values[k, self._sensors["tip_force"]] += self._edge
-        if k == nstep - 1 and self._jaws:
-          self._inner = self._jaws.inner_force(model, data)
-        if self.handle:
-          self._felt[k] = self.handle.wrench()
-          self._lead(k, nstep)
+          self.edge = np.sum([cutter.force for cutter in self.organ.cutters], axis=0)
+          values[k, self._sensors["tip_force"]] += self.edge
+        for hand in hands:
+          hand.advance(k, nstep, h)
         if k == nstep // 2 and self.meanwhile is not None:
           self.meanwhile()
         begin(model, data)
-      self._keep(values)
+      for hand in hands:
+        hand.keep(values)
+      self._join()
       self.moved()
 
-  def _keep(self, sensors: np.ndarray) -> None:
-    """Keeps the forces of steps that had these sensor values  (nstep, nsensordata)."""
-    values = sensors[:, self._signals]
-    parts = values[:, :6].reshape(-1, 2, 3)
-    tip, shaft = np.sqrt(np.einsum("ijk,ijk->ji", parts, parts))
-    self._forces = {"force": tip, "shaft_force": shaft}
-    self.peak_force, self.peak_shaft = float(tip.max()), float(shaft.max())
-    if self.has_jaw:
-      jaws = values[:, 6:]
-      self._forces["grip_force"] = jaws.max(axis=1)
-      # Pinched folds make single steps of large jaw force: the jaws' is a mean over the step.
-      self.peak_force = max(self.peak_force, float(jaws.sum(axis=0).max()) / len(jaws))
+  def _join(self) -> None:
+    """Takes the largest forces of both hands."""
+    if self.second:
+      self.peak_force = max(self.peak_force, self.second.peak_force)
+      self.peak_shaft = max(self.peak_shaft, self.second.peak_shaft)
 
-  def _lead(self, k: int, nstep: int) -> None:
-    """Moves the handle before step k of `nstep`, and the jaws where the row has them."""
-    row, vel, spin = self.guide.advance(k, nstep, self.timestep())
-    assert self.handle is not None
-    self.handle.move(row[:3], row[3:7], vel, spin)
-    if self.jaw >= 0 and len(row) > len(ROW):
-      self.close_jaws(row[len(ROW)])
-
-  def close_jaws(self, share: float) -> None:
-    """Gives the jaws their target: 1 is wide open, -1 squeezes closed jaws."""
-    low, high = self.model.ptr.actuator_ctrlrange[self.jaw]
-    self.data.ptr.ctrl[self.jaw] = low + (high - low) * (share + 1) / 2
-
-  def felt(self) -> np.ndarray:
-    """Returns force [N], torque [N m] on the hand in each step of the last `step`  (nstep, 6)."""
-    return self._felt
-
-  def forces(self) -> dict[str, np.ndarray]:
-    """Returns the force of the tip, the shaft and the jaws' grip in each step of the last `step`.
-
-    Magnitudes [N]  (nstep,), as `Recorder.append` takes them; a single 0 before the first.
-    """
-    return dict(self._forces)
+  def resume(self, data: mj.MjData, rest: dict[str, Any], config: Config) -> None:
+    """See `Portable`."""
+    super().resume(data, rest, config)
+    if self.second:
+      self.second.bind(self)
 
   def quiet(self) -> None:
-    """Forgets the forces of the last `step`: they would be in the next episode's start."""
-    self._felt, self._edge = np.zeros((1, 6)), np.zeros(3)
-    self._keep(np.zeros((1, self.model.nsensordata)))
+    """See `Instrument`; of all."""
+    super().quiet()
+    if self.second:
+      self.second.quiet()
 
   def forward(self) -> None:
     """Recomputes what depends on the state."""
@@ -181,81 +141,6 @@ class Physics(Portable):
     state = np.empty(mj.mj_stateSize(self.model.ptr, STATE))
     mj.mj_getState(self.model.ptr, self.data.ptr, state, STATE)
     return state
-
-  def sensor(self, name: str) -> np.ndarray:
-    """Returns a copy of one of the instrument's sensors."""
-    return self.data.ptr.sensordata[self._sensors[name]].copy()
-
-  def tip_pos(self) -> np.ndarray:
-    """Returns the tip's position [m]  (3,)."""
-    return self.sensor("tip_pos")
-
-  def tip_vel(self) -> np.ndarray:
-    """Returns the tip's velocity [m/s]  (3,)."""
-    return self.sensor("tip_vel")
-
-  def tip_quat(self) -> np.ndarray:
-    """Returns the tip's orientation, w x y z  (4,)."""
-    return self.sensor("tip_quat")
-
-  def joints(self) -> np.ndarray:
-    """Returns pitch, yaw, roll [rad] and insertion [m]  (4,)."""
-    return self.data.ptr.qpos[self._qpos]
-
-  def handle_row(self, tip: np.ndarray, roll: float) -> np.ndarray:
-    """Returns the row of an action that holds the tip at a place [m], rolled by an angle  (7,)."""
-    return pose(self._trocar, tip, roll)
-
-  def set_joints(self, joints: np.ndarray) -> None:
-    """Puts the instrument and its drives at a pose, as `joints`, with closed jaws."""
-    self.data.qpos[self._qpos] = joints
-    if self.handle:
-      row = self.handle_row(trocar.forward(self._trocar, joints[[0, 1, 3]]), joints[2])
-      self.handle.move(row[:3], row[3:])
-      self.guide.put(row)
-    else:
-      self.data.ctrl[self.drives] = joints
-    if self.jaw >= 0:
-      self.data.ctrl[self.jaw] = 0.0
-    self._inner = np.zeros(2)
-    mj.mj_forward(self.model.ptr, self.data.ptr)
-
-  def from_tip(self, point: np.ndarray) -> np.ndarray:
-    """Returns a point in the frame of the tip [m]  (3,)."""
-    local, turn = np.zeros(3), np.zeros(4)
-    mj.mju_negQuat(turn, self.tip_quat())
-    mj.mju_rotVecQuat(local, point - self.tip_pos(), turn)
-    return local
-
-  def joint_vel(self) -> np.ndarray:
-    """Returns the velocities of `joints`  (4,)."""
-    return self.data.ptr.qvel[self._dof]
-
-  def drive_targets(self) -> np.ndarray:
-    """Returns the targets of the position drives, or where the handle is, as `joints`  (4,)."""
-    return self.handle.joints(self._trocar) if self.handle else self.data.ptr.ctrl[self.drives]
-
-  def contact_force(self) -> np.ndarray:
-    """Returns the force of the tissue on the instrument below the shaft [N]  (3,)."""
-    return -self.sensor("tip_force") - self._edge
-
-  def shaft_force(self) -> np.ndarray:
-    """Returns the contact force on the shaft [N]  (3,)."""
-    return -self.sensor("shaft_force")
-
-  def gripper(self) -> np.ndarray:
-    """Returns opening and its target [rad], force on the left and right jaw [N]  (4,)."""
-    touch = self.sensor("touch_left"), self.sensor("touch_right")
-    return np.concatenate([self.sensor("jaw"), self.data.ctrl[[self.jaw]], *touch])
-
-  def closing(self) -> bool:
-    """Whether the jaws are told to close: on a fold of tissue at most, and below the opening."""
-    opening, target = float(self.sensor("jaw")[0]), float(self.data.ctrl[self.jaw])
-    return target < min(opening - CLOSING, GRIPPING)
-
-  def holds(self) -> bool:
-    """Whether tissue is between the jaws: it keeps them open, both inner faces press on it."""
-    return bool(self._inner.min() > HELD_FORCE and self.sensor("jaw")[0] > FOLD)
 
   def nodes(self) -> np.ndarray:
     """Returns the positions of the organ's nodes [m]  (nvert, 3); computed once a control step."""
@@ -335,9 +220,13 @@ class Physics(Portable):
 
   def tip_visible(self) -> bool:
     """Whether the laparoscope's picture holds the tip."""
+    return self.visible(self.data.ptr.sensordata[self._sensors["tip_pos"]])
+
+  def visible(self, point: np.ndarray) -> bool:
+    """Whether the laparoscope's picture holds a point of the world."""
     # As metrics.in_view; in plain numbers it takes a tenth of the time, and it runs every step.
     k, data = self._camera, self.data.ptr
-    x, y, z = (data.sensordata[self._sensors["tip_pos"]] - data.cam_xpos[k]).tolist()
+    x, y, z = (point - data.cam_xpos[k]).tolist()
     m = data.cam_xmat[k].tolist()
     depth = -(m[2] * x + m[5] * y + m[8] * z)
     half = depth * math.tan(math.radians(float(self.model.ptr.cam_fovy[k])) / 2)
@@ -368,20 +257,6 @@ class Physics(Portable):
     side, far = np.sign(det), (e2 * q).sum(axis=1)
     size, u, v, t = side * det, side * u, side * v, side * far
     return ((u >= 0) & (v >= 0) & (u + v <= size) & (t > 0) & (t < 0.999 * size)).any(axis=1)
-
-  def trocar(self) -> trocar.Trocar:
-    """Returns the instrument's trocar."""
-    return self._trocar
-
-  def move_port(self, shift: np.ndarray, turn: np.ndarray) -> None:
-    """Moves the trocar and turns it about itself; `shift` [m] and `turn` [rad] are small  (3,)."""
-    model, body = self.model.ptr, self.model.ptr.body(f"{self.prefix}trocar")
-    quat, rotation = np.zeros(4), np.zeros(4)
-    angle = float(np.linalg.norm(turn))
-    mj.mju_axisAngle2Quat(rotation, turn / max(angle, 1e-12), angle)
-    mj.mju_mulQuat(quat, rotation, body.quat)
-    body.pos[:], body.quat[:] = body.pos + shift, quat
-    self._trocar = trocar.trocar(model, self.prefix)
 
   def mark(
     self,

@@ -47,7 +47,7 @@ class Quantity:
 def _stiffness(physics: Physics, place: stage.Stage, factor: np.ndarray) -> None:
   foundation = float(factor[0]) * place.config.foundation
   physics.organ.configure(young_scale=float(factor[0]), foundation=foundation)
-  stage.settle(physics.organ, physics.prefix)
+  stage.settle(physics.organ, [hand.prefix for hand in physics.hands])
 
 
 def _friction(physics: Physics, place: stage.Stage, factor: np.ndarray) -> None:

@@ -30,6 +30,18 @@ __all__ = ["Event", "Recorder", "Recording", "Settings"]
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*")
 
 
+def together(*hands: Mapping[str, Any]) -> Mapping[str, Any]:
+  """Returns the entries of a sample of several instruments, each as of one; NaN where one has none.
+
+  Args:
+    *hands: entries of `Recorder.append` by name, the main instrument first
+  """
+  if len(hands) == 1:
+    return hands[0]
+  blank = {name: np.nan * np.asarray(value) for hand in hands for name, value in hand.items()}
+  return {name: np.stack([hand.get(name, none) for hand in hands]) for name, none in blank.items()}
+
+
 class _Buffer:
   """An array that grows by doubling."""
 
@@ -157,9 +169,8 @@ class Recorder:
     if not (math.isfinite(time) and time > self._last):
       raise ValueError(f"sample {self._count}: time is {time}, expected above {self._last}")
     self.settle()
-    owed = None
-    if callable(strain):
-      owed, strain = strain, math.nan
+    owed = strain if callable(strain) else None
+    strain = strain if owed is None else math.nan
     given = {"tip_pos": tip_pos, "quat": quat, "axis": axis, "force": force}
     given |= {"grip_force": grip_force, "shaft_force": shaft_force, "area": area, "strain": strain}
     given |= {"grip": grip, "held": held, "visible": visible} | more
@@ -204,7 +215,7 @@ class Recorder:
     if type(value) is float and buffer is not None and buffer.shape == (1,):
       return value
     array = np.asarray(value, np.float64)
-    if name in SIGNALS and self.substeps > 1 and array.shape in ((), (count,)):
+    if name in SIGNALS and self.substeps > 1 and array.shape in ((), (count,), (count, 1)):
       array = np.repeat(array.reshape(-1, 1), self.substeps, axis=1)
     if buffer is not None and (
       array.shape == buffer.shape or (count == 1 and array.shape == buffer.shape[1:])

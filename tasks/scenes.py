@@ -38,7 +38,7 @@ CONTACT = {
 # Residual of the organ's solve; 1e-4, the plugin's own, changes contact forces by 0.1 %.
 TOLERANCE = 1e-2
 # Slots of the organ's window for each 1000 nodes; the experts' instruments touch 15 and 38 at most.
-_SLOTS = {"probe": 40, "grasper": 48, "scalpel": 40}
+_SLOTS = {"probe": 40, "grasper": 48, "scalpel": 40, "hook": 24}
 # More than MuJoCo's 1 makes friction creep less: 2.4 N of grip then hold 3 N, with 3 only 2 N.
 _IMPRATIO = {"probe": 3, "grasper": 10, "scalpel": 3}
 # Foundation of an organ that comes away from its bed [Pa/m]; ours: what lies around it lets go too.
@@ -65,6 +65,8 @@ class Scene:
     center: the organ's landmark that ports and camera look at
     port: from there to the trocar [m]  (3,)
     camera: from there to the camera [m]  (3,)
+    second: instrument of the other hand, "" for none
+    second_port: from the landmark to its trocar [m]  (3,)
     targets: number of target sites
     inclusion: hidden stiff place: position in the world [m] (3), radius [m], factor on Young's
       modulus; None for healthy tissue. Without gravity: the organ would sag less where it is stiff
@@ -81,11 +83,18 @@ class Scene:
   center: str = "right_lobe"
   port: tuple[float, float, float] = (0.03, 0.05, 0.125)
   camera: tuple[float, float, float] = (-0.05, 0.15, 0.12)
+  second: str = ""
+  second_port: tuple[float, float, float] = (-0.05, 0.0, 0.12)
   targets: int = 1
   inclusion: tuple[float, ...] | None = None
   handle: bool = False
   bonds: tuple[float, float, float] | None = None
   surroundings: str = "abdomen"
+
+  @property
+  def prefixes(self) -> tuple[str, str]:
+    """Prefixes of the instruments; "" in place of the second where there is none."""
+    return f"{self.instrument}/", f"{self.second}/" if self.second else ""
 
 
 def chosen(scene: Scene, input: str, nodes: int | None, surroundings: str | None) -> Scene:
@@ -201,10 +210,12 @@ def furnish(
     slots: of the organ's window, None for what experts touch
   """
   spec = mujoco.MjSpec.from_string(_xml(organ, center, scene, bed))
-  port = center + scene.port
-  quat, prefix = trocar.aim(port, center), f"{scene.instrument}/"
-  trocar.attach(spec, scene.instrument, prefix, port, quat, scene.handle)
-  slots = slots or _SLOTS[scene.instrument] * max(1, -(-scene.nodes // 1000))
+  for name, offset in ((scene.instrument, scene.port), (scene.second, scene.second_port)):
+    port = center + offset
+    if name:
+      trocar.attach(spec, name, f"{name}/", port, trocar.aim(port, center), scene.handle)
+  touched = sum(_SLOTS[name] for name in (scene.instrument, scene.second) if name)
+  slots = slots or touched * max(1, -(-scene.nodes // 1000))
   palpate.add_windows(spec, ORGAN, nodes=slots)
   return spec
 

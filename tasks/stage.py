@@ -5,6 +5,7 @@
 import dataclasses
 import operator
 import warnings
+from collections.abc import Sequence
 
 import mujoco as mj
 import numpy as np
@@ -66,29 +67,30 @@ def compile_spec(spec: mj.MjSpec) -> mj.MjModel:
     return spec.compile()
 
 
-def build(model: mj.MjModel, prefix: str, organ: str) -> Stage:
-  """Returns the stage of a model; arguments as of `Physics.use`."""
+def build(model: mj.MjModel, hands: Sequence[str], organ: str) -> Stage:
+  """Returns the stage of a model, with an organ and the instruments of these prefixes."""
   data = mj.MjData(model)
   tissue = Organ(model, data, organ)
-  settle(tissue, prefix)
+  settle(tissue, hands)
   state = np.empty(mj.mj_stateSize(model, STATE))
   mj.mj_getState(model, data, state, STATE)
   nominal = {name: operator.attrgetter(name)(model).copy() for name in _CHANGED}
   return Stage(model, state, tissue.config, nominal)
 
 
-def settle(organ: Organ, prefix: str) -> None:
-  """Lets the organ come to rest under its weight, the instrument withdrawn; time starts anew."""
+def settle(organ: Organ, hands: Sequence[str]) -> None:
+  """Lets the organ come to rest under its weight, instruments withdrawn; time starts anew."""
   model, data = organ.model, organ.data
-  name = f"{prefix}insertion"
-  low = model.joint(name).range[0]
-  data.qpos[model.joint(name).qposadr[0]] = low
-  held = handle.find(model, data, prefix)
-  if held is None:
-    data.ctrl[model.actuator(name).id] = low
-  else:
-    port = trocar.trocar(model, prefix)
-    held.move(trocar.forward(port, (0.0, 0.0, low)))
+  for prefix in hands:
+    name = f"{prefix}insertion"
+    low = model.joint(name).range[0]
+    data.qpos[model.joint(name).qposadr[0]] = low
+    held = handle.find(model, data, prefix)
+    if held is None:
+      data.ctrl[model.actuator(name).id] = low
+    else:
+      port = trocar.trocar(model, prefix)
+      held.move(trocar.forward(port, (0.0, 0.0, low)))
   for _ in range(round(_SETTLE / _LOOK)):
     mj.mj_step(model, data, round(_LOOK / model.opt.timestep))
     if np.linalg.norm(organ.xvel, axis=1).max() < _STILL:

@@ -24,6 +24,7 @@ ALL_TASKS = _tagged(None)
 BENCHMARKING = _tagged("benchmarking")
 EASY = _tagged("easy")
 HARD = _tagged("hard")
+BIMANUAL = _tagged("bimanual")  # for two hands
 TASKS_BY_DOMAIN = {domain: tuple(module.SUITE) for domain, module in DOMAINS.items()}
 
 

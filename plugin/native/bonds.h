@@ -165,8 +165,13 @@ PALPATE void act_bonds(const Fields& f, Thread, int) {
 template <class Fields>
 PALPATE void keep_bonds(const Fields& f, Thread, int) {
   if (!f.live.data[0]) return;
-  for (int n = 0; n < 2 * f.nbond; ++n)
-    f.state.data[2 * f.slot.data[n / 2] + n % 2] = f.next.data[n];
+  for (int n = 0; n < f.nbond; ++n) {
+    double* state = f.state.data + 2 * f.slot.data[n];
+    const double* next = f.next.data + 2 * n;
+    // A current may have weakened it between the step's two halves.
+    state[0] = next[0] > state[0] ? next[0] : state[0];
+    state[1] = next[1];
+  }
 }
 
 // How far points are from some geoms.

@@ -6,15 +6,15 @@ from typing import Any
 import numpy as np
 import warp as wp
 from palpate.batch.threads import Threads
-from palpate.tasks import grasp, jaws, physics
+from palpate.tasks import grasp, instrument, jaws
 from palpate.tissue.types import Array, floats, ints, struct
 
 from . import domain
 from .fields import Common, flags, vectors
 from .kernels import error, point, put, reach, vector
 
-_CLOSING, _GRIPPING = wp.constant(physics.CLOSING), wp.constant(physics.GRIPPING)
-_FOLD, _FORCE = wp.constant(physics.FOLD), wp.constant(physics.HELD_FORCE)
+_CLOSING, _GRIPPING = wp.constant(instrument.CLOSING), wp.constant(instrument.GRIPPING)
+_FOLD, _FORCE = wp.constant(instrument.FOLD), wp.constant(instrument.HELD_FORCE)
 _REACH, _FACING = wp.constant(grasp.REACH), wp.constant(jaws.FACING)
 
 

@@ -13,9 +13,9 @@ import numpy as np
 import palpate.batch
 import warp as wp
 from palpate.models import trocar
-from palpate.tasks import base, episode
+from palpate.tasks import episode
 from palpate.tasks.environment import Environment
-from palpate.tasks.physics import AXES
+from palpate.tasks.instrument import AXES, RATES
 from palpate.tasks.stage import STATE
 from palpate.tissue.types import allocate
 
@@ -102,7 +102,7 @@ class Worlds:
     coarse = physics.coarse
     constants = {
       "drive": drives, "low": controls[:, 0], "high": controls[:, 1],
-      "move": np.array(base.RATES) * dt, "elem": self.organ.elem, "coarse": coarse,
+      "move": np.array(RATES) * dt, "elem": self.organ.elem, "coarse": coarse,
       "coarse0": physics.organ.xpos0[coarse],
     }  # fmt: skip
     for name, value in constants.items():

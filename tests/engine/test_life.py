@@ -49,13 +49,15 @@ def test_a_model_that_takes_the_address_of_a_freed_one_is_another(windowed):
     del twin
     gc.collect()
     kept.append(np.full(m.nbuffer // 8, np.nan))  # where its buffer was
+    if again > 1:
+      break
   assert again and organ.error is None
 
 
 @COUPLINGS
 def test_a_handle_works_on_its_own_model_when_another_was_freed(windowed):
   m, d, organ = load(probed(windowed))
-  for _ in range(5):
+  for _ in range(3):
     twin = copy.copy(m)
     drive(twin, d, 5)
     del twin

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from palpate import tasks
 from palpate.models import trocar
-from palpate.tasks import base, performer, safety, suite
+from palpate.tasks import instrument, performer, safety, suite
 
-FAST = np.array(base.RATES) * 0.02  # of the drives in a control step
+FAST = np.array(instrument.RATES) * 0.02  # of the drives in a control step
 
 
 def load(name, **kwargs):

@@ -8,7 +8,7 @@ from scenes import needs_cuda
 pytest.importorskip("gymnasium")
 
 import warp as wp
-from palpate.tasks import performer, physics, registry
+from palpate.tasks import instrument, performer, registry
 from palpate.tasks.batch import fields, vector
 from palpate.tasks.stage import STATE
 
@@ -43,7 +43,8 @@ class Beside:
 
   def holds(self):
     inner = self.worlds.own.inner.numpy()[self.world]
-    return bool(inner.min() > physics.HELD_FORCE and self.physics.sensor("jaw")[0] > physics.FOLD)
+    opening = self.physics.sensor("jaw")[0]
+    return bool(inner.min() > instrument.HELD_FORCE and opening > instrument.FOLD)
 
   def action(self):
     class Step:

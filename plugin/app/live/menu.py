@@ -20,9 +20,10 @@ def offer(device: str) -> dict[str, Any]:
   from palpate import models
   from palpate.tasks import suite
 
+  single = [pair for pair in suite.ALL_TASKS if pair not in suite.BIMANUAL]
   return {
     "type": "menu",
-    "tasks": {f"{d}/{t}": suite.summary(d, t) for d, t in suite.ALL_TASKS},
+    "tasks": {f"{d}/{t}": suite.summary(d, t) for d, t in single},
     "nodes": NODES,
     "speeds": SPEEDS,
     "device": device,
@@ -70,9 +71,12 @@ def exercise(message: dict[str, Any]) -> dict[str, Any]:
   seed = message.get("seed", 0)
   if type(seed) is not int or not 0 <= seed < 2**31:
     raise ValueError(f"seed is {seed!r}, expected a whole number in [0, 2^31)")
+  pair = suite.split(task)
+  if pair in suite.BIMANUAL:
+    raise ValueError(f"task is {task!r}, which takes two hands, expected one for a single hand")
   return _common(message) | {
     "type": "start",
-    "task": "/".join(suite.split(task)),
+    "task": "/".join(pair),
     "person": person.strip(),
     "seed": seed,
     "nodes": choice("nodes", message.get("nodes"), (None, *NODES)),

@@ -57,6 +57,8 @@ class Session:
     """
     if not env.task.scene.handle:
       raise ValueError(f"{env.task.name}: input is 'drives', expected 'handle' for a device")
+    if env.task.second:
+      raise ValueError(f"{env.task.name}: it takes two hands, expected one for a single device")
     self.env, self.seed, self.coach = env, seed, coach
     self.pace = pace or Pace(env.physics.timestep())
     self.link = Link(device, options, env.physics.timestep())

@@ -1,0 +1,252 @@
+# mujoco ships its bindings without type stubs:
+# pyright: reportAttributeAccessIssue=false
+"""An instrument on a trocar: where it is, what moves it and what it feels."""
+
+from typing import Any
+
+import mujoco as mj
+import numpy as np
+from palpate.models import trocar
+from palpate.models.handle import Handle, find, pose
+
+from .handle import ROW, Guide
+from .jaws import Jaws
+
+AXES = ("pitch", "yaw", "roll", "insertion")
+JAWS = "grasper/"  # prefix of the instrument that has them
+TOUCH = ("touch_left", "touch_right")  # sensors of the jaws
+RATES = (1.0, 1.0, 3.0, 0.12)  # pitch, yaw, roll [rad/s], insertion [m/s]
+HELD_FORCE = 0.2  # of the inner face of either jaw on tissue between them, to hold it [N]
+
+CLOSING = 0.005  # the drive's target is that far below the opening [rad]
+# Least opening over a fold of tissue, largest target that grips one [rad].
+FOLD, GRIPPING = 0.02, 0.15
+_RATES = np.array(RATES)
+
+
+class Instrument:
+  """One of the instruments of a scene.
+
+  Attributes:
+    prefix: of its names in the model, for instance "probe/"
+    model: what it is in, dm_control's
+    data: its state
+    handle: that pulls it, None where position drives move it
+    guide: takes the handle along an action
+    peak_force: largest force since the last control step, or a jaw's mean if that is more [N]
+    peak_shaft: largest force on the shaft since then [N]
+    edge: force of its edges on tissue that they cut [N]  (3,)
+  """
+
+  prefix = ""
+  model: Any
+  data: Any
+  handle: Handle | None = None
+
+  def equip(self, prefix: str) -> None:
+    """Finds an instrument in the model."""
+    model = self.model.ptr
+    self.prefix = prefix
+    self._sensors = {}
+    for i in range(model.nsensor):
+      name = model.sensor(i).name
+      if name.startswith(prefix):
+        adr = int(model.sensor_adr[i])
+        self._sensors[name[len(prefix) :]] = slice(adr, adr + int(model.sensor_dim[i]))
+    joints = [model.joint(prefix + axis) for axis in AXES]
+    self._qpos = np.array([int(joint.qposadr[0]) for joint in joints])
+    self._dof = np.array([int(joint.dofadr[0]) for joint in joints])
+    self.handle, self.guide = find(model, self.data.ptr, prefix), Guide()
+    driven = () if self.handle else AXES
+    self.drives = np.array([model.actuator(prefix + axis).id for axis in driven], int)
+    self.drive_range = model.actuator_ctrlrange[self.drives].copy()
+    self.jaw = model.actuator(prefix + "jaw").id if self.has_jaw else -1
+    self._jaws = Jaws(model, prefix) if self.has_jaw else None
+    self._inner = np.zeros(2)
+    signals = ["tip_force", "shaft_force", *(TOUCH if self.has_jaw else ())]
+    self._signals = np.concatenate([np.arange(*self._sensors[n].indices(10**6)) for n in signals])
+    self._trocar = trocar.trocar(model, prefix)
+
+  @property
+  def has_jaw(self) -> bool:
+    """Whether the instrument has jaws."""
+    return "jaw" in self._sensors
+
+  def sensor(self, name: str) -> np.ndarray:
+    """Returns a copy of one of the instrument's sensors."""
+    return self.data.ptr.sensordata[self._sensors[name]].copy()
+
+  def tip_pos(self) -> np.ndarray:
+    """Returns the tip's position [m]  (3,)."""
+    return self.sensor("tip_pos")
+
+  def tip_vel(self) -> np.ndarray:
+    """Returns the tip's velocity [m/s]  (3,)."""
+    return self.sensor("tip_vel")
+
+  def tip_quat(self) -> np.ndarray:
+    """Returns the tip's orientation, w x y z  (4,)."""
+    return self.sensor("tip_quat")
+
+  def joints(self) -> np.ndarray:
+    """Returns pitch, yaw, roll [rad] and insertion [m]  (4,)."""
+    return self.data.ptr.qpos[self._qpos]
+
+  def joint_vel(self) -> np.ndarray:
+    """Returns the velocities of `joints`  (4,)."""
+    return self.data.ptr.qvel[self._dof]
+
+  def drive_targets(self) -> np.ndarray:
+    """Returns the targets of the position drives, or where the handle is, as `joints`  (4,)."""
+    return self.handle.joints(self._trocar) if self.handle else self.data.ptr.ctrl[self.drives]
+
+  def contact_force(self) -> np.ndarray:
+    """Returns the force of the tissue on the instrument below the shaft [N]  (3,)."""
+    return -self.sensor("tip_force") - self.edge
+
+  def shaft_force(self) -> np.ndarray:
+    """Returns the contact force on the shaft [N]  (3,)."""
+    return -self.sensor("shaft_force")
+
+  def forces(self) -> dict[str, np.ndarray]:
+    """Returns the force of the tip, the shaft and the jaws' grip in each step of the last `step`.
+
+    Magnitudes [N]  (nstep,), as `Recorder.append` takes them; a single 0 before the first.
+    """
+    return dict(self._forces)
+
+  def felt(self) -> np.ndarray:
+    """Returns force [N], torque [N m] on the hand in each step of the last `step`  (nstep, 6)."""
+    return self._felt
+
+  def gripper(self) -> np.ndarray:
+    """Returns opening and its target [rad], force on the left and right jaw [N]  (4,)."""
+    touch = self.sensor("touch_left"), self.sensor("touch_right")
+    return np.concatenate([self.sensor("jaw"), self.data.ctrl[[self.jaw]], *touch])
+
+  def closing(self) -> bool:
+    """Whether the jaws are told to close: on a fold of tissue at most, and below the opening."""
+    opening, target = float(self.sensor("jaw")[0]), float(self.data.ctrl[self.jaw])
+    return target < min(opening - CLOSING, GRIPPING)
+
+  def holds(self) -> bool:
+    """Whether tissue is between the jaws: it keeps them open, both inner faces press on it."""
+    return bool(self._inner.min() > HELD_FORCE and self.sensor("jaw")[0] > FOLD)
+
+  def from_tip(self, point: np.ndarray) -> np.ndarray:
+    """Returns a point in the frame of the tip [m]  (3,)."""
+    local, turn = np.zeros(3), np.zeros(4)
+    mj.mju_negQuat(turn, self.tip_quat())
+    mj.mju_rotVecQuat(local, point - self.tip_pos(), turn)
+    return local
+
+  def trocar(self) -> trocar.Trocar:
+    """Returns the instrument's trocar."""
+    return self._trocar
+
+  def handle_row(self, tip: np.ndarray, roll: float) -> np.ndarray:
+    """Returns the row of an action that holds the tip at a place [m], rolled by an angle  (7,)."""
+    return pose(self._trocar, tip, roll)
+
+  def act(self, values: np.ndarray, dt: float) -> None:
+    """Takes its part of an action, for a control step of dt [s].
+
+    Args:
+      values: pitch, yaw, roll, insertion, and what is opened of the jaws; or rows of `handle`, each
+        with that
+      dt: duration of the control step
+    """
+    if self.handle:
+      self.guide.follow(values.reshape(-1, values.shape[-1]))
+      return
+    low, high = self.drive_range.T
+    ctrl = self.data.ptr.ctrl
+    ctrl[self.drives] = (ctrl[self.drives] + values[:4] * _RATES * dt).clip(low, high)
+    if self.jaw >= 0:
+      self.close_jaws(values[4])
+
+  def close_jaws(self, share: float) -> None:
+    """Gives the jaws their target: 1 is wide open, -1 squeezes closed jaws."""
+    low, high = self.model.ptr.actuator_ctrlrange[self.jaw]
+    self.data.ptr.ctrl[self.jaw] = low + (high - low) * (share + 1) / 2
+
+  def set_joints(self, joints: np.ndarray) -> None:
+    """Puts the instrument and its drives at a pose, as `joints`, with closed jaws."""
+    self.data.qpos[self._qpos] = joints
+    if self.handle:
+      row = self.handle_row(trocar.forward(self._trocar, joints[[0, 1, 3]]), joints[2])
+      self.handle.move(row[:3], row[3:])
+      self.guide.put(row)
+    else:
+      self.data.ctrl[self.drives] = joints
+    if self.jaw >= 0:
+      self.data.ctrl[self.jaw] = 0.0
+    self._inner = np.zeros(2)
+    mj.mj_forward(self.model.ptr, self.data.ptr)
+
+  def move_port(self, shift: np.ndarray, turn: np.ndarray) -> None:
+    """Moves the trocar and turns it about itself; `shift` [m] and `turn` [rad] are small  (3,)."""
+    model, body = self.model.ptr, self.model.ptr.body(f"{self.prefix}trocar")
+    quat, rotation = np.zeros(4), np.zeros(4)
+    angle = float(np.linalg.norm(turn))
+    mj.mju_axisAngle2Quat(rotation, turn / max(angle, 1e-12), angle)
+    mj.mju_mulQuat(quat, rotation, body.quat)
+    body.pos[:], body.quat[:] = body.pos + shift, quat
+    self._trocar = trocar.trocar(model, self.prefix)
+
+  def begin(self, nstep: int) -> None:
+    """Begins to keep what `nstep` steps of the physics do."""
+    self._felt = np.zeros((nstep, 6))
+
+  def advance(self, k: int, nstep: int, dt: float) -> None:
+    """Looks at step k of `nstep` of dt [s], between its two halves, and takes the handle on."""
+    if k == nstep - 1 and self._jaws:
+      self._inner = self._jaws.inner_force(self.model.ptr, self.data.ptr)
+    if self.handle:
+      self._felt[k] = self.handle.wrench()
+      self._lead(k, nstep, dt)
+
+  def _lead(self, k: int, nstep: int, dt: float) -> None:
+    """Moves the handle before step k of `nstep`, and the jaws where the row has them."""
+    row, vel, spin = self.guide.advance(k, nstep, dt)
+    assert self.handle is not None
+    self.handle.move(row[:3], row[3:7], vel, spin)
+    if self.jaw >= 0 and len(row) > len(ROW):
+      self.close_jaws(row[len(ROW)])
+
+  def keep(self, sensors: np.ndarray) -> None:
+    """Keeps the forces of steps that had these sensor values  (nstep, nsensordata)."""
+    values = sensors[:, self._signals]
+    parts = values[:, :6].reshape(-1, 2, 3)
+    tip, shaft = np.sqrt(np.einsum("ijk,ijk->ji", parts, parts))
+    self._forces = {"force": tip, "shaft_force": shaft}
+    self.peak_force, self.peak_shaft = float(tip.max()), float(shaft.max())
+    if self.has_jaw:
+      jaws = values[:, 6:]
+      self._forces["grip_force"] = jaws.max(axis=1)
+      # Pinched folds make single steps of large jaw force: the jaws' is a mean over the step.
+      self.peak_force = max(self.peak_force, float(jaws.sum(axis=0).max()) / len(jaws))
+
+  def quiet(self) -> None:
+    """Forgets the forces of the last steps: they would be in the next episode's start."""
+    self.edge = np.zeros(3)
+    self.begin(1)
+    self.keep(np.zeros((1, self.model.nsensordata)))
+
+
+class Second(Instrument):
+  """The instrument of the other hand, in the physics of the first."""
+
+  def __init__(self, physics: Any, prefix: str):
+    """Finds the instrument with a prefix in a physics."""
+    self.model, self.data = physics.model, physics.data
+    self.equip(prefix)
+    self.quiet()
+
+  def bind(self, physics: Any) -> None:
+    """Belongs to a copy of its physics from now on."""
+    self.model, self.data = physics.model, physics.data
+    self.handle = find(self.model.ptr, self.data.ptr, self.prefix)
+
+  def __getstate__(self) -> dict[str, Any]:
+    return {k: v for k, v in vars(self).items() if k not in ("model", "data", "handle")}
