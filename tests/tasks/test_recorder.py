@@ -265,7 +265,7 @@ def test_a_strain_given_as_a_function_is_worked_out_once_and_in_time():
 
 def test_a_number_that_no_sample_has_is_named():
   made = Recorder()
-  with pytest.raises(TypeError, match="append takes no 'forse', expected some of .*force"):
+  with pytest.raises(TypeError, match=r"append takes no 'forse', expected some of .*force"):
     made.append(0.0, (0, 0, 0), forse=1.0)
   assert len(made) == 0
 
