@@ -165,7 +165,7 @@ def _snap(
   vert, first = np.unique(np.concatenate(vert), return_index=True)
   goal = np.concatenate(goal)[first]
   goal, free = _on_rim(mesh, vert, goal)
-  free &= ~pinned[vert] & np.isin(vert, list(there))
+  free &= ~pinned[vert] & topology.among(mesh.nvert, list(there))[vert]
   vert, goal = vert[free], goal[free]
   around = mesh.ring_elem[vert]
   elem = np.where(around >= 0, around, around[:, :1]) // 3
