@@ -87,6 +87,7 @@ class Task(control.Task):
 
   name = "task"
   watch = ("miss", "unintended_contact")
+  resumes = True  # whether its expert can go on where another has come to
   control_timestep = CONTROL_TIMESTEP
   targets = 1
 

@@ -98,6 +98,7 @@ NOVICE = {
 }
 _WIDE = 1.0  # action of the jaw: wide open
 _ROLL = 0.8  # of the jaws to grasp, across the gallbladder's slack [rad]
+_THERE = 0.004  # jaws that are so near to their place may close [m]
 _FIRMER = 0.4  # by how much it is gripped more each time that it was lost [N]
 _SLID = 0.001  # what may move in the jaws unnoticed [m]
 _REFLEX, _FIRMEST = 400.0, 3.0  # force for each metre that slides further [N/m], and at most [N]
@@ -197,6 +198,8 @@ def find(who: str, *others: str) -> Any:
 class Performer:
   """Follows the script of the environment's task; starts it again with each episode.
 
+  Called first in the middle of an episode, it does what is left to do.
+
   Attributes:
     hand: the instrument that it moves
     other: who moves the other hand's, None where there is none
@@ -211,7 +214,7 @@ class Performer:
     self.random = np.random.RandomState(seed)
     self._steps: Script | None = None
     second = self.task.second and not hand
-    self.other = Performer(env, style, seed + 1, hand=1) if second else None
+    self.other = type(self)(env, style, seed + 1, hand=1) if second else None
 
   def __call__(self, timestep: Any) -> np.ndarray:
     """Returns the action for a time step."""
@@ -354,11 +357,18 @@ class Performer:
     """
     physics, up = self.physics, self.hand.trocar().mat[:, 2]
     self.firm = self._enough = grip + _FIRMER * min(again, 2)
-    self.roll, self.extra[:] = _ROLL, _WIDE
-    yield from self.move(physics.point(site) + 0.012 * up)
-    yield from self.wait(0.2)
-    deep = min(0.009 + 0.0015 * again, 0.012)
-    yield from self.move(physics.point(site) - deep * up, speed=0.03)
+    if self.task.grasped:  # by who had the instrument before
+      self.extra[:] = self._share()
+      return
+    self.roll, deep = _ROLL, min(0.009 + 0.0015 * again, 0.012)
+    below = np.linalg.norm(physics.point(site) - deep * up - self.hand.tip_pos())
+    if again or below > _THERE or self._share() > _WIDE - 0.1:
+      self.extra[:] = _WIDE
+      yield from self.move(physics.point(site) + 0.012 * up)
+      yield from self.wait(0.2)
+      yield from self.move(physics.point(site) - deep * up, speed=0.03)
+    else:  # somebody else was about to close
+      self.extra[:] = self._share()
     while self.extra[0] > -0.35:
       self.extra[0] -= 0.06
       yield self.step()
@@ -366,6 +376,11 @@ class Performer:
       yield self.step()
       if abs(self._squeeze(0.0, 0.02)) < 0.25 and self.hand.holds():
         return
+
+  def _share(self) -> float:
+    """Returns the action of the jaw that is their target now."""
+    low, high = self.physics.model.ptr.actuator_ctrlrange[self.hand.jaw]
+    return float(2 * (self.hand.gripper()[1] - low) / (high - low) - 1)
 
   def grip(self, contact: float) -> None:
     """Keeps the force of the jaws, which have held for a time [s]; more where the tissue slides."""

@@ -228,7 +228,8 @@ class Press(Task):
     while self.done < self.targets:
       done, now = self.done, self.now
       point, normal = self.points[now], self.normals[now]
-      yield from p.move(point + 0.008 * normal)
+      if not (self._pressing and self.distance(p.physics) <= self.tolerance):
+        yield from p.move(point + 0.008 * normal)
       middle = sum(self.band) / 2
 
       def until(done: int = done) -> bool:
@@ -255,6 +256,7 @@ class Palpate(Task):
   """Find the stiff inclusion and report its place."""
 
   watch = ("miss", "unintended_contact")
+  resumes = False  # an expert knows what it has felt itself
 
   def __init__(
     self,

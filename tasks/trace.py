@@ -233,10 +233,12 @@ class Trace(Task):
     """Goes along the curve in light contact."""
     physics = p.physics
     up = physics.trocar().mat[:, 2]
-    yield from p.move(self.curve[0] + 0.01 * up)
+    at = min(float(self.done), len(self.curve) - 1.0)
+    if not self.tracing:
+      yield from p.move(self.curve[int(at)] + 0.01 * up)
     yield from p.push(0.08, -up, lambda: self.tracing, most=3.0)
     # Pulls a point along the curve and keeps the force by its height.
-    at, height, contact = 0.0, float((p.tip - self.curve[0]) @ up), 0.0
+    height, contact = float((p.tip - self.curve[int(at)]) @ up), 0.0
     step = 0.02 * p.style.speed * self.control_timestep / STEP
     while self.outcome is None:
       contact += self.control_timestep

@@ -1,13 +1,13 @@
 # pyright: reportMissingImports=false
-"""Training by proximal policy optimisation (Schulman et al. 2017), rsl_rl's.
+"""Practice in many worlds, by proximal policy optimisation (Schulman et al. 2017), rsl_rl's.
 
 A checkpoint is a file of safetensors: weights and optimiser, in the header how far it has come.
 """
 
 from __future__ import annotations
 
+import copy
 import dataclasses
-import itertools
 import json
 import math
 import pathlib
@@ -15,17 +15,15 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-import palpate
 import torch
 from palpate.tasks import policy
 from palpate.tasks.files import replacing
-from palpate.tasks.observation import ROWS
 from rsl_rl.algorithms import PPO
-from rsl_rl.models import MLPModel
 from rsl_rl.storage import RolloutStorage
 from safetensors import safe_open
 from safetensors.torch import save as dump
 
+from .networks import Networks
 from .rsl import RslRl
 from .vector import Exercises
 
@@ -38,10 +36,8 @@ _KEY = "palpate training"
 _JUDGED = 1_000_000  # seed of the first world's episode when a policy is judged
 LEAST = 2048  # control steps of an iteration, in all worlds
 _SHORT = 24  # of a world, at least
-# How much observations vary at least, by their unit: tissue that is not touched yet will be.
-_VARY = {"m": 0.005, "m/s": 0.01, "rad": 0.05, "rad/s": 0.1, "N": 0.3, "-": 0.3}
-_STILL = 1e-6  # standard deviation of what has not changed, and may be anything
 _SLOWEST = 1e-4  # learning rate at the start of an iteration, at least
+_WATCHING = 2  # iterations in which the critic alone learns, after lessons
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,7 +51,8 @@ class Settings:
     lam: of generalised advantages [-]
     epochs: passes over the steps of an iteration
     minibatches: of a pass
-    spread: standard deviation of the actions at the start [-]
+    spread: standard deviation of the actions, at most, while none succeeds [-]
+    calm: the same once all do: what succeeds with a large spread may not without [-]
     entropy: what is paid for it
     learning_rate: at the start; it follows the change of the policy
   """
@@ -67,76 +64,64 @@ class Settings:
   epochs: int = 5
   minibatches: int = 4
   spread: float = 0.5
+  calm: float = 0.1
   entropy: float = 0.002
   learning_rate: float = 1e-3
 
 
+# After lessons, so that what was taught is not tried away.
+TAUGHT = {"spread": 0.25, "calm": 0.08, "entropy": 0.0, "learning_rate": 3e-4}
+
+
 class Learner:
-  """A policy that learns an exercise.
+  """Networks that practise an exercise.
 
   Attributes:
     iteration: iterations done
     steps: control steps of all worlds that it learned from
-    seconds: spent on it
+    seconds: spent on it, lessons included
   """
 
-  def __init__(self, env: Exercises, settings: Settings):
-    """Makes the networks for an environment with `output="torch"`."""
+  def __init__(
+    self, env: Exercises, settings: Settings, networks: Networks, seconds: float = 0.0
+  ):
+    """Begins episodes in an environment with `output="torch"`.
+
+    Args:
+      env: many worlds of the exercise
+      settings: how to learn
+      networks: that learn; what they have not been taught they find out here
+      seconds: spent on lessons
+    """
     torch.manual_seed(settings.seed)
-    self.settings, self.env = settings, RslRl(env, settings.seed)
-    self.iteration, self.steps, self.seconds = 0, 0, 0.0
+    self.settings, self.networks = settings, networks
+    self.env = RslRl(env, settings.seed, networks.groups)
+    self.iteration, self.steps, self.seconds = 0, 0, seconds
     self._count = max(_SHORT, math.ceil(LEAST / env.num_envs))
-    seen, groups = self.env.get_observations(), list(self.env.groups)
-    sets = {"actor": groups, "critic": groups}
-    common = {
-      "hidden_dims": settings.hidden,
-      "activation": "tanh",
-      "obs_normalization": True,
-    }
-    gaussian = {
-      "class_name": "GaussianDistribution", "init_std": settings.spread, "std_type": "log"
-    }  # fmt: skip
-    count, device = self.env.num_actions, self.env.device
-    actor = MLPModel(seen, sets, "actor", count, distribution_cfg=gaussian, **common)
-    critic = MLPModel(seen, sets, "critic", 1, **common)
-    storage = RolloutStorage("rl", env.num_envs, self._count, seen, [count], device)
+    seen, count = self.env.get_observations(), self.env.num_actions
+    storage = RolloutStorage(
+      "rl", env.num_envs, self._count, seen, [count], networks.device
+    )  # fmt: skip
     self._ppo = PPO(
-      actor, critic, storage, device=device, num_learning_epochs=settings.epochs,
-      num_mini_batches=settings.minibatches, gamma=settings.gamma, lam=settings.lam,
-      entropy_coef=settings.entropy, learning_rate=settings.learning_rate,
+      networks.actor, networks.critic, storage, device=networks.device,
+      num_learning_epochs=settings.epochs, num_mini_batches=settings.minibatches,
+      gamma=settings.gamma, lam=settings.lam, entropy_coef=settings.entropy,
+      learning_rate=settings.learning_rate,
     )  # fmt: skip
     self._ppo.train_mode()
-    self._look()
+    networks.calm(settings.spread)
+    if not networks.lessons:
+      self._look()
     self.env.stagger(torch.Generator().manual_seed(settings.seed))
 
   def _look(self) -> None:
-    """Learns how large observations are, once: what changed it later would change the policy."""
+    """Learns how large observations are."""
     seen = []
     with torch.no_grad():
       for _ in range(self._count):
         seen.append(self.env.get_observations())
-        self.env.step(self._ppo.actor(seen[-1], stochastic_output=True))
-    every = torch.cat([torch.cat(seen)[group] for group in self.env.groups], dim=1)
-    std = every.std(dim=0)
-    std = torch.where(std < _STILL, torch.full_like(std, _VARY["-"]), std)
-    std = torch.maximum(std, self._least().to(std))
-    for model in (self._ppo.actor, self._ppo.critic):
-      known, model.obs_normalizer.eps = model.obs_normalizer.state_dict(), 0.0
-      known["_mean"][:], known["_std"][:], known["_var"][:] = every.mean(dim=0), std, std.square()
-      model.obs_normalizer.until = 0
-
-  def _least(self) -> torch.Tensor:
-    """Returns how much each number that is observed varies at least."""
-    out: list[float] = []
-    space: Any = self.env.env.single_observation_space
-    for name in itertools.chain(*self.env.groups.values()):
-      count = math.prod(space[name].shape)
-      units = ROWS[name].unit.split(", ") if name in ROWS else []
-      least = [_VARY[unit] for unit in units] or [0.0]
-      if len(least) == 2:  # three angles and the insertion
-        least = 3 * least[:1] + least[1:]
-      out += least * (count // len(least))
-    return torch.tensor(out)
+        self.env.step(self.networks.actor(seen[-1], stochastic_output=True))
+    self.networks.normalise(torch.cat(seen))
 
   def iterate(self, stop: Callable[[], bool] = lambda: False) -> dict[str, float] | None:
     """Learns from some steps of all worlds; returns `ROW`, or None if it was to stop."""
@@ -153,8 +138,8 @@ class Learner:
         if extras["log"]:
           ended.append(extras["log"])
       ppo.compute_returns(env.get_observations())
-    ppo.learning_rate = max(ppo.learning_rate, _SLOWEST)
-    ppo.update()
+    success = float(env.won.mean())
+    self._update(success)
     self.iteration += 1
     self.steps += self._count * env.num_envs
     self.seconds += time.perf_counter() - start
@@ -164,20 +149,33 @@ class Learner:
 
     return {
       "iteration": self.iteration, "steps": self.steps, "seconds": self.seconds,
-      "episodes": sum(len(each["/return"]) for each in ended), "success": float(env.won.mean()),
+      "episodes": sum(len(each["/return"]) for each in ended), "success": success,
       "return": mean("/return"), "length": mean("/length"),
-      "spread": float(ppo.actor.distribution.log_std_param.detach().exp().mean()),
-      "learning_rate": ppo.learning_rate,
+      "spread": self.networks.spread, "learning_rate": ppo.learning_rate,
     }  # fmt: skip
+
+  def _update(self, success: float) -> None:
+    ppo, networks, settings = self._ppo, self.networks, self.settings
+    ppo.learning_rate = max(ppo.learning_rate, _SLOWEST)
+    watching = networks.lessons and self.iteration < _WATCHING
+    kept = copy.deepcopy(networks.actor.state_dict()) if watching else None
+    ppo.update()
+    if kept is not None:
+      networks.actor.load_state_dict(kept)
+      ppo.learning_rate = settings.learning_rate
+    else:
+      networks.rehearse(ppo.learning_rate)
+    # The more often it succeeds, the less it tries: what acts in the end has no spread.
+    networks.calm(settings.spread ** (1 - success) * settings.calm**success)
 
   def judge(self, stop: Callable[[], bool] = lambda: False) -> float:
     """Returns the share of successes without spread, of an episode in each world."""
-    env = self.env = RslRl(self.env.env, _JUDGED)
+    env = self.env = RslRl(self.env.env, _JUDGED, self.networks.groups)
     won = torch.zeros(env.num_envs, device=env.device)
     playing = torch.ones_like(won)
     with torch.no_grad():
       while playing.any() and not stop():
-        action = self._ppo.actor(env.get_observations())
+        action = self.networks.actor(env.get_observations())
         _, _, over, extras = env.step(action)
         if extras["log"]:
           ended = over.bool()
@@ -189,24 +187,12 @@ class Learner:
 
   def policy(self, task: Any, task_kwargs: dict[str, Any]) -> policy.Policy:
     """Returns what was learned, for an exercise."""
-    weights = {k: v.detach().cpu().numpy() for k, v in self._ppo.actor.state_dict().items()}
-    normalizer = self._ppo.actor.obs_normalizer
-    linear = sorted(int(k.split(".")[1]) for k in weights if k.startswith("mlp.") and "weight" in k)
     training = {
-      "palpate": palpate.__version__, "algorithm": "PPO (rsl_rl)", "num_envs": self.env.num_envs,
-      "iteration": self.iteration, "steps": self.steps, "seconds": round(self.seconds, 1),
+      "algorithm": "PPO (rsl_rl)", "num_envs": self.env.num_envs, "iteration": self.iteration,
+      "steps": self.steps, "seconds": round(self.seconds, 1), "lessons": self.networks.lessons,
       **dataclasses.asdict(self.settings),
     }  # fmt: skip
-    about = policy.About(
-      task.name, tuple(task.components), [*itertools.chain(*self.env.groups.values())],
-      task.control_timestep, task_kwargs, training,
-    )  # fmt: skip
-    return policy.Policy(
-      about,
-      weights["obs_normalizer._mean"][0],
-      1.0 / (weights["obs_normalizer._std"][0] + normalizer.eps),
-      [(weights[f"mlp.{k}.weight"], weights[f"mlp.{k}.bias"]) for k in linear],
-    )
+    return self.networks.policy(task, task_kwargs, training)
 
   def save(self, path: pathlib.Path, task: str) -> None:
     """Writes a checkpoint."""
@@ -250,7 +236,8 @@ class Learner:
     for group in ppo.optimizer.param_groups:
       group["lr"] = ppo.learning_rate
     torch.manual_seed(self.settings.seed + self.iteration)
-    self.env = RslRl(self.env.env, self.settings.seed + self.iteration * self.env.num_envs)
+    seed = self.settings.seed + self.iteration * self.env.num_envs
+    self.env = RslRl(self.env.env, seed, self.networks.groups)
 
 
 def _below(tensors: dict[str, Any], prefix: str) -> dict[str, Any]:

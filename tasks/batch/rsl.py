@@ -10,6 +10,7 @@ those that `stagger` has cut short.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -30,8 +31,19 @@ class RslRl(VecEnv):
     won: 1 where the last whole episode of a world that has ended was a success, else 0
   """
 
-  def __init__(self, env: Exercises, seed: int | None = None):
-    """Begins episodes in all worlds of an environment with `output="torch"`."""
+  def __init__(
+    self,
+    env: Exercises,
+    seed: int | None = None,
+    groups: Mapping[str, Sequence[str]] | None = None,
+  ):
+    """Begins episodes in all worlds of an environment with `output="torch"`.
+
+    Args:
+      env: of `gymnasium.make_vec`
+      seed: of the episodes
+      groups: names of observations by group, in place of `sensors` and `state`
+    """
     found: Any = env.unwrapped
     if not isinstance(found, Exercises) or found.output != "torch":
       raise ValueError("env is no vectorised exercise with output='torch', expected one")
@@ -39,7 +51,7 @@ class RslRl(VecEnv):
     self.num_envs, self.max_episode_length = found.num_envs, found.max_episode_steps
     self.num_actions = len(found.task.components)
     self.device = str(wp.device_to_torch(found.device))
-    self.groups = groups(found.single_observation_space)
+    self.groups = groups or by_group(found.single_observation_space)
     self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
     self.returns = torch.zeros(self.num_envs, device=self.device)
     self.whole = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
@@ -86,7 +98,7 @@ class RslRl(VecEnv):
     return self.get_observations(), reward, over.long(), extras
 
 
-def groups(space: Any) -> dict[str, list[str]]:
+def by_group(space: Any) -> dict[str, list[str]]:
   """Returns the names of a space's observations by their group."""
   found: dict[str, list[str]] = {group: [] for group in GROUPS}
   for name in space.spaces:

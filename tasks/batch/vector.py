@@ -45,6 +45,10 @@ _ELSE = 'vectorization_mode="sync" runs single environments side by side'
 OUTPUTS = ("numpy", "torch", "warp")
 
 
+class NotVectorisedError(ValueError):
+  """An exercise, or an option of one, that many worlds cannot have."""
+
+
 class Exercises(VectorEnv):
   """Worlds of an exercise, stepped together.
 
@@ -261,15 +265,16 @@ def _refuse(task: str, kwargs: Mapping[str, Any]) -> None:
   """Raises ValueError for what a vectorised exercise cannot do, naming it."""
   for name in ("render_mode", "record", "model", "randomise"):
     if kwargs.get(name):
-      raise ValueError(f"{task}: {name} is given, which a vectorised exercise cannot do; {_ELSE}")
+      what = f"{name} is given, which a vectorised exercise cannot do"
+      raise NotVectorisedError(f"{task}: {what}; {_ELSE}")
 
 
 def _refuse_task(task: Any) -> None:
   kind = type(task).__name__
   if kind not in DOMAINS:
-    raise ValueError(f"{task.name} is not vectorised yet; {_ELSE}")
+    raise NotVectorisedError(f"{task.name} is not vectorised yet; {_ELSE}")
   if task.observed.pictures:
-    raise ValueError(
+    raise NotVectorisedError(
       f"{task.name}: observations has {task.observed.pictures[0]!r}, but a vectorised exercise "
       f"makes no pictures; {_ELSE}"
     )

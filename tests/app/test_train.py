@@ -2,6 +2,7 @@
 
 import csv
 
+import numpy as np
 import pytest
 from palpate.app import cli
 
@@ -9,18 +10,28 @@ for name in ("gymnasium", "torch", "rsl_rl", "safetensors"):
   pytest.importorskip(name)
 
 import torch  # noqa: E402
-from palpate.tasks.batch import learning, rsl, vector  # noqa: E402
+from palpate.tasks import policy  # noqa: E402
+from palpate.tasks.batch import learning, networks, rsl, vector  # noqa: E402
 
-SMALL = ["--device", "cpu", "--num-envs", "2", "--set", "time_limit=0.4"]
+SMALL = ["--device", "cpu", "--num-envs", "2", "--processes", "1", "--set", "time_limit=0.4"]
 
 
-def train(folder, *words):
-  return cli.main(["train", "touch/easy", "-o", str(folder), *SMALL, *words])
+def train(folder, *words, lessons=0):
+  words = [*SMALL, "--lessons", str(lessons), *words]
+  return cli.main(["train", "touch/easy", "-o", str(folder), *words])
 
 
 @pytest.fixture(autouse=True)
 def short(monkeypatch):
   monkeypatch.setattr(learning, "LEAST", 48)
+  monkeypatch.setattr(networks, "CLONING", 20)
+
+
+def learner(env, **settings):
+  space, chosen = env.single_observation_space, learning.Settings(**settings)
+  shapes = {name: space[name].shape for name in space.spaces}
+  made = networks.Networks(shapes, 4, (8,), chosen.spread, 0, "cpu")
+  return learning.Learner(env, chosen, made)
 
 
 def rows(folder):
@@ -39,18 +50,49 @@ def test_training_goes_on_where_it_stopped_and_its_policy_is_evaluated(tmp_path,
   assert [row["iteration"] for row in rows(second)] == [1, 2]
   assert rows(second)[1]["steps"] == 2 * 48
   capsys.readouterr()
-  policy = str(first / "policy.safetensors")
-  words = ["--policy", policy, "--episodes", "1", "--set", "time_limit=0.4"]
+  path = str(first / "policy.safetensors")
+  words = ["--policy", path, "--episodes", "1", "--set", "time_limit=0.4"]
   assert cli.main(["evaluate", "touch/easy", *words]) == 0
   assert "time limit 1" in capsys.readouterr().out
   assert cli.main(["evaluate", "touch/standard", *words]) == 1
   assert "the policy is of touch/easy, not of touch/standard" in capsys.readouterr().err
 
 
+def test_an_expert_teaches_before_practice(tmp_path, capsys):
+  folder = tmp_path / "a"
+  assert train(folder, "--iterations", "0", lessons=2) == 0
+  names = {path.name for path in folder.iterdir()}
+  assert names == {"lessons.npz", "policy.safetensors", "LICENSE"}
+  with np.load(folder / "lessons.npz") as file:
+    lengths, before = file["lengths"], file["seen"]
+  assert len(lengths) == 3 * 2 and (lengths[:2] == 20).all()
+  assert (lengths[2:] < 20).any()  # the policy takes turns with the expert
+  assert train(folder, lessons=2) == 2  # nothing is written over
+  assert train(folder, "--iterations", "1", "--resume", lessons=2) == 0
+  assert [row["iteration"] for row in rows(folder)] == [1]
+  with np.load(folder / "lessons.npz") as file:
+    assert np.array_equal(file["seen"], before)
+  assert policy.load(folder / "policy.safetensors").about.training["lessons"] == 6
+  capsys.readouterr()
+  assert cli.main(["train", "tease/easy", "-o", str(tmp_path / "b"), *SMALL, "--lessons", "1"]) == 0
+  assert "taught, not practised: tease/easy is not vectorised" in capsys.readouterr().err
+
+
 def test_a_policy_is_judged_by_an_episode_in_each_world():
   env = vector.Exercises(3, "touch/easy", device="cpu", output="torch", time_limit=0.1)
-  learner = learning.Learner(env, learning.Settings())
-  assert learner.judge() == 0.0 and learner.judge(lambda: True) == 0.0
+  found = learner(env)
+  assert found.judge() == 0.0 and found.judge(lambda: True) == 0.0
+  env.close()
+
+
+def test_what_succeeds_tries_less():
+  # touch/standard once succeeded in every world with a spread of 0.36, and without in 10 of 50.
+  env = vector.Exercises(2, "touch/easy", device="cpu", output="torch", time_limit=2)
+  found = learner(env, spread=0.4, calm=0.1)
+  for won, spread in ((0.0, 0.4), (0.5, 0.2), (1.0, 0.1)):
+    found.env.won[:] = won
+    found.env.whole[:] = False  # what ends now is not counted
+    assert found.iterate()["spread"] <= spread + 1e-6
   env.close()
 
 

@@ -25,6 +25,7 @@ BENCHES = {
   "loop": "the whole loop, mj_step with a probe on a windowed organ",
   "loopholes": "what a search finds in the exercises that does not do the work",
   "peer": "mj_step in contact against MuJoCo's native flex",
+  "policies": "success of the policies that ship",
   "preconditioner": "iterations with block Jacobi and multilevel",
   "press_error": "what is left of the press's force error",
   "rest": "a sleeping organ against none",

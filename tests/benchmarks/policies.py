@@ -1,0 +1,92 @@
+"""Policies that were trained: how often each succeeds in the single environment on the CPU.
+
+`palpate train` makes them, all in the same way. Seeds from 0 on, which no policy has learned from.
+"""
+
+from __future__ import annotations
+
+import argparse
+import collections
+import pathlib
+
+import numpy as np
+from benchmarks import plots, results
+from benchmarks.runner import Bench, Case, Row
+from palpate import tasks
+from palpate.app import evaluate
+from palpate.tasks import policy, score
+from palpate.tasks.metrics import Metrics
+
+NAMES = ["/".join(pair) for pair in tasks.ALL_TASKS]
+_EPISODES, _BLOCK = 50, 5  # of a policy, of a case
+
+
+def arguments(parser: argparse.ArgumentParser):
+  """Declares the options."""
+  add = parser.add_argument
+  add("--policies", metavar="FOLDER", default=str(policy.FOLDER), help="those that ship")
+  add("--tasks", nargs="+", metavar="TASK", choices=NAMES, default=NAMES)
+
+
+def stages(args: argparse.Namespace) -> list[list[Case]]:
+  """Returns a case a few episodes of a policy."""
+  cases, count = [], 1 if args.short else _EPISODES
+  for start in range(0, count, _BLOCK):
+    for name in args.tasks:
+      file = pathlib.Path(args.policies).resolve() / f"{name.replace('/', '_')}{policy.SUFFIX}"
+      if file.exists():
+        case = {"case": f"{name}, from {start}", "task": name, "file": str(file), "start": start}
+        cases.append(case | {"end": min(start + _BLOCK, count)})
+  return [cases]
+
+
+def run(case: Case, out: pathlib.Path) -> list[Row]:
+  """Returns a row an episode."""
+  name, seeds = case["task"], range(case["start"], case["end"])
+  training, reference = policy.load(case["file"]).about.training, score.reference(name)
+  rows = []
+  options = {"surroundings": "none"}  # nothing is drawn
+  for result in evaluate.evaluate(name, case["file"], seeds, task_kwargs=options):
+    row = {"task": name, "seed": result.seed, "outcome": result.outcome}
+    row |= {"time_s": round(result.time, 2), "lessons": training.get("lessons", 0)}
+    row |= {"steps": training.get("steps", 0), "train_s": training.get("seconds", 0)}
+    row |= {"proficient": "", "peak_force_N": ""}
+    if result.metrics:
+      metrics = Metrics.from_json(result.metrics)
+      row["peak_force_N"] = round(metrics.peak_force, 3)
+      if reference is not None:
+        found = score.score(metrics, reference, result.outcome)
+        row["proficient"] = int(found.proficient)
+    rows.append(row)
+  return rows
+
+
+def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
+  """Writes the page: a line an exercise."""
+  groups: dict[str, list[Row]] = collections.defaultdict(list)
+  for row in rows:
+    if row["status"] == "ok":
+      groups[row["task"]].append(row)
+  head = ["exercise", "lessons", "control steps of practice", "training [s]", "success",
+          "proficient", "time of a success [s]", "ends otherwise"]  # fmt: skip
+  table = [_line(name, groups[name]) for name in NAMES if name in groups]
+  lines = [*(__doc__ or "").split("\n\n", 1)[1].splitlines(), ""]
+  lines += ["Proficient by the experts' limits, of all episodes. "
+            + results.link(out / "policies.csv"), "", *plots.table(head, table)]  # fmt: skip
+  return [results.page(out / "policies.md", "Policies that were trained", about, lines)]
+
+
+def _line(name: str, rows: list[Row]) -> list[str]:
+  won = [row for row in rows if row["outcome"] == score.SUCCESS]
+  ends = collections.Counter(row["outcome"] for row in rows if row["outcome"] != score.SUCCESS)
+  passed = sum(int(row["proficient"] or 0) for row in rows)
+  time = f"{np.mean([float(row['time_s']) for row in won]):.1f}" if won else "-"
+  first = rows[0]
+  return [
+    name, str(first["lessons"]), f"{float(first['steps']):,.0f}", f"{float(first['train_s']):.0f}",
+    f"{len(won)} of {len(rows)}", f"{100 * passed / len(rows):.0f} %", time,
+    ", ".join(f"{end} {count}" for end, count in sorted(ends.items())) or "-",
+  ]  # fmt: skip
+
+
+BENCH = Bench("policies", stages, run, report=report, arguments=arguments, jobs=1)
