@@ -89,6 +89,7 @@ def give(
     left -= 1
     taught.append(expert is not None)
     if expert is None:
+      assert learner
       action = learner(timestep.observation)
     else:
       action = np.asarray(expert(timestep), float)

@@ -230,8 +230,9 @@ class Performer:
       self._steps = self.wait(math.inf)
       action = next(self._steps)
     # A script that speaks of one hand leaves the other where it is.
-    alone = self.other and len(action) < len(self.task.components)
-    return np.concatenate([action, self.other.step()]) if alone else action
+    if self.other and len(action) < len(self.task.components):
+      action = np.concatenate([action, self.other.step()])
+    return action
 
   def begin(self) -> None:
     """Takes the instrument as it is when an episode begins."""

@@ -30,14 +30,14 @@ __all__ = ["Event", "Recorder", "Recording", "Settings"]
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*")
 
 
-def together(*hands: Mapping[str, Any]) -> Mapping[str, Any]:
+def together(*hands: Mapping[str, Any]) -> dict[str, Any]:
   """Returns the entries of a sample of several instruments, each as of one; NaN where one has none.
 
   Args:
     *hands: entries of `Recorder.append` by name, the main instrument first
   """
   if len(hands) == 1:
-    return hands[0]
+    return dict(hands[0])
   blank = {name: np.nan * np.asarray(value) for hand in hands for name, value in hand.items()}
   return {name: np.stack([hand.get(name, none) for hand in hands]) for name, none in blank.items()}
 

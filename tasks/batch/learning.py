@@ -70,7 +70,7 @@ class Settings:
 
 
 # After lessons, so that what was taught is not tried away.
-TAUGHT = {"spread": 0.25, "calm": 0.08, "entropy": 0.0, "learning_rate": 3e-4}
+TAUGHT: dict[str, Any] = {"spread": 0.25, "calm": 0.08, "entropy": 0.0, "learning_rate": 3e-4}
 
 
 class Learner:

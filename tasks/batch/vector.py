@@ -203,7 +203,7 @@ class Exercises(VectorEnv):
 
   def _observations(self) -> dict[str, Any]:
     self._wait()
-    return {name: self._tell(OBSERVED.get(name, name)) for name in self._observed}
+    return {name: self._tell(OBSERVED.get(name) or name) for name in self._observed}
 
   def _final(self, over: np.ndarray) -> Any:
     seen = self._observations()
@@ -236,7 +236,7 @@ class Exercises(VectorEnv):
 
 def _cat(arrays: list[wp.array]) -> Any:
   """Returns arrays one after the other as a torch tensor on the device of the first."""
-  import torch
+  import torch  # pyright: ignore[reportMissingImports]
 
   tensors = [wp.to_torch(array) for array in arrays]
   return torch.cat([tensor.to(tensors[0].device) for tensor in tensors])
