@@ -274,8 +274,8 @@ class Organ:
     """
     m = mjstruct.Model.from_address(self.model._address)
     d = mjstruct.Data.from_address(self.data._address)
-    tools = pierce.Tools(m, d, self._organ, pierce.tools(m, self._organ))
-    found = {*tools.inside(self._deformation), *self._space.watch.crossed}
+    tools = pierce.Tools(m, self._organ, pierce.tools(m, self._organ))
+    found = {*tools.inside(d, self._deformation), *self._space.watch.crossed}
     return tuple(self.model.geom(geom).name or f"geom {geom}" for geom in sorted(found))
 
   @property

@@ -6,7 +6,8 @@ that is cut [-]; `deviation` (1,), largest distance of the cut from the line so 
 
 Progress: 0.1 * closeness to the line, at its best, + 0.9 * share of the line that is cut. A point
 of the line is cut where the edge has gone through the wall within the tolerance of it; moving
-along without cutting counts nothing. Success: 98 % of it, and the piece is free. Failure: more than
+along without cutting counts nothing. Success: 98 % of it, and the piece is free, or 6 mm more are
+cut than the line is long: the mesh may hang together by an edge. Failure: more than
 10 mm cut farther from the line than the tolerance, a force above the damage limit, or the time
 limit.
 
@@ -36,6 +37,7 @@ SCENE = Scene(
 RULE = 0.002  # [m], of FLS
 ASTRAY = 0.01  # most that may be cut beyond the tolerance [m]
 COVERED = 0.98  # share of the line that is to be cut
+CLOSING = 0.006  # length that is cut beyond that of the line where the piece counts as free [m]
 STEP = 0.001  # between points of the line [m]
 AHEAD = (5, 10, 15)  # points further on that are observed
 _MARKS = 36  # spheres that draw the line
@@ -171,7 +173,8 @@ class Cut(Task):
       self.outcome = "damage"
       self.event(physics, "note", label=f"{1e3 * self.astray:.0f} mm are cut beside the line")
       return -1.0
-    if share >= COVERED and len(physics.organ.pieces) > 1:
+    closed = self.opened > self.length + CLOSING
+    if share >= COVERED and (closed or len(physics.organ.pieces) > 1):
       self.outcome = "success"
       return 1.0
     self.nearest = max(self.nearest, base.closeness(self.distance(physics), self.distance0))

@@ -147,8 +147,9 @@ class Physics(Instrument, Portable):
     if self._nodes is None:
       moved = self.organ.displacement
       rest = self._xpos0 if len(moved) == len(self._xpos0) else self.organ.xpos0  # it is cut
-      self._nodes = rest + moved
-      self._nodes.flags.writeable = False
+      nodes = rest + moved
+      nodes.flags.writeable = False
+      self._nodes = nodes
     return self._nodes
 
   def strain(self, rest: np.ndarray) -> Callable[[], float]:

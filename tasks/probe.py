@@ -38,9 +38,10 @@ _PIN_GAP = 0.02  # the field keeps that far from pinned nodes [m]
 PRESSES, LEAVES = 0.1, 0.02  # force above which a press begins, and below which it ends [N]
 FEELING, FELT = 0.1, 0.008  # force [N] that feels, and what lies within that distance [m]
 REPORT = 0.05  # least force at the report [N]
-# Of the expert: how far above a place it begins, how deep it feels, how far apart places to feel
-# are, first and around what is stiff, and how far around that it feels [m].
-_ABOVE, _DEPTH, _SWEEP, _CLOSE, _AROUND = 0.004, 0.004, 0.014, 0.006, 0.009
+# Of the expert: how far above a place it begins, how deep it feels, and how far apart places to
+# feel are, first and around what is stiff [m].
+_ABOVE, _DEPTH, _SWEEP, _CLOSE = 0.004, 0.004, 0.014, 0.006
+_LIKELY = 0.05  # of the likeliest place: others are not felt [-]
 _NOISE = 8.0  # of what it feels: triangles differ [N/m]
 _STIFF = 1.3  # times what is soft: what is worth a closer look [-]
 
@@ -388,20 +389,33 @@ class Palpate(Task):
     yield p.step()
 
   def _unsure(self, felt: dict[int, float]) -> int | None:
-    """Returns the place to feel for to be sure of what is stiff, None where nothing is, or all."""
+    """Returns the place to feel for to be sure of what is stiff, None where nothing is, or all.
+
+    The likeliest of those that nothing near was felt of: what is stiff at an edge of the field
+    shows on one side alone.
+    """
     stiffness = np.array(list(felt.values()))
     if not len(felt) or stiffness.max() < _STIFF * np.quantile(stiffness, 0.25):
       return None
+    chance = self._chance(felt)
     spots = self.places[list(felt)]
-    near = np.linalg.norm(self.places - self.places[self._guess(felt)], axis=1) < _AROUND
-    gap = np.linalg.norm(self.places[:, None] - spots, axis=2).min(axis=1) * near
-    return int(gap.argmax()) if gap.max() > _CLOSE else None
+    far = np.linalg.norm(self.places[:, None] - spots, axis=2).min(axis=1) > _CLOSE
+    k = int((chance * far).argmax())
+    return k if far[k] and chance[k] > _LIKELY * chance.max() else None
 
   def _guess(self, felt: dict[int, float]) -> int:
     """Returns the place nearest to where the inclusion is to be expected.
 
-    Each place is as likely as a bell of stiffness on it, h exp(-(d/w)^2) above what is soft, fits
-    what was felt. The best fit alone may be a far one of several that are nearly as good.
+    The best fit alone may be a far one of several that are nearly as good.
+    """
+    chance = self._chance(felt)
+    middle = chance @ self.places / chance.sum()
+    return int(np.linalg.norm(self.places - middle, axis=1).argmin())
+
+  def _chance(self, felt: dict[int, float]) -> np.ndarray:
+    """Returns how likely the inclusion is under each place, against the likeliest [-]  (nplace,).
+
+    As likely as a bell of stiffness on it, h exp(-(d/w)^2) above what is soft, fits what was felt.
     """
     stiffness = np.array(list(felt.values()))
     more = stiffness - np.quantile(stiffness, 0.25)
@@ -409,9 +423,7 @@ class Palpate(Task):
     bell = np.exp(-((distance / (1.2 * self.radius)) ** 2))
     height = np.maximum(bell @ more / np.maximum((bell**2).sum(axis=1), 1e-9), 0.0)
     error = ((more - height[:, None] * bell) ** 2).sum(axis=1)
-    chance = np.exp((error.min() - error) / (2 * _NOISE**2))
-    middle = chance @ self.places / chance.sum()
-    return int(np.linalg.norm(self.places - middle, axis=1).argmin())
+    return np.exp((error.min() - error) / (2 * _NOISE**2))
 
   def _hop(self, p: Performer, goal: np.ndarray) -> Script:
     """Moves to a point, in an arch over the organ where it is far."""

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .inputs import SIGNALS
+from .inputs import COLUMNS, SIGNALS
 from .metrics import Metrics
 from .recording import (
   Event,
@@ -133,18 +133,9 @@ class Recorder:
     force: ArrayLike | None = None,
     grip_force: ArrayLike | None = None,
     shaft_force: ArrayLike | None = None,
-    area: ArrayLike | None = None,
     strain: ArrayLike | Callable[[], float] | None = None,
-    grip: ArrayLike | None = None,
-    held: ArrayLike | None = None,
-    visible: ArrayLike | None = None,
-    freed: ArrayLike | None = None,
-    traction: ArrayLike | None = None,
-    deviation: ArrayLike | None = None,
-    farthest: ArrayLike | None = None,
-    excess: ArrayLike | None = None,
-    jagged: ArrayLike | None = None,
     arrays: Mapping[str, ArrayLike] | None = None,
+    **numbers: ArrayLike | None,
   ) -> None:
     """Adds one sample; with several instruments each argument has a row (or a number) for each.
 
@@ -160,20 +151,16 @@ class Recorder:
         magnitudes since the last sample, evenly spaced, now the last  (substeps,), or one for all
       grip_force: of the jaw that presses more [N]  (), or (substeps,)
       shaft_force: magnitude of the contact force on the shaft [N]  (), or (substeps,)
-      area: area of the organ's touched triangles [m^2]  ()
       strain: largest of the tissue, see `metrics.surface_strain`  (); or, with one instrument, what
         returns it, which is called by `settle`
-      grip: above 0.5 where the jaw is told to close  ()
-      held: above 0.5 where the jaw holds tissue  ()
-      visible: 1 where the camera's view holds the tip, else 0  ()
-      freed: share of what is bonded that came free as it should  ()
-      traction: pull on what it is bonded to [N]  ()
-      deviation: mean distance of a cut from its line so far [m]  ()
-      farthest: the largest so far [m]  ()
-      excess: area between the two so far [m^2]  ()
-      jagged: length of the cut so far that is more than 2 mm off [m]  ()
       arrays: the caller's own, of any shape and number type, the same in every sample; arrays that
         are not floating point may not miss a sample
+      **numbers: one each: `area` of the organ's touched triangles [m^2]; `grip`, `held`, above 0.5
+        where the jaw is told to close, holds tissue; `visible`, 1 where the camera's view holds the
+        tip, else 0; `freed`, share of what is bonded that came free as it should; `traction`, pull
+        on what it is bonded to [N]; of a cut so far, `deviation`, mean distance from its line [m],
+        `farthest`, the largest [m], `excess`, area between the two [m^2], `jagged`, length that is
+        more than 2 mm off [m]
     """
     time = float(time)
     if not (math.isfinite(time) and time > self._last):
@@ -181,10 +168,8 @@ class Recorder:
     self.settle()
     owed = strain if callable(strain) else None
     strain = strain if owed is None else math.nan
-    given = {"tip_pos": tip_pos, "quat": quat, "axis": axis, "force": force}
-    given |= {"grip_force": grip_force, "shaft_force": shaft_force, "area": area, "strain": strain}
-    given |= {"grip": grip, "held": held, "visible": visible, "freed": freed, "traction": traction}
-    given |= {"deviation": deviation, "farthest": farthest, "excess": excess, "jagged": jagged}
+    given = {"tip_pos": tip_pos, "quat": quat, "axis": axis, "force": force, "strain": strain}
+    given |= {"grip_force": grip_force, "shaft_force": shaft_force, **numbers}
     columns = {k: self._entry(k, v) for k, v in given.items() if v is not None}
     own = {name: self._own(name, value) for name, value in arrays.items()} if arrays else {}
     self._store(time, columns, own)
@@ -230,6 +215,8 @@ class Recorder:
       array.shape == buffer.shape or (count == 1 and array.shape == buffer.shape[1:])
     ):
       return array  # fits as it is
+    if name not in COLUMNS:
+      raise TypeError(f"append takes no {name!r}, expected some of {', '.join(COLUMNS)}")
     shapes = entry_shapes(name, self.substeps)
     if buffer is not None:
       shapes = [buffer.shape[1:]]

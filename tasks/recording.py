@@ -210,11 +210,16 @@ class Recording:
 
   @classmethod
   def load(cls, path: str | os.PathLike[str]) -> "Recording":
-    """Reads a recording; ValueError names the file and what is wrong with it."""
+    """Reads a recording; ValueError and OSError name the file and what is wrong with it."""
     path = Path(path)
     if path.exists() and not path.is_file():  # a pipe would be waited for
       raise ValueError(f"{path}: not a {FORMAT}: not a file")
-    with path.open("rb") as file:
+    try:
+      opened = path.open("rb")
+    except OSError as error:
+      why = f"{error.strerror}, expected a {FORMAT} (.npz), as palpate exercise keeps"
+      raise type(error)(f"{path}: {why}") from None
+    with opened as file:
       if file.read(2) != b"PK":
         raise ValueError(f"{path}: not a {FORMAT}: not a zip archive")
       file.seek(0)

@@ -28,7 +28,7 @@ _NODES = 1000  # of an organ, before it gets finer under the tool
 _WINDOW = 500  # vertices
 _SOFT = 0.02  # share of the radius of the tool that the organ's flex has
 _SUNK = 0.8  # of a block's height, that a tool may go
-_FOLLOW = 0.1  # of a change of that depth in a step, which contacts take three steps for
+_FOLLOW = 0.3  # of a change of that depth in a step, which contacts take three steps for
 _TRIES, _SMALLER = 6, 0.93  # of edges, where tetrahedra do not fill a mesh
 _HEAVY = 1e4  # times the organ's mass, so that contacts do not move the tool
 

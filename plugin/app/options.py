@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import functools
+import inspect
 import json
 from typing import Any
 
@@ -46,8 +47,21 @@ def load(name: str, task_kwargs: dict[str, Any]):
     return suite.load(*suite.split(name), task_kwargs={"random": 0, **task_kwargs})
   except (ValueError, OSError) as error:
     raise CommandError(str(error)) from None
-  except TypeError as error:  # an option that no exercise has
+  except TypeError as error:
+    allowed = _allowed(suite.load(*suite.split(name)).task)
+    for unknown in task_kwargs.keys() - allowed:
+      names = ", ".join(sorted(allowed))
+      raise CommandError(f"{name}: set has {unknown!r}, expected one of {names}") from None
     raise CommandError(f"{name}: set: {error}") from None
+
+
+def _allowed(task: object) -> set[str]:
+  """Returns the names of a task's options."""
+  names = {"time_limit"}
+  for kind in type(task).__mro__[:-1]:
+    parameters = inspect.signature(kind.__init__).parameters.values()
+    names |= {p.name for p in parameters if p.kind is p.KEYWORD_ONLY}
+  return names - {"name"}
 
 
 @functools.lru_cache(maxsize=1)  # each takes memory

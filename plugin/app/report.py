@@ -63,10 +63,7 @@ def _entries(paths: Sequence[pathlib.Path], references: Lookup, filmed: bool) ->
 
   entries = []
   for name, path in zip(_names(paths), paths, strict=True):
-    try:
-      recording = Recording.load(path)
-    except OSError as error:
-      raise CommandError(f"{path}: {error.strerror or error}") from None
+    recording = Recording.load(path)
     known = references(str(recording.info.get("task", "")))
     shot = film.of_recording(recording, _SIZE) if filmed else None
     entries.append(comparison.Entry(name, recording, known, shot))

@@ -25,7 +25,7 @@ from .organs import Organ
 from .rest import Rest
 
 _CONTACTS = 16  # of a world, of tools with each other and with what is fixed
-_ITERATIONS = 8  # of the constraint solver, at most
+_ITERATIONS = 6  # of the constraint solver, at most
 _LOST = int(OverflowType.NEFC | OverflowType.NJMAX_NNZ | OverflowType.NARROWPHASE)
 
 

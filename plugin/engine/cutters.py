@@ -268,17 +268,18 @@ class Cutters(Beside):
     path, rest = np.vstack([trail, at]), at[None]
     if not ended:
       path, rest = _part(mesh, path)
+    report, pinned = None, False
     try:
       report = w.cuts.cut(self._now(mesh, path), given) if len(path) > 1 else None
     except ValueError as error:
-      if "pinned" in str(error) and not self._said:
+      pinned = "pinned" in str(error)
+      if pinned and not self._said:
         self._said = True
         mjstruct.warn(str(error))
-      report = None
     if ended:
       row[BLADE.count] = 0
     elif report is None:
-      self._wait(row, at, count == TRAIL)
+      self._wait(row, at, pinned or count == TRAIL)
     else:
       tip = (report.path[-1][-1] - w.organ.origin) @ w.organ.frame if report.path else path[-1]
       trail = np.vstack([tip, rest[:-1]])[:TRAIL]

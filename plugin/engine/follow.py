@@ -50,11 +50,19 @@ class Grip:
     if not mesh.spare:  # it is never cut
       n = len(self.vert)
       return Held(np.arange(n), self.vert, np.ones(n), np.zeros((n, 3)))
-    vert = mesh.elem.reshape(-1)[self._corner]
-    area = topology.lengths(topology.area_vectors(mesh.rest, mesh.elem[self._corner // 3]))
-    key, number = np.unique(self._row * mesh.nvert + vert, return_inverse=True)
-    row, vert = key // mesh.nvert, key % mesh.nvert
-    share = np.bincount(number, area) / np.bincount(self._row, area)[row]
+    now = mesh.elem.reshape(-1)[self._corner]
+    apart = topology.among(len(self.vert), self._row[now != self.vert[self._row]])
+    there = apart[self._row]
+    of, corner, now = self._row[there], self._corner[there], now[there]
+    area = topology.lengths(topology.area_vectors(mesh.rest, mesh.elem[corner // 3]))
+    key, number = np.unique(of * mesh.nvert + now, return_inverse=True)
+    parts = key // mesh.nvert
+    share = np.bincount(number, area) / np.bincount(of, area, len(self.vert))[parts]
+    whole = np.flatnonzero(~apart)
+    row = np.append(whole, parts)
+    order = np.argsort(row, kind="stable")
+    row, vert = row[order], np.append(self.vert[whole], key % mesh.nvert)[order]
+    share = np.append(np.ones(len(whole)), share)[order]
     return Held(row, vert, share, mesh.rest[vert] - self._rest[row])
 
 

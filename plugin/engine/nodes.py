@@ -19,7 +19,7 @@ class Nodes:
   """A windowed organ's nodes, in the order of its vertices and in its frame."""
 
   nvert: int  # vertices
-  nouter: int  # those on the surface, the first ones
+  nouter: int  # those on the surface, the first ones, with spare ones that have no mass yet
   nslot: int  # slots of all windows
   nwindow: int  # windows
   most: int  # candidates of a window that the outbox has room for
@@ -55,7 +55,7 @@ def make(w, side, motion, boxes: tuple[wp.array, wp.array], sizes: dict[str, int
   node = s.node.numpy()
   values = dict(
     nvert=sizes["nvert"],
-    nouter=organ.mesh.nouter,
+    nouter=coupling.outer(organ),
     nslot=sizes["nslot"],
     nwindow=sizes["nwindow"],
     most=sizes["most"],
@@ -75,10 +75,12 @@ def make(w, side, motion, boxes: tuple[wp.array, wp.array], sizes: dict[str, int
 
 
 def reshape(w, nodes, vert: np.ndarray):
-  """Gives the nodes, on the CPU, the rest places and masses that vertices have now."""
-  nodes.nouter = w.organ.mesh.nouter
-  nodes.rest.numpy()[vert] = w.organ.mesh.rest[vert]
-  nodes.mass.numpy()[vert] = w.organ.mass[vert]
+  """Gives the nodes the rest places and masses that vertices have now."""
+  for array, values in ((nodes.rest, w.organ.mesh.rest), (nodes.mass, w.organ.mass)):
+    if array.device.is_cuda:
+      array.assign(values)
+    else:
+      array.numpy()[vert] = values[vert]
   _weigh(w, vert)
 
 

@@ -16,7 +16,7 @@ from palpate.tissue.types import doubles, ints, struct
 from . import coupling, flexes, mjstruct
 from .layout import FLAG
 
-_EVERY = 500  # steps between looks at what is inside
+_EVERY = 503  # steps between looks at what is inside; prime: not always where others do more too
 _OFTEN = 5  # steps between looks along the way of a fast tool
 _FAST = 1.0  # speed above which a tool may be through and out again between looks [m/s]
 _PATH = 16  # points of that way
@@ -45,14 +45,13 @@ def _crossings(point: np.ndarray, pos: np.ndarray, elem: np.ndarray) -> np.ndarr
   """Returns how often a ray from each point leaves a surface, less how often it comes in."""
   # In the time of a step: of all triangles only what a ray may meet is looked at closely.
   low, high = point.min(axis=0), point.max(axis=0)
-  (x0, x1), (y0, y1), (_, z1) = (_span(pos[:, k], elem) for k in range(3))
-  near = np.flatnonzero(
-    (x0 <= high[0]) & (x1 >= low[0]) & (y0 <= high[1]) & (y1 >= low[1]) & (z1 >= low[2])
-  )
-  x0, x1, y0, y1 = x0[near], x1[near], y0[near], y1[near]
+  for axis in range(2):
+    least, most = _span(pos[:, axis], elem)
+    elem = elem[(least <= high[axis]) & (most >= low[axis])]
+  (x0, x1), (y0, y1) = (_span(pos[:, axis], elem) for axis in range(2))
   x, y = point[:, :1], point[:, 1:2]
   k, t = np.nonzero((x0 <= x) & (x1 >= x) & (y0 <= y) & (y1 >= y))
-  at, corner = point[k], pos[elem[near[t]]]
+  at, corner = point[k], pos[elem[t]]
   through = np.zeros(len(k), bool)
   for i in range(3):
     through ^= _right_of(at, corner[:, i - 1], corner[:, i])
@@ -115,61 +114,62 @@ find_fast = kernel("find_fast", "tools.h", Speeds, coupling.CONSTANTS | {"FAST":
 class Tools:
   """Where some geoms are: points along the axis of a long one, the centre of another.
 
-  Args:
-    m: the mjModel
-    d: the mjData
-    organ: the organ, in whose frame they are
-    geoms: the geoms
+  Attributes:
+    geoms: their numbers
+    organ: in whose frame they are
+    half: half the length of a long one's axis [m]
   """
 
-  def __init__(self, m, d, organ, geoms: np.ndarray):
-    self.geoms, self._organ = geoms, organ
-    self._pos = mjstruct.view(d.geom_xpos, (m.ngeom, 3))[geoms]
-    self._axis = mjstruct.view(d.geom_xmat, (m.ngeom, 3, 3))[geoms, :, 2]
+  def __init__(self, m, organ, geoms: np.ndarray):
+    """Takes the geoms of an mjModel."""
+    self.geoms, self.organ, self._ngeom = geoms, organ, m.ngeom
     self.half = half_lengths(m, geoms)
     wide = 2 * np.ceil(self.half / mjstruct.view(m.geom_size, (m.ngeom, 3))[geoms, 0]) + 1
-    self._count = np.minimum(wide, _MOST).astype(int)
-    self._m, self._d = m, d
+    count = np.minimum(wide, _MOST).astype(int)
+    # Of each point: the tool, and how far along its axis [m].
+    self._tool = np.repeat(np.arange(len(geoms)), count)
+    along = [np.linspace(-half, half, n) for half, n in zip(self.half, count, strict=True)]
+    self._along = np.concatenate([np.zeros(0), *along])[:, None]
 
-  def inside(self, disp: np.ndarray) -> list[int]:
+  def inside(self, d, disp: np.ndarray) -> list[int]:
     """Returns which of the geoms are inside of the organ.
 
     Args:
+      d: the mjData
       disp: displacement of the vertices from rest, in the organ's frame [m], (nvert, 3)
     """
-    found = self._inside(range(len(self.geoms)), self._pos, self._axis, disp)
-    return [int(g) for g, is_in in zip(self.geoms, found, strict=True) if is_in]
+    return self.geoms[self._inside(*self._poses(d), disp)].tolist()
 
-  def passed(self, disp: np.ndarray, time: float) -> list[int]:
+  def passed(self, m, d, disp: np.ndarray, time: float) -> list[int]:
     """Returns which of the fast ones were inside of it on their way within the last seconds."""
-    spin, vel = self._motion()
+    pos, axis = self._poses(d)
+    spin, vel = self._motion(m, d, pos)
     speed = np.linalg.norm(vel, axis=1) + np.linalg.norm(spin, axis=1) * self.half
-    fast, found = np.flatnonzero(speed > _FAST), np.zeros(len(self.geoms), bool)
-    turn = np.cross(spin, self._axis)
+    turn, found = np.cross(spin, axis), np.zeros(len(self.geoms), bool)
     for t in np.linspace(0, time, _PATH):
-      found[fast] |= self._inside(fast, self._pos - t * vel, self._axis - t * turn, disp)
-    return [int(g) for g in self.geoms[found]]
+      found |= self._inside(pos - t * vel, axis - t * turn, disp)
+    return self.geoms[found & (speed > _FAST)].tolist()
 
-  def _inside(self, tools, pos: np.ndarray, axis: np.ndarray, disp: np.ndarray) -> np.ndarray:
-    """Returns whether any point of each of some tools is inside, (ntool,) bool."""
-    organ = self._organ
-    points = [
-      pos[k] + np.linspace(-self.half[k], self.half[k], self._count[k])[:, None] * axis[k]
-      for k in tools
-    ]
-    corner = organ.mesh.rest + disp
-    found = inside((np.concatenate(points) - organ.origin) @ organ.frame, corner, organ.mesh.elem)
-    ends = np.cumsum([len(p) for p in points])[:-1]
-    return np.array([part.any() for part in np.split(found, ends)])
+  def _inside(self, pos: np.ndarray, axis: np.ndarray, disp: np.ndarray) -> np.ndarray:
+    """Returns whether any point of each tool is inside, (ntool,) bool."""
+    organ, tool = self.organ, self._tool
+    point = (pos[tool] + self._along * axis[tool] - organ.origin) @ organ.frame
+    found = np.zeros(len(self.geoms), bool)
+    found[tool[inside(point, organ.mesh.rest + disp, organ.mesh.elem)]] = True
+    return found
 
-  def _motion(self) -> tuple[np.ndarray, np.ndarray]:
-    """Returns angular velocity [rad/s] and velocity [m/s], (ngeom, 3) both."""
-    m, d = self._m, self._d
+  def _poses(self, d) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the tools' places [m] and axes, (ntool, 3) both."""
+    pos = mjstruct.view(d.geom_xpos, (self._ngeom, 3))[self.geoms]
+    return pos, mjstruct.view(d.geom_xmat, (self._ngeom, 3, 3))[self.geoms, :, 2]
+
+  def _motion(self, m, d, pos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns angular velocity [rad/s] and velocity [m/s], (ntool, 3) both."""
     body = mjstruct.view(m.geom_bodyid, m.ngeom, np.int32)[self.geoms]
     root = mjstruct.view(m.body_rootid, m.nbody, np.int32)[body]
     spin, vel = np.moveaxis(mjstruct.view(d.cvel, (m.nbody, 2, 3))[body], 1, 0)
     com = mjstruct.view(d.subtree_com, (m.nbody, 3))[root]
-    return spin, vel + np.cross(spin, self._pos - com)
+    return spin, vel + np.cross(spin, pos - com)
 
 
 def half_lengths(m, geoms: np.ndarray) -> np.ndarray:
@@ -199,7 +199,7 @@ class Watch:
 
   def __init__(self):
     self.crossed: set[int] = set()
-    self._tools: np.ndarray | None = None
+    self._tools: Tools | None = None
     self._inside: set[int] | None = None
     self._said: set[int] = set()
     self._steps = 0
@@ -215,15 +215,16 @@ class Watch:
     Each once; not those that were inside when this began to look.
     """
     m, d = mjstruct.Model.from_address(w.model), mjstruct.Data.from_address(w.data)
-    if self._tools is None:
-      self._tools = tools(m, w.organ)
-    if not len(self._tools) or not w.organ.mesh.closed:  # a cut opens it
+    if self._tools is None or self._tools.organ is not w.organ:
+      self._tools = Tools(m, w.organ, tools(m, w.organ))
+    seen = self._tools
+    if not len(seen.geoms) or not w.organ.mesh.closed:  # a cut opens it
       return []
-    seen, disp = Tools(m, d, w.organ, self._tools), _displacement(m, d, w)
-    found = set(seen.inside(disp))
+    disp = _displacement(m, d, w)
+    found = set(seen.inside(d, disp))
     before, self._inside = found if self._inside is None else self._inside, found
     if w.flags[FLAG.fast]:
-      passed = set(seen.passed(disp, w.model_step[0] * _OFTEN)) - before
+      passed = set(seen.passed(m, d, disp, w.model_step[0] * _OFTEN)) - before
       self.crossed |= passed
       found = found | passed
     new = sorted(found - before - self._said)

@@ -113,6 +113,11 @@ class Resident:
     self.fetch()
     self.live, self.w.flags[FLAG.foreseen] = -1, 1
 
+  def renew(self):
+    """Notes that the motion in the plugin state was changed, and has to be sent."""
+    self.stop()
+    self.tail[TAIL.stamp] = 0.0
+
   def fetch(self):
     """Brings the motion into the plugin state."""
     stamp = int(self.tail[TAIL.stamp])

@@ -61,14 +61,16 @@ def read(m, organ) -> Skin | None:
   adr, count = (
     int(mjstruct.view(each, m.nskin, np.int32)[k]) for each in (m.skin_vertadr, m.skin_vertnum)
   )
-  sizes = subdivide.counts(organ.mesh.elem)
+  # MuJoCo's triangles: those of the physics may have other diagonals.
+  elem = organ.mesh.elem if organ.mesh.spare else flexes.elements(m, organ.flex)
+  sizes = subdivide.counts(elem)
   if count not in sizes:
     choices = ", ".join(map(str, sizes))
     raise ValueError(
       f"{who} has {count} vertices, expected one of {choices}: the organ's triangles divided in "
       "four once, twice, ...; see palpate.add_skin"
     )
-  smooth = subdivide.smooth(organ.mesh.elem, subdivide.LEVELS[sizes.index(count)])
+  smooth = subdivide.smooth(elem, subdivide.LEVELS[sizes.index(count)])
   first, faces = (
     int(mjstruct.view(each, m.nskin, np.int32)[k]) for each in (m.skin_faceadr, m.skin_facenum)
   )

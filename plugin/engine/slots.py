@@ -175,7 +175,7 @@ def _list_triangles(slots, mesh, vert: np.ndarray, elem: np.ndarray):
   """Lists the triangles whose first corners these vertices are; `elem`: all that they have."""
   begin, following = slots.begin.numpy(), slots.following.numpy()
   first = mesh.elem[elem, 0]
-  elem = elem[np.isin(first, vert)]
+  elem = elem[topology.among(mesh.nvert, vert)[first]]
   order = np.lexsort((elem, mesh.elem[elem, 0]))
   elem = elem[order]
   first = mesh.elem[elem, 0]

@@ -84,6 +84,8 @@ class Phases(coupling.Phases):
 
   def motion(self) -> tuple[np.ndarray, np.ndarray]:
     """Returns displacement and velocity of the vertices, in the organ's frame, (nvert, 3) each."""
+    if self._w.resident:
+      self._w.resident.fetch()
     motion = self._w.boxes["own"].motion
     return motion.disp.numpy().copy(), motion.vel.numpy().copy()
 
@@ -93,6 +95,8 @@ class Phases(coupling.Phases):
     motion.disp.numpy()[changed], motion.vel.numpy()[changed] = disp[changed], vel[changed]
     for values in (motion.last.numpy(), motion.before.numpy()):
       values[member] = values[group]
+    if self._w.resident:
+      self._w.resident.renew()
 
   def _sizes(self, organ) -> dict[str, int]:
     """Returns what the blocks of `layout` need."""

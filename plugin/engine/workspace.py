@@ -75,7 +75,7 @@ class Workspace:
     bonds: what it has grown on to
     rests: what it rests on
     creep: its stress relaxation
-    cuts: its mesh as it is now; cutters: what cuts it
+    cuts, cutters: its mesh as it is now, and what cuts it
     resident: keeper of a motion that stays on the device, or None
     stiff: whether the response is needed, see `inertia.stiffness`
     heaviest: most times its inertia that a node in contact may have, see there  (1,)
@@ -93,10 +93,10 @@ class Workspace:
     torn: whether a signal's handler has ended a callback of the last step
     watch: looks whether tools come through the surface
     nbad: MuJoCo's warnings of bad states that were looked at since the last reset
-    model_step: the model's time step comes first; time_step: that the armature is for [s]
+    model_step, time_step: the model's time step comes first, and the armature's [s]
     integrator: MuJoCo's comes first
     static: places of the bodies that the organ hangs on, and what they were
-    qpos: numbers of qpos that the slots have, as bytes; stood: after the last step, or None
+    qpos, stood: numbers of qpos that the slots have, as bytes; after the last step, or None
     plugin_state: the organ's own numbers
     signature: the last of them, see `Declaration`
     views: what a coupling keeps when its graphs are recorded anew

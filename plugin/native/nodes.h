@@ -144,6 +144,7 @@ PALPATE void search(const Fields& n, Thread t, int) {
     if (!any_near(n, geom, ngeom)) continue;
     double* record = n.outbox.record.data + (size_t)RECORD_LENGTH * n.most * w;
     each_item(t, n.nouter, [&](int i) {
+      if (n.mass.data[i] == 0.0) return;  // it waits for a cut
       const D3 v = next_velocity(n, i, ok), u = load(n.motion.disp.data + 3 * i) + h * v;
       const double far = nearest(geom, ngeom, load(n.rest.data + 3 * i) + u);
       if (far > reach) return;

@@ -389,8 +389,6 @@ def _check_spare(organ: str, config: Config):
     raise ValueError(f"organ {organ!r}: cutters is set, allowed only with spare, or bonds to free")
   if not config.spare:
     return
-  if config.resident:
-    raise ValueError(f"organ {organ!r}: resident is set, allowed only where spare is 0")
   for key, text in (("elements", "solid"), ("carrier", OWN)):
     if getattr(config, key) == text:
       raise ValueError(f"organ {organ!r}: {key} is {text!r}, allowed only where spare is 0")

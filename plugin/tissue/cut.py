@@ -119,8 +119,11 @@ def cut(
 def _ends_on_rim(mesh: Mesh, chain: list[int]) -> bool:
   if len(chain) != 2:
     return False
-  ends = np.array(chain)
-  return bool((mesh.ring_elem[ends, mesh.degree[ends] - 1] < 0).any()) and _is_inner(mesh, *chain)
+  return any(_is_on_rim(mesh, v) for v in chain) and _is_inner(mesh, *chain)
+
+
+def _is_on_rim(mesh: Mesh, vert: int) -> bool:
+  return bool(mesh.ring_elem[vert, mesh.degree[vert] - 1] < 0)
 
 
 def _check(organ: str, mesh: Mesh, runs: list[paths.Run], pinned: np.ndarray):
@@ -133,8 +136,9 @@ def _check(organ: str, mesh: Mesh, runs: list[paths.Run], pinned: np.ndarray):
       "one"
     )
   for run in runs:
-    inner = run.chain if run.closes else run.chain[1:-1]
-    bad = [v for v in inner if pinned[v]]
+    split = run.chain if run.closes else run.chain[1:-1]
+    split = [*split, *(v for v in run.chain[:1] + run.chain[-1:] if _is_on_rim(mesh, v))]
+    bad = [v for v in split if pinned[v]]
     if bad:
       raise ValueError(
         f"organ {organ!r}: the path goes through vertex {bad[0]}, which is pinned, expected tissue "
@@ -165,7 +169,7 @@ def _snap(
   vert, first = np.unique(np.concatenate(vert), return_index=True)
   goal = np.concatenate(goal)[first]
   goal, free = _on_rim(mesh, vert, goal)
-  free &= ~pinned[vert] & np.isin(vert, list(there))
+  free &= ~pinned[vert] & topology.among(mesh.nvert, list(there))[vert]
   vert, goal = vert[free], goal[free]
   around = mesh.ring_elem[vert]
   elem = np.where(around >= 0, around, around[:, :1]) // 3

@@ -75,8 +75,8 @@ def _alternating(mesh: Mesh, quad: np.ndarray) -> np.ndarray:
   meets = (at == start[one]) | (at == end[one])
   turned = (meets == ((at == start[two]) | (at == end[two]))).astype(float)
   n = len(quad)
-  graph = sparse.coo_array((turned + 1, (one, two)), shape=(n, n)).tocsr()
-  graph = graph.maximum(graph.T)
+  ends = np.concatenate([one, two]), np.concatenate([two, one])
+  graph = sparse.csr_matrix((np.tile(turned + 1, 2), ends), shape=(n, n))
   count, patch = csgraph.connected_components(graph, directed=False)
   flip = np.zeros(n, bool)
   for first in np.unique(patch, return_index=True)[1]:

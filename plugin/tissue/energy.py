@@ -48,16 +48,17 @@ def of_membrane(
   p1, p2 = u[:, 1] - u[:, 0], u[:, 2] - u[:, 0]
 
   def dot(x, y):
-    return (x * y).sum(axis=1)
+    return np.einsum("ij,ij->i", x, y)
 
-  metric = np.stack([dot(r1, r1), dot(r1, r2), dot(r1, r2), dot(r2, r2)], 1).reshape(-1, 2, 2)
+  g11, g12, g22 = dot(r1, r1), dot(r1, r2), dot(r2, r2)
+  det = g11 * g22 - g12 * g12
   e11 = dot(r1, p1) + 0.5 * dot(p1, p1)
   e22 = dot(r2, p2) + 0.5 * dot(p2, p2)
   e12 = 0.5 * (dot(r1, p2) + dot(r2, p1) + dot(p1, p2))
-  strain = np.linalg.inv(metric) @ np.stack([e11, e12, e12, e22], 1).reshape(-1, 2, 2)
-  trace = np.trace(strain, axis1=1, axis2=2)
-  square = np.einsum("tij,tji->t", strain, strain)
-  area = 0.5 * np.sqrt(np.linalg.det(metric))
+  # Of the strain with one index raised: its trace, and that of its square by its determinant.
+  trace = (g22 * e11 - 2 * g12 * e12 + g11 * e22) / det
+  square = trace**2 - 2 * (e11 * e22 - e12 * e12) / det
+  area = 0.5 * np.sqrt(det)
   modulus = config if which is None or len(config.young) == 1 else dataclasses.replace(
     config, young=tuple(np.asarray(config.young)[which])
   )

@@ -103,10 +103,19 @@ _BY_VERTEX = ("rest", "ring", "ring_elem", "degree")
 
 def distinct(*numbers: np.ndarray) -> np.ndarray:
   """Returns the different ones of whole numbers, ascending, as `np.unique` but for short lists."""
-  every = np.sort(np.concatenate([each.ravel() for each in numbers]))
-  first = np.ones(len(every), bool)
+  every = np.concatenate([each.ravel() for each in numbers])
+  every.sort()
+  first = np.empty(len(every), bool)
+  first[:1] = True
   np.not_equal(every[1:], every[:-1], out=first[1:])
   return every[first]
+
+
+def among(count: int, numbers: np.ndarray | list[int]) -> np.ndarray:
+  """Returns which of the numbers under `count` are some of these, (count,) bool."""
+  out = np.zeros(count, bool)
+  out[numbers] = True
+  return out
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -300,17 +309,15 @@ def _twins(organ: str, elem: np.ndarray, nvert: int) -> np.ndarray:
   return np.where(ordered[found] == reverse, order[found], -1)
 
 
-def _rings(organ, elem, twin, nvert, vert=None, near=None):
+def _rings(organ, elem, twin, nvert, only: tuple[np.ndarray, np.ndarray] | None = None):
   """Walks around vertices at once, one step for all of them in each pass.
 
-  Around `vert` alone where it is not None; `near` has the triangles that these have.
+  `only` has vertices and the triangles that these have, where not all are meant.
   """
   corner = elem.reshape(-1)
-  half = np.arange(elem.size)
-  if vert is None:
-    vert = np.arange(nvert)
-  else:
-    half = (3 * near[:, None] + np.arange(3)).ravel()
+  vert, half = np.arange(nvert), np.arange(elem.size)
+  if only is not None:
+    vert, half = only[0], (3 * only[1][:, None] + np.arange(3)).ravel()
   start = corner[half]
   first = np.full(nvert, -1, np.int64)  # of a vertex without triangles
   first[start[::-1]] = half[::-1]  # the first one is written last
@@ -383,8 +390,8 @@ def recut(
   walk = distinct(before[cut], after[cut])
   ring, ring_elem, degree = mesh.ring.copy(), mesh.ring_elem.copy(), mesh.degree.copy()
   if walk.size:
-    near = around(mesh, distinct(before[cut]))
-    part, part_elem, degree[walk] = _rings("cut", elem, new.twin, len(rest), walk, near)
+    only = walk, around(mesh, distinct(before[cut]))
+    part, part_elem, degree[walk] = _rings("cut", elem, new.twin, len(rest), only)
     ring[walk], ring_elem[walk] = -1, -1
     ring[walk, : part.shape[1]], ring_elem[walk, : part.shape[1]] = part, part_elem
   return dataclasses.replace(new, ring=ring, ring_elem=ring_elem, degree=degree), changed

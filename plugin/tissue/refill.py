@@ -118,8 +118,10 @@ class Refill:
     for name, values in dense.items():
       out[name] = [(_lane(near // LANES, near % LANES, values.ndim + 1), values)]
     dense = rows.hinges(mesh, hinge, self._node, number)
-    mine = np.isin(hinge.elem, near).any(axis=1)
-    gone = np.setdiff1d(self._numbers(near), number[mine])
+    changes = topology.among(mesh.nelem, near)[hinge.elem]
+    mine = changes[:, 0] | changes[:, 1]
+    had = self._numbers(near)
+    gone = had[~topology.among(none, number[mine])[had]]
     for name, values in dense.items():
       at, off = number[mine], gone
       out[name] = [

@@ -20,7 +20,7 @@ from .types import empty
 # doi:10.1002/(SICI)1099-0887(199805)14:5<437::AID-CNM162>3.0.CO;2-W), and averages alone let
 # neighbours shrink and grow in turn (Puso and Solberg 2006, doi:10.1002/nme.1457).
 _OWN_POISSON = 0.3
-_WINDOW = 64 * LANES  # edges that are sorted by the number of their tetrahedra
+_WINDOW = 8 * LANES  # edges that are sorted by the number of their tetrahedra
 
 
 def gradients(mesh: Mesh) -> np.ndarray:

@@ -190,7 +190,7 @@ def calibrate(body: Body):
     array.zero_()
   wp.copy(state.step, wp.array([1.0], dtype=float, device=body.device), count=1)
   _hinge_angles(body, Stage.EXPLICIT)
-  wp.copy(angle0.flatten(), system.hinge_angle[0].flatten())
+  wp.copy(angle0, system.hinge_angle, count=angle0.size)
 
 
 def solve(body: Body, stage: Stage):

@@ -148,7 +148,7 @@ def test_options_of_the_task_are_passed_on(tmp_path, capsys):
     ("reward", "set is 'reward', expected NAME=VALUE"),
     ("reward=dens", "reward is 'dens', expected one of dense, sparse"),
     ("random=1", "set has 'random', expected --seed"),
-    ("rewards=dense", "unexpected keyword argument 'rewards'"),
+    ("rewards=dense", "set has 'rewards', expected one of damage, force_limit"),
     ("time_limit=-1", "touch/easy: time_limit is -1, expected a number > 0 [s]"),
     ("pixels=84", "pixels is 84, expected height and width"),
   ],

@@ -60,6 +60,10 @@ def test_exercise_writes_recording_metrics_and_report(tmp_path, capsys):
   (tmp_path / "foreign.npz").write_bytes(b"PK nonsense")
   assert cli.main(["exercise", "--replay", str(tmp_path / "foreign.npz")]) == 2
   assert "not a readable palpate-recording" in capsys.readouterr().err
+  for words in (["exercise", "--replay"], ["report"]):
+    assert cli.main([*words, "nope.npz"]) == 2
+    said = capsys.readouterr().err
+    assert "nope.npz: No such file or directory, expected a palpate-recording (.npz)" in said
   assert cli.main(["exercise", "touch/easy", "--performer", "nobody"]) == 2
   assert "or module:object" in capsys.readouterr().err
   assert cli.main(["exercise", "touch/easy", "--performer", "math:none"]) == 2

@@ -1,4 +1,4 @@
-"""Organs of a batch on a GPU sleep while nothing happens to them, and wake as those of the plugin."""
+"""Organs of a batch on a GPU sleep while nothing happens to them, and wake as the plugin's do."""
 
 import mujoco
 import numpy as np

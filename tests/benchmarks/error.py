@@ -50,7 +50,7 @@ def stages(args: argparse.Namespace) -> list[list[Case]]:
         first += [
           {"case": f"reference-{name}-{nodes}-{elements}-{k}", "kind": "reference", "level": k}
           | what
-          for k in (LEVELS[:2] if args.short else LEVELS if nodes <= 642 else LEVELS[1:])
+          for k in _levels(args.short, nodes, elements)
         ]
         second += [
           {"case": f"{name}-{nodes}-{elements}-{h:g}", "kind": "run", "h": h} | what | short
@@ -58,6 +58,13 @@ def stages(args: argparse.Namespace) -> list[list[Case]]:
           if elements != "solid" or h <= LONGEST
         ]
   return [first, second]
+
+
+def _levels(short: bool, nodes: int, elements: str) -> tuple[int, ...]:
+  """Returns the time steps of a reference, in TAU; that of a solid takes long."""
+  if short or elements == "solid":
+    return LEVELS[:2]
+  return LEVELS if nodes <= 642 else LEVELS[1:]
 
 
 def groups(rows: list[Row]) -> dict[tuple, list[Row]]:

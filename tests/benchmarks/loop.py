@@ -8,11 +8,12 @@ An octahedral sphere of radius 5 cm (E = 30 kPa, t = 2 mm, 0.1 kg, foundation 1e
 pinned below, is pressed 1.5 mm deep by a probe of 5 mm, or as thick as `--tip` says, and slid
 over, solved to the tolerance given. With `--solid` it is the liver, filled (E = 5 kPa, nu = 0.45,
 1.2 kg), pressed 6 mm deep. On CUDA the motion stays on the device (`resident`). Bending is off
-unless `--bend 1`. The last columns are medians of what one step spends: MuJoCo itself, the
-CPU's side of the coupling, and waiting for the device (search, transfer and what is left of the
-solve, which a resident organ begins before MuJoCo looks for contacts); `rest_ms` is a step with the
-probe away and the organ asleep. The parts of the device's work are timed by themselves after the
-run, in the state of its last step. loop.md says what they cost a node.
+unless `--bend 1`. Times on the CPU are CPU time. The last columns are medians of what one step
+spends: MuJoCo itself, the CPU's side of the coupling, and waiting for the device (search, transfer
+and what is left of the solve, which a resident organ begins before MuJoCo looks for contacts);
+`rest_ms` is a step with the probe away and the organ asleep. The parts of the device's work are
+timed by themselves after the run, in the state of its last step. loop.md says what they cost a
+node.
 """
 
 import argparse
@@ -25,7 +26,7 @@ import numpy as np
 import palpate
 import scenes
 import warp as wp
-from benchmarks import results
+from benchmarks import results, runner
 from benchmarks.runner import Bench, Case, Row
 from palpate.engine import windowed, workspace
 from palpate.engine.layout import HEAD, MODE
@@ -107,15 +108,16 @@ def measure(
   organ = palpate.Organ(m, d, "organ")
   w = scenes.workspace(organ)
   spent = {"cpu": 0.0, "device": 0.0}
-  timed(w, spent)
+  clock = runner.clock if device == "cpu" else time.perf_counter
+  timed(w, spent, clock)
   rows, iterations, contacts = [], [], []
   for k in range(steps):
     d.ctrl[0] = -(DEEP if solid else 0.0015) * min(1.0, k / (0.3 * steps))
     d.ctrl[1] = 0.002 * max(0.0, k / steps - 0.4)
     spent["cpu"] = spent["device"] = 0.0
-    before = time.perf_counter()
+    before = clock()
     mujoco.mj_step(m, d)
-    rows.append((time.perf_counter() - before, spent["cpu"], spent["device"]))
+    rows.append((clock() - before, spent["cpu"], spent["device"]))
     iterations.append(organ.iterations)
     contacts.append(d.ncon)
   total, cpu, dev = 1e3 * np.median(np.array(rows[steps // 2 :]), axis=0)
@@ -139,21 +141,21 @@ def measure(
     "rate_Hz": 1e3 / total,
     "make_s": made,
   }
-  out |= parts(w)
-  out["rest_ms"] = rest(m, d, organ)
+  out |= parts(w, clock)
+  out["rest_ms"] = rest(m, d, organ, clock)
   assert organ.error is None, organ.error
   return out
 
 
-def timed(w, spent: dict):
+def timed(w, spent: dict, clock=time.perf_counter):
   """Makes a workspace note what its parts take."""
 
   def wrap(function, key):
     def call(*args):
-      before = time.perf_counter()
+      before = clock()
       inner = spent["device"] if key == "cpu" else 0.0
       function(*args)
-      taken = time.perf_counter() - before
+      taken = clock() - before
       spent[key] += taken - (spent["device"] - inner if key == "cpu" else 0.0)
 
     return call
@@ -165,20 +167,20 @@ def timed(w, spent: dict):
   def capture_launch(graph, *args):
     if id(graph) not in device_graphs:
       return original(graph, *args)
-    before = time.perf_counter()
+    before = clock()
     original(graph, *args)
     if w.body.device.is_cuda:
       wp.synchronize_device(w.body.device)
-    spent["device"] += time.perf_counter() - before
+    spent["device"] += clock() - before
 
   wp.capture_launch = capture_launch
   w.run = wrap(w.run, "cpu")
   w.step = wrap(w.step, "cpu")
 
 
-def parts(w) -> dict:
+def parts(w, clock=time.perf_counter) -> dict:
   """Returns what each part of a step's work on the organ's device takes, medians in ms."""
-  median = {name: float(np.median(each)) for name, each in times(w).items()}
+  median = {name: float(np.median(each)) for name, each in times(w, clock=clock).items()}
   rest_of_step = median["step"] - median["assemble"] - median["solve"]
   return {
     "search_ms": median["search"],
@@ -239,7 +241,7 @@ def replay(device, works: dict, count: int, clock=time.perf_counter) -> dict[str
   return {name: np.array(each) for name, each in spent.items()}
 
 
-def rest(m, d, organ) -> float:
+def rest(m, d, organ, clock) -> float:
   """Returns a step's time in ms with the probe away and the organ asleep; NaN if it is awake."""
   d.ctrl[:] = 0.08, 0.0
   for _ in range(300):
@@ -248,9 +250,9 @@ def rest(m, d, organ) -> float:
       break
   times = []
   for _ in range(50):
-    before = time.perf_counter()
+    before = clock()
     mujoco.mj_step(m, d)
-    times.append(time.perf_counter() - before)
+    times.append(clock() - before)
   return 1e3 * float(np.median(times)) if organ.asleep else float("nan")
 
 
@@ -264,7 +266,7 @@ def table(out: pathlib.Path) -> list[str]:
     *_rows(out, "loop_c*.csv"),
   ]
   solids = _rows(out, "loop_solid_c*.csv")
-  about = "The filled liver, `--solid`; nodes on its surface. From loop_solid_c*.csv."
+  about = "The filled liver, `--solid`; nodes on its surface. Measured beside other work."
   return lines + (["", "## Solids", "", about, "", *solids] if len(solids) > 2 else [])
 
 

@@ -124,14 +124,13 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
       return "-"
     return f"{r['second_s']:.3g} s ({r['scheme']} {1e3 * r['h']:g} ms, {r['tolerance']:g})"
 
+  def faster(theirs: Row | None, ours: Row | None) -> str:
+    return f"{theirs['second_s'] / ours['second_s']:.3g}" if theirs and ours else "-"
+
   table = []
   for level in LEVELS:
     best = {name: least(mine, level) for name, mine in sides.items()}
-    ratios = [
-      f"{best[name]['second_s'] / best['ours']['second_s']:.3g}"
-      if best[name] and best["ours"] else "-"
-      for name in ("flex", "right")
-    ]  # fmt: skip
+    ratios = [faster(best[name], best["ours"]) for name in ("flex", "right")]
     table.append([f"{100 * level:g} %", *map(cell, best.values()), *ratios])
   head = ["error", "ours, window", f"flex of mujoco {mujoco.__version__}", "flex, right weights"]
   lines = [str(__doc__).partition("\n\n")[2], "", "## Least time of a simulated second", ""]

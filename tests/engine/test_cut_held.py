@@ -198,6 +198,35 @@ def test_what_is_cut_off_rests_on_what_the_organ_rested_on(below):
   assert np.abs(organ.xpos[:, 2] - x[:, 2].mean()).max() < 1.5e-3
 
 
+@pytest.mark.parametrize("where", ["cpu", pytest.param("cuda:0", marks=scenes.needs_cuda)])
+def test_a_motion_that_stays_on_the_device_is_cut_there(where):
+  spec = mujoco.MjSpec()
+  spec.option.gravity = [0, 0, 0]
+  spec.worldbody.add_body(name="tool", mocap=True, pos=[0.045, 0.006, 0.05]).add_geom(
+    size=[0.008, 0, 0]
+  )
+  strip = scenes.triangular(0.08, 0.04, 16, 9, 0.2)
+  keys = KEYS | {"windows": {"tools": [["tool"]], "nodes": 60}, "foundation": 4e4}
+  organs = []
+  for resident in (False, True):
+    each = spec.copy()
+    palpate.add_organ(each, strip, "organ", resident=resident, device=where, **keys)
+    model = each.compile()
+    data = mujoco.MjData(model)
+    organ = palpate.Organ(model, data, "organ")
+    for k in range(100):
+      data.mocap_pos[0, 2] = 0.012 - 6e-5 * k
+      mujoco.mj_step(model, data)
+      if k == 60:
+        organ.cut(LINE)
+    organs.append((organ.xpos, organ.xvel, organ.force, organ.error))
+  (x, v, force, error), (other, speed, felt, trouble) = organs
+  assert error is None and trouble is None and len(x) > 160 and force[2] < -0.01
+  np.testing.assert_allclose(other, x, atol=1e-8)
+  np.testing.assert_allclose(speed, v, atol=1e-5)
+  np.testing.assert_allclose(felt, force, atol=1e-4 * np.abs(force).max())
+
+
 JAWS = """<mujoco><option timestep="0.002"/><worldbody><body name="hand" pos="0.068 0 0">
   <joint name="lift" type="slide" axis="0 0 1"/><inertial pos="0 0 0" mass=".1" diaginertia="1 1 1"
   />

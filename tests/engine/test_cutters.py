@@ -132,6 +132,17 @@ def test_a_state_in_the_middle_of_a_cut_goes_on_to_the_bit():
   assert not organ.cutters[0].inside and organ.cutters[0].energy == 0
 
 
+@BOTH
+def test_pinned_tissue_stays_whole_and_is_cut_beyond(windows):
+  points, _, _ = strip()
+  rim = np.abs(points - [0.025, 0, 0]) > [0.0249, 0.0129, 1]
+  model, data, organ = scene(windows, pin=np.flatnonzero(rim.any(axis=1)))
+  follow(model, data, organ, lambda t: (0.04 * t, 0), 1.6)
+  line = np.concatenate([line for report in organ.cuts for line in report.path])
+  assert 0.001 < line[:, 0].min() < 0.01 and 0.04 < line[:, 0].max() < 0.049
+  assert len(organ.pieces) == 1 and (organ.mass > 0).sum() > len(points) - rim.any(axis=1).sum()
+
+
 def test_scissors_cut_as_far_as_they_close():
   def add(spec, x, z):
     turn = (np.sqrt(0.5), 0, -np.sqrt(0.5), 0)

@@ -116,6 +116,19 @@ def test_bad_arguments_are_named(options, words):
   assert all(word in str(error.value) for word in words)
 
 
+def test_a_skin_has_the_triangles_that_are_declared_where_the_physics_turns_diagonals(scenes):
+  points, triangles = scenes.strip(0.08, 0.04, 8, 4)
+  spec = mujoco.MjSpec()
+  palpate.add_organ(spec, (points, triangles), "organ", young=5e3, mass=0.05, device="cpu")
+  palpate.add_skin(spec, "organ", 1)
+  m = spec.compile()
+  d = mujoco.MjData(m)
+  organ = palpate.Organ(m, d, "organ")
+  assert (np.sort(organ.elem, axis=1) != np.sort(triangles, axis=1)).any()
+  mujoco.mj_forward(m, d)
+  np.testing.assert_allclose(drawn(m, d), subdivide.smooth(triangles, 1)(points), atol=1e-7)
+
+
 def test_bad_skins_are_named():
   with pytest.raises(ValueError, match="no flexcomp 'liver'"):
     palpate.add_skin(scene(skin=False), "liver")

@@ -246,6 +246,13 @@ def test_trace_rms_of_an_offset_line():
   assert metrics.trace_rms(pos[::-1], curve) == pytest.approx(0.002)
 
 
+def test_what_a_cut_is_like_is_said_at_its_end():
+  for name in ("deviation", "farthest", "excess", "jagged"):
+    measure = getattr(metrics, f"cut_{name}")
+    assert measure([0.0, 1e-4, 3e-4]) == 3e-4
+    assert _unknown(measure([]), "too few samples: 0,")
+
+
 def test_share_freed_is_the_last():
   assert metrics.share_freed([0.0, 0.2, 0.6]) == 0.6
   assert _unknown(metrics.share_freed([]), "too few samples: 0,")

@@ -34,6 +34,15 @@ def test_fresh_performers_rank_as_they_should(name):
   assert mean(expert) > mean(people) > mean(novice)
 
 
+@pytest.mark.parametrize(
+  ("name", "seed"),
+  # A pinched fold shook the jaws; an inclusion at the field's edge was missed.
+  [("grasp/hard", 17), ("probe/palpate_standard", 18)],
+)
+def test_an_expert_is_proficient_where_it_once_was_not(name, seed):
+  assert share(scores(name, "expert", [seed])) == 1
+
+
 def test_the_expert_teases_with_the_tip_alone():
   env = tasks.load("tease", "easy", task_kwargs={"random": 0})
   metrics = episode.run(env, performer.make(env), 60).metrics()

@@ -263,6 +263,13 @@ def test_a_strain_given_as_a_function_is_worked_out_once_and_in_time():
   _same_bits(made.recording().columns["strain"], plain.recording().columns["strain"])
 
 
+def test_a_number_that_no_sample_has_is_named():
+  made = Recorder()
+  with pytest.raises(TypeError, match=r"append takes no 'forse', expected some of .*force"):
+    made.append(0.0, (0, 0, 0), forse=1.0)
+  assert len(made) == 0
+
+
 def test_missing_samples_are_nan_and_make_the_metric_unknown():
   recorder = Recorder(settings=SETTINGS)
   recorder.append(0.0, [0, 0, 0])

@@ -221,6 +221,8 @@ def test_bad_input_is_named():
     make("touch/easy", output="jax")
   with pytest.raises(ValueError, match="device is 'tpu'"):
     make("touch/easy", device="tpu")
+  with pytest.raises(ValueError, match=r"expected at most \d+"):
+    make("touch/easy", 10**9)
   for options, what in (
     ({"pixels": (8, 8)}, "makes no pictures"),
     ({"randomise": {"friction": (1, 2)}}, "randomise is given"),
@@ -239,8 +241,23 @@ def test_bad_input_is_named():
     action[1, 3] = bad
     with pytest.raises(ValueError, match="action insertion of world 1 is"):
       env.step(action)
+  with pytest.raises(ValueError, match=r"reset_mask has shape \(2,\) of int64, expected \(2,\)"):
+    env.reset(options={"reset_mask": np.array([1, 0])})
   with pytest.raises(ValueError, match="seed has 3 numbers, expected 2"):
     env.reset(seed=[1, 2, 3])
+
+
+def test_devices_share_the_worlds():
+  env, alone = make("touch/easy", 3, device=["cpu", "cpu"]), make("touch/easy", 3)
+  for each in (env, alone):
+    each.reset(seed=0)
+  action = np.outer([0.1, 0.2, 0.3], np.ones(4))
+  for found, expected in zip(env.step(action)[:4], alone.step(action)[:4], strict=True):
+    names = found if isinstance(found, dict) else [()]
+    assert all(np.array_equal(found[name], expected[name]) for name in names)
+  action[2, 0] = 2.0
+  with pytest.raises(ValueError, match="action pitch of world 2 is 2"):
+    env.step(action)
 
 
 def test_arrays_of_warp():

@@ -360,29 +360,29 @@ class Link:
     if device.rate * h * _SLOW < 1:
       force = _towards(self.force, force, _EDGE)
     if options.passive:
-      force = _limited(force, self._affordable(force))
+      force = self._affordable(force)
     torque = STILL
     if device.torque_limit:
       torque = _into(m, wrench[3], wrench[4], wrench[5], scale)
       torque = _limited(torque, device.torque_limit)
-    self.force = force
-    (x, y, z), (a, b, c, count) = force, self._pushed
+    self.force = x, y, z = force
+    a, b, c, count = self._pushed
     self._pushed = a + x, b + y, c + z, count + 1
     self._send(force, torque)
 
-  def _affordable(self, force: Three) -> float:
-    """Returns the largest force that cannot give the hand more energy than there is [N].
+  def _affordable(self, force: Three) -> Three:
+    """Returns a force made so small that it cannot give the hand more energy than there is.
 
     Until the next reading the hand goes no further than its speed takes it, and the force itself
     takes the lightest of hands.
     """
     x, y, z = force
-    size = math.sqrt(x * x + y * y + z * z)
-    if size < 1e-9:
-      return size
-    interval = 1 / self.device.rate
+    size, interval = math.sqrt(x * x + y * y + z * z), 1 / self.device.rate
     far = (self._fast + size * interval / _LIGHTEST) * interval
-    return max(self.energy, 0.0) / max(far, 1e-9)
+    if size * far <= self.energy or size < 1e-9:
+      return force
+    scale = max(self.energy, 0.0) / max(size * far, 1e-9 * size)
+    return (x * scale, y * scale, z * scale)
 
   def _send(self, force: Three, torque: Three) -> None:
     device = self.device

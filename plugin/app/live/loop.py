@@ -108,16 +108,18 @@ class Loop:
     """
     model, data, h = self._model, self._data, self._model.opt.timestep
     steps, k = duration / h, 0
+    hands = list(enumerate(zip(self.links, self._handles, strict=True)))
     try:
       with punctual(realtime):
         while k < steps and tick(self.pace, self.links, [tip.tolist() for tip in self._tips]):
-          for i, (link, handle) in enumerate(zip(self.links, self._handles, strict=True)):
+          for i, (link, handle) in hands:
             row, before, self._rows[i] = link.row, self._rows[i], link.row
             vel = (row[0] - before[0]) / h, (row[1] - before[1]) / h, (row[2] - before[2]) / h
             handle.move(row[:3], row[3:], vel, spin(before[3:], row[3:], h))
-          self._close_jaws()
+          if self._jaws:
+            self._close_jaws()
           mujoco.mj_step(model, data)
-          for link, handle in zip(self.links, self._handles, strict=True):
+          for _, (link, handle) in hands:
             link.feel(handle.wrench())
           k += 1
           if watch is not None:

@@ -81,9 +81,9 @@ const HEAR = {
     $("start").disabled = false;
     document.body.dataset.device = menu.device;
   },
-  loading({text}) {
+  loading({text, note}) {
     tell("");
-    $("instruction").textContent = `${text} is being made ready`;
+    $("instruction").textContent = `${text} is being made ready${note}`;
   },
   scene(message) {
     scene = message;

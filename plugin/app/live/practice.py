@@ -60,7 +60,8 @@ class Practice:
       step: of the physics [s]
       scheme: time stepping, see `integrator` in docs/configuration.md
       options: of the coupling
-      publish: called 30 times a second at most, in the loop's thread, to copy what pictures need
+      publish: called before the first step, and then 30 times a second at most, in the loop's
+        thread, to copy what pictures need
       pace: real time by default
     """
     spec = models.load(organ, instruments=tuple(hands), handle=True, coupling="window", **size)  # pyright: ignore
@@ -98,6 +99,8 @@ class Practice:
     self._look = watch
     try:
       first = realtime and self._spare()
+      if self._publish is not None:
+        self._publish(self)  # the shapes of a scene take longer than a step
       self._loop.run(watch=self._watch, realtime=first)
     finally:
       for link in self.links:

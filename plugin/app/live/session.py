@@ -53,7 +53,8 @@ class Session:
       options: of the coupling
       pace: real time by default
       coach: looks on after every control step, see `coach.Coach`
-      publish: called 30 times a second, in the loop's thread: to copy what pictures need, no more
+      publish: called before the first step, and then 30 times a second, in the loop's thread: to
+        copy what pictures need, no more
     """
     if not env.task.scene.handle:
       raise ValueError(f"{env.task.name}: input is 'drives', expected 'handle' for a device")
@@ -104,6 +105,8 @@ class Session:
       self._rows[:, : len(ROW)] = self.link.row
       if self.coach is not None:
         self.coach.begin(self.env)
+      if self._publish is not None:
+        self._publish(self)  # the shapes of a scene take longer than a step
     return self._rows
 
   def _live(self, rows: np.ndarray, k: int) -> None:

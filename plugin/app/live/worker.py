@@ -241,7 +241,7 @@ class Worker:
 
     if self._record is not None:
       self._record.keeping.check(job["task"])
-    self._tell({"type": "loading", "text": job["task"]})
+    self._tell({"type": "loading", "text": job["task"], "note": ""})
     kwargs = _kwargs(job)
     env = suite.load(*suite.split(job["task"]), task_kwargs={"random": 0, **kwargs})
     info = {"task_kwargs": kwargs, "person": job["person"], "seed": job["seed"]}
@@ -281,7 +281,8 @@ class Worker:
     self._publish(lambda: camera.frame(link, pace, env.task.progress))
 
   def _practise(self, job: dict[str, Any]) -> None:
-    self._tell({"type": "loading", "text": f"{job['organ']}, {job['mesh']}"})
+    note = ", which takes a minute or more" if job["size"].get("grid", 0) > 100 else ""
+    self._tell({"type": "loading", "text": f"{job['organ']}, {job['mesh']}", "note": note})
     right, left = job["instrument"], job["left"]
     hands = {}
     with contextlib.ExitStack() as stack:
