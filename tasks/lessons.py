@@ -80,7 +80,8 @@ def give(
   task.random, random = np.random.RandomState(seed), np.random.RandomState(seed)
   moves = noise * np.isin(task.components, AXES)
   timestep, phase = env.reset(), random.randint(SHAKEN + CALM)
-  expert, left = (Teacher(env), math.inf) if learner is None else (None, random.randint(*LEARNER))
+  expert: Any = Teacher(env) if learner is None else None
+  left = random.randint(*LEARNER) if learner else math.inf
   seen, done, rewards, taught = [], [], [], []
   while not timestep.last():
     if not left:
