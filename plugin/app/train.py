@@ -110,7 +110,8 @@ class Training:
     self.school = School(folder, name, self.kwargs, args.seed)
     if args.resume and not (self.school.rounds or (folder / learning.CHECKPOINT).exists()):
       raise CommandError(f"out has no {learning.CHECKPOINT} to go on with")
-    taught = bool(args.lessons or self.school.rounds)
+    begun = (folder / learning.CHECKPOINT).exists()
+    taught = bool(self.school.rounds or (args.lessons and not begun))
     self.settings = learning.Settings(seed=args.seed, **(learning.TAUGHT if taught else {}))
     single: Any = options.environment(name, self.school.task_kwargs)
     self.task, spec = single.task, single.observation_spec()
@@ -130,7 +131,9 @@ class Training:
     from palpate.tasks.batch import learning
 
     school, networks, stop = self.school, self.networks, _watch(interrupt)
-    if school.rounds and not (self.folder / learning.CHECKPOINT).exists():
+    if (self.folder / learning.CHECKPOINT).exists():  # it practises already
+      return True
+    if school.rounds:
       networks.learn(school.lessons, stop)
     while self.args.lessons and school.rounds < _ROUNDS:
       if not school.teach(networks, crew, self.args.lessons, self.settings.gamma, interrupt):

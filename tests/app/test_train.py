@@ -122,7 +122,7 @@ def test_what_is_wrong_is_said_before_the_work(tmp_path, capsys):
     (["touch/easy", "-o", str(tmp_path)], "expected --resume or another folder"),
     (["touch/easy", "-o", str(tmp_path / "new"), "--resume"], "to go on with"),
     (["touch/easy", "-o", str(tmp_path), "--resume", "--num-envs", "1"], "checkpoint.safetensors"),
-    (["touch/hard", "-o", str(tmp_path / "new"), "--num-envs", "1"], "expected one shape"),
+    (["tease/easy", "-o", str(tmp_path / "new"), "--lessons", "0"], "is not vectorised"),
     (["touch/easy", "-o", str(tmp_path / "new"), "--num-envs", "0"], "num_envs is 0"),
     (["sew/easy", "-o", str(tmp_path / "new")], "task is 'sew/easy'"),
   ):
