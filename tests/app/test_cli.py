@@ -91,7 +91,7 @@ def test_loading_and_running_a_scene_says_nothing_and_leaves_no_log(tmp_path):
     ("--seed -1", "seed is -1, expected a number in [0, 2^32)"),
     ("--device abacus", "device is 'abacus', expected 'cpu', 'cuda:0' or 'auto'"),
     ("--device cuda:63", "device is 'cuda:63'"),
-    ("--set yung=3", "expected KEY=VALUE with one of elements, young"),
+    ("--set yung=3", "expected KEY=VALUE with one of elements, tetrahedra, young"),
     ("--set young=soft", "organ 'organ': young is 'soft', expected a number > 0"),
     ("--organ spleen", "no organ 'spleen' in the model, it has 'organ'"),
     ("--actuator motor", "no actuator 'motor' in the scene, it has 'probe'"),

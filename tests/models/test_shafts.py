@@ -16,7 +16,8 @@ def test_an_edge_far_from_its_nodes_does_not_go_through(scenes, name):
   trocar.attach(spec, name, "tool/")
   model = spec.compile()
   data = mujoco.MjData(model)
-  for height in np.arange(0.002, 0.15, 0.001):  # above the tip
+  lowest = 0.0095 if name == "scalpel" else 0.002  # its blade goes through what it cuts
+  for height in np.arange(lowest, 0.15, 0.001):  # above the tip
     data.joint("tool/insertion").qpos = height - 0.02
     mujoco.mj_forward(model, data)
     tip, shaft = (data.sensor(f"tool/{part}_contacts").data[0] for part in ("tip", "shaft"))
