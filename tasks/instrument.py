@@ -194,6 +194,11 @@ class Instrument:
     body.pos[:], body.quat[:] = body.pos + shift, quat
     self._trocar = trocar.trocar(model, self.prefix)
 
+  @property
+  def busy(self) -> bool:
+    """Whether `advance` has something to do."""
+    return self.handle is not None or self._jaws is not None
+
   def begin(self, nstep: int) -> None:
     """Begins to keep what `nstep` steps of the physics do."""
     self._felt = np.zeros((nstep, 6))

@@ -83,6 +83,7 @@ class Physics(Instrument, Portable):
       begin, end, sensors = mj.mj_step1, mj.mj_step2, data.sensordata
       values = np.empty((nstep, model.nsensordata))
       hands, h = self.hands, self.timestep()
+      busy = [hand for hand in hands if hand.busy]
       for hand in hands:
         hand.begin(nstep)
       for k in range(nstep):
@@ -91,7 +92,7 @@ class Physics(Instrument, Portable):
         if self._cuts:  # MuJoCo's contacts know nothing of it
           self.edge = np.sum([cutter.force for cutter in self.organ.cutters], axis=0)
           values[k, self._sensors["tip_force"]] += self.edge
-        for hand in hands:
+        for hand in busy:
           hand.advance(k, nstep, h)
         if k == nstep // 2 and self.meanwhile is not None:
           self.meanwhile()
