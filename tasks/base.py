@@ -66,6 +66,7 @@ SHARE, PRICE, MOST = 0.4, 0.1, 0.55
 _FACING = 0.75  # least cosine between a target's normal and the way to the trocar
 _PIN_GAP = 0.012  # targets keep this far from pinned nodes [m]
 SLACK = 1e-6  # what rounding may add to an action
+_BACK = 0.03  # by how much the other hand begins farther away: the two would meet [m]
 
 
 class Task(control.Task):
@@ -302,10 +303,11 @@ class Task(control.Task):
   def _place_instrument(self, physics: Physics) -> None:
     _, center = self.place_of_work(physics)
     for hand in physics.hands:
+      back = 0.0 if hand is physics else _BACK
       port = hand.trocar()
       away = (port.pos - center) / np.linalg.norm(port.pos - center)
       aside = self.random.uniform(-0.015, 0.015, 3)
-      tip = center + self.random.uniform(0.03, 0.045) * away + aside
+      tip = center + (self.random.uniform(0.03, 0.045) + back) * away + aside
       joints = trocar.inverse(port, tip)
       pose = np.array([joints[0], joints[1], self.random.uniform(-0.5, 0.5), joints[2]])
       hand.set_joints(pose)
