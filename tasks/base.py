@@ -66,7 +66,7 @@ SHARE, PRICE, MOST = 0.4, 0.1, 0.55
 _FACING = 0.75  # least cosine between a target's normal and the way to the trocar
 _PIN_GAP = 0.012  # targets keep this far from pinned nodes [m]
 SLACK = 1e-6  # what rounding may add to an action
-_BACK = 0.03  # by how much the other hand begins farther away: the two would meet [m]
+_BACK = 0.008  # by how much the other hand begins farther away: the two would meet [m]
 
 
 class Task(control.Task):
