@@ -25,7 +25,6 @@ from .base import Physics
 from .dissect import Dissect
 from .grasp import FUNDUS
 from .performer import Performer, Script
-from .scenes import Scene
 
 SUITE = containers.TaggedTasks()
 # Stiffness [N/m^3], strength [Pa] and energy [J/m^2] of the bed; ours, we know of no measurement. A
@@ -37,10 +36,9 @@ TOUCHING, BURN = 0.03, 0.5  # force with which the hook touches [N], time that i
 SCENE = dataclasses.replace(
   FUNDUS, nodes=250, bonds=BED, second="hook", second_port=(-0.05, -0.01, 0.12)
 )
-# Of the expert: how far it pulls at most [m] and how fast [m/s], how much further than it has to,
-# the share of the largest traction it keeps under, how far the hook stays from a bond and begins
-# above it [m], and how much it pulls up.
-_FAR, _SPEED, _MORE, _SHARE, _OFF, _WAITS, _UP = 0.03, 0.01, 0.3, 0.7, 0.0015, 0.01, 0.5
+# Of the expert: how far it pulls at most [m], how much further than it has to, the share of the
+# largest traction it keeps under, how far the hook stays from a bond and begins above it [m].
+_FAR, _MORE, _SHARE, _OFF, _WAITS = 0.03, 0.3, 0.7, 0.0015, 0.01
 
 
 @SUITE.add("benchmarking", "easy", "bimanual")
@@ -79,11 +77,6 @@ class Bimanual(Dissect):
   def other(self) -> tuple[str, ...]:
     """See `Task`."""
     return ("current",)
-
-  def __init__(self, scene: Scene, random=None, **kwargs):
-    """Makes the task; arguments as of `Dissect`."""
-    super().__init__(scene, random, **kwargs)
-    self.burnt = 0.0
 
   def begin(self, physics: Physics) -> None:
     """Draws the site to grasp."""
@@ -162,24 +155,16 @@ class Bimanual(Dissect):
 
   def _pull(self, p: Performer) -> Script:
     """Grasps and pulls away from the bed, and holds it so."""
-    physics, up = p.physics, p.hand.trocar().mat[:, 2]
+
+    def further(contact: float) -> bool:
+      near = self.retracted(p.physics) < (1 + _MORE) * p.excess(contact) * AWAY
+      return near and self.traction < _SHARE * self.limit
+
     for again in itertools.count():
       if self.outcome is not None:
         return
       yield from p.close(self.site, again)
-      away = physics.point(self.site) - self.front(physics)
-      along = away / np.linalg.norm(away) + _UP * up
-      along /= np.linalg.norm(along)
-      start, far, contact = p.tip.copy(), 0.0, 0.0
-      while self.grasped and self.outcome is None:
-        contact += self.control_timestep
-        near = self.retracted(physics) < (1 + _MORE) * p.excess(contact) * AWAY
-        if near and self.traction < _SHARE * self.limit:
-          far = min(far + _SPEED * p.style.speed * self.control_timestep, _FAR)
-        p.tip = start + far * along
-        p.grip(contact)
-        yield p.step()
-      yield from p.open()
+      yield from self.pull(p, _FAR, further)
 
   def _divide(self, p: Performer) -> Script:
     """Waits for the pull, and goes from bond to bond."""

@@ -16,6 +16,7 @@ The bed stands: the liver is what its bonds pull at.
 
 import dataclasses
 import itertools
+from collections.abc import Callable
 
 import numpy as np
 from dm_control.utils import containers
@@ -129,23 +130,33 @@ class Dissect(Freeing, Hold):
 
   def expert(self, p: Performer) -> Script:
     """Grasps and pulls away from the bed, and grasps again what slipped."""
-    physics, up = p.physics, p.physics.trocar().mat[:, 2]
+    up = p.hand.trocar().mat[:, 2]
     for again in itertools.count():
       if self.outcome is not None:
         return
       yield from p.close(self.site, again)
       yield from p.wait(p.style.delay)
-      away = physics.point(self.site) - self.front(physics)
-      along = away / np.linalg.norm(away) + _UP * up
-      along /= np.linalg.norm(along)
-      start, far, contact = p.tip.copy(), 0.0, 0.0
       most = _FAR * (1 + 0.3 * p.style.overshoot)
-      while self.grasped and self.outcome is None:
-        contact += self.control_timestep
-        if self.traction < 0.8 * self.limit:
-          far = min(far + _SPEED * p.style.speed * self.control_timestep, most)
-        p.tip = start + far * along
-        p.grip(contact)
-        yield p.step()
-      yield from p.open()
+      yield from self.pull(p, most, lambda contact: self.traction < 0.8 * self.limit)
       yield from p.move(p.tip + 0.02 * up)
+
+  def pull(self, p: Performer, most: float, further: Callable[[float], bool]) -> Script:
+    """Pulls what is grasped away from the bed until it is lost or all is done, and lets go.
+
+    Args:
+      p: who has grasped it
+      most: how far at most [m]
+      further: whether to pull on, by the time that it was held [s]
+    """
+    away = p.physics.point(self.site) - self.front(p.physics)
+    along = away / np.linalg.norm(away) + _UP * p.hand.trocar().mat[:, 2]
+    along /= np.linalg.norm(along)
+    start, far, contact = p.tip.copy(), 0.0, 0.0
+    while self.grasped and self.outcome is None:
+      contact += self.control_timestep
+      if further(contact):
+        far = min(far + _SPEED * p.style.speed * self.control_timestep, most)
+      p.tip = start + far * along
+      p.grip(contact)
+      yield p.step()
+    yield from p.open()

@@ -154,7 +154,7 @@ class Group:
       restless=int(other is not None or may_move(m, self.body)),
       ahead=float(scheme.ahead),
       gain=scheme.gain(1.0, 0.0),
-      state=w.bonds.rows,
+      state=w.bonds.rows("bond", len(BOND)),
       own=nodes(w),
       solve=solver(w),
       other=Nodes() if other is None else nodes(other),
@@ -183,6 +183,8 @@ class Bonds(Beside):
   Args:
     w: the workspace
   """
+
+  ENTER = _enter
 
   def __init__(self, w):
     super().__init__(w)
@@ -236,20 +238,7 @@ class Bonds(Beside):
   @property
   def state(self) -> np.ndarray:
     """Damage and more of each vertex that moves, in the plugin state, (nfree, len(BOND))."""
-    return self.rows.numpy()
-
-  @property
-  def rows(self) -> wp.array:
-    """The same, as kernels take it."""
-    w = self._w
-    where, n = coupling.spans(w.organ)["bond"], coupling.sizes(w.organ)["nbond"]
-    address = w.views["plugin_state"].ptr + 8 * where.start
-    return wp.array(ptr=address, dtype=wp.float64, shape=(n, len(BOND)), device="cpu")
-
-  def load(self):
-    """See `Beside`."""
-    if self:
-      _enter.load(wp.get_device("cpu"))
+    return self.rows("bond", len(BOND)).numpy()
 
   def bind(self, model: int):
     """See `Beside`; also those of other organs, which this one's graphs launch."""

@@ -2,7 +2,6 @@
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -53,10 +52,11 @@ class Creep(Beside):
     w: the workspace
   """
 
+  ENTER, END = _enter, _end
+
   def __init__(self, w):
     super().__init__(w)
     self._number = wp.zeros(2, dtype=wp.float64, device="cpu")
-    self._creeping: Any = None
     self.renumber(w.config)
 
   def __bool__(self) -> bool:
@@ -66,49 +66,29 @@ class Creep(Beside):
     """Takes the numbers of a configuration that may change while running."""
     self._number.numpy()[:] = config.relax_share, config.relax_time
 
-  def load(self):
-    """See `Beside`."""
-    if self:
-      _enter.load(wp.get_device("cpu"))
-
   def bind(self, model: int):
     """See `Beside`."""
     if not self:
       return
     w, organ = self._w, self._w.organ
     sizes = coupling.sizes(organ)
-    where = coupling.spans(organ)["creep"]
-    state = w.views["plugin_state"]
-    own = wp.array(
-      ptr=state.ptr + 8 * where.start, dtype=wp.float64, shape=(sizes["ncreep"], 6), device="cpu"
-    )
     values = dict(
       held=int(bool(w.hold)),
       hold=w.hold.array if w.hold else np.zeros((0, 0, 6, 8)),
       windowed=int(organ.windows is not None),
       ncreep=sizes["ncreep"],
       node=w.body.shape.node.numpy()[np.flatnonzero(organ.free)],
-      own=own,
+      own=self.rows("creep", 6),
       number=self._number,
       flags=wp.array(np.asarray(w.flags), dtype=int, device="cpu", copy=False),
       tail=w.boxes["own"].tail if organ.windows else np.zeros(len(TAIL)),
       mj=coupling.mujoco_arrays(model, w.data, Clock),
     )
     names = ("mass", "force_ext", "dvel", "sol", "rhs", "status")
-    self._creeping = fill(Creeping, "cpu", values | {name: w.host[name] for name in names})
+    self.fields = fill(Creeping, "cpu", values | {name: w.host[name] for name in names})
 
   def carry(self, group: np.ndarray, member: np.ndarray, share: np.ndarray):
     """See `Beside`."""
     if self:
-      own, at = self._creeping.own.numpy(), np.cumsum(self._w.organ.free) - 1
+      own, at = self.fields.own.numpy(), np.cumsum(self._w.organ.free) - 1
       own[at[member]] = share[:, None] * own[at[group]]
-
-  def enter(self):
-    """See `Beside`."""
-    if self:
-      _enter.launch("cpu", 1, 1, 0, self._creeping)
-
-  def end(self):
-    """See `Beside`."""
-    if self:
-      _end.launch("cpu", 1, 1, 0, self._creeping)

@@ -97,13 +97,14 @@ class Cutters(Beside):
     w: the workspace
   """
 
+  ENTER, ACT, END = _enter, _act, _keep
+
   def __init__(self, w):
     super().__init__(w)
     self.names: list[tuple[str, ...]] = []
     self._arrays: dict[str, np.ndarray] = {}
     self._width = np.zeros(0)
     self._currents: dict[int, Current] = {}
-    self._blades: Any = None
     self._due: Any = ()
     self._said = False
 
@@ -156,20 +157,7 @@ class Cutters(Beside):
   @property
   def state(self) -> np.ndarray:
     """Where each is in the tissue, in the plugin state, (nblade, len(BLADE))."""
-    return self._rows.numpy()
-
-  @property
-  def _rows(self) -> wp.array:
-    w = self._w
-    where = coupling.spans(w.organ)["blade"]
-    address = w.views["plugin_state"].ptr + 8 * where.start
-    shape = len(self.names), len(BLADE)
-    return wp.array(ptr=address, dtype=wp.float64, shape=shape, device="cpu")
-
-  def load(self):
-    """See `Beside`."""
-    if self:
-      _enter.load(wp.get_device("cpu"))
+    return self.rows("blade", len(BLADE)).numpy()
 
   def bind(self, model: int):
     """See `Beside`."""
@@ -188,44 +176,29 @@ class Cutters(Beside):
       law=self._law(m),
       elem=mesh.elem,
       flat=mesh.rest,
-      state=self._rows,
+      state=self.rows("blade", len(BLADE)),
       due=np.zeros(n),
       own=nodes(w),
       solve=solver(w),
       number=w.body.numbers,
       mj=coupling.mujoco_arrays(model, w.data, Bodies),
     )
-    self._blades = fill(Blades, "cpu", values)
-    self._due = self._blades.due.numpy().data
+    self.fields = fill(Blades, "cpu", values)
+    self._due = self.fields.due.numpy().data
 
   def refresh(self):
     """Takes the thickness that the wall has now."""
-    if self._blades is not None:
-      self._blades.law.assign(self._law(mjstruct.Model.from_address(self._w.model)))
+    if self.fields is not None:
+      self.fields.law.assign(self._law(mjstruct.Model.from_address(self._w.model)))
 
   def reshape(self) -> list:
     """See `Beside`."""
-    if self._blades is not None:
+    if self.fields is not None:
       mesh = self._w.organ.mesh
-      self._blades.elem.assign(mesh.elem)
-      self._blades.flat.assign(mesh.rest)
-      self._blades.own.rest.assign(base(self._w.organ))
+      self.fields.elem.assign(mesh.elem)
+      self.fields.flat.assign(mesh.rest)
+      self.fields.own.rest.assign(base(self._w.organ))
     return []
-
-  def enter(self):
-    """See `Beside`."""
-    if self:
-      _enter.launch("cpu", 1, 1, 0, self._blades)
-
-  def act(self):
-    """See `Beside`."""
-    if self:
-      _act.launch("cpu", 1, 1, 0, self._blades)
-
-  def end(self):
-    """See `Beside`."""
-    if self:
-      _keep.launch("cpu", 1, 1, 0, self._blades)
 
   def open(self) -> bool:
     """Lets the mesh come apart along the paths that are long enough, or ended; returns whether."""
@@ -234,7 +207,7 @@ class Cutters(Beside):
       self._due[i] = self._follow(current, self.state[i])
     for i, due in enumerate(self._due):
       if due:
-        given = _GIVEN * self._blades.law.numpy()[i, LAW.force] * mesh.whole.edge_length
+        given = _GIVEN * self.fields.law.numpy()[i, LAW.force] * mesh.whole.edge_length
         opened = self._open(self.state[i], due == _ENDED, given) or opened
         self._due[i] = 0
     return opened
@@ -317,7 +290,7 @@ class Cutters(Beside):
     return out
 
   def _forces(self) -> np.ndarray:
-    return self._blades.force.numpy() @ self._w.organ.frame.T
+    return self.fields.force.numpy() @ self._w.organ.frame.T
 
 
 def _part(mesh, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -6,12 +6,15 @@ over an organ's `Nodes` and its solver's `Input`, and cost nothing where they ar
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
+from typing import Any
+
 import numpy as np
 import warp as wp
 from palpate.tissue import body as bodies
+from palpate.tissue.kernels import Kernel
 from palpate.tissue.types import doubles, fill, floats, ints, struct, vector
 
-from . import mjstruct
+from . import coupling, mjstruct
 from .layout import TAIL
 
 
@@ -74,13 +77,24 @@ class Beside:
 
   Args:
     w: the workspace
+
+  Attributes:
+    ENTER, ACT, END: kernels of `enter`, `act` and `end`, None for nothing
+    fields: what they take, made by `bind`
   """
+
+  ENTER: Kernel | None = None
+  ACT: Kernel | None = None
+  END: Kernel | None = None
 
   def __init__(self, w):
     self._w = w
+    self.fields: Any = None
 
   def load(self):
     """Loads the kernels, if there is something to do for them."""
+    if self and self.ENTER is not None:
+      self.ENTER.load(wp.get_device("cpu"))
 
   def bind(self, model: int):
     """Points the kernels at the arrays of a model and of the workspace's mjData."""
@@ -104,12 +118,25 @@ class Beside:
 
   def enter(self):
     """Adds to the solver's input, after a coupling has filled it."""
+    self._launch(self.ENTER)
 
   def act(self):
     """Lets bodies feel what has acted."""
+    self._launch(self.ACT)
 
   def end(self):
     """Takes into the plugin state what the step has made of it."""
+    self._launch(self.END)
+
+  def _launch(self, kernel: Kernel | None):
+    if self and kernel is not None:
+      kernel.launch("cpu", 1, 1, 0, self.fields)
+
+  def rows(self, block: str, width: int) -> wp.array:
+    """Returns a block of the plugin state as kernels take it, (n, width)."""
+    where, state = coupling.spans(self._w.organ)[block], self._w.views["plugin_state"]
+    shape = (where.stop - where.start) // width, width
+    return wp.array(ptr=state.ptr + 8 * where.start, dtype=wp.float64, shape=shape, device="cpu")
 
 
 def nodes(w):

@@ -122,12 +122,13 @@ class Ties(Beside):
     w: the workspace
   """
 
+  ENTER, ACT = _enter, _act
+
   def __init__(self, w):
     super().__init__(w)
     self.groups: list[Group] = []
     self._room = 0
     self._arrays: dict[str, wp.array] = {}
-    self._tied: Any = None
 
   def __bool__(self) -> bool:
     return self._room > 0
@@ -169,8 +170,8 @@ class Ties(Beside):
 
   def reshape(self) -> list:
     """See `Beside`."""
-    if self._tied is not None:
-      self._tied.own.rest.numpy()[:] = base(self._w.organ)
+    if self.fields is not None:
+      self.fields.own.rest.numpy()[:] = base(self._w.organ)
     spaces = [self._w, *{id(g.other): g.other for g in self.groups if g.other}.values()]
     grown = []
     for w in spaces:
@@ -191,11 +192,6 @@ class Ties(Beside):
       start = stop
     return out
 
-  def load(self):
-    """See `Beside`."""
-    if self:
-      _enter.load(wp.get_device("cpu"))
-
   def bind(self, model: int):
     """See `Beside`."""
     if not self:
@@ -211,7 +207,7 @@ class Ties(Beside):
       dvel_warm=w.host["dvel_warm"],
       mj=coupling.mujoco_arrays(model, w.data, Bodies),
     )
-    self._tied = fill(Tied, "cpu", values)
+    self.fields = fill(Tied, "cpu", values)
 
   def _leads(self, body: int) -> bool:
     """Returns whether it is stable that springs act where the last steps lead what they hold."""
@@ -222,16 +218,6 @@ class Ties(Beside):
     if body == TO_OWN_MOTION:
       return weight < _LEADS * w.organ.mass.sum()
     return body > 0 and weight * mjstruct.view(m.body_invweight0, (m.nbody, 2))[body, 0] < _LEADS
-
-  def enter(self):
-    """See `Beside`."""
-    if self:
-      _enter.launch("cpu", 1, 1, 0, self._tied)
-
-  def act(self):
-    """See `Beside`."""
-    if self:
-      _act.launch("cpu", 1, 1, 0, self._tied)
 
   def aim(self):
     """Finds where the points on other organs are."""
