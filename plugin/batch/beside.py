@@ -19,8 +19,10 @@ from palpate.tissue.kernels import Kernel, kernel
 from palpate.tissue.step import SCHEMES
 from palpate.tissue.types import DIMS, Array, doubles, fill, floats, ints, struct, vector
 
-from .bonds import Bonds
+from .bonds import HELD, Bonds
 from .patch import launch
+
+_HELD = wp.constant(HELD)
 
 
 @struct
@@ -106,7 +108,8 @@ def _put_back(mask: wp.array[bool], start: wp.array2d[wp.float64], out: wp.array
 def _show(b: WorldBonded, first: int, damage: wp.array2d[float], force: wp.array3d[float]):
   """Writes damage and force of bonds."""
   w, n = wp.tid()
-  damage[w, first + n] = wp.clamp(float(b.state[w, n, 0]), 0.0, 1.0)
+  had = b.state[w, n, 0]
+  damage[w, first + n] = wp.where(had >= wp.float64(1.0), 1.0, wp.min(float(had), _HELD))
   for c in range(3):
     force[w, first + n, c] = float(b.force[w, n, c])
 

@@ -10,6 +10,8 @@ from palpate.bonds import Bonds as Alone
 
 from .base import on_device
 
+HELD = 1.0 - 2.0**-24  # the most damage that leaves a bond, in float32
+
 
 class Bonds(abc.ABC):
   """The bonds of an organ in all worlds, those that the model declares; arrays as of `Batch`.
@@ -102,7 +104,8 @@ class OfThreads(Bonds):
   def _tell(self):
     damage, force = self._damage.numpy(), self._force.numpy()
     for world, alone in enumerate(self._alone):
-      damage[world], force[world] = alone.damage, alone.force
+      damage[world] = np.where(alone.free, 1.0, np.minimum(alone.damage, HELD))
+      force[world] = alone.force
 
   def _weaken(self, amount: wp.array):
     rows = amount.numpy().astype(float)
