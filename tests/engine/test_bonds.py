@@ -305,6 +305,19 @@ def test_bonds_of_python_are_copied_and_end_with_a_reset(make):
   assert not len(organ.bonds) and not organ.displacement.any()
 
 
+def test_what_is_held_before_anything_was_computed_is_held_where_it_is(make):
+  model, data, organ = make(bonds="none")
+  organ.bond("hand", *LAW, vertices=[3, 17])
+  grip = organ.attach([40], "hand")
+  data.mocap_pos[0] += [0, 0, 1e-3]
+  organ.bond("hand", *LAW, vertices=[5])  # it is where it will be found
+  data.mocap_pos[0] -= [0, 0, 1e-3]
+  mujoco.mj_step(model, data)
+  stretch = np.round(organ.bonds.stretch, 9)
+  np.testing.assert_array_equal(stretch, [[0, 0, 0], [0, 0, 0], [0, 0, 1e-3]])
+  assert np.abs(grip.force).max() < 1e-3
+
+
 def test_a_motion_that_is_set_leaves_what_is_torn_and_a_reset_of_the_organ_heals(make):
   model, data, organ, _ = _torn(make)
   _pull(model, data, 350)
