@@ -54,7 +54,7 @@ class Config:
     "membrane",
     reading.words("membrane", "spring", "solid"),
     "`membrane` (St. Venant-Kirchhoff triangles, plane stress), `spring` (edge springs) or `solid` "
-    "(neo-Hookean tetrahedra inside, made when the model is compiled; with `window` alone)",
+    "(neo-Hookean tetrahedra inside, made when the model is compiled)",
   )
   tetrahedra: str = _row(
     "",
@@ -360,8 +360,6 @@ def _check_combination(organ: str, config: Config, given: dict, closed: bool):
 
 
 def _check_solid(organ: str, config: Config, given: dict):
-  if not config.window:
-    raise ValueError(f"organ {organ!r}: elements is 'solid', expected window too (`add_windows`)")
   for key in ("thickness", "bend", "bulk", "pressure"):
     if given.get(key):
       raise ValueError(
