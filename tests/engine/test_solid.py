@@ -38,7 +38,12 @@ def test_a_resting_ball_is_carried_exactly(scenes, device, window):
 DRIVE = '<actuator><position joint="z" kp="500" kv="10"/></actuator>'
 
 
-@pytest.mark.parametrize("stiff", [{}, {"young": 3e5, "damping": 0.002}], ids=["soft", "stiff"])
+SKIN = {"capsule_young": 1e5, "thickness": 3e-4}
+
+
+@pytest.mark.parametrize(
+  "stiff", [SKIN, {"young": 3e5, "damping": 0.002}], ids=["soft, with a skin", "stiff"]
+)
 def test_force_is_the_same_with_and_without_windows(scenes, stiff):
   forces, places = [], []
   for window in (True, False):
@@ -127,8 +132,9 @@ def test_what_a_user_sees_is_the_surface(scenes, window):
 @pytest.mark.parametrize(
   ("keys", "message"),
   [
-    ({"thickness": 0.003}, "thickness is 0.003, allowed only where elements is not 'solid'"),
-    ({"bend": 2}, "bend is 2, allowed only"),
+    ({"thickness": 0.003}, "thickness is 0.003, allowed only on a solid with capsule_young"),
+    ({"bend": 2}, "bend is 2, allowed only on a solid with capsule_young"),
+    ({"capsule_young": 1e5}, "capsule_young is set and thickness is missing"),
     ({"bulk": 1e4}, "bulk is 10000, allowed only"),
     ({"pressure": 100}, "pressure is 100, allowed only"),
     ({"integrator": "neumann"}, "integrator is 'neumann', allowed only"),
@@ -140,12 +146,27 @@ def test_what_a_solid_has_not_is_refused(scenes, keys, message):
     scenes.load(_resting(scenes, **keys))
 
 
+def test_a_skin_may_change_but_not_begin_while_running(scenes):
+  forces = []
+  for skin in (SKIN, SKIN | {"capsule_young": 5e5}):
+    organ = scenes.load(_resting(scenes, **SKIN))[2]
+    organ.configure(**skin)
+    scenes.run(organ.model, organ.data, 200)
+    forces.append(-organ.xpos[organ.contact_force[:, 2] < 0, 2].mean())
+  assert forces[1] < forces[0]  # the ball sinks in less far
+  organ = scenes.load(_resting(scenes))[2]
+  with pytest.raises(ValueError, match="capsule_young is .*: it cannot begin or end"):
+    organ.configure(**SKIN)
+
+
 def test_a_file_of_tetrahedra_is_for_solids(scenes):
   with pytest.raises(ValueError, match="tetrahedra is 'a': No such file"):
     scenes.load(_resting(scenes, tetrahedra="a"))
   points, elem = scenes.sphere(1)
   with pytest.raises(ValueError, match="tetrahedra is 'a', allowed only with elements='solid'"):
     scenes.load(scenes.world(scenes.organ(points, elem, tetrahedra="a")))
+  with pytest.raises(ValueError, match="capsule_young is .*, allowed only with elements='solid'"):
+    scenes.load(scenes.world(scenes.organ(points, elem, **SKIN)))
 
 
 def test_a_solid_that_is_open_is_refused(scenes):
