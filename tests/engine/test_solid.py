@@ -155,7 +155,7 @@ def test_a_skin_may_change_but_not_begin_while_running(scenes):
     forces.append(-organ.xpos[organ.contact_force[:, 2] < 0, 2].mean())
   assert forces[1] < forces[0]  # the ball sinks in less far
   organ = scenes.load(_resting(scenes))[2]
-  with pytest.raises(ValueError, match="capsule_young is .*: it cannot begin or end"):
+  with pytest.raises(ValueError, match=r"capsule_young is .*: it cannot begin or end"):
     organ.configure(**SKIN)
 
 
@@ -165,7 +165,7 @@ def test_a_file_of_tetrahedra_is_for_solids(scenes):
   points, elem = scenes.sphere(1)
   with pytest.raises(ValueError, match="tetrahedra is 'a', allowed only with elements='solid'"):
     scenes.load(scenes.world(scenes.organ(points, elem, tetrahedra="a")))
-  with pytest.raises(ValueError, match="capsule_young is .*, allowed only with elements='solid'"):
+  with pytest.raises(ValueError, match=r"capsule_young is .*, allowed only with elements='solid'"):
     scenes.load(scenes.world(scenes.organ(points, elem, **SKIN)))
 
 
