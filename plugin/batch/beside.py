@@ -75,7 +75,8 @@ def _in_worlds(kind, rows: tuple[str, ...], others: dict[str, Any]) -> Any:
     fields[name] = others.get(name, var.type)
     if dims is not None and name not in others:
       fields[name] = Array(var.type.dtype, ("nworld", *dims) if name in rows else dims)
-  return struct(type(f"{kind.key}InWorlds", (), {"__annotations__": fields, "__module__": __name__}))
+  own = {"__annotations__": fields, "__module__": __name__}
+  return struct(type(f"{kind.key}InWorlds", (), own))
 
 
 _PARTS = {"own": WorldNodes, "other": WorldNodes, "mj": WorldBodies}
@@ -216,8 +217,8 @@ def check(spaces: list):
   for w in spaces:
     if w.rests.below:
       raise ValueError(
-        f"organ {w.organ.name!r}: support names organ {w.rests.below[0].organ.name!r}, which a batch "
-        "on a GPU cannot do; expected geoms"
+        f"organ {w.organ.name!r}: support names organ {w.rests.below[0].organ.name!r}, which a "
+        "batch on a GPU cannot do; expected geoms"
       )
 
 
@@ -309,9 +310,8 @@ class InBonds(Beside):
     shapes: dict[str, tuple] = {name: (n, 3) for name in ("stretch", "force", "pull")}
     shapes |= {"next": (n, len(BOND)), "hardness": (n,)}
     values: dict[str, Any] = dict(zip(("stiffness", "strength", "energy"), group.law, strict=True))
-    values |= {
-      name: getattr(group, name) for name in ("vert", "area", "anchor", "normal", "corner", "weight")
-    }
+    of_group = "vert", "area", "anchor", "normal", "corner", "weight"
+    values |= {name: getattr(group, name) for name in of_group}
     values |= {name: self._zeros(self._nworld, *shape) for name, shape in shapes.items()}
     values |= dict(
       nbond=n,

@@ -31,7 +31,7 @@ class Domain:
   observe: Any
   nodes: int = 12
   takes: tuple[str, ...] = ()
-  metrics: Mapping[str, str] = {}  # noqa: RUF012
+  metrics: Mapping[str, str] = {}
   tissue: tuple[str, ...] = ()
 
   @staticmethod
