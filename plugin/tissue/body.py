@@ -139,6 +139,8 @@ def _sizes(values: dict[str, Any]) -> dict[str, int]:
     "nheld": len(values["held_adr"]),
     "nsolidslot": out["nslot"] if solid else 0,
     "naround": len(values["around_corner"]),
+    "ncapsule": values["ncapsule"],
+    "ncapsuleslice": out["nslice"] if values["ncapsule"] else 0,
     "nedge": len(values["edge_from"]),
     "nbend": len(values["bend_node"]),
     "nbendslice": out["nslice"] if bends else 0,

@@ -49,8 +49,8 @@ ENOUGH = 0.03
 # one float32 residuals are noise to the slowest modes, which only cycles would act on.
 EASY, WORST = 8.0, 2e5
 
-# Share of a solid's mu that each tetrahedron has for itself; the means over nodes have the rest, and
-# lambda. Less is softer in contacts than it should be, more locks in bending (docs/accuracy.md).
+# Share of a solid's mu that each tetrahedron has for itself; the means over nodes have the rest,
+# and lambda. With less contacts are too soft, with more bending locks (docs/accuracy.md).
 OWN_SHARE = 0.3
 
 _FIRST, _MORE = 1, 2  # flags of `newton_update`
@@ -86,6 +86,7 @@ _node_stress = _solid("node_stress")
 _tet_stress = _solid("tet_stress")
 _edge_block = _solid("edge_block")
 _solid_row = _solid("solid_row")
+_capsule_row = kernel("capsule_row", "capsule.h", Fields, CONSTANTS)
 _edge_change = _scheme("edge_change")
 _predict = _scheme("predict")
 _stay = _scheme("stay")
@@ -124,6 +125,7 @@ def kernels(body: Body) -> list[Kernel]:
   if body.plan:
     return [_world_step(body.plan)]
   found = [_solid_row if body.is_solid else _row, _predict, _solve]
+  found += [_hinge_moment, _capsule_row] if body.shape.ncapsule else []
   return found if body.levels is None else [*found, _sample]
 
 
@@ -159,17 +161,19 @@ def assemble(body: Body, stage: Stage):
     stage: what the right-hand side is for
   """
   shape = body.shape
+  if body.has_bending:
+    _hinge_angles(body, stage)
+    _over(_hinge_moment, body, shape.nhingeslice)
+    _over(_elem_corner, body, shape.nelemslice)
   if body.is_solid:
     _over(_node_stress, body, shape.nslice, stage)
     _over(_tet_stress, body, shape.ntetslice, stage)
     if stage in (Stage.FIRST, Stage.LATER):
       _over(_edge_block, body, shape.nedgeslice)
+    if shape.ncapsule:
+      _over(_capsule_row, body, shape.nslice, stage)
     _over(_solid_row, body, shape.nslice, stage)
     return
-  if body.has_bending:
-    _hinge_angles(body, stage)
-    _over(_hinge_moment, body, shape.nhingeslice)
-    _over(_elem_corner, body, shape.nelemslice)
   _over(_row, body, shape.nslice, stage)
   if body.levels is not None and stage in (Stage.FIRST, Stage.LATER):
     coarse = body.levels.body

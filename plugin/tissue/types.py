@@ -148,6 +148,13 @@ class Shape:
   edge_from: ints("nedge", 8)  # of each tetrahedron around an edge, its corner at the first end
   edge_to: ints("nedge", 8)  # its corner at the other
   edge_slot: ints("nedgeslice", 2, 8)  # where the blocks of both ends start; -1 for padding
+  ncapsule: int  # rows of blocks of the skin of a solid, 0 without one; its fans are as those above
+  capsule_adr: ints("ncapsuleslice + 1")  # first row of these
+  capsule_node: ints("ncapsule + 2 ncapsuleslice", 8)  # see `fan_node`
+  capsule_rest: floats("ncapsule + 2 ncapsuleslice", 3, 8)  # see `fan_rest`
+  capsule_corner: ints("ncapsule + ncapsuleslice", 8)  # see `fan_corner`
+  capsule_side: ints("ncapsule + ncapsuleslice", 8)  # see `fan_side`
+  capsule_degree: floats("ncapsuleslice", 8)  # number of neighbours on the surface
 
 
 @struct
@@ -162,6 +169,7 @@ class Tissue:
   bend_diag: floats("nbendslice", 8)  # its diagonal [N/m]
   tet_moduli: floats("ntetslice", 3, 8)  # volume [m^3]; mu, lambda [Pa]
   node_moduli: floats("nsolidslice", 2, 8)  # mu, lambda of its mean gradient [Pa]
+  capsule_metric: floats("ncapsule + ncapsuleslice", 5, 8)  # see `fan_metric`
 
 
 @struct
@@ -201,6 +209,7 @@ class System:
   node_stress: floats("nworld", "nsolidslice", 12, 8)  # three shared vectors, rows [Pa s]
   tet_impulse: floats("nworld", "ntetslice", 16, 8)  # impulse on each corner [N s]
   tet_arm: floats("nworld", "ntetslice", 16, 8)  # turned gradient of each corner [kg^(1/2)], moduli
+  capsule_block: floats("nworld", "ncapsule", 9, 8)  # off-diagonal blocks of a solid's skin [kg]
   total: floats("nworld", 2)  # volume difference [m^3], areavec . vel
   sol: vector  # PCG solution [m/s]
   r: vector  # PCG residual
