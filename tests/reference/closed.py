@@ -9,6 +9,7 @@ from palpate.tissue import mesh as topology
 
 YOUNG, DENSITY = 5000.0, 1000.0
 LENGTH, SIDE = 0.1, 0.04  # of a bar along x [m]
+LOAD = 0.002  # on the end of a cantilever [N]
 
 
 def masses(mesh) -> np.ndarray:
@@ -74,10 +75,10 @@ def cantilever(poisson: float, spacing: float) -> tuple[float, float]:
   """Returns the sag of a bar's end [m]: Timoshenko's beam, a shear factor of 5/6."""
   points, elem = scenes.box((LENGTH, SIDE, SIDE), spacing)
   mesh, body = solid(points, elem, poisson, np.flatnonzero(points[:, 0] < -LENGTH / 2 + 1e-9))
-  load, share = 0.002, end_share(mesh, LENGTH / 2)
-  u = settled(mesh, body, np.outer(load * share, [0, 0, 1]))
+  share = end_share(mesh, LENGTH / 2)
+  u = settled(mesh, body, np.outer(LOAD * share, [0, 0, 1]))
   second, shear = SIDE**4 / 12, YOUNG / (2 * (1 + poisson))
-  sag = load * LENGTH * (LENGTH**2 / (3 * YOUNG * second) + 1.2 / (shear * SIDE**2))
+  sag = LOAD * LENGTH * (LENGTH**2 / (3 * YOUNG * second) + 1.2 / (shear * SIDE**2))
   return float(share @ u[:, 2]), sag
 
 
