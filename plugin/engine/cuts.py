@@ -9,13 +9,11 @@ stamp too, so that several mjData of one model take turns.
 from __future__ import annotations
 
 import dataclasses
-import functools
 from typing import Any
 
 import numpy as np
 from palpate.tissue import body as bodies
 from palpate.tissue import cut as cutting
-from palpate.tissue import energy
 from palpate.tissue import mesh as topology
 from palpate.tissue.mesh import Mesh
 from palpate.tissue.refill import Refill
@@ -83,6 +81,7 @@ class Cuts:
       return
     bodies.unshare(w.body)
     self._refill = Refill(w.body, self.whole)
+    self._knife = cutting.Knife(self.whole)
     self.declared = w.organ
     self.mass = w.organ.mass.copy()
     self.source = np.arange(self.whole.nvert)
@@ -224,9 +223,8 @@ class Cuts:
     organ, mesh = w.organ, self.mesh
     local = (np.asarray(points, float) - organ.origin) @ organ.frame
     u, v = w.phases.motion()
-    of_triangles = functools.partial(energy.of_triangles, w.config)
-    energies = of_triangles, self._held()
-    found = cutting.cut(organ.name, mesh, mesh.rest + u, local, ~organ.free, *energies, given)
+    how = ~organ.free, w.config, self._held(), given
+    found = self._knife.cut(organ.name, mesh, u, local, *how)
     if found.stopped:
       w.note(
         f"the cut stops early: no spare vertices are left of {mesh.spare}; give the organ more"
@@ -237,22 +235,18 @@ class Cuts:
     self.reports.append(report)
     return report
 
-  def _held(self) -> cutting.Held | None:
-    """Returns what tells the energy of ties and bonds, None where there are none."""
+  def _held(self) -> cutting.Springs | None:
+    """Returns the ties and bonds, None where there are none."""
     springs = [*self._w.ties.springs(), *self._w.bonds.springs()]
     if not springs:
       return None
     n = self.mesh.nvert
-    whole, pull, hard = np.zeros(n), np.zeros((n, 3)), np.zeros(n)
+    energy, force, hard = np.zeros(n), np.zeros((n, 3)), np.zeros(n)
     for vert, stiffness, stretch in springs:
-      np.add.at(whole, vert, 0.5 * stiffness * (stretch**2).sum(axis=1))
-      np.add.at(pull, vert, stiffness[:, None] * stretch)
+      np.add.at(energy, vert, 0.5 * stiffness * (stretch**2).sum(axis=1))
+      np.add.at(force, vert, stiffness[:, None] * stretch)
       np.add.at(hard, vert, stiffness)
-
-    def held(vert: np.ndarray, way: np.ndarray) -> np.ndarray:
-      return whole[vert] + (way * pull[vert]).sum(1) + 0.5 * hard[vert] * (way**2).sum(1)
-
-    return held
+    return cutting.Springs(energy, force, hard)
 
   def _report(self, found: cutting.Cut) -> Report:
     organ = self._w.organ

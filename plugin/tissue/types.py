@@ -42,6 +42,16 @@ def ints(*dims) -> Array:
   return Array(wp.int32, dims)
 
 
+def longs(*dims) -> Array:
+  """Returns the type of an array of int64."""
+  return Array(wp.int64, dims)
+
+
+def flags(*dims) -> Array:
+  """Returns the type of an array of bytes, each 0 or 1."""
+  return Array(wp.uint8, dims)
+
+
 DIMS: dict[str, dict[str, tuple]] = {}  # struct and field -> its shape
 
 

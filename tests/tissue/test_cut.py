@@ -42,7 +42,8 @@ def circle(radius, centre=(0.0, 0.0, 0.0), count=80):
 def cut(mesh, points, pinned=(), **given):
   mask = np.zeros(mesh.nvert, bool)
   mask[list(pinned)] = True
-  return cutting.cut("organ", mesh, mesh.rest, np.asarray(points, float), mask, **given)
+  disp = np.zeros_like(mesh.rest)
+  return cutting.Knife(mesh).cut("organ", mesh, disp, np.asarray(points, float), mask, **given)
 
 
 def form(mesh):
@@ -158,14 +159,14 @@ def test_a_refilled_body_is_one_made_anew_to_the_bit(kind, device):
   bodies.unshare(body)
   filler = refill.Refill(body, mesh)
   first = fields(body)
-  r = np.random.RandomState(1)
+  r, knife = np.random.RandomState(1), cutting.Knife(mesh)
   for _ in range(4):
     ends = points[r.choice(np.arange(10, len(points)), 2, replace=False)]
     path = ends[0] + np.linspace(0, 1, 40)[:, None] * (ends[1] - ends[0])
     if kind == "closed":
       path *= scenes.RADIUS / np.linalg.norm(path, axis=1, keepdims=True)
     try:
-      found = cutting.cut("organ", mesh, mesh.rest, path, pinned)
+      found = knife.cut("organ", mesh, np.zeros_like(mesh.rest), path, pinned)
     except ValueError:  # through a pin, or too short
       continue
     filler.write(found.mesh, found.changed, config, pinned)
@@ -204,8 +205,7 @@ def test_uneven_strain_does_not_rise_by_moving_vertices():
   points = x + u
   way = paths.nearest(mesh, mesh.rest, np.linspace(*path, 60))
   now = np.einsum("nk,nkj->nj", way[1], points[mesh.elem[way[0]]])
-  by = lambda rest, disp, which: energy.of_triangles(config, rest, disp, which)  # noqa: E731
-  found = cutting.cut("organ", mesh, mesh.rest + u, now, mask, by)
+  found = cutting.Knife(mesh).cut("organ", mesh, u, now, mask, config)
   after = u.copy()
   after[found.moved] = np.einsum("nk,nkj->nj", found.weight, u[found.corner])
   after[found.member] = after[found.group]
