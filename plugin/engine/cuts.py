@@ -17,6 +17,7 @@ from palpate.tissue import cut as cutting
 from palpate.tissue import mesh as topology
 from palpate.tissue.mesh import Mesh
 from palpate.tissue.refill import Refill
+from palpate.tissue.surface import WorkingCopy
 
 from . import coupling, flexes, graphs, mjstruct, turns
 from .bind import bind
@@ -80,8 +81,8 @@ class Cuts:
     if not self:
       return
     bodies.unshare(w.body)
-    self._refill = Refill(w.body, self.whole)
-    self._knife = cutting.Knife(self.whole)
+    copy = WorkingCopy(self.whole)
+    self._refill, self._knife = Refill(w.body, copy), cutting.Knife(copy)
     self.declared = w.organ
     self.mass = w.organ.mass.copy()
     self.source = np.arange(self.whole.nvert)

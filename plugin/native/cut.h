@@ -220,7 +220,7 @@ PALPATE int cut_along(const F& f, const S& m, const Material& p, const Path& pat
   Pieces pieces = {memory.numbers(m.nelem), memory.numbers(m.nelem), memory.numbers(m.nelem),
                    memory.numbers(m.nelem), memory.numbers(m.nelem), memory.values(m.nelem)};
   if (memory.full) return NO_ROOM;
-  come_loose(m, f.home.data, f.loose.data + out.elem, pieces);
+  come_loose(m, f.home.data, f.surface.loose.data + out.elem, pieces);
   out.found[FOUND_APART] = 1;
   return DONE;
 }
@@ -243,15 +243,15 @@ template <class Fields>
 PALPATE void cut_surface(const Fields& f, Thread t, int) {
   if (t.tid) return;
   const int w = t.world;
-  const auto m = surface_of(f, w);
-  const long long v = w * (long long)f.nvert, e = w * (long long)f.nelem;
+  const auto m = surface_of(f.surface, w);
+  const long long v = w * (long long)m.nvert, e = w * (long long)m.nelem;
   const Answer<Fields> out = {f, v, e, f.found.data + FOUND_LENGTH * w, f.size.data + SIZE_LENGTH * w};
   Scratch memory = {f.ints.data + w * (long long)f.nint, f.reals.data + w * (long long)f.nreal,
                     f.nint, f.nreal, false};
-  double* x = memory.values(3 * f.nvert);
+  double* x = memory.values(3 * m.nvert);
   if (memory.full) return;
   const double* disp = f.disp.data + 3 * v;
-  for (int i = 0; i < 3 * f.nvert; ++i) x[i] = m.rest[i] + disp[i];
+  for (int i = 0; i < 3 * m.nvert; ++i) x[i] = m.rest[i] + disp[i];
   const Material p = {f.kind, f.held, f.thickness, f.stiffness, f.given, f.lame.data, f.shear.data,
                       f.whole.data + v, f.pull.data + 3 * v, f.hard.data + v};
   Path path = {};

@@ -152,7 +152,7 @@ PALPATE void come_loose(const S& m, const I* home, unsigned char* loose, Pieces&
     if (p.label[t]) continue;
     int queued = 0;
     p.label[t] = ++count;
-    p.home[count - 1] = (int)home[t];
+    p.home[count - 1] = (int)home[t], p.size[count - 1] = 0.0;
     p.queue[queued++] = t;
     while (queued) {
       const int a = p.queue[--queued];

@@ -52,7 +52,7 @@ PALPATE auto surface_of(const F& f, int world) {
                     f.degree.data + v, f.whole_elem.data, f.whole_twin.data};
 }
 
-// Scratch of a world: what is taken is zero.
+// Scratch of a world; numbers that are taken are zero.
 struct Scratch {
   int* ints;
   double* reals;
@@ -70,7 +70,6 @@ struct Scratch {
     if (n > nreal) return full = true, nullptr;
     double* out = reals;
     reals += n, nreal -= n;
-    for (int i = 0; i < n; ++i) out[i] = 0.0;
     return out;
   }
 };

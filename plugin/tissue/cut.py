@@ -18,7 +18,8 @@ from . import config as configuration
 from .config import Config
 from .kernels import kernel
 from .mesh import Mesh, lengths
-from .types import CONSTANTS, DIMS, allocate, doubles, flags, ints, longs, struct
+from .surface import Surface, WorkingCopy, host_views
+from .types import CONSTANTS, allocate, doubles, flags, ints, longs, struct
 
 # Why nothing was cut, and what a path's samples are apart at most [edges], as in native/path.h.
 _DONE, _NO_ROOM, _OFF, _SHORT, _PINNED = range(5)
@@ -35,14 +36,9 @@ _NUMBERS = {
 
 @struct
 class Cutting:
-  """What cuts of nworld surfaces of one whole read and write; `Mesh` says what most of it is.
+  """What cuts of nworld surfaces of one whole read and write; the surfaces are other ones then."""
 
-  The surface's own arrays, of `rest` to `loose`, are what a cut makes another one of.
-  """
-
-  nvert: int
-  nelem: int
-  most: int  # neighbours that a vertex has room for
+  surface: Surface
   most_points: int  # points of a path
   nint: int  # whole numbers of scratch
   nreal: int  # others
@@ -52,16 +48,7 @@ class Cutting:
   thickness: wp.float64  # [m]
   stiffness: wp.float64  # of an edge's spring [N/m]
   given: wp.float64  # by which the energy around a vertex may rise as it moves [J]
-  rest: doubles("nworld", "nvert", 3)
-  elem: longs("nworld", "nelem", 3)
-  twin: longs("nworld", "nhalf")
-  ring: longs("nworld", "nvert", "most")
-  spoke: longs("nworld", "nvert", "most")  # `Mesh.ring_elem`
-  degree: longs("nworld", "nvert")
-  loose: flags("nworld", "nelem")
-  whole_elem: longs("nelem", 3)
-  whole_twin: longs("nhalf")
-  home: longs("nelem")
+  home: longs("nelem")  # `Mesh.home`
   disp: doubles("nworld", "nvert", 3)  # displacement [m]
   pinned: flags("nworld", "nvert")  # whether a vertex does not move
   lame: doubles("nelem")  # of triangles [Pa]
@@ -134,15 +121,14 @@ class Cut:
 
 
 class Knife:
-  """Cuts surfaces of one whole, one after the other, in memory of its own.
+  """Cuts surfaces of one whole, one after the other.
 
   Args:
-    mesh: one of them
+    copy: where they are
   """
 
-  def __init__(self, mesh: Mesh):
-    self._whole = mesh.whole
-    self._mesh: Mesh | None = None  # whose arrays are here
+  def __init__(self, copy: WorkingCopy):
+    self._copy, self._whole = copy, copy.whole
     self._config: Config | None = None
     self._fields: Any = None
     self._host: dict[str, np.ndarray] = {}
@@ -176,7 +162,7 @@ class Knife:
     """
     _check_points(organ, points)
     self._make_room(points)
-    self._put_mesh(mesh)
+    self._copy.put(mesh)
     self._put_material(config if config and config.elements in _KINDS else None, held, given)
     host = self._host
     host["disp"][:], host["pinned"][:] = disp, pinned
@@ -194,30 +180,17 @@ class Knife:
     n = 2 * len(points) + int((lengths(np.diff(points, axis=0)) / (_SAMPLE * edge)).sum())
     if self._fields is not None and n <= self._fields.most_points:
       return
-    n, most, self._mesh, self._config = 2 * n, whole.ring.shape[1], None, None
+    n, self._config = 2 * n, None
+    sizes = self._copy.sizes | {"most_points": n}
     # What native/cut.h takes of scratch, see there.
-    nint = 24 * whole.nvert + 15 * whole.nelem + 16 * n + 8 * most + 100
-    nreal = 27 * whole.nvert + 6 * whole.nelem + 11 * n
-    sizes = {"nworld": 1, "nvert": whole.nvert, "nelem": whole.nelem, "nhalf": 3 * whole.nelem}
-    sizes |= {"most": most, "most_points": n, "nint": nint, "nreal": nreal}
+    sizes["nint"] = 24 * whole.nvert + 15 * whole.nelem + 16 * n + 8 * sizes["most"] + 100
+    sizes["nreal"] = 27 * whole.nvert + 6 * whole.nelem + 11 * n
     self._fields = fields = allocate(Cutting, "cpu", sizes)
-    for name, value in (sizes | {"edge": edge}).items():
-      if hasattr(fields, name):
-        setattr(fields, name, value)
-    for name, dims in DIMS[Cutting.key].items():
-      array = getattr(fields, name).numpy()
-      self._host[name] = array[0] if dims[0] == "nworld" and len(dims) > 1 else array
-    for name, value in (("elem", whole.elem), ("twin", whole.twin)):
-      self._host[f"whole_{name}"][:] = value
+    fields.surface, fields.edge = self._copy.fields, edge
+    for name in ("most_points", "nint", "nreal"):
+      setattr(fields, name, sizes[name])
+    self._host = host_views(fields, Cutting)
     self._host["home"][:] = whole.home
-
-  def _put_mesh(self, mesh: Mesh):
-    if mesh is self._mesh:
-      return
-    for name, of_mesh in _SURFACE.items():
-      self._host[name][:] = getattr(mesh, of_mesh)
-    self._host["loose"][:] = 0 if mesh.loose is None else mesh.loose
-    self._mesh = mesh
 
   def _put_material(self, config: Config | None, held: Springs | None, given: float):
     fields, host = self._fields, self._host
@@ -255,7 +228,7 @@ class Knife:
         "tissue that moves"
       )
     if status == _NO_ROOM:
-      self._mesh = None
+      self._copy.forget()
       raise ValueError(
         f"organ {organ!r}: the path goes to and fro too often, expected shorter cuts"
       )
@@ -267,23 +240,12 @@ class Knife:
     changed = host["changed"][: found["changed"]].astype(int)
     weight, corner = host["weight"][: len(moved)].copy(), mesh.elem[target]
     if len(changed):
-      arrays = {of_mesh: host[name].copy() for name, of_mesh in _SURFACE.items()}
-      loose = host["loose"].astype(bool) if found["apart"] else mesh.loose
-      closed = mesh.closed and not len(group)
-      more = {"closed": closed, "uncut": self._whole, "loose": loose}
-      mesh = self._mesh = dataclasses.replace(mesh, **arrays, **more)
+      mesh = self._copy.take(mesh, mesh.closed and not len(group), bool(found["apart"]))
     path = _lines(mesh.rest, host["seam"][: found["edges"]].tolist())
     length = sum(float(lengths(np.diff(line, axis=0)).sum()) for line in path)
     deviation, stopped = float(host["size"][_SIZE.index("deviation")]), bool(found["stopped"])
     done = moved, corner, weight, group, member, path, length, deviation, stopped
     return Cut(mesh, changed, *done)
-
-
-# Arrays of a surface in `Cutting`, and in `Mesh`.
-_SURFACE = {
-  "rest": "rest", "elem": "elem", "twin": "twin", "ring": "ring", "spoke": "ring_elem",
-  "degree": "degree",
-}  # fmt: skip
 
 
 def _check_points(organ: str, points: np.ndarray):

@@ -329,15 +329,22 @@ def fill(
   return out
 
 
-def empty(sizes: tuple[str, ...]) -> dict[str, np.ndarray]:
-  """Returns the arrays of `Shape` and `Tissue` whose first axis is one of `sizes`, empty."""
+def zeros(names: tuple[str, ...], sizes: dict[str, int]) -> dict[str, np.ndarray]:
+  """Returns arrays of `Shape` and `Tissue` of zeros, from the sizes that they are named by."""
   out = {}
   for kind in (Shape, Tissue):
-    for name, dims in DIMS[kind.key].items():
-      if dims[0] in sizes:
-        dtype = np.int32 if kind.vars[name].type.dtype is wp.int32 else np.float32
-        out[name] = np.zeros((0, *dims[1:]), dtype)
+    for name in names:
+      if name in kind.vars:
+        dtype = wp.dtype_to_numpy(kind.vars[name].type.dtype)
+        out[name] = np.zeros([_extent(dim, sizes) for dim in DIMS[kind.key][name]], dtype)
   return out
+
+
+def empty(sizes: tuple[str, ...]) -> dict[str, np.ndarray]:
+  """Returns the arrays of `Shape` and `Tissue` whose first axis is one of `sizes`, empty."""
+  dims = {name: dims for kind in (Shape, Tissue) for name, dims in DIMS[kind.key].items()}
+  names = tuple(name for name in dims if dims[name][0] in sizes)
+  return zeros(names, dict.fromkeys(sizes, 0))
 
 
 def _extent(dim: int | str, sizes: dict[str, int]) -> int:

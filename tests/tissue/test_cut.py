@@ -6,7 +6,7 @@ import scenes
 from palpate.tissue import body as bodies
 from palpate.tissue import cut as cutting
 from palpate.tissue import device as devices
-from palpate.tissue import energy, refill, shape
+from palpate.tissue import energy, refill, shape, surface
 from palpate.tissue import mesh as topology
 from palpate.tissue import path as paths
 from palpate.tissue.config import Config
@@ -43,7 +43,8 @@ def cut(mesh, points, pinned=(), **given):
   mask = np.zeros(mesh.nvert, bool)
   mask[list(pinned)] = True
   disp = np.zeros_like(mesh.rest)
-  return cutting.Knife(mesh).cut("organ", mesh, disp, np.asarray(points, float), mask, **given)
+  knife = cutting.Knife(surface.WorkingCopy(mesh))
+  return knife.cut("organ", mesh, disp, np.asarray(points, float), mask, **given)
 
 
 def form(mesh):
@@ -157,9 +158,10 @@ def test_a_refilled_body_is_one_made_anew_to_the_bit(kind, device):
   pinned[:3] = True
   body = shape.make(mesh, config, pinned, device, np.inf if kind == "plate" else 0.0)
   bodies.unshare(body)
-  filler = refill.Refill(body, mesh)
+  copy = surface.WorkingCopy(mesh)
+  filler = refill.Refill(body, copy)
   first = fields(body)
-  r, knife = np.random.RandomState(1), cutting.Knife(mesh)
+  r, knife = np.random.RandomState(1), cutting.Knife(copy)
   for _ in range(4):
     ends = points[r.choice(np.arange(10, len(points)), 2, replace=False)]
     path = ends[0] + np.linspace(0, 1, 40)[:, None] * (ends[1] - ends[0])
@@ -205,7 +207,7 @@ def test_uneven_strain_does_not_rise_by_moving_vertices():
   points = x + u
   way = paths.nearest(mesh, mesh.rest, np.linspace(*path, 60))
   now = np.einsum("nk,nkj->nj", way[1], points[mesh.elem[way[0]]])
-  found = cutting.Knife(mesh).cut("organ", mesh, u, now, mask, config)
+  found = cutting.Knife(surface.WorkingCopy(mesh)).cut("organ", mesh, u, now, mask, config)
   after = u.copy()
   after[found.moved] = np.einsum("nk,nkj->nj", found.weight, u[found.corner])
   after[found.member] = after[found.group]
