@@ -223,16 +223,16 @@ class Cuts:
     self.follow()
     organ, mesh = w.organ, self.mesh
     local = (np.asarray(points, float) - organ.origin) @ organ.frame
-    u, v = w.phases.motion()
+    motion = cutting.Motion(self.mass, *w.phases.motion())
     how = ~organ.free, w.config, self._held(), given
-    found = self._knife.cut(organ.name, mesh, u, local, *how)
+    found = self._knife.cut(organ.name, mesh, motion, local, *how)
     if found.stopped:
       w.note(
         f"the cut stops early: no spare vertices are left of {mesh.spare}; give the organ more"
       )
     report = self._report(found)
     if found.changed.size:
-      self._take(found, u, v)
+      self._take(found)
     self.reports.append(report)
     return report
 
@@ -256,29 +256,20 @@ class Cuts:
     area = found.length * self._w.config.thickness
     return Report(found.length, area, path, found.deviation, nodes, found.stopped)
 
-  def _take(self, found: cutting.Cut, u: np.ndarray, v: np.ndarray):
+  def _take(self, found: cutting.Cut):
     """Makes the organ the mesh that was found; what moved goes on as it moved."""
-    w, old, mesh = self._w, self.mesh, found.mesh
-    group, member = found.group, found.member
-    mass, source = self.mass.copy(), self.source.copy()
-    area = topology.areas_of(mesh, member)
-    share = area / np.bincount(group, area, mesh.nvert)[group]
-    mass[member] = share * self.mass[group]
+    w, mesh, motion = self._w, found.mesh, found.motion
+    group, member, share = found.group, found.member, found.share
+    source = self.source.copy()
     source[member] = source[group]
-    now, speed = u.copy(), v.copy()
-    now[found.moved] = np.einsum("nk,nkj->nj", found.weight, u[found.corner])
-    near = topology.distinct(old.elem[found.changed])
-    near = near[w.organ.free[near]]
-    was, goes = (old.rest + u)[near], (mesh.rest + now)[near]
-    speed[near] = _keep_spin(self.mass[near], was, goes, v[near])
-    now[member], speed[member] = now[group], speed[group]
     for each in w.beside:
       each.carry(group, member, share)
     corner = flexes.pack(mesh.elem, mesh.loose)
-    self._become(mesh, found.changed, mass, source, flexes.stamp(corner, mesh.rest, mass))
+    stamp = flexes.stamp(corner, mesh.rest, motion.mass)
+    self._become(mesh, found.changed, motion.mass.copy(), source, stamp)
     self._write(corner)
-    changed = topology.distinct(near, member)
-    w.phases.carry(changed, now, speed, group, member, share)
+    changed = topology.distinct(found.near, member)
+    w.phases.carry(changed, motion.disp, motion.vel, group, member, share)
     self.show()
 
   def pieces(self) -> list[Piece]:
@@ -294,17 +285,3 @@ class Cuts:
       mass = float(self._w.organ.mass[vert].sum())
       out.append(Piece(vert, mass, volume, bool(held[vert].any())))
     return sorted(out, key=lambda piece: -piece.mass)
-
-
-def _keep_spin(mass: np.ndarray, was: np.ndarray, now: np.ndarray, v: np.ndarray) -> np.ndarray:
-  """Returns velocities with which nodes, some of them moved, keep momentum and angular momentum.
-
-  That is `v` and a slow rotation of them all about their centre.
-  """
-  if len(mass) < 3:
-    return v
-  spin = (mass[:, None] * topology.cross(was - now, v)).sum(axis=0)
-  arm = now - (mass[:, None] * now).sum(axis=0) / mass.sum()
-  inertia = (mass * (arm**2).sum(axis=1)).sum() * np.eye(3) - (mass * arm.T) @ arm
-  omega = np.linalg.lstsq(inertia, spin, rcond=1e-6)[0]
-  return v + topology.cross(omega[None], arm)

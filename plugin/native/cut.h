@@ -4,8 +4,7 @@
 //
 // What is written is the surface itself, and in what it is another one; nothing where it raises.
 #pragma once
-#include "snap.h"
-#include "split.h"
+#include "carry.h"
 
 namespace palpate {
 
@@ -133,21 +132,29 @@ PALPATE bool may_separate(const Chains& chains, int r, const Split& split) {
   return first && last;
 }
 
-// Moves and doubles the vertices of a seam, and renews what is around them; leaves in `near` the
-// triangles that are not as they were.
-template <class S>
-PALPATE bool apply(const S& m, const Move* move, int nmove, const Seam& seam, const Few& there,
-                   Split& split, Few& near, Scratch& memory) {
-  Few moved = few(memory, m.nvert), vert = few(memory, m.nvert);
+// What a cut makes of a surface: triangles that are not as they were, with the corners that they had;
+// which vertices were one; what was near.
+struct Changes {
+  Few elem, vert;
+  int* before;
+  Split split;
+  double* share;
+};
+
+// Moves and doubles the vertices of a seam, and renews what is around them.
+template <class S, class P>
+PALPATE bool apply(const S& m, const Moving& x, const Move* move, int nmove, const Seam& seam,
+                   const Few& there, const P* pinned, Changes& out, Scratch& memory) {
+  Few moved = few(memory, m.nvert), &near = out.elem;
   int *part = memory.numbers(m.most), *size = memory.numbers(m.most), *row = memory.numbers(m.most);
   int* source = memory.numbers(m.nvert);
-  D3* to = (D3*)memory.values(3 * nmove);
+  D3 *to = (D3*)memory.values(3 * nmove), *from = (D3*)memory.values(3 * nmove);
   if (memory.full) return false;
   for (int i = 0; i < nmove; ++i) {
     int corner[3];
     for (int c = 0; c < 3; ++c) corner[c] = (int)m.elem[3 * move[i].elem + c];
-    to[i] = at_corners(m.rest, corner, move[i].weight);
-    if (to[i] != m.place(move[i].vert)) moved.put(move[i].vert);
+    from[i] = m.place(move[i].vert), to[i] = at_corners(m.rest, corner, move[i].weight);
+    if (to[i] != from[i]) moved.put(move[i].vert);
   }
   for (int pass = 0; pass < 2; ++pass)
     for (int i = 0; i < (pass ? nmove : there.count); ++i) {
@@ -156,14 +163,19 @@ PALPATE bool apply(const S& m, const Move* move, int nmove, const Seam& seam, co
         if (m.half(v, k) >= 0) near.put(m.half(v, k) / 3);
     }
   near.sort(m.nelem);
-  int* before = memory.numbers(3 * near.count);
+  out.before = memory.numbers(3 * near.count), out.share = memory.values(m.nvert);
   if (memory.full) return false;
-  for (int i = 0; i < 3 * near.count; ++i) before[i] = (int)m.elem[3 * near.list[i / 3] + i % 3];
+  for (int i = 0; i < 3 * near.count; ++i) out.before[i] = (int)m.elem[3 * near.list[i / 3] + i % 3];
   for (int i = 0; i < nmove; ++i) store(m.rest + 3 * move[i].vert, to[i]);
-  double_vertices(m, seam, there, part, size, split);
-  for (int i = 0; i < split.count; ++i)
-    store(m.rest + 3 * split.member[i], m.place(split.group[i]));
-  rejoin(m, near, before, moved, split, vert, row, source);
+  double_vertices(m, seam, there, part, size, out.split);
+  for (int i = 0; i < out.split.count; ++i)
+    store(m.rest + 3 * out.split.member[i], m.place(out.split.group[i]));
+  rejoin(m, near, out.before, moved, out.split, out.vert, row, source);
+  out.vert.clear();
+  for (int i = 0; i < 3 * near.count; ++i)
+    if (!pinned[out.before[i]]) out.vert.put(out.before[i]);
+  carry_motion(m, x, move, nmove, from, out.vert);
+  share_masses(m, x, out.split, out.share);
   return true;
 }
 
@@ -175,47 +187,51 @@ struct Answer {
   int* found;  // numbers, see FOUND
   double* size;  // see SIZE
 
-  PALPATE void write(const Move* move, int nmove, const Split& split, const Seam& seam, const Few& near) const {
-    for (int i = 0; i < nmove; ++i) {
-      f.moved.data[vert + i] = move[i].vert, f.target.data[vert + i] = move[i].elem;
-      store(f.weight.data + 3 * (vert + i), move[i].weight);
+  PALPATE void write(const Changes& c, const Seam& seam, int nmove) const {
+    for (int i = 0; i < c.vert.count; ++i) f.near.data[vert + i] = c.vert.list[i];
+    for (int i = 0; i < c.split.count; ++i) {
+      f.group.data[vert + i] = c.split.group[i], f.member.data[vert + i] = c.split.member[i];
+      f.share.data[vert + i] = c.share[i];
     }
-    for (int i = 0; i < split.count; ++i)
-      f.group.data[vert + i] = split.group[i], f.member.data[vert + i] = split.member[i];
-    for (int i = 0; i < near.count; ++i) f.changed.data[elem + i] = near.list[i];
+    for (int i = 0; i < c.elem.count; ++i) f.changed.data[elem + i] = c.elem.list[i];
+    for (int i = 0; i < 3 * c.elem.count; ++i) f.before.data[3 * elem + i] = c.before[i];
     for (int i = 0; i < 2 * seam.count; ++i) f.seam.data[2 * vert + i] = seam.pair[i];
-    found[FOUND_MOVED] = nmove, found[FOUND_SPLIT] = split.count, found[FOUND_CHANGED] = near.count;
-    found[FOUND_EDGES] = seam.count, found[FOUND_NOUTER] = split.following;
+    found[FOUND_NEAR] = c.vert.count, found[FOUND_SPLIT] = c.split.count;
+    found[FOUND_CHANGED] = c.elem.count, found[FOUND_EDGES] = seam.count;
+    found[FOUND_NOUTER] = c.split.following, found[FOUND_MOVED] = nmove;
   }
 };
 
 // Cuts along a path that was traced; returns how it went.
 template <class F, class S>
-PALPATE int cut_along(const F& f, const S& m, const Material& p, const Path& path, const double* disp,
+PALPATE int cut_along(const F& f, const S& m, const Material& p, const Path& path, const Moving& x,
                       Scratch& memory, const Answer<F>& out) {
   Chains chains;
   Seam seam = {nullptr, 0, memory.numbers(3 * m.nelem)};
-  Few there = few(memory, m.nvert), movers = few(memory, m.nvert), near = few(memory, m.nelem);
+  Few there = few(memory, m.nvert), movers = few(memory, m.nvert);
+  Changes made = {few(memory, m.nelem), few(memory, m.nvert), nullptr};
+  made.split = {memory.numbers(m.nvert), memory.numbers(m.nvert), 0, out.found[FOUND_NOUTER]};
   int *seen = memory.numbers(m.nvert), *part = memory.numbers(m.most);
   D3* goal = (D3*)memory.values(3 * m.nvert);
-  Split split = {memory.numbers(m.nvert), memory.numbers(m.nvert), 0, out.found[FOUND_NOUTER]};
+  const auto* pinned = f.pinned.data + out.vert;
   if (memory.full) return NO_ROOM;
   int status = find_chains(m, path, memory, chains);
-  if (status == DONE) status = check_chains(m, path, chains, f.pinned.data + out.vert, out.size + SIZE_BAD);
+  if (status == DONE) status = check_chains(m, path, chains, pinned, out.size + SIZE_BAD);
   if (status != DONE) return status;
   seam.pair = memory.numbers(2 * chains.start[path.nrun] + 2);
   if (memory.full) return NO_ROOM;
   find_seam(m, path, chains, seam);
-  out.found[FOUND_STOPPED] = find_room(m, seam, m.nvert - split.following, there, part);
-  find_goals(m, path, chains, there, f.pinned.data + out.vert, movers, goal, seen);
+  out.found[FOUND_STOPPED] = find_room(m, seam, m.nvert - made.split.following, there, part);
+  find_goals(m, path, chains, there, pinned, movers, goal, seen);
   Move* move = (Move*)memory.values(movers.count * (int)(sizeof(Move) / sizeof(double)));
   if (memory.full || seam.count > m.nvert) return NO_ROOM;
-  const int nmove = find_moves(m, disp, p, goal, movers, move, memory);
-  if (memory.full || !apply(m, move, nmove, seam, there, split, near, memory)) return NO_ROOM;
-  out.write(move, nmove, split, seam, near);
+  const int nmove = find_moves(m, x.disp, p, goal, movers, move, memory);
+  if (memory.full || !apply(m, x, move, nmove, seam, there, pinned, made, memory)) return NO_ROOM;
+  out.write(made, seam, nmove);
   out.size[SIZE_DEVIATION] = deviation_of(m, path, chains, there);
   bool apart = false;
-  for (int r = 0; r < path.nrun && near.count; ++r) apart = apart || may_separate(chains, r, split);
+  for (int r = 0; r < path.nrun && made.elem.count; ++r)
+    apart = apart || may_separate(chains, r, made.split);
   if (!apart) return DONE;
   Pieces pieces = {memory.numbers(m.nelem), memory.numbers(m.nelem), memory.numbers(m.nelem),
                    memory.numbers(m.nelem), memory.numbers(m.nelem), memory.values(m.nelem)};
@@ -250,15 +266,15 @@ PALPATE void cut_surface(const Fields& f, Thread t, int) {
                     f.nint, f.nreal, false};
   double* x = memory.values(3 * m.nvert);
   if (memory.full) return;
-  const double* disp = f.disp.data + 3 * v;
-  for (int i = 0; i < 3 * m.nvert; ++i) x[i] = m.rest[i] + disp[i];
+  const Moving moving = {f.mass.data + v, f.disp.data + 3 * v, f.vel.data + 3 * v};
+  for (int i = 0; i < 3 * m.nvert; ++i) x[i] = m.rest[i] + moving.disp[i];
   const Material p = {f.kind, f.held, f.thickness, f.stiffness, f.given, f.lame.data, f.shear.data,
                       f.whole.data + v, f.pull.data + 3 * v, f.hard.data + v};
   Path path = {};
   path.edge = f.edge;
   int status = trace(m, x, out.found[FOUND_NOUTER], f.point.data + 3 * w * (long long)f.most_points,
                      f.npoint.data[w], memory, path, out.size + SIZE_BAD);
-  if (status == DONE) status = cut_along(f, m, p, path, disp, memory, out);
+  if (status == DONE) status = cut_along(f, m, p, path, moving, memory, out);
   out.found[FOUND_STATUS] = status;
 }
 

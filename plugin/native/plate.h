@@ -46,43 +46,17 @@ PALPATE D3 angle_of(const S& m, int h, const D2* flat, double* weight) {
   return zero - bend_of(inner, share, height, start, end) - bend_of(outer, beyond, far, start, end);
 }
 
-// Turns a symmetric matrix so that an entry beside its diagonal is 0 (Jacobi 1846), and with it `axes`.
-PALPATE void turn_axes(double (*a)[3], double (*axes)[3], int p, int q) {
-  if (a[p][q] == 0.0) return;
-  const double theta = 0.5 * (a[q][q] - a[p][p]) / a[p][q];
-  const double t = (theta >= 0.0 ? 1.0 : -1.0) / (fabs(theta) + sqrt(1.0 + theta * theta));
-  const double c = 1.0 / sqrt(1.0 + t * t), s = t * c;
-  for (int k = 0; k < 3; ++k) {
-    const double x = a[k][p], y = a[k][q];
-    a[k][p] = c * x - s * y, a[k][q] = s * x + c * y;
-  }
-  for (int k = 0; k < 3; ++k) {
-    const double x = a[p][k], y = a[q][k];
-    a[p][k] = c * x - s * y, a[q][k] = s * x + c * y;
-  }
-  a[p][q] = a[q][p] = 0.0;
-  for (int k = 0; k < 3; ++k) {
-    const double x = axes[k][p], y = axes[k][q];
-    axes[k][p] = c * x - s * y, axes[k][q] = s * x + c * y;
-  }
-}
-
 constexpr double RAISED = 0.05;  // of the largest eigenvalue
-constexpr int SWEEPS = 6;
 
 // Inverts a flexibility between hinges, small eigenvalues of which are raised; absent hinges have no
 // stiffness.
 PALPATE void stiffen(double (*flex)[3], const bool* there, double size, double (*gain)[3]) {
-  double axes[3][3] = {{1.0, 0.0, 0.0}, {0.0, 1.0, 0.0}, {0.0, 0.0, 1.0}};
-  for (int k = 0; k < SWEEPS; ++k)
-    for (int p = 0; p < 2; ++p)
-      for (int q = p + 1; q < 3; ++q) turn_axes(flex, axes, p, q);
-  double largest = 0.0, inverse[3];
+  double axes[3][3], largest = 0.0, inverse[3];
+  find_axes(flex, axes);
   for (int k = 0; k < 3; ++k) largest = flex[k][k] > largest ? flex[k][k] : largest;
   for (int k = 0; k < 3; ++k) {
     const double value = flex[k][k];
     const double raised = value > RAISED * largest ? value : RAISED * largest;
-    // The rows of absent hinges are 0, so that each keeps the axis of its own.
     inverse[k] = !there[k] || largest <= 0.0 ? 0.0 : 1.0 / raised;
   }
   for (int i = 0; i < 3; ++i)

@@ -80,23 +80,10 @@ PALPATE void put_fan(const F& f, const S& m, int v) {
   f.free.data[own] = f.pinned.data[v] || fan.degree == 0 ? 0.0f : 1.0f;
 }
 
-// The area that the foundation holds around a vertex, summed over triangles in ascending order.
+// The area that the foundation holds around a vertex.
 template <class F, class S>
 PALPATE void put_area(const F& f, const S& m, int v) {
-  double sum = 0.0;
-  for (int t = -1;;) {
-    int next = m.nelem;
-    for (int k = 0; k < m.degree[v]; ++k) {
-      const int h = m.half(v, k);
-      if (h >= 0 && h / 3 > t && h / 3 < next) next = h / 3;
-    }
-    if (next == m.nelem) break;
-    t = next;
-    D3 x[3];
-    m.corners(t, x);
-    if (!f.surface.loose.data[t]) sum += norm(0.5 * cross(x[1] - x[0], x[2] - x[0])) / 3.0;
-  }
-  f.area.data[f.node.data[v]] = (float)sum;
+  f.area.data[f.node.data[v]] = (float)area_around(m, v, f.surface.loose.data);
 }
 
 // The number of the hinge of a half-edge: that which it had before the first cut.
@@ -276,7 +263,7 @@ PALPATE bool write_rows(const F& f, const S& m, Scratch& memory) {
     const int t = f.changed.data[i];
     for (int c = 0; c < 3; ++c) {
       touched.put((int)m.elem[3 * t + c]);
-      touched.put((int)f.old_elem.data[3 * t + c]);
+      touched.put((int)f.before.data[3 * i + c]);
     }
   }
   // A triangle's plate is that of the patch of it and its neighbours.
@@ -291,10 +278,8 @@ PALPATE bool write_rows(const F& f, const S& m, Scratch& memory) {
     }
     own = ring ? own : near.count;
   }
-  for (int i = 0; i < 3 * near.count; ++i) {
-    const int h = 3 * near.list[i / 3] + i % 3;
-    vert.put((int)m.elem[h]), vert.put((int)f.old_elem.data[h]);
-  }
+  for (int i = 0; i < 3 * near.count; ++i) vert.put((int)m.elem[3 * near.list[i / 3] + i % 3]);
+  for (int i = 0; i < 3 * f.nchanged && f.bends; ++i) vert.put(f.before.data[i]);
   for (int i = 0; i < vert.count; ++i) {
     const int s = f.node.data[vert.list[i]] / LANES;
     find_columns(f, m, vert.list[i], row);

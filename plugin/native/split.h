@@ -107,9 +107,10 @@ PALPATE void walk(const S& m, int v, const int* row, int n) {
 // Gives triangles the twins that they have now, and vertices their rings.
 //
 // Args: the triangles around all that moved or came apart, ascending, with the corners that they had;
-// which of these were moved; the split; lists. Leaves in `elem` the triangles that are not as they were.
+// which of these were moved; the split; lists. Leaves in `elem` the triangles that are not as they were, and
+// in `before` their corners.
 template <class S>
-PALPATE void rejoin(const S& m, Few& elem, const int* before, const Few& moved, const Split& split,
+PALPATE void rejoin(const S& m, Few& elem, int* before, const Few& moved, const Split& split,
                     Few& vert, int* row, int* source) {
   int count = 0;
   vert.clear();
@@ -126,7 +127,9 @@ PALPATE void rejoin(const S& m, Few& elem, const int* before, const Few& moved, 
     }
     for (int c = 0; c < 3 && cut; ++c) vert.put(before[3 * i + c]), vert.put((int)m.elem[3 * t + c]);
     elem.place[t] = 0;
-    if (cut || goes) elem.list[count++] = t;
+    if (!cut && !goes) continue;
+    for (int c = 0; c < 3; ++c) before[3 * count + c] = before[3 * i + c];
+    elem.list[count++] = t;
   }
   elem.count = count;
   // New vertices first: what they come from has its old row until then.

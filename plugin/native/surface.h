@@ -103,6 +103,56 @@ PALPATE Few few(Scratch& memory, int most) {
   return {list, memory.numbers(most), 0};
 }
 
+// The area around a vertex, summed over triangles in ascending order; of those that `loose` marks none.
+template <class S, class L>
+PALPATE double area_around(const S& m, int v, const L* loose) {
+  double sum = 0.0;
+  for (int t = -1;;) {
+    int next = m.nelem;
+    for (int k = 0; k < m.degree[v]; ++k) {
+      const int h = m.half(v, k);
+      if (h >= 0 && h / 3 > t && h / 3 < next) next = h / 3;
+    }
+    if (next == m.nelem) return sum;
+    t = next;
+    D3 x[3];
+    m.corners(t, x);
+    if (!loose || !loose[t]) sum += norm(0.5 * cross(x[1] - x[0], x[2] - x[0])) / 3.0;
+  }
+}
+
+// Turns a symmetric matrix so that an entry beside its diagonal is 0 (Jacobi 1846), and with it `axes`.
+PALPATE void turn_axes(double (*a)[3], double (*axes)[3], int p, int q) {
+  if (a[p][q] == 0.0) return;
+  const double theta = 0.5 * (a[q][q] - a[p][p]) / a[p][q];
+  const double t = (theta >= 0.0 ? 1.0 : -1.0) / (fabs(theta) + sqrt(1.0 + theta * theta));
+  const double c = 1.0 / sqrt(1.0 + t * t), s = t * c;
+  for (int k = 0; k < 3; ++k) {
+    const double x = a[k][p], y = a[k][q];
+    a[k][p] = c * x - s * y, a[k][q] = s * x + c * y;
+  }
+  for (int k = 0; k < 3; ++k) {
+    const double x = a[p][k], y = a[q][k];
+    a[p][k] = c * x - s * y, a[q][k] = s * x + c * y;
+  }
+  a[p][q] = a[q][p] = 0.0;
+  for (int k = 0; k < 3; ++k) {
+    const double x = axes[k][p], y = axes[k][q];
+    axes[k][p] = c * x - s * y, axes[k][q] = s * x + c * y;
+  }
+}
+
+constexpr int SWEEPS = 6;
+
+// Leaves the eigenvalues of a symmetric matrix on its diagonal, and its eigenvectors as columns of `axes`;
+// rows that are 0 keep the axis of their own.
+PALPATE void find_axes(double (*a)[3], double (*axes)[3]) {
+  for (int i = 0; i < 9; ++i) axes[i / 3][i % 3] = i / 3 == i % 3;
+  for (int k = 0; k < SWEEPS; ++k)
+    for (int p = 0; p < 2; ++p)
+      for (int q = p + 1; q < 3; ++q) turn_axes(a, axes, p, q);
+}
+
 // The nearest place of a surface: a triangle, weights of its corners, and how far it is.
 struct Spot { int elem; D3 weight; double far; };
 

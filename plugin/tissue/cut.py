@@ -25,7 +25,9 @@ from .types import CONSTANTS, allocate, doubles, flags, ints, longs, struct
 _DONE, _NO_ROOM, _OFF, _SHORT, _PINNED = range(5)
 _SAMPLE, _FAR = 0.25, 2.0
 _KINDS = {"membrane": 1, "spring": 2}  # of energy, as in native/snap.h
-_FOUND = ("status", "moved", "split", "changed", "edges", "nouter", "stopped", "apart")
+_FOUND = (
+  "status", "moved", "near", "split", "changed", "edges", "nouter", "stopped", "apart",
+)  # fmt: skip
 _SIZE = ("bad", "far", "deviation")
 _NUMBERS = {
   f"{prefix}_{name.upper()}": k
@@ -49,7 +51,9 @@ class Cutting:
   stiffness: wp.float64  # of an edge's spring [N/m]
   given: wp.float64  # by which the energy around a vertex may rise as it moves [J]
   home: longs("nelem")  # `Mesh.home`
+  mass: doubles("nworld", "nvert")  # of vertices, before and after [kg]
   disp: doubles("nworld", "nvert", 3)  # displacement [m]
+  vel: doubles("nworld", "nvert", 3)  # velocity [m/s]
   pinned: flags("nworld", "nvert")  # whether a vertex does not move
   lame: doubles("nelem")  # of triangles [Pa]
   shear: doubles("nelem")  # [Pa]
@@ -60,12 +64,12 @@ class Cutting:
   point: doubles("nworld", "most_points", 3)  # these, where the surface is now [m]
   found: ints("nworld", len(_FOUND))  # see _FOUND; nouter is read too
   size: doubles("nworld", len(_SIZE))  # see _SIZE
-  moved: ints("nworld", "nvert")  # vertices that lie elsewhere at rest
-  target: ints("nworld", "nvert")  # triangles in which, in the mesh before
-  weight: doubles("nworld", "nvert", 3)  # and weights of their corners
-  group: ints("nworld", "nvert")  # vertices that were one, of the first of each group
-  member: ints("nworld", "nvert")  # those vertices
-  changed: ints("nworld", "nelem")  # triangles that are not as they were
+  near: ints("nworld", "nvert")  # see `Cut`, these and what follows
+  group: ints("nworld", "nvert")
+  member: ints("nworld", "nvert")
+  share: doubles("nworld", "nvert")
+  changed: ints("nworld", "nelem")
+  before: ints("nworld", "nelem", 3)
   seam: ints("nworld", "nvert", 2)  # edges that came apart
   ints: ints("nworld", "nint")  # scratch
   reals: doubles("nworld", "nreal")
@@ -90,17 +94,34 @@ class Springs:
 
 
 @dataclasses.dataclass(frozen=True)
+class Motion:
+  """What vertices carry.
+
+  Attributes:
+    mass: [kg]                       (nvert,)
+    disp: displacement from rest [m] (nvert, 3)
+    vel: velocity [m/s]              (nvert, 3)
+  """
+
+  mass: np.ndarray
+  disp: np.ndarray
+  vel: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
 class Cut:
   """What came of a path.
 
   Attributes:
     mesh: the mesh, cut
+    motion: what its vertices carry, until the next cut
+    moved: how many vertices lie elsewhere at rest
+    near: vertices that move on otherwise, those that have come not among them (n,)
     changed: triangles that are not as they were                        (n,)
-    moved: vertices that lie elsewhere at rest                          (n,)
-    corner: where they lie in the mesh before: corners of a triangle    (n, 3)
-    weight: and their weights                                           (n, 3)
+    before: corners that they had                                       (n, 3)
     group: vertices that were one, of the first of each group           (m,)
     member: those vertices, old and new                                 (m,)
+    share: their parts of its mass                                      (m,)
     path: the cut edges, one after the other, at rest [m]               list of (k, 3)
     length: of the cut edges at rest [m]
     deviation: greatest distance of their vertices from the path [m]
@@ -108,12 +129,14 @@ class Cut:
   """
 
   mesh: Mesh
+  motion: Motion
+  moved: int
+  near: np.ndarray
   changed: np.ndarray
-  moved: np.ndarray
-  corner: np.ndarray
-  weight: np.ndarray
+  before: np.ndarray
   group: np.ndarray
   member: np.ndarray
+  share: np.ndarray
   path: list[np.ndarray]
   length: float
   deviation: float
@@ -132,12 +155,13 @@ class Knife:
     self._config: Config | None = None
     self._fields: Any = None
     self._host: dict[str, np.ndarray] = {}
+    self._launch: Any = None
 
   def cut(
     self,
     organ: str,
     mesh: Mesh,
-    disp: np.ndarray,
+    motion: Motion,
     points: np.ndarray,
     pinned: np.ndarray,
     config: Config | None = None,
@@ -149,7 +173,7 @@ class Knife:
     Args:
       organ: its name, for messages
       mesh: the surface
-      disp: displacement of its vertices from rest [m]   (nvert, 3)
+      motion: what its vertices carry; mass, momentum and angular momentum are kept
       points: the path, in the same frame [m]            (n, 3)
       pinned: vertices that do not move                  (nvert,) bool
       config: material, whose energy moving vertices must not raise, or None
@@ -165,11 +189,12 @@ class Knife:
     self._copy.put(mesh)
     self._put_material(config if config and config.elements in _KINDS else None, held, given)
     host = self._host
-    host["disp"][:], host["pinned"][:] = disp, pinned
+    host["mass"][:], host["disp"][:], host["vel"][:] = motion.mass, motion.disp, motion.vel
+    host["pinned"][:] = pinned
     host["point"][: len(points)], host["npoint"][0] = points, len(points)
     host["found"][:] = 0
     host["found"][_FOUND.index("nouter")] = mesh.nouter
-    _cut.launch("cpu", 1, 1, 0, self._fields)
+    self._launch()
     found = dict(zip(_FOUND, host["found"].tolist(), strict=True))
     self._check(organ, found["status"])
     return self._answer(mesh, found)
@@ -184,13 +209,14 @@ class Knife:
     sizes = self._copy.sizes | {"most_points": n}
     # What native/cut.h takes of scratch, see there.
     sizes["nint"] = 24 * whole.nvert + 15 * whole.nelem + 16 * n + 8 * sizes["most"] + 100
-    sizes["nreal"] = 27 * whole.nvert + 6 * whole.nelem + 11 * n
+    sizes["nreal"] = 32 * whole.nvert + 6 * whole.nelem + 11 * n
     self._fields = fields = allocate(Cutting, "cpu", sizes)
     fields.surface, fields.edge = self._copy.fields, edge
     for name in ("most_points", "nint", "nreal"):
       setattr(fields, name, sizes[name])
     self._host = host_views(fields, Cutting)
     self._host["home"][:] = whole.home
+    self._launch = _cut.command(fields).launch
 
   def _put_material(self, config: Config | None, held: Springs | None, given: float):
     fields, host = self._fields, self._host
@@ -234,18 +260,25 @@ class Knife:
       )
 
   def _answer(self, mesh: Mesh, found: dict[str, int]) -> Cut:
-    host = self._host
-    moved, target = (host[name][: found["moved"]].astype(int) for name in ("moved", "target"))
-    group, member = (host[name][: found["split"]].astype(int) for name in ("group", "member"))
-    changed = host["changed"][: found["changed"]].astype(int)
-    weight, corner = host["weight"][: len(moved)].copy(), mesh.elem[target]
-    if len(changed):
-      mesh = self._copy.take(mesh, mesh.closed and not len(group), bool(found["apart"]))
+    host, parts = self._host, {"before": "changed", "group": "split", "member": "split"}
+    lists = {
+      name: host[name][: found[parts.get(name, name)]].astype(int)
+      for name in ("near", "changed", *parts)
+    }
+    if found["changed"]:
+      mesh = self._copy.take(mesh, mesh.closed and not found["split"], bool(found["apart"]))
     path = _lines(mesh.rest, host["seam"][: found["edges"]].tolist())
-    length = sum(float(lengths(np.diff(line, axis=0)).sum()) for line in path)
-    deviation, stopped = float(host["size"][_SIZE.index("deviation")]), bool(found["stopped"])
-    done = moved, corner, weight, group, member, path, length, deviation, stopped
-    return Cut(mesh, changed, *done)
+    return Cut(
+      mesh=mesh,
+      motion=Motion(host["mass"], host["disp"], host["vel"]),
+      moved=found["moved"],
+      share=host["share"][: found["split"]].copy(),
+      path=path,
+      length=sum(float(lengths(np.diff(line, axis=0)).sum()) for line in path),
+      deviation=float(host["size"][_SIZE.index("deviation")]),
+      stopped=bool(found["stopped"]),
+      **lists,
+    )
 
 
 def _check_points(organ: str, points: np.ndarray):

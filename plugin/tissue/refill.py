@@ -58,7 +58,8 @@ class Refill:
     """
     if not changed.size:
       return
-    if not self._rows.write(mesh, config, pinned, self.mesh, changed):
+    before, loosened = self.mesh.elem[changed], mesh.loose is not self.mesh.loose
+    if not self._rows.write(mesh, config, pinned, changed, before, loosened):
       raise ValueError("cuts that meet leave no room in the bending matrix")
     if self._body.device.is_cuda:
       for name in NAMES:

@@ -16,7 +16,7 @@ from .config import Config
 from .kernels import kernel
 from .mesh import Mesh
 from .surface import Surface, WorkingCopy
-from .types import CONSTANTS, Shape, Tissue, doubles, flags, ints, longs, struct
+from .types import CONSTANTS, Shape, Tissue, doubles, flags, ints, struct
 
 _OF_SHAPE = (
   "fan_node", "fan_rest", "fan_corner", "fan_side", "degree", "rest", "area", "free", "elem_node",
@@ -56,8 +56,8 @@ class Filling:
   young: doubles("nelem")  # [Pa]
   rigidity: doubles("nelem")  # of their plates [N m]
   pinned: flags("nvert")  # whether a vertex does not move
-  old_elem: longs("nelem", 3)  # corners that triangles had
-  changed: ints("nchanged")  # triangles that are not as they were
+  changed: ints("nelem")  # triangles that are not as they were
+  before: ints("nelem", 3)  # corners that they had
   hinge_of: ints("nhalf")  # number of each half-edge's hinge before the first cut
   node: ints("nvert")
   slot_adr: ints("nslice + 1")
@@ -92,12 +92,17 @@ class Rows:
     nint = 4 * (sizes["nvert"] + sizes["nelem"]) + 16 * sizes["most"]
     nreal = 8 * sizes["most"] + _PLATE * sizes["nelem"]
     scratch = {"ints": np.empty(nint, np.int32), "reals": np.empty(nreal)}
+    self._changed = np.zeros(whole.nelem, np.int32)
+    self._before = np.zeros((whole.nelem, 3), np.int32)
+    self._pinned = np.zeros(whole.nvert, np.uint8)
     self._put(
       **scratch, nint=nint, nreal=nreal, nhinge=len(whole.interior), hinge_of=hinge_of,
       centre=whole.centre, node=node.astype(np.int32), found=np.zeros(1, np.int32),
-      count=np.zeros(sizes["nvert"], np.int32),
+      count=np.zeros(sizes["nvert"], np.int32), changed=self._changed, before=self._before,
+      pinned=self._pinned,
     )  # fmt: skip
     self.fields.surface = copy.fields
+    self._fill, self._found = _fill.command(self.fields).launch, self.fields.found.numpy()
 
   def put(self, arrays: Mapping[str, Any]):
     """Writes into these arrays from now on."""
@@ -120,8 +125,9 @@ class Rows:
     mesh: Mesh,
     config: Config,
     pinned: np.ndarray,
-    old: Mesh | None = None,
     changed: np.ndarray | None = None,
+    before: np.ndarray | None = None,
+    loosened: bool = True,
   ) -> bool:
     """Writes the rows of a surface; returns False where the bending matrix has no room for them.
 
@@ -131,23 +137,19 @@ class Rows:
       mesh: the surface
       config: its configuration
       pinned: vertices that do not move, (nvert,) bool
-      old: what the arrays are of, None for nothing
-      changed: triangles that are not as there, None for all
+      changed: triangles that are not as in the arrays, None for all
+      before: corners that these have there, (n, 3)
+      loosened: whether what the foundation holds may be other triangles too
     """
     self._copy.put(mesh)
     self._put_material(config)
-    every = old is None or changed is None
+    self.fields.every, self.fields.loosened = int(changed is None), int(loosened)
     changed = np.arange(mesh.nelem) if changed is None else changed
-    self._put(
-      every=int(every),
-      loosened=int(old is None or old.loose is not mesh.loose),
-      nchanged=len(changed),
-      changed=changed.astype(np.int32),
-      pinned=pinned.astype(np.uint8),
-      old_elem=np.ascontiguousarray((old or mesh).elem, np.int64),
-    )
-    _fill.launch("cpu", 1, 1, 0, self.fields)
-    return bool(self.fields.found.numpy()[0])
+    self.fields.nchanged = n = len(changed)
+    self._changed[:n], self._pinned[:] = changed, pinned
+    self._before[:n] = mesh.elem[changed] if before is None else before
+    self._fill()
+    return bool(self._found[0])
 
   def _put_material(self, config: Config):
     if config == self._config:
