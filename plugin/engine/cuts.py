@@ -87,6 +87,8 @@ class Cuts:
     self.mass = w.organ.mass.copy()
     self.source = np.arange(self.whole.nvert)
     self._own: dict[str, np.ndarray] = {}
+    self._total: int | None = None  # that the stamp is made of, None for not known
+    self._loose: np.ndarray | None = None  # that of the mesh in the state then
     self.lock: Any = None  # held while the model's triangles are read or written
 
   def __bool__(self) -> bool:
@@ -110,6 +112,7 @@ class Cuts:
     state, where = w.views["plugin_state"].numpy(), coupling.spans(w.organ)
     names = ("corner", "place", "weight", "source", "stamp")
     self._own = {name: state[where[name]] for name in names}
+    self._words = state[where["corner"].start : where["weight"].stop]
     self._found: Any = self._own["stamp"].data
     self.lock = turns.lock_of(model)
     self._elem = flexes.element_data(m, w.organ.flex)
@@ -137,7 +140,7 @@ class Cuts:
     mesh, changed = topology.recut(self.mesh, rest, elem, loose)
     self._become(mesh, changed, mass, source, self._found[0])
     self.reports = []
-    self._fresh = True
+    self._fresh, self._total = True, None
 
   def _read(self):
     whole, own = self.whole, self._own
@@ -162,13 +165,25 @@ class Cuts:
     for name, values in kept.items():
       self._own[name][:] = values
 
-  def _write(self, corner: np.ndarray):
-    own, mesh = self._own, self.mesh
-    own["corner"][:] = corner
-    own["place"][:] = mesh.rest.ravel()
-    own["weight"][:] = self.mass
-    own["source"][:] = self.source[mesh.nvert - mesh.spare :]
-    self._found[0] = self.stamp
+  def _write(self, found: cutting.Cut):
+    """Writes to the state what a cut has changed, where it has the mesh before; else everything."""
+    own, mesh, n = self._own, self.mesh, self.whole.nvert
+    words, spare = self._words, mesh.nvert - mesh.spare
+    if self._total is None or mesh.loose is not self._loose:
+      words[:] = np.concatenate([flexes.pack(mesh.elem, mesh.loose), mesh.rest.ravel(), self.mass])
+      self._total = flexes.total(words, slice(None), len(words))
+    else:
+      elem, vert = found.changed, topology.distinct(found.before, mesh.elem[found.changed])
+      loose = None if mesh.loose is None else mesh.loose[elem]
+      place = (3 * vert[:, None] + np.arange(3)).ravel()
+      at = np.concatenate([elem, mesh.nelem + place, mesh.nelem + 3 * n + vert])
+      corner, rest = flexes.pack(mesh.elem[elem], loose), mesh.rest[vert].ravel()
+      new, old = np.concatenate([corner, rest, self.mass[vert]]), words[at]
+      self._total += flexes.total(new, at, len(words)) - flexes.total(old, at, len(words))
+      words[at] = new
+    own["source"][:] = self.source[spare:]
+    self._loose = mesh.loose
+    self.stamp = self._found[0] = flexes.stamp_of(self._total)
 
   def _become(self, mesh: Mesh, changed: np.ndarray, mass, source, stamp: float):
     w = self._w
@@ -176,7 +191,7 @@ class Cuts:
     touched = topology.distinct(touched, np.flatnonzero(mass != self.mass))
     self._refill.write(mesh, changed, w.config, ~w.organ.free)
     self.mass, self.source, self.stamp = mass, source, stamp
-    w.organ = dataclasses.replace(self.declared, mesh=mesh, mass=mass)
+    w.organ = self.declared.cut(mesh, mass)
     w.phases.reshape(touched)
     for grown in [space for each in w.beside for space in each.reshape()]:
       with graphs.lock:
@@ -264,10 +279,8 @@ class Cuts:
     source[member] = source[group]
     for each in w.beside:
       each.carry(group, member, share)
-    corner = flexes.pack(mesh.elem, mesh.loose)
-    stamp = flexes.stamp(corner, mesh.rest, motion.mass)
-    self._become(mesh, found.changed, motion.mass.copy(), source, stamp)
-    self._write(corner)
+    self._become(mesh, found.changed, motion.mass.copy(), source, self.stamp)
+    self._write(found)
     changed = topology.distinct(found.near, member)
     w.phases.carry(changed, motion.disp, motion.vel, group, member, share)
     self.show()
