@@ -170,7 +170,7 @@ def stamp(*parts: Any) -> float:
 
 
 def total(values: np.ndarray, where: Any, count: int) -> int:
-  """Returns the sum of which `stamp_of` makes a stamp, of those of `count` numbers that are there."""
+  """Returns the sum that a stamp is made of, of those of `count` numbers that are there."""
   words = values.view(np.uint64)
   return int(((words ^ words >> np.uint64(32)) * _keys(count)[where]).sum())
 

@@ -16,7 +16,7 @@ from . import rows, solid, step
 from .body import Body
 from .config import Config
 from .mesh import Mesh
-from .order import LANES, addresses, banks, node_order, offset
+from .order import LANES, addresses, banks, node_order, offset, to_slices
 from .surface import WorkingCopy
 from .types import NUMBERS, empty, zeros
 
@@ -145,23 +145,24 @@ def arrays(
   nslice = len(vert) // LANES
   node = np.empty(mesh.nvert, np.int64)
   node[vert[vert >= 0]] = np.flatnonzero(vert >= 0)
-  writer = rows.Rows(WorkingCopy(mesh), {}, node)
-  out = _fans(mesh, vert)
-  out |= _no_bending(nslice)
-  if config.bend:
-    out |= _bending(mesh, node, nslice, writer.widths(mesh), bend_width)
-  writer.put(out)
-  assert writer.write(mesh, config, pinned)
+  skin = dataclasses.replace(config, bend=0.0) if len(mesh.tet) else config
+  out = _skin(mesh, skin, pinned, vert, node, bend_width)
+  out |= _capsule(mesh.surface, config, pinned, vert, node)
   out |= solid.arrays(mesh, config, vert, node) if len(mesh.tet) else solid.none(nslice)
   out |= {
     "vert": vert.astype(np.int32),
     "node": node.astype(np.int32),
+    "area": _node_values(topology.held_areas(mesh), vert),
     "closed": int(mesh.closed),
     "volume0": topology.volume(mesh.rest, mesh.elem) if mesh.closed else 0.0,
     "shortest": 0.0 if mesh.spare else topology.shortest(mesh),
     "number": np.array(list(_numbers(config, mesh.closed).values())),
   }
   return out | counts(out)
+
+
+def _node_values(values: np.ndarray, vert: np.ndarray) -> np.ndarray:
+  return to_slices(np.where(vert >= 0, values[vert], 0.0).astype(np.float32))
 
 
 def counts(values: dict[str, Any]) -> dict[str, int]:
@@ -175,7 +176,26 @@ def counts(values: dict[str, Any]) -> dict[str, int]:
     "ntetslice": len(values["tet_node"]),
     "nedgeslice": len(values["edge_slot"]),
     "nslot": int(values["slot_adr"][-1]),
+    "ncapsule": int(values["capsule_adr"][-1]),
   }
+
+
+def _skin(
+  mesh: Mesh,
+  config: Config,
+  pinned: np.ndarray,
+  vert: np.ndarray,
+  node: np.ndarray,
+  bend_width: np.ndarray | None,
+) -> dict[str, np.ndarray]:
+  """Returns the arrays of fans, nodes and bending of a surface."""
+  nslice, writer = len(vert) // LANES, rows.Rows(WorkingCopy(mesh), {}, node)
+  out = _fans(mesh, vert) | _no_bending(nslice)
+  if config.bend:
+    out |= _bending(mesh, node, nslice, writer.widths(mesh), bend_width)
+  writer.put(out)
+  assert writer.write(mesh, config, pinned)
+  return out
 
 
 def _fans(mesh: Mesh, vert: np.ndarray) -> dict[str, np.ndarray]:
@@ -196,7 +216,21 @@ def _fans(mesh: Mesh, vert: np.ndarray) -> dict[str, np.ndarray]:
 _FANS = ("fan_rest", "fan_metric", "fan_spring", "fan_corner", "fan_side", "degree", "rest", "area",
          "free")  # fmt: skip
 _PLATES = ("elem_node", "elem_rest", "elem_hinge", "hinge_node", "hinge_rest", "hinge_elem",
-           "hinge_near", "hinge_gain", "bend_gain", "bend_diag")  # fmt: skip
+           "hinge_near", "hinge_gain", "hinge_angle0", "bend_gain", "bend_diag")  # fmt: skip
+
+
+def _capsule(
+  mesh: Mesh, config: Config, pinned: np.ndarray, vert: np.ndarray, node: np.ndarray
+) -> dict[str, np.ndarray]:
+  """Returns the skin of a solid, empty fans where there is none; `mesh` is its surface."""
+  names = ("node", "rest", "corner", "side", "metric")
+  if config.elements != "solid" or not config.capsule_young:
+    counts = ("ncapsule + 2 ncapsuleslice", "ncapsule + ncapsuleslice", "ncapsuleslice")
+    return {"capsule_adr": np.zeros(1, np.int32)} | empty(counts)
+  skin = _skin(mesh, solid.capsule(config), pinned, vert, node, None)
+  out = {f"capsule_{name}": skin[f"fan_{name}"] for name in names}
+  out |= {name: skin[name] for name in (*_PLATES, "bend_adr", "bend_node")}
+  return out | {"capsule_adr": skin["slot_adr"], "capsule_degree": skin["degree"]}
 
 
 def _bending(
@@ -219,7 +253,7 @@ def _bending(
   # Padding has a hinge that has no gain; so have those that were cut.
   sizes = {"nslice": nslice, "nelemslice": -(-mesh.nelem // LANES), "nbendslice": nslice}
   sizes |= {"nhingeslice": -(-(nhinge + 1) // LANES), "nbend": int(width.sum())}
-  out = zeros((*_PLATES, "hinge_angle0"), sizes)
+  out = zeros(_PLATES, sizes)
   out["elem_hinge"][-1] = nhinge
   own = np.arange(nslice * LANES, dtype=np.int32).reshape(nslice, LANES)
   return out | {"bend_adr": addresses(width), "bend_node": np.repeat(own, width, axis=0)}

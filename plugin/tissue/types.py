@@ -159,6 +159,13 @@ class Shape:
   edge_from: ints("nedge", 8)  # of each tetrahedron around an edge, its corner at the first end
   edge_to: ints("nedge", 8)  # its corner at the other
   edge_slot: ints("nedgeslice", 2, 8)  # where the blocks of both ends start; -1 for padding
+  ncapsule: int  # rows of blocks of the skin of a solid, 0 without one; its fans are as those above
+  capsule_adr: ints("ncapsuleslice + 1")  # first row of these
+  capsule_node: ints("ncapsule + 2 ncapsuleslice", 8)  # see `fan_node`
+  capsule_rest: floats("ncapsule + 2 ncapsuleslice", 3, 8)  # see `fan_rest`
+  capsule_corner: ints("ncapsule + ncapsuleslice", 8)  # see `fan_corner`
+  capsule_side: ints("ncapsule + ncapsuleslice", 8)  # see `fan_side`
+  capsule_degree: floats("ncapsuleslice", 8)  # number of neighbours on the surface
 
 
 @struct
@@ -173,6 +180,7 @@ class Tissue:
   bend_diag: floats("nbendslice", 8)  # its diagonal [N/m]
   tet_moduli: floats("ntetslice", 4, 8)  # volume [m^3]; mu, lambda, its averaged part [Pa]
   pressure_gain: floats("nsolidslice", 8)  # averaged part of lambda over a node's volume [Pa/m^3]
+  capsule_metric: floats("ncapsule + ncapsuleslice", 5, 8)  # see `fan_metric`
 
 
 @struct
@@ -214,6 +222,7 @@ class System:
   node_pressure: floats("nworld", "nsolidslice", 8)  # averaged pressure impulse [Pa s]
   tet_impulse: floats("nworld", "ntetslice", 16, 8)  # impulse on each corner [N s]
   tet_arm: floats("nworld", "ntetslice", 16, 8)  # turned gradient of each corner [kg^(1/2)], moduli
+  capsule_block: floats("nworld", "ncapsule", 9, 8)  # off-diagonal blocks of a solid's skin [kg]
   total: floats("nworld", 2)  # volume difference [m^3], areavec . vel
   sol: vector  # PCG solution [m/s]
   r: vector  # PCG residual
@@ -330,21 +339,27 @@ def fill(
 
 
 def zeros(names: tuple[str, ...], sizes: dict[str, int]) -> dict[str, np.ndarray]:
-  """Returns arrays of `Shape` and `Tissue` of zeros, from the sizes that they are named by."""
-  out = {}
-  for kind in (Shape, Tissue):
-    for name in names:
-      if name in kind.vars:
-        dtype = wp.dtype_to_numpy(kind.vars[name].type.dtype)
-        out[name] = np.zeros([_extent(dim, sizes) for dim in DIMS[kind.key][name]], dtype)
-  return out
+  """Returns arrays of `Shape` and `Tissue` of zeros, of the sizes that their shapes name."""
+  found = {name: dims for name, dims in _dims().items() if name in names}
+  return {
+    name: np.zeros([_extent(dim, sizes) for dim in dims], _dtype(name))
+    for name, dims in found.items()
+  }
 
 
 def empty(sizes: tuple[str, ...]) -> dict[str, np.ndarray]:
   """Returns the arrays of `Shape` and `Tissue` whose first axis is one of `sizes`, empty."""
-  dims = {name: dims for kind in (Shape, Tissue) for name, dims in DIMS[kind.key].items()}
-  names = tuple(name for name in dims if dims[name][0] in sizes)
-  return zeros(names, dict.fromkeys(sizes, 0))
+  found = {name: dims for name, dims in _dims().items() if dims[0] in sizes}
+  return {name: np.zeros((0, *dims[1:]), _dtype(name)) for name, dims in found.items()}
+
+
+def _dims() -> dict[str, tuple]:
+  return {name: dims for kind in (Shape, Tissue) for name, dims in DIMS[kind.key].items()}
+
+
+def _dtype(name: str):
+  kind = Shape if name in Shape.vars else Tissue
+  return wp.dtype_to_numpy(kind.vars[name].type.dtype)
 
 
 def _extent(dim: int | str, sizes: dict[str, int]) -> int:
