@@ -23,8 +23,6 @@ constexpr double BLOCKED = 0.3;  // share of its way that a seat goes where it i
 enum { AWAY, PIERCING, THROUGH };  // stages
 enum { NOTHING, LONG, ENDED };  // what is due
 
-PALPATE D3 blend(const D3* x, D3 w) { return w.x * x[0] + w.y * x[1] + w.z * x[2]; }
-
 template <class Fields>
 PALPATE void corners_at_rest(const Fields& f, int t, D3* x) {
   for (int c = 0; c < 3; ++c) x[c] = load(f.flat.data + 3 * f.elem.data[3 * t + c]);
