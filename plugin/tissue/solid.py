@@ -20,6 +20,9 @@ from .types import empty
 # doi:10.1002/(SICI)1099-0887(199805)14:5<437::AID-CNM162>3.0.CO;2-W), and averages alone let
 # neighbours shrink and grow in turn (Puso and Solberg 2006, doi:10.1002/nme.1457).
 _OWN_POISSON = 0.3
+# Times their own mass that nodes may be heavier in modes that the matrix makes too stiff, before a
+# step takes a second Newton iteration, and a third.
+_HEAVY = (4e3, 3e4)
 _WINDOW = 8 * LANES  # edges that are sorted by the number of their tetrahedra
 
 
@@ -58,6 +61,28 @@ def moduli(mesh: Mesh, config: Config) -> tuple[np.ndarray, np.ndarray, np.ndarr
   part = own[1] * shear / own[0]
   mu = 4 / 3 * shear
   return mu, part + 5 / 8 * mu, lame - part
+
+
+def iterations(mesh: Mesh, config: Config, mass: np.ndarray, gain: float) -> int:
+  """Returns how many Newton iterations a step of a solid takes at least.
+
+  The matrix has the resistance to a change of volume in each tetrahedron, the energy in means of
+  them: in most modes the matrix is stiffer, and a step is as if these were heavier by gain times
+  the difference. A solid that is much heavier so swings when it is let go.
+
+  Args:
+    mesh: the solid
+    config: its configuration
+    mass: of each node [kg], (nvert,)
+    gain: factor of K in the matrix of a step [s^2]
+  """
+  each = young(mesh, config)
+  lame, own = (configuration.lame_solid(each, nu)[1] for nu in (config.poisson, _OWN_POISSON))
+  stiffness = volumes(mesh.rest, mesh.tet) * np.maximum(lame - own, 0.0)
+  share = stiffness[:, None] * (gradients(mesh) ** 2).sum(axis=2)
+  nodal = np.bincount(mesh.tet.ravel(), share.ravel(), mesh.nvert)
+  heavier = gain * np.median((nodal / np.maximum(mass, 1e-300))[mass > 0])
+  return 1 + sum(heavier > limit for limit in _HEAVY)
 
 
 def arrays(mesh: Mesh, config: Config, vert: np.ndarray, node: np.ndarray) -> dict[str, Any]:
