@@ -20,10 +20,10 @@ from .types import empty
 # doi:10.1002/(SICI)1099-0887(199805)14:5<437::AID-CNM162>3.0.CO;2-W), and averages alone let
 # neighbours shrink and grow in turn (Puso and Solberg 2006, doi:10.1002/nme.1457).
 _OWN_POISSON = 0.3
+_WINDOW = 8 * LANES  # edges that are sorted by the number of their tetrahedra
 # Times their own mass that nodes may be heavier in modes that the matrix makes too stiff, before a
 # step takes a second Newton iteration, and a third.
 _HEAVY = (4e3, 3e4)
-_WINDOW = 8 * LANES  # edges that are sorted by the number of their tetrahedra
 
 
 def capsule(config: Config) -> Config:
@@ -76,9 +76,8 @@ def iterations(mesh: Mesh, config: Config, mass: np.ndarray, gain: float) -> int
     mass: of each node [kg], (nvert,)
     gain: factor of K in the matrix of a step [s^2]
   """
-  each = young(mesh, config)
-  lame, own = (configuration.lame_solid(each, nu)[1] for nu in (config.poisson, _OWN_POISSON))
-  stiffness = volumes(mesh.rest, mesh.tet) * np.maximum(lame - own, 0.0)
+  lame = configuration.lame_solid(young(mesh, config), config.poisson)[1]
+  stiffness = lame * volumes(mesh.rest, mesh.tet)
   share = stiffness[:, None] * (gradients(mesh) ** 2).sum(axis=2)
   nodal = np.bincount(mesh.tet.ravel(), share.ravel(), mesh.nvert)
   heavier = gain * np.median((nodal / np.maximum(mass, 1e-300))[mass > 0])
