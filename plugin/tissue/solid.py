@@ -23,7 +23,7 @@ _OWN_POISSON = 0.3
 _WINDOW = 8 * LANES  # edges that are sorted by the number of their tetrahedra
 # Times their own mass that nodes may be heavier in modes that the matrix makes too stiff, before a
 # step takes a second Newton iteration, and a third.
-_HEAVY = (4e3, 3e4)
+_HEAVY = (500.0, 4e3)
 
 
 def capsule(config: Config) -> Config:
