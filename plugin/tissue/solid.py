@@ -74,7 +74,7 @@ def iterations(mesh: Mesh, config: Config, mass: np.ndarray, gain: float) -> int
   share = stiffness[:, None] * (gradients(mesh) ** 2).sum(axis=2)
   nodal = np.bincount(mesh.tet.ravel(), share.ravel(), mesh.nvert)
   heavier = gain * np.median((nodal / np.maximum(mass, 1e-300))[mass > 0])
-  return 1 + sum(heavier > limit for limit in _HEAVY)
+  return 1 + sum(bool(heavier > limit) for limit in _HEAVY)
 
 
 def arrays(mesh: Mesh, config: Config, vert: np.ndarray, node: np.ndarray) -> dict[str, Any]:
