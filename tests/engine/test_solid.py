@@ -125,6 +125,9 @@ def test_what_a_user_sees_is_the_surface(scenes, window):
   held = ~organ.free
   np.testing.assert_allclose(organ.xpos[~held], moved[~held], atol=1e-12)
   np.testing.assert_allclose(organ.xpos[held], organ.xpos0[held], atol=1e-12)
+  corner = np.concatenate([organ.xpos, organ.inside])[organ.tetrahedra]
+  volume = np.linalg.det(corner[:, 1:] - corner[:, :1]) / 6
+  assert volume.min() > 0 and volume.sum() == pytest.approx(organ.volume)
   organ.reset()
   assert np.abs(organ.displacement).max() == 0 and organ.energy == 0
 
