@@ -195,9 +195,8 @@ class Cutters(Beside):
     """See `Beside`."""
     if self.fields is not None:
       mesh = self._w.organ.mesh
-      self.fields.elem.assign(mesh.elem)
-      self.fields.flat.assign(mesh.rest)
-      self.fields.own.rest.assign(base(self._w.organ))
+      self.fields.elem.numpy()[:], self.fields.flat.numpy()[:] = mesh.elem, mesh.rest
+      self.fields.own.rest.numpy()[:] = base(self._w.organ)
     return []
 
   def open(self) -> bool:
