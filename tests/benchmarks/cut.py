@@ -5,8 +5,8 @@
 A sheet of 15 by 10 cm (E = 30 kPa, t = 2 mm, h = 2 ms, windows), a membrane or with bending, pinned
 at its long sides, is cut by a blade at 80 mm/s, by scissors that close, by a hook's current at 14
 mm/s, or by `Organ.cut`, 4 mm at a time; the same sheet is pressed by a ball, with room for cuts and
-without. All three are stepped in turn. CPU time of the process; `open` are the steps in which the mesh came
-apart (with `Organ.cut` the call, and the step after it), `between` those in which it did not.
+without. All three are stepped in turn. CPU time of the process; `open` are the steps in which the
+mesh came apart (with `Organ.cut` the call, and the step after it), `between` the others.
 """
 
 import argparse
@@ -190,8 +190,8 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
     ]
     for row in rows
   ]
-  head = ["nodes", "tool", "tissue", "cuts", "in contact", "tool in it", "cut alone", "step that cuts",
-          "95 % of these", "to one in contact", "room to none"]  # fmt: skip
+  head = ["nodes", "tool", "tissue", "cuts", "in contact", "tool in it", "cut alone",
+          "step that cuts", "95 % of these", "to one in contact", "room to none"]  # fmt: skip
   lines = [
     "Milliseconds, medians of CPU time. A sheet pressed by a ball (in contact), with a tool in it "
     "that cuts nothing just then, what a cut of two edges adds, a step with such a cut, 95 % of "
