@@ -41,6 +41,7 @@ REPORT = 0.05  # least force at the report [N]
 # Of the expert: how far above a place it begins, how deep it feels, and how far apart places to
 # feel are, first and around what is stiff [m].
 _ABOVE, _DEPTH, _SWEEP, _CLOSE = 0.004, 0.004, 0.014, 0.006
+_ENOUGH = 0.7  # share of that depth that tells enough
 _LIKELY = 0.05  # of the likeliest place: others are not felt [-]
 _NOISE = 8.0  # of what it feels: triangles differ [N/m]
 _STIFF = 1.3  # times what is soft: what is worth a closer look [-]
@@ -229,7 +230,7 @@ class Press(Task):
       done, now = self.done, self.now
       point, normal = self.points[now], self.normals[now]
       if not (self._pressing and self.distance(p.physics) <= self.tolerance):
-        yield from p.move(point + 0.008 * normal)
+        yield from p.above(point, 0.008, normal)
       middle = sum(self.band) / 2
 
       def until(done: int = done) -> bool:
@@ -256,7 +257,7 @@ class Palpate(Task):
   """Find the stiff inclusion and report its place."""
 
   watch = ("miss", "unintended_contact")
-  resumes = False  # an expert knows what it has felt itself
+  final = ("report",)
 
   def __init__(
     self,
@@ -336,6 +337,9 @@ class Palpate(Task):
   def begin(self, physics: Physics) -> None:
     """Starts the search."""
     self._felt = np.zeros(len(self.field), bool)
+    self._outward = physics.normals()[self.field]
+    self._noted: dict[int, float] = {}
+    self._deepest, self._depth = 0, 0.0
     physics.mark(0, self.center, shown=False)
 
   def felt(self) -> float:
@@ -356,9 +360,23 @@ class Palpate(Task):
       self.event(physics, "target" if found else "miss", distance, "report")
       physics.mark(0, self.inclusion, shown=True)
       return 1.0 if found else 0.0
+    self._note(physics, force)
     if force >= FEELING:
       self._felt |= np.linalg.norm(self.places - physics.tip_pos(), axis=1) < FELT
     return 0.3 * self.felt()
+
+  def _note(self, physics: Physics, force: float) -> None:
+    """Notes what a press feels [N/m], for an expert who goes on where somebody else has felt."""
+    if force < LEAVES:
+      self._depth = 0.0
+      return
+    offset = self.places - physics.tip_pos()
+    k = int(np.einsum("ij,ij->i", offset, offset).argmin())
+    depth = float(offset[k] @ self._outward[k])
+    if depth > max(self._depth, _ENOUGH * _DEPTH):
+      if self._depth:
+        self._noted.pop(self._deepest, None)
+      self._deepest, self._depth, self._noted[k] = k, depth, force / depth
 
   def instruct(self, physics: Physics) -> str:
     """Says to feel, and to report."""
@@ -376,8 +394,8 @@ class Palpate(Task):
     feel stiffer. Where the inclusion is it learns from forces and depths alone.
     """
     normals = p.physics.normals()[self.field]
-    felt: dict[int, float] = {}  # place -> stiffness [N/m]
-    sweep = iter(_lattice(self.places, self.center, _SWEEP))
+    felt = dict(self._noted)  # place -> stiffness [N/m]
+    sweep = iter(self._left_out(felt))
     while (k := self._unsure(felt)) is not None or (k := next(sweep, None)) is not None:
       yield from self._hop(p, self.places[k] + _ABOVE * normals[k])
       felt[k] = yield from p.feel(self.places[k], -normals[k], _DEPTH)
@@ -385,8 +403,13 @@ class Palpate(Task):
     k = self._guess(felt)
     yield from self._hop(p, self.places[k] + _ABOVE * normals[k])
     yield from p.feel(self.places[k], -normals[k], 0.5 * _DEPTH)
-    p.extra[:] = 1.0
-    yield p.step()
+    yield from p.say()
+
+  def _left_out(self, felt: dict[int, float]) -> list[int]:
+    """Returns the places to sweep over, but for those that were felt."""
+    spots, sweep = self.places[list(felt)], _lattice(self.places, self.center, _SWEEP)
+    far = [np.linalg.norm(spots - self.places[k], axis=1).min(initial=np.inf) for k in sweep]
+    return [k for k, away in zip(sweep, far, strict=True) if away > 0.5 * _SWEEP]
 
   def _unsure(self, felt: dict[int, float]) -> int | None:
     """Returns the place to feel for to be sure of what is stiff, None where nothing is, or all.

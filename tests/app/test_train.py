@@ -25,12 +25,13 @@ def train(folder, *words, lessons=0):
 def short(monkeypatch):
   monkeypatch.setattr(learning, "LEAST", 48)
   monkeypatch.setattr(networks, "CLONING", 20)
+  monkeypatch.setattr("palpate.app.train._ROUNDS", 2)
 
 
 def learner(env, **settings):
   space, chosen = env.single_observation_space, learning.Settings(**settings)
   shapes = {name: space[name].shape for name in space.spaces}
-  made = networks.Networks(shapes, 4, (8,), chosen.spread, 0, "cpu")
+  made = networks.Networks(shapes, env.task.components, 8, (8,), chosen.spread, 0, "cpu")
   return learning.Learner(env, chosen, made)
 
 
@@ -65,14 +66,15 @@ def test_an_expert_teaches_before_practice(tmp_path, capsys):
   assert names == {"lessons.npz", "policy.safetensors", "LICENSE"}
   with np.load(folder / "lessons.npz") as file:
     lengths, before = file["lengths"], file["seen"]
-  assert len(lengths) == 3 * 2 and (lengths[:2] == 20).all()
-  assert (lengths[2:] < 20).any()  # the policy takes turns with the expert
+    taught = np.split(file["taught"], np.cumsum(lengths)[:-1])
+  assert len(lengths) == 2 * 2 and (lengths == 20).all()
+  assert taught[0][0] and not taught[2][0]  # the policy begins, and takes turns with the expert
   assert train(folder, lessons=2) == 2  # nothing is written over
   assert train(folder, "--iterations", "1", "--resume", lessons=2) == 0
   assert [row["iteration"] for row in rows(folder)] == [1]
   with np.load(folder / "lessons.npz") as file:
     assert np.array_equal(file["seen"], before)
-  assert policy.load(folder / "policy.safetensors").about.training["lessons"] == 6
+  assert policy.load(folder / "policy.safetensors").about.training["lessons"] == 4
   capsys.readouterr()
   assert cli.main(["train", "tease/easy", "-o", str(tmp_path / "b"), *SMALL, "--lessons", "1"]) == 0
   assert "taught, not practised: tease/easy is not vectorised" in capsys.readouterr().err
