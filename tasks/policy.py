@@ -75,9 +75,9 @@ class Policy:
   layers: Sequence[tuple[np.ndarray, np.ndarray]]
   memory: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None = None
 
-  def begin(self) -> Episode:
-    """Returns who acts in an episode, and remembers nothing of others."""
-    return Episode(self)
+  def begin(self, *count: int) -> Episode:
+    """Returns who acts in an episode, or in `count` side by side, and remembers no others."""
+    return Episode(self, *count)
 
   def check(self, env: Any) -> None:
     """Raises ValueError where an environment is not of the exercise that it was trained for."""
@@ -106,22 +106,23 @@ class Episode:
     last: action, to be set where somebody else has acted
   """
 
-  def __init__(self, policy: Policy):
+  def __init__(self, policy: Policy, *count: int):
     """Begins with an empty memory."""
-    self.policy = policy
-    self._state = np.zeros(policy.memory[1].shape[1]) if policy.memory else None
-    self.last = np.zeros(len(policy.about.components))
+    self.policy, self._count = policy, count
+    self._state = np.zeros((*count, policy.memory[1].shape[1])) if policy.memory else None
+    self.last = np.zeros((*count, len(policy.about.components)))
     self._adds = np.isin(policy.about.components, policy.about.changes)
 
   def __call__(self, observation: Mapping[str, np.ndarray]) -> np.ndarray:
     """Returns the action for an observation."""
     policy = self.policy
-    parts = [np.ravel(observation[name]) for name in policy.about.observations]
-    x = (np.concatenate(parts) - policy.mean) * policy.scale
+    names = policy.about.observations
+    parts = [np.reshape(observation[name], (*self._count, -1)) for name in names]
+    x = (np.concatenate(parts, axis=-1) - policy.mean) * policy.scale
     if policy.memory:
       x = self._state = _remember(x, self._state, *policy.memory)
     for k, (weight, bias) in enumerate(policy.layers):
-      x = weight @ (np.tanh(x) if k else x) + bias
+      x = (np.tanh(x) if k else x) @ weight.T + bias
     x = np.clip(x, -1.0, 1.0).astype(float)
     said = np.sign(x) * np.abs(x) ** policy.about.power
     self.last = np.clip(said + self._adds * self.last, -1.0, 1.0)
@@ -130,7 +131,9 @@ class Episode:
 
 def _remember(x, state, weight, own, bias, own_bias) -> np.ndarray:
   """Returns the next state of a memory."""
-  new, old = np.split(weight @ x + bias, 3), np.split(own @ state + own_bias, 3)
+  new, old = (
+    np.split(rows, 3, axis=-1) for rows in (x @ weight.T + bias, state @ own.T + own_bias)
+  )
   gates = (0.5 + 0.5 * np.tanh(0.5 * (a + b)) for a, b in zip(new[:2], old[:2], strict=True))
   reset, update = gates
   return (1.0 - update) * np.tanh(new[2] + reset * old[2]) + update * state

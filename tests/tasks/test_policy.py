@@ -51,6 +51,8 @@ def test_a_policy_remembers_its_episode_alone(tmp_path):
   for _ in range(2):
     act = loaded.begin()
     np.testing.assert_allclose([act(SEEN) for _ in range(3)], told, atol=2e-3)
+  side_by_side = loaded.begin(2)({name: np.stack([seen, seen]) for name, seen in SEEN.items()})
+  np.testing.assert_allclose(side_by_side, told[[0, 0]], atol=2e-3)
 
 
 def test_a_policy_says_small_actions_and_changes():
