@@ -92,8 +92,8 @@ class Networks:
     common = {"hidden_dims": list(hidden), "activation": "tanh", "obs_normalization": True}
     gaussian = {"class_name": "GaussianDistribution", "init_std": spread, "std_type": "log"}
     sets = {"actor": [ACTING], "critic": list(self.groups)}
-    recurrent: dict[str, Any] = {"distribution_cfg": gaussian, "rnn_type": "gru", "rnn_hidden_dim": memory}
-    count = len(components)
+    recurrent: dict[str, Any] = {"rnn_type": "gru", "rnn_hidden_dim": memory}
+    recurrent["distribution_cfg"], count = gaussian, len(components)
     self.actor: Any = RNNModel(seen, sets, "actor", count, **recurrent, **common).to(device)
     self.critic: Any = MLPModel(seen, sets, "critic", 1, **common).to(device)
     self._last: Any = torch.optim.Adam(self._parts())

@@ -1,7 +1,7 @@
 """Policies that were trained: how often each succeeds in the single environment on the CPU.
 
 `palpate train` makes them, all in the same way. Seeds from 0 on, which no policy has learned from.
-`--worlds 4096` lets them play in that many worlds side by side as well, on a GPU where there is one.
+`--worlds 4096` lets them play in so many worlds side by side as well, on a GPU where there is one.
 """
 
 from __future__ import annotations
