@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 _FEW = 16  # worlds on a CPU
 _MANY = 4096  # on a GPU
 _SAVE = 60.0  # seconds between checkpoints
-_ROUNDS = 6  # of lessons, at most
+ROUNDS = 6  # of lessons, at most
 _LESSONS = 96  # of a round
 _JUDGE = 5  # iterations between looks at the policy without spread
 _LICENCE = """SPDX-License-Identifier: Apache-2.0
@@ -50,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser):
   add("-o", "--out", metavar="FOLDER", required=True, help="of policy, checkpoint and curves")
   add(
     "--lessons", metavar="N", type=int, default=_LESSONS,
-    help=f"of an expert, in each of {_ROUNDS} rounds at most (%(default)s); 0 for practice alone",
+    help=f"of an expert, in each of {ROUNDS} rounds at most (%(default)s); 0 for practice alone",
   )  # fmt: skip
   add("--iterations", metavar="N", type=int, default=1000, help="of practice (%(default)s)")
   add("--minutes", metavar="T", type=float, default=math.inf, help="at most, in all")
@@ -135,7 +135,7 @@ class Training:
       return True
     if school.rounds:
       networks.learn(school.lessons, stop)
-    while self.args.lessons and school.rounds < _ROUNDS and not school.enough:
+    while self.args.lessons and school.rounds < ROUNDS and not school.enough:
       if not school.teach(networks, crew, self.args.lessons, self.settings.gamma, interrupt):
         return False
       school.save()
