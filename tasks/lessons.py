@@ -50,8 +50,11 @@ class Teacher(Performer):
   """An expert to learn from: it moves evenly, does not wait, and announces what ends an episode.
 
   A slow start is hard to tell from an end, a pause from having come to rest, and a single step is
-  easily missed.
+  easily missed. It searches no longer than it must: what is done long after its cause is hard to
+  learn.
   """
+
+  hasty = True
 
   def line(self, goal: np.ndarray, speed: float) -> Script:
     """Moves the tip along a straight line."""

@@ -22,6 +22,7 @@ _ENOUGH = 0.7  # share of that depth that tells enough
 _LIKELY = 0.05  # of the likeliest place: others are not felt [-]
 _NOISE = 8.0  # of what it feels: triangles differ [N/m]
 _STIFF = 1.3  # times what is soft: what is worth a closer look [-]
+_SURE, _SOME = 1.6, 5  # times what is soft, among so many places: what a hasty expert reports
 
 
 class Palpate(Task):
@@ -167,7 +168,10 @@ class Palpate(Task):
     normals = p.physics.normals()[self.field]
     felt = dict(self._noted)  # place -> stiffness [N/m]
     sweep = iter(self._left_out(felt))
-    while (k := self._unsure(felt)) is not None or (k := next(sweep, None)) is not None:
+    while (k := self._unsure(felt)) is not None or not (p.hasty and self._sure(felt)):
+      k = next(sweep, None) if k is None else k
+      if k is None:
+        break
       yield from self._hop(p, self.places[k] + _ABOVE * normals[k])
       felt[k] = yield from p.feel(self.places[k], -normals[k], _DEPTH)
       yield from p.line(self.places[k] + _ABOVE * normals[k], 0.03)
@@ -196,6 +200,11 @@ class Palpate(Task):
     far = np.linalg.norm(self.places[:, None] - spots, axis=2).min(axis=1) > _CLOSE
     k = int((chance * far).argmax())
     return k if far[k] and chance[k] > _LIKELY * chance.max() else None
+
+  def _sure(self, felt: dict[int, float]) -> bool:
+    """Returns whether something is so stiff, among enough places, that no more need be felt."""
+    stiffness = np.array(list(felt.values()))
+    return len(felt) >= _SOME and stiffness.max() > _SURE * np.quantile(stiffness, 0.25)
 
   def _guess(self, felt: dict[int, float]) -> int:
     """Returns the place nearest to where the inclusion is to be expected.

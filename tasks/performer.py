@@ -216,8 +216,11 @@ class Performer:
 
   Attributes:
     hand: the instrument that it moves
+    hasty: whether it leaves out what may be left out
     other: who moves the other hand's, None where there is none
   """
+
+  hasty = False
 
   def __init__(self, env: control.Environment, style: Style = EXPERT, seed: int = 0, hand: int = 0):
     """Makes a performer in a style, see `make`; `hand` is which of the instruments it moves."""
