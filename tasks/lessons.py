@@ -19,6 +19,7 @@ from .physics import AXES
 from .policy import Policy
 
 SHAKEN, CALM = 25, 50  # control steps that noise lasts, and that follow without
+_BACK = 0.2  # share of what has shaken the instrument that is made up in a control step
 EXPERT = (20, 80)  # control steps of an expert's turn, at least and at most
 PATIENCE = (40, 120)  # control steps without progress that end a policy's turn
 
@@ -55,6 +56,19 @@ class Teacher(Performer):
   """
 
   hasty = True
+
+  def begin(self) -> None:
+    """See `Performer`."""
+    super().begin()
+    self._before = self.hand.drive_targets()
+
+  def drive(self, goal: np.ndarray) -> np.ndarray:
+    """Returns where the drives go on the way to a goal: what has shaken them is made up slowly.
+
+    What is undone at once is neither seen nor learned.
+    """
+    before, self._before = self._before, goal
+    return self.hand.drive_targets() + goal - before + _BACK * (before - self.hand.drive_targets())
 
   def line(self, goal: np.ndarray, speed: float) -> Script:
     """Moves the tip along a straight line."""

@@ -276,9 +276,13 @@ class Performer:
     if self.hand.handle:
       return np.concatenate([self.hand.handle_row(tip, roll), extra])
     pitch, yaw, insertion = trocar.inverse(self.trocar, tip, check=False)
-    goal = np.array([pitch, yaw, roll, insertion])
+    goal = self.drive(np.array([pitch, yaw, roll, insertion]))
     move = (goal - self.hand.drive_targets()) / (np.array(RATES) * self.dt)
     return np.concatenate([np.clip(move, -1, 1), extra])
+
+  def drive(self, goal: np.ndarray) -> np.ndarray:
+    """Returns where the drives go on the way to a goal: there, as fast as they can."""
+    return goal
 
   def both(self, mine: Script, others: Script) -> Script:
     """Does one script with this hand and another with the other, until both are done."""
