@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import pathlib
 import time
 from collections.abc import Mapping
@@ -113,9 +114,11 @@ class School:
       return False
     whole = [lesson for lesson in given if lesson is not None]
     self.lessons += whole
-    if not any(lesson.taught.any() for lesson in self.lessons):
+    if not self.lessons:
       raise CommandError(f"{self.task}: no lesson was given: the workers died", code=1)
-    error = networks.learn(self.lessons, lambda: interrupt.seen)
+    error = math.nan  # where it needed no help, or not yet
+    if any(lesson.taught.any() for lesson in self.lessons):
+      error = networks.learn(self.lessons, lambda: interrupt.seen)
     self.rounds += 1
     self.seconds += time.perf_counter() - start
     wins = sum(lesson.outcome == "success" for lesson in whole)
@@ -141,7 +144,7 @@ class School:
       job = Job(self.task, self.task_kwargs, tuple(env.observation_spec()), first + k, gamma)
       if k % 2:
         job = dataclasses.replace(job, noise=float(random.uniform(0, _NOISE)))
-      if self.rounds:
+      if (self.path.parent / POLICY).exists():
         turn = _TURN if k % 2 else None
         job = dataclasses.replace(
           job, policy=str((self.path.parent / POLICY).resolve()), most=turn

@@ -85,6 +85,8 @@ class Networks:
     self.groups, self.device, self.lessons = grouped(list(shapes), taught), device, 0
     self._shapes: dict[str, tuple[int, ...]] = dict(shapes)
     self._memory: Any = None
+    self._components, self._begun = list(components), False
+    self._changes = [name for name in components if name in CHANGES]
     self._adds = torch.tensor([float(name in CHANGES) for name in components], device=device)
     seen = TensorDict(
       {g: torch.zeros(1, self._width(names)) for g, names in self.groups.items()}, batch_size=[1]
@@ -105,7 +107,7 @@ class Networks:
     return sum(math.prod(self._shapes[name]) for name in names)
 
   def normalise(self, seen: TensorDict) -> None:
-    """Learns how large observations are, once: what changed it later would change the policy."""
+    """Learns how large observations are; what was learned with others says the same as before."""
     for model in (self.actor, self.critic):
       every = torch.cat([seen[group] for group in model.obs_groups], dim=1)
       names = [name for group in model.obs_groups for name in self.groups[group]]
@@ -113,9 +115,38 @@ class Networks:
       std = torch.where(std < _STILL, torch.full_like(std, _VARY["-"]), std)
       share = _KNOWN if self.lessons else 1.0
       std = torch.maximum(std, share * self._least(names).to(std))
-      known, model.obs_normalizer.eps = model.obs_normalizer.state_dict(), 0.0
-      known["_mean"][:], known["_std"][:], known["_var"][:] = every.mean(dim=0), std, std.square()
-      model.obs_normalizer.until = 0
+      if self._begun:
+        _rescale(model, every.mean(dim=0), std)
+      self._scale(model, every.mean(dim=0), std)
+    self._begun = True
+
+  def _scale(self, model: Any, mean: torch.Tensor, std: torch.Tensor) -> None:
+    known, model.obs_normalizer.eps = model.obs_normalizer.state_dict(), 0.0
+    known["_mean"][:], known["_std"][:], known["_var"][:] = mean, std, std.square()
+    model.obs_normalizer.until = 0
+
+  def take(self, made: policy.Policy) -> None:
+    """Begins with what a policy of another exercise does; ValueError says why it cannot."""
+    for what, own, other in (
+      ("observes", self.groups[ACTING], made.about.observations),
+      ("moves", self._components, made.about.components),
+    ):
+      if list(own) != list(other):
+        raise ValueError(f"the policy {what} {', '.join(other)}, expected {', '.join(own)}")
+    weights, (mean, std) = self.actor.state_dict(), (made.mean, 1.0 / made.scale)
+    linear = [k.removesuffix(".weight") for k in weights if k.startswith("mlp") and "weight" in k]
+    arrays = dict(zip([f"rnn.rnn.{gate}_l0" for gate in _GATES], made.memory or (), strict=False))
+    for name, (weight, bias) in zip(linear, made.layers, strict=False):
+      arrays |= {f"{name}.weight": weight, f"{name}.bias": bias}
+    known = {k: v for k, v in weights.items() if k.startswith(("rnn", "mlp"))}
+    if {k: v.shape for k, v in arrays.items()} != {k: tuple(v.shape) for k, v in known.items()}:
+      raise ValueError("the policy is of another network")
+    if made.about.power != POWER or made.about.changes != self._changes:
+      raise ValueError("the policy says its actions otherwise")
+    for name, array in arrays.items():
+      known[name].copy_(torch.from_numpy(array))
+    self._scale(self.actor, *(torch.from_numpy(row).to(self.device) for row in (mean, std)))
+    self._begun = True
 
   def _least(self, names: Sequence[str]) -> torch.Tensor:
     """Returns how much each number that is observed varies at least."""
@@ -235,7 +266,7 @@ class Networks:
     linear = sorted(int(k.split(".")[1]) for k in weights if k.startswith("mlp.") and "weight" in k)
     about = policy.About(
       task.name, tuple(task.components), self.groups[ACTING], task.control_timestep, POWER,
-      [name for name in task.components if name in CHANGES],
+      self._changes,
       dict(task_kwargs), {"palpate": palpate.__version__, **training},
     )  # fmt: skip
     memory: Any = tuple(weights[f"rnn.rnn.{name}_l0"] for name in _GATES)
@@ -246,6 +277,18 @@ class Networks:
       [(weights[f"mlp.{k}.weight"], weights[f"mlp.{k}.bias"]) for k in linear],
       memory,
     )
+
+
+def _rescale(model: Any, mean: torch.Tensor, std: torch.Tensor) -> None:
+  """Changes the first weights of a network so that it says the same with another scale."""
+  first = model.mlp[0]
+  weight, bias = first.weight, first.bias
+  if model.is_recurrent:
+    weight, bias = model.rnn.rnn.weight_ih_l0, model.rnn.rnn.bias_ih_l0
+  known = model.obs_normalizer.state_dict()
+  with torch.no_grad():
+    bias += weight @ ((mean - known["_mean"][0]) / known["_std"][0])
+    weight *= std / known["_std"][0]
 
 
 def _padded(parts: Sequence[TensorDict]) -> dict[str, Any]:
