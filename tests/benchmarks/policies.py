@@ -10,7 +10,6 @@ import argparse
 import collections
 import pathlib
 
-import gymnasium
 import numpy as np
 import palpate
 from benchmarks import plots, results
@@ -73,6 +72,8 @@ def run(case: Case, out: pathlib.Path) -> list[Row]:
 
 def _side_by_side(name: str, file: str, count: int) -> int:
   """Returns how many worlds a policy succeeds in."""
+  import gymnasium
+
   palpate.register()
   env = gymnasium.make_vec(registry.gym_id(*name.split("/")), num_envs=count)
   act, (seen, _) = policy.load(file).begin(count), env.reset(seed=_OTHERS)
