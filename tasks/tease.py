@@ -39,6 +39,7 @@ SCENE = Scene(
 _OVER, _BEHIND, _BEYOND, _LANE = 0.002, 0.006, 0.006, 0.006
 _SPEED, _BACK = 0.03, 0.015
 _UNDER = 0.02  # from the front at most, of who is under the strip already [m]
+ROW = 0.5 * _LANE  # bonds of the front are no farther from the first of them [m]
 
 
 @SUITE.add("benchmarking", "easy")
@@ -116,7 +117,7 @@ class Tease(Freeing):
     bonds = physics.organ.bonds
     holds = ~bonds.free
     where = bonds.positions[holds if holds.any() else slice(None)]
-    row = where[where[:, 1] < where[:, 1].min() + 0.5 * _LANE]
+    row = where[where[:, 1] < where[:, 1].min() + ROW]
     return np.array([0.0, row[:, 1].min(), row[:, 2].mean()])
 
   def distance(self, physics: Physics) -> float:
