@@ -1,6 +1,7 @@
 """What the exercises of palpation in `probe` are: a field with a stiff inclusion under it."""
 
 import dataclasses
+from collections.abc import Iterator
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -22,7 +23,8 @@ _ENOUGH = 0.7  # share of that depth that tells enough
 _LIKELY = 0.05  # of the likeliest place: others are not felt [-]
 _NOISE = 8.0  # of what it feels: triangles differ [N/m]
 _STIFF = 1.3  # times what is soft: what is worth a closer look [-]
-_SURE, _SOME = 1.6, 5  # times what is soft, among so many places: what a hasty expert reports
+# Of a hasty one: times what is soft, among so many places, that it looks around; how far [m].
+_SURE, _SOME, _BESIDE = 1.6, 4, 0.008
 
 
 class Palpate(Task):
@@ -168,10 +170,7 @@ class Palpate(Task):
     normals = p.physics.normals()[self.field]
     felt = dict(self._noted)  # place -> stiffness [N/m]
     sweep = iter(self._left_out(felt))
-    while (k := self._unsure(felt)) is not None or not (p.hasty and self._sure(felt)):
-      k = next(sweep, None) if k is None else k
-      if k is None:
-        break
+    while (k := self._next(p, felt, sweep)) is not None:
       yield from self._hop(p, self.places[k] + _ABOVE * normals[k])
       felt[k] = yield from p.feel(self.places[k], -normals[k], _DEPTH)
       yield from p.line(self.places[k] + _ABOVE * normals[k], 0.03)
@@ -180,11 +179,34 @@ class Palpate(Task):
     yield from p.feel(self.places[k], -normals[k], 0.5 * _DEPTH)
     yield from p.say()
 
+  def _next(self, p: Performer, felt: dict[int, float], sweep: Iterator[int]) -> int | None:
+    """Returns the place to feel next, None where enough is felt."""
+    if p.hasty and self._sure(felt):
+      return self._neighbour(p, felt)
+    found = None if p.hasty else self._unsure(felt)
+    return next(sweep, None) if found is None else found
+
   def _left_out(self, felt: dict[int, float]) -> list[int]:
-    """Returns the places to sweep over, but for those that were felt."""
-    spots, sweep = self.places[list(felt)], _lattice(self.places, self.center, _SWEEP)
-    far = [np.linalg.norm(spots - self.places[k], axis=1).min(initial=np.inf) for k in sweep]
-    return [k for k, away in zip(sweep, far, strict=True) if away > 0.5 * _SWEEP]
+    """Returns the places to sweep over but for those that were felt, from the last of these on."""
+    sweep, spots = _lattice(self.places, self.center, _SWEEP), self.places[list(felt)]
+    near = [
+      bool(np.linalg.norm(spots - self.places[k], axis=1).min(initial=np.inf) < 0.5 * _SWEEP)
+      for k in sweep
+    ]
+    first = max((i + 1 for i, done in enumerate(near) if done), default=0)
+    order = [*range(first, len(sweep)), *range(first)]
+    return [sweep[i] for i in order if not near[i]]
+
+  def _neighbour(self, p: Performer, felt: dict[int, float]) -> int | None:
+    """Returns a place beside the stiffest, to the four sides of it; None where all are felt."""
+    across, top = p.physics.trocar().mat[:, :2].T, self.places[max(felt, key=lambda k: felt[k])]
+    for way in (*across, *-across):
+      goal = top + _BESIDE * way
+      k = int(np.linalg.norm(self.places - goal, axis=1).argmin())
+      far = np.linalg.norm(self.places[[*felt]] - self.places[k], axis=1).min()
+      if np.linalg.norm(self.places[k] - goal) < 0.5 * _BESIDE and far > 0.5 * _BESIDE:
+        return k
+    return None
 
   def _unsure(self, felt: dict[int, float]) -> int | None:
     """Returns the place to feel for to be sure of what is stiff, None where nothing is, or all.
