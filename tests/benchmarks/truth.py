@@ -32,8 +32,8 @@ from reference import closed
 
 YOUNG, POISSON = 5000.0, 0.45
 SIZE, RADIUS = (0.08, 0.08, 0.04), 0.04  # of the block and the sphere [m]
-# [m]; a 300th to an 80th of the radius: at a tenth of it, where strains are 15 %, a neo-Hookean
-# solid has 5 % less force than Hertz's, on the finest mesh too.
+# [m]; a 300th to an 80th of the radius: where it is a tenth, a neo-Hookean solid has 3 to 5 % less
+# force than Hertz's, on fine meshes too.
 DEPTHS = (1.25e-4, 2.5e-4, 5e-4)
 EDGES = (1.0, 2.0, 3.0, 4.0)  # in the contact's radius at the middle depth
 PROBE = 0.0035  # [m], the radius of the shipped probe and of the flexes
