@@ -12,7 +12,6 @@ from typing import Any
 import mujoco
 import numpy as np
 import warp as wp
-from palpate.tissue import path as paths
 from palpate.tissue.step import SCHEMES
 from palpate.tissue.types import doubles, fill, ints, struct
 
@@ -195,9 +194,8 @@ class Cutters(Beside):
     """See `Beside`."""
     if self.fields is not None:
       mesh = self._w.organ.mesh
-      self.fields.elem.assign(mesh.elem)
-      self.fields.flat.assign(mesh.rest)
-      self.fields.own.rest.assign(base(self._w.organ))
+      self.fields.elem.numpy()[:], self.fields.flat.numpy()[:] = mesh.elem, mesh.rest
+      self.fields.own.rest.numpy()[:] = base(self._w.organ)
     return []
 
   def open(self) -> bool:
@@ -240,7 +238,7 @@ class Cutters(Beside):
     trail = row[BLADE.trail : BLADE.trail + 3 * count].reshape(-1, 3)
     path, rest = np.vstack([trail, at]), at[None]
     if not ended:
-      path, rest = _part(mesh, path)
+      path, rest = _part(mesh, w.cuts.finder, path)
     report, pinned = None, False
     try:
       report = w.cuts.cut(self._now(mesh, path), given) if len(path) > 1 else None
@@ -258,13 +256,13 @@ class Cutters(Beside):
       trail = np.vstack([tip, rest[:-1]])[:TRAIL]
       row[BLADE.count], row[BLADE.wait] = len(trail), 0.0
       row[BLADE.trail : BLADE.trail + trail.size] = trail.ravel()
-      row[BLADE.elem] = paths.nearest(w.organ.mesh, w.organ.mesh.rest, at[None])[0][0]
+      row[BLADE.elem] = w.cuts.finder.nearest(w.organ.mesh, w.organ.mesh.rest, at[None])[0][0]
     return report is not None and report.nodes > 0
 
   def _now(self, mesh, path: np.ndarray) -> np.ndarray:
     """Returns where points of the rest shape are in the world."""
     organ = self._w.organ
-    elem, weight, _ = paths.nearest(mesh, mesh.rest, path)
+    elem, weight, _ = self._w.cuts.finder.nearest(mesh, mesh.rest, path)
     position = mesh.rest + self._w.phases.motion()[0]
     local = np.einsum("nk,nkj->nj", weight, position[mesh.elem[elem]])
     return organ.origin + local @ organ.frame.T
@@ -293,7 +291,7 @@ class Cutters(Beside):
     return self.fields.force.numpy() @ self._w.organ.frame.T
 
 
-def _part(mesh, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _part(mesh, finder, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
   """Returns the part of a path that comes apart now, and the rest; nothing where there is none.
 
   It ends where a vertex is near, so that the mesh need not be bent to where the blade is just now.
@@ -305,7 +303,7 @@ def _part(mesh, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
   point = np.stack([np.interp(way, arc, path[:, c]) for c in range(3)], axis=1)
   if not len(point):
     return path[:0], path
-  elem, _, _ = paths.nearest(mesh, mesh.rest, point)
+  elem, _, _ = finder.nearest(mesh, mesh.rest, point)
   vert = np.unique(mesh.elem[elem])
   far = np.linalg.norm(point[:, None] - mesh.rest[vert], axis=2).min(axis=1)
   stop = int(np.argmin(far - _FARTHER * way))
