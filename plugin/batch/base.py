@@ -10,6 +10,8 @@ import mujoco
 import numpy as np
 import warp as wp
 
+from .parting import Parting
+
 
 class Batch(abc.ABC):
   """Worlds of one scene.
@@ -307,8 +309,10 @@ class Contacts(NamedTuple):
   force: wp.array
 
 
-class Tissue(abc.ABC):
+class Tissue(Parting):
   """One organ in all worlds of a batch; arrays as those of `Batch`, in world coordinates.
+
+  Vertices that wait for a cut come last, and are at NaN until they are of use.
 
   Attributes:
     name: name of the flexcomp

@@ -125,9 +125,10 @@ def _where(p: Patch, world: int, i: int):
   s = i // 8
   lane = i % 8
   d = p.solve.disp
-  x = p.rest[i, 0] + wp.float64(d[world, s, 0, lane])
-  y = p.rest[i, 1] + wp.float64(d[world, s, 1, lane])
-  z = p.rest[i, 2] + wp.float64(d[world, s, 2, lane])
+  m = p.mesh[world]
+  x = p.rest[m, i, 0] + wp.float64(d[world, s, 0, lane])
+  y = p.rest[m, i, 1] + wp.float64(d[world, s, 1, lane])
+  z = p.rest[m, i, 2] + wp.float64(d[world, s, 2, lane])
   return wp.vec3(
     float(p.origin[0] + p.frame[0, 0] * x + p.frame[0, 1] * y + p.frame[0, 2] * z),
     float(p.origin[1] + p.frame[1, 0] * x + p.frame[1, 1] * y + p.frame[1, 2] * z),
@@ -287,11 +288,12 @@ def _ball(a: wp.vec3, b: wp.vec3, d: wp.vec3):
 @wp.func
 def _owner(p: Patch, world: int, e: int):
   """Returns the first corner of a triangle that has a slot, whose thread has the triangle."""
-  if p.node_slot[world, p.elem[e, 0]] >= 0:
-    return p.elem[e, 0]
-  if p.node_slot[world, p.elem[e, 1]] >= 0:
-    return p.elem[e, 1]
-  return p.elem[e, 2]
+  m = p.mesh[world]
+  if p.node_slot[world, p.elem[m, e, 0]] >= 0:
+    return p.elem[m, e, 0]
+  if p.node_slot[world, p.elem[m, e, 1]] >= 0:
+    return p.elem[m, e, 1]
+  return p.elem[m, e, 2]
 
 
 @functools.cache
@@ -318,9 +320,11 @@ def kernel(kinds: frozenset[int]) -> wp.Kernel:
       at.room = c.most - first
       first += c.nacon[0] + c.before[world]
     if i >= 0:
-      for q in range(p.near_adr[i] + k % c.ring, p.near_adr[i + 1], c.ring):
+      m = p.mesh[world]
+      was = p.source[m, i]
+      for q in range(p.near_adr[was] + k % c.ring, p.near_adr[was + 1], c.ring):
         e = p.near[q]
-        va, vb, vd = p.elem[e, 0], p.elem[e, 1], p.elem[e, 2]
+        va, vb, vd = p.elem[m, e, 0], p.elem[m, e, 1], p.elem[m, e, 2]
         a, b, d = p.node_slot[world, va], p.node_slot[world, vb], p.node_slot[world, vd]
         whole = a >= 0 and b >= 0 and d >= 0
         if _owner(p, world, e) == i and (whole or not writes):

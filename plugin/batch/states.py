@@ -104,7 +104,8 @@ def _pull_organ(organ: Organ, world: int, model, data):
   heavier = float(organ.patch.heavier[world : world + 1].numpy()[0])
   if declared.windows is None:
     free = declared.free
-    data.qpos[declared.qposs] = motion["disp"][free].ravel()
+    shift = _shift(organ, world)
+    data.qpos[declared.qposs] = (motion["disp"] + shift)[free].ravel()
     data.qvel[declared.dofs] = motion["vel"][free].ravel()
     for name, values in (("last", motion["last"]), ("before", motion["before"]), ("force", force)):
       own[spans[name]] = values[free].ravel()
@@ -115,7 +116,15 @@ def _pull_organ(organ: Organ, world: int, model, data):
     own[spans["tail"]] = 0.0
     own[spans["tail"].start + TAIL.heavier] = heavier
     _pull_slots(organ, world, own, spans, force)
+  if organ.topology:
+    organ.topology.pull(world, own, spans)
   own[spans["signature"]] = declared.signature
+
+
+def _shift(organ: Organ, world: int) -> np.ndarray:
+  """Returns how far cuts have moved vertices at rest [m], (nvert, 3)."""
+  whole = organ.declared.mesh
+  return organ.topology.mesh(world).rest - whole.rest if organ.topology else 0.0 * whole.rest
 
 
 def _pull_slots(organ: Organ, world: int, own, spans, force: np.ndarray):
@@ -162,6 +171,13 @@ def push(batch, world: int, data: mujoco.MjData):
 def keep(batch, start, data: mujoco.MjData):
   """Lets worlds start in the state of an mjData; `start` is what resets have of it."""
   d, organs = batch.d, batch.organs.values()
+  for organ in organs:
+    own, spans = _own(organ, batch.model, data)
+    if organ.topology and organ.topology.is_cut(own, spans):
+      raise ValueError(
+        f"organ {organ.name!r}: data has cuts, which a batch on a GPU cannot start with; cut after "
+        "a reset"
+      )
   pairs = [(getattr(d, name), getattr(start, f"{name}0")) for name in _STARTS]
   for organ in organs:
     own = _vectors(organ) | {
@@ -190,8 +206,10 @@ def _push_organ(organ: Organ, world: int, model, data):
   own, spans = _own(organ, model, data)
   motion = {name: np.zeros((declared.mesh.nvert, 3)) for name in _MOTION}
   force, free = np.zeros((declared.mesh.nvert, 3)), declared.free
+  if organ.topology:
+    organ.topology.push(world, own, spans)
   if declared.windows is None:
-    motion["disp"][free] = data.qpos[declared.qposs].reshape(-1, 3)
+    motion["disp"][free] = data.qpos[declared.qposs].reshape(-1, 3) - _shift(organ, world)[free]
     motion["vel"][free] = data.qvel[declared.dofs].reshape(-1, 3)
     for name, values in (("last", motion["last"]), ("before", motion["before"]), ("force", force)):
       values[free] = own[spans[name]].reshape(-1, 3)

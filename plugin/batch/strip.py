@@ -45,7 +45,7 @@ def tools_of(model: mujoco.MjModel, organ) -> np.ndarray:
   Raises:
     ValueError: one is not a tool that a batch knows, or it is not an organ that it can step.
   """
-  for key in ("carrier", "attach", "bonds", "support", "relax_share", "spare"):
+  for key in ("carrier", "attach", "bonds", "support", "relax_share", "tear"):
     if getattr(organ.config, key):
       raise ValueError(
         f"organ {organ.name!r}: {key} is set, which a batch on a GPU cannot do; expected none"
@@ -166,7 +166,7 @@ def _check_option(option):
 
 def _slot_mass(organ) -> float:
   """Returns the mass of a slot's body, lighter than a node whatever its world's masses [kg]."""
-  return 0.1 * float(organ.mass[organ.free].min())
+  return 0.1 * float(organ.mass[organ.free & (organ.mass > 0)].min())
 
 
 def _take_out(bare, bodies: dict, organ, model):

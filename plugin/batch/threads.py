@@ -11,12 +11,17 @@ from concurrent.futures import ThreadPoolExecutor
 import mujoco
 import numpy as np
 import warp as wp
+from palpate.engine import coupling
 from palpate.engine import plugin as engine
+from palpate.engine.cuts import Report
 from palpate.organ import Organ, instances
 from palpate.tissue import body as bodies
+from palpate.tissue import mesh as topology
 
 from .base import Batch, Tissue, refuse_crowd, spread
+from .parting import Cutters
 
+_OF_VERTICES = ("xpos", "xvel", "contact_force")
 _FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
 _CTRL = mujoco.mjtState.mjSTATE_CTRL
 _ALL = mujoco.mjtState.mjSTATE_INTEGRATION
@@ -158,14 +163,15 @@ class _Tissue(Tissue):
     pairs = zip(batch.models, batch.datas, strict=True)
     self.handles = [Organ(model, data, name) for model, data in pairs]
     self.spaces = [engine.find(data._address, instance) for data in batch.datas]
-    self.name, self.nvert, self.elem = name, self.handles[0].nvert, self.handles[0].elem
+    self.name, self.elem = name, self.handles[0].elem
+    self.nvert = coupling.outer(self.spaces[0].organ)
     self._batch = batch
 
   @functools.cached_property
   def _arrays(self) -> dict[str, wp.array]:
     shape = (self._batch.nworld, self.nvert, 3)
     arrays = {
-      name: wp.zeros(shape, dtype=float, device="cpu") for name in ("xpos", "xvel", "contact_force")
+      name: wp.zeros(shape, dtype=float, device="cpu") for name in _OF_VERTICES
     }
     return arrays | {
       name: wp.zeros(self._batch.nworld, dtype=float, device="cpu")
@@ -176,8 +182,48 @@ class _Tissue(Tissue):
     array = self._arrays[name]
     out = array.numpy()
     for world, handle in enumerate(self.handles):
-      out[world] = getattr(handle, name)
+      values = getattr(handle, name)
+      if name in _OF_VERTICES:  # those that wait for a cut are not there yet
+        out[world, len(values) :] = np.nan if name == "xpos" else 0.0
+        out[world, : len(values)] = values
+      else:
+        out[world] = values
     return array
+
+  @property
+  def _spare(self) -> int:
+    return self.spaces[0].organ.mesh.spare
+
+  def _cut(self, points: dict[int, np.ndarray]) -> list[Report | None]:
+    for world, path in points.items():
+      try:
+        self.spaces[world].cuts.find(path)
+      except ValueError as error:
+        raise ValueError(f"world {world}: {error}") from None
+    return [
+      handle.cut(points[world]) if world in points else None
+      for world, handle in enumerate(self.handles)
+    ]
+
+  def _told(self, name: str, world: int) -> list:
+    handle = self.handles[world]
+    return list(handle.cuts if name == "reports" else handle.pieces)
+
+  def _piece_count(self) -> wp.array:
+    count = [_count_pieces(space) for space in self.spaces]
+    return wp.array(count, dtype=int, device="cpu")
+
+  def _cutters(self) -> Cutters:
+    every = [handle.cutters for handle in self.handles]
+    columns = (
+      np.array([[getattr(each, name) for each in row] for row in every], np.float32)
+      for name in Cutters._fields
+    )
+    return Cutters(*(wp.array(column, dtype=float, device="cpu") for column in columns))
+
+  def elem_of(self, world: int) -> np.ndarray:
+    """Returns the triangles of a world, see `Tissue.elem_of`."""
+    return self.handles[self._batch._world(world)].elem
 
   def configure(self, mask=None, **keys):
     """Changes the tissue of worlds, see `Tissue.configure`."""
@@ -196,6 +242,11 @@ class _Tissue(Tissue):
     organ = self.spaces[world].organ
     touching = organ.windows.flex if organ.windows else [organ.flex]
     self._batch.models[world].flex_friction[touching, 0] = friction
+
+
+def _count_pieces(space) -> int:
+  space.cuts.follow()
+  return int(topology.pieces(space.organ.mesh).max()) + 1
 
 
 def _threads(nthread: int | None) -> int:

@@ -133,25 +133,11 @@ class Cuts:
     """
     if not self or self._found[0] == self.stamp:
       return
-    elem, loose, rest, mass, source = self._read()
+    elem, loose, rest, mass, source = read(self.whole, self.declared.mass, self._own)
     mesh, changed = topology.recut(self.mesh, rest, elem, loose)
     self._become(mesh, changed, mass, source, self._found[0])
     self.reports = []
     self._fresh = True
-
-  def _read(self):
-    whole, own = self.whole, self._own
-    if not self._found[0]:
-      return whole.elem, None, whole.rest, self.declared.mass, np.arange(whole.nvert)
-    elem, loose = flexes.unpack(own["corner"])
-    rest, mass = own["place"].reshape(-1, 3).copy(), own["weight"].copy()
-    source = np.append(np.arange(whole.nvert - whole.spare), own["source"]).astype(int)
-    inside = (elem >= 0).all() and (elem < whole.nvert).all()
-    if not inside or not np.array_equal(source[elem], whole.elem):
-      raise ValueError(_FOREIGN)
-    if flexes.stamp(own["corner"], rest, mass) != self._found[0]:
-      raise ValueError(_FOREIGN)
-    return elem, loose, rest, mass, source
 
   def copy(self) -> dict[str, np.ndarray]:
     """Returns what the plugin state has of the mesh."""
@@ -161,14 +147,6 @@ class Cuts:
     """Puts it there again."""
     for name, values in kept.items():
       self._own[name][:] = values
-
-  def _write(self, corner: np.ndarray):
-    own, mesh = self._own, self.mesh
-    own["corner"][:] = corner
-    own["place"][:] = mesh.rest.ravel()
-    own["weight"][:] = self.mass
-    own["source"][:] = self.source[mesh.nvert - mesh.spare :]
-    self._found[0] = self.stamp
 
   def _become(self, mesh: Mesh, changed: np.ndarray, mass, source, stamp: float):
     w = self._w
@@ -215,6 +193,22 @@ class Cuts:
 
   def cut(self, points: np.ndarray, given: float = 0.0) -> Report:
     """Cuts the organ along points in the world, (n, 3) [m]; see `Organ.cut`, and `cutting.cut`."""
+    w, (found, u, v) = self._w, self.find(points, given)
+    organ, mesh = w.organ, self.mesh
+    if found.stopped:
+      w.note(
+        f"the cut stops early: no spare vertices are left of {mesh.spare}; give the organ more"
+      )
+    done = report(found, mesh, organ, w.config.thickness)
+    if found.changed.size:
+      self._take(found, u, v)
+    self.reports.append(done)
+    return done
+
+  def find(
+    self, points: np.ndarray, given: float = 0.0
+  ) -> tuple[cutting.Cut, np.ndarray, np.ndarray]:
+    """Returns what a cut would make of the organ, and displacement and velocity of its vertices."""
     w, organ = self._w, self._w.organ
     if not self:
       raise ValueError(
@@ -227,15 +221,7 @@ class Cuts:
     of_triangles = functools.partial(energy.of_triangles, w.config)
     energies = of_triangles, self._held()
     found = cutting.cut(organ.name, mesh, mesh.rest + u, local, ~organ.free, *energies, given)
-    if found.stopped:
-      w.note(
-        f"the cut stops early: no spare vertices are left of {mesh.spare}; give the organ more"
-      )
-    report = self._report(found)
-    if found.changed.size:
-      self._take(found, u, v)
-    self.reports.append(report)
-    return report
+    return found, u, v
 
   def _held(self) -> cutting.Held | None:
     """Returns what tells the energy of ties and bonds, None where there are none."""
@@ -254,51 +240,127 @@ class Cuts:
 
     return held
 
-  def _report(self, found: cutting.Cut) -> Report:
-    organ = self._w.organ
-    path = [organ.origin + line @ organ.frame.T for line in found.path]
-    nodes = found.mesh.nouter - self.mesh.nouter
-    area = found.length * self._w.config.thickness
-    return Report(found.length, area, path, found.deviation, nodes, found.stopped)
-
   def _take(self, found: cutting.Cut, u: np.ndarray, v: np.ndarray):
     """Makes the organ the mesh that was found; what moved goes on as it moved."""
-    w, old, mesh = self._w, self.mesh, found.mesh
-    group, member = found.group, found.member
-    mass, source = self.mass.copy(), self.source.copy()
-    area = topology.areas_of(mesh, member)
-    share = area / np.bincount(group, area, mesh.nvert)[group]
-    mass[member] = share * self.mass[group]
-    source[member] = source[group]
-    now, speed = u.copy(), v.copy()
-    now[found.moved] = np.einsum("nk,nkj->nj", found.weight, u[found.corner])
-    near = topology.distinct(old.elem[found.changed])
-    near = near[w.organ.free[near]]
-    was, goes = (old.rest + u)[near], (mesh.rest + now)[near]
-    speed[near] = _keep_spin(self.mass[near], was, goes, v[near])
-    now[member], speed[member] = now[group], speed[group]
+    w, mesh, group, member = self._w, found.mesh, found.group, found.member
+    after = divide(found, Divided(self.mesh, self.mass, self.source, u, v), w.organ.free)
     for each in w.beside:
-      each.carry(group, member, share)
-    corner = flexes.pack(mesh.elem, mesh.loose)
-    self._become(mesh, found.changed, mass, source, flexes.stamp(corner, mesh.rest, mass))
-    self._write(corner)
-    changed = topology.distinct(near, member)
-    w.phases.carry(changed, now, speed, group, member, share)
+      each.carry(group, member, after.share)
+    stamp = flexes.stamp(flexes.pack(mesh.elem, mesh.loose), mesh.rest, after.mass)
+    self._become(mesh, found.changed, after.mass, after.source, stamp)
+    write(self._own, mesh, self.mass, self.source, stamp)
+    w.phases.carry(after.changed, after.disp, after.vel, group, member, after.share)
     self.show()
 
   def pieces(self) -> list[Piece]:
     """Returns the parts that hang together, the largest first."""
-    mesh = self.mesh
-    label = topology.pieces(mesh)
-    area = topology.vertex_areas(mesh.rest, mesh.elem)
-    held = topology.held_areas(mesh) > 0
-    out = []
-    for k in range(label.max() + 1):
-      vert = np.flatnonzero(label == k)
-      volume = float(area[vert].sum() * self._w.config.thickness)
-      mass = float(self._w.organ.mass[vert].sum())
-      out.append(Piece(vert, mass, volume, bool(held[vert].any())))
-    return sorted(out, key=lambda piece: -piece.mass)
+    return pieces(self.mesh, self._w.organ.mass, self._w.config.thickness)
+
+
+@dataclasses.dataclass
+class Divided:
+  """A mesh, and what its vertices have.
+
+  Attributes:
+    mesh: the mesh
+    mass: of each vertex [kg]                                    (nvert,)
+    source: what vertex each was before the first cut            (nvert,)
+    disp: displacement [m]                                       (nvert, 3)
+    vel: velocity [m/s]                                          (nvert, 3)
+    changed: vertices with another displacement or velocity      (n,)
+    share: of what was one, the part that each member has        (m,)
+  """
+
+  mesh: Mesh
+  mass: np.ndarray
+  source: np.ndarray
+  disp: np.ndarray
+  vel: np.ndarray
+  changed: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, int))
+  share: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))
+
+
+def divide(found: cutting.Cut, was: Divided, free: np.ndarray) -> Divided:
+  """Returns what vertices have after a cut: what moved goes on as it moved.
+
+  Args:
+    found: the cut
+    was: what they had
+    free: whether a vertex moves   (nvert,) bool
+  """
+  old, mesh, u, v = was.mesh, found.mesh, was.disp, was.vel
+  group, member = found.group, found.member
+  mass, source = was.mass.copy(), was.source.copy()
+  area = topology.areas_of(mesh, member)
+  share = area / np.bincount(group, area, mesh.nvert)[group]
+  mass[member] = share * was.mass[group]
+  source[member] = source[group]
+  now, speed = u.copy(), v.copy()
+  now[found.moved] = np.einsum("nk,nkj->nj", found.weight, u[found.corner])
+  near = topology.distinct(old.elem[found.changed])
+  near = near[free[near]]
+  before, goes = (old.rest + u)[near], (mesh.rest + now)[near]
+  speed[near] = _keep_spin(was.mass[near], before, goes, v[near])
+  now[member], speed[member] = now[group], speed[group]
+  changed = topology.distinct(near, member)
+  return Divided(mesh, mass, source, now, speed, changed, share)
+
+
+def report(found: cutting.Cut, before: Mesh, organ, thickness: float) -> Report:
+  """Returns what a cut of a mesh has done; `organ` is its declaration."""
+  path = [organ.origin + line @ organ.frame.T for line in found.path]
+  nodes = found.mesh.nouter - before.nouter
+  area = found.length * thickness
+  return Report(found.length, area, path, found.deviation, nodes, found.stopped)
+
+
+def pieces(mesh: Mesh, mass: np.ndarray, thickness: float) -> list[Piece]:
+  """Returns the parts of a mesh that hang together, the heaviest first."""
+  label = topology.pieces(mesh)
+  area = topology.vertex_areas(mesh.rest, mesh.elem)
+  held = topology.held_areas(mesh) > 0
+  out = []
+  for k in range(label.max() + 1):
+    vert = np.flatnonzero(label == k)
+    volume = float(area[vert].sum() * thickness)
+    out.append(Piece(vert, float(mass[vert].sum()), volume, bool(held[vert].any())))
+  return sorted(out, key=lambda piece: -piece.mass)
+
+
+# The plugin state, see `layout.Topology`; `own` has its blocks.
+
+
+def read(whole: Mesh, mass: np.ndarray, own: dict[str, np.ndarray]):
+  """Returns triangles, which of them are loose, rest places, masses and sources of a state.
+
+  Args:
+    whole: the mesh before the first cut
+    mass: of its vertices [kg]  (nvert,)
+    own: blocks of the state
+
+  Raises:
+    ValueError: the state is of another organ.
+  """
+  if not own["stamp"][0]:
+    return whole.elem, None, whole.rest, mass, np.arange(whole.nvert)
+  elem, loose = flexes.unpack(own["corner"])
+  rest, mass = own["place"].reshape(-1, 3).copy(), own["weight"].copy()
+  source = np.append(np.arange(whole.nvert - whole.spare), own["source"]).astype(int)
+  inside = (elem >= 0).all() and (elem < whole.nvert).all()
+  if not inside or not np.array_equal(source[elem], whole.elem):
+    raise ValueError(_FOREIGN)
+  if flexes.stamp(own["corner"], rest, mass) != own["stamp"][0]:
+    raise ValueError(_FOREIGN)
+  return elem, loose, rest, mass, source
+
+
+def write(own: dict[str, np.ndarray], mesh: Mesh, mass: np.ndarray, source, stamp: float):
+  """Writes a mesh to a state."""
+  own["corner"][:] = flexes.pack(mesh.elem, mesh.loose)
+  own["place"][:] = mesh.rest.ravel()
+  own["weight"][:] = mass
+  own["source"][:] = source[mesh.nvert - mesh.spare :]
+  own["stamp"][0] = stamp
 
 
 def _keep_spin(mass: np.ndarray, was: np.ndarray, now: np.ndarray, v: np.ndarray) -> np.ndarray:

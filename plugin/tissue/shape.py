@@ -154,6 +154,8 @@ def arrays(
     "free": _node_values(np.where(pinned | mesh.unused, 0.0, 1.0), vert),
     "closed": int(mesh.closed),
     "volume0": topology.volume(mesh.rest, mesh.elem) if mesh.closed else 0.0,
+    "stride": 0,
+    "mesh": np.zeros(0, np.int32),
     "shortest": 0.0 if mesh.spare else topology.shortest(mesh),
     "number": np.array(list(_numbers(config, mesh.closed).values())),
   }

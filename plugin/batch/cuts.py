@@ -1,0 +1,358 @@
+"""Cuts of an organ in worlds on a device, each with its mesh, as `engine.cuts` has one mjData's.
+
+Cuts are found on the host, for the worlds that are cut alone. Their motion comes from the device,
+and what has changed goes there; graphs go on as they were recorded.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import numpy as np
+import warp as wp
+from palpate.engine import cuts as engine
+from palpate.engine import flexes
+from palpate.engine.cuts import Divided, Piece, Report
+from palpate.tissue import body as bodies
+from palpate.tissue import cut as cutting
+from palpate.tissue import device as devices
+from palpate.tissue import energy, shape
+from palpate.tissue import mesh as topology
+from palpate.tissue.mesh import Mesh
+from palpate.tissue.meshes import Meshes
+from palpate.tissue.order import LANES, from_slices, to_slices
+from palpate.tissue.refill import Refill
+from palpate.tissue.types import NUMBERS
+
+from . import kernels
+from .patch import Surface
+
+_OWN = ("rest", "elem", "touch", "source", "share", "held")  # fields of `Patch`
+_STATE = ("corner", "place", "weight", "source", "stamp")  # blocks of the plugin state
+_INSIDE = NUMBERS.index("bulk")  # and pressure after it
+
+
+@dataclasses.dataclass
+class World:
+  """A world that was cut.
+
+  Attributes:
+    mesh: as it is now
+    mass: of its vertices [kg]                       (nvert,)
+    source: what each was before the first cut       (nvert,)
+    refill: writes its row
+    reports: what the cuts did
+  """
+
+  mesh: Mesh
+  mass: np.ndarray
+  source: np.ndarray
+  refill: Refill
+  reports: list[Report] = dataclasses.field(default_factory=list)
+
+  @functools.cached_property
+  def pieces(self) -> int:
+    """How many there are."""
+    return _count(self.mesh)
+
+
+@dataclasses.dataclass
+class Motion:
+  """What vertices of some worlds have, (worlds, nvert, 3) each, see `Patch`."""
+
+  disp: np.ndarray
+  vel: np.ndarray
+  last: np.ndarray
+  before: np.ndarray
+  force: np.ndarray
+
+
+class Cuts:
+  """The meshes of an organ's worlds.
+
+  Args:
+    organ: the organ of a batch, whose patch is not made yet
+    values: fields of that, which take the meshes in place of the one
+    surface: makes what of these follows from a mesh
+  """
+
+  def __init__(self, organ, values: dict, surface: Surface):
+    declared, body = organ.declared, organ.body
+    self._organ, self._surface = organ, surface
+    self.whole: Mesh = declared.mesh
+    nodes = devices.patch(body.device, body.shape.nslice)
+    arrays = shape.arrays(self.whole, organ.config, ~declared.free, nodes)
+    still = bodies.worlds(bodies.constants(arrays, wp.get_device("cpu"), organ.config.newton))
+    self._node = still.shape.node.numpy()
+    own = {f"patch.{name}": np.asarray(values[name][0]) for name in _OWN}
+    self._meshes = Meshes(body, still, own)
+    values |= {name: self._meshes.more[f"patch.{name}"] for name in _OWN}
+    values["mesh"] = self._meshes.which
+    number = body.tissue.number.numpy()[:, _INSIDE : _INSIDE + 2]
+    self._inside = wp.array(np.ascontiguousarray(number), dtype=float, device=body.device)
+    self._worlds: dict[int, World] = {}
+    self._whole_count = _count(self.whole)
+    self._count = wp.full(body.nworld, self._whole_count, dtype=int, device=body.device)
+
+  # What there is.
+
+  def follow(self):
+    """Forgets what worlds were that have been reset."""
+    if not self._worlds:
+      return
+    which = self._meshes.which.numpy()
+    for world in [world for world in self._worlds if not which[world]]:
+      self._forget(world)
+
+  def _forget(self, world: int):
+    del self._worlds[world]
+    self._meshes.heal(world)
+
+  def mesh(self, world: int) -> Mesh:
+    """Returns the mesh of a world."""
+    self.follow()
+    return self._mesh(world)
+
+  def _mesh(self, world: int) -> Mesh:
+    return self._worlds[world].mesh if world in self._worlds else self.whole
+
+  def mass(self, world: int) -> np.ndarray:
+    """Returns the masses of its vertices, as compiled [kg], (nvert,)."""
+    self.follow()
+    return self._worlds[world].mass if world in self._worlds else self._organ.declared.mass
+
+  def reports(self, world: int) -> list[Report]:
+    """Returns what the cuts of a world did."""
+    self.follow()
+    return list(self._worlds[world].reports) if world in self._worlds else []
+
+  def pieces(self, world: int) -> list[Piece]:
+    """Returns the parts of a world's organ that hang together, the heaviest first."""
+    scale = float(self._organ.patch.mass_scale.numpy()[world])
+    mass = scale * self.mass(world)
+    return engine.pieces(self.mesh(world), mass, self._organ.config.thickness)
+
+  def counts(self) -> wp.array:
+    """Returns how many pieces there are, (nworld,)."""
+    self.follow()
+    count = np.full(self._count.shape, self._whole_count)
+    for world, own in self._worlds.items():
+      count[world] = own.pieces
+    self._count.assign(count)
+    return self._count
+
+  # Within a step.
+
+  def heal(self):
+    """Gives the worlds of the mask the first mesh; `rest` has put back the rest."""
+    inputs, device = [self._organ.patch, self._inside, _INSIDE], self._organ.body.device
+    wp.launch(kernels.heal, dim=self._count.shape, inputs=inputs, device=device)
+
+  def renumber(self, worlds: np.ndarray, number: np.ndarray) -> np.ndarray:
+    """Keeps bulk and pressure of worlds; returns the numbers, without them where one is open."""
+    inside, which = self._inside.numpy(), self._meshes.which.numpy()
+    inside[worlds] = number[worlds, _INSIDE : _INSIDE + 2]
+    self._inside.assign(inside)
+    for world in worlds[which[worlds] > 0]:
+      if self.whole.closed and not self.mesh(world).closed:
+        number[world, _INSIDE : _INSIDE + 2] = 0.0
+    return number
+
+  # Cutting.
+
+  def find(
+    self, world: int, points: np.ndarray, disp: np.ndarray, given: float = 0.0
+  ) -> cutting.Cut:
+    """Returns what a cut along points in the organ's frame, (n, 3) [m], makes of a world.
+
+    Args:
+      world: the world
+      points: the path
+      disp: displacement of its vertices [m]  (nvert, 3)
+      given: see `cutting.cut`
+    """
+    organ, mesh = self._organ, self._mesh(world)
+    of_triangles = functools.partial(energy.of_triangles, organ.config)
+    pinned = ~organ.declared.free
+    return cutting.cut(
+      organ.name, mesh, mesh.rest + disp, points, pinned, of_triangles, given=given
+    )
+
+  def cut(self, points: dict[int, np.ndarray]) -> list[Report | None]:
+    """Cuts worlds along points in the world's axes, (n, 3) [m] each; see `Tissue.cut`."""
+    self.follow()
+    organ, worlds = self._organ, sorted(points)
+    motion = self.motion(worlds)
+    found = {}
+    for k, world in enumerate(worlds):
+      local = (points[world] - organ.declared.origin) @ organ.declared.frame
+      try:
+        found[world] = self.find(world, local, motion.disp[k])
+      except ValueError as error:
+        raise ValueError(f"world {world}: {error}") from None
+    out: list[Report | None] = [None] * organ.body.nworld
+    for world, report in self.take(worlds, found, motion).items():
+      out[world] = report
+    return out
+
+  def take(
+    self, worlds: list[int], found: dict[int, cutting.Cut], motion: Motion
+  ) -> dict[int, Report]:
+    """Makes worlds the meshes that were found; returns reports.
+
+    Args:
+      worlds: those of `motion`
+      found: cuts of some of them
+      motion: what their vertices have, which is written to
+    """
+    organ, out, changed = self._organ, {}, []
+    free = organ.declared.free
+    for k, world in enumerate(worlds):
+      if world not in found:
+        continue
+      cut, mesh = found[world], self._mesh(world)
+      out[world] = engine.report(cut, mesh, organ.declared, organ.config.thickness)
+      if cut.changed.size:
+        had = self._of(world)
+        was = Divided(mesh, had.mass, had.source, motion.disp[k], motion.vel[k])
+        after = engine.divide(cut, was, free)
+        _carry(motion, k, cut, after, free)
+        self._become(world, had, cut.mesh, cut.changed, after.mass, after.source)
+        changed.append(k)
+      if world in self._worlds:
+        self._worlds[world].reports.append(out[world])
+    if changed:
+      own = [worlds[k] for k in changed]
+      self._upload(own)
+      self.put_motion(own, Motion(*(getattr(motion, f.name)[changed]
+                                    for f in dataclasses.fields(Motion))))  # fmt: skip
+    return out
+
+  def _of(self, world: int) -> World:
+    """Returns a world, that of the first mesh until it is cut."""
+    if world in self._worlds:
+      return self._worlds[world]
+    refill = Refill(self._meshes.body(world), self.whole)
+    source = np.arange(self.whole.nvert)
+    return World(self.whole, self._organ.declared.mass.copy(), source, refill)
+
+  def _become(self, world: int, own: World, mesh: Mesh, changed: np.ndarray, mass, source):
+    organ = self._organ
+    own.refill.write(mesh, changed, organ.config, ~organ.declared.free)
+    own = World(mesh, mass, source, own.refill, own.reports)
+    arrays = self._meshes.of(self._meshes.row(world))
+    values = self._surface.of(mesh, mass, source)
+    for name in _OWN:
+      arrays[f"patch.{name}"][...] = values[name]
+    self._worlds[world] = own
+
+  def _upload(self, worlds: list[int]):
+    """Gives the device the meshes of worlds, and what follows from them."""
+    organ, body = self._organ, self._organ.body
+    self._meshes.upload(worlds)
+    mass = np.ones((len(worlds), body.shape.nnode), np.float32)
+    scale = organ.patch.mass_scale.numpy()
+    for k, world in enumerate(worlds):
+      own = scale[world] * self._worlds[world].mass
+      mass[k, self._node] = np.where(own > 0, own, 1.0)
+    self._put(body.state.mass, worlds, mass)
+    if self.whole.closed and any(not self._worlds[world].mesh.closed for world in worlds):
+      number = body.tissue.number.numpy()
+      for world in worlds:
+        if not self._worlds[world].mesh.closed:
+          number[world, _INSIDE : _INSIDE + 2] = 0.0
+      body.tissue.number.assign(number)
+    organ.wake(worlds)
+
+  # Motion of some worlds, to the host and back.
+
+  def _vectors(self) -> dict[str, wp.array]:
+    p = self._organ.patch
+    solve = self._organ.body.state
+    return {"disp": solve.disp, "vel": solve.vel, "last": p.last, "before": p.before}
+
+  def motion(self, worlds: list[int]) -> Motion:
+    """Returns what the vertices of worlds have."""
+    out = {}
+    for name, array in self._vectors().items():
+      rows = self._get(array, worlds).reshape(len(worlds), -1, 3, LANES)
+      out[name] = np.stack([from_slices(row)[self._node] for row in rows]).astype(float)
+    rows = self._get(self._organ.patch.force, worlds).reshape(len(worlds), -1, 3)
+    return Motion(**out, force=rows[:, self._node].astype(float))
+
+  def put_motion(self, worlds: list[int], motion: Motion):
+    """Gives vertices of worlds their motion."""
+    shape = len(worlds), self._organ.body.shape.nnode, 3
+    for name, array in self._vectors().items():
+      rows = np.zeros(shape, np.float32)
+      rows[:, self._node] = getattr(motion, name)
+      self._put(array, worlds, np.stack([to_slices(row) for row in rows]))
+    rows = np.zeros(shape, np.float32)
+    rows[:, self._node] = motion.force
+    self._put(self._organ.patch.force, worlds, rows)
+
+  def _get(self, array: wp.array, worlds: list[int]) -> np.ndarray:
+    whole = array.reshape((array.shape[0], -1))
+    rows = wp.empty((len(worlds), whole.shape[1]), dtype=float, device=array.device)
+    at = wp.array(worlds, dtype=int, device=array.device)
+    wp.launch(kernels.get_rows, dim=rows.shape, inputs=[whole, at, rows], device=array.device)
+    return rows.numpy()
+
+  def _put(self, array: wp.array, worlds: list[int], values: np.ndarray):
+    whole = array.reshape((array.shape[0], -1))
+    rows = wp.array(values.reshape(len(worlds), -1), dtype=float, device=array.device)
+    at = wp.array(worlds, dtype=int, device=array.device)
+    wp.launch(kernels.put_rows, dim=rows.shape, inputs=[rows, at, whole], device=array.device)
+
+  # States.
+
+  def pull(self, world: int, own: np.ndarray, spans: dict[str, slice]):
+    """Writes the mesh of a world to the plugin state, zero where it was not cut."""
+    self.follow()
+    if world not in self._worlds:
+      return
+    had = self._worlds[world]
+    corner = flexes.pack(had.mesh.elem, had.mesh.loose)
+    stamp = flexes.stamp(corner, had.mesh.rest, had.mass)
+    blocks = {name: own[spans[name]] for name in _STATE}
+    engine.write(blocks, had.mesh, had.mass, had.source, stamp)
+
+  def push(self, world: int, own: np.ndarray, spans: dict[str, slice]):
+    """Gives a world the mesh of a plugin state."""
+    blocks = {name: own[spans[name]] for name in _STATE}
+    mass = self._organ.declared.mass
+    elem, loose, rest, mass, source = engine.read(self.whole, mass, blocks)
+    self.follow()
+    before = self._mesh(world)
+    mesh, changed = topology.recut(before, rest, elem, loose)
+    if changed.size or mesh is not before:
+      self._become(world, self._of(world), mesh, changed, mass, source)
+      self._worlds[world].reports = []
+      self._upload([world])
+    if mesh is self.whole and world in self._worlds:
+      self._forget(world)
+      which = self._meshes.which.numpy()
+      which[world] = 0
+      self._meshes.which.assign(which)
+
+  @staticmethod
+  def is_cut(own: np.ndarray, spans: dict[str, slice]) -> bool:
+    """Returns whether a plugin state has cuts."""
+    return bool(own[spans["stamp"]].any())
+
+
+def _count(mesh: Mesh) -> int:
+  return int(topology.pieces(mesh).max()) + 1
+
+
+def _carry(motion: Motion, k: int, cut: cutting.Cut, after: Divided, free: np.ndarray):
+  """Gives the vertices of the k-th world of a motion what a cut makes of it."""
+  motion.disp[k], motion.vel[k] = after.disp, after.vel
+  group, member = cut.group, cut.member
+  share = after.share[free[member]][:, None]
+  group, member = group[free[member]], member[free[member]]
+  motion.force[k, member] = share * motion.force[k, group]
+  for name in ("last", "before"):
+    values = getattr(motion, name)
+    values[k, member] = values[k, group]
