@@ -19,6 +19,7 @@ from palpate.tissue import body as bodies
 from palpate.tissue import mesh as topology
 
 from .base import Batch, Tissue, refuse_crowd, spread
+from .bonds import OfThreads
 from .parting import Cutters
 
 _OF_VERTICES = ("xpos", "xvel", "contact_force")
@@ -177,6 +178,11 @@ class _Tissue(Tissue):
       name: wp.zeros(self._batch.nworld, dtype=float, device="cpu")
       for name in ("residual", "iterations")
     }
+
+  @functools.cached_property
+  def bonds(self) -> OfThreads:
+    """What it has grown on to."""
+    return OfThreads(self._batch, self.handles)
 
   def _read(self, name: str) -> wp.array:
     array = self._arrays[name]

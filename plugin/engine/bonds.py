@@ -56,9 +56,8 @@ class Bonded:
   mj: Bodies
 
 
-_stretch, _enter, _bear, _act, _keep = coupling.kernels(
-  "bonds.h", Bonded, "stretch_bonds", "enter_bonds", "bear_bonds", "act_bonds", "keep_bonds"
-)
+KERNELS = tuple(f"{verb}_bonds" for verb in ("stretch", "enter", "bear", "act", "feel", "keep"))
+_stretch, _enter, _bear, _act, _feel, _keep = coupling.kernels("bonds.h", Bonded, *KERNELS)
 
 
 @dataclasses.dataclass(eq=False)
@@ -258,6 +257,8 @@ class Bonds(Beside):
     """See `Beside`."""
     for group in self.groups:
       group.launch(_act)
+      if group.body != ON_ORGAN and group.bonded.restless:
+        group.launch(_feel)
 
   def end(self):
     """See `Beside`."""

@@ -285,7 +285,7 @@ PALPATE void bear(const Fields& f, int i, const Line& line) {
 template <class Fields>
 PALPATE void enter_blades(const Fields& f, Thread, int) {
   const D3 zero = {0.0, 0.0, 0.0};
-  if (f.own.windowed) f.solve.tail.data[TAIL_QUIET] = 0.0;
+  f.solve.quiet.data[0] = 0.0;
   for (int i = 0; i < f.nblade; ++i) {
     double* s = f.next.data + BLADE_LENGTH * i;
     for (int c = 0; c < BLADE_LENGTH; ++c) s[c] = f.state.data[BLADE_LENGTH * i + c];

@@ -122,7 +122,7 @@ PALPATE void enter_ties(const Fields& f, Thread, int) {
   const double h = f.mj.timestep.data[0], reach = f.ahead * h + f.number.data[DAMPING];
   const D3 zero = {0.0, 0.0, 0.0};
   const Rigid own = f.owned.data[0] ? own_motion(f) : Rigid{};
-  if (f.own.windowed && f.restless.data[0]) f.solve.tail.data[TAIL_QUIET] = 0.0;
+  if (f.restless.data[0]) f.solve.quiet.data[0] = 0.0;
   Twist moving = {zero, zero};
   for (int n = 0; n < count; ++n) {
     const int i = f.vert.data[n], node = f.solve.node.data[i];
