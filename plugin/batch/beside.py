@@ -61,7 +61,7 @@ class WorldNodes:
   origin: doubles(3)  # position of its frame [m]
 
 
-def _in_worlds(kind, rows: tuple[str, ...], others: dict[str, Any]) -> Any:
+def in_worlds(kind, rows: tuple[str, ...], others: dict[str, Any]) -> Any:
   """Returns a struct of many worlds.
 
   Args:
@@ -81,19 +81,19 @@ def _in_worlds(kind, rows: tuple[str, ...], others: dict[str, Any]) -> Any:
 _PARTS = {"own": WorldNodes, "other": WorldNodes, "mj": WorldBodies}
 _number = floats("nworld", "nnumber")
 BOND_ROWS = "state", "next", "stretch", "force", "hardness"
-WorldBonded = _in_worlds(engine_bonds.Bonded, BOND_ROWS, _PARTS | {"number": _number})
+WorldBonded = in_worlds(engine_bonds.Bonded, BOND_ROWS, _PARTS | {"number": _number})
 REST_ROWS = "slip", "slipped", "on", "force", "hardness"
-WorldRest = _in_worlds(rests.Rest, REST_ROWS, _PARTS)
+WorldRest = in_worlds(rests.Rest, REST_ROWS, _PARTS)
 
 
-def _kernels(header: str, kind, *names: str) -> list[Kernel]:
+def kernels(header: str, kind, *names: str) -> list[Kernel]:
   return [kernel(name, header, kind, coupling.CONSTANTS, tag=".worlds") for name in names]
 
 
-_stretch, _enter, _bear, _act, _feel, _keep = _kernels(
+_stretch, _enter, _bear, _act, _feel, _keep = kernels(
   "bonds.h", WorldBonded, *engine_bonds.KERNELS
 )
-_find, _press, _act_rest, _feel_rest, _keep_rest = _kernels("rests.h", WorldRest, *rests.KERNELS)
+_find, _press, _act_rest, _feel_rest, _keep_rest = kernels("rests.h", WorldRest, *rests.KERNELS)
 
 
 @wp.kernel(enable_backward=False)
@@ -189,8 +189,14 @@ class Beside:
   def _zeros(self, *shape: int, dtype=wp.float64) -> wp.array:
     return wp.zeros(shape, dtype=dtype, device=self._device)
 
-  def _over(self, what: Kernel, fields, count: int):
-    launch(what, fields, self._nworld, max(1, count), self._device)
+  def configure(self, worlds: np.ndarray, rows: dict[str, np.ndarray]):
+    """Follows the tissue of worlds, which has changed; `rows` as `Material.change` takes them."""
+
+  def stepped(self, last: bool):
+    """Does what the host has to do after a step; `last`: it was the last one for now."""
+
+  def _over(self, what: Kernel, fields, count: int, arg: int = 0):
+    launch(what, fields, self._nworld, max(1, count), self._device, arg)
 
 
 def check(spaces: list):

@@ -41,6 +41,7 @@ _CONSTRAINT = wp.constant(int(ContactType.CONSTRAINT))
 _LEAST = 1e-5  # friction, as in MuJoCo
 _FEW = 4  # tools; more of them share triangles
 # Whose sliding friction counts: the greater, or that of the one with priority.
+_NONE = {"margin": (), "condim": (), "whose": (), "friction": (5,), "solref": (2,), "solimp": (5,)}
 _GREATER, _TOOL, _ORGAN = wp.constant(0), wp.constant(1), wp.constant(2)
 
 
@@ -404,6 +405,7 @@ def make(model: mujoco.MjModel, organ, tools: np.ndarray, place, patch, data):
   own = int(organ.windows.flex[0]) if organ.windows else organ.flex
   rows = [_mix(model, int(g), own) for g in tools]
   mixed = {name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else ())}
+  mixed = mixed or {name: np.zeros((0, *wide)) for name, wide in _NONE.items()}
   contact = {f"out_{name}": getattr(data.contact, name) for name in _written()}
   values = mixed | contact | dict(
     most=most_of(model, tools, nslot),

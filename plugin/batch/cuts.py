@@ -92,6 +92,7 @@ class Cuts:
     number = body.tissue.number.numpy()[:, _INSIDE : _INSIDE + 2]
     self._inside = wp.array(np.ascontiguousarray(number), dtype=float, device=body.device)
     self._worlds: dict[int, World] = {}
+    self._changed: set[int] = set()
     self._whole_count = _count(self.whole)
     self._count = wp.full(body.nworld, self._whole_count, dtype=int, device=body.device)
 
@@ -112,9 +113,10 @@ class Cuts:
   def mesh(self, world: int) -> Mesh:
     """Returns the mesh of a world."""
     self.follow()
-    return self._mesh(world)
+    return self.mesh_of(world)
 
-  def _mesh(self, world: int) -> Mesh:
+  def mesh_of(self, world: int) -> Mesh:
+    """Returns the mesh of a world, as it was when `follow` was called."""
     return self._worlds[world].mesh if world in self._worlds else self.whole
 
   def mass(self, world: int) -> np.ndarray:
@@ -172,7 +174,7 @@ class Cuts:
       disp: displacement of its vertices [m]  (nvert, 3)
       given: see `cutting.cut`
     """
-    organ, mesh = self._organ, self._mesh(world)
+    organ, mesh = self._organ, self.mesh_of(world)
     of_triangles = functools.partial(energy.of_triangles, organ.config)
     pinned = ~organ.declared.free
     return cutting.cut(
@@ -184,50 +186,41 @@ class Cuts:
     self.follow()
     organ, worlds = self._organ, sorted(points)
     motion = self.motion(worlds)
-    found = {}
+    found = []
     for k, world in enumerate(worlds):
       local = (points[world] - organ.declared.origin) @ organ.declared.frame
       try:
-        found[world] = self.find(world, local, motion.disp[k])
+        found.append(self.find(world, local, motion.disp[k]))
       except ValueError as error:
         raise ValueError(f"world {world}: {error}") from None
     out: list[Report | None] = [None] * organ.body.nworld
-    for world, report in self.take(worlds, found, motion).items():
-      out[world] = report
-    return out
-
-  def take(
-    self, worlds: list[int], found: dict[int, cutting.Cut], motion: Motion
-  ) -> dict[int, Report]:
-    """Makes worlds the meshes that were found; returns reports.
-
-    Args:
-      worlds: those of `motion`
-      found: cuts of some of them
-      motion: what their vertices have, which is written to
-    """
-    organ, out, changed = self._organ, {}, []
-    free = organ.declared.free
     for k, world in enumerate(worlds):
-      if world not in found:
-        continue
-      cut, mesh = found[world], self._mesh(world)
-      out[world] = engine.report(cut, mesh, organ.declared, organ.config.thickness)
-      if cut.changed.size:
-        had = self._of(world)
-        was = Divided(mesh, had.mass, had.source, motion.disp[k], motion.vel[k])
-        after = engine.divide(cut, was, free)
-        _carry(motion, k, cut, after, free)
-        self._become(world, had, cut.mesh, cut.changed, after.mass, after.source)
-        changed.append(k)
-      if world in self._worlds:
-        self._worlds[world].reports.append(out[world])
-    if changed:
-      own = [worlds[k] for k in changed]
-      self._upload(own)
-      self.put_motion(own, Motion(*(getattr(motion, f.name)[changed]
-                                    for f in dataclasses.fields(Motion))))  # fmt: skip
+      out[world] = self.apply(world, found[k], motion, k)
+    self.finish(worlds, motion)
     return out
+
+  def apply(self, world: int, cut: cutting.Cut, motion: Motion, k: int) -> Report:
+    """Makes a world the mesh that was found, the k-th of a motion; `finish` is to come."""
+    organ, had = self._organ, self._of(world)
+    report = engine.report(cut, had.mesh, organ.declared, organ.config.thickness)
+    if cut.changed.size:
+      was = Divided(had.mesh, had.mass, had.source, motion.disp[k], motion.vel[k])
+      after = engine.divide(cut, was, organ.declared.free)
+      _carry(motion, k, cut, after, organ.declared.free)
+      self._become(world, had, cut.mesh, cut.changed, after.mass, after.source)
+      self._changed.add(world)
+      self._worlds[world].reports.append(report)
+    return report
+
+  def finish(self, worlds: list[int], motion: Motion):
+    """Brings the worlds that `apply` has changed to the device; `motion` is of `worlds`."""
+    which = [k for k, world in enumerate(worlds) if world in self._changed]
+    self._changed.clear()
+    if which:
+      own = [worlds[k] for k in which]
+      self._upload(own)
+      names = [field.name for field in dataclasses.fields(Motion)]
+      self.put_motion(own, Motion(*(getattr(motion, name)[which] for name in names)))
 
   def _of(self, world: int) -> World:
     """Returns a world, that of the first mesh until it is cut."""
@@ -324,7 +317,7 @@ class Cuts:
     mass = self._organ.declared.mass
     elem, loose, rest, mass, source = engine.read(self.whole, mass, blocks)
     self.follow()
-    before = self._mesh(world)
+    before = self.mesh_of(world)
     mesh, changed = topology.recut(before, rest, elem, loose)
     if changed.size or mesh is not before:
       self._become(world, self._of(world), mesh, changed, mass, source)

@@ -16,6 +16,7 @@ from palpate.tissue import order, shape, step
 
 from . import beside, contacts, convex, kernels, patch, sliding
 from .base import Contacts, Tissue, spread
+from .blades import Blades
 from .cuts import Cuts
 from .material import KEYS, MODULI, Material
 from .parting import Cutters
@@ -268,7 +269,10 @@ class Organ(Tissue):
     return self._cuts.counts()
 
   def _cutters(self) -> Cutters:
-    raise ValueError(f"organ {self.name!r}: a batch on a GPU has no cutters yet")
+    for each in self.beside:
+      if isinstance(each, Blades):
+        return each.read()
+    raise ValueError(f"organ {self.name!r}: nothing cuts it, expected the key cutters")
 
   def elem_of(self, world: int) -> np.ndarray:
     """Returns the triangles of a world, see `Tissue.elem_of`."""
@@ -292,6 +296,8 @@ class Organ(Tissue):
       if key != "friction" and key != "mass":
         self._check(key, values)
     self._material.change(chosen, rows)
+    for each in self.beside:
+      each.configure(chosen, rows)
     self.wake(chosen)
 
   def _fixed(self, key: str) -> str | None:

@@ -121,10 +121,10 @@ tell_tools, enter, rank, stand, push, take, follow, commit, find_bad, rest = cou
 )
 
 
-def launch(kernel, patch, nworld: int, count: int, device):
+def launch(kernel, patch, nworld: int, count: int, device, arg: int = 0):
   """Launches a kernel over `count` items of each world; one thread has a world on the CPU."""
   nthread = -(-count // 32) * 32 if device.is_cuda else 1
-  kernel.launch(device, nworld, nthread, 0, patch, _BLOCK)
+  kernel.launch(device, nworld, nthread, arg, patch, _BLOCK)
 
 
 def constants(body, organ, tools: np.ndarray, model: mujoco.MjModel, inertia, surface) -> dict:

@@ -57,6 +57,7 @@ class Threads(Batch):
     self.datas += [mujoco.MjData(each) for each in self.models[1:]]
     self._pool = ThreadPoolExecutor(min(nthread, nworld))
     self._begin: np.ndarray | None = None
+    self._felt: list[tuple[int, str]] = []
     self._seen = np.zeros((nworld, 0, model.nsensordata), np.float32)
     self._organs = {name: _Tissue(self, name, number) for name, number in instances(model).items()}
 
@@ -82,6 +83,9 @@ class Threads(Batch):
       most, total = np.zeros(model.nsensor), np.zeros(model.nsensordata)
       for k in range(n):
         mujoco.mj_step(model, data)
+        for adr, organ in self._felt:
+          for cutter in self._organs[organ].handles[world].cutters:
+            data.sensordata[adr : adr + 3] += cutter.force
         self._seen[world, k : k + 1] = data.sensordata
         total += data.sensordata
         np.maximum(most, np.add.reduceat(data.sensordata**2, first), out=most)
@@ -89,6 +93,9 @@ class Threads(Batch):
       return self._look(world)
 
     self.each(work)
+
+  def _feel(self, sensor: int, organ: str):
+    self._felt.append((int(self.model.sensor_adr[sensor]), organ))
 
   def _watch(self, out: wp.array) -> wp.array:
     self._seen = out.numpy()
