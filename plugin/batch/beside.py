@@ -87,6 +87,7 @@ WorldRest = in_worlds(rests.Rest, REST_ROWS, _PARTS)
 
 
 def kernels(header: str, kind, *names: str) -> list[Kernel]:
+  """Returns the kernels of a header that take a struct of many worlds."""
   return [kernel(name, header, kind, coupling.CONSTANTS, tag=".worlds") for name in names]
 
 

@@ -137,18 +137,14 @@ class Cuts:
 
   def counts(self) -> wp.array:
     """Returns how many pieces there are, (nworld,)."""
-    self.follow()
-    count = np.full(self._count.shape, self._whole_count)
-    for world, own in self._worlds.items():
-      count[world] = own.pieces
-    self._count.assign(count)
     return self._count
 
   # Within a step.
 
   def heal(self):
     """Gives the worlds of the mask the first mesh; `rest` has put back the rest."""
-    inputs, device = [self._organ.patch, self._inside, _INSIDE], self._organ.body.device
+    whole = [self._inside, _INSIDE, self._count, self._whole_count]
+    inputs, device = [self._organ.patch, *whole], self._organ.body.device
     wp.launch(kernels.heal, dim=self._count.shape, inputs=inputs, device=device)
 
   def renumber(self, worlds: np.ndarray, number: np.ndarray) -> np.ndarray:
@@ -256,6 +252,9 @@ class Cuts:
         if not self._worlds[world].mesh.closed:
           number[world, _INSIDE : _INSIDE + 2] = 0.0
       body.tissue.number.assign(number)
+    count = self._count.numpy()
+    count[worlds] = [self._worlds[world].pieces for world in worlds]
+    self._count.assign(count)
     organ.wake(worlds)
 
   # Motion of some worlds, to the host and back.
@@ -328,6 +327,9 @@ class Cuts:
       which = self._meshes.which.numpy()
       which[world] = 0
       self._meshes.which.assign(which)
+      count = self._count.numpy()
+      count[world] = self._whole_count
+      self._count.assign(count)
 
   @staticmethod
   def is_cut(own: np.ndarray, spans: dict[str, slice]) -> bool:

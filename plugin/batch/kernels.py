@@ -199,11 +199,12 @@ def spread_nodes(p: Patch, adr: wp.array[int], velocity: int, out: wp.array2d[fl
 
 
 @wp.kernel(enable_backward=False)
-def heal(p: Patch, inside: wp.array2d[float], first: int):
+def heal(p: Patch, inside: wp.array2d[float], first: int, pieces: wp.array[int], whole: int):
   """Gives the worlds of a mask the first mesh, with the volume stiffness and pressure of that."""
   w = wp.tid()
   if p.mask[w] and p.mesh[w] > 0:
     p.mesh[w] = 0
+    pieces[w] = whole
     for k in range(inside.shape[1]):
       p.tissue.number[w, first + k] = inside[w, k]
 

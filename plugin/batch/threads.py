@@ -173,7 +173,8 @@ class _Tissue(Tissue):
     self.spaces = [engine.find(data._address, instance) for data in batch.datas]
     self.name, self.elem = name, self.handles[0].elem
     self.nvert = coupling.outer(self.spaces[0].organ)
-    self._batch = batch
+    self._batch, self._counted = batch, [None] * batch.nworld
+    self._pieces = wp.zeros(batch.nworld, dtype=int, device="cpu")
 
   @functools.cached_property
   def _arrays(self) -> dict[str, wp.array]:
@@ -223,8 +224,13 @@ class _Tissue(Tissue):
     return list(handle.cuts if name == "reports" else handle.pieces)
 
   def _piece_count(self) -> wp.array:
-    count = [_count_pieces(space) for space in self.spaces]
-    return wp.array(count, dtype=int, device="cpu")
+    out = self._pieces.numpy()
+    for world, space in enumerate(self.spaces):
+      space.cuts.follow()
+      mesh = space.organ.mesh
+      if mesh is not self._counted[world]:
+        self._counted[world], out[world] = mesh, int(topology.pieces(mesh).max()) + 1
+    return self._pieces
 
   def _cutters(self) -> Cutters:
     every = [handle.cutters for handle in self.handles]
@@ -255,11 +261,6 @@ class _Tissue(Tissue):
     organ = self.spaces[world].organ
     touching = organ.windows.flex if organ.windows else [organ.flex]
     self._batch.models[world].flex_friction[touching, 0] = friction
-
-
-def _count_pieces(space) -> int:
-  space.cuts.follow()
-  return int(topology.pieces(space.organ.mesh).max()) + 1
 
 
 def _threads(nthread: int | None) -> int:
