@@ -55,7 +55,8 @@ class Parting(abc.ABC):
       )
     worlds = np.flatnonzero(batch._mask(mask).numpy()).tolist()
     batch._fresh = False
-    return self._cut({world: points[world] for world in worlds})
+    paths = {world: points[world] for world in worlds}
+    return self._cut(paths) if paths else [None] * batch.nworld
 
   @property
   def cuts(self) -> list[list[Report]]:

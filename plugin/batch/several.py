@@ -195,7 +195,7 @@ class _Gathered(Tissue):
     out: list[Report | None] = []
     for at, part in zip(self._batch.slices, self._parts, strict=True):
       own = {world - at.start: points[world] for world in points if at.start <= world < at.stop}
-      out += part._cut(own)
+      out += part._cut(own) if own else [None] * (at.stop - at.start)
     return out
 
   def _told(self, name: str, world: int) -> list:
