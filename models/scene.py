@@ -53,7 +53,7 @@ def load(
     handle: whether mocap handles pull the instruments in place of position actuators
     grid: a regular sheet of grid x grid nodes in place of `nodes`, one of `GRIDS`
     coupling: `nodal`, or `window` where MuJoCo knows the nodes near the instruments alone
-    interior: `solid` for tetrahedra inside, with `coupling="window"`; `none` for the surface alone,
+    interior: `solid` for tetrahedra inside; `none` for the surface alone,
       on a foundation and with a bulk modulus that stand for what is inside
     fine: longest edge of the triangles within 6 mm of the places that instruments point at [m], for
       forces of small tools, with contacts that do not let them sink in; a skin wants it longer than
@@ -103,8 +103,6 @@ def _organ(build: Build, name: str, coupling: str, interior: str) -> mujoco.MjSp
     raise ValueError(f"organ {name!r}: interior is {interior!r}, expected none or solid")
   if solid and build.entry.hollow:
     raise ValueError(f"organ {name!r}: interior is 'solid', expected none: it is hollow")
-  if solid and coupling != "window":
-    raise ValueError(f"organ {name!r}: interior is 'solid', expected coupling='window' with it")
   made = markup.catalogued(build, name, None, coupling == "window", solid)
   return mujoco.MjSpec.from_string(made)
 

@@ -258,8 +258,13 @@ class Task(control.Task):
     return {}
 
   def arrays(self, physics: Physics) -> dict[str, np.ndarray]:
-    """Returns the arrays of a control step for a recording: the action, and what the hand felt."""
-    return {"action": self.action} | ({"felt": physics.felt()} if self.scene.handle else {})
+    """Returns the arrays of a control step for a recording: the action, and what hands felt."""
+    arrays = {"action": self.action}
+    if self.scene.handle:
+      arrays["felt"] = physics.felt()
+      if physics.second:
+        arrays[f"{self.second.replace('/', '_')}felt"] = physics.second.felt()
+    return arrays
 
   def constants(self, physics: Physics) -> Mapping[str, np.ndarray]:
     """Returns further constants of a recording, see `Recorder.attach`."""

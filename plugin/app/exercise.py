@@ -38,6 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser):
     help="do it by hand, live: mouse, keyboard or touch on a page; gamepad, spacemouse, udp, "
     "openhaptics, forcedimension, haply, hand",
   )  # fmt: skip
+  add("--left", metavar="NAME", help="device of the other hand, in an exercise that takes two")
   add("--scale", metavar="X", type=float, default=1.0, help="of a device's movements (%(default)s)")
   add("--seed", metavar="N", type=int, default=0, help="of the episode (%(default)s)")
   add("--replay", metavar="FILE", help="repeat a recording and check that it comes out the same")
@@ -69,6 +70,8 @@ def main(args: argparse.Namespace) -> int:
     try:
       if devices.on_page(args.device):
         return _page(args)
+      if args.left and devices.on_page(args.left):
+        raise ValueError(f"left is {args.left!r}, which is on a page as --device alone")
     except ValueError as error:
       raise CommandError(str(error)) from None
   job = _prepare(args)
@@ -113,6 +116,8 @@ def _check_who(args: argparse.Namespace):
   """Raises CommandError where the options do not agree on who does what."""
   if args.device and not args.task:
     raise CommandError("device is given without a TASK; a replay needs none")
+  if args.left and not args.device:
+    raise CommandError(f"left is {args.left!r} without --device NAME, that of the main hand")
   if args.device and args.performer:
     raise CommandError(f"performer is {args.performer!r} and device is {args.device!r}, expected "
                        "one of them")  # fmt: skip
@@ -131,6 +136,8 @@ def _check_who(args: argparse.Namespace):
 
 def _page(args: argparse.Namespace) -> int:
   """Opens the page on the exercise."""
+  if args.left:
+    raise CommandError(f"left is {args.left!r} with --device {args.device}: the page asks for it")
   from palpate.tasks import suite
 
   from . import serve
@@ -251,9 +258,11 @@ def _by_hand(args: argparse.Namespace, name: str, task_kwargs: dict[str, Any]):
   env = options.load(name, task_kwargs)
   try:
     device, coupled = live.device(args.device), live.Options(scale=args.scale)
+    other = live.device(args.left) if args.left else None
   except live.DeviceError as error:
     raise CommandError(str(error), code=1) from None
-  session = live.Session(env, device, args.seed, {"task_kwargs": task_kwargs}, coupled)
+  info = {"task_kwargs": task_kwargs}
+  session = live.Session(env, device, args.seed, info, coupled, other=other)
   return lambda watch: session.run(watch=watch)
 
 

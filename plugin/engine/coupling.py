@@ -219,11 +219,17 @@ def sizes(organ) -> dict[str, int]:
   out |= cut_sizes(whole.nelem, whole.nvert, whole.spare)
   out["nbond"] = int(organ.free[: outer(organ)].sum()) if organ.config.bonded else 0
   out["nblade"] = len(organ.config.cutters)
+  solid = len(organ.mesh.tet) > 0
   if organ.windows is None:
-    return out | {"nfree": organ.nfree}
+    return out | nodal_sizes(organ.nfree, 3 * (organ.mesh.nvert - organ.mesh.nouter) * solid)
   win = organ.windows
   out["nrest"] = outer(organ) if organ.config.support else 0
   return out | {"nvert": organ.mesh.nvert, "nslot": win.nslot, "ngeom": win.geom.size}
+
+
+def nodal_sizes(nfree: int, ninner: int) -> dict[str, int]:
+  """Returns what dofs of MuJoCo, and numbers of nodes inside, need in the plugin state."""
+  return {"nfree": nfree, "ninner": ninner, "nmoving": nfree + ninner}
 
 
 def cut_sizes(nelem: int, nvert: int, spare: int) -> dict[str, int]:

@@ -165,11 +165,6 @@ class Cuts:
     if self:
       self._refill.forget()
 
-  def spread(self):
-    """Tells the coupling what nodes there are now, and their masses."""
-    if self:
-      self._w.phases.reshape()
-
   def share(self, values: np.ndarray) -> np.ndarray:
     """Returns values by mass of the whole's vertices, spread over what became of them, (nvert,)."""
     was = self.declared.mass[self.source]

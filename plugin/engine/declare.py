@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 from palpate.tissue import config as configuration
 from palpate.tissue import device as devices
-from palpate.tissue import diagonals, shape
+from palpate.tissue import diagonals, fill, gmsh, shape
 from palpate.tissue import mesh as topology
 from palpate.tissue.body import Body
 from palpate.tissue.config import Config
@@ -46,7 +46,7 @@ class Declaration:
     dofadr: first dof, -1 if pinned         (nvert,)
     qposadr: first qpos, -1 if pinned       (nvert,)
     stateadr: first own number in the plugin state, -1 if pinned (nvert,)
-    nfree: three times the number of moving vertices
+    nfree: three times the number of vertices that have dofs
     frame: rotation from the slides' axes to the world (3, 3)
     origin: position of the parent body [m] (3,)
     mass: mass of each vertex [kg]          (nvert,)
@@ -81,15 +81,25 @@ class Declaration:
     return float(2**50 + int.from_bytes(digest.digest()[:6], "big"))
 
   @property
+  def jointed(self) -> np.ndarray:
+    """Vertices that are dofs of MuJoCo."""
+    return np.flatnonzero(self.dofadr >= 0)
+
+  @property
+  def inner(self) -> np.ndarray:
+    """Vertices inside of a solid."""
+    return np.arange(self.mesh.nouter if len(self.mesh.tet) else self.mesh.nvert, self.mesh.nvert)
+
+  @property
   def dofs(self) -> np.ndarray:
     """Degrees of freedom of the moving vertices, or of the windows' slots."""
-    first = self.windows.dofadr if self.windows else self.dofadr[self.free]
+    first = self.windows.dofadr if self.windows else self.dofadr[self.jointed]
     return (first[:, None] + np.arange(3)).ravel()
 
   @property
   def qposs(self) -> np.ndarray:
     """Where they are in qpos."""
-    first = self.windows.qposadr if self.windows else self.qposadr[self.free]
+    first = self.windows.qposadr if self.windows else self.qposadr[self.jointed]
     return (first[:, None] + np.arange(3)).ravel()
 
 
@@ -162,8 +172,15 @@ def read(model: int, instance: int) -> Declaration:
   if config.carrier and not free.all():
     raise ValueError(f"organ {name!r}: carrier is set and vertices are pinned, expected no <pin>")
   dofadr, qposadr = addresses(m, name, body, free)
-  order = np.cumsum(free) - 1
   mass = mjstruct.view(m.body_mass, m.nbody)[body]
+  if config.elements == "solid":
+    mesh = fill_inside(name, mesh, config)
+    share = fill.vertex_volumes(mesh)
+    mass = float(mass[free].mean()) * nvert * share / share.sum()
+  # Those inside move, and MuJoCo knows nothing of them.
+  absent = np.full(mesh.nvert - nvert, -1)
+  free = np.concatenate([free, absent < 0])
+  order = np.cumsum(free) - 1
   return cached(
     float(m.opt.timestep),
     name=name,
@@ -171,11 +188,11 @@ def read(model: int, instance: int) -> Declaration:
     mesh=mesh,
     config=config,
     free=free,
-    body=body,
-    dofadr=dofadr,
-    qposadr=qposadr,
+    body=np.concatenate([body, np.full_like(absent, parent)]),
+    dofadr=np.concatenate([dofadr, absent]),
+    qposadr=np.concatenate([qposadr, absent]),
     stateadr=np.where(free, 3 * order, -1),
-    nfree=3 * int(free.sum()),
+    nfree=3 * int(free[:nvert].sum()),
     frame=frame,
     origin=origin,
     mass=mass,
@@ -199,6 +216,12 @@ def read_mesh(
   if config.elements == "membrane" and config.bend and not spare:  # a cut goes along given edges
     mesh = diagonals.parallel(name, mesh, np.asarray(config.young))
   return config, mesh
+
+
+def fill_inside(name: str, mesh: Mesh, config: Config) -> Mesh:
+  """Returns the surface with its inside, of a file or made."""
+  given = config.tetrahedra
+  return gmsh.read(name, given, mesh) if given else fill.fill(name, mesh)
 
 
 def cached(
@@ -363,7 +386,7 @@ def static_frame(m, name: str, parent: int) -> tuple[np.ndarray, np.ndarray]:
 def static_places(m, organ: Declaration) -> list[memoryview]:
   """Returns position and turn, as bytes, of each body that the organ or a window hangs on."""
   parentid = mjstruct.view(m.body_parentid, m.nbody, np.int32)
-  start = [int(organ.body[0])] if organ.windows else parentid[organ.body[organ.free]]
+  start = [int(organ.body[0])] if organ.windows else parentid[organ.body[organ.jointed]]
   slots = parentid[organ.windows.body] if organ.windows else []
   found: set[int] = set()
   for body in {int(b) for b in (*start, *slots)}:
@@ -381,10 +404,10 @@ def static_places(m, organ: Declaration) -> list[memoryview]:
 def check_frame(m, organ: Declaration):
   """Raises ValueError where the organ's frame is not, or no longer, where it was declared."""
   parentid = mjstruct.view(m.body_parentid, m.nbody, np.int32)
-  body = int(organ.body[0]) if organ.windows else int(parentid[organ.body[organ.free][0]])
+  body = int(organ.body[0]) if organ.windows else int(parentid[organ.body[organ.jointed][0]])
   frame, origin = static_frame(m, organ.name, body)
   if not organ.windows:
-    frame = frame @ find_turn(m, organ.name, organ.body[organ.free])
+    frame = frame @ find_turn(m, organ.name, organ.body[organ.jointed])
   if not (np.array_equal(frame, organ.frame) and np.array_equal(origin, organ.origin)):
     who = mjstruct.name_of(m, m.name_bodyadr, body)
     raise ValueError(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from palpate.tissue import device as devices
-from palpate.tissue import fill, gmsh
+from palpate.tissue import fill
 from palpate.tissue import mesh as topology
 from palpate.tissue.config import Config
 
@@ -33,8 +33,7 @@ def read(model: int, instance: int) -> Declaration:
   elem = mesh.elem
   declare.check_volume(name, mesh, config)
   if config.elements == "solid":
-    given = config.tetrahedra
-    mesh = gmsh.read(name, given, mesh) if given else fill.fill(name, mesh)
+    mesh = declare.fill_inside(name, mesh, config)
   free = np.ones(mesh.nvert, bool)
   for vertex in config.pin:
     if vertex >= nvert:

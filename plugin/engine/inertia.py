@@ -106,14 +106,18 @@ def _naming(organ: Declaration):
 def of_dofs(m, organ: Declaration) -> np.ndarray:
   """Returns the inertia that the dofs of every node have in the model [kg], (nvert,)."""
   inertia = masses(m, organ).copy()
-  inertia[organ.free] += mjstruct.view(m.dof_armature, m.nv)[organ.dofs].reshape(-1, 3)[:, 0]
+  own = organ.jointed
+  inertia[own] = mjstruct.view(m.body_mass, m.nbody)[organ.body[own]]
+  inertia[own] += mjstruct.view(m.dof_armature, m.nv)[organ.dofs].reshape(-1, 3)[:, 0]
   return inertia
 
 
 def masses(m, organ: Declaration) -> np.ndarray:
-  """Returns the mass of every node that MuJoCo or the windows give it [kg], (nvert,)."""
+  """Returns the mass of every node that MuJoCo, a solid or the windows give it [kg], (nvert,)."""
   if organ.windows:
     return organ.windows.mass
+  if len(organ.mesh.tet):
+    return organ.mass
   return mjstruct.view(m.body_mass, m.nbody)[organ.body]
 
 

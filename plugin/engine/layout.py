@@ -222,11 +222,13 @@ NO_CUTS = {"nblade": 0, "ncorner": 0, "nplace": 0, "nspare": 0, "ncuts": 0}
 
 @struct
 class NodalState:
-  """Plugin state of an organ whose nodes are degrees of freedom of MuJoCo."""
+  """Plugin state of an organ whose nodes are degrees of freedom of MuJoCo; of solids, the outer."""
 
+  disp: doubles("ninner")  # displacement from rest of nodes inside [m]
+  vel: doubles("ninner")  # their velocity [m/s]
   force: doubles("nfree")  # contact force of the last step [N]
-  last: doubles("nfree")  # last change of the velocity [m/s]
-  before: doubles("nfree")  # the one before it [m/s]
+  last: doubles("nmoving")  # last change of the velocity, of those inside after the others [m/s]
+  before: doubles("nmoving")  # the one before it [m/s]
   creep: doubles("ncreep", 6)  # see `creep`
   bond: doubles("nbond", len(BOND))  # of each vertex that moves, see BOND
   blade: doubles("nblade", len(BLADE))  # of each geom that cuts, see BLADE

@@ -8,22 +8,23 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from . import workspace
+from . import coupling, workspace
 from .workspace import Workspace
 
 
 class Nodal:
-  """Motion of an organ whose vertices are MuJoCo's dofs."""
+  """Motion of an organ whose vertices are MuJoCo's dofs, but for those inside of a solid."""
 
   def __init__(self, w: Workspace):
     self._w = w
-    self._moving = np.flatnonzero(w.organ.free)
+    self._moving, self._inner = w.organ.jointed, w.organ.inner
     self._qpos = w.organ.qposs.reshape(-1, 3)
     self._dofs = w.organ.dofs.reshape(-1, 3)
 
   def displacement(self, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
     """Returns the displacement from rest [m], (nvert, 3)."""
-    return self._spread(data.qpos[self._qpos] - model.qpos0[self._qpos] - self._shift)
+    moved = data.qpos[self._qpos] - model.qpos0[self._qpos] - self._shift
+    return self._spread(moved, self._within("disp"))
 
   @property
   def _shift(self) -> np.ndarray:
@@ -33,7 +34,7 @@ class Nodal:
 
   def velocity(self, data: mujoco.MjData) -> np.ndarray:
     """Returns the velocity [m/s], (nvert, 3)."""
-    return self._spread(data.qvel[self._dofs])
+    return self._spread(data.qvel[self._dofs], self._within("vel"))
 
   def contact_force(self, data: mujoco.MjData) -> np.ndarray:
     """Returns the constraint force of the last step [N], (nvert, 3)."""
@@ -45,11 +46,19 @@ class Nodal:
       data.qpos[self._qpos] = model.qpos0[self._qpos] + self._shift + u[self._moving]
     if v is not None:
       data.qvel[self._dofs] = v[self._moving]
+    kept = [self._within(name).copy() for name in ("disp", "vel")]
     _forget(self._w)
+    for name, old, new in zip(("disp", "vel"), kept, (u, v), strict=True):
+      self._within(name)[:] = old if new is None else new[self._inner]
 
-  def _spread(self, values: np.ndarray) -> np.ndarray:
+  def _within(self, name: str) -> np.ndarray:
+    """Returns what the plugin state has of the vertices inside, (n, 3)."""
+    return self._w.plugin_state[coupling.spans(self._w.organ)[name]].reshape(-1, 3)
+
+  def _spread(self, values: np.ndarray, within: np.ndarray | float = 0.0) -> np.ndarray:
     out = np.zeros((len(self._w.organ.free), 3))
     out[self._moving] = values
+    out[self._inner] = within
     return out
 
 

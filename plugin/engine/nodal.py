@@ -21,13 +21,14 @@ class Nodal:
   dofadr: ints("nnode")  # first dof of a node, -1 for pinned ones and padding
   qposadr: ints("nnode")  # its first number in qpos
   bodyid: ints("nnode")  # its body
-  stateadr: ints("nnode")  # its first number in a block of the plugin state
+  stateadr: ints("nnode")  # its first number in a block of the plugin state, -1 for those
+  nfree: int  # numbers of nodes that have dofs; those of the nodes inside of a solid follow
   massadr: ints("nnode", 3)  # where M has the diagonals of its dofs
   frame: doubles(3, 3)  # rotation from the slides' axes to the world
-  cuts: int  # whether it has room for cuts; the next three are there then
-  weight: doubles("ncut")  # mass of a node [kg]
-  inertia: doubles("ncut")  # its inertia to MuJoCo [kg]
-  shift: doubles("ncut", 3)  # rest position now less that of the compiled model [m]
+  weighs: int  # whether masses are not MuJoCo's: solids, and where cuts may come; then there are
+  weight: doubles("nweighed")  # mass of a node [kg]
+  inertia: doubles("nweighed")  # its inertia to MuJoCo [kg]
+  shift: doubles("nweighed", 3)  # rest position now less that of the compiled model [m]
   heaviest: doubles(1)  # see `Workspace`
   number: doubles("nnumber")  # see `NUMBERS`
   flags: ints(len(FLAG))  # see FLAG
@@ -42,9 +43,9 @@ gather, scatter, push, remember = coupling.kernels(
 )
 
 
-def state_size(nfree: int, **more: int) -> int:
+def state_size(nfree: int, ninner: int = 0, **more: int) -> int:
   """Returns the length of the plugin state of `nfree` degrees of freedom; see `coupling.sizes`."""
-  sizes = {"nfree": nfree, "ncreep": 0, "nbond": 0} | layout.NO_CUTS
+  sizes = coupling.nodal_sizes(nfree, ninner) | {"ncreep": 0, "nbond": 0} | layout.NO_CUTS
   return layout.size(NodalState, sizes | more)
 
 
@@ -60,6 +61,8 @@ class Phases(coupling.Phases):
     dofs = np.maximum(dofadr, 0)[:, None] + np.arange(3)
     sizes = coupling.sizes(organ)
     state = coupling.plugin_state(model, w.data, instance, layout.size(NodalState, sizes))
+    weighs = organ.mesh.spare > 0 or len(organ.mesh.tet) > 0
+    nweighed = weighs * len(vert)
     values = dict(
       nnode=s.nnode,
       rest_share=step.REST,
@@ -69,10 +72,11 @@ class Phases(coupling.Phases):
       stateadr=_in_node_order(organ.stateadr, vert),
       massadr=np.where(dofadr[:, None] >= 0, coupling.mass_addresses(m, dofs), -1),
       frame=organ.frame,
-      cuts=int(organ.mesh.spare > 0),
-      weight=np.zeros(len(vert) if organ.mesh.spare else 0),
-      inertia=np.zeros(len(vert) if organ.mesh.spare else 0),
-      shift=np.zeros((len(vert) if organ.mesh.spare else 0, 3)),
+      nfree=organ.nfree,
+      weighs=int(weighs),
+      weight=np.zeros(nweighed),
+      inertia=np.zeros(nweighed),
+      shift=np.zeros((nweighed, 3)),
       heaviest=wp.array(w.heaviest, dtype=wp.float64, device="cpu", copy=False),
       number=w.body.numbers,
       flags=wp.array(np.asarray(w.flags), dtype=int, device="cpu", copy=False),
@@ -83,8 +87,7 @@ class Phases(coupling.Phases):
     )
     w.views["plugin_state"] = state
     self._nodal, self._w, self._model = fill(Nodal, "cpu", values), w, m
-    if organ.mesh.spare:
-      self.reshape()
+    self.reshape()
 
   def _launch(self, kernel):
     kernel.launch("cpu", 1, 1, 0, self._nodal)
@@ -105,15 +108,16 @@ class Phases(coupling.Phases):
     """Steps the plugin state, and ends the step with the response where there was one."""
     self._launch(remember)
 
-  # Cuts.
+  # Solids and cuts.
 
   def reshape(self, touched: np.ndarray | None = None):
     """Takes the mesh and the masses that the organ has now."""
     w, organ, n = self._w, self._w.organ, self._nodal
-    node = w.body.shape.node.numpy()
-    mass = np.where(organ.mass > 0, organ.mass, 1.0)
-    n.weight.numpy()[node] = mass
-    n.inertia.numpy()[node] = w.cuts.share(inertia.of_dofs(self._model, organ))
+    if not n.weighs:
+      return
+    node, found = w.body.shape.node.numpy(), inertia.of_dofs(self._model, organ)
+    n.weight.numpy()[node] = np.where(organ.mass > 0, organ.mass, 1.0)
+    n.inertia.numpy()[node] = w.cuts.share(found) if w.cuts else found
     n.shift.numpy()[node] = organ.mesh.rest - organ.mesh.whole.rest
 
   def _views(self) -> tuple[np.ndarray, np.ndarray]:
@@ -128,8 +132,11 @@ class Phases(coupling.Phases):
     shift = organ.mesh.rest - organ.mesh.whole.rest
     disp, vel = np.zeros((organ.mesh.nvert, 3)), np.zeros((organ.mesh.nvert, 3))
     at, dofs = organ.qposs.reshape(-1, 3), organ.dofs.reshape(-1, 3)
-    disp[organ.free] = qpos[at] - qpos0[at] - shift[organ.free]
-    vel[organ.free] = qvel[dofs]
+    disp[organ.jointed] = qpos[at] - qpos0[at] - shift[organ.jointed]
+    vel[organ.jointed] = qvel[dofs]
+    own = self._nodal.own
+    for values, inside in ((disp, own.disp), (vel, own.vel)):
+      values[organ.inner] = inside.numpy().reshape(-1, 3)
     return disp, vel
 
   def carry(self, changed, disp, vel, group, member, share):

@@ -236,7 +236,7 @@ def _displacement(m, d, w) -> np.ndarray:
   """Returns the displacement of the vertices from rest, in the organ's frame [m], (nvert, 3)."""
   if w.organ.windows:
     return w.boxes["own"].motion.disp.numpy()
-  out = np.zeros((w.organ.mesh.nvert, 3))
+  out = np.zeros((w.organ.mesh.nvert, 3))  # only those on the surface are asked for
   moved = mjstruct.view(d.qpos, m.nq) - mjstruct.view(m.qpos0, m.nq)
-  out[w.organ.free] = moved[w.organ.qposs].reshape(-1, 3)
+  out[w.organ.jointed] = moved[w.organ.qposs].reshape(-1, 3)
   return out

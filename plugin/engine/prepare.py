@@ -32,6 +32,8 @@ def fit(m, organ: Declaration, body: Body):
     mark_compiled(m, organ.flex)
   if organ.windows is None:
     give_armature(m, organ, body, organ.config)
+    if len(organ.mesh.tet):
+      give_weights(m, organ)
     return
   win = organ.windows
   mjstruct.view(m.body_pos, (m.nbody, 3))[win.body] = win.stand
@@ -62,14 +64,27 @@ def give_armature(m, organ: Declaration, body: Body, config: Config):
     return
   mass = inertia.masses(m, organ)
   found = inertia.of_nodes(m, organ, body, config, mass, organ.flex)
-  added = np.repeat((found - mass)[organ.free], 3)
+  theirs, own = mjstruct.view(m.body_mass, m.nbody)[organ.body], organ.jointed
+  total = np.maximum(found, theirs)[own]  # of solids, MuJoCo's mass of a node may be more
+  added = np.repeat(total - theirs[own], 3)
   armature[dofs] = added
   if len(_made_for) >= _KNOWN:
     _made_for.pop(next(iter(_made_for)))
   _made_for[_digest(added)] = of
   # mj_setConst gives the same: M0 has the armature, the inverse weights, which scale the contacts'
   # softness, are those of the masses alone for such dofs.
-  mjstruct.view(m.dof_M0, m.nv)[dofs] = np.repeat(found[organ.free], 3)
+  mjstruct.view(m.dof_M0, m.nv)[dofs] = np.repeat(total, 3)
+
+
+def give_weights(m, organ: Declaration):
+  """Makes contacts with a solid as soft as its nodes' masses, which are not MuJoCo's, have it.
+
+  MuJoCo spreads the mass evenly over the vertices, the nodes inside have their part of it.
+  """
+  own = organ.jointed
+  weight = 1 / organ.mass[own]
+  mjstruct.view(m.body_invweight0, (m.nbody, 2))[organ.body[own], 0] = weight
+  mjstruct.view(m.dof_invweight0, m.nv)[organ.dofs] = np.repeat(weight, 3)
 
 
 def show(m, organ: Declaration, shown: bool):

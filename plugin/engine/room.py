@@ -22,12 +22,14 @@ def state_size(model: int, instance: int) -> int:
   cuts = coupling.cut_sizes(m.nflexelem, m.nflexvert, spare * m.nflexvert)
   cutters = mjstruct.config(model, instance, "cutters").strip()
   cuts |= {"nblade": cutters.count(",") + 1 if cutters else 0}
+  # Asked before MuJoCo has filled in the flexes: what is needed is at most this.
+  solid = mjstruct.config(model, instance, "elements").strip() == "solid"
+  inner = fill.MOST * m.nflexvert if solid else 0
   if names:
-    # Asked before MuJoCo has filled in the flexes: what `windowed` needs is at most this.
-    inside = fill.MOST if mjstruct.config(model, instance, "elements").strip() == "solid" else 0
-    most = (1 + inside) * m.nflexvert
+    most = inner + m.nflexvert
     outer = {"nrest": rests * m.nflexvert, "nbond": bonded * m.nflexvert}
     outer |= {"ncreep": relaxes * most} | cuts
     return windowed.state_size(most, 0, m.ngeom * len(names), **outer)
   moving = len(declare.moving_bodies(m, instance))
-  return nodal.state_size(3 * moving, ncreep=relaxes * moving, nbond=bonded * moving, **cuts)
+  cuts |= {"ncreep": relaxes * (moving + inner), "nbond": bonded * moving}
+  return nodal.state_size(3 * moving, 3 * inner, **cuts)

@@ -257,7 +257,7 @@ def motion(w, vert: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     u, v = own.disp.numpy()[vert], own.vel.numpy()[vert]
   else:
     m, d = mjstruct.Model.from_address(w.model), mjstruct.Data.from_address(w.data)
-    free = organ.free[vert][:, None]
+    free = (organ.dofadr[vert] >= 0)[:, None]
     qpos = np.maximum(organ.qposadr[vert], 0)[:, None] + np.arange(3)
     dofs = np.maximum(organ.dofadr[vert], 0)[:, None] + np.arange(3)
     u = mjstruct.view(d.qpos, m.nq)[qpos] - mjstruct.view(m.qpos0, m.nq)[qpos]

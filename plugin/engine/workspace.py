@@ -160,7 +160,7 @@ class Workspace:
   views: dict = dataclasses.field(default_factory=dict)
   skin: skin.Skin | None = None
   boxes: dict = dataclasses.field(default_factory=dict)
-  phases: Phases | None = None
+  phases: Phases = dataclasses.field(init=False)
 
   def __post_init__(self):
     self.hold, self.ties = Hold(self), Ties(self)
@@ -440,7 +440,7 @@ def refresh(w: Workspace):
   with graphs.lock:
     if w.organ.windows is None:
       prepare.give_armature(m, w.declared, w.body, w.config)
-      w.cuts.spread()
+      w.phases.reshape()
     else:
       windowed.set_inertia(w, m)
       if w.turn is not None and w.turn.mine:

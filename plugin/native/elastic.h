@@ -276,6 +276,19 @@ struct Assembly {
     g, number[STIFFNESS], number[SHEAR], number[LAME], matrix, areas, bends, normal
   };
 
+  // Adds the bending of a fan to the impulse b, and says what the diagonal block has of it.
+  PALPATE S3 bent(const Fan& fan, const Sum& sum, int s, V3& b, Lane lane) const {
+    b = bending(fan, normal, corner, b, lane);
+    // Hinges of squeezed triangles are stiffer than at rest; the normal's length makes up for it.
+    const V scale = vsqrt(sum.squeeze / vmax(dot(sum.area, sum.area), splat(1e-30f)));
+    const V3 n = scale * sum.area;
+    st3(at.normal + 24 * s, n, lane);
+    const size_t own = (size_t)world * f.shape.nslice + s;
+    const float* bend = f.lump.bend_diag.data ? f.lump.bend_diag.data + 8 * own
+                                              : f.tissue.bend_diag.data + mesh + 8 * s;
+    return square(number[PLATE] * g * ld(bend, 0, lane), n);
+  }
+
   PALPATE void row(int s, Lane lane) const {
     const size_t own = (size_t)world * f.shape.nslice + s;
     const Fan fan = fan_of(f, world, at, s, lane);
@@ -289,16 +302,7 @@ struct Assembly {
     S3 self = splat(g) * sum.stiffness + diag;
     if (f.state.hold.data) self = self + hold(f, stage, own, b, lane);
     if (areas) st3(at.areavec + 24 * s, sum.area, lane);
-    if (bends) {
-      b = bending(fan, normal, corner, b, lane);
-      // Hinges of squeezed triangles are stiffer than at rest; the normal's length makes up for it.
-      const V scale = vsqrt(sum.squeeze / vmax(dot(sum.area, sum.area), splat(1e-30f)));
-      const V3 n = scale * sum.area;
-      st3(at.normal + 24 * s, n, lane);
-      const float* bend = f.lump.bend_diag.data ? f.lump.bend_diag.data + 8 * own
-                                                : f.tissue.bend_diag.data + mesh + 8 * s;
-      self = self + square(number[PLATE] * g * ld(bend, 0, lane), n);
-    }
+    if (bends) self = self + bent(fan, sum, s, b, lane);
     st3(at.rhs + 24 * s, b, lane);
     if (!matrix) return;
     const V free = ld(f.shape.free.data + mesh, s, lane);

@@ -1,19 +1,21 @@
-// Nodal coupling: each moving node of an organ has three degrees of freedom of MuJoCo.
+// Nodal coupling: each moving node of an organ has three degrees of freedom of MuJoCo, but for those
+// inside of a solid, whose motion is in the plugin state.
 #pragma once
 #include "formula.h"
 
 namespace palpate {
 
-// The mass of a node: where there may be cuts not MuJoCo's, which is the same in every mjData.
+// The mass of a node: of solids, and where there may be cuts, not MuJoCo's, which is even and the same
+// in every mjData.
 template <class Fields>
 PALPATE double mass_of(const Fields& f, int i) {
-  return f.cuts ? f.weight.data[i] : f.mj.body_mass.data[f.bodyid.data[i]];
+  return f.weighs ? f.weight.data[i] : f.mj.body_mass.data[f.bodyid.data[i]];
 }
 
 // The inertia of dof `k`, less than three, of a node whose dofs start at `adr`.
 template <class Fields>
 PALPATE double inertia(const Fields& f, int i, int adr, int k) {
-  if (f.cuts) return f.inertia.data[i];
+  if (f.weighs) return f.inertia.data[i];
   return f.mj.body_mass.data[f.bodyid.data[i]] + f.mj.dof_armature.data[adr + k];
 }
 
@@ -21,7 +23,28 @@ PALPATE double inertia(const Fields& f, int i, int adr, int k) {
 template <class Fields>
 PALPATE D3 displacement(const Fields& f, int i, int qadr) {
   const D3 u = load(f.mj.qpos.data + qadr) - load(f.mj.qpos0.data + qadr);
-  return f.cuts ? u - load(f.shift.data + 3 * i) : u;
+  return f.weighs ? u - load(f.shift.data + 3 * i) : u;
+}
+
+// Whether a node is inside of a solid, and where its displacement and velocity are then.
+template <class Fields>
+PALPATE bool is_inner(const Fields& f, int i) { return f.stateadr.data[i] >= f.nfree; }
+template <class Fields>
+PALPATE double* inner_disp(const Fields& f, int i) {
+  return f.own.disp.data + f.stateadr.data[i] - f.nfree;
+}
+template <class Fields>
+PALPATE double* inner_vel(const Fields& f, int i) {
+  return f.own.vel.data + f.stateadr.data[i] - f.nfree;
+}
+
+// Gives a node that moves its mass, and to the solver where its changes of velocity lead.
+template <class Fields>
+PALPATE void begin_node(const Fields& f, int i, double mass) {
+  const int own = f.stateadr.data[i];
+  f.solve.mass.data[i] = (float)mass;
+  const D3 next = forecast(load(f.own.last.data + own), load(f.own.before.data + own));
+  store_lane(f.solve.dvel_warm.data + offset_of(i), next);
 }
 
 // Reads MuJoCo's arrays into the solver's state and keeps what acts on the nodes.
@@ -38,20 +61,25 @@ PALPATE void gather_nodes(const Fields& f, Thread, int) {
   double weight = 0.0;
   for (int i = 0; i < f.nnode; ++i) {
     const int at = offset_of(i), adr = f.dofadr.data[i];
-    if (adr < 0) continue;
     const int qadr = f.qposadr.data[i], body = f.bodyid.data[i], own = f.stateadr.data[i];
-    const double m = mass_of(f, i), theirs = mj.body_mass.data[body];
-    solve.mass.data[i] = (float)m;
+    if (own < 0) continue;
+    const double m = mass_of(f, i);
     weight += m;
+    begin_node(f, i, m);
+    if (is_inner(f, i)) {
+      store_lane(solve.force_ext.data + at, m * g);
+      store_lane(solve.disp.data + at, load(inner_disp(f, i)));
+      store_lane(solve.vel.data + at, load(inner_vel(f, i)));
+      continue;
+    }
+    const double theirs = mj.body_mass.data[body];
     const D3 along = theirs * g + load(mj.qfrc_applied.data + adr) + load(mj.qfrc_passive.data + adr);
     const D3 f_ext = external(along, R, mj.xfrc_applied.data + 6 * body);
     const D3 lagged = f_ext + load(f.own.force.data + own);
     store(f.lagged.data + 3 * i, lagged);
-    store_lane(solve.force_ext.data + at, f.cuts ? lagged + (m - theirs) * g : lagged);
+    store_lane(solve.force_ext.data + at, f.weighs ? lagged + (m - theirs) * g : lagged);
     store_lane(solve.disp.data + at, displacement(f, i, qadr));
     store_lane(solve.vel.data + at, load(mj.qvel.data + adr));
-    const D3 next = forecast(load(f.own.last.data + own), load(f.own.before.data + own));
-    store_lane(solve.dvel_warm.data + at, next);
   }
   // Residual floor: with D ~ mass, sqrt(r^T D^-1 r) of this share of the weight's impulse.
   const double rest = f.rest_share * 9.81 * h;
@@ -68,11 +96,11 @@ PALPATE void scatter_nodes(const Fields& f, Thread, int) {
   const double per_h = 1.0 / mj.timestep.data[0], heavy = f.own.heavier.data[0];
   for (int i = 0; i < f.nnode; ++i) {
     const int adr = f.dofadr.data[i], own = f.stateadr.data[i];
-    if (adr < 0) continue;
+    if (adr < 0) continue;  // pinned, inside or padding
     const double gain = heavy > 1.0 && touched(load(f.own.force.data + own)) ? heavy : 1.0;
     const D3 Mhat = {gain * inertia(f, i, adr, 0), gain * inertia(f, i, adr, 1),
                      gain * inertia(f, i, adr, 2)};
-    if (gain > 1.0 || f.cuts) set_inertia(mj, f.massadr.data + 3 * i, adr, Mhat);
+    if (gain > 1.0 || f.weighs) set_inertia(mj, f.massadr.data + 3 * i, adr, Mhat);
     const D3 dv = load_lane(f.solve.dvel.data + offset_of(i));
     const D3 rate = {Mhat.x * dv.x * per_h, Mhat.y * dv.y * per_h, Mhat.z * dv.z * per_h};
     double* out = mj.qfrc_passive.data + adr;
@@ -97,6 +125,21 @@ PALPATE void push_nodes(const Fields& f, Thread, int) {
   f.flags.data[FLAG_CHANGED] = changed;
 }
 
+// Steps the change of velocity that the plugin state keeps of a node, from what this one was.
+template <class Fields>
+PALPATE void shift_last(const Fields& f, int own, D3 dv) {
+  store(f.own.before.data + own, load(f.own.last.data + own));
+  store(f.own.last.data + own, dv);
+}
+
+// Moves a node inside of a solid.
+template <class Fields>
+PALPATE void move_inner(const Fields& f, int i, double h, D3 dv) {
+  const D3 v = load(inner_vel(f, i)) + dv;
+  store(inner_disp(f, i), load(inner_disp(f, i)) + h * v);
+  store(inner_vel(f, i), v);
+}
+
 // Steps the plugin state, and ends the step with the organ's response where there was one: not by
 // what MuJoCo made of the forces, whose solver may have stopped where those that it reports are not
 // quite those that moved the dofs.
@@ -109,26 +152,27 @@ PALPATE void remember_nodes(const Fields& f, Thread, int) {
   Secant secant;
   for (int i = 0; i < f.nnode; ++i) {
     const int at = offset_of(i), adr = f.dofadr.data[i], own = f.stateadr.data[i];
-    if (adr < 0) continue;
-    double* last = f.own.last.data + own;
-    double* force = f.own.force.data + own;
-    const D3 now = load(mj.qfrc_constraint.data + adr), df = now - load(force);
+    if (own < 0) continue;
     D3 dv = {0.0, 0.0, 0.0};
     if (ok) dv = load_lane(f.solve.dvel.data + at);
+    const D3 answer = answered ? load_lane(f.solve.sol.data + at) : D3{0.0, 0.0, 0.0};
+    shift_last(f, own, dv + answer);
+    if (is_inner(f, i)) {
+      move_inner(f, i, h, dv + answer);
+      continue;
+    }
+    double* force = f.own.force.data + own;
+    const D3 now = load(mj.qfrc_constraint.data + adr), df = now - load(force);
     if (answered) {
       const double Mhat = (touched(load(force)) ? heavy : 1.0) * inertia(f, i, adr, 0);
-      const D3 answer = load_lane(f.solve.sol.data + at);
       secant.add(h * df, answer, h * h * dot(df, df) / Mhat, df, norm(now));
-      dv += answer;
-      const D3 v = load_lane(f.solve.vel.data + at) + dv;
+      const D3 v = load_lane(f.solve.vel.data + at) + dv + answer;
       double* qpos = mj.qpos.data + f.qposadr.data[i];
       double* qvel = mj.qvel.data + adr;
       store(qpos, load(qpos) + h * (v - load(qvel)));
       store(qvel, v);
     }
     store(force, now);
-    store(f.own.before.data + own, load(last));
-    store(last, dv);
   }
   if (answered) f.own.heavier.data[0] = secant.heavier(heavy, f.heaviest.data[0]);
   f.flags.data[FLAG_STAGE] = STAGE_ENDED;

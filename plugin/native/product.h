@@ -17,6 +17,8 @@ struct Matrix {
   const int* bend_node;
   const float* bend_gain;
   const float* hold;  // of nodes that springs hold, or null
+  const float* capsule;  // blocks of the skin of a solid, and where they are; or null
+  const int *capsule_adr, *capsule_node;
   float bend;  // (h^2 + h damping) times the scale of the plate, for the bending matrix
   bool bends;  // whether there is one
 
@@ -36,6 +38,8 @@ PALPATE Matrix matrix(const Fields& f, int world) {
     f.lump.bend_gain.data ? f.lump.bend_gain.data + 8 * nbend * world
                           : f.tissue.bend_gain.data + mesh,
     f.state.hold.data ? f.state.hold.data + 48 * base : nullptr,
+    f.shape.ncapsule ? f.system.capsule_block.data + 72 * (size_t)world * f.shape.ncapsule : nullptr,
+    f.shape.capsule_adr.data, f.shape.capsule_node.data,
     f.state.step.data[4 * world + 1] * numbers(f, world)[PLATE], BENDING && f.shape.nhingeslice > 0
   };
 }
@@ -56,6 +60,14 @@ PALPATE V3 product(const Any& a, const Vector& z, V3 own, int s, Lane lane) {
     });
   }
   if (a.hold) out = out + ld6(a.hold + 48 * s, lane) * own;
+  if (a.capsule) {
+    const int row = a.capsule_adr[s], width = a.capsule_adr[s + 1] - row;
+    const float* block = a.capsule + 72 * (size_t)row;
+    z.each_near(a.capsule_node + 8 * (row + 2 * s + 1), width, lane, [&](V3 near) {
+      out = out + ld9(block, lane) * (near - own);
+      block += 72;
+    });
+  }
   if (a.bends) {
     const int row = a.bend_row[s], width = a.bend_row[s + 1] - row;
     const float* gain = a.bend_gain + 8 * row;

@@ -226,6 +226,10 @@ PALPATE void solid_row(const Fields& f, Thread t, int stage) {
     const V zero = splat(0.0f);
     S3 held = {zero, zero, zero, zero, zero, zero};
     if (f.state.hold.data) held = hold(f, stage, at, b, lane);
+    if (f.shape.ncapsule) {  // see `capsule_row`
+      b += ld3(f.system.rhs.data + 24 * at, lane);
+      held = held + ld6(f.system.inverse.data + 48 * at, lane);
+    }
     st3(f.system.rhs.data + 24 * at, b, lane);
     if (!implicit) return;
     S3 self = {zero, zero, zero, zero, zero, zero};

@@ -139,6 +139,8 @@ def _sizes(values: dict[str, Any]) -> dict[str, int]:
     "nmesh": 0,
     "nheld": len(values["held_adr"]),
     "naround": len(values["around_tet"]),
+    "ncapsule": values["ncapsule"],
+    "ncapsuleslice": out["nslice"] if values["ncapsule"] else 0,
     "nedge": len(values["edge_from"]),
     "nbend": len(values["bend_node"]),
     "nbendslice": out["nslice"] if bends else 0,

@@ -54,7 +54,7 @@ class Config:
     "membrane",
     reading.words("membrane", "spring", "solid"),
     "`membrane` (St. Venant-Kirchhoff triangles, plane stress), `spring` (edge springs) or `solid` "
-    "(neo-Hookean tetrahedra inside, made when the model is compiled; with `window` alone)",
+    "(neo-Hookean tetrahedra inside, made when the model is compiled)",
   )
   tetrahedra: str = _row(
     "",
@@ -70,7 +70,17 @@ class Config:
     TISSUE,
   )
   poisson: float = _row(0.45, reading.number(0.0, 0.5), "Poisson's ratio", "-", TISSUE)
-  thickness: float = _row(0.002, reading.POSITIVE, "thickness of membrane and plate", "m", TISSUE)
+  thickness: float = _row(
+    0.002, reading.POSITIVE, "thickness of membrane and plate, also on a solid", "m", TISSUE
+  )
+  capsule_young: tuple[float, ...] = _row(
+    (),
+    (reading.numbers, "a number > 0"),
+    "Young's modulus of the skin on a solid (capsule, serosa): membrane and plate of `thickness`; "
+    "one value, or one for each triangle; none for a bare solid",
+    "Pa",
+    TISSUE,
+  )
   stiffness: float = _row(
     0.0,
     reading.POSITIVE,
@@ -268,7 +278,9 @@ def parse(organ: str, texts: dict[str, str], nelem: int, closed: bool) -> Config
   values = _values(organ, texts, nelem)
   config = Config(**values)
   _check_combination(organ, config, values, closed)
-  return dataclasses.replace(config, bend=0.0) if config.elements == "solid" else config
+  if config.capsule_young and "thickness" not in values:
+    raise ValueError(f"organ {organ!r}: capsule_young is set and thickness is missing [m]")
+  return config
 
 
 def change(
@@ -301,11 +313,12 @@ def change(
     factor = _value(organ, _SCALE, scale, *reading.POSITIVE)
     values["young"] = tuple(factor * young for young in compiled.young)
   changed = dataclasses.replace(config, **values)
-  if bool(changed.relax_share) != bool(compiled.relax_share):
-    raise ValueError(
-      f"organ {organ!r}: relax_share is {changed.relax_share:g}, compiled as "
-      f"{compiled.relax_share:g}: it cannot begin or end while running"
-    )
+  for key in ("relax_share", "capsule_young"):
+    if bool(getattr(changed, key)) != bool(getattr(compiled, key)):
+      raise ValueError(
+        f"organ {organ!r}: {key} is {getattr(changed, key)}, compiled as {getattr(compiled, key)}: "
+        "it cannot begin or end while running"
+      )
   given = values | ({"stiffness": 0} if config.stiffness else {})
   _check_combination(organ, changed, given, closed)
   return changed
@@ -345,10 +358,9 @@ def _check_combination(organ: str, config: Config, given: dict, closed: bool):
       raise ValueError(f"organ {organ!r}: {key} is set, allowed only with window")
   if config.elements == "solid":
     _check_solid(organ, config, given)
-  elif config.tetrahedra:
-    raise ValueError(
-      f"organ {organ!r}: tetrahedra is {config.tetrahedra!r}, allowed only with elements='solid'"
-    )
+  for key in () if config.elements == "solid" else ("tetrahedra", "capsule_young"):
+    if value := getattr(config, key):
+      raise ValueError(f"organ {organ!r}: {key} is {value!r}, allowed only with elements='solid'")
   _check_ties(organ, config)
   _check_spare(organ, config)
   if config.window and "mass" not in given and not config.mass:
@@ -360,19 +372,15 @@ def _check_combination(organ: str, config: Config, given: dict, closed: bool):
 
 
 def _check_solid(organ: str, config: Config, given: dict):
-  if not config.window:
-    raise ValueError(f"organ {organ!r}: elements is 'solid', expected window too (`add_windows`)")
-  for key in ("thickness", "bend", "bulk", "pressure"):
+  other = "where elements is not 'solid'"
+  only = dict.fromkeys(("bulk", "pressure"), f"{other}: poisson says how it keeps its volume")
+  if not config.capsule_young:
+    only |= dict.fromkeys(("thickness", "bend"), "on a solid with capsule_young")
+  for key, where in only.items():
     if given.get(key):
-      raise ValueError(
-        f"organ {organ!r}: {key} is {given[key]:g}, allowed only where elements is not 'solid': "
-        "poisson says how a solid keeps its volume"
-      )
+      raise ValueError(f"organ {organ!r}: {key} is {given[key]:g}, allowed only {where}")
   if not SCHEMES[config.integrator].solids:
-    raise ValueError(
-      f"organ {organ!r}: integrator is {config.integrator!r}, allowed only where elements is not "
-      "'solid'"
-    )
+    raise ValueError(f"organ {organ!r}: integrator is {config.integrator!r}, allowed only {other}")
 
 
 def spare(organ: str, text: str, there: int) -> int:
@@ -389,9 +397,10 @@ def _check_spare(organ: str, config: Config):
     raise ValueError(f"organ {organ!r}: cutters is set, allowed only with spare, or bonds to free")
   if not config.spare:
     return
-  for key, text in (("elements", "solid"), ("carrier", OWN)):
-    if getattr(config, key) == text:
-      raise ValueError(f"organ {organ!r}: {key} is {text!r}, allowed only where spare is 0")
+  refused = {"elements": "solid", "carrier": OWN, "capsule_young": config.capsule_young or None}
+  for key, value in refused.items():
+    if getattr(config, key) == value:
+      raise ValueError(f"organ {organ!r}: {key} is {value!r}, allowed only where spare is 0")
 
 
 def _check_ties(organ: str, config: Config):

@@ -28,6 +28,7 @@ def membrane(mesh: Mesh, config: Config, u: np.ndarray) -> float:
     config: material
     u: displacement from rest [m], (nvert, 3)
   """
+  config = solids.capsule(config)
   if config.elements != "membrane":
     return 0.0
   return float(of_membrane(config, mesh.rest[mesh.elem], u[mesh.elem]).sum())
@@ -106,6 +107,7 @@ def hinge_angles(mesh: Mesh, hinge: plate.Hinges, u: np.ndarray) -> np.ndarray:
 
 def bending(mesh: Mesh, config: Config, u: np.ndarray) -> float:
   """Returns the plate energy of the hinges 1/2 d^T G d [J], d the angles less those at rest."""
+  config = solids.capsule(config)
   if config.bend == 0:
     return 0.0
   hinge = plate.hinges(mesh, configuration.rigidity(config, mesh.nelem), config.poisson)

@@ -87,6 +87,16 @@ class Mesh:
     """Number of vertices on the surface, which come first."""
     return int(self.elem.max()) + 1
 
+  @functools.cached_property
+  def surface(self) -> Mesh:
+    """The surface alone: of a solid with the vertices inside, which have no neighbours then."""
+    if not len(self.tet):
+      return self
+    ring, ring_elem, degree = _rings("solid", self.elem, self.twin, self.nvert)
+    return dataclasses.replace(
+      self, ring=ring, ring_elem=ring_elem, degree=degree, tet=self.tet[:0]
+    )
+
   @property
   def nvert(self) -> int:
     """Number of vertices."""

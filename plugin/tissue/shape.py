@@ -146,7 +146,8 @@ def arrays(
   node[vert[vert >= 0]] = np.flatnonzero(vert >= 0)
   out = {
     **_fans(mesh, config, vert, node),
-    **_bending(mesh, config, node, len(vert) // LANES, bend_width),
+    **_bending(mesh.surface, solid.capsule(config), node, len(vert) // LANES, bend_width),
+    **_capsule(mesh.surface, config, vert, node),
     **(solid.arrays(mesh, config, vert, node) if len(mesh.tet) else solid.none(len(vert) // LANES)),
     "vert": vert.astype(np.int32),
     "node": node.astype(np.int32),
@@ -173,6 +174,7 @@ def counts(values: dict[str, Any]) -> dict[str, int]:
     "ntetslice": len(values["tet_node"]),
     "nedgeslice": len(values["edge_slot"]),
     "nslot": int(values["slot_adr"][-1]),
+    "ncapsule": int(values["capsule_adr"][-1]),
   }
 
 
@@ -201,6 +203,19 @@ def _fans(mesh: Mesh, config: Config, vert: np.ndarray, node: np.ndarray) -> dic
     "degree": to_slices(dense["degree"]),
     "rest": to_slices(dense["rest"]),
   }
+
+
+def _capsule(
+  mesh: Mesh, config: Config, vert: np.ndarray, node: np.ndarray
+) -> dict[str, np.ndarray]:
+  """Returns the fans of the skin of a solid, empty where there is none; `mesh` is its surface."""
+  names = ("node", "rest", "corner", "side", "metric")
+  if config.elements != "solid" or not config.capsule_young:
+    counts = ("ncapsule + 2 ncapsuleslice", "ncapsule + ncapsuleslice", "ncapsuleslice")
+    return {"capsule_adr": np.zeros(1, np.int32)} | empty(counts)
+  fans = _fans(mesh, solid.capsule(config), vert, node)
+  out = {f"capsule_{name}": fans[f"fan_{name}"] for name in names}
+  return out | {"capsule_adr": fans["slot_adr"], "capsule_degree": fans["degree"]}
 
 
 def _bending(

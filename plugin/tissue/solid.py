@@ -23,6 +23,15 @@ _OWN_POISSON = 0.3
 _WINDOW = 8 * LANES  # edges that are sorted by the number of their tetrahedra
 
 
+def capsule(config: Config) -> Config:
+  """Returns the configuration of an organ's triangles: of a solid those of its skin, if any."""
+  if config.elements != "solid":
+    return config
+  if not config.capsule_young:
+    return dataclasses.replace(config, bend=0.0)
+  return dataclasses.replace(config, elements="membrane", young=config.capsule_young)
+
+
 def gradients(mesh: Mesh) -> np.ndarray:
   """Returns the gradient of each corner's share at rest [1/m], (ntet, 4, 3)."""
   corner = mesh.rest[mesh.tet]

@@ -83,6 +83,7 @@ _node_pressure = _solid("node_pressure")
 _tet_stress = _solid("tet_stress")
 _edge_block = _solid("edge_block")
 _solid_row = _solid("solid_row")
+_capsule_row = kernel("capsule_row", "capsule.h", Fields, CONSTANTS)
 _edge_change = _scheme("edge_change")
 _predict = _scheme("predict")
 _stay = _scheme("stay")
@@ -121,6 +122,7 @@ def kernels(body: Body) -> list[Kernel]:
   if body.plan:
     return [_world_step(body.plan)]
   found = [_solid_row if body.is_solid else _row, _predict, _solve]
+  found += [_hinge_moment, _capsule_row] if body.shape.ncapsule else []
   return found if body.levels is None else [*found, _sample]
 
 
@@ -157,18 +159,20 @@ def assemble(body: Body, stage: Stage):
     stage: what the right-hand side is for
   """
   shape = body.shape
+  if body.has_bending:
+    _hinge_angles(body, stage)
+    _over(_hinge_moment, body, shape.nhingeslice)
+    _over(_elem_corner, body, shape.nelemslice)
   if body.is_solid:
     _over(_tet_strain, body, shape.ntetslice, stage)
     _over(_node_pressure, body, shape.nslice)
     _over(_tet_stress, body, shape.ntetslice, stage)
     if stage in (Stage.FIRST, Stage.LATER):
       _over(_edge_block, body, shape.nedgeslice)
+    if shape.ncapsule:
+      _over(_capsule_row, body, shape.nslice, stage)
     _over(_solid_row, body, shape.nslice, stage)
     return
-  if body.has_bending:
-    _hinge_angles(body, stage)
-    _over(_hinge_moment, body, shape.nhingeslice)
-    _over(_elem_corner, body, shape.nelemslice)
   _over(_row, body, shape.nslice, stage)
   if body.levels is not None and stage in (Stage.FIRST, Stage.LATER):
     coarse = body.levels.body

@@ -151,6 +151,13 @@ class Shape:
   edge_from: ints("nedge", 8)  # of each tetrahedron around an edge, its corner at the first end
   edge_to: ints("nedge", 8)  # its corner at the other
   edge_slot: ints("nedgeslice", 2, 8)  # where the blocks of both ends start; -1 for padding
+  ncapsule: int  # rows of blocks of the skin of a solid, 0 without one; its fans are as those above
+  capsule_adr: ints("ncapsuleslice + 1")  # first row of these
+  capsule_node: ints("ncapsule + 2 ncapsuleslice", 8)  # see `fan_node`
+  capsule_rest: floats("ncapsule + 2 ncapsuleslice", 3, 8)  # see `fan_rest`
+  capsule_corner: ints("ncapsule + ncapsuleslice", 8)  # see `fan_corner`
+  capsule_side: ints("ncapsule + ncapsuleslice", 8)  # see `fan_side`
+  capsule_degree: floats("ncapsuleslice", 8)  # number of neighbours on the surface
 
 
 @struct
@@ -165,6 +172,7 @@ class Tissue:
   bend_diag: floats("nbendslice", 8)  # its diagonal [N/m]
   tet_moduli: floats("ntetslice", 4, 8)  # volume [m^3]; mu, lambda, its averaged part [Pa]
   pressure_gain: floats("nsolidslice", 8)  # averaged part of lambda over a node's volume [Pa/m^3]
+  capsule_metric: floats("ncapsule + ncapsuleslice", 5, 8)  # see `fan_metric`
 
 
 @struct
@@ -206,6 +214,7 @@ class System:
   node_pressure: floats("nworld", "nsolidslice", 8)  # averaged pressure impulse [Pa s]
   tet_impulse: floats("nworld", "ntetslice", 16, 8)  # impulse on each corner [N s]
   tet_arm: floats("nworld", "ntetslice", 16, 8)  # turned gradient of each corner [kg^(1/2)], moduli
+  capsule_block: floats("nworld", "ncapsule", 9, 8)  # off-diagonal blocks of a solid's skin [kg]
   total: floats("nworld", 2)  # volume difference [m^3], areavec . vel
   sol: vector  # PCG solution [m/s]
   r: vector  # PCG residual

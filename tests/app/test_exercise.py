@@ -74,21 +74,16 @@ def test_exercise_writes_recording_metrics_and_report(tmp_path, capsys):
   assert cli.main(["exercise", "nothing"]) == 2
 
 
-def test_a_report_has_a_film_on_request(tmp_path, capsys):
+def test_films(tmp_path, capsys):
+  """One of an episode as it goes, and one in its report on request."""
   pytest.importorskip("imageio_ffmpeg")
-  assert cli.main([*EASY, "--out", "a"]) == 0
+  words = ["exercise", "touch/easy", "--set", "time_limit=0.4", "--no-report", "--out", "a"]
+  assert cli.main([*words, "--film", "a.gif"]) == 0
+  assert (tmp_path / "a.gif").read_bytes()[:3] == b"GIF"
   assert cli.main(["report", "a/recording.npz", "--film"]) == 0
   page = (tmp_path / "a" / "report.html").read_text()
   data = re.search(r"<video [^>]*src='data:video/mp4;base64,([^']*)'", page)[1]
   assert base64.b64decode(data)[4:8] == b"ftyp"
-
-
-def test_film(tmp_path):
-  pytest.importorskip("imageio")
-  out = tmp_path / "a.gif"
-  words = ["exercise", "touch/easy", "-o", str(tmp_path), "--no-report", "--film", str(out)]
-  assert cli.main(words) == 0
-  assert out.read_bytes()[:3] == b"GIF"
 
 
 def test_a_replay_leaves_the_recording_alone(tmp_path, capsys):

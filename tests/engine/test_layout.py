@@ -5,10 +5,11 @@ import itertools
 import mujoco
 import palpate
 import pytest
-from palpate.engine import layout
+from palpate.engine import coupling, layout
 from scenes import probed
 
-SIZES = {"nfree": 21, "nvert": 9, "nslot": 5, "nwindow": 2, "ngeom": 3, "most": 7}
+SIZES = {"nfree": 21, "ninner": 6, "nmoving": 27}
+SIZES |= {"nvert": 9, "nslot": 5, "nwindow": 2, "ngeom": 3, "most": 7}
 SIZES |= {"ncreep": 4, "nrest": 6, "nbond": 3, "nblade": 2}
 SIZES |= {"ncorner": 8, "nplace": 10, "nspare": 2, "ncuts": 1}
 BLOCKS = (layout.NodalState, layout.WindowState, layout.Inbox, layout.Outbox)
@@ -35,7 +36,8 @@ def test_numbers_have_a_name_a_unit_and_a_meaning(table):
 def test_the_plugin_state_has_room_for_its_table(window):
   m = mujoco.MjModel.from_xml_string(probed(window=window))
   organ = palpate.Organ(m, mujoco.MjData(m), "organ")
-  sizes = {"nvert": organ.nvert, "nfree": 3 * organ.nvert, "nslot": 54, "ngeom": 1}
+  sizes = coupling.nodal_sizes(3 * organ.nvert, 0)
+  sizes |= {"nvert": organ.nvert, "nslot": 54, "ngeom": 1}
   sizes |= layout.NO_CUTS | {"ncreep": 0, "nrest": 0, "nbond": 0}
   needed = layout.size(layout.WindowState if window else layout.NodalState, sizes)
   # It is asked for before the windows are known.

@@ -9,21 +9,57 @@ WEIGHT = 0.05 * 9.81
 KEYS = {"elements": "solid", "young": 2e4, "poisson": 0.45, "damping": 0.01, "tolerance": 1e-6}
 
 
-def _resting(scenes, **keys):
+both = pytest.mark.parametrize("window", [True, False], ids=["window", "nodal"])
+
+
+def _resting(scenes, window=True, extra="", **keys):
   """Returns a block, held below, with a ball above that falls onto it."""
   points, elem = scenes.box((0.06, 0.06, 0.03), 0.006)
-  pin = " ".join(map(str, np.flatnonzero(points[:, 2] < -0.0149)))
-  block = scenes.windowed(points, elem, count="12 12 1", **{"pin": pin, "mass": 0.1} | KEYS | keys)
-  return scenes.world(block + scenes.ball(0.0265, radius=0.01), gravity=(0, 0, -9.81))
+  pin, keys = np.flatnonzero(points[:, 2] < -0.0149), KEYS | keys
+  if window:
+    keys |= {"mass": 0.1, "pin": " ".join(map(str, pin)), "count": "12 12 1"}
+    block = scenes.windowed(points, elem, **keys)
+  else:
+    block = scenes.organ(points, elem, mass=0.1, pin=pin, **keys)
+  ball = scenes.ball(0.0265, radius=0.01)
+  return scenes.world(block + ball, gravity=(0, 0, -9.81), extra=extra)
 
 
-def test_a_resting_ball_is_carried_exactly(scenes, device):
+@both
+def test_a_resting_ball_is_carried_exactly(scenes, device, window):
   # The window hangs in the air, so that gravity acts on the organ and the ball.
-  model, data, organ = scenes.load(_resting(scenes, device=device))
+  model, data, organ = scenes.load(_resting(scenes, window, device=device))
   scenes.run(model, data, 1500)
   assert organ.force[2] == pytest.approx(-WEIGHT, rel=2e-3)
   assert np.abs(organ.xvel).max() < 1e-3 and organ.error is None
   assert 5e-4 < np.abs(organ.displacement).max() < 5e-3
+
+
+DRIVE = '<actuator><position joint="z" kp="500" kv="10"/></actuator>'
+
+
+SKIN = {"capsule_young": 1e5, "thickness": 3e-4}
+
+
+@pytest.mark.parametrize(
+  "stiff", [SKIN, {"young": 3e5, "damping": 0.002}], ids=["soft, with a skin", "stiff"]
+)
+def test_force_is_the_same_with_and_without_windows(scenes, stiff):
+  forces, places = [], []
+  for window in (True, False):
+    model, data, organ = scenes.load(_resting(scenes, window, DRIVE, **stiff))
+    force = []
+    for _ in range(150):
+      data.ctrl[0] = -min(0.05 * data.time, 0.004)
+      mujoco.mj_step(model, data)
+      force.append(organ.force[2])
+    assert organ.error is None
+    forces.append(force)
+    places.append(organ.xpos)
+  peak = np.abs(forces[0]).max()
+  assert peak > 0.1
+  np.testing.assert_allclose(*forces, atol=0.005 * peak)
+  np.testing.assert_allclose(*places, atol=1e-6)
 
 
 def test_force_of_an_indentation_is_that_of_hertz_on_a_layer(scenes):
@@ -48,9 +84,10 @@ def test_force_of_an_indentation_is_that_of_hertz_on_a_layer(scenes):
   assert 1.0 < np.linalg.norm(organ.force) / (hertz * layer) < 1.5
 
 
-def test_a_solid_that_nothing_holds_falls_freely(scenes):
+@both
+def test_a_solid_that_nothing_holds_falls_freely(scenes, window):
   points, elem = scenes.sphere(2)
-  organ = scenes.windowed(points, elem, **KEYS | {"mass": 0.5})
+  organ = (scenes.windowed if window else scenes.organ)(points, elem, **KEYS | {"mass": 0.5})
   far = scenes.ball(1.0)
   model, data, organ = scenes.load(scenes.world(organ + far, gravity=(0, 0, -9.81), h=1e-3))
   scenes.run(model, data, 100)
@@ -58,22 +95,30 @@ def test_a_solid_that_nothing_holds_falls_freely(scenes):
   assert organ.energy < 1e-9
 
 
-def test_a_saved_state_goes_on_to_the_bit(scenes):
-  model, data, organ = scenes.load(_resting(scenes))
+@both
+def test_a_saved_state_goes_on_to_the_bit(scenes, window):
+  model, data, organ = scenes.load(_resting(scenes, window))
   scenes.run(model, data, 60)
-  kind = mujoco.mjtState.mjSTATE_FULLPHYSICS
+  kind = mujoco.mjtState.mjSTATE_INTEGRATION
   state = np.zeros(mujoco.mj_stateSize(model, kind))
   mujoco.mj_getState(model, data, state, kind)
+  copied = mujoco.MjData(model)
+  mujoco.mj_copyData(copied, model, data)
   scenes.run(model, data, 40)
   expected = organ.xpos
   other = mujoco.MjData(model)
   mujoco.mj_setState(model, other, state, kind)
-  scenes.run(model, other, 40)
-  np.testing.assert_array_equal(palpate.Organ(model, other, "organ").xpos, expected)
+  for again in (other, copied):
+    scenes.run(model, again, 40)
+    np.testing.assert_array_equal(palpate.Organ(model, again, "organ").xpos, expected)
+  mujoco.mj_resetData(model, data)
+  scenes.run(model, data, 100)
+  np.testing.assert_array_equal(organ.xpos, expected)
 
 
-def test_what_a_user_sees_is_the_surface(scenes):
-  organ = scenes.load(_resting(scenes))[2]
+@both
+def test_what_a_user_sees_is_the_surface(scenes, window):
+  organ = scenes.load(_resting(scenes, window))[2]
   assert organ.nvert == len(organ.xpos) == len(organ.free) == len(organ.contact_force)
   moved = organ.xpos0 + np.array([0.0, 0.0, 0.001])
   organ.set_state(moved)
@@ -87,8 +132,9 @@ def test_what_a_user_sees_is_the_surface(scenes):
 @pytest.mark.parametrize(
   ("keys", "message"),
   [
-    ({"thickness": 0.003}, "thickness is 0.003, allowed only where elements is not 'solid'"),
-    ({"bend": 2}, "bend is 2, allowed only"),
+    ({"thickness": 0.003}, "thickness is 0.003, allowed only on a solid with capsule_young"),
+    ({"bend": 2}, "bend is 2, allowed only on a solid with capsule_young"),
+    ({"capsule_young": 1e5}, "capsule_young is set and thickness is missing"),
     ({"bulk": 1e4}, "bulk is 10000, allowed only"),
     ({"pressure": 100}, "pressure is 100, allowed only"),
     ({"integrator": "neumann"}, "integrator is 'neumann', allowed only"),
@@ -100,18 +146,27 @@ def test_what_a_solid_has_not_is_refused(scenes, keys, message):
     scenes.load(_resting(scenes, **keys))
 
 
+def test_a_skin_may_change_but_not_begin_while_running(scenes):
+  forces = []
+  for skin in (SKIN, SKIN | {"capsule_young": 5e5}):
+    organ = scenes.load(_resting(scenes, **SKIN))[2]
+    organ.configure(**skin)
+    scenes.run(organ.model, organ.data, 200)
+    forces.append(-organ.xpos[organ.contact_force[:, 2] < 0, 2].mean())
+  assert forces[1] < forces[0]  # the ball sinks in less far
+  organ = scenes.load(_resting(scenes))[2]
+  with pytest.raises(ValueError, match=r"capsule_young is .*: it cannot begin or end"):
+    organ.configure(**SKIN)
+
+
 def test_a_file_of_tetrahedra_is_for_solids(scenes):
   with pytest.raises(ValueError, match="tetrahedra is 'a': No such file"):
     scenes.load(_resting(scenes, tetrahedra="a"))
   points, elem = scenes.sphere(1)
   with pytest.raises(ValueError, match="tetrahedra is 'a', allowed only with elements='solid'"):
     scenes.load(scenes.world(scenes.organ(points, elem, tetrahedra="a")))
-
-
-def test_a_solid_needs_windows(scenes):
-  points, elem = scenes.sphere(1)
-  with pytest.raises(ValueError, match="elements is 'solid', expected window too"):
-    scenes.load(scenes.world(scenes.organ(points, elem, **KEYS)))
+  with pytest.raises(ValueError, match=r"capsule_young is .*, allowed only with elements='solid'"):
+    scenes.load(scenes.world(scenes.organ(points, elem, **SKIN)))
 
 
 def test_a_solid_that_is_open_is_refused(scenes):

@@ -191,7 +191,7 @@ def test_dm_control_physics_copies_and_resets(scenes):
 def test_deleted_data_and_models_leave_no_workspace(scenes):
   gc.collect()
   before = engine.count()
-  for _ in range(5):
+  for _ in range(2):
     model = mujoco.MjModel.from_xml_string(scenes.press(subdivisions=1))
     datas = [mujoco.MjData(model) for _ in range(3)]
     mujoco.mj_step(model, datas[0])

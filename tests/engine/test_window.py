@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import palpate
 import pytest
-from palpate.engine import layout
+from palpate.engine import coupling, layout
 from scenes import RADIUS, drive, load, lump, organ, probed, sphere, windowed, world
 
 
@@ -116,7 +116,8 @@ def test_two_steps_back_tell_where_the_solve_starts(window):
     if window:
       where = layout.spans(layout.Motion, {"nvert": organ.nvert})
     else:
-      sizes = layout.NO_CUTS | {"nfree": 3 * organ.nvert, "ncreep": 0, "nbond": 0}
+      sizes = layout.NO_CUTS | coupling.nodal_sizes(3 * organ.nvert, 0)
+      sizes |= {"ncreep": 0, "nbond": 0}
       where = layout.spans(layout.NodalState, sizes)
     before = where["before"]
     forces.append([])

@@ -9,7 +9,7 @@ import sys
 import pytest
 from fuzz import apart
 
-SHORT = {"configurations": 40, "meshes": 40, "files": 20}
+SHORT = {"configurations": 40, "meshes": 40, "files": 12}
 LONG = 10_000
 
 

@@ -24,9 +24,9 @@ def settled(mesh, body, force, steps=20) -> np.ndarray:
   return u
 
 
-def solid(points, elem, poisson, pin=(), device="cpu"):
-  """Returns mesh and body of a solid."""
-  made = {"elements": "solid", "poisson": poisson, "young": (YOUNG,), "device": device}
+def solid(points, elem, poisson, pin=(), device="cpu", **skin):
+  """Returns mesh and body of a solid; `skin` are the keys of one on its surface."""
+  made = skin | {"elements": "solid", "poisson": poisson, "young": (YOUNG,), "device": device}
   mesh, _, body = scenes.kernels(points, elem, pin=pin, tolerance=1e-5, iterations=2000, **made)
   return mesh, body
 
@@ -41,15 +41,24 @@ def end_share(mesh, x: float) -> np.ndarray:
   return share / share.sum()
 
 
-def bar(poisson: float, spacing: float = 0.02, device="cpu") -> tuple[float, float, float]:
-  """Returns the strain of a bar that is pulled at both ends, F / (E A), and Poisson's ratio."""
-  mesh, body = solid(*scenes.box((LENGTH, SIDE, SIDE), spacing), poisson, device=device)
+def bar(
+  poisson: float, spacing: float = 0.02, device="cpu", **skin
+) -> tuple[float, float, float]:
+  """Returns the strain of a bar that is pulled at both ends, F / (E A), and Poisson's ratio.
+
+  With a skin that is F / (E A + E' t U), U the bar's girth: both have the same Poisson's ratio.
+  """
+  made = scenes.box((LENGTH, SIDE, SIDE), spacing)
+  mesh, body = solid(*made, poisson, device=device, **skin)
   pull, force = 0.02, np.zeros((mesh.nvert, 3))
   for sign in (-1, 1):  # so that nothing hinders it from getting thinner
     force[:, 0] += sign * pull * end_share(mesh, sign * LENGTH / 2)
   u = settled(mesh, body, force)
   stretch, thinner = (float(np.polyfit(mesh.rest[:, k], u[:, k], 1)[0]) for k in (0, 1))
-  return stretch, pull / (YOUNG * SIDE**2), -thinner / stretch
+  stiffness = YOUNG * SIDE**2
+  if skin:
+    stiffness += skin["capsule_young"][0] * skin["thickness"] * 4 * SIDE
+  return stretch, pull / stiffness, -thinner / stretch
 
 
 def cantilever(poisson: float, spacing: float) -> tuple[float, float]:

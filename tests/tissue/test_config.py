@@ -13,6 +13,7 @@ REFUSED = [
   ("young", "-1", "a number > 0"),
   ("young", "nan", "a number > 0"),
   ("young", "0", "a number > 0"),
+  ("capsule_young", "0", "a number > 0"),
   ("young", "1 2", "1 or 4"),
   ("young", "1 2 nan 4", "has nan for element 2"),
   ("young", "1_0", "a number > 0"),

@@ -33,6 +33,37 @@ def test_a_bar_in_tension_has_its_young(device, poisson):
   assert ratio == pytest.approx(poisson, abs=0.01)
 
 
+SKIN = {"capsule_young": (1e5,), "thickness": 5e-4, "bend": 1.0}
+
+
+def test_a_bar_with_a_skin_has_the_stiffness_of_both(device):
+  stretch, theory, ratio = closed.bar(0.3, 0.01, device=device, **SKIN)
+  assert stretch == pytest.approx(theory, rel=0.01)  # of which the skin has half
+  assert ratio == pytest.approx(0.3, abs=0.03)  # the skin of the ends is not pulled
+
+
+def test_a_solid_with_a_skin_has_the_force_of_its_energy(scenes, device):
+  points, elem = scenes.box((0.06, 0.05, 0.04), 0.01)
+  made = {"elements": "solid", "poisson": 0.4, "young": (1e4,), "device": device} | SKIN
+  mesh, config, body = scenes.kernels(points, elem, damping=0.0, **made)
+  random = np.random.RandomState(0)
+  u, way = 1e-3 * random.uniform(-1, 1, (2, *mesh.rest.shape))
+  force = scenes.force(body, u)
+  parts = [energy.total(mesh, config, u + step * way) for step in (1e-3, -1e-3)]
+  assert (force * way).sum() == pytest.approx((parts[1] - parts[0]) / 2e-3, rel=1e-5)
+  assert energy.membrane(mesh, config, u) > 0.1 * energy.solid(mesh, config, u)
+  assert energy.bending(mesh, config, u) > 0
+  np.testing.assert_allclose(force.sum(axis=0), 0.0, atol=1e-5 * np.abs(force).max())
+  np.testing.assert_allclose(np.cross(mesh.rest + u, force).sum(axis=0), 0.0, atol=1e-6)
+  assert np.abs(scenes.force(body, 0 * u)).max() == 0
+  # The matrix is the skin's too: where it has all the stiffness, a step has the force at its end.
+  body = scenes.kernels(points, elem, damping=0.0, **made | {"young": (10.0,)})[2]
+  h, u = 1e-3, 0.01 * u
+  step = scenes.step(body, h, u, mass=1e-3)
+  again = scenes.step(body, h, u + h * step, mass=1e-3, beta=-h)
+  np.testing.assert_allclose(step, again, atol=0.01 * np.abs(step).max())
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("poisson", [0.3, 0.49])
 def test_a_cantilever_bends_more_like_a_beam_the_finer_it_is(poisson):
@@ -58,11 +89,13 @@ def test_equal_tension_everywhere_swells_by_the_bulk_modulus(scenes, device):
 
 
 @pytest.mark.parametrize("start", ["squeezed", "turned inside out", "random"])
-@pytest.mark.parametrize("poisson", [0.3, 0.45, 0.49])
+@pytest.mark.parametrize(
+  ("poisson", "skin"), [(0.3, {}), (0.45, {}), (0.49, {}), (0.45, SKIN)], ids=str
+)
 @pytest.mark.parametrize("h", [1e-3, 5e-3])
-def test_a_crushed_solid_does_not_gain_energy(scenes, start, poisson, h):
+def test_a_crushed_solid_does_not_gain_energy(scenes, start, poisson, skin, h):
   points, elem = scenes.sphere(2)
-  made = {"elements": "solid", "poisson": poisson, "young": (YOUNG,)}
+  made = {"elements": "solid", "poisson": poisson, "young": (YOUNG,)} | skin
   mesh, config, body = scenes.kernels(points, elem, damping=0.002, **made)
   size, random = 0.05, np.random.RandomState(0)
   u = {

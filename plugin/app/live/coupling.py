@@ -121,6 +121,7 @@ class Link:
     message: the last fault, for people
     row: place [m] and orientation of the anchor  (7,)
     jaw: opening of the jaws [-]
+    grip: whether the button that closes jaws, or switches a current on, is held
     report: whether a place is reported now
     force: last force sent [N], in the device's axes
     energy: what the hand has given, less what it got, and what it is lent at the start [J]
@@ -139,7 +140,8 @@ class Link:
     self.guard = Guard(device)
     self.force: Three = STILL
     self.state, self.message = "waiting", ""
-    self.row, self.jaw, self.report, self.paused = [0.0] * 3 + list(_SAME), 1.0, False, False
+    self.row, self.jaw, self.paused = [0.0] * 3 + list(_SAME), 1.0, False
+    self.grip = self.report = False
     self.energy, self._asked = _LENT, False
     self._place, self._turn = Track(h), Track(h)
     self._heard, self._tried, self._gain = 0.0, 0.0, 0.0
@@ -236,7 +238,7 @@ class Link:
     pos, quat, roll, jaw, buttons = reading
     asks, self._asked = not self._asked, "pause" in buttons
     self.paused ^= asks and self._asked
-    self.report = "report" in buttons
+    self.grip, self.report = "grip" in buttons, "report" in buttons
     if jaw is not None:
       self.jaw = min(max(jaw, -1.0), 1.0)
     elif buttons or self.jaw != 1.0:

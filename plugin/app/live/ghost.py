@@ -24,10 +24,11 @@ def trace(task: str, seed: int, kwargs: dict[str, Any]) -> dict[str, Any]:
 
   env = suite.load(*suite.split(task), task_kwargs={"random": 0, **kwargs})
   made = episode.run(env, performer.make(env, seed=seed), seed, {"task_kwargs": kwargs})
-  tips, quats = made.columns["tip_pos"][::_EVERY], made.columns["quat"][::_EVERY]
+  tips, quats = made.column("tip_pos", 0), made.column("quat", 0)  # of the main hand
+  assert tips is not None and quats is not None
   pose = [
-    [round(float(x), 5) for x in (*tip.ravel(), *quat.ravel())]
-    for tip, quat in zip(tips, quats, strict=True)
+    [round(float(x), 5) for x in (*tip, *quat)]
+    for tip, quat in zip(tips[::_EVERY], quats[::_EVERY], strict=True)
   ]
   time = [round(float(t), 3) for t in made.time[::_EVERY]]
   return {"time": time, "pose": pose, "outcome": made.outcome}

@@ -20,10 +20,10 @@ def offer(device: str) -> dict[str, Any]:
   from palpate import models
   from palpate.tasks import suite
 
-  single = [pair for pair in suite.ALL_TASKS if pair not in suite.BIMANUAL]
   return {
     "type": "menu",
-    "tasks": {f"{d}/{t}": suite.summary(d, t) for d, t in single},
+    "tasks": {f"{d}/{t}": suite.summary(d, t) for d, t in suite.ALL_TASKS},
+    "two": ["/".join(pair) for pair in suite.BIMANUAL],
     "nodes": NODES,
     "speeds": SPEEDS,
     "device": device,
@@ -58,7 +58,7 @@ def meshes() -> tuple[str, ...]:
   return (*(f"{n} nodes" for n in models.RESOLUTIONS), *(f"{n} x {n}" for n in models.GRIDS))
 
 
-def exercise(message: dict[str, Any]) -> dict[str, Any]:
+def exercise(message: dict[str, Any], device: str) -> dict[str, Any]:
   """Returns the exercise that a message asks for; ValueError names what is wrong with it."""
   from palpate.tasks import suite
 
@@ -72,14 +72,18 @@ def exercise(message: dict[str, Any]) -> dict[str, Any]:
   if type(seed) is not int or not 0 <= seed < 2**31:
     raise ValueError(f"seed is {seed!r}, expected a whole number in [0, 2^31)")
   pair = suite.split(task)
-  if pair in suite.BIMANUAL:
-    raise ValueError(f"task is {task!r}, which takes two hands, expected one for a single hand")
+  left = choice("left", message.get("left", ""), lefts(device)) if pair in suite.BIMANUAL else None
+  if left == "":
+    raise ValueError(
+      f"task is {task!r}, which takes two hands, left is '', expected one of {lefts(device)[1:]}"
+    )
   return _common(message) | {
     "type": "start",
     "task": "/".join(pair),
     "person": person.strip(),
     "seed": seed,
     "nodes": choice("nodes", message.get("nodes"), (None, *NODES)),
+    "left": left or "",
     "assessment": message.get("assessment") is True,
   }
 

@@ -20,6 +20,7 @@ try {
   $("welcome").textContent = `${error.message}: try another browser, or switch on its hardware acceleration`;
   throw error;
 }
+let two = [];  // exercises for two hands
 let scene = null, frame = null, head = {}, rest = null, running = false, paused = false, sound = null;
 let fresh = false, drawn = "", echoed = 0, before = null, trace = null, trouble = "", warned = "", late = null;
 let turn = 0, told = 0, came = 0, shown = 0;
@@ -78,6 +79,8 @@ const HEAR = {
     if (menu.devices.includes(menu.device)) $("device").value = menu.device;
     const wanted = new URLSearchParams(location.hash.slice(1)).get("task");
     if (wanted in menu.tasks) $("task").value = wanted;
+    two = menu.two;
+    hands();
     $("start").disabled = false;
     document.body.dataset.device = menu.device;
   },
@@ -158,6 +161,14 @@ function mode(name) {
   for (const each of ["exercise", "practice"]) $(`tab-${each}`).setAttribute("aria-selected", each === name);
   $("welcome").textContent = name === "practice" ? "Choose an organ and press Start; everything may be changed while it runs."
     : "Choose an exercise and press Start.";
+  hands();
+}
+
+// An exercise for two hands asks for the other one's device: the keys, where nothing is chosen.
+function hands() {
+  const both = !practice() && two.includes($("task").value);
+  $("other").hidden = !practice() && !both;
+  if (both && !$("left").value) $("left").value = "keyboard";
 }
 
 function run(on) {
@@ -190,9 +201,9 @@ function start() {
       instrument: $("instrument").value, step: Number($("step").value), ...common,
     });
   } else {
-    hand.left = "";
+    hand.left = two.includes($("task").value) ? $("left").value : "";
     say({
-      type: "start", task: $("task").value, seed: Number($("seed").value), person: $("person").value,
+      type: "start", task: $("task").value, left: hand.left, seed: Number($("seed").value), person: $("person").value,
       nodes: $("nodes").value ? Number($("nodes").value) : null, assessment: $("assessment").checked, ...common,
     });
   }
@@ -323,6 +334,7 @@ toggle("ghost", on => {
 });
 for (const name of ["exercise", "practice"]) $(`tab-${name}`).onclick = () => mode(name);
 $("start").onclick = start;
+$("task").onchange = hands;
 $("stop").onclick = () => say({type: "stop"});
 $("pause").onclick = () => {
   paused = !paused;

@@ -1,8 +1,9 @@
-"""One exercise by hand: the loop, its recording, and what pictures are drawn of."""
+"""One exercise by hand, or by two: the loop, its recording, and what pictures are drawn of."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import functools
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,10 +18,16 @@ from .loop import axes, tick
 from .pace import Pace, punctual
 
 _FPS = 30  # of what is published
+# What a hand says for each of the components that do not move its instrument as a whole.
+_SAYS: dict[str, Callable[[Link], float]] = {
+  "jaw": lambda link: link.jaw,
+  "report": lambda link: float(link.report),
+  "current": lambda link: 1.0 if link.grip else -1.0,
+}
 
 
 class Session:
-  """An exercise that a person does with a device.
+  """An exercise that a person does with a device, or with one in each hand.
 
   `run` owns the simulation in the thread that calls it. Others may use `pace` to pause, slow down
   and stop it, and read `link.state` and `link.message`.
@@ -28,7 +35,7 @@ class Session:
   Attributes:
     env: of the suite, with `input="handle"`
     pace: of the loop
-    link: between device and instrument
+    links: between devices and instruments, the main one first
     faults: what went wrong on the way, for people
   """
 
@@ -42,12 +49,13 @@ class Session:
     pace: Pace | None = None,
     coach: Any = None,
     publish: Callable[[Session], None] | None = None,
+    other: Device | None = None,
   ):
     """Prepares the exercise.
 
     Args:
       env: of the suite, with `input="handle"`
-      device: of the hand
+      device: of the hand, where there are two of the one that has the main instrument
       seed: of the episode
       info: further entries of the recording; with `task_kwargs` it can be replayed
       options: of the coupling
@@ -55,18 +63,26 @@ class Session:
       coach: looks on after every control step, see `coach.Coach`
       publish: called before the first step, and then 30 times a second, in the loop's thread: to
         copy what pictures need, no more
+      other: device of the other hand, where the exercise has two
     """
     if not env.task.scene.handle:
       raise ValueError(f"{env.task.name}: input is 'drives', expected 'handle' for a device")
-    if env.task.second:
-      raise ValueError(f"{env.task.name}: it takes two hands, expected one for a single device")
+    if bool(env.task.second) != (other is not None):
+      hands = "two hands, expected another" if env.task.second else "one hand, expected no other"
+      raise ValueError(f"{env.task.name}: it takes {hands} device")
     self.env, self.seed, self.coach = env, seed, coach
     self.pace = pace or Pace(env.physics.timestep())
-    self.link = Link(device, options, env.physics.timestep())
+    h = env.physics.timestep()
+    self.links = [Link(each, options, h) for each in (device, other) if each is not None]
     self.faults: list[str] = []
     self._info, self._publish = dict(info or {}), publish
     self._rows = np.zeros((episode.substeps(env), len(env.task.components)))
     self._due = 0.0
+
+  @property
+  def link(self) -> Link:
+    """Between the main device and its instrument."""
+    return self.links[0]
 
   def run(
     self, realtime: bool = False, watch: Callable[[Any], Any] | None = None
@@ -78,57 +94,69 @@ class Session:
       watch: called with the environment after every control step; a true result ends the exercise
     """
     self._look = watch
-    device = self.link.device
-    info = {"performer": f"device:{device.name}", **self._info}
+    names = "+".join(link.device.name for link in self.links)
+    info = {"performer": f"device:{names}", **self._info}
     try:
       with punctual(realtime):
         made = episode.run(self.env, self._act, self.seed, info, watch=self._watch)
     except episode.EpisodeError as error:
       made = error.recording
     finally:
-      self.env.physics.guide.live = None
-      self.link.quiet()
-      device.close()
+      for hand, link in zip(self.env.physics.hands, self.links, strict=True):
+        hand.guide.live = None
+        link.quiet()
+        link.device.close()
     made.info["live"] = self.pace.lateness.summary() | {"faults": self.faults}
     if self.coach is not None:
       made.info["coach"] = self.coach.log()
     return made
 
   def _act(self, timestep: Any) -> np.ndarray:
-    physics = self.env.physics
+    physics, task = self.env.physics, self.env.task
     if timestep.first():
-      shaft, handle = Shaft(physics.trocar()), physics.handle
       turn = axes(physics.model.ptr, physics.data.ptr)
-      self.link.attach(shaft, handle.pos, handle.quat, turn)
-      physics.guide.live = self._live
       self._rows[:] = 0.0
-      self._rows[:, : len(ROW)] = self.link.row
+      first, extras = 0, (task.extra, task.other)
+      for hand, link, extra in zip(physics.hands, self.links, extras, strict=False):
+        handle = hand.handle
+        link.attach(Shaft(hand.trocar()), handle.pos, handle.quat, turn)
+        self._rows[:, first : first + len(ROW)] = link.row
+        first += len(ROW) + len(extra)
+        hand.guide.live = functools.partial(self._live, link, [_SAYS[name] for name in extra])
       if self.coach is not None:
         self.coach.begin(self.env)
       if self._publish is not None:
         self._publish(self)  # the shapes of a scene take longer than a step
     return self._rows
 
-  def _live(self, rows: np.ndarray, k: int) -> None:
-    """Fills a row when its step is due."""
-    physics, link = self.env.physics, self.link
-    before = link.state
-    if tick(self.pace, (link,), (physics.tip_pos().tolist(),)):
-      link.feel(physics.handle.wrench())
-    if link.message and (not self.faults or self.faults[-1] != link.message):
-      self.faults.append(link.message)
-    if link.state != before:
-      self._due = 0.0
-    row = link.row
-    rows[k, :7] = row
-    if self.env.task.jaws:
-      rows[k, 7] = link.jaw
-    elif self.env.task.extra:
-      rows[k, 7] = float(link.report)
+  def _live(
+    self, link: Link, says: Sequence[Callable[[Link], float]], rows: np.ndarray, k: int
+  ) -> None:
+    """Fills a hand's row when its step is due, the main one's first."""
+    if link is self.link:
+      self._tick()
+    row = rows[k]
+    row[:7] = link.row
+    for i, say in enumerate(says, 7):
+      row[i] = say(link)
     # Not beside what a control step does at its end.
-    if 0 < k < len(rows) - 1 and self._publish is not None and self.pace.now >= self._due:
+    last = link is self.links[-1] and 0 < k < len(rows) - 1
+    if last and self._publish is not None and self.pace.now >= self._due:
       self._due = max(self._due + 1 / _FPS, self.pace.now)
       self._publish(self)
+
+  def _tick(self) -> None:
+    """Waits until the step is due, and has all hands read and feel."""
+    hands, links = self.env.physics.hands, self.links
+    before = [link.state for link in links]
+    ready = tick(self.pace, links, [hand.tip_pos().tolist() for hand in hands])
+    for hand, link in zip(hands, links, strict=True):
+      if ready:
+        link.feel(hand.handle.wrench())
+      if link.message and (not self.faults or self.faults[-1] != link.message):
+        self.faults.append(link.message)
+    if before != [link.state for link in links]:
+      self._due = 0.0
 
   def _watch(self, env: Any) -> bool:
     if self.coach is not None:

@@ -13,6 +13,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Iterator
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -129,7 +130,7 @@ class Worker:
       desk.feed(**{k: message[k] for k in ("move", "rate", "buttons", "jaw", "at") if k in message})
 
   def _on_start(self, message: dict[str, Any]) -> None:
-    self._put(menu.exercise(message))
+    self._put(menu.exercise(message, self._own))
 
   def _on_practice(self, message: dict[str, Any]) -> None:
     self._put(menu.practice(message, self._own))
@@ -245,10 +246,11 @@ class Worker:
     kwargs = _kwargs(job)
     env = suite.load(*suite.split(job["task"]), task_kwargs={"random": 0, **kwargs})
     info = {"task_kwargs": kwargs, "person": job["person"], "seed": job["seed"]}
-    session = Session(
-      env, self._open(self._device), job["seed"], info, Options(scale=job["scale"]),
-      coach=Coach(job["assessment"]), publish=self._draw,
-    )  # fmt: skip
+    with self._hands(job["left"]) as (device, other):
+      session = Session(
+        env, device, job["seed"], info, Options(scale=job["scale"]),
+        coach=Coach(job["assessment"]), publish=self._draw, other=other,
+      )  # fmt: skip
     recording = self._run(session, job, lambda: session.run(realtime=True))
     done = Finished(recording)
     self._unkept = None if done.keep(self._folder, self._record) and not done.fault else done
@@ -284,19 +286,14 @@ class Worker:
     note = ", which takes a minute or more" if job["size"].get("grid", 0) > 100 else ""
     self._tell({"type": "loading", "text": f"{job['organ']}, {job['mesh']}", "note": note})
     right, left = job["instrument"], job["left"]
-    hands = {}
-    with contextlib.ExitStack() as stack:
-      hands[right] = self._open(self._device)
-      stack.callback(hands[right].close)
-      if left:
-        other = "grasper" if right != "grasper" else "probe"
-        hands[other] = self._open("page" if left in menu.OTHER else left, "left")
-        stack.callback(hands[other].close)
+    with self._hands(left) as (device, other):
+      hands = {right: device}
+      if other is not None:
+        hands["grasper" if right != "grasper" else "probe"] = other
       practice = Practice(
         job["organ"], job["size"], hands, 1e-3 * job["step"], job["scheme"],
         Options(scale=job["scale"]), self._picture,
       )  # fmt: skip
-      stack.pop_all()
     self._run(practice, job, lambda: practice.run(realtime=True))
     self._tell({"type": "idle", "late": practice.pace.lateness.summary()})
 
@@ -310,6 +307,18 @@ class Worker:
         report=False, assessment=False, practice=True, step=1e-3 * self._job["step"],
       ))  # fmt: skip
     self._publish(lambda: camera.frame(practice.link, practice.pace))
+
+  @contextlib.contextmanager
+  def _hands(self, left: str) -> Iterator[tuple[Device, Device | None]]:
+    """Opens the devices of both hands, the left one's if it has a name; closes them on failure."""
+    with contextlib.ExitStack() as stack:
+      right, other = self._open(self._device), None
+      stack.callback(right.close)
+      if left:
+        other = self._open("page" if left in menu.OTHER else left, "left")
+        stack.callback(other.close)
+      yield right, other
+      stack.pop_all()
 
   def _open(self, name: str, which: str = "right") -> Device:
     """Opens a device for a hand."""
@@ -329,8 +338,7 @@ def _kwargs(job: dict[str, Any]) -> dict[str, Any]:
 
 def _status(now: Session | Practice) -> dict[str, Any]:
   """Returns the words about what runs."""
-  link = now.link
-  lost = link.message if link.state == "lost" else ""
+  lost = next((link.message for link in now.links if link.state == "lost"), "")
   words = {"type": "status", "instruction": "", "warning": "", "kind": "", "fault": lost}
   if isinstance(now, Practice):
     return words | {"fault": lost or "; ".join(now.faults[-1:]), "scheme": now.organ.integrator}

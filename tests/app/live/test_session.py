@@ -114,6 +114,35 @@ def test_pictures_are_of_thirty_moments_a_second():
   assert 28 <= len(times) <= 32
 
 
+def test_two_hands_move_two_instruments_and_what_they_do_replays(tmp_path):
+  """The right hand pulls its instrument up, the left one goes aside and switches its current on."""
+  env = load("bimanual/easy", time_limit=0.6)
+  right = live.Hand(lambda t: (0.0, 0.02 * t, 0.0))
+  left = live.Hand(
+    lambda t: (0.02 * t, 0.0, 0.0),
+    buttons=lambda t: frozenset({"grip"} if t > 0.3 else ()),
+  )
+  made = session(env, right, other=left).run()
+  first, second = made.columns["tip_pos"].transpose(1, 0, 2)
+  axes = env.physics.camera()[1]
+  assert ((first[-1] - first[0]) @ axes)[1] > 0.004 > abs(((first[-1] - first[0]) @ axes)[0])
+  assert ((second[-1] - second[0]) @ axes)[0] > 0.004 > abs(((second[-1] - second[0]) @ axes)[1])
+  current = made.arrays["action"][1:, :, -1]
+  assert (current[0] == -1).all() and (current[-1] == 1).all()
+  assert made.arrays["hook_felt"].shape == made.arrays["felt"].shape
+  assert made.info["performer"] == "device:hand+hand"
+  made.info["task_kwargs"] = {**KWARGS, "time_limit": 0.6}
+  old = Recording.load(made.save(tmp_path / "a.npz"))
+  assert episode.differences(old, episode.replay(old)) == []
+
+
+def test_hands_are_as_many_as_the_exercise_takes():
+  with pytest.raises(ValueError, match="bimanual/easy: it takes two hands, expected another"):
+    live.Session(load("bimanual/easy"), live.Hand())
+  with pytest.raises(ValueError, match="touch/easy: it takes one hand, expected no other device"):
+    live.Session(load(), live.Hand(), other=live.Hand())
+
+
 def test_drives_are_refused():
   env = suite.load("touch", "easy", task_kwargs={"random": 0})
   with pytest.raises(ValueError, match="input is 'drives', expected 'handle'"):

@@ -134,17 +134,27 @@ def test_free_practice_changes_while_it_runs(page):
 
 def test_two_hands_on_one_page(page):
   one = page()
-  one.tell("practice", organ="liver", mesh="16 x 16", left="keyboard")
+  both = {"task": "bimanual/easy", "left": "keyboard"}
+  one.tell("start", **both | {"left": ""})
+  assert "which takes two hands, left is ''" in one.hear("error")["text"]
+  for kind, words in ("practice", {"mesh": "16 x 16", "left": "keyboard"}), ("start", both):
+    one.tell(kind, **words)
+    the_left_hand_moves_its_instrument_alone(one)
+  made = Recording.load(finish(one)["path"])
+  assert made.info["performer"] == "device:mouse+mouse" and len(made.instruments) == 2
+
+
+def the_left_hand_moves_its_instrument_alone(one):
   one.hear("scene")
   first = one.hear("frame")
   one.tell("hand", which="left", rate=[1, 0, 0, 0])
   size = len(one.scene["head"]) + 3 * one.scene["nodes"]
-  geoms = first[size:].reshape(-1, 12)[:, :3]
-  moved = np.zeros(len(geoms))
+  own = slice(size, size + 12 * len(one.scene["geoms"]))
+  places = lambda frame: frame[own].reshape(-1, 12)[:, :3]  # noqa: E731
+  moved = np.zeros(len(one.scene["geoms"]))
   while moved.max() < 0.01:
-    moved = np.linalg.norm(one.hear("frame")[size:].reshape(-1, 12)[:, :3] - geoms, axis=1)
-  mine = np.array([geom["mine"] for geom in one.scene["geoms"]])
-  assert moved[mine].max() < 1e-3  # the right one stays
+    moved = np.linalg.norm(places(one.hear("frame")) - places(first), axis=1)
+  assert np.linalg.norm(one.tip() - first[one.place]) < 1e-3  # the right one stays
 
 
 def test_the_expert_is_shown_on_request_and_noted(page):
