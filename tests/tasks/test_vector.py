@@ -85,6 +85,7 @@ def compare_metrics(told, k, expected):
     ("trace/easy", 1, 280, {}),
     ("grasp/easy", 1, 235, {}),
     ("retract/easy", 1, 195, {}),
+    ("cut/easy", 1, 75, {}),
   ],
 )
 def test_each_world_is_the_single_environment_of_its_seed(task, count, steps, options):

@@ -61,8 +61,10 @@ class Beside:
 
 
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda:0", marks=needs_cuda)])
-@pytest.mark.parametrize("task", ["grasp/easy", "retract/easy"])
-def test_experts_hold_tissue_in_a_batch(device, task):
+@pytest.mark.parametrize(
+  "task", ["grasp/easy", "retract/easy", pytest.param("cut/easy", marks=needs_cuda)]
+)
+def test_experts_hold_and_cut_tissue_in_a_batch(device, task):
   count = 1 if device == "cpu" else 6
   env = vector.Exercises(count, task, device=device)
   env.reset(seed=SEED)
