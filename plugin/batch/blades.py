@@ -188,9 +188,8 @@ class Blades(beside.Beside):
     cuts = self._organ.topology
 
     def cut(path: np.ndarray) -> tuple[Any, Mesh]:
-      disp = motion.disp[k]
-      now = cutters.on_surface(cuts.mesh_of(world), path, disp)
-      report = cuts.apply(world, cuts.find(world, now, disp, given), motion, k)
+      now = cutters.on_surface(cuts.mesh_of(world), path, motion.disp[k])
+      report = cuts.apply(world, cuts.find(world, now, motion, k, given), motion, k)
       return report, cuts.mesh_of(world)
 
     cutters.open_path(row, cuts.mesh_of(world), bool(ended), self._organ.declared, cut)

@@ -7,22 +7,22 @@ and what has changed goes there; graphs go on as they were recorded.
 from __future__ import annotations
 
 import dataclasses
-import functools
 
 import numpy as np
 import warp as wp
 from palpate.engine import cuts as engine
 from palpate.engine import flexes
-from palpate.engine.cuts import Divided, Piece, Report
+from palpate.engine.cuts import Piece, Report
 from palpate.tissue import body as bodies
 from palpate.tissue import cut as cutting
 from palpate.tissue import device as devices
-from palpate.tissue import energy, shape
 from palpate.tissue import mesh as topology
+from palpate.tissue import shape, step
 from palpate.tissue.mesh import Mesh
 from palpate.tissue.meshes import Meshes
 from palpate.tissue.order import LANES, from_slices, to_slices
-from palpate.tissue.refill import Refill
+from palpate.tissue.rows import NAMES, Rows
+from palpate.tissue.surface import WorkingCopy
 from palpate.tissue.types import NUMBERS
 
 from . import kernels
@@ -30,6 +30,7 @@ from .patch import Surface
 
 _OWN = ("rest", "elem", "touch", "source", "share", "held")  # fields of `Patch`
 _STATE = ("corner", "place", "weight", "source", "stamp")  # blocks of the plugin state
+_READ = (*NAMES, "slot_adr", "bend_adr")  # arrays that rows are written to, and by
 _INSIDE = NUMBERS.index("bulk")  # and pressure after it
 
 
@@ -41,20 +42,15 @@ class World:
     mesh: as it is now
     mass: of its vertices [kg]                       (nvert,)
     source: what each was before the first cut       (nvert,)
-    refill: writes its row
+    pieces: how many there are
     reports: what the cuts did
   """
 
   mesh: Mesh
   mass: np.ndarray
   source: np.ndarray
-  refill: Refill
+  pieces: int
   reports: list[Report] = dataclasses.field(default_factory=list)
-
-  @functools.cached_property
-  def pieces(self) -> int:
-    """How many there are."""
-    return _count(self.mesh)
 
 
 @dataclasses.dataclass
@@ -85,10 +81,16 @@ class Cuts:
     arrays = shape.arrays(self.whole, organ.config, ~declared.free, nodes)
     still = bodies.worlds(bodies.constants(arrays, wp.get_device("cpu"), organ.config.newton))
     self._node = still.shape.node.numpy()
+    copy = WorkingCopy(self.whole)
+    self._knife = cutting.Knife(copy)
     own = {f"patch.{name}": np.asarray(values[name][0]) for name in _OWN}
     self._meshes = Meshes(body, still, own)
     values |= {name: self._meshes.more[f"patch.{name}"] for name in _OWN}
     values["mesh"] = self._meshes.which
+    self._here = {name: self._meshes.here[f"patch.{name}"] for name in _OWN}
+    parts = still.shape, still.tissue
+    there = {name: getattr(part, name) for part in parts for name in _READ if hasattr(part, name)}
+    self._rows = Rows(copy, there, self._node)
     number = body.tissue.number.numpy()[:, _INSIDE : _INSIDE + 2]
     self._inside = wp.array(np.ascontiguousarray(number), dtype=float, device=body.device)
     self._worlds: dict[int, World] = {}
@@ -160,22 +162,23 @@ class Cuts:
   # Cutting.
 
   def find(
-    self, world: int, points: np.ndarray, disp: np.ndarray, given: float = 0.0
+    self, world: int, points: np.ndarray, motion: Motion, k: int, given: float = 0.0
   ) -> cutting.Cut:
     """Returns what a cut along points in the organ's frame, (n, 3) [m], makes of a world.
 
     Args:
       world: the world
       points: the path
-      disp: displacement of its vertices [m]  (nvert, 3)
-      given: see `cutting.cut`
+      motion: what vertices of some worlds have
+      k: which of them it is
+      given: see `cutting.Knife.cut`
     """
-    organ, mesh = self._organ, self.mesh_of(world)
-    of_triangles = functools.partial(energy.of_triangles, organ.config)
-    pinned = ~organ.declared.free
-    return cutting.cut(
-      organ.name, mesh, mesh.rest + disp, points, pinned, of_triangles, given=given
-    )
+    organ, had = self._organ, self._of(world)
+    carried = cutting.Motion(had.mass, motion.disp[k], motion.vel[k])
+    how = ~organ.declared.free, organ.config, None, given
+    found = self._knife.cut(organ.name, had.mesh, carried, points, *how)
+    kept = (getattr(found.motion, name).copy() for name in ("mass", "disp", "vel"))
+    return dataclasses.replace(found, motion=cutting.Motion(*kept))
 
   def cut(self, points: dict[int, np.ndarray]) -> list[Report | None]:
     """Cuts worlds along points in the world's axes, (n, 3) [m] each; see `Tissue.cut`."""
@@ -186,7 +189,7 @@ class Cuts:
     for k, world in enumerate(worlds):
       local = (points[world] - organ.declared.origin) @ organ.declared.frame
       try:
-        found.append(self.find(world, local, motion.disp[k]))
+        found.append(self.find(world, local, motion, k))
       except ValueError as error:
         raise ValueError(f"world {world}: {error}") from None
     out: list[Report | None] = [None] * organ.body.nworld
@@ -200,10 +203,13 @@ class Cuts:
     organ, had = self._organ, self._of(world)
     report = engine.report(cut, had.mesh, organ.declared, organ.config.thickness)
     if cut.changed.size:
-      was = Divided(had.mesh, had.mass, had.source, motion.disp[k], motion.vel[k])
-      after = engine.divide(cut, was, organ.declared.free)
-      _carry(motion, k, cut, after, organ.declared.free)
-      self._become(world, had, cut.mesh, cut.changed, after.mass, after.source)
+      _carry(motion, k, cut, organ.declared.free)
+      source = had.source.copy()
+      source[cut.member] = source[cut.group]
+      # Vertices that come apart inside do not make two pieces of one.
+      pieces = _count(cut.mesh) if cut.mesh.loose is not had.mesh.loose else had.pieces
+      now = World(cut.mesh, cut.motion.mass, source, pieces, had.reports)
+      self._become(world, had, now, cut.changed)
       self._changed.add(world)
       self._worlds[world].reports.append(report)
     return report
@@ -222,24 +228,27 @@ class Cuts:
     """Returns a world, that of the first mesh until it is cut."""
     if world in self._worlds:
       return self._worlds[world]
-    refill = Refill(self._meshes.body(world), self.whole)
-    source = np.arange(self.whole.nvert)
-    return World(self.whole, self._organ.declared.mass.copy(), source, refill)
+    mass, source = self._organ.declared.mass.copy(), np.arange(self.whole.nvert)
+    return World(self.whole, mass, source, self._whole_count)
 
-  def _become(self, world: int, own: World, mesh: Mesh, changed: np.ndarray, mass, source):
-    organ = self._organ
-    own.refill.write(mesh, changed, organ.config, ~organ.declared.free)
-    own = World(mesh, mass, source, own.refill, own.reports)
-    arrays = self._meshes.of(self._meshes.row(world))
-    values = self._surface.of(mesh, mass, source)
-    for name in _OWN:
-      arrays[f"patch.{name}"][...] = values[name]
-    self._worlds[world] = own
+  def _become(self, world: int, had: World, now: World, changed: np.ndarray):
+    """Writes the row of a world, in which triangles have changed."""
+    organ, mesh = self._organ, now.mesh
+    before, loosened = had.mesh.elem[changed], mesh.loose is not had.mesh.loose
+    how = ~organ.declared.free, changed, before, loosened
+    touched = topology.touched(had.mesh, mesh, changed)
+    with self._meshes.writing(world):
+      if not self._rows.write(mesh, organ.config, *how):
+        raise ValueError("cuts that meet leave no room in the bending matrix")
+      self._surface.write(self._here, mesh, now.mass, now.source, touched, changed)
+    self._worlds[world] = now
 
   def _upload(self, worlds: list[int]):
     """Gives the device the meshes of worlds, and what follows from them."""
     organ, body = self._organ, self._organ.body
     self._meshes.upload(worlds)
+    for _ in range(2 * body.has_bending):  # what is left of the first time is exact
+      self._meshes.angle(worlds, step.rest_angles(body))
     mass = np.ones((len(worlds), body.shape.nnode), np.float32)
     scale = organ.patch.mass_scale.numpy()
     for k, world in enumerate(worlds):
@@ -319,8 +328,7 @@ class Cuts:
     before = self.mesh_of(world)
     mesh, changed = topology.recut(before, rest, elem, loose)
     if changed.size or mesh is not before:
-      self._become(world, self._of(world), mesh, changed, mass, source)
-      self._worlds[world].reports = []
+      self._become(world, self._of(world), World(mesh, mass, source, _count(mesh)), changed)
       self._upload([world])
     if mesh is self.whole and world in self._worlds:
       self._forget(world)
@@ -341,11 +349,11 @@ def _count(mesh: Mesh) -> int:
   return int(topology.pieces(mesh).max()) + 1
 
 
-def _carry(motion: Motion, k: int, cut: cutting.Cut, after: Divided, free: np.ndarray):
+def _carry(motion: Motion, k: int, cut: cutting.Cut, free: np.ndarray):
   """Gives the vertices of the k-th world of a motion what a cut makes of it."""
-  motion.disp[k], motion.vel[k] = after.disp, after.vel
+  motion.disp[k], motion.vel[k] = cut.motion.disp, cut.motion.vel
   group, member = cut.group, cut.member
-  share = after.share[free[member]][:, None]
+  share = cut.share[free[member]][:, None]
   group, member = group[free[member]], member[free[member]]
   motion.force[k, member] = share * motion.force[k, group]
   for name in ("last", "before"):

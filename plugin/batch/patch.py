@@ -139,7 +139,7 @@ def constants(body, organ, tools: np.ndarray, model: mujoco.MjModel, inertia, su
     surface: makes what follows from a mesh
   """
   mesh, skin = organ.mesh, _skin(organ, model)
-  own = surface.of(mesh, organ.mass, np.arange(mesh.nvert))
+  own = surface.make(mesh)
   longest = float(own["touch"].max()) * (_LONGER if mesh.spare else 1.0)
   node, nnode = body.shape.node.numpy(), body.shape.nnode
   elem = node[mesh.elem]
@@ -196,33 +196,44 @@ class Surface:
       wall = slots.WALL * organ.mass[organ.free].sum()
       self._held = np.where(organ.free, mass, wall)
 
-  def of(self, mesh, mass: np.ndarray, source: np.ndarray) -> dict[str, np.ndarray]:
-    """Returns the fields of `Patch` that a cut changes.
+  def make(self, mesh) -> dict[str, np.ndarray]:
+    """Returns the fields of `Patch` that a cut changes, of the mesh before the first one."""
+    n = self._nnode
+    out = {
+      "rest": np.zeros((n, 3)),
+      "elem": np.zeros((mesh.nelem, 3), np.int32),
+      "touch": np.full(n, -np.inf),  # padding is never near
+      "source": np.arange(n, dtype=np.int32),
+      "share": np.ones(n),
+      "held": np.ones(n),
+    }
+    vert, elem = np.arange(mesh.nvert), np.arange(mesh.nelem)
+    self.write(out, mesh, self._organ.mass, vert, vert, elem)
+    return out
+
+  def write(self, out: dict[str, np.ndarray], mesh, mass: np.ndarray, source, vert, elem):
+    """Writes them, for some vertices and triangles.
 
     Args:
+      out: the fields
       mesh: the mesh
       mass: of its vertices [kg]                   (nvert,)
       source: what each was before the first cut   (nvert,)
+      vert: the vertices
+      elem: the triangles
     """
-    node, organ, waits = self._node, self._organ, mesh.unused
+    organ, node, waits = self._organ, self._node[vert], mesh.unused[vert]
+    source = source[vert]
     was = organ.mass[source]
-    share = np.where(was > 0, mass / np.where(was > 0, was, 1.0), 1.0)
+    share = np.where(was > 0, mass[vert] / np.where(was > 0, was, 1.0), 1.0)
     # Nodal coupling leaves contacts the masses of the compiled model.
-    held = share * self._held[source] if organ.windows else self._held
-    out = {
-      "rest": np.zeros((self._nnode, 3)),
-      "elem": node[mesh.elem].astype(np.int32),
-      "touch": np.full(self._nnode, -np.inf),  # padding is never near
-      "source": np.arange(self._nnode, dtype=np.int32),
-      "share": np.ones(self._nnode),
-      "held": np.ones(self._nnode),
-    }
-    out["rest"][node] = mesh.rest
-    out["touch"][node] = np.where(waits, -np.inf, _touch(mesh, self._reach))
-    out["source"][node] = node[source]
+    held = share * self._held[source] if organ.windows else self._held[vert]
+    out["elem"][elem] = self._node[mesh.elem[elem]]
+    out["rest"][node] = mesh.rest[vert]
+    out["touch"][node] = np.where(waits, -np.inf, self._reach + _longest(mesh, vert))
+    out["source"][node] = self._node[source]
     out["share"][node] = np.where(waits, 0.0, share)
     out["held"][node] = np.where(waits, 1.0, held)
-    return out
 
 
 def _skin(organ, model) -> float:
@@ -231,14 +242,11 @@ def _skin(organ, model) -> float:
   return float(model.flex_radius[flex].max() + model.flex_margin[flex].max())
 
 
-def _touch(mesh, reach: float) -> np.ndarray:
-  """Returns the distance from a geom within which a vertex's triangles may touch it [m]."""
-  edge = mesh.rest[mesh.elem[:, [1, 2, 0]]] - mesh.rest[mesh.elem]
-  length = np.linalg.norm(edge, axis=2)
-  longest = np.zeros(mesh.nvert)
-  for corner in (mesh.elem, mesh.elem[:, [1, 2, 0]]):
-    np.maximum.at(longest, corner.ravel(), length.ravel())
-  return longest + reach
+def _longest(mesh, vert: np.ndarray) -> np.ndarray:
+  """Returns the longest edge at each vertex at rest: its triangles are no farther from it [m]."""
+  ring = mesh.ring[vert]
+  edge = mesh.rest[np.where(ring >= 0, ring, vert[:, None])] - mesh.rest[vert][:, None]
+  return np.sqrt(np.einsum("ijk,ijk->ij", edge, edge).max(axis=1))
 
 
 def _tools(tools: np.ndarray, model, reach: float) -> np.ndarray:

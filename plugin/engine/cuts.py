@@ -9,16 +9,15 @@ stamp too, so that several mjData of one model take turns.
 from __future__ import annotations
 
 import dataclasses
-import functools
 from typing import Any
 
 import numpy as np
 from palpate.tissue import body as bodies
 from palpate.tissue import cut as cutting
-from palpate.tissue import energy
 from palpate.tissue import mesh as topology
 from palpate.tissue.mesh import Mesh
 from palpate.tissue.refill import Refill
+from palpate.tissue.surface import WorkingCopy
 
 from . import coupling, flexes, graphs, mjstruct, turns
 from .bind import bind
@@ -82,11 +81,14 @@ class Cuts:
     if not self:
       return
     bodies.unshare(w.body)
-    self._refill = Refill(w.body, self.whole)
+    copy = WorkingCopy(self.whole)
+    self._refill, self._knife = Refill(w.body, copy), cutting.Knife(copy)
     self.declared = w.organ
     self.mass = w.organ.mass.copy()
     self.source = np.arange(self.whole.nvert)
     self._own: dict[str, np.ndarray] = {}
+    self._total: int | None = None  # that the stamp is made of, None for not known
+    self._loose: np.ndarray | None = None  # that of the mesh in the state then
     self.lock: Any = None  # held while the model's triangles are read or written
 
   def __bool__(self) -> bool:
@@ -110,6 +112,7 @@ class Cuts:
     state, where = w.views["plugin_state"].numpy(), coupling.spans(w.organ)
     names = ("corner", "place", "weight", "source", "stamp")
     self._own = {name: state[where[name]] for name in names}
+    self._words = state[where["corner"].start : where["weight"].stop]
     self._found: Any = self._own["stamp"].data
     self.lock = turns.lock_of(model)
     self._elem = flexes.element_data(m, w.organ.flex)
@@ -137,7 +140,7 @@ class Cuts:
     mesh, changed = topology.recut(self.mesh, rest, elem, loose)
     self._become(mesh, changed, mass, source, self._found[0])
     self.reports = []
-    self._fresh = True
+    self._fresh, self._total = True, None
 
   def copy(self) -> dict[str, np.ndarray]:
     """Returns what the plugin state has of the mesh."""
@@ -148,13 +151,33 @@ class Cuts:
     for name, values in kept.items():
       self._own[name][:] = values
 
+  def _write(self, found: cutting.Cut):
+    """Writes to the state what a cut has changed, where it has the mesh before; else everything."""
+    own, mesh, n = self._own, self.mesh, self.whole.nvert
+    words, spare = self._words, mesh.nvert - mesh.spare
+    if self._total is None or mesh.loose is not self._loose:
+      words[:] = np.concatenate([flexes.pack(mesh.elem, mesh.loose), mesh.rest.ravel(), self.mass])
+      self._total = flexes.total(words, slice(None), len(words))
+    else:
+      elem, vert = found.changed, topology.distinct(found.before, mesh.elem[found.changed])
+      loose = None if mesh.loose is None else mesh.loose[elem]
+      place = (3 * vert[:, None] + np.arange(3)).ravel()
+      at = np.concatenate([elem, mesh.nelem + place, mesh.nelem + 3 * n + vert])
+      corner, rest = flexes.pack(mesh.elem[elem], loose), mesh.rest[vert].ravel()
+      new, old = np.concatenate([corner, rest, self.mass[vert]]), words[at]
+      self._total += flexes.total(new, at, len(words)) - flexes.total(old, at, len(words))
+      words[at] = new
+    own["source"][:] = self.source[spare:]
+    self._loose = mesh.loose
+    self.stamp = self._found[0] = flexes.stamp_of(self._total)
+
   def _become(self, mesh: Mesh, changed: np.ndarray, mass, source, stamp: float):
     w = self._w
     touched = topology.touched(self.mesh, mesh, changed)
     touched = topology.distinct(touched, np.flatnonzero(mass != self.mass))
     self._refill.write(mesh, changed, w.config, ~w.organ.free)
     self.mass, self.source, self.stamp = mass, source, stamp
-    w.organ = dataclasses.replace(self.declared, mesh=mesh, mass=mass)
+    w.organ = self.declared.cut(mesh, mass)
     w.phases.reshape(touched)
     for grown in [space for each in w.beside for space in each.reshape()]:
       with graphs.lock:
@@ -188,22 +211,19 @@ class Cuts:
 
   def cut(self, points: np.ndarray, given: float = 0.0) -> Report:
     """Cuts the organ along points in the world, (n, 3) [m]; see `Organ.cut`, and `cutting.cut`."""
-    w, (found, u, v) = self._w, self.find(points, given)
-    organ, mesh = w.organ, self.mesh
+    w, found = self._w, self.find(points, given)
     if found.stopped:
       w.note(
-        f"the cut stops early: no spare vertices are left of {mesh.spare}; give the organ more"
+        f"the cut stops early: no spare vertices are left of {self.mesh.spare}; give the organ more"
       )
-    done = report(found, mesh, organ, w.config.thickness)
+    done = report(found, self.mesh, w.organ, w.config.thickness)
     if found.changed.size:
-      self._take(found, u, v)
+      self._take(found)
     self.reports.append(done)
     return done
 
-  def find(
-    self, points: np.ndarray, given: float = 0.0
-  ) -> tuple[cutting.Cut, np.ndarray, np.ndarray]:
-    """Returns what a cut would make of the organ, and displacement and velocity of its vertices."""
+  def find(self, points: np.ndarray, given: float = 0.0) -> cutting.Cut:
+    """Returns what a cut would make of the organ."""
     w, organ = self._w, self._w.organ
     if not self:
       raise ValueError(
@@ -212,93 +232,40 @@ class Cuts:
     self.follow()
     organ, mesh = w.organ, self.mesh
     local = (np.asarray(points, float) - organ.origin) @ organ.frame
-    u, v = w.phases.motion()
-    of_triangles = functools.partial(energy.of_triangles, w.config)
-    energies = of_triangles, self._held()
-    found = cutting.cut(organ.name, mesh, mesh.rest + u, local, ~organ.free, *energies, given)
-    return found, u, v
+    motion = cutting.Motion(self.mass, *w.phases.motion())
+    how = ~organ.free, w.config, self._held(), given
+    return self._knife.cut(organ.name, mesh, motion, local, *how)
 
-  def _held(self) -> cutting.Held | None:
-    """Returns what tells the energy of ties and bonds, None where there are none."""
+  def _held(self) -> cutting.Springs | None:
+    """Returns the ties and bonds, None where there are none."""
     springs = [*self._w.ties.springs(), *self._w.bonds.springs()]
     if not springs:
       return None
     n = self.mesh.nvert
-    whole, pull, hard = np.zeros(n), np.zeros((n, 3)), np.zeros(n)
+    energy, force, hard = np.zeros(n), np.zeros((n, 3)), np.zeros(n)
     for vert, stiffness, stretch in springs:
-      np.add.at(whole, vert, 0.5 * stiffness * (stretch**2).sum(axis=1))
-      np.add.at(pull, vert, stiffness[:, None] * stretch)
+      np.add.at(energy, vert, 0.5 * stiffness * (stretch**2).sum(axis=1))
+      np.add.at(force, vert, stiffness[:, None] * stretch)
       np.add.at(hard, vert, stiffness)
+    return cutting.Springs(energy, force, hard)
 
-    def held(vert: np.ndarray, way: np.ndarray) -> np.ndarray:
-      return whole[vert] + (way * pull[vert]).sum(1) + 0.5 * hard[vert] * (way**2).sum(1)
-
-    return held
-
-  def _take(self, found: cutting.Cut, u: np.ndarray, v: np.ndarray):
+  def _take(self, found: cutting.Cut):
     """Makes the organ the mesh that was found; what moved goes on as it moved."""
-    w, mesh, group, member = self._w, found.mesh, found.group, found.member
-    after = divide(found, Divided(self.mesh, self.mass, self.source, u, v), w.organ.free)
+    w, mesh, motion = self._w, found.mesh, found.motion
+    group, member, share = found.group, found.member, found.share
+    source = self.source.copy()
+    source[member] = source[group]
     for each in w.beside:
-      each.carry(group, member, after.share)
-    stamp = flexes.stamp(flexes.pack(mesh.elem, mesh.loose), mesh.rest, after.mass)
-    self._become(mesh, found.changed, after.mass, after.source, stamp)
-    write(self._own, mesh, self.mass, self.source, stamp)
-    w.phases.carry(after.changed, after.disp, after.vel, group, member, after.share)
+      each.carry(group, member, share)
+    self._become(mesh, found.changed, motion.mass.copy(), source, self.stamp)
+    self._write(found)
+    changed = topology.distinct(found.near, member)
+    w.phases.carry(changed, motion.disp, motion.vel, group, member, share)
     self.show()
 
   def pieces(self) -> list[Piece]:
     """Returns the parts that hang together, the largest first."""
     return pieces(self.mesh, self._w.organ.mass, self._w.config.thickness)
-
-
-@dataclasses.dataclass
-class Divided:
-  """A mesh, and what its vertices have.
-
-  Attributes:
-    mesh: the mesh
-    mass: of each vertex [kg]                                    (nvert,)
-    source: what vertex each was before the first cut            (nvert,)
-    disp: displacement [m]                                       (nvert, 3)
-    vel: velocity [m/s]                                          (nvert, 3)
-    changed: vertices with another displacement or velocity      (n,)
-    share: of what was one, the part that each member has        (m,)
-  """
-
-  mesh: Mesh
-  mass: np.ndarray
-  source: np.ndarray
-  disp: np.ndarray
-  vel: np.ndarray
-  changed: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, int))
-  share: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))
-
-
-def divide(found: cutting.Cut, was: Divided, free: np.ndarray) -> Divided:
-  """Returns what vertices have after a cut: what moved goes on as it moved.
-
-  Args:
-    found: the cut
-    was: what they had
-    free: whether a vertex moves   (nvert,) bool
-  """
-  old, mesh, u, v = was.mesh, found.mesh, was.disp, was.vel
-  group, member = found.group, found.member
-  mass, source = was.mass.copy(), was.source.copy()
-  area = topology.areas_of(mesh, member)
-  share = area / np.bincount(group, area, mesh.nvert)[group]
-  mass[member] = share * was.mass[group]
-  source[member] = source[group]
-  now, speed = u.copy(), v.copy()
-  now[found.moved] = np.einsum("nk,nkj->nj", found.weight, u[found.corner])
-  near = topology.distinct(old.elem[found.changed])
-  near = near[free[near]]
-  before, goes = (old.rest + u)[near], (mesh.rest + now)[near]
-  speed[near] = _keep_spin(was.mass[near], before, goes, v[near])
-  now[member], speed[member] = now[group], speed[group]
-  changed = topology.distinct(near, member)
-  return Divided(mesh, mass, source, now, speed, changed, share)
 
 
 def report(found: cutting.Cut, before: Mesh, organ, thickness: float) -> Report:
@@ -356,17 +323,3 @@ def write(own: dict[str, np.ndarray], mesh: Mesh, mass: np.ndarray, source, stam
   own["weight"][:] = mass
   own["source"][:] = source[mesh.nvert - mesh.spare :]
   own["stamp"][0] = stamp
-
-
-def _keep_spin(mass: np.ndarray, was: np.ndarray, now: np.ndarray, v: np.ndarray) -> np.ndarray:
-  """Returns velocities with which nodes, some of them moved, keep momentum and angular momentum.
-
-  That is `v` and a slow rotation of them all about their centre.
-  """
-  if len(mass) < 3:
-    return v
-  spin = (mass[:, None] * topology.cross(was - now, v)).sum(axis=0)
-  arm = now - (mass[:, None] * now).sum(axis=0) / mass.sum()
-  inertia = (mass * (arm**2).sum(axis=1)).sum() * np.eye(3) - (mass * arm.T) @ arm
-  omega = np.linalg.lstsq(inertia, spin, rcond=1e-6)[0]
-  return v + topology.cross(omega[None], arm)

@@ -34,8 +34,6 @@ PALPATE void agree(double& least, int& elem, D3& weight) {
   weight = {w[0], w[1], w[2]};
 }
 
-PALPATE D3 blend(const D3* x, D3 w) { return w.x * x[0] + w.y * x[1] + w.z * x[2]; }
-
 template <class Fields>
 PALPATE void corners_at_rest(const Fields& f, int t, D3* x) {
   for (int c = 0; c < 3; ++c) x[c] = load(f.flat.data + 3 * f.elem.data[3 * t + c]);

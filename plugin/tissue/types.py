@@ -42,6 +42,16 @@ def ints(*dims) -> Array:
   return Array(wp.int32, dims)
 
 
+def longs(*dims) -> Array:
+  """Returns the type of an array of int64."""
+  return Array(wp.int64, dims)
+
+
+def flags(*dims) -> Array:
+  """Returns the type of an array of bytes, each 0 or 1."""
+  return Array(wp.uint8, dims)
+
+
 DIMS: dict[str, dict[str, tuple]] = {}  # struct and field -> its shape
 
 
@@ -330,15 +340,28 @@ def fill(
   return out
 
 
+def zeros(names: tuple[str, ...], sizes: dict[str, int]) -> dict[str, np.ndarray]:
+  """Returns arrays of `Shape` and `Tissue` of zeros, of the sizes that their shapes name."""
+  found = {name: dims for name, dims in _dims().items() if name in names}
+  return {
+    name: np.zeros([_extent(dim, sizes) for dim in dims], _dtype(name))
+    for name, dims in found.items()
+  }
+
+
 def empty(sizes: tuple[str, ...]) -> dict[str, np.ndarray]:
   """Returns the arrays of `Shape` and `Tissue` whose first axis is one of `sizes`, empty."""
-  out = {}
-  for kind in (Shape, Tissue):
-    for name, dims in DIMS[kind.key].items():
-      if dims[0] in sizes:
-        dtype = np.int32 if kind.vars[name].type.dtype is wp.int32 else np.float32
-        out[name] = np.zeros((0, *dims[1:]), dtype)
-  return out
+  found = {name: dims for name, dims in _dims().items() if dims[0] in sizes}
+  return {name: np.zeros((0, *dims[1:]), _dtype(name)) for name, dims in found.items()}
+
+
+def _dims() -> dict[str, tuple]:
+  return {name: dims for kind in (Shape, Tissue) for name, dims in DIMS[kind.key].items()}
+
+
+def _dtype(name: str):
+  kind = Shape if name in Shape.vars else Tissue
+  return wp.dtype_to_numpy(kind.vars[name].type.dtype)
 
 
 def _extent(dim: int | str, sizes: dict[str, int]) -> int:
