@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 import warp as wp
 from palpate.engine import bonds as engine_bonds
-from palpate.engine import coupling, hold, rests
+from palpate.engine import coupling, hold, rests, ties
 from palpate.engine.layout import BOND
 from palpate.tissue import body as bodies
 from palpate.tissue.kernels import Kernel, kernel
@@ -75,15 +75,32 @@ def in_worlds(kind, rows: tuple[str, ...], others: dict[str, Any]) -> Any:
     fields[name] = others.get(name, var.type)
     if dims is not None and name not in others:
       fields[name] = Array(var.type.dtype, ("nworld", *dims) if name in rows else dims)
-  return struct(type(f"{kind.key}InWorlds", (), {"__annotations__": fields, "__module__": __name__}))
+  own = {"__annotations__": fields, "__module__": __name__}
+  return struct(type(f"{kind.key}InWorlds", (), own))
 
 
 _PARTS = {"own": WorldNodes, "other": WorldNodes, "mj": WorldBodies}
 _number = floats("nworld", "nnumber")
-BOND_ROWS = "state", "next", "stretch", "force", "hardness"
+BOND_ROWS = "state", "next", "stretch", "force", "pull", "hardness"
 WorldBonded = in_worlds(engine_bonds.Bonded, BOND_ROWS, _PARTS | {"number": _number})
 REST_ROWS = "slip", "slipped", "on", "force", "hardness"
+WorldTied = in_worlds(
+  ties.Tied, ("point", "force"), _PARTS | {"number": _number, "dvel_warm": vector}
+)
 WorldRest = in_worlds(rests.Rest, REST_ROWS, _PARTS)
+
+
+@struct
+class Aimed:
+  """Ties to another organ."""
+
+  npair: int  # number of them
+  first: int  # the first among all ties
+  pair: ints("npair")  # vertices of the other organ
+  anchor: doubles("npair", 3)  # from there to the points, in the world [m]
+  point: doubles("nworld", "ntie", 6)  # place and velocity of the points [m, m/s]
+  other: WorldNodes
+  mj: WorldBodies
 
 
 def kernels(header: str, kind, *names: str) -> list[Kernel]:
@@ -94,6 +111,8 @@ def kernels(header: str, kind, *names: str) -> list[Kernel]:
 _stretch, _enter, _bear, _act, _feel, _keep = kernels(
   "bonds.h", WorldBonded, *engine_bonds.KERNELS
 )
+_enter_ties, _act_ties = kernels("ties.h", WorldTied, *ties.KERNELS)
+(_aim,) = kernels("ties.h", Aimed, "aim_ties")
 _find, _press, _act_rest, _feel_rest, _keep_rest = kernels("rests.h", WorldRest, *rests.KERNELS)
 
 
@@ -112,7 +131,7 @@ def _show(b: WorldBonded, first: int, damage: wp.array2d[float], force: wp.array
   had = b.state[w, n, 0]
   damage[w, first + n] = wp.where(had >= wp.float64(1.0), 1.0, wp.min(float(had), _HELD))
   for c in range(3):
-    force[w, first + n, c] = float(b.force[w, n, c])
+    force[w, first + n, c] = float(b.pull[w, n, c])
 
 
 @wp.kernel(enable_backward=False)
@@ -205,8 +224,8 @@ def check(spaces: list):
   for w in spaces:
     if w.rests.below:
       raise ValueError(
-        f"organ {w.organ.name!r}: support names organ {w.rests.below[0].organ.name!r}, which a batch "
-        "on a GPU cannot do; expected geoms"
+        f"organ {w.organ.name!r}: support names organ {w.rests.below[0].organ.name!r}, which a "
+        "batch on a GPU cannot do; expected geoms"
       )
 
 
@@ -225,7 +244,7 @@ def make(organ, numbers: np.ndarray) -> tuple[Beside, ...]:
     numbers: of the model's bodies in mujoco_warp's, (nbody,)
   """
   w = organ.space
-  kinds = (InBonds, w.bonds), (Rests, w.rests)
+  kinds = (Ties, w.ties), (InBonds, w.bonds), (Rests, w.rests)
   return tuple(kind(organ, numbers) for kind, there in kinds if there)
 
 
@@ -295,11 +314,11 @@ class InBonds(Beside):
   def _fill(self, group, other, numbers: np.ndarray):
     organ, n = self._organ, len(group.vert)
     scheme = SCHEMES[organ.config.integrator]
-    shapes = {"next": (n, len(BOND)), "stretch": (n, 3), "force": (n, 3), "hardness": (n,)}
+    shapes: dict[str, tuple] = {name: (n, 3) for name in ("stretch", "force", "pull")}
+    shapes |= {"next": (n, len(BOND)), "hardness": (n,)}
     values: dict[str, Any] = dict(zip(("stiffness", "strength", "energy"), group.law, strict=True))
-    values |= {
-      name: getattr(group, name) for name in ("vert", "area", "anchor", "normal", "corner", "weight")
-    }
+    of_group = "vert", "area", "anchor", "normal", "corner", "weight"
+    values |= {name: getattr(group, name) for name in of_group}
     values |= {name: self._zeros(self._nworld, *shape) for name, shape in shapes.items()}
     values |= dict(
       nbond=n,
@@ -373,6 +392,52 @@ class Grown(Bonds):
 
   def _weaken(self, amount: wp.array):
     self._all(_weaken, amount)
+
+
+class Ties(Beside):
+  """What an organ is attached to; a thread has all ties of a world."""
+
+  def __init__(self, organ, numbers: np.ndarray):
+    super().__init__(organ)
+    made, batch = organ.space.ties, organ._batch
+    known: Any = made.fields
+    self._count = int(known.count.numpy()[0])
+    names = "vert", "leads", "stiffness", "anchor", "count", "owned", "restless"
+    values = {name: getattr(known, name).numpy() for name in names}
+    body = known.body.numpy()
+    point = self._zeros(self._nworld, len(body), 6)
+    values |= dict(
+      ahead=known.ahead, gain=known.gain, body=np.where(body < 0, body, numbers[body]), point=point,
+      force=self._zeros(self._nworld, len(body), 3), own=nodes_of(organ), solve=input_of(organ),
+      number=organ.body.tissue.number, dvel_warm=organ.body.state.dvel_warm, mj=batch.bodies,
+    )  # fmt: skip
+    self._fields, self._aimed, first = fill(WorldTied, self._device, values), [], 0
+    self._moves = bool(values["restless"][0] and (body >= 0).any())
+    for group in made.groups:
+      if group.other is not None:
+        other = nodes_of(batch.organ(group.other.organ.name))
+        own = {"npair": len(group.pair), "first": first, "pair": group.pair, "point": point}
+        own |= {"anchor": group.anchor, "other": other, "mj": batch.bodies}
+        self._aimed.append(fill(Aimed, self._device, own))
+      first += len(group.vert)
+
+  @property
+  def aims(self) -> bool:
+    """See `Beside`."""
+    return self._moves
+
+  def _alone(self, what: Kernel):
+    what.launch(self._device, self._nworld, 1, 0, self._fields, 32)
+
+  def enter(self):
+    """See `Beside`."""
+    for aimed in self._aimed:
+      self._over(_aim, aimed, aimed.npair)
+    self._alone(_enter_ties)
+
+  def act(self):
+    """See `Beside`."""
+    self._alone(_act_ties)
 
 
 class Rests(Beside):

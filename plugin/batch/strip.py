@@ -45,15 +45,19 @@ def tools_of(model: mujoco.MjModel, organ) -> np.ndarray:
   Raises:
     ValueError: one is not a tool that a batch knows, or it is not an organ that it can step.
   """
-  for key in ("carrier", "attach", "relax_share", "tear"):
+  for key in ("carrier", "relax_share", "tear"):
     if getattr(organ.config, key):
       raise ValueError(
         f"organ {organ.name!r}: {key} is set, which a batch on a GPU cannot do; expected none"
       )
-  if organ.mesh.spare and organ.config.bonded:
-    raise ValueError(
-      f"organ {organ.name!r}: spare and bonds are set, of which a batch on a GPU can do one"
-    )
+  for key, there in (
+    ("bonds", organ.config.bonded), ("attach", organ.config.attach),
+    ("support", organ.config.support),
+  ):  # fmt: skip
+    if organ.mesh.spare and there:
+      raise ValueError(
+        f"organ {organ.name!r}: spare and {key} are set, of which a batch on a GPU can do one"
+      )
   if organ.mesh.spare and any(row.current for row in organ.config.cutters):
     raise ValueError(
       f"organ {organ.name!r}: cutters has a current, which cuts nothing in a batch on a GPU; "
@@ -124,9 +128,11 @@ def strip(
   for key in list(bare.keys):
     bare.delete(key)
   bodies = {body.name: body for body in bare.bodies}
-  _take_plugins(bare)
+  instances = _release_plugins(bare)
   for organ in organs:
     _take_out(bare, bodies, organ, model)
+  for instance in instances:  # at last: bodies are not deleted safely without
+    bare.delete(instance)
   masses = [_slot_mass(organ) for organ in organs]
   for organ, nslot, mass in zip(organs, nslots, masses, strict=True):
     _add_slots(bare, organ, nslot, mass, model)
@@ -156,14 +162,13 @@ def strip(
   return made, slots
 
 
-def _take_plugins(bare):
-  """Deletes the instances of the plugin, first from the bodies that refer to them."""
+def _release_plugins(bare) -> list:
+  """Returns the instances of the plugin, which no body refers to from now on."""
   mine = [b for b in bare.bodies if b.plugin.active and b.plugin.plugin_name == mjstruct.NAME]
-  instances = {body.plugin.name: body.plugin for body in mine}
+  numbers = {body.plugin.id for body in mine}  # some have no name
   for body in mine:
     body.plugin.active = False
-  for instance in instances.values():
-    bare.delete(instance)
+  return [instance for instance in bare.plugins if instance.id in numbers]
 
 
 def _check_option(option):

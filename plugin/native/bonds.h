@@ -27,6 +27,7 @@ PALPATE Fields of_world(Fields f, int world) {
   move_to(f.next, world);
   move_to(f.stretch, world);
   move_to(f.force, world);
+  move_to(f.pull, world);
   move_to(f.hardness, world);
   move_to(f.number, world);
   move_nodes(f.own, world);
@@ -156,7 +157,7 @@ PALPATE void bear_bonds(const Fields& all, Thread t, int) {
   }
 }
 
-// Ends the forces with what the step made of the vertices' velocities.
+// Finds what the forces are with what the step made of the vertices' velocities.
 template <class Fields>
 PALPATE void act_bonds(const Fields& all, Thread t, int) {
   if (!all.live.data[0]) return;
@@ -165,11 +166,11 @@ PALPATE void act_bonds(const Fields& all, Thread t, int) {
   const double per_h = 1.0 / f.mj.timestep.data[0];
   each_item(t, f.nbond, [&](int n) {
     const double weight = f.hardness.data[n];
-    if (weight == 0.0) return;
+    store(f.pull.data + 3 * n, {0.0, 0.0, 0.0});
+    if (weight == 0.0 || !ok) return;
     const int at = offset_of(f.solve.node.data[f.vert.data[n]]);
     const D3 dv = turned(f.own.frame.data, load_lane(f.solve.dvel.data + at));
-    const D3 pull = load(f.force.data + 3 * n) - (weight * per_h) * dv;
-    store(f.force.data + 3 * n, ok ? pull : D3{0.0, 0.0, 0.0});
+    store(f.pull.data + 3 * n, load(f.force.data + 3 * n) - (weight * per_h) * dv);
   });
 }
 
@@ -182,7 +183,7 @@ PALPATE void feel_bonds(const Fields& all, Thread t, int) {
   const Seat s = seat_on_body(f, Twist{zero, zero});
   D3 force = zero, torque = zero;
   for (int n = 0; n < f.nbond; ++n) {
-    const D3 pull = load(f.force.data + 3 * n);
+    const D3 pull = load(f.pull.data + 3 * n);
     const D3 point = s.at + in_axes(s, load(f.anchor.data + 3 * n));
     force = force - pull;
     torque = torque - cross(arm_of(f.mj, f.body, point), pull);

@@ -15,7 +15,6 @@ import warp as wp
 
 from . import body as bodies
 from .body import Body
-from .types import Shape, Tissue
 
 # What a cut changes of a body's arrays.
 _OF_SHAPE = (
