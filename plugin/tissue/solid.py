@@ -1,4 +1,4 @@
-"""The inside of a solid: tetrahedra to sliced arrays."""
+"""The inside of a solid: tetrahedra, and means over nodes of their gradients, to sliced arrays."""
 
 from __future__ import annotations
 
@@ -12,14 +12,10 @@ from . import config as configuration
 from .config import Config
 from .fill import vertex_volumes, volumes
 from .mesh import Mesh
-from .order import LANES, addresses, ellpack, pad, to_slices
+from .order import LANES, addresses, ellpack, offset, pad, to_slices
+from .step import OWN_SHARE
 from .types import empty
 
-# Poisson's ratio up to which the resistance to a change of volume is each tetrahedron's own. What
-# is above is averaged over nodes: linear tetrahedra would lock (Bonet and Burton 1998,
-# doi:10.1002/(SICI)1099-0887(199805)14:5<437::AID-CNM162>3.0.CO;2-W), and averages alone let
-# neighbours shrink and grow in turn (Puso and Solberg 2006, doi:10.1002/nme.1457).
-_OWN_POISSON = 0.3
 _WINDOW = 8 * LANES  # edges that are sorted by the number of their tetrahedra
 
 
@@ -47,17 +43,14 @@ def young(mesh: Mesh, config: Config) -> np.ndarray:
   return np.asarray(config.young)[middle.query(mesh.rest[mesh.tet].mean(axis=1))[1]]
 
 
-def moduli(mesh: Mesh, config: Config) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-  """Returns mu, lambda and its averaged part of each tetrahedron [Pa], (ntet,) each.
+def moduli(mesh: Mesh, config: Config) -> tuple[np.ndarray, np.ndarray]:
+  """Returns mu and lambda of each tetrahedron [Pa], (ntet,) each.
 
-  Those of the energy in `energy.solid`, with which small strains have the Lame constants
-  mu' = 3/4 mu, lambda' = lambda - 5/8 mu (Smith et al. 2018, section 3.4).
+  Those of the energy in `energy.solid`: small strains have the Lame constants 3/4 mu and lambda
+  (Smith et al. 2018, section 3.4, where 5/8 mu is counted as part of lambda).
   """
   shear, lame = configuration.lame_solid(young(mesh, config), config.poisson)
-  own = configuration.lame_solid(young(mesh, config), min(config.poisson, _OWN_POISSON))
-  part = own[1] * shear / own[0]
-  mu = 4 / 3 * shear
-  return mu, part + 5 / 8 * mu, lame - part
+  return 4 / 3 * shear, lame
 
 
 def arrays(mesh: Mesh, config: Config, vert: np.ndarray, node: np.ndarray) -> dict[str, Any]:
@@ -74,28 +67,49 @@ def arrays(mesh: Mesh, config: Config, vert: np.ndarray, node: np.ndarray) -> di
   mesh = dataclasses.replace(mesh, tet=mesh.tet[order])
   tet = mesh.tet
   volume = volumes(mesh.rest, tet)
-  mu, lam, averaged = moduli(mesh, config)
+  mu, lam = moduli(mesh, config)
   at = node[tet]
-  own = np.arange(len(vert)).reshape(-1, LANES)
-  share = np.repeat(volume / 4, 4)
-  entry = np.arange(tet.size)
-  width, entry, weight = ellpack(at.ravel(), entry, share, np.full_like(own, tet.size))
-  total = vertex_volumes(mesh)
-  gain = np.where(vert >= 0, (vertex_volumes(mesh, averaged) / total**2)[vert], 0.0)
-  values = pad(np.stack([volume, mu, lam, averaged], axis=1), least=1)
+  absent = np.full((len(vert) // LANES, LANES), tet.size)
+  width, entry, _ = ellpack(at.ravel(), np.arange(tet.size), np.ones(tet.size), absent)
+  values = pad(np.stack([volume, mu, lam], axis=1), least=1)
   values[len(tet) :, 1] = 1.0  # padding has no volume, but quotients
   gradient = gradients(mesh)[:, 1:].reshape(-1, 9)
+  nodal = np.where((vert >= 0)[:, None], nodal_moduli(mesh, config)[vert], 0.0)
   return {
-    "tet_node": to_slices(pad(at, least=1)).astype(np.int32),
+    "tet_node": to_slices(pad(offset(at), least=1)).astype(np.int32),
     "tet_gradient": to_slices(pad(gradient, least=1)).astype(np.float32),
     "tet_moduli": to_slices(values).astype(np.float32),
     "around_adr": addresses(width),
-    "around_tet": (entry // 4).astype(np.int32),
     "around_corner": _corner(entry // 4, entry % 4),
-    "around_share": weight,
-    "pressure_gain": to_slices(gain).astype(np.float32),
+    "fan_slope": _slopes(mesh, vert, node),
+    "node_moduli": to_slices(nodal).astype(np.float32),
     **_edges(mesh, vert, node),
   }
+
+
+def _slopes(mesh: Mesh, vert: np.ndarray, node: np.ndarray) -> np.ndarray:
+  """Returns `fan_slope`: with it the mean of the gradients around a node is a sum over its fan.
+
+  That of neighbour b is the sum of V g_b / sum V over the tetrahedra around the node, g_b the
+  gradient of the share of b in each.
+  """
+  pairs = np.array([(a, b) for a in range(4) for b in range(4) if a != b])
+  start, end = (mesh.tet[:, pairs[:, k]].ravel() for k in (0, 1))
+  weighed = volumes(mesh.rest, mesh.tet)[:, None, None] / 4 * gradients(mesh)
+  value = weighed[:, pairs[:, 1]].reshape(-1, 3) / vertex_volumes(mesh)[start, None]
+  degree = np.where(vert >= 0, mesh.degree[vert], 0).reshape(-1, LANES)
+  first = addresses(degree.max(axis=1))
+  out = np.zeros((first[-1], LANES, 3))
+  entry = (mesh.ring[start] == end[:, None]).argmax(axis=1)
+  np.add.at(out, (first[node[start] // LANES] + entry, node[start] % LANES), value)
+  return np.ascontiguousarray(out.transpose(0, 2, 1)).astype(np.float32)
+
+
+def nodal_moduli(mesh: Mesh, config: Config) -> np.ndarray:
+  """Returns what vertices have of mu, and lambda [Pa], (nvert, 2): the means around them."""
+  mu, lam = moduli(mesh, config)
+  sums = [vertex_volumes(mesh, part) for part in ((1 - OWN_SHARE) * mu, lam)]
+  return np.stack(sums, axis=1) / np.maximum(vertex_volumes(mesh), 1e-300)[:, None]
 
 
 def _corner(tet: np.ndarray, corner: np.ndarray) -> np.ndarray:
@@ -142,7 +156,7 @@ def _slot(mesh: Mesh, vert: np.ndarray, node: np.ndarray, edge: np.ndarray) -> n
 
 def none(nslice: int) -> dict[str, np.ndarray]:
   """Returns the arrays of `arrays` for a surface."""
-  sizes = ("ntetslice", "naround", "nedge", "nedgeslice", "nsolidslice")
+  sizes = ("ntetslice", "naround", "nedge", "nedgeslice", "nsolidslice", "nsolidslot")
   return {
     "around_adr": np.zeros(nslice + 1, np.int32),
     "edge_adr": np.zeros(1, np.int32),
