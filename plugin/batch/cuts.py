@@ -149,15 +149,22 @@ class Cuts:
     inputs, device = [self._organ.patch, *whole], self._organ.body.device
     wp.launch(kernels.heal, dim=self._count.shape, inputs=inputs, device=device)
 
-  def renumber(self, worlds: np.ndarray, number: np.ndarray) -> np.ndarray:
-    """Keeps bulk and pressure of worlds; returns the numbers, without them where one is open."""
-    inside, which = self._inside.numpy(), self._meshes.which.numpy()
-    inside[worlds] = number[worlds, _INSIDE : _INSIDE + 2]
+  def renumber(self, worlds: np.ndarray, number: np.ndarray, rows: dict[str, np.ndarray]):
+    """Keeps bulk and pressure of worlds for when they are whole again: where one is open they end.
+
+    Args:
+      worlds: that have changed
+      number: `NUMBERS` of all worlds, which are written to
+      rows: what has changed
+    """
+    self.follow()
+    inside = self._inside.numpy()
+    for k in (_INSIDE, _INSIDE + 1):
+      if NUMBERS[k] in rows:
+        inside[worlds, k - _INSIDE] = rows[NUMBERS[k]]
     self._inside.assign(inside)
-    for world in worlds[which[worlds] > 0]:
-      if self.whole.closed and not self.mesh(world).closed:
-        number[world, _INSIDE : _INSIDE + 2] = 0.0
-    return number
+    opened = [w for w, own in self._worlds.items() if self.whole.closed and not own.mesh.closed]
+    number[opened, _INSIDE : _INSIDE + 2] = 0.0
 
   # Cutting.
 

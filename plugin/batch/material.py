@@ -72,6 +72,8 @@ class Material:
     number = self._organ.body.tissue.number.numpy()
     for key, values in numbers.items():
       number[worlds, NUMBERS.index(key)] = values
+    if self._organ.topology:
+      self._organ.topology.renumber(worlds, number, numbers)
     self._organ.body.tissue.number.assign(number)
 
   def _put(self, array: wp.array, worlds: np.ndarray, values: np.ndarray):
@@ -108,6 +110,11 @@ class Material:
     if self._lumps is None:
       if factor.shape[1] == 1:
         return
+      if self._organ.topology:
+        raise ValueError(
+          f"organ {self._organ.name!r}: young has a number a triangle, which a batch on a GPU "
+          "cannot do where spare is set; expected one a world"
+        )
       self._lumps = Lumps(self._organ.declared, self._organ.body)
       self._organ.patch.lump = self._lumps.node
       self._lumps.put(worlds, factor)
