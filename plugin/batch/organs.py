@@ -14,7 +14,7 @@ from palpate.tissue import config as configuration
 from palpate.tissue import device as devices
 from palpate.tissue import order, shape, step
 
-from . import beside, contacts, convex, kernels, patch, sliding
+from . import beside, contacts, convex, held, kernels, patch, sliding
 from .base import Contacts, Tissue, spread
 from .blades import Blades
 from .cuts import Cuts
@@ -223,9 +223,9 @@ class Organ(Tissue):
     return {name: wp.zeros(shape, dtype=wp.vec3, device=self.body.device) for name in _WHAT}
 
   @functools.cached_property
-  def bonds(self) -> beside.Grown:
+  def bonds(self) -> held.Grown:
     """What it has grown on to."""
-    return beside.Grown(self)
+    return held.Grown(self)
 
   def _read(self, name: str) -> wp.array:
     if name in _STATUS:
