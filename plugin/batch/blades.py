@@ -14,7 +14,7 @@ from palpate.engine import cutters, mjstruct
 from palpate.engine.layout import BLADE, LAW
 from palpate.tissue.mesh import Mesh
 from palpate.tissue.step import SCHEMES
-from palpate.tissue.types import doubles, fill, floats, ints
+from palpate.tissue.types import allocate, doubles, fill, floats, ints, struct
 
 from . import beside
 from .parting import Cutters
@@ -44,22 +44,30 @@ def _turned(f: wp.array2d[wp.float64], c: int, x: wp.float64, y: wp.float64, z: 
   return f[c, 0] * x + f[c, 1] * y + f[c, 2] * z
 
 
+@struct
+class Told:
+  """Arrays of `Cutters`."""
+
+  inside: floats("nworld", "nblade")
+  force: floats("nworld", "nblade", 3)
+  energy: floats("nworld", "nblade")
+  length: floats("nworld", "nblade")
+  seat: floats("nworld", "nblade", 3)
+
+
 @wp.kernel(enable_backward=False)
-def _show(
-  b: _WorldBlades, inside: wp.array2d[float], force: wp.array3d[float], energy: wp.array2d[float],
-  length: wp.array2d[float], seat: wp.array3d[float],
-):  # fmt: skip
+def _show(b: _WorldBlades, out: Told):
   """Writes what cutters do, in the world's axes."""
   w, i = wp.tid()
-  inside[w, i] = wp.where(b.state[w, i, _STAGE] == wp.float64(2.0), 1.0, 0.0)
-  energy[w, i] = float(b.state[w, i, _WORK])
-  length[w, i] = float(b.state[w, i, _OPENED])
+  out.inside[w, i] = wp.where(b.state[w, i, _STAGE] == wp.float64(2.0), 1.0, 0.0)
+  out.energy[w, i] = float(b.state[w, i, _WORK])
+  out.length[w, i] = float(b.state[w, i, _OPENED])
   f = b.own.frame
   for c in range(3):
     turned = _turned(f, c, b.force[w, i, 0], b.force[w, i, 1], b.force[w, i, 2])
-    force[w, i, c] = float(turned)
+    out.force[w, i, c] = float(turned)
     at = _turned(f, c, b.state[w, i, _AT], b.state[w, i, _AT + 1], b.state[w, i, _AT + 2])
-    seat[w, i, c] = float(b.own.origin[c] + at)
+    out.seat[w, i, c] = float(b.own.origin[c] + at)
 
 
 @wp.kernel(enable_backward=False)
@@ -106,8 +114,10 @@ class Blades(beside.Beside):
       mj=organ._batch.bodies,
     )
     self.fields = fill(_WorldBlades, self._device, values)
-    self._count, self._steps = n, 0
-    self._out: Cutters | None = None
+    self._steps = 0
+    sizes = {"nworld": self._nworld, "nblade": n}
+    self._told = allocate(Told, self._device, sizes)
+    self._out = Cutters(*(getattr(self._told, name) for name in Cutters._fields))
 
   @property
   def aims(self) -> bool:
@@ -147,13 +157,7 @@ class Blades(beside.Beside):
 
   def read(self) -> Cutters:
     """Returns what they do."""
-    if self._out is None:
-      wide = (), (3,), (), (), (3,)
-      self._out = Cutters(*(
-        wp.zeros((self._nworld, self._count, *more), dtype=float, device=self._device)
-        for more in wide
-      ))  # fmt: skip
-    dim, inputs = (self._nworld, self._count), [self.fields, *self._out]
+    dim, inputs = self._told.inside.shape, [self.fields, self._told]
     wp.launch(_show, dim=dim, inputs=inputs, device=self._device)
     return self._out
 
@@ -188,11 +192,12 @@ class Blades(beside.Beside):
     cuts = self._organ.topology
 
     def cut(path: np.ndarray) -> tuple[Any, Mesh]:
-      now = cutters.on_surface(cuts.mesh_of(world), path, motion.disp[k])
+      now = cutters.on_surface(cuts.finder, cuts.mesh_of(world), path, motion.disp[k])
       report = cuts.apply(world, cuts.find(world, now, motion, k, given), motion, k)
       return report, cuts.mesh_of(world)
 
-    cutters.open_path(row, cuts.mesh_of(world), bool(ended), self._organ.declared, cut)
+    organ, mesh = self._organ.declared, cuts.mesh_of(world)
+    cutters.open_path(row, mesh, bool(ended), organ, cuts.finder, cut)
 
 
 @wp.kernel(enable_backward=False)

@@ -21,9 +21,10 @@ from palpate.tissue import shape, step
 from palpate.tissue.mesh import Mesh
 from palpate.tissue.meshes import Meshes
 from palpate.tissue.order import LANES, from_slices, to_slices
+from palpate.tissue.path import Finder
 from palpate.tissue.rows import NAMES, Rows
 from palpate.tissue.surface import WorkingCopy
-from palpate.tissue.types import NUMBERS
+from palpate.tissue.types import NUMBERS, fill
 
 from . import kernels
 from .patch import Surface
@@ -82,7 +83,7 @@ class Cuts:
     still = bodies.worlds(bodies.constants(arrays, wp.get_device("cpu"), organ.config.newton))
     self._node = still.shape.node.numpy()
     copy = WorkingCopy(self.whole)
-    self._knife = cutting.Knife(copy)
+    self._knife, self.finder = cutting.Knife(copy), Finder(copy)
     own = {f"patch.{name}": np.asarray(values[name][0]) for name in _OWN}
     self._meshes = Meshes(body, still, own)
     values |= {name: self._meshes.more[f"patch.{name}"] for name in _OWN}
@@ -92,11 +93,13 @@ class Cuts:
     there = {name: getattr(part, name) for part in parts for name in _READ if hasattr(part, name)}
     self._rows = Rows(copy, there, self._node)
     number = body.tissue.number.numpy()[:, _INSIDE : _INSIDE + 2]
-    self._inside = wp.array(np.ascontiguousarray(number), dtype=float, device=body.device)
     self._worlds: dict[int, World] = {}
     self._changed: set[int] = set()
     self._whole_count = _count(self.whole)
-    self._count = wp.full(body.nworld, self._whole_count, dtype=int, device=body.device)
+    self._intact = fill(kernels.Whole, body.device, {
+      "first": _INSIDE, "count": self._whole_count, "inside": number,
+      "pieces": np.full(body.nworld, self._whole_count),
+    })  # fmt: skip
 
   # What there is.
 
@@ -139,15 +142,14 @@ class Cuts:
 
   def counts(self) -> wp.array:
     """Returns how many pieces there are, (nworld,)."""
-    return self._count
+    return self._intact.pieces
 
   # Within a step.
 
   def heal(self):
     """Gives the worlds of the mask the first mesh; `rest` has put back the rest."""
-    whole = [self._inside, _INSIDE, self._count, self._whole_count]
-    inputs, device = [self._organ.patch, *whole], self._organ.body.device
-    wp.launch(kernels.heal, dim=self._count.shape, inputs=inputs, device=device)
+    inputs, body = [self._organ.patch, self._intact], self._organ.body
+    wp.launch(kernels.heal, dim=body.nworld, inputs=inputs, device=body.device)
 
   def renumber(self, worlds: np.ndarray, number: np.ndarray, rows: dict[str, np.ndarray]):
     """Keeps bulk and pressure of worlds for when they are whole again: where one is open they end.
@@ -158,11 +160,11 @@ class Cuts:
       rows: what has changed
     """
     self.follow()
-    inside = self._inside.numpy()
+    inside = self._intact.inside.numpy()
     for k in (_INSIDE, _INSIDE + 1):
       if NUMBERS[k] in rows:
         inside[worlds, k - _INSIDE] = rows[NUMBERS[k]]
-    self._inside.assign(inside)
+    self._intact.inside.assign(inside)
     opened = [w for w, own in self._worlds.items() if self.whole.closed and not own.mesh.closed]
     number[opened, _INSIDE : _INSIDE + 2] = 0.0
 
@@ -268,9 +270,9 @@ class Cuts:
         if not self._worlds[world].mesh.closed:
           number[world, _INSIDE : _INSIDE + 2] = 0.0
       body.tissue.number.assign(number)
-    count = self._count.numpy()
+    count = self._intact.pieces.numpy()
     count[worlds] = [self._worlds[world].pieces for world in worlds]
-    self._count.assign(count)
+    self._intact.pieces.assign(count)
     organ.wake(worlds)
 
   # Motion of some worlds, to the host and back.
@@ -342,9 +344,9 @@ class Cuts:
       which = self._meshes.which.numpy()
       which[world] = 0
       self._meshes.which.assign(which)
-      count = self._count.numpy()
+      count = self._intact.pieces.numpy()
       count[world] = self._whole_count
-      self._count.assign(count)
+      self._intact.pieces.assign(count)
 
   @staticmethod
   def is_cut(own: np.ndarray, spans: dict[str, slice]) -> bool:

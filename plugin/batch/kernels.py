@@ -198,15 +198,25 @@ def spread_nodes(p: Patch, adr: wp.array[int], velocity: int, out: wp.array2d[fl
         out[w, adr[i] + c] = p.solve.disp[w, n // 8, c, n % 8] + shift
 
 
+@struct
+class Whole:
+  """What worlds have again that are whole again."""
+
+  first: int  # of the numbers of `inside`, see `NUMBERS`
+  count: int  # pieces
+  inside: floats("nworld", 2)  # volume stiffness and pressure
+  pieces: ints("nworld")
+
+
 @wp.kernel(enable_backward=False)
-def heal(p: Patch, inside: wp.array2d[float], first: int, pieces: wp.array[int], whole: int):
-  """Gives the worlds of a mask the first mesh, with the volume stiffness and pressure of that."""
+def heal(p: Patch, s: Whole):
+  """Gives the worlds of a mask the first mesh."""
   w = wp.tid()
   if p.mask[w] and p.mesh[w] > 0:
     p.mesh[w] = 0
-    pieces[w] = whole
-    for k in range(inside.shape[1]):
-      p.tissue.number[w, first + k] = inside[w, k]
+    s.pieces[w] = s.count
+    for k in range(s.inside.shape[1]):
+      p.tissue.number[w, s.first + k] = s.inside[w, k]
 
 
 @wp.kernel(enable_backward=False)
@@ -221,6 +231,24 @@ def put_rows(source: wp.array2d[float], row: wp.array[int], out: wp.array2d[floa
   """Writes rows to their places."""
   k, i = wp.tid()
   out[row[k], i] = source[k, i]
+
+
+@wp.func
+def _choose(n: int, k: int):
+  """Returns n over k, k up to 3."""
+  if k == 2:
+    return n * (n - 1) // 2
+  return n * (n - 1) * (n - 2) // 6
+
+
+@wp.func
+def triple(a: int, b: int, c: int, n: int):
+  """Returns the number of a triple of n in the order of `itertools.combinations`."""
+  low = wp.min(a, wp.min(b, c))
+  high = wp.max(a, wp.max(b, c))
+  middle = a + b + c - low - high
+  before = _choose(n, 3) - _choose(n - low, 3)
+  return before + _choose(n - low - 1, 2) - _choose(n - middle, 2) + high - middle - 1
 
 
 @wp.func

@@ -7,6 +7,7 @@ import functools
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -173,7 +174,7 @@ class _Tissue(Tissue):
     self.spaces = [engine.find(data._address, instance) for data in batch.datas]
     self.name, self.elem = name, self.handles[0].elem
     self.nvert = coupling.outer(self.spaces[0].organ)
-    self._batch, self._counted = batch, [None] * batch.nworld
+    self._batch, self._counted = batch, list[Any]([None] * batch.nworld)
     self._pieces = wp.zeros(batch.nworld, dtype=int, device="cpu")
 
   @functools.cached_property

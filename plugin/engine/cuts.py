@@ -16,6 +16,7 @@ from palpate.tissue import body as bodies
 from palpate.tissue import cut as cutting
 from palpate.tissue import mesh as topology
 from palpate.tissue.mesh import Mesh
+from palpate.tissue.path import Finder
 from palpate.tissue.refill import Refill
 from palpate.tissue.surface import WorkingCopy
 
@@ -83,6 +84,7 @@ class Cuts:
     bodies.unshare(w.body)
     copy = WorkingCopy(self.whole)
     self._refill, self._knife = Refill(w.body, copy), cutting.Knife(copy)
+    self.finder = Finder(copy)
     self.declared = w.organ
     self.mass = w.organ.mass.copy()
     self.source = np.arange(self.whole.nvert)

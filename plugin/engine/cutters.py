@@ -13,8 +13,8 @@ from typing import Any
 import mujoco
 import numpy as np
 import warp as wp
-from palpate.tissue import path as paths
 from palpate.tissue.mesh import Mesh
+from palpate.tissue.path import Finder
 from palpate.tissue.step import SCHEMES
 from palpate.tissue.types import doubles, fill, ints, struct
 
@@ -209,9 +209,8 @@ class Cutters(Beside):
     """See `Beside`."""
     if self.fields is not None:
       mesh = self._w.organ.mesh
-      self.fields.elem.assign(mesh.elem)
-      self.fields.flat.assign(mesh.rest)
-      self.fields.own.rest.assign(base(self._w.organ))
+      self.fields.elem.numpy()[:], self.fields.flat.numpy()[:] = mesh.elem, mesh.rest
+      self.fields.own.rest.numpy()[:] = base(self._w.organ)
     return []
 
   def open(self) -> bool:
@@ -232,10 +231,10 @@ class Cutters(Beside):
 
     def cut(path: np.ndarray) -> tuple[Report, Mesh]:
       organ = w.organ
-      now = on_surface(organ.mesh, path, w.phases.motion()[0])
+      now = on_surface(w.cuts.finder, organ.mesh, path, w.phases.motion()[0])
       return w.cuts.cut(organ.origin + now @ organ.frame.T, given), w.organ.mesh
 
-    report, why = open_path(row, w.organ.mesh, ended, w.organ, cut)
+    report, why = open_path(row, w.organ.mesh, ended, w.organ, w.cuts.finder, cut)
     if "pinned" in why and not self._said:
       self._said = True
       mjstruct.warn(why)
@@ -273,7 +272,12 @@ class Cutters(Beside):
 
 
 def open_path(
-  row: np.ndarray, mesh: Mesh, ended: bool, organ, cut: Callable[[np.ndarray], tuple[Report, Mesh]]
+  row: np.ndarray,
+  mesh: Mesh,
+  ended: bool,
+  organ,
+  finder: Finder,
+  cut: Callable[[np.ndarray], tuple[Report, Mesh]],
 ) -> tuple[Report | None, str]:
   """Opens the path of a blade, as far as the mesh is to come apart along it.
 
@@ -282,6 +286,7 @@ def open_path(
     mesh: the organ's
     ended: whether all of it comes apart
     organ: its declaration
+    finder: of its surfaces
     cut: cuts along a path at rest, (n, 3) [m]; returns what it did, and the mesh then
 
   Returns:
@@ -292,7 +297,7 @@ def open_path(
   trail = row[BLADE.trail : BLADE.trail + 3 * count].reshape(-1, 3)
   path, rest = np.vstack([trail, at]), at[None]
   if not ended:
-    path, rest = _part(mesh, path)
+    path, rest = _part(mesh, finder, path)
   report, why = None, ""
   try:
     if len(path) > 1:
@@ -308,13 +313,13 @@ def open_path(
     trail = np.vstack([tip, rest[:-1]])[:TRAIL]
     row[BLADE.count], row[BLADE.wait] = len(trail), 0.0
     row[BLADE.trail : BLADE.trail + trail.size] = trail.ravel()
-    row[BLADE.elem] = paths.nearest(mesh, mesh.rest, at[None])[0][0]
+    row[BLADE.elem] = finder.nearest(mesh, mesh.rest, at[None])[0][0]
   return report, why
 
 
-def on_surface(mesh: Mesh, path: np.ndarray, disp: np.ndarray) -> np.ndarray:
+def on_surface(finder: Finder, mesh: Mesh, path: np.ndarray, disp: np.ndarray) -> np.ndarray:
   """Returns where points of the rest shape are, (n, 3), with displacements (nvert, 3)."""
-  elem, weight, _ = paths.nearest(mesh, mesh.rest, path)
+  elem, weight, _ = finder.nearest(mesh, mesh.rest, path)
   return np.einsum("nk,nkj->nj", weight, (mesh.rest + disp)[mesh.elem[elem]])
 
 
@@ -327,7 +332,7 @@ def _wait(row: np.ndarray, at: np.ndarray, edge: float, full: bool):
     start[:] = at
 
 
-def _part(mesh, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _part(mesh, finder, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
   """Returns the part of a path that comes apart now, and the rest; nothing where there is none.
 
   It ends where a vertex is near, so that the mesh need not be bent to where the blade is just now.
@@ -339,7 +344,7 @@ def _part(mesh, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
   point = np.stack([np.interp(way, arc, path[:, c]) for c in range(3)], axis=1)
   if not len(point):
     return path[:0], path
-  elem, _, _ = paths.nearest(mesh, mesh.rest, point)
+  elem, _, _ = finder.nearest(mesh, mesh.rest, point)
   vert = np.unique(mesh.elem[elem])
   far = np.linalg.norm(point[:, None] - mesh.rest[vert], axis=2).min(axis=1)
   stop = int(np.argmin(far - _FARTHER * way))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 from scipy import sparse
 from scipy.sparse import csgraph
@@ -42,7 +40,6 @@ def ellpack(
   index: np.ndarray,
   value: np.ndarray,
   fill: np.ndarray,
-  room: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
   """Returns the lists of all nodes as sliced ELLPACK: row k of a slice has their k-th entries.
 
@@ -51,7 +48,6 @@ def ellpack(
     index: what it points at    (n,)
     value: its value            (n,)
     fill: what the entries that pad a node's list point at, with value 0 (nslice, 8)
-    room: returns the rows of each slice from the numbers of entries, None for as few as may be
 
   Returns:
     rows of each slice (nslice,), entries and values (rows, 8)
@@ -59,7 +55,7 @@ def ellpack(
   by_row = np.lexsort((index, row))
   row, index, value = row[by_row], index[by_row], value[by_row]
   count = np.bincount(row, minlength=fill.size)
-  width = count.reshape(-1, LANES).max(axis=1) if room is None else room(count)
+  width = count.reshape(-1, LANES).max(axis=1)
   within = np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count)
   place = (np.cumsum(width) - width)[row // LANES] + within
   entry = np.repeat(fill, width, axis=0)
