@@ -72,6 +72,7 @@ class Organ(Tissue):
     self._batch, self._scheme = batch, step.SCHEMES[organ.config.integrator]
     still = shape.make(organ.mesh, organ.config, ~organ.free, str(device), nworld=0)
     self.body = bodies.worlds(still, nworld, plan_of(still, organ.config))
+    self.body.newton = w.body.newton
     model, d, m = batch.model, batch.d, batch.m
     node = self.body.shape.node.numpy()
     mass = np.ones(self.body.shape.nnode, np.float32)

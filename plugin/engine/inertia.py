@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 from palpate.tissue import body as bodies
 from palpate.tissue import mesh as topology
-from palpate.tissue import shape, step
+from palpate.tissue import shape, solid, step
 from palpate.tissue.body import Body
 from palpate.tissue.config import MATERIAL, Config
 from palpate.tissue.mesh import Mesh
@@ -24,11 +24,11 @@ from .flexes import meeting_geoms
 
 # Loads whose response gives the effective inertia; between them it follows the nodal area.
 _SAMPLES = 24
-# Nodes that say whether tissue is stiff, and times its own mass that one moves then: of presses
-# with less, none gained energy from contacts that MuJoCo answers with the dofs' inertia, while a
-# fold pinched by jaws, of nodes of two masses, shook them at 30 Hz where it answered for itself.
+# Nodes that say whether tissue is stiff, and times its own mass that one moves then: presses of
+# nodes of 2.8 to 3 masses gained energy from contacts that MuJoCo answers with the dofs' inertia,
+# while a fold pinched by jaws, of two masses, shook them at 30 Hz where it answered for itself.
 _FEW = 8
-_STIFF = 3.0
+_STIFF = 2.75
 # Times its inertia by itself that a pressed node may have, which is stretched too.
 _PRESSED = 2.0
 _KNOWN = 64
@@ -59,6 +59,14 @@ def stiffness(
   alone = _by_itself(m, organ, body, config, sample)
   stiff = np.quantile(alone / masses(m, organ)[sample], 0.75) > _STIFF
   return bool(stiff), _PRESSED * max(1.0, float(np.median(alone / nodal[sample])))
+
+
+def iterations(m, organ: Declaration, config: Config) -> int:
+  """Returns how many Newton iterations a step takes, for the model's time step."""
+  if not len(organ.mesh.tet) or not SCHEMES[config.integrator].ahead:
+    return config.newton
+  gain = SCHEMES[config.integrator].gain(float(m.opt.timestep), config.damping)
+  return max(config.newton, solid.iterations(organ.mesh, config, masses(m, organ), gain))
 
 
 def _by_itself(m, organ: Declaration, body: Body, config: Config, sample: np.ndarray) -> np.ndarray:
