@@ -261,8 +261,8 @@ PALPATE Sym without(const Sym& m, double k, D3 a) {
 }
 
 // The force of a blade on its seat at the end of the step, and what of its spring weighs on the change
-// of the seat's velocity. Where it would be more than the tissue bears it is that, and does not weigh
-// along itself.
+// of the seat's velocity. Where it would be more than the tissue bears it is that, and less by as
+// much of the way to the blade as the tissue goes: light tissue must not be thrown ahead of the blade.
 template <class Fields>
 PALPATE void bear(const Fields& f, Thread t, int i, const Line& line, const double* s) {
   const double* law = f.law.data + LAW_LENGTH * i;
@@ -284,7 +284,7 @@ PALPATE void bear(const Fields& f, Thread t, int i, const Line& line, const doub
   const double size = k * norm(then.flat);
   if (size > law[LAW_FORCE]) {
     const double share = law[LAW_FORCE] / size;
-    hold = share * without(hold, weight, unit_of(then.pull));
+    hold = share * hold;
     force = (share * k) * then.pull;
   }
   if (s[BLADE_STAGE] == PIERCING) {
