@@ -314,11 +314,11 @@ def change(
     values["young"] = tuple(factor * young for young in compiled.young)
   changed = dataclasses.replace(config, **values)
   for key in ("relax_share", "capsule_young"):
-    now, first = getattr(changed, key), getattr(compiled, key)
-    if bool(now) != bool(first):
+    both = getattr(changed, key), getattr(compiled, key)
+    if bool(both[0]) != bool(both[1]):
+      now, first = (" ".join(f"{x:g}" for x in np.ravel(each)) or "none" for each in both)
       raise ValueError(
-        f"organ {organ!r}: {key} is {now:g}, compiled as {first:g}: it cannot begin or end while "
-        "running"
+        f"organ {organ!r}: {key} is {now}, compiled as {first}: it cannot begin or end while running"
       )
   given = values | ({"stiffness": 0} if config.stiffness else {})
   _check_combination(organ, changed, given, closed)
