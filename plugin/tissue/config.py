@@ -318,7 +318,8 @@ def change(
     if bool(both[0]) != bool(both[1]):
       now, first = (" ".join(f"{x:g}" for x in np.ravel(each)) or "none" for each in both)
       raise ValueError(
-        f"organ {organ!r}: {key} is {now}, compiled as {first}: it cannot begin or end while running"
+        f"organ {organ!r}: {key} is {now}, compiled as {first}: it cannot begin or end while "
+        "running"
       )
   given = values | ({"stiffness": 0} if config.stiffness else {})
   _check_combination(organ, changed, given, closed)
