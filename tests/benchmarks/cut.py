@@ -5,8 +5,9 @@
 A sheet of 15 by 10 cm (E = 200 kPa, t = 2 mm, h = 2 ms, windows), a membrane or with bending,
 pinned at its long sides, is cut by a blade at 80 mm/s, by scissors that close, by a hook's current
 at 14 mm/s, or by `Organ.cut`, two edges at a time; the same sheet is pressed by a ball, with room
-for cuts and without. All three are stepped in turn. CPU time of the process; `open` are the steps in
-which the mesh came apart (with `Organ.cut` the call, and the step after it), `between` the others.
+for cuts and without. All three are stepped in turn. CPU time of the process; `open` are the steps
+in which the mesh came apart (with `Organ.cut` the call, and the step after it), `between` the
+others.
 """
 
 import argparse
