@@ -8,14 +8,17 @@ namespace palpate {
 // length)^2, 0 where none of the nodes is so fast that an edge could change by more than AHEAD in a
 // step h, the node at its other end being slower.
 template <class Fields>
-PALPATE V fastest(const Fields& f, const float* vel, float h, int s, Lane lane) {
+PALPATE V fastest(
+  const Fields& f, int world, const float* vel, float h, int s, Lane lane
+) {
   const V3 v = ld3(vel + 24 * s, lane);
   const float slow = AHEAD * f.shape.shortest / (2.0f * h);
   V most = splat(0.0f);
   if (!any_above(dot(v, v), slow * slow)) return most;
   const int first = f.shape.slot_adr.data[s], width = f.shape.slot_adr.data[s + 1] - first;
-  const int* node = f.shape.fan_node.data + 8 * (first + 2 * s + 1);
-  const float* rest = f.shape.fan_rest.data + 24 * (first + 2 * s + 1);
+  const size_t mesh = mesh_of(f, world);
+  const int* node = f.shape.fan_node.data + mesh + 8 * (first + 2 * s + 1);
+  const float* rest = f.shape.fan_rest.data + mesh + 24 * (first + 2 * s + 1);
   for (int k = 0; k < width; ++k, node += 8, rest += 24) {
     const V3 d = gather3(vel, node, lane) - v, r = ld3(rest, lane);
     most = vmax(most, dot(d, d) / vmax(dot(r, r), splat(1e-30f)));
@@ -28,7 +31,7 @@ PALPATE void edge_change(const Fields& f, Thread t, int) {
   const float* vel = f.state.vel.data + 24 * (size_t)t.world * f.shape.nslice;
   const float h = f.state.step.data[4 * t.world];
   each_slice(t, f.shape.nslice, [&](int s, Lane lane) {
-    put_most(f.system.change.data + t.world, fastest(f, vel, h, s, lane));
+    put_most(f.system.change.data + t.world, fastest(f, t.world, vel, h, s, lane));
   });
 }
 
@@ -131,17 +134,18 @@ struct Springs {
 template <class Fields>
 PALPATE Springs springs(const Fields& f, int world, int s, Lane lane) {
   const int row = f.shape.slot_adr.data[s], width = f.shape.slot_adr.data[s + 1] - row;
-  const float* k = f.tissue.fan_spring.data + 8 * row;
-  const V area = ld(f.shape.area.data, s, lane);
+  const size_t mesh = mesh_of(f, world);
+  const float* k = f.tissue.fan_spring.data + mesh + 8 * row;
+  const V area = ld(f.shape.area.data + mesh, s, lane);
   V sum = numbers(f, world)[FOUNDATION] * area;
   for (int i = 0; i < width; ++i) sum += ld(k, i, lane);
-  return {width, f.shape.fan_node.data + 8 * (row + 2 * s + 1), k, area, sum};
+  return {width, f.shape.fan_node.data + mesh + 8 * (row + 2 * s + 1), k, area, sum};
 }
 
 // One over the mass of a slice's nodes, 0 for those that do not move: they may have no mass.
 template <class Fields>
 PALPATE V lightness(const Fields& f, int world, int s, Lane lane) {
-  const V free = ld(f.shape.free.data, s, lane), zero = splat(0.0f);
+  const V free = ld(f.shape.free.data + mesh_of(f, world), s, lane), zero = splat(0.0f);
   const V mass = ld(f.state.mass.data + 8 * (size_t)world * f.shape.nslice, s, lane);
   return select(free > zero, 1.0f / mass, zero);
 }
