@@ -24,7 +24,7 @@ from . import coupling, flexes, graphs, mjstruct, turns
 from .bind import bind
 from .tear import Tear
 
-_FOREIGN = "plugin_state has cuts that are not of this organ; set a state that was saved from it"
+FOREIGN = "plugin_state has cuts that are not of this organ; set a state that was saved from it"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,11 +33,12 @@ class Report:
 
   Attributes:
     length: of the edges that came apart, at rest [m]
-    area: of the faces that a cut through the wall opened: length times thickness [m^2]
+    area: of the faces that it opened at rest: length times thickness of a wall [m^2]
     path: those edges at rest, in the world: polylines, each (n, 3) [m]
     deviation: greatest distance of their vertices from the path that was asked for, at rest [m]
     nodes: spare vertices used
     stopped: whether it ended early for want of spare vertices
+    depth: of a solid, how far below its skin it goes at most, at rest [m]
   """
 
   length: float
@@ -46,6 +47,7 @@ class Report:
   deviation: float
   nodes: int
   stopped: bool
+  depth: float = 0.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,9 +55,9 @@ class Piece:
   """A part of an organ that hangs together.
 
   Attributes:
-    vertices: numbers of its vertices
+    vertices: numbers of its vertices, those on the surface
     mass: [kg]
-    volume: of its wall, rest area times thickness [m^3]
+    volume: of its wall, rest area times thickness, or of a solid's tetrahedra, at rest [m^3]
     held: whether the foundation holds it; not where it was cut free
   """
 
@@ -82,7 +84,7 @@ class Cuts:
     if not self:
       return
     bodies.unshare(w.body)
-    self._refill = Refill(w.body, self.whole)
+    self._refill = self._made()
     self.declared = w.organ
     self.mass = w.organ.mass.copy()
     self.source = np.arange(self.whole.nvert)
@@ -92,10 +94,14 @@ class Cuts:
   def __bool__(self) -> bool:
     return self.whole.spare > 0
 
+  def _made(self) -> Any:
+    """Returns what writes meshes into the body's arrays."""
+    return Refill(self._w.body, self.whole)
+
   @property
   def full(self) -> bool:
     """Whether there is no spare vertex left."""
-    return self.mesh.nouter == self.mesh.nvert
+    return self.mesh.nouter == self.mesh.nskin
 
   @property
   def mesh(self) -> Mesh:
@@ -133,25 +139,25 @@ class Cuts:
     """
     if not self or self._found[0] == self.stamp:
       return
-    elem, loose, rest, mass, source = self._read()
-    mesh, changed = topology.recut(self.mesh, rest, elem, loose)
-    self._become(mesh, changed, mass, source, self._found[0])
+    self._become(*self._read(), stamp=self._found[0])
     self.reports = []
     self._fresh = True
 
-  def _read(self):
+  def _read(self) -> tuple:
+    """Returns the mesh that the state has, what differs, masses, and where vertices come from."""
     whole, own = self.whole, self._own
     if not self._found[0]:
-      return whole.elem, None, whole.rest, self.declared.mass, np.arange(whole.nvert)
+      found = topology.recut(self.mesh, whole.rest, whole.elem, None)
+      return *found, self.declared.mass, np.arange(whole.nvert)
     elem, loose = flexes.unpack(own["corner"])
     rest, mass = own["place"].reshape(-1, 3).copy(), own["weight"].copy()
     source = np.append(np.arange(whole.nvert - whole.spare), own["source"]).astype(int)
     inside = (elem >= 0).all() and (elem < whole.nvert).all()
     if not inside or not np.array_equal(source[elem], whole.elem):
-      raise ValueError(_FOREIGN)
+      raise ValueError(FOREIGN)
     if flexes.stamp(own["corner"], rest, mass) != self._found[0]:
-      raise ValueError(_FOREIGN)
-    return elem, loose, rest, mass, source
+      raise ValueError(FOREIGN)
+    return *topology.recut(self.mesh, rest, elem, loose), mass, source
 
   def copy(self) -> dict[str, np.ndarray]:
     """Returns what the plugin state has of the mesh."""
@@ -167,12 +173,12 @@ class Cuts:
     own["corner"][:] = corner
     own["place"][:] = mesh.rest.ravel()
     own["weight"][:] = self.mass
-    own["source"][:] = self.source[mesh.nvert - mesh.spare :]
+    own["source"][:] = self.source[mesh.spares]
     self._found[0] = self.stamp
 
   def _become(self, mesh: Mesh, changed: np.ndarray, mass, source, stamp: float):
     w = self._w
-    touched = topology.touched(self.mesh, mesh, changed)
+    touched = self._touched(mesh, changed)
     touched = topology.distinct(touched, np.flatnonzero(mass != self.mass))
     self._refill.write(mesh, changed, w.config, ~w.organ.free)
     self.mass, self.source, self.stamp = mass, source, stamp
@@ -181,6 +187,10 @@ class Cuts:
     for grown in [space for each in w.beside for space in each.reshape()]:
       with graphs.lock:
         bind(grown, grown.model)
+
+  def _touched(self, mesh: Mesh, changed: np.ndarray) -> np.ndarray:
+    """Returns the vertices that something has changed at, in this mesh and another."""
+    return topology.touched(self.mesh, mesh, changed)
 
   def forget(self):
     """Forgets what the body's arrays hold: the material has changed."""
@@ -208,7 +218,13 @@ class Cuts:
 
   # Cutting.
 
-  def cut(self, points: np.ndarray, given: float = 0.0) -> Report:
+  def cut(
+    self,
+    points: np.ndarray,
+    given: float = 0.0,
+    depth: float | np.ndarray | None = None,
+    direction: np.ndarray | None = None,
+  ) -> Report:
     """Cuts the organ along points in the world, (n, 3) [m]; see `Organ.cut`, and `cutting.cut`."""
     w, organ = self._w, self._w.organ
     if not self:
@@ -216,21 +232,31 @@ class Cuts:
         f"organ {organ.name!r}: spare is 0, expected room for cuts: palpate.add_organ(..., spare=)"
       )
     self.follow()
-    organ, mesh = w.organ, self.mesh
+    organ = w.organ
     local = (np.asarray(points, float) - organ.origin) @ organ.frame
     u, v = w.phases.motion()
-    of_triangles = functools.partial(energy.of_triangles, w.config)
-    energies = of_triangles, self._held()
-    found = cutting.cut(organ.name, mesh, mesh.rest + u, local, ~organ.free, *energies, given)
+    found = self._find(local, u, given, depth, direction)
     if found.stopped:
       w.note(
-        f"the cut stops early: no spare vertices are left of {mesh.spare}; give the organ more"
+        f"the cut stops early: no spare vertices are left of {self.whole.spare}; give the organ "
+        "more"
       )
     report = self._report(found)
     if found.changed.size:
       self._take(found, u, v)
     self.reports.append(report)
     return report
+
+  def _find(self, points, u: np.ndarray, given: float, depth, direction) -> Any:
+    """Returns the cut along points in the organ's frame, see `cutting.cut`."""
+    w, organ, mesh = self._w, self._w.organ, self.mesh
+    if depth is not None or direction is not None:
+      raise ValueError(
+        f"organ {organ.name!r}: depth or direction is set, allowed only with elements='solid'"
+      )
+    of_triangles = functools.partial(energy.of_triangles, w.config)
+    energies = of_triangles, self._held()
+    return cutting.cut(organ.name, mesh, mesh.rest + u, points, ~organ.free, *energies, given)
 
   def _held(self) -> cutting.Held | None:
     """Returns what tells the energy of ties and bonds, None where there are none."""
@@ -261,39 +287,53 @@ class Cuts:
     w, old, mesh = self._w, self.mesh, found.mesh
     group, member = found.group, found.member
     mass, source = self.mass.copy(), self.source.copy()
-    area = topology.areas_of(mesh, member)
-    share = area / np.bincount(group, area, mesh.nvert)[group]
+    share, near = self._parts(found)
+    mass[group] = 0.0
     mass[member] = share * self.mass[group]
     source[member] = source[group]
     now, speed = u.copy(), v.copy()
     now[found.moved] = np.einsum("nk,nkj->nj", found.weight, u[found.corner])
-    near = topology.distinct(old.elem[found.changed])
     near = near[w.organ.free[near]]
     was, goes = (old.rest + u)[near], (mesh.rest + now)[near]
     speed[near] = _keep_spin(self.mass[near], was, goes, v[near])
     now[member], speed[member] = now[group], speed[group]
     for each in w.beside:
       each.carry(group, member, share)
-    corner = flexes.pack(mesh.elem, mesh.loose)
+    corner = self._corners(mesh)
     self._become(mesh, found.changed, mass, source, flexes.stamp(corner, mesh.rest, mass))
     self._write(corner)
     changed = topology.distinct(near, member)
     w.phases.carry(changed, now, speed, group, member, share)
     self.show()
 
+  def _parts(self, found) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the shares of what was one, and the vertices around what changes."""
+    area = topology.areas_of(found.mesh, found.member)
+    share = area / np.bincount(found.group, area, found.mesh.nvert)[found.group]
+    return share, topology.distinct(self.mesh.elem[found.changed])
+
+  def _corners(self, mesh: Mesh) -> np.ndarray:
+    """Returns what the plugin state has of the triangles."""
+    return flexes.pack(mesh.elem, mesh.loose)
+
   def pieces(self) -> list[Piece]:
     """Returns the parts that hang together, the largest first."""
-    mesh = self.mesh
+    mesh, size = self.mesh, self._sizes()
     label = topology.pieces(mesh)
-    area = topology.vertex_areas(mesh.rest, mesh.elem)
     held = topology.held_areas(mesh) > 0
     out = []
     for k in range(label.max() + 1):
       vert = np.flatnonzero(label == k)
-      volume = float(area[vert].sum() * self._w.config.thickness)
+      volume = float(size[vert].sum())
       mass = float(self._w.organ.mass[vert].sum())
-      out.append(Piece(vert, mass, volume, bool(held[vert].any())))
+      outer = vert[vert < mesh.nouter]
+      out.append(Piece(outer, mass, volume, bool(held[vert].any())))
     return sorted(out, key=lambda piece: -piece.mass)
+
+  def _sizes(self) -> np.ndarray:
+    """Returns the volume of the tissue at each vertex at rest [m^3], (nvert,)."""
+    area = topology.vertex_areas(self.mesh.rest, self.mesh.elem)
+    return area * self._w.config.thickness
 
 
 def _keep_spin(mass: np.ndarray, was: np.ndarray, now: np.ndarray, v: np.ndarray) -> np.ndarray:

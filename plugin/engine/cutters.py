@@ -169,12 +169,12 @@ class Cutters(Beside):
     values = {name: np.zeros((n, width)) for name, width in shapes.items()}
     values |= self._arrays | dict(
       nblade=n,
-      nelem=mesh.nelem,
+      nelem=mesh.whole.nelem,
       ahead=float(scheme.ahead),
       gain=scheme.gain(1.0, 0.0),
       edge=float(mesh.whole.edge_length),
       law=self._law(m),
-      elem=mesh.elem,
+      elem=mesh.elem[: mesh.whole.nelem],
       flat=mesh.rest,
       state=self.rows("blade", len(BLADE)),
       due=np.zeros(n),
@@ -195,7 +195,7 @@ class Cutters(Beside):
     """See `Beside`."""
     if self.fields is not None:
       mesh = self._w.organ.mesh
-      self.fields.elem.assign(mesh.elem)
+      self.fields.elem.assign(mesh.elem[: mesh.whole.nelem])
       self.fields.flat.assign(mesh.rest)
       self.fields.own.rest.assign(base(self._w.organ))
     return []

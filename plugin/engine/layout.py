@@ -15,6 +15,7 @@ from palpate.tissue.types import DIMS, doubles, struct
 
 MAX_WINDOWS = 64  # of an organ
 MAX_GEOMS = 32  # of a window
+WALLS = 4  # triangles that cuts of a solid may open, for one spare vertex
 TRAIL = 12  # points of the path of a blade that has not come apart yet
 
 
@@ -209,10 +210,10 @@ CONSTANTS = {
 class Topology:
   """The mesh of an organ with room for cuts, see `cuts`; zero before the first one."""
 
-  corner: doubles("ncorner")  # corners of each triangle, packed [-]
+  corner: doubles("ncorner")  # corners of each triangle, packed; of a wall its face + 1 [-]
   place: doubles("nplace", 3)  # rest position of each vertex, in the organ's frame [m]
   weight: doubles("nplace")  # its mass [kg]
-  source: doubles("nspare")  # what vertex each spare one comes from [-]
+  source: doubles("nspare")  # what vertex each spare one comes from; of a solid a corner + 1 [-]
   stamp: doubles("ncuts")  # of all these; 0 before the first cut [-]
 
 

@@ -397,10 +397,9 @@ def _check_spare(organ: str, config: Config):
     raise ValueError(f"organ {organ!r}: cutters is set, allowed only with spare, or bonds to free")
   if not config.spare:
     return
-  refused = {"elements": "solid", "carrier": OWN, "capsule_young": config.capsule_young or None}
-  for key, value in refused.items():
-    if getattr(config, key) == value:
-      raise ValueError(f"organ {organ!r}: {key} is {value!r}, allowed only where spare is 0")
+  for key, text in (("carrier", OWN), ("capsule_young", config.capsule_young or None)):
+    if getattr(config, key) == text:
+      raise ValueError(f"organ {organ!r}: {key} is {text!r}, allowed only where spare is 0")
 
 
 def _check_ties(organ: str, config: Config):

@@ -146,9 +146,32 @@ def solid(mesh: Mesh, config: Config, u: np.ndarray) -> float:
   swelling += (h[:, 0] * cofactor[:, 0]).sum(axis=1)
   mu, lam, averaged = solids.moduli(mesh, config)
   own = mu / 2 * (i - np.log1p(i / 4)) - 3 / 4 * mu * swelling + lam / 2 * swelling**2
-  mean = fill.vertex_volumes(mesh, swelling) / fill.vertex_volumes(mesh)
+  share = fill.vertex_volumes(mesh)
+  mean = fill.vertex_volumes(mesh, swelling) / np.where(share > 0, share, 1.0)  # some wait for cuts
   stiffness = fill.vertex_volumes(mesh, averaged)
   return float((volume * own).sum() + 0.5 * (stiffness * mean**2).sum())
+
+
+def of_tets(
+  mesh: Mesh, config: Config, rest: np.ndarray, u: np.ndarray, which: np.ndarray
+) -> np.ndarray:
+  """Returns the energy of tetrahedra by themselves [J], (n,): without means over nodes.
+
+  Args:
+    mesh: the solid
+    config: material
+    rest: their corners at rest [m]             (n, 4, 3)
+    u: displacement of these [m]                (n, 4, 3)
+    which: their numbers                        (n,)
+  """
+  arm = rest[:, 1:] - rest[:, :1]
+  h = np.einsum("nkj,nik->nji", u[:, 1:] - u[:, :1], np.linalg.inv(arm))
+  size = (h * h).sum(axis=(1, 2))
+  i = 2 * np.trace(h, axis1=1, axis2=2) + size
+  j = np.linalg.det(np.eye(3) + h) - 1
+  mu, lam, averaged = (each[which] for each in solids.moduli(mesh, config))
+  own = mu / 2 * (i - np.log1p(i / 4)) - 3 / 4 * mu * j + (lam + averaged) / 2 * j**2
+  return np.linalg.det(arm) / 6 * own
 
 
 # The terms of the energy: (mesh, config, displacement) -> [J], 0 where a term is off.

@@ -106,12 +106,14 @@ def node_order(mesh: Mesh, patch: int = 0) -> np.ndarray:
     patch: nodes of a block of threads that works on a patch of the surface, 0 for no patches
   """
   mesh = mesh.whole
-  n = mesh.nvert - mesh.spare
-  order = _patches(mesh.rest[:n], patch) if patch else _band(mesh)
-  order = order[order < n]
+  spare = np.arange(mesh.spares.start, mesh.spares.stop)
+  used = np.delete(np.arange(mesh.nvert), spare)
+  order = used[_patches(mesh.rest[used], patch)] if patch else _band(mesh)
+  order = order[~np.isin(order, spare)]
+  n = len(order)
   window = np.arange(n) // (8 * LANES)
   order = order[np.lexsort((np.arange(n), -mesh.degree[order], window))]
-  return np.concatenate([order, np.arange(n, mesh.nvert), np.full(-mesh.nvert % LANES, -1)])
+  return np.concatenate([order, spare, np.full(-mesh.nvert % LANES, -1)])
 
 
 def _patches(point: np.ndarray, size: int) -> np.ndarray:

@@ -18,6 +18,7 @@ _RIM = 0.5  # edges: a cut that ends closer to a boundary opens it
 _ALONG = 0.2  # edges from an older cut within which a path goes along it
 _BOX = 3.0  # edges from the path within which they are found sooner
 _FEW = 20_000  # pairs that are all compared
+_AROUND = 12  # triangles around a point of a solid's skin among which the nearest is
 _NEAR = 6  # vertices nearest to a point around which its triangle is looked for
 
 
@@ -123,6 +124,8 @@ def nearest(
   Returns:
     triangles (n,), weights of their corners (n, 3), distances [m] (n,)
   """
+  if len(mesh.tet):
+    return nearest_of(position, mesh.elem[: mesh.whole.nelem], points, mesh.whole.edge_length)
   near = _nearest_vertices(mesh, position[: mesh.nouter], points)
   around = mesh.ring_elem[near].reshape(len(points), -1)
   elem = np.where(around >= 0, around // 3, around.max(axis=1, keepdims=True) // 3)
@@ -131,6 +134,20 @@ def nearest(
   best = np.argmin(far, axis=1)
   row = np.arange(len(points))
   return elem[row, best], weight[row, best], far[row, best]
+
+
+def nearest_of(position: np.ndarray, elem: np.ndarray, points: np.ndarray, edge: float):
+  """Returns what `nearest` does of given triangles; `edge`: their edges' mean length [m]."""
+  low, high = points.min(axis=0) - _BOX * edge, points.max(axis=0) + _BOX * edge
+  corner = position[elem]
+  middle = corner.mean(axis=1)
+  box = np.flatnonzero(((middle >= low) & (middle <= high)).all(axis=1))
+  box = box if len(box) >= _AROUND else np.arange(len(elem))
+  near = box[_neighbours(middle[box], points, min(_AROUND, len(box)))[0]]
+  a, b, c = np.moveaxis(corner[near], 2, 0)
+  weight, far = closest(points[:, None], a, b, c)
+  best, row = np.argmin(far, axis=1), np.arange(len(points))
+  return near[row, best], weight[row, best], far[row, best]
 
 
 def _nearest_vertices(mesh: Mesh, position: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from . import config as configuration
-from . import plate
+from . import faces, plate
 from .config import Config
 from .mesh import Mesh
 from .order import LANES, offset
@@ -60,9 +60,11 @@ def room(mesh: Mesh) -> np.ndarray:
   A cut takes triangles from a fan and adds none; an open one has a neighbour more than triangles.
   """
   mesh = mesh.whole
+  if len(mesh.tet):
+    return faces.room(mesh)
   closes = mesh.ring_elem[np.arange(mesh.nvert), np.maximum(mesh.degree - 1, 0)] >= 0
   most = mesh.degree + (closes & (mesh.degree > 0))
-  most[mesh.nvert - mesh.spare :] = most.max()
+  most[mesh.spares] = most.max()
   return most
 
 

@@ -263,7 +263,7 @@ def _bend_room(mesh: Mesh, node: np.ndarray, entries: np.ndarray) -> np.ndarray:
   A node near the end of a cut has vertices of both its sides around it.
   """
   room = entries + np.where(entries > 0, _BEND_MORE, 0)
-  room[node[mesh.nvert - mesh.spare :]] = room.max()
+  room[node[mesh.spares]] = room.max()
   return room.reshape(-1, LANES).max(axis=1)
 
 

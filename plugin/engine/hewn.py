@@ -1,0 +1,139 @@
+"""Cuts of a solid: as those of a surface in `cuts`, by the faces between tetrahedra that are open.
+
+The plugin state has these faces, in the place of triangles that wait, and of each vertex that cuts
+have made a corner of a tetrahedron that it has: the rest follows, see `faces.restored`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import numpy as np
+from palpate.tissue import cleave, energy, faces, fill
+from palpate.tissue import mesh as topology
+from palpate.tissue.mesh import Mesh
+from palpate.tissue.resolid import SolidRefill
+
+from . import cuts, flexes
+from .cuts import Cuts
+
+
+def cuts_of(w) -> Cuts:
+  """Returns what cuts a workspace's organ."""
+  return (SolidCuts if len(w.organ.mesh.tet) else Cuts)(w)
+
+
+class SolidCuts(Cuts):
+  """The mesh of a workspace's solid; false where there is no room for cuts."""
+
+  def _made(self) -> SolidRefill:
+    return SolidRefill(self._w.body, self.whole)
+
+  def show(self):
+    """Gives the model the triangles of this organ's skin."""
+    if not self.shown:
+      self._elem[:] = self.mesh.elem[: self.whole.nelem]
+      self._mark[0] = self.stamp
+
+  def share(self, values: np.ndarray) -> np.ndarray:
+    """Returns values by mass, see `Cuts.share`; what comes from inside has them as the skin."""
+    was, skin = self.declared.mass, np.arange(self.whole.nouter)
+    skin = skin[was[skin] > 0]
+    usual = self.mass * float(np.median(values[skin] / was[skin]))
+    inside = self.source >= self.whole.nskin
+    out = np.where(inside, usual, super().share(values))
+    return np.where(self.mass > 0, out, values)
+
+  def _read(self) -> tuple:
+    whole, own, n = self.whole, self._own, self.whole.nelem
+    if not self._found[0]:
+      found = faces.grown(self.mesh, whole.rest, whole.tet, whole.of_tet)
+      return *found, self.declared.mass, np.arange(whole.nvert)
+    corner, rest, mass = own["corner"], own["place"].reshape(-1, 3).copy(), own["weight"].copy()
+    face, seat = (np.rint(np.clip(each[each > 0], 0, 2.0**52)).astype(np.int64) - 1
+                  for each in (corner[n:], own["source"]))  # fmt: skip
+    try:
+      if flexes.stamp(corner, rest, mass) != self._found[0]:
+        raise ValueError
+      tet = faces.restored(whole, rest, face, seat)
+    except ValueError:
+      raise ValueError(cuts.FOREIGN) from None
+    of_tet = np.concatenate([whole.of_tet, faces.corners(face)])
+    mesh, changed = faces.grown(self.mesh, rest, tet, of_tet)
+    if mesh is None:
+      raise ValueError(cuts.FOREIGN)
+    loose = np.append(flexes.unpack(corner[:n])[1], np.ones(len(face), bool))
+    source = np.arange(whole.nvert)
+    source[whole.spares][: len(seat)] = whole.tet.ravel()[seat]
+    self.seat = seat
+    return dataclasses.replace(mesh, loose=loose), changed, mass, source
+
+  def _write(self, corner: np.ndarray):
+    own, mesh = self._own, self.mesh
+    own["corner"][:] = corner
+    own["place"][:] = mesh.rest.ravel()
+    own["weight"][:] = self.mass
+    own["source"][:] = 0.0
+    own["source"][: len(self.seat)] = self.seat + 1
+    self._found[0] = self.stamp
+
+  def _corners(self, mesh: Mesh) -> np.ndarray:
+    out, n = np.zeros_like(self._own["corner"]), self.whole.nelem
+    out[:n] = flexes.pack(mesh.elem[:n], mesh.loose[:n])
+    face = faces.opened(mesh)
+    out[n : n + len(face)] = face + 1
+    return out
+
+  def _touched(self, mesh: Mesh, changed: np.ndarray) -> np.ndarray:
+    return topology.distinct(self.mesh.tet[changed], mesh.tet[changed])
+
+  def _find(self, points, u: np.ndarray, given: float, depth, direction) -> cleave.Cut:
+    w, organ, mesh = self._w, self._w.organ, self.mesh
+    if direction is not None:
+      direction = np.asarray(direction, float) @ organ.frame
+    found = cleave.cut(
+      organ.name,
+      mesh,
+      mesh.rest + u,
+      points,
+      ~organ.free,
+      depth,
+      direction,
+      functools.partial(energy.of_tets, mesh, w.config),
+      given,
+      len(self._own["corner"]),
+    )
+    return dataclasses.replace(found, mesh=_freed(found.mesh))
+
+  def _parts(self, found: cleave.Cut) -> tuple[np.ndarray, np.ndarray]:
+    new = found.member >= self.whole.nouter
+    fresh = found.member[new & (found.member >= self.mesh.nouter)]
+    seat = np.zeros(found.mesh.nouter - self.whole.nouter, np.int64)
+    kept = self.seat if self.mesh.uncut is not None else np.zeros(0, np.int64)
+    seat[: len(kept)] = kept
+    seat[found.member[new] - self.whole.nouter] = found.seat[new]
+    self.seat = seat
+    assert len(fresh) == found.mesh.nouter - self.mesh.nouter
+    return found.share, topology.distinct(self.mesh.tet[found.changed])
+
+  def _report(self, found: cleave.Cut) -> cuts.Report:
+    organ = self._w.organ
+    path = [organ.origin + line @ organ.frame.T for line in found.path]
+    nodes = found.mesh.nouter - self.mesh.nouter
+    return cuts.Report(
+      found.length, found.area, path, found.deviation, nodes, found.stopped, found.depth
+    )
+
+  def _sizes(self) -> np.ndarray:
+    return fill.vertex_volumes(self.mesh)
+
+
+def _freed(mesh: Mesh) -> Mesh:
+  """Returns the solid with the triangles of its skin marked that the foundation let go of."""
+  if mesh.uncut is None:
+    return mesh
+  n = mesh.whole.nelem
+  skin = dataclasses.replace(mesh, elem=mesh.elem[:n], loose=mesh.loose[:n])
+  loose = np.append(topology.come_loose(skin).loose, mesh.loose[n:])
+  return dataclasses.replace(mesh, loose=loose)
