@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 
 from .engine import plugin as engine
-from .engine.layout import MAX_GEOMS
+from .engine.layout import MAX_GEOMS, WALLS
 
 # Slots of a window: from so few up to so many, unless told.
 _LEAST, _MOST = 16, 256
@@ -24,6 +24,8 @@ _TOOL = (0.0025, 0.02)
 # Of a slot's body; it does not turn, and is lighter than any node.
 _INERTIA, _SHARE = 1e-8, 0.01
 _KEY_FIELDS = {"qpos": 0, "qvel": 1}  # columns of `_layout`
+INSIDE = (0.5, 0.13, 0.12, 1.0)  # colour of the walls of cuts in a solid
+_THIN = 1e-4  # of the flex that draws them [m]
 _WINDOW_GROUP = 4  # drawn by nobody who does not ask for it
 
 
@@ -114,7 +116,37 @@ def add_spare(spec: mujoco.MjSpec, organ: str, spare: int):
     vertbody.append(f"{organ}_spare_{k}" if own else vertbody[0])
   more = np.zeros((spare, 3)) + (0.0 if own else middle)
   flex.vert, flex.vertbody = np.concatenate([points, more]).ravel(), vertbody
-  plugin.config = {k: v for k, v in plugin.config.items() if v} | {"spare": str(spare)}
+  config = {k: v for k, v in plugin.config.items() if v} | {"spare": str(spare)}
+  if config.get("elements") == "solid":
+    above = own[0].parent if own else bodies[vertbody[0]]
+    config["walls"] = add_walls(spec, above, organ, len(vertbody), spare, INSIDE)
+  plugin.config = config
+
+
+def add_walls(spec, body, organ: str, nvert: int, spare: int, rgba: Sequence[float]) -> str:
+  """Adds the flex that draws a solid's walls where it is cut, and returns its name.
+
+  Args:
+    spec: changed in place
+    body: of the organ
+    organ: its name
+    nvert: number of its vertices, with spare ones
+    spare: of these
+    rgba: colour
+  """
+  name = f"{organ}_inside"
+  if spec.flex(name) is not None:
+    raise ValueError(f"organ {organ!r}: the spec has a flex {name!r} already")
+  if np.shape(rgba) != (4,):
+    raise ValueError(f"organ {organ!r}: inside is {rgba}, expected four numbers")
+  own = body.add_body(name=name)
+  elem = np.tile([0, 1, 2], (WALLS * spare, 1))  # others when there are some
+  points = np.zeros((nvert, 3))
+  flex = make_flex(spec, name, points, [name] * nvert, elem, rgba=np.asarray(rgba, float))
+  flex.contype = flex.conaffinity = 0
+  flex.selfcollide, flex.radius = mujoco.mjtFlexSelf.mjFLEXSELF_NONE, _THIN
+  flex.edgedamping = 0.0
+  return name
 
 
 def find_organ(spec: mujoco.MjSpec, organ: str):

@@ -216,6 +216,12 @@ class Cuts:
       self._rim[:] = np.stack([topology.corners(self.mesh, self._border, k) for k in (0, 1)], 1)
       self._mark[0] = self.stamp
 
+  def draw(self, model: int, data: int):
+    """Writes what is drawn besides these triangles."""
+
+  def hide(self, model: int):
+    """Hides it again, after a picture."""
+
   # Cutting.
 
   def cut(

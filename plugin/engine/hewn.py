@@ -17,6 +17,7 @@ from palpate.tissue.resolid import SolidRefill
 
 from . import cuts, flexes
 from .cuts import Cuts
+from .walls import Walls
 
 
 def cuts_of(w) -> Cuts:
@@ -26,6 +27,18 @@ def cuts_of(w) -> Cuts:
 
 class SolidCuts(Cuts):
   """The mesh of a workspace's solid; false where there is no room for cuts."""
+
+  def __init__(self, w):
+    super().__init__(w)
+    self.walls = Walls(w)
+
+  def draw(self, model: int, data: int):
+    """Writes what is drawn of the walls of cuts."""
+    self.walls.draw(model, data)
+
+  def hide(self, model: int):
+    """Hides it again."""
+    self.walls.hide(model)
 
   def _made(self) -> SolidRefill:
     return SolidRefill(self._w.body, self.whole)

@@ -190,6 +190,12 @@ class Config:
     "vertices without triangles, after the others, that cuts make use of ([cutting](cutting.md)); "
     "`auto`: as many as there are; `add_organ` and `add_spare` make them",
   )
+  walls: str = _row(
+    "",
+    (reading.name, "the name of a flexcomp"),
+    "with `spare`, of a solid: flexcomp that is drawn where it was cut open, in its own colour "
+    "(`add_organ` makes it)",
+  )
   tear: float = _row(
     0.0,
     reading.NOT_NEGATIVE,
