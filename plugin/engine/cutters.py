@@ -29,6 +29,10 @@ _FIRST, _LAST, _FARTHER = 0.9, 0.3, 0.15
 # Share of the work on an edge that moving a vertex may turn into strain: without it none could move
 # on to the blade's path, where tissue is stretched.
 _GIVEN = 0.1
+_PIERCED = 0.001  # how deep a blade is in a solid before it cuts along it [m]
+# Edges of a path in a solid that are cut again with what follows: the end of a cut is not even.
+_AGAIN, _BEHIND = 1.0, 0.5  # and that stay whole behind the blade
+_FLAT = 0.3  # cosine of a blade to the normal under which the cut goes along that
 _ROUND = (int(mujoco.mjtGeom.mjGEOM_CAPSULE), int(mujoco.mjtGeom.mjGEOM_CYLINDER))
 _BOX = int(mujoco.mjtGeom.mjGEOM_BOX)
 
@@ -141,17 +145,19 @@ class Cutters(Beside):
   def _law(self, m) -> np.ndarray:
     """Returns the rows of `Blades.law`."""
     w, rows = self._w, []
+    solid, edge = w.config.elements == "solid", w.organ.mesh.whole.edge_length
+    wall = _PIERCED if solid else w.config.thickness
     for i, row in enumerate(w.config.cutters):
-      force = row.energy * w.config.thickness
+      force = row.energy * (1.0 if solid else wall)  # of a solid by depth
       if row.current:
-        rows.append((0.0, 0.0, 0.0, w.config.thickness))
+        rows.append((0.0, 0.0, 0.0, wall, solid))
         continue
-      stiff = force / (_SLACK * w.organ.mesh.whole.edge_length)
+      stiff = force * (edge if solid else 1.0) / (_SLACK * edge)
       for g in self._arrays["geom"][i]:
         if g >= 0:
           body = int(mjstruct.view(m.geom_bodyid, m.ngeom, np.int32)[g])
           stiff = min(stiff, fasten.most(w, m, body))
-      rows.append((force, row.energy * self._width[i], stiff, w.config.thickness))
+      rows.append((force, row.energy * self._width[i], stiff, wall, solid))
     return np.array(rows)
 
   @property
@@ -208,7 +214,10 @@ class Cutters(Beside):
     for i, due in enumerate(self._due):
       if due:
         given = _GIVEN * self.fields.law.numpy()[i, LAW.force] * mesh.whole.edge_length
-        opened = self._open(self.state[i], due == _ENDED, given) or opened
+        if len(mesh.tet):
+          opened = self._open_inward(i, due == _ENDED, given) or opened
+        else:
+          opened = self._open(self.state[i], due == _ENDED, given) or opened
         self._due[i] = 0
     return opened
 
@@ -223,6 +232,7 @@ class Cutters(Beside):
     start, last = (row[k : k + 3] for k in (BLADE.trail, BLADE.trail + 3 * (count - 1)))
     if count < TRAIL and np.linalg.norm(at - last) > _SPACING * edge:
       row[BLADE.trail + 3 * count : BLADE.trail + 3 * count + 3] = at
+      row[BLADE.below + count] = row[BLADE.depth]
       row[BLADE.count] += 1
     wait = row[BLADE.wait] or _BATCH * edge
     return int(np.linalg.norm(at - start) > wait or row[BLADE.count] == TRAIL)
@@ -241,14 +251,7 @@ class Cutters(Beside):
     path, rest = np.vstack([trail, at]), at[None]
     if not ended:
       path, rest = _part(mesh, path)
-    report, pinned = None, False
-    try:
-      report = w.cuts.cut(self._now(mesh, path), given) if len(path) > 1 else None
-    except ValueError as error:
-      pinned = "pinned" in str(error)
-      if pinned and not self._said:
-        self._said = True
-        mjstruct.warn(str(error))
+    report, pinned = self._cut(path, given)
     if ended:
       row[BLADE.count] = 0
     elif report is None:
@@ -260,6 +263,60 @@ class Cutters(Beside):
       row[BLADE.trail : BLADE.trail + trail.size] = trail.ravel()
       row[BLADE.elem] = paths.nearest(w.organ.mesh, w.organ.mesh.rest, at[None])[0][0]
     return report is not None and report.nodes > 0
+
+  def _cut(self, path: np.ndarray, given: float, **inward) -> tuple[Any, bool]:
+    """Cuts along a path at rest; returns what came of it, if anything, and whether it is pinned."""
+    w, pinned = self._w, False
+    try:
+      if len(path) > 1:
+        return w.cuts.cut(self._now(w.organ.mesh, path), given, **inward), False
+    except ValueError as error:
+      pinned = "pinned" in str(error)
+      if pinned and not self._said:
+        self._said = True
+        mjstruct.warn(str(error))
+    return None, pinned
+
+  def _open_inward(self, i: int, ended: bool, given: float) -> bool:
+    """Opens the path of a blade in a solid, as deep as it was there; see `_open`."""
+    row, edge = self.state[i], self._w.organ.mesh.whole.edge_length
+    count, at = int(row[BLADE.count]), row[BLADE.at : BLADE.at + 3].copy()
+    trail = row[BLADE.trail : BLADE.trail + 3 * count].reshape(-1, 3)
+    path = np.vstack([trail, at])
+    deep = np.append(row[BLADE.below : BLADE.below + count], row[BLADE.depth])
+    left = np.append(np.cumsum(np.linalg.norm(np.diff(path[::-1], axis=0), axis=1))[::-1], 0.0)
+    goes = path, np.maximum(deep, _PIERCED)
+    if not ended:  # what is just behind the blade stays whole
+      goes = _until(*goes, left - _BEHIND * edge)
+    way = self._inward(i, row)
+    report, pinned = self._cut(goes[0], given * deep.mean(), depth=goes[1], direction=way)
+    if ended:
+      row[BLADE.count] = 0
+    elif report is None:
+      self._wait(row, at, pinned or count == TRAIL)
+    else:
+      first = min(int((left[:-1] > (_BEHIND + _AGAIN) * edge).sum()), count - 1)
+      kept, below = trail[first:].copy(), deep[first:count].copy()
+      row[BLADE.count] = len(kept)
+      row[BLADE.wait] = np.linalg.norm(at - kept[0]) + edge
+      row[BLADE.elem] = paths.nearest(self._w.organ.mesh, self._w.organ.mesh.rest, at[None])[0][0]
+      row[BLADE.trail : BLADE.trail + kept.size] = kept.ravel()
+      row[BLADE.below : BLADE.below + len(below)] = below
+    return report is not None and report.nodes > 0
+
+  def _inward(self, i: int, row: np.ndarray) -> np.ndarray:
+    """Returns the unit vector along a blade into the tissue, in the world."""
+    w, organ, mesh = self._w, self._w.organ, self._w.organ.mesh
+    corner = (mesh.rest + w.phases.motion()[0])[mesh.elem[int(row[BLADE.elem])]]
+    normal = organ.frame @ np.cross(corner[1] - corner[0], corner[2] - corner[0])
+    normal /= np.linalg.norm(normal)
+    if i in self._currents or self._arrays["geom"][i, 1] >= 0:
+      return -normal
+    m, d = mjstruct.Model.from_address(w.model), mjstruct.Data.from_address(w.data)
+    mat = mjstruct.view(d.geom_xmat, (m.ngeom, 3, 3))[self._arrays["geom"][i, 0]]
+    axis = mat[:, self._arrays["axis"][i, 0]]
+    level = axis @ normal
+    return -normal if abs(level) < _FLAT else -np.sign(level) * axis
 
   def _now(self, mesh, path: np.ndarray) -> np.ndarray:
     """Returns where points of the rest shape are in the world."""
@@ -312,6 +369,16 @@ def _part(mesh, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
   k = int(np.searchsorted(arc, way[stop]))
   end = point[stop][None]
   return np.vstack([path[:k], end]), np.vstack([path[k:]])
+
+
+def _until(path: np.ndarray, depth: np.ndarray, left: np.ndarray):
+  """Returns a path and its depths up to where nothing is left, (n, 3) and (n,)."""
+  k = int((left > 0).sum())
+  if not 0 < k < len(path):
+    return path[:k], depth[:k]
+  share = left[k - 1] / (left[k - 1] - left[k])
+  ends = [x[k - 1] + share * (x[k] - x[k - 1]) for x in (path, depth)]
+  return np.vstack([path[:k], ends[0]]), np.append(depth[:k], ends[1])
 
 
 def _name(m, geom: int) -> str:

@@ -162,7 +162,7 @@ BOND = Numbers(
 BLADE = Numbers(
   "BLADE",
   ("stage", 1, "-", "0 away, 1 at the surface, 2 through the wall"),
-  ("depth", 1, "m", "how far it has pierced the wall"),
+  ("depth", 1, "m", "how far it has pierced the wall, or is in a solid"),
   ("elem", 1, "-", "triangle of its seat"),
   ("at", 3, "m", "its seat"),
   ("toward", 3, "-", "which way it cut last, 0 before"),
@@ -171,15 +171,17 @@ BLADE = Numbers(
   ("wait", 1, "m", "how far it goes before the mesh comes apart"),
   ("count", 1, "-", "points of `trail`"),
   ("trail", 3 * TRAIL, "m", "its path since the mesh came apart"),
+  ("below", TRAIL, "m", "how deep it was there in a solid"),
 )
 
 # What a geom that cuts meets.
 LAW = Numbers(
   "LAW",
-  ("force", 1, "N", "to cut, along the surface"),
+  ("force", 1, "N", "to cut, along the surface; of a solid by depth [N/m]"),
   ("pierce", 1, "N", "to pierce the wall, along the blade"),
   ("stiffness", 1, "N/m", "of the spring to its seat"),
-  ("wall", 1, "m", "thickness of the wall"),
+  ("wall", 1, "m", "thickness of the wall; of a solid how deep a blade is before it cuts along"),
+  ("solid", 1, "-", "whether it is a solid"),
 )
 
 # The last numbers of the plugin state of a windowed organ.

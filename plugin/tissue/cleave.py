@@ -24,7 +24,8 @@ from .sheet import Sheet, Where, sweep
 _WIDE = 1.5  # edges inside from the sheet within which tetrahedra are looked at
 _ON = 0.02  # edges within which a vertex is on it
 _FLAT = 0.05  # cost of a face on the sheet, by area; one an edge away costs 1
-_LEAST = 0.8  # edges that a cut is deep at least: mostly a tetrahedron
+_LEAST = 0.3  # edges that a path is deep at least for one tetrahedron to come apart all through
+_BESIDE = 0.75  # edges of the skin from the sheet within which its vertices are at the mouth
 _FEWER = 0.85  # share of the faces that is tried where there is no room for all
 _FINE = 1e4  # of costs as whole numbers
 _MOUTH = 0.6  # edges below the path down to which an edge of the skin is at the mouth of a cut
@@ -163,8 +164,14 @@ def _between(mesh: Mesh, sheet: Sheet) -> tuple[np.ndarray, Where]:
   off = off[near]
   low = where.deep[mesh.tet[near]].mean(axis=1)
   past = where.past[mesh.tet[near]].mean(axis=1)
-  short = max(0.0, _LEAST * edge - float(lengths(sheet.end - sheet.begin).max()))
-  inside = (low <= short) & (past <= 0)
+  reach = float(lengths(sheet.end - sheet.begin).max())
+  low = low <= 0
+  if reach > _LEAST * edge:  # all around the mouth, so that it opens
+    skin = mesh.whole.edge_length
+    mouth = (np.abs(where.off) < _BESIDE * skin) & (where.deep + reach < _MOUTH * skin)
+    mouth[mesh.nskin :] = False
+    low |= mouth[mesh.tet[near]].any(axis=1)
+  inside = low & (past <= 0)
   near, off = near[inside], off[inside]
   left, right = off.max(axis=1) <= _ON * edge, off.min(axis=1) >= -_ON * edge
   flat = left & right
