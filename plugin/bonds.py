@@ -112,7 +112,7 @@ class Bonds:
   @property
   def force(self) -> np.ndarray:
     """Force of each on its vertex in the last step, in the world [N], (n, 3)."""
-    return self._written("force")
+    return self._written("pull")
 
   def _written(self, name: str) -> np.ndarray:
     parts = [group.arrays[name].numpy()[: len(group.vert)] for group in self._groups]

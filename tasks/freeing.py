@@ -7,7 +7,7 @@ import numpy as np
 from .base import Physics, Task
 from .scenes import Scene
 
-_SEEN = 1e-6  # what rounding may take from a share
+SEEN = 1e-6  # what rounding may take from a share
 
 
 class Freeing(Task):
@@ -58,9 +58,9 @@ class Freeing(Task):
     elif more > 0:
       self.torn += more
       self.event(physics, "slip", more, "torn")
-    if self.clean >= self.wanted - _SEEN:
+    if self.clean >= self.wanted - SEEN:
       self.outcome = "success"
-    elif self.torn > 1.0 - self.wanted + _SEEN:
+    elif self.torn > 1.0 - self.wanted + SEEN:
       self.harm_done(physics, f"torn off: {100 * self.torn:.0f} %")
     elif self.traction > 2 * self.limit:
       self.harm_done(physics, f"torn by a pull of {self.traction:.2f} N")

@@ -115,7 +115,8 @@ class Exercise(gymnasium.Env):
     self._recorder = None
     if self._record:
       self._recorder = Recorder(
-        ["instrument"], self._task.settings(), self._task.watch,
+        [hand.prefix.rstrip("/") for hand in self._physics.hands],
+        self._task.settings(), self._task.watch,
         substeps=episode.substeps(self.environment),
       )  # fmt: skip
       for name, value in self._task.constants(self._physics).items():

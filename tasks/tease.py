@@ -38,6 +38,7 @@ SCENE = Scene(
 # [m/s]. Back faster, the tip leaves what it held up, and the strip falls on the shaft behind it.
 _OVER, _BEHIND, _BEYOND, _LANE = 0.002, 0.006, 0.006, 0.006
 _SPEED, _BACK = 0.03, 0.015
+ROW = 0.5 * _LANE  # bonds of the front are no farther from the first of them [m]
 
 
 @SUITE.add("benchmarking", "easy")
@@ -115,7 +116,7 @@ class Tease(Freeing):
     bonds = physics.organ.bonds
     holds = ~bonds.free
     where = bonds.positions[holds if holds.any() else slice(None)]
-    row = where[where[:, 1] < where[:, 1].min() + 0.5 * _LANE]
+    row = where[where[:, 1] < where[:, 1].min() + ROW]
     return np.array([0.0, row[:, 1].min(), row[:, 2].mean()])
 
   def distance(self, physics: Physics) -> float:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import mujoco
 import numpy as np
 import warp as wp
+
+if TYPE_CHECKING:
+  from .bonds import Bonds
 
 
 class Batch(abc.ABC):
@@ -353,6 +356,11 @@ class Tissue(abc.ABC):
   def contacts(self) -> Contacts:
     """Contacts of the last step; on a GPU alone, on the CPU they are in `Batch.datas`."""
     raise ValueError(f"organ {self.name!r}: contacts are in `batch.datas` on the CPU")
+
+  @property
+  @abc.abstractmethod
+  def bonds(self) -> Bonds:
+    """What it has grown on to."""
 
   @abc.abstractmethod
   def configure(self, mask=None, **keys):

@@ -13,7 +13,7 @@ from palpate.tissue import config as configuration
 from palpate.tissue import device as devices
 from palpate.tissue import order, shape, step
 
-from . import contacts, convex, kernels, patch, sliding
+from . import beside, contacts, convex, kernels, patch, sliding
 from .base import Contacts, Tissue, spread
 from .material import KEYS, MODULI, Material
 from .patch import launch
@@ -52,7 +52,12 @@ class Organ(Tissue):
     w: the plugin's workspace of the organ
     place: where the stripped model has its slots
     tools: geoms that they follow
+
+  Attributes:
+    beside: what acts on it beside its tissue
   """
+
+  beside: tuple[beside.Beside, ...] = ()
 
   def __init__(self, batch, w, place: Slots, tools: np.ndarray):
     organ, device, nworld = w.organ, batch.device, batch.nworld
@@ -126,7 +131,8 @@ class Organ(Tissue):
     """Returns about how many bytes a world takes of the organ of a workspace."""
     there = dataclasses.replace(w.body, device=device)
     alone = dataclasses.replace(w.body, levels=None, plan=plan_of(there, w.organ.config))
-    return bodies.nbytes(alone) + 44.0 * w.organ.mesh.nvert
+    held = 24.0 + 160.0 if any(w.beside) else 0.0  # of springs beside the tissue
+    return bodies.nbytes(alone) + (44.0 + held) * w.organ.mesh.nvert
 
   # Within a step.
 
@@ -143,6 +149,10 @@ class Organ(Tissue):
     p = self.patch
     self._over(patch.tell_tools, max(1, p.ntool))
     self._over(patch.enter, p.nnode)
+    if self.body.state.hold.size:
+      self.body.state.hold.zero_()
+    for each in self.beside:
+      each.enter()
     self._over(patch.rank, p.most)
     self._over(patch.stand, max(p.most, p.nslot))
     self._scheme.step(self.body)
@@ -162,6 +172,8 @@ class Organ(Tissue):
     self._over(patch.push, self.place.nslot)
     dim = self._pressed.geom.shape
     wp.launch(sliding.keep_closed, dim=dim, inputs=[self._pressed], device=self.body.device)
+    for each in self.beside:
+      each.act()
 
   def end(self):
     """Ends the step with the contact forces that mujoco_warp found."""
@@ -174,6 +186,8 @@ class Organ(Tissue):
       respond(self.body)
       self._over(patch.follow, 1)
     self._over(patch.commit, self.patch.nnode)
+    for each in self.beside:
+      each.end()
 
   def find_bad(self):
     """Flags worlds that are not finite."""
@@ -182,6 +196,8 @@ class Organ(Tissue):
   def rest(self):
     """Puts the worlds of the mask at rest."""
     self._over(patch.rest, self.patch.nnode)
+    for each in self.beside:
+      each.rest()
 
   def wake(self, worlds):
     """Lets the organ of some worlds step that may have slept."""
@@ -200,6 +216,11 @@ class Organ(Tissue):
   def _out(self) -> dict[str, wp.array]:
     shape = (self._batch.nworld, self.nvert)
     return {name: wp.zeros(shape, dtype=wp.vec3, device=self.body.device) for name in _WHAT}
+
+  @functools.cached_property
+  def bonds(self) -> beside.Grown:
+    """What it has grown on to."""
+    return beside.Grown(self)
 
   def _read(self, name: str) -> wp.array:
     if name in _STATUS:

@@ -6,6 +6,7 @@ worlds is gathered on the first device; `parts` have theirs in place.
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Sequence
 from typing import Any
@@ -15,6 +16,7 @@ import numpy as np
 import warp as wp
 
 from .base import Batch, Contacts, Tissue, on_device, spread
+from .bonds import Gathered
 from .worlds import Worlds
 
 
@@ -177,6 +179,11 @@ class _Gathered(Tissue):
 
   def _read(self, name: str) -> wp.array:
     return self._gather(name, [getattr(part, name) for part in self._parts])
+
+  @functools.cached_property
+  def bonds(self) -> Gathered:
+    """What it has grown on to."""
+    return Gathered(self._batch, [part.bonds for part in self._parts])
 
   @property
   def contacts(self) -> Contacts:

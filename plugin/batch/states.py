@@ -115,6 +115,8 @@ def _pull_organ(organ: Organ, world: int, model, data):
     own[spans["tail"]] = 0.0
     own[spans["tail"].start + TAIL.heavier] = heavier
     _pull_slots(organ, world, own, spans, force)
+  for kept in (kept for each in organ.beside for kept in each.kept):
+    kept.of(own, spans)[kept.rows] = kept.array[world].numpy()
   own[spans["signature"]] = declared.signature
 
 
@@ -168,6 +170,7 @@ def keep(batch, start, data: mujoco.MjData):
       name: getattr(organ.patch, name) for name in ("force", "heavier", "calm")
     }
     pairs += [(array, getattr(organ.patch, f"{name}0")) for name, array in own.items()]
+    pairs += [(kept.flat, kept.start) for each in organ.beside for kept in each.kept]
   # The first world has it for a moment.
   changed = [array for array, _ in pairs] + [d.ctrl, d.time, d.qacc_warmstart]
   saved = [(array, wp.clone(array[:1])) for array in changed if array.size]
@@ -213,3 +216,5 @@ def _push_organ(organ: Organ, world: int, model, data):
   _assign(organ.patch.force, world, full)
   for array, value in ((organ.patch.heavier, heavier), (organ.patch.calm, calm)):
     array[world : world + 1].assign(np.array([value]))
+  for kept in (kept for each in organ.beside for kept in each.kept):
+    _assign(kept.array, world, kept.of(own, spans)[kept.rows])

@@ -45,7 +45,7 @@ def tools_of(model: mujoco.MjModel, organ) -> np.ndarray:
   Raises:
     ValueError: one is not a tool that a batch knows, or it is not an organ that it can step.
   """
-  for key in ("carrier", "attach", "bonds", "support", "relax_share", "spare"):
+  for key in ("carrier", "relax_share", "spare"):
     if getattr(organ.config, key):
       raise ValueError(
         f"organ {organ.name!r}: {key} is set, which a batch on a GPU cannot do; expected none"
@@ -115,9 +115,11 @@ def strip(
   for key in list(bare.keys):
     bare.delete(key)
   bodies = {body.name: body for body in bare.bodies}
-  _take_plugins(bare)
+  instances = _release_plugins(bare)
   for organ in organs:
     _take_out(bare, bodies, organ, model)
+  for instance in instances:  # at last: bodies are not deleted safely without
+    bare.delete(instance)
   masses = [_slot_mass(organ) for organ in organs]
   for organ, nslot, mass in zip(organs, nslots, masses, strict=True):
     _add_slots(bare, organ, nslot, mass, model)
@@ -147,14 +149,13 @@ def strip(
   return made, slots
 
 
-def _take_plugins(bare):
-  """Deletes the instances of the plugin, first from the bodies that refer to them."""
+def _release_plugins(bare) -> list:
+  """Returns the instances of the plugin, which no body refers to from now on."""
   mine = [b for b in bare.bodies if b.plugin.active and b.plugin.plugin_name == mjstruct.NAME]
-  instances = {body.plugin.name: body.plugin for body in mine}
+  numbers = {body.plugin.id for body in mine}  # some have no name
   for body in mine:
     body.plugin.active = False
-  for instance in instances.values():
-    bare.delete(instance)
+  return [instance for instance in bare.plugins if instance.id in numbers]
 
 
 def _check_option(option):

@@ -16,6 +16,7 @@ from palpate.organ import Organ, instances
 from palpate.tissue import body as bodies
 
 from .base import Batch, Tissue, refuse_crowd, spread
+from .bonds import OfThreads
 
 _FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
 _CTRL = mujoco.mjtState.mjSTATE_CTRL
@@ -171,6 +172,11 @@ class _Tissue(Tissue):
       name: wp.zeros(self._batch.nworld, dtype=float, device="cpu")
       for name in ("residual", "iterations")
     }
+
+  @functools.cached_property
+  def bonds(self) -> OfThreads:
+    """What it has grown on to."""
+    return OfThreads(self._batch, self.handles)
 
   def _read(self, name: str) -> wp.array:
     array = self._arrays[name]

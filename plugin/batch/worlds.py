@@ -19,7 +19,7 @@ from palpate.engine import plugin as engine
 from palpate.organ import instances
 from palpate.tissue import device as devices
 
-from . import contacts, convex, kernels, states, strip
+from . import beside, contacts, convex, kernels, states, strip
 from .base import Batch, Tissue, refuse_crowd
 from .organs import Organ
 from .rest import Rest
@@ -57,10 +57,11 @@ class Worlds(Batch):
       name: engine.find(self.scratch._address, number) for name, number in instances(model).items()
     }
     declared = [w.organ for w in spaces.values()]
+    beside.check(list(spaces.values()))
     tools = [strip.tools_of(model, organ) for organ in declared]
     nslots = [strip.slots_for(model, o, t, nodes) for o, t in zip(declared, tools, strict=True)]
     bare, slots = strip.strip(spec, model, declared, nslots)
-    self._kept = strip.kept(model, declared)
+    self._kept, self.bare = strip.kept(model, declared), bare
     with wp.ScopedDevice(target):
       self._put(bare, nslots, tools, deterministic, spaces)
       self._allocate()
@@ -71,7 +72,8 @@ class Worlds(Batch):
         name: Organ(self, w, s, t)
         for (name, w), s, t in zip(spaces.items(), slots, tools, strict=True)
       }
-      self._rest, self._bare = Rest(self, bare), bare
+      self._rest = Rest(self, bare)
+      self.aims = self._join()
       self._teller = states.Teller(self)
       self._alias()
       self._sensed: Any = kernels.Sensed()
@@ -129,6 +131,18 @@ class Worlds(Batch):
     gravity = np.tile(model.opt.gravity, (nworld, 1)).astype(np.float32)
     self.m.opt.gravity = wp.array(gravity, dtype=wp.vec3)
 
+  def _join(self) -> bool:
+    """Lets organs have what acts beside them; returns whether it asks where bodies are."""
+    organs = list(self._organs.values())
+    if not any(any(organ.space.beside) for organ in organs):
+      return False
+    self.bodies = beside.bodies_of(self)
+    numbers = beside.numbers_of(self.model, self.bare, [organ.declared for organ in organs])
+    for organ in organs:
+      organ.beside = beside.make(organ, numbers)
+    beside.meet(organs)
+    return any(each.aims for organ in organs for each in organ.beside)
+
   def _alias(self):
     """Lets controls, sensors and time be mujoco_warp's own arrays."""
     for name in ("ctrl", "sensordata", "time"):
@@ -150,6 +164,10 @@ class Worlds(Batch):
 
   def begin(self):
     """Launches the part of a step before mujoco_warp's."""
+    if self.aims:  # bodies are where the last step found them
+      mjw.kinematics(self.m, self.d)
+      mjw.com_pos(self.m, self.d)
+      mjw.com_vel(self.m, self.d)
     for organ in self._organs.values():
       organ.begin()
 
@@ -231,7 +249,7 @@ class Worlds(Batch):
 
   def _place(self, body: int, pos: np.ndarray, quat: np.ndarray, mask: wp.array):
     wp.copy(self.mask, mask)
-    self._rest.place(self._bare.body(self.model.body(body).name).id, pos, quat)
+    self._rest.place(self.bare.body(self.model.body(body).name).id, pos, quat)
     self._run("look")
 
   def _configure(self, worlds: np.ndarray, gravity: np.ndarray | None, friction: dict):
@@ -270,7 +288,7 @@ class Worlds(Batch):
   def xmat(self, body: str) -> wp.array:
     """Returns the axes of a body in the last step, (nworld,) of mat33."""
     found: Any = self.d.xmat
-    return found[:, self._bare.body(body).id]
+    return found[:, self.bare.body(body).id]
 
   @property
   def overflow(self) -> wp.array:

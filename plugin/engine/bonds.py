@@ -46,7 +46,8 @@ class Bonded:
   state: doubles("nfree", len(BOND))  # see BOND
   next: doubles("nbond", len(BOND))  # what it will be
   stretch: doubles("nbond", 3)  # how far it is from what it leads to [m]
-  force: doubles("nbond", 3)  # on the vertex, in the world [N]
+  force: doubles("nbond", 3)  # on the vertex as a step begins, in the world [N]
+  pull: doubles("nbond", 3)  # on the vertex, with what the step has changed of it [N]
   hardness: doubles("nbond")  # what its spring weighs on the change of its velocity [kg]
   own: Nodes
   solve: Input
@@ -56,9 +57,8 @@ class Bonded:
   mj: Bodies
 
 
-_stretch, _enter, _bear, _act, _keep = coupling.kernels(
-  "bonds.h", Bonded, "stretch_bonds", "enter_bonds", "bear_bonds", "act_bonds", "keep_bonds"
-)
+KERNELS = tuple(f"{verb}_bonds" for verb in ("stretch", "enter", "bear", "act", "feel", "keep"))
+_stretch, _enter, _bear, _act, _feel, _keep = coupling.kernels("bonds.h", Bonded, *KERNELS)
 
 
 @dataclasses.dataclass(eq=False)
@@ -106,7 +106,8 @@ class Group:
 
   def __post_init__(self):
     n = len(self.grip.vert) + self.own.organ.mesh.spare
-    shapes = {"next": (n, len(BOND)), "stretch": (n, 3), "force": (n, 3), "hardness": n}
+    shapes = {name: (n, 3) for name in ("stretch", "force", "pull")}
+    shapes |= {"next": (n, len(BOND)), "hardness": n}
     self.arrays = {k: wp.zeros(s, dtype=wp.float64, device="cpu") for k, s in shapes.items()}
     self.arrays["live"] = wp.ones(1, dtype=int, device="cpu")
     self._find()
@@ -260,6 +261,8 @@ class Bonds(Beside):
     """See `Beside`."""
     for group in self.groups:
       group.launch(_act)
+      if group.body != ON_ORGAN and group.bonded.restless:
+        group.launch(_feel)
 
   def end(self):
     """See `Beside`."""

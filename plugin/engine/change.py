@@ -78,6 +78,7 @@ def attach(w, model: int, vertices, to, stiffness: float | None) -> list[tuple[A
         f"organ {each.organ.name!r}: resident or integrator='neumann' is set, allowed only without "
         "attachments"
       )
+  _find_bodies(w)
   if isinstance(to, int):
     made = [fasten.to_body(w, vert, to, stiffness)]
   else:
@@ -129,11 +130,17 @@ def bond(w, model: int, to, name: str, law, near: float | None, vertices):
     raise ValueError(f"organ {organ!r}: a bond {error}") from None
   for each in [w] if isinstance(to, int) else [w, to]:
     workspace.attach(each, model)
+  _find_bodies(w)
   if isinstance(to, int):
     group = adhere.to_body(w, to, name, *how)
   else:
     group = adhere.to_organ(w, to, *how)
   _put(w, group)
+
+
+def _find_bodies(w):
+  """Brings up to date where bodies are: before a first step, or after one, they are not there."""
+  mjstruct.library().mj_kinematics(w.model, w.data)
 
 
 def _put(w, group: bonds.Group):

@@ -9,16 +9,15 @@ stamp too, so that several mjData of one model take turns.
 from __future__ import annotations
 
 import dataclasses
-import functools
 from typing import Any
 
 import numpy as np
 from palpate.tissue import body as bodies
 from palpate.tissue import cut as cutting
-from palpate.tissue import energy
 from palpate.tissue import mesh as topology
 from palpate.tissue.mesh import Mesh
 from palpate.tissue.refill import Refill
+from palpate.tissue.surface import WorkingCopy
 
 from . import coupling, flexes, graphs, mjstruct, turns
 from .bind import bind
@@ -84,19 +83,22 @@ class Cuts:
     if not self:
       return
     bodies.unshare(w.body)
-    self._refill = self._made()
+    self._make()
     self.declared = w.organ
     self.mass = w.organ.mass.copy()
     self.source = np.arange(self.whole.nvert)
     self._own: dict[str, np.ndarray] = {}
+    self._total: int | None = None  # that the stamp is made of, None for not known
+    self._loose: np.ndarray | None = None  # that of the mesh in the state then
     self.lock: Any = None  # held while the model's triangles are read or written
 
   def __bool__(self) -> bool:
     return self.whole.spare > 0
 
-  def _made(self) -> Any:
-    """Returns what writes meshes into the body's arrays."""
-    return Refill(self._w.body, self.whole)
+  def _make(self):
+    """Makes what finds cuts, and what writes meshes into the body's arrays."""
+    copy = WorkingCopy(self.whole)
+    self._refill, self._knife = Refill(self._w.body, copy), cutting.Knife(copy)
 
   @property
   def full(self) -> bool:
@@ -116,6 +118,7 @@ class Cuts:
     state, where = w.views["plugin_state"].numpy(), coupling.spans(w.organ)
     names = ("corner", "place", "weight", "source", "stamp")
     self._own = {name: state[where[name]] for name in names}
+    self._words = state[where["corner"].start : where["weight"].stop]
     self._found: Any = self._own["stamp"].data
     self.lock = turns.lock_of(model)
     self._elem = flexes.element_data(m, w.organ.flex)
@@ -141,7 +144,7 @@ class Cuts:
       return
     self._become(*self._read(), stamp=self._found[0])
     self.reports = []
-    self._fresh = True
+    self._fresh, self._total = True, None
 
   def _read(self) -> tuple:
     """Returns the mesh that the state has, what differs, masses, and where vertices come from."""
@@ -168,13 +171,25 @@ class Cuts:
     for name, values in kept.items():
       self._own[name][:] = values
 
-  def _write(self, corner: np.ndarray):
-    own, mesh = self._own, self.mesh
-    own["corner"][:] = corner
-    own["place"][:] = mesh.rest.ravel()
-    own["weight"][:] = self.mass
-    own["source"][:] = self.source[mesh.spares]
-    self._found[0] = self.stamp
+  def _write(self, found: Any):
+    """Writes to the state what a cut has changed, where it has the mesh before; else everything."""
+    own, mesh, n = self._own, self.mesh, self.whole.nvert
+    words, spare = self._words, mesh.nvert - mesh.spare
+    if self._total is None or mesh.loose is not self._loose:
+      words[:] = np.concatenate([flexes.pack(mesh.elem, mesh.loose), mesh.rest.ravel(), self.mass])
+      self._total = flexes.total(words, slice(None), len(words))
+    else:
+      elem, vert = found.changed, topology.distinct(found.before, mesh.elem[found.changed])
+      loose = None if mesh.loose is None else mesh.loose[elem]
+      place = (3 * vert[:, None] + np.arange(3)).ravel()
+      at = np.concatenate([elem, mesh.nelem + place, mesh.nelem + 3 * n + vert])
+      corner, rest = flexes.pack(mesh.elem[elem], loose), mesh.rest[vert].ravel()
+      new, old = np.concatenate([corner, rest, self.mass[vert]]), words[at]
+      self._total += flexes.total(new, at, len(words)) - flexes.total(old, at, len(words))
+      words[at] = new
+    own["source"][:] = self.source[spare:]
+    self._loose = mesh.loose
+    self.stamp = self._found[0] = flexes.stamp_of(self._total)
 
   def _become(self, mesh: Mesh, changed: np.ndarray, mass, source, stamp: float):
     w = self._w
@@ -182,7 +197,7 @@ class Cuts:
     touched = topology.distinct(touched, np.flatnonzero(mass != self.mass))
     self._refill.write(mesh, changed, w.config, ~w.organ.free)
     self.mass, self.source, self.stamp = mass, source, stamp
-    w.organ = dataclasses.replace(self.declared, mesh=mesh, mass=mass)
+    w.organ = self.declared.cut(mesh, mass)
     w.phases.reshape(touched)
     for grown in [space for each in w.beside for space in each.reshape()]:
       with graphs.lock:
@@ -224,13 +239,7 @@ class Cuts:
 
   # Cutting.
 
-  def cut(
-    self,
-    points: np.ndarray,
-    given: float = 0.0,
-    depth: float | np.ndarray | None = None,
-    direction: np.ndarray | None = None,
-  ) -> Report:
+  def cut(self, points: np.ndarray, given: float = 0.0, depth=None, direction=None) -> Report:
     """Cuts the organ along points in the world, (n, 3) [m]; see `Organ.cut`, and `cutting.cut`."""
     w, organ = self._w, self._w.organ
     if not self:
@@ -240,8 +249,8 @@ class Cuts:
     self.follow()
     organ = w.organ
     local = (np.asarray(points, float) - organ.origin) @ organ.frame
-    u, v = w.phases.motion()
-    found = self._find(local, u, given, depth, direction)
+    motion = cutting.Motion(self.mass, *w.phases.motion())
+    found = self._find(motion, local, given, depth, direction)
     if found.stopped:
       w.note(
         f"the cut stops early: no spare vertices are left of {self.whole.spare}; give the organ "
@@ -249,78 +258,53 @@ class Cuts:
       )
     report = self._report(found)
     if found.changed.size:
-      self._take(found, u, v)
+      self._take(found)
     self.reports.append(report)
     return report
 
-  def _find(self, points, u: np.ndarray, given: float, depth, direction) -> Any:
-    """Returns the cut along points in the organ's frame, see `cutting.cut`."""
-    w, organ, mesh = self._w, self._w.organ, self.mesh
+  def _find(self, motion: cutting.Motion, points, given: float, depth, direction) -> Any:
+    """Returns the cut along points in the organ's frame, see `cutting.Knife`."""
+    w, organ = self._w, self._w.organ
     if depth is not None or direction is not None:
       raise ValueError(
         f"organ {organ.name!r}: depth or direction is set, allowed only with elements='solid'"
       )
-    of_triangles = functools.partial(energy.of_triangles, w.config)
-    energies = of_triangles, self._held()
-    return cutting.cut(organ.name, mesh, mesh.rest + u, points, ~organ.free, *energies, given)
+    how = ~organ.free, w.config, self._held(), given
+    return self._knife.cut(organ.name, self.mesh, motion, points, *how)
 
-  def _held(self) -> cutting.Held | None:
-    """Returns what tells the energy of ties and bonds, None where there are none."""
+  def _held(self) -> cutting.Springs | None:
+    """Returns the ties and bonds, None where there are none."""
     springs = [*self._w.ties.springs(), *self._w.bonds.springs()]
     if not springs:
       return None
     n = self.mesh.nvert
-    whole, pull, hard = np.zeros(n), np.zeros((n, 3)), np.zeros(n)
+    energy, force, hard = np.zeros(n), np.zeros((n, 3)), np.zeros(n)
     for vert, stiffness, stretch in springs:
-      np.add.at(whole, vert, 0.5 * stiffness * (stretch**2).sum(axis=1))
-      np.add.at(pull, vert, stiffness[:, None] * stretch)
+      np.add.at(energy, vert, 0.5 * stiffness * (stretch**2).sum(axis=1))
+      np.add.at(force, vert, stiffness[:, None] * stretch)
       np.add.at(hard, vert, stiffness)
+    return cutting.Springs(energy, force, hard)
 
-    def held(vert: np.ndarray, way: np.ndarray) -> np.ndarray:
-      return whole[vert] + (way * pull[vert]).sum(1) + 0.5 * hard[vert] * (way**2).sum(1)
-
-    return held
-
-  def _report(self, found: cutting.Cut) -> Report:
+  def _report(self, found: Any) -> Report:
     organ = self._w.organ
     path = [organ.origin + line @ organ.frame.T for line in found.path]
     nodes = found.mesh.nouter - self.mesh.nouter
     area = found.length * self._w.config.thickness
     return Report(found.length, area, path, found.deviation, nodes, found.stopped)
 
-  def _take(self, found: cutting.Cut, u: np.ndarray, v: np.ndarray):
+  def _take(self, found: Any):
     """Makes the organ the mesh that was found; what moved goes on as it moved."""
-    w, old, mesh = self._w, self.mesh, found.mesh
-    group, member = found.group, found.member
-    mass, source = self.mass.copy(), self.source.copy()
-    share, near = self._parts(found)
-    mass[group] = 0.0
-    mass[member] = share * self.mass[group]
+    w, mesh, motion = self._w, found.mesh, found.motion
+    group, member, share = found.group, found.member, found.share
+    source = self.source.copy()
     source[member] = source[group]
-    now, speed = u.copy(), v.copy()
-    now[found.moved] = np.einsum("nk,nkj->nj", found.weight, u[found.corner])
-    near = near[w.organ.free[near]]
-    was, goes = (old.rest + u)[near], (mesh.rest + now)[near]
-    speed[near] = _keep_spin(self.mass[near], was, goes, v[near])
-    now[member], speed[member] = now[group], speed[group]
     for each in w.beside:
       each.carry(group, member, share)
-    corner = self._corners(mesh)
-    self._become(mesh, found.changed, mass, source, flexes.stamp(corner, mesh.rest, mass))
-    self._write(corner)
-    changed = topology.distinct(near, member)
-    w.phases.carry(changed, now, speed, group, member, share)
+    self._become(mesh, found.changed, motion.mass.copy(), source, self.stamp)
+    self._write(found)
+    changed = topology.distinct(found.near, member)
+    w.phases.carry(changed, motion.disp, motion.vel, group, member, share)
     self.show()
-
-  def _parts(self, found) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the shares of what was one, and the vertices around what changes."""
-    area = topology.areas_of(found.mesh, found.member)
-    share = area / np.bincount(found.group, area, found.mesh.nvert)[found.group]
-    return share, topology.distinct(self.mesh.elem[found.changed])
-
-  def _corners(self, mesh: Mesh) -> np.ndarray:
-    """Returns what the plugin state has of the triangles."""
-    return flexes.pack(mesh.elem, mesh.loose)
 
   def pieces(self) -> list[Piece]:
     """Returns the parts that hang together, the largest first."""
@@ -340,17 +324,3 @@ class Cuts:
     """Returns the volume of the tissue at each vertex at rest [m^3], (nvert,)."""
     area = topology.vertex_areas(self.mesh.rest, self.mesh.elem)
     return area * self._w.config.thickness
-
-
-def _keep_spin(mass: np.ndarray, was: np.ndarray, now: np.ndarray, v: np.ndarray) -> np.ndarray:
-  """Returns velocities with which nodes, some of them moved, keep momentum and angular momentum.
-
-  That is `v` and a slow rotation of them all about their centre.
-  """
-  if len(mass) < 3:
-    return v
-  spin = (mass[:, None] * topology.cross(was - now, v)).sum(axis=0)
-  arm = now - (mass[:, None] * now).sum(axis=0) / mass.sum()
-  inertia = (mass * (arm**2).sum(axis=1)).sum() * np.eye(3) - (mass * arm.T) @ arm
-  omega = np.linalg.lstsq(inertia, spin, rcond=1e-6)[0]
-  return v + topology.cross(omega[None], arm)

@@ -80,6 +80,12 @@ class Declaration:
       digest.update(np.ascontiguousarray(part if part is not None else 0).tobytes())
     return float(2**50 + int.from_bytes(digest.digest()[:6], "big"))
 
+  def cut(self, mesh: Mesh, mass: np.ndarray) -> Declaration:
+    """Returns the organ with another mesh of the same whole, and other masses [kg]."""
+    out = dataclasses.replace(self, mesh=mesh, mass=mass)
+    vars(out)["signature"] = self.signature
+    return out
+
   @property
   def jointed(self) -> np.ndarray:
     """Vertices that are dofs of MuJoCo."""

@@ -165,10 +165,19 @@ def unpack(packed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def stamp(*parts: Any) -> float:
   """Returns a number that tells meshes apart, over 2^50: 48 bits of a sum of words by odd keys."""
-  words = np.concatenate([np.ravel(part).astype(np.float64).view(np.uint64) for part in parts])
-  words ^= words >> np.uint64(32)
-  words *= _keys(len(words))
-  return float(2**50 + (int(words.sum()) >> 16))
+  values = np.concatenate([np.ravel(part).astype(float) for part in parts])
+  return stamp_of(total(values, slice(None), len(values)))
+
+
+def total(values: np.ndarray, where: Any, count: int) -> int:
+  """Returns the sum that a stamp is made of, of those of `count` numbers that are there."""
+  words = values.view(np.uint64)
+  return int(((words ^ words >> np.uint64(32)) * _keys(count)[where]).sum())
+
+
+def stamp_of(total: int) -> float:
+  """Returns the stamp of a sum, of which 64 bits count."""
+  return float(2**50 + (total % 2**64 >> 16))
 
 
 @functools.lru_cache(maxsize=8)

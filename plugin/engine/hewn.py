@@ -12,6 +12,7 @@ import functools
 import numpy as np
 from palpate.tissue import cleave, energy, faces, fill
 from palpate.tissue import mesh as topology
+from palpate.tissue.cut import Motion
 from palpate.tissue.mesh import Mesh
 from palpate.tissue.resolid import SolidRefill
 
@@ -40,8 +41,9 @@ class SolidCuts(Cuts):
     """Hides it again."""
     self.walls.hide(model)
 
-  def _made(self) -> SolidRefill:
-    return SolidRefill(self._w.body, self.whole)
+  def _make(self):
+    self._refill = SolidRefill(self._w.body, self.whole)
+    self.seat = np.zeros(0, np.int64)
 
   def show(self):
     """Gives the model the triangles of this organ's skin."""
@@ -67,48 +69,54 @@ class SolidCuts(Cuts):
     face, seat = (np.rint(np.clip(each[each > 0], 0, 2.0**52)).astype(np.int64) - 1
                   for each in (corner[n:], own["source"]))  # fmt: skip
     try:
-      if flexes.stamp(corner, rest, mass) != self._found[0]:
+      if flexes.stamp(self._words) != self._found[0]:
         raise ValueError
       tet = faces.restored(whole, rest, face, seat)
+      of_tet = np.concatenate([whole.of_tet, faces.corners(face)])
+      mesh, changed = faces.grown(self.mesh, rest, tet, of_tet)
     except ValueError:
       raise ValueError(cuts.FOREIGN) from None
-    of_tet = np.concatenate([whole.of_tet, faces.corners(face)])
-    mesh, changed = faces.grown(self.mesh, rest, tet, of_tet)
-    if mesh is None:
-      raise ValueError(cuts.FOREIGN)
     loose = np.append(flexes.unpack(corner[:n])[1], np.ones(len(face), bool))
     source = np.arange(whole.nvert)
     source[whole.spares][: len(seat)] = whole.tet.ravel()[seat]
     self.seat = seat
     return dataclasses.replace(mesh, loose=loose), changed, mass, source
 
-  def _write(self, corner: np.ndarray):
-    own, mesh = self._own, self.mesh
-    own["corner"][:] = corner
+  def _write(self, found: cleave.Cut):
+    own, mesh, n = self._own, self.mesh, self.whole.nelem
+    self._sit(found)
+    face = faces.opened(mesh)
+    own["corner"][:n] = flexes.pack(mesh.elem[:n], mesh.loose[:n])
+    own["corner"][n:] = 0.0
+    own["corner"][n : n + len(face)] = face + 1
     own["place"][:] = mesh.rest.ravel()
     own["weight"][:] = self.mass
     own["source"][:] = 0.0
     own["source"][: len(self.seat)] = self.seat + 1
-    self._found[0] = self.stamp
+    self.stamp = self._found[0] = flexes.stamp(self._words)
 
-  def _corners(self, mesh: Mesh) -> np.ndarray:
-    out, n = np.zeros_like(self._own["corner"]), self.whole.nelem
-    out[:n] = flexes.pack(mesh.elem[:n], mesh.loose[:n])
-    face = faces.opened(mesh)
-    out[n : n + len(face)] = face + 1
-    return out
+  def _sit(self, found: cleave.Cut):
+    """Notes a corner of each vertex that cuts have made."""
+    first = self.whole.nouter
+    seat = np.zeros(found.mesh.nouter - first, np.int64)
+    seat[: len(self.seat)] = self.seat
+    new = found.member >= first
+    seat[found.member[new] - first] = found.seat[new]
+    self.seat = seat
 
   def _touched(self, mesh: Mesh, changed: np.ndarray) -> np.ndarray:
     return topology.distinct(self.mesh.tet[changed], mesh.tet[changed])
 
-  def _find(self, points, u: np.ndarray, given: float, depth, direction) -> cleave.Cut:
+  def _find(self, motion: Motion, points, given: float, depth, direction) -> cleave.Cut:
     w, organ, mesh = self._w, self._w.organ, self.mesh
+    if mesh.uncut is None:
+      self.seat = np.zeros(0, np.int64)
     if direction is not None:
       direction = np.asarray(direction, float) @ organ.frame
     found = cleave.cut(
       organ.name,
       mesh,
-      mesh.rest + u,
+      motion,
       points,
       ~organ.free,
       depth,
@@ -118,17 +126,6 @@ class SolidCuts(Cuts):
       len(self._own["corner"]),
     )
     return dataclasses.replace(found, mesh=_freed(found.mesh))
-
-  def _parts(self, found: cleave.Cut) -> tuple[np.ndarray, np.ndarray]:
-    new = found.member >= self.whole.nouter
-    fresh = found.member[new & (found.member >= self.mesh.nouter)]
-    seat = np.zeros(found.mesh.nouter - self.whole.nouter, np.int64)
-    kept = self.seat if self.mesh.uncut is not None else np.zeros(0, np.int64)
-    seat[: len(kept)] = kept
-    seat[found.member[new] - self.whole.nouter] = found.seat[new]
-    self.seat = seat
-    assert len(fresh) == found.mesh.nouter - self.mesh.nouter
-    return found.share, topology.distinct(self.mesh.tet[found.changed])
 
   def _report(self, found: cleave.Cut) -> cuts.Report:
     organ = self._w.organ

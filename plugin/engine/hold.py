@@ -1,7 +1,8 @@
 """What acts on an organ beside its tissue: springs that hold its nodes, and what feels them.
 
 `Beside` is what ties, bonds, supports and relaxation are to a step. All of them run on the CPU,
-over an organ's `Nodes` and its solver's `Input`, and cost nothing where they are not used.
+over an organ's `Nodes` and its solver's `Input`, and cost nothing where they are not used. In a
+batch on a GPU the same kernels act in all worlds, see `palpate.batch.beside`.
 """
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
@@ -64,7 +65,7 @@ class Input:
   """What an organ's solver is given, and what it finds."""
 
   node: ints("nvert")  # node of each vertex
-  tail: doubles(len(TAIL))  # see TAIL
+  quiet: doubles("nworld")  # how long it has been at rest [s]
   hold: floats("nworld", "nholdslice", 6, 8)
   force_ext: vector
   vel: vector
@@ -166,9 +167,11 @@ def base(organ) -> np.ndarray:
 def solver(w):
   """Returns `Input` of a workspace."""
   values = {name: w.host[name] for name in ("force_ext", "vel", "dvel", "status")}
-  tail = w.boxes["own"].tail if w.organ.windows else np.zeros(len(TAIL))
+  quiet = np.zeros(1)
+  if w.organ.windows:
+    quiet = coupling.wrap(w.boxes["own"].tail.ptr + 8 * TAIL.quiet, 1)
   node = w.body.shape.node.numpy()
-  return fill(Input, "cpu", values | {"node": node, "tail": tail, "hold": w.hold.array})
+  return fill(Input, "cpu", values | {"node": node, "quiet": quiet, "hold": w.hold.array})
 
 
 class Hold:

@@ -53,9 +53,9 @@ class Rest:
   mj: Bodies
 
 
-_find_geoms, _find_organ, _press, _act, _bear, _keep = coupling.kernels(
-  "rests.h", Rest, "find_geoms", "find_organ", "press", "act_rests", "bear", "keep"
-)
+KERNELS = "find_geoms", "press", "act_rests", "feel_rests", "keep"
+_find_geoms, _press, _act, _feel, _keep = coupling.kernels("rests.h", Rest, *KERNELS)
+_find_organ, _bear = coupling.kernels("rests.h", Rest, "find_organ", "bear")
 
 
 class Rests(Beside):
@@ -190,6 +190,8 @@ class Rests(Beside):
     """Lets the bodies feel what rests on them."""
     if self:
       _launch(_act, self._alone)
+      if self._alone.restless:
+        _launch(_feel, self._alone)
 
   def end(self):
     """Keeps how far the nodes have slipped."""

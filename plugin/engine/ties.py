@@ -50,7 +50,8 @@ class Tied:
   mj: Bodies
 
 
-_enter, _act = coupling.kernels("ties.h", Tied, "enter_ties", "act_ties")
+KERNELS = "enter_ties", "act_ties"
+_enter, _act = coupling.kernels("ties.h", Tied, *KERNELS)
 _OF_COUNT = ("count", "owned", "restless")
 _OF_TIE = ("vert", "body", "leads", "stiffness", "anchor", "point", "force")
 

@@ -23,8 +23,6 @@ constexpr double BLOCKED = 0.3;  // share of its way that a seat goes where it i
 enum { AWAY, PIERCING, THROUGH };  // stages
 enum { NOTHING, LONG, ENDED };  // what is due
 
-PALPATE D3 blend(const D3* x, D3 w) { return w.x * x[0] + w.y * x[1] + w.z * x[2]; }
-
 template <class Fields>
 PALPATE void corners_at_rest(const Fields& f, int t, D3* x) {
   for (int c = 0; c < 3; ++c) x[c] = load(f.flat.data + 3 * f.elem.data[3 * t + c]);
@@ -303,7 +301,7 @@ PALPATE void bear(const Fields& f, int i, const Line& line) {
 template <class Fields>
 PALPATE void enter_blades(const Fields& f, Thread, int) {
   const D3 zero = {0.0, 0.0, 0.0};
-  if (f.own.windowed) f.solve.tail.data[TAIL_QUIET] = 0.0;
+  f.solve.quiet.data[0] = 0.0;
   for (int i = 0; i < f.nblade; ++i) {
     double* s = f.next.data + BLADE_LENGTH * i;
     for (int c = 0; c < BLADE_LENGTH; ++c) s[c] = f.state.data[BLADE_LENGTH * i + c];

@@ -1,8 +1,43 @@
 // Bodies of MuJoCo that an organ holds, or that hold it, by forces of its own.
+//
+// A kernel begins with `of_world`, which moves what worlds have of their own to its world: MuJoCo's
+// doubles, of which there is one world, or mujoco_warp's floats.
 #pragma once
 #include "formula.h"
 
 namespace palpate {
+
+template <class Array>
+PALPATE void move_to(Array& a, int world) {
+  a.data += (size_t)world * ((size_t)a.strides[0] / sizeof(*a.data));
+}
+
+template <class Arrays>
+PALPATE void move_bodies(Arrays& mj, int world) {
+  move_to(mj.xpos, world);
+  move_to(mj.xmat, world);
+  move_to(mj.cvel, world);
+  move_to(mj.cdof, world);
+  move_to(mj.qacc_warmstart, world);
+  move_to(mj.subtree_com, world);
+  move_to(mj.geom_xpos, world);
+  move_to(mj.geom_xmat, world);
+  move_to(mj.qfrc_passive, world);
+}
+template <class Nodes>
+PALPATE void move_nodes(Nodes& o, int world) {
+  move_to(o.disp, world);
+  move_to(o.vel, world);
+}
+template <class Solve>
+PALPATE void move_input(Solve& s, int world) {
+  move_to(s.quiet, world);
+  move_to(s.hold, world);
+  move_to(s.force_ext, world);
+  move_to(s.vel, world);
+  move_to(s.dvel, world);
+  move_to(s.status, world);
+}
 
 // A symmetric matrix, by its upper half.
 struct Sym { double xx, xy, xz, yy, yz, zz; };
@@ -24,23 +59,37 @@ PALPATE Sym load_hold(const float* p) {
 
 struct Place { D3 at, vel; };
 
-// Displacement of a vertex from rest, in the organ's frame.
+// Displacement of a vertex from rest and its velocity, in the organ's frame: of an organ that is in
+// MuJoCo's memory or, with windows, in the plugin state.
 template <class Arrays, class Nodes>
-PALPATE D3 moved_by(const Arrays& mj, const Nodes& o, int i) {
+PALPATE auto moved_by(const Arrays& mj, const Nodes& o, int i) -> decltype(*o.qposadr.data, D3{}) {
   if (o.windowed) return load(o.disp.data + 3 * i);
   const int adr = o.qposadr.data[i];
   return adr < 0 ? D3{0.0, 0.0, 0.0} : load(mj.qpos.data + adr) - load(mj.qpos0.data + adr);
+}
+template <class Arrays, class Nodes>
+PALPATE auto goes_by(const Arrays& mj, const Nodes& o, int i) -> decltype(*o.qposadr.data, D3{}) {
+  const int dof = o.windowed ? 0 : o.dofadr.data[i];
+  if (dof < 0) return {0.0, 0.0, 0.0};
+  return load(o.windowed ? o.vel.data + 3 * i : mj.qvel.data + dof);
+}
+
+// Of one in the solver's own vectors.
+template <class Arrays, class Nodes>
+PALPATE auto moved_by(const Arrays&, const Nodes& o, int i) -> decltype(*o.node.data, D3{}) {
+  return load_lane(o.disp.data + offset_of(o.node.data[i]));
+}
+template <class Arrays, class Nodes>
+PALPATE auto goes_by(const Arrays&, const Nodes& o, int i) -> decltype(*o.node.data, D3{}) {
+  return load_lane(o.vel.data + offset_of(o.node.data[i]));
 }
 
 // Where a vertex is in the world, and its velocity.
 template <class Arrays, class Nodes>
 PALPATE Place place_of(const Arrays& mj, const Nodes& o, int i) {
   const double* R = o.frame.data;
-  const int dof = o.windowed ? 0 : o.dofadr.data[i];
-  const D3 vel = dof < 0 ? D3{0.0, 0.0, 0.0}
-    : load(o.windowed ? o.vel.data + 3 * i : mj.qvel.data + dof);
   return {load(o.origin.data) + turned(R, load(o.rest.data + 3 * i) + moved_by(mj, o, i)),
-          turned(R, vel)};
+          turned(R, goes_by(mj, o, i))};
 }
 
 // Adds to the solver's input a force on a node that falls by `weight` dv / h in the step.
@@ -87,7 +136,7 @@ PALPATE void push_body(const Arrays& mj, int b, D3 force, D3 torque) {
   for (; b > 0; b = mj.body_parentid.data[b])
     for (int d = 0; d < mj.body_dofnum.data[b]; ++d) {
       const int dof = mj.body_dofadr.data[b] + d;
-      const double* axis = mj.cdof.data + 6 * dof;
+      const auto* axis = mj.cdof.data + 6 * dof;
       mj.qfrc_passive.data[dof] += dot(load(axis), torque) + dot(load(axis + 3), force);
     }
 }

@@ -9,6 +9,7 @@ namespace palpate {
 struct D3 { double x, y, z; };
 
 PALPATE D3 load(const double* p) { return {p[0], p[1], p[2]}; }
+PALPATE D3 load(const float* p) { return {p[0], p[1], p[2]}; }
 PALPATE void store(double* p, D3 a) { p[0] = a.x; p[1] = a.y; p[2] = a.z; }
 
 // A node's numbers in a vector of slices; they start at `offset_of(node)`.
@@ -36,7 +37,8 @@ PALPATE D3 cross(D3 a, D3 b) {
   return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
 }
 // R x, with R row by row.
-PALPATE D3 turned(const double* R, D3 x) {
+template <class Number>
+PALPATE D3 turned(const Number* R, D3 x) {
   return {R[0] * x.x + R[1] * x.y + R[2] * x.z, R[3] * x.x + R[4] * x.y + R[5] * x.z,
           R[6] * x.x + R[7] * x.y + R[8] * x.z};
 }

@@ -1,5 +1,5 @@
 // What an organ rests on: geoms and other organs, by springs of the surface instead of MuJoCo's
-// contacts, of which an organ that lies on something has hundreds. Doubles, on the CPU.
+// contacts, of which an organ that lies on something has hundreds. Doubles, a thread a node.
 //
 // A node at depth d in what is below has k d as its force along the normal, k a stiffness times its
 // area, and along the surface k times the way that it has slipped (Cundall and Strack 1979,
@@ -14,6 +14,19 @@ namespace palpate {
 
 constexpr int ON_NOTHING = -1, ON_GEOM = -2;  // and below, by geoms; others are organs
 constexpr int CELLS = 1024;
+
+template <class Fields>
+PALPATE Fields of_world(Fields f, int world) {
+  move_to(f.slip, world);
+  move_to(f.slipped, world);
+  move_to(f.on, world);
+  move_to(f.force, world);
+  move_to(f.hardness, world);
+  move_nodes(f.own, world);
+  move_input(f.solve, world);
+  move_bodies(f.mj, world);
+  return f;
+}
 
 // n n^T times a, and the rest of the identity times b.
 PALPATE Sym along_and_across(D3 n, double a, double b) {
@@ -63,7 +76,7 @@ PALPATE D3 up(const double* geom, D3 d, double step) {
 // A geom of mjData as GEOM, in the world's axes.
 template <class Fields>
 PALPATE void read_geom(const Fields& f, int g, double* geom) {
-  const double* R = f.mj.geom_xmat.data + 9 * g;
+  const auto* R = f.mj.geom_xmat.data + 9 * g;
   store(geom + GEOM_POS, load(f.mj.geom_xpos.data + 3 * g));
   for (int a = 0; a < 3; ++a) store(geom + GEOM_AXIS + 3 * a, {R[a], R[3 + a], R[6 + a]});
   geom[GEOM_TYPE] = f.mj.geom_type.data[g];
@@ -74,23 +87,24 @@ PALPATE void read_geom(const Fields& f, int g, double* geom) {
 
 // Finds what of the geoms each node rests on.
 template <class Fields>
-PALPATE void find_geoms(const Fields& f, Thread, int) {
-  for (int i = 0; i < f.nouter; ++i) f.on.data[i] = ON_NOTHING;
+PALPATE void find_geoms(const Fields& all, Thread t, int) {
+  const Fields f = of_world(all, t.world);
+  each_item(t, f.nouter, [&](int i) { f.on.data[i] = ON_NOTHING; });
   for (int q = 0; q < f.ngeom; ++q) {
     const int g = f.geom.data[q], b = f.mj.geom_bodyid.data[g];
     double geom[GEOM_LENGTH];
     read_geom(f, g, geom);
     const Twist moving = twist(f.mj, b, false);
-    for (int i = 0; i < f.nouter; ++i) {
-      if (f.on.data[i] != ON_NOTHING || !f.free.data[i]) continue;
+    each_item(t, f.nouter, [&](int i) {
+      if (f.on.data[i] != ON_NOTHING || !f.free.data[i]) return;
       const Place x = place_of(f.mj, f.own, i);
       const D3 d = x.at - load(geom + GEOM_POS);
       const double depth = f.skin - distance(geom, d);
-      if (!(depth > 0.0)) continue;
+      if (!(depth > 0.0)) return;
       const D3 n = up(geom, d, 0.1 * f.skin), arm = arm_of(f.mj, b, x.at);
       const D3 vel = velocity_at(moving, arm);
       if (rest(f, i, x, depth, n, vel, f.friction.data[q])) f.on.data[i] = ON_GEOM - q;
-    }
+    });
   }
 }
 
@@ -218,32 +232,43 @@ PALPATE Sym turned_back(const double* R, const Sym& m) {
 
 // Adds what an organ's nodes rest on to its solver's input.
 template <class Fields>
-PALPATE void press(const Fields& f, Thread, int) {
+PALPATE void press(const Fields& all, Thread t, int) {
+  const Fields f = of_world(all, t.world);
   const D3 zero = {0, 0, 0};
   const double* R = f.own.frame.data;
-  if (f.restless) f.solve.tail.data[TAIL_QUIET] = 0.0;
-  for (int i = 0; i < f.nouter; ++i) {
-    if (f.on.data[i] == ON_NOTHING) continue;
+  if (f.restless && t.tid == 0) f.solve.quiet.data[0] = 0.0;
+  each_item(t, f.nouter, [&](int i) {
+    if (f.on.data[i] == ON_NOTHING) return;
     push_node(f.solve, f.solve.node.data[i], add_turned(zero, R, load(f.force.data + 3 * i)),
               turned_back(R, hardness(f, i)));
-  }
+  });
 }
 
-// Ends the forces with what the step made of the nodes' velocities, and lets the geoms' bodies feel
-// them.
+// Ends the forces of geoms with what the step made of the nodes' velocities.
 template <class Fields>
-PALPATE void act_rests(const Fields& f, Thread, int) {
-  const D3 zero = {0, 0, 0};
+PALPATE void act_rests(const Fields& all, Thread t, int) {
+  const Fields f = of_world(all, t.world);
   const double per_h = 1.0 / f.mj.timestep.data[0];
+  each_item(t, f.nouter, [&](int i) {
+    if (f.on.data[i] > ON_GEOM) return;
+    const D3 dv = turned(f.own.frame.data,
+                         load_lane(f.solve.dvel.data + offset_of(f.solve.node.data[i])));
+    store(f.force.data + 3 * i, load(f.force.data + 3 * i) - per_h * (hardness(f, i) * dv));
+  });
+}
+
+// Lets the geoms' bodies feel them.
+template <class Fields>
+PALPATE void feel_rests(const Fields& all, Thread t, int) {
+  if (t.tid > 0) return;
+  const Fields f = of_world(all, t.world);
+  const D3 zero = {0, 0, 0};
   for (int q = 0; q < f.ngeom; ++q) {
     const int b = f.mj.geom_bodyid.data[f.geom.data[q]];
     D3 force = zero, torque = zero;
     for (int i = 0; i < f.nouter; ++i) {
       if (f.on.data[i] != ON_GEOM - q) continue;
-      const D3 dv = turned(f.own.frame.data,
-                           load_lane(f.solve.dvel.data + offset_of(f.solve.node.data[i])));
-      const D3 push = load(f.force.data + 3 * i) - per_h * (hardness(f, i) * dv);
-      store(f.force.data + 3 * i, push);
+      const D3 push = load(f.force.data + 3 * i);
       force = force - push;
       torque = torque - cross(arm_of(f.mj, b, place_of(f.mj, f.own, i).at), push);
     }
@@ -255,7 +280,7 @@ PALPATE void act_rests(const Fields& f, Thread, int) {
 template <class Fields>
 PALPATE void bear(const Fields& f, Thread, int which) {
   const double* R = f.other.frame.data;
-  f.below.tail.data[TAIL_QUIET] = 0.0;
+  f.below.quiet.data[0] = 0.0;
   for (int i = 0; i < f.nouter; ++i) {
     if (f.on.data[i] != which) continue;
     const D3 push = add_turned({0, 0, 0}, R, D3{0, 0, 0} - load(f.force.data + 3 * i));
@@ -269,10 +294,12 @@ PALPATE void bear(const Fields& f, Thread, int which) {
 
 // Keeps how far the nodes have slipped.
 template <class Fields>
-PALPATE void keep(const Fields& f, Thread, int) {
+PALPATE void keep(const Fields& all, Thread t, int) {
+  const Fields f = of_world(all, t.world);
   const D3 zero = {0, 0, 0};
-  for (int i = 0; i < f.nouter; ++i)
+  each_item(t, f.nouter, [&](int i) {
     store(f.slip.data + 3 * i, f.on.data[i] == ON_NOTHING ? zero : load(f.slipped.data + 3 * i));
+  });
 }
 
 }  // namespace palpate

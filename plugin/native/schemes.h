@@ -55,8 +55,8 @@ PALPATE void stand(const Fields& f, size_t at, V3 u, V3 v, Lane lane) {
   st3(f.system.disp_trial.data + 24 * at, u, lane);
   st3(f.system.vel_trial.data + 24 * at, v, lane);
   if (!f.shape.ntetslice) return;
-  share(f.system.node_disp.data + 32 * at, u, lane);
-  share(f.system.node_vel.data + 32 * at, v, lane);
+  share(f.system.node_motion.data + 96 * at, u, lane);
+  share(f.system.node_motion.data + 96 * at + 32, v, lane);
 }
 
 // The trial state is the present one.

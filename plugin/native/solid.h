@@ -1,12 +1,13 @@
-// The inside of a solid: linear tetrahedra of the stable neo-Hookean energy (Smith, de Goes and Kim
-// 2018, doi:10.1145/3180491, eq. 14) with the change of volume averaged over nodes (Bonet and
-// Burton 1998). With the gradient of the displacement H, F = I + H, and
+// The inside of a solid: tetrahedra of the stable neo-Hookean energy (Smith, de Goes and Kim 2018,
+// doi:10.1145/3180491, eq. 14), most of which acts on means over nodes (Puso and Solberg 2006,
+// doi:10.1002/nme.1457). With the gradient of the displacement H, F = I + H, and
 //
 //     i = tr F^T F - 3 = 2 tr H + H : H,    j = det F - 1,    C = dj/dH = cof F = I + c
 //
-// an element's energy is volume (mu / 2 (i - ln(1 + i / 4)) - 3/4 mu j + lambda / 2 j^2), and a
-// node's lambda' / 2 volume j'^2, j' the mean of j around it. All of it is of the order of H, so that
-// float32 keeps the digits of small strains and a solid at rest is at rest to the bit.
+// the density of energy is mu / 2 (i - ln(1 + i / 4)) - 3/4 mu j + (lambda + 5/8 mu) / 2 j^2: of a
+// tetrahedron with OWN_SHARE of mu alone, of a node with the rest of mu and lambda, H then the mean
+// of the tetrahedra around it. All of it is of the order of H, so that float32 keeps the digits of
+// small strains and a solid at rest is at rest to the bit.
 #pragma once
 #include "elastic.h"
 
@@ -51,41 +52,6 @@ PALPATE Swelling swelling(const M3& h) {
   return {t + trace(cof) + det, splat(-1.0f) * transposed(h) + t + cof};
 }
 
-// Strain impulse of volume of each tetrahedron: h j + what K v has of it. The gradients of
-// displacement and velocity are kept, where `tet_stress` then writes what it makes of them.
-template <class Fields>
-PALPATE void tet_strain(const Fields& f, Thread t, int stage) {
-  const float* step = f.state.step.data + 4 * t.world;
-  const float h = step[0], gv = weight_of_rate(stage, step);
-  const size_t base = 32 * (size_t)t.world * f.shape.nslice;
-  each_slice(t, f.shape.ntetslice, [&](int s, Lane lane) {
-    const int* node = f.shape.tet_node.data + 32 * s;
-    const float* g = f.shape.tet_gradient.data + 72 * s;
-    const M3 H = gradient(f.system.node_disp.data + base, node, g, lane);
-    const M3 rate = gradient(f.system.node_vel.data + base, node, g, lane);
-    const Swelling now = swelling(H);
-    const size_t at = (size_t)t.world * f.shape.ntetslice + s;
-    st9(f.system.tet_arm.data + 128 * at, H, lane);
-    st9(f.system.tet_impulse.data + 128 * at, rate, lane);
-    st(f.system.tet_strain.data, at, h * now.j + gv * (trace(rate) + inner(now.c, rate)), lane);
-  });
-}
-
-// Pressure impulse of each node, from the mean of the tetrahedra around it.
-template <class Fields>
-PALPATE void node_pressure(const Fields& f, Thread t, int) {
-  const float* strain = f.system.tet_strain.data + 8 * (size_t)t.world * f.shape.ntetslice;
-  each_slice(t, f.shape.nslice, [&](int s, Lane lane) {
-    const int row = f.shape.around_adr.data[s], width = f.shape.around_adr.data[s + 1] - row;
-    V sum = splat(0.0f);
-    for (int k = row; k < row + width; ++k)
-      sum += ld(f.shape.around_share.data, k, lane)
-        * gather(strain, f.shape.around_tet.data + 8 * k, 0, lane);
-    st(f.system.node_pressure.data + 8 * (size_t)t.world * f.shape.nslice, s,
-       ld(f.tissue.pressure_gain.data, s, lane) * sum, lane);
-  });
-}
-
 // The rotation nearest to F, by Newton's iteration with Higham's scaling (Higham 1986,
 // doi:10.1137/0907079): two or three of them, of a stretch of two to 1e-3, for the matrix and damping
 // alone. Of a tetrahedron inside out it is a reflection, which serves as well.
@@ -122,43 +88,98 @@ PALPATE M3 turn(const M3& F, const M3& cof, V det, V size2) {
   return turn.x;
 }
 
+// Stress of the energy, h times; the pressure impulse p comes in place of h lambda j.
+PALPATE M3 stress(const M3& H, const Swelling& now, V mu, V p, float h) {
+  const V i = 2.0f * trace(H) + inner(H, H);
+  return (0.75f * h * mu) * (H + splat(-1.0f) * now.c)
+    + (0.25f * h * mu * i / (4.0f + i)) * (H + splat(1.0f)) + p * (now.c + splat(1.0f));
+}
+
+// Stress of each node for the mean gradient of the tetrahedra around it, which its neighbours say,
+// with what damping adds to the pressure.
+template <class Fields>
+PALPATE void node_stress(const Fields& f, Thread t, int stage) {
+  const float* step = f.state.step.data + 4 * t.world;
+  const float h = step[0], gv = weight_of_rate(stage, step);
+  const size_t base = 96 * (size_t)t.world * f.shape.nslice;
+  const float* motion = f.system.node_motion.data + base;
+  each_slice(t, f.shape.nslice, [&](int s, Lane lane) {
+    const int row = f.shape.slot_adr.data[s], width = f.shape.slot_adr.data[s + 1] - row;
+    const int* node = f.shape.fan_node.data + 8 * (row + 2 * s + 1);
+    const float* slope = f.shape.fan_slope.data + 24 * (size_t)row;
+    const V3 u = ld3(f.system.disp_trial.data + base / 4 + 24 * s, lane);
+    const V3 v = ld3(f.system.vel_trial.data + base / 4 + 24 * s, lane);
+    const V zero = splat(0.0f);
+    M3 H = {zero, zero, zero, zero, zero, zero, zero, zero, zero}, rate = H;
+    for (int k = 0; k < width; ++k) {
+      const V3 g = ld3(slope, 3 * k, lane);
+      H = H + outer(gather_shared(motion, node + 8 * k, lane) - u, g);
+      rate = rate + outer(gather_shared(motion + 32, node + 8 * k, lane) - v, g);
+    }
+    const V mu = ld(f.tissue.node_moduli.data, 2 * s, lane);
+    const V lam = ld(f.tissue.node_moduli.data, 2 * s + 1, lane);
+    const Swelling now = swelling(H);
+    const V p = lam * (h * now.j + gv * (trace(rate) + inner(now.c, rate)));
+    const M3 P = stress(H, now, mu, p + (0.625f * h) * mu * now.j, h);
+    float* to = f.system.node_stress.data + base + 96 * s;
+    share(to, {P.xx, P.xy, P.xz}, p, lane);
+    share(to + 32, {P.yx, P.yy, P.yz}, lane);
+    share(to + 64, {P.zx, P.zy, P.zz}, lane);
+  });
+}
+
+// Mean stress and pressure of a tetrahedron's corners.
+PALPATE M3 mean_stress(const float* stress, const int* node, V& pressure, Lane lane) {
+  V w, p = splat(0.0f);
+  V3 x = {p, p, p}, y = x, z = x;
+  for (int k = 0; k < 4; ++k) {
+    x += gather_shared(stress, node + 8 * k, w, lane);
+    y += gather_shared(stress + 32, node + 8 * k, lane);
+    z += gather_shared(stress + 64, node + 8 * k, lane);
+    p += w;
+  }
+  pressure = 0.25f * p;
+  return splat(0.25f) * M3{x.x, x.y, x.z, y.x, y.y, y.z, z.x, z.y, z.z};
+}
+
 // What a tetrahedron gives to its corners: impulses, and for the matrix its turned gradients times
 // the root of g volume and of the modulus mu, beside which are lambda and 1 + tension over mu.
 //
-// The matrix is that of small strains in the turned frame, which leaves rotations free. A change of
-// volume C : dF hangs on the faces: their mean is in lambda, and what they differ by is covered by an
-// isotropic stiffness, lambda times its square, so that the matrix is at least half the true Hessian
-// for every direction ((a + b)^2 <= 2 a^2 + 2 b^2). The stress adds a geometric stiffness between principal
-// directions a and b: (P_a + P_b) / (s_a + s_b) of a tension to rotations, of which `tension` is an
-// upper bound, and the pressure times the third stretch to shear, which mu has. K v is without both.
+// The matrix is that of small strains in the turned frame, which leaves rotations free, with all of
+// the moduli in the tetrahedra: no mean over nodes is stiffer, and no neighbours beyond the edges'
+// take part. A change of volume C : dF hangs on the faces: their mean is in lambda, and what they
+// differ by is covered by an isotropic stiffness, lambda times its square, so that the matrix is at
+// least half the true Hessian for every direction ((a + b)^2 <= 2 a^2 + 2 b^2). The stress adds a
+// geometric stiffness between principal directions a and b: (P_a + P_b) / (s_a + s_b) of a tension
+// to rotations, of which `tension` is an upper bound, and the pressure times the third stretch to
+// shear, which mu has. K v is without both.
 template <class Fields>
 PALPATE void tet_stress(const Fields& f, Thread t, int stage) {
   const float* step = f.state.step.data + 4 * t.world;
   const float h = step[0], weight = step[1], gv = weight_of_rate(stage, step);
   const bool implicit = stage == FIRST || stage == LATER;
-  const float* pressure = f.system.node_pressure.data + 8 * (size_t)t.world * f.shape.nslice;
+  const size_t base = 96 * (size_t)t.world * f.shape.nslice;
+  const float* motion = f.system.node_motion.data + base;
+  const float* nodal = f.system.node_stress.data + base;
   each_slice(t, f.shape.ntetslice, [&](int s, Lane lane) {
     const int* node = f.shape.tet_node.data + 32 * s;
     const float* g = f.shape.tet_gradient.data + 72 * s;
-    const float* moduli = f.tissue.tet_moduli.data + 32 * s;
+    const float* moduli = f.tissue.tet_moduli.data + 24 * s;
     const V volume = ld(moduli, 0, lane), mu = ld(moduli, 1, lane), lam = ld(moduli, 2, lane);
     const size_t at = (size_t)t.world * f.shape.ntetslice + s;
     float* arm = f.system.tet_arm.data + 128 * at;
     float* impulse = f.system.tet_impulse.data + 128 * at;
-    const M3 H = ld9(arm, lane), rate = ld9(impulse, lane);
+    const M3 H = gradient(motion, node, g, lane), rate = gradient(motion + 32, node, g, lane);
     const Swelling now = swelling(H);
     const M3 F = H + splat(1.0f), C = now.c + splat(1.0f);
-    const V i = 2.0f * trace(H) + inner(H, H), size2 = 3.0f + i;
-    // Mean pressure of the corners, and with the tetrahedron's own.
-    V p = splat(0.0f);
-    for (int k = 0; k < 4; ++k) p += gather(pressure, node + 8 * k, 0, lane);
-    p = 0.25f * p + (h * lam) * now.j;
-    const M3 stress = (0.75f * h * mu) * (H + splat(-1.0f) * now.c)
-      + (0.25f * h * mu * i / (4.0f + i)) * F + p * C;
+    const V size2 = inner(F, F);
     const M3 Q = turn(F, C, now.j + 1.0f, size2), strain = transposed(Q) * rate;
-    const M3 moving = (0.75f * gv * mu) * (strain + transposed(strain))
-      + gv * (lam - 0.625f * mu) * trace(strain);
-    const M3 P = splat(-1.0f) * volume * (stress + Q * moving);
+    const V own = OWN_SHARE * mu;
+    V p;
+    const M3 elastic = mean_stress(nodal, node, p, lane)
+      + stress(H, now, own, (0.625f * h) * own * now.j, h);
+    const M3 P = splat(-1.0f) * volume
+      * (elastic + (0.75f * gv * mu) * (Q * (strain + transposed(strain))));
     const V3 g1 = ld3(g, 0, lane), g2 = ld3(g, 3, lane), g3 = ld3(g, 6, lane);
     const V3 b1 = P * g1, b2 = P * g2, b3 = P * g3;
     share(impulse, splat(-1.0f) * (b1 + b2 + b3), lane);
@@ -166,13 +187,12 @@ PALPATE void tet_stress(const Fields& f, Thread t, int stage) {
     share(impulse + 64, b2, lane);
     share(impulse + 96, b3, lane);
     if (!implicit) return;
-    const V zero = splat(0.0f), mean = inner(Q, stress) / 3.0f, even = inner(Q, C) / 3.0f;
-    const V rest = vmax(inner(stress, stress) - 3.0f * mean * mean, zero);
+    const V zero = splat(0.0f), mean = inner(Q, elastic) / 3.0f, even = inner(Q, C) / 3.0f;
+    const V rest = vmax(inner(elastic, elastic) - 3.0f * mean * mean, zero);
     const V uneven = vmax(inner(C, C) - 3.0f * even * even, zero);
-    const V whole = lam - 0.625f * mu + ld(moduli, 3, lane);
     const V shear = 0.75f * mu + vmax(-p, zero) * vsqrt(size2 / 3.0f) / h;
-    const V tension = vmax(mean + 0.40825f * vsqrt(rest), zero) / h + whole * uneven;
-    const V beside = two(whole * even * even / shear, 1.0f + tension / shear);
+    const V tension = vmax(mean + 0.40825f * vsqrt(rest), zero) / h + lam * uneven;
+    const V beside = two(lam * even * even / shear, 1.0f + tension / shear);
     const M3 scaled = vsqrt(weight * volume * shear) * Q;
     const V3 a1 = scaled * g1, a2 = scaled * g2, a3 = scaled * g3;
     share(arm, splat(-1.0f) * (a1 + a2 + a3), beside, lane);

@@ -1,5 +1,5 @@
 // Ties: springs from nodes of an organ to points of MuJoCo's bodies, of other organs, or of the
-// organ's own rigid motion. Doubles, on the CPU beside MuJoCo.
+// organ's own rigid motion. Doubles, a thread a world: several may share a node.
 //
 // The force on a node at the end of the step, where the node will be and where the point will be:
 //
@@ -14,6 +14,18 @@ namespace palpate {
 
 // What a tie leads to besides bodies.
 constexpr int TO_POINT = -1, TO_OWN_MOTION = -2;
+
+template <class Fields>
+PALPATE Fields of_world(Fields f, int world) {
+  move_to(f.point, world);
+  move_to(f.force, world);
+  move_to(f.number, world);
+  move_to(f.dvel_warm, world);
+  move_nodes(f.own, world);
+  move_input(f.solve, world);
+  move_bodies(f.mj, world);
+  return f;
+}
 
 struct Rigid { double R[9]; D3 middle, rest, vel, spin; };
 
@@ -115,14 +127,28 @@ PALPATE D3 point_of_body(const Fields& f, int n) {
     + turned(f.mj.xmat.data + 9 * b, load(f.anchor.data + 3 * n));
 }
 
+// Finds where points on another organ are, of a world that is a row.
+template <class Fields>
+PALPATE void aim_ties(const Fields& all, Thread t, int) {
+  Fields f = all;
+  move_to(f.point, t.world);
+  move_nodes(f.other, t.world);
+  each_item(t, f.npair, [&](int n) {
+    const Place p = place_of(f.mj, f.other, f.pair.data[n]);
+    store(f.point.data + 6 * (f.first + n), p.at + load(f.anchor.data + 3 * n));
+    store(f.point.data + 6 * (f.first + n) + 3, p.vel);
+  });
+}
+
 // Adds to the solver's input what pulls at the tied nodes.
 template <class Fields>
-PALPATE void enter_ties(const Fields& f, Thread, int) {
+PALPATE void enter_ties(const Fields& all, Thread t, int) {
+  const Fields f = of_world(all, t.world);
   const int count = f.count.data[0];
   const double h = f.mj.timestep.data[0], reach = f.ahead * h + f.number.data[DAMPING];
   const D3 zero = {0.0, 0.0, 0.0};
   const Rigid own = f.owned.data[0] ? own_motion(f) : Rigid{};
-  if (f.own.windowed && f.restless.data[0]) f.solve.tail.data[TAIL_QUIET] = 0.0;
+  if (f.restless.data[0]) f.solve.quiet.data[0] = 0.0;
   Twist moving = {zero, zero};
   for (int n = 0; n < count; ++n) {
     const int i = f.vert.data[n], node = f.solve.node.data[i];
@@ -154,7 +180,8 @@ PALPATE void enter_ties(const Fields& f, Thread, int) {
 // Ends the forces of the ties with what the step makes of the nodes' velocities, and lets the bodies
 // feel them.
 template <class Fields>
-PALPATE void act_ties(const Fields& f, Thread, int) {
+PALPATE void act_ties(const Fields& all, Thread t, int) {
+  const Fields f = of_world(all, t.world);
   const auto& mj = f.mj;
   const bool ok = f.solve.status.data[3] == 0.0f;
   const double h = mj.timestep.data[0];

@@ -34,4 +34,7 @@ PALPATE D3 barycentric(D3 p, const D3* x) {
   return far1 <= far2 ? D3{0.0, 1.0 - t1, t1} : D3{t2, 0.0, 1.0 - t2};
 }
 
+// The place in a triangle that weights mean.
+PALPATE D3 blend(const D3* x, D3 w) { return w.x * x[0] + w.y * x[1] + w.z * x[2]; }
+
 }  // namespace palpate

@@ -137,7 +137,8 @@ def _sizes(values: dict[str, Any]) -> dict[str, int]:
   return out | {
     "nsolidslice": out["nslice"] if solid else 0,
     "nheld": len(values["held_adr"]),
-    "naround": len(values["around_tet"]),
+    "nsolidslot": out["nslot"] if solid else 0,
+    "naround": len(values["around_corner"]),
     "ncapsule": values["ncapsule"],
     "ncapsuleslice": out["nslice"] if values["ncapsule"] else 0,
     "nedge": len(values["edge_from"]),

@@ -16,6 +16,7 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 from . import faces, settle
+from .cut import Motion
 from .fill import FACES
 from .mesh import Mesh, among, area_vectors, distinct, lengths
 from .settle import Energy
@@ -38,10 +39,10 @@ class Cut:
 
   Attributes:
     mesh: the solid, cut
+    motion: what its vertices carry
+    moved: how many vertices lie elsewhere at rest
+    near: vertices that move on otherwise                          (n,)
     changed: tetrahedra that are not as they were                  (n,)
-    moved: vertices that lie elsewhere at rest                     (n,)
-    corner: where they lie in the mesh before: corners of a tetrahedron (n, 4)
-    weight: and their weights                                      (n, 4)
     group, member, share, seat: see `faces.Split`                  (m,)
     path: the edges on the skin that came apart at rest [m]        list of (2, 3)
     length: of these [m]
@@ -52,10 +53,10 @@ class Cut:
   """
 
   mesh: Mesh
+  motion: Motion
+  moved: int
+  near: np.ndarray
   changed: np.ndarray
-  moved: np.ndarray
-  corner: np.ndarray
-  weight: np.ndarray
   group: np.ndarray
   member: np.ndarray
   share: np.ndarray
@@ -71,7 +72,7 @@ class Cut:
 def cut(
   organ: str,
   mesh: Mesh,
-  position: np.ndarray,
+  motion: Motion,
   points: np.ndarray,
   pinned: np.ndarray,
   depth: float | np.ndarray | None = None,
@@ -85,8 +86,8 @@ def cut(
   Args:
     organ: its name, for messages
     mesh: the solid, as `faces.faced` makes it
-    position: where its vertices are now [m]     (nvert, 3)
-    points: the path, in the same frame [m]      (n, 3)
+    motion: what its vertices carry
+    points: the path, in the organ's frame [m]   (n, 3)
     pinned: vertices that do not move            (nvert,) bool
     depth: of the cut, or None, see `sheet.sweep`
     direction: in which it goes, or None, see there
@@ -98,47 +99,68 @@ def cut(
     ValueError: the path is off the skin or too short, goes through pinned tissue, or the depth is
       not allowed.
   """
-  sheet = sweep(organ, mesh, position, points, depth, direction)
+  sheet = sweep(organ, mesh, mesh.rest + motion.disp, points, depth, direction)
   face, where = _between(mesh, sheet)
-  whole = len(face)
-  face, made = _fitting(mesh, where, face, room)
+  face, made, stopped = _fitting(mesh, where, face, room)
   if made is None:
-    return _nothing(mesh)
-  if not made.group.size and len(face) < whole:
-    return _nothing(mesh)
+    return _nothing(mesh, motion)
+  if not made.group.size and stopped:
+    return _nothing(mesh, motion)
   if not made.group.size:
     raise ValueError(
       f"organ {organ!r}: no tetrahedra come apart along the path, expected a longer or deeper one, "
       "or it was cut there before"
     )
   _check(organ, mesh, face, pinned)
-  vert, u = distinct(_corners(mesh, face)), position - mesh.rest
-  moves = settle.move(mesh, vert, where, sheet.path, pinned, u, (energy, given))
+  vert = distinct(_corners(mesh, face))
+  moves = settle.move(mesh, vert, where, sheet.path, pinned, motion.disp, (energy, given))
   made = faces.split(mesh, moves.rest, face)
   assert made is not None
-  return _told(mesh, made, moves, sheet, len(face) < whole)
+  goes = _carried(mesh, made, moves, motion, pinned)
+  return _told(mesh, made, goes, sheet, stopped)
 
 
 def _fitting(mesh: Mesh, where: Where, face: np.ndarray, room: int | None):
   """Returns as many faces, from where the path begins, as there is room for, and what they part.
 
   That is None where there is no room at all.
+
+  Returns:
+    faces, what they part, and whether these are fewer for want of room
   """
   along = where.along[_corners(mesh, face)].max(axis=1, initial=0.0)
-  face = face[np.argsort(along, kind="stable")]
+  face, stopped = face[np.argsort(along, kind="stable")], False
   while True:
-    made = faces.split(mesh, mesh.rest, face)
+    try:
+      made = faces.split(mesh, mesh.rest, face)
+    except faces.Crowded as crowd:  # around these it hangs together
+      face = face[~np.isin(_corners(mesh, face), crowd.vertices).any(axis=1)]
+      continue
     if made is not None and (room is None or made.mesh.nelem <= room):
-      return face, made
+      return face, made, stopped
     if not face.size:
-      return face, None
-    face = face[: int(_FEWER * len(face))]
+      return face, None, True
+    face, stopped = face[: int(_FEWER * len(face))], True
 
 
-def _nothing(mesh: Mesh) -> Cut:
-  none, wide = np.zeros(0, int), np.zeros((0, 4))
-  numbers = (none, none, wide.astype(int), wide, none, none, np.zeros(0), none)
-  return Cut(mesh, *numbers, [], 0.0, 0.0, 0.0, 0.0, True)
+def _nothing(mesh: Mesh, motion: Motion) -> Cut:
+  none = np.zeros(0, int)
+  return Cut(mesh, motion, 0, *4 * [none], np.zeros(0), none, [], 0.0, 0.0, 0.0, 0.0, True)
+
+
+def _carried(mesh: Mesh, made: faces.Split, moves: settle.Moves, motion: Motion, pinned):
+  """Returns what vertices carry then, how many were moved, and which move on otherwise."""
+  near = distinct(mesh.tet[made.changed])
+  near = near[~pinned[near]]
+  disp, vel, mass = motion.disp.copy(), motion.vel.copy(), motion.mass.copy()
+  disp[moves.vert] = np.einsum("nk,nkj->nj", moves.weight, motion.disp[moves.corner])
+  was, goes = mesh.rest[near] + motion.disp[near], moves.rest[near] + disp[near]
+  vel[near] = settle.keep_spin(mass[near], was, goes, motion.vel[near])
+  group, member = made.group, made.member
+  disp[member], vel[member] = disp[group], vel[group]
+  mass[group] = 0.0
+  mass[member] = made.share * motion.mass[group]
+  return Motion(mass, disp, vel), len(moves.vert), near
 
 
 def _corners(mesh: Mesh, face: np.ndarray) -> np.ndarray:
@@ -229,7 +251,7 @@ def _parted(mesh: Mesh, where: Where, near, left, right, edge: float) -> np.ndar
   return face[side[a] != side[b]]
 
 
-def _told(mesh: Mesh, made: faces.Split, moves: settle.Moves, sheet: Sheet, stopped: bool) -> Cut:
+def _told(mesh: Mesh, made: faces.Split, goes: tuple, sheet: Sheet, stopped: bool) -> Cut:
   """Returns the cut, with what is said of it."""
   new = made.mesh
   wall = new.elem[mesh.nelem :: 2]
@@ -237,10 +259,8 @@ def _told(mesh: Mesh, made: faces.Split, moves: settle.Moves, sheet: Sheet, stop
   path, length, deviation, depth = _mouth(mesh, made, sheet)
   return Cut(
     new,
+    *goes,
     made.changed,
-    moves.vert,
-    moves.corner,
-    moves.weight,
     made.group,
     made.member,
     made.share,

@@ -1,38 +1,111 @@
 """Cuts: a path on the surface becomes edges of the mesh, and the mesh comes apart along them.
 
-A chain of edges near the path is found, its vertices are moved onto the path in the rest shape
-("snap"), as far as no triangle gets thin, and vertices on it are doubled ("split"; Nienhuys and van
-der Stappen 2001). Triangles keep their numbers and none is added, so that what is stored by
-triangle stays, and so does the room that arrays need.
+A chain of edges near the path is found, its vertices are moved onto the path in the rest shape, as
+far as no triangle gets thin, and vertices on it are doubled: `native/cut.h`. Triangles keep their
+numbers and none is added, so that what is stored by triangle stays, and so does the room that
+arrays need.
 """
 
-from __future__ import annotations
-
+# Annotations here are objects, not text: no `from __future__ import annotations`.
+# pyright: reportInvalidTypeForm=false
 import dataclasses
-from collections.abc import Callable
+from typing import Any
 
 import numpy as np
+import warp as wp
 
-from . import mesh as topology
-from . import path as paths
-from .mesh import Mesh
+from . import config as configuration
+from .config import Config
+from .kernels import kernel
+from .mesh import Mesh, lengths
+from .surface import Surface, WorkingCopy, host_views
+from .types import CONSTANTS, allocate, doubles, flags, ints, longs, struct
 
-_SHAPE = 0.3  # least shape of a triangle that is moved, or so much of what it had; equilateral: 1
-_KEEP = 0.9
-_TURN = 0.95  # least cosine between a triangle's normals before and after
-_CORNER = -0.8  # greatest cosine between the boundary's edges at a vertex that may slide on it
-_TRIES = 10
-_RISE = 1.01  # times its energy that the tissue around a vertex may have when it was moved
-_LESS = 0.7
+# Why nothing was cut, and what a path's samples are apart at most [edges], as in native/path.h.
+_DONE, _NO_ROOM, _OFF, _SHORT, _PINNED = range(5)
+_SAMPLE, _FAR = 0.25, 2.0
+_KINDS = {"membrane": 1, "spring": 2}  # of energy, as in native/snap.h
+_FOUND = (
+  "status", "moved", "near", "split", "changed", "edges", "nouter", "stopped", "apart",
+)  # fmt: skip
+_SIZE = ("bad", "far", "deviation")
+_NUMBERS = {
+  f"{prefix}_{name.upper()}": k
+  for prefix, names in (("FOUND", (*_FOUND, "length")), ("SIZE", (*_SIZE, "length")))
+  for k, name in enumerate(names)
+}
 
 
-# Energy of triangles [J], (n,), from their corners at rest and the displacements of these,
-# (n, 3, 3) each, and their numbers (n,).
-Energy = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+@struct
+class Cutting:
+  """What cuts of nworld surfaces of one whole read and write; the surfaces are other ones then."""
 
-# Energy of springs that hold vertices [J], (n,), from these (n,) and the changes of their
-# displacements (n, 3).
-Held = Callable[[np.ndarray, np.ndarray], np.ndarray]
+  surface: Surface
+  most_points: int  # points of a path
+  nint: int  # whole numbers of scratch
+  nreal: int  # others
+  kind: int  # of energy: 0 none, 1 membrane, 2 springs
+  held: int  # whether springs hold vertices
+  edge: wp.float64  # mean length of the whole's edges [m]
+  thickness: wp.float64  # [m]
+  stiffness: wp.float64  # of an edge's spring [N/m]
+  given: wp.float64  # by which the energy around a vertex may rise as it moves [J]
+  home: longs("nelem")  # `Mesh.home`
+  mass: doubles("nworld", "nvert")  # of vertices, before and after [kg]
+  disp: doubles("nworld", "nvert", 3)  # displacement [m]
+  vel: doubles("nworld", "nvert", 3)  # velocity [m/s]
+  pinned: flags("nworld", "nvert")  # whether a vertex does not move
+  lame: doubles("nelem")  # of triangles [Pa]
+  shear: doubles("nelem")  # [Pa]
+  whole: doubles("nworld", "nvert")  # energy of springs at vertices [J]
+  pull: doubles("nworld", "nvert", 3)  # its gradient [N]
+  hard: doubles("nworld", "nvert")  # their stiffness [N/m]
+  npoint: ints("nworld")  # points of the path
+  point: doubles("nworld", "most_points", 3)  # these, where the surface is now [m]
+  found: ints("nworld", len(_FOUND))  # see _FOUND; nouter is read too
+  size: doubles("nworld", len(_SIZE))  # see _SIZE
+  near: ints("nworld", "nvert")  # see `Cut`, these and what follows
+  group: ints("nworld", "nvert")
+  member: ints("nworld", "nvert")
+  share: doubles("nworld", "nvert")
+  changed: ints("nworld", "nelem")
+  before: ints("nworld", "nelem", 3)
+  seam: ints("nworld", "nvert", 2)  # edges that came apart
+  ints: ints("nworld", "nint")  # scratch
+  reals: doubles("nworld", "nreal")
+
+
+_cut = kernel("cut_surface", "cut.h", Cutting, CONSTANTS | _NUMBERS)
+
+
+@dataclasses.dataclass(frozen=True)
+class Springs:
+  """What holds vertices.
+
+  Attributes:
+    energy: of those of each vertex [J]     (nvert,)
+    force: its gradient [N]                 (nvert, 3)
+    stiffness: of these together [N/m]      (nvert,)
+  """
+
+  energy: np.ndarray
+  force: np.ndarray
+  stiffness: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
+class Motion:
+  """What vertices carry.
+
+  Attributes:
+    mass: [kg]                       (nvert,)
+    disp: displacement from rest [m] (nvert, 3)
+    vel: velocity [m/s]              (nvert, 3)
+  """
+
+  mass: np.ndarray
+  disp: np.ndarray
+  vel: np.ndarray
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,12 +114,14 @@ class Cut:
 
   Attributes:
     mesh: the mesh, cut
+    motion: what its vertices carry, until the next cut
+    moved: how many vertices lie elsewhere at rest
+    near: vertices that move on otherwise, those that have come not among them (n,)
     changed: triangles that are not as they were                        (n,)
-    moved: vertices that lie elsewhere at rest                          (n,)
-    corner: where they lie in the mesh before: corners of a triangle    (n, 3)
-    weight: and their weights                                           (n, 3)
+    before: corners that they had                                       (n, 3)
     group: vertices that were one, of the first of each group           (m,)
     member: those vertices, old and new                                 (m,)
+    share: their parts of its mass                                      (m,)
     path: the cut edges, one after the other, at rest [m]               list of (k, 3)
     length: of the cut edges at rest [m]
     deviation: greatest distance of their vertices from the path [m]
@@ -54,292 +129,169 @@ class Cut:
   """
 
   mesh: Mesh
+  motion: Motion
+  moved: int
+  near: np.ndarray
   changed: np.ndarray
-  moved: np.ndarray
-  corner: np.ndarray
-  weight: np.ndarray
+  before: np.ndarray
   group: np.ndarray
   member: np.ndarray
+  share: np.ndarray
   path: list[np.ndarray]
   length: float
   deviation: float
   stopped: bool
 
 
-def cut(
-  organ: str,
-  mesh: Mesh,
-  position: np.ndarray,
-  points: np.ndarray,
-  pinned: np.ndarray,
-  energy: Energy | None = None,
-  held: Held | None = None,
-  given: float = 0.0,
-) -> Cut:
-  """Returns the mesh cut along the path on the surface that is nearest to points.
+class Knife:
+  """Cuts surfaces of one whole, one after the other.
 
   Args:
-    organ: its name, for messages
-    mesh: the surface
-    position: where its vertices are now [m]     (nvert, 3)
-    points: the path, in the same frame [m]      (n, 3)
-    pinned: vertices that do not move            (nvert,) bool
-    energy: of triangles, which moving vertices must not raise, or None
-    held: that of what holds vertices, for which the same is true, or None
-    given: but by so much around each, since what cuts has brought it [J]
-
-  Raises:
-    ValueError: points are off the surface; the path goes through pinned vertices, or is too short.
+    copy: where they are
   """
-  edge = mesh.whole.edge_length
-  runs = paths.trace(organ, mesh, position, points, edge)
-  for run in runs:
-    if not run.open:
-      run.chain = paths.chain(mesh, run, edge)
-  _check(organ, mesh, runs, pinned)
-  edges, stopped = _room(mesh, [pair for run in runs for pair in _uncut(mesh, run.chain)])
-  there = {v for pair in edges for v in pair}
-  moved, corner, weight = _snap(mesh, runs, pinned, position, (energy, held, given), there)
-  rest = mesh.rest.copy()
-  rest[moved] = np.einsum("nk,nkj->nj", weight, mesh.rest[corner])
-  elem, group, member = _split(mesh, edges)
-  rest[member] = rest[group]
-  near = topology.around(mesh, topology.distinct(np.array(list(there), int), moved))
-  new, changed = topology.recut(mesh, rest, elem, mesh.loose, near)
-  if any(_may_separate(run, group) for run in runs):
-    new = topology.come_loose(new)
-  path = _lines(rest, edges)
-  cut_chains = [(run, [v for v in run.chain if v in there]) for run in runs]
-  far = [paths.distance(run.at, rest[chain])[0].max() for run, chain in cut_chains if chain]
-  length = sum(float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum()) for line in path)
-  deviation = float(max(far, default=0.0))
-  return Cut(new, changed, moved, corner, weight, group, member, path, length, deviation, stopped)
 
+  def __init__(self, copy: WorkingCopy):
+    self._copy, self._whole = copy, copy.whole
+    self._config: Config | None = None
+    self._fields: Any = None
+    self._host: dict[str, np.ndarray] = {}
+    self._launch: Any = None
 
-def _ends_on_rim(mesh: Mesh, chain: list[int]) -> bool:
-  if len(chain) != 2:
-    return False
-  return any(_is_on_rim(mesh, v) for v in chain) and _is_inner(mesh, *chain)
+  def cut(
+    self,
+    organ: str,
+    mesh: Mesh,
+    motion: Motion,
+    points: np.ndarray,
+    pinned: np.ndarray,
+    config: Config | None = None,
+    held: Springs | None = None,
+    given: float = 0.0,
+  ) -> Cut:
+    """Returns the mesh cut along the path on the surface that is nearest to points.
 
+    Args:
+      organ: its name, for messages
+      mesh: the surface
+      motion: what its vertices carry; mass, momentum and angular momentum are kept
+      points: the path, in the same frame [m]            (n, 3)
+      pinned: vertices that do not move                  (nvert,) bool
+      config: material, whose energy moving vertices must not raise, or None
+      held: what holds vertices, for which the same is true, or None
+      given: but by so much around each, since what cuts has brought it [J]
 
-def _is_on_rim(mesh: Mesh, vert: int) -> bool:
-  return bool(mesh.ring_elem[vert, mesh.degree[vert] - 1] < 0)
+    Raises:
+      ValueError: points are off the surface; the path goes through pinned vertices, or is too
+        short.
+    """
+    _check_points(organ, points)
+    self._make_room(points)
+    self._copy.put(mesh)
+    self._put_material(config if config and config.elements in _KINDS else None, held, given)
+    host = self._host
+    host["mass"][:], host["disp"][:], host["vel"][:] = motion.mass, motion.disp, motion.vel
+    host["pinned"][:] = pinned
+    host["point"][: len(points)], host["npoint"][0] = points, len(points)
+    host["found"][:] = 0
+    host["found"][_FOUND.index("nouter")] = mesh.nouter
+    self._launch()
+    found = dict(zip(_FOUND, host["found"].tolist(), strict=True))
+    self._check(organ, found["status"])
+    return self._answer(mesh, found)
 
+  def _make_room(self, points: np.ndarray):
+    """Makes the arrays, and makes them larger for a long path."""
+    whole, edge = self._whole, self._whole.edge_length
+    n = 2 * len(points) + int((lengths(np.diff(points, axis=0)) / (_SAMPLE * edge)).sum())
+    if self._fields is not None and n <= self._fields.most_points:
+      return
+    n, self._config = 2 * n, None
+    sizes = self._copy.sizes | {"most_points": n}
+    # What native/cut.h takes of scratch, see there.
+    sizes["nint"] = 24 * whole.nvert + 15 * whole.nelem + 16 * n + 8 * sizes["most"] + 100
+    sizes["nreal"] = 32 * whole.nvert + 6 * whole.nelem + 11 * n
+    self._fields = fields = allocate(Cutting, "cpu", sizes)
+    fields.surface, fields.edge = self._copy.fields, edge
+    for name in ("most_points", "nint", "nreal"):
+      setattr(fields, name, sizes[name])
+    self._host = host_views(fields, Cutting)
+    self._host["home"][:] = whole.home
+    self._launch = _cut.command(fields).launch
 
-def _check(organ: str, mesh: Mesh, runs: list[paths.Run], pinned: np.ndarray):
-  # One edge is enough where it ends on a boundary, or at the end of an older cut.
-  if not any(
-    run.open or len(run.chain) > 2 or _ends_on_rim(mesh, run.chain) for run in runs
-  ):
-    raise ValueError(
-      f"organ {organ!r}: the path is shorter than two edges of the mesh there, expected a longer "
-      "one"
-    )
-  for run in runs:
-    split = run.chain if run.closes else run.chain[1:-1]
-    split = [*split, *(v for v in run.chain[:1] + run.chain[-1:] if _is_on_rim(mesh, v))]
-    bad = [v for v in split if pinned[v]]
-    if bad:
+  def _put_material(self, config: Config | None, held: Springs | None, given: float):
+    fields, host = self._fields, self._host
+    fields.kind = _KINDS[config.elements] if config else 0
+    fields.held, fields.given = int(held is not None), given
+    if config and config != self._config:
+      fields.thickness, fields.stiffness = config.thickness, config.stiffness
+      host["lame"][:], host["shear"][:] = configuration.lame(config, self._whole.nelem)
+      self._config = config
+    if held is not None:
+      host["whole"][:], host["pull"][:] = held.energy, held.force
+      host["hard"][:] = held.stiffness
+
+  def _check(self, organ: str, status: int):
+    """Says why nothing was cut.
+
+    Raises:
+      ValueError: nothing was.
+    """
+    bad, far = self._host["size"][:2]
+    edge = self._whole.edge_length
+    if status == _OFF:
       raise ValueError(
-        f"organ {organ!r}: the path goes through vertex {bad[0]}, which is pinned, expected tissue "
-        "that moves"
+        f"organ {organ!r}: point {int(bad)} of the path is {far:.3g} m from the surface, expected "
+        f"at most {_FAR * edge:.3g} m"
+      )
+    if status == _SHORT:
+      raise ValueError(
+        f"organ {organ!r}: the path is shorter than two edges of the mesh there, expected a longer "
+        "one"
+      )
+    if status == _PINNED:
+      raise ValueError(
+        f"organ {organ!r}: the path goes through vertex {int(bad)}, which is pinned, expected "
+        "tissue that moves"
+      )
+    if status == _NO_ROOM:
+      self._copy.forget()
+      raise ValueError(
+        f"organ {organ!r}: the path goes to and fro too often, expected shorter cuts"
       )
 
-
-# Snapping.
-
-
-def _snap(
-  mesh: Mesh, runs: list[paths.Run], pinned, position, energies: tuple, there: set[int]
-):
-  """Returns vertices that move at rest, and where they lie: corners of a triangle and weights.
-
-  Those of the runs that are `there`.
-  """
-  vert, goal = [np.zeros(0, int)], [np.zeros((0, 3))]
-  for run in runs:
-    chain = np.array(run.chain, int)
-    if not len(chain):
-      continue
-    at = paths.distance(run.at, mesh.rest[chain])[1]
-    if not run.closes:
-      at[0], at[-1] = run.at[0], run.at[-1]
-    vert.append(chain)
-    goal.append(at)
-  vert, first = np.unique(np.concatenate(vert), return_index=True)
-  goal = np.concatenate(goal)[first]
-  goal, free = _on_rim(mesh, vert, goal)
-  free &= ~pinned[vert] & topology.among(mesh.nvert, list(there))[vert]
-  vert, goal = vert[free], goal[free]
-  around = mesh.ring_elem[vert]
-  elem = np.where(around >= 0, around, around[:, :1]) // 3
-  corner = mesh.rest[mesh.elem[elem]]
-  weight, far = paths.closest(goal[:, None], corner[:, :, 0], corner[:, :, 1], corner[:, :, 2])
-  best, row = np.argmin(far, axis=1), np.arange(len(vert))
-  elem, weight = elem[row, best], weight[row, best]
-  own = (mesh.elem[elem] == vert[:, None]).astype(float)
-  u = position - mesh.rest
-  weight = own + _shares(mesh, vert, elem, weight, u, energies)[:, None] * (weight - own)
-  moved = (weight != own).any(axis=1)
-  return vert[moved], mesh.elem[elem[moved]], weight[moved]
+  def _answer(self, mesh: Mesh, found: dict[str, int]) -> Cut:
+    host, parts = self._host, {"before": "changed", "group": "split", "member": "split"}
+    lists = {
+      name: host[name][: found[parts.get(name, name)]].astype(int)
+      for name in ("near", "changed", *parts)
+    }
+    if found["changed"]:
+      mesh = self._copy.take(mesh, mesh.closed and not found["split"], bool(found["apart"]))
+    path = _lines(mesh.rest, host["seam"][: found["edges"]].tolist())
+    return Cut(
+      mesh=mesh,
+      motion=Motion(host["mass"], host["disp"], host["vel"]),
+      moved=found["moved"],
+      share=host["share"][: found["split"]].copy(),
+      path=path,
+      length=sum(float(lengths(np.diff(line, axis=0)).sum()) for line in path),
+      deviation=float(host["size"][_SIZE.index("deviation")]),
+      stopped=bool(found["stopped"]),
+      **lists,
+    )
 
 
-def _on_rim(mesh: Mesh, vert: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-  """Returns goals of vertices, those of a boundary on it, and whether each may move."""
-  last = mesh.degree[vert] - 1
-  rim = mesh.ring_elem[vert, last] < 0
-  here = mesh.rest[vert]
-  arms = [mesh.rest[mesh.ring[vert, k]] - here for k in (0 * last, last)]
-  units = [arm / np.linalg.norm(arm, axis=1, keepdims=True) for arm in arms]
-  free = ~rim | ((units[0] * units[1]).sum(1) < _CORNER)
-  along = np.stack([np.maximum(((goal - here) * u).sum(1), 0.0) for u in units])
-  side = np.argmax(along, axis=0)
-  slid = here + np.where(
-    side[:, None] == 0, along[0][:, None] * units[0], along[1][:, None] * units[1]
-  )
-  return np.where(rim[:, None], slid, goal), free
+def _check_points(organ: str, points: np.ndarray):
+  if points.ndim != 2 or points.shape[1] != 3 or len(points) < 2:
+    raise ValueError(
+      f"organ {organ!r}: points of a cut have shape {points.shape}, expected (n, 3), n >= 2"
+    )
+  if not np.isfinite(points).all():
+    bad = int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])
+    raise ValueError(f"organ {organ!r}: point {bad} is {points[bad]}, expected finite numbers")
 
 
-def _shares(mesh: Mesh, vert, elem, weight, u: np.ndarray, energies: tuple) -> np.ndarray:
-  """Returns how far of its way each vertex goes, (n,).
-
-  So far that no triangle gets thin or turns, and that the energy around none rises: a vertex gets
-  the displacement of where it goes to, and an uneven strain is another one after it.
-  """
-  energy, held, given = energies
-  tri = topology.around(mesh, vert)
-  own, corner = np.unique(mesh.elem[tri], return_inverse=True)
-  corner = corner.reshape(-1, 3)
-  number = np.searchsorted(own, vert)
-  rest0, u0 = mesh.rest[own], u[own]
-  before = rest0[corner]
-  normal, shape = _form(before)
-  least = np.minimum(_SHAPE, _KEEP * shape)
-  way, lead = (
-    np.einsum("nk,nkj->nj", weight, values[mesh.elem[elem]]) - values[vert]
-    for values in (mesh.rest, u)
-  )
-  had = np.zeros(0) if energy is None else energy(before, u0[corner], tri)
-  share = np.ones(len(vert))
-  mover = np.full(len(own), -1)
-  mover[number] = np.arange(len(vert))
-  who = mover[corner]
-  for k in range(_TRIES + 1):
-    rest = rest0.copy()
-    rest[number] += share[:, None] * way
-    turned, now = _form(rest[corner])
-    bad = (now < least) | ((turned * normal).sum(1) < _TURN)
-    less = topology.distinct(who[bad])
-    if energy is not None:
-      moved, fine = u0.copy(), ~bad
-      moved[number] += share[:, None] * lead
-      has = had.copy()
-      has[fine] = energy(rest[corner[fine]], moved[corner[fine]], tri[fine])
-      old, new = (
-        np.bincount(who.ravel() + 1, np.repeat(e, 3), len(vert) + 1)[1:] for e in (had, has)
-      )
-      if held is not None:
-        old, new = old + held(vert, 0 * lead), new + held(vert, share[:, None] * lead)
-      less = topology.distinct(less, np.flatnonzero(new > _RISE * old + given))
-    less = less[less >= 0]
-    if not less.size:
-      break
-    share[less] *= _LESS if k + 1 < _TRIES else 0.0
-  return share
-
-
-def _form(corner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-  """Returns unit normals and shapes of triangles (n, 3, 3); an equilateral one has shape 1."""
-  a, b, c = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 1], corner[:, 0] - corner[:, 2]
-  area = topology.cross(a, -c)
-  size = topology.lengths(area)
-  length2 = (a * a).sum(1) + (b * b).sum(1) + (c * c).sum(1)
-  return area / np.maximum(size, 1e-300)[:, None], 2 * np.sqrt(3) * size / length2
-
-
-# Splitting.
-
-
-def _fans(mesh: Mesh, vert: int, cuts: set[tuple[int, int]]) -> list[list[int]]:
-  """Returns the half-edges from a vertex, in a list for each of the parts that edges cut it in."""
-  degree = int(mesh.degree[vert])
-  ring, half = mesh.ring[vert, :degree].tolist(), mesh.ring_elem[vert, :degree].tolist()
-  closed = half[-1] >= 0
-  is_cut = [(min(vert, v), max(vert, v)) in cuts for v in ring]
-  parts: list[list[int]] = [[]]
-  for k, h in enumerate(half):
-    if is_cut[k] and parts[-1]:
-      parts.append([])
-    if h >= 0:
-      parts[-1].append(h)
-  if closed and len(parts) > 1 and not is_cut[0]:
-    parts[0] = parts.pop() + parts[0]
-  return [part for part in parts if part]
-
-
-def _may_separate(run: paths.Run, group: np.ndarray) -> bool:
-  """Returns whether a cut along a run may make two pieces: not where an end of it is inside."""
-  ends = {run.chain[0], run.chain[-1]} if run.chain else {-1}
-  return run.closes or ends <= set(group.tolist())
-
-
-def _uncut(mesh: Mesh, chain: list[int]) -> list[tuple[int, int]]:
-  """Returns the edges of a chain that have tissue on both sides.
-
-  Where it goes along an older cut, single edges between are not a way into the tissue.
-  """
-  pairs = paths.pairs(chain)
-  inner = [_is_inner(mesh, *pair) for pair in pairs]
-  if all(inner):
-    return pairs
-  beside = [False, *inner, False]
-  return [p for k, p in enumerate(pairs) if inner[k] and (beside[k] or beside[k + 2])]
-
-
-def _is_inner(mesh: Mesh, a: int, b: int) -> bool:
-  """Returns whether an edge has a triangle on both sides."""
-  halves = mesh.ring_elem[a][mesh.ring[a] == b]
-  return bool(len(halves) and halves[0] >= 0 and mesh.twin[halves[0]] >= 0)
-
-
-def _room(mesh: Mesh, pairs: list[tuple[int, int]]) -> tuple[list[tuple[int, int]], bool]:
-  """Returns as many of the edges, from the first one, as there are spare vertices for."""
-  left = mesh.nvert - mesh.nouter
-  count = len(pairs)
-  while count:
-    cuts = {(min(p), max(p)) for p in pairs[:count]}
-    verts = dict.fromkeys(v for pair in pairs[:count] for v in pair)
-    need = sum(len(_fans(mesh, v, cuts)) - 1 for v in verts)
-    if not need:  # nothing comes apart: it was cut already, or there is no room at all
-      return [], count < len(pairs)
-    if need <= left:
-      break
-    count -= max(1, min(count, need - left))
-  return pairs[:count], count < len(pairs)
-
-
-def _split(mesh: Mesh, pairs: list[tuple[int, int]]):
-  """Returns the triangles cut along edges, and the vertices that were one."""
-  cuts = {(min(p), max(p)) for p in pairs}
-  elem = mesh.elem.copy()
-  corner = elem.reshape(-1)
-  following = mesh.nouter
-  group, member = [], []
-  for v in dict.fromkeys(v for pair in pairs for v in pair):
-    parts = _fans(mesh, v, cuts)
-    if len(parts) < 2:
-      continue
-    kept = max(range(len(parts)), key=lambda k: len(parts[k]))
-    for k, part in enumerate(parts):
-      name = v if k == kept else following
-      following += k != kept
-      corner[part] = name
-      group.append(v)
-      member.append(name)
-  return elem, np.array(group, int), np.array(member, int)
-
-
-def _lines(rest: np.ndarray, pairs: list[tuple[int, int]]) -> list[np.ndarray]:
+def _lines(rest: np.ndarray, pairs: list[list[int]]) -> list[np.ndarray]:
   """Returns edges that follow one another as polylines."""
   lines: list[list[int]] = []
   for a, b in pairs:

@@ -16,6 +16,7 @@ from . import mesh as topology
 from . import solid as solids
 from .config import Config
 from .mesh import Mesh
+from .step import OWN_SHARE
 
 
 def membrane(mesh: Mesh, config: Config, u: np.ndarray) -> float:
@@ -135,21 +136,33 @@ def enclosed(mesh: Mesh, config: Config, u: np.ndarray) -> float:
 
 
 def solid(mesh: Mesh, config: Config, u: np.ndarray) -> float:
-  """Returns the energy of the tetrahedra [J], see native/solid.h."""
+  """Returns the energy of the tetrahedra and of their means over nodes [J], see native/solid.h."""
   if config.elements != "solid":
     return 0.0
-  volume = fill.volumes(mesh.rest, mesh.tet)
-  h = np.einsum("tki,tkj->tij", u[mesh.tet], solids.gradients(mesh))
-  i = 2 * np.trace(h, axis1=1, axis2=2) + (h * h).sum(axis=(1, 2))
-  cofactor = np.stack([np.cross(h[:, k - 2], h[:, k - 1]) for k in range(3)], axis=1)
-  swelling = np.trace(h, axis1=1, axis2=2) + np.trace(cofactor, axis1=1, axis2=2)
-  swelling += (h[:, 0] * cofactor[:, 0]).sum(axis=1)
-  mu, lam, averaged = solids.moduli(mesh, config)
-  own = mu / 2 * (i - np.log1p(i / 4)) - 3 / 4 * mu * swelling + lam / 2 * swelling**2
-  share = fill.vertex_volumes(mesh)
-  mean = fill.vertex_volumes(mesh, swelling) / np.where(share > 0, share, 1.0)  # some wait for cuts
-  stiffness = fill.vertex_volumes(mesh, averaged)
-  return float((volume * own).sum() + 0.5 * (stiffness * mean**2).sum())
+  volume, total = fill.volumes(mesh.rest, mesh.tet), fill.vertex_volumes(mesh)
+  slope = np.einsum("tki,tkj->tij", u[mesh.tet], solids.gradients(mesh))
+  parts = [fill.vertex_volumes(mesh, part) for part in slope.reshape(-1, 9).T]
+  mean = np.stack(parts, axis=1).reshape(-1, 3, 3) / np.maximum(total, 1e-300)[:, None, None]
+  mu, _ = solids.moduli(mesh, config)
+  own = OWN_SHARE * of_gradients(slope, mu, 0.0)
+  nodal = of_gradients(mean, *solids.nodal_moduli(mesh, config).T)
+  return float((volume * own).sum() + (total * nodal).sum())
+
+
+def of_gradients(slope: np.ndarray, mu: np.ndarray, lam: np.ndarray | float) -> np.ndarray:
+  """Returns the density of stable neo-Hookean energy [J/m^3], (n,).
+
+  Args:
+    slope: gradients of the displacement    (n, 3, 3)
+    mu: [Pa]                                (n,)
+    lam: [Pa]                               (n,)
+  """
+  i = 2 * np.trace(slope, axis1=1, axis2=2) + (slope * slope).sum(axis=(1, 2))
+  cofactor = np.stack([np.cross(slope[:, k - 2], slope[:, k - 1]) for k in range(3)], axis=1)
+  swelling = np.trace(slope, axis1=1, axis2=2) + np.trace(cofactor, axis1=1, axis2=2)
+  swelling += (slope[:, 0] * cofactor[:, 0]).sum(axis=1)
+  shape = mu / 2 * (i - np.log1p(i / 4)) - 3 / 4 * mu * swelling
+  return shape + (lam + 5 / 8 * mu) / 2 * swelling**2
 
 
 def of_tets(
@@ -165,13 +178,9 @@ def of_tets(
     which: their numbers                        (n,)
   """
   arm = rest[:, 1:] - rest[:, :1]
-  h = np.einsum("nkj,nik->nji", u[:, 1:] - u[:, :1], np.linalg.inv(arm))
-  size = (h * h).sum(axis=(1, 2))
-  i = 2 * np.trace(h, axis1=1, axis2=2) + size
-  j = np.linalg.det(np.eye(3) + h) - 1
-  mu, lam, averaged = (each[which] for each in solids.moduli(mesh, config))
-  own = mu / 2 * (i - np.log1p(i / 4)) - 3 / 4 * mu * j + (lam + averaged) / 2 * j**2
-  return np.linalg.det(arm) / 6 * own
+  slope = np.linalg.solve(arm, u[:, 1:] - u[:, :1]).transpose(0, 2, 1)
+  mu, lam = (each[which] for each in solids.moduli(mesh, config))
+  return np.linalg.det(arm) / 6 * of_gradients(slope, mu, lam)
 
 
 # The terms of the energy: (mesh, config, displacement) -> [J], 0 where a term is off.

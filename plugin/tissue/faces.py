@@ -17,8 +17,16 @@ from scipy.sparse import csgraph
 from .fill import FACES, joined, volumes
 from .mesh import Mesh, among, build, distinct
 
-MORE = 4  # neighbours that a vertex may have by cuts; where it would have more they end
+MORE = 6  # neighbours that a vertex may have by cuts; where it would have more they end
 _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+
+
+class Crowded(ValueError):
+  """Some vertices have no room for their neighbours: `vertices`."""
+
+  def __init__(self, vertices: np.ndarray):
+    super().__init__("vertices have no room for their neighbours")
+    self.vertices = vertices
 
 
 @dataclasses.dataclass(frozen=True)
@@ -180,6 +188,9 @@ def split(mesh: Mesh, rest: np.ndarray, face: np.ndarray) -> Split | None:
     mesh: the solid
     rest: rest positions of its vertices [m]    (nvert, 3)
     face: faces, one of each pair               (n,)
+
+  Raises:
+    Crowded: vertices of the solid have no room for their neighbours.
   """
   mate = mates_now(mesh)
   face, parts = _without_idle(mesh, mate, face)
@@ -204,9 +215,12 @@ def split(mesh: Mesh, rest: np.ndarray, face: np.ndarray) -> Split | None:
   of_tet = np.concatenate([mesh.of_tet, corners(both)])
   rest = rest.copy()
   rest[name] = rest[vert]
-  made, changed = grown(mesh, rest, tet, of_tet)
-  if made is None:
-    return None
+  try:
+    made, changed = grown(mesh, rest, tet, of_tet)
+  except Crowded as crowd:
+    source = np.arange(mesh.nvert)
+    source[name] = vert
+    raise Crowded(source[crowd.vertices]) from None
   volume = np.bincount(part, volumes(rest, tet[corner // 4]), len(vert))
   share = volume / np.bincount(vert, volume, mesh.nvert)[vert]
   some = ~(alone & keeps)
@@ -230,8 +244,10 @@ def grown(mesh: Mesh, rest: np.ndarray, tet: np.ndarray, of_tet: np.ndarray):
   """Returns a solid with other rest positions, corners and triangles, of the same whole.
 
   Returns:
-    the solid, None where a vertex has no room for its neighbours, and the tetrahedra that are not
-    as they were, ascending
+    the solid, and the tetrahedra that are not as they were, ascending
+
+  Raises:
+    Crowded: vertices have no room for their neighbours.
   """
   whole = mesh.whole
   apart = (tet != mesh.tet).any(axis=1)
@@ -245,8 +261,9 @@ def grown(mesh: Mesh, rest: np.ndarray, tet: np.ndarray, of_tet: np.ndarray):
   vert = distinct(tet[apart], mesh.tet[apart])
   ring, degree = mesh.ring.copy(), mesh.degree.copy()
   near, degree[vert] = _rings(tet, vert, mesh.nvert)
-  if (degree > room(mesh)).any():
-    return None, changed
+  crowded = np.flatnonzero(degree > room(mesh))
+  if crowded.size:
+    raise Crowded(crowded)
   ring[vert] = -1
   ring[vert, : near.shape[1]] = near
   changes = dict(rest=rest, elem=elem, tet=tet, of_tet=of_tet, ring=ring, degree=degree)

@@ -67,6 +67,16 @@ class Kernel:
     wp.launch(self.on(device), dim=dim, inputs=inputs, device=device, block_dim=block_dim)
 
 
+  def command(self, fields) -> wp.Launch:
+    """Returns what launches the kernel on the CPU, a thread over a world, as often as is wanted.
+
+    Args:
+      fields: the struct, read when it is launched
+    """
+    inputs = [1, 0, _reference(self.struct, fields)]
+    return wp.launch(self.cpu, dim=(1, 1), inputs=inputs, device="cpu", record_cmd=True)
+
+
 def _reference(struct, fields) -> wp.array:
   """Returns an array of the struct's own memory, which it keeps."""
   address = ctypes.addressof(fields.__ctype__())

@@ -50,11 +50,10 @@ class SolidRefill:
     self._owner = np.full(count, -1)
     waits = -(-solid.EDGES * mesh.spare // LANES) * LANES
     self._owner[: count - waits] = count  # never free
-    self._averaged: tuple[Config, np.ndarray] | None = None
 
   def forget(self):
     """Forgets what the arrays hold: others have written into them."""
-    self._host, self._averaged = {}, None
+    self._host = {}
 
   def write(self, mesh: Mesh, changed: np.ndarray, config: Config, pinned: np.ndarray):
     """Makes the body that of another mesh.
@@ -121,7 +120,7 @@ class SolidRefill:
     gradient = solid.gradients(dataclasses.replace(mesh, tet=tet))[:, 1:].reshape(-1, 9)
     at = own // LANES, own % LANES
     return {
-      "tet_node": [((at[0], slice(None), at[1]), self._node[tet])],
+      "tet_node": [((at[0], slice(None), at[1]), offset(self._node[tet]))],
       "tet_gradient": [((at[0], slice(None), at[1]), gradient)],
       "tet_moduli": [((at[0], 0, at[1]), volumes(mesh.rest, tet))],
     }
@@ -134,32 +133,25 @@ class SolidRefill:
     by = np.argsort(vert, kind="stable")
     corner, vert = corner[by], vert[by]
     within = np.arange(len(vert)) - np.searchsorted(vert, vert)
-    size = volumes(mesh.rest, tet[corner // 4])
     node = self._node[vert]
     row, lane = self._around[node // LANES] + within, node % LANES
     own = self._node[touched]
     width = np.diff(self._around)[own // LANES]
     i, k = np.nonzero(np.arange(width.max()) < width[:, None])
     blank = self._around[own[i] // LANES] + k, own[i] % LANES
-    none = len(tet)
-    averaged = self._moduli(mesh, config)[self._order][corner // 4]
-    number = np.searchsorted(touched, vert)
-    total, part = (np.bincount(number, w, len(touched)) / 4 for w in (size, size * averaged))
-    gain = np.where(total > 0, part / np.where(total > 0, total**2, 1.0), 0.0)
+    moduli = solid.nodal_moduli(mesh, config, touched)
+    width = np.diff(self._start)[own // LANES]
+    i, k = np.nonzero(np.arange(width.max()) < width[:, None])
+    empty = self._start[own[i] // LANES] + k, slice(None), own[i] % LANES
+    at, which, slope = solid.slopes(mesh, self._row, self._node, touched)
     return {
-      "around_tet": [(blank, none), ((row, lane), corner // 4)],
       "around_corner": [
-        (blank, solid.corner_number(none, 0)),
+        (blank, solid.corner_number(len(tet), 0)),
         ((row, lane), solid.corner_number(corner // 4, corner % 4)),
       ],
-      "around_share": [(blank, 0.0), ((row, lane), size / 4)],
-      "pressure_gain": [((own // LANES, own % LANES), gain)],
+      "node_moduli": [((own // LANES, slice(None), own % LANES), moduli)],
+      "fan_slope": [(empty, 0.0), ((at, slice(None), which), slope)],
     }
-
-  def _moduli(self, mesh: Mesh, config: Config) -> np.ndarray:
-    if self._averaged is None or self._averaged[0] is not config:
-      self._averaged = config, solid.moduli(mesh, config)[2]
-    return self._averaged[1]
 
   def _edges(self, mesh: Mesh, near: np.ndarray) -> dict[str, list]:
     """Returns the tetrahedra around the edges of some, and where the blocks of these are.

@@ -1,57 +1,180 @@
-"""What a node, a triangle and a hinge have in `Shape` and `Tissue`, dense, for any of them.
+"""What vertices, triangles and hinges have in `Shape` and `Tissue`, as `native/rows.h` writes it.
 
-`shape` makes the arrays of all of them, `refill` those that a cut has changed: both by these.
+`shape` makes the arrays of all of them so, and `refill` writes those that a cut has changed.
 """
 
-from __future__ import annotations
+# Annotations here are objects, not text: no `from __future__ import annotations`.
+# pyright: reportInvalidTypeForm=false
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
+import warp as wp
 
 from . import config as configuration
-from . import faces, plate
+from . import faces
 from .config import Config
+from .kernels import kernel
 from .mesh import Mesh
-from .order import LANES, offset
+from .surface import Surface, WorkingCopy
+from .types import CONSTANTS, Shape, Tissue, doubles, flags, ints, struct
+
+_OF_SHAPE = (
+  "fan_node", "fan_rest", "fan_corner", "fan_side", "degree", "rest", "area", "free", "elem_node",
+  "elem_rest", "elem_hinge", "hinge_node", "hinge_rest", "hinge_elem", "hinge_near", "bend_node",
+)  # fmt: skip
+_OF_TISSUE = ("fan_metric", "fan_spring", "hinge_gain", "bend_gain", "bend_diag")
+NAMES = (*_OF_SHAPE, *_OF_TISSUE)
 
 
-def fans(
-  mesh: Mesh, config: Config, vert: np.ndarray, own: np.ndarray, node: np.ndarray, most: int
-) -> dict[str, np.ndarray]:
-  """Returns what nodes have of the arrays of fans, their entries along the second axis.
+def _typed(cls):
+  """Gives a struct the arrays of `NAMES`, of the types that they have there."""
+  for kind, names in ((Shape, _OF_SHAPE), (Tissue, _OF_TISSUE)):
+    cls.__annotations__ |= {name: kind.vars[name].type for name in names}
+  return cls
+
+
+@struct
+@_typed
+class Filling:
+  """A surface, what its rows are made of, and what they are written to, under the names there."""
+
+  surface: Surface
+  every: int  # whether all is written
+  loosened: int  # whether areas of all vertices are written
+  bends: int  # whether there is bending
+  springs: int  # whether edges are springs, not triangles a membrane
+  nhinge: int  # hinges before the first cut
+  nchanged: int
+  nint: int  # whole numbers of scratch
+  nreal: int  # others
+  thickness: wp.float64  # [m]
+  stiffness: wp.float64  # of an edge's spring [N/m]
+  poisson: wp.float64
+  centre: doubles(3)  # that rest positions are about [m]
+  lame: doubles("nelem")  # of triangles [Pa]
+  shear: doubles("nelem")  # [Pa]
+  young: doubles("nelem")  # [Pa]
+  rigidity: doubles("nelem")  # of their plates [N m]
+  pinned: flags("nvert")  # whether a vertex does not move
+  changed: ints("nelem")  # triangles that are not as they were
+  before: ints("nelem", 3)  # corners that they had
+  hinge_of: ints("nhalf")  # number of each half-edge's hinge before the first cut
+  node: ints("nvert")
+  slot_adr: ints("nslice + 1")
+  bend_adr: ints("nslice + 1")
+  count: ints("nvert")  # entries of rows of the bending matrix
+  found: ints(1)  # whether there was room for these
+  ints: ints("nint")
+  reals: doubles("nreal")
+
+
+_count = kernel("count_bends", "rows.h", Filling, CONSTANTS)
+_fill = kernel("fill_rows", "rows.h", Filling, CONSTANTS)
+_PLATE = 21  # doubles of a triangle's plate
+
+
+class Rows:
+  """Writes rows of the surfaces of one whole.
 
   Args:
-    mesh: the surface
-    config: its configuration
-    vert: vertices, -1 for padding    (n,)
-    own: their nodes                  (n,)
-    node: node of every vertex        (nvert,)
-    most: neighbours that there is room for
+    copy: where these are
+    arrays: those that `Filling` has of `Shape` and `Tissue`, on the CPU; others are left out
+    node: node of every vertex
   """
-  real = vert >= 0
-  degree = np.where(real, mesh.degree[vert], 0)
-  fan, half = _rings(mesh, vert, degree, most)
-  neighbour = np.where(fan >= 0, node[fan], own[:, None])
-  here = mesh.rest[np.where(real, vert, 0)] - mesh.centre
-  toward = mesh.rest[fan] - mesh.centre - here[:, None]
-  toward[fan < 0] = 0.0
-  metric, spring = _stiffness(mesh, config, toward, half, degree)
-  corner = np.where(half >= 0, half, 0)
-  return {
-    "fan_node": offset(neighbour).astype(np.int32),
-    "fan_rest": toward.astype(np.float32),
-    "fan_metric": metric.astype(np.float32),
-    "fan_spring": spring.astype(np.float32),
-    "fan_corner": offset(corner // 3, 4).astype(np.int32),
-    # Corner forces are (nelemslice, 3, 8): component c of vector t.
-    "fan_side": (offset(corner // 3) + corner % 3 * LANES).astype(np.int32),
-    "degree": degree.astype(np.float32),
-    "rest": np.where(real[:, None], here, 0.0).astype(np.float32),
-  }
+
+  def __init__(self, copy: WorkingCopy, arrays: Mapping[str, Any], node: np.ndarray):
+    whole, sizes = copy.whole, copy.sizes
+    self._copy, self._config, self.fields = copy, None, Filling()
+    self.put(arrays)
+    hinge_of = np.full(3 * whole.nelem, -1, np.int32)
+    hinge_of[whole.interior] = np.arange(len(whole.interior))
+    hinge_of[whole.twin[whole.interior]] = np.arange(len(whole.interior))
+    nint = 4 * (sizes["nvert"] + sizes["nelem"]) + 16 * sizes["most"]
+    nreal = 8 * sizes["most"] + _PLATE * sizes["nelem"]
+    scratch = {"ints": np.empty(nint, np.int32), "reals": np.empty(nreal)}
+    self._changed = np.zeros(whole.nelem, np.int32)
+    self._before = np.zeros((whole.nelem, 3), np.int32)
+    self._pinned = np.zeros(whole.nvert, np.uint8)
+    self._put(
+      **scratch, nint=nint, nreal=nreal, nhinge=len(whole.interior), hinge_of=hinge_of,
+      centre=whole.centre, node=node.astype(np.int32), found=np.zeros(1, np.int32),
+      count=np.zeros(sizes["nvert"], np.int32), changed=self._changed, before=self._before,
+      pinned=self._pinned,
+    )  # fmt: skip
+    self.fields.surface = copy.fields
+    self._fill, self._found = _fill.command(self.fields).launch, self.fields.found.numpy()
+
+  def put(self, arrays: Mapping[str, Any]):
+    """Writes into these arrays from now on."""
+    for name in (*NAMES, "slot_adr", "bend_adr"):
+      if name in arrays:
+        setattr(self.fields, name, _array(name, arrays[name]))
+
+  def _put(self, **values):
+    for name, value in values.items():
+      setattr(self.fields, name, _array(name, value) if isinstance(value, np.ndarray) else value)
+
+  def widths(self, mesh: Mesh) -> np.ndarray:
+    """Returns the entries of each vertex's row of the bending matrix, (nvert,)."""
+    self._copy.put(mesh)
+    _count.launch("cpu", 1, 1, 0, self.fields)
+    return self.fields.count.numpy().copy()
+
+  def write(
+    self,
+    mesh: Mesh,
+    config: Config,
+    pinned: np.ndarray,
+    changed: np.ndarray | None = None,
+    before: np.ndarray | None = None,
+    loosened: bool = True,
+  ) -> bool:
+    """Writes the rows of a surface; returns False where the bending matrix has no room for them.
+
+    Nothing was written then.
+
+    Args:
+      mesh: the surface
+      config: its configuration
+      pinned: vertices that do not move, (nvert,) bool
+      changed: triangles that are not as in the arrays, None for all
+      before: corners that these have there, (n, 3)
+      loosened: whether what the foundation holds may be other triangles too
+    """
+    self._copy.put(mesh)
+    self._put_material(config)
+    self.fields.every, self.fields.loosened = int(changed is None), int(loosened)
+    changed = np.arange(mesh.nelem) if changed is None else changed
+    self.fields.nchanged = n = len(changed)
+    self._changed[:n], self._pinned[:] = changed, pinned
+    self._before[:n] = mesh.elem[changed] if before is None else before
+    self._fill()
+    return bool(self._found[0])
+
+  def _put_material(self, config: Config):
+    if config == self._config:
+      return
+    nelem, springs = self._copy.whole.nelem, config.elements == "spring"
+    lame, shear = configuration.lame(config, nelem)
+    self._put(
+      bends=int(config.bend > 0),
+      springs=int(springs),
+      thickness=config.thickness,
+      stiffness=config.stiffness,
+      poisson=config.poisson,
+      lame=0 * lame if springs else lame,
+      shear=0 * shear if springs else shear,
+      young=np.array(np.broadcast_to(np.asarray(config.young, float), (nelem,))),
+      rigidity=configuration.rigidity(config, nelem),
+    )
+    self._config = config
 
 
-# Rows of a fan's arrays beyond the number of its neighbours.
-EXTRA = {"fan_node": 2, "fan_rest": 2, "fan_metric": 1, "fan_spring": 0, "fan_corner": 1,
-         "fan_side": 1}  # fmt: skip
+def _array(name: str, value: Any) -> wp.array:
+  if not isinstance(value, np.ndarray):
+    return value
+  return wp.array(value, dtype=Filling.vars[name].type.dtype, device="cpu", copy=False)
 
 
 def room(mesh: Mesh) -> np.ndarray:
@@ -66,117 +189,3 @@ def room(mesh: Mesh) -> np.ndarray:
   most = mesh.degree + (closes & (mesh.degree > 0))
   most[mesh.spares] = most.max()
   return most
-
-
-def _rings(
-  mesh: Mesh, vert: np.ndarray, degree: np.ndarray, most: int
-) -> tuple[np.ndarray, np.ndarray]:
-  """Returns the vertices of each node's fan and the half-edges to them, -1 for none.
-
-  Entry 0 is the last neighbour again where the fan closes, and the first one follows the last.
-  """
-  real = vert >= 0
-  own = np.arange(len(vert))
-  ring = np.where(real[:, None], mesh.ring[vert], -1)
-  ring_elem = np.where(real[:, None], mesh.ring_elem[vert], -1)
-  fan = np.full((len(vert), most + 2), -1, np.int64)
-  half = np.full((len(vert), most + 1), -1, np.int64)
-  across = min(most, ring.shape[1])
-  fan[:, 1 : 1 + across] = ring[:, :across]
-  half[:, 1 : 1 + across] = ring_elem[:, :across]
-  last = np.maximum(degree - 1, 0)
-  wraps = real & (ring_elem[own, last] >= 0)
-  fan[:, 0] = np.where(wraps, ring[own, last], -1)
-  half[:, 0] = np.where(wraps, ring_elem[own, last], -1)
-  closing = np.where(wraps, degree + 1, 0)
-  fan[own[wraps], closing[wraps]] = ring[wraps, 0]
-  return fan, half
-
-
-def _stiffness(
-  mesh: Mesh, config: Config, toward: np.ndarray, half: np.ndarray, degree: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-  """Returns metric and moduli of each node's triangles, and the springs of its edges.
-
-  Args:
-    mesh: the surface
-    config: its configuration
-    toward: rest vector to each entry of a node's fan [m]    (nnode, most + 2, 3)
-    half: half-edge to each, but the last one; -1 for none   (nnode, most + 1)
-    degree: number of neighbours                             (nnode,)
-
-  Returns:
-    `fan_metric` (nnode, most + 1, 5), `fan_spring` (nnode, most)
-  """
-  # Contravariant metric of the triangle (i, fan[k], fan[k + 1]).
-  has = half >= 0
-  e1, e2 = toward[:, :-1], toward[:, 1:]
-  g11, g12, g22 = (e1 * e1).sum(-1), (e1 * e2).sum(-1), (e2 * e2).sum(-1)
-  det = np.where(has, g11 * g22 - g12 * g12, 1.0)
-  volume = 0.5 * np.sqrt(det) * config.thickness
-  lam, mu = configuration.lame(config, mesh.nelem)
-  if config.elements == "spring":
-    lam, mu = 0 * lam, 0 * mu
-  elem = np.where(has, half // 3, 0)
-  metric = np.stack([g22 / det, -g12 / det, g11 / det, mu[elem] * volume, lam[elem] * volume], -1)
-  metric[~has] = 0
-  # Van Gelder 1998: springs like a triangle mesh of modulus E, E t area / length^2 on each side.
-  young = np.broadcast_to(np.asarray(config.young), (mesh.nelem,))
-  strength = np.where(has, young[elem] * volume, 0.0)
-  length2 = (toward[:, 1:-1] ** 2).sum(-1)
-  spring = (strength[:, :-1] + strength[:, 1:]) / np.where(length2 > 0, length2, 1.0)
-  if config.elements == "spring":
-    spring = config.stiffness * np.where(_is_cut(mesh, half), 0.5, 1.0)  # a half for each side
-  spring[np.arange(spring.shape[1]) >= degree[:, None]] = 0
-  return metric, spring
-
-
-def _is_cut(mesh: Mesh, half: np.ndarray) -> np.ndarray:
-  """Returns whether the edges of fans, but for those that repeat, were cut, (n, most)."""
-  before, after = half[:, :-1], half[:, 1:]
-  alone = (before < 0) != (after < 0)
-  own = np.where(after >= 0, after, before - before % 3 + (before + 2) % 3)
-  return alone & (mesh.whole.twin[own] >= 0)
-
-
-def elements(
-  mesh: Mesh, which: np.ndarray, node: np.ndarray, hinge: np.ndarray, none: int
-) -> dict[str, np.ndarray]:
-  """Returns what triangles have where there is bending.
-
-  Args:
-    mesh: the surface
-    which: triangles                                        (n,)
-    node: node of every vertex                              (nvert,)
-    hinge: number of the hinge of each of their half-edges, -1 on the boundary (n, 3)
-    none: number of a hinge that has no gain
-  """
-  corner = mesh.rest[mesh.elem[which]] - mesh.centre
-  arms = np.concatenate([corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]], axis=1)
-  # The hinge opposite corner c is that of the half-edge after it.
-  opposite = np.where(hinge < 0, none, hinge)[:, [1, 2, 0]]
-  return {
-    "elem_node": offset(node[mesh.elem[which]]).astype(np.int32),
-    "elem_rest": arms.astype(np.float32),
-    "elem_hinge": opposite.astype(np.int32),
-  }
-
-
-def hinges(
-  mesh: Mesh, hinge: plate.Hinges, node: np.ndarray, number: np.ndarray
-) -> dict[str, np.ndarray]:
-  """Returns what hinges have, those of `hinge` in its order; `number` has their numbers."""
-  at = mesh.rest[hinge.vert] - mesh.centre
-  near, gain = plate.neighbours(hinge)
-  return {
-    "hinge_node": offset(node[hinge.vert]).astype(np.int32),
-    "hinge_rest": (at[:, 1:] - at[:, :1]).reshape(-1, 9).astype(np.float32),
-    "hinge_elem": offset(hinge.elem, 4).astype(np.int32),
-    "hinge_near": number[near].astype(np.int32),
-    "hinge_gain": gain.astype(np.float32),
-  }
-
-
-def numbers(mesh: Mesh, half: np.ndarray) -> np.ndarray:
-  """Returns the numbers of hinges by their half-edges: those of the mesh before the first cut."""
-  return np.searchsorted(mesh.whole.interior, half)

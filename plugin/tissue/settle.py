@@ -195,3 +195,17 @@ def _keep_volume(mesh: Mesh, rest: np.ndarray, vert: np.ndarray):
     np.add.at(area, skin, area_vectors(rest, skin)[:, None] / 3)
     area = area[vert]
     rest[vert] += lost * area / (area**2).sum()
+
+
+def keep_spin(mass: np.ndarray, was: np.ndarray, now: np.ndarray, v: np.ndarray) -> np.ndarray:
+  """Returns velocities with which nodes, some of them moved, keep momentum and angular momentum.
+
+  That is `v` and a slow rotation of them all about their centre.
+  """
+  if len(mass) < 3:
+    return v
+  spin = (mass[:, None] * cross(was - now, v)).sum(axis=0)
+  arm = now - (mass[:, None] * now).sum(axis=0) / mass.sum()
+  inertia = (mass * (arm**2).sum(axis=1)).sum() * np.eye(3) - (mass * arm.T) @ arm
+  omega = np.linalg.lstsq(inertia, spin, rcond=1e-6)[0]
+  return v + cross(omega[None], arm)

@@ -10,15 +10,15 @@ import warp as wp
 
 from . import body as bodies
 from . import coarse as coarsening
-from . import config as configuration
 from . import device as devices
 from . import mesh as topology
-from . import plate, rows, solid, step
+from . import rows, solid, step
 from .body import Body
 from .config import Config
 from .mesh import Mesh
-from .order import LANES, addresses, banks, ellpack, node_order, pad, to_slices
-from .types import NUMBERS, empty
+from .order import LANES, addresses, banks, node_order, offset, to_slices
+from .surface import WorkingCopy
+from .types import NUMBERS, empty, zeros
 
 _BEND_MORE = 4  # entries that a cut may add to a row of the bending matrix
 
@@ -142,23 +142,27 @@ def arrays(
     bend_width: rows of each slice of the bending matrix, where it has room for cuts; None for new
   """
   vert = node_order(mesh, patch)
+  nslice = len(vert) // LANES
   node = np.empty(mesh.nvert, np.int64)
   node[vert[vert >= 0]] = np.flatnonzero(vert >= 0)
-  out = {
-    **_fans(mesh, config, vert, node),
-    **_bending(mesh.surface, solid.capsule(config), node, len(vert) // LANES, bend_width),
-    **_capsule(mesh.surface, config, vert, node),
-    **(solid.arrays(mesh, config, vert, node) if len(mesh.tet) else solid.none(len(vert) // LANES)),
+  skin = dataclasses.replace(config, bend=0.0) if len(mesh.tet) else config
+  out = _skin(solid.skin(mesh), skin, pinned, vert, node, bend_width)
+  out |= _capsule(mesh.surface, config, pinned, vert, node)
+  out |= solid.arrays(mesh, config, vert, node) if len(mesh.tet) else solid.none(nslice)
+  out |= {
     "vert": vert.astype(np.int32),
     "node": node.astype(np.int32),
     "area": _node_values(topology.held_areas(mesh), vert),
-    "free": _node_values(np.where(pinned | mesh.unused, 0.0, 1.0), vert),
     "closed": int(mesh.closed),
     "volume0": topology.volume(mesh.rest, mesh.elem) if mesh.closed else 0.0,
     "shortest": 0.0 if mesh.spare else topology.shortest(mesh),
     "number": np.array(list(_numbers(config, mesh.closed).values())),
   }
   return out | counts(out)
+
+
+def _node_values(values: np.ndarray, vert: np.ndarray) -> np.ndarray:
+  return to_slices(np.where(vert >= 0, values[vert], 0.0).astype(np.float32))
 
 
 def counts(values: dict[str, Any]) -> dict[str, int]:
@@ -176,85 +180,83 @@ def counts(values: dict[str, Any]) -> dict[str, int]:
   }
 
 
-def _node_values(values: np.ndarray, vert: np.ndarray) -> np.ndarray:
-  return to_slices(np.where(vert >= 0, values[vert], 0.0).astype(np.float32))
+def _skin(
+  mesh: Mesh,
+  config: Config,
+  pinned: np.ndarray,
+  vert: np.ndarray,
+  node: np.ndarray,
+  bend_width: np.ndarray | None,
+) -> dict[str, np.ndarray]:
+  """Returns the arrays of fans, nodes and bending of a surface."""
+  nslice, writer = len(vert) // LANES, rows.Rows(WorkingCopy(mesh), {}, node)
+  out = _fans(mesh, vert) | _no_bending(nslice)
+  if config.bend:
+    out |= _bending(mesh, node, nslice, writer.widths(mesh), bend_width)
+  writer.put(out)
+  assert writer.write(mesh, config, pinned)
+  return out
 
 
-def _fans(mesh: Mesh, config: Config, vert: np.ndarray, node: np.ndarray) -> dict[str, np.ndarray]:
-  """Returns the arrays of fans; see `types.Shape`."""
+def _fans(mesh: Mesh, vert: np.ndarray) -> dict[str, np.ndarray]:
+  """Returns the arrays of fans and nodes, see `types.Shape`, as those of padding."""
   nslice = len(vert) // LANES
   degree = np.where(vert >= 0, rows.room(mesh)[vert] if mesh.spare else mesh.degree[vert], 0)
   width = degree.reshape(nslice, LANES).max(axis=1)
-  dense = rows.fans(mesh, config, vert, np.arange(len(vert)), node, int(degree.max()))
-
-  def sliced(name):
-    """Returns rows 0 .. width + extra - 1 of every slice, slice after slice."""
-    extra = rows.EXTRA[name]
-    take = np.concatenate([np.arange(w + extra) for w in width])
-    which = np.repeat(np.arange(nslice), width + extra)
-    return to_slices(dense[name])[which, take]
-
+  sizes = {"nslice": nslice, "nslot": int(width.sum())}
+  own = offset(np.arange(len(vert)).reshape(nslice, LANES)).astype(np.int32)
   return {
     "slot_adr": addresses(width),
     "held_adr": banks(width),
-    **{name: sliced(name) for name in rows.EXTRA},
-    "degree": to_slices(dense["degree"]),
-    "rest": to_slices(dense["rest"]),
+    **zeros(_FANS, sizes),
+    "fan_node": np.repeat(own, width + 2, axis=0),
   }
 
 
+_FANS = ("fan_rest", "fan_metric", "fan_spring", "fan_corner", "fan_side", "degree", "rest", "area",
+         "free")  # fmt: skip
+_PLATES = ("elem_node", "elem_rest", "elem_hinge", "hinge_node", "hinge_rest", "hinge_elem",
+           "hinge_near", "hinge_gain", "hinge_angle0", "bend_gain", "bend_diag")  # fmt: skip
+
+
 def _capsule(
-  mesh: Mesh, config: Config, vert: np.ndarray, node: np.ndarray
+  mesh: Mesh, config: Config, pinned: np.ndarray, vert: np.ndarray, node: np.ndarray
 ) -> dict[str, np.ndarray]:
-  """Returns the fans of the skin of a solid, empty where there is none; `mesh` is its surface."""
+  """Returns the skin of a solid, empty fans where there is none; `mesh` is its surface."""
   names = ("node", "rest", "corner", "side", "metric")
   if config.elements != "solid" or not config.capsule_young:
     counts = ("ncapsule + 2 ncapsuleslice", "ncapsule + ncapsuleslice", "ncapsuleslice")
     return {"capsule_adr": np.zeros(1, np.int32)} | empty(counts)
-  fans = _fans(mesh, solid.capsule(config), vert, node)
-  out = {f"capsule_{name}": fans[f"fan_{name}"] for name in names}
-  return out | {"capsule_adr": fans["slot_adr"], "capsule_degree": fans["degree"]}
+  skin = _skin(mesh, solid.capsule(config), pinned, vert, node, None)
+  out = {f"capsule_{name}": skin[f"fan_{name}"] for name in names}
+  out |= {name: skin[name] for name in (*_PLATES, "bend_adr", "bend_node")}
+  return out | {"capsule_adr": skin["slot_adr"], "capsule_degree": skin["degree"]}
 
 
 def _bending(
-  mesh: Mesh, config: Config, node: np.ndarray, nslice: int, width: np.ndarray | None
+  mesh: Mesh, node: np.ndarray, nslice: int, entries: np.ndarray, width: np.ndarray | None
 ) -> dict[str, np.ndarray]:
-  """Returns the arrays of triangles, hinges and the bending matrix, empty where bending is off."""
-  if config.bend == 0:
-    return _no_bending(nslice)
-  rigidity = configuration.rigidity(config, mesh.nelem)
-  hinge = plate.hinges(mesh, rigidity, config.poisson)
-  number, nhinge = rows.numbers(mesh, hinge.half), len(mesh.whole.interior)
-  of_elem = np.full(hinge.of_elem.shape, -1)  # a surface of one triangle has no hinge
-  of_elem[hinge.of_elem >= 0] = number[hinge.of_elem[hinge.of_elem >= 0]]
-  out = rows.elements(mesh, np.arange(mesh.nelem), node, of_elem, nhinge)
-  dense = rows.hinges(mesh, hinge, node, number)
-  # The hinges that padding adds have no gain; nor have those that were cut.
-  for name, values in dense.items():
-    every = np.zeros((nhinge, *values.shape[1:]), values.dtype)
-    every[number] = values
-    out[name] = pad(every, 0, 1)
-  out["elem_hinge"] = pad(out["elem_hinge"], nhinge)
-  out = {name: to_slices(values if len(values) % LANES == 0 else pad(values))
-         for name, values in out.items()}  # fmt: skip
-  coo = plate.bending_matrix(mesh, hinge)
-  row, col, value = coo.row, coo.col, coo.data
-  own = np.arange(nslice * LANES).reshape(nslice, LANES)
+  """Returns the arrays of triangles, hinges and the bending matrix, as those of padding.
 
-  def room(entries: np.ndarray) -> np.ndarray:
-    return _bend_room(mesh, node, entries) if width is None else width
-
-  wide = room if mesh.spare else None
-  widths, bend_node, bend_gain = ellpack(node[row], node[col], value, own, wide)
-  diag = np.zeros(own.size)
-  diag[node[row[row == col]]] = value[row == col]
-  return out | {
-    "hinge_angle0": np.zeros((len(out["hinge_node"]), LANES), np.float32),
-    "bend_adr": addresses(widths),
-    "bend_node": bend_node,
-    "bend_gain": bend_gain,
-    "bend_diag": to_slices(diag).astype(np.float32),
-  }
+  Args:
+    mesh: the surface
+    node: node of every vertex
+    nslice: slices of nodes
+    entries: of each vertex's row of the bending matrix
+    width: rows of each slice of it, None for as many as are needed
+  """
+  count, nhinge = np.zeros(nslice * LANES, int), len(mesh.whole.interior)
+  count[node] = entries
+  if width is None and mesh.spare:
+    width = _bend_room(mesh, node, count)
+  width = count.reshape(-1, LANES).max(axis=1) if width is None else width
+  # Padding has a hinge that has no gain; so have those that were cut.
+  sizes = {"nslice": nslice, "nelemslice": -(-mesh.nelem // LANES), "nbendslice": nslice}
+  sizes |= {"nhingeslice": -(-(nhinge + 1) // LANES), "nbend": int(width.sum())}
+  out = zeros(_PLATES, sizes)
+  out["elem_hinge"][-1] = nhinge
+  own = np.arange(nslice * LANES, dtype=np.int32).reshape(nslice, LANES)
+  return out | {"bend_adr": addresses(width), "bend_node": np.repeat(own, width, axis=0)}
 
 
 def _bend_room(mesh: Mesh, node: np.ndarray, entries: np.ndarray) -> np.ndarray:

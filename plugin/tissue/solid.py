@@ -1,4 +1,4 @@
-"""The inside of a solid: tetrahedra to sliced arrays."""
+"""The inside of a solid: tetrahedra, and means over nodes of their gradients, to sliced arrays."""
 
 from __future__ import annotations
 
@@ -12,15 +12,11 @@ from . import config as configuration
 from . import rows
 from .config import Config
 from .fill import vertex_volumes, volumes
-from .mesh import Mesh
-from .order import LANES, addresses, ellpack, pad, to_slices
+from .mesh import Mesh, among
+from .order import LANES, addresses, ellpack, offset, pad, to_slices
+from .step import OWN_SHARE
 from .types import empty
 
-# Poisson's ratio up to which the resistance to a change of volume is each tetrahedron's own. What
-# is above is averaged over nodes: linear tetrahedra would lock (Bonet and Burton 1998,
-# doi:10.1002/(SICI)1099-0887(199805)14:5<437::AID-CNM162>3.0.CO;2-W), and averages alone let
-# neighbours shrink and grow in turn (Puso and Solberg 2006, doi:10.1002/nme.1457).
-_OWN_POISSON = 0.3
 EDGES = 2  # by which cuts may divide edges, for one spare vertex
 _WINDOW = 8 * LANES  # edges that are sorted by the number of their tetrahedra
 
@@ -32,6 +28,14 @@ def capsule(config: Config) -> Config:
   if not config.capsule_young:
     return dataclasses.replace(config, bend=0.0)
   return dataclasses.replace(config, elements="membrane", young=config.capsule_young)
+
+
+def skin(mesh: Mesh) -> Mesh:
+  """Returns a mesh without the walls of cuts in a solid."""
+  if not len(mesh.tet) or mesh.uncut is None:
+    return mesh
+  n = mesh.whole.nelem
+  return dataclasses.replace(mesh, elem=mesh.elem[:n], loose=mesh.loose[:n])
 
 
 def gradients(mesh: Mesh) -> np.ndarray:
@@ -50,25 +54,14 @@ def young(mesh: Mesh, config: Config) -> np.ndarray:
   return np.asarray(config.young)[middle.query(mesh.rest[mesh.tet].mean(axis=1))[1]]
 
 
-def moduli(mesh: Mesh, config: Config) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-  """Returns mu, lambda and its averaged part of each tetrahedron [Pa], (ntet,) each.
+def moduli(mesh: Mesh, config: Config) -> tuple[np.ndarray, np.ndarray]:
+  """Returns mu and lambda of each tetrahedron [Pa], (ntet,) each.
 
-  Those of the energy in `energy.solid`, with which small strains have the Lame constants
-  mu' = 3/4 mu, lambda' = lambda - 5/8 mu (Smith et al. 2018, section 3.4).
+  Those of the energy in `energy.solid`: small strains have the Lame constants 3/4 mu and lambda
+  (Smith et al. 2018, section 3.4, where 5/8 mu is counted as part of lambda).
   """
   shear, lame = configuration.lame_solid(young(mesh, config), config.poisson)
-  own = configuration.lame_solid(young(mesh, config), min(config.poisson, _OWN_POISSON))
-  part = own[1] * shear / own[0]
-  mu = 4 / 3 * shear
-  return mu, part + 5 / 8 * mu, lame - part
-
-
-def order(mesh: Mesh, node: np.ndarray) -> np.ndarray:
-  """Returns tetrahedra in the order of their nodes before the first cut.
-
-  Who gathers from them finds them near each other.
-  """
-  return np.lexsort(np.sort(node[mesh.whole.tet], axis=1).T[::-1])
+  return 4 / 3 * shear, lame
 
 
 def arrays(mesh: Mesh, config: Config, vert: np.ndarray, node: np.ndarray) -> dict[str, Any]:
@@ -82,35 +75,38 @@ def arrays(mesh: Mesh, config: Config, vert: np.ndarray, node: np.ndarray) -> di
   """
   which = order(mesh, node)
   tet, volume = mesh.tet[which], volumes(mesh.rest, mesh.tet)[which]
-  mu, lam, averaged = moduli(mesh, config)
+  mu, lam = moduli(mesh, config)
   at = node[tet]
-  own = np.arange(len(vert)).reshape(-1, LANES)
-  entry, room = np.arange(tet.size), None
-  if mesh.spare:
-    room = _around_room(mesh, node, len(vert))
-  blank = np.full_like(own, tet.size)
-  width, entry, weight = ellpack(at.ravel(), entry, np.repeat(volume / 4, 4), blank, room)
-  values = pad(np.stack([volume, mu[which], lam[which], averaged[which]], axis=1), least=1)
+  absent = np.full((len(vert) // LANES, LANES), tet.size)
+  room = _around_room(mesh, node, len(vert)) if mesh.spare else None
+  entry = np.arange(tet.size)
+  width, entry, _ = ellpack(at.ravel(), entry, np.ones(tet.size), absent, room)
+  values = pad(np.stack([volume, mu[which], lam[which]], axis=1), least=1)
   values[len(tet) :, 1] = 1.0  # padding has no volume, but quotients
   gradient = gradients(mesh)[which, 1:].reshape(-1, 9)
-  gain = np.where(vert >= 0, pressure_gain(mesh, averaged)[vert], 0.0)
+  nodal = np.where((vert >= 0)[:, None], nodal_moduli(mesh, config)[vert], 0.0)
+  row = slot_rows(mesh, vert)
+  slope = np.zeros((row[-1], LANES, 3))
+  at_row, lane, value = slopes(mesh, row, node)
+  slope[at_row, lane] = value
   return {
-    "tet_node": to_slices(pad(at, least=1)).astype(np.int32),
+    "tet_node": to_slices(pad(offset(at), least=1)).astype(np.int32),
     "tet_gradient": to_slices(pad(gradient, least=1)).astype(np.float32),
     "tet_moduli": to_slices(values).astype(np.float32),
     "around_adr": addresses(width),
-    "around_tet": (entry // 4).astype(np.int32),
     "around_corner": corner_number(entry // 4, entry % 4),
-    "around_share": weight,
-    "pressure_gain": to_slices(gain).astype(np.float32),
+    "fan_slope": np.ascontiguousarray(slope.transpose(0, 2, 1)).astype(np.float32),
+    "node_moduli": to_slices(nodal).astype(np.float32),
     **_edges(dataclasses.replace(mesh, tet=tet), vert, node),
   }
 
 
-def pressure_gain(mesh: Mesh, averaged: np.ndarray) -> np.ndarray:
-  """Returns the averaged part of lambda over the volume of each vertex [Pa/m^3], (nvert,)."""
-  total = vertex_volumes(mesh)
-  return np.where(total > 0, vertex_volumes(mesh, averaged) / np.where(total > 0, total**2, 1), 0.0)
+def order(mesh: Mesh, node: np.ndarray) -> np.ndarray:
+  """Returns tetrahedra in the order of their nodes before the first cut.
+
+  Who gathers from them finds them near each other.
+  """
+  return np.lexsort(np.sort(node[mesh.whole.tet], axis=1).T[::-1])
 
 
 def _around_room(mesh: Mesh, node: np.ndarray, nnode: int):
@@ -118,6 +114,51 @@ def _around_room(mesh: Mesh, node: np.ndarray, nnode: int):
   count = np.bincount(node[mesh.whole.tet].ravel(), minlength=nnode)
   count[node[mesh.spares]] = count.max()
   return lambda _: count.reshape(-1, LANES).max(axis=1)
+
+
+def slopes(mesh: Mesh, row: np.ndarray, node: np.ndarray, which: np.ndarray | None = None):
+  """Returns `fan_slope`: with it the mean of the gradients around a node is a sum over its fan.
+
+  That of neighbour b is the sum of V g_b / sum V over the tetrahedra around the node, g_b the
+  gradient of the share of b in each.
+
+  Args:
+    mesh: the solid
+    row: see `slot_rows`
+    node: node of each vertex   (nvert,)
+    which: vertices, ascending, None for all
+
+  Returns:
+    rows and lanes of entries (n,), their slopes [1/m] (n, 3)
+  """
+  tet = mesh.tet
+  if which is not None:
+    mine = among(mesh.nvert, which)
+    tet = tet[mine[tet].any(axis=1)]
+  pairs = np.array([(a, b) for a in range(4) for b in range(4) if a != b])
+  start, end = (tet[:, pairs[:, k]].ravel() for k in (0, 1))
+  part = dataclasses.replace(mesh, tet=tet)
+  weighed = volumes(mesh.rest, tet)[:, None, None] / 4 * gradients(part)
+  value = weighed[:, pairs[:, 1]].reshape(-1, 3)
+  if which is not None:
+    start, end, value = (x[mine[start]] for x in (start, end, value))
+  key, number = np.unique(start * mesh.nvert + end, return_inverse=True)
+  sums = [np.bincount(number, column, len(key)) for column in value.T]
+  start = key // mesh.nvert
+  total = vertex_volumes(part)[start]  # all that is around these is there
+  entry = np.arange(len(key)) - np.searchsorted(start, start)
+  return row[node[start] // LANES] + entry, node[start] % LANES, np.stack(sums, 1) / total[:, None]
+
+
+def nodal_moduli(mesh: Mesh, config: Config, which: np.ndarray | None = None) -> np.ndarray:
+  """Returns what vertices, or some, have of mu, and lambda [Pa], (n, 2): the means around them."""
+  mu, lam = moduli(mesh, config)
+  if which is not None:
+    near = among(mesh.nvert, which)[mesh.tet].any(axis=1)
+    mesh, mu, lam = dataclasses.replace(mesh, tet=mesh.tet[near]), mu[near], lam[near]
+  sums = [vertex_volumes(mesh, part) for part in ((1 - OWN_SHARE) * mu, lam)]
+  out = np.stack(sums, axis=1) / np.maximum(vertex_volumes(mesh), 1e-300)[:, None]
+  return out if which is None else out[which]
 
 
 def corner_number(tet: np.ndarray | int, corner: np.ndarray | int) -> np.ndarray:
@@ -206,7 +247,7 @@ def slot(mesh: Mesh, row: np.ndarray, node: np.ndarray, edge: np.ndarray) -> np.
 
 def none(nslice: int) -> dict[str, np.ndarray]:
   """Returns the arrays of `arrays` for a surface."""
-  sizes = ("ntetslice", "naround", "nedge", "nedgeslice", "nsolidslice")
+  sizes = ("ntetslice", "naround", "nedge", "nedgeslice", "nsolidslice", "nsolidslot")
   return {
     "around_adr": np.zeros(nslice + 1, np.int32),
     "edge_adr": np.zeros(1, np.int32),

@@ -49,6 +49,10 @@ ENOUGH = 0.03
 # one float32 residuals are noise to the slowest modes, which only cycles would act on.
 EASY, WORST = 8.0, 2e5
 
+# Share of a solid's mu that each tetrahedron has for itself; the means over nodes have the rest,
+# and lambda. With less contacts are too soft, with more bending locks (docs/accuracy.md).
+OWN_SHARE = 0.3
+
 _FIRST, _MORE = 1, 2  # flags of `newton_update`
 _CYCLES_PER_SM = 2  # blocks on one multiprocessor
 _CONSTANTS = CONSTANTS | {
@@ -66,7 +70,7 @@ def _elastic(name: str) -> Kernel:
 
 
 def _solid(name: str) -> Kernel:
-  return kernel(name, "solid.h", Fields, CONSTANTS)
+  return kernel(name, "solid.h", Fields, CONSTANTS | {"OWN_SHARE": OWN_SHARE})
 
 
 def _scheme(name: str, bounds: int | None = None) -> Kernel:
@@ -78,8 +82,7 @@ _hinge_angle = _elastic("hinge_angle")
 _hinge_moment = _elastic("hinge_moment")
 _elem_corner = _elastic("elem_corner")
 _row = _elastic("row")
-_tet_strain = _solid("tet_strain")
-_node_pressure = _solid("node_pressure")
+_node_stress = _solid("node_stress")
 _tet_stress = _solid("tet_stress")
 _edge_block = _solid("edge_block")
 _solid_row = _solid("solid_row")
@@ -163,8 +166,7 @@ def assemble(body: Body, stage: Stage):
     _over(_hinge_moment, body, shape.nhingeslice)
     _over(_elem_corner, body, shape.nelemslice)
   if body.is_solid:
-    _over(_tet_strain, body, shape.ntetslice, stage)
-    _over(_node_pressure, body, shape.nslice)
+    _over(_node_stress, body, shape.nslice, stage)
     _over(_tet_stress, body, shape.ntetslice, stage)
     if stage in (Stage.FIRST, Stage.LATER):
       _over(_edge_block, body, shape.nedgeslice)

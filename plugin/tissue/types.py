@@ -42,6 +42,16 @@ def ints(*dims) -> Array:
   return Array(wp.int32, dims)
 
 
+def longs(*dims) -> Array:
+  """Returns the type of an array of int64."""
+  return Array(wp.int64, dims)
+
+
+def flags(*dims) -> Array:
+  """Returns the type of an array of bytes, each 0 or 1."""
+  return Array(wp.uint8, dims)
+
+
 DIMS: dict[str, dict[str, tuple]] = {}  # struct and field -> its shape
 
 
@@ -139,12 +149,11 @@ class Shape:
   hinge_angle0: floats("nhingeslice", 8)  # rest angle 2 sin(theta / 2) [-]
   bend_adr: ints("nslice + 1")  # first row of the bending matrix
   bend_node: ints("nbend", 8)  # node of each entry
-  tet_node: ints("ntetslice", 4, 8)  # each corner's node
+  fan_slope: floats("nsolidslot", 3, 8)  # of a neighbour's share in a node's mean gradient [1/m]
+  tet_node: ints("ntetslice", 4, 8)  # offset of each corner's node
   tet_gradient: floats("ntetslice", 9, 8)  # of the shares of corners 1, 2, 3 at rest [1/m]
-  around_adr: ints("nslice + 1")  # first row of each slice in the three below, for solids
-  around_tet: ints("naround", 8)  # each tetrahedron around a node
+  around_adr: ints("nslice + 1")  # first row of each slice below, for solids
   around_corner: ints("naround", 8)  # number of its corner there
-  around_share: floats("naround", 8)  # a quarter of its volume [m^3]; 0 for padding
   edge_adr: ints("nedgeslice + 1")  # first row of each slice of edges in the two below
   edge_from: ints("nedge", 8)  # of each tetrahedron around an edge, its corner at the first end
   edge_to: ints("nedge", 8)  # its corner at the other
@@ -168,8 +177,8 @@ class Tissue:
   hinge_gain: floats("nhingeslice", 5, 8)  # stiffness to itself and to `hinge_near` [N m]
   bend_gain: floats("nbend", 8)  # bending matrix [N/m]
   bend_diag: floats("nbendslice", 8)  # its diagonal [N/m]
-  tet_moduli: floats("ntetslice", 4, 8)  # volume [m^3]; mu, lambda, its averaged part [Pa]
-  pressure_gain: floats("nsolidslice", 8)  # averaged part of lambda over a node's volume [Pa/m^3]
+  tet_moduli: floats("ntetslice", 3, 8)  # volume [m^3]; mu, lambda [Pa]
+  node_moduli: floats("nsolidslice", 2, 8)  # mu, lambda of its mean gradient [Pa]
   capsule_metric: floats("ncapsule + ncapsuleslice", 5, 8)  # see `fan_metric`
 
 
@@ -206,10 +215,8 @@ class System:
   hinge_half: floats("nworld", "nhingeslice", 8)  # cos(theta / 2)
   hinge_moment: floats("nworld", "nhingeslice", 8)  # moment impulse [N m s]
   hinge_rough: floats("nworld", "nhingeslice", 8)  # what the bending matrix may leave out [N m]
-  tet_strain: floats("nworld", "ntetslice", 8)  # impulse of the change of volume [s]
-  node_disp: floats("nworld", "nsolidslice", 4, 8)  # that of `disp_trial`, as shared vectors [m]
-  node_vel: floats("nworld", "nsolidslice", 4, 8)  # that of `vel_trial`, as shared vectors [m/s]
-  node_pressure: floats("nworld", "nsolidslice", 8)  # averaged pressure impulse [Pa s]
+  node_motion: floats("nworld", "nsolidslice", 12, 8)  # shared vectors, of both trials [m, m/s]
+  node_stress: floats("nworld", "nsolidslice", 12, 8)  # three shared vectors, rows [Pa s]
   tet_impulse: floats("nworld", "ntetslice", 16, 8)  # impulse on each corner [N s]
   tet_arm: floats("nworld", "ntetslice", 16, 8)  # turned gradient of each corner [kg^(1/2)], moduli
   capsule_block: floats("nworld", "ncapsule", 9, 8)  # off-diagonal blocks of a solid's skin [kg]
@@ -328,15 +335,28 @@ def fill(
   return out
 
 
+def zeros(names: tuple[str, ...], sizes: dict[str, int]) -> dict[str, np.ndarray]:
+  """Returns arrays of `Shape` and `Tissue` of zeros, of the sizes that their shapes name."""
+  found = {name: dims for name, dims in _dims().items() if name in names}
+  return {
+    name: np.zeros([_extent(dim, sizes) for dim in dims], _dtype(name))
+    for name, dims in found.items()
+  }
+
+
 def empty(sizes: tuple[str, ...]) -> dict[str, np.ndarray]:
   """Returns the arrays of `Shape` and `Tissue` whose first axis is one of `sizes`, empty."""
-  out = {}
-  for kind in (Shape, Tissue):
-    for name, dims in DIMS[kind.key].items():
-      if dims[0] in sizes:
-        dtype = np.int32 if kind.vars[name].type.dtype is wp.int32 else np.float32
-        out[name] = np.zeros((0, *dims[1:]), dtype)
-  return out
+  found = {name: dims for name, dims in _dims().items() if dims[0] in sizes}
+  return {name: np.zeros((0, *dims[1:]), _dtype(name)) for name, dims in found.items()}
+
+
+def _dims() -> dict[str, tuple]:
+  return {name: dims for kind in (Shape, Tissue) for name, dims in DIMS[kind.key].items()}
+
+
+def _dtype(name: str):
+  kind = Shape if name in Shape.vars else Tissue
+  return wp.dtype_to_numpy(kind.vars[name].type.dtype)
 
 
 def _extent(dim: int | str, sizes: dict[str, int]) -> int:

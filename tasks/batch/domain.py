@@ -16,10 +16,12 @@ class Domain:
     struct: of Warp, its state
     begin: kernel (fields, own): begins the episodes of `begun`, once the instrument is measured
     advance: kernel (fields, own): what `Task.advance` is; it ends with `kernels.judge`
-    observe: kernel (fields, own, beginning): what `Task.observe` is
+    observe: kernel (fields, own, beginning): what `Task.observe` is; with two hands (fields, own,
+      fields of the other, beginning)
     nodes: of the organ that its instrument touches at once, and some more: the slots of a GPU's
       window
     takes: numbers of the task that the struct has under the same names
+    metrics: of its own, by the struct's arrays of an episode's values so far
     tissue: keys of the organ's tissue among the rows of `draw`, which the struct does not have
   """
 
@@ -29,6 +31,7 @@ class Domain:
   observe: Any
   nodes: int = 12
   takes: tuple[str, ...] = ()
+  metrics: Mapping[str, str] = {}
   tissue: tuple[str, ...] = ()
 
   @staticmethod
@@ -39,6 +42,14 @@ class Domain:
   def sizes(task: Any, physics: Physics) -> dict[str, int]:
     """Returns the named sizes of its arrays."""
     return {}
+
+  @staticmethod
+  def act(worlds: Any) -> None:
+    """Does what of an action no drive does, before the steps of the physics."""
+
+  @staticmethod
+  def read(worlds: Any) -> None:
+    """Brings what is of the organ up to date, after a step or where episodes begin."""
 
   @staticmethod
   def sense(worlds: Any) -> None:

@@ -13,30 +13,44 @@ import numpy as np
 from dm_control.mujoco import wrapper
 from palpate.models import trocar
 from palpate.tasks.base import Task
+from palpate.tasks.instrument import Second
 from palpate.tasks.physics import Physics
+from palpate.tasks.scenes import ORGAN
 
 from .domain import Domain
 
-# What every exercise draws: trocar, joints, length of the path.
-FRAME = ("body_pos", "body_quat", "pose", "reference")
+# What every exercise draws: trocar and joints of an instrument, and the length of the path.
+HAND = ("body_pos", "body_quat", "pose")
+FRAME = (*HAND, "reference")
 
 
-class Resting(Physics):
-  """The physics of an exercise while its organ rests, which is not stepped to answer."""
-
-  def use(self, *args: Any) -> None:
-    """Takes a compiled scene, see `Physics.use`."""
-    self._rest_normals: np.ndarray | None = None
-    super().use(*args)
-    mj.mj_forward(self.model.ptr, self.data.ptr)  # the camera is where it is
+class Posed:
+  """An instrument that is where it is said to be: nothing is computed for it."""
 
   def set_joints(self, pose: np.ndarray) -> None:
     """Takes the instrument's pose at the start of an episode."""
     self.pose = np.array(pose)
 
-  def tip_pos(self) -> np.ndarray:
+  def tip_pos(self: Any) -> np.ndarray:
     """Returns where that puts the tip [m]  (3,)."""
     return trocar.forward(self.trocar(), self.pose[[0, 1, 3]])
+
+
+class Other(Posed, Second):
+  """The other hand's."""
+
+
+class Resting(Posed, Physics):
+  """The physics of an exercise while its organ rests, which is not stepped to answer."""
+
+  def use(
+    self, model: mj.MjModel, prefix: str, targets: int, organ: str = ORGAN, second: str = ""
+  ) -> None:
+    """Takes a compiled scene, see `Physics.use`."""
+    self._rest_normals: np.ndarray | None = None
+    super().use(model, prefix, targets, organ, second)
+    self.second = Other(self, second) if second else None
+    mj.mj_forward(self.model.ptr, self.data.ptr)  # the camera is where it is
 
   def mark(self, *args: Any, **kwargs: Any) -> None:
     """Does nothing: no picture is made."""
@@ -65,7 +79,7 @@ class Episodes:
   def __init__(self, task: Task, domain: type[Domain], nworld: int):
     model = task.compiled(task.variants[0]).model
     self.physics: Any = Resting.from_model(wrapper.MjModel(model))
-    self.physics.use(model, task.prefix, task.targets, task.organ)
+    self.physics.use(model, task.prefix, task.targets, task.organ, task.second)
     self._task, self._domain = task, domain
     self._random: list[np.random.RandomState | None] = [None] * nworld
     self.rows: dict[str, np.ndarray] = {}
@@ -118,13 +132,20 @@ class Episodes:
     self._ready[world] = True
 
   def _row(self) -> Mapping[str, Any]:
-    model = self.physics.model.ptr
-    body = model.body(f"{self._task.prefix}trocar")
-    if body.parentid[0]:
-      raise ValueError(f"{self._task.name}: the trocar hangs on a body, expected the world")
-    frame = {"body_pos": body.pos.copy(), "body_quat": body.quat.copy(), "pose": self.physics.pose}
+    model, frame = self.physics.model.ptr, dict[str, Any]()
+    for hand in self.physics.hands:
+      body = model.body(f"{hand.prefix}trocar")
+      if body.parentid[0]:
+        raise ValueError(f"{self._task.name}: the trocar hangs on a body, expected the world")
+      own = body.pos.copy(), body.quat.copy(), hand.pose
+      frame |= dict(zip(of_hand(hand is not self.physics), own, strict=True))
     frame["reference"] = np.array(self._task.reference_length() or 0.0)
     return frame | dict(self._domain.draw(self._task, self.physics))
+
+
+def of_hand(other: bool) -> list[str]:
+  """Returns the names of the rows of HAND of the instrument, or of the other hand's."""
+  return [f"other_{name}" for name in HAND] if other else [*HAND]
 
 
 def at_rest(model: mj.MjModel, state: np.ndarray, kind: int) -> mj.MjData:

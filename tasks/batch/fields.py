@@ -4,6 +4,8 @@ Sizes are named: nworld worlds, nvert nodes, nelem triangles, naction components
 """
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
+from typing import Any
+
 import warp as wp
 from palpate.tasks.physics import COARSE, NEAR
 from palpate.tissue.types import Array, floats, ints, struct
@@ -12,9 +14,15 @@ flags = Array(wp.bool, ("nworld",))
 vectors = Array(wp.vec3, ("nworld",))
 
 
+def together(name: str, *parts: type) -> Any:
+  """Returns the struct of the fields of some classes."""
+  fields = {key: kind for part in parts for key, kind in part.__annotations__.items()}
+  return struct(type(name, (), {"__annotations__": fields, "__module__": __name__}))
+
+
 @struct
 class Common:
-  """Scene and state.
+  """Scene and state; of the other hand's instrument, where there is one, what is an instrument's.
 
   `outcome` is a number of `OUTCOMES`.
   """
@@ -26,6 +34,7 @@ class Common:
   damage: float  # [N]
   sparse: int  # whether rewards are
   depth: float  # from the trocar to the tip when every joint is zero [m]
+  first: int  # its first component of an action
   jaw: int  # actuator, -1 without jaws
   opening: int  # first of the two joints of the jaws in qpos
   qposadr: ints(4)  # of pitch, yaw, roll, insertion

@@ -5,10 +5,11 @@ from typing import Any
 
 import warp as wp
 from palpate.tasks import grasp, touch
+from palpate.tissue.types import floats
 
-from .fields import RUNNING, SUCCESS, Common
-from .hold import Hold, HoldState, distance, follow, from_tip, holds, show, start
-from .kernels import closeness, error, judge, point
+from .fields import RUNNING, SUCCESS, Common, flags, together, vectors
+from .hold import Hold, Holding, distance, follow, from_tip, holds, offset, start
+from .kernels import closeness, error, judge, point, put
 
 progress = wp.func(grasp.progress)
 _SLACK, _REST = wp.constant(touch.SLACK), wp.constant(grasp.REST)
@@ -16,14 +17,32 @@ _LOW, _RESTING = wp.constant(grasp.LOW), wp.constant(grasp.RESTING)
 _LETTING = wp.constant(grasp.LETTING)
 
 
+class Lifting:
+  """What the domain has besides jaws."""
+
+  lift: float  # [m]
+  hold: float  # [s]
+  rest: vectors  # the site's place at rest [m]
+  up: vectors  # towards the trocar
+  time: floats("nworld")  # held [s]
+  done: flags  # it was held
+  lowered: floats("nworld")  # it rests low [s]
+  letting: flags  # the jaws let go
+  height: floats("nworld", 1)
+  held: floats("nworld", 1)
+
+
+GraspState = together("GraspState", Holding, Lifting)
+
+
 @wp.func
-def height(s: Common, o: HoldState, w: int):
+def height(s: Common, o: GraspState, w: int):
   """Returns how far the site is above its place at rest, towards the trocar [m]."""
   return wp.dot(point(s, w, o.site[w]) - o.rest[w], o.up[w])
 
 
 @wp.func
-def again(o: HoldState, w: int):
+def again(o: GraspState, w: int):
   """Starts the holding again."""
   o.time[w] = 0.0
   o.done[w] = False
@@ -32,7 +51,7 @@ def again(o: HoldState, w: int):
 
 
 @wp.func
-def count(s: Common, o: HoldState, w: int, share: float):
+def count(s: Common, o: GraspState, w: int, share: float):
   """Counts the time that the site is held high, and then at rest low."""
   if not o.done[w]:
     if share < 1.0:
@@ -49,7 +68,7 @@ def count(s: Common, o: HoldState, w: int, share: float):
 
 
 @wp.kernel(enable_backward=False)
-def begin(s: Common, o: HoldState):
+def begin(s: Common, o: GraspState):
   """Begins episodes."""
   w = wp.tid()
   if s.begun[w]:
@@ -58,7 +77,7 @@ def begin(s: Common, o: HoldState):
 
 
 @wp.kernel(enable_backward=False)
-def advance(s: Common, o: HoldState):
+def advance(s: Common, o: GraspState):
   """Follows the grasp from closing to release."""
   w = wp.tid()
   share = height(s, o, w) / o.lift
@@ -85,17 +104,19 @@ def advance(s: Common, o: HoldState):
 
 
 @wp.kernel(enable_backward=False)
-def observe(s: Common, o: HoldState, beginning: bool):
+def observe(s: Common, o: GraspState, beginning: bool):
   """Writes target, height and held; grasped is kept up to date."""
   w = wp.tid()
   if not beginning or s.begun[w]:
-    show(s, o, w)
+    put(o.target, w, offset(s, o, w))
+    o.held[w, 0] = wp.min(o.time[w] / o.hold, 1.0)
     o.height[w, 0] = height(s, o, w) - o.lift
 
 
 class Grasp(Hold):
   """The domain."""
 
+  struct = GraspState
   begin, advance, observe = begin, advance, observe
   takes = ("lift", "hold", "slip")
 

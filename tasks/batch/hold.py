@@ -1,4 +1,4 @@
-"""What grasp and retract share in arrays, see `tasks.grasp.Hold`."""
+"""What exercises with jaws share in arrays, see `tasks.grasp.Hold`."""
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 from typing import Any
@@ -11,65 +11,48 @@ from palpate.tissue.types import Array, floats, ints, struct
 
 from . import domain
 from .fields import Common, flags, vectors
-from .kernels import error, point, put, reach, vector
+from .kernels import error, point, reach, vector
 
 _CLOSING, _GRIPPING = wp.constant(instrument.CLOSING), wp.constant(instrument.GRIPPING)
 _FOLD, _FORCE = wp.constant(instrument.FOLD), wp.constant(instrument.HELD_FORCE)
 _REACH, _FACING = wp.constant(grasp.REACH), wp.constant(jaws.FACING)
 
 
-@struct
-class HoldState:
-  """State of both domains; what is of one alone says so."""
+class Holding:
+  """State of jaws that hold a site, of a domain's struct."""
 
-  lift: float  # grasp [m]
-  wanted: float  # retract: share of the disc
-  hold: float  # [s]
   slip: float  # [m]
-  eye: wp.vec3  # retract: of the laparoscope [m]
   side: floats("nside")  # of a geom, see `Jaws`
   site: ints("nworld")  # triangle to grasp
-  rest: vectors  # grasp: its place at rest [m]
-  up: vectors  # grasp: towards the trocar
-  disc: Array(wp.vec3, ("nworld", "nsample"))  # retract: points of it [m]
-  covered: Array(wp.bool, ("nworld", "nsample"))  # retract: whether the organ hides them
   inner: floats("nworld", 2)  # force of the jaws' inner faces [N]
   closing: flags
   where: vectors  # the site in the frame of the tip, where it was grasped [m]
   distance0: floats("nworld")  # [m]
-  time: floats("nworld")  # held [s]
-  done: flags  # grasp: it was held
-  lowered: floats("nworld")  # grasp: it rests low [s]
-  letting: flags  # grasp: the jaws let go
   target: floats("nworld", 3)
-  height: floats("nworld", 1)
-  hidden: floats("nworld", 3)
-  visible: floats("nworld", 1)
-  held: floats("nworld", 1)
   grasped: floats("nworld", 1)
 
 
 @wp.func
-def distance(s: Common, o: HoldState, w: int):
+def distance(s: Common, o: Any, w: int):
   """Returns how far the tip is from the site [m]."""
   return wp.length(point(s, w, o.site[w]) - vector(s.tip_pos, w))
 
 
 @wp.func
-def holds(s: Common, o: HoldState, w: int):
+def holds(s: Common, o: Any, w: int):
   """Returns whether tissue is between the jaws, see `Physics.holds`."""
   return wp.min(o.inner[w, 0], o.inner[w, 1]) > _FORCE and s.gripper[w, 0] > _FOLD
 
 
 @wp.func
-def from_tip(s: Common, o: HoldState, w: int):
+def from_tip(s: Common, o: Any, w: int):
   """Returns the site in the frame of the tip [m]."""
   q = wp.quat(s.tip_quat[w, 1], s.tip_quat[w, 2], s.tip_quat[w, 3], s.tip_quat[w, 0])
   return wp.quat_rotate_inv(q, point(s, w, o.site[w]) - vector(s.tip_pos, w))
 
 
 @wp.func
-def follow(s: Common, o: HoldState, w: int):
+def follow(s: Common, o: Any, w: int):
   """Finds out whether the site is grasped; returns whether it was until now, and is no more."""
   before = o.grasped[w, 0] == 1.0
   closing = s.gripper[w, 1] < wp.min(s.gripper[w, 0] - _CLOSING, _GRIPPING)
@@ -92,25 +75,25 @@ def follow(s: Common, o: HoldState, w: int):
 
 
 @wp.func
-def start(s: Common, o: HoldState, w: int):
+def start(s: Common, o: Any, w: int):
   """Begins an episode."""
   o.grasped[w, 0] = 0.0
   o.closing[w] = False
-  o.time[w] = 0.0
   o.distance0[w] = distance(s, o, w)
 
 
 @wp.func
-def show(s: Common, o: HoldState, w: int):
-  """Writes target and held."""
-  put(o.target, w, point(s, w, o.site[w]) - vector(s.tip_pos, w))
-  o.held[w, 0] = wp.min(o.time[w] / o.hold, 1.0)
+def offset(s: Common, o: Any, w: int):
+  """Returns the way from the tip to the site [m]."""
+  return point(s, w, o.site[w]) - vector(s.tip_pos, w)
 
 
 @struct
 class Between:
   """What the jaws touch."""
 
+  side: floats("nside")  # see `Holding`
+  inner: floats("nworld", 2)
   left: Array(wp.mat33, ("nworld",))  # axes of the jaws
   right: Array(wp.mat33, ("nworld",))
   geom: ints("nworld", "ncontact")  # see `palpate.batch.Contacts`
@@ -119,36 +102,35 @@ class Between:
 
 
 @wp.kernel(enable_backward=False)
-def press(o: HoldState, b: Between):
+def press(b: Between):
   """Adds up the force of the jaws' inner faces on the organ, see `Jaws.inner_force`."""
   w = wp.tid()
   both = wp.vec2(0.0, 0.0)
   for k in range(b.geom.shape[1]):
     g = b.geom[w, k]
-    if g >= 0 and o.side[g] != 0.0:
+    if g >= 0 and b.side[g] != 0.0:
       n = -wp.vec3(b.normal[w, k, 0], b.normal[w, k, 1], b.normal[w, k, 2])
       jaw = int(0)  # noqa: RUF046, UP018 - a variable to Warp
       axes = b.left[w]
-      if o.side[g] < 0.0:
+      if b.side[g] < 0.0:
         jaw = 1
         axes = b.right[w]
-      along = o.side[g] * (n[0] * axes[0, 0] + n[1] * axes[1, 0] + n[2] * axes[2, 0])
+      along = b.side[g] * (n[0] * axes[0, 0] + n[1] * axes[1, 0] + n[2] * axes[2, 0])
       if along > _FACING:
         both[jaw] = both[jaw] + b.force[w, k] * along
-  o.inner[w, 0] = both[0]
-  o.inner[w, 1] = both[1]
+  b.inner[w, 0] = both[0]
+  b.inner[w, 1] = both[1]
 
 
 class Hold(domain.Domain):
   """What the domains share."""
 
-  struct = HoldState
   nodes = 24
 
   @staticmethod
   def sizes(task: Any, physics):
     """Returns the named sizes of its arrays."""
-    return {"nsample": 1, "nside": physics.model.ngeom + 1}
+    return {"nside": physics.model.ngeom + 1}
 
   @staticmethod
   def constants(task: Any, physics) -> dict[str, Any]:
@@ -169,7 +151,8 @@ class Hold(domain.Domain):
       between: Any = Between()
       between.left, between.right = (batch.xmat(name) for name in found.names)
       between.geom, between.normal, between.force = worlds.organ.contacts
-      worlds.launch(press, worlds.nworld, [own, between])
+      between.side, between.inner = own.side, own.inner
+      worlds.launch(press, worlds.nworld, [between])
       return
     inner = own.inner.numpy()
 

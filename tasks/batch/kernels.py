@@ -76,10 +76,10 @@ def act(s: Common):
   """Moves the drives' targets."""
   w = wp.tid()
   for k in range(4):
-    target = s.ctrl[w, s.drive[k]] + wp.clamp(s.action[w, k], -1.0, 1.0) * s.move[k]
+    target = s.ctrl[w, s.drive[k]] + wp.clamp(s.action[w, s.first + k], -1.0, 1.0) * s.move[k]
     s.ctrl[w, s.drive[k]] = wp.clamp(target, s.low[k], s.high[k])
   if s.jaw >= 0:
-    share = 0.5 * (wp.clamp(s.action[w, 4], -1.0, 1.0) + 1.0)
+    share = 0.5 * (wp.clamp(s.action[w, s.first + 4], -1.0, 1.0) + 1.0)
     s.ctrl[w, s.jaw] = s.low[4] + (s.high[4] - s.low[4]) * share
 
 
@@ -143,6 +143,14 @@ def measure(s: Common, beginning: bool):
     s.gripper[w, 1] = s.ctrl[w, s.jaw]
   s.peak_force[w, 0] = most
   s.shaft_peak[w] = shaft
+
+
+@wp.kernel(enable_backward=False)
+def join(s: Common, other: Common):
+  """Takes the largest forces of both hands."""
+  w = wp.tid()
+  s.peak_force[w, 0] = wp.max(s.peak_force[w, 0], other.peak_force[w, 0])
+  s.shaft_peak[w] = wp.max(s.shaft_peak[w], other.shaft_peak[w])
 
 
 @wp.func

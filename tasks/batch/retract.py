@@ -5,17 +5,35 @@ from typing import Any
 
 import warp as wp
 from palpate.tasks import retract, touch
+from palpate.tissue.types import Array, floats
 
-from .fields import RUNNING, SUCCESS, Common
-from .hold import Hold, HoldState, distance, follow, show, start
+from .fields import RUNNING, SUCCESS, Common, together
+from .hold import Hold, Holding, distance, follow, offset, start
 from .kernels import closeness, error, judge, node, put, vector
 
 progress = wp.func(retract.progress)
 _SLACK, _SEEN = wp.constant(touch.SLACK), wp.constant(retract.SEEN)
 
 
+class Seeing:
+  """What the domain has besides jaws."""
+
+  wanted: float  # share of the disc
+  hold: float  # [s]
+  eye: wp.vec3  # of the laparoscope [m]
+  disc: Array(wp.vec3, ("nworld", "nsample"))  # points of it [m]
+  covered: Array(wp.bool, ("nworld", "nsample"))  # whether the organ hides them
+  time: floats("nworld")  # held [s]
+  hidden: floats("nworld", 3)
+  visible: floats("nworld", 1)
+  held: floats("nworld", 1)
+
+
+RetractState = together("RetractState", Holding, Seeing)
+
+
 @wp.kernel(enable_backward=False)
-def hide(s: Common, o: HoldState):
+def hide(s: Common, o: RetractState):
   """Finds which points of the disc the organ hides: rays against triangles, as `Physics.hidden`."""
   w, k = wp.tid()
   covered = wp.bool(False)
@@ -37,16 +55,17 @@ def hide(s: Common, o: HoldState):
 
 
 @wp.kernel(enable_backward=False)
-def begin(s: Common, o: HoldState):
+def begin(s: Common, o: RetractState):
   """Begins episodes."""
   w = wp.tid()
   if s.begun[w]:
     start(s, o, w)
+    o.time[w] = 0.0
     o.visible[w, 0] = 0.0
 
 
 @wp.kernel(enable_backward=False)
-def advance(s: Common, o: HoldState):
+def advance(s: Common, o: RetractState):
   """Follows the grasp and what is seen."""
   w = wp.tid()
   if follow(s, o, w):
@@ -71,17 +90,19 @@ def advance(s: Common, o: HoldState):
 
 
 @wp.kernel(enable_backward=False)
-def observe(s: Common, o: HoldState, beginning: bool):
+def observe(s: Common, o: RetractState, beginning: bool):
   """Writes target, hidden and held; visible and grasped are kept up to date."""
   w = wp.tid()
   if not beginning or s.begun[w]:
-    show(s, o, w)
+    put(o.target, w, offset(s, o, w))
+    o.held[w, 0] = wp.min(o.time[w] / o.hold, 1.0)
     put(o.hidden, w, o.disc[w, 0] - vector(s.tip_pos, w))
 
 
 class Retract(Hold):
   """The domain."""
 
+  struct = RetractState
   begin, advance, observe = begin, advance, observe
   takes = ("wanted", "hold", "slip")
 

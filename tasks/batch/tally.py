@@ -7,6 +7,7 @@ is not in `NAMES` a recording of the single environment has.
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
 import warp as wp
+from palpate.tasks.metrics import METRICS
 from palpate.tasks.metrics import force as pressing
 from palpate.tissue.types import Array, doubles, floats, ints, struct
 
@@ -21,6 +22,7 @@ NAMES = (
   "peak_grip", "mean_grip", "grip_breaches", "grip_ratio", "grasp_slips",
 )  # fmt: skip
 _OF_JAWS = NAMES.index("peak_grip")
+_INEFFICIENCY = wp.constant(NAMES.index("path_inefficiency"))
 _SETTLE = wp.constant(pressing.SETTLE)
 _LONG = wp.constant(1 << 30)  # steps ago: never
 _TIP, _GRIP = wp.constant(0), wp.constant(1)
@@ -239,6 +241,32 @@ def _tell(s: Common, t: Tally, w: int):
     t.gripped[w] - end * t.last[w, _GRIP], t.pulled[w] - end * last
   )
   t.values[w, 23] = wp.where(s.grasps[w] > 0, float(s.slips[w]), wp.nan)
+
+
+_SUM, _MAX, _MEAN = (wp.constant(k) for k in range(3))
+_HOWS = [("sum", "max", "mean", "all").index(METRICS[name].combine) for name in NAMES]
+
+
+@wp.kernel(enable_backward=False)
+def join(s: Common, t: Tally, other: Tally, how: wp.array[int]):
+  """Makes metrics of both hands together of those of each, see `Recording.metrics`."""
+  w, k = wp.tid()
+  a, b = t.values[w, k], other.values[w, k]
+  if how[k] > _MEAN:  # they are of the whole
+    if k == _INEFFICIENCY:
+      path = t.path[w] + other.path[w]
+      t.values[w, k] = 100.0 * (_share(path, wp.float64(s.reference[w])) - 1.0)
+  elif wp.isnan(a) or wp.isnan(b):
+    t.values[w, k] = wp.where(wp.isnan(a), b, a)
+  elif how[k] == _MAX:
+    t.values[w, k] = wp.max(a, b)
+  else:
+    t.values[w, k] = wp.where(how[k] == _SUM, a + b, 0.5 * (a + b))
+
+
+def hows(device) -> wp.array:
+  """Returns how each metric is made of those of two hands."""
+  return wp.array(_HOWS, dtype=int, device=device)
 
 
 def names(jaws: bool) -> tuple[str, ...]:

@@ -26,12 +26,15 @@ from palpate.batch.base import on_device
 from palpate.tasks.gym import Exercise
 
 from . import tally
+from .bimanual import Bimanual
+from .dissect import Dissect
 from .domain import Domain
 from .fields import INFO, OBSERVED, OUTCOMES
 from .grasp import Grasp
 from .palpate import Palpate
 from .press import Press
 from .retract import Retract
+from .tease import Tease
 from .touch import Touch
 from .trace import Trace
 from .worlds import Worlds
@@ -39,7 +42,7 @@ from .worlds import Worlds
 # Exercises that are vectorised, by the class of their task.
 DOMAINS: dict[str, type[Domain]] = {
   "Touch": Touch, "Press": Press, "Palpate": Palpate, "Grasp": Grasp, "Retract": Retract,
-  "Trace": Trace,
+  "Trace": Trace, "Dissect": Dissect, "Tease": Tease, "Bimanual": Bimanual,
 }  # fmt: skip
 _ELSE = 'vectorization_mode="sync" runs single environments side by side'
 OUTPUTS = ("numpy", "torch", "warp")
@@ -203,7 +206,7 @@ class Exercises(VectorEnv):
 
   def _observations(self) -> dict[str, Any]:
     self._wait()
-    return {name: self._tell(OBSERVED.get(name) or name) for name in self._observed}
+    return {name: self._tell(OBSERVED.get(name, name)) for name in self._observed}
 
   def _final(self, over: np.ndarray) -> Any:
     seen = self._observations()
@@ -217,9 +220,11 @@ class Exercises(VectorEnv):
   def _metrics(self) -> dict[str, Any]:
     """Returns the metrics of the episodes so far, NaN where they are unknown."""
     values, names = self._tell("values"), tally.names(self.task.jaws)
+    own = DOMAINS[type(self.task).__name__].metrics
+    more = {name: self._tell(field) for name, field in own.items()}
     if self.output != "warp":
-      return {name: values[:, k] for k, name in enumerate(names)}
-    return {name: wp.clone(values[:, k]) for k, name in enumerate(names)}
+      return {name: values[:, k] for k, name in enumerate(names)} | more
+    return {name: wp.clone(values[:, k]) for k, name in enumerate(names)} | more
 
   def _infos(self, where: np.ndarray | None = None) -> dict[str, Any]:
     """Returns what `info` is of a single environment; with a mask that is not of all worlds."""

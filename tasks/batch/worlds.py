@@ -15,14 +15,14 @@ import warp as wp
 from palpate.models import trocar
 from palpate.tasks import episode
 from palpate.tasks.environment import Environment
-from palpate.tasks.instrument import AXES, RATES
+from palpate.tasks.instrument import AXES, JAWS, RATES
 from palpate.tasks.stage import STATE
 from palpate.tissue.types import allocate
 
 from . import kernels, tally
 from .domain import Domain
-from .episodes import FRAME, Episodes, at_rest
-from .fields import Common
+from .episodes import FRAME, HAND, Episodes, at_rest, of_hand
+from .fields import OBSERVED, Common
 
 _SENSORS = ("tip_force", "shaft_force", "touch_left", "touch_right")
 
@@ -32,6 +32,7 @@ class Worlds:
 
   Attributes:
     fields: what every exercise has, arrays on the device
+    other: the same of the other hand's instrument, or None
     own: what the domain has
     tally: what metrics are made of
     batch: the physics
@@ -71,7 +72,13 @@ class Worlds:
     self.batch.start(at_rest(self.batch.model, stage.state, STATE))
     self.episodes = Episodes(task, domain, nworld)
     self.organ = self.batch.organ(task.organ)
-    self.fields = self._make(task, environment.control_timestep(), limit)
+    dt = environment.control_timestep()
+    self.fields, self.other = self._make(task, task.prefix, dt, limit), None
+    if task.second:
+      self.other = self._make(task, task.second, dt, limit)
+      self.other.first = len(task.components) - len(AXES) - len(task.other)
+      for name in ("action", "begun", "step"):
+        setattr(self.other, name, getattr(self.fields, name))
     sizes = {"nworld": nworld, **domain.sizes(task, self.episodes.physics)}
     self.own = allocate(domain.struct, self.device, sizes)
     shared: dict[str, Any] = {name: getattr(task, name) for name in domain.takes}
@@ -81,11 +88,19 @@ class Worlds:
         getattr(self.own, name).assign(value)
       else:
         setattr(self.own, name, value)
-    self.tally = self._count(task)
+    steps = self.batch.watch(self._substeps)
+    self.tally = self._count(task, steps)
+    self._tally = self._count(task, steps) if self.other else None
+    self._hows = tally.hows(self.device)
     self._bad = wp.zeros(1, dtype=int, device=self.device)
     self._done, self._graphs = set[str](), dict[str, Any]()
 
-  def _make(self, task: Any, dt: float, limit: int) -> Any:
+  @property
+  def hands(self) -> tuple[Any, ...]:
+    """The fields of each instrument."""
+    return (self.fields, self.other) if self.other else (self.fields,)
+
+  def _make(self, task: Any, prefix: str, dt: float, limit: int) -> Any:
     physics, model = self.episodes.physics, self.batch.model
     sizes = dict(
       nworld=self.nworld, nvert=self.organ.nvert, nelem=len(self.organ.elem), nq=model.nq,
@@ -95,10 +110,10 @@ class Worlds:
     s = allocate(Common, self.device, sizes)
     s.dt, s.limit, s.sparse = dt, limit, int(task.reward == "sparse")
     s.force_limit, s.damage = task.force_limit, task.damage
-    s.depth = trocar.trocar(model, task.prefix).depth
-    self._point_at(s, task, model)
-    drives = [model.actuator(task.prefix + axis).id for axis in AXES]
-    controls = model.actuator_ctrlrange[[*drives, s.jaw if task.jaws else drives[0]]]
+    s.depth = trocar.trocar(model, prefix).depth
+    self._point_at(s, prefix, model)
+    drives = [model.actuator(prefix + axis).id for axis in AXES]
+    controls = model.actuator_ctrlrange[[*drives, s.jaw if s.jaw >= 0 else drives[0]]]
     coarse = physics.coarse
     constants = {
       "drive": drives, "low": controls[:, 0], "high": controls[:, 1],
@@ -113,9 +128,8 @@ class Worlds:
     self._read(s)
     return s
 
-  def _count(self, task: Any) -> Any:
-    """Returns the sums that metrics are made of."""
-    steps = self.batch.watch(self._substeps)
+  def _count(self, task: Any, steps: wp.array) -> Any:
+    """Returns the sums that metrics are made of, of the sensors of these steps."""
     sizes = dict(
       nworld=self.nworld, nstep=self._substeps, nsensordata=self.batch.model.nsensordata
     )  # fmt: skip
@@ -125,14 +139,15 @@ class Worlds:
     return t
 
   @staticmethod
-  def _point_at(s: Any, task: Any, model: mj.MjModel) -> None:
-    """Writes where the instrument's joints and sensors are."""
-    joints = [model.joint(task.prefix + axis) for axis in AXES]
+  def _point_at(s: Any, prefix: str, model: mj.MjModel) -> None:
+    """Writes where an instrument's joints and sensors are."""
+    jaws = prefix == JAWS
+    joints = [model.joint(prefix + axis) for axis in AXES]
     s.qposadr.assign(np.array([int(joint.qposadr[0]) for joint in joints]))
     s.dofadr.assign(np.array([int(joint.dofadr[0]) for joint in joints]))
-    s.jaw = model.actuator(f"{task.prefix}jaw").id if task.jaws else -1
-    s.opening = int(model.joint(f"{task.prefix}jaw_left").qposadr[0]) if task.jaws else -1
-    sensors = [model.sensor(task.prefix + n).id for n in _SENSORS[: 4 if task.jaws else 2]]
+    s.jaw = model.actuator(f"{prefix}jaw").id if jaws else -1
+    s.opening = int(model.joint(f"{prefix}jaw_left").qposadr[0]) if jaws else -1
+    sensors = [model.sensor(prefix + n).id for n in _SENSORS[: 4 if jaws else 2]]
     sensors += [0] * (4 - len(sensors))
     s.sensor.assign(np.array(sensors))
     s.sensoradr.assign(model.sensor_adr[sensors])
@@ -150,6 +165,9 @@ class Worlds:
     """Returns one of the arrays of `fields`, `own` or `tally`."""
     if name in Common.vars:
       return getattr(self.fields, name)
+    own = name.removeprefix(self.task.second.replace("/", "_")) if self.other else name
+    if own != name and OBSERVED.get(own, own) in Common.vars:
+      return getattr(self.other, OBSERVED.get(own, own))
     return getattr(self.own if name in self._domain.struct.vars else self.tally, name)
 
   def check(self, action: wp.array, first: int = 0) -> None:
@@ -180,7 +198,8 @@ class Worlds:
   def launch_step(self, action: wp.array) -> None:
     """Begins a control step with actions that are allowed."""
     wp.copy(self.fields.action, action)
-    self._over(kernels.act)
+    self._of_hands(kernels.act)
+    self._domain.act(self)
     self.batch.step(self._substeps)
     self._run(self._judge)
 
@@ -193,12 +212,29 @@ class Worlds:
 
   def _judge(self) -> None:
     """Launches what follows the steps of the physics."""
-    self._read(self.fields)
-    self._over(kernels.measure, False)
+    self._measure(False)
     self._domain.sense(self)
     self._over(self._domain.advance, self.own)
     self._over(tally.add, self.tally)
+    if self.other:
+      self.launch(tally.add, self.nworld, [self.other, self._tally])
+      inputs = [self.fields, self.tally, self._tally, self._hows]
+      self.launch(tally.join, self.tally.values.shape, inputs)
     self._observe(False)
+
+  def _measure(self, beginning: bool) -> None:
+    """Measures the instruments, and brings what is of the batch up to date."""
+    for hand in self.hands:
+      self._read(hand)
+    self._of_hands(kernels.measure, beginning)
+    if self.other:
+      self._over(kernels.join, self.other)
+    self._domain.read(self)
+
+  def _of_hands(self, kernel: Any, *inputs: Any) -> None:
+    """Launches a kernel over the fields of each instrument."""
+    for hand in self.hands:
+      self.launch(kernel, self.nworld, [hand, *inputs])
 
   def begin(self, worlds: np.ndarray, seeds: Sequence[int | None] | None = None) -> None:
     """Begins episodes in some worlds, numbers or a mask."""
@@ -213,15 +249,19 @@ class Worlds:
     for name, values in rows.items():
       if name in self._domain.tissue:
         continue
-      self._write(getattr(s if name in FRAME else self.own, name), at, values[worlds])
-    # The plugin's worlds take them as they were drawn, in float64.
-    pos, quat, pose = (
-      rows[name] if self.device.is_cpu else getattr(s, name) for name in FRAME[:3]
-    )  # fmt: skip
+      of_other = self.other is not None and name in of_hand(True)
+      out = self.other if of_other else s if name in FRAME else self.own
+      self._write(getattr(out, name.removeprefix("other_" if of_other else "")), at, values[worlds])
     self.batch.reset(s.begun)
-    if self.task.jitter:
-      self.batch.place(f"{self.task.prefix}trocar", pos, quat, s.begun)
-    self.batch.pose([self.task.prefix + axis for axis in AXES], pose, s.begun)
+    for hand, prefix in zip(self.hands, (self.task.prefix, self.task.second), strict=False):
+      # The plugin's worlds take them as they were drawn, in float64.
+      pos, quat, pose = (
+        rows[row] if self.device.is_cpu else getattr(hand, name)
+        for name, row in zip(HAND, of_hand(hand is not s), strict=True)
+      )  # fmt: skip
+      if self.task.jitter:
+        self.batch.place(f"{prefix}trocar", pos, quat, s.begun)
+      self.batch.pose([prefix + axis for axis in AXES], pose, s.begun)
     if self._domain.tissue:
       self.organ.configure(mask, **{key: rows[key] for key in self._domain.tissue})
     self._run(self._open)
@@ -237,11 +277,12 @@ class Worlds:
 
   def _open(self) -> None:
     """Launches what follows the beginning of episodes."""
-    self._over(kernels.begin)
-    self._read(self.fields)
-    self._over(kernels.measure, True)
+    self._of_hands(kernels.begin)
+    self._measure(True)
     self._over(self._domain.begin, self.own)
     self._over(tally.start, self.tally)
+    if self.other:
+      self.launch(tally.start, self.nworld, [self.other, self._tally])
     self._observe(True)
 
   def _run(self, work: Callable[[], None]) -> None:
@@ -261,7 +302,8 @@ class Worlds:
     self._over(kernels.look, beginning)
     dim = (self.nworld, self.fields.coarse.shape[0])
     self.launch(kernels.survey, dim, [self.fields, beginning])
-    self._over(self._domain.observe, self.own, beginning)
+    others = (self.other,) if self.other else ()
+    self._over(self._domain.observe, self.own, *others, beginning)
 
   def _over(self, kernel: Any, *inputs: Any) -> None:
     self.launch(kernel, self.nworld, [self.fields, *inputs])

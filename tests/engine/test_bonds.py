@@ -100,7 +100,7 @@ def test_an_organ_and_a_free_body_bonded_together_keep_their_momentum(make, scen
   assert np.isfinite(data.qpos[adr]) and organ.error is None
 
 
-def _two(scenes, gravity=(0, 0, -9.81), **keys):
+def _two(scenes, gravity=(0, 0, -9.81), first="upper", **keys):
   """Returns a block that is held, with bonds to a block a millimetre under it, and that block."""
   points, elem = scenes.box((0.06, 0.06, 0.03), 0.012)
   points[:, 2] -= points[:, 2].min()
@@ -109,7 +109,8 @@ def _two(scenes, gravity=(0, 0, -9.81), **keys):
   each |= {"contact": {"contype": 1, "conaffinity": 2}}
   upper = scenes.windowed(points, elem, "upper", "one", "3 3 1", pin=held, **each | keys)
   lower = scenes.windowed(points - [0, 0, 0.031], elem, "lower", "two", "3 3 1", **each)
-  made = scenes.world(upper + lower + scenes.ball(1.0, joint=False) + HAND, gravity=gravity)
+  both = upper + lower if first == "upper" else lower + upper
+  made = scenes.world(both + scenes.ball(1.0, joint=False) + HAND, gravity=gravity)
   model, data, organ = scenes.load(made, "upper")
   mujoco.mj_forward(model, data)
   return model, data, organ, palpate.Organ(model, data, "lower")
@@ -125,12 +126,22 @@ def test_an_organ_hangs_by_its_bonds_on_another(scenes):
   assert upper.error is None and lower.error is None
 
 
+def test_forces_between_organs_are_the_same_whichever_comes_first(scenes):
+  found = []
+  for first in ("upper", "lower"):
+    model, data, upper, _ = _two(scenes, first=first, bonds="lower 1e6 5e3 50 near 0.002")
+    for _ in range(20):
+      mujoco.mj_step(model, data)
+    found.append(upper.bonds.force)
+  np.testing.assert_allclose(found[1], found[0], atol=1e-3 * np.abs(found[0]).max())
+
+
 def test_a_pull_frees_an_organ_from_another(scenes):
   energy = 1.0
   model, data, upper, lower = _two(scenes, (0, 0, 0), bonds=f"lower 1e6 1e3 {energy} near 0.002")
   grip = lower.attach(np.flatnonzero(lower.xpos0[:, 2] < -0.0305), "hand")
   shares = []
-  for _ in range(400):
+  for _ in range(600):
     data.mocap_pos[0, 2] -= 2e-5
     mujoco.mj_step(model, data)
     shares.append(upper.bonds.share_freed)
@@ -303,6 +314,19 @@ def test_bonds_of_python_are_copied_and_end_with_a_reset(make):
   data.mocap_pos[0] += [0, 0, 0.005]
   mujoco.mj_step(model, data)
   assert not len(organ.bonds) and not organ.displacement.any()
+
+
+def test_what_is_held_before_anything_was_computed_is_held_where_it_is(make):
+  model, data, organ = make(bonds="none")
+  organ.bond("hand", *LAW, vertices=[3, 17])
+  grip = organ.attach([40], "hand")
+  data.mocap_pos[0] += [0, 0, 1e-3]
+  organ.bond("hand", *LAW, vertices=[5])  # it is where it will be found
+  data.mocap_pos[0] -= [0, 0, 1e-3]
+  mujoco.mj_step(model, data)
+  stretch = np.round(organ.bonds.stretch, 9)
+  np.testing.assert_array_equal(stretch, [[0, 0, 0], [0, 0, 0], [0, 0, 1e-3]])
+  assert np.abs(grip.force).max() < 1e-3
 
 
 def test_a_motion_that_is_set_leaves_what_is_torn_and_a_reset_of_the_organ_heals(make):

@@ -33,7 +33,7 @@ def scene(windows=True, x=-0.033, z=0.01, half=0.006, cutters=f"edge {ENERGY}"):
   points, elem = scenes.box((0.05, 0.03, 0.018), 0.005)
   points[:, 2] += 0.001  # its top is at 10 mm
   pin = np.flatnonzero(np.abs(np.abs(points[:, 1]) - 0.015) < 1e-9)
-  given = {"mass": 0.05, "young": 1e5, "spare": 300, "pin": pin, "cutters": cutters}
+  given = {"mass": 0.05, "young": 5e5, "spare": 300, "pin": pin, "cutters": cutters}
   palpate.add_organ(spec, (points, elem), windows=windows, elements="solid", device="cpu", **given)
   model = spec.compile()
   data = mujoco.MjData(model)

@@ -1,4 +1,4 @@
-"""A press by the finite elements of another library: scikit-fem, quadratic, small strains.
+"""A press and a cantilever by the quadratic elements of another library, scikit-fem: small strains.
 
 A rigid sphere without friction on a linear elastic body. The body's compliance at the surface's
 nodes under the sphere comes from one factorization; the contact is then a quadratic programme:
@@ -7,6 +7,7 @@ least p^T C p / 2 - g^T p with p >= 0, p the nodes' forces and g how deep the sp
 
 from __future__ import annotations
 
+import functools
 import math
 
 import numpy as np
@@ -58,6 +59,49 @@ def layer(height: float, width: float, radius: float, depths, young: float, pois
   compliance = _compliance(stiffness, held, unit)
   gap = np.asarray(depths)[:, None] - where[0][touched] ** 2 / (2 * radius)
   return np.array([_pressed(compliance, g).sum() for g in gap])
+
+
+@functools.cache
+def cantilever(
+  length: float, side: float, load: float, young: float, poisson: float, edge: float
+) -> float:
+  """Returns the sag of a square bar's loaded end [m], the other end clamped.
+
+  Half of the bar, finer towards its edges and its clamp, which hinders the sides from swelling.
+
+  Args:
+    length: [m]
+    side: [m]
+    load: across the bar, even over its end [N]
+    young: [Pa]
+    poisson: [-]
+    edge: of the finest elements [m]
+  """
+  import skfem
+  from skfem.models.elasticity import linear_elasticity
+
+  along, half = _widening(edge, length, side / 3), side / 2 - _widening(edge, side / 2, side / 3)
+  cells = skfem.MeshHex.init_tensor(along, half[::-1], np.unique([*half, *-half]))
+  element = skfem.ElementVector(skfem.ElementHex2())
+  basis = skfem.Basis(cells, element, intorder=4)
+  mu, lam = config.lame_solid(np.array(young), poisson)
+  stiffness = linear_elasticity(float(lam), float(mu)).assemble(basis)
+  facets = cells.facets_satisfying(lambda x: x[0] > length - 1e-9)
+  end = skfem.FacetBasis(cells, element, facets=facets, intorder=4)
+  push = skfem.LinearForm(lambda v, w: v[2]).assemble(end) / side**2
+  held = basis.get_dofs(lambda x: x[0] < 1e-9).all()
+  middle = basis.get_dofs(lambda x: x[1] < 1e-9).all(["u^2"])
+  sag = skfem.solve(*skfem.condense(stiffness, load * push, D=np.union1d(held, middle)))
+  return float(2 * push @ sag)
+
+
+def _widening(edge: float, length: float, most: float) -> np.ndarray:
+  """Returns coordinates from 0 to length whose distances grow from `edge` to `most`."""
+  steps = [edge]
+  while sum(steps) < length:
+    steps.append(min(1.5 * steps[-1], most))
+  line = np.cumsum([0.0, *steps])
+  return line * length / line[-1]
 
 
 def _along(basis, k: int, dim: int) -> np.ndarray:

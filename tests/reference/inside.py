@@ -1,7 +1,8 @@
 """The forces of a solid in float64, written independently of the kernels.
 
-Stable neo-Hookean tetrahedra with nodal averages of the change of volume, as `energy.solid` defines
-them, and Rayleigh damping on the stiffness of small strains in the turned frame. The reference of
+Stable neo-Hookean tetrahedra, most of whose energy acts on gradients averaged over nodes, as
+`energy.solid` defines them. Damping of shear is that of plain tetrahedra of small strains in the
+turned frame, of the volume that of the nodes. The reference of
 the error bench; `tests/benchmarks/test_bench.py` checks it against `palpate.tissue.energy`.
 """
 
@@ -12,6 +13,7 @@ from palpate.tissue import fill, solid
 from palpate.tissue import mesh as topology
 from palpate.tissue.config import Config
 from palpate.tissue.mesh import Mesh
+from palpate.tissue.step import OWN_SHARE
 from scipy import sparse
 
 _TURNS = 8  # of Newton's iteration: stretches are moderate
@@ -31,13 +33,12 @@ class Inside:
     self.volume = fill.volumes(self.mesh.rest, tet)
     self.gradient = solid.gradients(self.mesh)
     self._weighed = self.volume[:, None, None] * self.gradient
-    self.mu, self.lam, averaged = solid.moduli(self.mesh, config)
+    self.mu, _ = solid.moduli(self.mesh, config)
+    self.nodal = solid.nodal_moduli(self.mesh, config).T
     share = np.repeat(self.volume / 4, 4)
     shape = (self.mesh.nvert, len(tet))
     around = sparse.csr_array((share, (tet.ravel(), np.repeat(np.arange(len(tet)), 4))), shape)
-    total = around.sum(axis=1)
-    self._around, self._total = around, total
-    self._stiff = (around @ averaged) / total
+    self._mean = sparse.csr_array(sparse.diags_array(1 / around.sum(axis=1)) @ around)
     self._sum = sparse.csr_array(
       (np.ones(tet.size), (tet.ravel(), np.arange(tet.size))), (self.mesh.nvert, tet.size)
     )
@@ -48,24 +49,33 @@ class Inside:
     beta = self.config.damping
     tet = self.mesh.tet
     slope, rate = (x[tet].transpose(0, 2, 1) @ self.gradient for x in (u, v))
+    mean, mean_rate = ((self._mean @ x.reshape(-1, 9)).reshape(-1, 3, 3) for x in (slope, rate))
+    C = _cofactors(mean + np.eye(3))
+    mu, lam = self.nodal
+    nodal = _stress(mean, mu)
+    swell = (C * mean_rate).sum(axis=(1, 2))
+    nodal += (lam * (_swelling(mean + np.eye(3), C) + beta * swell))[:, None, None] * C
     F = slope + np.eye(3)
-    C = _cofactors(F)
-    j = (F[:, 0] * C[:, 0]).sum(axis=1) - 1
-    i = (F * F).sum(axis=(1, 2)) - 3
-    mu, lam = self.mu[:, None, None], self.lam[:, None, None]
-    stress = mu * (1 - 1 / (4 + i))[:, None, None] * F
-    stress += (lam * j[:, None, None] - 0.75 * mu) * C
-    swell = j + beta * (C * rate).sum(axis=(1, 2))
-    pressure = self._stiff * (self._around @ swell) / self._total
-    stress += pressure[tet].mean(axis=1)[:, None, None] * C
     Q = _turns(F)
     strain = Q.transpose(0, 2, 1) @ rate
-    trace = np.trace(strain, axis1=1, axis2=2)[:, None, None]
-    moving = 0.75 * mu * (strain + strain.transpose(0, 2, 1))
-    moving += (lam - 0.625 * mu) * trace * np.eye(3)
-    stress += beta * Q @ moving
+    moving = 0.75 * self.mu[:, None, None] * (strain + strain.transpose(0, 2, 1))
+    stress = _stress(slope, OWN_SHARE * self.mu) + nodal[tet].mean(axis=1) + beta * Q @ moving
     corner = (self._weighed @ stress.transpose(0, 2, 1)).reshape(-1, 3)
     return -(self._sum @ corner) - self.foundation * (u + beta * v)
+
+
+def _stress(slope: np.ndarray, mu: np.ndarray) -> np.ndarray:
+  """Returns what mu has of the stress [Pa], (n, 3, 3)."""
+  F = slope + np.eye(3)
+  C = _cofactors(F)
+  i = (F * F).sum(axis=(1, 2)) - 3
+  stretch, swell = 1 - 1 / (4 + i), 5 / 8 * _swelling(F, C) - 3 / 4
+  return (mu * stretch)[:, None, None] * F + (mu * swell)[:, None, None] * C
+
+
+def _swelling(F: np.ndarray, C: np.ndarray) -> np.ndarray:
+  """Returns det F - 1, (n,); C are the cofactors."""
+  return (F[:, 0] * C[:, 0]).sum(axis=1) - 1
 
 
 def _cofactors(F: np.ndarray) -> np.ndarray:

@@ -60,8 +60,13 @@ class Beside:
     self.first = False
 
 
-@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda:0", marks=needs_cuda)])
-@pytest.mark.parametrize("task", ["grasp/easy", "retract/easy"])
+TASKS = "grasp/easy", "retract/easy", "dissect/easy", "tease/easy", "bimanual/easy"
+
+
+@pytest.mark.parametrize(
+  ("device", "task"),
+  [("cpu", "grasp/easy"), *(pytest.param("cuda:0", task, marks=needs_cuda) for task in TASKS)],
+)
 def test_experts_hold_tissue_in_a_batch(device, task):
   count = 1 if device == "cpu" else 6
   env = vector.Exercises(count, task, device=device)

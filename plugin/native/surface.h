@@ -1,0 +1,226 @@
+// The surface of an organ that is cut: triangles and, of each vertex, the ring of its neighbours.
+//
+// A half-edge 3 t + k goes from corner k of triangle t to the next one; its twin is on the other side,
+// -1 on a boundary. A ring is counter-clockwise, with the half-edges from its vertex ("spokes"): in an
+// open one the last neighbour is reached by none, -1. Whole is what there was before the first cut.
+#pragma once
+#include "triangle.h"
+
+AS_WRITTEN
+
+namespace palpate {
+
+PALPATE int next_half(int h) { return h % 3 == 2 ? h - 2 : h + 1; }
+PALPATE int last_half(int h) { return h % 3 == 0 ? h + 2 : h - 1; }
+
+template <class I>
+struct Surface {
+  int nvert, nelem, most;
+  double* rest;
+  I *elem, *twin, *ring, *spoke, *degree;
+  const I *whole_elem, *whole_twin;
+
+  PALPATE D3 place(int v) const { return load(rest + 3 * v); }
+  PALPATE int from(int h) const { return (int)elem[h]; }
+  PALPATE int to(int h) const { return (int)elem[next_half(h)]; }
+  PALPATE int opposite(int h) const { return (int)elem[last_half(h)]; }
+  PALPATE int neighbour(int v, int k) const { return (int)ring[most * v + k]; }
+  PALPATE int half(int v, int k) const { return (int)spoke[most * v + k]; }
+  PALPATE bool on_rim(int v) const { return degree[v] == 0 || half(v, (int)degree[v] - 1) < 0; }
+  // The half-edge to a neighbour, -1 for none.
+  PALPATE int half_to(int v, int other) const {
+    for (int k = 0; k < degree[v]; ++k)
+      if (neighbour(v, k) == other) return half(v, k);
+    return -1;
+  }
+  PALPATE bool has_both_sides(int v, int other) const {
+    const int h = half_to(v, other);
+    return h >= 0 && twin[h] >= 0;
+  }
+  PALPATE void corners(int t, D3* x) const {
+    for (int c = 0; c < 3; ++c) x[c] = place((int)elem[3 * t + c]);
+  }
+};
+
+// The surface of a world in arrays of such names, all of them with the worlds one after the other.
+template <class F>
+PALPATE auto surface_of(const F& f, int world) {
+  using I = decltype(f.elem.data[0] + 0);
+  const long long v = world * (long long)f.nvert, t = world * (long long)f.nelem;
+  return Surface<I>{f.nvert, f.nelem, f.most, f.rest.data + 3 * v, f.elem.data + 3 * t,
+                    f.twin.data + 3 * t, f.ring.data + f.most * v, f.spoke.data + f.most * v,
+                    f.degree.data + v, f.whole_elem.data, f.whole_twin.data};
+}
+
+// Scratch of a world; numbers that are taken are zero.
+struct Scratch {
+  int* ints;
+  double* reals;
+  int nint, nreal;
+  bool full;
+
+  PALPATE int* numbers(int n) {
+    if (n > nint) return full = true, nullptr;
+    int* out = ints;
+    ints += n, nint -= n;
+    for (int i = 0; i < n; ++i) out[i] = 0;
+    return out;
+  }
+  PALPATE double* values(int n) {
+    if (n > nreal) return full = true, nullptr;
+    double* out = reals;
+    reals += n, nreal -= n;
+    return out;
+  }
+};
+
+// Different numbers, in the order in which they came; `put` tells whether one is new.
+struct Few {
+  int *list, *place;  // of a number: where it is in the list, from 1; 0 where it is not
+  int count;
+
+  PALPATE bool put(int number) {
+    if (place[number]) return false;
+    list[count++] = number;
+    place[number] = count;
+    return true;
+  }
+  PALPATE bool has(int number) const { return place[number] > 0; }
+  PALPATE void clear() {
+    for (int i = 0; i < count; ++i) place[list[i]] = 0;
+    count = 0;
+  }
+  // Puts them in ascending order; they are under `end`.
+  PALPATE void sort(int end) {
+    int k = 0;
+    for (int n = 0; n < end; ++n)
+      if (place[n]) list[k++] = n, place[n] = k;
+  }
+};
+
+PALPATE Few few(Scratch& memory, int most) {
+  int* list = memory.numbers(most);
+  return {list, memory.numbers(most), 0};
+}
+
+// The area around a vertex, summed over triangles in ascending order; of those that `loose` marks none.
+template <class S, class L>
+PALPATE double area_around(const S& m, int v, const L* loose) {
+  double sum = 0.0;
+  for (int t = -1;;) {
+    int next = m.nelem;
+    for (int k = 0; k < m.degree[v]; ++k) {
+      const int h = m.half(v, k);
+      if (h >= 0 && h / 3 > t && h / 3 < next) next = h / 3;
+    }
+    if (next == m.nelem) return sum;
+    t = next;
+    D3 x[3];
+    m.corners(t, x);
+    if (!loose || !loose[t]) sum += norm(0.5 * cross(x[1] - x[0], x[2] - x[0])) / 3.0;
+  }
+}
+
+// Turns a symmetric matrix so that an entry beside its diagonal is 0 (Jacobi 1846), and with it `axes`.
+PALPATE void turn_axes(double (*a)[3], double (*axes)[3], int p, int q) {
+  if (a[p][q] == 0.0) return;
+  const double theta = 0.5 * (a[q][q] - a[p][p]) / a[p][q];
+  const double t = (theta >= 0.0 ? 1.0 : -1.0) / (fabs(theta) + sqrt(1.0 + theta * theta));
+  const double c = 1.0 / sqrt(1.0 + t * t), s = t * c;
+  for (int k = 0; k < 3; ++k) {
+    const double x = a[k][p], y = a[k][q];
+    a[k][p] = c * x - s * y, a[k][q] = s * x + c * y;
+  }
+  for (int k = 0; k < 3; ++k) {
+    const double x = a[p][k], y = a[q][k];
+    a[p][k] = c * x - s * y, a[q][k] = s * x + c * y;
+  }
+  a[p][q] = a[q][p] = 0.0;
+  for (int k = 0; k < 3; ++k) {
+    const double x = axes[k][p], y = axes[k][q];
+    axes[k][p] = c * x - s * y, axes[k][q] = s * x + c * y;
+  }
+}
+
+constexpr int SWEEPS = 6;
+
+// Leaves the eigenvalues of a symmetric matrix on its diagonal, and its eigenvectors as columns of `axes`;
+// rows that are 0 keep the axis of their own.
+PALPATE void find_axes(double (*a)[3], double (*axes)[3]) {
+  for (int i = 0; i < 9; ++i) axes[i / 3][i % 3] = i / 3 == i % 3;
+  for (int k = 0; k < SWEEPS; ++k)
+    for (int p = 0; p < 2; ++p)
+      for (int q = p + 1; q < 3; ++q) turn_axes(a, axes, p, q);
+}
+
+// The nearest place of a surface: a triangle, weights of its corners, and how far it is.
+struct Spot { int elem; D3 weight; double far; };
+
+// The spot nearest to a point among the triangles around some vertices; `x` has where vertices are.
+template <class S>
+PALPATE Spot nearest_around(const S& m, const double* x, D3 point, const int* vert, int n) {
+  Spot out = {0, {1.0, 0.0, 0.0}, 1e300};
+  for (int i = 0; i < n; ++i)
+    for (int k = 0; k < m.degree[vert[i]]; ++k) {
+      const int h = m.half(vert[i], k);
+      if (h < 0) continue;
+      D3 corner[3];
+      for (int c = 0; c < 3; ++c) corner[c] = load(x + 3 * m.elem[h - h % 3 + c]);
+      const D3 w = barycentric(point, corner);
+      const double far = norm(blend(corner, w) - point);
+      if (far < out.far) out = {h / 3, w, far};
+    }
+  return out;
+}
+
+constexpr double BOX = 3.0;  // edges from points within which they are found sooner
+constexpr int NEAR = 6;  // vertices nearest to a point around which its triangle is looked for
+
+// Finds those of a few vertices, all `n` where `among` is null, that are nearest to a point; returns
+// how many there are and the square of how far the last one is.
+PALPATE int nearest_vertices(const double* x, D3 p, const int* among, int n, int* near, double& last) {
+  double far[NEAR];
+  int count = 0;
+  for (int i = 0; i < n; ++i) {
+    const int v = among ? among[i] : i;
+    const D3 arm = load(x + 3 * v) - p;
+    const double d = dot(arm, arm);
+    if (count == NEAR && d >= far[NEAR - 1]) continue;
+    int k = count < NEAR ? count++ : NEAR - 1;
+    for (; k > 0 && far[k - 1] > d; --k) far[k] = far[k - 1], near[k] = near[k - 1];
+    far[k] = d, near[k] = v;
+  }
+  last = count ? far[count - 1] : 0.0;
+  return count;
+}
+
+// Finds the spots of a surface that are nearest to points, which `put` gets: looked for in a box around
+// all points first, whose vertices `box` gets.
+template <class S, class Put>
+PALPATE void nearest_spots(const S& m, const double* x, int nouter, const double* point, int n,
+                           double edge, int* box, Put put) {
+  const double room = BOX * edge;
+  D3 low = load(point), high = low;
+  const D3 zero = {0.0, 0.0, 0.0}, more = {room, room, room};
+  for (int i = 1; i < n; ++i) {
+    high = vmax(high, load(point + 3 * i));
+    low = zero - vmax(zero - low, zero - load(point + 3 * i));
+  }
+  low = low - more, high = high + more;
+  int inside = 0;
+  for (int v = 0; v < nouter; ++v) {
+    const D3 a = load(x + 3 * v), off = vmax(low - a, a - high);
+    if (off.x <= 0.0 && off.y <= 0.0 && off.z <= 0.0) box[inside++] = v;
+  }
+  const int want = NEAR < nouter ? NEAR : nouter;
+  for (int i = 0; i < n; ++i) {
+    int near[NEAR];
+    double last;
+    int count = nearest_vertices(x, load(point + 3 * i), box, inside, near, last);
+    if (count < want || last > room * room)
+      count = nearest_vertices(x, load(point + 3 * i), nullptr, nouter, near, last);
+    INLINED put(i, nearest_around(m, x, load(point + 3 * i), near, count));
+  }
+}
+
+}  // namespace palpate
