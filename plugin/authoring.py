@@ -20,7 +20,7 @@ from .tissue import mesh as topology
 
 _DENSITY = 1060.0  # [kg/m^3], of most soft tissue
 _CUTS = 8  # times the square root of its vertices is what `spare="auto"` gives an organ
-_THROUGH = 5  # times the number of vertices to the power of 2/3 is what it gives a solid
+_THROUGH = 4  # times the number of vertices to the power of 2/3 is what it gives a solid
 _BOX = 0.005  # [m]; half the side of the box whose inertia a node's body has, as in a flexcomp
 _SELF = {
   word: getattr(mujoco.mjtFlexSelf, f"mjFLEXSELF_{word.upper()}")

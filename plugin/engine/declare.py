@@ -228,7 +228,12 @@ def fill_inside(name: str, mesh: Mesh, config: Config) -> Mesh:
   """Returns the surface with its inside, of a file or made."""
   given, bare = config.tetrahedra, mesh.without_spare
   solid = gmsh.read(name, given, bare) if given else fill.fill(name, bare)
-  return faces.cuttable(mesh, solid) if mesh.spare else solid
+  if not mesh.spare:
+    return solid
+  try:
+    return faces.cuttable(mesh, solid)
+  except ValueError as error:
+    raise ValueError(f"organ {name!r}: {error}") from None
 
 
 def cached(

@@ -134,7 +134,8 @@ def _fitting(mesh: Mesh, where: Where, face: np.ndarray, room: int | None):
     try:
       made = faces.split(mesh, mesh.rest, face)
     except faces.Crowded as crowd:  # around these it hangs together
-      face = face[~np.isin(_corners(mesh, face), crowd.vertices).any(axis=1)]
+      beside = np.isin(_corners(mesh, face), crowd.vertices).any(axis=1)
+      face = face[~beside] if beside.any() else face[:0]
       continue
     if made is not None and (room is None or made.mesh.nelem <= room):
       return face, made, stopped
@@ -248,7 +249,10 @@ def _parted(mesh: Mesh, where: Where, near, left, right, edge: float) -> np.ndar
   rest.eliminate_zeros()
   reached = csgraph.breadth_first_order(rest, count, return_predecessors=False)
   side = among(size, reached)
-  return face[side[a] != side[b]]
+  face = face[side[a] != side[b]]
+  # A slit comes apart as a whole, or not.
+  half = np.isin(mesh.slit, face).reshape(-1, 2, 2).any(axis=2)
+  return face[~np.isin(face, mesh.slit[half[:, 0] != half[:, 1]])]
 
 
 def _told(mesh: Mesh, made: faces.Split, goes: tuple, sheet: Sheet, stopped: bool) -> Cut:

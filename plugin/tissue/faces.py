@@ -15,9 +15,9 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 from .fill import FACES, joined, volumes
-from .mesh import Mesh, among, build, distinct
+from .mesh import Mesh, among, build, cross, distinct
 
-MORE = 6  # neighbours that a vertex may have by cuts; where it would have more they end
+MORE = 6  # neighbours beyond those of any vertex that one may have by cuts
 _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 
 
@@ -77,6 +77,19 @@ def cuttable(surface: Mesh, solid: Mesh) -> Mesh:
     found = find(others)
     if (found >= 0).all() and at[s] < 0 and at[t] < 0:
       at[[s, t]] = found
+  left = np.setdiff1d(np.arange(len(known)), at)
+  face = tet.ravel()[corner[left]]
+  for part in _patches(elem, np.flatnonzero(at < 0)):
+    fits = left[np.isin(face, elem[part]).all(axis=1)]
+    if len(fits) != len(part):
+      raise ValueError(
+        f"spare is {spare}, and triangle {part[0]} (vertices {elem[part[0]].tolist()}) is the face "
+        "of no tetrahedron, expected a surface of even triangles: `palpate wrap` makes one"
+      )
+    at[part] = fits
+  single = np.setdiff1d(np.flatnonzero(mate < 0), corner_face(corner[at]))
+  slit = _slits(mesh, single)
+  mate[slit] = slit[:, [1, 0, 3, 2]]
   corner = corner[at]
   mesh = dataclasses.replace(
     mesh, **{name: _wider(getattr(mesh, name)) for name in ("ring", "ring_elem")}
@@ -86,7 +99,7 @@ def cuttable(surface: Mesh, solid: Mesh) -> Mesh:
   corner = np.take_along_axis(corner, (turn[:, None] + np.arange(3)) % 3, axis=1)
   elem = tet.ravel()[corner]
   twin = build("solid", surface.rest, elem, spare).twin
-  return dataclasses.replace(mesh, elem=elem, twin=twin, of_tet=corner, mate=mate)
+  return dataclasses.replace(mesh, elem=elem, twin=twin, of_tet=corner, mate=mate, slit=slit)
 
 
 def _wider(ring: np.ndarray) -> np.ndarray:
@@ -96,10 +109,10 @@ def _wider(ring: np.ndarray) -> np.ndarray:
 def room(mesh: Mesh) -> np.ndarray:
   """Returns the most neighbours that each vertex of a solid can have, cut or not, (nvert,).
 
-  At the end of a cut a vertex has those on both of its sides around it.
+  At the end of a cut a vertex has those on both of its sides around it: then it becomes a spare one.
   """
-  most = mesh.whole.degree + MORE
-  most[mesh.spares] = most.max()
+  most = mesh.whole.degree.copy()
+  most[mesh.spares] = most.max() + MORE
   return most
 
 
@@ -131,6 +144,50 @@ def _flips(elem: np.ndarray, missing: np.ndarray):
         yield s, int(t), np.array([[p, q, a], [p, q, b]])
 
 
+def _slits(mesh: Mesh, face: np.ndarray) -> np.ndarray:
+  """Returns faces around flat tetrahedra that `fill` has left out, (n, 4).
+
+  Two of each slit on one side, which have one diagonal, are the first and third; beside each is one
+  of the other side.
+  """
+  vert = np.sort(mesh.tet.ravel()[corners(face)], axis=1)
+  a, b, c = np.moveaxis(mesh.rest[mesh.tet.ravel()[corners(face)]], 1, 0)
+  normal = cross(b - a, c - a)
+  of_vertex: dict[tuple[int, int], list[int]] = {}
+  for k, v in enumerate(vert.tolist()):
+    for pair in ((v[0], v[1]), (v[0], v[2]), (v[1], v[2])):
+      of_vertex.setdefault(pair, []).append(k)
+  groups: dict[frozenset, set[int]] = {}
+  for some in of_vertex.values():
+    for i in some:
+      for j in some:
+        if i < j:
+          groups.setdefault(frozenset((*vert[i].tolist(), *vert[j].tolist())), set()).update((i, j))
+  out, used = [], set()
+  for corner, some in groups.items():
+    mine = sorted(some - used)
+    if len(corner) != 4 or len(mine) != 4:
+      continue
+    one = [k for k in mine if normal[k] @ normal[mine[0]] > 0]
+    other = [k for k in mine if k not in one]
+    if len(one) == len(other) == 2:
+      out.append([one[0], other[0], one[1], other[1]])
+      used.update(mine)
+  return face[np.array(out, int).reshape(-1, 4)]
+
+
+def _patches(elem: np.ndarray, some: np.ndarray) -> list[np.ndarray]:
+  """Returns triangles in the parts in which they share edges."""
+  edge = np.sort(np.stack([elem[some], elem[some][:, [1, 2, 0]]], axis=2).reshape(-1, 2), axis=1)
+  _, number = np.unique(edge, axis=0, return_inverse=True)
+  own = np.repeat(np.arange(len(some)), 3)
+  ends = own, len(some) + number.ravel()
+  size = len(some) + len(edge)
+  graph = sparse.coo_array((np.ones(len(own), np.int8), ends), shape=(size, size))
+  label = csgraph.connected_components(graph, directed=False)[1][: len(some)]
+  return [some[label == k] for k in np.unique(label)]
+
+
 def corners(face: np.ndarray) -> np.ndarray:
   """Returns the corners of faces, as their triangles have them, (n, 3)."""
   return face[:, None] // 4 * 4 + FACES[face % 4]
@@ -138,7 +195,11 @@ def corners(face: np.ndarray) -> np.ndarray:
 
 def opened(mesh: Mesh) -> np.ndarray:
   """Returns the faces that were opened, in the order of their triangles, both of each pair."""
-  corner = mesh.of_tet[mesh.whole.nelem :]
+  return corner_face(mesh.of_tet[mesh.whole.nelem :])
+
+
+def corner_face(corner: np.ndarray) -> np.ndarray:
+  """Returns the faces that have these corners of a tetrahedron, (n,) of (n, 3)."""
   return corner[:, 0] // 4 * 4 + 6 - (corner % 4).sum(axis=1)
 
 
@@ -169,7 +230,9 @@ def around(tet: np.ndarray, mate: np.ndarray, vert: np.ndarray, nvert: int):
   other = mate[face]
   i, j = np.nonzero(other >= 0)
   t = other[i, j] // 4
-  k = (tet[t] == own[i, None]).argmax(axis=1)
+  same = tet[t] == own[i, None]
+  has = same.any(axis=1)  # not always where there is a slit, see `_slits`
+  i, t, k = i[has], t[has], same[has].argmax(axis=1)
   ends = i, np.searchsorted(corner, 4 * t + k)
   graph = sparse.coo_array((np.ones(len(i), np.int8), ends), shape=(len(corner), len(corner)))
   label = csgraph.connected_components(graph, directed=False)[1]
@@ -181,13 +244,16 @@ def around(tet: np.ndarray, mate: np.ndarray, vert: np.ndarray, nvert: int):
   return corner, rank[part], own[first], corner[first]
 
 
-def split(mesh: Mesh, rest: np.ndarray, face: np.ndarray) -> Split | None:
+def split(
+  mesh: Mesh, rest: np.ndarray, face: np.ndarray, renew: np.ndarray | None = None
+) -> Split | None:
   """Returns a solid whose faces come apart, None where there are too few spare vertices.
 
   Args:
     mesh: the solid
     rest: rest positions of its vertices [m]    (nvert, 3)
     face: faces, one of each pair               (n,)
+    renew: vertices on the skin that become spare ones, since these have more room
 
   Raises:
     Crowded: vertices of the solid have no room for their neighbours.
@@ -203,7 +269,7 @@ def split(mesh: Mesh, rest: np.ndarray, face: np.ndarray) -> Split | None:
   lead = np.append(True, np.diff(vert[order]) != 0) if len(vert) else np.zeros(0, bool)
   keeps = np.zeros(len(vert), bool)
   keeps[order[lead]] = True
-  keeps &= vert < inner
+  keeps &= (vert < inner) & ~among(mesh.nvert, [] if renew is None else renew)[vert]
   new = np.flatnonzero(~keeps)
   if mesh.nouter + len(new) > inner:
     return None
@@ -220,7 +286,12 @@ def split(mesh: Mesh, rest: np.ndarray, face: np.ndarray) -> Split | None:
   except Crowded as crowd:
     source = np.arange(mesh.nvert)
     source[name] = vert
-    raise Crowded(source[crowd.vertices]) from None
+    tight = distinct(source[crowd.vertices])
+    on_skin = tight[tight < mesh.whole.nouter]
+    had = on_skin[:0] if renew is None else renew
+    if not np.isin(on_skin, had).all():
+      return split(mesh, rest, face, distinct(on_skin, had))
+    raise Crowded(tight) from None
   volume = np.bincount(part, volumes(rest, tet[corner // 4]), len(vert))
   share = volume / np.bincount(vert, volume, mesh.nvert)[vert]
   some = ~(alone & keeps)

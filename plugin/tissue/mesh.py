@@ -28,6 +28,7 @@ class Mesh:
     loose: triangles that were cut free of the foundation, None for none    (nelem,) bool
     of_tet: corner of a tetrahedron that each of triangles is, of solids, see `faces` (nelem, 3)
     mate: face of a tetrahedron on the other side of each, before the first cut (4 ntet,)
+    slit: faces around each flat tetrahedron that was left out, see `faces`     (n, 4)
   """
 
   rest: np.ndarray
@@ -43,6 +44,7 @@ class Mesh:
   loose: np.ndarray | None = None
   of_tet: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 3), np.int64))
   mate: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, np.int64))
+  slit: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 4), np.int64))
 
   @property
   def whole(self) -> Mesh:

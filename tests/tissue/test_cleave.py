@@ -53,7 +53,8 @@ def check(mesh):
   shape = [fill.quality(m.rest, m.tet).min() for m in (mesh, whole)]
   assert shape[0] > 0.85 * min(0.15, shape[1])
   # The surface is that of the tetrahedra, and closed.
-  topology.build("organ", mesh.rest[: mesh.nouter], mesh.elem)
+  used, elem = np.unique(mesh.elem, return_inverse=True)
+  assert topology.build("organ", mesh.rest[used], elem.reshape(-1, 3)).closed
   assert np.array_equal(mesh.elem, mesh.tet.ravel()[mesh.of_tet])
   # Neighbours are those that edges lead to.
   start, k = np.nonzero(mesh.ring >= 0)
