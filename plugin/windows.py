@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 
 from .engine import plugin as engine
-from .engine.layout import MAX_GEOMS, WALLS
+from .engine.layout import MAX_GEOMS
 
 # Slots of a window: from so few up to so many, unless told.
 _LEAST, _MOST = 16, 256
@@ -24,8 +24,6 @@ _TOOL = (0.0025, 0.02)
 # Of a slot's body; it does not turn, and is lighter than any node.
 _INERTIA, _SHARE = 1e-8, 0.01
 _KEY_FIELDS = {"qpos": 0, "qvel": 1}  # columns of `_layout`
-INSIDE = (0.5, 0.13, 0.12, 1.0)  # colour of the walls of cuts in a solid
-_THIN = 1e-4  # of the flex that draws them [m]
 _WINDOW_GROUP = 4  # drawn by nobody who does not ask for it
 
 
@@ -83,70 +81,6 @@ def add_windows(
   flex.contype = flex.conaffinity = 0
   _fit_keys(spec, organ, keys)
   return tuple(names)
-
-
-def add_spare(spec: mujoco.MjSpec, organ: str, spare: int):
-  """Gives an organ vertices without triangles, which cuts make use of.
-
-  They wait in its middle. What `add_organ(..., spare=)` does to an organ that MJCF declares: the
-  vertices of a <flexcomp> that no triangle has would be left out.
-
-  Args:
-    spec: changed in place
-    organ: name of the flexcomp
-    spare: how many
-
-  Raises:
-    ValueError: there is no such organ, or it has spare vertices already.
-  """
-  flex, plugin, bodies = find_organ(spec, organ)
-  if plugin.config.get("spare") or isinstance(spare, bool) or int(spare) < 1:
-    raise ValueError(f"organ {organ!r}: spare is {spare}, expected a number > 0 for one without")
-  vertbody = list(flex.vertbody)
-  free = np.array([bodies[name].first_joint() is not None for name in vertbody])
-  own = [bodies[name] for name, moves in zip(vertbody, free, strict=True) if moves]
-  rest = _rest(flex, free, own)
-  points = np.reshape(flex.vert, (-1, 3)) if len(flex.vert) else np.zeros_like(rest)
-  middle = rest.mean(axis=0)
-  for k in range(spare):
-    if own:
-      made = add_node(own[0].parent, f"{organ}_spare_{k}", middle, own[0].mass, own[0].inertia[0])
-      made.plugin.name, made.plugin.plugin_name = plugin.name, engine.NAME
-      made.plugin.active = True
-    vertbody.append(f"{organ}_spare_{k}" if own else vertbody[0])
-  more = np.zeros((spare, 3)) + (0.0 if own else middle)
-  flex.vert, flex.vertbody = np.concatenate([points, more]).ravel(), vertbody
-  config = {k: v for k, v in plugin.config.items() if v} | {"spare": str(spare)}
-  if config.get("elements") == "solid":
-    above = own[0].parent if own else bodies[vertbody[0]]
-    config["walls"] = add_walls(spec, above, organ, len(vertbody), spare, INSIDE)
-  plugin.config = config
-
-
-def add_walls(spec, body, organ: str, nvert: int, spare: int, rgba: Sequence[float]) -> str:
-  """Adds the flex that draws a solid's walls where it is cut, and returns its name.
-
-  Args:
-    spec: changed in place
-    body: of the organ
-    organ: its name
-    nvert: number of its vertices, with spare ones
-    spare: of these
-    rgba: colour
-  """
-  name = f"{organ}_inside"
-  if spec.flex(name) is not None:
-    raise ValueError(f"organ {organ!r}: the spec has a flex {name!r} already")
-  if np.shape(rgba) != (4,):
-    raise ValueError(f"organ {organ!r}: inside is {rgba}, expected four numbers")
-  own = body.add_body(name=name)
-  elem = np.tile([0, 1, 2], (WALLS * spare, 1))  # others when there are some
-  points = np.zeros((nvert, 3))
-  flex = make_flex(spec, name, points, [name] * nvert, elem, rgba=np.asarray(rgba, float))
-  flex.contype = flex.conaffinity = 0
-  flex.selfcollide, flex.radius = mujoco.mjtFlexSelf.mjFLEXSELF_NONE, _THIN
-  flex.edgedamping = 0.0
-  return name
 
 
 def find_organ(spec: mujoco.MjSpec, organ: str):
@@ -272,7 +206,7 @@ def _own_bodies(flex, bodies: dict) -> list:
   return own
 
 
-def _rest(flex, free: np.ndarray, own: list) -> np.ndarray:
+def rest_of(flex, free: np.ndarray, own: list) -> np.ndarray:
   """Returns where vertices are in the body that an organ is in [m], (nvert, 3)."""
   rest = np.zeros((len(free), 3))
   rest += np.reshape(flex.vert, (-1, 3)) if len(flex.vert) else 0.0  # none: all on their bodies
@@ -285,7 +219,7 @@ def _make_rigid(spec, flex, own: list, plugin, config: dict[str, str]):
   vertbody = list(flex.vertbody)
   free = np.isin(vertbody, [body.name for body in own])
   parent = own[0].parent
-  rest = _rest(flex, free, own)
+  rest = rest_of(flex, free, own)
   nvert = len(rest) - int(config.get("spare", 0))
   config["mass"] = f"{nvert * np.mean([body.mass for body in own]):.9g}"
   if not free.all():

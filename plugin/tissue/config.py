@@ -193,8 +193,7 @@ class Config:
   walls: str = _row(
     "",
     (reading.name, "the name of a flexcomp"),
-    "with `spare`, of a solid: flexcomp that is drawn where it was cut open, in its own colour "
-    "(`add_organ` makes it)",
+    "flexcomp that is drawn where a solid was cut open (`add_organ` makes it)",
   )
   tear: float = _row(
     0.0,

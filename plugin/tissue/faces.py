@@ -109,7 +109,7 @@ def _wider(ring: np.ndarray) -> np.ndarray:
 def room(mesh: Mesh) -> np.ndarray:
   """Returns the most neighbours that each vertex of a solid can have, cut or not, (nvert,).
 
-  At the end of a cut a vertex has those on both of its sides around it: then it becomes a spare one.
+  At the end of a cut one has those on both of its sides around it: it becomes a spare one then.
   """
   most = mesh.whole.degree.copy()
   most[mesh.spares] = most.max() + MORE

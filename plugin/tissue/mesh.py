@@ -27,8 +27,7 @@ class Mesh:
     uncut: the mesh before the first cut, None for one that has none
     loose: triangles that were cut free of the foundation, None for none    (nelem,) bool
     of_tet: corner of a tetrahedron that each of triangles is, of solids, see `faces` (nelem, 3)
-    mate: face of a tetrahedron on the other side of each, before the first cut (4 ntet,)
-    slit: faces around each flat tetrahedron that was left out, see `faces`     (n, 4)
+    mate, slit: faces beside those of tetrahedra before the first cut, see there (4 ntet,), (n, 4)
   """
 
   rest: np.ndarray
@@ -91,8 +90,7 @@ class Mesh:
   @property
   def spares(self) -> slice:
     """The vertices that waited for the first cut: they follow those on the surface."""
-    first = self.whole.nouter
-    return slice(first, first + self.spare)
+    return slice(self.whole.nouter, self.whole.nouter + self.spare)
 
   @property
   def nskin(self) -> int:
@@ -173,8 +171,7 @@ def pieces(mesh: Mesh) -> np.ndarray:
   """Returns the number of the piece that each vertex is in, -1 if unused, (nvert,)."""
   a, b = mesh.elem.T[:2].ravel(), mesh.elem.T[1:].ravel()
   if len(mesh.tet):
-    a, k = np.nonzero(mesh.ring >= 0)
-    b = mesh.ring[a, k]
+    a, b = mesh.tet.T[:3].ravel(), mesh.tet.T[1:].ravel()
   graph = sparse.coo_array((np.ones(len(a), np.int8), (a, b)), shape=(mesh.nvert, mesh.nvert))
   label = csgraph.connected_components(graph, directed=False)[1]
   label[mesh.unused] = -1

@@ -4,7 +4,6 @@
 # pyright: reportInvalidTypeForm=false
 import numpy as np
 import warp as wp
-
 from scipy.spatial import KDTree
 
 from .kernels import kernel
