@@ -8,6 +8,8 @@ import textwrap
 from collections.abc import Iterable, Mapping
 
 import numpy as np
+from palpate.tissue import fill
+from palpate.tissue import mesh as topology
 
 from . import markup, mjcf
 from .catalog import ENTRIES
@@ -25,8 +27,9 @@ def check(
   folder: str | pathlib.Path,
   names: Iterable[str],
   young: float = _LIVER.tissue.young,
-  foundation: float = _LIVER.tissue.foundation,
+  foundation: float | None = None,
   overwrite: bool = False,
+  solid: bool = False,
 ) -> None:
   """Raises a ValueError for what `write` would refuse; arguments as for that."""
   for name in names:
@@ -35,7 +38,7 @@ def check(
     if name.lower() == SCENE:
       raise ValueError(f"name is {name!r}, which the scene's file has; expected another")
   for key, value in (("young", young), ("foundation", foundation)):
-    if not (np.isfinite(value) and value > 0):
+    if value is not None and not (np.isfinite(value) and value > 0):
       raise ValueError(f"{key} is {value:g}, expected a number > 0")
   root = pathlib.Path(folder)
   if os.path.lexists(root) and not root.is_dir():
@@ -54,8 +57,9 @@ def write(
   folder: str | pathlib.Path,
   organs: Mapping[str, Wrapped],
   young: float = _LIVER.tissue.young,
-  foundation: float = _LIVER.tissue.foundation,
+  foundation: float | None = None,
   overwrite: bool = False,
+  solid: bool = False,
 ) -> list[pathlib.Path]:
   """Writes `<name>.xml` and `assets/<name>.obj` for each organ, `scene.xml` and `README.md`.
 
@@ -63,21 +67,29 @@ def write(
     folder: made if it is not there
     organs: what `wrap` returned, by names of letters, digits, _ and -
     young: Young's modulus [Pa]
-    foundation: Winkler foundation, which holds the organ in place [Pa/m]
+    foundation: Winkler foundation, which holds the organ in place [Pa/m]; None for the liver's, and
+      for none of a solid
     overwrite: whether the folder may have files; those of the names above are replaced
+    solid: whether they are filled with tetrahedra, in place of a skin
 
   Returns:
     The paths, the scene's first.
 
   Raises:
-    ValueError: a name or a constant is not allowed, or there is something to be lost.
+    ValueError: a name or a constant is not allowed, there is something to be lost, or tetrahedra do
+      not fill a surface.
   """
   check(folder, organs, young, foundation, overwrite)
   root = pathlib.Path(folder)
-  config = _LIVER.tissue.keys() | {"young": young, "foundation": foundation}
+  config = _LIVER.tissue.keys(solid) | {"young": young}
+  config |= {"elements": "solid"} if solid else {}
+  config |= {"foundation": foundation} if foundation else {}
+  if solid:
+    for name, (vertices, triangles, _) in organs.items():
+      fill.fill(name, topology.build(name, vertices, triangles))
   files = {
     root / f"{SCENE}.xml": _scene(organs),
-    root / "README.md": _readme(organs, young, foundation),
+    root / "README.md": _readme(organs, config),
   }
   for name, (vertices, triangles, report) in organs.items():
     mesh, mass = f"assets/{name}.obj", _LIVER.tissue.mass_of(report.volume)
@@ -127,16 +139,20 @@ def _scene(organs: Mapping[str, Wrapped]) -> str:
 """
 
 
-def _readme(organs: Mapping[str, Wrapped], young: float, foundation: float) -> str:
+def _readme(organs: Mapping[str, Wrapped], config: Mapping) -> str:
   first, density = next(iter(organs)), _LIVER.tissue.density
+  held = config.get("foundation", 0)
+  inside = "filled with tetrahedra" if "elements" in config else "a skin"
+  how = f"{inside}, foundation {held:g} Pa/m" if held else inside
+  holds = "the foundation holds it" if held else "nothing holds it: pin, attach or support it"
   text = f"""# {first}
 
 Made by `palpate wrap`. `{SCENE}.xml` shows what these files hold, each an organ to attach:
 
 ![{first}]({first}.png)
 
-E = {young:g} Pa, foundation {foundation:g} Pa/m, {density:g} kg/m^3: the liver's values where not
-given, to be replaced by the tissue's own. Nothing is pinned; the foundation holds it.
+E = {config["young"]:g} Pa, {density:g} kg/m^3, {how}: the liver's values where not given, to be
+replaced by the tissue's own. Nothing is pinned; {holds}.
 """
   for name, (_, _, report) in organs.items():
     rows = [("mass", f"{_LIVER.tissue.mass_of(report.volume):.4g} kg"), *report.rows()]

@@ -260,6 +260,19 @@ class Organ:
     return self.xpos0 + self.displacement
 
   @property
+  def inside(self) -> np.ndarray:
+    """Positions of the nodes inside of a solid [m], (n, 3); no rows of a skin."""
+    inner = self._organ.inner
+    moved = self._organ.mesh.rest[inner] + self._deformation[inner]
+    return self._organ.origin + moved @ self._organ.frame.T
+
+  @property
+  def tetrahedra(self) -> np.ndarray:
+    """Corners of a solid's tetrahedra, (n, 4): vertices, and from `nvert` on nodes `inside`."""
+    tet, inner = self._organ.mesh.tet, self._organ.inner
+    return np.where(tet < inner[0], tet, tet - inner[0] + self.nvert) if len(inner) else tet.copy()
+
+  @property
   def xvel(self) -> np.ndarray:
     """Velocities [m/s], (nvert, 3)."""
     return self._motion.velocity(self.data)[: self.nvert] @ self._organ.frame.T

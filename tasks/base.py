@@ -88,7 +88,7 @@ class Task(control.Task):
 
   name = "task"
   watch = ("miss", "unintended_contact")
-  resumes = True  # whether its expert can go on where another has come to
+  final: tuple[str, ...] = ()  # components that end the episode above 0.5
   control_timestep = CONTROL_TIMESTEP
   targets = 1
 

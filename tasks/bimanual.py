@@ -177,7 +177,7 @@ class Bimanual(Dissect):
       bonds = physics.organ.bonds
       held = np.flatnonzero(~bonds.free)
       near = held[np.linalg.norm(bonds.positions[held] - p.tip, axis=1).argmin()]
-      yield from p.move(bonds.positions[near] + _WAITS * up)
+      yield from p.above(bonds.positions[near], _WAITS, up)
       while self.outcome is None and self.fair(physics) and not bonds.free[near]:
         goal = bonds.positions[near]
         step = goal + _OFF * up - p.tip

@@ -232,6 +232,12 @@ class Cut(Task):
     """Returns the length of the line and of the way to it [m]."""
     return self.length + self.distance0
 
+  def _goes_on(self, physics: Physics) -> bool:
+    """Returns whether somebody else was cutting along the line."""
+    (cutter,) = physics.organ.cutters
+    off = np.linalg.norm(self.curve[self.next] - cutter.seat) if cutter.inside else np.inf
+    return bool(off < 2 * self.tolerance)
+
   def expert(self, p: Performer) -> Script:
     """Goes through the sheet and around, a little beyond where it began."""
     physics, up, count = p.physics, np.array([0.0, 0.0, 1.0]), len(self.curve)
@@ -243,7 +249,8 @@ class Cut(Task):
 
     while self.outcome is None:
       start = self.next
-      yield from p.move(self.curve[start] + _OVER * up)
+      if not self._goes_on(physics):
+        yield from p.move(self.curve[start] + _OVER * up)
       yield from p.line(under(self.curve[start], _DEEP), speed=0.02)
       for _ in range(100):  # the sheet gives before it is pierced
         if physics.organ.cutters[0].inside:

@@ -2,7 +2,8 @@
 
 The script of an expert makes a plan of what is left to do, from wherever it begins. So a policy and
 an expert may play by turns: who learns from that learns the way back from mistakes of its own
-(Ross, Gordon and Bagnell 2011, 10.48550/arXiv.1011.0686).
+(Ross, Gordon and Bagnell 2011, 10.48550/arXiv.1011.0686). A turn of the policy ends where it does
+not get on: most is taught where most is to be learned.
 """
 
 import dataclasses
@@ -15,33 +16,59 @@ from dm_control.rl import control
 
 from .performer import Performer, Script
 from .physics import AXES
+from .policy import Policy
 
 SHAKEN, CALM = 25, 50  # control steps that noise lasts, and that follow without
-LEARNER, EXPERT = (1, 60), (20, 80)  # control steps of a turn, at least and at most
+_BACK = 0.2  # share of what has shaken the instrument that is made up in a control step
+EXPERT = (20, 80)  # control steps of an expert's turn, at least and at most
+PATIENCE = (40, 120)  # control steps without progress that end a policy's turn
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Lesson:
-  """What an expert did in an episode, a row a control step.
+  """An episode with an expert, a row a control step.
 
   Attributes:
     seen: what was observed, flat, in the order of the names  (nstep, nseen)
-    done: what the expert meant to do  (nstep, naction)
+    meant: what the expert meant to do, 0 in a policy's turns  (nstep, naction)
+    done: what was done  (nstep, naction)
+    taught: whether that is worth to be learned  (nstep,) bool
     returns: discounted sum of the rewards from there on  (nstep,)
     outcome: of the episode, `time limit` without one
+    alone: whether the policy needed no help
   """
 
   seen: np.ndarray
+  meant: np.ndarray
   done: np.ndarray
+  taught: np.ndarray
   returns: np.ndarray
   outcome: str
+  alone: bool
 
 
 class Teacher(Performer):
-  """An expert for who sees neither velocity nor time: it moves evenly, and does not wait.
+  """An expert to learn from: it moves evenly, does not wait, and announces what ends an episode.
 
-  A slow start cannot be told from an end, nor a pause from having come to rest.
+  A slow start is hard to tell from an end, a pause from having come to rest, and a single step is
+  easily missed. It searches no longer than it must: what is done long after its cause is hard to
+  learn.
   """
+
+  hasty = True
+
+  def begin(self) -> None:
+    """See `Performer`."""
+    super().begin()
+    self._before = self.hand.drive_targets()
+
+  def drive(self, goal: np.ndarray) -> np.ndarray:
+    """Returns where the drives go on the way to a goal: what has shaken them is made up slowly.
+
+    What is undone at once is neither seen nor learned.
+    """
+    before, self._before = self._before, goal
+    return self.hand.drive_targets() + goal - before + _BACK * (before - self.hand.drive_targets())
 
   def line(self, goal: np.ndarray, speed: float) -> Script:
     """Moves the tip along a straight line."""
@@ -52,9 +79,14 @@ class Teacher(Performer):
       yield self.step()
 
   def wait(self, duration: float) -> Script:
-    """Holds still, where the exercise is over or what is felt is measured."""
-    if math.isinf(duration) or not self.task.resumes:
+    """Holds still where the exercise is over."""
+    if math.isinf(duration):
       yield from super().wait(duration)
+
+  def say(self) -> Script:
+    """Sets the component that is no motion to 1, by and by."""
+    for self.extra[:] in np.linspace(0.1, 1.0, 10):
+      yield self.step()
 
 
 def give(
@@ -63,7 +95,8 @@ def give(
   seed: int,
   gamma: float,
   noise: float = 0.0,
-  learner: Any = None,
+  learner: Policy | None = None,
+  most: int | None = None,
 ) -> Lesson:
   """Returns the lesson of an episode.
 
@@ -74,42 +107,77 @@ def give(
     gamma: discount of a control step [-]
     noise: SD of what is added to the expert's motion now and then; what is kept is what it meant
       to do (DART: Laskey et al. 2017, 10.48550/arXiv.1703.09327) [-]
-    learner: called with an observation, returns an action: it begins, and takes turns with experts
+    learner: begins, and takes turns with experts
+    most: control steps of its turns at most; all, by default, as long as it gets on
   """
   task: Any = env.task
   task.random, random = np.random.RandomState(seed), np.random.RandomState(seed)
-  moves = noise * np.isin(task.components, AXES)
+  moves = noise * np.array([name.endswith(AXES) for name in task.components])
+  final = np.isin(task.components, task.final)
   timestep, phase = env.reset(), random.randint(SHAKEN + CALM)
-  expert: Any = Teacher(env) if learner is None else None
-  left = random.randint(*LEARNER) if learner else math.inf
-  seen, done, rewards, taught = [], [], [], []
+  act = learner.begin() if learner else None
+  turns = _Turns(env, random, most, act is not None)
+  seen, meant, done, taught, rewards, best = [], [], [], [], [], 0
   while not timestep.last():
-    if not left:
-      expert = None if expert else Teacher(env)
-      left = random.randint(*(EXPERT if expert else LEARNER))
-    left -= 1
-    taught.append(expert is not None)
-    if expert is None:
-      assert learner
-      action = learner(timestep.observation)
-    else:
-      action = np.asarray(expert(timestep), float)
-      seen.append(flat(timestep.observation, names))
-      done.append(action)
+    seen.append(flat(timestep.observation, names))
+    action = act(timestep.observation) if act else np.zeros(len(moves))  # it sees all
+    expert = turns.next(bool((action[final] > 0.5).any()))
+    meant.append(np.zeros(len(moves)) if expert is None else np.asarray(expert(timestep), float))
+    if expert is not None:
       shakes = (len(done) + phase) % (SHAKEN + CALM) < SHAKEN
-      action = np.clip(action + shakes * moves * random.normal(size=len(moves)), -1, 1)
-    timestep = env.step(action)
+      action = np.clip(meant[-1] + shakes * moves * random.normal(size=len(moves)), -1, 1)
+    if act:
+      act.last = action
+    done.append(action)
+    taught.append(expert is not None)
+    before, timestep = task.best, env.step(action)
     rewards.append(float(timestep.reward))
+    best = len(done) if task.best > before else best
+  if task.outcome != "success":
+    taught[best:] = [False] * (len(taught) - best)  # it did not help
   returns = np.array(rewards)
   for k in reversed(range(len(returns) - 1)):
     returns[k] += gamma * returns[k + 1]
-  width = sum(int(np.prod(env.observation_spec()[name].shape)) for name in names)
-  return Lesson(
-    np.array(seen, np.float32).reshape(-1, width),
-    np.array(done, np.float32).reshape(-1, len(moves)),
-    returns[np.array(taught, bool)].astype(np.float32),
-    task.outcome or "time limit",
-  )
+  rows = np.array(seen, np.float32), np.array(meant, np.float32), np.array(done, np.float32)
+  ends = returns.astype(np.float32), task.outcome or "time limit", not turns.helped
+  return Lesson(*rows, np.array(taught, bool), *ends)
+
+
+class _Turns:
+  """Whose turn it is in a lesson.
+
+  Attributes:
+    helped: whether an expert had one
+  """
+
+  def __init__(
+    self, env: control.Environment, random: np.random.RandomState, most: int | None, both: bool
+  ):
+    self._env, self._random, self._most, self._both = env, random, most, both
+    self._expert: Teacher | None = None
+    self.helped = False
+    self._begin(not both)
+
+  def next(self, ends: bool) -> Teacher | None:
+    """Returns the expert if it is the next to act; `ends` is whether a policy wants to end all."""
+    progress = float(self._env.task.progress)  # type: ignore
+    self._idle = 0 if progress > self._best else self._idle + 1
+    self._best = max(self._best, progress)
+    if not self._left or (self._expert is None and self._idle > self._patience):
+      self._begin(self._expert is None)
+    if ends and self._expert is None:
+      self._begin(True)
+    self._left -= 1
+    return self._expert
+
+  def _begin(self, helps: bool) -> None:
+    """Begins a turn, of an expert or of the policy."""
+    self._expert = Teacher(self._env) if helps else None
+    self.helped |= helps
+    turn = EXPERT if helps else self._most and (1, self._most)
+    self._left = self._random.randint(*turn) if turn and self._both else math.inf
+    self._idle, self._best = 0, -math.inf
+    self._patience = self._random.randint(*PATIENCE)
 
 
 def flat(observation: Any, names: Sequence[str]) -> np.ndarray:

@@ -98,6 +98,7 @@ NOVICE = {
 }
 _WIDE = 1.0  # action of the jaw: wide open
 _ROLL = 0.8  # of the jaws to grasp, across the gallbladder's slack [rad]
+_ASIDE = 0.2  # of the height that it comes down from: how far aside it may be
 _THERE = 0.004  # jaws that are so near to their place may close [m]
 _FIRMER = 0.4  # by how much it is gripped more each time that it was lost [N]
 _SLID = 0.001  # what may move in the jaws unnoticed [m]
@@ -126,12 +127,25 @@ def make(env: control.Environment, who: str | Style = EXPERT, seed: int = 0) -> 
     return Performer(env, found, seed)
   if isinstance(found, policy.Policy):
     found.check(env)
+    return _played(found)
   if not isinstance(found, type):
     return lambda timestep: found(timestep.observation)
   try:
     return found(env, seed)
   except Exception as error:
     raise ValueError(f"policy {who!r}: {type(error).__name__}: {error}") from error
+
+
+def _played(made: policy.Policy) -> Act:
+  """Returns who plays a policy, episode by episode."""
+  act = made.begin()
+
+  def play(timestep: Any) -> np.ndarray:
+    nonlocal act
+    act = made.begin() if timestep.first() else act
+    return act(timestep.observation)
+
+  return play
 
 
 def skilled(seed: int) -> Style:
@@ -202,8 +216,11 @@ class Performer:
 
   Attributes:
     hand: the instrument that it moves
+    hasty: whether it leaves out what may be left out
     other: who moves the other hand's, None where there is none
   """
+
+  hasty = False
 
   def __init__(self, env: control.Environment, style: Style = EXPERT, seed: int = 0, hand: int = 0):
     """Makes a performer in a style, see `make`; `hand` is which of the instruments it moves."""
@@ -259,9 +276,13 @@ class Performer:
     if self.hand.handle:
       return np.concatenate([self.hand.handle_row(tip, roll), extra])
     pitch, yaw, insertion = trocar.inverse(self.trocar, tip, check=False)
-    goal = np.array([pitch, yaw, roll, insertion])
+    goal = self.drive(np.array([pitch, yaw, roll, insertion]))
     move = (goal - self.hand.drive_targets()) / (np.array(RATES) * self.dt)
     return np.concatenate([np.clip(move, -1, 1), extra])
+
+  def drive(self, goal: np.ndarray) -> np.ndarray:
+    """Returns where the drives go on the way to a goal: there, as fast as they can."""
+    return goal
 
   def both(self, mine: Script, others: Script) -> Script:
     """Does one script with this hand and another with the other, until both are done."""
@@ -298,6 +319,13 @@ class Performer:
       points.insert(-1, over)
     for point in points:
       yield from self.line(point, speed)
+
+  def above(self, point: np.ndarray, high: float, along: np.ndarray) -> Script:
+    """Moves to a height [m] over a point, unless somebody else was on the way down from there."""
+    height = float((self.tip - point) @ along)
+    aside = float(np.linalg.norm(self.tip - point - height * along))
+    if not -_ASIDE * high < height <= high or aside > _ASIDE * high:
+      yield from self.move(point + high * along)
 
   def line(self, goal: np.ndarray, speed: float) -> Script:
     """Moves the tip along such a line at once and straight: a stroke that is known by heart."""
@@ -344,7 +372,7 @@ class Performer:
   def feel(self, point: np.ndarray, along: np.ndarray, depth: float) -> Feeling:
     """Presses to a depth [m] below a point in one stroke; returns the stiffness felt [N/m]."""
     yield from self.line(point + depth * self.excess(0.0) * along, speed=0.03)
-    yield from self.wait(self.style.reaction + 0.1)
+    yield from Performer.wait(self, self.style.reaction + 0.1)  # whoever learns from it
     force = float(np.linalg.norm(self.hand.contact_force()))
     return force / max(float((self.hand.tip_pos() - point) @ along), 1e-3)
 
@@ -365,7 +393,7 @@ class Performer:
     below = np.linalg.norm(physics.point(site) - deep * up - self.hand.tip_pos())
     if again or below > _THERE or self._share() > _WIDE - 0.1:
       self.extra[:] = _WIDE
-      yield from self.move(physics.point(site) + 0.012 * up)
+      yield from self.above(physics.point(site) - deep * up, 0.012 + deep, up)
       yield from self.wait(0.2)
       yield from self.move(physics.point(site) - deep * up, speed=0.03)
     else:  # somebody else was about to close
@@ -377,6 +405,11 @@ class Performer:
       yield self.step()
       if abs(self._squeeze(0.0, 0.02)) < 0.25 and self.hand.holds():
         return
+
+  def say(self) -> Script:
+    """Sets the component that is no motion to 1."""
+    self.extra[:] = 1.0
+    yield self.step()
 
   def _share(self) -> float:
     """Returns the action of the jaw that is their target now."""

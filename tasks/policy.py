@@ -1,10 +1,11 @@
 """Policies that were trained: files of weights, without code, for the exercise they are of.
 
-    policy = load("policy.safetensors")
-    action = policy(timestep.observation)
+    act = load("policy.safetensors").begin()  # of an episode
+    action = act(timestep.observation)
 
-A file is one of safetensors: a network of `tanh` layers, what its input is normalised by, and in
-the header as JSON the exercise, its action and what it observes. NumPy is enough to run it.
+A file is one of safetensors: a memory, which is a gated recurrent unit (Cho et al. 2014,
+10.48550/arXiv.1406.1078), a network of `tanh` layers above it, what the input is normalised by, and
+in the header as JSON the exercise, its action and what it observes. NumPy is enough to run it.
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ from .files import replacing
 SUFFIX = ".safetensors"
 FOLDER = pathlib.Path(__file__).parent / "policies"  # of those that come with exercises
 _KEY = "palpate"  # of the header
-_FORMAT = 1
+_FORMAT = 2
+_MEMORY = ("input", "state", "input_bias", "state_bias")  # arrays of a memory
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,6 +37,9 @@ class About:
     components: of the action
     observations: names, in the order of the input
     control_timestep: between actions [s]
+    power: that the size of what the network says is raised to, which makes it exact where actions
+      are small
+    changes: components that it says as changes of the last action
     task_kwargs: options of the exercise it was trained with
     training: how it was made, for people
     licence: of the weights
@@ -44,6 +49,8 @@ class About:
   components: Sequence[str]
   observations: Sequence[str]
   control_timestep: float
+  power: float = 1.0
+  changes: Sequence[str] = ()
   task_kwargs: Mapping[str, Any] = dataclasses.field(default_factory=dict)
   training: Mapping[str, Any] = dataclasses.field(default_factory=dict)
   licence: str = "Apache-2.0"
@@ -58,20 +65,19 @@ class Policy:
     mean: of the input  (ninput,)
     scale: what the input is multiplied by once the mean is taken off  (ninput,)
     layers: weights (nout, nin) and biases (nout,)
+    memory: weights of input (3 n, ninput) and state (3 n, n), biases of both (3 n,), in each the
+      rows of the reset gate, the update gate and the new state; None for no memory
   """
 
   about: About
   mean: np.ndarray
   scale: np.ndarray
   layers: Sequence[tuple[np.ndarray, np.ndarray]]
+  memory: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None = None
 
-  def __call__(self, observation: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Returns the action for an observation."""
-    parts = [np.ravel(observation[name]) for name in self.about.observations]
-    x = (np.concatenate(parts) - self.mean) * self.scale
-    for k, (weight, bias) in enumerate(self.layers):
-      x = weight @ (np.tanh(x) if k else x) + bias
-    return np.clip(x, -1.0, 1.0).astype(float)
+  def begin(self, *count: int) -> Episode:
+    """Returns who acts in an episode, or in `count` side by side, and remembers no others."""
+    return Episode(self, *count)
 
   def check(self, env: Any) -> None:
     """Raises ValueError where an environment is not of the exercise that it was trained for."""
@@ -93,15 +99,57 @@ class Policy:
                        f"{env.control_timestep():g} s")  # fmt: skip
 
 
+class Episode:
+  """A policy in an episode, to be called with each observation.
+
+  Attributes:
+    last: action, to be set where somebody else has acted
+  """
+
+  def __init__(self, policy: Policy, *count: int):
+    """Begins with an empty memory."""
+    self.policy, self._count = policy, count
+    self._state = np.zeros((*count, policy.memory[1].shape[1])) if policy.memory else None
+    self.last = np.zeros((*count, len(policy.about.components)))
+    self._adds = np.isin(policy.about.components, policy.about.changes)
+
+  def __call__(self, observation: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Returns the action for an observation."""
+    policy = self.policy
+    names = policy.about.observations
+    parts = [np.reshape(observation[name], (*self._count, -1)) for name in names]
+    x = (np.concatenate(parts, axis=-1) - policy.mean) * policy.scale
+    if policy.memory:
+      x = self._state = _remember(x, self._state, *policy.memory)
+    for k, (weight, bias) in enumerate(policy.layers):
+      x = (np.tanh(x) if k else x) @ weight.T + bias
+    x = np.clip(x, -1.0, 1.0).astype(float)
+    said = np.sign(x) * np.abs(x) ** policy.about.power
+    self.last = np.clip(said + self._adds * self.last, -1.0, 1.0)
+    return self.last
+
+
+def _remember(x, state, weight, own, bias, own_bias) -> np.ndarray:
+  """Returns the next state of a memory."""
+  new, old = (
+    np.split(rows, 3, axis=-1) for rows in (x @ weight.T + bias, state @ own.T + own_bias)
+  )
+  gates = (0.5 + 0.5 * np.tanh(0.5 * (a + b)) for a, b in zip(new[:2], old[:2], strict=True))
+  reset, update = gates
+  return (1.0 - update) * np.tanh(new[2] + reset * old[2]) + update * state
+
+
 def save(path: str | os.PathLike[str], policy: Policy) -> None:
-  """Writes a policy."""
+  """Writes a policy, its weights in half precision."""
   from safetensors.numpy import save as dump
 
-  arrays = {"mean": policy.mean, "scale": policy.scale}
+  arrays = dict(zip(_MEMORY, policy.memory or (), strict=False))
   for k, (weight, bias) in enumerate(policy.layers):
     arrays |= {f"weight{k}": weight, f"bias{k}": bias}
+  arrays = {name: np.asarray(array, np.float16) for name, array in arrays.items()}
+  arrays |= {"mean": policy.mean.astype(np.float32), "scale": policy.scale.astype(np.float32)}
   about = json.dumps({"format": _FORMAT, **dataclasses.asdict(policy.about)})
-  arrays = {name: np.ascontiguousarray(array, np.float32) for name, array in arrays.items()}
+  arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
   with replacing(path, "wb") as file:
     file.write(dump(arrays, {_KEY: about}))
 
@@ -115,7 +163,7 @@ def load(path: str | os.PathLike[str]) -> Policy:
   try:
     with safe_open(os.fspath(path), "np") as file:
       header = (file.metadata() or {}).get(_KEY)
-      arrays = {name: file.get_tensor(name) for name in file.keys()}
+      arrays = {name: file.get_tensor(name).astype(np.float32) for name in file.keys()}
   except (OSError, SafetensorError) as error:
     raise ValueError(f"policy {os.fspath(path)!r}: {error}") from None
   if header is None:
@@ -126,7 +174,8 @@ def load(path: str | os.PathLike[str]) -> Policy:
       raise ValueError("it is of another version")
     count = sum(name.startswith("weight") for name in arrays)
     layers = [(arrays[f"weight{k}"], arrays[f"bias{k}"]) for k in range(count)]
-    made = Policy(About(**about), arrays["mean"], arrays["scale"], layers)
+    memory: Any = tuple(arrays[name] for name in _MEMORY if name in arrays) or None
+    made = Policy(About(**about), arrays["mean"], arrays["scale"], layers, memory)
     _check_shapes(made)
   except (ValueError, KeyError, TypeError, AttributeError) as error:
     raise ValueError(f"policy {os.fspath(path)!r}: {error}") from None
@@ -146,11 +195,19 @@ def _check_shapes(policy: Policy) -> None:
   size = len(policy.mean)
   if policy.scale.shape != (size,):
     raise ValueError(f"scale has shape {policy.scale.shape}, expected ({size},)")
+  if policy.memory:
+    count = policy.memory[1].shape[-1]
+    expected = [(3 * count, size), (3 * count, count), (3 * count,), (3 * count,)]
+    for name, array, shape in zip(_MEMORY, policy.memory, expected, strict=True):
+      if array.shape != shape:
+        raise ValueError(f"{name} has shape {array.shape}, expected {shape}")
+    size = count
   for k, (weight, bias) in enumerate(policy.layers):
     if weight.shape != (len(bias), size):
       raise ValueError(f"weight{k} has shape {weight.shape}, expected ({len(bias)}, {size})")
     size = len(bias)
   if not policy.layers or size != len(policy.about.components):
     raise ValueError(f"it ends in {size} numbers, expected {len(policy.about.components)}")
-  if not all(np.isfinite(array).all() for layer in policy.layers for array in layer):
+  parts = (*policy.layers, policy.memory or ())
+  if not all(np.isfinite(array).all() for part in parts for array in part):
     raise ValueError("its weights are not finite")

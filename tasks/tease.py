@@ -38,6 +38,7 @@ SCENE = Scene(
 # [m/s]. Back faster, the tip leaves what it held up, and the strip falls on the shaft behind it.
 _OVER, _BEHIND, _BEYOND, _LANE = 0.002, 0.006, 0.006, 0.006
 _SPEED, _BACK = 0.03, 0.015
+_UNDER = 0.02  # from the front at most, of who is under the strip already [m]
 ROW = 0.5 * _LANE  # bonds of the front are no farther from the first of them [m]
 
 
@@ -153,7 +154,10 @@ class Tease(Freeing):
     """Strokes under the strip, lane by lane, a little beyond where it holds."""
     physics, sides = p.physics, (0.0, -_LANE, _LANE)
     along, far = np.array([0.0, 1.0, 0.0]), _BEHIND + _BEYOND * (1 + p.style.overshoot)
-    for turn in itertools.count():
+    # Where somebody else was under the strip it begins with their lane.
+    here = [abs(p.tip[0] - x) for x in sides] if self.distance(physics) < _UNDER else []
+    first = int(np.argmin(here)) if here else 0
+    for turn in itertools.count(first):
       if self.outcome is not None:
         return
       x = sides[turn % len(sides)]
@@ -164,7 +168,7 @@ class Tease(Freeing):
         continue
       front = lane[:, 1].min()
       start = np.array([x, front - _BEHIND, _OVER])
-      if not turn:
+      if not turn and not here:
         yield from p.move(start - 0.025 * along)
       yield from p.move(start)
       yield from p.move(start + far * along, speed=_SPEED)

@@ -136,8 +136,10 @@ class Touch(Task):
     while self.done < self.targets:
       done, goal = self.done, self.goal()
       point, normal = physics.point(goal), physics.normals()[goal]
-      if self.spoilt or not self.pressing:
+      if self.spoilt:
         yield from p.move(point + 0.005 * normal)
+      elif not self.pressing:
+        yield from p.above(point, 0.005, normal)
       yield from p.push(0.12, -normal, lambda done=done: self.done > done, most=3.0)
       yield from p.line(physics.tip_pos() + 0.01 * normal, 0.05)
 

@@ -235,7 +235,7 @@ class Trace(Task):
     up = physics.trocar().mat[:, 2]
     at = min(float(self.done), len(self.curve) - 1.0)
     if not self.tracing:
-      yield from p.move(self.curve[int(at)] + 0.01 * up)
+      yield from p.above(self.curve[int(at)], 0.01, up)
     yield from p.push(0.08, -up, lambda: self.tracing, most=3.0)
     # Pulls a point along the curve and keeps the force by its height.
     height, contact = float((p.tip - self.curve[int(at)]) @ up), 0.0

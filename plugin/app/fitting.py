@@ -91,7 +91,8 @@ def constant(name: str, start: float | None = None) -> Constant:
 
   Args:
     name: key of the configuration
-    start: where the search begins; None for the key's default, or a third of its range
+    start: where the search begins; None for the key's default, that of `young` for a
+      modulus without one, or a third of its range
   """
   known = allowed()
   if name not in known:
@@ -99,7 +100,8 @@ def constant(name: str, start: float | None = None) -> Constant:
   span = re.search(r"\[([\d.e+-]+), ([\d.e+-]+)\)", known[name].allowed)
   high = float(span[2]) if span else math.inf
   if start is None:
-    start = float(np.ravel(getattr(config.Config, name))[0])
+    default = getattr(config.Config, name)
+    start = float(np.ravel(config.Config.young if default == () else default)[0])
     if not start > 0:
       start = 0.3 * high if math.isfinite(high) else 1.0
   if not 0 < start < high:

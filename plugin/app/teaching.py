@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import pathlib
 import time
 from collections.abc import Mapping
@@ -20,8 +21,11 @@ if TYPE_CHECKING:
   from palpate.tasks.lessons import Lesson
 
 LESSONS = "lessons.npz"
+_ROWS, _ENDS = ("seen", "meant", "done", "taught", "returns"), ("outcome", "alone")  # of a lesson
 _FIRST = 10_000_000  # seed of the first lesson
 _NOISE = 0.2  # SD of what shakes the expert in every other lesson, at most [-]
+_TURN = 60  # control steps of the policy's turns in every other lesson, at most
+_ENOUGH = 0.95  # share of the rest that it brings to a good end alone
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,6 +40,7 @@ class Job:
     gamma: discount [-]
     noise: see `lessons.give`
     policy: file of who takes turns with the expert, or empty
+    most: see `lessons.give`
   """
 
   task: str
@@ -45,6 +50,7 @@ class Job:
   gamma: float
   noise: float = 0.0
   policy: str = ""
+  most: int | None = None
 
 
 def give(job: Job) -> Lesson:
@@ -54,7 +60,7 @@ def give(job: Job) -> Lesson:
 
   env = options.environment(job.task, job.task_kwargs)
   learner = policy.load(job.policy) if job.policy else None
-  return lessons.give(env, job.names, job.seed, job.gamma, job.noise, learner)
+  return lessons.give(env, job.names, job.seed, job.gamma, job.noise, learner, job.most)
 
 
 class School:
@@ -64,6 +70,7 @@ class School:
     lessons: of all rounds so far
     rounds: that are done
     seconds: spent on them
+    alone: share that the policy brought to a good end without help where it was let to, last [-]
   """
 
   def __init__(self, folder: pathlib.Path, task: str, task_kwargs: Mapping[str, Any], seed: int):
@@ -71,9 +78,14 @@ class School:
     self.path, self.task, self.seed = folder / LESSONS, task, seed
     self.task_kwargs = json.dumps({"surroundings": "none", **task_kwargs})  # it draws nothing
     self.lessons: list[Lesson] = []
-    self.rounds, self.seconds = 0, 0.0
+    self.rounds, self.seconds, self.alone = 0, 0.0, 0.0
     if self.path.exists():
       self._load()
+
+  @property
+  def enough(self) -> bool:
+    """Whether the policy needs no more lessons."""
+    return self.alone >= _ENOUGH
 
   def teach(
     self,
@@ -93,25 +105,31 @@ class School:
       interrupt: once seen, the round is given up
     """
     start, progress, given = time.perf_counter(), Progress(), []
-    for lesson in workers.parallel(give, self._jobs(count, gamma), crew, interrupt):
+    jobs = self._jobs(count, gamma)
+    for lesson in workers.parallel(give, jobs, crew, interrupt):
       given.append(lesson)
       progress.show(f"round {self.rounds + 1}: {len(given)} of {count} lessons")
     progress.clear()
     if interrupt.seen:
       return False
     whole = [lesson for lesson in given if lesson is not None]
-    # What an expert could not bring to a good end may have been past helping.
-    self.lessons += [lesson for lesson in whole if lesson.outcome == "success"] or whole
-    if not any(len(lesson.done) for lesson in self.lessons):
+    self.lessons += whole
+    if not self.lessons:
       raise CommandError(f"{self.task}: no lesson was given: the workers died", code=1)
-    error = networks.learn(self.lessons, lambda: interrupt.seen)
+    error = math.nan  # where it needed no help, or not yet
+    if any(lesson.taught.any() for lesson in self.lessons):
+      error = networks.learn(self.lessons, lambda: interrupt.seen)
     self.rounds += 1
     self.seconds += time.perf_counter() - start
     wins = sum(lesson.outcome == "success" for lesson in whole)
-    steps = sum(len(lesson.done) for lesson in self.lessons)
+    free = [lesson for lesson, job in zip(given, jobs, strict=True) if lesson and _free(job)]
+    self.alone = sum(each.alone and each.outcome == "success" for each in free) / max(len(free), 1)
+    steps = sum(int(lesson.taught.sum()) for lesson in self.lessons)
+    told = f"; {100 * self.alone:.0f} % of {len(free)} alone" if free else ""
     print(
-      f"lessons, round {self.rounds}: {wins} of {count} were a success; {steps} steps to learn "
-      f"from, error {error:.3f}, {self.seconds:.0f} s"
+      f"lessons, round {self.rounds}: {wins} of {count} were a success{told}; {steps} steps to "
+      f"learn from, error {error:.3f}, {self.seconds:.0f} s",
+      flush=True,
     )
     return not interrupt.seen
 
@@ -126,8 +144,12 @@ class School:
       job = Job(self.task, self.task_kwargs, tuple(env.observation_spec()), first + k, gamma)
       if k % 2:
         job = dataclasses.replace(job, noise=float(random.uniform(0, _NOISE)))
-      if self.rounds and env.task.resumes:
-        job = dataclasses.replace(job, policy=str((self.path.parent / POLICY).resolve()))
+      # Of an easier exercise's policy alone it would learn what was missing, and forget the rest.
+      if (self.path.parent / POLICY).exists() and (self.rounds or not k % 2):
+        turn = _TURN if k % 2 else None
+        job = dataclasses.replace(
+          job, policy=str((self.path.parent / POLICY).resolve()), most=turn
+        )
       jobs.append(job)
     return jobs
 
@@ -138,29 +160,30 @@ class School:
     from palpate.tasks.files import replacing
 
     every: dict[str, Any] = {
-      name: np.concatenate([getattr(lesson, name) for lesson in self.lessons])
-      for name in ("seen", "done", "returns")
+      name: np.concatenate([getattr(lesson, name) for lesson in self.lessons]) for name in _ROWS
     }
-    lengths = np.array([len(lesson.done) for lesson in self.lessons])
-    outcomes = np.array([lesson.outcome for lesson in self.lessons])
-    done = np.array(json.dumps([self.task, self.task_kwargs, self.rounds, self.seconds]))
+    every |= {name: np.array([getattr(each, name) for each in self.lessons]) for name in _ENDS}
+    every["lengths"] = np.array([len(lesson.done) for lesson in self.lessons])
+    about = [self.task, self.task_kwargs, self.rounds, self.seconds, self.alone]
     with writing(self.path), replacing(self.path, "wb") as file:
-      np.savez(
-        file, allow_pickle=False, about=done, lengths=lengths, outcomes=outcomes, **every
-      )  # fmt: skip
+      np.savez(file, allow_pickle=False, about=np.array(json.dumps(about)), **every)
 
   def _load(self) -> None:
     from palpate.tasks.lessons import Lesson
 
     try:
       with np.load(self.path, allow_pickle=False) as file:
-        task, _, self.rounds, self.seconds = json.loads(str(file["about"][()]))
+        task, _, self.rounds, self.seconds, self.alone = json.loads(str(file["about"][()]))
         ends = np.cumsum(file["lengths"])[:-1]
-        parts = [np.split(file[name], ends) for name in ("seen", "done", "returns")]
-        outcomes = [str(outcome) for outcome in file["outcomes"]]
+        parts = [np.split(file[name], ends) for name in _ROWS]
+        parts += [file[name].tolist() for name in _ENDS]
     except Exception as error:
       raise CommandError(f"{self.path}: {error}") from None
     if task != self.task:
       raise CommandError(f"{self.path} is of {task}, not of {self.task}")
-    rows = zip(*parts, outcomes, strict=True)
-    self.lessons = [Lesson(*row) for row in rows]
+    self.lessons = [Lesson(*row) for row in zip(*parts, strict=True)]
+
+
+def _free(job: Job) -> bool:
+  """Returns whether a policy was let to do all of a lesson."""
+  return bool(job.policy) and job.most is None

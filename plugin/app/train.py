@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 _FEW = 16  # worlds on a CPU
 _MANY = 4096  # on a GPU
 _SAVE = 60.0  # seconds between checkpoints
-_ROUNDS = 3  # of lessons
+ROUNDS = 6  # of lessons, at most
 _LESSONS = 96  # of a round
 _JUDGE = 5  # iterations between looks at the policy without spread
 _LICENCE = """SPDX-License-Identifier: Apache-2.0
@@ -50,8 +50,9 @@ def add_arguments(parser: argparse.ArgumentParser):
   add("-o", "--out", metavar="FOLDER", required=True, help="of policy, checkpoint and curves")
   add(
     "--lessons", metavar="N", type=int, default=_LESSONS,
-    help=f"of an expert, in each of {_ROUNDS} rounds (%(default)s); 0 for practice alone",
+    help=f"of an expert, in each of {ROUNDS} rounds at most (%(default)s); 0 for practice alone",
   )  # fmt: skip
+  add("--from", metavar="FILE", dest="start", help="policy of an easier exercise to begin with")
   add("--iterations", metavar="N", type=int, default=1000, help="of practice (%(default)s)")
   add("--minutes", metavar="T", type=float, default=math.inf, help="at most, in all")
   add("--success", metavar="SHARE", type=float, default=math.inf, help="enough, without spread")
@@ -99,6 +100,7 @@ class Training:
   def __init__(self, name: str, args: argparse.Namespace, folder: pathlib.Path):
     """Makes the networks, or takes up what the folder has of them."""
     import warp as wp
+    from palpate.tasks import policy
     from palpate.tasks.batch import learning, networks
 
     self.name, self.args, self.folder = name, args, folder
@@ -119,35 +121,48 @@ class Training:
       raise CommandError(f"{name}: observations has a picture, expected numbers alone")
     device = "cpu" if self.device == "cpu" else str(wp.device_to_torch(self.device))
     self.networks = networks.Networks(
-      {key: tuple(spec[key].shape) for key in spec}, len(self.task.components),
-      self.settings.hidden, self.settings.spread, args.seed, device, taught,
+      {key: tuple(spec[key].shape) for key in spec}, self.task.components,
+      self.settings.memory, self.settings.hidden, self.settings.spread, args.seed, device, taught,
     )  # fmt: skip
     if self.school.rounds:
       self.networks.remember(self.school.lessons)
+    start = folder / learning.POLICY if self.school.rounds else args.start
+    if start and not begun:
+      try:
+        self.networks.take(policy.load(start))
+      except ValueError as error:
+        raise CommandError(f"from: {error}") from None
+      self._write_taught()
 
   def teach(self, crew: workers.Workers, interrupt: Interrupt) -> bool:
     """Lets the expert teach; returns whether it was to the end."""
-    from palpate.tasks import policy
     from palpate.tasks.batch import learning
 
-    school, networks, stop = self.school, self.networks, _watch(interrupt)
+    school, networks = self.school, self.networks
     if (self.folder / learning.CHECKPOINT).exists():  # it practises already
       return True
-    if school.rounds:
-      networks.learn(school.lessons, stop)
-    while self.args.lessons and school.rounds < _ROUNDS:
+    while self.args.lessons and school.rounds < ROUNDS and not school.enough:
       if not school.teach(networks, crew, self.args.lessons, self.settings.gamma, interrupt):
         return False
       school.save()
-      with writing(self.folder):
-        training = {
-          "algorithm": "lessons", "lessons": networks.lessons, "rounds": school.rounds,
-          "seconds": round(school.seconds, 1), "seed": self.args.seed,
-        }  # fmt: skip
-        made = networks.policy(self.task, self._told(), training)
-        policy.save(self.folder / learning.POLICY, made)
-        (self.folder / "LICENSE").write_text(_LICENCE, encoding="utf-8")
+      self._write_taught()
     return not interrupt.seen
+
+  def _write_taught(self) -> None:
+    """Writes the policy as it was taught so far, and its licence."""
+    from palpate.tasks import policy
+    from palpate.tasks.batch import learning
+
+    school, networks = self.school, self.networks
+    with writing(self.folder):
+      training = {
+        "algorithm": "lessons", "lessons": networks.lessons, "rounds": school.rounds,
+        "seconds": round(school.seconds, 1), "seed": self.args.seed,
+      }  # fmt: skip
+      training |= {"from": pathlib.Path(self.args.start).name} if self.args.start else {}
+      made = networks.policy(self.task, self._told(), training)
+      policy.save(self.folder / learning.POLICY, made)
+      (self.folder / "LICENSE").write_text(_LICENCE, encoding="utf-8")
 
   def practise(self, interrupt: Interrupt) -> bool:
     """Practises in many worlds; returns whether it was to the end."""

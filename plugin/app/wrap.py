@@ -41,7 +41,8 @@ def add_arguments(parser: argparse.ArgumentParser):
   add("--accept-losses", action="store_true", help="write the organ even if it leaves parts out")
   add("--name", help="of the organ (the file's)")
   add("--young", metavar="PA", type=float, help="Young's modulus (the liver's)")
-  add("--foundation", metavar="PA/M", type=float, help="Winkler foundation (the liver's)")
+  add("--foundation", metavar="PA/M", type=float, help="foundation (the liver's; of a solid none)")
+  add("--solid", action="store_true", help="fill it with tetrahedra, in place of a skin")
 
 
 def main(args: argparse.Namespace) -> int:
@@ -53,6 +54,7 @@ def main(args: argparse.Namespace) -> int:
   if not source.is_file():
     raise CommandError(f"no file {str(source)!r}")
   constants = {k: getattr(args, k) for k in ("young", "foundation") if getattr(args, k) is not None}
+  constants["solid"] = args.solid
   nodes = args.nodes or (None if args.method == "direct" else _NODES)
   name = args.name if args.name is not None else _name(source, args.out)
   try:

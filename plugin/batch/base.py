@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 import warp as wp
-
-if TYPE_CHECKING:
-  from .bonds import Bonds
 
 
 class Batch(abc.ABC):
@@ -359,8 +356,8 @@ class Tissue(abc.ABC):
 
   @property
   @abc.abstractmethod
-  def bonds(self) -> Bonds:
-    """What it has grown on to."""
+  def bonds(self) -> Any:
+    """What it has grown on to, see `palpate.batch.bonds.Bonds`."""
 
   @abc.abstractmethod
   def configure(self, mask=None, **keys):

@@ -1,4 +1,4 @@
-"""What acts on an organ of `Worlds` beside its tissue: bonds, springs to bodies, and supports.
+"""What acts on an organ of `Worlds` beside its tissue: what all that does so shares.
 
 The kernels and their structs are the plugin's, over rows of worlds: see `palpate.engine.hold`.
 """
@@ -11,18 +11,12 @@ from typing import Any
 import mujoco
 import numpy as np
 import warp as wp
-from palpate.engine import bonds as engine_bonds
-from palpate.engine import coupling, hold, rests, ties
-from palpate.engine.layout import BOND
+from palpate.engine import coupling, hold
 from palpate.tissue import body as bodies
 from palpate.tissue.kernels import Kernel, kernel
-from palpate.tissue.step import SCHEMES
 from palpate.tissue.types import DIMS, Array, doubles, fill, floats, ints, struct, vector
 
-from .bonds import HELD, Bonds
 from .patch import launch
-
-_HELD = wp.constant(HELD)
 
 
 @struct
@@ -61,7 +55,7 @@ class WorldNodes:
   origin: doubles(3)  # position of its frame [m]
 
 
-def _in_worlds(kind, rows: tuple[str, ...], others: dict[str, Any]) -> Any:
+def in_worlds(kind, rows: tuple[str, ...], others: dict[str, Any]) -> Any:
   """Returns a struct of many worlds.
 
   Args:
@@ -79,40 +73,9 @@ def _in_worlds(kind, rows: tuple[str, ...], others: dict[str, Any]) -> Any:
   return struct(type(f"{kind.key}InWorlds", (), own))
 
 
-_PARTS = {"own": WorldNodes, "other": WorldNodes, "mj": WorldBodies}
-_number = floats("nworld", "nnumber")
-BOND_ROWS = "state", "next", "stretch", "force", "pull", "hardness"
-WorldBonded = _in_worlds(engine_bonds.Bonded, BOND_ROWS, _PARTS | {"number": _number})
-REST_ROWS = "slip", "slipped", "on", "force", "hardness"
-WorldTied = _in_worlds(
-  ties.Tied, ("point", "force"), _PARTS | {"number": _number, "dvel_warm": vector}
-)
-WorldRest = _in_worlds(rests.Rest, REST_ROWS, _PARTS)
-
-
-@struct
-class Aimed:
-  """Ties to another organ."""
-
-  npair: int  # number of them
-  first: int  # the first among all ties
-  pair: ints("npair")  # vertices of the other organ
-  anchor: doubles("npair", 3)  # from there to the points, in the world [m]
-  point: doubles("nworld", "ntie", 6)  # place and velocity of the points [m, m/s]
-  other: WorldNodes
-  mj: WorldBodies
-
-
-def _kernels(header: str, kind, *names: str) -> list[Kernel]:
+def kernels(header: str, kind, *names: str) -> list[Kernel]:
+  """Returns the kernels of a header that take a struct of many worlds."""
   return [kernel(name, header, kind, coupling.CONSTANTS, tag=".worlds") for name in names]
-
-
-_stretch, _enter, _bear, _act, _feel, _keep = _kernels(
-  "bonds.h", WorldBonded, *engine_bonds.KERNELS
-)
-_enter_ties, _act_ties = _kernels("ties.h", WorldTied, *ties.KERNELS)
-(_aim,) = _kernels("ties.h", Aimed, "aim_ties")
-_find, _press, _act_rest, _feel_rest, _keep_rest = _kernels("rests.h", WorldRest, *rests.KERNELS)
 
 
 @wp.kernel(enable_backward=False)
@@ -121,23 +84,6 @@ def _put_back(mask: wp.array[bool], start: wp.array2d[wp.float64], out: wp.array
   w, k = wp.tid()
   if mask[w]:
     out[w, k] = start[0, k]
-
-
-@wp.kernel(enable_backward=False)
-def _show(b: WorldBonded, first: int, damage: wp.array2d[float], force: wp.array3d[float]):
-  """Writes damage and force of bonds."""
-  w, n = wp.tid()
-  had = b.state[w, n, 0]
-  damage[w, first + n] = wp.where(had >= wp.float64(1.0), 1.0, wp.min(float(had), _HELD))
-  for c in range(3):
-    force[w, first + n, c] = float(b.pull[w, n, c])
-
-
-@wp.kernel(enable_backward=False)
-def _weaken(b: WorldBonded, first: int, amount: wp.array2d[float]):
-  """Adds damage to bonds."""
-  w, n = wp.tid()
-  b.state[w, n, 0] = wp.min(b.state[w, n, 0] + wp.float64(amount[w, first + n]), wp.float64(1.0))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -212,35 +158,6 @@ class Beside:
     launch(what, fields, self._nworld, max(1, count), self._device)
 
 
-def check(spaces: list):
-  """Raises ValueError where workspaces have beside their tissue what a batch on a GPU cannot do."""
-  for w in spaces:
-    if w.rests.below:
-      raise ValueError(
-        f"organ {w.organ.name!r}: support names organ {w.rests.below[0].organ.name!r}, which a "
-        "batch on a GPU cannot do; expected geoms"
-      )
-
-
-def meet(organs: list):
-  """Lets organs know of what others have to them."""
-  every = [each for organ in organs for each in organ.beside if isinstance(each, InBonds)]
-  for each in every:
-    each.bear(every)
-
-
-def make(organ, numbers: np.ndarray) -> tuple[Beside, ...]:
-  """Returns what acts on an organ beside its tissue; it gets `State.hold` where something does.
-
-  Args:
-    organ: of `Worlds`, all of whose organs there are
-    numbers: of the model's bodies in mujoco_warp's, (nbody,)
-  """
-  w = organ.space
-  kinds = (Ties, w.ties), (InBonds, w.bonds), (Rests, w.rests)
-  return tuple(kind(organ, numbers) for kind, there in kinds if there)
-
-
 def bodies_of(batch):
   """Returns `WorldBodies` of a batch's worlds."""
   m, d, model = batch.m, batch.d, batch.bare
@@ -286,201 +203,6 @@ def input_of(organ):
   values = {name: getattr(body.state, name) for name in ("hold", "force_ext", "vel", "dvel")}
   values |= {"node": body.shape.node, "quiet": organ.patch.calm, "status": body.system.status}
   return fill(hold.Input, body.device, values)
-
-
-class InBonds(Beside):
-  """Bonds of an organ, and those that others have to it."""
-
-  def __init__(self, organ, numbers: np.ndarray):
-    super().__init__(organ)
-    self.groups: list[tuple[Any, Any]] = []
-    self.borne: list[tuple[Any, Any]] = []
-    for group in organ.space.bonds.groups:
-      other = organ._batch.organ(group.other.organ.name) if group.other else None
-      self.groups.append((group, self._fill(group, other, numbers)))
-
-  def bear(self, others: list["InBonds"]):
-    """Finds the bonds that others have to it, once all have been made."""
-    mine = self._organ.space.bonds.borne
-    self.borne = [pair for each in others for pair in each.groups if pair[0] in mine]
-
-  def _fill(self, group, other, numbers: np.ndarray):
-    organ, n = self._organ, len(group.vert)
-    scheme = SCHEMES[organ.config.integrator]
-    shapes: dict[str, tuple] = {name: (n, 3) for name in ("stretch", "force", "pull")}
-    shapes |= {"next": (n, len(BOND)), "hardness": (n,)}
-    values: dict[str, Any] = dict(zip(("stiffness", "strength", "energy"), group.law, strict=True))
-    of_group = "vert", "area", "anchor", "normal", "corner", "weight"
-    values |= {name: getattr(group, name) for name in of_group}
-    values |= {name: self._zeros(self._nworld, *shape) for name, shape in shapes.items()}
-    values |= dict(
-      nbond=n,
-      body=int(numbers[group.body]) if group.body >= 0 else group.body,
-      restless=group.bonded.restless,
-      ahead=float(scheme.ahead),
-      gain=scheme.gain(1.0, 0.0),
-      live=np.ones(1),
-      slot=np.arange(n),
-      state=self._keep("bond", group.slot, len(BOND)),
-      own=nodes_of(organ),
-      solve=input_of(organ),
-      other=WorldNodes() if other is None else nodes_of(other),
-      below=hold.Input() if other is None else input_of(other),
-      number=organ.body.tissue.number,
-      mj=organ._batch.bodies,
-    )
-    return fill(WorldBonded, self._device, values)
-
-  @property
-  def aims(self) -> bool:
-    """See `Beside`."""
-    return any(b.restless and b.body >= 0 for _, b in self.groups)
-
-  def enter(self):
-    """See `Beside`."""
-    for _, b in self.groups:
-      self._over(_stretch, b, b.nbond)
-      self._over(_enter, b, b.nbond)
-    for _, b in self.borne:
-      self._over(_stretch, b, b.nbond)
-      self._over(_bear, b, 1)
-
-  def act(self):
-    """See `Beside`."""
-    for _, b in self.groups:
-      self._over(_act, b, b.nbond)
-      if b.body >= 0 and b.restless:
-        self._over(_feel, b, 1)
-
-  def end(self):
-    """See `Beside`."""
-    for _, b in self.groups:
-      self._over(_keep, b, b.nbond)
-
-
-class Grown(Bonds):
-  """The bonds of an organ of `Worlds`, for those who ask.
-
-  Args:
-    organ: the organ
-  """
-
-  def __init__(self, organ):
-    found = [each.groups for each in organ.beside if isinstance(each, InBonds)]
-    self._groups = [pair for groups in found for pair in groups]
-    made = [group for group, _ in self._groups]
-    self.vertices = np.concatenate([np.zeros(0, int), *(group.vert for group in made)])
-    self.area = np.concatenate([np.zeros(0), *(group.area for group in made)])
-    super().__init__(organ._batch.nworld, organ._batch.device)
-
-  def _all(self, what, *arrays: wp.array):
-    first, nworld = 0, self._share.shape[0]
-    for _, b in self._groups:
-      inputs = [b, first, *arrays]
-      wp.launch(what, dim=(nworld, b.nbond), inputs=inputs, device=self._device)
-      first += b.nbond
-
-  def _tell(self):
-    self._all(_show, self._damage, self._force)
-
-  def _weaken(self, amount: wp.array):
-    self._all(_weaken, amount)
-
-
-class Ties(Beside):
-  """What an organ is attached to; a thread has all ties of a world."""
-
-  def __init__(self, organ, numbers: np.ndarray):
-    super().__init__(organ)
-    made, batch = organ.space.ties, organ._batch
-    known: Any = made.fields
-    self._count = int(known.count.numpy()[0])
-    names = "vert", "leads", "stiffness", "anchor", "count", "owned", "restless"
-    values = {name: getattr(known, name).numpy() for name in names}
-    body = known.body.numpy()
-    point = self._zeros(self._nworld, len(body), 6)
-    values |= dict(
-      ahead=known.ahead, gain=known.gain, body=np.where(body < 0, body, numbers[body]), point=point,
-      force=self._zeros(self._nworld, len(body), 3), own=nodes_of(organ), solve=input_of(organ),
-      number=organ.body.tissue.number, dvel_warm=organ.body.state.dvel_warm, mj=batch.bodies,
-    )  # fmt: skip
-    self._fields, self._aimed, first = fill(WorldTied, self._device, values), [], 0
-    self._moves = bool(values["restless"][0] and (body >= 0).any())
-    for group in made.groups:
-      if group.other is not None:
-        other = nodes_of(batch.organ(group.other.organ.name))
-        own = {"npair": len(group.pair), "first": first, "pair": group.pair, "point": point}
-        own |= {"anchor": group.anchor, "other": other, "mj": batch.bodies}
-        self._aimed.append(fill(Aimed, self._device, own))
-      first += len(group.vert)
-
-  @property
-  def aims(self) -> bool:
-    """See `Beside`."""
-    return self._moves
-
-  def _alone(self, what: Kernel):
-    what.launch(self._device, self._nworld, 1, 0, self._fields, 32)
-
-  def enter(self):
-    """See `Beside`."""
-    for aimed in self._aimed:
-      self._over(_aim, aimed, aimed.npair)
-    self._alone(_enter_ties)
-
-  def act(self):
-    """See `Beside`."""
-    self._alone(_act_ties)
-
-
-class Rests(Beside):
-  """The geoms that an organ rests on."""
-
-  def __init__(self, organ, numbers: np.ndarray):
-    super().__init__(organ)
-    alone: Any = organ.space.rests._alone
-    n = alone.nouter
-    shapes = {"slipped": (n, 3), "force": (n, 3), "hardness": (n, 6), "weight": (n, 3)}
-    names = "ngeom", "nouter", "nother", "restless", "skin", "cell", "mu"
-    values: dict[str, Any] = {name: getattr(alone, name) for name in names}
-    same = "geom", "friction", "free", "stiffness", "elem", "near_adr", "near", "where", "next"
-    values |= {name: getattr(alone, name).numpy() for name in (*same, "first")}
-    values |= {name: self._zeros(self._nworld, *shape) for name, shape in shapes.items()}
-    values |= dict(
-      weight=self._zeros(n, 3),
-      corner=self._zeros(n, 3, dtype=int),
-      on=self._zeros(self._nworld, n, dtype=int),
-      slip=self._keep("slip", np.arange(n), 3),
-      own=nodes_of(organ),
-      solve=input_of(organ),
-      other=WorldNodes(),
-      below=hold.Input(),
-      mj=organ._batch.bodies,
-    )
-    self._fields = fill(WorldRest, self._device, values)
-
-  @property
-  def aims(self) -> bool:
-    """See `Beside`."""
-    return bool(self._fields.restless)
-
-  def _each(self, what: Kernel):
-    self._over(what, self._fields, self._fields.nouter)
-
-  def enter(self):
-    """See `Beside`."""
-    self._each(_find)
-    self._each(_press)
-
-  def act(self):
-    """See `Beside`."""
-    self._each(_act_rest)
-    if self._fields.restless:
-      self._over(_feel_rest, self._fields, 1)
-
-  def end(self):
-    """See `Beside`."""
-    self._each(_keep_rest)
 
 
 def numbers_of(model: mujoco.MjModel, bare: mujoco.MjModel, organs: list) -> np.ndarray:

@@ -13,7 +13,7 @@ from palpate.tissue import config as configuration
 from palpate.tissue import device as devices
 from palpate.tissue import order, shape, step
 
-from . import beside, contacts, convex, kernels, patch, sliding
+from . import beside, contacts, convex, held, kernels, patch, sliding
 from .base import Contacts, Tissue, spread
 from .material import KEYS, MODULI, Material
 from .patch import launch
@@ -67,6 +67,7 @@ class Organ(Tissue):
     self._batch, self._scheme = batch, step.SCHEMES[organ.config.integrator]
     still = shape.make(organ.mesh, organ.config, ~organ.free, str(device), nworld=0)
     self.body = bodies.worlds(still, nworld, plan_of(still, organ.config))
+    self.body.newton = w.body.newton
     model, d, m = batch.model, batch.d, batch.m
     node = self.body.shape.node.numpy()
     mass = np.ones(self.body.shape.nnode, np.float32)
@@ -218,9 +219,9 @@ class Organ(Tissue):
     return {name: wp.zeros(shape, dtype=wp.vec3, device=self.body.device) for name in _WHAT}
 
   @functools.cached_property
-  def bonds(self) -> beside.Grown:
+  def bonds(self) -> held.Grown:
     """What it has grown on to."""
-    return beside.Grown(self)
+    return held.Grown(self)
 
   def _read(self, name: str) -> wp.array:
     if name in _STATUS:

@@ -93,6 +93,12 @@ def _vectors(organ: Organ) -> dict[str, wp.array]:
   }  # fmt: skip
 
 
+def _kept(declared) -> list[tuple[str, np.ndarray]]:
+  """Returns what the plugin state has of an organ's motion with nodal coupling, and of whom."""
+  moving = np.flatnonzero(declared.free)
+  return [("last", moving), ("before", moving), ("disp", declared.inner), ("vel", declared.inner)]
+
+
 def _pull_organ(organ: Organ, world: int, model, data):
   declared, node = organ.declared, organ.body.shape.node.numpy()
   own, spans = _own(organ, model, data)
@@ -103,11 +109,12 @@ def _pull_organ(organ: Organ, world: int, model, data):
   force = organ.patch.force[world].numpy()[node].astype(float)
   heavier = float(organ.patch.heavier[world : world + 1].numpy()[0])
   if declared.windows is None:
-    free = declared.free
-    data.qpos[declared.qposs] = motion["disp"][free].ravel()
-    data.qvel[declared.dofs] = motion["vel"][free].ravel()
-    for name, values in (("last", motion["last"]), ("before", motion["before"]), ("force", force)):
-      own[spans[name]] = values[free].ravel()
+    jointed = declared.jointed
+    data.qpos[declared.qposs] = motion["disp"][jointed].ravel()
+    data.qvel[declared.dofs] = motion["vel"][jointed].ravel()
+    for name, which in _kept(declared):
+      own[spans[name]] = motion[name][which].ravel()
+    own[spans["force"]] = force[jointed].ravel()
     own[spans["heavier"]] = heavier
   else:
     for name in _MOTION:
@@ -192,12 +199,14 @@ def _push_organ(organ: Organ, world: int, model, data):
   declared, node = organ.declared, organ.body.shape.node.numpy()
   own, spans = _own(organ, model, data)
   motion = {name: np.zeros((declared.mesh.nvert, 3)) for name in _MOTION}
-  force, free = np.zeros((declared.mesh.nvert, 3)), declared.free
+  force = np.zeros((declared.mesh.nvert, 3))
   if declared.windows is None:
-    motion["disp"][free] = data.qpos[declared.qposs].reshape(-1, 3)
-    motion["vel"][free] = data.qvel[declared.dofs].reshape(-1, 3)
-    for name, values in (("last", motion["last"]), ("before", motion["before"]), ("force", force)):
-      values[free] = own[spans[name]].reshape(-1, 3)
+    jointed = declared.jointed
+    motion["disp"][jointed] = data.qpos[declared.qposs].reshape(-1, 3)
+    motion["vel"][jointed] = data.qvel[declared.dofs].reshape(-1, 3)
+    for name, which in _kept(declared):
+      motion[name][which] = own[spans[name]].reshape(-1, 3)
+    force[jointed] = own[spans["force"]].reshape(-1, 3)
     heavier, calm = float(own[spans["heavier"]][0]), 0.0
   else:
     for name in _MOTION:

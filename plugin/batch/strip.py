@@ -118,7 +118,7 @@ def strip(
   instances = _release_plugins(bare)
   for organ in organs:
     _take_out(bare, bodies, organ, model)
-  for instance in instances:  # at last: bodies are not deleted safely without
+  for instance in instances:
     bare.delete(instance)
   masses = [_slot_mass(organ) for organ in organs]
   for organ, nslot, mass in zip(organs, nslots, masses, strict=True):
@@ -150,12 +150,21 @@ def strip(
 
 
 def _release_plugins(bare) -> list:
-  """Returns the instances of the plugin, which no body refers to from now on."""
+  """Deletes the instances of the plugin, which no body refers to from now on.
+
+  Returns:
+    those without a name, which are a body's own: bodies can be deleted safely as long as they are
+    there, but not where those with a name were left, which many refer to
+  """
   mine = [b for b in bare.bodies if b.plugin.active and b.plugin.plugin_name == mjstruct.NAME]
   numbers = {body.plugin.id for body in mine}  # some have no name
   for body in mine:
     body.plugin.active = False
-  return [instance for instance in bare.plugins if instance.id in numbers]
+  instances = [instance for instance in bare.plugins if instance.id in numbers]
+  for instance in instances:
+    if instance.name:
+      bare.delete(instance)
+  return [instance for instance in instances if not instance.name]
 
 
 def _check_option(option):

@@ -19,7 +19,7 @@ from palpate.engine import plugin as engine
 from palpate.organ import instances
 from palpate.tissue import device as devices
 
-from . import beside, contacts, convex, kernels, states, strip
+from . import beside, contacts, convex, held, kernels, states, strip
 from .base import Batch, Tissue, refuse_crowd
 from .organs import Organ
 from .rest import Rest
@@ -57,7 +57,7 @@ class Worlds(Batch):
       name: engine.find(self.scratch._address, number) for name, number in instances(model).items()
     }
     declared = [w.organ for w in spaces.values()]
-    beside.check(list(spaces.values()))
+    held.check(list(spaces.values()))
     tools = [strip.tools_of(model, organ) for organ in declared]
     nslots = [strip.slots_for(model, o, t, nodes) for o, t in zip(declared, tools, strict=True)]
     bare, slots = strip.strip(spec, model, declared, nslots)
@@ -139,8 +139,8 @@ class Worlds(Batch):
     self.bodies = beside.bodies_of(self)
     numbers = beside.numbers_of(self.model, self.bare, [organ.declared for organ in organs])
     for organ in organs:
-      organ.beside = beside.make(organ, numbers)
-    beside.meet(organs)
+      organ.beside = held.make(organ, numbers)
+    held.meet(organs)
     return any(each.aims for organ in organs for each in organ.beside)
 
   def _alias(self):

@@ -37,7 +37,8 @@ def copy(w, model: int, other, twin):
     other: workspace of the original
     twin: returns the workspace of the copy for one of the original
   """
-  if w.organ.digest != other.organ.digest:
+  one, two = w.organ, other.organ  # which may have been made for different time steps
+  if (one.signature, one.config) != (two.signature, two.config):
     return
   if not w.chosen and w.config != other.config:
     _change(w, model, other.config)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 from palpate.tissue import path as paths
+from palpate.tissue.surface import WorkingCopy
 
 from . import mjstruct
 from .layout import BLADE, BOND
@@ -31,6 +32,7 @@ class Current:
 
   def __init__(self, w, geom: int, actuator: int, energy: float, shape: tuple[int, float, float]):
     self._w, self._geom, self._actuator = w, geom, actuator
+    self._finder = w.cuts.finder if w.cuts else paths.Finder(WorkingCopy(w.organ.mesh))
     self._energy, (self._axis, self._half, width) = energy, shape
     self._reach = 0.5 * width + _SPARK
 
@@ -73,7 +75,7 @@ class Current:
     """Lets the path follow the geom; returns whether it touches the wall."""
     w, organ, mesh = self._w, self._w.organ, self._w.organ.mesh
     local = (np.linspace(low, high, 5) - organ.origin) @ organ.frame
-    elem, weight, far = paths.nearest(mesh, mesh.rest + w.phases.motion()[0], local)
+    elem, weight, far = self._finder.nearest(mesh, mesh.rest + w.phases.motion()[0], local)
     k = int(np.argmin(far))
     if far[k] > self._reach and not len(mesh.tet):
       return False

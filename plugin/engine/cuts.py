@@ -16,6 +16,7 @@ from palpate.tissue import body as bodies
 from palpate.tissue import cut as cutting
 from palpate.tissue import mesh as topology
 from palpate.tissue.mesh import Mesh
+from palpate.tissue.path import Finder
 from palpate.tissue.refill import Refill
 from palpate.tissue.surface import WorkingCopy
 
@@ -99,6 +100,7 @@ class Cuts:
     """Makes what finds cuts, and what writes meshes into the body's arrays."""
     copy = WorkingCopy(self.whole)
     self._refill, self._knife = Refill(self._w.body, copy), cutting.Knife(copy)
+    self.finder = Finder(copy)
 
   @property
   def full(self) -> bool:

@@ -12,7 +12,6 @@ from typing import Any
 import mujoco
 import numpy as np
 import warp as wp
-from palpate.tissue import path as paths
 from palpate.tissue.step import SCHEMES
 from palpate.tissue.types import doubles, fill, ints, struct
 
@@ -201,9 +200,9 @@ class Cutters(Beside):
     """See `Beside`."""
     if self.fields is not None:
       mesh = self._w.organ.mesh
-      self.fields.elem.assign(mesh.elem[: mesh.whole.nelem])
-      self.fields.flat.assign(mesh.rest)
-      self.fields.own.rest.assign(base(self._w.organ))
+      self.fields.elem.numpy()[:] = mesh.elem[: mesh.whole.nelem]
+      self.fields.flat.numpy()[:] = mesh.rest
+      self.fields.own.rest.numpy()[:] = base(self._w.organ)
     return []
 
   def open(self) -> bool:
@@ -250,7 +249,7 @@ class Cutters(Beside):
     trail = row[BLADE.trail : BLADE.trail + 3 * count].reshape(-1, 3)
     path, rest = np.vstack([trail, at]), at[None]
     if not ended:
-      path, rest = _part(mesh, path)
+      path, rest = _part(mesh, w.cuts.finder, path)
     report, pinned = self._cut(path, given)
     if ended:
       row[BLADE.count] = 0
@@ -261,7 +260,7 @@ class Cutters(Beside):
       trail = np.vstack([tip, rest[:-1]])[:TRAIL]
       row[BLADE.count], row[BLADE.wait] = len(trail), 0.0
       row[BLADE.trail : BLADE.trail + trail.size] = trail.ravel()
-      row[BLADE.elem] = paths.nearest(w.organ.mesh, w.organ.mesh.rest, at[None])[0][0]
+      row[BLADE.elem] = w.cuts.finder.nearest(w.organ.mesh, w.organ.mesh.rest, at[None])[0][0]
     return report is not None and report.nodes > 0
 
   def _cut(self, path: np.ndarray, given: float, **inward) -> tuple[Any, bool]:
@@ -297,9 +296,10 @@ class Cutters(Beside):
     else:
       first = min(int((left[:-1] > (_BEHIND + _AGAIN) * edge).sum()), count - 1)
       kept, below = trail[first:].copy(), deep[first:count].copy()
+      mesh = self._w.organ.mesh
       row[BLADE.count] = len(kept)
       row[BLADE.wait] = np.linalg.norm(at - kept[0]) + edge
-      row[BLADE.elem] = paths.nearest(self._w.organ.mesh, self._w.organ.mesh.rest, at[None])[0][0]
+      row[BLADE.elem] = self._w.cuts.finder.nearest(mesh, mesh.rest, at[None])[0][0]
       row[BLADE.trail : BLADE.trail + kept.size] = kept.ravel()
       row[BLADE.below : BLADE.below + len(below)] = below
     return report is not None and report.nodes > 0
@@ -321,7 +321,7 @@ class Cutters(Beside):
   def _now(self, mesh, path: np.ndarray) -> np.ndarray:
     """Returns where points of the rest shape are in the world."""
     organ = self._w.organ
-    elem, weight, _ = paths.nearest(mesh, mesh.rest, path)
+    elem, weight, _ = self._w.cuts.finder.nearest(mesh, mesh.rest, path)
     position = mesh.rest + self._w.phases.motion()[0]
     local = np.einsum("nk,nkj->nj", weight, position[mesh.elem[elem]])
     return organ.origin + local @ organ.frame.T
@@ -350,7 +350,7 @@ class Cutters(Beside):
     return self.fields.force.numpy() @ self._w.organ.frame.T
 
 
-def _part(mesh, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _part(mesh, finder, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
   """Returns the part of a path that comes apart now, and the rest; nothing where there is none.
 
   It ends where a vertex is near, so that the mesh need not be bent to where the blade is just now.
@@ -362,7 +362,7 @@ def _part(mesh, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
   point = np.stack([np.interp(way, arc, path[:, c]) for c in range(3)], axis=1)
   if not len(point):
     return path[:0], path
-  elem, _, _ = paths.nearest(mesh, mesh.rest, point)
+  elem, _, _ = finder.nearest(mesh, mesh.rest, point)
   vert = np.unique(mesh.elem[elem])
   far = np.linalg.norm(point[:, None] - mesh.rest[vert], axis=2).min(axis=1)
   stop = int(np.argmin(far - _FARTHER * way))

@@ -50,7 +50,6 @@ class Declaration:
     frame: rotation from the slides' axes to the world (3, 3)
     origin: position of the parent body [m] (3,)
     mass: mass of each vertex [kg]          (nvert,)
-    digest: identifies geometry, configuration and masses
     windows: the windows, or None where the vertices are MuJoCo's dofs
   """
 
@@ -68,7 +67,6 @@ class Declaration:
   frame: np.ndarray
   origin: np.ndarray
   mass: np.ndarray
-  digest: bytes
   windows: Windows | None = None
 
   @functools.cached_property
@@ -259,7 +257,7 @@ def cached(
       if len(_made) >= _CACHED:
         _made.pop(next(iter(_made)))
       _made[key] = Declaration(
-        name=name, mesh=mesh, config=config, free=free, still=still, digest=key, **fields
+        name=name, mesh=mesh, config=config, free=free, still=still, **fields
       )
     return _made[key]
 

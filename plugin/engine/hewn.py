@@ -14,7 +14,9 @@ from palpate.tissue import cleave, energy, faces, fill
 from palpate.tissue import mesh as topology
 from palpate.tissue.cut import Motion
 from palpate.tissue.mesh import Mesh
+from palpate.tissue.path import Finder
 from palpate.tissue.resolid import SolidRefill
+from palpate.tissue.surface import WorkingCopy
 
 from . import cuts, flexes
 from .cuts import Cuts
@@ -43,6 +45,7 @@ class SolidCuts(Cuts):
 
   def _make(self):
     self._refill = SolidRefill(self._w.body, self.whole)
+    self.finder = Finder(WorkingCopy(self.whole))
     self.seat = np.zeros(0, np.int64)
 
   def show(self):

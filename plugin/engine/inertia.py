@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 from palpate.tissue import body as bodies
 from palpate.tissue import mesh as topology
-from palpate.tissue import shape, step
+from palpate.tissue import shape, solid, step
 from palpate.tissue.body import Body
 from palpate.tissue.config import MATERIAL, Config
 from palpate.tissue.mesh import Mesh
@@ -59,6 +59,14 @@ def stiffness(
   alone = _by_itself(m, organ, body, config, sample)
   stiff = np.quantile(alone / masses(m, organ)[sample], 0.75) > _STIFF
   return bool(stiff), _PRESSED * max(1.0, float(np.median(alone / nodal[sample])))
+
+
+def iterations(m, organ: Declaration, config: Config) -> int:
+  """Returns how many Newton iterations a step takes, for the model's time step."""
+  if not len(organ.mesh.tet) or not SCHEMES[config.integrator].ahead:
+    return config.newton
+  gain = SCHEMES[config.integrator].gain(float(m.opt.timestep), config.damping)
+  return max(config.newton, solid.iterations(organ.mesh, config, masses(m, organ), gain))
 
 
 def _by_itself(m, organ: Declaration, body: Body, config: Config, sample: np.ndarray) -> np.ndarray:

@@ -165,13 +165,12 @@ def reshape(w, slots, vert: np.ndarray):
   """Gives slots the mesh and the masses that vertices have now; triangles keep their number."""
   organ, mesh, m = w.organ, w.organ.mesh, mjstruct.Model.from_address(w.model)
   radius = float(mjstruct.view(m.flex_radius, m.nflex)[organ.windows.flex].max())
-  elem = topology.around(mesh, vert)
-  slots.rest.numpy()[vert] = mesh.rest[vert]
+  elem, ring, place = topology.around(mesh, vert), mesh.ring[vert], mesh.rest[vert]
+  slots.rest.numpy()[vert] = place
   slots.elem.numpy()[elem] = mesh.elem[elem]
-  arm = mesh.rest[mesh.ring[vert]] - mesh.rest[vert][:, None]
-  length = np.where(mesh.ring[vert] >= 0, np.linalg.norm(arm, axis=2), 0.0)
+  length = np.where(ring >= 0, topology.lengths(mesh.rest[ring] - place[:, None]), 0.0)
   slots.touch.numpy()[vert] = length.max(axis=1) + radius
-  slots.node_mass.numpy()[vert] = hold(organ, organ.mass)[vert]
+  slots.node_mass.numpy()[vert] = hold(organ, organ.mass[vert], vert)
   _list_triangles(slots, mesh, vert, elem)
 
 
@@ -179,18 +178,17 @@ def _list_triangles(slots, mesh, vert: np.ndarray, elem: np.ndarray):
   """Lists the triangles whose first corners these vertices are; `elem`: all that they have."""
   begin, following = slots.begin.numpy(), slots.following.numpy()
   first = mesh.elem[elem, 0]
-  elem = elem[topology.among(mesh.nvert, vert)[first]]
-  order = np.lexsort((elem, mesh.elem[elem, 0]))
-  elem = elem[order]
-  first = mesh.elem[elem, 0]
+  order = np.lexsort((elem, first))
+  order = order[topology.among(mesh.nvert, vert)[first[order]]]
+  elem, first = elem[order], first[order]
   begin[vert] = -1
   begin[first[::-1]] = elem[::-1]
   following[elem] = np.append(np.where(first[1:] == first[:-1], elem[1:], -1), -1)[: len(elem)]
 
 
-def hold(organ, inertia: np.ndarray) -> np.ndarray:
-  """Returns the inertia of the nodes, with that of a wall for pinned ones [kg], (nvert,)."""
-  return np.where(organ.free, inertia, WALL * organ.windows.mass.sum())
+def hold(organ, inertia: np.ndarray, vert: np.ndarray | slice = slice(None)) -> np.ndarray:
+  """Returns the inertia of nodes, with that of a wall for pinned ones [kg]."""
+  return np.where(organ.free[vert], inertia, WALL * organ.windows.mass.sum())
 
 
 def _edges(mesh) -> tuple[np.ndarray, np.ndarray]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from palpate.tissue import path as paths
 
 _WAY = 1.2  # edges by which a tear goes on, to each side where it begins
 _NEAR = 1.5  # edges from the end of a cut from which it goes on
@@ -56,7 +55,7 @@ class Tear:
       start = x[rim[np.argmin(far)]]
       across = across if (at - start) @ across >= 0 else -across
     points = start + np.linspace(0, 2 * _WAY * size, 12)[:, None] * across
-    elem, weight, _ = paths.nearest(mesh, x, points)
+    elem, weight, _ = self._w.cuts.finder.nearest(mesh, x, points)
     return np.einsum("nk,nkj->nj", weight, x[mesh.elem[elem]])
 
 

@@ -67,34 +67,29 @@ class Workspace:
     after: recorded graph of the forces after it where the motion is on a device, else part of it
     leave: recorded graph that takes the contact forces after MuJoCo's step
     respond: recorded graphs of the organ's response to their change; none where the scheme has none
-    advance: recorded graph of the plugin state's step after that
-    end: recorded graph that ends a step without such a response, and steps the plugin state
-    place: recorded graph that puts the windows where the plugin state says, or None
-    hold: springs that hold nodes
-    ties: what the organ is tied to
-    bonds: what it has grown on to
-    rests: what it rests on
-    creep: its stress relaxation
+    advance, end: recorded graphs of the plugin state's step after that, or without a response
+    place: recorded graph that puts the windows where the state says, or None
+    hold, creep: springs that hold nodes; its stress relaxation
+    ties, bonds, rests: what the organ is tied to, has grown on to, and rests on
     cuts, cutters: its mesh as it is now, and what cuts it
     resident: keeper of a motion that stays on the device, or None
     stiff: whether the response is needed, see `inertia.stiffness`
     heaviest: most times its inertia that a node in contact may have, see there  (1,)
     computed: whether forces were computed for the step that ends
     flags: what the coupling reports, see `layout.FLAG`
-    policy: MuJoCo's sleep policy of the windows' bodies comes first
-    counts: the number of vertices that MuJoCo sees of a windowed organ comes first
+    policy, counts: MuJoCo's sleep policy of the windows' bodies, and the number of vertices that it
+      sees of a windowed organ, come first
     status: iterations, relative residual, norm, failure  (4,)
     error: what went wrong since the last reset, or None
     missed: most nodes and triangles that the windows had no room for in a step
     warning: last index and count of each of MuJoCo's warnings, one after the other
-    nefc: the number of MuJoCo's constraints comes first
     strange: whether the plugin state is not one of this organ
-    noticed: whether it was said that windows came without their state
-    torn: whether a signal's handler has ended a callback of the last step
+    noticed, torn: whether it was said that windows came without their state; whether a signal's
+      handler has ended a callback of the last step
     watch: looks whether tools come through the surface
     nbad: MuJoCo's warnings of bad states that were looked at since the last reset
     model_step, time_step: the model's time step comes first, and the armature's [s]
-    integrator: MuJoCo's comes first
+    integrator, nefc: MuJoCo's, and the number of its constraints, come first
     static: places of the bodies that the organ hangs on, and what they were
     qpos, stood: numbers of qpos that the slots have, as bytes; after the last step, or None
     plugin_state: the organ's own numbers
@@ -423,9 +418,13 @@ def _view(w: Workspace, d, m):
 
 
 def feel(w: Workspace, m):
-  """Notes whether the organ is stiff for the present time step."""
+  """Notes how stiff the organ is for the present time step, and what its step takes for it."""
   nodal = w.inertia(w.model)
   w.stiff, w.heaviest[0] = inertia.stiffness(m, w.declared, w.body, w.config, nodal)
+  newton = inertia.iterations(m, w.declared, w.config)
+  if newton != w.body.newton:
+    w.body.newton = newton
+    bind(w, w.model)
 
 
 def sync(w: Workspace):

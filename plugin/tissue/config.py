@@ -319,10 +319,11 @@ def change(
     values["young"] = tuple(factor * young for young in compiled.young)
   changed = dataclasses.replace(config, **values)
   for key in ("relax_share", "capsule_young"):
-    if bool(getattr(changed, key)) != bool(getattr(compiled, key)):
+    now, first = getattr(changed, key), getattr(compiled, key)
+    if bool(now) != bool(first):
       raise ValueError(
-        f"organ {organ!r}: {key} is {getattr(changed, key)}, compiled as {getattr(compiled, key)}: "
-        "it cannot begin or end while running"
+        f"organ {organ!r}: {key} is {now:g}, compiled as {first:g}: it cannot begin or end while "
+        "running"
       )
   given = values | ({"stiffness": 0} if config.stiffness else {})
   _check_combination(organ, changed, given, closed)

@@ -193,12 +193,6 @@ def around(mesh: Mesh, vert: np.ndarray) -> np.ndarray:
   return distinct(half[half >= 0] // 3)
 
 
-def with_beside(mesh: Mesh, elem: np.ndarray) -> np.ndarray:
-  """Returns these triangles and those that share an edge with one of them, ascending."""
-  other = mesh.twin.reshape(-1, 3)[elem]
-  return distinct(other[other >= 0] // 3, elem)
-
-
 def held_areas(mesh: Mesh) -> np.ndarray:
   """Returns the areas of the vertices that the foundation holds [m^2], (nvert,)."""
   elem = mesh.elem if mesh.loose is None else mesh.elem[~mesh.loose]

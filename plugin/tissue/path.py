@@ -8,6 +8,7 @@ from scipy.spatial import KDTree
 
 from .kernels import kernel
 from .mesh import Mesh, lengths
+from .surface import WorkingCopy
 from .types import CONSTANTS, doubles, ints, longs, struct
 
 _BOX = 3.0  # edges from points within which a solid's triangles are looked at first
@@ -35,34 +36,64 @@ class Nearest:
 _nearest = kernel("find_nearest", "cut.h", Nearest, CONSTANTS)
 
 
+class Finder:
+  """Finds the points of surfaces of one whole that are nearest to points, one after the other.
+
+  Args:
+    copy: where the surfaces are
+  """
+
+  def __init__(self, copy: WorkingCopy):
+    self._copy, whole, there = copy, copy.whole, copy.fields
+    self._fields = fields = Nearest()
+    fields.nvert, fields.most, fields.edge = whole.nvert, copy.sizes["most"], whole.edge_length
+    fields.elem, fields.spoke, fields.degree = there.elem[0], there.spoke[0], there.degree[0]
+    self._x, self._box = np.zeros((whole.nvert, 3)), np.zeros(whole.nvert, np.int32)
+    fields.x, fields.box = _wrap(self._x), _wrap(self._box)
+    self._launch = _nearest.command(fields).launch
+    self._make_room(16)
+
+  def _make_room(self, count: int):
+    self._point, self._spot = np.zeros((count, 3)), np.zeros((count, 5))
+    self._fields.point, self._fields.spot = _wrap(self._point), _wrap(self._spot)
+
+  def nearest(
+    self, mesh: Mesh, position: np.ndarray, points: np.ndarray
+  ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns the points of the surface nearest to points.
+
+    Args:
+      mesh: the surface
+      position: where its vertices are [m]  (nvert, 3)
+      points: some points [m]               (n, 3)
+
+    Returns:
+      triangles (n,), weights of their corners (n, 3), distances [m] (n,)
+    """
+    if len(mesh.tet):
+      return nearest(mesh, position, points)
+    n = len(points)
+    if n > len(self._point):
+      self._make_room(2 * n)
+    self._copy.put(mesh)
+    self._x[:], self._point[:n] = position, points
+    self._fields.npoint, self._fields.nouter = n, mesh.nouter
+    self._launch()
+    spot = self._spot[:n].copy()
+    return spot[:, 0].astype(int), spot[:, 1:4], spot[:, 4]
+
+
+def _wrap(array: np.ndarray) -> wp.array:
+  return wp.array(array, device="cpu", copy=False)
+
+
 def nearest(
   mesh: Mesh, position: np.ndarray, points: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-  """Returns the points of the surface nearest to points.
-
-  Args:
-    mesh: the surface
-    position: where its vertices are [m]  (nvert, 3)
-    points: some points [m]               (n, 3)
-
-  Returns:
-    triangles (n,), weights of their corners (n, 3), distances [m] (n,)
-  """
+  """Returns what `Finder.nearest` does, once."""
   if len(mesh.tet):
     return _nearest_of(position, mesh.elem[: mesh.whole.nelem], points, mesh.whole.edge_length)
-  values = {"elem": mesh.elem, "spoke": mesh.ring_elem, "degree": mesh.degree, "x": position}
-  values |= {"point": points, "box": np.empty(mesh.nvert, np.int32)}
-  values |= {"spot": np.empty((len(points), 5))}
-  fields = Nearest()
-  fields.nvert, fields.most = mesh.ring.shape
-  fields.nouter, fields.npoint, fields.edge = mesh.nouter, len(points), mesh.whole.edge_length
-  for name, value in values.items():
-    dtype = Nearest.vars[name].type.dtype
-    array = np.ascontiguousarray(value, wp.dtype_to_numpy(dtype))
-    setattr(fields, name, wp.array(array, dtype=dtype, device="cpu", copy=False))
-  _nearest.launch("cpu", 1, 1, 0, fields)
-  spot = fields.spot.numpy()
-  return spot[:, 0].astype(int), spot[:, 1:4], spot[:, 4]
+  return Finder(WorkingCopy(mesh)).nearest(mesh, position, points)
 
 
 def _nearest_of(position: np.ndarray, elem: np.ndarray, points: np.ndarray, edge: float):

@@ -1,11 +1,13 @@
-"""Hinges of a surface and the stiffness that makes them a Kirchhoff plate."""
+"""Hinges of a surface and the stiffness that makes them a Kirchhoff plate.
+
+In float64, for energies; what kernels use is `native/plate.h`.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 
 import numpy as np
-from scipy import sparse
 
 from .mesh import Mesh, area_vectors, corners, cross, distinct, lengths
 
@@ -15,28 +17,22 @@ class Hinges:
   """Interior edges with the plate stiffness of the triangles beside them.
 
   Attributes:
-    half: half-edge that it is in the left triangle                            (nhinge,)
     vert: edge p0, p1 (direction of the left triangle), left apex, right apex  (nhinge, 4)
     elem: left and right triangle                                              (nhinge, 2)
-    which: triangles that the next two are of                                  (nelem,)
     of_elem: hinge of each triangle's half-edge, -1 on the boundary            (nelem, 3)
     gain: stiffness between the hinges of one triangle [N m]                   (nelem, 3, 3)
     weight: angle of each triangle's hinge by normal displacements of the half-edge's start and end,
       the triangle's apex and the other one [1/m]                              (nelem, 3, 4)
   """
 
-  half: np.ndarray
   vert: np.ndarray
   elem: np.ndarray
-  which: np.ndarray
   of_elem: np.ndarray
   gain: np.ndarray
   weight: np.ndarray
 
 
-def hinges(
-  mesh: Mesh, rigidity: np.ndarray, poisson: float, which: np.ndarray | None = None
-) -> Hinges:
+def hinges(mesh: Mesh, rigidity: np.ndarray, poisson: float) -> Hinges:
   """Returns the hinges of a surface and the stiffness that makes them a Kirchhoff plate.
 
   The three angles of a triangle's hinges fix a constant curvature (kxx, kyy, kxy) of the patch of
@@ -50,11 +46,9 @@ def hinges(
     mesh: the surface
     rigidity: plate bending rigidity [N m], (nelem,)
     poisson: Poisson's ratio [-]
-    which: triangles whose hinges are meant, ascending; None for all
   """
   twin = mesh.twin
-  which = np.arange(mesh.nelem) if which is None else which
-  mine = 3 * which[:, None] + np.arange(3)
+  mine = np.arange(len(twin)).reshape(-1, 3)
   across = twin[mine]
   half = distinct(np.minimum(mine, across)[across >= 0])
   other = twin[half]
@@ -62,15 +56,11 @@ def hinges(
   vert = np.stack([*ends, corners(mesh, other, 2)], axis=1)
   of_half = np.full(len(twin), -1, np.int64)
   of_half[half] = of_half[other] = np.arange(len(half))
-  angle, weight = _angles(mesh, which)
-  size = _area(mesh, which) * rigidity[which]
+  angle, weight = _angles(mesh)
+  size = lengths(area_vectors(mesh.rest, mesh.elem)) * rigidity
   gain = _gain(angle, across >= 0, poisson) * size[:, None, None]
   sides = np.stack([half // 3, other // 3], axis=1)
-  return Hinges(half, vert, sides, which, of_half[mine], gain, weight)
-
-
-def _area(mesh: Mesh, which: np.ndarray) -> np.ndarray:
-  return lengths(area_vectors(mesh.rest, mesh.elem[which]))
+  return Hinges(vert, sides, of_half[mine], gain, weight)
 
 
 def _foot(mesh: Mesh, half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -81,30 +71,30 @@ def _foot(mesh: Mesh, half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
   return share, lengths(arm - share[..., None] * edge)
 
 
-def _unfolded(mesh: Mesh, which: np.ndarray) -> np.ndarray:
+def _unfolded(mesh: Mesh) -> np.ndarray:
   """Returns the corners of triangles in their own planes, (n, 3, 2)."""
-  corner = mesh.rest[mesh.elem[which]]
+  corner = mesh.rest[mesh.elem]
   x_axis = corner[:, 1] - corner[:, 0]
   x_axis /= lengths(x_axis)[:, None]
-  normal = area_vectors(mesh.rest, mesh.elem[which])
+  normal = area_vectors(mesh.rest, mesh.elem)
   area = lengths(normal)
   y_axis = cross(normal / area[:, None], x_axis)
   arm = corner - corner[:, :1]
   return np.stack([(arm * x_axis[:, None]).sum(-1), (arm * y_axis[:, None]).sum(-1)], axis=-1)
 
 
-def _angles(mesh: Mesh, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _angles(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
   """Returns C, the angles of triangles' hinges by curvature kxx, kyy, kxy, and `Hinges.weight`.
 
   Those of hinges that are not there mean nothing.
   """
-  flat, twin = _unfolded(mesh, which), mesh.twin
+  flat, twin = _unfolded(mesh), mesh.twin
 
   def modes(point):
     x, y = point[..., 0], point[..., 1]
     return np.stack([x * x / 2, y * y / 2, x * y], axis=-1)
 
-  h = 3 * which[:, None] + np.arange(3)
+  h = np.arange(len(twin)).reshape(-1, 3)
   p0, p1, inner = flat, flat[:, [1, 2, 0]], flat[:, [2, 0, 1]]
   share, height = _foot(mesh, h)
   share_o, height_o = _foot(mesh, np.where(twin[h] >= 0, twin[h], h))
@@ -139,55 +129,3 @@ def _gain(angle: np.ndarray, present: np.ndarray, poisson: float) -> np.ndarray:
   degenerate = ~absent & (value <= 1e-12 * largest) & (largest > 0)
   inverse = np.where(degenerate, 20 / np.maximum(largest, 1e-300), inverse)
   return np.where(both, np.einsum("tik,tk,tjk->tij", vector, inverse, vector), 0)
-
-
-def bending_matrix(
-  mesh: Mesh, hinge: Hinges, vert: np.ndarray | None = None
-) -> sparse.coo_array:
-  """Returns the plate stiffness on normal displacements at rest [N/m], (nvert, nvert).
-
-  Args:
-    mesh: the surface
-    hinge: its hinges
-    vert: vertices whose rows are meant, of which all hinges are there; None for all
-  """
-  which, c = hinge.which, np.arange(3)
-  angle = np.zeros((len(which), 3, 6))  # by the triangle's corners and the apexes beside it
-  for k, at in enumerate((c, (c + 1) % 3, (c + 2) % 3, 3 + c)):
-    angle[:, c, at] = hinge.weight[:, :, k]
-  value = angle.transpose(0, 2, 1) @ hinge.gain @ angle
-  across = mesh.twin.reshape(-1, 3)[which]
-  there: np.ndarray = across >= 0
-  apex = np.where(there, corners(mesh, across, 2), -1)
-  own = np.where(there.any(axis=1, keepdims=True), mesh.elem[which], -1)
-  patch = np.hstack([own, apex])
-  mine = np.ones(mesh.nvert, bool)
-  if vert is not None:
-    mine = np.zeros(mesh.nvert, bool)
-    mine[vert] = True
-  t, i, j = np.nonzero(((patch >= 0) & mine[patch])[:, :, None] & (patch >= 0)[:, None])
-  key, number = np.unique(patch[t, i] * mesh.nvert + patch[t, j], return_inverse=True)
-  at = key // mesh.nvert, key % mesh.nvert
-  return sparse.coo_array((np.bincount(number, value[t, i, j]), at), (mesh.nvert, mesh.nvert))
-
-
-def neighbours(hinge: Hinges) -> tuple[np.ndarray, np.ndarray]:
-  """Returns each hinge's four neighbours in its two triangles, and the gains to itself and them.
-
-  Those of a hinge with a triangle that is not in `Hinges.which` mean nothing.
-  """
-  nhinge = len(hinge.vert)
-  near = np.zeros((nhinge, 4), np.int64)
-  gain = np.zeros((nhinge, 5))
-  own = np.arange(nhinge)
-  last = len(hinge.which) - 1
-  for side in range(2):
-    elem = np.minimum(np.searchsorted(hinge.which, hinge.elem[:, side]), last)
-    c = np.argmax(hinge.of_elem[elem] == own[:, None], axis=1)
-    gain[:, 0] += hinge.gain[elem, c, c]
-    for k in range(2):
-      other = (c + 1 + k) % 3
-      index = hinge.of_elem[elem, other]
-      near[:, 2 * side + k] = np.where(index >= 0, index, own)
-      gain[:, 1 + 2 * side + k] = np.where(index >= 0, hinge.gain[elem, c, other], 0.0)
-  return near, gain

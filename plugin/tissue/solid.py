@@ -19,6 +19,9 @@ from .types import empty
 
 EDGES = 2  # by which cuts may divide edges, for one spare vertex
 _WINDOW = 8 * LANES  # edges that are sorted by the number of their tetrahedra
+# Times their own mass that nodes may be heavier in modes that the matrix makes too stiff, before a
+# step takes a second Newton iteration, and a third.
+_HEAVY = (500.0, 4e3)
 
 
 def capsule(config: Config) -> Config:
@@ -62,6 +65,27 @@ def moduli(mesh: Mesh, config: Config) -> tuple[np.ndarray, np.ndarray]:
   """
   shear, lame = configuration.lame_solid(young(mesh, config), config.poisson)
   return 4 / 3 * shear, lame
+
+
+def iterations(mesh: Mesh, config: Config, mass: np.ndarray, gain: float) -> int:
+  """Returns how many Newton iterations a step of a solid takes at least.
+
+  The matrix has the resistance to a change of volume in each tetrahedron, the energy in means of
+  them: in most modes the matrix is stiffer, and a step is as if these were heavier by gain times
+  the difference. A solid that is much heavier so swings when it is let go.
+
+  Args:
+    mesh: the solid
+    config: its configuration
+    mass: of each node [kg], (nvert,)
+    gain: factor of K in the matrix of a step [s^2]
+  """
+  lame = configuration.lame_solid(young(mesh, config), config.poisson)[1]
+  stiffness = lame * volumes(mesh.rest, mesh.tet)
+  share = stiffness[:, None] * (gradients(mesh) ** 2).sum(axis=2)
+  nodal = np.bincount(mesh.tet.ravel(), share.ravel(), mesh.nvert)
+  heavier = gain * np.median((nodal / np.maximum(mass, 1e-300))[mass > 0])
+  return 1 + sum(bool(heavier > limit) for limit in _HEAVY)
 
 
 def arrays(mesh: Mesh, config: Config, vert: np.ndarray, node: np.ndarray) -> dict[str, Any]:

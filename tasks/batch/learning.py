@@ -46,7 +46,8 @@ class Settings:
 
   Attributes:
     seed: of what is random
-    hidden: sizes of the layers
+    memory: numbers that the actor remembers
+    hidden: sizes of the layers, above the actor's memory and of the critic
     gamma: discount of a control step [-]
     lam: of generalised advantages [-]
     epochs: passes over the steps of an iteration
@@ -58,7 +59,8 @@ class Settings:
   """
 
   seed: int = 0
-  hidden: tuple[int, ...] = (128, 128)
+  memory: int = 96
+  hidden: tuple[int, ...] = (64,)
   gamma: float = 0.99
   lam: float = 0.95
   epochs: int = 5
@@ -95,7 +97,7 @@ class Learner:
     """
     torch.manual_seed(settings.seed)
     self.settings, self.networks = settings, networks
-    self.env = RslRl(env, settings.seed, networks.groups)
+    self._begin(env, settings.seed)
     self.iteration, self.steps, self.seconds = 0, 0, seconds
     self._count = max(_SHORT, math.ceil(LEAST / env.num_envs))
     seen, count = self.env.get_observations(), self.env.num_actions
@@ -120,8 +122,22 @@ class Learner:
     with torch.no_grad():
       for _ in range(self._count):
         seen.append(self.env.get_observations())
-        self.env.step(self.networks.actor(seen[-1], stochastic_output=True))
+        self._step(self.networks.actor(seen[-1], stochastic_output=True))
+    self.networks.actor.reset()
     self.networks.normalise(torch.cat(seen))
+
+  def _step(self, said: torch.Tensor):
+    """Does what the actor says."""
+    action = self.networks.action(said, self._last)
+    found = self.env.step(action)
+    self._last = action * (1 - found[2])[:, None]
+    return found
+
+  def _begin(self, env: Exercises, seed: int) -> None:
+    """Begins episodes in all worlds."""
+    self.env = RslRl(env, seed, self.networks.groups)
+    self.networks.actor.reset()
+    self._last = torch.zeros(self.env.num_envs, self.env.num_actions, device=self.env.device)
 
   def iterate(self, stop: Callable[[], bool] = lambda: False) -> dict[str, float] | None:
     """Learns from some steps of all worlds; returns `ROW`, or None if it was to stop."""
@@ -133,7 +149,7 @@ class Learner:
           ppo.storage.clear()
           return None
         action = ppo.act(env.get_observations())
-        seen, reward, over, extras = env.step(action)
+        seen, reward, over, extras = self._step(action)
         ppo.process_env_step(seen, reward, over, extras)
         if extras["log"]:
           ended.append(extras["log"])
@@ -170,17 +186,20 @@ class Learner:
 
   def judge(self, stop: Callable[[], bool] = lambda: False) -> float:
     """Returns the share of successes without spread, of an episode in each world."""
-    env = self.env = RslRl(self.env.env, _JUDGED, self.networks.groups)
+    self._begin(self.env.env, _JUDGED)
+    env = self.env
     won = torch.zeros(env.num_envs, device=env.device)
     playing = torch.ones_like(won)
     with torch.no_grad():
       while playing.any() and not stop():
         action = self.networks.actor(env.get_observations())
-        _, _, over, extras = env.step(action)
+        _, _, over, extras = self._step(action)
+        self.networks.actor.reset(over)
         if extras["log"]:
           ended = over.bool()
           won[ended] += playing[ended] * extras["log"]["/success"]
           playing[ended] = 0.0
+    self.networks.actor.reset()
     return float(won.mean())
 
   # Files.
@@ -236,8 +255,7 @@ class Learner:
     for group in ppo.optimizer.param_groups:
       group["lr"] = ppo.learning_rate
     torch.manual_seed(self.settings.seed + self.iteration)
-    seed = self.settings.seed + self.iteration * self.env.num_envs
-    self.env = RslRl(self.env.env, seed, self.networks.groups)
+    self._begin(self.env.env, self.settings.seed + self.iteration * self.env.num_envs)
 
 
 def _below(tensors: dict[str, Any], prefix: str) -> dict[str, Any]:

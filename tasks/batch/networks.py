@@ -1,9 +1,11 @@
 # pyright: reportMissingImports=false
 """The networks that learn: an actor, which goes into a policy, and a critic.
 
-An actor that is taught does not see velocities and what the drives are behind: they tell what was
-done before, and who copies an expert by that does not look (de Haan, Jayaraman and Levine 2019,
-10.48550/arXiv.1905.11979). Nor does it see the far parts of the organ. A critic sees all.
+The actor has a memory: an expert's script does one thing after the other, and what comes next
+cannot be seen in every moment. When it is taught it does not see velocities and what the drives are
+behind: they tell what was done before, and who copies an expert by that does not look (de Haan,
+Jayaraman and Levine 2019, 10.48550/arXiv.1905.11979). Nor does it see the far parts of the organ.
+The critic sees all, and remembers nothing.
 """
 
 from __future__ import annotations
@@ -17,25 +19,31 @@ import torch
 from palpate.tasks import policy
 from palpate.tasks.lessons import Lesson
 from palpate.tasks.observation import ROWS
-from rsl_rl.models import MLPModel
+from rsl_rl.models import MLPModel, RNNModel
 from tensordict import TensorDict
 from torch.nn.functional import smooth_l1_loss
+from torch.nn.utils.rnn import pad_sequence
 
 HIDDEN = ("joint_vel", "drive", "tip_vel", "surface")  # from an actor that is taught
 ACTING, MORE = "acting", "more"  # groups of observations
-CLONING = 3000  # steps of the optimiser at most
-_BATCH, _RATE = 1024, 2e-3
-_FINE = 0.05  # errors above count by their size, not their square: a touch is small motion [-]
+CHANGES = ("jaw",)  # components that an actor says as changes: jaws close by and by
+POWER = 2.0  # an action is what the actor says times its size: slow motion is as clear as fast
+CLONING = 700  # steps of the optimiser of a round
+_BATCH, _RATE = 32, 3e-3  # lessons of a step
+_FINE = 0.1  # errors above count by their size, not their square [-]
+_SELDOM = 0.01  # least mean size of a component: what is said seldom counts more [-]
+_LAST = 50  # steps of the optimiser that the error is a mean of
 _KNOWN = 0.05  # share of `_VARY` that is enough where lessons have shown the whole
-_REHEARSING, _CAREFUL = 10, 0.2  # steps an iteration, learning rate over that of practice
+_REHEARSING, _CAREFUL = 5, 0.2  # steps an iteration, learning rate over that of practice
 # How much observations vary at least, by their unit: tissue that is not touched yet will be.
 _VARY = {"m": 0.005, "m/s": 0.01, "rad": 0.05, "rad/s": 0.1, "N": 0.3, "-": 0.3}
+_GATES = ("weight_ih", "weight_hh", "bias_ih", "bias_hh")  # of torch, as a policy has them
 _STILL = 1e-6  # standard deviation of what has not changed, and may be anything
 
 
 def grouped(names: Sequence[str], taught: bool) -> dict[str, list[str]]:
   """Returns what is observed in the groups of the networks."""
-  hidden = [name for name in names if taught and name in HIDDEN]
+  hidden = [name for name in names if taught and name.endswith(HIDDEN)]
   found = {ACTING: [name for name in names if name not in hidden], MORE: hidden}
   return {group: chosen for group, chosen in found.items() if chosen}
 
@@ -53,7 +61,8 @@ class Networks:
   def __init__(
     self,
     shapes: Mapping[str, tuple[int, ...]],
-    count: int,
+    components: Sequence[str],
+    memory: int,
     hidden: Sequence[int],
     spread: float,
     seed: int,
@@ -64,8 +73,9 @@ class Networks:
 
     Args:
       shapes: of what is observed, by name
-      count: of the components of an action
-      hidden: sizes of the layers
+      components: of an action
+      memory: numbers that the actor remembers
+      hidden: sizes of the layers, above the actor's memory and of the critic
       spread: standard deviation of the actions [-]
       seed: of the weights, and of the order of what is learned
       device: of torch
@@ -75,23 +85,29 @@ class Networks:
     self.groups, self.device, self.lessons = grouped(list(shapes), taught), device, 0
     self._shapes: dict[str, tuple[int, ...]] = dict(shapes)
     self._memory: Any = None
+    self._components, self._begun = list(components), False
+    self._changes = [name for name in components if name in CHANGES]
+    self._adds = torch.tensor([float(name in CHANGES) for name in components], device=device)
     seen = TensorDict(
       {g: torch.zeros(1, self._width(names)) for g, names in self.groups.items()}, batch_size=[1]
     )
     common = {"hidden_dims": list(hidden), "activation": "tanh", "obs_normalization": True}
     gaussian = {"class_name": "GaussianDistribution", "init_std": spread, "std_type": "log"}
     sets = {"actor": [ACTING], "critic": list(self.groups)}
-    self.actor: Any = MLPModel(
-      seen, sets, "actor", count, distribution_cfg=gaussian, **common
-    ).to(device)  # fmt: skip
+    recurrent: dict[str, Any] = {"rnn_type": "gru", "rnn_hidden_dim": memory}
+    recurrent["distribution_cfg"], count = gaussian, len(components)
+    self.actor: Any = RNNModel(seen, sets, "actor", count, **recurrent, **common).to(device)
     self.critic: Any = MLPModel(seen, sets, "critic", 1, **common).to(device)
-    self._last: Any = torch.optim.Adam(self.actor.mlp.parameters())
+    self._last: Any = torch.optim.Adam(self._parts())
+
+  def _parts(self) -> list[Any]:
+    return [*self.actor.rnn.parameters(), *self.actor.mlp.parameters()]
 
   def _width(self, names: Sequence[str]) -> int:
     return sum(math.prod(self._shapes[name]) for name in names)
 
   def normalise(self, seen: TensorDict) -> None:
-    """Learns how large observations are, once: what changed it later would change the policy."""
+    """Learns how large observations are; what was learned with others says the same as before."""
     for model in (self.actor, self.critic):
       every = torch.cat([seen[group] for group in model.obs_groups], dim=1)
       names = [name for group in model.obs_groups for name in self.groups[group]]
@@ -99,9 +115,38 @@ class Networks:
       std = torch.where(std < _STILL, torch.full_like(std, _VARY["-"]), std)
       share = _KNOWN if self.lessons else 1.0
       std = torch.maximum(std, share * self._least(names).to(std))
-      known, model.obs_normalizer.eps = model.obs_normalizer.state_dict(), 0.0
-      known["_mean"][:], known["_std"][:], known["_var"][:] = every.mean(dim=0), std, std.square()
-      model.obs_normalizer.until = 0
+      if self._begun:
+        _rescale(model, every.mean(dim=0), std)
+      self._scale(model, every.mean(dim=0), std)
+    self._begun = True
+
+  def _scale(self, model: Any, mean: torch.Tensor, std: torch.Tensor) -> None:
+    known, model.obs_normalizer.eps = model.obs_normalizer.state_dict(), 0.0
+    known["_mean"][:], known["_std"][:], known["_var"][:] = mean, std, std.square()
+    model.obs_normalizer.until = 0
+
+  def take(self, made: policy.Policy) -> None:
+    """Begins with what a policy of another exercise does; ValueError says why it cannot."""
+    for what, own, other in (
+      ("observes", self.groups[ACTING], made.about.observations),
+      ("moves", self._components, made.about.components),
+    ):
+      if list(own) != list(other):
+        raise ValueError(f"the policy {what} {', '.join(other)}, expected {', '.join(own)}")
+    weights, (mean, std) = self.actor.state_dict(), (made.mean, 1.0 / made.scale)
+    linear = [k.removesuffix(".weight") for k in weights if k.startswith("mlp") and "weight" in k]
+    arrays = dict(zip([f"rnn.rnn.{gate}_l0" for gate in _GATES], made.memory or (), strict=False))
+    for name, (weight, bias) in zip(linear, made.layers, strict=False):
+      arrays |= {f"{name}.weight": weight, f"{name}.bias": bias}
+    known = {k: v for k, v in weights.items() if k.startswith(("rnn", "mlp"))}
+    if {k: v.shape for k, v in arrays.items()} != {k: tuple(v.shape) for k, v in known.items()}:
+      raise ValueError("the policy is of another network")
+    if made.about.power != POWER or made.about.changes != self._changes:
+      raise ValueError("the policy says its actions otherwise")
+    for name, array in arrays.items():
+      known[name].copy_(torch.from_numpy(array))
+    self._scale(self.actor, *(torch.from_numpy(row).to(self.device) for row in (mean, std)))
+    self._begun = True
 
   def _least(self, names: Sequence[str]) -> torch.Tensor:
     """Returns how much each number that is observed varies at least."""
@@ -114,43 +159,77 @@ class Networks:
       out += least * (math.prod(self._shapes[name]) // len(least))
     return torch.tensor(out)
 
+  def action(self, said: torch.Tensor, last: torch.Tensor) -> torch.Tensor:
+    """Returns the action for what the actor says, after the last one."""
+    said = said.detach().clamp(-1.0, 1.0)
+    return (said * said.abs() ** (POWER - 1.0) + self._adds * last).clamp(-1.0, 1.0)
+
   # Lessons.
 
   def learn(self, lessons: Sequence[Lesson], stop: Callable[[], bool] = lambda: False) -> float:
     """Learns to do what was done in lessons, and what comes of it; returns the error."""
     self.remember(lessons)
-    seen, done, returns = self._memory
-    parameters = [*self.actor.mlp.parameters(), *self.critic.mlp.parameters()]
+    parameters = [*self._parts(), *self.critic.mlp.parameters()]
     optimiser = torch.optim.Adam(parameters, lr=_RATE)
     falling = torch.optim.lr_scheduler.OneCycleLR(optimiser, _RATE, total_steps=CLONING)
-    loss = torch.zeros(())
+    losses = []
     for _ in range(CLONING):
       if stop():
         break
-      rows = torch.randint(len(done), (min(_BATCH, len(done)),), device=self.device)
-      some = seen[rows]
-      loss = smooth_l1_loss(self.actor(some), done[rows], beta=_FINE)
-      both = loss + (self.critic(some) - returns[rows]).square().mean()
+      some = self._some()
+      loss = self._error(some)
+      values = self.critic(some["seen"]).squeeze(-1)
+      both = loss + (some["present"] * (values - some["returns"]).square()).mean()
       optimiser.zero_grad()
       both.backward()
+      torch.nn.utils.clip_grad_norm_(parameters, 1.0)
       optimiser.step()
       falling.step()
-    return float(loss.detach())
+      losses.append(loss.detach())
+    return float(torch.stack(losses[-_LAST:]).mean()) if losses else math.nan
 
   def remember(self, lessons: Sequence[Lesson]) -> None:
     """Keeps lessons to learn from and to rehearse, and learns how large observations are."""
-    every = torch.cat([torch.from_numpy(lesson.seen) for lesson in lessons])
-    widths = [math.prod(shape) for shape in self._shapes.values()]
-    parts = dict(zip(self._shapes, every.split(widths, dim=1), strict=True))
-    seen = TensorDict(
-      {g: torch.cat([parts[name] for name in names], dim=1) for g, names in self.groups.items()},
-      batch_size=[len(every)],
-    )
-    done = torch.cat([torch.from_numpy(lesson.done) for lesson in lessons]).clamp(-1.0, 1.0)
-    returns = torch.cat([torch.from_numpy(lesson.returns) for lesson in lessons])[:, None]
     self.lessons = len(lessons)
-    self._memory = seen.to(self.device), done.to(self.device), returns.to(self.device)
-    self.normalise(self._memory[0])
+    whole = sorted((each for each in lessons if len(each.done)), key=lambda each: len(each.done))
+    self._memory = [self._read(lesson) for lesson in whole]
+    every = torch.cat([each["seen"] for each in self._memory])
+    self.normalise(every)
+    done = torch.cat([each["says"][each["taught"] > 0] for each in self._memory])
+    size = (done - done.median(dim=0).values).abs().mean(dim=0)
+    self._weights = 1.0 / (len(size) * size.clamp(min=_SELDOM))
+
+  def _read(self, lesson: Lesson) -> TensorDict:
+    """Returns a lesson on the device."""
+    flat, count = torch.from_numpy(lesson.seen), len(lesson.done)
+    widths = [math.prod(shape) for shape in self._shapes.values()]
+    parts = dict(zip(self._shapes, flat.split(widths, dim=1), strict=True))
+    groups = {g: torch.cat([parts[n] for n in names], dim=1) for g, names in self.groups.items()}
+    meant, done = torch.from_numpy(lesson.meant), torch.from_numpy(lesson.done)
+    last = torch.cat([torch.zeros_like(done[:1]), done[:-1]])
+    says = (meant - self._adds.cpu() * last).clamp(-1.0, 1.0)
+    rows = {
+      "seen": TensorDict(groups, batch_size=[count]),
+      "says": says.sign() * says.abs() ** (1.0 / POWER),
+      "taught": torch.from_numpy(lesson.taught).float(),
+      "returns": torch.from_numpy(lesson.returns),
+      "present": torch.ones(count),
+    }
+    return TensorDict(rows, batch_size=[count]).to(self.device)
+
+  def _some(self) -> TensorDict:
+    """Returns lessons that are about as long, padded  (nstep, nlesson)."""
+    first = int(torch.randint(1 - _BATCH // 2, len(self._memory), ()))
+    chosen = self._memory[max(first, 0) : max(first + _BATCH, 1)]
+    return TensorDict.from_dict(_padded(chosen), batch_size=[len(chosen[-1]), len(chosen)])
+
+  def _error(self, some: TensorDict) -> torch.Tensor:
+    """Returns how far the actor is from what was meant, each component by its size in lessons."""
+    actor = self.actor
+    latent, _ = actor.rnn.rnn(actor.obs_normalizer(some["seen"][ACTING]))
+    error = smooth_l1_loss(actor.mlp(latent), some["says"], beta=_FINE, reduction="none")
+    taught = some["taught"]
+    return ((error @ self._weights) * taught).sum() / taught.sum().clamp(min=1.0)
 
   def rehearse(self, rate: float) -> None:
     """Goes over some of what it was taught, so that practice does not make it forget the manner.
@@ -161,10 +240,8 @@ class Networks:
     if self._memory is None:
       return
     self._last.param_groups[0]["lr"] = _CAREFUL * rate
-    seen, done, _ = self._memory
     for _ in range(_REHEARSING):
-      rows = torch.randint(len(done), (min(4 * _BATCH, len(done)),), device=self.device)
-      loss = smooth_l1_loss(self.actor(seen[rows]), done[rows], beta=_FINE)
+      loss = self._error(self._some())
       self._last.zero_grad()
       loss.backward()
       self._last.step()
@@ -188,12 +265,38 @@ class Networks:
     weights = {k: v.detach().cpu().numpy() for k, v in self.actor.state_dict().items()}
     linear = sorted(int(k.split(".")[1]) for k in weights if k.startswith("mlp.") and "weight" in k)
     about = policy.About(
-      task.name, tuple(task.components), self.groups[ACTING], task.control_timestep,
+      task.name, tuple(task.components), self.groups[ACTING], task.control_timestep, POWER,
+      self._changes,
       dict(task_kwargs), {"palpate": palpate.__version__, **training},
     )  # fmt: skip
+    memory: Any = tuple(weights[f"rnn.rnn.{name}_l0"] for name in _GATES)
     return policy.Policy(
       about,
       weights["obs_normalizer._mean"][0],
       1.0 / (weights["obs_normalizer._std"][0] + self.actor.obs_normalizer.eps),
       [(weights[f"mlp.{k}.weight"], weights[f"mlp.{k}.bias"]) for k in linear],
+      memory,
     )
+
+
+def _rescale(model: Any, mean: torch.Tensor, std: torch.Tensor) -> None:
+  """Changes the first weights of a network so that it says the same with another scale."""
+  first = model.mlp[0]
+  weight, bias = first.weight, first.bias
+  if model.is_recurrent:
+    weight, bias = model.rnn.rnn.weight_ih_l0, model.rnn.rnn.bias_ih_l0
+  known = model.obs_normalizer.state_dict()
+  with torch.no_grad():
+    bias += weight @ ((mean - known["_mean"][0]) / known["_std"][0])
+    weight *= std / known["_std"][0]
+
+
+def _padded(parts: Sequence[TensorDict]) -> dict[str, Any]:
+  """Returns what has rows of different number as columns, with zeros below."""
+  keys = parts[0].keys()
+  return {
+    key: _padded([part[key] for part in parts])
+    if isinstance(parts[0][key], TensorDict)
+    else pad_sequence([part[key] for part in parts])
+    for key in keys
+  }

@@ -1,19 +1,19 @@
-"""Palpation in arrays, see `tasks.probe.Palpate`."""
+"""Palpation in arrays, see `tasks.palpation.Palpate`."""
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 from typing import Any
 
 import warp as wp
 from palpate.models import shapes
-from palpate.tasks import probe, scenes
+from palpate.tasks import palpation, scenes
 from palpate.tissue.types import Array, floats, struct
 
 from . import domain
 from .fields import MISSED, RUNNING, SUCCESS, Common
 from .kernels import error, judge, put, reach, vector
 
-_FEELING, _FELT = wp.constant(probe.FEELING), wp.constant(probe.FELT)
-_REPORT = wp.constant(probe.REPORT)
+_FEELING, _FELT = wp.constant(palpation.FEELING), wp.constant(palpation.FELT)
+_REPORT = wp.constant(palpation.REPORT)
 
 
 @struct

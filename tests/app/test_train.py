@@ -12,6 +12,7 @@ for name in ("gymnasium", "torch", "rsl_rl", "safetensors"):
 import torch  # noqa: E402
 from palpate.tasks import policy  # noqa: E402
 from palpate.tasks.batch import learning, networks, rsl, vector  # noqa: E402
+from palpate.tasks.lessons import Lesson  # noqa: E402
 
 SMALL = ["--device", "cpu", "--num-envs", "2", "--processes", "1", "--set", "time_limit=0.4"]
 
@@ -27,12 +28,13 @@ def train(folder, *words, lessons=0):
 def short(monkeypatch):
   monkeypatch.setattr(learning, "LEAST", 48)
   monkeypatch.setattr(networks, "CLONING", 20)
+  monkeypatch.setattr("palpate.app.train.ROUNDS", 2)
 
 
 def learner(env, **settings):
   space, chosen = env.single_observation_space, learning.Settings(**settings)
   shapes = {name: space[name].shape for name in space.spaces}
-  made = networks.Networks(shapes, 4, (8,), chosen.spread, 0, "cpu")
+  made = networks.Networks(shapes, env.task.components, 8, (8,), chosen.spread, 0, "cpu")
   return learning.Learner(env, chosen, made)
 
 
@@ -67,18 +69,54 @@ def test_an_expert_teaches_before_practice(tmp_path, capsys):
   assert names == {"lessons.npz", "policy.safetensors", "LICENSE"}
   with np.load(folder / "lessons.npz") as file:
     lengths, before = file["lengths"], file["seen"]
-  assert len(lengths) == 3 * 2 and (lengths[:2] == 20).all()
-  assert (lengths[2:] < 20).any()  # the policy takes turns with the expert
+    taught = np.split(file["taught"], np.cumsum(lengths)[:-1])
+  assert len(lengths) == 2 * 2 and (lengths == 20).all()
+  assert taught[0][0] and not taught[2][0]  # the policy begins, and takes turns with the expert
   assert train(folder, lessons=2) == 2  # nothing is written over
   assert train(folder, "--iterations", "1", "--resume", lessons=2) == 0
   assert [row["iteration"] for row in rows(folder)] == [1]
   with np.load(folder / "lessons.npz") as file:
     assert np.array_equal(file["seen"], before)
-  assert policy.load(folder / "policy.safetensors").about.training["lessons"] == 6
+  assert policy.load(folder / "policy.safetensors").about.training["lessons"] == 4
   capsys.readouterr()
   words = ["train", "touch/easy", "-o", str(tmp_path / "b"), *SMALL, "--set", VARIED]
   assert cli.main([*words, "--lessons", "1"]) == 0
   assert "taught, not practised: touch/easy: randomise is given" in capsys.readouterr().err
+
+
+def test_lessons_begin_with_the_policy_of_an_easier_exercise(tmp_path, capsys):
+  assert train(tmp_path / "a", "--iterations", "0", lessons=1) == 0
+  start = tmp_path / "a" / "policy.safetensors"
+  words = [*SMALL, "--lessons", "1", "--iterations", "0", "--from", str(start)]
+  assert cli.main(["train", "touch/standard", "-o", str(tmp_path / "b"), *words]) == 0
+  with np.load(tmp_path / "b" / "lessons.npz") as file:
+    assert not file["taught"][0]  # it begins
+  assert policy.load(tmp_path / "b" / "policy.safetensors").about.training["from"] == start.name
+  capsys.readouterr()
+  assert cli.main(["train", "grasp/easy", "-o", str(tmp_path / "c"), *words]) == 2
+  assert "from: the policy observes joints" in capsys.readouterr().err
+
+
+def test_networks_take_up_a_policy_and_keep_it_where_observations_vary_otherwise():
+  env = vector.Exercises(1, "touch/easy", device="cpu", output="torch", time_limit=0.1)
+  shapes = {name: env.single_observation_space[name].shape for name in env.single_observation_space}
+  first, second = (
+    networks.Networks(shapes, env.task.components, 8, (8,), 0.1, seed, "cpu") for seed in (0, 1)
+  )
+  count = sum(int(np.prod(shape)) for shape in shapes.values())
+  random = np.random.RandomState(0)
+  rows = [random.randn(9, count), *(random.rand(9, 4) for _ in range(2))]
+  lesson = [row.astype(np.float32) for row in (*rows, np.ones(9), np.ones(9))]
+  for made, size in ((first, 1.0), (second, 3.0)):
+    seen = Lesson(size * lesson[0], *lesson[1:], "success", False)
+    if made is second:
+      made.take(first.policy(env.task, {}, {}))
+    made.remember([seen])
+  env.close()
+  one, other = (made.policy(env.task, {}, {}).begin() for made in (first, second))
+  for _ in range(3):
+    seen = {name: random.randn(*shape) for name, shape in shapes.items()}
+    np.testing.assert_allclose(one(seen), other(seen), atol=1e-4)
 
 
 def test_a_policy_is_judged_by_an_episode_in_each_world():

@@ -91,13 +91,15 @@ def test_a_missing_file_is_named(tmp_path, wrap):
   assert code == 2 and "none.obj" in said
 
 
-def test_a_mesh_called_scene_is_an_organ(tmp_path, wrap):
+def test_a_mesh_called_scene_is_an_organ_solid_or_not(tmp_path, wrap):
   """The usual name of a glTF file is the name of the scene's file as well."""
-  for out, name in (("spleen", "spleen"), ("scene", "organ")):
+  for out, name, kind in (("spleen", "spleen", ["--solid"]), ("scene", "organ", [])):
     mesh = _mesh(tmp_path / "scene.glb")
-    assert wrap(mesh, "-o", out, "--nodes", 64, "--accept-losses")[0] == 0
+    assert wrap(mesh, "-o", out, "--nodes", 64, "--accept-losses", *kind)[0] == 0
     model = mujoco.MjModel.from_xml_path(str(tmp_path / out / "scene.xml"))
-    assert palpate.Organ(model, mujoco.MjData(model), f"{name}/{name}").nvert == 64
+    organ = palpate.Organ(model, mujoco.MjData(model), f"{name}/{name}")
+    assert organ.nvert == 64 and (organ.config.elements == "solid") == bool(kind)
+    assert (organ.config.foundation == 0) == bool(kind)
 
 
 def _two(path):

@@ -175,8 +175,12 @@ def test_contacts_have_the_normal_forces(make, cone):
   np.testing.assert_allclose(pushed[:, 2], found[:, 2], rtol=0.03)
 
 
-def test_a_solid_is_that_of_the_plugin(make):
-  made = probed(keys={"elements": "solid", "young": 3e3, "foundation": None})
+@pytest.mark.parametrize(
+  ("window", "skin"), [(True, {}), (False, {"capsule_young": 1e5, "thickness": 3e-4})]
+)
+def test_a_solid_is_that_of_the_plugin(make, window, skin):
+  solid = {"elements": "solid", "young": 3e3, "foundation": None} | skin
+  made = probed(window, keys=solid)
   batch, organ, found = slid_beside(make, made, 100, aside=0.005, wait=70)
   assert np.sqrt(np.mean((found[:, 0] - found[:, 1]) ** 2)) < 0.005 * np.abs(found[:, 1]).max()
   np.testing.assert_allclose(batch.organ("organ").xpos.numpy()[0], organ.xpos, atol=2e-5)

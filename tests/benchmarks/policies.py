@@ -1,6 +1,7 @@
 """Policies that were trained: how often each succeeds in the single environment on the CPU.
 
 `palpate train` makes them, all in the same way. Seeds from 0 on, which no policy has learned from.
+`--worlds 4096` lets them play in so many worlds side by side as well, on a GPU where there is one.
 """
 
 from __future__ import annotations
@@ -10,21 +11,24 @@ import collections
 import pathlib
 
 import numpy as np
+import palpate
 from benchmarks import plots, results
 from benchmarks.runner import Bench, Case, Row
 from palpate import tasks
 from palpate.app import evaluate
-from palpate.tasks import policy, score
+from palpate.tasks import policy, registry, score
 from palpate.tasks.metrics import Metrics
 
 NAMES = ["/".join(pair) for pair in tasks.ALL_TASKS]
 _EPISODES, _BLOCK = 50, 5  # of a policy, of a case
+_OTHERS = 1_000_000  # seed of the first of many worlds
 
 
 def arguments(parser: argparse.ArgumentParser):
   """Declares the options."""
   add = parser.add_argument
   add("--policies", metavar="FOLDER", default=str(policy.FOLDER), help="those that ship")
+  add("--worlds", metavar="N", type=int, default=0, help="side by side, besides")
   add("--tasks", nargs="+", metavar="TASK", choices=NAMES, default=NAMES)
 
 
@@ -37,11 +41,16 @@ def stages(args: argparse.Namespace) -> list[list[Case]]:
       if file.exists():
         case = {"case": f"{name}, from {start}", "task": name, "file": str(file), "start": start}
         cases.append(case | {"end": min(start + _BLOCK, count)})
+        if args.worlds and not start:
+          cases.append({**case, "case": f"{name}, {args.worlds} worlds", "worlds": args.worlds})
   return [cases]
 
 
 def run(case: Case, out: pathlib.Path) -> list[Row]:
-  """Returns a row an episode."""
+  """Returns a row an episode, or one for many worlds."""
+  if case.get("worlds"):
+    won = _side_by_side(case["task"], case["file"], case["worlds"])
+    return [{"task": case["task"], "worlds": case["worlds"], "won": won}]
   name, seeds = case["task"], range(case["start"], case["end"])
   training, reference = policy.load(case["file"]).about.training, score.reference(name)
   rows = []
@@ -50,7 +59,7 @@ def run(case: Case, out: pathlib.Path) -> list[Row]:
     row = {"task": name, "seed": result.seed, "outcome": result.outcome}
     row |= {"time_s": round(result.time, 2), "lessons": training.get("lessons", 0)}
     row |= {"steps": training.get("steps", 0), "train_s": training.get("seconds", 0)}
-    row |= {"proficient": "", "peak_force_N": ""}
+    row |= {"proficient": "", "peak_force_N": "", "worlds": "", "won": ""}
     if result.metrics:
       metrics = Metrics.from_json(result.metrics)
       row["peak_force_N"] = round(metrics.peak_force, 3)
@@ -61,15 +70,38 @@ def run(case: Case, out: pathlib.Path) -> list[Row]:
   return rows
 
 
+def _side_by_side(name: str, file: str, count: int) -> int:
+  """Returns how many worlds a policy succeeds in."""
+  import gymnasium
+
+  palpate.register()
+  env = gymnasium.make_vec(registry.gym_id(*name.split("/")), num_envs=count)
+  act, (seen, _) = policy.load(file).begin(count), env.reset(seed=_OTHERS)
+  playing, won = np.ones(count, bool), 0
+  while playing.any():
+    seen, _, terminated, truncated, info = env.step(act(seen).astype(np.float32))
+    over = terminated | truncated
+    if over.any():
+      won += int((playing & over & info["final_info"]["success"]).sum())
+    playing &= ~over
+  env.close()
+  return won
+
+
 def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
   """Writes the page: a line an exercise."""
   groups: dict[str, list[Row]] = collections.defaultdict(list)
+  many: dict[str, str] = {}
   for row in rows:
-    if row["status"] == "ok":
+    if row["status"] == "ok" and row.get("worlds"):
+      many[row["task"]] = f"{100 * int(row['won']) / int(row['worlds']):.1f} % of {row['worlds']}"
+    elif row["status"] == "ok":
       groups[row["task"]].append(row)
   head = ["exercise", "lessons", "control steps of practice", "training [s]", "success",
-          "proficient", "time of a success [s]", "ends otherwise"]  # fmt: skip
-  table = [_line(name, groups[name]) for name in NAMES if name in groups]
+          "proficient", "time of a success [s]", "ends otherwise", "side by side"]  # fmt: skip
+  table = [
+    [*_line(name, groups[name]), many.get(name, "-")] for name in NAMES if name in groups
+  ]
   lines = [*(__doc__ or "").split("\n\n", 1)[1].splitlines(), ""]
   lines += ["Proficient by the experts' limits, of all episodes. "
             + results.link(out / "policies.csv"), "", *plots.table(head, table)]  # fmt: skip

@@ -15,6 +15,7 @@ BENCHES = {
   "attacks": "what random attacks break",
   "batch": "world-steps a second of batches, and what a world takes",
   "cloning": "behaviour cloning: success over the number of demonstrations",
+  "cut": "steps in which an organ is cut, beside steps in contact",
   "error": "run time against error, beside MuJoCo's own flex",
   "experts": "how many of its episodes each expert solves; the references",
   "flicker": "steps without force while a probe presses the organs that ship",

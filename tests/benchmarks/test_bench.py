@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import palpate
 import pytest
-from benchmarks import compare, error, films, results, run, runner, scene, stability, thesis
+from benchmarks import compare, error, films, judge, results, run, runner, scene, stability, thesis
 from palpate.engine import weights
 from palpate.tissue import energy
 from palpate.tissue.config import Config
@@ -188,6 +188,13 @@ def test_native_flex_on_mujoco_3_keeps_an_error_that_no_time_step_takes_away(err
 
 
 # Stability.
+
+
+def test_a_stiff_solid_that_keeps_its_volume_comes_to_rest(tmp_path):
+  case = next(c for c in stability_cases("--short") if c["side"] == "solid, nu 0.49")
+  assert case["young"] == 1e6 and case["h"] == 5e-3
+  (row,) = judge.run(case, tmp_path)
+  assert row["verdict"] == "rest" and row["growth"] < 0.7
 
 
 def test_stability_bench_judges_every_case_and_resumes(tmp_path, capsys, monkeypatch):

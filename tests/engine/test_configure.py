@@ -2,6 +2,7 @@
 
 import mujoco
 import numpy as np
+import palpate
 import pytest
 from palpate import models
 from palpate.tissue.step import SCHEMES
@@ -127,3 +128,17 @@ def test_the_stiffness_of_springs_changes(scenes):
     deep.append(organ.displacement)
   np.testing.assert_array_equal(deep[1], deep[2])
   assert np.abs(deep[0]).max() > 1.1 * np.abs(deep[1]).max()
+
+
+def test_a_copy_has_the_configuration_after_a_change_of_the_time_step(scenes):
+  model, data, organ = scenes.load(scenes.probed())
+  organ.configure(young=6e4, damping=0.01)
+  model.opt.timestep = 2e-3
+  scenes.run(model, data, 80, deepest=0.004)
+  copied = mujoco.MjData(model)
+  mujoco.mj_copyData(copied, model, data)
+  other = palpate.Organ(model, copied, "organ")
+  assert other.config == organ.config
+  for each in (data, copied):
+    mujoco.mj_step(model, each, nstep=5)
+  np.testing.assert_array_equal(other.xpos, organ.xpos)

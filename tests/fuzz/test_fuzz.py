@@ -1,4 +1,4 @@
-"""Random cases by seed: a few always, ten thousand of each kind with `-m slow`.
+"""Random cases by seed: a few always, and as many of each kind as LONG says with `-m slow`.
 
 A seed that failed is run again with `python -m pytest tests/fuzz -k KIND --seed N`.
 """
@@ -9,8 +9,8 @@ import sys
 import pytest
 from fuzz import apart
 
-SHORT = {"configurations": 40, "meshes": 40, "files": 12}
-LONG = 10_000
+SHORT = {"configurations": 40, "meshes": 40, "files": 12, "cutters": 4}
+LONG = dict.fromkeys(SHORT, 10_000) | {"cutters": 1000}
 
 
 @pytest.mark.parametrize("kind", SHORT)
@@ -36,7 +36,7 @@ def test_what_is_not_mended_yet(kind, seed):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", SHORT)
 def test_many_cases(kind):
-  failed = apart.sweep(kind, LONG)
+  failed = apart.sweep(kind, LONG[kind])
   known = set(importlib.import_module(f"fuzz.{kind}").OPEN.values())
   assert not failed, f"{len(failed)} seeds, known are {known}"
 

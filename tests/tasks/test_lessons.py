@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from palpate import tasks
-from palpate.tasks import lessons, performer
+from palpate.tasks import lessons, performer, policy
 
 
 def played(env, act, until, most=400):
@@ -43,16 +43,44 @@ def test_a_lesson_is_what_the_expert_meant_from_its_turn_on():
   alone = lessons.give(env, names, 5, 0.5)
   assert alone.outcome == "success" and alone.seen.shape == (len(alone.done), 7)
   assert alone.returns[-1] > 0.6  # the reward of the end
+  assert alone.taught.all() and not alone.alone and np.array_equal(alone.meant, alone.done)
   assert np.allclose(alone.returns[:-1] - 0.5 * alone.returns[1:], rewards(env, 5), atol=1e-6)
   shaken = lessons.give(env, names, 5, 0.5, noise=0.2)
   assert shaken.outcome == "success"
   count = min(len(alone.done), len(shaken.done))
-  assert not np.allclose(shaken.done[:count], alone.done[:count], atol=0.05)
-  turns = []
-  both = lessons.give(env, names, 5, 0.5, learner=lambda seen: turns.append(1) or [0, 0, 0, -1.0])
-  assert both.outcome == "success" and len(turns) > 5
+  assert not np.allclose(shaken.meant[:count], alone.meant[:count], atol=0.05)
+  assert not np.allclose(shaken.meant, shaken.done, atol=0.05)
+  both = lessons.give(env, names, 5, 0.5, learner=says([0, 0, 0, -0.5]), most=20)
+  assert both.outcome == "success" and not both.alone and not both.taught[0]
+  assert (both.done[~both.taught] == [0, 0, 0, -0.5]).all() and 5 < both.taught.sum()
   far = np.linalg.norm(both.seen[:, :3], axis=1)
-  assert far[0] > np.linalg.norm(alone.seen[0, :3]) + 0.0005 * len(turns[:3])  # backed away
+  assert far[both.taught.argmax()] > far[0] + 0.0005  # it backed away
+
+
+def test_who_does_not_get_on_is_helped_and_what_did_not_help_is_not_learned():
+  env = tasks.load("touch", "easy", task_kwargs={"surroundings": "none"})
+  idle = lessons.give(env, ("target",), 5, 0.5, learner=says([0, 0, 0, 0]))
+  first = int(idle.taught.argmax())
+  assert lessons.PATIENCE[0] < first <= lessons.PATIENCE[1] + 1 and idle.outcome == "success"
+  env = tasks.load("touch", "easy", task_kwargs={"surroundings": "none", "time_limit": 0.4})
+  env.task.tolerance = 0.0  # nobody can touch it
+  lost = lessons.give(env, ("target",), 5, 0.5)
+  best = np.linalg.norm(lost.seen, axis=1).argmin()
+  assert lost.outcome == "time limit" and not lost.taught[best + 1 :].any()
+
+
+def test_a_policy_does_not_end_the_lesson_of_a_search():
+  env = tasks.load("probe", "palpate_easy", task_kwargs={"surroundings": "none", "time_limit": 5})
+  lesson = lessons.give(env, ("field",), 5, 0.5, learner=says([0, 0, 0, 0, 1.0]))
+  assert lesson.taught[0] and not lesson.alone and len(lesson.done) > 50
+
+
+def says(action):
+  """Returns a policy that always does the same."""
+  names = ("pitch", "yaw", "roll", "insertion", "report")[: len(action)]
+  about = policy.About("any", names, ("joints",), 0.02)
+  layers = [(np.zeros((len(action), 4)), np.array(action, float))]
+  return policy.Policy(about, np.zeros(4), np.ones(4), layers)
 
 
 def rewards(env, seed):

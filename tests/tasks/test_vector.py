@@ -14,7 +14,7 @@ from palpate.tasks import performer, registry  # noqa: E402
 # float32 of the batch against float64; jaws on a fold of tissue magnify it.
 LIMITS = {"contact_force": 0.02, "shaft_force": 0.02, "peak_force": 0.02, "gripper": 0.1}
 LIMITS |= {"joint_vel": 5e-3, "traction": 0.02}
-ENDING = "touch/easy", "trace/easy", "grasp/easy", "retract/easy", "tease/easy", "bimanual/easy"
+ENDING = "touch/easy", "trace/easy", "grasp/easy", "retract/easy", "bimanual/easy"
 
 
 def ids(task):
@@ -87,7 +87,7 @@ def compare_metrics(told, k, expected):
     ("grasp/easy", 1, 179, {"hold": 0.1, "lift": 0.003}),
     ("retract/easy", 1, 157, {"hold": 0.1, "wanted": 0.1}),
     ("dissect/easy", 1, 15, {}),
-    ("tease/easy", 1, 135, {"wanted": 0.03}),
+    ("tease/easy", 1, 95, {}),
     ("bimanual/easy", 1, 213, {"wanted": 0.03}),
   ],
 )

@@ -1,0 +1,210 @@
+"""Times steps in which an organ is cut, beside steps in which it is touched.
+
+    python tests/benchmarks/run.py cut
+
+A sheet of 15 by 10 cm (E = 30 kPa, t = 2 mm, h = 2 ms, windows), a membrane or with bending, pinned
+at its long sides, is cut by a blade at 80 mm/s, by scissors that close, by a hook's current at 14
+mm/s, or by `Organ.cut`, two edges at a time; the same sheet is pressed by a ball, with room for
+cuts and without. All three are stepped in turn. CPU time of the process; `open` are the steps in
+which the mesh came apart (with `Organ.cut` the call, and the step after it), `between` the others.
+"""
+
+import argparse
+import itertools
+import pathlib
+import time
+
+import mujoco
+import numpy as np
+import palpate
+import scenes
+from benchmarks import plots, results
+from benchmarks.runner import Bench, Case, Row
+from palpate.models import trocar
+
+H, LENGTH, WIDTH = 2e-3, 0.15, 0.10
+ENERGY, BURN, THICKNESS = 160.0, 1.1e6, 2e-3  # [J/m^2], of a current, of the wall [m]
+SLIDE, CAPSULE = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtGeom.mjGEOM_CAPSULE
+FREE = {"contype": 0, "conaffinity": 0}
+TOOLS = ("blade", "scissors", "hook", "Organ.cut")
+SPEED = {"blade": 0.08, "hook": 0.014}  # [m/s]
+STEPS = 900  # at most
+PIECE = 2.3  # edges that `Organ.cut` cuts at a time
+
+
+def _drive(spec, joint: str):
+  """Adds an actuator that moves a slide."""
+  spec.add_actuator(name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT,
+                    biastype=mujoco.mjtBias.mjBIAS_AFFINE, gainprm=[2000] + 9 * [0],
+                    biasprm=[0, -2000, 0] + 7 * [0])  # fmt: skip
+
+
+def _blade(spec, radius: float, half: float):
+  body = spec.worldbody.add_body(name="tool", pos=[0, 0, 0])
+  body.add_joint(type=SLIDE, axis=[1, 0, 0], name="x", damping=4)
+  _drive(spec, "x")
+  body.add_geom(pos=[0, 0, 0.03], size=[0.004, 0, 0], mass=0.1, **FREE)
+  body.add_geom(name="edge", type=CAPSULE, size=[radius, half, 0], mass=1e-3, **FREE)
+
+
+def scene(nodes: int, tool: str, bend: float):
+  """Returns model, data and organ of a sheet and what cuts it, or a ball that presses it."""
+  nx = round(np.sqrt(nodes * LENGTH / WIDTH * 0.87))
+  points, elem = scenes.triangular(LENGTH, WIDTH, nx, round(nx * WIDTH / LENGTH / 0.866), 0.2)
+  pin = np.flatnonzero(np.abs(np.abs(points[:, 1]) - WIDTH / 2) < 1e-9)
+  spec = mujoco.MjSpec()
+  spec.option.timestep, spec.option.gravity = H, (0, 0, 0)
+  keys = {"spare": "auto"}
+  if tool == "blade":
+    _blade(spec, 5e-4, 6e-3)
+    keys["cutters"] = f"edge {ENERGY}"
+  elif tool == "hook":
+    _blade(spec, 1e-3, 1e-3)
+    spec.add_actuator(name="power", target="x", trntype=mujoco.mjtTrn.mjTRN_JOINT)
+    spec.actuator("power").gainprm = 10 * [0]
+    keys["cutters"] = f"edge {BURN} by power"
+  elif tool == "scissors":
+    turn = (np.sqrt(0.5), 0, -np.sqrt(0.5), 0)
+    trocar.attach(spec, "scissors", "s/", pos=(LENGTH / 2 - 0.12, 0, 0), quat=turn)
+    keys |= {"cutters": f"s/edge_left s/edge_right {ENERGY}", "contact": FREE}
+  elif tool != "Organ.cut":
+    body = spec.worldbody.add_body(name="ball", pos=[LENGTH / 2, 0, 0.012])
+    body.add_joint(type=SLIDE, axis=[0, 0, 1], name="z", damping=4)
+    _drive(spec, "z")
+    body.add_geom(size=[0.008, 0, 0], mass=0.1)
+    keys = {} if tool == "plain" else keys
+  palpate.add_organ(spec, (points, elem), "organ", windows=True, mass=0.05, young=3e4, pin=pin,
+                    thickness=THICKNESS, bend=bend, device="cpu", **keys)  # fmt: skip
+  model = spec.compile()
+  data = mujoco.MjData(model)
+  return model, data, palpate.Organ(model, data, "organ")
+
+
+def _spent(work) -> float:
+  start = time.process_time()
+  work()
+  return 1e3 * (time.process_time() - start)
+
+
+def _cuts(model, data, organ, tool: str):
+  """Yields functions, each of which takes a step with the tool."""
+
+  def step():
+    mujoco.mj_step(model, data)
+
+  if tool in SPEED:
+    for k in range(min(STEPS, round((LENGTH - 0.01) / SPEED[tool] / H))):
+      data.ctrl[0] = SPEED[tool] * H * k
+      if tool == "hook":
+        data.ctrl[1] = 2 * SPEED[tool] * BURN * THICKNESS
+      yield step
+  elif tool == "scissors":
+    jaw = data.actuator("s/jaw")
+    for _ in range(2):
+      mujoco.mj_resetData(model, data)
+      data.joint("s/jaw_left").qpos[0] = data.joint("s/jaw_right").qpos[0] = 0.4
+      for opening in [*np.full(50, 0.8), *np.linspace(0.8, -0.1, 400)]:
+        jaw.ctrl[0] = opening
+        yield step
+  else:
+
+    def cut(line):
+      organ.cut(line)
+      step()
+
+    edge = organ.xpos0[organ.elem]
+    piece = PIECE * np.linalg.norm(edge[:, 1] - edge[:, 0], axis=1).mean()
+    for y in np.linspace(-0.03, 0.03, 3):
+      for x in np.arange(0.02, LENGTH - 0.02, piece):
+        yield lambda line=[[x, y, 0], [x + piece, y, 0]]: cut(line)
+        yield step
+
+
+def measure(nodes: int, tool: str, bend: float) -> dict:
+  """Returns medians of steps of the three sheets, in ms."""
+  cutting, touched, plain = (scene(nodes, name, bend) for name in (tool, "ball", "plain"))
+  for model, data, _ in (touched, plain):
+    for k in range(150):
+      data.ctrl[0] = -0.012 * min(1.0, k / 100)
+      mujoco.mj_step(model, data)
+  spent, opened = {"cut": [], "touched": [], "plain": []}, []
+  model, data, organ = cutting
+  for k, work in enumerate(_cuts(model, data, organ, tool)):
+    before = len(organ.cuts)
+    spent["cut"].append(_spent(work))
+    opened.append(len(organ.cuts) > before)
+    for name, (m, d, _) in (("touched", touched), ("plain", plain)) if k % 4 == 0 else ():
+      spent[name].append(_spent(lambda m=m, d=d: mujoco.mj_step(m, d)))
+  assert organ.error is None and touched[2].error is None, organ.error
+  opened, taken = np.array(opened), np.array(spent["cut"])
+  contact = float(np.median(spent["touched"]))
+  cuts = taken[opened]
+  return {
+    "nodes": touched[2].nvert,
+    "tool": tool,
+    "bend": bend,
+    "cuts": int(opened.sum()),
+    "contacts": touched[1].ncon,
+    "plain_ms": float(np.median(spent["plain"])),
+    "contact_ms": contact,
+    "between_ms": float(np.median(taken[~opened])),
+    "open_ms": float(np.median(cuts)),
+    "open_most_ms": float(np.quantile(cuts, 0.95)),
+    "mean_ms": float(taken.mean()),
+    "cut_ms": float(np.median(cuts) - np.median(taken[~opened])),
+    "ratio": float(np.median(cuts)) / contact,
+    "room_ratio": float(np.median(np.array(spent["touched"]) / np.array(spent["plain"]))),
+  }
+
+
+def stages(args: argparse.Namespace) -> list[list[Case]]:
+  """Returns a case a size and tool."""
+  nodes = args.nodes[:1] if args.short else args.nodes
+  return [
+    [
+      {"case": f"{n}-{tool}-{bend}", "nodes": n, "tool": tool, "bend": bend}
+      for n, bend, tool in itertools.product(nodes, (0, 1), TOOLS)
+    ]
+  ]
+
+
+def run(case: Case, out: pathlib.Path) -> list[Row]:
+  """Returns the row of a case."""
+  return [measure(case["nodes"], case["tool"], case["bend"])]
+
+
+def arguments(parser: argparse.ArgumentParser):
+  """Declares the options."""
+  parser.add_argument("--nodes", type=int, nargs="+", default=[1000, 4000])
+
+
+def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
+  """Writes the page."""
+  names = ("contact", "between", "mean", "cut", "open", "open_most")
+  table = [
+    [
+      str(row["nodes"]),
+      row["tool"],
+      "plate" if row["bend"] else "membrane",
+      str(row["cuts"]),
+      *(f"{row[f'{name}_ms']:.2f}" for name in names),
+      f"{row['ratio']:.2f}",
+      f"{row['room_ratio']:.3f}",
+    ]
+    for row in rows
+  ]
+  head = ["nodes", "tool", "tissue", "cuts", "in contact", "tool in it", "mean", "cut alone",
+          "step that cuts", "95 % of these", "to one in contact", "room to none"]  # fmt: skip
+  lines = [
+    "Milliseconds of CPU time, medians but for one mean. A sheet pressed by a ball (in contact), "
+    "with a tool in it that cuts nothing just then, the mean of all steps while it cuts, what a "
+    "cut of two edges adds, a step with such a cut, 95 % of these, and that to a step in contact; "
+    "last: in contact, with room for cuts to without. "
+    + results.link(out / "cut.csv"),
+    "",
+    *plots.table(head, table),
+  ]
+  return [results.page(out / "cut.md", "What cutting costs a step", about, lines)]
+
+
+BENCH = Bench("cut", stages, run, report=report, arguments=arguments)
