@@ -397,8 +397,10 @@ def spare(organ: str, text: str, there: int) -> int:
 
 
 def _check_spare(organ: str, config: Config):
-  if config.tear and not config.spare:
-    raise ValueError(f"organ {organ!r}: tear is {config.tear:g}, allowed only with spare")
+  if config.tear and (not config.spare or config.elements == "solid"):
+    raise ValueError(
+      f"organ {organ!r}: tear is {config.tear:g}, allowed only with spare and not for a solid"
+    )
   if config.cutters and not config.spare and not config.bonded:
     raise ValueError(f"organ {organ!r}: cutters is set, allowed only with spare, or bonds to free")
   if not config.spare:

@@ -171,6 +171,31 @@ def test_what_holds_a_solid_goes_on_to_hold_both_sides(windows):
   assert grip.force[2] == pytest.approx(force, rel=0.2)
 
 
+@BOTH
+def test_the_walls_are_drawn_and_hidden_between_pictures(windows):
+  model, data, organ = scene(windows=windows)
+  drawn = mujoco.MjvScene(model, 4000)
+  arguments = mujoco.MjvOption(), mujoco.MjvPerturb(), mujoco.MjvCamera()
+  flex, faces = model.flex("organ_inside").id, mujoco.mjtCatBit.mjCAT_ALL.value
+  first, count = model.flex_elemdataadr[flex], 4 * KEYS["spare"]
+  for cuts in range(3):
+    if cuts == 1:
+      organ.cut(across(), depth=0.02)
+    if cuts == 2:
+      mujoco.mj_resetData(model, data)
+    mujoco.mj_forward(model, data)
+    mujoco.mjv_updateScene(model, data, *arguments, faces, drawn)
+    elem = model.flex_elem[first : first + 3 * count].reshape(-1, 3)
+    wall = organ.elem[len(block()[1]) :]
+    assert np.array_equal(elem[: len(wall)], wall) and bool(len(wall)) == (cuts == 1)
+    if cuts == 1:
+      assert model.flex_vertnum[flex] > 0 and not elem[len(wall) :].any()
+      at = data.flexvert_xpos[model.flex_vertadr[flex] :][wall]
+      np.testing.assert_allclose(at, organ.xpos[wall], atol=2e-3)
+    run(model, data, 1)
+    assert model.flex_vertnum[flex] == 0
+
+
 def test_a_tool_carries_a_piece_away():
   model, data, organ = scene(gravity=(0, 0, -9.81), foundation=4e5)
   run(model, data, 1)

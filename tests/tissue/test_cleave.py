@@ -198,10 +198,12 @@ def test_a_cut_at_4000_nodes_follows_its_path():
   both = np.concatenate([points, np.zeros((900, 3))])
   surface = topology.build("organ", both, elem.astype(int), 900)
   mesh = faces.cuttable(surface, fill.fill("organ", surface.without_spare))
-  for side in (0.0, 0.1, 0.3):
-    found = cut(mesh, line(side=side), 0.012)
+  for side in (0.0, 0.1, 0.2, 0.3, 0.4, 0.5):
+    path = line(side=side)
+    path *= 0.05 / np.linalg.norm(path, axis=1, keepdims=True)
+    found = cut(mesh, path, 0.012)
     check(found.mesh)
-    ends = np.concatenate([np.array([line(side=side)[0], line(side=side)[-1]])])
     x = np.concatenate(found.path)
-    inner = np.linalg.norm(x[:, None] - ends, axis=2).min(axis=1) > 0.004
-    assert cleave.nearest_on(line(side=side), x[inner]).max() < 0.5e-3
+    inner = np.linalg.norm(x[:, None] - path[[0, -1]], axis=2).min(axis=1) > 0.004
+    far = cleave.nearest_on(path, x[inner])
+    assert np.median(far) < 0.1e-3 and np.percentile(far, 90) < 0.7e-3
