@@ -16,6 +16,7 @@ from palpate.tissue import body as bodies
 from palpate.tissue.kernels import Kernel, kernel
 from palpate.tissue.types import DIMS, Array, doubles, fill, floats, ints, struct, vector
 
+from .kernels import put_back_rows
 from .patch import launch
 
 
@@ -78,14 +79,6 @@ def kernels(header: str, kind, *names: str) -> list[Kernel]:
   return [kernel(name, header, kind, coupling.CONSTANTS, tag=".worlds") for name in names]
 
 
-@wp.kernel(enable_backward=False)
-def _put_back(mask: wp.array[bool], start: wp.array2d[wp.float64], out: wp.array2d[wp.float64]):
-  """Puts rows of the worlds of a mask back to where they start."""
-  w, k = wp.tid()
-  if mask[w]:
-    out[w, k] = start[0, k]
-
-
 @dataclasses.dataclass(frozen=True)
 class Kept:
   """What worlds keep of a block of the plugin state.
@@ -143,7 +136,7 @@ class Beside:
     """Puts it where the worlds of the mask start."""
     for kept in self.kept:
       inputs = [self._mask, kept.start, kept.flat]
-      wp.launch(_put_back, dim=kept.flat.shape, inputs=inputs, device=self._device)
+      wp.launch(put_back_rows, dim=kept.flat.shape, inputs=inputs, device=self._device)
 
   def _keep(self, block: str, rows: np.ndarray, width: int) -> wp.array:
     """Returns an array of what worlds keep in rows of a block of the plugin state."""
@@ -151,7 +144,7 @@ class Beside:
     self.kept.append(Kept(block, rows, self._zeros(self._nworld, len(rows), width), start))
     return self.kept[-1].array
 
-  def _zeros(self, *shape: int, dtype=wp.float64) -> wp.array:
+  def _zeros(self, *shape: int, dtype: Any = wp.float64) -> wp.array:
     return wp.zeros(shape, dtype=dtype, device=self._device)
 
   def _over(self, what: Kernel, fields, count: int):
@@ -174,11 +167,11 @@ def bodies_of(batch):
   return fill(WorldBodies, batch.device, values)
 
 
-def _rows(array: wp.array) -> wp.array:
+def _rows(array: Any) -> Any:
   """Returns an array of mujoco_warp's as floats, a row a world, in its memory."""
   item = wp.types.type_size_in_bytes(array.dtype) // 4
   count = int(np.prod(array.shape[1:])) * item
-  out = wp.array(
+  out: Any = wp.array(
     ptr=array.ptr, dtype=float, shape=(array.shape[0], count), strides=(array.strides[0], 4),
     device=array.device,
   )  # fmt: skip

@@ -9,8 +9,7 @@ import warp as wp
 from palpate.bonds import Bonds as Alone
 
 from .base import on_device
-
-HELD = 1.0 - 2.0**-24  # the most damage that leaves a bond, in float32
+from .kernels import HELD, share_freed
 
 
 class Bonds(abc.ABC):
@@ -50,7 +49,7 @@ class Bonds(abc.ABC):
   def share_freed(self) -> wp.array:
     """Share of the area whose bonds have broken, (nworld,); 0 where there are none."""
     inputs = [self.damage, self._each, self._share]
-    wp.launch(_share, dim=self._share.shape, inputs=inputs, device=self._device)
+    wp.launch(share_freed, dim=self._share.shape, inputs=inputs, device=self._device)
     return self._share
 
   def weaken(self, amount):
@@ -73,19 +72,6 @@ class Bonds(abc.ABC):
   @abc.abstractmethod
   def _weaken(self, amount: wp.array):
     """Adds damage."""
-
-
-@wp.kernel(enable_backward=False)
-def _share(damage: wp.array2d[float], area: wp.array[float], out: wp.array[float]):
-  """Finds the share of the area that is free."""
-  w = wp.tid()
-  whole = float(0.0)  # noqa: UP018 - a variable to Warp
-  free = float(0.0)  # noqa: UP018
-  for k in range(area.shape[0]):
-    whole += area[k]
-    if damage[w, k] >= 1.0:
-      free += area[k]
-  out[w] = wp.where(whole > 0.0, free / whole, 0.0)
 
 
 class OfThreads(Bonds):

@@ -14,9 +14,9 @@ from palpate.tissue.step import SCHEMES
 from palpate.tissue.types import doubles, fill, floats, ints, struct, vector
 
 from .beside import Beside, WorldBodies, WorldNodes, in_worlds, input_of, kernels, nodes_of
-from .bonds import HELD, Bonds
+from .bonds import Bonds
+from .kernels import show_damage, show_pull, weaken_bonds
 
-_HELD = wp.constant(HELD)
 _PARTS = {"own": WorldNodes, "other": WorldNodes, "mj": WorldBodies}
 _number = floats("nworld", "nnumber")
 BOND_ROWS = "state", "next", "stretch", "force", "pull", "hardness"
@@ -45,23 +45,6 @@ _stretch, _enter, _bear, _act, _feel, _keep = kernels("bonds.h", WorldBonded, *e
 _enter_ties, _act_ties = kernels("ties.h", WorldTied, *ties.KERNELS)
 (_aim,) = kernels("ties.h", Aimed, "aim_ties")
 _find, _press, _act_rest, _feel_rest, _keep_rest = kernels("rests.h", WorldRest, *rests.KERNELS)
-
-
-@wp.kernel(enable_backward=False)
-def _show(b: WorldBonded, first: int, damage: wp.array2d[float], force: wp.array3d[float]):
-  """Writes damage and force of bonds."""
-  w, n = wp.tid()
-  had = b.state[w, n, 0]
-  damage[w, first + n] = wp.where(had >= wp.float64(1.0), 1.0, wp.min(float(had), _HELD))
-  for c in range(3):
-    force[w, first + n, c] = float(b.pull[w, n, c])
-
-
-@wp.kernel(enable_backward=False)
-def _weaken(b: WorldBonded, first: int, amount: wp.array2d[float]):
-  """Adds damage to bonds."""
-  w, n = wp.tid()
-  b.state[w, n, 0] = wp.min(b.state[w, n, 0] + wp.float64(amount[w, first + n]), wp.float64(1.0))
 
 
 class InBonds(Beside):
@@ -149,18 +132,20 @@ class Grown(Bonds):
     self.area = np.concatenate([np.zeros(0), *(group.area for group in made)])
     super().__init__(organ._batch.nworld, organ._batch.device)
 
-  def _all(self, what, *arrays: wp.array):
-    first, nworld = 0, self._share.shape[0]
+  def _over(self, what, name: str, values: wp.array):
+    first = 0
     for _, b in self._groups:
-      inputs = [b, first, *arrays]
-      wp.launch(what, dim=(nworld, b.nbond), inputs=inputs, device=self._device)
+      inputs = [getattr(b, name), first, values]
+      dim = (self._share.shape[0], b.nbond)
+      wp.launch(what, dim=dim, inputs=inputs, device=self._device)
       first += b.nbond
 
   def _tell(self):
-    self._all(_show, self._damage, self._force)
+    self._over(show_damage, "state", self._damage)
+    self._over(show_pull, "pull", self._force)
 
   def _weaken(self, amount: wp.array):
-    self._all(_weaken, amount)
+    self._over(weaken_bonds, "state", amount)
 
 
 class Ties(Beside):

@@ -6,6 +6,8 @@ from palpate.tissue.types import Array, floats, ints, struct
 
 from .patch import Patch
 
+HELD = wp.constant(1.0 - 2.0**-24)  # the most damage that leaves a bond, in float32
+
 
 @struct
 class Start:
@@ -222,3 +224,50 @@ def show(p: Patch, what: int, out: wp.array2d[wp.vec3]):
     out[w, i] = frame * _lane(p.solve.vel, w, n)
   else:
     out[w, i] = frame * wp.vec3(p.force[w, n, 0], p.force[w, n, 1], p.force[w, n, 2])
+
+
+@wp.kernel(enable_backward=False)
+def put_back_rows(
+  mask: wp.array[bool], start: wp.array2d[wp.float64], out: wp.array2d[wp.float64]
+):
+  """Puts rows of the worlds of a mask back to where they start."""
+  w, k = wp.tid()
+  if mask[w]:
+    out[w, k] = start[0, k]
+
+
+@wp.kernel(enable_backward=False)
+def show_damage(state: wp.array3d[wp.float64], first: int, damage: wp.array2d[float]):
+  """Writes the damage of bonds, the first of which has a place."""
+  w, n = wp.tid()
+  had = state[w, n, 0]
+  damage[w, first + n] = wp.where(had >= wp.float64(1.0), 1.0, wp.min(float(had), HELD))
+
+
+@wp.kernel(enable_backward=False)
+def show_pull(pull: wp.array3d[wp.float64], first: int, force: wp.array3d[float]):
+  """Writes the force of bonds."""
+  w, n = wp.tid()
+  for c in range(3):
+    force[w, first + n, c] = float(pull[w, n, c])
+
+
+@wp.kernel(enable_backward=False)
+def weaken_bonds(state: wp.array3d[wp.float64], first: int, amount: wp.array2d[float]):
+  """Adds damage to bonds."""
+  w, n = wp.tid()
+  more = state[w, n, 0] + wp.float64(amount[w, first + n])
+  state[w, n, 0] = wp.min(more, wp.float64(1.0))
+
+
+@wp.kernel(enable_backward=False)
+def share_freed(damage: wp.array2d[float], area: wp.array[float], out: wp.array[float]):
+  """Finds the share of the area of bonds that is free."""
+  w = wp.tid()
+  whole = float(0.0)  # noqa: UP018 - a variable to Warp
+  free = float(0.0)  # noqa: UP018
+  for k in range(area.shape[0]):
+    whole += area[k]
+    if damage[w, k] >= 1.0:
+      free += area[k]
+  out[w] = wp.where(whole > 0.0, free / whole, 0.0)

@@ -85,7 +85,8 @@ class Networks:
     self.groups, self.device, self.lessons = grouped(list(shapes), taught), device, 0
     self._shapes: dict[str, tuple[int, ...]] = dict(shapes)
     self._memory: Any = None
-    self._components, self._begun = list(components), False
+    self._components = list(components)
+    self._scaled: list[Any] = []  # networks that know how large observations are
     self._changes = [name for name in components if name in CHANGES]
     self._adds = torch.tensor([float(name in CHANGES) for name in components], device=device)
     seen = TensorDict(
@@ -115,15 +116,15 @@ class Networks:
       std = torch.where(std < _STILL, torch.full_like(std, _VARY["-"]), std)
       share = _KNOWN if self.lessons else 1.0
       std = torch.maximum(std, share * self._least(names).to(std))
-      if self._begun:
+      if model in self._scaled:
         _rescale(model, every.mean(dim=0), std)
       self._scale(model, every.mean(dim=0), std)
-    self._begun = True
 
   def _scale(self, model: Any, mean: torch.Tensor, std: torch.Tensor) -> None:
     known, model.obs_normalizer.eps = model.obs_normalizer.state_dict(), 0.0
     known["_mean"][:], known["_std"][:], known["_var"][:] = mean, std, std.square()
     model.obs_normalizer.until = 0
+    self._scaled.append(model)
 
   def take(self, made: policy.Policy) -> None:
     """Begins with what a policy of another exercise does; ValueError says why it cannot."""
@@ -146,7 +147,6 @@ class Networks:
     for name, array in arrays.items():
       known[name].copy_(torch.from_numpy(array))
     self._scale(self.actor, *(torch.from_numpy(row).to(self.device) for row in (mean, std)))
-    self._begun = True
 
   def _least(self, names: Sequence[str]) -> torch.Tensor:
     """Returns how much each number that is observed varies at least."""
@@ -266,8 +266,7 @@ class Networks:
     linear = sorted(int(k.split(".")[1]) for k in weights if k.startswith("mlp.") and "weight" in k)
     about = policy.About(
       task.name, tuple(task.components), self.groups[ACTING], task.control_timestep, POWER,
-      self._changes,
-      dict(task_kwargs), {"palpate": palpate.__version__, **training},
+      self._changes, dict(task_kwargs), {"palpate": palpate.__version__, **training},
     )  # fmt: skip
     memory: Any = tuple(weights[f"rnn.rnn.{name}_l0"] for name in _GATES)
     return policy.Policy(
@@ -281,8 +280,7 @@ class Networks:
 
 def _rescale(model: Any, mean: torch.Tensor, std: torch.Tensor) -> None:
   """Changes the first weights of a network so that it says the same with another scale."""
-  first = model.mlp[0]
-  weight, bias = first.weight, first.bias
+  weight, bias = model.mlp[0].weight, model.mlp[0].bias
   if model.is_recurrent:
     weight, bias = model.rnn.rnn.weight_ih_l0, model.rnn.rnn.bias_ih_l0
   known = model.obs_normalizer.state_dict()

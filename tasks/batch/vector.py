@@ -206,7 +206,7 @@ class Exercises(VectorEnv):
 
   def _observations(self) -> dict[str, Any]:
     self._wait()
-    return {name: self._tell(OBSERVED.get(name, name)) for name in self._observed}
+    return {name: self._tell(OBSERVED.get(name) or name) for name in self._observed}
 
   def _final(self, over: np.ndarray) -> Any:
     seen = self._observations()

@@ -283,6 +283,7 @@ def test_an_explicit_step_that_blows_up_is_called_so(tmp_path):
     "hypercube-implicit-0.0005733-39910-213",  # plate thicker than its triangles are wide
     "hypercube-implicit-window-0.0007135-154.1-170",  # 1 g of tissue
     "hypercube-implicit-window-0.001793-570.6-214",
+    "hypercube-implicit-0.003945-12780-157",  # nodes of three masses
   ],
 )
 def test_what_once_failed_is_stable(tmp_path, name):

@@ -87,7 +87,7 @@ def compare_metrics(told, k, expected):
     ("grasp/easy", 1, 179, {"hold": 0.1, "lift": 0.003}),
     ("retract/easy", 1, 157, {"hold": 0.1, "wanted": 0.1}),
     ("dissect/easy", 1, 15, {}),
-    ("tease/easy", 1, 95, {}),
+    ("tease/easy", 1, 76, {}),
     ("bimanual/easy", 1, 213, {"wanted": 0.03}),
   ],
 )
