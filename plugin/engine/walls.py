@@ -68,9 +68,7 @@ class Walls:
     elem = flexes.element_data(m, self._flex)
     wall = mesh.elem[mesh.whole.nelem :][: len(elem)]
     elem[: len(wall)], elem[len(wall) :] = wall, 0  # without area, which nobody sees
-    self._show(m, bool(len(wall)))
-    if not len(wall):
-      return
+    self._show(m, True)
     start = int(mjstruct.view(m.flex_vertadr, m.nflex, np.int32)[self._flex])
     out = mjstruct.view(d.flexvert_xpos, (m.nflexvert, 3))[start : start + n]
     x = (mesh.rest + self._w.phases.motion()[0])[:n]

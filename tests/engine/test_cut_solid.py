@@ -176,7 +176,8 @@ def test_the_walls_are_drawn_and_hidden_between_pictures(windows):
   model, data, organ = scene(windows=windows)
   drawn = mujoco.MjvScene(model, 4000)
   arguments = mujoco.MjvOption(), mujoco.MjvPerturb(), mujoco.MjvCamera()
-  flex, faces = model.flex("organ_inside").id, mujoco.mjtCatBit.mjCAT_ALL.value
+  flex = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_FLEX, "organ_inside")
+  faces = mujoco.mjtCatBit.mjCAT_ALL.value
   first, count = model.flex_elemdataadr[flex], 4 * KEYS["spare"]
   for cuts in range(3):
     if cuts == 1:
@@ -232,6 +233,11 @@ def test_what_cannot_be_cut_says_so(keys, message):
   organ = scene(pin=np.flatnonzero(points[:, 0] < -0.0299))[2]
   with pytest.raises(ValueError, match=message):
     organ.cut(**{"points": across()} | keys)
+
+
+def test_a_solid_does_not_tear():
+  with pytest.raises(ValueError, match=r"tear is .*, allowed only with spare and not for a solid"):
+    scene(tear=0.4)
 
 
 def test_a_surface_has_no_depth_and_without_room_a_cut_ends_early():
