@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from palpate.tissue import body as bodies
 from palpate.tissue import cut as cutting
+from palpate.tissue import fill
 from palpate.tissue import mesh as topology
 from palpate.tissue.mesh import Mesh
 from palpate.tissue.path import Finder
@@ -150,18 +151,7 @@ class Cuts:
 
   def _read(self) -> tuple:
     """Returns the mesh that the state has, what differs, masses, and where vertices come from."""
-    whole, own = self.whole, self._own
-    if not self._found[0]:
-      found = topology.recut(self.mesh, whole.rest, whole.elem, None)
-      return *found, self.declared.mass, np.arange(whole.nvert)
-    elem, loose = flexes.unpack(own["corner"])
-    rest, mass = own["place"].reshape(-1, 3).copy(), own["weight"].copy()
-    source = np.append(np.arange(whole.nvert - whole.spare), own["source"]).astype(int)
-    inside = (elem >= 0).all() and (elem < whole.nvert).all()
-    if not inside or not np.array_equal(source[elem], whole.elem):
-      raise ValueError(FOREIGN)
-    if flexes.stamp(own["corner"], rest, mass) != self._found[0]:
-      raise ValueError(FOREIGN)
+    elem, loose, rest, mass, source = read(self.whole, self.declared.mass, self._own)
     return *topology.recut(self.mesh, rest, elem, loose), mass, source
 
   def copy(self) -> dict[str, np.ndarray]:
@@ -243,6 +233,19 @@ class Cuts:
 
   def cut(self, points: np.ndarray, given: float = 0.0, depth=None, direction=None) -> Report:
     """Cuts the organ along points in the world, (n, 3) [m]; see `Organ.cut`, and `cutting.cut`."""
+    w, found = self._w, self.find(points, given, depth, direction)
+    if found.stopped:
+      w.note(
+        f"the cut stops early: no spare vertices are left of {self.mesh.spare}; give the organ more"
+      )
+    done = self._report(found)
+    if found.changed.size:
+      self._take(found)
+    self.reports.append(done)
+    return done
+
+  def find(self, points: np.ndarray, given: float = 0.0, depth=None, direction=None) -> Any:
+    """Returns what a cut would make of the organ."""
     w, organ = self._w, self._w.organ
     if not self:
       raise ValueError(
@@ -252,17 +255,7 @@ class Cuts:
     organ = w.organ
     local = (np.asarray(points, float) - organ.origin) @ organ.frame
     motion = cutting.Motion(self.mass, *w.phases.motion())
-    found = self._find(motion, local, given, depth, direction)
-    if found.stopped:
-      w.note(
-        f"the cut stops early: no spare vertices are left of {self.whole.spare}; give the organ "
-        "more"
-      )
-    report = self._report(found)
-    if found.changed.size:
-      self._take(found)
-    self.reports.append(report)
-    return report
+    return self._find(motion, local, given, depth, direction)
 
   def _find(self, motion: cutting.Motion, points, given: float, depth, direction) -> Any:
     """Returns the cut along points in the organ's frame, see `cutting.Knife`."""
@@ -288,11 +281,7 @@ class Cuts:
     return cutting.Springs(energy, force, hard)
 
   def _report(self, found: Any) -> Report:
-    organ = self._w.organ
-    path = [organ.origin + line @ organ.frame.T for line in found.path]
-    nodes = found.mesh.nouter - self.mesh.nouter
-    area = found.length * self._w.config.thickness
-    return Report(found.length, area, path, found.deviation, nodes, found.stopped)
+    return report(found, self.mesh, self._w.organ, self._w.config.thickness)
 
   def _take(self, found: Any):
     """Makes the organ the mesh that was found; what moved goes on as it moved."""
@@ -310,19 +299,62 @@ class Cuts:
 
   def pieces(self) -> list[Piece]:
     """Returns the parts that hang together, the largest first."""
-    mesh, size = self.mesh, self._sizes()
-    label = topology.pieces(mesh)
-    held = topology.held_areas(mesh) > 0
-    out = []
-    for k in range(label.max() + 1):
-      vert = np.flatnonzero(label == k)
-      volume = float(size[vert].sum())
-      mass = float(self._w.organ.mass[vert].sum())
-      outer = vert[vert < mesh.nouter]
-      out.append(Piece(outer, mass, volume, bool(held[vert].any())))
-    return sorted(out, key=lambda piece: -piece.mass)
+    return pieces(self.mesh, self._w.organ.mass, self._w.config.thickness)
 
-  def _sizes(self) -> np.ndarray:
-    """Returns the volume of the tissue at each vertex at rest [m^3], (nvert,)."""
-    area = topology.vertex_areas(self.mesh.rest, self.mesh.elem)
-    return area * self._w.config.thickness
+
+def report(found: cutting.Cut, before: Mesh, organ, thickness: float) -> Report:
+  """Returns what a cut of a mesh has done; `organ` is its declaration."""
+  path = [organ.origin + line @ organ.frame.T for line in found.path]
+  nodes = found.mesh.nouter - before.nouter
+  area = found.length * thickness
+  return Report(found.length, area, path, found.deviation, nodes, found.stopped)
+
+
+def pieces(mesh: Mesh, mass: np.ndarray, thickness: float) -> list[Piece]:
+  """Returns the parts of a mesh that hang together, the heaviest first."""
+  label, solid = topology.pieces(mesh), len(mesh.tet) > 0
+  area = topology.vertex_areas(mesh.rest, mesh.elem)
+  size = fill.vertex_volumes(mesh) if solid else area * thickness
+  held = topology.held_areas(mesh) > 0
+  out = []
+  for k in range(label.max() + 1):
+    vert = np.flatnonzero(label == k)
+    numbers = float(mass[vert].sum()), float(size[vert].sum()), bool(held[vert].any())
+    out.append(Piece(vert[vert < mesh.nouter], *numbers))
+  return sorted(out, key=lambda piece: -piece.mass)
+
+
+# The plugin state, see `layout.Topology`; `own` has its blocks.
+
+
+def read(whole: Mesh, mass: np.ndarray, own: dict[str, np.ndarray]):
+  """Returns triangles, which of them are loose, rest places, masses and sources of a state.
+
+  Args:
+    whole: the mesh before the first cut
+    mass: of its vertices [kg]  (nvert,)
+    own: blocks of the state
+
+  Raises:
+    ValueError: the state is of another organ.
+  """
+  if not own["stamp"][0]:
+    return whole.elem, None, whole.rest, mass, np.arange(whole.nvert)
+  elem, loose = flexes.unpack(own["corner"])
+  rest, mass = own["place"].reshape(-1, 3).copy(), own["weight"].copy()
+  source = np.append(np.arange(whole.nvert - whole.spare), own["source"]).astype(int)
+  inside = (elem >= 0).all() and (elem < whole.nvert).all()
+  if not inside or not np.array_equal(source[elem], whole.elem):
+    raise ValueError(FOREIGN)
+  if flexes.stamp(own["corner"], rest, mass) != own["stamp"][0]:
+    raise ValueError(FOREIGN)
+  return elem, loose, rest, mass, source
+
+
+def write(own: dict[str, np.ndarray], mesh: Mesh, mass: np.ndarray, source, stamp: float):
+  """Writes a mesh to a state."""
+  own["corner"][:] = flexes.pack(mesh.elem, mesh.loose)
+  own["place"][:] = mesh.rest.ravel()
+  own["weight"][:] = mass
+  own["source"][:] = source[mesh.nvert - mesh.spare :]
+  own["stamp"][0] = stamp

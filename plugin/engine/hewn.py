@@ -10,7 +10,7 @@ import dataclasses
 import functools
 
 import numpy as np
-from palpate.tissue import cleave, energy, faces, fill
+from palpate.tissue import cleave, energy, faces
 from palpate.tissue import mesh as topology
 from palpate.tissue.cut import Motion
 from palpate.tissue.mesh import Mesh
@@ -138,15 +138,21 @@ class SolidCuts(Cuts):
       found.length, found.area, path, found.deviation, nodes, found.stopped, found.depth
     )
 
-  def _sizes(self) -> np.ndarray:
-    return fill.vertex_volumes(self.mesh)
-
 
 def _freed(mesh: Mesh) -> Mesh:
-  """Returns the solid with the triangles of its skin marked that the foundation let go of."""
+  """Returns the solid with the triangles of its skin marked that the foundation let go of.
+
+  Of what it held together until now, it goes on to hold the largest piece.
+  """
+  whole = mesh.whole
   if mesh.uncut is None:
     return mesh
-  n = mesh.whole.nelem
-  skin = dataclasses.replace(mesh, elem=mesh.elem[:n], loose=mesh.loose[:n])
-  loose = np.append(topology.come_loose(skin).loose, mesh.loose[n:])
+  n, loose = whole.nelem, mesh.loose.copy()
+  area = topology.lengths(topology.area_vectors(mesh.rest, mesh.elem[:n]))
+  piece = topology.pieces(mesh)[mesh.elem[:n, 0]]
+  for part in np.unique(whole.home):
+    held = (whole.home == part) & ~loose[:n]
+    size = np.bincount(piece[held], area[held])
+    if (size > 0).sum() > 1:
+      loose[:n] |= held & (piece != np.argmax(size))
   return dataclasses.replace(mesh, loose=loose)

@@ -191,9 +191,7 @@ class Config:
     "`auto`: as many as there are; `add_organ` and `add_spare` make them",
   )
   walls: str = _row(
-    "",
-    (reading.name, "the name of a flexcomp"),
-    "flexcomp that is drawn where a solid was cut open (`add_organ` makes it)",
+    "", (reading.name, "the name of a flexcomp"), "drawn where a solid is cut (`add_organ`)"
   )
   tear: float = _row(
     0.0,
@@ -319,10 +317,11 @@ def change(
     values["young"] = tuple(factor * young for young in compiled.young)
   changed = dataclasses.replace(config, **values)
   for key in ("relax_share", "capsule_young"):
-    now, first = getattr(changed, key), getattr(compiled, key)
-    if bool(now) != bool(first):
+    now, first = (np.ravel(getattr(each, key)) for each in (changed, compiled))
+    if now.any() != first.any():
+      now, first = (" ".join(f"{x:g}" for x in values) or "none" for values in (now, first))
       raise ValueError(
-        f"organ {organ!r}: {key} is {now:g}, compiled as {first:g}: it cannot begin or end while "
+        f"organ {organ!r}: {key} is {now}, compiled as {first}: it cannot begin or end while "
         "running"
       )
   given = values | ({"stiffness": 0} if config.stiffness else {})
@@ -398,16 +397,15 @@ def spare(organ: str, text: str, there: int) -> int:
 
 def _check_spare(organ: str, config: Config):
   if config.tear and (not config.spare or config.elements == "solid"):
-    raise ValueError(
-      f"organ {organ!r}: tear is {config.tear:g}, allowed only with spare and not for a solid"
-    )
+    allowed = "allowed only with spare and not for a solid"
+    raise ValueError(f"organ {organ!r}: tear is {config.tear:g}, {allowed}")
   if config.cutters and not config.spare and not config.bonded:
     raise ValueError(f"organ {organ!r}: cutters is set, allowed only with spare, or bonds to free")
   if not config.spare:
     return
-  for key, text in (("carrier", OWN), ("capsule_young", config.capsule_young or None)):
-    if getattr(config, key) == text:
-      raise ValueError(f"organ {organ!r}: {key} is {text!r}, allowed only where spare is 0")
+  for key, of in (("carrier", OWN), ("capsule_young", config.capsule_young or None)):
+    if getattr(config, key) == of:
+      raise ValueError(f"organ {organ!r}: {key} is {of!r}, allowed only where spare is 0")
 
 
 def _check_ties(organ: str, config: Config):
