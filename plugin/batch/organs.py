@@ -108,8 +108,8 @@ class Organ(Tissue):
     self._cuts = None
     if organ.mesh.spare and len(organ.mesh.tet):
       raise ValueError(
-        f"organ {organ.name!r}: spare is {organ.mesh.spare}, in batches on a GPU allowed only where "
-        "elements is not 'solid'"
+        f"organ {organ.name!r}: spare is {organ.mesh.spare}, allowed in batches on a GPU only "
+        "where elements is not 'solid'"
       )
     if organ.mesh.spare:
       self._cuts = Cuts(self, values, surface)
