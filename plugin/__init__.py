@@ -15,7 +15,8 @@ if TYPE_CHECKING:
   from .authoring import add_organ
   from .organ import Organ
   from .skins import add_skin
-  from .windows import add_spare, add_windows
+  from .spares import add_spare
+  from .windows import add_windows
 
 __all__ = [
   "Organ",
@@ -28,7 +29,9 @@ __all__ = [
 ]
 __version__ = "0.1.0"
 # Modules of what `register` brings.
-_BROUGHT = {"Organ": "organ", "add_skin": "skins", "add_spare": "windows", "add_windows": "windows"}
+_BROUGHT = {
+  "Organ": "organ", "add_skin": "skins", "add_spare": "spares", "add_windows": "windows",
+}  # fmt: skip
 
 
 def register() -> int:

@@ -4,13 +4,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 
 import mujoco
 import numpy as np
 
-from . import meshes
+from . import meshes, spares
 from . import windows as author
 from .attributes import CONTACT, text
 from .engine import plugin as engine
@@ -18,7 +17,6 @@ from .tissue import config as configuration
 from .tissue import mesh as topology
 
 _DENSITY = 1060.0  # [kg/m^3], of most soft tissue
-_CUTS = 8  # times the square root of its vertices is what `spare="auto"` gives an organ
 _BOX = 0.005  # [m]; half the side of the box whose inertia a node's body has, as in a flexcomp
 _SELF = {
   word: getattr(mujoco.mjtFlexSelf, f"mjFLEXSELF_{word.upper()}")
@@ -49,8 +47,8 @@ def add_organ(
 ) -> mujoco.MjsFlex:
   """Adds an organ to a spec, in a body of its name; what a <flexcomp> with the plugin does in MJCF.
 
-  The mesh is taken as it is: a manifold surface wound one way, its triangles not too thin.
-  `palpate wrap`, or `palpate.models.wrap`, makes one of any other.
+  The mesh is taken as it is: a manifold surface wound one way, its triangles not too thin, as
+  `palpate wrap`, or `palpate.models.wrap`, makes them.
 
   Args:
     spec: changed in place, unless an error is raised
@@ -65,9 +63,8 @@ def add_organ(
     radius: of the flex [m]
     rgba: colour
     contact: attributes of <contact> that are not as in CONTACT, which suits instruments
-    windows: whether MuJoCo has dofs under the tools alone, which are in the spec; or how: `tools`
-      and `nodes` of `add_windows`
-    spare: vertices that cuts can make use of, or `auto` for some eight cuts across the organ
+    windows: whether MuJoCo has dofs under the spec's tools alone; or `tools`, `nodes` as there
+    spare: vertices for cuts; `auto`: for some eight across the organ, or one through a solid
     **config: the plugin's configuration keys: young, poisson, thickness, foundation, bulk, ...
 
   Returns:
@@ -77,7 +74,8 @@ def add_organ(
     ValueError: a key, value, name or the mesh is not allowed; the message says what is.
   """
   _, vertices, triangles = meshes.read(mesh, scale, sized=not isinstance(mesh, tuple | list))
-  surface = _with_spare(name, _surface(name, *meshes.merge(vertices, triangles)), spare)
+  bare = _surface(name, *meshes.merge(vertices, triangles))
+  surface = spares.with_spare(name, bare, spare, config)
   pins, mass = _pins(name, pin, surface), _mass(name, mass, surface)
   windowed, options = windows is not False, _windows(name, windows)
   texts = _texts(name, config, surface, mass if windowed else None)
@@ -85,6 +83,7 @@ def add_organ(
   where = _parent(spec, name, parent)
   _check_names(spec, name, 0 if windowed else surface.nvert)
   body = where.add_body(name=name, pos=pos, quat=quat)
+  texts |= spares.add_walls(spec, body, name, surface, config)
   if windowed:
     return _add_windowed(spec, body, surface, pins, mass, texts, look, options)
   return _add_nodal(spec, body, surface, pins, mass, texts, look)
@@ -147,16 +146,6 @@ def _pins(name: str, pin: Sequence[int], surface: topology.Mesh) -> np.ndarray:
   if len(pins) == nvert:
     raise ValueError(f"organ {name!r}: all vertices are pinned, expected some that move")
   return pins.astype(int)
-
-
-def _with_spare(name: str, surface: topology.Mesh, spare: int | str) -> topology.Mesh:
-  """Returns a surface with vertices that wait for cuts, in its middle, where nothing meets them."""
-  if spare == "auto":
-    spare = math.ceil(_CUTS * math.sqrt(surface.nvert))
-  if not isinstance(spare, int) or isinstance(spare, bool) or spare < 0:
-    raise ValueError(f"organ {name!r}: spare is {spare!r}, expected a whole number >= 0 or 'auto'")
-  rest = np.concatenate([surface.rest, np.tile(surface.rest.mean(axis=0), (spare, 1))])
-  return topology.build(name, rest, surface.elem, spare) if spare else surface
 
 
 def _mass(name: str, mass: float | None, surface: topology.Mesh) -> float:

@@ -158,8 +158,16 @@ class Organ:
         change.detach(group.other, self.model._address, theirs)
     change.detach(self._space, self.model._address, made)
 
-  def cut(self, points: npt.ArrayLike) -> Report:
-    """Cuts the organ, through its wall, along the path on its surface that is nearest to points.
+  def cut(
+    self,
+    points: npt.ArrayLike,
+    depth: float | npt.ArrayLike | None = None,
+    direction: npt.ArrayLike | None = None,
+  ) -> Report:
+    """Cuts the organ along the path on its surface that is nearest to points.
+
+    A surface is cut through its wall. A solid is cut from the path inward, to a depth or right
+    through: faces between its tetrahedra come apart, and are part of its surface from then on.
 
     Vertices near the path are moved onto it at rest, and the mesh comes apart along its edges:
     vertices are doubled, and triangles keep their numbers. Mass and momentum are kept. What is cut
@@ -170,15 +178,22 @@ class Organ:
     Args:
       points: the path in the world, where the organ is now [m], (n, 3); to cut to an edge of an
         open surface, let it begin or end there; the same first and last point cut out a piece
+      depth: of the cut in a solid, below its surface at rest [m], one or one a point; None cuts
+        right through
+      direction: which way a solid is cut from its surface, in the world; None for inward: as the
+        surface's normals are in the mean, each by itself where the path goes around the organ, or
+        toward the middle of a path that goes around and has no depth
 
     Returns:
       What the cut has done. With too few spare vertices it ends early: `stopped`, and a warning.
 
     Raises:
       ValueError: the organ has no `spare`; points are off the surface; the path is too short, or
-        goes through pinned vertices.
+        goes through pinned vertices; the depth is not above 0, or the organ is no solid.
     """
-    report = self._space.cuts.cut(np.asarray(points, dtype=float))
+    inward = {"depth": depth, "direction": direction}
+    given = {k: np.asarray(v, dtype=float) for k, v in inward.items() if v is not None}
+    report = self._space.cuts.cut(np.asarray(points, dtype=float), **given)
     workspace.place(self._space, self.model._address)
     return report
 

@@ -83,40 +83,6 @@ def add_windows(
   return tuple(names)
 
 
-def add_spare(spec: mujoco.MjSpec, organ: str, spare: int):
-  """Gives an organ vertices without triangles, which cuts make use of.
-
-  They wait in its middle. What `add_organ(..., spare=)` does to an organ that MJCF declares: the
-  vertices of a <flexcomp> that no triangle has would be left out.
-
-  Args:
-    spec: changed in place
-    organ: name of the flexcomp
-    spare: how many
-
-  Raises:
-    ValueError: there is no such organ, or it has spare vertices already.
-  """
-  flex, plugin, bodies = find_organ(spec, organ)
-  if plugin.config.get("spare") or isinstance(spare, bool) or int(spare) < 1:
-    raise ValueError(f"organ {organ!r}: spare is {spare}, expected a number > 0 for one without")
-  vertbody = list(flex.vertbody)
-  free = np.array([bodies[name].first_joint() is not None for name in vertbody])
-  own = [bodies[name] for name, moves in zip(vertbody, free, strict=True) if moves]
-  rest = _rest(flex, free, own)
-  points = np.reshape(flex.vert, (-1, 3)) if len(flex.vert) else np.zeros_like(rest)
-  middle = rest.mean(axis=0)
-  for k in range(spare):
-    if own:
-      made = add_node(own[0].parent, f"{organ}_spare_{k}", middle, own[0].mass, own[0].inertia[0])
-      made.plugin.name, made.plugin.plugin_name = plugin.name, engine.NAME
-      made.plugin.active = True
-    vertbody.append(f"{organ}_spare_{k}" if own else vertbody[0])
-  more = np.zeros((spare, 3)) + (0.0 if own else middle)
-  flex.vert, flex.vertbody = np.concatenate([points, more]).ravel(), vertbody
-  plugin.config = {k: v for k, v in plugin.config.items() if v} | {"spare": str(spare)}
-
-
 def find_organ(spec: mujoco.MjSpec, organ: str):
   """Returns flex and plugin of an organ, and the spec's bodies by name; it may name the plugin.
 
@@ -240,7 +206,7 @@ def _own_bodies(flex, bodies: dict) -> list:
   return own
 
 
-def _rest(flex, free: np.ndarray, own: list) -> np.ndarray:
+def rest_of(flex, free: np.ndarray, own: list) -> np.ndarray:
   """Returns where vertices are in the body that an organ is in [m], (nvert, 3)."""
   rest = np.zeros((len(free), 3))
   rest += np.reshape(flex.vert, (-1, 3)) if len(flex.vert) else 0.0  # none: all on their bodies
@@ -253,7 +219,7 @@ def _make_rigid(spec, flex, own: list, plugin, config: dict[str, str]):
   vertbody = list(flex.vertbody)
   free = np.isin(vertbody, [body.name for body in own])
   parent = own[0].parent
-  rest = _rest(flex, free, own)
+  rest = rest_of(flex, free, own)
   nvert = len(rest) - int(config.get("spare", 0))
   config["mass"] = f"{nvert * np.mean([body.mass for body in own]):.9g}"
   if not free.all():

@@ -41,7 +41,7 @@ def floor(module: str) -> int:
   words = module.split(".")
   room = words[1] if len(words) > 1 else "organ"  # palpate itself: the handle and register
   names = {"__main__": "app"} | dict.fromkeys(
-    ("attributes", "authoring", "bonds", "meshes", "screen", "skins", "windows"), "organ"
+    ("attributes", "authoring", "bonds", "meshes", "screen", "skins", "spares", "windows"), "organ"
   )
   return FLOORS.index(names.get(room, room))
 

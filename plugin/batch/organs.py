@@ -106,6 +106,11 @@ class Organ(Tissue):
         "geom_xpos", "geom_xmat", "qpos", "qvel", "qfrc_passive", "qfrc_constraint")},
     )  # fmt: skip
     self._cuts = None
+    if organ.mesh.spare and len(organ.mesh.tet):
+      raise ValueError(
+        f"organ {organ.name!r}: spare is {organ.mesh.spare}, allowed in batches on a GPU only "
+        "where elements is not 'solid'"
+      )
     if organ.mesh.spare:
       self._cuts = Cuts(self, values, surface)
     self.patch = patch.make(values, self.body)

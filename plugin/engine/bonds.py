@@ -231,6 +231,8 @@ class Bonds(Beside):
     """See `Beside`."""
     if not self._w.config.bonded:
       return
+    outer = group < self._w.organ.mesh.nskin  # what was inside of a solid had none
+    group, member, share = group[outer], member[outer], share[outer]
     slot, state = np.cumsum(self._w.organ.free) - 1, self.state
     damage, released = BOND.damage, BOND.released
     state[slot[member], damage] = state[slot[group], damage]

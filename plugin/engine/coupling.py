@@ -208,7 +208,7 @@ def mass_addresses(m, dofs: np.ndarray) -> np.ndarray:
 
 def outer(organ) -> int:
   """Returns how many vertices there are on an organ's surface, or may be by cuts."""
-  return organ.mesh.nvert if organ.mesh.spare else organ.mesh.nouter
+  return organ.mesh.nskin
 
 
 def sizes(organ) -> dict[str, int]:
@@ -216,12 +216,12 @@ def sizes(organ) -> dict[str, int]:
   relaxes = organ.config.relax_share > 0
   out = {"ncreep": int(organ.free.sum()) if relaxes else 0}
   whole = organ.mesh.whole
-  out |= cut_sizes(whole.nelem, whole.nvert, whole.spare)
+  out |= cut_sizes(whole.nelem, whole.nvert, whole.spare, bool(len(whole.tet)))
   out["nbond"] = int(organ.free[: outer(organ)].sum()) if organ.config.bonded else 0
   out["nblade"] = len(organ.config.cutters)
   solid = len(organ.mesh.tet) > 0
   if organ.windows is None:
-    return out | nodal_sizes(organ.nfree, 3 * (organ.mesh.nvert - organ.mesh.nouter) * solid)
+    return out | nodal_sizes(organ.nfree, 3 * (organ.mesh.nvert - organ.mesh.nskin) * solid)
   win = organ.windows
   out["nrest"] = outer(organ) if organ.config.support else 0
   return out | {"nvert": organ.mesh.nvert, "nslot": win.nslot, "ngeom": win.geom.size}
@@ -232,11 +232,12 @@ def nodal_sizes(nfree: int, ninner: int) -> dict[str, int]:
   return {"nfree": nfree, "ninner": ninner, "nmoving": nfree + ninner}
 
 
-def cut_sizes(nelem: int, nvert: int, spare: int) -> dict[str, int]:
+def cut_sizes(nelem: int, nvert: int, spare: int, solid: bool) -> dict[str, int]:
   """Returns what the mesh of an organ needs in the plugin state: nothing without room for cuts."""
   if not spare:
     return dict(layout.NO_CUTS)
-  return {"ncorner": nelem, "nplace": nvert, "nspare": spare, "ncuts": 1}
+  walls = layout.WALLS * spare * solid
+  return {"ncorner": nelem + walls, "nplace": nvert, "nspare": spare, "ncuts": 1}
 
 
 def spans(organ) -> dict[str, slice]:

@@ -77,19 +77,34 @@ class Current:
     local = (np.linspace(low, high, 5) - organ.origin) @ organ.frame
     elem, weight, far = self._finder.nearest(mesh, mesh.rest + w.phases.motion()[0], local)
     k = int(np.argmin(far))
-    if far[k] > self._reach:
+    if far[k] > self._reach and not len(mesh.tet):
       return False
+    deep = w.config.thickness
+    if len(mesh.tet):
+      deep = self._depth(mesh, local, elem, far)
+      if deep <= 0:
+        return False
+      row[BLADE.depth] = deep
     goal = weight[k] @ mesh.rest[mesh.elem[elem[k]]]
     at = row[BLADE.at : BLADE.at + 3]
     if not row[BLADE.stage]:
       row[BLADE.stage], row[BLADE.elem], row[BLADE.count] = 2, elem[k], 1
       at[:] = goal
       row[BLADE.trail : BLADE.trail + 3] = goal
+      row[BLADE.below] = deep
     way = goal - at
     size = float(np.linalg.norm(way))
-    goes = min(size, given / (self._energy * w.config.thickness))
+    goes = min(size, given / (self._energy * deep))
     if goes > 0:
       at += goes / size * way
-      row[BLADE.work] += goes * self._energy * w.config.thickness
+      row[BLADE.work] += goes * self._energy * deep
       row[BLADE.opened] += goes
+      row[BLADE.elem] = elem[k]
     return True
+
+  def _depth(self, mesh, local: np.ndarray, elem: np.ndarray, far: np.ndarray) -> float:
+    """Returns how deep in a solid it acts, 0 where it is beside it; `local`: points of its axis."""
+    corner = (mesh.rest + self._w.phases.motion()[0])[mesh.elem[elem]]
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    inside = ((local - corner[:, 0]) * normal).sum(axis=1) < 0
+    return float(max(np.where(inside, far, -far).max() + self._reach, 0.0))

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from palpate.tissue import body as bodies
 from palpate.tissue import cut as cutting
+from palpate.tissue import fill
 from palpate.tissue import mesh as topology
 from palpate.tissue.mesh import Mesh
 from palpate.tissue.path import Finder
@@ -24,7 +25,7 @@ from . import coupling, flexes, graphs, mjstruct, turns
 from .bind import bind
 from .tear import Tear
 
-_FOREIGN = "plugin_state has cuts that are not of this organ; set a state that was saved from it"
+FOREIGN = "plugin_state has cuts that are not of this organ; set a state that was saved from it"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,11 +34,12 @@ class Report:
 
   Attributes:
     length: of the edges that came apart, at rest [m]
-    area: of the faces that a cut through the wall opened: length times thickness [m^2]
+    area: of the faces that it opened at rest: length times thickness of a wall [m^2]
     path: those edges at rest, in the world: polylines, each (n, 3) [m]
     deviation: greatest distance of their vertices from the path that was asked for, at rest [m]
     nodes: spare vertices used
     stopped: whether it ended early for want of spare vertices
+    depth: of a solid, how far below its skin it goes at most, at rest [m]
   """
 
   length: float
@@ -46,6 +48,7 @@ class Report:
   deviation: float
   nodes: int
   stopped: bool
+  depth: float = 0.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,9 +56,9 @@ class Piece:
   """A part of an organ that hangs together.
 
   Attributes:
-    vertices: numbers of its vertices
+    vertices: numbers of its vertices, those on the surface
     mass: [kg]
-    volume: of its wall, rest area times thickness [m^3]
+    volume: of its wall, rest area times thickness, or of a solid's tetrahedra, at rest [m^3]
     held: whether the foundation holds it; not where it was cut free
   """
 
@@ -82,9 +85,7 @@ class Cuts:
     if not self:
       return
     bodies.unshare(w.body)
-    copy = WorkingCopy(self.whole)
-    self._refill, self._knife = Refill(w.body, copy), cutting.Knife(copy)
-    self.finder = Finder(copy)
+    self._make()
     self.declared = w.organ
     self.mass = w.organ.mass.copy()
     self.source = np.arange(self.whole.nvert)
@@ -96,10 +97,16 @@ class Cuts:
   def __bool__(self) -> bool:
     return self.whole.spare > 0
 
+  def _make(self):
+    """Makes what finds cuts, and what writes meshes into the body's arrays."""
+    copy = WorkingCopy(self.whole)
+    self._refill, self._knife = Refill(self._w.body, copy), cutting.Knife(copy)
+    self.finder = Finder(copy)
+
   @property
   def full(self) -> bool:
     """Whether there is no spare vertex left."""
-    return self.mesh.nouter == self.mesh.nvert
+    return self.mesh.nouter == self.mesh.nskin
 
   @property
   def mesh(self) -> Mesh:
@@ -138,11 +145,14 @@ class Cuts:
     """
     if not self or self._found[0] == self.stamp:
       return
-    elem, loose, rest, mass, source = read(self.whole, self.declared.mass, self._own)
-    mesh, changed = topology.recut(self.mesh, rest, elem, loose)
-    self._become(mesh, changed, mass, source, self._found[0])
+    self._become(*self._read(), stamp=self._found[0])
     self.reports = []
     self._fresh, self._total = True, None
+
+  def _read(self) -> tuple:
+    """Returns the mesh that the state has, what differs, masses, and where vertices come from."""
+    elem, loose, rest, mass, source = read(self.whole, self.declared.mass, self._own)
+    return *topology.recut(self.mesh, rest, elem, loose), mass, source
 
   def copy(self) -> dict[str, np.ndarray]:
     """Returns what the plugin state has of the mesh."""
@@ -153,7 +163,7 @@ class Cuts:
     for name, values in kept.items():
       self._own[name][:] = values
 
-  def _write(self, found: cutting.Cut):
+  def _write(self, found: Any):
     """Writes to the state what a cut has changed, where it has the mesh before; else everything."""
     own, mesh, n = self._own, self.mesh, self.whole.nvert
     words, spare = self._words, mesh.nvert - mesh.spare
@@ -175,7 +185,7 @@ class Cuts:
 
   def _become(self, mesh: Mesh, changed: np.ndarray, mass, source, stamp: float):
     w = self._w
-    touched = topology.touched(self.mesh, mesh, changed)
+    touched = self._touched(mesh, changed)
     touched = topology.distinct(touched, np.flatnonzero(mass != self.mass))
     self._refill.write(mesh, changed, w.config, ~w.organ.free)
     self.mass, self.source, self.stamp = mass, source, stamp
@@ -184,6 +194,10 @@ class Cuts:
     for grown in [space for each in w.beside for space in each.reshape()]:
       with graphs.lock:
         bind(grown, grown.model)
+
+  def _touched(self, mesh: Mesh, changed: np.ndarray) -> np.ndarray:
+    """Returns the vertices that something has changed at, in this mesh and another."""
+    return topology.touched(self.mesh, mesh, changed)
 
   def forget(self):
     """Forgets what the body's arrays hold: the material has changed."""
@@ -209,22 +223,28 @@ class Cuts:
       self._rim[:] = np.stack([topology.corners(self.mesh, self._border, k) for k in (0, 1)], 1)
       self._mark[0] = self.stamp
 
+  def draw(self, model: int, data: int):
+    """Writes what is drawn besides these triangles."""
+
+  def hide(self, model: int):
+    """Hides it again, after a picture."""
+
   # Cutting.
 
-  def cut(self, points: np.ndarray, given: float = 0.0) -> Report:
+  def cut(self, points: np.ndarray, given: float = 0.0, depth=None, direction=None) -> Report:
     """Cuts the organ along points in the world, (n, 3) [m]; see `Organ.cut`, and `cutting.cut`."""
-    w, found = self._w, self.find(points, given)
+    w, found = self._w, self.find(points, given, depth, direction)
     if found.stopped:
       w.note(
         f"the cut stops early: no spare vertices are left of {self.mesh.spare}; give the organ more"
       )
-    done = report(found, self.mesh, w.organ, w.config.thickness)
+    done = self._report(found)
     if found.changed.size:
       self._take(found)
     self.reports.append(done)
     return done
 
-  def find(self, points: np.ndarray, given: float = 0.0) -> cutting.Cut:
+  def find(self, points: np.ndarray, given: float = 0.0, depth=None, direction=None) -> Any:
     """Returns what a cut would make of the organ."""
     w, organ = self._w, self._w.organ
     if not self:
@@ -232,11 +252,20 @@ class Cuts:
         f"organ {organ.name!r}: spare is 0, expected room for cuts: palpate.add_organ(..., spare=)"
       )
     self.follow()
-    organ, mesh = w.organ, self.mesh
+    organ = w.organ
     local = (np.asarray(points, float) - organ.origin) @ organ.frame
     motion = cutting.Motion(self.mass, *w.phases.motion())
+    return self._find(motion, local, given, depth, direction)
+
+  def _find(self, motion: cutting.Motion, points, given: float, depth, direction) -> Any:
+    """Returns the cut along points in the organ's frame, see `cutting.Knife`."""
+    w, organ = self._w, self._w.organ
+    if depth is not None or direction is not None:
+      raise ValueError(
+        f"organ {organ.name!r}: depth or direction is set, allowed only with elements='solid'"
+      )
     how = ~organ.free, w.config, self._held(), given
-    return self._knife.cut(organ.name, mesh, motion, local, *how)
+    return self._knife.cut(organ.name, self.mesh, motion, points, *how)
 
   def _held(self) -> cutting.Springs | None:
     """Returns the ties and bonds, None where there are none."""
@@ -251,7 +280,10 @@ class Cuts:
       np.add.at(hard, vert, stiffness)
     return cutting.Springs(energy, force, hard)
 
-  def _take(self, found: cutting.Cut):
+  def _report(self, found: Any) -> Report:
+    return report(found, self.mesh, self._w.organ, self._w.config.thickness)
+
+  def _take(self, found: Any):
     """Makes the organ the mesh that was found; what moved goes on as it moved."""
     w, mesh, motion = self._w, found.mesh, found.motion
     group, member, share = found.group, found.member, found.share
@@ -280,14 +312,15 @@ def report(found: cutting.Cut, before: Mesh, organ, thickness: float) -> Report:
 
 def pieces(mesh: Mesh, mass: np.ndarray, thickness: float) -> list[Piece]:
   """Returns the parts of a mesh that hang together, the heaviest first."""
-  label = topology.pieces(mesh)
+  label, solid = topology.pieces(mesh), len(mesh.tet) > 0
   area = topology.vertex_areas(mesh.rest, mesh.elem)
+  size = fill.vertex_volumes(mesh) if solid else area * thickness
   held = topology.held_areas(mesh) > 0
   out = []
   for k in range(label.max() + 1):
     vert = np.flatnonzero(label == k)
-    volume = float(area[vert].sum() * thickness)
-    out.append(Piece(vert, float(mass[vert].sum()), volume, bool(held[vert].any())))
+    numbers = float(mass[vert].sum()), float(size[vert].sum()), bool(held[vert].any())
+    out.append(Piece(vert[vert < mesh.nouter], *numbers))
   return sorted(out, key=lambda piece: -piece.mass)
 
 
@@ -312,9 +345,9 @@ def read(whole: Mesh, mass: np.ndarray, own: dict[str, np.ndarray]):
   source = np.append(np.arange(whole.nvert - whole.spare), own["source"]).astype(int)
   inside = (elem >= 0).all() and (elem < whole.nvert).all()
   if not inside or not np.array_equal(source[elem], whole.elem):
-    raise ValueError(_FOREIGN)
+    raise ValueError(FOREIGN)
   if flexes.stamp(own["corner"], rest, mass) != own["stamp"][0]:
-    raise ValueError(_FOREIGN)
+    raise ValueError(FOREIGN)
   return elem, loose, rest, mass, source
 
 

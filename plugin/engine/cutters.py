@@ -18,7 +18,7 @@ from palpate.tissue.path import Finder
 from palpate.tissue.step import SCHEMES
 from palpate.tissue.types import doubles, fill, ints, struct
 
-from . import coupling, fasten, flexes, mjstruct
+from . import coupling, fasten, flexes, inward, mjstruct
 from .current import Current
 from .cuts import Report
 from .hold import Beside, Bodies, Input, Nodes, base, nodes, solver
@@ -144,17 +144,19 @@ class Cutters(Beside):
   def law(self, m, thickness: float) -> np.ndarray:
     """Returns the rows of `Blades.law` where the wall has a thickness [m]."""
     w, rows = self._w, []
+    solid, edge = w.config.elements == "solid", w.organ.mesh.whole.edge_length
+    thickness = inward.PIERCED if solid else thickness
     for i, row in enumerate(w.config.cutters):
-      force = row.energy * thickness
+      force = row.energy * (1.0 if solid else thickness)  # of a solid by depth
       if row.current:
-        rows.append((0.0, 0.0, 0.0, thickness))
+        rows.append((0.0, 0.0, 0.0, thickness, solid))
         continue
-      stiff = force / (_SLACK * w.organ.mesh.whole.edge_length)
+      stiff = force * (edge if solid else 1.0) / (_SLACK * edge)
       for g in self._arrays["geom"][i]:
         if g >= 0:
           body = int(mjstruct.view(m.geom_bodyid, m.ngeom, np.int32)[g])
           stiff = min(stiff, fasten.most(w, m, body))
-      rows.append((force, row.energy * self._width[i], stiff, thickness))
+      rows.append((force, row.energy * self._width[i], stiff, thickness, solid))
     return np.array(rows)
 
   @property
@@ -181,13 +183,13 @@ class Cutters(Beside):
     values = {name: np.zeros((n, width)) for name, width in shapes.items()}
     values |= self._arrays | dict(
       nblade=n,
-      nelem=mesh.nelem,
+      nelem=mesh.whole.nelem,
       ahead=float(scheme.ahead),
       gain=scheme.gain(1.0, 0.0),
       edge=float(mesh.whole.edge_length),
       law=self.law(m, w.config.thickness),
       mesh=np.zeros(1),
-      elem=mesh.elem,
+      elem=mesh.elem[: mesh.whole.nelem],
       flat=mesh.rest,
       state=self.rows("blade", len(BLADE)),
       due=np.zeros(n),
@@ -209,7 +211,8 @@ class Cutters(Beside):
     """See `Beside`."""
     if self.fields is not None:
       mesh = self._w.organ.mesh
-      self.fields.elem.numpy()[:], self.fields.flat.numpy()[:] = mesh.elem, mesh.rest
+      self.fields.elem.numpy()[:] = mesh.elem[: mesh.whole.nelem]
+      self.fields.flat.numpy()[:] = mesh.rest
       self.fields.own.rest.numpy()[:] = base(self._w.organ)
     return []
 
@@ -221,20 +224,30 @@ class Cutters(Beside):
     for i, due in enumerate(self._due):
       if due:
         given = GIVEN * self.fields.law.numpy()[i, LAW.force] * mesh.whole.edge_length
-        opened = self._open(self.state[i], due == ENDED, given) or opened
+        opened = self._open(i, due == ENDED, given) or opened
         self._due[i] = 0
     return opened
 
-  def _open(self, row: np.ndarray, ended: bool, given: float) -> bool:
+  def _open(self, i: int, ended: bool, given: float) -> bool:
     """Opens the path of a blade; returns whether the mesh is another."""
-    w = self._w
+    w, row, mesh = self._w, self.state[i], self._w.organ.mesh
 
-    def cut(path: np.ndarray) -> tuple[Report, Mesh]:
-      organ = w.organ
+    def cut(path: np.ndarray, *deep: np.ndarray) -> tuple[Report, Mesh]:
+      organ, more = w.organ, {}
       now = on_surface(w.cuts.finder, organ.mesh, path, w.phases.motion()[0])
-      return w.cuts.cut(organ.origin + now @ organ.frame.T, given), w.organ.mesh
+      how = given
+      if deep:
+        geom, axis = (self._arrays[name][i] for name in ("geom", "axis"))
+        own = geom[1] < 0 and i not in self._currents
+        way = inward.direction(w, int(geom[0]) if own else -1, axis[0], int(row[BLADE.elem]))
+        more, how = {"depth": deep[0], "direction": way}, given * float(deep[0].mean())
+      return w.cuts.cut(organ.origin + now @ organ.frame.T, how, **more), w.organ.mesh
 
-    report, why = open_path(row, w.organ.mesh, ended, w.organ, w.cuts.finder, cut)
+    if len(mesh.tet):
+      edge = mesh.whole.edge_length
+      report, why = inward.open_path(row, edge, ended, w.cuts.finder, cut)
+    else:
+      report, why = open_path(row, mesh, ended, w.organ, w.cuts.finder, cut)
     if "pinned" in why and not self._said:
       self._said = True
       mjstruct.warn(why)
@@ -251,6 +264,7 @@ class Cutters(Beside):
     start, last = (row[k : k + 3] for k in (BLADE.trail, BLADE.trail + 3 * (count - 1)))
     if count < TRAIL and np.linalg.norm(at - last) > _SPACING * edge:
       row[BLADE.trail + 3 * count : BLADE.trail + 3 * count + 3] = at
+      row[BLADE.below + count] = row[BLADE.depth]
       row[BLADE.count] += 1
     wait = row[BLADE.wait] or _BATCH * edge
     return int(np.linalg.norm(at - start) > wait or row[BLADE.count] == TRAIL)

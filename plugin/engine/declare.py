@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 from palpate.tissue import config as configuration
 from palpate.tissue import device as devices
-from palpate.tissue import diagonals, fill, gmsh, shape
+from palpate.tissue import diagonals, faces, fill, gmsh, shape
 from palpate.tissue import mesh as topology
 from palpate.tissue.body import Body
 from palpate.tissue.config import Config
@@ -92,7 +92,7 @@ class Declaration:
   @property
   def inner(self) -> np.ndarray:
     """Vertices inside of a solid."""
-    return np.arange(self.mesh.nouter if len(self.mesh.tet) else self.mesh.nvert, self.mesh.nvert)
+    return np.arange(self.mesh.nskin if len(self.mesh.tet) else self.mesh.nvert, self.mesh.nvert)
 
   @property
   def dofs(self) -> np.ndarray:
@@ -180,7 +180,7 @@ def read(model: int, instance: int) -> Declaration:
   if config.elements == "solid":
     mesh = fill_inside(name, mesh, config)
     share = fill.vertex_volumes(mesh)
-    mass = float(mass[free].mean()) * nvert * share / share.sum()
+    mass = float(mass[free].mean()) * (nvert - mesh.spare) * share / share.sum()
   # Those inside move, and MuJoCo knows nothing of them.
   absent = np.full(mesh.nvert - nvert, -1)
   free = np.concatenate([free, absent < 0])
@@ -224,8 +224,14 @@ def read_mesh(
 
 def fill_inside(name: str, mesh: Mesh, config: Config) -> Mesh:
   """Returns the surface with its inside, of a file or made."""
-  given = config.tetrahedra
-  return gmsh.read(name, given, mesh) if given else fill.fill(name, mesh)
+  given, bare = config.tetrahedra, mesh.without_spare
+  solid = gmsh.read(name, given, bare) if given else fill.fill(name, bare)
+  if not mesh.spare:
+    return solid
+  try:
+    return faces.cuttable(mesh, solid)
+  except ValueError as error:
+    raise ValueError(f"organ {name!r}: {error}") from None
 
 
 def cached(

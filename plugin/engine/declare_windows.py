@@ -30,7 +30,6 @@ def read(model: int, instance: int) -> Declaration:
   start = int(mjstruct.view(m.flex_vertadr, m.nflex, np.int32)[flex])
   rest = mjstruct.view(m.flex_vert, (m.nflexvert, 3))[start : start + nvert].copy()
   config, mesh = declare.read_mesh(m, name, declare.keys(model, instance), rest, flex)
-  elem = mesh.elem
   declare.check_volume(name, mesh, config)
   if config.elements == "solid":
     mesh = declare.fill_inside(name, mesh, config)
@@ -41,7 +40,7 @@ def read(model: int, instance: int) -> Declaration:
     free[vertex] = bool(config.carrier)  # which holds them by springs
   if not free.any():
     raise ValueError(f"organ {name!r}: all vertices are pinned, expected some that move")
-  share = fill.vertex_volumes(mesh) if len(mesh.tet) else topology.vertex_areas(rest, elem)
+  share = fill.vertex_volumes(mesh) if len(mesh.tet) else topology.vertex_areas(rest, mesh.elem)
   mass = config.mass * share / share.sum()
   windows = _windows(model, m, instance, name, config, mesh, mass, (frame, origin))
   _check_neighbours(m, model, instance, name, windows, frame, origin, rest)

@@ -40,8 +40,15 @@ class Grip:
   """
 
   def __init__(self, mesh: Mesh, vert: np.ndarray):
-    half = mesh.ring_elem[vert]
     self.vert, self._rest = vert, mesh.rest[vert]
+    if len(mesh.tet):  # whose triangles keep their numbers too, those on its skin
+      elem = mesh.elem[: mesh.whole.nelem].reshape(-1)
+      number = np.full(mesh.nvert, -1)
+      number[vert] = np.arange(len(vert))
+      self._corner = np.flatnonzero(number[elem] >= 0)
+      self._row = number[elem[self._corner]]
+      return
+    half = mesh.ring_elem[vert]
     self._row, k = np.nonzero(half >= 0)
     self._corner = half[self._row, k]
 

@@ -15,6 +15,7 @@ from palpate.tissue.types import DIMS, doubles, struct
 
 MAX_WINDOWS = 64  # of an organ
 MAX_GEOMS = 32  # of a window
+WALLS = 4  # triangles that cuts of a solid may open, for one spare vertex
 TRAIL = 12  # points of the path of a blade that has not come apart yet
 
 
@@ -161,7 +162,7 @@ BOND = Numbers(
 BLADE = Numbers(
   "BLADE",
   ("stage", 1, "-", "0 away, 1 at the surface, 2 through the wall"),
-  ("depth", 1, "m", "how far it has pierced the wall"),
+  ("depth", 1, "m", "how far it has pierced the wall, or is in a solid"),
   ("elem", 1, "-", "triangle of its seat"),
   ("at", 3, "m", "its seat"),
   ("toward", 3, "-", "which way it cut last, 0 before"),
@@ -170,15 +171,17 @@ BLADE = Numbers(
   ("wait", 1, "m", "how far it goes before the mesh comes apart"),
   ("count", 1, "-", "points of `trail`"),
   ("trail", 3 * TRAIL, "m", "its path since the mesh came apart"),
+  ("below", TRAIL, "m", "how deep it was there in a solid"),
 )
 
 # What a geom that cuts meets.
 LAW = Numbers(
   "LAW",
-  ("force", 1, "N", "to cut, along the surface"),
+  ("force", 1, "N", "to cut, along the surface; of a solid by depth [N/m]"),
   ("pierce", 1, "N", "to pierce the wall, along the blade"),
   ("stiffness", 1, "N/m", "of the spring to its seat"),
-  ("wall", 1, "m", "thickness of the wall"),
+  ("wall", 1, "m", "thickness of the wall; of a solid how deep a blade is before it cuts along"),
+  ("solid", 1, "-", "whether it is a solid"),
 )
 
 # The last numbers of the plugin state of a windowed organ.
@@ -209,10 +212,10 @@ CONSTANTS = {
 class Topology:
   """The mesh of an organ with room for cuts, see `cuts`; zero before the first one."""
 
-  corner: doubles("ncorner")  # corners of each triangle, packed [-]
+  corner: doubles("ncorner")  # corners of each triangle, packed; of a wall its face + 1 [-]
   place: doubles("nplace", 3)  # rest position of each vertex, in the organ's frame [m]
   weight: doubles("nplace")  # its mass [kg]
-  source: doubles("nspare")  # what vertex each spare one comes from [-]
+  source: doubles("nspare")  # what vertex each spare one comes from; of a solid a corner + 1 [-]
   stamp: doubles("ncuts")  # of all these; 0 before the first cut [-]
 
 

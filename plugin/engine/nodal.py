@@ -144,15 +144,22 @@ class Phases(coupling.Phases):
     organ, (qpos, qvel) = self._w.organ, self._views()
     qpos0 = mjstruct.view(self._model.qpos0, self._model.nq)
     shift = organ.mesh.rest - organ.mesh.whole.rest
-    mine = changed[organ.free[changed]]
+    mine, within = (changed[organ.free[changed] & (there == (organ.dofadr[changed] >= 0))]
+                    for there in (True, False))  # fmt: skip
     at = organ.qposadr[mine, None] + np.arange(3)
     qpos[at] = qpos0[at] + shift[mine] + disp[mine]
     qvel[organ.dofadr[mine, None] + np.arange(3)] = vel[mine]
-    own = organ.stateadr[:, None] + np.arange(3)
-    for name in ("force", "last", "before"):
-      block = getattr(self._nodal.own, name).numpy()
-      part = share[:, None] if name == "force" else 1.0
-      block[own[member]] = part * block[own[group]]
+    own = self._nodal.own
+    for inner, values in ((own.disp, disp), (own.vel, vel)):
+      inner.numpy().reshape(-1, 3)[within - organ.mesh.nskin] = values[within]
+    at = organ.stateadr[:, None] + np.arange(3)
+    for name in ("last", "before"):
+      block = getattr(own, name).numpy()
+      block[at[member]] = block[at[group]]
+    force, outer = own.force.numpy(), organ.dofadr[group] >= 0  # what was inside had none
+    force[at[member]] = share[:, None] * np.where(
+      outer[:, None], force[at[np.where(outer, group, member)]], 0.0
+    )
 
 
 def _in_node_order(values: np.ndarray, vert: np.ndarray) -> np.ndarray:

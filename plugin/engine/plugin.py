@@ -208,6 +208,8 @@ def _advance(model: int, data: int, instance: int):
 def _end(w: Workspace):
   """Ends the step, and looks at what came of it."""
   w.step()
+  if w.cuts:
+    w.cuts.hide(w.model)
   if (w.cuts.tear and w.cuts.tear.act()) or (w.cutters and w.cutters.open()):
     workspace.place(w, w.model)
   nodes, triangles = w.flags[FLAG.missed_nodes], w.flags[FLAG.missed_elements]
@@ -228,6 +230,8 @@ def _visualize(model: int, data: int, option: int, scene: int, instance: int):
       w.cuts.show()
     if w.organ.windows:
       windowed.draw(w, model, data)
+    if w.cuts:
+      w.cuts.draw(model, data)
     if w.skin is not None:
       _draw_skin(w, model, data)
   except BaseException as error:

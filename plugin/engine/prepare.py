@@ -82,7 +82,8 @@ def give_weights(m, organ: Declaration):
   MuJoCo spreads the mass evenly over the vertices, the nodes inside have their part of it.
   """
   own = organ.jointed
-  weight = 1 / organ.mass[own]
+  mass = organ.mass[own]
+  weight = 1 / np.where(mass > 0, mass, mass[mass > 0].mean())  # some wait for cuts
   mjstruct.view(m.body_invweight0, (m.nbody, 2))[organ.body[own], 0] = weight
   mjstruct.view(m.dof_invweight0, m.nv)[organ.dofs] = np.repeat(weight, 3)
 
@@ -108,7 +109,7 @@ def show(m, organ: Declaration, shown: bool):
 
 def drawn(mesh) -> int:
   """Returns how many vertices of an organ a flex has: those on the surface, and spare ones."""
-  return mesh.nvert if mesh.spare else mesh.nouter
+  return mesh.nskin
 
 
 def group(m, skin: int, flex: int, groups: tuple[int, int]):

@@ -159,7 +159,8 @@ class Rests(Beside):
     """See `Beside`."""
     if self:
       slip = self._w.boxes["own"].slip.numpy()
-      slip[member] = slip[group]
+      outer = group < len(slip)  # what was inside of a solid rested on nothing
+      slip[member[outer]] = slip[group[outer]]
 
   def reshape(self) -> list:
     """See `Beside`."""

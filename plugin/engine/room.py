@@ -19,14 +19,14 @@ def state_size(model: int, instance: int) -> int:
     for key in ("relax_share", "support", "bonds")
   )
   spare = mjstruct.config(model, instance, "spare").strip() not in ("", "0")
-  cuts = coupling.cut_sizes(m.nflexelem, m.nflexvert, spare * m.nflexvert)
-  cutters = mjstruct.config(model, instance, "cutters").strip()
-  cuts |= {"nblade": cutters.count(",") + 1 if cutters else 0}
   # Asked before MuJoCo has filled in the flexes: what is needed is at most this.
   solid = mjstruct.config(model, instance, "elements").strip() == "solid"
   inner = fill.MOST * m.nflexvert if solid else 0
+  most = inner + m.nflexvert
+  cuts = coupling.cut_sizes(m.nflexelem, most, spare * m.nflexvert, solid)
+  cutters = mjstruct.config(model, instance, "cutters").strip()
+  cuts |= {"nblade": cutters.count(",") + 1 if cutters else 0}
   if names:
-    most = inner + m.nflexvert
     outer = {"nrest": rests * m.nflexvert, "nbond": bonded * m.nflexvert}
     outer |= {"ncreep": relaxes * most} | cuts
     return windowed.state_size(most, 0, m.ngeom * len(names), **outer)

@@ -28,6 +28,7 @@ class Slots:
   nvert: int  # vertices
   nslot: int  # slots of all windows
   nwindow: int  # windows
+  nroom: int  # triangles, and walls that cuts may open
   most: int  # candidates of a window that the outbox has room for
   resident: int  # 1 if the motion stays on a device and the plugin state may be old
   rest_share: wp.float64  # see `step.REST`
@@ -42,9 +43,9 @@ class Slots:
   rest: doubles("nvert", 3)  # rest position [m]
   inertia: doubles("nvert")  # effective inertia, of pinned nodes that of a wall [kg]
   touch: doubles("nvert")  # distance from a geom within which a node's triangles may touch it [m]
-  elem: ints("nelem", 3)  # nodes of a triangle
+  elem: ints("nroom", 3)  # nodes of a triangle
   begin: ints("nvert")  # first of the triangles whose first corner a node is, -1 for none
-  following: ints("nelem")  # the next one with the same first corner, -1 for none
+  following: ints("nroom")  # the next one with the same first corner, -1 for none
   frame: doubles(3, 3)  # rotation from the organ's axes to the world's
   origin: doubles(3)  # position of its frame [m]
   heaviest: doubles(1)  # see `Workspace`
@@ -113,10 +114,12 @@ def make(w, model: int, sizes: dict[str, int]):
   margin = float(mjstruct.view(m.flex_margin, m.nflex)[win.flex].max())
   margin += float(mjstruct.view(m.geom_margin, m.ngeom)[win.geom].max(initial=0.0))
   dofs = win.dofadr[:, None] + np.arange(3)
+  room = max(mesh.whole.nelem, sizes["ncorner"])
   values = w.boxes | {name: w.views[name] for name in scratch(0, 0)} | dict(
     nvert=sizes["nvert"],
     nslot=sizes["nslot"],
     nwindow=sizes["nwindow"],
+    nroom=room,
     most=sizes["most"],
     resident=int(w.config.resident),
     rest_share=step.REST,
@@ -129,9 +132,9 @@ def make(w, model: int, sizes: dict[str, int]):
     node_mass=hold(organ, organ.mass),
     rest=mesh.rest,
     touch=longest + radius,
-    elem=mesh.elem,
+    elem=np.zeros((room, 3)),
     begin=np.full(mesh.nvert, -1),
-    following=np.full(mesh.nelem, -1),
+    following=np.full(room, -1),
     frame=organ.frame,
     origin=organ.origin,
     heaviest=wp.array(w.heaviest, dtype=wp.float64, device="cpu", copy=False),
@@ -153,6 +156,7 @@ def make(w, model: int, sizes: dict[str, int]):
     mj=coupling.mujoco_arrays(model, w.data),
   )  # fmt: skip
   out = fill(Slots, "cpu", values)
+  out.elem.numpy()[: mesh.nelem] = mesh.elem
   _list_triangles(out, mesh, np.arange(mesh.nvert), np.arange(mesh.nelem))
   return out
 

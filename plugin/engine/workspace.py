@@ -30,9 +30,9 @@ from .bind import bind
 from .bonds import Bonds
 from .coupling import Phases
 from .creep import Creep
-from .cuts import Cuts
 from .cutters import Cutters
 from .declare import Declaration
+from .hewn import Cuts, cuts_of
 from .hold import Beside, Hold
 from .layout import FLAG, HEAD, STAGE
 from .pierce import Watch
@@ -160,7 +160,7 @@ class Workspace:
   def __post_init__(self):
     self.hold, self.ties = Hold(self), Ties(self)
     self.bonds, self.rests, self.creep = Bonds(self), Rests(self), Creep(self)
-    self.cuts, self.cutters = Cuts(self), Cutters(self)
+    self.cuts, self.cutters = cuts_of(self), Cutters(self)
 
   @property
   def beside(self) -> tuple[Beside, ...]:

@@ -161,13 +161,29 @@ PALPATE Stretch stretch_of(D3 pull, D3 blade, const Seated& at, D3 toward) {
   return s;
 }
 
+// How far a blade is beyond a place on it: its end that is nearer to that is inside.
+PALPATE double beyond(const Line& line, double place) {
+  return place < line.length - place ? place : line.length - place;
+}
+
+// The force that tissue bears of a blade: in a solid, by how deep it is.
+PALPATE double borne(const double* law, double deep) {
+  return law[LAW_SOLID] == 0.0 ? law[LAW_FORCE] : deep > 0.0 ? law[LAW_FORCE] * deep : 0.0;
+}
+
 // Adds the seat to the path, where it is far enough from the last point.
 PALPATE void note_path(double* s, double spacing) {
   const int count = (int)s[BLADE_COUNT];
   const D3 at = load(s + BLADE_AT);
-  if (count == TRAIL) return;
-  if (count && norm(at - load(s + BLADE_TRAIL + 3 * (count - 1))) < spacing) return;
+  const double deep = s[BLADE_DEPTH];
+  double* last = s + BLADE_BELOW + (count ? count - 1 : 0);
+  const bool near = count && norm(at - load(s + BLADE_TRAIL + 3 * (count - 1))) < spacing;
+  if (count == TRAIL || near) {
+    if (deep > *last) *last = deep;
+    return;
+  }
   store(s + BLADE_TRAIL + 3 * count, at);
+  s[BLADE_BELOW + count] = deep;
   s[BLADE_COUNT] += 1.0;
 }
 
@@ -179,16 +195,18 @@ PALPATE void sit_down(const Fields& f, Thread t, int i, const Line& line, double
   if (shears && toward == zero) return;
   int elem = 0;
   D3 weight, rest[3], x[3];
-  const double beyond = enters(f, t, line, elem, weight);
-  if (beyond < 0.0) return;
+  const double deep = enters(f, t, line, elem, weight);
+  if (deep < 0.0) return;
   corners_at_rest(f, elem, rest);
   corners_now(f, elem, x);
   const Line later = line_of(f, i, f.mj.timestep.data[0]);
   const double fast = 2.0 * norm(later.from - line.from);
-  const bool sideways = beyond > f.law.data[LAW_LENGTH * i + LAW_WALL] + fast || shears;
+  const double* law = f.law.data + LAW_LENGTH * i;
+  const bool sideways = deep > law[LAW_WALL] + fast || shears;
   s[BLADE_STAGE] = sideways ? THROUGH : PIERCING;
   s[BLADE_ELEM] = elem;
-  s[BLADE_DEPTH] = s[BLADE_COUNT] = 0.0;
+  s[BLADE_COUNT] = 0.0;
+  s[BLADE_DEPTH] = law[LAW_SOLID] != 0.0 && sideways ? deep : 0.0;
   store(s + BLADE_AT, blend(rest, weight));
   store(s + BLADE_TOWARD, unit_of(carried(toward, x, rest)));
   if (sideways) note_path(s, 0.0);
@@ -209,7 +227,7 @@ PALPATE bool advance(const Fields& f, Thread t, int i, D3 way, const Seated& fro
   store(s + BLADE_AT, now);
   if (s[BLADE_STAGE] == PIERCING) return true;
   store(s + BLADE_TOWARD, unit_of(now - was));
-  s[BLADE_WORK] += f.law.data[LAW_LENGTH * i + LAW_FORCE] * norm(way);
+  s[BLADE_WORK] += borne(f.law.data + LAW_LENGTH * i, s[BLADE_DEPTH]) * norm(way);
   s[BLADE_OPENED] += gone;
   note_path(s, SPACING * f.edge);
   return true;
@@ -222,7 +240,8 @@ PALPATE void give_way(const Fields& f, Thread t, int i, const Line& line, double
   const double* law = f.law.data + LAW_LENGTH * i;
   Seated at = seated(f, s);
   const double place = dot(at.at - line.from, line.along);
-  const double slack = law[LAW_FORCE] / law[LAW_STIFFNESS];
+  const double deep = beyond(line, place), slack = borne(law, deep) / law[LAW_STIFFNESS];
+  if (law[LAW_SOLID] != 0.0 && s[BLADE_STAGE] == THROUGH) s[BLADE_DEPTH] = deep > 0.0 ? deep : 0.0;
   const double before = s[BLADE_STAGE] == PIERCING ? slack : 0.0;
   bool out = place < -before || place > line.length + before || line.length == 0.0;
   if (!out) {
@@ -240,8 +259,7 @@ PALPATE void give_way(const Fields& f, Thread t, int i, const Line& line, double
   if (out) {
     s[BLADE_STAGE] = AWAY;
   } else if (s[BLADE_STAGE] == PIERCING) {
-    const double beyond = place < line.length - place ? place : line.length - place;
-    const double depth = beyond - law[LAW_PIERCE] / law[LAW_STIFFNESS];
+    const double depth = deep - law[LAW_PIERCE] / law[LAW_STIFFNESS];
     if (depth > s[BLADE_DEPTH]) {
       const double goes = depth < law[LAW_WALL] ? depth : law[LAW_WALL];
       s[BLADE_WORK] += law[LAW_PIERCE] * (goes - s[BLADE_DEPTH]);
@@ -281,9 +299,9 @@ PALPATE void bear(const Fields& f, Thread t, int i, const Line& line, const doub
     hold = without(hold, weight, then.back);
     force = across(force, then.back);
   }
-  const double size = k * norm(then.flat);
-  if (size > law[LAW_FORCE]) {
-    const double share = law[LAW_FORCE] / size;
+  const double size = k * norm(then.flat), most = borne(law, beyond(later, place));
+  if (size > most) {
+    const double share = most / size;
     hold = share * hold;
     force = (share * k) * then.pull;
   }

@@ -190,6 +190,9 @@ class Config:
     "vertices without triangles, after the others, that cuts make use of ([cutting](cutting.md)); "
     "`auto`: as many as there are; `add_organ` and `add_spare` make them",
   )
+  walls: str = _row(
+    "", (reading.name, "the name of a flexcomp"), "drawn where a solid is cut (`add_organ`)"
+  )
   tear: float = _row(
     0.0,
     reading.NOT_NEGATIVE,
@@ -393,16 +396,16 @@ def spare(organ: str, text: str, there: int) -> int:
 
 
 def _check_spare(organ: str, config: Config):
-  if config.tear and not config.spare:
-    raise ValueError(f"organ {organ!r}: tear is {config.tear:g}, allowed only with spare")
+  if config.tear and (not config.spare or config.elements == "solid"):
+    allowed = "allowed only with spare and not for a solid"
+    raise ValueError(f"organ {organ!r}: tear is {config.tear:g}, {allowed}")
   if config.cutters and not config.spare and not config.bonded:
     raise ValueError(f"organ {organ!r}: cutters is set, allowed only with spare, or bonds to free")
   if not config.spare:
     return
-  refused = {"elements": "solid", "carrier": OWN, "capsule_young": config.capsule_young or None}
-  for key, value in refused.items():
-    if getattr(config, key) == value:
-      raise ValueError(f"organ {organ!r}: {key} is {value!r}, allowed only where spare is 0")
+  for key, of in (("carrier", OWN), ("capsule_young", config.capsule_young or None)):
+    if getattr(config, key) == of:
+      raise ValueError(f"organ {organ!r}: {key} is {of!r}, allowed only where spare is 0")
 
 
 def _check_ties(organ: str, config: Config):

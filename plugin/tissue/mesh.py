@@ -23,9 +23,11 @@ class Mesh:
     ring_elem: half-edge vertex -> ring[k]; -1 where it has no face (nvert, most)
     degree: number of neighbours                                    (nvert,)
     tet: corners of each tetrahedron, of positive volume, see `fill`(ntet, 4)
-    spare: the last so many vertices may have no triangle yet: room for cuts
+    spare: after those on the surface so many vertices may have no triangle yet: room for cuts
     uncut: the mesh before the first cut, None for one that has none
     loose: triangles that were cut free of the foundation, None for none    (nelem,) bool
+    of_tet: corner of a tetrahedron that each of triangles is, of solids, see `faces` (nelem, 3)
+    mate, slit: faces beside those of tetrahedra before the first cut, see there (4 ntet,), (n, 4)
   """
 
   rest: np.ndarray
@@ -39,6 +41,9 @@ class Mesh:
   spare: int = 0
   uncut: Mesh | None = None
   loose: np.ndarray | None = None
+  of_tet: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 3), np.int64))
+  mate: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, np.int64))
+  slit: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 4), np.int64))
 
   @property
   def whole(self) -> Mesh:
@@ -50,7 +55,7 @@ class Mesh:
     """Mean of the rest positions before the first cut [m], (3,)."""
     if self.uncut is not None:
       return self.uncut.centre
-    return self.rest[: self.nvert - self.spare].mean(axis=0)
+    return np.delete(self.rest, self.spares, axis=0).mean(axis=0)
 
   @functools.cached_property
   def edge_length(self) -> float:
@@ -79,8 +84,18 @@ class Mesh:
 
   @property
   def unused(self) -> np.ndarray:
-    """Whether a vertex waits for a cut, (nvert,) bool."""
-    return (np.arange(self.nvert) >= self.nvert - self.spare) & (self.degree == 0)
+    """Whether a vertex waits for a cut, or is no more since one, (nvert,) bool."""
+    return (self.degree == 0) & (self.spare > 0)
+
+  @property
+  def spares(self) -> slice:
+    """The vertices that waited for the first cut: they follow those on the surface."""
+    return slice(self.whole.nouter, self.whole.nouter + self.spare)
+
+  @property
+  def nskin(self) -> int:
+    """Number of vertices that are on the surface or may come there by cuts, which come first."""
+    return self.spares.stop
 
   @functools.cached_property
   def nouter(self) -> int:
@@ -89,9 +104,11 @@ class Mesh:
 
   @functools.cached_property
   def surface(self) -> Mesh:
-    """The surface alone: of a solid with the vertices inside, which have no neighbours then."""
+    """The surface alone: of a solid, before the first cut, and without neighbours inside."""
     if not len(self.tet):
       return self
+    if self.uncut is not None:
+      return self.uncut.surface
     ring, ring_elem, degree = _rings("solid", self.elem, self.twin, self.nvert)
     return dataclasses.replace(
       self, ring=ring, ring_elem=ring_elem, degree=degree, tet=self.tet[:0]
@@ -151,8 +168,10 @@ def vertex_areas(position: np.ndarray, elem: np.ndarray) -> np.ndarray:
 
 
 def pieces(mesh: Mesh) -> np.ndarray:
-  """Returns the number of the piece of surface that each vertex is in, -1 if unused, (nvert,)."""
+  """Returns the number of the piece that each vertex is in, -1 if unused, (nvert,)."""
   a, b = mesh.elem.T[:2].ravel(), mesh.elem.T[1:].ravel()
+  if len(mesh.tet):
+    a, b = mesh.tet.T[:3].ravel(), mesh.tet.T[1:].ravel()
   graph = sparse.coo_array((np.ones(len(a), np.int8), (a, b)), shape=(mesh.nvert, mesh.nvert))
   label = csgraph.connected_components(graph, directed=False)[1]
   label[mesh.unused] = -1
@@ -168,6 +187,8 @@ def corners(mesh: Mesh, half: np.ndarray, k: int = 0) -> np.ndarray:
 
 def around(mesh: Mesh, vert: np.ndarray) -> np.ndarray:
   """Returns the triangles that have a corner among these vertices, ascending."""
+  if len(mesh.tet):
+    return np.flatnonzero(among(mesh.nvert, vert)[mesh.elem].any(axis=1))
   half = mesh.ring_elem[vert]
   return distinct(half[half >= 0] // 3)
 
@@ -180,6 +201,8 @@ def held_areas(mesh: Mesh) -> np.ndarray:
 
 def areas_of(mesh: Mesh, vert: np.ndarray, held: bool = False) -> np.ndarray:
   """Returns the areas of some vertices, to the bit as `vertex_areas` and `held_areas` [m^2]."""
+  if len(mesh.tet):
+    return (held_areas(mesh) if held else vertex_areas(mesh.rest, mesh.elem))[vert]
   around = np.sort(np.where(mesh.ring_elem[vert] >= 0, mesh.ring_elem[vert] // 3, mesh.nelem))
   elem, where = np.unique(around, return_inverse=True)
   size = np.zeros(len(elem))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from scipy import sparse
 from scipy.sparse import csgraph
@@ -40,6 +42,7 @@ def ellpack(
   index: np.ndarray,
   value: np.ndarray,
   fill: np.ndarray,
+  room: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
   """Returns the lists of all nodes as sliced ELLPACK: row k of a slice has their k-th entries.
 
@@ -48,6 +51,7 @@ def ellpack(
     index: what it points at    (n,)
     value: its value            (n,)
     fill: what the entries that pad a node's list point at, with value 0 (nslice, 8)
+    room: returns the rows of each slice from the numbers of entries, None for as few as may be
 
   Returns:
     rows of each slice (nslice,), entries and values (rows, 8)
@@ -55,7 +59,7 @@ def ellpack(
   by_row = np.lexsort((index, row))
   row, index, value = row[by_row], index[by_row], value[by_row]
   count = np.bincount(row, minlength=fill.size)
-  width = count.reshape(-1, LANES).max(axis=1)
+  width = count.reshape(-1, LANES).max(axis=1) if room is None else room(count)
   within = np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count)
   place = (np.cumsum(width) - width)[row // LANES] + within
   entry = np.repeat(fill, width, axis=0)
@@ -102,12 +106,14 @@ def node_order(mesh: Mesh, patch: int = 0) -> np.ndarray:
     patch: nodes of a block of threads that works on a patch of the surface, 0 for no patches
   """
   mesh = mesh.whole
-  n = mesh.nvert - mesh.spare
-  order = _patches(mesh.rest[:n], patch) if patch else _band(mesh)
-  order = order[order < n]
+  spare = np.arange(mesh.spares.start, mesh.spares.stop)
+  used = np.delete(np.arange(mesh.nvert), spare)
+  order = used[_patches(mesh.rest[used], patch)] if patch else _band(mesh)
+  order = order[~np.isin(order, spare)]
+  n = len(order)
   window = np.arange(n) // (8 * LANES)
   order = order[np.lexsort((np.arange(n), -mesh.degree[order], window))]
-  return np.concatenate([order, np.arange(n, mesh.nvert), np.full(-mesh.nvert % LANES, -1)])
+  return np.concatenate([order, spare, np.full(-mesh.nvert % LANES, -1)])
 
 
 def _patches(point: np.ndarray, size: int) -> np.ndarray:

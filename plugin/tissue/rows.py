@@ -12,6 +12,7 @@ import numpy as np
 import warp as wp
 
 from . import config as configuration
+from . import faces
 from .config import Config
 from .kernels import kernel
 from .mesh import Mesh
@@ -182,7 +183,9 @@ def room(mesh: Mesh) -> np.ndarray:
   A cut takes triangles from a fan and adds none; an open one has a neighbour more than triangles.
   """
   mesh = mesh.whole
+  if len(mesh.tet):
+    return faces.room(mesh)
   closes = mesh.ring_elem[np.arange(mesh.nvert), np.maximum(mesh.degree - 1, 0)] >= 0
   most = mesh.degree + (closes & (mesh.degree > 0))
-  most[mesh.nvert - mesh.spare :] = most.max()
+  most[mesh.spares] = most.max()
   return most

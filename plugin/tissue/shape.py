@@ -150,7 +150,7 @@ def arrays(
   node = np.empty(mesh.nvert, np.int64)
   node[vert[vert >= 0]] = np.flatnonzero(vert >= 0)
   skin = dataclasses.replace(config, bend=0.0) if len(mesh.tet) else config
-  out = _skin(mesh, skin, pinned, vert, node, bend_width)
+  out = _skin(solid.skin(mesh), skin, pinned, vert, node, bend_width)
   out |= _capsule(mesh.surface, config, pinned, vert, node)
   out |= solid.arrays(mesh, config, vert, node) if len(mesh.tet) else solid.none(nslice)
   out |= {
@@ -271,7 +271,7 @@ def _bend_room(mesh: Mesh, node: np.ndarray, entries: np.ndarray) -> np.ndarray:
   A node near the end of a cut has vertices of both its sides around it.
   """
   room = entries + np.where(entries > 0, _BEND_MORE, 0)
-  room[node[mesh.nvert - mesh.spare :]] = room.max()
+  room[node[mesh.spares]] = room.max()
   return room.reshape(-1, LANES).max(axis=1)
 
 

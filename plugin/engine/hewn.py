@@ -1,0 +1,158 @@
+"""Cuts of a solid: as those of a surface in `cuts`, by the faces between tetrahedra that are open.
+
+The plugin state has these faces, in the place of triangles that wait, and of each vertex that cuts
+have made a corner of a tetrahedron that it has: the rest follows, see `faces.restored`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import numpy as np
+from palpate.tissue import cleave, energy, faces
+from palpate.tissue import mesh as topology
+from palpate.tissue.cut import Motion
+from palpate.tissue.mesh import Mesh
+from palpate.tissue.path import Finder
+from palpate.tissue.resolid import SolidRefill
+from palpate.tissue.surface import WorkingCopy
+
+from . import cuts, flexes
+from .cuts import Cuts
+from .walls import Walls
+
+
+def cuts_of(w) -> Cuts:
+  """Returns what cuts a workspace's organ."""
+  return (SolidCuts if len(w.organ.mesh.tet) else Cuts)(w)
+
+
+class SolidCuts(Cuts):
+  """The mesh of a workspace's solid; false where there is no room for cuts."""
+
+  def __init__(self, w):
+    super().__init__(w)
+    self.walls = Walls(w)
+
+  def draw(self, model: int, data: int):
+    """Writes what is drawn of the walls of cuts."""
+    self.walls.draw(model, data)
+
+  def hide(self, model: int):
+    """Hides it again."""
+    self.walls.hide(model)
+
+  def _make(self):
+    self._refill = SolidRefill(self._w.body, self.whole)
+    self.finder = Finder(WorkingCopy(self.whole))
+    self.seat = np.zeros(0, np.int64)
+
+  def show(self):
+    """Gives the model the triangles of this organ's skin."""
+    if not self.shown:
+      self._elem[:] = self.mesh.elem[: self.whole.nelem]
+      self._mark[0] = self.stamp
+
+  def share(self, values: np.ndarray) -> np.ndarray:
+    """Returns values by mass, see `Cuts.share`; what comes from inside has them as the skin."""
+    was, skin = self.declared.mass, np.arange(self.whole.nouter)
+    skin = skin[was[skin] > 0]
+    usual = self.mass * float(np.median(values[skin] / was[skin]))
+    inside = self.source >= self.whole.nskin
+    out = np.where(inside, usual, super().share(values))
+    return np.where(self.mass > 0, out, values)
+
+  def _read(self) -> tuple:
+    whole, own, n = self.whole, self._own, self.whole.nelem
+    if not self._found[0]:
+      found = faces.grown(self.mesh, whole.rest, whole.tet, whole.of_tet)
+      return *found, self.declared.mass, np.arange(whole.nvert)
+    corner, rest, mass = own["corner"], own["place"].reshape(-1, 3).copy(), own["weight"].copy()
+    face, seat = (np.rint(np.clip(each[each > 0], 0, 2.0**52)).astype(np.int64) - 1
+                  for each in (corner[n:], own["source"]))  # fmt: skip
+    try:
+      if flexes.stamp(self._words) != self._found[0]:
+        raise ValueError
+      tet = faces.restored(whole, rest, face, seat)
+      of_tet = np.concatenate([whole.of_tet, faces.corners(face)])
+      mesh, changed = faces.grown(self.mesh, rest, tet, of_tet)
+    except ValueError:
+      raise ValueError(cuts.FOREIGN) from None
+    loose = np.append(flexes.unpack(corner[:n])[1], np.ones(len(face), bool))
+    source = np.arange(whole.nvert)
+    source[whole.spares][: len(seat)] = whole.tet.ravel()[seat]
+    self.seat = seat
+    return dataclasses.replace(mesh, loose=loose), changed, mass, source
+
+  def _write(self, found: cleave.Cut):
+    own, mesh, n = self._own, self.mesh, self.whole.nelem
+    self._sit(found)
+    face = faces.opened(mesh)
+    own["corner"][:n] = flexes.pack(mesh.elem[:n], mesh.loose[:n])
+    own["corner"][n:] = 0.0
+    own["corner"][n : n + len(face)] = face + 1
+    own["place"][:] = mesh.rest.ravel()
+    own["weight"][:] = self.mass
+    own["source"][:] = 0.0
+    own["source"][: len(self.seat)] = self.seat + 1
+    self.stamp = self._found[0] = flexes.stamp(self._words)
+
+  def _sit(self, found: cleave.Cut):
+    """Notes a corner of each vertex that cuts have made."""
+    first = self.whole.nouter
+    seat = np.zeros(found.mesh.nouter - first, np.int64)
+    seat[: len(self.seat)] = self.seat
+    new = found.member >= first
+    seat[found.member[new] - first] = found.seat[new]
+    self.seat = seat
+
+  def _touched(self, mesh: Mesh, changed: np.ndarray) -> np.ndarray:
+    return topology.distinct(self.mesh.tet[changed], mesh.tet[changed])
+
+  def _find(self, motion: Motion, points, given: float, depth, direction) -> cleave.Cut:
+    w, organ, mesh = self._w, self._w.organ, self.mesh
+    if mesh.uncut is None:
+      self.seat = np.zeros(0, np.int64)
+    if direction is not None:
+      direction = np.asarray(direction, float) @ organ.frame
+    found = cleave.cut(
+      organ.name,
+      mesh,
+      motion,
+      points,
+      ~organ.free,
+      depth,
+      direction,
+      functools.partial(energy.of_tets, mesh, w.config),
+      given,
+      len(self._own["corner"]),
+    )
+    return dataclasses.replace(found, mesh=_freed(found.mesh))
+
+  def _report(self, found: cleave.Cut) -> cuts.Report:
+    organ = self._w.organ
+    path = [organ.origin + line @ organ.frame.T for line in found.path]
+    nodes = found.mesh.nouter - self.mesh.nouter
+    return cuts.Report(
+      found.length, found.area, path, found.deviation, nodes, found.stopped, found.depth
+    )
+
+
+def _freed(mesh: Mesh) -> Mesh:
+  """Returns the solid with the triangles of its skin marked that the foundation let go of.
+
+  Of what it held together until now, it goes on to hold the largest piece.
+  """
+  whole = mesh.whole
+  if mesh.uncut is None:
+    return mesh
+  n, loose = whole.nelem, mesh.loose.copy()
+  area = topology.lengths(topology.area_vectors(mesh.rest, mesh.elem[:n]))
+  piece = topology.pieces(mesh)[mesh.elem[:n, 0]]
+  for part in np.unique(whole.home):
+    held = (whole.home == part) & ~loose[:n]
+    size = np.bincount(piece[held], area[held])
+    if (size > 0).sum() > 1:
+      loose[:n] |= held & (piece != np.argmax(size))
+  return dataclasses.replace(mesh, loose=loose)
