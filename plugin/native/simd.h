@@ -322,6 +322,12 @@ PALPATE const float* numbers(const Fields& f, int world) {
   return f.tissue.number.data + NUMBERS * world;
 }
 
+// How far what worlds have of their own, of `Shape` and `Tissue`, lies behind that of the first mesh.
+template <class Fields>
+PALPATE size_t mesh_of(const Fields& f, int world) {
+  return MESHES && f.shape.mesh.data ? (size_t)f.shape.stride * f.shape.mesh.data[world] : 0;
+}
+
 #if ON_CUDA
 // Lane of a thread. That it is below eight is hidden from the compiler, which otherwise takes rows
 // for bits of one number and computes the address of each anew.
