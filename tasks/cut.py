@@ -41,7 +41,7 @@ CLOSING = 0.006  # length that is cut beyond that of the line where the piece co
 STEP = 0.001  # between points of the line [m]
 AHEAD = (5, 10, 15)  # points further on that are observed
 _MARKS = 36  # spheres that draw the line
-_LEAP = 10  # points of the line between two control steps that do not follow one another
+LEAP = 10  # points of the line between two control steps that do not follow one another
 # Of the expert: how fast it cuts [m/s], and how deep the tip is under the sheet and over it [m].
 _SPEED, _DEEP, _OVER = 0.012, 0.0035, 0.012
 _BEYOND = 10  # points of the line that it goes on beyond where it began
@@ -69,6 +69,22 @@ def hard(time_limit=80, random=None, environment_kwargs=None, **kwargs):
   kwargs = {"radius": 0.018, "wave": 0.2, "tolerance": 0.0015, "jitter": 0.005, **kwargs}
   task = Cut(dataclasses.replace(SCENE, nodes=1000), random, name="cut/hard", **kwargs)
   return base.make(task, time_limit, environment_kwargs)
+
+
+def line(radius: float, wave: float, start: float) -> tuple[np.ndarray, float]:
+  """Returns points of the line around the middle, (n, 3), and its length [m].
+
+  Args:
+    radius: mean radius [m]
+    wave: by how much that comes and goes, three times around [-]
+    start: angle at which it begins [rad]
+  """
+  angle = start + np.linspace(0, 2 * np.pi, 721)
+  far = radius * (1 + wave * np.cos(3 * angle))
+  fine = np.stack([far * np.cos(angle), far * np.sin(angle), 0.0 * angle], axis=1)
+  arc = np.concatenate([[0.0], np.linalg.norm(np.diff(fine, axis=0), axis=1).cumsum()])
+  way = np.linspace(0.0, arc[-1], round(arc[-1] / STEP) + 1)[:-1]
+  return np.stack([np.interp(way, arc, column) for column in fine.T], axis=1), float(arc[-1])
 
 
 class Cut(Task):
@@ -129,13 +145,7 @@ class Cut(Task):
 
   def begin(self, physics: Physics) -> None:
     """Draws the line, which begins anywhere on it."""
-    angle = self.random.uniform(0, 2 * np.pi) + np.linspace(0, 2 * np.pi, 721)
-    radius = self.radius * (1 + self.wave * np.cos(3 * angle))
-    fine = np.stack([radius * np.cos(angle), radius * np.sin(angle), 0.0 * angle], axis=1)
-    arc = np.concatenate([[0.0], np.linalg.norm(np.diff(fine, axis=0), axis=1).cumsum()])
-    way = np.linspace(0.0, arc[-1], round(arc[-1] / STEP) + 1)[:-1]
-    self.curve = np.stack([np.interp(way, arc, column) for column in fine.T], axis=1)
-    self.length = float(arc[-1])
+    self.curve, self.length = line(self.radius, self.wave, self.random.uniform(0, 2 * np.pi))
     self.cut = np.zeros(len(self.curve), bool)
     self.opened = self.astray = self.jagged = self.excess = self.farthest = 0.0
     self._seat: np.ndarray | None = None
@@ -196,7 +206,7 @@ class Cut(Task):
     if beside:
       return
     way = (last - first + count // 2) % count - count // 2
-    between = np.arange(min(0, way), max(0, way) + 1) if abs(way) <= _LEAP else np.array([way])
+    between = np.arange(min(0, way), max(0, way) + 1) if abs(way) <= LEAP else np.array([way])
     self.cut[(first + between) % count] = True
 
   def _beside(self, place: np.ndarray) -> bool:

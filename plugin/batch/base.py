@@ -10,6 +10,8 @@ import mujoco
 import numpy as np
 import warp as wp
 
+from .parting import Parting
+
 
 class Batch(abc.ABC):
   """Worlds of one scene.
@@ -102,6 +104,21 @@ class Batch(abc.ABC):
     if isinstance(steps, bool) or not isinstance(steps, int | np.integer) or steps < 1:
       raise ValueError(f"steps is {steps!r}, expected a whole number >= 1")
     return self._watch(self._make(int(steps), self.model.nsensordata))
+
+  def feel(self, sensor: str, organ: str):
+    """Adds the force of what cuts an organ to a sensor of force, in each step from now on.
+
+    MuJoCo's sensors of contacts know nothing of a blade.
+    """
+    found = self.model.sensor(sensor)
+    if found.dim[0] != 3:
+      raise ValueError(f"sensor {sensor!r} has {found.dim[0]} numbers, expected 3: a force")
+    if not self.organ(organ).cutters.inside.shape[1]:
+      raise ValueError(f"organ {organ!r}: nothing cuts it, expected the key cutters")
+    self._feel(found.id, organ)
+
+  def _feel(self, sensor: int, organ: str):
+    raise ValueError("worlds on several devices cannot feel cutters; their `parts` can")
 
   def _watch(self, out: wp.array) -> wp.array:
     raise ValueError("worlds on several devices cannot be watched; their `parts` can")
@@ -307,8 +324,10 @@ class Contacts(NamedTuple):
   force: wp.array
 
 
-class Tissue(abc.ABC):
+class Tissue(Parting):
   """One organ in all worlds of a batch; arrays as those of `Batch`, in world coordinates.
+
+  Vertices that wait for a cut come last, and are at NaN until they are of use.
 
   Attributes:
     name: name of the flexcomp

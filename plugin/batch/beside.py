@@ -147,8 +147,14 @@ class Beside:
   def _zeros(self, *shape: int, dtype: Any = wp.float64) -> wp.array:
     return wp.zeros(shape, dtype=dtype, device=self._device)
 
-  def _over(self, what: Kernel, fields, count: int):
-    launch(what, fields, self._nworld, max(1, count), self._device)
+  def configure(self, worlds: np.ndarray, rows: dict[str, np.ndarray]):
+    """Follows the tissue of worlds, which has changed; `rows` as `Material.change` takes them."""
+
+  def stepped(self, last: bool):
+    """Does what the host has to do after a step; `last`: it was the last one for now."""
+
+  def _over(self, what: Kernel, fields, count: int, arg: int = 0):
+    launch(what, fields, self._nworld, max(1, count), self._device, arg)
 
 
 def bodies_of(batch):

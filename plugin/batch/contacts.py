@@ -20,6 +20,7 @@ from palpate.tissue.types import Array, fill, floats, ints, struct
 
 from . import convex, cylinder
 from .convex import Convex
+from .kernels import triple
 from .patch import Patch
 
 _GEOM = mujoco.mjtGeom
@@ -41,6 +42,8 @@ _CONSTRAINT = wp.constant(int(ContactType.CONSTRAINT))
 _LEAST = 1e-5  # friction, as in MuJoCo
 _FEW = 4  # tools; more of them share triangles
 # Whose sliding friction counts: the greater, or that of the one with priority.
+_MIXED = {"margin": (), "slide": (), "whose": (), "condim": (), "friction": (5,), "solref": (2,),
+          "solimp": (5,)}  # fmt: skip
 _GREATER, _TOOL, _ORGAN = wp.constant(0), wp.constant(1), wp.constant(2)
 
 
@@ -102,32 +105,15 @@ class Place:
 
 
 @wp.func
-def _choose(n: int, k: int):
-  """Returns n over k, k up to 3."""
-  if k == 2:
-    return n * (n - 1) // 2
-  return n * (n - 1) * (n - 2) // 6
-
-
-@wp.func
-def _triple(a: int, b: int, c: int, n: int):
-  """Returns the number of a triple of n in the order of `itertools.combinations`."""
-  low = wp.min(a, wp.min(b, c))
-  high = wp.max(a, wp.max(b, c))
-  middle = a + b + c - low - high
-  before = _choose(n, 3) - _choose(n - low, 3)
-  return before + _choose(n - low - 1, 2) - _choose(n - middle, 2) + high - middle - 1
-
-
-@wp.func
 def _where(p: Patch, world: int, i: int):
   """Returns where a node is."""
   s = i // 8
   lane = i % 8
   d = p.solve.disp
-  x = p.rest[i, 0] + wp.float64(d[world, s, 0, lane])
-  y = p.rest[i, 1] + wp.float64(d[world, s, 1, lane])
-  z = p.rest[i, 2] + wp.float64(d[world, s, 2, lane])
+  m = p.mesh[world]
+  x = p.rest[m, i, 0] + wp.float64(d[world, s, 0, lane])
+  y = p.rest[m, i, 1] + wp.float64(d[world, s, 1, lane])
+  z = p.rest[m, i, 2] + wp.float64(d[world, s, 2, lane])
   return wp.vec3(
     float(p.origin[0] + p.frame[0, 0] * x + p.frame[0, 1] * y + p.frame[0, 2] * z),
     float(p.origin[1] + p.frame[1, 0] * x + p.frame[1, 1] * y + p.frame[1, 2] * z),
@@ -285,13 +271,18 @@ def _ball(a: wp.vec3, b: wp.vec3, d: wp.vec3):
 
 
 @wp.func
+def _corners(p: Patch, world: int, e: int):
+  m = p.mesh[world]
+  return p.elem[m, e, 0], p.elem[m, e, 1], p.elem[m, e, 2]
+
+
+@wp.func
 def _owner(p: Patch, world: int, e: int):
   """Returns the first corner of a triangle that has a slot, whose thread has the triangle."""
-  if p.node_slot[world, p.elem[e, 0]] >= 0:
-    return p.elem[e, 0]
-  if p.node_slot[world, p.elem[e, 1]] >= 0:
-    return p.elem[e, 1]
-  return p.elem[e, 2]
+  a, b, c = _corners(p, world, e)
+  if p.node_slot[world, a] >= 0:
+    return a
+  return wp.where(p.node_slot[world, b] >= 0, b, c)
 
 
 @functools.cache
@@ -318,17 +309,16 @@ def kernel(kinds: frozenset[int]) -> wp.Kernel:
       at.room = c.most - first
       first += c.nacon[0] + c.before[world]
     if i >= 0:
-      for q in range(p.near_adr[i] + k % c.ring, p.near_adr[i + 1], c.ring):
+      was = p.source[p.mesh[world], i]
+      for q in range(p.near_adr[was] + k % c.ring, p.near_adr[was + 1], c.ring):
         e = p.near[q]
-        va, vb, vd = p.elem[e, 0], p.elem[e, 1], p.elem[e, 2]
+        va, vb, vd = _corners(p, world, e)
         a, b, d = p.node_slot[world, va], p.node_slot[world, vb], p.node_slot[world, vd]
         whole = a >= 0 and b >= 0 and d >= 0
         if _owner(p, world, e) == i and (whole or not writes):
           at.first = first
           at.vert = -1
-          at.elem = 0
-          if whole:
-            at.elem = _triple(a, b, d, p.nslot)
+          at.elem = wp.where(whole, triple(a, b, d, p.nslot), 0)
           more = wp.where(whole, n, 0)
           xa = _where(p, world, va)
           xb = _where(p, world, vb)
@@ -399,7 +389,8 @@ def make(model: mujoco.MjModel, organ, tools: np.ndarray, place, patch, data):
   ring = 1 if alone else int(np.diff(patch.near_adr.numpy()).max())
   own = int(organ.windows.flex[0]) if organ.windows else organ.flex
   rows = [_mix(model, int(g), own) for g in tools]
-  mixed = {name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else ())}
+  mixed = {name: np.array([row[name] for row in rows]).reshape(-1, *wide)
+           for name, wide in _MIXED.items()}  # fmt: skip
   contact = {f"out_{name}": getattr(data.contact, name) for name in _written()}
   values = mixed | contact | dict(
     most=most_of(model, tools, nslot),
@@ -408,7 +399,7 @@ def make(model: mujoco.MjModel, organ, tools: np.ndarray, place, patch, data):
     kind=model.geom_type[tools],
     size=model.geom_size[tools],
     rough=np.full(nworld, model.flex_friction[own, 0]),
-    slide=np.tile(mixed["slide"], (nworld, 1)) if rows else np.zeros((nworld, 0)),
+    slide=np.tile(mixed["slide"], (nworld, 1)),
     ring=ring,
     many=np.zeros((nworld, ring * nslot)),
     count=np.zeros(nworld),

@@ -190,13 +190,67 @@ def spread(source: wp.array2d[float], at: wp.array[int], out: wp.array2d[float])
 def spread_nodes(p: Patch, adr: wp.array[int], velocity: int, out: wp.array2d[float]):
   """Writes the motion of nodes that are dofs of the model to their places."""
   w, i = wp.tid()
-  n = p.node[i]
+  n, m = p.node[i], p.mesh[w]
   for c in range(3):
     if adr[i] >= 0:
       if velocity == 1:
         out[w, adr[i] + c] = p.solve.vel[w, n // 8, c, n % 8]
       else:
-        out[w, adr[i] + c] = p.solve.disp[w, n // 8, c, n % 8]
+        shift = float(p.rest[m, n, c] - p.rest[0, n, c])
+        out[w, adr[i] + c] = p.solve.disp[w, n // 8, c, n % 8] + shift
+
+
+@struct
+class Whole:
+  """What worlds have again that are whole again."""
+
+  first: int  # of the numbers of `inside`, see `NUMBERS`
+  count: int  # pieces
+  inside: floats("nworld", 2)  # volume stiffness and pressure
+  pieces: ints("nworld")
+
+
+@wp.kernel(enable_backward=False)
+def heal(p: Patch, s: Whole):
+  """Gives the worlds of a mask the first mesh."""
+  w = wp.tid()
+  if p.mask[w] and p.mesh[w] > 0:
+    p.mesh[w] = 0
+    s.pieces[w] = s.count
+    for k in range(s.inside.shape[1]):
+      p.tissue.number[w, s.first + k] = s.inside[w, k]
+
+
+@wp.kernel(enable_backward=False)
+def get_rows(source: wp.array2d[float], row: wp.array[int], out: wp.array2d[float]):
+  """Copies some rows."""
+  k, i = wp.tid()
+  out[k, i] = source[row[k], i]
+
+
+@wp.kernel(enable_backward=False)
+def put_rows(source: wp.array2d[float], row: wp.array[int], out: wp.array2d[float]):
+  """Writes rows to their places."""
+  k, i = wp.tid()
+  out[row[k], i] = source[k, i]
+
+
+@wp.func
+def _choose(n: int, k: int):
+  """Returns n over k, k up to 3."""
+  if k == 2:
+    return n * (n - 1) // 2
+  return n * (n - 1) * (n - 2) // 6
+
+
+@wp.func
+def triple(a: int, b: int, c: int, n: int):
+  """Returns the number of a triple of n in the order of `itertools.combinations`."""
+  low = wp.min(a, wp.min(b, c))
+  high = wp.max(a, wp.max(b, c))
+  middle = a + b + c - low - high
+  before = _choose(n, 3) - _choose(n - low, 3)
+  return before + _choose(n - low - 1, 2) - _choose(n - middle, 2) + high - middle - 1
 
 
 @wp.func
@@ -215,9 +269,12 @@ def show(p: Patch, what: int, out: wp.array2d[wp.vec3]):
     float(f[1, 0]), float(f[1, 1]), float(f[1, 2]),
     float(f[2, 0]), float(f[2, 1]), float(f[2, 2]),
   )  # fmt: skip
-  if what == 0:
+  m = p.mesh[w]
+  if what == 0 and p.share[m, n] == wp.float64(0.0):
+    out[w, i] = wp.vec3(wp.nan)
+  elif what == 0:
     x = _lane(p.solve.disp, w, n)
-    at = wp.vec3(float(p.rest[n, 0]), float(p.rest[n, 1]), float(p.rest[n, 2]))
+    at = wp.vec3(float(p.rest[m, n, 0]), float(p.rest[m, n, 1]), float(p.rest[m, n, 2]))
     origin = wp.vec3(float(p.origin[0]), float(p.origin[1]), float(p.origin[2]))
     out[w, i] = origin + frame * (at + x)
   elif what == 1:

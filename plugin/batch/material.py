@@ -9,7 +9,7 @@ from palpate.engine import inertia, mjstruct
 from palpate.tissue.types import NUMBERS
 
 from .lumps import Lumps
-from .patch import GRADES
+from .patch import GRADES, Patch
 
 _PLAIN = ("foundation", "bulk", "pressure", "damping", "tolerance", "iterations", "stiffness")
 # What may change: numbers of the tissue, what its moduli follow from, and what else.
@@ -19,12 +19,13 @@ _LIGHTEST, _HEAVIEST = 0.25, 4.0  # times the compiled mass
 
 
 @wp.kernel(enable_backward=False)
-def weigh(
-  mass0: wp.array2d[float], world: wp.array[int], scale: wp.array[float], mass: wp.array3d[float]
-):
+def weigh(p: Patch, world: wp.array[int], scale: wp.array[float]):
   """Gives some worlds multiples of the masses at first."""
-  k, s, lane = wp.tid()
-  mass[world[k], s, lane] = scale[k] * mass0[s, lane]
+  k, i = wp.tid()
+  w = world[k]
+  m = p.mesh[w]
+  mass = p.share[m, i] * p.mass[p.source[m, i]]
+  p.solve.mass[w, i // 8, i % 8] = wp.where(mass > wp.float64(0.0), scale[k] * float(mass), 1.0)
 
 
 class Material:
@@ -71,6 +72,8 @@ class Material:
     number = self._organ.body.tissue.number.numpy()
     for key, values in numbers.items():
       number[worlds, NUMBERS.index(key)] = values
+    if self._organ.topology:
+      self._organ.topology.renumber(worlds, number, numbers)
     self._organ.body.tissue.number.assign(number)
 
   def _put(self, array: wp.array, worlds: np.ndarray, values: np.ndarray):
@@ -107,6 +110,11 @@ class Material:
     if self._lumps is None:
       if factor.shape[1] == 1:
         return
+      if self._organ.topology:
+        raise ValueError(
+          f"organ {self._organ.name!r}: young has a number a triangle, which a batch on a GPU "
+          "cannot do where spare is set; expected one a world"
+        )
       self._lumps = Lumps(self._organ.declared, self._organ.body)
       self._organ.patch.lump = self._lumps.node
       self._lumps.put(worlds, factor)
@@ -126,8 +134,8 @@ class Material:
     self._put(organ.patch.mass_scale, worlds, scale)
     at = wp.array(worlds, dtype=int, device=mass.device)
     factor = wp.array(scale, dtype=float, device=mass.device)
-    dim = (len(worlds), *mass.shape[1:])
-    wp.launch(weigh, dim=dim, inputs=[organ.mass, at, factor, mass], device=mass.device)
+    dim = (len(worlds), organ.patch.nnode)
+    wp.launch(weigh, dim=dim, inputs=[organ.patch, at, factor], device=mass.device)
 
   def _grade(self):
     """Lets tools meet the inertia of the worlds' tissue."""

@@ -7,7 +7,8 @@ import functools
 
 import numpy as np
 import warp as wp
-from palpate.engine import slots
+from palpate.engine import coupling, slots
+from palpate.engine.cuts import Report, pieces
 from palpate.tissue import body as bodies
 from palpate.tissue import config as configuration
 from palpate.tissue import device as devices
@@ -15,7 +16,10 @@ from palpate.tissue import order, shape, step
 
 from . import beside, contacts, convex, held, kernels, patch, sliding
 from .base import Contacts, Tissue, spread
+from .blades import Blades
+from .cuts import Cuts
 from .material import KEYS, MODULI, Material
+from .parting import Cutters
 from .patch import launch
 from .strip import Slots
 
@@ -41,6 +45,7 @@ def plan_of(body, config, volumes: bool = False) -> devices.Plan | None:
     bends=body.has_bending,
     springs=config.elements == "spring",
     volumes=bool(volumes or config.bulk or config.pressure),
+    meshes=config.spare > 0,
   )
 
 
@@ -61,7 +66,7 @@ class Organ(Tissue):
 
   def __init__(self, batch, w, place: Slots, tools: np.ndarray):
     organ, device, nworld = w.organ, batch.device, batch.nworld
-    self.name, self.nvert, self.elem = organ.name, organ.mesh.nouter, organ.mesh.elem
+    self.name, self.nvert, self.elem = organ.name, coupling.outer(organ), organ.mesh.elem
     self.declared, self.config, self.space, self.place = organ, organ.config, w, place
     self.instance = w.instance
     self._batch, self._scheme = batch, step.SCHEMES[organ.config.integrator]
@@ -71,17 +76,12 @@ class Organ(Tissue):
     model, d, m = batch.model, batch.d, batch.m
     node = self.body.shape.node.numpy()
     mass = np.ones(self.body.shape.nnode, np.float32)
-    mass[node] = organ.mass
-    self.mass = wp.array(order.to_slices(mass), dtype=float, device=device)  # of any world at first
+    mass[node] = np.where(organ.mass > 0, organ.mass, 1.0)  # what waits for a cut has none
     self.body.state.mass.assign(np.tile(order.to_slices(mass), (nworld, 1, 1)))
-    held = organ.mass if organ.windows else np.where(organ.free, organ.mass, organ.mass.mean())
-    nodal = w.inertia(model._address)
-    if organ.windows:
-      held = slots.hold(organ, held)
-    else:
-      wall = slots.WALL * organ.mass[organ.free].sum()
-      held, nodal = np.where(organ.free, held, wall), np.where(organ.free, nodal, wall)
-    values = patch.constants(self.body, organ, tools, model, nodal, held)
+    nodal, surface = w.inertia(model._address), patch.Surface(self.body, organ, model, tools)
+    if not organ.windows:
+      nodal = np.where(organ.free, nodal, slots.WALL * organ.mass[organ.free].sum())
+    values = patch.constants(self.body, organ, tools, model, nodal, surface)
     values |= patch.variables(nworld, place.nslot, self.body.shape.nslice)
     values |= dict(
       nq=m.nq,
@@ -105,6 +105,9 @@ class Organ(Tissue):
       **{name: getattr(d, name) for name in (
         "geom_xpos", "geom_xmat", "qpos", "qvel", "qfrc_passive", "qfrc_constraint")},
     )  # fmt: skip
+    self._cuts = None
+    if organ.mesh.spare:
+      self._cuts = Cuts(self, values, surface)
     self.patch = patch.make(values, self.body)
     self._touch = contacts.make(model, organ, tools, place, self.patch, d)
     self._pressed = sliding.make(batch, self._touch)
@@ -199,6 +202,8 @@ class Organ(Tissue):
     self._over(patch.rest, self.patch.nnode)
     for each in self.beside:
       each.rest()
+    if self._cuts:
+      self._cuts.heal()
 
   def wake(self, worlds):
     """Lets the organ of some worlds step that may have slept."""
@@ -237,6 +242,43 @@ class Organ(Tissue):
     wp.launch(sliding.press, dim=p.geom.shape, inputs=[p], device=self.body.device)
     return Contacts(p.geom, p.normal.view(float), p.force)
 
+  # Cuts.
+
+  @property
+  def topology(self) -> Cuts | None:
+    """The worlds' meshes, None where there is no room for cuts."""
+    return self._cuts
+
+  @property
+  def _spare(self) -> int:
+    return self.declared.mesh.spare
+
+  def _cut(self, points: dict[int, np.ndarray]) -> list[Report | None]:
+    assert self._cuts is not None
+    return self._cuts.cut(points)
+
+  def _told(self, name: str, world: int) -> list:
+    if self._cuts is None:
+      mesh, thickness = self.declared.mesh, self.config.thickness
+      return [] if name == "reports" else pieces(mesh, self.declared.mass, thickness)
+    return getattr(self._cuts, name)(world)
+
+  def _piece_count(self) -> wp.array:
+    if self._cuts is None:
+      return wp.full(self._batch.nworld, len(self._told("pieces", 0)), dtype=int,
+                     device=self.body.device)  # fmt: skip
+    return self._cuts.counts()
+
+  def _cutters(self) -> Cutters:
+    for each in self.beside:
+      if isinstance(each, Blades):
+        return each.read()
+    raise ValueError(f"organ {self.name!r}: nothing cuts it, expected the key cutters")
+
+  def elem_of(self, world: int) -> np.ndarray:
+    """Returns the triangles of a world, see `Tissue.elem_of`."""
+    return self._cuts.mesh(self._batch._world(world)).elem if self._cuts else self.elem
+
   # Changing.
 
   def configure(self, mask=None, **keys):
@@ -255,6 +297,8 @@ class Organ(Tissue):
       if key != "friction" and key != "mass":
         self._check(key, values)
     self._material.change(chosen, rows)
+    for each in self.beside:
+      each.configure(chosen, rows)
     self.wake(chosen)
 
   def _fixed(self, key: str) -> str | None:

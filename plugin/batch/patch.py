@@ -13,6 +13,7 @@ from palpate.tissue.types import Array, Tissue, doubles, fill, floats, ints, str
 
 _BLOCK = 128  # threads, whole warps
 _ENDLESS = 1e300  # square of a distance beyond all others [m^2]
+_LONGER = 1.5  # times which an edge may be that a cut has moved
 # Candidates for the slots, times the slots.
 _ROOM = 6
 # Steps of the scale of Young's modulus for which the effective inertia is known.
@@ -53,16 +54,20 @@ class Patch:
   node: ints("nvert")  # node of a vertex
   free: ints("nnode")  # whether a node moves
   mass: doubles("nnode")  # mass [kg]
-  held: doubles("nnode")  # mass, of pinned ones that of a wall [kg]
-  rest: doubles("nnode", 3)  # rest position [m]
   inertia: doubles("ngrade", "nnode")  # effective inertia at each of GRADES [kg]
-  touch: doubles("nnode")  # distance from a geom within which its triangles may touch it [m]
-  elem: ints("nelem", 3)  # nodes of a triangle
   near_adr: ints("nnode + 1")  # first of a node's triangles in `near`
-  near: ints("nnear")  # triangles of the nodes
+  near: ints("nnear")  # triangles of the nodes before the first cut
   frame: doubles(3, 3)  # rotation from the organ's axes to the world's
   origin: doubles(3)  # position of its frame [m]
   tool_geom: ints("ntool")  # geoms that the slots follow
+  # The organ's mesh, of worlds that are cut their own:
+  mesh: ints("nworld")  # which of these a world has
+  rest: doubles("nmesh", "nnode", 3)  # rest position [m]
+  elem: ints("nmesh", "nelem", 3)  # nodes of a triangle
+  touch: doubles("nmesh", "nnode")  # distance of a geom within which its triangles may touch it [m]
+  source: ints("nmesh", "nnode")  # what a node was before it was divided
+  share: doubles("nmesh", "nnode")  # its part of that; 0 where it waits for a cut
+  held: doubles("nmesh", "nnode")  # mass by which contacts weigh it, of pinned ones a wall's [kg]
   # What a world has of its own:
   grade: floats("nworld")  # place in GRADES of the scale of stiffness over that of mass
   mass_scale: doubles("nworld")  # times the masses below
@@ -116,13 +121,13 @@ tell_tools, enter, rank, stand, push, take, follow, commit, find_bad, rest = cou
 )
 
 
-def launch(kernel, patch, nworld: int, count: int, device):
+def launch(kernel, patch, nworld: int, count: int, device, arg: int = 0):
   """Launches a kernel over `count` items of each world; one thread has a world on the CPU."""
   nthread = -(-count // 32) * 32 if device.is_cuda else 1
-  kernel.launch(device, nworld, nthread, 0, patch, _BLOCK)
+  kernel.launch(device, nworld, nthread, arg, patch, _BLOCK)
 
 
-def constants(body, organ, tools: np.ndarray, model: mujoco.MjModel, inertia, held) -> dict:
+def constants(body, organ, tools: np.ndarray, model: mujoco.MjModel, inertia, surface) -> dict:
   """Returns the fields of `Patch` that say what the organ is and which tools it meets.
 
   Args:
@@ -131,10 +136,11 @@ def constants(body, organ, tools: np.ndarray, model: mujoco.MjModel, inertia, he
     tools: geoms that the slots follow
     model: the compiled scene
     inertia: effective inertia of every vertex [kg]
-    held: mass of every vertex, of pinned ones that of a wall [kg]
+    surface: makes what follows from a mesh
   """
   mesh, skin = organ.mesh, _skin(organ, model)
-  touch = _touch(mesh, skin + float(model.geom_margin[tools].max(initial=0.0)))
+  own = surface.make(mesh)
+  longest = float(own["touch"].max()) * (_LONGER if mesh.spare else 1.0)
   node, nnode = body.shape.node.numpy(), body.shape.nnode
   elem = node[mesh.elem]
   count = np.bincount(elem.ravel(), minlength=nnode)
@@ -157,18 +163,77 @@ def constants(body, organ, tools: np.ndarray, model: mujoco.MjModel, inertia, he
     node=node,
     free=by_node(organ.free),
     mass=by_node(organ.mass),
-    held=by_node(held, 1.0),
-    rest=by_node(mesh.rest),
     inertia=np.tile(by_node(inertia, 1.0), (len(GRADES), 1)),
-    touch=by_node(touch, -np.inf),  # padding is never near
-    elem=elem,
+    mesh=np.zeros(body.nworld),
+    **{name: values[None] for name, values in own.items()},
     near_adr=np.concatenate([[0], np.cumsum(count)]),
     near=np.argsort(elem.ravel(), kind="stable") // 3,
     frame=organ.frame,
     origin=organ.origin,
     tool_geom=tools,
-    tool=np.tile(_tools(tools, model, float(touch.max())), (body.nworld, 1, 1)),
+    tool=np.tile(_tools(tools, model, longest), (body.nworld, 1, 1)),
   )  # fmt: skip
+
+
+class Surface:
+  """What of a patch follows from a mesh.
+
+  Args:
+    body: the tissue
+    organ: its declaration
+    model: the compiled scene
+    tools: geoms that the slots follow
+  """
+
+  def __init__(self, body, organ, model: mujoco.MjModel, tools: np.ndarray):
+    self._node, self._nnode = body.shape.node.numpy(), body.shape.nnode
+    self._organ = organ
+    self._reach = _skin(organ, model) + float(model.geom_margin[tools].max(initial=0.0))
+    mass = organ.mass if organ.windows else model.body_mass[organ.body]
+    if organ.windows:
+      self._held = slots.hold(organ, mass)
+    else:
+      wall = slots.WALL * organ.mass[organ.free].sum()
+      self._held = np.where(organ.free, mass, wall)
+
+  def make(self, mesh) -> dict[str, np.ndarray]:
+    """Returns the fields of `Patch` that a cut changes, of the mesh before the first one."""
+    n = self._nnode
+    out = {
+      "rest": np.zeros((n, 3)),
+      "elem": np.zeros((mesh.nelem, 3), np.int32),
+      "touch": np.full(n, -np.inf),  # padding is never near
+      "source": np.arange(n, dtype=np.int32),
+      "share": np.ones(n),
+      "held": np.ones(n),
+    }
+    vert, elem = np.arange(mesh.nvert), np.arange(mesh.nelem)
+    self.write(out, mesh, self._organ.mass, vert, vert, elem)
+    return out
+
+  def write(self, out: dict[str, np.ndarray], mesh, mass: np.ndarray, source, vert, elem):
+    """Writes them, for some vertices and triangles.
+
+    Args:
+      out: the fields
+      mesh: the mesh
+      mass: of its vertices [kg]                   (nvert,)
+      source: what each was before the first cut   (nvert,)
+      vert: the vertices
+      elem: the triangles
+    """
+    organ, node, waits = self._organ, self._node[vert], mesh.unused[vert]
+    source = source[vert]
+    was = organ.mass[source]
+    share = np.where(was > 0, mass[vert] / np.where(was > 0, was, 1.0), 1.0)
+    # Nodal coupling leaves contacts the masses of the compiled model.
+    held = share * self._held[source] if organ.windows else self._held[vert]
+    out["elem"][elem] = self._node[mesh.elem[elem]]
+    out["rest"][node] = mesh.rest[vert]
+    out["touch"][node] = np.where(waits, -np.inf, self._reach + _longest(mesh, vert))
+    out["source"][node] = self._node[source]
+    out["share"][node] = np.where(waits, 0.0, share)
+    out["held"][node] = np.where(waits, 1.0, held)
 
 
 def _skin(organ, model) -> float:
@@ -177,14 +242,11 @@ def _skin(organ, model) -> float:
   return float(model.flex_radius[flex].max() + model.flex_margin[flex].max())
 
 
-def _touch(mesh, reach: float) -> np.ndarray:
-  """Returns the distance from a geom within which a vertex's triangles may touch it [m]."""
-  edge = mesh.rest[mesh.elem[:, [1, 2, 0]]] - mesh.rest[mesh.elem]
-  length = np.linalg.norm(edge, axis=2)
-  longest = np.zeros(mesh.nvert)
-  for corner in (mesh.elem, mesh.elem[:, [1, 2, 0]]):
-    np.maximum.at(longest, corner.ravel(), length.ravel())
-  return longest + reach
+def _longest(mesh, vert: np.ndarray) -> np.ndarray:
+  """Returns the longest edge at each vertex at rest: its triangles are no farther from it [m]."""
+  ring = mesh.ring[vert]
+  edge = mesh.rest[np.where(ring >= 0, ring, vert[:, None])] - mesh.rest[vert][:, None]
+  return np.sqrt(np.einsum("ijk,ijk->ij", edge, edge).max(axis=1))
 
 
 def _tools(tools: np.ndarray, model, reach: float) -> np.ndarray:

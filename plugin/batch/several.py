@@ -14,9 +14,11 @@ from typing import Any
 import mujoco
 import numpy as np
 import warp as wp
+from palpate.engine.cuts import Report
 
 from .base import Batch, Contacts, Tissue, on_device, spread
 from .bonds import Gathered
+from .parting import Cutters
 from .worlds import Worlds
 
 
@@ -184,6 +186,38 @@ class _Gathered(Tissue):
   def bonds(self) -> Gathered:
     """What it has grown on to."""
     return Gathered(self._batch, [part.bonds for part in self._parts])
+
+  @property
+  def _spare(self) -> int:
+    return self._parts[0]._spare
+
+  def _cut(self, points: dict[int, np.ndarray]) -> list[Report | None]:
+    out: list[Report | None] = []
+    for at, part in zip(self._batch.slices, self._parts, strict=True):
+      own = {world - at.start: points[world] for world in points if at.start <= world < at.stop}
+      out += part._cut(own) if own else [None] * (at.stop - at.start)
+    return out
+
+  def _told(self, name: str, world: int) -> list:
+    part, own = self._part(world)
+    return part._told(name, own)
+
+  def _part(self, world: int) -> tuple[Tissue, int]:
+    batch, own = self._batch._find(world)
+    return batch.organ(self.name), own
+
+  def _piece_count(self) -> wp.array:
+    return self._gather("piece_count", [part.piece_count for part in self._parts])
+
+  def _cutters(self) -> Cutters:
+    parts = [part.cutters for part in self._parts]
+    names = Cutters._fields
+    return Cutters(*(self._gather(n, [getattr(part, n) for part in parts]) for n in names))
+
+  def elem_of(self, world: int) -> np.ndarray:
+    """Returns the triangles of a world, see `Tissue.elem_of`."""
+    part, own = self._part(self._batch._world(world))
+    return part.elem_of(own)
 
   @property
   def contacts(self) -> Contacts:

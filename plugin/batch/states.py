@@ -110,7 +110,7 @@ def _pull_organ(organ: Organ, world: int, model, data):
   heavier = float(organ.patch.heavier[world : world + 1].numpy()[0])
   if declared.windows is None:
     jointed = declared.jointed
-    data.qpos[declared.qposs] = motion["disp"][jointed].ravel()
+    data.qpos[declared.qposs] = (motion["disp"] + _shift(organ, world))[jointed].ravel()
     data.qvel[declared.dofs] = motion["vel"][jointed].ravel()
     for name, which in _kept(declared):
       own[spans[name]] = motion[name][which].ravel()
@@ -122,9 +122,17 @@ def _pull_organ(organ: Organ, world: int, model, data):
     own[spans["tail"]] = 0.0
     own[spans["tail"].start + TAIL.heavier] = heavier
     _pull_slots(organ, world, own, spans, force)
+  if organ.topology:
+    organ.topology.pull(world, own, spans)
   for kept in (kept for each in organ.beside for kept in each.kept):
     kept.of(own, spans)[kept.rows] = kept.array[world].numpy()
   own[spans["signature"]] = declared.signature
+
+
+def _shift(organ: Organ, world: int) -> np.ndarray:
+  """Returns how far cuts have moved vertices at rest [m], (nvert, 3)."""
+  whole = organ.declared.mesh
+  return organ.topology.mesh(world).rest - whole.rest if organ.topology else 0.0 * whole.rest
 
 
 def _pull_slots(organ: Organ, world: int, own, spans, force: np.ndarray):
@@ -171,6 +179,13 @@ def push(batch, world: int, data: mujoco.MjData):
 def keep(batch, start, data: mujoco.MjData):
   """Lets worlds start in the state of an mjData; `start` is what resets have of it."""
   d, organs = batch.d, batch.organs.values()
+  for organ in organs:
+    own, spans = _own(organ, batch.model, data)
+    if organ.topology and organ.topology.is_cut(own, spans):
+      raise ValueError(
+        f"organ {organ.name!r}: data has cuts, which a batch on a GPU cannot start with; cut after "
+        "a reset"
+      )
   pairs = [(getattr(d, name), getattr(start, f"{name}0")) for name in _STARTS]
   for organ in organs:
     own = _vectors(organ) | {
@@ -200,9 +215,12 @@ def _push_organ(organ: Organ, world: int, model, data):
   own, spans = _own(organ, model, data)
   motion = {name: np.zeros((declared.mesh.nvert, 3)) for name in _MOTION}
   force = np.zeros((declared.mesh.nvert, 3))
+  if organ.topology:
+    organ.topology.push(world, own, spans)
   if declared.windows is None:
     jointed = declared.jointed
-    motion["disp"][jointed] = data.qpos[declared.qposs].reshape(-1, 3)
+    at = data.qpos[declared.qposs].reshape(-1, 3)
+    motion["disp"][jointed] = at - _shift(organ, world)[jointed]
     motion["vel"][jointed] = data.qvel[declared.dofs].reshape(-1, 3)
     for name, which in _kept(declared):
       motion[name][which] = own[spans[name]].reshape(-1, 3)

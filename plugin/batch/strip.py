@@ -45,11 +45,24 @@ def tools_of(model: mujoco.MjModel, organ) -> np.ndarray:
   Raises:
     ValueError: one is not a tool that a batch knows, or it is not an organ that it can step.
   """
-  for key in ("carrier", "relax_share", "spare"):
+  for key in ("carrier", "relax_share", "tear"):
     if getattr(organ.config, key):
       raise ValueError(
         f"organ {organ.name!r}: {key} is set, which a batch on a GPU cannot do; expected none"
       )
+  for key, there in (
+    ("bonds", organ.config.bonded), ("attach", organ.config.attach),
+    ("support", organ.config.support),
+  ):  # fmt: skip
+    if organ.mesh.spare and there:
+      raise ValueError(
+        f"organ {organ.name!r}: spare and {key} are set, of which a batch on a GPU can do one"
+      )
+  if organ.mesh.spare and any(row.current for row in organ.config.cutters):
+    raise ValueError(
+      f"organ {organ.name!r}: cutters has a current, which cuts nothing in a batch on a GPU; "
+      "expected blades and scissors, or spare=0"
+    )
   if organ.windows:
     found = np.unique(organ.windows.geom)
   else:
@@ -176,7 +189,7 @@ def _check_option(option):
 
 def _slot_mass(organ) -> float:
   """Returns the mass of a slot's body, lighter than a node whatever its world's masses [kg]."""
-  return 0.1 * float(organ.mass[organ.free].min())
+  return 0.1 * float(organ.mass[organ.free & (organ.mass > 0)].min())
 
 
 def _take_out(bare, bodies: dict, organ, model):

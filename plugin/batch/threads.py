@@ -7,17 +7,23 @@ import functools
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import mujoco
 import numpy as np
 import warp as wp
+from palpate.engine import coupling
 from palpate.engine import plugin as engine
+from palpate.engine.cuts import Report
 from palpate.organ import Organ, instances
 from palpate.tissue import body as bodies
+from palpate.tissue import mesh as topology
 
 from .base import Batch, Tissue, refuse_crowd, spread
 from .bonds import OfThreads
+from .parting import Cutters
 
+_OF_VERTICES = ("xpos", "xvel", "contact_force")
 _FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
 _CTRL = mujoco.mjtState.mjSTATE_CTRL
 _ALL = mujoco.mjtState.mjSTATE_INTEGRATION
@@ -52,6 +58,7 @@ class Threads(Batch):
     self.datas += [mujoco.MjData(each) for each in self.models[1:]]
     self._pool = ThreadPoolExecutor(min(nthread, nworld))
     self._begin: np.ndarray | None = None
+    self._felt: list[tuple[int, str]] = []
     self._seen = np.zeros((nworld, 0, model.nsensordata), np.float32)
     self._organs = {name: _Tissue(self, name, number) for name, number in instances(model).items()}
 
@@ -77,6 +84,9 @@ class Threads(Batch):
       most, total = np.zeros(model.nsensor), np.zeros(model.nsensordata)
       for k in range(n):
         mujoco.mj_step(model, data)
+        for adr, organ in self._felt:
+          for cutter in self._organs[organ].handles[world].cutters:
+            data.sensordata[adr : adr + 3] += cutter.force
         self._seen[world, k : k + 1] = data.sensordata
         total += data.sensordata
         np.maximum(most, np.add.reduceat(data.sensordata**2, first), out=most)
@@ -84,6 +94,9 @@ class Threads(Batch):
       return self._look(world)
 
     self.each(work)
+
+  def _feel(self, sensor: int, organ: str):
+    self._felt.append((int(self.model.sensor_adr[sensor]), organ))
 
   def _watch(self, out: wp.array) -> wp.array:
     self._seen = out.numpy()
@@ -159,14 +172,16 @@ class _Tissue(Tissue):
     pairs = zip(batch.models, batch.datas, strict=True)
     self.handles = [Organ(model, data, name) for model, data in pairs]
     self.spaces = [engine.find(data._address, instance) for data in batch.datas]
-    self.name, self.nvert, self.elem = name, self.handles[0].nvert, self.handles[0].elem
-    self._batch = batch
+    self.name, self.elem = name, self.handles[0].elem
+    self.nvert = coupling.outer(self.spaces[0].organ)
+    self._batch, self._counted = batch, list[Any]([None] * batch.nworld)
+    self._pieces = wp.zeros(batch.nworld, dtype=int, device="cpu")
 
   @functools.cached_property
   def _arrays(self) -> dict[str, wp.array]:
     shape = (self._batch.nworld, self.nvert, 3)
     arrays = {
-      name: wp.zeros(shape, dtype=float, device="cpu") for name in ("xpos", "xvel", "contact_force")
+      name: wp.zeros(shape, dtype=float, device="cpu") for name in _OF_VERTICES
     }
     return arrays | {
       name: wp.zeros(self._batch.nworld, dtype=float, device="cpu")
@@ -182,8 +197,53 @@ class _Tissue(Tissue):
     array = self._arrays[name]
     out = array.numpy()
     for world, handle in enumerate(self.handles):
-      out[world] = getattr(handle, name)
+      values = getattr(handle, name)
+      if name in _OF_VERTICES:  # those that wait for a cut are not there yet
+        out[world, len(values) :] = np.nan if name == "xpos" else 0.0
+        out[world, : len(values)] = values
+      else:
+        out[world] = values
     return array
+
+  @property
+  def _spare(self) -> int:
+    return self.spaces[0].organ.mesh.spare
+
+  def _cut(self, points: dict[int, np.ndarray]) -> list[Report | None]:
+    for world, path in points.items():
+      try:
+        self.spaces[world].cuts.find(path)
+      except ValueError as error:
+        raise ValueError(f"world {world}: {error}") from None
+    return [
+      handle.cut(points[world]) if world in points else None
+      for world, handle in enumerate(self.handles)
+    ]
+
+  def _told(self, name: str, world: int) -> list:
+    handle = self.handles[world]
+    return list(handle.cuts if name == "reports" else handle.pieces)
+
+  def _piece_count(self) -> wp.array:
+    out = self._pieces.numpy()
+    for world, space in enumerate(self.spaces):
+      space.cuts.follow()
+      mesh = space.organ.mesh
+      if mesh is not self._counted[world]:
+        self._counted[world], out[world] = mesh, int(topology.pieces(mesh).max()) + 1
+    return self._pieces
+
+  def _cutters(self) -> Cutters:
+    every = [handle.cutters for handle in self.handles]
+    columns = (
+      np.array([[getattr(each, name) for each in row] for row in every], np.float32)
+      for name in Cutters._fields
+    )
+    return Cutters(*(wp.array(column, dtype=float, device="cpu") for column in columns))
+
+  def elem_of(self, world: int) -> np.ndarray:
+    """Returns the triangles of a world, see `Tissue.elem_of`."""
+    return self.handles[self._batch._world(world)].elem
 
   def configure(self, mask=None, **keys):
     """Changes the tissue of worlds, see `Tissue.configure`."""

@@ -19,7 +19,7 @@ from palpate.engine import plugin as engine
 from palpate.organ import instances
 from palpate.tissue import device as devices
 
-from . import beside, contacts, convex, held, kernels, states, strip
+from . import beside, blades, contacts, convex, held, kernels, states, strip
 from .base import Batch, Tissue, refuse_crowd
 from .organs import Organ
 from .rest import Rest
@@ -74,6 +74,8 @@ class Worlds(Batch):
       }
       self._rest = Rest(self, bare)
       self.aims = self._join()
+      every = (each for organ in self._organs.values() for each in organ.beside)
+      self._looks = [each for each in every if isinstance(each, blades.Blades)]
       self._teller = states.Teller(self)
       self._alias()
       self._sensed: Any = kernels.Sensed()
@@ -81,6 +83,7 @@ class Worlds(Batch):
       self._sensed.data, self._sensed.count = self.d.sensordata, wp.zeros(nworld, dtype=int)
       self._sensed.peak, self._sensed.mean = self._summary["peak"], self._summary["mean"]
       self._sensed.seen = self._make(0, model.nsensordata)
+      self._felt: list[tuple[blades.Blades, int]] = []
       self._callbacks()
       try:
         self.record()
@@ -139,7 +142,7 @@ class Worlds(Batch):
     self.bodies = beside.bodies_of(self)
     numbers = beside.numbers_of(self.model, self.bare, [organ.declared for organ in organs])
     for organ in organs:
-      organ.beside = held.make(organ, numbers)
+      organ.beside = (*held.make(organ, numbers), *blades.make(organ))
     held.meet(organs)
     return any(each.aims for organ in organs for each in organ.beside)
 
@@ -184,7 +187,14 @@ class Worlds(Batch):
     self.begin()
     self.step_tools()
     self.end()
+    for each, adr in self._felt:
+      each.feel(adr, self.d.sensordata)
     self._sense(kernels.sum_up)
+
+  def _feel(self, sensor: int, organ: str):
+    adr = int(self.model.sensor_adr[sensor])
+    self._felt += [(each, adr) for each in self._organs[organ].beside if each in self._looks]
+    self.record()
 
   def _sense(self, kernel):
     if self.model.nsensor:
@@ -229,8 +239,10 @@ class Worlds(Batch):
   def _step(self, n: int):
     for sums in self._summary.values():
       sums.zero_()
-    for _ in range(n):
+    for k in range(n):
       self._run("step")
+      for each in self._looks:
+        each.stepped(k + 1 == n)
     self._sense(kernels.average)
     self._run("after")
 

@@ -138,25 +138,11 @@ class Cuts:
     """
     if not self or self._found[0] == self.stamp:
       return
-    elem, loose, rest, mass, source = self._read()
+    elem, loose, rest, mass, source = read(self.whole, self.declared.mass, self._own)
     mesh, changed = topology.recut(self.mesh, rest, elem, loose)
     self._become(mesh, changed, mass, source, self._found[0])
     self.reports = []
     self._fresh, self._total = True, None
-
-  def _read(self):
-    whole, own = self.whole, self._own
-    if not self._found[0]:
-      return whole.elem, None, whole.rest, self.declared.mass, np.arange(whole.nvert)
-    elem, loose = flexes.unpack(own["corner"])
-    rest, mass = own["place"].reshape(-1, 3).copy(), own["weight"].copy()
-    source = np.append(np.arange(whole.nvert - whole.spare), own["source"]).astype(int)
-    inside = (elem >= 0).all() and (elem < whole.nvert).all()
-    if not inside or not np.array_equal(source[elem], whole.elem):
-      raise ValueError(_FOREIGN)
-    if flexes.stamp(own["corner"], rest, mass) != self._found[0]:
-      raise ValueError(_FOREIGN)
-    return elem, loose, rest, mass, source
 
   def copy(self) -> dict[str, np.ndarray]:
     """Returns what the plugin state has of the mesh."""
@@ -227,6 +213,19 @@ class Cuts:
 
   def cut(self, points: np.ndarray, given: float = 0.0) -> Report:
     """Cuts the organ along points in the world, (n, 3) [m]; see `Organ.cut`, and `cutting.cut`."""
+    w, found = self._w, self.find(points, given)
+    if found.stopped:
+      w.note(
+        f"the cut stops early: no spare vertices are left of {self.mesh.spare}; give the organ more"
+      )
+    done = report(found, self.mesh, w.organ, w.config.thickness)
+    if found.changed.size:
+      self._take(found)
+    self.reports.append(done)
+    return done
+
+  def find(self, points: np.ndarray, given: float = 0.0) -> cutting.Cut:
+    """Returns what a cut would make of the organ."""
     w, organ = self._w, self._w.organ
     if not self:
       raise ValueError(
@@ -237,16 +236,7 @@ class Cuts:
     local = (np.asarray(points, float) - organ.origin) @ organ.frame
     motion = cutting.Motion(self.mass, *w.phases.motion())
     how = ~organ.free, w.config, self._held(), given
-    found = self._knife.cut(organ.name, mesh, motion, local, *how)
-    if found.stopped:
-      w.note(
-        f"the cut stops early: no spare vertices are left of {mesh.spare}; give the organ more"
-      )
-    report = self._report(found)
-    if found.changed.size:
-      self._take(found)
-    self.reports.append(report)
-    return report
+    return self._knife.cut(organ.name, mesh, motion, local, *how)
 
   def _held(self) -> cutting.Springs | None:
     """Returns the ties and bonds, None where there are none."""
@@ -260,13 +250,6 @@ class Cuts:
       np.add.at(force, vert, stiffness[:, None] * stretch)
       np.add.at(hard, vert, stiffness)
     return cutting.Springs(energy, force, hard)
-
-  def _report(self, found: cutting.Cut) -> Report:
-    organ = self._w.organ
-    path = [organ.origin + line @ organ.frame.T for line in found.path]
-    nodes = found.mesh.nouter - self.mesh.nouter
-    area = found.length * self._w.config.thickness
-    return Report(found.length, area, path, found.deviation, nodes, found.stopped)
 
   def _take(self, found: cutting.Cut):
     """Makes the organ the mesh that was found; what moved goes on as it moved."""
@@ -284,14 +267,61 @@ class Cuts:
 
   def pieces(self) -> list[Piece]:
     """Returns the parts that hang together, the largest first."""
-    mesh = self.mesh
-    label = topology.pieces(mesh)
-    area = topology.vertex_areas(mesh.rest, mesh.elem)
-    held = topology.held_areas(mesh) > 0
-    out = []
-    for k in range(label.max() + 1):
-      vert = np.flatnonzero(label == k)
-      volume = float(area[vert].sum() * self._w.config.thickness)
-      mass = float(self._w.organ.mass[vert].sum())
-      out.append(Piece(vert, mass, volume, bool(held[vert].any())))
-    return sorted(out, key=lambda piece: -piece.mass)
+    return pieces(self.mesh, self._w.organ.mass, self._w.config.thickness)
+
+
+def report(found: cutting.Cut, before: Mesh, organ, thickness: float) -> Report:
+  """Returns what a cut of a mesh has done; `organ` is its declaration."""
+  path = [organ.origin + line @ organ.frame.T for line in found.path]
+  nodes = found.mesh.nouter - before.nouter
+  area = found.length * thickness
+  return Report(found.length, area, path, found.deviation, nodes, found.stopped)
+
+
+def pieces(mesh: Mesh, mass: np.ndarray, thickness: float) -> list[Piece]:
+  """Returns the parts of a mesh that hang together, the heaviest first."""
+  label = topology.pieces(mesh)
+  area = topology.vertex_areas(mesh.rest, mesh.elem)
+  held = topology.held_areas(mesh) > 0
+  out = []
+  for k in range(label.max() + 1):
+    vert = np.flatnonzero(label == k)
+    volume = float(area[vert].sum() * thickness)
+    out.append(Piece(vert, float(mass[vert].sum()), volume, bool(held[vert].any())))
+  return sorted(out, key=lambda piece: -piece.mass)
+
+
+# The plugin state, see `layout.Topology`; `own` has its blocks.
+
+
+def read(whole: Mesh, mass: np.ndarray, own: dict[str, np.ndarray]):
+  """Returns triangles, which of them are loose, rest places, masses and sources of a state.
+
+  Args:
+    whole: the mesh before the first cut
+    mass: of its vertices [kg]  (nvert,)
+    own: blocks of the state
+
+  Raises:
+    ValueError: the state is of another organ.
+  """
+  if not own["stamp"][0]:
+    return whole.elem, None, whole.rest, mass, np.arange(whole.nvert)
+  elem, loose = flexes.unpack(own["corner"])
+  rest, mass = own["place"].reshape(-1, 3).copy(), own["weight"].copy()
+  source = np.append(np.arange(whole.nvert - whole.spare), own["source"]).astype(int)
+  inside = (elem >= 0).all() and (elem < whole.nvert).all()
+  if not inside or not np.array_equal(source[elem], whole.elem):
+    raise ValueError(_FOREIGN)
+  if flexes.stamp(own["corner"], rest, mass) != own["stamp"][0]:
+    raise ValueError(_FOREIGN)
+  return elem, loose, rest, mass, source
+
+
+def write(own: dict[str, np.ndarray], mesh: Mesh, mass: np.ndarray, source, stamp: float):
+  """Writes a mesh to a state."""
+  own["corner"][:] = flexes.pack(mesh.elem, mesh.loose)
+  own["place"][:] = mesh.rest.ravel()
+  own["weight"][:] = mass
+  own["source"][:] = source[mesh.nvert - mesh.spare :]
+  own["stamp"][0] = stamp

@@ -7,16 +7,20 @@ edges at a time, since the mesh cannot do so by less.
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import mujoco
 import numpy as np
 import warp as wp
+from palpate.tissue.mesh import Mesh
+from palpate.tissue.path import Finder
 from palpate.tissue.step import SCHEMES
 from palpate.tissue.types import doubles, fill, ints, struct
 
 from . import coupling, fasten, flexes, mjstruct
 from .current import Current
+from .cuts import Report
 from .hold import Beside, Bodies, Input, Nodes, base, nodes, solver
 from .layout import BLADE, LAW, TRAIL
 
@@ -27,7 +31,7 @@ _MORE = 0.5  # edges after which what could not come apart is tried again
 _FIRST, _LAST, _FARTHER = 0.9, 0.3, 0.15
 # Share of the work on an edge that moving a vertex may turn into strain: without it none could move
 # on to the blade's path, where tissue is stretched.
-_GIVEN = 0.1
+GIVEN = 0.1
 _ROUND = (int(mujoco.mjtGeom.mjGEOM_CAPSULE), int(mujoco.mjtGeom.mjGEOM_CYLINDER))
 _BOX = int(mujoco.mjtGeom.mjGEOM_BOX)
 
@@ -45,6 +49,7 @@ class Blades:
   axis: ints("nblade", 2)  # axis of each along which its edge is
   half: doubles("nblade", 2)  # half the edge's length [m]
   law: doubles("nblade", len(LAW))  # see LAW
+  mesh: ints("nworld")  # which mesh a world has
   elem: ints("nelem", 3)  # triangles
   flat: doubles("nvert", 3)  # rest positions as the cuts have them [m]
   state: doubles("nblade", len(BLADE))  # see BLADE
@@ -60,12 +65,11 @@ class Blades:
   mj: Bodies
 
 
-_enter, _act, _keep = coupling.kernels(
-  "blades.h", Blades, "enter_blades", "act_blades", "keep_blades"
-)
+KERNELS = "enter_blades", "act_blades", "keep_blades"
+_enter, _act, _keep = coupling.kernels("blades.h", Blades, *KERNELS)
 # As in the header: the blade is out of the tissue; edges between points of a path, and that come
 # apart at once.
-_ENDED, _SPACING, _BATCH = 2, 0.4, 1.8
+ENDED, _SPACING, _BATCH = 2, 0.4, 1.8
 
 
 @dataclasses.dataclass(frozen=True)
@@ -137,21 +141,30 @@ class Cutters(Beside):
     self._arrays = {"geom": geom, "axis": axis, "half": half}
     w.hold.need()
 
-  def _law(self, m) -> np.ndarray:
-    """Returns the rows of `Blades.law`."""
+  def law(self, m, thickness: float) -> np.ndarray:
+    """Returns the rows of `Blades.law` where the wall has a thickness [m]."""
     w, rows = self._w, []
     for i, row in enumerate(w.config.cutters):
-      force = row.energy * w.config.thickness
+      force = row.energy * thickness
       if row.current:
-        rows.append((0.0, 0.0, 0.0, w.config.thickness))
+        rows.append((0.0, 0.0, 0.0, thickness))
         continue
       stiff = force / (_SLACK * w.organ.mesh.whole.edge_length)
       for g in self._arrays["geom"][i]:
         if g >= 0:
           body = int(mjstruct.view(m.geom_bodyid, m.ngeom, np.int32)[g])
           stiff = min(stiff, fasten.most(w, m, body))
-      rows.append((force, row.energy * self._width[i], stiff, w.config.thickness))
+      rows.append((force, row.energy * self._width[i], stiff, thickness))
     return np.array(rows)
+
+  @property
+  def currents(self) -> list[str]:
+    """Names of the geoms that cut by a current."""
+    return [self.names[i][0] for i in self._currents]
+
+  def edges(self) -> dict[str, np.ndarray]:
+    """Returns the fields of `Blades` that say which geoms they are, and their edges."""
+    return self._arrays
 
   @property
   def state(self) -> np.ndarray:
@@ -172,7 +185,8 @@ class Cutters(Beside):
       ahead=float(scheme.ahead),
       gain=scheme.gain(1.0, 0.0),
       edge=float(mesh.whole.edge_length),
-      law=self._law(m),
+      law=self.law(m, w.config.thickness),
+      mesh=np.zeros(1),
       elem=mesh.elem,
       flat=mesh.rest,
       state=self.rows("blade", len(BLADE)),
@@ -188,7 +202,8 @@ class Cutters(Beside):
   def refresh(self):
     """Takes the thickness that the wall has now."""
     if self.fields is not None:
-      self.fields.law.assign(self._law(mjstruct.Model.from_address(self._w.model)))
+      m = mjstruct.Model.from_address(self._w.model)
+      self.fields.law.assign(self.law(m, self._w.config.thickness))
 
   def reshape(self) -> list:
     """See `Beside`."""
@@ -205,15 +220,30 @@ class Cutters(Beside):
       self._due[i] = self._follow(current, self.state[i])
     for i, due in enumerate(self._due):
       if due:
-        given = _GIVEN * self.fields.law.numpy()[i, LAW.force] * mesh.whole.edge_length
-        opened = self._open(self.state[i], due == _ENDED, given) or opened
+        given = GIVEN * self.fields.law.numpy()[i, LAW.force] * mesh.whole.edge_length
+        opened = self._open(self.state[i], due == ENDED, given) or opened
         self._due[i] = 0
     return opened
+
+  def _open(self, row: np.ndarray, ended: bool, given: float) -> bool:
+    """Opens the path of a blade; returns whether the mesh is another."""
+    w = self._w
+
+    def cut(path: np.ndarray) -> tuple[Report, Mesh]:
+      organ = w.organ
+      now = on_surface(w.cuts.finder, organ.mesh, path, w.phases.motion()[0])
+      return w.cuts.cut(organ.origin + now @ organ.frame.T, given), w.organ.mesh
+
+    report, why = open_path(row, w.organ.mesh, ended, w.organ, w.cuts.finder, cut)
+    if "pinned" in why and not self._said:
+      self._said = True
+      mjstruct.warn(why)
+    return report is not None and report.nodes > 0
 
   def _follow(self, current: Current, row: np.ndarray) -> int:
     """Lets a path follow a current; returns what is due, as the header says it of blades."""
     if current.act(row):
-      return _ENDED
+      return ENDED
     count, at = int(row[BLADE.count]), row[BLADE.at : BLADE.at + 3]
     if not row[BLADE.stage]:
       return 0
@@ -224,56 +254,6 @@ class Cutters(Beside):
       row[BLADE.count] += 1
     wait = row[BLADE.wait] or _BATCH * edge
     return int(np.linalg.norm(at - start) > wait or row[BLADE.count] == TRAIL)
-
-  def _open(self, row: np.ndarray, ended: bool, given: float) -> bool:
-    """Opens the path of a blade; returns whether the mesh is another.
-
-    Args:
-      row: of the state
-      ended: whether all of it comes apart
-      given: energy that moving a vertex may bring [J]
-    """
-    w, mesh = self._w, self._w.organ.mesh
-    count, at = int(row[BLADE.count]), row[BLADE.at : BLADE.at + 3]
-    trail = row[BLADE.trail : BLADE.trail + 3 * count].reshape(-1, 3)
-    path, rest = np.vstack([trail, at]), at[None]
-    if not ended:
-      path, rest = _part(mesh, w.cuts.finder, path)
-    report, pinned = None, False
-    try:
-      report = w.cuts.cut(self._now(mesh, path), given) if len(path) > 1 else None
-    except ValueError as error:
-      pinned = "pinned" in str(error)
-      if pinned and not self._said:
-        self._said = True
-        mjstruct.warn(str(error))
-    if ended:
-      row[BLADE.count] = 0
-    elif report is None:
-      self._wait(row, at, pinned or count == TRAIL)
-    else:
-      tip = (report.path[-1][-1] - w.organ.origin) @ w.organ.frame if report.path else path[-1]
-      trail = np.vstack([tip, rest[:-1]])[:TRAIL]
-      row[BLADE.count], row[BLADE.wait] = len(trail), 0.0
-      row[BLADE.trail : BLADE.trail + trail.size] = trail.ravel()
-      row[BLADE.elem] = w.cuts.finder.nearest(w.organ.mesh, w.organ.mesh.rest, at[None])[0][0]
-    return report is not None and report.nodes > 0
-
-  def _now(self, mesh, path: np.ndarray) -> np.ndarray:
-    """Returns where points of the rest shape are in the world."""
-    organ = self._w.organ
-    elem, weight, _ = self._w.cuts.finder.nearest(mesh, mesh.rest, path)
-    position = mesh.rest + self._w.phases.motion()[0]
-    local = np.einsum("nk,nkj->nj", weight, position[mesh.elem[elem]])
-    return organ.origin + local @ organ.frame.T
-
-  def _wait(self, row: np.ndarray, at: np.ndarray, full: bool):
-    """Lets a path grow that could not come apart, or forgets it where there is no more room."""
-    start = row[BLADE.trail : BLADE.trail + 3]
-    row[BLADE.wait] = np.linalg.norm(at - start) + _MORE * self._w.organ.mesh.whole.edge_length
-    if full:
-      row[BLADE.count], row[BLADE.wait] = 1, 0.0
-      start[:] = at
 
   def read(self) -> list[Cutter]:
     """Returns what the cutters do."""
@@ -289,6 +269,67 @@ class Cutters(Beside):
 
   def _forces(self) -> np.ndarray:
     return self.fields.force.numpy() @ self._w.organ.frame.T
+
+
+def open_path(
+  row: np.ndarray,
+  mesh: Mesh,
+  ended: bool,
+  organ,
+  finder: Finder,
+  cut: Callable[[np.ndarray], tuple[Report, Mesh]],
+) -> tuple[Report | None, str]:
+  """Opens the path of a blade, as far as the mesh is to come apart along it.
+
+  Args:
+    row: of the blades' state
+    mesh: the organ's
+    ended: whether all of it comes apart
+    organ: its declaration
+    finder: of its surfaces
+    cut: cuts along a path at rest, (n, 3) [m]; returns what it did, and the mesh then
+
+  Returns:
+    what was cut, None for nothing, and why it could not be
+  """
+  count, at = int(row[BLADE.count]), row[BLADE.at : BLADE.at + 3]
+  edge = mesh.whole.edge_length
+  trail = row[BLADE.trail : BLADE.trail + 3 * count].reshape(-1, 3)
+  path, rest = np.vstack([trail, at]), at[None]
+  if not ended:
+    path, rest = _part(mesh, finder, path)
+  report, why = None, ""
+  try:
+    if len(path) > 1:
+      report, mesh = cut(path)
+  except ValueError as error:
+    why = str(error)
+  if ended:
+    row[BLADE.count] = 0
+  elif report is None:
+    _wait(row, at, edge, "pinned" in why or count == TRAIL)
+  else:
+    tip = (report.path[-1][-1] - organ.origin) @ organ.frame if report.path else path[-1]
+    trail = np.vstack([tip, rest[:-1]])[:TRAIL]
+    row[BLADE.count], row[BLADE.wait] = len(trail), 0.0
+    row[BLADE.trail : BLADE.trail + trail.size] = trail.ravel()
+    row[BLADE.elem] = finder.nearest(mesh, mesh.rest, at[None])[0][0]
+  return report, why
+
+
+def on_surface(finder: Finder, mesh: Mesh, path: np.ndarray, disp: np.ndarray) -> np.ndarray:
+  """Returns where points of the rest shape are, (n, 3), with displacements (nvert, 3)."""
+  elem, weight, _ = finder.nearest(mesh, mesh.rest, path)
+  return np.einsum("nk,nkj->nj", weight, (mesh.rest + disp)[mesh.elem[elem]])
+
+
+def _wait(row: np.ndarray, at: np.ndarray, edge: float, full: bool):
+  """Lets a path grow that could not come apart, or forgets it where there is no more room."""
+  start = row[BLADE.trail : BLADE.trail + 3]
+  row[BLADE.wait] = np.linalg.norm(at - start) + _MORE * edge
+  if full:
+    row[BLADE.count], row[BLADE.wait] = 1, 0.0
+    start[:] = at
 
 
 def _part(mesh, finder, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,5 +1,6 @@
 // Blades that cut: a segment goes through the wall of an organ without contact, and a spring holds it
-// to a point of the tissue, its seat. Doubles, on the CPU beside MuJoCo.
+// to a point of the tissue, its seat. Doubles; on the CPU beside MuJoCo, on CUDA a warp a world, whose
+// threads do all the same but for looking at triangles, of which each has its part.
 //
 // With G the energy that it takes to open an area and t the thickness of the wall, a length dl takes
 // G t dl. So the tissue bears a blade up to the force G t along the surface, and there the seat goes on
@@ -10,6 +11,7 @@
 //
 // Places are in the organ's frame; a blade slides freely along itself.
 #pragma once
+#include "block.h"
 #include "lines.h"
 #include "triangle.h"
 
@@ -23,6 +25,15 @@ constexpr double BLOCKED = 0.3;  // share of its way that a seat goes where it i
 enum { AWAY, PIERCING, THROUGH };  // stages
 enum { NOTHING, LONG, ENDED };  // what is due
 
+constexpr double NOWHERE = 1e300;  // farther than any
+
+// The least that the threads of a warp have found: all of them have it then.
+PALPATE void agree(double& least, int& elem, D3& weight) {
+  double w[3] = {weight.x, weight.y, weight.z};
+  warp_least(least, elem, w);
+  weight = {w[0], w[1], w[2]};
+}
+
 template <class Fields>
 PALPATE void corners_at_rest(const Fields& f, int t, D3* x) {
   for (int c = 0; c < 3; ++c) x[c] = load(f.flat.data + 3 * f.elem.data[3 * t + c]);
@@ -34,6 +45,28 @@ PALPATE void corners_now(const Fields& f, int t, D3* x) {
     const int v = f.elem.data[3 * t + c];
     x[c] = load(f.own.rest.data + 3 * v) + moved_by(f.mj, f.own, v);
   }
+}
+
+// Moves what worlds have of their own to one of them, see `bodies.h`; there a mesh is by nodes.
+template <class Nodes>
+PALPATE auto stand_on(Nodes& o, const double* rest) -> decltype(*o.node.data, void()) {
+  o.rest.data = (double*)rest;
+}
+template <class Nodes>
+PALPATE auto stand_on(Nodes& o, const double*) -> decltype(*o.qposadr.data, void()) {}
+
+template <class Fields>
+PALPATE Fields of_world(Fields f, int world) {
+  move_bodies(f.mj, world);
+  move_nodes(f.own, world);
+  move_input(f.solve, world);
+  move_to(f.state, world), move_to(f.next, world), move_to(f.due, world), move_to(f.law, world);
+  move_to(f.force, world), move_to(f.point, world), move_to(f.share, world), move_to(f.hold, world);
+  f.number.data += NUMBERS * world;
+  move_to(f.elem, f.mesh.data[world]);
+  move_to(f.flat, f.mesh.data[world]);
+  stand_on(f.own, f.flat.data);
+  return f;
 }
 
 // Where a line goes through a triangle: how far from its end, or -1 where it does not.
@@ -50,28 +83,29 @@ PALPATE double crossing(const Line& s, const D3* x, D3& weight) {
 // Finds where a blade goes through the surface, nearest to one of its ends; returns how far that end is
 // beyond it, or -1.
 template <class Fields>
-PALPATE double enters(const Fields& f, const Line& s, int& elem, D3& weight) {
+PALPATE double enters(const Fields& f, Thread me, const Line& s, int& elem, D3& weight) {
   const D3 half = (0.5 * s.length) * s.along, middle = s.from + half, reach = vabs(half);
   const D3 zero = {0.0, 0.0, 0.0};
-  double least = -1.0;
-  for (int t = 0; t < f.nelem; ++t) {
+  double least = NOWHERE;
+  for (int t = me.tid; t < f.nelem; t += me.nthread) {
     D3 x[3], w;
     corners_now(f, t, x);
     const D3 low = zero - vmax(vmax(zero - x[0], zero - x[1]), zero - x[2]);
     const D3 high = vmax(vmax(x[0], x[1]), x[2]), off = vmax(low - middle, middle - high) - reach;
     if (off.x > 0.0 || off.y > 0.0 || off.z > 0.0) continue;
     const double at = crossing(s, x, w), beyond = at < s.length - at ? at : s.length - at;
-    if (at < 0.0 || (least >= 0.0 && beyond >= least)) continue;
+    if (at < 0.0 || beyond >= least) continue;
     least = beyond, elem = t, weight = w;
   }
-  return least;
+  agree(least, elem, weight);
+  return least < NOWHERE ? least : -1.0;
 }
 
 // Finds the point of the surface at rest that is nearest to a place: its triangle and weights.
 template <class Fields>
-PALPATE void find_seat(const Fields& f, D3 place, int& elem, D3& weight) {
-  double least = 1e300;
-  for (int t = 0; t < f.nelem; ++t) {
+PALPATE void find_seat(const Fields& f, Thread me, D3 place, int& elem, D3& weight) {
+  double least = NOWHERE;
+  for (int t = me.tid; t < f.nelem; t += me.nthread) {
     D3 x[3];
     corners_at_rest(f, t, x);
     const double far = norm(x[0] - place) - norm(x[1] - x[0]) - norm(x[2] - x[0]);
@@ -80,6 +114,7 @@ PALPATE void find_seat(const Fields& f, D3 place, int& elem, D3& weight) {
     if (!(dot(off, off) < least)) continue;
     least = dot(off, off), elem = t, weight = w;
   }
+  agree(least, elem, weight);
 }
 
 // Where the seat of a blade is: triangle, weights, place now, velocity, and normal.
@@ -138,14 +173,13 @@ PALPATE void note_path(double* s, double spacing) {
 
 // Puts a blade that goes through the surface on its seat there.
 template <class Fields>
-PALPATE void sit_down(const Fields& f, int i, const Line& line) {
-  double* s = f.next.data + BLADE_LENGTH * i;
+PALPATE void sit_down(const Fields& f, Thread t, int i, const Line& line, double* s) {
   const D3 zero = {0.0, 0.0, 0.0}, toward = cuts_toward(f, i);
   const bool shears = f.geom.data[2 * i + 1] >= 0;
   if (shears && toward == zero) return;
   int elem = 0;
   D3 weight, rest[3], x[3];
-  const double beyond = enters(f, line, elem, weight);
+  const double beyond = enters(f, t, line, elem, weight);
   if (beyond < 0.0) return;
   corners_at_rest(f, elem, rest);
   corners_now(f, elem, x);
@@ -162,12 +196,11 @@ PALPATE void sit_down(const Fields& f, int i, const Line& line) {
 
 // Moves the seat of a blade along the surface; returns whether it could.
 template <class Fields>
-PALPATE bool advance(const Fields& f, int i, D3 way, const Seated& from) {
-  double* s = f.next.data + BLADE_LENGTH * i;
+PALPATE bool advance(const Fields& f, Thread t, int i, D3 way, const Seated& from, double* s) {
   const D3 was = load(s + BLADE_AT), goes = carried(way, from.x, from.rest);
   int elem = (int)s[BLADE_ELEM];
   D3 weight, rest[3];
-  find_seat(f, was + goes, elem, weight);
+  find_seat(f, t, was + goes, elem, weight);
   corners_at_rest(f, elem, rest);
   const D3 now = blend(rest, weight);
   const double gone = norm(now - was);
@@ -185,8 +218,7 @@ PALPATE bool advance(const Fields& f, int i, D3 way, const Seated& from) {
 // Brings the spring of a blade that sits to what the tissue bears; ends the cut where the blade is out
 // of the tissue, or cuts another way.
 template <class Fields>
-PALPATE void give_way(const Fields& f, int i, const Line& line) {
-  double* s = f.next.data + BLADE_LENGTH * i;
+PALPATE void give_way(const Fields& f, Thread t, int i, const Line& line, double* s) {
   const double* law = f.law.data + LAW_LENGTH * i;
   Seated at = seated(f, s);
   const double place = dot(at.at - line.from, line.along);
@@ -202,7 +234,7 @@ PALPATE void give_way(const Fields& f, int i, const Line& line) {
       const D3 unit = (1.0 / size) * now.flat;
       const double tilt = dot(unit, line.along), level = 1.0 - tilt * tilt;
       const double far = (size - slack) / (level > LEVEL ? level : LEVEL), most = LEAP * f.edge;
-      out = now.behind || !advance(f, i, (far < most ? far : most) * unit, at);
+      out = now.behind || !advance(f, t, i, (far < most ? far : most) * unit, at, s);
     }
   }
   if (out) {
@@ -229,11 +261,10 @@ PALPATE Sym without(const Sym& m, double k, D3 a) {
 }
 
 // The force of a blade on its seat at the end of the step, and what of its spring weighs on the change
-// of the seat's velocity. Where it would be more than the tissue bears it is that, and does not weigh
-// along itself.
+// of the seat's velocity. Where it would be more than the tissue bears it is that, and less by as
+// much of the way to the blade as the tissue goes: light tissue must not be thrown ahead of the blade.
 template <class Fields>
-PALPATE void bear(const Fields& f, int i, const Line& line) {
-  const double* s = f.next.data + BLADE_LENGTH * i;
+PALPATE void bear(const Fields& f, Thread t, int i, const Line& line, const double* s) {
   const double* law = f.law.data + LAW_LENGTH * i;
   const double h = f.mj.timestep.data[0], damping = f.number.data[DAMPING];
   const double reach = f.ahead * h + damping, k = law[LAW_STIFFNESS], weight = k * f.gain * h * (h + damping);
@@ -253,7 +284,7 @@ PALPATE void bear(const Fields& f, int i, const Line& line) {
   const double size = k * norm(then.flat);
   if (size > law[LAW_FORCE]) {
     const double share = law[LAW_FORCE] / size;
-    hold = share * without(hold, weight, unit_of(then.pull));
+    hold = share * hold;
     force = (share * k) * then.pull;
   }
   if (s[BLADE_STAGE] == PIERCING) {
@@ -267,6 +298,7 @@ PALPATE void bear(const Fields& f, int i, const Line& line) {
       force += law[LAW_PIERCE] * tip;
     }
   }
+  if (t.tid > 0) return;
   store(f.force.data + 3 * i, force);
   store(f.point.data + 3 * i, at.at + then.pull);
   const double entries[6] = {hold.xx, hold.xy, hold.xz, hold.yy, hold.yz, hold.zz};
@@ -279,34 +311,47 @@ PALPATE void bear(const Fields& f, int i, const Line& line) {
   }
 }
 
-// Adds the blades' forces to the solver's input, and finds what state they will be in.
+// What is due of the path of a blade.
 template <class Fields>
-PALPATE void enter_blades(const Fields& f, Thread, int) {
+PALPATE int due_of(const Fields& f, const double* s) {
+  if (!(s[BLADE_COUNT] > 0.0)) return NOTHING;
+  if (s[BLADE_STAGE] == AWAY) return ENDED;
+  const double far = norm(load(s + BLADE_AT) - load(s + BLADE_TRAIL));
+  const double wait = s[BLADE_WAIT] > 0.0 ? s[BLADE_WAIT] : BATCH * f.edge;
+  return far > wait || s[BLADE_COUNT] == TRAIL ? LONG : NOTHING;
+}
+
+// Adds the blades' forces to the solver's input, and finds what state they will be in. What is due is
+// kept until it is done where `keeps` says so.
+template <class Fields>
+PALPATE void enter_blades(const Fields& given, Thread t, int keeps) {
+  const Fields f = of_world(given, t.world);
   const D3 zero = {0.0, 0.0, 0.0};
-  f.solve.quiet.data[0] = 0.0;
+  if (t.tid == 0) f.solve.quiet.data[0] = 0.0;
   for (int i = 0; i < f.nblade; ++i) {
-    double* s = f.next.data + BLADE_LENGTH * i;
+    double s[BLADE_LENGTH];
     for (int c = 0; c < BLADE_LENGTH; ++c) s[c] = f.state.data[BLADE_LENGTH * i + c];
-    store(f.force.data + 3 * i, zero);
-    f.due.data[i] = NOTHING;
-    if (f.law.data[LAW_LENGTH * i + LAW_STIFFNESS] == 0.0) continue;  // it cuts by its current
+    if (t.tid == 0) store(f.force.data + 3 * i, zero);
+    int due = NOTHING;
+    const bool cuts = f.law.data[LAW_LENGTH * i + LAW_STIFFNESS] != 0.0;  // else by its current
     const Line line = line_of(f, i, 0.0);
-    if (s[BLADE_STAGE] == AWAY && line.length > 0.0) sit_down(f, i, line);
-    if (s[BLADE_STAGE] == AWAY) continue;
-    give_way(f, i, line);
-    if (s[BLADE_COUNT] > 0.0) {
-      const double far = norm(load(s + BLADE_AT) - load(s + BLADE_TRAIL));
-      const double wait = s[BLADE_WAIT] > 0.0 ? s[BLADE_WAIT] : BATCH * f.edge;
-      if (far > wait || s[BLADE_COUNT] == TRAIL) f.due.data[i] = LONG;
-      if (s[BLADE_STAGE] == AWAY) f.due.data[i] = ENDED;
+    if (cuts && s[BLADE_STAGE] == AWAY && line.length > 0.0) sit_down(f, t, i, line, s);
+    if (cuts && s[BLADE_STAGE] != AWAY) {
+      give_way(f, t, i, line, s);
+      due = due_of(f, s);
+      if (s[BLADE_STAGE] != AWAY) bear(f, t, i, line, s);
     }
-    if (s[BLADE_STAGE] != AWAY) bear(f, i, line);
+    if (t.tid > 0) continue;
+    for (int c = 0; c < BLADE_LENGTH; ++c) f.next.data[BLADE_LENGTH * i + c] = s[c];
+    if (!keeps || due > f.due.data[i]) f.due.data[i] = due;
   }
 }
 
 // Ends the forces with what the step made of the seats' velocities, and lets the blades feel them.
 template <class Fields>
-PALPATE void act_blades(const Fields& f, Thread, int) {
+PALPATE void act_blades(const Fields& given, Thread t, int) {
+  if (t.tid > 0) return;
+  const Fields f = of_world(given, t.world);
   const bool ok = f.solve.status.data[3] == 0.0f;
   const D3 zero = {0.0, 0.0, 0.0};
   for (int i = 0; i < f.nblade; ++i) {
@@ -329,8 +374,9 @@ PALPATE void act_blades(const Fields& f, Thread, int) {
 
 // Keeps the blades' state.
 template <class Fields>
-PALPATE void keep_blades(const Fields& f, Thread, int) {
-  for (int i = 0; i < BLADE_LENGTH * f.nblade; ++i) f.state.data[i] = f.next.data[i];
+PALPATE void keep_blades(const Fields& given, Thread t, int) {
+  const Fields f = of_world(given, t.world);
+  each_item(t, BLADE_LENGTH * f.nblade, [&](int i) { f.state.data[i] = f.next.data[i]; });
 }
 
 }  // namespace palpate

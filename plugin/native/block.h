@@ -108,8 +108,27 @@ PALPATE float warp_most(float v) {
   return v;
 }
 
+// The least number of a warp, of equal ones that with the least key, and what is with it.
+template <int N>
+PALPATE void warp_least(double& least, int& key, double (&with)[N]) {
+  const unsigned all = 0xffffffffu;
+  for (int o = 16; o > 0; o >>= 1) {
+    const double value = __shfl_xor_sync(all, least, o);
+    const int k = __shfl_xor_sync(all, key, o);
+    const bool less = value < least || (value == least && k < key);
+    for (int c = 0; c < N; ++c) {
+      const double other = __shfl_xor_sync(all, with[c], o);
+      with[c] = less ? other : with[c];
+    }
+    least = less ? value : least;
+    key = less ? k : key;
+  }
+}
+
 #else
 
+template <int N>
+PALPATE void warp_least(double&, int&, double (&)[N]) {}
 PALPATE float* block_memory() { return nullptr; }
 PALPATE int block_room() { return 0; }
 PALPATE void meet_block() {}

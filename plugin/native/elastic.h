@@ -119,14 +119,15 @@ struct Fan {
 template <class Fields>
 PALPATE Fan fan_of(const Fields& f, int world, const Rows& at, int s, Lane lane) {
   const int row = f.shape.slot_adr.data[s], width = f.shape.slot_adr.data[s + 1] - row;
+  const size_t mesh = mesh_of(f, world);
   return {
     width,
-    ld(f.shape.degree.data, s, lane),
-    f.shape.fan_node.data + 8 * (row + 2 * s),
-    f.shape.fan_rest.data + 24 * (row + 2 * s),
-    f.tissue.fan_metric.data + 40 * (row + s),
-    f.shape.fan_corner.data + 8 * (row + s),
-    f.shape.fan_side.data + 8 * (row + s),
+    ld(f.shape.degree.data + mesh, s, lane),
+    f.shape.fan_node.data + mesh + 8 * (row + 2 * s),
+    f.shape.fan_rest.data + mesh + 24 * (row + 2 * s),
+    f.tissue.fan_metric.data + mesh + 40 * (row + s),
+    f.shape.fan_corner.data + mesh + 8 * (row + s),
+    f.shape.fan_side.data + mesh + 8 * (row + s),
     f.lump.fan.data ? f.lump.fan.data + 8 * ((size_t)world * (f.shape.nslot + f.shape.nslice) + row + s)
                     : nullptr,
     at.blocks(s, row),
@@ -259,6 +260,7 @@ struct Assembly {
   const int world, stage;
   const Rows& at;
 
+  const size_t mesh = mesh_of(f, world);
   const float* const step = f.state.step.data + 4 * world;
   const float* const number = numbers(f, world);
   const float h = step[0], g = step[1], gv = weight_of_rate(stage, step);
@@ -283,7 +285,7 @@ struct Assembly {
     st3(at.normal + 24 * s, n, lane);
     const size_t own = (size_t)world * f.shape.nslice + s;
     const float* bend = f.lump.bend_diag.data ? f.lump.bend_diag.data + 8 * own
-                                              : f.tissue.bend_diag.data + 8 * s;
+                                              : f.tissue.bend_diag.data + mesh + 8 * s;
     return square(number[PLATE] * g * ld(bend, 0, lane), n);
   }
 
@@ -293,7 +295,7 @@ struct Assembly {
     const Motion m = {at.disp, at.vel, ld3(at.disp + 24 * s, lane), ld3(at.vel + 24 * s, lane)};
     Sum sum = around(fan, m, want, lane);
     const V mass = ld(f.state.mass.data + 8 * own, 0, lane);
-    const V kf = splat(foundation) * ld(f.shape.area.data, s, lane), diag = mass + g * kf;
+    const V kf = splat(foundation) * ld(f.shape.area.data + mesh, s, lane), diag = mass + g * kf;
     V3 b = h * (sum.force + ld3(f.state.force_ext.data + 24 * own, lane) - kf * m.u)
       + gv * (sum.rate - kf * m.v);
     if (stage == LATER) b -= mass * ld3(f.state.dvel.data + 24 * own, lane);
@@ -303,7 +305,7 @@ struct Assembly {
     if (bends) self = self + bent(fan, sum, s, b, lane);
     st3(at.rhs + 24 * s, b, lane);
     if (!matrix) return;
-    const V free = ld(f.shape.free.data, s, lane);
+    const V free = ld(f.shape.free.data + mesh, s, lane);
     put_diagonal(at.diag + 8 * s, at.inverse + 48 * s, free, diag, self, lane);
   }
 };

@@ -33,9 +33,10 @@ PALPATE Triangle triangle(const float* disp, const int* node, const float* rest,
 template <class Fields>
 PALPATE void elem_normal(const Fields& f, Thread t, int) {
   const float* disp = f.system.disp_trial.data + 24 * (size_t)t.world * f.shape.nslice;
+  const size_t mesh = mesh_of(f, t.world);
   each_slice(t, f.shape.nelemslice, [&](int s, Lane lane) {
-    const int* node = f.shape.elem_node.data + 24 * s;
-    const Triangle e = triangle(disp, node, f.shape.elem_rest.data + 48 * s, lane);
+    const int* node = f.shape.elem_node.data + mesh + 24 * s;
+    const Triangle e = triangle(disp, node, f.shape.elem_rest.data + mesh + 48 * s, lane);
     float* out = f.system.elem_normal.data + 32 * ((size_t)t.world * f.shape.nelemslice + s);
     st3(out, e.scale() * cross(e.a, e.b), lane);
   });
@@ -68,10 +69,11 @@ PALPATE void hinge_angle(const Fields& f, Thread t, int stage) {
   const float* disp = f.system.disp_trial.data + base;
   const float* vel = f.system.vel_trial.data + base;
   const float* normal = f.system.elem_normal.data + 32 * (size_t)t.world * f.shape.nelemslice;
+  const size_t mesh = mesh_of(f, t.world);
   each_slice(t, f.shape.nhingeslice, [&](int s, Lane lane) {
-    const int* node = f.shape.hinge_node.data + 32 * s;
-    const int* elem = f.shape.hinge_elem.data + 16 * s;
-    const float* rest = f.shape.hinge_rest.data + 72 * s;
+    const int* node = f.shape.hinge_node.data + mesh + 32 * s;
+    const int* elem = f.shape.hinge_elem.data + mesh + 16 * s;
+    const float* rest = f.shape.hinge_rest.data + mesh + 72 * s;
     const V3 re = ld3(rest, 0, lane), ra = ld3(rest, 3, lane), rb = ld3(rest, 6, lane);
     const V3 u = gather3(disp, node, lane);
     const V3 e = re + gather3(disp, node + 8, lane) - u;
@@ -94,12 +96,12 @@ PALPATE void hinge_angle(const Fields& f, Thread t, int stage) {
     const V rate = -dot(l, c) / vsqrt(vmax(dot(a, a), dot(na, na) * rest2 + 1e-30f))
       - dot(r, d) / vsqrt(vmax(dot(b, b), dot(nb, nb) * rest2 + 1e-30f));
     const size_t out = (size_t)t.world * f.shape.nhingeslice + s;
-    const V change = now.psi - ld(f.shape.hinge_angle0.data, s, lane);
+    const V change = now.psi - ld(f.shape.hinge_angle0.data + mesh, s, lane);
     st(f.system.hinge_angle.data + 8 * out, 0, h * change + gv * now.half * rate, lane);
     st(f.system.hinge_half.data + 8 * out, 0, now.half, lane);
     // What the bending matrix may leave out here, see elem_corner.
     const V fold = 4.0f - 4.0f * now.half * now.half + 2.0f * change * change;
-    V gain = plate * ld(f.tissue.hinge_gain.data, 5 * s, lane);
+    V gain = plate * ld(f.tissue.hinge_gain.data + mesh, 5 * s, lane);
     if (f.lump.hinge.data) {
       const float* factor = f.lump.hinge.data + 16 * out;
       gain = gain * vmax(ld(factor, 0, lane), ld(factor, 1, lane));
@@ -114,9 +116,10 @@ PALPATE void hinge_moment(const Fields& f, Thread t, int) {
   const size_t base = (size_t)t.world * f.shape.nhingeslice;
   const float* angle = f.system.hinge_angle.data + 8 * base;
   const float plate = numbers(f, t.world)[PLATE];
+  const size_t mesh = mesh_of(f, t.world);
   each_slice(t, f.shape.nhingeslice, [&](int s, Lane lane) {
-    const int* near = f.shape.hinge_near.data + 32 * s;
-    const float* gain = f.tissue.hinge_gain.data + 40 * s;
+    const int* near = f.shape.hinge_near.data + mesh + 32 * s;
+    const float* gain = f.tissue.hinge_gain.data + mesh + 40 * s;
     const V own = ld(angle, s, lane);
     V sum = ld(gain, 0, lane) * own;
     if (f.lump.hinge.data) {
@@ -148,10 +151,11 @@ PALPATE void elem_corner(const Fields& f, Thread t, int) {
   const float* disp = f.system.disp_trial.data + 24 * (size_t)t.world * f.shape.nslice;
   const float* moment = f.system.hinge_moment.data + 8 * (size_t)t.world * f.shape.nhingeslice;
   const float* rough = f.system.hinge_rough.data + 8 * (size_t)t.world * f.shape.nhingeslice;
+  const size_t mesh = mesh_of(f, t.world);
   each_slice(t, f.shape.nelemslice, [&](int s, Lane lane) {
-    const int* node = f.shape.elem_node.data + 24 * s;
-    const int* hinge = f.shape.elem_hinge.data + 24 * s;
-    const Triangle e = triangle(disp, node, f.shape.elem_rest.data + 48 * s, lane);
+    const int* node = f.shape.elem_node.data + mesh + 24 * s;
+    const int* hinge = f.shape.elem_hinge.data + mesh + 24 * s;
+    const Triangle e = triangle(disp, node, f.shape.elem_rest.data + mesh + 48 * s, lane);
     const V3 a = e.a, b = e.b, c = b - a;
     const V scale = e.scale();
     const V aa = dot(a, a), bb = dot(b, b), cc = dot(c, c), ab = dot(a, b);

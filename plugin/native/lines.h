@@ -18,7 +18,7 @@ template <class Fields>
 PALPATE Line line_of_geom(const Fields& f, int i, int which, double ahead) {
   const int g = f.geom.data[2 * i + which], b = f.mj.geom_bodyid.data[g];
   const int k = f.axis.data[2 * i + which];
-  const double* R = f.mj.geom_xmat.data + 9 * g;
+  const auto* R = f.mj.geom_xmat.data + 9 * g;
   const D3 half = f.half.data[2 * i + which] * D3{R[k], R[3 + k], R[6 + k]};
   D3 from = load(f.mj.geom_xpos.data + 3 * g) - half, to = from + 2.0 * half;
   if (ahead > 0.0) {

@@ -30,11 +30,13 @@ struct Matrix {
 template <class Fields>
 PALPATE Matrix matrix(const Fields& f, int world) {
   const size_t base = (size_t)world * f.shape.nslice, nbend = f.shape.bend_adr.data[f.shape.nslice];
+  const size_t mesh = mesh_of(f, world);
   return {
     f.system.block.data + 72 * (size_t)world * f.shape.nslot, f.system.diag.data + 8 * base,
     f.system.inverse.data + 48 * base, f.system.normal.data + 24 * base, f.shape.slot_adr.data,
-    f.shape.fan_node.data, f.shape.bend_adr.data, f.shape.bend_node.data,
-    f.lump.bend_gain.data ? f.lump.bend_gain.data + 8 * nbend * world : f.tissue.bend_gain.data,
+    f.shape.fan_node.data + mesh, f.shape.bend_adr.data, f.shape.bend_node.data + mesh,
+    f.lump.bend_gain.data ? f.lump.bend_gain.data + 8 * nbend * world
+                          : f.tissue.bend_gain.data + mesh,
     f.state.hold.data ? f.state.hold.data + 48 * base : nullptr,
     f.shape.ncapsule ? f.system.capsule_block.data + 72 * (size_t)world * f.shape.ncapsule : nullptr,
     f.shape.capsule_adr.data, f.shape.capsule_node.data,

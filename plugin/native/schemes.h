@@ -7,10 +7,11 @@ namespace palpate {
 // How fast the edges of a slice's nodes change: the largest (rate of an edge's ends over its
 // length)^2.
 template <class Fields>
-PALPATE V fastest(const Fields& f, const float* vel, int s, Lane lane) {
+PALPATE V fastest(const Fields& f, int world, const float* vel, int s, Lane lane) {
   const int first = f.shape.slot_adr.data[s], width = f.shape.slot_adr.data[s + 1] - first;
-  const int* node = f.shape.fan_node.data + 8 * (first + 2 * s + 1);
-  const float* rest = f.shape.fan_rest.data + 24 * (first + 2 * s + 1);
+  const size_t mesh = mesh_of(f, world);
+  const int* node = f.shape.fan_node.data + mesh + 8 * (first + 2 * s + 1);
+  const float* rest = f.shape.fan_rest.data + mesh + 24 * (first + 2 * s + 1);
   const V3 v = ld3(vel + 24 * s, lane);
   V most = splat(0.0f);
   for (int k = 0; k < width; ++k, node += 8, rest += 24) {
@@ -39,7 +40,7 @@ PALPATE void edge_change(const Fields& f, Thread t, int) {
   const float* vel = f.state.vel.data + 24 * (size_t)t.world * f.shape.nslice;
   if (slow(f, vel, f.state.step.data[4 * t.world])) return;
   each_slice(t, f.shape.nslice, [&](int s, Lane lane) {
-    put_most(f.system.change.data + t.world, fastest(f, vel, s, lane));
+    put_most(f.system.change.data + t.world, fastest(f, t.world, vel, s, lane));
   });
 }
 
@@ -142,17 +143,18 @@ struct Springs {
 template <class Fields>
 PALPATE Springs springs(const Fields& f, int world, int s, Lane lane) {
   const int row = f.shape.slot_adr.data[s], width = f.shape.slot_adr.data[s + 1] - row;
-  const float* k = f.tissue.fan_spring.data + 8 * row;
-  const V area = ld(f.shape.area.data, s, lane);
+  const size_t mesh = mesh_of(f, world);
+  const float* k = f.tissue.fan_spring.data + mesh + 8 * row;
+  const V area = ld(f.shape.area.data + mesh, s, lane);
   V sum = numbers(f, world)[FOUNDATION] * area;
   for (int i = 0; i < width; ++i) sum += ld(k, i, lane);
-  return {width, f.shape.fan_node.data + 8 * (row + 2 * s + 1), k, area, sum};
+  return {width, f.shape.fan_node.data + mesh + 8 * (row + 2 * s + 1), k, area, sum};
 }
 
 // One over the mass of a slice's nodes, 0 for those that do not move: they may have no mass.
 template <class Fields>
 PALPATE V lightness(const Fields& f, int world, int s, Lane lane) {
-  const V free = ld(f.shape.free.data, s, lane), zero = splat(0.0f);
+  const V free = ld(f.shape.free.data + mesh_of(f, world), s, lane), zero = splat(0.0f);
   const V mass = ld(f.state.mass.data + 8 * (size_t)world * f.shape.nslice, s, lane);
   return select(free > zero, 1.0f / mass, zero);
 }

@@ -32,6 +32,16 @@
 
 namespace palpate {
 
+// Within a kernel on the CPU numbers under 1e-38 are 0: they cost a hundred times as much as others, and
+// what decays far from a tool goes through them.
+struct Flush {
+#if !ON_CUDA && defined(__x86_64__)
+  unsigned kept;
+  Flush() : kept(__builtin_ia32_stmxcsr()) { __builtin_ia32_ldmxcsr(kept | 0x8040); }
+  ~Flush() { __builtin_ia32_ldmxcsr(kept); }
+#endif
+};
+
 #if ON_CUDA
 using V = float;
 using Lane = int;
@@ -310,6 +320,12 @@ struct Thread { int world, tid, nthread; };
 template <class Fields>
 PALPATE const float* numbers(const Fields& f, int world) {
   return f.tissue.number.data + NUMBERS * world;
+}
+
+// How far what worlds have of their own, of `Shape` and `Tissue`, lies behind that of the first mesh.
+template <class Fields>
+PALPATE size_t mesh_of(const Fields& f, int world) {
+  return MESHES && f.shape.mesh.data ? (size_t)f.shape.stride * f.shape.mesh.data[world] : 0;
 }
 
 #if ON_CUDA

@@ -16,7 +16,7 @@ PALPATE float volume_impulse(
   const float bulk = number[BULK], pressure = number[PRESSURE];
   if (!VOLUMES || (bulk == 0.0f && pressure == 0.0f)) return 0.0f;
   const float* areavec = f.system.areavec.data + 24 * (size_t)world * f.shape.nslice;
-  const float* rest = f.shape.rest.data;
+  const float* rest = f.shape.rest.data + mesh_of(f, world);
   V vol = splat(0.0f), rate = splat(0.0f);
   group.each(0, f.shape.nslice, [&](int s, Lane lane) {
     const V3 o = ld3(areavec + 24 * s, lane);

@@ -38,6 +38,28 @@ template <class Fields>
 PALPATE int slot_dof(const Fields& f, int world, int slot) {
   return world * f.nv + f.dofadr + 3 * slot;
 }
+// What a world's mesh has, of an array with a row a mesh.
+template <class Array>
+PALPATE auto of_mesh(const Array& a, int mesh) -> decltype(a.data) {
+  return (decltype(a.data))((char*)a.data + (size_t)mesh * a.strides[0]);
+}
+// What a node was before cuts, its part of that, and where it is at rest.
+template <class Fields>
+PALPATE int source_of(const Fields& f, int world, int i) {
+  return of_mesh(f.source, f.mesh.data[world])[i];
+}
+template <class Fields>
+PALPATE double share_of(const Fields& f, int world, int i) {
+  return of_mesh(f.share, f.mesh.data[world])[i];
+}
+template <class Fields>
+PALPATE D3 at_rest(const Fields& f, int world, int i) {
+  return load(of_mesh(f.rest, f.mesh.data[world]) + 3 * i);
+}
+template <class Fields>
+PALPATE double mass_of(const Fields& f, int world, int i) {
+  return share_of(f, world, i) * f.mass.data[source_of(f, world, i)];
+}
 template <class Fields>
 PALPATE D3 gravity(const Fields& f, int world) {
   return load_floats((const float*)f.gravity.data + (f.ngravity > 1 ? 3 * world : 0));
@@ -62,13 +84,14 @@ PALPATE bool sleeps(const Fields& f, int world) {
 template <class Fields>
 PALPATE double inertia_of(const Fields& f, int world, int i) {
   float grade = f.grade.data[world];
-  if (f.lump.data) grade += log2f(f.lump.data[in_row(f, world, i)]);
+  const int source = source_of(f, world, i);
+  if (f.lump.data) grade += log2f(f.lump.data[in_row(f, world, source)]);
   const float last = (float)(f.ngrade - 1);
   grade = grade < 0.0f ? 0.0f : grade > last ? last : grade;
   const int k = (int)grade < f.ngrade - 1 ? (int)grade : f.ngrade - 2;
-  const double t = grade - k, low = f.inertia.data[k * f.nnode + i];
-  const double more = t * (f.inertia.data[(k + 1) * f.nnode + i] - low);
-  const double total = f.mass_scale.data[world] * (low + more);
+  const double t = grade - k, low = f.inertia.data[k * f.nnode + source];
+  const double more = t * (f.inertia.data[(k + 1) * f.nnode + source] - low);
+  const double total = f.mass_scale.data[world] * share_of(f, world, i) * (low + more);
   const D3 force = load_floats(f.force.data + 3 * in_row(f, world, i));
   return touched(force) && f.heavier.data[world] > 1.0 ? f.heavier.data[world] * total : total;
 }
@@ -111,11 +134,11 @@ PALPATE void enter_worlds(const Fields& f, Thread t, int) {
     const D3 last = load_lane(f.last.data + at), before = load_lane(f.before.data + at);
     const D3 contact = load_floats(f.force.data + 3 * in_row(f, w, i));
     store_lane(f.solve.dvel_warm.data + at, forecast(last, before));
-    store_lane(f.solve.force_ext.data + at, (masses * f.mass.data[i]) * g + contact);
+    store_lane(f.solve.force_ext.data + at, (masses * mass_of(f, w, i)) * g + contact);
     f.node_slot.data[in_row(f, w, i)] = -1;
-    const D3 x = load(f.rest.data + 3 * i) + load_lane(f.solve.disp.data + at);
+    const D3 x = at_rest(f, w, i) + load_lane(f.solve.disp.data + at);
     const double far = nearest(tool, f.ntool, x);
-    if (far > f.touch.data[i]) return;
+    if (far > of_mesh(f.touch, f.mesh.data[w])[i]) return;
     const int q = append(f.count.data + w);
     if (q >= f.most) return;
     f.candidate.data[w * f.most + q] = i;
@@ -164,7 +187,7 @@ PALPATE void stand_on(const Fields& f, int world, int slot, int i) {
   const size_t at = at_node(f, world, i);
   f.slot_node.data[world * f.nslot + slot] = i;
   f.node_slot.data[in_row(f, world, i)] = slot;
-  const D3 x = load(f.rest.data + 3 * i) + load_lane(f.solve.disp.data + at);
+  const D3 x = at_rest(f, world, i) + load_lane(f.solve.disp.data + at);
   const D3 v = load_lane(f.solve.vel.data + at);
   store_floats(f.qpos.data + (size_t)world * f.nq + f.qposadr + 3 * slot,
                load(f.origin.data) + turned(f.frame.data, x));
@@ -172,7 +195,7 @@ PALPATE void stand_on(const Fields& f, int world, int slot, int i) {
   const double more = inertia_of(f, world, i) - f.slot_mass;
   store_floats(f.dof_armature.data + adr, {more, more, more});
   float* inverse = (float*)f.body_invweight0.data + 2 * (world * f.nbody + f.bodyid + slot);
-  inverse[0] = (float)(1.0 / (f.mass_scale.data[world] * f.held.data[i]));
+  inverse[0] = (float)(1.0 / (f.mass_scale.data[world] * of_mesh(f.held, f.mesh.data[world])[i]));
 }
 
 // Gives the slots to the chosen nodes, in their order.
@@ -294,6 +317,9 @@ PALPATE void find_bad(const Fields& f, Thread t, int) {
   if (bad) f.bad.data[t.world] = 1;
 }
 
+// The mass that the solve has of a node: nodes that wait for a cut have none.
+PALPATE float solved(double mass) { return mass > 0.0 ? (float)mass : 1.0f; }
+
 // Puts the organ of the worlds of a mask where it starts.
 template <class Fields>
 PALPATE void rest_organ(const Fields& f, Thread t, int) {
@@ -304,6 +330,7 @@ PALPATE void rest_organ(const Fields& f, Thread t, int) {
     f.calm.data[w] = f.calm0.data[0];
     f.stirred.data[w] = 0;
   }
+  const bool heals = f.mesh.data[w] != 0;
   each_item(t, f.nnode, [&](int i) {
     const size_t at = at_node(f, w, i);
     const int from = offset_of(i);
@@ -313,6 +340,7 @@ PALPATE void rest_organ(const Fields& f, Thread t, int) {
     store_lane(f.before.data + at, load_lane(f.before0.data + from));
     store_lane(f.solve.dvel.data + at, {0.0, 0.0, 0.0});
     store_floats(f.force.data + 3 * in_row(f, w, i), load_floats(f.force0.data + 3 * i));
+    if (heals) f.solve.mass.data[in_row(f, w, i)] = solved(f.mass_scale.data[w] * f.mass.data[i]);
   });
   each_item(t, f.nslot, [&](int k) { wait(f, w, k); });
 }

@@ -136,6 +136,7 @@ def _sizes(values: dict[str, Any]) -> dict[str, int]:
   bends, solid = out["nhingeslice"] > 0, out["ntetslice"] > 0
   return out | {
     "nsolidslice": out["nslice"] if solid else 0,
+    "nmesh": 0,
     "nheld": len(values["held_adr"]),
     "nsolidslot": out["nslot"] if solid else 0,
     "naround": len(values["around_corner"]),

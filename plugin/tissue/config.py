@@ -314,10 +314,11 @@ def change(
     values["young"] = tuple(factor * young for young in compiled.young)
   changed = dataclasses.replace(config, **values)
   for key in ("relax_share", "capsule_young"):
-    now, first = getattr(changed, key), getattr(compiled, key)
-    if bool(now) != bool(first):
+    now, first = (np.ravel(getattr(each, key)) for each in (changed, compiled))
+    if now.any() != first.any():
+      now, first = (" ".join(f"{x:g}" for x in values) or "none" for values in (now, first))
       raise ValueError(
-        f"organ {organ!r}: {key} is {now:g}, compiled as {first:g}: it cannot begin or end while "
+        f"organ {organ!r}: {key} is {now}, compiled as {first}: it cannot begin or end while "
         "running"
       )
   given = values | ({"stiffness": 0} if config.stiffness else {})

@@ -195,7 +195,7 @@ class Knife:
     host["found"][:] = 0
     host["found"][_FOUND.index("nouter")] = mesh.nouter
     self._launch()
-    found = dict(zip(_FOUND, host["found"].tolist(), strict=True))
+    found: dict[Any, int] = dict(zip(_FOUND, host["found"].tolist(), strict=True))
     self._check(organ, found["status"])
     return self._answer(mesh, found)
 
@@ -259,7 +259,7 @@ class Knife:
         f"organ {organ!r}: the path goes to and fro too often, expected shorter cuts"
       )
 
-  def _answer(self, mesh: Mesh, found: dict[str, int]) -> Cut:
+  def _answer(self, mesh: Mesh, found: dict[Any, int]) -> Cut:
     host, parts = self._host, {"before": "changed", "group": "split", "member": "split"}
     lists = {
       name: host[name][: found[parts.get(name, name)]].astype(int)

@@ -127,6 +127,7 @@ class Plan:
     bends: whether there is bending
     springs: whether elements are springs
     volumes: whether there may be volume stiffness or pressure
+    meshes: whether worlds have meshes of their own
   """
 
   own: int
@@ -137,6 +138,7 @@ class Plan:
   bends: bool
   springs: bool
   volumes: bool
+  meshes: bool = False
 
 
 def plan(device, nslice: int, nheld: int, **kinds: bool) -> Plan | None:

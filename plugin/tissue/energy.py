@@ -6,8 +6,6 @@ inside a step.
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 
 from . import config as configuration
@@ -32,20 +30,7 @@ def membrane(mesh: Mesh, config: Config, u: np.ndarray) -> float:
   config = solids.capsule(config)
   if config.elements != "membrane":
     return 0.0
-  return float(of_membrane(config, mesh.rest[mesh.elem], u[mesh.elem]).sum())
-
-
-def of_membrane(
-  config: Config, rest: np.ndarray, u: np.ndarray, which: np.ndarray | None = None
-) -> np.ndarray:
-  """Returns the membrane's energy in triangles [J], (n,).
-
-  Args:
-    config: material
-    rest: their corners at rest [m]             (n, 3, 3)
-    u: displacement of these [m]                (n, 3, 3)
-    which: their numbers, None for all there are (n,)
-  """
+  rest, u = mesh.rest[mesh.elem], u[mesh.elem]
   r1, r2 = rest[:, 1] - rest[:, 0], rest[:, 2] - rest[:, 0]
   p1, p2 = u[:, 1] - u[:, 0], u[:, 2] - u[:, 0]
 
@@ -60,20 +45,9 @@ def of_membrane(
   # Of the strain with one index raised: its trace, and that of its square by its determinant.
   trace = (g22 * e11 - 2 * g12 * e12 + g11 * e22) / det
   square = trace**2 - 2 * (e11 * e22 - e12 * e12) / det
-  area = 0.5 * np.sqrt(det)
-  modulus = config if which is None or len(config.young) == 1 else dataclasses.replace(
-    config, young=tuple(np.asarray(config.young)[which])
-  )
-  lam, mu = configuration.lame(modulus, len(rest))
-  return area * config.thickness * (0.5 * lam * trace**2 + mu * square)
-
-
-def of_triangles(config: Config, rest: np.ndarray, u: np.ndarray, which: np.ndarray) -> np.ndarray:
-  """Returns what triangles have of the energy of the skin [J], (n,); arguments as `of_membrane`."""
-  if config.elements == "membrane":
-    return of_membrane(config, rest, u, which)
-  stretch = [np.linalg.norm(x[:, [1, 2, 0]] - x, axis=2) for x in (rest, rest + u)]
-  return 0.25 * config.stiffness * ((stretch[1] - stretch[0]) ** 2).sum(axis=1)
+  lam, mu = configuration.lame(config, mesh.nelem)
+  volume = 0.5 * np.sqrt(det) * config.thickness
+  return float((volume * (0.5 * lam * trace**2 + mu * square)).sum())
 
 
 def springs(mesh: Mesh, config: Config, u: np.ndarray) -> float:

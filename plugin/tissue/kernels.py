@@ -123,7 +123,7 @@ def kernel(
   native.__name__ = native.__qualname__ = f"{name}_native"
   native.__annotations__["f"] = brought.__annotations__["f"] = struct
   pointed.__annotations__["f"] = wp.array(dtype=struct)
-  call = f"palpate::{name}(f, palpate::Thread{{world, tid, nthread}}, arg);"
+  call = f"palpate::Flush flush; palpate::{name}(f, palpate::Thread{{world, tid, nthread}}, arg);"
   native = wp.func_native(call)(native)
 
   def made(entry, kind: str, bounds) -> wp.Kernel:

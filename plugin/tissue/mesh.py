@@ -193,23 +193,6 @@ def areas_of(mesh: Mesh, vert: np.ndarray, held: bool = False) -> np.ndarray:
   return out
 
 
-def come_loose(mesh: Mesh) -> Mesh:
-  """Returns the mesh with its triangles marked that a cut has freed from the foundation.
-
-  Of what it held together until now, it goes on to hold the largest piece.
-  """
-  whole = mesh.whole
-  loose = np.zeros(mesh.nelem, bool) if mesh.loose is None else mesh.loose.copy()
-  area = np.linalg.norm(area_vectors(mesh.rest, mesh.elem), axis=1)
-  piece, home = pieces(mesh)[mesh.elem[:, 0]], whole.home
-  for part in np.unique(home):
-    held = (home == part) & ~loose
-    size = np.bincount(piece[held], area[held])
-    if (size > 0).sum() > 1:
-      loose |= held & (piece != np.argmax(size))
-  return dataclasses.replace(mesh, loose=loose)
-
-
 def vertex_normals(position: np.ndarray, elem: np.ndarray) -> np.ndarray:
   """Returns area-weighted unit normals, (nvert, 3)."""
   weighted = np.repeat(area_vectors(position, elem), 3, axis=0)

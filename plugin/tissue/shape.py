@@ -155,6 +155,8 @@ def arrays(
     "area": _node_values(topology.held_areas(mesh), vert),
     "closed": int(mesh.closed),
     "volume0": topology.volume(mesh.rest, mesh.elem) if mesh.closed else 0.0,
+    "stride": 0,
+    "mesh": np.zeros(0, np.int32),
     "shortest": 0.0 if mesh.spare else topology.shortest(mesh),
     "number": np.array(list(_numbers(config, mesh.closed).values())),
   }
@@ -247,16 +249,16 @@ def _bending(
   """
   count, nhinge = np.zeros(nslice * LANES, int), len(mesh.whole.interior)
   count[node] = entries
-  if width is None and mesh.spare:
-    width = _bend_room(mesh, node, count)
-  width = count.reshape(-1, LANES).max(axis=1) if width is None else width
+  needed = count.reshape(-1, LANES).max(axis=1)
+  room = _bend_room(mesh, node, count) if mesh.spare else needed
+  wide: np.ndarray = room if width is None else width
   # Padding has a hinge that has no gain; so have those that were cut.
   sizes = {"nslice": nslice, "nelemslice": -(-mesh.nelem // LANES), "nbendslice": nslice}
-  sizes |= {"nhingeslice": -(-(nhinge + 1) // LANES), "nbend": int(width.sum())}
+  sizes |= {"nhingeslice": -(-(nhinge + 1) // LANES), "nbend": int(wide.sum())}
   out = zeros(_PLATES, sizes)
   out["elem_hinge"][-1] = nhinge
   own = np.arange(nslice * LANES, dtype=np.int32).reshape(nslice, LANES)
-  return out | {"bend_adr": addresses(width), "bend_node": np.repeat(own, width, axis=0)}
+  return out | {"bend_adr": addresses(wide), "bend_node": np.repeat(own, wide, axis=0)}
 
 
 def _bend_room(mesh: Mesh, node: np.ndarray, entries: np.ndarray) -> np.ndarray:

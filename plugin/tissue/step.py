@@ -137,6 +137,7 @@ def _world_step(plan: Plan) -> Kernel:
 @functools.cache
 def _world_kernel(plan: Plan) -> Kernel:
   kinds = {"BENDING": plan.bends, "SPRINGS": plan.springs, "VOLUMES": plan.volumes}
+  kinds["MESHES"] = plan.meshes
   constants = _CONSTANTS | {"OWN": plan.own} | {name: int(kind) for name, kind in kinds.items()}
   tag = f".{plan.own}.{plan.threads}.{plan.per_sm}." + "".join(str(int(k)) for k in kinds.values())
   bounds = (plan.threads, plan.per_sm)
@@ -191,12 +192,19 @@ def calibrate(body: Body):
   """Stores the rest angles as the kernels see them, so that a rest shape is at rest to the bit."""
   if not body.has_bending:
     return
-  state, system, angle0 = body.state, body.system, body.shape.hinge_angle0
-  for array in (system.disp_trial, system.vel_trial, angle0, state.step):
-    array.zero_()
-  wp.copy(state.step, wp.array([1.0], dtype=float, device=body.device), count=1)
+  angle0 = body.shape.hinge_angle0
+  angle0.zero_()
+  wp.copy(angle0, rest_angles(body), count=angle0.size)
+
+
+def rest_angles(body: Body) -> wp.array:
+  """Returns how much more than its rest angle each hinge has at rest, in memory of a step's."""
+  state, system = body.state, body.system
+  system.disp_trial.zero_()
+  system.vel_trial.zero_()
+  state.step.fill_(1.0)
   _hinge_angles(body, Stage.EXPLICIT)
-  wp.copy(angle0, system.hinge_angle, count=angle0.size)
+  return system.hinge_angle
 
 
 def solve(body: Body, stage: Stage):

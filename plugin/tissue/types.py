@@ -98,7 +98,7 @@ CONSTANTS: dict[str, int | float] = {
   **{stage.name: stage.value for stage in Stage},
   "NUMBERS": len(NUMBERS),
   # Whether code for these is compiled; which of them there are is found as it runs.
-  **dict.fromkeys(("BENDING", "SPRINGS", "VOLUMES"), 1),
+  **dict.fromkeys(("BENDING", "SPRINGS", "VOLUMES", "MESHES"), 1),
   **{name.upper(): k for k, name in enumerate(NUMBERS)},
 }
 
@@ -125,8 +125,10 @@ class Shape:
   nedgeslice: int  # slices of their edges; 0 but for solids
   nslot: int  # rows of stiffness blocks
   closed: int  # whether the surface encloses a volume
+  stride: int  # words from a mesh to the next, where worlds have their own, see `meshes`
   volume0: float  # rest volume [m^3]; 0 for an open surface
   shortest: float  # no edge is shorter at rest [m]; 0 where cuts may come
+  mesh: ints("nmesh")  # which mesh each world has; none where all have the first
   vert: ints("nnode")  # vertex of each node, -1 for padding
   node: ints("nvert")  # node of each vertex
   slot_adr: ints("nslice + 1")  # first row of stiffness blocks

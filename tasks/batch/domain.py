@@ -44,6 +44,10 @@ class Domain:
     return {}
 
   @staticmethod
+  def attach(worlds: Any) -> None:
+    """Asks the batch, which has just been made, for what the domain needs."""
+
+  @staticmethod
   def act(worlds: Any) -> None:
     """Does what of an action no drive does, before the steps of the physics."""
 

@@ -27,6 +27,7 @@ from palpate.tasks.gym import Exercise
 
 from . import tally
 from .bimanual import Bimanual
+from .cut import Cut
 from .dissect import Dissect
 from .domain import Domain
 from .fields import INFO, OBSERVED, OUTCOMES
@@ -43,6 +44,7 @@ from .worlds import Worlds
 DOMAINS: dict[str, type[Domain]] = {
   "Touch": Touch, "Press": Press, "Palpate": Palpate, "Grasp": Grasp, "Retract": Retract,
   "Trace": Trace, "Dissect": Dissect, "Tease": Tease, "Bimanual": Bimanual,
+  "Cut": Cut,
 }  # fmt: skip
 _ELSE = 'vectorization_mode="sync" runs single environments side by side'
 OUTPUTS = ("numpy", "torch", "warp")

@@ -72,6 +72,7 @@ class Worlds:
     self.batch.start(at_rest(self.batch.model, stage.state, STATE))
     self.episodes = Episodes(task, domain, nworld)
     self.organ = self.batch.organ(task.organ)
+    domain.attach(self)
     dt = environment.control_timestep()
     self.fields, self.other = self._make(task, task.prefix, dt, limit), None
     if task.second:

@@ -2,11 +2,12 @@
 
     python tests/benchmarks/run.py cut
 
-A sheet of 15 by 10 cm (E = 30 kPa, t = 2 mm, h = 2 ms, windows), a membrane or with bending, pinned
-at its long sides, is cut by a blade at 80 mm/s, by scissors that close, by a hook's current at 14
-mm/s, or by `Organ.cut`, two edges at a time; the same sheet is pressed by a ball, with room for
-cuts and without. All three are stepped in turn. CPU time of the process; `open` are the steps in
-which the mesh came apart (with `Organ.cut` the call, and the step after it), `between` the others.
+A sheet of 15 by 10 cm (E = 200 kPa, t = 2 mm, h = 2 ms, windows), a membrane or with bending,
+pinned at its long sides, is cut by a blade at 80 mm/s, by scissors that close, by a hook's current
+at 14 mm/s, or by `Organ.cut`, two edges at a time; the same sheet is pressed by a ball, with room
+for cuts and without. All three are stepped in turn. CPU time of the process; `open` are the steps
+in which the mesh came apart (with `Organ.cut` the call, and the step after it), `between` the
+others.
 """
 
 import argparse
@@ -23,7 +24,7 @@ from benchmarks.runner import Bench, Case, Row
 from palpate.models import trocar
 
 H, LENGTH, WIDTH = 2e-3, 0.15, 0.10
-ENERGY, BURN, THICKNESS = 160.0, 1.1e6, 2e-3  # [J/m^2], of a current, of the wall [m]
+ENERGY, BURN, THICKNESS = 40.0, 1.1e6, 2e-3  # [J/m^2], of a current, of the wall [m]
 SLIDE, CAPSULE = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtGeom.mjGEOM_CAPSULE
 FREE = {"contype": 0, "conaffinity": 0}
 TOOLS = ("blade", "scissors", "hook", "Organ.cut")
@@ -66,14 +67,16 @@ def scene(nodes: int, tool: str, bend: float):
   elif tool == "scissors":
     turn = (np.sqrt(0.5), 0, -np.sqrt(0.5), 0)
     trocar.attach(spec, "scissors", "s/", pos=(LENGTH / 2 - 0.12, 0, 0), quat=turn)
-    keys |= {"cutters": f"s/edge_left s/edge_right {ENERGY}", "contact": FREE}
+    for geom in spec.geoms:
+      geom.contype = geom.conaffinity = 0
+    keys["cutters"] = f"s/edge_left s/edge_right {ENERGY}"
   elif tool != "Organ.cut":
     body = spec.worldbody.add_body(name="ball", pos=[LENGTH / 2, 0, 0.012])
     body.add_joint(type=SLIDE, axis=[0, 0, 1], name="z", damping=4)
     _drive(spec, "z")
     body.add_geom(size=[0.008, 0, 0], mass=0.1)
     keys = {} if tool == "plain" else keys
-  palpate.add_organ(spec, (points, elem), "organ", windows=True, mass=0.05, young=3e4, pin=pin,
+  palpate.add_organ(spec, (points, elem), "organ", windows=True, mass=0.05, young=2e5, pin=pin,
                     thickness=THICKNESS, bend=bend, device="cpu", **keys)  # fmt: skip
   model = spec.compile()
   data = mujoco.MjData(model)
@@ -138,7 +141,7 @@ def measure(nodes: int, tool: str, bend: float) -> dict:
   assert organ.error is None and touched[2].error is None, organ.error
   opened, taken = np.array(opened), np.array(spent["cut"])
   contact = float(np.median(spent["touched"]))
-  cuts = taken[opened]
+  cuts, at = taken[opened], np.flatnonzero(opened[:-1])
   return {
     "nodes": touched[2].nvert,
     "tool": tool,
@@ -151,7 +154,7 @@ def measure(nodes: int, tool: str, bend: float) -> dict:
     "open_ms": float(np.median(cuts)),
     "open_most_ms": float(np.quantile(cuts, 0.95)),
     "mean_ms": float(taken.mean()),
-    "cut_ms": float(np.median(cuts) - np.median(taken[~opened])),
+    "cut_ms": float(np.median(taken[at] - 0.5 * (taken[at - 1] + taken[at + 1]))),
     "ratio": float(np.median(cuts)) / contact,
     "room_ratio": float(np.median(np.array(spent["touched"]) / np.array(spent["plain"]))),
   }
@@ -192,6 +195,7 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
       f"{row['room_ratio']:.3f}",
     ]
     for row in rows
+    if row["status"] == "ok"
   ]
   head = ["nodes", "tool", "tissue", "cuts", "in contact", "tool in it", "mean", "cut alone",
           "step that cuts", "95 % of these", "to one in contact", "room to none"]  # fmt: skip

@@ -75,7 +75,7 @@ def stages(args: argparse.Namespace) -> list[list[Case]]:
   for side in ("implicit", "MuJoCo flex", "solid, nu 0.49") if args.short else SIDES:
     for h in H[1::3] if args.short else H:
       for young in YOUNG[1::3] if args.short else YOUNG:
-        if args.short and side in SOLIDS and (h, young) != (H[4], YOUNG[4]):
+        if args.short and side in SOLIDS and (h, young) != (H[4], YOUNG[1]):
           continue
         what = {"nodes": small} | SOLIDS.get(side, {})
         maps.append(USUAL | _of("map", side, h=h, young=young) | what)

@@ -9,7 +9,7 @@ import sys
 import pytest
 from fuzz import apart
 
-SHORT = {"configurations": 40, "meshes": 40, "files": 12, "cutters": 4}
+SHORT = {"configurations": 40, "meshes": 40, "files": 12, "cutters": 3}
 LONG = dict.fromkeys(SHORT, 10_000) | {"cutters": 1000}
 
 

@@ -89,6 +89,7 @@ def compare_metrics(told, k, expected):
     ("dissect/easy", 1, 15, {}),
     ("tease/easy", 1, 76, {}),
     ("bimanual/easy", 1, 213, {"wanted": 0.03}),
+    ("cut/easy", 1, 75, {}),
   ],
 )
 def test_each_world_is_the_single_environment_of_its_seed(task, count, steps, options):

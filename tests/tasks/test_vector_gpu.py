@@ -60,7 +60,7 @@ class Beside:
     self.first = False
 
 
-TASKS = "grasp/easy", "retract/easy", "dissect/easy", "tease/easy", "bimanual/easy"
+TASKS = "grasp/easy", "retract/easy", "dissect/easy", "tease/easy", "bimanual/easy", "cut/easy"
 
 
 @pytest.mark.parametrize(

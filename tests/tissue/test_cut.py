@@ -217,15 +217,6 @@ def test_uneven_strain_does_not_rise_by_moving_vertices():
   assert found.moved > 10 and risen < 1.002 * before
 
 
-def test_energies_of_triangles_add_up():
-  mesh = sheet(12, spare=SPARE)
-  u = np.random.RandomState(0).normal(0, 1e-3, mesh.rest.shape)
-  every = np.arange(mesh.nelem)
-  for config in (Config(**FLAT), Config(young=tuple(np.linspace(1e3, 2e3, mesh.nelem)))):
-    each = energy.of_triangles(config, mesh.rest[mesh.elem], u[mesh.elem], every)
-    assert each.sum() == pytest.approx(energy.membrane(mesh, config, u))
-
-
 def test_a_cut_stops_where_no_spare_vertices_are_left():
   found = cut(sheet(30, spare=6), PATHS["line"])
   assert found.stopped and found.mesh.nouter <= found.mesh.nvert

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from palpate.models import shapes
 from palpate.tissue import config as configuration
-from palpate.tissue import energy, fill, gmsh
+from palpate.tissue import energy, fill, gmsh, solid
 from palpate.tissue import mesh as topology
 from reference import closed
 from reference.closed import YOUNG
@@ -87,6 +87,16 @@ def test_equal_tension_everywhere_swells_by_the_bulk_modulus(scenes, device):
   before, after = (topology.volume(mesh.rest + part, mesh.elem) for part in (0 * u, u))
   bulk = YOUNG / (3 * (1 - 2 * 0.45))
   assert after / before - 1 == pytest.approx(50.0 / bulk, rel=0.02)
+
+
+def test_a_solid_much_stiffer_in_its_matrix_than_it_is_takes_more_iterations(scenes):
+  points, elem = scenes.sphere(2)
+  made = {"elements": "solid", "poisson": 0.49}
+  found = []
+  for stiff in (1e4, 1e6, 1e7):
+    mesh, config, _ = scenes.kernels(points, elem, young=(stiff,), **made)
+    found.append(solid.iterations(mesh, config, closed.masses(mesh), 7e-6))
+  assert found == [1, 2, 3]
 
 
 @pytest.mark.parametrize("start", ["squeezed", "turned inside out", "random"])

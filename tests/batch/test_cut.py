@@ -1,0 +1,188 @@
+"""Cuts in batches: in each world its own mesh, and blades that cut there."""
+
+import mujoco
+import numpy as np
+import palpate
+import palpate.batch
+import pytest
+from scenes import needs_cuda, sphere, triangular
+
+BACKENDS = [
+  "cpu",
+  pytest.param("warp-cpu", marks=pytest.mark.slow),  # mujoco_warp compiles for minutes
+  pytest.param("cuda:0", marks=needs_cuda),
+]
+SLIDE = mujoco.mjtJoint.mjJNT_SLIDE
+ROUND = np.linspace(0, 2 * np.pi, 60)
+CIRCLE = 0.05 * np.stack([0.4 * np.cos(ROUND), 0.4 * np.sin(ROUND), 0 * ROUND + 0.84**0.5], axis=1)
+LINE = 0.05 * np.stack([np.sin(ROUND / 4 - 0.7), 0 * ROUND, np.cos(ROUND / 4 - 0.7)], axis=1)
+ENERGY, THICKNESS = 160.0, 2e-3  # [J/m^2], [m]
+
+
+@pytest.fixture(params=BACKENDS)
+def device(request):
+  return request.param
+
+
+def slide(body, spec, name, axis, gain):
+  body.add_joint(type=SLIDE, axis=axis, name=name, damping=4)
+  spec.add_actuator(
+    name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT, gainprm=[gain] + 9 * [0],
+    biastype=mujoco.mjtBias.mjBIAS_AFFINE, biasprm=[0, -gain, 0] + 7 * [0],
+  )  # fmt: skip
+
+
+def pressed(windows, **keys):
+  """Returns a ball over an uneven sphere, with room for cuts."""
+  spec = mujoco.MjSpec()
+  spec.option.timestep, spec.option.integrator = 2e-3, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+  points, elem = sphere(2)
+  points = points + 0.002 * np.random.RandomState(1).randn(*points.shape)
+  points *= 0.05 / np.linalg.norm(points, axis=1)[:, None]
+  body = spec.worldbody.add_body(pos=[0, 0, 0.062])
+  slide(body, spec, "z", [0, 0, 1], 400)
+  body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.01, 0, 0], mass=0.05, condim=1)
+  given = {"mass": 0.3, "foundation": 4e4, "spare": 90, "young": 2e4, "thickness": THICKNESS}
+  given |= {"damping": 0.01, "device": "cpu", "tolerance": 1e-6, "windows": windows}
+  palpate.add_organ(spec, (points, elem), "organ", **given | keys)
+  return spec
+
+
+def strip():
+  """Returns a blade before a strip that its long sides hold."""
+  spec = mujoco.MjSpec()
+  spec.option.timestep, spec.option.gravity = 2e-3, (0, 0, 0)
+  body = spec.worldbody.add_body(pos=[-0.004, 0, 0])
+  slide(body, spec, "x", [1, 0, 0], 2000)
+  free = {"contype": 0, "conaffinity": 0}
+  body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.004, 0, 0], pos=[0, 0, 0.02], mass=0.1,
+                **free)  # fmt: skip
+  body.add_geom(name="edge", type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=[5e-4, 0.006, 0], mass=1e-3,
+                **free)  # fmt: skip
+  points, elem = triangular(0.03, 0.026, 11, 11, 0.2)
+  pin = np.flatnonzero(np.abs(np.abs(points[:, 1]) - 0.013) < 1e-9)
+  palpate.add_organ(
+    spec, (points, elem), "organ", windows=True, mass=0.005, young=2e5, thickness=THICKNESS,
+    spare=60, pin=pin, cutters=f"edge {ENERGY}", device="cpu",
+  )  # fmt: skip
+  return spec
+
+
+def test_each_world_is_cut_for_itself_and_reset_makes_it_whole(device):
+  batch = palpate.batch.make(pressed(True), 3, device=device)
+  organ = batch.organ("organ")
+  reports = organ.cut([LINE, LINE, CIRCLE], np.array([True, False, True]))
+  assert [report is not None for report in reports] == [True, False, True]
+  assert reports[0].length == pytest.approx(0.07, rel=0.3) and not reports[2].stopped
+  assert [len(pieces) for pieces in organ.pieces] == organ.piece_count.numpy().tolist() == [1, 1, 2]
+  masses = [sum(piece.mass for piece in pieces) for pieces in organ.pieces]
+  np.testing.assert_allclose(masses, 0.3, rtol=1e-6)
+  there = np.isfinite(organ.xpos.numpy()).all(axis=2).sum(axis=1)
+  assert organ.nvert == len(sphere(2)[0]) + 90
+  assert (there == len(sphere(2)[0]) + np.array([reports[0].nodes, 0, reports[2].nodes])).all()
+  assert np.array_equal(organ.elem_of(1), organ.elem)
+  assert organ.elem_of(0).max() == there[0] - 1
+  batch.step(5)
+  organ.cut(CIRCLE, np.array([True, False, False]))
+  assert [len(cuts) for cuts in organ.cuts] == [2, 0, 1]
+  batch.reset(np.array([False, False, True]))
+  batch.step(5)
+  assert organ.piece_count.numpy().tolist() == [2 + (len(organ.pieces[0]) > 2), 1, 1]
+  assert [len(cuts) for cuts in organ.cuts] == [2, 0, 0]
+  xpos = organ.xpos.numpy()
+  there = np.isfinite(xpos[1]).all(axis=1)
+  np.testing.assert_allclose(xpos[2][there], batch_alone(device).numpy()[0][there], atol=1e-7)
+  assert not batch.failures.numpy().any()
+
+
+def batch_alone(device):
+  """Returns positions of a world that was stepped as often and never cut."""
+  batch = palpate.batch.make(pressed(True), 1, device=device)
+  batch.step(5)
+  return batch.organ("organ").xpos
+
+
+@pytest.mark.parametrize(
+  ("windows", "keys"), [(True, {"bend": 0.0}), (False, {"bend": 1.0, "bulk": 1e4})],
+  ids=["membrane", "nodal shell"],
+)  # fmt: skip
+def test_a_cut_world_goes_on_as_the_plugin_does(device, windows, keys):
+  batch = palpate.batch.make(pressed(windows, **keys), 2, device=device, nodes=40)
+  model, data = batch.model, mujoco.MjData(batch.model)
+  alone, organ = palpate.Organ(model, data, "organ"), batch.organ("organ")
+  alone.cut(LINE)
+  batch.set_state(0, data)
+  force = []
+  for _ in range(40):
+    data.ctrl[:] = -0.013
+    batch.ctrl = np.full((2, 1), -0.013)
+    mujoco.mj_step(model, data)
+    batch.step()
+    total = organ.contact_force.numpy().sum(axis=1)
+    force.append((alone.contact_force.sum(axis=0)[2], *total[:, 2]))
+  force = np.array(force)
+  peak = np.abs(force[:, 0]).max()
+  assert peak > 0.1 and np.abs(force[:, 0] - force[:, 2]).max() > 0.1 * peak  # that is whole
+  assert np.sqrt(np.mean((force[:, 0] - force[:, 1]) ** 2)) < 1e-3 * peak
+  batch.get_state(0, data)
+  mujoco.mj_forward(model, data)
+  xpos = organ.xpos.numpy()[0]
+  assert alone.nvert == np.isfinite(xpos).all(axis=1).sum() > np.isfinite(xpos).shape[0] - 90
+  np.testing.assert_allclose(alone.xpos, xpos[: alone.nvert], atol=1e-7)
+  assert device == "cpu" or not batch.overflow.numpy().any()
+
+
+def test_blades_cut_in_each_world(device):
+  batch = palpate.batch.make(strip(), 3, device=device)
+  model, data = batch.model, mujoco.MjData(batch.model)
+  alone, organ = palpate.Organ(model, data, "organ"), batch.organ("organ")
+  speed, found = np.array([0.1, 0.1, 0.03]), []
+  for _ in range(160):
+    data.ctrl[:] = 0.1 * data.time
+    batch.ctrl = (speed * data.time)[:, None]
+    mujoco.mj_step(model, data)
+    batch.step()
+    found.append((alone.cutters[0].force[0], *organ.cutters.force.numpy()[:, 0, 0]))
+  found = np.array(found)
+  assert found[60:, 0].mean() == pytest.approx(ENERGY * THICKNESS, rel=0.02)
+  np.testing.assert_allclose(found[:, 1], found[:, 0], atol=1e-3 * ENERGY * THICKNESS)
+  assert np.array_equal(found[:, 1], found[:, 2])
+  cutters = organ.cutters
+  assert cutters.length.numpy()[0, 0] == pytest.approx(alone.cutters[0].length, rel=1e-3)
+  assert cutters.energy.numpy()[0, 0] == pytest.approx(alone.cutters[0].energy, rel=1e-3)
+  assert cutters.length.numpy()[0, 0] > 3 * cutters.length.numpy()[2, 0] > 0
+  assert cutters.inside.numpy().tolist() == [[1], [1], [1]]
+  np.testing.assert_allclose(cutters.seat.numpy()[0, 0], alone.cutters[0].seat, atol=1e-5)
+  cuts = organ.cuts
+  assert len(cuts[0]) == len(alone.cuts) > len(cuts[2])
+  batch.reset(np.array([False, True, False]))
+  assert organ.cutters.length.numpy()[:, 0].astype(bool).tolist() == [True, False, True]
+  assert [bool(each) for each in organ.cuts] == [True, False, bool(cuts[2])]
+
+
+def test_what_cannot_be_cut_is_named():
+  batch = palpate.batch.make(pressed(True), 2)
+  organ = batch.organ("organ")
+  with pytest.raises(ValueError, match=r"world 1: organ 'organ': point 0 of the path is 0\.\d+ m"):
+    organ.cut([CIRCLE, CIRCLE + 0.1])
+  assert not any(organ.cuts)
+  with pytest.raises(ValueError, match=r"world 0 have shape \(60, 2\), expected \(n, 3\)"):
+    organ.cut(CIRCLE[:, :2])
+  with pytest.raises(ValueError, match=r"points are of 3 worlds, expected .* one a world, 2"):
+    organ.cut([CIRCLE] * 3)
+  whole = palpate.batch.make(pressed(True, spare=0), 2).organ("organ")
+  with pytest.raises(ValueError, match="spare is 0, expected room for cuts"):
+    whole.cut(CIRCLE)
+  assert whole.piece_count.numpy().tolist() == [1, 1]
+
+
+@pytest.mark.parametrize(
+  ("keys", "match"),
+  [
+    ({"tear": 0.4}, "tear is set, which a batch on a GPU cannot do"),
+    ({"bonds": "none"}, "spare and bonds are set, of which a batch on a GPU can do one"),
+  ],
+)
+def test_what_a_gpu_cannot_do_is_named(keys, match):
+  with pytest.raises(ValueError, match=match):
+    palpate.batch.make(pressed(True, **keys), 2, device="warp-cpu")
