@@ -12,6 +12,7 @@
 // has of words. Otherwise everything here has the same name and meaning for both devices.
 #pragma once
 #include "block.h"
+#include "packed.h"
 
 namespace palpate {
 
@@ -46,7 +47,11 @@ class OwnVector {
 
 #if ON_CUDA
 
-template <Meeting FOR = MEMORY>
+// Which of the SPLIT threads of a node this is.
+template <int SPLIT>
+PALPATE int part_of() { return SPLIT > 1 ? threadIdx.x / LANES % SPLIT : 0; }
+
+template <Meeting FOR = MEMORY, int SPLIT = 1>
 class Group {
  public:
   static constexpr bool SUMS_COST = true;
@@ -69,7 +74,8 @@ class Group {
   template <class Body>
   PALPATE void each(int from, int to, Body body) const {
     const Lane lane = lane_of(tid);
-    for (int s = from + (tid >> 3); s < to; s += nthread >> 3) body(s, lane);
+    for (int s = from + tid / (LANES * SPLIT); s < to; s += nthread / (LANES * SPLIT))
+      body(s, lane);
   }
 
   PALPATE float sum(V u) {
@@ -120,7 +126,7 @@ class Group {
     float* set = words + 4 * MAX_BLOCKS * flip;
     flip ^= 1;
     ++turn;
-    for (int c = 0; c < N; ++c) v[c] = warp_sum(v[c]);
+    for (int c = 0; c < N; ++c) v[c] = warp_sum(part_of<SPLIT>() == 0 ? v[c] : 0.0f);
     if (at == 0) for (int c = 0; c < N; ++c) mine[c][warp] = v[c];
     __syncthreads();
     int nsum = nwarp, from = 0;
@@ -167,13 +173,13 @@ class Group {
 };
 
 // The slices of a thread: OWN of its block's, or with 0 any of all.
-template <int OWN>
+template <int OWN, int SPLIT = 1>
 class Slices {
  public:
   using Vector = OwnVector<OWN>;
 
   template <Meeting FOR>
-  PALPATE Slices(const Group<FOR>& group, int nslice)
+  PALPATE Slices(const Group<FOR, SPLIT>& group, int nslice)
     : nslice(nslice), first(group.first_slice(nslice)), tid(group.tid), nthread(group.nthread) {
     const int end = first + group.share(nslice);
     last = end < nslice ? end : nslice;
@@ -185,9 +191,9 @@ class Slices {
     constexpr int SIZE = Own<OWN>::SIZE;
     const Lane lane = lane_of(tid);
 #pragma unroll SIZE
-    for (int k = 0, s = OWN ? first + (threadIdx.x >> 3) : tid >> 3; OWN ? k < OWN : s < nslice;
-         ++k, s += (OWN ? blockDim.x : nthread) >> 3)
-      if (!OWN || s < last) body(s, lane, k);
+    for (int k = 0, s = OWN ? first + threadIdx.x / (LANES * SPLIT) : tid / (LANES * SPLIT);
+         OWN ? k < OWN : s < nslice; ++k, s += (OWN ? blockDim.x : nthread) / (LANES * SPLIT))
+      if (OWN ? s < last : part_of<SPLIT>() == 0) body(s, lane, k);
   }
 
   // Where a node of slice `s` is in its block's memory; below 0 it is of another block.
@@ -203,9 +209,9 @@ class Slices {
 };
 
 // Runs work(Own<N>()) for one, four or any number of nodes a thread, whichever suits.
-template <Meeting FOR, class Work>
-PALPATE void choose_own(const Group<FOR>& group, int nslice, Work work) {
-  const int own = (LANES * group.share(nslice) + blockDim.x - 1) / blockDim.x;
+template <Meeting FOR, int SPLIT, class Work>
+PALPATE void choose_own(const Group<FOR, SPLIT>& group, int nslice, Work work) {
+  const int own = (LANES * SPLIT * group.share(nslice) + blockDim.x - 1) / blockDim.x;
   if (own == 1) return work(Own<1>());
   if (own <= 4) return work(Own<4>());
   work(Own<0>());
@@ -213,20 +219,23 @@ PALPATE void choose_own(const Group<FOR>& group, int nslice, Work work) {
 
 // A vector of which each thread reads what others wrote in the present turn, without a meeting: a
 // block's from its own memory, those of others word by word, for which it waits.
-template <int OWN>
+template <int OWN, int SPLIT = 1>
 class Quads {
  public:
+  static constexpr int PARTS = OWN ? SPLIT : 1;  // threads that share the neighbours of a node
+
   template <class Fields>
-  PALPATE Quads(const Fields& f, int world, const Slices<OWN>& slices)
+  PALPATE Quads(const Fields& f, int world, const Slices<OWN, SPLIT>& slices)
     : slices(slices), quad(f.system.quad.data + 96 * (size_t)world * f.shape.nslice),
       word(f.system.zn.data + 16 * (size_t)world * f.shape.nslice), turn(0) {}
 
   // What is shown after `next` is of a new turn, and read after `shown`.
   template <Meeting FOR>
-  PALPATE void next(Group<FOR>& group) { turn = ++group.turn; }
+  PALPATE void next(Group<FOR, SPLIT>& group) { turn = ++group.turn; }
   PALPATE void shown() { __syncthreads(); }
 
   PALPATE void show(int s, V3 a, Lane lane) {
+    if (part_of<PARTS>() > 0) return;
     Word(a, turn).put(quad + 4 * (24 * s + lane));
     if (OWN) {
       const int at = LANES * (s - slices.first) + lane;
@@ -234,6 +243,7 @@ class Quads {
     }
   }
   PALPATE void show_normal(int s, V a, Lane lane) {
+    if (part_of<PARTS>() > 0) return;
     HalfWord(a, turn).put(word + 2 * (LANES * s + lane));
     if (OWN) block_nodes()[3][LANES * (s - slices.first) + lane] = a;
   }
@@ -248,44 +258,59 @@ class Quads {
     return found.value();
   }
 
-  // Runs body(value) for the neighbours, one after the other.
-  template <class Body>
-  PALPATE void each_near(const int* node, int width, Lane lane, Body body) const {
+  // Runs body(weight(k), value) for this thread's neighbours, one after the other.
+  template <class Weight, class Body>
+  PALPATE void each_near(const int* node, int width, Lane lane, Weight weight, Body body) const {
     const auto place = [&](int at) { return slices.place(at / 24, at % 24); };
-    each<3, Word>(quad, node, width, lane, place, body);
+    each<3, Word>(quad, node, width, lane, place, weight, body);
   }
   // The same for normal components and nodes numbered one by one.
-  template <class Body>
-  PALPATE void each_bent(const int* node, int width, Lane lane, Body body) const {
+  template <class Weight, class Body>
+  PALPATE void each_bent(const int* node, int width, Lane lane, Weight weight, Body body) const {
     const auto place = [&](int at) { return slices.place(at >> 3, at & 7); };
-    each<6, HalfWord>(word, node, width, lane, place, body);
+    each<6, HalfWord>(word, node, width, lane, place, weight, body);
   }
+  // Sum of what the threads of a node have of one.
+  PALPATE static V joined(V a) {
+    constexpr unsigned ALL = LANES * PARTS;  // threads of a slice
+    const unsigned mask = 0xffffffffu >> (32 - ALL) << (threadIdx.x % 32 / ALL * ALL);
+    for (int o = LANES; o < ALL; o *= 2) a += __shfl_xor_sync(mask, a, o);
+    return a;
+  }
+  PALPATE static V3 joined(V3 a) { return {joined(a.x), joined(a.y), joined(a.z)}; }
 
  private:
-  const Slices<OWN>& slices;
+  const Slices<OWN, SPLIT>& slices;
   float* const quad;
   float* const word;
   unsigned turn;
 
-  // The words of AHEAD neighbours are under way at once, hence no branches before they are used.
-  template <int AHEAD, class Any, class Place, class Body>
+  // The words of AHEAD neighbours are under way at once, hence no branches before they are used, and
+  // weights are read while they are.
+  template <int AHEAD, class Any, class Place, class Weight, class Body>
   PALPATE void each(
-    const float* words, const int* node, int width, Lane lane, Place place, Body body
+    const float* words, const int* node, int width, Lane lane, Place place, Weight weight, Body body
   ) const {
-    for (int i = 0; i < width; i += AHEAD, node += AHEAD * LANES) {
+    using Weighs = decltype(weight(0));
+    for (int i = part_of<PARTS>(); i < width; i += AHEAD * PARTS) {
       Any found[AHEAD];
+      Weighs weighs[AHEAD];
       int at[AHEAD];
-      for (int b = 0; b < AHEAD; ++b) at[b] = i + b < width ? node[LANES * b + lane] : -1;
+      for (int b = 0; b < AHEAD; ++b) {
+        const int k = i + b * PARTS;
+        at[b] = k < width ? node[LANES * k + lane] : -1;
+      }
       for (int b = 0; b < AHEAD; ++b) {
         const bool has = at[b] >= 0;
         const int here = has ? place(at[b]) : -1;
         found[b] = Any::near(here < 0 ? 0 : here, turn);
         found[b].get(words + Any::SIZE * at[b], has && here < 0);
       }
+      for (int b = 0; b < AHEAD; ++b) weighs[b] = weight(at[b] < 0 ? i : i + b * PARTS);
       for (int b = 0; b < AHEAD; ++b) {
         if (at[b] < 0) continue;
         while (found[b].turn() != turn) found[b].get(words + Any::SIZE * at[b]);
-        body(found[b].value());
+        body(weighs[b], found[b].value());
       }
     }
   }
@@ -297,7 +322,7 @@ PALPATE float sum_of(V a) {
   return ((a[0] + a[4]) + (a[1] + a[5])) + ((a[2] + a[6]) + (a[3] + a[7]));
 }
 
-template <Meeting FOR = MEMORY>
+template <Meeting FOR = MEMORY, int = 1>
 class Group {
  public:
   static constexpr bool SUMS_COST = false;
@@ -315,13 +340,13 @@ class Group {
   PALPATE float most(V v) { return __builtin_reduce_max(v); }
 };
 
-template <int OWN>
+template <int OWN, int SPLIT = 1>
 class Slices {
  public:
   using Vector = OwnVector<OWN>;
 
   template <Meeting FOR>
-  PALPATE Slices(const Group<FOR>&, int nslice) : nslice(nslice) {}
+  PALPATE Slices(const Group<FOR, SPLIT>&, int nslice) : nslice(nslice) {}
   template <class Body>
   PALPATE void each(Body body) const {
     for (int s = 0; s < nslice; ++s) INLINED body(s, Lane(), 0);
@@ -330,42 +355,39 @@ class Slices {
   const int nslice;
 };
 
-template <Meeting FOR, class Work>
-PALPATE void choose_own(const Group<FOR>&, int, Work work) {
+template <Meeting FOR, int SPLIT, class Work>
+PALPATE void choose_own(const Group<FOR, SPLIT>&, int, Work work) {
   INLINED work(Own<0>());
 }
 
-// The vector in slices and a copy in quads.
-template <int OWN>
+// A vector in quads.
+template <int OWN, int SPLIT = 1>
 class Quads {
  public:
   template <class Fields>
-  PALPATE Quads(const Fields& f, int world, const Slices<OWN>&)
-    : z(f.system.z.data + 24 * (size_t)world * f.shape.nslice),
-      zn(f.system.zn.data + 8 * (size_t)world * f.shape.nslice),
+  PALPATE Quads(const Fields& f, int world, const Slices<OWN, SPLIT>&)
+    : zn(f.system.zn.data + 8 * (size_t)world * f.shape.nslice),
       quad(f.system.quad.data + 96 * (size_t)world * f.shape.nslice) {}
   template <Meeting FOR>
-  PALPATE void next(Group<FOR>&) {}
+  PALPATE void next(Group<FOR, SPLIT>&) {}
   PALPATE void shown() {}
-  PALPATE void show(int s, V3 a, Lane lane) {
-    st3(z + 24 * s, a, lane);
-    put_quads(quad + 96 * s, a);
-  }
+  PALPATE void show(int s, V3 a, Lane) { put_quads(quad + 96 * s, a); }
   PALPATE void show_normal(int s, V a, Lane lane) { st(zn, s, a, lane); }
-  PALPATE V3 own(int s, Lane lane) const { return ld3(z + 24 * s, lane); }
-  template <class Body>
-  PALPATE void each_near(const int* node, int width, Lane, Body body) const {
+  PALPATE V3 own(int s, Lane) const { return ld_quads(quad + 96 * s); }
+  template <class Weight, class Body>
+  PALPATE void each_near(const int* node, int width, Lane, Weight weight, Body body) const {
     for (int i = 0; i < width; ++i, node += LANES)
-      INLINED body(gather_quads(quad, node));
+      INLINED body(weight(i), gather_quads(quad, node));
   }
-  template <class Body>
-  PALPATE void each_bent(const int* node, int width, Lane lane, Body body) const {
+  template <class Weight, class Body>
+  PALPATE void each_bent(const int* node, int width, Lane lane, Weight weight, Body body) const {
     for (int i = 0; i < width; ++i, node += LANES)
-      INLINED body(gather(zn, node, 0, lane));
+      INLINED body(weight(i), gather(zn, node, 0, lane));
   }
+  template <class Any>
+  PALPATE static Any joined(Any a) { return a; }
 
  private:
-  float* const z;
   float* const zn;
   float* const quad;
 };

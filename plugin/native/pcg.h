@@ -231,20 +231,24 @@ struct Jacobi {
   }
 };
 
-// Solves A sol = rhs, with A as `assemble` wrote it; writes `sol` and `status`.
-template <class Fields>
-PALPATE void solve(const Fields& f, Thread t, int stage) {
-  Group<SUMS> group(t, f.system.partial.data);
+// Solves A sol = rhs, A as `assemble` wrote it; writes `sol` and `status`. On CUDA a node has SPLIT
+// threads.
+template <int SPLIT, class Fields, class Any>
+PALPATE void solve(const Fields& f, Thread t, int stage, const Any& a) {
+  using Team = Group<SUMS, SPLIT>;
+  Team group(t, f.system.partial.data);
   choose_own(group, f.shape.nslice, [&](auto own) {
-    using Mine = Slices<decltype(own)::COUNT>;
-    using Vector = Quads<decltype(own)::COUNT>;
+    using Mine = Slices<decltype(own)::COUNT, SPLIT>;
+    using Vector = Quads<decltype(own)::COUNT, SPLIT>;
     const Mine slices(group, f.shape.nslice);
     Vector z(f, t.world, slices);
-    const Matrix a = matrix(f, t.world);
-    Jacobi<Group<SUMS>::SUMS_COST> jacobi;
-    Pcg<Fields, Group<SUMS>, Mine, Vector, Matrix>{f, t.world, stage, group, slices, z, a}.solve(
-      jacobi);
+    Jacobi<Team::SUMS_COST> jacobi;
+    Pcg<Fields, Team, Mine, Vector, Any>{f, t.world, stage, group, slices, z, a}.solve(jacobi);
   });
+}
+template <class Fields>
+PALPATE void solve(const Fields& f, Thread t, int stage) {
+  solve<1>(f, t, stage, matrix(f, t.world));
 }
 
 }  // namespace palpate

@@ -5,15 +5,20 @@
 namespace palpate {
 
 // How fast the edges of a slice's nodes change: the largest (rate of an edge's ends over its
-// length)^2.
+// length)^2, 0 where none of the nodes is so fast that an edge could change by more than AHEAD in a
+// step h, the node at its other end being slower.
 template <class Fields>
-PALPATE V fastest(const Fields& f, int world, const float* vel, int s, Lane lane) {
+PALPATE V fastest(
+  const Fields& f, int world, const float* vel, float h, int s, Lane lane
+) {
+  const V3 v = ld3(vel + 24 * s, lane);
+  const float slow = AHEAD * f.shape.shortest / (2.0f * h);
+  V most = splat(0.0f);
+  if (!any_above(dot(v, v), slow * slow)) return most;
   const int first = f.shape.slot_adr.data[s], width = f.shape.slot_adr.data[s + 1] - first;
   const size_t mesh = mesh_of(f, world);
   const int* node = f.shape.fan_node.data + mesh + 8 * (first + 2 * s + 1);
   const float* rest = f.shape.fan_rest.data + mesh + 24 * (first + 2 * s + 1);
-  const V3 v = ld3(vel + 24 * s, lane);
-  V most = splat(0.0f);
   for (int k = 0; k < width; ++k, node += 8, rest += 24) {
     const V3 d = gather3(vel, node, lane) - v, r = ld3(rest, lane);
     most = vmax(most, dot(d, d) / vmax(dot(r, r), splat(1e-30f)));
@@ -21,26 +26,12 @@ PALPATE V fastest(const Fields& f, int world, const float* vel, int s, Lane lane
   return most;
 }
 
-// Whether the nodes are so slow that no edge changes by more than AHEAD in a step, whichever way
-// they move: seen without neighbours, and nearly always so. Not where threads share the nodes.
-template <class Fields>
-PALPATE bool slow(const Fields& f, const float* vel, float h) {
-  if (BLOCKS) return false;
-  V most = splat(0.0f);
-  for (int s = 0; s < f.shape.nslice; ++s) {
-    const V3 v = ld3(vel + 24 * s, Lane());
-    most = vmax(most, dot(v, v));
-  }
-  const float speed = AHEAD * f.shape.shortest / (2.0f * h);
-  return !any_above(most, speed * speed);
-}
-
 template <class Fields>
 PALPATE void edge_change(const Fields& f, Thread t, int) {
   const float* vel = f.state.vel.data + 24 * (size_t)t.world * f.shape.nslice;
-  if (slow(f, vel, f.state.step.data[4 * t.world])) return;
+  const float h = f.state.step.data[4 * t.world];
   each_slice(t, f.shape.nslice, [&](int s, Lane lane) {
-    put_most(f.system.change.data + t.world, fastest(f, t.world, vel, s, lane));
+    put_most(f.system.change.data + t.world, fastest(f, t.world, vel, h, s, lane));
   });
 }
 

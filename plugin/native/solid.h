@@ -10,6 +10,7 @@
 // small strains and a solid at rest is at rest to the bit.
 #pragma once
 #include "elastic.h"
+#include "product.h"
 
 namespace palpate {
 
@@ -130,14 +131,9 @@ PALPATE void node_stress(const Fields& f, Thread t, int stage) {
 
 // Mean stress and pressure of a tetrahedron's corners.
 PALPATE M3 mean_stress(const float* stress, const int* node, V& pressure, Lane lane) {
-  V w, p = splat(0.0f);
-  V3 x = {p, p, p}, y = x, z = x;
-  for (int k = 0; k < 4; ++k) {
-    x += gather_shared(stress, node + 8 * k, w, lane);
-    y += gather_shared(stress + 32, node + 8 * k, lane);
-    z += gather_shared(stress + 64, node + 8 * k, lane);
-    p += w;
-  }
+  V p, none;
+  const V3 x = gather_four(stress, node, p, lane), y = gather_four(stress + 32, node, none, lane);
+  const V3 z = gather_four(stress + 64, node, none, lane);
   pressure = 0.25f * p;
   return splat(0.25f) * M3{x.x, x.y, x.z, y.x, y.y, y.z, z.x, z.y, z.z};
 }
@@ -202,11 +198,17 @@ PALPATE void tet_stress(const Fields& f, Thread t, int stage) {
   });
 }
 
-// The blocks of each edge, one for either end, from the tetrahedra around it.
+// The blocks of each edge, one for either end, from the tetrahedra around it. What rounding to 16 bits
+// may take from the matrix is added as an isotropic stiffness along the edges where it is more than
+// CARRIED of the nodes' masses, so that the matrix stays positive definite.
+constexpr float ROUNDING = 1.0f / 2048.0f, CARRIED = 0.02f, MOST_HALF = 6e4f;
+
 template <class Fields>
 PALPATE void edge_block(const Fields& f, Thread t, int) {
   const float* arm = f.system.tet_arm.data + 128 * (size_t)t.world * f.shape.ntetslice;
-  float* out = f.system.block.data + 72 * (size_t)t.world * f.shape.nslot;
+  Half* out = f.system.half.data + 72 * (size_t)t.world * f.shape.nslot;
+  const float* mass = f.state.mass.data + 8 * (size_t)t.world * f.shape.nslice;
+  const float whole = unit(f, t.world), per_unit = whole > 0.0f ? 1.0f / whole : 0.0f;
   each_slice(t, f.shape.nedgeslice, [&](int s, Lane lane) {
     const V zero = splat(0.0f);
     M3 block = {zero, zero, zero, zero, zero, zero, zero, zero, zero};
@@ -216,6 +218,12 @@ PALPATE void edge_block(const Fields& f, Thread t, int) {
       const V3 c = gather_shared(arm, f.shape.edge_to.data + 8 * k, lane);
       block = block + outer(first_of(beside) * a, c) + outer(c, a) + second_of(beside) * dot(a, c);
     }
+    block = splat(per_unit) * block;
+    const V size = vsqrt(inner(block, block)) + 1e-7f;
+    const int* end = f.shape.edge_node.data + 16 * s;
+    const V light = vmin(gather(mass, end, 0, lane), gather(mass, end + 8, 0, lane));
+    const V taken = vmax(ROUNDING * size - (CARRIED * per_unit) * light, zero);
+    block = vmin(splat(1.0f), MOST_HALF / size) * block + splat(-1.0f) * taken;
     const int* at = f.shape.edge_slot.data + 16 * s;
     put9(out, at, block, lane);
     put9(out, at + 8, transposed(block), lane);
@@ -253,11 +261,11 @@ PALPATE void solid_row(const Fields& f, Thread t, int stage) {
     st3(f.system.rhs.data + 24 * at, b, lane);
     if (!implicit) return;
     S3 self = {zero, zero, zero, zero, zero, zero};
-    const float* block = f.system.block.data + 72 * (size_t)t.world * f.shape.nslot;
+    const Half* block = f.system.half.data + 72 * (size_t)t.world * f.shape.nslot;
     for (int j = f.shape.slot_adr.data[s]; j < f.shape.slot_adr.data[s + 1]; ++j)
       self = self + symmetric(ld9(block + 72 * (size_t)j, lane));
     put_diagonal(f.system.diag.data + 8 * at, f.system.inverse.data + 48 * at,
-                 ld(f.shape.free.data, s, lane), diag, splat(-1.0f) * self + diag + held, lane);
+                 ld(f.shape.free.data, s, lane), diag, splat(-unit(f, t.world)) * self + diag + held, lane);
   });
 }
 

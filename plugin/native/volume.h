@@ -8,9 +8,9 @@ namespace palpate {
 // K v with weight gv,
 //   push = h (pressure - bulk (V - V0) / V0) / 6,  pull = gv bulk / V0 (areavec . vel) / 36.
 // `disp` and `vel` are the world's displacement and velocity; the volume goes to `total`.
-template <class Fields, Meeting FOR>
+template <class Fields, class Team>
 PALPATE float volume_impulse(
-  const Fields& f, int world, Group<FOR>& group, const float* disp, const float* vel, float gv
+  const Fields& f, int world, Team& group, const float* disp, const float* vel, float gv
 ) {
   const float* number = numbers(f, world);
   const float bulk = number[BULK], pressure = number[PRESSURE];

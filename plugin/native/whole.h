@@ -80,7 +80,9 @@ PALPATE void stand_ahead(const Fields& f, int world, Team& group, const Mine& sl
   });
   meet_block();
   V fast = splat(0.0f);
-  slices.each([&](int s, Lane lane, int) { fast = vmax(fast, fastest(f, world, at.vel, s, lane)); });
+  slices.each([&](int s, Lane lane, int) {
+    fast = vmax(fast, fastest(f, world, at.vel, h, s, lane));
+  });
   const float share = share_ahead(h, group.most(fast)), *number = numbers(f, world);
   const bool told = (BENDING && f.shape.nhingeslice > 0)
     || (VOLUMES && (number[BULK] != 0.0f || number[PRESSURE] != 0.0f));

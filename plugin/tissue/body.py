@@ -136,6 +136,7 @@ def _sizes(values: dict[str, Any]) -> dict[str, int]:
   bends, solid = out["nhingeslice"] > 0, out["ntetslice"] > 0
   return out | {
     "nsolidslice": out["nslice"] if solid else 0,
+    "nskinslot": 0 if solid else out["nslot"],
     "nmesh": 0,
     "nheld": len(values["held_adr"]),
     "nsolidslot": out["nslot"] if solid else 0,
@@ -203,7 +204,8 @@ def worlds(body: Body, nworld: int = 1, plan: Plan | None = None) -> Body:
   fields = Fields()
   fields.shape = body.shape
   for name in Tissue.vars:
-    setattr(fields.tissue, name, wp.clone(getattr(body.tissue, name)))
+    value = getattr(body.tissue, name)
+    setattr(fields.tissue, name, wp.clone(value) if isinstance(value, wp.array) else value)
   number = np.repeat(body.tissue.number.numpy()[:1], max(nworld, 1), axis=0)
   fields.tissue.number = wp.array(number, device=body.device)
   out = dataclasses.replace(body, fields=fields, levels=None, plan=plan)
@@ -242,7 +244,8 @@ def nbytes(body: Body) -> int:
   """Returns how many bytes of memory the worlds of a body take, without what they share."""
   kinds = ((State, body.state), (System, body.system))
   names = [(each, name) for kind, each in kinds for name in DIMS[kind.key]]
-  total = sum(getattr(each, name).size * 4 for each, name in names if name not in spare(body))
+  arrays = [getattr(each, name) for each, name in names if name not in spare(body)]
+  total = sum(array.size * wp.types.type_size_in_bytes(array.dtype) for array in arrays)
   return total + (nbytes(body.levels.body) if body.levels is not None else 0)
 
 

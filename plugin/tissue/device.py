@@ -23,6 +23,7 @@ from .order import LANES
 _CUDA_FROM = 2000
 BLOCK = 512  # threads of a block, at most
 MAX_BLOCKS = 512  # of one world
+SPLIT = 4  # threads of a node of a solid, which share its neighbours, where there is one world
 WORDS = 2 * MAX_BLOCKS + 1  # of 128 bits that a world's threads exchange
 _MOST = 1024  # threads of a block that has a world to itself
 _FEW = 128  # nodes of which a thread has one
@@ -107,11 +108,18 @@ def group_size(device, nslice: int, nworld: int, per_sm: int = 1) -> int:
   return size * max(1, min(most, -(-nslice * LANES // size)))
 
 
-def patch(device, nslice: int) -> int:
-  """Returns the nodes that a block has of one world of `nslice` slices, 0 on the CPU."""
+def patch(device, nslice: int, split: int = 1) -> int:
+  """Returns the nodes that a block has of one world of `nslice` slices, 0 on the CPU.
+
+  Args:
+    device: where they are
+    nslice: slices of nodes
+    split: threads of a node
+  """
   if not device.is_cuda:
     return 0
-  return LANES * -(-nslice // (group_size(device, nslice, 1) // block(device, nslice)))
+  nblock = group_size(device, split * nslice, 1) // block(device, split * nslice)
+  return LANES * -(-nslice // nblock)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -30,12 +30,14 @@ _COARSER = 1.7  # distance of nodes inside to that on the surface
 _FINE = 1.2  # the same where triangles are of different sizes: small ones are where forces count
 _GRADED = 1.3  # times their mean edge that those are on most of the surface
 _CLEAR = 0.8  # least distance of a node inside to the surface's, in mean edges
-_WIDENS = 0.15  # by which the distance between nodes grows with that from the surface
+_EVEN = 1.0  # edges beneath the surface to which the distance between nodes stays,
+_WIDENS = 0.3  # and by which it grows with depth from there on,
+_WIDEST = 3.0  # at most to so many edges of the surface
 _ROUNDS = 8
 _MOVE = 0.7  # share of the way that a node goes in a round
 FLAT = 1e-3  # quality of a tetrahedron that is none
 _KEPT = 16
-_VERSION = 1  # of what is kept in files: another one where tetrahedra are made otherwise
+_VERSION = 2  # of what is kept in files: another one where tetrahedra are made otherwise
 _TIE = 1e-6  # of the size, by which points on one sphere are told apart
 
 # Faces of a tetrahedron, each opposite the corner of its number.
@@ -207,7 +209,8 @@ def _lattice(surface: np.ndarray, triangle: np.ndarray) -> np.ndarray:
   low, high = surface.min(axis=0), surface.max(axis=0)
   coarser = _FINE if widest > _GRADED * edge else _COARSER
   tree, side = KDTree(surface), coarser * edge * 2 / np.sqrt(3)  # neighbours: half a diagonal
-  levels = range(*np.rint(np.log2([local.min() / edge, 2.83 * widest / edge])).astype(int))
+  ends = np.array([local.min(), 2.83 * _WIDEST * widest]) / edge
+  levels = range(*np.rint(np.log2(ends)).astype(int))
   while True:
     parts = []
     for level in levels:
@@ -217,8 +220,9 @@ def _lattice(surface: np.ndarray, triangle: np.ndarray) -> np.ndarray:
       point = np.concatenate([corner.reshape(-1, 3), corner.reshape(-1, 3) + scale * side / 2])
       distance, nearest = tree.query(point)
       beneath = ((point - surface[nearest]) * normal[nearest]).sum(axis=1) < 0
-      wanted = np.minimum(local[nearest] + _WIDENS * distance, widest) / edge
-      here = np.clip(np.rint(np.log2(wanted)), levels[0], levels[-1]) == level
+      near = local[nearest]
+      wanted = np.minimum(near + _WIDENS * np.maximum(distance - _EVEN * near, 0), _WIDEST * widest)
+      here = np.clip(np.rint(np.log2(wanted / edge)), levels[0], levels[-1]) == level
       parts.append(point[beneath & here & (distance > _CLEAR * scale * edge)])
     point = np.concatenate(parts)
     if len(point) <= MOST * len(surface):

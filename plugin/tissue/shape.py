@@ -43,7 +43,7 @@ def make(
     nworld: number of worlds, 0 for what they share
   """
   target = devices.resolve(device, mesh.nvert)
-  finest = arrays(mesh, config, pinned, devices.patch(target, -(-mesh.nvert // LANES)))
+  finest = arrays(mesh, config, pinned, _patch(mesh, target))
   below = None
   surface = len(mesh.tet) == 0
   if surface and (np.isinf(scale) or coarsening.pay(finest, scale, coarsening.threshold(target))):
@@ -52,6 +52,10 @@ def make(
   with wp.ScopedDevice(target):
     step.calibrate(bodies.worlds(body))
   return bodies.worlds(body, nworld) if nworld else body
+
+
+def _patch(mesh: Mesh, device: wp.Device) -> int:
+  return devices.patch(device, -(-mesh.nvert // LANES), devices.SPLIT if len(mesh.tet) else 1)
 
 
 def change(body: Body, mesh: Mesh, config: Config, pinned: np.ndarray):
@@ -64,7 +68,7 @@ def change(body: Body, mesh: Mesh, config: Config, pinned: np.ndarray):
     pinned: vertices that do not move, (nvert,) bool
   """
   width = np.diff(body.shape.bend_adr.numpy())
-  finest = arrays(mesh, config, pinned, devices.patch(body.device, body.shape.nslice), width)
+  finest = arrays(mesh, config, pinned, _patch(mesh, body.device), width)
   bodies.retissue(body, finest)
   below = _below(mesh, config, pinned, finest, body.device) if body.levels else None
   if body.levels and below:

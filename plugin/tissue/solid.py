@@ -102,6 +102,7 @@ def arrays(mesh: Mesh, config: Config, vert: np.ndarray, node: np.ndarray) -> di
   return {
     "tet_node": to_slices(pad(offset(at), least=1)).astype(np.int32),
     "tet_gradient": to_slices(pad(gradient, least=1)).astype(np.float32),
+    "stiffness": _stiffness(mesh, values),
     "tet_moduli": to_slices(values).astype(np.float32),
     "around_adr": addresses(width),
     "around_corner": _corner(entry // 4, entry % 4),
@@ -109,6 +110,13 @@ def arrays(mesh: Mesh, config: Config, vert: np.ndarray, node: np.ndarray) -> di
     "node_moduli": to_slices(nodal).astype(np.float32),
     **_edges(mesh, vert, node),
   }
+
+
+def _stiffness(mesh: Mesh, values: np.ndarray) -> np.ndarray:
+  """Returns that of a corner of the stiffest tetrahedron at rest [N/m], (1,)."""
+  volume, mu, lam = values[: len(mesh.tet)].T
+  size2 = (gradients(mesh) ** 2).sum(axis=2).max(axis=1)
+  return np.array([(volume * (mu + lam) * size2).max()], np.float32)
 
 
 def _slopes(mesh: Mesh, vert: np.ndarray, node: np.ndarray) -> np.ndarray:
@@ -165,6 +173,7 @@ def _edges(mesh: Mesh, vert: np.ndarray, node: np.ndarray) -> dict[str, np.ndarr
     "edge_adr": addresses(width),
     "edge_from": _corner(tet, first[pair]),
     "edge_to": _corner(tet, last[pair]),
+    "edge_node": to_slices(pad(node[edge[order]])).astype(np.int32),
     "edge_slot": to_slices(pad(np.stack(slots, axis=1), -1)).astype(np.int32),
   }
 
@@ -184,4 +193,5 @@ def none(nslice: int) -> dict[str, np.ndarray]:
   return {
     "around_adr": np.zeros(nslice + 1, np.int32),
     "edge_adr": np.zeros(1, np.int32),
+    "stiffness": np.zeros(1, np.float32),
   } | empty(sizes)

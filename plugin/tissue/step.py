@@ -30,7 +30,7 @@ from typing import Any
 import warp as wp
 
 from .body import Body
-from .device import BLOCK, Plan, block, group_size, reserve, threads
+from .device import BLOCK, SPLIT, Plan, block, group_size, reserve, threads
 from .kernels import Kernel, kernel
 from .types import CONSTANTS, Cycle, Fields, Stage
 
@@ -94,6 +94,8 @@ _newton_update = _scheme("newton_update")
 _centre_step = _scheme("centre", BLOCK)
 _direct_step = _scheme("direct", BLOCK)
 _solve = kernel("solve", "pcg.h", Fields, _CONSTANTS, (BLOCK, 1))
+_solve_solid = kernel("solve_solid", "solid_solve.h", Fields, _CONSTANTS, (BLOCK, 1))
+_solve_solids = kernel("solve_solids", "solid_solve.h", Fields, _CONSTANTS, (BLOCK, 1))
 _sample = kernel("sample", "multigrid.h", Cycle, _CONSTANTS)
 _solve_cycles = kernel("solve_cycles", "multigrid.h", Cycle, _CONSTANTS, (BLOCK, _CYCLES_PER_SM))
 
@@ -104,7 +106,9 @@ def _over(kernel: Kernel, body: Body, nslice: int, arg: int = 0, fields: Any = N
   kernel.launch(body.device, body.nworld, size, arg, body.fields if fields is None else fields)
 
 
-def _together(kernel: Kernel, body: Body, arg: int, fields: Any = None, per_sm: int = 1):
+def _together(
+  kernel: Kernel, body: Body, arg: int, fields: Any = None, per_sm: int = 1, split: int = 1
+):
   """Launches a kernel in which the threads of a world work together; see native/group.h.
 
   Args:
@@ -113,8 +117,9 @@ def _together(kernel: Kernel, body: Body, arg: int, fields: Any = None, per_sm: 
     arg: its number
     fields: what it takes, the body's where None
     per_sm: blocks on one multiprocessor that the kernel's bounds allow
+    split: threads of a node
   """
-  nslice = body.shape.nslice
+  nslice = split * body.shape.nslice
   size = group_size(body.device, nslice, body.nworld, per_sm)
   fields = body.fields if fields is None else fields
   kernel.launch(body.device, body.nworld, size, arg, fields, block(body.device, nslice))
@@ -124,7 +129,7 @@ def kernels(body: Body) -> list[Kernel]:
   """Returns a kernel of each module that a body's step needs."""
   if body.plan:
     return [_world_step(body.plan)]
-  found = [_solid_row if body.is_solid else _row, _predict, _solve]
+  found = [_predict, *([_solid_row, _solve_solid] if body.is_solid else [_row, _solve])]
   found += [_hinge_moment, _capsule_row] if body.shape.ncapsule else []
   return found if body.levels is None else [*found, _sample]
 
@@ -214,7 +219,11 @@ def solve(body: Body, stage: Stage):
     body: the body, with A as `assemble` wrote it
     stage: FIRST, LATER or RESPONSE
   """
-  if body.levels is None:
+  if body.is_solid and body.nworld == 1:
+    _together(_solve_solid, body, stage, split=SPLIT)
+  elif body.is_solid:
+    _together(_solve_solids, body, stage)
+  elif body.levels is None:
     _together(_solve, body, stage)
   else:
     _together(_solve_cycles, body, stage, body.levels.cycle, _CYCLES_PER_SM)

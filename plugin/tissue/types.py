@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from .device import BLOCK, MAX_BLOCKS, WORDS
+from .device import BLOCK, MAX_BLOCKS, SPLIT, WORDS
 from .order import LANES
 
 
@@ -35,6 +35,11 @@ def floats(*dims) -> Array:
 def doubles(*dims) -> Array:
   """Returns the type of an array of float64."""
   return Array(wp.float64, dims)
+
+
+def halves(*dims) -> Array:
+  """Returns the type of an array of 16 bits; native code reads them as numbers of eleven digits."""
+  return Array(wp.uint16, dims)
 
 
 def ints(*dims) -> Array:
@@ -95,6 +100,7 @@ CONSTANTS: dict[str, int | float] = {
   "BLOCK": BLOCK,
   "MAX_BLOCKS": MAX_BLOCKS,
   "WORDS": WORDS,
+  "SPLIT": SPLIT,
   **{stage.name: stage.value for stage in Stage},
   "NUMBERS": len(NUMBERS),
   # Whether code for these is compiled; which of them there are is found as it runs.
@@ -159,6 +165,7 @@ class Shape:
   edge_adr: ints("nedgeslice + 1")  # first row of each slice of edges in the two below
   edge_from: ints("nedge", 8)  # of each tetrahedron around an edge, its corner at the first end
   edge_to: ints("nedge", 8)  # its corner at the other
+  edge_node: ints("nedgeslice", 2, 8)  # its ends
   edge_slot: ints("nedgeslice", 2, 8)  # where the blocks of both ends start; -1 for padding
   ncapsule: int  # rows of blocks of the skin of a solid, 0 without one; its fans are as those above
   capsule_adr: ints("ncapsuleslice + 1")  # first row of these
@@ -179,6 +186,7 @@ class Tissue:
   hinge_gain: floats("nhingeslice", 5, 8)  # stiffness to itself and to `hinge_near` [N m]
   bend_gain: floats("nbend", 8)  # bending matrix [N/m]
   bend_diag: floats("nbendslice", 8)  # its diagonal [N/m]
+  stiffness: floats(1)  # of the stiffest tetrahedron at rest, the unit of solids' blocks [N/m]
   tet_moduli: floats("ntetslice", 3, 8)  # volume [m^3]; mu, lambda [Pa]
   node_moduli: floats("nsolidslice", 2, 8)  # mu, lambda of its mean gradient [Pa]
   capsule_metric: floats("ncapsule + ncapsuleslice", 5, 8)  # see `fan_metric`
@@ -205,7 +213,8 @@ class System:
   change: floats("nworld")  # largest (rate of an edge's ends over its length)^2 [1/s^2]
   disp_trial: vector  # displacement of the present Newton iteration [m]
   vel_trial: vector  # velocity of the present Newton iteration [m/s]
-  block: floats("nworld", "nslot", 9, 8)  # off-diagonal blocks of A [kg]
+  block: floats("nworld", "nskinslot", 9, 8)  # off-diagonal blocks of A [kg]
+  half: halves("nworld", "nsolidslot", 9, 8)  # of solids, in `stiffness` times h^2 + h damping
   diag: scalar  # inertia and foundation on the diagonal [kg]
   inverse: floats("nworld", "nslice", 6, 8)  # inverse of the diagonal blocks [1/kg]
   rhs: vector  # right-hand side [N s]

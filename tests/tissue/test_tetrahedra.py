@@ -154,6 +154,14 @@ def test_tetrahedra_fill_an_organ_and_end_at_its_triangles(name):
   np.testing.assert_array_equal(again.tet, solid.tet)
 
 
+def test_tetrahedra_are_larger_deep_inside(scenes):
+  points, elem = scenes.sphere(3)
+  solid = fill.fill("ball", topology.build("ball", points, elem))
+  size = np.cbrt(fill.volumes(solid.rest, solid.tet))
+  depth = 0.05 - np.linalg.norm(solid.rest[solid.tet].mean(axis=1), axis=1)
+  assert size[depth > 0.025].mean() > 1.5 * size[depth < 0.005].mean()
+
+
 def test_tetrahedra_are_kept_and_made_again_where_a_file_is_damaged(monkeypatch, tmp_path):
   monkeypatch.setattr(fill.wp.config, "kernel_cache_dir", str(tmp_path))
   points, elem = shapes.kidney(150)
