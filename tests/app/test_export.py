@@ -254,7 +254,7 @@ def test_the_page_clones_an_expert(tmp_path):
   made = policy.load("clone.safetensors")
   env = options.environment("touch/standard", json.dumps({"observations": ["sensors", "state"]}))
   made.check(env)
-  assert made(env.reset().observation).shape == (4,)
+  assert made.begin()(env.reset().observation).shape == (4,)
 
 
 # What goes wrong.
