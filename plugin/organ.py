@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import mujoco
 import numpy as np
 import numpy.typing as npt
@@ -193,7 +195,8 @@ class Organ:
     """
     inward = {"depth": depth, "direction": direction}
     given = {k: np.asarray(v, dtype=float) for k, v in inward.items() if v is not None}
-    report = self._space.cuts.cut(np.asarray(points, dtype=float), **given)
+    cuts: Any = self._space.cuts
+    report = cuts.cut(np.asarray(points, dtype=float), **given)
     workspace.place(self._space, self.model._address)
     return report
 

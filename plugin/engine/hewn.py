@@ -89,6 +89,7 @@ class SolidCuts(Cuts):
     own, mesh, n = self._own, self.mesh, self.whole.nelem
     self._sit(found)
     face = faces.opened(mesh)
+    assert mesh.loose is not None
     own["corner"][:n] = flexes.pack(mesh.elem[:n], mesh.loose[:n])
     own["corner"][n:] = 0.0
     own["corner"][n : n + len(face)] = face + 1
@@ -147,6 +148,7 @@ def _freed(mesh: Mesh) -> Mesh:
   whole = mesh.whole
   if mesh.uncut is None:
     return mesh
+  assert mesh.loose is not None
   n, loose = whole.nelem, mesh.loose.copy()
   area = topology.lengths(topology.area_vectors(mesh.rest, mesh.elem[:n]))
   piece = topology.pieces(mesh)[mesh.elem[:n, 0]]

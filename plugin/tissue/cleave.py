@@ -146,7 +146,9 @@ def _fitting(mesh: Mesh, where: Where, face: np.ndarray, room: int | None):
 
 def _nothing(mesh: Mesh, motion: Motion) -> Cut:
   none = np.zeros(0, int)
-  return Cut(mesh, motion, 0, *4 * [none], np.zeros(0), none, [], 0.0, 0.0, 0.0, 0.0, True)
+  whole = (none, none, none, none, np.zeros(0), none)
+  return Cut(mesh, motion, 0, *whole, path=[], length=0.0, area=0.0, depth=0.0, deviation=0.0,
+             stopped=True)  # fmt: skip
 
 
 def _carried(mesh: Mesh, made: faces.Split, moves: settle.Moves, motion: Motion, pinned):
@@ -251,7 +253,7 @@ def _parted(mesh: Mesh, where: Where, near, left, right, edge: float) -> np.ndar
   side = among(size, reached)
   face = face[side[a] != side[b]]
   # A slit comes apart as a whole, or not.
-  half = np.isin(mesh.slit, face).reshape(-1, 2, 2).any(axis=2)
+  half = np.asarray(np.isin(mesh.slit, face).reshape(-1, 2, 2).any(axis=2))
   return face[~np.isin(face, mesh.slit[half[:, 0] != half[:, 1]])]
 
 
@@ -261,9 +263,12 @@ def _told(mesh: Mesh, made: faces.Split, goes: tuple, sheet: Sheet, stopped: boo
   wall = new.elem[mesh.nelem :: 2]
   area = float(lengths(area_vectors(new.rest, wall)).sum())
   path, length, deviation, depth = _mouth(mesh, made, sheet)
+  motion, moved, near = goes
   return Cut(
     new,
-    *goes,
+    motion,
+    moved,
+    near,
     made.changed,
     made.group,
     made.member,

@@ -37,6 +37,7 @@ def skin(mesh: Mesh) -> Mesh:
   """Returns a mesh without the walls of cuts in a solid."""
   if not len(mesh.tet) or mesh.uncut is None:
     return mesh
+  assert mesh.loose is not None
   n = mesh.whole.nelem
   return dataclasses.replace(mesh, elem=mesh.elem[:n], loose=mesh.loose[:n])
 
@@ -178,10 +179,11 @@ def slopes(mesh: Mesh, row: np.ndarray, node: np.ndarray, which: np.ndarray | No
   weighed = volumes(mesh.rest, tet)[:, None, None] / 4 * gradients(part)
   value = weighed[:, pairs[:, 1]].reshape(-1, 3)
   if which is not None:
-    start, end, value = (x[mine[start]] for x in (start, end, value))
+    keep = mine[start]
+    start, end, value = start[keep], end[keep], value[keep]
   key, number = np.unique(start * mesh.nvert + end, return_inverse=True)
   sums = [np.bincount(number, column, len(key)) for column in value.T]
-  start = key // mesh.nvert
+  start = np.asarray(key // mesh.nvert, int)
   total = vertex_volumes(part)[start]  # all that is around these is there
   entry = np.arange(len(key)) - np.searchsorted(start, start)
   return row[node[start] // LANES] + entry, node[start] % LANES, np.stack(sums, 1) / total[:, None]
