@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import mujoco
 import numpy as np
 import numpy.typing as npt
@@ -193,10 +191,8 @@ class Organ:
       ValueError: the organ has no `spare`; points are off the surface; the path is too short, or
         goes through pinned vertices; the depth is not above 0, or the organ is no solid.
     """
-    inward = {"depth": depth, "direction": direction}
-    given = {k: np.asarray(v, dtype=float) for k, v in inward.items() if v is not None}
-    cuts: Any = self._space.cuts
-    report = cuts.cut(np.asarray(points, dtype=float), **given)
+    inward = (None if v is None else np.asarray(v, dtype=float) for v in (depth, direction))
+    report = self._space.cuts.cut(np.asarray(points, dtype=float), 0.0, *inward)
     workspace.place(self._space, self.model._address)
     return report
 

@@ -240,6 +240,12 @@ def hold(body: Body) -> wp.array:
   return body.state.hold
 
 
+def arrays(body: Body) -> dict[str, Any]:
+  """Returns the arrays of a body's shape and material by name."""
+  kinds = ((body.shape, Shape), (body.tissue, Tissue))
+  return {name: getattr(struct, name) for struct, kind in kinds for name in DIMS[kind.key]}
+
+
 def nbytes(body: Body) -> int:
   """Returns how many bytes of memory the worlds of a body take, without what they share."""
   kinds = ((State, body.state), (System, body.system))

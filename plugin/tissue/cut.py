@@ -18,6 +18,7 @@ from . import config as configuration
 from .config import Config
 from .kernels import kernel
 from .mesh import Mesh, lengths
+from .path import check_points
 from .surface import Surface, WorkingCopy, host_views
 from .types import CONSTANTS, allocate, doubles, flags, ints, longs, struct
 
@@ -184,7 +185,7 @@ class Knife:
       ValueError: points are off the surface; the path goes through pinned vertices, or is too
         short.
     """
-    _check_points(organ, points)
+    check_points(organ, points)
     self._make_room(points)
     self._copy.put(mesh)
     self._put_material(config if config and config.elements in _KINDS else None, held, given)
@@ -279,16 +280,6 @@ class Knife:
       stopped=bool(found["stopped"]),
       **lists,
     )
-
-
-def _check_points(organ: str, points: np.ndarray):
-  if points.ndim != 2 or points.shape[1] != 3 or len(points) < 2:
-    raise ValueError(
-      f"organ {organ!r}: points of a cut have shape {points.shape}, expected (n, 3), n >= 2"
-    )
-  if not np.isfinite(points).all():
-    bad = int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])
-    raise ValueError(f"organ {organ!r}: point {bad} is {points[bad]}, expected finite numbers")
 
 
 def _lines(rest: np.ndarray, pairs: list[list[int]]) -> list[np.ndarray]:

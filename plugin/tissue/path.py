@@ -146,3 +146,14 @@ def distance(line: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarr
   far = lengths(points[:, None] - at)
   best, row = np.argmin(far, axis=1), np.arange(len(points))
   return far[row, best], at[row, best]
+
+
+def check_points(organ: str, points: np.ndarray):
+  """Raises ValueError where points of a cut are no path of two finite places or more."""
+  if points.ndim != 2 or points.shape[1] != 3 or len(points) < 2:
+    raise ValueError(
+      f"organ {organ!r}: points of a cut have shape {points.shape}, expected (n, 3), n >= 2"
+    )
+  if not np.isfinite(points).all():
+    bad = int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])
+    raise ValueError(f"organ {organ!r}: point {bad} is {points[bad]}, expected finite numbers")

@@ -10,12 +10,11 @@ import numpy as np
 import warp as wp
 
 from . import shape, step
-from .body import Body
+from .body import Body, arrays
 from .config import Config
 from .mesh import Mesh
 from .rows import NAMES, Rows
 from .surface import WorkingCopy
-from .types import DIMS, Shape, Tissue
 
 
 class Refill:
@@ -29,10 +28,7 @@ class Refill:
   def __init__(self, body: Body, copy: WorkingCopy):
     self._body = body
     self.mesh = copy.whole
-    kinds = ((body.shape, Shape), (body.tissue, Tissue))
-    self._arrays = {
-      name: getattr(struct, name) for struct, kind in kinds for name in DIMS[kind.key]
-    }
+    self._arrays = arrays(body)
     self._rows = Rows(copy, self._here(), body.shape.node.numpy())
 
   def _here(self) -> dict[str, wp.array]:

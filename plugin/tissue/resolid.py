@@ -12,12 +12,11 @@ import numpy as np
 
 from . import mesh as topology
 from . import solid
-from .body import Body
+from .body import Body, arrays
 from .config import Config
 from .fill import volumes
 from .mesh import Mesh, among, distinct
 from .order import LANES, addresses, offset
-from .types import DIMS, Shape, Tissue
 
 
 class SolidRefill:
@@ -30,10 +29,7 @@ class SolidRefill:
 
   def __init__(self, body: Body, mesh: Mesh):
     self._body, self.mesh = body, mesh
-    kinds = ((body.shape, Shape), (body.tissue, Tissue))
-    self._arrays = {
-      name: getattr(struct, name) for struct, kind in kinds for name in DIMS[kind.key]
-    }
+    self._arrays = arrays(body)
     self._host: dict[str, np.ndarray] = {}
     node = self._node = body.shape.node.numpy()
     self._start = body.shape.slot_adr.numpy()

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 
 from .mesh import Mesh, area_vectors, cross, lengths
-from .path import nearest
+from .path import check_points, nearest
 
 _STEP = 0.25  # between samples of the path, and between lines, in edges
 _OFF = 2.0  # edges from the skin from which a point is off it
@@ -172,13 +172,7 @@ def sweep(
 
 
 def _check(organ: str, points: np.ndarray, depth) -> np.ndarray:
-  if points.ndim != 2 or points.shape[1] != 3 or len(points) < 2:
-    raise ValueError(
-      f"organ {organ!r}: points of a cut have shape {points.shape}, expected (n, 3), n >= 2"
-    )
-  if not np.isfinite(points).all():
-    bad = int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])
-    raise ValueError(f"organ {organ!r}: point {bad} is {points[bad]}, expected finite numbers")
+  check_points(organ, points)
   depth = np.inf if depth is None else np.asarray(depth, float)
   if np.ndim(depth) and np.shape(depth) != (len(points),):
     raise ValueError(
