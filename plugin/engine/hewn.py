@@ -13,6 +13,7 @@ import numpy as np
 from palpate.tissue import cleave, energy, faces
 from palpate.tissue import mesh as topology
 from palpate.tissue.cut import Motion
+from palpate.tissue.ease import ease
 from palpate.tissue.mesh import Mesh
 from palpate.tissue.path import Finder
 from palpate.tissue.resolid import SolidRefill
@@ -129,7 +130,11 @@ class SolidCuts(Cuts):
       given,
       len(self._own["corner"]),
     )
-    return dataclasses.replace(found, mesh=_freed(found.mesh))
+    if not found.changed.size:
+      return found
+    new, how = _freed(found.mesh), (motion, found.motion, ~organ.free, w.config)
+    goes, near = ease(mesh, new, found.changed, found.group, found.member, *how)
+    return dataclasses.replace(found, mesh=new, motion=goes, near=near)
 
   def _report(self, found: cleave.Cut) -> cuts.Report:
     organ = self._w.organ

@@ -156,9 +156,8 @@ def _carried(mesh: Mesh, made: faces.Split, moves: settle.Moves, motion: Motion,
   near = distinct(mesh.tet[made.changed])
   near = near[~pinned[near]]
   disp, vel, mass = motion.disp.copy(), motion.vel.copy(), motion.mass.copy()
-  disp[moves.vert] = np.einsum("nk,nkj->nj", moves.weight, motion.disp[moves.corner])
-  was, goes = mesh.rest[near] + motion.disp[near], moves.rest[near] + disp[near]
-  vel[near] = settle.keep_spin(mass[near], was, goes, motion.vel[near])
+  for value, was in ((disp, motion.disp), (vel, motion.vel)):
+    value[moves.vert] = np.einsum("nk,nkj->nj", moves.weight, was[moves.corner])
   group, member = made.group, made.member
   disp[member], vel[member] = disp[group], vel[group]
   mass[group] = 0.0
