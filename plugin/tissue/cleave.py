@@ -250,10 +250,7 @@ def _parted(mesh: Mesh, where: Where, near, left, right, edge: float) -> np.ndar
   rest.eliminate_zeros()
   reached = csgraph.breadth_first_order(rest, count, return_predecessors=False)
   side = among(size, reached)
-  face = face[side[a] != side[b]]
-  # A slit comes apart as a whole, or not.
-  half = np.asarray(np.isin(mesh.slit, face).reshape(-1, 2, 2).any(axis=2))
-  return face[~np.isin(face, mesh.slit[half[:, 0] != half[:, 1]])]
+  return face[side[a] != side[b]]
 
 
 def _told(mesh: Mesh, made: faces.Split, goes: tuple, sheet: Sheet, stopped: bool) -> Cut:
