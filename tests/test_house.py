@@ -202,7 +202,7 @@ def flexcomp_writers() -> set[str]:
 
 def flexcomp_in_tests() -> set[str]:
   """Returns the tests that write an organ's flexcomp; `scenes` is the one builder."""
-  allowed = ("tests/scenes.py", "tests/reference/press_explicit_20us.py")
+  allowed = ("tests/scenes/documents.py", "tests/reference/press_explicit_20us.py")
   return {
     name_of(path)
     for path in suite_files()
