@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from .kernels import kernel
+from .kernels import aim, kernel
 from .mesh import Mesh
 from .order import LANES, addresses, pad
 from .rows import typed
@@ -250,10 +250,9 @@ class Tets:
     if moduli is not None:
       self._set(mu=moduli[0][self._order], lam=moduli[1][self._order])
     loose = np.zeros(mesh.nelem, bool) if mesh.loose is None else mesh.loose
-    self._set(
-      nelem=mesh.nelem, nchanged=n, every=int(every), mesh_rest=mesh.rest, ring=mesh.ring,
-      mesh_degree=mesh.degree, elem=mesh.elem, loose=loose,
-    )  # fmt: skip
+    self._set(nelem=mesh.nelem, nchanged=n, every=int(every))
+    aim(self._fields, mesh_rest=mesh.rest, ring=mesh.ring, mesh_degree=mesh.degree,
+        elem=mesh.elem, loose=loose)  # fmt: skip
     self._launch()
     if not self._found[0]:
       self._tet[which] = self._before[:n]
