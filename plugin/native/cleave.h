@@ -9,7 +9,6 @@
 #include "flow.h"
 #include "open.h"
 #include "settle.h"
-#include "spin.h"
 
 namespace palpate {
 
@@ -135,23 +134,6 @@ PALPATE bool part_sides(const S& m, const Measured& at, const Sheet& sheet, doub
   return true;
 }
 
-// A slit, two faces beside two, comes apart as a whole, or not.
-template <class I>
-PALPATE void leave_slits(const I* slit, int nslit, Opening& o) {
-  for (int i = 0; i < o.count; ++i) o.cut[o.face[i]] = 1;
-  for (int i = 0; i < nslit; ++i, slit += 4) {
-    const bool one = o.cut[slit[0]] || o.cut[slit[1]], other = o.cut[slit[2]] || o.cut[slit[3]];
-    for (int k = 0; k < 4 && one != other; ++k) o.cut[slit[k]] = 0;
-  }
-  int left = 0;
-  for (int i = 0; i < o.count; ++i) {
-    const int face = o.face[i];
-    if (o.cut[face]) o.face[left++] = face;
-    o.cut[face] = 0;
-  }
-  o.count = left;
-}
-
 // Puts faces in their order along the path.
 template <class S>
 PALPATE bool order_faces(const S& m, const Measured& at, Opening& o, Scratch& memory) {
@@ -201,18 +183,22 @@ PALPATE int share_masses(const S& m, const Opening& o, const Moving& x, const F&
   return count;
 }
 
-// Lets what moved go on as it moved, and lists the tetrahedra that are not as they were.
+// Vertices that have moved get what is carried where they are now; lists the tetrahedra that are not as they
+// were, and their vertices.
 template <class S, class F>
 PALPATE bool carry(const S& m, const Opening& o, const Few& movers, const Shift* shift, const double* rest,
                    const Moving& x, const F& f, Scratch& memory) {
   Few vert = few(memory, m.nvert), tets = few(memory, m.ntet);
-  D3* lead = (D3*)memory.values(3 * movers.count);
+  D3* now = (D3*)memory.values(6 * movers.count);
   if (memory.full) return false;
-  const Parts& p = o.parts;
-  each_apart(p, [&](int corner) { tets.put(corner / 4); });
+  each_apart(o.parts, [&](int corner) { tets.put(corner / 4); });
   for (int i = 0; i < movers.count; ++i) {
     const int v = movers.list[i];
-    lead[i] = shift[i].share * shift[i].lead;
+    const double* of[2] = {x.disp, x.vel};
+    for (int k = 0; k < 2; ++k) {
+      const D3 was = load(of[k] + 3 * v);
+      now[2 * i + k] = was + shift[i].share * (at_corners(of[k], shift[i]) - was);
+    }
     if (load(rest + 3 * v) != m.place(v)) m.each_corner(v, [&](int corner) { tets.put(corner / 4); });
   }
   tets.sort(m.ntet);
@@ -222,16 +208,12 @@ PALPATE bool carry(const S& m, const Opening& o, const Few& movers, const Shift*
     if (!f.pinned.data[v]) vert.put(v);
   }
   vert.sort(m.nvert);
-  D3 spin = {0.0, 0.0, 0.0};
+  for (int i = 0; i < vert.count; ++i) f.near.data[i] = vert.list[i];
   for (int i = 0; i < movers.count; ++i) {
     const int v = movers.list[i];
-    const D3 back = m.place(v) - load(rest + 3 * v) - lead[i];
-    if (vert.has(v)) spin += x.mass[v] * cross(back, load(x.vel + 3 * v));
-    store(x.disp + 3 * v, load(x.disp + 3 * v) + lead[i]);
+    store(x.disp + 3 * v, now[2 * i]), store(x.vel + 3 * v, now[2 * i + 1]);
     store(m.rest + 3 * v, load(rest + 3 * v));
   }
-  add_spin(m.rest, x, vert, spin);
-  for (int i = 0; i < vert.count; ++i) f.near.data[i] = vert.list[i];
   f.found.data[FOUND_NEAR] = vert.count, f.found.data[FOUND_CHANGED] = tets.count;
   f.found.data[FOUND_MOVED] = movers.count;
   return true;
@@ -342,7 +324,6 @@ PALPATE int cleave(const F& f, const S& m, const Sheet& sheet, const Neohookean&
   int* found = f.found.data;
   if (memory.full || !measure_all(m, sheet, f.edge, at, memory)) return FULL;
   if (!part_sides(m, at, sheet, f.edge, o, memory)) return FULL;
-  leave_slits(f.slit.data, f.nslit, o);
   if (!order_faces(m, at, o, memory)) return FULL;
   const bool fits = fit(m, o, f.ntriangle, memory);
   found[FOUND_STOPPED] = o.stopped || !fits;

@@ -41,7 +41,7 @@ PALPATE double log_after(double x) {
   return u == 1.0 ? x : log(u) * (x / (u - 1.0));
 }
 
-// The energy of a tetrahedron with corners `x` and displacements `u`, as energy.of_tets has it.
+// The energy of a tetrahedron with corners `x` and displacements `u`, as energy.of_gradients has it.
 PALPATE double energy_of(const D3* x, const D3* u, double mu, double lam) {
   const D3 a = x[1] - x[0], b = x[2] - x[0], c = x[3] - x[0];
   const double det = dot(a, cross(b, c));

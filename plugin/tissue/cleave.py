@@ -46,7 +46,6 @@ class Cleaving:
   nelem: int  # triangles of the skin
   nskin: int
   nspare: int
-  nslit: int
   most: int  # neighbours that a vertex has room for
   most_spare: int  # and those of a spare one
   most_elem: int  # triangles that there may be
@@ -72,7 +71,6 @@ class Cleaving:
   whole_tet: longs("ntet", 4)
   whole_degree: longs("nvert")
   mate: longs("nface")
-  slit: longs("nslit", 4)
   home: longs("nelem")
   begin: ints("nvert + 1")  # of the corners around each vertex of the whole
   around: ints("nface")  # these
@@ -156,20 +154,20 @@ class Cleaver:
     self._mesh: Mesh | None = None
     self._config: Config | None = None
     ntet, nvert = len(whole.tet), whole.nvert
-    sizes = {"nvert": nvert, "ntet": ntet, "nelem": whole.nelem, "nslit": len(whole.slit)}
+    sizes = {"nvert": nvert, "ntet": ntet, "nelem": whole.nelem}
     sizes |= {"most": whole.ring.shape[1], "most_elem": room, "nface": 4 * ntet}
     # What native/cleave.h takes of scratch, see there.
     sizes |= {"nint": 62 * ntet + 32 * nvert + 8 * room, "nreal": 36 * nvert + 10 * ntet + 3 * room}
     sizes |= {"nmouth": 3 * (room - whole.nelem), "npath": 0, "nline": 0}
     self._fields: Any = allocate(Cleaving, "cpu", sizes)
-    for name in ("nvert", "ntet", "nelem", "most", "most_elem", "nslit", "nint", "nreal"):
+    for name in ("nvert", "ntet", "nelem", "most", "most_elem", "nint", "nreal"):
       setattr(self._fields, name, sizes[name])
     self._fields.nskin, self._fields.nspare = whole.nskin, whole.spare
     self._fields.most_spare, self._fields.edge = int(faces.room(whole).max()), whole.edge_length
     self._host = host_views(self._fields, Cleaving)
     corner = whole.tet.ravel()
     fixed = {"whole_tet": whole.tet, "whole_degree": whole.degree, "home": whole.home}
-    fixed |= {"around": np.argsort(corner, kind="stable"), "mate": whole.mate, "slit": whole.slit}
+    fixed |= {"around": np.argsort(corner, kind="stable"), "mate": whole.mate}
     fixed["begin"] = addresses(np.bincount(corner, minlength=nvert))
     for name, values in fixed.items():
       self._host[name][:] = values
