@@ -7,10 +7,9 @@ have made a corner of a tetrahedron that it has: the rest follows, see `faces.re
 from __future__ import annotations
 
 import dataclasses
-import functools
 
 import numpy as np
-from palpate.tissue import cleave, energy, faces
+from palpate.tissue import cleave, faces
 from palpate.tissue import mesh as topology
 from palpate.tissue.cut import Motion
 from palpate.tissue.ease import ease
@@ -19,7 +18,7 @@ from palpate.tissue.path import Finder
 from palpate.tissue.resolid import SolidRefill
 from palpate.tissue.surface import WorkingCopy
 
-from . import cuts, flexes
+from . import coupling, cuts, flexes
 from .cuts import Cuts
 from .walls import Walls
 
@@ -47,6 +46,8 @@ class SolidCuts(Cuts):
   def _make(self):
     self._refill = SolidRefill(self._w.body, self.whole)
     self.finder = Finder(WorkingCopy(self.whole))
+    room = coupling.spans(self._w.organ)["corner"]
+    self._cleaver = cleave.Cleaver(self.whole, self.finder, room.stop - room.start)
     self.seat = np.zeros(0, np.int64)
 
   def show(self):
@@ -57,10 +58,9 @@ class SolidCuts(Cuts):
 
   def share(self, values: np.ndarray) -> np.ndarray:
     """Returns values by mass, see `Cuts.share`; what comes from inside has them as the skin."""
-    was, skin = self.declared.mass, np.arange(self.whole.nouter)
-    skin = skin[was[skin] > 0]
-    usual = self.mass * float(np.median(values[skin] / was[skin]))
-    inside = self.source >= self.whole.nskin
+    was, n = self.declared.mass, self.whole.nouter
+    ratio = np.sort(values[:n] / np.maximum(was[:n], 1e-300))
+    usual, inside = self.mass * ratio[n // 2], self.source >= self.whole.nskin
     out = np.where(inside, usual, super().share(values))
     return np.where(self.mass > 0, out, values)
 
@@ -91,14 +91,18 @@ class SolidCuts(Cuts):
     self._sit(found)
     face = faces.opened(mesh)
     assert mesh.loose is not None
-    own["corner"][:n] = flexes.pack(mesh.elem[:n], mesh.loose[:n])
-    own["corner"][n:] = 0.0
-    own["corner"][n : n + len(face)] = face + 1
-    own["place"][:] = mesh.rest.ravel()
-    own["weight"][:] = self.mass
+    corner = np.zeros(len(own["corner"]))
+    corner[:n] = flexes.pack(mesh.elem[:n], mesh.loose[:n])
+    corner[n : n + len(face)] = face + 1
+    new, words = np.concatenate([corner, mesh.rest.ravel(), self.mass]), self._words
+    at, count = np.flatnonzero(new != words), len(words)
+    if self._total is None:
+      self._total = flexes.total(words, slice(None), count)
+    self._total += flexes.total(new[at], at, count) - flexes.total(words[at], at, count)
+    words[at] = new[at]
     own["source"][:] = 0.0
     own["source"][: len(self.seat)] = self.seat + 1
-    self.stamp = self._found[0] = flexes.stamp(self._words)
+    self.stamp = self._found[0] = flexes.stamp_of(self._total)
 
   def _sit(self, found: cleave.Cut):
     """Notes a corner of each vertex that cuts have made."""
@@ -118,23 +122,13 @@ class SolidCuts(Cuts):
       self.seat = np.zeros(0, np.int64)
     if direction is not None:
       direction = np.asarray(direction, float) @ organ.frame
-    found = cleave.cut(
-      organ.name,
-      mesh,
-      motion,
-      points,
-      ~organ.free,
-      depth,
-      direction,
-      functools.partial(energy.of_tets, mesh, w.config),
-      given,
-      len(self._own["corner"]),
-    )
+    how = ~organ.free, depth, direction, w.config, given
+    found = self._cleaver.cut(organ.name, mesh, motion, points, *how)
     if not found.changed.size:
       return found
-    new, how = _freed(found.mesh), (motion, found.motion, ~organ.free, w.config)
-    goes, near = ease(mesh, new, found.changed, found.group, found.member, *how)
-    return dataclasses.replace(found, mesh=new, motion=goes, near=near)
+    how = found.group, found.member, motion, found.motion, ~organ.free, w.config
+    goes, near = ease(mesh, found.mesh, found.changed, *how)
+    return dataclasses.replace(found, motion=goes, near=near)
 
   def _report(self, found: cleave.Cut) -> cuts.Report:
     organ = self._w.organ
@@ -143,23 +137,3 @@ class SolidCuts(Cuts):
     return cuts.Report(
       found.length, found.area, path, found.deviation, nodes, found.stopped, found.depth
     )
-
-
-def _freed(mesh: Mesh) -> Mesh:
-  """Returns the solid with the triangles of its skin marked that the foundation let go of.
-
-  Of what it held together until now, it goes on to hold the largest piece.
-  """
-  whole = mesh.whole
-  if mesh.uncut is None:
-    return mesh
-  assert mesh.loose is not None
-  n, loose = whole.nelem, mesh.loose.copy()
-  area = topology.lengths(topology.area_vectors(mesh.rest, mesh.elem[:n]))
-  piece = topology.pieces(mesh)[mesh.elem[:n, 0]]
-  for part in np.unique(whole.home):
-    held = (whole.home == part) & ~loose[:n]
-    size = np.bincount(piece[held], area[held])
-    if (size > 0).sum() > 1:
-      loose[:n] |= held & (piece != np.argmax(size))
-  return dataclasses.replace(mesh, loose=loose)

@@ -5,9 +5,6 @@
 
 namespace palpate {
 
-// Of vertices.
-struct Moving { double *mass, *disp, *vel; };
-
 constexpr double LITTLE = 1e-6;  // of the largest moment of inertia
 
 // The slow rotation that has a given spin; none about an axis with hardly any inertia.

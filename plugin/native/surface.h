@@ -52,18 +52,25 @@ PALPATE auto surface_of(const F& f, int world) {
                     f.degree.data + v, f.whole_elem.data, f.whole_twin.data};
 }
 
-// Scratch of a world; numbers that are taken are zero.
+// What vertices carry.
+struct Moving { double *mass, *disp, *vel; };
+
+// Scratch of a world; numbers that are taken are zero, unless they are room alone.
 struct Scratch {
   int* ints;
   double* reals;
   int nint, nreal;
   bool full;
 
-  PALPATE int* numbers(int n) {
+  PALPATE int* room(int n) {
     if (n > nint) return full = true, nullptr;
     int* out = ints;
     ints += n, nint -= n;
-    for (int i = 0; i < n; ++i) out[i] = 0;
+    return out;
+  }
+  PALPATE int* numbers(int n) {
+    int* out = room(n);
+    for (int i = 0; i < n && out; ++i) out[i] = 0;
     return out;
   }
   PALPATE double* values(int n) {
@@ -99,7 +106,7 @@ struct Few {
 };
 
 PALPATE Few few(Scratch& memory, int most) {
-  int* list = memory.numbers(most);
+  int* list = memory.room(most);
   return {list, memory.numbers(most), 0};
 }
 
@@ -174,6 +181,8 @@ PALPATE Spot nearest_around(const S& m, const double* x, D3 point, const int* ve
 }
 
 constexpr double BOX = 3.0;  // edges from points within which they are found sooner
+constexpr int MIDDLES = 12;  // triangles around a point of a solid's skin among which the nearest is
+constexpr double TIE = 1e-9;  // edges by which a triangle must be nearer than one with a nearer middle
 constexpr int NEAR = 6;  // vertices nearest to a point around which its triangle is looked for
 
 // Finds those of a few vertices, all `n` where `among` is null, that are nearest to a point; returns
@@ -194,32 +203,106 @@ PALPATE int nearest_vertices(const double* x, D3 p, const int* among, int n, int
   return count;
 }
 
+// The box around points, and some room.
+struct Box {
+  D3 low, high;
+
+  PALPATE Box(const double* point, int n, double room) : low(load(point)), high(low) {
+    const D3 zero = {0.0, 0.0, 0.0}, more = {room, room, room};
+    for (int i = 1; i < n; ++i) {
+      high = vmax(high, load(point + 3 * i));
+      low = zero - vmax(zero - low, zero - load(point + 3 * i));
+    }
+    low = low - more, high = high + more;
+  }
+  PALPATE bool has(D3 a) const {
+    const D3 off = vmax(low - a, a - high);
+    return off.x <= 0.0 && off.y <= 0.0 && off.z <= 0.0;
+  }
+};
+
 // Finds the spots of a surface that are nearest to points, which `put` gets: looked for in a box around
-// all points first, whose vertices `box` gets.
+// all points first, whose vertices `inside` gets.
 template <class S, class Put>
 PALPATE void nearest_spots(const S& m, const double* x, int nouter, const double* point, int n,
-                           double edge, int* box, Put put) {
+                           double edge, int* inside, Put put) {
   const double room = BOX * edge;
-  D3 low = load(point), high = low;
-  const D3 zero = {0.0, 0.0, 0.0}, more = {room, room, room};
-  for (int i = 1; i < n; ++i) {
-    high = vmax(high, load(point + 3 * i));
-    low = zero - vmax(zero - low, zero - load(point + 3 * i));
-  }
-  low = low - more, high = high + more;
-  int inside = 0;
-  for (int v = 0; v < nouter; ++v) {
-    const D3 a = load(x + 3 * v), off = vmax(low - a, a - high);
-    if (off.x <= 0.0 && off.y <= 0.0 && off.z <= 0.0) box[inside++] = v;
-  }
+  const Box box(point, n, room);
+  int count = 0;
+  for (int v = 0; v < nouter; ++v)
+    if (box.has(load(x + 3 * v))) inside[count++] = v;
   const int want = NEAR < nouter ? NEAR : nouter;
   for (int i = 0; i < n; ++i) {
     int near[NEAR];
     double last;
-    int count = nearest_vertices(x, load(point + 3 * i), box, inside, near, last);
-    if (count < want || last > room * room)
-      count = nearest_vertices(x, load(point + 3 * i), nullptr, nouter, near, last);
-    INLINED put(i, nearest_around(m, x, load(point + 3 * i), near, count));
+    int found = nearest_vertices(x, load(point + 3 * i), inside, count, near, last);
+    if (found < want || last > room * room)
+      found = nearest_vertices(x, load(point + 3 * i), nullptr, nouter, near, last);
+    INLINED put(i, nearest_around(m, x, load(point + 3 * i), near, found));
+  }
+}
+
+// The triangles of a solid's skin.
+template <class I>
+struct Skin {
+  int nelem;
+  const I* elem;
+  const double *x, *rest;  // where vertices are, now and at rest
+
+  PALPATE D3 corner(int t, int c) const { return load(x + 3 * elem[3 * t + c]); }
+  PALPATE D3 middle(int t) const { return (1.0 / 3.0) * (corner(t, 0) + corner(t, 1) + corner(t, 2)); }
+  PALPATE D3 area_vector(int t) const {
+    const D3 a = load(rest + 3 * elem[3 * t]), b = load(rest + 3 * elem[3 * t + 1]);
+    return 0.5 * cross(b - a, load(rest + 3 * elem[3 * t + 2]) - a);
+  }
+  // The nearest spot among the triangles of a list, all `n` where it is null, whose middles are nearest.
+  PALPATE Spot nearest(D3 p, double edge, const int* among, int n) const {
+    double far[MIDDLES];
+    int near[MIDDLES], found = 0;
+    for (int j = 0; j < n; ++j) {
+      const int t = among ? among[j] : j;
+      const D3 arm = middle(t) - p;
+      const double d = dot(arm, arm);
+      if (found == MIDDLES && d >= far[MIDDLES - 1]) continue;
+      int k = found < MIDDLES ? found++ : MIDDLES - 1;
+      for (; k > 0 && far[k - 1] > d; --k) far[k] = far[k - 1], near[k] = near[k - 1];
+      far[k] = d, near[k] = t;
+    }
+    Spot out = {0, {1.0, 0.0, 0.0}, 1e300};
+    for (int k = 0; k < found; ++k) {
+      D3 x[3];
+      for (int c = 0; c < 3; ++c) x[c] = corner(near[k], c);
+      const D3 w = barycentric(p, x);
+      const double off = norm(blend(x, w) - p);
+      if (off < out.far - TIE * edge) out = {near[k], w, off};  // on an edge that of the nearer middle
+    }
+    return out;
+  }
+  // The unit normal at rest, even across edges, of those triangles.
+  PALPATE D3 normal(Spot spot, const int* among, int n) const {
+    D3 sum[3] = {}, out = {0.0, 0.0, 0.0};
+    for (int j = 0; j < n; ++j) {
+      const int t = among ? among[j] : j;
+      for (int c = 0; c < 9; ++c)
+        if (elem[3 * t + c / 3] == elem[3 * spot.elem + c % 3]) sum[c % 3] += area_vector(t);
+    }
+    const double weight[3] = {spot.weight.x, spot.weight.y, spot.weight.z};
+    for (int c = 0; c < 3; ++c) out += (weight[c] / norm(sum[c])) * sum[c];
+    return (1.0 / norm(out)) * out;
+  }
+};
+
+// The same of the skin of a solid, whose normals `put` gets too.
+template <class I, class Put>
+PALPATE void nearest_of_skin(const Skin<I>& m, const double* point, int n, double edge, int* inside, Put put) {
+  const Box box(point, n, BOX * edge);
+  int count = 0;
+  for (int t = 0; t < m.nelem; ++t)
+    if (box.has(m.middle(t))) inside[count++] = t;
+  if (count < MIDDLES) inside = nullptr, count = m.nelem;
+  for (int i = 0; i < n; ++i) {
+    const Spot spot = m.nearest(load(point + 3 * i), edge, inside, count);
+    INLINED put(i, spot, m.normal(spot, inside, count));
   }
 }
 

@@ -5,7 +5,7 @@
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -27,15 +27,19 @@ _OF_TISSUE = ("fan_metric", "fan_spring", "hinge_gain", "bend_gain", "bend_diag"
 NAMES = (*_OF_SHAPE, *_OF_TISSUE)
 
 
-def _typed(cls):
-  """Gives a struct the arrays of `NAMES`, of the types that they have there."""
-  for kind, names in ((Shape, _OF_SHAPE), (Tissue, _OF_TISSUE)):
-    cls.__annotations__ |= {name: kind.vars[name].type for name in names}
-  return cls
+def typed(*names: tuple[str, ...]) -> Callable[[type], type]:
+  """Returns what gives a struct arrays of `Shape`, and of `Tissue`, of the types that they have."""
+
+  def give(cls: type) -> type:
+    for kind, some in zip((Shape, Tissue), names, strict=True):
+      cls.__annotations__ |= {name: kind.vars[name].type for name in some}
+    return cls
+
+  return give
 
 
 @struct
-@_typed
+@typed(_OF_SHAPE, _OF_TISSUE)
 class Filling:
   """A surface, what its rows are made of, and what they are written to, under the names there."""
 
@@ -51,6 +55,7 @@ class Filling:
   thickness: wp.float64  # [m]
   stiffness: wp.float64  # of an edge's spring [N/m]
   poisson: wp.float64
+  skip: wp.int64  # words by which what is written to lies after the arrays
   centre: doubles(3)  # that rest positions are about [m]
   lame: doubles("nelem")  # of triangles [Pa]
   shear: doubles("nelem")  # [Pa]
@@ -129,6 +134,7 @@ class Rows:
     changed: np.ndarray | None = None,
     before: np.ndarray | None = None,
     loosened: bool = True,
+    skip: int = 0,
   ) -> bool:
     """Writes the rows of a surface; returns False where the bending matrix has no room for them.
 
@@ -141,10 +147,12 @@ class Rows:
       changed: triangles that are not as in the arrays, None for all
       before: corners that these have there, (n, 3)
       loosened: whether what the foundation holds may be other triangles too
+      skip: words by which what is written to lies after the arrays
     """
     self._copy.put(mesh)
     self._put_material(config)
     self.fields.every, self.fields.loosened = int(changed is None), int(loosened)
+    self.fields.skip = skip
     changed = np.arange(mesh.nelem) if changed is None else changed
     self.fields.nchanged = n = len(changed)
     self._changed[:n], self._pinned[:] = changed, pinned
