@@ -39,9 +39,9 @@ def skin(mesh: Mesh) -> Mesh:
   return dataclasses.replace(mesh, elem=mesh.elem[:n], loose=mesh.loose[:n])
 
 
-def gradients(mesh: Mesh, tet: np.ndarray | None = None) -> np.ndarray:
-  """Returns the gradient of each corner's share at rest [1/m], (ntet, 4, 3), or of some's."""
-  corner = mesh.rest[mesh.tet if tet is None else tet]
+def gradients(mesh: Mesh) -> np.ndarray:
+  """Returns the gradient of each corner's share at rest [1/m], (ntet, 4, 3)."""
+  corner = mesh.rest[mesh.tet]
   others = np.linalg.inv(corner[:, 1:] - corner[:, :1]).transpose(0, 2, 1)
   return np.concatenate([-others.sum(axis=1, keepdims=True), others], axis=1)
 
