@@ -48,11 +48,16 @@ def gradients(mesh: Mesh) -> np.ndarray:
 
 def young(mesh: Mesh, config: Config) -> np.ndarray:
   """Returns Young's modulus of each tetrahedron [Pa], that of the nearest triangle, (ntet,)."""
-  mesh = mesh.whole
   if len(config.young) == 1:
-    return np.full(len(mesh.tet), config.young[0])
+    return np.full(len(mesh.whole.tet), config.young[0])
+  return np.asarray(config.young)[nearest_triangle(mesh)]
+
+
+def nearest_triangle(mesh: Mesh) -> np.ndarray:
+  """Returns the triangle nearest to each tetrahedron before the first cut, (ntet,)."""
+  mesh = mesh.whole
   middle = KDTree(mesh.rest[mesh.elem].mean(axis=1))
-  return np.asarray(config.young)[middle.query(mesh.rest[mesh.tet].mean(axis=1))[1]]
+  return middle.query(mesh.rest[mesh.tet].mean(axis=1))[1]
 
 
 def moduli(mesh: Mesh, config: Config) -> tuple[np.ndarray, np.ndarray]:
