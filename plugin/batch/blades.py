@@ -20,7 +20,6 @@ from . import beside
 from .bench import Bench
 from .parting import Cutters
 
-_LOOK = 10  # steps after which the host looks, at most
 _ROWS = "state", "next", "force", "point", "share", "hold", "due", "law"
 _WorldBlades = beside.in_worlds(
   cutters.Blades,
@@ -82,7 +81,7 @@ def _feel(b: _WorldBlades, adr: int, data: wp.array2d[float]):
       data[w, adr + c] = data[w, adr + c] + float(turned)
 
 
-class Blades(beside.Beside):
+class Blades(beside.Opens):
   """What cuts an organ in all worlds.
 
   Args:
@@ -163,13 +162,6 @@ class Blades(beside.Beside):
     return self._out
 
   # The meshes come apart.
-
-  def stepped(self, last: bool):
-    """Counts a step; opens paths where it is time, or it was the last one for now."""
-    self._steps += 1
-    if last or self._steps >= _LOOK:
-      self._steps = 0
-      self.open()
 
   def open(self):
     """Lets the meshes of worlds come apart along the paths that are long enough, or ended."""

@@ -119,6 +119,11 @@ class Cuts:
     """Returns the mesh of a world, as it was when `follow` was called."""
     return self._worlds[world].mesh if world in self._worlds else self.whole
 
+  def is_full(self, world: int) -> bool:
+    """Returns whether a world has no spare vertex left, as `mesh_of` has it."""
+    mesh = self.mesh_of(world)
+    return mesh.nouter == mesh.nskin
+
   def mass(self, world: int) -> np.ndarray:
     """Returns the masses of its vertices, as compiled [kg], (nvert,)."""
     self.follow()

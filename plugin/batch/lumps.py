@@ -1,7 +1,8 @@
 """Young's modulus of each triangle of each world: a lump that lies elsewhere in each.
 
-In a solid tetrahedra have that of the triangle nearest to them. All that depends on it in a step is linear in the triangles' factors on the modulus they were
-compiled with, so that a world's numbers are products with sparse matrices.
+In a solid tetrahedra have that of the triangle nearest to them. All that depends on it in a step is
+linear in the triangles' factors on the modulus they were compiled with, so that a world's numbers
+are products with sparse matrices.
 """
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
