@@ -60,7 +60,7 @@ def nearest_triangle(mesh: Mesh) -> np.ndarray:
   """Returns the triangle nearest to each tetrahedron before the first cut, (ntet,)."""
   mesh = mesh.whole
   middle = KDTree(mesh.rest[mesh.elem].mean(axis=1))
-  return middle.query(mesh.rest[mesh.tet].mean(axis=1))[1]
+  return np.asarray(middle.query(mesh.rest[mesh.tet].mean(axis=1))[1])
 
 
 def moduli(mesh: Mesh, config: Config) -> tuple[np.ndarray, np.ndarray]:
