@@ -17,7 +17,6 @@ from palpate.tissue.step import SCHEMES
 from palpate.tissue.types import allocate, doubles, fill, floats, ints, struct
 
 from . import beside
-from .bench import Bench
 from .parting import Cutters
 
 _ROWS = "state", "next", "force", "point", "share", "hold", "due", "law"
@@ -173,31 +172,24 @@ class Blades(beside.Opens):
     law, edge = self.fields.law.numpy(), self._organ.declared.mesh.edge_length
     cuts.follow()
     motion = cuts.motion(worlds)
-
-    def work(bench: Bench, k: int):
-      world = worlds[k]
+    for k, world in enumerate(worlds):
       for i in np.flatnonzero(due[world]):
         given = cutters.GIVEN * float(law[world, i, LAW.force]) * edge
-        ended = due[world, i] == cutters.ENDED
-        self._open(bench, state[world, i], ended, given, motion, k, world)
-
-    cuts.benches.each(work, len(worlds))
+        self._open(state[world, i], due[world, i] == cutters.ENDED, given, motion, k, world)
     cuts.finish(worlds, motion)
     self.fields.state.assign(state)
     self.fields.due.zero_()
 
-  def _open(
-    self, bench: Bench, row: np.ndarray, ended: bool, given: float, motion, k: int, world: int
-  ):
+  def _open(self, row: np.ndarray, ended: bool, given: float, motion, k: int, world: int):
     cuts = self._organ.topology
 
     def cut(path: np.ndarray) -> tuple[Any, Mesh]:
-      now = cutters.on_surface(bench.finder, cuts.mesh_of(world), path, motion.disp[k])
-      found = cuts.find(bench, world, now, motion, k, given)
-      return cuts.apply(bench, world, found, motion, k), cuts.mesh_of(world)
+      now = cutters.on_surface(cuts.finder, cuts.mesh_of(world), path, motion.disp[k])
+      report = cuts.apply(world, cuts.find(world, now, motion, k, given), motion, k)
+      return report, cuts.mesh_of(world)
 
     organ, mesh = self._organ.declared, cuts.mesh_of(world)
-    cutters.open_path(row, mesh, bool(ended), organ, bench.finder, cut)
+    cutters.open_path(row, mesh, bool(ended), organ, cuts.finder, cut)
 
 
 @wp.kernel(enable_backward=False)

@@ -8,7 +8,6 @@ import warp as wp
 from palpate.engine import tear
 
 from . import beside
-from .bench import Bench
 from .patch import Patch
 
 # In what a triangle is beyond the limit: shares of it, and the most that are told apart.
@@ -81,15 +80,11 @@ class Tears(beside.Opens):
     if not worlds:
       return
     motion = cuts.motion(worlds)
-
-    def work(bench: Bench, k: int):
-      world, mesh = worlds[k], cuts.mesh_of(worlds[k])
-      worst = nelem - 1 - int(found[world]) % nelem
-      line = tear.line_of(mesh, mesh.rest + motion.disp[k], worst, bench.finder)
+    for k, world in enumerate(worlds):
+      mesh, worst = cuts.mesh_of(world), nelem - 1 - int(found[world]) % nelem
+      line = tear.line_of(mesh, mesh.rest + motion.disp[k], worst, cuts.finder)
       with contextlib.suppress(ValueError):  # pinned tissue around it
-        cuts.apply(bench, world, cuts.find(bench, world, line, motion, k), motion, k)
-
-    cuts.benches.each(work, len(worlds))
+        cuts.apply(world, cuts.find(world, line, motion, k), motion, k)
     cuts.finish(worlds, motion)
 
 
