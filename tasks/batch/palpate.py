@@ -5,8 +5,8 @@ from typing import Any
 
 import warp as wp
 from palpate.models import shapes
-from palpate.tasks import palpation, scenes
-from palpate.tissue.types import Array, floats, struct
+from palpate.tasks import feeling, palpation, scenes
+from palpate.tissue.types import Array, floats, ints, struct
 
 from . import domain
 from .fields import MISSED, RUNNING, SUCCESS, Common
@@ -14,6 +14,8 @@ from .kernels import error, judge, put, reach, vector
 
 _FEELING, _FELT = wp.constant(palpation.FEELING), wp.constant(palpation.FELT)
 _REPORT = wp.constant(palpation.REPORT)
+_LEFT, _DEEP, _SOFT = (wp.constant(x) for x in (feeling.LEFT, feeling.DEEP, feeling.SOFT))
+_APART, _NEAR = wp.constant(feeling.APART), wp.constant(feeling.NEAR)
 
 
 @struct
@@ -24,9 +26,91 @@ class PalpateState:
   center: wp.vec3  # of the field [m]
   places: Array(wp.vec3, ("nfield",))  # middles of its triangles [m]
   inclusion: Array(wp.vec3, ("nworld",))  # where it is [m]
+  outward: Array(wp.vec3, ("nfield",))  # normals there
+  beside: ints("nfield", 4)  # see `feeling.Notes`
   touched: Array(wp.bool, ("nworld", "nfield"))
+  noted: floats("nworld", "nfield")  # stiffness, 0 where nothing was felt [N/m]
+  near: Array(wp.bool, ("nworld", "nfield"))  # what was felt
+  deepest: ints("nworld")  # of this press
+  depth: floats("nworld")  # there [m]
+  top: ints("nworld")  # that felt stiffest, -1 without one
   field: floats("nworld", 3)
   felt: floats("nworld", 1)
+  unfelt: floats("nworld", 3)
+  stiffest: floats("nworld", 3)
+  stiffness: floats("nworld", 6)
+
+
+@wp.func
+def press(o: PalpateState, w: int, tip: wp.vec3, force: float):
+  """Follows a press, see `feeling.Notes.press`; returns whether it noted something."""
+  if force < _LEFT:
+    o.depth[w] = 0.0
+    return False
+  k = wp.int32(0)
+  for i in range(o.places.shape[0]):
+    if wp.length_sq(o.places[i] - tip) < wp.length_sq(o.places[k] - tip):
+      k = i
+  depth = wp.dot(o.places[k] - tip, o.outward[k])
+  if depth <= wp.max(o.depth[w], _DEEP):
+    return False
+  if o.depth[w] > 0.0:
+    o.noted[w, o.deepest[w]] = 0.0
+  o.deepest[w] = k
+  o.depth[w] = depth
+  o.noted[w, k] = force / depth
+  return True
+
+
+@wp.func
+def soft(o: PalpateState, w: int, count: int):
+  """Returns what counts as soft among so many places that were felt [N/m]."""
+  rank = int(wp.floor(_SOFT * float(count - 1)))
+  for i in range(o.places.shape[0]):
+    below = wp.int32(0)
+    for j in range(o.places.shape[0]):
+      own, other = o.noted[w, i], o.noted[w, j]
+      if other > 0.0 and (other < own or (other == own and j < i)):
+        below += 1
+    if o.noted[w, i] > 0.0 and below == rank:
+      return o.noted[w, i]
+  return wp.float32(0.0)
+
+
+@wp.func
+def side(o: PalpateState, w: int, i: int):
+  """Returns the stiffness at a side of the stiffest place, see `feeling.Notes.summary` [N/m]."""
+  k = o.beside[o.top[w], i]
+  if k < 0:
+    return wp.float32(-1.0)
+  found, least = wp.float32(0.0), wp.float32(_NEAR)
+  for j in range(o.places.shape[0]):
+    away = wp.length(o.places[j] - o.places[k])
+    if o.noted[w, j] > 0.0 and j != o.top[w] and away < least:
+      found = o.noted[w, j]
+      least = away
+  return found
+
+
+@wp.func
+def summarise(o: PalpateState, w: int):
+  """Writes what follows from what is noted."""
+  count, top = wp.int32(0), wp.int32(0)
+  for i in range(o.places.shape[0]):
+    o.near[w, i] = False
+    count += wp.where(o.noted[w, i] > 0.0, 1, 0)
+    if o.noted[w, i] > o.noted[w, top]:
+      top = i
+  o.top[w] = top
+  for j in range(o.places.shape[0]):
+    if o.noted[w, j] > 0.0:
+      for i in range(o.places.shape[0]):
+        if wp.length(o.places[i] - o.places[j]) < _APART:
+          o.near[w, i] = True
+  o.stiffness[w, 0] = soft(o, w, count)
+  o.stiffness[w, 1] = o.noted[w, top]
+  for i in range(4):
+    o.stiffness[w, 2 + i] = side(o, w, i)
 
 
 @wp.kernel(enable_backward=False)
@@ -36,8 +120,14 @@ def begin(s: Common, o: PalpateState):
   if not s.begun[w]:
     return
   o.felt[w, 0] = 0.0
+  o.depth[w] = 0.0
+  o.top[w] = -1
   for k in range(o.places.shape[0]):
     o.touched[w, k] = False
+    o.near[w, k] = False
+    o.noted[w, k] = 0.0
+  for k in range(6):
+    o.stiffness[w, k] = 0.0
 
 
 @wp.kernel(enable_backward=False)
@@ -56,6 +146,8 @@ def advance(s: Common, o: PalpateState):
     else:
       error(s, w)
   else:
+    if press(o, w, tip, force):
+      summarise(o, w)
     count = wp.int32(0)
     for k in range(o.places.shape[0]):
       if force >= _FEELING and wp.length(o.places[k] - tip) < _FELT:
@@ -69,10 +161,19 @@ def advance(s: Common, o: PalpateState):
 
 @wp.kernel(enable_backward=False)
 def observe(s: Common, o: PalpateState, beginning: bool):
-  """Writes field; `advance` wrote felt."""
+  """Writes field, unfelt and stiffest; `advance` wrote felt and stiffness."""
   w = wp.tid()
-  if not beginning or s.begun[w]:
-    put(o.field, w, o.center - vector(s.tip_pos, w))
+  if beginning and not s.begun[w]:
+    return
+  tip = vector(s.tip_pos, w)
+  put(o.field, w, o.center - tip)
+  left = wp.int32(-1)
+  for k in range(o.places.shape[0]):
+    if not o.near[w, k]:
+      if left < 0 or wp.length_sq(o.places[k] - tip) < wp.length_sq(o.places[left] - tip):
+        left = k
+  put(o.unfelt, w, wp.where(left < 0, wp.vec3(), o.places[wp.max(left, 0)] - tip))
+  put(o.stiffest, w, wp.where(o.top[w] < 0, wp.vec3(), o.places[wp.max(o.top[w], 0)] - tip))
 
 
 class Palpate(domain.Domain):
@@ -96,7 +197,9 @@ class Palpate(domain.Domain):
   @staticmethod
   def constants(task: Any, physics):
     """Returns what else all worlds share."""
-    return {"places": task.places, "center": wp.vec3(*task.center)}
+    beside = feeling.beside(task.places, task.up)
+    told = {"places": task.places, "outward": task.outward, "beside": beside}
+    return told | {"center": wp.vec3(*task.center)}
 
   @staticmethod
   def draw(task: Any, physics):
