@@ -47,10 +47,11 @@ def test_what_an_exercise_tells_of_what_was_felt_is_from_the_tip():
   env = tasks.load("probe", "palpate_easy", task_kwargs={"random": 2, "surroundings": "none"})
   timestep, act = env.reset(), lessons.Teacher(env)
   assert not timestep.observation["stiffness"].any() and not timestep.observation["stiffest"].any()
-  while not timestep.observation["stiffness"].any():
-    unfelt, tip = timestep.observation["unfelt"], timestep.observation["tip_pos"]
-    timestep = env.step(act(timestep))
-  seen = timestep.observation
-  np.testing.assert_allclose(seen["tip_pos"] + seen["stiffest"], unfelt + tip, atol=1e-9)
+  before = seen = timestep.observation
+  while not seen["stiffness"].any():
+    before, timestep = seen, env.step(act(timestep))
+    seen = timestep.observation
+  place = before["tip_pos"] + before["unfelt"]
+  np.testing.assert_allclose(seen["tip_pos"] + seen["stiffest"], place, atol=1e-9)
   assert np.linalg.norm(seen["unfelt"] - seen["stiffest"]) >= 0.014
   assert seen["stiffness"][0] == seen["stiffness"][1] > 30
