@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from . import scenes
 from .base import Physics, Task
-from .feeling import APART, NOT_YET, SOFT, Notes
+from .feeling import APART, SOFT, Notes, chance
 from .performer import Performer, Script
 from .scenes import Scene
 
@@ -20,9 +20,7 @@ REPORT = 0.05  # least force at the report [N]
 # feel are around what is stiff [m].
 _ABOVE, _DEPTH, _CLOSE = 0.004, 0.004, 0.006
 _LIKELY = 0.05  # of the likeliest place: others are not felt [-]
-_NOISE = 8.0  # of what it feels: triangles differ [N/m]
 _STIFF = 1.3  # times what is soft: what is worth a closer look [-]
-_SURE = 1.6  # times what is soft: what a hasty one looks around, and at nothing else
 
 
 class Palpate(Task):
@@ -148,14 +146,13 @@ class Palpate(Task):
 
   def observe(self, physics: Physics) -> dict[str, np.ndarray]:
     """Returns what was felt, and where what matters of it is from the tip."""
-    tip, notes = physics.tip_pos(), self.notes
-    left, top = notes.left(tip), notes.stiffest()
+    tip, left = physics.tip_pos(), self.notes.left(physics.tip_pos())
     return {
       "field": self.center - tip,
       "felt": np.array([self.felt()]),
+      "left": np.array([float(left is not None)]),
       "unfelt": np.zeros(3) if left is None else self.places[left] - tip,
-      "stiffest": np.zeros(3) if top is None else self.places[top] - tip,
-      "stiffness": notes.summary(),
+      "expected": self.notes.expected(self.radius) - tip,
     }
 
   def expert(self, p: Performer) -> Script:
@@ -171,25 +168,19 @@ class Palpate(Task):
       yield from self._hop(p, self.places[k] + _ABOVE * normals[k])
       felt[k] = yield from p.feel(self.places[k], -normals[k], _DEPTH)
       yield from p.line(self.places[k] + _ABOVE * normals[k], 0.03)
-    k = self._guess(felt)
-    yield from self._hop(p, self.places[k] + _ABOVE * normals[k])
-    yield from p.feel(self.places[k], -normals[k], 0.5 * _DEPTH)
+    # A hasty one goes by what is observed alone, which can be learned.
+    goal = self.notes.expected(self.radius) if p.hasty else self.places[self._guess(felt)]
+    normal = normals[np.linalg.norm(self.places - goal, axis=1).argmin()]
+    yield from self._hop(p, goal + _ABOVE * normal)
+    yield from p.feel(goal, -normal, 0.5 * _DEPTH)
     yield from p.say()
 
   def _next(self, p: Performer, felt: dict[int, float], sweep: Iterator[int]) -> int | None:
     """Returns the place to feel next, None where enough is felt."""
     if p.hasty:
-      return self._plain(p.hand.tip_pos())
+      return self.notes.left(p.hand.tip_pos())
     found = self._unsure(felt)
     return next(sweep, None) if found is None else found
-
-  def _plain(self, tip: np.ndarray) -> int | None:
-    """Returns what to feel next by what is observed alone, which can be learned."""
-    notes, left, top = self.notes, self.notes.left(tip), self.notes.stiffest()
-    if top is None or (left is not None and notes.stiffness[top] < _SURE * notes.soft()):
-      return left
-    sides = notes.beside[top][notes.around() == NOT_YET]
-    return int(sides[0]) if len(sides) else None
 
   def _left_out(self, felt: dict[int, float]) -> list[int]:
     """Returns the places to sweep over but for those that were felt, from the last of these on."""
@@ -226,16 +217,8 @@ class Palpate(Task):
     return int(np.linalg.norm(self.places - middle, axis=1).argmin())
 
   def _chance(self, felt: dict[int, float]) -> np.ndarray:
-    """Returns how likely the inclusion is under each place, against the likeliest [-]  (nplace,).
-
-    As likely as a bell of stiffness on it, h exp(-(d/w)^2) above what is soft, fits what was felt.
-    """
     more = np.array(list(felt.values())) - _soft(felt)
-    distance = np.linalg.norm(self.places[:, None] - self.places[list(felt)], axis=2)
-    bell = np.exp(-((distance / (1.2 * self.radius)) ** 2))
-    height = np.maximum(bell @ more / np.maximum((bell**2).sum(axis=1), 1e-9), 0.0)
-    error = ((more - height[:, None] * bell) ** 2).sum(axis=1)
-    return np.exp((error.min() - error) / (2 * _NOISE**2))
+    return chance(self.places, np.array([*felt]), more, self.radius)
 
   def _hop(self, p: Performer, goal: np.ndarray) -> Script:
     """Moves to a point, in an arch over the organ where it is far."""

@@ -16,6 +16,9 @@ _FEELING, _FELT = wp.constant(palpation.FEELING), wp.constant(palpation.FELT)
 _REPORT = wp.constant(palpation.REPORT)
 _LEFT, _DEEP, _SOFT = (wp.constant(x) for x in (feeling.LEFT, feeling.DEEP, feeling.SOFT))
 _APART, _NEAR = wp.constant(feeling.APART), wp.constant(feeling.NEAR)
+_STIFF, _WIDTH = wp.constant(feeling.STIFF), wp.constant(feeling.WIDTH)
+_LEAST = wp.constant(1e-9)
+_NOISE = wp.constant(feeling.NOISE)
 
 
 @struct
@@ -23,7 +26,10 @@ class PalpateState:
   """State of the domain."""
 
   tolerance: float  # of the report [m]
+  radius: float  # of inclusions [m]
   center: wp.vec3  # of the field [m]
+  one: wp.vec3  # across the way to the trocar
+  two: wp.vec3
   places: Array(wp.vec3, ("nfield",))  # middles of its triangles [m]
   inclusion: Array(wp.vec3, ("nworld",))  # where it is [m]
   outward: Array(wp.vec3, ("nfield",))  # normals there
@@ -33,12 +39,14 @@ class PalpateState:
   near: Array(wp.bool, ("nworld", "nfield"))  # what was felt
   deepest: ints("nworld")  # of this press
   depth: floats("nworld")  # there [m]
-  top: ints("nworld")  # that felt stiffest, -1 without one
+  side: ints("nworld")  # of what is stiff, that is left to feel, -1 without one
+  stiff: Array(wp.bool, ("nworld",))  # whether something is
+  likely: Array(wp.vec3, ("nworld",))  # where the inclusion is to be expected [m]
   field: floats("nworld", 3)
   felt: floats("nworld", 1)
+  left: floats("nworld", 1)
   unfelt: floats("nworld", 3)
-  stiffest: floats("nworld", 3)
-  stiffness: floats("nworld", 6)
+  expected: floats("nworld", 3)
 
 
 @wp.func
@@ -78,39 +86,60 @@ def soft(o: PalpateState, w: int, count: int):
 
 
 @wp.func
-def side(o: PalpateState, w: int, i: int):
-  """Returns the stiffness at a side of the stiffest place, see `feeling.Notes.summary` [N/m]."""
-  k = o.beside[o.top[w], i]
-  if k < 0:
-    return wp.float32(-1.0)
-  found, least = wp.float32(0.0), wp.float32(_NEAR)
+def side(o: PalpateState, w: int, top: int):
+  """Returns a place beside the stiffest that is left to feel, -1 without one."""
+  for i in range(4):
+    k = o.beside[top, i]
+    new = k >= 0
+    for j in range(o.places.shape[0]):
+      if o.noted[w, j] > 0.0 and j != top and new:
+        new = wp.length(o.places[j] - o.places[k]) >= _NEAR
+    if new:
+      return k
+  return wp.int32(-1)
+
+
+@wp.func
+def gain(o: PalpateState, w: int, k: int, soft: float):
+  """Returns by how much an inclusion under a place explains what was felt, see `feeling.chance`."""
+  both, square = wp.float32(0.0), wp.float32(_LEAST)
   for j in range(o.places.shape[0]):
-    away = wp.length(o.places[j] - o.places[k])
-    if o.noted[w, j] > 0.0 and j != o.top[w] and away < least:
-      found = o.noted[w, j]
-      least = away
-  return found
+    if o.noted[w, j] > 0.0:
+      far = wp.length(o.places[j] - o.places[k]) / (_WIDTH * o.radius)
+      bell = wp.exp(-far * far)
+      both += bell * (o.noted[w, j] - soft)
+      square += bell * bell
+  both = wp.max(both, 0.0)
+  return both * both / square
 
 
 @wp.func
 def summarise(o: PalpateState, w: int):
-  """Writes what follows from what is noted."""
+  """Finds what follows from what is noted."""
   count, top = wp.int32(0), wp.int32(0)
   for i in range(o.places.shape[0]):
     o.near[w, i] = False
-    count += wp.where(o.noted[w, i] > 0.0, 1, 0)
+    if o.noted[w, i] > 0.0:
+      count += 1
     if o.noted[w, i] > o.noted[w, top]:
       top = i
-  o.top[w] = top
   for j in range(o.places.shape[0]):
     if o.noted[w, j] > 0.0:
       for i in range(o.places.shape[0]):
         if wp.length(o.places[i] - o.places[j]) < _APART:
           o.near[w, i] = True
-  o.stiffness[w, 0] = soft(o, w, count)
-  o.stiffness[w, 1] = o.noted[w, top]
-  for i in range(4):
-    o.stiffness[w, 2 + i] = side(o, w, i)
+  least = soft(o, w, count)
+  o.stiff[w] = o.noted[w, top] > _STIFF * least
+  o.side[w] = side(o, w, top)
+  best = wp.float32(0.0)
+  for k in range(o.places.shape[0]):
+    best = wp.max(best, gain(o, w, k, least))
+  mass, middle = wp.float32(0.0), wp.vec3()
+  for k in range(o.places.shape[0]):
+    chance = wp.exp((gain(o, w, k, least) - best) / (2.0 * _NOISE * _NOISE))
+    mass += chance
+    middle += chance * o.places[k]
+  o.likely[w] = middle / mass
 
 
 @wp.kernel(enable_backward=False)
@@ -121,13 +150,15 @@ def begin(s: Common, o: PalpateState):
     return
   o.felt[w, 0] = 0.0
   o.depth[w] = 0.0
-  o.top[w] = -1
+  o.stiff[w] = False
+  o.side[w] = -1
+  middle = wp.vec3()
   for k in range(o.places.shape[0]):
     o.touched[w, k] = False
     o.near[w, k] = False
     o.noted[w, k] = 0.0
-  for k in range(6):
-    o.stiffness[w, k] = 0.0
+    middle += o.places[k] / float(o.places.shape[0])
+  o.likely[w] = middle
 
 
 @wp.kernel(enable_backward=False)
@@ -159,21 +190,32 @@ def advance(s: Common, o: PalpateState):
   judge(s, w, found, outcome)
 
 
+@wp.func
+def aside(o: PalpateState, k: int, tip: wp.vec3):
+  """Returns the square of how far a place is from the tip, seen along the way to the trocar."""
+  offset = o.places[k] - tip
+  one, two = wp.dot(o.one, offset), wp.dot(o.two, offset)
+  return one * one + two * two
+
+
 @wp.kernel(enable_backward=False)
 def observe(s: Common, o: PalpateState, beginning: bool):
-  """Writes field, unfelt and stiffest; `advance` wrote felt and stiffness."""
+  """Writes field, left, unfelt and expected; `advance` wrote felt."""
   w = wp.tid()
   if beginning and not s.begun[w]:
     return
   tip = vector(s.tip_pos, w)
   put(o.field, w, o.center - tip)
+  put(o.expected, w, o.likely[w] - tip)
   left = wp.int32(-1)
   for k in range(o.places.shape[0]):
     if not o.near[w, k]:
-      if left < 0 or wp.length_sq(o.places[k] - tip) < wp.length_sq(o.places[left] - tip):
+      if left < 0 or aside(o, k, tip) < aside(o, left, tip):
         left = k
+  if o.stiff[w] or left < 0:
+    left = o.side[w]
+  o.left[w, 0] = wp.where(left < 0, 0.0, 1.0)
   put(o.unfelt, w, wp.where(left < 0, wp.vec3(), o.places[wp.max(left, 0)] - tip))
-  put(o.stiffest, w, wp.where(o.top[w] < 0, wp.vec3(), o.places[wp.max(o.top[w], 0)] - tip))
 
 
 class Palpate(domain.Domain):
@@ -181,7 +223,7 @@ class Palpate(domain.Domain):
 
   struct = PalpateState
   begin, advance, observe = begin, advance, observe
-  takes = ("tolerance",)
+  takes = ("tolerance", "radius")
   tissue = ("young",)
 
   @staticmethod
@@ -199,7 +241,8 @@ class Palpate(domain.Domain):
     """Returns what else all worlds share."""
     beside = feeling.beside(task.places, task.up)
     told = {"places": task.places, "outward": task.outward, "beside": beside}
-    return told | {"center": wp.vec3(*task.center)}
+    one, two = (wp.vec3(*way) for way in feeling.across(task.up))
+    return told | {"center": wp.vec3(*task.center), "one": one, "two": two}
 
   @staticmethod
   def draw(task: Any, physics):

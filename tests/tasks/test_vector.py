@@ -13,7 +13,7 @@ from palpate.tasks import performer, registry  # noqa: E402
 
 # float32 of the batch against float64; jaws on a fold of tissue magnify it.
 LIMITS = {"contact_force": 0.02, "shaft_force": 0.02, "peak_force": 0.02, "gripper": 0.1}
-LIMITS |= {"joint_vel": 5e-3, "traction": 0.02, "stiffness": 0.1}
+LIMITS |= {"joint_vel": 5e-3, "traction": 0.02}
 ENDING = "touch/easy", "trace/easy", "grasp/easy", "retract/easy", "bimanual/easy"
 
 
