@@ -45,10 +45,11 @@ class Run(Side):
     tolerance: of its solver
     scheme: of ours
     weighs: whether MuJoCo's flex gets right weights
+    kind: one of `peer.KINDS`
   """
 
-  def __init__(self, nodes, side, h, tolerance, scheme="implicit", weighs=False):
-    m = peer.model(round(math.log((nodes - 2) / 10, 4)), side, "solid", tolerance, h)
+  def __init__(self, nodes, side, h, tolerance, scheme="implicit", weighs=False, kind="solid"):
+    m = peer.model(round(math.log((nodes - 2) / 10, 4)), side, kind, tolerance, h)
     if side == "peer":
       m.opt.tolerance = tolerance
     super().__init__(m, weighs=weighs)
@@ -61,8 +62,13 @@ class Run(Side):
   def go(self, first: int):
     """Takes a block of steps, unless it has come to its end."""
     for step in range(first, min(first + BLOCK, self.count)):
-      self.data.ctrl[0] = -0.05 * (step + 0.5) * self.h - 0.001
+      self.data.ctrl[0] = place(step, self.h)
       self.take()
+
+  def finish(self):
+    """Takes all steps."""
+    for first in range(0, self.count, BLOCK):
+      self.go(first)
 
   @property
   def force(self) -> np.ndarray:
@@ -90,22 +96,25 @@ def run(case: Case, out: pathlib.Path) -> list[Row]:
   exact = {}
   finest = (4 if case["short"] else 1) * FINEST
   for side, tolerance in (("window", 1e-6), ("peer", 1e-10)):
-    each = exact[side] = Run(nodes, side, finest, tolerance, weighs=side == "peer")
-    for first in range(0, each.count, BLOCK):
-      each.go(first)
+    exact[side] = Run(nodes, side, finest, tolerance, weighs=side == "peer")
+    exact[side].finish()
   return [
     {"nodes": nodes, **each.about, "step_ms": each.time, "second_s": each.time / (1e3 * each.h),
-     "error": error(each, exact[each.about["side"]]), "force_N": each.forces[-1]}
+     "error": error(each.force, exact[each.about["side"]].force), "force_N": each.forces[-1]}
     for each in runs
   ]  # fmt: skip
 
 
-def error(one: Run, exact: Run) -> float:
-  """Returns the RMS error of a run's forces over their peak."""
-  parts = round(one.h / exact.h)
-  ends = exact.force[::parts]
-  off = [one.force[1:] - theirs for theirs in (ends[1:], ends[:-1])]
-  return float(min(np.sqrt(np.mean(each**2)) for each in off) / np.abs(exact.force).max())
+def place(step: float, h: float) -> float:
+  """Returns where the instrument is driven in a step [m]."""
+  return -0.05 * (step + 0.5) * h - 0.001
+
+
+def error(force: np.ndarray, exact: np.ndarray) -> float:
+  """Returns the RMS error of the forces at the ends of steps over the peak, from 0 on."""
+  ends = exact[:: (len(exact) - 1) // (len(force) - 1)]
+  off = [force[1:] - theirs for theirs in (ends[1:], ends[:-1])]
+  return float(min(np.sqrt(np.mean(each**2)) for each in off) / np.abs(exact).max())
 
 
 def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
