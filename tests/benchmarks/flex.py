@@ -199,8 +199,8 @@ def stages(args: argparse.Namespace) -> list[list[Case]]:
   counts = [] if args.short else [w for w in args.worlds if w != many]
   tried += [
     (side, kind, STEPS[0], t[0], w)
-    for kind in args.kinds
     for w in counts
+    for kind in args.kinds
     for side, t in TOLERANCES.items()
   ]
   return [[
