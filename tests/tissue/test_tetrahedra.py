@@ -162,6 +162,17 @@ def test_tetrahedra_are_larger_deep_inside(scenes):
   assert size[depth > 0.025].mean() > 1.5 * size[depth < 0.005].mean()
 
 
+@pytest.mark.parametrize("name", ["ball", "box"])
+def test_between_tetrahedra_of_a_lattice_is_nothing(scenes, name):
+  # Points of a lattice lie on common spheres, four of them in a plane.
+  made = {"ball": lambda: scenes.sphere(3), "box": lambda: scenes.box((0.06, 0.05, 0.03), 0.008)}
+  points, elem = made[name]()
+  tet = fill.fill(name, topology.build(name, points, elem)).tet
+  face = np.sort(tet[:, fill.FACES].reshape(-1, 3), axis=1)
+  count = np.unique(face, axis=0, return_counts=True)[1]
+  assert (count == 1).sum() == len(elem) and count.max() == 2
+
+
 def test_tetrahedra_are_kept_and_made_again_where_a_file_is_damaged(monkeypatch, tmp_path):
   monkeypatch.setattr(fill.wp.config, "kernel_cache_dir", str(tmp_path))
   points, elem = shapes.kidney(150)
