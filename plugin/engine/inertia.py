@@ -68,7 +68,7 @@ def iterations(m, organ: Declaration, config: Config) -> int:
   """Returns how many Newton iterations a step takes, for the model's time step."""
   if not len(organ.mesh.tet) or not SCHEMES[config.integrator].ahead:
     return config.newton
-  gain = SCHEMES[config.integrator].gain(float(m.opt.timestep), config.damping)
+  gain = shape.gain(config, float(m.opt.timestep))
   return max(config.newton, solid.iterations(organ.mesh, config, masses(m, organ), gain))
 
 
@@ -81,7 +81,7 @@ def _by_itself(m, organ: Declaration, body: Body, config: Config, sample: np.nda
   if key not in _alone:
     if len(_alone) >= _KNOWN:
       _alone.pop(next(iter(_alone)))
-    gain = SCHEMES[config.integrator].gain(h, config.damping)
+    gain = shape.gain(config, h)
     terms = {key: getattr(config, key) for key in ("damping", "foundation", "bulk")}
     scratch = _scratch(body, dataclasses.replace(_compiled(organ, config), **terms))
     with _naming(organ):
@@ -99,7 +99,7 @@ def of_nodes(
   """
   h, config = float(m.opt.timestep), _compiled(organ, config)
   radius = _tool_radius(m, organ, flex)
-  gain = SCHEMES[config.integrator].gain(h, config.damping)
+  gain = shape.gain(config, h)
   scratch = _scratch(body, config)
   with _naming(organ):
     return effective_inertia(scratch, organ.mesh, mass, organ.free, h, radius, gain)

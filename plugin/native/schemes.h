@@ -61,12 +61,6 @@ PALPATE void stay(const Fields& f, Thread t, int) {
   });
 }
 
-// What a step of a solid has of its damping: the step by itself damps like h / 2 more, which is taken off
-// where there is as much, and never more than half.
-PALPATE float damping_left(float h, float damping) {
-  return damping > h ? damping - 0.5f * h : 0.5f * damping;
-}
-
 // Where the first Newton iteration stands.
 template <class Fields>
 PALPATE void predict(const Fields& f, Thread t, int) {
@@ -77,9 +71,7 @@ PALPATE void predict(const Fields& f, Thread t, int) {
     const V3 v = ld3(f.state.vel.data + 24 * at, lane);
     stand(f, at, ld3(f.state.disp.data + 24 * at, lane) + share * h * v, v, lane);
   });
-  if (t.tid > 0) return;
-  step[3] = share;
-  if (f.shape.ntetslice) step[1] = h * (h + damping_left(h, numbers(f, t.world)[DAMPING]));
+  if (t.tid == 0) step[3] = share;
 }
 
 // Takes the solution of a Newton iteration over, IS_FIRST or not; IS_MORE: more are to come.
