@@ -226,6 +226,10 @@ def test_material_and_time_step_may_change_on_a_cut_solid():
   [
     ({"depth": 0.0}, "depth is 0, expected a number > 0"),
     ({"depth": -0.01}, "depth is -0.01, expected a number > 0"),
+    ({"depth": 0.01, "direction": [0, 1]}, r"direction is .*, expected three numbers"),
+    ({"points": []}, r"points of a cut have shape \(0,\), expected \(n, 3\), n >= 2"),
+    ({"points": [[0, 0], [0, 1]]}, r"points of a cut have shape \(2, 2\)"),
+    ({"points": "round"}, "points of a cut are 'round', expected numbers"),
     ({"points": [[0, 0, 0.08], [0.01, 0, 0.08]]}, "point 0 of the path is .* m from the surface"),
     ({"points": [[-0.03, y, 0.0] for y in (-0.02, 0, 0.02)]}, "vertex .*, which is pinned"),
   ],
