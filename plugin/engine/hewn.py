@@ -12,7 +12,6 @@ import numpy as np
 from palpate.tissue import cleave, faces
 from palpate.tissue import mesh as topology
 from palpate.tissue.cut import Motion
-from palpate.tissue.ease import ease
 from palpate.tissue.mesh import Mesh
 from palpate.tissue.path import Finder
 from palpate.tissue.resolid import SolidRefill
@@ -123,12 +122,7 @@ class SolidCuts(Cuts):
     if direction is not None:
       direction = np.asarray(direction, float) @ organ.frame
     how = ~organ.free, depth, direction, w.config, given
-    found = self._cleaver.cut(organ.name, mesh, motion, points, *how)
-    if not found.changed.size:
-      return found
-    how = found.group, found.member, motion, found.motion, ~organ.free, w.config
-    goes, near = ease(mesh, found.mesh, found.changed, *how)
-    return dataclasses.replace(found, motion=goes, near=near)
+    return self._cleaver.cut(organ.name, mesh, motion, points, *how)
 
   def _report(self, found: cleave.Cut) -> cuts.Report:
     organ = self._w.organ

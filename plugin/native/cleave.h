@@ -6,6 +6,7 @@
 // far as no tetrahedron gets thin ("snap"), and the faces are opened ("split"; Nienhuys and van der Stappen
 // 2001).
 #pragma once
+#include "ease.h"
 #include "flow.h"
 #include "open.h"
 #include "settle.h"
@@ -212,7 +213,7 @@ PALPATE int share_masses(const S& m, const Opening& o, const Moving& x, const F&
 template <class S, class F>
 PALPATE bool carry(const S& m, const Opening& o, const Few& movers, const Shift* shift, const double* rest,
                    const Moving& x, const F& f, Scratch& memory) {
-  Few vert = few(memory, m.nvert), tets = few(memory, m.ntet);
+  Few tets = few(memory, m.ntet);
   D3* now = (D3*)memory.values(6 * movers.count);
   if (memory.full) return false;
   each_apart(o.parts, [&](int corner) { tets.put(corner / 4); });
@@ -227,19 +228,12 @@ PALPATE bool carry(const S& m, const Opening& o, const Few& movers, const Shift*
   }
   tets.sort(m.ntet);
   for (int i = 0; i < tets.count; ++i) f.changed.data[i] = tets.list[i];
-  for (int i = 0; i < 4 * tets.count; ++i) {
-    const int v = m.vert(4 * tets.list[i / 4] + i % 4);
-    if (!f.pinned.data[v]) vert.put(v);
-  }
-  vert.sort(m.nvert);
-  for (int i = 0; i < vert.count; ++i) f.near.data[i] = vert.list[i];
   for (int i = 0; i < movers.count; ++i) {
     const int v = movers.list[i];
     store(x.disp + 3 * v, now[2 * i]), store(x.vel + 3 * v, now[2 * i + 1]);
     store(m.rest + 3 * v, load(rest + 3 * v));
   }
-  f.found.data[FOUND_NEAR] = vert.count, f.found.data[FOUND_CHANGED] = tets.count;
-  f.found.data[FOUND_MOVED] = movers.count;
+  f.found.data[FOUND_CHANGED] = tets.count, f.found.data[FOUND_MOVED] = movers.count;
   return true;
 }
 
@@ -328,6 +322,57 @@ PALPATE Opening opening_of(Scratch& memory, int nvert, int ntet, int nouter) {
   return o;
 }
 
+// What is around a cut before it is made: the patch, its energy, what its vertices have together, and the volume
+// around each.
+struct Before { Patch patch; double energy; Sums sums; double* size; };
+
+template <class S, class F>
+PALPATE bool look_before(const S& m, const Opening& o, const Few& movers, const Neohookean& e, const Moving& x,
+                         const F& f, Before& out, Scratch& memory) {
+  out.patch = patch_of(memory, m.nvert, m.ntet), out.size = memory.values(m.nvert);
+  if (memory.full) return false;
+  Patch& p = out.patch;
+  const auto put = [&](int v) { m.each_corner(v, [&](int corner) { p.own.put(corner / 4); }); };
+  for (int i = 0; i < movers.count; ++i) put(movers.list[i]);
+  for (int k = 0; k < o.parts.count; ++k) put(o.parts.vert[k]);
+  find_patch(m, e, f.loose.data, f.foundation, f.ntriangle, p);
+  out.energy = e.has ? strain_patch(m, e, x.disp, p) : 0.0;
+  out.sums = sums_of(m, x, p.vert, f.pinned.data);
+  for (int i = 0; i < p.vert.count; ++i) out.size[p.vert.list[i]] = p.size[i];
+  return true;
+}
+
+// Lets what is around a cut go on with no more energy than it had.
+template <class S, class F>
+PALPATE bool ease(const S& m, const Neohookean& e, const Moving& x, const F& f, Before& was, Scratch& memory) {
+  Patch& p = was.patch;
+  Few apart = few(memory, m.nvert);
+  const int nsplit = f.found.data[FOUND_SPLIT];
+  double* part = memory.values(nsplit);
+  if (memory.full) return false;
+  for (int i = 0; i < nsplit; ++i) part[i] = f.share.data[i] * was.size[f.group.data[i]];
+  for (int i = 0; i < nsplit; ++i) was.size[f.member.data[i]] = part[i], apart.put(f.member.data[i]);
+  find_patch(m, e, f.loose.data, f.foundation, f.found.data[FOUND_TRIANGLES], p);
+  double had = 0.0, has = 0.0;
+  for (int i = 0; i < p.vert.count; ++i) {
+    const int v = p.vert.list[i];
+    had += x.mass[v], has += x.mass[v] *= p.size[i] / was.size[v];
+  }
+  for (int i = 0; i < p.vert.count; ++i) x.mass[p.vert.list[i]] *= had / has;
+  double most = was.energy;
+  for (int turn = 0; turn < 2; ++turn) {
+    const double more = e.has ? give_way(m, e, p, apart, most, x.disp, memory) : 0.0;
+    const double over = keep_motion(m, x, p.vert, f.pinned.data, was.sums, more > 0.0 ? more : 0.0);
+    if (!e.has || !(over > 0.0)) break;
+    most -= over;
+  }
+  int count = 0;
+  for (int i = 0; i < p.vert.count; ++i)
+    if (!f.pinned.data[p.vert.list[i]]) f.near.data[count++] = p.vert.list[i];
+  f.found.data[FOUND_NEAR] = count;
+  return true;
+}
+
 // Cuts under a sheet; returns how it went.
 template <class F, class S>
 PALPATE int cleave(const F& f, const S& m, const Sheet& sheet, const Neohookean& p, Scratch& memory) {
@@ -356,6 +401,8 @@ PALPATE int cleave(const F& f, const S& m, const Sheet& sheet, const Neohookean&
   for (int i = 0; i < 3 * m.nvert; ++i) rest[i] = m.rest[i];
   if (!settle(m, sheet, f.edge, at.where, f.pinned.data, p, movers, shift, rest, memory)) return FULL;
   const Moving x = {f.mass.data, f.disp.data, f.vel.data};
+  Before was = {};
+  if (!look_before(m, o, movers, p, x, f, was, memory)) return FULL;
   if (!carry(m, o, movers, shift, rest, x, f, memory)) return FULL;
   const int count = 3 * (f.ntriangle + 2 * o.nparting);
   open_faces(m, o, f.ntriangle, near);
@@ -363,7 +410,8 @@ PALPATE int cleave(const F& f, const S& m, const Sheet& sheet, const Neohookean&
   found[FOUND_SPLIT] = share_masses(m, o, x, f, memory);
   for (int t = f.ntriangle; t < count / 3; ++t) f.loose.data[t] = 1;
   measure_walls(m, sheet, f.edge, f.ntriangle, count / 3, f);
-  return come_loose(m, f.home.data, f.loose.data, memory) && !memory.full ? APART : FULL;
+  if (!come_loose(m, f.home.data, f.loose.data, memory)) return FULL;
+  return ease(m, p, x, f, was, memory) && !memory.full ? APART : FULL;
 }
 
 template <class Fields>

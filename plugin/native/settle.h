@@ -1,8 +1,8 @@
 // Vertices of a solid are moved onto a sheet in the rest shape, as far as its tetrahedra allow.
 #pragma once
+#include "neohookean.h"
 #include "parts.h"
 #include "sheet.h"
-#include "tet.h"
 
 namespace palpate {
 
@@ -16,13 +16,6 @@ constexpr double LIPS = 0.75;  // edges from the path within which a vertex of t
 constexpr double ALONG = 0.02;  // edges from the path within which one gives way along it
 constexpr int PASSES = 4;  // times that each goes farther by itself
 constexpr int EXACT = 3;  // times that the volume is put right
-
-// What tells the energy of tetrahedra.
-struct Neohookean {
-  bool has;
-  double given;  // by so much that around a vertex may rise
-  const double *mu, *lam, *disp;
-};
 
 // A vertex that moves to a place in a tetrahedron.
 struct Shift { int vert, corner[4]; double share, weight[4]; D3 way, lead; };

@@ -33,7 +33,7 @@ template <class F, class S>
 PALPATE double measure_tet(const F& f, const S& m, int t, D3* g) {
   D3 x[4];
   for (int c = 0; c < 4; ++c) x[c] = m.place(f.tet.data[4 * t + c]);
-  return gradients_of(x, g);
+  return slopes_of(x, g);
 }
 
 template <class F, class S>

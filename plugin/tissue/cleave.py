@@ -20,6 +20,7 @@ from .mesh import Mesh, distinct, lengths
 from .order import addresses
 from .path import Finder
 from .sheet import sweep
+from .step import OWN_SHARE
 from .surface import host_views
 from .types import CONSTANTS, allocate, doubles, flags, ints, longs, struct
 
@@ -60,6 +61,7 @@ class Cleaving:
   edge: wp.float64  # mean length of the skin's edges before the first cut [m]
   before: wp.float64  # see `sheet.Sheet.more` [m]
   after: wp.float64  # [m]
+  foundation: wp.float64  # stiffness by area [N/m^3]
   given: wp.float64  # by which the energy around a vertex may rise as it moves [J]
   rest: doubles("nvert", 3)
   tet: longs("ntet", 4)
@@ -98,7 +100,8 @@ class Cleaving:
   reals: doubles("nreal")
 
 
-_cleave = kernel("cleave_solid", "cleave.h", Cleaving, CONSTANTS | _NUMBERS)
+_CONSTANTS = CONSTANTS | _NUMBERS | {"OWN_SHARE": OWN_SHARE}
+_cleave = kernel("cleave_solid", "cleave.h", Cleaving, _CONSTANTS)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -157,7 +160,7 @@ class Cleaver:
     sizes = {"nvert": nvert, "ntet": ntet, "nelem": whole.nelem}
     sizes |= {"most": whole.ring.shape[1], "most_elem": room, "nface": 4 * ntet}
     # What native/cleave.h takes of scratch, see there.
-    sizes |= {"nint": 62 * ntet + 32 * nvert + 8 * room, "nreal": 36 * nvert + 12 * ntet + 3 * room}
+    sizes |= {"nint": 66 * ntet + 36 * nvert + 8 * room, "nreal": 64 * nvert + 22 * ntet + 3 * room}
     sizes |= {"nmouth": 3 * (room - whole.nelem), "npath": 0, "nline": 0}
     self._fields: Any = allocate(Cleaving, "cpu", sizes)
     for name in ("nvert", "ntet", "nelem", "most", "most_elem", "nint", "nreal"):
@@ -210,6 +213,8 @@ class Cleaver:
     fields.before, fields.after = sheet.more
     fields.nouter, fields.ntriangle = mesh.nouter, mesh.nelem
     fields.energy, fields.given = int(config is not None), given
+    held = config is not None and not config.carrier
+    fields.foundation = config.foundation if held else 0.0
     if config is not None and config != self._config:
       host["mu"][:], host["lam"][:] = solid.moduli(mesh, config)
       self._config = config

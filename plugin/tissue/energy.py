@@ -131,28 +131,12 @@ def of_gradients(slope: np.ndarray, mu: np.ndarray, lam: np.ndarray | float) -> 
     mu: [Pa]                                (n,)
     lam: [Pa]                               (n,)
   """
-  i, _, swelling = _changes(slope)
+  i = 2 * np.trace(slope, axis1=1, axis2=2) + (slope * slope).sum(axis=(1, 2))
+  cofactor = np.stack([np.cross(slope[:, k - 2], slope[:, k - 1]) for k in range(3)], axis=1)
+  swelling = np.trace(slope, axis1=1, axis2=2) + np.trace(cofactor, axis1=1, axis2=2)
+  swelling += (slope[:, 0] * cofactor[:, 0]).sum(axis=1)
   shape = mu / 2 * (i - np.log1p(i / 4)) - 3 / 4 * mu * swelling
   return shape + (lam + 5 / 8 * mu) / 2 * swelling**2
-
-
-def stresses(slope: np.ndarray, mu: np.ndarray, lam: np.ndarray | float) -> np.ndarray:
-  """Returns the derivative of `of_gradients` by the gradients [Pa], (n, 3, 3)."""
-  i, cofactor, swelling = _changes(slope)
-  tension = mu * (1 - 1 / (4 + i))
-  pressure = (lam + 5 / 8 * mu) * swelling - 3 / 4 * mu
-  mine = cofactor + np.trace(slope, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-  mine += np.eye(3) - slope.transpose(0, 2, 1)
-  return tension[:, None, None] * (slope + np.eye(3)) + pressure[:, None, None] * mine
-
-
-def _changes(slope: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-  """Returns tr F^T F - 3 with F = 1 + slope, the cofactors of the slope, and det F - 1."""
-  trace = np.trace(slope, axis1=1, axis2=2)
-  i = 2 * trace + (slope * slope).sum(axis=(1, 2))
-  cofactor = np.stack([np.cross(slope[:, k - 2], slope[:, k - 1]) for k in range(3)], axis=1)
-  swelling = trace + np.trace(cofactor, axis1=1, axis2=2) + (slope[:, 0] * cofactor[:, 0]).sum(axis=1)
-  return i, cofactor, swelling
 
 
 # The terms of the energy: (mesh, config, displacement) -> [J], 0 where a term is off.

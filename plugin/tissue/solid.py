@@ -17,8 +17,8 @@ from .step import OWN_SHARE
 from .types import empty
 
 # Times their own mass that nodes may be heavier in modes that the matrix makes too stiff, before a
-# step takes a second Newton iteration, and a third.
-_HEAVY = (500.0, 4e3)
+# step takes a second Newton iteration, and so on: presses that swung when they were let go.
+_HEAVY = (150.0, 400.0, 1e3, 2.5e3, 5e3)
 
 
 def capsule(config: Config) -> Config:
@@ -39,20 +39,25 @@ def skin(mesh: Mesh) -> Mesh:
   return dataclasses.replace(mesh, elem=mesh.elem[:n], loose=mesh.loose[:n])
 
 
-def gradients(mesh: Mesh, tet: np.ndarray | None = None) -> np.ndarray:
-  """Returns the gradient of each corner's share at rest [1/m], (ntet, 4, 3), or of some's."""
-  corner = mesh.rest[mesh.tet if tet is None else tet]
+def gradients(mesh: Mesh) -> np.ndarray:
+  """Returns the gradient of each corner's share at rest [1/m], (ntet, 4, 3)."""
+  corner = mesh.rest[mesh.tet]
   others = np.linalg.inv(corner[:, 1:] - corner[:, :1]).transpose(0, 2, 1)
   return np.concatenate([-others.sum(axis=1, keepdims=True), others], axis=1)
 
 
 def young(mesh: Mesh, config: Config) -> np.ndarray:
   """Returns Young's modulus of each tetrahedron [Pa], that of the nearest triangle, (ntet,)."""
-  mesh = mesh.whole
   if len(config.young) == 1:
-    return np.full(len(mesh.tet), config.young[0])
+    return np.full(len(mesh.whole.tet), config.young[0])
+  return np.asarray(config.young)[nearest_triangle(mesh)]
+
+
+def nearest_triangle(mesh: Mesh) -> np.ndarray:
+  """Returns the triangle nearest to each tetrahedron before the first cut, (ntet,)."""
+  mesh = mesh.whole
   middle = KDTree(mesh.rest[mesh.elem].mean(axis=1))
-  return np.asarray(config.young)[middle.query(mesh.rest[mesh.tet].mean(axis=1))[1]]
+  return np.asarray(middle.query(mesh.rest[mesh.tet].mean(axis=1))[1])
 
 
 def moduli(mesh: Mesh, config: Config) -> tuple[np.ndarray, np.ndarray]:

@@ -93,10 +93,10 @@ def test_a_solid_much_stiffer_in_its_matrix_than_it_is_takes_more_iterations(sce
   points, elem = scenes.sphere(2)
   made = {"elements": "solid", "poisson": 0.49}
   found = []
-  for stiff in (1e4, 1e6, 1e7):
+  for stiff in (1e4, 1e5, 1e6, 1e7):
     mesh, config, _ = scenes.kernels(points, elem, young=(stiff,), **made)
     found.append(solid.iterations(mesh, config, closed.masses(mesh), 7e-6))
-  assert found == [1, 2, 3]
+  assert found == [1, 2, 5, 6]
 
 
 @pytest.mark.parametrize("start", ["squeezed", "turned inside out", "random"])
