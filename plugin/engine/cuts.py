@@ -85,6 +85,7 @@ class Cuts:
     if not self:
       return
     bodies.unshare(w.body)
+    bodies.occupy(w.body, self.whole)
     self._make()
     self.declared = w.organ
     self.mass = w.organ.mass.copy()
@@ -188,6 +189,7 @@ class Cuts:
     touched = self._touched(mesh, changed)
     touched = topology.distinct(touched, np.flatnonzero(mass != self.mass))
     self._refill.write(mesh, changed, w.config, ~w.organ.free)
+    bodies.occupy(w.body, mesh)
     self.mass, self.source, self.stamp = mass, source, stamp
     w.organ = self.declared.cut(mesh, mass)
     w.phases.reshape(touched)

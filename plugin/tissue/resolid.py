@@ -103,10 +103,13 @@ class SolidRefill:
     which = touched if self.mesh.loose is mesh.loose else np.arange(mesh.nskin)
     area = topology.held_areas(mesh)[which]
     at = self._node[which]
+    most = np.zeros(len(self._start) - 1, int)
+    np.maximum.at(most, self._node // LANES, mesh.degree)
     return {
       "fan_node": [((row, lane[i]), offset(node))],
       "fan_rest": [((row, slice(None), lane[i]), toward)],
       "degree": [((s, lane), mesh.degree[touched])],
+      "fan_width": [(s, most[s])],
       "rest": [((s, slice(None), lane), here)],
       "free": [((s, lane), moves)],
       "area": [((at // LANES, at % LANES), area)],

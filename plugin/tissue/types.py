@@ -125,6 +125,7 @@ class Shape:
   nvert: int  # vertices
   nnode: int  # nodes: vertices padded to whole slices
   nslice: int  # slices of nodes
+  nused: int  # those that a step goes over: not the last ones, of vertices that wait for a cut
   nelemslice: int  # slices of triangles; 0 without bending
   nhingeslice: int  # slices of hinges; 0 without bending
   ntetslice: int  # slices of tetrahedra; 0 but for solids
@@ -143,6 +144,7 @@ class Shape:
   fan_rest: floats("nslot + 2 nslice", 3, 8)  # rest vector to each fan entry [m]
   fan_corner: ints("nslot + nslice", 8)  # offset of each fan triangle's normal
   fan_side: ints("nslot + nslice", 8)  # offset of its corner force at this node
+  fan_width: ints("nslice")  # rows of stiffness blocks that some node has a neighbour in
   degree: floats("nslice", 8)  # number of neighbours
   rest: floats("nslice", 3, 8)  # rest position about the centroid [m]
   area: floats("nslice", 8)  # nodal area [m^2]; 0 for padding
@@ -157,6 +159,7 @@ class Shape:
   hinge_angle0: floats("nhingeslice", 8)  # rest angle 2 sin(theta / 2) [-]
   bend_adr: ints("nslice + 1")  # first row of the bending matrix
   bend_node: ints("nbend", 8)  # node of each entry
+  bend_width: ints("nbendslice")  # rows of it that some node has an entry in
   fan_slope: floats("nsolidslot", 3, 8)  # of a neighbour's share in a node's mean gradient [1/m]
   tet_node: ints("ntetslice", 4, 8)  # offset of each corner's node
   tet_gradient: floats("ntetslice", 9, 8)  # of the shares of corners 1, 2, 3 at rest [1/m]
