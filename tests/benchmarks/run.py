@@ -39,6 +39,7 @@ BENCHES = {
   "stability": "where each scheme breaks, over a thousand runs",
   "thesis": "the tables and figures of the thesis, measured today",
   "truth": "organ forces against closed forms, other finite elements and published measurements",
+  "uncut": "steps of organs that are never cut, beside an older state of the code",
 }
 
 
