@@ -239,11 +239,13 @@ def occupy(body: Body, mesh: Mesh):
   """
   if body.device.is_cuda:
     return
-  nused = -(-(mesh.nvert - (mesh.nskin - mesh.nouter)) // LANES)
+  nused, was = -(-(mesh.nvert - (mesh.nskin - mesh.nouter)) // LANES), body.shape.nused
+  if nused == was:
+    return
   for fields in (body.fields, *([body.levels.cycle.fine] if body.levels else [])):
     fields.shape.nused = nused
-  for array in (body.state.dvel, body.system.sol):  # a mesh before may have gone on
-    array.numpy()[:, nused:] = 0.0
+  for array in (body.state.dvel, body.system.sol) if nused < was else ():
+    array.numpy()[:, nused:was] = 0.0
 
 
 def hold(body: Body) -> wp.array:

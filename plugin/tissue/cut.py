@@ -154,6 +154,7 @@ class Knife:
   def __init__(self, copy: WorkingCopy):
     self._copy, self._whole = copy, copy.whole
     self._config: Config | None = None
+    self._how: tuple = ()
     self._fields: Any = None
     self._host: dict[str, np.ndarray] = {}
     self._launch: Any = None
@@ -203,10 +204,10 @@ class Knife:
   def _make_room(self, points: np.ndarray):
     """Makes the arrays, and makes them larger for a long path."""
     whole, edge = self._whole, self._whole.edge_length
-    n = 2 * len(points) + int((lengths(np.diff(points, axis=0)) / (_SAMPLE * edge)).sum())
+    n = 2 * len(points) + int(lengths(points[1:] - points[:-1]).sum() / (_SAMPLE * edge))
     if self._fields is not None and n <= self._fields.most_points:
       return
-    n, self._config = 2 * n, None
+    n, self._config, self._how = 2 * n, None, ()
     sizes = self._copy.sizes | {"most_points": n}
     # What native/cut.h takes of scratch, see there.
     sizes["nint"] = 24 * whole.nvert + 15 * whole.nelem + 16 * n + 8 * sizes["most"] + 100
@@ -221,9 +222,10 @@ class Knife:
 
   def _put_material(self, config: Config | None, held: Springs | None, given: float):
     fields, host = self._fields, self._host
-    fields.kind = _KINDS[config.elements] if config else 0
-    fields.held, fields.given = int(held is not None), given
-    if config and config != self._config:
+    how = _KINDS[config.elements] if config else 0, int(held is not None), given
+    if how != self._how:
+      (fields.kind, fields.held, fields.given), self._how = how, how
+    if config and config is not self._config and config != self._config:
       fields.thickness, fields.stiffness = config.thickness, config.stiffness
       host["lame"][:], host["shear"][:] = configuration.lame(config, self._whole.nelem)
       self._config = config

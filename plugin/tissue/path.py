@@ -2,12 +2,15 @@
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
+import functools
+
 import numpy as np
 import warp as wp
 from scipy.spatial import KDTree
 
 from .kernels import kernel
 from .mesh import Mesh, lengths
+from .stop import Stops
 from .surface import WorkingCopy
 from .types import CONSTANTS, doubles, ints, longs, struct
 
@@ -81,6 +84,11 @@ class Finder:
     self._launch()
     spot = self._spot[:n].copy()
     return spot[:, 0].astype(int), spot[:, 1:4], spot[:, 4]
+
+  @functools.cached_property
+  def stops(self) -> Stops:
+    """What finds where paths end that come apart."""
+    return Stops(self._copy)
 
 
 def _wrap(array: np.ndarray) -> wp.array:

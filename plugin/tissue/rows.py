@@ -154,7 +154,7 @@ class Rows:
     return bool(self._found[0])
 
   def _put_material(self, config: Config):
-    if config == self._config:
+    if config is self._config or config == self._config:
       return
     nelem, springs = self._copy.whole.nelem, config.elements == "spring"
     lame, shear = configuration.lame(config, nelem)

@@ -325,6 +325,21 @@ def allocate(kind: Any, device, sizes: dict[str, int], spare: tuple[str, ...] = 
   return out
 
 
+class Views:
+  """The arrays of a struct that is on the CPU as numpy has them, each looked up once.
+
+  Args:
+    fields: the struct, whose arrays stay
+  """
+
+  def __init__(self, fields: Any):
+    self._fields = fields
+
+  def __getattr__(self, name: str) -> np.ndarray:
+    self.__dict__[name] = found = getattr(self._fields, name).numpy()
+    return found
+
+
 def fill(
   kind: Any, device, values: dict[str, Any], sizes: dict[str, int] | None = None, into: Any = None
 ):
