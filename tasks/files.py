@@ -1,10 +1,18 @@
-"""Writing files whole or not at all."""
+"""Writing files whole or not at all, and none over another."""
 
 import contextlib
 import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Any
+
+
+def free(folder: Path, name: str, ending: str) -> Path:
+  """Returns a path that is not taken; in the order of names, later ones follow."""
+  path, k = folder / f"{name}{ending}", 1
+  while path.exists():
+    path, k = folder / f"{name}_{k}{ending}", k + 1
+  return path
 
 
 @contextlib.contextmanager

@@ -33,6 +33,12 @@ def tree(path: pathlib.Path) -> ast.Module:
   return ast.parse(path.read_text(encoding="utf-8"))
 
 
+@functools.cache
+def nodes(path: pathlib.Path) -> list[ast.AST]:
+  """Returns all that a file's syntax tree has, walked once for all rules."""
+  return list(ast.walk(tree(path)))
+
+
 def name_of(path: pathlib.Path) -> str:
   return path.relative_to(ROOT).as_posix()
 
@@ -45,16 +51,17 @@ def below(folder: str) -> list[pathlib.Path]:
   return [path for path in package_files() if name_of(path).startswith(folder)]
 
 
+@functools.cache
 def strings(path: pathlib.Path) -> list[str]:
   """Returns the strings of a file but for its docstrings."""
   docs = set()
-  for node in ast.walk(tree(path)):
+  for node in nodes(path):
     body = getattr(node, "body", None)
     if isinstance(body, list) and body and isinstance(body[0], ast.Expr):
       docs.add(id(body[0].value))
   return [
     node.value
-    for node in ast.walk(tree(path))
+    for node in nodes(path)
     if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docs
   ]
 
@@ -64,12 +71,15 @@ def imports() -> list[tuple[str, str, bool]]:
   """Returns (module, what it imports, whether inside a function), of the package and of others."""
   found = []
   for module, path in modules().items():
-    inside = set()
-    for node in ast.walk(tree(path)):
-      if isinstance(node, ast.FunctionDef):
-        inside |= {id(n) for n in ast.walk(node)}
+    inside = {
+      id(within)
+      for node in nodes(path)
+      if isinstance(node, ast.FunctionDef)
+      for within in ast.walk(node)
+      if isinstance(within, ast.Import | ast.ImportFrom)
+    }
     package = module if path.name == "__init__.py" else module.rpartition(".")[0]
-    for node in ast.walk(tree(path)):
+    for node in nodes(path):
       if isinstance(node, ast.Import):
         found += [(module, alias.name, id(node) in inside) for alias in node.names]
       elif isinstance(node, ast.ImportFrom):
@@ -87,10 +97,11 @@ def is_private(name: str) -> bool:
   return name.startswith("_") and not name.startswith("__") and name != "_"
 
 
+@functools.cache
 def defined(path: pathlib.Path) -> set[str]:
   """Returns the private names that a file defines: functions, classes, variables, attributes."""
   found = set()
-  for node in ast.walk(tree(path)):
+  for node in nodes(path):
     if isinstance(node, ast.FunctionDef | ast.ClassDef):
       found.add(node.name)
     elif isinstance(node, ast.Name | ast.Attribute) and isinstance(node.ctx, ast.Store):
@@ -106,10 +117,11 @@ def private_uses(paths: list[pathlib.Path]) -> set[str]:
   found = set()
   for path in paths:
     foreign = package - defined(path)
-    for node in ast.walk(tree(path)):
+    for node in nodes(path):
       used = []
       if isinstance(node, ast.Attribute):
-        used = [] if ast.unparse(node.value) in ("self", "cls") else [node.attr]
+        own = isinstance(node.value, ast.Name) and node.value.id in ("self", "cls")
+        used = [] if own else [node.attr]
       elif isinstance(node, ast.ImportFrom) and (node.level or "palpate" in (node.module or "")):
         used = [alias.name for alias in node.names if is_private(alias.name)]
         foreign = foreign | set(used)

@@ -19,11 +19,11 @@ from sources import (
   modules,
   name_of,
   native_functions,
+  nodes,
   package_files,
   private_uses,
   strings,
   suite_files,
-  tree,
 )
 
 # Floors from the ground up; an import leads to the same floor or a lower one.
@@ -46,6 +46,7 @@ def floor(module: str) -> int:
   return FLOORS.index(names.get(room, room))
 
 
+@functools.cache
 def inner() -> list[tuple[str, str, bool]]:
   """Returns the imports of the package's own modules."""
   return [(a, b, hidden) for a, b, hidden in imports() if b in modules() and a != b]
@@ -127,7 +128,7 @@ def long_functions() -> set[str]:
   return {
     name_of(path)
     for path in [*package_files(), *suite_files()]
-    for node in ast.walk(tree(path))
+    for node in nodes(path)
     if isinstance(node, ast.FunctionDef) and node.end_lineno - node.lineno >= LARGE["function"]
   }
 
@@ -157,7 +158,7 @@ def native_in_python() -> set[str]:
     name_of(path)
     for path in package_files()
     if name_of(path) != "plugin/tissue/kernels.py"
-    for node in ast.walk(tree(path))
+    for node in nodes(path)
     if isinstance(node, ast.Attribute) and node.attr == "func_native"
   }
 
@@ -166,7 +167,7 @@ def wide_kernels() -> set[str]:
   """Returns the files with kernels of more than four arguments."""
   found = set()
   for path in package_files():
-    for node in ast.walk(tree(path)):
+    for node in nodes(path):
       if isinstance(node, ast.FunctionDef):
         marks = [ast.unparse(mark) for mark in node.decorator_list]
         if len(node.args.args) > 4 and any(re.match(r"wp\.kernel\b", mark) for mark in marks):
@@ -189,7 +190,7 @@ def calls(pattern: str, paths: list[pathlib.Path], *allowed: str) -> set[str]:
     name_of(path)
     for path in paths
     if name_of(path) not in allowed
-    for node in ast.walk(tree(path))
+    for node in nodes(path)
     if isinstance(node, ast.Call) and re.search(pattern, ast.unparse(node.func))
   }
 
@@ -202,7 +203,7 @@ def flexcomp_writers() -> set[str]:
 
 def flexcomp_in_tests() -> set[str]:
   """Returns the tests that write an organ's flexcomp; `scenes` is the one builder."""
-  allowed = ("tests/scenes.py", "tests/reference/press_explicit_20us.py")
+  allowed = ("tests/scenes/documents.py", "tests/reference/press_explicit_20us.py")
   return {
     name_of(path)
     for path in suite_files()
@@ -228,7 +229,7 @@ def model_writers() -> set[str]:
   """Returns the files but prepare.py that write to an mjModel's arrays outside of a step."""
   found = set()
   for path in [*below("plugin/engine"), *below("plugin/organ"), *below("plugin/tissue")]:
-    for node in ast.walk(tree(path)):
+    for node in nodes(path):
       targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
       for target in targets:
         text = ast.unparse(target) if isinstance(target, ast.Subscript) else ""
@@ -243,7 +244,7 @@ def scheme_comparisons() -> set[str]:
   names = {"implicit", "midpoint", "neumann", "explicit"}
   found = set()
   for path in below("plugin"):
-    for node in ast.walk(tree(path)):
+    for node in nodes(path):
       if isinstance(node, ast.Compare):
         words = [n.value for n in ast.walk(node) if isinstance(n, ast.Constant)]
         if names & {word for word in words if isinstance(word, str)}:
@@ -265,7 +266,7 @@ def literal_offsets() -> set[str]:
   boxes = r"(plugin_state|inbox|outbox|state)\b"
   found = set()
   for path in [*below("plugin/engine"), *below("plugin/organ"), *below("plugin/windows")]:
-    for node in ast.walk(tree(path)):
+    for node in nodes(path):
       if not isinstance(node, ast.Subscript) or not re.search(boxes, ast.unparse(node.value)):
         continue
       numbers = [n.value for n in ast.walk(node.slice) if isinstance(n, ast.Constant)]

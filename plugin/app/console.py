@@ -27,6 +27,13 @@ class CommandError(Exception):
     self.code = code
 
 
+def compile_error(error: Exception) -> str:
+  """Returns what the plugin said, of an error of MuJoCo's compiler, or else the whole of it."""
+  lines = str(error).splitlines()
+  said = [line for line in lines if line.startswith("palpate.organ: ")]  # MuJoCo says it twice
+  return said[0].removeprefix("palpate.organ: ") if said else str(error)
+
+
 def check_counts(args: argparse.Namespace, *names: str):
   """Raises CommandError where one of the options is no whole number >= 1."""
   for name in names:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib.metadata
 import os
 import pathlib
@@ -43,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser):
 def main(args: argparse.Namespace) -> int:
   """Prints the findings; returns 1 if something is wrong, else 0."""
   wrong = 0
-  for name, check in _CHECKS.items():
+  for name, check in CHECKS.items():
     try:
       state, lines = "ok", check()
     except Exception as error:
@@ -134,7 +135,11 @@ def _cache() -> list[str]:
   folder = pathlib.Path(wp.config.kernel_cache_dir or "")
   if not os.access(folder, os.W_OK):
     raise CommandError(f"cannot write to the kernel cache {folder}; set WARP_CACHE_PATH")
-  size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+  size = 0
+  for parent, _, names in os.walk(folder):
+    for name in names:
+      with contextlib.suppress(FileNotFoundError):  # other processes move what they have compiled
+        size += os.path.getsize(os.path.join(parent, name))
   return [f"{folder} ({size / 1e6:.1f} MB)"]
 
 
@@ -207,7 +212,7 @@ def _self_test() -> list[str]:
   return [f"press on {organ.device}: {len(samples)} steps of {1e3 * step:.2f} ms, {force:.3f} N"]
 
 
-_CHECKS: dict[str, Callable[[], list[str]]] = {
+CHECKS: dict[str, Callable[[], list[str]]] = {
   "palpate": _palpate,
   "packages": _packages,
   "devices": _devices,

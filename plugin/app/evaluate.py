@@ -71,11 +71,11 @@ def main(args: argparse.Namespace) -> int:
   check_counts(args, "episodes")
   crew = workers.chosen(args)
   palpate.register()
-  from palpate.tasks import performer, suite
+  from palpate.tasks import performer
 
   known = keeping.references(args.references)
+  name = options.task_name(args.task)
   try:
-    name = "/".join(suite.split(args.task))
     performer.find(args.policy)
   except ValueError as error:
     raise CommandError(str(error)) from None

@@ -138,14 +138,9 @@ def _page(args: argparse.Namespace) -> int:
   """Opens the page on the exercise."""
   if args.left:
     raise CommandError(f"left is {args.left!r} with --device {args.device}: the page asks for it")
-  from palpate.tasks import suite
-
   from . import serve
 
-  try:
-    name = "/".join(suite.split(args.task))
-  except ValueError as error:
-    raise CommandError(str(error)) from None
+  name = options.task_name(args.task)
   for option in ("set", "film", "states"):
     if getattr(args, option):
       raise CommandError(f"{option} is given with --device {args.device}, whose page has none")
@@ -191,8 +186,6 @@ class _Job:
 
 def _prepare(args: argparse.Namespace) -> _Job:
   """Returns the job, everything that can be wrong with it checked."""
-  from palpate.tasks import suite
-
   old, kept = None, None
   references = keeping.references(args.references)
   try:
@@ -202,7 +195,7 @@ def _prepare(args: argparse.Namespace) -> _Job:
       old, run = _replay(args.replay)
       name, seed = old.info["task"], old.info["seed"]
     else:
-      kept = keeping.read(args, "/".join(suite.split(args.task)))
+      kept = keeping.read(args, options.task_name(args.task))
       (name, run), seed = _perform(args), args.seed
   except (ValueError, OSError) as error:
     raise CommandError(str(error)) from None
@@ -230,9 +223,9 @@ def _replay(path: str):
 
 def _perform(args: argparse.Namespace):
   """Returns a task's name, and what runs an episode of it."""
-  from palpate.tasks import episode, performer, suite
+  from palpate.tasks import episode, performer
 
-  name, task_kwargs = "/".join(suite.split(args.task)), options.read(args.set)
+  name, task_kwargs = options.task_name(args.task), options.read(args.set)
   if args.device:
     return name, _by_hand(args, name, task_kwargs)
   who = args.performer or "expert"

@@ -151,7 +151,7 @@ def _command(args: argparse.Namespace) -> str:
 
 def _todo(args: argparse.Namespace) -> tuple[str, dict[str, Any], list[tuple[str, dict]]]:
   """Returns task, options, and the recordings with their own options; all are checked."""
-  from palpate.tasks import performer, suite
+  from palpate.tasks import performer
 
   chosen: dict[str, Any] = {"observations": args.observations}
   if args.size:
@@ -163,7 +163,7 @@ def _todo(args: argparse.Namespace) -> tuple[str, dict[str, Any], list[tuple[str
         raise ValueError("recordings have a task, options and actions of their own, expected none")
       task, kwargs, found = _recordings(args.recordings)
     elif args.task:
-      task = "/".join(suite.split(args.task))
+      task = options.task_name(args.task)
       performer.find(args.performer)
     else:
       raise ValueError("neither TASK nor --recordings is given")

@@ -39,6 +39,16 @@ def read(texts: list[str]) -> dict[str, Any]:
   return found
 
 
+def task_name(text: str) -> str:
+  """Returns the whole name of a task, such as `touch/standard` of `touch`."""
+  from palpate.tasks import suite
+
+  try:
+    return "/".join(suite.split(text))
+  except ValueError as error:
+    raise CommandError(str(error)) from None
+
+
 def load(name: str, task_kwargs: dict[str, Any]):
   """Returns the environment of a task with these options; CommandError says what is wrong."""
   from palpate.tasks import suite

@@ -16,7 +16,17 @@ import numpy as np
 from palpate import register
 
 from . import film
-from .console import CommandError, Interrupt, Progress, csv_rows, need, output, output_folder, table
+from .console import (
+  CommandError,
+  Interrupt,
+  Progress,
+  compile_error,
+  csv_rows,
+  need,
+  output,
+  output_folder,
+  table,
+)
 
 _NODES, _SEED = 1000, 1  # of the organ that ships
 _SIZE = (0.9, 0.7, 0.48)  # flattens the lobed ball
@@ -241,7 +251,7 @@ def _compile(path: pathlib.Path, args: argparse.Namespace):
     model = spec.compile()
     data = mujoco.MjData(model)
   except (ValueError, mujoco.FatalError) as error:
-    raise CommandError(f"scene {path.name}: {_plain(str(error))}") from None
+    raise CommandError(f"scene {path.name}: {compile_error(error)}") from None
   if model.nkey:
     mujoco.mj_resetDataKeyframe(model, data, 0)
   names = []
@@ -264,12 +274,6 @@ def _couple(spec, coupling: str, author):
       author.add_windows(spec, organ)
     elif coupling == "nodal" and windowed:
       raise CommandError(f"coupling is 'nodal', organ {organ!r} is declared with windows")
-
-
-def _plain(message: str) -> str:
-  """Returns what the plugin said, of a compile error of MuJoCo's, or else the whole of it."""
-  said = [line for line in message.splitlines() if line.startswith("palpate.organ: ")]
-  return said[0].removeprefix("palpate.organ: ") if said else message
 
 
 @contextlib.contextmanager

@@ -8,7 +8,7 @@ import pathlib
 import mujoco
 
 from . import press
-from .console import CommandError
+from .console import CommandError, compile_error
 
 
 def add_arguments(parser: argparse.ArgumentParser):
@@ -63,7 +63,7 @@ def load(args: argparse.Namespace, handle: bool) -> tuple[mujoco.MjModel, mujoco
     else:
       model = _compile(file(args.scene))
   except ValueError as error:
-    raise CommandError(str(error)) from None
+    raise CommandError(compile_error(error)) from None
   data = mujoco.MjData(model)
   reset(model, data, args.keyframe)
   return model, data
@@ -114,7 +114,7 @@ def _compile(path: pathlib.Path) -> mujoco.MjModel:
   try:
     return mujoco.MjModel.from_xml_path(str(path.absolute()))
   except (ValueError, mujoco.FatalError) as error:
-    raise CommandError(f"scene {path}: {error}") from None
+    raise CommandError(f"scene {path}: {compile_error(error)}") from None
 
 
 def first_camera(model: mujoco.MjModel) -> int:

@@ -74,13 +74,8 @@ def main(args: argparse.Namespace) -> int:
   crew = workers.chosen(args)
   need("train", "torch", "rsl_rl", "tensordict", "safetensors", "gymnasium")
   palpate.register()
-  from palpate.tasks import suite
 
-  try:
-    name = "/".join(suite.split(args.task))
-  except ValueError as error:
-    raise CommandError(str(error)) from None
-  training = Training(name, args, output_folder("out", args.out))
+  training = Training(options.task_name(args.task), args, output_folder("out", args.out))
   with Interrupt() as interrupt:
     ok = training.teach(crew, interrupt) and training.practise(interrupt)
   print(training.folder / "policy.safetensors")

@@ -17,6 +17,7 @@ from palpate.tissue.step import SCHEMES
 from palpate.tissue.types import allocate, doubles, fill, floats, ints, struct
 
 from . import beside
+from .bench import Bench
 from .parting import Cutters
 
 _LOOK = 10  # steps after which the host looks, at most
@@ -180,24 +181,31 @@ class Blades(beside.Beside):
     law, edge = self.fields.law.numpy(), self._organ.declared.mesh.edge_length
     cuts.follow()
     motion = cuts.motion(worlds)
-    for k, world in enumerate(worlds):
+
+    def work(bench: Bench, k: int):
+      world = worlds[k]
       for i in np.flatnonzero(due[world]):
         given = cutters.GIVEN * float(law[world, i, LAW.force]) * edge
-        self._open(state[world, i], due[world, i] == cutters.ENDED, given, motion, k, world)
+        ended = due[world, i] == cutters.ENDED
+        self._open(bench, state[world, i], ended, given, motion, k, world)
+
+    cuts.benches.each(work, len(worlds))
     cuts.finish(worlds, motion)
     self.fields.state.assign(state)
     self.fields.due.zero_()
 
-  def _open(self, row: np.ndarray, ended: bool, given: float, motion, k: int, world: int):
+  def _open(
+    self, bench: Bench, row: np.ndarray, ended: bool, given: float, motion, k: int, world: int
+  ):
     cuts = self._organ.topology
 
     def cut(path: np.ndarray) -> tuple[Any, Mesh]:
-      now = cutters.on_surface(cuts.finder, cuts.mesh_of(world), path, motion.disp[k])
-      report = cuts.apply(world, cuts.find(world, now, motion, k, given), motion, k)
-      return report, cuts.mesh_of(world)
+      now = cutters.on_surface(bench.finder, cuts.mesh_of(world), path, motion.disp[k])
+      found = cuts.find(bench, world, now, motion, k, given)
+      return cuts.apply(bench, world, found, motion, k), cuts.mesh_of(world)
 
     organ, mesh = self._organ.declared, cuts.mesh_of(world)
-    cutters.open_path(row, mesh, bool(ended), organ, cuts.finder, cut)
+    cutters.open_path(row, mesh, bool(ended), organ, bench.finder, cut)
 
 
 @wp.kernel(enable_backward=False)

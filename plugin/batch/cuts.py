@@ -7,6 +7,7 @@ and what has changed goes there; graphs go on as they were recorded.
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import numpy as np
 import warp as wp
@@ -17,21 +18,18 @@ from palpate.tissue import body as bodies
 from palpate.tissue import cut as cutting
 from palpate.tissue import device as devices
 from palpate.tissue import mesh as topology
-from palpate.tissue import shape, step
+from palpate.tissue import order, shape, step
 from palpate.tissue.mesh import Mesh
 from palpate.tissue.meshes import Meshes
-from palpate.tissue.order import LANES, from_slices, to_slices
-from palpate.tissue.path import Finder
-from palpate.tissue.rows import NAMES, Rows
-from palpate.tissue.surface import WorkingCopy
+from palpate.tissue.order import LANES
 from palpate.tissue.types import NUMBERS, fill
 
 from . import kernels
+from .bench import Bench, Benches
 from .patch import Surface
 
 _OWN = ("rest", "elem", "touch", "source", "share", "held")  # fields of `Patch`
 _STATE = ("corner", "place", "weight", "source", "stamp")  # blocks of the plugin state
-_READ = (*NAMES, "slot_adr", "bend_adr")  # arrays that rows are written to, and by
 _INSIDE = NUMBERS.index("bulk")  # and pressure after it
 
 
@@ -81,17 +79,14 @@ class Cuts:
     nodes = devices.patch(body.device, body.shape.nslice)
     arrays = shape.arrays(self.whole, organ.config, ~declared.free, nodes)
     still = bodies.worlds(bodies.constants(arrays, wp.get_device("cpu"), organ.config.newton))
-    self._node = still.shape.node.numpy()
-    copy = WorkingCopy(self.whole)
-    self._knife, self.finder = cutting.Knife(copy), Finder(copy)
+    node = still.shape.node.numpy()
+    self._node, self._place = node, order.offset(node)[:, None] + LANES * np.arange(3)
     own = {f"patch.{name}": np.asarray(values[name][0]) for name in _OWN}
-    self._meshes = Meshes(body, still, own)
+    self._meshes = Meshes(body, own)
     values |= {name: self._meshes.more[f"patch.{name}"] for name in _OWN}
     values["mesh"] = self._meshes.which
     self._here = {name: self._meshes.here[f"patch.{name}"] for name in _OWN}
-    parts = still.shape, still.tissue
-    there = {name: getattr(part, name) for part in parts for name in _READ if hasattr(part, name)}
-    self._rows = Rows(copy, there, self._node)
+    self.benches = Benches(functools.partial(Bench, self.whole, self._meshes, still))
     number = body.tissue.number.numpy()[:, _INSIDE : _INSIDE + 2]
     self._worlds: dict[int, World] = {}
     self._changed: set[int] = set()
@@ -171,11 +166,12 @@ class Cuts:
   # Cutting.
 
   def find(
-    self, world: int, points: np.ndarray, motion: Motion, k: int, given: float = 0.0
+    self, bench: Bench, world: int, points: np.ndarray, motion: Motion, k: int, given: float = 0.0
   ) -> cutting.Cut:
     """Returns what a cut along points in the organ's frame, (n, 3) [m], makes of a world.
 
     Args:
+      bench: where
       world: the world
       points: the path
       motion: what vertices of some worlds have
@@ -185,7 +181,7 @@ class Cuts:
     organ, had = self._organ, self._of(world)
     carried = cutting.Motion(had.mass, motion.disp[k], motion.vel[k])
     how = ~organ.declared.free, organ.config, None, given
-    found = self._knife.cut(organ.name, had.mesh, carried, points, *how)
+    found = bench.knife.cut(organ.name, had.mesh, carried, points, *how)
     kept = (getattr(found.motion, name).copy() for name in ("mass", "disp", "vel"))
     return dataclasses.replace(found, motion=cutting.Motion(*kept))
 
@@ -194,20 +190,25 @@ class Cuts:
     self.follow()
     organ, worlds = self._organ, sorted(points)
     motion = self.motion(worlds)
-    found = []
-    for k, world in enumerate(worlds):
-      local = (points[world] - organ.declared.origin) @ organ.declared.frame
+
+    def find(bench: Bench, k: int) -> cutting.Cut:
+      local = (points[worlds[k]] - organ.declared.origin) @ organ.declared.frame
       try:
-        found.append(self.find(world, local, motion, k))
+        return self.find(bench, worlds[k], local, motion, k)
       except ValueError as error:
-        raise ValueError(f"world {world}: {error}") from None
-    out: list[Report | None] = [None] * organ.body.nworld
-    for k, world in enumerate(worlds):
-      out[world] = self.apply(world, found[k], motion, k)
+        raise ValueError(f"world {worlds[k]}: {error}") from None
+
+    found = self.benches.each(find, len(worlds))
+    reports = self.benches.each(
+      lambda bench, k: self.apply(bench, worlds[k], found[k], motion, k), len(worlds)
+    )
     self.finish(worlds, motion)
+    out: list[Report | None] = [None] * organ.body.nworld
+    for world, report in zip(worlds, reports, strict=True):
+      out[world] = report
     return out
 
-  def apply(self, world: int, cut: cutting.Cut, motion: Motion, k: int) -> Report:
+  def apply(self, bench: Bench, world: int, cut: cutting.Cut, motion: Motion, k: int) -> Report:
     """Makes a world the mesh that was found, the k-th of a motion; `finish` is to come."""
     organ, had = self._organ, self._of(world)
     report = engine.report(cut, had.mesh, organ.declared, organ.config.thickness)
@@ -218,7 +219,7 @@ class Cuts:
       # Vertices that come apart inside do not make two pieces of one.
       pieces = _count(cut.mesh) if cut.mesh.loose is not had.mesh.loose else had.pieces
       now = World(cut.mesh, cut.motion.mass, source, pieces, had.reports)
-      self._become(world, had, now, cut.changed)
+      self._become(bench, world, had, now, cut.changed)
       self._changed.add(world)
       self._worlds[world].reports.append(report)
     return report
@@ -240,16 +241,16 @@ class Cuts:
     mass, source = self._organ.declared.mass.copy(), np.arange(self.whole.nvert)
     return World(self.whole, mass, source, self._whole_count)
 
-  def _become(self, world: int, had: World, now: World, changed: np.ndarray):
+  def _become(self, bench: Bench, world: int, had: World, now: World, changed: np.ndarray):
     """Writes the row of a world, in which triangles have changed."""
     organ, mesh = self._organ, now.mesh
     before, loosened = had.mesh.elem[changed], mesh.loose is not had.mesh.loose
     how = ~organ.declared.free, changed, before, loosened
     touched = topology.touched(had.mesh, mesh, changed)
-    with self._meshes.writing(world):
-      if not self._rows.write(mesh, organ.config, *how):
-        raise ValueError("cuts that meet leave no room in the bending matrix")
-      self._surface.write(self._here, mesh, now.mass, now.source, touched, changed)
+    if not bench.rows.write(mesh, organ.config, *how, self._meshes.open(world)):
+      raise ValueError("cuts that meet leave no room in the bending matrix")
+    here = {name: array[world] for name, array in self._here.items()}
+    self._surface.write(here, mesh, now.mass, now.source, touched, changed)
     self._worlds[world] = now
 
   def _upload(self, worlds: list[int]):
@@ -286,19 +287,18 @@ class Cuts:
     """Returns what the vertices of worlds have."""
     out = {}
     for name, array in self._vectors().items():
-      rows = self._get(array, worlds).reshape(len(worlds), -1, 3, LANES)
-      out[name] = np.stack([from_slices(row)[self._node] for row in rows]).astype(float)
+      out[name] = self._get(array, worlds)[:, self._place].astype(float)
     rows = self._get(self._organ.patch.force, worlds).reshape(len(worlds), -1, 3)
     return Motion(**out, force=rows[:, self._node].astype(float))
 
   def put_motion(self, worlds: list[int], motion: Motion):
     """Gives vertices of worlds their motion."""
-    shape = len(worlds), self._organ.body.shape.nnode, 3
+    shape = len(worlds), 3 * self._organ.body.shape.nnode
     for name, array in self._vectors().items():
       rows = np.zeros(shape, np.float32)
-      rows[:, self._node] = getattr(motion, name)
-      self._put(array, worlds, np.stack([to_slices(row) for row in rows]))
-    rows = np.zeros(shape, np.float32)
+      rows[:, self._place] = getattr(motion, name)
+      self._put(array, worlds, rows)
+    rows = np.zeros(shape, np.float32).reshape(len(worlds), -1, 3)
     rows[:, self._node] = motion.force
     self._put(self._organ.patch.force, worlds, rows)
 
@@ -337,7 +337,8 @@ class Cuts:
     before = self.mesh_of(world)
     mesh, changed = topology.recut(before, rest, elem, loose)
     if changed.size or mesh is not before:
-      self._become(world, self._of(world), World(mesh, mass, source, _count(mesh)), changed)
+      now = World(mesh, mass, source, _count(mesh))
+      self._become(self.benches.first, world, self._of(world), now, changed)
       self._upload([world])
     if mesh is self.whole and world in self._worlds:
       self._forget(world)
@@ -361,10 +362,7 @@ def _count(mesh: Mesh) -> int:
 def _carry(motion: Motion, k: int, cut: cutting.Cut, free: np.ndarray):
   """Gives the vertices of the k-th world of a motion what a cut makes of it."""
   motion.disp[k], motion.vel[k] = cut.motion.disp, cut.motion.vel
-  group, member = cut.group, cut.member
-  share = cut.share[free[member]][:, None]
-  group, member = group[free[member]], member[free[member]]
-  motion.force[k, member] = share * motion.force[k, group]
-  for name in ("last", "before"):
-    values = getattr(motion, name)
-    values[k, member] = values[k, group]
+  moves = free[cut.member]
+  group, member, share = cut.group[moves], cut.member[moves], cut.share[moves]
+  motion.force[k, member] = share[:, None] * motion.force[k, group]
+  motion.last[k, member], motion.before[k, member] = motion.last[k, group], motion.before[k, group]

@@ -5,7 +5,7 @@
 import mujoco
 import numpy as np
 import warp as wp
-from palpate.engine import coupling, slots
+from palpate.engine import coupling, inertia, mjstruct, slots
 from palpate.engine.coupling import Crossing
 from palpate.engine.layout import GEOM
 from palpate.tissue import step
@@ -127,7 +127,7 @@ def launch(kernel, patch, nworld: int, count: int, device, arg: int = 0):
   kernel.launch(device, nworld, nthread, arg, patch, _BLOCK)
 
 
-def constants(body, organ, tools: np.ndarray, model: mujoco.MjModel, inertia, surface) -> dict:
+def constants(body, organ, tools: np.ndarray, model: mujoco.MjModel, met, surface) -> dict:
   """Returns the fields of `Patch` that say what the organ is and which tools it meets.
 
   Args:
@@ -135,7 +135,7 @@ def constants(body, organ, tools: np.ndarray, model: mujoco.MjModel, inertia, su
     organ: its declaration
     tools: geoms that the slots follow
     model: the compiled scene
-    inertia: effective inertia of every vertex [kg]
+    met: effective inertia of every vertex [kg]
     surface: makes what follows from a mesh
   """
   mesh, skin = organ.mesh, _skin(organ, model)
@@ -163,7 +163,7 @@ def constants(body, organ, tools: np.ndarray, model: mujoco.MjModel, inertia, su
     node=node,
     free=by_node(organ.free),
     mass=by_node(organ.mass),
-    inertia=np.tile(by_node(inertia, 1.0), (len(GRADES), 1)),
+    inertia=np.tile(by_node(met, 1.0), (len(GRADES), 1)),
     mesh=np.zeros(body.nworld),
     **{name: values[None] for name, values in own.items()},
     near_adr=np.concatenate([[0], np.cumsum(count)]),
@@ -189,7 +189,7 @@ class Surface:
     self._node, self._nnode = body.shape.node.numpy(), body.shape.nnode
     self._organ = organ
     self._reach = _skin(organ, model) + float(model.geom_margin[tools].max(initial=0.0))
-    mass = organ.mass if organ.windows else model.body_mass[organ.body]
+    mass = inertia.masses(mjstruct.Model.from_address(model._address), organ)
     if organ.windows:
       self._held = slots.hold(organ, mass)
     else:

@@ -7,10 +7,9 @@ have made a corner of a tetrahedron that it has: the rest follows, see `faces.re
 from __future__ import annotations
 
 import dataclasses
-import functools
 
 import numpy as np
-from palpate.tissue import cleave, energy, faces
+from palpate.tissue import cleave, faces
 from palpate.tissue import mesh as topology
 from palpate.tissue.cut import Motion
 from palpate.tissue.mesh import Mesh
@@ -18,7 +17,7 @@ from palpate.tissue.path import Finder
 from palpate.tissue.resolid import SolidRefill
 from palpate.tissue.surface import WorkingCopy
 
-from . import cuts, flexes
+from . import coupling, cuts, flexes
 from .cuts import Cuts
 from .walls import Walls
 
@@ -46,6 +45,8 @@ class SolidCuts(Cuts):
   def _make(self):
     self._refill = SolidRefill(self._w.body, self.whole)
     self.finder = Finder(WorkingCopy(self.whole))
+    room = coupling.spans(self._w.organ)["corner"]
+    self._cleaver = cleave.Cleaver(self.whole, self.finder, room.stop - room.start)
     self.seat = np.zeros(0, np.int64)
 
   def show(self):
@@ -117,19 +118,8 @@ class SolidCuts(Cuts):
       self.seat = np.zeros(0, np.int64)
     if direction is not None:
       direction = np.asarray(direction, float) @ organ.frame
-    found = cleave.cut(
-      organ.name,
-      mesh,
-      motion,
-      points,
-      ~organ.free,
-      depth,
-      direction,
-      functools.partial(energy.of_tets, mesh, w.config),
-      given,
-      len(self._own["corner"]),
-    )
-    return dataclasses.replace(found, mesh=_freed(found.mesh))
+    how = ~organ.free, depth, direction, w.config, given
+    return self._cleaver.cut(organ.name, mesh, motion, points, *how)
 
   def _report(self, found: cleave.Cut) -> cuts.Report:
     organ = self._w.organ
@@ -138,23 +128,3 @@ class SolidCuts(Cuts):
     return cuts.Report(
       found.length, found.area, path, found.deviation, nodes, found.stopped, found.depth
     )
-
-
-def _freed(mesh: Mesh) -> Mesh:
-  """Returns the solid with the triangles of its skin marked that the foundation let go of.
-
-  Of what it held together until now, it goes on to hold the largest piece.
-  """
-  whole = mesh.whole
-  if mesh.uncut is None:
-    return mesh
-  assert mesh.loose is not None
-  n, loose = whole.nelem, mesh.loose.copy()
-  area = topology.lengths(topology.area_vectors(mesh.rest, mesh.elem[:n]))
-  piece = topology.pieces(mesh)[mesh.elem[:n, 0]]
-  for part in np.unique(whole.home):
-    held = (whole.home == part) & ~loose[:n]
-    size = np.bincount(piece[held], area[held])
-    if (size > 0).sum() > 1:
-      loose[:n] |= held & (piece != np.argmax(size))
-  return dataclasses.replace(mesh, loose=loose)

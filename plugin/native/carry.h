@@ -1,27 +1,10 @@
 // What moves goes on as it moved: masses, displacements and velocities after a cut.
 #pragma once
 #include "snap.h"
+#include "spin.h"
 #include "split.h"
 
 namespace palpate {
-
-// Of vertices.
-struct Moving { double *mass, *disp, *vel; };
-
-constexpr double LITTLE = 1e-6;  // of the largest moment of inertia
-
-// The slow rotation that has a given spin; none about an axis with hardly any inertia.
-PALPATE D3 rotation_of(double (*inertia)[3], D3 spin) {
-  double axes[3][3], largest = 0.0;
-  find_axes(inertia, axes);
-  for (int k = 0; k < 3; ++k) largest = inertia[k][k] > largest ? inertia[k][k] : largest;
-  D3 out = {0.0, 0.0, 0.0};
-  for (int k = 0; k < 3; ++k) {
-    const D3 axis = {axes[0][k], axes[1][k], axes[2][k]};
-    if (inertia[k][k] > LITTLE * largest) out += (dot(axis, spin) / inertia[k][k]) * axis;
-  }
-  return out;
-}
 
 // Vertices get the displacement of where they were moved to, and those around keep momentum and angular
 // momentum: a slow rotation of them all about their centre. `from` has where moved ones were at rest;
@@ -29,8 +12,7 @@ PALPATE D3 rotation_of(double (*inertia)[3], D3 spin) {
 template <class S>
 PALPATE void carry_motion(const S& m, const Moving& x, const Move* move, int nmove, const D3* from,
                           const Few& vert) {
-  D3 spin = {0.0, 0.0, 0.0}, centre = spin;
-  double total = 0.0;
+  D3 spin = {0.0, 0.0, 0.0};
   for (int i = 0; i < nmove; ++i) {
     const int v = move[i].vert;
     const D3 disp = load(x.disp + 3 * v), now = disp + move[i].share * move[i].lead;
@@ -38,28 +20,7 @@ PALPATE void carry_motion(const S& m, const Moving& x, const Move* move, int nmo
     if (vert.has(v)) spin += x.mass[v] * cross(back, load(x.vel + 3 * v));
     store(x.disp + 3 * v, now);
   }
-  if (vert.count < 3) return;
-  for (int i = 0; i < vert.count; ++i) {
-    const int v = vert.list[i];
-    centre += x.mass[v] * (m.place(v) + load(x.disp + 3 * v));
-    total += x.mass[v];
-  }
-  centre = (1.0 / total) * centre;
-  double inertia[3][3] = {};
-  for (int i = 0; i < vert.count; ++i) {
-    const int v = vert.list[i];
-    const D3 arm = m.place(v) + load(x.disp + 3 * v) - centre;
-    const double a[3] = {arm.x, arm.y, arm.z}, square = dot(arm, arm);
-    for (int k = 0; k < 9; ++k)
-      inertia[k / 3][k % 3] += x.mass[v] * ((k / 3 == k % 3 ? square : 0.0) - a[k / 3] * a[k % 3]);
-  }
-  if (spin == D3{0.0, 0.0, 0.0}) return;
-  const D3 omega = rotation_of(inertia, spin);
-  for (int i = 0; i < vert.count; ++i) {
-    const int v = vert.list[i];
-    const D3 arm = m.place(v) + load(x.disp + 3 * v) - centre;
-    store(x.vel + 3 * v, load(x.vel + 3 * v) + cross(omega, arm));
-  }
+  add_spin(m.rest, x, vert, spin);
 }
 
 // Vertices that were one share its mass by area; `share` gets their parts of it.

@@ -337,10 +337,24 @@ PALPATE void count_bends(const Fields& f, Thread t, int) {
   }
 }
 
+// The same with the arrays that are written to some words on, all of which are of 32 bits.
+template <class F>
+PALPATE F skipped(F f) {
+  const auto n = f.skip;
+  f.fan_node.data += n, f.fan_rest.data += n, f.fan_corner.data += n, f.fan_side.data += n;
+  f.degree.data += n, f.rest.data += n, f.area.data += n, f.free.data += n;
+  f.elem_node.data += n, f.elem_rest.data += n, f.elem_hinge.data += n;
+  f.hinge_node.data += n, f.hinge_rest.data += n, f.hinge_elem.data += n, f.hinge_near.data += n;
+  f.bend_node.data += n, f.fan_metric.data += n, f.fan_spring.data += n;
+  f.hinge_gain.data += n, f.bend_gain.data += n, f.bend_diag.data += n;
+  return f;
+}
+
 // Writes the rows; `found` says whether the bending matrix had room, nothing was written otherwise.
 template <class Fields>
-PALPATE void fill_rows(const Fields& f, Thread t, int) {
+PALPATE void fill_rows(const Fields& fields, Thread t, int) {
   if (t.tid) return;
+  const Fields f = skipped(fields);
   const auto m = surface_of(f.surface, t.world);
   Scratch memory = {f.ints.data, f.reals.data, f.nint, f.nreal, false};
   f.found.data[0] = write_rows(f, m, memory);

@@ -174,6 +174,8 @@ PALPATE Spot nearest_around(const S& m, const double* x, D3 point, const int* ve
 }
 
 constexpr double BOX = 3.0;  // edges from points within which they are found sooner
+constexpr int MIDDLES = 12;  // triangles around a point of a solid's skin among which the nearest is
+constexpr double TIE = 1e-9;  // edges by which a triangle must be nearer than one with a nearer middle
 constexpr int NEAR = 6;  // vertices nearest to a point around which its triangle is looked for
 
 // Finds those of a few vertices, all `n` where `among` is null, that are nearest to a point; returns
@@ -194,32 +196,80 @@ PALPATE int nearest_vertices(const double* x, D3 p, const int* among, int n, int
   return count;
 }
 
+// The box around points, and some room.
+struct Box {
+  D3 low, high;
+
+  PALPATE Box(const double* point, int n, double room) : low(load(point)), high(low) {
+    const D3 zero = {0.0, 0.0, 0.0}, more = {room, room, room};
+    for (int i = 1; i < n; ++i) {
+      high = vmax(high, load(point + 3 * i));
+      low = zero - vmax(zero - low, zero - load(point + 3 * i));
+    }
+    low = low - more, high = high + more;
+  }
+  PALPATE bool has(D3 a) const {
+    const D3 off = vmax(low - a, a - high);
+    return off.x <= 0.0 && off.y <= 0.0 && off.z <= 0.0;
+  }
+};
+
 // Finds the spots of a surface that are nearest to points, which `put` gets: looked for in a box around
-// all points first, whose vertices `box` gets.
+// all points first, whose vertices `inside` gets.
 template <class S, class Put>
 PALPATE void nearest_spots(const S& m, const double* x, int nouter, const double* point, int n,
-                           double edge, int* box, Put put) {
+                           double edge, int* inside, Put put) {
   const double room = BOX * edge;
-  D3 low = load(point), high = low;
-  const D3 zero = {0.0, 0.0, 0.0}, more = {room, room, room};
-  for (int i = 1; i < n; ++i) {
-    high = vmax(high, load(point + 3 * i));
-    low = zero - vmax(zero - low, zero - load(point + 3 * i));
-  }
-  low = low - more, high = high + more;
-  int inside = 0;
-  for (int v = 0; v < nouter; ++v) {
-    const D3 a = load(x + 3 * v), off = vmax(low - a, a - high);
-    if (off.x <= 0.0 && off.y <= 0.0 && off.z <= 0.0) box[inside++] = v;
-  }
+  const Box box(point, n, room);
+  int count = 0;
+  for (int v = 0; v < nouter; ++v)
+    if (box.has(load(x + 3 * v))) inside[count++] = v;
   const int want = NEAR < nouter ? NEAR : nouter;
   for (int i = 0; i < n; ++i) {
     int near[NEAR];
     double last;
-    int count = nearest_vertices(x, load(point + 3 * i), box, inside, near, last);
-    if (count < want || last > room * room)
-      count = nearest_vertices(x, load(point + 3 * i), nullptr, nouter, near, last);
-    INLINED put(i, nearest_around(m, x, load(point + 3 * i), near, count));
+    int found = nearest_vertices(x, load(point + 3 * i), inside, count, near, last);
+    if (found < want || last > room * room)
+      found = nearest_vertices(x, load(point + 3 * i), nullptr, nouter, near, last);
+    INLINED put(i, nearest_around(m, x, load(point + 3 * i), near, found));
+  }
+}
+
+// The same of the skin of a solid: among those triangles whose middles are nearest.
+template <class S, class Put>
+PALPATE void nearest_of_skin(const S& m, const double* x, const double* point, int n, double edge,
+                             int* inside, Put put) {
+  const Box box(point, n, BOX * edge);
+  const auto middle = [&](int t) {
+    const auto* vert = m.elem + 3 * t;
+    return (1.0 / 3.0) * (load(x + 3 * vert[0]) + load(x + 3 * vert[1]) + load(x + 3 * vert[2]));
+  };
+  int count = 0;
+  for (int t = 0; t < m.nelem; ++t)
+    if (box.has(middle(t))) inside[count++] = t;
+  const bool few = count < MIDDLES;
+  for (int i = 0; i < n; ++i) {
+    const D3 p = load(point + 3 * i);
+    double far[MIDDLES];
+    int near[MIDDLES], found = 0;
+    for (int j = 0; j < (few ? m.nelem : count); ++j) {
+      const int t = few ? j : inside[j];
+      const D3 arm = middle(t) - p;
+      const double d = dot(arm, arm);
+      if (found == MIDDLES && d >= far[MIDDLES - 1]) continue;
+      int k = found < MIDDLES ? found++ : MIDDLES - 1;
+      for (; k > 0 && far[k - 1] > d; --k) far[k] = far[k - 1], near[k] = near[k - 1];
+      far[k] = d, near[k] = t;
+    }
+    Spot out = {0, {1.0, 0.0, 0.0}, 1e300};
+    for (int k = 0; k < found; ++k) {
+      D3 corner[3];
+      for (int c = 0; c < 3; ++c) corner[c] = load(x + 3 * m.elem[3 * near[k] + c]);
+      const D3 w = barycentric(p, corner);
+      const double off = norm(blend(corner, w) - p);
+      if (off < out.far - TIE * edge) out = {near[k], w, off};  // on an edge that of the nearer middle
+    }
+    INLINED put(i, out);
   }
 }
 

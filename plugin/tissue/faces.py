@@ -14,40 +14,11 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse import csgraph
 
-from .fill import FACES, joined, volumes
+from .fill import FACES, joined
 from .mesh import Mesh, among, build, cross, distinct
 
 MORE = 6  # neighbours beyond those of any vertex that one may have by cuts
 _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
-
-
-class Crowded(ValueError):
-  """Some vertices have no room for their neighbours: `vertices`."""
-
-  def __init__(self, vertices: np.ndarray):
-    super().__init__("vertices have no room for their neighbours")
-    self.vertices = vertices
-
-
-@dataclasses.dataclass(frozen=True)
-class Split:
-  """What became of vertices.
-
-  Attributes:
-    mesh: the solid, its faces opened
-    changed: tetrahedra that are not as they were       (n,)
-    group: vertices that were one, which                (m,)
-    member: those vertices, old and new                 (m,)
-    share: their part of its volume                     (m,)
-    seat: of each member, a corner that it has, see `restored`  (m,)
-  """
-
-  mesh: Mesh
-  changed: np.ndarray
-  group: np.ndarray
-  member: np.ndarray
-  share: np.ndarray
-  seat: np.ndarray
 
 
 def cuttable(surface: Mesh, solid: Mesh) -> Mesh:
@@ -203,13 +174,6 @@ def corner_face(corner: np.ndarray) -> np.ndarray:
   return corner[:, 0] // 4 * 4 + 6 - (corner % 4).sum(axis=1)
 
 
-def mates_now(mesh: Mesh) -> np.ndarray:
-  """Returns the face on the other side of each, -1 for none or where it was opened, (4 ntet,)."""
-  out = mesh.whole.mate.copy()
-  out[opened(mesh)] = -1
-  return out
-
-
 def around(tet: np.ndarray, mate: np.ndarray, vert: np.ndarray, nvert: int):
   """Returns what is around vertices, in parts that hang together.
 
@@ -244,73 +208,6 @@ def around(tet: np.ndarray, mate: np.ndarray, vert: np.ndarray, nvert: int):
   return corner, rank[part], own[first], corner[first]
 
 
-def split(
-  mesh: Mesh, rest: np.ndarray, face: np.ndarray, renew: np.ndarray | None = None
-) -> Split | None:
-  """Returns a solid whose faces come apart, None where there are too few spare vertices.
-
-  Args:
-    mesh: the solid
-    rest: rest positions of its vertices [m]    (nvert, 3)
-    face: faces, one of each pair               (n,)
-    renew: vertices on the skin that become spare ones, since these have more room
-
-  Raises:
-    Crowded: vertices of the solid have no room for their neighbours.
-  """
-  mate = mates_now(mesh)
-  face, parts = _without_idle(mesh, mate, face)
-  corner, part, vert, first = parts
-  inner = mesh.nskin
-  alone = np.bincount(vert, minlength=mesh.nvert)[vert] == 1
-  size = np.bincount(part, minlength=len(vert))
-  # The largest part of a vertex on the surface keeps its number.
-  order = np.lexsort((-size, vert))
-  lead = np.append(True, np.diff(vert[order]) != 0) if len(vert) else np.zeros(0, bool)
-  keeps = np.zeros(len(vert), bool)
-  keeps[order[lead]] = True
-  keeps &= (vert < inner) & ~among(mesh.nvert, [] if renew is None else renew)[vert]
-  new = np.flatnonzero(~keeps)
-  if mesh.nouter + len(new) > inner:
-    return None
-  name = vert.copy()
-  name[new] = mesh.nouter + np.arange(len(new))
-  tet = mesh.tet.copy()
-  tet.ravel()[corner] = name[part]
-  both = np.stack([face, mate[face]], axis=1).ravel()
-  of_tet = np.concatenate([mesh.of_tet, corners(both)])
-  rest = rest.copy()
-  rest[name] = rest[vert]
-  try:
-    made, changed = grown(mesh, rest, tet, of_tet)
-  except Crowded as crowd:
-    source = np.arange(mesh.nvert)
-    source[name] = vert
-    tight = distinct(source[crowd.vertices])
-    on_skin = tight[tight < mesh.whole.nouter]
-    had = on_skin[:0] if renew is None else renew
-    if not np.isin(on_skin, had).all():
-      return split(mesh, rest, face, distinct(on_skin, had))
-    raise Crowded(tight) from None
-  volume = np.bincount(part, volumes(rest, tet[corner // 4]), len(vert))
-  share = volume / np.bincount(vert, volume, mesh.nvert)[vert]
-  some = ~(alone & keeps)
-  return Split(made, changed, vert[some], name[some], share[some], first[some])
-
-
-def _without_idle(mesh: Mesh, mate: np.ndarray, face: np.ndarray):
-  """Returns faces without those that part nothing, and `around` their vertices."""
-  while True:
-    cut = mate.copy()
-    cut[face] = cut[mate[face]] = -1
-    vert = mesh.tet[face // 4][np.arange(len(face))[:, None], _OTHERS[face % 4]]
-    parts = around(mesh.tet, cut, distinct(vert), mesh.nvert)
-    idle = (np.bincount(parts[2], minlength=mesh.nvert)[vert] == 1).all(axis=1)
-    if not idle.any():
-      return face, parts
-    face = face[~idle]
-
-
 def grown(mesh: Mesh, rest: np.ndarray, tet: np.ndarray, of_tet: np.ndarray):
   """Returns a solid with other rest positions, corners and triangles, of the same whole.
 
@@ -318,7 +215,7 @@ def grown(mesh: Mesh, rest: np.ndarray, tet: np.ndarray, of_tet: np.ndarray):
     the solid, and the tetrahedra that are not as they were, ascending
 
   Raises:
-    Crowded: vertices have no room for their neighbours.
+    ValueError: vertices have no room for their neighbours.
   """
   whole = mesh.whole
   apart = (tet != mesh.tet).any(axis=1)
@@ -332,9 +229,8 @@ def grown(mesh: Mesh, rest: np.ndarray, tet: np.ndarray, of_tet: np.ndarray):
   vert = distinct(tet[apart], mesh.tet[apart])
   ring, degree = mesh.ring.copy(), mesh.degree.copy()
   near, degree[vert] = _rings(tet, vert, mesh.nvert)
-  crowded = np.flatnonzero(degree > room(mesh))
-  if crowded.size:
-    raise Crowded(crowded)
+  if (degree > room(mesh)).any():
+    raise ValueError("vertices have no room for their neighbours")
   ring[vert] = -1
   ring[vert, : near.shape[1]] = near
   changes = dict(rest=rest, elem=elem, tet=tet, of_tet=of_tet, ring=ring, degree=degree)

@@ -7,7 +7,6 @@ on the host, by what writes a cut into a body, and go to the device as they are.
 
 from __future__ import annotations
 
-import contextlib
 from typing import Any
 
 import numpy as np
@@ -28,20 +27,6 @@ _WARP = {np.dtype(np.int32): wp.int32, np.dtype(np.float32): wp.float32,
 
 
 @wp.kernel(enable_backward=False)
-def _begin(row: wp.array[int], memory: wp.array2d[int]):
-  k, i = wp.tid()
-  memory[row[k], i] = memory[0, i]
-
-
-@wp.kernel(enable_backward=False)
-def _put(
-  row: wp.array[int], at: wp.array[int], word: wp.array[int], memory: wp.array2d[int]
-):
-  i = wp.tid()
-  memory[row[i], at[i]] = word[i]
-
-
-@wp.kernel(enable_backward=False)
 def _turn(world: wp.array[int], more: wp.array3d[float], angle: wp.array3d[float]):
   k, s, lane = wp.tid()
   w = world[k]
@@ -53,17 +38,16 @@ class Meshes:
 
   Args:
     body: the body, whose shape and tissue become views of the first row
-    still: the same on the CPU, with one world, whose arrays become those that are written
     more: arrays of the first mesh besides, by names of their own
 
   Attributes:
     which: which mesh each world has, the first one at first (nworld,)
     more: views of those arrays, with a row a mesh
-    body: the body on the CPU, see `writing`
-    here: all arrays there by name
+    here: the same on the host, with a row a world
+    arrays: all arrays of the first of these rows; those of others are `open` words on
   """
 
-  def __init__(self, body: Body, still: Body, more: dict[str, np.ndarray]):
+  def __init__(self, body: Body, more: dict[str, np.ndarray]):
     self._device = body.device
     arrays = {name: getattr(body.shape, name) for name in _OF_SHAPE}
     arrays |= {name: getattr(body.tissue, name) for name in _OF_TISSUE}
@@ -77,12 +61,11 @@ class Meshes:
     self._first = np.zeros(self.nword, np.int32)
     for name in names:
       self.of(self._first)[name][...] = values[name]
-    self._rows: dict[int, np.ndarray] = {}  # of the worlds that have been cut
-    self._new: dict[int, list[np.ndarray]] = {}  # what the device has not got of them yet
-    self._there: set[int] = set()  # worlds whose row it has
-    self._open = self._first.copy()
-    self.here, self.body = self.of(self._open), still
-    _point(still.fields, self._views(self._open.ctypes.data, still.device))
+    # Memory that the system gives when it is written to.
+    self._rows = np.empty((body.nworld, self.nword), np.int32)
+    self._begun: set[int] = set()  # worlds that have been cut
+    self.arrays = self._views(self._rows.ctypes.data, wp.get_device("cpu"))
+    self.here = {name: self.of(self._rows)[name] for name in more}
     nrow = 1 + body.nworld
     self._memory = wp.zeros((nrow, self.nword), dtype=int, device=self._device)
     first = wp.array(self._first, dtype=int, device=self._device)
@@ -95,11 +78,11 @@ class Meshes:
     self.more, self._angle = {name: views[name] for name in more}, views["hinge_angle0"]
 
   def of(self, row: np.ndarray) -> dict[str, np.ndarray]:
-    """Returns the arrays of a row that is on the host."""
+    """Returns the arrays of a row that is on the host, or of several."""
     out = {}
     for name, like in self._like.items():
-      part = row[self._start[name] :][: like.nbytes // 4]
-      out[name] = part.view(like.dtype).reshape(like.shape)
+      part = row[..., self._start[name] :][..., : like.nbytes // 4]
+      out[name] = part.view(like.dtype).reshape(*row.shape[:-1], *like.shape)
     return out
 
   def _views(self, ptr: int, device: Any, nrow: int = 0) -> dict[str, wp.array]:
@@ -115,53 +98,31 @@ class Meshes:
 
   def heal(self, world: int):
     """Forgets the row of a world, which has the first mesh again."""
-    self._rows.pop(world, None)
-    self._new.pop(world, None)
-    self._there.discard(world)
+    self._begun.discard(world)
 
-  @contextlib.contextmanager
-  def writing(self, world: int):
-    """Lets `body` and `here` have the row of a world, that of the first mesh until it is written.
-
-    What is written to them is kept unless an error is raised.
-    """
-    if world not in self._rows:
-      self._rows[world], self._new[world] = self._first.copy(), []
-    row = self._rows[world]
-    self._open[:] = row
-    yield
-    at = np.flatnonzero(self._open != row).astype(np.int32)
-    row[at] = self._open[at]
-    self._new.setdefault(world, []).append(at)
+  def open(self, world: int) -> int:
+    """Makes a world's row that of the first mesh where it has none; returns where it starts."""
+    if world not in self._begun:
+      self._rows[world] = self._first
+      self._begun.add(world)
+    return world * self.nword
 
   def upload(self, worlds: list[int]):
-    """Writes what has changed in rows of worlds to the device, which have them from then on."""
-    fresh = [1 + world for world in worlds if world not in self._there]
-    if fresh:
-      rows = wp.array(fresh, dtype=int, device=self._device)
-      dim = (len(fresh), self.nword)
-      wp.launch(_begin, dim=dim, inputs=[rows, self._memory], device=self._device)
-    found = [(world, _union(self._new.pop(world))) for world in worlds]
-    row = np.repeat(1 + np.array(worlds), [len(at) for _, at in found])
-    at = np.concatenate([at for _, at in found])
-    word = np.concatenate([self._rows[world][at] for world, at in found])
-    inputs = [wp.array(each, dtype=int, device=self._device) for each in (row, at, word)]
-    wp.launch(_put, dim=len(row), inputs=[*inputs, self._memory], device=self._device)
-    self._there |= set(worlds)
+    """Writes the rows of worlds, ascending, to the device, which have them from then on."""
+    there, here = self._memory.flatten(), wp.array(self._rows.ravel(), device="cpu", copy=False)
+    ends = np.flatnonzero(np.diff(worlds) > 1) + 1
+    for run in np.split(np.array(worlds), ends):
+      start, count = int(run[0]) * self.nword, len(run) * self.nword
+      wp.copy(there, here, dest_offset=start + self.nword, src_offset=start, count=count)
     which = self.which.numpy()
     which[worlds] = 1 + np.array(worlds)
     self.which.assign(which)
-
 
   def angle(self, worlds: list[int], more: wp.array):
     """Adds to the rest angles of the hinges of worlds; `more` has a row for every world."""
     at = wp.array(worlds, dtype=int, device=self._device)
     dim = (len(worlds), *self._angle.shape[1:])
     wp.launch(_turn, dim=dim, inputs=[at, more, self._angle], device=self._device)
-
-
-def _union(parts: list[np.ndarray]) -> np.ndarray:
-  return parts[0] if len(parts) == 1 else np.unique(np.concatenate(parts))
 
 
 def _point(fields: Any, views: dict[str, wp.array]):

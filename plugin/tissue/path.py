@@ -6,7 +6,6 @@ import functools
 
 import numpy as np
 import warp as wp
-from scipy.spatial import KDTree
 
 from .kernels import kernel
 from .mesh import Mesh, lengths
@@ -14,15 +13,14 @@ from .stop import Stops
 from .surface import WorkingCopy
 from .types import CONSTANTS, doubles, ints, longs, struct
 
-_BOX = 3.0  # edges from points within which a solid's triangles are looked at first
-_AROUND = 12  # triangles around a point of a solid's skin among which the nearest is
-
 
 @struct
 class Nearest:
   """A surface, and what is asked of it; see `nearest`."""
 
   nvert: int
+  nelem: int
+  solid: int  # whether it is the skin of a solid, whose rings are others
   most: int  # neighbours that a vertex has room for
   nouter: int
   npoint: int
@@ -32,7 +30,7 @@ class Nearest:
   degree: longs("nvert")
   x: doubles("nvert", 3)  # where the vertices are [m]
   point: doubles("npoint", 3)
-  box: ints("nvert")  # scratch
+  box: ints("nvert + nelem")  # scratch
   spot: doubles("npoint", 5)  # triangle, weights of its corners, distance [m]
 
 
@@ -49,9 +47,10 @@ class Finder:
   def __init__(self, copy: WorkingCopy):
     self._copy, whole, there = copy, copy.whole, copy.fields
     self._fields = fields = Nearest()
-    fields.nvert, fields.most, fields.edge = whole.nvert, copy.sizes["most"], whole.edge_length
+    fields.nvert, fields.nelem, fields.solid = whole.nvert, whole.nelem, int(len(whole.tet) > 0)
+    fields.most, fields.edge = copy.sizes["most"], whole.edge_length
     fields.elem, fields.spoke, fields.degree = there.elem[0], there.spoke[0], there.degree[0]
-    self._x, self._box = np.zeros((whole.nvert, 3)), np.zeros(whole.nvert, np.int32)
+    self._x, self._box = np.zeros((whole.nvert, 3)), np.zeros(whole.nvert + whole.nelem, np.int32)
     fields.x, fields.box = _wrap(self._x), _wrap(self._box)
     self._launch = _nearest.command(fields).launch
     self._make_room(16)
@@ -73,8 +72,6 @@ class Finder:
     Returns:
       triangles (n,), weights of their corners (n, 3), distances [m] (n,)
     """
-    if len(mesh.tet):
-      return nearest(mesh, position, points)
     n = len(points)
     if n > len(self._point):
       self._make_room(2 * n)
@@ -99,50 +96,7 @@ def nearest(
   mesh: Mesh, position: np.ndarray, points: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
   """Returns what `Finder.nearest` does, once."""
-  if len(mesh.tet):
-    return _nearest_of(position, mesh.elem[: mesh.whole.nelem], points, mesh.whole.edge_length)
   return Finder(WorkingCopy(mesh)).nearest(mesh, position, points)
-
-
-def _nearest_of(position: np.ndarray, elem: np.ndarray, points: np.ndarray, edge: float):
-  """Returns what `nearest` does of given triangles; `edge`: their edges' mean length [m]."""
-  low, high = points.min(axis=0) - _BOX * edge, points.max(axis=0) + _BOX * edge
-  corner = position[elem]
-  middle = corner.mean(axis=1)
-  box = np.flatnonzero(((middle >= low) & (middle <= high)).all(axis=1))
-  box = box if len(box) >= _AROUND else np.arange(len(elem))
-  near = KDTree(middle[box]).query(points, k=min(_AROUND, len(box)))[1]
-  near = box[near.reshape(len(points), -1)]
-  a, b, c = np.moveaxis(corner[near], 2, 0)
-  weight, far = closest(points[:, None], a, b, c)
-  best, row = np.argmin(far, axis=1), np.arange(len(points))
-  return near[row, best], weight[row, best], far[row, best]
-
-
-def closest(p, a, b, c) -> tuple[np.ndarray, np.ndarray]:
-  """Returns weights of the point of triangles that is nearest to points, and its distance."""
-  ab, ac, ap = b - a, c - a, p - a
-
-  def dot(x, y):
-    return np.einsum("...i,...i->...", x, y)
-
-  d11, d12, d22, e1, e2 = dot(ab, ab), dot(ab, ac), dot(ac, ac), dot(ap, ab), dot(ap, ac)
-  square, bc2 = dot(ap, ap), np.maximum(d11 - 2 * d12 + d22, 1e-300)
-  det = np.maximum(d11 * d22 - d12 * d12, 1e-300)
-  v, w = (d22 * e1 - d12 * e2) / det, (d11 * e2 - d12 * e1) / det
-  on_ab = np.clip(e1 / np.maximum(d11, 1e-300), 0, 1)
-  on_ac = np.clip(e2 / np.maximum(d22, 1e-300), 0, 1)
-  on_bc = np.clip((e2 - e1 - d12 + d11) / bc2, 0, 1)
-  none = np.zeros_like(v)
-  v = np.stack([v, on_ab, none, 1 - on_bc])
-  w = np.stack([w, none, on_ac, on_bc])
-  u = np.stack([1 - v[0] - w[0], 1 - on_ab, 1 - on_ac, none])
-  gap2 = square - 2 * (v * e1 + w * e2) + v * v * d11 + 2 * v * w * d12 + w * w * d22
-  outside = (u[0] < 0) | (v[0] < 0) | (w[0] < 0)
-  gap2[0, outside] = np.inf
-  best = np.argmin(gap2, axis=0)[None]
-  weight = np.stack([np.take_along_axis(x, best, 0)[0] for x in (u, v, w)], axis=-1)
-  return weight, np.sqrt(np.maximum(np.take_along_axis(gap2, best, 0)[0], 0.0))
 
 
 def distance(line: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -52,6 +52,7 @@ class Filling:
   thickness: wp.float64  # [m]
   stiffness: wp.float64  # of an edge's spring [N/m]
   poisson: wp.float64
+  skip: wp.int64  # words by which what is written to lies after the arrays
   centre: doubles(3)  # that rest positions are about [m]
   lame: doubles("nelem")  # of triangles [Pa]
   shear: doubles("nelem")  # [Pa]
@@ -130,6 +131,7 @@ class Rows:
     changed: np.ndarray | None = None,
     before: np.ndarray | None = None,
     loosened: bool = True,
+    skip: int = 0,
   ) -> bool:
     """Writes the rows of a surface; returns False where the bending matrix has no room for them.
 
@@ -142,10 +144,12 @@ class Rows:
       changed: triangles that are not as in the arrays, None for all
       before: corners that these have there, (n, 3)
       loosened: whether what the foundation holds may be other triangles too
+      skip: words by which what is written to lies after the arrays
     """
     self._copy.put(mesh)
     self._put_material(config)
     self.fields.every, self.fields.loosened = int(changed is None), int(loosened)
+    self.fields.skip = skip
     changed = np.arange(mesh.nelem) if changed is None else changed
     self.fields.nchanged = n = len(changed)
     self._changed[:n], self._pinned[:] = changed, pinned

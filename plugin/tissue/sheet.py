@@ -6,8 +6,8 @@ import dataclasses
 
 import numpy as np
 
-from .mesh import Mesh, area_vectors, cross, lengths
-from .path import check_points, nearest
+from .mesh import Mesh, among, area_vectors, lengths, vertex_normals
+from .path import Finder, check_points
 
 _STEP = 0.25  # between samples of the path, and between lines, in edges
 _OFF = 2.0  # edges from the skin from which a point is off it
@@ -19,27 +19,8 @@ _FALLS = 0.5  # greatest cosine between direction and normal there
 
 
 @dataclasses.dataclass(frozen=True)
-class Where:
-  """Where points are beside a sheet.
-
-  Attributes:
-    off: signed distance [m]                                    (n,)
-    past: how far beyond the path's ends, below 0 between [m]   (n,)
-    deep: how far below the sheet's lower end, below 0 over it [m]  (n,)
-    at: the point of the sheet that is nearest [m]              (n, 3)
-    along: how far along the path that is [m]                   (n,)
-  """
-
-  off: np.ndarray
-  past: np.ndarray
-  deep: np.ndarray
-  at: np.ndarray
-  along: np.ndarray
-
-
-@dataclasses.dataclass(frozen=True)
 class Sheet:
-  """A surface of lines, at rest.
+  """A surface of lines, at rest; `native/sheet.h` says where points are beside it.
 
   Attributes:
     path: samples of the path on the skin [m]           (n, 3)
@@ -54,74 +35,11 @@ class Sheet:
   closes: bool
   more: tuple[float, float]
 
-  def measure(self, point: np.ndarray) -> Where:
-    """Returns where points (n, 3) are."""
-    way = self.end - self.begin
-    size = lengths(way)
-    dot = point @ way.T - (self.begin * way).sum(1)
-    share = dot / size**2
-    inside = np.clip(share, 0.0, 1.0)
-    far = -2 * point @ self.begin.T + (self.begin**2).sum(1)
-    far += inside * (inside * size**2 - 2 * dot)
-    line = np.argmin(far, axis=1)
-    row = np.arange(len(point))
-    share, inside = share[row, line], inside[row, line]
-    # The polyline through all lines at that share of their length, beside the nearest of them.
-    count = len(way) - self.closes
-    step = np.array([-1, 0, 1])
-    beside = line[:, None] + step
-    beside = beside % count if self.closes else np.clip(beside, 0, count - 1)
-    level = self.begin[beside] + share[:, None, None] * way[beside]
-    arm = np.diff(level, axis=1)
-    gap = point[:, None] - level[:, :-1]
-    length2 = np.maximum((arm * arm).sum(2), 1e-300)
-    free = (gap * arm).sum(2) / length2
-    on = np.clip(free, 0.0, 1.0)
-    miss = np.where((arm * arm).sum(2) > 0, lengths(gap - on[..., None] * arm), np.inf)
-    side = np.argmin(miss, axis=1)
-    on, arm = on[row, side], arm[row, side]
-    start, stop = beside[row, side], beside[row, side + 1]
-    tangent = self._tangent(share, start, 1 - on) + self._tangent(share, stop, on)
-    tangent /= np.maximum(lengths(tangent), 1e-300)[:, None]
-    down = way[line] / size[line, None]
-    normal = cross(tangent, down)
-    normal /= np.maximum(lengths(normal), 1e-300)[:, None]
-
-    def there(part):
-      a = self.begin[start] + part[:, None] * way[start]
-      return a + on[:, None] * (self.begin[stop] + part[:, None] * way[stop] - a)
-
-    past = np.full(len(point), -np.inf)
-    if not self.closes:
-      over = (free[row, side] - on) * np.sqrt(length2[row, side])
-      past = np.where(start == 0, -over - self.more[0], past)
-      ends = np.where(stop == count - 1, over - self.more[1], -np.inf)
-      past = np.maximum(past, ends)
-    off = ((point - there(share)) * normal).sum(1)
-    deep = (share - 1) * size[line]
-    return Where(off, past, deep, there(inside), self._arc[start] + on * self._gap[start])
-
-  def _tangent(self, share: np.ndarray, line: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Returns the direction along the sheet at lines, by a weight, (n, 3)."""
-    count = len(self.begin) - self.closes
-    both = np.stack([line - 1, line + 1], axis=1)
-    both = both % count if self.closes else np.clip(both, 0, count - 1)
-    level = self.begin[both] + share[:, None, None] * (self.end - self.begin)[both]
-    way = level[:, 1] - level[:, 0]
-    return weight[:, None] * way / np.maximum(lengths(way), 1e-300)[:, None]
-
-  @property
-  def _gap(self) -> np.ndarray:
-    return np.append(lengths(np.diff(self.begin, axis=0)), 0.0)
-
-  @property
-  def _arc(self) -> np.ndarray:
-    return np.append(0.0, np.cumsum(self._gap[:-1]))
-
 
 def sweep(
   organ: str,
   mesh: Mesh,
+  finder: Finder,
   position: np.ndarray,
   points: np.ndarray,
   depth: float | np.ndarray | None,
@@ -132,6 +50,7 @@ def sweep(
   Args:
     organ: its name, for messages
     mesh: the solid
+    finder: of its surfaces
     position: where its vertices are now [m]    (nvert, 3)
     points: the path, in the same frame [m]     (n, 3)
     depth: of the cut at rest, one or one a point; None: right through [m]
@@ -149,7 +68,7 @@ def sweep(
   k = np.minimum(at.astype(int), len(points) - 2)
   sample = points[k] + (at - k)[:, None] * (points[k + 1] - points[k])
   reach = np.interp(at, np.arange(len(points)), reach)
-  elem, weight, far = nearest(mesh, position, sample)
+  elem, weight, far = finder.nearest(mesh, position, sample)
   off = np.flatnonzero(far[given] > _OFF * edge)
   if off.size:
     raise ValueError(
@@ -162,13 +81,20 @@ def sweep(
   path, elem, reach = path[part], elem[part], reach[part]
   if len(path) < 2 or lengths(np.diff(path, axis=0)).sum() < _STEP * edge:
     raise ValueError(f"organ {organ!r}: the path is shorter than an edge of the mesh")
-  inward = -area_vectors(mesh.rest, mesh.elem[elem])
-  inward /= lengths(inward)[:, None]
+  inward = _inward(mesh, elem, weight[part])
   if direction is not None:
     direction = _at_rest(organ, mesh, position, elem, direction)
   size = 2 * float(lengths(np.ptp(mesh.rest[: mesh.whole.nouter], axis=0)))
   way, reach = _ways(organ, path, inward, direction, reach, edge)
   return _lines(path, way, np.minimum(reach, size), inward, edge)
+
+
+def _inward(mesh: Mesh, elem: np.ndarray, weight: np.ndarray) -> np.ndarray:
+  """Returns the unit normals inward of places of the skin, even across its edges, (n, 3)."""
+  vert, skin = mesh.elem[elem], mesh.elem[: mesh.whole.nelem]
+  around = skin[among(mesh.nvert, vert.ravel())[skin].any(axis=1)]
+  normal = np.einsum("nk,nkj->nj", weight, vertex_normals(mesh.rest, around)[vert])
+  return -normal / np.maximum(lengths(normal), 1e-300)[:, None]
 
 
 def _check(organ: str, points: np.ndarray, depth) -> np.ndarray:

@@ -35,7 +35,7 @@ _NAMES = {name: name for name in ("rest", "elem", "twin", "ring", "degree")} | {
 
 
 class WorkingCopy:
-  """The arrays of one mesh after another, all of one whole.
+  """The arrays of one mesh after another, all of one whole; of a solid those of its skin.
 
   Attributes:
     whole: the mesh before the first cut
@@ -58,9 +58,11 @@ class WorkingCopy:
     """Makes the arrays those of a mesh."""
     if mesh is self._mesh:
       return
+    n = self.whole.nelem
     for name, of_mesh in _NAMES.items():
-      self._host[name][:] = getattr(mesh, of_mesh)
-    self._host["loose"][:] = 0 if mesh.loose is None else mesh.loose
+      values = getattr(mesh, of_mesh)
+      self._host[name][:] = values[:n] if name == "elem" else values
+    self._host["loose"][:] = 0 if mesh.loose is None else mesh.loose[:n]
     self._mesh = mesh
 
   def take(self, mesh: Mesh, closed: bool, apart: bool) -> Mesh:

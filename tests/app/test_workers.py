@@ -77,7 +77,7 @@ def test_a_ray_cluster_loses_nothing_with_a_worker(tmp_path, monkeypatch, capsys
   monkeypatch.chdir(tmp_path)
   monkeypatch.setattr(sys, "path", sys.path.copy())
   (tmp_path / "dies.py").write_text(DIES)
-  short = ["--episodes", "2", "--set", "time_limit=0.2"]
+  short = ["--episodes", "2", "--set", "time_limit=0.2", "--set", "surroundings=none"]
   words = ["evaluate", "touch/easy", "--policy", "dies:Policy", "--json", "ray.json", *short]
   assert cli.main([*words, "--ray", "--processes", "2", "--recordings", "kept"]) == 0
   assert (tmp_path / "mark").exists()  # it did die

@@ -5,7 +5,7 @@ import numpy as np
 import palpate
 import palpate.batch
 import pytest
-from scenes import needs_cuda, sphere, triangular
+from scenes import needs_cuda, servo, sphere, triangular
 
 BACKENDS = [
   "cpu",
@@ -26,10 +26,7 @@ def device(request):
 
 def slide(body, spec, name, axis, gain):
   body.add_joint(type=SLIDE, axis=axis, name=name, damping=4)
-  spec.add_actuator(
-    name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT, gainprm=[gain] + 9 * [0],
-    biastype=mujoco.mjtBias.mjBIAS_AFFINE, biasprm=[0, -gain, 0] + 7 * [0],
-  )  # fmt: skip
+  servo(spec, name, gain)
 
 
 def pressed(windows, **keys):

@@ -33,17 +33,10 @@ STEPS = 900  # at most
 PIECE = 2.3  # edges that `Organ.cut` cuts at a time
 
 
-def _drive(spec, joint: str):
-  """Adds an actuator that moves a slide."""
-  spec.add_actuator(name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT,
-                    biastype=mujoco.mjtBias.mjBIAS_AFFINE, gainprm=[2000] + 9 * [0],
-                    biasprm=[0, -2000, 0] + 7 * [0])  # fmt: skip
-
-
 def _blade(spec, radius: float, half: float):
   body = spec.worldbody.add_body(name="tool", pos=[0, 0, 0])
   body.add_joint(type=SLIDE, axis=[1, 0, 0], name="x", damping=4)
-  _drive(spec, "x")
+  scenes.servo(spec, "x", 2000)
   body.add_geom(pos=[0, 0, 0.03], size=[0.004, 0, 0], mass=0.1, **FREE)
   body.add_geom(name="edge", type=CAPSULE, size=[radius, half, 0], mass=1e-3, **FREE)
 
@@ -73,7 +66,7 @@ def scene(nodes: int, tool: str, bend: float):
   elif tool != "Organ.cut":
     body = spec.worldbody.add_body(name="ball", pos=[LENGTH / 2, 0, 0.012])
     body.add_joint(type=SLIDE, axis=[0, 0, 1], name="z", damping=4)
-    _drive(spec, "z")
+    scenes.servo(spec, "z", 2000)
     body.add_geom(size=[0.008, 0, 0], mass=0.1)
     keys = {} if tool == "plain" else keys
   palpate.add_organ(spec, (points, elem), "organ", windows=True, mass=0.05, young=2e5, pin=pin,

@@ -36,9 +36,7 @@ def scene(mesh, windows=False, gravity=(0, 0, 0), h=2e-3, tool=True, **keys):
     body = spec.worldbody.add_body(name="ball", pos=[0, 0, 0.09], gravcomp=1)
     body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 0, 1], name="z")
     body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.008, 0, 0], mass=0.1)
-    position = {"gainprm": [400] + 9 * [0], "biasprm": [0, -400, -10] + 7 * [0]}
-    position |= {"biastype": mujoco.mjtBias.mjBIAS_AFFINE, "target": "z"}
-    spec.add_actuator(name="z", trntype=mujoco.mjtTrn.mjTRN_JOINT, **position)
+    scenes.servo(spec, "z", 400, 10)
   given = {"mass": 0.2, "young": 6e3, "thickness": 0.003, "spare": SPARE, "device": "cpu"} | keys
   palpate.add_organ(spec, mesh, "organ", windows=windows, **given)
   model = spec.compile()

@@ -15,17 +15,6 @@ HINGE, SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
 CAPSULE, SPHERE = mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_SPHERE
 
 
-def drive(spec, joint, gain):
-  spec.add_actuator(
-    name=joint,
-    target=joint,
-    trntype=mujoco.mjtTrn.mjTRN_JOINT,
-    biastype=mujoco.mjtBias.mjBIAS_AFFINE,
-    gainprm=[gain] + 9 * [0],
-    biasprm=[0, -gain, 0] + 7 * [0],
-  )
-
-
 def strip():
   """Returns a strip along x whose long sides are to be pinned."""
   points, elem = scenes.triangular(0.05, 0.026, 18, 11, 0.2)
@@ -37,7 +26,7 @@ def scalpel(spec, x, z):
   body = spec.worldbody.add_body(name="scalpel", pos=[x, 0, z])
   for name, axis in (("x", [1, 0, 0]), ("z", [0, 0, 1])):
     body.add_joint(type=SLIDE, axis=axis, name=name, damping=4)
-    drive(spec, name, 2000)
+    scenes.servo(spec, name, 2000)
   free = {"contype": 0, "conaffinity": 0}
   body.add_geom(type=SPHERE, size=[0.004, 0, 0], pos=[0, 0, 0.02], mass=0.1, **free)
   body.add_geom(name="edge", type=CAPSULE, size=[WIDTH / 2, 0.006, 0], mass=1e-3, **free)
@@ -56,22 +45,11 @@ def scene(windows=False, x=-0.004, z=0.0, add=scalpel, **keys):
   return model, data, palpate.Organ(model, data, "organ")
 
 
-def follow(model, data, organ, way, seconds):
-  """Moves the blade; returns its force on the tissue in each step [N]  (n, 3)."""
-  out = []
-  for _ in range(round(seconds / model.opt.timestep)):
-    data.ctrl[:] = way(data.time)
-    mujoco.mj_step(model, data)
-    out.append(organ.cutters[0].force)
-  assert organ.error is None
-  return np.array(out)
-
-
 @BOTH
 def test_a_blade_needs_the_toughness_times_the_thickness(windows):
   model, data, organ = scene(windows)
   speed = 0.04
-  force = follow(model, data, organ, lambda t: (speed * t, 0), 0.06 / speed)
+  force = scenes.follow(model, data, organ, lambda t: (speed * t, 0), 0.06 / speed)
   (cutter,), reports = organ.cutters, organ.cuts
   steady = force[len(force) // 3 : 2 * len(force) // 3]
   assert steady[:, 0].mean() == pytest.approx(FORCE, rel=0.02)
@@ -86,7 +64,7 @@ def test_a_blade_needs_the_toughness_times_the_thickness(windows):
 
 def test_the_blade_feels_what_the_tissue_feels():
   model, data, organ = scene()
-  follow(model, data, organ, lambda t: (0.04 * t, 0), 0.5)
+  scenes.follow(model, data, organ, lambda t: (0.04 * t, 0), 0.5)
   joint = data.qvel[model.joint("x").dofadr[0]]
   felt = data.actuator("x").force[0] - 4 * joint  # less the joint's damping
   assert felt == pytest.approx(organ.cutters[0].force[0], rel=0.1)
@@ -96,10 +74,10 @@ def test_what_is_pushed_too_little_does_not_cut():
   model, data, organ = scene(x=-0.0003)
   model.actuator("x").biasprm[:] = 0
   model.actuator("x").gainprm[0] = 1.0  # the control is a force [N]
-  force = follow(model, data, organ, lambda t: (0.8 * FORCE * min(t, 1), 0), 1.4)
+  force = scenes.follow(model, data, organ, lambda t: (0.8 * FORCE * min(t, 1), 0), 1.4)
   assert organ.cutters[0].inside and not organ.cuts and organ.cutters[0].energy == 0
   assert force[-100:, 0].mean() == pytest.approx(0.8 * FORCE, rel=0.02)
-  follow(model, data, organ, lambda t: (1.3 * FORCE, 0), 0.5)
+  scenes.follow(model, data, organ, lambda t: (1.3 * FORCE, 0), 0.5)
   assert organ.cutters[0].length > 0.005
 
 
@@ -108,23 +86,23 @@ def test_a_blade_from_above_pierces_the_wall_first():
   model.actuator("z").biasprm[:] = 0
   model.actuator("z").gainprm[0] = 1.0
   pierce = ENERGY * WIDTH
-  force = follow(model, data, organ, lambda t: (0, -0.7 * pierce * min(2 * t, 1)), 0.7)
+  force = scenes.follow(model, data, organ, lambda t: (0, -0.7 * pierce * min(2 * t, 1)), 0.7)
   assert force[-1, 2] == pytest.approx(-0.7 * pierce, rel=0.05)
   assert organ.cutters[0].energy == 0
-  follow(model, data, organ, lambda t: (0, -1.5 * pierce if t < 0.85 else 0.0), 0.4)
+  scenes.follow(model, data, organ, lambda t: (0, -1.5 * pierce if t < 0.85 else 0.0), 0.4)
   assert organ.cutters[0].energy == pytest.approx(pierce * THICKNESS, rel=1e-6)
   assert not organ.cuts  # it has gone through, but nowhere along
 
 
 def test_a_state_in_the_middle_of_a_cut_goes_on_to_the_bit():
   model, data, organ = scene()
-  follow(model, data, organ, lambda t: (0.04 * t, 0), 0.5)
+  scenes.follow(model, data, organ, lambda t: (0.04 * t, 0), 0.5)
   state = np.zeros(mujoco.mj_stateSize(model, STATE))
   mujoco.mj_getState(model, data, state, STATE)
   ends = []
   for _ in range(2):
     mujoco.mj_setState(model, data, state, STATE)
-    follow(model, data, organ, lambda t: (0.04 * t, 0), 0.2)
+    scenes.follow(model, data, organ, lambda t: (0.04 * t, 0), 0.2)
     ends.append((organ.xpos, organ.cutters[0].energy))
   np.testing.assert_array_equal(ends[0][0], ends[1][0])
   assert ends[0][1] == ends[1][1] > 0
@@ -137,7 +115,7 @@ def test_pinned_tissue_stays_whole_and_is_cut_beyond(windows):
   points, _, _ = strip()
   rim = np.abs(points - [0.025, 0, 0]) > [0.0249, 0.0129, 1]
   model, data, organ = scene(windows, pin=np.flatnonzero(rim.any(axis=1)))
-  follow(model, data, organ, lambda t: (0.04 * t, 0), 1.6)
+  scenes.follow(model, data, organ, lambda t: (0.04 * t, 0), 1.6)
   line = np.concatenate([line for report in organ.cuts for line in report.path])
   assert 0.001 < line[:, 0].min() < 0.01 and 0.04 < line[:, 0].max() < 0.049
   assert len(organ.pieces) == 1 and (organ.mass > 0).sum() > len(points) - rim.any(axis=1).sum()
@@ -194,7 +172,7 @@ def test_a_current_cuts_as_fast_as_its_power_allows():
   given = {"add": current, "x": 0.01, "cutters": f"edge {burn} by power"}
   for share, length in ((1.0, 0.01), (0.0, 0.0), (-1.0, 0.0)):
     model, data, organ = scene(**given)
-    follow(model, data, organ, lambda t, p=share * power: (0.009 * t, 0, p), 1.2)
+    scenes.follow(model, data, organ, lambda t, p=share * power: (0.009 * t, 0, p), 1.2)
     assert organ.cutters[0].length == pytest.approx(length, abs=1.2e-3)
     assert bool(organ.cuts) == (length > 0)
 
@@ -208,7 +186,7 @@ def test_a_current_frees_bonds():
   organ.bond("world", 1e7, 6e3, 6.0, vertices=vertices)
   near = np.linalg.norm(organ.bonds.positions - [0.025, 0, 0], axis=1) < 0.002
   assert near.any()
-  follow(model, data, organ, lambda t: (0, 0, -80.0), 0.4)
+  scenes.follow(model, data, organ, lambda t: (0, 0, -80.0), 0.4)
   assert organ.bonds.free[near].all() and not organ.bonds.free[~near].any()
 
 

@@ -17,14 +17,7 @@ def scene(windows=True, x=-0.033, z=0.01, half=0.006, cutters=f"edge {ENERGY}"):
   body = spec.worldbody.add_body(name="scalpel", pos=[x, 0, z])
   for name, axis in (("x", [1, 0, 0]), ("z", [0, 0, 1])):
     body.add_joint(type=SLIDE, axis=axis, name=name, damping=4)
-    spec.add_actuator(
-      name=name,
-      target=name,
-      trntype=mujoco.mjtTrn.mjTRN_JOINT,
-      biastype=mujoco.mjtBias.mjBIAS_AFFINE,
-      gainprm=[2000] + 9 * [0],
-      biasprm=[0, -2000, 0] + 7 * [0],
-    )
+    scenes.servo(spec, name, 2000)
   spec.add_actuator(name="power", target="x", trntype=mujoco.mjtTrn.mjTRN_JOINT)
   spec.actuator("power").gainprm = 10 * [0]
   free = {"contype": 0, "conaffinity": 0}
@@ -40,22 +33,11 @@ def scene(windows=True, x=-0.033, z=0.01, half=0.006, cutters=f"edge {ENERGY}"):
   return model, data, palpate.Organ(model, data, "organ")
 
 
-def follow(model, data, organ, way, seconds):
-  """Moves the blade; returns its force on the tissue in each step [N]  (n, 3)."""
-  out = []
-  for _ in range(round(seconds / model.opt.timestep)):
-    data.ctrl[:] = way(data.time)
-    mujoco.mj_step(model, data)
-    out.append(organ.cutters[0].force)
-  assert organ.error is None
-  return np.array(out)
-
-
 @pytest.mark.parametrize("windows", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_a_blade_needs_the_toughness_times_its_depth(windows):
   model, data, organ = scene(windows)  # its lower half is in the block
   deep, speed = 0.006, 0.1
-  force = follow(model, data, organ, lambda t: (speed * t, 0, 0), 0.075 / speed)
+  force = scenes.follow(model, data, organ, lambda t: (speed * t, 0, 0), 0.075 / speed)
   (cutter,), reports = organ.cutters, organ.cuts
   steady = force[120:210]
   assert steady[:, 0].mean() == pytest.approx(ENERGY * deep, rel=0.02)
@@ -71,10 +53,10 @@ def test_a_blade_needs_the_toughness_times_its_depth(windows):
 
 def test_a_blade_from_above_goes_in_and_then_along():
   model, data, organ = scene(x=-0.012, z=0.0165)
-  follow(model, data, organ, lambda t: (0, -0.005 * min(1, 5 * t), 0), 0.3)
+  scenes.follow(model, data, organ, lambda t: (0, -0.005 * min(1, 5 * t), 0), 0.3)
   assert organ.cutters[0].inside and not organ.cuts
   assert organ.cutters[0].energy == pytest.approx(ENERGY * WIDTH * 1e-3, rel=1e-6)
-  force = follow(model, data, organ, lambda t: (0.08 * (t - 0.3), -0.005, 0), 0.3)
+  force = scenes.follow(model, data, organ, lambda t: (0.08 * (t - 0.3), -0.005, 0), 0.3)
   assert force[-30:, 0].mean() == pytest.approx(ENERGY * 0.0045, rel=0.05)
   assert organ.cuts and organ.cuts[0].depth < 0.0065
   # State in the middle of a cut.
@@ -83,7 +65,7 @@ def test_a_blade_from_above_goes_in_and_then_along():
   ends = []
   for _ in range(2):
     mujoco.mj_setState(model, data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
-    follow(model, data, organ, lambda t: (0.08 * (t - 0.3), -0.005, 0), 0.1)
+    scenes.follow(model, data, organ, lambda t: (0.08 * (t - 0.3), -0.005, 0), 0.1)
     ends.append((organ.xpos, organ.cutters[0].energy))
   assert np.array_equal(ends[0][0], ends[1][0]) and ends[0][1] == ends[1][1]
 
@@ -92,7 +74,7 @@ def test_a_current_cuts_by_its_power_and_depth():
   burn, deep = 1.1e6, 0.001 + WIDTH / 2 + 0.001  # [J/m^2, m], with what it reaches beyond itself
   model, data, organ = scene(x=-0.02, z=0.0095, half=0.0005, cutters=f"edge {burn} by power")
   power = 0.04 * burn * deep  # [W], for 40 mm/s
-  follow(model, data, organ, lambda t: (0.036 * t, 0, power), 0.5)
+  scenes.follow(model, data, organ, lambda t: (0.036 * t, 0, power), 0.5)
   assert organ.cutters[0].length == pytest.approx(0.018, rel=0.1)
   assert organ.cutters[0].energy == pytest.approx(burn * deep * organ.cutters[0].length, rel=0.15)
   assert organ.cuts and organ.cuts[0].depth < deep + 1e-3

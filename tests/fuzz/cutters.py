@@ -18,23 +18,12 @@ FREE = {"contype": 0, "conaffinity": 0}
 BURN = 1.1e6  # [J/m^2]
 
 
-def _servo(spec, joint: str):
-  spec.add_actuator(
-    name=joint,
-    target=joint,
-    trntype=mujoco.mjtTrn.mjTRN_JOINT,
-    biastype=mujoco.mjtBias.mjBIAS_AFFINE,
-    gainprm=[1000] + 9 * [0],
-    biasprm=[0, -1000, 0] + 7 * [0],
-  )
-
-
 def _edge(spec, random, power: bool):
   """Adds a blade, or a hook's toe, on three slides."""
   body = spec.worldbody.add_body(name="tool")
   for name, axis in zip("xyz", np.eye(3), strict=True):
     body.add_joint(type=SLIDE, axis=axis, name=name, damping=4)
-    _servo(spec, name)
+    scenes.servo(spec, name, 1000)
   tilt = np.append(1.0, random.normal(0, 0.2, 3))
   size = [1e-3, 1e-3, 0] if power else [5e-4, 0.01, 0]
   body.add_geom(pos=[0, 0, 0.02], size=[0.004, 0, 0], mass=0.1, **FREE)

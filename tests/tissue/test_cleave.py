@@ -9,6 +9,8 @@ from palpate.tissue import cleave, energy, faces, fill
 from palpate.tissue import mesh as topology
 from palpate.tissue.config import Config
 from palpate.tissue.cut import Motion
+from palpate.tissue.path import Finder, distance
+from palpate.tissue.surface import WorkingCopy
 
 
 @functools.cache
@@ -30,11 +32,13 @@ def line(span=0.9, side=0.1):
   return 0.05 * np.stack([np.sin(a), side + 0 * a, np.cos(a)], axis=1)
 
 
-def cut(mesh, points, depth=None, pinned=(), u=0.0, **keys):
+def cut(mesh, points, depth=None, pinned=(), u=0.0, room=None, **keys):
   held = np.isin(np.arange(mesh.nvert), pinned)
   still = np.zeros_like(mesh.rest)
   motion = Motion(fill.vertex_volumes(mesh), still + u, still)
-  return cleave.cut("organ", mesh, motion, np.asarray(points), held, depth, **keys)
+  whole = mesh.whole
+  knife = cleave.Cleaver(whole, Finder(WorkingCopy(whole)), room or whole.nelem + 4 * mesh.spare)
+  return knife.cut("organ", mesh, motion, np.asarray(points), held, depth, **keys)
 
 
 def sizes(mesh):
@@ -183,8 +187,7 @@ def test_a_direction_slants_the_cut():
 def test_the_strain_energy_around_what_moves_does_not_rise():
   mesh, config = solid(), dataclasses.replace(Config(), elements="solid", bend=0.0)
   u = 0.004 * np.sin(40 * mesh.rest[:, [1, 2, 0]]) * (mesh.degree > 0)[:, None]
-  of_tets = functools.partial(energy.of_tets, mesh, config)
-  found = cut(mesh, line(), 0.02, u=u, energy=of_tets)
+  found = cut(mesh, line(), 0.02, u=u, config=config)
   assert found.moved > 5
   both = (mesh, u), (found.mesh, found.motion.disp)
   before, after = (energy.solid(m, config, x) for m, x in both)
@@ -206,5 +209,5 @@ def test_a_cut_at_4000_nodes_follows_its_path():
     check(found.mesh)
     x = np.concatenate(found.path)
     inner = np.linalg.norm(x[:, None] - path[[0, -1]], axis=2).min(axis=1) > 0.004
-    far = cleave.nearest_on(path, x[inner])
+    far = distance(path, x[inner])[0]
     assert np.median(far) < 0.1e-3 and np.percentile(far, 90) < 0.7e-3

@@ -7,6 +7,7 @@ import pathlib
 import tempfile
 import time
 
+from palpate.tasks.files import free
 from palpate.tasks.recording import Recording
 
 from ..trainee.keeping import Sitting
@@ -49,22 +50,14 @@ class Finished:
     name = f"{time.strftime('%Y%m%d-%H%M%S')}_{task}"
     try:
       folder.mkdir(parents=True, exist_ok=True)
-      self.path, self.fault = self.recording.save(_free(folder, name)), ""
+      self.path, self.fault = self.recording.save(free(folder, name, ".npz")), ""
       return True
     except OSError as error:
       self.fault = f"not kept in {folder}: {error.strerror or error}"
     if self.path is None:
       try:
         beside = pathlib.Path(tempfile.mkdtemp(prefix="palpate-"))
-        self.path = self.recording.save(_free(beside, name))
+        self.path = self.recording.save(free(beside, name, ".npz"))
       except OSError as error:
         self.fault += f"; nor among the temporary files: {error.strerror or error}"
     return self.path is not None
-
-
-def _free(folder: pathlib.Path, name: str) -> pathlib.Path:
-  """Returns a path that is not taken."""
-  path, k = folder / f"{name}.npz", 1
-  while path.exists():
-    path, k = folder / f"{name}-{k}.npz", k + 1
-  return path

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from ..trainee.record import check_name
+
 NODES = (250, 500, 1000, 2000, 4000)  # of an exercise
 SPEEDS = (0.1, 0.25, 0.5, 1.0)
 SCHEMES = ("implicit", "midpoint", "neumann", "explicit")
@@ -66,8 +68,7 @@ def exercise(message: dict[str, Any], device: str) -> dict[str, Any]:
   if not isinstance(task, str):
     raise ValueError(f"task is {task!r}, expected a name")
   person = message.get("person", "")
-  if not isinstance(person, str) or len(person) > 40 or not person.isprintable():
-    raise ValueError(f"person is {str(person)[:50]!r}, expected a name of at most 40 letters")
+  person = check_name(person, "person") if person != "" else ""
   seed = message.get("seed", 0)
   if type(seed) is not int or not 0 <= seed < 2**31:
     raise ValueError(f"seed is {seed!r}, expected a whole number in [0, 2^31)")
@@ -80,7 +81,7 @@ def exercise(message: dict[str, Any], device: str) -> dict[str, Any]:
   return _common(message) | {
     "type": "start",
     "task": "/".join(pair),
-    "person": person.strip(),
+    "person": person,
     "seed": seed,
     "nodes": choice("nodes", message.get("nodes"), (None, *NODES)),
     "left": left or "",

@@ -25,7 +25,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from palpate.tasks.curves import Attempt
-from palpate.tasks.files import replacing
+from palpate.tasks.files import free, replacing
 from palpate.tasks.limits import Lookup
 from palpate.tasks.metrics import METRICS, Metrics, Unknown
 from palpate.tasks.recording import Recording
@@ -95,12 +95,14 @@ def now() -> str:
   return datetime.datetime.now(datetime.UTC).isoformat(timespec="milliseconds")
 
 
-def check_name(name: Any) -> str:
-  """Returns a person's name as it is kept; ValueError for what is none."""
+def check_name(name: Any, option: str = "trainee") -> str:
+  """Returns a person's name as it is kept; ValueError for what is none, given as `option`."""
   text = unicodedata.normalize("NFC", name).strip() if isinstance(name, str) else ""
   if not (0 < len(text) <= _LONGEST and text.isprintable()):
     shown = str(name)[:_LONGEST]
-    raise ValueError(f"trainee is {shown!r}, expected a name of 1 to {_LONGEST} printable letters")
+    raise ValueError(
+      f"{option} is {shown!r}, expected a name of 1 to {_LONGEST} printable characters"
+    )
   return text
 
 
@@ -216,7 +218,7 @@ class Record:
         if not self._rows("select 1 from trainee where id = ?", person.id):
           raise RecordError(f"{person.name!r} is no longer in {str(self.folder)!r}")
         folder = self.folder / RECORDINGS / person.id
-        file = _free(folder, f"{re.sub('[^0-9]', '', ended[:23])}_{task}")
+        file = free(folder, f"{re.sub('[^0-9]', '', ended[:23])}_{task}", ".npz")
         with database.named(file):
           database.private_folder(folder)
           path = recording.save(file)
@@ -339,14 +341,6 @@ def _write_private(path: pathlib.Path, text: str) -> None:
   with replacing(path) as file:
     file.write(text)
   path.chmod(0o600)
-
-
-def _free(folder: pathlib.Path, name: str) -> pathlib.Path:
-  """Returns a path that is not taken; in the order of names, later ones follow."""
-  path, k = folder / f"{name}.npz", 1
-  while path.exists():
-    path, k = folder / f"{name}_{k}.npz", k + 1
-  return path
 
 
 def _facts(recording: Recording, references: Lookup) -> dict[str, Any]:

@@ -1,0 +1,36 @@
+"""Builders of the scenes of all tests and benches, and helpers; the fixture `scenes` is this room.
+
+Every size is in SI units.
+"""
+
+import pytest
+import warp as wp
+from palpate.models.block import box
+
+from .bare import force, get, kernels, put, step
+from .documents import (
+  ball,
+  contacts,
+  flex,
+  organ,
+  plugin,
+  press,
+  probed,
+  ridge,
+  windowed,
+  world,
+)
+from .numbers import bodies, dofs, lump, masses, qposs, slot_bodies, slots, workspace
+from .running import Warnings, adrift, beside, drive, follow, grasp, load, motion, run, settle
+from .specs import servo
+from .surfaces import RADIUS, sphere, strip, triangular
+
+needs_cuda = pytest.mark.skipif(not wp.is_cuda_available(), reason="needs a CUDA device")
+
+__all__ = [
+  "RADIUS", "Warnings", "adrift", "ball", "beside", "bodies", "box", "contacts", "dofs", "drive",
+  "flex", "follow", "force", "get", "grasp", "kernels", "load", "lump", "masses", "motion",
+  "needs_cuda", "organ", "plugin", "press", "probed", "put", "qposs", "ridge", "run", "servo",
+  "settle", "slot_bodies", "slots", "sphere", "step", "strip", "triangular", "windowed",
+  "workspace", "world",
+]  # fmt: skip
