@@ -346,6 +346,7 @@ PALPATE F skipped(F f) {
   f.elem_node.data += n, f.elem_rest.data += n, f.elem_hinge.data += n;
   f.hinge_node.data += n, f.hinge_rest.data += n, f.hinge_elem.data += n, f.hinge_near.data += n;
   f.bend_node.data += n, f.fan_metric.data += n, f.fan_spring.data += n;
+  f.fan_width.data += n, f.bend_width.data += n;
   f.hinge_gain.data += n, f.bend_gain.data += n, f.bend_diag.data += n;
   return f;
 }
