@@ -200,8 +200,7 @@ class Blades(beside.Beside):
     cuts = self._organ.topology
 
     def cut(path: np.ndarray) -> tuple[Any, Mesh]:
-      now = cutters.on_surface(bench.finder, cuts.mesh_of(world), path, motion.disp[k])
-      found = cuts.find(bench, world, now, motion, k, given)
+      found = cuts.find(bench, world, path, motion, k, given, True)
       return cuts.apply(bench, world, found, motion, k), cuts.mesh_of(world)
 
     organ, mesh = self._organ.declared, cuts.mesh_of(world)

@@ -235,15 +235,13 @@ class Cutters(Beside):
     w, row, mesh = self._w, self.state[i], self._w.organ.mesh
 
     def cut(path: np.ndarray, *deep: np.ndarray) -> tuple[Report, Mesh]:
-      organ, more = w.organ, {}
-      now = on_surface(w.cuts.finder, organ.mesh, path, w.phases.motion()[0])
-      how = given
-      if deep:
-        geom, axis = (self._arrays[name][i] for name in ("geom", "axis"))
-        own = geom[1] < 0 and i not in self._currents
-        way = inward.direction(w, int(geom[0]) if own else -1, axis[0], int(row[BLADE.elem]))
-        more, how = {"depth": deep[0], "direction": way}, given * float(deep[0].mean())
-      return w.cuts.cut(organ.origin + now @ organ.frame.T, how, **more), w.organ.mesh
+      if not deep:
+        return w.cuts.cut_at_rest(path, given), w.organ.mesh
+      geom, axis = (self._arrays[name][i] for name in ("geom", "axis"))
+      own = geom[1] < 0 and i not in self._currents
+      way = inward.direction(w, int(geom[0]) if own else -1, axis[0], int(row[BLADE.elem]))
+      now = w.organ.origin + self._on_surface(path) @ w.organ.frame.T
+      return w.cuts.cut(now, given * float(deep[0].mean()), deep[0], way), w.organ.mesh
 
     if len(mesh.tet):
       edge = mesh.whole.edge_length
@@ -254,6 +252,13 @@ class Cutters(Beside):
       self._said = True
       mjstruct.warn(why)
     return report is not None and report.nodes > 0
+
+  def _on_surface(self, path: np.ndarray) -> np.ndarray:
+    """Returns where points of the rest shape are now, in the organ's frame, (n, 3)."""
+    w, mesh = self._w, self._w.organ.mesh
+    elem, weight, _ = w.cuts.finder.nearest(mesh, mesh.rest, path)
+    place = mesh.rest + w.phases.motion()[0]
+    return np.einsum("nk,nkj->nj", weight, place[mesh.elem[elem]])
 
   def _follow(self, current: Current, row: np.ndarray) -> int:
     """Lets a path follow a current; returns what is due, as the header says it of blades."""
@@ -331,12 +336,6 @@ def open_path(
     row[BLADE.trail : BLADE.trail + trail.size] = trail.ravel()
     row[BLADE.elem] = finder.nearest(mesh, mesh.rest, at[None])[0][0]
   return report, why
-
-
-def on_surface(finder: Finder, mesh: Mesh, path: np.ndarray, disp: np.ndarray) -> np.ndarray:
-  """Returns where points of the rest shape are, (n, 3), with displacements (nvert, 3)."""
-  elem, weight, _ = finder.nearest(mesh, mesh.rest, path)
-  return np.einsum("nk,nkj->nj", weight, (mesh.rest + disp)[mesh.elem[elem]])
 
 
 def _wait(row: np.ndarray, at: np.ndarray, edge: float, full: bool):

@@ -2,6 +2,8 @@
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
+from typing import Any
+
 import numpy as np
 import warp as wp
 from palpate.tissue import mesh as topology
@@ -114,7 +116,6 @@ def make(w, model: int, sizes: dict[str, int]):
   radius = float(mjstruct.view(m.flex_radius, m.nflex)[win.flex].max())
   margin = float(mjstruct.view(m.flex_margin, m.nflex)[win.flex].max())
   margin += float(mjstruct.view(m.geom_margin, m.ngeom)[win.geom].max(initial=0.0))
-  dofs = win.dofadr[:, None] + np.arange(3)
   room = max(mesh.whole.nelem, sizes["ncorner"])
   values = w.boxes | {name: w.views[name] for name in scratch(0, 0)} | dict(
     nvert=sizes["nvert"],
@@ -145,7 +146,7 @@ def make(w, model: int, sizes: dict[str, int]):
     home=win.home,
     qhome=win.qhome,
     dofadr=win.dofadr,
-    massadr=coupling.mass_addresses(m, dofs),
+    massadr=coupling.mass_addresses(m, win.dofadr[:, None] + np.arange(3)),
     qposadr=win.qposadr,
     bodyid=win.body,
     window_adr=win.adr,
@@ -177,8 +178,9 @@ def reshape(organ, here: Views, radius: float, vert: np.ndarray):
   elem, ring, place = topology.around(mesh, vert), mesh.ring[vert], mesh.rest[vert]
   corner = mesh.elem[elem]
   here.rest[vert], here.elem[elem] = place, corner
-  length = np.where(ring >= 0, topology.lengths(mesh.rest[ring] - place[:, None]), 0.0)
-  here.touch[vert] = length.max(axis=1) + radius
+  arm = mesh.rest[ring] - place[:, None]
+  square = np.where(ring >= 0, np.einsum("ijk,ijk->ij", arm, arm), 0.0)
+  here.touch[vert] = np.sqrt(square.max(axis=1)) + radius
   here.node_mass[vert] = hold(organ, organ.mass[vert], vert)
   _list_triangles(here, mesh, vert, elem, corner[:, 0])
 
@@ -203,7 +205,7 @@ def _list_triangles(here: Views, mesh, vert: np.ndarray, elem: np.ndarray, first
   following[elem] = np.append(np.where(first[1:] == first[:-1], elem[1:], -1), -1)[: len(elem)]
 
 
-def hold(organ, inertia: np.ndarray, vert: np.ndarray | slice = slice(None)) -> np.ndarray:
+def hold(organ, inertia: np.ndarray, vert: Any = slice(None)) -> np.ndarray:
   """Returns the inertia of nodes, with that of a wall for pinned ones [kg]."""
   return np.where(organ.free[vert], inertia, WALL * organ.windows.mass.sum())
 

@@ -12,6 +12,8 @@ its device over a copy that `Resident` keeps; the slots' kernels (`slots`) on th
 
 from __future__ import annotations
 
+from typing import Any
+
 import mujoco
 import numpy as np
 import warp as wp
@@ -83,7 +85,7 @@ class Phases(coupling.Phases):
     organ = self._w.organ
     touched = np.arange(organ.mesh.nvert) if touched is None else touched
     slots.reshape(organ, self._slots_here, self._slots.radius, touched)
-    share_inertia(self._w)
+    share_inertia(self._w, touched)
     self._weights.put(touched)
     wake(self._w)
 
@@ -280,10 +282,11 @@ def set_inertia(w, m):
   share_inertia(w)
 
 
-def share_inertia(w):
-  """Gives vertices that were one their part of its inertia."""
+def share_inertia(w, vert: Any = slice(None)):
+  """Gives vertices, some or all, that were one their part of its inertia."""
   nodal = w.views["whole"]
-  w.views["inertia"].numpy()[:] = slots.hold(w.organ, w.cuts.share(nodal) if w.cuts else nodal)
+  nodal = w.cuts.share(nodal, vert) if w.cuts else nodal[vert]
+  w.views["inertia"].numpy()[vert] = slots.hold(w.organ, nodal, vert)
 
 
 def shortage(w) -> str | None:
