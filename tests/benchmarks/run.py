@@ -25,6 +25,7 @@ BENCHES = {
   "locality": "what leaving out solved nodes would save",
   "loop": "the whole loop, mj_step with a probe on a windowed organ",
   "loopholes": "what a search finds in the exercises that does not do the work",
+  "paths": "how near cuts of surfaces follow their path, and what they keep",
   "peer": "mj_step in contact against MuJoCo's native flex",
   "policies": "success of the policies that ship",
   "preconditioner": "iterations with block Jacobi and multilevel",
