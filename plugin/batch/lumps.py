@@ -1,16 +1,19 @@
 """Young's modulus of each triangle of each world: a lump that lies elsewhere in each.
 
-All that depends on it in a step is linear in the triangles' factors on the modulus they were
+In a solid tetrahedra have that of the triangle nearest to them. All that depends on it in a step is linear in the triangles' factors on the modulus they were
 compiled with, so that a world's numbers are products with sparse matrices.
 """
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
+import math
+
 import numpy as np
 import warp as wp
 from palpate.tissue import config as configuration
-from palpate.tissue import plate
-from palpate.tissue.order import LANES, ellpack
+from palpate.tissue import plate, solid, step
+from palpate.tissue.fill import vertex_volumes, volumes
+from palpate.tissue.order import LANES, ellpack, offset
 from palpate.tissue.types import Lump, allocate, fill, floats, ints, struct
 from scipy import sparse
 
@@ -46,20 +49,17 @@ class Lumps:
     self._device, self._nelem = body.device, organ.mesh.nelem
     body.fields.lump = allocate(Lump, body.device, body.sizes | {"nlump": body.nworld})
     self.node = wp.zeros((body.nworld, body.shape.nnode), dtype=float, device=body.device)
-    maps = _maps(organ, body)
     lump = body.fields.lump
+    maps = {"node": _around(organ.mesh, body)}
+    if body.is_solid:
+      maps |= _solid_maps(organ, body)
+    else:
+      maps |= _maps(organ, body)
+      lump.hinge_left.assign(_left(organ, body))
     self._maps = [
-      (self._put(map), _rows(array))
-      for map, array in (
-        (maps["node"], self.node),
-        (maps["fan"], lump.fan),
-        (maps["hinge"], lump.hinge),
-        (maps["bend_gain"], lump.bend_gain),
-        (maps["bend_diag"], lump.bend_diag),
-      )
-      if array.size
+      (self._put(map), _rows(self.node if name == "node" else getattr(lump, name)))
+      for name, map in maps.items()
     ]
-    lump.hinge_left.assign(maps["hinge_left"])
     self.put(np.arange(body.nworld), np.ones((1, self._nelem), np.float32))
 
   def _put(self, matrix: sparse.csr_matrix):
@@ -80,44 +80,79 @@ def _rows(array: wp.array) -> wp.array:
   return array.reshape((array.shape[0], -1))
 
 
-def _maps(organ, body) -> dict:
-  """Returns the matrices from factors to the arrays of `Lump`, and its constant."""
-  mesh, config, shape = organ.mesh, organ.config, body.shape
-  node, nelem = shape.node.numpy(), mesh.nelem
+def _around(mesh, body) -> sparse.csr_matrix:
+  """Returns the matrix from factors of triangles to their means around nodes."""
+  node, nelem = body.shape.node.numpy(), mesh.nelem
+  entries = node[mesh.elem].ravel(), np.repeat(np.arange(nelem), 3)
+  around = sparse.csr_matrix((np.ones(3 * nelem), entries), shape=(body.shape.nnode, nelem))
+  total = np.maximum(np.asarray(around.sum(axis=1)).ravel(), 1.0)
+  return sparse.csr_matrix(sparse.diags_array(1.0 / total) @ around)
 
-  def pick(offset):
+
+def _solid_maps(organ, body) -> dict:
+  """Returns the matrices from factors to the moduli of tetrahedra and nodes."""
+  mesh, lump, node = organ.mesh, body.fields.lump, body.shape.node.numpy()
+  ntet, nlane = len(mesh.tet), LANES * body.shape.ntetslice
+  # Padding has no volume, but quotients of mu.
+  elem = np.concatenate([solid.nearest_triangle(mesh), np.zeros(nlane - ntet, int)])
+  place = np.arange(nlane)
+  place[solid.order(mesh, node)] = np.arange(ntet)
+  share = np.repeat(volumes(mesh.rest, mesh.tet) / 4, 4)
+  share /= vertex_volumes(mesh)[mesh.tet.ravel()]
+  tet = np.repeat(np.arange(ntet), 4)
+  rows: dict[str, list] = {"tet_moduli": [], "node_moduli": []}
+  for k, modulus in enumerate(solid.moduli(mesh, organ.config)):
+    own = np.concatenate([modulus, np.full(nlane - ntet, 1.0 - k)])
+    rows["tet_moduli"].append((offset(place, 2) + k * LANES, elem, own))
+    mean = (1 - step.OWN_SHARE if k == 0 else 1.0) * share * modulus[tet]
+    rows["node_moduli"].append((offset(node[mesh.tet.ravel()], 2) + k * LANES, elem[tet], mean))
+  out = {}
+  for name, parts in rows.items():
+    row, col, value = (np.concatenate(part) for part in zip(*parts, strict=True))
+    size = math.prod(getattr(lump, name).shape[1:])
+    out[name] = sparse.csr_matrix((value, (row, col)), shape=(size, mesh.nelem))
+  return out
+
+
+def _left(organ, body) -> np.ndarray:
+  """Returns `Lump.hinge_left`."""
+  out = np.zeros(body.fields.lump.hinge_left.size)
+  if body.has_bending:
+    hinge = _hinges(organ)
+    own, left = np.arange(len(hinge.vert)), hinge.elem[:, 0]
+    corner = np.argmax(hinge.of_elem[left] == own[:, None], axis=1)
+    out[: len(own)] = hinge.gain[left, corner, corner]
+  return out.reshape(-1, LANES)
+
+
+def _hinges(organ) -> plate.Hinges:
+  mesh, config = organ.mesh, organ.config
+  return plate.hinges(mesh, configuration.rigidity(config, mesh.nelem), config.poisson)
+
+
+def _maps(organ, body) -> dict:
+  """Returns the matrices from factors to the arrays of `Lump` that a surface has."""
+  nelem, shape = organ.mesh.nelem, body.shape
+
+  def pick(start):
     """Returns the matrix that takes triangles by the offsets of vectors of four."""
-    elem = (offset // (4 * LANES) * LANES + offset % (4 * LANES)).ravel()
+    elem = (start // (4 * LANES) * LANES + start % (4 * LANES)).ravel()
     ones = np.ones(len(elem), np.float32)
     return sparse.csr_matrix((ones, (np.arange(len(elem)), np.minimum(elem, nelem - 1))),
                              shape=(len(elem), nelem))  # fmt: skip
 
-  around = sparse.csr_matrix(
-    (np.ones(3 * nelem), (node[mesh.elem].ravel(), np.repeat(np.arange(nelem), 3))),
-    shape=(shape.nnode, nelem),
-  )
-  total = np.maximum(np.asarray(around.sum(axis=1)).ravel(), 1.0)
-  out = {
-    "node": sparse.csr_matrix(sparse.diags_array(1.0 / total) @ around),
-    "fan": pick(shape.fan_corner.numpy()),
-    "hinge": pick(shape.hinge_elem.numpy()),
-    "bend_gain": None,
-    "bend_diag": None,
-    "hinge_left": np.zeros(body.fields.lump.hinge_left.shape, np.float32),
-  }
+  out = {"fan": pick(shape.fan_corner.numpy())}
   if body.has_bending:
-    hinge = plate.hinges(mesh, configuration.rigidity(config, nelem), config.poisson)
-    out |= _plate_maps(hinge, body, node)
+    out["hinge"] = pick(shape.hinge_elem.numpy())
+    out |= _plate_maps(_hinges(organ), body, shape.node.numpy())
   return out
 
 
 def _plate_maps(hinge: plate.Hinges, body, node: np.ndarray) -> dict:
-  """Returns the matrices of the bending matrix, and what of a hinge's stiffness is to its left."""
-  nelem, nhinge, nnode = len(hinge.gain), len(hinge.vert), body.shape.nnode
-  own, left = np.arange(nhinge), hinge.elem[:, 0]
-  corner = np.argmax(hinge.of_elem[left] == own[:, None], axis=1)
-  gain_left = np.zeros(body.fields.lump.hinge_left.size)
-  gain_left[:nhinge] = hinge.gain[left, corner, corner]
+  """Returns the matrices of the bending matrix."""
+  nelem, nnode = len(hinge.gain), body.shape.nnode
+  left = hinge.elem[:, 0]
+  corner = np.argmax(hinge.of_elem[left] == np.arange(len(left))[:, None], axis=1)
   vert, weight = hinge.vert, hinge.weight[left, corner]
   row, col, value, elem = [], [], [], []
   for a in range(3):
@@ -139,7 +174,6 @@ def _plate_maps(hinge: plate.Hinges, body, node: np.ndarray) -> dict:
   place[number[number > 0] - 1] = np.flatnonzero(number)
   same = row == col
   return {
-    "hinge_left": gain_left.reshape(-1, LANES),
     "bend_gain": sparse.csr_matrix((value, (place[which], elem)), shape=(len(number), nelem)),
     "bend_diag": sparse.csr_matrix((value[same], (row[same], elem[same])), shape=(nnode, nelem)),
   }

@@ -6,6 +6,10 @@ import dataclasses
 import numpy as np
 import warp as wp
 from palpate.engine import inertia, mjstruct
+from palpate.tissue import body as bodies
+from palpate.tissue import shape
+from palpate.tissue.body import Body
+from palpate.tissue.config import Config
 from palpate.tissue.types import NUMBERS
 
 from .lumps import Lumps
@@ -46,6 +50,7 @@ class Material:
     self._most = np.ones(nworld)  # greatest factor of a triangle
     self._lumps: Lumps | None = None
     self._graded = False
+    self._stiffest = 1.0, config.poisson  # what the step is for: multiple of young, and poisson
 
   def change(self, worlds: np.ndarray, rows: dict[str, np.ndarray]):
     """Changes worlds; `rows` has a value of each key for each of them."""
@@ -83,19 +88,19 @@ class Material:
 
   def _moduli(self, worlds: np.ndarray) -> dict[str, np.ndarray]:
     """Returns the scales of mu, lambda' and the plate's rigidity."""
-    config = self._organ.config
+    config, solid = self._organ.config, self._organ.body.is_solid
     scale, nu, thick = (self._worlds[key][worlds] for key in ("scale", "poisson", "thickness"))
     thick, nu0 = thick / config.thickness, config.poisson
-    squeeze, squeeze0 = nu / (1 - nu**2), nu0 / (1 - nu0**2)
+    squeeze, squeeze0 = (x / ((1 + x) * (1 - 2 * x) if solid else 1 - x**2) for x in (nu, nu0))
     if squeeze0 == 0 and squeeze.any():
       raise ValueError(
         f"organ {self._organ.name!r}: poisson was compiled as 0, which cannot change in a batch "
         "on a GPU"
       )
-    return {
+    plate = {} if solid else {"plate": scale * thick**3}  # that of a solid's skin stays
+    return plate | {
       "shear": scale * thick * (1 + nu0) / (1 + nu),
       "lame": scale * thick * (squeeze / squeeze0 if squeeze0 else 1.0),
-      "plate": scale * thick**3,
     }
 
   def _stiffen(self, worlds: np.ndarray, rows: dict[str, np.ndarray]):
@@ -150,13 +155,22 @@ class Material:
     m = mjstruct.Model.from_address(self._batch.model._address)
     self._find_inertia(m)
     organ.patch.grade.assign(np.log2(scale / own["mass"] / GRADES[0]).astype(np.float32))
-    if organ.patch.stiff or organ.responds is None:
-      return
-    nodal = organ.space.inertia(self._batch.model._address)
-    config = self._scaled(float(high))
-    stiff, _ = inertia.stiffness(m, organ.space.organ, organ.space.body, config, nodal)
-    if stiff:
-      organ.patch.stiff = 1
+    stiffest = float(high), float(own["poisson"].max())
+    if any(now > before for now, before in zip(stiffest, self._stiffest, strict=True)):
+      self._stiffest = stiffest
+      self._follow(m)
+
+  def _follow(self, m):
+    """Lets the step be one for the stiffest world."""
+    organ = self._organ
+    body, config = self._scaled(*self._stiffest)
+    newton = max(organ.body.newton, inertia.iterations(m, organ.space.organ, config))
+    stiff = bool(organ.patch.stiff)
+    if not stiff and organ.responds:
+      nodal = organ.space.inertia(self._batch.model._address)
+      stiff = inertia.stiffness(m, organ.space.organ, body, config, nodal)[0]
+    if (newton, stiff) != (organ.body.newton, bool(organ.patch.stiff)):
+      organ.body.newton, organ.patch.stiff = newton, int(stiff)
       self._batch.record()
 
   def _find_inertia(self, m):
@@ -168,11 +182,19 @@ class Material:
     mass = inertia.masses(m, w.organ)
     table, node = organ.patch.inertia.numpy(), organ.body.shape.node.numpy()
     for k, grade in enumerate(GRADES):
-      found = inertia.of_nodes(m, w.organ, w.body, self._scaled(grade), mass, flex)
+      found = inertia.of_nodes(m, w.organ, *self._scaled(float(grade)), mass, flex)
       table[k, node] = np.where(organ.declared.free, found, table[k, node])
     organ.patch.inertia.assign(table)
     self._graded = True
 
-  def _scaled(self, scale: float):
-    config = self._organ.config
-    return dataclasses.replace(config, young=tuple(scale * young for young in config.young))
+  def _scaled(self, scale: float, poisson: float | None = None) -> tuple[Body, Config]:
+    """Returns the organ of one world with multiples of the moduli, and its configuration."""
+    organ, config = self._organ.declared, self._organ.config
+    config = dataclasses.replace(
+      config,
+      young=tuple(scale * young for young in config.young),
+      poisson=config.poisson if poisson is None else poisson,
+    )
+    body = bodies.worlds(self._organ.space.body)
+    shape.change(body, organ.mesh, config, ~organ.free)
+    return body, config

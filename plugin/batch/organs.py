@@ -18,7 +18,7 @@ from . import beside, contacts, convex, held, kernels, patch, sliding
 from .base import Contacts, Tissue, spread
 from .blades import Blades
 from .cuts import Cuts
-from .material import KEYS, MODULI, Material
+from .material import KEYS, Material
 from .parting import Cutters
 from .patch import launch
 from .strip import Slots
@@ -312,7 +312,11 @@ class Organ(Tissue):
       return ""
     if key == "poisson" and self.body.has_bending:
       return " while tissue bends"
-    return " of a solid" if key in MODULI and self.body.is_solid else None
+    if key == "thickness" and self.body.is_solid:
+      return " of a solid"
+    if key == "poisson" and self.body.shape.ncapsule:
+      return " of a solid with a skin"
+    return None
 
   def _check(self, key: str, values: np.ndarray):
     """Raises ValueError where a value of a key is not allowed."""

@@ -58,10 +58,9 @@ class SolidCuts(Cuts):
 
   def share(self, values: np.ndarray, vert: Any = slice(None)) -> np.ndarray:
     """Returns values by mass, see `Cuts.share`; what comes from inside has them as the skin."""
-    was, skin = self.declared.mass, np.arange(self.whole.nouter)
-    skin = skin[was[skin] > 0]
-    usual = self.mass * float(np.median(values[skin] / was[skin]))
-    inside = self.source >= self.whole.nskin
+    was, n = self.declared.mass, self.whole.nouter
+    ratio = np.sort(values[:n] / np.maximum(was[:n], 1e-300))
+    usual, inside = self.mass * ratio[n // 2], self.source >= self.whole.nskin
     out = np.where(inside, usual, super().share(values))
     return np.where(self.mass > 0, out, values)[vert]
 
@@ -92,14 +91,18 @@ class SolidCuts(Cuts):
     self._sit(found)
     face = faces.opened(mesh)
     assert mesh.loose is not None
-    own["corner"][:n] = flexes.pack(mesh.elem[:n], mesh.loose[:n])
-    own["corner"][n:] = 0.0
-    own["corner"][n : n + len(face)] = face + 1
-    own["place"][:] = mesh.rest.ravel()
-    own["weight"][:] = self.mass
+    corner = np.zeros(len(own["corner"]))
+    corner[:n] = flexes.pack(mesh.elem[:n], mesh.loose[:n])
+    corner[n : n + len(face)] = face + 1
+    new, words = np.concatenate([corner, mesh.rest.ravel(), self.mass]), self._words
+    at, count = np.flatnonzero(new != words), len(words)
+    if self._total is None:
+      self._total = flexes.total(words, slice(None), count)
+    self._total += flexes.total(new[at], at, count) - flexes.total(words[at], at, count)
+    words[at] = new[at]
     own["source"][:] = 0.0
     own["source"][: len(self.seat)] = self.seat + 1
-    self.stamp = self._found[0] = flexes.stamp(self._words)
+    self.stamp = self._found[0] = flexes.stamp_of(self._total)
 
   def _sit(self, found: cleave.Cut):
     """Notes a corner of each vertex that cuts have made."""

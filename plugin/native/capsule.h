@@ -27,10 +27,12 @@ template <class Fields>
 PALPATE void capsule_row(const Fields& f, Thread t, int stage) {
   const Rows at = rows(f, t.world);
   const Assembly<Fields> skin{f, t.world, stage, at};
+  Wanted want = skin.want;
+  want.shear = want.lame = 1.0f;  // worlds differ in the tetrahedra's
   each_slice(t, f.shape.nslice, [&](int s, Lane lane) {
     const Fan fan = capsule_fan(f, t.world, s, lane);
     const Motion m = {at.disp, at.vel, ld3(at.disp + 24 * s, lane), ld3(at.vel + 24 * s, lane)};
-    const Sum sum = around(fan, m, skin.want, lane);
+    const Sum sum = around(fan, m, want, lane);
     V3 b = skin.h * sum.force + skin.gv * sum.rate;
     S3 self = splat(skin.g) * sum.stiffness;
     if (skin.bends) self = self + skin.bent(fan, sum, s, b, lane);

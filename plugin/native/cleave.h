@@ -324,7 +324,7 @@ PALPATE Sheet sheet_of(const F& f) {
 
 PALPATE Opening opening_of(Scratch& memory, int nvert, int ntet, int nouter) {
   Opening o = {};
-  o.face = memory.numbers(2 * ntet), o.parting = memory.numbers(2 * ntet), o.cut = memory.numbers(4 * ntet);
+  o.face = memory.room(2 * ntet), o.parting = memory.room(2 * ntet), o.cut = memory.numbers(4 * ntet);
   o.parts = parts_of(memory, 4 * ntet);
   o.vert = few(memory, nvert), o.renew = few(memory, nvert);
   o.ring = memory.numbers(nvert), o.seen = memory.numbers(nvert);

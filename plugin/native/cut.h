@@ -246,17 +246,21 @@ template <class Fields>
 PALPATE void find_nearest(const Fields& f, Thread t, int) {
   if (t.tid) return;
   using I = decltype(f.elem.data[0] + 0);
-  const Surface<I> m = {f.nvert, f.nelem, f.most, nullptr, f.elem.data, nullptr, nullptr, f.spoke.data,
-                        f.degree.data, nullptr, nullptr};
-  const auto put = [&](int i, Spot s) {
-    double* out = f.spot.data + 5 * i;
+  const auto put = [&](int i, Spot s, D3 normal) {
+    double* out = f.spot.data + 8 * i;
     out[0] = s.elem, out[4] = s.far;
     store(out + 1, s.weight);
+    store(out + 5, normal);
   };
-  if (f.solid)
-    nearest_of_skin(m, f.x.data, f.point.data, f.npoint, f.edge, f.box.data, put);
-  else
-    nearest_spots(m, f.x.data, f.nouter, f.point.data, f.npoint, f.edge, f.box.data, put);
+  if (f.solid) {
+    const Skin<I> skin = {f.nelem, f.elem.data, f.x.data, f.rest.data};
+    nearest_of_skin(skin, f.point.data, f.npoint, f.edge, f.box.data, put);
+    return;
+  }
+  const Surface<I> m = {f.nvert, 0, f.most, nullptr, f.elem.data, nullptr, nullptr, f.spoke.data,
+                        f.degree.data, nullptr, nullptr};
+  nearest_spots(m, f.x.data, f.nouter, f.point.data, f.npoint, f.edge, f.box.data,
+                [&](int i, Spot s) { put(i, s, {0.0, 0.0, 0.0}); });
 }
 
 template <class Fields>

@@ -85,8 +85,9 @@ struct Parts {
 
 PALPATE Parts parts_of(Scratch& memory, int ncorner) {
   Parts out = {};
-  int** lists[] = {&out.vert, &out.first, &out.size, &out.name, &out.part, &out.corner, &out.queue};
-  for (int i = 0; i < 7; ++i) *lists[i] = memory.numbers(ncorner);
+  int** lists[] = {&out.vert, &out.first, &out.size, &out.name, &out.corner, &out.queue};
+  for (int i = 0; i < 6; ++i) *lists[i] = memory.room(ncorner);
+  out.part = memory.numbers(ncorner);
   return out;
 }
 

@@ -61,6 +61,24 @@ PALPATE int used_rows(const F& f, int s) {
   return (int)most;
 }
 
+// The neighbours of a vertex, and where it is.
+template <class F, class S>
+PALPATE void put_neighbours(const F& f, const S& m, int v) {
+  const Fan<S> fan(m, v);
+  const int own = f.node.data[v], s = own / LANES, lane = own % LANES, begin = f.slot_adr.data[s];
+  const int width = f.slot_adr.data[s + 1] - begin;
+  const D3 centre = load(f.centre.data), here = m.place(v) - centre, zero = {0.0, 0.0, 0.0};
+  for (int k = 0; k < width + 2; ++k) {
+    const int other = fan.vert(k), row = begin + 2 * s + k;
+    f.fan_node.data[LANES * row + lane] = offset_in(other < 0 ? own : f.node.data[other], 3);
+    store_lane(f.fan_rest.data + 3 * LANES * row + lane, other < 0 ? zero : m.place(other) - centre - here);
+  }
+  f.degree.data[own] = (float)fan.degree;
+  f.fan_width.data[s] = used_rows(f, s);
+  store_lane(f.rest.data + offset_in(own, 3), here);
+  f.free.data[own] = f.pinned.data[v] || fan.degree == 0 ? 0.0f : 1.0f;
+}
+
 template <class F, class S>
 PALPATE void put_fan(const F& f, const S& m, int v) {
   const Fan<S> fan(m, v);
@@ -69,11 +87,10 @@ PALPATE void put_fan(const F& f, const S& m, int v) {
   const D3 centre = load(f.centre.data), here = m.place(v) - centre, zero = {0.0, 0.0, 0.0};
   D3 last = zero, toward = zero;
   double strength = 0.0;
+  put_neighbours(f, m, v);
   for (int k = 0; k < width + 2; ++k) {
-    const int other = fan.vert(k), row = begin + 2 * s + k;
+    const int other = fan.vert(k);
     last = toward, toward = other < 0 ? zero : m.place(other) - centre - here;
-    f.fan_node.data[LANES * row + lane] = offset_in(other < 0 ? own : f.node.data[other], 3);
-    store_lane(f.fan_rest.data + 3 * LANES * row + lane, toward);
     if (k == 0) continue;
     // The triangle between the last entry and this one, and where it is the second the edge between.
     const int half = fan.half(k - 1), corner = half < 0 ? 0 : half, tri = begin + s + k - 1;
@@ -86,10 +103,6 @@ PALPATE void put_fan(const F& f, const S& m, int v) {
     if (f.springs) spring = f.stiffness * (is_cut(m, fan.half(k - 2), half) ? 0.5 : 1.0);
     f.fan_spring.data[LANES * (begin + k - 2) + lane] = k - 2 < fan.degree ? (float)spring : 0.0f;
   }
-  f.degree.data[own] = (float)fan.degree;
-  f.fan_width.data[s] = used_rows(f, s);
-  store_lane(f.rest.data + offset_in(own, 3), here);
-  f.free.data[own] = f.pinned.data[v] || fan.degree == 0 ? 0.0f : 1.0f;
 }
 
 // The area that the foundation holds around a vertex.

@@ -104,6 +104,9 @@ PALPATE void node_stress(const Fields& f, Thread t, int stage) {
   const float h = step[0], gv = weight_of_rate(stage, step);
   const size_t base = 96 * (size_t)t.world * f.shape.nslice;
   const float* motion = f.system.node_motion.data + base;
+  const float* number = numbers(f, t.world);
+  const float* moduli = f.lump.node_moduli.data ? f.lump.node_moduli.data + base / 6
+                                                : f.tissue.node_moduli.data;
   each_slice(t, f.shape.nused, [&](int s, Lane lane) {
     const int row = f.shape.slot_adr.data[s], width = f.shape.fan_width.data[s];
     const int* node = f.shape.fan_node.data + 8 * (row + 2 * s + 1);
@@ -117,8 +120,8 @@ PALPATE void node_stress(const Fields& f, Thread t, int stage) {
       H = H + outer(gather_shared(motion, node + 8 * k, lane) - u, g);
       rate = rate + outer(gather_shared(motion + 32, node + 8 * k, lane) - v, g);
     }
-    const V mu = ld(f.tissue.node_moduli.data, 2 * s, lane);
-    const V lam = ld(f.tissue.node_moduli.data, 2 * s + 1, lane);
+    const V mu = number[SHEAR] * ld(moduli, 2 * s, lane);
+    const V lam = number[LAME] * ld(moduli, 2 * s + 1, lane);
     const Swelling now = swelling(H);
     const V p = lam * (h * now.j + gv * (trace(rate) + inner(now.c, rate)));
     const M3 P = stress(H, now, mu, p + (0.625f * h) * mu * now.j, h);
@@ -157,12 +160,15 @@ PALPATE void tet_stress(const Fields& f, Thread t, int stage) {
   const size_t base = 96 * (size_t)t.world * f.shape.nslice;
   const float* motion = f.system.node_motion.data + base;
   const float* nodal = f.system.node_stress.data + base;
+  const float* number = numbers(f, t.world);
   each_slice(t, f.shape.ntetslice, [&](int s, Lane lane) {
     const int* node = f.shape.tet_node.data + 32 * s;
     const float* g = f.shape.tet_gradient.data + 72 * s;
-    const float* moduli = f.tissue.tet_moduli.data + 24 * s;
-    const V volume = ld(moduli, 0, lane), mu = ld(moduli, 1, lane), lam = ld(moduli, 2, lane);
     const size_t at = (size_t)t.world * f.shape.ntetslice + s;
+    const float* own = f.tissue.tet_moduli.data + 24 * s;
+    const float* moduli = f.lump.tet_moduli.data ? f.lump.tet_moduli.data + 16 * at : own + 8;
+    const V volume = ld(own, 0, lane);
+    const V mu = number[SHEAR] * ld(moduli, 0, lane), lam = number[LAME] * ld(moduli, 1, lane);
     float* arm = f.system.tet_arm.data + 128 * at;
     float* impulse = f.system.tet_impulse.data + 128 * at;
     const M3 H = gradient(motion, node, g, lane), rate = gradient(motion + 32, node, g, lane);
@@ -170,10 +176,10 @@ PALPATE void tet_stress(const Fields& f, Thread t, int stage) {
     const M3 F = H + splat(1.0f), C = now.c + splat(1.0f);
     const V size2 = inner(F, F);
     const M3 Q = turn(F, C, now.j + 1.0f, size2), strain = transposed(Q) * rate;
-    const V own = OWN_SHARE * mu;
+    const V alone = OWN_SHARE * mu;
     V p;
     const M3 elastic = mean_stress(nodal, node, p, lane)
-      + stress(H, now, own, (0.625f * h) * own * now.j, h);
+      + stress(H, now, alone, (0.625f * h) * alone * now.j, h);
     const M3 P = splat(-1.0f) * volume
       * (elastic + (0.75f * gv * mu) * (Q * (strain + transposed(strain))));
     const V3 g1 = ld3(g, 0, lane), g2 = ld3(g, 3, lane), g3 = ld3(g, 6, lane);

@@ -52,18 +52,22 @@ PALPATE auto surface_of(const F& f, int world) {
                     f.degree.data + v, f.whole_elem.data, f.whole_twin.data};
 }
 
-// Scratch of a world; numbers that are taken are zero.
+// Scratch of a world; numbers that are taken are zero, unless they are room alone.
 struct Scratch {
   int* ints;
   double* reals;
   int nint, nreal;
   bool full;
 
-  PALPATE int* numbers(int n) {
+  PALPATE int* room(int n) {
     if (n > nint) return full = true, nullptr;
     int* out = ints;
     ints += n, nint -= n;
-    for (int i = 0; i < n; ++i) out[i] = 0;
+    return out;
+  }
+  PALPATE int* numbers(int n) {
+    int* out = room(n);
+    for (int i = 0; i < n && out; ++i) out[i] = 0;
     return out;
   }
   PALPATE double* values(int n) {
@@ -99,7 +103,7 @@ struct Few {
 };
 
 PALPATE Few few(Scratch& memory, int most) {
-  int* list = memory.numbers(most);
+  int* list = memory.room(most);
   return {list, memory.numbers(most), 0};
 }
 
@@ -235,25 +239,25 @@ PALPATE void nearest_spots(const S& m, const double* x, int nouter, const double
   }
 }
 
-// The same of the skin of a solid: among those triangles whose middles are nearest.
-template <class S, class Put>
-PALPATE void nearest_of_skin(const S& m, const double* x, const double* point, int n, double edge,
-                             int* inside, Put put) {
-  const Box box(point, n, BOX * edge);
-  const auto middle = [&](int t) {
-    const auto* vert = m.elem + 3 * t;
-    return (1.0 / 3.0) * (load(x + 3 * vert[0]) + load(x + 3 * vert[1]) + load(x + 3 * vert[2]));
-  };
-  int count = 0;
-  for (int t = 0; t < m.nelem; ++t)
-    if (box.has(middle(t))) inside[count++] = t;
-  const bool few = count < MIDDLES;
-  for (int i = 0; i < n; ++i) {
-    const D3 p = load(point + 3 * i);
+// The triangles of a solid's skin.
+template <class I>
+struct Skin {
+  int nelem;
+  const I* elem;
+  const double *x, *rest;  // where vertices are, now and at rest
+
+  PALPATE D3 corner(int t, int c) const { return load(x + 3 * elem[3 * t + c]); }
+  PALPATE D3 middle(int t) const { return (1.0 / 3.0) * (corner(t, 0) + corner(t, 1) + corner(t, 2)); }
+  PALPATE D3 area_vector(int t) const {
+    const D3 a = load(rest + 3 * elem[3 * t]), b = load(rest + 3 * elem[3 * t + 1]);
+    return 0.5 * cross(b - a, load(rest + 3 * elem[3 * t + 2]) - a);
+  }
+  // The nearest spot among the triangles of a list, all `n` where it is null, whose middles are nearest.
+  PALPATE Spot nearest(D3 p, double edge, const int* among, int n) const {
     double far[MIDDLES];
     int near[MIDDLES], found = 0;
-    for (int j = 0; j < (few ? m.nelem : count); ++j) {
-      const int t = few ? j : inside[j];
+    for (int j = 0; j < n; ++j) {
+      const int t = among ? among[j] : j;
       const D3 arm = middle(t) - p;
       const double d = dot(arm, arm);
       if (found == MIDDLES && d >= far[MIDDLES - 1]) continue;
@@ -263,13 +267,39 @@ PALPATE void nearest_of_skin(const S& m, const double* x, const double* point, i
     }
     Spot out = {0, {1.0, 0.0, 0.0}, 1e300};
     for (int k = 0; k < found; ++k) {
-      D3 corner[3];
-      for (int c = 0; c < 3; ++c) corner[c] = load(x + 3 * m.elem[3 * near[k] + c]);
-      const D3 w = barycentric(p, corner);
-      const double off = norm(blend(corner, w) - p);
+      D3 x[3];
+      for (int c = 0; c < 3; ++c) x[c] = corner(near[k], c);
+      const D3 w = barycentric(p, x);
+      const double off = norm(blend(x, w) - p);
       if (off < out.far - TIE * edge) out = {near[k], w, off};  // on an edge that of the nearer middle
     }
-    INLINED put(i, out);
+    return out;
+  }
+  // The unit normal at rest, even across edges, of those triangles.
+  PALPATE D3 normal(Spot spot, const int* among, int n) const {
+    D3 sum[3] = {}, out = {0.0, 0.0, 0.0};
+    for (int j = 0; j < n; ++j) {
+      const int t = among ? among[j] : j;
+      for (int c = 0; c < 9; ++c)
+        if (elem[3 * t + c / 3] == elem[3 * spot.elem + c % 3]) sum[c % 3] += area_vector(t);
+    }
+    const double weight[3] = {spot.weight.x, spot.weight.y, spot.weight.z};
+    for (int c = 0; c < 3; ++c) out += (weight[c] / norm(sum[c])) * sum[c];
+    return (1.0 / norm(out)) * out;
+  }
+};
+
+// The same of the skin of a solid, whose normals `put` gets too.
+template <class I, class Put>
+PALPATE void nearest_of_skin(const Skin<I>& m, const double* point, int n, double edge, int* inside, Put put) {
+  const Box box(point, n, BOX * edge);
+  int count = 0;
+  for (int t = 0; t < m.nelem; ++t)
+    if (box.has(m.middle(t))) inside[count++] = t;
+  if (count < MIDDLES) inside = nullptr, count = m.nelem;
+  for (int i = 0; i < n; ++i) {
+    const Spot spot = m.nearest(load(point + 3 * i), edge, inside, count);
+    INLINED put(i, spot, m.normal(spot, inside, count));
   }
 }
 

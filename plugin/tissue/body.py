@@ -138,6 +138,7 @@ def _sizes(values: dict[str, Any]) -> dict[str, int]:
   return out | {
     "nsolidslice": out["nslice"] if solid else 0,
     "nskinslot": 0 if solid else out["nslot"],
+    "nskinslice": 0 if solid else out["nslice"],
     "nmesh": 0,
     "nheld": len(values["held_adr"]),
     "nsolidslot": out["nslot"] if solid else 0,

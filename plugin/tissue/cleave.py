@@ -15,7 +15,7 @@ import warp as wp
 from . import faces, solid
 from .config import Config
 from .cut import Motion
-from .kernels import kernel
+from .kernels import aim, kernel
 from .mesh import Mesh, distinct, lengths
 from .order import addresses
 from .path import Finder
@@ -207,9 +207,7 @@ class Cleaver:
     sheet = sweep(organ, mesh, self._finder, mesh.rest + motion.disp, points, depth, direction)
     self._put(mesh)
     fields, host = self._fields, self._host
-    lines = {"path": sheet.path, "begin_line": sheet.begin, "end_line": sheet.end}
-    for name, values in lines.items():
-      setattr(fields, name, wp.array(np.ascontiguousarray(values), device="cpu", copy=False))
+    aim(fields, path=sheet.path, begin_line=sheet.begin, end_line=sheet.end)
     fields.npath, fields.nline, fields.closes = len(sheet.path), len(sheet.begin), int(sheet.closes)
     fields.before, fields.after = sheet.more
     fields.nouter, fields.ntriangle = mesh.nouter, mesh.nelem

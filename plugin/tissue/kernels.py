@@ -16,6 +16,7 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 NATIVE = pathlib.Path(__file__).parents[1] / "native"
@@ -75,6 +76,17 @@ class Kernel:
     """
     inputs = [1, 0, _reference(self.struct, fields)]
     return wp.launch(self.cpu, dim=(1, 1), inputs=inputs, device="cpu", record_cmd=True)
+
+
+def aim(fields, **arrays: np.ndarray):
+  """Lets fields of a struct be arrays of the host, of their types, which the caller keeps.
+
+  As by a `wp.array` around each, but at once: that takes 16 us.
+  """
+  native = fields.__ctype__()
+  for name, array in arrays.items():
+    assert array.flags.c_contiguous
+    getattr(native, name).data = array.ctypes.data
 
 
 def _reference(struct, fields) -> wp.array:

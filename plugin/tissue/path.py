@@ -7,7 +7,7 @@ import functools
 import numpy as np
 import warp as wp
 
-from .kernels import kernel
+from .kernels import aim, kernel
 from .mesh import Mesh, lengths
 from .stop import Stops
 from .surface import WorkingCopy
@@ -31,7 +31,8 @@ class Nearest:
   x: doubles("nvert", 3)  # where the vertices are [m]
   point: doubles("npoint", 3)
   box: ints("nvert + nelem")  # scratch
-  spot: doubles("npoint", 5)  # triangle, weights of its corners, distance [m]
+  rest: doubles("nvert", 3)  # of a solid [m]
+  spot: doubles("npoint", 8)  # triangle, weights of its corners, distance [m], a solid's normal
 
 
 _nearest = kernel("find_nearest", "cut.h", Nearest, CONSTANTS)
@@ -46,6 +47,7 @@ class Finder:
 
   def __init__(self, copy: WorkingCopy):
     self._copy, whole, there = copy, copy.whole, copy.fields
+    self._elem, self._rest = whole.elem, whole.rest
     self._fields = fields = Nearest()
     fields.nvert, fields.nelem, fields.solid = whole.nvert, whole.nelem, int(len(whole.tet) > 0)
     fields.most, fields.edge = copy.sizes["most"], whole.edge_length
@@ -56,7 +58,7 @@ class Finder:
     self._make_room(16)
 
   def _make_room(self, count: int):
-    self._point, self._spot = np.zeros((count, 3)), np.zeros((count, 5))
+    self._point, self._spot = np.zeros((count, 3)), np.zeros((count, 8))
     self._fields.point, self._fields.spot = _wrap(self._point), _wrap(self._spot)
 
   def nearest(
@@ -75,12 +77,23 @@ class Finder:
     n = len(points)
     if n > len(self._point):
       self._make_room(2 * n)
-    self._copy.put(mesh)
+    if self._fields.solid:
+      self._elem, self._rest = mesh.elem, mesh.rest  # which native code reads
+      aim(self._fields, elem=mesh.elem, rest=mesh.rest)
+    else:
+      self._copy.put(mesh)
     self._x[:], self._point[:n] = position, points
     self._fields.npoint, self._fields.nouter = n, mesh.nouter
     self._launch()
     spot = self._spot[:n].copy()
     return spot[:, 0].astype(int), spot[:, 1:4], spot[:, 4]
+
+  def inward(self, mesh: Mesh, position: np.ndarray, points: np.ndarray) -> tuple:
+    """Returns what `nearest` does of a solid, and the normals inward there at rest, (n, 3).
+
+    These are even across edges: means by area around vertices.
+    """
+    return *self.nearest(mesh, position, points), -self._spot[: len(points), 5:]
 
   @functools.cached_property
   def stops(self) -> Stops:

@@ -5,7 +5,7 @@
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -28,15 +28,19 @@ _OF_TISSUE = ("fan_metric", "fan_spring", "hinge_gain", "bend_gain", "bend_diag"
 NAMES = (*_OF_SHAPE, *_OF_TISSUE)
 
 
-def _typed(cls):
-  """Gives a struct the arrays of `NAMES`, of the types that they have there."""
-  for kind, names in ((Shape, _OF_SHAPE), (Tissue, _OF_TISSUE)):
-    cls.__annotations__ |= {name: kind.vars[name].type for name in names}
-  return cls
+def typed(*names: tuple[str, ...]) -> Callable[[type], type]:
+  """Returns what gives a struct arrays of `Shape`, and of `Tissue`, of the types that they have."""
+
+  def give(cls: type) -> type:
+    for kind, some in zip((Shape, Tissue), names, strict=True):
+      cls.__annotations__ |= {name: kind.vars[name].type for name in some}
+    return cls
+
+  return give
 
 
 @struct
-@_typed
+@typed(_OF_SHAPE, _OF_TISSUE)
 class Filling:
   """A surface, what its rows are made of, and what they are written to, under the names there."""
 

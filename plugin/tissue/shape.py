@@ -152,7 +152,10 @@ def arrays(
   skin = dataclasses.replace(config, bend=0.0) if len(mesh.tet) else config
   out = _skin(solid.skin(mesh), skin, pinned, vert, node, bend_width)
   out |= _capsule(mesh.surface, config, pinned, vert, node)
-  out |= solid.arrays(mesh, config, vert, node) if len(mesh.tet) else solid.none(nslice)
+  if len(mesh.tet):
+    out |= solid.arrays(mesh, config, vert, node, out["slot_adr"])
+  else:
+    out |= solid.none(nslice)
   out |= {
     "vert": vert.astype(np.int32),
     "node": node.astype(np.int32),

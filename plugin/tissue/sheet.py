@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from .mesh import Mesh, among, area_vectors, lengths, vertex_normals
+from .mesh import Mesh, area_vectors, lengths
 from .path import Finder, check_points
 
 _STEP = 0.25  # between samples of the path, and between lines, in edges
@@ -68,7 +68,7 @@ def sweep(
   k = np.minimum(at.astype(int), len(points) - 2)
   sample = points[k] + (at - k)[:, None] * (points[k + 1] - points[k])
   reach = np.interp(at, np.arange(len(points)), reach)
-  elem, weight, far = finder.nearest(mesh, position, sample)
+  elem, weight, far, inward = finder.inward(mesh, position, sample)
   off = np.flatnonzero(far[given] > _OFF * edge)
   if off.size:
     raise ValueError(
@@ -81,20 +81,12 @@ def sweep(
   path, elem, reach = path[part], elem[part], reach[part]
   if len(path) < 2 or lengths(np.diff(path, axis=0)).sum() < _STEP * edge:
     raise ValueError(f"organ {organ!r}: the path is shorter than an edge of the mesh")
-  inward = _inward(mesh, elem, weight[part])
+  inward = inward[part]
   if direction is not None:
     direction = _at_rest(organ, mesh, position, elem, direction)
   size = 2 * float(lengths(np.ptp(mesh.rest[: mesh.whole.nouter], axis=0)))
   way, reach = _ways(organ, path, inward, direction, reach, edge)
   return _lines(path, way, np.minimum(reach, size), inward, edge)
-
-
-def _inward(mesh: Mesh, elem: np.ndarray, weight: np.ndarray) -> np.ndarray:
-  """Returns the unit normals inward of places of the skin, even across its edges, (n, 3)."""
-  vert, skin = mesh.elem[elem], mesh.elem[: mesh.whole.nelem]
-  around = skin[among(mesh.nvert, vert.ravel())[skin].any(axis=1)]
-  normal = np.einsum("nk,nkj->nj", weight, vertex_normals(mesh.rest, around)[vert])
-  return -normal / np.maximum(lengths(normal), 1e-300)[:, None]
 
 
 def _check(organ: str, points: np.ndarray, depth) -> np.ndarray:

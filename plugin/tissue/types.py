@@ -88,7 +88,7 @@ class Stage(enum.IntEnum):
 
 
 # Numbers that may change while running, in the order of `Tissue.number`: configuration keys, and
-# where worlds differ what the triangles' mu and lambda' and the plate's rigidity are multiples of.
+# where worlds differ what mu, lambda' (of solids lambda) and the plate's rigidity are multiples of.
 NUMBERS = (
   "foundation", "bulk", "pressure", "damping", "tolerance", "iterations", "stiffness",
   "shear", "lame", "plate",
@@ -253,14 +253,17 @@ class System:
 class Lump:
   """Factors on Young's modulus of the triangles of each world; empty where worlds do not differ.
 
-  Those of a fan's triangles and of a hinge's two, and the bending matrix with them.
+  Those of a fan's triangles and of a hinge's two, and the bending matrix with them; of solids what
+  follows from those of the triangles nearest to tetrahedra.
   """
 
-  fan: floats("nlump", "nslot + nslice", 8)
+  fan: floats("nlump", "nskinslot + nskinslice", 8)
   hinge: floats("nlump", "nhingeslice", 2, 8)
   hinge_left: floats("nhingeslice", 8)  # stiffness to itself by the left triangle [N m]
   bend_gain: floats("nlump", "nbend", 8)  # as in `Tissue` [N/m]
   bend_diag: floats("nlump", "nbendslice", 8)  # as in `Tissue` [N/m]
+  tet_moduli: floats("nlump", "ntetslice", 2, 8)  # as in `Tissue`, without the volume [Pa]
+  node_moduli: floats("nlump", "nsolidslice", 2, 8)  # as in `Tissue` [Pa]
 
 
 @struct

@@ -12,6 +12,7 @@ BACKENDS = [
   pytest.param("warp-cpu", marks=pytest.mark.slow),  # mujoco_warp compiles for minutes
   pytest.param("cuda:0", marks=needs_cuda),
 ]
+SKIN = {"capsule_young": 1e5, "thickness": 3e-4}
 
 
 def spec(made):
@@ -175,9 +176,7 @@ def test_contacts_have_the_normal_forces(make, cone):
   np.testing.assert_allclose(pushed[:, 2], found[:, 2], rtol=0.03)
 
 
-@pytest.mark.parametrize(
-  ("window", "skin"), [(True, {}), (False, {"capsule_young": 1e5, "thickness": 3e-4})]
-)
+@pytest.mark.parametrize(("window", "skin"), [(True, {}), (False, SKIN)])
 def test_a_solid_is_that_of_the_plugin(make, window, skin):
   solid = {"elements": "solid", "young": 3e3, "foundation": None} | skin
   made = probed(window, keys=solid)
@@ -191,16 +190,18 @@ def test_a_solid_is_that_of_the_plugin(make, window, skin):
 
 
 TISSUES = [
-  (0, {"poisson": [0.45, 0.2, 0.49], "thickness": [0.002, 0.003, 0.001]}),
-  (1, {"thickness": [0.002, 0.004, 0.0015], "young": [2e4, 3e4, 4e4]}),
-  (0, {"young": "lumps"}),
-  (1, {"young": "lumps"}),
+  ({"bend": 0}, {"poisson": [0.45, 0.2, 0.49], "thickness": [0.002, 0.003, 0.001]}),
+  ({"bend": 1}, {"thickness": [0.002, 0.004, 0.0015], "young": [2e4, 3e4, 4e4]}),
+  ({"bend": 0}, {"young": "lumps"}),
+  ({"bend": 1}, {"young": "lumps"}),
+  ({"elements": "solid"}, {"young_scale": [0.3, 1.0, 4.0], "poisson": [0.49, 0.45, 0.3]}),
+  ({"elements": "solid", **SKIN}, {"young": "lumps"}),
 ]
 
 
-@pytest.mark.parametrize(("bend", "keys"), TISSUES)
-def test_tissues_of_worlds_are_those_of_the_plugin(make, bend, keys):
-  made, keys = press(bend=bend, foundation=2e4), dict(keys)
+@pytest.mark.parametrize(("scene", "keys"), TISSUES)
+def test_tissues_of_worlds_are_those_of_the_plugin(make, scene, keys):
+  made, keys = press(foundation=2e4, **scene), dict(keys)
   forces = []
   for device in (make.device, "cpu"):
     batch = palpate.batch.make(spec(made), 3, device=device)

@@ -45,7 +45,8 @@ def heights(kind: str, k: int) -> float:
 def test_a_tool_presses_as_under_the_plugin(device, kind):
   made = pressed(KINDS[kind])
   model, data, handle = load(made)
-  batch = palpate.batch.make(mujoco.MjSpec.from_string(made), 2, device=device, nodes=24)
+  how = {"device": device, "nodes": 24, "deterministic": True}
+  batch = palpate.batch.make(mujoco.MjSpec.from_string(made), 2, **how)
   tissue, found, expected = batch.organ("organ"), [], []
   for k in range(100):
     batch.ctrl = np.full((2, 1), heights(kind, k))

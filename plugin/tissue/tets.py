@@ -1,0 +1,259 @@
+"""What the inside of a solid has in `Shape` and `Tissue`, as `native/tets.h` writes it.
+
+`solid` makes the arrays of all of it so, and `resolid` writes those that a cut has changed.
+"""
+
+# Annotations here are objects, not text: no `from __future__ import annotations`.
+# pyright: reportInvalidTypeForm=false
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from .kernels import aim, kernel
+from .mesh import Mesh
+from .order import LANES, addresses, pad
+from .rows import typed
+from .step import OWN_SHARE
+from .types import CONSTANTS, doubles, flags, halves, ints, longs, struct
+
+EDGES = 2  # by which cuts may divide edges, for one spare vertex
+_WINDOW = 8 * LANES  # edges that are sorted by the number of their tetrahedra
+_OF_SHAPE = (
+  "fan_node", "fan_rest", "fan_width", "degree", "rest", "free", "area", "tet_node", "tet_gradient",
+  "around_corner", "fan_slope", "edge_from", "edge_to", "edge_node", "edge_slot",
+)  # fmt: skip
+_OF_TISSUE = ("tet_moduli", "node_moduli", "stiffness")
+NAMES = (*_OF_SHAPE, *_OF_TISSUE)
+_ADDRESSES = ("slot_adr", "around_adr", "edge_adr")
+
+
+@struct
+@typed(_OF_SHAPE, _OF_TISSUE)
+class Within:
+  """A solid, what its rows are made of, and what they are written to, under the names there."""
+
+  nvert: int
+  ntet: int
+  nskin: int
+  nelem: int  # triangles
+  most: int  # neighbours that a vertex has room for
+  most_around: int  # tetrahedra around an edge, at most
+  nedge: int  # before the first cut
+  nplace: int  # places of edges
+  nwait: int  # the last so many wait for edges that cuts divide
+  nchanged: int
+  every: int  # whether all is written, but what a surface has too
+  clears: int  # whether blocks of neighbours that are none any more are in `half`
+  nint: int  # whole numbers of scratch
+  nreal: int  # others
+  own: wp.float64  # share of mu that tetrahedra have by themselves
+  centre: doubles(3)  # that rest positions are about [m]
+  mesh_rest: doubles("nvert", 3)  # see `Mesh`, with those that follow
+  ring: longs("nvert", "most")
+  mesh_degree: longs("nvert")
+  elem: longs("nelem", 3)
+  loose: flags("nelem")
+  tet: ints("ntet", 4)  # in the order of the arrays, as all that is by tetrahedron
+  whole_tet: ints("ntet", 4)
+  begin: ints("nvert + 1")  # of the corners around each vertex of the whole
+  around: ints("ncorner")  # these
+  mu: doubles("ntet")  # [Pa]
+  lam: doubles("ntet")  # [Pa]
+  steep: doubles("ntet")  # volume times the square of the steepest gradient [m]
+  pinned: flags("nvert")  # whether a vertex does not move
+  changed: ints("ntet")  # tetrahedra that are not as they were
+  before: ints("ntet", 4)  # corners that they had
+  node: ints("nvert")
+  slot_adr: ints("nslice + 1")
+  around_adr: ints("nslice + 1")
+  edge_adr: ints("nedgeslice + 1")
+  which: ints("npair")  # the edge of each pair of corners before the first cut
+  first: ints("npair")  # its corner of the lower vertex number then, and the other
+  last: ints("npair")
+  edge_begin: ints("nedge + 1")  # of the pairs of each edge
+  edge_pair: ints("npair")  # these
+  place: ints("nedge")  # where each edge lies
+  owner: ints("nwait")  # the edge that has each place that waits, -1 for none
+  half: halves("nhalf")  # see `System`
+  found: ints(1)  # whether there was room
+  ints: ints("nint")
+  reals: doubles("nreal")
+
+
+_fill = kernel("fill_solid", "tets.h", Within, CONSTANTS)
+
+
+@dataclasses.dataclass(frozen=True)
+class Layout:
+  """Where the tetrahedra of a solid and their edges lie, cut or not.
+
+  Attributes:
+    order: tetrahedra in the order of the arrays      (ntet,)
+    first, last, which, place: see `Within`
+    most: tetrahedra around an edge, at most
+    waits: places of edges that wait
+    around_adr: see `types.Shape`
+    edge_adr: see there
+  """
+
+  order: np.ndarray
+  first: np.ndarray
+  last: np.ndarray
+  which: np.ndarray
+  place: np.ndarray
+  most: int
+  waits: int
+  around_adr: np.ndarray
+  edge_adr: np.ndarray
+
+
+def layout(mesh: Mesh, node: np.ndarray, nnode: int) -> Layout:
+  """Returns where tetrahedra and edges lie; `node`: of each vertex, of `nnode`."""
+  mesh = mesh.whole
+  # Who gathers from tetrahedra in the order of their nodes finds them near each other.
+  order = np.lexsort(np.sort(node[mesh.tet], axis=1).T[::-1])
+  tet = mesh.tet[order]
+  a, b = np.triu_indices(4, 1)
+  ends = np.sort(tet[:, np.stack([a, b], axis=1)].reshape(-1, 2), axis=1)
+  # The first end is that of the lower number.
+  swap = (tet[:, a] > tet[:, b]).ravel()
+  first, last = np.tile(a, len(tet)), np.tile(b, len(tet))
+  first, last = np.where(swap, last, first), np.where(swap, first, last)
+  edge, which, count = np.unique(ends, axis=0, return_inverse=True, return_counts=True)
+  # Near ones near each other; within a window those of as many tetrahedra, so that slices are full.
+  near = np.lexsort(np.sort(node[edge], axis=1).T[::-1])
+  window = np.arange(len(edge)) // _WINDOW
+  by = near[np.lexsort((np.arange(len(edge)), -count[near], window))]
+  place = np.empty(len(edge), np.int64)
+  place[by] = np.arange(len(edge))
+  most, more = int(count.max()), -(-EDGES * mesh.spare // LANES)
+  width = np.append(pad(count[by]).reshape(-1, LANES).max(axis=1), np.full(more, most))
+  around = np.bincount(node[mesh.tet].ravel(), minlength=nnode)
+  if mesh.spare:  # a cut adds none to a list
+    around[node[mesh.spares]] = around.max()
+  around_adr = addresses(around.reshape(-1, LANES).max(axis=1))
+  return Layout(
+    order, first, last, which.ravel(), place, most, LANES * more, around_adr, addresses(width)
+  )
+
+
+def blank(lay: Layout, nslot: int, nslice: int) -> dict[str, np.ndarray]:
+  """Returns the arrays of tetrahedra as those of padding, see `types.Shape` and `Tissue`."""
+  ntet, nedge = len(lay.order), len(lay.edge_adr) - 1
+  slices = ntet // LANES + 1  # one at least is padding
+  none = corner_number(ntet)
+  moduli = np.zeros((slices, 3, LANES), np.float32)
+  moduli[:, 1] = 1.0  # padding has no volume, but quotients
+  return {
+    "tet_node": np.zeros((slices, 4, LANES), np.int32),
+    "tet_gradient": np.zeros((slices, 9, LANES), np.float32),
+    "tet_moduli": moduli,
+    "stiffness": np.zeros(1, np.float32),
+    "around_adr": lay.around_adr,
+    "around_corner": np.full((lay.around_adr[-1], LANES), none),
+    "fan_slope": np.zeros((nslot, 3, LANES), np.float32),
+    "node_moduli": np.zeros((nslice, 2, LANES), np.float32),
+    "edge_adr": lay.edge_adr,
+    "edge_from": np.full((lay.edge_adr[-1], LANES), none),
+    "edge_to": np.full((lay.edge_adr[-1], LANES), none),
+    "edge_node": np.zeros((nedge, 2, LANES), np.int32),
+    "edge_slot": np.full((nedge, 2, LANES), -1, np.int32),
+  }
+
+
+def corner_number(tet: int) -> np.int32:
+  """Returns the number of the first corner of a tetrahedron; a slice has eight times four."""
+  return np.int32(tet // LANES * 4 * LANES + tet % LANES)
+
+
+class Tets:
+  """Writes rows of solids of one whole.
+
+  Args:
+    mesh: one of these
+    lay: where what is
+    node: node of every vertex
+    arrays: those that `Within` has of `Shape` and `Tissue`, on the CPU; others are left out
+  """
+
+  def __init__(self, mesh: Mesh, lay: Layout, node: np.ndarray, arrays: Mapping[str, Any]):
+    whole = self._whole = mesh.whole
+    self._order = lay.order
+    self._place = np.argsort(lay.order)
+    ntet, nvert, npair = len(whole.tet), whole.nvert, len(lay.which)
+    self._fields = fields = Within()
+    self.put(arrays)
+    self._tet = whole.tet[lay.order].astype(np.int32)
+    self._changed, self._before = np.zeros(ntet, np.int32), np.zeros((ntet, 4), np.int32)
+    self._pinned = np.zeros(nvert, np.uint8)
+    corner, edges = self._tet.ravel(), len(lay.place)
+    nint, nreal = 6 * nvert + 2 * edges + 2 * lay.most, nvert + 3 * whole.ring.shape[1]
+    self._set(
+      nvert=nvert, ntet=ntet, nskin=whole.nskin, most=whole.ring.shape[1], most_around=lay.most,
+      nedge=edges, nplace=LANES * (len(lay.edge_adr) - 1), nwait=lay.waits, own=OWN_SHARE,
+      nint=nint, nreal=nreal, centre=whole.centre, tet=self._tet, whole_tet=self._tet.copy(),
+      around=np.argsort(corner, kind="stable"), changed=self._changed, before=self._before,
+      begin=addresses(np.bincount(corner, minlength=nvert)), steep=np.zeros(ntet), node=node,
+      which=lay.which, first=lay.first, last=lay.last, place=lay.place, pinned=self._pinned,
+      edge_pair=np.argsort(lay.which, kind="stable"), edge_begin=addresses(np.bincount(lay.which)),
+      owner=np.full(lay.waits, -1), found=np.zeros(1), ints=np.zeros(nint), reals=np.zeros(nreal),
+      half=np.zeros(0),
+    )  # fmt: skip
+    assert npair == 6 * ntet
+    self._found = fields.found.numpy()
+    self._launch = _fill.command(fields).launch
+
+  def put(self, arrays: Mapping[str, Any]):
+    """Writes into these arrays from now on."""
+    self._set(**{name: arrays[name] for name in (*NAMES, *_ADDRESSES) if name in arrays})
+
+  def clear(self, half: wp.array):
+    """Clears the blocks of neighbours that are none any more, on the CPU."""
+    self._set(half=half.flatten(), clears=1)
+
+  def _set(self, **values):
+    for name, value in values.items():
+      if isinstance(value, np.ndarray):
+        kind = Within.vars[name].type.dtype
+        value = np.ascontiguousarray(value, wp.dtype_to_numpy(kind))
+        value = wp.array(value, dtype=kind, device="cpu", copy=False)
+      setattr(self._fields, name, value)
+
+  def write(
+    self,
+    mesh: Mesh,
+    moduli: tuple[np.ndarray, np.ndarray] | None,
+    pinned: np.ndarray,
+    changed: np.ndarray | None = None,
+  ) -> bool:
+    """Writes the rows of a solid; returns False where there is no room for its edges.
+
+    Nothing was written then.
+
+    Args:
+      mesh: the solid
+      moduli: mu and lambda of each tetrahedron [Pa], None for those before
+      pinned: vertices that do not move, (nvert,) bool
+      changed: tetrahedra that are not as in the arrays, None for all
+    """
+    every = changed is None
+    which = np.arange(len(self._order)) if changed is None else np.sort(self._place[changed])
+    n = len(which)
+    new = mesh.tet[self._order[which]]
+    if every:  # an edge that was divided is so whatever was there before
+      self._tet[:] = new
+    self._changed[:n], self._before[:n], self._tet[which] = which, self._tet[which], new
+    self._pinned[:] = pinned
+    if moduli is not None:
+      self._set(mu=moduli[0][self._order], lam=moduli[1][self._order])
+    loose = np.zeros(mesh.nelem, bool) if mesh.loose is None else mesh.loose
+    self._set(nelem=mesh.nelem, nchanged=n, every=int(every))
+    aim(self._fields, mesh_rest=mesh.rest, ring=mesh.ring, mesh_degree=mesh.degree,
+        elem=mesh.elem, loose=loose)  # fmt: skip
+    self._launch()
+    if not self._found[0]:
+      self._tet[which] = self._before[:n]
+    return bool(self._found[0])
