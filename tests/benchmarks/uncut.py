@@ -120,7 +120,8 @@ def run(case: Case, out: pathlib.Path) -> list[Row]:
   """Returns the row of a scene."""
   order = random.Random(SEED)
   if hasattr(os, "sched_setaffinity"):  # processes that follow have it too
-    os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+    cores = sorted(os.sched_getaffinity(0))
+    os.sched_setaffinity(0, {cores[-1 - os.getpid() % len(cores)]})
   with tempfile.TemporaryDirectory() as folder:
     old = package(case["before"], pathlib.Path(folder, "old"))
     new = package(ROOT, pathlib.Path(folder, "new"))
