@@ -159,9 +159,8 @@ def make(w, model: int, sizes: dict[str, int]):
     mj=coupling.mujoco_arrays(model, w.data),
   )  # fmt: skip
   out = fill(Slots, "cpu", values)
-  here = Views(out)
-  here.elem[: mesh.nelem] = mesh.elem
-  _list_triangles(here, mesh, np.arange(mesh.nvert), np.arange(mesh.nelem), mesh.elem[:, 0])
+  out.elem.numpy()[: mesh.nelem] = mesh.elem
+  _list_triangles(Views(out), mesh, np.arange(mesh.nvert), np.arange(mesh.nelem), mesh.elem[:, 0])
   return out
 
 
