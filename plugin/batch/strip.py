@@ -58,6 +58,11 @@ def tools_of(model: mujoco.MjModel, organ) -> np.ndarray:
       raise ValueError(
         f"organ {organ.name!r}: spare and {key} are set, of which a batch on a GPU can do one"
       )
+  if organ.config.bonded and any(row.current for row in organ.config.cutters):
+    raise ValueError(
+      f"organ {organ.name!r}: cutters has a current and bonds are set, which it frees none of in a "
+      "batch on a GPU; expected one of both"
+    )
   if organ.windows:
     found = np.unique(organ.windows.geom)
   else:

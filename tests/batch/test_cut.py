@@ -45,7 +45,7 @@ def pressed(windows, **keys):
   return spec
 
 
-def strip(x=-0.004, cutters=f"edge {ENERGY}", size=(5e-4, 0.006, 0)):
+def strip(x=-0.004, cutters=f"edge {ENERGY}", size=(5e-4, 0.006, 0), **keys):
   """Returns a blade before a strip that its long sides hold."""
   spec = mujoco.MjSpec()
   spec.option.timestep, spec.option.gravity = 2e-3, (0, 0, 0)
@@ -59,8 +59,8 @@ def strip(x=-0.004, cutters=f"edge {ENERGY}", size=(5e-4, 0.006, 0)):
   points, elem = triangular(0.03, 0.026, 11, 11, 0.2)
   pin = np.flatnonzero(np.abs(np.abs(points[:, 1]) - 0.013) < 1e-9)
   palpate.add_organ(
-    spec, (points, elem), "organ", windows=True, mass=0.005, young=2e5, thickness=THICKNESS,
-    spare=60, pin=pin, cutters=cutters, device="cpu",
+    spec, (points, elem), "organ", mass=0.005, young=2e5, thickness=THICKNESS,
+    pin=pin, cutters=cutters, device="cpu", **{"spare": 60, "windows": True} | keys,
   )  # fmt: skip
   return spec
 
@@ -213,13 +213,17 @@ def test_what_cannot_be_cut_is_named():
   assert whole.piece_count.numpy().tolist() == [1, 1]
 
 
+CURRENT = {"cutters": "edge 1e6 by x", "spare": 0, "bonds": "none"}
+
+
 @pytest.mark.parametrize(
-  ("keys", "match"),
+  ("make", "keys", "match"),
   [
-    ({"carrier": "own", "spare": 0}, "carrier is set, which a batch on a GPU cannot do"),
-    ({"bonds": "none"}, "spare and bonds are set, of which a batch on a GPU can do one"),
+    (pressed, {"carrier": "own", "spare": 0}, "carrier is set, which a batch on a GPU cannot do"),
+    (pressed, {"bonds": "none"}, "spare and bonds are set, of which a batch on a GPU can do one"),
+    (strip, CURRENT, "cutters has a current and bonds are set, which it frees none of"),
   ],
 )
-def test_what_a_gpu_cannot_do_is_named(keys, match):
+def test_what_a_gpu_cannot_do_is_named(make, keys, match):
   with pytest.raises(ValueError, match=match):
-    palpate.batch.make(pressed(True, **keys), 2, device="warp-cpu")
+    palpate.batch.make(make(windows=True, **keys), 2, device="warp-cpu")
