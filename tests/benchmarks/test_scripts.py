@@ -64,6 +64,7 @@ def test_another_python_takes_the_same_steps():
   keys = {"nodes": 42, "side": "peer", "h": 4e-3, "tolerance": 1e-8}
   here = solids.Run(**keys)
   with solids.another(sys.executable) as other:
+    assert other
     there = solids.Beside(other, keys)
     for run in (here, there):
       run.restart()
