@@ -144,7 +144,7 @@ PALPATE M3 mean_stress(const float* stress, const int* node, V& pressure, Lane l
 // of as long edges, which is 1 after a rotation.
 constexpr float CRUSHED = 0.5f;
 PALPATE V crushed(V volume, V size2) {
-  const V edge = vmax(size2 / 3.0f, splat(1.0f)), zero = splat(0.0f);
+  const V edge = vmax((1.0f / 3.0f) * size2, splat(1.0f)), zero = splat(0.0f);
   return vmin(vmax(1.0f - volume / (CRUSHED * edge * vsqrt(edge)), zero), splat(1.0f));
 }
 constexpr float LINGERS = 2.0f;  // time steps of damping that it then has besides
@@ -195,9 +195,9 @@ PALPATE void tet_stress(const Fields& f, Thread t, int stage) {
     V p;
     const M3 elastic = mean_stress(nodal, node, p, lane)
       + stress(H, now, alone, (0.625f * h) * alone * now.j, h);
-    const V zero = splat(0.0f);
     const V shear = 0.75f * mu + (per_h * vmax(-p, zero)) * vsqrt(THIRD * size2);
-    const V more = crushed(now.j + 1.0f, size2) * (implicit ? LINGERS * (weight > 0.0f ? h * h : 0.0f) : 0.0f);
+    const float lingers = implicit && weight > 0.0f ? LINGERS * h * h : 0.0f;
+    const V more = lingers * crushed(now.j + 1.0f, size2);
     M3 viscous = (0.75f * gv * mu + more * shear) * (Q * (strain + transposed(strain)));
     if (any_above(more, 0.0f)) viscous = viscous + (more * lam * inner(C, rate)) * C;
     const M3 P = splat(-1.0f) * volume * (elastic + viscous);
