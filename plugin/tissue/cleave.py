@@ -100,7 +100,8 @@ class Cleaving:
   reals: doubles("nreal")
 
 
-_cleave = kernel("cleave_solid", "cleave.h", Cleaving, CONSTANTS | _NUMBERS | {"OWN_SHARE": OWN_SHARE})
+_CONSTANTS = CONSTANTS | _NUMBERS | {"OWN_SHARE": OWN_SHARE}
+_cleave = kernel("cleave_solid", "cleave.h", Cleaving, _CONSTANTS)
 
 
 @dataclasses.dataclass(frozen=True)
