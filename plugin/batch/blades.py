@@ -206,9 +206,8 @@ class Blades(beside.Opens):
     cuts = self._organ.topology
 
     def cut(path: np.ndarray) -> tuple[Any, Mesh]:
-      now = cutters.on_surface(cuts.finder, cuts.mesh_of(world), path, motion.disp[k])
-      report = cuts.apply(world, cuts.find(world, now, motion, k, given), motion, k)
-      return report, cuts.mesh_of(world)
+      found = cuts.find(world, path, motion, k, given, True)
+      return cuts.apply(world, found, motion, k), cuts.mesh_of(world)
 
     organ, mesh = self._organ.declared, cuts.mesh_of(world)
     cutters.open_path(row, mesh, bool(ended), organ, cuts.finder, cut)
