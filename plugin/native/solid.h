@@ -106,8 +106,8 @@ PALPATE void node_stress(const Fields& f, Thread t, int stage) {
   const float* number = numbers(f, t.world);
   const float* moduli = f.lump.node_moduli.data ? f.lump.node_moduli.data + base / 6
                                                 : f.tissue.node_moduli.data;
-  each_slice(t, f.shape.nslice, [&](int s, Lane lane) {
-    const int row = f.shape.slot_adr.data[s], width = f.shape.slot_adr.data[s + 1] - row;
+  each_slice(t, f.shape.nused, [&](int s, Lane lane) {
+    const int row = f.shape.slot_adr.data[s], width = f.shape.fan_width.data[s];
     const int* node = f.shape.fan_node.data + 8 * (row + 2 * s + 1);
     const float* slope = f.shape.fan_slope.data + 24 * (size_t)row;
     const V3 u = ld3(f.system.disp_trial.data + base / 4 + 24 * s, lane);
@@ -266,7 +266,7 @@ PALPATE void solid_row(const Fields& f, Thread t, int stage) {
   const size_t base = (size_t)t.world * f.shape.nslice;
   const size_t tet = (size_t)t.world * f.shape.ntetslice;
   const float* impulse = f.system.tet_impulse.data + 128 * tet;
-  each_slice(t, f.shape.nslice, [&](int s, Lane lane) {
+  each_slice(t, f.shape.nused, [&](int s, Lane lane) {
     const size_t at = base + s;
     const V mass = ld(f.state.mass.data + 8 * at, 0, lane);
     const V kf = splat(foundation) * ld(f.shape.area.data, s, lane), diag = mass + g * kf;
@@ -287,7 +287,8 @@ PALPATE void solid_row(const Fields& f, Thread t, int stage) {
     if (!implicit) return;
     S3 self = {zero, zero, zero, zero, zero, zero};
     const Half* block = f.system.half.data + 72 * (size_t)t.world * f.shape.nslot;
-    for (int j = f.shape.slot_adr.data[s]; j < f.shape.slot_adr.data[s + 1]; ++j)
+    const int row = f.shape.slot_adr.data[s], end = row + f.shape.fan_width.data[s];
+    for (int j = row; j < end; ++j)
       self = self + symmetric(ld9(block + 72 * (size_t)j, lane));
     put_diagonal(f.system.diag.data + 8 * at, f.system.inverse.data + 48 * at,
                  ld(f.shape.free.data, s, lane), diag, splat(-unit(f, t.world)) * self + diag + held, lane);
