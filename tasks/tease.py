@@ -36,8 +36,8 @@ SCENE = Scene(
 # stroke goes beyond the front, how wide a lane is [m], and how fast a stroke and the way back are
 # [m/s]. Back faster, the tip leaves what it held up, and the strip falls on the shaft behind it.
 _OVER, _BEHIND, _BEYOND, _LANE = 0.002, 0.006, 0.006, 0.006
-_SPEED, _BACK = 0.03, 0.015
-_UNDER = 0.02  # from the front at most, of who is under the strip already [m]
+_SPEED, _BACK = 0.03, 0.012
+_UNDER, _LOW = 0.02, 0.005  # from the front and the bed at most, of who is under the strip [m]
 ROW = 0.5 * _LANE  # bonds of the front are no farther from the first of them [m]
 
 
@@ -154,7 +154,8 @@ class Tease(Freeing):
     physics, sides = p.physics, (0.0, -_LANE, _LANE)
     along, far = np.array([0.0, 1.0, 0.0]), _BEHIND + _BEYOND * (1 + p.style.overshoot)
     # Where somebody else was under the strip it begins with their lane.
-    here = [abs(p.tip[0] - x) for x in sides] if self.distance(physics) < _UNDER else []
+    under = self.distance(physics) < _UNDER and p.tip[2] < _LOW
+    here = [abs(p.tip[0] - x) for x in sides] if under else []
     first = int(np.argmin(here)) if here else 0
     for turn in itertools.count(first):
       if self.outcome is not None:

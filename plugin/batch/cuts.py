@@ -175,7 +175,7 @@ class Cuts:
   # Cutting.
 
   def find(
-    self, world: int, points: np.ndarray, motion: Motion, k: int, given: float = 0.0
+    self, world: int, points: np.ndarray, motion: Motion, k: int, *how
   ) -> cutting.Cut:
     """Returns what a cut along points in the organ's frame, (n, 3) [m], makes of a world.
 
@@ -184,12 +184,12 @@ class Cuts:
       points: the path
       motion: what vertices of some worlds have
       k: which of them it is
-      given: see `cutting.Knife.cut`
+      how: last arguments of `cutting.Knife.cut`
     """
     organ, had = self._organ, self._of(world)
     carried = cutting.Motion(had.mass, motion.disp[k], motion.vel[k])
-    how = ~organ.declared.free, organ.config, None, given
-    found = self._knife.cut(organ.name, had.mesh, carried, points, *how)
+    free, config = organ.declared.free, organ.config
+    found = self._knife.cut(organ.name, had.mesh, carried, points, ~free, config, None, *how)
     kept = (getattr(found.motion, name).copy() for name in ("mass", "disp", "vel"))
     return dataclasses.replace(found, motion=cutting.Motion(*kept))
 

@@ -86,6 +86,7 @@ class Cuts:
     if not self:
       return
     bodies.unshare(w.body)
+    bodies.occupy(w.body, self.whole)
     self._make()
     self.declared = w.organ
     self.mass = w.organ.mass.copy()
@@ -164,7 +165,7 @@ class Cuts:
     for name, values in kept.items():
       self._own[name][:] = values
 
-  def _write(self, found: Any):
+  def _write(self, found: Any, vert: np.ndarray):
     """Writes to the state what a cut has changed, where it has the mesh before; else everything."""
     own, mesh, n = self._own, self.mesh, self.whole.nvert
     words, spare = self._words, mesh.nvert - mesh.spare
@@ -172,7 +173,7 @@ class Cuts:
       words[:] = np.concatenate([flexes.pack(mesh.elem, mesh.loose), mesh.rest.ravel(), self.mass])
       self._total = flexes.total(words, slice(None), len(words))
     else:
-      elem, vert = found.changed, topology.distinct(found.before, mesh.elem[found.changed])
+      elem = found.changed
       loose = None if mesh.loose is None else mesh.loose[elem]
       place = (3 * vert[:, None] + np.arange(3)).ravel()
       at = np.concatenate([elem, mesh.nelem + place, mesh.nelem + 3 * n + vert])
@@ -184,17 +185,25 @@ class Cuts:
     self._loose = mesh.loose
     self.stamp = self._found[0] = flexes.stamp_of(self._total)
 
-  def _become(self, mesh: Mesh, changed: np.ndarray, mass, source, stamp: float):
+  def _become(
+    self, mesh: Mesh, changed: np.ndarray, mass, source, stamp: float
+  ) -> np.ndarray:
+    """Makes the organ another mesh; returns the vertices that something has changed at."""
     w = self._w
     touched = self._touched(mesh, changed)
-    touched = topology.distinct(touched, np.flatnonzero(mass != self.mass))
+    other = mass != self.mass
+    other[touched] = False
+    if other.any():
+      touched = topology.distinct(touched, np.flatnonzero(other))
     self._refill.write(mesh, changed, w.config, ~w.organ.free)
+    bodies.occupy(w.body, mesh)
     self.mass, self.source, self.stamp = mass, source, stamp
     w.organ = self.declared.cut(mesh, mass)
     w.phases.reshape(touched)
     for grown in [space for each in w.beside for space in each.reshape()]:
       with graphs.lock:
         bind(grown, grown.model)
+    return touched
 
   def _touched(self, mesh: Mesh, changed: np.ndarray) -> np.ndarray:
     """Returns the vertices that something has changed at, in this mesh and another."""
@@ -205,10 +214,11 @@ class Cuts:
     if self:
       self._refill.forget()
 
-  def share(self, values: np.ndarray) -> np.ndarray:
-    """Returns values by mass of the whole's vertices, spread over what became of them, (nvert,)."""
-    was = self.declared.mass[self.source]
-    return values[self.source] * self.mass / np.where(was > 0, was, 1.0)
+  def share(self, values: np.ndarray, vert: Any = slice(None)) -> np.ndarray:
+    """Returns what has become of values by mass of the whole's vertices, at some or all, (n,)."""
+    source = self.source[vert]
+    was = self.declared.mass[source]
+    return values[source] * self.mass[vert] / np.where(was > 0, was, 1.0)
 
   # MuJoCo's triangles.
 
@@ -233,8 +243,17 @@ class Cuts:
   # Cutting.
 
   def cut(self, points: npt.ArrayLike, given: float = 0.0, depth=None, direction=None) -> Report:
-    """Cuts the organ along points in the world, (n, 3) [m]; see `Organ.cut`, and `cutting.cut`."""
-    w, found = self._w, self.find(points, given, depth, direction)
+    """Cuts the organ along points in the world, (n, 3) [m]; see `Organ.cut`, and `Knife.cut`."""
+    return self._end(self.find(points, given, depth, direction))
+
+  def cut_at_rest(self, points: np.ndarray, given: float) -> Report:
+    """Cuts a surface along points on it at rest, in its frame, (n, 3) [m]."""
+    self.follow()
+    return self._end(self._knife.cut(*self._state(points), given, at_rest=True))
+
+  def _end(self, found: Any) -> Report:
+    """Takes over what was found, and says what it is."""
+    w = self._w
     if found.stopped:
       w.note(
         f"the cut stops early: no spare vertices are left of {self.mesh.spare}; give the organ more"
@@ -264,13 +283,18 @@ class Cuts:
 
   def _find(self, motion: cutting.Motion, points, given: float, depth, direction) -> Any:
     """Returns the cut along points in the organ's frame, see `cutting.Knife`."""
-    w, organ = self._w, self._w.organ
     if depth is not None or direction is not None:
       raise ValueError(
-        f"organ {organ.name!r}: depth or direction is set, allowed only with elements='solid'"
+        f"organ {self._w.organ.name!r}: depth or direction is set, allowed only with "
+        "elements='solid'"
       )
-    how = ~organ.free, w.config, self._held(), given
-    return self._knife.cut(organ.name, self.mesh, motion, points, *how)
+    return self._knife.cut(*self._state(points, motion), given)
+
+  def _state(self, points: np.ndarray, motion: cutting.Motion | None = None) -> tuple:
+    """Returns what `Knife.cut` is told of the organ."""
+    w, organ = self._w, self._w.organ
+    motion = motion or cutting.Motion(self.mass, *w.phases.motion())
+    return organ.name, self.mesh, motion, points, ~organ.free, w.config, self._held()
 
   def _held(self) -> cutting.Springs | None:
     """Returns the ties and bonds, None where there are none."""
@@ -296,11 +320,12 @@ class Cuts:
     source[member] = source[group]
     for each in w.beside:
       each.carry(group, member, share)
-    self._become(mesh, found.changed, motion.mass.copy(), source, self.stamp)
-    self._write(found)
+    touched = self._become(mesh, found.changed, motion.mass.copy(), source, self.stamp)
+    self._write(found, touched)
     changed = topology.distinct(found.near, member)
     w.phases.carry(changed, motion.disp, motion.vel, group, member, share)
-    self.show()
+    if not w.organ.windows:  # of which MuJoCo reads triangles only where they are drawn
+      self.show()
 
   def pieces(self) -> list[Piece]:
     """Returns the parts that hang together, the largest first."""

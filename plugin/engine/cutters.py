@@ -16,7 +16,7 @@ import warp as wp
 from palpate.tissue.mesh import Mesh
 from palpate.tissue.path import Finder
 from palpate.tissue.step import SCHEMES
-from palpate.tissue.types import doubles, fill, ints, struct
+from palpate.tissue.types import Views, doubles, fill, ints, struct
 
 from . import coupling, fasten, flexes, inward, mjstruct
 from .current import Current
@@ -26,9 +26,6 @@ from .layout import BLADE, LAW, TRAIL
 
 _SLACK = 0.1  # edges of the mesh by which a blade's spring is stretched where it cuts
 _MORE = 0.5  # edges after which what could not come apart is tried again
-# Edges of a path that come apart at once at least, and that do not yet, behind the blade; and what
-# a vertex may be farther from the path for an edge that is opened more.
-_FIRST, _LAST, _FARTHER = 0.9, 0.3, 0.15
 # Share of the work on an edge that moving a vertex may turn into strain: without it none could move
 # on to the blade's path, where tissue is stretched.
 GIVEN = 0.1
@@ -107,8 +104,10 @@ class Cutters(Beside):
     self.names: list[tuple[str, ...]] = []
     self._arrays: dict[str, np.ndarray] = {}
     self._width = np.zeros(0)
-    self._currents: dict[int, Current] = {}
+    self.by_current: dict[int, Current] = {}
     self._due: Any = ()
+    self._here: Any = None  # the arrays of `fields`, and of what it has of the organ
+    self._own: Any = None
     self._said = False
 
   def __bool__(self) -> bool:
@@ -136,7 +135,7 @@ class Cutters(Beside):
         self._width[i] = max(self._width[i], width)
       if rows[i].current:
         actuator, shape = _find_actuator(w, m, rows[i].current), _shape(w, m, geoms[0])
-        self._currents[i] = Current(w, geoms[0], actuator, rows[i].energy, shape)
+        self.by_current[i] = Current(w, geoms[0], actuator, rows[i].energy, shape)
     self.names = [tuple(_name(m, g) for g in geoms) for geoms in found]
     self._arrays = {"geom": geom, "axis": axis, "half": half}
     w.hold.need()
@@ -162,7 +161,7 @@ class Cutters(Beside):
   @property
   def currents(self) -> list[str]:
     """Names of the geoms that cut by a current."""
-    return [self.names[i][0] for i in self._currents]
+    return [self.names[i][0] for i in self.by_current]
 
   def edges(self) -> dict[str, np.ndarray]:
     """Returns the fields of `Blades` that say which geoms they are, and their edges."""
@@ -171,7 +170,7 @@ class Cutters(Beside):
   @property
   def state(self) -> np.ndarray:
     """Where each is in the tissue, in the plugin state, (nblade, len(BLADE))."""
-    return self.rows("blade", len(BLADE)).numpy()
+    return self._here.state
 
   def bind(self, model: int):
     """See `Beside`."""
@@ -199,7 +198,10 @@ class Cutters(Beside):
       mj=coupling.mujoco_arrays(model, w.data, Bodies),
     )
     self.fields = fill(Blades, "cpu", values)
-    self._due = self.fields.due.numpy().data
+    self._here, self._own = Views(self.fields), Views(self.fields.own)
+    self._due = self._here.due.data
+    if w.cuts and not len(mesh.tet):
+      assert w.cuts.finder.stops  # made now, since its kernel takes a while to load
 
   def refresh(self):
     """Takes the thickness that the wall has now."""
@@ -211,19 +213,20 @@ class Cutters(Beside):
     """See `Beside`."""
     if self.fields is not None:
       mesh = self._w.organ.mesh
-      self.fields.elem.numpy()[:] = mesh.elem[: mesh.whole.nelem]
-      self.fields.flat.numpy()[:] = mesh.rest
-      self.fields.own.rest.numpy()[:] = base(self._w.organ)
+      self._here.elem[:] = mesh.elem[: mesh.whole.nelem]
+      self._here.flat[:] = mesh.rest
+      self._own.rest[:] = base(self._w.organ)
     return []
 
   def open(self) -> bool:
     """Lets the mesh come apart along the paths that are long enough, or ended; returns whether."""
     opened, mesh = False, self._w.organ.mesh
-    for i, current in self._currents.items():
-      self._due[i] = self._follow(current, self.state[i])
+    for i, current in self.by_current.items():
+      row = self.state[i]
+      self._due[i] = ENDED if current.act(row) else lay_trail(row, mesh.whole.edge_length)
     for i, due in enumerate(self._due):
       if due:
-        given = GIVEN * self.fields.law.numpy()[i, LAW.force] * mesh.whole.edge_length
+        given = GIVEN * self._here.law[i, LAW.force] * mesh.whole.edge_length
         opened = self._open(i, due == ENDED, given) or opened
         self._due[i] = 0
     return opened
@@ -233,15 +236,13 @@ class Cutters(Beside):
     w, row, mesh = self._w, self.state[i], self._w.organ.mesh
 
     def cut(path: np.ndarray, *deep: np.ndarray) -> tuple[Report, Mesh]:
-      organ, more = w.organ, {}
-      now = on_surface(w.cuts.finder, organ.mesh, path, w.phases.motion()[0])
-      how = given
-      if deep:
-        geom, axis = (self._arrays[name][i] for name in ("geom", "axis"))
-        own = geom[1] < 0 and i not in self._currents
-        way = inward.direction(w, int(geom[0]) if own else -1, axis[0], int(row[BLADE.elem]))
-        more, how = {"depth": deep[0], "direction": way}, given * float(deep[0].mean())
-      return w.cuts.cut(organ.origin + now @ organ.frame.T, how, **more), w.organ.mesh
+      if not deep:
+        return w.cuts.cut_at_rest(path, given), w.organ.mesh
+      organ, geom, axis = w.organ, *(self._arrays[name][i] for name in ("geom", "axis"))
+      own = geom[1] < 0 and i not in self.by_current
+      way = inward.direction(w, int(geom[0]) if own else -1, axis[0], int(row[BLADE.elem]))
+      now = organ.origin + self._on_surface(path) @ organ.frame.T
+      return w.cuts.cut(now, given * float(deep[0].mean()), deep[0], way), w.organ.mesh
 
     if len(mesh.tet):
       edge = mesh.whole.edge_length
@@ -253,21 +254,12 @@ class Cutters(Beside):
       mjstruct.warn(why)
     return report is not None and report.nodes > 0
 
-  def _follow(self, current: Current, row: np.ndarray) -> int:
-    """Lets a path follow a current; returns what is due, as the header says it of blades."""
-    if current.act(row):
-      return ENDED
-    count, at = int(row[BLADE.count]), row[BLADE.at : BLADE.at + 3]
-    if not row[BLADE.stage]:
-      return 0
-    edge = self._w.organ.mesh.whole.edge_length
-    start, last = (row[k : k + 3] for k in (BLADE.trail, BLADE.trail + 3 * (count - 1)))
-    if count < TRAIL and np.linalg.norm(at - last) > _SPACING * edge:
-      row[BLADE.trail + 3 * count : BLADE.trail + 3 * count + 3] = at
-      row[BLADE.below + count] = row[BLADE.depth]
-      row[BLADE.count] += 1
-    wait = row[BLADE.wait] or _BATCH * edge
-    return int(np.linalg.norm(at - start) > wait or row[BLADE.count] == TRAIL)
+  def _on_surface(self, path: np.ndarray) -> np.ndarray:
+    """Returns where points of the rest shape are now, in the organ's frame, (n, 3)."""
+    w, mesh = self._w, self._w.organ.mesh
+    elem, weight, _ = w.cuts.finder.nearest(mesh, mesh.rest, path)
+    place = mesh.rest + w.phases.motion()[0]
+    return np.einsum("nk,nkj->nj", weight, place[mesh.elem[elem]])
 
   def read(self) -> list[Cutter]:
     """Returns what the cutters do."""
@@ -282,7 +274,26 @@ class Cutters(Beside):
     return out
 
   def _forces(self) -> np.ndarray:
-    return self.fields.force.numpy() @ self._w.organ.frame.T
+    return self._here.force @ self._w.organ.frame.T
+
+
+def lay_trail(row: np.ndarray, edge: float) -> int:
+  """Lets a path follow what cuts by a current; returns what is due, as the header says of blades.
+
+  Args:
+    row: of the blades' state
+    edge: mean length of the mesh's edges [m]
+  """
+  count, at = int(row[BLADE.count]), row[BLADE.at : BLADE.at + 3]
+  if not row[BLADE.stage]:
+    return 0
+  start, last = (row[k : k + 3] for k in (BLADE.trail, BLADE.trail + 3 * (count - 1)))
+  if count < TRAIL and np.linalg.norm(at - last) > _SPACING * edge:
+    row[BLADE.trail + 3 * count : BLADE.trail + 3 * count + 3] = at
+    row[BLADE.below + count] = row[BLADE.depth]
+    row[BLADE.count] += 1
+  wait = row[BLADE.wait] or _BATCH * edge
+  return int(np.linalg.norm(at - start) > wait or row[BLADE.count] == TRAIL)
 
 
 def open_path(
@@ -311,7 +322,7 @@ def open_path(
   trail = row[BLADE.trail : BLADE.trail + 3 * count].reshape(-1, 3)
   path, rest = np.vstack([trail, at]), at[None]
   if not ended:
-    path, rest = _part(mesh, finder, path)
+    path, rest = finder.stops.part(mesh, path)
   report, why = None, ""
   try:
     if len(path) > 1:
@@ -324,17 +335,11 @@ def open_path(
     _wait(row, at, edge, "pinned" in why or count == TRAIL)
   else:
     tip = (report.path[-1][-1] - organ.origin) @ organ.frame if report.path else path[-1]
-    trail = np.vstack([tip, rest[:-1]])[:TRAIL]
+    trail = np.concatenate([tip[None], rest[:-1]])[:TRAIL]
     row[BLADE.count], row[BLADE.wait] = len(trail), 0.0
     row[BLADE.trail : BLADE.trail + trail.size] = trail.ravel()
     row[BLADE.elem] = finder.nearest(mesh, mesh.rest, at[None])[0][0]
   return report, why
-
-
-def on_surface(finder: Finder, mesh: Mesh, path: np.ndarray, disp: np.ndarray) -> np.ndarray:
-  """Returns where points of the rest shape are, (n, 3), with displacements (nvert, 3)."""
-  elem, weight, _ = finder.nearest(mesh, mesh.rest, path)
-  return np.einsum("nk,nkj->nj", weight, (mesh.rest + disp)[mesh.elem[elem]])
 
 
 def _wait(row: np.ndarray, at: np.ndarray, edge: float, full: bool):
@@ -344,27 +349,6 @@ def _wait(row: np.ndarray, at: np.ndarray, edge: float, full: bool):
   if full:
     row[BLADE.count], row[BLADE.wait] = 1, 0.0
     start[:] = at
-
-
-def _part(mesh, finder, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-  """Returns the part of a path that comes apart now, and the rest; nothing where there is none.
-
-  It ends where a vertex is near, so that the mesh need not be bent to where the blade is just now.
-  """
-  edge = mesh.whole.edge_length
-  size = np.linalg.norm(np.diff(path, axis=0), axis=1)
-  arc = np.concatenate([[0.0], np.cumsum(size)])
-  way = np.arange(_FIRST * edge, arc[-1] - _LAST * edge, 0.1 * edge)
-  point = np.stack([np.interp(way, arc, path[:, c]) for c in range(3)], axis=1)
-  if not len(point):
-    return path[:0], path
-  elem, _, _ = finder.nearest(mesh, mesh.rest, point)
-  vert = np.unique(mesh.elem[elem])
-  far = np.linalg.norm(point[:, None] - mesh.rest[vert], axis=2).min(axis=1)
-  stop = int(np.argmin(far - _FARTHER * way))
-  k = int(np.searchsorted(arc, way[stop]))
-  end = point[stop][None]
-  return np.vstack([path[:k], end]), np.vstack([path[k:]])
 
 
 def _name(m, geom: int) -> str:

@@ -7,6 +7,7 @@ have made a corner of a tetrahedron that it has: the rest follows, see `faces.re
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 from palpate.tissue import cleave, faces
@@ -55,13 +56,13 @@ class SolidCuts(Cuts):
       self._elem[:] = self.mesh.elem[: self.whole.nelem]
       self._mark[0] = self.stamp
 
-  def share(self, values: np.ndarray) -> np.ndarray:
+  def share(self, values: np.ndarray, vert: Any = slice(None)) -> np.ndarray:
     """Returns values by mass, see `Cuts.share`; what comes from inside has them as the skin."""
     was, n = self.declared.mass, self.whole.nouter
     ratio = np.sort(values[:n] / np.maximum(was[:n], 1e-300))
     usual, inside = self.mass * ratio[n // 2], self.source >= self.whole.nskin
     out = np.where(inside, usual, super().share(values))
-    return np.where(self.mass > 0, out, values)
+    return np.where(self.mass > 0, out, values)[vert]
 
   def _read(self) -> tuple:
     whole, own, n = self.whole, self._own, self.whole.nelem
@@ -85,7 +86,7 @@ class SolidCuts(Cuts):
     self.seat = seat
     return dataclasses.replace(mesh, loose=loose), changed, mass, source
 
-  def _write(self, found: cleave.Cut):
+  def _write(self, found: cleave.Cut, vert: np.ndarray):
     own, mesh, n = self._own, self.mesh, self.whole.nelem
     self._sit(found)
     face = faces.opened(mesh)

@@ -5,7 +5,7 @@
 import numpy as np
 import warp as wp
 from palpate.tissue import order
-from palpate.tissue.types import doubles, fill, ints, struct
+from palpate.tissue.types import Views, doubles, fill, ints, struct
 
 from . import coupling, layout
 from .coupling import Crossing
@@ -69,26 +69,34 @@ def make(w, side, motion, boxes: tuple[wp.array, wp.array], sizes: dict[str, int
     outbox=layout.carve(Outbox, boxes[1], sizes),
     solve=coupling.crossing(coupling.on_body(w.body) if w.config.resident else w.host),
   )
-  out = fill(Nodes, side, values)
-  _weigh(w, np.arange(organ.mesh.nvert))
-  return out
+  return fill(Nodes, side, values)
 
 
-def reshape(w, nodes, vert: np.ndarray):
-  """Gives the nodes the rest places and masses that vertices have now."""
-  for array, values in ((nodes.rest, w.organ.mesh.rest), (nodes.mass, w.organ.mass)):
-    if array.device.is_cuda:
-      array.assign(values)
+class Weights:
+  """Rest places and masses of a workspace's nodes, which cuts change.
+
+  Args:
+    w: the workspace
+    nodes: `Nodes` of it
+  """
+
+  def __init__(self, w, nodes):
+    self._w, self._nodes, self._here = w, nodes, Views(nodes)
+    self._number, self._mass = w.body.shape.node.numpy(), w.host["mass"].numpy().reshape(-1)
+
+  def put(self, vert: np.ndarray):
+    """Gives the nodes what these vertices have now."""
+    w, nodes = self._w, self._nodes
+    rest, mass = w.organ.mesh.rest, w.organ.mass
+    if nodes.rest.device.is_cuda:
+      nodes.rest.assign(rest)
+      nodes.mass.assign(mass)
     else:
-      array.numpy()[vert] = values[vert]
-  _weigh(w, vert)
-
-
-def _weigh(w, vert: np.ndarray):
-  """Gives the solver's nodes the masses that vertices have now."""
-  node, mass = w.body.shape.node.numpy()[vert], w.organ.mass[vert]
-  w.host["mass"].numpy()[0, node // order.LANES, node % order.LANES] = np.where(mass > 0, mass, 1.0)
-  wp.copy(w.body.state.mass, w.host["mass"])
+      self._here.rest[vert], self._here.mass[vert] = rest[vert], mass[vert]
+    # Nodes without a mass have one in the solver, so that nothing divides by zero.
+    self._mass[self._number[vert]] = np.where(mass[vert] > 0, mass[vert], 1.0)
+    if w.body.device.is_cuda:
+      wp.copy(w.body.state.mass, w.host["mass"])
 
 
 def launch(kernel, nodes, count: int, device):

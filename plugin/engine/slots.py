@@ -2,11 +2,13 @@
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
+from typing import Any
+
 import numpy as np
 import warp as wp
 from palpate.tissue import mesh as topology
 from palpate.tissue import step
-from palpate.tissue.types import doubles, fill, floats, ints, struct
+from palpate.tissue.types import Views, doubles, fill, floats, ints, struct
 
 from . import coupling, mjstruct
 from .coupling import Mujoco
@@ -35,6 +37,7 @@ class Slots:
   reach: wp.float64  # distance from a geom within which nodes may be in a window [m]
   slow: wp.float64  # speed below which the organ counts as at rest [m/s]
   longest: wp.float64  # longest edge [m]
+  radius: wp.float64  # of the windows' flexes [m]
   skin: wp.float64  # distance of surface and geom at which MuJoCo finds a contact, at most [m]
   weight: wp.float64  # mass of the organ [kg]
   # The organ:
@@ -113,7 +116,6 @@ def make(w, model: int, sizes: dict[str, int]):
   radius = float(mjstruct.view(m.flex_radius, m.nflex)[win.flex].max())
   margin = float(mjstruct.view(m.flex_margin, m.nflex)[win.flex].max())
   margin += float(mjstruct.view(m.geom_margin, m.ngeom)[win.geom].max(initial=0.0))
-  dofs = win.dofadr[:, None] + np.arange(3)
   room = max(mesh.whole.nelem, sizes["ncorner"])
   values = w.boxes | {name: w.views[name] for name in scratch(0, 0)} | dict(
     nvert=sizes["nvert"],
@@ -126,6 +128,7 @@ def make(w, model: int, sizes: dict[str, int]):
     reach=max(_REACH * float(lengths.mean()), float(longest.max())) + radius,
     slow=SLOW * float(np.linalg.norm(np.ptp(mesh.rest, axis=0))),
     longest=float(longest.max()),
+    radius=radius,
     skin=radius + margin,
     weight=float(win.mass.sum()),
     free=organ.free,
@@ -143,7 +146,7 @@ def make(w, model: int, sizes: dict[str, int]):
     home=win.home,
     qhome=win.qhome,
     dofadr=win.dofadr,
-    massadr=coupling.mass_addresses(m, dofs),
+    massadr=coupling.mass_addresses(m, win.dofadr[:, None] + np.arange(3)),
     qposadr=win.qposadr,
     bodyid=win.body,
     window_adr=win.adr,
@@ -157,36 +160,51 @@ def make(w, model: int, sizes: dict[str, int]):
   )  # fmt: skip
   out = fill(Slots, "cpu", values)
   out.elem.numpy()[: mesh.nelem] = mesh.elem
-  _list_triangles(out, mesh, np.arange(mesh.nvert), np.arange(mesh.nelem))
+  _list_triangles(Views(out), mesh, np.arange(mesh.nvert), np.arange(mesh.nelem), mesh.elem[:, 0])
   return out
 
 
-def reshape(w, slots, vert: np.ndarray):
-  """Gives slots the mesh and the masses that vertices have now; triangles keep their number."""
-  organ, mesh, m = w.organ, w.organ.mesh, mjstruct.Model.from_address(w.model)
-  radius = float(mjstruct.view(m.flex_radius, m.nflex)[organ.windows.flex].max())
+def reshape(organ, here: Views, radius: float, vert: np.ndarray):
+  """Gives slots the mesh and the masses that vertices have now; triangles keep their number.
+
+  Args:
+    organ: the declaration
+    here: of the slots
+    radius: of the windows' flexes [m]
+    vert: vertices that something has changed at
+  """
+  mesh = organ.mesh
   elem, ring, place = topology.around(mesh, vert), mesh.ring[vert], mesh.rest[vert]
-  slots.rest.numpy()[vert] = place
-  slots.elem.numpy()[elem] = mesh.elem[elem]
-  length = np.where(ring >= 0, topology.lengths(mesh.rest[ring] - place[:, None]), 0.0)
-  slots.touch.numpy()[vert] = length.max(axis=1) + radius
-  slots.node_mass.numpy()[vert] = hold(organ, organ.mass[vert], vert)
-  _list_triangles(slots, mesh, vert, elem)
+  corner = mesh.elem[elem]
+  here.rest[vert], here.elem[elem] = place, corner
+  arm = mesh.rest[ring] - place[:, None]
+  square = np.where(ring >= 0, np.einsum("ijk,ijk->ij", arm, arm), 0.0)
+  here.touch[vert] = np.sqrt(square.max(axis=1)) + radius
+  here.node_mass[vert] = hold(organ, organ.mass[vert], vert)
+  _list_triangles(here, mesh, vert, elem, corner[:, 0])
 
 
-def _list_triangles(slots, mesh, vert: np.ndarray, elem: np.ndarray):
-  """Lists the triangles whose first corners these vertices are; `elem`: all that they have."""
-  begin, following = slots.begin.numpy(), slots.following.numpy()
-  first = mesh.elem[elem, 0]
-  order = np.lexsort((elem, first))
-  order = order[topology.among(mesh.nvert, vert)[first[order]]]
+def _list_triangles(here: Views, mesh, vert: np.ndarray, elem: np.ndarray, first: np.ndarray):
+  """Lists the triangles whose first corners these vertices are.
+
+  Args:
+    here: of the slots
+    mesh: the mesh
+    vert: the vertices
+    elem: all triangles that they have, ascending
+    first: the first corners of these
+  """
+  begin, following = here.begin, here.following
+  mine = topology.among(mesh.nvert, vert)[first]
+  elem, first = elem[mine], first[mine]
+  order = np.argsort(first, kind="stable")
   elem, first = elem[order], first[order]
   begin[vert] = -1
   begin[first[::-1]] = elem[::-1]
   following[elem] = np.append(np.where(first[1:] == first[:-1], elem[1:], -1), -1)[: len(elem)]
 
 
-def hold(organ, inertia: np.ndarray, vert: np.ndarray | slice = slice(None)) -> np.ndarray:
+def hold(organ, inertia: np.ndarray, vert: Any = slice(None)) -> np.ndarray:
   """Returns the inertia of nodes, with that of a wall for pinned ones [kg]."""
   return np.where(organ.free[vert], inertia, WALL * organ.windows.mass.sum())
 

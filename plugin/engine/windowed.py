@@ -12,10 +12,13 @@ its device over a copy that `Resident` keeps; the slots' kernels (`slots`) on th
 
 from __future__ import annotations
 
+from typing import Any
+
 import mujoco
 import numpy as np
 import warp as wp
 from palpate.tissue import step
+from palpate.tissue.types import Views
 
 from . import apart, coupling, inertia, layout, mjstruct, nodes, prepare, slots
 from .layout import TAIL, Inbox, Motion, Outbox, WindowState
@@ -71,29 +74,33 @@ class Phases(coupling.Phases):
       motion = layout.carve(Motion, self._motion, sizes)
       w.resident = Resident(w, self._motion, self._end_now, self.look_ahead)
     self._nodes = nodes.make(w, self.side, motion, self._far, sizes)
+    self._weights = nodes.Weights(w, self._nodes)
+    self._weights.put(np.arange(organ.mesh.nvert))
+    self._slots_here, self._motion_here = Views(self._slots), Views(w.boxes["own"].motion)
 
   # Cuts.
 
   def reshape(self, touched: np.ndarray | None = None):
     """Takes the mesh and the masses that the organ has now."""
-    touched = np.arange(self._w.organ.mesh.nvert) if touched is None else touched
-    slots.reshape(self._w, self._slots, touched)
-    share_inertia(self._w)
-    nodes.reshape(self._w, self._nodes, touched)
+    organ = self._w.organ
+    touched = np.arange(organ.mesh.nvert) if touched is None else touched
+    slots.reshape(organ, self._slots_here, self._slots.radius, touched)
+    share_inertia(self._w, touched)
+    self._weights.put(touched)
     wake(self._w)
 
   def motion(self) -> tuple[np.ndarray, np.ndarray]:
     """Returns displacement and velocity of the vertices, in the organ's frame, (nvert, 3) each."""
     if self._w.resident:
       self._w.resident.fetch()
-    motion = self._w.boxes["own"].motion
-    return motion.disp.numpy().copy(), motion.vel.numpy().copy()
+    motion = self._motion_here
+    return motion.disp.copy(), motion.vel.copy()
 
   def carry(self, changed, disp, vel, group, member, share):
     """Gives vertices their motion after a cut, see `coupling.Phases`; slots keep their forces."""
-    motion = self._w.boxes["own"].motion
-    motion.disp.numpy()[changed], motion.vel.numpy()[changed] = disp[changed], vel[changed]
-    for values in (motion.last.numpy(), motion.before.numpy()):
+    motion = self._motion_here
+    motion.disp[changed], motion.vel[changed] = disp[changed], vel[changed]
+    for values in (motion.last, motion.before):
       values[member] = values[group]
     if self._w.resident:
       self._w.resident.renew()
@@ -275,10 +282,11 @@ def set_inertia(w, m):
   share_inertia(w)
 
 
-def share_inertia(w):
-  """Gives vertices that were one their part of its inertia."""
+def share_inertia(w, vert: Any = slice(None)):
+  """Gives vertices, some or all, that were one their part of its inertia."""
   nodal = w.views["whole"]
-  w.views["inertia"].numpy()[:] = slots.hold(w.organ, w.cuts.share(nodal) if w.cuts else nodal)
+  nodal = w.cuts.share(nodal, vert) if w.cuts else nodal[vert]
+  w.views["inertia"].numpy()[vert] = slots.hold(w.organ, nodal, vert)
 
 
 def shortage(w) -> str | None:

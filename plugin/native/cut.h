@@ -275,7 +275,7 @@ PALPATE void cut_surface(const Fields& f, Thread t, int) {
   double* x = memory.values(3 * m.nvert);
   if (memory.full) return;
   const Moving moving = {f.mass.data + v, f.disp.data + 3 * v, f.vel.data + 3 * v};
-  for (int i = 0; i < 3 * m.nvert; ++i) x[i] = m.rest[i] + moving.disp[i];
+  for (int i = 0; i < 3 * m.nvert; ++i) x[i] = f.at_rest ? m.rest[i] : m.rest[i] + moving.disp[i];
   const Material p = {f.kind, f.held, f.thickness, f.stiffness, f.given, f.lame.data, f.shear.data,
                       f.whole.data + v, f.pull.data + 3 * v, f.hard.data + v};
   Path path = {};

@@ -118,10 +118,10 @@ struct Fan {
 
 template <class Fields>
 PALPATE Fan fan_of(const Fields& f, int world, const Rows& at, int s, Lane lane) {
-  const int row = f.shape.slot_adr.data[s], width = f.shape.slot_adr.data[s + 1] - row;
+  const int row = f.shape.slot_adr.data[s];
   const size_t mesh = mesh_of(f, world);
   return {
-    width,
+    f.shape.fan_width.data[mesh + s],
     ld(f.shape.degree.data + mesh, s, lane),
     f.shape.fan_node.data + mesh + 8 * (row + 2 * s),
     f.shape.fan_rest.data + mesh + 24 * (row + 2 * s),
@@ -314,7 +314,7 @@ template <class Fields>
 PALPATE void row(const Fields& f, Thread t, int stage) {
   const Rows at = rows(f, t.world);
   const Assembly<Fields> assembly{f, t.world, stage, at};
-  each_slice(t, f.shape.nslice, [&](int s, Lane lane) { assembly.row(s, lane); });
+  each_slice(t, f.shape.nused, [&](int s, Lane lane) { assembly.row(s, lane); });
 }
 
 }  // namespace palpate

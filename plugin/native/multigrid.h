@@ -40,7 +40,7 @@ class Multigrid {
   PALPATE Multigrid(const Cycle& f, const Level (&levels)[2], Pcg& s)
     : f(f), levels(levels), s(s), turned(0), depth(0) {
     V heavy = splat(0.0f);
-    s.group.each(0, f.fine.shape.nslice, [&](int i, Lane lane) {
+    s.group.each(0, f.fine.shape.nused, [&](int i, Lane lane) {
       heavy += ld(s.a.diag, i, lane) * ld(f.fine.shape.free.data, i, lane);
     });
     per_mass = s.a.bend * (float)f.transfer.nodes / s.group.sum(heavy);
@@ -80,7 +80,7 @@ class Multigrid {
   PALPATE const Level& level(int l) const { return levels[l > 0]; }
   PALPATE int first_slice(int l) const { return l == 0 ? 0 : f.transfer.slice_adr.data[l - 1]; }
   PALPATE int last_slice(int l) const {
-    return l == 0 ? f.fine.shape.nslice : f.transfer.slice_adr.data[l];
+    return l == 0 ? f.fine.shape.nused : f.transfer.slice_adr.data[l];
   }
 
   // z of level l, or the other one of z and e.
@@ -227,7 +227,7 @@ PALPATE void solve_cycles(const Cycle& f, Thread t, int stage) {
   using Fields = decltype(f.fine);
   Group<MEMORY> group(t, f.fine.system.partial.data);
   const size_t base = (size_t)t.world * f.fine.shape.nslice;
-  const Slices<0> slices(group, f.fine.shape.nslice);
+  const Slices<0> slices(group, f.fine.shape.nused);
   Vectors z{f.fine.system.z.data + 24 * base, f.fine.system.zn.data + 8 * base};
   using Solve = Pcg<Fields, Group<MEMORY>, Slices<0>, Vectors, Matrix>;
   const Matrix a = matrix(f.fine, t.world);

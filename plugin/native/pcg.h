@@ -237,10 +237,10 @@ template <int SPLIT, class Fields, class Any>
 PALPATE void solve(const Fields& f, Thread t, int stage, const Any& a) {
   using Team = Group<SUMS, SPLIT>;
   Team group(t, f.system.partial.data);
-  choose_own(group, f.shape.nslice, [&](auto own) {
+  choose_own(group, f.shape.nused, [&](auto own) {
     using Mine = Slices<decltype(own)::COUNT, SPLIT>;
     using Vector = Quads<decltype(own)::COUNT, SPLIT>;
-    const Mine slices(group, f.shape.nslice);
+    const Mine slices(group, f.shape.nused);
     Vector z(f, t.world, slices);
     Jacobi<Team::SUMS_COST> jacobi;
     Pcg<Fields, Team, Mine, Vector, Any>{f, t.world, stage, group, slices, z, a}.solve(jacobi);

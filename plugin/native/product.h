@@ -12,9 +12,9 @@ struct Matrix {
   const float* diag;
   const float* inverse;
   const float* normal;
-  const int* slot;
+  const int *slot, *width;  // first row of a slice, and how many it uses
   const int* fan;
-  const int* bend_row;
+  const int *bend_row, *bend_width;
   const int* bend_node;
   const float* bend_gain;
   const float* hold;  // of nodes that springs hold, or null
@@ -36,7 +36,8 @@ PALPATE Matrix matrix(const Fields& f, int world) {
     f.system.block.data + 72 * (size_t)world * f.shape.nslot,
     f.system.diag.data + 8 * base,
     f.system.inverse.data + 48 * base, f.system.normal.data + 24 * base, f.shape.slot_adr.data,
-    f.shape.fan_node.data + mesh, f.shape.bend_adr.data, f.shape.bend_node.data + mesh,
+    f.shape.fan_width.data + mesh, f.shape.fan_node.data + mesh, f.shape.bend_adr.data,
+    f.shape.bend_width.data + mesh, f.shape.bend_node.data + mesh,
     f.lump.bend_gain.data ? f.lump.bend_gain.data + 8 * nbend * world
                           : f.tissue.bend_gain.data + mesh,
     f.state.hold.data ? f.state.hold.data + 48 * base : nullptr,
@@ -74,7 +75,7 @@ PALPATE V3 product(const Any& a, const Vector& z, V3 own, int s, Lane lane) {
   const V3 zero = {splat(0.0f), splat(0.0f), splat(0.0f)};
   Carried out = Any::SOLID ? zero : ld(a.diag, s, lane) * own;
   {
-    const int row = a.slot[s], width = a.slot[s + 1] - row;
+    const int row = a.slot[s], width = a.width[s];
     a.with_blocks(s, row, [&](auto* block) {
       z.each_near(
         a.fan + 8 * (row + 2 * s + 1), width, lane,
@@ -95,7 +96,7 @@ PALPATE V3 product(const Any& a, const Vector& z, V3 own, int s, Lane lane) {
     out = out + z.joined(skin);
   }
   if (a.bends) {
-    const int row = a.bend_row[s], width = a.bend_row[s + 1] - row;
+    const int row = a.bend_row[s], width = a.bend_width[s];
     const float* gain = a.bend_gain + 8 * row;
     V sum = splat(0.0f);
     z.each_bent(

@@ -50,6 +50,17 @@ PALPATE bool is_cut(const S& m, int before, int after) {
   return m.whole_twin[after >= 0 ? after : last_half(before)] >= 0;
 }
 
+// The rows of stiffness blocks of a slice that one of its nodes has a neighbour in.
+template <class F>
+PALPATE int used_rows(const F& f, int s) {
+  float most = 0.0f;
+  for (int lane = 0; lane < LANES; ++lane) {
+    const float degree = f.degree.data[LANES * s + lane];
+    most = degree > most ? degree : most;
+  }
+  return (int)most;
+}
+
 // The neighbours of a vertex, and where it is.
 template <class F, class S>
 PALPATE void put_neighbours(const F& f, const S& m, int v) {
@@ -63,6 +74,7 @@ PALPATE void put_neighbours(const F& f, const S& m, int v) {
     store_lane(f.fan_rest.data + 3 * LANES * row + lane, other < 0 ? zero : m.place(other) - centre - here);
   }
   f.degree.data[own] = (float)fan.degree;
+  f.fan_width.data[s] = used_rows(f, s);
   store_lane(f.rest.data + offset_in(own, 3), here);
   f.free.data[own] = f.pinned.data[v] || fan.degree == 0 ? 0.0f : 1.0f;
 }
@@ -268,6 +280,18 @@ PALPATE void sum_row(const S& m, int v, BendRow& row, P& plates) {
   }
 }
 
+// The rows of a slice of the bending matrix that one of its nodes has an entry in: others lead to itself.
+template <class F>
+PALPATE int used_bends(const F& f, int s) {
+  const int begin = f.bend_adr.data[s];
+  for (int row = f.bend_adr.data[s + 1]; row > begin; --row)
+    for (int lane = 0; lane < LANES; ++lane) {
+      const int at = LANES * (row - 1) + lane;
+      if (f.bend_gain.data[at] != 0.0f || f.bend_node.data[at] != LANES * s + lane) return row - begin;
+    }
+  return 0;
+}
+
 template <class F, class S, class P>
 PALPATE void put_bending(const F& f, const S& m, int v, BendRow& row, P& plates) {
   const int own = f.node.data[v], s = own / LANES, lane = own % LANES, begin = f.bend_adr.data[s];
@@ -280,6 +304,7 @@ PALPATE void put_bending(const F& f, const S& m, int v, BendRow& row, P& plates)
     f.bend_gain.data[LANES * (begin + k) + lane] = has ? (float)row.value[k] : 0.0f;
     if (has && row.vert[k] == v) f.bend_diag.data[own] = (float)row.value[k];
   }
+  f.bend_width.data[s] = used_bends(f, s);
 }
 
 // Writes the rows of what has a triangle near those that changed.
@@ -351,6 +376,7 @@ PALPATE F skipped(F f) {
   f.elem_node.data += n, f.elem_rest.data += n, f.elem_hinge.data += n;
   f.hinge_node.data += n, f.hinge_rest.data += n, f.hinge_elem.data += n, f.hinge_near.data += n;
   f.bend_node.data += n, f.fan_metric.data += n, f.fan_spring.data += n;
+  f.fan_width.data += n, f.bend_width.data += n;
   f.hinge_gain.data += n, f.bend_gain.data += n, f.bend_diag.data += n;
   return f;
 }

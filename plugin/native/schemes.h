@@ -15,8 +15,8 @@ PALPATE V fastest(
   const float slow = AHEAD * f.shape.shortest / (2.0f * h);
   V most = splat(0.0f);
   if (!any_above(dot(v, v), slow * slow)) return most;
-  const int first = f.shape.slot_adr.data[s], width = f.shape.slot_adr.data[s + 1] - first;
   const size_t mesh = mesh_of(f, world);
+  const int first = f.shape.slot_adr.data[s], width = f.shape.fan_width.data[mesh + s];
   const int* node = f.shape.fan_node.data + mesh + 8 * (first + 2 * s + 1);
   const float* rest = f.shape.fan_rest.data + mesh + 24 * (first + 2 * s + 1);
   for (int k = 0; k < width; ++k, node += 8, rest += 24) {
@@ -30,7 +30,7 @@ template <class Fields>
 PALPATE void edge_change(const Fields& f, Thread t, int) {
   const float* vel = f.state.vel.data + 24 * (size_t)t.world * f.shape.nslice;
   const float h = f.state.step.data[4 * t.world];
-  each_slice(t, f.shape.nslice, [&](int s, Lane lane) {
+  each_slice(t, f.shape.nused, [&](int s, Lane lane) {
     put_most(f.system.change.data + t.world, fastest(f, t.world, vel, h, s, lane));
   });
 }
@@ -54,7 +54,7 @@ PALPATE void stand(const Fields& f, size_t at, V3 u, V3 v, Lane lane) {
 // The trial state is the present one.
 template <class Fields>
 PALPATE void stay(const Fields& f, Thread t, int) {
-  each_slice(t, f.shape.nslice, [&](int s, Lane lane) {
+  each_slice(t, f.shape.nused, [&](int s, Lane lane) {
     const size_t at = (size_t)t.world * f.shape.nslice + s;
     const V3 u = ld3(f.state.disp.data + 24 * at, lane);
     stand(f, at, u, ld3(f.state.vel.data + 24 * at, lane), lane);
@@ -66,7 +66,7 @@ template <class Fields>
 PALPATE void predict(const Fields& f, Thread t, int) {
   float* step = f.state.step.data + 4 * t.world;
   const float h = step[0], share = share_ahead(h, f.system.change.data[t.world]);
-  each_slice(t, f.shape.nslice, [&](int s, Lane lane) {
+  each_slice(t, f.shape.nused, [&](int s, Lane lane) {
     const size_t at = (size_t)t.world * f.shape.nslice + s;
     const V3 v = ld3(f.state.vel.data + 24 * at, lane);
     stand(f, at, ld3(f.state.disp.data + 24 * at, lane) + share * h * v, v, lane);
@@ -78,7 +78,7 @@ PALPATE void predict(const Fields& f, Thread t, int) {
 template <class Fields>
 PALPATE void newton_update(const Fields& f, Thread t, int flags) {
   const float h = f.state.step.data[4 * t.world];
-  each_slice(t, f.shape.nslice, [&](int s, Lane lane) {
+  each_slice(t, f.shape.nused, [&](int s, Lane lane) {
     const size_t own = (size_t)t.world * f.shape.nslice + s, at = 24 * own;
     V3 dv = ld3(f.system.sol.data + at, lane);
     if (!(flags & IS_FIRST)) dv += ld3(f.state.dvel.data + at, lane);
@@ -97,7 +97,7 @@ PALPATE void centre(const Fields& f, Thread t, int undo) {
   Group<SUMS> group(t, f.system.partial.data);
   const float* warm = f.state.dvel_warm.data + 24 * (size_t)t.world * f.shape.nslice;
   V sum = splat(0.0f);
-  group.each(0, f.shape.nslice, [&](int s, Lane lane) {
+  group.each(0, f.shape.nused, [&](int s, Lane lane) {
     const V3 d = ld3(warm + 24 * s, lane);
     sum = add_dot(sum, d, d);
   });
@@ -133,8 +133,8 @@ struct Springs {
 
 template <class Fields>
 PALPATE Springs springs(const Fields& f, int world, int s, Lane lane) {
-  const int row = f.shape.slot_adr.data[s], width = f.shape.slot_adr.data[s + 1] - row;
   const size_t mesh = mesh_of(f, world);
+  const int row = f.shape.slot_adr.data[s], width = f.shape.fan_width.data[mesh + s];
   const float* k = f.tissue.fan_spring.data + mesh + 8 * row;
   const V area = ld(f.shape.area.data + mesh, s, lane);
   V sum = numbers(f, world)[FOUNDATION] * area;
@@ -165,7 +165,7 @@ PALPATE void direct(const Fields& f, Thread t, int stage) {
   float* first = f.system.q.data + base;
   const float impulse = volume_impulse(f, t.world, group, f.state.disp.data + base, vel, gv);
   V norm = splat(0.0f);
-  group.each(0, f.shape.nslice, [&](int s, Lane lane) {
+  group.each(0, f.shape.nused, [&](int s, Lane lane) {
     const V inverse = lightness(f, t.world, s, lane);
     V3 b = ld3(f.system.rhs.data + base + 24 * s, lane);
     if (impulse != 0.0f) b += impulse * ld3(areavec + 24 * s, lane);
@@ -183,7 +183,7 @@ PALPATE void direct(const Fields& f, Thread t, int stage) {
   });
   const float whole = group.sum(norm);
   if (stage == NEUMANN)
-    group.each(0, f.shape.nslice, [&](int s, Lane lane) {
+    group.each(0, f.shape.nused, [&](int s, Lane lane) {
       // With y = D^-1 (...) and W = D - N: y + D^-1 N y.
       const V inverse = lightness(f, t.world, s, lane);
       const Springs k = springs(f, t.world, s, lane);

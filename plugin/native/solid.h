@@ -106,8 +106,8 @@ PALPATE void node_stress(const Fields& f, Thread t, int stage) {
   const float* number = numbers(f, t.world);
   const float* moduli = f.lump.node_moduli.data ? f.lump.node_moduli.data + base / 6
                                                 : f.tissue.node_moduli.data;
-  each_slice(t, f.shape.nslice, [&](int s, Lane lane) {
-    const int row = f.shape.slot_adr.data[s], width = f.shape.slot_adr.data[s + 1] - row;
+  each_slice(t, f.shape.nused, [&](int s, Lane lane) {
+    const int row = f.shape.slot_adr.data[s], width = f.shape.fan_width.data[s];
     const int* node = f.shape.fan_node.data + 8 * (row + 2 * s + 1);
     const float* slope = f.shape.fan_slope.data + 24 * (size_t)row;
     const V3 u = ld3(f.system.disp_trial.data + base / 4 + 24 * s, lane);
@@ -144,7 +144,7 @@ PALPATE M3 mean_stress(const float* stress, const int* node, V& pressure, Lane l
 // of as long edges, which is 1 after a rotation.
 constexpr float CRUSHED = 0.5f;
 PALPATE V crushed(V volume, V size2) {
-  const V edge = vmax((1.0f / 3.0f) * size2, splat(1.0f)), zero = splat(0.0f);
+  const V edge = vmax(size2 / 3.0f, splat(1.0f)), zero = splat(0.0f);
   return vmin(vmax(1.0f - volume / (CRUSHED * edge * vsqrt(edge)), zero), splat(1.0f));
 }
 constexpr float LINGERS = 2.0f;  // time steps of damping that it then has besides
@@ -167,6 +167,7 @@ PALPATE void tet_stress(const Fields& f, Thread t, int stage) {
   const float h = step[0], weight = step[1], gv = weight_of_rate(stage, step), per_h = 1.0f / h;
   constexpr float THIRD = 1.0f / 3.0f;
   const bool implicit = stage == FIRST || stage == LATER;
+  const float lingers = implicit && weight > 0.0f ? LINGERS * h * h : 0.0f;
   const size_t base = 96 * (size_t)t.world * f.shape.nslice;
   const float* motion = f.system.node_motion.data + base;
   const float* nodal = f.system.node_stress.data + base;
@@ -196,7 +197,6 @@ PALPATE void tet_stress(const Fields& f, Thread t, int stage) {
     const M3 elastic = mean_stress(nodal, node, p, lane)
       + stress(H, now, alone, (0.625f * h) * alone * now.j, h);
     const V shear = 0.75f * mu + (per_h * vmax(-p, zero)) * vsqrt(THIRD * size2);
-    const float lingers = implicit && weight > 0.0f ? LINGERS * h * h : 0.0f;
     const V more = lingers * crushed(now.j + 1.0f, size2);
     M3 viscous = (0.75f * gv * mu + more * shear) * (Q * (strain + transposed(strain)));
     if (any_above(more, 0.0f)) viscous = viscous + (more * lam * inner(C, rate)) * C;
@@ -265,7 +265,7 @@ PALPATE void solid_row(const Fields& f, Thread t, int stage) {
   const size_t base = (size_t)t.world * f.shape.nslice;
   const size_t tet = (size_t)t.world * f.shape.ntetslice;
   const float* impulse = f.system.tet_impulse.data + 128 * tet;
-  each_slice(t, f.shape.nslice, [&](int s, Lane lane) {
+  each_slice(t, f.shape.nused, [&](int s, Lane lane) {
     const size_t at = base + s;
     const V mass = ld(f.state.mass.data + 8 * at, 0, lane);
     const V kf = splat(foundation) * ld(f.shape.area.data, s, lane), diag = mass + g * kf;
@@ -286,7 +286,8 @@ PALPATE void solid_row(const Fields& f, Thread t, int stage) {
     if (!implicit) return;
     S3 self = {zero, zero, zero, zero, zero, zero};
     const Half* block = f.system.half.data + 72 * (size_t)t.world * f.shape.nslot;
-    for (int j = f.shape.slot_adr.data[s]; j < f.shape.slot_adr.data[s + 1]; ++j)
+    const int row = f.shape.slot_adr.data[s], end = row + f.shape.fan_width.data[s];
+    for (int j = row; j < end; ++j)
       self = self + symmetric(ld9(block + 72 * (size_t)j, lane));
     put_diagonal(f.system.diag.data + 8 * at, f.system.inverse.data + 48 * at,
                  ld(f.shape.free.data, s, lane), diag, splat(-unit(f, t.world)) * self + diag + held, lane);

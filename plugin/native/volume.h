@@ -18,7 +18,7 @@ PALPATE float volume_impulse(
   const float* areavec = f.system.areavec.data + 24 * (size_t)world * f.shape.nslice;
   const float* rest = f.shape.rest.data + mesh_of(f, world);
   V vol = splat(0.0f), rate = splat(0.0f);
-  group.each(0, f.shape.nslice, [&](int s, Lane lane) {
+  group.each(0, f.shape.nused, [&](int s, Lane lane) {
     const V3 o = ld3(areavec + 24 * s, lane);
     const V3 x = ld3(rest + 24 * s, lane) + ld3(disp + 24 * s, lane);
     vol = add_dot(vol, x, o);

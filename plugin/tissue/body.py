@@ -9,6 +9,7 @@ import numpy as np
 import warp as wp
 
 from .device import WORDS, Plan
+from .mesh import Mesh
 from .order import LANES
 from .types import (
   DIMS,
@@ -229,6 +230,23 @@ def unshare(body: Body):
       setattr(transfer, name, getattr(old, name))
     transfer.rate = wp.clone(old.rate)
     body.levels.cycle.fine, body.levels.cycle.transfer = body.fields, transfer
+
+
+def occupy(body: Body, mesh: Mesh):
+  """Lets steps leave out the slices of vertices that wait for a cut.
+
+  Not on a device: launches that were recorded have their number, and threads do not wait there for
+  those that have nothing to do.
+  """
+  if body.device.is_cuda:
+    return
+  nused, was = -(-(mesh.nvert - (mesh.nskin - mesh.nouter)) // LANES), body.shape.nused
+  if nused == was:
+    return
+  for fields in (body.fields, *([body.levels.cycle.fine] if body.levels else [])):
+    fields.shape.nused = nused
+  for array in (body.state.dvel, body.system.sol) if nused < was else ():
+    array.numpy()[:, nused:was] = 0.0
 
 
 def hold(body: Body) -> wp.array:

@@ -43,12 +43,14 @@ _PLAIN = (
   "fan_rest",
   "fan_metric",
   "fan_spring",
+  "fan_width",
   "degree",
   "rest",
   "area",
   "free",
   "bend_gain",
   "bend_diag",
+  "bend_width",
 )
 
 

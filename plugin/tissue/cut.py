@@ -47,6 +47,7 @@ class Cutting:
   nreal: int  # others
   kind: int  # of energy: 0 none, 1 membrane, 2 springs
   held: int  # whether springs hold vertices
+  at_rest: int  # whether points are where the surface is at rest
   edge: wp.float64  # mean length of the whole's edges [m]
   thickness: wp.float64  # [m]
   stiffness: wp.float64  # of an edge's spring [N/m]
@@ -62,7 +63,7 @@ class Cutting:
   pull: doubles("nworld", "nvert", 3)  # its gradient [N]
   hard: doubles("nworld", "nvert")  # their stiffness [N/m]
   npoint: ints("nworld")  # points of the path
-  point: doubles("nworld", "most_points", 3)  # these, where the surface is now [m]
+  point: doubles("nworld", "most_points", 3)  # these, where the surface is now, or at rest [m]
   found: ints("nworld", len(_FOUND))  # see _FOUND; nouter is read too
   size: doubles("nworld", len(_SIZE))  # see _SIZE
   near: ints("nworld", "nvert")  # see `Cut`, these and what follows
@@ -154,6 +155,7 @@ class Knife:
   def __init__(self, copy: WorkingCopy):
     self._copy, self._whole = copy, copy.whole
     self._config: Config | None = None
+    self._how: tuple = ()
     self._fields: Any = None
     self._host: dict[str, np.ndarray] = {}
     self._launch: Any = None
@@ -168,6 +170,7 @@ class Knife:
     config: Config | None = None,
     held: Springs | None = None,
     given: float = 0.0,
+    at_rest: bool = False,
   ) -> Cut:
     """Returns the mesh cut along the path on the surface that is nearest to points.
 
@@ -180,6 +183,7 @@ class Knife:
       config: material, whose energy moving vertices must not raise, or None
       held: what holds vertices, for which the same is true, or None
       given: but by so much around each, since what cuts has brought it [J]
+      at_rest: whether points are on the surface at rest, not where it is now
 
     Raises:
       ValueError: points are off the surface; the path goes through pinned vertices, or is too
@@ -188,7 +192,8 @@ class Knife:
     check_points(organ, points)
     self._make_room(points)
     self._copy.put(mesh)
-    self._put_material(config if config and config.elements in _KINDS else None, held, given)
+    config = config if config and config.elements in _KINDS else None
+    self._put_material(config, held, given, at_rest)
     host = self._host
     host["mass"][:], host["disp"][:], host["vel"][:] = motion.mass, motion.disp, motion.vel
     host["pinned"][:] = pinned
@@ -203,10 +208,11 @@ class Knife:
   def _make_room(self, points: np.ndarray):
     """Makes the arrays, and makes them larger for a long path."""
     whole, edge = self._whole, self._whole.edge_length
-    n = 2 * len(points) + int((lengths(np.diff(points, axis=0)) / (_SAMPLE * edge)).sum())
+    way = np.abs(points[1:] - points[:-1]).sum()  # no less than the path is long
+    n = 2 * len(points) + int(way / (_SAMPLE * edge))
     if self._fields is not None and n <= self._fields.most_points:
       return
-    n, self._config = 2 * n, None
+    n, self._config, self._how = 2 * n, None, ()
     sizes = self._copy.sizes | {"most_points": n}
     # What native/cut.h takes of scratch, see there.
     sizes["nint"] = 24 * whole.nvert + 15 * whole.nelem + 16 * n + 8 * sizes["most"] + 100
@@ -219,11 +225,14 @@ class Knife:
     self._host["home"][:] = whole.home
     self._launch = _cut.command(fields).launch
 
-  def _put_material(self, config: Config | None, held: Springs | None, given: float):
+  def _put_material(
+    self, config: Config | None, held: Springs | None, given: float, at_rest: bool
+  ):
     fields, host = self._fields, self._host
-    fields.kind = _KINDS[config.elements] if config else 0
-    fields.held, fields.given = int(held is not None), given
-    if config and config != self._config:
+    how = _KINDS[config.elements] if config else 0, int(held is not None), given, int(at_rest)
+    if how != self._how:
+      fields.kind, fields.held, fields.given, fields.at_rest = self._how = how
+    if config and config is not self._config and config != self._config:
       fields.thickness, fields.stiffness = config.thickness, config.stiffness
       host["lame"][:], host["shear"][:] = configuration.lame(config, self._whole.nelem)
       self._config = config
@@ -267,7 +276,8 @@ class Knife:
       for name in ("near", "changed", *parts)
     }
     if found["changed"]:
-      mesh = self._copy.take(mesh, mesh.closed and not found["split"], bool(found["apart"]))
+      closed = mesh.closed and not found["split"]
+      mesh = self._copy.take(mesh, closed, bool(found["apart"]), found["nouter"])
     path = _lines(mesh.rest, host["seam"][: found["edges"]].tolist())
     return Cut(
       mesh=mesh,
@@ -275,7 +285,7 @@ class Knife:
       moved=found["moved"],
       share=host["share"][: found["split"]].copy(),
       path=path,
-      length=sum(float(lengths(np.diff(line, axis=0)).sum()) for line in path),
+      length=sum(float(lengths(line[1:] - line[:-1]).sum()) for line in path),
       deviation=float(host["size"][_SIZE.index("deviation")]),
       stopped=bool(found["stopped"]),
       **lists,

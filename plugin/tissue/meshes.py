@@ -17,9 +17,9 @@ from .body import Body
 
 # What a cut changes of a body's arrays.
 _OF_SHAPE = (
-  "fan_node", "fan_rest", "fan_corner", "fan_side", "degree", "rest", "area", "free", "elem_node",
-  "elem_rest", "elem_hinge", "hinge_node", "hinge_rest", "hinge_elem", "hinge_near",
-  "hinge_angle0", "bend_node",
+  "fan_node", "fan_rest", "fan_corner", "fan_side", "fan_width", "degree", "rest", "area", "free",
+  "elem_node", "elem_rest", "elem_hinge", "hinge_node", "hinge_rest", "hinge_elem", "hinge_near",
+  "hinge_angle0", "bend_node", "bend_width",
 )  # fmt: skip
 _OF_TISSUE = ("fan_metric", "fan_spring", "hinge_gain", "bend_gain", "bend_diag")
 _WARP = {np.dtype(np.int32): wp.int32, np.dtype(np.float32): wp.float32,

@@ -20,8 +20,9 @@ from .surface import Surface, WorkingCopy
 from .types import CONSTANTS, Shape, Tissue, doubles, flags, ints, struct
 
 _OF_SHAPE = (
-  "fan_node", "fan_rest", "fan_corner", "fan_side", "degree", "rest", "area", "free", "elem_node",
-  "elem_rest", "elem_hinge", "hinge_node", "hinge_rest", "hinge_elem", "hinge_near", "bend_node",
+  "fan_node", "fan_rest", "fan_corner", "fan_side", "fan_width", "degree", "rest", "area", "free",
+  "elem_node", "elem_rest", "elem_hinge", "hinge_node", "hinge_rest", "hinge_elem", "hinge_near",
+  "bend_node", "bend_width",
 )  # fmt: skip
 _OF_TISSUE = ("fan_metric", "fan_spring", "hinge_gain", "bend_gain", "bend_diag")
 NAMES = (*_OF_SHAPE, *_OF_TISSUE)
@@ -161,7 +162,7 @@ class Rows:
     return bool(self._found[0])
 
   def _put_material(self, config: Config):
-    if config == self._config:
+    if config is self._config or config == self._config:
       return
     nelem, springs = self._copy.whole.nelem, config.elements == "spring"
     lame, shear = configuration.lame(config, nelem)

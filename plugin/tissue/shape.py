@@ -195,6 +195,7 @@ def counts(values: dict[str, Any]) -> dict[str, int]:
     "nvert": len(values["node"]),
     "nnode": len(values["vert"]),
     "nslice": len(values["area"]),
+    "nused": len(values["area"]),
     "nelemslice": len(values["elem_node"]),
     "nhingeslice": len(values["hinge_node"]),
     "ntetslice": len(values["tet_node"]),
@@ -237,10 +238,11 @@ def _fans(mesh: Mesh, vert: np.ndarray) -> dict[str, np.ndarray]:
   }
 
 
-_FANS = ("fan_rest", "fan_metric", "fan_spring", "fan_corner", "fan_side", "degree", "rest", "area",
-         "free")  # fmt: skip
+_FANS = ("fan_rest", "fan_metric", "fan_spring", "fan_corner", "fan_side", "fan_width", "degree",
+         "rest", "area", "free")  # fmt: skip
 _PLATES = ("elem_node", "elem_rest", "elem_hinge", "hinge_node", "hinge_rest", "hinge_elem",
-           "hinge_near", "hinge_gain", "hinge_angle0", "bend_gain", "bend_diag")  # fmt: skip
+           "hinge_near", "hinge_gain", "hinge_angle0", "bend_gain", "bend_diag",
+           "bend_width")  # fmt: skip
 
 
 def _capsule(

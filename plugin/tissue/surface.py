@@ -65,19 +65,21 @@ class WorkingCopy:
     self._host["loose"][:] = 0 if mesh.loose is None else mesh.loose[:n]
     self._mesh = mesh
 
-  def take(self, mesh: Mesh, closed: bool, apart: bool) -> Mesh:
+  def take(self, mesh: Mesh, closed: bool, apart: bool, nouter: int) -> Mesh:
     """Returns the mesh that native code has made of one that was put here.
 
     Args:
       mesh: that one
       closed: whether there is no boundary edge
       apart: whether it may have come apart, so that `loose` is another
+      nouter: vertices on the surface
     """
     arrays = {of_mesh: self._host[name].copy() for name, of_mesh in _NAMES.items()}
     loose = self._host["loose"].astype(bool) if apart else mesh.loose
     more = {"closed": closed, "loose": loose, "uncut": self.whole}
-    self._mesh = dataclasses.replace(mesh, **arrays, **more)
-    return self._mesh
+    self._mesh = out = dataclasses.replace(mesh, **arrays, **more)
+    vars(out)["nouter"] = nouter
+    return out
 
   def forget(self):
     """Lets the next `put` write everything."""

@@ -22,7 +22,7 @@ from .types import CONSTANTS, doubles, flags, halves, ints, longs, struct
 EDGES = 2  # by which cuts may divide edges, for one spare vertex
 _WINDOW = 8 * LANES  # edges that are sorted by the number of their tetrahedra
 _OF_SHAPE = (
-  "fan_node", "fan_rest", "degree", "rest", "free", "area", "tet_node", "tet_gradient",
+  "fan_node", "fan_rest", "fan_width", "degree", "rest", "free", "area", "tet_node", "tet_gradient",
   "around_corner", "fan_slope", "edge_from", "edge_to", "edge_node", "edge_slot",
 )  # fmt: skip
 _OF_TISSUE = ("tet_moduli", "node_moduli", "stiffness")

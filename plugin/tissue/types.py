@@ -126,6 +126,7 @@ class Shape:
   nvert: int  # vertices
   nnode: int  # nodes: vertices padded to whole slices
   nslice: int  # slices of nodes
+  nused: int  # those that a step goes over: not the last ones, of vertices that wait for a cut
   nelemslice: int  # slices of triangles; 0 without bending
   nhingeslice: int  # slices of hinges; 0 without bending
   ntetslice: int  # slices of tetrahedra; 0 but for solids
@@ -144,6 +145,7 @@ class Shape:
   fan_rest: floats("nslot + 2 nslice", 3, 8)  # rest vector to each fan entry [m]
   fan_corner: ints("nslot + nslice", 8)  # offset of each fan triangle's normal
   fan_side: ints("nslot + nslice", 8)  # offset of its corner force at this node
+  fan_width: ints("nslice")  # rows of stiffness blocks that some node has a neighbour in
   degree: floats("nslice", 8)  # number of neighbours
   rest: floats("nslice", 3, 8)  # rest position about the centroid [m]
   area: floats("nslice", 8)  # nodal area [m^2]; 0 for padding
@@ -158,6 +160,7 @@ class Shape:
   hinge_angle0: floats("nhingeslice", 8)  # rest angle 2 sin(theta / 2) [-]
   bend_adr: ints("nslice + 1")  # first row of the bending matrix
   bend_node: ints("nbend", 8)  # node of each entry
+  bend_width: ints("nbendslice")  # rows of it that some node has an entry in
   fan_slope: floats("nsolidslot", 3, 8)  # of a neighbour's share in a node's mean gradient [1/m]
   tet_node: ints("ntetslice", 4, 8)  # offset of each corner's node
   tet_gradient: floats("ntetslice", 9, 8)  # of the shares of corners 1, 2, 3 at rest [1/m]
@@ -324,6 +327,21 @@ def allocate(kind: Any, device, sizes: dict[str, int], spare: tuple[str, ...] = 
     shape = (0, *shape[1:]) if name in spare else shape
     setattr(out, name, wp.zeros(shape, dtype=kind.vars[name].type.dtype, device=device))
   return out
+
+
+class Views:
+  """The arrays of a struct that is on the CPU as numpy has them, each looked up once.
+
+  Args:
+    fields: the struct, whose arrays stay
+  """
+
+  def __init__(self, fields: Any):
+    self._fields = fields
+
+  def __getattr__(self, name: str) -> np.ndarray:
+    self.__dict__[name] = found = getattr(self._fields, name).numpy()
+    return found
 
 
 def fill(

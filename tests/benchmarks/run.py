@@ -26,6 +26,7 @@ BENCHES = {
   "locality": "what leaving out solved nodes would save",
   "loop": "the whole loop, mj_step with a probe on a windowed organ",
   "loopholes": "what a search finds in the exercises that does not do the work",
+  "paths": "how near cuts of surfaces follow their path, and what they keep",
   "peer": "mj_step in contact against MuJoCo's native flex",
   "policies": "success of the policies that ship",
   "preconditioner": "iterations with block Jacobi and multilevel",
@@ -40,6 +41,7 @@ BENCHES = {
   "stability": "where each scheme breaks, over a thousand runs",
   "thesis": "the tables and figures of the thesis, measured today",
   "truth": "organ forces against closed forms, other finite elements and published measurements",
+  "uncut": "steps of organs that are never cut, beside an older state of the code",
 }
 
 

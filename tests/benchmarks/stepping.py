@@ -1,0 +1,72 @@
+"""Steps a scene as often as it is asked to: what `uncut` starts, with the code of any state."""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+
+import mujoco
+import numpy as np
+import palpate
+import scenes
+
+H = 2e-3  # time step [s]
+WARM = 150  # steps before the first ones that count
+# Shape, vertices about, keys of the organ.
+SCENES = {
+  "membrane, windows": ("sheet", 1000, {"windows": True}),
+  "membrane, windows, 4000 nodes": ("sheet", 4000, {"windows": True}),
+  "plate, windows": ("sheet", 1000, {"windows": True, "bend": 1.0}),
+  "closed, windows": ("ball", 642, {"windows": True, "bend": 1.0, "bulk": 1e4}),
+  "closed, nodal": ("ball", 162, {"bend": 1.0, "bulk": 1e4}),
+}
+
+
+def scene(name: str):
+  """Returns model and data of an organ that a ball presses."""
+  shape, nodes, keys = SCENES[name]
+  if shape == "sheet":
+    nx = round(math.sqrt(nodes * 1.3))
+    points, elem = scenes.triangular(0.15, 0.10, nx, round(nx / 1.3), 0.2)
+    pin = np.flatnonzero(np.abs(np.abs(points[:, 1]) - 0.05) < 1e-9)
+  else:
+    points, elem = scenes.sphere(round(math.log((nodes - 2) / 10, 4)))
+    pin = np.flatnonzero(points[:, 2] < -0.8 * points[:, 2].max())
+  spec = mujoco.MjSpec()
+  spec.option.timestep, spec.option.gravity = H, (0, 0, 0)
+  place = [points[:, 0].mean(), 0, points[:, 2].max() + 0.012]
+  body = spec.worldbody.add_body(name="ball", pos=place)
+  body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 0, 1], name="z", damping=4)
+  body.add_geom(size=[0.008, 0, 0], mass=0.1)
+  spec.add_actuator(name="z", target="z", trntype=mujoco.mjtTrn.mjTRN_JOINT,
+                    biastype=mujoco.mjtBias.mjBIAS_AFFINE, gainprm=[2000] + 9 * [0],
+                    biasprm=[0, -2000, 0] + 7 * [0])  # fmt: skip
+  palpate.add_organ(spec, (points, elem), "organ", mass=0.05, young=2e5, pin=pin, thickness=2e-3,
+                    device="cpu", **keys)  # fmt: skip
+  model = spec.compile()
+  return model, mujoco.MjData(model)
+
+
+def serve(name: str):
+  """Steps a scene as often as each line of the input says, and answers with CPU time [ns]."""
+  model, data = scene(name)
+  done = 0
+
+  def advance(count: int):
+    nonlocal done
+    for _ in range(count):
+      data.ctrl[0] = -0.012 * min(1.0, done / 100) + 0.001 * math.sin(done / 7)
+      mujoco.mj_step(model, data)
+      done += 1
+
+  advance(WARM)
+  print("ready", flush=True)
+  for line in sys.stdin:
+    start = time.process_time_ns()
+    advance(int(line))
+    print(time.process_time_ns() - start, flush=True)
+
+
+if __name__ == "__main__":
+  serve(sys.argv[1])
