@@ -130,7 +130,7 @@ def tube(points, radii, sides: int = 12, along: int = 30) -> Surface:
   radius = np.interp(t, knots, radii)
   vertices = curve(t)[:, None] + radius[:, None, None] * ring
   uv = np.stack(np.meshgrid(t / knots[-1], angle / (2 * np.pi), indexing="ij"), axis=-1)
-  return Surface(vertices.reshape(-1, 3), _cells(along, sides + 1), uv.reshape(-1, 2))
+  return lattice(vertices, uv)
 
 
 def sheet(height, low, high, cells: tuple[int, int]) -> Surface:
@@ -144,9 +144,8 @@ def sheet(height, low, high, cells: tuple[int, int]) -> Surface:
   """
   x, y = np.meshgrid(*(np.linspace(*ends) for ends in zip(low, high, cells, strict=True)))
   x, y = x.T, y.T
-  vertices = np.stack([x, y, height(x, y)], axis=-1).reshape(-1, 3)
-  uv = (vertices[:, :2] - low) / (np.subtract(high, low).max())
-  return Surface(vertices, _cells(*cells), uv)
+  vertices = np.stack([x, y, height(x, y)], axis=-1)
+  return lattice(vertices, (vertices[..., :2] - low) / np.subtract(high, low).max())
 
 
 def shell(center, radii, power: float, cells: tuple[int, int]) -> Surface:
@@ -160,16 +159,22 @@ def shell(center, radii, power: float, cells: tuple[int, int]) -> Surface:
   way = np.stack([np.sin(rise) * np.cos(turn), np.sin(rise) * np.sin(turn), np.cos(rise)], axis=-1)
   long = (np.abs(way) ** power).sum(axis=-1, keepdims=True) ** (-1 / power)
   vertices = np.asarray(center) + np.asarray(radii) * way * long
-  uv = np.stack([2 * turn / np.pi, 2 * rise / np.pi], axis=-1).reshape(-1, 2)
-  return Surface(vertices.reshape(-1, 3), _cells(*cells), uv)
+  return lattice(vertices, np.stack([2 * turn / np.pi, 2 * rise / np.pi], axis=-1))
 
 
-def _cells(rows: int, columns: int) -> np.ndarray:
-  """Returns the triangles of a grid of vertices."""
+def lattice(vertices: np.ndarray, texcoord: np.ndarray) -> Surface:
+  """Returns the surface over a grid; columns lie to the left of rows, seen from outside.
+
+  Args:
+    vertices: [m]  (rows, columns, 3)
+    texcoord: where they are on the texture  (rows, columns, 2)
+  """
+  rows, columns = vertices.shape[:2]
   i, j = np.meshgrid(np.arange(rows - 1), np.arange(columns - 1), indexing="ij")
   a = (i * columns + j).ravel()
   b, c, d = a + columns, a + columns + 1, a + 1
-  return np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+  triangles = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+  return Surface(vertices.reshape(-1, 3), triangles, texcoord.reshape(-1, 2))
 
 
 def bumps(seed: int, size: float, height: float):

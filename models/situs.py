@@ -30,11 +30,11 @@ COLOURS = {
   "gallbladder": (0.60, 0.65, 0.46, 1.0),
   "stomach": (0.86, 0.60, 0.53, 1.0),
   "kidney": (0.62, 0.27, 0.23, 1.0),
-  "fat": (1.0, 0.84, 0.46, 1.0),
+  "fat": (0.95, 0.77, 0.43, 1.0),
   "wall": (0.92, 0.56, 0.47, 1.0),
 }
 # Specular share of wet surfaces; by eye. Much of it turns yellow and pink ones green.
-_SHEEN = {"fat": 0.2, "wall": 0.15, "stomach": 0.3, "gallbladder": 0.4}
+_SHEEN = {"fat": 0.12, "wall": 0.15, "stomach": 0.3, "gallbladder": 0.4}
 # What the fixed renderer's light loses on its way, 1 at 15 cm: 0.55 + 0.45 (d / 15 cm)^2.
 _FADE = (0.55, 0.0, 0.45 / 0.15**2)
 _VIEW = ((0.0, 0.175, 0.135), (0.0, 0.03, 0.005))  # of `abdomen`'s camera: from, to [m]
@@ -47,7 +47,7 @@ class Arrangement:
   Attributes:
     lifts: how far other organs are from their places, in the world [m]
     fat: how far the fat is from its place, upward [m]
-    without: organs and ducts that would be in the way
+    without: organs, ducts and fat that would be in the way
   """
 
   lifts: Mapping[str, tuple[float, float, float]] = dataclasses.field(default_factory=dict)
@@ -141,11 +141,27 @@ def cover(spec: mujoco.MjSpec, organ: str, kind: str, look: int = 0, uv=None) ->
     look: seed of spots and vessels
     uv: texture coordinates of its vertices (n, 2); None makes them
   """
-  material = _material(spec, kind, COLOURS[kind], kind, look)
+  material = paint(spec, kind, look)
   flex = spec.flex(organ)
   if uv is None:
     uv = scenery.texcoord(kind, np.reshape(flex.vert, (-1, 3)), np.reshape(flex.elem, (-1, 3)))
   return skins.add_skin(spec, organ, material=material, texcoord=uv)
+
+
+def dress(spec: mujoco.MjSpec, organ: str, kind: str, uv: np.ndarray, look: int = 0):
+  """Gives an organ's own surface the look of a kind; an open one, since skins have one side.
+
+  Args:
+    spec: changed in place
+    organ: name of the flexcomp
+    kind: of COLOURS
+    uv: texture coordinates of its vertices  (n, 2)
+    look: seed of spots and vessels
+  """
+  flex = spec.flex(organ)
+  flex.material = _material(spec, organ, COLOURS[kind], kind, look)  # its colour is its own
+  flex.rgba = [0.5, 0.5, 0.5, 1.0]
+  flex.texcoord, flex.elemtexcoord = np.ravel(uv), flex.elem
 
 
 def surround(
@@ -171,8 +187,6 @@ def surround(
   cover(spec, organ, kind, look, uv)
   held = arrangement or ARRANGEMENTS[kind]
   furnish(spec, [name for name in NAMES if name != kind], kind, held, look)
-  for lamp in list(spec.lights):
-    spec.delete(lamp)
   light(spec, *view)
 
 
@@ -197,10 +211,10 @@ def furnish(
   for name in organs:
     if name in held.without:
       continue
-    skin = _material(spec, name, COLOURS[name], name, look)
+    skin = paint(spec, name, look)
     lift = held.lifts.get(name, (0, 0, 0))
     surface = scenery.to_world(scenery.organ(name, _LEVELS[name]))
-    _draw(spec, name, surface, skin, place(name) - origin + lift)
+    draw(spec, name, surface, skin, place(name) - origin + lift)
   for name, duct in catalog.DUCTS.items():
     if name in held.without:
       continue
@@ -210,11 +224,11 @@ def furnish(
     skin = _material(spec, name, duct.rgba, kind, look)
     goes_with = "stomach" if name == "duodenum" else "gallbladder"
     lift = held.lifts.get(goes_with, (0, 0, 0))
-    _draw(spec, name, surface, skin, np.array(lift) - origin)
+    draw(spec, name, surface, skin, np.array(lift) - origin)
   fat, wall = _bounds()
-  skin = _material(spec, "fat", COLOURS["fat"], "fat", look, 2)
-  _draw(spec, "fat", fat, skin, [0, 0, held.fat] - origin)
-  _draw(spec, "wall", wall, _material(spec, "wall", COLOURS["wall"], "wall", look), -origin)
+  if "fat" not in held.without:
+    draw(spec, "fat", fat, paint(spec, "fat", look, 2), [0, 0, held.fat] - origin)
+  draw(spec, "wall", wall, paint(spec, "wall", look), -origin)
 
 
 @functools.cache
@@ -238,13 +252,16 @@ def _fat(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def light(spec: mujoco.MjSpec, pos, target) -> None:
-  """Lights a scene as an endoscope does: from the camera, ever less with the distance."""
+  """Lights a scene as an endoscope does, and by nothing else: ever less with the distance."""
+  for lamp in list(spec.lights):
+    spec.delete(lamp)
   head = spec.visual.headlight
   head.ambient, head.diffuse, head.specular = [0.2] * 3, [0.12] * 3, [0.0] * 3
   forward = np.subtract(target, pos)
   # Beside the lens: what reflects it is not all in the picture's middle.
   beside = np.cross(forward, [0.0, 0.0, 1.0])
   beside *= 0.006 / np.linalg.norm(beside)
+  near = min(1.0, np.polyval(_FADE[::-1], np.linalg.norm(forward)))  # exposed for what is near
   spec.worldbody.add_light(
     name=LIGHT,
     pos=np.asarray(pos) + beside,
@@ -253,11 +270,16 @@ def light(spec: mujoco.MjSpec, pos, target) -> None:
     cutoff=70,
     exponent=2,
     attenuation=_FADE,
-    ambient=[0.05, 0.045, 0.045],
-    diffuse=[0.92, 0.89, 0.85],
-    specular=[0.7, 0.7, 0.7],
+    ambient=near * np.array([0.05, 0.045, 0.045]),
+    diffuse=near * np.array([0.92, 0.89, 0.85]),
+    specular=near * np.array([0.7, 0.7, 0.7]),
     castshadow=False,
   )
+
+
+def paint(spec: mujoco.MjSpec, kind: str, look: int = 0, repeat: float = 1.0) -> str:
+  """Returns the name of the material of a kind of COLOURS, made unless the spec has it."""
+  return _material(spec, kind, COLOURS[kind], kind, look, repeat)
 
 
 def _material(spec, name: str, rgba, kind: str | None, look: int, repeat: float = 1.0) -> str:
@@ -287,7 +309,7 @@ def _material(spec, name: str, rgba, kind: str | None, look: int, repeat: float 
   return name
 
 
-def _draw(spec, name: str, surface: Surface, material: str, pos) -> None:
+def draw(spec: mujoco.MjSpec, name: str, surface: Surface, material: str, pos=(0, 0, 0)) -> None:
   """Adds a surface to the world: a skin, which no contact, ray or state knows of."""
   count = len(surface.vertices)
   skin = spec.add_skin(

@@ -192,7 +192,7 @@ class Organ:
         goes through pinned vertices; the depth is not above 0, or the organ is no solid.
     """
     inward = (None if v is None else np.asarray(v, dtype=float) for v in (depth, direction))
-    report = self._space.cuts.cut(np.asarray(points, dtype=float), 0.0, *inward)
+    report = self._space.cuts.cut(points, 0.0, *inward)
     workspace.place(self._space, self.model._address)
     return report
 

@@ -6,7 +6,7 @@ which an instrument gets, its far end does not move.
 
 import mujoco
 import numpy as np
-from palpate.models import mjcf
+from palpate.models import catalog, mjcf, situs
 
 from . import scenes
 from .scenes import BED, Scene
@@ -20,6 +20,9 @@ _NEAR = 0.0015  # distance from the bed at which it has grown on [m]
 _TISSUE = {"young": 1e5, "thickness": 0.002, "damping": 0.005}
 _MASS = 0.003  # [kg]
 _SLOTS = 100  # of its window: the expert's probe touches fewer, folds and all
+_PLAIN = (0.5, 0.5, 0.5, 1.0)  # a geom's colour that leaves its material's
+# What lies around: no ducts, and the fat below the bed; ours.
+_HELD = situs.Arrangement(fat=-0.035, without=tuple(catalog.DUCTS))
 _COLOUR, _UNDER = (0.85, 0.62, 0.5, 1.0), "0.52 0.17 0.13 1"
 
 
@@ -67,4 +70,15 @@ def build(scene: Scene) -> mujoco.MjSpec:
   )
   spec = scenes.furnish(scene, flex, np.zeros(3), bed, slots=_SLOTS)
   spec.option.gravity = np.zeros(3)
+  if scene.surroundings == "abdomen":
+    _surround(spec, scene, vertices)
   return spec
+
+
+def _surround(spec: mujoco.MjSpec, scene: Scene, vertices: np.ndarray):
+  """Makes a liver of the bed, with fat and the wall around it, and peritoneum of the strip."""
+  liver = spec.geom(BED)
+  liver.material, liver.rgba = situs.paint(spec, "liver"), _PLAIN
+  situs.dress(spec, scenes.ORGAN, "fat", vertices[:, :2] / LENGTH)
+  situs.furnish(spec, (), arrangement=_HELD)
+  situs.light(spec, scene.camera, np.zeros(3))

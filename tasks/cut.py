@@ -32,7 +32,6 @@ SCENE = Scene(
   instrument="scalpel",
   port=(0.0, -0.025, 0.12),
   camera=(-0.03, -0.07, 0.09),
-  surroundings="none",
 )
 RULE = 0.002  # [m], of FLS
 ASTRAY = 0.01  # most that may be cut beyond the tolerance [m]

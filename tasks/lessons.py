@@ -19,6 +19,8 @@ from .physics import AXES
 from .policy import Policy
 
 SHAKEN, CALM = 25, 50  # control steps that noise lasts, and that follow without
+# What it shakes. Not the roll: where an expert does not turn the shaft, its clone shall not.
+SHAKES = tuple(name for name in AXES if name != "roll")
 _BACK = 0.2  # share of what has shaken the instrument that is made up in a control step
 EXPERT = (20, 80)  # control steps of an expert's turn, at least and at most
 PATIENCE = (40, 120)  # control steps without progress that end a policy's turn
@@ -112,7 +114,7 @@ def give(
   """
   task: Any = env.task
   task.random, random = np.random.RandomState(seed), np.random.RandomState(seed)
-  moves = noise * np.array([name.endswith(AXES) for name in task.components])
+  moves = noise * np.array([name.endswith(SHAKES) for name in task.components])
   final = np.isin(task.components, task.final)
   timestep, phase = env.reset(), random.randint(SHAKEN + CALM)
   act = learner.begin() if learner else None

@@ -8,23 +8,19 @@ from scipy.spatial import cKDTree
 
 from . import scenes
 from .base import Physics, Task
+from .feeling import APART, SOFT, Notes, chance
 from .performer import Performer, Script
 from .scenes import Scene
 
-_LEFT = 0.02  # force below which a press has ended [N]
 _FACING = 0.75  # least cosine between the field's normal and the way to the trocar
 _PIN_GAP = 0.02  # the field keeps that far from pinned nodes [m]
 FEELING, FELT = 0.1, 0.008  # force [N] that feels, and what lies within that distance [m]
 REPORT = 0.05  # least force at the report [N]
 # Of the expert: how far above a place it begins, how deep it feels, and how far apart places to
-# feel are, first and around what is stiff [m].
-_ABOVE, _DEPTH, _SWEEP, _CLOSE = 0.004, 0.004, 0.014, 0.006
-_ENOUGH = 0.7  # share of that depth that tells enough
+# feel are around what is stiff [m].
+_ABOVE, _DEPTH, _CLOSE = 0.004, 0.004, 0.006
 _LIKELY = 0.05  # of the likeliest place: others are not felt [-]
-_NOISE = 8.0  # of what it feels: triangles differ [N/m]
 _STIFF = 1.3  # times what is soft: what is worth a closer look [-]
-# Of a hasty one: times what is soft, among so many places, that it looks around; how far [m].
-_SURE, _SOME, _BESIDE = 1.6, 4, 0.008
 
 
 class Palpate(Task):
@@ -76,7 +72,7 @@ class Palpate(Task):
     variant = super().choose()
     if variant not in self._fields:
       self._fields[variant] = self._find_field(super()._scene(variant))
-    self.field, self.places, corners, share, self.center = self._fields[variant]
+    self.field, self.places, self.outward, corners, share, self.center = self._fields[variant]
     triangle = corners[self.random.choice(len(share), p=share)]
     self.inclusion = self.random.dirichlet(np.ones(3)) @ triangle
     if self.embeds:
@@ -90,7 +86,7 @@ class Palpate(Task):
     self._models.clear()
 
   def _find_field(self, scene: Scene) -> tuple[np.ndarray, ...]:
-    """Returns the field's triangles, middles, corners, shares of its area, and the center."""
+    """Returns the field's triangles, middles, normals, corners, shares of area, and the center."""
     vertices, triangles = scenes.surface(scene.organ, scene.nodes, scene.variant)
     center = scenes.landmark(scene, scene.center)
     corners = vertices[triangles]
@@ -103,7 +99,8 @@ class Palpate(Task):
     near = np.linalg.norm(middle - center, axis=1) < self.spread
     near &= pins.query(middle)[0] > _PIN_GAP
     field = np.flatnonzero(near & (normal @ port > _FACING * area))
-    return field, middle[field], corners[field], area[field] / area[field].sum(), center
+    outward, share = normal[field] / area[field, None], area[field] / area[field].sum()
+    return field, middle[field], outward, corners[field], share, center
 
   def _scene(self, variant: int | None) -> Scene:
     return dataclasses.replace(super()._scene(variant), inclusion=self._inclusion)
@@ -111,10 +108,13 @@ class Palpate(Task):
   def begin(self, physics: Physics) -> None:
     """Starts the search."""
     self._felt = np.zeros(len(self.field), bool)
-    self._outward = physics.normals()[self.field]
-    self._noted: dict[int, float] = {}
-    self._deepest, self._depth = 0, 0.0
+    self.notes = Notes(self.places, self.outward, self.up)
     physics.mark(0, self.center, shown=False)
+
+  @property
+  def up(self) -> np.ndarray:
+    """Way from the field to the trocar, about."""
+    return np.asarray(self.scene.port, float)
 
   def felt(self) -> float:
     """Returns the share of the field that was felt [-]."""
@@ -134,23 +134,10 @@ class Palpate(Task):
       self.event(physics, "target" if found else "miss", distance, "report")
       physics.mark(0, self.inclusion, shown=True)
       return 1.0 if found else 0.0
-    self._note(physics, force)
+    self.notes.press(physics.tip_pos(), force)
     if force >= FEELING:
       self._felt |= np.linalg.norm(self.places - physics.tip_pos(), axis=1) < FELT
     return 0.3 * self.felt()
-
-  def _note(self, physics: Physics, force: float) -> None:
-    """Notes what a press feels [N/m], for an expert who goes on where somebody else has felt."""
-    if force < _LEFT:
-      self._depth = 0.0
-      return
-    offset = self.places - physics.tip_pos()
-    k = int(np.einsum("ij,ij->i", offset, offset).argmin())
-    depth = float(offset[k] @ self._outward[k])
-    if depth > max(self._depth, _ENOUGH * _DEPTH):
-      if self._depth:
-        self._noted.pop(self._deepest, None)
-      self._deepest, self._depth, self._noted[k] = k, depth, force / depth
 
   def instruct(self, physics: Physics) -> str:
     """Says to feel, and to report."""
@@ -158,8 +145,15 @@ class Palpate(Task):
     return f"Press here and there, and report where it is stiff while you press: {share}"
 
   def observe(self, physics: Physics) -> dict[str, np.ndarray]:
-    """Returns field and felt."""
-    return {"field": self.center - physics.tip_pos(), "felt": np.array([self.felt()])}
+    """Returns what was felt, and where what matters of it is from the tip."""
+    tip, left = physics.tip_pos(), self.notes.left(physics.tip_pos())
+    return {
+      "field": self.center - tip,
+      "felt": np.array([self.felt()]),
+      "left": np.array([float(left is not None)]),
+      "unfelt": np.zeros(3) if left is None else self.places[left] - tip,
+      "expected": self.notes.expected(self.radius) - tip,
+    }
 
   def expert(self, p: Performer) -> Script:
     """Feels over the field until something is stiff, then around it, and reports the middle.
@@ -168,45 +162,36 @@ class Palpate(Task):
     feel stiffer. Where the inclusion is it learns from forces and depths alone.
     """
     normals = p.physics.normals()[self.field]
-    felt = dict(self._noted)  # place -> stiffness [N/m]
+    felt = self.notes.felt()  # place -> stiffness [N/m]
     sweep = iter(self._left_out(felt))
     while (k := self._next(p, felt, sweep)) is not None:
       yield from self._hop(p, self.places[k] + _ABOVE * normals[k])
       felt[k] = yield from p.feel(self.places[k], -normals[k], _DEPTH)
       yield from p.line(self.places[k] + _ABOVE * normals[k], 0.03)
-    k = self._guess(felt)
-    yield from self._hop(p, self.places[k] + _ABOVE * normals[k])
-    yield from p.feel(self.places[k], -normals[k], 0.5 * _DEPTH)
+    # A hasty one goes by what is observed alone, which can be learned.
+    goal = self.notes.expected(self.radius) if p.hasty else self.places[self._guess(felt)]
+    normal = normals[np.linalg.norm(self.places - goal, axis=1).argmin()]
+    yield from self._hop(p, goal + _ABOVE * normal)
+    yield from p.feel(goal, -normal, 0.5 * _DEPTH)
     yield from p.say()
 
   def _next(self, p: Performer, felt: dict[int, float], sweep: Iterator[int]) -> int | None:
     """Returns the place to feel next, None where enough is felt."""
-    if p.hasty and self._sure(felt):
-      return self._neighbour(p, felt)
-    found = None if p.hasty else self._unsure(felt)
+    if p.hasty:
+      return self.notes.left(p.hand.tip_pos())
+    found = self._unsure(felt)
     return next(sweep, None) if found is None else found
 
   def _left_out(self, felt: dict[int, float]) -> list[int]:
     """Returns the places to sweep over but for those that were felt, from the last of these on."""
-    sweep, spots = _lattice(self.places, self.center, _SWEEP), self.places[list(felt)]
+    sweep, spots = _lattice(self.places, self.center, APART), self.places[list(felt)]
     near = [
-      bool(np.linalg.norm(spots - self.places[k], axis=1).min(initial=np.inf) < 0.5 * _SWEEP)
+      bool(np.linalg.norm(spots - self.places[k], axis=1).min(initial=np.inf) < 0.5 * APART)
       for k in sweep
     ]
     first = max((i + 1 for i, done in enumerate(near) if done), default=0)
     order = [*range(first, len(sweep)), *range(first)]
     return [sweep[i] for i in order if not near[i]]
-
-  def _neighbour(self, p: Performer, felt: dict[int, float]) -> int | None:
-    """Returns a place beside the stiffest, to the four sides of it; None where all are felt."""
-    across, top = p.physics.trocar().mat[:, :2].T, self.places[max(felt, key=lambda k: felt[k])]
-    for way in (*across, *-across):
-      goal = top + _BESIDE * way
-      k = int(np.linalg.norm(self.places - goal, axis=1).argmin())
-      far = np.linalg.norm(self.places[[*felt]] - self.places[k], axis=1).min()
-      if np.linalg.norm(self.places[k] - goal) < 0.5 * _BESIDE and far > 0.5 * _BESIDE:
-        return k
-    return None
 
   def _unsure(self, felt: dict[int, float]) -> int | None:
     """Returns the place to feel for to be sure of what is stiff, None where nothing is, or all.
@@ -214,19 +199,13 @@ class Palpate(Task):
     The likeliest of those that nothing near was felt of: what is stiff at an edge of the field
     shows on one side alone.
     """
-    stiffness = np.array(list(felt.values()))
-    if not len(felt) or stiffness.max() < _STIFF * np.quantile(stiffness, 0.25):
+    if not felt or max(felt.values()) < _STIFF * _soft(felt):
       return None
     chance = self._chance(felt)
     spots = self.places[list(felt)]
     far = np.linalg.norm(self.places[:, None] - spots, axis=2).min(axis=1) > _CLOSE
     k = int((chance * far).argmax())
     return k if far[k] and chance[k] > _LIKELY * chance.max() else None
-
-  def _sure(self, felt: dict[int, float]) -> bool:
-    """Returns whether something is so stiff, among enough places, that no more need be felt."""
-    stiffness = np.array(list(felt.values()))
-    return len(felt) >= _SOME and stiffness.max() > _SURE * np.quantile(stiffness, 0.25)
 
   def _guess(self, felt: dict[int, float]) -> int:
     """Returns the place nearest to where the inclusion is to be expected.
@@ -238,17 +217,8 @@ class Palpate(Task):
     return int(np.linalg.norm(self.places - middle, axis=1).argmin())
 
   def _chance(self, felt: dict[int, float]) -> np.ndarray:
-    """Returns how likely the inclusion is under each place, against the likeliest [-]  (nplace,).
-
-    As likely as a bell of stiffness on it, h exp(-(d/w)^2) above what is soft, fits what was felt.
-    """
-    stiffness = np.array(list(felt.values()))
-    more = stiffness - np.quantile(stiffness, 0.25)
-    distance = np.linalg.norm(self.places[:, None] - self.places[list(felt)], axis=2)
-    bell = np.exp(-((distance / (1.2 * self.radius)) ** 2))
-    height = np.maximum(bell @ more / np.maximum((bell**2).sum(axis=1), 1e-9), 0.0)
-    error = ((more - height[:, None] * bell) ** 2).sum(axis=1)
-    return np.exp((error.min() - error) / (2 * _NOISE**2))
+    more = np.array(list(felt.values())) - _soft(felt)
+    return chance(self.places, np.array([*felt]), more, self.radius)
 
   def _hop(self, p: Performer, goal: np.ndarray) -> Script:
     """Moves to a point, in an arch over the organ where it is far."""
@@ -256,6 +226,11 @@ class Palpate(Task):
     if far > 0.025:
       yield from p.move((goal + p.tip) / 2 + 0.35 * far * p.physics.trocar().mat[:, 2])
     yield from p.move(goal)
+
+
+def _soft(felt: dict[int, float]) -> float:
+  """Returns what counts as soft [N/m]."""
+  return float(np.quantile(list(felt.values()), SOFT))
 
 
 def _lattice(points: np.ndarray, center: np.ndarray, gap: float) -> list[int]:

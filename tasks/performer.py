@@ -209,6 +209,11 @@ def find(who: str, *others: str) -> Any:
   return found
 
 
+def is_policy(found: Any) -> bool:
+  """Returns whether what `find` found is a trained policy, which is of one exercise."""
+  return found is trained or isinstance(found, policy.Policy)
+
+
 class Performer:
   """Follows the script of the environment's task; starts it again with each episode.
 

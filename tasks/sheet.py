@@ -6,7 +6,7 @@ World: z is up, the sheet lies in z = 0 and is held along its four sides.
 import mujoco
 import numpy as np
 import palpate
-from palpate.models import mjcf
+from palpate.models import catalog, mjcf, scenery, situs
 
 from . import scenes
 from .scenes import Scene
@@ -17,7 +17,9 @@ _SPARE = 5.0  # times the square root of its nodes: room for a cut around and on
 # Ours: a firm sheet on a centimetre of fat of 10 kPa, of 6 g.
 _TISSUE = {"young": 1e6, "thickness": 0.0015, "damping": 0.005, "foundation": 1e6}
 _MASS, _SKIN = 0.006, 0.0005  # [kg], radius of the flex [m]
-_COLOUR, _FRAME = (0.87, 0.62, 0.52, 1.0), "0.55 0.58 0.62 1"
+# What lies around: the wall, and fat of its own; ours.
+_HELD = situs.Arrangement(without=(*catalog.DUCTS, "fat"))
+_COLOUR, _FRAME = (0.87, 0.62, 0.52, 1.0), "0.55 0.58 0.62"
 
 
 def sheet(nodes: int) -> tuple[np.ndarray, np.ndarray]:
@@ -65,15 +67,40 @@ def build(scene: Scene) -> mujoco.MjSpec:
     radius=_SKIN,
     rgba=_COLOUR,
   )
+  inside = scene.surroundings == "abdomen"
+  spec = scenes.furnish(scene, flex, np.zeros(3), _frame(seen=not inside))
+  palpate.add_spare(spec, scenes.ORGAN, spare)
+  spec.option.gravity = np.zeros(3)
+  if inside:
+    situs.dress(spec, scenes.ORGAN, "wall", vertices[:, :2] / 0.15)
+    situs.draw(spec, "abdomen_border", _border(), situs.paint(spec, "fat"))
+    situs.furnish(spec, (), arrangement=_HELD)
+    situs.light(spec, scene.camera, np.zeros(3))
+  return spec
+
+
+def _frame(seen: bool) -> str:
+  """Returns the bars around the sheet, which are seen where it is alone."""
   half, bar = SIZE / 2 + 0.003, 0.003
   sides = [(half, 0, bar, half + bar), (-half, 0, bar, half + bar)]
   sides += [(y, x, b, a) for x, y, a, b in sides]
-  frame = "".join(
-    f'<geom type="box" pos="{x} {y} 0" size="{a} {b} 0.002" rgba="{_FRAME}" contype="0" '
+  return "".join(
+    f'<geom type="box" pos="{x} {y} 0" size="{a} {b} 0.002" rgba="{_FRAME} {seen:d}" contype="0" '
     'conaffinity="0"/>'
     for x, y, a, b in sides
   )
-  spec = scenes.furnish(scene, flex, np.zeros(3), frame)
-  palpate.add_spare(spec, scenes.ORGAN, spare)
-  spec.option.gravity = np.zeros(3)
-  return spec
+
+
+def _border() -> scenery.Surface:
+  """Returns the fat that the sheet lies in: under it, over its sides, and in lumps around it."""
+  out, around = np.meshgrid(
+    np.r_[0, np.linspace(0, 1, 33)], np.linspace(0, 2 * np.pi, 145), indexing="ij"
+  )
+  square = (np.cos(around) ** 8 + np.sin(around) ** 8) ** (-1 / 8)  # with round corners
+  far = SIZE / 2 * (0.95 + 5 * out**1.6)
+  far[0] = 0.0
+  x, y = far * square * np.cos(around), far * square * np.sin(around)
+  lumps = scenery.bumps(3, 0.045, 0.004)(x, y) + scenery.bumps(4, 0.015, 0.001)(x, y)
+  rise = np.minimum(1, 12 * out)
+  z = (0.005 + lumps) * rise - 0.004 * (1 - rise)
+  return scenery.lattice(np.stack([x, y, z], axis=-1), np.stack([x, y], axis=-1) / 0.14)

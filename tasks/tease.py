@@ -31,7 +31,6 @@ SCENE = Scene(
   nodes=250,
   port=(0.0, -0.13, 0.065),
   camera=(-0.07, -0.06, 0.06),
-  surroundings="none",
 )
 # Of the expert: where the tip is over the bed and behind the front before a stroke, how far a
 # stroke goes beyond the front, how wide a lane is [m], and how fast a stroke and the way back are

@@ -76,15 +76,19 @@ def main(args: argparse.Namespace) -> int:
   known = keeping.references(args.references)
   name = options.task_name(args.task)
   try:
-    performer.find(args.policy)
+    trained = performer.is_policy(performer.find(args.policy))
   except ValueError as error:
     raise CommandError(str(error)) from None
   file = output("json", args.json) if args.json else None
   if args.recordings:
     output_folder("recordings", args.recordings)
   task_kwargs = options.read(args.set)
-  if task_kwargs:  # what is wrong with them is said once
-    options.load(name, task_kwargs)
+  if task_kwargs or trained:  # what is wrong with them is said once
+    env = options.environment(name, json.dumps(task_kwargs))
+    try:
+      _ = performer.make(env, args.policy) if trained else None
+    except ValueError as error:
+      raise CommandError(str(error)) from None
   seeds = range(args.seed, args.seed + args.episodes)
   progress, results = Progress(), []
   with Interrupt() as interrupt:

@@ -5,6 +5,7 @@ The kernels and their structs are the plugin's, over rows of worlds: see `palpat
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
+import abc
 import dataclasses
 from typing import Any
 
@@ -18,6 +19,8 @@ from palpate.tissue.types import DIMS, Array, doubles, fill, floats, ints, struc
 
 from .kernels import put_back_rows
 from .patch import launch
+
+_LOOK = 10  # steps after which the host looks, at most
 
 
 @struct
@@ -155,6 +158,25 @@ class Beside:
 
   def _over(self, what: Kernel, fields, count: int, arg: int = 0):
     launch(what, fields, self._nworld, max(1, count), self._device, arg)
+
+
+class Opens(Beside):
+  """What lets meshes come apart, for which the host looks now and then."""
+
+  def __init__(self, organ):
+    super().__init__(organ)
+    self._steps = 0
+
+  def stepped(self, last: bool):
+    """See `Beside`: looks where it is time, or it was the last step for now."""
+    self._steps += 1
+    if last or self._steps >= _LOOK:
+      self._steps = 0
+      self.open()
+
+  @abc.abstractmethod
+  def open(self):
+    """Lets the meshes of worlds come apart where they have to."""
 
 
 def bodies_of(batch):

@@ -17,10 +17,8 @@ from palpate.tissue.step import SCHEMES
 from palpate.tissue.types import allocate, doubles, fill, floats, ints, struct
 
 from . import beside
-from .bench import Bench
 from .parting import Cutters
 
-_LOOK = 10  # steps after which the host looks, at most
 _ROWS = "state", "next", "force", "point", "share", "hold", "due", "law"
 _WorldBlades = beside.in_worlds(
   cutters.Blades,
@@ -82,7 +80,7 @@ def _feel(b: _WorldBlades, adr: int, data: wp.array2d[float]):
       data[w, adr + c] = data[w, adr + c] + float(turned)
 
 
-class Blades(beside.Beside):
+class Blades(beside.Opens):
   """What cuts an organ in all worlds.
 
   Args:
@@ -164,13 +162,6 @@ class Blades(beside.Beside):
 
   # The meshes come apart.
 
-  def stepped(self, last: bool):
-    """Counts a step; opens paths where it is time, or it was the last one for now."""
-    self._steps += 1
-    if last or self._steps >= _LOOK:
-      self._steps = 0
-      self.open()
-
   def open(self):
     """Lets the meshes of worlds come apart along the paths that are long enough, or ended."""
     due = self.fields.due.numpy()
@@ -181,30 +172,23 @@ class Blades(beside.Beside):
     law, edge = self.fields.law.numpy(), self._organ.declared.mesh.edge_length
     cuts.follow()
     motion = cuts.motion(worlds)
-
-    def work(bench: Bench, k: int):
-      world = worlds[k]
+    for k, world in enumerate(worlds):
       for i in np.flatnonzero(due[world]):
         given = cutters.GIVEN * float(law[world, i, LAW.force]) * edge
-        ended = due[world, i] == cutters.ENDED
-        self._open(bench, state[world, i], ended, given, motion, k, world)
-
-    cuts.benches.each(work, len(worlds))
+        self._open(state[world, i], due[world, i] == cutters.ENDED, given, motion, k, world)
     cuts.finish(worlds, motion)
     self.fields.state.assign(state)
     self.fields.due.zero_()
 
-  def _open(
-    self, bench: Bench, row: np.ndarray, ended: bool, given: float, motion, k: int, world: int
-  ):
+  def _open(self, row: np.ndarray, ended: bool, given: float, motion, k: int, world: int):
     cuts = self._organ.topology
 
     def cut(path: np.ndarray) -> tuple[Any, Mesh]:
-      found = cuts.find(bench, world, path, motion, k, given, True)
-      return cuts.apply(bench, world, found, motion, k), cuts.mesh_of(world)
+      found = cuts.find(world, path, motion, k, given, True)
+      return cuts.apply(world, found, motion, k), cuts.mesh_of(world)
 
     organ, mesh = self._organ.declared, cuts.mesh_of(world)
-    cutters.open_path(row, mesh, bool(ended), organ, bench.finder, cut)
+    cutters.open_path(row, mesh, bool(ended), organ, cuts.finder, cut)
 
 
 @wp.kernel(enable_backward=False)

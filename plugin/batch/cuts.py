@@ -7,7 +7,6 @@ and what has changed goes there; graphs go on as they were recorded.
 from __future__ import annotations
 
 import dataclasses
-import functools
 
 import numpy as np
 import warp as wp
@@ -22,10 +21,12 @@ from palpate.tissue import order, shape, step
 from palpate.tissue.mesh import Mesh
 from palpate.tissue.meshes import Meshes
 from palpate.tissue.order import LANES
+from palpate.tissue.path import Finder
+from palpate.tissue.rows import Rows
+from palpate.tissue.surface import WorkingCopy
 from palpate.tissue.types import NUMBERS, fill
 
 from . import kernels
-from .bench import Bench, Benches
 from .patch import Surface
 
 _OWN = ("rest", "elem", "touch", "source", "share", "held")  # fields of `Patch`
@@ -86,10 +87,13 @@ class Cuts:
     values |= {name: self._meshes.more[f"patch.{name}"] for name in _OWN}
     values["mesh"] = self._meshes.which
     self._here = {name: self._meshes.here[f"patch.{name}"] for name in _OWN}
-    self.benches = Benches(functools.partial(Bench, self.whole, self._meshes, still))
+    copy = WorkingCopy(self.whole)
+    self._knife, self.finder = cutting.Knife(copy), Finder(copy)
+    starts = {"slot_adr": still.shape.slot_adr, "bend_adr": still.shape.bend_adr}
+    self._rows = Rows(copy, self._meshes.arrays | starts, node)
     number = body.tissue.number.numpy()[:, _INSIDE : _INSIDE + 2]
     self._worlds: dict[int, World] = {}
-    self._changed: set[int] = set()
+    self._changed: dict[int, list[np.ndarray]] = {}  # vertices and triangles, see `finish`
     self._whole_count = _count(self.whole)
     self._intact = fill(kernels.Whole, body.device, {
       "first": _INSIDE, "count": self._whole_count, "inside": number,
@@ -118,6 +122,11 @@ class Cuts:
   def mesh_of(self, world: int) -> Mesh:
     """Returns the mesh of a world, as it was when `follow` was called."""
     return self._worlds[world].mesh if world in self._worlds else self.whole
+
+  def is_full(self, world: int) -> bool:
+    """Returns whether a world has no spare vertex left, as `mesh_of` has it."""
+    mesh = self.mesh_of(world)
+    return mesh.nouter == mesh.nskin
 
   def mass(self, world: int) -> np.ndarray:
     """Returns the masses of its vertices, as compiled [kg], (nvert,)."""
@@ -166,12 +175,11 @@ class Cuts:
   # Cutting.
 
   def find(
-    self, bench: Bench, world: int, points: np.ndarray, motion: Motion, k: int, *how
+    self, world: int, points: np.ndarray, motion: Motion, k: int, *how
   ) -> cutting.Cut:
     """Returns what a cut along points in the organ's frame, (n, 3) [m], makes of a world.
 
     Args:
-      bench: where
       world: the world
       points: the path
       motion: what vertices of some worlds have
@@ -181,7 +189,7 @@ class Cuts:
     organ, had = self._organ, self._of(world)
     carried = cutting.Motion(had.mass, motion.disp[k], motion.vel[k])
     free, config = organ.declared.free, organ.config
-    found = bench.knife.cut(organ.name, had.mesh, carried, points, ~free, config, None, *how)
+    found = self._knife.cut(organ.name, had.mesh, carried, points, ~free, config, None, *how)
     kept = (getattr(found.motion, name).copy() for name in ("mass", "disp", "vel"))
     return dataclasses.replace(found, motion=cutting.Motion(*kept))
 
@@ -189,26 +197,20 @@ class Cuts:
     """Cuts worlds along points in the world's axes, (n, 3) [m] each; see `Tissue.cut`."""
     self.follow()
     organ, worlds = self._organ, sorted(points)
-    motion = self.motion(worlds)
-
-    def find(bench: Bench, k: int) -> cutting.Cut:
-      local = (points[worlds[k]] - organ.declared.origin) @ organ.declared.frame
+    motion, found = self.motion(worlds), []
+    for k, world in enumerate(worlds):
+      local = (points[world] - organ.declared.origin) @ organ.declared.frame
       try:
-        return self.find(bench, worlds[k], local, motion, k)
+        found.append(self.find(world, local, motion, k))
       except ValueError as error:
-        raise ValueError(f"world {worlds[k]}: {error}") from None
-
-    found = self.benches.each(find, len(worlds))
-    reports = self.benches.each(
-      lambda bench, k: self.apply(bench, worlds[k], found[k], motion, k), len(worlds)
-    )
-    self.finish(worlds, motion)
+        raise ValueError(f"world {world}: {error}") from None
     out: list[Report | None] = [None] * organ.body.nworld
-    for world, report in zip(worlds, reports, strict=True):
-      out[world] = report
+    for k, world in enumerate(worlds):
+      out[world] = self.apply(world, found[k], motion, k)
+    self.finish(worlds, motion)
     return out
 
-  def apply(self, bench: Bench, world: int, cut: cutting.Cut, motion: Motion, k: int) -> Report:
+  def apply(self, world: int, cut: cutting.Cut, motion: Motion, k: int) -> Report:
     """Makes a world the mesh that was found, the k-th of a motion; `finish` is to come."""
     organ, had = self._organ, self._of(world)
     report = engine.report(cut, had.mesh, organ.declared, organ.config.thickness)
@@ -219,15 +221,13 @@ class Cuts:
       # Vertices that come apart inside do not make two pieces of one.
       pieces = _count(cut.mesh) if cut.mesh.loose is not had.mesh.loose else had.pieces
       now = World(cut.mesh, cut.motion.mass, source, pieces, had.reports)
-      self._become(bench, world, had, now, cut.changed)
-      self._changed.add(world)
+      self._become(world, had, now, cut.changed)
       self._worlds[world].reports.append(report)
     return report
 
   def finish(self, worlds: list[int], motion: Motion):
     """Brings the worlds that `apply` has changed to the device; `motion` is of `worlds`."""
     which = [k for k, world in enumerate(worlds) if world in self._changed]
-    self._changed.clear()
     if which:
       own = [worlds[k] for k in which]
       self._upload(own)
@@ -241,21 +241,28 @@ class Cuts:
     mass, source = self._organ.declared.mass.copy(), np.arange(self.whole.nvert)
     return World(self.whole, mass, source, self._whole_count)
 
-  def _become(self, bench: Bench, world: int, had: World, now: World, changed: np.ndarray):
+  def _become(self, world: int, had: World, now: World, changed: np.ndarray):
     """Writes the row of a world, in which triangles have changed."""
     organ, mesh = self._organ, now.mesh
     before, loosened = had.mesh.elem[changed], mesh.loose is not had.mesh.loose
     how = ~organ.declared.free, changed, before, loosened
     touched = topology.touched(had.mesh, mesh, changed)
-    if not bench.rows.write(mesh, organ.config, *how, self._meshes.open(world)):
+    if not self._rows.write(mesh, organ.config, *how, self._meshes.open(world)):
       raise ValueError("cuts that meet leave no room in the bending matrix")
-    here = {name: array[world] for name, array in self._here.items()}
-    self._surface.write(here, mesh, now.mass, now.source, touched, changed)
     self._worlds[world] = now
+    kept = self._changed.get(world)
+    self._changed[world] = (
+      [touched, changed] if kept is None
+      else [topology.distinct(*pair) for pair in zip(kept, (touched, changed), strict=True)]
+    )  # fmt: skip
 
   def _upload(self, worlds: list[int]):
     """Gives the device the meshes of worlds, and what follows from them."""
     organ, body = self._organ, self._organ.body
+    own = [self._worlds[world] for world in worlds]
+    changed = [self._changed.pop(world) for world in worlds]
+    changes = [(w.mesh, w.mass, w.source, *c) for w, c in zip(own, changed, strict=True)]
+    self._surface.write(self._here, worlds, changes)
     self._meshes.upload(worlds)
     for _ in range(2 * body.has_bending):  # what is left of the first time is exact
       self._meshes.angle(worlds, step.rest_angles(body))
@@ -338,7 +345,7 @@ class Cuts:
     mesh, changed = topology.recut(before, rest, elem, loose)
     if changed.size or mesh is not before:
       now = World(mesh, mass, source, _count(mesh))
-      self._become(self.benches.first, world, self._of(world), now, changed)
+      self._become(world, self._of(world), now, changed)
       self._upload([world])
     if mesh is self.whole and world in self._worlds:
       self._forget(world)
@@ -364,5 +371,7 @@ def _carry(motion: Motion, k: int, cut: cutting.Cut, free: np.ndarray):
   motion.disp[k], motion.vel[k] = cut.motion.disp, cut.motion.vel
   moves = free[cut.member]
   group, member, share = cut.group[moves], cut.member[moves], cut.share[moves]
-  motion.force[k, member] = share[:, None] * motion.force[k, group]
-  motion.last[k, member], motion.before[k, member] = motion.last[k, group], motion.before[k, group]
+  force = motion.force[k]
+  force[member] = share[:, None] * force[group]
+  for values in (motion.last[k], motion.before[k]):
+    values[member] = values[group]

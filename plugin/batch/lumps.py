@@ -1,7 +1,8 @@
 """Young's modulus of each triangle of each world: a lump that lies elsewhere in each.
 
-In a solid tetrahedra have that of the triangle nearest to them. All that depends on it in a step is linear in the triangles' factors on the modulus they were
-compiled with, so that a world's numbers are products with sparse matrices.
+In a solid tetrahedra have that of the triangle nearest to them. All that depends on it in a step is
+linear in the triangles' factors on the modulus they were compiled with, so that a world's numbers
+are products with sparse matrices.
 """
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
@@ -11,7 +12,7 @@ import math
 import numpy as np
 import warp as wp
 from palpate.tissue import config as configuration
-from palpate.tissue import plate, solid, step
+from palpate.tissue import plate, solid, step, tets
 from palpate.tissue.fill import vertex_volumes, volumes
 from palpate.tissue.order import LANES, ellpack, offset
 from palpate.tissue.types import Lump, allocate, fill, floats, ints, struct
@@ -96,7 +97,7 @@ def _solid_maps(organ, body) -> dict:
   # Padding has no volume, but quotients of mu.
   elem = np.concatenate([solid.nearest_triangle(mesh), np.zeros(nlane - ntet, int)])
   place = np.arange(nlane)
-  place[solid.order(mesh, node)] = np.arange(ntet)
+  place[tets.order(mesh, node)] = np.arange(ntet)
   share = np.repeat(volumes(mesh.rest, mesh.tet) / 4, 4)
   share /= vertex_volumes(mesh)[mesh.tet.ravel()]
   tet = np.repeat(np.arange(ntet), 4)

@@ -208,32 +208,38 @@ class Surface:
       "held": np.ones(n),
     }
     vert, elem = np.arange(mesh.nvert), np.arange(mesh.nelem)
-    self.write(out, mesh, self._organ.mass, vert, vert, elem)
+    here = {name: values[None] for name, values in out.items()}
+    self.write(here, [0], [(mesh, self._organ.mass, vert, vert, elem)])
     return out
 
-  def write(self, out: dict[str, np.ndarray], mesh, mass: np.ndarray, source, vert, elem):
-    """Writes them, for some vertices and triangles.
+  def write(self, out: dict[str, np.ndarray], worlds, changes: list[tuple]):
+    """Writes them, for some vertices and triangles of worlds.
 
     Args:
-      out: the fields
-      mesh: the mesh
-      mass: of its vertices [kg]                   (nvert,)
-      source: what each was before the first cut   (nvert,)
-      vert: the vertices
-      elem: the triangles
+      out: the fields, with a row a world
+      worlds: the worlds
+      changes: of each its mesh, masses and sources of vertices, which vertices and which triangles
     """
-    organ, node, waits = self._organ, self._node[vert], mesh.unused[vert]
-    source = source[vert]
-    was = organ.mass[source]
-    share = np.where(was > 0, mass[vert] / np.where(was > 0, was, 1.0), 1.0)
+    parts = [
+      (v, mesh.rest[v], mesh.unused[v], _longest(mesh, v), source[v], mass[v], e, mesh.elem[e])
+      for mesh, mass, source, v, e in changes
+    ]
+    of_vert = np.repeat(worlds, [len(each[0]) for each in parts])
+    of_elem = np.repeat(worlds, [len(each[6]) for each in parts])
+    vert, rest, waits, longest, source, mass, elem, corner = (
+      np.concatenate(each) for each in zip(*parts, strict=True)
+    )
+    was = self._organ.mass[source]
+    share = np.where(was > 0, mass / np.where(was > 0, was, 1.0), 1.0)
     # Nodal coupling leaves contacts the masses of the compiled model.
-    held = share * self._held[source] if organ.windows else self._held[vert]
-    out["elem"][elem] = self._node[mesh.elem[elem]]
-    out["rest"][node] = mesh.rest[vert]
-    out["touch"][node] = np.where(waits, -np.inf, self._reach + _longest(mesh, vert))
-    out["source"][node] = self._node[source]
-    out["share"][node] = np.where(waits, 0.0, share)
-    out["held"][node] = np.where(waits, 1.0, held)
+    held = share * self._held[source] if self._organ.windows else self._held[vert]
+    at = of_vert, self._node[vert]
+    out["elem"][of_elem, elem] = self._node[corner]
+    out["rest"][at] = rest
+    out["touch"][at] = np.where(waits, -np.inf, self._reach + longest)
+    out["source"][at] = self._node[source]
+    out["share"][at] = np.where(waits, 0.0, share)
+    out["held"][at] = np.where(waits, 1.0, held)
 
 
 def _skin(organ, model) -> float:

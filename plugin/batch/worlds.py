@@ -19,7 +19,7 @@ from palpate.engine import plugin as engine
 from palpate.organ import instances
 from palpate.tissue import device as devices
 
-from . import beside, blades, contacts, convex, held, kernels, states, strip
+from . import beside, blades, contacts, convex, held, kernels, states, strip, tears
 from .base import Batch, Tissue, refuse_crowd
 from .organs import Organ
 from .rest import Rest
@@ -75,7 +75,7 @@ class Worlds(Batch):
       self._rest = Rest(self, bare)
       self.aims = self._join()
       every = (each for organ in self._organs.values() for each in organ.beside)
-      self._looks = [each for each in every if isinstance(each, blades.Blades)]
+      self._looks = [each for each in every if isinstance(each, beside.Opens)]
       self._teller = states.Teller(self)
       self._alias()
       self._sensed: Any = kernels.Sensed()
@@ -137,12 +137,14 @@ class Worlds(Batch):
   def _join(self) -> bool:
     """Lets organs have what acts beside them; returns whether it asks where bodies are."""
     organs = list(self._organs.values())
+    for organ in organs:
+      organ.beside = tears.make(organ)
     if not any(any(organ.space.beside) for organ in organs):
       return False
     self.bodies = beside.bodies_of(self)
     numbers = beside.numbers_of(self.model, self.bare, [organ.declared for organ in organs])
     for organ in organs:
-      organ.beside = (*held.make(organ, numbers), *blades.make(organ))
+      organ.beside += (*held.make(organ, numbers), *blades.make(organ))
     held.meet(organs)
     return any(each.aims for organ in organs for each in organ.beside)
 
@@ -193,7 +195,8 @@ class Worlds(Batch):
 
   def _feel(self, sensor: int, organ: str):
     adr = int(self.model.sensor_adr[sensor])
-    self._felt += [(each, adr) for each in self._organs[organ].beside if each in self._looks]
+    found = self._organs[organ].beside
+    self._felt += [(each, adr) for each in found if isinstance(each, blades.Blades)]
     self.record()
 
   def _sense(self, kernel):

@@ -12,12 +12,13 @@ import dataclasses
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from palpate.tissue import body as bodies
 from palpate.tissue import cut as cutting
 from palpate.tissue import fill
 from palpate.tissue import mesh as topology
 from palpate.tissue.mesh import Mesh
-from palpate.tissue.path import Finder
+from palpate.tissue.path import Finder, check_points
 from palpate.tissue.refill import Refill
 from palpate.tissue.surface import WorkingCopy
 
@@ -241,7 +242,7 @@ class Cuts:
 
   # Cutting.
 
-  def cut(self, points: np.ndarray, given: float = 0.0, depth=None, direction=None) -> Report:
+  def cut(self, points: npt.ArrayLike, given: float = 0.0, depth=None, direction=None) -> Report:
     """Cuts the organ along points in the world, (n, 3) [m]; see `Organ.cut`, and `Knife.cut`."""
     return self._end(self.find(points, given, depth, direction))
 
@@ -263,7 +264,7 @@ class Cuts:
     self.reports.append(done)
     return done
 
-  def find(self, points: np.ndarray, given: float = 0.0, depth=None, direction=None) -> Any:
+  def find(self, points: npt.ArrayLike, given: float = 0.0, depth=None, direction=None) -> Any:
     """Returns what a cut would make of the organ."""
     w, organ = self._w, self._w.organ
     if not self:
@@ -272,7 +273,11 @@ class Cuts:
       )
     self.follow()
     organ = w.organ
-    local = (np.asarray(points, float) - organ.origin) @ organ.frame
+    if direction is not None and np.shape(direction) != (3,):
+      raise ValueError(
+        f"organ {organ.name!r}: direction is {direction}, expected three numbers, not all 0"
+      )
+    local = (check_points(organ.name, points) - organ.origin) @ organ.frame
     motion = cutting.Motion(self.mass, *w.phases.motion())
     return self._find(motion, local, given, depth, direction)
 

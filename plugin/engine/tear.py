@@ -5,6 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from palpate.tissue.mesh import Mesh
+from palpate.tissue.path import Finder
 
 _WAY = 1.2  # edges by which a tear goes on, to each side where it begins
 _NEAR = 1.5  # edges from the end of a cut from which it goes on
@@ -35,28 +37,39 @@ class Tear:
     worst = int(np.argmax(stretch))
     if not stretch[worst] > (1 + w.config.tear) ** 2 or self._w.cuts.full:
       return False
-    corner = x[mesh.elem[worst]]
-    line = self._line(mesh, x, corner.mean(axis=0), _across(mesh.rest[mesh.elem[worst]], corner))
-    organ = w.organ
+    line, organ = line_of(mesh, x, worst, w.cuts.finder), w.organ
     try:
       return w.cuts.cut(organ.origin + line @ organ.frame.T).nodes > 0
     except ValueError:  # pinned tissue around it
       return False
 
-  def _line(self, mesh, x: np.ndarray, at: np.ndarray, across: np.ndarray) -> np.ndarray:
-    """Returns the path that tears: on from the end of a cut beside it, or to both sides."""
-    size = np.linalg.norm(np.diff(x[mesh.elem[:1]][0], axis=0), axis=1).mean()
-    size = max(size, mesh.whole.edge_length)
-    last = mesh.ring_elem[np.arange(mesh.nvert), np.maximum(mesh.degree - 1, 0)]
-    rim = np.flatnonzero((last < 0) & (mesh.degree > 0))
-    start = at - _WAY * size * across
-    far = np.linalg.norm(x[rim] - at, axis=1)
-    if rim.size and far.min() < _NEAR * size:
-      start = x[rim[np.argmin(far)]]
-      across = across if (at - start) @ across >= 0 else -across
-    points = start + np.linspace(0, 2 * _WAY * size, 12)[:, None] * across
-    elem, weight, _ = self._w.cuts.finder.nearest(mesh, x, points)
-    return np.einsum("nk,nkj->nj", weight, x[mesh.elem[elem]])
+
+def line_of(mesh: Mesh, x: np.ndarray, worst: int, finder: Finder) -> np.ndarray:
+  """Returns the path that tears: on from the end of a cut beside it, or to both sides.
+
+  Args:
+    mesh: the surface
+    x: where its vertices are [m]  (nvert, 3)
+    worst: the triangle that is stretched most
+    finder: of its surfaces
+
+  Returns:
+    points on the surface [m], (n, 3)
+  """
+  corner = x[mesh.elem[worst]]
+  at, across = corner.mean(axis=0), _across(mesh.rest[mesh.elem[worst]], corner)
+  size = np.linalg.norm(np.diff(x[mesh.elem[:1]][0], axis=0), axis=1).mean()
+  size = max(size, mesh.whole.edge_length)
+  last = mesh.ring_elem[np.arange(mesh.nvert), np.maximum(mesh.degree - 1, 0)]
+  rim = np.flatnonzero((last < 0) & (mesh.degree > 0))
+  start = at - _WAY * size * across
+  far = np.linalg.norm(x[rim] - at, axis=1)
+  if rim.size and far.min() < _NEAR * size:
+    start = x[rim[np.argmin(far)]]
+    across = across if (at - start) @ across >= 0 else -across
+  points = start + np.linspace(0, 2 * _WAY * size, 12)[:, None] * across
+  elem, weight, _ = finder.nearest(mesh, x, points)
+  return np.einsum("nk,nkj->nj", weight, x[mesh.elem[elem]])
 
 
 def _metric(corner: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -12,7 +12,8 @@ namespace palpate {
 template <class S>
 PALPATE void carry_motion(const S& m, const Moving& x, const Move* move, int nmove, const D3* from,
                           const Few& vert) {
-  D3 spin = {0.0, 0.0, 0.0};
+  D3 spin = {0.0, 0.0, 0.0}, centre = spin;
+  double total = 0.0;
   for (int i = 0; i < nmove; ++i) {
     const int v = move[i].vert;
     const D3 disp = load(x.disp + 3 * v), now = disp + move[i].share * move[i].lead;
@@ -20,7 +21,28 @@ PALPATE void carry_motion(const S& m, const Moving& x, const Move* move, int nmo
     if (vert.has(v)) spin += x.mass[v] * cross(back, load(x.vel + 3 * v));
     store(x.disp + 3 * v, now);
   }
-  add_spin(m.rest, x, vert, spin);
+  if (vert.count < 3) return;
+  for (int i = 0; i < vert.count; ++i) {
+    const int v = vert.list[i];
+    centre += x.mass[v] * (m.place(v) + load(x.disp + 3 * v));
+    total += x.mass[v];
+  }
+  centre = (1.0 / total) * centre;
+  double inertia[3][3] = {};
+  for (int i = 0; i < vert.count; ++i) {
+    const int v = vert.list[i];
+    const D3 arm = m.place(v) + load(x.disp + 3 * v) - centre;
+    const double a[3] = {arm.x, arm.y, arm.z}, square = dot(arm, arm);
+    for (int k = 0; k < 9; ++k)
+      inertia[k / 3][k % 3] += x.mass[v] * ((k / 3 == k % 3 ? square : 0.0) - a[k / 3] * a[k % 3]);
+  }
+  if (spin == D3{0.0, 0.0, 0.0}) return;
+  const D3 omega = rotation_of(inertia, spin);
+  for (int i = 0; i < vert.count; ++i) {
+    const int v = vert.list[i];
+    const D3 arm = m.place(v) + load(x.disp + 3 * v) - centre;
+    store(x.vel + 3 * v, load(x.vel + 3 * v) + cross(omega, arm));
+  }
 }
 
 // Vertices that were one share its mass by area; `share` gets their parts of it.

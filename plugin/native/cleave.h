@@ -6,10 +6,10 @@
 // far as no tetrahedron gets thin ("snap"), and the faces are opened ("split"; Nienhuys and van der Stappen
 // 2001).
 #pragma once
+#include "ease.h"
 #include "flow.h"
 #include "open.h"
 #include "settle.h"
-#include "spin.h"
 
 namespace palpate {
 
@@ -135,23 +135,6 @@ PALPATE bool part_sides(const S& m, const Measured& at, const Sheet& sheet, doub
   return true;
 }
 
-// A slit, two faces beside two, comes apart as a whole, or not.
-template <class I>
-PALPATE void leave_slits(const I* slit, int nslit, Opening& o) {
-  for (int i = 0; i < o.count; ++i) o.cut[o.face[i]] = 1;
-  for (int i = 0; i < nslit; ++i, slit += 4) {
-    const bool one = o.cut[slit[0]] || o.cut[slit[1]], other = o.cut[slit[2]] || o.cut[slit[3]];
-    for (int k = 0; k < 4 && one != other; ++k) o.cut[slit[k]] = 0;
-  }
-  int left = 0;
-  for (int i = 0; i < o.count; ++i) {
-    const int face = o.face[i];
-    if (o.cut[face]) o.face[left++] = face;
-    o.cut[face] = 0;
-  }
-  o.count = left;
-}
-
 // Puts faces in their order along the path.
 template <class S>
 PALPATE bool order_faces(const S& m, const Measured& at, Opening& o, Scratch& memory) {
@@ -201,39 +184,32 @@ PALPATE int share_masses(const S& m, const Opening& o, const Moving& x, const F&
   return count;
 }
 
-// Lets what moved go on as it moved, and lists the tetrahedra that are not as they were.
+// Vertices that have moved get what is carried where they are now; lists the tetrahedra that are not as they
+// were, and their vertices.
 template <class S, class F>
 PALPATE bool carry(const S& m, const Opening& o, const Few& movers, const Shift* shift, const double* rest,
                    const Moving& x, const F& f, Scratch& memory) {
-  Few vert = few(memory, m.nvert), tets = few(memory, m.ntet);
-  D3* lead = (D3*)memory.values(3 * movers.count);
+  Few tets = few(memory, m.ntet);
+  D3* now = (D3*)memory.values(6 * movers.count);
   if (memory.full) return false;
-  const Parts& p = o.parts;
-  each_apart(p, [&](int corner) { tets.put(corner / 4); });
+  each_apart(o.parts, [&](int corner) { tets.put(corner / 4); });
   for (int i = 0; i < movers.count; ++i) {
     const int v = movers.list[i];
-    lead[i] = shift[i].share * shift[i].lead;
+    const double* of[2] = {x.disp, x.vel};
+    for (int k = 0; k < 2; ++k) {
+      const D3 was = load(of[k] + 3 * v);
+      now[2 * i + k] = was + shift[i].share * (at_corners(of[k], shift[i]) - was);
+    }
     if (load(rest + 3 * v) != m.place(v)) m.each_corner(v, [&](int corner) { tets.put(corner / 4); });
   }
   tets.sort(m.ntet);
   for (int i = 0; i < tets.count; ++i) f.changed.data[i] = tets.list[i];
-  for (int i = 0; i < 4 * tets.count; ++i) {
-    const int v = m.vert(4 * tets.list[i / 4] + i % 4);
-    if (!f.pinned.data[v]) vert.put(v);
-  }
-  vert.sort(m.nvert);
-  D3 spin = {0.0, 0.0, 0.0};
   for (int i = 0; i < movers.count; ++i) {
     const int v = movers.list[i];
-    const D3 back = m.place(v) - load(rest + 3 * v) - lead[i];
-    if (vert.has(v)) spin += x.mass[v] * cross(back, load(x.vel + 3 * v));
-    store(x.disp + 3 * v, load(x.disp + 3 * v) + lead[i]);
+    store(x.disp + 3 * v, now[2 * i]), store(x.vel + 3 * v, now[2 * i + 1]);
     store(m.rest + 3 * v, load(rest + 3 * v));
   }
-  add_spin(m.rest, x, vert, spin);
-  for (int i = 0; i < vert.count; ++i) f.near.data[i] = vert.list[i];
-  f.found.data[FOUND_NEAR] = vert.count, f.found.data[FOUND_CHANGED] = tets.count;
-  f.found.data[FOUND_MOVED] = movers.count;
+  f.found.data[FOUND_CHANGED] = tets.count, f.found.data[FOUND_MOVED] = movers.count;
   return true;
 }
 
@@ -332,6 +308,57 @@ PALPATE Opening opening_of(Scratch& memory, int nvert, int ntet, int nouter) {
   return o;
 }
 
+// What is around a cut before it is made: the patch, its energy, what its vertices have together, and the volume
+// around each.
+struct Before { Patch patch; double energy; Sums sums; double* size; };
+
+template <class S, class F>
+PALPATE bool look_before(const S& m, const Opening& o, const Few& movers, const Neohookean& e, const Moving& x,
+                         const F& f, Before& out, Scratch& memory) {
+  out.patch = patch_of(memory, m.nvert, m.ntet), out.size = memory.values(m.nvert);
+  if (memory.full) return false;
+  Patch& p = out.patch;
+  const auto put = [&](int v) { m.each_corner(v, [&](int corner) { p.own.put(corner / 4); }); };
+  for (int i = 0; i < movers.count; ++i) put(movers.list[i]);
+  for (int k = 0; k < o.parts.count; ++k) put(o.parts.vert[k]);
+  find_patch(m, e, f.loose.data, f.foundation, f.ntriangle, p);
+  out.energy = e.has ? strain_patch(m, e, x.disp, p) : 0.0;
+  out.sums = sums_of(m, x, p.vert, f.pinned.data);
+  for (int i = 0; i < p.vert.count; ++i) out.size[p.vert.list[i]] = p.size[i];
+  return true;
+}
+
+// Lets what is around a cut go on with no more energy than it had.
+template <class S, class F>
+PALPATE bool ease(const S& m, const Neohookean& e, const Moving& x, const F& f, Before& was, Scratch& memory) {
+  Patch& p = was.patch;
+  Few apart = few(memory, m.nvert);
+  const int nsplit = f.found.data[FOUND_SPLIT];
+  double* part = memory.values(nsplit);
+  if (memory.full) return false;
+  for (int i = 0; i < nsplit; ++i) part[i] = f.share.data[i] * was.size[f.group.data[i]];
+  for (int i = 0; i < nsplit; ++i) was.size[f.member.data[i]] = part[i], apart.put(f.member.data[i]);
+  find_patch(m, e, f.loose.data, f.foundation, f.found.data[FOUND_TRIANGLES], p);
+  double had = 0.0, has = 0.0;
+  for (int i = 0; i < p.vert.count; ++i) {
+    const int v = p.vert.list[i];
+    had += x.mass[v], has += x.mass[v] *= p.size[i] / was.size[v];
+  }
+  for (int i = 0; i < p.vert.count; ++i) x.mass[p.vert.list[i]] *= had / has;
+  double most = was.energy;
+  for (int turn = 0; turn < 2; ++turn) {
+    const double more = e.has ? give_way(m, e, p, apart, most, x.disp, memory) : 0.0;
+    const double over = keep_motion(m, x, p.vert, f.pinned.data, was.sums, more > 0.0 ? more : 0.0);
+    if (!e.has || !(over > 0.0)) break;
+    most -= over;
+  }
+  int count = 0;
+  for (int i = 0; i < p.vert.count; ++i)
+    if (!f.pinned.data[p.vert.list[i]]) f.near.data[count++] = p.vert.list[i];
+  f.found.data[FOUND_NEAR] = count;
+  return true;
+}
+
 // Cuts under a sheet; returns how it went.
 template <class F, class S>
 PALPATE int cleave(const F& f, const S& m, const Sheet& sheet, const Neohookean& p, Scratch& memory) {
@@ -342,7 +369,6 @@ PALPATE int cleave(const F& f, const S& m, const Sheet& sheet, const Neohookean&
   int* found = f.found.data;
   if (memory.full || !measure_all(m, sheet, f.edge, at, memory)) return FULL;
   if (!part_sides(m, at, sheet, f.edge, o, memory)) return FULL;
-  leave_slits(f.slit.data, f.nslit, o);
   if (!order_faces(m, at, o, memory)) return FULL;
   const bool fits = fit(m, o, f.ntriangle, memory);
   found[FOUND_STOPPED] = o.stopped || !fits;
@@ -361,6 +387,8 @@ PALPATE int cleave(const F& f, const S& m, const Sheet& sheet, const Neohookean&
   for (int i = 0; i < 3 * m.nvert; ++i) rest[i] = m.rest[i];
   if (!settle(m, sheet, f.edge, at.where, f.pinned.data, p, movers, shift, rest, memory)) return FULL;
   const Moving x = {f.mass.data, f.disp.data, f.vel.data};
+  Before was = {};
+  if (!look_before(m, o, movers, p, x, f, was, memory)) return FULL;
   if (!carry(m, o, movers, shift, rest, x, f, memory)) return FULL;
   const int count = 3 * (f.ntriangle + 2 * o.nparting);
   open_faces(m, o, f.ntriangle, near);
@@ -368,7 +396,8 @@ PALPATE int cleave(const F& f, const S& m, const Sheet& sheet, const Neohookean&
   found[FOUND_SPLIT] = share_masses(m, o, x, f, memory);
   for (int t = f.ntriangle; t < count / 3; ++t) f.loose.data[t] = 1;
   measure_walls(m, sheet, f.edge, f.ntriangle, count / 3, f);
-  return come_loose(m, f.home.data, f.loose.data, memory) && !memory.full ? APART : FULL;
+  if (!come_loose(m, f.home.data, f.loose.data, memory)) return FULL;
+  return ease(m, p, x, f, was, memory) && !memory.full ? APART : FULL;
 }
 
 template <class Fields>

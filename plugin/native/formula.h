@@ -20,6 +20,13 @@ constexpr double CHANGE = 0.005, COHERENT = 0.7, FASTER = 2.0;
 // Time without motion and force after which an organ sleeps [s].
 constexpr double QUIET = 0.2;
 
+// h^2 + h damping, `eased` times h taken off the damping where that is no more than MOST of it.
+PALPATE double weight_of_stiffness(double h, double damping, double eased) {
+  constexpr double MOST = 0.5;
+  const double taken = eased * h < MOST * damping ? eased * h : MOST * damping;
+  return h * h + h * (damping - taken);
+}
+
 PALPATE bool touched(D3 contact) { return contact != D3{0.0, 0.0, 0.0}; }
 
 // What MuJoCo adds to a node's dofs by itself, in the organ's frame: forces along them, and one on

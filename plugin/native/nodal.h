@@ -54,7 +54,7 @@ PALPATE void gather_nodes(const Fields& f, Thread, int) {
   const auto& solve = f.solve;
   const double h = mj.timestep.data[0], damping = (float)f.number.data[DAMPING];
   solve.step.data[0] = (float)h;
-  solve.step.data[1] = (float)(h * h + h * damping);
+  solve.step.data[1] = (float)weight_of_stiffness(h, damping, f.number.data[EASED]);
   const double* R = f.frame.data;
   const bool falls = !(mj.disableflags.data[0] & DISABLE_GRAVITY);
   const D3 zero = {0.0, 0.0, 0.0}, g = falls ? add_turned(zero, R, load(mj.gravity.data)) : zero;
@@ -146,7 +146,7 @@ PALPATE void move_inner(const Fields& f, int i, double h, D3 dv) {
 template <class Fields>
 PALPATE void remember_nodes(const Fields& f, Thread, int) {
   const auto& mj = f.mj;
-  const double h = mj.timestep.data[0];
+  const double h = mj.timestep.data[0], damping = (float)f.number.data[DAMPING];
   const bool ok = f.solve.status.data[3] == 0.0f, answered = ok && f.flags.data[FLAG_ANSWERED];
   const double heavy = f.own.heavier.data[0] > 1.0 ? f.own.heavier.data[0] : 1.0;
   Secant secant;

@@ -110,7 +110,7 @@ PALPATE int find_parts(const S& m, int v, int from, const int* cut, Parts& out) 
         const int face = other_corner(corner, j), mate = cut[face] ? -1 : m.beside(face);
         if (mate < 0) continue;
         const int t = mate - mate % 4;
-        for (int c = t; c < t + 4; ++c)  // not always there where there is a slit
+        for (int c = t; c < t + 4; ++c)
           if (m.tet[c] == v && !out.part[c]) out.part[c] = k + 1, out.queue[queued++] = c;
       }
     }

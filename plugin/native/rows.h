@@ -194,8 +194,26 @@ PALPATE void patch_of(const S& m, int t, int* vert) {
   }
 }
 
-// A row of the bending matrix: columns in the order of their nodes. Scratch has room for all of them.
-struct BendRow { int *elem, *vert, count; double* value; };
+// A row of the bending matrix: its plates, ascending, and its columns in the order of their nodes. Scratch
+// has room for all of them; `place` says where a vertex is among the columns, from 1.
+struct BendRow {
+  int *elem, nelem, *vert, count;
+  double* value;
+  int* place;
+
+  PALPATE void clear() {
+    for (int k = 0; k < count; ++k) place[vert[k]] = 0;
+    count = 0;
+  }
+};
+
+template <class S>
+PALPATE BendRow bend_row(const S& m, Scratch& memory) {
+  const int most = 8 * m.most;
+  int *elem = memory.numbers(most), *vert = memory.numbers(most);
+  double* value = memory.values(most);
+  return {elem, 0, vert, 0, value, memory.numbers(m.nvert)};
+}
 
 // Finds the triangles whose plates a vertex is in, ascending; returns how many.
 template <class S>
@@ -218,29 +236,30 @@ PALPATE int plates_of(const S& m, int v, int* elem) {
 
 template <class F, class S>
 PALPATE void find_columns(const F& f, const S& m, int v, BendRow& row) {
-  row.count = 0;
-  for (int i = 0, n = plates_of(m, v, row.elem); i < n; ++i) {
+  row.clear();
+  row.nelem = plates_of(m, v, row.elem);
+  for (int i = 0; i < row.nelem; ++i) {
     int patch[6];
     patch_of(m, row.elem[i], patch);
     bool mine = false;
     for (int c = 0; c < 6; ++c) mine = mine || patch[c] == v;
-    for (int c = 0; c < 6 && mine; ++c) {
-      bool is_there = patch[c] < 0;
-      for (int k = 0; k < row.count; ++k) is_there = is_there || row.vert[k] == patch[c];
-      if (is_there) continue;
-      int at = row.count++;
-      for (; at > 0 && f.node.data[row.vert[at - 1]] > f.node.data[patch[c]]; --at)
-        row.vert[at] = row.vert[at - 1];
-      row.vert[at] = patch[c];
-    }
+    for (int c = 0; c < 6 && mine; ++c)
+      if (patch[c] >= 0 && !row.place[patch[c]]) row.vert[row.count++] = patch[c], row.place[patch[c]] = 1;
   }
+  for (int k = 1; k < row.count; ++k) {
+    const int vert = row.vert[k], node = f.node.data[vert];
+    int at = k;
+    for (; at > 0 && f.node.data[row.vert[at - 1]] > node; --at) row.vert[at] = row.vert[at - 1];
+    row.vert[at] = vert;
+  }
+  for (int k = 0; k < row.count; ++k) row.place[row.vert[k]] = k + 1;
 }
 
 // Adds up a row: the angles' stiffness of each plate, on the displacements of its patch.
 template <class S, class P>
 PALPATE void sum_row(const S& m, int v, BendRow& row, P& plates) {
   for (int k = 0; k < row.count; ++k) row.value[k] = 0.0;
-  for (int n = 0, count = plates_of(m, v, row.elem); n < count; ++n) {
+  for (int n = 0; n < row.nelem; ++n) {
     int patch[6];
     patch_of(m, row.elem[n], patch);
     const Plate& p = plates.of(row.elem[n]);
@@ -254,8 +273,7 @@ PALPATE void sum_row(const S& m, int v, BendRow& row, P& plates) {
         for (int c = 0; c < 3; ++c) force[d] += angle[c][i] * p.gain[c][d];
       for (int j = 0; j < 6; ++j) {
         if (patch[j] < 0) continue;
-        int k = 0;
-        while (row.vert[k] != patch[j]) ++k;
+        const int k = row.place[patch[j]] - 1;
         row.value[k] += force[0] * angle[0][j] + force[1] * angle[1][j] + force[2] * angle[2][j];
       }
     }
@@ -294,8 +312,7 @@ template <class F, class S>
 PALPATE bool write_rows(const F& f, const S& m, Scratch& memory) {
   Few touched = few(memory, m.nvert), vert = few(memory, m.nvert), near = few(memory, m.nelem);
   Few known = few(memory, m.nelem);
-  const int most = 8 * m.most;
-  BendRow row = {memory.numbers(most), memory.numbers(most), 0, memory.values(most)};
+  BendRow row = bend_row(m, memory);
   for (int v = 0; v < m.nvert && f.every; ++v) touched.put(v);
   for (int i = 0; i < f.nchanged; ++i) {
     const int t = f.changed.data[i];
@@ -343,7 +360,7 @@ PALPATE void count_bends(const Fields& f, Thread t, int) {
   if (t.tid) return;
   const auto m = surface_of(f.surface, t.world);
   Scratch memory = {f.ints.data, f.reals.data, f.nint, f.nreal, false};
-  BendRow row = {memory.numbers(8 * m.most), memory.numbers(8 * m.most), 0, nullptr};
+  BendRow row = bend_row(m, memory);
   for (int v = 0; v < m.nvert; ++v) {
     find_columns(f, m, v, row);
     f.count.data[v] = row.count;

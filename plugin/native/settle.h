@@ -1,5 +1,6 @@
 // Vertices of a solid are moved onto a sheet in the rest shape, as far as its tetrahedra allow.
 #pragma once
+#include "neohookean.h"
 #include "parts.h"
 #include "sheet.h"
 
@@ -14,17 +15,8 @@ constexpr double GIVES = 0.1;  // share of its way down to which a vertex inside
 constexpr double LIPS = 0.75;  // edges from the path within which a vertex of the skin goes to it
 constexpr int EXACT = 3;  // times that the volume is put right
 
-// What tells the energy of tetrahedra.
-struct Neohookean {
-  bool has;
-  double given;  // by so much that around a vertex may rise
-  const double *mu, *lam, *disp;
-};
-
 // A vertex that moves to a place in a tetrahedron.
 struct Shift { int vert, corner[4]; double share, weight[4]; D3 way, lead; };
-
-PALPATE double volume_of(const D3* x) { return dot(x[1] - x[0], cross(x[2] - x[0], x[3] - x[0])) / 6.0; }
 
 // 1 for a regular tetrahedron.
 PALPATE double quality_of(const D3* x) {
@@ -33,30 +25,6 @@ PALPATE double quality_of(const D3* x) {
     for (int j = i + 1; j < 4; ++j) sum += dot(x[j] - x[i], x[j] - x[i]);
   const double length2 = sum / 6.0 > 1e-300 ? sum / 6.0 : 1e-300;
   return 6.0 * sqrt(2.0) * volume_of(x) / (length2 * sqrt(length2));
-}
-
-// log(1 + x) to all digits (Goldberg 1991).
-PALPATE double log_after(double x) {
-  const double u = 1.0 + x;
-  return u == 1.0 ? x : log(u) * (x / (u - 1.0));
-}
-
-// The energy of a tetrahedron with corners `x` and displacements `u`, as energy.of_tets has it.
-PALPATE double energy_of(const D3* x, const D3* u, double mu, double lam) {
-  const D3 a = x[1] - x[0], b = x[2] - x[0], c = x[3] - x[0];
-  const double det = dot(a, cross(b, c));
-  const D3 g[3] = {(1.0 / det) * cross(b, c), (1.0 / det) * cross(c, a), (1.0 / det) * cross(a, b)};
-  D3 h[3] = {};  // rows of the gradient
-  for (int k = 0; k < 3; ++k) {
-    const D3 d = u[k + 1] - u[0];
-    h[0] += d.x * g[k], h[1] += d.y * g[k], h[2] += d.z * g[k];
-  }
-  const D3 cof[3] = {cross(h[1], h[2]), cross(h[2], h[0]), cross(h[0], h[1])};
-  const double trace = h[0].x + h[1].y + h[2].z;
-  const double i = 2.0 * trace + dot(h[0], h[0]) + dot(h[1], h[1]) + dot(h[2], h[2]);
-  const double j = trace + cof[0].x + cof[1].y + cof[2].z + dot(h[0], cof[0]);
-  const double shape = mu / 2.0 * (i - log_after(i / 4.0)) - 0.75 * mu * j;
-  return det / 6.0 * (shape + (lam + 0.625 * mu) / 2.0 * j * j);
 }
 
 // Where a vertex of the skin goes on it: to the path where that is near.

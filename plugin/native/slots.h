@@ -19,7 +19,7 @@ PALPATE bool tell_step(const Fields& f) {
   const D3 g = falls ? add_turned(zero, f.frame.data, load(f.mj.gravity.data)) : zero;
   double* in = head(f);
   in[HEAD_STEP] = h;
-  in[HEAD_GAIN] = h * h + h * f.number.data[DAMPING];
+  in[HEAD_GAIN] = weight_of_stiffness(h, f.number.data[DAMPING], f.number.data[EASED]);
   in[HEAD_FLOOR] = f.weight * still * still;
   in[HEAD_MODE] = f.flags.data[FLAG_PENDING];
   store(in + HEAD_GRAVITY, g);

@@ -74,13 +74,12 @@ struct Turn {
   }
 };
 
-PALPATE M3 turn(const M3& F, const M3& cof, V det, V size2) {
+PALPATE M3 turn(const M3& F, const M3& cof, V det, V size2, V stretched) {
   constexpr float NEAR = 0.03f;  // of the squares of the stretches, of 3: the last makes 1e-4 of it
+  constexpr float SMALL = 4e-4f;  // of `stretched`: twice the squares of the strains
   Turn turn = {F, cof, det, size2};
-  turn.next(true);
-  turn.measure();
-  turn.size2 = inner(turn.x, turn.x);
-  if (any_above(turn.size2, 3.0f + NEAR)) {
+  for (int k = 0; k < 2; ++k) {
+    if (!any_above(k ? turn.size2 - (3.0f + NEAR) : stretched - SMALL, 0.0f)) break;
     turn.next(true);
     turn.measure();
     turn.size2 = inner(turn.x, turn.x);
@@ -141,6 +140,15 @@ PALPATE M3 mean_stress(const float* stress, const int* node, V& pressure, Lane l
   return splat(0.25f) * M3{x.x, x.y, x.z, y.x, y.y, y.z, z.x, z.y, z.z};
 }
 
+// How far a tetrahedron is crushed, turned inside out or drawn long, 0 to 1: by its volume over that of a cube
+// of as long edges, which is 1 after a rotation.
+constexpr float CRUSHED = 0.5f;
+PALPATE V crushed(V volume, V size2) {
+  const V edge = vmax(size2 / 3.0f, splat(1.0f)), zero = splat(0.0f);
+  return vmin(vmax(1.0f - volume / (CRUSHED * edge * vsqrt(edge)), zero), splat(1.0f));
+}
+constexpr float LINGERS = 2.0f;  // time steps of damping that it then has besides
+
 // What a tetrahedron gives to its corners: impulses, and for the matrix its turned gradients times
 // the root of g volume and of the modulus mu, beside which are lambda and 1 + tension over mu.
 //
@@ -151,11 +159,13 @@ PALPATE M3 mean_stress(const float* stress, const int* node, V& pressure, Lane l
 // least half the true Hessian for every direction ((a + b)^2 <= 2 a^2 + 2 b^2). The stress adds a
 // geometric stiffness between principal directions a and b: (P_a + P_b) / (s_a + s_b) of a tension
 // to rotations, of which `tension` is an upper bound, and the pressure times the third stretch to
-// shear, which mu has. K v is without both.
+// shear, which mu has. K v is without both. Where a tetrahedron is crushed such bounds change within a step,
+// and what the matrix has beyond the energy would come out as motion: there K v is more.
 template <class Fields>
 PALPATE void tet_stress(const Fields& f, Thread t, int stage) {
   const float* step = f.state.step.data + 4 * t.world;
-  const float h = step[0], weight = step[1], gv = weight_of_rate(stage, step);
+  const float h = step[0], weight = step[1], gv = weight_of_rate(stage, step), per_h = 1.0f / h;
+  constexpr float THIRD = 1.0f / 3.0f;
   const bool implicit = stage == FIRST || stage == LATER;
   const size_t base = 96 * (size_t)t.world * f.shape.nslice;
   const float* motion = f.system.node_motion.data + base;
@@ -172,16 +182,24 @@ PALPATE void tet_stress(const Fields& f, Thread t, int stage) {
     float* arm = f.system.tet_arm.data + 128 * at;
     float* impulse = f.system.tet_impulse.data + 128 * at;
     const M3 H = gradient(motion, node, g, lane), rate = gradient(motion + 32, node, g, lane);
+    const V zero = splat(0.0f);
     const Swelling now = swelling(H);
     const M3 F = H + splat(1.0f), C = now.c + splat(1.0f);
     const V size2 = inner(F, F);
-    const M3 Q = turn(F, C, now.j + 1.0f, size2), strain = transposed(Q) * rate;
+    const V shrunk = vmax(-now.j, zero);
+    // tr F^T F - 3 - 2 ln det F, by the first terms of it: twice the squares of small strains.
+    const V stretched = 2.0f * trace(H) + inner(H, H) - now.j * (2.0f - now.j)
+      + (2.0f * THIRD) * shrunk * shrunk * shrunk;
+    const M3 Q = turn(F, C, now.j + 1.0f, size2, stretched), strain = transposed(Q) * rate;
     const V alone = OWN_SHARE * mu;
     V p;
     const M3 elastic = mean_stress(nodal, node, p, lane)
       + stress(H, now, alone, (0.625f * h) * alone * now.j, h);
-    const M3 P = splat(-1.0f) * volume
-      * (elastic + (0.75f * gv * mu) * (Q * (strain + transposed(strain))));
+    const V shear = 0.75f * mu + (per_h * vmax(-p, zero)) * vsqrt(THIRD * size2);
+    const V more = crushed(now.j + 1.0f, size2) * (implicit ? LINGERS * (weight > 0.0f ? h * h : 0.0f) : 0.0f);
+    M3 viscous = (0.75f * gv * mu + more * shear) * (Q * (strain + transposed(strain)));
+    if (any_above(more, 0.0f)) viscous = viscous + (more * lam * inner(C, rate)) * C;
+    const M3 P = splat(-1.0f) * volume * (elastic + viscous);
     const V3 g1 = ld3(g, 0, lane), g2 = ld3(g, 3, lane), g3 = ld3(g, 6, lane);
     const V3 b1 = P * g1, b2 = P * g2, b3 = P * g3;
     share(impulse, splat(-1.0f) * (b1 + b2 + b3), lane);
@@ -189,13 +207,12 @@ PALPATE void tet_stress(const Fields& f, Thread t, int stage) {
     share(impulse + 64, b2, lane);
     share(impulse + 96, b3, lane);
     if (!implicit) return;
-    const V zero = splat(0.0f), mean = inner(Q, elastic) / 3.0f, even = inner(Q, C) / 3.0f;
+    const V mean = THIRD * inner(Q, elastic), even = THIRD * inner(Q, C);
     const V rest = vmax(inner(elastic, elastic) - 3.0f * mean * mean, zero);
     const V uneven = vmax(inner(C, C) - 3.0f * even * even, zero);
-    const V shear = 0.75f * mu + vmax(-p, zero) * vsqrt(size2 / 3.0f) / h;
-    const V tension = vmax(mean + 0.40825f * vsqrt(rest), zero) / h + lam * uneven;
-    const V beside = two(lam * even * even / shear, 1.0f + tension / shear);
-    const M3 scaled = vsqrt(weight * volume * shear) * Q;
+    const V tension = per_h * vmax(mean + 0.40825f * vsqrt(rest), zero) + lam * uneven;
+    const V part = 1.0f / shear, beside = two(lam * even * even * part, 1.0f + tension * part);
+    const M3 scaled = vsqrt((weight + more) * volume * shear) * Q;
     const V3 a1 = scaled * g1, a2 = scaled * g2, a3 = scaled * g3;
     share(arm, splat(-1.0f) * (a1 + a2 + a3), beside, lane);
     share(arm + 32, a1, beside, lane);

@@ -52,6 +52,9 @@ PALPATE auto surface_of(const F& f, int world) {
                     f.degree.data + v, f.whole_elem.data, f.whole_twin.data};
 }
 
+// What vertices carry.
+struct Moving { double *mass, *disp, *vel; };
+
 // Scratch of a world; numbers that are taken are zero, unless they are room alone.
 struct Scratch {
   int* ints;

@@ -124,7 +124,7 @@ PALPATE void enter_worlds(const Fields& f, Thread t, int) {
     float* step = f.solve.step.data + 4 * w;
     const double still = f.rest_share * 9.81 * h;
     step[0] = (float)h;
-    step[1] = (float)(h * h + h * numbers(f, w)[DAMPING]);
+    step[1] = (float)weight_of_stiffness(h, numbers(f, w)[DAMPING], numbers(f, w)[EASED]);
     step[2] = (float)(masses * f.weight * still * still);
   }
   const D3 g = turned_back(f.frame.data, gravity(f, w));

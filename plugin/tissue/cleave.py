@@ -20,6 +20,7 @@ from .mesh import Mesh, distinct, lengths
 from .order import addresses
 from .path import Finder
 from .sheet import sweep
+from .step import OWN_SHARE
 from .surface import host_views
 from .types import CONSTANTS, allocate, doubles, flags, ints, longs, struct
 
@@ -46,7 +47,6 @@ class Cleaving:
   nelem: int  # triangles of the skin
   nskin: int
   nspare: int
-  nslit: int
   most: int  # neighbours that a vertex has room for
   most_spare: int  # and those of a spare one
   most_elem: int  # triangles that there may be
@@ -61,6 +61,7 @@ class Cleaving:
   edge: wp.float64  # mean length of the skin's edges before the first cut [m]
   before: wp.float64  # see `sheet.Sheet.more` [m]
   after: wp.float64  # [m]
+  foundation: wp.float64  # stiffness by area [N/m^3]
   given: wp.float64  # by which the energy around a vertex may rise as it moves [J]
   rest: doubles("nvert", 3)
   tet: longs("ntet", 4)
@@ -72,7 +73,6 @@ class Cleaving:
   whole_tet: longs("ntet", 4)
   whole_degree: longs("nvert")
   mate: longs("nface")
-  slit: longs("nslit", 4)
   home: longs("nelem")
   begin: ints("nvert + 1")  # of the corners around each vertex of the whole
   around: ints("nface")  # these
@@ -100,7 +100,7 @@ class Cleaving:
   reals: doubles("nreal")
 
 
-_cleave = kernel("cleave_solid", "cleave.h", Cleaving, CONSTANTS | _NUMBERS)
+_cleave = kernel("cleave_solid", "cleave.h", Cleaving, CONSTANTS | _NUMBERS | {"OWN_SHARE": OWN_SHARE})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -156,20 +156,20 @@ class Cleaver:
     self._mesh: Mesh | None = None
     self._config: Config | None = None
     ntet, nvert = len(whole.tet), whole.nvert
-    sizes = {"nvert": nvert, "ntet": ntet, "nelem": whole.nelem, "nslit": len(whole.slit)}
+    sizes = {"nvert": nvert, "ntet": ntet, "nelem": whole.nelem}
     sizes |= {"most": whole.ring.shape[1], "most_elem": room, "nface": 4 * ntet}
     # What native/cleave.h takes of scratch, see there.
-    sizes |= {"nint": 62 * ntet + 32 * nvert + 8 * room, "nreal": 36 * nvert + 10 * ntet + 3 * room}
+    sizes |= {"nint": 66 * ntet + 36 * nvert + 8 * room, "nreal": 64 * nvert + 20 * ntet + 3 * room}
     sizes |= {"nmouth": 3 * (room - whole.nelem), "npath": 0, "nline": 0}
     self._fields: Any = allocate(Cleaving, "cpu", sizes)
-    for name in ("nvert", "ntet", "nelem", "most", "most_elem", "nslit", "nint", "nreal"):
+    for name in ("nvert", "ntet", "nelem", "most", "most_elem", "nint", "nreal"):
       setattr(self._fields, name, sizes[name])
     self._fields.nskin, self._fields.nspare = whole.nskin, whole.spare
     self._fields.most_spare, self._fields.edge = int(faces.room(whole).max()), whole.edge_length
     self._host = host_views(self._fields, Cleaving)
     corner = whole.tet.ravel()
     fixed = {"whole_tet": whole.tet, "whole_degree": whole.degree, "home": whole.home}
-    fixed |= {"around": np.argsort(corner, kind="stable"), "mate": whole.mate, "slit": whole.slit}
+    fixed |= {"around": np.argsort(corner, kind="stable"), "mate": whole.mate}
     fixed["begin"] = addresses(np.bincount(corner, minlength=nvert))
     for name, values in fixed.items():
       self._host[name][:] = values
@@ -212,6 +212,8 @@ class Cleaver:
     fields.before, fields.after = sheet.more
     fields.nouter, fields.ntriangle = mesh.nouter, mesh.nelem
     fields.energy, fields.given = int(config is not None), given
+    held = config is not None and not config.carrier
+    fields.foundation = config.foundation if held else 0.0
     if config is not None and config != self._config:
       host["mu"][:], host["lam"][:] = solid.moduli(mesh, config)
       self._config = config

@@ -139,24 +139,6 @@ def of_gradients(slope: np.ndarray, mu: np.ndarray, lam: np.ndarray | float) -> 
   return shape + (lam + 5 / 8 * mu) / 2 * swelling**2
 
 
-def of_tets(
-  mesh: Mesh, config: Config, rest: np.ndarray, u: np.ndarray, which: np.ndarray
-) -> np.ndarray:
-  """Returns the energy of tetrahedra by themselves [J], (n,): without means over nodes.
-
-  Args:
-    mesh: the solid
-    config: material
-    rest: their corners at rest [m]             (n, 4, 3)
-    u: displacement of these [m]                (n, 4, 3)
-    which: their numbers                        (n,)
-  """
-  arm = rest[:, 1:] - rest[:, :1]
-  slope = np.linalg.solve(arm, u[:, 1:] - u[:, :1]).transpose(0, 2, 1)
-  mu, lam = (each[which] for each in solids.moduli(mesh, config))
-  return np.linalg.det(arm) / 6 * of_gradients(slope, mu, lam)
-
-
 # The terms of the energy: (mesh, config, displacement) -> [J], 0 where a term is off.
 TERMS = {
   "membrane": membrane,

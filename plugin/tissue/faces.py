@@ -15,7 +15,7 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 from .fill import FACES, joined
-from .mesh import Mesh, among, build, cross, distinct
+from .mesh import Mesh, among, build, distinct
 
 MORE = 6  # neighbours beyond those of any vertex that one may have by cuts
 _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
@@ -58,9 +58,6 @@ def cuttable(surface: Mesh, solid: Mesh) -> Mesh:
         "of no tetrahedron, expected a surface of even triangles: `palpate wrap` makes one"
       )
     at[part] = fits
-  single = np.setdiff1d(np.flatnonzero(mate < 0), corner_face(corner[at]))
-  slit = _slits(mesh, single)
-  mate[slit] = slit[:, [1, 0, 3, 2]]
   corner = corner[at]
   mesh = dataclasses.replace(
     mesh, **{name: _wider(getattr(mesh, name)) for name in ("ring", "ring_elem")}
@@ -70,7 +67,7 @@ def cuttable(surface: Mesh, solid: Mesh) -> Mesh:
   corner = np.take_along_axis(corner, (turn[:, None] + np.arange(3)) % 3, axis=1)
   elem = tet.ravel()[corner]
   twin = build("solid", surface.rest, elem, spare).twin
-  return dataclasses.replace(mesh, elem=elem, twin=twin, of_tet=corner, mate=mate, slit=slit)
+  return dataclasses.replace(mesh, elem=elem, twin=twin, of_tet=corner, mate=mate)
 
 
 def _wider(ring: np.ndarray) -> np.ndarray:
@@ -113,38 +110,6 @@ def _flips(elem: np.ndarray, missing: np.ndarray):
       s, q = beside.setdefault(frozenset((a, b)), (int(t), p))
       if s != t:
         yield s, int(t), np.array([[p, q, a], [p, q, b]])
-
-
-def _slits(mesh: Mesh, face: np.ndarray) -> np.ndarray:
-  """Returns faces around flat tetrahedra that `fill` has left out, (n, 4).
-
-  Two of each slit on one side, which have one diagonal, are the first and third; beside each is one
-  of the other side.
-  """
-  vert = np.sort(mesh.tet.ravel()[corners(face)], axis=1)
-  a, b, c = np.moveaxis(mesh.rest[mesh.tet.ravel()[corners(face)]], 1, 0)
-  normal = cross(b - a, c - a)
-  of_vertex: dict[tuple[int, int], list[int]] = {}
-  for k, v in enumerate(vert.tolist()):
-    for pair in ((v[0], v[1]), (v[0], v[2]), (v[1], v[2])):
-      of_vertex.setdefault(pair, []).append(k)
-  groups: dict[frozenset, set[int]] = {}
-  for some in of_vertex.values():
-    for i in some:
-      for j in some:
-        if i < j:
-          groups.setdefault(frozenset((*vert[i].tolist(), *vert[j].tolist())), set()).update((i, j))
-  out, used = [], set()
-  for corner, some in groups.items():
-    mine = sorted(some - used)
-    if len(corner) != 4 or len(mine) != 4:
-      continue
-    one = [k for k in mine if normal[k] @ normal[mine[0]] > 0]
-    other = [k for k in mine if k not in one]
-    if len(one) == len(other) == 2:
-      out.append([one[0], other[0], one[1], other[1]])
-      used.update(mine)
-  return face[np.array(out, int).reshape(-1, 4)]
 
 
 def _patches(elem: np.ndarray, some: np.ndarray) -> list[np.ndarray]:
@@ -194,10 +159,7 @@ def around(tet: np.ndarray, mate: np.ndarray, vert: np.ndarray, nvert: int):
   other = mate[face]
   i, j = np.nonzero(other >= 0)
   t = other[i, j] // 4
-  same = tet[t] == own[i, None]
-  has = same.any(axis=1)  # not always where there is a slit, see `_slits`
-  i, t, k = i[has], t[has], same[has].argmax(axis=1)
-  ends = i, np.searchsorted(corner, 4 * t + k)
+  ends = i, np.searchsorted(corner, 4 * t + (tet[t] == own[i, None]).argmax(axis=1))
   graph = sparse.coo_array((np.ones(len(i), np.int8), ends), shape=(len(corner), len(corner)))
   label = csgraph.connected_components(graph, directed=False)[1]
   _, first, part = np.unique(label, return_index=True, return_inverse=True)

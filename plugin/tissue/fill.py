@@ -21,7 +21,7 @@ import numpy as np
 import warp as wp
 from scipy import sparse
 from scipy.sparse import csgraph, linalg
-from scipy.spatial import Delaunay, KDTree
+from scipy.spatial import ConvexHull, KDTree
 
 from .mesh import Mesh, area_vectors, vertex_normals
 
@@ -37,8 +37,8 @@ _ROUNDS = 8
 _MOVE = 0.7  # share of the way that a node goes in a round
 FLAT = 1e-3  # quality of a tetrahedron that is none
 _KEPT = 16
-_VERSION = 2  # of what is kept in files: another one where tetrahedra are made otherwise
-_TIE = 1e-6  # of the size, by which points on one sphere are told apart
+_VERSION = 4  # of what is kept in files: another one where tetrahedra are made otherwise
+_TIE = 1e-6  # of the size's square, by which points on one sphere are told apart
 
 # Faces of a tetrahedron, each opposite the corner of its number.
 FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
@@ -178,7 +178,7 @@ def _make(rest: bytes, elem: bytes) -> tuple[bytes, np.ndarray, int]:
   surface = np.frombuffer(rest).reshape(-1, 3)
   triangle = np.frombuffer(elem, np.int64).reshape(-1, 3)
   inner = _lattice(surface, triangle)
-  best, found, faulty = 0.0, None, -1
+  best, found, faulty = FLAT, None, -1
   for _ in range(_ROUNDS):
     point = np.concatenate([surface, inner])
     tet, faulty = _inside(point, triangle, len(surface))
@@ -247,10 +247,7 @@ def _inside(point: np.ndarray, triangle: np.ndarray, nsurface: int) -> tuple[np.
     triangle: the surface                           (nelem, 3)
     nsurface: number of its vertices
   """
-  size = float(np.ptp(point, axis=0).max())
-  shaken = point + _TIE * size * np.random.RandomState(0).uniform(-1, 1, point.shape)
-  made = Delaunay(shaken)
-  tet, neighbour = made.simplices.astype(np.int64), made.neighbors
+  tet, neighbour = _joined(point)
   face = tet[:, FACES]
   has = (face < nsurface).all(axis=2)
   known = np.where(has, _key(np.minimum(face, nsurface - 1), nsurface), -1)
@@ -271,9 +268,24 @@ def _inside(point: np.ndarray, triangle: np.ndarray, nsurface: int) -> tuple[np.
   height = (side * area_vectors(point, triangle)[at]).sum(axis=1)
   sure = wanted[at] == _key(triangle[at], nsurface)  # others were flipped
   within = np.bincount(part[which], np.where(sure, np.sign(height), 0), count)[part] < 0
-  volume = volumes(point, tet)
-  tet = np.where((volume < 0)[:, None], tet[:, [0, 2, 1, 3]], tet)[within]
-  return tet[quality(point, tet) > FLAT], -1
+  tet = np.where((volumes(point, tet) < 0)[:, None], tet[:, [0, 2, 1, 3]], tet)
+  # A flat one on the surface has a pair of its triangles; without it they have the other diagonal.
+  flat = (np.bincount(which, minlength=len(tet)) > 1) & (quality(point, tet) <= FLAT)
+  return tet[within & ~flat], -1
+
+
+def _joined(point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+  """Returns the tetrahedra between points, and their neighbours opposite each corner or -1, (n, 4).
+
+  Delaunay's are the lower hull of the points lifted to a paraboloid. Points on one sphere are told
+  apart by heights that are a little off it, at random: four in a plane make no tetrahedron so.
+  """
+  at = (point - point.mean(axis=0)) / np.ptp(point, axis=0).max()
+  height = (at**2).sum(axis=1) + _TIE * np.random.RandomState(0).uniform(-1, 1, len(at))
+  hull = ConvexHull(np.column_stack([at, height]))
+  low = hull.equations[:, 3] < 0
+  number = np.append(np.where(low, np.cumsum(low) - 1, -1), -1)
+  return hull.simplices[low].astype(np.int64), number[hull.neighbors[low]]
 
 
 def _key(corner: np.ndarray, n: int) -> np.ndarray:

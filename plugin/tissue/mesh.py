@@ -27,7 +27,7 @@ class Mesh:
     uncut: the mesh before the first cut, None for one that has none
     loose: triangles that were cut free of the foundation, None for none    (nelem,) bool
     of_tet: corner of a tetrahedron that each of triangles is, of solids, see `faces` (nelem, 3)
-    mate, slit: faces beside those of tetrahedra before the first cut, see there (4 ntet,), (n, 4)
+    mate: faces beside those of tetrahedra before the first cut, see there (4 ntet,)
   """
 
   rest: np.ndarray
@@ -43,7 +43,6 @@ class Mesh:
   loose: np.ndarray | None = None
   of_tet: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 3), np.int64))
   mate: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, np.int64))
-  slit: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 4), np.int64))
 
   @property
   def whole(self) -> Mesh:

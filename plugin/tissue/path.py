@@ -5,6 +5,7 @@
 import functools
 
 import numpy as np
+import numpy.typing as npt
 import warp as wp
 
 from .kernels import aim, kernel
@@ -123,8 +124,13 @@ def distance(line: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarr
   return far[row, best], at[row, best]
 
 
-def check_points(organ: str, points: np.ndarray):
-  """Raises ValueError where points of a cut are no path of two finite places or more."""
+def check_points(organ: str, points: npt.ArrayLike) -> np.ndarray:
+  """Returns points of a cut, (n, 3); ValueError where they are no path of two finite places."""
+  try:
+    points = np.asarray(points, float)
+  except (TypeError, ValueError):
+    said = f"points of a cut are {points!r:.80}, expected numbers (n, 3), n >= 2"
+    raise ValueError(f"organ {organ!r}: {said}") from None
   if points.ndim != 2 or points.shape[1] != 3 or len(points) < 2:
     raise ValueError(
       f"organ {organ!r}: points of a cut have shape {points.shape}, expected (n, 3), n >= 2"
@@ -132,3 +138,4 @@ def check_points(organ: str, points: np.ndarray):
   if not np.isfinite(points).all():
     bad = int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])
     raise ValueError(f"organ {organ!r}: point {bad} is {points[bad]}, expected finite numbers")
+  return points

@@ -96,7 +96,7 @@ class Rows:
     hinge_of = np.full(3 * whole.nelem, -1, np.int32)
     hinge_of[whole.interior] = np.arange(len(whole.interior))
     hinge_of[whole.twin[whole.interior]] = np.arange(len(whole.interior))
-    nint = 4 * (sizes["nvert"] + sizes["nelem"]) + 16 * sizes["most"]
+    nint = 5 * sizes["nvert"] + 4 * sizes["nelem"] + 16 * sizes["most"]
     nreal = 8 * sizes["most"] + _PLATE * sizes["nelem"]
     scratch = {"ints": np.empty(nint, np.int32), "reals": np.empty(nreal)}
     self._changed = np.zeros(whole.nelem, np.int32)

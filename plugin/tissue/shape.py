@@ -96,7 +96,22 @@ def _numbers(config: Config, closed: bool = True) -> dict[str, float]:
     values["bulk"] = values["pressure"] = 0.0
   values["stiffness"] = config.stiffness if config.elements == "spring" else 0.0
   values["foundation"] = 0.0 if config.carrier else config.foundation  # its springs are held then
+  values["eased"] = eased(config)
   return values
+
+
+def eased(config: Config) -> float:
+  """Returns what of its time step h a step takes off `damping`: as much as it damps by itself.
+
+  Of solids alone, whose tissue has that much to take it off.
+  """
+  return step.SCHEMES[config.integrator].damps if config.elements == "solid" else 0.0
+
+
+def gain(config: Config, h: float) -> float:
+  """Returns the factor of K in the matrix of a step h [s^2], as `formula.h` has it."""
+  damping = config.damping - min(eased(config) * h, 0.5 * config.damping)
+  return step.SCHEMES[config.integrator].gain(h, damping)
 
 
 def rerate(levels: bodies.Levels, mesh: Mesh):

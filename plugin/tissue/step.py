@@ -10,7 +10,8 @@ the middle of a step; about the time of x the step is centred, and stable for ev
 
 (Newmark's family, with beta = 1/2 so that a step's stiffest motions fade with the damping). A step
 after which v is yet that of the time of x, the first one, makes half of it. It damps no more than
-the tissue does; `implicit` adds h / 2 to the damping. See docs/accuracy.md.
+the tissue does; `implicit` adds h / 2 to the damping, which solids take off theirs. See
+docs/accuracy.md.
 
 `explicit` is the scheme of the Virtual Training Environment, semi-implicit Euler on the same
 forces: dv = M^-1 h (F + f_ext). `neumann` is the thesis scheme (eq. 5.19-5.26): the constant
@@ -304,6 +305,7 @@ class Scheme:
     levels: whether coarser meshes serve its solve
     whole: whether a block of threads can take a world's whole step
     ahead: whether it takes forces where the present velocity leads
+    damps: the share of h by which it damps beyond `damping`, as Euler's does
     solids: whether it can step tetrahedra, and springs that hold nodes
   """
 
@@ -313,6 +315,7 @@ class Scheme:
   levels: bool = False
   whole: bool = False
   ahead: bool = False
+  damps: float = 0.0
   solids: bool = True
 
   @property
@@ -326,7 +329,9 @@ def _whole(h: float, damping: float) -> float:
 
 
 SCHEMES = {
-  "implicit": Scheme(_implicit, _whole, _respond, levels=True, whole=True, ahead=True),
+  "implicit": Scheme(
+    _implicit, _whole, _respond, levels=True, whole=True, ahead=True, damps=0.5
+  ),
   "midpoint": Scheme(_midpoint, lambda h, b: 0.5 * _whole(h, b), _respond_centred, levels=True),
   "neumann": Scheme(_neumann, _whole, solids=False),
   "explicit": Scheme(_explicit, lambda h, b: 0.0),

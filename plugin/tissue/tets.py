@@ -110,12 +110,19 @@ class Layout:
   edge_adr: np.ndarray
 
 
+def order(mesh: Mesh, node: np.ndarray) -> np.ndarray:
+  """Returns tetrahedra in the order of the arrays: that of their nodes before the first cut.
+
+  Who gathers from them finds them near each other.
+  """
+  return np.lexsort(np.sort(node[mesh.whole.tet], axis=1).T[::-1])
+
+
 def layout(mesh: Mesh, node: np.ndarray, nnode: int) -> Layout:
   """Returns where tetrahedra and edges lie; `node`: of each vertex, of `nnode`."""
   mesh = mesh.whole
-  # Who gathers from tetrahedra in the order of their nodes finds them near each other.
-  order = np.lexsort(np.sort(node[mesh.tet], axis=1).T[::-1])
-  tet = mesh.tet[order]
+  which_tet = order(mesh, node)
+  tet = mesh.tet[which_tet]
   a, b = np.triu_indices(4, 1)
   ends = np.sort(tet[:, np.stack([a, b], axis=1)].reshape(-1, 2), axis=1)
   # The first end is that of the lower number.
@@ -136,7 +143,7 @@ def layout(mesh: Mesh, node: np.ndarray, nnode: int) -> Layout:
     around[node[mesh.spares]] = around.max()
   around_adr = addresses(around.reshape(-1, LANES).max(axis=1))
   return Layout(
-    order, first, last, which.ravel(), place, most, LANES * more, around_adr, addresses(width)
+    which_tet, first, last, which.ravel(), place, most, LANES * more, around_adr, addresses(width)
   )
 
 

@@ -87,11 +87,12 @@ class Stage(enum.IntEnum):
   RESPONSE = 4
 
 
-# Numbers that may change while running, in the order of `Tissue.number`: configuration keys, and
-# where worlds differ what mu, lambda' (of solids lambda) and the plate's rigidity are multiples of.
+# Numbers that may change while running, in the order of `Tissue.number`: configuration keys, where
+# worlds differ what mu, lambda' (of solids lambda) and the plate's rigidity are multiples of, and what
+# of h a step takes off the damping, see `shape.eased`.
 NUMBERS = (
   "foundation", "bulk", "pressure", "damping", "tolerance", "iterations", "stiffness",
-  "shear", "lame", "plate",
+  "shear", "lame", "plate", "eased",
 )  # fmt: skip
 
 # What native code knows of these, as constexpr.

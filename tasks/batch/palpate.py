@@ -5,8 +5,8 @@ from typing import Any
 
 import warp as wp
 from palpate.models import shapes
-from palpate.tasks import palpation, scenes
-from palpate.tissue.types import Array, floats, struct
+from palpate.tasks import feeling, palpation, scenes
+from palpate.tissue.types import Array, floats, ints, struct
 
 from . import domain
 from .fields import MISSED, RUNNING, SUCCESS, Common
@@ -14,6 +14,11 @@ from .kernels import error, judge, put, reach, vector
 
 _FEELING, _FELT = wp.constant(palpation.FEELING), wp.constant(palpation.FELT)
 _REPORT = wp.constant(palpation.REPORT)
+_LEFT, _DEEP, _SOFT = (wp.constant(x) for x in (feeling.LEFT, feeling.DEEP, feeling.SOFT))
+_APART, _NEAR = wp.constant(feeling.APART), wp.constant(feeling.NEAR)
+_STIFF, _WIDTH = wp.constant(feeling.STIFF), wp.constant(feeling.WIDTH)
+_LEAST = wp.constant(1e-9)
+_NOISE = wp.constant(feeling.NOISE)
 
 
 @struct
@@ -21,12 +26,120 @@ class PalpateState:
   """State of the domain."""
 
   tolerance: float  # of the report [m]
+  radius: float  # of inclusions [m]
   center: wp.vec3  # of the field [m]
+  one: wp.vec3  # across the way to the trocar
+  two: wp.vec3
   places: Array(wp.vec3, ("nfield",))  # middles of its triangles [m]
   inclusion: Array(wp.vec3, ("nworld",))  # where it is [m]
+  outward: Array(wp.vec3, ("nfield",))  # normals there
+  beside: ints("nfield", 4)  # see `feeling.Notes`
   touched: Array(wp.bool, ("nworld", "nfield"))
+  noted: floats("nworld", "nfield")  # stiffness, 0 where nothing was felt [N/m]
+  near: Array(wp.bool, ("nworld", "nfield"))  # what was felt
+  deepest: ints("nworld")  # of this press
+  depth: floats("nworld")  # there [m]
+  side: ints("nworld")  # of what is stiff, that is left to feel, -1 without one
+  stiff: Array(wp.bool, ("nworld",))  # whether something is
+  likely: Array(wp.vec3, ("nworld",))  # where the inclusion is to be expected [m]
   field: floats("nworld", 3)
   felt: floats("nworld", 1)
+  left: floats("nworld", 1)
+  unfelt: floats("nworld", 3)
+  expected: floats("nworld", 3)
+
+
+@wp.func
+def press(o: PalpateState, w: int, tip: wp.vec3, force: float):
+  """Follows a press, see `feeling.Notes.press`; returns whether it noted something."""
+  if force < _LEFT:
+    o.depth[w] = 0.0
+    return False
+  k = wp.int32(0)
+  for i in range(o.places.shape[0]):
+    if wp.length_sq(o.places[i] - tip) < wp.length_sq(o.places[k] - tip):
+      k = i
+  depth = wp.dot(o.places[k] - tip, o.outward[k])
+  if depth <= wp.max(o.depth[w], _DEEP):
+    return False
+  if o.depth[w] > 0.0:
+    o.noted[w, o.deepest[w]] = 0.0
+  o.deepest[w] = k
+  o.depth[w] = depth
+  o.noted[w, k] = force / depth
+  return True
+
+
+@wp.func
+def soft(o: PalpateState, w: int, count: int):
+  """Returns what counts as soft among so many places that were felt [N/m]."""
+  rank = int(wp.floor(_SOFT * float(count - 1)))
+  for i in range(o.places.shape[0]):
+    below = wp.int32(0)
+    for j in range(o.places.shape[0]):
+      own, other = o.noted[w, i], o.noted[w, j]
+      if other > 0.0 and (other < own or (other == own and j < i)):
+        below += 1
+    if o.noted[w, i] > 0.0 and below == rank:
+      return o.noted[w, i]
+  return wp.float32(0.0)
+
+
+@wp.func
+def side(o: PalpateState, w: int, top: int):
+  """Returns a place beside the stiffest that is left to feel, -1 without one."""
+  for i in range(4):
+    k = o.beside[top, i]
+    new = k >= 0
+    for j in range(o.places.shape[0]):
+      if o.noted[w, j] > 0.0 and j != top and new:
+        new = wp.length(o.places[j] - o.places[k]) >= _NEAR
+    if new:
+      return k
+  return wp.int32(-1)
+
+
+@wp.func
+def gain(o: PalpateState, w: int, k: int, soft: float):
+  """Returns by how much an inclusion under a place explains what was felt, see `feeling.chance`."""
+  both, square = wp.float32(0.0), wp.float32(_LEAST)
+  for j in range(o.places.shape[0]):
+    if o.noted[w, j] > 0.0:
+      far = wp.length(o.places[j] - o.places[k]) / (_WIDTH * o.radius)
+      bell = wp.exp(-far * far)
+      both += bell * (o.noted[w, j] - soft)
+      square += bell * bell
+  both = wp.max(both, 0.0)
+  return both * both / square
+
+
+@wp.func
+def summarise(o: PalpateState, w: int):
+  """Finds what follows from what is noted."""
+  count, top = wp.int32(0), wp.int32(0)
+  for i in range(o.places.shape[0]):
+    o.near[w, i] = False
+    if o.noted[w, i] > 0.0:
+      count += 1
+    if o.noted[w, i] > o.noted[w, top]:
+      top = i
+  for j in range(o.places.shape[0]):
+    if o.noted[w, j] > 0.0:
+      for i in range(o.places.shape[0]):
+        if wp.length(o.places[i] - o.places[j]) < _APART:
+          o.near[w, i] = True
+  least = soft(o, w, count)
+  o.stiff[w] = o.noted[w, top] > _STIFF * least
+  o.side[w] = side(o, w, top)
+  best = wp.float32(0.0)
+  for k in range(o.places.shape[0]):
+    best = wp.max(best, gain(o, w, k, least))
+  mass, middle = wp.float32(0.0), wp.vec3()
+  for k in range(o.places.shape[0]):
+    chance = wp.exp((gain(o, w, k, least) - best) / (2.0 * _NOISE * _NOISE))
+    mass += chance
+    middle += chance * o.places[k]
+  o.likely[w] = middle / mass
 
 
 @wp.kernel(enable_backward=False)
@@ -36,8 +149,16 @@ def begin(s: Common, o: PalpateState):
   if not s.begun[w]:
     return
   o.felt[w, 0] = 0.0
+  o.depth[w] = 0.0
+  o.stiff[w] = False
+  o.side[w] = -1
+  middle = wp.vec3()
   for k in range(o.places.shape[0]):
     o.touched[w, k] = False
+    o.near[w, k] = False
+    o.noted[w, k] = 0.0
+    middle += o.places[k] / float(o.places.shape[0])
+  o.likely[w] = middle
 
 
 @wp.kernel(enable_backward=False)
@@ -56,6 +177,8 @@ def advance(s: Common, o: PalpateState):
     else:
       error(s, w)
   else:
+    if press(o, w, tip, force):
+      summarise(o, w)
     count = wp.int32(0)
     for k in range(o.places.shape[0]):
       if force >= _FEELING and wp.length(o.places[k] - tip) < _FELT:
@@ -67,12 +190,32 @@ def advance(s: Common, o: PalpateState):
   judge(s, w, found, outcome)
 
 
+@wp.func
+def aside(o: PalpateState, k: int, tip: wp.vec3):
+  """Returns the square of how far a place is from the tip, seen along the way to the trocar."""
+  offset = o.places[k] - tip
+  one, two = wp.dot(o.one, offset), wp.dot(o.two, offset)
+  return one * one + two * two
+
+
 @wp.kernel(enable_backward=False)
 def observe(s: Common, o: PalpateState, beginning: bool):
-  """Writes field; `advance` wrote felt."""
+  """Writes field, left, unfelt and expected; `advance` wrote felt."""
   w = wp.tid()
-  if not beginning or s.begun[w]:
-    put(o.field, w, o.center - vector(s.tip_pos, w))
+  if beginning and not s.begun[w]:
+    return
+  tip = vector(s.tip_pos, w)
+  put(o.field, w, o.center - tip)
+  put(o.expected, w, o.likely[w] - tip)
+  left = wp.int32(-1)
+  for k in range(o.places.shape[0]):
+    if not o.near[w, k]:
+      if left < 0 or aside(o, k, tip) < aside(o, left, tip):
+        left = k
+  if o.stiff[w] or left < 0:
+    left = o.side[w]
+  o.left[w, 0] = wp.where(left < 0, 0.0, 1.0)
+  put(o.unfelt, w, wp.where(left < 0, wp.vec3(), o.places[wp.max(left, 0)] - tip))
 
 
 class Palpate(domain.Domain):
@@ -80,7 +223,7 @@ class Palpate(domain.Domain):
 
   struct = PalpateState
   begin, advance, observe = begin, advance, observe
-  takes = ("tolerance",)
+  takes = ("tolerance", "radius")
   tissue = ("young",)
 
   @staticmethod
@@ -96,7 +239,10 @@ class Palpate(domain.Domain):
   @staticmethod
   def constants(task: Any, physics):
     """Returns what else all worlds share."""
-    return {"places": task.places, "center": wp.vec3(*task.center)}
+    beside = feeling.beside(task.places, task.up)
+    told = {"places": task.places, "outward": task.outward, "beside": beside}
+    one, two = (wp.vec3(*way) for way in feeling.across(task.up))
+    return told | {"center": wp.vec3(*task.center), "one": one, "two": two}
 
   @staticmethod
   def draw(task: Any, physics):

@@ -1,11 +1,13 @@
 """`palpate evaluate`: scores, spread, and what is kept when something breaks."""
 
 import json
+import pathlib
 import re
 import signal
 import sys
 
 import pytest
+from palpate import tasks
 from palpate.app import cli, console, evaluate, panel, workers
 from palpate.tasks import score
 from palpate.tasks.recording import Recording
@@ -91,6 +93,18 @@ def test_a_policy_that_cannot_be_made_is_one_line(tmp_path, capsys):
   said = capsys.readouterr()
   assert said.err == "palpate: 1 episodes failed, the first: policy 'lost:P': OSError: no weights\n"
   assert json.loads((tmp_path / "a.json").read_text())[0]["outcome"] == "error"
+
+
+def test_a_policy_of_another_task_is_refused_before_the_work(tmp_path, monkeypatch, capsys):
+  pytest.importorskip("safetensors")
+  monkeypatch.setattr(evaluate, "evaluate", lambda *_: pytest.fail("it worked first"))
+  shipped = pathlib.Path(tasks.__file__).parent / "policies" / "probe_easy.safetensors"
+  words = ["evaluate", "touch/easy", "--set", "surroundings=none", "--episodes", "9"]
+  assert cli.main([*words, "--policy", str(shipped)]) == 2
+  said = capsys.readouterr().err
+  assert said == "palpate: the policy is of probe/easy, not of touch/easy\n"
+  assert cli.main(["evaluate", "tease/hard", "--policy", "trained"]) == 2
+  assert "no trained policy comes with tease/hard, expected one of" in capsys.readouterr().err
 
 
 def test_a_process_that_dies_ends_the_job_and_keeps_what_was_done(tmp_path, monkeypatch, capsys):

@@ -157,6 +157,22 @@ def test_blades_cut_in_each_world(device):
   assert [bool(each) for each in organ.cuts] == [True, False, bool(cuts[2])]
 
 
+def test_tissue_tears_in_each_world(device):
+  batch = palpate.batch.make(pressed(True, tear=0.05, foundation=1e4), 3, device=device, nodes=40)
+  model, data = batch.model, mujoco.MjData(batch.model)
+  alone, organ = palpate.Organ(model, data, "organ"), batch.organ("organ")
+  deep = np.array([0.02, 0.02, 0.008])
+  for k in range(85):
+    data.ctrl[:] = -deep[0] * min(1, k / 80)
+    batch.ctrl = -deep[:, None] * min(1, k / 80)
+    mujoco.mj_step(model, data)
+    batch.step()
+  found = [[cut.length for cut in cuts if cut.nodes] for cuts in (alone.cuts, *organ.cuts)]
+  assert len(found[0]) == 2 and not found[3]
+  for each in found[1:3]:
+    np.testing.assert_allclose(each, found[0], rtol=1e-3)
+
+
 def test_what_cannot_be_cut_is_named():
   batch = palpate.batch.make(pressed(True), 2)
   organ = batch.organ("organ")
@@ -176,7 +192,7 @@ def test_what_cannot_be_cut_is_named():
 @pytest.mark.parametrize(
   ("keys", "match"),
   [
-    ({"tear": 0.4}, "tear is set, which a batch on a GPU cannot do"),
+    ({"carrier": "own", "spare": 0}, "carrier is set, which a batch on a GPU cannot do"),
     ({"bonds": "none"}, "spare and bonds are set, of which a batch on a GPU can do one"),
   ],
 )

@@ -9,9 +9,6 @@ the difference of the probe's force from that of the plugin on the CPU over the 
 that is pressed deepest, as a share of the greatest. On CUDA the parts of a step are timed by
 themselves afterwards: the organ's before and after mujoco_warp's step, and that. Several devices
 share the worlds: `--device cuda:0+cuda:1`.
-
-`--flex` times mujoco_warp's own flex instead: the peer's sphere of `benchmarks/peer.py`, whose page
-has its error beside ours.
 """
 
 from __future__ import annotations
@@ -22,12 +19,11 @@ import pathlib
 import time
 
 import mujoco
-import mujoco_warp as mjw
 import numpy as np
 import palpate.batch
 import scenes
 import warp as wp
-from benchmarks import peer, plots, results
+from benchmarks import plots, results
 from benchmarks.runner import Bench, Case, Row
 from palpate.models import grid
 
@@ -124,40 +120,6 @@ def measure(
   } | (parts(batch) if where == device and target.is_cuda else dict.fromkeys(_PARTS, float("nan")))
 
 
-def measure_flex(device: str, nodes: int, nworld: int, bend: float) -> dict:
-  """Returns what steps of mujoco_warp's own flex take, pressed by a ball."""
-  start = time.perf_counter()
-  subdivisions = round(np.log((nodes - 2) / 10) / np.log(4))
-  model = peer.model(subdivisions, "peer", "bending" if bend else "skin")
-  data = mujoco.MjData(model)
-  for k in range(STEPS):
-    data.ctrl[0] = -DEEP * min(1.0, 1.5 * k / STEPS)
-    mujoco.mj_step(model, data)
-  with wp.ScopedDevice(device):
-    m = mjw.put_model(model)
-    room = {"nconmax": max(64, 2 * data.ncon), "njmax": max(256, 3 * data.nefc)}
-    free = wp.get_device().free_memory
-    d = mjw.put_data(model, data, nworld=nworld, **room)
-    mjw.step(m, d)
-    with wp.ScopedCapture() as capture:
-      mjw.step(m, d)
-    wp.synchronize()
-    made, before = time.perf_counter() - start, time.perf_counter()
-    for _ in range(STEPS // 10):
-      wp.capture_launch(capture.graph)
-    wp.synchronize()
-    step = (time.perf_counter() - before) / (STEPS // 10)
-    used = (free - wp.get_device().free_memory) / nworld
-  finite = np.isfinite(d.qpos.numpy()).all(axis=1)
-  unknown = ("iterations", "residual", "force_N", "force_rms", *_PARTS)
-  return {
-    "device": f"{device}, mujoco_warp's flex", "nodes": (model.nv - 1) // 3, "nworld": nworld,
-    "slots": 0, "bend": bend, "condim": 3, "tolerance": float(model.opt.tolerance),
-    "repeat": False, "step_ms": 1e3 * step, "rate": nworld / step, "world_kB": used / 1e3,
-    "overflow": 0, "failures": int((~finite).sum()), "make_s": made,
-  } | dict.fromkeys(unknown, float("nan"))  # fmt: skip
-
-
 PUBLISHED = (
   "Published by others, on other machines, and not run here: FF-SRL, 545 nodes and 1717",
   "tetrahedra, 8 substeps of one iteration a frame: 21,662 frames a second in 32 worlds on an",
@@ -196,17 +158,16 @@ def arguments(parser: argparse.ArgumentParser):
   add("--condim", type=int, nargs="+", default=[1])
   add("--tolerance", type=float, default=1e-3)
   add("--slots", type=int, nargs="+", help="nodes that the ball may touch, one a size or for all")
-  add("--flex", action="store_true", help="mujoco_warp's own flex")
   add("--repeat", action="store_true", help="runs that repeat to the bit whatever the GPU does")
 
 
 def stages(args: argparse.Namespace) -> list[list[Case]]:
   """Returns a case a size, number of worlds, and kind of tissue and contact."""
-  keys = {name: getattr(args, name) for name in ("device", "tolerance", "repeat", "flex")}
+  keys = {name: getattr(args, name) for name in ("device", "tolerance", "repeat")}
   slots = args.slots or [None]
   slots = dict(zip(args.nodes, slots * (len(args.nodes) // len(slots)), strict=True))
   worlds = args.worlds or ([8] if args.device == "cpu" else [1024, 4096, 16384])
-  kind = "-repeat" * args.repeat + "-flex" * args.flex
+  kind = "-repeat" * args.repeat
   many = f"-x{args.device.count('+') + 1}" * ("+" in args.device)
   cases = [
     {"case": f"{n}-{w}-{bend:g}-{c}-{slots[n] or 0}{kind}{many}", "nodes": n, "nworld": w}
@@ -219,10 +180,7 @@ def stages(args: argparse.Namespace) -> list[list[Case]]:
 
 def run(case: Case, out: pathlib.Path) -> list[Row]:
   """Returns the row of a case."""
-  given = {key: value for key, value in case.items() if key not in ("case", "flex")}
-  if case["flex"]:
-    return [measure_flex(*(given[key] for key in ("device", "nodes", "nworld", "bend")))]
-  return [measure(**given)]
+  return [measure(**{key: value for key, value in case.items() if key != "case"})]
 
 
 def table(out: pathlib.Path) -> list[str]:

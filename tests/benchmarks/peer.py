@@ -46,6 +46,11 @@ SIDES = ("peer", "nodal", "window")
 def model(
   subdivisions: int, side: str, kind: str, tolerance: float = 1e-4, h: float = H
 ) -> mujoco.MjModel:
+  """Returns the model of `mjcf`."""
+  return mujoco.MjModel.from_xml_string(mjcf(subdivisions, side, kind, tolerance, h))
+
+
+def mjcf(subdivisions: int, side: str, kind: str, tolerance: float = 1e-4, h: float = H) -> str:
   """Returns a sphere of one of `KINDS` pinned below and pressed from above, on one of `SIDES`."""
   shape = points, _ = scenes.sphere(subdivisions)
   pin = np.flatnonzero(points[:, 2] < -0.9 * RADIUS)
@@ -55,17 +60,15 @@ def model(
     <geom size="0.005" mass="0.05"/></body>"""
   drive = '<actuator><position joint="z" kp="500" kv="10"/></actuator>'
   integrator = "discrete" if side == "peer" else "Euler"
-  return mujoco.MjModel.from_xml_string(
-    scenes.world(
-      organ,
-      probe,
-      h=h,
-      integrator=integrator,
-      solver="CG",
-      tolerance=1e-8,
-      memory=2048,
-      extra=drive,
-    )
+  return scenes.world(
+    organ,
+    probe,
+    h=h,
+    integrator=integrator,
+    solver="CG",
+    tolerance=1e-8,
+    memory=2048,
+    extra=drive,
   )
 
 

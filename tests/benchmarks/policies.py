@@ -59,13 +59,14 @@ def run(case: Case, out: pathlib.Path) -> list[Row]:
     row = {"task": name, "seed": result.seed, "outcome": result.outcome}
     row |= {"time_s": round(result.time, 2), "lessons": training.get("lessons", 0)}
     row |= {"steps": training.get("steps", 0), "train_s": training.get("seconds", 0)}
-    row |= {"proficient": "", "peak_force_N": "", "worlds": "", "won": ""}
+    row |= {"proficient": "", "peak_force_N": "", "over": "", "worlds": "", "won": ""}
     if result.metrics:
       metrics = Metrics.from_json(result.metrics)
       row["peak_force_N"] = round(metrics.peak_force, 3)
       if reference is not None:
         found = score.score(metrics, reference, result.outcome)
         row["proficient"] = int(found.proficient)
+        row["over"] = " ".join(found.over) if result.outcome == score.SUCCESS else ""
     rows.append(row)
   return rows
 
@@ -97,27 +98,35 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
       many[row["task"]] = f"{100 * int(row['won']) / int(row['worlds']):.1f} % of {row['worlds']}"
     elif row["status"] == "ok":
       groups[row["task"]].append(row)
-  head = ["exercise", "lessons", "control steps of practice", "training [s]", "success",
-          "proficient", "time of a success [s]", "ends otherwise", "side by side"]  # fmt: skip
+  head = ["exercise", "lessons", "training [s]", "success", "proficient", "time of a success [s]",
+          "ends otherwise", "successes over a limit", "side by side"]  # fmt: skip
   table = [
-    [*_line(name, groups[name]), many.get(name, "-")] for name in NAMES if name in groups
+    [*(_line(name, groups[name]) if name in groups else [name, *"-------"]), many.get(name, "-")]
+    for name in NAMES
   ]
+  times = [float(groups[name][0]["train_s"]) for name in NAMES if name in groups]
   lines = [*(__doc__ or "").split("\n\n", 1)[1].splitlines(), ""]
-  lines += ["Proficient by the experts' limits, of all episodes. "
-            + results.link(out / "policies.csv"), "", *plots.table(head, table)]  # fmt: skip
+  lines += [
+    f"{len(groups)} of {len(NAMES)} exercises have one; training took {np.median(times):.0f} s in "
+    "the median. Proficient is by the experts' limits, of all episodes; over a limit are named the "
+    f"three metrics that most are over. {results.link(out / 'policies.csv')}",
+    "", *plots.table(head, table),
+  ]  # fmt: skip
   return [results.page(out / "policies.md", "Policies that were trained", about, lines)]
 
 
 def _line(name: str, rows: list[Row]) -> list[str]:
   won = [row for row in rows if row["outcome"] == score.SUCCESS]
   ends = collections.Counter(row["outcome"] for row in rows if row["outcome"] != score.SUCCESS)
+  over = collections.Counter(metric for row in won for metric in str(row.get("over", "")).split())
   passed = sum(int(row["proficient"] or 0) for row in rows)
   time = f"{np.mean([float(row['time_s']) for row in won]):.1f}" if won else "-"
   first = rows[0]
   return [
-    name, str(first["lessons"]), f"{float(first['steps']):,.0f}", f"{float(first['train_s']):.0f}",
-    f"{len(won)} of {len(rows)}", f"{100 * passed / len(rows):.0f} %", time,
+    name, str(first["lessons"]), f"{float(first['train_s']):.0f}", f"{len(won)} of {len(rows)}",
+    f"{100 * passed / len(rows):.0f} %", time,
     ", ".join(f"{end} {count}" for end, count in sorted(ends.items())) or "-",
+    ", ".join(f"{metric.replace('_', ' ')} {n}" for metric, n in over.most_common(3)) or "-",
   ]  # fmt: skip
 
 

@@ -18,6 +18,7 @@ BENCHES = {
   "cut": "steps in which an organ is cut, beside steps in contact",
   "error": "run time against error, beside MuJoCo's own flex",
   "experts": "how many of its episodes each expert solves; the references",
+  "flex": "batches beside mujoco_warp's own flex on the same device",
   "flicker": "steps without force while a probe presses the organs that ship",
   "inertia": "what the effective inertia does to the contact force",
   "learning": "SAC on touch/easy",

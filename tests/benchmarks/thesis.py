@@ -354,6 +354,8 @@ def _tables(rates: dict[tuple, Row]) -> list[str]:
   return [
     *table("7.1 Haptic update rate [Hz]",
            [(*w, [], "rate_hz", "", RATE.get(w, {})) for w in pairs]),
+    *table("Haptic cycle, of which 7.1 is the inverse [ms]",
+           [(*w, [], "cycle_ms", "cycle_sd", {}) for w in pairs]),
     *table("7.2 Integration [ms]",
            [(*w, [], "step_ms", "step_sd", INTEGRATION.get(w, {})) for w in pairs]),
     *table("7.3 Parts of the GPU step [ms]", gpu if "cuda" in devices else []),

@@ -45,6 +45,8 @@ SHIPPED = {
   "solid, even triangles": {"coupling": "window", "interior": "solid"},
   "solid, 3 mm under the probe": {"coupling": "window", "interior": "solid", "fine": 3e-3},
 }
+# Foundations with which skins push as hard as a solid of their Young's modulus does [Pa/m].
+AS_SOLID = {"liver": 3e4, "kidney": 8e4}
 ORGAN_DEPTHS = (2e-3, 4e-3)  # of the probe's tip under the vertices [m]
 # Nodes, and edges under the probe [m] or None for even triangles; the last is the reference.
 MESHES = ((250, None), (1000, None), (4000, None), (1000, 3e-3), (1000, 2e-3), (16000, None))
@@ -75,6 +77,17 @@ PUBLISHED = (
    "the abstract has no force at a depth; the figures could not be read here"),
   ("Samur et al. 2007, doi:10.1016/j.media.2007.04.001, hal-03177346",
    "pig liver in vivo, force at a depth", "the figures could not be read here"),
+  ("\"Biomechanical and microstructural characterisation of the porcine stomach wall\", Acta "
+   "Biomaterialia 2020, abstract",
+   "wall in biaxial tension, greatest stresses: corpus 201.5, antrum 73.1, fundus 26.6 kPa along, "
+   "15.7, 39.7, 26.2 kPa around", "the stretches that they belong to could not be read here"),
+  ("\"Regional differences in stomach stretch during organ filling\", 2024, abstract",
+   "pig stomach at 3.5 l: strains around of 13.2 % (antrum), 22 % (corpus), 67.8 % (fundus), the "
+   "corpus then beyond 400 kPa", "the pressure could not be read here"),
+  ("Indentation with large relaxation, PMC7595329", "kidney, spleen and liver, poroelastic",
+   "the tables could not be read here; no fluid flows through ours"),
+  ("Capilnasiu et al. 2020, doi:10.1007/s10237-020-01297-5, CC BY",
+   "cattle's liver in large oscillating shear, 1 to 50 %", "the constants could not be read here"),
   ("Rosen et al. 2008, J Biomech Eng", "seven pig organs in a grasper, stress and strain",
    "the fits could not be read here"),
   ("Malik et al. 2022, doi:10.1371/journal.pone.0268608, CC BY", "pig organs in and ex vivo",
@@ -210,6 +223,8 @@ def _organ(name: str) -> list[Row]:
   place = catalog.entry(name).ports[0].landmark
   test = Test("sphere", PROBE, organ=name, place=place, edge=FINE, step=5e-4)
   presses = {what: _shipped(name, NODES, **how) for what, how in SHIPPED.items()}
+  softer = f"skin, foundation {AS_SOLID[name]:g} Pa/m, 3 mm under the probe"
+  presses[softer] = _shipped(name, NODES, False, AS_SOLID[name], coupling="window", fine=3e-3)
   depth = {what: np.array([p.depth + p.touch for p in mine]) for what, mine in presses.items()}
   mean = np.mean(list(depth.values()), axis=0)
   fine, rows = _solid(test, name, mean), []
@@ -254,13 +269,17 @@ def _meshes(name: str, contact: str) -> list[Row]:
   return rows
 
 
-def _shipped(name: str, nodes: int, firm: bool = False, **how) -> list:
+def _shipped(
+  name: str, nodes: int, firm: bool = False, foundation: float | None = None, **how
+) -> list:
   """Returns presses by the shipped probe to the depths."""
   from palpate.models import measure
 
   spec = models.load(name, nodes=nodes, **how)
   for flex in spec.flexes if firm else ():
     flex.solimp[:3] = 0.99, 0.999, 1e-4
+  for plugin in spec.plugins if foundation else ():
+    plugin.config = dict(plugin.config) | {"foundation": str(foundation)}
   model = spec.compile()
   return [measure.press(model, name, depth) for depth in ORGAN_DEPTHS]
 

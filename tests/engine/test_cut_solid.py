@@ -65,7 +65,7 @@ def test_a_block_that_is_cut_through_falls_in_two(windows, device):
   assert report.depth == pytest.approx(0.03, abs=1e-3) and organ.energy < 1e-20
   one, two = organ.pieces
   assert one.mass + two.mass == pytest.approx(0.3, rel=1e-12)
-  assert one.volume + two.volume == pytest.approx(9e-5, rel=1e-6) == organ.volume  # slits inside
+  assert one.volume + two.volume == pytest.approx(9e-5, rel=1e-12) == organ.volume
   assert two.mass > 0.45 * 0.3
   loose = max((one, two), key=lambda piece: organ.xpos0[piece.vertices, 0].mean())
   held = one if loose is two else two
@@ -226,6 +226,10 @@ def test_material_and_time_step_may_change_on_a_cut_solid():
   [
     ({"depth": 0.0}, "depth is 0, expected a number > 0"),
     ({"depth": -0.01}, "depth is -0.01, expected a number > 0"),
+    ({"depth": 0.01, "direction": [0, 1]}, r"direction is .*, expected three numbers"),
+    ({"points": []}, r"points of a cut have shape \(0,\), expected \(n, 3\), n >= 2"),
+    ({"points": [[0, 0], [0, 1]]}, r"points of a cut have shape \(2, 2\)"),
+    ({"points": "round"}, "points of a cut are 'round', expected numbers"),
     ({"points": [[0, 0, 0.08], [0.01, 0, 0.08]]}, "point 0 of the path is .* m from the surface"),
     ({"points": [[-0.03, y, 0.0] for y in (-0.02, 0, 0.02)]}, "vertex .*, which is pinned"),
   ],
@@ -252,47 +256,3 @@ def test_a_surface_has_no_depth_and_without_room_a_cut_ends_early():
   assert 0 < report.nodes <= 9 and len(organ.pieces) == 1
   run(model, data, 5, -0.03)
   assert np.isfinite(organ.xpos).all()
-
-
-SLOW = [pytest.param(range(5 * k, 5 * k + 5), marks=pytest.mark.slow) for k in range(1, 50)]
-
-
-@pytest.mark.parametrize("seeds", [range(2), *SLOW])
-def test_random_cuts_gain_no_energy(seeds):
-  for seed in seeds:
-    r = np.random.RandomState(seed)
-    mesh = block() if r.rand() < 0.5 else scenes.sphere(2)
-    keys = {"young": float(r.choice([3e3, 3e4])), "poisson": float(r.choice([0.3, 0.45]))}
-    keys |= {"foundation": float(r.choice([0, 1e4])), "spare": 500}
-    h = float(r.choice([5e-4, 1e-3, 2e-3, 5e-3]))
-    model, data, organ = scene(mesh, bool(r.randint(2)), h=h, **keys)
-    data.ctrl[0] = 0.1  # out of the way
-    x, wave = organ.xpos, r.normal(0, 20, (3, 3))
-    shape = np.sin(x @ wave + r.rand(3) * 6)
-    organ.set_state(x + 0.08 * np.ptp(x) * r.rand() * shape, r.rand() * 0.5 * shape)
-    first = last = moving(organ)[1]
-    for step in range(20):
-      if step % 4 == 2:
-        random_cut(organ, r)
-        assert moving(organ)[1] < last + 5e-3 * first, (seed, step)
-        last = moving(organ)[1]
-      run(model, data, 1, 0.1)
-      now = moving(organ)[1]
-      assert now <= last + 2e-3 * first, (seed, step, now / last)
-      last = now
-    assert np.isfinite(organ.xpos).all()
-    assert organ.error is None or "no spare vertices" in organ.error
-
-
-def random_cut(organ, r):
-  x = organ.xpos
-  way = r.normal(size=3)
-  line = x[r.randint(len(x))] + np.outer(np.linspace(-0.5, 0.5, 30), way * np.ptp(x))
-  near = cKDTree(x).query(line)[1]
-  points = x[near[np.append(True, np.diff(near) != 0)]]
-  depth = None if r.rand() < 0.3 else float(0.005 + 0.03 * r.rand())
-  words = ("no tetrahedra", "shorter", "shape", "goes around", "from the surface")
-  try:
-    organ.cut(points, depth=depth)
-  except ValueError as error:
-    assert any(word in str(error) for word in words), error

@@ -9,8 +9,8 @@ import sys
 import pytest
 from fuzz import apart
 
-SHORT = {"configurations": 40, "meshes": 40, "files": 12, "cutters": 3}
-LONG = dict.fromkeys(SHORT, 10_000) | {"cutters": 1000}
+SHORT = {"configurations": 40, "meshes": 40, "files": 12, "cutters": 3, "solids": 4}
+LONG = dict.fromkeys(SHORT, 10_000) | {"cutters": 1000, "solids": 1000}
 
 
 @pytest.mark.parametrize("kind", SHORT)

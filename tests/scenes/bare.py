@@ -36,7 +36,8 @@ def get(body, array, world=0):
 
 def step(body, h, u, v=0.0, mass=1.0, force=0.0, beta=None, scheme="implicit"):
   """Returns the change of velocity of one step, (nvert, 3); `beta` replaces the damping."""
-  beta = body.number("damping") if beta is None else beta
+  damping, eased = body.number("damping"), body.number("eased") * (scheme == "implicit")
+  beta = damping - min(eased * h, 0.5 * damping) if beta is None else beta
   state = body.state
   row = np.array([[h, h * h + h * beta, 0, 0]], np.float32)
   state.step.assign(np.repeat(row, body.nworld, axis=0))

@@ -50,6 +50,7 @@ def test_a_lesson_is_what_the_expert_meant_from_its_turn_on():
   count = min(len(alone.done), len(shaken.done))
   assert not np.allclose(shaken.meant[:count], alone.meant[:count], atol=0.05)
   assert not np.allclose(shaken.meant, shaken.done, atol=0.05)
+  assert not shaken.meant[:, 2].any()  # who never rolls the shaft teaches not to
   both = lessons.give(env, names, 5, 0.5, learner=says([0, 0, 0, -0.5]), most=20)
   assert both.outcome == "success" and not both.alone and not both.taught[0]
   assert (both.done[~both.taught] == [0, 0, 0, -0.5]).all() and 5 < both.taught.sum()

@@ -82,7 +82,7 @@ def compare_metrics(told, k, expected):
     ("touch/hard", 2, 40, {"variants": (None, 1)}),
     ("probe/easy", 2, 90, {}),
     ("probe/depth", 1, 60, {"reward": "sparse"}),
-    ("probe/palpate_easy", 2, 60, {}),
+    ("probe/palpate_easy", 2, 120, {}),
     ("trace/easy", 1, 280, {}),
     ("grasp/easy", 1, 179, {"hold": 0.1, "lift": 0.003}),
     ("retract/easy", 1, 157, {"hold": 0.1, "wanted": 0.1}),

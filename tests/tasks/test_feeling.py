@@ -1,0 +1,62 @@
+"""What who palpates remembers of what was felt."""
+
+import numpy as np
+import pytest
+from palpate import tasks
+from palpate.tasks import lessons
+from palpate.tasks.feeling import Notes
+
+GRID = np.array([(0.008 * x, 0.008 * y, 0.0) for x in range(-3, 4) for y in range(-3, 4)])
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def pressed(*presses):
+  """Returns notes of presses at (x, y) in steps of the grid, with a force [N], 4 mm deep."""
+  notes = Notes(GRID, np.tile(UP, (len(GRID), 1)), UP)
+  for x, y, force in presses:
+    for depth in (0.001, 0.004, 0.002):
+      notes.press(np.array([0.008 * x, 0.008 * y, -depth]), force)
+    notes.press(np.array([0.0, 0.0, 0.01]), 0.0)
+  return notes
+
+
+def test_a_press_is_noted_where_it_was_deepest_and_what_is_far_is_left():
+  notes = pressed((0, 0, 0.4))
+  assert list(notes.felt().values()) == pytest.approx([100.0])
+  far = np.linalg.norm(GRID[notes.left(np.zeros(3))])
+  assert 0.014 <= far < 0.017  # the nearest of those that are not felt with the first
+  notes.press(np.array([0.0, 0.016, -0.001]), 0.2)  # too light to tell
+  assert len(notes.felt()) == 1
+  all_of_it = [(x, y, 0.2) for x in (-3, -1, 1, 3) for y in (-3, -1, 1, 3)]
+  assert pressed(*all_of_it).left(np.zeros(3)) is not None  # beside the stiffest
+  sides = [(x, y, 0.2) for x, y in ((-3, -2), (-2, -3))]
+  assert pressed(*all_of_it, *sides).left(np.zeros(3)) is None
+
+
+def test_what_is_stiff_is_felt_around_and_expected_in_the_middle():
+  stiff = [(1, 0, 0.4), (-2, -2, 0.2), (-2, 2, 0.2)]
+  asked = []
+  for force in (0.39, 0.3, 0.35, 0.3):
+    side = GRID[pressed(*stiff).left(np.zeros(3))] / 0.008
+    asked.append(tuple(np.round(side[:2]).astype(int)))
+    stiff.append((*asked[-1], force))
+  assert sorted(asked) == [(0, 0), (1, -1), (1, 1), (2, 0)]
+  notes = pressed(*stiff)
+  assert notes.left(np.zeros(3)) is None
+  np.testing.assert_allclose(notes.expected(0.012), (0.008, 0, 0), atol=0.003)
+  lone = pressed((3, 3, 0.4), (-3, -3, 0.2))
+  assert len({lone.left(np.zeros(3)), *map(int, lone.beside[len(GRID) - 1])} - {-1}) == 2
+
+
+def test_what_an_exercise_tells_of_what_was_felt_is_from_the_tip():
+  env = tasks.load("probe", "palpate_easy", task_kwargs={"random": 2, "surroundings": "none"})
+  timestep, act = env.reset(), lessons.Teacher(env)
+  seen = timestep.observation
+  place = first = seen["tip_pos"] + seen["unfelt"]
+  np.testing.assert_allclose(seen["expected"], env.task.places.mean(axis=0) - seen["tip_pos"])
+  while np.allclose(place, first, atol=1e-9):
+    timestep = env.step(act(timestep))
+    seen = timestep.observation
+    place = seen["tip_pos"] + seen["unfelt"]
+  assert np.linalg.norm(place - first) >= 0.014
+  assert np.linalg.norm(seen["contact_force"]) > 0.1 and seen["left"] == 1
