@@ -17,7 +17,7 @@ import numpy as np
 from palpate import skins
 from palpate import windows as author
 
-from . import catalog, markup, scene, scenery, texture, trocar
+from . import catalog, markup, organs, scene, scenery, texture, trocar
 from .scenery import Surface
 
 NAMES = ("liver", "gallbladder", "stomach")  # organs, in the order they are drawn
@@ -188,6 +188,24 @@ def surround(
   held = arrangement or ARRANGEMENTS[kind]
   furnish(spec, [name for name in NAMES if name != kind], kind, held, look)
   light(spec, *view)
+
+
+def enter(spec: mujoco.MjSpec, name: str, nodes: int, seed: int | None = None, look: int = 0):
+  """Puts a scene of `models.load` into an abdomen, lit as its laparoscope's.
+
+  Args:
+    spec: changed in place
+    name: of the organ, and `nodes` and `seed` of its shape, as it was loaded
+    nodes: see `name`
+    seed: see `name`
+    look: seed of spots and vessels
+  """
+  build, lamp = organs.build(name, nodes, 0, seed), spec.light(CAMERA)
+  kind, pos = build.entry.shape, np.array(lamp.pos)
+  if build.entry.backdrop is not None:
+    spec.delete(spec.geom(build.entry.backdrop[0]))
+  uv = scenery.texcoord(kind, build.vertices, build.triangles)
+  surround(spec, f"{name}/{name}", kind, uv, (pos, pos + lamp.dir), look)
 
 
 def furnish(

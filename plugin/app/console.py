@@ -89,8 +89,9 @@ def need(extra: str, *modules: str):
   """Raises CommandError, naming the extra to install, if a module is missing."""
   missing = [name for name in modules if importlib.util.find_spec(name) is None]
   if missing:
+    verb = "is" if len(missing) == 1 else "are"
     raise CommandError(
-      f"{', '.join(missing)} is not installed: pip install 'palpate[{extra}]'", code=1
+      f"{', '.join(missing)} {verb} not installed: pip install 'palpate[{extra}]'", code=1
     )
 
 

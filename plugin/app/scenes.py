@@ -44,6 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser):
 def load(args: argparse.Namespace, handle: bool) -> tuple[mujoco.MjModel, mujoco.MjData]:
   """Returns model and data at the keyframe; `handle` gives named organs handles to drag."""
   from palpate import models
+  from palpate.models import situs
 
   options = ("nodes", "seed", "instruments", "coupling")
   given = [option for option in options if getattr(args, option) is not None]
@@ -55,7 +56,9 @@ def load(args: argparse.Namespace, handle: bool) -> tuple[mujoco.MjModel, mujoco
       choices["coupling"] = args.coupling or "nodal"
       if args.instruments is not None:
         choices["instruments"] = [name for name in args.instruments.split(",") if name]
-      model = models.load(args.scene, **choices).compile()
+      spec = models.load(args.scene, **choices)
+      situs.enter(spec, args.scene, choices["nodes"], args.seed)
+      model = spec.compile()
     elif args.scene == "abdomen" and not pathlib.Path(args.scene).exists():
       model = _abdomen(args, handle)
     elif given:

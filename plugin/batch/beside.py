@@ -171,12 +171,12 @@ class Opens(Beside):
     """See `Beside`: looks where it is time, or it was the last step for now."""
     self._steps += 1
     if last or self._steps >= _LOOK:
+      self.open(self._steps)
       self._steps = 0
-      self.open()
 
   @abc.abstractmethod
-  def open(self):
-    """Lets the meshes of worlds come apart where they have to."""
+  def open(self, steps: int):
+    """Lets the meshes of worlds come apart where they have to, so many steps since the last."""
 
 
 def bodies_of(batch):

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 from palpate.engine import cutters, mjstruct
+from palpate.engine.current import ends
 from palpate.engine.layout import BLADE, LAW
 from palpate.tissue.mesh import Mesh
 from palpate.tissue.step import SCHEMES
@@ -162,16 +163,24 @@ class Blades(beside.Opens):
 
   # The meshes come apart.
 
-  def open(self):
+  def open(self, steps: int):
     """Lets the meshes of worlds come apart along the paths that are long enough, or ended."""
-    due = self.fields.due.numpy()
-    worlds = np.flatnonzero(due.any(axis=1)).tolist()
+    due, currents = self.fields.due.numpy(), self._organ.space.cutters.by_current
+    ctrl = self._organ._batch.d.ctrl.numpy() if currents else None
+    state: Any = self.fields.state.numpy() if currents or due.any() else None
+    acts = due.any(axis=1)
+    for i, current in currents.items():
+      acts |= (ctrl[:, current.actuator] > 0) | (state[:, i, BLADE.count] > 0)
+    worlds = np.flatnonzero(acts).tolist()
     if not worlds:
       return
-    cuts, state = self._organ.topology, self.fields.state.numpy()
+    cuts = self._organ.topology
     law, edge = self.fields.law.numpy(), self._organ.declared.mesh.edge_length
     cuts.follow()
     motion = cuts.motion(worlds)
+    for i, current in currents.items():
+      given = steps * float(self._organ._batch.model.opt.timestep) * ctrl[:, current.actuator]
+      self._follow(current, state[:, i], due[:, i], given, worlds, motion)
     for k, world in enumerate(worlds):
       for i in np.flatnonzero(due[world]):
         given = cutters.GIVEN * float(law[world, i, LAW.force]) * edge
@@ -179,6 +188,19 @@ class Blades(beside.Opens):
     cuts.finish(worlds, motion)
     self.fields.state.assign(state)
     self.fields.due.zero_()
+
+  def _follow(self, current, state: np.ndarray, due: np.ndarray, given, worlds: list, motion):
+    """Lets paths of worlds follow a current; `given`: energy that it has brought [J], (nworld,)."""
+    cuts, d = self._organ.topology, self._organ._batch.d
+    place, axes = (array.numpy()[:, current.geom] for array in (d.geom_xpos, d.geom_xmat))
+    for k, world in enumerate(worlds):
+      row, mesh = state[world], cuts.mesh_of(world)
+      line = current.line(place[world].astype(float), axes[world].astype(float))
+      burns = given[world] > 0 and current.burn(
+        row, mesh, mesh.rest + motion.disp[k], cuts.finder, *line, float(given[world])
+      )
+      edge = mesh.whole.edge_length
+      due[world] = cutters.lay_trail(row, edge) if burns else cutters.ENDED * ends(row)
 
   def _open(self, row: np.ndarray, ended: bool, given: float, motion, k: int, world: int):
     cuts = self._organ.topology

@@ -58,10 +58,10 @@ def tools_of(model: mujoco.MjModel, organ) -> np.ndarray:
       raise ValueError(
         f"organ {organ.name!r}: spare and {key} are set, of which a batch on a GPU can do one"
       )
-  if organ.mesh.spare and any(row.current for row in organ.config.cutters):
+  if organ.config.bonded and any(row.current for row in organ.config.cutters):
     raise ValueError(
-      f"organ {organ.name!r}: cutters has a current, which cuts nothing in a batch on a GPU; "
-      "expected blades and scissors, or spare=0"
+      f"organ {organ.name!r}: cutters has a current and bonds are set, which it frees none of in a "
+      "batch on a GPU; expected one of both"
     )
   if organ.windows:
     found = np.unique(organ.windows.geom)

@@ -67,7 +67,7 @@ class Tears(beside.Opens):
     super().__init__(organ)
     self._found = self._zeros(self._nworld, dtype=wp.int64)
 
-  def open(self):
+  def open(self, steps: int):
     """Tears each world at its most stretched triangle, where that is too far."""
     organ, cuts, nelem = self._organ, self._organ.topology, len(self._organ.elem)
     limit = (1 + organ.config.tear) ** 2

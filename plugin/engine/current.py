@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 from palpate.tissue import path as paths
+from palpate.tissue.mesh import Mesh
 from palpate.tissue.surface import WorkingCopy
 
 from . import mjstruct
@@ -31,7 +32,7 @@ class Current:
   """
 
   def __init__(self, w, geom: int, actuator: int, energy: float, shape: tuple[int, float, float]):
-    self._w, self._geom, self._actuator = w, geom, actuator
+    self._w, self.geom, self.actuator = w, geom, actuator
     self._finder = w.cuts.finder if w.cuts else paths.Finder(WorkingCopy(w.organ.mesh))
     self._energy, (self._axis, self._half, width) = energy, shape
     self._reach = 0.5 * width + _SPARK
@@ -44,19 +45,23 @@ class Current:
     """
     w = self._w
     m, d = mjstruct.Model.from_address(w.model), mjstruct.Data.from_address(w.data)
-    power = float(mjstruct.view(d.ctrl, m.nu)[self._actuator])
+    power = float(mjstruct.view(d.ctrl, m.nu)[self.actuator])
     given = abs(power) * float(m.opt.timestep)  # [J]
     if given:
       self._free(d, m, given)
-    if power > 0 and w.cuts and self._burn(row, *self._line(d, m), given):
-      return False
-    row[BLADE.stage] = 0
-    return bool(row[BLADE.count])
+    if power > 0 and w.cuts:
+      x = w.organ.mesh.rest + w.phases.motion()[0]
+      if self.burn(row, w.organ.mesh, x, self._finder, *self._line(d, m), given):
+        return False
+    return ends(row)
 
   def _line(self, d, m) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the ends of its axis in the world [m]."""
-    middle = mjstruct.view(d.geom_xpos, (m.ngeom, 3))[self._geom]
-    axis = mjstruct.view(d.geom_xmat, (m.ngeom, 3, 3))[self._geom][:, self._axis]
+    middle = mjstruct.view(d.geom_xpos, (m.ngeom, 3))[self.geom]
+    return self.line(middle, mjstruct.view(d.geom_xmat, (m.ngeom, 3, 3))[self.geom])
+
+  def line(self, middle: np.ndarray, axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the ends of its axis in the world [m], of where the geom is."""
+    axis = axes[:, self._axis]
     return middle - self._half * axis, middle + self._half * axis
 
   def _free(self, d, m, given: float):
@@ -71,17 +76,30 @@ class Current:
         more = given / (self._energy * group.area[near].sum())
         w.bonds.state[slot, BOND.damage] = np.minimum(damage[near] + more, 1.0)
 
-  def _burn(self, row: np.ndarray, low: np.ndarray, high: np.ndarray, given: float) -> bool:
-    """Lets the path follow the geom; returns whether it touches the wall."""
-    w, organ, mesh = self._w, self._w.organ, self._w.organ.mesh
+  def burn(
+    self, row: np.ndarray, mesh: Mesh, x: np.ndarray, finder: paths.Finder,
+    low: np.ndarray, high: np.ndarray, given: float,
+  ) -> bool:  # fmt: skip
+    """Lets the path follow the geom; returns whether it touches the wall.
+
+    Args:
+      row: of the blades' state
+      mesh: the organ's
+      x: where its vertices are, in its frame [m]  (nvert, 3)
+      finder: of its surfaces
+      low: an end of the geom's axis in the world [m]
+      high: the other
+      given: energy that the current has brought [J]
+    """
+    w, organ = self._w, self._w.organ
     local = (np.linspace(low, high, 5) - organ.origin) @ organ.frame
-    elem, weight, far = self._finder.nearest(mesh, mesh.rest + w.phases.motion()[0], local)
+    elem, weight, far = finder.nearest(mesh, x, local)
     k = int(np.argmin(far))
     if far[k] > self._reach and not len(mesh.tet):
       return False
     deep = w.config.thickness
     if len(mesh.tet):
-      deep = self._depth(mesh, local, elem, far)
+      deep = self._depth(x[mesh.elem[elem]], local, far)
       if deep <= 0:
         return False
       row[BLADE.depth] = deep
@@ -102,9 +120,14 @@ class Current:
       row[BLADE.elem] = elem[k]
     return True
 
-  def _depth(self, mesh, local: np.ndarray, elem: np.ndarray, far: np.ndarray) -> float:
+  def _depth(self, corner: np.ndarray, local: np.ndarray, far: np.ndarray) -> float:
     """Returns how deep in a solid it acts, 0 where it is beside it; `local`: points of its axis."""
-    corner = (mesh.rest + self._w.phases.motion()[0])[mesh.elem[elem]]
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     inside = ((local - corner[:, 0]) * normal).sum(axis=1) < 0
     return float(max(np.where(inside, far, -far).max() + self._reach, 0.0))
+
+
+def ends(row: np.ndarray) -> bool:
+  """Ends a path, of a row of the blades' state; returns whether there was one."""
+  row[BLADE.stage] = 0
+  return bool(row[BLADE.count])

@@ -104,7 +104,7 @@ class Cutters(Beside):
     self.names: list[tuple[str, ...]] = []
     self._arrays: dict[str, np.ndarray] = {}
     self._width = np.zeros(0)
-    self._currents: dict[int, Current] = {}
+    self.by_current: dict[int, Current] = {}
     self._due: Any = ()
     self._here: Any = None  # the arrays of `fields`, and of what it has of the organ
     self._own: Any = None
@@ -135,7 +135,7 @@ class Cutters(Beside):
         self._width[i] = max(self._width[i], width)
       if rows[i].current:
         actuator, shape = _find_actuator(w, m, rows[i].current), _shape(w, m, geoms[0])
-        self._currents[i] = Current(w, geoms[0], actuator, rows[i].energy, shape)
+        self.by_current[i] = Current(w, geoms[0], actuator, rows[i].energy, shape)
     self.names = [tuple(_name(m, g) for g in geoms) for geoms in found]
     self._arrays = {"geom": geom, "axis": axis, "half": half}
     w.hold.need()
@@ -161,7 +161,7 @@ class Cutters(Beside):
   @property
   def currents(self) -> list[str]:
     """Names of the geoms that cut by a current."""
-    return [self.names[i][0] for i in self._currents]
+    return [self.names[i][0] for i in self.by_current]
 
   def edges(self) -> dict[str, np.ndarray]:
     """Returns the fields of `Blades` that say which geoms they are, and their edges."""
@@ -221,8 +221,9 @@ class Cutters(Beside):
   def open(self) -> bool:
     """Lets the mesh come apart along the paths that are long enough, or ended; returns whether."""
     opened, mesh = False, self._w.organ.mesh
-    for i, current in self._currents.items():
-      self._due[i] = self._follow(current, self.state[i])
+    for i, current in self.by_current.items():
+      row = self.state[i]
+      self._due[i] = ENDED if current.act(row) else lay_trail(row, mesh.whole.edge_length)
     for i, due in enumerate(self._due):
       if due:
         given = GIVEN * self._here.law[i, LAW.force] * mesh.whole.edge_length
@@ -237,10 +238,10 @@ class Cutters(Beside):
     def cut(path: np.ndarray, *deep: np.ndarray) -> tuple[Report, Mesh]:
       if not deep:
         return w.cuts.cut_at_rest(path, given), w.organ.mesh
-      geom, axis = (self._arrays[name][i] for name in ("geom", "axis"))
-      own = geom[1] < 0 and i not in self._currents
+      organ, geom, axis = w.organ, *(self._arrays[name][i] for name in ("geom", "axis"))
+      own = geom[1] < 0 and i not in self.by_current
       way = inward.direction(w, int(geom[0]) if own else -1, axis[0], int(row[BLADE.elem]))
-      now = w.organ.origin + self._on_surface(path) @ w.organ.frame.T
+      now = organ.origin + self._on_surface(path) @ organ.frame.T
       return w.cuts.cut(now, given * float(deep[0].mean()), deep[0], way), w.organ.mesh
 
     if len(mesh.tet):
@@ -260,22 +261,6 @@ class Cutters(Beside):
     place = mesh.rest + w.phases.motion()[0]
     return np.einsum("nk,nkj->nj", weight, place[mesh.elem[elem]])
 
-  def _follow(self, current: Current, row: np.ndarray) -> int:
-    """Lets a path follow a current; returns what is due, as the header says it of blades."""
-    if current.act(row):
-      return ENDED
-    count, at = int(row[BLADE.count]), row[BLADE.at : BLADE.at + 3]
-    if not row[BLADE.stage]:
-      return 0
-    edge = self._w.organ.mesh.whole.edge_length
-    start, last = (row[k : k + 3] for k in (BLADE.trail, BLADE.trail + 3 * (count - 1)))
-    if count < TRAIL and np.linalg.norm(at - last) > _SPACING * edge:
-      row[BLADE.trail + 3 * count : BLADE.trail + 3 * count + 3] = at
-      row[BLADE.below + count] = row[BLADE.depth]
-      row[BLADE.count] += 1
-    wait = row[BLADE.wait] or _BATCH * edge
-    return int(np.linalg.norm(at - start) > wait or row[BLADE.count] == TRAIL)
-
   def read(self) -> list[Cutter]:
     """Returns what the cutters do."""
     out = []
@@ -290,6 +275,25 @@ class Cutters(Beside):
 
   def _forces(self) -> np.ndarray:
     return self._here.force @ self._w.organ.frame.T
+
+
+def lay_trail(row: np.ndarray, edge: float) -> int:
+  """Lets a path follow what cuts by a current; returns what is due, as the header says of blades.
+
+  Args:
+    row: of the blades' state
+    edge: mean length of the mesh's edges [m]
+  """
+  count, at = int(row[BLADE.count]), row[BLADE.at : BLADE.at + 3]
+  if not row[BLADE.stage]:
+    return 0
+  start, last = (row[k : k + 3] for k in (BLADE.trail, BLADE.trail + 3 * (count - 1)))
+  if count < TRAIL and np.linalg.norm(at - last) > _SPACING * edge:
+    row[BLADE.trail + 3 * count : BLADE.trail + 3 * count + 3] = at
+    row[BLADE.below + count] = row[BLADE.depth]
+    row[BLADE.count] += 1
+  wait = row[BLADE.wait] or _BATCH * edge
+  return int(np.linalg.norm(at - start) > wait or row[BLADE.count] == TRAIL)
 
 
 def open_path(

@@ -29,7 +29,7 @@ _SAMPLES = 24
 # while a fold pinched by jaws, of two masses, shook them at 30 Hz where it answered for itself.
 _FEW = 8
 _STIFF = 2.75
-# The same of solids: at 2.6 a stroke was twice as wrong without answers, at 1.6 no better with them.
+# The same of solids: at 2.6 a stroke was twice as wrong without answers, at 1.6 as good.
 _STIFF_SOLID = 2.0
 # Times its inertia by itself that a pressed node may have, which is stretched too.
 _PRESSED = 2.0

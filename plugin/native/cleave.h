@@ -16,9 +16,11 @@ namespace palpate {
 constexpr double WIDE = 1.5;  // edges inside from the sheet within which tetrahedra are looked at
 constexpr double ON = 0.02;  // edges within which a vertex is on it
 constexpr double FLAT = 0.05;  // cost of a face on the sheet, by area; one an edge away costs 1
+constexpr double LIP = 16.0;  // cost of an edge of the skin at the mouth that is an edge away, by length
 constexpr double LEAST = 0.3;  // edges that a path is deep at least for one to come apart all through
 constexpr double BESIDE = 0.75;  // edges of the skin from the sheet within which its vertices are at the mouth
 constexpr double MOUTH = 0.6;  // edges below the path down to which an edge of the skin is at the mouth
+constexpr double PAST = 0.2;  // edges of the skin beyond an end of the path up to which a face reaches
 constexpr double FINE = 1e4;  // of costs as whole numbers
 constexpr double MUCH = 1e9;
 constexpr double AROUND = 3.0;  // edges of the skin around the sheet in which vertices are looked at
@@ -78,7 +80,17 @@ PALPATE int side_of(const S& m, const Measured& at, const Sheet& sheet, double s
   return left == right ? 3 : left ? 1 : 2;
 }
 
-// How much of the cut a face costs.
+// Whether an edge is one of the skin's.
+template <class S>
+PALPATE bool on_skin(const S& m, int a, int b) {
+  bool found = false;
+  m.each_triangle(a, [&](int t) {
+    for (int c = 0; c < 3 && t < m.nelem; ++c) found = found || m.elem[3 * t + c] == b;
+  });
+  return found;
+}
+
+// How much of the cut a face costs: more where its edges at the mouth are off the path.
 template <class S>
 PALPATE int cost_of(const S& m, const Measured& at, int face, double most) {
   double far = 0.0;
@@ -88,8 +100,14 @@ PALPATE int cost_of(const S& m, const Measured& at, int face, double most) {
     const double off = fabs(at.where[v].off) / at.edge;
     x[k] = m.place(v), far = off > far ? off : far;
   }
-  const double area = norm(0.5 * cross(x[1] - x[0], x[2] - x[0])) / (at.edge * at.edge);
-  const double cost = floor(area * (FLAT + far * far) * FINE);
+  double cost = norm(0.5 * cross(x[1] - x[0], x[2] - x[0])) / (at.edge * at.edge) * (FLAT + far * far);
+  for (int k = 0; k < 3; ++k) {
+    const int a = m.face_vert(face, k), b = m.face_vert(face, (k + 1) % 3);
+    if (a >= m.nskin || b >= m.nskin || !on_skin(m, a, b)) continue;
+    const double one = fabs(at.where[a].off) / at.edge, two = fabs(at.where[b].off) / at.edge;
+    cost += LIP * norm(x[(k + 1) % 3] - x[k]) / at.edge * (one > two ? one * one : two * two);
+  }
+  cost = floor(cost * FINE);
   return (int)(cost < 1.0 ? 1.0 : cost < most ? cost : most);
 }
 
@@ -130,7 +148,13 @@ PALPATE bool part_sides(const S& m, const Measured& at, const Sheet& sheet, doub
   o.count = 0;
   for (int f = 0; f < 4 * m.ntet; ++f) {
     const int mate = side[f / 4] ? between(f) : -1;
-    if (mate > f && first(f / 4) != first(mate / 4)) o.face[o.count++] = f;
+    if (mate <= f || first(f / 4) == first(mate / 4)) continue;
+    double past = -1e300;
+    for (int k = 0; k < 3; ++k) {
+      const double far = at.where[m.face_vert(f, k)].past;
+      past = far > past ? far : past;
+    }
+    if (past < PAST * skin) o.face[o.count++] = f;
   }
   return true;
 }
@@ -211,16 +235,6 @@ PALPATE bool carry(const S& m, const Opening& o, const Few& movers, const Shift*
   }
   f.found.data[FOUND_CHANGED] = tets.count, f.found.data[FOUND_MOVED] = movers.count;
   return true;
-}
-
-// Whether an edge is one of the skin's.
-template <class S>
-PALPATE bool on_skin(const S& m, int a, int b) {
-  bool found = false;
-  m.each_triangle(a, [&](int t) {
-    for (int c = 0; c < 3 && t < m.nelem; ++c) found = found || m.elem[3 * t + c] == b;
-  });
-  return found;
 }
 
 // Measures what has opened: its area, how deep it is, and the edges at its mouth, where a wall meets the skin

@@ -1,6 +1,6 @@
 // The energy of a solid's tetrahedra and nodes in double, as energy.of_gradients has it.
 #pragma once
-#include "surface.h"
+#include "tet.h"
 
 namespace palpate {
 
@@ -16,17 +16,6 @@ struct Rows { D3 row[3]; };
 
 PALPATE void add(Rows& a, double s, const Rows& b) {
   for (int k = 0; k < 3; ++k) a.row[k] += s * b.row[k];
-}
-
-PALPATE double volume_of(const D3* x) { return dot(x[1] - x[0], cross(x[2] - x[0], x[3] - x[0])) / 6.0; }
-
-// Writes the gradients of the shares of a tetrahedron's corners; returns its volume.
-PALPATE double slopes_of(const D3* x, D3* g) {
-  const D3 a = x[1] - x[0], b = x[2] - x[0], c = x[3] - x[0];
-  const double det = dot(a, cross(b, c));
-  g[1] = (1.0 / det) * cross(b, c), g[2] = (1.0 / det) * cross(c, a), g[3] = (1.0 / det) * cross(a, b);
-  g[0] = D3{0.0, 0.0, 0.0} - (g[1] + g[2] + g[3]);
-  return det / 6.0;
 }
 
 PALPATE Rows gradient_of(const D3* u, const D3* g) {

@@ -13,26 +13,17 @@ constexpr double ABOVE = 1.005;  // times its energy that the tissue around a ve
 constexpr double SHORTER = 0.7;
 constexpr double GIVES = 0.1;  // share of its way down to which a vertex inside gives way to the skin's
 constexpr double LIPS = 0.75;  // edges from the path within which a vertex of the skin goes to it
+constexpr double ALONG = 0.02;  // edges from the path within which one gives way along it
+constexpr int PASSES = 4;  // times that each goes farther by itself
 constexpr int EXACT = 3;  // times that the volume is put right
 
 // A vertex that moves to a place in a tetrahedron.
 struct Shift { int vert, corner[4]; double share, weight[4]; D3 way, lead; };
 
-// 1 for a regular tetrahedron.
-PALPATE double quality_of(const D3* x) {
-  double sum = 0.0;
-  for (int i = 0; i < 4; ++i)
-    for (int j = i + 1; j < 4; ++j) sum += dot(x[j] - x[i], x[j] - x[i]);
-  const double length2 = sum / 6.0 > 1e-300 ? sum / 6.0 : 1e-300;
-  return 6.0 * sqrt(2.0) * volume_of(x) / (length2 * sqrt(length2));
-}
-
-// Where a vertex of the skin goes on it: to the path where that is near.
+// The point of the skin around a vertex that is nearest to a goal.
 template <class S>
-PALPATE D3 goal_on_skin(const S& m, const Sheet& sheet, double edge, int v, D3 goal) {
-  double far, least = 1e300;
-  const D3 at = nearest_on(sheet.path, sheet.npath, m.place(v), far);
-  if (far < LIPS * edge) goal = at;
+PALPATE D3 nearest_on_skin(const S& m, int v, D3 goal) {
+  double least = 1e300;
   D3 best = goal;
   int low = -1;
   m.each_triangle(v, [&](int t) {
@@ -44,6 +35,14 @@ PALPATE D3 goal_on_skin(const S& m, const Sheet& sheet, double edge, int v, D3 g
     if (off < least || (off == least && t < low)) least = off, best = on, low = t;
   });
   return best;
+}
+
+// Where a vertex of the skin goes on it: to the path where that is near.
+template <class S>
+PALPATE D3 goal_on_skin(const S& m, const Sheet& sheet, double edge, int v, D3 goal) {
+  double far;
+  const D3 at = nearest_on(sheet.path, sheet.npath, m.place(v), far);
+  return nearest_on_skin(m, v, far < LIPS * edge ? at : goal);
 }
 
 // Finds the tetrahedron in which a goal is, or which it is the least outside of, and the weights of its
@@ -73,10 +72,21 @@ PALPATE D3 at_corners(const double* values, const Shift& a) {
   return out;
 }
 
+// How a vertex moves to a goal.
+template <class S>
+PALPATE Shift shift_to(const S& m, int v, D3 goal, const double* disp) {
+  Shift a = {v};
+  a.share = 1.0;
+  find_weights(m, v, goal, a);
+  a.way = goal - m.place(v);
+  a.lead = at_corners(disp, a) - load(disp + 3 * v);
+  return a;
+}
+
 // The tetrahedra and triangles around vertices that move, as they are before.
 struct Nearby {
   Few tet, side;
-  double *least, *had;
+  double *least, *had, *has, *next;  // energies before, now, and with what is tried
   D3* normal;
 };
 
@@ -107,7 +117,8 @@ PALPATE bool find_nearby(const S& m, const Few& movers, const Shift* shift, cons
     m.each_triangle(movers.list[i], [&](int t) { out.side.put(t); });
   }
   out.tet.sort(m.ntet);
-  out.least = memory.values(out.tet.count), out.had = memory.values(out.tet.count);
+  double** lists[] = {&out.least, &out.had, &out.has, &out.next};
+  for (int i = 0; i < 4; ++i) *lists[i] = memory.values(out.tet.count);
   out.normal = (D3*)memory.values(3 * out.side.count);
   if (memory.full) return false;
   for (int i = 0; i < out.tet.count; ++i) {
@@ -144,7 +155,7 @@ PALPATE void mark_thin(const S& m, const Shift* shift, const int* mover, int t, 
 // Marks in `less` the vertices that are to move less.
 template <class S>
 PALPATE void weigh_shifts(const S& m, const Shift* shift, const Few& movers, const Neohookean& p,
-                          const Nearby& near, double* old, double* now, int* less) {
+                          Nearby& near, double* old, double* now, int* less) {
   const int* mover = movers.place;
   for (int i = 0; i < movers.count; ++i) old[i] = now[i] = 0.0, less[i] = 0;
   for (int i = 0; i < near.tet.count; ++i) {
@@ -157,6 +168,7 @@ PALPATE void weigh_shifts(const S& m, const Shift* shift, const Few& movers, con
     double has = near.had[i];
     for (int c = 0; c < 4 && !bad; ++c) u[c] = moved_disp(p.disp, shift, mover, m.vert(4 * t + c));
     if (!bad) has = energy_of(x, u, p.mu[t], p.lam[t]);
+    near.has[i] = has;
     for (int c = 0; c < 4; ++c) {
       const int k = mover[m.vert(4 * t + c)] - 1;
       if (k >= 0) old[k] += near.had[i], now[k] += has;
@@ -174,16 +186,132 @@ PALPATE void weigh_shifts(const S& m, const Shift* shift, const Few& movers, con
     if (now[i] > ABOVE * old[i] + p.given) less[i] = 1;
 }
 
-// Finds how far of its way each vertex goes: so far that no tetrahedron gets thin and the skin does not
-// turn, and that the energy around none rises.
+// Vertices that move, what is around them, and the energy around each before and now.
 template <class S>
-PALPATE bool find_shares(const S& m, Shift* shift, const Few& movers, const Neohookean& p, Scratch& memory) {
-  Nearby near = {few(memory, m.ntet), few(memory, m.most_elem), nullptr, nullptr, nullptr};
-  double *old = memory.values(movers.count), *now = memory.values(movers.count);
+struct Settling {
+  const S& m;
+  const Few& movers;
+  const Neohookean& p;
+  const Sheet& sheet;
+  double edge;
+  Shift* shift;
+  Nearby near;
+  double *old, *now;
+
+  PALPATE void place_of(int t, D3* x) const {
+    for (int c = 0; c < 4; ++c) x[c] = moved_place(m, shift, movers.place, m.vert(4 * t + c));
+  }
+  // Adds to the energy around the corners of a tetrahedron.
+  PALPATE void add(int t, double more) {
+    for (int c = 0; c < 4; ++c) {
+      const int k = movers.place[m.vert(4 * t + c)] - 1;
+      if (k >= 0) now[k] += more;
+    }
+  }
+  // A tetrahedron around a vertex that is too thin, -1 for none.
+  PALPATE int thin(int i) const {
+    int out = -1;
+    m.each_corner(shift[i].vert, [&](int corner) {
+      D3 x[4];
+      const int t = corner / 4;
+      place_of(t, x);
+      if (out < 0 && quality_of(x) < near.least[near.tet.place[t] - 1]) out = t;
+    });
+    return out;
+  }
+  PALPATE bool turns(int i) const {
+    bool out = false;
+    m.each_triangle(shift[i].vert, [&](int t) {
+      const D3 normal = near.normal[near.side.place[t] - 1];
+      out = out || dot(moved_normal(m, shift, movers.place, t), normal) < TURNED;
+    });
+    return out;
+  }
+  // Takes the energy of what is around a vertex as it is now; returns whether that may be.
+  PALPATE bool weigh(int i) {
+    bool may = true;
+    m.each_corner(shift[i].vert, [&](int corner) {
+      const int t = corner / 4, n = near.tet.place[t] - 1;
+      D3 x[4], u[4];
+      place_of(t, x);
+      for (int c = 0; c < 4; ++c) u[c] = moved_disp(p.disp, shift, movers.place, m.vert(4 * t + c));
+      near.next[n] = energy_of(x, u, p.mu[t], p.lam[t]);
+      add(t, near.next[n] - near.has[n]);
+    });
+    m.each_corner(shift[i].vert, [&](int corner) {
+      for (int c = corner - corner % 4; c < corner - corner % 4 + 4; ++c) {
+        const int k = movers.place[m.vert(c)] - 1;
+        may = may && (k < 0 || now[k] <= ABOVE * old[k] + p.given);
+      }
+    });
+    m.each_corner(shift[i].vert, [&](int corner) {
+      const int t = corner / 4, n = near.tet.place[t] - 1;
+      if (may) near.has[n] = near.next[n];
+      else add(t, near.has[n] - near.next[n]);
+    });
+    return may;
+  }
+  // Lets a vertex move otherwise, where the others stay; returns whether it may.
+  PALPATE bool takes(int i, const Shift& other) {
+    const Shift before = shift[i];
+    shift[i] = other;
+    if (thin(i) < 0 && !turns(i) && (!p.has || weigh(i))) return true;
+    shift[i] = before;
+    return false;
+  }
+  PALPATE bool goes(int i, double share) {
+    Shift other = shift[i];
+    other.share = share;
+    return takes(i, other);
+  }
+  // Where a vertex gives way to: one of the skin along the path, if it is there.
+  PALPATE D3 aside(int v, D3 here, D3 goal) const {
+    double far;
+    if (v >= m.nskin) return goal;
+    nearest_on(sheet.path, sheet.npath, here, far);
+    if (far > ALONG * edge) return here;
+    return nearest_on_skin(m, v, nearest_on(sheet.path, sheet.npath, goal, far));
+  }
+  // Lets a vertex of the skin have a share of its way where others of a tetrahedron that would be thin give
+  // way.
+  PALPATE bool gets_room(int i, double wanted) {
+    const double share = shift[i].share;
+    shift[i].share = wanted;
+    const int t = thin(i);
+    D3 x[4], g[4];
+    if (t >= 0) place_of(t, x);
+    shift[i].share = share;
+    if (t < 0) return false;
+    normals_of(x, g);
+    for (int c = 0; c < 4; ++c) {
+      const int v = m.vert(4 * t + c), k = movers.place[v] - 1;
+      if (k < 0 || k == i) continue;
+      const Shift before = shift[k];
+      for (double part = 0.1; part < 0.7; part *= 2.0) {
+        const D3 goal = aside(v, x[c], x[c] + part * edge * g[c]);
+        if (goal == x[c]) break;
+        const Shift other = shift_to(m, v, goal, p.disp);
+        if (!takes(k, other)) break;
+        if (goes(i, wanted)) return true;
+      }
+      takes(k, before);
+    }
+    return false;
+  }
+};
+
+// Finds how far of its way each vertex goes: so far that no tetrahedron gets thin and the skin does not
+// turn, and that the energy around none rises. All go as far as they may together, and then each farther
+// where the others leave it room.
+template <class S>
+PALPATE bool find_shares(const S& m, const Sheet& sheet, double edge, Shift* shift, const Few& movers,
+                         const Neohookean& p, Scratch& memory) {
+  Settling<S> all = {m, movers, p, sheet, edge, shift, {few(memory, m.ntet), few(memory, m.most_elem)}};
+  all.old = memory.values(movers.count), all.now = memory.values(movers.count);
   int* less = memory.numbers(movers.count);
-  if (memory.full || !find_nearby(m, movers, shift, p, near, memory)) return false;
+  if (memory.full || !find_nearby(m, movers, shift, p, all.near, memory)) return false;
   for (int k = 0; k <= ROUNDS; ++k) {
-    weigh_shifts(m, shift, movers, p, near, old, now, less);
+    weigh_shifts(m, shift, movers, p, all.near, all.old, all.now, less);
     bool any = false;
     for (int i = 0; i < movers.count; ++i) {
       if (!less[i] || shift[i].share == 0.0) continue;
@@ -192,6 +320,17 @@ PALPATE bool find_shares(const S& m, Shift* shift, const Few& movers, const Neoh
     }
     if (!any) break;
   }
+  weigh_shifts(m, shift, movers, p, all.near, all.old, all.now, less);
+  for (int k = 0; k < 2 * PASSES; ++k)  // those of the skin first, where the path is seen
+    for (int i = 0; i < movers.count; ++i) {
+      const double share = shift[i].share;
+      const bool outer = shift[i].vert < m.nskin;
+      if (share == 1.0 || outer != (k % 2 == 0) || shift[i].way == D3{0.0, 0.0, 0.0}) continue;
+      for (double part = 1.0; part > 0.2; part *= 0.5) {
+        const double wanted = share + part * (1.0 - share);
+        if (all.goes(i, wanted) || (outer && all.gets_room(i, wanted))) break;
+      }
+    }
   return true;
 }
 
@@ -248,18 +387,26 @@ PALPATE bool settle(const S& m, const Sheet& sheet, double edge, const Where* wh
     movers.place[v] = 0;
     if (!stays) movers.list[count++] = v, movers.place[v] = count;
   }
-  movers.count = count;
+  // Those inside beside the skin's may make room for them.
+  for (int i = 0, n = movers.count = count; i < n; ++i)
+    m.each_corner(movers.list[i], [&](int corner) {
+      for (int k = 0; k < 3 && movers.list[i] < m.nskin; ++k) {
+        const int v = m.vert(other_corner(corner, k));
+        if (v >= m.nskin && !pinned[v]) movers.put(v);
+      }
+    });
+  const int helpers = count;
+  count = movers.count;
   shift = (Shift*)memory.values(count * (int)(sizeof(Shift) / sizeof(double)));
   if (memory.full) return false;
   for (int i = 0; i < count; ++i) {
-    Shift& a = shift[i];
-    a.vert = movers.list[i], a.share = 1.0;
-    const D3 goal = a.vert < m.nskin ? goal_on_skin(m, sheet, edge, a.vert, where[a.vert].at) : where[a.vert].at;
-    find_weights(m, a.vert, goal, a);
-    a.way = goal - m.place(a.vert);
-    a.lead = at_corners(p.disp, a) - load(p.disp + 3 * a.vert);
+    const int v = movers.list[i];
+    D3 goal = i < helpers ? where[v].at : m.place(v);
+    if (v < m.nskin) goal = goal_on_skin(m, sheet, edge, v, goal);
+    shift[i] = shift_to(m, v, goal, p.disp);
+    if (i >= helpers) shift[i].share = 0.0, shift[i].way = {0.0, 0.0, 0.0};
   }
-  if (!find_shares(m, shift, movers, p, memory)) return false;
+  if (!find_shares(m, sheet, edge, shift, movers, p, memory)) return false;
   count = 0;
   for (int i = 0; i < movers.count; ++i) {
     const int v = shift[i].vert;

@@ -1,6 +1,6 @@
 // The surface along which a solid is cut: lines from a path on its skin inward, side by side.
 #pragma once
-#include "triangle.h"
+#include "tet.h"
 
 namespace palpate {
 
@@ -25,10 +25,6 @@ struct Sheet {
 // both below 0 over it; the nearest point of it, and how far along the path that is.
 struct Where { double off, past, deep, along; D3 at; };
 
-PALPATE D3 unit(D3 a) {
-  const double size = norm(a);
-  return (1.0 / (size > 1e-300 ? size : 1e-300)) * a;
-}
 PALPATE double clamp01(double x) { return x < 0.0 ? 0.0 : x > 1.0 ? 1.0 : x; }
 
 // How far neighbouring lines are apart at most, and how long the longest is.

@@ -167,6 +167,7 @@ PALPATE void tet_stress(const Fields& f, Thread t, int stage) {
   const float h = step[0], weight = step[1], gv = weight_of_rate(stage, step), per_h = 1.0f / h;
   constexpr float THIRD = 1.0f / 3.0f;
   const bool implicit = stage == FIRST || stage == LATER;
+  const float lingers = implicit && weight > 0.0f ? LINGERS * h * h : 0.0f;
   const size_t base = 96 * (size_t)t.world * f.shape.nslice;
   const float* motion = f.system.node_motion.data + base;
   const float* nodal = f.system.node_stress.data + base;
@@ -196,7 +197,7 @@ PALPATE void tet_stress(const Fields& f, Thread t, int stage) {
     const M3 elastic = mean_stress(nodal, node, p, lane)
       + stress(H, now, alone, (0.625f * h) * alone * now.j, h);
     const V shear = 0.75f * mu + (per_h * vmax(-p, zero)) * vsqrt(THIRD * size2);
-    const V more = crushed(now.j + 1.0f, size2) * (implicit ? LINGERS * (weight > 0.0f ? h * h : 0.0f) : 0.0f);
+    const V more = lingers * crushed(now.j + 1.0f, size2);
     M3 viscous = (0.75f * gv * mu + more * shear) * (Q * (strain + transposed(strain)));
     if (any_above(more, 0.0f)) viscous = viscous + (more * lam * inner(C, rate)) * C;
     const M3 P = splat(-1.0f) * volume * (elastic + viscous);

@@ -5,6 +5,7 @@
 // Tetrahedra are in the order of the arrays, six pairs of corners each.
 #pragma once
 #include "rows.h"
+#include "tet.h"
 
 namespace palpate {
 
@@ -28,20 +29,11 @@ struct Star {
 // The number of a corner; a slice of tetrahedra has eight times four.
 PALPATE int number_of(int tet, int corner) { return tet / LANES * 4 * LANES + corner * LANES + tet % LANES; }
 
-// The gradients of the shares of a tetrahedron's corners; returns its volume.
-PALPATE double gradients_of(const D3* x, D3* g) {
-  const D3 a = x[1] - x[0], b = x[2] - x[0], c = x[3] - x[0];
-  const double det = dot(a, cross(b, c));
-  g[1] = (1.0 / det) * cross(b, c), g[2] = (1.0 / det) * cross(c, a), g[3] = (1.0 / det) * cross(a, b);
-  g[0] = -1.0 * (g[1] + g[2] + g[3]);
-  return det / 6.0;
-}
-
 template <class F, class S>
 PALPATE double measure_tet(const F& f, const S& m, int t, D3* g) {
   D3 x[4];
   for (int c = 0; c < 4; ++c) x[c] = m.place(f.tet.data[4 * t + c]);
-  return gradients_of(x, g);
+  return slopes_of(x, g);
 }
 
 template <class F, class S>

@@ -14,8 +14,9 @@ _OFF = 2.0  # edges from the skin from which a point is off it
 _LEVEL = 0.25  # least cosine of the normals of a path's triangles to their mean for one direction
 _AROUND = 0.5  # length of the mean of the normals up to which a path goes around the organ
 _SMOOTH = 2.0  # edges along the path over which directions are averaged otherwise
-_RIM = 1.0  # edges by which a sheet goes on beyond the end of a path where the skin falls away
-_FALLS = 0.5  # greatest cosine between direction and normal there
+# Edges by which a sheet right through goes on beyond the end of a path where the skin falls away,
+# and the greatest cosine between direction and normal there.
+_RIM, _FALLS = 1.0, 0.5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,8 +86,9 @@ def sweep(
   if direction is not None:
     direction = _at_rest(organ, mesh, position, elem, direction)
   size = 2 * float(lengths(np.ptp(mesh.rest[: mesh.whole.nouter], axis=0)))
+  through = bool(np.isinf(reach).any())
   way, reach = _ways(organ, path, inward, direction, reach, edge)
-  return _lines(path, way, np.minimum(reach, size), inward, edge)
+  return _lines(path, way, np.minimum(reach, size), inward if through else way, edge)
 
 
 def _check(organ: str, points: np.ndarray, depth) -> np.ndarray:

@@ -88,8 +88,8 @@ class Stage(enum.IntEnum):
 
 
 # Numbers that may change while running, in the order of `Tissue.number`: configuration keys, where
-# worlds differ what mu, lambda' (of solids lambda) and the plate's rigidity are multiples of, and what
-# of h a step takes off the damping, see `shape.eased`.
+# worlds differ what mu, lambda' (of solids lambda) and the plate's rigidity are multiples of, and
+# what of h a step takes off the damping, see `shape.eased`.
 NUMBERS = (
   "foundation", "bulk", "pressure", "damping", "tolerance", "iterations", "stiffness",
   "shear", "lame", "plate", "eased",

@@ -45,22 +45,22 @@ def pressed(windows, **keys):
   return spec
 
 
-def strip():
+def strip(x=-0.004, cutters=f"edge {ENERGY}", size=(5e-4, 0.006, 0), **keys):
   """Returns a blade before a strip that its long sides hold."""
   spec = mujoco.MjSpec()
   spec.option.timestep, spec.option.gravity = 2e-3, (0, 0, 0)
-  body = spec.worldbody.add_body(pos=[-0.004, 0, 0])
+  body = spec.worldbody.add_body(pos=[x, 0, 0])
   slide(body, spec, "x", [1, 0, 0], 2000)
   free = {"contype": 0, "conaffinity": 0}
   body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.004, 0, 0], pos=[0, 0, 0.02], mass=0.1,
                 **free)  # fmt: skip
-  body.add_geom(name="edge", type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=[5e-4, 0.006, 0], mass=1e-3,
+  body.add_geom(name="edge", type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=size, mass=1e-3,
                 **free)  # fmt: skip
   points, elem = triangular(0.03, 0.026, 11, 11, 0.2)
   pin = np.flatnonzero(np.abs(np.abs(points[:, 1]) - 0.013) < 1e-9)
   palpate.add_organ(
-    spec, (points, elem), "organ", windows=True, mass=0.005, young=2e5, thickness=THICKNESS,
-    spare=60, pin=pin, cutters=f"edge {ENERGY}", device="cpu",
+    spec, (points, elem), "organ", mass=0.005, young=2e5, thickness=THICKNESS,
+    pin=pin, cutters=cutters, device="cpu", **{"spare": 60, "windows": True} | keys,
   )  # fmt: skip
   return spec
 
@@ -157,6 +157,30 @@ def test_blades_cut_in_each_world(device):
   assert [bool(each) for each in organ.cuts] == [True, False, bool(cuts[2])]
 
 
+@pytest.mark.parametrize("device", BACKENDS[1:])
+def test_a_current_cuts_in_each_world(device):
+  burn = 1.1e6
+  spec = strip(0.01, f"edge {burn} by power", (1e-3, 1e-3, 0))
+  spec.add_actuator(name="power", target="x", trntype=mujoco.mjtTrn.mjTRN_JOINT, gainprm=10 * [0])
+  batch = palpate.batch.make(spec, 3, device=device)
+  model, data = batch.model, mujoco.MjData(batch.model)
+  alone, organ = palpate.Organ(model, data, "organ"), batch.organ("organ")
+  power = 0.04 * burn * THICKNESS * np.array([1, 1, 0])
+  for k in range(110):
+    given = power * (k < 100)
+    data.ctrl[:] = 0.035 * data.time, given[0]
+    batch.ctrl = np.stack([np.full(3, 0.035 * data.time), given], 1)
+    mujoco.mj_step(model, data)
+    batch.step()
+  found, expected = organ.cutters, alone.cutters[0]
+  assert expected.length == pytest.approx(0.007, abs=1.5e-3)
+  np.testing.assert_allclose(found.length.numpy()[:2, 0], expected.length, rtol=1e-3)
+  np.testing.assert_allclose(found.energy.numpy()[:2, 0], expected.energy, rtol=1e-3)
+  assert [len(cuts) for cuts in organ.cuts] == [len(alone.cuts), len(alone.cuts), 0]
+  assert len(alone.cuts) > 0 and not found.length.numpy()[2, 0]
+
+
+@pytest.mark.parametrize("device", BACKENDS[1:])
 def test_tissue_tears_in_each_world(device):
   batch = palpate.batch.make(pressed(True, tear=0.05, foundation=1e4), 3, device=device, nodes=40)
   model, data = batch.model, mujoco.MjData(batch.model)
@@ -189,13 +213,17 @@ def test_what_cannot_be_cut_is_named():
   assert whole.piece_count.numpy().tolist() == [1, 1]
 
 
+CURRENT = {"cutters": "edge 1e6 by x", "spare": 0, "bonds": "none"}
+
+
 @pytest.mark.parametrize(
-  ("keys", "match"),
+  ("make", "keys", "match"),
   [
-    ({"carrier": "own", "spare": 0}, "carrier is set, which a batch on a GPU cannot do"),
-    ({"bonds": "none"}, "spare and bonds are set, of which a batch on a GPU can do one"),
+    (pressed, {"carrier": "own", "spare": 0}, "carrier is set, which a batch on a GPU cannot do"),
+    (pressed, {"bonds": "none"}, "spare and bonds are set, of which a batch on a GPU can do one"),
+    (strip, CURRENT, "cutters has a current and bonds are set, which it frees none of"),
   ],
 )
-def test_what_a_gpu_cannot_do_is_named(keys, match):
+def test_what_a_gpu_cannot_do_is_named(make, keys, match):
   with pytest.raises(ValueError, match=match):
-    palpate.batch.make(pressed(True, **keys), 2, device="warp-cpu")
+    palpate.batch.make(make(windows=True, **keys), 2, device="warp-cpu")

@@ -187,8 +187,8 @@ def summarize(rows: list[Row]) -> list[str]:
   lines = [
     "Errors are RMS over the scene, of the reference's peak: contact force on the probe where "
     "there is one, node positions in `vibrate`. A force is that of the step's end for `implicit` "
-    "and of its start for the others, which is the better one for each (both are in the CSV). The "
-    "reference is explicit, in float64, at "
+    "and of its start for the others and for solids, the better one for each (both are in the CSV)."
+    " The reference is explicit, in float64, at "
     f"{1e6 * TAU:g} us and multiples, extrapolated. Run time is the median step times the steps of "
     "the scene, in CPU time of the one thread, so that other load does not count.",
     "",

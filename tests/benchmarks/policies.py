@@ -59,6 +59,7 @@ def run(case: Case, out: pathlib.Path) -> list[Row]:
     row = {"task": name, "seed": result.seed, "outcome": result.outcome}
     row |= {"time_s": round(result.time, 2), "lessons": training.get("lessons", 0)}
     row |= {"steps": training.get("steps", 0), "train_s": training.get("seconds", 0)}
+    row["began_with"] = training.get("from", "").removesuffix(policy.SUFFIX)
     row |= {"proficient": "", "peak_force_N": "", "over": "", "worlds": "", "won": ""}
     if result.metrics:
       metrics = Metrics.from_json(result.metrics)
@@ -98,10 +99,11 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
       many[row["task"]] = f"{100 * int(row['won']) / int(row['worlds']):.1f} % of {row['worlds']}"
     elif row["status"] == "ok":
       groups[row["task"]].append(row)
-  head = ["exercise", "lessons", "training [s]", "success", "proficient", "time of a success [s]",
-          "ends otherwise", "successes over a limit", "side by side"]  # fmt: skip
+  head = ["exercise", "lessons", "training [s]", "began with", "success", "proficient",
+          "time of a success [s]", "ends otherwise", "successes over a limit",
+          "side by side"]  # fmt: skip
   table = [
-    [*(_line(name, groups[name]) if name in groups else [name, *"-------"]), many.get(name, "-")]
+    [*(_line(name, groups[name]) if name in groups else [name, *"--------"]), many.get(name, "-")]
     for name in NAMES
   ]
   times = [float(groups[name][0]["train_s"]) for name in NAMES if name in groups]
@@ -109,7 +111,8 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
   lines += [
     f"{len(groups)} of {len(NAMES)} exercises have one; training took {np.median(times):.0f} s in "
     "the median. Proficient is by the experts' limits, of all episodes; over a limit are named the "
-    f"three metrics that most are over. {results.link(out / 'policies.csv')}",
+    "three metrics that most are over. Who began with another's policy has not counted the time of "
+    f"that one's training. {results.link(out / 'policies.csv')}",
     "", *plots.table(head, table),
   ]  # fmt: skip
   return [results.page(out / "policies.md", "Policies that were trained", about, lines)]
@@ -123,8 +126,8 @@ def _line(name: str, rows: list[Row]) -> list[str]:
   time = f"{np.mean([float(row['time_s']) for row in won]):.1f}" if won else "-"
   first = rows[0]
   return [
-    name, str(first["lessons"]), f"{float(first['train_s']):.0f}", f"{len(won)} of {len(rows)}",
-    f"{100 * passed / len(rows):.0f} %", time,
+    name, str(first["lessons"]), f"{float(first['train_s']):.0f}", first.get("began_with") or "-",
+    f"{len(won)} of {len(rows)}", f"{100 * passed / len(rows):.0f} %", time,
     ", ".join(f"{end} {count}" for end, count in sorted(ends.items())) or "-",
     ", ".join(f"{metric.replace('_', ' ')} {n}" for metric, n in over.most_common(3)) or "-",
   ]  # fmt: skip

@@ -110,7 +110,7 @@ class Beside:
     process.stdin.flush()
     line = process.stdout.readline()
     if not line:
-      raise BenchError(f"{process.args[0]} has ended; expected this package there", code=1)
+      raise BenchError("the other interpreter has ended; expected this package there", code=1)
     return json.loads(line)
 
   def restart(self):

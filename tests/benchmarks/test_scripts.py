@@ -1,9 +1,10 @@
 """The benches of one question: that they run, and what they write adds up."""
 
 import json
+import sys
 
 import pytest
-from benchmarks import results, run
+from benchmarks import results, run, solids
 from palpate.engine import weights
 
 
@@ -57,6 +58,29 @@ def test_short_forms_write_rows_and_a_page(tmp_path, name, words):
   assert rows and all(row["status"] == "ok" for row in rows)
   page = (tmp_path / f"{name}.md").read_text()
   assert f"run.py {name} --short" in page and page.count("|") >= 12
+
+
+def test_another_python_takes_the_same_steps():
+  keys = {"nodes": 42, "side": "peer", "h": 4e-3, "tolerance": 1e-8}
+  here = solids.Run(**keys)
+  with solids.another(sys.executable) as other:
+    assert other
+    there = solids.Beside(other, keys)
+    for run in (here, there):
+      run.restart()
+      run.finish()
+    assert there.about == here.about and there.time > 0
+    assert there.force == pytest.approx(here.force, abs=1e-15)
+  with pytest.raises(results.BenchError, match="expected an interpreter"), solids.another("/none"):
+    pass
+
+
+@pytest.mark.slow
+def test_mujoco_warps_flex_is_beside_ours(tmp_path):
+  assert command("flex", "--short", "-o", tmp_path) == 0
+  rows = results.read(tmp_path / "flex_cpu.csv")
+  assert [row["side"] for row in rows] == ["flex", "ours"]
+  assert all(row["rate"] > 0 and row["error"] < 0.1 and not row["failures"] for row in rows)
 
 
 def test_peer_is_beside_ours(tmp_path):

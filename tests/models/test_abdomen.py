@@ -132,3 +132,21 @@ def test_bad_input_is_named(options, words):
   with pytest.raises(ValueError, match="texture is 'bone', expected one of liver"):
     texture.texture("bone")
   assert set(situs.ARRANGEMENTS) == set(catalog.PLACES)
+
+
+@pytest.mark.parametrize("name", ["gallbladder", "liver_inclusion"])
+def test_a_scene_of_one_organ_enters_the_abdomen_and_moves_as_before(name):
+  found = []
+  for inside in (False, True):
+    spec = models.load(name, 250)
+    if inside:
+      situs.enter(spec, name, 250)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, model.key("press").id)
+    mujoco.mj_step(model, data, 20)
+    found.append((model, data))
+  np.testing.assert_array_equal(found[0][1].qpos, found[1][1].qpos)
+  drawn = {found[1][0].skin(k).name for k in range(found[1][0].nskin)}
+  assert {"abdomen_fat", "abdomen_wall", "abdomen_stomach", f"{name}/{name}_skin"} <= drawn
+  assert "abdomen_" + name.removesuffix("_inclusion") not in drawn and not found[0][0].nskin
