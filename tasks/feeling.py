@@ -29,35 +29,34 @@ class Notes:
       up: what the sides are across  (3,)
     """
     self.places, self.beside = places, beside(places, up)
-    self._across = across(up)
     self._outward, self.stiffness = outward, np.zeros(len(places))
-    self._deepest, self._depth = 0, 0.0
+    self._last, self._depth = nearest(places, places.mean(axis=0)), 0.0
 
   def press(self, tip: np.ndarray, force: float) -> None:
     """Follows a press with a force [N]; each counts once, where it was deepest."""
     if force < LEFT:
       self._depth = 0.0
       return
-    k = int(np.square(self.places - tip).sum(axis=1).argmin())
+    k = nearest(self.places, tip)
     depth = float((self.places[k] - tip) @ self._outward[k])
     if depth > max(self._depth, DEEP):
       if self._depth:
-        self.stiffness[self._deepest] = 0.0
-      self._deepest, self._depth, self.stiffness[k] = k, depth, force / depth
+        self.stiffness[self._last] = 0.0
+      self._last, self._depth, self.stiffness[k] = k, depth, force / depth
 
   def felt(self) -> dict[int, float]:
     """Returns the stiffness of the places that were felt [N/m]."""
     return {int(k): float(self.stiffness[k]) for k in np.flatnonzero(self.stiffness)}
 
-  def left(self, tip: np.ndarray) -> int | None:
-    """Returns the place that is left to feel, None where enough is felt.
+  def left(self) -> int | None:
+    """Returns the place to feel next, None where enough is felt.
 
-    That is a side of what is stiff, or else of those far from all that was felt the nearest, seen
-    along `up`.
+    That is a side of what is stiff, or else of those far from all that was felt the nearest to the
+    last; the first is in the middle.
     """
     felt = np.flatnonzero(self.stiffness)
     gaps = np.linalg.norm(self.places[:, None] - self.places[felt], axis=2)
-    away = np.linalg.norm((self.places - tip) @ self._across.T, axis=1)
+    away = np.linalg.norm(self.places - self.places[self._last], axis=1)
     away[gaps.min(axis=1, initial=np.inf) < APART] = np.inf
     k = int(away.argmin())
     if away[k] < np.inf and self.stiffness.max() <= STIFF * self.soft():
@@ -100,14 +99,14 @@ def chance(places: np.ndarray, felt: np.ndarray, more: np.ndarray, radius: float
   return np.exp((gain - gain.max()) / (2 * NOISE**2))
 
 
-def across(up: np.ndarray) -> np.ndarray:
-  """Returns two directions across another  (2, 3)."""
-  return np.linalg.svd(np.reshape(up, (1, 3)))[2][1:]
+def nearest(places: np.ndarray, point: np.ndarray) -> int:
+  """Returns the place nearest to a point."""
+  return int(np.linalg.norm(places - point, axis=1).argmin())
 
 
 def beside(places: np.ndarray, up: np.ndarray) -> np.ndarray:
   """Returns the places to the four sides of each, -1 where there is none  (nplace, 4)."""
-  one, two = across(up)
+  one, two = np.linalg.svd(np.reshape(up, (1, 3)))[2][1:]
   found = np.full((len(places), 4), -1)
   for i, way in enumerate((one, two, -one, -two)):
     gap = np.linalg.norm(places[:, None] + BESIDE * way - places, axis=2)

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from . import scenes
 from .base import Physics, Task
-from .feeling import APART, SOFT, Notes, chance
+from .feeling import APART, SOFT, Notes, chance, nearest
 from .performer import Performer, Script
 from .scenes import Scene
 
@@ -145,14 +145,15 @@ class Palpate(Task):
     return f"Press here and there, and report where it is stiff while you press: {share}"
 
   def observe(self, physics: Physics) -> dict[str, np.ndarray]:
-    """Returns what was felt, and where what matters of it is from the tip."""
-    tip, left = physics.tip_pos(), self.notes.left(physics.tip_pos())
+    """Returns what was felt, and where to feel, or to report, next."""
+    tip, left = physics.tip_pos(), self.notes.left()
+    goal = self.notes.expected(self.radius) if left is None else self.places[left]
     return {
       "field": self.center - tip,
       "felt": np.array([self.felt()]),
       "left": np.array([float(left is not None)]),
-      "unfelt": np.zeros(3) if left is None else self.places[left] - tip,
-      "expected": self.notes.expected(self.radius) - tip,
+      "target": goal - tip,
+      "normal": self.outward[nearest(self.places, goal)],
     }
 
   def expert(self, p: Performer) -> Script:
@@ -161,8 +162,7 @@ class Palpate(Task):
     It knows where the organ's triangles are and presses their middles: on the coarse mesh corners
     feel stiffer. Where the inclusion is it learns from forces and depths alone.
     """
-    normals = p.physics.normals()[self.field]
-    felt = self.notes.felt()  # place -> stiffness [N/m]
+    normals, felt = self.outward, self.notes.felt()  # place -> stiffness [N/m]
     sweep = iter(self._left_out(felt))
     while (k := self._next(p, felt, sweep)) is not None:
       yield from self._hop(p, self.places[k] + _ABOVE * normals[k])
@@ -170,7 +170,7 @@ class Palpate(Task):
       yield from p.line(self.places[k] + _ABOVE * normals[k], 0.03)
     # A hasty one goes by what is observed alone, which can be learned.
     goal = self.notes.expected(self.radius) if p.hasty else self.places[self._guess(felt)]
-    normal = normals[np.linalg.norm(self.places - goal, axis=1).argmin()]
+    normal = normals[nearest(self.places, goal)]
     yield from self._hop(p, goal + _ABOVE * normal)
     yield from p.feel(goal, -normal, 0.5 * _DEPTH)
     yield from p.say()
@@ -178,7 +178,7 @@ class Palpate(Task):
   def _next(self, p: Performer, felt: dict[int, float], sweep: Iterator[int]) -> int | None:
     """Returns the place to feel next, None where enough is felt."""
     if p.hasty:
-      return self.notes.left(p.hand.tip_pos())
+      return self.notes.left()
     found = self._unsure(felt)
     return next(sweep, None) if found is None else found
 
@@ -214,7 +214,7 @@ class Palpate(Task):
     """
     chance = self._chance(felt)
     middle = chance @ self.places / chance.sum()
-    return int(np.linalg.norm(self.places - middle, axis=1).argmin())
+    return nearest(self.places, middle)
 
   def _chance(self, felt: dict[int, float]) -> np.ndarray:
     more = np.array(list(felt.values())) - _soft(felt)

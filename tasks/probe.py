@@ -13,11 +13,11 @@ report (action `report` above 0.5) ends the episode, with success when the tip p
 or more within the tolerance of the inclusion. Reporting the best place without feeling succeeds in
 8 % of the episodes (8 mm), 6 to 7 % in `palpate_hard` (7 mm).
 Own observations: `field` (3,), from the tip to the field's middle [m]; `felt` (1,), share of the
-field that lies within 8 mm of where the probe has pressed with 0.1 N or more [-]; and what who
-searches knows of presses deeper than 2.8 mm: `unfelt` (3,), from the tip to a place that is left to
-feel, 0 without one [m]: beside the stiffest, if that is 1.6 times as stiff as what is soft, or else
-the nearest that is 14 mm from all that was felt; `left` (1,), 1 while there is one [-]; `expected`
-(3,), from the tip to where stiffness, force over depth, lets expect the inclusion [m].
+field that lies within 8 mm of where the probe has pressed with 0.1 N or more [-]; and what follows
+from the force over the depth of presses deeper than 2.8 mm: `left` (1,), 1 while a place is left to
+feel [-]; `target` (3,), from the tip to it [m]: beside the stiffest, if that is 1.6 times as stiff
+as what is soft, or else the nearest 14 mm or more from all that was felt; without one to where the
+inclusion is to be expected; `normal` (3,), of the surface there [-].
 Progress: 0.3 * felt; on the report 1 or 0.
 """
 

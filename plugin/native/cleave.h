@@ -20,7 +20,8 @@ constexpr double LIP = 16.0;  // cost of an edge of the skin at the mouth that i
 constexpr double LEAST = 0.3;  // edges that a path is deep at least for one to come apart all through
 constexpr double BESIDE = 0.75;  // edges of the skin from the sheet within which its vertices are at the mouth
 constexpr double MOUTH = 0.6;  // edges below the path down to which an edge of the skin is at the mouth
-constexpr double PAST = 0.2;  // edges of the skin beyond an end of the path up to which a face reaches
+// Edges of the skin beyond an end of the path up to which a face reaches, and a short path's.
+constexpr double PAST = 0.2, OVER = 0.8;
 constexpr double FINE = 1e4;  // of costs as whole numbers
 constexpr double MUCH = 1e9;
 constexpr double AROUND = 3.0;  // edges of the skin around the sheet in which vertices are looked at
@@ -113,8 +114,8 @@ PALPATE int cost_of(const S& m, const Measured& at, int face, double most) {
 
 // Finds the faces that part both sides, by a minimal cut, ascending.
 template <class S>
-PALPATE bool part_sides(const S& m, const Measured& at, const Sheet& sheet, double skin, Opening& o,
-                        Scratch& memory) {
+PALPATE bool part_sides(const S& m, const Measured& at, const Sheet& sheet, double skin, double over,
+                        Opening& o, Scratch& memory) {
   int *side = memory.numbers(m.ntet), *node = memory.numbers(m.ntet);
   if (memory.full) return false;
   int count = 0, nface = 0;
@@ -154,7 +155,7 @@ PALPATE bool part_sides(const S& m, const Measured& at, const Sheet& sheet, doub
       const double far = at.where[m.face_vert(f, k)].past;
       past = far > past ? far : past;
     }
-    if (past < PAST * skin) o.face[o.count++] = f;
+    if (past < over * skin) o.face[o.count++] = f;
   }
   return true;
 }
@@ -382,13 +383,15 @@ PALPATE int cleave(const F& f, const S& m, const Sheet& sheet, const Neohookean&
   double* rest = memory.values(3 * m.nvert);
   int* found = f.found.data;
   if (memory.full || !measure_all(m, sheet, f.edge, at, memory)) return FULL;
-  if (!part_sides(m, at, sheet, f.edge, o, memory)) return FULL;
-  if (!order_faces(m, at, o, memory)) return FULL;
-  const bool fits = fit(m, o, f.ntriangle, memory);
+  bool fits = false;
+  for (int k = 0; k < 2 && !o.nparting; ++k) {
+    const double over = k ? OVER : PAST;
+    if (!part_sides(m, at, sheet, f.edge, over, o, memory) || !order_faces(m, at, o, memory)) return FULL;
+    fits = fit(m, o, f.ntriangle, memory);
+  }
   found[FOUND_STOPPED] = o.stopped || !fits;
   if (memory.full) return FULL;
-  if (!fits || (!o.nparting && o.stopped)) return NOTHING;
-  if (!o.nparting) return NOTHING;
+  if (!fits || !o.nparting) return NOTHING;
   for (int i = 0; i < 3 * o.count; ++i) {
     const int v = m.face_vert(o.face[i / 3], i % 3);
     movers.put(v);

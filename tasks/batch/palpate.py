@@ -28,8 +28,6 @@ class PalpateState:
   tolerance: float  # of the report [m]
   radius: float  # of inclusions [m]
   center: wp.vec3  # of the field [m]
-  one: wp.vec3  # across the way to the trocar
-  two: wp.vec3
   places: Array(wp.vec3, ("nfield",))  # middles of its triangles [m]
   inclusion: Array(wp.vec3, ("nworld",))  # where it is [m]
   outward: Array(wp.vec3, ("nfield",))  # normals there
@@ -37,16 +35,25 @@ class PalpateState:
   touched: Array(wp.bool, ("nworld", "nfield"))
   noted: floats("nworld", "nfield")  # stiffness, 0 where nothing was felt [N/m]
   near: Array(wp.bool, ("nworld", "nfield"))  # what was felt
-  deepest: ints("nworld")  # of this press
+  last: ints("nworld")  # that was noted
   depth: floats("nworld")  # there [m]
-  side: ints("nworld")  # of what is stiff, that is left to feel, -1 without one
-  stiff: Array(wp.bool, ("nworld",))  # whether something is
+  next: ints("nworld")  # to feel, -1 without one
   likely: Array(wp.vec3, ("nworld",))  # where the inclusion is to be expected [m]
   field: floats("nworld", 3)
   felt: floats("nworld", 1)
   left: floats("nworld", 1)
-  unfelt: floats("nworld", 3)
-  expected: floats("nworld", 3)
+  target: floats("nworld", 3)
+  normal: floats("nworld", 3)
+
+
+@wp.func
+def nearest(o: PalpateState, point: wp.vec3):
+  """Returns the place nearest to a point."""
+  k = wp.int32(0)
+  for i in range(o.places.shape[0]):
+    if wp.length_sq(o.places[i] - point) < wp.length_sq(o.places[k] - point):
+      k = i
+  return k
 
 
 @wp.func
@@ -55,16 +62,13 @@ def press(o: PalpateState, w: int, tip: wp.vec3, force: float):
   if force < _LEFT:
     o.depth[w] = 0.0
     return False
-  k = wp.int32(0)
-  for i in range(o.places.shape[0]):
-    if wp.length_sq(o.places[i] - tip) < wp.length_sq(o.places[k] - tip):
-      k = i
+  k = nearest(o, tip)
   depth = wp.dot(o.places[k] - tip, o.outward[k])
   if depth <= wp.max(o.depth[w], _DEEP):
     return False
   if o.depth[w] > 0.0:
-    o.noted[w, o.deepest[w]] = 0.0
-  o.deepest[w] = k
+    o.noted[w, o.last[w]] = 0.0
+  o.last[w] = k
   o.depth[w] = depth
   o.noted[w, k] = force / depth
   return True
@@ -83,6 +87,18 @@ def soft(o: PalpateState, w: int, count: int):
     if o.noted[w, i] > 0.0 and below == rank:
       return o.noted[w, i]
   return wp.float32(0.0)
+
+
+@wp.func
+def far(o: PalpateState, w: int):
+  """Returns of the places far from all that was felt the nearest to the last, -1 without one."""
+  found, least = wp.int32(-1), wp.float32(0.0)
+  for k in range(o.places.shape[0]):
+    away = wp.length_sq(o.places[k] - o.places[o.last[w]])
+    if not o.near[w, k] and (found < 0 or away < least):
+      found = k
+      least = away
+  return found
 
 
 @wp.func
@@ -105,8 +121,8 @@ def gain(o: PalpateState, w: int, k: int, soft: float):
   both, square = wp.float32(0.0), wp.float32(_LEAST)
   for j in range(o.places.shape[0]):
     if o.noted[w, j] > 0.0:
-      far = wp.length(o.places[j] - o.places[k]) / (_WIDTH * o.radius)
-      bell = wp.exp(-far * far)
+      ratio = wp.length(o.places[j] - o.places[k]) / (_WIDTH * o.radius)
+      bell = wp.exp(-ratio * ratio)
       both += bell * (o.noted[w, j] - soft)
       square += bell * bell
   both = wp.max(both, 0.0)
@@ -129,8 +145,11 @@ def summarise(o: PalpateState, w: int):
         if wp.length(o.places[i] - o.places[j]) < _APART:
           o.near[w, i] = True
   least = soft(o, w, count)
-  o.stiff[w] = o.noted[w, top] > _STIFF * least
-  o.side[w] = side(o, w, top)
+  o.next[w] = wp.int32(-1)
+  if o.noted[w, top] <= _STIFF * least:
+    o.next[w] = far(o, w)
+  if o.next[w] < 0:
+    o.next[w] = side(o, w, top)
   best = wp.float32(0.0)
   for k in range(o.places.shape[0]):
     best = wp.max(best, gain(o, w, k, least))
@@ -150,8 +169,6 @@ def begin(s: Common, o: PalpateState):
     return
   o.felt[w, 0] = 0.0
   o.depth[w] = 0.0
-  o.stiff[w] = False
-  o.side[w] = -1
   middle = wp.vec3()
   for k in range(o.places.shape[0]):
     o.touched[w, k] = False
@@ -159,6 +176,8 @@ def begin(s: Common, o: PalpateState):
     o.noted[w, k] = 0.0
     middle += o.places[k] / float(o.places.shape[0])
   o.likely[w] = middle
+  o.last[w] = nearest(o, middle)
+  o.next[w] = o.last[w]
 
 
 @wp.kernel(enable_backward=False)
@@ -190,32 +209,19 @@ def advance(s: Common, o: PalpateState):
   judge(s, w, found, outcome)
 
 
-@wp.func
-def aside(o: PalpateState, k: int, tip: wp.vec3):
-  """Returns the square of how far a place is from the tip, seen along the way to the trocar."""
-  offset = o.places[k] - tip
-  one, two = wp.dot(o.one, offset), wp.dot(o.two, offset)
-  return one * one + two * two
-
-
 @wp.kernel(enable_backward=False)
 def observe(s: Common, o: PalpateState, beginning: bool):
-  """Writes field, left, unfelt and expected; `advance` wrote felt."""
+  """Writes field, left, target and normal; `advance` wrote felt."""
   w = wp.tid()
   if beginning and not s.begun[w]:
     return
   tip = vector(s.tip_pos, w)
   put(o.field, w, o.center - tip)
-  put(o.expected, w, o.likely[w] - tip)
-  left = wp.int32(-1)
-  for k in range(o.places.shape[0]):
-    if not o.near[w, k]:
-      if left < 0 or aside(o, k, tip) < aside(o, left, tip):
-        left = k
-  if o.stiff[w] or left < 0:
-    left = o.side[w]
-  o.left[w, 0] = wp.where(left < 0, 0.0, 1.0)
-  put(o.unfelt, w, wp.where(left < 0, wp.vec3(), o.places[wp.max(left, 0)] - tip))
+  left = o.next[w] >= 0
+  o.left[w, 0] = wp.where(left, 1.0, 0.0)
+  goal = wp.where(left, o.places[wp.max(o.next[w], 0)], o.likely[w])
+  put(o.target, w, goal - tip)
+  put(o.normal, w, o.outward[nearest(o, goal)])
 
 
 class Palpate(domain.Domain):
@@ -241,8 +247,7 @@ class Palpate(domain.Domain):
     """Returns what else all worlds share."""
     beside = feeling.beside(task.places, task.up)
     told = {"places": task.places, "outward": task.outward, "beside": beside}
-    one, two = (wp.vec3(*way) for way in feeling.across(task.up))
-    return told | {"center": wp.vec3(*task.center), "one": one, "two": two}
+    return told | {"center": wp.vec3(*task.center)}
 
   @staticmethod
   def draw(task: Any, physics):

@@ -7,7 +7,8 @@ pinned at its long sides, is cut by a blade at 80 mm/s, by scissors that close, 
 at 14 mm/s, or by `Organ.cut`, two edges at a time; the same sheet is pressed by a ball, with room
 for cuts and without. All three are stepped in turn. CPU time of the process; `open` are the steps
 in which the mesh came apart (with `Organ.cut` the call, and the step after it), `between` the
-others.
+others. A solid, a block of 30 mm of the same tissue, is cut and pressed in the same way, 6 mm deep;
+`nodes` are those on its surface.
 """
 
 import argparse
@@ -28,6 +29,8 @@ ENERGY, BURN, THICKNESS = 40.0, 1.1e6, 2e-3  # [J/m^2], of a current, of the wal
 SLIDE, CAPSULE = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtGeom.mjGEOM_CAPSULE
 FREE = {"contype": 0, "conaffinity": 0}
 TOOLS = ("blade", "scissors", "hook", "Organ.cut")
+TISSUES = ("membrane", "plate", "solid")
+DEEP, BLOCK = 6e-3, 0.03  # how deep solids are cut, and how thick they are [m]
 SPEED = {"blade": 0.08, "hook": 0.014}  # [m/s]
 STEPS = 900  # at most
 PIECE = 2.3  # edges that `Organ.cut` cuts at a time
@@ -41,11 +44,24 @@ def _blade(spec, radius: float, half: float):
   body.add_geom(name="edge", type=CAPSULE, size=[radius, half, 0], mass=1e-3, **FREE)
 
 
-def scene(nodes: int, tool: str, bend: float):
-  """Returns model, data and organ of a sheet and what cuts it, or a ball that presses it."""
+def _organ(nodes: int, tissue: str):
+  """Returns points, triangles and the pinned ones, and what else an organ is given."""
+  if tissue == "solid":
+    area = 2 * (LENGTH * WIDTH + (LENGTH + WIDTH) * BLOCK)
+    points, elem = scenes.box((LENGTH, WIDTH, BLOCK), np.sqrt(area / nodes))
+    points += [LENGTH / 2, 0, -BLOCK / 2]
+    pin = np.flatnonzero(points[:, 2] < 1e-9 - BLOCK)
+    return points, elem, pin, {"elements": "solid", "mass": 0.45, "young": 2e5}
   nx = round(np.sqrt(nodes * LENGTH / WIDTH * 0.87))
   points, elem = scenes.triangular(LENGTH, WIDTH, nx, round(nx * WIDTH / LENGTH / 0.866), 0.2)
   pin = np.flatnonzero(np.abs(np.abs(points[:, 1]) - WIDTH / 2) < 1e-9)
+  more = {"mass": 0.05, "young": 2e5, "thickness": THICKNESS, "bend": float(tissue == "plate")}
+  return points, elem, pin, more
+
+
+def scene(nodes: int, tool: str, tissue: str):
+  """Returns model, data and organ of a sheet or block, and what cuts it or a ball on it."""
+  points, elem, pin, more = _organ(nodes, tissue)
   spec = mujoco.MjSpec()
   spec.option.timestep, spec.option.gravity = H, (0, 0, 0)
   keys = {"spare": "auto"}
@@ -69,8 +85,10 @@ def scene(nodes: int, tool: str, bend: float):
     scenes.servo(spec, "z", 2000)
     body.add_geom(size=[0.008, 0, 0], mass=0.1)
     keys = {} if tool == "plain" else keys
-  palpate.add_organ(spec, (points, elem), "organ", windows=True, mass=0.05, young=2e5, pin=pin,
-                    thickness=THICKNESS, bend=bend, device="cpu", **keys)  # fmt: skip
+  if keys and tissue == "solid":
+    keys["spare"] = 900
+  more |= {"windows": True, "pin": pin, "device": "cpu", **keys}
+  palpate.add_organ(spec, (points, elem), "organ", **more)
   model = spec.compile()
   data = mujoco.MjData(model)
   return model, data, palpate.Organ(model, data, "organ")
@@ -82,7 +100,7 @@ def _spent(work) -> float:
   return 1e3 * (time.process_time() - start)
 
 
-def _cuts(model, data, organ, tool: str):
+def _cuts(model, data, organ, tool: str, tissue: str):
   """Yields functions, each of which takes a step with the tool."""
 
   def step():
@@ -104,8 +122,10 @@ def _cuts(model, data, organ, tool: str):
         yield step
   else:
 
+    depth = DEEP if tissue == "solid" else None
+
     def cut(line):
-      organ.cut(line)
+      organ.cut(line, depth=depth)
       step()
 
     edge = organ.xpos0[organ.elem]
@@ -116,16 +136,16 @@ def _cuts(model, data, organ, tool: str):
         yield step
 
 
-def measure(nodes: int, tool: str, bend: float) -> dict:
-  """Returns medians of steps of the three sheets, in ms."""
-  cutting, touched, plain = (scene(nodes, name, bend) for name in (tool, "ball", "plain"))
+def measure(nodes: int, tool: str, tissue: str) -> dict:
+  """Returns medians of steps of the three sheets or blocks, in ms."""
+  cutting, touched, plain = (scene(nodes, name, tissue) for name in (tool, "ball", "plain"))
   for model, data, _ in (touched, plain):
     for k in range(150):
       data.ctrl[0] = -0.012 * min(1.0, k / 100)
       mujoco.mj_step(model, data)
   spent, opened = {"cut": [], "touched": [], "plain": []}, []
   model, data, organ = cutting
-  for k, work in enumerate(_cuts(model, data, organ, tool)):
+  for k, work in enumerate(_cuts(model, data, organ, tool, tissue)):
     before = len(organ.cuts)
     spent["cut"].append(_spent(work))
     opened.append(len(organ.cuts) > before)
@@ -138,7 +158,7 @@ def measure(nodes: int, tool: str, bend: float) -> dict:
   return {
     "nodes": touched[2].nvert,
     "tool": tool,
-    "bend": bend,
+    "tissue": tissue,
     "cuts": int(opened.sum()),
     "contacts": touched[1].ncon,
     "plain_ms": float(np.median(spent["plain"])),
@@ -158,20 +178,22 @@ def stages(args: argparse.Namespace) -> list[list[Case]]:
   nodes = args.nodes[:1] if args.short else args.nodes
   return [
     [
-      {"case": f"{n}-{tool}-{bend}", "nodes": n, "tool": tool, "bend": bend}
-      for n, bend, tool in itertools.product(nodes, (0, 1), TOOLS)
+      {"case": f"{n}-{tool}-{tissue}", "nodes": n, "tool": tool, "tissue": tissue}
+      for n, tissue, tool in itertools.product(nodes, args.tissues, TOOLS)
+      if tissue != "solid" or tool in ("blade", "Organ.cut")  # others reach less than such meshes
     ]
   ]
 
 
 def run(case: Case, out: pathlib.Path) -> list[Row]:
   """Returns the row of a case."""
-  return [measure(case["nodes"], case["tool"], case["bend"])]
+  return [measure(case["nodes"], case["tool"], case["tissue"])]
 
 
 def arguments(parser: argparse.ArgumentParser):
   """Declares the options."""
   parser.add_argument("--nodes", type=int, nargs="+", default=[1000, 4000])
+  parser.add_argument("--tissues", nargs="+", choices=TISSUES, default=TISSUES)
 
 
 def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
@@ -181,7 +203,7 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
     [
       str(row["nodes"]),
       row["tool"],
-      "plate" if row["bend"] else "membrane",
+      row["tissue"],
       str(row["cuts"]),
       *(f"{row[f'{name}_ms']:.2f}" for name in names),
       f"{row['ratio']:.2f}",

@@ -23,40 +23,41 @@ def pressed(*presses):
 def test_a_press_is_noted_where_it_was_deepest_and_what_is_far_is_left():
   notes = pressed((0, 0, 0.4))
   assert list(notes.felt().values()) == pytest.approx([100.0])
-  far = np.linalg.norm(GRID[notes.left(np.zeros(3))])
+  far = np.linalg.norm(GRID[notes.left()])
   assert 0.014 <= far < 0.017  # the nearest of those that are not felt with the first
   notes.press(np.array([0.0, 0.016, -0.001]), 0.2)  # too light to tell
   assert len(notes.felt()) == 1
   all_of_it = [(x, y, 0.2) for x in (-3, -1, 1, 3) for y in (-3, -1, 1, 3)]
-  assert pressed(*all_of_it).left(np.zeros(3)) is not None  # beside the stiffest
+  assert pressed(*all_of_it).left() is not None  # beside the stiffest
   sides = [(x, y, 0.2) for x, y in ((-3, -2), (-2, -3))]
-  assert pressed(*all_of_it, *sides).left(np.zeros(3)) is None
+  assert pressed(*all_of_it, *sides).left() is None
 
 
 def test_what_is_stiff_is_felt_around_and_expected_in_the_middle():
   stiff = [(1, 0, 0.4), (-2, -2, 0.2), (-2, 2, 0.2)]
   asked = []
   for force in (0.39, 0.3, 0.35, 0.3):
-    side = GRID[pressed(*stiff).left(np.zeros(3))] / 0.008
+    side = GRID[pressed(*stiff).left()] / 0.008
     asked.append(tuple(np.round(side[:2]).astype(int)))
     stiff.append((*asked[-1], force))
   assert sorted(asked) == [(0, 0), (1, -1), (1, 1), (2, 0)]
   notes = pressed(*stiff)
-  assert notes.left(np.zeros(3)) is None
+  assert notes.left() is None
   np.testing.assert_allclose(notes.expected(0.012), (0.008, 0, 0), atol=0.003)
   lone = pressed((3, 3, 0.4), (-3, -3, 0.2))
-  assert len({lone.left(np.zeros(3)), *map(int, lone.beside[len(GRID) - 1])} - {-1}) == 2
+  assert len({lone.left(), *map(int, lone.beside[len(GRID) - 1])} - {-1}) == 2
 
 
-def test_what_an_exercise_tells_of_what_was_felt_is_from_the_tip():
-  env = tasks.load("probe", "palpate_easy", task_kwargs={"random": 2, "surroundings": "none"})
-  timestep, act = env.reset(), lessons.Teacher(env)
-  seen = timestep.observation
-  place = first = seen["tip_pos"] + seen["unfelt"]
-  np.testing.assert_allclose(seen["expected"], env.task.places.mean(axis=0) - seen["tip_pos"])
-  while np.allclose(place, first, atol=1e-9):
-    timestep = env.step(act(timestep))
+def test_an_exercise_tells_where_to_feel_next_and_in_the_end_where_to_report():
+  env = tasks.load("probe", "palpate_easy", task_kwargs={"random": 9, "surroundings": "none"})
+  timestep, act, asked = env.reset(), lessons.Teacher(env), []
+  while not timestep.last():
     seen = timestep.observation
-    place = seen["tip_pos"] + seen["unfelt"]
-  assert np.linalg.norm(place - first) >= 0.014
-  assert np.linalg.norm(seen["contact_force"]) > 0.1 and seen["left"] == 1
+    place = seen["tip_pos"] + seen["target"]
+    if not asked or not np.allclose(place, asked[-1], atol=1e-9):
+      asked.append(place)
+      assert not seen["contact_force"].any() or np.linalg.norm(seen["contact_force"]) > 0.1
+    timestep = env.step(act(timestep))
+  assert env.task.outcome == "success" and seen["left"] == 0
+  assert np.linalg.norm(asked[1] - asked[0]) > 0.007
+  assert np.linalg.norm(asked[-1] - env.task.inclusion) < env.task.tolerance
