@@ -174,9 +174,7 @@ class Cuts:
 
   # Cutting.
 
-  def find(
-    self, world: int, points: np.ndarray, motion: Motion, k: int, *how
-  ) -> cutting.Cut:
+  def find(self, world: int, points: np.ndarray, motion: Motion, k: int, *how) -> cutting.Cut:
     """Returns what a cut along points in the organ's frame, (n, 3) [m], makes of a world.
 
     Args:

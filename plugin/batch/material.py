@@ -50,7 +50,7 @@ class Material:
     self._most = np.ones(nworld)  # greatest factor of a triangle
     self._lumps: Lumps | None = None
     self._graded = False
-    self._stiffest = 1.0, config.poisson  # what the step is for: multiple of young, and poisson
+    self._hardest = 1 + self._squeeze(config.poisson)  # of a world that the step is for
 
   def change(self, worlds: np.ndarray, rows: dict[str, np.ndarray]):
     """Changes worlds; `rows` has a value of each key for each of them."""
@@ -88,20 +88,25 @@ class Material:
 
   def _moduli(self, worlds: np.ndarray) -> dict[str, np.ndarray]:
     """Returns the scales of mu, lambda' and the plate's rigidity."""
-    config, solid = self._organ.config, self._organ.body.is_solid
+    config = self._organ.config
     scale, nu, thick = (self._worlds[key][worlds] for key in ("scale", "poisson", "thickness"))
     thick, nu0 = thick / config.thickness, config.poisson
-    squeeze, squeeze0 = (x / ((1 + x) * (1 - 2 * x) if solid else 1 - x**2) for x in (nu, nu0))
+    squeeze, squeeze0 = self._squeeze(nu), self._squeeze(nu0)
     if squeeze0 == 0 and squeeze.any():
       raise ValueError(
         f"organ {self._organ.name!r}: poisson was compiled as 0, which cannot change in a batch "
         "on a GPU"
       )
-    plate = {} if solid else {"plate": scale * thick**3}  # that of a solid's skin stays
+    # The plate of a solid is its skin's, which stays.
+    plate = {} if self._organ.body.is_solid else {"plate": scale * thick**3}
     return plate | {
       "shear": scale * thick * (1 + nu0) / (1 + nu),
       "lame": scale * thick * (squeeze / squeeze0 if squeeze0 else 1.0),
     }
+
+  def _squeeze(self, nu):
+    """Returns lambda, or lambda' of a shell, over Young's modulus."""
+    return nu / ((1 + nu) * (1 - 2 * nu) if self._organ.body.is_solid else 1 - nu**2)
 
   def _stiffen(self, worlds: np.ndarray, rows: dict[str, np.ndarray]):
     """Takes Young's modulus, of the whole or of each triangle."""
@@ -155,15 +160,15 @@ class Material:
     m = mjstruct.Model.from_address(self._batch.model._address)
     self._find_inertia(m)
     organ.patch.grade.assign(np.log2(scale / own["mass"] / GRADES[0]).astype(np.float32))
-    stiffest = float(high), float(own["poisson"].max())
-    if any(now > before for now, before in zip(stiffest, self._stiffest, strict=True)):
-      self._stiffest = stiffest
-      self._follow(m)
+    most, nu = scale * self._most, own["poisson"]
+    hard = most * (1 + self._squeeze(nu))
+    if hard.max() > self._hardest:
+      self._hardest, k = hard.max(), int(np.argmax(hard))
+      self._follow(m, *self._scaled(float(most[k]), float(nu[k])))
 
-  def _follow(self, m):
+  def _follow(self, m, body: Body, config: Config):
     """Lets the step be one for the stiffest world."""
     organ = self._organ
-    body, config = self._scaled(*self._stiffest)
     newton = max(organ.body.newton, inertia.iterations(m, organ.space.organ, config))
     stiff = bool(organ.patch.stiff)
     if not stiff and organ.responds:

@@ -141,11 +141,12 @@ PALPATE M3 mean_stress(const float* stress, const int* node, V& pressure, Lane l
 }
 
 // How far a tetrahedron is crushed, turned inside out or drawn long, 0 to 1: by its volume over that of a cube
-// of as long edges, which is 1 after a rotation.
+// of edges about as long, which is 1 after a rotation.
 constexpr float CRUSHED = 0.5f;
 PALPATE V crushed(V volume, V size2) {
-  const V edge = vmax(size2 / 3.0f, splat(1.0f)), zero = splat(0.0f);
-  return vmin(vmax(1.0f - volume / (CRUSHED * edge * vsqrt(edge)), zero), splat(1.0f));
+  const V edge2 = vmax((1.0f / 3.0f) * size2, splat(1.0f)), cube = (0.5f * CRUSHED) * edge2 * (1.0f + edge2);
+  const V less = cube - volume;
+  return any_above(less, 0.0f) ? vmin(vmax(less, splat(0.0f)) / cube, splat(1.0f)) : splat(0.0f);
 }
 constexpr float LINGERS = 2.0f;  // time steps of damping that it then has besides
 

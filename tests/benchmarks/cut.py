@@ -60,7 +60,7 @@ def _organ(nodes: int, tissue: str):
 
 
 def scene(nodes: int, tool: str, tissue: str):
-  """Returns model, data and organ of a sheet or block, and what cuts it or presses it."""
+  """Returns model, data and organ of a sheet or block, and what cuts it or a ball on it."""
   points, elem, pin, more = _organ(nodes, tissue)
   spec = mujoco.MjSpec()
   spec.option.timestep, spec.option.gravity = H, (0, 0, 0)

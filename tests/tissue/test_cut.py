@@ -164,6 +164,7 @@ def test_a_refilled_body_is_one_made_anew_to_the_bit(kind, device):
   copy = surface.WorkingCopy(mesh)
   filler = refill.Refill(body, copy)
   first = fields(body)
+  assert first["fan_width"][-1] == 0 < first["fan_width"][0]  # rows of what waits are left out
   r, knife = np.random.RandomState(1), cutting.Knife(copy)
   for _ in range(4):
     ends = points[r.choice(np.arange(10, len(points)), 2, replace=False)]
@@ -198,6 +199,21 @@ def fields(body):
       if hasattr(var.type, "dtype"):
         out[name] = getattr(struct, name).numpy().copy()
   return out
+
+
+def test_what_comes_apart_behind_a_blade_ends_near_a_vertex():
+  mesh = sheet(30)
+  finder, edge = paths.Finder(surface.WorkingCopy(mesh)), mesh.edge_length
+  start = mesh.rest[mesh.nouter // 2]
+  path = start + edge * np.linspace(0, 2, 6)[:, None] * [1.0, 0.1, 0.0]
+  part, rest = finder.stops.part(mesh, path)
+  assert np.array_equal(np.concatenate([part[:-1], rest]), path)
+  length = np.linalg.norm(np.diff(part, axis=0), axis=1).sum()
+  assert 0.9 * edge <= length * (1 + 1e-9) and length < (2 * np.hypot(1, 0.1) - 0.3) * edge
+  near = np.linalg.norm(mesh.rest[: mesh.nouter] - part[-1], axis=1).min()
+  other = np.linalg.norm(mesh.rest[: mesh.nouter] - path[3], axis=1).min()
+  assert near < min(other, 0.4 * edge)
+  assert not len(finder.stops.part(mesh, path[:2])[0])  # too short
 
 
 def test_uneven_strain_does_not_rise_by_moving_vertices():
