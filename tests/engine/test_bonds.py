@@ -141,7 +141,7 @@ def test_a_pull_frees_an_organ_from_another(scenes):
   model, data, upper, lower = _two(scenes, (0, 0, 0), bonds=f"lower 1e6 1e3 {energy} near 0.002")
   grip = lower.attach(np.flatnonzero(lower.xpos0[:, 2] < -0.0305), "hand")
   shares = []
-  for _ in range(600):
+  for _ in range(750):
     data.mocap_pos[0, 2] -= 2e-5
     mujoco.mj_step(model, data)
     shares.append(upper.bonds.share_freed)
