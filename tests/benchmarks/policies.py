@@ -103,16 +103,16 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
           "time of a success [s]", "ends otherwise", "successes over a limit",
           "side by side"]  # fmt: skip
   table = [
-    [*(_line(name, groups[name]) if name in groups else [name, *"--------"]), many.get(name, "-")]
+    [*(_line(name, groups[name]) if name in groups else _untried(name)), many.get(name, "-")]
     for name in NAMES
   ]
-  times = [float(groups[name][0]["train_s"]) for name in NAMES if name in groups]
+  times = [float(line[2]) for line in table if line[2] != "-"]
   lines = [*(__doc__ or "").split("\n\n", 1)[1].splitlines(), ""]
   lines += [
-    f"{len(groups)} of {len(NAMES)} exercises have one; training took {np.median(times):.0f} s in "
+    f"{len(times)} of {len(NAMES)} exercises have one; training took {np.median(times):.0f} s in "
     "the median. Proficient is by the experts' limits, of all episodes; over a limit are named the "
     "three metrics that most are over. Who began with another's policy has not counted the time of "
-    f"that one's training. {results.link(out / 'policies.csv')}",
+    f"that one's training: with 0 lessons it is that one. {results.link(out / 'policies.csv')}",
     "", *plots.table(head, table),
   ]  # fmt: skip
   return [results.page(out / "policies.md", "Policies that were trained", about, lines)]
@@ -131,6 +131,16 @@ def _line(name: str, rows: list[Row]) -> list[str]:
     ", ".join(f"{end} {count}" for end, count in sorted(ends.items())) or "-",
     ", ".join(f"{metric.replace('_', ' ')} {n}" for metric, n in over.most_common(3)) or "-",
   ]  # fmt: skip
+
+
+def _untried(name: str) -> list[str]:
+  """Returns the line of an exercise that has no rows."""
+  try:
+    training = policy.shipped(name).about.training
+  except ValueError:
+    return [name, *"--------"]
+  told = [str(training.get("lessons", 0)), f"{training.get('seconds', 0):.0f}"]
+  return [name, *told, training.get("from", "-").removesuffix(policy.SUFFIX), "not judged", *"----"]
 
 
 BENCH = Bench("policies", stages, run, report=report, arguments=arguments, jobs=1)
