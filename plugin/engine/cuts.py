@@ -249,7 +249,7 @@ class Cuts:
   def cut_at_rest(self, points: np.ndarray, given: float) -> Report:
     """Cuts a surface along points on it at rest, in its frame, (n, 3) [m]."""
     self.follow()
-    return self._end(self._knife.cut(*self._state(points), given, at_rest=True))
+    return self._end(self._knife.cut(*self._state(points), given=given, at_rest=True))
 
   def _end(self, found: Any) -> Report:
     """Takes over what was found, and says what it is."""
@@ -288,7 +288,7 @@ class Cuts:
         f"organ {self._w.organ.name!r}: depth or direction is set, allowed only with "
         "elements='solid'"
       )
-    return self._knife.cut(*self._state(points, motion), given)
+    return self._knife.cut(*self._state(points, motion), given=given)
 
   def _state(self, points: np.ndarray, motion: cutting.Motion | None = None) -> tuple:
     """Returns what `Knife.cut` is told of the organ."""

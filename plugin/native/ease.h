@@ -11,7 +11,7 @@
 
 namespace palpate {
 
-constexpr int CONJUGATE = 20, SEARCHES = 4;
+constexpr int CONJUGATE = 60, SEARCHES = 4;
 constexpr double AMPLE = 1.001;  // times what is wanted that is asked for
 constexpr double FARTHEST = 4.0;  // times the way of a vertex that gives way alone
 

@@ -213,8 +213,7 @@ class Cleaver:
     fields.before, fields.after = sheet.more
     fields.nouter, fields.ntriangle = mesh.nouter, mesh.nelem
     fields.energy, fields.given = int(config is not None), given
-    held = config is not None and not config.carrier
-    fields.foundation = config.foundation if held else 0.0
+    fields.foundation = 0.0 if config is None or config.carrier else config.foundation
     if config is not None and config != self._config:
       host["mu"][:], host["lam"][:] = solid.moduli(mesh, config)
       self._config = config
@@ -240,7 +239,7 @@ class Cleaver:
 
   def _answer(self, organ: str, mesh: Mesh, motion: Motion) -> Cut:
     host = self._host
-    found = dict(zip(_FOUND, host["found"].tolist(), strict=True))
+    found: dict[str, int] = dict(zip(_FOUND, host["found"].tolist(), strict=True))
     bad, area, depth, deviation = host["size"].tolist()
     status, stopped = found["status"], bool(found["stopped"])
     none = np.zeros(0, int)
