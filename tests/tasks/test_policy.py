@@ -114,7 +114,8 @@ def test_policies_that_come_along_are_small_and_of_their_exercise():
     about = policy.load(path).about
     domain, task = about.task.split("/")
     assert path.stem == f"{domain}_{task}" and task in registry.TASKS[domain]
-    assert path.stat().st_size < 150_000 and about.training["lessons"] > 0
+    assert path.stat().st_size < 150_000
+    assert about.training["lessons"] or about.training["from"]  # of another level
 
 
 @pytest.mark.parametrize(
