@@ -106,10 +106,11 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
     [*(_line(name, groups[name]) if name in groups else _untried(name)), many.get(name, "-")]
     for name in NAMES
   ]
-  times = [float(line[2]) for line in table if line[2] != "-"]
+  times = [float(line[2]) for line in table if line[1] not in ("-", "0")]
+  count = sum(line[1] != "-" for line in table)
   lines = [*(__doc__ or "").split("\n\n", 1)[1].splitlines(), ""]
   lines += [
-    f"{len(times)} of {len(NAMES)} exercises have one; training took {np.median(times):.0f} s in "
+    f"{count} of {len(NAMES)} exercises have one; training took {np.median(times):.0f} s in "
     "the median. Proficient is by the experts' limits, of all episodes; over a limit are named the "
     "three metrics that most are over. Who began with another's policy has not counted the time of "
     f"that one's training: with 0 lessons it is that one. {results.link(out / 'policies.csv')}",
