@@ -153,7 +153,7 @@ class Palpate(Task):
       "felt": np.array([self.felt()]),
       "left": np.array([float(left is not None)]),
       "target": goal - tip,
-      "normal": self.outward[nearest(self.places, goal)],
+      "normal": self.outward[nearest(self.places, goal)].copy(),
     }
 
   def expert(self, p: Performer) -> Script:
