@@ -14,7 +14,7 @@ import warp as wp
 
 from . import faces, solid
 from .config import Config
-from .cut import Motion
+from .cut import Apart, Motion, listed
 from .kernels import aim, kernel
 from .mesh import Mesh, distinct, lengths
 from .order import addresses
@@ -104,43 +104,19 @@ _CONSTANTS = CONSTANTS | _NUMBERS | {"OWN_SHARE": OWN_SHARE}
 _cleave = kernel("cleave_solid", "cleave.h", Cleaving, _CONSTANTS)
 
 
-@dataclasses.dataclass(frozen=True)
-class Cut:
-  """What came of a path.
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Cut(Apart):
+  """What came of a path in a solid; the path's edges are those of the skin.
 
   Attributes:
-    mesh: the solid, cut
-    motion: what its vertices carry, until the next cut
-    moved: how many vertices lie elsewhere at rest
-    near: vertices that move on otherwise                          (n,)
-    changed: tetrahedra that are not as they were, ascending       (n,)
-    group: vertices that were one, which                           (m,)
-    member: those vertices, old and new                            (m,)
-    share: their parts of its mass, by volume                      (m,)
     seat: of each member, a corner that it has, see `faces.restored`  (m,)
-    path: the edges on the skin that came apart at rest [m]        list of (2, 3)
-    length: of these [m]
     area: of the opened faces, one of each pair, at rest [m^2]
     depth: how far they go below the skin, along the sheet, at most [m]
-    deviation: greatest distance of the path's vertices from it [m]
-    stopped: whether there were too few spare vertices or triangles
   """
 
-  mesh: Mesh
-  motion: Motion
-  moved: int
-  near: np.ndarray
-  changed: np.ndarray
-  group: np.ndarray
-  member: np.ndarray
-  share: np.ndarray
   seat: np.ndarray
-  path: list[np.ndarray]
-  length: float
   area: float
   depth: float
-  deviation: float
-  stopped: bool
 
 
 class Cleaver:
@@ -244,9 +220,10 @@ class Cleaver:
     status, stopped = found["status"], bool(found["stopped"])
     none = np.zeros(0, int)
     if status == _NOTHING and stopped:
-      whole = (none, none, none, none, np.zeros(0), none)
-      return Cut(mesh, motion, 0, *whole, path=[], length=0.0, area=0.0, depth=0.0, deviation=0.0,
-                 stopped=True)  # fmt: skip
+      empty = dict.fromkeys(("near", "changed", "group", "member", "seat"), none)
+      size = dict.fromkeys(("length", "area", "depth", "deviation"), 0.0)
+      return Cut(mesh=mesh, motion=motion, moved=0, share=np.zeros(0), path=[], stopped=True,
+                 **empty, **size)  # fmt: skip
     if status == _NOTHING:
       raise ValueError(
         f"organ {organ!r}: no tetrahedra come apart along the path, expected a longer or deeper "
@@ -262,11 +239,7 @@ class Cleaver:
     key = distinct(ends[:, 0] * mesh.nvert + ends[:, 1])
     new = self._take(mesh, found["triangles"])
     path = new.rest[np.stack([key // mesh.nvert, key % mesh.nvert], axis=1)]
-    parts = {"group": "split", "member": "split", "sat": "split"}
-    lists = {
-      name: host[name][: found[parts.get(name, name)]].astype(int)
-      for name in ("near", "changed", *parts)
-    }
+    lists = listed(host, found, {"group": "split", "member": "split", "sat": "split"})
     lists["seat"] = lists.pop("sat")
     return Cut(
       mesh=new,

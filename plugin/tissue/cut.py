@@ -110,24 +110,23 @@ class Motion:
   vel: np.ndarray
 
 
-@dataclasses.dataclass(frozen=True)
-class Cut:
-  """What came of a path.
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Apart:
+  """What came of a path, of a surface or a solid: elements are triangles or tetrahedra.
 
   Attributes:
     mesh: the mesh, cut
     motion: what its vertices carry, until the next cut
     moved: how many vertices lie elsewhere at rest
-    near: vertices that move on otherwise, those that have come not among them (n,)
-    changed: triangles that are not as they were                        (n,)
-    before: corners that they had                                       (n, 3)
-    group: vertices that were one, of the first of each group           (m,)
-    member: those vertices, old and new                                 (m,)
-    share: their parts of its mass                                      (m,)
-    path: the cut edges, one after the other, at rest [m]               list of (k, 3)
-    length: of the cut edges at rest [m]
-    deviation: greatest distance of their vertices from the path [m]
-    stopped: whether there were too few spare vertices
+    near: vertices that move on otherwise                 (n,)
+    changed: elements that are not as they were           (n,)
+    group: vertices that were one, which                  (m,)
+    member: those vertices, old and new                   (m,)
+    share: their parts of its mass                        (m,)
+    path: the edges that came apart at rest [m]           list of (k, 3)
+    length: of these [m]
+    deviation: greatest distance of the path's vertices from it [m]
+    stopped: whether there was too little room
   """
 
   mesh: Mesh
@@ -135,7 +134,6 @@ class Cut:
   moved: int
   near: np.ndarray
   changed: np.ndarray
-  before: np.ndarray
   group: np.ndarray
   member: np.ndarray
   share: np.ndarray
@@ -143,6 +141,17 @@ class Cut:
   length: float
   deviation: float
   stopped: bool
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Cut(Apart):
+  """What came of a path on a surface; `near` is without the vertices that have come.
+
+  Attributes:
+    before: corners that the changed triangles had  (n, 3)
+  """
+
+  before: np.ndarray
 
 
 class Knife:
@@ -270,11 +279,8 @@ class Knife:
       )
 
   def _answer(self, mesh: Mesh, found: dict[Any, int]) -> Cut:
-    host, parts = self._host, {"before": "changed", "group": "split", "member": "split"}
-    lists = {
-      name: host[name][: found[parts.get(name, name)]].astype(int)
-      for name in ("near", "changed", *parts)
-    }
+    host = self._host
+    lists = listed(host, found, {"before": "changed", "group": "split", "member": "split"})
     if found["changed"]:
       closed = mesh.closed and not found["split"]
       mesh = self._copy.take(mesh, closed, bool(found["apart"]), found["nouter"])
@@ -290,6 +296,16 @@ class Knife:
       stopped=bool(found["stopped"]),
       **lists,
     )
+
+
+def listed(
+  host: dict[str, np.ndarray], found: dict[Any, int], parts: dict[str, str]
+) -> dict[str, np.ndarray]:
+  """Returns lists that native code has written, those of `parts` as long as others."""
+  return {
+    name: host[name][: found[parts.get(name, name)]].astype(int)
+    for name in ("near", "changed", *parts)
+  }
 
 
 def _lines(rest: np.ndarray, pairs: list[list[int]]) -> list[np.ndarray]:

@@ -69,12 +69,6 @@ def run(model, data, steps, z=0.0):
     mujoco.mj_step(model, data)
 
 
-def state(model, data):
-  out = np.zeros(mujoco.mj_stateSize(model, FULL))
-  mujoco.mj_getState(model, data, out, FULL)
-  return out
-
-
 @BOTH
 def test_an_organ_at_rest_stays_there_when_it_is_cut(windows, device):
   model, data = scene(sphere(), windows, foundation=1e4, device=device)
@@ -166,15 +160,15 @@ def test_state_copy_and_reset_have_the_cuts_to_the_bit(windows):
   run(model, data, 30, -0.03)
   organ.cut(cap())
   run(model, data, 10, -0.03)
-  saved, other = state(model, data), copy.copy(data)
+  saved, other = scenes.state(model, data), copy.copy(data)
   run(model, data, 15, -0.02)
-  goal = organ.xpos, state(model, data)
+  goal = organ.xpos, scenes.state(model, data)
   # A copy goes on alike, in turns with data that was never cut.
   third = mujoco.MjData(model)
   for _ in range(15):
     run(model, other, 1, -0.02)
     run(model, third, 1, -0.02)
-  assert np.array_equal(state(model, other), goal[1])
+  assert np.array_equal(scenes.state(model, other), goal[1])
   assert handle(model, third).nvert == len(sphere()[0])
   # So does the state, in this data after a reset, and in another.
   mujoco.mj_resetData(model, data)
@@ -182,14 +176,14 @@ def test_state_copy_and_reset_have_the_cuts_to_the_bit(windows):
   for each in (data, third):
     mujoco.mj_setState(model, each, saved, FULL)
     run(model, each, 15, -0.02)
-    assert np.array_equal(state(model, each), goal[1])
+    assert np.array_equal(scenes.state(model, each), goal[1])
     assert np.array_equal(handle(model, each).xpos, goal[0])
   # A healed organ moves as one that was never cut.
   fresh = mujoco.MjData(model)
   mujoco.mj_resetData(model, data)
   for each in (data, fresh):
     run(model, each, 20, -0.03)
-  assert np.array_equal(state(model, data), state(model, fresh))
+  assert np.array_equal(scenes.state(model, data), scenes.state(model, fresh))
 
 
 def test_models_that_were_copied_or_made_while_cut_have_the_whole_organ(tmp_path):
@@ -288,7 +282,7 @@ def test_a_state_of_another_model_or_with_other_cuts_is_refused():
   model, data = scene(sphere(), foundation=1e4)
   handle(model, data).cut(cap())
   run(model, data, 2)
-  damaged = state(model, data)
+  damaged = scenes.state(model, data)
   where = np.flatnonzero(damaged > 2.0**33)
   damaged[where[5]] += 1.0
   fresh = mujoco.MjData(model)

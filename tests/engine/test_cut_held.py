@@ -35,12 +35,6 @@ def make(request):
   return make
 
 
-def state(model, data):
-  out = np.zeros(mujoco.mj_stateSize(model, FULL))
-  mujoco.mj_getState(model, data, out, FULL)
-  return out
-
-
 def lift(model, data, speed, steps):
   for _ in range(steps):
     data.mocap_pos[0, 2] += speed * model.opt.timestep
@@ -79,7 +73,7 @@ def test_a_cut_keeps_the_damage_and_what_it_took(make):
   assert after.stored + organ.energy < 1.02 * stored
   np.testing.assert_allclose(after.force.sum(axis=0), pull, atol=0.03 * np.abs(pull).max())
   # And goes on the same from a state and in a copy, also after a reset.
-  saved, twin = state(model, data), copy.copy(data)
+  saved, twin = scenes.state(model, data), copy.copy(data)
   lift(model, data, 0.02, 40)
   goal, released = organ.xpos, organ.bonds.energy
   assert released > energy and organ.error is None
@@ -106,7 +100,7 @@ def test_ties_are_divided_by_a_cut_and_hold_both_sides(make):
   mujoco.mj_step(model, data, 400)
   cut = np.arange(len(scenes.triangular(0.08, 0.04, 16, 9)[0]), organ.nvert)
   assert len(cut) > 5 and organ.displacement[cut, 2].min() > 0.008
-  saved = state(model, data)
+  saved = scenes.state(model, data)
   mujoco.mj_step(model, data, 5)
   goal = organ.xpos
   mujoco.mj_resetData(model, data)

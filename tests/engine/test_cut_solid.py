@@ -47,12 +47,6 @@ def run(model, data, steps, z=0.0):
   mujoco.mj_step(model, data, steps)
 
 
-def state(model, data):
-  out = np.zeros(mujoco.mj_stateSize(model, FULL))
-  mujoco.mj_getState(model, data, out, FULL)
-  return out
-
-
 @BOTH
 def test_a_block_that_is_cut_through_falls_in_two(windows, device):
   points = block()[0]
@@ -84,25 +78,25 @@ def test_state_copy_and_reset_have_the_cuts_to_the_bit(windows):
   organ.cut(across(0.004), depth=0.02)
   run(model, data, 5, -0.03)
   organ.cut(across(-0.01))
-  saved, other, nvert = state(model, data), copy.copy(data), organ.nvert
+  saved, other, nvert = scenes.state(model, data), copy.copy(data), organ.nvert
   run(model, data, 10, -0.03)
-  goal = organ.xpos, state(model, data)
+  goal = organ.xpos, scenes.state(model, data)
   run(model, other, 10, -0.03)
-  assert np.array_equal(state(model, other), goal[1])
+  assert np.array_equal(scenes.state(model, other), goal[1])
   mujoco.mj_resetData(model, data)
   assert organ.nvert == len(block()[0]) and len(organ.pieces) == 1 and organ.cuts == ()
   third = mujoco.MjData(model)
   for each in (data, third):
     mujoco.mj_setState(model, each, saved, FULL)
     run(model, each, 10, -0.03)
-    assert np.array_equal(state(model, each), goal[1])
+    assert np.array_equal(scenes.state(model, each), goal[1])
     handle = palpate.Organ(model, each, "organ")
     assert np.array_equal(handle.xpos, goal[0]) and handle.nvert == nvert
   fresh = mujoco.MjData(model)
   mujoco.mj_resetData(model, data)
   for each in (data, fresh):
     run(model, each, 10, -0.03)
-  assert np.array_equal(state(model, data), state(model, fresh))
+  assert np.array_equal(scenes.state(model, data), scenes.state(model, fresh))
   damaged = saved.copy()
   damaged[np.flatnonzero(damaged > 2.0**33)[3]] += 1.0
   mujoco.mj_setState(model, data, damaged, FULL)

@@ -15,12 +15,6 @@ GRAVITY = (0, 0, -9.81)
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 
 
-def _state(model, data):
-  out = np.empty(mujoco.mj_stateSize(model, STATE))
-  mujoco.mj_getState(model, data, out, STATE)
-  return out
-
-
 # Repetition and state.
 
 
@@ -40,9 +34,9 @@ def test_forward_twice_changes_nothing(scenes, device):
   for _ in range(100):
     extra[1].ctrl[0] = -min(0.1 * extra[1].time, 0.008)
     mujoco.mj_forward(extra[0], extra[1])
-    before = _state(extra[0], extra[1])
+    before = scenes.state(extra[0], extra[1])
     mujoco.mj_forward(extra[0], extra[1])
-    np.testing.assert_array_equal(_state(extra[0], extra[1]), before)
+    np.testing.assert_array_equal(scenes.state(extra[0], extra[1]), before)
     out.append(scenes.run(extra[0], extra[1], 1, record=True)[0])
   # The constraint solver starts elsewhere after an extra forward: rounding of its tolerance.
   np.testing.assert_allclose(out, motion[0], rtol=0, atol=1e-6)
@@ -56,7 +50,7 @@ def test_a_restored_state_gives_the_same_motion_to_the_bit(scenes, restore):
   other = mujoco.MjData(model)
   if restore == "setState":
     scenes.run(model, other, 13)
-    mujoco.mj_setState(model, other, _state(model, data), STATE)
+    mujoco.mj_setState(model, other, scenes.state(model, data), STATE)
   elif restore == "copyData":
     mujoco.mj_copyData(other, model, data)
   elif restore == "copy":

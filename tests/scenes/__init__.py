@@ -21,7 +21,19 @@ from .documents import (
   world,
 )
 from .numbers import bodies, dofs, lump, masses, qposs, slot_bodies, slots, workspace
-from .running import Warnings, adrift, beside, drive, follow, grasp, load, motion, run, settle
+from .running import (
+  Warnings,
+  adrift,
+  beside,
+  drive,
+  follow,
+  grasp,
+  load,
+  motion,
+  run,
+  settle,
+  state,
+)
 from .specs import servo
 from .surfaces import RADIUS, sphere, strip, triangular
 
@@ -31,6 +43,6 @@ __all__ = [
   "RADIUS", "Warnings", "adrift", "ball", "beside", "bodies", "box", "contacts", "dofs", "drive",
   "flex", "follow", "force", "get", "grasp", "kernels", "load", "lump", "masses", "motion",
   "needs_cuda", "organ", "plugin", "press", "probed", "put", "qposs", "ridge", "run", "servo",
-  "settle", "slot_bodies", "slots", "sphere", "step", "strip", "triangular", "windowed",
+  "settle", "slot_bodies", "slots", "sphere", "state", "step", "strip", "triangular", "windowed",
   "workspace", "world",
 ]  # fmt: skip

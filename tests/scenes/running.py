@@ -127,3 +127,10 @@ class Warnings:
 
   def __exit__(self, *_):
     mujoco.set_mju_user_warning(None)
+
+
+def state(model, data, kind=mujoco.mjtState.mjSTATE_INTEGRATION):
+  """Returns mj_getState's numbers."""
+  out = np.zeros(mujoco.mj_stateSize(model, kind))
+  mujoco.mj_getState(model, data, out, kind)
+  return out
