@@ -258,8 +258,8 @@ class Cutters(Beside):
     """Returns where points of the rest shape are now, in the organ's frame, (n, 3)."""
     w, mesh = self._w, self._w.organ.mesh
     elem, weight, _ = w.cuts.finder.nearest(mesh, mesh.rest, path)
-    place = mesh.rest + w.phases.motion()[0]
-    return np.einsum("nk,nkj->nj", weight, place[mesh.elem[elem]])
+    vert = mesh.elem[elem]
+    return np.einsum("nk,nkj->nj", weight, mesh.rest[vert] + w.phases.motion()[0][vert])
 
   def read(self) -> list[Cutter]:
     """Returns what the cutters do."""

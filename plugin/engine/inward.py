@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from palpate.tissue.mesh import cross
 
 from . import mjstruct
 from .layout import BLADE, TRAIL
@@ -69,8 +70,9 @@ def direction(w, geom: int, axis: int, elem: int) -> np.ndarray:
     elem: triangle of its seat
   """
   organ, mesh = w.organ, w.organ.mesh
-  corner = (mesh.rest + w.phases.motion()[0])[mesh.elem[elem]]
-  normal = organ.frame @ np.cross(corner[1] - corner[0], corner[2] - corner[0])
+  vert = mesh.elem[elem]
+  corner = mesh.rest[vert] + w.phases.motion()[0][vert]
+  normal = organ.frame @ cross(corner[1] - corner[0], corner[2] - corner[0])
   normal /= np.linalg.norm(normal)
   if geom < 0:
     return -normal
