@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from palpate.tissue.mesh import cross
+from palpate.tissue.mesh import cross, lengths
 
 from . import mjstruct
 from .layout import BLADE, TRAIL
@@ -32,7 +32,7 @@ def open_path(row: np.ndarray, edge: float, ended: bool, finder, cut):
   trail = row[BLADE.trail : BLADE.trail + 3 * count].reshape(-1, 3)
   path = np.vstack([trail, at])
   deep = np.append(row[BLADE.below : BLADE.below + count], row[BLADE.depth])
-  left = np.append(np.cumsum(np.linalg.norm(np.diff(path[::-1], axis=0), axis=1))[::-1], 0.0)
+  left = np.append(np.cumsum(lengths(path[:-1] - path[1:])[::-1])[::-1], 0.0)
   goes = path, np.maximum(deep, PIERCED)
   if not ended:
     goes = _until(*goes, left - _BEHIND * edge)
