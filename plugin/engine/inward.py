@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 from palpate.tissue.mesh import cross, lengths
 
-from . import mjstruct
 from .layout import BLADE, TRAIL
 
 PIERCED = 0.001  # how deep a blade is in a solid before it cuts along it [m]
 # Edges of a path that are cut again with what follows, since the end of a cut is not even, and that
 # stay whole behind the blade; and after which what could not come apart is tried again.
 _AGAIN, _BEHIND, _MORE = 1.0, 0.5, 0.5
+_SHUT = 1e-3  # angle of scissors under which they have no way to close [rad]
 _FLAT = 0.3  # cosine of a blade to the normal under which the cut goes along that
 
 
@@ -60,24 +60,23 @@ def open_path(row: np.ndarray, edge: float, ended: bool, finder, cut):
   return report, why
 
 
-def direction(w, geom: int, axis: int, elem: int) -> np.ndarray:
-  """Returns the unit vector along a blade into the tissue, in the world.
+def direction(organ, disp: np.ndarray, along: np.ndarray | None, elem: int) -> np.ndarray:
+  """Returns the unit vector along which a blade cuts into the tissue, in the world.
 
   Args:
-    w: workspace of the organ
-    geom: the blade, -1 for what cuts along the normal
-    axis: of the geom along which it is long
+    organ: its declaration
+    disp: displacements of its vertices [m]  (nvert, 3)
+    along: the blade's way, of either sign; None for what cuts along the normal
     elem: triangle of its seat
   """
-  organ, mesh = w.organ, w.organ.mesh
-  vert = mesh.elem[elem]
-  corner = mesh.rest[vert] + w.phases.motion()[0][vert]
+  vert = organ.mesh.elem[elem]
+  corner = organ.mesh.rest[vert] + disp[vert]
   normal = organ.frame @ cross(corner[1] - corner[0], corner[2] - corner[0])
   normal /= np.linalg.norm(normal)
-  if geom < 0:
+  size = 0.0 if along is None else np.linalg.norm(along)
+  if along is None or size < _SHUT:
     return -normal
-  m, d = mjstruct.Model.from_address(w.model), mjstruct.Data.from_address(w.data)
-  along = mjstruct.view(d.geom_xmat, (m.ngeom, 3, 3))[geom][:, axis]
+  along = along / size
   level = along @ normal
   return -normal if abs(level) < _FLAT else -np.sign(level) * along
 
