@@ -10,8 +10,7 @@ mujoco_warp's flex in one world, ours on the CPU in float64. A step's force is c
 its start and of its end, and the better one counts. Then all worlds go on from the press, each ball
 moved by 0.9 to 1 mm every five steps, and whole steps are timed, as replays of a CUDA graph.
 
-On CUDA the first run compiles mujoco_warp's collision of flexes and tools for minutes. Its one run
-so far, with kernels compiled ahead, ended in the flex's first step: see docs/batch.md.
+On CUDA the first run compiles mujoco_warp's collision of flexes and tools for minutes.
 """
 
 from __future__ import annotations
@@ -232,12 +231,12 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
     [row["kind"], row["nworld"], row["side"].replace("flex", "mujoco_warp's flex"),
      f"{1e3 * row['h']:g}", f"{row['tolerance']:g}", f"{row['step_ms']:.3g}", f"{row['rate']:.3g}",
      f"{row['rate'] * row['h']:.3g}", f"{100 * row['error']:.2g}", f"{row['force_N']:.3g}",
-     f"{row['world_kB']:.0f}"]
+     f"{row['world_kB']:.0f}" if row["world_kB"] > 0 else "-"]
     for row in sorted(done, key=lambda row: [row[key] for key in order])
   ]  # fmt: skip
   head = ["kind", "worlds", "side", "h [ms]", "tolerance", "step [ms]", "world-steps/s",
           "simulated s/s", "error [%]", "force [N]", "a world [kB]"]  # fmt: skip
-  lines = [str(__doc__).partition("\n\n")[2], "", *plots.table(head, table), ""]
+  lines = [str(__doc__).split("\n\n", 2)[2], "", *plots.table(head, table), ""]
   for kind, count in sorted({(row["kind"], row["nworld"]) for row in done}):
     here = [row for row in done if (row["kind"], row["nworld"]) == (kind, count)]
     for level in LEVELS:
