@@ -5,24 +5,15 @@
 // What is written is the surface itself, and in what it is another one; nothing where it raises.
 #pragma once
 #include "carry.h"
+#include "mend.h"
 
 namespace palpate {
-
-// The chains of a path's runs, one after the other.
-struct Chains {
-  int *vert, *start;  // that of run r begins at start[r]
-
-  PALPATE int size(int r) const { return start[r + 1] - start[r]; }
-  PALPATE const int* of(int r) const { return vert + start[r]; }
-  PALPATE int first(int r) const { return vert[start[r]]; }
-  PALPATE int last(int r) const { return vert[start[r + 1] - 1]; }
-  PALPATE bool closes(int r) const { return size(r) > 3 && first(r) == last(r); }
-};
 
 template <class S>
 PALPATE int find_chains(const S& m, const Path& path, Scratch& memory, Chains& chains) {
   const int most = 2 * (m.nvert + path.count);
   chains.vert = memory.numbers(most), chains.start = memory.numbers(path.nrun + 1);
+  chains.nrun = path.nrun, chains.most = most;
   Band band = {few(memory, m.nvert), memory.values(m.nvert)};
   Search search = {memory.values(m.nvert), memory.numbers(m.nvert), memory.numbers(m.nvert)};
   int* way = memory.numbers(path.count + 4);
@@ -63,48 +54,6 @@ PALPATE int check_chains(const S& m, const Path& path, const Chains& chains, con
       return PINNED;
     }
   return DONE;
-}
-
-// Finds the edges of the chains that have tissue on both sides. Where a chain goes along an older cut,
-// single edges between are not a way into the tissue.
-template <class S>
-PALPATE void find_seam(const S& m, const Path& path, const Chains& chains, Seam& seam) {
-  for (int r = 0; r < path.nrun; ++r) {
-    const int *chain = chains.of(r), n = chains.size(r) - 1;
-    bool all = true;
-    for (int k = 0; k < n; ++k) all = all && m.has_both_sides(chain[k], chain[k + 1]);
-    for (int k = 0; k < n; ++k) {
-      const bool beside = all || (k > 0 && m.has_both_sides(chain[k - 1], chain[k])) ||
-        (k + 1 < n && m.has_both_sides(chain[k + 1], chain[k + 2]));
-      if (!beside || !m.has_both_sides(chain[k], chain[k + 1])) continue;
-      seam.pair[2 * seam.count] = chain[k], seam.pair[2 * seam.count++ + 1] = chain[k + 1];
-    }
-  }
-}
-
-// Finds the vertices of the seam that may move, ascending, and where each is to go.
-template <class S, class P>
-PALPATE void find_goals(const S& m, const Path& path, const Chains& chains, const Few& there,
-                        const P* pinned, Few& movers, D3* goal, int* seen) {
-  for (int r = 0; r < path.nrun; ++r) {
-    const double* line = path.at + 3 * path.run[r].first;
-    const int n = path.run[r].last - path.run[r].first, size = chains.size(r);
-    for (int i = 0; i < size; ++i) {
-      const int v = chains.of(r)[i];
-      if (seen[v]) continue;
-      seen[v] = 1;
-      double far;
-      D3 to = place_on(line, n, m.place(v), far);
-      if (!chains.closes(r) && i == 0) to = load(line);
-      if (!chains.closes(r) && i == size - 1) to = load(line + 3 * (n - 1));
-      const bool slides = !m.on_rim(v) || slide(m, v, to);
-      if (!slides || pinned[v] || !there.has(v)) continue;
-      movers.put(v);
-      goal[v] = to;
-    }
-  }
-  movers.sort(m.nvert);
-  for (int i = 0; i < movers.count; ++i) goal[i] = goal[movers.list[i]];  // in place: list[i] >= i
 }
 
 // The greatest distance of vertices that came apart from the path.
@@ -207,28 +156,22 @@ template <class F, class S>
 PALPATE int cut_along(const F& f, const S& m, const Material& p, const Path& path, const Moving& x,
                       Scratch& memory, const Answer<F>& out) {
   Chains chains;
-  Seam seam = {nullptr, 0, memory.numbers(3 * m.nelem)};
-  Few there = few(memory, m.nvert), movers = few(memory, m.nvert);
   Changes made = {few(memory, m.nelem), few(memory, m.nvert), nullptr};
   made.split = {memory.numbers(m.nvert), memory.numbers(m.nvert), 0, out.found[FOUND_NOUTER]};
-  int *seen = memory.numbers(m.nvert), *part = memory.numbers(m.most);
-  D3* goal = (D3*)memory.values(3 * m.nvert);
   const auto* pinned = f.pinned.data + out.vert;
   if (memory.full) return NO_ROOM;
   int status = find_chains(m, path, memory, chains);
   if (status == DONE) status = check_chains(m, path, chains, pinned, out.size + SIZE_BAD);
   if (status != DONE) return status;
-  seam.pair = memory.numbers(2 * chains.start[path.nrun] + 2);
-  if (memory.full) return NO_ROOM;
-  find_seam(m, path, chains, seam);
-  out.found[FOUND_STOPPED] = find_room(m, seam, m.nvert - made.split.following, there, part);
-  find_goals(m, path, chains, there, pinned, movers, goal, seen);
-  Move* move = (Move*)memory.values(movers.count * (int)(sizeof(Move) / sizeof(double)));
-  if (memory.full || seam.count > m.nvert) return NO_ROOM;
-  const int nmove = find_moves(m, x.disp, p, goal, movers, move, memory);
-  if (memory.full || !apply(m, x, move, nmove, seam, there, pinned, made, memory)) return NO_ROOM;
-  out.write(made, seam, nmove);
-  out.size[SIZE_DEVIATION] = deviation_of(m, path, chains, there);
+  Plan plan = new_plan(m, chains, memory);
+  if (memory.full || !mend(m, path, p, x.disp, pinned, m.nvert - made.split.following, chains, plan, memory) ||
+      plan.seam.count > m.nvert)
+    return NO_ROOM;
+  out.found[FOUND_STOPPED] = plan.stopped;
+  const int nmove = those_that_move(plan.move, plan.movers.count);
+  if (!apply(m, x, plan.move, nmove, plan.seam, plan.there, pinned, made, memory)) return NO_ROOM;
+  out.write(made, plan.seam, nmove);
+  out.size[SIZE_DEVIATION] = deviation_of(m, path, chains, plan.there);
   bool apart = false;
   for (int r = 0; r < path.nrun && made.elem.count; ++r)
     apart = apart || may_separate(chains, r, made.split);

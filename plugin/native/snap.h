@@ -9,8 +9,8 @@ constexpr double SHAPE = 0.3, KEEP = 0.9;  // least shape of a triangle, or so m
 constexpr double TURN = 0.95;  // least cosine between a triangle's normals before and after
 constexpr double CORNER = -0.8;  // greatest one between a boundary's edges where a vertex slides on it
 constexpr double RISE = 1.01;  // times its energy that the tissue around a vertex may have when it moved
-constexpr double LESS = 0.7;
-constexpr int TRIES = 10;
+constexpr double LESS = 0.87;
+constexpr int TRIES = 22;
 enum { NO_ENERGY, MEMBRANE, SPRINGS_OF_EDGES };
 
 // What tells the energy around vertices: of triangles, and of the springs that hold vertices.
@@ -160,10 +160,9 @@ PALPATE void find_shares(const S& m, const double* disp, const Material& p, Move
   }
 }
 
-// Finds which vertices move and where to: of those in `movers`, in ascending order, with `goal` each.
-// Leaves those that do; returns how many.
+// Finds where vertices move to: those in `movers`, in ascending order, with `goal` each.
 template <class S>
-PALPATE int find_moves(const S& m, const double* disp, const Material& p, const D3* goal, const Few& movers,
+PALPATE void find_moves(const S& m, const double* disp, const Material& p, const D3* goal, const Few& movers,
                        Move* move, Scratch& memory) {
   for (int i = 0; i < movers.count; ++i) {
     const int v = movers.list[i];
@@ -177,8 +176,12 @@ PALPATE int find_moves(const S& m, const double* disp, const Material& p, const 
     a.lead = at_corners(disp, corner, a.weight) - load(disp + 3 * v);
   }
   find_shares(m, disp, p, move, movers, memory);
+}
+
+// Leaves the moves that go anywhere; returns how many.
+PALPATE int those_that_move(Move* move, int n) {
   int count = 0;
-  for (int i = 0; i < movers.count; ++i) {
+  for (int i = 0; i < n; ++i) {
     Move a = move[i];
     a.weight = a.own + a.share * (a.weight - a.own);
     if (a.weight != a.own) move[count++] = a;

@@ -224,8 +224,8 @@ class Knife:
     n, self._config, self._how = 2 * n, None, ()
     sizes = self._copy.sizes | {"most_points": n}
     # What native/cut.h takes of scratch, see there.
-    sizes["nint"] = 24 * whole.nvert + 15 * whole.nelem + 16 * n + 8 * sizes["most"] + 100
-    sizes["nreal"] = 32 * whole.nvert + 6 * whole.nelem + 11 * n
+    sizes["nint"] = 29 * whole.nvert + 18 * whole.nelem + 20 * n + 8 * sizes["most"] + 100
+    sizes["nreal"] = 48 * whole.nvert + 6 * whole.nelem + 13 * n
     self._fields = fields = allocate(Cutting, "cpu", sizes)
     fields.surface, fields.edge = self._copy.fields, edge
     for name in ("most_points", "nint", "nreal"):

@@ -247,6 +247,17 @@ def test_a_cut_along_an_older_one_does_nothing():
   assert not again.stopped and again.length == 0.0 and again.mesh.nouter == mesh.nouter
 
 
+@pytest.mark.parametrize("path", PATHS)
+def test_a_cut_once_more_where_the_tissue_has_moved_cuts_off_no_crumbs(path):
+  mesh, points = sheet(40, seed=2), PATHS[path]
+  first = cut(mesh, points)
+  pieces = 1 + (path == "circle")
+  for k in range(8):
+    turn = np.array([np.cos(k), np.sin(k), 0])
+    again = cut(first.mesh, points + MILLI * turn * np.sin(90 * points[:, :1] + k))
+    assert len(np.unique(topology.pieces(again.mesh)[again.mesh.elem])) == pieces, k
+
+
 REFUSED = {
   "shape": ([[0.0, 0.0]], "shape \\(1, 2\\), expected \\(n, 3\\), n >= 2"),
   "finite": ([[0.05, 0, 0], [np.nan, 0, 0]], "point 1 is .* expected finite"),
