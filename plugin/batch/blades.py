@@ -1,7 +1,7 @@
 """Geoms that cut an organ of `Worlds`: the plugin's kernels, over rows of worlds.
 
 A blade's path grows on the device. Now and then the host looks at which are long enough, or have
-ended, and lets the meshes of those worlds come apart; see `engine.cutters`.
+ended, and lets the meshes of those worlds come apart; see `engine.cutting.cutters`.
 """
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 import warp as wp
-from palpate.engine import cutters, mjstruct
-from palpate.engine.current import ends
+from palpate.engine import mjstruct
+from palpate.engine.cutting import cutters
+from palpate.engine.cutting.current import ends
 from palpate.engine.layout import BLADE, LAW
-from palpate.tissue.mesh import Mesh
+from palpate.tissue.geometry.mesh import Mesh
 from palpate.tissue.step import SCHEMES
 from palpate.tissue.types import allocate, doubles, fill, floats, ints, struct
 

@@ -28,8 +28,9 @@ import scenes
 import warp as wp
 from benchmarks import results, runner
 from benchmarks.runner import Bench, Case, Row
-from palpate.engine import windowed, workspace
+from palpate.engine import workspace
 from palpate.engine.layout import HEAD, MODE
+from palpate.engine.windows import windowed
 from palpate.models import grid, shapes
 from palpate.tissue import step as stepping
 from palpate.tissue.types import Stage
