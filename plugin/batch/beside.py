@@ -1,6 +1,6 @@
 """What acts on an organ of `Worlds` beside its tissue: what all that does so shares.
 
-The kernels and their structs are the plugin's, over rows of worlds: see `palpate.engine.beside.hold`.
+The kernels and their structs are the plugin's, over rows of worlds: see `engine.beside.hold`.
 """
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.

@@ -1,4 +1,4 @@
-"""Cuts of an organ in worlds on a device, each with its mesh, as `engine.cutting.cuts` has one mjData's.
+"""Cuts of an organ in worlds, each with its mesh, as `engine.cutting.cuts` has one mjData's.
 
 Cuts are found on the host, for the worlds that are cut alone. Their motion comes from the device,
 and what has changed goes there; graphs go on as they were recorded.

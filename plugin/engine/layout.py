@@ -162,7 +162,7 @@ BOND = Numbers(
 BLADE = Numbers(
   "BLADE",
   ("stage", 1, "-", "0 away, 1 at the surface, 2 through the wall"),
-  ("depth", 1, "m", "how far it has pierced the wall, or is in a solid"),
+  ("depth", 1, "m", "how far it has pierced the wall, or cuts into a solid"),
   ("elem", 1, "-", "triangle of its seat"),
   ("at", 3, "m", "its seat"),
   ("toward", 3, "-", "which way it cut last, 0 before"),

@@ -166,6 +166,31 @@ PALPATE double beyond(const Line& line, double place) {
   return place < line.length - place ? place : line.length - place;
 }
 
+// How deep a seat's blade is in a solid. Scissors close over what lies between them: from the seat along
+// the way they close to where the solid ends, or as far as they reach; `through` says which.
+struct Depth { double deep; bool through; };
+
+template <class Fields>
+PALPATE Depth depth_of(const Fields& f, Thread me, int i, const Line& line, double place, const Seated& at) {
+  if (f.law.data[LAW_LENGTH * i + LAW_SOLID] == 0.0 || f.geom.data[2 * i + 1] < 0)
+    return {beyond(line, place), false};
+  const D3 zero = {0.0, 0.0, 0.0};
+  const bool back = dot(line.along, at.normal) > 0.0;
+  const Line in = {at.at, back ? zero - line.along : line.along, back ? place : line.length - place};
+  double least = NOWHERE;
+  for (int t = me.tid; t < f.nelem; t += me.nthread) {
+    D3 x[3], w;
+    corners_now(f, t, x);
+    if (!(dot(cross(x[1] - x[0], x[2] - x[0]), in.along) > 0.0)) continue;
+    const double far = crossing(in, x, w);
+    if (far >= 0.0 && far < least) least = far;
+  }
+  int elem = 0;
+  D3 weight = zero;
+  agree(least, elem, weight);
+  return least < NOWHERE ? Depth{least, true} : Depth{in.length, false};
+}
+
 // The force that tissue bears of a blade: in a solid, by how deep it is.
 PALPATE double borne(const double* law, double deep) {
   return law[LAW_SOLID] == 0.0 ? law[LAW_FORCE] : deep > 0.0 ? law[LAW_FORCE] * deep : 0.0;
@@ -212,9 +237,9 @@ PALPATE void sit_down(const Fields& f, Thread t, int i, const Line& line, double
   if (sideways) note_path(s, 0.0);
 }
 
-// Moves the seat of a blade along the surface; returns whether it could.
+// Moves the seat of a blade along the surface, against the most that tissue bears; returns whether it could.
 template <class Fields>
-PALPATE bool advance(const Fields& f, Thread t, int i, D3 way, const Seated& from, double* s) {
+PALPATE bool advance(const Fields& f, Thread t, int i, D3 way, const Seated& from, double most, double* s) {
   const D3 was = load(s + BLADE_AT), goes = carried(way, from.x, from.rest);
   int elem = (int)s[BLADE_ELEM];
   D3 weight, rest[3];
@@ -227,7 +252,7 @@ PALPATE bool advance(const Fields& f, Thread t, int i, D3 way, const Seated& fro
   store(s + BLADE_AT, now);
   if (s[BLADE_STAGE] == PIERCING) return true;
   store(s + BLADE_TOWARD, unit_of(now - was));
-  s[BLADE_WORK] += borne(f.law.data + LAW_LENGTH * i, s[BLADE_DEPTH]) * norm(way);
+  s[BLADE_WORK] += most * norm(way);
   s[BLADE_OPENED] += gone;
   note_path(s, SPACING * f.edge);
   return true;
@@ -240,8 +265,11 @@ PALPATE void give_way(const Fields& f, Thread t, int i, const Line& line, double
   const double* law = f.law.data + LAW_LENGTH * i;
   Seated at = seated(f, s);
   const double place = dot(at.at - line.from, line.along);
-  const double deep = beyond(line, place), slack = borne(law, deep) / law[LAW_STIFFNESS];
-  if (law[LAW_SOLID] != 0.0 && s[BLADE_STAGE] == THROUGH) s[BLADE_DEPTH] = deep > 0.0 ? deep : 0.0;
+  const Depth reach = depth_of(f, t, i, line, place, at);
+  const double deep = reach.deep, most = borne(law, deep), slack = most / law[LAW_STIFFNESS];
+  // An edge more where it goes through, so that nothing is left below.
+  if (law[LAW_SOLID] != 0.0 && s[BLADE_STAGE] == THROUGH)
+    s[BLADE_DEPTH] = deep > 0.0 ? deep + (reach.through ? f.edge : 0.0) : 0.0;
   const double before = s[BLADE_STAGE] == PIERCING ? slack : 0.0;
   bool out = place < -before || place > line.length + before || line.length == 0.0;
   if (!out) {
@@ -252,8 +280,8 @@ PALPATE void give_way(const Fields& f, Thread t, int i, const Line& line, double
     if (!out && size > slack) {
       const D3 unit = (1.0 / size) * now.flat;
       const double tilt = dot(unit, line.along), level = 1.0 - tilt * tilt;
-      const double far = (size - slack) / (level > LEVEL ? level : LEVEL), most = LEAP * f.edge;
-      out = now.behind || !advance(f, t, i, (far < most ? far : most) * unit, at, s);
+      const double far = (size - slack) / (level > LEVEL ? level : LEVEL), leap = LEAP * f.edge;
+      out = now.behind || !advance(f, t, i, (far < leap ? far : leap) * unit, at, most, s);
     }
   }
   if (out) {
@@ -299,7 +327,7 @@ PALPATE void bear(const Fields& f, Thread t, int i, const Line& line, const doub
     hold = without(hold, weight, then.back);
     force = across(force, then.back);
   }
-  const double size = k * norm(then.flat), most = borne(law, beyond(later, place));
+  const double size = k * norm(then.flat), most = borne(law, depth_of(f, t, i, later, place, at).deep);
   if (size > most) {
     const double share = most / size;
     hold = share * hold;

@@ -116,12 +116,13 @@ PALPATE int cost_of(const S& m, const Measured& at, int face, double most) {
 template <class S>
 PALPATE bool part_sides(const S& m, const Measured& at, const Sheet& sheet, double skin, double over,
                         Opening& o, Scratch& memory) {
-  int *side = memory.numbers(m.ntet), *node = memory.numbers(m.ntet);
+  int *side = memory.room(m.ntet), *node = memory.room(m.ntet), *near = memory.room(m.ntet);
   if (memory.full) return false;
-  int count = 0, nface = 0;
+  int count = 0, nface = 0, nnear = 0;
   for (int t = 0; t < m.ntet; ++t) {
     side[t] = side_of(m, at, sheet, skin, t);
     if (side[t] == 3) node[t] = count++;
+    if (side[t]) near[nnear++] = t;
   }
   const auto between = [&](int face) {
     const int mate = m.beside(face);
@@ -129,34 +130,37 @@ PALPATE bool part_sides(const S& m, const Measured& at, const Sheet& sheet, doub
     const int a = side[face / 4], b = side[mate / 4];
     return a && b && (a != b || a == 3) ? mate : -1;
   };
-  for (int f = 0; f < 4 * m.ntet; ++f) nface += side[f / 4] && between(f) > f;
+  const auto each_face = [&](auto act) {  // of these, ascending
+    for (int i = 0; i < 4 * nnear; ++i) act(4 * near[i / 4] + i % 4);
+  };
+  each_face([&](int f) { nface += between(f) > f; });
   Flow flow = flow_of(memory, count);
   if (memory.full) return false;
   const double most = floor(MUCH / (nface ? nface : 1));
-  for (int f = 0; f < 4 * m.ntet; ++f) {
-    if (side[f / 4] != 3) continue;
+  each_face([&](int f) {
+    if (side[f / 4] != 3) return;
     const int a = 4 * node[f / 4] + f % 4, mate = between(f);
     flow.to[a] = -1;
-    if (mate < 0) continue;
+    if (mate < 0) return;
     const int cost = cost_of(m, at, f < mate ? f : mate, most);
     if (side[mate / 4] == 1) flow.source[node[f / 4]] += cost;
     if (side[mate / 4] == 2) flow.sink[node[f / 4]] += cost;
-    if (side[mate / 4] != 3) continue;
+    if (side[mate / 4] != 3) return;
     flow.to[a] = node[mate / 4], flow.back[a] = 4 * node[mate / 4] + mate % 4, flow.room[a] = cost;
-  }
+  });
   flow.part();
   const auto first = [&](int t) { return side[t] == 1 || (side[t] == 3 && flow.level[node[t]] > 0); };
   o.count = 0;
-  for (int f = 0; f < 4 * m.ntet; ++f) {
-    const int mate = side[f / 4] ? between(f) : -1;
-    if (mate <= f || first(f / 4) == first(mate / 4)) continue;
+  each_face([&](int f) {
+    const int mate = between(f);
+    if (mate <= f || first(f / 4) == first(mate / 4)) return;
     double past = -1e300;
     for (int k = 0; k < 3; ++k) {
       const double far = at.where[m.face_vert(f, k)].past;
       past = far > past ? far : past;
     }
     if (past < over * skin) o.face[o.count++] = f;
-  }
+  });
   return true;
 }
 
@@ -271,9 +275,11 @@ PALPATE void measure_walls(const S& m, const Sheet& sheet, double skin, int firs
 }
 
 // Marks triangles that a cut has freed from the foundation: of what it held together until now, it goes on to
-// hold the largest piece. Pieces are known by their first vertices.
+// hold the largest piece. Pieces are known by their first vertices. Where vertices that were one hang together
+// still by the tetrahedra around them, nothing has come free.
 template <class S, class I>
-PALPATE bool come_loose(const S& m, const I* home, unsigned char* loose, Scratch& memory) {
+PALPATE bool come_loose(const S& m, const Parts& parts, const Few& near, const I* home, unsigned char* loose,
+                        Scratch& memory) {
   int *root = memory.numbers(m.nvert), *best = memory.numbers(m.nelem), *many = memory.numbers(m.nelem);
   double* size = memory.values(m.nvert);
   if (memory.full) return false;
@@ -282,10 +288,22 @@ PALPATE bool come_loose(const S& m, const I* home, unsigned char* loose, Scratch
     return v;
   };
   for (int v = 0; v < m.nvert; ++v) root[v] = v, size[v] = 0.0;
-  for (int i = 0; i < 4 * m.ntet; ++i) {
-    const int a = find(m.vert(i)), b = find(m.vert(i / 4 * 4));
-    if (a != b) root[a > b ? a : b] = a < b ? a : b;
-  }
+  const auto join = [&](int t) {
+    int a = find(m.vert(4 * t));
+    for (int c = 1; c < 4; ++c) {
+      const int v = m.vert(4 * t + c);
+      if (root[v] == a) continue;
+      const int b = find(v);
+      root[a > b ? a : b] = a < b ? a : b;
+      a = a < b ? a : b;
+    }
+  };
+  for (int i = 0; i < near.count; ++i) join(near.list[i]);
+  bool free = false;
+  for (int k = 1; k < parts.count; ++k)
+    free = free || (parts.vert[k] == parts.vert[k - 1] && find(parts.name[k]) != find(parts.name[k - 1]));
+  if (!free) return true;
+  for (int t = 0; t < m.ntet; ++t) join(t);
   for (int t = 0; t < m.nelem; ++t) {
     D3 x[3];
     for (int c = 0; c < 3; ++c) x[c] = m.place((int)m.elem[3 * t + c]);
@@ -413,7 +431,7 @@ PALPATE int cleave(const F& f, const S& m, const Sheet& sheet, const Neohookean&
   found[FOUND_SPLIT] = share_masses(m, o, x, f, memory);
   for (int t = f.ntriangle; t < count / 3; ++t) f.loose.data[t] = 1;
   measure_walls(m, sheet, f.edge, f.ntriangle, count / 3, f);
-  if (!come_loose(m, f.home.data, f.loose.data, memory)) return FULL;
+  if (!come_loose(m, o.parts, was.patch.own, f.home.data, f.loose.data, memory)) return FULL;
   return ease(m, p, x, f, was, memory) && !memory.full ? APART : FULL;
 }
 

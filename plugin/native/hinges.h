@@ -7,7 +7,7 @@ namespace palpate {
 // Weight of K v on the right-hand side of a stage; `step` is h, h^2 + h damping, ., share ahead.
 PALPATE float weight_of_rate(int stage, const float* step) {
   if (stage == NEUMANN) return 0.0f;
-  return step[1] - (stage == FIRST ? step[3] : 1.0f) * step[0] * step[0];
+  return step[1] - (stage == EXPLICIT ? 1.0f : step[3]) * step[0] * step[0];
 }
 
 // Triangles.

@@ -77,7 +77,7 @@ struct Pcg {
 
   // r = b, its norm and the residual to reach; neighbours are shown where to start.
   PALPATE void right_hand_side() {
-    const float h2 = step[0] * step[0], gv = step[1] - (stage == FIRST ? step[3] * h2 : h2);
+    const float gv = step[1] - step[3] * step[0] * step[0];
     const float impulse = stage == RESPONSE ? 0.0f : volume_impulse(
       f, world, group, f.system.disp_trial.data + at, f.system.vel_trial.data + at, gv);
     V bb = splat(0.0f), flux = splat(0.0f);

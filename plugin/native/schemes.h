@@ -74,20 +74,26 @@ PALPATE void predict(const Fields& f, Thread t, int) {
   if (t.tid == 0) step[3] = share;
 }
 
-// Takes the solution of a Newton iteration over, IS_FIRST or not; IS_MORE: more are to come.
+// Takes the solution of a Newton iteration over, IS_FIRST or not; IS_MORE: more are to come, at the
+// end of the step, or IS_CENTRED where `midpoint` has forces and damping.
 template <class Fields>
 PALPATE void newton_update(const Fields& f, Thread t, int flags) {
-  const float h = f.state.step.data[4 * t.world];
+  float* step = f.state.step.data + 4 * t.world;
+  const float h = step[0];
+  const bool centred = flags & IS_CENTRED;
+  const float way = centred ? 0.5f * (step[1] / h + step[3] * h) : h, part = centred ? 0.5f : 1.0f;
   each_slice(t, f.shape.nused, [&](int s, Lane lane) {
     const size_t own = (size_t)t.world * f.shape.nslice + s, at = 24 * own;
     V3 dv = ld3(f.system.sol.data + at, lane);
     if (!(flags & IS_FIRST)) dv += ld3(f.state.dvel.data + at, lane);
     st3(f.state.dvel.data + at, dv, lane);
     if (flags & IS_MORE) {
-      const V3 v = ld3(f.state.vel.data + at, lane) + dv;
-      stand(f, own, ld3(f.state.disp.data + at, lane) + h * v, v, lane);
+      const V3 v = ld3(f.state.vel.data + at, lane);
+      const V3 moved = centred ? dv : v + dv;
+      stand(f, own, ld3(f.state.disp.data + at, lane) + way * moved, v + part * dv, lane);
     }
   });
+  if (t.tid == 0 && !centred) step[3] = 1.0f;
 }
 
 // Makes the step that of `midpoint` in place of `implicit`'s, or puts it back: half its stiffness,

@@ -2,6 +2,7 @@
 // answer it gives to MuJoCo.
 #pragma once
 #include "choose.h"
+#include "reshape.h"
 #include "sleep.h"
 
 namespace palpate {

@@ -8,7 +8,9 @@ the middle of a step; about the time of x the step is centred, and stable for ev
 
     A dv = h (F + f_ext + f_c) - h damping K v,    A = M + (h^2 + h damping) K / 2
 
-(Newmark's family, with beta = 1/2 so that a step's stiffest motions fade with the damping). A step
+(Newmark's family, with beta = 1/2 so that a step's stiffest motions fade with the damping). Newton
+iterations matter where the matrix is not that of the forces, as in solids: they stand at
+x + h dv / 2 and v + dv / 2. A step
 after which v is yet that of the time of x, the first one, makes half of it. It damps no more than
 the tissue does; `implicit` adds h / 2 to the damping, which solids take off theirs. See
 docs/accuracy.md.
@@ -54,7 +56,7 @@ EASY, WORST = 8.0, 2e5
 # and lambda. With less contacts are too soft, with more bending locks (docs/accuracy.md).
 OWN_SHARE = 0.3
 
-_FIRST, _MORE = 1, 2  # flags of `newton_update`
+_FIRST, _MORE, _CENTRED = 1, 2, 4  # flags of `newton_update`
 _CYCLES_PER_SM = 2  # blocks on one multiprocessor
 _CONSTANTS = CONSTANTS | {
   "AHEAD": AHEAD,
@@ -63,6 +65,7 @@ _CONSTANTS = CONSTANTS | {
   "WORST": WORST,
   "IS_FIRST": _FIRST,
   "IS_MORE": _MORE,
+  "IS_CENTRED": _CENTRED,
 }
 
 
@@ -241,21 +244,24 @@ def _implicit(body: Body):
   nslice = body.shape.nslice
   _over(_edge_change, body, nslice)
   _over(_predict, body, nslice)
+  _iterate(body)
+
+
+def _iterate(body: Body, kind: int = 0):
+  """Takes the Newton iterations from the trial state on."""
   for it in range(body.newton):
     stage = Stage.FIRST if it == 0 else Stage.LATER
     assemble(body, stage)
     solve(body, stage)
-    flags = _FIRST * (it == 0) + _MORE * (it + 1 < body.newton)
-    _over(_newton_update, body, nslice, flags)
+    flags = kind + _FIRST * (it == 0) + _MORE * (it + 1 < body.newton)
+    _over(_newton_update, body, body.shape.nslice, flags)
 
 
 def _midpoint(body: Body):
   _over(_stay, body, body.shape.nslice)
   _centre(body)
-  assemble(body, Stage.FIRST)
-  solve(body, Stage.FIRST)
+  _iterate(body, _CENTRED)
   _centre(body, undo=True)
-  wp.copy(body.state.dvel, body.system.sol)
 
 
 def _centre(body: Body, undo: bool = False):

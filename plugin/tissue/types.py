@@ -76,8 +76,9 @@ class Stage(enum.IntEnum):
 
   FIRST and LATER are Newton iterations. The first stands at x + share h v, share in `State.step`,
   and has the rest of the step ahead in it: h^2 (1 - share) + h damping; later ones are residuals at
-  the trial state, h damping. EXPLICIT has h damping, and NEUMANN brings its own. RESPONSE is the
-  answer to impulses alone, with the matrix of the last solve.
+  the trial state, where share is 1, h damping; `midpoint` has a share of its own. EXPLICIT has h
+  damping, and NEUMANN brings its own. RESPONSE is the answer to impulses alone, with the matrix of
+  the last solve.
   """
 
   FIRST = 0

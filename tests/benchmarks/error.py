@@ -170,6 +170,8 @@ def _race(found: dict[tuple, list[Row]]) -> tuple[list[str], list[list], list[st
       for label, belongs in sides.items():
         best[label], row = cheapest([r for r in mine if belongs(r)], level)
         which = f"{row['scheme']} " if row and label.startswith("ours") else ""
+        if row and row["newton"] not in ("", 1):
+          which += f"{row['newton']} Newton, "
         cells.append(f"{best[label]:.3g} ({which}{1e3 * row['h']:g} ms)" if row else "-")
       winner = min(best, key=lambda k: best[k])
       table.append([*key, f"{100 * level:g} %", *cells,

@@ -13,13 +13,19 @@ import scenes
 
 H = 2e-3  # time step [s]
 WARM = 150  # steps before the first ones that count
+# Tight, so that `iterations` bounds a solve: sheets that bend take a tenth fewer to a looser one
+# since, for a reason that is no cuts. Not so with nodal coupling, which takes fewer: see results.
+TOLERANCE = 1e-10
 # Shape, vertices about, keys of the organ.
 SCENES = {
-  "membrane, windows": ("sheet", 1000, {"windows": True}),
-  "membrane, windows, 4000 nodes": ("sheet", 4000, {"windows": True}),
-  "plate, windows": ("sheet", 1000, {"windows": True, "bend": 1.0}),
-  "closed, windows": ("ball", 642, {"windows": True, "bend": 1.0, "bulk": 1e4}),
-  "closed, nodal": ("ball", 162, {"bend": 1.0, "bulk": 1e4}),
+  "membrane, windows": ("sheet", 1000, {"windows": True, "bend": 0.0, "iterations": 40}),
+  "membrane, windows, 4000 nodes": (
+    "sheet", 4000, {"windows": True, "bend": 0.0, "iterations": 60},
+  ),
+  "plate, windows": ("sheet", 1000, {"windows": True, "iterations": 9}),
+  "plate, windows, 4000 nodes": ("sheet", 4000, {"windows": True, "iterations": 9}),
+  "closed, windows": ("ball", 642, {"windows": True, "bulk": 1e4, "iterations": 20}),
+  "closed, nodal": ("ball", 162, {"bulk": 1e4, "iterations": 20}),
 }
 
 
@@ -43,7 +49,7 @@ def scene(name: str):
                     biastype=mujoco.mjtBias.mjBIAS_AFFINE, gainprm=[2000] + 9 * [0],
                     biasprm=[0, -2000, 0] + 7 * [0])  # fmt: skip
   palpate.add_organ(spec, (points, elem), "organ", mass=0.05, young=2e5, pin=pin, thickness=2e-3,
-                    device="cpu", **keys)  # fmt: skip
+                    device="cpu", tolerance=TOLERANCE, **keys)  # fmt: skip
   model = spec.compile()
   return model, mujoco.MjData(model)
 

@@ -240,9 +240,9 @@ class Cutters(Beside):
     def cut(path: np.ndarray, *deep: np.ndarray) -> tuple[Report, Mesh]:
       if not deep:
         return w.cuts.cut_at_rest(path, given), w.organ.mesh
-      organ, geom, axis = w.organ, *(self._arrays[name][i] for name in ("geom", "axis"))
-      own = geom[1] < 0 and i not in self.by_current
-      way = inward.direction(w, int(geom[0]) if own else -1, axis[0], int(row[BLADE.elem]))
+      organ = w.organ
+      along = None if i in self.by_current else self._along(i)
+      way = inward.direction(organ, w.phases.motion()[0], along, int(row[BLADE.elem]))
       now = organ.origin + self._on_surface(path) @ organ.frame.T
       return w.cuts.cut(now, given * float(deep[0].mean()), deep[0], way), w.organ.mesh
 
@@ -256,12 +256,23 @@ class Cutters(Beside):
       mjstruct.warn(why)
     return report is not None and report.nodes > 0
 
+  def _along(self, i: int) -> np.ndarray:
+    """Returns the way along a blade, or along which scissors close, in the world, either sign."""
+    m = mjstruct.Model.from_address(self._w.model)
+    d = mjstruct.Data.from_address(self._w.data)
+    turn = mjstruct.view(d.geom_xmat, (m.ngeom, 3, 3))
+    geoms, axes = self._arrays["geom"][i], self._arrays["axis"][i]
+    one, two = (turn[g][:, k] for g, k in zip(geoms, axes, strict=True))
+    if geoms[1] < 0:
+      return one
+    return one - np.copysign(1.0, one @ two) * two  # blades are at less than 90 degrees
+
   def _on_surface(self, path: np.ndarray) -> np.ndarray:
     """Returns where points of the rest shape are now, in the organ's frame, (n, 3)."""
     w, mesh = self._w, self._w.organ.mesh
     elem, weight, _ = w.cuts.finder.nearest(mesh, mesh.rest, path)
-    place = mesh.rest + w.phases.motion()[0]
-    return np.einsum("nk,nkj->nj", weight, place[mesh.elem[elem]])
+    vert = mesh.elem[elem]
+    return np.einsum("nk,nkj->nj", weight, mesh.rest[vert] + w.phases.motion()[0][vert])
 
   def read(self) -> list[Cutter]:
     """Returns what the cutters do."""

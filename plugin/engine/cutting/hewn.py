@@ -36,6 +36,8 @@ class SolidCuts(Cuts):
   def __init__(self, w):
     super().__init__(w)
     self.walls = Walls(w)
+    self._ranked: np.ndarray | None = None  # see `_usual`
+    self._median = 0.0
 
   def draw(self, model: int, data: int):
     """Writes what is drawn of the walls of cuts."""
@@ -60,11 +62,20 @@ class SolidCuts(Cuts):
 
   def share(self, values: np.ndarray, vert: Any = slice(None)) -> np.ndarray:
     """Returns values by mass, see `Cuts.share`; what comes from inside has them as the skin."""
-    was, n = self.declared.mass, self.whole.nouter
-    ratio = np.sort(values[:n] / np.maximum(was[:n], 1e-300))
-    usual, inside = self.mass * ratio[n // 2], self.source >= self.whole.nskin
-    out = np.where(inside, usual, super().share(values))
-    return np.where(self.mass > 0, out, values)[vert]
+    out = np.where(
+      self.source[vert] >= self.whole.nskin,
+      self.mass[vert] * self._usual(values),
+      super().share(values, vert),
+    )
+    return np.where(self.mass[vert] > 0, out, values[vert])
+
+  def _usual(self, values: np.ndarray) -> float:
+    """Returns the median of what vertices of the skin have for a mass."""
+    if values is not self._ranked:
+      was, n = self.declared.mass, self.whole.nouter
+      ratio = np.sort(values[:n] / np.maximum(was[:n], 1e-300))
+      self._ranked, self._median = values, ratio[n // 2]
+    return self._median
 
   def _read(self) -> tuple:
     whole, own, n = self.whole, self._own, self.whole.nelem

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
+from palpate.tissue.geometry.mesh import cross, lengths
 
-from .. import mjstruct
 from ..layout import BLADE, TRAIL
 
 PIERCED = 0.001  # how deep a blade is in a solid before it cuts along it [m]
 # Edges of a path that are cut again with what follows, since the end of a cut is not even, and that
 # stay whole behind the blade; and after which what could not come apart is tried again.
 _AGAIN, _BEHIND, _MORE = 1.0, 0.5, 0.5
+_SHUT = 1e-3  # angle of scissors under which they have no way to close [rad]
 _FLAT = 0.3  # cosine of a blade to the normal under which the cut goes along that
 
 
@@ -31,7 +32,7 @@ def open_path(row: np.ndarray, edge: float, ended: bool, finder, cut):
   trail = row[BLADE.trail : BLADE.trail + 3 * count].reshape(-1, 3)
   path = np.vstack([trail, at])
   deep = np.append(row[BLADE.below : BLADE.below + count], row[BLADE.depth])
-  left = np.append(np.cumsum(np.linalg.norm(np.diff(path[::-1], axis=0), axis=1))[::-1], 0.0)
+  left = np.append(np.cumsum(lengths(path[:-1] - path[1:])[::-1])[::-1], 0.0)
   goes = path, np.maximum(deep, PIERCED)
   if not ended:
     goes = _until(*goes, left - _BEHIND * edge)
@@ -59,23 +60,23 @@ def open_path(row: np.ndarray, edge: float, ended: bool, finder, cut):
   return report, why
 
 
-def direction(w, geom: int, axis: int, elem: int) -> np.ndarray:
-  """Returns the unit vector along a blade into the tissue, in the world.
+def direction(organ, disp: np.ndarray, along: np.ndarray | None, elem: int) -> np.ndarray:
+  """Returns the unit vector along which a blade cuts into the tissue, in the world.
 
   Args:
-    w: workspace of the organ
-    geom: the blade, -1 for what cuts along the normal
-    axis: of the geom along which it is long
+    organ: its declaration
+    disp: displacements of its vertices [m]  (nvert, 3)
+    along: the blade's way, of either sign; None for what cuts along the normal
     elem: triangle of its seat
   """
-  organ, mesh = w.organ, w.organ.mesh
-  corner = (mesh.rest + w.phases.motion()[0])[mesh.elem[elem]]
-  normal = organ.frame @ np.cross(corner[1] - corner[0], corner[2] - corner[0])
+  vert = organ.mesh.elem[elem]
+  corner = organ.mesh.rest[vert] + disp[vert]
+  normal = organ.frame @ cross(corner[1] - corner[0], corner[2] - corner[0])
   normal /= np.linalg.norm(normal)
-  if geom < 0:
+  size = 0.0 if along is None else np.linalg.norm(along)
+  if along is None or size < _SHUT:
     return -normal
-  m, d = mjstruct.Model.from_address(w.model), mjstruct.Data.from_address(w.data)
-  along = mjstruct.view(d.geom_xmat, (m.ngeom, 3, 3))[geom][:, axis]
+  along = along / size
   level = along @ normal
   return -normal if abs(level) < _FLAT else -np.sign(level) * along
 

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 from palpate.tissue import step
-from palpate.tissue.geometry import mesh as topology
-from palpate.tissue.types import Views, doubles, fill, floats, ints, struct
+from palpate.tissue.kernels import aim
+from palpate.tissue.types import doubles, fill, flags, floats, ints, longs, struct
 
 from .. import coupling, mjstruct
 from ..coupling import Mujoco
@@ -92,6 +92,34 @@ place, gather, scatter, leave, choose, foresee = coupling.kernels(
 )
 
 
+@struct
+class Reshaping:
+  """What slots have of vertices, and the mesh that they are to have."""
+
+  nvert: int
+  nelem: int
+  most: int  # neighbours that a vertex has room for
+  nchanged: int
+  radius: wp.float64  # see `Slots`
+  wall: wp.float64  # mass of pinned nodes [kg]
+  rest: doubles("nvert", 3)  # see `Slots`, these and what follows
+  touch: doubles("nvert")
+  node_mass: doubles("nvert")
+  free: ints("nvert")
+  elem: ints("nroom", 3)
+  begin: ints("nvert")
+  following: ints("nroom")
+  vert: longs("nchanged")  # vertices that something has changed at
+  mesh_rest: doubles("nvert", 3)  # see `Mesh`
+  mesh_elem: longs("nelem", 3)
+  ring: longs("nvert", "most")
+  mass: doubles("nvert")  # [kg]
+  near: flags("nvert")  # scratch; 0 between calls
+
+
+(_reshape,) = coupling.kernels("slots.h", Reshaping, "reshape_slots")
+
+
 def scratch(nvert: int, nslot: int) -> dict[str, wp.array]:
   """Returns the arrays of `Slots` that outlive a new recording."""
   ints_of = {"placed": (nslot, -2), "taken": (nvert, -1), "chosen": (nvert, 0)}
@@ -158,50 +186,36 @@ def make(w, model: int, sizes: dict[str, int]):
     status=w.host["status"],
     mj=coupling.mujoco_arrays(model, w.data),
   )  # fmt: skip
-  out = fill(Slots, "cpu", values)
-  out.elem.numpy()[: mesh.nelem] = mesh.elem
-  _list_triangles(Views(out), mesh, np.arange(mesh.nvert), np.arange(mesh.nelem), mesh.elem[:, 0])
-  return out
+  return fill(Slots, "cpu", values)
 
 
-def reshape(organ, here: Views, radius: float, vert: np.ndarray):
-  """Gives slots the mesh and the masses that vertices have now; triangles keep their number.
+class Reshape:
+  """Gives slots the mesh and the masses that vertices have; triangles keep their number.
 
   Args:
     organ: the declaration
-    here: of the slots
-    radius: of the windows' flexes [m]
-    vert: vertices that something has changed at
+    slots: of it
   """
-  mesh = organ.mesh
-  elem, ring, place = topology.around(mesh, vert), mesh.ring[vert], mesh.rest[vert]
-  corner = mesh.elem[elem]
-  here.rest[vert], here.elem[elem] = place, corner
-  arm = mesh.rest[ring] - place[:, None]
-  square = np.where(ring >= 0, np.einsum("ijk,ijk->ij", arm, arm), 0.0)
-  here.touch[vert] = np.sqrt(square.max(axis=1)) + radius
-  here.node_mass[vert] = hold(organ, organ.mass[vert], vert)
-  _list_triangles(here, mesh, vert, elem, corner[:, 0])
 
+  def __init__(self, organ, slots):
+    self._fields = fields = Reshaping()
+    mesh = organ.mesh
+    for name in ("rest", "touch", "node_mass", "free", "elem", "begin", "following", "radius"):
+      setattr(fields, name, getattr(slots, name))
+    fields.nvert, fields.most = mesh.nvert, mesh.ring.shape[1]
+    fields.wall = WALL * float(organ.windows.mass.sum())
+    fields.near = wp.zeros(mesh.nvert, dtype=wp.uint8, device="cpu")
+    self._launch = _reshape.command(fields).launch
+    self.put(organ, np.arange(mesh.nvert))
 
-def _list_triangles(here: Views, mesh, vert: np.ndarray, elem: np.ndarray, first: np.ndarray):
-  """Lists the triangles whose first corners these vertices are.
-
-  Args:
-    here: of the slots
-    mesh: the mesh
-    vert: the vertices
-    elem: all triangles that they have, ascending
-    first: the first corners of these
-  """
-  begin, following = here.begin, here.following
-  mine = topology.among(mesh.nvert, vert)[first]
-  elem, first = elem[mine], first[mine]
-  order = np.argsort(first, kind="stable")
-  elem, first = elem[order], first[order]
-  begin[vert] = -1
-  begin[first[::-1]] = elem[::-1]
-  following[elem] = np.append(np.where(first[1:] == first[:-1], elem[1:], -1), -1)[: len(elem)]
+  def put(self, organ, vert: np.ndarray):
+    """Gives the slots what the organ has at vertices that something has changed at."""
+    mesh, fields = organ.mesh, self._fields
+    fields.nelem, fields.nchanged = mesh.nelem, len(vert)
+    whole = {"vert": vert, "mesh_elem": mesh.elem, "ring": mesh.ring}
+    whole = {name: np.ascontiguousarray(each, np.int64) for name, each in whole.items()}
+    aim(fields, mesh_rest=mesh.rest, mass=organ.mass, **whole)
+    self._launch()
 
 
 def hold(organ, inertia: np.ndarray, vert: Any = slice(None)) -> np.ndarray:

@@ -77,7 +77,8 @@ class Phases(coupling.Phases):
     self._nodes = nodes.make(w, self.side, motion, self._far, sizes)
     self._weights = nodes.Weights(w, self._nodes)
     self._weights.put(np.arange(organ.mesh.nvert))
-    self._slots_here, self._motion_here = Views(self._slots), Views(w.boxes["own"].motion)
+    self._reshape = slots.Reshape(organ, self._slots)
+    self._motion_here = Views(w.boxes["own"].motion)
 
   # Cuts.
 
@@ -85,17 +86,17 @@ class Phases(coupling.Phases):
     """Takes the mesh and the masses that the organ has now."""
     organ = self._w.organ
     touched = np.arange(organ.mesh.nvert) if touched is None else touched
-    slots.reshape(organ, self._slots_here, self._slots.radius, touched)
+    self._reshape.put(organ, touched)
     share_inertia(self._w, touched)
     self._weights.put(touched)
     wake(self._w)
 
   def motion(self) -> tuple[np.ndarray, np.ndarray]:
-    """Returns displacement and velocity of the vertices, in the organ's frame, (nvert, 3) each."""
+    """Returns displacement and velocity of the vertices, where the state has them."""
     if self._w.resident:
       self._w.resident.fetch()
     motion = self._motion_here
-    return motion.disp.copy(), motion.vel.copy()
+    return motion.disp, motion.vel
 
   def carry(self, changed, disp, vel, group, member, share):
     """Gives vertices their motion after a cut, see `coupling.Phases`; slots keep their forces."""

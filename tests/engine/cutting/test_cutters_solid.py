@@ -5,6 +5,7 @@ import numpy as np
 import palpate
 import pytest
 import scenes
+from palpate.models import trocar
 
 ENERGY, WIDTH = 160.0, 1e-3  # [J/m^2], of the blade [m]
 SLIDE = mujoco.mjtJoint.mjJNT_SLIDE
@@ -78,3 +79,43 @@ def test_a_current_cuts_by_its_power_and_depth():
   assert organ.cutters[0].length == pytest.approx(0.018, rel=0.1)
   assert organ.cutters[0].energy == pytest.approx(burn * deep * organ.cutters[0].length, rel=0.15)
   assert organ.cuts and organ.cuts[0].depth < deep + 1e-3
+
+
+def slab(thick):
+  """Returns a slab of 12 mm between scissors, open, that close over it to beyond its end."""
+  spec = mujoco.MjSpec()
+  spec.option.timestep, spec.option.gravity = 2e-3, (0, 0, 0)
+  turn = (np.sqrt(0.5), 0, -np.sqrt(0.5), 0)
+  trocar.attach(spec, "scissors", "s/", pos=(0.01 - 0.12, 0, 0), quat=turn)
+  for geom in spec.geoms:
+    geom.contype = geom.conaffinity = 0
+  points, elem = scenes.box((0.012, 0.02, thick), 0.003)
+  pin = np.flatnonzero(np.abs(np.abs(points[:, 1]) - 0.01) < 1e-9)
+  given = {"mass": 0.005, "young": 5e5, "spare": 600, "pin": pin, "windows": True}
+  given |= {"cutters": f"s/edge_left s/edge_right {ENERGY}", "elements": "solid", "device": "cpu"}
+  palpate.add_organ(spec, (points, elem), **given)
+  model = spec.compile()
+  data = mujoco.MjData(model)
+  data.joint("s/jaw_left").qpos[0] = data.joint("s/jaw_right").qpos[0] = 0.4
+  return model, data, palpate.Organ(model, data, "organ")
+
+
+def test_scissors_part_the_slab_that_they_close_over():
+  thick = 0.006
+  model, data, organ = slab(thick)
+  depths = []
+  for opening in [*np.full(50, 0.8), *np.linspace(0.8, -0.1, 300), *np.full(300, -0.1)]:
+    data.actuator("s/jaw").ctrl[0] = opening
+    mujoco.mj_step(model, data)
+    (cutter,) = organ.cutters
+    if cutter.inside:
+      depths.append(np.linalg.norm(cutter.force) / ENERGY)
+  (cutter,) = organ.cutters
+  assert len(organ.pieces) == 2 and organ.error is None
+  sides = [organ.xpos[piece.vertices, 1].mean() for piece in organ.pieces]
+  assert min(sides) < -0.003 and max(sides) > 0.003
+  area = sum(report.area for report in organ.cuts)
+  assert area == pytest.approx(thick * 0.012, rel=0.05)  # the slab's section
+  # The work is the toughness times the area, as thick as the slab was where it was stretched.
+  assert cutter.energy == pytest.approx(ENERGY * thick * cutter.length, rel=0.15)
+  assert 0.7 < np.median(depths) / thick < 1.15
