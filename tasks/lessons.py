@@ -3,7 +3,8 @@
 The script of an expert makes a plan of what is left to do, from wherever it begins. So a policy and
 an expert may play by turns: who learns from that learns the way back from mistakes of its own
 (Ross, Gordon and Bagnell 2011, 10.48550/arXiv.1011.0686). A turn of the policy ends where it does
-not get on: most is taught where most is to be learned.
+not get on, or presses or grips with more than the force limit, while there is a way back: most is
+taught where most is to be learned.
 """
 
 import dataclasses
@@ -162,12 +163,14 @@ class _Turns:
 
   def next(self, ends: bool) -> Teacher | None:
     """Returns the expert if it is the next to act; `ends` is whether a policy wants to end all."""
-    progress = float(self._env.task.progress)  # type: ignore
+    task: Any = self._env.task
+    physics: Any = self._env.physics
+    progress, harsh = float(task.progress), physics.peak_force > task.force_limit
     self._idle = 0 if progress > self._best else self._idle + 1
     self._best = max(self._best, progress)
     if not self._left or (self._expert is None and self._idle > self._patience):
       self._begin(self._expert is None)
-    if ends and self._expert is None:
+    if (ends or harsh) and self._expert is None:
       self._begin(True)
     self._left -= 1
     return self._expert

@@ -46,18 +46,21 @@ PALPATE D3 angle_of(const S& m, int h, const D2* flat, double* weight) {
   return zero - bend_of(inner, share, height, start, end) - bend_of(outer, beyond, far, start, end);
 }
 
-constexpr double RAISED = 0.05;  // of the largest eigenvalue
+constexpr double RAISED = 0.05, NONE = 1e-9;  // of the largest eigenvalue
 
 // Inverts a flexibility between hinges, small eigenvalues of which are raised; absent hinges have no
-// stiffness.
-PALPATE void stiffen(double (*flex)[3], const bool* there, double size, double (*gain)[3]) {
+// stiffness. At a boundary two hinges can have one curvature between them: how else they fold has no
+// stiffness where `loose`, in coarse meshes, whose cycles what is stiffer than the tissue holds up.
+PALPATE void stiffen(double (*flex)[3], const bool* there, double size, bool loose, double (*gain)[3]) {
+  const bool folds = loose && !(there[0] && there[1] && there[2]);
   double axes[3][3], largest = 0.0, inverse[3];
   find_axes(flex, axes);
   for (int k = 0; k < 3; ++k) largest = flex[k][k] > largest ? flex[k][k] : largest;
   for (int k = 0; k < 3; ++k) {
     const double value = flex[k][k];
     const double raised = value > RAISED * largest ? value : RAISED * largest;
-    inverse[k] = !there[k] || largest <= 0.0 ? 0.0 : 1.0 / raised;
+    const bool none = !there[k] || largest <= 0.0 || (folds && value < NONE * largest);
+    inverse[k] = none ? 0.0 : 1.0 / raised;
   }
   for (int i = 0; i < 3; ++i)
     for (int j = 0; j < 3; ++j) {
@@ -68,7 +71,7 @@ PALPATE void stiffen(double (*flex)[3], const bool* there, double size, double (
 }
 
 template <class S>
-PALPATE Plate plate_of(const S& m, int t, double rigidity, double nu) {
+PALPATE Plate plate_of(const S& m, int t, double rigidity, double nu, bool loose) {
   Plate out;
   D3 x[3], angle[3];
   m.corners(t, x);
@@ -91,7 +94,7 @@ PALPATE Plate plate_of(const S& m, int t, double rigidity, double nu) {
                                   twist * angle[j].z};
       flex[i][j] = there[i] && there[j] ? dot(a, b) : 0.0;
     }
-  stiffen(flex, there, area * rigidity, out.gain);
+  stiffen(flex, there, area * rigidity, loose, out.gain);
   return out;
 }
 

@@ -144,7 +144,7 @@ struct Plates {
     if (known.has(t)) return plate[known.place[t] - 1];
     if (keeps) known.put(t);
     Plate& out = keeps ? plate[known.count - 1] : more;
-    return out = plate_of(m, t, f.rigidity.data[t], f.poisson);
+    return out = plate_of(m, t, f.rigidity.data[t], f.poisson, f.coarse);
   }
 };
 

@@ -120,12 +120,13 @@ def _gain(angle: np.ndarray, present: np.ndarray, poisson: float) -> np.ndarray:
   compliance = np.linalg.inv(np.array([[1, nu, 0], [nu, 1, 0], [0, 0, 2 * (1 - nu)]]))
   both = present[:, :, None] & present[:, None, :]
   flexibility = np.where(both, angle @ compliance @ angle.transpose(0, 2, 1), 0)
+  # Absent hinges have no stiffness: as the least eigenvalues they are told from those of hinges.
+  size = np.trace(flexibility, axis1=1, axis2=2)[:, None]
+  k = np.arange(3)
+  flexibility[:, k, k] -= np.where(present, 0, 1 + size)
   value, vector = np.linalg.eigh(flexibility)
-  largest = value[:, -1:]
-  # Absent hinges have eigenvalue 0 and no stiffness.
-  raised = np.where(value > 1e-12 * largest, np.maximum(value, 0.05 * largest), np.inf)
-  absent = (~present).sum(axis=1)[:, None] > np.arange(3)
-  inverse = np.where(absent | (largest <= 0), 0, 1 / np.maximum(raised, 1e-300))
-  degenerate = ~absent & (value <= 1e-12 * largest) & (largest > 0)
-  inverse = np.where(degenerate, 20 / np.maximum(largest, 1e-300), inverse)
+  largest = np.maximum(value[:, -1:], 0)
+  absent = (~present).sum(axis=1)[:, None] > k
+  stiff = ~absent & (largest > 0)
+  inverse = np.where(stiff, 1 / np.where(stiff, np.maximum(value, 0.05 * largest), 1), 0)
   return np.where(both, np.einsum("tik,tk,tjk->tij", vector, inverse, vector), 0)

@@ -47,6 +47,7 @@ class Filling:
   surface: Surface
   every: int  # whether all is written
   loosened: int  # whether areas of all vertices are written
+  coarse: int  # whether it is a mesh for preconditioning alone, see `native/plate.h`
   bends: int  # whether there is bending
   springs: int  # whether edges are springs, not triangles a membrane
   nhinge: int  # hinges before the first cut
@@ -87,9 +88,12 @@ class Rows:
     copy: where these are
     arrays: those that `Filling` has of `Shape` and `Tissue`, on the CPU; others are left out
     node: node of every vertex
+    coarse: whether it is a mesh for preconditioning alone
   """
 
-  def __init__(self, copy: WorkingCopy, arrays: Mapping[str, Any], node: np.ndarray):
+  def __init__(
+    self, copy: WorkingCopy, arrays: Mapping[str, Any], node: np.ndarray, coarse: bool = False
+  ):
     whole, sizes = copy.whole, copy.sizes
     self._copy, self._config, self.fields = copy, None, Filling()
     self.put(arrays)
@@ -108,7 +112,7 @@ class Rows:
       count=np.zeros(sizes["nvert"], np.int32), changed=self._changed, before=self._before,
       pinned=self._pinned,
     )  # fmt: skip
-    self.fields.surface = copy.fields
+    self.fields.surface, self.fields.coarse = copy.fields, int(coarse)
     self._fill, self._found = _fill.command(self.fields).launch, self.fields.found.numpy()
 
   def put(self, arrays: Mapping[str, Any]):

@@ -134,7 +134,7 @@ def _below(
   young = coarsening.young(np.broadcast_to(config.young, mesh.nelem), mesh, levels)
   masks = [pinned, *(pinned[level.vert] for level in levels)]
   parts = [finest] + [
-    arrays(level.mesh, dataclasses.replace(config, young=e), mask)
+    arrays(level.mesh, dataclasses.replace(config, young=e), mask, coarse=True)
     for level, e, mask in zip(levels, young, masks[1:], strict=True)
   ]
   levels[0].weight.resize((nvert, levels[0].mesh.nvert))
@@ -150,6 +150,7 @@ def arrays(
   pinned: np.ndarray,
   patch: int = 0,
   bend_width: np.ndarray | None = None,
+  coarse: bool = False,
 ) -> dict[str, Any]:
   """Returns the fields of `Shape` and `Tissue` by name.
 
@@ -159,13 +160,14 @@ def arrays(
     pinned: vertices that do not move, (nvert,) bool
     patch: see `order.node_order`
     bend_width: rows of each slice of the bending matrix, where it has room for cuts; None for new
+    coarse: whether it is a mesh for preconditioning alone
   """
   vert = node_order(mesh, patch)
   nslice = len(vert) // LANES
   node = np.empty(mesh.nvert, np.int64)
   node[vert[vert >= 0]] = np.flatnonzero(vert >= 0)
   skin = dataclasses.replace(config, bend=0.0) if len(mesh.tet) else config
-  out = _skin(solid.skin(mesh), skin, pinned, vert, node, bend_width)
+  out = _skin(solid.skin(mesh), skin, pinned, vert, node, bend_width, coarse)
   out |= _capsule(mesh.surface, config, pinned, vert, node)
   if len(mesh.tet):
     out |= solid.arrays(mesh, config, vert, node, out["slot_adr"])
@@ -212,9 +214,10 @@ def _skin(
   vert: np.ndarray,
   node: np.ndarray,
   bend_width: np.ndarray | None,
+  coarse: bool = False,
 ) -> dict[str, np.ndarray]:
   """Returns the arrays of fans, nodes and bending of a surface."""
-  nslice, writer = len(vert) // LANES, rows.Rows(WorkingCopy(mesh), {}, node)
+  nslice, writer = len(vert) // LANES, rows.Rows(WorkingCopy(mesh), {}, node, coarse)
   out = _fans(mesh, vert) | _no_bending(nslice)
   if config.bend:
     out |= _bending(mesh, node, nslice, writer.widths(mesh), bend_width)

@@ -70,6 +70,14 @@ def test_who_does_not_get_on_is_helped_and_what_did_not_help_is_not_learned():
   assert lost.outcome == "time limit" and not lost.taught[best + 1 :].any()
 
 
+def test_who_presses_too_hard_is_helped_while_there_is_a_way_back():
+  env = tasks.load("touch", "easy", task_kwargs={"surroundings": "none"})
+  lesson = lessons.give(env, ("peak_force",), 5, 0.5, learner=says([0, 0, 0, 0.5]))
+  peak, first = lesson.seen[:, 0], int(lesson.taught.argmax())
+  assert lesson.outcome == "success" and peak.max() < 2 * env.task.force_limit
+  assert peak[first] > env.task.force_limit > peak[first - 1]
+
+
 def test_a_policy_does_not_end_the_lesson_of_a_search():
   env = tasks.load("probe", "palpate_easy", task_kwargs={"surroundings": "none", "time_limit": 5})
   lesson = lessons.give(env, ("field",), 5, 0.5, learner=says([0, 0, 0, 0, 1.0]))

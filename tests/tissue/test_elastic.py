@@ -195,9 +195,17 @@ def test_matrix_is_the_derivative_of_the_force_in_tension(scenes, name):
     np.testing.assert_allclose(found, expected, atol=1e-3 * np.abs(expected).max())
 
 
-def test_bending_matrix_is_the_derivative_at_rest(scenes):
+def _fan() -> tuple[np.ndarray, np.ndarray]:
+  """Returns triangles around a vertex whose others are on a line: hinges have one curvature."""
+  line = [[x, 0.0, 0.0] for x in (0.0, 0.011, 0.021, 0.032, 0.04)]
+  elem = [[0, k, k + 1] for k in range(1, 5)]
+  return np.array([[0.018, 0.015, 0.0], *line]), np.array(elem)
+
+
+@pytest.mark.parametrize("shape", ["sheet", "fan"])
+def test_bending_matrix_is_the_derivative_at_rest(scenes, shape):
   # A flat plate: out-of-plane stiffness is bending alone.
-  points, elem = scenes.triangular(0.1, 0.05, 6, 4)
+  points, elem = scenes.triangular(0.1, 0.05, 6, 4) if shape == "sheet" else _fan()
   mesh, config, body = scenes.kernels(points, elem, young=(1e-6,), bend=1e12)
   scenes.step(body, 1.0, np.zeros_like(points), beta=0.0)
   matrix = _dense(body) - np.eye(3 * mesh.nvert)
