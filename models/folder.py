@@ -8,8 +8,8 @@ import textwrap
 from collections.abc import Iterable, Mapping
 
 import numpy as np
-from palpate.tissue import fill
-from palpate.tissue import mesh as topology
+from palpate.tissue.geometry import fill
+from palpate.tissue.geometry import mesh as topology
 
 from . import markup, mjcf
 from .catalog import ENTRIES

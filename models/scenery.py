@@ -12,8 +12,8 @@ import functools
 
 import numpy as np
 import trimesh
-from palpate.tissue import subdivide
-from palpate.tissue.mesh import vertex_normals
+from palpate.tissue.geometry import subdivide
+from palpate.tissue.geometry.mesh import vertex_normals
 from scipy.interpolate import CubicSpline
 from scipy.spatial import KDTree
 

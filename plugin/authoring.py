@@ -14,7 +14,7 @@ from . import windows as author
 from .attributes import CONTACT, text
 from .engine import plugin as engine
 from .tissue import config as configuration
-from .tissue import mesh as topology
+from .tissue.geometry import mesh as topology
 
 _DENSITY = 1060.0  # [kg/m^3], of most soft tissue
 _BOX = 0.005  # [m]; half the side of the box whose inertia a node's body has, as in a flexcomp

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from palpate.engine.bonds import Group
+from palpate.engine.beside.bonds import Group
+from palpate.engine.beside.ties import motion
 from palpate.engine.layout import BOND
-from palpate.engine.ties import motion
 
 
 class Bonds:

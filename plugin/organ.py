@@ -5,14 +5,16 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 import numpy.typing as npt
-from palpate.engine import change, mjstruct, motion, pierce, windowed, workspace
+from palpate.engine import change, mjstruct, motion, pierce, workspace
 from palpate.engine import plugin as engine
-from palpate.engine.cuts import Piece, Report
-from palpate.engine.cutters import Cutter
+from palpate.engine.cutting.cuts import Piece, Report
+from palpate.engine.cutting.cutters import Cutter
 from palpate.engine.layout import FLAG
-from palpate.tissue import energy, fill
-from palpate.tissue import mesh as topology
+from palpate.engine.windows import windowed
+from palpate.tissue import energy
 from palpate.tissue.config import Config
+from palpate.tissue.geometry import fill
+from palpate.tissue.geometry import mesh as topology
 
 from .bonds import Bonds
 

@@ -8,8 +8,8 @@ import mujoco
 import numpy as np
 
 from .engine.skin import HIDDEN
-from .tissue import subdivide
-from .tissue.mesh import vertex_normals
+from .tissue.geometry import subdivide
+from .tissue.geometry.mesh import vertex_normals
 from .windows import find_organ
 
 _ENOUGH = 3500  # vertices of a skin, unless told how many

@@ -12,7 +12,7 @@ import numpy as np
 
 from .engine import plugin as engine
 from .engine.layout import WALLS
-from .tissue import mesh as topology
+from .tissue.geometry import mesh as topology
 from .windows import add_node, find_organ, make_flex, rest_of
 
 _INSIDE = (0.5, 0.13, 0.12, 1.0)  # colour of the walls of cuts in a solid

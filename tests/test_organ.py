@@ -5,7 +5,7 @@ import numpy as np
 import palpate
 import pytest
 from palpate.attributes import CONTACT, text
-from palpate.tissue import mesh as topology
+from palpate.tissue.geometry import mesh as topology
 
 
 @pytest.fixture

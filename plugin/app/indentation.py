@@ -13,8 +13,8 @@ from palpate import add_organ
 from palpate.models import block, catalog, organs, shapes
 from palpate.models.refine import refine
 from palpate.organ import Organ
-from palpate.tissue import fill
-from palpate.tissue import mesh as topology
+from palpate.tissue.geometry import fill
+from palpate.tissue.geometry import mesh as topology
 
 from .console import CommandError
 from .measured import Record

@@ -133,7 +133,7 @@ def _shots(args, model, data, renderer, seconds: float, moving: bool) -> Iterato
 def _draw_edges(model, data, scene, option):
   """Adds the edges of every flex surface that is drawn, as lines just above its skin."""
   import mujoco
-  from palpate.tissue.mesh import vertex_normals
+  from palpate.tissue.geometry.mesh import vertex_normals
 
   for flex in range(model.nflex):
     first, count = model.flex_vertadr[flex], model.flex_vertnum[flex]

@@ -1,6 +1,6 @@
 """What acts on an organ of `Worlds` beside its tissue: what all that does so shares.
 
-The kernels and their structs are the plugin's, over rows of worlds: see `palpate.engine.hold`.
+The kernels and their structs are the plugin's, over rows of worlds: see `engine.beside.hold`.
 """
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
@@ -12,7 +12,8 @@ from typing import Any
 import mujoco
 import numpy as np
 import warp as wp
-from palpate.engine import coupling, hold
+from palpate.engine import coupling
+from palpate.engine.beside import hold
 from palpate.tissue import body as bodies
 from palpate.tissue.kernels import Kernel, kernel
 from palpate.tissue.types import DIMS, Array, doubles, fill, floats, ints, struct, vector

@@ -1,7 +1,7 @@
 """Geoms that cut an organ of `Worlds`: the plugin's kernels, over rows of worlds.
 
 A blade's path grows on the device. Now and then the host looks at which are long enough, or have
-ended, and lets the meshes of those worlds come apart; see `engine.cutters`.
+ended, and lets the meshes of those worlds come apart; see `engine.cutting.cutters`.
 """
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
@@ -10,17 +10,18 @@ from typing import Any
 
 import numpy as np
 import warp as wp
-from palpate.engine import cutters, mjstruct
-from palpate.engine.current import ends
+from palpate.engine import mjstruct
+from palpate.engine.cutting import cutters
+from palpate.engine.cutting.current import ends
 from palpate.engine.layout import BLADE, LAW
-from palpate.tissue.mesh import Mesh
+from palpate.tissue.geometry.mesh import Mesh
 from palpate.tissue.step import SCHEMES
 from palpate.tissue.types import allocate, doubles, fill, floats, ints, struct
 
 from . import beside
 from .parting import Cutters
 
-_ROWS = "state", "next", "force", "point", "share", "hold", "due", "law"
+_ROWS = "state", "next", "force", "point", "held", "share", "hold", "due", "law"
 _WorldBlades = beside.in_worlds(
   cutters.Blades,
   _ROWS,
@@ -93,9 +94,9 @@ class Blades(beside.Opens):
     space, body, n = organ.space, organ.body, len(organ.config.cutters)
     mesh, scheme = organ.declared.mesh, SCHEMES[organ.config.integrator]
     self._model = mjstruct.Model.from_address(space.model)
-    shapes = {"force": 3, "point": 3, "share": 3, "hold": 6, "next": len(BLADE)}
+    widths = cutters.WIDTHS.items()
     law = space.cutters.law(self._model, organ.config.thickness)
-    values: dict[str, Any] = {k: self._zeros(self._nworld, n, wide) for k, wide in shapes.items()}
+    values: dict[str, Any] = {k: self._zeros(self._nworld, n, wide) for k, wide in widths}
     values |= space.cutters.edges() | dict(
       nblade=n,
       nelem=mesh.nelem,

@@ -1,4 +1,4 @@
-"""Cuts of an organ in worlds on a device, each with its mesh, as `engine.cuts` has one mjData's.
+"""Cuts of an organ in worlds, each with its mesh, as `engine.cutting.cuts` has one mjData's.
 
 Cuts are found on the host, for the worlds that are cut alone. Their motion comes from the device,
 and what has changed goes there; graphs go on as they were recorded.
@@ -10,18 +10,18 @@ import dataclasses
 
 import numpy as np
 import warp as wp
-from palpate.engine import cuts as engine
 from palpate.engine import flexes
-from palpate.engine.cuts import Piece, Report
+from palpate.engine.cutting import cuts as engine
+from palpate.engine.cutting.cuts import Piece, Report
 from palpate.tissue import body as bodies
-from palpate.tissue import cut as cutting
 from palpate.tissue import device as devices
-from palpate.tissue import mesh as topology
 from palpate.tissue import order, shape, step
-from palpate.tissue.mesh import Mesh
-from palpate.tissue.meshes import Meshes
+from palpate.tissue.cutting import cut as cutting
+from palpate.tissue.cutting.meshes import Meshes
+from palpate.tissue.cutting.path import Finder
+from palpate.tissue.geometry import mesh as topology
+from palpate.tissue.geometry.mesh import Mesh
 from palpate.tissue.order import LANES
-from palpate.tissue.path import Finder
 from palpate.tissue.rows import Rows
 from palpate.tissue.surface import WorkingCopy
 from palpate.tissue.types import NUMBERS, fill

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 import warp as wp
-from palpate.engine import bonds as engine_bonds
-from palpate.engine import hold, rests, ties
+from palpate.engine.beside import bonds as engine_bonds
+from palpate.engine.beside import hold, rests, ties
 from palpate.engine.layout import BOND
 from palpate.tissue.kernels import Kernel
 from palpate.tissue.step import SCHEMES

@@ -12,8 +12,9 @@ import math
 import numpy as np
 import warp as wp
 from palpate.tissue import config as configuration
-from palpate.tissue import plate, solid, step, tets
-from palpate.tissue.fill import vertex_volumes, volumes
+from palpate.tissue import solid, step, tets
+from palpate.tissue.geometry import plate
+from palpate.tissue.geometry.fill import vertex_volumes, volumes
 from palpate.tissue.order import LANES, ellpack, offset
 from palpate.tissue.types import Lump, allocate, fill, floats, ints, struct
 from scipy import sparse

@@ -7,8 +7,9 @@ import functools
 
 import numpy as np
 import warp as wp
-from palpate.engine import coupling, slots
-from palpate.engine.cuts import Report, pieces
+from palpate.engine import coupling
+from palpate.engine.cutting.cuts import Report, pieces
+from palpate.engine.windows import slots
 from palpate.tissue import body as bodies
 from palpate.tissue import config as configuration
 from palpate.tissue import device as devices

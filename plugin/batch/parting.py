@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
-from palpate.engine.cuts import Piece, Report
+from palpate.engine.cutting.cuts import Piece, Report
 
 
 class Cutters(NamedTuple):

@@ -1,11 +1,11 @@
-"""Tissue of `Worlds` that tears where it is stretched too far; see `engine.tear`."""
+"""Tissue of `Worlds` that tears where it is stretched too far; see `engine.cutting.tear`."""
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 import contextlib
 
 import numpy as np
 import warp as wp
-from palpate.engine import tear
+from palpate.engine.cutting import tear
 
 from . import beside
 from .patch import Patch

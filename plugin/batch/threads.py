@@ -14,10 +14,10 @@ import numpy as np
 import warp as wp
 from palpate.engine import coupling
 from palpate.engine import plugin as engine
-from palpate.engine.cuts import Report
+from palpate.engine.cutting.cuts import Report
 from palpate.organ import Organ, instances
 from palpate.tissue import body as bodies
-from palpate.tissue import mesh as topology
+from palpate.tissue.geometry import mesh as topology
 
 from .base import Batch, Tissue, refuse_crowd, spread
 from .bonds import OfThreads

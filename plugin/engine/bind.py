@@ -9,19 +9,8 @@ import warp as wp
 from palpate.tissue import step
 from palpate.tissue.body import Body
 
-from . import (
-  coupling,
-  declare,
-  declare_windows,
-  graphs,
-  mjstruct,
-  nodal,
-  nodes,
-  pierce,
-  slots,
-  weights,
-  windowed,
-)
+from . import coupling, declare, graphs, mjstruct, nodal, pierce, weights
+from .windows import declare_windows, nodes, slots, windowed
 
 
 def bind(w, model: int):

@@ -11,9 +11,11 @@ from palpate.tissue import reading, shape
 from palpate.tissue.config import Config
 from palpate.tissue.step import SCHEMES
 
-from . import adhere, bonds, fasten, graphs, mjstruct, windowed, workspace
+from . import graphs, mjstruct, workspace
+from .beside import adhere, bonds, fasten
+from .beside.ties import Group
 from .bind import bind
-from .ties import Group
+from .windows import windowed
 
 
 def configure(w, model: int, texts: dict[str, str]):

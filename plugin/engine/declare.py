@@ -13,11 +13,12 @@ import mujoco
 import numpy as np
 from palpate.tissue import config as configuration
 from palpate.tissue import device as devices
-from palpate.tissue import diagonals, faces, fill, gmsh, shape
-from palpate.tissue import mesh as topology
+from palpate.tissue import shape
 from palpate.tissue.body import Body
 from palpate.tissue.config import Config
-from palpate.tissue.mesh import Mesh
+from palpate.tissue.geometry import diagonals, faces, fill, gmsh
+from palpate.tissue.geometry import mesh as topology
+from palpate.tissue.geometry.mesh import Mesh
 from palpate.tissue.step import SCHEMES
 
 from . import flexes, graphs, mjstruct

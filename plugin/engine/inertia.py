@@ -10,11 +10,11 @@ import mujoco
 import numpy as np
 import warp as wp
 from palpate.tissue import body as bodies
-from palpate.tissue import mesh as topology
 from palpate.tissue import shape, solid, step
 from palpate.tissue.body import Body
 from palpate.tissue.config import MATERIAL, Config
-from palpate.tissue.mesh import Mesh
+from palpate.tissue.geometry import mesh as topology
+from palpate.tissue.geometry.mesh import Mesh
 from palpate.tissue.order import from_slices, to_slices
 from palpate.tissue.step import SCHEMES
 

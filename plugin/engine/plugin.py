@@ -15,21 +15,11 @@ import mujoco
 import numpy as np
 from palpate.tissue.config import KEYS
 
-from . import (
-  adhere,
-  change,
-  fasten,
-  guard,
-  mjstruct,
-  rests,
-  room,
-  skin,
-  weights,
-  windowed,
-  workspace,
-)
+from . import change, guard, mjstruct, room, skin, weights, workspace
+from .beside import adhere, fasten, rests
 from .layout import FLAG, STAGE
 from .mjstruct import NAME, warn
+from .windows import windowed
 from .workspace import Workspace
 
 if "register" in globals():

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from palpate.tissue import fill
+from palpate.tissue.geometry import fill
 
-from . import coupling, declare, mjstruct, nodal, windowed
+from . import coupling, declare, mjstruct, nodal
+from .windows import windowed
 
 
 def state_size(model: int, instance: int) -> int:

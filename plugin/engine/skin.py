@@ -11,9 +11,9 @@ import dataclasses
 
 import mujoco
 import numpy as np
-from palpate.tissue import mesh as topology
-from palpate.tissue import subdivide
-from palpate.tissue.subdivide import Smooth
+from palpate.tissue.geometry import mesh as topology
+from palpate.tissue.geometry import subdivide
+from palpate.tissue.geometry.subdivide import Smooth
 
 from . import flexes, mjstruct, prepare
 

@@ -12,34 +12,23 @@ from palpate.tissue import body as bodies
 from palpate.tissue.body import Body
 from palpate.tissue.config import Config
 
-from . import (
-  adhere,
-  coupling,
-  declare,
-  declare_windows,
-  fasten,
-  graphs,
-  inertia,
-  mjstruct,
-  prepare,
-  skin,
-  weights,
-  windowed,
-)
+from . import coupling, declare, graphs, inertia, mjstruct, prepare, skin, weights
+from .beside import adhere, fasten
+from .beside.bonds import Bonds
+from .beside.creep import Creep
+from .beside.hold import Beside, Hold
+from .beside.rests import Rests
+from .beside.ties import Ties
 from .bind import bind
-from .bonds import Bonds
 from .coupling import Phases
-from .creep import Creep
-from .cutters import Cutters
+from .cutting.cutters import Cutters
+from .cutting.hewn import Cuts, cuts_of
 from .declare import Declaration
-from .hewn import Cuts, cuts_of
-from .hold import Beside, Hold
 from .layout import FLAG, HEAD, STAGE
 from .pierce import Watch
-from .resident import Resident
-from .rests import Rests
-from .ties import Ties
-from .turns import Turn
+from .windows import declare_windows, windowed
+from .windows.resident import Resident
+from .windows.turns import Turn
 
 _ALLOWED = int(mujoco.mjtSleepPolicy.mjSLEEP_AUTO_ALLOWED)
 _RK4 = int(mujoco.mjtIntegrator.mjINT_RK4)

@@ -1,4 +1,4 @@
-// The stiffness that makes the hinges of a triangle a Kirchhoff plate; tissue/plate.py says how.
+// The stiffness that makes the hinges of a triangle a Kirchhoff plate; tissue/geometry/plate.py says how.
 #pragma once
 #include "surface.h"
 

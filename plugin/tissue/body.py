@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from .device import WORDS, Plan
-from .mesh import Mesh
+from .geometry.mesh import Mesh
 from .order import LANES
 from .types import (
   DIMS,

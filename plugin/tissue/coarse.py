@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
-from . import mesh as topology
-from .mesh import Mesh
+from .geometry import mesh as topology
+from .geometry.mesh import Mesh
 from .order import LANES, addresses, ellpack, offset
 
 COARSEST = 64  # nodes of the coarsest mesh

@@ -9,11 +9,11 @@ from __future__ import annotations
 import numpy as np
 
 from . import config as configuration
-from . import fill, plate
-from . import mesh as topology
 from . import solid as solids
 from .config import Config
-from .mesh import Mesh
+from .geometry import fill, plate
+from .geometry import mesh as topology
+from .geometry.mesh import Mesh
 from .step import OWN_SHARE
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse import csgraph
 
-from .mesh import Mesh
+from .geometry.mesh import Mesh
 
 LANES = 8  # nodes of a slice; see native/simd.h
 

@@ -12,10 +12,10 @@ import numpy as np
 import warp as wp
 
 from . import config as configuration
-from . import faces
 from .config import Config
+from .geometry import faces
+from .geometry.mesh import Mesh
 from .kernels import kernel
-from .mesh import Mesh
 from .surface import Surface, WorkingCopy
 from .types import CONSTANTS, Shape, Tissue, doubles, flags, ints, struct
 

@@ -11,11 +11,11 @@ import warp as wp
 from . import body as bodies
 from . import coarse as coarsening
 from . import device as devices
-from . import mesh as topology
 from . import rows, solid, step
 from .body import Body
 from .config import Config
-from .mesh import Mesh
+from .geometry import mesh as topology
+from .geometry.mesh import Mesh
 from .order import LANES, addresses, banks, node_order, offset, to_slices
 from .surface import WorkingCopy
 from .types import NUMBERS, empty, zeros

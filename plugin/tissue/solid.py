@@ -11,8 +11,8 @@ from scipy.spatial import KDTree
 from . import config as configuration
 from . import tets
 from .config import Config
-from .fill import vertex_volumes, volumes
-from .mesh import Mesh
+from .geometry.fill import vertex_volumes, volumes
+from .geometry.mesh import Mesh
 from .step import OWN_SHARE
 from .types import empty
 

@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from .mesh import Mesh
+from .geometry.mesh import Mesh
 from .types import DIMS, allocate, doubles, flags, longs, struct
 
 

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from .geometry.mesh import Mesh
 from .kernels import aim, kernel
-from .mesh import Mesh
 from .order import LANES, addresses, pad
 from .rows import typed
 from .step import OWN_SHARE

@@ -4,8 +4,9 @@
 
 A sheet of 15 by 10 cm (E = 200 kPa, t = 2 mm, h = 2 ms, windows), a membrane or with bending,
 pinned at its long sides, is cut by a blade at 80 mm/s, by scissors that close, by a hook's current
-at 14 mm/s, or by `Organ.cut`, two edges at a time; the same sheet is pressed by a ball, with room
-for cuts and without. All three are stepped in turn. CPU time of the process; `open` are the steps
+at 14 mm/s, or by `Organ.cut`, two edges at a time; the same sheet is pressed by a ball that holds
+still, with room for cuts and without, and by one that moves on as fast as the tool (as the blade
+for tools without a speed). All are stepped in turn. CPU time of the process; `open` are the steps
 in which the mesh came apart (with `Organ.cut` the call, and the step after it), `between` the
 others. A solid, a block of 30 mm of the same tissue, is cut and pressed in the same way, 6 mm deep;
 `nodes` are those on its surface.
@@ -33,6 +34,7 @@ TISSUES = ("membrane", "plate", "solid")
 DEEP, BLOCK = 6e-3, 0.03  # how deep solids are cut, and how thick they are [m]
 SPEED = {"blade": 0.08, "hook": 0.014}  # [m/s]
 STEPS = 900  # at most
+AROUND = 0.02  # from the ends of the sheet to where the ball that moves turns back [m]
 PIECE = 2.3  # edges that `Organ.cut` cuts at a time
 
 
@@ -81,8 +83,9 @@ def scene(nodes: int, tool: str, tissue: str):
     keys["cutters"] = f"s/edge_left s/edge_right {ENERGY}"
   elif tool != "Organ.cut":
     body = spec.worldbody.add_body(name="ball", pos=[LENGTH / 2, 0, 0.012])
-    body.add_joint(type=SLIDE, axis=[0, 0, 1], name="z", damping=4)
-    scenes.servo(spec, "z", 2000)
+    for axis in ("z", "x"):
+      body.add_joint(type=SLIDE, axis=np.eye(3)["xyz".index(axis)], name=axis, damping=4)
+      scenes.servo(spec, axis, 2000)
     body.add_geom(size=[0.008, 0, 0], mass=0.1)
     keys = {} if tool == "plain" else keys
   if keys and tissue == "solid":
@@ -136,24 +139,35 @@ def _cuts(model, data, organ, tool: str, tissue: str):
         yield step
 
 
+def _place(step: int, speed: float) -> float:
+  """Returns where a ball is that goes to and fro about the middle [m]."""
+  half = LENGTH / 2 - AROUND
+  return half - abs((speed * H * step + half) % (4 * half) - 2 * half)
+
+
 def measure(nodes: int, tool: str, tissue: str) -> dict:
-  """Returns medians of steps of the three sheets or blocks, in ms."""
-  cutting, touched, plain = (scene(nodes, name, tissue) for name in (tool, "ball", "plain"))
-  for model, data, _ in (touched, plain):
+  """Returns medians of steps of the four sheets or blocks, in ms."""
+  cutting, touched, moved, plain = (
+    scene(nodes, name, tissue) for name in (tool, "ball", "ball", "plain")
+  )
+  for model, data, _ in (touched, moved, plain):
     for k in range(150):
       data.ctrl[0] = -0.012 * min(1.0, k / 100)
       mujoco.mj_step(model, data)
-  spent, opened = {"cut": [], "touched": [], "plain": []}, []
+  spent, opened = {"cut": [], "touched": [], "moved": [], "plain": []}, []
+  others = {"touched": touched, "moved": moved, "plain": plain}
   model, data, organ = cutting
   for k, work in enumerate(_cuts(model, data, organ, tool, tissue)):
     before = len(organ.cuts)
     spent["cut"].append(_spent(work))
     opened.append(len(organ.cuts) > before)
-    for name, (m, d, _) in (("touched", touched), ("plain", plain)) if k % 4 == 0 else ():
+    for name, (m, d, _) in others.items() if k % 4 == 0 else ():
+      if name == "moved":
+        d.ctrl[1] = _place(len(spent[name]), SPEED.get(tool, SPEED["blade"]))
       spent[name].append(_spent(lambda m=m, d=d: mujoco.mj_step(m, d)))
   assert organ.error is None and touched[2].error is None, organ.error
   opened, taken = np.array(opened), np.array(spent["cut"])
-  contact = float(np.median(spent["touched"]))
+  contact, moving = (float(np.median(spent[name])) for name in ("touched", "moved"))
   cuts, at = taken[opened], np.flatnonzero(opened[:-1])
   return {
     "nodes": touched[2].nvert,
@@ -163,12 +177,14 @@ def measure(nodes: int, tool: str, tissue: str) -> dict:
     "contacts": touched[1].ncon,
     "plain_ms": float(np.median(spent["plain"])),
     "contact_ms": contact,
+    "moving_ms": moving,
     "between_ms": float(np.median(taken[~opened])),
     "open_ms": float(np.median(cuts)),
     "open_most_ms": float(np.quantile(cuts, 0.95)),
     "mean_ms": float(taken.mean()),
     "cut_ms": float(np.median(taken[at] - 0.5 * (taken[at - 1] + taken[at + 1]))),
     "ratio": float(np.median(cuts)) / contact,
+    "moving_ratio": float(np.median(cuts)) / moving,
     "room_ratio": float(np.median(np.array(spent["touched"]) / np.array(spent["plain"]))),
   }
 
@@ -198,7 +214,7 @@ def arguments(parser: argparse.ArgumentParser):
 
 def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
   """Writes the page."""
-  names = ("contact", "between", "mean", "cut", "open", "open_most")
+  names = ("contact", "moving", "between", "mean", "cut", "open", "open_most")
   table = [
     [
       str(row["nodes"]),
@@ -207,18 +223,21 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
       str(row["cuts"]),
       *(f"{row[f'{name}_ms']:.2f}" for name in names),
       f"{row['ratio']:.2f}",
+      f"{row['moving_ratio']:.2f}",
       f"{row['room_ratio']:.3f}",
     ]
     for row in rows
     if row["status"] == "ok"
   ]
-  head = ["nodes", "tool", "tissue", "cuts", "in contact", "tool in it", "mean", "cut alone",
-          "step that cuts", "95 % of these", "to one in contact", "room to none"]  # fmt: skip
+  head = ["nodes", "tool", "tissue", "cuts", "in contact", "moving", "tool in it", "mean",
+          "cut alone", "step that cuts", "95 % of these", "to one in contact", "to one moving",
+          "room to none"]  # fmt: skip
   lines = [
-    "Milliseconds of CPU time, medians but for one mean. A sheet pressed by a ball (in contact), "
-    "with a tool in it that cuts nothing just then, the mean of all steps while it cuts, what a "
-    "cut of two edges adds, a step with such a cut, 95 % of these, and that to a step in contact; "
-    "last: in contact, with room for cuts to without. "
+    "Milliseconds of CPU time, medians but for one mean. A sheet pressed by a ball that holds "
+    "still (in contact) or moves on, with a tool in it that cuts nothing just then, the mean of "
+    "all steps while it cuts, what a cut of two edges adds, a step with such a cut, 95 % of these, "
+    "and that to a step in contact, and to one in which the ball moves; last: in contact, with "
+    "room for cuts to without. "
     + results.link(out / "cut.csv"),
     "",
     *plots.table(head, table),

@@ -14,10 +14,11 @@ from benchmarks import runner, scene
 from benchmarks.runner import Case, Row
 from palpate.organ import Organ
 from palpate.tissue import config as configuration
-from palpate.tissue import energy, plate
-from palpate.tissue import mesh as topology
+from palpate.tissue import energy
 from palpate.tissue.config import Config
-from palpate.tissue.mesh import Mesh
+from palpate.tissue.geometry import mesh as topology
+from palpate.tissue.geometry import plate
+from palpate.tissue.geometry.mesh import Mesh
 
 DEPTH = 0.008  # of the press [m]
 CLEARANCE = 2e-4  # between probe and organ at first [m]

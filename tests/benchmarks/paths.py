@@ -17,8 +17,8 @@ import palpate
 import scenes
 from benchmarks import plots, results
 from benchmarks.runner import Bench, Case, Row
-from palpate.tissue import mesh as topology
-from palpate.tissue import path as paths
+from palpate.tissue.cutting import path as paths
+from palpate.tissue.geometry import mesh as topology
 from scipy.spatial import ConvexHull
 
 RADIUS, THICKNESS = 0.05, 2e-3  # [m]

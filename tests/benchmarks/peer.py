@@ -31,8 +31,8 @@ import palpate
 import scenes
 from benchmarks import plots, results, scene
 from benchmarks.runner import Bench, Case, Row
-from palpate.tissue import fill
-from palpate.tissue import mesh as topology
+from palpate.tissue.geometry import fill
+from palpate.tissue.geometry import mesh as topology
 from scenes import RADIUS
 
 YOUNG, POISSON, THICKNESS, MASS, DAMPING = 3e4, 0.3, 0.002, 0.1, 0.002

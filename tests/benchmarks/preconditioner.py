@@ -18,9 +18,9 @@ from benchmarks.runner import Bench, Case, Row
 from benchmarks.solver import PRECONDITIONERS, condition, limit, make, press, sphere
 from palpate import models as _models
 from palpate.tissue import coarse as coarsening
-from palpate.tissue import mesh
 from palpate.tissue import step as stepping
 from palpate.tissue.body import Body
+from palpate.tissue.geometry import mesh
 from palpate.tissue.types import Stage
 
 MOST = 1000  # iterations

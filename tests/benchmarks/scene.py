@@ -11,9 +11,9 @@ import numpy as np
 from palpate.engine import weights
 from palpate.models import mjcf
 from palpate.organ import Organ
-from palpate.tissue import fill
-from palpate.tissue import mesh as topology
-from palpate.tissue.mesh import Mesh
+from palpate.tissue.geometry import fill
+from palpate.tissue.geometry import mesh as topology
+from palpate.tissue.geometry.mesh import Mesh
 from scenes import RADIUS, flex, organ, windowed, world
 
 PROBE = 0.006  # radius of the probe [m]

@@ -20,10 +20,11 @@ from benchmarks.results import BenchError
 from benchmarks.runner import Bench, Case, Row
 from palpate.models import grid
 from palpate.tissue import body as bodies
-from palpate.tissue import coarse, config, mesh
+from palpate.tissue import coarse, config
 from palpate.tissue import shape as making
 from palpate.tissue import step as stepping
 from palpate.tissue.body import Body
+from palpate.tissue.geometry import mesh
 from palpate.tissue.types import NUMBERS, Stage
 
 H = 1e-3

@@ -5,7 +5,7 @@ import numpy as np
 import palpate
 import pytest
 import warp as wp
-from palpate.tissue import mesh as topology
+from palpate.tissue.geometry import mesh as topology
 
 GRAVITY = (0, 0, -9.81)
 

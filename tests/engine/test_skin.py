@@ -5,7 +5,7 @@ import numpy as np
 import palpate
 import pytest
 from palpate.models import grid
-from palpate.tissue import subdivide
+from palpate.tissue.geometry import subdivide
 
 RADIUS = 0.03
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from palpate.models import refine
 from palpate.models.quality import angles
-from palpate.tissue import fill
-from palpate.tissue import mesh as topology
+from palpate.tissue.geometry import fill
+from palpate.tissue.geometry import mesh as topology
 
 AT, RADIUS, EDGE = (0, 0, 0.015), 0.006, 0.0015
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import scenes
-from palpate.tissue import fill
-from palpate.tissue import mesh as topology
+from palpate.tissue.geometry import fill
+from palpate.tissue.geometry import mesh as topology
 
 YOUNG, DENSITY = 5000.0, 1000.0
 LENGTH, SIDE = 0.1, 0.04  # of a bar along x [m]

@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import numpy as np
 from palpate.tissue import config as configuration
-from palpate.tissue import mesh as topology
 from palpate.tissue import step as stepping
 from palpate.tissue.config import Config
-from palpate.tissue.mesh import Mesh
+from palpate.tissue.geometry import mesh as topology
+from palpate.tissue.geometry.mesh import Mesh
 from scipy import sparse
 from scipy.sparse import linalg
 

@@ -9,10 +9,11 @@ the error bench; `tests/benchmarks/test_bench.py` checks it against `palpate.tis
 from __future__ import annotations
 
 import numpy as np
-from palpate.tissue import fill, solid
-from palpate.tissue import mesh as topology
+from palpate.tissue import solid
 from palpate.tissue.config import Config
-from palpate.tissue.mesh import Mesh
+from palpate.tissue.geometry import fill
+from palpate.tissue.geometry import mesh as topology
+from palpate.tissue.geometry.mesh import Mesh
 from palpate.tissue.step import OWN_SHARE
 from scipy import sparse
 

@@ -2,10 +2,11 @@
 
 import numpy as np
 import warp as wp
-from palpate.tissue import fill, shape
-from palpate.tissue import mesh as topology
+from palpate.tissue import shape
 from palpate.tissue import step as stepping
 from palpate.tissue.config import Config
+from palpate.tissue.geometry import fill
+from palpate.tissue.geometry import mesh as topology
 from palpate.tissue.order import from_slices, to_slices
 
 

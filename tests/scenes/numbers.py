@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 from palpate.engine import plugin as engine
-from palpate.tissue import mesh as topology
+from palpate.tissue.geometry import mesh as topology
 
 
 def bodies(organ):

@@ -2,7 +2,7 @@
 
 import numpy as np
 import trimesh
-from palpate.tissue import mesh as topology
+from palpate.tissue.geometry import mesh as topology
 from scipy.spatial import Delaunay
 
 RADIUS = 0.05  # of the test sphere [m]

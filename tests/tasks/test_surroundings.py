@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from palpate import tasks
 from palpate.tasks import observation, suite
-from palpate.tissue import subdivide
+from palpate.tissue.geometry import subdivide
 
 
 def load(name, surroundings="abdomen", **options):

@@ -6,7 +6,7 @@ import palpate
 import pytest
 from benchmarks import judge, scene
 from palpate.tissue import energy
-from palpate.tissue import mesh as topology
+from palpate.tissue.geometry import mesh as topology
 
 SCALE = 0.05  # of the test surfaces [m]
 YOUNG = 5000.0

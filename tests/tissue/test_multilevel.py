@@ -6,10 +6,10 @@ import warp as wp
 from palpate.models import grid
 from palpate.tissue import body as bodies
 from palpate.tissue import coarse
-from palpate.tissue import mesh as topology
 from palpate.tissue import shape as making
 from palpate.tissue import step as stepping
 from palpate.tissue.config import Config
+from palpate.tissue.geometry import mesh as topology
 
 H = 1e-3
 MASS = 0.1

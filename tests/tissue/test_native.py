@@ -2,7 +2,8 @@
 
 import pytest
 import warp as wp
-from palpate.engine import nodal, nodes, slots
+from palpate.engine import nodal
+from palpate.engine.windows import nodes, slots
 from palpate.tissue import kernels, step
 
 # Kernels are declared where they are used; these modules declare all of them.

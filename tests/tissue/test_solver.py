@@ -5,11 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 import warp as wp
-from palpate.tissue import energy, plate
-from palpate.tissue import mesh as topology
+from palpate.tissue import energy
 from palpate.tissue import shape as making
 from palpate.tissue import step as stepping
 from palpate.tissue.config import rigidity
+from palpate.tissue.geometry import mesh as topology
+from palpate.tissue.geometry import plate
 from reference import plates
 
 H = 1e-3

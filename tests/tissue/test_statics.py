@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from palpate.tissue import mesh as topology
+from palpate.tissue.geometry import mesh as topology
 
 THICKNESS = 0.002
 

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from palpate.models import shapes
 from palpate.tissue import config as configuration
-from palpate.tissue import energy, fill, gmsh, solid
-from palpate.tissue import mesh as topology
+from palpate.tissue import energy, solid
+from palpate.tissue.geometry import fill, gmsh
+from palpate.tissue.geometry import mesh as topology
 from reference import closed
 from reference.closed import YOUNG
 

@@ -6,7 +6,8 @@ import re
 
 import pytest
 from palpate.engine import workspace
-from palpate.tissue import body, config, mesh, plate, step, types
+from palpate.tissue import body, config, step, types
+from palpate.tissue.geometry import mesh, plate
 
 CLASSES = (
   body.Body,

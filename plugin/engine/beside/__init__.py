@@ -1,0 +1,1 @@
+"""What acts on an organ beside its tissue: ties, bonds, supports, relaxation."""

@@ -1,0 +1,418 @@
+"""Geoms that cut an organ: blades, and the two of scissors; their forces are `native/blades.h`.
+
+A blade's path grows in the plugin state, step by step; here the mesh comes apart along it, a few
+edges at a time, since the mesh cannot do so by less.
+"""
+
+# Annotations here are objects, not text: no `from __future__ import annotations`.
+# pyright: reportInvalidTypeForm=false
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import mujoco
+import numpy as np
+import warp as wp
+from palpate.tissue.cutting.path import Finder
+from palpate.tissue.geometry.mesh import Mesh
+from palpate.tissue.step import SCHEMES
+from palpate.tissue.types import Views, doubles, fill, ints, struct
+
+from .. import coupling, flexes, mjstruct
+from ..beside import fasten
+from ..beside.hold import Beside, Bodies, Input, Nodes, base, nodes, solver
+from ..layout import BLADE, LAW, TRAIL
+from . import inward
+from .current import Current
+from .cuts import Report
+
+_SLACK = 0.1  # edges of the mesh by which a blade's spring is stretched where it cuts
+_MORE = 0.5  # edges after which what could not come apart is tried again
+# Share of the work on an edge that moving a vertex may turn into strain: without it none could move
+# on to the blade's path, where tissue is stretched.
+GIVEN = 0.1
+_ROUND = (int(mujoco.mjtGeom.mjGEOM_CAPSULE), int(mujoco.mjtGeom.mjGEOM_CYLINDER))
+_BOX = int(mujoco.mjtGeom.mjGEOM_BOX)
+
+
+@struct
+class Blades:
+  """The geoms that cut an organ."""
+
+  nblade: int  # number of them
+  nelem: int  # triangles of the organ
+  ahead: wp.float64  # share of the step's way at which its scheme takes forces
+  gain: wp.float64  # how much of a step's stiffness its scheme has on dv
+  edge: wp.float64  # mean length of the mesh's edges [m]
+  geom: ints("nblade", 2)  # its geoms, the second of scissors alone; else -1
+  axis: ints("nblade", 2)  # axis of each along which its edge is
+  half: doubles("nblade", 2)  # half the edge's length [m]
+  law: doubles("nblade", len(LAW))  # see LAW
+  mesh: ints("nworld")  # which mesh a world has
+  elem: ints("nelem", 3)  # triangles
+  flat: doubles("nvert", 3)  # rest positions as the cuts have them [m]
+  state: doubles("nblade", len(BLADE))  # see BLADE
+  next: doubles("nblade", len(BLADE))  # what it will be
+  force: doubles("nblade", 3)  # on the tissue, in the organ's frame [N]
+  point: doubles("nblade", 3)  # where it acts [m]
+  held: ints("nblade", 6)  # vertices that bear it
+  share: doubles("nblade", 6)  # of each of them
+  hold: doubles("nblade", 6)  # what weighs on the change of the seat's velocity [kg]
+  due: ints("nblade")  # whether the path is to come apart, and how
+  own: Nodes
+  solve: Input
+  number: doubles("nnumber")  # see `NUMBERS`
+  mj: Bodies
+
+
+# Of the arrays that a step writes, a row for each.
+WIDTHS = {"force": 3, "point": 3, "held": 6, "share": 6, "hold": 6, "next": len(BLADE)}
+KERNELS = "enter_blades", "act_blades", "keep_blades"
+_enter, _act, _keep = coupling.kernels("blades.h", Blades, *KERNELS)
+# As in the header: the blade is out of the tissue; edges between points of a path, and that come
+# apart at once.
+ENDED, _SPACING, _BATCH = 2, 0.4, 1.8
+
+
+@dataclasses.dataclass(frozen=True)
+class Cutter:
+  """A geom, or two, that cut an organ.
+
+  Attributes:
+    geoms: their names
+    inside: whether it has gone through the wall and is there
+    force: on the tissue in the last step, in the world [N]  (3,)
+    energy: that opening the tissue has taken [J]
+    length: of its paths so far, at rest [m]
+    seat: where it is in the tissue at rest, in the world [m]  (3,)
+  """
+
+  geoms: tuple[str, ...]
+  inside: bool
+  force: np.ndarray
+  energy: float
+  length: float
+  seat: np.ndarray
+
+
+class Cutters(Beside):
+  """What cuts a workspace's organ; false where nothing does.
+
+  Args:
+    w: the workspace
+  """
+
+  ENTER, ACT, END = _enter, _act, _keep
+
+  def __init__(self, w):
+    super().__init__(w)
+    self.names: list[tuple[str, ...]] = []
+    self._arrays: dict[str, np.ndarray] = {}
+    self._width = np.zeros(0)
+    self.by_current: dict[int, Current] = {}
+    self._due: Any = ()
+    self._here: Any = None  # the arrays of `fields`, and of what it has of the organ
+    self._own: Any = None
+    self._said = False
+
+  def __bool__(self) -> bool:
+    return bool(self.names)
+
+  def declare(self):
+    """Finds the geoms that the configuration names.
+
+    Raises:
+      ValueError: one does not exist, has no edge, or collides with the organ.
+    """
+    w = self._w
+    if not w.config.cutters:
+      return
+    m = mjstruct.Model.from_address(w.model)
+    rows = w.config.cutters
+    found = [[_find(w, m, name, bool(row.current)) for name in row.geoms] for row in rows]
+    n = len(found)
+    geom, half, axis = np.full((n, 2), -1), np.zeros((n, 2)), np.zeros((n, 2), int)
+    self._width = np.zeros(n)
+    for i, geoms in enumerate(found):
+      for k, g in enumerate(geoms):
+        geom[i, k] = g
+        axis[i, k], half[i, k], width = _shape(w, m, g)
+        self._width[i] = max(self._width[i], width)
+      if rows[i].current:
+        actuator, shape = _find_actuator(w, m, rows[i].current), _shape(w, m, geoms[0])
+        self.by_current[i] = Current(w, geoms[0], actuator, rows[i].energy, shape)
+    self.names = [tuple(_name(m, g) for g in geoms) for geoms in found]
+    self._arrays = {"geom": geom, "axis": axis, "half": half}
+    w.hold.need()
+
+  def law(self, m, thickness: float) -> np.ndarray:
+    """Returns the rows of `Blades.law` where the wall has a thickness [m]."""
+    w, rows = self._w, []
+    solid, edge = w.config.elements == "solid", w.organ.mesh.whole.edge_length
+    thickness = inward.PIERCED if solid else thickness
+    for i, row in enumerate(w.config.cutters):
+      force = row.energy * (1.0 if solid else thickness)  # of a solid by depth
+      if row.current:
+        rows.append((0.0, 0.0, 0.0, thickness, solid))
+        continue
+      stiff = force * (edge if solid else 1.0) / (_SLACK * edge)
+      for g in self._arrays["geom"][i]:
+        if g >= 0:
+          body = int(mjstruct.view(m.geom_bodyid, m.ngeom, np.int32)[g])
+          stiff = min(stiff, fasten.most(w, m, body))
+      rows.append((force, row.energy * self._width[i], stiff, thickness, solid))
+    return np.array(rows)
+
+  @property
+  def currents(self) -> list[str]:
+    """Names of the geoms that cut by a current."""
+    return [self.names[i][0] for i in self.by_current]
+
+  def edges(self) -> dict[str, np.ndarray]:
+    """Returns the fields of `Blades` that say which geoms they are, and their edges."""
+    return self._arrays
+
+  @property
+  def state(self) -> np.ndarray:
+    """Where each is in the tissue, in the plugin state, (nblade, len(BLADE))."""
+    return self._here.state
+
+  def bind(self, model: int):
+    """See `Beside`."""
+    if not self:
+      return
+    w, n, mesh = self._w, len(self.names), self._w.organ.mesh
+    m, scheme = mjstruct.Model.from_address(model), SCHEMES[w.config.integrator]
+    values = {name: np.zeros((n, width)) for name, width in WIDTHS.items()}
+    values |= self._arrays | dict(
+      nblade=n,
+      nelem=mesh.whole.nelem,
+      ahead=float(scheme.ahead),
+      gain=scheme.gain(1.0, 0.0),
+      edge=float(mesh.whole.edge_length),
+      law=self.law(m, w.config.thickness),
+      mesh=np.zeros(1),
+      elem=mesh.elem[: mesh.whole.nelem],
+      flat=mesh.rest,
+      state=self.rows("blade", len(BLADE)),
+      due=np.zeros(n),
+      own=nodes(w),
+      solve=solver(w),
+      number=w.body.numbers,
+      mj=coupling.mujoco_arrays(model, w.data, Bodies),
+    )
+    self.fields = fill(Blades, "cpu", values)
+    self._here, self._own = Views(self.fields), Views(self.fields.own)
+    self._due = self._here.due.data
+    if w.cuts and not len(mesh.tet):
+      assert w.cuts.finder.stops  # made now, since its kernel takes a while to load
+
+  def refresh(self):
+    """Takes the thickness that the wall has now."""
+    if self.fields is not None:
+      m = mjstruct.Model.from_address(self._w.model)
+      self.fields.law.assign(self.law(m, self._w.config.thickness))
+
+  def reshape(self) -> list:
+    """See `Beside`."""
+    if self.fields is not None:
+      mesh = self._w.organ.mesh
+      self._here.elem[:] = mesh.elem[: mesh.whole.nelem]
+      self._here.flat[:] = mesh.rest
+      self._own.rest[:] = base(self._w.organ)
+    return []
+
+  def open(self) -> bool:
+    """Lets the mesh come apart along the paths that are long enough, or ended; returns whether."""
+    opened, mesh = False, self._w.organ.mesh
+    for i, current in self.by_current.items():
+      row = self.state[i]
+      self._due[i] = ENDED if current.act(row) else lay_trail(row, mesh.whole.edge_length)
+    for i, due in enumerate(self._due):
+      if due:
+        given = GIVEN * self._here.law[i, LAW.force] * mesh.whole.edge_length
+        opened = self._open(i, due == ENDED, given) or opened
+        self._due[i] = 0
+    return opened
+
+  def _open(self, i: int, ended: bool, given: float) -> bool:
+    """Opens the path of a blade; returns whether the mesh is another."""
+    w, row, mesh = self._w, self.state[i], self._w.organ.mesh
+
+    def cut(path: np.ndarray, *deep: np.ndarray) -> tuple[Report, Mesh]:
+      if not deep:
+        return w.cuts.cut_at_rest(path, given), w.organ.mesh
+      organ = w.organ
+      along = None if i in self.by_current else self._along(i)
+      now, elem = self._on_surface(path)
+      way = inward.direction(organ, w.phases.motion()[0], along, elem)
+      now = organ.origin + now @ organ.frame.T
+      return w.cuts.cut(now, given * float(deep[0].mean()), deep[0], way), w.organ.mesh
+
+    if len(mesh.tet):
+      edge = mesh.whole.edge_length
+      report, why = inward.open_path(row, edge, ended, w.cuts.finder, cut)
+    else:
+      report, why = open_path(row, mesh, ended, w.organ, w.cuts.finder, cut)
+    if "pinned" in why and not self._said:
+      self._said = True
+      mjstruct.warn(why)
+    return report is not None and report.nodes > 0
+
+  def _along(self, i: int) -> np.ndarray:
+    """Returns the way along a blade, or along which scissors close, in the world, either sign."""
+    m = mjstruct.Model.from_address(self._w.model)
+    d = mjstruct.Data.from_address(self._w.data)
+    turn = mjstruct.view(d.geom_xmat, (m.ngeom, 3, 3))
+    geoms, axes = self._arrays["geom"][i], self._arrays["axis"][i]
+    one, two = (turn[g][:, k] for g, k in zip(geoms, axes, strict=True))
+    if geoms[1] < 0:
+      return one
+    return one - np.copysign(1.0, one @ two) * two  # blades are at less than 90 degrees
+
+  def _on_surface(self, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns where points of the rest shape are now, in the organ's frame, and their triangles."""
+    w, mesh = self._w, self._w.organ.mesh
+    elem, weight, _ = w.cuts.finder.nearest(mesh, mesh.rest, path)
+    vert = mesh.elem[elem]
+    return np.einsum("nk,nkj->nj", weight, mesh.rest[vert] + w.phases.motion()[0][vert]), elem
+
+  def read(self) -> list[Cutter]:
+    """Returns what the cutters do."""
+    out = []
+    if not self:
+      return out
+    for names, row, force in zip(self.names, self.state, self._forces(), strict=True):
+      stage, energy, length = row[[BLADE.stage, BLADE.work, BLADE.opened]]
+      organ = self._w.organ
+      seat = organ.origin + organ.frame @ row[BLADE.at : BLADE.at + 3]
+      out.append(Cutter(names, stage == 2, force, float(energy), float(length), seat))
+    return out
+
+  def _forces(self) -> np.ndarray:
+    return self._here.force @ self._w.organ.frame.T
+
+
+def lay_trail(row: np.ndarray, edge: float) -> int:
+  """Lets a path follow what cuts by a current; returns what is due, as the header says of blades.
+
+  Args:
+    row: of the blades' state
+    edge: mean length of the mesh's edges [m]
+  """
+  count, at = int(row[BLADE.count]), row[BLADE.at : BLADE.at + 3]
+  if not row[BLADE.stage]:
+    return 0
+  start, last = (row[k : k + 3] for k in (BLADE.trail, BLADE.trail + 3 * (count - 1)))
+  if count < TRAIL and np.linalg.norm(at - last) > _SPACING * edge:
+    row[BLADE.trail + 3 * count : BLADE.trail + 3 * count + 3] = at
+    row[BLADE.below + count] = row[BLADE.depth]
+    row[BLADE.count] += 1
+  wait = row[BLADE.wait] or _BATCH * edge
+  return int(np.linalg.norm(at - start) > wait or row[BLADE.count] == TRAIL)
+
+
+def open_path(
+  row: np.ndarray,
+  mesh: Mesh,
+  ended: bool,
+  organ,
+  finder: Finder,
+  cut: Callable[[np.ndarray], tuple[Report, Mesh]],
+) -> tuple[Report | None, str]:
+  """Opens the path of a blade, as far as the mesh is to come apart along it.
+
+  Args:
+    row: of the blades' state
+    mesh: the organ's
+    ended: whether all of it comes apart
+    organ: its declaration
+    finder: of its surfaces
+    cut: cuts along a path at rest, (n, 3) [m]; returns what it did, and the mesh then
+
+  Returns:
+    what was cut, None for nothing, and why it could not be
+  """
+  count, at = int(row[BLADE.count]), row[BLADE.at : BLADE.at + 3]
+  edge = mesh.whole.edge_length
+  trail = row[BLADE.trail : BLADE.trail + 3 * count].reshape(-1, 3)
+  path, rest = np.vstack([trail, at]), at[None]
+  if not ended:
+    path, rest = finder.stops.part(mesh, path)
+  report, why = None, ""
+  try:
+    if len(path) > 1:
+      report, mesh = cut(path)
+  except ValueError as error:
+    why = str(error)
+  if ended:
+    row[BLADE.count] = 0
+  elif report is None:
+    _wait(row, at, edge, "pinned" in why or count == TRAIL)
+  else:
+    tip = (report.path[-1][-1] - organ.origin) @ organ.frame if report.path else path[-1]
+    trail = np.concatenate([tip[None], rest[:-1]])[:TRAIL]
+    row[BLADE.count], row[BLADE.wait] = len(trail), 0.0
+    row[BLADE.trail : BLADE.trail + trail.size] = trail.ravel()
+    row[BLADE.elem] = finder.nearest(mesh, mesh.rest, at[None])[0][0]
+  return report, why
+
+
+def _wait(row: np.ndarray, at: np.ndarray, edge: float, full: bool):
+  """Lets a path grow that could not come apart, or forgets it where there is no more room."""
+  start = row[BLADE.trail : BLADE.trail + 3]
+  row[BLADE.wait] = np.linalg.norm(at - start) + _MORE * edge
+  if full:
+    row[BLADE.count], row[BLADE.wait] = 1, 0.0
+    start[:] = at
+
+
+def _name(m, geom: int) -> str:
+  return mjstruct.name_of(m, m.name_geomadr, geom)
+
+
+def _find_actuator(w, m, name: str) -> int:
+  names = [mjstruct.name_of(m, m.name_actuatoradr, a) for a in range(m.nu)]
+  found = flexes.resolve(name, w.organ.name, names)
+  if found is None:
+    raise ValueError(
+      f"organ {w.organ.name!r}: cutters names {name!r}, which is no actuator of the model"
+    )
+  return names.index(found)
+
+
+def _find(w, m, name: str, current: bool) -> int:
+  names = [_name(m, g) for g in range(m.ngeom)]
+  found = flexes.resolve(name, w.organ.name, names)
+  if found is None:
+    raise ValueError(
+      f"organ {w.organ.name!r}: cutters names {name!r}, which is no geom of the model"
+    )
+  geom = names.index(found)
+  flex = w.organ.windows.flex if w.organ.windows else [w.organ.flex]
+  if not current and not w.cuts:
+    raise ValueError(
+      f"organ {w.organ.name!r}: cutters names {name!r}, which cuts by its edge, allowed only with "
+      "spare"
+    )
+  if not current and any(geom in flexes.meeting_geoms(m, int(f)) for f in flex):
+    raise ValueError(
+      f"organ {w.organ.name!r}: cutters names {name!r}, which collides with it, expected a geom "
+      "with contype='0' conaffinity='0': what cuts goes through"
+    )
+  return geom
+
+
+def _shape(w, m, geom: int) -> tuple[int, float, float]:
+  """Returns the axis of a geom along which its edge is, half its length and its width [m]."""
+  kind = int(mjstruct.view(m.geom_type, m.ngeom, np.int32)[geom])
+  size = mjstruct.view(m.geom_size, (m.ngeom, 3))[geom]
+  if kind == _BOX:
+    order = np.argsort(size)
+    return int(order[2]), float(size[order[2]]), 2 * float(size[order[1]])
+  if kind not in _ROUND:
+    raise ValueError(
+      f"organ {w.organ.name!r}: cutters names {_name(m, geom)!r}, expected a capsule, cylinder or "
+      "box, whose longest axis is the edge"
+    )
+  return 2, float(size[1]), 2 * float(size[0])

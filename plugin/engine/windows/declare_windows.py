@@ -1,0 +1,315 @@
+"""Reads the declaration of an organ with windows from a compiled mjModel and checks it."""
+
+from __future__ import annotations
+
+import numpy as np
+from palpate.tissue import device as devices
+from palpate.tissue.config import Config
+from palpate.tissue.geometry import fill
+from palpate.tissue.geometry import mesh as topology
+
+from .. import declare, flexes, mjstruct
+from ..declare import Declaration, Windows
+from ..layout import MAX_GEOMS, MAX_WINDOWS
+
+_NEAR = 0.1  # of its size: closer than that to an organ, a flex is beside it
+
+
+def read(model: int, instance: int) -> Declaration:
+  """Returns the organ that plugin instance `instance` declares: a rigid flex, with windows.
+
+  Raises:
+    ValueError: the declaration is not one this plugin can run.
+  """
+  devices.init()
+  m = mjstruct.Model.from_address(model)
+  flex, parent = _surface(m, instance)
+  name = flexes.name(m, flex)
+  frame, origin = declare.static_frame(m, name, parent)
+  nvert = flexes.vertices(m, flex)
+  start = int(mjstruct.view(m.flex_vertadr, m.nflex, np.int32)[flex])
+  rest = mjstruct.view(m.flex_vert, (m.nflexvert, 3))[start : start + nvert].copy()
+  config, mesh = declare.read_mesh(m, name, declare.keys(model, instance), rest, flex)
+  declare.check_volume(name, mesh, config)
+  if config.elements == "solid":
+    mesh = declare.fill_inside(name, mesh, config)
+  free = np.ones(mesh.nvert, bool)
+  for vertex in config.pin:
+    if vertex >= nvert:
+      raise ValueError(f"organ {name!r}: pin has {vertex}, expected vertices in [0, {nvert})")
+    free[vertex] = bool(config.carrier)  # which holds them by springs
+  if not free.any():
+    raise ValueError(f"organ {name!r}: all vertices are pinned, expected some that move")
+  share = fill.vertex_volumes(mesh) if len(mesh.tet) else topology.vertex_areas(rest, mesh.elem)
+  mass = config.mass * share / share.sum()
+  windows = _windows(model, m, instance, name, config, mesh, mass, (frame, origin))
+  _check_neighbours(m, model, instance, name, windows, frame, origin, rest)
+  absent = np.full(mesh.nvert, -1)
+  return declare.cached(
+    float(m.opt.timestep),
+    name=name,
+    flex=flex,
+    mesh=mesh,
+    config=config,
+    free=free,
+    body=np.full(mesh.nvert, parent),
+    dofadr=absent,
+    qposadr=absent,
+    stateadr=absent,
+    nfree=0,
+    frame=frame,
+    origin=origin,
+    mass=mass,
+    windows=windows,
+  )
+
+
+def _surface(m, instance: int) -> tuple[int, int]:
+  """Returns the rigid flex that is the organ and the body that it is in."""
+  bodies, mine = _rigid_flexes(m, instance)
+  who = mjstruct.name_of(m, m.name_bodyadr, int(bodies[0]))
+  if len(mine) != 1:
+    raise ValueError(
+      f"plugin palpate.organ with window on body {who!r}: {len(mine)} rigid flexcomps there, "
+      "expected one <flexcomp rigid='true'> in the body that has the plugin"
+    )
+  flex = mine[0]
+  name = flexes.name(m, flex)
+  declare.check_surface(m, flex, name)
+  for key in ("contype", "conaffinity"):
+    value = mjstruct.view(getattr(m, f"flex_{key}"), m.nflex, np.int32)[flex]
+    if value:
+      raise ValueError(f"organ {name!r}: {key} is {value}, expected 0: its windows collide for it")
+  return flex, int(bodies[0])
+
+
+def _rigid_flexes(m, instance: int) -> tuple[np.ndarray, list[int]]:
+  """Returns the bodies of a plugin instance and the rigid flexes in them."""
+  bodies = np.flatnonzero(mjstruct.view(m.body_plugin, m.nbody, np.int32) == instance)
+  start = mjstruct.view(m.flex_vertadr, m.nflex, np.int32)
+  vertbody = mjstruct.view(m.flex_vertbodyid, m.nflexvert, np.int32)
+  rigid = mjstruct.view(m.flex_rigid, m.nflex, np.bool_)
+  return bodies, [f for f in range(m.nflex) if rigid[f] and vertbody[start[f]] in bodies]
+
+
+def _windows(model, m, instance, name, config, mesh, mass, place) -> Windows:
+  """Returns the windows of an organ, and where they stand at rest."""
+  found = _claimed(model, m, instance, name, config)
+  slots = [
+    _slots(m, f"organ {name!r}: window {window!r}", window, flex, place)
+    for window, flex in zip(config.window, found, strict=True)
+  ]
+  sizes = [len(each[0]) for each in slots]
+  body, dofadr, qposadr, offset, turn = (
+    np.concatenate(parts) for parts in zip(*slots, strict=True)
+  )
+  elem_num = mjstruct.view(m.flex_elemnum, m.nflex, np.int32)[found]
+  # At rest the windows stand on patches of their own: their bodies move there, so that qpos0 fits.
+  # The last slot stays free; a patch of n nodes has up to 2 n - 4 triangles: see `native/slot.h`.
+  room = [min(n - 1, int(t) // 2 + 2) for n, t in zip(sizes, elem_num, strict=True)]
+  home = _home_slots(mesh.elem, mesh.nouter, sizes, room)
+  used = home >= 0
+  stand = mjstruct.view(m.body_pos, (m.nbody, 3))[body]
+  stand[used] = np.einsum("kij,kj->ki", turn[used], offset[used] + mesh.rest[home[used]])
+  geom_adr, geom = _followed(m, name, config, found)
+  return Windows(
+    flex=np.array(found),
+    adr=np.concatenate([[0], np.cumsum(sizes)]),
+    body=body,
+    dofadr=dofadr,
+    qposadr=qposadr,
+    home=home,
+    stand=stand,
+    qhome=offset - np.einsum("kji,kj->ki", turn, stand),
+    elem_adr=mjstruct.view(m.flex_elemdataadr, m.nflex, np.int32)[found],
+    elem_num=elem_num,
+    geom_adr=geom_adr,
+    geom=geom,
+    mass=mass,
+  )
+
+
+def _claimed(model, m, instance: int, name: str, config: Config) -> list[int]:
+  """Returns the flexes that an organ names as its windows and nobody else does."""
+  names = [flexes.name(m, f) for f in range(m.nflex)]
+  surface = _surfaces(model, m, instance, without=instance)
+  claimed = {names[window]: f"organ {names[flex]!r}" for window, flex in surface.items()}
+  if len(config.window) > MAX_WINDOWS:
+    raise ValueError(
+      f"organ {name!r}: window has {len(config.window)} names, expected at most {MAX_WINDOWS}"
+    )
+  out = []
+  for window in config.window:
+    what = f"organ {name!r}: window {window!r}"
+    found = flexes.resolve(window, name, names)
+    if found is None:
+      raise ValueError(f"{what} does not exist, expected a flexcomp; the model has {names}")
+    if found in claimed:
+      raise ValueError(f"{what} is claimed by {claimed[found]} too, expected one organ a window")
+    claimed[found] = "this organ"
+    out.append(names.index(found))
+  return out
+
+
+def _slots(m, what: str, window: str, flex: int, place) -> tuple[np.ndarray, ...]:
+  """Returns body, first dof, first qpos, offset from the organ and turn of each of its slots."""
+  start = int(mjstruct.view(m.flex_vertadr, m.nflex, np.int32)[flex])
+  count = flexes.vertices(m, flex)
+  own = mjstruct.view(m.flex_vertbodyid, m.nflexvert, np.int32)[start : start + count].copy()
+  jointed = mjstruct.view(m.body_jntnum, m.nbody, np.int32)[own] > 0
+  try:
+    declare.check_flex(m, flex, window)
+    if not jointed.all():
+      raise ValueError(f"organ {window!r}: vertices without joints, expected no pins")
+    frame, origin = declare.static_frame(m, window, declare.find_parent(m, window, own, jointed))
+    turn = declare.find_turn(m, window, own)
+    frame = frame @ turn
+    dofs, qposs = declare.addresses(m, window, own, jointed)
+  except ValueError as error:
+    raise ValueError(f"{what}: {str(error).partition(': ')[2]}") from None
+  if np.abs(frame - place[0]).max() > 1e-9:
+    raise ValueError(f"{what} is rotated against the organ, expected the same orientation")
+  offset = np.tile(place[0].T @ (place[1] - origin), (count, 1))
+  return own, dofs, qposs, offset, np.tile(turn, (count, 1, 1))
+
+
+def _followed(m, name: str, config: Config, flex: list[int]) -> tuple[np.ndarray, np.ndarray]:
+  """Returns the geoms of each window: those of the bodies named, or all that move and collide."""
+  bodyid = mjstruct.view(m.geom_bodyid, m.ngeom, np.int32)
+  weld = mjstruct.view(m.body_weldid, m.nbody, np.int32)
+  names = [mjstruct.name_of(m, m.name_bodyadr, b) for b in range(m.nbody)]
+  groups: list[list[int]] = []
+  for k, f in enumerate(flex):
+    meets = flexes.meeting_geoms(m, f)
+    if config.follow:
+      if len(config.follow) != len(flex):
+        raise ValueError(
+          f"organ {name!r}: follow has {len(config.follow)} groups, expected {len(flex)}, "
+          "one a window"
+        )
+      wanted = []
+      for body in config.follow[k]:
+        found = flexes.resolve(body, name, names)
+        if found is None:
+          raise ValueError(f"organ {name!r}: follow names body {body!r}, which does not exist")
+        wanted.append(names.index(found))
+      mine = [g for g in meets if bodyid[g] in wanted]
+      _check_follow(name, config.follow[k], {int(bodyid[g]) for g in mine}, wanted)
+    else:
+      mine = [g for g in meets if weld[bodyid[g]] != 0]
+    groups.append(mine)
+  if not config.follow and len(flex) > 1:
+    # A tree of bodies is one tool: a triangle between two windows would touch neither jaw.
+    root = mjstruct.view(m.body_treeid, m.nbody, np.int32)[bodyid]
+    trees = sorted({root[g] for group in groups for g in group})
+    turn = {tree: k % len(flex) for k, tree in enumerate(trees)}
+    groups = [[g for g in group if turn[root[g]] == k] for k, group in enumerate(groups)]
+  for k, group in enumerate(groups):
+    if len(group) > MAX_GEOMS:
+      raise ValueError(
+        f"organ {name!r}: window {config.window[k]!r} follows {len(group)} geoms, expected at most "
+        f"{MAX_GEOMS}; name bodies in follow"
+      )
+  adr = np.concatenate([[0], np.cumsum([len(group) for group in groups])])
+  return adr, np.array([g for group in groups for g in group], np.int64)
+
+
+def _check_follow(organ: str, follow: tuple[str, ...], touching: set[int], wanted: list[int]):
+  """Raises ValueError where a window follows a body with which it cannot collide."""
+  for body, number in zip(follow, wanted, strict=True):
+    if number not in touching:
+      raise ValueError(
+        f"organ {organ!r}: follow names body {body!r}, which has no geoms that collide with its "
+        "window, expected bodies with geoms"
+      )
+
+
+def _check_neighbours(m, model, instance, name, windows: Windows, frame, origin, rest):
+  """Raises ValueError where a flex is beside the organ and collides with its windows.
+
+  Windows follow geoms: they would not be there.
+  """
+  own = np.isin(np.arange(m.nflex), windows.flex)
+  contype = mjstruct.view(m.flex_contype, m.nflex, np.int32)
+  conaffinity = mjstruct.view(m.flex_conaffinity, m.nflex, np.int32)
+  surface = _surfaces(model, m, instance, without=instance)
+  bearing = _bearing(model, m, instance, name)
+  points = origin + rest @ frame.T
+  room = _NEAR * float(np.linalg.norm(np.ptp(points, axis=0)))
+  low, high = points.min(axis=0) - room, points.max(axis=0) + room
+  for f in np.flatnonzero(~own):
+    if flexes.name(m, surface.get(int(f), int(f))) in bearing:
+      continue
+    meets = (contype[f] & conaffinity[own]) | (conaffinity[f] & contype[own])
+    other = flexes.rest_points(m, surface.get(int(f), int(f)))
+    if meets.any() and (other.max(axis=0) > low).all() and (other.min(axis=0) < high).all():
+      raise ValueError(
+        f"organ {name!r}: its windows follow geoms and would not feel flex "
+        f"{flexes.name(m, surface.get(int(f), int(f)))!r} beside it; use nodal coupling, or "
+        "contype and conaffinity that do not meet"
+      )
+
+
+def _bearing(model, m, instance: int, name: str) -> set[str]:
+  """Returns the organs on which one rests, and those that rest on it."""
+  names = [flexes.name(m, f) for f in range(m.nflex)]
+  found = {}
+  for other in range(m.nplugin):
+    for flex in _rigid_flexes(m, other)[1]:
+      support = mjstruct.config(model, other, "support").split()
+      found[names[flex]] = {flexes.resolve(each, names[flex], names) for each in support}
+  return {each for each in names if name in found.get(each, ()) or each in found.get(name, ())}
+
+
+def touching(model: int, instance: int) -> np.ndarray:
+  """Returns the flexes that meet tools for this plugin's organs, of which one is an instance."""
+  m = mjstruct.Model.from_address(model)
+  owner = mjstruct.view(m.body_plugin, m.nbody, np.int32)
+  plugin = mjstruct.view(m.plugin, m.nplugin, np.int32)
+  ours = np.flatnonzero((owner >= 0) & (plugin[owner] == plugin[instance]))
+  rigid = mjstruct.view(m.flex_rigid, m.nflex, np.bool_)
+  start = mjstruct.view(m.flex_vertadr, m.nflex, np.int32)
+  body = mjstruct.view(m.flex_vertbodyid, m.nflexvert, np.int32)
+  own = [np.isin(body[start[f] : start[f] + flexes.vertices(m, f)], ours) for f in range(m.nflex)]
+  nodal = [f for f in range(m.nflex) if not rigid[f] and own[f].any()]
+  return np.array([*nodal, *_surfaces(model, m, instance)], int)
+
+
+def _surfaces(model, m, instance: int, without: int = -1) -> dict[int, int]:
+  """Returns the flex of the organ that each window is of, of all organs or without one."""
+  names = [flexes.name(m, f) for f in range(m.nflex)]
+  plugin = mjstruct.view(m.plugin, m.nplugin, np.int32)
+  found = {}
+  for other in range(m.nplugin):
+    if other != without and plugin[other] == plugin[instance]:
+      for flex in _rigid_flexes(m, other)[1]:
+        for window in mjstruct.config(model, other, "window").split():
+          resolved = flexes.resolve(window, names[flex], names)
+          if resolved in names:
+            found[names.index(resolved)] = flex
+  return found
+
+
+def _home_slots(elem: np.ndarray, nvert: int, sizes: list[int], room: list[int]) -> np.ndarray:
+  """Returns the default node of each slot: disjoint patches grown over the surface, (W,)."""
+  neighbours: list[set[int]] = [set() for _ in range(nvert)]
+  for a, b, c in elem:
+    neighbours[a] |= {b, c}
+    neighbours[b] |= {a, c}
+    neighbours[c] |= {a, b}
+  used: set[int] = set()
+  out = []
+  for size, most in zip(sizes, room, strict=True):
+    # None where other windows have all nodes already.
+    queue = [i for i in range(nvert) if i not in used][:1]
+    patch: list[int] = []
+    used.update(queue)
+    while queue and len(patch) < most:
+      i = queue.pop(0)
+      patch.append(i)
+      for j in sorted(neighbours[i] - used):
+        used.add(j)
+        queue.append(j)
+    used -= set(queue)
+    out += patch + [-1] * (size - len(patch))
+  return np.array(out)

@@ -1,0 +1,105 @@
+"""Windows, the nodes' side: the motion of an organ, on the CPU or on a device."""
+
+# Annotations here are objects, not text: no `from __future__ import annotations`.
+# pyright: reportInvalidTypeForm=false
+import numpy as np
+import warp as wp
+from palpate.tissue import order
+from palpate.tissue.types import Views, doubles, fill, ints, struct
+
+from .. import coupling, layout
+from ..coupling import Crossing
+from ..layout import Inbox, Motion, Outbox
+
+_BLOCK = 128  # threads, whole warps
+
+
+@struct
+class Nodes:
+  """A windowed organ's nodes, in the order of its vertices and in its frame."""
+
+  nvert: int  # vertices
+  nouter: int  # those on the surface, the first ones, with spare ones that have no mass yet
+  nslot: int  # slots of all windows
+  nwindow: int  # windows
+  most: int  # candidates of a window that the outbox has room for
+  node: ints("nvert")  # where a vertex starts in vectors of slices
+  mass: doubles("nvert")  # mass [kg]
+  rest: doubles("nvert", 3)  # rest position [m]
+  count: ints("nwindow")  # candidates of each window; 0 between steps
+  extent: ints(7)  # squared speed, bounds, as `put_most` has them; nothing put between steps
+  motion: Motion
+  inbox: Inbox
+  outbox: Outbox
+  solve: Crossing
+
+
+commit, move_slots, enter, push_slots, push_impulses, search, report = coupling.kernels(
+  "nodes.h",
+  Nodes,
+  *("commit", "move_slots", "enter", "push_slots", "push_impulses", "search", "report"),
+)
+
+
+def make(w, side, motion, boxes: tuple[wp.array, wp.array], sizes: dict[str, int]):
+  """Returns a workspace's nodes on a device.
+
+  Args:
+    w: the workspace
+    side: the device
+    motion: where the motion is there, `Motion`
+    boxes: numbers of inbox and outbox there
+    sizes: what the blocks of `layout` need
+  """
+  organ, s = w.organ, w.body.shape
+  node = s.node.numpy()
+  values = dict(
+    nvert=sizes["nvert"],
+    nouter=coupling.outer(organ),
+    nslot=sizes["nslot"],
+    nwindow=sizes["nwindow"],
+    most=sizes["most"],
+    node=order.offset(node),
+    mass=organ.mass,
+    rest=organ.mesh.rest,
+    count=np.zeros(sizes["nwindow"]),
+    extent=np.full(7, -(2**31)),  # nothing put
+    motion=motion,
+    inbox=layout.carve(Inbox, boxes[0], sizes),
+    outbox=layout.carve(Outbox, boxes[1], sizes),
+    solve=coupling.crossing(coupling.on_body(w.body) if w.config.resident else w.host),
+  )
+  return fill(Nodes, side, values)
+
+
+class Weights:
+  """Rest places and masses of a workspace's nodes, which cuts change.
+
+  Args:
+    w: the workspace
+    nodes: `Nodes` of it
+  """
+
+  def __init__(self, w, nodes):
+    self._w, self._nodes, self._here = w, nodes, Views(nodes)
+    self._number, self._mass = w.body.shape.node.numpy(), w.host["mass"].numpy().reshape(-1)
+
+  def put(self, vert: np.ndarray):
+    """Gives the nodes what these vertices have now."""
+    w, nodes = self._w, self._nodes
+    rest, mass = w.organ.mesh.rest, w.organ.mass
+    if nodes.rest.device.is_cuda:
+      nodes.rest.assign(rest)
+      nodes.mass.assign(mass)
+    else:
+      self._here.rest[vert], self._here.mass[vert] = rest[vert], mass[vert]
+    # Nodes without a mass have one in the solver, so that nothing divides by zero.
+    self._mass[self._number[vert]] = np.where(mass[vert] > 0, mass[vert], 1.0)
+    if w.body.device.is_cuda:
+      wp.copy(w.body.state.mass, w.host["mass"])
+
+
+def launch(kernel, nodes, count: int, device):
+  """Launches a kernel over `count` items: one thread each on CUDA, one for all on the CPU."""
+  nthread = -(-count // _BLOCK) * _BLOCK if wp.get_device(device).is_cuda else 1
+  kernel.launch(device, 1, nthread, 0, nodes, _BLOCK)

@@ -1,0 +1,317 @@
+"""Windows: what MuJoCo sees of an organ are small flexes that slide over it, under the tools.
+
+Only nodes near a tool need degrees of freedom of MuJoCo: the organ's motion lives in
+`plugin_state`, and each window's vertex bodies ("slots") stand on the nodes nearest to the tool,
+with their position, velocity and effective inertia. The window's triangles are the organ's
+triangles between them. Forces follow the same formula as on all nodes; a node outside the window
+moves by dv exactly as it would with dofs of its own and no contact.
+
+The nodes' kernels (`nodes`) run on the CPU over the plugin state, or, for a `resident` organ, on
+its device over a copy that `Resident` keeps; the slots' kernels (`slots`) on the CPU.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mujoco
+import numpy as np
+import warp as wp
+from palpate.tissue import step
+from palpate.tissue.types import Views
+
+from .. import apart, coupling, inertia, layout, mjstruct, prepare
+from ..layout import TAIL, Inbox, Motion, Outbox, WindowState
+from . import nodes, slots
+from .resident import Resident
+
+# Candidates of a window that a device reports, times the window's slots.
+ROOM = 16
+
+
+def state_size(nvert: int, nslot: int, ngeom: int, **more: int) -> int:
+  """Returns the length of the plugin state; ngeom is summed over the windows."""
+  sizes = {"nvert": nvert, "nslot": nslot, "ngeom": ngeom, "ncreep": 0, "nrest": 0, "nbond": 0}
+  return layout.size(WindowState, sizes | layout.NO_CUTS | more)
+
+
+class Phases(coupling.Phases):
+  """Window coupling of a workspace's organ."""
+
+  def __init__(self, w, model: int, instance: int):
+    organ, win = w.organ, w.organ.windows
+    self.side = w.body.device if w.config.resident else wp.get_device("cpu")
+    self._resident, self._away = w.config.resident, self.side.is_cuda
+    self._status = w.host["status"], w.body.system.status
+    m = mjstruct.Model.from_address(model)
+    first = mjstruct.view(m.body_treeid, m.nbody, np.int32)[win.body[0]]
+    w.policy = mjstruct.view(m.tree_sleep_policy, m.ntree, np.int32)[first:].data
+    w.counts = mjstruct.view(m.flex_vertnum, m.nflex, np.int32)[organ.flex :].data
+    sizes = self._sizes(organ)
+    size = layout.size(WindowState, sizes)
+    state = coupling.plugin_state(model, w.data, instance, size)
+    if not w.views:
+      w.views = slots.scratch(organ.mesh.nvert, win.nslot) | {
+        name: wp.zeros(layout.size(kind, sizes), dtype=wp.float64, device="cpu", pinned=self._away)
+        for name, kind in (("inbox", Inbox), ("outbox", Outbox), ("foreseen", Inbox))
+      }
+    v = w.views
+    v["plugin_state"] = state
+    w.boxes = {
+      "own": layout.carve(WindowState, state, sizes),
+      "inbox": layout.carve(Inbox, v["inbox"], sizes),
+      "outbox": layout.carve(Outbox, v["outbox"], sizes),
+      "foreseen": layout.carve(Inbox, v["foreseen"], sizes),
+    }
+    self._slots, self._w = slots.make(w, model, sizes), w
+    # The boxes here and on `side`, which may be the same.
+    self._near, self._foreseen = (v["inbox"], v["outbox"]), v["foreseen"]
+    self._far, motion = self._near, w.boxes["own"].motion
+    if self._away:
+      inbox, outbox = (wp.clone(box, device=self.side) for box in self._near)
+      self._far = inbox, outbox
+    if w.config.resident:
+      self._motion = wp.zeros(layout.size(Motion, sizes), dtype=wp.float64, device=self.side)
+      motion = layout.carve(Motion, self._motion, sizes)
+      w.resident = Resident(w, self._motion, self._end_now, self.look_ahead)
+    self._nodes = nodes.make(w, self.side, motion, self._far, sizes)
+    self._weights = nodes.Weights(w, self._nodes)
+    self._weights.put(np.arange(organ.mesh.nvert))
+    self._reshape = slots.Reshape(organ, self._slots)
+    self._motion_here = Views(w.boxes["own"].motion)
+
+  # Cuts.
+
+  def reshape(self, touched: np.ndarray | None = None):
+    """Takes the mesh and the masses that the organ has now."""
+    organ = self._w.organ
+    touched = np.arange(organ.mesh.nvert) if touched is None else touched
+    self._reshape.put(organ, touched)
+    share_inertia(self._w, touched)
+    self._weights.put(touched)
+    wake(self._w)
+
+  def motion(self) -> tuple[np.ndarray, np.ndarray]:
+    """Returns displacement and velocity of the vertices, where the state has them."""
+    if self._w.resident:
+      self._w.resident.fetch()
+    motion = self._motion_here
+    return motion.disp, motion.vel
+
+  def carry(self, changed, disp, vel, group, member, share):
+    """Gives vertices their motion after a cut, see `coupling.Phases`; slots keep their forces."""
+    motion = self._motion_here
+    motion.disp[changed], motion.vel[changed] = disp[changed], vel[changed]
+    for values in (motion.last, motion.before):
+      values[member] = values[group]
+    if self._w.resident:
+      self._w.resident.renew()
+
+  def _sizes(self, organ) -> dict[str, int]:
+    """Returns what the blocks of `layout` need."""
+    win, nvert = organ.windows, organ.mesh.nvert
+    most = nvert
+    if self.side.is_cuda:
+      most = min(nvert, ROOM * int(np.diff(win.adr).max()))
+    return coupling.sizes(organ) | {"nwindow": len(win.flex), "most": most}
+
+  def _over_slots(self, kernel):
+    slots.launch(kernel, self._slots)
+
+  def _over_nodes(self, kernel):
+    nodes.launch(kernel, self._nodes, self._nodes.nvert, self.side)
+
+  def _over_pushed(self, kernel):
+    nodes.launch(kernel, self._nodes, self._nodes.nslot, self.side)
+
+  def _receive(self):
+    if self._away:
+      wp.copy(self._far[0], self._near[0])
+
+  def place(self):
+    """Puts the windows where the plugin state says."""
+    self._over_slots(slots.place)
+
+  def gather(self):
+    """Tells what acts on the slots and where the tools are."""
+    self._over_slots(slots.gather)
+
+  def enter(self):
+    """Ends the last step if the motion is on a device; fills the solver's state."""
+    self._receive()
+    self._begin()
+
+  def _begin(self):
+    if self._resident:
+      self._end()
+    self._over_nodes(nodes.enter)
+    self._over_pushed(nodes.push_slots)
+
+  def look(self):
+    """Looks for nodes near the tools."""
+    self._over_nodes(nodes.search)
+    self._over_pushed(nodes.report)
+    if self._away:
+      wp.copy(self._near[1], self._far[1])
+      wp.copy(*self._status)
+
+  def scatter(self):
+    """Adds the passive force on the slots."""
+    self._over_slots(slots.scatter)
+
+  def leave(self):
+    """Takes the slots' motion and contact forces, and says whether the organ falls asleep."""
+    self._over_slots(slots.leave)
+
+  def push(self):
+    """Fills the right-hand side with the impulses on the slots."""
+    self._receive()
+    self._nodes.solve.rhs.zero_()
+    self._over_pushed(nodes.push_impulses)
+
+  def answer(self):
+    """Ends the step with the response, and looks at where the nodes are then."""
+    self._over_nodes(nodes.commit)
+    self.look()
+
+  def end(self):
+    """Ends the step, unless the motion is on a device: there the next one does."""
+    if not self._resident:
+      self._end()
+
+  def _end(self):
+    self._over_nodes(nodes.commit)
+    self._over_pushed(nodes.move_slots)
+
+  def _end_now(self):
+    self._receive()
+    self._end()
+
+  def advance(self):
+    """Gives each window the nodes nearest to its tools."""
+    self._over_slots(slots.choose)
+
+  def foresee(self):
+    """Guesses what the next `gather` tells."""
+    self._over_slots(slots.foresee)
+
+  def enter_ahead(self):
+    """Ends the last step and fills the solver's state with the guess."""
+    wp.copy(self._far[0], self._foreseen)
+    self._begin()
+
+  def look_ahead(self):
+    """Looks again, with where the tools are now."""
+    self._receive()
+    self.look()
+
+
+def settle(w, model: int):
+  """Readies the state for the default slots."""
+  set_inertia(w, mjstruct.Model.from_address(model))
+  w.views["plugin_state"].fill_(0.0)  # MuJoCo has not cleared it yet
+
+
+def find_astray(w) -> float:
+  """Returns how far a slot is from the node that the plugin state says it is on, at most [m]."""
+  own = w.boxes["own"]
+  if own.tail.numpy()[TAIL.stamp] < 0:  # that motion is on a device, and the slots have moved
+    return np.inf if w.stood else 0.0
+  win, n, number = w.organ.windows, w.organ.mesh.nvert, own.slot.numpy()
+  node = np.where(number == 0, win.home, np.where((number >= 1) & (number <= n), number - 1, -1))
+  used = np.flatnonzero(node >= 0)
+  node = node[used].astype(int)
+  first = win.qposadr[used, None] + np.arange(3)
+  qpos = mjstruct.view(mjstruct.Data.from_address(w.data).qpos, first.max(initial=-1) + 1)[first]
+  disp = own.motion.disp.numpy()[node]
+  return float(np.abs(qpos - win.qhome[used] - w.organ.mesh.rest[node] - disp).max(initial=0.0))
+
+
+def hide(w):
+  """Hides the organ's flex from MuJoCo until it is drawn again."""
+  if w.counts[0]:
+    prepare.show(mjstruct.Model.from_address(w.model), w.organ, shown=False)
+
+
+def let_sleep(w, allowed: bool):
+  """Lets MuJoCo put the windows' bodies to sleep, or wakes them in the middle of a step.
+
+  It does so itself where `<flag sleep="enable"/>` is set: it then spends next to nothing on dofs
+  that have nothing to do while the organ sleeps.
+  """
+  m, d = mjstruct.Model.from_address(w.model), mjstruct.Data.from_address(w.data)
+  tree = mjstruct.view(m.body_treeid, m.nbody, np.int32)[w.organ.windows.body]
+  policy = mujoco.mjtSleepPolicy
+  may = policy.mjSLEEP_AUTO_ALLOWED if allowed else policy.mjSLEEP_AUTO_NEVER
+  mjstruct.view(m.tree_sleep_policy, m.ntree, np.int32)[tree] = int(may)
+  if allowed or (mjstruct.view(d.tree_asleep, m.ntree, np.int32)[tree] < 0).all():
+    return
+  find_contacts_again(w)  # trees that may not sleep wake
+  mjstruct.library().mj_comVel(w.model, w.data)
+  mjstruct.view(d.qfrc_passive, m.nv)[w.organ.dofs] = 0.0
+  wp.capture_launch(w.before)
+
+
+def find_contacts_again(w):
+  """Does the position stage once more.
+
+  Inertias of others stay: an organ may have made its own greater in this step.
+  """
+  m, d = mjstruct.Model.from_address(w.model), mjstruct.Data.from_address(w.data)
+  other = np.ones(m.nv, bool)
+  other[w.organ.dofs] = False
+  row = np.repeat(other, mjstruct.view(m.M_rownnz, m.nv, np.int32))
+  kept = [(mjstruct.view(d.M, m.nC), row), (mjstruct.view(d.qLD, m.nC), row)]
+  kept += [(mjstruct.view(d.qLDiagInv, m.nv), other)]
+  values = [array[which].copy() for array, which in kept]
+  apart.find_contacts(w.model, w.data)
+  for (array, which), were in zip(kept, values, strict=True):
+    array[which] = were
+
+
+def wake(w):
+  """Ends the organ's sleep: something has changed."""
+  w.boxes["own"].tail.numpy()[TAIL.quiet] = 0.0
+
+
+def set_inertia(w, m):
+  """Stores the effective inertia of every node for the present time step."""
+  organ, win = w.declared, w.organ.windows
+  nodal = win.mass
+  if step.SCHEMES[w.config.integrator].spreads:
+    nodal = inertia.of_nodes(m, organ, w.body, w.config, win.mass, int(win.flex[0]))
+  w.views["whole"] = nodal
+  share_inertia(w)
+
+
+def share_inertia(w, vert: Any = slice(None)):
+  """Gives vertices, some or all, that were one their part of its inertia."""
+  nodal = w.views["whole"]
+  nodal = w.cuts.share(nodal, vert) if w.cuts else nodal[vert]
+  w.views["inertia"].numpy()[vert] = slots.hold(w.organ, nodal, vert)
+
+
+def shortage(w) -> str | None:
+  """Returns what the windows had no room for at most, and what to do, or None."""
+  nodes, triangles = w.missed
+  if nodes:
+    what = f"{nodes} nodes that tools touch and keep the deepest; give them more vertices"
+  elif triangles:
+    what = f"{triangles} triangles between their nodes; give them more elements"
+  else:
+    return None
+  return f"organ {w.organ.name!r}: its windows have no room for {what}"
+
+
+def draw(w, model: int, data: int):
+  """Writes the deformed surface where renderers read it."""
+  m, d = mjstruct.Model.from_address(model), mjstruct.Data.from_address(data)
+  organ = w.organ
+  start = int(mjstruct.view(m.flex_vertadr, m.nflex, np.int32)[organ.flex])
+  n = prepare.drawn(organ.mesh)
+  prepare.show(m, organ, shown=True)
+  if w.resident:
+    w.resident.fetch()
+  out = mjstruct.view(d.flexvert_xpos, (m.nflexvert, 3))[start : start + n]
+  disp = w.boxes["own"].motion.disp.numpy()[:n]
+  out[:] = organ.origin + (organ.mesh.rest[:n] + disp) @ organ.frame.T

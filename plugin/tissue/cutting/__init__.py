@@ -1,0 +1,1 @@
+"""Cuts: a path becomes edges or faces of a mesh, and the mesh comes apart there."""

@@ -1,0 +1,319 @@
+"""Cuts: a path on the surface becomes edges of the mesh, and the mesh comes apart along them.
+
+A chain of edges near the path is found, its vertices are moved onto the path in the rest shape, as
+far as no triangle gets thin, and vertices on it are doubled: `native/cut.h`. Triangles keep their
+numbers and none is added, so that what is stored by triangle stays, and so does the room that
+arrays need.
+"""
+
+# Annotations here are objects, not text: no `from __future__ import annotations`.
+# pyright: reportInvalidTypeForm=false
+import dataclasses
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from .. import config as configuration
+from ..config import Config
+from ..geometry.mesh import Mesh, lengths
+from ..kernels import kernel
+from ..surface import Surface, WorkingCopy, host_views
+from ..types import CONSTANTS, allocate, doubles, flags, ints, longs, struct
+from .path import check_points
+
+# Why nothing was cut, and what a path's samples are apart at most [edges], as in native/path.h.
+_DONE, _NO_ROOM, _OFF, _SHORT, _PINNED = range(5)
+_SAMPLE, _FAR = 0.25, 2.0
+_KINDS = {"membrane": 1, "spring": 2}  # of energy, as in native/snap.h
+_FOUND = (
+  "status", "moved", "near", "split", "changed", "edges", "nouter", "stopped", "apart",
+)  # fmt: skip
+_SIZE = ("bad", "far", "deviation")
+_NUMBERS = {
+  f"{prefix}_{name.upper()}": k
+  for prefix, names in (("FOUND", (*_FOUND, "length")), ("SIZE", (*_SIZE, "length")))
+  for k, name in enumerate(names)
+}
+
+
+@struct
+class Cutting:
+  """What cuts of nworld surfaces of one whole read and write; the surfaces are other ones then."""
+
+  surface: Surface
+  most_points: int  # points of a path
+  nint: int  # whole numbers of scratch
+  nreal: int  # others
+  kind: int  # of energy: 0 none, 1 membrane, 2 springs
+  held: int  # whether springs hold vertices
+  at_rest: int  # whether points are where the surface is at rest
+  edge: wp.float64  # mean length of the whole's edges [m]
+  thickness: wp.float64  # [m]
+  stiffness: wp.float64  # of an edge's spring [N/m]
+  given: wp.float64  # by which the energy around a vertex may rise as it moves [J]
+  home: longs("nelem")  # `Mesh.home`
+  mass: doubles("nworld", "nvert")  # of vertices, before and after [kg]
+  disp: doubles("nworld", "nvert", 3)  # displacement [m]
+  vel: doubles("nworld", "nvert", 3)  # velocity [m/s]
+  pinned: flags("nworld", "nvert")  # whether a vertex does not move
+  lame: doubles("nelem")  # of triangles [Pa]
+  shear: doubles("nelem")  # [Pa]
+  whole: doubles("nworld", "nvert")  # energy of springs at vertices [J]
+  pull: doubles("nworld", "nvert", 3)  # its gradient [N]
+  hard: doubles("nworld", "nvert")  # their stiffness [N/m]
+  npoint: ints("nworld")  # points of the path
+  point: doubles("nworld", "most_points", 3)  # these, where the surface is now, or at rest [m]
+  found: ints("nworld", len(_FOUND))  # see _FOUND; nouter is read too
+  size: doubles("nworld", len(_SIZE))  # see _SIZE
+  near: ints("nworld", "nvert")  # see `Cut`, these and what follows
+  group: ints("nworld", "nvert")
+  member: ints("nworld", "nvert")
+  share: doubles("nworld", "nvert")
+  changed: ints("nworld", "nelem")
+  before: ints("nworld", "nelem", 3)
+  seam: ints("nworld", "nvert", 2)  # edges that came apart
+  ints: ints("nworld", "nint")  # scratch
+  reals: doubles("nworld", "nreal")
+
+
+_cut = kernel("cut_surface", "cut.h", Cutting, CONSTANTS | _NUMBERS)
+
+
+@dataclasses.dataclass(frozen=True)
+class Springs:
+  """What holds vertices.
+
+  Attributes:
+    energy: of those of each vertex [J]     (nvert,)
+    force: its gradient [N]                 (nvert, 3)
+    stiffness: of these together [N/m]      (nvert,)
+  """
+
+  energy: np.ndarray
+  force: np.ndarray
+  stiffness: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
+class Motion:
+  """What vertices carry.
+
+  Attributes:
+    mass: [kg]                       (nvert,)
+    disp: displacement from rest [m] (nvert, 3)
+    vel: velocity [m/s]              (nvert, 3)
+  """
+
+  mass: np.ndarray
+  disp: np.ndarray
+  vel: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Apart:
+  """What came of a path, of a surface or a solid: elements are triangles or tetrahedra.
+
+  Attributes:
+    mesh: the mesh, cut
+    motion: what its vertices carry, until the next cut
+    moved: how many vertices lie elsewhere at rest
+    near: vertices that move on otherwise                 (n,)
+    changed: elements that are not as they were           (n,)
+    group: vertices that were one, which                  (m,)
+    member: those vertices, old and new                   (m,)
+    share: their parts of its mass                        (m,)
+    path: the edges that came apart at rest [m]           list of (k, 3)
+    length: of these [m]
+    deviation: greatest distance of the path's vertices from it [m]
+    stopped: whether there was too little room
+  """
+
+  mesh: Mesh
+  motion: Motion
+  moved: int
+  near: np.ndarray
+  changed: np.ndarray
+  group: np.ndarray
+  member: np.ndarray
+  share: np.ndarray
+  path: list[np.ndarray]
+  length: float
+  deviation: float
+  stopped: bool
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Cut(Apart):
+  """What came of a path on a surface; `near` is without the vertices that have come.
+
+  Attributes:
+    before: corners that the changed triangles had  (n, 3)
+  """
+
+  before: np.ndarray
+
+
+class Knife:
+  """Cuts surfaces of one whole, one after the other.
+
+  Args:
+    copy: where they are
+  """
+
+  def __init__(self, copy: WorkingCopy):
+    self._copy, self._whole = copy, copy.whole
+    self._config: Config | None = None
+    self._how: tuple = ()
+    self._fields: Any = None
+    self._host: dict[str, np.ndarray] = {}
+    self._launch: Any = None
+
+  def cut(
+    self,
+    organ: str,
+    mesh: Mesh,
+    motion: Motion,
+    points: np.ndarray,
+    pinned: np.ndarray,
+    config: Config | None = None,
+    held: Springs | None = None,
+    given: float = 0.0,
+    at_rest: bool = False,
+  ) -> Cut:
+    """Returns the mesh cut along the path on the surface that is nearest to points.
+
+    Args:
+      organ: its name, for messages
+      mesh: the surface
+      motion: what its vertices carry; mass, momentum and angular momentum are kept
+      points: the path, in the same frame [m]            (n, 3)
+      pinned: vertices that do not move                  (nvert,) bool
+      config: material, whose energy moving vertices must not raise, or None
+      held: what holds vertices, for which the same is true, or None
+      given: but by so much around each, since what cuts has brought it [J]
+      at_rest: whether points are on the surface at rest, not where it is now
+
+    Raises:
+      ValueError: points are off the surface; the path goes through pinned vertices, or is too
+        short.
+    """
+    check_points(organ, points)
+    self._make_room(points)
+    self._copy.put(mesh)
+    config = config if config and config.elements in _KINDS else None
+    self._put_material(config, held, given, at_rest)
+    host = self._host
+    host["mass"][:], host["disp"][:], host["vel"][:] = motion.mass, motion.disp, motion.vel
+    host["pinned"][:] = pinned
+    host["point"][: len(points)], host["npoint"][0] = points, len(points)
+    host["found"][:] = 0
+    host["found"][_FOUND.index("nouter")] = mesh.nouter
+    self._launch()
+    found: dict[Any, int] = dict(zip(_FOUND, host["found"].tolist(), strict=True))
+    self._check(organ, found["status"])
+    return self._answer(mesh, found)
+
+  def _make_room(self, points: np.ndarray):
+    """Makes the arrays, and makes them larger for a long path."""
+    whole, edge = self._whole, self._whole.edge_length
+    way = np.abs(points[1:] - points[:-1]).sum()  # no less than the path is long
+    n = 2 * len(points) + int(way / (_SAMPLE * edge))
+    if self._fields is not None and n <= self._fields.most_points:
+      return
+    n, self._config, self._how = 2 * n, None, ()
+    sizes = self._copy.sizes | {"most_points": n}
+    # What native/cut.h takes of scratch, see there.
+    sizes["nint"] = 29 * whole.nvert + 18 * whole.nelem + 20 * n + 8 * sizes["most"] + 100
+    sizes["nreal"] = 48 * whole.nvert + 6 * whole.nelem + 13 * n
+    self._fields = fields = allocate(Cutting, "cpu", sizes)
+    fields.surface, fields.edge = self._copy.fields, edge
+    for name in ("most_points", "nint", "nreal"):
+      setattr(fields, name, sizes[name])
+    self._host = host_views(fields, Cutting)
+    self._host["home"][:] = whole.home
+    self._launch = _cut.command(fields).launch
+
+  def _put_material(
+    self, config: Config | None, held: Springs | None, given: float, at_rest: bool
+  ):
+    fields, host = self._fields, self._host
+    how = _KINDS[config.elements] if config else 0, int(held is not None), given, int(at_rest)
+    if how != self._how:
+      fields.kind, fields.held, fields.given, fields.at_rest = self._how = how
+    if config and config is not self._config and config != self._config:
+      fields.thickness, fields.stiffness = config.thickness, config.stiffness
+      host["lame"][:], host["shear"][:] = configuration.lame(config, self._whole.nelem)
+      self._config = config
+    if held is not None:
+      host["whole"][:], host["pull"][:] = held.energy, held.force
+      host["hard"][:] = held.stiffness
+
+  def _check(self, organ: str, status: int):
+    """Says why nothing was cut.
+
+    Raises:
+      ValueError: nothing was.
+    """
+    bad, far = self._host["size"][:2]
+    edge = self._whole.edge_length
+    if status == _OFF:
+      raise ValueError(
+        f"organ {organ!r}: point {int(bad)} of the path is {far:.3g} m from the surface, expected "
+        f"at most {_FAR * edge:.3g} m"
+      )
+    if status == _SHORT:
+      raise ValueError(
+        f"organ {organ!r}: the path is shorter than two edges of the mesh there, expected a longer "
+        "one"
+      )
+    if status == _PINNED:
+      raise ValueError(
+        f"organ {organ!r}: the path goes through vertex {int(bad)}, which is pinned, expected "
+        "tissue that moves"
+      )
+    if status == _NO_ROOM:
+      self._copy.forget()
+      raise ValueError(
+        f"organ {organ!r}: the path goes to and fro too often, expected shorter cuts"
+      )
+
+  def _answer(self, mesh: Mesh, found: dict[Any, int]) -> Cut:
+    host = self._host
+    lists = listed(host, found, {"before": "changed", "group": "split", "member": "split"})
+    if found["changed"]:
+      closed = mesh.closed and not found["split"]
+      mesh = self._copy.take(mesh, closed, bool(found["apart"]), found["nouter"])
+    path = _lines(mesh.rest, host["seam"][: found["edges"]].tolist())
+    return Cut(
+      mesh=mesh,
+      motion=Motion(host["mass"], host["disp"], host["vel"]),
+      moved=found["moved"],
+      share=host["share"][: found["split"]].copy(),
+      path=path,
+      length=sum(float(lengths(line[1:] - line[:-1]).sum()) for line in path),
+      deviation=float(host["size"][_SIZE.index("deviation")]),
+      stopped=bool(found["stopped"]),
+      **lists,
+    )
+
+
+def listed(
+  host: dict[str, np.ndarray], found: dict[Any, int], parts: dict[str, str]
+) -> dict[str, np.ndarray]:
+  """Returns lists that native code has written, those of `parts` as long as others."""
+  return {
+    name: host[name][: found[parts.get(name, name)]].astype(int)
+    for name in ("near", "changed", *parts)
+  }
+
+
+def _lines(rest: np.ndarray, pairs: list[list[int]]) -> list[np.ndarray]:
+  """Returns edges that follow one another as polylines."""
+  lines: list[list[int]] = []
+  for a, b in pairs:
+    if lines and lines[-1][-1] == a:
+      lines[-1].append(b)
+    else:
+      lines.append([a, b])
+  return [rest[line] for line in lines]

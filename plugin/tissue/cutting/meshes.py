@@ -1,0 +1,131 @@
+"""Meshes of worlds that are cut: what differs between them, a row of one memory each.
+
+The first row is the mesh that all have at first. Kernels see arrays in it and how far it is to the
+next one (`Shape.stride`), so that worlds that were not cut read the same memory. Rows are written
+on the host, by what writes a cut into a body, and go to the device as they are.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from .. import body as bodies
+from ..body import Body
+
+# What a cut changes of a body's arrays.
+_OF_SHAPE = (
+  "fan_node", "fan_rest", "fan_corner", "fan_side", "fan_width", "degree", "rest", "area", "free",
+  "elem_node", "elem_rest", "elem_hinge", "hinge_node", "hinge_rest", "hinge_elem", "hinge_near",
+  "hinge_angle0", "bend_node", "bend_width",
+)  # fmt: skip
+_OF_TISSUE = ("fan_metric", "fan_spring", "hinge_gain", "bend_gain", "bend_diag")
+_WARP = {np.dtype(np.int32): wp.int32, np.dtype(np.float32): wp.float32,
+         np.dtype(np.float64): wp.float64}  # fmt: skip
+
+
+@wp.kernel(enable_backward=False)
+def _turn(world: wp.array[int], more: wp.array3d[float], angle: wp.array3d[float]):
+  k, s, lane = wp.tid()
+  w = world[k]
+  angle[1 + w, s, lane] = angle[1 + w, s, lane] + more[w, s, lane]
+
+
+class Meshes:
+  """The meshes of a body's worlds: the first one, and room for one more a world.
+
+  Args:
+    body: the body, whose shape and tissue become views of the first row
+    more: arrays of the first mesh besides, by names of their own
+
+  Attributes:
+    which: which mesh each world has, the first one at first (nworld,)
+    more: views of those arrays, with a row a mesh
+    here: the same on the host, with a row a world
+    arrays: all arrays of the first of these rows; those of others are `open` words on
+  """
+
+  def __init__(self, body: Body, more: dict[str, np.ndarray]):
+    self._device = body.device
+    arrays = {name: getattr(body.shape, name) for name in _OF_SHAPE}
+    arrays |= {name: getattr(body.tissue, name) for name in _OF_TISSUE}
+    values = {name: array.numpy() for name, array in arrays.items()} | more
+    # Those of 64 bits come first, where they are aligned.
+    names = sorted(values, key=lambda name: -values[name].itemsize)
+    self._like = {name: np.empty(values[name].shape, values[name].dtype) for name in names}
+    size = [values[name].nbytes // 4 for name in names]
+    start = np.concatenate([[0], np.cumsum(size)]).tolist()
+    self._start, self.nword = dict(zip(names, start, strict=False)), start[-1] + start[-1] % 2
+    self._first = np.zeros(self.nword, np.int32)
+    for name in names:
+      self.of(self._first)[name][...] = values[name]
+    # Memory that the system gives when it is written to.
+    self._rows = np.empty((body.nworld, self.nword), np.int32)
+    self._begun: set[int] = set()  # worlds that have been cut
+    self.arrays = self._views(self._rows.ctypes.data, wp.get_device("cpu"))
+    self.here = {name: self.of(self._rows)[name] for name in more}
+    nrow = 1 + body.nworld
+    self._memory = wp.zeros((nrow, self.nword), dtype=int, device=self._device)
+    first = wp.array(self._first, dtype=int, device=self._device)
+    wp.copy(self._memory.flatten(), first, count=self.nword)
+    self.which = wp.zeros(body.nworld, dtype=int, device=self._device)
+    bodies.unshare(body)
+    _point(body.fields, self._views(self._memory.ptr, self._device))
+    body.fields.shape.mesh, body.fields.shape.stride = self.which, self.nword
+    views = self._views(self._memory.ptr, self._device, nrow)
+    self.more, self._angle = {name: views[name] for name in more}, views["hinge_angle0"]
+
+  def of(self, row: np.ndarray) -> dict[str, np.ndarray]:
+    """Returns the arrays of a row that is on the host, or of several."""
+    out = {}
+    for name, like in self._like.items():
+      part = row[..., self._start[name] :][..., : like.nbytes // 4]
+      out[name] = part.view(like.dtype).reshape(*row.shape[:-1], *like.shape)
+    return out
+
+  def _views(self, ptr: int, device: Any, nrow: int = 0) -> dict[str, wp.array]:
+    """Returns the arrays of the row at an address, or with an axis of rows that follow it."""
+    out = {}
+    for name, like in self._like.items():
+      shape, options = like.shape, {}
+      if nrow:
+        shape, options = (nrow, *shape), {"strides": (4 * self.nword, *like.strides)}
+      at = ptr + 4 * self._start[name]
+      out[name] = wp.array(ptr=at, dtype=_WARP[like.dtype], shape=shape, device=device, **options)
+    return out
+
+  def heal(self, world: int):
+    """Forgets the row of a world, which has the first mesh again."""
+    self._begun.discard(world)
+
+  def open(self, world: int) -> int:
+    """Makes a world's row that of the first mesh where it has none; returns where it starts."""
+    if world not in self._begun:
+      self._rows[world] = self._first
+      self._begun.add(world)
+    return world * self.nword
+
+  def upload(self, worlds: list[int]):
+    """Writes the rows of worlds, ascending, to the device, which have them from then on."""
+    there, here = self._memory.flatten(), wp.array(self._rows.ravel(), device="cpu", copy=False)
+    ends = np.flatnonzero(np.diff(worlds) > 1) + 1
+    for run in np.split(np.array(worlds), ends):
+      start, count = int(run[0]) * self.nword, len(run) * self.nword
+      wp.copy(there, here, dest_offset=start + self.nword, src_offset=start, count=count)
+    which = self.which.numpy()
+    which[worlds] = 1 + np.array(worlds)
+    self.which.assign(which)
+
+  def angle(self, worlds: list[int], more: wp.array):
+    """Adds to the rest angles of the hinges of worlds; `more` has a row for every world."""
+    at = wp.array(worlds, dtype=int, device=self._device)
+    dim = (len(worlds), *self._angle.shape[1:])
+    wp.launch(_turn, dim=dim, inputs=[at, more, self._angle], device=self._device)
+
+
+def _point(fields: Any, views: dict[str, wp.array]):
+  for struct, names in ((fields.shape, _OF_SHAPE), (fields.tissue, _OF_TISSUE)):
+    for name in names:
+      setattr(struct, name, views[name])
