@@ -7,7 +7,7 @@
 
 namespace palpate {
 
-// Edges of a chain, and one fewer of a lip, between which there is a crumb.
+// Edges of a chain that cut a crumb off, at most; the lip beside it has one more.
 constexpr int CRUMB = 3;
 
 // In edges: off the path from which another chain is looked for. Places that are looked at, at most; edges on
@@ -85,7 +85,7 @@ PALPATE bool follows(const S& m, int v, int other, int most) {
 template <class S>
 PALPATE bool cuts_crumb(const S& m, const int* first, int n) {
   if (n > CRUMB || !m.on_rim(first[0]) || !m.on_rim(first[n])) return false;
-  return follows(m, first[0], first[n], CRUMB - 1) || follows(m, first[n], first[0], CRUMB - 1);
+  return follows(m, first[0], first[n], n + 1) || follows(m, first[n], first[0], n + 1);
 }
 
 // Finds the edges of the chains that have tissue on both sides. Where a chain goes along an older cut,
