@@ -21,7 +21,7 @@ from palpate.tissue.types import allocate, doubles, fill, floats, ints, struct
 from . import beside
 from .parting import Cutters
 
-_ROWS = "state", "next", "force", "point", "share", "hold", "due", "law"
+_ROWS = "state", "next", "force", "point", "held", "share", "hold", "due", "law"
 _WorldBlades = beside.in_worlds(
   cutters.Blades,
   _ROWS,
@@ -94,9 +94,9 @@ class Blades(beside.Opens):
     space, body, n = organ.space, organ.body, len(organ.config.cutters)
     mesh, scheme = organ.declared.mesh, SCHEMES[organ.config.integrator]
     self._model = mjstruct.Model.from_address(space.model)
-    shapes = {"force": 3, "point": 3, "share": 3, "hold": 6, "next": len(BLADE)}
+    widths = cutters.WIDTHS.items()
     law = space.cutters.law(self._model, organ.config.thickness)
-    values: dict[str, Any] = {k: self._zeros(self._nworld, n, wide) for k, wide in shapes.items()}
+    values: dict[str, Any] = {k: self._zeros(self._nworld, n, wide) for k, wide in widths}
     values |= space.cutters.edges() | dict(
       nblade=n,
       nelem=mesh.nelem,

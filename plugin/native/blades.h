@@ -11,9 +11,7 @@
 //
 // Places are in the organ's frame; a blade slides freely along itself.
 #pragma once
-#include "block.h"
-#include "lines.h"
-#include "triangle.h"
+#include "seat.h"
 
 namespace palpate {
 
@@ -22,30 +20,10 @@ constexpr double SPACING = 0.4, LEAP = 1.0;
 constexpr double BATCH = 1.8;  // edges that come apart at once, at least
 constexpr double LEVEL = 0.05;  // least share of a way along the surface that is across the blade
 constexpr double BLOCKED = 0.3;  // share of its way that a seat goes where it is not at a boundary
+constexpr int HELD = 6;  // vertices that bear a blade
+constexpr double LEAVES = 0.8;  // cosine of a pull to the normal of a face by which a blade leaves
 enum { AWAY, PIERCING, THROUGH };  // stages
 enum { NOTHING, LONG, ENDED };  // what is due
-
-constexpr double NOWHERE = 1e300;  // farther than any
-
-// The least that the threads of a warp have found: all of them have it then.
-PALPATE void agree(double& least, int& elem, D3& weight) {
-  double w[3] = {weight.x, weight.y, weight.z};
-  warp_least(least, elem, w);
-  weight = {w[0], w[1], w[2]};
-}
-
-template <class Fields>
-PALPATE void corners_at_rest(const Fields& f, int t, D3* x) {
-  for (int c = 0; c < 3; ++c) x[c] = load(f.flat.data + 3 * f.elem.data[3 * t + c]);
-}
-
-template <class Fields>
-PALPATE void corners_now(const Fields& f, int t, D3* x) {
-  for (int c = 0; c < 3; ++c) {
-    const int v = f.elem.data[3 * t + c];
-    x[c] = load(f.own.rest.data + 3 * v) + moved_by(f.mj, f.own, v);
-  }
-}
 
 // Moves what worlds have of their own to one of them, see `bodies.h`; there a mesh is by nodes.
 template <class Nodes>
@@ -62,87 +40,12 @@ PALPATE Fields of_world(Fields f, int world) {
   move_input(f.solve, world);
   move_to(f.state, world), move_to(f.next, world), move_to(f.due, world), move_to(f.law, world);
   move_to(f.force, world), move_to(f.point, world), move_to(f.share, world), move_to(f.hold, world);
+  move_to(f.held, world);
   f.number.data += NUMBERS * world;
   move_to(f.elem, f.mesh.data[world]);
   move_to(f.flat, f.mesh.data[world]);
   stand_on(f.own, f.flat.data);
   return f;
-}
-
-// Where a line goes through a triangle: how far from its end, or -1 where it does not.
-PALPATE double crossing(const Line& s, const D3* x, D3& weight) {
-  const D3 e = x[1] - x[0], g = x[2] - x[0], p = cross(s.along, g);
-  const double det = dot(e, p);
-  if (!(fabs(det) > 0.0)) return -1.0;
-  const D3 r = s.from - x[0], q = cross(r, e);
-  const double v = dot(r, p) / det, w = dot(s.along, q) / det, t = dot(g, q) / det;
-  weight = {1.0 - v - w, v, w};
-  return v < 0.0 || w < 0.0 || v + w > 1.0 || t > s.length ? -1.0 : t;
-}
-
-// Finds where a blade goes through the surface, nearest to one of its ends; returns how far that end is
-// beyond it, or -1.
-template <class Fields>
-PALPATE double enters(const Fields& f, Thread me, const Line& s, int& elem, D3& weight) {
-  const D3 half = (0.5 * s.length) * s.along, middle = s.from + half, reach = vabs(half);
-  const D3 zero = {0.0, 0.0, 0.0};
-  double least = NOWHERE;
-  for (int t = me.tid; t < f.nelem; t += me.nthread) {
-    D3 x[3], w;
-    corners_now(f, t, x);
-    const D3 low = zero - vmax(vmax(zero - x[0], zero - x[1]), zero - x[2]);
-    const D3 high = vmax(vmax(x[0], x[1]), x[2]), off = vmax(low - middle, middle - high) - reach;
-    if (off.x > 0.0 || off.y > 0.0 || off.z > 0.0) continue;
-    const double at = crossing(s, x, w), beyond = at < s.length - at ? at : s.length - at;
-    if (at < 0.0 || beyond >= least) continue;
-    least = beyond, elem = t, weight = w;
-  }
-  agree(least, elem, weight);
-  return least < NOWHERE ? least : -1.0;
-}
-
-// Finds the point of the surface at rest that is nearest to a place: its triangle and weights.
-template <class Fields>
-PALPATE void find_seat(const Fields& f, Thread me, D3 place, int& elem, D3& weight) {
-  double least = NOWHERE;
-  for (int t = me.tid; t < f.nelem; t += me.nthread) {
-    D3 x[3];
-    corners_at_rest(f, t, x);
-    const double far = norm(x[0] - place) - norm(x[1] - x[0]) - norm(x[2] - x[0]);
-    if (far > 0.0 && far * far > least) continue;
-    const D3 w = barycentric(place, x), off = blend(x, w) - place;
-    if (!(dot(off, off) < least)) continue;
-    least = dot(off, off), elem = t, weight = w;
-  }
-  agree(least, elem, weight);
-}
-
-// Where the seat of a blade is: triangle, weights, place now, velocity, and normal.
-struct Seated { D3 x[3], rest[3], weight, at, vel, normal; };
-
-template <class Fields>
-PALPATE Seated seated(const Fields& f, const double* s) {
-  Seated out;
-  const int elem = (int)s[BLADE_ELEM];
-  corners_now(f, elem, out.x);
-  corners_at_rest(f, elem, out.rest);
-  out.weight = barycentric(load(s + BLADE_AT), out.rest);
-  out.at = blend(out.x, out.weight);
-  out.normal = unit_of(cross(out.x[1] - out.x[0], out.x[2] - out.x[0]));
-  D3 vel[3];
-  for (int c = 0; c < 3; ++c)
-    vel[c] = load_lane(f.solve.vel.data + offset_of(f.solve.node.data[f.elem.data[3 * elem + c]]));
-  out.vel = blend(vel, out.weight);
-  return out;
-}
-
-// A way along a triangle, as it is in another shape of the triangle.
-PALPATE D3 carried(D3 way, const D3* x, const D3* to) {
-  const D3 e = x[1] - x[0], g = x[2] - x[0];
-  const double ee = dot(e, e), eg = dot(e, g), gg = dot(g, g), ew = dot(e, way), gw = dot(g, way);
-  const double det = ee * gg - eg * eg;
-  if (!(det > 0.0)) return {0.0, 0.0, 0.0};
-  return ((gg * ew - eg * gw) / det) * (to[1] - to[0]) + ((ee * gw - eg * ew) / det) * (to[2] - to[0]);
 }
 
 // What stretches a blade's spring: across the blade, and along the surface; not what is behind the end
@@ -161,39 +64,15 @@ PALPATE Stretch stretch_of(D3 pull, D3 blade, const Seated& at, D3 toward) {
   return s;
 }
 
-// How far a blade is beyond a place on it: its end that is nearer to that is inside.
-PALPATE double beyond(const Line& line, double place) {
-  return place < line.length - place ? place : line.length - place;
-}
-
-// How deep a seat's blade is in a solid. Scissors close over what lies between them: from the seat along
-// the way they close to where the solid ends, or as far as they reach; `through` says which.
-struct Depth { double deep; bool through; };
-
-template <class Fields>
-PALPATE Depth depth_of(const Fields& f, Thread me, int i, const Line& line, double place, const Seated& at) {
-  if (f.law.data[LAW_LENGTH * i + LAW_SOLID] == 0.0 || f.geom.data[2 * i + 1] < 0)
-    return {beyond(line, place), false};
-  const D3 zero = {0.0, 0.0, 0.0};
-  const bool back = dot(line.along, at.normal) > 0.0;
-  const Line in = {at.at, back ? zero - line.along : line.along, back ? place : line.length - place};
-  double least = NOWHERE;
-  for (int t = me.tid; t < f.nelem; t += me.nthread) {
-    D3 x[3], w;
-    corners_now(f, t, x);
-    if (!(dot(cross(x[1] - x[0], x[2] - x[0]), in.along) > 0.0)) continue;
-    const double far = crossing(in, x, w);
-    if (far >= 0.0 && far < least) least = far;
-  }
-  int elem = 0;
-  D3 weight = zero;
-  agree(least, elem, weight);
-  return least < NOWHERE ? Depth{least, true} : Depth{in.length, false};
-}
-
 // The force that tissue bears of a blade: in a solid, by how deep it is.
 PALPATE double borne(const double* law, double deep) {
   return law[LAW_SOLID] == 0.0 ? law[LAW_FORCE] : deep > 0.0 ? law[LAW_FORCE] * deep : 0.0;
+}
+
+// How far what counts of a spring is stretched: of a solid all that is across the blade, since that is what
+// moves its edge through the tissue, of a wall what is along it.
+PALPATE double pull_of(const double* law, const Stretch& s) {
+  return norm(law[LAW_SOLID] != 0.0 ? s.pull : s.flat);
 }
 
 // Adds the seat to the path, where it is far enough from the last point.
@@ -237,9 +116,9 @@ PALPATE void sit_down(const Fields& f, Thread t, int i, const Line& line, double
   if (sideways) note_path(s, 0.0);
 }
 
-// Moves the seat of a blade along the surface, against the most that tissue bears; returns whether it could.
+// Moves the seat of a blade along the surface, against what tissue bears along it; returns whether it could.
 template <class Fields>
-PALPATE bool advance(const Fields& f, Thread t, int i, D3 way, const Seated& from, double most, double* s) {
+PALPATE bool advance(const Fields& f, Thread t, int i, D3 way, const Seated& from, double bears, double* s) {
   const D3 was = load(s + BLADE_AT), goes = carried(way, from.x, from.rest);
   int elem = (int)s[BLADE_ELEM];
   D3 weight, rest[3];
@@ -252,7 +131,7 @@ PALPATE bool advance(const Fields& f, Thread t, int i, D3 way, const Seated& fro
   store(s + BLADE_AT, now);
   if (s[BLADE_STAGE] == PIERCING) return true;
   store(s + BLADE_TOWARD, unit_of(now - was));
-  s[BLADE_WORK] += most * norm(way);
+  s[BLADE_WORK] += bears * norm(way);
   s[BLADE_OPENED] += gone;
   note_path(s, SPACING * f.edge);
   return true;
@@ -275,13 +154,16 @@ PALPATE void give_way(const Fields& f, Thread t, int i, const Line& line, double
   if (!out) {
     const D3 pull = line.from + place * line.along - at.at;
     const Stretch now = stretch_of(pull, line.along, at, load(s + BLADE_TOWARD));
-    const double size = norm(now.flat);
-    out = now.far > LEAP * f.edge;  // it has been drawn back
+    const double size = pull_of(law, now);
+    out = now.far > LEAP * f.edge;  // it has been drawn back, or goes out where the solid ends
+    out = out || (law[LAW_SOLID] != 0.0 && dot(now.pull, at.normal) > LEAVES * norm(now.pull));
     if (!out && size > slack) {
-      const D3 unit = (1.0 / size) * now.flat;
-      const double tilt = dot(unit, line.along), level = 1.0 - tilt * tilt;
+      const D3 unit = unit_of(now.flat);
+      const double tilt = dot(unit, line.along), across = 1.0 - tilt * tilt;
+      const double level = law[LAW_SOLID] != 0.0 ? sqrt(across) : across;
       const double far = (size - slack) / (level > LEVEL ? level : LEVEL), leap = LEAP * f.edge;
-      out = now.behind || !advance(f, t, i, (far < leap ? far : leap) * unit, at, most, s);
+      const double bears = law[LAW_SOLID] != 0.0 ? level * most : most;
+      out = now.behind || !advance(f, t, i, (far < leap ? far : leap) * unit, at, bears, s);
     }
   }
   if (out) {
@@ -298,6 +180,22 @@ PALPATE void give_way(const Fields& f, Thread t, int i, const Line& line, double
       note_path(s, 0.0);
     }
   }
+}
+
+// Says which vertices bear a blade, by which shares, and returns their velocity: those at its seat, and
+// half of it those where scissors come out, since they press on both skins.
+template <class Fields>
+PALPATE D3 take_hold(const Fields& f, Thread t, int i, int elem, const Seated& at, const Depth& depth) {
+  const double far = depth.through ? 0.5 : 0.0;
+  const D3 near = (1.0 - far) * at.weight, other = far * depth.weight;
+  const double share[HELD] = {near.x, near.y, near.z, other.x, other.y, other.z};
+  D3 vel = {0.0, 0.0, 0.0};
+  for (int c = 0; c < HELD; ++c) {
+    const int v = f.elem.data[3 * (c < 3 ? elem : depth.elem) + c % 3];
+    vel += share[c] * load_lane(f.solve.vel.data + offset_of(f.solve.node.data[v]));
+    if (t.tid == 0) f.share.data[HELD * i + c] = share[c], f.held.data[HELD * i + c] = v;
+  }
+  return vel;
 }
 
 // What is left of a spring's matrix across some directions.
@@ -318,8 +216,10 @@ PALPATE void bear(const Fields& f, Thread t, int i, const Line& line, const doub
   Line later = line_of(f, i, reach);
   if (later.length == 0.0) later = line;
   // Whether the seat will give way is told by the blade alone: where it does, tissue is at rest.
-  const D3 off = at.at - later.from, lag = reach * at.vel;
+  const D3 off = at.at - later.from;
   const double place = dot(off, later.along);
+  const Depth depth = depth_of(f, t, i, later, place, at);
+  const D3 lag = reach * take_hold(f, t, i, (int)s[BLADE_ELEM], at, depth);
   const Stretch then = stretch_of(place * later.along - off, later.along, at, load(s + BLADE_TOWARD));
   D3 force = k * (then.pull - across(lag, later.along));
   Sym hold = without({weight, 0.0, 0.0, weight, 0.0, weight}, weight, later.along);
@@ -327,7 +227,7 @@ PALPATE void bear(const Fields& f, Thread t, int i, const Line& line, const doub
     hold = without(hold, weight, then.back);
     force = across(force, then.back);
   }
-  const double size = k * norm(then.flat), most = borne(law, depth_of(f, t, i, later, place, at).deep);
+  const double size = k * pull_of(law, then), most = borne(law, depth.deep);
   if (size > most) {
     const double share = most / size;
     hold = share * hold;
@@ -349,11 +249,9 @@ PALPATE void bear(const Fields& f, Thread t, int i, const Line& line, const doub
   store(f.point.data + 3 * i, at.at + then.pull);
   const double entries[6] = {hold.xx, hold.xy, hold.xz, hold.yy, hold.yz, hold.zz};
   for (int c = 0; c < 6; ++c) f.hold.data[6 * i + c] = entries[c];
-  const double share[3] = {at.weight.x, at.weight.y, at.weight.z};
-  for (int c = 0; c < 3; ++c) {
-    const int v = f.elem.data[3 * (int)s[BLADE_ELEM] + c];
-    f.share.data[3 * i + c] = share[c];
-    push_node(f.solve, f.solve.node.data[v], share[c] * force, share[c] * hold);
+  for (int c = HELD * i; c < HELD * (i + 1); ++c) {
+    const double share = f.share.data[c];
+    if (share > 0.0) push_node(f.solve, f.solve.node.data[f.held.data[c]], share * force, share * hold);
   }
 }
 
@@ -404,9 +302,9 @@ PALPATE void act_blades(const Fields& given, Thread t, int) {
     const double* s = f.next.data + BLADE_LENGTH * i;
     if (s[BLADE_STAGE] == AWAY || f.law.data[LAW_LENGTH * i + LAW_STIFFNESS] == 0.0) continue;
     D3 dv = zero;
-    for (int c = 0; c < 3; ++c) {
-      const int v = f.elem.data[3 * (int)s[BLADE_ELEM] + c];
-      dv += f.share.data[3 * i + c] * load_lane(f.solve.dvel.data + offset_of(f.solve.node.data[v]));
+    for (int c = HELD * i; c < HELD * (i + 1); ++c) {
+      const int node = f.solve.node.data[f.held.data[c]];
+      dv += f.share.data[c] * load_lane(f.solve.dvel.data + offset_of(node));
     }
     const double* p = f.hold.data + 6 * i;
     const Sym hold = {p[0], p[1], p[2], p[3], p[4], p[5]};

@@ -55,7 +55,8 @@ class Blades:
   next: doubles("nblade", len(BLADE))  # what it will be
   force: doubles("nblade", 3)  # on the tissue, in the organ's frame [N]
   point: doubles("nblade", 3)  # where it acts [m]
-  share: doubles("nblade", 3)  # of the corners of the triangle
+  held: ints("nblade", 6)  # vertices that bear it
+  share: doubles("nblade", 6)  # of each of them
   hold: doubles("nblade", 6)  # what weighs on the change of the seat's velocity [kg]
   due: ints("nblade")  # whether the path is to come apart, and how
   own: Nodes
@@ -64,6 +65,8 @@ class Blades:
   mj: Bodies
 
 
+# Of the arrays that a step writes, a row for each.
+WIDTHS = {"force": 3, "point": 3, "held": 6, "share": 6, "hold": 6, "next": len(BLADE)}
 KERNELS = "enter_blades", "act_blades", "keep_blades"
 _enter, _act, _keep = coupling.kernels("blades.h", Blades, *KERNELS)
 # As in the header: the blade is out of the tissue; edges between points of a path, and that come
@@ -180,8 +183,7 @@ class Cutters(Beside):
       return
     w, n, mesh = self._w, len(self.names), self._w.organ.mesh
     m, scheme = mjstruct.Model.from_address(model), SCHEMES[w.config.integrator]
-    shapes = {"force": 3, "point": 3, "share": 3, "hold": 6, "next": len(BLADE)}
-    values = {name: np.zeros((n, width)) for name, width in shapes.items()}
+    values = {name: np.zeros((n, width)) for name, width in WIDTHS.items()}
     values |= self._arrays | dict(
       nblade=n,
       nelem=mesh.whole.nelem,
@@ -242,8 +244,9 @@ class Cutters(Beside):
         return w.cuts.cut_at_rest(path, given), w.organ.mesh
       organ = w.organ
       along = None if i in self.by_current else self._along(i)
-      way = inward.direction(organ, w.phases.motion()[0], along, int(row[BLADE.elem]))
-      now = organ.origin + self._on_surface(path) @ organ.frame.T
+      now, elem = self._on_surface(path)
+      way = inward.direction(organ, w.phases.motion()[0], along, elem)
+      now = organ.origin + now @ organ.frame.T
       return w.cuts.cut(now, given * float(deep[0].mean()), deep[0], way), w.organ.mesh
 
     if len(mesh.tet):
@@ -267,12 +270,12 @@ class Cutters(Beside):
       return one
     return one - np.copysign(1.0, one @ two) * two  # blades are at less than 90 degrees
 
-  def _on_surface(self, path: np.ndarray) -> np.ndarray:
-    """Returns where points of the rest shape are now, in the organ's frame, (n, 3)."""
+  def _on_surface(self, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns where points of the rest shape are now, in the organ's frame, and their triangles."""
     w, mesh = self._w, self._w.organ.mesh
     elem, weight, _ = w.cuts.finder.nearest(mesh, mesh.rest, path)
     vert = mesh.elem[elem]
-    return np.einsum("nk,nkj->nj", weight, mesh.rest[vert] + w.phases.motion()[0][vert])
+    return np.einsum("nk,nkj->nj", weight, mesh.rest[vert] + w.phases.motion()[0][vert]), elem
 
   def read(self) -> list[Cutter]:
     """Returns what the cutters do."""

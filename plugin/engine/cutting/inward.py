@@ -60,18 +60,19 @@ def open_path(row: np.ndarray, edge: float, ended: bool, finder, cut):
   return report, why
 
 
-def direction(organ, disp: np.ndarray, along: np.ndarray | None, elem: int) -> np.ndarray:
+def direction(organ, disp: np.ndarray, along: np.ndarray | None, elem: np.ndarray) -> np.ndarray:
   """Returns the unit vector along which a blade cuts into the tissue, in the world.
 
   Args:
     organ: its declaration
     disp: displacements of its vertices [m]  (nvert, 3)
     along: the blade's way, of either sign; None for what cuts along the normal
-    elem: triangle of its seat
+    elem: triangles that its path is on  (n,)
   """
   vert = organ.mesh.elem[elem]
-  corner = organ.mesh.rest[vert] + disp[vert]
-  normal = organ.frame @ cross(corner[1] - corner[0], corner[2] - corner[0])
+  a, b, c = np.moveaxis(organ.mesh.rest[vert] + disp[vert], 1, 0)
+  normals = cross(b - a, c - a)
+  normal = organ.frame @ (normals / lengths(normals)[:, None]).sum(axis=0)
   normal /= np.linalg.norm(normal)
   size = 0.0 if along is None else np.linalg.norm(along)
   if along is None or size < _SHUT:

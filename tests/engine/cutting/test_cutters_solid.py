@@ -34,10 +34,11 @@ def scene(windows=True, x=-0.033, z=0.01, half=0.006, cutters=f"edge {ENERGY}"):
   return model, data, palpate.Organ(model, data, "organ")
 
 
+@pytest.mark.parametrize("deep", [0.006, 0.009])  # of 12 mm
 @pytest.mark.parametrize("windows", [pytest.param(False, marks=pytest.mark.slow), True])
-def test_a_blade_needs_the_toughness_times_its_depth(windows):
-  model, data, organ = scene(windows)  # its lower half is in the block
-  deep, speed = 0.006, 0.1
+def test_a_blade_needs_the_toughness_times_its_depth(windows, deep):
+  model, data, organ = scene(windows, z=0.016 - deep)
+  speed = 0.1
   force = scenes.follow(model, data, organ, lambda t: (speed * t, 0, 0), 0.075 / speed)
   (cutter,), reports = organ.cutters, organ.cuts
   steady = force[120:210]
@@ -47,7 +48,9 @@ def test_a_blade_needs_the_toughness_times_its_depth(windows):
   # The mesh came apart along it, as deep, in one groove.
   area = sum(report.area for report in reports)
   assert 0.8 < area / (deep * 0.05) < 1.6 and len(organ.pieces) == 1  # of edges of 5 mm and more
-  assert max(report.depth for report in reports) == pytest.approx(deep, rel=0.1)
+  depths = [report.depth for report in reports]
+  assert np.median(depths) == pytest.approx(deep, rel=0.02)
+  assert max(depths) < 1.25 * deep  # at the edge where it comes in its force raises the skin
   line = np.concatenate([line for report in reports for line in report.path])
   assert np.abs(line[:, 1]).max() < 2e-3 and np.ptp(line[:, 0]) > 0.045
 
@@ -100,8 +103,8 @@ def slab(thick):
   return model, data, palpate.Organ(model, data, "organ")
 
 
-def test_scissors_part_the_slab_that_they_close_over():
-  thick = 0.006
+@pytest.mark.parametrize("thick", [0.004, 0.005, 0.006, 0.007])
+def test_scissors_part_the_slab_that_they_close_over(thick):
   model, data, organ = slab(thick)
   depths = []
   for opening in [*np.full(50, 0.8), *np.linspace(0.8, -0.1, 300), *np.full(300, -0.1)]:
@@ -116,6 +119,5 @@ def test_scissors_part_the_slab_that_they_close_over():
   assert min(sides) < -0.003 and max(sides) > 0.003
   area = sum(report.area for report in organ.cuts)
   assert area == pytest.approx(thick * 0.012, rel=0.05)  # the slab's section
-  # The work is the toughness times the area, as thick as the slab was where it was stretched.
-  assert cutter.energy == pytest.approx(ENERGY * thick * cutter.length, rel=0.15)
-  assert 0.7 < np.median(depths) / thick < 1.15
+  assert cutter.energy == pytest.approx(ENERGY * area, rel=0.06)
+  assert np.median(depths) == pytest.approx(thick, rel=0.1)
