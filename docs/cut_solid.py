@@ -54,8 +54,9 @@ def picture(points: np.ndarray, parts: dict[str, np.ndarray]) -> np.ndarray:
   spec = mujoco.MjSpec()
   spec.visual.global_.offwidth, spec.visual.global_.offheight = 760, 560
   spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.35] * 3, [0.35] * 3
-  spec.add_texture(name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, width=64, height=64,
-                   builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT, rgb1=[0.86, 0.88, 0.9], rgb2=[0.86, 0.88, 0.9])  # fmt: skip
+  sky = spec.add_texture(name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX)
+  sky.width, sky.height, sky.builtin = 64, 64, mujoco.mjtBuiltin.mjBUILTIN_FLAT
+  sky.rgb1 = sky.rgb2 = [0.86, 0.88, 0.9]
   light = spec.worldbody.add_light(pos=[-0.2, -0.3, 0.5], dir=[0.2, 0.3, -0.5], diffuse=[0.6] * 3)
   light.castshadow = True
   for name, elem in parts.items():
