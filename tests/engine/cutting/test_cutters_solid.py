@@ -47,7 +47,7 @@ def test_a_blade_needs_the_toughness_times_its_depth(windows, deep):
   assert cutter.length == pytest.approx(0.05, rel=0.02) and not cutter.inside
   # The mesh came apart along it, as deep, in one groove.
   area = sum(report.area for report in reports)
-  assert 0.8 < area / (deep * 0.05) < 1.6 and len(organ.pieces) == 1  # of edges of 5 mm and more
+  assert 0.7 < area / (deep * 0.05) < 1.6 and len(organ.pieces) == 1  # of edges of 5 mm and more
   depths = [report.depth for report in reports]
   assert np.median(depths) == pytest.approx(deep, rel=0.02)
   assert max(depths) < 1.1 * deep
