@@ -341,10 +341,7 @@ PALPATE Opening opening_of(Scratch& memory, int nvert, int ntet, int nouter) {
   return o;
 }
 
-// What is around a cut before it is made: the patch, its energy, what its vertices have together, and the volume
-// around each.
-struct Before { Patch patch; double energy; Sums sums; double* size; };
-
+// Finds what is around a cut before it is made.
 template <class S, class F>
 PALPATE bool look_before(const S& m, const Opening& o, const Few& movers, const Neohookean& e, const Moving& x,
                          const F& f, Before& out, Scratch& memory) {
@@ -358,37 +355,6 @@ PALPATE bool look_before(const S& m, const Opening& o, const Few& movers, const 
   out.energy = e.has ? strain_patch(m, e, x.disp, p) : 0.0;
   out.sums = sums_of(m, x, p.vert, f.pinned.data);
   for (int i = 0; i < p.vert.count; ++i) out.size[p.vert.list[i]] = p.size[i];
-  return true;
-}
-
-// Lets what is around a cut go on with no more energy than it had.
-template <class S, class F>
-PALPATE bool ease(const S& m, const Neohookean& e, const Moving& x, const F& f, Before& was, Scratch& memory) {
-  Patch& p = was.patch;
-  Few apart = few(memory, m.nvert);
-  const int nsplit = f.found.data[FOUND_SPLIT];
-  double* part = memory.values(nsplit);
-  if (memory.full) return false;
-  for (int i = 0; i < nsplit; ++i) part[i] = f.share.data[i] * was.size[f.group.data[i]];
-  for (int i = 0; i < nsplit; ++i) was.size[f.member.data[i]] = part[i], apart.put(f.member.data[i]);
-  find_patch(m, e, f.loose.data, f.foundation, f.found.data[FOUND_TRIANGLES], p);
-  double had = 0.0, has = 0.0;
-  for (int i = 0; i < p.vert.count; ++i) {
-    const int v = p.vert.list[i];
-    had += x.mass[v], has += x.mass[v] *= p.size[i] / was.size[v];
-  }
-  for (int i = 0; i < p.vert.count; ++i) x.mass[p.vert.list[i]] *= had / has;
-  double most = was.energy;
-  for (int turn = 0; turn < 2; ++turn) {
-    const double more = e.has ? give_way(m, e, p, apart, most, x.disp, memory) : 0.0;
-    const double over = keep_motion(m, x, p.vert, f.pinned.data, was.sums, more > 0.0 ? more : 0.0);
-    if (!e.has || !(over > 0.0)) break;
-    most -= over;
-  }
-  int count = 0;
-  for (int i = 0; i < p.vert.count; ++i)
-    if (!f.pinned.data[p.vert.list[i]]) f.near.data[count++] = p.vert.list[i];
-  f.found.data[FOUND_NEAR] = count;
   return true;
 }
 

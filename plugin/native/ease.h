@@ -12,6 +12,8 @@
 namespace palpate {
 
 constexpr int CONJUGATE = 60, SEARCHES = 4;
+constexpr int TURNS = 8;  // each with a ring of tetrahedra more
+constexpr double EVEN = 1e-9;  // of the kinetic energy, that counts as none
 constexpr double AMPLE = 1.001;  // times what is wanted that is asked for
 constexpr double FARTHEST = 4.0;  // times the way of a vertex that gives way alone
 
@@ -239,6 +241,62 @@ PALPATE double keep_motion(const S& m, const Moving& x, const Few& vert, const L
     store(x.vel + 3 * v, goal.at(arm_of(v)) + share * rest);
   }
   return -left;
+}
+
+// What is around a cut before it is made: the patch, its energy, what its vertices have together, and the volume
+// around each.
+struct Before { Patch patch; double energy; Sums sums; double* size; };
+
+// Adds a ring of tetrahedra, and lets all give way that then have theirs in the patch: the least energy of what
+// came apart may be more than it was, where the rest is held by it.
+template <class S, class F>
+PALPATE void widen(const S& m, const Neohookean& e, const Moving& x, const F& f, Before& was, Few& apart) {
+  Patch& p = was.patch;
+  for (int far = 0; far < 2; ++far) {
+    const Sums sums = sums_of(m, x, p.vert, f.pinned.data);
+    const double sign = far ? 1.0 : -1.0;
+    was.energy += sign * strain_patch(m, e, x.disp, p), was.sums.energy += sign * sums.energy;
+    was.sums.momentum += sign * sums.momentum, was.sums.spin += sign * sums.spin;
+    if (far) break;
+    for (int i = 0; i < p.vert.count; ++i) {
+      const int v = p.vert.list[i];
+      if (!f.pinned.data[v]) apart.put(v);
+      m.each_corner(v, [&](int corner) { p.own.put(corner / 4); });
+    }
+    find_patch(m, e, f.loose.data, f.foundation, f.found.data[FOUND_TRIANGLES], p);
+  }
+}
+
+// Lets what is around a cut go on with no more energy than it had.
+template <class S, class F>
+PALPATE bool ease(const S& m, const Neohookean& e, const Moving& x, const F& f, Before& was, Scratch& memory) {
+  Patch& p = was.patch;
+  Few apart = few(memory, m.nvert);
+  const int nsplit = f.found.data[FOUND_SPLIT];
+  double* part = memory.values(nsplit);
+  if (memory.full) return false;
+  for (int i = 0; i < nsplit; ++i) part[i] = f.share.data[i] * was.size[f.group.data[i]];
+  for (int i = 0; i < nsplit; ++i) was.size[f.member.data[i]] = part[i], apart.put(f.member.data[i]);
+  find_patch(m, e, f.loose.data, f.foundation, f.found.data[FOUND_TRIANGLES], p);
+  double had = 0.0, has = 0.0;
+  for (int i = 0; i < p.vert.count; ++i) {
+    const int v = p.vert.list[i];
+    had += x.mass[v], has += x.mass[v] *= p.size[i] / was.size[v];
+  }
+  for (int i = 0; i < p.vert.count; ++i) x.mass[p.vert.list[i]] *= had / has;
+  double ask = 0.0;  // by how much less than before it is to have
+  for (int turn = 0; turn < TURNS; ++turn) {
+    if (turn) widen(m, e, x, f, was, apart);
+    const double more = e.has ? give_way(m, e, p, apart, was.energy - ask, x.disp, memory) - ask : 0.0;
+    const double over = keep_motion(m, x, p.vert, f.pinned.data, was.sums, more);
+    if (!e.has || !(over > EVEN * was.sums.energy)) break;
+    ask = AMPLE * (over - more);
+  }
+  int count = 0;
+  for (int i = 0; i < p.vert.count; ++i)
+    if (!f.pinned.data[p.vert.list[i]]) f.near.data[count++] = p.vert.list[i];
+  f.found.data[FOUND_NEAR] = count;
+  return true;
 }
 
 }  // namespace palpate

@@ -137,7 +137,7 @@ class Cleaver:
     sizes = {"nvert": nvert, "ntet": ntet, "nelem": whole.nelem}
     sizes |= {"most": whole.ring.shape[1], "most_elem": room, "nface": 4 * ntet}
     # What native/cleave.h takes of scratch, see there.
-    sizes |= {"nint": 92 * ntet + 40 * nvert + 8 * room, "nreal": 64 * nvert + 26 * ntet + 3 * room}
+    sizes |= {"nint": 92 * ntet + 40 * nvert + 8 * room, "nreal": 70 * nvert + 26 * ntet + 3 * room}
     sizes |= {"nmouth": 3 * (room - whole.nelem), "npath": 0, "nline": 0}
     self._fields: Any = allocate(Cleaving, "cpu", sizes)
     for name in ("nvert", "ntet", "nelem", "most", "most_elem", "nint", "nreal"):
