@@ -100,6 +100,8 @@ class Blades(beside.Opens):
     values |= space.cutters.edges() | dict(
       nblade=n,
       nelem=mesh.nelem,
+      ntet=0,
+      tet=np.zeros((0, 4), int),
       ahead=float(scheme.ahead),
       gain=scheme.gain(1.0, 0.0),
       edge=float(mesh.whole.edge_length),

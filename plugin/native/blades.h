@@ -9,6 +9,9 @@
 // through is the path of the cut. A blade that comes from above pierces the wall first, with up to G
 // times its width along itself, over the wall's thickness. On its way back it meets nothing.
 //
+// In a solid t is how deep the blade is, the force is across it, and is spread along it: at one place of
+// the skin it would drag soft tissue along.
+//
 // Places are in the organ's frame; a blade slides freely along itself.
 #pragma once
 #include "seat.h"
@@ -20,7 +23,7 @@ constexpr double SPACING = 0.4, LEAP = 1.0;
 constexpr double BATCH = 1.8;  // edges that come apart at once, at least
 constexpr double LEVEL = 0.05;  // least share of a way along the surface that is across the blade
 constexpr double BLOCKED = 0.3;  // share of its way that a seat goes where it is not at a boundary
-constexpr int HELD = 6;  // vertices that bear a blade
+constexpr int ALONG = 4, HELD = 4 * ALONG + 3;  // places along a blade that bear it, and their vertices
 constexpr double LEAVES = 0.8;  // cosine of a pull to the normal of a face by which a blade leaves
 enum { AWAY, PIERCING, THROUGH };  // stages
 enum { NOTHING, LONG, ENDED };  // what is due
@@ -182,20 +185,34 @@ PALPATE void give_way(const Fields& f, Thread t, int i, const Line& line, double
   }
 }
 
-// Says which vertices bear a blade, by which shares, and returns their velocity: those at its seat, and
-// half of it those where scissors come out, since they press on both skins.
+// Says which vertices bear a blade, by which shares, and returns where they do and their velocity. In a
+// solid it is those around its edge, evenly along it, else and where there are none those at its seat.
+struct Borne { D3 at, vel; };
+
 template <class Fields>
-PALPATE D3 take_hold(const Fields& f, Thread t, int i, int elem, const Seated& at, const Depth& depth) {
-  const double far = depth.through ? 0.5 : 0.0;
-  const D3 near = (1.0 - far) * at.weight, other = far * depth.weight;
-  const double share[HELD] = {near.x, near.y, near.z, other.x, other.y, other.z};
-  D3 vel = {0.0, 0.0, 0.0};
-  for (int c = 0; c < HELD; ++c) {
-    const int v = f.elem.data[3 * (c < 3 ? elem : depth.elem) + c % 3];
-    vel += share[c] * load_lane(f.solve.vel.data + offset_of(f.solve.node.data[v]));
-    if (t.tid == 0) f.share.data[HELD * i + c] = share[c], f.held.data[HELD * i + c] = v;
+PALPATE Borne take_hold(const Fields& f, Thread t, int i, const double* s, const Seated& at,
+                        const Depth& depth) {
+  const bool spread = s[BLADE_STAGE] == THROUGH && depth.deep > 0.0 && dot(depth.in, depth.in) > 0.0;
+  Borne out = {{0.0, 0.0, 0.0}, {0.0, 0.0, 0.0}};
+  const auto hold = [&](int c, int v, double share) {
+    out.vel += share * load_lane(f.solve.vel.data + offset_of(f.solve.node.data[v]));
+    if (t.tid == 0) f.share.data[HELD * i + c] = share, f.held.data[HELD * i + c] = v;
+  };
+  double left = 1.0;
+  for (int k = 0; k < ALONG; ++k) {
+    const D3 place = at.at + ((k + 0.5) / ALONG * depth.deep) * depth.in;
+    int tet = 0;
+    D3 w = {0.0, 0.0, 0.0};
+    const double part = spread && find_tet(f, t, place, tet, w) ? 1.0 / ALONG : 0.0;
+    const double share[4] = {part * (1.0 - w.x - w.y - w.z), part * w.x, part * w.y, part * w.z};
+    for (int c = 0; c < 4; ++c) hold(4 * k + c, part > 0.0 ? f.tet.data[4 * tet + c] : 0, share[c]);
+    out.at += part * place;
+    left -= part;
   }
-  return vel;
+  const double share[3] = {left * at.weight.x, left * at.weight.y, left * at.weight.z};
+  for (int c = 0; c < 3; ++c) hold(4 * ALONG + c, f.elem.data[3 * (int)s[BLADE_ELEM] + c], share[c]);
+  out.at += left * at.at;
+  return out;
 }
 
 // What is left of a spring's matrix across some directions.
@@ -219,7 +236,8 @@ PALPATE void bear(const Fields& f, Thread t, int i, const Line& line, const doub
   const D3 off = at.at - later.from;
   const double place = dot(off, later.along);
   const Depth depth = depth_of(f, t, i, later, place, at);
-  const D3 lag = reach * take_hold(f, t, i, (int)s[BLADE_ELEM], at, depth);
+  const Borne by = take_hold(f, t, i, s, at, depth);
+  const D3 lag = reach * by.vel;
   const Stretch then = stretch_of(place * later.along - off, later.along, at, load(s + BLADE_TOWARD));
   D3 force = k * (then.pull - across(lag, later.along));
   Sym hold = without({weight, 0.0, 0.0, weight, 0.0, weight}, weight, later.along);
@@ -246,7 +264,7 @@ PALPATE void bear(const Fields& f, Thread t, int i, const Line& line, const doub
   }
   if (t.tid > 0) return;
   store(f.force.data + 3 * i, force);
-  store(f.point.data + 3 * i, at.at + then.pull);
+  store(f.point.data + 3 * i, by.at + then.pull);
   const double entries[6] = {hold.xx, hold.xy, hold.xz, hold.yy, hold.yz, hold.zz};
   for (int c = 0; c < 6; ++c) f.hold.data[6 * i + c] = entries[c];
   for (int c = HELD * i; c < HELD * (i + 1); ++c) {

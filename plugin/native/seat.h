@@ -107,22 +107,20 @@ PALPATE double beyond(const Line& line, double place) {
   return place < line.length - place ? place : line.length - place;
 }
 
-// How deep a seat's blade is in a solid: as far as its end that is below the skin. Scissors close over what
-// lies between them: from the seat along the way they close to where the solid ends, at a place on a
-// triangle, or as far as they reach, and then not `through`.
-struct Depth { double deep; bool through; int elem; D3 weight; };
+// How deep a seat's blade is in a solid, and which way: as far as its end that is below the skin. Scissors
+// close over what lies between them: from the seat along the way they close to where the solid ends, or as
+// far as they reach, and then not `through`.
+struct Depth { double deep; bool through; D3 in; };
 
 template <class Fields>
 PALPATE Depth depth_of(const Fields& f, Thread me, int i, const Line& line, double place, const Seated& at) {
   const D3 zero = {0.0, 0.0, 0.0};
   const double level = dot(line.along, at.normal);
-  if (f.law.data[LAW_LENGTH * i + LAW_SOLID] == 0.0) return {beyond(line, place), false, 0, zero};
-  const bool back = level > 0.0;
-  if (f.geom.data[2 * i + 1] < 0) {
-    const double below = back ? place : line.length - place;
-    return {fabs(level) < GRAZES ? beyond(line, place) : below, false, 0, zero};
-  }
+  const bool back = level > 0.0, shears = f.geom.data[2 * i + 1] >= 0;
   const Line in = {at.at, back ? zero - line.along : line.along, back ? place : line.length - place};
+  if (f.law.data[LAW_LENGTH * i + LAW_SOLID] == 0.0 || (!shears && fabs(level) < GRAZES))
+    return {beyond(line, place), false, zero};
+  if (!shears) return {in.length, false, in.along};
   double least = NOWHERE;
   for (int t = me.tid; t < f.nelem; t += me.nthread) {
     D3 x[3], w;
@@ -135,7 +133,32 @@ PALPATE Depth depth_of(const Fields& f, Thread me, int i, const Line& line, doub
   D3 weight = zero;
   agree(least, elem, weight);
   const bool through = least < NOWHERE;
-  return {through ? least : in.length, through, elem, weight};
+  return {through ? least : in.length, through, in.along};
+}
+
+// Finds the tetrahedron that a place is in; returns whether there is one.
+template <class Fields>
+PALPATE bool find_tet(const Fields& f, Thread me, D3 place, int& tet, D3& weight) {
+  double least = NOWHERE;
+  for (int t = me.tid; t < f.ntet; t += me.nthread) {
+    D3 x[4];
+    for (int c = 0; c < 4; ++c) {
+      const int v = f.tet.data[4 * t + c];
+      x[c] = load(f.own.rest.data + 3 * v) + moved_by(f.mj, f.own, v) - place;
+    }
+    const D3 high = vmax(vmax(x[0], x[1]), vmax(x[2], x[3]));
+    if (high.x < 0.0 || high.y < 0.0 || high.z < 0.0) continue;
+    const D3 a = x[1] - x[0], b = x[2] - x[0], c = x[3] - x[0], p = -1.0 * x[0];
+    const double det = dot(a, cross(b, c));
+    if (!(det > 0.0)) continue;
+    const D3 w = (1.0 / det) * D3{dot(p, cross(b, c)), dot(a, cross(p, c)), dot(a, cross(b, p))};
+    double low = 1.0 - w.x - w.y - w.z;
+    const double shares[3] = {w.x, w.y, w.z};
+    for (int k = 0; k < 3; ++k) low = shares[k] < low ? shares[k] : low;
+    if (low >= 0.0 && -low < least) least = -low, tet = t, weight = w;
+  }
+  agree(least, tet, weight);
+  return least < NOWHERE;
 }
 
 }  // namespace palpate

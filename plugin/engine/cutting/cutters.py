@@ -35,12 +35,17 @@ _ROUND = (int(mujoco.mjtGeom.mjGEOM_CAPSULE), int(mujoco.mjtGeom.mjGEOM_CYLINDER
 _BOX = int(mujoco.mjtGeom.mjGEOM_BOX)
 
 
+# As in the header: vertices that bear a blade.
+HELD = 19
+
+
 @struct
 class Blades:
   """The geoms that cut an organ."""
 
   nblade: int  # number of them
   nelem: int  # triangles of the organ
+  ntet: int  # tetrahedra, of a solid
   ahead: wp.float64  # share of the step's way at which its scheme takes forces
   gain: wp.float64  # how much of a step's stiffness its scheme has on dv
   edge: wp.float64  # mean length of the mesh's edges [m]
@@ -50,13 +55,14 @@ class Blades:
   law: doubles("nblade", len(LAW))  # see LAW
   mesh: ints("nworld")  # which mesh a world has
   elem: ints("nelem", 3)  # triangles
+  tet: ints("ntet", 4)  # tetrahedra
   flat: doubles("nvert", 3)  # rest positions as the cuts have them [m]
   state: doubles("nblade", len(BLADE))  # see BLADE
   next: doubles("nblade", len(BLADE))  # what it will be
   force: doubles("nblade", 3)  # on the tissue, in the organ's frame [N]
   point: doubles("nblade", 3)  # where it acts [m]
-  held: ints("nblade", 6)  # vertices that bear it
-  share: doubles("nblade", 6)  # of each of them
+  held: ints("nblade", HELD)  # vertices that bear it
+  share: doubles("nblade", HELD)  # of each of them
   hold: doubles("nblade", 6)  # what weighs on the change of the seat's velocity [kg]
   due: ints("nblade")  # whether the path is to come apart, and how
   own: Nodes
@@ -66,7 +72,7 @@ class Blades:
 
 
 # Of the arrays that a step writes, a row for each.
-WIDTHS = {"force": 3, "point": 3, "held": 6, "share": 6, "hold": 6, "next": len(BLADE)}
+WIDTHS = {"force": 3, "point": 3, "held": HELD, "share": HELD, "hold": 6, "next": len(BLADE)}
 KERNELS = "enter_blades", "act_blades", "keep_blades"
 _enter, _act, _keep = coupling.kernels("blades.h", Blades, *KERNELS)
 # As in the header: the blade is out of the tissue; edges between points of a path, and that come
@@ -187,12 +193,14 @@ class Cutters(Beside):
     values |= self._arrays | dict(
       nblade=n,
       nelem=mesh.whole.nelem,
+      ntet=len(mesh.tet),
       ahead=float(scheme.ahead),
       gain=scheme.gain(1.0, 0.0),
       edge=float(mesh.whole.edge_length),
       law=self.law(m, w.config.thickness),
       mesh=np.zeros(1),
       elem=mesh.elem[: mesh.whole.nelem],
+      tet=mesh.tet,
       flat=mesh.rest,
       state=self.rows("blade", len(BLADE)),
       due=np.zeros(n),
@@ -218,6 +226,7 @@ class Cutters(Beside):
     if self.fields is not None:
       mesh = self._w.organ.mesh
       self._here.elem[:] = mesh.elem[: mesh.whole.nelem]
+      self._here.tet[:] = mesh.tet
       self._here.flat[:] = mesh.rest
       self._own.rest[:] = base(self._w.organ)
     return []
