@@ -217,13 +217,14 @@ PALPATE Rigid rigid_of(const Sums& sums, D3 momentum, D3 spin) {
 
 // Gives vertices the momentum and angular momentum that they had: they turn slowly together for it. Where they
 // have more than their kinetic energy less `less`, they move less beside what they have in common. Returns by how
-// much they have more all the same.
+// much they have more all the same; where `slows`, they turn by that more slowly instead.
 template <class S, class L>
 PALPATE double keep_motion(const S& m, const Moving& x, const Few& vert, const L* pinned, const Sums& was,
-                           double less) {
+                           double less, bool slows) {
   const Sums now = sums_of(m, x, vert, pinned);
   if (!(now.mass > 0.0)) return 0.0;
-  const Rigid own = rigid_of(now, now.momentum, now.spin), goal = rigid_of(now, was.momentum, was.spin);
+  const Rigid own = rigid_of(now, now.momentum, now.spin);
+  Rigid goal = rigid_of(now, was.momentum, was.spin);
   double common = 0.0, besides = 0.0;
   const auto arm_of = [&](int v) { return m.place(v) + load(x.disp + 3 * v) - now.centre; };
   for (int i = 0; i < vert.count; ++i) {
@@ -233,6 +234,10 @@ PALPATE double keep_motion(const S& m, const Moving& x, const Few& vert, const L
     common += 0.5 * x.mass[v] * dot(a, a), besides += 0.5 * x.mass[v] * dot(b, b);
   }
   const double left = was.energy - less - common;
+  if (slows && left < 0.0) {
+    const double turning = common - 0.5 * now.mass * dot(goal.mean, goal.mean);
+    goal.omega = (turning > -left ? sqrt(1.0 + left / turning) : 0.0) * goal.omega;
+  }
   const double share = left >= besides ? 1.0 : left > 0.0 ? sqrt(left / besides) : 0.0;
   for (int i = 0; i < vert.count; ++i) {
     const int v = vert.list[i];
@@ -284,12 +289,13 @@ PALPATE bool ease(const S& m, const Neohookean& e, const Moving& x, const F& f, 
     had += x.mass[v], has += x.mass[v] *= p.size[i] / was.size[v];
   }
   for (int i = 0; i < p.vert.count; ++i) x.mass[p.vert.list[i]] *= had / has;
-  double ask = 0.0;  // by how much less than before it is to have
+  double ask = 0.0, over = 0.0;  // by how much less than before it is to have, and how much more all have
   for (int turn = 0; turn < TURNS; ++turn) {
     if (turn) widen(m, e, x, f, was, apart);
     const double more = e.has ? give_way(m, e, p, apart, was.energy - ask, x.disp, memory) - ask : 0.0;
-    const double over = keep_motion(m, x, p.vert, f.pinned.data, was.sums, more);
-    if (!e.has || !(over > EVEN * was.sums.energy)) break;
+    const bool rigid = turn && was.energy + more < over;  // no strain is left to give
+    over = keep_motion(m, x, p.vert, f.pinned.data, was.sums, more, rigid || turn + 1 == TURNS);
+    if (rigid || !e.has || !(over > EVEN * was.sums.energy)) break;
     ask = AMPLE * (over - more);
   }
   int count = 0;
