@@ -97,6 +97,7 @@ class Blades(beside.Opens):
     widths = cutters.WIDTHS.items()
     law = space.cutters.law(self._model, organ.config.thickness)
     values: dict[str, Any] = {k: self._zeros(self._nworld, n, wide) for k, wide in widths}
+    values["held"] = self._zeros(self._nworld, n, cutters.HELD, dtype=int)
     values |= space.cutters.edges() | dict(
       nblade=n,
       nelem=mesh.nelem,

@@ -157,6 +157,12 @@ def test_blades_cut_in_each_world(device):
   assert [bool(each) for each in organ.cuts] == [True, False, bool(cuts[2])]
 
 
+def test_worlds_with_a_blade_are_made_by_kernels():
+  # The short form of what is above, as steps of mujoco_warp on a CPU compile for minutes.
+  organ = palpate.batch.make(strip(), 2, device="warp-cpu").organ("organ")
+  assert organ.cutters.inside.numpy().tolist() == [[0], [0]]
+
+
 @pytest.mark.parametrize("device", BACKENDS[1:])
 def test_a_current_cuts_in_each_world(device):
   burn = 1.1e6

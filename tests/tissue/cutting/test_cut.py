@@ -248,14 +248,18 @@ def test_a_cut_along_an_older_one_does_nothing():
   assert not again.stopped and again.length == 0.0 and again.mesh.nouter == mesh.nouter
 
 
-@pytest.mark.parametrize("path", ["line", "circle"])
+# Of a wave a triangle comes off across a gap, once in eight.
+ACROSS = pytest.mark.xfail(raises=AssertionError, strict=True, reason="docs/cutting.md says so")
+
+
+@pytest.mark.parametrize("path", ["line", "circle", pytest.param("wave", marks=ACROSS)])
 def test_a_cut_once_more_where_the_tissue_has_moved_cuts_off_no_crumbs(path):
   mesh, points = sheet(40, seed=2), PATHS[path]
   first = cut(mesh, points)
   pieces = 1 + (path == "circle")
   for k in range(8):
     turn = np.array([np.cos(k), np.sin(k), 0])
-    again = cut(first.mesh, points + 0.8 * MILLI * turn * np.sin(90 * points[:, :1] + k))
+    again = cut(first.mesh, points + MILLI * turn * np.sin(90 * points[:, :1] + k))
     assert len(np.unique(topology.pieces(again.mesh)[again.mesh.elem])) == pieces, k
 
 
