@@ -94,7 +94,7 @@ def test_copied_data_continues_alike():
 def test_memory_need_not_be_clear_before():
   code = """if True:
     import importlib.util, pathlib, sys
-    sys.path.insert(0, str(pathlib.Path(sys.argv[1]).parents[1]))
+    sys.path.insert(0, str(pathlib.Path(sys.argv[1]).parents[2]))
     spec = importlib.util.spec_from_file_location("test_window", sys.argv[1])
     tests = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(tests)

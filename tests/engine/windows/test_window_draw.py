@@ -1,6 +1,7 @@
 """Windowed organs in pictures and films: the deformed surface, in every way MuJoCo draws."""
 
 import os
+import pathlib
 import subprocess
 import sys
 
@@ -58,7 +59,7 @@ def test_a_windowed_organ_looks_like_a_nodal_one(backend):
     except Exception as error:
       print(error)
       sys.exit(77)
-    sys.path.insert(0, {os.path.dirname(os.path.dirname(__file__))!r})
+    sys.path.insert(0, {str(pathlib.Path(__file__).parents[2])!r})
     spec = importlib.util.spec_from_file_location("drawing", {__file__!r})
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
