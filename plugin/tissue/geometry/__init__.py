@@ -1,1 +1,1 @@
-"""Surfaces and the inside of solids before there is a tissue: numpy and scipy alone."""
+"""Surfaces and the inside of solids before there is a tissue: no kernels."""
