@@ -1,4 +1,7 @@
-"""Steps a scene as often as it is asked to: what `uncut` starts, with the code of any state."""
+"""Steps a scene as often as it is asked to: what `uncut` starts, with the code of any state.
+
+So it knows nothing of the tests beside it, which are of the present state; surfaces come in a file.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,6 @@ import time
 import mujoco
 import numpy as np
 import palpate
-import scenes
 
 H = 2e-3  # time step [s]
 WARM = 150  # steps before the first ones that count
@@ -29,15 +31,12 @@ SCENES = {
 }
 
 
-def scene(name: str):
+def scene(name: str, points: np.ndarray, elem: np.ndarray):
   """Returns model and data of an organ that a ball presses."""
-  shape, nodes, keys = SCENES[name]
+  shape, _, keys = SCENES[name]
   if shape == "sheet":
-    nx = round(math.sqrt(nodes * 1.3))
-    points, elem = scenes.triangular(0.15, 0.10, nx, round(nx / 1.3), 0.2)
     pin = np.flatnonzero(np.abs(np.abs(points[:, 1]) - 0.05) < 1e-9)
   else:
-    points, elem = scenes.sphere(round(math.log((nodes - 2) / 10, 4)))
     pin = np.flatnonzero(points[:, 2] < -0.8 * points[:, 2].max())
   spec = mujoco.MjSpec()
   spec.option.timestep, spec.option.gravity = H, (0, 0, 0)
@@ -54,9 +53,10 @@ def scene(name: str):
   return model, mujoco.MjData(model)
 
 
-def serve(name: str):
+def serve(name: str, file: str):
   """Steps a scene as often as each line of the input says, and answers with CPU time [ns]."""
-  model, data = scene(name)
+  with np.load(file) as surface:
+    model, data = scene(name, surface["points"], surface["elem"])
   done = 0
 
   def advance(count: int):
@@ -75,4 +75,4 @@ def serve(name: str):
 
 
 if __name__ == "__main__":
-  serve(sys.argv[1])
+  serve(*sys.argv[1:])

@@ -22,6 +22,7 @@ import sys
 import tempfile
 
 import numpy as np
+import scenes
 from benchmarks import plots, results, stepping
 from benchmarks.results import BenchError
 from benchmarks.runner import SEED, Bench, Case, Row
@@ -36,12 +37,12 @@ class Server:
   Args:
     code: folder that has the package
     name: of the scene
+    surface: file of its organ
   """
 
-  def __init__(self, code: pathlib.Path, name: str):
-    tests = str(pathlib.Path(__file__).parents[1])
-    path = os.pathsep.join([str(code), tests, os.environ.get("PYTHONPATH", "")])
-    words = [sys.executable, stepping.__file__, name]
+  def __init__(self, code: pathlib.Path, name: str, surface: pathlib.Path):
+    path = os.pathsep.join([str(code), os.environ.get("PYTHONPATH", "")])
+    words = [sys.executable, stepping.__file__, name, str(surface)]
     more = {"PYTHONPATH": path, "OMP_NUM_THREADS": "1", "MUJOCO_GL": "disabled"}
     self._process = subprocess.Popen(
       words, env=os.environ | more, text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE
@@ -88,9 +89,22 @@ def package(checkout: str | os.PathLike, where: pathlib.Path) -> pathlib.Path:
   return where
 
 
+def write_surface(name: str, file: pathlib.Path):
+  """Writes the organ of a scene, which all processes have then."""
+  shape, nodes, _ = stepping.SCENES[name]
+  if shape == "sheet":
+    nx = round(math.sqrt(nodes * 1.3))
+    points, elem = scenes.triangular(0.15, 0.10, nx, round(nx / 1.3), 0.2)
+  else:
+    points, elem = scenes.sphere(round(math.log((nodes - 2) / 10, 4)))
+  np.savez(file, points=points, elem=elem)
+
+
 def compare(old: pathlib.Path, new: pathlib.Path, case: Case, order: random.Random) -> dict:
   """Returns the logarithms of ratios of one life, and the CPU time of a step [s]."""
-  servers = [Server(code, case["case"]) for code in (old, old, new, new)]
+  surface = new.parent / "surface.npz"
+  write_surface(case["case"], surface)
+  servers = [Server(code, case["case"], surface) for code in (old, old, new, new)]
   try:
     for server in servers:
       server.wait()
