@@ -96,8 +96,10 @@ class Blades(beside.Opens):
     self._model = mjstruct.Model.from_address(space.model)
     widths = cutters.WIDTHS.items()
     law = space.cutters.law(self._model, organ.config.thickness)
-    values: dict[str, Any] = {k: self._zeros(self._nworld, n, wide) for k, wide in widths}
-    values["held"] = self._zeros(self._nworld, n, cutters.HELD, dtype=int)
+    values: dict[str, Any] = {
+      name: self._zeros(self._nworld, n, wide, dtype=_WorldBlades.vars[name].type.dtype)
+      for name, wide in widths
+    }
     values |= space.cutters.edges() | dict(
       nblade=n,
       nelem=mesh.nelem,
