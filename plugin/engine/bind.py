@@ -44,10 +44,10 @@ def bind(w, model: int):
     def respond():
       assert scheme.respond is not None  # recorded only then
       if crossing:
-        _cross(w, ("rhs",), to_device=True)
+        _cross(w, ("rhs", "expected"), to_device=True)
       scheme.respond(w.body)
       if crossing:
-        _cross(w, ("sol", "status"), to_device=False)
+        _cross(w, ("sol", "status", "ratio"), to_device=False)
 
     # As few graphs as may be: a launch costs a small organ a hundredth of its step.
     after = [] if w.resident else [(cpu, part(_scatter, w, does))]

@@ -93,6 +93,7 @@ HEAD = Numbers(
   ("reach", 1, "m", "distance from a geom within which nodes may be in a window"),
   ("step_ended", 1, "s", "time step of the step that ends"),
   ("answered", 1, "-", "1 where it ends with the organ's response"),
+  ("expected", 1, "J", "see `State.expected`"),
 )
 
 # Of the inbox: where contacts left a slot in the last step.
@@ -126,6 +127,7 @@ GEOM = Numbers(
 SUMMARY = Numbers(
   "SUMMARY",
   ("status", 4, "-", "as `System.status`"),
+  ("ratio", 1, "-", "as `System.ratio`"),
   ("speed2", 1, "m^2/s^2", "square of the greatest speed of a node"),
   ("low", 3, "m", "lowest corner of the organ's bounds, in its frame"),
   ("high", 3, "m", "highest corner"),
@@ -136,7 +138,6 @@ ANSWER = Numbers(
   "ANSWER",
   ("disp", 3, "m", "displacement from rest"),
   ("vel", 3, "m/s", "velocity"),
-  ("dvel", 3, "m/s", "what the response changed of it"),
 )
 
 # Of the outbox: a node that is near a window's geoms.

@@ -27,6 +27,11 @@ PALPATE double weight_of_stiffness(double h, double damping, double eased) {
   return h * h + h * (damping - taken);
 }
 
+// The contact force that an organ takes over: of the change as much as its response was relaxed to.
+PALPATE D3 relaxed(D3 before, D3 now, double ratio) {
+  return ratio < 1.0 ? before + ratio * (now - before) : now;
+}
+
 PALPATE bool touched(D3 contact) { return contact != D3{0.0, 0.0, 0.0}; }
 
 // What MuJoCo adds to a node's dofs by itself, in the organ's frame: forces along them, and one on
@@ -61,26 +66,21 @@ PALPATE D3 forecast(D3 last, D3 before) { return 2.0 * last - before; }
 // doi:10.1007/s00466-008-0255-5). Impulses that cancel say nothing about what a tool meets, and it
 // meets no more than one node alone has, `heaviest` times.
 struct Secant {
-  double acted = 0.0;  // impulses times the organ's answer
-  double meant = 0.0;  // impulses times what the dofs' inertia makes of them
   double gross = 0.0;  // sizes of the changes of the forces
   double whole = 0.0;  // sizes of the forces
   D3 sum = {0.0, 0.0, 0.0};  // of the changes
 
-  PALPATE void add(D3 impulse, D3 answer, double expected, D3 change, double force) {
-    acted += impulse.x * answer.x;
-    acted += impulse.y * answer.y;
-    acted += impulse.z * answer.z;
-    meant += expected;
+  PALPATE void add(D3 change, double force) {
     sum += change;
     gross += norm(change);
     whole += force;
   }
 
-  PALPATE double heavier(double now, double heaviest) const {
+  // `ratio`: what MuJoCo expected the impulses to do over what they did, see `System`.
+  PALPATE double heavier(double now, double heaviest, double ratio) const {
     if (whole == 0.0) return 1.0;
-    if (!(acted > 0.0) || gross < CHANGE * whole || norm(sum) < COHERENT * gross) return now;
-    const double seen = now * meant / acted;
+    if (gross < CHANGE * whole || norm(sum) < COHERENT * gross) return now;
+    const double seen = now * ratio;
     const double most = FASTER * now < heaviest ? FASTER * now : heaviest;
     return seen < 1.0 ? 1.0 : seen > most ? most : seen;
   }
