@@ -27,9 +27,19 @@ PALPATE double weight_of_stiffness(double h, double damping, double eased) {
   return h * h + h * (damping - taken);
 }
 
-// The contact force that an organ takes over: of the change as much as its response was relaxed to.
+// How much of a change df of the contact forces an organ takes. MuJoCo has solved the contacts with
+// the inertia Mhat. The change is a descent direction of their dual problem, whose curvature along it
+// is df^T A^-1 df; `ratio` is what MuJoCo took it for, df^T Mhat^-1 df, over that. The minimum along df
+// is at `ratio` (exact line search, Nocedal and Wright 2006, eq. 3.55), and below 1/2 the whole change
+// goes past it and up again: contacts chatter. So the organ takes `ratio` there, and the whole of df
+// from 3/4 on. At rest df is 0, and the contact force is exact.
+PALPATE float relaxation(float ratio) {
+  if (ratio < 0.5f) return ratio;
+  return ratio < 0.75f ? 2.0f * ratio - 0.5f : 1.0f;
+}
 PALPATE D3 relaxed(D3 before, D3 now, double ratio) {
-  return ratio < 1.0 ? before + ratio * (now - before) : now;
+  const double part = relaxation((float)ratio);
+  return part < 1.0 ? before + part * (now - before) : now;
 }
 
 PALPATE bool touched(D3 contact) { return contact != D3{0.0, 0.0, 0.0}; }

@@ -10,6 +10,7 @@
 // FIRST and RESPONSE are stages of a step, ENOUGH is the relative residual at which a response is
 // good enough, and BULK and so on are places in `Tissue.number`.
 #pragma once
+#include "formula.h"
 #include "product.h"
 #include "volume.h"
 
@@ -195,16 +196,12 @@ struct Pcg {
     if (bulk != 0.0f) flux += dot(v, ld3(areavec + 24 * s, lane));
   }
 
-  // Takes of a response the part that is best. MuJoCo solved contacts with an inertia of its own, and
-  // the changes of their forces, the impulses b, are a descent direction of the contacts' dual problem,
-  // whose curvature along it is b^T A^-1 b. Where that is more than MuJoCo expected, the whole of b
-  // overshoots and contacts chatter; the exact line search stops at `expected` over it
-  // (Armijo-free, as the problem is quadratic: Nocedal and Wright 2006, eq. 3.55).
+  // Notes what a response made of the impulses, and returns how much of it is taken.
   PALPATE float relax() {
     const float expected = f.state.expected.data[world];
     const float ratio = expected > 0.0f && work > 0.0f ? expected / work : 1.0f;
     if (group.is_first()) f.system.ratio.data[world] = ratio;
-    return ratio;
+    return relaxation(ratio);
   }
 
   // Writes the solution and the world's status.

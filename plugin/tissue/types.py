@@ -209,7 +209,7 @@ class State:
   hold: floats("nworld", "nholdslice", 6, 8)  # what springs in `force_ext` weigh on dv [kg]
   dvel: vector  # change of velocity in this step [m/s]
   dvel_warm: vector  # what those of the last steps lead to, where PCG starts [m/s]
-  expected: floats("nworld")  # twice the energy that MuJoCo gave the impulses of a response [J]
+  expected: floats("nworld")  # b^T Mhat^-1 b, for the impulses b that a response is to [J]
 
 
 @struct
@@ -250,7 +250,7 @@ class System:
   t: vector  # A times z; smoother's direction and residual
   partial: floats("nworld", "nword", 4)  # what the blocks of a world exchange
   status: floats("nworld", 4)  # PCG iterations, relative residual, norm of rhs, 1 if not finite
-  ratio: floats("nworld")  # `State.expected` over what a response gave them, see `relax`
+  ratio: floats("nworld")  # b^T Mhat^-1 b over b^T A^-1 b, see `relaxation`
 
 
 @struct
