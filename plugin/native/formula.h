@@ -37,12 +37,24 @@ PALPATE float relaxation(float ratio) {
   if (ratio < 0.5f) return ratio;
   return ratio < 0.75f ? 2.0f * ratio - 0.5f : 1.0f;
 }
+PALPATE bool touched(D3 contact) { return contact != D3{0.0, 0.0, 0.0}; }
 PALPATE D3 relaxed(D3 before, D3 now, double ratio) {
   const double part = relaxation((float)ratio);
-  return part < 1.0 ? before + part * (now - before) : now;
+  return part < 1.0 && touched(now) ? before + part * (now - before) : now;
 }
 
-PALPATE bool touched(D3 contact) { return contact != D3{0.0, 0.0, 0.0}; }
+// df^T Mhat^-1 df of the impulses by which contact forces changed. Where a contact parts, its force
+// ends at 0 and not at the minimum, which lies farther off: by the share of those that part.
+struct Expected {
+  double whole = 0.0, kept = 0.0;
+
+  PALPATE void add(D3 impulse, double Mhat, D3 now) {
+    const double each = dot(impulse, impulse) / Mhat;
+    whole += each;
+    if (touched(now)) kept += each;
+  }
+  PALPATE float value() const { return kept > 0.0 ? (float)(whole * whole / kept) : 0.0f; }
+};
 
 // What MuJoCo adds to a node's dofs by itself, in the organ's frame: forces along them, and one on
 // their body, `wrench`, in the world's.

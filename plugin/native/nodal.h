@@ -121,17 +121,17 @@ template <class Fields>
 PALPATE void push_nodes(const Fields& f, Thread, int) {
   const double h = f.mj.timestep.data[0];
   bool changed = false;
-  double expected = 0.0;
+  Expected expected;
   for (int i = 0; i < f.nnode; ++i) {
     const int adr = f.dofadr.data[i], own = f.stateadr.data[i];
-    D3 df = {0.0, 0.0, 0.0};
-    if (adr >= 0) df = load(f.mj.qfrc_constraint.data + adr) - load(f.own.force.data + own);
+    D3 df = {0.0, 0.0, 0.0}, now = df;
+    if (adr >= 0) now = load(f.mj.qfrc_constraint.data + adr), df = now - load(f.own.force.data + own);
     store_lane(f.solve.rhs.data + offset_of(i), h * df);
     if (!touched(df)) continue;
     changed = true;
-    expected += h * h * dot(df, df) / (heavier(f, own) * inertia(f, i, adr, 0));
+    expected.add(h * df, heavier(f, own) * inertia(f, i, adr, 0), now);
   }
-  f.solve.expected.data[0] = (float)expected;
+  f.solve.expected.data[0] = expected.value();
   f.flags.data[FLAG_CHANGED] = changed;
 }
 

@@ -253,14 +253,15 @@ PALPATE void take(const Fields& f, Thread t, int) {
     store_lane(f.solve.rhs.data + at_node(f, t.world, i), (double)f.h * change);
   });
   if (t.tid > 0 || !f.stiff) return;
-  double expected = 0.0;
+  Expected expected;
   for (int k = 0; k < f.nslot; ++k) {
     const int i = f.slot_node.data[t.world * f.nslot + k];
     if (i < 0) continue;
-    const D3 df = contact_now(f, t.world, k, i) - load_floats(f.force.data + 3 * in_row(f, t.world, i));
-    expected += f.h * f.h * dot(df, df) / (f.slot_mass + f.dof_armature.data[slot_dof(f, t.world, k)]);
+    const D3 now = contact_now(f, t.world, k, i);
+    const D3 df = now - load_floats(f.force.data + 3 * in_row(f, t.world, i));
+    expected.add((double)f.h * df, f.slot_mass + f.dof_armature.data[slot_dof(f, t.world, k)], now);
   }
-  f.solve.expected.data[t.world] = (float)expected;
+  f.solve.expected.data[t.world] = expected.value();
 }
 
 // Follows the organ's answer with the contact forces, and with the inertia that tools meet.
