@@ -212,6 +212,7 @@ BAD = {
   "twice": ("time [s],t [s],force [N]", "is a second time"),
   "word": ("time [s],depth [mm],force [N]\n0,0,none", "line 2: force is 'none', expected a finite"),
   "few": ("time [s],depth [mm],force [N]\n0,0,0", "1 rows, expected at least 10"),
+  "long": (f"time [s],depth [mm],force [N]\n0,0,{'1' * 200_000}", "cannot be read: field larger"),
   "short": ("time [s],depth [mm],force [N]\n0,0", "line 2: force is '', expected"),
 }
 
