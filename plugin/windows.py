@@ -12,6 +12,7 @@ from collections.abc import Iterator, Sequence
 import mujoco
 import numpy as np
 
+from .engine import flexes
 from .engine import plugin as engine
 from .engine.layout import MAX_GEOMS
 
@@ -71,7 +72,7 @@ def add_windows(
   keys = _take_keys(spec)
   surface = _make_rigid(spec, flex, own, plugin, config) if nodal else bodies[flex.vertbody[0]]
   _fill(spec, flex, surface, names, followed, nodes, meets, config)
-  _warn_of_others(organ, colliding, groups)
+  _warn_of_others(organ, colliding, groups, config.get("support", "").split())
   config["window"] = " ".join(names)
   if groups:
     config["follow"] = ", ".join(
@@ -330,16 +331,29 @@ def make_flex(spec, name: str, points: np.ndarray, bodies: list[str], elem: np.n
   )
 
 
-def _warn_of_others(organ: str, colliding: list, groups: list[set[str]]):
-  """Warns of geoms that the organ would collide with and that no window follows."""
-  followed = set().union(*groups)
-  for geom in colliding:
-    if followed.isdisjoint(_ancestors(geom)) and (groups or not _moves(geom)):
-      warnings.warn(
-        f"organ {organ!r}: no window follows geom {geom.name or geom.type!r} of body "
-        f"{geom.parent.name!r}, which it can touch; name the body in tools, or use nodal coupling",
-        stacklevel=3,
-      )
+def _warn_of_others(organ: str, colliding: list, groups: list[set[str]], support: list[str]):
+  """Warns of geoms that the organ would collide with, that no window follows and do not bear it."""
+  followed, names = set().union(*groups), [geom.name for geom in colliding]
+  bearing = {flexes.resolve(each, organ, names) for each in support}
+  alone = [
+    _label(geom)
+    for geom in colliding
+    if followed.isdisjoint(_ancestors(geom)) and (groups or not _moves(geom))
+    if geom.name not in bearing
+  ]
+  if alone:
+    warnings.warn(
+      f"organ {organ!r}: it can touch what no window follows: {', '.join(alone)}; name their "
+      "bodies in tools or the geoms in support, or use nodal coupling",
+      stacklevel=3,
+    )
+
+
+def _label(geom) -> str:
+  """Returns a geom's name or kind, and its body."""
+  kind = mujoco.mjtGeom(geom.type).name.removeprefix("mjGEOM_").lower()
+  what = f"geom {geom.name!r}" if geom.name else f"a {kind}"
+  return f"{what} of body {geom.parent.name!r}"
 
 
 def _layout(spec) -> list[tuple[tuple[str, int], tuple[int, int]]]:

@@ -237,6 +237,16 @@ def test_a_table_that_nobody_follows_is_pointed_out():
     palpate.add_windows(spec(extra=table), "organ")
 
 
+def test_what_no_window_follows_is_listed_once_and_in_words():
+  arm = "".join(f'<geom type="capsule" size=".01 .05" pos="0 0 {k}"/>' for k in (1, 2))
+  extra = f'<body name="arm" pos="0 0 3">{arm}<geom name="tip" size=".01"/></body>'
+  with pytest.warns(UserWarning) as said:
+    made = mujoco.MjSpec.from_string(scenes.ridge(extra=extra))
+    palpate.add_windows(made, "organ", ["grasper"])
+  (text,) = [str(each.message) for each in said if "no window follows" in str(each.message)]
+  assert text.count("a capsule of body 'arm'") == 2 and "geom 'tip' of body 'arm'" in text
+
+
 def test_the_motion_of_a_keyframe_that_windows_leave_out_is_pointed_out():
   made = spec()
   m = made.compile()
