@@ -230,6 +230,11 @@ class Config:
   )
 
   @property
+  def held(self) -> bool:
+    """Whether something holds the organ in place, so that it does not fall."""
+    return any(getattr(self, key) for key in holders(self.carrier))
+
+  @property
   def bonded(self) -> bool:
     """Whether there are bonds, or room for some."""
     return self.bonds is not None
@@ -250,6 +255,12 @@ def table() -> str:
     cells = [f"`{key}`", row.meaning, row.unit, row.allowed.replace("'", "`"), _default(key)]
     lines.append(f"| {' | '.join(cells)} | {'may change' if row.change else '-'} |")
   return "\n".join(lines) + "\n"
+
+
+def holders(carrier: str) -> tuple[str, ...]:
+  """Returns the keys that hold an organ in place; its own rigid motion, as `carrier`, does not."""
+  keys = ("pin", "attach", "bonds", "support")
+  return keys if carrier == OWN else (*keys, "foundation", "carrier")
 
 
 def _default(key: str) -> str:
