@@ -21,6 +21,7 @@ from .documents import (
   world,
 )
 from .numbers import bodies, dofs, lump, masses, qposs, slot_bodies, slots, workspace
+from .resting import LYING, PRESSED, block, resting, watch
 from .running import (
   Warnings,
   adrift,
