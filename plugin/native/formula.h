@@ -44,16 +44,19 @@ PALPATE D3 relaxed(D3 before, D3 now, double ratio) {
 }
 
 // df^T Mhat^-1 df of the impulses by which contact forces changed. Where a contact parts, its force
-// ends at 0 and not at the minimum, which lies farther off: by the share of those that part.
+// ends at 0 and not at the minimum, which lies farther off: by the share of the force that is gone.
 struct Expected {
-  double whole = 0.0, kept = 0.0;
+  double sum = 0.0, before = 0.0, kept = 0.0;
 
-  PALPATE void add(D3 impulse, double Mhat, D3 now) {
-    const double each = dot(impulse, impulse) / Mhat;
-    whole += each;
-    if (touched(now)) kept += each;
+  PALPATE void add(D3 impulse, double Mhat, D3 was, D3 now) {
+    sum += dot(impulse, impulse) / Mhat;
+    before += norm(was);
+    if (touched(now)) kept += norm(was);
   }
-  PALPATE float value() const { return kept > 0.0 ? (float)(whole * whole / kept) : 0.0f; }
+  PALPATE float value() const {
+    if (before == 0.0) return (float)sum;
+    return kept > 0.0 ? (float)(sum * before / kept) : 0.0f;  // none where all is gone
+  }
 };
 
 // What MuJoCo adds to a node's dofs by itself, in the organ's frame: forces along them, and one on

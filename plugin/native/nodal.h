@@ -124,12 +124,14 @@ PALPATE void push_nodes(const Fields& f, Thread, int) {
   Expected expected;
   for (int i = 0; i < f.nnode; ++i) {
     const int adr = f.dofadr.data[i], own = f.stateadr.data[i];
-    D3 df = {0.0, 0.0, 0.0}, now = df;
-    if (adr >= 0) now = load(f.mj.qfrc_constraint.data + adr), df = now - load(f.own.force.data + own);
-    store_lane(f.solve.rhs.data + offset_of(i), h * df);
-    if (!touched(df)) continue;
-    changed = true;
-    expected.add(h * df, heavier(f, own) * inertia(f, i, adr, 0), now);
+    store_lane(f.solve.rhs.data + offset_of(i), {0.0, 0.0, 0.0});
+    if (adr < 0) continue;
+    const D3 was = load(f.own.force.data + own), now = load(f.mj.qfrc_constraint.data + adr);
+    if (!touched(was) && !touched(now)) continue;
+    const D3 impulse = h * (now - was);
+    store_lane(f.solve.rhs.data + offset_of(i), impulse);
+    changed = changed || touched(impulse);
+    expected.add(impulse, heavier(f, own) * inertia(f, i, adr, 0), was, now);
   }
   f.solve.expected.data[0] = expected.value();
   f.flags.data[FLAG_CHANGED] = changed;

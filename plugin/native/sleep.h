@@ -89,7 +89,7 @@ PALPATE bool take_contacts(const Fields& f) {
     store(f.own.force.data + 3 * k, now);
     const D3 impulse = h * (now - before);
     store(pushed(f, k) + PUSHED_FORCE, impulse);
-    expected.add(impulse, f.mj.M.data[f.massadr.data[3 * k]], now);
+    expected.add(impulse, f.mj.M.data[f.massadr.data[3 * k]], before, now);
     if (now != before) f.flags.data[FLAG_CHANGED] = 1;
     moved(f, k)[MOVED_NODE] = i;
     if (i < 0) continue;

@@ -258,8 +258,9 @@ PALPATE void take(const Fields& f, Thread t, int) {
     const int i = f.slot_node.data[t.world * f.nslot + k];
     if (i < 0) continue;
     const D3 now = contact_now(f, t.world, k, i);
-    const D3 df = now - load_floats(f.force.data + 3 * in_row(f, t.world, i));
-    expected.add((double)f.h * df, f.slot_mass + f.dof_armature.data[slot_dof(f, t.world, k)], now);
+    const D3 was = load_floats(f.force.data + 3 * in_row(f, t.world, i));
+    const double Mhat = f.slot_mass + f.dof_armature.data[slot_dof(f, t.world, k)];
+    expected.add((double)f.h * (now - was), Mhat, was, now);
   }
   f.solve.expected.data[t.world] = expected.value();
 }
