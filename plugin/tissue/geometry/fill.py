@@ -123,14 +123,15 @@ def quality(point: np.ndarray, tet: np.ndarray) -> np.ndarray:
 def inside(mesh: Mesh, values: np.ndarray) -> np.ndarray:
   """Returns vectors of the surface's vertices, (nouter, 3), with those inside, (nvert, 3).
 
-  A vertex inside has the mean of those around it.
+  A vertex inside has the mean of those around it, one that waits for a cut or is no more has 0.
   """
   n = mesh.nouter
   if not len(mesh.tet):  # what else there is waits for cuts
     return np.concatenate([values, np.zeros((mesh.nvert - n, 3))])
   start, k = np.nonzero(mesh.ring >= 0)
   ones = np.ones(len(start))
-  share = sparse.csr_array((ones / mesh.degree[start], (start, mesh.ring[start, k])))
+  place, size = (start, mesh.ring[start, k]), (mesh.nvert, mesh.nvert)
+  share = sparse.csr_array((ones / mesh.degree[start], place), shape=size)
   below = share[n:]
   matrix = sparse.eye_array(mesh.nvert - n) - below[:, n:]
   within = linalg.spsolve(sparse.csc_array(matrix), below[:, :n] @ values)
