@@ -278,8 +278,8 @@ def test_a_tool_that_flies_through_the_organ_is_named(scenes, windowed):
 def test_a_thin_box_pressed_through_beside_its_centre_is_named(scenes, size):
   made = scenes.windowed(*scenes.sphere(2), mass=0.5, radius=0.001, young=5e3, foundation=2e5)
   tool = f"""<body name="bar" pos="0 {scenes.RADIUS + 0.005} {scenes.RADIUS}">
-    <joint name="z" type="slide" axis="0 0 1"/><geom name="thin" type="box" size="{size}" mass="0.1"/>
-    </body>"""
+    <joint name="z" type="slide" axis="0 0 1"/>
+    <geom name="thin" type="box" size="{size}" mass="0.1"/></body>"""
   drive = '<actuator><position joint="z" kp="5000" kv="60"/></actuator>'
   model, data, organ = scenes.load(scenes.world(tool, made, extra=drive))
   for _ in range(600):

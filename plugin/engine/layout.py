@@ -169,7 +169,7 @@ BLADE = Numbers(
   ("toward", 3, "-", "which way it cut last, 0 before"),
   ("work", 1, "J", "what it has spent"),
   ("opened", 1, "m", "what it has cut"),
-  ("wait", 1, "m", "how far it goes before the mesh comes apart"),
+  ("wait", 1, "m", "how far it goes before the mesh comes apart; 0 as usual, < 0 at an edge"),
   ("count", 1, "-", "points of `trail`"),
   ("trail", 3 * TRAIL, "m", "its path since the mesh came apart"),
   ("below", TRAIL, "m", "how deep it was there in a solid"),

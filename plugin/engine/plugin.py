@@ -217,7 +217,8 @@ def _visualize(model: int, data: int, option: int, scene: int, instance: int):
   try:
     if w.cuts:
       w.cuts.follow()
-      w.cuts.show()
+      with w.cuts.lock:
+        w.cuts.show()
     if w.organ.windows:
       windowed.draw(w, model, data)
     if w.cuts:

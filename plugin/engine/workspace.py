@@ -182,8 +182,8 @@ class Workspace:
   def _run_cut(self, changed: bool):
     """Runs an organ that may be cut: the model's triangles must be its own."""
     with self.cuts.lock:
-      if self.flags[FLAG.stage] < STAGE.gathered and (changed or not self.cuts.shown):
-        self.cuts.show()
+      others = self.cuts.show()
+      if self.flags[FLAG.stage] < STAGE.gathered and (changed or others):
         windowed.find_contacts_again(self)
       self._run()
 

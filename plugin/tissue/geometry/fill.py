@@ -65,6 +65,12 @@ def fill(organ: str, mesh: Mesh) -> Mesh:
       f"{mesh.elem[missing].tolist()}) cannot be the face of a tetrahedron; expected a surface of "
       "even triangles that does not cut itself: `palpate wrap` makes one"
     )
+  if not len(tet):
+    raise ValueError(
+      f"organ {organ!r}: elements is 'solid', and some of its tetrahedra would be flat; expected a "
+      "surface without patches of many vertices in one plane, as `refine` makes them: `palpate "
+      "wrap` makes an even one"
+    )
   bare = np.setdiff1d(np.arange(mesh.nvert), tet)
   if bare.size:
     raise ValueError(
@@ -123,14 +129,15 @@ def quality(point: np.ndarray, tet: np.ndarray) -> np.ndarray:
 def inside(mesh: Mesh, values: np.ndarray) -> np.ndarray:
   """Returns vectors of the surface's vertices, (nouter, 3), with those inside, (nvert, 3).
 
-  A vertex inside has the mean of those around it.
+  A vertex inside has the mean of those around it, one that waits for a cut or is no more has 0.
   """
   n = mesh.nouter
   if not len(mesh.tet):  # what else there is waits for cuts
     return np.concatenate([values, np.zeros((mesh.nvert - n, 3))])
   start, k = np.nonzero(mesh.ring >= 0)
   ones = np.ones(len(start))
-  share = sparse.csr_array((ones / mesh.degree[start], (start, mesh.ring[start, k])))
+  place, size = (start, mesh.ring[start, k]), (mesh.nvert, mesh.nvert)
+  share = sparse.csr_array((ones / mesh.degree[start], place), shape=size)
   below = share[n:]
   matrix = sparse.eye_array(mesh.nvert - n) - below[:, n:]
   within = linalg.spsolve(sparse.csc_array(matrix), below[:, :n] @ values)
@@ -149,11 +156,12 @@ def _fill(rest: bytes, elem: bytes) -> tuple[bytes, np.ndarray, int]:
   file = pathlib.Path(wp.config.kernel_cache_dir) / f"fill_{digest}.npz"
   try:
     with np.load(file, allow_pickle=False) as kept:
-      return kept["inner"].tobytes(), kept["tet"], -1
+      if len(kept["tet"]):
+        return kept["inner"].tobytes(), kept["tet"], -1
   except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
     pass
   inner, tet, faulty = _make(rest, elem)
-  if faulty < 0:
+  if len(tet):
     _keep(file, inner=np.frombuffer(inner), tet=tet)
   return inner, tet, faulty
 
