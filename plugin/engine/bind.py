@@ -133,6 +133,7 @@ def _touched(w, model: int) -> weights.Weights:
 
   With all of them, since one that looks for contacts again has those of the others found again.
   """
+  weights.put_tissue(model, w.data, w.organ, w.config)
   out = weights.make(model, w.data, declare_windows.touching(model, w.instance), w.flags)
   w.views["mine"] = out.mine
   return out

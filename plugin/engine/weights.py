@@ -16,7 +16,7 @@ from palpate.tissue.kernels import kernel
 from palpate.tissue.types import Array, doubles, ints, struct
 
 from . import apart, coupling, mjstruct
-from .layout import FLAG
+from .layout import FLAG, Numbers
 
 _DATA = (
   *("contact", "ncon", "nefc", "nisland", "efc_type", "efc_J", "efc_J_rownnz", "efc_J_rowadr"),
@@ -24,8 +24,18 @@ _DATA = (
   *("map_efc2iefc", "iefc_R", "iefc_D"),
 )
 _CONTACT = (
-  *("dist", "pos", "friction", "dim", "geom", "flex", "elem", "vert", "exclude", "efc_address"),
+  *("dist", "pos", "friction", "mu", "dim", "geom", "flex", "elem", "vert", "exclude", "efc_address"),
 )
+# What an organ's contacts follow, of each flex.
+TISSUE = Numbers(
+  "TISSUE",
+  ("modulus", 1, "Pa", "young / (1 - poisson^2) of a solid"),
+  ("skin", 1, "N/m", "of the skin: stretch, and bending on a foundation"),
+  ("foundation", 1, "Pa/m", ""),
+  ("edge", 1, "m", "mean length of edges at rest"),
+)
+_tissue: dict[int, np.ndarray] = {}  # of the flexes of an mjData, by its address
+FIRM, STICK = 0.03, 100.0
 _SPARSE_FROM = 60  # dofs from which MuJoCo's rows are sparse where it may choose
 
 
@@ -38,6 +48,9 @@ class Weights:
   memory: Array(wp.uint64, ("nword",))  # the mjData itself
   mine: ints("nflex")  # whether a flex is an organ's, or a window of one
   flags: ints(len(FLAG))  # see FLAG
+  firm: wp.float64  # of a contact, most of its tissue's compliance
+  stick: wp.float64  # least times that friction is firmer
+  tissue: doubles("nflex", len(TISSUE))  # see TISSUE
   # mjOption:
   jacobian: ints(1)
   solver: ints(1)
@@ -67,6 +80,7 @@ weigh = kernel(
   "weights.h",
   Weights,
   coupling.CONSTANTS
+  | TISSUE.constants()
   | _offsets("DATA", mjstruct.Data, _DATA)
   | _offsets("CONTACT", mjstruct.Contact, _CONTACT)
   | {
@@ -118,11 +132,38 @@ def make(model: int, data: int, flexes, flags: np.ndarray | None = None) -> Weig
   out = coupling.mujoco_arrays(model, data, Weights)
   out.nv = mjstruct.Model.from_address(model).nv
   out.wrong = are_wrong()
+  out.firm, out.stick = FIRM, STICK
+  out.tissue = wp.array(_tissues(data, len(mine)), dtype=wp.float64, device="cpu", copy=False)
   out.memory = coupling.wrap(data, mjstruct.size(mjstruct.Data) // 8, wp.uint64)
   out.mine = wp.array(mine, dtype=int, device="cpu")
   flags = np.zeros(len(FLAG), np.int32) if flags is None else flags
   out.flags = wp.array(flags, dtype=int, device="cpu", copy=False)
   return out
+
+
+def _tissues(data: int, nflex: int) -> np.ndarray:
+  """Returns TISSUE of the flexes of an mjData, which its organs fill, (nflex, n)."""
+  found = _tissue.get(data)
+  if found is None or len(found) != nflex:
+    found = _tissue[data] = np.zeros((nflex, len(TISSUE)))
+  return found
+
+
+def put_tissue(model: int, data: int, organ, config):
+  """Tells contacts with an organ what its tissue is made of."""
+  found = _tissues(data, mjstruct.Model.from_address(model).nflex)
+  young, plane = float(np.max(config.young)), 1 - config.poisson**2
+  corner = organ.mesh.rest[organ.mesh.elem]
+  solid = config.elements == "solid"
+  skin = float(np.max(config.capsule_young, initial=0.0)) if solid else young
+  rigidity = config.bend * skin * config.thickness**3 / (12 * plane)
+  stretch = config.stiffness if config.elements == "spring" else skin * config.thickness / plane
+  row = np.zeros(len(TISSUE))
+  row[TISSUE.modulus] = solid * young / plane
+  row[TISSUE.skin] = stretch + 8 * np.sqrt(rigidity * config.foundation)
+  row[TISSUE.foundation] = config.foundation
+  row[TISSUE.edge] = np.linalg.norm(corner - corner[:, [1, 2, 0]], axis=2).mean()
+  found[organ.windows.flex if organ.windows else [organ.flex]] = row
 
 
 def launch(weights):

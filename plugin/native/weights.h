@@ -98,6 +98,42 @@ PALPATE void scale_impedance(const Fields& f, Rows rows, double gain) {
   }
 }
 
+// How far the tissue of one side of a contact yields to a unit force [m/N]: an elastic half space, a
+// membrane with bending and a foundation, under a patch as wide as the edges of what is touched.
+template <class Fields>
+PALPATE double yielding(const Fields& f, const char* contact, int side) {
+  const int flex = side_of(contact, CONTACT_FLEX, side), elem = side_of(contact, CONTACT_ELEM, side);
+  if (flex < 0 || !f.mine.data[flex]) return 0.0;
+  const double* tissue = f.tissue.data + TISSUE_LENGTH * flex;
+  double edge = tissue[TISSUE_EDGE];
+  if (elem >= 0) {
+    const int* e = f.flex_elem.data + f.flex_elemdataadr.data[flex] + 3 * elem;
+    const double* x = f.flexvert_xpos.data + 3 * f.flex_vertadr.data[flex];
+    const D3 a = load(x + 3 * e[0]), b = load(x + 3 * e[1]), c = load(x + 3 * e[2]);
+    edge = (norm(b - a) + norm(c - b) + norm(a - c)) / 3.0;
+  }
+  const double within = tissue[TISSUE_MODULUS] * edge, below = tissue[TISSUE_FOUNDATION] * edge * edge;
+  return 1.0 / (within + tissue[TISSUE_SKIN] + below);
+}
+
+// Makes a contact as firm as its tissue asks for, if it is softer, whatever the nodes weigh: f = gap /
+// compliance at rest, with R = compliance times stiffness. Friction holds STICK times firmer: what
+// sticks creeps at a speed in proportion to R (MuJoCo, Computation, Friction). Done twice it does
+// nothing.
+template <class Fields>
+PALPATE void firm_up(const Fields& f, char* contact, Rows rows) {
+  if (!rows.count) return;
+  const double* row = datum<double*>(f, DATA_EFC_KBIP) + 4 * rows.first;
+  const double yields = yielding(f, contact, 0) + yielding(f, contact, 1);
+  const double* R = datum<double*>(f, DATA_EFC_R) + rows.first;
+  const double most = row[0] * row[2] * f.firm * yields * (rows.paired ? rows.count : 1);
+  if (most > 0.0 && R[0] > most) scale_impedance(f, rows, most / R[0]);
+  if (rows.paired || rows.count < 2 || !(R[1] * f.stick > R[0])) return;
+  const double gain = R[0] / (f.stick * R[1]);
+  scale_impedance(f, {rows.first + 1, rows.count - 1, false}, gain);
+  *(double*)(contact + CONTACT_MU) *= sqrt(gain);
+}
+
 // Gives the corners of the triangle on one side of a contact their weights.
 template <class Fields>
 PALPATE bool weigh_side(const Fields& f, char* contact, Rows rows, int side) {
@@ -199,6 +235,7 @@ PALPATE void weigh(const Fields& f, Thread, int) {
     const Rows rows = is_mine(f, contact) ? rows_of(f, contact) : Rows{0, 0, false};
     for (int side = 0; side < 2 && rows.count && f.wrong; ++side)
       changed = weigh_side(f, contact, rows, side) || changed;
+    firm_up(f, contact, rows);
     keep_closed(f, contact, rows);
   }
   const bool projects = f.solver.data[0] == SOLVER_PGS || f.noslip_iterations.data[0] > 0 ||
