@@ -35,7 +35,6 @@ TISSUE = Numbers(
   ("edge", 1, "m", "mean length of edges at rest"),
 )
 _tissue: dict[int, np.ndarray] = {}  # of the flexes of an mjData, by its address
-FIRM, STICK = 0.03, 100.0
 _SPARSE_FROM = 60  # dofs from which MuJoCo's rows are sparse where it may choose
 
 
@@ -48,8 +47,6 @@ class Weights:
   memory: Array(wp.uint64, ("nword",))  # the mjData itself
   mine: ints("nflex")  # whether a flex is an organ's, or a window of one
   flags: ints(len(FLAG))  # see FLAG
-  firm: wp.float64  # of a contact, most of its tissue's compliance
-  stick: wp.float64  # least times that friction is firmer
   tissue: doubles("nflex", len(TISSUE))  # see TISSUE
   # mjOption:
   jacobian: ints(1)
@@ -132,7 +129,6 @@ def make(model: int, data: int, flexes, flags: np.ndarray | None = None) -> Weig
   out = coupling.mujoco_arrays(model, data, Weights)
   out.nv = mjstruct.Model.from_address(model).nv
   out.wrong = are_wrong()
-  out.firm, out.stick = FIRM, STICK
   out.tissue = wp.array(_tissues(data, len(mine)), dtype=wp.float64, device="cpu", copy=False)
   out.memory = coupling.wrap(data, mjstruct.size(mjstruct.Data) // 8, wp.uint64)
   out.mine = wp.array(mine, dtype=int, device="cpu")

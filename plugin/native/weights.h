@@ -10,6 +10,9 @@
 
 namespace palpate {
 
+// Of a contact, most of its tissue's compliance, and how many times firmer friction is at least.
+constexpr double FIRM = 0.03, STICK = 100.0;
+
 // A field of mjData: those in its arena are elsewhere in each step.
 template <class T, class Fields>
 PALPATE T& datum(const Fields& f, int offset) {
@@ -116,20 +119,20 @@ PALPATE double yielding(const Fields& f, const char* contact, int side) {
   return 1.0 / (within + tissue[TISSUE_SKIN] + below);
 }
 
-// Makes a contact as firm as its tissue asks for, if it is softer, whatever the nodes weigh: f = gap /
-// compliance at rest, with R = compliance times stiffness. Friction holds STICK times firmer: what
-// sticks creeps at a speed in proportion to R (MuJoCo, Computation, Friction). Done twice it does
-// nothing.
+// Makes a contact as firm as its tissue asks for, whatever its nodes weigh, if it is softer: at rest its
+// force is gap / compliance with R = compliance * stiffness, of which the rows of a pyramid have a part
+// each. Friction is STICK times firmer, since what sticks creeps at a speed in proportion to its R; in
+// a pyramid it has no R of its own (MuJoCo, Computation, Constraint model). Done twice it does nothing.
 template <class Fields>
 PALPATE void firm_up(const Fields& f, char* contact, Rows rows) {
   if (!rows.count) return;
   const double* row = datum<double*>(f, DATA_EFC_KBIP) + 4 * rows.first;
-  const double yields = yielding(f, contact, 0) + yielding(f, contact, 1);
   const double* R = datum<double*>(f, DATA_EFC_R) + rows.first;
-  const double most = row[0] * row[2] * f.firm * yields * (rows.paired ? rows.count : 1);
+  const double compliance = FIRM * (yielding(f, contact, 0) + yielding(f, contact, 1));
+  const double most = row[0] * row[2] * compliance * (rows.paired ? rows.count : 1);
   if (most > 0.0 && R[0] > most) scale_impedance(f, rows, most / R[0]);
-  if (rows.paired || rows.count < 2 || !(R[1] * f.stick > R[0])) return;
-  const double gain = R[0] / (f.stick * R[1]);
+  if (rows.paired || rows.count == 1 || !(STICK * R[1] > R[0])) return;
+  const double gain = R[0] / (STICK * R[1]);
   scale_impedance(f, {rows.first + 1, rows.count - 1, false}, gain);
   *(double*)(contact + CONTACT_MU) *= sqrt(gain);
 }
