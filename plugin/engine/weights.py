@@ -24,7 +24,7 @@ _DATA = (
   *("map_efc2iefc", "iefc_R", "iefc_D"),
 )
 _CONTACT = (
-  *("dist", "pos", "friction", "mu", "dim", "geom", "flex", "elem", "vert", "exclude", "efc_address"),
+  *("dist", "pos", "frame", "friction", "mu", "dim", "geom", "flex", "elem", "vert", "exclude", "efc_address"),
 )
 # What an organ's contacts follow, of each flex.
 TISSUE = Numbers(
@@ -34,7 +34,7 @@ TISSUE = Numbers(
   ("foundation", 1, "Pa/m", ""),
   ("edge", 1, "m", "mean length of edges at rest"),
 )
-_tissue: dict[int, np.ndarray] = {}  # of the flexes of an mjData, by its address
+_tissue: dict[int, tuple] = {}  # by the address of an mjData, see `_tissues`
 _SPARSE_FROM = 60  # dofs from which MuJoCo's rows are sparse where it may choose
 
 
@@ -45,9 +45,10 @@ class Weights:
   nv: int  # dofs of the model
   wrong: int  # whether MuJoCo's weights are
   memory: Array(wp.uint64, ("nword",))  # the mjData itself
-  mine: ints("nflex")  # whether a flex is an organ's, or a window of one
+  mine: ints("nflex")  # 1 where a flex is an organ's, or a window of one; 2 where of the own one
   flags: ints(len(FLAG))  # see FLAG
   tissue: doubles("nflex", len(TISSUE))  # see TISSUE
+  force_adr: ints("nflexvert")  # where the plugin state has a vertex' contact force, or -1
   # mjOption:
   jacobian: ints(1)
   solver: ints(1)
@@ -58,6 +59,9 @@ class Weights:
   body_dofnum: ints("nbody")
   body_invweight0: doubles("nbody", 2)
   geom_bodyid: ints("ngeom")
+  geom_type: ints("ngeom")
+  geom_size: doubles("ngeom", 3)
+  flex_radius: doubles("nflex")
   flex_dim: ints("nflex")
   flex_vertadr: ints("nflex")
   flex_vertbodyid: ints("nflexvert")
@@ -66,6 +70,9 @@ class Weights:
   # mjData:
   qvel: doubles("nv")
   flexvert_xpos: doubles("nflexvert", 3)
+  geom_xpos: doubles("ngeom", 3)
+  geom_xmat: doubles("ngeom", 9)
+  plugin_state: doubles("npluginstate")
 
 
 def _offsets(prefix: str, kind, names) -> dict[str, int]:
@@ -129,7 +136,9 @@ def make(model: int, data: int, flexes, flags: np.ndarray | None = None) -> Weig
   out = coupling.mujoco_arrays(model, data, Weights)
   out.nv = mjstruct.Model.from_address(model).nv
   out.wrong = are_wrong()
-  out.tissue = wp.array(_tissues(data, len(mine)), dtype=wp.float64, device="cpu", copy=False)
+  tissue, adr = _tissues(model, data)
+  out.tissue = wp.array(tissue, dtype=wp.float64, device="cpu", copy=False)
+  out.force_adr = wp.array(adr, dtype=int, device="cpu", copy=False)
   out.memory = coupling.wrap(data, mjstruct.size(mjstruct.Data) // 8, wp.uint64)
   out.mine = wp.array(mine, dtype=int, device="cpu")
   flags = np.zeros(len(FLAG), np.int32) if flags is None else flags
@@ -137,17 +146,31 @@ def make(model: int, data: int, flexes, flags: np.ndarray | None = None) -> Weig
   return out
 
 
-def _tissues(data: int, nflex: int) -> np.ndarray:
-  """Returns TISSUE of the flexes of an mjData, which its organs fill, (nflex, n)."""
+def _tissues(model: int, data: int) -> tuple[np.ndarray, np.ndarray]:
+  """Returns what the organs of an mjData tell of its flexes and their vertices."""
+  m = mjstruct.Model.from_address(model)
   found = _tissue.get(data)
-  if found is None or len(found) != nflex:
-    found = _tissue[data] = np.zeros((nflex, len(TISSUE)))
+  if found is None or (len(found[0]), len(found[1])) != (m.nflex, m.nflexvert):
+    found = np.zeros((m.nflex, len(TISSUE))), np.full(m.nflexvert, -1, np.int32)
+    _tissue[data] = found
   return found
 
 
-def put_tissue(model: int, data: int, organ, config):
-  """Tells contacts with an organ what its tissue is made of."""
-  found = _tissues(data, mjstruct.Model.from_address(model).nflex)
+def put_tissue(model: int, data: int, instance: int, organ, config):
+  """Tells contacts with an organ what its tissue is made of, and where its contact forces are."""
+  m = mjstruct.Model.from_address(model)
+  found, adr = _tissues(model, data)
+  start = int(mjstruct.view(m.plugin_stateadr, m.nplugin, np.int32)[instance])
+  start += coupling.spans(organ)["force"].start
+  first = mjstruct.view(m.flex_vertadr, m.nflex, np.int32)
+  if organ.windows:
+    for k, flex in enumerate(organ.windows.flex):
+      slot = np.arange(*organ.windows.adr[k : k + 2])
+      adr[first[flex] + slot - slot[0]] = start + 3 * slot
+  else:
+    n = coupling.outer(organ)
+    own = organ.dofadr[:n] >= 0
+    adr[first[organ.flex] : first[organ.flex] + n] = np.where(own, start + organ.stateadr[:n], -1)
   young, plane = float(np.max(config.young)), 1 - config.poisson**2
   corner = organ.mesh.rest[organ.mesh.elem]
   solid = config.elements == "solid"
