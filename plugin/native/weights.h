@@ -23,6 +23,9 @@ constexpr double SELF = 1.75;
 // Edges that a tool's radius has at least, else it is told that the mesh is too coarse.
 constexpr double COARSE = 0.25;
 
+// Most that a tool sinks in, in radii.
+constexpr double DEEPEST = 0.5;
+
 constexpr double PI = 3.14159265358979;
 
 // A field of mjData: those in its arena are elsewhere in each step.
@@ -177,11 +180,8 @@ struct Dent {
     return true;
   }
 
-  // The mean square of the contacts' distances from the axis of the dent.
-  PALPATE double spread() const {
-    const double along = dot(way, normal);
-    return square / gaps - along * along / (gaps * gaps * dot(normal, normal));
-  }
+  // The mean square of the contacts' distances from the middle of the dent.
+  PALPATE double spread() const { return square / gaps - dot(way, way) / (gaps * gaps); }
 };
 
 // Looks at the dent of a tool; returns whether it is one of few nodes.
@@ -251,7 +251,8 @@ PALPATE double unresolved(const Fields& f, const char* contacts, int ncon, Touch
     const double* R = f.geom_xmat.data + 9 * touch.geom;
     if (fabs(dot(D3{R[2], R[5], R[8]}, dent.normal)) < 0.95 * norm(dent.normal)) return 0.0;
   }
-  const double lacks = yields - work / (modulus * total * total);
+  double lacks = yields - work / (modulus * total * total);
+  if (lacks * total > DEEPEST * radius) lacks = DEEPEST * radius / total;  // or a needle falls through
   return lacks > 0.0 ? lacks * dent.gaps / dent.deepest : 0.0;  // contacts in parallel
 }
 
