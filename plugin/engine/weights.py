@@ -24,7 +24,8 @@ _DATA = (
   *("map_efc2iefc", "iefc_R", "iefc_D"),
 )
 _CONTACT = (
-  *("dist", "pos", "frame", "friction", "mu", "dim", "geom", "flex", "elem", "vert", "exclude", "efc_address"),
+  *("dist", "pos", "frame", "friction", "mu", "dim", "geom", "flex", "elem", "vert", "exclude"),
+  "efc_address",
 )
 # What an organ's contacts follow, of each flex.
 TISSUE = Numbers(
@@ -35,6 +36,7 @@ TISSUE = Numbers(
   ("edge", 1, "m", "mean length of edges at rest"),
 )
 _tissue: dict[int, tuple] = {}  # by the address of an mjData, see `_tissues`
+FIRM = 0.03  # of a contact, most of its tissue's compliance
 _SPARSE_FROM = 60  # dofs from which MuJoCo's rows are sparse where it may choose
 
 
@@ -88,6 +90,7 @@ weigh = kernel(
   | _offsets("DATA", mjstruct.Data, _DATA)
   | _offsets("CONTACT", mjstruct.Contact, _CONTACT)
   | {
+    "FIRM": FIRM,
     "CONTACT_LENGTH": mjstruct.size(mjstruct.Contact),
     "CONTACT_PYRAMIDAL": int(mujoco.mjtConstraint.mjCNSTR_CONTACT_PYRAMIDAL),
     "CONTACT_ELLIPTIC": int(mujoco.mjtConstraint.mjCNSTR_CONTACT_ELLIPTIC),
@@ -171,18 +174,21 @@ def put_tissue(model: int, data: int, instance: int, organ, config):
     n = coupling.outer(organ)
     own = organ.dofadr[:n] >= 0
     adr[first[organ.flex] : first[organ.flex] + n] = np.where(own, start + organ.stateadr[:n], -1)
-  young, plane = float(np.max(config.young)), 1 - config.poisson**2
-  corner = organ.mesh.rest[organ.mesh.elem]
-  solid = config.elements == "solid"
-  skin = float(np.max(config.capsule_young, initial=0.0)) if solid else young
+  found[organ.windows.flex if organ.windows else [organ.flex]] = tissue_of(organ, config)
+
+
+def tissue_of(organ, config=None) -> np.ndarray:
+  """Returns TISSUE of an organ, as compiled or with another configuration."""
+  config = config or organ.config
+  solid, plane = config.elements == "solid", 1 - config.poisson**2
+  young = float(np.mean(config.young))
+  skin = float(np.mean(config.capsule_young or 0.0)) if solid else young
   rigidity = config.bend * skin * config.thickness**3 / (12 * plane)
   stretch = config.stiffness if config.elements == "spring" else skin * config.thickness / plane
-  row = np.zeros(len(TISSUE))
-  row[TISSUE.modulus] = solid * young / plane
-  row[TISSUE.skin] = stretch + 8 * np.sqrt(rigidity * config.foundation)
-  row[TISSUE.foundation] = config.foundation
-  row[TISSUE.edge] = np.linalg.norm(corner - corner[:, [1, 2, 0]], axis=2).mean()
-  found[organ.windows.flex if organ.windows else [organ.flex]] = row
+  corner = organ.mesh.rest[organ.mesh.elem]
+  edge = np.linalg.norm(corner - corner[:, [1, 2, 0]], axis=2).mean()
+  below = stretch + 8 * np.sqrt(rigidity * config.foundation)  # Winkler's plate under a point
+  return np.array([solid * young / plane, below, config.foundation, edge])
 
 
 def launch(weights):

@@ -13,8 +13,8 @@
 
 namespace palpate {
 
-// Of a contact, most of its tissue's compliance, and how many times firmer friction is at least.
-constexpr double FIRM = 0.03, STICK = 100.0;
+// How many times firmer than a contact its friction is at least.
+constexpr double STICK = 100.0;
 
 // How far a mesh yields at a node to a unit force there, times E* and its edges' mean length: that of
 // pressed blocks (tests/benchmarks/truth.py).
@@ -275,29 +275,29 @@ PALPATE void firm_up(const Fields& f, char* contact, Rows rows, double least) {
     scale_impedance(f, {rows.first + 1, rows.count - 1, false}, gain);
     mu *= sqrt(gain);
   }
-  if (!(R[0] < stiffness * least)) return;
-  const double gain = stiffness * least / R[0];
-  scale_impedance(f, {rows.first, rows.paired ? rows.count : 1, false}, gain);
-  if (!rows.paired) mu /= sqrt(gain);
+  if (R[0] < stiffness * least) {
+    const double gain = stiffness * least / R[0];
+    scale_impedance(f, {rows.first, rows.paired ? rows.count : 1, false}, gain);
+    if (!rows.paired) mu /= sqrt(gain);
+  }
 }
 
 // Gives the corners of the triangle on one side of a contact their weights.
 template <class Fields>
-PALPATE bool weigh_side(const Fields& f, char* contact, Rows rows, int side) {
+PALPATE void weigh_side(const Fields& f, char* contact, Rows rows, int side) {
   const int flex = side_of(contact, CONTACT_FLEX, side), elem = side_of(contact, CONTACT_ELEM, side);
-  if (flex < 0 || elem < 0 || !f.mine.data[flex]) return false;
+  if (flex < 0 || elem < 0 || !f.mine.data[flex]) return;
   const int start = f.flex_vertadr.data[flex], other = side_of(contact, CONTACT_VERT, 1 - side);
   const int* e = f.flex_elem.data + f.flex_elemdataadr.data[flex] + 3 * elem;
   D3 x[3];
   for (int k = 0; k < 3; ++k) {
-    if (e[k] == other) return false;  // MuJoCo leaves that corner out
+    if (e[k] == other) return;  // MuJoCo leaves that corner out
     x[k] = load(f.flexvert_xpos.data + 3 * (start + e[k]));
   }
   const double before = inverse_inertia(f, contact, rows, 1 - side);
   double from = before, to = before;
   const D3 w = barycentric(load(pos_of(contact)), x);
   const double right[3] = {w.x, w.y, w.z};
-  bool changed = false;
   for (int k = 0; k < 3; ++k) {
     const int body = f.flex_vertbodyid.data[start + e[k]];
     const double found = weight_of(f, rows, body, 0.0);
@@ -305,14 +305,12 @@ PALPATE bool weigh_side(const Fields& f, char* contact, Rows rows, int side) {
     const double gain = right[k] / found;
     from += found * f.body_invweight0.data[2 * body];
     to += right[k] * f.body_invweight0.data[2 * body];
-    changed = changed || fabs(right[k] - found) > 1e-12;
     for (int r = rows.first; r < rows.first + rows.count; ++r) {
       double* a = columns(f, r, body);
       store(a, gain * load(a));
     }
   }
   if (from > 0.0 && to > 0.0) scale_impedance(f, rows, to / from);
-  return changed;
 }
 
 // The velocity of a row.
@@ -371,11 +369,11 @@ PALPATE bool is_mine(const Fields& f, const char* contact) {
   return false;
 }
 
-// Gives the contacts of an organ's triangles their weights, and flags that what MuJoCo has computed
-// of the rows for its dual solvers has to be computed again. Done twice it does nothing.
+// Gives contacts with an organ their rows, and flags that what MuJoCo has computed of them for its dual
+// solvers has to be computed again. Done twice it does nothing.
 template <class Fields>
 PALPATE void weigh(const Fields& f, Thread, int) {
-  bool changed = false;
+  bool touched = false;
   Touch last = {-1, -1, 0};
   double least = 0.0;
   char* const contacts = datum<char*>(f, DATA_CONTACT);
@@ -384,8 +382,9 @@ PALPATE void weigh(const Fields& f, Thread, int) {
     char* contact = contacts + (size_t)CONTACT_LENGTH * c;
     const Rows rows = is_mine(f, contact) ? rows_of(f, contact) : Rows{0, 0, false};
     if (!rows.count) continue;
+    touched = true;
     for (int side = 0; side < 2 && f.wrong; ++side)
-      changed = weigh_side(f, contact, rows, side) || changed;
+      weigh_side(f, contact, rows, side);
     const Touch touch = touch_of(f, contact);
     if (touch.geom < 0) {
       least = 0.0;
@@ -398,7 +397,7 @@ PALPATE void weigh(const Fields& f, Thread, int) {
   }
   const bool projects = f.solver.data[0] == SOLVER_PGS || f.noslip_iterations.data[0] > 0 ||
                         (f.enableflags.data[0] & ENABLE_DIAGEXACT);
-  f.flags.data[FLAG_WEIGHED] = changed && projects;
+  f.flags.data[FLAG_WEIGHED] = touched && projects;
 }
 
 }  // namespace palpate
