@@ -205,6 +205,7 @@ def _against(kinds: frozenset[int]):
   def against(
     p: Patch, c: Touch, v: Convex, at: Place, n: int, a: wp.vec3, b: wp.vec3, d: wp.vec3
   ):
+    at.edge = (wp.length(b - a) + wp.length(d - b) + wp.length(a - d)) / 3.0
     pos = p.geom_xpos[at.world, at.geom]
     rot = p.geom_xmat[at.world, at.geom]
     size = c.size[at.tool]
@@ -272,11 +273,10 @@ def _on_planes(p: Patch, c: Touch, at: Place, n: int, x: wp.vec3):
 
 @wp.func
 def _ball(a: wp.vec3, b: wp.vec3, d: wp.vec3):
-  """Returns middle and radius of a ball about a triangle, and the mean length of its edges."""
+  """Returns middle and radius of a ball about a triangle."""
   centre = (a + b + d) / 3.0
   far = wp.max(wp.length_sq(a - centre), wp.length_sq(b - centre))
-  edge = (wp.length(b - a) + wp.length(d - b) + wp.length(a - d)) / 3.0
-  return centre, wp.sqrt(wp.max(far, wp.length_sq(d - centre))), edge
+  return centre, wp.sqrt(wp.max(far, wp.length_sq(d - centre)))
 
 
 @wp.func
@@ -332,7 +332,7 @@ def kernel(kinds: frozenset[int]) -> wp.Kernel:
           xa = _where(p, world, va)
           xb = _where(p, world, vb)
           xd = _where(p, world, vd)
-          centre, around, at.edge = _ball(xa, xb, xd)
+          centre, around = _ball(xa, xb, xd)
           for tool in range(p.ntool):
             at.tool = tool
             at.geom = p.tool_geom[tool]
