@@ -14,7 +14,7 @@
 namespace palpate {
 
 // How many times firmer than a contact its friction is at least.
-constexpr double STICK = 100.0;
+constexpr double STICK = 10.0;
 
 // How far a mesh yields at a node to a unit force there, times E* and its edges' mean length: that of
 // pressed blocks (tests/benchmarks/truth.py).
