@@ -252,9 +252,10 @@ def _touched(kind: str, edge: float, depth: float, at, slides: float = 0.0):
   drive = '<position joint="z" kp="2e4" kv="200"/><position joint="x" kp="2e4" kv="200"/>'
   spec = mujoco.MjSpec.from_string(f"""<mujoco><option gravity="0 0 0" timestep="0.001"
     integrator="implicitfast" cone="elliptic"/><size memory="1G"/><worldbody>
-    <body name="tool" pos="{x} {y} {top + RADIUS + FLEX}"><joint name="z" type="slide" axis="0 0 1"/>
-    <joint name="x" type="slide" axis="1 0 0"/><geom size="{RADIUS}" mass="0.5" condim="1"/></body>
-    </worldbody><actuator>{drive}</actuator></mujoco>""")
+    <body name="tool" pos="{x} {y} {top + RADIUS + FLEX}">
+    <joint name="z" type="slide" axis="0 0 1"/><joint name="x" type="slide" axis="1 0 0"/>
+    <geom size="{RADIUS}" mass="0.5" condim="1"/></body></worldbody>
+    <actuator>{drive}</actuator></mujoco>""")
   keys |= {"young": YOUNG, "poisson": POISSON, "damping": 0.005, "tolerance": 1e-5}
   how = {"radius": FLEX, "contact": {"condim": 1}, "windows": {"nodes": 300}, "device": "cpu"}
   palpate.add_organ(spec, (points, elem), "organ", **keys, **how)
