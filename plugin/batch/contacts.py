@@ -16,6 +16,7 @@ import warp as wp
 # All that depends on names inside of mujoco_warp: its tools against a triangle, and types.
 from mujoco_warp._src import collision_primitive_core as core
 from mujoco_warp._src.types import ContactType, vec5
+from palpate.engine import weights
 from palpate.tissue.types import Array, fill, floats, ints, struct
 
 from . import convex, cylinder
@@ -39,6 +40,7 @@ _SPHERE, _ELLIPSOID, _CAPSULE, _BOX, _PLANE = (wp.constant(kind) for kind in KIN
 _CYLINDER, _MESH = KINDS[5:]
 _FAR = wp.constant(1e10)  # what mujoco_warp says of a contact that is none
 _CONSTRAINT = wp.constant(int(ContactType.CONSTRAINT))
+FIRM = wp.constant(weights.FIRM)
 _LEAST = 1e-5  # friction, as in MuJoCo
 _FEW = 4  # tools; more of them share triangles
 # Whose sliding friction counts: the greater, or that of the one with priority.
@@ -65,6 +67,8 @@ class Touch:
   friction: Array(vec5, ("ntool",))  # all of it, the sliding one as compiled
   solref: Array(wp.vec2, ("ntool",))
   solimp: Array(vec5, ("ntool",))
+  tissue: Array(wp.vec4, (1,))  # see `weights.TISSUE`
+  yields: floats("naconmax")  # most compliance of a contact [m/N], see native/weights.h
   many: ints("nworld", "nthread")  # contacts that a thread finds, `ring` of them for a slot
   count: ints("nworld")  # of a world
   before: ints("nworld")  # of the worlds before it
@@ -102,6 +106,7 @@ class Place:
   vert: int  # -1 for a triangle
   tool: int  # which of the organ's
   geom: int
+  edge: float  # mean one of the triangle, or of all [m]
 
 
 @wp.func
@@ -145,6 +150,8 @@ def _put(c: Touch, at: Place, n: int, dist: float, pos: wp.vec3, normal: wp.vec3
     c.out_pos[k] = pos
     c.out_frame[k] = _axes(normal)
     c.out_includemargin[k] = c.margin[q]
+    t, e = c.tissue[0], at.edge
+    c.yields[k] = FIRM / (t[0] * e + t[1] + t[2] * e * e)
     slide = c.slide[at.world, q]
     if c.whose[q] == _ORGAN:
       slide = c.rough[at.world]
@@ -198,6 +205,7 @@ def _against(kinds: frozenset[int]):
   def against(
     p: Patch, c: Touch, v: Convex, at: Place, n: int, a: wp.vec3, b: wp.vec3, d: wp.vec3
   ):
+    at.edge = (wp.length(b - a) + wp.length(d - b) + wp.length(a - d)) / 3.0
     pos = p.geom_xpos[at.world, at.geom]
     rot = p.geom_xmat[at.world, at.geom]
     size = c.size[at.tool]
@@ -251,6 +259,7 @@ def _against(kinds: frozenset[int]):
 @wp.func
 def _on_planes(p: Patch, c: Touch, at: Place, n: int, x: wp.vec3):
   """Writes the contacts of a node with planes; returns how many there are then."""
+  at.edge = c.tissue[0][3]
   for tool in range(p.ntool):
     at.tool = tool
     at.geom = p.tool_geom[tool]
@@ -401,6 +410,7 @@ def make(model: mujoco.MjModel, organ, tools: np.ndarray, place, patch, data):
     rough=np.full(nworld, model.flex_friction[own, 0]),
     slide=np.tile(mixed["slide"], (nworld, 1)),
     ring=ring,
+    tissue=weights.tissue_of(organ)[None], yields=np.zeros(data.naconmax),
     many=np.zeros((nworld, ring * nslot)),
     count=np.zeros(nworld),
     before=np.zeros(nworld),

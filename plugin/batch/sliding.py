@@ -9,6 +9,7 @@ what the gap adds follows from those rows.
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
 import warp as wp
+from mujoco_warp._src.constraint import _contact_kbimp
 from mujoco_warp._src.types import vec5
 from palpate.tissue.types import Array, floats, ints, struct
 
@@ -27,6 +28,14 @@ class Pressed:
   frame: Array(wp.mat33, ("naconmax",))
   friction: Array(vec5, ("naconmax",))
   efc_address: ints("naconmax", "nrow")  # -1 for none
+  timestep: floats("nstep")
+  disableflags: int
+  dist: floats("naconmax")
+  includemargin: floats("naconmax")
+  solref: Array(wp.vec2, ("naconmax",))
+  solimp: Array(vec5, ("naconmax",))
+  yields: floats("naconmax")  # see `Touch`
+  D: floats("nworld", "njmax")  # inverse of the rows' R [kg]
   aref: floats("nworld", "njmax")  # reference acceleration of the rows [m/s^2]
   row_force: floats("nworld", "njmax")  # force of the rows [N]
   # See `Contacts`:
@@ -51,15 +60,34 @@ def _has_rows(p: Pressed, c: int):
   return p.contact_geom[c][0] >= 0
 
 
+@wp.func
+def _firm_up(p: Pressed, world: int, c: int):
+  """Makes a contact as firm as its tissue asks for, see native/weights.h; friction with it."""
+  h = p.timestep[world % p.timestep.shape[0]]
+  gap = p.dist[c] - p.includemargin[c]
+  kbi = _contact_kbimp(p.disableflags, h, p.solref[c], p.solimp[c], gap, False)
+  most = kbi[0] * kbi[2] * p.yields[c]
+  if p.paired == 1:
+    most *= float(_rows(p, c))
+  gain = most * p.D[world, p.efc_address[c, 0]]
+  if gain > 0.0 and gain < 1.0:
+    for r in range(_rows(p, c)):
+      row = p.efc_address[c, r]
+      p.D[world, row] = p.D[world, row] / gain
+
+
 @wp.kernel(enable_backward=False)
 def keep_closed(p: Pressed):
-  """Takes the parting of sliding contacts off their reference accelerations."""
+  """Makes contacts firm, and takes the parting of those that slide off their reference."""
   world, k = wp.tid()
   if k >= p.count[world]:
     return
   c = p.start[0] + p.before[world] + k
   n = p.dim[c]
-  if n < 2 or not _has_rows(p, c):
+  if not _has_rows(p, c):
+    return
+  _firm_up(p, world, c)
+  if n < 2:
     return
   square = float(0.0)  # noqa: UP018 - a variable to Warp
   for r in range(n - 1):
@@ -102,9 +130,12 @@ def make(batch, touch):
   out, d = Pressed(), batch.d
   out.many, out.paired = touch.most, int(batch.paired)
   out.start, out.before, out.count = touch.start, touch.before, touch.count
-  for name in ("dim", "frame", "friction", "efc_address"):
+  written = "dist", "includemargin", "solref", "solimp"
+  for name in ("dim", "frame", "friction", "efc_address", *written):
     setattr(out, name, getattr(d.contact, name))
   out.contact_geom, out.aref, out.row_force = d.contact.geom, d.efc.aref, d.efc.force
+  out.D, out.yields = d.efc.D, touch.yields
+  out.timestep, out.disableflags = batch.m.opt.timestep, int(batch.m.opt.disableflags)
   shape = (batch.nworld, out.many)
   out.geom, out.normal, out.force = (
     wp.zeros(shape, dtype=kind, device=batch.device) for kind in (int, wp.vec3, float)

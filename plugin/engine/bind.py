@@ -133,7 +133,10 @@ def _touched(w, model: int) -> weights.Weights:
 
   With all of them, since one that looks for contacts again has those of the others found again.
   """
+  weights.put_tissue(model, w.data, w.instance, w.organ, w.config)
   out = weights.make(model, w.data, declare_windows.touching(model, w.instance), w.flags)
+  own = w.organ.windows.flex if w.organ.windows else [w.organ.flex]
+  out.mine.numpy()[own] = 2
   w.views["mine"] = out.mine
   return out
 

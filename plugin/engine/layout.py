@@ -59,9 +59,10 @@ FLAG = Numbers(
   ("changed", 1, "-", "the contact forces are not those of the last step"),
   ("answered", 1, "-", "the organ responded to that"),
   ("foreseen", 1, "-", "what acts on the organ is what was guessed"),
-  ("weighed", 1, "-", "rows of contacts changed that MuJoCo has made use of"),
+  ("weighed", 1, "-", "rows of contacts changed, or may have, that MuJoCo has made use of"),
   ("stage", 1, "-", "how far the step is, see STAGE"),
   ("fast", 1, "-", "a tool may go through the organ and out again between two looks"),
+  ("coarse", 1, "um", "edge that a tool needs which is too small for the mesh; negative once told"),
 )
 
 # What of a step is done that must not be done twice. These are values, not offsets.

@@ -205,6 +205,8 @@ def _end(w: Workspace):
   nodes, triangles = w.flags[FLAG.missed_nodes], w.flags[FLAG.missed_elements]
   if nodes > w.missed[0] or triangles > w.missed[1]:
     _miss(w, int(nodes), int(triangles))
+  if w.flags[FLAG.coarse] > 0:
+    _tell_coarse(w)
   if w.model_step[0] != w.time_step:
     workspace.refresh(w)
   if w.watch.due(w.flags[FLAG.fast]) and not (w.asleep or w.resident):
@@ -287,6 +289,16 @@ def _watch(w: Workspace):
       f"organ {w.organ.name!r}: geom {name!r} has gone through its surface, where contacts do not "
       "hold it any more; see Organ.pierced"
     )
+
+
+def _tell_coarse(w: Workspace):
+  """Warns, once, of a tool that is too small for the mesh."""
+  edge, w.flags[FLAG.coarse] = 1e-6 * w.flags[FLAG.coarse], -1
+  warn(
+    f"organ {w.organ.name!r}: a tool touches it whose radius is less than a quarter of an edge of "
+    f"its triangles, so that forces depend on where it meets them; edges of {1e3 * edge:.2g} mm "
+    "would do"
+  )
 
 
 def _miss(w: Workspace, nodes: int, triangles: int):

@@ -16,7 +16,7 @@ from palpate.tissue.kernels import kernel
 from palpate.tissue.types import Array, doubles, ints, struct
 
 from . import apart, coupling, mjstruct
-from .layout import FLAG
+from .layout import FLAG, Numbers
 
 _DATA = (
   *("contact", "ncon", "nefc", "nisland", "efc_type", "efc_J", "efc_J_rownnz", "efc_J_rowadr"),
@@ -24,8 +24,19 @@ _DATA = (
   *("map_efc2iefc", "iefc_R", "iefc_D"),
 )
 _CONTACT = (
-  *("dist", "pos", "friction", "dim", "geom", "flex", "elem", "vert", "exclude", "efc_address"),
+  *("dist", "pos", "frame", "friction", "mu", "dim", "geom", "flex", "elem", "vert", "exclude"),
+  "efc_address",
 )
+# What an organ's contacts follow, of each flex.
+TISSUE = Numbers(
+  "TISSUE",
+  ("modulus", 1, "Pa", "young / (1 - poisson^2) of a solid"),
+  ("skin", 1, "N/m", "of the skin: stretch, and bending on a foundation"),
+  ("foundation", 1, "Pa/m", ""),
+  ("edge", 1, "m", "mean length of edges at rest"),
+)
+_tissue: dict[int, tuple] = {}  # by the address of an mjData, see `_tissues`
+FIRM = 0.03  # of a contact, most of its tissue's compliance
 _SPARSE_FROM = 60  # dofs from which MuJoCo's rows are sparse where it may choose
 
 
@@ -36,8 +47,10 @@ class Weights:
   nv: int  # dofs of the model
   wrong: int  # whether MuJoCo's weights are
   memory: Array(wp.uint64, ("nword",))  # the mjData itself
-  mine: ints("nflex")  # whether a flex is an organ's, or a window of one
+  mine: ints("nflex")  # 1 where a flex is an organ's, or a window of one; 2 where of the own one
   flags: ints(len(FLAG))  # see FLAG
+  tissue: doubles("nflex", len(TISSUE))  # see TISSUE
+  force_adr: ints("nflexvert")  # where the plugin state has a vertex' contact force, or -1
   # mjOption:
   jacobian: ints(1)
   solver: ints(1)
@@ -48,6 +61,9 @@ class Weights:
   body_dofnum: ints("nbody")
   body_invweight0: doubles("nbody", 2)
   geom_bodyid: ints("ngeom")
+  geom_type: ints("ngeom")
+  geom_size: doubles("ngeom", 3)
+  flex_radius: doubles("nflex")
   flex_dim: ints("nflex")
   flex_vertadr: ints("nflex")
   flex_vertbodyid: ints("nflexvert")
@@ -56,6 +72,9 @@ class Weights:
   # mjData:
   qvel: doubles("nv")
   flexvert_xpos: doubles("nflexvert", 3)
+  geom_xpos: doubles("ngeom", 3)
+  geom_xmat: doubles("ngeom", 9)
+  plugin_state: doubles("npluginstate")
 
 
 def _offsets(prefix: str, kind, names) -> dict[str, int]:
@@ -67,9 +86,11 @@ weigh = kernel(
   "weights.h",
   Weights,
   coupling.CONSTANTS
+  | TISSUE.constants()
   | _offsets("DATA", mjstruct.Data, _DATA)
   | _offsets("CONTACT", mjstruct.Contact, _CONTACT)
   | {
+    "FIRM": FIRM,
     "CONTACT_LENGTH": mjstruct.size(mjstruct.Contact),
     "CONTACT_PYRAMIDAL": int(mujoco.mjtConstraint.mjCNSTR_CONTACT_PYRAMIDAL),
     "CONTACT_ELLIPTIC": int(mujoco.mjtConstraint.mjCNSTR_CONTACT_ELLIPTIC),
@@ -118,11 +139,56 @@ def make(model: int, data: int, flexes, flags: np.ndarray | None = None) -> Weig
   out = coupling.mujoco_arrays(model, data, Weights)
   out.nv = mjstruct.Model.from_address(model).nv
   out.wrong = are_wrong()
+  tissue, adr = _tissues(model, data)
+  out.tissue = wp.array(tissue, dtype=wp.float64, device="cpu", copy=False)
+  out.force_adr = wp.array(adr, dtype=int, device="cpu", copy=False)
   out.memory = coupling.wrap(data, mjstruct.size(mjstruct.Data) // 8, wp.uint64)
   out.mine = wp.array(mine, dtype=int, device="cpu")
   flags = np.zeros(len(FLAG), np.int32) if flags is None else flags
   out.flags = wp.array(flags, dtype=int, device="cpu", copy=False)
   return out
+
+
+def _tissues(model: int, data: int) -> tuple[np.ndarray, np.ndarray]:
+  """Returns what the organs of an mjData tell of its flexes and their vertices."""
+  m = mjstruct.Model.from_address(model)
+  found = _tissue.get(data)
+  if found is None or (len(found[0]), len(found[1])) != (m.nflex, m.nflexvert):
+    found = np.zeros((m.nflex, len(TISSUE))), np.full(m.nflexvert, -1, np.int32)
+    _tissue[data] = found
+  return found
+
+
+def put_tissue(model: int, data: int, instance: int, organ, config):
+  """Tells contacts with an organ what its tissue is made of, and where its contact forces are."""
+  m = mjstruct.Model.from_address(model)
+  found, adr = _tissues(model, data)
+  start = int(mjstruct.view(m.plugin_stateadr, m.nplugin, np.int32)[instance])
+  start += coupling.spans(organ)["force"].start
+  first = mjstruct.view(m.flex_vertadr, m.nflex, np.int32)
+  if organ.windows:
+    for k, flex in enumerate(organ.windows.flex):
+      slot = np.arange(*organ.windows.adr[k : k + 2])
+      adr[first[flex] + slot - slot[0]] = start + 3 * slot
+  else:
+    n = coupling.outer(organ)
+    own = organ.dofadr[:n] >= 0
+    adr[first[organ.flex] : first[organ.flex] + n] = np.where(own, start + organ.stateadr[:n], -1)
+  found[organ.windows.flex if organ.windows else [organ.flex]] = tissue_of(organ, config)
+
+
+def tissue_of(organ, config=None) -> np.ndarray:
+  """Returns TISSUE of an organ, as compiled or with another configuration."""
+  config = config or organ.config
+  solid, plane = config.elements == "solid", 1 - config.poisson**2
+  young = float(np.mean(config.young))
+  skin = float(np.mean(config.capsule_young or 0.0)) if solid else young
+  rigidity = config.bend * skin * config.thickness**3 / (12 * plane)
+  stretch = config.stiffness if config.elements == "spring" else skin * config.thickness / plane
+  corner = organ.mesh.rest[organ.mesh.elem]
+  edge = np.linalg.norm(corner - corner[:, [1, 2, 0]], axis=2).mean()
+  below = stretch + 8 * np.sqrt(rigidity * config.foundation)  # Winkler's plate under a point
+  return np.array([solid * young / plane, below, config.foundation, edge])
 
 
 def launch(weights):

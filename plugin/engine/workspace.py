@@ -204,11 +204,14 @@ class Workspace:
         wp.capture_launch(self.before)
       if not self.asleep and self.policy[0] == _ALLOWED:
         windowed.let_sleep(self, False)
+    if not self.asleep:  # what `after` does was done with `before`
+      self._solve()
     if self.flags[FLAG.weighed]:
-      weights.project(self.model, self.data)
-    if self.asleep:
-      self.computed = True
-      return  # what `after` does was done with `before`
+      weights.project(self.model, self.data)  # with the inertia that is in the model now
+    self.computed = True
+
+  def _solve(self):
+    """Solves for the step, and tells MuJoCo."""
     if self.ties.aims:
       self.ties.aim()
     if self.resident:
@@ -218,7 +221,6 @@ class Workspace:
       wp.capture_launch(self.after)
     else:
       graphs.launch_all(self.solve)
-    self.computed = True
 
   def _check_model(self):
     """Makes sure that nothing has changed in the model that may not change while running.

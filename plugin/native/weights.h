@@ -2,6 +2,9 @@
 // where it is. MuJoCo 3.17 weighs them by inverse distance, as if the contact were at another point.
 // Its rows are made when this runs, their reference accelerations are not.
 //
+// Contacts are as firm as their tissue asks for: MuJoCo's grow softer as nodes grow lighter. Under a
+// round or flat-ended tool that is small for the mesh they yield by what the mesh cannot.
+//
 // And contacts that slide stay closed. MuJoCo's friction is convex: a sliding contact parts, by its
 // friction times how fast it is braked. On light nodes that lifts a tool off within a step, and the
 // force flickers.
@@ -9,6 +12,21 @@
 #include "triangle.h"
 
 namespace palpate {
+
+// How many times firmer than a contact its friction is at least.
+constexpr double STICK = 10.0;
+
+// How far a mesh yields at a node to a unit force there, times E* and its edges' mean length: that of
+// pressed blocks (tests/benchmarks/truth.py).
+constexpr double SELF = 1.75;
+
+// Edges that a tool's radius has at least, else it is told that the mesh is too coarse.
+constexpr double COARSE = 0.25;
+
+// Most that a tool sinks in, in radii.
+constexpr double DEEPEST = 0.5;
+
+constexpr double PI = 3.14159265358979;
 
 // A field of mjData: those in its arena are elsewhere in each step.
 template <class T, class Fields>
@@ -98,23 +116,188 @@ PALPATE void scale_impedance(const Fields& f, Rows rows, double gain) {
   }
 }
 
+// Mean length of the edges of what a side of a contact touches [m].
+template <class Fields>
+PALPATE double edge_of(const Fields& f, const char* contact, int side) {
+  const int flex = side_of(contact, CONTACT_FLEX, side), elem = side_of(contact, CONTACT_ELEM, side);
+  if (elem < 0) return f.tissue.data[TISSUE_LENGTH * flex + TISSUE_EDGE];
+  const int* e = f.flex_elem.data + f.flex_elemdataadr.data[flex] + 3 * elem;
+  const double* x = f.flexvert_xpos.data + 3 * f.flex_vertadr.data[flex];
+  const D3 a = load(x + 3 * e[0]), b = load(x + 3 * e[1]), c = load(x + 3 * e[2]);
+  return (norm(b - a) + norm(c - b) + norm(a - c)) / 3.0;
+}
+
+// How far the tissue of one side of a contact yields to a unit force [m/N]: an elastic half space, a
+// membrane with bending and a foundation, under a patch as wide as the edges of what is touched.
+template <class Fields>
+PALPATE double yielding(const Fields& f, const char* contact, int side) {
+  const int flex = side_of(contact, CONTACT_FLEX, side);
+  if (flex < 0 || !f.mine.data[flex]) return 0.0;
+  const double* tissue = f.tissue.data + TISSUE_LENGTH * flex;
+  const double edge = edge_of(f, contact, side);
+  const double within = tissue[TISSUE_MODULUS] * edge, below = tissue[TISSUE_FOUNDATION] * edge * edge;
+  return 1.0 / (within + tissue[TISSUE_SKIN] + below);
+}
+
+// A geom's contacts with an organ's flex, which is on one side of them.
+struct Touch { int geom, flex, side; };
+
+PALPATE bool operator==(Touch a, Touch b) { return a.geom == b.geom && a.flex == b.flex; }
+
+template <class Fields>
+PALPATE Touch touch_of(const Fields& f, const char* contact) {
+  for (int side = 0; side < 2; ++side) {
+    const int flex = side_of(contact, CONTACT_FLEX, side);
+    const int geom = side_of(contact, CONTACT_GEOM, 1 - side);
+    const bool whole = side_of(contact, CONTACT_ELEM, side) >= 0;
+    if (geom >= 0 && flex >= 0 && f.mine.data[flex] && whole) return {geom, flex, side};
+  }
+  return {-1, -1, 0};
+}
+
+// What a tool presses in: the corners of the triangles that it touches, and how it lies in them.
+struct Dent {
+  static constexpr int MOST = 64;
+  int node[MOST], nnode = 0, ncon = 0;
+  double edges = 0.0, deepest = 0.0, gaps = 0.0;
+  double square = 0.0;  // of the way from the tool's middle to its contacts, weighed by their gaps
+  D3 way = {0.0, 0.0, 0.0}, normal = {0.0, 0.0, 0.0};  // mean ones, weighed so
+
+  PALPATE void sink(double gap, D3 r, D3 along) {
+    if (gap > deepest) deepest = gap;
+    if (!(gap > 0.0)) return;
+    gaps += gap;
+    square += gap * dot(r, r);
+    way += gap * r;
+    normal += gap * along;
+  }
+
+  PALPATE bool add(int vert) {
+    for (int q = 0; q < nnode; ++q)
+      if (node[q] == vert) return true;
+    if (nnode == MOST) return false;
+    node[nnode++] = vert;
+    return true;
+  }
+
+  // The mean square of the contacts' distances from the middle of the dent.
+  PALPATE double spread() const { return square / gaps - dot(way, way) / (gaps * gaps); }
+};
+
+// Looks at the dent of a tool; returns whether it is one of few nodes.
+template <class Fields>
+PALPATE bool find_dent(const Fields& f, const char* contact, int ncon, Touch touch, Dent& dent) {
+  const D3 middle = load(f.geom_xpos.data + 3 * touch.geom);
+  const int start = f.flex_vertadr.data[touch.flex];
+  for (int c = 0; c < ncon; ++c, contact += CONTACT_LENGTH) {
+    if (!(touch_of(f, contact) == touch)) continue;
+    const D3 r = load((const double*)(contact + CONTACT_POS)) - middle;
+    dent.sink(-*(const double*)(contact + CONTACT_DIST), r,
+              load((const double*)(contact + CONTACT_FRAME)));
+    dent.edges += edge_of(f, contact, touch.side);
+    ++dent.ncon;
+    const int* e = f.flex_elem.data + f.flex_elemdataadr.data[touch.flex] +
+                   3 * side_of(contact, CONTACT_ELEM, touch.side);
+    for (int k = 0; k < 3; ++k)
+      if (f.force_adr.data[start + e[k]] >= 0 && !dent.add(start + e[k])) return false;
+  }
+  return dent.deepest > 0.0;
+}
+
+// The force in a dent, and the work of the forces on its nodes, those of the last step, as it is on a
+// mesh of E* = 1: a node yields by SELF / edge to its own, by 1 / (pi r) to another at r (Boussinesq).
+template <class Fields>
+PALPATE double work_of(const Fields& f, const Dent& dent, double& total) {
+  D3 sum = {0.0, 0.0, 0.0};
+  double work = 0.0;
+  for (int i = 0; i < dent.nnode; ++i) {
+    const D3 x = load(f.flexvert_xpos.data + 3 * dent.node[i]);
+    const D3 force = load(f.plugin_state.data + f.force_adr.data[dent.node[i]]);
+    D3 others = {0.0, 0.0, 0.0};
+    for (int j = 0; j < i; ++j) {
+      const double r = norm(load(f.flexvert_xpos.data + 3 * dent.node[j]) - x);
+      others += 2.0 / (PI * r) * load(f.plugin_state.data + f.force_adr.data[dent.node[j]]);
+    }
+    sum += force;
+    work += dot(force, (SELF * dent.ncon / dent.edges) * force + others);
+  }
+  total = norm(sum);
+  return work;
+}
+
+// How much less the mesh under a tool yields than a half space would, as a compliance of each of its
+// contacts [m/N]. Under a round tool the half space yields by 3 / (4 E* a), a the radius of the contact
+// (Hertz), less what the tool rises off its axis; under a flat end by 1 / (2 E* radius).
+template <class Fields>
+PALPATE double unresolved(const Fields& f, const char* contacts, int ncon, Touch touch) {
+  const double* tissue = f.tissue.data + TISSUE_LENGTH * touch.flex;
+  const double modulus = tissue[TISSUE_MODULUS];
+  const int type = f.geom_type.data[touch.geom];
+  const bool round = type == GEOM_IS_SPHERE || type == GEOM_IS_CAPSULE;
+  if (!round && type != GEOM_IS_CYLINDER) return 0.0;
+  Dent dent;
+  if (!find_dent(f, contacts, ncon, touch, dent)) return 0.0;
+  const double size = f.geom_size.data[3 * touch.geom], radius = size + f.flex_radius.data[touch.flex];
+  if (f.mine.data[touch.flex] > 1 && !f.flags.data[FLAG_COARSE] && radius < COARSE * dent.edges / dent.ncon)
+    f.flags.data[FLAG_COARSE] = (int)(2e6 * radius) + 1;
+  double total;
+  const double work = work_of(f, dent, total);
+  if (!(modulus > 0.0 && total > 0.0) || tissue[TISSUE_SKIN] > 0.0) return 0.0;
+  double yields = 0.5 / (modulus * size);
+  if (round) {
+    const double a = cbrt(0.75 * total * radius / modulus);
+    yields = 0.75 / (modulus * a) - dent.spread() / (2.0 * radius * total);
+  } else {
+    const double* R = f.geom_xmat.data + 9 * touch.geom;
+    if (fabs(dot(D3{R[2], R[5], R[8]}, dent.normal)) < 0.95 * norm(dent.normal)) return 0.0;
+  }
+  double lacks = yields - work / (modulus * total * total);
+  if (lacks * total > DEEPEST * radius) lacks = DEEPEST * radius / total;  // or a needle falls through
+  return lacks > 0.0 ? lacks * dent.gaps / dent.deepest : 0.0;  // contacts in parallel
+}
+
+// Makes a contact as firm as its tissue asks for, whatever its nodes weigh, if it is softer: at rest its
+// force is gap / compliance with R = compliance * stiffness, of which the rows of a pyramid have a part
+// each. Friction is STICK times firmer, since what sticks creeps at a speed in proportion to its R; in
+// a pyramid it has no R of its own (MuJoCo, Computation, Constraint model). Then the normal yields by
+// `least` [m/N] at least. Done twice it does nothing.
+template <class Fields>
+PALPATE void firm_up(const Fields& f, char* contact, Rows rows, double least) {
+  const double* row = datum<double*>(f, DATA_EFC_KBIP) + 4 * rows.first;
+  const double* R = datum<double*>(f, DATA_EFC_R) + rows.first;
+  const double stiffness = row[0] * row[2] * (rows.paired ? rows.count : 1);
+  if (!(stiffness > 0.0)) return;
+  double& mu = *(double*)(contact + CONTACT_MU);  // friction times the root of its R over the normal's
+  const double most = stiffness * FIRM * (yielding(f, contact, 0) + yielding(f, contact, 1));
+  if (most > 0.0 && R[0] > most) scale_impedance(f, rows, most / R[0]);
+  if (!rows.paired && rows.count > 1 && STICK * R[1] > R[0]) {
+    const double gain = R[0] / (STICK * R[1]);
+    scale_impedance(f, {rows.first + 1, rows.count - 1, false}, gain);
+    mu *= sqrt(gain);
+  }
+  if (R[0] < stiffness * least) {
+    const double gain = stiffness * least / R[0];
+    scale_impedance(f, {rows.first, rows.paired ? rows.count : 1, false}, gain);
+    if (!rows.paired) mu /= sqrt(gain);
+  }
+}
+
 // Gives the corners of the triangle on one side of a contact their weights.
 template <class Fields>
-PALPATE bool weigh_side(const Fields& f, char* contact, Rows rows, int side) {
+PALPATE void weigh_side(const Fields& f, char* contact, Rows rows, int side) {
   const int flex = side_of(contact, CONTACT_FLEX, side), elem = side_of(contact, CONTACT_ELEM, side);
-  if (flex < 0 || elem < 0 || !f.mine.data[flex]) return false;
+  if (flex < 0 || elem < 0 || !f.mine.data[flex]) return;
   const int start = f.flex_vertadr.data[flex], other = side_of(contact, CONTACT_VERT, 1 - side);
   const int* e = f.flex_elem.data + f.flex_elemdataadr.data[flex] + 3 * elem;
   D3 x[3];
   for (int k = 0; k < 3; ++k) {
-    if (e[k] == other) return false;  // MuJoCo leaves that corner out
+    if (e[k] == other) return;  // MuJoCo leaves that corner out
     x[k] = load(f.flexvert_xpos.data + 3 * (start + e[k]));
   }
   const double before = inverse_inertia(f, contact, rows, 1 - side);
   double from = before, to = before;
   const D3 w = barycentric(load(pos_of(contact)), x);
   const double right[3] = {w.x, w.y, w.z};
-  bool changed = false;
   for (int k = 0; k < 3; ++k) {
     const int body = f.flex_vertbodyid.data[start + e[k]];
     const double found = weight_of(f, rows, body, 0.0);
@@ -122,14 +305,12 @@ PALPATE bool weigh_side(const Fields& f, char* contact, Rows rows, int side) {
     const double gain = right[k] / found;
     from += found * f.body_invweight0.data[2 * body];
     to += right[k] * f.body_invweight0.data[2 * body];
-    changed = changed || fabs(right[k] - found) > 1e-12;
     for (int r = rows.first; r < rows.first + rows.count; ++r) {
       double* a = columns(f, r, body);
       store(a, gain * load(a));
     }
   }
   if (from > 0.0 && to > 0.0) scale_impedance(f, rows, to / from);
-  return changed;
 }
 
 // The velocity of a row.
@@ -188,22 +369,35 @@ PALPATE bool is_mine(const Fields& f, const char* contact) {
   return false;
 }
 
-// Gives the contacts of an organ's triangles their weights, and flags that what MuJoCo has computed
-// of the rows for its dual solvers has to be computed again. Done twice it does nothing.
+// Gives contacts with an organ their rows, and flags that what MuJoCo has computed of them for its dual
+// solvers has to be computed again. Done twice it does nothing.
 template <class Fields>
 PALPATE void weigh(const Fields& f, Thread, int) {
-  bool changed = false;
-  char* contact = datum<char*>(f, DATA_CONTACT);
+  bool touched = false;
+  Touch last = {-1, -1, 0};
+  double least = 0.0;
+  char* const contacts = datum<char*>(f, DATA_CONTACT);
   const int ncon = datum<int>(f, DATA_NEFC) > 0 ? datum<int>(f, DATA_NCON) : 0;
-  for (int c = 0; c < ncon; ++c, contact += CONTACT_LENGTH) {
+  for (int c = 0; c < ncon; ++c) {
+    char* contact = contacts + (size_t)CONTACT_LENGTH * c;
     const Rows rows = is_mine(f, contact) ? rows_of(f, contact) : Rows{0, 0, false};
-    for (int side = 0; side < 2 && rows.count && f.wrong; ++side)
-      changed = weigh_side(f, contact, rows, side) || changed;
+    if (!rows.count) continue;
+    touched = true;
+    for (int side = 0; side < 2 && f.wrong; ++side)
+      weigh_side(f, contact, rows, side);
+    const Touch touch = touch_of(f, contact);
+    if (touch.geom < 0) {
+      least = 0.0;
+    } else if (!(touch == last)) {
+      least = unresolved(f, contacts, ncon, touch);
+    }
+    last = touch;
+    firm_up(f, contact, rows, least);
     keep_closed(f, contact, rows);
   }
   const bool projects = f.solver.data[0] == SOLVER_PGS || f.noslip_iterations.data[0] > 0 ||
                         (f.enableflags.data[0] & ENABLE_DIAGEXACT);
-  f.flags.data[FLAG_WEIGHED] = changed && projects;
+  f.flags.data[FLAG_WEIGHED] = touched && projects;
 }
 
 }  // namespace palpate
