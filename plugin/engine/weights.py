@@ -9,6 +9,7 @@ flicker where a tool presses. MuJoCo 4.0 has it right. Both part what slides.
 
 import functools
 
+import os
 import mujoco
 import numpy as np
 import warp as wp
@@ -53,12 +54,16 @@ class Weights:
   force_adr: ints("nflexvert")  # where the plugin state has a vertex' contact force, or -1
   # mjOption:
   jacobian: ints(1)
+  timestep: doubles(1)
   solver: ints(1)
   noslip_iterations: ints(1)
   enableflags: ints(1)
   # mjModel:
   body_dofadr: ints("nbody")
   body_dofnum: ints("nbody")
+  body_parentid: ints("nbody")
+  body_rootid: ints("nbody")
+  dof_parentid: ints("nv")
   body_invweight0: doubles("nbody", 2)
   geom_bodyid: ints("ngeom")
   geom_type: ints("ngeom")
@@ -74,6 +79,8 @@ class Weights:
   flexvert_xpos: doubles("nflexvert", 3)
   geom_xpos: doubles("ngeom", 3)
   geom_xmat: doubles("ngeom", 9)
+  subtree_com: doubles("nbody", 3)
+  cdof: doubles("nv", 6)
   plugin_state: doubles("npluginstate")
 
 
@@ -90,7 +97,7 @@ weigh = kernel(
   | _offsets("DATA", mjstruct.Data, _DATA)
   | _offsets("CONTACT", mjstruct.Contact, _CONTACT)
   | {
-    "FIRM": FIRM,
+    "FIRM": float(os.environ.get("FIRM", .99)), "SLOW": float(os.environ.get("SLOW", 4)), "LEAST": float(os.environ.get("LEAST", 1)), "STICK": float(os.environ.get("STICK", 100)),
     "CONTACT_LENGTH": mjstruct.size(mjstruct.Contact),
     "CONTACT_PYRAMIDAL": int(mujoco.mjtConstraint.mjCNSTR_CONTACT_PYRAMIDAL),
     "CONTACT_ELLIPTIC": int(mujoco.mjtConstraint.mjCNSTR_CONTACT_ELLIPTIC),

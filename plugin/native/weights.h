@@ -13,9 +13,6 @@
 
 namespace palpate {
 
-// How many times firmer than a contact its friction is at least.
-constexpr double STICK = 10.0;
-
 // How far a mesh yields at a node to a unit force there, times E* and its edges' mean length: that of
 // pressed blocks (tests/benchmarks/truth.py).
 constexpr double SELF = 1.75;
@@ -25,6 +22,10 @@ constexpr double COARSE = 0.25;
 
 // Most that a tool sinks in, in radii.
 constexpr double DEEPEST = 0.5;
+
+// Points of a triangle along an edge at which it is looked at, and the part of a radius that is its rim.
+constexpr int POINTS = 6;
+constexpr double RIM = 0.1, SLACK = 0.01, COVER = 0.25;
 
 constexpr double PI = 3.14159265358979;
 
@@ -60,19 +61,23 @@ PALPATE bool is_dense(const Fields& f) {
   return jacobian == JACOBIAN_DENSE || (jacobian == JACOBIAN_AUTO && f.nv < SPARSE_FROM);
 }
 
-// Where a row has the three columns of a body's dofs, or null.
+// Where a row has the column of a dof, or null.
 template <class Fields>
-PALPATE double* columns(const Fields& f, int row, int body) {
-  const int adr = f.body_dofadr.data[body];
+PALPATE double* column(const Fields& f, int row, int dof) {
   double* J = datum<double*>(f, DATA_EFC_J);
-  if (f.body_dofnum.data[body] != 3) return nullptr;
-  if (is_dense(f)) return J + (long long)f.nv * row + adr;
+  if (is_dense(f)) return J + (long long)f.nv * row + dof;
   const int start = datum<int*>(f, DATA_EFC_J_ROWADR)[row];
   const int count = datum<int*>(f, DATA_EFC_J_ROWNNZ)[row];
   const int* colind = datum<int*>(f, DATA_EFC_J_COLIND) + start;
-  for (int k = 0; k + 2 < count; ++k)
-    if (colind[k] == adr) return J + start + k;
+  for (int k = 0; k < count; ++k)
+    if (colind[k] == dof) return J + start + k;
   return nullptr;
+}
+
+// Where a row has the three columns of a vertex' body, or null.
+template <class Fields>
+PALPATE double* columns(const Fields& f, int row, int body) {
+  return f.body_dofnum.data[body] == 3 ? column(f, row, f.body_dofadr.data[body]) : nullptr;
 }
 
 // The weight that the rows give to a body: the length of its part of the normal's row, which is the
@@ -256,20 +261,25 @@ PALPATE double unresolved(const Fields& f, const char* contacts, int ncon, Touch
   return lacks > 0.0 ? lacks * dent.gaps / dent.deepest : 0.0;  // contacts in parallel
 }
 
-// Makes a contact as firm as its tissue asks for, whatever its nodes weigh, if it is softer: at rest its
-// force is gap / compliance with R = compliance * stiffness, of which the rows of a pyramid have a part
-// each. Friction is STICK times firmer, since what sticks creeps at a speed in proportion to its R; in
+// Makes a contact as firm as its time step allows, whatever its nodes weigh and its solref and solimp
+// say. Friction is STICK times firmer, since what sticks creeps at a speed in proportion to its R; in
 // a pyramid it has no R of its own (MuJoCo, Computation, Constraint model). Then the normal yields by
 // `least` [m/N] at least. Done twice it does nothing.
 template <class Fields>
 PALPATE void firm_up(const Fields& f, char* contact, Rows rows, double least) {
-  const double* row = datum<double*>(f, DATA_EFC_KBIP) + 4 * rows.first;
+  double* row = datum<double*>(f, DATA_EFC_KBIP) + 4 * rows.first;
   const double* R = datum<double*>(f, DATA_EFC_R) + rows.first;
-  const double stiffness = row[0] * row[2] * (rows.paired ? rows.count : 1);
-  if (!(stiffness > 0.0)) return;
   double& mu = *(double*)(contact + CONTACT_MU);  // friction times the root of its R over the normal's
-  const double most = stiffness * FIRM * (yielding(f, contact, 0) + yielding(f, contact, 1));
-  if (most > 0.0 && R[0] > most) scale_impedance(f, rows, most / R[0]);
+  if (!(row[0] > 0.0) || !(row[2] < 1.0)) return;
+  const double lasts = SLOW * FIRM * f.timestep.data[0];
+  scale_impedance(f, rows, (1.0 - FIRM) / FIRM * row[2] / (1.0 - row[2]));
+  for (int r = 0; r < rows.count; ++r) {
+    double* each = row + 4 * r;
+    if (each[0] > 0.0) each[0] = 1.0 / (lasts * lasts);
+    each[1] = 2.0 / lasts;
+    each[2] = FIRM;
+  }
+  const double stiffness = row[0] * row[2] * (rows.paired ? rows.count : 1);
   if (!rows.paired && rows.count > 1 && STICK * R[1] > R[0]) {
     const double gain = R[0] / (STICK * R[1]);
     scale_impedance(f, {rows.first + 1, rows.count - 1, false}, gain);
@@ -279,6 +289,82 @@ PALPATE void firm_up(const Fields& f, char* contact, Rows rows, double least) {
     const double gain = stiffness * least / R[0];
     scale_impedance(f, {rows.first, rows.paired ? rows.count : 1, false}, gain);
     if (!rows.paired) mu /= sqrt(gain);
+  }
+}
+
+// How a row of a contact sees velocities: along the normal, a tangent, or in a pyramid along the normal
+// and part of a tangent; and about them, where it rolls and twists.
+struct Axis { D3 along, about; };
+
+PALPATE Axis axis_of(const char* contact, Rows rows, int row) {
+  const double* frame = (const double*)(contact + CONTACT_FRAME);
+  const D3 none = {0.0, 0.0, 0.0};
+  if (!rows.paired) return row < 3 ? Axis{load(frame + 3 * row), none} : Axis{none, load(frame + 3 * row - 9)};
+  const int k = row / 2;
+  const double slope = (row % 2 ? -1.0 : 1.0) * ((const double*)(contact + CONTACT_FRICTION))[k];
+  if (k < 2) return {load(frame) + slope * load(frame + 3 + 3 * k), none};
+  return {load(frame), slope * load(frame + 3 * k - 6)};
+}
+
+// Where a triangle lies under the flat end of a cylinder: the middle of that part, weighed by how deep
+// it is, as barycentric weights; its gap; and the axis out of that end. MuJoCo names the deepest point,
+// which jumps from corner to corner where a tool lies flat, and at times a way out that is longer.
+template <class Fields>
+PALPATE bool under_end(const Fields& f, int geom, double radius, const D3* x, D3& w, double& gap, D3& out) {
+  if (geom < 0 || f.geom_type.data[geom] != GEOM_IS_CYLINDER) return false;
+  const double* R = f.geom_xmat.data + 9 * geom;
+  const double* size = f.geom_size.data + 3 * geom;
+  D3 r[3], sum = {0.0, 0.0, 0.0};
+  for (int k = 0; k < 3; ++k) r[k] = x[k] - load(f.geom_xpos.data + 3 * geom);
+  out = {R[2], R[5], R[8]};
+  if (dot(r[0] + r[1] + r[2], out) < 0.0) out = -1.0 * out;
+  const double slack = SLACK * size[0];
+  double total = 0.0, covered = 0.0;
+  for (int i = 0; i < POINTS; ++i) {
+    for (int j = 0; i + j < POINTS; ++j) {
+      const double u = (i + 1.0 / 3.0) / POINTS, v = (j + 1.0 / 3.0) / POINTS;
+      const D3 at = blend(r, {1.0 - u - v, u, v});
+      const double high = dot(at, out), depth = size[1] + radius - high;
+      const double inside = (size[0] + radius - norm(at - high * out) - depth) / (RIM * size[0]);
+      if (!(depth > -slack && inside > 0.0)) continue;
+      const double counts = (depth + slack) * (inside < 1.0 ? inside : 1.0);
+      covered += inside < 1.0 ? inside : 1.0;
+      sum += counts * D3{1.0 - u - v, u, v};
+      total += counts;
+    }
+  }
+  if (!(total > 0.0)) return false;
+  w = (1.0 / total) * sum;
+  gap = dot(blend(r, w), out) - size[1] - radius;
+  covered /= 0.5 * POINTS * (POINTS + 1) * COVER;
+  if (covered < 1.0) gap *= covered;
+  return true;
+}
+
+// Gives a contact another place, normal and gap, and the side of it that is a geom its columns.
+template <class Fields>
+PALPATE void put(const Fields& f, char* contact, Rows rows, int side, D3 pos, D3 normal, double gap) {
+  double* frame = (double*)(contact + CONTACT_FRAME);
+  const D3 other = fabs(normal.x) < 0.5 ? D3{1.0, 0.0, 0.0} : D3{0.0, 1.0, 0.0};
+  D3 tangent = cross(normal, other);
+  tangent = (1.0 / norm(tangent)) * tangent;
+  store(frame, normal);
+  store(frame + 3, tangent);
+  store(frame + 6, cross(normal, tangent));
+  store(pos_of(contact), pos);
+  *(double*)(contact + CONTACT_DIST) = gap;
+  for (int r = 0; r < (rows.paired ? rows.count : 1); ++r) datum<double*>(f, DATA_EFC_POS)[rows.first + r] = gap;
+  int body = f.geom_bodyid.data[side_of(contact, CONTACT_GEOM, side)];
+  pos = pos - load(f.subtree_com.data + 3 * f.body_rootid.data[body]);
+  while (body > 0 && !f.body_dofnum.data[body]) body = f.body_parentid.data[body];
+  int dof = body ? f.body_dofadr.data[body] + f.body_dofnum.data[body] - 1 : -1;
+  for (; dof >= 0; dof = f.dof_parentid.data[dof]) {
+    const D3 turns = load(f.cdof.data + 6 * dof), moves = load(f.cdof.data + 6 * dof + 3) + cross(turns, pos);
+    for (int r = 0; r < rows.count; ++r) {
+      const Axis axis = axis_of(contact, rows, r);
+      double* a = column(f, rows.first + r, dof);
+      if (a) *a = (side ? 1.0 : -1.0) * (dot(axis.along, moves) + dot(axis.about, turns));
+    }
   }
 }
 
@@ -294,21 +380,22 @@ PALPATE void weigh_side(const Fields& f, char* contact, Rows rows, int side) {
     if (e[k] == other) return;  // MuJoCo leaves that corner out
     x[k] = load(f.flexvert_xpos.data + 3 * (start + e[k]));
   }
+  D3 w, out;
+  double gap;
+  if (under_end(f, side_of(contact, CONTACT_GEOM, 1 - side), f.flex_radius.data[flex], x, w, gap, out))
+    put(f, contact, rows, 1 - side, blend(x, w), side ? out : -1.0 * out, gap);
+  else
+    w = barycentric(load(pos_of(contact)), x);
   const double before = inverse_inertia(f, contact, rows, 1 - side);
   double from = before, to = before;
-  const D3 w = barycentric(load(pos_of(contact)), x);
   const double right[3] = {w.x, w.y, w.z};
   for (int k = 0; k < 3; ++k) {
     const int body = f.flex_vertbodyid.data[start + e[k]];
-    const double found = weight_of(f, rows, body, 0.0);
-    if (!(found > 0.0)) continue;
-    const double gain = right[k] / found;
-    from += found * f.body_invweight0.data[2 * body];
+    if (!columns(f, rows.first, body)) continue;
+    from += weight_of(f, rows, body, 0.0) * f.body_invweight0.data[2 * body];
     to += right[k] * f.body_invweight0.data[2 * body];
-    for (int r = rows.first; r < rows.first + rows.count; ++r) {
-      double* a = columns(f, r, body);
-      store(a, gain * load(a));
-    }
+    for (int r = 0; r < rows.count; ++r)
+      store(columns(f, rows.first + r, body), (side ? right[k] : -right[k]) * axis_of(contact, rows, r).along);
   }
   if (from > 0.0 && to > 0.0) scale_impedance(f, rows, to / from);
 }
@@ -383,7 +470,7 @@ PALPATE void weigh(const Fields& f, Thread, int) {
     const Rows rows = is_mine(f, contact) ? rows_of(f, contact) : Rows{0, 0, false};
     if (!rows.count) continue;
     touched = true;
-    for (int side = 0; side < 2 && f.wrong; ++side)
+    for (int side = 0; side < 2; ++side)
       weigh_side(f, contact, rows, side);
     const Touch touch = touch_of(f, contact);
     if (touch.geom < 0) {
@@ -392,7 +479,7 @@ PALPATE void weigh(const Fields& f, Thread, int) {
       least = unresolved(f, contacts, ncon, touch);
     }
     last = touch;
-    firm_up(f, contact, rows, least);
+    firm_up(f, contact, rows, LEAST * least);
     keep_closed(f, contact, rows);
   }
   const bool projects = f.solver.data[0] == SOLVER_PGS || f.noslip_iterations.data[0] > 0 ||
