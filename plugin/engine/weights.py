@@ -9,7 +9,6 @@ flicker where a tool presses. MuJoCo 4.0 has it right. Both part what slides.
 
 import functools
 
-import os
 import mujoco
 import numpy as np
 import warp as wp
@@ -31,13 +30,10 @@ _CONTACT = (
 # What an organ's contacts follow, of each flex.
 TISSUE = Numbers(
   "TISSUE",
-  ("modulus", 1, "Pa", "young / (1 - poisson^2) of a solid"),
-  ("skin", 1, "N/m", "of the skin: stretch, and bending on a foundation"),
-  ("foundation", 1, "Pa/m", ""),
-  ("edge", 1, "m", "mean length of edges at rest"),
+  ("modulus", 1, "Pa", "young / (1 - poisson^2) of a solid without a skin, else 0"),
+  ("mass", 1, "kg", "mean of the vertices"),
 )
 _tissue: dict[int, tuple] = {}  # by the address of an mjData, see `_tissues`
-FIRM = 0.03  # of a contact, most of its tissue's compliance
 _SPARSE_FROM = 60  # dofs from which MuJoCo's rows are sparse where it may choose
 
 
@@ -97,7 +93,6 @@ weigh = kernel(
   | _offsets("DATA", mjstruct.Data, _DATA)
   | _offsets("CONTACT", mjstruct.Contact, _CONTACT)
   | {
-    "FIRM": float(os.environ.get("FIRM", .99)), "SLOW": float(os.environ.get("SLOW", 4)), "LEAST": float(os.environ.get("LEAST", 1)), "STICK": float(os.environ.get("STICK", 100)),
     "CONTACT_LENGTH": mjstruct.size(mjstruct.Contact),
     "CONTACT_PYRAMIDAL": int(mujoco.mjtConstraint.mjCNSTR_CONTACT_PYRAMIDAL),
     "CONTACT_ELLIPTIC": int(mujoco.mjtConstraint.mjCNSTR_CONTACT_ELLIPTIC),
@@ -187,15 +182,9 @@ def put_tissue(model: int, data: int, instance: int, organ, config):
 def tissue_of(organ, config=None) -> np.ndarray:
   """Returns TISSUE of an organ, as compiled or with another configuration."""
   config = config or organ.config
-  solid, plane = config.elements == "solid", 1 - config.poisson**2
-  young = float(np.mean(config.young))
-  skin = float(np.mean(config.capsule_young or 0.0)) if solid else young
-  rigidity = config.bend * skin * config.thickness**3 / (12 * plane)
-  stretch = config.stiffness if config.elements == "spring" else skin * config.thickness / plane
-  corner = organ.mesh.rest[organ.mesh.elem]
-  edge = np.linalg.norm(corner - corner[:, [1, 2, 0]], axis=2).mean()
-  below = stretch + 8 * np.sqrt(rigidity * config.foundation)  # Winkler's plate under a point
-  return np.array([solid * young / plane, below, config.foundation, edge])
+  bare = config.elements == "solid" and not np.any(config.capsule_young)
+  modulus = bare * float(np.mean(config.young)) / (1 - config.poisson**2)
+  return np.array([modulus, organ.mass[organ.mass > 0].mean()])
 
 
 def launch(weights):

@@ -13,6 +13,10 @@
 
 namespace palpate {
 
+// A contact: the steps in which it closes, and R in the inverse inertia that it meets. Firmer ones
+// chatter; where a step is longer than LONG [s], those as well.
+constexpr double SLOW = 4.0, SOFT = 0.01, LONG = 5e-3;
+
 // How far a mesh yields at a node to a unit force there, times E* and its edges' mean length: that of
 // pressed blocks (tests/benchmarks/truth.py).
 constexpr double SELF = 1.75;
@@ -105,6 +109,15 @@ PALPATE double inverse_inertia(const Fields& f, const char* contact, Rows rows, 
   return sum;
 }
 
+// The inverse inertia of a side that makes a contact as soft as it is: an organ's is that of a vertex.
+template <class Fields>
+PALPATE double lightness(const Fields& f, const char* contact, int side) {
+  const int geom = side_of(contact, CONTACT_GEOM, side), flex = side_of(contact, CONTACT_FLEX, side);
+  if (geom >= 0) return f.body_invweight0.data[2 * f.geom_bodyid.data[geom]];
+  const double mass = f.tissue.data[TISSUE_LENGTH * flex + TISSUE_MASS];
+  return mass > 0.0 ? 1.0 / mass : 0.0;
+}
+
 // Multiplies the inertia that constraints are regularized by: R is a contact's inverse inertia times
 // what does not know of weights (MuJoCo, Computation, Constraint model). Islands have copies.
 template <class Fields>
@@ -121,27 +134,14 @@ PALPATE void scale_impedance(const Fields& f, Rows rows, double gain) {
   }
 }
 
-// Mean length of the edges of what a side of a contact touches [m].
+// Mean length of the edges of the triangle that a side of a contact touches [m].
 template <class Fields>
 PALPATE double edge_of(const Fields& f, const char* contact, int side) {
   const int flex = side_of(contact, CONTACT_FLEX, side), elem = side_of(contact, CONTACT_ELEM, side);
-  if (elem < 0) return f.tissue.data[TISSUE_LENGTH * flex + TISSUE_EDGE];
   const int* e = f.flex_elem.data + f.flex_elemdataadr.data[flex] + 3 * elem;
   const double* x = f.flexvert_xpos.data + 3 * f.flex_vertadr.data[flex];
   const D3 a = load(x + 3 * e[0]), b = load(x + 3 * e[1]), c = load(x + 3 * e[2]);
   return (norm(b - a) + norm(c - b) + norm(a - c)) / 3.0;
-}
-
-// How far the tissue of one side of a contact yields to a unit force [m/N]: an elastic half space, a
-// membrane with bending and a foundation, under a patch as wide as the edges of what is touched.
-template <class Fields>
-PALPATE double yielding(const Fields& f, const char* contact, int side) {
-  const int flex = side_of(contact, CONTACT_FLEX, side);
-  if (flex < 0 || !f.mine.data[flex]) return 0.0;
-  const double* tissue = f.tissue.data + TISSUE_LENGTH * flex;
-  const double edge = edge_of(f, contact, side);
-  const double within = tissue[TISSUE_MODULUS] * edge, below = tissue[TISSUE_FOUNDATION] * edge * edge;
-  return 1.0 / (within + tissue[TISSUE_SKIN] + below);
 }
 
 // A geom's contacts with an organ's flex, which is on one side of them.
@@ -247,7 +247,7 @@ PALPATE double unresolved(const Fields& f, const char* contacts, int ncon, Touch
     f.flags.data[FLAG_COARSE] = (int)(2e6 * radius) + 1;
   double total;
   const double work = work_of(f, dent, total);
-  if (!(modulus > 0.0 && total > 0.0) || tissue[TISSUE_SKIN] > 0.0) return 0.0;
+  if (!(modulus > 0.0 && total > 0.0)) return 0.0;
   double yields = 0.5 / (modulus * size);
   if (round) {
     const double a = cbrt(0.75 * total * radius / modulus);
@@ -271,17 +271,20 @@ PALPATE void firm_up(const Fields& f, char* contact, Rows rows, double least) {
   const double* R = datum<double*>(f, DATA_EFC_R) + rows.first;
   double& mu = *(double*)(contact + CONTACT_MU);  // friction times the root of its R over the normal's
   if (!(row[0] > 0.0) || !(row[2] < 1.0)) return;
-  const double lasts = SLOW * FIRM * f.timestep.data[0];
-  scale_impedance(f, rows, (1.0 - FIRM) / FIRM * row[2] / (1.0 - row[2]));
+  const double lasts = SLOW * f.timestep.data[0];
+  const double meets = lightness(f, contact, 0) + lightness(f, contact, 1);
+  const double found = inverse_inertia(f, contact, rows, 0) + inverse_inertia(f, contact, rows, 1);
+  const double h = f.timestep.data[0], longer = h > LONG ? h * h / (LONG * LONG) : 1.0;
+  scale_impedance(f, rows, longer * SOFT * row[2] / (1.0 - row[2]) * meets / found);
   for (int r = 0; r < rows.count; ++r) {
     double* each = row + 4 * r;
     if (each[0] > 0.0) each[0] = 1.0 / (lasts * lasts);
     each[1] = 2.0 / lasts;
-    each[2] = FIRM;
+    each[2] = 1.0;
   }
   const double stiffness = row[0] * row[2] * (rows.paired ? rows.count : 1);
-  if (!rows.paired && rows.count > 1 && STICK * R[1] > R[0]) {
-    const double gain = R[0] / (STICK * R[1]);
+  if (!rows.paired && h < LONG && R[1] * LONG > R[0] * h) {
+    const double gain = R[0] * h / (R[1] * LONG);
     scale_impedance(f, {rows.first + 1, rows.count - 1, false}, gain);
     mu *= sqrt(gain);
   }
@@ -479,7 +482,7 @@ PALPATE void weigh(const Fields& f, Thread, int) {
       least = unresolved(f, contacts, ncon, touch);
     }
     last = touch;
-    firm_up(f, contact, rows, LEAST * least);
+    firm_up(f, contact, rows, least);
     keep_closed(f, contact, rows);
   }
   const bool projects = f.solver.data[0] == SOLVER_PGS || f.noslip_iterations.data[0] > 0 ||
