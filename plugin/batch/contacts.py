@@ -40,8 +40,8 @@ _SPHERE, _ELLIPSOID, _CAPSULE, _BOX, _PLANE = (wp.constant(kind) for kind in KIN
 _CYLINDER, _MESH = KINDS[5:]
 _FAR = wp.constant(1e10)  # what mujoco_warp says of a contact that is none
 _CONSTRAINT = wp.constant(int(ContactType.CONSTRAINT))
-FIRM = wp.constant(weights.FIRM)
 _LEAST = 1e-5  # friction, as in MuJoCo
+_HARD = (1.0, 1.0, 1.0, 0.5, 2.0)  # solimp; `sliding` makes contacts as soft as they are
 _FEW = 4  # tools; more of them share triangles
 # Whose sliding friction counts: the greater, or that of the one with priority.
 _MIXED = {"margin": (), "slide": (), "whose": (), "condim": (), "friction": (5,), "solref": (2,),
@@ -67,8 +67,6 @@ class Touch:
   friction: Array(vec5, ("ntool",))  # all of it, the sliding one as compiled
   solref: Array(wp.vec2, ("ntool",))
   solimp: Array(vec5, ("ntool",))
-  tissue: Array(wp.vec4, (1,))  # see `weights.TISSUE`
-  yields: floats("naconmax")  # most compliance of a contact [m/N], see native/weights.h
   many: ints("nworld", "nthread")  # contacts that a thread finds, `ring` of them for a slot
   count: ints("nworld")  # of a world
   before: ints("nworld")  # of the worlds before it
@@ -106,7 +104,6 @@ class Place:
   vert: int  # -1 for a triangle
   tool: int  # which of the organ's
   geom: int
-  edge: float  # mean one of the triangle, or of all [m]
 
 
 @wp.func
@@ -150,8 +147,6 @@ def _put(c: Touch, at: Place, n: int, dist: float, pos: wp.vec3, normal: wp.vec3
     c.out_pos[k] = pos
     c.out_frame[k] = _axes(normal)
     c.out_includemargin[k] = c.margin[q]
-    t, e = c.tissue[0], at.edge
-    c.yields[k] = FIRM / (t[0] * e + t[1] + t[2] * e * e)
     slide = c.slide[at.world, q]
     if c.whose[q] == _ORGAN:
       slide = c.rough[at.world]
@@ -205,7 +200,6 @@ def _against(kinds: frozenset[int]):
   def against(
     p: Patch, c: Touch, v: Convex, at: Place, n: int, a: wp.vec3, b: wp.vec3, d: wp.vec3
   ):
-    at.edge = (wp.length(b - a) + wp.length(d - b) + wp.length(a - d)) / 3.0
     pos = p.geom_xpos[at.world, at.geom]
     rot = p.geom_xmat[at.world, at.geom]
     size = c.size[at.tool]
@@ -235,7 +229,7 @@ def _against(kinds: frozenset[int]):
           n = _put(c, at, n, dists2[k], xs2[k], normals2[k])
     if wp.static(_CYLINDER in kinds):
       if kind == wp.static(_CYLINDER):
-        far4, x4, normal4 = cylinder.touch(pos, rot, size, margin + c.radius, a, b, d)
+        far4, x4, normal4 = cylinder.touch(pos, rot, size, margin + c.radius, c.radius, a, b, d)
         gap4 = far4 - c.radius
         n = _put(c, at, n, gap4, x4 - (c.radius + 0.5 * gap4) * normal4, normal4)
     if wp.static(solid):
@@ -259,7 +253,6 @@ def _against(kinds: frozenset[int]):
 @wp.func
 def _on_planes(p: Patch, c: Touch, at: Place, n: int, x: wp.vec3):
   """Writes the contacts of a node with planes; returns how many there are then."""
-  at.edge = c.tissue[0][3]
   for tool in range(p.ntool):
     at.tool = tool
     at.geom = p.tool_geom[tool]
@@ -410,7 +403,6 @@ def make(model: mujoco.MjModel, organ, tools: np.ndarray, place, patch, data):
     rough=np.full(nworld, model.flex_friction[own, 0]),
     slide=np.tile(mixed["slide"], (nworld, 1)),
     ring=ring,
-    tissue=weights.tissue_of(organ)[None], yields=np.zeros(data.naconmax),
     many=np.zeros((nworld, ring * nslot)),
     count=np.zeros(nworld),
     before=np.zeros(nworld),
@@ -428,22 +420,17 @@ def _written() -> list[str]:
 def _mix(model, g: int, f: int) -> dict:
   """Returns the parameters of a contact of a geom and a flex, as mj_contactParam mixes them."""
   mine, other = int(model.geom_priority[g]), int(model.flex_priority[f])
-  solref = np.stack([model.geom_solref[g], model.flex_solref[f]])
-  solimp = np.stack([model.geom_solimp[g], model.flex_solimp[f]])
   friction = np.stack([model.geom_friction[g], model.flex_friction[f]])
   condim = np.array([model.geom_condim[g], model.flex_condim[f]])
   margin = float(model.geom_margin[g] + model.flex_margin[f])
   out = {"margin": margin, "slide": friction[0, 0], "whose": int(_GREATER)}
   if mine != other:
     k = int(other > mine)
-    parts = condim[k], solref[k], solimp[k], friction[k]
+    parts = condim[k], friction[k]
     out["whose"] = int(_ORGAN if k else _TOOL)
   else:
-    a, b = float(model.geom_solmix[g]), float(model.flex_solmix[f])
-    share = a / (a + b) if a + b > 0 else 0.5
-    mixed = share * solref[0] + (1 - share) * solref[1]
-    direct = (solref[:, 0] <= 0).any()
-    ref = solref.min(axis=0) if direct else mixed
-    parts = condim.max(), ref, share * solimp[0] + (1 - share) * solimp[1], friction.max(axis=0)
-  out |= dict(zip(("condim", "solref", "solimp"), parts[:3], strict=True))
-  return out | {"friction": np.maximum(parts[3][[0, 0, 1, 2, 2]], _LEAST)}
+    parts = condim.max(), friction.max(axis=0)
+  out["condim"] = parts[0]
+  out["solref"] = weights.SLOW * model.opt.timestep, 1.0
+  out["solimp"] = _HARD
+  return out | {"friction": np.maximum(parts[1][[0, 0, 1, 2, 2]], _LEAST)}

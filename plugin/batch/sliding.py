@@ -8,9 +8,10 @@ what the gap adds follows from those rows.
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
+import mujoco
 import warp as wp
-from mujoco_warp._src.constraint import _contact_kbimp
 from mujoco_warp._src.types import vec5
+from palpate.engine import weights
 from palpate.tissue.types import Array, floats, ints, struct
 
 
@@ -28,15 +29,10 @@ class Pressed:
   frame: Array(wp.mat33, ("naconmax",))
   friction: Array(vec5, ("naconmax",))
   efc_address: ints("naconmax", "nrow")  # -1 for none
-  timestep: floats("nstep")
-  disableflags: int
-  dist: floats("naconmax")
-  includemargin: floats("naconmax")
-  solref: Array(wp.vec2, ("naconmax",))
-  solimp: Array(vec5, ("naconmax",))
-  yields: floats("naconmax")  # see `Touch`
-  D: floats("nworld", "njmax")  # inverse of the rows' R [kg]
   aref: floats("nworld", "njmax")  # reference acceleration of the rows [m/s^2]
+  soft: floats("ngeom")  # R of a contact of each geom [1/kg]
+  pairs: float  # times that, in a pyramid: 2 / impratio
+  D: floats("nworld", "njmax")  # inverse of the rows' R [kg]
   row_force: floats("nworld", "njmax")  # force of the rows [N]
   # See `Contacts`:
   geom: ints("nworld", "many")
@@ -62,23 +58,20 @@ def _has_rows(p: Pressed, c: int):
 
 @wp.func
 def _firm_up(p: Pressed, world: int, c: int):
-  """Makes a contact as firm as its tissue asks for, see native/weights.h; friction with it."""
-  h = p.timestep[world % p.timestep.shape[0]]
-  gap = p.dist[c] - p.includemargin[c]
-  kbi = _contact_kbimp(p.disableflags, h, p.solref[c], p.solimp[c], gap, False)
-  most = kbi[0] * kbi[2] * p.yields[c]
-  if p.paired == 1:
-    most *= float(_rows(p, c))
-  gain = most * p.D[world, p.efc_address[c, 0]]
-  if gain > 0.0 and gain < 1.0:
-    for r in range(_rows(p, c)):
-      row = p.efc_address[c, r]
-      p.D[world, row] = p.D[world, row] / gain
+  """Makes a contact as firm as under the plugin, see native/weights.h."""
+  R = p.soft[p.contact_geom[c][0]]
+  if p.paired == 1 and p.dim[c] > 1:
+    square = p.friction[c][0] * p.friction[c][0]
+    R *= p.pairs * square * (1.0 + square)
+  gain = 1.0 / (R * p.D[world, p.efc_address[c, 0]])
+  for r in range(_rows(p, c)):
+    row = p.efc_address[c, r]
+    p.D[world, row] = gain * p.D[world, row]
 
 
 @wp.kernel(enable_backward=False)
 def keep_closed(p: Pressed):
-  """Makes contacts firm, and takes the parting of those that slide off their reference."""
+  """Makes contacts firm, and takes the parting of sliding ones off their reference accelerations."""
   world, k = wp.tid()
   if k >= p.count[world]:
     return
@@ -120,22 +113,23 @@ def press(p: Pressed):
   p.force[world, k] = total
 
 
-def make(batch, touch):
+def make(batch, model: mujoco.MjModel, organ, touch):
   """Returns the contacts of an organ.
 
   Args:
     batch: the worlds, with mujoco_warp's data
+    model: the compiled scene
+    organ: the organ's declaration
     touch: how the organ touches its tools
   """
   out, d = Pressed(), batch.d
   out.many, out.paired = touch.most, int(batch.paired)
   out.start, out.before, out.count = touch.start, touch.before, touch.count
-  written = "dist", "includemargin", "solref", "solimp"
-  for name in ("dim", "frame", "friction", "efc_address", *written):
+  for name in ("dim", "frame", "friction", "efc_address"):
     setattr(out, name, getattr(d.contact, name))
+  out.D, out.pairs = d.efc.D, 2.0 / float(model.opt.impratio)
+  out.soft = wp.array(weights.softness(model, organ), dtype=float, device=batch.device)
   out.contact_geom, out.aref, out.row_force = d.contact.geom, d.efc.aref, d.efc.force
-  out.D, out.yields = d.efc.D, touch.yields
-  out.timestep, out.disableflags = batch.m.opt.timestep, int(batch.m.opt.disableflags)
   shape = (batch.nworld, out.many)
   out.geom, out.normal, out.force = (
     wp.zeros(shape, dtype=kind, device=batch.device) for kind in (int, wp.vec3, float)

@@ -16,7 +16,7 @@ import math
 import mujoco
 import numpy as np
 from palpate import windows
-from palpate.engine import mjstruct
+from palpate.engine import mjstruct, weights
 
 from .contacts import KINDS
 
@@ -143,6 +143,7 @@ def strip(
   made = bare.compile()
   made.flex_vert[:] = 0.0  # vertices are where their bodies are
   made.flex_centered[:] = True
+  made.opt.impratio = weights.impratio(made.opt)
   if made.nv <= 60 and made.opt.solver == mujoco.mjtSolver.mjSOL_NEWTON:
     made.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
   _check(model, made, organs, nslots)

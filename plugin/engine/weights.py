@@ -33,6 +33,13 @@ TISSUE = Numbers(
   ("modulus", 1, "Pa", "young / (1 - poisson^2) of a solid without a skin, else 0"),
   ("mass", 1, "kg", "mean of the vertices"),
 )
+# A contact: the steps in which it closes, and its R in the inverse inertia that it meets. Firmer ones
+# chatter; where a step is longer than LONG [s], those as well.
+SLOW, SOFT, LONG = 4.0, 0.01, 5e-3
+# How a triangle is looked at under the flat end of a cylinder: points along an edge; in radii, how far
+# in from the rim they count less, and how far off the end they count; the share of points that carry
+# it in full.
+FLAT = {"POINTS": 6, "RIM": 0.1, "SLACK": 0.01, "COVER": 0.25}
 _tissue: dict[int, tuple] = {}  # by the address of an mjData, see `_tissues`
 _SPARSE_FROM = 60  # dofs from which MuJoCo's rows are sparse where it may choose
 
@@ -93,6 +100,10 @@ weigh = kernel(
   | _offsets("DATA", mjstruct.Data, _DATA)
   | _offsets("CONTACT", mjstruct.Contact, _CONTACT)
   | {
+    "SLOW": SLOW,
+    "SOFT": SOFT,
+    "LONG": LONG,
+    **FLAT,
     "CONTACT_LENGTH": mjstruct.size(mjstruct.Contact),
     "CONTACT_PYRAMIDAL": int(mujoco.mjtConstraint.mjCNSTR_CONTACT_PYRAMIDAL),
     "CONTACT_ELLIPTIC": int(mujoco.mjtConstraint.mjCNSTR_CONTACT_ELLIPTIC),
@@ -185,6 +196,19 @@ def tissue_of(organ, config=None) -> np.ndarray:
   bare = config.elements == "solid" and not np.any(config.capsule_young)
   modulus = bare * float(np.mean(config.young)) / (1 - config.poisson**2)
   return np.array([modulus, organ.mass[organ.mass > 0].mean()])
+
+
+def softness(model: mujoco.MjModel, organ) -> np.ndarray:
+  """Returns R of a contact of each geom with an organ [1/kg], (ngeom,)."""
+  tools = model.body_invweight0[model.geom_bodyid, 0]
+  longer = max(1.0, (model.opt.timestep / LONG) ** 2)
+  return longer * SOFT * (tools + 1 / tissue_of(organ)[TISSUE.mass])
+
+
+def impratio(option: mujoco.MjOption) -> float:
+  """Returns the `impratio` of contacts with organs: the shorter a step, the less sticking creeps."""
+  elliptic = option.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
+  return max(option.impratio, elliptic * LONG / option.timestep)
 
 
 def launch(weights):

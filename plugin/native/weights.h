@@ -13,10 +13,6 @@
 
 namespace palpate {
 
-// A contact: the steps in which it closes, and R in the inverse inertia that it meets. Firmer ones
-// chatter; where a step is longer than LONG [s], those as well.
-constexpr double SLOW = 4.0, SOFT = 0.01, LONG = 5e-3;
-
 // How far a mesh yields at a node to a unit force there, times E* and its edges' mean length: that of
 // pressed blocks (tests/benchmarks/truth.py).
 constexpr double SELF = 1.75;
@@ -26,10 +22,6 @@ constexpr double COARSE = 0.25;
 
 // Most that a tool sinks in, in radii.
 constexpr double DEEPEST = 0.5;
-
-// Points of a triangle along an edge at which it is looked at, and the part of a radius that is its rim.
-constexpr int POINTS = 6;
-constexpr double RIM = 0.1, SLACK = 0.01, COVER = 0.25;
 
 constexpr double PI = 3.14159265358979;
 
@@ -330,8 +322,8 @@ PALPATE bool under_end(const Fields& f, int geom, double radius, const D3* x, D3
       const double high = dot(at, out), depth = size[1] + radius - high;
       const double inside = (size[0] + radius - norm(at - high * out) - depth) / (RIM * size[0]);
       if (!(depth > -slack && inside > 0.0)) continue;
-      const double counts = (depth + slack) * (inside < 1.0 ? inside : 1.0);
-      covered += inside < 1.0 ? inside : 1.0;
+      const double part = inside < 1.0 ? inside : 1.0, counts = (depth + slack) * part;
+      covered += part;
       sum += counts * D3{1.0 - u - v, u, v};
       total += counts;
     }
@@ -386,7 +378,8 @@ PALPATE void weigh_side(const Fields& f, char* contact, Rows rows, int side) {
   D3 w, out;
   double gap;
   if (under_end(f, side_of(contact, CONTACT_GEOM, 1 - side), f.flex_radius.data[flex], x, w, gap, out))
-    put(f, contact, rows, 1 - side, blend(x, w), side ? out : -1.0 * out, gap);
+    put(f, contact, rows, 1 - side, blend(x, w) - (f.flex_radius.data[flex] + 0.5 * gap) * out,
+        side ? out : -1.0 * out, gap);
   else
     w = barycentric(load(pos_of(contact)), x);
   const double before = inverse_inertia(f, contact, rows, 1 - side);
