@@ -128,7 +128,7 @@ def make(batch, model: mujoco.MjModel, organ, touch):
   for name in ("dim", "frame", "friction", "efc_address"):
     setattr(out, name, getattr(d.contact, name))
   out.D, out.pairs = d.efc.D, 2.0 / float(model.opt.impratio)
-  out.soft = wp.array(weights.softness(model, organ), dtype=float, device=batch.device)
+  out.soft = wp.array(weights.softness(model, organ)[0], dtype=float, device=batch.device)
   out.contact_geom, out.aref, out.row_force = d.contact.geom, d.efc.aref, d.efc.force
   shape = (batch.nworld, out.many)
   out.geom, out.normal, out.force = (

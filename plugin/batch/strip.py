@@ -143,7 +143,9 @@ def strip(
   made = bare.compile()
   made.flex_vert[:] = 0.0  # vertices are where their bodies are
   made.flex_centered[:] = True
-  made.opt.impratio = weights.impratio(made.opt)
+  if made.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC:
+    sticks = max(weights.softness(model, organ)[1] for organ in organs)
+    made.opt.impratio = max(made.opt.impratio, sticks)
   if made.nv <= 60 and made.opt.solver == mujoco.mjtSolver.mjSOL_NEWTON:
     made.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
   _check(model, made, organs, nslots)

@@ -24,18 +24,20 @@ _DATA = (
   *("map_efc2iefc", "iefc_R", "iefc_D"),
 )
 _CONTACT = (
-  *("dist", "pos", "frame", "friction", "mu", "dim", "geom", "flex", "elem", "vert", "exclude"),
+  *("dist", "pos", "frame", "friction", "solref", "solimp", "mu", "dim", "geom", "flex", "elem", "vert", "exclude"),
   "efc_address",
 )
 # What an organ's contacts follow, of each flex.
 TISSUE = Numbers(
   "TISSUE",
   ("modulus", 1, "Pa", "young / (1 - poisson^2) of a solid without a skin, else 0"),
-  ("mass", 1, "kg", "mean of the vertices"),
+  ("yields", 1, "m/N", "compliance under a patch as wide as an edge"),
+  ("mass", 1, "kg", "mean of the vertices that move"),
 )
-# A contact: the steps in which it closes, and its R in the inverse inertia that it meets. Firmer ones
-# chatter; where a step is longer than LONG [s], those as well.
-SLOW, SOFT, LONG = 4.0, 0.01, 5e-3
+# A contact: the steps in which it closes; of its tissue's compliance, how much it has; and the least R
+# in the inverse inertia that it meets. Firmer ones chatter, from steps of LONG [s] on those as well.
+SLOW, FIRM, SOFT, LONG = 4.0, 0.03, 0.0075, 5e-3
+STUCK = 0.2  # of that, least R of friction
 # How a triangle is looked at under the flat end of a cylinder: points along an edge; in radii, how far
 # in from the rim they count less, and how far off the end they count; the share of points that carry
 # it in full.
@@ -58,6 +60,8 @@ class Weights:
   # mjOption:
   jacobian: ints(1)
   timestep: doubles(1)
+  impratio: doubles(1)
+  integrator: ints(1)
   solver: ints(1)
   noslip_iterations: ints(1)
   enableflags: ints(1)
@@ -101,8 +105,10 @@ weigh = kernel(
   | _offsets("CONTACT", mjstruct.Contact, _CONTACT)
   | {
     "SLOW": SLOW,
+    "FIRM": FIRM,
     "SOFT": SOFT,
     "LONG": LONG,
+    "STUCK": STUCK,
     **FLAT,
     "CONTACT_LENGTH": mjstruct.size(mjstruct.Contact),
     "CONTACT_PYRAMIDAL": int(mujoco.mjtConstraint.mjCNSTR_CONTACT_PYRAMIDAL),
@@ -110,6 +116,7 @@ weigh = kernel(
     "JACOBIAN_DENSE": int(mujoco.mjtJacobian.mjJAC_DENSE),
     "JACOBIAN_AUTO": int(mujoco.mjtJacobian.mjJAC_AUTO),
     "SPARSE_FROM": _SPARSE_FROM,
+    "INTEGRATOR_DISCRETE": int(getattr(mujoco.mjtIntegrator, "mjINT_DISCRETE", -1)),
     "SOLVER_PGS": int(mujoco.mjtSolver.mjSOL_PGS),
     "ENABLE_DIAGEXACT": int(mujoco.mjtEnableBit.mjENBL_DIAGEXACT),
   },
@@ -191,24 +198,41 @@ def put_tissue(model: int, data: int, instance: int, organ, config):
 
 
 def tissue_of(organ, config=None) -> np.ndarray:
-  """Returns TISSUE of an organ, as compiled or with another configuration."""
+  """Returns TISSUE of an organ, as compiled or with another configuration.
+
+  Its compliance is that of an elastic half space, a membrane with bending (Winkler's plate under a
+  point) and a foundation, side by side.
+  """
   config = config or organ.config
-  bare = config.elements == "solid" and not np.any(config.capsule_young)
-  modulus = bare * float(np.mean(config.young)) / (1 - config.poisson**2)
-  return np.array([modulus, organ.mass[organ.mass > 0].mean()])
+  solid, plane = config.elements == "solid", 1 - config.poisson**2
+  young = float(np.mean(config.young))
+  skin = float(np.mean(config.capsule_young or 0.0)) if solid else young
+  rigidity = config.bend * skin * config.thickness**3 / (12 * plane)
+  stretch = config.stiffness if config.elements == "spring" else skin * config.thickness / plane
+  corner = organ.mesh.rest[organ.mesh.elem]
+  edge = np.linalg.norm(corner - corner[:, [1, 2, 0]], axis=2).mean()
+  within, below = solid * young / plane * edge, config.foundation * edge**2
+  stiffness = within + stretch + 8 * np.sqrt(rigidity * config.foundation) + below
+  bare = 0.0 if stretch else solid * young / plane
+  return np.array([bare, 1 / stiffness, organ.mass[organ.free].mean()])
 
 
-def softness(model: mujoco.MjModel, organ) -> np.ndarray:
-  """Returns R of a contact of each geom with an organ [1/kg], (ngeom,)."""
-  tools = model.body_invweight0[model.geom_bodyid, 0]
-  longer = max(1.0, (model.opt.timestep / LONG) ** 2)
-  return longer * SOFT * (tools + 1 / tissue_of(organ)[TISSUE.mass])
+def softness(model: mujoco.MjModel, organ) -> tuple[np.ndarray, float]:
+  """Returns R of contacts of each geom with an organ, and what that of friction is less.
 
+  Args:
+    model: the mjModel
+    organ: the organ's declaration
 
-def impratio(option: mujoco.MjOption) -> float:
-  """Returns the `impratio` of contacts with organs: the shorter a step, the less sticking creeps."""
-  elliptic = option.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
-  return max(option.impratio, elliptic * LONG / option.timestep)
+  Returns:
+    R [1/kg], (ngeom,); the `impratio` where the cone is elliptic
+  """
+  h, tissue = float(model.opt.timestep), tissue_of(organ)
+  node = 1 / tissue[TISSUE.mass]
+  borne = max(1.0, (h / LONG) ** 2) * SOFT * (model.body_invweight0[model.geom_bodyid, 0] + node)
+  asked = FIRM * tissue[TISSUE.yields] / (SLOW * h) ** 2
+  stuck = min(1.0, max(STUCK, h / LONG))
+  return np.maximum(borne, asked), max(1.0, asked / (SOFT * node)) / stuck
 
 
 def launch(weights):

@@ -126,7 +126,7 @@ PALPATE void scale_impedance(const Fields& f, Rows rows, double gain) {
   }
 }
 
-// Mean length of the edges of the triangle that a side of a contact touches [m].
+// Mean length of the edges of the triangle on a side of a contact [m].
 template <class Fields>
 PALPATE double edge_of(const Fields& f, const char* contact, int side) {
   const int flex = side_of(contact, CONTACT_FLEX, side), elem = side_of(contact, CONTACT_ELEM, side);
@@ -134,6 +134,13 @@ PALPATE double edge_of(const Fields& f, const char* contact, int side) {
   const double* x = f.flexvert_xpos.data + 3 * f.flex_vertadr.data[flex];
   const D3 a = load(x + 3 * e[0]), b = load(x + 3 * e[1]), c = load(x + 3 * e[2]);
   return (norm(b - a) + norm(c - b) + norm(a - c)) / 3.0;
+}
+
+// How far the tissue of one side of a contact yields to a unit force [m/N].
+template <class Fields>
+PALPATE double yielding(const Fields& f, const char* contact, int side) {
+  const int flex = side_of(contact, CONTACT_FLEX, side);
+  return flex >= 0 && f.mine.data[flex] ? f.tissue.data[TISSUE_LENGTH * flex + TISSUE_YIELDS] : 0.0;
 }
 
 // A geom's contacts with an organ's flex, which is on one side of them.
@@ -253,37 +260,52 @@ PALPATE double unresolved(const Fields& f, const char* contacts, int ncon, Touch
   return lacks > 0.0 ? lacks * dent.gaps / dent.deepest : 0.0;  // contacts in parallel
 }
 
-// Makes a contact as firm as its time step allows, whatever its nodes weigh and its solref and solimp
-// say. Friction is STICK times firmer, since what sticks creeps at a speed in proportion to its R; in
-// a pyramid it has no R of its own (MuJoCo, Computation, Constraint model). Then the normal yields by
-// `least` [m/N] at least. Done twice it does nothing.
+// What the discrete integrator divides R by: what a spring and damper do within the step. It makes rows
+// again, from the contact's solref and solimp.
+template <class Fields>
+PALPATE double within_step(const Fields& f, double stiffness, double damping) {
+  const double h = f.timestep.data[0];
+  return f.integrator.data[0] == INTEGRATOR_DISCRETE ? 1.0 + h * damping + h * h * stiffness : 1.0;
+}
+
+// Makes a contact as firm as its tissue asks for and the time step can bear, whatever its nodes weigh
+// and its solref and solimp say; and at least `least` [m/N] soft. At rest its force is gap / compliance
+// with R = compliance * stiffness, of which the rows of a pyramid have a part each. Friction is firmer
+// the shorter the step, since what sticks creeps at a speed in proportion to its R; in a pyramid it has
+// no R of its own (MuJoCo, Computation, Constraint model). Done twice it does nothing.
 template <class Fields>
 PALPATE void firm_up(const Fields& f, char* contact, Rows rows, double least) {
   double* row = datum<double*>(f, DATA_EFC_KBIP) + 4 * rows.first;
   const double* R = datum<double*>(f, DATA_EFC_R) + rows.first;
-  double& mu = *(double*)(contact + CONTACT_MU);  // friction times the root of its R over the normal's
   if (!(row[0] > 0.0) || !(row[2] < 1.0)) return;
-  const double lasts = SLOW * f.timestep.data[0];
-  const double meets = lightness(f, contact, 0) + lightness(f, contact, 1);
-  const double found = inverse_inertia(f, contact, rows, 0) + inverse_inertia(f, contact, rows, 1);
+  const double* friction = (const double*)(contact + CONTACT_FRICTION);
   const double h = f.timestep.data[0], longer = h > LONG ? h * h / (LONG * LONG) : 1.0;
-  scale_impedance(f, rows, longer * SOFT * row[2] / (1.0 - row[2]) * meets / found);
+  const double damping = 2.0 / (SLOW * h), stiffness = 0.25 * damping * damping;
+  const double borne = longer * SOFT * (lightness(f, contact, 0) + lightness(f, contact, 1));
+  const double asked = FIRM * stiffness * (yielding(f, contact, 0) + yielding(f, contact, 1));
+  const double square = friction[0] * friction[0];
+  const double pair = rows.paired ? 2.0 * square * (1.0 + square) / f.impratio.data[0] : 1.0;
+  const double soft = pair * (borne > asked ? borne : asked);
+  const double more = (rows.paired ? rows.count : 1) * stiffness * least;
+  const double wanted = more > soft ? more : soft, now = within_step(f, stiffness, damping);
+  const double whole = R[0] * within_step(f, row[0] * row[2], row[1]) * row[2] / (1.0 - row[2]);
+  double* solref = (double*)(contact + CONTACT_SOLREF);
+  double* solimp = (double*)(contact + CONTACT_SOLIMP);
+  solref[0] = SLOW * h;
+  solref[1] = 1.0;
+  solimp[0] = solimp[1] = whole / (whole + wanted);
+  if (!rows.paired && rows.count > 1) {
+    const double stuck = h > LONG ? 1.0 : h > STUCK * LONG ? h / LONG : STUCK;
+    const double ratio = R[1] / R[0] < stuck ? R[1] / R[0] : stuck;
+    scale_impedance(f, {rows.first + 1, rows.count - 1, false}, ratio * borne / (now * R[1]));
+    *(double*)(contact + CONTACT_MU) = friction[0] * sqrt(ratio * borne / wanted);
+  }
+  scale_impedance(f, {rows.first, rows.paired ? rows.count : 1, false}, wanted / (now * R[0]));
   for (int r = 0; r < rows.count; ++r) {
     double* each = row + 4 * r;
-    if (each[0] > 0.0) each[0] = 1.0 / (lasts * lasts);
-    each[1] = 2.0 / lasts;
+    if (each[0] > 0.0) each[0] = stiffness;
+    each[1] = damping;
     each[2] = 1.0;
-  }
-  const double stiffness = row[0] * row[2] * (rows.paired ? rows.count : 1);
-  if (!rows.paired && h < LONG && R[1] * LONG > R[0] * h) {
-    const double gain = R[0] * h / (R[1] * LONG);
-    scale_impedance(f, {rows.first + 1, rows.count - 1, false}, gain);
-    mu *= sqrt(gain);
-  }
-  if (R[0] < stiffness * least) {
-    const double gain = stiffness * least / R[0];
-    scale_impedance(f, {rows.first, rows.paired ? rows.count : 1, false}, gain);
-    if (!rows.paired) mu /= sqrt(gain);
   }
 }
 
@@ -390,8 +412,12 @@ PALPATE void weigh_side(const Fields& f, char* contact, Rows rows, int side) {
     if (!columns(f, rows.first, body)) continue;
     from += weight_of(f, rows, body, 0.0) * f.body_invweight0.data[2 * body];
     to += right[k] * f.body_invweight0.data[2 * body];
-    for (int r = 0; r < rows.count; ++r)
-      store(columns(f, rows.first + r, body), (side ? right[k] : -right[k]) * axis_of(contact, rows, r).along);
+    const double* slides = f.cdof.data + 6 * f.body_dofadr.data[body] + 3;
+    for (int r = 0; r < rows.count; ++r) {
+      const D3 along = (side ? right[k] : -right[k]) * axis_of(contact, rows, r).along;
+      store(columns(f, rows.first + r, body),
+            {dot(along, load(slides)), dot(along, load(slides + 6)), dot(along, load(slides + 12))});
+    }
   }
   if (from > 0.0 && to > 0.0) scale_impedance(f, rows, to / from);
 }

@@ -18,7 +18,7 @@ def find(
 ):
   i = wp.tid()
   far, x, n = cylinder.touch(
-    wp.vec3(0.01, 0.02, 0.03), axes[i], wp.vec3(0.0025, 0.006, 0.0), 1.0,
+    wp.vec3(0.01, 0.02, 0.03), axes[i], wp.vec3(0.0025, 0.006, 0.0), 1.0, 0.0,
     corner[i, 0], corner[i, 1], corner[i, 2],
   )  # fmt: skip
   dist[i] = far
