@@ -478,6 +478,12 @@ PALPATE bool is_mine(const Fields& f, const char* contact) {
   return false;
 }
 
+// Whether a side of a contact is a geom. Where two organs lie flat on each other MuJoCo has one contact a
+// pair of triangles, which jumps about: firm ones would shake them.
+PALPATE bool has_geom(const char* contact) {
+  return side_of(contact, CONTACT_GEOM, 0) >= 0 || side_of(contact, CONTACT_GEOM, 1) >= 0;
+}
+
 // Gives contacts with an organ their rows, and flags that what MuJoCo has computed of them for its dual
 // solvers has to be computed again. Done twice it does nothing.
 template <class Fields>
@@ -501,7 +507,7 @@ PALPATE void weigh(const Fields& f, Thread, int) {
       least = unresolved(f, contacts, ncon, touch);
     }
     last = touch;
-    firm_up(f, contact, rows, least);
+    if (has_geom(contact)) firm_up(f, contact, rows, least);
     keep_closed(f, contact, rows);
   }
   const bool projects = f.solver.data[0] == SOLVER_PGS || f.noslip_iterations.data[0] > 0 ||
