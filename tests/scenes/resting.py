@@ -59,7 +59,7 @@ def resting(kind, h=1e-3, mesh=None, mass=0.064, press=0.1, coupling="nodal", co
       lower = spec.worldbody.add_body(name="lower", pos=[0, 0, low[2] - 0.0105])
       lower.add_geom(type=_BOX, size=[0.1, 0.1, 0.01], condim=condim)
     else:
-      made["pin"] = np.flatnonzero(mesh.vertices[:, 2] < low[2] + 1e-4).tolist()
+      made.setdefault("pin", np.flatnonzero(mesh.vertices[:, 2] < low[2] + 1e-4).tolist())
   if coupling == "window":
     tools = {"plate": ["press"], "cylinder": ["press"], "plates": [["press", "lower"]]}
     made["windows"] = {"tools": tools.get(kind), "nodes": 200}
