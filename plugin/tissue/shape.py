@@ -179,6 +179,7 @@ def arrays(
     "area": _node_values(topology.held_areas(mesh), vert),
     "closed": int(mesh.closed),
     "volume0": topology.volume(mesh.rest, mesh.elem) if mesh.closed else 0.0,
+    "unheld": int(not (config.held or config.carrier or mesh.spare or pinned.any())),
     "stride": 0,
     "mesh": np.zeros(0, np.int32),
     "shortest": 0.0 if mesh.spare else topology.shortest(mesh),

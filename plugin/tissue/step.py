@@ -100,6 +100,7 @@ _direct_step = _scheme("direct", BLOCK)
 _solve = kernel("solve", "pcg.h", Fields, _CONSTANTS, (BLOCK, 1))
 _solve_solid = kernel("solve_solid", "solid_solve.h", Fields, _CONSTANTS, (BLOCK, 1))
 _solve_solids = kernel("solve_solids", "solid_solve.h", Fields, _CONSTANTS, (BLOCK, 1))
+_keep_spin = kernel("keep_spin", "momentum.h", Fields, _CONSTANTS, (BLOCK, 1))
 _sample = kernel("sample", "multigrid.h", Cycle, _CONSTANTS)
 _solve_cycles = kernel("solve_cycles", "multigrid.h", Cycle, _CONSTANTS, (BLOCK, _CYCLES_PER_SM))
 
@@ -239,6 +240,7 @@ def solve(body: Body, stage: Stage):
 def _implicit(body: Body):
   if body.plan:
     _by_block(body, body.plan, Stage.FIRST)
+    _keep_momentum(body)
     return
   body.system.change.zero_()
   nslice = body.shape.nslice
@@ -255,6 +257,13 @@ def _iterate(body: Body, kind: int = 0):
     solve(body, stage)
     flags = kind + _FIRST * (it == 0) + _MORE * (it + 1 < body.newton)
     _over(_newton_update, body, body.shape.nslice, flags)
+  _keep_momentum(body)
+
+
+def _keep_momentum(body: Body):
+  """Gives an organ that nothing holds the angular momentum that the forces on it leave it."""
+  if body.shape.unheld:
+    _together(_keep_spin, body, 0)
 
 
 def _midpoint(body: Body):
