@@ -1,16 +1,16 @@
 // Keeps the angular momentum of an organ that nothing holds.
 //
-// Nodes end a step at x + h (v + dv), where their angular momentum is sum m x ^ (v + dv): x ^ dv is
-// what it changes by, of which the forces f that act on the organ have h x ^ f. What the tissue adds
-// must be none, but in an implicit step it is, for its forces are those of another place than x:
-// Euler's takes the share (h omega)^2 a step. A slow rotation gives it back. Linear momentum is kept.
+// A step takes nodes from x to x + h (v + dv). Their angular momentum there is the sum of m x ^ (v + dv), so
+// that it changes by the sum of m x ^ dv. The forces f on the organ account for h x ^ f, and those of the tissue
+// must add nothing. In an implicit step they do, because they belong to another place than x: Euler's loses the
+// share (h omega)^2 of a rotation. A rigid rotation about the centre of mass gives back what is missing.
 #pragma once
 #include "group.h"
 #include "spin.h"
 
 namespace palpate {
 
-// Three sums over a group.
+// The sum of a vector over a group.
 template <class Team>
 PALPATE D3 sum3(Team& group, V3 v) {
   float x, y, z;
@@ -18,6 +18,7 @@ PALPATE D3 sum3(Team& group, V3 v) {
   return {x, y, z};
 }
 
+// Corrects `dvel`; nothing where springs hold nodes, or a foundation that may change while running.
 template <class Fields>
 PALPATE void keep_spin(const Fields& f, Thread t, int) {
   const float h = f.state.step.data[4 * t.world];
@@ -55,7 +56,7 @@ PALPATE void keep_spin(const Fields& f, Thread t, int) {
   const D3 spin = sum3(group, lost), q = sum3(group, square), p = sum3(group, mixed);
   double inertia[3][3] = {{q.y + q.z, -p.z, -p.y}, {-p.z, q.z + q.x, -p.x}, {-p.y, -p.x, q.x + q.y}};
   const D3 turn = rotation_of(inertia, spin);
-  if (turn.x != turn.x || turn.y != turn.y || turn.z != turn.z) return;  // the status says so
+  if (turn.x != turn.x || turn.y != turn.y || turn.z != turn.z) return;  // the solve has failed, which its status says
   const V3 omega = {splat((float)turn.x), splat((float)turn.y), splat((float)turn.z)};
   group.each(0, f.shape.nused, [&](int s, Lane lane) {
     const V3 back = cross(omega, place(s, lane) - centre);
