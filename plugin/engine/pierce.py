@@ -255,7 +255,7 @@ class Watch:
     return new
 
   def stuck(self, w) -> int:
-    """Returns how many tetrahedra are inside out, and were at the last look; 0 once that is said."""
+    """Returns how many tetrahedra are inside out as at the last look; 0 once that is said."""
     mesh, before = w.organ.mesh, self._inverted
     if not len(mesh.tet) or self._steps % _EVERY != 1 or (before is not None and not before.size):
       return 0
@@ -266,7 +266,7 @@ class Watch:
 
 
 def _inside_out(x: np.ndarray, tet: np.ndarray) -> np.ndarray:
-  """Returns which tetrahedra have no volume or a negative one, (ntet,) bool, in the time of a step."""
+  """Returns which tetrahedra have no volume or a negative one, (ntet,) bool."""
   corner = x.T[:, tet.T]
   (ax, bx, cx), (ay, by, cy), (az, bz, cz) = corner[:, 1:] - corner[:, :1]
   return ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx) <= 0

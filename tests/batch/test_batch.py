@@ -143,7 +143,7 @@ def test_a_world_goes_out_to_the_plugin_and_back(make, window):
 @pytest.mark.parametrize("h", [1e-3, 5e-3])
 def test_a_spinning_organ_keeps_its_angular_momentum(make, h):
   # The tool stays aside, and no foundation holds the sphere.
-  model, data, organ = load(probed(keys={"foundation": 0}, h=h))
+  _, data, organ = load(probed(keys={"foundation": 0}, h=h))
   batch, mass = make(probed(keys={"foundation": 0}, h=h), 2), masses(organ)[:, None]
   organ.set_state(organ.xpos, np.cross([1.0, 2.0, 6.0], organ.xpos))
   batch.set_state(1, data)
