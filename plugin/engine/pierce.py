@@ -213,6 +213,8 @@ def speeds(m, model: int, data: int, organ, flags: np.ndarray) -> Speeds:
 class Watch:
   """Looks now and then whether a tool has come through, and all along the way of a fast one.
 
+  And whether tetrahedra stay inside out.
+
   Attributes:
     crossed: geoms that went in and out again between two looks
   """
@@ -223,6 +225,7 @@ class Watch:
     self._inside: set[int] | None = None
     self._said: set[int] = set()
     self._steps = 0
+    self._inverted: np.ndarray | None = None
 
   def due(self, fast: int) -> bool:
     """Counts a step; returns whether it is time to look."""
@@ -250,6 +253,23 @@ class Watch:
     new = sorted(found - before - self._said)
     self._said.update(new)
     return new
+
+  def stuck(self, w) -> int:
+    """Returns how many tetrahedra are inside out as at the last look; 0 once that is said."""
+    mesh, before = w.organ.mesh, self._inverted
+    if not len(mesh.tet) or self._steps % _EVERY != 1 or (before is not None and not before.size):
+      return 0
+    found = _inside_out(mesh.rest + w.phases.motion()[0], mesh.tet)
+    stay = int((found & before).sum()) if before is not None and len(before) == len(found) else 0
+    self._inverted = found[:0] if stay else found
+    return stay
+
+
+def _inside_out(x: np.ndarray, tet: np.ndarray) -> np.ndarray:
+  """Returns which tetrahedra have no volume or a negative one, (ntet,) bool."""
+  corner = x.T[:, tet.T]
+  (ax, bx, cx), (ay, by, cy), (az, bz, cz) = corner[:, 1:] - corner[:, :1]
+  return ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx) <= 0
 
 
 def _displacement(m, d, w) -> np.ndarray:

@@ -281,7 +281,13 @@ def _fail(w: Workspace, error: BaseException) -> bool:
 
 
 def _watch(w: Workspace):
-  """Warns of tools that have come through the surface."""
+  """Warns of tools that have come through the surface, and of tetrahedra that stay inside out."""
+  if stuck := w.watch.stuck(w):
+    warn(
+      f"organ {w.organ.name!r}: {stuck} of {len(w.organ.mesh.tet)} tetrahedra are inside out and "
+      "do not recover: the tissue is crushed or was placed so; a smaller time step, newton of 2 or "
+      "3 or a greater young may keep them from it, a reset puts them right"
+    )
   for geom in w.watch.look(w):
     m = mjstruct.Model.from_address(w.model)
     name = mjstruct.name_of(m, m.name_geomadr, geom) or geom

@@ -20,9 +20,11 @@ constexpr double CHANGE = 0.005, COHERENT = 0.7, FASTER = 2.0;
 // Time without motion and force after which an organ sleeps [s].
 constexpr double QUIET = 0.2;
 
-// h^2 + h damping, `eased` times h taken off the damping where that is no more than MOST of it.
+// h^2 + h damping, `eased` times h taken off the damping where that is no more than MOST of it. Where
+// `eased` is negative, the damping is no less than so many h.
 PALPATE double weight_of_stiffness(double h, double damping, double eased) {
   constexpr double MOST = 0.5;
+  if (eased < 0.0) return h * h + h * (damping > -eased * h ? damping : -eased * h);
   const double taken = eased * h < MOST * damping ? eased * h : MOST * damping;
   return h * h + h * (damping - taken);
 }

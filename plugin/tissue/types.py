@@ -134,6 +134,7 @@ class Shape:
   nedgeslice: int  # slices of their edges; 0 but for solids
   nslot: int  # rows of stiffness blocks
   closed: int  # whether the surface encloses a volume
+  unheld: int  # whether nothing holds the organ, nor cuts part it, so that it may spin
   stride: int  # words from a mesh to the next, where worlds have their own, see `meshes`
   volume0: float  # rest volume [m^3]; 0 for an open surface
   shortest: float  # no edge is shorter at rest [m]; 0 where cuts may come
