@@ -34,10 +34,11 @@ TISSUE = Numbers(
   ("yields", 1, "m/N", "compliance under a patch as wide as an edge"),
   ("mass", 1, "kg", "mean of the vertices that move"),
 )
-# A contact: the steps in which it closes; of its tissue's compliance, how much it has; and the least R
-# in the inverse inertia that it meets. Firmer ones chatter, from steps of LONG [s] on those as well.
-SLOW, FIRM, SOFT, LONG = 4.0, 0.03, 0.0075, 5e-3
-STUCK = 0.2  # of that, least R of friction
+# A contact: the steps in which it closes; of its tissue's compliance, how much it has; the least R in
+# the inverse inertia that it meets, since firmer ones chatter, and of that the least R of friction.
+SLOW, FIRM, SOFT, STUCK = 4.0, 0.03, 0.0075, 0.2
+# From where on contacts are softer: a step [s], and times its mass that a vertex has in stiff tissue.
+LONG, STIFF = 5e-3, 1000.0
 # How a triangle is looked at under the flat end of a cylinder: points along an edge; in radii, how far
 # in from the rim they count less, and how far off the end they count; the share of points that carry
 # it in full.
@@ -109,6 +110,7 @@ weigh = kernel(
     "SOFT": SOFT,
     "LONG": LONG,
     "STUCK": STUCK,
+    "STIFF": STIFF,
     **FLAT,
     "CONTACT_LENGTH": mjstruct.size(mjstruct.Contact),
     "CONTACT_PYRAMIDAL": int(mujoco.mjtConstraint.mjCNSTR_CONTACT_PYRAMIDAL),
@@ -228,9 +230,10 @@ def softness(model: mujoco.MjModel, organ) -> tuple[np.ndarray, float]:
     R [1/kg], (ngeom,); the `impratio` where the cone is elliptic
   """
   h, tissue = float(model.opt.timestep), tissue_of(organ)
-  node = 1 / tissue[TISSUE.mass]
-  borne = max(1.0, (h / LONG) ** 2) * SOFT * (model.body_invweight0[model.geom_bodyid, 0] + node)
-  asked = FIRM * tissue[TISSUE.yields] / (SLOW * h) ** 2
+  mass, yields = tissue[TISSUE.mass], tissue[TISSUE.yields]
+  node = max(1.0, (h / LONG) ** 2) * max(1.0, h**2 / (STIFF * yields * mass)) / mass
+  borne = SOFT * (model.body_invweight0[model.geom_bodyid, 0] + node)
+  asked = FIRM * yields / (SLOW * h) ** 2
   stuck = min(1.0, max(STUCK, h / LONG))
   return np.maximum(borne, asked), max(1.0, asked / (SOFT * node)) / stuck
 

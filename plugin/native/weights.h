@@ -101,13 +101,17 @@ PALPATE double inverse_inertia(const Fields& f, const char* contact, Rows rows, 
   return sum;
 }
 
-// The inverse inertia of a side that makes a contact as soft as it is: an organ's is that of a vertex.
+// The least R of a contact that a side can bear: in the inverse inertia of a geom, or of an organ's
+// vertex; more where a step is long, or moves a vertex of stiff tissue by much less than a free one.
 template <class Fields>
-PALPATE double lightness(const Fields& f, const char* contact, int side) {
+PALPATE double borne_by(const Fields& f, const char* contact, int side) {
   const int geom = side_of(contact, CONTACT_GEOM, side), flex = side_of(contact, CONTACT_FLEX, side);
-  if (geom >= 0) return f.body_invweight0.data[2 * f.geom_bodyid.data[geom]];
-  const double mass = f.tissue.data[TISSUE_LENGTH * flex + TISSUE_MASS];
-  return mass > 0.0 ? 1.0 / mass : 0.0;
+  if (geom >= 0) return SOFT * f.body_invweight0.data[2 * f.geom_bodyid.data[geom]];
+  const double* tissue = f.tissue.data + TISSUE_LENGTH * flex;
+  if (!(tissue[TISSUE_MASS] > 0.0)) return 0.0;
+  const double h = f.timestep.data[0], late = h * h / (LONG * LONG);
+  const double stiff = h * h / (STIFF * tissue[TISSUE_YIELDS] * tissue[TISSUE_MASS]);
+  return SOFT / tissue[TISSUE_MASS] * (late > 1.0 ? late : 1.0) * (stiff > 1.0 ? stiff : 1.0);
 }
 
 // Multiplies the inertia that constraints are regularized by: R is a contact's inverse inertia times
@@ -279,10 +283,10 @@ PALPATE void firm_up(const Fields& f, char* contact, Rows rows, double least) {
   const double* R = datum<double*>(f, DATA_EFC_R) + rows.first;
   if (!(row[0] > 0.0) || !(row[2] < 1.0)) return;
   const double* friction = (const double*)(contact + CONTACT_FRICTION);
-  const double h = f.timestep.data[0], longer = h > LONG ? h * h / (LONG * LONG) : 1.0;
-  const double damping = 2.0 / (SLOW * h), stiffness = 0.25 * damping * damping;
-  const double borne = longer * SOFT * (lightness(f, contact, 0) + lightness(f, contact, 1));
-  const double asked = FIRM * stiffness * (yielding(f, contact, 0) + yielding(f, contact, 1));
+  const double h = f.timestep.data[0], damping = 2.0 / (SLOW * h), stiffness = 0.25 * damping * damping;
+  const double borne = borne_by(f, contact, 0) + borne_by(f, contact, 1);
+  const double yields = yielding(f, contact, 0) + yielding(f, contact, 1);
+  const double asked = FIRM * stiffness * yields;
   const double square = friction[0] * friction[0];
   const double pair = rows.paired ? 2.0 * square * (1.0 + square) / f.impratio.data[0] : 1.0;
   const double soft = pair * (borne > asked ? borne : asked);
