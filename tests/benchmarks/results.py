@@ -186,8 +186,12 @@ def page(path: pathlib.Path, title: str, about: dict, lines: list[str]) -> pathl
   """
   command = f"    python tests/benchmarks/run.py {about.get('bench', path.stem)}"
   command += " --short" if about.get("short") else ""
-  options = {k: v for k, v in about.get("options", {}).items() if k in ("device",) and v != "cpu"}
-  command += "".join(f" --{key} {value}" for key, value in options.items())
+  options = about.get("options", {})
+  command += "".join(
+    f" --{key} {options[key]}"
+    for key in ("device", "beside")
+    if options.get(key, "None") not in ("None", "cpu")
+  )
   known = [word for line in (caption(about), command) if line for word in (line, "")]
   text = "\n".join([f"# {title}", "", *known, *lines]).rstrip("\n") + "\n"
   before = path.read_text(encoding="utf-8") if path.exists() else ""
