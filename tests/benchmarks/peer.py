@@ -74,7 +74,7 @@ def mjcf(subdivisions: int, side: str, kind: str, tolerance: float = 1e-4, h: fl
   tissue = KINDS[kind]
   pin = np.flatnonzero(points[:, 2] < -0.9 * RADIUS) if not tissue.foundation else ()
   contact = {"condim": 3, "solref": "0.02 1"}
-  keys = tissue.keys() | {"mass": tissue.mass, "tolerance": tolerance}
+  keys: dict = tissue.keys() | {"mass": tissue.mass, "tolerance": tolerance}
   if side == "peer":
     organ = _flex(shape, tissue, pin, contact)
   elif side == "nodal":
@@ -100,13 +100,14 @@ def mjcf(subdivisions: int, side: str, kind: str, tolerance: float = 1e-4, h: fl
 
 def _flex(shape, tissue: Tissue, pin, contact) -> str:
   young, poisson, damping = tissue.young, tissue.poisson, tissue.damping
+  keys = {"mass": tissue.mass, "pin": pin, "contact": contact}
   if tissue.elements == "solid":
     mesh = fill.fill("organ", topology.build("organ", *shape))
-    shape, dim = (mesh.rest, mesh.tet), 3
     inside = f'<elasticity young="{young}" poisson="{poisson}" damping="{damping}"/>'
-  else:
-    inside, dim = scene.native(young, poisson, tissue.thickness, damping, tissue.bend), 2
-  return scenes.flex(*shape, inside, mass=tissue.mass, pin=pin, contact=contact, dim=dim)
+    return scenes.flex(mesh.rest, mesh.tet, inside, dim=3, **keys)
+  inside = scene.native(young, poisson, tissue.thickness, damping, tissue.bend)
+  points, elem = shape
+  return scenes.flex(points, elem, inside, **keys)
 
 
 class Run:
@@ -262,31 +263,30 @@ def measure(case: Case, out: pathlib.Path) -> list[Row]:
 
 
 def _measure(kind: str, nodes: int, short: int, repeats: int, other) -> list[Row]:
-  what, steps = {"kind": kind, "nodes": nodes}, STEPS[1:] if nodes > LARGE else STEPS
-  steps = STEPS[2:4] if short else steps
+  def keys(side: str, h: float, tolerance: float, **more) -> dict:
+    return {"kind": kind, "nodes": nodes, "side": side, "h": h, "tolerance": tolerance} | more
+
+  steps = STEPS[2:4] if short else STEPS[nodes > LARGE :]
   couplings = ("window",) if kind == "solid" else ("window", "nodal")
   ours = [
-    what | {"side": side, "h": h, "tolerance": tolerance, "scheme": scheme}
+    keys(side, h, tolerance, scheme=scheme)
     for h in steps
     for side in couplings
     for tolerance in OURS
     for scheme in ("implicit", "midpoint")
   ]
-  theirs = [what | {"side": "peer", "h": h, "tolerance": tolerance, "iterations": iterations}
-            for h in steps for tolerance, iterations in THEIRS]  # fmt: skip
-  right = [what | {"side": "peer", "h": h, "tolerance": THEIRS[0][0], "weighs": True}
-           for h in steps]  # fmt: skip
-  runs = [Run(**keys) for keys in (*ours, *theirs, *right)]
-  runs += [Beside(other, keys) for keys in theirs if other]
+  theirs = [keys("peer", h, tolerance, iterations=n) for h in steps for tolerance, n in THEIRS]
+  right = [keys("peer", h, THEIRS[0][0], weighs=True) for h in steps]
+  runs = [Run(**one) for one in (*ours, *theirs, *right)]
+  runs += [Beside(other, one) for one in theirs if other]
   for _ in range(repeats):
     for each in runs:
       each.restart()
     for first in range(0, max(each.count for each in runs), BLOCK):
       for each in runs:
         each.go(first)
-  finest = what | {"h": steps[0] / 4}
-  exact = [Run(**finest, side=side, tolerance=1e-6) for side in couplings]
-  last = finest | {"side": "peer", "tolerance": 1e-10}
+  exact = [Run(**keys(side, steps[0] / 4, 1e-6)) for side in couplings]
+  last = keys("peer", steps[0] / 4, 1e-10)
   exact += [Run(**last, weighs=True), *([Beside(other, last)] if other else [])]
   forces = {}
   for one in exact:
