@@ -52,6 +52,7 @@ DURATION = 0.1  # [s]
 STEPS = (2.5e-4, 5e-4, 1e-3, 2e-3, 4e-3)  # [s]
 FINEST = STEPS[0] / 4  # [s]
 LARGE = 1000  # nodes above which the smallest step is left out
+EVEN = 1e-3  # step at which sides are compared as well [s]
 LEVELS = (0.05, 0.02, 0.01, 0.005, 0.002)
 OURS = (1e-4, 1e-2, 1e-1)  # tolerances
 THEIRS = ((1e-8, 100), (1e-6, 100), (1e-4, 100), (1e-3, 100), (1e-8, 20))  # and iterations
@@ -331,21 +332,24 @@ def stages(args: argparse.Namespace) -> list[list[Case]]:
 
 def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
   """Writes the page."""
-  versions = sorted({str(r["mujoco"]) for r in rows})
-  head = ["tissue", "nodes", "error", "organ, window", "organ, nodal"]
-  head += [f"flex of {v}" for v in versions]
-  table = []
+  sides: dict = {"organ, window": {"side": "window"}, "organ, nodal": {"side": "nodal"}}
+  for version in sorted({r["mujoco"] for r in rows}, key=str):
+    sides[f"flex of {version}"] = {"side": "peer", "mujoco": version, "weights": "as is"}
+  least, steps = [], []
   for kind, nodes in dict.fromkeys((r["kind"], r["nodes"]) for r in rows):
     mine = [r for r in rows if (r["kind"], r["nodes"]) == (kind, nodes)]
-    sides = [[r for r in mine if r["side"] == side] for side in ("window", "nodal")]
-    theirs = [r for r in mine if r["side"] == "peer" and r["weights"] == "as is"]
-    sides += [[r for r in theirs if str(r["mujoco"]) == v] for v in versions]
+    each = [[r for r in mine if key.items() <= r.items()] for key in sides.values()]
     for level in LEVELS:
-      ours, *others = [_least(side, level) for side in sides]
+      ours, *others = [_least(side, level) for side in each]
       if ours or any(others):
-        table.append(
-          [kind, nodes, f"{100 * level:g} %", *(_cell(r, ours) for r in (ours, *others))]
-        )
+        cells = (_cell(r, ours, r["second_s"], "s") if r else "-" for r in (ours, *others))
+        least.append([kind, nodes, f"{100 * level:g} %", *cells])
+    each = [[r for r in side if r["h"] == EVEN] for side in each]
+    ours, *others = [
+      _least(side, 1.1 * min((r["error"] for r in side), default=0.0)) for side in each
+    ]
+    cells = (_cell(r, ours, r["step_ms"], "ms") if r else "-" for r in (ours, *others))
+    steps.append([kind, nodes, *cells])
   every = [
     [r["kind"], r["nodes"], r["side"].replace("peer", f"flex of {r['mujoco']}"), r["scheme"],
      r["weights"], f"{1e3 * r['h']:g}", f"{r['tolerance']:g}", r["iterations"],
@@ -354,15 +358,17 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
     for r in rows
   ]  # fmt: skip
   lines = [str(__doc__).partition("\n\n")[2], "", "## Least time of a simulated second", ""]
-  lines += ["In brackets scheme, time step and tolerance; `-`: no setting is as exact. Errors of "
-            "MuJoCo 3.17 have its wrong weights of corners.", ""]  # fmt: skip
-  lines += [*plots.table(head, table), "", "## All", ""]
-  head = ["kind", "nodes", "side", "scheme", "weights", "h [ms]", "tolerance", "iterations",
+  lines += ["In brackets scheme, time step, tolerance and error; `-`: no setting is as exact. "
+            "Errors of MuJoCo 3.17 have its wrong weights of corners.", ""]  # fmt: skip
+  lines += [*plots.table(["tissue", "nodes", "error", *sides], least), ""]
+  lines += [f"## A step of {1e3 * EVEN:g} ms", ""]
+  lines += ["The cheapest setting whose error is at most 1.1 times the least at this step.", ""]
+  lines += [*plots.table(["tissue", "nodes", *sides], steps), "", "## All", ""]
+  head = ["tissue", "nodes", "side", "scheme", "weights", "h [ms]", "tolerance", "iterations",
           "step [ms]", "second [s]", "error [%]", "force [N]"]  # fmt: skip
   lines += [*plots.table(head, every), "", results.link(out / "peer.csv")]
-  return [
-    results.page(out / "peer.md", "Run time against error beside MuJoCo's flex", about, lines)
-  ]
+  title = "Run time against error beside MuJoCo's flex"
+  return [results.page(out / "peer.md", title, about, lines)]
 
 
 def _least(rows: list[Row], level: float) -> Row | None:
@@ -370,13 +376,11 @@ def _least(rows: list[Row], level: float) -> Row | None:
   return min(fit, key=lambda r: r["second_s"], default=None)
 
 
-def _cell(r: Row | None, ours: Row | None) -> str:
-  if r is None:
-    return "-"
-  least = f", {r['iterations']} iterations" if r["iterations"] not in ("", 100) else ""
-  how = f"({r['scheme']} {1e3 * r['h']:g} ms, {r['tolerance']:g}{least})"
+def _cell(r: Row, ours: Row | None, value: float, unit: str) -> str:
+  how = f"{r['scheme']} {1e3 * r['h']:g} ms, {r['tolerance']:g}"
+  how += f", {r['iterations']} iterations" if r["iterations"] not in ("", 100) else ""
   times = f", {r['second_s'] / ours['second_s']:.3g} times ours" if ours and ours != r else ""
-  return f"{r['second_s']:.3g} s {how}{times}"
+  return f"{value:.3g} {unit} ({how}: {100 * r['error']:.2g} %){times}"
 
 
 BENCH = Bench("peer", stages, measure, report=report, arguments=arguments)
