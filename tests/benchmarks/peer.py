@@ -350,23 +350,14 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
     ]
     cells = (_cell(r, ours, r["step_ms"], "ms") if r else "-" for r in (ours, *others))
     steps.append([kind, nodes, *cells])
-  every = [
-    [r["kind"], r["nodes"], r["side"].replace("peer", f"flex of {r['mujoco']}"), r["scheme"],
-     r["weights"], f"{1e3 * r['h']:g}", f"{r['tolerance']:g}", r["iterations"],
-     f"{r['step_ms']:.3g}", f"{r['second_s']:.3g}", f"{100 * r['error']:.2g}",
-     f"{r['force_N']:.3g}"]
-    for r in rows
-  ]  # fmt: skip
   lines = [str(__doc__).partition("\n\n")[2], "", "## Least time of a simulated second", ""]
   lines += ["In brackets scheme, time step, tolerance and error; `-`: no setting is as exact. "
             "Errors of MuJoCo 3.17 have its wrong weights of corners.", ""]  # fmt: skip
   lines += [*plots.table(["tissue", "nodes", "error", *sides], least), ""]
   lines += [f"## A step of {1e3 * EVEN:g} ms", ""]
   lines += ["The cheapest setting whose error is at most 1.1 times the least at this step.", ""]
-  lines += [*plots.table(["tissue", "nodes", *sides], steps), "", "## All", ""]
-  head = ["tissue", "nodes", "side", "scheme", "weights", "h [ms]", "tolerance", "iterations",
-          "step [ms]", "second [s]", "error [%]", "force [N]"]  # fmt: skip
-  lines += [*plots.table(head, every), "", results.link(out / "peer.csv")]
+  lines += [*plots.table(["tissue", "nodes", *sides], steps), ""]
+  lines += ["Every setting, with its force: [peer.csv](peer.csv)."]
   title = "Run time against error beside MuJoCo's flex"
   return [results.page(out / "peer.md", title, about, lines)]
 
