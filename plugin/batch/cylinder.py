@@ -94,8 +94,9 @@ def touch(
 ):
   """Returns distance, point of a triangle and normal there of a cylinder that is nearest to it.
 
-  Under a flat end that is its middle there. Else the cylinder's utmost point towards the triangle's plane
-  lies over the triangle, or an edge is nearest. What is farther than `reach` is not looked at closely.
+  Under a flat end that is its middle there. Else the cylinder's utmost point towards the triangle's
+  plane lies over the triangle, or an edge is nearest. What is farther than `reach` is not looked
+  at closely.
   """
   r, half = size[0], size[1]
   t = wp.transpose(rot)

@@ -71,7 +71,7 @@ def _firm_up(p: Pressed, world: int, c: int):
 
 @wp.kernel(enable_backward=False)
 def keep_closed(p: Pressed):
-  """Makes contacts firm, and takes the parting of sliding ones off their reference accelerations."""
+  """Makes contacts firm, and takes the parting of those that slide off their reference."""
   world, k = wp.tid()
   if k >= p.count[world]:
     return

@@ -24,8 +24,8 @@ _DATA = (
   *("map_efc2iefc", "iefc_R", "iefc_D"),
 )
 _CONTACT = (
-  *("dist", "pos", "frame", "friction", "solref", "solimp", "mu", "dim", "geom", "flex", "elem", "vert", "exclude"),
-  "efc_address",
+  *("dist", "pos", "frame", "friction", "solref", "solimp", "mu", "dim", "geom", "flex", "elem"),
+  *("vert", "exclude", "efc_address"),
 )
 # What an organ's contacts follow, of each flex.
 TISSUE = Numbers(
@@ -34,14 +34,14 @@ TISSUE = Numbers(
   ("yields", 1, "m/N", "compliance under a patch as wide as an edge"),
   ("mass", 1, "kg", "mean of the vertices that move"),
 )
-# A contact: the steps in which it closes; of its tissue's compliance, how much it has; the least R in
-# the inverse inertia that it meets, since firmer ones chatter, and of that the least R of friction.
+# A contact: the steps in which it closes; of its tissue's compliance, how much it has; the least R
+# in the inverse inertia that it meets, since firmer ones chatter; of that, the least of friction.
 SLOW, FIRM, SOFT, STUCK = 4.0, 0.03, 0.0075, 0.2
-# From where on contacts are softer: a step [s], and times its mass that a vertex has in stiff tissue.
+# Contacts are softer from a step on [s], and where a vertex has more times its mass than this.
 LONG, STIFF = 5e-3, 1000.0
-# How a triangle is looked at under the flat end of a cylinder: points along an edge; in radii, how far
-# in from the rim they count less, and how far off the end they count; the share of points that carry
-# it in full.
+# How a triangle is looked at under the flat end of a cylinder: points along an edge; in radii, how
+# far in from the rim they count less, and how far off the end they count; the share of points that
+# carries it in full.
 FLAT = {"POINTS": 6, "RIM": 0.1, "SLACK": 0.01, "COVER": 0.25}
 _tissue: dict[int, tuple] = {}  # by the address of an mjData, see `_tissues`
 _SPARSE_FROM = 60  # dofs from which MuJoCo's rows are sparse where it may choose

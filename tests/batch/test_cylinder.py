@@ -69,7 +69,7 @@ def test_a_cylinder_is_as_far_as_the_nearest_point_of_a_triangle():
 
 def test_what_lies_flat_under_an_end_is_touched_in_its_middle():
   depth, small = 1e-4, 2e-4 * np.array([[1, 0, 0], [-0.5, 0.8, 0], [-0.5, -0.8, 0]])
-  corner = small + [0.0003, -0.0002, HALF - depth] + CENTRE
+  corner = CENTRE + small + np.array([0.0003, -0.0002, HALF - depth])
   dist = wp.zeros(1, dtype=float, device="cpu")
   point, normal = (wp.zeros(1, dtype=wp.vec3, device="cpu") for _ in range(2))
   inputs = [wp.array(corner[None], dtype=wp.vec3, device="cpu")]

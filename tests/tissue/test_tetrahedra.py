@@ -6,7 +6,6 @@ import os
 import numpy as np
 import pytest
 from palpate.models import shapes
-from palpate.tissue import config as configuration
 from palpate.tissue import energy, solid
 from palpate.tissue.geometry import fill, gmsh
 from palpate.tissue.geometry import mesh as topology
@@ -19,7 +18,7 @@ def test_small_uniform_strains_have_the_energy_of_linear_elasticity(scenes, pois
   points, elem = scenes.box((0.1, 0.08, 0.06), 0.02)
   made = {"elements": "solid", "poisson": poisson, "young": (YOUNG,)}
   mesh, config, _ = scenes.kernels(points, elem, **made)
-  mu, lam = configuration.lame_solid(np.array(YOUNG), poisson)
+  mu, lam = solid.lame_solid(np.array(YOUNG), poisson)
   shear = np.eye(3)[[1, 2, 0]]
   for gradient in (np.diag([1e-4, 0, 0]), np.diag([1e-4, -2e-4, 3e-4]), 1e-4 * shear):
     strain = (gradient + gradient.T) / 2
