@@ -16,7 +16,6 @@ import warp as wp
 # All that depends on names inside of mujoco_warp: its tools against a triangle, and types.
 from mujoco_warp._src import collision_primitive_core as core
 from mujoco_warp._src.types import ContactType, vec5
-from palpate.engine import weights
 from palpate.tissue.types import Array, fill, floats, ints, struct
 
 from . import convex, cylinder
@@ -41,7 +40,6 @@ _CYLINDER, _MESH = KINDS[5:]
 _FAR = wp.constant(1e10)  # what mujoco_warp says of a contact that is none
 _CONSTRAINT = wp.constant(int(ContactType.CONSTRAINT))
 _LEAST = 1e-5  # friction, as in MuJoCo
-_HARD = (1.0, 1.0, 1.0, 0.5, 2.0)  # solimp; `sliding` makes contacts as soft as they are
 _FEW = 4  # tools; more of them share triangles
 # Whose sliding friction counts: the greater, or that of the one with priority.
 _MIXED = {"margin": (), "slide": (), "whose": (), "condim": (), "friction": (5,), "solref": (2,),
@@ -420,17 +418,22 @@ def _written() -> list[str]:
 def _mix(model, g: int, f: int) -> dict:
   """Returns the parameters of a contact of a geom and a flex, as mj_contactParam mixes them."""
   mine, other = int(model.geom_priority[g]), int(model.flex_priority[f])
+  solref = np.stack([model.geom_solref[g], model.flex_solref[f]])
+  solimp = np.stack([model.geom_solimp[g], model.flex_solimp[f]])
   friction = np.stack([model.geom_friction[g], model.flex_friction[f]])
   condim = np.array([model.geom_condim[g], model.flex_condim[f]])
   margin = float(model.geom_margin[g] + model.flex_margin[f])
   out = {"margin": margin, "slide": friction[0, 0], "whose": int(_GREATER)}
   if mine != other:
     k = int(other > mine)
-    parts = condim[k], friction[k]
+    parts = condim[k], solref[k], solimp[k], friction[k]
     out["whose"] = int(_ORGAN if k else _TOOL)
   else:
-    parts = condim.max(), friction.max(axis=0)
-  out["condim"] = parts[0]
-  out["solref"] = weights.SLOW * model.opt.timestep, 1.0
-  out["solimp"] = _HARD
-  return out | {"friction": np.maximum(parts[1][[0, 0, 1, 2, 2]], _LEAST)}
+    a, b = float(model.geom_solmix[g]), float(model.flex_solmix[f])
+    share = a / (a + b) if a + b > 0 else 0.5
+    mixed = share * solref[0] + (1 - share) * solref[1]
+    direct = (solref[:, 0] <= 0).any()
+    ref = solref.min(axis=0) if direct else mixed
+    parts = condim.max(), ref, share * solimp[0] + (1 - share) * solimp[1], friction.max(axis=0)
+  out |= dict(zip(("condim", "solref", "solimp"), parts[:3], strict=True))
+  return out | {"friction": np.maximum(parts[3][[0, 0, 1, 2, 2]], _LEAST)}

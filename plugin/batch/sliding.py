@@ -10,9 +10,12 @@ what the gap adds follows from those rows.
 # pyright: reportInvalidTypeForm=false
 import mujoco
 import warp as wp
+from mujoco_warp._src.constraint import _contact_kbimp
 from mujoco_warp._src.types import vec5
 from palpate.engine import weights
 from palpate.tissue.types import Array, floats, ints, struct
+
+_SLOW = wp.constant(weights.SLOW)
 
 
 @struct
@@ -30,6 +33,12 @@ class Pressed:
   friction: Array(vec5, ("naconmax",))
   efc_address: ints("naconmax", "nrow")  # -1 for none
   aref: floats("nworld", "njmax")  # reference acceleration of the rows [m/s^2]
+  timestep: floats("nstep")
+  disableflags: int
+  dist: floats("naconmax")
+  includemargin: floats("naconmax")
+  solref: Array(wp.vec2, ("naconmax",))
+  solimp: Array(vec5, ("naconmax",))
   soft: floats("ngeom")  # R of a contact of each geom [1/kg]
   pairs: float  # times that, in a pyramid: 2 / impratio
   D: floats("nworld", "njmax")  # inverse of the rows' R [kg]
@@ -58,15 +67,29 @@ def _has_rows(p: Pressed, c: int):
 
 @wp.func
 def _firm_up(p: Pressed, world: int, c: int):
-  """Makes a contact as firm as under the plugin, see native/weights.h."""
+  """Makes a contact as firm as under the plugin, see native/firm.h."""
+  h = p.timestep[world % p.timestep.shape[0]]
+  gap = p.dist[c] - p.includemargin[c]
+  was = _contact_kbimp(p.disableflags, h, p.solref[c], p.solimp[c], gap, False)
+  damping = 2.0 / (_SLOW * h)
+  stiffness = 0.25 * damping * damping
   R = p.soft[p.contact_geom[c][0]]
   if p.paired == 1 and p.dim[c] > 1:
     square = p.friction[c][0] * p.friction[c][0]
     R *= p.pairs * square * (1.0 + square)
-  gain = 1.0 / (R * p.D[world, p.efc_address[c, 0]])
+  D = p.D[world, p.efc_address[c, 0]]
+  if D * R * was[0] * was[2] > stiffness or was[0] <= 0.0:
+    return
   for r in range(_rows(p, c)):
     row = p.efc_address[c, r]
-    p.D[world, row] = gain * p.D[world, row]
+    p.D[world, row] = p.D[world, row] / (R * D)
+    aref = p.aref[world, row]
+    if p.paired == 1 or r == 0:
+      aref += was[0] * was[2] * gap
+    aref *= damping / was[1]
+    if p.paired == 1 or r == 0:
+      aref -= stiffness * gap
+    p.aref[world, row] = aref
 
 
 @wp.kernel(enable_backward=False)
@@ -125,8 +148,10 @@ def make(batch, model: mujoco.MjModel, organ, touch):
   out, d = Pressed(), batch.d
   out.many, out.paired = touch.most, int(batch.paired)
   out.start, out.before, out.count = touch.start, touch.before, touch.count
-  for name in ("dim", "frame", "friction", "efc_address"):
+  spring = "dist", "includemargin", "solref", "solimp"
+  for name in ("dim", "frame", "friction", "efc_address", *spring):
     setattr(out, name, getattr(d.contact, name))
+  out.timestep, out.disableflags = batch.m.opt.timestep, int(batch.m.opt.disableflags)
   out.D, out.pairs = d.efc.D, 2.0 / float(model.opt.impratio)
   out.soft = wp.array(weights.softness(model, organ)[0], dtype=float, device=batch.device)
   out.contact_geom, out.aref, out.row_force = d.contact.geom, d.efc.aref, d.efc.force

@@ -301,7 +301,7 @@ def _tell_coarse(w: Workspace):
   """Warns, once, of a tool that is too small for the mesh."""
   edge, w.flags[FLAG.coarse] = 1e-6 * w.flags[FLAG.coarse], -1
   warn(
-    f"organ {w.organ.name!r}: a tool touches it whose radius is less than a quarter of an edge of "
+    f"organ {w.organ.name!r}: a tool touches it whose radius is under a twentieth of an edge of "
     f"its triangles, so that forces depend on where it meets them; edges of {1e3 * edge:.2g} mm "
     "would do"
   )

@@ -11,7 +11,7 @@ namespace palpate {
 constexpr double SELF = 1.75;
 
 // Edges that a tool's radius has at least, else it is told that the mesh is too coarse.
-constexpr double COARSE = 0.25;
+constexpr double COARSE = 0.05;
 
 // Most that a tool sinks in, in radii.
 constexpr double DEEPEST = 0.5;
@@ -173,45 +173,54 @@ PALPATE double within_step(const Fields& f, double stiffness, double damping) {
   return f.integrator.data[0] == INTEGRATOR_DISCRETE ? 1.0 + h * damping + h * h * stiffness : 1.0;
 }
 
-// Makes a contact as firm as its tissue asks for and the time step can bear, whatever its nodes weigh
-// and its solref and solimp say; and at least `least` [m/N] soft. At rest its force is gap / compliance
-// with R = compliance * stiffness, of which the rows of a pyramid have a part each. Friction is firmer
-// the shorter the step, since what sticks creeps at a speed in proportion to its R; in a pyramid it has
-// no R of its own (MuJoCo, Computation, Constraint model). Done twice it does nothing.
+// Gives the rows of a contact a critically damped spring and its R, less what the step takes of it.
+template <class Fields>
+PALPATE void put_spring(const Fields& f, char* contact, Rows rows, double damping, double R) {
+  const double stiffness = 0.25 * damping * damping;
+  double* row = datum<double*>(f, DATA_EFC_KBIP) + 4 * rows.first;
+  const double now = datum<double*>(f, DATA_EFC_R)[rows.first];
+  const double whole = now * within_step(f, row[0] * row[2], row[1]) * row[2] / (1.0 - row[2]);
+  double* solref = (double*)(contact + CONTACT_SOLREF);
+  double* solimp = (double*)(contact + CONTACT_SOLIMP);
+  solref[0] = 2.0 / damping;
+  solref[1] = 1.0;
+  solimp[0] = solimp[1] = whole / (whole + R);
+  scale_impedance(f, rows, R / (within_step(f, stiffness, damping) * now));
+  for (int r = 0; r < rows.count; ++r) {
+    if (row[4 * r] > 0.0) row[4 * r] = stiffness;
+    row[4 * r + 1] = damping;
+    row[4 * r + 2] = 1.0;
+  }
+}
+
+// Makes a contact as firm as its tissue asks for and the time step can bear, whatever its nodes weigh, if
+// its solref and solimp have it softer; and at least `least` [m/N] soft. At rest its force is
+// gap / compliance with R = compliance * stiffness, of which the rows of a pyramid have a part each.
+// Friction is firmer the shorter the step, since what sticks creeps at a speed in proportion to its R;
+// in a pyramid it has no R of its own (MuJoCo, Computation, Constraint model). Done twice it does
+// nothing.
 template <class Fields>
 PALPATE void firm_up(const Fields& f, char* contact, Rows rows, double least) {
-  double* row = datum<double*>(f, DATA_EFC_KBIP) + 4 * rows.first;
+  const double* row = datum<double*>(f, DATA_EFC_KBIP) + 4 * rows.first;
   const double* R = datum<double*>(f, DATA_EFC_R) + rows.first;
-  if (!(row[0] > 0.0) || !(row[2] < 1.0)) return;
+  if (!(row[0] > 0.0)) return;
   const double* friction = (const double*)(contact + CONTACT_FRICTION);
   const double h = f.timestep.data[0], damping = 2.0 / (SLOW * h), stiffness = 0.25 * damping * damping;
   const double borne = borne_by(f, contact, 0) + borne_by(f, contact, 1);
-  const double yields = yielding(f, contact, 0) + yielding(f, contact, 1);
-  const double asked = FIRM * stiffness * yields;
+  const double asked = FIRM * stiffness * (yielding(f, contact, 0) + yielding(f, contact, 1));
   const double square = friction[0] * friction[0];
   const double pair = rows.paired ? 2.0 * square * (1.0 + square) / f.impratio.data[0] : 1.0;
   const double soft = pair * (borne > asked ? borne : asked);
-  const double more = (rows.paired ? rows.count : 1) * stiffness * least;
-  const double wanted = more > soft ? more : soft, now = within_step(f, stiffness, damping);
-  const double whole = R[0] * within_step(f, row[0] * row[2], row[1]) * row[2] / (1.0 - row[2]);
-  double* solref = (double*)(contact + CONTACT_SOLREF);
-  double* solimp = (double*)(contact + CONTACT_SOLIMP);
-  solref[0] = SLOW * h;
-  solref[1] = 1.0;
-  solimp[0] = solimp[1] = whole / (whole + wanted);
+  const double has = R[0] * within_step(f, row[0] * row[2], row[1]) / (row[0] * row[2]);
+  if (row[2] < 1.0 && has > soft / stiffness) put_spring(f, contact, rows, damping, soft);
   if (!rows.paired && rows.count > 1) {
-    const double stuck = h > LONG ? 1.0 : h > STUCK * LONG ? h / LONG : STUCK;
-    const double ratio = R[1] / R[0] < stuck ? R[1] / R[0] : stuck;
-    scale_impedance(f, {rows.first + 1, rows.count - 1, false}, ratio * borne / (now * R[1]));
-    *(double*)(contact + CONTACT_MU) = friction[0] * sqrt(ratio * borne / wanted);
+    const double stuck = h > LONG ? 1.0 : h > STUCK * LONG ? h / LONG : STUCK, most = stuck * pair * borne;
+    const double gain = R[1] > most ? most / R[1] : 1.0;
+    scale_impedance(f, {rows.first + 1, rows.count - 1, false}, gain);
   }
-  scale_impedance(f, {rows.first, rows.paired ? rows.count : 1, false}, wanted / (now * R[0]));
-  for (int r = 0; r < rows.count; ++r) {
-    double* each = row + 4 * r;
-    if (each[0] > 0.0) each[0] = stiffness;
-    each[1] = damping;
-    each[2] = 1.0;
-  }
+  const double more = (rows.paired ? rows.count : 1) * row[0] * row[2] * least;
+  if (R[0] < more) scale_impedance(f, {rows.first, rows.paired ? rows.count : 1, false}, more / R[0]);
+  if (!rows.paired && rows.count > 1) *(double*)(contact + CONTACT_MU) = friction[0] * sqrt(R[1] / R[0]);
 }
 
 }  // namespace palpate

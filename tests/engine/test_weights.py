@@ -191,10 +191,10 @@ def test_a_needle_does_not_fall_through_a_coarse_mesh(scenes):
 
 
 def test_a_tool_too_small_for_the_mesh_is_named_once(scenes):
-  mesh, keys = scenes.sphere(2, 0.04), {"young": 1e4, "foundation": 1e5}
+  mesh, keys = scenes.sphere(1, 0.04), {"young": 1e4, "foundation": 1e5}
   with scenes.Warnings() as seen:
-    pressed(scenes, mesh, 'size=".001" pos="0 0 .001"', 0.002, 100, **keys)
-    assert seen().count("edges of 3 mm would do") == 1
+    pressed(scenes, mesh, 'size=".0005" pos="0 0 .0005"', 0.002, 100, **keys)
+    assert seen().count("edges of 2 mm would do") == 1
   with scenes.Warnings() as seen:
     pressed(scenes, mesh, 'size=".006" pos="0 0 .006"', 0.002, 100, **keys)
     assert not seen()
