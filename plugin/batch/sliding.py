@@ -31,6 +31,7 @@ class Pressed:
   contact_geom: Array(wp.vec2i, ("naconmax",))
   frame: Array(wp.mat33, ("naconmax",))
   friction: Array(vec5, ("naconmax",))
+  elem: Array(wp.vec2i, ("naconmax",))
   efc_address: ints("naconmax", "nrow")  # -1 for none
   aref: floats("nworld", "njmax")  # reference acceleration of the rows [m/s^2]
   timestep: floats("nstep")
@@ -39,8 +40,11 @@ class Pressed:
   includemargin: floats("naconmax")
   solref: Array(wp.vec2, ("naconmax",))
   solimp: Array(vec5, ("naconmax",))
-  soft: floats("ngeom")  # R of a contact of each geom [1/kg]
-  pairs: float  # times that, in a pyramid: 2 / impratio
+  # See `weights.Firmness`:
+  asked: float
+  share: float
+  tools: floats("ngeom")
+  pairs: float  # times R, in a pyramid: 2 / impratio
   D: floats("nworld", "njmax")  # inverse of the rows' R [kg]
   row_force: floats("nworld", "njmax")  # force of the rows [N]
   # See `Contacts`:
@@ -73,13 +77,14 @@ def _firm_up(p: Pressed, world: int, c: int):
   was = _contact_kbimp(p.disableflags, h, p.solref[c], p.solimp[c], gap, False)
   damping = 2.0 / (_SLOW * h)
   stiffness = 0.25 * damping * damping
-  R = p.soft[p.contact_geom[c][0]]
+  touched = float(p.count[world])
+  if p.elem[c][1] >= 0:
+    touched = touched / 3.0
+  R = wp.max(p.asked, touched * p.share + p.tools[p.contact_geom[c][0]])
   if p.paired == 1 and p.dim[c] > 1:
     square = p.friction[c][0] * p.friction[c][0]
     R *= p.pairs * square * (1.0 + square)
   D = p.D[world, p.efc_address[c, 0]]
-  if D * R * was[0] * was[2] > stiffness or was[0] <= 0.0:
-    return
   for r in range(_rows(p, c)):
     row = p.efc_address[c, r]
     p.D[world, row] = p.D[world, row] / (R * D)
@@ -149,11 +154,13 @@ def make(batch, model: mujoco.MjModel, organ, touch):
   out.many, out.paired = touch.most, int(batch.paired)
   out.start, out.before, out.count = touch.start, touch.before, touch.count
   spring = "dist", "includemargin", "solref", "solimp"
-  for name in ("dim", "frame", "friction", "efc_address", *spring):
+  for name in ("dim", "frame", "friction", "elem", "efc_address", *spring):
     setattr(out, name, getattr(d.contact, name))
   out.timestep, out.disableflags = batch.m.opt.timestep, int(batch.m.opt.disableflags)
   out.D, out.pairs = d.efc.D, 2.0 / float(model.opt.impratio)
-  out.soft = wp.array(weights.softness(model, organ)[0], dtype=float, device=batch.device)
+  firm = weights.firmness(model, organ)
+  out.asked, out.share = firm.asked, firm.share
+  out.tools = wp.array(firm.tools, dtype=float, device=batch.device)
   out.contact_geom, out.aref, out.row_force = d.contact.geom, d.efc.aref, d.efc.force
   shape = (batch.nworld, out.many)
   out.geom, out.normal, out.force = (

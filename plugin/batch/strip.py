@@ -144,8 +144,8 @@ def strip(
   made.flex_vert[:] = 0.0  # vertices are where their bodies are
   made.flex_centered[:] = True
   if made.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC:
-    sticks = max(weights.softness(model, organ)[1] for organ in organs)
-    made.opt.impratio = max(made.opt.impratio, sticks)
+    sticks = min(weights.firmness(model, organ).stuck for organ in organs)
+    made.opt.impratio = max(made.opt.impratio, 1 / sticks)
   if made.nv <= 60 and made.opt.solver == mujoco.mjtSolver.mjSOL_NEWTON:
     made.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
   _check(model, made, organs, nslots)

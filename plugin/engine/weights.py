@@ -7,6 +7,7 @@ flicker where a tool presses. MuJoCo 4.0 has it right. Both part what slides.
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
 
+import dataclasses
 import functools
 
 import mujoco
@@ -32,11 +33,12 @@ TISSUE = Numbers(
   "TISSUE",
   ("modulus", 1, "Pa", "young / (1 - poisson^2) of a solid without a skin, else 0"),
   ("yields", 1, "m/N", "compliance under a patch as wide as an edge"),
-  ("mass", 1, "kg", "mean of the vertices that move"),
+  ("mass", 1, "kg", "of all vertices that move"),
+  ("quick", 1, "1/s^2", "stiffness over mass of a vertex"),
 )
-# A contact: the steps in which it closes; of its tissue's compliance, how much it has; the least R
-# in the inverse inertia that it meets, since firmer ones chatter; of that, the least of friction.
-SLOW, FIRM, SOFT, STUCK = 4.0, 0.03, 0.0075, 0.2
+# A contact: the steps in which it closes; of its tissue's compliance, how much it has; the least R in
+# the inverse inertia of an organ and of a tool, since firmer ones chatter; of that, friction's.
+SLOW, FIRM, SOFT, LIGHT, STUCK = 4.0, 0.03, 0.036, 0.0075, 0.2
 # Contacts are softer from a step on [s], and where a vertex has more times its mass than this.
 LONG, STIFF = 5e-3, 1000.0
 # How a triangle is looked at under the flat end of a cylinder: points along an edge; in radii, how
@@ -108,6 +110,7 @@ weigh = kernel(
     "SLOW": SLOW,
     "FIRM": FIRM,
     "SOFT": SOFT,
+    "LIGHT": LIGHT,
     "LONG": LONG,
     "STUCK": STUCK,
     "STIFF": STIFF,
@@ -216,26 +219,37 @@ def tissue_of(organ, config=None) -> np.ndarray:
   within, below = solid * young / plane * edge, config.foundation * edge**2
   stiffness = within + stretch + 8 * np.sqrt(rigidity * config.foundation) + below
   bare = 0.0 if stretch else solid * young / plane
-  return np.array([bare, 1 / stiffness, organ.mass[organ.free].mean()])
+  mass = organ.mass[organ.free]
+  return np.array([bare, 1 / stiffness, mass.sum(), stiffness / mass.mean()])
 
 
-def softness(model: mujoco.MjModel, organ) -> tuple[np.ndarray, float]:
-  """Returns R of contacts of each geom with an organ, and what that of friction is less.
+@dataclasses.dataclass(frozen=True)
+class Firmness:
+  """What contacts with an organ have of R, see native/firm.h.
 
-  Args:
-    model: the mjModel
-    organ: the organ's declaration
-
-  Returns:
-    R [1/kg], (ngeom,); the `impratio` where the cone is elliptic
+  Attributes:
+    asked: what the tissue asks for [1/kg]
+    share: what the organ bears for each vertex that is touched [1/kg]
+    tools: what each geom bears [1/kg]  (ngeom,)
+    stuck: of that, the most that friction has
   """
+
+  asked: float
+  share: float
+  tools: np.ndarray
+  stuck: float
+
+
+def firmness(model: mujoco.MjModel, organ) -> Firmness:
+  """Returns how firm contacts with an organ are."""
   h, tissue = float(model.opt.timestep), tissue_of(organ)
-  mass, yields = tissue[TISSUE.mass], tissue[TISSUE.yields]
-  node = max(1.0, (h / LONG) ** 2) * max(1.0, h**2 / (STIFF * yields * mass)) / mass
-  borne = SOFT * (model.body_invweight0[model.geom_bodyid, 0] + node)
-  asked = FIRM * yields / (SLOW * h) ** 2
-  stuck = min(1.0, max(STUCK, h / LONG))
-  return np.maximum(borne, asked), max(1.0, asked / (SOFT * node)) / stuck
+  softer = max(1.0, (h / LONG) ** 2) * max(1.0, h**2 * tissue[TISSUE.quick] / STIFF)
+  return Firmness(
+    FIRM * tissue[TISSUE.yields] / (SLOW * h) ** 2,
+    softer * SOFT / tissue[TISSUE.mass],
+    LIGHT * model.body_invweight0[model.geom_bodyid, 0],
+    min(1.0, max(STUCK, h / LONG)),
+  )
 
 
 def launch(weights):

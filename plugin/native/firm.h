@@ -18,17 +18,18 @@ constexpr double DEEPEST = 0.5;
 
 constexpr double PI = 3.14159265358979;
 
-// The least R of a contact that a side can bear: in the inverse inertia of a geom, or of an organ's
-// vertex; more where a step is long, or moves a vertex of stiff tissue by much less than a free one.
+// The least R of a contact that a side can bear: of a geom's inverse inertia a part; of an organ's as
+// well, which the contacts share that it has with geoms, `count`. More where a step is long, or moves a
+// vertex of stiff tissue by much less than a free one.
 template <class Fields>
-PALPATE double borne_by(const Fields& f, const char* contact, int side) {
+PALPATE double borne_by(const Fields& f, const char* contact, int side, int count) {
   const int geom = side_of(contact, CONTACT_GEOM, side), flex = side_of(contact, CONTACT_FLEX, side);
-  if (geom >= 0) return SOFT * f.body_invweight0.data[2 * f.geom_bodyid.data[geom]];
+  if (geom >= 0) return LIGHT * f.body_invweight0.data[2 * f.geom_bodyid.data[geom]];
   const double* tissue = f.tissue.data + TISSUE_LENGTH * flex;
-  if (!(tissue[TISSUE_MASS] > 0.0)) return 0.0;
   const double h = f.timestep.data[0], late = h * h / (LONG * LONG);
-  const double stiff = h * h / (STIFF * tissue[TISSUE_YIELDS] * tissue[TISSUE_MASS]);
-  return SOFT / tissue[TISSUE_MASS] * (late > 1.0 ? late : 1.0) * (stiff > 1.0 ? stiff : 1.0);
+  const double stiff = h * h * tissue[TISSUE_QUICK] / STIFF;
+  const double each = side_of(contact, CONTACT_ELEM, side) < 0 ? 1.0 : 1.0 / 3.0;  // a corner is of several
+  return SOFT * each * count / tissue[TISSUE_MASS] * (late > 1.0 ? late : 1.0) * (stiff > 1.0 ? stiff : 1.0);
 }
 
 // Mean length of the edges of the triangle on a side of a contact [m].
@@ -48,8 +49,20 @@ PALPATE double yielding(const Fields& f, const char* contact, int side) {
   return flex >= 0 && f.mine.data[flex] ? f.tissue.data[TISSUE_LENGTH * flex + TISSUE_YIELDS] : 0.0;
 }
 
-// A geom's contacts with an organ's flex, which is on one side of them.
+// A geom's contacts with an organ's flex, which is on one side of them. Not those of two organs: where
+// they lie flat on each other MuJoCo has one contact a pair of triangles, which jumps about, and firm
+// ones would shake them.
 struct Touch { int geom, flex, side; };
+
+// How many contacts a flex has with geoms.
+PALPATE int count_of(const char* contact, int ncon, int flex) {
+  int count = 0;
+  for (int c = 0; c < ncon; ++c, contact += CONTACT_LENGTH)
+    for (int side = 0; side < 2; ++side)
+      if (side_of(contact, CONTACT_FLEX, side) == flex)
+        count += side_of(contact, CONTACT_GEOM, 1 - side) >= 0;
+  return count;
+}
 
 PALPATE bool operator==(Touch a, Touch b) { return a.geom == b.geom && a.flex == b.flex; }
 
@@ -58,8 +71,8 @@ PALPATE Touch touch_of(const Fields& f, const char* contact) {
   for (int side = 0; side < 2; ++side) {
     const int flex = side_of(contact, CONTACT_FLEX, side);
     const int geom = side_of(contact, CONTACT_GEOM, 1 - side);
-    const bool whole = side_of(contact, CONTACT_ELEM, side) >= 0;
-    if (geom >= 0 && flex >= 0 && f.mine.data[flex] && whole) return {geom, flex, side};
+    if (geom >= 0 && flex >= 0 && f.mine.data[flex] && f.tissue.data[TISSUE_LENGTH * flex + TISSUE_MASS] > 0.0)
+      return {geom, flex, side};
   }
   return {-1, -1, 0};
 }
@@ -193,26 +206,24 @@ PALPATE void put_spring(const Fields& f, char* contact, Rows rows, double dampin
   }
 }
 
-// Makes a contact as firm as its tissue asks for and the time step can bear, whatever its nodes weigh, if
-// its solref and solimp have it softer; and at least `least` [m/N] soft. At rest its force is
-// gap / compliance with R = compliance * stiffness, of which the rows of a pyramid have a part each.
-// Friction is firmer the shorter the step, since what sticks creeps at a speed in proportion to its R;
-// in a pyramid it has no R of its own (MuJoCo, Computation, Constraint model). Done twice it does
-// nothing.
+// Makes a contact as firm as its tissue asks for and the time step can bear, whatever its nodes weigh
+// and its solref and solimp say; and at least `least` [m/N] soft. At rest its force is gap / compliance
+// with R = compliance * stiffness, of which the rows of a pyramid have a part each. Friction is firmer
+// the shorter the step, since what sticks creeps at a speed in proportion to its R; in a pyramid it has
+// no R of its own (MuJoCo, Computation, Constraint model). Done twice it does nothing.
 template <class Fields>
-PALPATE void firm_up(const Fields& f, char* contact, Rows rows, double least) {
+PALPATE void firm_up(const Fields& f, char* contact, Rows rows, int count, double least) {
   const double* row = datum<double*>(f, DATA_EFC_KBIP) + 4 * rows.first;
   const double* R = datum<double*>(f, DATA_EFC_R) + rows.first;
   if (!(row[0] > 0.0)) return;
   const double* friction = (const double*)(contact + CONTACT_FRICTION);
   const double h = f.timestep.data[0], damping = 2.0 / (SLOW * h), stiffness = 0.25 * damping * damping;
-  const double borne = borne_by(f, contact, 0) + borne_by(f, contact, 1);
+  const double borne = borne_by(f, contact, 0, count) + borne_by(f, contact, 1, count);
   const double asked = FIRM * stiffness * (yielding(f, contact, 0) + yielding(f, contact, 1));
   const double square = friction[0] * friction[0];
   const double pair = rows.paired ? 2.0 * square * (1.0 + square) / f.impratio.data[0] : 1.0;
   const double soft = pair * (borne > asked ? borne : asked);
-  const double has = R[0] * within_step(f, row[0] * row[2], row[1]) / (row[0] * row[2]);
-  if (row[2] < 1.0 && has > soft / stiffness) put_spring(f, contact, rows, damping, soft);
+  if (row[2] < 1.0) put_spring(f, contact, rows, damping, soft);
   if (!rows.paired && rows.count > 1) {
     const double stuck = h > LONG ? 1.0 : h > STUCK * LONG ? h / LONG : STUCK, most = stuck * pair * borne;
     const double gain = R[1] > most ? most / R[1] : 1.0;

@@ -150,12 +150,6 @@ PALPATE bool is_mine(const Fields& f, const char* contact) {
   return false;
 }
 
-// Whether a side of a contact is a geom. Where two organs lie flat on each other MuJoCo has one contact a
-// pair of triangles, which jumps about: firm ones would shake them.
-PALPATE bool has_geom(const char* contact) {
-  return side_of(contact, CONTACT_GEOM, 0) >= 0 || side_of(contact, CONTACT_GEOM, 1) >= 0;
-}
-
 // Gives contacts with an organ their rows, and flags that what MuJoCo has computed of them for its dual
 // solvers has to be computed again. Done twice it does nothing.
 template <class Fields>
@@ -163,6 +157,7 @@ PALPATE void weigh(const Fields& f, Thread, int) {
   bool touched = false;
   Touch last = {-1, -1, 0};
   double least = 0.0;
+  int count = 0;
   char* const contacts = datum<char*>(f, DATA_CONTACT);
   const int ncon = datum<int>(f, DATA_NEFC) > 0 ? datum<int>(f, DATA_NCON) : 0;
   for (int c = 0; c < ncon; ++c) {
@@ -173,13 +168,12 @@ PALPATE void weigh(const Fields& f, Thread, int) {
     for (int side = 0; side < 2; ++side)
       weigh_side(f, contact, rows, side);
     const Touch touch = touch_of(f, contact);
-    if (touch.geom < 0) {
-      least = 0.0;
-    } else if (!(touch == last)) {
-      least = unresolved(f, contacts, ncon, touch);
+    if (touch.geom >= 0) {
+      if (!(touch == last)) least = unresolved(f, contacts, ncon, touch);
+      if (touch.flex != last.flex) count = count_of(contacts, ncon, touch.flex);
+      firm_up(f, contact, rows, count, least);
+      last = touch;
     }
-    last = touch;
-    if (has_geom(contact)) firm_up(f, contact, rows, least);
     keep_closed(f, contact, rows);
   }
   const bool projects = f.solver.data[0] == SOLVER_PGS || f.noslip_iterations.data[0] > 0 ||
