@@ -8,7 +8,9 @@ import warp as wp
 from palpate.engine.weights import FLAT
 
 _POINTS = wp.constant(FLAT["POINTS"])
-_RIM, _SLACK, _COVER = (wp.constant(FLAT[name]) for name in ("RIM", "SLACK", "COVER"))
+_LEVEL, _RIM, _SLACK, _COVER = (
+  wp.constant(FLAT[name]) for name in ("LEVEL", "RIM", "SLACK", "COVER")
+)
 _HALVINGS = wp.constant(20)  # of an edge: to 1e-6 of its length
 _LEAST = wp.constant(1e-9)  # length of a direction [m]
 
@@ -60,6 +62,7 @@ def _under_end(size: wp.vec3, radius: float, a: wp.vec3, b: wp.vec3, d: wp.vec3)
   It is `under_end` of native/weights.h, in the cylinder's frame.
   """
   out = wp.where(a[2] + b[2] + d[2] < 0.0, -1.0, 1.0)
+  level = wp.abs(wp.normalize(wp.cross(b - a, d - a))[2]) >= _LEVEL
   slack = _SLACK * size[0]
   middle = wp.vec3(0.0)
   total = float(0.0)  # noqa: UP018 - a variable to Warp
@@ -72,7 +75,7 @@ def _under_end(size: wp.vec3, radius: float, a: wp.vec3, b: wp.vec3, d: wp.vec3)
       depth = size[1] + radius - out * x[2]
       aside = wp.sqrt(x[0] * x[0] + x[1] * x[1])
       inside = wp.min((size[0] + radius - aside - depth) / (_RIM * size[0]), 1.0)
-      if depth > -slack and inside > 0.0:
+      if level and depth > -slack and inside > 0.0:
         middle += (depth + slack) * inside * x
         total += (depth + slack) * inside
         covered += inside

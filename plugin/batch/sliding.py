@@ -9,13 +9,11 @@ what the gap adds follows from those rows.
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
 import mujoco
+import numpy as np
 import warp as wp
-from mujoco_warp._src.constraint import _contact_kbimp
 from mujoco_warp._src.types import vec5
 from palpate.engine import weights
 from palpate.tissue.types import Array, floats, ints, struct
-
-_SLOW = wp.constant(weights.SLOW)
 
 
 @struct
@@ -34,16 +32,10 @@ class Pressed:
   elem: Array(wp.vec2i, ("naconmax",))
   efc_address: ints("naconmax", "nrow")  # -1 for none
   aref: floats("nworld", "njmax")  # reference acceleration of the rows [m/s^2]
-  timestep: floats("nstep")
-  disableflags: int
-  dist: floats("naconmax")
-  includemargin: floats("naconmax")
-  solref: Array(wp.vec2, ("naconmax",))
-  solimp: Array(vec5, ("naconmax",))
   # See `weights.Firmness`:
   asked: float
   share: float
-  tools: floats("ngeom")
+  tools: floats("ngeom")  # less than 0 where contacts stay as they are
   pairs: float  # times R, in a pyramid: 2 / impratio
   D: floats("nworld", "njmax")  # inverse of the rows' R [kg]
   row_force: floats("nworld", "njmax")  # force of the rows [N]
@@ -72,29 +64,20 @@ def _has_rows(p: Pressed, c: int):
 @wp.func
 def _firm_up(p: Pressed, world: int, c: int):
   """Makes a contact as firm as under the plugin, see native/firm.h."""
-  h = p.timestep[world % p.timestep.shape[0]]
-  gap = p.dist[c] - p.includemargin[c]
-  was = _contact_kbimp(p.disableflags, h, p.solref[c], p.solimp[c], gap, False)
-  damping = 2.0 / (_SLOW * h)
-  stiffness = 0.25 * damping * damping
+  tool = p.tools[p.contact_geom[c][0]]
+  if tool < 0.0:
+    return
   touched = float(p.count[world])
   if p.elem[c][1] >= 0:
     touched = touched / 3.0
-  R = wp.max(p.asked, touched * p.share + p.tools[p.contact_geom[c][0]])
+  R = wp.max(p.asked, touched * p.share + tool)
   if p.paired == 1 and p.dim[c] > 1:
     square = p.friction[c][0] * p.friction[c][0]
     R *= p.pairs * square * (1.0 + square)
-  D = p.D[world, p.efc_address[c, 0]]
+  gain = 1.0 / (R * p.D[world, p.efc_address[c, 0]])
   for r in range(_rows(p, c)):
     row = p.efc_address[c, r]
-    p.D[world, row] = p.D[world, row] / (R * D)
-    aref = p.aref[world, row]
-    if p.paired == 1 or r == 0:
-      aref += was[0] * was[2] * gap
-    aref *= damping / was[1]
-    if p.paired == 1 or r == 0:
-      aref -= stiffness * gap
-    p.aref[world, row] = aref
+    p.D[world, row] = gain * p.D[world, row]
 
 
 @wp.kernel(enable_backward=False)
@@ -153,14 +136,13 @@ def make(batch, model: mujoco.MjModel, organ, touch):
   out, d = Pressed(), batch.d
   out.many, out.paired = touch.most, int(batch.paired)
   out.start, out.before, out.count = touch.start, touch.before, touch.count
-  spring = "dist", "includemargin", "solref", "solimp"
-  for name in ("dim", "frame", "friction", "elem", "efc_address", *spring):
+  for name in ("dim", "frame", "friction", "elem", "efc_address"):
     setattr(out, name, getattr(d.contact, name))
-  out.timestep, out.disableflags = batch.m.opt.timestep, int(batch.m.opt.disableflags)
   out.D, out.pairs = d.efc.D, 2.0 / float(model.opt.impratio)
   firm = weights.firmness(model, organ)
   out.asked, out.share = firm.asked, firm.share
-  out.tools = wp.array(firm.tools, dtype=float, device=batch.device)
+  tools = np.broadcast_to(firm.tools, model.ngeom)
+  out.tools = wp.array(tools, dtype=float, device=batch.device)
   out.contact_geom, out.aref, out.row_force = d.contact.geom, d.efc.aref, d.efc.force
   shape = (batch.nworld, out.many)
   out.geom, out.normal, out.force = (

@@ -144,8 +144,9 @@ def strip(
   made.flex_vert[:] = 0.0  # vertices are where their bodies are
   made.flex_centered[:] = True
   if made.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC:
-    sticks = min(weights.firmness(model, organ).stuck for organ in organs)
-    made.opt.impratio = max(made.opt.impratio, 1 / sticks)
+    firm = [weights.firmness(model, organ) for organ in organs]
+    sticks = [1 / each.stuck for each in firm if np.min(each.tools) >= 0]
+    made.opt.impratio = max(made.opt.impratio, *sticks, 0)
   if made.nv <= 60 and made.opt.solver == mujoco.mjtSolver.mjSOL_NEWTON:
     made.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
   _check(model, made, organs, nslots)

@@ -13,6 +13,7 @@ import functools
 import mujoco
 import numpy as np
 import warp as wp
+from palpate.attributes import CONTACT
 from palpate.tissue.kernels import kernel
 from palpate.tissue.types import Array, doubles, ints, struct
 
@@ -33,18 +34,21 @@ TISSUE = Numbers(
   "TISSUE",
   ("modulus", 1, "Pa", "young / (1 - poisson^2) of a solid without a skin, else 0"),
   ("yields", 1, "m/N", "compliance under a patch as wide as an edge"),
-  ("mass", 1, "kg", "of all vertices that move"),
+  ("share", 1, "1/kg", "least R of a contact for each vertex that is touched"),
   ("quick", 1, "1/s^2", "stiffness over mass of a vertex"),
+  ("firm", 1, "-", "whether contacts are made so; 0 where the organ says itself how firm they are"),
 )
-# A contact: the steps in which it closes; of its tissue's compliance, how much it has; the least R in
-# the inverse inertia of an organ and of a tool, since firmer ones chatter; of that, friction's.
+# A contact: the steps in which it closes; of its tissue's compliance, how much it has; the least R
+# in the inverse inertia of an organ and of a tool, since firmer ones chatter; of that, friction's.
 SLOW, FIRM, SOFT, LIGHT, STUCK = 4.0, 0.03, 0.036, 0.0075, 0.2
 # Contacts are softer from a step on [s], and where a vertex has more times its mass than this.
 LONG, STIFF = 5e-3, 1000.0
-# How a triangle is looked at under the flat end of a cylinder: points along an edge; in radii, how
-# far in from the rim they count less, and how far off the end they count; the share of points that
-# carries it in full.
-FLAT = {"POINTS": 6, "RIM": 0.1, "SLACK": 0.01, "COVER": 0.25}
+SKIN = 3.0  # times the least R of solids that skins have, for whose nodes MuJoCo answers
+# How a triangle is looked at under the flat end of a cylinder: how level it is at least; points
+# along an edge; in radii, how far in from the rim they count less, and how far off the end they
+# count; the share of points that carries it in full.
+FLAT = {"LEVEL": 0.85, "POINTS": 6, "RIM": 0.1, "SLACK": 0.01, "COVER": 0.25}
+_USUAL = (0.02, 1, 0.9, 0.95, 0.001, 0.5, 2)  # MuJoCo's solref and solimp
 _tissue: dict[int, tuple] = {}  # by the address of an mjData, see `_tissues`
 _SPARSE_FROM = 60  # dofs from which MuJoCo's rows are sparse where it may choose
 
@@ -109,7 +113,6 @@ weigh = kernel(
   | {
     "SLOW": SLOW,
     "FIRM": FIRM,
-    "SOFT": SOFT,
     "LIGHT": LIGHT,
     "LONG": LONG,
     "STUCK": STUCK,
@@ -199,7 +202,12 @@ def put_tissue(model: int, data: int, instance: int, organ, config):
     n = coupling.outer(organ)
     own = organ.dofadr[:n] >= 0
     adr[first[organ.flex] : first[organ.flex] + n] = np.where(own, start + organ.stateadr[:n], -1)
-  found[organ.windows.flex if organ.windows else [organ.flex]] = tissue_of(organ, config)
+  own = organ.windows.flex if organ.windows else [organ.flex]
+  found[own] = tissue_of(organ, config)
+  for flex in own:
+    solref = mjstruct.view(m.flex_solref, (m.nflex, 2))[flex]
+    solimp = mjstruct.view(m.flex_solimp, (m.nflex, 5))[flex]
+    found[flex, TISSUE.firm] = not says(solref, solimp)
 
 
 def tissue_of(organ, config=None) -> np.ndarray:
@@ -220,7 +228,15 @@ def tissue_of(organ, config=None) -> np.ndarray:
   stiffness = within + stretch + 8 * np.sqrt(rigidity * config.foundation) + below
   bare = 0.0 if stretch else solid * young / plane
   mass = organ.mass[organ.free]
-  return np.array([bare, 1 / stiffness, mass.sum(), stiffness / mass.mean()])
+  share = (1 if solid else SKIN) * SOFT / mass.sum()
+  return np.array([bare, 1 / stiffness, share, stiffness / mass.mean(), 1.0])
+
+
+def says(solref, solimp) -> bool:
+  """Returns whether an organ says itself how firm its contacts are."""
+  given = [*solref, *solimp]
+  usual = [*CONTACT["solref"], *CONTACT["solimp"], 0.5, 2]
+  return not (np.allclose(given, _USUAL, atol=1e-9) or np.allclose(given, usual, atol=1e-9))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -230,24 +246,26 @@ class Firmness:
   Attributes:
     asked: what the tissue asks for [1/kg]
     share: what the organ bears for each vertex that is touched [1/kg]
-    tools: what each geom bears [1/kg]  (ngeom,)
+    tools: what each geom bears [1/kg], (ngeom,); or -1 where contacts stay as they are
     stuck: of that, the most that friction has
   """
 
   asked: float
   share: float
-  tools: np.ndarray
+  tools: np.ndarray | float
   stuck: float
 
 
 def firmness(model: mujoco.MjModel, organ) -> Firmness:
   """Returns how firm contacts with an organ are."""
   h, tissue = float(model.opt.timestep), tissue_of(organ)
+  flex = organ.windows.flex[0] if organ.windows else organ.flex
+  left = says(model.flex_solref[flex], model.flex_solimp[flex])
   softer = max(1.0, (h / LONG) ** 2) * max(1.0, h**2 * tissue[TISSUE.quick] / STIFF)
   return Firmness(
     FIRM * tissue[TISSUE.yields] / (SLOW * h) ** 2,
-    softer * SOFT / tissue[TISSUE.mass],
-    LIGHT * model.body_invweight0[model.geom_bodyid, 0],
+    softer * tissue[TISSUE.share],
+    -1.0 if left else LIGHT * model.body_invweight0[model.geom_bodyid, 0],
     min(1.0, max(STUCK, h / LONG)),
   )
 

@@ -29,7 +29,7 @@ PALPATE double borne_by(const Fields& f, const char* contact, int side, int coun
   const double h = f.timestep.data[0], late = h * h / (LONG * LONG);
   const double stiff = h * h * tissue[TISSUE_QUICK] / STIFF;
   const double each = side_of(contact, CONTACT_ELEM, side) < 0 ? 1.0 : 1.0 / 3.0;  // a corner is of several
-  return SOFT * each * count / tissue[TISSUE_MASS] * (late > 1.0 ? late : 1.0) * (stiff > 1.0 ? stiff : 1.0);
+  return each * count * tissue[TISSUE_SHARE] * (late > 1.0 ? late : 1.0) * (stiff > 1.0 ? stiff : 1.0);
 }
 
 // Mean length of the edges of the triangle on a side of a contact [m].
@@ -71,7 +71,7 @@ PALPATE Touch touch_of(const Fields& f, const char* contact) {
   for (int side = 0; side < 2; ++side) {
     const int flex = side_of(contact, CONTACT_FLEX, side);
     const int geom = side_of(contact, CONTACT_GEOM, 1 - side);
-    if (geom >= 0 && flex >= 0 && f.mine.data[flex] && f.tissue.data[TISSUE_LENGTH * flex + TISSUE_MASS] > 0.0)
+    if (geom >= 0 && flex >= 0 && f.mine.data[flex] && f.tissue.data[TISSUE_LENGTH * flex + TISSUE_SHARE] > 0.0)
       return {geom, flex, side};
   }
   return {-1, -1, 0};
@@ -206,32 +206,30 @@ PALPATE void put_spring(const Fields& f, char* contact, Rows rows, double dampin
   }
 }
 
-// Makes a contact as firm as its tissue asks for and the time step can bear, whatever its nodes weigh
-// and its solref and solimp say; and at least `least` [m/N] soft. At rest its force is gap / compliance
-// with R = compliance * stiffness, of which the rows of a pyramid have a part each. Friction is firmer
-// the shorter the step, since what sticks creeps at a speed in proportion to its R; in a pyramid it has
-// no R of its own (MuJoCo, Computation, Constraint model). Done twice it does nothing.
+// Makes a contact as firm as its tissue asks for, whatever its nodes weigh, but no firmer than the time
+// step can bear, if the organ does not say itself how firm it is; and at least `least` [m/N] soft. At rest its force is gap / compliance with R = compliance * stiffness, of which the rows of a pyramid have a
+// part each. Friction is firmer the shorter the step, since what sticks creeps at a speed in proportion
+// to its R; in a pyramid it has no R of its own (MuJoCo, Computation, Constraint model). Done twice it
+// does nothing.
 template <class Fields>
-PALPATE void firm_up(const Fields& f, char* contact, Rows rows, int count, double least) {
+PALPATE void firm_up(const Fields& f, char* contact, Rows rows, Touch touch, int count, double least) {
   const double* row = datum<double*>(f, DATA_EFC_KBIP) + 4 * rows.first;
   const double* R = datum<double*>(f, DATA_EFC_R) + rows.first;
-  if (!(row[0] > 0.0)) return;
   const double* friction = (const double*)(contact + CONTACT_FRICTION);
-  const double h = f.timestep.data[0], damping = 2.0 / (SLOW * h), stiffness = 0.25 * damping * damping;
-  const double borne = borne_by(f, contact, 0, count) + borne_by(f, contact, 1, count);
-  const double asked = FIRM * stiffness * (yielding(f, contact, 0) + yielding(f, contact, 1));
-  const double square = friction[0] * friction[0];
-  const double pair = rows.paired ? 2.0 * square * (1.0 + square) / f.impratio.data[0] : 1.0;
-  const double soft = pair * (borne > asked ? borne : asked);
-  if (row[2] < 1.0) put_spring(f, contact, rows, damping, soft);
-  if (!rows.paired && rows.count > 1) {
-    const double stuck = h > LONG ? 1.0 : h > STUCK * LONG ? h / LONG : STUCK, most = stuck * pair * borne;
-    const double gain = R[1] > most ? most / R[1] : 1.0;
-    scale_impedance(f, {rows.first + 1, rows.count - 1, false}, gain);
+  const bool sticks = !rows.paired && rows.count > 1;
+  if (f.tissue.data[TISSUE_LENGTH * touch.flex + TISSUE_FIRM] > 0.0 && row[2] < 1.0) {
+    const double h = f.timestep.data[0], damping = 2.0 / (SLOW * h), stiffness = 0.25 * damping * damping;
+    const double borne = borne_by(f, contact, 0, count) + borne_by(f, contact, 1, count);
+    const double asked = FIRM * stiffness * (yielding(f, contact, 0) + yielding(f, contact, 1));
+    const double square = friction[0] * friction[0];
+    const double pair = rows.paired ? 2.0 * square * (1.0 + square) / f.impratio.data[0] : 1.0;
+    put_spring(f, contact, rows, damping, pair * (borne > asked ? borne : asked));
+    const double stuck = h > LONG ? 1.0 : h > STUCK * LONG ? h / LONG : STUCK, most = stuck * borne;
+    if (sticks && R[1] > most) scale_impedance(f, {rows.first + 1, rows.count - 1, false}, most / R[1]);
   }
   const double more = (rows.paired ? rows.count : 1) * row[0] * row[2] * least;
   if (R[0] < more) scale_impedance(f, {rows.first, rows.paired ? rows.count : 1, false}, more / R[0]);
-  if (!rows.paired && rows.count > 1) *(double*)(contact + CONTACT_MU) = friction[0] * sqrt(R[1] / R[0]);
+  if (sticks) *(double*)(contact + CONTACT_MU) = friction[0] * sqrt(R[1] / R[0]);
 }
 
 }  // namespace palpate

@@ -21,6 +21,8 @@ PALPATE bool under_end(const Fields& f, int geom, double radius, const D3* x, D3
   D3 r[3], sum = {0.0, 0.0, 0.0};
   for (int k = 0; k < 3; ++k) r[k] = x[k] - load(f.geom_xpos.data + 3 * geom);
   out = {R[2], R[5], R[8]};
+  const D3 across = cross(r[1] - r[0], r[2] - r[0]);
+  if (fabs(dot(across, out)) < LEVEL * norm(across)) return false;
   if (dot(r[0] + r[1] + r[2], out) < 0.0) out = -1.0 * out;
   const double slack = SLACK * size[0];
   double total = 0.0, covered = 0.0;
@@ -171,7 +173,7 @@ PALPATE void weigh(const Fields& f, Thread, int) {
     if (touch.geom >= 0) {
       if (!(touch == last)) least = unresolved(f, contacts, ncon, touch);
       if (touch.flex != last.flex) count = count_of(contacts, ncon, touch.flex);
-      firm_up(f, contact, rows, count, least);
+      firm_up(f, contact, rows, touch, count, least);
       last = touch;
     }
     keep_closed(f, contact, rows);

@@ -52,8 +52,8 @@ def reference():
 
 @pytest.mark.parametrize(
   ("h", "newton", "allowed"),
-  # Share of the peak: what the contact yields grows with the square of the step.
-  [(5e-4, 1, 0.003), (1e-3, 1, 0.009), (2e-3, 1, 0.027), (1e-3, 3, 0.009)],
+  # Share of the peak; half of the square is the first touch, where the ball bounces on one node.
+  [(5e-4, 1, 0.005), (1e-3, 1, 0.006), (2e-3, 1, 0.013), (1e-3, 3, 0.006)],
 )
 def test_the_press_of_the_explicit_reference_is_reproduced(
   scenes, reference, device, h, newton, allowed
@@ -75,7 +75,7 @@ def test_the_press_of_the_explicit_reference_is_reproduced(
   force = np.interp(time, found[:, 0], found[:, 1])
   error = np.sqrt(np.mean((force - expected) ** 2)) / expected.max()
   assert error < allowed
-  assert force[-1] == pytest.approx(expected[-1], rel=allowed)
+  assert force[-1] == pytest.approx(expected[-1], rel=1e-3)
 
 
 @pytest.mark.parametrize("duration", [0.03, pytest.param(0.25, marks=pytest.mark.slow)])

@@ -80,7 +80,7 @@ def test_every_integrator_gives_the_same_held_contact_force(scenes, integrator):
     assert organ.error is None and _quiet(data)
     force.append(organ.force[2])
   assert force[0] < -0.3
-  assert force[1] == pytest.approx(force[0], rel=2e-2)
+  assert force[1] == pytest.approx(force[0], rel=2e-3)
 
 
 def test_rk4_is_refused(scenes):

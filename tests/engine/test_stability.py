@@ -54,10 +54,8 @@ def test_the_stabilising_stiffness_acts_on_the_change_of_velocity_only(scenes, h
 
 
 @pytest.mark.parametrize("windowed", [False, True], ids=["nodal", "window"])
-@pytest.mark.parametrize(("young", "push"), [(8e3, 16.0), (4e4, 60.0)])
-def test_jaws_that_pierce_an_organ_give_it_no_more_energy_than_their_work(
-  scenes, windowed, young, push
-):
+@pytest.mark.parametrize("young", [8e3, 3e5])
+def test_jaws_that_pierce_an_organ_give_it_no_more_energy_than_their_work(scenes, windowed, young):
   points, elem = scenes.sphere(2)
   z = points[:, 2].max() - 0.001
   jaws = "".join(
@@ -74,7 +72,7 @@ def test_jaws_that_pierce_an_organ_give_it_no_more_energy_than_their_work(
   )
   moving, work, had, pierced = shut + down, 0.0, 0.0, False
   for _ in range(250):
-    data.qfrc_applied[shut] = push * min(1, data.time / 0.05)  # [N]
+    data.qfrc_applied[shut] = 16.0 * min(1, data.time / 0.05)  # [N]
     data.qfrc_applied[down] = -200 * 0.004 * min(1, data.time / 0.05) - 2 * data.qvel[down]
     mujoco.mj_step(model, data)
     work += model.opt.timestep * float(data.qfrc_applied[moving] @ data.qvel[moving])

@@ -137,9 +137,11 @@ def pressed(scenes, mesh, tool, depth, steps=250, h=1e-3, **config):
   points, elem = mesh
   low, top = points[:, 2].min(), points[:, 2].max()
   pin = np.flatnonzero(points[:, 2] < low + 0.1 * (top - low))
-  tissue = scenes.organ(points, elem, radius=0.0005, pin=pin, damping=0.005, **config)
+  usual = {"condim": 1, "solref": "0.02 1"}
+  keys = {"radius": 0.0005, "pin": pin, "damping": 0.005, "contact": usual} | config
+  tissue = scenes.organ(points, elem, **keys)
   body = f"""<body name="tool" pos="0 0 {top + 0.0007}"><joint name="z" type="slide" axis="0 0 1"/>
-    <geom name="tool" {tool} mass="0.5" condim="1" solref="0.004 1"/></body>"""
+    <geom name="tool" {tool} mass="0.5" condim="1"/></body>"""
   drive = '<actuator><position joint="z" kp="20000" kv="200"/></actuator>'
   model, data, organ = scenes.load(scenes.world(tissue, body, h=h, extra=drive))
   scenes.run(model, data, steps, deepest=depth + 0.0002)

@@ -44,7 +44,7 @@ def test_static_force_does_not_depend_on_the_step():
     for _ in range(round(0.8 / h)):
       mujoco.mj_step(m, d)
     forces.append(d.qfrc_constraint[-2])
-  np.testing.assert_allclose(forces, forces[0], rtol=2e-3)
+  np.testing.assert_allclose(forces, forces[0], rtol=1e-3)
 
 
 def test_state_restores_to_the_bit():
@@ -137,7 +137,7 @@ def test_rotated_frame_gives_the_same_force():
   turned = mujoco.MjModel.from_xml_string(probed(frame='pos=".1 .2 .3" euler="40 20 70"'))
   forces = [drive(m, mujoco.MjData(m), 150) for m in (plain, turned)]
   # Rounding differs under the rotation, and friction amplifies it.
-  np.testing.assert_allclose(forces[1][:60], forces[0][:60], atol=1e-6 * np.abs(forces[0]).max())
+  np.testing.assert_allclose(forces[1][:110], forces[0][:110], atol=1e-6 * np.abs(forces[0]).max())
 
 
 def test_far_tool_leaves_the_organ_at_rest_and_finds_it_after_a_jump():
@@ -248,7 +248,7 @@ def test_a_tilted_tool_meets_the_nodes_under_it(shape):
     found.append((d.qfrc_constraint[-1], handle.displacement))
   assert found[0][0] > 0.05
   assert found[1][0] == pytest.approx(found[0][0], rel=1e-3)
-  np.testing.assert_allclose(found[1][1], found[0][1], atol=2e-5)
+  np.testing.assert_allclose(found[1][1], found[0][1], atol=1e-5)
 
 
 @pytest.mark.parametrize(
