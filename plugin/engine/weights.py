@@ -13,7 +13,6 @@ import functools
 import mujoco
 import numpy as np
 import warp as wp
-from palpate.attributes import CONTACT
 from palpate.tissue.kernels import kernel
 from palpate.tissue.types import Array, doubles, ints, struct
 
@@ -49,6 +48,8 @@ SKIN = 3.0  # times the least R of solids that skins have, for whose nodes MuJoC
 # count; the share of points that carries it in full.
 FLAT = {"LEVEL": 0.85, "POINTS": 6, "RIM": 0.1, "SLACK": 0.01, "COVER": 0.25}
 _USUAL = (0.02, 1, 0.9, 0.95, 0.001, 0.5, 2)  # MuJoCo's solref and solimp
+# Those of `add_organ`, by which an organ does not say how firm its contacts are either.
+SOLREF, SOLIMP = (0.004, 1), (0.95, 0.99, 0.001)
 _tissue: dict[int, tuple] = {}  # by the address of an mjData, see `_tissues`
 _SPARSE_FROM = 60  # dofs from which MuJoCo's rows are sparse where it may choose
 
@@ -235,7 +236,7 @@ def tissue_of(organ, config=None) -> np.ndarray:
 def says(solref, solimp) -> bool:
   """Returns whether an organ says itself how firm its contacts are."""
   given = [*solref, *solimp]
-  usual = [*CONTACT["solref"], *CONTACT["solimp"], 0.5, 2]
+  usual = [*SOLREF, *SOLIMP, 0.5, 2]
   return not (np.allclose(given, _USUAL, atol=1e-9) or np.allclose(given, usual, atol=1e-9))
 
 
