@@ -3,7 +3,6 @@
 import ast
 import functools
 import pathlib
-import re
 
 ROOT = pathlib.Path(__file__).parents[1]
 ROOMS = {"palpate": "plugin", "palpate.models": "models", "palpate.tasks": "tasks"}
@@ -130,33 +129,4 @@ def private_uses(paths: list[pathlib.Path]) -> set[str]:
         words = [a.value for a in node.args if isinstance(a, ast.Constant)]
         used = [str(word).rpartition(".")[2] for word in words]
       found |= {f"{name_of(path)}: {name}" for name in used if name in foreign}
-  return found
-
-
-def native_functions(text: str) -> dict[str, int]:
-  """Returns the lines of each function of a header, by name."""
-  text = re.sub(r"/\*.*?\*/", lambda m: "\n" * m[0].count("\n"), text, flags=re.S)
-  found, scopes, head, start = {}, [], "", 0
-  for number, line in enumerate(text.splitlines()):
-    line = re.sub(r"//.*|^\s*#.*", "", line)
-    for char in line + " ":
-      if char == "{":
-        outside = all(kind == "scope" for kind, *_ in scopes)
-        head = re.sub(r"template\s*<[^>]*>", "", head)
-        kind = "scope" if re.search(r"\b(namespace|class|struct|enum|extern)\b", head) else "block"
-        name = re.findall(r"(\w+|operator\W+?)\s*\(", head)
-        if outside and kind == "block" and name:
-          kind, start = "function", number - head.strip().count("\n")
-        scopes.append((kind, name[0] if name else "", start))
-        head = ""
-      elif char == "}":
-        kind, name, begin = scopes.pop()
-        if kind == "function":
-          found[name] = max(found.get(name, 0), number - begin + 1)
-        head = ""
-      elif char == ";" and "(" not in head.rpartition(")")[2]:
-        head = ""
-      else:
-        head += char
-    head += "\n"
   return found

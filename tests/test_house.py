@@ -1,4 +1,4 @@
-"""The rules of the house: what may import what, sizes, and one place for each thing.
+"""The rules of the house: what may import what, and one place for each thing.
 
 A rule finds its offenders in the source, none of which is run. What does not comply yet is named in
 NOT_YET, and a name that does comply must go from there.
@@ -18,7 +18,6 @@ from sources import (
   imports,
   modules,
   name_of,
-  native_functions,
   nodes,
   package_files,
   private_uses,
@@ -28,7 +27,6 @@ from sources import (
 
 # Floors from the ground up; an import leads to the same floor or a lower one.
 FLOORS = ("native", "tissue", "engine", "organ", "batch", "models", "tasks", "app")
-LARGE = {"file": 450, "function": 60, "native function": 70}
 
 NOT_YET: dict[str, set[str]] = {}
 
@@ -114,32 +112,6 @@ def private_in_tests() -> set[str]:
 
 def private_above() -> set[str]:
   return private_uses([*below("models"), *below("tasks"), *below("plugin/app")])
-
-
-# Sizes.
-
-
-def long_files() -> set[str]:
-  paths = [*package_files(), *headers(), *suite_files()]
-  return {name_of(p) for p in paths if len(p.read_text().splitlines()) > LARGE["file"]}
-
-
-def long_functions() -> set[str]:
-  return {
-    name_of(path)
-    for path in [*package_files(), *suite_files()]
-    for node in nodes(path)
-    if isinstance(node, ast.FunctionDef) and node.end_lineno - node.lineno >= LARGE["function"]
-  }
-
-
-def long_native_functions() -> set[str]:
-  return {
-    name_of(path)
-    for path in headers()
-    for lines in native_functions(path.read_text()).values()
-    if lines > LARGE["native function"]
-  }
 
 
 # One place for each thing.
@@ -284,9 +256,6 @@ RULES = {
   "tissue knows no MuJoCo": mujoco_in_tissue,
   "tests use public names": private_in_tests,
   "models, tasks and commands use public names": private_above,
-  "files": long_files,
-  "functions": long_functions,
-  "native functions": long_native_functions,
   "device switches": device_switches,
   "native code in headers": native_in_python,
   "kernels of four arguments": wide_kernels,
@@ -320,21 +289,3 @@ def test_the_wheel_is_the_package_alone():
   for module, path in modules().items():
     package = module if path.name == "__init__.py" else module.rpartition(".")[0]
     assert package in packages, f"{name_of(path)} would be left out of the wheel"
-
-
-def test_native_functions_are_measured():
-  text = """
-namespace a {
-// f(x) {
-struct V { float x; V operator+(V b) const { return b; } };
-template <class T>
-inline float sum(
-    T a, int n) {
-  for (int i = 0; i < n; ++i) {
-    a += i;
-  }
-  return a;
-}
-}
-"""
-  assert native_functions(text)["sum"] == 7

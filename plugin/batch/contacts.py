@@ -16,7 +16,7 @@ import warp as wp
 # All that depends on names inside of mujoco_warp: its tools against a triangle, and types.
 from mujoco_warp._src import collision_primitive_core as core
 from mujoco_warp._src.types import ContactType, vec5
-from palpate.engine import weights
+from palpate.engine import mjstruct, weights
 from palpate.tissue.types import Array, fill, floats, ints, struct
 
 from . import convex, cylinder
@@ -389,9 +389,9 @@ def make(model: mujoco.MjModel, organ, tools: np.ndarray, place, patch, data):
   # EPA has memory for one triangle of a slot at a time.
   alone = convex.KINDS & set(model.geom_type[tools].tolist())
   ring = 1 if alone else int(np.diff(patch.near_adr.numpy()).max())
-  own = int(organ.windows.flex[0]) if organ.windows else organ.flex
+  own = organ.flexes[0]
   rows = [_mix(model, int(g), own) for g in tools]
-  if not weights.says(model.flex_solref[own], model.flex_solimp[own]):
+  if not weights.says(mjstruct.Model.from_address(model._address), own):
     firm = {"solref": (weights.SLOW * model.opt.timestep, 1.0), "solimp": _HARD}
     rows = [row | firm for row in rows]
   mixed = {name: np.array([row[name] for row in rows]).reshape(-1, *wide)

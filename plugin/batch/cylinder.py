@@ -67,18 +67,19 @@ def _under_end(size: wp.vec3, radius: float, a: wp.vec3, b: wp.vec3, d: wp.vec3)
   middle = wp.vec3(0.0)
   total = float(0.0)  # noqa: UP018 - a variable to Warp
   covered = float(0.0)  # noqa: UP018
-  for i in range(_POINTS):
-    for j in range(_POINTS - i):
-      u = (float(i) + 1.0 / 3.0) / float(_POINTS)
-      v = (float(j) + 1.0 / 3.0) / float(_POINTS)
-      x = (1.0 - u - v) * a + u * b + v * d
-      depth = size[1] + radius - out * x[2]
-      aside = wp.sqrt(x[0] * x[0] + x[1] * x[1])
-      inside = wp.min((size[0] + radius - aside - depth) / (_RIM * size[0]), 1.0)
-      if level and depth > -slack and inside > 0.0:
-        middle += (depth + slack) * inside * x
-        total += (depth + slack) * inside
-        covered += inside
+  if level:
+    for i in range(_POINTS):
+      for j in range(_POINTS - i):
+        u = (float(i) + 1.0 / 3.0) / float(_POINTS)
+        v = (float(j) + 1.0 / 3.0) / float(_POINTS)
+        x = (1.0 - u - v) * a + u * b + v * d
+        depth = size[1] + radius - out * x[2]
+        aside = wp.sqrt(x[0] * x[0] + x[1] * x[1])
+        inside = wp.min((size[0] + radius - aside - depth) / (_RIM * size[0]), 1.0)
+        if depth > -slack and inside > 0.0:
+          middle += (depth + slack) * inside * x
+          total += (depth + slack) * inside
+          covered += inside
   middle = middle / wp.max(total, 1e-30)
   share = wp.min(covered / (0.5 * float(_POINTS * (_POINTS + 1)) * _COVER), 1.0)
   return share, middle, share * (out * middle[2] - size[1] - radius), out

@@ -245,8 +245,8 @@ class Surface:
 
 def _skin(organ, model) -> float:
   """Returns the distance from an organ's triangles within which it touches [m]."""
-  flex = organ.windows.flex if organ.windows else [organ.flex]
-  return float(model.flex_radius[flex].max() + model.flex_margin[flex].max())
+  flexes = organ.flexes
+  return float(model.flex_radius[flexes].max() + model.flex_margin[flexes].max())
 
 
 def _longest(mesh, vert: np.ndarray) -> np.ndarray:

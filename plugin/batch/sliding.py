@@ -9,10 +9,10 @@ what the gap adds follows from those rows.
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
 import mujoco
-import numpy as np
 import warp as wp
 from mujoco_warp._src.types import vec5
-from palpate.engine import weights
+from palpate.engine import mjstruct, weights
+from palpate.engine.weights import TISSUE
 from palpate.tissue.types import Array, floats, ints, struct
 
 
@@ -32,10 +32,11 @@ class Pressed:
   elem: Array(wp.vec2i, ("naconmax",))
   efc_address: ints("naconmax", "nrow")  # -1 for none
   aref: floats("nworld", "njmax")  # reference acceleration of the rows [m/s^2]
-  # See `weights.Firmness`:
+  # See `weights.TISSUE`:
+  firm: int
   asked: float
   share: float
-  tools: floats("ngeom")  # less than 0 where contacts stay as they are
+  tools: floats("ngeom")  # R that the step can bear for each tool [1/kg]
   pairs: float  # times R, in a pyramid: 2 / impratio
   D: floats("nworld", "njmax")  # inverse of the rows' R [kg]
   row_force: floats("nworld", "njmax")  # force of the rows [N]
@@ -64,13 +65,12 @@ def _has_rows(p: Pressed, c: int):
 @wp.func
 def _firm_up(p: Pressed, world: int, c: int):
   """Makes a contact as firm as under the plugin, see native/firm.h."""
-  tool = p.tools[p.contact_geom[c][0]]
-  if tool < 0.0:
+  if p.firm == 0:
     return
   touched = float(p.count[world])
   if p.elem[c][1] >= 0:
     touched = touched / 3.0
-  R = wp.max(p.asked, touched * p.share + tool)
+  R = wp.max(p.asked, touched * p.share + p.tools[p.contact_geom[c][0]])
   if p.paired == 1 and p.dim[c] > 1:
     square = p.friction[c][0] * p.friction[c][0]
     R *= p.pairs * square * (1.0 + square)
@@ -139,9 +139,10 @@ def make(batch, model: mujoco.MjModel, organ, touch):
   for name in ("dim", "frame", "friction", "elem", "efc_address"):
     setattr(out, name, getattr(d.contact, name))
   out.D, out.pairs = d.efc.D, 2.0 / float(model.opt.impratio)
-  firm = weights.firmness(model, organ)
-  out.asked, out.share = firm.asked, firm.share
-  tools = np.broadcast_to(firm.tools, model.ngeom)
+  tissue = weights.tissue_of(mjstruct.Model.from_address(model._address), organ)
+  out.firm = int(tissue[TISSUE.firm])
+  out.asked, out.share = tissue[TISSUE.asked], tissue[TISSUE.share]
+  tools = weights.LIGHT * model.body_invweight0[model.geom_bodyid, 0]
   out.tools = wp.array(tools, dtype=float, device=batch.device)
   out.contact_geom, out.aref, out.row_force = d.contact.geom, d.efc.aref, d.efc.force
   shape = (batch.nworld, out.many)

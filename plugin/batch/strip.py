@@ -17,6 +17,7 @@ import mujoco
 import numpy as np
 from palpate import windows
 from palpate.engine import mjstruct, weights
+from palpate.engine.weights import TISSUE
 
 from .contacts import KINDS
 
@@ -144,8 +145,9 @@ def strip(
   made.flex_vert[:] = 0.0  # vertices are where their bodies are
   made.flex_centered[:] = True
   if made.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC:
-    firm = [weights.firmness(model, organ) for organ in organs]
-    sticks = [1 / each.stuck for each in firm if np.min(each.tools) >= 0]
+    m = mjstruct.Model.from_address(model._address)
+    tissues = [weights.tissue_of(m, organ) for organ in organs]
+    sticks = [1 / tissue[TISSUE.stuck] for tissue in tissues if tissue[TISSUE.firm]]
     made.opt.impratio = max(made.opt.impratio, *sticks, 0)
   if made.nv <= 60 and made.opt.solver == mujoco.mjtSolver.mjSOL_NEWTON:
     made.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
@@ -198,8 +200,7 @@ def _slot_mass(organ) -> float:
 
 def _take_out(bare, bodies: dict, organ, model):
   """Deletes an organ's flexes and the bodies of its nodes or windows."""
-  numbers = [organ.flex, *(organ.windows.flex if organ.windows else [])]
-  for number in numbers:
+  for number in {organ.flex, *organ.flexes}:
     name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_FLEX, int(number))
     flex = bare.flex(name)
     mine = [bodies[body] for body in dict.fromkeys(flex.vertbody)]

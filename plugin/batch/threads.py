@@ -260,8 +260,7 @@ class _Tissue(Tissue):
 
   def _rub(self, world: int, friction: float):
     organ = self.spaces[world].organ
-    touching = organ.windows.flex if organ.windows else [organ.flex]
-    self._batch.models[world].flex_friction[touching, 0] = friction
+    self._batch.models[world].flex_friction[organ.flexes, 0] = friction
 
 
 def _threads(nthread: int | None) -> int:

@@ -133,10 +133,9 @@ def _touched(w, model: int) -> weights.Weights:
 
   With all of them, since one that looks for contacts again has those of the others found again.
   """
-  weights.put_tissue(model, w.data, w.instance, w.organ, w.config)
+  weights.tell(w, model)
   out = weights.make(model, w.data, declare_windows.touching(model, w.instance), w.flags)
-  own = w.organ.windows.flex if w.organ.windows else [w.organ.flex]
-  out.mine.numpy()[own] = 2
+  out.mine.numpy()[w.organ.flexes] = 2
   w.views["mine"] = out.mine
   return out
 

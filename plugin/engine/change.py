@@ -158,7 +158,7 @@ def _put(w, group: bonds.Group):
 def _change(w, model: int, config: Config):
   workspace.attach(w, model)
   before, w.config = w.config, config
-  weights.put_tissue(model, w.data, w.instance, w.organ, config)
+  weights.tell(w, model)
   if w.resident:
     w.resident.stop()
   material = any(getattr(before, key) != getattr(config, key) for key in configuration.MATERIAL)

@@ -86,6 +86,11 @@ class Declaration:
     return out
 
   @property
+  def flexes(self) -> list[int]:
+    """Flexes that tools meet: those of the windows, or its own."""
+    return [int(flex) for flex in self.windows.flex] if self.windows else [self.flex]
+
+  @property
   def jointed(self) -> np.ndarray:
     """Vertices that are dofs of MuJoCo."""
     return np.flatnonzero(self.dofadr >= 0)

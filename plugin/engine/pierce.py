@@ -87,8 +87,7 @@ def tools(m, organ) -> np.ndarray:
     return np.zeros(0, int)
   body = mjstruct.view(m.geom_bodyid, m.ngeom, np.int32)
   weld = mjstruct.view(m.body_weldid, m.nbody, np.int32)
-  flex = organ.windows.flex if organ.windows else [organ.flex]
-  meets = np.unique(np.concatenate([flexes.meeting_geoms(m, int(f)) for f in flex]))
+  meets = np.unique(np.concatenate([flexes.meeting_geoms(m, flex) for flex in organ.flexes]))
   return meets[weld[body[meets]] != 0]
 
 

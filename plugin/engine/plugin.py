@@ -126,6 +126,7 @@ def _init(model: int, data: int, instance: int) -> int:
 @guard.watch
 def _destroy(data: int, instance: int):
   w = _workspaces.pop((data, instance), None)
+  weights.forget(data)
   for state in [s for s, other in _states.items() if other is w]:
     del _states[state]
 

@@ -25,8 +25,7 @@ def fit(m, organ: Declaration, body: Body):
   """Makes a model fit an organ that it declares, with the tissue `body`."""
   # MuJoCo warns of a flex without forces of its own; an <edge damping> silences it and, zero here,
   # costs nothing while running. The plugin's own damping acts instead.
-  flexes = organ.windows.flex if organ.windows else [organ.flex]
-  mjstruct.view(m.flex_edgedamping, m.nflex)[flexes] = 0.0
+  mjstruct.view(m.flex_edgedamping, m.nflex)[organ.flexes] = 0.0
   if organ.windows is None:
     give_armature(m, organ, body, organ.config)
     if len(organ.mesh.tet):

@@ -7,13 +7,14 @@ flicker where a tool presses. MuJoCo 4.0 has it right. Both part what slides.
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
 
-import dataclasses
 import functools
 
 import mujoco
 import numpy as np
 import warp as wp
+from palpate.tissue.config import Config, rigidity
 from palpate.tissue.kernels import kernel
+from palpate.tissue.solid import capsule
 from palpate.tissue.types import Array, doubles, ints, struct
 
 from . import apart, coupling, mjstruct
@@ -32,9 +33,9 @@ _CONTACT = (
 TISSUE = Numbers(
   "TISSUE",
   ("modulus", 1, "Pa", "young / (1 - poisson^2) of a solid without a skin, else 0"),
-  ("yields", 1, "m/N", "compliance under a patch as wide as an edge"),
-  ("share", 1, "1/kg", "least R of a contact for each vertex that is touched"),
-  ("quick", 1, "1/s^2", "stiffness over mass of a vertex"),
+  ("asked", 1, "1/kg", "R of a contact that the tissue asks for"),
+  ("share", 1, "1/kg", "R that the step can bear at least for each vertex that is touched"),
+  ("stuck", 1, "-", "of the R that the step can bear, the most that friction has"),
   ("firm", 1, "-", "whether contacts are made so; 0 where the organ says itself how firm they are"),
 )
 # A contact: the steps in which it closes; of its tissue's compliance, how much it has; the least R
@@ -50,7 +51,7 @@ FLAT = {"LEVEL": 0.85, "POINTS": 6, "RIM": 0.1, "SLACK": 0.01, "COVER": 0.25}
 _USUAL = (0.02, 1, 0.9, 0.95, 0.001, 0.5, 2)  # MuJoCo's solref and solimp
 # Those of `add_organ`, by which an organ does not say how firm its contacts are either.
 SOLREF, SOLIMP = (0.004, 1), (0.95, 0.99, 0.001)
-_tissue: dict[int, tuple] = {}  # by the address of an mjData, see `_tissues`
+_tissue: dict[int, tuple] = {}  # by the address of an mjData, see `tell`
 _SPARSE_FROM = 60  # dofs from which MuJoCo's rows are sparse where it may choose
 
 
@@ -113,11 +114,7 @@ weigh = kernel(
   | _offsets("CONTACT", mjstruct.Contact, _CONTACT)
   | {
     "SLOW": SLOW,
-    "FIRM": FIRM,
     "LIGHT": LIGHT,
-    "LONG": LONG,
-    "STUCK": STUCK,
-    "STIFF": STIFF,
     **FLAT,
     "CONTACT_LENGTH": mjstruct.size(mjstruct.Contact),
     "CONTACT_PYRAMIDAL": int(mujoco.mjtConstraint.mjCNSTR_CONTACT_PYRAMIDAL),
@@ -188,11 +185,11 @@ def _tissues(model: int, data: int) -> tuple[np.ndarray, np.ndarray]:
   return found
 
 
-def put_tissue(model: int, data: int, instance: int, organ, config):
-  """Tells contacts with an organ what its tissue is made of, and where its contact forces are."""
-  m = mjstruct.Model.from_address(model)
-  found, adr = _tissues(model, data)
-  start = int(mjstruct.view(m.plugin_stateadr, m.nplugin, np.int32)[instance])
+def tell(w, model: int):
+  """Tells contacts with an organ what its tissue is like, and where its contact forces are."""
+  m, organ = mjstruct.Model.from_address(model), w.organ
+  found, adr = _tissues(model, w.data)
+  start = int(mjstruct.view(m.plugin_stateadr, m.nplugin, np.int32)[w.instance])
   start += coupling.spans(organ)["force"].start
   first = mjstruct.view(m.flex_vertadr, m.nflex, np.int32)
   if organ.windows:
@@ -203,72 +200,49 @@ def put_tissue(model: int, data: int, instance: int, organ, config):
     n = coupling.outer(organ)
     own = organ.dofadr[:n] >= 0
     adr[first[organ.flex] : first[organ.flex] + n] = np.where(own, start + organ.stateadr[:n], -1)
-  own = organ.windows.flex if organ.windows else [organ.flex]
-  found[own] = tissue_of(organ, config)
-  for flex in own:
-    solref = mjstruct.view(m.flex_solref, (m.nflex, 2))[flex]
-    solimp = mjstruct.view(m.flex_solimp, (m.nflex, 5))[flex]
-    found[flex, TISSUE.firm] = not says(solref, solimp)
+  found[organ.flexes] = tissue_of(m, organ, w.config)
 
 
-def tissue_of(organ, config=None) -> np.ndarray:
+def forget(data: int):
+  """Forgets what organs have told of an mjData that is freed."""
+  _tissue.pop(data, None)
+
+
+def tissue_of(m, organ, config: Config | None = None) -> np.ndarray:
   """Returns TISSUE of an organ, as compiled or with another configuration.
 
   Its compliance is that of an elastic half space, a membrane with bending (Winkler's plate under a
   point) and a foundation, side by side.
+
+  Args:
+    m: the model's struct
+    organ: the organ's declaration
+    config: its configuration, or None for the declared one
   """
-  config = config or organ.config
-  solid, plane = config.elements == "solid", 1 - config.poisson**2
-  young = float(np.mean(config.young))
-  skin = float(np.mean(config.capsule_young or 0.0)) if solid else young
-  rigidity = config.bend * skin * config.thickness**3 / (12 * plane)
-  stretch = config.stiffness if config.elements == "spring" else skin * config.thickness / plane
+  config, h = config or organ.config, float(m.opt.timestep)
+  outside, plane, young = capsule(config), 1 - config.poisson**2, float(np.mean(config.young))
+  bare = young / plane if config.elements == "solid" else 0.0
+  skin = float(np.mean(outside.young)) * outside.thickness / plane
+  stretch = {"spring": config.stiffness, "solid": 0.0}.get(outside.elements, skin)
+  bend = float(rigidity(outside, np.size(outside.young)).mean())
   corner = organ.mesh.rest[organ.mesh.elem]
   edge = np.linalg.norm(corner - corner[:, [1, 2, 0]], axis=2).mean()
-  within, below = solid * young / plane * edge, config.foundation * edge**2
-  stiffness = within + stretch + 8 * np.sqrt(rigidity * config.foundation) + below
-  bare = 0.0 if stretch else solid * young / plane
+  below = config.foundation
+  stiffness = bare * edge + stretch + 8 * np.sqrt(bend * below) + below * edge**2
   mass = organ.mass[organ.free]
-  share = (1 if solid else SKIN) * SOFT / mass.sum()
-  return np.array([bare, 1 / stiffness, share, stiffness / mass.mean(), 1.0])
+  softer = max(1.0, (h / LONG) ** 2) * max(1.0, h**2 * stiffness / (STIFF * mass.mean()))
+  share = softer * SOFT / mass.sum() * (1.0 if bare else SKIN)
+  asked = FIRM / (stiffness * (SLOW * h) ** 2)
+  stuck = min(1.0, max(STUCK, h / LONG))
+  return np.array([0.0 if stretch else bare, asked, share, stuck, not says(m, organ.flexes[0])])
 
 
-def says(solref, solimp) -> bool:
-  """Returns whether an organ says itself how firm its contacts are."""
-  given = [*solref, *solimp]
-  usual = [*SOLREF, *SOLIMP, 0.5, 2]
+def says(m, flex: int) -> bool:
+  """Returns whether an organ says itself how firm the contacts of a flex are."""
+  solref = mjstruct.view(m.flex_solref, (m.nflex, 2))[flex]
+  solimp = mjstruct.view(m.flex_solimp, (m.nflex, 5))[flex]
+  given, usual = [*solref, *solimp], [*SOLREF, *SOLIMP, 0.5, 2]
   return not (np.allclose(given, _USUAL, atol=1e-9) or np.allclose(given, usual, atol=1e-9))
-
-
-@dataclasses.dataclass(frozen=True)
-class Firmness:
-  """What contacts with an organ have of R, see native/firm.h.
-
-  Attributes:
-    asked: what the tissue asks for [1/kg]
-    share: what the organ bears for each vertex that is touched [1/kg]
-    tools: what each geom bears [1/kg], (ngeom,); or -1 where contacts stay as they are
-    stuck: of that, the most that friction has
-  """
-
-  asked: float
-  share: float
-  tools: np.ndarray | float
-  stuck: float
-
-
-def firmness(model: mujoco.MjModel, organ) -> Firmness:
-  """Returns how firm contacts with an organ are."""
-  h, tissue = float(model.opt.timestep), tissue_of(organ)
-  flex = organ.windows.flex[0] if organ.windows else organ.flex
-  left = says(model.flex_solref[flex], model.flex_solimp[flex])
-  softer = max(1.0, (h / LONG) ** 2) * max(1.0, h**2 * tissue[TISSUE.quick] / STIFF)
-  return Firmness(
-    FIRM * tissue[TISSUE.yields] / (SLOW * h) ** 2,
-    softer * tissue[TISSUE.share],
-    -1.0 if left else LIGHT * model.body_invweight0[model.geom_bodyid, 0],
-    min(1.0, max(STUCK, h / LONG)),
-  )
 
 
 def launch(weights):

@@ -436,5 +436,6 @@ def refresh(w: Workspace):
       if w.turn is not None and w.turn.mine:
         place(w, w.model)
     feel(w, m)
+    weights.tell(w, w.model)
     w.cutters.refresh()
     w.time_step = float(m.opt.timestep)

@@ -15,7 +15,13 @@ PALPATE int side_of(const char* contact, int field, int side) {
 }
 
 // The rows of a contact in efc_J: how many, and which.
-struct Rows { int first, count; bool paired; };
+struct Rows {
+  int first, count;
+  bool paired;
+
+  // Those along the normal: all of a pyramid.
+  PALPATE Rows normals() const { return {first, paired ? count : 1, paired}; }
+};
 
 // The rows of a contact; none where MuJoCo left it out.
 template <class Fields>

@@ -18,20 +18,6 @@ constexpr double DEEPEST = 0.5;
 
 constexpr double PI = 3.14159265358979;
 
-// The least R of a contact that a side can bear: of a geom's inverse inertia a part; of an organ's as
-// well, which the contacts share that it has with geoms, `count`. More where a step is long, or moves a
-// vertex of stiff tissue by much less than a free one.
-template <class Fields>
-PALPATE double borne_by(const Fields& f, const char* contact, int side, int count) {
-  const int geom = side_of(contact, CONTACT_GEOM, side), flex = side_of(contact, CONTACT_FLEX, side);
-  if (geom >= 0) return LIGHT * f.body_invweight0.data[2 * f.geom_bodyid.data[geom]];
-  const double* tissue = f.tissue.data + TISSUE_LENGTH * flex;
-  const double h = f.timestep.data[0], late = h * h / (LONG * LONG);
-  const double stiff = h * h * tissue[TISSUE_QUICK] / STIFF;
-  const double each = side_of(contact, CONTACT_ELEM, side) < 0 ? 1.0 : 1.0 / 3.0;  // a corner is of several
-  return each * count * tissue[TISSUE_SHARE] * (late > 1.0 ? late : 1.0) * (stiff > 1.0 ? stiff : 1.0);
-}
-
 // Mean length of the edges of the triangle on a side of a contact [m].
 template <class Fields>
 PALPATE double edge_of(const Fields& f, const char* contact, int side) {
@@ -42,27 +28,10 @@ PALPATE double edge_of(const Fields& f, const char* contact, int side) {
   return (norm(b - a) + norm(c - b) + norm(a - c)) / 3.0;
 }
 
-// How far the tissue of one side of a contact yields to a unit force [m/N].
-template <class Fields>
-PALPATE double yielding(const Fields& f, const char* contact, int side) {
-  const int flex = side_of(contact, CONTACT_FLEX, side);
-  return flex >= 0 && f.mine.data[flex] ? f.tissue.data[TISSUE_LENGTH * flex + TISSUE_YIELDS] : 0.0;
-}
-
 // A geom's contacts with an organ's flex, which is on one side of them. Not those of two organs: where
 // they lie flat on each other MuJoCo has one contact a pair of triangles, which jumps about, and firm
 // ones would shake them.
 struct Touch { int geom, flex, side; };
-
-// How many contacts a flex has with geoms.
-PALPATE int count_of(const char* contact, int ncon, int flex) {
-  int count = 0;
-  for (int c = 0; c < ncon; ++c, contact += CONTACT_LENGTH)
-    for (int side = 0; side < 2; ++side)
-      if (side_of(contact, CONTACT_FLEX, side) == flex)
-        count += side_of(contact, CONTACT_GEOM, 1 - side) >= 0;
-  return count;
-}
 
 PALPATE bool operator==(Touch a, Touch b) { return a.geom == b.geom && a.flex == b.flex; }
 
@@ -75,6 +44,16 @@ PALPATE Touch touch_of(const Fields& f, const char* contact) {
       return {geom, flex, side};
   }
   return {-1, -1, 0};
+}
+
+// How many contacts a flex has with geoms.
+PALPATE int count_of(const char* contact, int ncon, int flex) {
+  int count = 0;
+  for (int c = 0; c < ncon; ++c, contact += CONTACT_LENGTH)
+    for (int side = 0; side < 2; ++side)
+      if (side_of(contact, CONTACT_FLEX, side) == flex)
+        count += side_of(contact, CONTACT_GEOM, 1 - side) >= 0;
+  return count;
 }
 
 // What a tool presses in: the corners of the triangles that it touches, and how it lies in them.
@@ -162,9 +141,10 @@ PALPATE double unresolved(const Fields& f, const char* contacts, int ncon, Touch
   const double size = f.geom_size.data[3 * touch.geom], radius = size + f.flex_radius.data[touch.flex];
   if (f.mine.data[touch.flex] > 1 && !f.flags.data[FLAG_COARSE] && radius < COARSE * dent.edges / dent.ncon)
     f.flags.data[FLAG_COARSE] = (int)(2e6 * radius) + 1;
+  if (!(modulus > 0.0)) return 0.0;
   double total;
   const double work = work_of(f, dent, total);
-  if (!(modulus > 0.0 && total > 0.0)) return 0.0;
+  if (!(total > 0.0)) return 0.0;
   double yields = 0.5 / (modulus * size);
   if (round) {
     const double a = cbrt(0.75 * total * radius / modulus);
@@ -207,7 +187,9 @@ PALPATE void put_spring(const Fields& f, char* contact, Rows rows, double dampin
 }
 
 // Makes a contact as firm as its tissue asks for, whatever its nodes weigh, but no firmer than the time
-// step can bear, if the organ does not say itself how firm it is; and at least `least` [m/N] soft. At rest its force is gap / compliance with R = compliance * stiffness, of which the rows of a pyramid have a
+// step can bear; unless the organ says itself how firm it is. It is at least `least` soft [m/N].
+//
+// At rest its force is gap / compliance with R = compliance * stiffness; the rows of a pyramid have a
 // part each. Friction is firmer the shorter the step, since what sticks creeps at a speed in proportion
 // to its R; in a pyramid it has no R of its own (MuJoCo, Computation, Constraint model). Done twice it
 // does nothing.
@@ -216,19 +198,23 @@ PALPATE void firm_up(const Fields& f, char* contact, Rows rows, Touch touch, int
   const double* row = datum<double*>(f, DATA_EFC_KBIP) + 4 * rows.first;
   const double* R = datum<double*>(f, DATA_EFC_R) + rows.first;
   const double* friction = (const double*)(contact + CONTACT_FRICTION);
+  const double* tissue = f.tissue.data + TISSUE_LENGTH * touch.flex;
   const bool sticks = !rows.paired && rows.count > 1;
-  if (f.tissue.data[TISSUE_LENGTH * touch.flex + TISSUE_FIRM] > 0.0 && row[2] < 1.0) {
-    const double h = f.timestep.data[0], damping = 2.0 / (SLOW * h), stiffness = 0.25 * damping * damping;
-    const double borne = borne_by(f, contact, 0, count) + borne_by(f, contact, 1, count);
-    const double asked = FIRM * stiffness * (yielding(f, contact, 0) + yielding(f, contact, 1));
+  if (tissue[TISSUE_FIRM] > 0.0 && row[2] < 1.0) {
+    const double asked = tissue[TISSUE_ASKED];
+    // A triangle's corners are of several contacts.
+    const double each = side_of(contact, CONTACT_ELEM, touch.side) < 0 ? 1.0 : 1.0 / 3.0;
+    const double borne = each * count * tissue[TISSUE_SHARE] +
+                         LIGHT * f.body_invweight0.data[2 * f.geom_bodyid.data[touch.geom]];
     const double square = friction[0] * friction[0];
     const double pair = rows.paired ? 2.0 * square * (1.0 + square) / f.impratio.data[0] : 1.0;
-    put_spring(f, contact, rows, damping, pair * (borne > asked ? borne : asked));
-    const double stuck = h > LONG ? 1.0 : h > STUCK * LONG ? h / LONG : STUCK, most = stuck * borne;
+    put_spring(f, contact, rows, 2.0 / (SLOW * f.timestep.data[0]), pair * (borne > asked ? borne : asked));
+    const double most = tissue[TISSUE_STUCK] * borne;
     if (sticks && R[1] > most) scale_impedance(f, {rows.first + 1, rows.count - 1, false}, most / R[1]);
   }
-  const double more = (rows.paired ? rows.count : 1) * row[0] * row[2] * least;
-  if (R[0] < more) scale_impedance(f, {rows.first, rows.paired ? rows.count : 1, false}, more / R[0]);
+  const Rows normals = rows.normals();
+  const double more = normals.count * row[0] * row[2] * least;
+  if (R[0] < more) scale_impedance(f, normals, more / R[0]);
   if (sticks) *(double*)(contact + CONTACT_MU) = friction[0] * sqrt(R[1] / R[0]);
 }
 

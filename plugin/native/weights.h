@@ -60,7 +60,7 @@ PALPATE void put(const Fields& f, char* contact, Rows rows, int side, D3 pos, D3
   store(pos_of(contact), pos);
   *(double*)(contact + CONTACT_DIST) = gap;
   double* efc_pos = datum<double*>(f, DATA_EFC_POS) + rows.first;
-  for (int r = 0; r < (rows.paired ? rows.count : 1); ++r) efc_pos[r] = gap;
+  for (int r = 0; r < rows.normals().count; ++r) efc_pos[r] = gap;
   int body = f.geom_bodyid.data[side_of(contact, CONTACT_GEOM, side)];
   pos = pos - load(f.subtree_com.data + 3 * f.body_rootid.data[body]);
   while (body > 0 && !f.body_dofnum.data[body]) body = f.body_parentid.data[body];
@@ -92,6 +92,8 @@ PALPATE void weigh_side(const Fields& f, char* contact, Rows rows, int side) {
   if (under_end(f, side_of(contact, CONTACT_GEOM, 1 - side), f.flex_radius.data[flex], x, w, gap, out))
     put(f, contact, rows, 1 - side, blend(x, w) - (f.flex_radius.data[flex] + 0.5 * gap) * out,
         side ? out : -1.0 * out, gap);
+  else if (!f.wrong)
+    return;
   else
     w = barycentric(load(pos_of(contact)), x);
   const double before = inverse_inertia(f, contact, rows, 1 - side);
@@ -138,8 +140,7 @@ PALPATE void keep_closed(const Fields& f, const char* contact, Rows rows) {
   const double stiffness = row[0] * row[2];
   if (!(stiffness > 0.0)) return;
   const double gap = *(const double*)(contact + CONTACT_DIST) + parting(f, contact, rows) / stiffness;
-  for (int r = rows.first; r < rows.first + (rows.paired ? rows.count : 1); ++r)
-    datum<double*>(f, DATA_EFC_POS)[r] = gap;
+  for (int r = 0; r < rows.normals().count; ++r) datum<double*>(f, DATA_EFC_POS)[rows.first + r] = gap;
 }
 
 // Whether one of the two sides of a contact is an organ's.

@@ -398,7 +398,7 @@ def _find(w, m, name: str, current: bool) -> int:
       f"organ {w.organ.name!r}: cutters names {name!r}, which is no geom of the model"
     )
   geom = names.index(found)
-  flex = w.organ.windows.flex if w.organ.windows else [w.organ.flex]
+  flex = w.organ.flexes
   if not current and not w.cuts:
     raise ValueError(
       f"organ {w.organ.name!r}: cutters names {name!r}, which cuts by its edge, allowed only with "
