@@ -5,8 +5,9 @@ import numpy as np
 import palpate.batch
 import pytest
 from scenes import RADIUS, drive, load, masses, needs_cuda, press, probed
+from scenes.resting import block, resting
 
-BARE = 0.15, 1e-3  # in batches contacts with bare solids do not yield by what the mesh lacks
+BARE = 0.15, 2e-3  # in batches contacts with bare solids do not yield by what the mesh lacks
 BACKENDS = [
   "cpu",
   pytest.param("warp-cpu", marks=pytest.mark.slow),  # mujoco_warp compiles for minutes
@@ -150,6 +151,21 @@ def test_a_spinning_organ_keeps_its_angular_momentum(make, h):
   batch.step(round(1 / h))
   after = (mass * np.cross(tissue.xpos.numpy()[1], tissue.xvel.numpy()[1])).sum(axis=0)
   np.testing.assert_allclose(after, before, atol=2e-3 * np.linalg.norm(before))
+
+
+def test_a_block_comes_to_rest_under_a_plate(make):
+  made, _ = resting("plate", h=2e-3, mesh=block(edge=0.02))
+  room = {} if make.device == "cpu" else {"nodes": 48}
+  batch = palpate.batch.make(made, 2, device=make.device, **room)
+  depth, forces = batch.model.actuator_ctrlrange[0, 0], []
+  for k in range(400):
+    batch.ctrl = np.full((2, 1), depth * min(1, k / 150))
+    batch.step()
+    forces.append(batch.organ("organ").contact_force.numpy().sum(axis=1)[:, 2])
+  last = np.abs(forces[-150:])
+  np.testing.assert_allclose(last.mean(axis=0), 2.2, rtol=0.02)  # that of the plugin alone
+  assert np.all(last.std(axis=0) < 0.006 * last.mean(axis=0))
+
 
 
 def test_each_world_has_a_tissue_of_its_own(make):
