@@ -4,6 +4,11 @@ import mujoco
 import numpy as np
 import palpate
 import trimesh
+from palpate.models import mjcf
+from palpate.tissue.geometry import fill
+from palpate.tissue.geometry import mesh as topology
+
+from .documents import flex, world
 
 _PLANE, _BOX, _CYLINDER = (
   getattr(mujoco.mjtGeom, f"mjGEOM_{name}") for name in ("PLANE", "BOX", "CYLINDER")
@@ -30,7 +35,7 @@ def resting(kind, h=1e-3, mesh=None, mass=0.064, press=0.1, coupling="nodal", co
     mesh: the organ's; a cube of 40 mm
     mass: of the organ [kg]
     press: how far it is pressed, of its height
-    coupling: nodal or window
+    coupling: nodal or window; or flex, MuJoCo's own of the same tetrahedra
     condim: of all contacts
     keys: configuration, that of SOLID otherwise
 
@@ -63,7 +68,10 @@ def resting(kind, h=1e-3, mesh=None, mass=0.064, press=0.1, coupling="nodal", co
   if coupling == "window":
     tools = {"plate": ["press"], "cylinder": ["press"], "plates": [["press", "lower"]]}
     made["windows"] = {"tools": tools.get(kind), "nodes": 200}
-  palpate.add_organ(spec, mesh, "organ", **made)
+  if coupling == "flex":
+    _attach_flex(spec, mesh, made)
+  else:
+    palpate.add_organ(spec, mesh, "organ", **made)
   if kind == "organ":
     mesh.apply_translation([0.002, 0.001, high[2] - low[2] + 0.003])
     palpate.add_organ(spec, mesh, "upper", **made)
@@ -81,28 +89,58 @@ def _add_press(spec, kind, low, high, press, condim):
   servo.ctrlrange = [-press * (high[2] - low[2]) - 0.0005, 0]
 
 
+def _attach_flex(spec, mesh, made):
+  """Adds MuJoCo's flex of a solid, with MuJoCo's contacts."""
+  solid = fill.fill("organ", topology.build("organ", mesh.vertices, mesh.faces))
+  keys = {"damping": 0.002} | {k: made[k] for k in ("young", "poisson", "damping") if k in made}
+  inside = mjcf.tag("elasticity", keys)
+  contact = {"condim": made["contact"]["condim"], "solref": "0.02 1"}
+  keys = {"mass": made["mass"], "pin": made.get("pin", ()), "contact": contact, "dim": 3}
+  # In a body: pinned to the world it would be lost where it is attached.
+  body = mjcf.tag("body", {"name": "organ"}, flex(solid.rest, solid.tet, inside, **keys))
+  child = mujoco.MjSpec.from_string(world(body))
+  for name in ("timestep", "gravity", "tolerance"):
+    setattr(child.option, name, getattr(spec.option, name))
+  child.memory = spec.memory
+  spec.attach(child, frame=spec.worldbody.add_frame())
+  spec.option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
+
+
+def _carried(model, data):
+  """Returns the force that contacts put on what is no geom [N]."""
+  total = np.zeros(3)
+  for number, contact in enumerate(data.contact):
+    local = np.zeros(6)
+    mujoco.mj_contactForce(model, data, number, local)
+    sign = 1.0 if contact.geom[0] >= 0 else -1.0
+    total += sign * contact.frame.reshape(3, 3).T @ local[:3]
+  return total
+
+
 def watch(spec, seconds=1.5, last=0.3):
   """Runs a scene and returns what is seen of its organ.
 
   Returns:
     force: on the organ, or of the press, in the last part [N]  (n, 3)
     speed: of the fastest node there [m/s]
-    energy: most elastic energy at any time [J]
-    organ: the handle
+    energy: most elastic energy at any time [J]; zero of MuJoCo's flex
+    organ: the handle, or None of MuJoCo's flex
   """
   model = spec.compile()
   data = mujoco.MjData(model)
-  organ = palpate.Organ(model, data, "organ")
+  organ = palpate.Organ(model, data, "organ") if model.nplugin else None
+  tool = model.joint("z").dofadr[0] if model.nu else None
   force, speed, energy = [], 0.0, 0.0
   for k in range(round(seconds / model.opt.timestep)):
     data.ctrl[:] = model.actuator_ctrlrange[:, 0] * min(1.0, data.time / 0.3)
     mujoco.mj_step(model, data)
-    if k % 10 == 0:
+    if organ and k % 10 == 0:
       energy = max(energy, organ.energy)
-    if organ.error is not None:
+    if (organ and organ.error is not None) or not np.isfinite(data.qpos).all():
       break
     if data.time > seconds - last:
-      pressed = model.nu and [0, 0, data.qfrc_constraint[model.joint("z").dofadr[0]]]
-      force.append(pressed or organ.force)
-      speed = max(speed, np.abs(organ.xvel).max())
+      own = organ.force if organ else _carried(model, data)
+      force.append(own if tool is None else [0, 0, data.qfrc_constraint[tool]])
+      moving = organ.xvel if organ else np.delete(data.qvel, [] if tool is None else tool)
+      speed = max(speed, np.abs(moving).max())
   return np.array(force), speed, energy, organ
