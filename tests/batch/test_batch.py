@@ -10,7 +10,7 @@ from scenes.resting import block, resting
 BARE = 0.15, 2e-3  # in batches contacts with bare solids do not yield by what the mesh lacks
 BACKENDS = [
   "cpu",
-  pytest.param("warp-cpu", marks=pytest.mark.slow),  # mujoco_warp compiles for minutes
+  "warp-cpu",
   pytest.param("cuda:0", marks=needs_cuda),
 ]
 SKIN = {"capsule_young": 1e5, "thickness": 3e-4}

@@ -10,7 +10,7 @@ from scenes import ball, box, load, needs_cuda, sphere, windowed, workspace, wor
 
 BACKENDS = [
   "cpu",
-  pytest.param("warp-cpu", marks=pytest.mark.slow),  # mujoco_warp compiles for minutes
+  "warp-cpu",
   pytest.param("cuda:0", marks=needs_cuda),
 ]
 BODIES = """<body name="bed" pos="0 0 -0.0605"><geom name="bed" type="box" size="0.1 0.1 0.01"

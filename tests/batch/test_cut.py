@@ -9,7 +9,7 @@ from scenes import needs_cuda, servo, sphere, triangular
 
 BACKENDS = [
   "cpu",
-  pytest.param("warp-cpu", marks=pytest.mark.slow),  # mujoco_warp compiles for minutes
+  "warp-cpu",
   pytest.param("cuda:0", marks=needs_cuda),
 ]
 SLIDE = mujoco.mjtJoint.mjJNT_SLIDE

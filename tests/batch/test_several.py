@@ -8,7 +8,7 @@ import warp as wp
 from scenes import needs_cuda, probed
 
 DEVICES = [
-  pytest.param("warp-cpu", "warp-cpu", marks=pytest.mark.slow),  # mujoco_warp compiles for minutes
+  ("warp-cpu", "warp-cpu"),
   pytest.param("cuda:0", f"cuda:{int(wp.get_cuda_device_count() > 1)}", marks=needs_cuda),
 ]
 

@@ -7,7 +7,7 @@ import pytest
 from scenes import load, needs_cuda, probed
 
 DEVICES = [
-  pytest.param("warp-cpu", marks=pytest.mark.slow),  # mujoco_warp compiles for minutes
+  "warp-cpu",
   pytest.param("cuda:0", marks=needs_cuda),
 ]
 AWAY, DEEP = 0.02, -0.006  # where the probe waits, and is pressed to [m]

@@ -7,7 +7,7 @@ import pytest
 from scenes import RADIUS, load, needs_cuda, organ, sphere, world
 
 DEVICES = [
-  pytest.param("warp-cpu", marks=pytest.mark.slow),  # mujoco_warp compiles for minutes
+  "warp-cpu",
   pytest.param("cuda:0", marks=needs_cuda),
 ]
 POINTS = "-1 -1 -3 1 -1 -3 1 1 -3 -1 1 -3 -1 -1 3 1 -1 3 1 1 3 -1 1 3"
