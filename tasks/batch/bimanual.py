@@ -8,7 +8,7 @@ from typing import Any
 import mujoco as mj
 import numpy as np
 import warp as wp
-from palpate.tasks import bimanual
+from palpate.tasks.domains import bimanual
 from palpate.tissue.types import floats
 
 from . import dissect

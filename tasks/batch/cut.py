@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import warp as wp
-from palpate.tasks import cut
+from palpate.tasks.domains import cut
 from palpate.tissue.types import Array, floats, ints, struct
 
 from . import domain

@@ -28,6 +28,7 @@ class Common:
   """
 
   # The scene.
+  world: int  # that a thread works on
   dt: float  # of a control step [s]
   limit: int  # steps of an episode
   force_limit: float  # [N]

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import warp as wp
-from palpate.tasks import freeing
+from palpate.tasks.domains import freeing
 from palpate.tissue.types import doubles, floats, ints
 
 from . import domain

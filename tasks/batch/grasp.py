@@ -4,7 +4,7 @@
 from typing import Any
 
 import warp as wp
-from palpate.tasks import grasp, touch
+from palpate.tasks.domains import grasp, touch
 from palpate.tissue.types import floats
 
 from .fields import RUNNING, SUCCESS, Common, flags, together, vectors

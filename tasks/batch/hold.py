@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 from palpate.batch.threads import Threads
-from palpate.tasks import grasp, instrument, jaws
+from palpate.tasks import instrument, jaws
+from palpate.tasks.domains import grasp
 from palpate.tissue.types import Array, floats, ints, struct
 
 from . import domain

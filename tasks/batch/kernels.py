@@ -3,11 +3,12 @@
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 import warp as wp
 from palpate.tasks import base, safety
+from palpate.tasks.core.rules import closeness as _closeness
 from palpate.tasks.physics import NEAR
 
 from .fields import DAMAGED, RUNNING, SUCCESS, Common
 
-closeness, parts = wp.func(base.closeness), wp.func(safety.parts)
+closeness, parts = wp.func(_closeness), wp.func(safety.parts)
 
 _SHARE, _PRICE = wp.constant(base.SHARE), wp.constant(base.PRICE)
 _MOST = wp.constant(base.MOST)

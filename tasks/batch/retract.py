@@ -4,7 +4,7 @@
 from typing import Any
 
 import warp as wp
-from palpate.tasks import retract, touch
+from palpate.tasks.domains import retract, touch
 from palpate.tissue.types import Array, floats
 
 from .fields import RUNNING, SUCCESS, Common, together

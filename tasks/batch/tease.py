@@ -2,7 +2,7 @@
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 import warp as wp
-from palpate.tasks import tease
+from palpate.tasks.domains import tease
 from palpate.tissue.types import floats
 
 from .fields import Common, together, vectors

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import warp as wp
-from palpate.tasks import trace
+from palpate.tasks.domains import trace
 from palpate.tissue.types import Array, floats, ints, struct
 
 from . import domain

@@ -33,16 +33,14 @@ from .domain import Domain
 from .fields import INFO, OBSERVED, OUTCOMES
 from .grasp import Grasp
 from .palpate import Palpate
-from .press import Press
 from .retract import Retract
 from .tease import Tease
-from .touch import Touch
 from .trace import Trace
 from .worlds import Worlds
 
 # Exercises that are vectorised, by the class of their task.
 DOMAINS: dict[str, type[Domain]] = {
-  "Touch": Touch, "Press": Press, "Palpate": Palpate, "Grasp": Grasp, "Retract": Retract,
+  "Touch": Domain, "Press": Domain, "Palpate": Palpate, "Grasp": Grasp, "Retract": Retract,
   "Trace": Trace, "Dissect": Dissect, "Tease": Tease, "Bimanual": Bimanual,
   "Cut": Cut,
 }  # fmt: skip

@@ -23,6 +23,7 @@ from . import kernels, tally
 from .domain import Domain
 from .episodes import FRAME, HAND, Episodes, at_rest, of_hand
 from .fields import OBSERVED, Common
+from .states import States
 
 _SENSORS = ("tip_force", "shaft_force", "touch_left", "touch_right")
 
@@ -71,6 +72,9 @@ class Worlds:
     self.device, self._substeps = self.batch.device, episode.substeps(environment)
     self.batch.start(at_rest(self.batch.model, stage.state, STATE))
     self.episodes = Episodes(task, domain, nworld)
+    self.states = States(task.rules, task, nworld, self.device) if task.rules else None
+    if self.states:
+      self.episodes.draw = self.states.draw
     self.organ = self.batch.organ(task.organ)
     domain.attach(self)
     dt = environment.control_timestep()
@@ -80,6 +84,16 @@ class Worlds:
       self.other.first = len(task.components) - len(AXES) - len(task.other)
       for name in ("action", "begun", "step"):
         setattr(self.other, name, getattr(self.fields, name))
+    if not self.states:
+      self._make_own(task, domain, nworld)
+    steps = self.batch.watch(self._substeps)
+    self.tally = self._count(task, steps)
+    self._tally = self._count(task, steps) if self.other else None
+    self._hows = tally.hows(self.device)
+    self._bad = wp.zeros(1, dtype=int, device=self.device)
+    self._done, self._graphs = set[str](), dict[str, Any]()
+
+  def _make_own(self, task, domain, nworld):
     sizes = {"nworld": nworld, **domain.sizes(task, self.episodes.physics)}
     self.own = allocate(domain.struct, self.device, sizes)
     shared: dict[str, Any] = {name: getattr(task, name) for name in domain.takes}
@@ -89,12 +103,16 @@ class Worlds:
         getattr(self.own, name).assign(value)
       else:
         setattr(self.own, name, value)
-    steps = self.batch.watch(self._substeps)
-    self.tally = self._count(task, steps)
-    self._tally = self._count(task, steps) if self.other else None
-    self._hows = tally.hows(self.device)
-    self._bad = wp.zeros(1, dtype=int, device=self.device)
-    self._done, self._graphs = set[str](), dict[str, Any]()
+
+  def _write_states(self, at: wp.array, rows: Any, worlds: np.ndarray) -> None:
+    """Begins with the states that were drawn for some worlds."""
+    assert self.states
+    for name in self.task.rules.fields:
+      if name in self.states.rows:
+        self._write(self.states.rows[name], at, rows[name][worlds])
+      else:
+        self.states.set(name, rows[name])
+    self._write(self.states.records, at, self.states.table()[worlds])
 
   @property
   def hands(self) -> tuple[Any, ...]:
@@ -169,6 +187,9 @@ class Worlds:
     own = name.removeprefix(self.task.second.replace("/", "_")) if self.other else name
     if own != name and OBSERVED.get(own, own) in Common.vars:
       return getattr(self.other, OBSERVED.get(own, own))
+    if self.states:
+      own = self.task.rules.fields
+      return self.states.array(name) if name in own else getattr(self.tally, name)
     return getattr(self.own if name in self._domain.struct.vars else self.tally, name)
 
   def check(self, action: wp.array, first: int = 0) -> None:
@@ -215,7 +236,10 @@ class Worlds:
     """Launches what follows the steps of the physics."""
     self._measure(False)
     self._domain.sense(self)
-    self._over(self._domain.advance, self.own)
+    if self.states:
+      self._over(self.states.advance, self.states.records)
+    else:
+      self._over(self._domain.advance, self.own)
     self._over(tally.add, self.tally)
     if self.other:
       self.launch(tally.add, self.nworld, [self.other, self._tally])
@@ -248,11 +272,13 @@ class Worlds:
     s.begun.assign(mask)
     at = wp.array(worlds, dtype=int, device=self.device)
     for name, values in rows.items():
-      if name in self._domain.tissue:
+      if name in self._domain.tissue or (self.states and name in self.task.rules.fields):
         continue
       of_other = self.other is not None and name in of_hand(True)
       out = self.other if of_other else s if name in FRAME else self.own
       self._write(getattr(out, name.removeprefix("other_" if of_other else "")), at, values[worlds])
+    if self.states:
+      self._write_states(at, rows, worlds)
     self.batch.reset(s.begun)
     for hand, prefix in zip(self.hands, (self.task.prefix, self.task.second), strict=False):
       # The plugin's worlds take them as they were drawn, in float64.
@@ -270,7 +296,8 @@ class Worlds:
   def _write(self, out: wp.array, at: wp.array, rows: np.ndarray) -> None:
     """Writes rows of some worlds to an array on the device."""
     words = out.size * wp.types.type_size_in_bytes(out.dtype) // 4 // self.nworld
-    rows = np.ascontiguousarray(rows, np.float32 if rows.dtype.kind == "f" else np.int32)
+    kind = {"f": np.float32, "V": rows.dtype}.get(rows.dtype.kind, np.int32)
+    rows = np.ascontiguousarray(rows, kind)
     rows = rows.view(np.int32).reshape(len(rows), words)
     source = wp.array(rows, dtype=int, device=self.device)
     whole = wp.array(ptr=out.ptr, dtype=int, shape=(self.nworld, words), device=self.device)
@@ -280,7 +307,8 @@ class Worlds:
     """Launches what follows the beginning of episodes."""
     self._of_hands(kernels.begin)
     self._measure(True)
-    self._over(self._domain.begin, self.own)
+    if not self.states:
+      self._over(self._domain.begin, self.own)
     self._over(tally.start, self.tally)
     if self.other:
       self.launch(tally.start, self.nworld, [self.other, self._tally])
@@ -303,6 +331,9 @@ class Worlds:
     self._over(kernels.look, beginning)
     dim = (self.nworld, self.fields.coarse.shape[0])
     self.launch(kernels.survey, dim, [self.fields, beginning])
+    if self.states:
+      self._over(self.states.observe, self.states.records, beginning)
+      return
     others = (self.other,) if self.other else ()
     self._over(self._domain.observe, self.own, *others, beginning)
 

@@ -21,15 +21,14 @@ import dataclasses
 import itertools
 
 import numpy as np
-from dm_control.utils import containers
 
-from . import base
-from .base import Physics, Task
-from .performer import Performer, Script
-from .scenes import Scene
+from .. import base
+from ..registry import exercise
+from ..base import Physics, Task
+from ..performer import Performer, Script
+from ..scenes import Scene
 from .touch import SLACK
 
-SUITE = containers.TaggedTasks()
 FUNDUS = Scene(
   organ="gallbladder",
   instrument="grasper",
@@ -43,29 +42,26 @@ REST = 0.2  # at a low height before release [s]
 LOW, RESTING, LETTING = -0.25, 0.4, 0.5
 
 
-@SUITE.add("benchmarking", "easy")
-def easy(time_limit=20, random=None, environment_kwargs=None, **kwargs):
-  """Returns the task to lift the fundus by 6 mm for 0.5 s."""
+@exercise("grasp/easy", 20, "easy")
+def easy(**kwargs):
+  """Lift the fundus by 6 mm for 0.5 s."""
   kwargs = {"lift": 0.006, "hold": 0.5, **kwargs}
-  task = Grasp(dataclasses.replace(FUNDUS, nodes=250), random, name="grasp/easy", **kwargs)
-  return base.make(task, time_limit, environment_kwargs)
+  return Grasp(dataclasses.replace(FUNDUS, nodes=250), **kwargs)
 
 
-@SUITE.add("benchmarking")
-def standard(time_limit=30, random=None, environment_kwargs=None, **kwargs):
-  """Returns the task to lift the fundus by 8 mm for 1 s."""
+@exercise("grasp/standard", 30)
+def standard(**kwargs):
+  """Lift the fundus by 8 mm for 1 s."""
   kwargs = {"lift": 0.008, "hold": 1.0, "jitter": 0.003, **kwargs}
-  task = Grasp(dataclasses.replace(FUNDUS, nodes=250), random, name="grasp/standard", **kwargs)
-  return base.make(task, time_limit, environment_kwargs)
+  return Grasp(dataclasses.replace(FUNDUS, nodes=250), **kwargs)
 
 
-@SUITE.add("benchmarking", "hard")
-def hard(time_limit=40, random=None, environment_kwargs=None, **kwargs):
-  """Returns the task to lift the fundus by 10 mm for 2 s with less force, on varying organs."""
+@exercise("grasp/hard", 40, "hard")
+def hard(**kwargs):
+  """Lift the fundus by 10 mm for 2 s with less force, on varying organs."""
   kwargs = {"lift": 0.01, "hold": 2.0, "jitter": 0.005, "variants": (None, 1, 2), **kwargs}
   kwargs = {"force_limit": 3.4, "damage": 6.0, **kwargs}
-  task = Grasp(dataclasses.replace(FUNDUS, nodes=500), random, name="grasp/hard", **kwargs)
-  return base.make(task, time_limit, environment_kwargs)
+  return Grasp(dataclasses.replace(FUNDUS, nodes=500), **kwargs)
 
 
 class Hold(Task):

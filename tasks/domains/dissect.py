@@ -19,16 +19,15 @@ import itertools
 from collections.abc import Callable
 
 import numpy as np
-from dm_control.utils import containers
 
-from . import base
-from .base import Physics
+from .. import base
+from ..registry import exercise
+from ..base import Physics
 from .freeing import Freeing
 from .grasp import FUNDUS, Hold
-from .performer import Performer, Script
-from .scenes import Scene
+from ..performer import Performer, Script
+from ..scenes import Scene
 
-SUITE = containers.TaggedTasks()
 # Stiffness [N/m^3], strength [Pa] and energy [J/m^2] of the bed, and of a tough one. Ours: we know
 # of no measurement; the bed bears the organ, and comes away under half a newton or one.
 BED, TOUGH = (1e7, 6e3, 8.0), (1e7, 7e3, 10.0)
@@ -36,32 +35,29 @@ BED, TOUGH = (1e7, 6e3, 8.0), (1e7, 7e3, 10.0)
 _FAR, _SPEED, _UP = 0.045, 0.01, 0.5
 
 
-@SUITE.add("benchmarking", "easy")
-def easy(time_limit=30, random=None, environment_kwargs=None, **kwargs):
-  """Returns the task to free half of the gallbladder's bed."""
+@exercise("dissect/easy", 30, "easy")
+def easy(**kwargs):
+  """Free half of the gallbladder's bed."""
   kwargs = {"wanted": 0.5, **kwargs}
   scene = dataclasses.replace(FUNDUS, nodes=250, bonds=BED)
-  task = Dissect(scene, random, name="dissect/easy", **kwargs)
-  return base.make(task, time_limit, environment_kwargs)
+  return Dissect(scene, **kwargs)
 
 
-@SUITE.add("benchmarking")
-def standard(time_limit=40, random=None, environment_kwargs=None, **kwargs):
-  """Returns the task to free 80 % of it."""
+@exercise("dissect/standard", 40)
+def standard(**kwargs):
+  """Free 80 % of it."""
   kwargs = {"wanted": 0.8, "jitter": 0.003, **kwargs}
   scene = dataclasses.replace(FUNDUS, nodes=250, bonds=BED)
-  task = Dissect(scene, random, name="dissect/standard", **kwargs)
-  return base.make(task, time_limit, environment_kwargs)
+  return Dissect(scene, **kwargs)
 
 
-@SUITE.add("benchmarking", "hard")
-def hard(time_limit=60, random=None, environment_kwargs=None, **kwargs):
-  """Returns the task to free 85 % of a tough bed with less force, on varying organs."""
+@exercise("dissect/hard", 60, "hard")
+def hard(**kwargs):
+  """Free 85 % of a tough bed with less force, on varying organs."""
   kwargs = {"wanted": 0.85, "jitter": 0.005, "variants": (None, 1, 2), **kwargs}
   kwargs = {"force_limit": 3.4, "damage": 6.0, "traction": 1.2, **kwargs}
   scene = dataclasses.replace(FUNDUS, nodes=500, bonds=TOUGH)
-  task = Dissect(scene, random, name="dissect/hard", **kwargs)
-  return base.make(task, time_limit, environment_kwargs)
+  return Dissect(scene, **kwargs)
 
 
 class Dissect(Freeing, Hold):

@@ -15,45 +15,41 @@ import dataclasses
 import itertools
 
 import numpy as np
-from dm_control.utils import containers
 
-from . import base
-from .base import Physics
+from .. import base
+from ..registry import exercise
+from ..base import Physics
 from .grasp import FUNDUS, Hold
-from .performer import Performer, Script
-from .scenes import Scene
+from ..performer import Performer, Script
+from ..scenes import Scene
 from .touch import SLACK
 
-SUITE = containers.TaggedTasks()
 _BEHIND = 0.02  # from the organ's middle to the disc [m]
 _SAMPLES = 12  # points of the disc
 _GRIP = 1.8  # of the expert, more than to lift: what is pulled aside slides [N]
 SEEN = 1e-6  # what rounding may take from a share of it
 
 
-@SUITE.add("benchmarking", "easy")
-def easy(time_limit=20, random=None, environment_kwargs=None, **kwargs):
-  """Returns the task to uncover half of a disc of 3 mm for 0.5 s."""
+@exercise("retract/easy", 20, "easy")
+def easy(**kwargs):
+  """Uncover half of a disc of 3 mm for 0.5 s."""
   kwargs = {"radius": 0.003, "wanted": 0.5, "hold": 0.5, **kwargs}
-  task = Retract(dataclasses.replace(FUNDUS, nodes=250), random, name="retract/easy", **kwargs)
-  return base.make(task, time_limit, environment_kwargs)
+  return Retract(dataclasses.replace(FUNDUS, nodes=250), **kwargs)
 
 
-@SUITE.add("benchmarking")
-def standard(time_limit=30, random=None, environment_kwargs=None, **kwargs):
-  """Returns the task to uncover 80 % of a disc of 4 mm for 1 s."""
+@exercise("retract/standard", 30)
+def standard(**kwargs):
+  """Uncover 80 % of a disc of 4 mm for 1 s."""
   kwargs = {"radius": 0.004, "wanted": 0.8, "hold": 1.0, "jitter": 0.003, **kwargs}
-  task = Retract(dataclasses.replace(FUNDUS, nodes=250), random, name="retract/standard", **kwargs)
-  return base.make(task, time_limit, environment_kwargs)
+  return Retract(dataclasses.replace(FUNDUS, nodes=250), **kwargs)
 
 
-@SUITE.add("benchmarking", "hard")
-def hard(time_limit=40, random=None, environment_kwargs=None, **kwargs):
-  """Returns the task to uncover a disc of 4 mm for 2 s with less force, on varying organs."""
+@exercise("retract/hard", 40, "hard")
+def hard(**kwargs):
+  """Uncover a disc of 4 mm for 2 s with less force, on varying organs."""
   kwargs = {"radius": 0.004, "wanted": 1.0, "hold": 2.0, "jitter": 0.005, **kwargs}
   kwargs = {"variants": (None, 1, 2), "force_limit": 3.4, "damage": 6.0, **kwargs}
-  task = Retract(dataclasses.replace(FUNDUS, nodes=500), random, name="retract/hard", **kwargs)
-  return base.make(task, time_limit, environment_kwargs)
+  return Retract(dataclasses.replace(FUNDUS, nodes=500), **kwargs)
 
 
 class Retract(Hold):

@@ -15,15 +15,15 @@ import itertools
 
 import mujoco
 import numpy as np
-from dm_control.utils import containers
 
-from . import adhesion, base
-from .base import Physics
+from .. import base
+from . import adhesion
+from ..registry import exercise
+from ..base import Physics
 from .freeing import Freeing
-from .performer import Performer, Script
-from .scenes import Scene
+from ..performer import Performer, Script
+from ..scenes import Scene
 
-SUITE = containers.TaggedTasks()
 # Stiffness [N/m^3], strength [Pa] and energy [J/m^2]: ours, we know of no measurement.
 FILMY, DENSE = (1e7, 6e3, 6.0), (1e7, 8e3, 12.0)
 SCENE = Scene(
@@ -41,27 +41,24 @@ _UNDER, _LOW = 0.02, 0.005  # from the front and the bed at most, of who is unde
 ROW = 0.5 * _LANE  # bonds of the front are no farther from the first of them [m]
 
 
-@SUITE.add("benchmarking", "easy")
-def easy(time_limit=40, random=None, environment_kwargs=None, **kwargs):
-  """Returns the task to free 40 % of a filmy adhesion."""
-  task = Tease(SCENE, random, name="tease/easy", **{"wanted": 0.4, "law": FILMY, **kwargs})
-  return base.make(task, time_limit, environment_kwargs)
+@exercise("tease/easy", 40, "easy")
+def easy(**kwargs):
+  """Free 40 % of a filmy adhesion."""
+  return Tease(SCENE, **{"wanted": 0.4, "law": FILMY, **kwargs})
 
 
-@SUITE.add("benchmarking")
-def standard(time_limit=60, random=None, environment_kwargs=None, **kwargs):
-  """Returns the task to free half of it."""
+@exercise("tease/standard", 60)
+def standard(**kwargs):
+  """Free half of it."""
   kwargs = {"wanted": 0.5, "law": FILMY, "jitter": 0.003, **kwargs}
-  return base.make(Tease(SCENE, random, name="tease/standard", **kwargs), time_limit,
-                   environment_kwargs)  # fmt: skip
+  return Tease(SCENE, **kwargs)
 
 
-@SUITE.add("benchmarking", "hard")
-def hard(time_limit=80, random=None, environment_kwargs=None, **kwargs):
-  """Returns the task to free 60 % of a dense one with less force."""
+@exercise("tease/hard", 80, "hard")
+def hard(**kwargs):
+  """Free 60 % of a dense one with less force."""
   kwargs = {"wanted": 0.6, "law": DENSE, "jitter": 0.005, "force_limit": 1.2, **kwargs}
-  return base.make(Tease(SCENE, random, name="tease/hard", **kwargs), time_limit,
-                   environment_kwargs)  # fmt: skip
+  return Tease(SCENE, **kwargs)
 
 
 class Tease(Freeing):

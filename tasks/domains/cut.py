@@ -19,14 +19,14 @@ import dataclasses
 
 import mujoco
 import numpy as np
-from dm_control.utils import containers
 
-from . import base, sheet
-from .base import Physics, Task
-from .performer import Performer, Script
-from .scenes import Scene
+from .. import base
+from . import sheet
+from ..registry import exercise
+from ..base import Physics, Task
+from ..performer import Performer, Script
+from ..scenes import Scene
 
-SUITE = containers.TaggedTasks()
 SCENE = Scene(
   organ="sheet",
   instrument="scalpel",
@@ -46,28 +46,25 @@ _SPEED, _DEEP, _OVER = 0.012, 0.0035, 0.012
 _BEYOND = 10  # points of the line that it goes on beyond where it began
 
 
-@SUITE.add("benchmarking", "easy")
-def easy(time_limit=40, random=None, environment_kwargs=None, **kwargs):
-  """Returns the task to cut out a circle of 24 mm within 3 mm of its line."""
+@exercise("cut/easy", 40, "easy")
+def easy(**kwargs):
+  """Cut out a circle of 24 mm within 3 mm of its line."""
   kwargs = {"radius": 0.012, "tolerance": 0.003, **kwargs}
-  task = Cut(dataclasses.replace(SCENE, nodes=400), random, name="cut/easy", **kwargs)
-  return base.make(task, time_limit, environment_kwargs)
+  return Cut(dataclasses.replace(SCENE, nodes=400), **kwargs)
 
 
-@SUITE.add("benchmarking")
-def standard(time_limit=60, random=None, environment_kwargs=None, **kwargs):
-  """Returns the task to cut out a circle of 40 mm within 2 mm, as FLS asks for."""
+@exercise("cut/standard", 60)
+def standard(**kwargs):
+  """Cut out a circle of 40 mm within 2 mm, as FLS asks for."""
   kwargs = {"radius": 0.02, "jitter": 0.003, **kwargs}
-  task = Cut(dataclasses.replace(SCENE, nodes=600), random, name="cut/standard", **kwargs)
-  return base.make(task, time_limit, environment_kwargs)
+  return Cut(dataclasses.replace(SCENE, nodes=600), **kwargs)
 
 
-@SUITE.add("benchmarking", "hard")
-def hard(time_limit=80, random=None, environment_kwargs=None, **kwargs):
-  """Returns the task to cut out a clover of 36 mm within 1.5 mm."""
+@exercise("cut/hard", 80, "hard")
+def hard(**kwargs):
+  """Cut out a clover of 36 mm within 1.5 mm."""
   kwargs = {"radius": 0.018, "wave": 0.2, "tolerance": 0.0015, "jitter": 0.005, **kwargs}
-  task = Cut(dataclasses.replace(SCENE, nodes=1000), random, name="cut/hard", **kwargs)
-  return base.make(task, time_limit, environment_kwargs)
+  return Cut(dataclasses.replace(SCENE, nodes=1000), **kwargs)
 
 
 def line(radius: float, wave: float, start: float) -> tuple[np.ndarray, float]:

@@ -18,15 +18,14 @@ import dataclasses
 import itertools
 
 import numpy as np
-from dm_control.utils import containers
 
-from . import base
-from .base import Physics
+from .. import base
+from ..registry import exercise
+from ..base import Physics
 from .dissect import Dissect
 from .grasp import FUNDUS
-from .performer import Performer, Script
+from ..performer import Performer, Script
 
-SUITE = containers.TaggedTasks()
 # Stiffness [N/m^3], strength [Pa] and energy [J/m^2] of the bed; ours, we know of no measurement. A
 # pull within the limits does not free it.
 BED = (1e7, 2.5e4, 40.0)
@@ -41,29 +40,26 @@ SCENE = dataclasses.replace(
 _FAR, _MORE, _SHARE, _OFF, _WAITS = 0.03, 0.3, 0.7, 0.0015, 0.01
 
 
-@SUITE.add("benchmarking", "easy", "bimanual")
-def easy(time_limit=40, random=None, environment_kwargs=None, **kwargs):
-  """Returns the task to hold the gallbladder and divide half of its bed with a hook."""
-  task = Bimanual(SCENE, random, name="bimanual/easy", **{"wanted": 0.5, **kwargs})
-  return base.make(task, time_limit, environment_kwargs)
+@exercise("bimanual/easy", 40, "easy", "bimanual")
+def easy(**kwargs):
+  """Hold the gallbladder and divide half of its bed with a hook."""
+  return Bimanual(SCENE, **{"wanted": 0.5, **kwargs})
 
 
-@SUITE.add("benchmarking", "bimanual")
-def standard(time_limit=60, random=None, environment_kwargs=None, **kwargs):
-  """Returns the task to divide 80 % of it."""
+@exercise("bimanual/standard", 60, "bimanual")
+def standard(**kwargs):
+  """Divide 80 % of it."""
   kwargs = {"wanted": 0.8, "jitter": 0.003, **kwargs}
-  task = Bimanual(SCENE, random, name="bimanual/standard", **kwargs)
-  return base.make(task, time_limit, environment_kwargs)
+  return Bimanual(SCENE, **kwargs)
 
 
-@SUITE.add("benchmarking", "hard", "bimanual")
-def hard(time_limit=80, random=None, environment_kwargs=None, **kwargs):
-  """Returns the task to divide 90 % of it with less force, on varying organs."""
+@exercise("bimanual/hard", 80, "hard", "bimanual")
+def hard(**kwargs):
+  """Divide 90 % of it with less force, on varying organs."""
   kwargs = {"wanted": 0.9, "jitter": 0.005, "variants": (None, 1, 2), **kwargs}
   kwargs = {"force_limit": 3.4, "damage": 6.0, "traction": 1.2, **kwargs}
   scene = dataclasses.replace(SCENE, nodes=500)
-  task = Bimanual(scene, random, name="bimanual/hard", **kwargs)
-  return base.make(task, time_limit, environment_kwargs)
+  return Bimanual(scene, **kwargs)
 
 
 class Bimanual(Dissect):

@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
-from .base import Physics, Task
-from .scenes import Scene
+from ..base import Physics, Task
+from ..scenes import Scene
 
 SEEN = 1e-6  # what rounding may take from a share
 

@@ -16,15 +16,14 @@ import dataclasses
 import math
 
 import numpy as np
-from dm_control.utils import containers
 from scipy.spatial import cKDTree
 
-from . import base
-from .base import Physics, Task
-from .performer import Performer, Script
-from .scenes import Scene
+from .. import base
+from ..registry import exercise
+from ..base import Physics, Task
+from ..performer import Performer, Script
+from ..scenes import Scene
 
-SUITE = containers.TaggedTasks()
 STOMACH = Scene(organ="stomach", center="body", port=(0.03, 0.045, 0.12), camera=(-0.05, 0.1, 0.14))
 CONTACT = 0.02  # [N]
 STEP = 0.0015  # between points of the curve [m]
@@ -37,29 +36,26 @@ _FACING = 0.7  # least cosine between the surface's normal and the way to the tr
 _MARKS = 30  # spheres that draw the curve
 
 
-@SUITE.add("benchmarking", "easy")
-def easy(time_limit=20, random=None, environment_kwargs=None, **kwargs):
-  """Returns the task to trace an arc of about 40 mm within 5 mm."""
+@exercise("trace/easy", 20, "easy")
+def easy(**kwargs):
+  """Trace an arc of about 40 mm within 5 mm."""
   kwargs = {"size": 0.02, "turns": 0.0, "tolerance": 0.005, **kwargs}
-  task = Trace(dataclasses.replace(STOMACH, nodes=250), random, name="trace/easy", **kwargs)
-  return base.make(task, time_limit, environment_kwargs)
+  return Trace(dataclasses.replace(STOMACH, nodes=250), **kwargs)
 
 
-@SUITE.add("benchmarking")
-def standard(time_limit=30, random=None, environment_kwargs=None, **kwargs):
-  """Returns the task to trace an S of about 60 mm within 3.5 mm."""
+@exercise("trace/standard", 30)
+def standard(**kwargs):
+  """Trace an S of about 60 mm within 3.5 mm."""
   kwargs = {"size": 0.025, "turns": 1.0, "tolerance": 0.0035, "jitter": 0.005, **kwargs}
-  task = Trace(dataclasses.replace(STOMACH, nodes=500), random, name="trace/standard", **kwargs)
-  return base.make(task, time_limit, environment_kwargs)
+  return Trace(dataclasses.replace(STOMACH, nodes=500), **kwargs)
 
 
-@SUITE.add("benchmarking", "hard")
-def hard(time_limit=40, random=None, environment_kwargs=None, **kwargs):
-  """Returns the task to trace a double S of about 80 mm within 3 mm, on stomachs that vary."""
+@exercise("trace/hard", 40, "hard")
+def hard(**kwargs):
+  """Trace a double S of about 80 mm within 3 mm, on stomachs that vary."""
   kwargs = {"size": 0.026, "turns": 2.0, "tolerance": 0.003, "jitter": 0.005, **kwargs}
   kwargs = {"variants": (None, 1, 2), "force_limit": 0.5, "damage": 2.0, **kwargs}
-  task = Trace(dataclasses.replace(STOMACH, nodes=1000), random, name="trace/hard", **kwargs)
-  return base.make(task, time_limit, environment_kwargs)
+  return Trace(dataclasses.replace(STOMACH, nodes=1000), **kwargs)
 
 
 class Trace(Task):

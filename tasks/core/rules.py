@@ -1,0 +1,154 @@
+"""The words that the rules of exercises are written in.
+
+A rule is a plain function of the world `s` and of the exercise's state in it, `o`, which it returns
+changed. Python runs it for one world: `s` is the `Physics`, `o` the task, and these words are what
+is below. For many worlds Warp compiles the same text, with the words of `tasks.batch.words` in
+place of these; so a rule has no dictionaries, no strings, no chained comparisons, and counts in
+loops from `int(0)`.
+"""
+
+import dataclasses
+import inspect
+import math
+from collections.abc import Callable
+from typing import Annotated, Any, get_type_hints
+
+import numpy as np
+import warp as wp
+
+RUNNING, SUCCESS, DAMAGED, MISSED = range(4)
+OUTCOMES = (None, "success", "damage", "missed")
+
+Vector = Annotated[Any, wp.vec3]
+Vectors3 = Annotated[Any, wp.mat33]  # three vectors, a row each
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Rules:
+  """The rules of a domain.
+
+  Attributes:
+    state: class whose annotations are a world's state: numbers, flags, `Vector`, and arrays, such
+      as `Annotated[Any, ints("targets")]`, whose sizes are numbers or attributes of the task; a
+      task has attributes of these names
+    advance: rule (s, o) that returns o, the progress and the outcome, one of RUNNING, SUCCESS,
+      DAMAGED, MISSED, after a control step
+    observe: rule (s, o) that returns o with its own observations up to date
+    observed: fields of the state that are these
+  """
+
+  state: type
+  advance: Callable
+  observe: Callable
+  observed: tuple[str, ...]
+
+  def __post_init__(self):
+    where = f"{self.state.__module__}.{self.state.__qualname__}"
+    for name in ("advance", "observe"):
+      rule = getattr(self, name)
+      if not inspect.isfunction(rule) or len(inspect.signature(rule).parameters) != 2:
+        raise TypeError(f"{where}: {name} is {rule!r}, expected a function of s and o")
+    known = self.fields
+    for name in self.observed:
+      if name not in known:
+        raise TypeError(f"{where}: {name!r} is observed, expected a field: {', '.join(known)}")
+
+  @property
+  def fields(self) -> dict[str, Any]:
+    """Kinds of the fields by name."""
+    found = get_type_hints(self.state, include_extras=True)
+    return {
+      name: hint.__metadata__[0] if hasattr(hint, "__metadata__") else hint
+      for name, hint in found.items()
+    }
+
+
+INSTEAD: dict[Callable, Callable] = {}  # what Warp compiles in place of a function
+
+
+def many(function: Callable) -> Callable:
+  """Returns a decorator: what it decorates is compiled for many worlds in place of a function.
+
+  For loops that numpy does at once: the two say the same, in the same words.
+  """
+
+  def add(other: Callable) -> Callable:
+    INSTEAD[function] = other
+    return other
+
+  return add
+
+
+# Numbers and vectors.
+
+
+root = math.sqrt
+
+
+def vector(x: float, y: float, z: float) -> np.ndarray:
+  """Returns a vector."""
+  return np.array([x, y, z])
+
+
+def length(v: np.ndarray) -> float:
+  """Returns the length of a vector."""
+  return math.sqrt(v.dot(v))
+
+
+def dot(a: np.ndarray, b: np.ndarray) -> float:
+  """Returns the product of two vectors."""
+  return float(a.dot(b))
+
+
+# Questions to the world.
+
+
+def tip(s: Any) -> np.ndarray:
+  """Returns where the tip is [m]."""
+  return s.tip_pos()
+
+
+def point(s: Any, triangle: int) -> np.ndarray:
+  """Returns the middle of a triangle [m]."""
+  return s.point(triangle)
+
+
+def corner(s: Any, triangle: int, k: int) -> np.ndarray:
+  """Returns where corner k of a triangle is [m]."""
+  return s.nodes()[s.organ.elem[triangle, k]]
+
+
+def normal(s: Any, triangle: int) -> np.ndarray:
+  """Returns the outward unit normal of a triangle."""
+  return s.normal(triangle)
+
+
+def peak(s: Any) -> float:
+  """Returns the largest force of the control step, jaws included [N]."""
+  return s.peak_force
+
+
+def force(s: Any) -> float:
+  """Returns the force on the instrument below the shaft [N]."""
+  return length(s.contact_force())
+
+
+# What the recorder is told; labels are the task's.
+
+
+def miss(s: Any, o: Any, value: float) -> None:
+  """Reports a contact, or a closing, beside what it was meant for, by so much [m]."""
+  o.event(s, "miss", value, o.label("miss"))
+
+
+def reach(s: Any, o: Any, value: float) -> None:
+  """Reports a target that was reached, at a distance from it [m]."""
+  o.event(s, "target", value, o.label("target"))
+
+
+# Formulas.
+
+
+def closeness(distance: float, start: float) -> float:
+  """Returns 1 at the goal, 0 at the distance it started from, -1 at twice that and beyond [-]."""
+  return max(-1.0, 1.0 - distance / max(start, 1e-3))
