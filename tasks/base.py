@@ -48,7 +48,7 @@ from palpate.models import trocar
 from scipy.spatial import cKDTree
 
 from . import observation, randomisation, safety, scenes, stage
-from .core.rules import OUTCOMES, closeness
+from .core.rules import DAMAGED, OUTCOMES
 from .environment import CONTROL_TIMESTEP, Environment
 from .handle import ROW
 from .instrument import AXES, JAWS
@@ -89,6 +89,7 @@ class Task(control.Task):
 
   name = "task"
   rules: Any = None  # see `Rules`
+  touched = 12  # nodes that the instrument touches at once, and some more: slots of a GPU's window
   watch = ("miss", "unintended_contact")
   final: tuple[str, ...] = ()  # components that end the episode above 0.5
   control_timestep = CONTROL_TIMESTEP
@@ -250,6 +251,8 @@ class Task(control.Task):
     """Returns the progress after a control step; sets `outcome` on success or failure."""
     _, progress, outcome = self.rules.advance(physics, self)
     self.outcome = OUTCOMES[outcome]
+    if outcome == DAMAGED:
+      self.event(physics, "note", label=self.label("damage"))
     self.show(physics)
     return progress
 
@@ -269,7 +272,8 @@ class Task(control.Task):
     if self.rules is None:
       return {}
     self.rules.observe(physics, self)
-    return {name: np.atleast_1d(np.asarray(getattr(self, name), float)) for name in self.rules.observed}
+    own = self.rules.observed
+    return {name: np.atleast_1d(np.asarray(getattr(self, name), float)) for name in own}
 
   def recorded(self, physics: Physics) -> Mapping[str, Any]:
     """Returns further columns of a sample, see `Recorder.append`."""

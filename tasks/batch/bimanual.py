@@ -116,7 +116,6 @@ class Bimanual(Dissect):
 
   struct = BimanualState
   begin, advance, observe = begin, advance, observe
-  nodes = 36
   takes = dissect.Dissect.takes
 
   @staticmethod

@@ -72,12 +72,12 @@ class Dissect(Freeing, Hold):
   @staticmethod
   def sizes(task: Any, physics):
     """Returns the named sizes of its arrays."""
-    return Freeing.sizes(task, physics) | Hold.sizes(task, physics)
+    return Freeing.sizes(task, physics)
 
   @staticmethod
   def constants(task: Any, physics):
     """Returns what all worlds share."""
-    return Freeing.constants(task, physics) | Hold.constants(task, physics)
+    return Freeing.constants(task, physics)
 
   @staticmethod
   def draw(task: Any, physics):

@@ -18,8 +18,6 @@ class Domain:
     advance: kernel (fields, own): what `Task.advance` is; it ends with `kernels.judge`
     observe: kernel (fields, own, beginning): what `Task.observe` is; with two hands (fields, own,
       fields of the other, beginning)
-    nodes: of the organ that its instrument touches at once, and some more: the slots of a GPU's
-      window
     takes: numbers of the task that the struct has under the same names
     metrics: of its own, by the struct's arrays of an episode's values so far
     tissue: keys of the organ's tissue among the rows of `draw`, which the struct does not have
@@ -29,7 +27,6 @@ class Domain:
   begin: Any
   advance: Any
   observe: Any
-  nodes: int = 12
   takes: tuple[str, ...] = ()
   metrics: Mapping[str, str] = {}
   tissue: tuple[str, ...] = ()

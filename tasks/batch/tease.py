@@ -82,4 +82,3 @@ class Tease(Freeing):
 
   struct = TeaseState
   begin, advance, observe = begin, advance, observe
-  nodes = 24

@@ -31,16 +31,14 @@ from .cut import Cut
 from .dissect import Dissect
 from .domain import Domain
 from .fields import INFO, OBSERVED, OUTCOMES
-from .grasp import Grasp
 from .palpate import Palpate
-from .retract import Retract
 from .tease import Tease
 from .trace import Trace
 from .worlds import Worlds
 
 # Exercises that are vectorised, by the class of their task.
 DOMAINS: dict[str, type[Domain]] = {
-  "Touch": Domain, "Press": Domain, "Palpate": Palpate, "Grasp": Grasp, "Retract": Retract,
+  "Touch": Domain, "Press": Domain, "Palpate": Palpate, "Grasp": Domain, "Retract": Domain,
   "Trace": Trace, "Dissect": Dissect, "Tease": Tease, "Bimanual": Bimanual,
   "Cut": Cut,
 }  # fmt: skip
@@ -133,7 +131,7 @@ class Exercises(VectorEnv):
         of_part = single
         if len(kinds) > 1:
           of_part = Exercise(task, **{**kwargs, "variants": (variant,)})
-        options = {} if where == "cpu" else {"nodes": domain.nodes if nodes is None else nodes}
+        options = {} if where == "cpu" else {"nodes": self.task.touched if nodes is None else nodes}
         count = end - start
         self.parts.append(Worlds(of_part.environment, domain, count, where, limit, **options))
         self.slices.append(slice(start, end))
@@ -220,8 +218,9 @@ class Exercises(VectorEnv):
   def _metrics(self) -> dict[str, Any]:
     """Returns the metrics of the episodes so far, NaN where they are unknown."""
     values, names = self._tell("values"), tally.names(self.task.jaws)
-    own = DOMAINS[type(self.task).__name__].metrics
-    more = {name: self._tell(field) for name, field in own.items()}
+    rules = self.task.rules
+    own = rules.metrics if rules else DOMAINS[type(self.task).__name__].metrics
+    more = {name: self._tell(field).reshape(self.num_envs) for name, field in own.items()}
     if self.output != "warp":
       return {name: values[:, k] for k, name in enumerate(names)} | more
     return {name: wp.clone(values[:, k]) for k, name in enumerate(names)} | more

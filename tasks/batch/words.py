@@ -6,12 +6,16 @@ import types
 from typing import Any
 
 import warp as wp
+from palpate.tasks import instrument
 from palpate.tasks.core import rules
 from palpate.tasks.core.rules import Rules
 from palpate.tissue.types import Array
 
 from . import kernels
 from .fields import Common
+
+_CLOSING, _GRIPPING = wp.constant(instrument.CLOSING), wp.constant(instrument.GRIPPING)
+_FOLD, _FORCE = wp.constant(instrument.FOLD), wp.constant(instrument.HELD_FORCE)
 
 
 @wp.func
@@ -63,13 +67,163 @@ def reach(s: Common, o: Any, value: float):
   s.missed_by[s.world] = s.missed_by[s.world] + value
 
 
+@wp.func
+def _turn(quat: wp.array2d[float], w: int):
+  """Returns the rotation in a row, w x y z."""
+  return wp.quat(quat[w, 1], quat[w, 2], quat[w, 3], quat[w, 0])
+
+
+@wp.func
+def from_tip(s: Common, place: wp.vec3):
+  """See `rules`."""
+  return wp.quat_rotate_inv(_turn(s.tip_quat, s.world), place - tip(s))
+
+
+@wp.func
+def closing(s: Common):
+  """See `rules`."""
+  opening, target = s.gripper[s.world, 0], s.gripper[s.world, 1]
+  return target < wp.min(opening - _CLOSING, _GRIPPING)
+
+
+@wp.func
+def holds(s: Common):
+  """See `rules`."""
+  both = wp.min(s.inner[s.world, 0], s.inner[s.world, 1])
+  return both > _FORCE and s.gripper[s.world, 0] > _FOLD
+
+
+@wp.func
+def grip(s: Common, o: Any, value: float):
+  """See `rules`."""
+  reach(s, o, value)
+  s.grasps[s.world] = s.grasps[s.world] + 1
+
+
+@wp.func
+def slipped(s: Common, o: Any):
+  """See `rules`."""
+  s.slips[s.world] = s.slips[s.world] + 1
+
+
+@wp.func
+def drop(s: Common, o: Any):
+  """See `rules`."""
+  s.errors[s.world] = s.errors[s.world] + 1
+
+
+@wp.func
+def tear(s: Common, o: Any, share: float):
+  """See `rules`."""
+
+
+@wp.func
+def visible(s: Common, o: Any):
+  """See `rules`."""
+  seen = wp.float32(0.0)
+  for k in range(s.behind.shape[1]):
+    if not s.behind[s.world, k]:
+      seen += 1.0
+  return seen / float(s.behind.shape[1])
+
+
+@wp.func
+def bonds(s: Common):
+  """See `rules`."""
+  return s.bond_vert.shape[0]
+
+
+@wp.func
+def bond(s: Common, k: int):
+  """See `rules`."""
+  return kernels.node(s, s.world, s.bond_vert[k])
+
+
+@wp.func
+def free(s: Common, k: int):
+  """See `rules`."""
+  return s.bond_damage[s.world, k] >= 1.0
+
+
+@wp.func
+def freed(s: Common):
+  """See `rules`."""
+  share = wp.float64(0.0)
+  for k in range(s.bond_vert.shape[0]):
+    if free(s, k):
+      share += wp.float64(s.bond_area[k])
+  return float(share)
+
+
+@wp.func
+def pull(s: Common):
+  """See `rules`."""
+  sum = wp.vec3()
+  for k in range(s.bond_vert.shape[0]):
+    w, f = s.world, s.bond_force
+    sum += wp.vec3(f[w, k, 0], f[w, k, 1], f[w, k, 2])
+  return wp.length(sum)
+
+
+@wp.func
+def other_tip(s: Common):
+  """See `rules`."""
+  return kernels.vector(s.other_pos, s.world)
+
+
+@wp.func
+def other_force(s: Common):
+  """See `rules`."""
+  return wp.length(kernels.vector(s.other_force, s.world))
+
+
+@wp.func
+def other_turned(s: Common, v: wp.vec3):
+  """See `rules`."""
+  return wp.quat_rotate(_turn(s.other_quat, s.world), v)
+
+
+@wp.func
+def commanded(s: Common, o: Any):
+  """See `rules`."""
+  return s.action[s.world, s.action.shape[1] - 1]
+
+
+@wp.func
+def edge_inside(s: Common):
+  """See `rules`."""
+  return s.edge_inside[s.world, 0] > 0.0
+
+
+@wp.func
+def edge_length(s: Common):
+  """See `rules`."""
+  return s.edge_length[s.world, 0]
+
+
+@wp.func
+def edge_seat(s: Common):
+  """See `rules`."""
+  w = s.world
+  return wp.vec3(s.edge_seat[w, 0, 0], s.edge_seat[w, 0, 1], s.edge_seat[w, 0, 2])
+
+
+@wp.func
+def pieces(s: Common):
+  """See `rules`."""
+  return s.pieces[s.world]
+
+
 _BUILTIN = {
   rules.vector: wp.vec3, rules.length: wp.length, rules.dot: wp.dot,
-  rules.root: wp.sqrt, rules.closeness: kernels.closeness,
+  rules.root: wp.sqrt, rules.closeness: kernels.closeness, rules.clamp: wp.clamp,
 }  # fmt: skip
-WORDS = _BUILTIN | {
-  getattr(rules, word.key): word for word in (tip, point, corner, normal, peak, force, miss, reach)
-}  # of Python -> of Warp
+_WORDS = (
+  tip, point, corner, normal, peak, force, miss, reach, from_tip, closing, holds, grip, slipped,
+  drop, tear, visible, bonds, bond, free, freed, pull, other_tip, other_force, other_turned,
+  commanded, edge_inside, edge_length, edge_seat, pieces,
+)  # fmt: skip
+WORDS = _BUILTIN | {getattr(rules, word.key): word for word in _WORDS}  # of Python -> of Warp
 
 
 def translate(rule: Any, module: Any, known: dict[Any, Any]) -> Any:
@@ -98,7 +252,7 @@ def translate(rule: Any, module: Any, known: dict[Any, Any]) -> Any:
 
 
 @functools.cache
-def compiled(own: Rules) -> tuple[Any, Any, Any]:
+def compiled(own: Rules) -> tuple[Any, Any, Any, Any]:
   """Returns the struct of a domain's state, and the kernels of its rules."""
   module, known = wp.get_module(own.state.__module__), dict(WORDS)
   kinds = {
@@ -107,6 +261,7 @@ def compiled(own: Rules) -> tuple[Any, Any, Any]:
   }
   state: Any = wp.struct(type("State", (), {"__annotations__": kinds, "__module__": module.name}))
   rule, look = (translate(each, module, known) for each in (own.advance, own.observe))
+  first = translate(own.before, module, known) if own.before else None
   judge = kernels.judge
 
   def advance(s: Common, states: wp.array(dtype=state)):
@@ -120,5 +275,10 @@ def compiled(own: Rules) -> tuple[Any, Any, Any]:
     if not beginning or s.begun[s.world]:
       states[s.world] = look(s, states[s.world])
 
-  made = (wp.kernel(k, module=module, enable_backward=False) for k in (advance, observe))
-  return state, *made
+  def before(s: Common, states: wp.array(dtype=state)):
+    s.world = wp.tid()
+    states[s.world] = first(s, states[s.world])
+
+  used = (advance, observe, *([before] if first else []))
+  made = [wp.kernel(k, module=module, enable_backward=False) for k in used]
+  return state, *made, *([] if first else [None])

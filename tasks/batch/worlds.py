@@ -12,8 +12,9 @@ import mujoco as mj
 import numpy as np
 import palpate.batch
 import warp as wp
+from palpate.batch.threads import Threads
 from palpate.models import trocar
-from palpate.tasks import episode
+from palpate.tasks import episode, jaws
 from palpate.tasks.environment import Environment
 from palpate.tasks.instrument import AXES, JAWS, RATES
 from palpate.tasks.stage import STATE
@@ -77,6 +78,9 @@ class Worlds:
       self.episodes.draw = self.states.draw
     self.organ = self.batch.organ(task.organ)
     domain.attach(self)
+    self.cuts = bool(self.episodes.physics.organ.config.cutters) and bool(self.states)
+    if self.cuts:
+      self.batch.feel(f"{task.prefix}tip_force", task.organ)
     dt = environment.control_timestep()
     self.fields, self.other = self._make(task, task.prefix, dt, limit), None
     if task.second:
@@ -84,6 +88,8 @@ class Worlds:
       self.other.first = len(task.components) - len(AXES) - len(task.other)
       for name in ("action", "begun", "step"):
         setattr(self.other, name, getattr(self.fields, name))
+      for name, own in (("pos", "tip_pos"), ("quat", "tip_quat"), ("force", "contact_force")):
+        setattr(self.fields, f"other_{name}", getattr(self.other, own))
     if not self.states:
       self._make_own(task, domain, nworld)
     steps = self.batch.watch(self._substeps)
@@ -124,7 +130,8 @@ class Worlds:
     sizes = dict(
       nworld=self.nworld, nvert=self.organ.nvert, nelem=len(self.organ.elem), nq=model.nq,
       nv=model.nv, nu=model.nu, nsensor=model.nsensor, nsensordata=model.nsensordata,
-      naction=len(task.components),
+      naction=len(task.components), nbond=len(physics.organ.bonds), nside=model.ngeom + 1,
+      nspot=len(getattr(task, "disc", ())),
     )  # fmt: skip
     s = allocate(Common, self.device, sizes)
     s.dt, s.limit, s.sparse = dt, limit, int(task.reward == "sparse")
@@ -139,8 +146,14 @@ class Worlds:
       "move": np.array(RATES) * dt, "elem": self.organ.elem, "coarse": coarse,
       "coarse0": physics.organ.xpos0[coarse],
     }  # fmt: skip
+    if s.jaw >= 0:
+      constants["side"] = jaws.Jaws(model, prefix).side
+    if bonds := physics.organ.bonds:
+      constants |= {"bond_vert": bonds.vertices, "bond_area": bonds.area / bonds.area.sum()}
     for name, value in constants.items():
       getattr(s, name).assign(np.asarray(value))
+    if self.states and s.behind.shape[1]:
+      s.disc, s.eye = self.states.rows["disc"], wp.vec3(*physics.camera()[0])
     batch = self.batch
     s.ctrl, s.failures = batch.ctrl, batch.failures
     s.sensor_peak, s.sensor_mean = batch.sensor_peak, batch.sensor_mean
@@ -177,6 +190,12 @@ class Worlds:
     s.qpos, s.qvel, s.sensordata, s.xpos = (
       batch.qpos, batch.qvel, batch.sensordata, self.organ.xpos
     )  # fmt: skip
+    if s.bond_vert.shape[0]:
+      s.bond_damage, s.bond_force = self.organ.bonds.damage, self.organ.bonds.force
+    if self.cuts:
+      found = self.organ.cutters
+      s.edge_inside, s.edge_length, s.edge_seat = found.inside, found.length, found.seat
+      s.pieces = self.organ.piece_count
 
   # Doing.
 
@@ -222,6 +241,10 @@ class Worlds:
     wp.copy(self.fields.action, action)
     self._of_hands(kernels.act)
     self._domain.act(self)
+    if self.states and self.states.before:
+      self._over(self.states.before, self.states.records)
+      if "burning" in self.states.rows:
+        self.organ.bonds.weaken(self.states.rows["burning"])
     self.batch.step(self._substeps)
     self._run(self._judge)
 
@@ -236,6 +259,10 @@ class Worlds:
     """Launches what follows the steps of the physics."""
     self._measure(False)
     self._domain.sense(self)
+    if self.fields.jaw >= 0:
+      self._press()
+    if self.states and self.fields.behind.shape[1]:
+      self.launch(kernels.hide, self.fields.behind.shape, [self.fields])
     if self.states:
       self._over(self.states.advance, self.states.records)
     else:
@@ -246,6 +273,24 @@ class Worlds:
       inputs = [self.fields, self.tally, self._tally, self._hows]
       self.launch(tally.join, self.tally.values.shape, inputs)
     self._observe(False)
+
+  def _press(self) -> None:
+    """Measures what the jaws have between them."""
+    batch, s = self.batch, self.fields
+    found = jaws.Jaws(batch.model, self.task.prefix)
+    if not isinstance(batch, Threads):
+      between: Any = kernels.Between()
+      between.left, between.right = (batch.xmat(name) for name in found.names)
+      between.geom, between.normal, between.force = self.organ.contacts
+      between.side, between.inner = s.side, s.inner
+      self.launch(kernels.press, self.nworld, [between])
+      return
+    inner = s.inner.numpy()
+
+    def work(world: int):
+      inner[world] = found.inner_force(batch.models[world], batch.datas[world])
+
+    batch.each(work)
 
   def _measure(self, beginning: bool) -> None:
     """Measures the instruments, and brings what is of the batch up to date."""

@@ -10,9 +10,10 @@ loops from `int(0)`.
 import dataclasses
 import inspect
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Annotated, Any, get_type_hints
 
+import mujoco
 import numpy as np
 import warp as wp
 
@@ -35,23 +36,27 @@ class Rules:
       DAMAGED, MISSED, after a control step
     observe: rule (s, o) that returns o with its own observations up to date
     observed: fields of the state that are these
+    before: rule (s, o) that returns o before the steps of the physics, or None
+    metrics: of the domain's own, by the field that is an episode's value so far
   """
 
   state: type
   advance: Callable
   observe: Callable
   observed: tuple[str, ...]
+  before: Callable | None = None
+  metrics: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
   def __post_init__(self):
     where = f"{self.state.__module__}.{self.state.__qualname__}"
-    for name in ("advance", "observe"):
+    for name in ("advance", "observe", *(["before"] if self.before else [])):
       rule = getattr(self, name)
       if not inspect.isfunction(rule) or len(inspect.signature(rule).parameters) != 2:
         raise TypeError(f"{where}: {name} is {rule!r}, expected a function of s and o")
     known = self.fields
-    for name in self.observed:
+    for name in (*self.observed, *self.metrics.values()):
       if name not in known:
-        raise TypeError(f"{where}: {name!r} is observed, expected a field: {', '.join(known)}")
+        raise TypeError(f"{where}: {name!r} is told, expected a field: {', '.join(known)}")
 
   @property
   def fields(self) -> dict[str, Any]:
@@ -82,7 +87,15 @@ def many(function: Callable) -> Callable:
 # Numbers and vectors.
 
 
-root = math.sqrt
+def root(x: float) -> float:
+  """Returns the square root."""
+  return math.sqrt(x)
+
+
+def clamp(x: float, low: float, high: float) -> float:
+  """Returns the number between two others that is nearest to one."""
+  return min(max(x, low), high)
+
 
 
 def vector(x: float, y: float, z: float) -> np.ndarray:
@@ -133,6 +146,93 @@ def force(s: Any) -> float:
   return length(s.contact_force())
 
 
+def from_tip(s: Any, place: np.ndarray) -> np.ndarray:
+  """Returns a place in the frame of the tip [m]."""
+  return s.from_tip(place)
+
+
+def closing(s: Any) -> bool:
+  """Returns whether the jaws are told to close, see `Instrument`."""
+  return s.closing()
+
+
+def holds(s: Any) -> bool:
+  """Returns whether tissue is between the jaws, see `Instrument`."""
+  return s.holds()
+
+
+def visible(s: Any, o: Any) -> float:
+  """Returns the share of the points `o.disc` that the organ does not hide [-]."""
+  return 1 - float(s.hidden(o.disc).mean())
+
+
+def bonds(s: Any) -> int:
+  """Returns how many bonds the organ has, free ones too."""
+  return len(s.organ.bonds)
+
+
+def bond(s: Any, k: int) -> np.ndarray:
+  """Returns where a bond is [m]."""
+  return s.organ.bonds.positions[k]
+
+
+def free(s: Any, k: int) -> bool:
+  """Returns whether a bond has broken."""
+  return bool(s.organ.bonds.free[k])
+
+
+def freed(s: Any) -> float:
+  """Returns the share of the bonds' area that is free [-]."""
+  return s.organ.bonds.share_freed
+
+
+def pull(s: Any) -> float:
+  """Returns the pull of all bonds [N]."""
+  return length(s.organ.bonds.force.sum(axis=0))
+
+
+def other_tip(s: Any) -> np.ndarray:
+  """Returns where the tip of the other hand's instrument is [m]."""
+  return s.second.tip_pos()
+
+
+def other_force(s: Any) -> float:
+  """Returns the force on that below its shaft [N]."""
+  return length(s.second.contact_force())
+
+
+def other_turned(s: Any, v: np.ndarray) -> np.ndarray:
+  """Returns a vector of the frame of that tip in the world."""
+  out = np.zeros(3)
+  mujoco.mju_rotVecQuat(out, v, s.second.tip_quat())
+  return out
+
+
+def commanded(s: Any, o: Any) -> float:
+  """Returns the last component of the action, the largest of its rows."""
+  return o.action[..., -1].max()
+
+
+def edge_inside(s: Any) -> bool:
+  """Returns whether the edge is in the tissue."""
+  return s.organ.cutters[0].inside
+
+
+def edge_length(s: Any) -> float:
+  """Returns how far the edge has cut [m]."""
+  return s.organ.cutters[0].length
+
+
+def edge_seat(s: Any) -> np.ndarray:
+  """Returns where the edge is in the tissue at rest [m]."""
+  return s.organ.cutters[0].seat
+
+
+def pieces(s: Any) -> int:
+  """Returns how many pieces the organ is in."""
+  return len(s.organ.pieces)
+
+
 # What the recorder is told; labels are the task's.
 
 
@@ -144,6 +244,25 @@ def miss(s: Any, o: Any, value: float) -> None:
 def reach(s: Any, o: Any, value: float) -> None:
   """Reports a target that was reached, at a distance from it [m]."""
   o.event(s, "target", value, o.label("target"))
+
+
+def grip(s: Any, o: Any, value: float) -> None:
+  """Reports that the jaws have grasped the site, at a distance from it [m]."""
+  o.event(s, "target", value, "grasp")
+
+
+def slipped(s: Any, o: Any) -> None:
+  """Reports a grasp that was lost in closed jaws, which a recording shows by itself."""
+
+
+def drop(s: Any, o: Any) -> None:
+  """Reports that what was held, or followed, is lost."""
+  o.event(s, "drop", None, o.label("drop"))
+
+
+def tear(s: Any, o: Any, share: float) -> None:
+  """Reports a share that came free as it should not."""
+  o.event(s, "slip", share, "torn")
 
 
 # Formulas.

@@ -19,12 +19,11 @@ import itertools
 
 import numpy as np
 
-from .. import base
-from ..registry import exercise
 from ..base import Physics
+from ..performer import Performer, Script
+from ..registry import exercise
 from .dissect import Dissect
 from .grasp import FUNDUS
-from ..performer import Performer, Script
 
 # Stiffness [N/m^3], strength [Pa] and energy [J/m^2] of the bed; ours, we know of no measurement. A
 # pull within the limits does not free it.
@@ -68,6 +67,8 @@ class Bimanual(Dissect):
   Attributes:
     burnt: how long the current has burnt what the hook touches [s]
   """
+
+  touched = 36
 
   @property
   def other(self) -> tuple[str, ...]:

@@ -20,12 +20,12 @@ import dataclasses
 import mujoco
 import numpy as np
 
-from .. import base
-from . import sheet
-from ..registry import exercise
 from ..base import Physics, Task
+from ..core.rules import closeness
 from ..performer import Performer, Script
+from ..registry import exercise
 from ..scenes import Scene
+from . import sheet
 
 SCENE = Scene(
   organ="sheet",
@@ -120,7 +120,7 @@ class Cut(Task):
       tolerance: largest distance of the cut from the line [m]
       **kwargs: see Task
     """
-    self.name, self.targets = name, _MARKS
+    self.targets = _MARKS
     if not 0.005 <= radius * (1 + abs(wave)) <= 0.024:
       raise ValueError(
         f"{name}: radius is {radius} and wave {wave}, expected a line from 5 to 24 mm of the middle"
@@ -129,7 +129,7 @@ class Cut(Task):
       raise ValueError(f"{name}: tolerance is {tolerance}, expected a number in (0, {radius})")
     self.radius, self.wave, self.tolerance = radius, wave, tolerance
     kwargs = {"force_limit": 0.8, "damage": 2.0, **kwargs}
-    super().__init__(dataclasses.replace(scene, targets=_MARKS), random, **kwargs)
+    super().__init__(dataclasses.replace(scene, targets=_MARKS), random, name=name, **kwargs)
 
   def spec(self, variant: int | None) -> mujoco.MjSpec:
     """Returns the scene, which has no other shapes."""
@@ -183,7 +183,7 @@ class Cut(Task):
     if share >= COVERED and (closed or len(physics.organ.pieces) > 1):
       self.outcome = "success"
       return 1.0
-    self.nearest = max(self.nearest, base.closeness(self.distance(physics), self.distance0))
+    self.nearest = max(self.nearest, closeness(self.distance(physics), self.distance0))
     return 0.1 * self.nearest + 0.9 * share
 
   def _open(self, physics: Physics, start: np.ndarray, end: np.ndarray, length: float) -> None:

@@ -20,13 +20,13 @@ from collections.abc import Callable
 
 import numpy as np
 
-from .. import base
-from ..registry import exercise
 from ..base import Physics
-from .freeing import Freeing
-from .grasp import FUNDUS, Hold
+from ..core.rules import closeness, drop
 from ..performer import Performer, Script
+from ..registry import exercise
 from ..scenes import Scene
+from .freeing import Freeing
+from .grasp import FUNDUS, Hold, distance, follow
 
 # Stiffness [N/m^3], strength [Pa] and energy [J/m^2] of the bed, and of a tough one. Ours: we know
 # of no measurement; the bed bears the organ, and comes away under half a newton or one.
@@ -66,19 +66,18 @@ class Dissect(Freeing, Hold):
   slip = 0.006
 
   def __init__(
-    self, scene: Scene, random=None, *, name: str, wanted: float, traction: float = 1.5, **kwargs
+    self, scene: Scene, random=None, *, wanted: float, traction: float = 1.5, **kwargs
   ):
     """Makes the task.
 
     Args:
       scene: what it plays in, with bonds
       random: see Task
-      name: domain and task
       wanted: share of the bed that must come free cleanly [-]
       traction: limit of the pull on the liver [N]
       **kwargs: see Task; the force limit counts the jaws too
     """
-    self.name, self.targets = name, 1
+    self.targets = 1
     kwargs = {"spread": 0.012, "force_limit": 4.0, "damage": 8.0, **kwargs}
     kwargs |= {"wanted": wanted, "traction": traction}
     super().__init__(dataclasses.replace(scene, targets=1), random, **kwargs)
@@ -92,10 +91,10 @@ class Dissect(Freeing, Hold):
   def advance(self, physics: Physics) -> float:
     """Follows the grasp and what comes free."""
     physics.mark(0, physics.point(self.site), now=True)
-    if self.follow(physics):
-      self.dropped(physics)
+    if follow(physics, self)[1]:
+      drop(physics, self)
     self.count(physics, self.fair(physics))
-    near = base.closeness(self.distance(physics), self.distance0)
+    near = closeness(distance(physics, self), self.distance0)
     return self.earned(1.0 if self.grasped else near)
 
   def fair(self, physics: Physics) -> bool:

@@ -22,10 +22,28 @@ import itertools
 
 import numpy as np
 
-from .. import base
-from ..registry import exercise
 from ..base import Physics, Task
+from ..core.rules import (
+  RUNNING,
+  SUCCESS,
+  Rules,
+  Vector,
+  closeness,
+  closing,
+  dot,
+  drop,
+  from_tip,
+  grip,
+  holds,
+  length,
+  miss,
+  peak,
+  point,
+  slipped,
+  tip,
+)
 from ..performer import Performer, Script
+from ..registry import exercise
 from ..scenes import Scene
 from .touch import SLACK
 
@@ -64,17 +82,63 @@ def hard(**kwargs):
   return Grasp(dataclasses.replace(FUNDUS, nodes=500), **kwargs)
 
 
+class Held:
+  """State of jaws that are to hold a site."""
+
+  slip: float  # how far it may move in the jaws [m]
+  force_limit: float  # [N]
+  control_timestep: float  # [s]
+  site: int  # triangle to grasp
+  closing: bool  # whether the jaws are told to close
+  where: Vector  # the site in the frame of the tip, where it was grasped [m]
+  distance0: float  # [m]
+  target: Vector
+  grasped: float  # 1 while the jaws hold it
+
+
+# The rules of holding.
+
+
+def distance(s, o):
+  """Returns how far the tip is from the site [m]."""
+  return length(point(s, o.site) - tip(s))
+
+
+def slid(s, o):
+  """Returns how far the site has moved in the jaws from where it was grasped [m]."""
+  return length(from_tip(s, point(s, o.site)) - o.where)
+
+
+def follow(s, o):
+  """Finds out whether the site is grasped; returns too whether it was until now, and is no more."""
+  told, far, before, now = closing(s), distance(s, o), o.grasped == 1.0, False
+  if before:
+    now = told and holds(s) and slid(s, o) < o.slip
+    if told and not now:
+      slipped(s, o)
+  elif told and far < REACH and holds(s):
+    now = True
+    o.where = from_tip(s, point(s, o.site))
+    grip(s, o, far)
+  if told and not o.closing and far >= 2.0 * REACH:
+    miss(s, o, far)
+  o.closing = told
+  o.grasped = 1.0 if now else 0.0
+  return o, before and not now
+
+
 class Hold(Task):
   """What the exercises of the grasper share: a site that is to be held between the jaws.
 
   Attributes:
     site: triangle to grasp
-    grasped: whether the jaws hold it, see the module's head
+    grasped: 1 while the jaws hold it, see the module's head
     closing: whether they are told to close
     slip: how far it may move in the jaws [m]
   """
 
   watch = ("miss", "unintended_contact", "drop")
+  touched = 24
   site: int
   slip = 0.005
 
@@ -82,67 +146,122 @@ class Hold(Task):
     """Draws the site."""
     place, _ = self.place_of_work(physics)
     self.site = int(self.random.choice(place))
-    self.grasped, self.closing = False, False
-    self.distance0 = self.distance(physics)
-
-  def distance(self, physics: Physics) -> float:
-    """Returns how far the tip is from the site [m]."""
-    return float(np.linalg.norm(physics.point(self.site) - physics.tip_pos()))
-
-  def follow(self, physics: Physics) -> bool:
-    """Finds out whether the site is grasped; returns whether it was until now, and is no more."""
-    before, closing, distance = self.grasped, physics.closing(), self.distance(physics)
-    holds = closing and physics.holds()
-    if before:
-      self.grasped = holds and self.slid(physics) < self.slip
-    elif holds and distance < REACH:
-      self.grasped = True
-      self.hold_here(physics)
-      self.event(physics, "target", distance, "grasp")
-    if closing and not self.closing and distance >= 2 * REACH:
-      self.event(physics, "miss", distance, "closed off the site")
-    self.closing = closing
-    return before and not self.grasped
-
-  def hold_here(self, physics: Physics) -> None:
-    """Takes where the site is in the jaws as the place that it may slip from."""
-    self._place = physics.from_tip(physics.point(self.site))
+    self.grasped, self.closing, self.where = 0.0, False, np.zeros(3)
+    self.distance0 = distance(physics, self)
 
   def slid(self, physics: Physics) -> float:
-    """Returns how far the site has moved in the jaws from that place [m]."""
-    return float(np.linalg.norm(physics.from_tip(physics.point(self.site)) - self._place))
+    """Returns how far the site has moved in the jaws from where it was grasped [m]."""
+    return slid(physics, self)
 
-  def dropped(self, physics: Physics) -> None:
-    """Reports that the tissue was lost."""
-    self.event(physics, "drop", label="slipped" if self.closing else "let go")
+  def label(self, kind: str) -> str:
+    """Returns what a miss is, and how tissue was lost."""
+    return "closed off the site" if kind == "miss" else "slipped" if self.closing else "let go"
 
   def recorded(self, physics: Physics) -> dict[str, float]:
     """Returns whether the jaws are told to close and whether they hold."""
     return {"grip": float(self.closing), "held": float(self.grasped)}
 
 
-def progress(done: bool, grasped: bool, near: float, share: float, held: float) -> float:
-  """Returns the progress, see the module's head: of closeness, shares of lift and time."""
+class State(Held):
+  """State of a world."""
+
+  lift: float  # [m]
+  hold: float  # [s]
+  rest: Vector  # the site's place at rest [m]
+  up: Vector  # towards the trocar
+  time: float  # held [s]
+  done: bool  # it was held
+  lowered: float  # it rests low [s]
+  letting: bool  # the jaws let go
+  height: float
+  held: float
+
+
+# The rules.
+
+
+def raised(s, o):
+  """Returns how far the site is above its place at rest, towards the trocar [m]."""
+  return dot(point(s, o.site) - o.rest, o.up)
+
+
+def again(o):
+  """Starts the holding again."""
+  o.time = 0.0
+  o.done = False
+  o.lowered = 0.0
+  o.letting = False
+  return o
+
+
+def lose(s, o):
+  """Counts a loss, and starts again."""
+  drop(s, o)
+  return again(o)
+
+
+def count(s, o, share):
+  """Counts the time that the site is held high, and then at rest low."""
+  if not o.done:
+    if share < 1.0:
+      o.time = 0.0
+    elif peak(s) <= o.force_limit:
+      o.time = o.time + o.control_timestep
+    if o.time >= o.hold - SLACK:
+      o.done = True
+      o.where = from_tip(s, point(s, o.site))
+  low = o.done and share >= LOW and share <= RESTING
+  o.lowered = o.lowered + o.control_timestep if low else 0.0
+  return o
+
+
+def advance(s, o):
+  """Follows the grasp from closing to release."""
+  share = raised(s, o) / o.lift
+  o, lost = follow(s, o)
+  if lost:
+    o.letting = o.lowered >= REST - SLACK and not o.closing
+    if not o.letting:
+      o = lose(s, o)
+  if o.letting and (share < LOW or share > LETTING):
+    o = lose(s, o)
+  if o.letting and not holds(s):
+    return o, 1.0, SUCCESS
+  if o.grasped == 1.0:
+    o = count(s, o, share)
   high = max(min(share, 1.0), 0.0)
-  low = 0.9 + 0.05 * (1.0 - high) if done else 0.2 * near
-  return 0.3 + 0.4 * high + 0.2 * min(held, 1.0) if grasped and not done else low
+  progress = 0.2 * closeness(distance(s, o), o.distance0)
+  if o.done:
+    progress = 0.9 + 0.05 * (1.0 - high)
+  elif o.grasped == 1.0:
+    progress = 0.3 + 0.4 * high + 0.2 * min(o.time / o.hold, 1.0)
+  return o, progress, RUNNING
+
+
+def observe(s, o):
+  """Finds target, height and held; grasped is up to date."""
+  o.target = point(s, o.site) - tip(s)
+  o.height = raised(s, o) - o.lift
+  o.held = min(o.time / o.hold, 1.0)
+  return o
 
 
 class Grasp(Hold):
   """Grasp, lift, hold, lower, release."""
 
-  def __init__(self, scene: Scene, random=None, *, name: str, lift: float, hold: float, **kwargs):
+  rules = Rules(State, advance, observe, ("target", "height", "held", "grasped"))
+
+  def __init__(self, scene: Scene, random=None, *, lift: float, hold: float, **kwargs):
     """Makes the task.
 
     Args:
       scene: what it plays in
       random: see Task
-      name: domain and task
       lift: height to lift the site to [m]
       hold: how long to hold it there [s]
       **kwargs: see Task; the force limit counts the jaws too
     """
-    self.name, self.targets, self.lift, self.hold = name, 1, lift, hold
+    self.targets, self.lift, self.hold = 1, lift, hold
     self.slip = 0.5 * lift
     kwargs = {"spread": 0.012, "force_limit": 4.0, "damage": 8.0, **kwargs}
     super().__init__(dataclasses.replace(scene, targets=1), random, **kwargs)
@@ -152,39 +271,17 @@ class Grasp(Hold):
     super().begin(physics)
     self.rest = physics.point(self.site)
     self.up = physics.trocar().mat[:, 2]
-    self._again()
-    physics.mark(0, self.rest)
+    again(self)
+    self.show(physics)
 
-  def _again(self) -> None:
-    """Starts the holding again."""
-    self.held, self.done, self.lowered, self._letting = 0.0, False, 0.0, False
+  def show(self, physics: Physics) -> None:
+    """Marks the site."""
+    physics.mark(0, physics.point(self.site))
 
   @property
   def rests(self) -> bool:
     """Whether the site was held, lowered and rests there, ready to be let go."""
     return self.lowered >= REST - SLACK
-
-  def height(self, physics: Physics) -> float:
-    """Returns how far the site is above its place at rest, towards the trocar [m]."""
-    return float((physics.point(self.site) - self.rest) @ self.up)
-
-  def advance(self, physics: Physics) -> float:
-    """Follows the grasp from closing to release."""
-    physics.mark(0, physics.point(self.site))
-    share = self.height(physics) / self.lift
-    if self.follow(physics):
-      self._letting = self.rests and not self.closing
-      if not self._letting:
-        self._lose(physics)
-    if self._letting and not LOW <= share <= LETTING:
-      self._lose(physics)
-    if self._letting and not physics.holds():
-      self.outcome = "success"
-      return 1.0
-    if self.grasped:
-      self._count(physics, share)
-    near = base.closeness(self.distance(physics), self.distance0)
-    return progress(self.done, self.grasped, near, share, self.held / self.hold)
 
   def instruct(self, physics: Physics) -> str:
     """Says to grasp, lift, hold, lower or let go."""
@@ -194,33 +291,9 @@ class Grasp(Hold):
       return "Open the jaws to let go"
     if self.done:
       return "Lower it to where it was"
-    if self.height(physics) < self.lift:
+    if raised(physics, self) < self.lift:
       return f"Lift it by {1e3 * self.lift:.0f} mm, towards the trocar"
-    return f"Hold it there for {max(self.hold - self.held, 0.0):.1f} s more"
-
-  def _lose(self, physics: Physics) -> None:
-    self.dropped(physics)
-    self._again()
-
-  def _count(self, physics: Physics, share: float) -> None:
-    """Counts the time that the site is held high, and then at rest low."""
-    gentle = physics.peak_force <= self.force_limit
-    if not self.done:
-      self.held = self.held + self.control_timestep * gentle if share >= 1 else 0.0
-      self.done = self.held >= self.hold - SLACK
-      if self.done:
-        self.hold_here(physics)
-    low = self.done and LOW <= share <= RESTING
-    self.lowered = self.lowered + self.control_timestep if low else 0.0
-
-  def observe(self, physics: Physics) -> dict[str, np.ndarray]:
-    """Returns target, height, held and grasped."""
-    return {
-      "target": physics.point(self.site) - physics.tip_pos(),
-      "height": np.array([self.height(physics) - self.lift]),
-      "held": np.array([min(self.held / self.hold, 1.0)]),
-      "grasped": np.array([float(self.grasped)]),
-    }
+    return f"Hold it there for {max(self.hold - self.time, 0.0):.1f} s more"
 
   def reference_length(self) -> float:
     """Returns the way to the site, up and down again [m]."""
@@ -239,13 +312,13 @@ class Grasp(Hold):
       goal = self.lift + 0.0015 + 0.3 * p.style.overshoot * self.lift
       while self.grasped and not self.done:  # up, and hold
         contact += self.control_timestep
-        missing = goal - self.height(physics)
+        missing = goal - raised(physics, self)
         p.tip = p.tip + float(np.clip(3 * missing, -speed, speed)) * self.control_timestep * up
         p.grip(contact)
         yield p.step()
       yield from p.wait(p.style.delay)
       while self.grasped and not self.rests:
-        if self.height(physics) > 0.2 * self.lift:
+        if raised(physics, self) > 0.2 * self.lift:
           p.tip = p.tip - speed * self.control_timestep * up
         p.grip(contact)
         yield p.step()

@@ -8,9 +8,9 @@ from scipy.spatial import cKDTree
 
 from .. import scenes
 from ..base import Physics, Task
-from .feeling import APART, SOFT, Notes, chance, nearest
 from ..performer import Performer, Script
 from ..scenes import Scene
+from .feeling import APART, SOFT, Notes, chance, nearest
 
 _FACING = 0.75  # least cosine between the field's normal and the way to the trocar
 _PIN_GAP = 0.02  # the field keeps that far from pinned nodes [m]

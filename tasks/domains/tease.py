@@ -16,13 +16,13 @@ import itertools
 import mujoco
 import numpy as np
 
-from .. import base
-from . import adhesion
-from ..registry import exercise
 from ..base import Physics
-from .freeing import Freeing
+from ..core.rules import closeness
 from ..performer import Performer, Script
+from ..registry import exercise
 from ..scenes import Scene
+from . import adhesion
+from .freeing import Freeing
 
 # Stiffness [N/m^3], strength [Pa] and energy [J/m^2]: ours, we know of no measurement.
 FILMY, DENSE = (1e7, 6e3, 6.0), (1e7, 8e3, 12.0)
@@ -66,12 +66,13 @@ class Tease(Freeing):
 
   watch = ("unintended_contact",)
 
+  touched = 24
+
   def __init__(
     self,
     scene: Scene,
     random=None,
     *,
-    name: str,
     wanted: float,
     law: tuple[float, float, float],
     traction: float = 2.0,
@@ -82,13 +83,11 @@ class Tease(Freeing):
     Args:
       scene: what it plays in
       random: see Task
-      name: domain and task
       wanted: share of the strip that must come free cleanly [-]
       law: stiffness [N/m^3], strength [Pa] and energy [J/m^2] of what holds it
       traction: limit of the pull on what is under it [N]
       **kwargs: see Task
     """
-    self.name = name
     kwargs |= {"wanted": wanted, "traction": traction}
     super().__init__(dataclasses.replace(scene, bonds=law), random, **kwargs)
 
@@ -125,7 +124,7 @@ class Tease(Freeing):
     self.count(physics)
     self._goal = self.front(physics)
     physics.mark(0, self._goal, now=True)
-    near = base.closeness(self.distance(physics), self.distance0)
+    near = closeness(self.distance(physics), self.distance0)
     self.nearest = max(self.nearest, near)
     return self.earned(self.nearest)
 

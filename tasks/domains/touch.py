@@ -23,7 +23,6 @@ from ..core.rules import (
   Rules,
   Vector,
   closeness,
-  force,
   length,
   miss,
   normal,

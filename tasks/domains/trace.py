@@ -18,10 +18,10 @@ import math
 import numpy as np
 from scipy.spatial import cKDTree
 
-from .. import base
-from ..registry import exercise
 from ..base import Physics, Task
+from ..core.rules import closeness
 from ..performer import Performer, Script
+from ..registry import exercise
 from ..scenes import Scene
 
 STOMACH = Scene(organ="stomach", center="body", port=(0.03, 0.045, 0.12), camera=(-0.05, 0.1, 0.14))
@@ -68,7 +68,6 @@ class Trace(Task):
     scene: Scene,
     random=None,
     *,
-    name: str,
     size: float,
     turns: float,
     tolerance: float,
@@ -79,13 +78,12 @@ class Trace(Task):
     Args:
       scene: what it plays in
       random: see Task
-      name: domain and task
       size: half the width of the curve [m]
       turns: how often it waves; 0 is an arc
       tolerance: largest distance of the tip from the curve [m]
       **kwargs: see Task
     """
-    self.name, self.targets = name, _MARKS
+    self.targets = _MARKS
     self.size, self.turns, self.tolerance = size, turns, tolerance
     kwargs = {"spread": 0.03, **kwargs}
     super().__init__(dataclasses.replace(scene, targets=_MARKS), random, **kwargs)
@@ -180,7 +178,7 @@ class Trace(Task):
       self.outcome = "success"
       return 1.0
     if not self.traced:
-      return 0.1 * base.closeness(self.distance(physics), self.distance0)
+      return 0.1 * closeness(self.distance(physics), self.distance0)
     return 0.1 + 0.9 * self.traced / float(self.arc[-1])
 
   def _trace(self, place: float, on: bool) -> None:
