@@ -215,8 +215,8 @@ def pieces(s: Common):
 
 
 _BUILTIN = {
-  rules.vector: wp.vec3, rules.length: wp.length, rules.dot: wp.dot,
-  rules.root: wp.sqrt, rules.closeness: kernels.closeness, rules.clamp: wp.clamp,
+  rules.vector: wp.vec3, rules.rows: wp.matrix_from_rows, rules.length: wp.length,
+  rules.dot: wp.dot, rules.root: wp.sqrt, rules.closeness: kernels.closeness, rules.clamp: wp.clamp,
 }  # fmt: skip
 _WORDS = (
   tip, point, corner, normal, peak, force, miss, reach, from_tip, closing, holds, grip, slipped,

@@ -103,6 +103,11 @@ def vector(x: float, y: float, z: float) -> np.ndarray:
   return np.array([x, y, z])
 
 
+def rows(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+  """Returns three vectors as rows, see `Vectors3`."""
+  return np.array([a, b, c])
+
+
 def length(v: np.ndarray) -> float:
   """Returns the length of a vector."""
   return math.sqrt(v.dot(v))
