@@ -7,7 +7,10 @@ slices and orientation; the origin is the image's. Files are read by nibabel (NI
 
 from __future__ import annotations
 
+import bz2
 import dataclasses
+import gzip
+import math
 import os
 
 import numpy as np
@@ -20,6 +23,7 @@ KINDS = (".nii", ".nii.gz", ".nrrd")
 _METRES = {"m": 1.0, "meter": 1.0, "mm": 1e-3, "um": 1e-6, "micron": 1e-6, "cm": 1e-2}
 _SMOOTHING = 0.6  # of the largest voxel edge; removes the steps between slices
 _PAD = 4  # voxels around a label
+_MOST = 2**29  # voxels of a volume
 
 Wrapped = tuple[np.ndarray, np.ndarray, Report]
 
@@ -128,7 +132,7 @@ def read(path: str | os.PathLike) -> Labels:
   name = os.fspath(path)
   if not name.lower().endswith(KINDS):
     raise ValueError(f"{name}: not a volume that can be read ({', '.join(KINDS)})")
-  if not os.path.exists(name):
+  if not os.path.isfile(name):
     raise FileNotFoundError(f"{name}: no such file")
   reader = _read_nrrd if name.lower().endswith(".nrrd") else _read_nifti
   try:
@@ -139,19 +143,41 @@ def read(path: str | os.PathLike) -> Labels:
     raise ValueError(f"{name}: cannot be read: {error}") from error
   if values.ndim != 4:
     raise ValueError(f"{name}: has {values.ndim - 1} dimensions, expected a label map with 3")
-  labels = np.round(values).astype(np.int64)
-  if not np.array_equal(labels, values):
-    other = values[labels != values][0]
-    raise ValueError(f"{name}: has the value {other}, expected a label map of whole numbers")
+  labels = _whole(name, values)
   if not np.isfinite(affine).all() or abs(np.linalg.det(affine[:3, :3])) < 1e-18:
     raise ValueError(f"{name}: its orientation is {affine[:3, :3].tolist()}, expected three axes")
   names = {(segment.layer, segment.value): segment for segment in named}
   found = (
     names.get((layer, int(value)), Segment(int(value), layer))
     for layer, each in enumerate(labels)
-    for value in np.unique(each[each != 0])
+    for value in sorted(set().union(*(np.unique(part).tolist() for part in each)) - {0})
   )
   return Labels(name, labels, affine, tuple(found))
+
+
+def _whole(name: str, values: np.ndarray) -> np.ndarray:
+  """Returns labels in the smallest type of integers that holds them."""
+  if values.dtype.kind not in "biuf":
+    raise ValueError(f"{name}: has values of type {values.dtype}, expected whole numbers")
+  low, high = (values.min(), values.max()) if values.size else (0, 0)
+  if not -(2.0**63) <= low <= high < 2.0**63:
+    other = high if np.isfinite(low) else low
+    raise ValueError(f"{name}: has the value {other}, expected a label map of whole numbers")
+  low, high = int(low), int(high)
+  labels = np.empty(values.shape, np.min_scalar_type(high if low >= 0 else min(low, -high - 1)))
+  for k in np.ndindex(*values.shape[:2]):  # slices: no second copy of them all
+    labels[k] = values[k]
+    if not np.array_equal(labels[k], values[k]):
+      other = values[k][labels[k] != values[k]][0]
+      raise ValueError(f"{name}: has the value {other}, expected a label map of whole numbers")
+  return labels
+
+
+def _check_size(shape):
+  """Raises ValueError where a header declares more voxels than are read."""
+  count = math.prod(int(each) for each in shape)
+  if not 0 < count <= _MOST:
+    raise ValueError(f"it declares {count} voxels, expected 1 to {_MOST}")
 
 
 def surface(mask: np.ndarray, affine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -186,6 +212,7 @@ def _read_nifti(name: str) -> Read:
   import nibabel
 
   image = nibabel.load(name)
+  _check_size(image.shape)  # pyright: ignore
   unit = image.header.get_xyzt_units()[0]  # pyright: ignore
   affine = np.diag([_METRES.get(unit, 1e-3)] * 3 + [1]) @ image.affine  # pyright: ignore
   values = np.asanyarray(image.dataobj)  # pyright: ignore
@@ -197,7 +224,13 @@ def _read_nifti(name: str) -> Read:
 def _read_nrrd(name: str) -> Read:
   import nrrd
 
-  values, header = nrrd.read(name)
+  with open(name, "rb") as file:
+    header = nrrd.read_header(file)
+    _check_size(header["sizes"])
+    if "data file" in header or "datafile" in header:
+      raise ValueError("its voxels are in another file, expected them behind the header")
+    _check_stream(file, str(header["encoding"]), 8 * math.prod(map(int, header["sizes"])))
+    values = nrrd.read_data(header, file, name)
   affine = np.eye(4)
   if header.get("space directions") is not None:
     rows = [_direction(row) for row in header["space directions"]]
@@ -216,6 +249,20 @@ def _read_nrrd(name: str) -> Read:
   unit = str(np.atleast_1d(header.get("space units", "mm"))[0])
   affine = np.diag([*(_METRES.get(unit, 1e-3) * np.array(sign)), 1.0]) @ affine
   return values, affine, _segments(header)
+
+
+def _check_stream(file, encoding: str, most: int):
+  """Raises ValueError where compressed voxels are more bytes than the header allows for."""
+  stream = {"gzip": gzip.open, "gz": gzip.open, "bzip2": bz2.open, "bz2": bz2.open}
+  if encoding not in stream:
+    return
+  at = file.tell()
+  with stream[encoding](file) as packed:
+    while some := packed.read(1 << 22):
+      most -= len(some)
+      if most < 0:
+        raise ValueError("it holds more voxels than its header declares")
+  file.seek(at)
 
 
 def _direction(row) -> np.ndarray | None:

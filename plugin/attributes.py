@@ -6,12 +6,14 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from .engine.weights import SOLIMP, SOLREF
+
 # Of an organ under instruments. solmix: its solref counts, not theirs, for its nodes are light.
 CONTACT: Mapping[str, object] = {
   "condim": 3,
   "friction": 0.3,
-  "solref": (0.004, 1),
-  "solimp": (0.95, 0.99, 0.001),
+  "solref": SOLREF,
+  "solimp": SOLIMP,
   "solmix": 1000,
   "selfcollide": "none",
 }

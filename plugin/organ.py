@@ -280,7 +280,7 @@ class Organ:
 
   @property
   def contact_force(self) -> np.ndarray:
-    """Constraint force on each vertex in the last step [N], (nvert, 3): contacts and equalities."""
+    """Constraint force on each vertex that the last step took [N], (nvert, 3); at rest MuJoCo's."""
     return self._motion.contact_force(self.data)[: self.nvert] @ self._organ.frame.T
 
   @property

@@ -12,8 +12,10 @@ from collections.abc import Iterator, Sequence
 import mujoco
 import numpy as np
 
+from .engine import flexes
 from .engine import plugin as engine
 from .engine.layout import MAX_GEOMS
+from .tissue.config import holders
 
 # Slots of a window: from so few up to so many, unless told.
 _LEAST, _MOST = 16, 256
@@ -47,7 +49,8 @@ def add_windows(
     spec: changed in place
     organ: name of the flexcomp
     tools: what each window follows: a body with all that hangs on it, or several; None for one
-      window that follows all that moves and collides
+      window that follows all that moves and collides, and what an organ may fall on that nothing
+      holds
     nodes: most nodes in each window; None sizes it from the tools' geoms and the organ's edges
 
   Returns:
@@ -65,13 +68,17 @@ def add_windows(
   nodal = len(set(flex.vertbody)) > 1 or "mass" not in config
   meets = (flex.contype, flex.conaffinity) if nodal or flex.contype or flex.conaffinity else (1, 1)
   colliding = [g for g in spec.geoms if (g.contype & meets[1]) | (g.conaffinity & meets[0])]
-  followed = _followed(organ, groups, colliding)
   own = _own_bodies(flex, bodies) if nodal else []
+  pinned = nodal and len(own) < len(flex.vertbody)
+  held = pinned or any(
+    config.get(key, "").strip("0. ") for key in holders(config.get("carrier", ""))
+  )
+  followed = _followed(organ, groups, colliding, held)
   # From here on the spec changes.
   keys = _take_keys(spec)
   surface = _make_rigid(spec, flex, own, plugin, config) if nodal else bodies[flex.vertbody[0]]
   _fill(spec, flex, surface, names, followed, nodes, meets, config)
-  _warn_of_others(organ, colliding, groups)
+  _warn_of_others(organ, colliding, groups, held, config.get("support", "").split())
   config["window"] = " ".join(names)
   if groups:
     config["follow"] = ", ".join(
@@ -111,10 +118,13 @@ def _check(spec, flex, config: dict[str, str], names: list[str], nodes: int | No
     raise ValueError(f"organ {organ!r}: nodes is {nodes}, expected at least 5")
 
 
-def _followed(organ: str, groups: list[set[str]], colliding: list) -> list[list]:
-  """Returns the geoms that each window follows; one window follows all that moves."""
+def _followed(organ: str, groups: list[set[str]], colliding: list, held: bool) -> list[list]:
+  """Returns the geoms that each window follows.
+
+  One window follows all that moves, and where nothing holds the organ all that it may fall on.
+  """
   if not groups:
-    followed = [[g for g in colliding if _moves(g)]]
+    followed = [[g for g in colliding if _moves(g) or not held]]
   else:
     followed = [[g for g in colliding if not group.isdisjoint(_ancestors(g))] for group in groups]
   for group, mine in zip(groups, followed, strict=False):
@@ -330,16 +340,31 @@ def make_flex(spec, name: str, points: np.ndarray, bodies: list[str], elem: np.n
   )
 
 
-def _warn_of_others(organ: str, colliding: list, groups: list[set[str]]):
-  """Warns of geoms that the organ would collide with and that no window follows."""
-  followed = set().union(*groups)
-  for geom in colliding:
-    if followed.isdisjoint(_ancestors(geom)) and (groups or not _moves(geom)):
-      warnings.warn(
-        f"organ {organ!r}: no window follows geom {geom.name or geom.type!r} of body "
-        f"{geom.parent.name!r}, which it can touch; name the body in tools, or use nodal coupling",
-        stacklevel=3,
-      )
+def _warn_of_others(
+  organ: str, colliding: list, groups: list[set[str]], held: bool, support: list[str]
+):
+  """Warns of geoms that the organ would collide with, that no window follows and do not bear it."""
+  followed, names = set().union(*groups), [geom.name for geom in colliding]
+  bearing = {flexes.resolve(each, organ, names) for each in support}
+  alone = [
+    _label(geom)
+    for geom in colliding
+    if followed.isdisjoint(_ancestors(geom)) and (groups or (held and not _moves(geom)))
+    if geom.name not in bearing
+  ]
+  if alone:
+    warnings.warn(
+      f"organ {organ!r}: it can touch what no window follows: {', '.join(alone)}; name their "
+      "bodies in tools or the geoms in support, or use nodal coupling",
+      stacklevel=3,
+    )
+
+
+def _label(geom) -> str:
+  """Returns a geom's name or kind, and its body."""
+  kind = mujoco.mjtGeom(geom.type).name.removeprefix("mjGEOM_").lower()
+  what = f"geom {geom.name!r}" if geom.name else f"a {kind}"
+  return f"{what} of body {geom.parent.name!r}"
 
 
 def _layout(spec) -> list[tuple[tuple[str, int], tuple[int, int]]]:

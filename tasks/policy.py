@@ -25,6 +25,7 @@ SUFFIX = ".safetensors"
 FOLDER = pathlib.Path(__file__).parent / "policies"  # of those that come with exercises
 _KEY = "palpate"  # of the header
 _FORMAT = 2
+_DTYPES = ("F16", "F32", "F64")  # of arrays
 _MEMORY = ("input", "state", "input_bias", "state_bias")  # arrays of a memory
 
 
@@ -160,23 +161,32 @@ def load(path: str | os.PathLike[str]) -> Policy:
     from safetensors import SafetensorError, safe_open
   except ImportError:
     raise ValueError("safetensors is not installed: pip install 'palpate[policy]'") from None
+  if os.path.exists(path) and not os.path.isfile(path):
+    raise ValueError(f"policy {os.fspath(path)!r} is no regular file")
   try:
     with safe_open(os.fspath(path), "np") as file:
       header = (file.metadata() or {}).get(_KEY)
+      for name in file.keys():
+        kind = file.get_slice(name).get_dtype()
+        if kind not in _DTYPES:
+          raise ValueError(f"{name} is of type {kind}, expected one of {', '.join(_DTYPES)}")
       arrays = {name: file.get_tensor(name).astype(np.float32) for name in file.keys()}
-  except (OSError, SafetensorError) as error:
+  except (OSError, SafetensorError, ValueError) as error:
     raise ValueError(f"policy {os.fspath(path)!r}: {error}") from None
   if header is None:
     raise ValueError(f"policy {os.fspath(path)!r} is not one of Palpate's")
   try:
     about = json.loads(header)
-    if about.pop("format") != _FORMAT:
+    if not isinstance(about, dict) or about.pop("format", None) != _FORMAT:
       raise ValueError("it is of another version")
     count = sum(name.startswith("weight") for name in arrays)
     layers = [(arrays[f"weight{k}"], arrays[f"bias{k}"]) for k in range(count)]
     memory: Any = tuple(arrays[name] for name in _MEMORY if name in arrays) or None
     made = Policy(About(**about), arrays["mean"], arrays["scale"], layers, memory)
+    _check_about(made.about)
     _check_shapes(made)
+  except RecursionError:
+    raise ValueError(f"policy {os.fspath(path)!r}: its header is nested too deep") from None
   except (ValueError, KeyError, TypeError, AttributeError) as error:
     raise ValueError(f"policy {os.fspath(path)!r}: {error}") from None
   return made
@@ -191,7 +201,27 @@ def shipped(task: str) -> Policy:
   return load(path)
 
 
+def _check_about(about: About) -> None:
+  for name in ("task", "licence"):
+    if not isinstance(getattr(about, name), str):
+      raise ValueError(f"{name} is {getattr(about, name)!r}, expected a text")
+  for name in ("components", "observations", "changes"):
+    value = getattr(about, name)
+    if not isinstance(value, list | tuple) or not all(isinstance(each, str) for each in value):
+      raise ValueError(f"{name} is {value!r}, expected a list of names")
+  for name in ("power", "control_timestep"):
+    value = getattr(about, name)
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    if not (number and 0 < value < np.inf):
+      raise ValueError(f"{name} is {value!r}, expected a finite number > 0")
+  for name in ("task_kwargs", "training"):
+    if not isinstance(getattr(about, name), dict):
+      raise ValueError(f"{name} is {getattr(about, name)!r}, expected options by name")
+
+
 def _check_shapes(policy: Policy) -> None:
+  if policy.mean.ndim != 1:
+    raise ValueError(f"mean has shape {policy.mean.shape}, expected (ninput,)")
   size = len(policy.mean)
   if policy.scale.shape != (size,):
     raise ValueError(f"scale has shape {policy.scale.shape}, expected ({size},)")
@@ -208,6 +238,6 @@ def _check_shapes(policy: Policy) -> None:
     size = len(bias)
   if not policy.layers or size != len(policy.about.components):
     raise ValueError(f"it ends in {size} numbers, expected {len(policy.about.components)}")
-  parts = (*policy.layers, policy.memory or ())
+  parts = (*policy.layers, policy.memory or (), (policy.mean, policy.scale))
   if not all(np.isfinite(array).all() for part in parts for array in part):
     raise ValueError("its weights are not finite")

@@ -233,6 +233,9 @@ class Recording:
   @classmethod
   def _read(cls, file: Any) -> "Recording":
     with zipfile.ZipFile(file) as archive:
+      size = sum(each.file_size for each in archive.infolist())
+      if size > _MOST:
+        raise ValueError(f"it declares {size} bytes, expected at most {_MOST}")
       if broken := archive.testzip():
         raise ValueError(f"{broken} fails its checksum")
     file.seek(0)
@@ -260,6 +263,7 @@ class Recording:
     return cls(time=time, **tables, **meta)
 
 
+_MOST = 2**30  # bytes of all entries, not compressed
 _TABLES = {"column": "columns", "array": "arrays", "constant": "constants"}
 
 

@@ -274,6 +274,20 @@ def test_a_tool_that_flies_through_the_organ_is_named(scenes, windowed):
   assert organ.pierced == ()
 
 
+@pytest.mark.parametrize("size", ["0.001 0.03 0.001", "0.03 0.03 0.001"], ids=["bar", "plate"])
+def test_a_thin_box_pressed_through_beside_its_centre_is_named(scenes, size):
+  made = scenes.windowed(*scenes.sphere(2), mass=0.5, radius=0.001, young=5e3, foundation=2e5)
+  tool = f"""<body name="bar" pos="0 {scenes.RADIUS + 0.005} {scenes.RADIUS}">
+    <joint name="z" type="slide" axis="0 0 1"/>
+    <geom name="thin" type="box" size="{size}" mass="0.1"/></body>"""
+  drive = '<actuator><position joint="z" kp="5000" kv="60"/></actuator>'
+  model, data, organ = scenes.load(scenes.world(tool, made, extra=drive))
+  for _ in range(600):
+    data.ctrl[0] = -0.1 * min(data.time, 0.3)
+    mujoco.mj_step(model, data)
+  assert not organ.error and organ.pierced == ("thin",)
+
+
 def test_a_tool_that_is_put_on_the_other_side_has_not_gone_through(scenes):
   made = scenes.windowed(*scenes.sphere(2), mass=0.5, radius=0.001, young=5e3, foundation=2e5)
   tool = """<body name="ball" pos="0 0 0.1"><joint name="z" type="slide" axis="0 0 1"/>

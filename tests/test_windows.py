@@ -116,7 +116,7 @@ def test_more_nodes_than_the_window_holds_warn_once():
     away = (organ.xpos - d.geom(name).xpos) / m.geom(name).size
     inside = np.minimum(inside, np.linalg.norm(away, axis=1))
   nearest = np.argsort(inside)
-  assert set(nearest[:4]) <= set(held) and len(set(nearest[:12]) & set(held)) >= 9
+  assert set(nearest[:4]) <= set(held) and len(set(nearest[:12]) & set(held)) >= 8
 
 
 def test_attached_with_a_prefix_names_still_fit():
@@ -235,6 +235,16 @@ def test_a_table_that_nobody_follows_is_pointed_out():
   table = '<geom name="table" type="plane" size="1 1 .1" pos="0 0 -.1"/>'
   with pytest.warns(UserWarning, match="'table'"):
     palpate.add_windows(spec(extra=table), "organ")
+
+
+def test_what_no_window_follows_is_listed_once_and_in_words():
+  arm = "".join(f'<geom type="capsule" size=".01 .05" pos="0 0 {k}"/>' for k in (1, 2))
+  extra = f'<body name="arm" pos="0 0 3">{arm}<geom name="tip" size=".01"/></body>'
+  with pytest.warns(UserWarning) as said:
+    made = mujoco.MjSpec.from_string(scenes.ridge(extra=extra))
+    palpate.add_windows(made, "organ", ["grasper"])
+  (text,) = [str(each.message) for each in said if "no window follows" in str(each.message)]
+  assert text.count("a capsule of body 'arm'") == 2 and "geom 'tip' of body 'arm'" in text
 
 
 def test_the_motion_of_a_keyframe_that_windows_leave_out_is_pointed_out():

@@ -54,7 +54,9 @@ def main(argv: Sequence[str] | None = None) -> int:
   words = list(sys.argv[1:] if argv is None else argv)
   try:
     try:
-      args = _parser(words).parse_args(words)
+      args, rest = _parser(words).parse_known_args(words)
+      if rest:  # said by the command, whose usage helps
+        args.parser.error(f"unrecognized arguments: {' '.join(rest)}")
       return args.main(args)
     finally:
       sys.stdout.flush()
@@ -72,6 +74,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _parser(words: list[str]) -> argparse.ArgumentParser:
   parser = argparse.ArgumentParser("palpate", description="Soft-tissue simulation for MuJoCo.")
   parser.add_argument("--version", action="version", version=f"palpate {__version__}")
+  parser.set_defaults(parser=parser)
   commands = parser.add_subparsers(metavar="COMMAND", required=True)
   groups = {}
   for name, (module, text) in COMMANDS.items():
@@ -86,5 +89,5 @@ def _parser(words: list[str]) -> argparse.ArgumentParser:
       screen.prepare_gl()  # before MuJoCo is imported
       chosen = importlib.import_module(f".{module}", __package__)
       chosen.add_arguments(command)
-      command.set_defaults(main=chosen.main)
+      command.set_defaults(main=chosen.main, parser=command)
   return parser

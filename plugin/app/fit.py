@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser):
   add("--edge", metavar="M", type=float,
       help="longest edge of a triangle under the tool (a third of the contact)")  # fmt: skip
   add("--h", metavar="S", type=float, help="time step (600 for the record)")
-  add("--out", metavar="FOLDER", default="out", help="output folder (%(default)s)")
+  add("-o", "--out", metavar="FOLDER", default="out", help="output folder (%(default)s)")
 
 
 def main(args: argparse.Namespace) -> int:
@@ -85,8 +85,12 @@ def main(args: argparse.Namespace) -> int:
   constants = start | found.values
   _write(out, args, simulation, record, free, found, constants)
   print(table(_rows(free, found, record, simulation)))
-  for a, b in found.alike:
-    print(f"palpate: this test does not tell {a} and {b} apart; --set one of them", file=sys.stderr)
+  for name, value in found.kept.items():
+    print(
+      f"palpate: the data do not determine {name}: it is kept at {value:g}, for which the other "
+      f"constants hold; give --set {name}=VALUE where it is known, and leave it out of --free",
+      file=sys.stderr,
+    )
   _plot(out / "fit.png", record, found)
   for name, what in (("json", "numbers"), ("xml", "the plugin, to paste into MJCF")):
     print(f"{out / f'fit.{name}'}: {what}")
@@ -155,6 +159,9 @@ def _rows(free, found, record, simulation) -> list[tuple[str, str]]:
   """Returns the table that is printed."""
   rows = []
   for each in free:
+    if each.name in found.kept:
+      rows.append((each.name, f"{each.start:.4g}, kept: the data do not determine it"))
+      continue
     value, low, high = (part[each.name] for part in (found.values, found.low, found.high))
     unit = "" if each.unit == "-" else f" {each.unit}"
     span = f"{low:.4g} to {high:.4g}" if math.isfinite(low) else "unknown"
@@ -174,14 +181,15 @@ def _write(out: pathlib.Path, args, simulation, record, free, found, constants):
   from palpate.models import mjcf
   from palpate.tasks.files import replacing
 
+  unit = {each.name: each.unit for each in free}
   numbers = {
     name: {
-      "value": found.values[name],
+      "value": value,
       "low": _or_none(found.low[name]),
       "high": _or_none(found.high[name]),
-      "unit": unit,
+      "unit": unit[name],
     }
-    for name, unit in ((each.name, each.unit) for each in free)
+    for name, value in found.values.items()
   }
   about = {
     "data": str(args.data),
@@ -199,7 +207,7 @@ def _write(out: pathlib.Path, args, simulation, record, free, found, constants):
     "step": simulation.step,
     "simulations": found.simulations,
     "complete": found.whole,
-    "alike": found.alike,
+    "undetermined": list(found.kept),
   }
   path = out / "fit.json"
   with writing(path), replacing(path) as file:

@@ -61,7 +61,10 @@ def read(path: pathlib.Path) -> Record:
   if not rows:
     raise CommandError(f"{path.name}: it is empty, expected a header and rows")
   comma = ";" if rows[0][1].count(";") > rows[0][1].count(",") else ","
-  cells = list(csv.reader([line for _, line in rows], delimiter=comma))
+  try:
+    cells = list(csv.reader([line for _, line in rows], delimiter=comma))
+  except csv.Error as error:
+    raise CommandError(f"{path.name}: cannot be read: {error}") from None
   where = _columns(path.name, cells[0])
   values = {name: [] for name in where}
   for (line, _), row in zip(rows[1:], cells[1:], strict=True):

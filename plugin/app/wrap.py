@@ -10,7 +10,7 @@ import sys
 from palpate import register
 
 from . import figures
-from .console import CommandError, table
+from .console import CommandError, compile_error, table
 
 _VOLUMES = (".nii", ".nii.gz", ".nrrd")
 _NODES = 1000
@@ -162,7 +162,10 @@ def picture(paths: list[pathlib.Path], name: str) -> pathlib.Path:
 
   register()
   scene = paths[0]
-  model = mujoco.MjModel.from_xml_path(str(scene))
+  try:
+    model = mujoco.MjModel.from_xml_path(str(scene))
+  except ValueError as error:
+    raise CommandError(f"{scene} does not compile: {compile_error(error)}", code=1) from None
   data = mujoco.MjData(model)
   mujoco.mj_step(model, data)
   out = scene.parent / f"{name}.png"

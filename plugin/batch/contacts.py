@@ -16,6 +16,7 @@ import warp as wp
 # All that depends on names inside of mujoco_warp: its tools against a triangle, and types.
 from mujoco_warp._src import collision_primitive_core as core
 from mujoco_warp._src.types import ContactType, vec5
+from palpate.engine import weights
 from palpate.tissue.types import Array, fill, floats, ints, struct
 
 from . import convex, cylinder
@@ -40,6 +41,7 @@ _CYLINDER, _MESH = KINDS[5:]
 _FAR = wp.constant(1e10)  # what mujoco_warp says of a contact that is none
 _CONSTRAINT = wp.constant(int(ContactType.CONSTRAINT))
 _LEAST = 1e-5  # friction, as in MuJoCo
+_HARD = (1.0, 1.0, 1.0, 0.5, 2.0)  # solimp; `sliding` makes contacts as soft as they are
 _FEW = 4  # tools; more of them share triangles
 # Whose sliding friction counts: the greater, or that of the one with priority.
 _MIXED = {"margin": (), "slide": (), "whose": (), "condim": (), "friction": (5,), "solref": (2,),
@@ -227,7 +229,7 @@ def _against(kinds: frozenset[int]):
           n = _put(c, at, n, dists2[k], xs2[k], normals2[k])
     if wp.static(_CYLINDER in kinds):
       if kind == wp.static(_CYLINDER):
-        far4, x4, normal4 = cylinder.touch(pos, rot, size, margin + c.radius, a, b, d)
+        far4, x4, normal4 = cylinder.touch(pos, rot, size, margin + c.radius, c.radius, a, b, d)
         gap4 = far4 - c.radius
         n = _put(c, at, n, gap4, x4 - (c.radius + 0.5 * gap4) * normal4, normal4)
     if wp.static(solid):
@@ -389,6 +391,9 @@ def make(model: mujoco.MjModel, organ, tools: np.ndarray, place, patch, data):
   ring = 1 if alone else int(np.diff(patch.near_adr.numpy()).max())
   own = int(organ.windows.flex[0]) if organ.windows else organ.flex
   rows = [_mix(model, int(g), own) for g in tools]
+  if not weights.says(model.flex_solref[own], model.flex_solimp[own]):
+    firm = {"solref": (weights.SLOW * model.opt.timestep, 1.0), "solimp": _HARD}
+    rows = [row | firm for row in rows]
   mixed = {name: np.array([row[name] for row in rows]).reshape(-1, *wide)
            for name, wide in _MIXED.items()}  # fmt: skip
   contact = {f"out_{name}": getattr(data.contact, name) for name in _written()}

@@ -5,7 +5,12 @@
 # pyright: reportOperatorIssue=false, reportCallIssue=false, reportArgumentType=false
 # pyright: reportIndexIssue=false, reportAttributeAccessIssue=false
 import warp as wp
+from palpate.engine.weights import FLAT
 
+_POINTS = wp.constant(FLAT["POINTS"])
+_LEVEL, _RIM, _SLACK, _COVER = (
+  wp.constant(FLAT[name]) for name in ("LEVEL", "RIM", "SLACK", "COVER")
+)
 _HALVINGS = wp.constant(20)  # of an edge: to 1e-6 of its length
 _LEAST = wp.constant(1e-9)  # length of a direction [m]
 
@@ -51,17 +56,57 @@ def _within(x: wp.vec3, a: wp.vec3, b: wp.vec3, d: wp.vec3, n: wp.vec3):
 
 
 @wp.func
+def _under_end(size: wp.vec3, radius: float, a: wp.vec3, b: wp.vec3, d: wp.vec3):
+  """Returns how much of a triangle lies under a flat end, its middle and gap, and the way out.
+
+  It is `under_end` of native/weights.h, in the cylinder's frame.
+  """
+  out = wp.where(a[2] + b[2] + d[2] < 0.0, -1.0, 1.0)
+  level = wp.abs(wp.normalize(wp.cross(b - a, d - a))[2]) >= _LEVEL
+  slack = _SLACK * size[0]
+  middle = wp.vec3(0.0)
+  total = float(0.0)  # noqa: UP018 - a variable to Warp
+  covered = float(0.0)  # noqa: UP018
+  for i in range(_POINTS):
+    for j in range(_POINTS - i):
+      u = (float(i) + 1.0 / 3.0) / float(_POINTS)
+      v = (float(j) + 1.0 / 3.0) / float(_POINTS)
+      x = (1.0 - u - v) * a + u * b + v * d
+      depth = size[1] + radius - out * x[2]
+      aside = wp.sqrt(x[0] * x[0] + x[1] * x[1])
+      inside = wp.min((size[0] + radius - aside - depth) / (_RIM * size[0]), 1.0)
+      if level and depth > -slack and inside > 0.0:
+        middle += (depth + slack) * inside * x
+        total += (depth + slack) * inside
+        covered += inside
+  middle = middle / wp.max(total, 1e-30)
+  share = wp.min(covered / (0.5 * float(_POINTS * (_POINTS + 1)) * _COVER), 1.0)
+  return share, middle, share * (out * middle[2] - size[1] - radius), out
+
+
+@wp.func
 def touch(
-  pos: wp.vec3, rot: wp.mat33, size: wp.vec3, reach: float, a: wp.vec3, b: wp.vec3, d: wp.vec3
+  pos: wp.vec3,
+  rot: wp.mat33,
+  size: wp.vec3,
+  reach: float,
+  radius: float,
+  a: wp.vec3,
+  b: wp.vec3,
+  d: wp.vec3,
 ):
   """Returns distance, point of a triangle and normal there of a cylinder that is nearest to it.
 
-  Either the cylinder's utmost point towards the triangle's plane lies over the triangle, or an edge
-  is nearest. What is farther than `reach` is not looked at closely.
+  Under a flat end that is its middle there. Else the cylinder's utmost point towards the triangle's
+  plane lies over the triangle, or an edge is nearest. What is farther than `reach` is not looked
+  at closely.
   """
   r, half = size[0], size[1]
   t = wp.transpose(rot)
   la, lb, ld = t * (a - pos), t * (b - pos), t * (d - pos)
+  under, middle, gap, end = _under_end(size, radius, la, lb, ld)
+  if under > 0.0:
+    return gap + radius, pos + rot * middle, rot * wp.vec3(0.0, 0.0, end)
   n = wp.normalize(wp.cross(lb - la, ld - la))
   up = n  # towards the cylinder
   if wp.dot(n, la) > 0.0:

@@ -116,7 +116,7 @@ class Organ(Tissue):
       self._cuts = Cuts(self, values, surface)
     self.patch = patch.make(values, self.body)
     self._touch = contacts.make(model, organ, tools, place, self.patch, d)
-    self._pressed = sliding.make(batch, self._touch)
+    self._pressed = sliding.make(batch, model, organ, self._touch)
     self._convex = convex.make(model, tools, nworld * place.nslot, m, d)
     kinds = frozenset(int(kind) for kind in model.geom_type[tools])
     self._find = contacts.kernel(kinds)

@@ -8,8 +8,11 @@ what the gap adds follows from those rows.
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
+import mujoco
+import numpy as np
 import warp as wp
 from mujoco_warp._src.types import vec5
+from palpate.engine import weights
 from palpate.tissue.types import Array, floats, ints, struct
 
 
@@ -26,8 +29,15 @@ class Pressed:
   contact_geom: Array(wp.vec2i, ("naconmax",))
   frame: Array(wp.mat33, ("naconmax",))
   friction: Array(vec5, ("naconmax",))
+  elem: Array(wp.vec2i, ("naconmax",))
   efc_address: ints("naconmax", "nrow")  # -1 for none
   aref: floats("nworld", "njmax")  # reference acceleration of the rows [m/s^2]
+  # See `weights.Firmness`:
+  asked: float
+  share: float
+  tools: floats("ngeom")  # less than 0 where contacts stay as they are
+  pairs: float  # times R, in a pyramid: 2 / impratio
+  D: floats("nworld", "njmax")  # inverse of the rows' R [kg]
   row_force: floats("nworld", "njmax")  # force of the rows [N]
   # See `Contacts`:
   geom: ints("nworld", "many")
@@ -51,15 +61,37 @@ def _has_rows(p: Pressed, c: int):
   return p.contact_geom[c][0] >= 0
 
 
+@wp.func
+def _firm_up(p: Pressed, world: int, c: int):
+  """Makes a contact as firm as under the plugin, see native/firm.h."""
+  tool = p.tools[p.contact_geom[c][0]]
+  if tool < 0.0:
+    return
+  touched = float(p.count[world])
+  if p.elem[c][1] >= 0:
+    touched = touched / 3.0
+  R = wp.max(p.asked, touched * p.share + tool)
+  if p.paired == 1 and p.dim[c] > 1:
+    square = p.friction[c][0] * p.friction[c][0]
+    R *= p.pairs * square * (1.0 + square)
+  gain = 1.0 / (R * p.D[world, p.efc_address[c, 0]])
+  for r in range(_rows(p, c)):
+    row = p.efc_address[c, r]
+    p.D[world, row] = gain * p.D[world, row]
+
+
 @wp.kernel(enable_backward=False)
 def keep_closed(p: Pressed):
-  """Takes the parting of sliding contacts off their reference accelerations."""
+  """Makes contacts firm, and takes the parting of those that slide off their reference."""
   world, k = wp.tid()
   if k >= p.count[world]:
     return
   c = p.start[0] + p.before[world] + k
   n = p.dim[c]
-  if n < 2 or not _has_rows(p, c):
+  if not _has_rows(p, c):
+    return
+  _firm_up(p, world, c)
+  if n < 2:
     return
   square = float(0.0)  # noqa: UP018 - a variable to Warp
   for r in range(n - 1):
@@ -92,18 +124,25 @@ def press(p: Pressed):
   p.force[world, k] = total
 
 
-def make(batch, touch):
+def make(batch, model: mujoco.MjModel, organ, touch):
   """Returns the contacts of an organ.
 
   Args:
     batch: the worlds, with mujoco_warp's data
+    model: the compiled scene
+    organ: the organ's declaration
     touch: how the organ touches its tools
   """
   out, d = Pressed(), batch.d
   out.many, out.paired = touch.most, int(batch.paired)
   out.start, out.before, out.count = touch.start, touch.before, touch.count
-  for name in ("dim", "frame", "friction", "efc_address"):
+  for name in ("dim", "frame", "friction", "elem", "efc_address"):
     setattr(out, name, getattr(d.contact, name))
+  out.D, out.pairs = d.efc.D, 2.0 / float(model.opt.impratio)
+  firm = weights.firmness(model, organ)
+  out.asked, out.share = firm.asked, firm.share
+  tools = np.broadcast_to(firm.tools, model.ngeom)
+  out.tools = wp.array(tools, dtype=float, device=batch.device)
   out.contact_geom, out.aref, out.row_force = d.contact.geom, d.efc.aref, d.efc.force
   shape = (batch.nworld, out.many)
   out.geom, out.normal, out.force = (

@@ -16,7 +16,7 @@ import math
 import mujoco
 import numpy as np
 from palpate import windows
-from palpate.engine import mjstruct
+from palpate.engine import mjstruct, weights
 
 from .contacts import KINDS
 
@@ -143,6 +143,10 @@ def strip(
   made = bare.compile()
   made.flex_vert[:] = 0.0  # vertices are where their bodies are
   made.flex_centered[:] = True
+  if made.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC:
+    firm = [weights.firmness(model, organ) for organ in organs]
+    sticks = [1 / each.stuck for each in firm if np.min(each.tools) >= 0]
+    made.opt.impratio = max(made.opt.impratio, *sticks, 0)
   if made.nv <= 60 and made.opt.solver == mujoco.mjtSolver.mjSOL_NEWTON:
     made.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
   _check(model, made, organs, nslots)

@@ -44,10 +44,10 @@ def bind(w, model: int):
     def respond():
       assert scheme.respond is not None  # recorded only then
       if crossing:
-        _cross(w, ("rhs",), to_device=True)
+        _cross(w, ("rhs", "expected"), to_device=True)
       scheme.respond(w.body)
       if crossing:
-        _cross(w, ("sol", "status"), to_device=False)
+        _cross(w, ("sol", "status", "ratio"), to_device=False)
 
     # As few graphs as may be: a launch costs a small organ a hundredth of its step.
     after = [] if w.resident else [(cpu, part(_scatter, w, does))]
@@ -133,7 +133,10 @@ def _touched(w, model: int) -> weights.Weights:
 
   With all of them, since one that looks for contacts again has those of the others found again.
   """
+  weights.put_tissue(model, w.data, w.instance, w.organ, w.config)
   out = weights.make(model, w.data, declare_windows.touching(model, w.instance), w.flags)
+  own = w.organ.windows.flex if w.organ.windows else [w.organ.flex]
+  out.mine.numpy()[own] = 2
   w.views["mine"] = out.mine
   return out
 

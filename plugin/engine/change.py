@@ -11,7 +11,7 @@ from palpate.tissue import reading, shape
 from palpate.tissue.config import Config
 from palpate.tissue.step import SCHEMES
 
-from . import graphs, mjstruct, workspace
+from . import graphs, mjstruct, weights, workspace
 from .beside import adhere, bonds, fasten
 from .beside.ties import Group
 from .bind import bind
@@ -158,6 +158,7 @@ def _put(w, group: bonds.Group):
 def _change(w, model: int, config: Config):
   workspace.attach(w, model)
   before, w.config = w.config, config
+  weights.put_tissue(model, w.data, w.instance, w.organ, config)
   if w.resident:
     w.resident.stop()
   material = any(getattr(before, key) != getattr(config, key) for key in configuration.MATERIAL)

@@ -145,6 +145,8 @@ class Crossing:
   rhs: vector
   sol: vector
   status: floats("nworld", 4)
+  expected: floats("nworld")
+  ratio: floats("nworld")
 
 
 CONSTANTS = {

@@ -71,30 +71,30 @@ def rim_data(m, flex: int, count: int) -> np.ndarray:
   return shell[adr : adr + 2 * count].reshape(-1, 2)
 
 
-def marks(m, flex: int, nelem: int) -> np.ndarray:
-  """Returns numbers of a flex that MuJoCo does not use, and that are copied and saved with it.
+def marks(m, flex: int) -> np.ndarray:
+  """Returns two numbers of a flex, copied and saved with it, that a step does not use; see `cuts`.
 
-  They are inverse weights of edges that no equality holds: for each triangle the corners that it
-  was compiled with, packed, what marks these, and the stamp of those in place; see `cuts`.
+  They are inverse weights of edges that no equality holds. mj_setConst makes them anew.
   """
   edge = int(mjstruct.view(m.flex_edgeadr, m.nflex, np.int32)[flex])
-  return mjstruct.view(m.flexedge_invweight0, m.nflexedge)[edge : edge + nelem + 2]
+  return mjstruct.view(m.flexedge_invweight0, m.nflexedge)[edge : edge + 2]
 
 
 def compiled_elements(m, flex: int) -> np.ndarray:
-  """Returns the triangles that a flex with room for cuts was compiled with, (nelem, 3)."""
-  now = elements(m, flex)
-  packed, mark, _ = np.split(marks(m, flex, len(now)), [len(now), len(now) + 1])
-  return unpack(packed)[0] if mark.size and mark[0] == stamp(packed) else now
+  """Returns the triangles that a flex was compiled with, (nelem, 3).
 
-
-def mark_compiled(m, flex: int):
-  """Notes the triangles of a flex, before the first cut, for `compiled_elements`."""
-  elem = elements(m, flex)
-  packed, mark, shown = np.split(marks(m, flex, len(elem)), [len(elem), len(elem) + 1])
-  if mark[0] != stamp(packed):
-    packed[:] = pack(elem)
-    mark[0], shown[0] = stamp(packed), 0.0
+  Cuts leave MuJoCo's edges alone. Those of a triangle are its sides from corner 1 to 2, 2 to 0 and
+  0 to 1.
+  """
+  adr = int(mjstruct.view(m.flex_elemedgeadr, m.nflex, np.int32)[flex])
+  num = _extent(m.flex_elemadr, m.nflex, m.nflexelem, flex)
+  first = int(mjstruct.view(m.flex_edgeadr, m.nflex, np.int32)[flex])
+  edge = mjstruct.view(m.flex_edge, (m.nflexedge, 2), np.int32)[first:]
+  side = mjstruct.view(m.flex_elemedge, m.nflexelemedge, np.int32)[adr : adr + 3 * num]
+  ends = edge[side.reshape(num, 3)]
+  here, there = ends[:, [1, 2, 0]], ends[:, [2, 0, 1]]  # the sides that meet at each corner
+  shared = (here[..., :1] == there).any(axis=-1)
+  return np.ascontiguousarray(np.where(shared, here[..., 0], here[..., 1]))
 
 
 def body_frame(m, body: int) -> tuple[np.ndarray, np.ndarray]:

@@ -59,9 +59,10 @@ FLAG = Numbers(
   ("changed", 1, "-", "the contact forces are not those of the last step"),
   ("answered", 1, "-", "the organ responded to that"),
   ("foreseen", 1, "-", "what acts on the organ is what was guessed"),
-  ("weighed", 1, "-", "rows of contacts changed that MuJoCo has made use of"),
+  ("weighed", 1, "-", "rows of contacts changed, or may have, that MuJoCo has made use of"),
   ("stage", 1, "-", "how far the step is, see STAGE"),
   ("fast", 1, "-", "a tool may go through the organ and out again between two looks"),
+  ("coarse", 1, "um", "edge that a tool needs which is too small for the mesh; negative once told"),
 )
 
 # What of a step is done that must not be done twice. These are values, not offsets.
@@ -93,6 +94,7 @@ HEAD = Numbers(
   ("reach", 1, "m", "distance from a geom within which nodes may be in a window"),
   ("step_ended", 1, "s", "time step of the step that ends"),
   ("answered", 1, "-", "1 where it ends with the organ's response"),
+  ("expected", 1, "J", "see `State.expected`"),
 )
 
 # Of the inbox: where contacts left a slot in the last step.
@@ -126,6 +128,7 @@ GEOM = Numbers(
 SUMMARY = Numbers(
   "SUMMARY",
   ("status", 4, "-", "as `System.status`"),
+  ("ratio", 1, "-", "as `System.ratio`"),
   ("speed2", 1, "m^2/s^2", "square of the greatest speed of a node"),
   ("low", 3, "m", "lowest corner of the organ's bounds, in its frame"),
   ("high", 3, "m", "highest corner"),
@@ -136,7 +139,6 @@ ANSWER = Numbers(
   "ANSWER",
   ("disp", 3, "m", "displacement from rest"),
   ("vel", 3, "m/s", "velocity"),
-  ("dvel", 3, "m/s", "what the response changed of it"),
 )
 
 # Of the outbox: a node that is near a window's geoms.
@@ -168,7 +170,7 @@ BLADE = Numbers(
   ("toward", 3, "-", "which way it cut last, 0 before"),
   ("work", 1, "J", "what it has spent"),
   ("opened", 1, "m", "what it has cut"),
-  ("wait", 1, "m", "how far it goes before the mesh comes apart"),
+  ("wait", 1, "m", "how far it goes before the mesh comes apart; 0 as usual, < 0 at an edge"),
   ("count", 1, "-", "points of `trail`"),
   ("trail", 3 * TRAIL, "m", "its path since the mesh came apart"),
   ("below", TRAIL, "m", "how deep it was there in a solid"),

@@ -37,8 +37,8 @@ class Nodal:
     return self._spread(data.qvel[self._dofs], self._within("vel"))
 
   def contact_force(self, data: mujoco.MjData) -> np.ndarray:
-    """Returns the constraint force of the last step [N], (nvert, 3)."""
-    return self._spread(data.qfrc_constraint[self._dofs])
+    """Returns the contact force that the organ took in the last step [N], (nvert, 3)."""
+    return self._spread(self._within("force"))
 
   def put(self, model, data, u: np.ndarray | None, v: np.ndarray | None):
     """Sets displacement and velocity of the vertices that move and forgets forces of the past."""
@@ -78,7 +78,7 @@ class Windowed:
     return self._own("vel").copy()
 
   def contact_force(self, data) -> np.ndarray:
-    """Returns the constraint force of the last step [N], (nvert, 3)."""
+    """Returns the contact force that the organ took in the last step [N], (nvert, 3)."""
     out = np.zeros((self._nvert, 3))
     node = self._w.slots
     used = node >= 0

@@ -21,7 +21,8 @@ _OFTEN = 5  # steps between looks along the way of a fast tool
 _FAST = 1.0  # speed above which a tool may be through and out again between looks [m/s]
 _PATH = 16  # points of that way
 _LONG = (int(mujoco.mjtGeom.mjGEOM_CAPSULE), int(mujoco.mjtGeom.mjGEOM_CYLINDER))
-_MOST = 33  # points that stand for a long geom
+_BOX = int(mujoco.mjtGeom.mjGEOM_BOX)
+_MOST, _ACROSS = 33, 9  # points along a geom's longest axis, and along another
 
 
 def inside(point: np.ndarray, pos: np.ndarray, elem: np.ndarray) -> np.ndarray:
@@ -97,7 +98,7 @@ class Speeds:
 
   ntool: int
   tool: ints("ntool")  # their geoms
-  half: doubles("ntool")  # half the length of a long one's axis [m]
+  reach: doubles("ntool")  # of their points from their centres [m]
   flags: ints(len(FLAG))  # see FLAG
   # mjModel:
   geom_bodyid: ints("ngeom")
@@ -112,24 +113,22 @@ find_fast = kernel("find_fast", "tools.h", Speeds, coupling.CONSTANTS | {"FAST":
 
 
 class Tools:
-  """Where some geoms are: points along the axis of a long one, the centre of another.
+  """Where some geoms are: see `points`.
 
   Attributes:
     geoms: their numbers
     organ: in whose frame they are
-    half: half the length of a long one's axis [m]
+    reach: of their points from their centres [m]
   """
 
   def __init__(self, m, organ, geoms: np.ndarray):
     """Takes the geoms of an mjModel."""
     self.geoms, self.organ, self._ngeom = geoms, organ, m.ngeom
-    self.half = half_lengths(m, geoms)
-    wide = 2 * np.ceil(self.half / mjstruct.view(m.geom_size, (m.ngeom, 3))[geoms, 0]) + 1
-    count = np.minimum(wide, _MOST).astype(int)
-    # Of each point: the tool, and how far along its axis [m].
-    self._tool = np.repeat(np.arange(len(geoms)), count)
-    along = [np.linspace(-half, half, n) for half, n in zip(self.half, count, strict=True)]
-    self._along = np.concatenate([np.zeros(0), *along])[:, None]
+    found = points(m, geoms)
+    self.reach = _reach(found)
+    # Of each point: the tool, and where it is in its frame [m].
+    self._tool = np.repeat(np.arange(len(geoms)), [len(each) for each in found])
+    self._local = np.concatenate([np.zeros((0, 3)), *found])
 
   def inside(self, d, disp: np.ndarray) -> list[int]:
     """Returns which of the geoms are inside of the organ.
@@ -142,26 +141,27 @@ class Tools:
 
   def passed(self, m, d, disp: np.ndarray, time: float) -> list[int]:
     """Returns which of the fast ones were inside of it on their way within the last seconds."""
-    pos, axis = self._poses(d)
+    pos, turn = self._poses(d)
     spin, vel = self._motion(m, d, pos)
-    speed = np.linalg.norm(vel, axis=1) + np.linalg.norm(spin, axis=1) * self.half
-    turn, found = np.cross(spin, axis), np.zeros(len(self.geoms), bool)
+    speed = np.linalg.norm(vel, axis=1) + np.linalg.norm(spin, axis=1) * self.reach
+    turning, found = np.cross(spin[:, :, None], turn, axis=1), np.zeros(len(self.geoms), bool)
     for t in np.linspace(0, time, _PATH):
-      found |= self._inside(pos - t * vel, axis - t * turn, disp)
+      found |= self._inside(pos - t * vel, turn - t * turning, disp)
     return self.geoms[found & (speed > _FAST)].tolist()
 
-  def _inside(self, pos: np.ndarray, axis: np.ndarray, disp: np.ndarray) -> np.ndarray:
+  def _inside(self, pos: np.ndarray, turn: np.ndarray, disp: np.ndarray) -> np.ndarray:
     """Returns whether any point of each tool is inside, (ntool,) bool."""
     organ, tool = self.organ, self._tool
-    point = (pos[tool] + self._along * axis[tool] - organ.origin) @ organ.frame
+    point = pos[tool] + (turn[tool] @ self._local[:, :, None])[:, :, 0]
+    point = (point - organ.origin) @ organ.frame
     found = np.zeros(len(self.geoms), bool)
     found[tool[inside(point, organ.mesh.rest + disp, organ.mesh.elem)]] = True
     return found
 
   def _poses(self, d) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the tools' places [m] and axes, (ntool, 3) both."""
+    """Returns the tools' places [m], (ntool, 3), and rotations, (ntool, 3, 3)."""
     pos = mjstruct.view(d.geom_xpos, (self._ngeom, 3))[self.geoms]
-    return pos, mjstruct.view(d.geom_xmat, (self._ngeom, 3, 3))[self.geoms, :, 2]
+    return pos, mjstruct.view(d.geom_xmat, (self._ngeom, 3, 3))[self.geoms]
 
   def _motion(self, m, d, pos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Returns angular velocity [rad/s] and velocity [m/s], (ntool, 3) both."""
@@ -172,11 +172,31 @@ class Tools:
     return spin, vel + np.cross(spin, pos - com)
 
 
-def half_lengths(m, geoms: np.ndarray) -> np.ndarray:
-  """Returns half the length of the axis of long geoms, 0 of others [m]."""
+def points(m, geoms: np.ndarray) -> list[np.ndarray]:
+  """Returns what stands for each geom, in its frame [m], (n, 3) each.
+
+  Points along the axis of a capsule or cylinder, over the middle of a box, the centre of another:
+  MuJoCo feels capsules and boxes at their ends and at the vertices that they meet, so that edges
+  pass between.
+  """
   kind = mjstruct.view(m.geom_type, m.ngeom, np.int32)[geoms]
-  is_long = (kind == _LONG[0]) | (kind == _LONG[1])
-  return np.where(is_long, mjstruct.view(m.geom_size, (m.ngeom, 3))[geoms, 1], 0.0)
+  out = []
+  for k, size in zip(kind, mjstruct.view(m.geom_size, (m.ngeom, 3))[geoms], strict=True):
+    thick, half = 1.0, np.zeros(3)
+    if k in _LONG:
+      thick, half[2] = size[0], size[1]
+    elif k == _BOX:
+      thick = size.min()
+      half = size - thick
+    most = np.where(np.arange(3) == half.argmax(), _MOST, _ACROSS)
+    count = np.minimum(2 * np.ceil(half / thick) + 1, most).astype(int)
+    along = [np.linspace(-h, h, n) if n > 1 else [0.0] for h, n in zip(half, count, strict=True)]
+    out.append(np.stack(np.meshgrid(*along), axis=-1).reshape(-1, 3))
+  return out
+
+
+def _reach(found: list[np.ndarray]) -> np.ndarray:
+  return np.array([np.linalg.norm(each, axis=1).max() for each in found])
 
 
 def speeds(m, model: int, data: int, organ, flags: np.ndarray) -> Speeds:
@@ -185,13 +205,15 @@ def speeds(m, model: int, data: int, organ, flags: np.ndarray) -> Speeds:
   out = coupling.mujoco_arrays(model, data, Speeds)
   out.ntool = len(geoms)
   out.tool = wp.array(geoms, dtype=int, device="cpu")
-  out.half = wp.array(half_lengths(m, geoms), dtype=wp.float64, device="cpu")
+  out.reach = wp.array(_reach(points(m, geoms)), dtype=wp.float64, device="cpu")
   out.flags = wp.array(flags, dtype=int, device="cpu", copy=False)
   return out
 
 
 class Watch:
   """Looks now and then whether a tool has come through, and all along the way of a fast one.
+
+  And whether tetrahedra stay inside out.
 
   Attributes:
     crossed: geoms that went in and out again between two looks
@@ -203,6 +225,7 @@ class Watch:
     self._inside: set[int] | None = None
     self._said: set[int] = set()
     self._steps = 0
+    self._inverted: np.ndarray | None = None
 
   def due(self, fast: int) -> bool:
     """Counts a step; returns whether it is time to look."""
@@ -230,6 +253,23 @@ class Watch:
     new = sorted(found - before - self._said)
     self._said.update(new)
     return new
+
+  def stuck(self, w) -> int:
+    """Returns how many tetrahedra are inside out as at the last look; 0 once that is said."""
+    mesh, before = w.organ.mesh, self._inverted
+    if not len(mesh.tet) or self._steps % _EVERY != 1 or (before is not None and not before.size):
+      return 0
+    found = _inside_out(mesh.rest + w.phases.motion()[0], mesh.tet)
+    stay = int((found & before).sum()) if before is not None and len(before) == len(found) else 0
+    self._inverted = found[:0] if stay else found
+    return stay
+
+
+def _inside_out(x: np.ndarray, tet: np.ndarray) -> np.ndarray:
+  """Returns which tetrahedra have no volume or a negative one, (ntet,) bool."""
+  corner = x.T[:, tet.T]
+  (ax, bx, cx), (ay, by, cy), (az, bz, cz) = corner[:, 1:] - corner[:, :1]
+  return ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx) <= 0
 
 
 def _displacement(m, d, w) -> np.ndarray:

@@ -205,6 +205,8 @@ def _end(w: Workspace):
   nodes, triangles = w.flags[FLAG.missed_nodes], w.flags[FLAG.missed_elements]
   if nodes > w.missed[0] or triangles > w.missed[1]:
     _miss(w, int(nodes), int(triangles))
+  if w.flags[FLAG.coarse] > 0:
+    _tell_coarse(w)
   if w.model_step[0] != w.time_step:
     workspace.refresh(w)
   if w.watch.due(w.flags[FLAG.fast]) and not (w.asleep or w.resident):
@@ -217,7 +219,8 @@ def _visualize(model: int, data: int, option: int, scene: int, instance: int):
   try:
     if w.cuts:
       w.cuts.follow()
-      w.cuts.show()
+      with w.cuts.lock:
+        w.cuts.show()
     if w.organ.windows:
       windowed.draw(w, model, data)
     if w.cuts:
@@ -278,7 +281,13 @@ def _fail(w: Workspace, error: BaseException) -> bool:
 
 
 def _watch(w: Workspace):
-  """Warns of tools that have come through the surface."""
+  """Warns of tools that have come through the surface, and of tetrahedra that stay inside out."""
+  if stuck := w.watch.stuck(w):
+    warn(
+      f"organ {w.organ.name!r}: {stuck} of {len(w.organ.mesh.tet)} tetrahedra are inside out and "
+      "do not recover: the tissue is crushed or was placed so; a smaller time step, newton of 2 or "
+      "3 or a greater young may keep them from it, a reset puts them right"
+    )
   for geom in w.watch.look(w):
     m = mjstruct.Model.from_address(w.model)
     name = mjstruct.name_of(m, m.name_geomadr, geom) or geom
@@ -286,6 +295,16 @@ def _watch(w: Workspace):
       f"organ {w.organ.name!r}: geom {name!r} has gone through its surface, where contacts do not "
       "hold it any more; see Organ.pierced"
     )
+
+
+def _tell_coarse(w: Workspace):
+  """Warns, once, of a tool that is too small for the mesh."""
+  edge, w.flags[FLAG.coarse] = 1e-6 * w.flags[FLAG.coarse], -1
+  warn(
+    f"organ {w.organ.name!r}: a tool touches it whose radius is under a twentieth of an edge of "
+    f"its triangles, so that forces depend on where it meets them; edges of {1e3 * edge:.2g} mm "
+    "would do"
+  )
 
 
 def _miss(w: Workspace, nodes: int, triangles: int):

@@ -15,7 +15,6 @@ from palpate.tissue.step import SCHEMES
 
 from . import inertia, mjstruct
 from .declare import Declaration
-from .flexes import mark_compiled
 
 _KNOWN = 64
 _PARTS = 8  # that cuts may make of a node
@@ -28,8 +27,6 @@ def fit(m, organ: Declaration, body: Body):
   # costs nothing while running. The plugin's own damping acts instead.
   flexes = organ.windows.flex if organ.windows else [organ.flex]
   mjstruct.view(m.flex_edgedamping, m.nflex)[flexes] = 0.0
-  if organ.mesh.spare:
-    mark_compiled(m, organ.flex)
   if organ.windows is None:
     give_armature(m, organ, body, organ.config)
     if len(organ.mesh.tet):

@@ -7,6 +7,7 @@ flicker where a tool presses. MuJoCo 4.0 has it right. Both part what slides.
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
 
+import dataclasses
 import functools
 
 import mujoco
@@ -16,7 +17,7 @@ from palpate.tissue.kernels import kernel
 from palpate.tissue.types import Array, doubles, ints, struct
 
 from . import apart, coupling, mjstruct
-from .layout import FLAG
+from .layout import FLAG, Numbers
 
 _DATA = (
   *("contact", "ncon", "nefc", "nisland", "efc_type", "efc_J", "efc_J_rownnz", "efc_J_rowadr"),
@@ -24,8 +25,32 @@ _DATA = (
   *("map_efc2iefc", "iefc_R", "iefc_D"),
 )
 _CONTACT = (
-  *("dist", "pos", "friction", "dim", "geom", "flex", "elem", "vert", "exclude", "efc_address"),
+  *("dist", "pos", "frame", "friction", "solref", "solimp", "mu", "dim", "geom", "flex", "elem"),
+  *("vert", "exclude", "efc_address"),
 )
+# What an organ's contacts follow, of each flex.
+TISSUE = Numbers(
+  "TISSUE",
+  ("modulus", 1, "Pa", "young / (1 - poisson^2) of a solid without a skin, else 0"),
+  ("yields", 1, "m/N", "compliance under a patch as wide as an edge"),
+  ("share", 1, "1/kg", "least R of a contact for each vertex that is touched"),
+  ("quick", 1, "1/s^2", "stiffness over mass of a vertex"),
+  ("firm", 1, "-", "whether contacts are made so; 0 where the organ says itself how firm they are"),
+)
+# A contact: the steps in which it closes; of its tissue's compliance, how much it has; the least R
+# in the inverse inertia of an organ and of a tool, since firmer ones chatter; of that, friction's.
+SLOW, FIRM, SOFT, LIGHT, STUCK = 4.0, 0.03, 0.036, 0.0075, 0.2
+# Contacts are softer from a step on [s], and where a vertex has more times its mass than this.
+LONG, STIFF = 5e-3, 1000.0
+SKIN = 3.0  # times the least R of solids that skins have, for whose nodes MuJoCo answers
+# How a triangle is looked at under the flat end of a cylinder: how level it is at least; points
+# along an edge; in radii, how far in from the rim they count less, and how far off the end they
+# count; the share of points that carries it in full.
+FLAT = {"LEVEL": 0.85, "POINTS": 6, "RIM": 0.1, "SLACK": 0.01, "COVER": 0.25}
+_USUAL = (0.02, 1, 0.9, 0.95, 0.001, 0.5, 2)  # MuJoCo's solref and solimp
+# Those of `add_organ`, by which an organ does not say how firm its contacts are either.
+SOLREF, SOLIMP = (0.004, 1), (0.95, 0.99, 0.001)
+_tissue: dict[int, tuple] = {}  # by the address of an mjData, see `_tissues`
 _SPARSE_FROM = 60  # dofs from which MuJoCo's rows are sparse where it may choose
 
 
@@ -36,18 +61,29 @@ class Weights:
   nv: int  # dofs of the model
   wrong: int  # whether MuJoCo's weights are
   memory: Array(wp.uint64, ("nword",))  # the mjData itself
-  mine: ints("nflex")  # whether a flex is an organ's, or a window of one
+  mine: ints("nflex")  # 1 where a flex is an organ's, or a window of one; 2 where of the own one
   flags: ints(len(FLAG))  # see FLAG
+  tissue: doubles("nflex", len(TISSUE))  # see TISSUE
+  force_adr: ints("nflexvert")  # where the plugin state has a vertex' contact force, or -1
   # mjOption:
   jacobian: ints(1)
+  timestep: doubles(1)
+  impratio: doubles(1)
+  integrator: ints(1)
   solver: ints(1)
   noslip_iterations: ints(1)
   enableflags: ints(1)
   # mjModel:
   body_dofadr: ints("nbody")
   body_dofnum: ints("nbody")
+  body_parentid: ints("nbody")
+  body_rootid: ints("nbody")
+  dof_parentid: ints("nv")
   body_invweight0: doubles("nbody", 2)
   geom_bodyid: ints("ngeom")
+  geom_type: ints("ngeom")
+  geom_size: doubles("ngeom", 3)
+  flex_radius: doubles("nflex")
   flex_dim: ints("nflex")
   flex_vertadr: ints("nflex")
   flex_vertbodyid: ints("nflexvert")
@@ -56,6 +92,11 @@ class Weights:
   # mjData:
   qvel: doubles("nv")
   flexvert_xpos: doubles("nflexvert", 3)
+  geom_xpos: doubles("ngeom", 3)
+  geom_xmat: doubles("ngeom", 9)
+  subtree_com: doubles("nbody", 3)
+  cdof: doubles("nv", 6)
+  plugin_state: doubles("npluginstate")
 
 
 def _offsets(prefix: str, kind, names) -> dict[str, int]:
@@ -67,15 +108,24 @@ weigh = kernel(
   "weights.h",
   Weights,
   coupling.CONSTANTS
+  | TISSUE.constants()
   | _offsets("DATA", mjstruct.Data, _DATA)
   | _offsets("CONTACT", mjstruct.Contact, _CONTACT)
   | {
+    "SLOW": SLOW,
+    "FIRM": FIRM,
+    "LIGHT": LIGHT,
+    "LONG": LONG,
+    "STUCK": STUCK,
+    "STIFF": STIFF,
+    **FLAT,
     "CONTACT_LENGTH": mjstruct.size(mjstruct.Contact),
     "CONTACT_PYRAMIDAL": int(mujoco.mjtConstraint.mjCNSTR_CONTACT_PYRAMIDAL),
     "CONTACT_ELLIPTIC": int(mujoco.mjtConstraint.mjCNSTR_CONTACT_ELLIPTIC),
     "JACOBIAN_DENSE": int(mujoco.mjtJacobian.mjJAC_DENSE),
     "JACOBIAN_AUTO": int(mujoco.mjtJacobian.mjJAC_AUTO),
     "SPARSE_FROM": _SPARSE_FROM,
+    "INTEGRATOR_DISCRETE": int(getattr(mujoco.mjtIntegrator, "mjINT_DISCRETE", -1)),
     "SOLVER_PGS": int(mujoco.mjtSolver.mjSOL_PGS),
     "ENABLE_DIAGEXACT": int(mujoco.mjtEnableBit.mjENBL_DIAGEXACT),
   },
@@ -118,11 +168,107 @@ def make(model: int, data: int, flexes, flags: np.ndarray | None = None) -> Weig
   out = coupling.mujoco_arrays(model, data, Weights)
   out.nv = mjstruct.Model.from_address(model).nv
   out.wrong = are_wrong()
+  tissue, adr = _tissues(model, data)
+  out.tissue = wp.array(tissue, dtype=wp.float64, device="cpu", copy=False)
+  out.force_adr = wp.array(adr, dtype=int, device="cpu", copy=False)
   out.memory = coupling.wrap(data, mjstruct.size(mjstruct.Data) // 8, wp.uint64)
   out.mine = wp.array(mine, dtype=int, device="cpu")
   flags = np.zeros(len(FLAG), np.int32) if flags is None else flags
   out.flags = wp.array(flags, dtype=int, device="cpu", copy=False)
   return out
+
+
+def _tissues(model: int, data: int) -> tuple[np.ndarray, np.ndarray]:
+  """Returns what the organs of an mjData tell of its flexes and their vertices."""
+  m = mjstruct.Model.from_address(model)
+  found = _tissue.get(data)
+  if found is None or (len(found[0]), len(found[1])) != (m.nflex, m.nflexvert):
+    found = np.zeros((m.nflex, len(TISSUE))), np.full(m.nflexvert, -1, np.int32)
+    _tissue[data] = found
+  return found
+
+
+def put_tissue(model: int, data: int, instance: int, organ, config):
+  """Tells contacts with an organ what its tissue is made of, and where its contact forces are."""
+  m = mjstruct.Model.from_address(model)
+  found, adr = _tissues(model, data)
+  start = int(mjstruct.view(m.plugin_stateadr, m.nplugin, np.int32)[instance])
+  start += coupling.spans(organ)["force"].start
+  first = mjstruct.view(m.flex_vertadr, m.nflex, np.int32)
+  if organ.windows:
+    for k, flex in enumerate(organ.windows.flex):
+      slot = np.arange(*organ.windows.adr[k : k + 2])
+      adr[first[flex] + slot - slot[0]] = start + 3 * slot
+  else:
+    n = coupling.outer(organ)
+    own = organ.dofadr[:n] >= 0
+    adr[first[organ.flex] : first[organ.flex] + n] = np.where(own, start + organ.stateadr[:n], -1)
+  own = organ.windows.flex if organ.windows else [organ.flex]
+  found[own] = tissue_of(organ, config)
+  for flex in own:
+    solref = mjstruct.view(m.flex_solref, (m.nflex, 2))[flex]
+    solimp = mjstruct.view(m.flex_solimp, (m.nflex, 5))[flex]
+    found[flex, TISSUE.firm] = not says(solref, solimp)
+
+
+def tissue_of(organ, config=None) -> np.ndarray:
+  """Returns TISSUE of an organ, as compiled or with another configuration.
+
+  Its compliance is that of an elastic half space, a membrane with bending (Winkler's plate under a
+  point) and a foundation, side by side.
+  """
+  config = config or organ.config
+  solid, plane = config.elements == "solid", 1 - config.poisson**2
+  young = float(np.mean(config.young))
+  skin = float(np.mean(config.capsule_young or 0.0)) if solid else young
+  rigidity = config.bend * skin * config.thickness**3 / (12 * plane)
+  stretch = config.stiffness if config.elements == "spring" else skin * config.thickness / plane
+  corner = organ.mesh.rest[organ.mesh.elem]
+  edge = np.linalg.norm(corner - corner[:, [1, 2, 0]], axis=2).mean()
+  within, below = solid * young / plane * edge, config.foundation * edge**2
+  stiffness = within + stretch + 8 * np.sqrt(rigidity * config.foundation) + below
+  bare = 0.0 if stretch else solid * young / plane
+  mass = organ.mass[organ.free]
+  share = (1 if solid else SKIN) * SOFT / mass.sum()
+  return np.array([bare, 1 / stiffness, share, stiffness / mass.mean(), 1.0])
+
+
+def says(solref, solimp) -> bool:
+  """Returns whether an organ says itself how firm its contacts are."""
+  given = [*solref, *solimp]
+  usual = [*SOLREF, *SOLIMP, 0.5, 2]
+  return not (np.allclose(given, _USUAL, atol=1e-9) or np.allclose(given, usual, atol=1e-9))
+
+
+@dataclasses.dataclass(frozen=True)
+class Firmness:
+  """What contacts with an organ have of R, see native/firm.h.
+
+  Attributes:
+    asked: what the tissue asks for [1/kg]
+    share: what the organ bears for each vertex that is touched [1/kg]
+    tools: what each geom bears [1/kg], (ngeom,); or -1 where contacts stay as they are
+    stuck: of that, the most that friction has
+  """
+
+  asked: float
+  share: float
+  tools: np.ndarray | float
+  stuck: float
+
+
+def firmness(model: mujoco.MjModel, organ) -> Firmness:
+  """Returns how firm contacts with an organ are."""
+  h, tissue = float(model.opt.timestep), tissue_of(organ)
+  flex = organ.windows.flex[0] if organ.windows else organ.flex
+  left = says(model.flex_solref[flex], model.flex_solimp[flex])
+  softer = max(1.0, (h / LONG) ** 2) * max(1.0, h**2 * tissue[TISSUE.quick] / STIFF)
+  return Firmness(
+    FIRM * tissue[TISSUE.yields] / (SLOW * h) ** 2,
+    softer * tissue[TISSUE.share],
+    -1.0 if left else LIGHT * model.body_invweight0[model.geom_bodyid, 0],
+    min(1.0, max(STUCK, h / LONG)),
+  )
 
 
 def launch(weights):

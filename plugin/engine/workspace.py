@@ -182,8 +182,8 @@ class Workspace:
   def _run_cut(self, changed: bool):
     """Runs an organ that may be cut: the model's triangles must be its own."""
     with self.cuts.lock:
-      if self.flags[FLAG.stage] < STAGE.gathered and (changed or not self.cuts.shown):
-        self.cuts.show()
+      others = self.cuts.show()
+      if self.flags[FLAG.stage] < STAGE.gathered and (changed or others):
         windowed.find_contacts_again(self)
       self._run()
 
@@ -204,11 +204,14 @@ class Workspace:
         wp.capture_launch(self.before)
       if not self.asleep and self.policy[0] == _ALLOWED:
         windowed.let_sleep(self, False)
+    if not self.asleep:  # what `after` does was done with `before`
+      self._solve()
     if self.flags[FLAG.weighed]:
-      weights.project(self.model, self.data)
-    if self.asleep:
-      self.computed = True
-      return  # what `after` does was done with `before`
+      weights.project(self.model, self.data)  # with the inertia that is in the model now
+    self.computed = True
+
+  def _solve(self):
+    """Solves for the step, and tells MuJoCo."""
     if self.ties.aims:
       self.ties.aim()
     if self.resident:
@@ -218,7 +221,6 @@ class Workspace:
       wp.capture_launch(self.after)
     else:
       graphs.launch_all(self.solve)
-    self.computed = True
 
   def _check_model(self):
     """Makes sure that nothing has changed in the model that may not change while running.

@@ -9,6 +9,9 @@
 // through is the path of the cut. A blade that comes from above pierces the wall first, with up to G
 // times its width along itself, over the wall's thickness. On its way back it meets nothing.
 //
+// Where a blade enters at a free edge, the mesh has a vertex or two to bear it. Where they give way before they
+// bear G t, the blade notches the edge: the force grows to G t until the mesh comes apart there.
+//
 // In a solid t is how deep the blade is, the force is across it, and is spread along it: at one place of
 // the skin it would drag soft tissue along.
 //
@@ -22,6 +25,12 @@ namespace palpate {
 constexpr double SPACING = 0.4, LEAP = 1.0;
 constexpr double BATCH = 1.8;  // edges that come apart at once, at least
 constexpr double LEVEL = 0.05;  // least share of a way along the surface that is across the blade
+constexpr double AFRESH = 2.0;  // edges from its last seat from which a blade enters anew
+// Share of its length to which the tissue ahead of a blade is pressed together where it gives way: below
+// 1 / sqrt(3) a St. Venant-Kirchhoff membrane bears less and less.
+constexpr double CRUSHED = 0.6;
+// Of BLADE_WAIT: the blade has entered at an edge, and notches it.
+constexpr double ENTERED = -1.0, NOTCHES = -2.0;
 constexpr double BLOCKED = 0.3;  // share of its way that a seat goes where it is not at a boundary
 constexpr int ALONG = 4, HELD = 4 * ALONG + 3;  // places along a blade that bear it, and their vertices
 constexpr double LEAVES = 0.8;  // cosine of a pull to the normal of a face by which a blade leaves
@@ -67,9 +76,13 @@ PALPATE Stretch stretch_of(D3 pull, D3 blade, const Seated& at, D3 toward) {
   return s;
 }
 
-// The force that tissue bears of a blade: in a solid, by how deep it is.
-PALPATE double borne(const double* law, double deep) {
-  return law[LAW_SOLID] == 0.0 ? law[LAW_FORCE] : deep > 0.0 ? law[LAW_FORCE] * deep : 0.0;
+// The force that tissue bears of a blade: in a solid by how deep it is, in a wall by how far it is in.
+template <class Fields>
+PALPATE double borne(const Fields& f, const double* law, double deep, const double* s) {
+  if (law[LAW_SOLID] != 0.0) return deep > 0.0 ? law[LAW_FORCE] * deep : 0.0;
+  if (s[BLADE_WAIT] != NOTCHES) return law[LAW_FORCE];
+  const double in = norm(load(s + BLADE_AT) - load(s + BLADE_TRAIL)) / (BATCH * f.edge);
+  return (in < 1.0 ? in : 1.0) * law[LAW_FORCE];
 }
 
 // How far what counts of a spring is stretched: of a solid all that is across the blade, since that is what
@@ -108,13 +121,16 @@ PALPATE void sit_down(const Fields& f, Thread t, int i, const Line& line, double
   corners_now(f, elem, x);
   const Line later = line_of(f, i, f.mj.timestep.data[0]);
   const double fast = 2.0 * norm(later.from - line.from);
+  const D3 seat = blend(rest, weight);
+  const bool afresh = s[BLADE_OPENED] == 0.0 || norm(seat - load(s + BLADE_AT)) > AFRESH * f.edge;
   const double* law = f.law.data + LAW_LENGTH * i;
   const bool sideways = deep > law[LAW_WALL] + fast || shears;
   s[BLADE_STAGE] = sideways ? THROUGH : PIERCING;
   s[BLADE_ELEM] = elem;
   s[BLADE_COUNT] = 0.0;
   s[BLADE_DEPTH] = law[LAW_SOLID] != 0.0 && sideways ? deep : 0.0;
-  store(s + BLADE_AT, blend(rest, weight));
+  if (sideways && afresh && !shears) s[BLADE_WAIT] = ENTERED;
+  store(s + BLADE_AT, seat);
   store(s + BLADE_TOWARD, unit_of(carried(toward, x, rest)));
   if (sideways) note_path(s, 0.0);
 }
@@ -140,6 +156,18 @@ PALPATE bool advance(const Fields& f, Thread t, int i, D3 way, const Seated& fro
   return true;
 }
 
+// Whether the tissue of a wall ahead of a blade, over an edge of the mesh, gives way.
+template <class Fields>
+PALPATE bool gives_way(const Fields& f, Thread t, D3 way, const Seated& at, const double* s) {
+  const D3 here = load(s + BLADE_AT), goes = f.edge * unit_of(carried(way, at.x, at.rest));
+  int elem = 0;
+  D3 weight, rest[3], x[3];
+  find_seat(f, t, here + goes, elem, weight);
+  corners_at_rest(f, elem, rest);
+  corners_now(f, elem, x);
+  return dot(blend(x, weight) - at.at, way) < CRUSHED * norm(blend(rest, weight) - here);
+}
+
 // Brings the spring of a blade that sits to what the tissue bears; ends the cut where the blade is out
 // of the tissue, or cuts another way.
 template <class Fields>
@@ -148,7 +176,7 @@ PALPATE void give_way(const Fields& f, Thread t, int i, const Line& line, double
   Seated at = seated(f, s);
   const double place = dot(at.at - line.from, line.along);
   const Depth reach = depth_of(f, t, i, line, place, at);
-  const double deep = reach.deep, most = borne(law, deep), slack = most / law[LAW_STIFFNESS];
+  const double deep = reach.deep, most = borne(f, law, deep, s), slack = most / law[LAW_STIFFNESS];
   // An edge more where it goes through, so that nothing is left below.
   if (law[LAW_SOLID] != 0.0 && s[BLADE_STAGE] == THROUGH)
     s[BLADE_DEPTH] = deep > 0.0 ? deep + (reach.through ? f.edge : 0.0) : 0.0;
@@ -160,8 +188,10 @@ PALPATE void give_way(const Fields& f, Thread t, int i, const Line& line, double
     const double size = pull_of(law, now);
     out = now.far > LEAP * f.edge;  // it has been drawn back, or goes out where the solid ends
     out = out || (law[LAW_SOLID] != 0.0 && dot(now.pull, at.normal) > LEAVES * norm(now.pull));
+    const D3 unit = unit_of(now.flat);
+    if (!out && size > 0.0 && s[BLADE_WAIT] == ENTERED && gives_way(f, t, unit, at, s))
+      s[BLADE_WAIT] = NOTCHES;  // from the next step on
     if (!out && size > slack) {
-      const D3 unit = unit_of(now.flat);
       const double tilt = dot(unit, line.along), across = 1.0 - tilt * tilt;
       const double level = law[LAW_SOLID] != 0.0 ? sqrt(across) : across;
       const double far = (size - slack) / (level > LEVEL ? level : LEVEL), leap = LEAP * f.edge;
@@ -245,7 +275,7 @@ PALPATE void bear(const Fields& f, Thread t, int i, const Line& line, const doub
     hold = without(hold, weight, then.back);
     force = across(force, then.back);
   }
-  const double size = k * pull_of(law, then), most = borne(law, depth.deep);
+  const double size = k * pull_of(law, then), most = borne(f, law, depth.deep, s);
   if (size > most) {
     const double share = most / size;
     hold = share * hold;

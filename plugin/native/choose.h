@@ -27,19 +27,19 @@ PALPATE const double* moved_to(const Fields& f, int k) {
                                      : moved(f, k) + MOVED_DISP;
 }
 
-// Follows the organ's answer with the inertia that tools meet.
+// Follows the organ's answer with the contact forces, and with the inertia that tools meet.
 template <class Fields>
 PALPATE void follow_answer(const Fields& f) {
+  const double ratio = f.outbox.summary.data[SUMMARY_RATIO], per_h = 1.0 / head(f)[HEAD_STEP];
   Secant secant;
   for (int k = 0; k < f.nslot; ++k) {
     if (f.placed.data[k] < 0) continue;
-    const D3 p = load(pushed(f, k) + PUSHED_FORCE);
-    const D3 answer = load(f.outbox.answer.data + ANSWER_LENGTH * k + ANSWER_DVEL);
-    const double force = head(f)[HEAD_STEP] * norm(contact_force(f, k));
-    secant.add(p, answer, dot(p, p) / f.mj.M.data[f.massadr.data[3 * k]], p, force);
+    const D3 change = per_h * load(pushed(f, k) + PUSHED_FORCE), now = contact_force(f, k);
+    secant.add(change, norm(now));
+    store(f.own.force.data + 3 * k, relaxed(now - change, now, ratio));
   }
   double* heavier = tail(f) + TAIL_HEAVIER;
-  *heavier = secant.heavier(*heavier > 1.0 ? *heavier : 1.0, f.heaviest.data[0]);
+  *heavier = secant.heavier(*heavier > 1.0 ? *heavier : 1.0, f.heaviest.data[0], ratio);
 }
 
 // Puts the slots where their nodes went, and keeps their contact forces for those that get them.

@@ -19,6 +19,13 @@ PALPATE double inertia(const Fields& f, int i, int adr, int k) {
   return f.mj.body_mass.data[f.bodyid.data[i]] + f.mj.dof_armature.data[adr + k];
 }
 
+// How many times its inertia a node that contacts touch has to MuJoCo.
+template <class Fields>
+PALPATE double heavier(const Fields& f, int own) {
+  const double heavy = f.own.heavier.data[0];
+  return heavy > 1.0 && touched(load(f.own.force.data + own)) ? heavy : 1.0;
+}
+
 // Displacement of a node from rest, whose place a cut may have moved.
 template <class Fields>
 PALPATE D3 displacement(const Fields& f, int i, int qadr) {
@@ -93,11 +100,11 @@ PALPATE void scatter_nodes(const Fields& f, Thread, int) {
   const auto& mj = f.mj;
   // A solve that failed holds the organ still for this step instead of spreading the damage.
   const bool ok = f.solve.status.data[3] == 0.0f;
-  const double per_h = 1.0 / mj.timestep.data[0], heavy = f.own.heavier.data[0];
+  const double per_h = 1.0 / mj.timestep.data[0];
   for (int i = 0; i < f.nnode; ++i) {
     const int adr = f.dofadr.data[i], own = f.stateadr.data[i];
     if (adr < 0) continue;  // pinned, inside or padding
-    const double gain = heavy > 1.0 && touched(load(f.own.force.data + own)) ? heavy : 1.0;
+    const double gain = heavier(f, own);
     const D3 Mhat = {gain * inertia(f, i, adr, 0), gain * inertia(f, i, adr, 1),
                      gain * inertia(f, i, adr, 2)};
     if (gain > 1.0 || f.weighs) set_inertia(mj, f.massadr.data + 3 * i, adr, Mhat);
@@ -114,14 +121,19 @@ template <class Fields>
 PALPATE void push_nodes(const Fields& f, Thread, int) {
   const double h = f.mj.timestep.data[0];
   bool changed = false;
+  Expected expected;
   for (int i = 0; i < f.nnode; ++i) {
-    const int adr = f.dofadr.data[i];
-    D3 df = {0.0, 0.0, 0.0};
-    if (adr >= 0)
-      df = load(f.mj.qfrc_constraint.data + adr) - load(f.own.force.data + f.stateadr.data[i]);
-    store_lane(f.solve.rhs.data + offset_of(i), h * df);
-    changed = changed || touched(df);
+    const int adr = f.dofadr.data[i], own = f.stateadr.data[i];
+    store_lane(f.solve.rhs.data + offset_of(i), {0.0, 0.0, 0.0});
+    if (adr < 0) continue;
+    const D3 was = load(f.own.force.data + own), now = load(f.mj.qfrc_constraint.data + adr);
+    if (!touched(was) && !touched(now)) continue;
+    const D3 impulse = h * (now - was);
+    store_lane(f.solve.rhs.data + offset_of(i), impulse);
+    changed = changed || touched(impulse);
+    expected.add(impulse, heavier(f, own) * inertia(f, i, adr, 0), was, now);
   }
+  f.solve.expected.data[0] = expected.value();
   f.flags.data[FLAG_CHANGED] = changed;
 }
 
@@ -149,6 +161,7 @@ PALPATE void remember_nodes(const Fields& f, Thread, int) {
   const double h = mj.timestep.data[0], damping = (float)f.number.data[DAMPING];
   const bool ok = f.solve.status.data[3] == 0.0f, answered = ok && f.flags.data[FLAG_ANSWERED];
   const double heavy = f.own.heavier.data[0] > 1.0 ? f.own.heavier.data[0] : 1.0;
+  const double ratio = answered ? f.solve.ratio.data[0] : 1.0;
   Secant secant;
   for (int i = 0; i < f.nnode; ++i) {
     const int at = offset_of(i), adr = f.dofadr.data[i], own = f.stateadr.data[i];
@@ -162,19 +175,18 @@ PALPATE void remember_nodes(const Fields& f, Thread, int) {
       continue;
     }
     double* force = f.own.force.data + own;
-    const D3 now = load(mj.qfrc_constraint.data + adr), df = now - load(force);
+    const D3 was = load(force), now = load(mj.qfrc_constraint.data + adr);
     if (answered) {
-      const double Mhat = (touched(load(force)) ? heavy : 1.0) * inertia(f, i, adr, 0);
-      secant.add(h * df, answer, h * h * dot(df, df) / Mhat, df, norm(now));
+      secant.add(now - was, norm(now));
       const D3 v = load_lane(f.solve.vel.data + at) + dv + answer;
       double* qpos = mj.qpos.data + f.qposadr.data[i];
       double* qvel = mj.qvel.data + adr;
       store(qpos, load(qpos) + h * (v - load(qvel)));
       store(qvel, v);
     }
-    store(force, now);
+    store(force, relaxed(was, now, ratio));
   }
-  if (answered) f.own.heavier.data[0] = secant.heavier(heavy, f.heaviest.data[0]);
+  if (answered) f.own.heavier.data[0] = secant.heavier(heavy, f.heaviest.data[0], ratio);
   f.flags.data[FLAG_STAGE] = STAGE_ENDED;
 }
 

@@ -119,6 +119,7 @@ PALPATE void push_impulses(const Fields& n, Thread t, int) {
     const int i = (int)pushed(n, k)[PUSHED_NODE];
     if (i >= 0) store_lane(n.solve.rhs.data + n.node.data[i], load(pushed(n, k) + PUSHED_FORCE));
   });
+  if (t.tid == 0) n.solve.expected.data[0] = (float)head(n, HEAD_EXPECTED);
 }
 
 // Whether a window's geom comes near the organ's bounds.
@@ -171,10 +172,10 @@ PALPATE void report(const Fields& n, Thread t, int) {
     double* answer = n.outbox.answer.data + ANSWER_LENGTH * k;
     store(answer + ANSWER_DISP, load(n.motion.disp.data + 3 * i));
     store(answer + ANSWER_VEL, load(n.motion.vel.data + 3 * i));
-    store(answer + ANSWER_DVEL, load_lane(n.solve.sol.data + at));
   });
   if (t.tid > 0) return;
   for (int k = 0; k < 4; ++k) n.outbox.summary.data[SUMMARY_STATUS + k] = n.solve.status.data[k];
+  n.outbox.summary.data[SUMMARY_RATIO] = n.solve.ratio.data[0];
   if (answered) n.inbox.head.data[HEAD_MODE] = MODE_STILL;  // the answer has ended the step
   for (int w = 0; w < n.nwindow; ++w) {
     n.outbox.found.data[w] = n.count.data[w];

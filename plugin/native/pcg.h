@@ -10,6 +10,7 @@
 // FIRST and RESPONSE are stages of a step, ENOUGH is the relative residual at which a response is
 // good enough, and BULK and so on are places in `Tissue.number`.
 #pragma once
+#include "formula.h"
 #include "product.h"
 #include "volume.h"
 
@@ -45,6 +46,7 @@ struct Pcg {
   typename Slices::Vector az{f.system.t.data + at};
   float norm = 0.0f, target = 0.0f, along = 0.0f, residual = 0.0f;
   float rz = 0.0f, before = 0.0f;  // r^T z, and that of the last iteration
+  float work = 0.0f;  // b^T x, of a solve that starts at 0
   int it = 0;
 
   template <class Preconditioner>
@@ -65,7 +67,9 @@ struct Pcg {
         bent = curved;
       }
       before = rz;
-      part = update(m, rz / bent, beta, volume);
+      const float alpha = rz / bent;
+      work += alpha * rz;
+      part = update(m, alpha, beta, volume);
       ++it;
     }
     finish();
@@ -192,9 +196,21 @@ struct Pcg {
     if (bulk != 0.0f) flux += dot(v, ld3(areavec + 24 * s, lane));
   }
 
+  // Notes what a response made of the impulses, and returns how much of it is taken.
+  PALPATE float relax() {
+    const float expected = f.state.expected.data[world];
+    const float ratio = expected > 0.0f && work > 0.0f ? expected / work : 1.0f;
+    if (group.is_first()) f.system.ratio.data[world] = ratio;
+    return relaxation(ratio);
+  }
+
   // Writes the solution and the world's status.
   PALPATE void finish() {
-    slices.each([&](int s, Lane lane, int k) { x.store(s, lane, k); });
+    const float part = stage == RESPONSE ? relax() : 1.0f;
+    slices.each([&](int s, Lane lane, int k) {
+      if (part < 1.0f) x.put(s, part * x.get(s, lane, k), lane, k);
+      x.store(s, lane, k);
+    });
     if (!group.is_first()) return;
     float* out = f.system.status.data + 4 * world;
     out[0] = (stage == FIRST ? 0.0f : out[0]) + (float)it;

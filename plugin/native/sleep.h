@@ -78,6 +78,7 @@ PALPATE bool take_contacts(const Fields& f) {
   const double h = head(f)[HEAD_STEP];
   const D3 zero = {0.0, 0.0, 0.0};
   bool any = false, pushes = false;
+  Expected expected;
   for (int k = 0; k < f.nslot; ++k) {
     const int i = f.placed.data[k], adr = f.dofadr.data[k];
     const bool moves = i >= 0 && f.free.data[i];
@@ -86,7 +87,9 @@ PALPATE bool take_contacts(const Fields& f) {
     any = any || touched(now);
     pushes = pushes || load(pushed(f, k) + PUSHED_FORCE) != zero;
     store(f.own.force.data + 3 * k, now);
-    store(pushed(f, k) + PUSHED_FORCE, h * (now - before));
+    const D3 impulse = h * (now - before);
+    store(pushed(f, k) + PUSHED_FORCE, impulse);
+    expected.add(impulse, f.mj.M.data[f.massadr.data[3 * k]], before, now);
     if (now != before) f.flags.data[FLAG_CHANGED] = 1;
     moved(f, k)[MOVED_NODE] = i;
     if (i < 0) continue;
@@ -94,6 +97,7 @@ PALPATE bool take_contacts(const Fields& f) {
     store(moved(f, k) + MOVED_DISP, moves ? off - load(f.rest.data + 3 * i) : zero);
     store(moved(f, k) + MOVED_VEL, moves ? load(f.mj.qvel.data + adr) : zero);
   }
+  head(f)[HEAD_EXPECTED] = expected.value();
   if (!any) tail(f)[TAIL_HEAVIER] = 1.0;
   return !any && !pushes && f.outbox.summary.data[SUMMARY_SPEED2] < f.slow * f.slow;
 }

@@ -4,7 +4,7 @@
 
 namespace palpate {
 
-// Flags whether a tool is faster than FAST, at an end of a long one: it may go through an organ and
+// Flags whether a tool is faster than FAST, at its farthest point: it may go through an organ and
 // out again between two looks.
 template <class Fields>
 PALPATE void find_fast(const Fields& f, Thread, int) {
@@ -13,7 +13,7 @@ PALPATE void find_fast(const Fields& f, Thread, int) {
     const int geom = f.tool.data[k], body = f.geom_bodyid.data[geom];
     const Twist moving = {load(f.cvel.data + 6 * body), load(f.cvel.data + 6 * body + 3)};
     const D3 vel = velocity_at(moving, arm_of(f, body, load(f.geom_xpos.data + 3 * geom)));
-    fast = norm(vel) + f.half.data[k] * norm(moving.spin) > FAST;
+    fast = norm(vel) + f.reach.data[k] * norm(moving.spin) > FAST;
   }
   f.flags.data[FLAG_FAST] = fast;
 }

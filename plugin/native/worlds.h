@@ -232,6 +232,13 @@ PALPATE void push_worlds(const Fields& f, Thread t, int) {
   });
 }
 
+// The contact force on a slot's node that MuJoCo found.
+template <class Fields>
+PALPATE D3 contact_now(const Fields& f, int world, int slot, int i) {
+  const D3 found = load_floats(f.qfrc_constraint.data + slot_dof(f, world, slot));
+  return f.free.data[i] ? turned_back(f.frame.data, found) : D3{0.0, 0.0, 0.0};
+}
+
 // Takes the contact forces that MuJoCo found; where the organ answers, the impulses by which they
 // changed go to the solver's right-hand side, which is zero.
 template <class Fields>
@@ -239,32 +246,41 @@ PALPATE void take(const Fields& f, Thread t, int) {
   each_item(t, f.nslot, [&](int k) {
     const int i = f.slot_node.data[t.world * f.nslot + k];
     if (i < 0) return;
-    const D3 found = load_floats(f.qfrc_constraint.data + slot_dof(f, t.world, k));
-    const D3 now = f.free.data[i] ? turned_back(f.frame.data, found) : D3{0.0, 0.0, 0.0};
+    const D3 now = contact_now(f, t.world, k, i);
     store_floats(f.found.data + 3 * (t.world * f.nslot + k), now);
     if (!f.stiff) return;
     const D3 change = now - load_floats(f.force.data + 3 * in_row(f, t.world, i));
     store_lane(f.solve.rhs.data + at_node(f, t.world, i), (double)f.h * change);
   });
+  if (t.tid > 0 || !f.stiff) return;
+  Expected expected;
+  for (int k = 0; k < f.nslot; ++k) {
+    const int i = f.slot_node.data[t.world * f.nslot + k];
+    if (i < 0) continue;
+    const D3 now = contact_now(f, t.world, k, i);
+    const D3 was = load_floats(f.force.data + 3 * in_row(f, t.world, i));
+    const double Mhat = f.slot_mass + f.dof_armature.data[slot_dof(f, t.world, k)];
+    expected.add((double)f.h * (now - was), Mhat, was, now);
+  }
+  f.solve.expected.data[t.world] = expected.value();
 }
 
-// Follows the organ's answer with the inertia that tools meet.
+// Follows the organ's answer with the contact forces, and with the inertia that tools meet.
 template <class Fields>
 PALPATE void follow(const Fields& f, Thread t, int) {
   if (t.tid > 0) return;
   Secant secant;
-  const double h = f.h;
+  const double ratio = f.solve.ratio.data[t.world];
   for (int k = 0; k < f.nslot; ++k) {
     const int i = f.slot_node.data[t.world * f.nslot + k];
     if (i < 0) continue;
-    const D3 now = load_floats(f.found.data + 3 * (t.world * f.nslot + k));
-    const D3 df = now - load_floats(f.force.data + 3 * in_row(f, t.world, i));
-    const D3 answer = load_lane(f.solve.sol.data + at_node(f, t.world, i));
-    const double Mhat = f.slot_mass + f.dof_armature.data[slot_dof(f, t.world, k)];
-    secant.add(h * df, answer, h * h * dot(df, df) / Mhat, df, norm(now));
+    float* found = f.found.data + 3 * (t.world * f.nslot + k);
+    const D3 now = load_floats(found), was = load_floats(f.force.data + 3 * in_row(f, t.world, i));
+    secant.add(now - was, norm(now));
+    store_floats(found, relaxed(was, now, ratio));
   }
   double* heavier = f.heavier.data + t.world;
-  *heavier = secant.heavier(*heavier > 1.0 ? *heavier : 1.0, f.heaviest);
+  *heavier = secant.heavier(*heavier > 1.0 ? *heavier : 1.0, f.heaviest, ratio);
 }
 
 // Ends the step.

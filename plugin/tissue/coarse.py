@@ -291,7 +291,7 @@ def join(parts: list[dict[str, Any]]) -> dict[str, Any]:
   for name, value in parts[0].items():
     if name not in out and isinstance(value, np.ndarray) and name != "number":
       out[name] = np.zeros((min(1, len(value)), *value.shape[1:]), value.dtype)
-  names = ("closed", "stride", "volume0", "shortest", "number")
+  names = ("closed", "unheld", "stride", "volume0", "shortest", "number")
   common = {name: parts[0][name] for name in names}
   return out | common
 

@@ -230,6 +230,11 @@ class Config:
   )
 
   @property
+  def held(self) -> bool:
+    """Whether something holds the organ in place, so that it does not fall."""
+    return any(getattr(self, key) for key in holders(self.carrier))
+
+  @property
   def bonded(self) -> bool:
     """Whether there are bonds, or room for some."""
     return self.bonds is not None
@@ -244,12 +249,17 @@ RECORDED = tuple(key for key, row in ROWS.items() if row.change == GRAPH)
 
 def table() -> str:
   """Returns the keys as a Markdown table."""
-  lines = ["| key | meaning | unit | allowed | default | while running |"]
-  lines.append("|---|---|---|---|---|---|")
+  lines = ["| key | meaning | unit | allowed | default | while running |", "|---" * 6 + "|"]
   for key, row in ROWS.items():
     cells = [f"`{key}`", row.meaning, row.unit, row.allowed.replace("'", "`"), _default(key)]
     lines.append(f"| {' | '.join(cells)} | {'may change' if row.change else '-'} |")
   return "\n".join(lines) + "\n"
+
+
+def holders(carrier: str) -> tuple[str, ...]:
+  """Returns the keys that hold an organ in place; its own rigid motion, as `carrier`, does not."""
+  keys = ("pin", "attach", "bonds", "support")
+  return keys if carrier == OWN else (*keys, "foundation", "carrier")
 
 
 def _default(key: str) -> str:
@@ -432,14 +442,6 @@ def lame(config: Config, nelem: int) -> tuple[np.ndarray, np.ndarray]:
   young = np.broadcast_to(np.asarray(config.young), (nelem,))
   nu = config.poisson
   return young * nu / (1 - nu * nu), young / (2 * (1 + nu))
-
-
-def lame_solid(young: np.ndarray, poisson: float) -> tuple[np.ndarray, np.ndarray]:
-  """Returns the Lame constants mu, lambda of a solid [Pa].
-
-  mu = E / (2 (1 + nu)), lambda = E nu / ((1 + nu) (1 - 2 nu)).
-  """
-  return young / (2 * (1 + poisson)), young * poisson / ((1 + poisson) * (1 - 2 * poisson))
 
 
 def rigidity(config: Config, nelem: int) -> np.ndarray:

@@ -103,14 +103,16 @@ def _numbers(config: Config, closed: bool = True) -> dict[str, float]:
 def eased(config: Config) -> float:
   """Returns what of its time step h a step takes off `damping`: as much as it damps by itself.
 
-  Of solids alone, whose tissue has that much to take it off.
+  Of solids alone, whose tissue has that much to take it off. Negative: the least damping over h.
   """
-  return step.SCHEMES[config.integrator].damps if config.elements == "solid" else 0.0
+  damps = step.SCHEMES[config.integrator].damps
+  return damps if config.elements == "solid" else min(damps, 0.0)
 
 
 def gain(config: Config, h: float) -> float:
   """Returns the factor of K in the matrix of a step h [s^2], as `formula.h` has it."""
-  damping = config.damping - min(eased(config) * h, 0.5 * config.damping)
+  damping, less = config.damping, eased(config) * h
+  damping = max(damping, -less) if less < 0 else damping - min(less, 0.5 * damping)
   return step.SCHEMES[config.integrator].gain(h, damping)
 
 
@@ -179,6 +181,7 @@ def arrays(
     "area": _node_values(topology.held_areas(mesh), vert),
     "closed": int(mesh.closed),
     "volume0": topology.volume(mesh.rest, mesh.elem) if mesh.closed else 0.0,
+    "unheld": int(not (config.held or config.carrier or mesh.spare or pinned.any())),
     "stride": 0,
     "mesh": np.zeros(0, np.int32),
     "shortest": 0.0 if mesh.spare else topology.shortest(mesh),

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from scipy.spatial import KDTree
 
-from . import config as configuration
 from . import tets
 from .config import Config
 from .geometry.fill import vertex_volumes, volumes
@@ -60,13 +59,21 @@ def nearest_triangle(mesh: Mesh) -> np.ndarray:
   return np.asarray(middle.query(mesh.rest[mesh.tet].mean(axis=1))[1])
 
 
+def lame_solid(young: np.ndarray, poisson: float) -> tuple[np.ndarray, np.ndarray]:
+  """Returns the Lame constants mu, lambda of a solid [Pa].
+
+  mu = E / (2 (1 + nu)), lambda = E nu / ((1 + nu) (1 - 2 nu)).
+  """
+  return young / (2 * (1 + poisson)), young * poisson / ((1 + poisson) * (1 - 2 * poisson))
+
+
 def moduli(mesh: Mesh, config: Config) -> tuple[np.ndarray, np.ndarray]:
   """Returns mu and lambda of each tetrahedron [Pa], (ntet,) each.
 
   Those of the energy in `energy.solid`: small strains have the Lame constants 3/4 mu and lambda
   (Smith et al. 2018, section 3.4, where 5/8 mu is counted as part of lambda).
   """
-  shear, lame = configuration.lame_solid(young(mesh, config), config.poisson)
+  shear, lame = lame_solid(young(mesh, config), config.poisson)
   return 4 / 3 * shear, lame
 
 
@@ -83,7 +90,7 @@ def iterations(mesh: Mesh, config: Config, mass: np.ndarray, gain: float) -> int
     mass: of each node [kg], (nvert,)
     gain: factor of K in the matrix of a step [s^2]
   """
-  lame = configuration.lame_solid(young(mesh, config), config.poisson)[1]
+  lame = lame_solid(young(mesh, config), config.poisson)[1]
   stiffness = lame * volumes(mesh.rest, mesh.tet)
   share = stiffness[:, None] * (gradients(mesh) ** 2).sum(axis=2)
   nodal = np.bincount(mesh.tet.ravel(), share.ravel(), mesh.nvert)

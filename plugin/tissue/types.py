@@ -134,6 +134,7 @@ class Shape:
   nedgeslice: int  # slices of their edges; 0 but for solids
   nslot: int  # rows of stiffness blocks
   closed: int  # whether the surface encloses a volume
+  unheld: int  # whether nothing holds the organ, nor cuts part it, so that it may spin
   stride: int  # words from a mesh to the next, where worlds have their own, see `meshes`
   volume0: float  # rest volume [m^3]; 0 for an open surface
   shortest: float  # no edge is shorter at rest [m]; 0 where cuts may come
@@ -209,6 +210,7 @@ class State:
   hold: floats("nworld", "nholdslice", 6, 8)  # what springs in `force_ext` weigh on dv [kg]
   dvel: vector  # change of velocity in this step [m/s]
   dvel_warm: vector  # what those of the last steps lead to, where PCG starts [m/s]
+  expected: floats("nworld")  # b^T Mhat^-1 b, for the impulses b that a response is to [J]
 
 
 @struct
@@ -249,6 +251,7 @@ class System:
   t: vector  # A times z; smoother's direction and residual
   partial: floats("nworld", "nword", 4)  # what the blocks of a world exchange
   status: floats("nworld", 4)  # PCG iterations, relative residual, norm of rhs, 1 if not finite
+  ratio: floats("nworld")  # b^T Mhat^-1 b over b^T A^-1 b, see `relaxation`
 
 
 @struct

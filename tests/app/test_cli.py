@@ -47,6 +47,23 @@ def test_every_command_has_help(capsys):
     assert f"usage: palpate {' '.join(words)}" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(
+  ("words", "usage"),
+  [
+    (["fit", "data.csv", "--radius", "0.005", "-x"], "usage: palpate fit "),
+    (["run", "press", "-x"], "usage: palpate run press "),
+    (["--colour", "doctor"], "usage: palpate "),
+  ],
+)
+def test_an_unknown_option_shows_the_usage_of_its_command(capsys, words, usage):
+  with pytest.raises(SystemExit) as end:
+    cli.main(words)
+  said = capsys.readouterr().err
+  assert end.value.code == 2
+  assert said.startswith(usage), said
+  assert "unrecognized arguments: -" in said
+
+
 @pytest.mark.parametrize("words", [["--help"], ["run", "press", "--help"], ["exercise", "--list"]])
 def test_a_reader_that_has_enough_is_no_error(words):
   reader, writer = os.pipe()

@@ -1,5 +1,7 @@
 """`palpate fit`: constants come back, with honest intervals; what is wrong is named."""
 
+import dataclasses
+import functools
 import json
 import os
 import re
@@ -12,6 +14,7 @@ import numpy as np
 import palpate
 import pytest
 from palpate.app import cli, fitting, indentation, measured
+from palpate.app.console import CommandError
 from palpate.tissue import config
 
 palpate.register()
@@ -65,7 +68,7 @@ def test_constants_of_simulated_data_come_back(tmp_path, capsys, test, words):
   for name in ("young", "damping"):
     found = about["constants"][name]
     assert found["value"] == pytest.approx(TRUE[name], rel=0.02)
-    assert 0.001 * TRUE[name] < found["high"] - found["low"] < 0.1 * TRUE[name]
+    assert 0.08 * TRUE[name] < found["high"] - found["low"] < 0.3 * TRUE[name]
     assert found["low"] < found["value"] < found["high"]
     assert re.search(rf"^{name} .*95 %", shown.out, re.M)
   assert about["residual"] == pytest.approx(0.02 * record.force.max(), rel=0.1)
@@ -77,19 +80,79 @@ def test_constants_of_simulated_data_come_back(tmp_path, capsys, test, words):
   assert float(texts["young"]) == pytest.approx(about["constants"]["young"]["value"], rel=1e-4)
 
 
-def test_young_and_poisson_are_not_told_apart_by_one_press():
-  depth = np.linspace(0, 0.002, 100)
-  noise = 1e-4 * np.random.RandomState(0).standard_normal(100)
+GRID = 0.05  # of a constant's logarithm
 
-  def hertz(values):
-    return 4 / 3 * values["young"] / (1 - values["poisson"] ** 2) * np.sqrt(0.006 * depth**3)
 
-  free = [fitting.constant("young", 6000.0), fitting.constant("poisson", 0.3)]
-  found = fitting.fit(free, hertz, hertz(TRUE) + noise)
-  assert found.alike == [("young", "poisson")]
-  found = fitting.fit(free[:1], lambda values: hertz(TRUE | values), hertz(TRUE) + noise)
-  assert not found.alike
-  assert found.values["young"] == pytest.approx(TRUE["young"], rel=0.01)
+@functools.cache
+def coarse(other):
+  """Returns the fit's own model of a coarse block, of Young's modulus and one other constant.
+
+  Forces are linear in the modulus where inertia is small, and between simulations on a grid of the
+  other constant: a simulation serves many records.
+  """
+  time = np.linspace(0, 0.3, 60)
+  way = measured.Record(time, 0.0025 * np.clip(time / 0.2, 0, 1), np.ones_like(time))
+  model = indentation.Indentation(dataclasses.replace(TEST, edge=0.006, step=0.005), way)
+
+  @functools.cache
+  def of(k):
+    value = TRUE[other] * np.exp(GRID * k)
+    return model.force(TRUE | {other: min(value, 0.495)})
+
+  def simulate(values):
+    at = np.log(values.get(other, TRUE[other]) / TRUE[other]) / GRID
+    k = int(np.floor(at))
+    return values["young"] / TRUE["young"] * ((k + 1 - at) * of(k) + (at - k) * of(k + 1))
+
+  return simulate
+
+
+@pytest.mark.parametrize("count", [10, pytest.param(100, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+  ("names", "kept"), [(("young", "poisson"), {"poisson"}), (("young", "damping"), set())]
+)
+def test_intervals_of_noisy_records_hold_the_truth(names, kept, count):
+  simulate, random = coarse(names[1]), np.random.RandomState(0)
+  true, hits = simulate(TRUE), 0
+  starts = {"young": 5000.0, "damping": 0.01, "poisson": TRUE["poisson"]}
+  for _ in range(count):
+    record = true + 0.05 * true.max() * random.standard_normal(true.size)
+    found = fitting.fit([fitting.constant(n, starts[n]) for n in names], simulate, record)
+    assert set(found.kept) == kept
+    hits += all(found.low[n] < TRUE[n] < found.high[n] for n in found.values)
+    assert found.high["young"] < 1.3 * found.low["young"]
+  assert hits >= 0.9 * count
+
+
+@pytest.mark.parametrize("start", [0.3, 0.45])
+def test_poisson_of_one_press_is_kept_wherever_it_starts(start):
+  simulate = coarse("poisson")
+  free = [fitting.constant("young", 6000.0), fitting.constant("poisson", start)]
+  for noise in (0.0, 0.05):
+    random = np.random.RandomState(1)
+    true = simulate(TRUE)
+    record = true + noise * true.max() * random.standard_normal(true.size)
+    assert fitting.fit(free, simulate, record).kept == {"poisson": pytest.approx(start)}
+
+
+def test_the_command_names_what_the_data_do_not_determine(tmp_path, capsys, record):
+  data, out = written(tmp_path / "data.csv", record), tmp_path / "out"
+  free = ["--free", "young", "poisson", "--set", "damping=0.02", "--set", "poisson=0.4"]
+  code, shown = run(capsys, data, *WORDS, *free, "-o", out)
+  assert code == 0, shown.err
+  assert re.search("do not determine poisson: it is kept at 0.4, .* --set poisson=VALUE", shown.err)
+  assert re.search(r"^poisson +0.4, kept", shown.out, re.M)
+  about = json.loads((out / "fit.json").read_text())
+  assert (about["undetermined"], about["known"]["poisson"]) == (["poisson"], 0.4)
+  assert list(about["constants"]) == ["young"]
+
+
+def test_a_press_that_depends_on_no_constant_is_refused():
+  with pytest.raises(CommandError, match="the data determine none of damping, foundation"):
+    free = [fitting.constant("damping"), fitting.constant("foundation")]
+    fitting.fit(free, lambda _: np.ones(20), np.ones(20) + 0.01 * np.arange(20))
+  with pytest.raises(CommandError, match="2 rows for 2 constants"):
+    fitting.fit(free, lambda _: np.ones(2), np.ones(2))
 
 
 def test_intervals_hold_what_they_promise():
@@ -97,7 +160,8 @@ def test_intervals_hold_what_they_promise():
   hits = 0
   for _ in range(200):
     measured_force = 3.0 * x + 0.05 * random.standard_normal(200)
-    one = fitting.fit([fitting.constant("young", 2.0)], lambda v: v["young"] * x, measured_force)
+    free = [fitting.constant("young", 2.0)]
+    one = fitting.fit(free, lambda v: v["young"] * x, measured_force, mesh=0.0, rough=0.0)
     hits += one.low["young"] < 3.0 < one.high["young"]
   assert 180 <= hits <= 199  # 95 %, and chance
 
@@ -148,6 +212,7 @@ BAD = {
   "twice": ("time [s],t [s],force [N]", "is a second time"),
   "word": ("time [s],depth [mm],force [N]\n0,0,none", "line 2: force is 'none', expected a finite"),
   "few": ("time [s],depth [mm],force [N]\n0,0,0", "1 rows, expected at least 10"),
+  "long": (f"time [s],depth [mm],force [N]\n0,0,{'1' * 200_000}", "cannot be read: field larger"),
   "short": ("time [s],depth [mm],force [N]\n0,0", "line 2: force is '', expected"),
 }
 
@@ -209,7 +274,7 @@ def test_an_option_that_is_wrong_is_named(tmp_path, capsys, words, match):
 
 def test_ctrl_c_keeps_the_best_so_far(tmp_path, record):
   data, out = written(tmp_path / "data.csv", record), tmp_path / "out"
-  slow = [*WORDS[:-1], "0.0001"]  # for half a minute
+  slow = [*WORDS[:-1], "0.00002"]  # for minutes
   code = "import sys; from palpate.app import cli; sys.exit(cli.main(sys.argv[1:]))"
   with subprocess.Popen(
     [sys.executable, "-c", code, "fit", data, *slow, "--out", str(out)],

@@ -86,6 +86,14 @@ def test_what_is_wrong_is_said_in_one_line(tmp_path, wrap, options, words):
   assert not (tmp_path / "out").exists()
 
 
+def test_constants_that_do_not_compile_are_said_in_one_line(tmp_path, capsys):
+  mesh = _mesh(tmp_path / "ball.obj")
+  code = cli.main(["wrap", str(mesh), "-o", str(tmp_path / "out"), "--young", "1e30"])
+  said = capsys.readouterr().err
+  assert code == 1 and "does not compile: organ " in said
+  assert said.count("\n") == 1
+
+
 def test_a_missing_file_is_named(tmp_path, wrap):
   code, _, said = wrap(tmp_path / "none.obj", "-o", tmp_path)
   assert code == 2 and "none.obj" in said

@@ -5,7 +5,7 @@ import numpy as np
 import palpate
 import palpate.batch
 import pytest
-from scenes import RADIUS, drive, load, needs_cuda, press, probed
+from scenes import RADIUS, drive, load, masses, needs_cuda, press, probed
 
 BACKENDS = [
   "cpu",
@@ -138,6 +138,19 @@ def test_a_world_goes_out_to_the_plugin_and_back(make, window):
   np.testing.assert_allclose(batch.qpos.numpy()[0, -2:], data.qpos[-2:], atol=1e-7)
   np.testing.assert_allclose(batch.organ("organ").xvel.numpy()[0], organ.xvel, atol=1e-7)
   assert np.isfinite(alone).all()
+
+
+@pytest.mark.parametrize("h", [1e-3, 5e-3])
+def test_a_spinning_organ_keeps_its_angular_momentum(make, h):
+  _, data, organ = load(scene := probed(keys={"foundation": 0}, h=h))
+  batch, mass = make(scene, 2), masses(organ)[:, None]
+  organ.set_state(organ.xpos, np.cross([1.0, 2.0, 6.0], organ.xpos))
+  batch.set_state(1, data)
+  before = (mass * np.cross(organ.xpos, organ.xvel)).sum(axis=0)
+  batch.step(round(1 / h))
+  x, v = (getattr(batch.organ("organ"), name).numpy()[1] for name in ("xpos", "xvel"))
+  after = (mass * np.cross(x, v)).sum(axis=0)
+  np.testing.assert_allclose(after, before, atol=2e-3 * np.linalg.norm(before))
 
 
 def test_each_world_has_a_tissue_of_its_own(make):

@@ -18,7 +18,7 @@ def find(
 ):
   i = wp.tid()
   far, x, n = cylinder.touch(
-    wp.vec3(0.01, 0.02, 0.03), axes[i], wp.vec3(0.0025, 0.006, 0.0), 1.0,
+    wp.vec3(0.01, 0.02, 0.03), axes[i], wp.vec3(0.0025, 0.006, 0.0), 1.0, 0.0,
     corner[i, 0], corner[i, 1], corner[i, 2],
   )  # fmt: skip
   dist[i] = far
@@ -63,4 +63,18 @@ def test_a_cylinder_is_as_far_as_the_nearest_point_of_a_triangle():
   np.testing.assert_allclose(beyond(found)[apart], dist.numpy()[apart], atol=1e-6)
   back = found - dist.numpy()[:, None] * np.einsum("ic,icd->id", normal.numpy(), axes)
   np.testing.assert_allclose(beyond(back)[apart], 0, atol=2e-6)  # the normal leads to the cylinder
-  assert (dist.numpy()[nearest < -1e-4] < 0).all()
+  # What is under a flat end has its contact in the middle of that, which may be just off it.
+  assert (dist.numpy()[nearest < -1e-4] < 0.01 * RADIUS).all()
+
+
+def test_what_lies_flat_under_an_end_is_touched_in_its_middle():
+  depth, small = 1e-4, 2e-4 * np.array([[1, 0, 0], [-0.5, 0.8, 0], [-0.5, -0.8, 0]])
+  corner = CENTRE + small + np.array([0.0003, -0.0002, HALF - depth])
+  dist = wp.zeros(1, dtype=float, device="cpu")
+  point, normal = (wp.zeros(1, dtype=wp.vec3, device="cpu") for _ in range(2))
+  inputs = [wp.array(corner[None], dtype=wp.vec3, device="cpu")]
+  inputs += [wp.array(np.eye(3)[None], dtype=wp.mat33, device="cpu"), dist, point, normal]
+  wp.launch(find, dim=1, inputs=inputs, device="cpu")
+  np.testing.assert_allclose(dist.numpy(), -depth, atol=1e-8)
+  np.testing.assert_allclose(point.numpy()[0], corner.mean(axis=0), atol=1e-7)
+  np.testing.assert_allclose(normal.numpy()[0], [0, 0, 1], atol=1e-7)

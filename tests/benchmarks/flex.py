@@ -26,12 +26,12 @@ import mujoco_warp as mjw
 import numpy as np
 import palpate.batch
 import warp as wp
-from benchmarks import batch, peer, plots, results, solids
+from benchmarks import batch, peer, plots, results
 from benchmarks.runner import Bench, Case, Row
 
 TOLERANCES = {"flex": (1e-6, 1e-4), "ours": (1e-3, 1e-2)}  # float32 has no finer ones
 STEPS = (1e-3, 2e-3, 4e-3)  # [s]
-KINDS = ("bending", "solid")  # of `peer`, whose skin that only stretches gives way under the ball
+KINDS = ("bending", "solid")  # of `peer`
 LEVELS = (0.05, 0.02, 0.01)  # of the errors that rates are compared at
 TIMED, BLOCK = 20, 5  # steps
 # Of a world of mujoco_warp's. The ball has 6 candidates, of which 1 or 2 become contacts.
@@ -55,7 +55,7 @@ class Flex:
 
   def __init__(self, kind: str, nodes: int, h: float, tolerance: float, nworld: int, device: str):
     self.h, self.nworld, self.device = h, nworld, wp.get_device(device)
-    model = mujoco.MjModel.from_xml_string(_mjcf("peer", kind, nodes, h, tolerance))
+    model = peer.model(_level(nodes), "peer", kind, tolerance, h)
     model.opt.tolerance = tolerance
     with wp.ScopedDevice(self.device):
       self.model = mjw.put_model(model)
@@ -104,7 +104,7 @@ class Ours:
 
   def __init__(self, kind: str, nodes: int, h: float, tolerance: float, nworld: int, device: str):
     self.h, self.nworld = h, nworld
-    spec = mujoco.MjSpec.from_string(_mjcf("window", kind, nodes, h, tolerance))
+    spec = mujoco.MjSpec.from_string(peer.mjcf(_level(nodes), "window", kind, tolerance, h))
     self.batch = palpate.batch.make(spec, nworld, device)
 
   def step(self, places: np.ndarray, count: int = 1):
@@ -131,15 +131,15 @@ class Ours:
 SIDES = {"flex": Flex, "ours": Ours}
 
 
-def _mjcf(side: str, kind: str, nodes: int, h: float, tolerance: float) -> str:
-  return peer.mjcf(round(math.log((nodes - 2) / 10, 4)), side, kind, tolerance, h)
+def _level(nodes: int) -> int:
+  return round(math.log((nodes - 2) / 10, 4))
 
 
 def press(worlds: Flex | Ours) -> np.ndarray:
   """Presses the balls in; returns the force at the ends of steps, from 0 on [N]."""
   forces = [0.0]
-  for k in range(round(solids.DURATION / worlds.h)):
-    worlds.step(np.full(worlds.nworld, solids.place(k, worlds.h)))
+  for k in range(round(peer.DURATION / worlds.h)):
+    worlds.step(np.full(worlds.nworld, peer.place(k, worlds.h)))
     forces.append(worlds.force)
   return np.array(forces)
 
@@ -149,7 +149,7 @@ def exact(side: str, kind: str, nodes: int, device: str, h: float) -> np.ndarray
   """Returns the force that this side's smallest steps have [N]."""
   if side == "flex":
     return press(Flex(kind, nodes, h, TOLERANCES["flex"][0], 1, device))
-  run = solids.Run(nodes, "window", h, 1e-6, kind=kind)
+  run = peer.Run(kind, nodes, "window", h, 1e-6)
   run.finish()
   return run.force
 
@@ -162,14 +162,14 @@ def measure(
   few = SIDES[side](kind, nodes, h, tolerance, min(nworld, 4), device)
   made = time.perf_counter() - start
   force = press(few)
-  smallest = (1 if nodes > 162 else 8) * solids.FINEST
-  off = solids.error(force, exact(side, kind, nodes, device, smallest))
+  smallest = (1 if nodes > 162 else 8) * peer.FINEST
+  off = peer.error(force, exact(side, kind, nodes, device, smallest))
   free = target.free_memory if target.is_cuda else math.nan
   worlds = SIDES[side](kind, nodes, h, tolerance, nworld, device)
   worlds.follow(few)
   wp.synchronize_device(target)
   used = free - target.free_memory if target.is_cuda else math.nan
-  deep = solids.place(solids.DURATION / h, h)
+  deep = peer.place(peer.DURATION / h, h)
   times = []
   for k in range(TIMED // BLOCK):
     back = 0.001 * (k % 2 == 0) * np.linspace(1.0, 0.9, nworld)

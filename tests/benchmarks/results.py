@@ -8,6 +8,7 @@ import json
 import os
 import pathlib
 import platform
+import subprocess
 from collections.abc import Iterable
 
 FOLDER = pathlib.Path(__file__).parent / "results"
@@ -131,6 +132,7 @@ def machine() -> dict:
   cuda = [device.name for device in warp.get_cuda_devices()] if warp.is_cuda_available() else []
   return {
     "palpate": __version__,
+    "commit": _commit(),
     "mujoco": mujoco.__version__,
     "warp": warp.__version__,
     "numpy": numpy.__version__,
@@ -141,6 +143,15 @@ def machine() -> dict:
     "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
     "cuda": cuda,
   }
+
+
+def _commit() -> str:
+  """Returns the state of the code, with `-dirty` if it has changes; empty without git."""
+  command = ["git", "-C", str(FOLDER), "describe", "--always", "--dirty", "--exclude=*"]
+  try:
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+  except (OSError, subprocess.CalledProcessError):
+    return ""
 
 
 def notes(path: pathlib.Path) -> dict:
@@ -156,7 +167,8 @@ def note(path: pathlib.Path, about: dict):
 
 def caption(about: dict) -> str:
   """Returns the line of a page that says what it was measured with, as far as that is known."""
-  words = [f"{name} {about[name]}" for name in ("palpate", "mujoco", "warp") if name in about]
+  names = ("palpate", "commit", "mujoco", "warp")
+  words = [f"{name} {about[name]}" for name in names if about.get(name)]
   words += [f"Python {about['python']}"] if "python" in about else []
   words += [about[name] for name in ("cpu",) if name in about] + about.get("cuda", [])[:1]
   words += [f"{about['cores']} cores"] if "cores" in about else []
@@ -174,8 +186,12 @@ def page(path: pathlib.Path, title: str, about: dict, lines: list[str]) -> pathl
   """
   command = f"    python tests/benchmarks/run.py {about.get('bench', path.stem)}"
   command += " --short" if about.get("short") else ""
-  options = {k: v for k, v in about.get("options", {}).items() if k in ("device",) and v != "cpu"}
-  command += "".join(f" --{key} {value}" for key, value in options.items())
+  options = about.get("options", {})
+  command += "".join(
+    f" --{key} {options[key]}"
+    for key in ("device", "beside")
+    if options.get(key, "None") not in ("None", "cpu")
+  )
   known = [word for line in (caption(about), command) if line for word in (line, "")]
   text = "\n".join([f"# {title}", "", *known, *lines]).rstrip("\n") + "\n"
   before = path.read_text(encoding="utf-8") if path.exists() else ""

@@ -168,12 +168,25 @@ def build(
 
 
 def _adjust(model: mujoco.MjModel, mesh: Mesh, tissue: Tissue, scheme: str, lumped: bool):
-  """Writes what MJCF has no words for: masses by area, and the foundation of the native flex."""
+  """Writes what MJCF has no words for: masses by area, and constants of the native flex."""
   if lumped:
     bodies = model.dof_bodyid[node_dofs(model, mesh.nvert)[:, 0]]
     model.body_mass[bodies] = masses(mesh, tissue)[: mesh.nvert]
     mujoco.mj_setConst(model, mujoco.MjData(model))
-  if scheme == NATIVE and tissue.foundation:
+  if scheme == NATIVE:
+    finish(model, mesh, tissue)
+
+
+def finish(model: mujoco.MjModel, mesh: Mesh, tissue: Tissue):
+  """Writes what MJCF has no words for into a model with a flex of MuJoCo's own.
+
+  It gets the foundation as stiffness and damping of its joints. MuJoCo 3.17 bends with the shear
+  modulus that `native` gives it for stretch, four times that of the tissue; it gets the rigidity of
+  a plate, E t^3 / (12 (1 - nu^2)), which 4.0 has.
+  """
+  if mujoco.__version__ < "4":
+    model.flex_bending[:] /= 3 * (1 - tissue.poisson)
+  if tissue.foundation:
     dofs = node_dofs(model, mesh.nvert)
     gain = tissue.foundation * topology.vertex_areas(mesh.rest, mesh.elem)
     model.jnt_stiffness[model.dof_jntid[dofs]] = gain[:, None]
@@ -211,7 +224,8 @@ def _organ(
 def native(young: float, poisson: float, thickness: float, damping: float, bend: float) -> str:
   """Returns MuJoCo's elasticity of a flex with these constants.
 
-  MuJoCo 3.17 stretches softer than documented: there others reach the documented ones; see 4.0.
+  MuJoCo 3.17 stretches softer than documented: there others reach the documented ones, see 4.0;
+  `finish` puts bending right.
   """
   if mujoco.__version__ < "4":
     young, poisson = 4 * young * (1 + poisson / 2) / (1 + poisson), poisson / 2

@@ -326,6 +326,11 @@ def test_thesis_bench_measures_every_scheme(tmp_path):
     assert min(held) > 0.01 and abs(mine[-1]["force_N"]) < 0.1 * max(held)
   page = (tmp_path / "thesis.md").read_text()
   assert "(611)" in page and "0 are gone" in page
+  for row in rates:
+    row["diverged"] = int(row["scheme"] == "explicit")
+  page = thesis.summarize(rows)
+  assert "| explicit | cpu | - |" in page and "| implicit | cpu | - |" not in page
+  assert "Not stable at 1 ms: explicit on cpu at 16 x 16." in page[-1]
 
 
 def test_skipping_bench_gives_a_row_to_every_feature(tmp_path):

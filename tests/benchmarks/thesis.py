@@ -225,6 +225,11 @@ _COLOURS = {
 }  # fmt: skip
 
 
+def _stable(rows: list[Row]) -> list[Row]:
+  """Returns the rows of the tables whose run did not diverge: others have no rate."""
+  return [r for r in rows if r["kind"] == "rate" and not r["diverged"]]
+
+
 def _rates(rows: list[Row], out: pathlib.Path) -> pathlib.Path:
   figure, axes = plots.grid(1, 2, width=9.0, height=4.0)
   for ax, key, then, label in (
@@ -232,7 +237,7 @@ def _rates(rows: list[Row], out: pathlib.Path) -> pathlib.Path:
     (axes[1], "step_ms", INTEGRATION, "integration [ms]"),
   ):
     for which, colour in _COLOURS.items():
-      mine = [r for r in rows if r["kind"] == "rate" and (r["scheme"], r["device"]) == which]
+      mine = [r for r in _stable(rows) if (r["scheme"], r["device"]) == which]
       mine.sort(key=lambda r: r["nodes"])
       if mine:
         ax.plot([r["nodes"] for r in mine], [r[key] for r in mine], "o-", ms=4, color=colour,
@@ -285,7 +290,7 @@ def _traces(rows: list[Row], out: pathlib.Path) -> pathlib.Path:
 
 def summarize(rows: list[Row]) -> list[str]:
   """Returns the page: each table of the thesis with today's figures beside it."""
-  rates = {(r["scheme"], r["device"], r["side"]): r for r in rows if r["kind"] == "rate"}
+  rates = {(r["scheme"], r["device"], r["side"]): r for r in _stable(rows)}
   traces = [r for r in rows if r["kind"] == "trace"]
   lines = [
     "",
@@ -294,7 +299,7 @@ def summarize(rows: list[Row]) -> list[str]:
     "A haptic cycle is a whole `mj_step` with a window under the tool, which a hand presses 8 mm "
     "into an organ of 1.2 kg through a virtual coupling. Means of 10,000 cycles (1000 at 256 x "
     f"256) and of {REPLAYS} replays of a part, +- their standard deviation; on the CPU of the "
-    "thread's own time. "
+    "thread's own time. A run that diverges has no figures (`-`). "
     "[thesis_cpu.csv](thesis_cpu.csv), [thesis_cuda.csv](thesis_cuda.csv).",
     "",
     *_tables(rates),
@@ -303,7 +308,7 @@ def summarize(rows: list[Row]) -> list[str]:
   held = [r for r in traces if 300 <= r["cycle"] < 500 and not r["diverged"]]
   gone = sum(abs(r["force_N"]) < 1e-3 for r in held)
   names = sorted({f"{r['scheme']} on {r['device']} at {r['side']} x {r['side']}"
-                  for r in [*rates.values(), *traces] if r["diverged"]})  # fmt: skip
+                  for r in rows if r["diverged"]})  # fmt: skip
   behind = [
     f"{r[key]:.3g} {unit} for {was[k[:2]][k[2]]:g} ({k[0]} on {k[1]}, {k[2]} x {k[2]})"
     for k, r in rates.items()

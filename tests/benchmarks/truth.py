@@ -11,8 +11,10 @@ end and the surface, 1 mm thick, meet as a sphere of 3.5 mm: the reference is a 
 measured modulus with edges of 1.5 mm under such a sphere, as deep from the first touch on, by the
 rows above within some 5 % itself; beside it solids, and the shipped skins, whose foundation stands
 for their inside. `mesh`: those skins with fewer triangles, even ones and with `fine` ones where the
-probe goes, over 16,000 nodes, all with contacts as firm as those of `fine`; and as they ship, whose
-contacts are softer the lighter their nodes are.
+probe goes, over 16,000 nodes, with contacts as firm as those of `fine` and as they ship.
+`small`: a ball on a block, over Hertz's layer, and on a skin with a foundation, over one with edges
+of a quarter, on a node and between nodes; and its greatest force over the least where it slides on
+over an edge, as deep and without friction.
 """
 
 from __future__ import annotations
@@ -36,9 +38,12 @@ SIZE, RADIUS = (0.08, 0.08, 0.04), 0.04  # of the block and the sphere [m]
 # force than Hertz's, on fine meshes too.
 DEPTHS = (1.25e-4, 2.5e-4, 5e-4)
 EDGES = (1.0, 2.0, 3.0, 4.0)  # in the contact's radius at the middle depth
+SMALL = (0.25, 0.5, 1.0, 2.0)  # the same, of a contact that is small for the mesh
+PLACES = {"on a node": (1, 0, 0), "on an edge": (0.5, 0.5, 0), "between nodes": (1 / 3,) * 3}
 PROBE = 0.0035  # [m], the radius of the shipped probe and of the flexes
 FINE = 0.0015  # edges of the organs that are the reference [m]
 NODES = 1000  # of the others
+FLEX = 0.0005  # radius of the flex under the small ball [m]
 SHIPPED = {
   "skin on foundation": {},
   "skin on foundation, 3 mm under the probe": {"coupling": "window", "fine": 3e-3},
@@ -51,7 +56,7 @@ ORGAN_DEPTHS = (2e-3, 4e-3)  # of the probe's tip under the vertices [m]
 # Nodes, and edges under the probe [m] or None for even triangles; the last is the reference.
 MESHES = ((250, None), (1000, None), (4000, None), (1000, 3e-3), (1000, 2e-3), (16000, None))
 ALLOWED = {"hertz": 3.0, "elements": 3.0, "bar": 3.0, "cantilever": 5.0, "lame": 5.0, "mesh": 5.0,
-           "organ": 10.0}  # fmt: skip
+           "organ": 10.0, "small": 5.0}  # fmt: skip
 _COLUMNS = ("kind", "what", "edges", "nodes", "depth_mm", "reference", "ours", "unit", "error")
 
 # What was published and what stands in the way of a row above: (source, what it has, why not).
@@ -118,6 +123,11 @@ def stages(args: argparse.Namespace) -> list[list[Case]]:
       {"case": f"organ {name}", "kind": "organ", "organ": name} for name in ("liver", "kidney")
     ]
   cases += [
+    {"case": f"small {kind} {edges:g}", "kind": "small", "tissue": kind, "edges": edges}
+    for kind in ("solid", "skin")
+    for edges in ((0.5,) if args.short else SMALL)
+  ]
+  cases += [
     {"case": f"press {edges:g}", "kind": "press", "edges": edges}
     for edges in (EDGES[:1] if args.short else EDGES[::-1])
   ]
@@ -145,6 +155,8 @@ def run(case: Case, out: pathlib.Path) -> list[Row]:
     return _press(case["edges"])
   if case["kind"] == "organ":
     return _organ(case["organ"])
+  if case["kind"] == "small":
+    return _small(case["tissue"], case["edges"])
   if case["kind"] == "mesh":
     return _meshes(case["organ"], case["contact"])
   if case["kind"] == "bar":
@@ -203,6 +215,58 @@ def _press(edges: float) -> list[Row]:
     what = "sphere on a block, scikit-fem"
     rows.append(_row("elements", what, float(force), float(fine), "N", **more))
   return rows
+
+
+def _small(kind: str, edges: float) -> list[Row]:
+  """Returns rows of a ball whose contact's radius is `edges` edges, and of its sliding."""
+  edge = 0.008
+  depth = (edges * edge) ** 2 / RADIUS
+  fine = _touched(kind, edge / 4, depth, (1, 0, 0))[0] if kind == "skin" else 0.0
+  rows, more = [], {"edges": edges, "depth_mm": round(1e3 * depth, 3)}
+  for place, at in PLACES.items():
+    force, nodes, _ = _touched(kind, edge, depth, at)
+    reference = fine or hertz(RADIUS + FLEX, depth, SIZE[2])
+    what = f"ball on a {kind}, {place}"
+    rows.append(_row("small", what, force, reference, "N", nodes=nodes, **more))
+  _, nodes, slid = _touched(kind, edge, depth, (1, 0, 0), slides=edge)
+  what = f"ball sliding on a {kind}, greatest force over least"
+  return [*rows, _row("small", what, slid.max() / slid.min(), 1.0, "", nodes=nodes, **more)]
+
+
+def _touched(kind: str, edge: float, depth: float, at, slides: float = 0.0):
+  """Returns the force of a ball at a depth [N], nodes, and forces where it slides on from there."""
+  import mujoco
+  import palpate
+  from palpate.models.block import box
+
+  points, elem = box(SIZE, edge)
+  top = points[:, 2].max()
+  upper = elem[(points[elem][:, :, 2] > top - 1e-6).all(axis=1)]
+  middle = upper[np.argmin(np.linalg.norm(points[upper].mean(axis=1)[:, :2], axis=1))]
+  x, y = (np.array(at) @ points[middle])[:2]
+  keys = {"elements": "solid", "mass": 0.25, "pin": np.flatnonzero(points[:, 2] < 1e-6 - top)}
+  if kind == "skin":
+    kept, elem = np.unique(upper, return_inverse=True)
+    points, elem = points[kept], elem.reshape(-1, 3)
+    keys = {"thickness": 0.002, "foundation": 2e5, "mass": 0.05}
+  drive = '<position joint="z" kp="2e4" kv="200"/><position joint="x" kp="2e4" kv="200"/>'
+  spec = mujoco.MjSpec.from_string(f"""<mujoco><option gravity="0 0 0" timestep="0.001"
+    integrator="implicitfast" cone="elliptic"/><size memory="1G"/><worldbody>
+    <body name="tool" pos="{x} {y} {top + RADIUS + FLEX}">
+    <joint name="z" type="slide" axis="0 0 1"/><joint name="x" type="slide" axis="1 0 0"/>
+    <geom size="{RADIUS}" mass="0.5" condim="1"/></body></worldbody>
+    <actuator>{drive}</actuator></mujoco>""")
+  keys |= {"young": YOUNG, "poisson": POISSON, "damping": 0.005, "tolerance": 1e-5}
+  how = {"radius": FLEX, "contact": {"condim": 1}, "windows": {"nodes": 300}, "device": "cpu"}
+  palpate.add_organ(spec, (points, elem), "organ", **keys, **how)
+  data = mujoco.MjData(spec.compile())
+  force, slid, last = 0.0, [], 700 + round(slides / 2e-5)
+  for k in range(last):
+    data.ctrl[:] = -depth * min(1, k / 300), max(0, k - 700) * 2e-5
+    mujoco.mj_step(data.model, data)
+    force = float(data.joint("z").qfrc_constraint[0])
+    slid += [force] if k >= 700 else []
+  return force, len(points), np.array(slid)
 
 
 def hertz(radius: float, depth: float, height: float) -> float:

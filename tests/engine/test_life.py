@@ -75,7 +75,7 @@ def test_a_time_integration_that_is_chosen_later_is_checked_too(said):
   run(m, d, 3)
   m.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
   run(m, d, 3)
-  assert "integrator is RK4" in organ.error and len(said) == 1
+  assert "integrator is RK4" in organ.error and "integrator is RK4" in said[-1]
 
 
 @COUPLINGS

@@ -24,7 +24,7 @@ print(mujoco.__version__, organ.nvert, organ.error, repr(float(data.qpos[0])))
 
 def _process(scenes, tmp_path, python=sys.executable):
   path = tmp_path / "scene.xml"
-  path.write_text(scenes.press(subdivisions=1))
+  path.write_text(scenes.press(subdivisions=1, tool=0.02))
   environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
   return subprocess.run(
     [python, "-c", _SCRIPT, str(path)],

@@ -51,3 +51,24 @@ def test_looking_at_forces_twice_changes_nothing(scenes):
   mujoco.mj_forwardSkip(model, data, mujoco.mjtStage.mjSTAGE_POS, 0)
   np.testing.assert_array_equal(data.efc_pos, before[0])
   np.testing.assert_allclose(data.efc_force, before[1], atol=1e-9)
+
+
+def test_what_sticks_does_not_creep(scenes):
+  points, elem = scenes.strip(0.08, 0.04, 16, 8)
+  contact = {"condim": 3, "friction": FRICTION, "solref": "0.02 1"}
+  sheet = scenes.organ(points, elem, contact=contact, young=5e3, foundation=1e5, damping=0.005)
+  ball = f"""<body name="ball" pos="0.02 0.001 0.0105"><joint name="z" type="slide" axis="0 0 1"/>
+    <joint name="x" type="slide" axis="1 0 0"/>
+    <geom size="0.01" mass="0.2" condim="3" friction="{FRICTION}"/></body>"""
+  drive = """<actuator><motor joint="x"/><motor joint="z"/></actuator>"""
+  made = scenes.world(sheet, ball, option='cone="elliptic"', extra=drive)
+  model, data, organ = scenes.load(made)
+  places = []
+  for second in range(3):
+    while data.time < second + 1 - 1e-9:
+      pull = 0.5 * FRICTION * np.clip((data.time - 0.3) / 0.3, 0, 1)
+      data.ctrl[:] = 0.3 * pull, -0.3 * min(1, data.time / 0.2)
+      mujoco.mj_step(model, data)
+    places.append(data.joint("x").qpos[0])
+  assert organ.error is None
+  assert abs(places[2] - places[1]) < 5e-5  # 0.76 mm where friction is as soft as what presses

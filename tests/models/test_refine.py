@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from palpate.models import refine
+from palpate.models import refine, shapes
 from palpate.models.quality import angles
 from palpate.tissue.geometry import fill
 from palpate.tissue.geometry import mesh as topology
@@ -46,6 +46,25 @@ def test_tetrahedra_are_small_where_triangles_are(finer):
   assert np.median(edge[away < 0.005]) < 0.4 * np.median(edge[away > 0.02])
   assert fill.quality(solid.rest, solid.tet).min() > 0.01
   assert fill.volumes(solid.rest, solid.tet).sum() == pytest.approx(0.06 * 0.06 * 0.03)
+
+
+@pytest.mark.parametrize(
+  ("nodes", "edge"), [(250, 0.003), (250, 0.002), (1000, 0.003), (1000, 0.0014)]
+)
+def test_a_round_surface_that_was_refined_has_tetrahedra_inside(nodes, edge):
+  # Its old triangles are flat patches of several new ones: vertices in one plane, shallow folds.
+  points, elem = shapes.kidney(nodes)
+  points, elem = refine.refine(points, elem, points[points[:, 2].argmax()], 0.012, edge)
+  mesh = topology.build("kidney", points, elem)
+  solid = fill.fill("kidney", mesh)
+  assert fill.quality(solid.rest, solid.tet).min() > 0.01
+  assert fill.volumes(solid.rest, solid.tet).sum() == pytest.approx(
+    topology.volume(mesh.rest, mesh.elem), rel=1e-3
+  )
+  face = np.sort(solid.tet[:, fill.FACES].reshape(-1, 3), axis=1)
+  count = np.unique(face, axis=0, return_counts=True)[1]
+  assert (count == 1).sum() == len(elem) and count.max() == 2
+  assert len(np.unique(solid.tet)) == solid.nvert
 
 
 @pytest.mark.parametrize(

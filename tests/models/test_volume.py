@@ -1,3 +1,5 @@
+import gzip
+
 import numpy as np
 import pytest
 from palpate.models import volume as volumes
@@ -208,6 +210,46 @@ def test_labels_are_listed(tmp_path):
   save_nifti(path, labels * 0, affine)
   with pytest.raises(ValueError, match="in the volume: none"):
     volumes.wrap_volume(path)
+
+
+def test_labels_take_the_smallest_integers(tmp_path):
+  affine = GRIDS["even"]
+  for value, kind in ((3, np.uint8), (300, np.uint16), (-3, np.int8)):
+    for saved in (np.int16, np.float32):
+      save_nifti(tmp_path / "scan.nii", ellipsoid(affine, label=value).astype(saved), affine)
+      labels = volumes.read(tmp_path / "scan.nii")
+      assert labels.values.dtype == kind
+      assert [each.value for each in labels.segments] == [value]
+
+
+def test_volumes_larger_than_they_may_be_are_refused_unread(tmp_path):
+  path = tmp_path / "large.nii"
+  header = nibabel.Nifti1Header()
+  header.set_data_shape((30_000, 30_000, 30_000))
+  with path.open("wb") as file:
+    header["vox_offset"] = 352
+    file.write(header.binaryblock + bytes(4))
+  with pytest.raises(ValueError, match="declares 27000000000000 voxels, expected 1 to"):
+    volumes.read(path)
+  text = "NRRD0004\ntype: uint8\ndimension: 3\nsizes: {0} {0} {0}\nencoding: {1}\n{2}\n"
+  path = tmp_path / "large.nrrd"
+  path.write_bytes(text.format(30_000, "gzip", "").encode())
+  with pytest.raises(ValueError, match="declares 27000000000000 voxels, expected 1 to"):
+    volumes.read(path)
+  path.write_bytes(text.format(10, "gzip", "").encode() + gzip.compress(bytes(10**6)))
+  with pytest.raises(ValueError, match="holds more voxels than its header declares"):
+    volumes.read(path)
+  (tmp_path / "other").write_bytes(bytes(1000))
+  path.write_bytes(text.format(10, "raw", "data file: other\n").encode())
+  with pytest.raises(ValueError, match="its voxels are in another file"):
+    volumes.read(path)
+
+
+def test_colours_are_no_labels(tmp_path):
+  colours = np.zeros((4, 4, 4), [("R", "u1"), ("G", "u1"), ("B", "u1")])
+  nibabel.save(nibabel.Nifti1Image(colours, np.eye(4)), tmp_path / "colours.nii")
+  with pytest.raises(ValueError, match=r"colours.nii: has values of type .*, expected whole"):
+    volumes.read(tmp_path / "colours.nii")
 
 
 def test_files_that_are_no_label_maps(tmp_path):

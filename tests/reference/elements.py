@@ -11,7 +11,7 @@ import functools
 import math
 
 import numpy as np
-from palpate.tissue import config
+from palpate.tissue import solid
 from scipy import optimize
 from scipy.sparse import linalg
 
@@ -33,7 +33,7 @@ def layer(height: float, width: float, radius: float, depths, young: float, pois
   import skfem
   from skfem.helpers import dot, grad, sym_grad, trace
 
-  mu, lam = config.lame_solid(np.array(young), poisson)
+  mu, lam = solid.lame_solid(np.array(young), poisson)
 
   @skfem.BilinearForm
   def energy(u, v, w):
@@ -84,7 +84,7 @@ def cantilever(
   cells = skfem.MeshHex.init_tensor(along, half[::-1], np.unique([*half, *-half]))
   element = skfem.ElementVector(skfem.ElementHex2())
   basis = skfem.Basis(cells, element, intorder=4)
-  mu, lam = config.lame_solid(np.array(young), poisson)
+  mu, lam = solid.lame_solid(np.array(young), poisson)
   stiffness = linear_elasticity(float(lam), float(mu)).assemble(basis)
   facets = cells.facets_satisfying(lambda x: x[0] > length - 1e-9)
   end = skfem.FacetBasis(cells, element, facets=facets, intorder=4)

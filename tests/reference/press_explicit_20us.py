@@ -31,10 +31,11 @@ MJCF = """
 <size memory="200M"/>{extension}
 <worldbody>
   <flexcomp name="organ" type="direct" dim="2" mass="0.1" radius="0.0005" point="{point}" element="{element}">
-    {plugin}<contact selfcollide="none" condim="1" solref="0.004 1"/><edge damping="1e-9"/>
+    {plugin}<contact selfcollide="none" condim="1" solref="0.004 1" solimp="0.999 0.999 0.001"/><edge damping="1e-9"/>
   </flexcomp>
   <body pos="0 0 0.0565"><joint name="z" type="slide" axis="0 0 1"/>
-    <geom size="0.006" mass="0.05" condim="1" solref="0.004 1"/></body>
+    <geom size="0.006" mass="0.05" condim="1" solref="0.004 1"
+      solimp="0.999 0.999 0.001"/></body>
 </worldbody>
 <actuator><position joint="z" kp="500" kv="10"/></actuator></mujoco>"""  # noqa: E501
 

@@ -21,6 +21,7 @@ from .documents import (
   world,
 )
 from .numbers import bodies, dofs, lump, masses, qposs, slot_bodies, slots, workspace
+from .resting import resting, watch
 from .running import (
   Warnings,
   adrift,
@@ -42,7 +43,7 @@ needs_cuda = pytest.mark.skipif(not wp.is_cuda_available(), reason="needs a CUDA
 __all__ = [
   "RADIUS", "Warnings", "adrift", "ball", "beside", "bodies", "box", "contacts", "dofs", "drive",
   "flex", "follow", "force", "get", "grasp", "kernels", "load", "lump", "masses", "motion",
-  "needs_cuda", "organ", "plugin", "press", "probed", "put", "qposs", "ridge", "run", "servo",
-  "settle", "slot_bodies", "slots", "sphere", "state", "step", "strip", "triangular", "windowed",
-  "workspace", "world",
+  "needs_cuda", "organ", "plugin", "press", "probed", "put", "qposs", "resting", "ridge", "run",
+  "servo", "settle", "slot_bodies", "slots", "sphere", "state", "step", "strip", "triangular",
+  "watch", "windowed", "workspace", "world",
 ]  # fmt: skip

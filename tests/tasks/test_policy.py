@@ -1,6 +1,9 @@
 """Files of trained policies."""
 
 import dataclasses
+import json
+import os
+import struct
 
 import numpy as np
 import pytest
@@ -102,6 +105,58 @@ def test_a_file_that_is_none_is_refused(tmp_path):
   policy.save(path, made(memory=memory))
   with pytest.raises(ValueError, match=r"input has shape \(15, 3\), expected \(15, 4\)"):
     policy.load(path)
+
+
+@pytest.mark.parametrize(
+  ("changes", "said"),
+  [
+    ({"power": float("nan")}, "power is nan, expected a finite number > 0"),
+    ({"power": -3.0}, "power is -3.0, expected a finite number > 0"),
+    ({"control_timestep": "x"}, "control_timestep is 'x', expected a finite number"),
+    ({"components": 5}, "components is 5, expected a list of names"),
+    ({"observations": [1, 2]}, r"observations is \[1, 2\], expected a list of names"),
+    ({"task": ["x"]}, r"task is \['x'\], expected a text"),
+    ({"task_kwargs": "abc"}, "task_kwargs is 'abc', expected options by name"),
+  ],
+)
+def test_a_header_of_wrong_types_is_refused(tmp_path, changes, said):
+  path = tmp_path / "policy.safetensors"
+  policy.save(path, made(about=dataclasses.replace(made().about, **changes)))
+  with pytest.raises(ValueError, match=f"policy.safetensors': {said}"):
+    policy.load(path)
+
+
+@pytest.mark.parametrize("name", ["mean", "scale"])
+def test_an_input_that_is_not_normalised_by_finite_numbers_is_refused(tmp_path, name):
+  policy.save(tmp_path / "policy.safetensors", made(**{name: np.full(4, np.inf)}))
+  with pytest.raises(ValueError, match="not finite"):
+    policy.load(tmp_path / "policy.safetensors")
+
+
+def test_headers_and_arrays_that_cannot_be_read_are_refused(tmp_path):
+  path = tmp_path / "policy.safetensors"
+  for header in ("[" * 100_000, '{"a":' * 50_000):
+    save_file({"mean": np.zeros(3, np.float32)}, path, {"palpate": header})
+    with pytest.raises(ValueError, match="its header is nested too deep"):
+      policy.load(path)
+  for header in ("null", "{}"):
+    save_file({"mean": np.zeros(3, np.float32)}, path, {"palpate": header})
+    with pytest.raises(ValueError, match="it is of another version"):
+      policy.load(path)
+  for kind, count in (("BF16", 2), ("F8_E4M3", 4), ("I32", 1)):
+    array = {"dtype": kind, "shape": [count], "data_offsets": [0, 4]}
+    header = json.dumps({"mean": array, "__metadata__": {"palpate": "{}"}}).encode()
+    path.write_bytes(struct.pack("<Q", len(header)) + header + bytes(4))
+    with pytest.raises(ValueError, match=f"mean is of type {kind}, expected one of F16, F32"):
+      policy.load(path)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes here")
+def test_a_policy_that_is_no_regular_file_is_refused(tmp_path):
+  os.mkfifo(tmp_path / "pipe.safetensors")
+  for path in (tmp_path / "pipe.safetensors", tmp_path, "/dev/zero"):
+    with pytest.raises(ValueError, match="is no regular file"):
+      policy.load(path)
 
 
 SHIPPED = sorted(policy.FOLDER.glob(f"*{policy.SUFFIX}"))

@@ -105,6 +105,15 @@ def test_a_pipe_is_refused_and_not_waited_for(tmp_path):
       read(tmp_path / "pipe.npz")
 
 
+def test_a_recording_that_declares_too_much_is_refused_unread(tmp_path):
+  path = exercise(40).save(tmp_path / "large.npz")
+  with zipfile.ZipFile(path, "a") as archive:
+    archive.writestr("array.large.npy", b"")
+    archive.filelist[-1].file_size = 2**40
+  with pytest.raises(ValueError, match=r"large.npz: .*declares 10995\d+ bytes, expected at most"):
+    Recording.load(path)
+
+
 def test_truncated_files_are_refused(tmp_path):
   data = exercise(40).save(tmp_path / "whole.npz").read_bytes()
   path = tmp_path / "cut.npz"

@@ -1,11 +1,11 @@
 """Solids: tetrahedra inside a surface, against closed forms of elasticity."""
 
 import dataclasses
+import os
 
 import numpy as np
 import pytest
 from palpate.models import shapes
-from palpate.tissue import config as configuration
 from palpate.tissue import energy, solid
 from palpate.tissue.geometry import fill, gmsh
 from palpate.tissue.geometry import mesh as topology
@@ -18,7 +18,7 @@ def test_small_uniform_strains_have_the_energy_of_linear_elasticity(scenes, pois
   points, elem = scenes.box((0.1, 0.08, 0.06), 0.02)
   made = {"elements": "solid", "poisson": poisson, "young": (YOUNG,)}
   mesh, config, _ = scenes.kernels(points, elem, **made)
-  mu, lam = configuration.lame_solid(np.array(YOUNG), poisson)
+  mu, lam = solid.lame_solid(np.array(YOUNG), poisson)
   shear = np.eye(3)[[1, 2, 0]]
   for gradient in (np.diag([1e-4, 0, 0]), np.diag([1e-4, -2e-4, 3e-4]), 1e-4 * shear):
     strain = (gradient + gradient.T) / 2
@@ -271,7 +271,19 @@ def test_a_file_that_does_not_fit_is_refused(scenes, tmp_path, change, message):
     gmsh.read("organ", str(file), mesh)
 
 
-@pytest.mark.parametrize("text", ["", "$MeshFormat 4.1 1 8", "$MeshFormat 2.2 0 8 $Nodes -3"])
+TWO, FOUR = "$MeshFormat 2.2 0 8 $Nodes ", "$MeshFormat 4.1 0 8 $Nodes "
+NODE, NODES = TWO + "1 1 0 0 0 $Elements ", FOUR + "1 1 1 1 2 1 0 1 1 0 0 0 $Elements "
+MANY = 10**12
+
+
+@pytest.mark.parametrize(
+  "text",
+  ["", "$MeshFormat 4.1 1 8", f"{TWO}-3", f"{TWO}{MANY} 1 0 0 0 $Elements 0",
+   f"{NODE}{MANY} 1 15 -4 1", f"{NODE}1 1 15 -4 1", f"{NODE}1 1 15 {MANY} 1",
+   f"{FOUR}1 1 1 1 2 1 0 {MANY} 1 0 0 0 $Elements 0 0 0 0",
+   f"{FOUR}{MANY} 1 1 1 2 1 0 -1 $Elements 0 0 0 0",
+   f"{NODES}1 1 1 1 3 1 4 {MANY} 1 1 1 1 1", f"{NODES}{MANY} 1 1 1 3 1 4 -1"],
+)  # fmt: skip
 def test_a_file_that_cannot_be_read_is_refused(scenes, tmp_path, text):
   mesh = topology.build("organ", *scenes.sphere(1))
   (tmp_path / "inside.msh").write_text(text)
@@ -279,3 +291,12 @@ def test_a_file_that_cannot_be_read_is_refused(scenes, tmp_path, text):
     gmsh.read("organ", str(tmp_path / "inside.msh"), mesh)
   with pytest.raises(ValueError, match="No such file"):
     gmsh.read("organ", str(tmp_path / "other.msh"), mesh)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes here")
+def test_what_is_no_regular_file_is_refused(scenes, tmp_path):
+  mesh = topology.build("organ", *scenes.sphere(1))
+  os.mkfifo(tmp_path / "pipe.msh")
+  for file in (tmp_path / "pipe.msh", tmp_path, "/dev/zero"):
+    with pytest.raises(ValueError, match="is no regular file"):
+      gmsh.read("organ", str(file), mesh)

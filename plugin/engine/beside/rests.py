@@ -2,6 +2,7 @@
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
+import functools
 from typing import Any
 
 import numpy as np
@@ -227,14 +228,33 @@ def meet(spaces: list) -> list:
 
 
 def check(m, w):
-  """Raises ValueError where an organ names as its support what does not exist."""
-  names = _geom_names(m) + [flexes.name(m, f) for f in range(m.nflex)]
-  for name in w.config.support:
-    if flexes.resolve(name, w.organ.name, names) is None:
-      raise ValueError(
-        f"organ {w.organ.name!r}: support names {name!r}, which does not exist, expected a geom or "
-        "another organ"
-      )
+  """Looks at the names of what an organ rests on, and warns of what bears it by contacts too.
+
+  Raises:
+    ValueError: one does not exist.
+  """
+  organ, geoms = w.organ, _geom_names(m)
+  names = geoms + [flexes.name(m, f) for f in range(m.nflex)]
+  found = [flexes.resolve(name, organ.name, names) for name in organ.config.support]
+  if None in found:
+    raise ValueError(
+      f"organ {organ.name!r}: support names {organ.config.support[found.index(None)]!r}, which "
+      "does not exist, expected a geom or another organ"
+    )
+  if found:
+    meets = flexes.meeting_geoms(m, int(organ.windows.flex[0]))
+    for geom in meets:
+      if geoms[geom] in found:
+        _warn_twice(organ.name, geoms[geom])
+
+
+@functools.cache
+def _warn_twice(organ: str, geom: str):
+  """Warns once, not with each mjData."""
+  mjstruct.warn(
+    f"organ {organ!r}: geom {geom!r} bears it by support and contact, so twice; give the geom "
+    "contype and conaffinity that do not meet the organ's"
+  )
 
 
 def _geom_names(m) -> list[str]:

@@ -3,7 +3,7 @@
 The state has what tells the mesh from the whole one: corners, rest positions, masses, and a stamp
 of them. Where the stamp is not that of the arrays, a state came from outside (or a reset, a copy),
 and what differs is written into them. MuJoCo's own list of triangles is in the mjModel; it has a
-stamp too, so that several mjData of one model take turns.
+stamp too, and a number that each writing changes, so that several mjData of one model take turns.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from ..bind import bind
 from ..windows import turns
 from .tear import Tear
 
+_UNCUT = 1.0  # stands for the stamp of triangles before the first cut
 FOREIGN = "plugin_state has cuts that are not of this organ; set a state that was saved from it"
 
 
@@ -130,7 +131,8 @@ class Cuts:
     self._elem = flexes.element_data(m, w.organ.flex)
     self._border = np.flatnonzero(self.whole.twin < 0)
     self._rim = flexes.rim_data(m, w.organ.flex, len(self._border))
-    self._mark: Any = flexes.marks(m, w.organ.flex, self.whole.nelem)[-1:].data
+    self._marks = flexes.marks(m, w.organ.flex)
+    self._seen = float(self._marks[1])
 
   # What the state says.
 
@@ -186,9 +188,7 @@ class Cuts:
     self._loose = mesh.loose
     self.stamp = self._found[0] = flexes.stamp_of(self._total)
 
-  def _become(
-    self, mesh: Mesh, changed: np.ndarray, mass, source, stamp: float
-  ) -> np.ndarray:
+  def _become(self, mesh: Mesh, changed: np.ndarray, mass, source, stamp: float) -> np.ndarray:
     """Makes the organ another mesh; returns the vertices that something has changed at."""
     w = self._w
     touched = self._touched(mesh, changed)
@@ -223,17 +223,18 @@ class Cuts:
 
   # MuJoCo's triangles.
 
-  @property
-  def shown(self) -> bool:
-    """Whether the model has the triangles of this organ."""
-    return self._mark[0] == self.stamp
+  def show(self) -> bool:
+    """Gives the model the triangles of this organ; returns whether it has had others meanwhile.
 
-  def show(self):
-    """Gives the model the triangles of this organ."""
-    if not self.shown:
-      self._elem[:] = self.mesh.elem
+    The caller holds `lock`. What other mjData wrote may be like these again, but not all along.
+    """
+    own = self.stamp or _UNCUT
+    if self._marks[0] != own:
+      self._elem[:] = self.mesh.elem[: self.whole.nelem]
       self._rim[:] = np.stack([topology.corners(self.mesh, self._border, k) for k in (0, 1)], 1)
-      self._mark[0] = self.stamp
+      self._marks[:] = own, turns.new_mark()
+    was, self._seen = self._seen, float(self._marks[1])
+    return was != self._seen
 
   def draw(self, model: int, data: int):
     """Writes what is drawn besides these triangles."""
@@ -326,7 +327,8 @@ class Cuts:
     changed = topology.distinct(found.near, member)
     w.phases.carry(changed, motion.disp, motion.vel, group, member, share)
     if not w.organ.windows:  # of which MuJoCo reads triangles only where they are drawn
-      self.show()
+      with self.lock:
+        self.show()
 
   def pieces(self) -> list[Piece]:
     """Returns the parts that hang together, the largest first."""

@@ -54,12 +54,6 @@ class SolidCuts(Cuts):
     self._cleaver = cleave.Cleaver(self.whole, self.finder, room.stop - room.start)
     self.seat = np.zeros(0, np.int64)
 
-  def show(self):
-    """Gives the model the triangles of this organ's skin."""
-    if not self.shown:
-      self._elem[:] = self.mesh.elem[: self.whole.nelem]
-      self._mark[0] = self.stamp
-
   def share(self, values: np.ndarray, vert: Any = slice(None)) -> np.ndarray:
     """Returns values by mass, see `Cuts.share`; what comes from inside has them as the skin."""
     out = np.where(

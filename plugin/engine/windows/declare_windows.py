@@ -174,7 +174,10 @@ def _slots(m, what: str, window: str, flex: int, place) -> tuple[np.ndarray, ...
 
 
 def _followed(m, name: str, config: Config, flex: list[int]) -> tuple[np.ndarray, np.ndarray]:
-  """Returns the geoms of each window: those of the bodies named, or all that move and collide."""
+  """Returns the geoms of each window: those of the bodies named, or all that move and collide.
+
+  An organ that nothing holds may fall on what stands still: a window follows that too.
+  """
   bodyid = mjstruct.view(m.geom_bodyid, m.ngeom, np.int32)
   weld = mjstruct.view(m.body_weldid, m.nbody, np.int32)
   names = [mjstruct.name_of(m, m.name_bodyadr, b) for b in range(m.nbody)]
@@ -196,7 +199,7 @@ def _followed(m, name: str, config: Config, flex: list[int]) -> tuple[np.ndarray
       mine = [g for g in meets if bodyid[g] in wanted]
       _check_follow(name, config.follow[k], {int(bodyid[g]) for g in mine}, wanted)
     else:
-      mine = [g for g in meets if weld[bodyid[g]] != 0]
+      mine = [g for g in meets if weld[bodyid[g]] != 0 or not config.held]
     groups.append(mine)
   if not config.follow and len(flex) > 1:
     # A tree of bodies is one tool: a triangle between two windows would touch neither jaw.

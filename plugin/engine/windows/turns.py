@@ -28,6 +28,11 @@ _marks = map(float, itertools.count(time.time_ns() >> 10))  # never the same twi
 _locks: weakref.WeakValueDictionary[int, Any] = weakref.WeakValueDictionary()  # by model address
 
 
+def new_mark() -> float:
+  """Returns a number that no other call returns."""
+  return next(_marks)
+
+
 def lock_of(model: int):
   """Returns the lock of a model, held while what mjData take turns in is read or written."""
   return _locks.setdefault(model, threading.RLock())

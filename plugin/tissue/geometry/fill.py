@@ -4,7 +4,8 @@ Nodes inside are a body-centred cubic lattice, moved where the tetrahedra around
 middle (the centroidal relaxation of optimal Delaunay triangulations, Alliez et al. 2005,
 doi:10.1145/1073204.1073238), and all nodes are joined by Delaunay's criterion. On a surface of even
 triangles that has the surface's triangles among its faces, but for some pairs of which it has the
-other diagonal: these serve as well. Where it has neither, there is an error.
+other diagonal: these serve as well. Where it has neither, there is an error. In a flat patch, as
+`refine` makes them, flat tetrahedra lie between the two triangulations and are left out.
 """
 
 from __future__ import annotations
@@ -30,14 +31,16 @@ _COARSER = 1.7  # distance of nodes inside to that on the surface
 _FINE = 1.2  # the same where triangles are of different sizes: small ones are where forces count
 _GRADED = 1.3  # times their mean edge that those are on most of the surface
 _CLEAR = 0.8  # least distance of a node inside to the surface's, in mean edges
+_BENEATH = 0.2  # least depth, likewise, where triangles are of different sizes
 _EVEN = 1.0  # edges beneath the surface to which the distance between nodes stays,
 _WIDENS = 0.3  # and by which it grows with depth from there on,
 _WIDEST = 3.0  # at most to so many edges of the surface
 _ROUNDS = 8
 _MOVE = 0.7  # share of the way that a node goes in a round
 FLAT = 1e-3  # quality of a tetrahedron that is none
+_SHALLOW = 0.02  # that of one between two triangles that fold by some 2 degrees
 _KEPT = 16
-_VERSION = 4  # of what is kept in files: another one where tetrahedra are made otherwise
+_VERSION = 5  # of what is kept in files: another one where tetrahedra are made otherwise
 _TIE = 1e-6  # of the size's square, by which points on one sphere are told apart
 
 # Faces of a tetrahedron, each opposite the corner of its number.
@@ -123,14 +126,15 @@ def quality(point: np.ndarray, tet: np.ndarray) -> np.ndarray:
 def inside(mesh: Mesh, values: np.ndarray) -> np.ndarray:
   """Returns vectors of the surface's vertices, (nouter, 3), with those inside, (nvert, 3).
 
-  A vertex inside has the mean of those around it.
+  A vertex inside has the mean of those around it, one that waits for a cut or is no more has 0.
   """
   n = mesh.nouter
   if not len(mesh.tet):  # what else there is waits for cuts
     return np.concatenate([values, np.zeros((mesh.nvert - n, 3))])
   start, k = np.nonzero(mesh.ring >= 0)
   ones = np.ones(len(start))
-  share = sparse.csr_array((ones / mesh.degree[start], (start, mesh.ring[start, k])))
+  place, size = (start, mesh.ring[start, k]), (mesh.nvert, mesh.nvert)
+  share = sparse.csr_array((ones / mesh.degree[start], place), shape=size)
   below = share[n:]
   matrix = sparse.eye_array(mesh.nvert - n) - below[:, n:]
   within = linalg.spsolve(sparse.csc_array(matrix), below[:, :n] @ values)
@@ -207,7 +211,8 @@ def _lattice(surface: np.ndarray, triangle: np.ndarray) -> np.ndarray:
   corners = triangle.ravel()
   local = np.bincount(corners, np.repeat(length, 3)) / np.bincount(corners)
   low, high = surface.min(axis=0), surface.max(axis=0)
-  coarser = _FINE if widest > _GRADED * edge else _COARSER
+  graded = widest > _GRADED * edge
+  coarser = _FINE if graded else _COARSER
   tree, side = KDTree(surface), coarser * edge * 2 / np.sqrt(3)  # neighbours: half a diagonal
   ends = np.array([local.min(), 2.83 * _WIDEST * widest]) / edge
   levels = range(*np.rint(np.log2(ends)).astype(int))
@@ -219,11 +224,15 @@ def _lattice(surface: np.ndarray, triangle: np.ndarray) -> np.ndarray:
       corner = low + scale * side * np.stack(np.meshgrid(*map(np.arange, count), indexing="ij"), -1)
       point = np.concatenate([corner.reshape(-1, 3), corner.reshape(-1, 3) + scale * side / 2])
       distance, nearest = tree.query(point)
-      beneath = ((point - surface[nearest]) * normal[nearest]).sum(axis=1) < 0
       near = local[nearest]
+      height = ((point - surface[nearest]) * normal[nearest]).sum(axis=1)
       wanted = np.minimum(near + _WIDENS * np.maximum(distance - _EVEN * near, 0), _WIDEST * widest)
       here = np.clip(np.rint(np.log2(wanted / edge)), levels[0], levels[-1]) == level
-      parts.append(point[beneath & here & (distance > _CLEAR * scale * edge)])
+      clear = scale * edge
+      if graded:  # a point near the middle of a large triangle can be far from all vertices
+        clear = np.maximum(clear, near)
+        height += _BENEATH * near
+      parts.append(point[(height < 0) & here & (distance > _CLEAR * clear)])
     point = np.concatenate(parts)
     if len(point) <= MOST * len(surface):
       return point
@@ -269,9 +278,14 @@ def _inside(point: np.ndarray, triangle: np.ndarray, nsurface: int) -> tuple[np.
   sure = wanted[at] == _key(triangle[at], nsurface)  # others were flipped
   within = np.bincount(part[which], np.where(sure, np.sign(height), 0), count)[part] < 0
   tet = np.where((volumes(point, tet) < 0)[:, None], tet[:, [0, 2, 1, 3]], tet)
-  # A flat one on the surface has a pair of its triangles; without it they have the other diagonal.
-  flat = (np.bincount(which, minlength=len(tet)) > 1) & (quality(point, tet) <= FLAT)
-  return tet[within & ~flat], -1
+  # A flat one has a pair of the surface's triangles; without it they have the other diagonal.
+  even = quality(point, tet)
+  outer = np.bincount(which, minlength=len(tet))
+  while (flat := within & (outer > 1) & (even <= np.where(outer == 2, _SHALLOW, FLAT))).any():
+    within &= ~flat
+    beneath = neighbour[flat]
+    np.add.at(outer, beneath[beneath >= 0], 1)
+  return tet[within], -1
 
 
 def _joined(point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import numpy as np
 from scipy.spatial import KDTree
 
@@ -24,6 +26,8 @@ def read(organ: str, file: str, mesh: Mesh) -> Mesh:
     ValueError: the file cannot be read, or its tetrahedra do not fit the surface.
   """
   where = f"organ {organ!r}: tetrahedra is {file!r}"
+  if os.path.exists(file) and not os.path.isfile(file):
+    raise ValueError(f"{where}, which is no regular file, expected a Gmsh file")
   try:
     with open(file, encoding="ascii") as stream:
       point, tet = _parse(stream.read().split())
@@ -53,10 +57,10 @@ def _parse(words: list[str]) -> tuple[np.ndarray, np.ndarray]:
 
 def _lines(nodes: list[str], elements: list[str]) -> tuple[list, list, list]:
   """Returns names and places of nodes, and names of tetrahedra's corners, of version 2."""
-  rows = [nodes[k : k + 4] for k in range(1, 4 * int(nodes[0]) + 1, 4)]
+  rows = [nodes[k : k + 4] for k in range(1, 4 * _count(nodes[0], 4, nodes) + 1, 4)]
   tet, at = [], 1
-  for _ in range(int(elements[0])):
-    kind, tags = int(elements[at + 1]), int(elements[at + 2])
+  for _ in range(_count(elements[0], 3, elements)):
+    kind, tags = int(elements[at + 1]), _count(elements[at + 2], 1, elements)
     end = at + 3 + tags + _CORNERS[kind]
     if kind == _TETRAHEDRON:
       tet.append(elements[end - 4 : end])
@@ -67,8 +71,8 @@ def _lines(nodes: list[str], elements: list[str]) -> tuple[list, list, list]:
 def _blocks(nodes: list[str], elements: list[str]) -> tuple[list, list, list]:
   """Returns the same of version 4.1, where both come in blocks."""
   names, point, at = [], [], 4
-  for _ in range(int(nodes[0])):
-    count = int(nodes[at + 3])
+  for _ in range(_count(nodes[0], 4, nodes)):
+    count = _count(nodes[at + 3], 4, nodes)
     if nodes[at + 2] != "0":  # with parameters behind the places
       raise ValueError
     at += 4
@@ -76,14 +80,23 @@ def _blocks(nodes: list[str], elements: list[str]) -> tuple[list, list, list]:
     point += [nodes[k : k + 3] for k in range(at + count, at + 4 * count, 3)]
     at += 4 * count
   tet, at = [], 4
-  for _ in range(int(elements[0])):
-    kind, count = int(elements[at + 2]), int(elements[at + 3])
-    at += 4
+  for _ in range(_count(elements[0], 4, elements)):
+    kind = int(elements[at + 2])
     step = 1 + _CORNERS[kind]
+    count = _count(elements[at + 3], step, elements)
+    at += 4
     if kind == _TETRAHEDRON:
       tet += [elements[k + 1 : k + step] for k in range(at, at + step * count, step)]
     at += step * count
   return names, point, tet
+
+
+def _count(word: str, size: int, words: list[str]) -> int:
+  """Returns a count of what takes `size` words each; ValueError where there are fewer words."""
+  count = int(word)
+  if not 0 <= size * count <= len(words):
+    raise ValueError
+  return count
 
 
 # Corners of Gmsh's elements of first order: line, triangle, quadrangle, tetrahedron and so on; 15

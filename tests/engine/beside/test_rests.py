@@ -1,5 +1,7 @@
 """Organs that lie on floors, bodies and each other, are lifted, and fall back."""
 
+import warnings
+
 import mujoco
 import numpy as np
 import palpate
@@ -130,3 +132,19 @@ def test_a_saved_state_goes_on_to_the_bit(scenes):
 def test_what_cannot_bear_is_named(scenes, keys, message):
   with pytest.raises(ValueError, match=message):
     _load(scenes, _block(scenes, **keys))
+
+
+@pytest.mark.parametrize("meets", [0, 1])
+def test_what_bears_an_organ_by_contacts_as_well_is_said_once(scenes, meets):
+  spec = mujoco.MjSpec.from_string(f"""<mujoco><worldbody>
+    <geom name="slab{meets}" type="plane" size="1 1 .1" contype="{meets}" conaffinity="{meets}"/>
+    <body name="finger" mocap="true" pos="0 0 0.2"><geom size="0.005"/></body>
+  </worldbody></mujoco>""")
+  place = dict(windows=True, support=f"slab{meets}", pos=(0, 0, 0.02))
+  with warnings.catch_warnings(record=True) as said:
+    warnings.simplefilter("always")
+    palpate.add_organ(spec, scenes.sphere(2, 0.02), elements="solid", mass=0.03, **place)
+    assert not said
+    spec.compile()
+  found = [each for each in said if "'slab1' bears it by support and contact" in str(each.message)]
+  assert len(found) == meets == len(said)

@@ -104,6 +104,21 @@ def test_state_copy_and_reset_have_the_cuts_to_the_bit(windows):
     organ.nvert  # noqa: B018
 
 
+@BOTH
+def test_a_cut_solid_may_be_placed_and_put_to_rest(windows):
+  model, data, organ = scene(windows=windows)
+  for x in (-0.018, -0.009, 0.0, 0.009, 0.018):  # so many that the last vertex inside is on a wall
+    organ.cut(across(x), depth=0.02)
+  shift, speed = np.full((organ.nvert, 3), 1e-3), np.full((organ.nvert, 3), 0.01)
+  organ.set_state(organ.xpos0 + shift, speed)
+  np.testing.assert_allclose(organ.displacement, shift, atol=1e-12)
+  run(model, data, 10)
+  np.testing.assert_allclose(organ.displacement, 1e-3 + 10 * 0.01 * 2e-3, rtol=1e-4)  # rigid
+  organ.reset()
+  run(model, data, 10)
+  assert np.abs(organ.displacement).max() < 1e-9 and organ.error is None and organ.cuts
+
+
 def moving(organ):
   """Returns mass, momentum, angular momentum, and energy, of all nodes."""
   space = scenes.workspace(organ)

@@ -62,6 +62,29 @@ def test_a_blade_needs_the_toughness_times_the_thickness(windows):
   assert sum(report.length for report in reports) == pytest.approx(0.05, rel=0.05)
 
 
+@pytest.mark.parametrize(("speed", "beside"), [(0.05, 0.0), (0.1, 4e-4)])
+def test_a_blade_notches_a_free_edge_that_would_fold(speed, beside):
+  # A vertex of a fine mesh bears 0.23 N at the edge, less than cutting takes.
+  points, elem = scenes.strip(0.04, 0.05, 18, 22)
+  points[:, 1] += beside
+  pin = (np.abs(points[:, 1] - beside) > 0.0249) | (points[:, 0] > points[:, 0].max() - 1e-6)
+  spec = mujoco.MjSpec()
+  spec.option.timestep, spec.option.gravity = 1e-3, (0, 0, 0)
+  scalpel(spec, points[:, 0].min() - 0.002, 0.0)
+  given = {"mass": 0.005, "young": 2e5, "poisson": 0.4, "thickness": THICKNESS, "spare": 60}
+  given |= {"pin": np.flatnonzero(pin), "cutters": f"edge {ENERGY}", "device": "cpu"}
+  palpate.add_organ(spec, (points, elem), "organ", **given)
+  model = spec.compile()
+  data = mujoco.MjData(model)
+  organ, pushed = palpate.Organ(model, data, "organ"), 0.0
+  for _ in range(8):
+    force = scenes.follow(model, data, organ, lambda t: (speed * t, 0), 0.003 / speed)
+    pushed = max(pushed, np.abs(organ.displacement).max())
+  assert pushed < 0.004 and len(organ.cuts) > 2
+  assert organ.cutters[0].length == pytest.approx(0.022, abs=0.002)
+  assert force[:, 0].mean() == pytest.approx(FORCE, rel=0.05)
+
+
 def test_the_blade_feels_what_the_tissue_feels():
   model, data, organ = scene()
   scenes.follow(model, data, organ, lambda t: (0.04 * t, 0), 0.5)
