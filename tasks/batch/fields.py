@@ -58,26 +58,12 @@ class Common:
   sensor_mean: floats("nworld", "nsensordata")
   failures: ints("nworld")
   xpos: floats("nworld", "nvert", 3)
-  # Of an organ that has grown on to something, its bonds.
-  bond_vert: ints("nbond")  # vertex of each
-  bond_area: floats("nbond")  # share of the area
-  bond_damage: floats("nworld", "nbond")
-  bond_force: floats("nworld", "nbond", 3)  # on the organ [N]
-  # Of an edge that cuts, see `palpate.batch.parting.Cutters`.
-  edge_inside: floats("nworld", 1)
-  edge_length: floats("nworld", 1)  # that it has cut [m]
-  edge_seat: floats("nworld", 1, 3)  # [m]
-  pieces: ints("nworld")
   # Of jaws, and of points that the organ may hide.
   side: floats("nside")  # of a geom, see `Jaws`
   inner: floats("nworld", 2)  # force of the jaws' inner faces [N]
   eye: wp.vec3  # of the laparoscope [m]
   disc: Array(wp.vec3, ("nworld", "nspot"))  # [m]
   behind: Array(wp.bool, ("nworld", "nspot"))  # whether the organ hides them
-  # Of the other hand's instrument.
-  other_pos: floats("nworld", 3)
-  other_quat: floats("nworld", 4)
-  other_force: floats("nworld", 3)  # on its tip [N]
   # Drawn for an episode.
   body_pos: floats("nworld", 3)  # of the trocar in the world [m]
   body_quat: floats("nworld", 4)  # w x y z

@@ -21,11 +21,10 @@ class States:
     rows: of arrays of the state by name, (nworld, ...) each
     advance: kernel (fields, records)
     observe: kernel (fields, records, beginning)
-    before: kernel (fields, records), before the steps of the physics; None without such a rule
   """
 
   def __init__(self, own: Rules, task: Any, nworld: int, device: Any):
-    self.kind, self.advance, self.observe, self.before = compiled(own)
+    self.kind, self.advance, self.observe = compiled(own)
     self._fields, self._dtype = own.fields, self.kind.numpy_dtype()
     self._dtype = np.dtype(self._dtype)
     self.rows: dict[str, wp.array] = {}

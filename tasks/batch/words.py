@@ -113,11 +113,6 @@ def drop(s: Common, o: Any):
 
 
 @wp.func
-def tear(s: Common, o: Any, share: float):
-  """See `rules`."""
-
-
-@wp.func
 def visible(s: Common, o: Any):
   """See `rules`."""
   seen = wp.float32(0.0)
@@ -127,101 +122,13 @@ def visible(s: Common, o: Any):
   return seen / float(s.behind.shape[1])
 
 
-@wp.func
-def bonds(s: Common):
-  """See `rules`."""
-  return s.bond_vert.shape[0]
-
-
-@wp.func
-def bond(s: Common, k: int):
-  """See `rules`."""
-  return kernels.node(s, s.world, s.bond_vert[k])
-
-
-@wp.func
-def free(s: Common, k: int):
-  """See `rules`."""
-  return s.bond_damage[s.world, k] >= 1.0
-
-
-@wp.func
-def freed(s: Common):
-  """See `rules`."""
-  share = wp.float64(0.0)
-  for k in range(s.bond_vert.shape[0]):
-    if free(s, k):
-      share += wp.float64(s.bond_area[k])
-  return float(share)
-
-
-@wp.func
-def pull(s: Common):
-  """See `rules`."""
-  sum = wp.vec3()
-  for k in range(s.bond_vert.shape[0]):
-    w, f = s.world, s.bond_force
-    sum += wp.vec3(f[w, k, 0], f[w, k, 1], f[w, k, 2])
-  return wp.length(sum)
-
-
-@wp.func
-def other_tip(s: Common):
-  """See `rules`."""
-  return kernels.vector(s.other_pos, s.world)
-
-
-@wp.func
-def other_force(s: Common):
-  """See `rules`."""
-  return wp.length(kernels.vector(s.other_force, s.world))
-
-
-@wp.func
-def other_turned(s: Common, v: wp.vec3):
-  """See `rules`."""
-  return wp.quat_rotate(_turn(s.other_quat, s.world), v)
-
-
-@wp.func
-def commanded(s: Common, o: Any):
-  """See `rules`."""
-  return s.action[s.world, s.action.shape[1] - 1]
-
-
-@wp.func
-def edge_inside(s: Common):
-  """See `rules`."""
-  return s.edge_inside[s.world, 0] > 0.0
-
-
-@wp.func
-def edge_length(s: Common):
-  """See `rules`."""
-  return s.edge_length[s.world, 0]
-
-
-@wp.func
-def edge_seat(s: Common):
-  """See `rules`."""
-  w = s.world
-  return wp.vec3(s.edge_seat[w, 0, 0], s.edge_seat[w, 0, 1], s.edge_seat[w, 0, 2])
-
-
-@wp.func
-def pieces(s: Common):
-  """See `rules`."""
-  return s.pieces[s.world]
-
-
 _BUILTIN = {
-  rules.vector: wp.vec3, rules.rows: wp.matrix_from_rows, rules.length: wp.length,
+  rules.rows: wp.matrix_from_rows, rules.length: wp.length,
   rules.dot: wp.dot, rules.root: wp.sqrt, rules.closeness: kernels.closeness, rules.clamp: wp.clamp,
 }  # fmt: skip
 _WORDS = (
   tip, point, corner, normal, peak, force, miss, reach, from_tip, closing, holds, grip, slipped,
-  drop, tear, visible, bonds, bond, free, freed, pull, other_tip, other_force, other_turned,
-  commanded, edge_inside, edge_length, edge_seat, pieces,
+  drop, visible,
 )  # fmt: skip
 WORDS = _BUILTIN | {getattr(rules, word.key): word for word in _WORDS}  # of Python -> of Warp
 
@@ -252,7 +159,7 @@ def translate(rule: Any, module: Any, known: dict[Any, Any]) -> Any:
 
 
 @functools.cache
-def compiled(own: Rules) -> tuple[Any, Any, Any, Any]:
+def compiled(own: Rules) -> tuple[Any, Any, Any]:
   """Returns the struct of a domain's state, and the kernels of its rules."""
   module, known = wp.get_module(own.state.__module__), dict(WORDS)
   kinds = {
@@ -261,7 +168,6 @@ def compiled(own: Rules) -> tuple[Any, Any, Any, Any]:
   }
   state: Any = wp.struct(type("State", (), {"__annotations__": kinds, "__module__": module.name}))
   rule, look = (translate(each, module, known) for each in (own.advance, own.observe))
-  first = translate(own.before, module, known) if own.before else None
   judge = kernels.judge
 
   def advance(s: Common, states: wp.array(dtype=state)):
@@ -275,10 +181,5 @@ def compiled(own: Rules) -> tuple[Any, Any, Any, Any]:
     if not beginning or s.begun[s.world]:
       states[s.world] = look(s, states[s.world])
 
-  def before(s: Common, states: wp.array(dtype=state)):
-    s.world = wp.tid()
-    states[s.world] = first(s, states[s.world])
-
-  used = (advance, observe, *([before] if first else []))
-  made = [wp.kernel(k, module=module, enable_backward=False) for k in used]
-  return state, *made, *([] if first else [None])
+  made = [wp.kernel(k, module=module, enable_backward=False) for k in (advance, observe)]
+  return state, *made

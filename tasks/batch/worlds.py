@@ -78,9 +78,6 @@ class Worlds:
       self.episodes.draw = self.states.draw
     self.organ = self.batch.organ(task.organ)
     domain.attach(self)
-    self.cuts = bool(self.episodes.physics.organ.config.cutters) and bool(self.states)
-    if self.cuts:
-      self.batch.feel(f"{task.prefix}tip_force", task.organ)
     dt = environment.control_timestep()
     self.fields, self.other = self._make(task, task.prefix, dt, limit), None
     if task.second:
@@ -88,8 +85,6 @@ class Worlds:
       self.other.first = len(task.components) - len(AXES) - len(task.other)
       for name in ("action", "begun", "step"):
         setattr(self.other, name, getattr(self.fields, name))
-      for name, own in (("pos", "tip_pos"), ("quat", "tip_quat"), ("force", "contact_force")):
-        setattr(self.fields, f"other_{name}", getattr(self.other, own))
     if not self.states:
       self._make_own(task, domain, nworld)
     steps = self.batch.watch(self._substeps)
@@ -130,7 +125,7 @@ class Worlds:
     sizes = dict(
       nworld=self.nworld, nvert=self.organ.nvert, nelem=len(self.organ.elem), nq=model.nq,
       nv=model.nv, nu=model.nu, nsensor=model.nsensor, nsensordata=model.nsensordata,
-      naction=len(task.components), nbond=len(physics.organ.bonds), nside=model.ngeom + 1,
+      naction=len(task.components), nside=model.ngeom + 1,
       nspot=len(getattr(task, "disc", ())),
     )  # fmt: skip
     s = allocate(Common, self.device, sizes)
@@ -148,8 +143,6 @@ class Worlds:
     }  # fmt: skip
     if s.jaw >= 0:
       constants["side"] = jaws.Jaws(model, prefix).side
-    if bonds := physics.organ.bonds:
-      constants |= {"bond_vert": bonds.vertices, "bond_area": bonds.area / bonds.area.sum()}
     for name, value in constants.items():
       getattr(s, name).assign(np.asarray(value))
     if self.states and s.behind.shape[1]:
@@ -190,12 +183,6 @@ class Worlds:
     s.qpos, s.qvel, s.sensordata, s.xpos = (
       batch.qpos, batch.qvel, batch.sensordata, self.organ.xpos
     )  # fmt: skip
-    if s.bond_vert.shape[0]:
-      s.bond_damage, s.bond_force = self.organ.bonds.damage, self.organ.bonds.force
-    if self.cuts:
-      found = self.organ.cutters
-      s.edge_inside, s.edge_length, s.edge_seat = found.inside, found.length, found.seat
-      s.pieces = self.organ.piece_count
 
   # Doing.
 
@@ -241,10 +228,6 @@ class Worlds:
     wp.copy(self.fields.action, action)
     self._of_hands(kernels.act)
     self._domain.act(self)
-    if self.states and self.states.before:
-      self._over(self.states.before, self.states.records)
-      if "burning" in self.states.rows:
-        self.organ.bonds.weaken(self.states.rows["burning"])
     self.batch.step(self._substeps)
     self._run(self._judge)
 

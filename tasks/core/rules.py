@@ -13,7 +13,6 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Annotated, Any, get_type_hints
 
-import mujoco
 import numpy as np
 import warp as wp
 
@@ -36,7 +35,6 @@ class Rules:
       DAMAGED, MISSED, after a control step
     observe: rule (s, o) that returns o with its own observations up to date
     observed: fields of the state that are these
-    before: rule (s, o) that returns o before the steps of the physics, or None
     metrics: of the domain's own, by the field that is an episode's value so far
   """
 
@@ -44,12 +42,11 @@ class Rules:
   advance: Callable
   observe: Callable
   observed: tuple[str, ...]
-  before: Callable | None = None
   metrics: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
   def __post_init__(self):
     where = f"{self.state.__module__}.{self.state.__qualname__}"
-    for name in ("advance", "observe", *(["before"] if self.before else [])):
+    for name in ("advance", "observe"):
       rule = getattr(self, name)
       if not inspect.isfunction(rule) or len(inspect.signature(rule).parameters) != 2:
         raise TypeError(f"{where}: {name} is {rule!r}, expected a function of s and o")
@@ -95,12 +92,6 @@ def root(x: float) -> float:
 def clamp(x: float, low: float, high: float) -> float:
   """Returns the number between two others that is nearest to one."""
   return min(max(x, low), high)
-
-
-
-def vector(x: float, y: float, z: float) -> np.ndarray:
-  """Returns a vector."""
-  return np.array([x, y, z])
 
 
 def rows(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
@@ -171,73 +162,6 @@ def visible(s: Any, o: Any) -> float:
   return 1 - float(s.hidden(o.disc).mean())
 
 
-def bonds(s: Any) -> int:
-  """Returns how many bonds the organ has, free ones too."""
-  return len(s.organ.bonds)
-
-
-def bond(s: Any, k: int) -> np.ndarray:
-  """Returns where a bond is [m]."""
-  return s.organ.bonds.positions[k]
-
-
-def free(s: Any, k: int) -> bool:
-  """Returns whether a bond has broken."""
-  return bool(s.organ.bonds.free[k])
-
-
-def freed(s: Any) -> float:
-  """Returns the share of the bonds' area that is free [-]."""
-  return s.organ.bonds.share_freed
-
-
-def pull(s: Any) -> float:
-  """Returns the pull of all bonds [N]."""
-  return length(s.organ.bonds.force.sum(axis=0))
-
-
-def other_tip(s: Any) -> np.ndarray:
-  """Returns where the tip of the other hand's instrument is [m]."""
-  return s.second.tip_pos()
-
-
-def other_force(s: Any) -> float:
-  """Returns the force on that below its shaft [N]."""
-  return length(s.second.contact_force())
-
-
-def other_turned(s: Any, v: np.ndarray) -> np.ndarray:
-  """Returns a vector of the frame of that tip in the world."""
-  out = np.zeros(3)
-  mujoco.mju_rotVecQuat(out, v, s.second.tip_quat())
-  return out
-
-
-def commanded(s: Any, o: Any) -> float:
-  """Returns the last component of the action, the largest of its rows."""
-  return o.action[..., -1].max()
-
-
-def edge_inside(s: Any) -> bool:
-  """Returns whether the edge is in the tissue."""
-  return s.organ.cutters[0].inside
-
-
-def edge_length(s: Any) -> float:
-  """Returns how far the edge has cut [m]."""
-  return s.organ.cutters[0].length
-
-
-def edge_seat(s: Any) -> np.ndarray:
-  """Returns where the edge is in the tissue at rest [m]."""
-  return s.organ.cutters[0].seat
-
-
-def pieces(s: Any) -> int:
-  """Returns how many pieces the organ is in."""
-  return len(s.organ.pieces)
-
-
 # What the recorder is told; labels are the task's.
 
 
@@ -263,11 +187,6 @@ def slipped(s: Any, o: Any) -> None:
 def drop(s: Any, o: Any) -> None:
   """Reports that what was held, or followed, is lost."""
   o.event(s, "drop", None, o.label("drop"))
-
-
-def tear(s: Any, o: Any, share: float) -> None:
-  """Reports a share that came free as it should not."""
-  o.event(s, "slip", share, "torn")
 
 
 # Formulas.
