@@ -35,9 +35,11 @@ class States:
       shape = tuple(getattr(task, dim) if isinstance(dim, str) else dim for dim in kind.dims)
       rows = wp.zeros((nworld, *shape), dtype=kind.dtype, device=device)
       self.rows[name], field = rows, self._host[name]
-      field["data"] = rows.ptr + np.arange(nworld, dtype=np.uint64) * rows.strides[0]
+      start: Any = rows.ptr
+      strides: Any = rows.strides
+      field["data"] = start + np.arange(nworld, dtype=np.uint64) * strides[0]
       field["shape"][:, : len(shape)] = shape
-      field["strides"][:, : len(shape)] = rows.strides[1:]
+      field["strides"][:, : len(shape)] = strides[1:]
       field["ndim"] = len(shape)
     self.records = wp.array(self._host, dtype=self.kind, device=device)
 
@@ -60,10 +62,12 @@ class States:
 
   def array(self, name: str) -> wp.array:
     """Returns a field of all worlds, a view: (nworld,) + shape, of a number (nworld, 1)."""
-    kind, start = self._dtype.fields[name][:2]
+    fields: Any = self._dtype.fields
+    kind, start = fields[name][:2]
+    first: Any = self.records.ptr
     shape = kind.shape or (1,)
     steps = [4 * int(np.prod(shape[k + 1 :])) for k in range(len(shape))]
     return wp.array(
-      ptr=self.records.ptr + start, dtype=float, shape=(len(self._host), *shape),
+      ptr=first + start, dtype=float, shape=(len(self._host), *shape),
       strides=(self._dtype.itemsize, *steps), device=self.records.device,
     )  # fmt: skip

@@ -1,6 +1,9 @@
 """The words of `tasks.core.rules` for many worlds, and what compiles rules that use them."""
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
+# Vectors of Warp's are not known to type checkers:
+# pyright: reportCallIssue=false, reportArgumentType=false, reportIndexIssue=false
+# pyright: reportInvalidTypeForm=false
 import functools
 import types
 from typing import Any
@@ -181,5 +184,5 @@ def compiled(own: Rules) -> tuple[Any, Any, Any]:
     if not beginning or s.begun[s.world]:
       states[s.world] = look(s, states[s.world])
 
-  made = [wp.kernel(k, module=module, enable_backward=False) for k in (advance, observe)]
-  return state, *made
+  after, seen = (wp.kernel(k, module=module, enable_backward=False) for k in (advance, observe))
+  return state, after, seen

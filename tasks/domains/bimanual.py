@@ -89,7 +89,7 @@ class Bimanual(Dissect):
 
   def fair(self, physics: Physics) -> bool:
     """Whether what comes free now is held away from the bed."""
-    return self.grasped and self.retracted(physics) > AWAY
+    return bool(self.grasped) and self.retracted(physics) > AWAY
 
   def before_step(self, action, physics: Physics) -> None:
     """Moves both instruments, and sends the current through the hook."""

@@ -99,7 +99,7 @@ class Dissect(Freeing, Hold):
 
   def fair(self, physics: Physics) -> bool:
     """Whether what comes free now counts as clean."""
-    return self.grasped
+    return bool(self.grasped)
 
   def instruct(self, physics: Physics) -> str:
     """Says to grasp, or to pull."""
