@@ -8,7 +8,7 @@ from typing import Any
 
 import warp as wp
 from palpate.tasks.physics import COARSE, NEAR
-from palpate.tissue.types import Array, floats, ints, struct
+from palpate.tissue.types import Array, doubles, floats, ints, struct
 
 flags = Array(wp.bool, ("nworld",))
 vectors = Array(wp.vec3, ("nworld",))
@@ -64,6 +64,11 @@ class Common:
   eye: wp.vec3  # of the laparoscope [m]
   disc: Array(wp.vec3, ("nworld", "nspot"))  # [m]
   behind: Array(wp.bool, ("nworld", "nspot"))  # whether the organ hides them
+  # Of bonds.
+  bond_vert: ints("nbond")  # vertex of each
+  bond_share: doubles("nbond")  # of their area
+  bond_damage: floats("nworld", "nbond")  # 1 where it is free
+  bond_force: floats("nworld", "nbond", 3)  # on the organ [N]
   # Drawn for an episode.
   body_pos: floats("nworld", 3)  # of the trocar in the world [m]
   body_quat: floats("nworld", 4)  # w x y z

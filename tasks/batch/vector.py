@@ -32,13 +32,12 @@ from .dissect import Dissect
 from .domain import Domain
 from .fields import INFO, OBSERVED, OUTCOMES
 from .palpate import Palpate
-from .tease import Tease
 from .worlds import Worlds
 
 # Exercises that are vectorised, by the class of their task.
 DOMAINS: dict[str, type[Domain]] = {
   "Touch": Domain, "Press": Domain, "Palpate": Palpate, "Grasp": Domain, "Retract": Domain,
-  "Trace": Domain, "Dissect": Dissect, "Tease": Tease, "Bimanual": Bimanual,
+  "Trace": Domain, "Dissect": Dissect, "Tease": Domain, "Bimanual": Bimanual,
   "Cut": Cut,
 }  # fmt: skip
 _ELSE = 'vectorization_mode="sync" runs single environments side by side'

@@ -58,6 +58,50 @@ def force(s: Common):
 
 
 @wp.func
+def bonds(s: Common):
+  """See `rules`."""
+  return s.bond_vert.shape[0]
+
+
+@wp.func
+def bond(s: Common, k: int):
+  """See `rules`."""
+  return kernels.node(s, s.world, s.bond_vert[k])
+
+
+@wp.func
+def is_free(s: Common, k: int):
+  """See `rules`."""
+  return s.bond_damage[s.world, k] >= 1.0
+
+
+@wp.func
+def share_freed(s: Common):
+  """See `rules`."""
+  free = wp.float64(0.0)
+  for k in range(bonds(s)):
+    if is_free(s, k):
+      free += s.bond_share[k]
+  return float(free)
+
+
+@wp.func
+def traction(s: Common):
+  """See `rules`."""
+  sum = wp.vec3()
+  for k in range(bonds(s)):
+    sum += wp.vec3(
+      s.bond_force[s.world, k, 0], s.bond_force[s.world, k, 1], s.bond_force[s.world, k, 2]
+    )
+  return wp.length(sum)
+
+
+@wp.func
+def tear(s: Common, o: Any, value: float):
+  """See `rules`."""
+
+
+@wp.func
 def miss(s: Common, o: Any, value: float):
   """See `rules`."""
   s.errors[s.world] = s.errors[s.world] + 1
@@ -126,12 +170,12 @@ def visible(s: Common, o: Any):
 
 
 _BUILTIN = {
-  rules.rows: wp.matrix_from_rows, rules.length: wp.length,
+  rules.rows: wp.matrix_from_rows, rules.vector: wp.vec3, rules.length: wp.length,
   rules.dot: wp.dot, rules.root: wp.sqrt, rules.closeness: kernels.closeness, rules.clamp: wp.clamp,
 }  # fmt: skip
 _WORDS = (
   tip, point, corner, normal, peak, force, miss, reach, from_tip, closing, holds, grip, slipped,
-  drop, visible,
+  drop, visible, bonds, bond, is_free, share_freed, traction, tear,
 )  # fmt: skip
 WORDS = _BUILTIN | {getattr(rules, word.key): word for word in _WORDS}  # of Python -> of Warp
 
@@ -157,7 +201,9 @@ def translate(rule: Any, module: Any, known: dict[Any, Any]) -> Any:
   copy = types.FunctionType(code, names, rule.__name__, rule.__defaults__, rule.__closure__)
   copy.__annotations__ = dict.fromkeys(code.co_varnames[: code.co_argcount], Any)
   copy.__module__, copy.__qualname__ = rule.__module__, rule.__qualname__
-  known[rule] = wp.func(copy, module=module)
+  # Domains that build on others have rules of the same names.
+  name = f"{rule.__module__.rpartition('.')[2]}_{rule.__name__}"
+  known[rule] = wp.func(copy, name=name, module=module)
   return known[rule]
 
 

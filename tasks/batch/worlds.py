@@ -126,7 +126,7 @@ class Worlds:
       nworld=self.nworld, nvert=self.organ.nvert, nelem=len(self.organ.elem), nq=model.nq,
       nv=model.nv, nu=model.nu, nsensor=model.nsensor, nsensordata=model.nsensordata,
       naction=len(task.components), nside=model.ngeom + 1,
-      nspot=len(getattr(task, "disc", ())),
+      nspot=len(getattr(task, "disc", ())), nbond=len(physics.organ.bonds),
     )  # fmt: skip
     s = allocate(Common, self.device, sizes)
     s.dt, s.limit, s.sparse = dt, limit, int(task.reward == "sparse")
@@ -141,6 +141,9 @@ class Worlds:
       "move": np.array(RATES) * dt, "elem": self.organ.elem, "coarse": coarse,
       "coarse0": physics.organ.xpos0[coarse],
     }  # fmt: skip
+    bonds = physics.organ.bonds
+    if len(bonds):
+      constants |= {"bond_vert": bonds.vertices, "bond_share": bonds.area / bonds.area.sum()}
     if s.jaw >= 0:
       constants["side"] = jaws.Jaws(model, prefix).side
     for name, value in constants.items():
@@ -183,6 +186,12 @@ class Worlds:
     s.qpos, s.qvel, s.sensordata, s.xpos = (
       batch.qpos, batch.qvel, batch.sensordata, self.organ.xpos
     )  # fmt: skip
+
+  def _read_organ(self) -> None:
+    """Brings what the organ is held by up to date."""
+    s, organ = self.fields, self.organ
+    if s.bond_vert.shape[0]:
+      s.bond_damage, s.bond_force = organ.bonds.damage, organ.bonds.force
 
   # Doing.
 
@@ -279,6 +288,7 @@ class Worlds:
     """Measures the instruments, and brings what is of the batch up to date."""
     for hand in self.hands:
       self._read(hand)
+    self._read_organ()
     self._of_hands(kernels.measure, beginning)
     if self.other:
       self._over(kernels.join, self.other)

@@ -99,6 +99,11 @@ def rows(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
   return np.array([a, b, c])
 
 
+def vector(x: float, y: float, z: float) -> np.ndarray:
+  """Returns a vector."""
+  return np.array([x, y, z])
+
+
 def length(v: np.ndarray) -> float:
   """Returns the length of a vector."""
   return math.sqrt(v.dot(v))
@@ -162,6 +167,31 @@ def visible(s: Any, o: Any) -> float:
   return 1 - float(s.hidden(o.disc).mean())
 
 
+def bonds(s: Any) -> int:
+  """Returns how many bonds the organ has, free ones too."""
+  return len(s.organ.bonds)
+
+
+def bond(s: Any, k: int) -> np.ndarray:
+  """Returns where a bond is [m]."""
+  return s.organ.bonds.positions[k]
+
+
+def is_free(s: Any, k: int) -> bool:
+  """Returns whether a bond has broken."""
+  return bool(s.organ.bonds.free[k])
+
+
+def share_freed(s: Any) -> float:
+  """Returns the share of the area of bonds that is free [-]."""
+  return s.organ.bonds.share_freed
+
+
+def traction(s: Any) -> float:
+  """Returns the pull of all bonds together on the organ [N]."""
+  return length(s.organ.bonds.force.sum(axis=0))
+
+
 # What the recorder is told; labels are the task's.
 
 
@@ -187,6 +217,11 @@ def slipped(s: Any, o: Any) -> None:
 def drop(s: Any, o: Any) -> None:
   """Reports that what was held, or followed, is lost."""
   o.event(s, "drop", None, o.label("drop"))
+
+
+def tear(s: Any, o: Any, value: float) -> None:
+  """Reports what came free as it should not, a share of the area of bonds [-]."""
+  o.event(s, "slip", value, "torn")
 
 
 # Formulas.
