@@ -69,6 +69,11 @@ class Common:
   bond_share: doubles("nbond")  # of their area
   bond_damage: floats("nworld", "nbond")  # 1 where it is free
   bond_force: floats("nworld", "nbond", 3)  # on the organ [N]
+  bond_loss: floats("nworld", "nbond")  # that an action adds to the damage
+  # Of the other hand.
+  other_tip_pos: floats("nworld", 3)
+  other_tip_quat: floats("nworld", 4)
+  other_contact_force: floats("nworld", 3)
   # Drawn for an episode.
   body_pos: floats("nworld", 3)  # of the trocar in the world [m]
   body_quat: floats("nworld", 4)  # w x y z

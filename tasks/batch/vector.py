@@ -26,9 +26,7 @@ from palpate.batch.base import on_device
 from palpate.tasks.gym import Exercise
 
 from . import tally
-from .bimanual import Bimanual
 from .cut import Cut
-from .dissect import Dissect
 from .domain import Domain
 from .fields import INFO, OBSERVED, OUTCOMES
 from .palpate import Palpate
@@ -37,7 +35,7 @@ from .worlds import Worlds
 # Exercises that are vectorised, by the class of their task.
 DOMAINS: dict[str, type[Domain]] = {
   "Touch": Domain, "Press": Domain, "Palpate": Palpate, "Grasp": Domain, "Retract": Domain,
-  "Trace": Domain, "Dissect": Dissect, "Tease": Domain, "Bimanual": Bimanual,
+  "Trace": Domain, "Dissect": Domain, "Tease": Domain, "Bimanual": Domain,
   "Cut": Cut,
 }  # fmt: skip
 _ELSE = 'vectorization_mode="sync" runs single environments side by side'

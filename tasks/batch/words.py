@@ -4,6 +4,7 @@
 # Vectors of Warp's are not known to type checkers:
 # pyright: reportCallIssue=false, reportArgumentType=false, reportIndexIssue=false
 # pyright: reportInvalidTypeForm=false
+import dis
 import functools
 import types
 from typing import Any
@@ -58,6 +59,30 @@ def force(s: Common):
 
 
 @wp.func
+def last(s: Common, o: Any):
+  """See `rules`."""
+  return s.action[s.world, s.action.shape[1] - 1]
+
+
+@wp.func
+def other_tip(s: Common):
+  """See `rules`."""
+  return kernels.vector(s.other_tip_pos, s.world)
+
+
+@wp.func
+def other_point(s: Common, place: wp.vec3):
+  """See `rules`."""
+  return other_tip(s) + wp.quat_rotate(_turn(s.other_tip_quat, s.world), place)
+
+
+@wp.func
+def other_force(s: Common):
+  """See `rules`."""
+  return wp.length(kernels.vector(s.other_contact_force, s.world))
+
+
+@wp.func
 def bonds(s: Common):
   """See `rules`."""
   return s.bond_vert.shape[0]
@@ -94,6 +119,12 @@ def traction(s: Common):
       s.bond_force[s.world, k, 0], s.bond_force[s.world, k, 1], s.bond_force[s.world, k, 2]
     )
   return wp.length(sum)
+
+
+@wp.func
+def weaken(s: Common, k: int, amount: float):
+  """See `rules`."""
+  s.bond_loss[s.world, k] = s.bond_loss[s.world, k] + amount
 
 
 @wp.func
@@ -175,7 +206,8 @@ _BUILTIN = {
 }  # fmt: skip
 _WORDS = (
   tip, point, corner, normal, peak, force, miss, reach, from_tip, closing, holds, grip, slipped,
-  drop, visible, bonds, bond, is_free, share_freed, traction, tear,
+  drop, visible, bonds, bond, is_free, share_freed, traction, tear, weaken, last,
+  other_tip, other_point, other_force,
 )  # fmt: skip
 WORDS = _BUILTIN | {getattr(rules, word.key): word for word in _WORDS}  # of Python -> of Warp
 
@@ -194,7 +226,8 @@ def translate(rule: Any, module: Any, known: dict[Any, Any]) -> Any:
     known[rule] = translate(rules.INSTEAD[rule], module, known)
     return known[rule]
   names = dict(rule.__globals__)
-  for name in rule.__code__.co_names:
+  used = (step.argval for step in dis.get_instructions(rule) if step.opname == "LOAD_GLOBAL")
+  for name in used:
     if isinstance(names.get(name), types.FunctionType):
       names[name] = translate(names[name], module, known)
   code = rule.__code__
@@ -208,7 +241,7 @@ def translate(rule: Any, module: Any, known: dict[Any, Any]) -> Any:
 
 
 @functools.cache
-def compiled(own: Rules) -> tuple[Any, Any, Any]:
+def compiled(own: Rules) -> tuple[Any, Any, Any, Any]:
   """Returns the struct of a domain's state, and the kernels of its rules."""
   module, known = wp.get_module(own.state.__module__), dict(WORDS)
   kinds = {
@@ -216,7 +249,7 @@ def compiled(own: Rules) -> tuple[Any, Any, Any]:
     for name, kind in own.fields.items()
   }
   state: Any = wp.struct(type("State", (), {"__annotations__": kinds, "__module__": module.name}))
-  rule, look = (translate(each, module, known) for each in (own.advance, own.observe))
+  rule = translate(own.advance, module, known)
   judge = kernels.judge
 
   def advance(s: Common, states: wp.array(dtype=state)):
@@ -225,10 +258,18 @@ def compiled(own: Rules) -> tuple[Any, Any, Any]:
     states[s.world] = o
     judge(s, s.world, progress, outcome)
 
-  def observe(s: Common, states: wp.array(dtype=state), beginning: bool):
-    s.world = wp.tid()
-    if not beginning or s.begun[s.world]:
-      states[s.world] = look(s, states[s.world])
+  def following(name: str, rule: Any) -> Any:
+    """Returns the kernel of a rule that returns the state alone."""
 
-  after, seen = (wp.kernel(k, module=module, enable_backward=False) for k in (advance, observe))
-  return state, after, seen
+    def follow(s: Common, states: wp.array(dtype=state), beginning: bool):
+      s.world = wp.tid()
+      if not beginning or s.begun[s.world]:
+        states[s.world] = rule(s, states[s.world])
+
+    follow.__qualname__ = name
+    return wp.kernel(follow, module=module, enable_backward=False)
+
+  after = wp.kernel(advance, module=module, enable_backward=False)
+  look = following("observe", translate(own.observe, module, known))
+  act = following("act", translate(own.act, module, known)) if own.act else None
+  return state, after, look, act

@@ -85,6 +85,8 @@ class Worlds:
       self.other.first = len(task.components) - len(AXES) - len(task.other)
       for name in ("action", "begun", "step"):
         setattr(self.other, name, getattr(self.fields, name))
+      for name in ("tip_pos", "tip_quat", "contact_force"):
+        setattr(self.fields, f"other_{name}", getattr(self.other, name))
     if not self.states:
       self._make_own(task, domain, nworld)
     steps = self.batch.watch(self._substeps)
@@ -236,9 +238,19 @@ class Worlds:
     """Begins a control step with actions that are allowed."""
     wp.copy(self.fields.action, action)
     self._of_hands(kernels.act)
-    self._domain.act(self)
+    if self.states and self.states.act:
+      self._act()
     self.batch.step(self._substeps)
     self._run(self._judge)
+
+  def _act(self) -> None:
+    """Does what of an action no drive does."""
+    assert self.states
+    lost = self.fields.bond_loss
+    lost.zero_()
+    self._over(self.states.act, self.states.records, False)
+    if lost.shape[1]:
+      self.organ.bonds.weaken(lost)
 
   def wait(self) -> np.ndarray:
     """Ends a control step; returns in which worlds the episode is over  (nworld,) bool."""

@@ -36,6 +36,7 @@ class Rules:
     observe: rule (s, o) that returns o with its own observations up to date
     observed: fields of the state that are these
     metrics: of the domain's own, by the field that is an episode's value so far
+    act: rule (s, o) that returns o once an action has moved the drives, before the physics, or None
   """
 
   state: type
@@ -43,10 +44,11 @@ class Rules:
   observe: Callable
   observed: tuple[str, ...]
   metrics: Mapping[str, str] = dataclasses.field(default_factory=dict)
+  act: Callable | None = None
 
   def __post_init__(self):
     where = f"{self.state.__module__}.{self.state.__qualname__}"
-    for name in ("advance", "observe"):
+    for name in ("advance", "observe", *(["act"] if self.act else [])):
       rule = getattr(self, name)
       if not inspect.isfunction(rule) or len(inspect.signature(rule).parameters) != 2:
         raise TypeError(f"{where}: {name} is {rule!r}, expected a function of s and o")
@@ -167,6 +169,26 @@ def visible(s: Any, o: Any) -> float:
   return 1 - float(s.hidden(o.disc).mean())
 
 
+def last(s: Any, o: Any) -> float:
+  """Returns the last component of the action, the largest of its rows."""
+  return float(o.action[..., -1].max())
+
+
+def other_tip(s: Any) -> np.ndarray:
+  """Returns where the tip of the other hand's instrument is [m]."""
+  return s.second.tip_pos()
+
+
+def other_point(s: Any, place: np.ndarray) -> np.ndarray:
+  """Returns where a place in the frame of that tip is [m]."""
+  return s.second.to_world(place)
+
+
+def other_force(s: Any) -> float:
+  """Returns the force on that instrument below the shaft [N]."""
+  return length(s.second.contact_force())
+
+
 def bonds(s: Any) -> int:
   """Returns how many bonds the organ has, free ones too."""
   return len(s.organ.bonds)
@@ -190,6 +212,13 @@ def share_freed(s: Any) -> float:
 def traction(s: Any) -> float:
   """Returns the pull of all bonds together on the organ [N]."""
   return length(s.organ.bonds.force.sum(axis=0))
+
+
+def weaken(s: Any, k: int, amount: float) -> None:
+  """Adds to the damage of a bond."""
+  amounts = np.zeros(bonds(s))
+  amounts[k] = amount
+  s.organ.bonds.weaken(amounts)
 
 
 # What the recorder is told; labels are the task's.

@@ -40,6 +40,11 @@ METRICS = {"share_freed": "clean", "peak_traction": "pulled"}
 # The rules.
 
 
+def ruined(o):
+  """Returns whether so much is torn that too little is left, or the pull tears what is under it."""
+  return o.torn > 1.0 - o.wanted + SEEN or o.traction > 2.0 * o.limit
+
+
 def count(s, o, fair):
   """Counts what came free, as torn where it was not fair; returns too what outcome that makes."""
   o.traction = traction(s)
@@ -55,7 +60,7 @@ def count(s, o, fair):
   outcome = RUNNING
   if o.clean >= o.wanted - SEEN:
     outcome = SUCCESS
-  elif o.torn > 1.0 - o.wanted + SEEN or o.traction > 2.0 * o.limit:
+  elif ruined(o):
     outcome = DAMAGED
   return o, outcome
 
