@@ -70,6 +70,11 @@ class Common:
   bond_damage: floats("nworld", "nbond")  # 1 where it is free
   bond_force: floats("nworld", "nbond", 3)  # on the organ [N]
   bond_loss: floats("nworld", "nbond")  # that an action adds to the damage
+  # Of what cuts the organ, see `palpate.batch.parting.Cutters`.
+  cutter_inside: floats("nworld", "ncutter")
+  cutter_length: floats("nworld", "ncutter")  # [m]
+  cutter_seat: floats("nworld", "ncutter", 3)  # [m]
+  piece_count: ints("nworld")
   # Of the other hand.
   other_tip_pos: floats("nworld", 3)
   other_tip_quat: floats("nworld", 4)

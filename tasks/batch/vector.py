@@ -26,7 +26,6 @@ from palpate.batch.base import on_device
 from palpate.tasks.gym import Exercise
 
 from . import tally
-from .cut import Cut
 from .domain import Domain
 from .fields import INFO, OBSERVED, OUTCOMES
 from .palpate import Palpate
@@ -36,7 +35,7 @@ from .worlds import Worlds
 DOMAINS: dict[str, type[Domain]] = {
   "Touch": Domain, "Press": Domain, "Palpate": Palpate, "Grasp": Domain, "Retract": Domain,
   "Trace": Domain, "Dissect": Domain, "Tease": Domain, "Bimanual": Domain,
-  "Cut": Cut,
+  "Cut": Domain,
 }  # fmt: skip
 _ELSE = 'vectorization_mode="sync" runs single environments side by side'
 OUTPUTS = ("numpy", "torch", "warp")

@@ -128,6 +128,20 @@ def weaken(s: Common, k: int, amount: float):
 
 
 @wp.func
+def cutter(s: Common):
+  """See `rules`."""
+  w = s.world
+  seat = wp.vec3(s.cutter_seat[w, 0, 0], s.cutter_seat[w, 0, 1], s.cutter_seat[w, 0, 2])
+  return s.cutter_inside[w, 0] > 0.0, s.cutter_length[w, 0], seat
+
+
+@wp.func
+def pieces(s: Common):
+  """See `rules`."""
+  return s.piece_count[s.world]
+
+
+@wp.func
 def tear(s: Common, o: Any, value: float):
   """See `rules`."""
 
@@ -207,7 +221,7 @@ _BUILTIN = {
 _WORDS = (
   tip, point, corner, normal, peak, force, miss, reach, from_tip, closing, holds, grip, slipped,
   drop, visible, bonds, bond, is_free, share_freed, traction, tear, weaken, last,
-  other_tip, other_point, other_force,
+  other_tip, other_point, other_force, cutter, pieces,
 )  # fmt: skip
 WORDS = _BUILTIN | {getattr(rules, word.key): word for word in _WORDS}  # of Python -> of Warp
 

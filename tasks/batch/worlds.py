@@ -89,6 +89,8 @@ class Worlds:
         setattr(self.fields, f"other_{name}", getattr(self.other, name))
     if not self.states:
       self._make_own(task, domain, nworld)
+    if self.fields.cutter_inside.shape[1]:
+      self.batch.feel(f"{task.prefix}tip_force", task.organ)
     steps = self.batch.watch(self._substeps)
     self.tally = self._count(task, steps)
     self._tally = self._count(task, steps) if self.other else None
@@ -129,6 +131,7 @@ class Worlds:
       nv=model.nv, nu=model.nu, nsensor=model.nsensor, nsensordata=model.nsensordata,
       naction=len(task.components), nside=model.ngeom + 1,
       nspot=len(getattr(task, "disc", ())), nbond=len(physics.organ.bonds),
+      ncutter=len(physics.organ.cutters),
     )  # fmt: skip
     s = allocate(Common, self.device, sizes)
     s.dt, s.limit, s.sparse = dt, limit, int(task.reward == "sparse")
@@ -190,10 +193,14 @@ class Worlds:
     )  # fmt: skip
 
   def _read_organ(self) -> None:
-    """Brings what the organ is held by up to date."""
+    """Brings what holds and cuts the organ up to date."""
     s, organ = self.fields, self.organ
     if s.bond_vert.shape[0]:
       s.bond_damage, s.bond_force = organ.bonds.damage, organ.bonds.force
+    if s.cutter_inside.shape[1]:
+      found = organ.cutters
+      s.cutter_inside, s.cutter_length, s.cutter_seat = found.inside, found.length, found.seat
+      s.piece_count = organ.piece_count
 
   # Doing.
 

@@ -221,6 +221,17 @@ def weaken(s: Any, k: int, amount: float) -> None:
   s.organ.bonds.weaken(amounts)
 
 
+def cutter(s: Any) -> tuple[bool, float, np.ndarray]:
+  """Returns of what cuts whether it is inside, how far it came, where it is at rest [m, m]."""
+  (found,) = s.organ.cutters
+  return found.inside, found.length, found.seat
+
+
+def pieces(s: Any) -> int:
+  """Returns how many parts the organ is in."""
+  return len(s.organ.pieces)
+
+
 # What the recorder is told; labels are the task's.
 
 
