@@ -17,6 +17,7 @@ import numpy as np
 import warp as wp
 
 RUNNING, SUCCESS, DAMAGED, MISSED = range(4)
+FAR = 1e9  # farther than anything [m]
 OUTCOMES = (None, "success", "damage", "missed")
 
 Vector = Annotated[Any, wp.vec3]

@@ -22,6 +22,7 @@ import numpy as np
 from ..base import Physics
 from ..core.rules import (
   DAMAGED,
+  FAR,
   RUNNING,
   Rules,
   Vector,
@@ -52,7 +53,6 @@ from .grasp import FUNDUS
 BED = (1e7, 2.5e4, 40.0)
 AWAY = 0.005  # least way of the site from the bed, for what is divided to count [m]
 REACH, RATE = 0.003, 5.0  # of the current around the wire [m], damage that it does to bonds [1/s]
-FAR = 1e9  # [m]
 TOUCHING, BURN = 0.03, 0.5  # force with which the hook touches [N], time that it may burn [s]
 SCENE = dataclasses.replace(
   FUNDUS, nodes=250, bonds=BED, second="hook", second_port=(-0.05, -0.01, 0.12)

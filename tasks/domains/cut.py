@@ -26,6 +26,7 @@ from palpate.tissue.types import Array, ints
 from ..base import Physics, Task
 from ..core.rules import (
   DAMAGED,
+  FAR,
   RUNNING,
   SUCCESS,
   Rules,
@@ -58,7 +59,6 @@ COVERED = 0.98  # share of the line that is to be cut
 CLOSING = 0.006  # length that is cut beyond that of the line where the piece counts as free [m]
 STEP = 0.001  # between points of the line [m]
 FIRST, SECOND, THIRD = 5, 10, 15  # points further on that are observed
-FAR = 1e9  # [m]
 _MARKS = 36  # spheres that draw the line
 LEAP = 10  # points of the line between two control steps that do not follow one another
 # Of the expert: how fast it cuts [m/s], and how deep the tip is under the sheet and over it [m].
@@ -110,6 +110,8 @@ class State:
   count: int  # points of the line
   curve: Annotated[Any, Array(wp.vec3, ("room",))]  # these [m]
   cut: Annotated[Any, ints("room")]  # whether they are cut
+  done: int  # how many are
+  next: int  # the first that is not, after those that are
   length: float  # of the line [m]
   opened: float  # length that was cut so far [m]
   astray: float  # length of that beyond the tolerance [m]
@@ -133,30 +135,10 @@ class State:
 
 def following(o):
   """Returns the first point of the line that is not cut, after those that are."""
-  if not o.cut.any() or o.cut.all():
-    return 0
-  return int(np.flatnonzero(~o.cut & np.roll(o.cut, 1))[0])
-
-
-@many(following)
-def _following(o):
   for k in range(o.count):
     if o.cut[k] == 0 and o.cut[(k + o.count - 1) % o.count] == 1:
       return k
   return 0
-
-
-def share(o):
-  """Returns the share of the line that is cut."""
-  return float(o.cut.mean())
-
-
-@many(share)
-def _share(o):
-  found = int(0)  # noqa: RUF046, UP018 - a variable to Warp
-  for k in range(o.count):
-    found += o.cut[k]
-  return float(found) / float(o.count)
 
 
 def nearest(o, place):
@@ -180,7 +162,7 @@ def _nearest(o, place):
 
 def distance(s, o):
   """Returns how far the tip is from the next point of the line [m]."""
-  return length(o.curve[following(o)] - tip(s))
+  return length(o.curve[o.next] - tip(s))
 
 
 def cover(o, first, last):
@@ -191,8 +173,13 @@ def cover(o, first, last):
   if abs(way) > LEAP:
     low = way
     high = way
-  for k in range(low, high + 1):
-    o.cut[(first + k + o.count) % o.count] = 1
+  for i in range(low, high + 1):
+    k = (first + i + o.count) % o.count
+    if o.cut[k] == 0:
+      o.cut[k] = 1
+      o.done = o.done + 1
+  o.covered = float(o.done) / float(o.count)
+  o.next = following(o)
   return o
 
 
@@ -223,7 +210,6 @@ def advance(s, o):
   o.inside = inside
   o.seat = seat
   o.travelled = travelled
-  o.covered = share(o)
   if o.astray > ASTRAY:
     return o, -1.0, DAMAGED
   if o.covered >= COVERED and (o.opened > o.length + CLOSING or pieces(s) > 1):
@@ -234,7 +220,7 @@ def advance(s, o):
 
 def observe(s, o):
   """Finds target, ahead and deviation; covered is up to date."""
-  k, n, here = following(o), o.count, tip(s)
+  k, n, here = o.next, o.count, tip(s)
   o.target = o.curve[k] - here
   o.ahead = rows(
     o.curve[(k + FIRST) % n] - here,
@@ -310,7 +296,8 @@ class Cut(Task):
     self.count, self.cut = len(self.curve), np.zeros(len(self.curve), bool)
     self.opened = self.astray = self.jagged = self.excess = self.mean = self.farthest = 0.0
     self.inside, self.travelled, self.seat = cutter(physics)
-    self.nearest, self.covered, self.distance0 = 0.0, 0.0, distance(physics, self)
+    self.done, self.next, self.covered, self.nearest = 0, 0, 0.0, 0.0
+    self.distance0 = distance(physics, self)
     for i, k in enumerate(np.linspace(0, len(self.curve), _MARKS, endpoint=False).astype(int)):
       physics.mark(i, self.curve[k] + [0.0, 0.0, 0.0006], size=0.0009)
 
@@ -322,7 +309,7 @@ class Cut(Task):
     """Says to begin, or to go on."""
     if not self.opened:
       return "Push the tip of the blade through the line"
-    return f"Cut along the line: {100 * self.cut.mean():.0f} % done"
+    return f"Cut along the line: {100 * self.covered:.0f} % done"
 
   def recorded(self, physics: Physics) -> dict[str, float]:
     """Returns how the cut is so far."""
@@ -341,7 +328,7 @@ class Cut(Task):
   def _goes_on(self, physics: Physics) -> bool:
     """Returns whether somebody else was cutting along the line."""
     inside, _, seat = cutter(physics)
-    off = length(self.curve[following(self)] - seat)
+    off = length(self.curve[self.next] - seat)
     return inside and off < 2 * self.tolerance
 
   def expert(self, p: Performer) -> Script:
@@ -354,7 +341,7 @@ class Cut(Task):
       return place + deep / np.linalg.norm(place - port) * (place - port)
 
     while self.outcome is None:
-      start = following(self)
+      start = self.next
       if not self._goes_on(physics):
         yield from p.move(self.curve[start] + _OVER * up)
       yield from p.line(under(self.curve[start], _DEEP), speed=0.02)

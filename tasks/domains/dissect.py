@@ -72,9 +72,6 @@ def hard(**kwargs):
   return Dissect(scene, **kwargs)
 
 
-OBSERVED = "target", "front", "freed", "traction", "grasped"
-
-
 class State(Held, Freed):
   """State of a world."""
 
@@ -123,7 +120,9 @@ def observe(s, o):
 class Dissect(Freeing, Hold):
   """Free an organ from its bed by traction."""
 
-  rules = Rules(State, advance, observe, OBSERVED, METRICS)
+  rules = Rules(
+    State, advance, observe, ("target", "front", "freed", "traction", "grasped"), METRICS
+  )
   slip = 0.006
 
   def __init__(

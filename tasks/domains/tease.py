@@ -18,6 +18,7 @@ import numpy as np
 
 from ..base import Physics
 from ..core.rules import (
+  FAR,
   Rules,
   Vector,
   bond,
@@ -49,7 +50,6 @@ SCENE = Scene(
 _OVER, _BEHIND, _BEYOND, _LANE = 0.002, 0.006, 0.006, 0.006
 _SPEED, _BACK = 0.03, 0.012
 _UNDER, _LOW = 0.02, 0.005  # from the front and the bed at most, of who is under the strip [m]
-FAR = 1e9  # [m]
 ROW = 0.5 * _LANE  # bonds of the front are no farther from the first of them [m]
 
 
