@@ -4,20 +4,11 @@ Sizes are named: nworld worlds, nvert nodes, nelem triangles, naction components
 """
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
-from typing import Any
-
 import warp as wp
 from palpate.tasks.physics import COARSE, NEAR
 from palpate.tissue.types import Array, doubles, floats, ints, struct
 
 flags = Array(wp.bool, ("nworld",))
-vectors = Array(wp.vec3, ("nworld",))
-
-
-def together(name: str, *parts: type) -> Any:
-  """Returns the struct of the fields of some classes."""
-  fields = {key: kind for part in parts for key, kind in part.__annotations__.items()}
-  return struct(type(name, (), {"__annotations__": fields, "__module__": __name__}))
 
 
 @struct
