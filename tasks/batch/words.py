@@ -22,85 +22,97 @@ _CLOSING, _GRIPPING = wp.constant(instrument.CLOSING), wp.constant(instrument.GR
 _FOLD, _FORCE = wp.constant(instrument.FOLD), wp.constant(instrument.HELD_FORCE)
 
 
-@wp.func
+WORDS: dict[Any, Any] = {  # of Python -> of Warp
+  rules.rows: wp.matrix_from_rows, rules.vector: wp.vec3, rules.length: wp.length,
+  rules.dot: wp.dot, rules.root: wp.sqrt, rules.closeness: kernels.closeness, rules.clamp: wp.clamp,
+}  # fmt: skip
+
+
+def word(function: Any) -> Any:
+  """Makes a Warp function of what a word of the same name in `rules` is for many worlds."""
+  WORDS[getattr(rules, function.__name__)] = found = wp.func(function)
+  return found
+
+
+@word
 def tip(s: Common):
   """See `rules`."""
   return kernels.vector(s.tip_pos, s.world)
 
 
-@wp.func
+@word
 def point(s: Common, triangle: int):
   """See `rules`."""
   return kernels.point(s, s.world, triangle)
 
 
-@wp.func
+@word
 def corner(s: Common, triangle: int, k: int):
   """See `rules`."""
   return kernels.node(s, s.world, s.elem[triangle, k])
 
 
-@wp.func
+@word
 def normal(s: Common, triangle: int):
   """See `rules`."""
   return kernels.normal(s, s.world, triangle)
 
 
-@wp.func
+@word
 def peak(s: Common):
   """See `rules`."""
   return s.peak_force[s.world, 0]
 
 
-@wp.func
+@word
 def force(s: Common):
   """See `rules`."""
   return wp.length(kernels.vector(s.contact_force, s.world))
 
 
-@wp.func
+@word
 def last(s: Common, o: Any):
   """See `rules`."""
   return s.action[s.world, s.action.shape[1] - 1]
 
 
-@wp.func
+@word
 def other_tip(s: Common):
   """See `rules`."""
   return kernels.vector(s.other_tip_pos, s.world)
 
 
-@wp.func
+@word
 def other_point(s: Common, place: wp.vec3):
   """See `rules`."""
   return other_tip(s) + wp.quat_rotate(_turn(s.other_tip_quat, s.world), place)
 
 
-@wp.func
+@word
 def other_force(s: Common):
   """See `rules`."""
   return wp.length(kernels.vector(s.other_contact_force, s.world))
 
 
-@wp.func
+@word
 def bonds(s: Common):
   """See `rules`."""
   return s.bond_vert.shape[0]
 
 
-@wp.func
+@word
 def bond(s: Common, k: int):
   """See `rules`."""
   return kernels.node(s, s.world, s.bond_vert[k])
 
 
-@wp.func
+@word
 def is_free(s: Common, k: int):
   """See `rules`."""
   return s.bond_damage[s.world, k] >= 1.0
 
 
-@wp.func
+@word
 def share_freed(s: Common):
   """See `rules`."""
   free = wp.float64(0.0)
@@ -110,7 +122,7 @@ def share_freed(s: Common):
   return float(free)
 
 
-@wp.func
+@word
 def traction(s: Common):
   """See `rules`."""
   sum = wp.vec3()
@@ -121,13 +133,13 @@ def traction(s: Common):
   return wp.length(sum)
 
 
-@wp.func
+@word
 def weaken(s: Common, k: int, amount: float):
   """See `rules`."""
   s.bond_loss[s.world, k] = s.bond_loss[s.world, k] + amount
 
 
-@wp.func
+@word
 def cutter(s: Common):
   """See `rules`."""
   w = s.world
@@ -135,24 +147,24 @@ def cutter(s: Common):
   return s.cutter_inside[w, 0] > 0.0, s.cutter_length[w, 0], seat
 
 
-@wp.func
+@word
 def pieces(s: Common):
   """See `rules`."""
   return s.piece_count[s.world]
 
 
-@wp.func
+@word
 def tear(s: Common, o: Any, value: float):
   """See `rules`."""
 
 
-@wp.func
+@word
 def miss(s: Common, o: Any, value: float):
   """See `rules`."""
   s.errors[s.world] = s.errors[s.world] + 1
 
 
-@wp.func
+@word
 def reach(s: Common, o: Any, value: float):
   """See `rules`."""
   s.targets[s.world] = s.targets[s.world] + 1
@@ -165,46 +177,46 @@ def _turn(quat: wp.array2d[float], w: int):
   return wp.quat(quat[w, 1], quat[w, 2], quat[w, 3], quat[w, 0])
 
 
-@wp.func
+@word
 def from_tip(s: Common, place: wp.vec3):
   """See `rules`."""
   return wp.quat_rotate_inv(_turn(s.tip_quat, s.world), place - tip(s))
 
 
-@wp.func
+@word
 def closing(s: Common):
   """See `rules`."""
   opening, target = s.gripper[s.world, 0], s.gripper[s.world, 1]
   return target < wp.min(opening - _CLOSING, _GRIPPING)
 
 
-@wp.func
+@word
 def holds(s: Common):
   """See `rules`."""
   both = wp.min(s.inner[s.world, 0], s.inner[s.world, 1])
   return both > _FORCE and s.gripper[s.world, 0] > _FOLD
 
 
-@wp.func
+@word
 def grip(s: Common, o: Any, value: float):
   """See `rules`."""
   reach(s, o, value)
   s.grasps[s.world] = s.grasps[s.world] + 1
 
 
-@wp.func
+@word
 def slipped(s: Common, o: Any):
   """See `rules`."""
   s.slips[s.world] = s.slips[s.world] + 1
 
 
-@wp.func
+@word
 def drop(s: Common, o: Any):
   """See `rules`."""
   s.errors[s.world] = s.errors[s.world] + 1
 
 
-@wp.func
+@word
 def visible(s: Common, o: Any):
   """See `rules`."""
   seen = wp.float32(0.0)
@@ -212,18 +224,6 @@ def visible(s: Common, o: Any):
     if not s.behind[s.world, k]:
       seen += 1.0
   return seen / float(s.behind.shape[1])
-
-
-_BUILTIN = {
-  rules.rows: wp.matrix_from_rows, rules.vector: wp.vec3, rules.length: wp.length,
-  rules.dot: wp.dot, rules.root: wp.sqrt, rules.closeness: kernels.closeness, rules.clamp: wp.clamp,
-}  # fmt: skip
-_WORDS = (
-  tip, point, corner, normal, peak, force, miss, reach, from_tip, closing, holds, grip, slipped,
-  drop, visible, bonds, bond, is_free, share_freed, traction, tear, weaken, last,
-  other_tip, other_point, other_force, cutter, pieces,
-)  # fmt: skip
-WORDS = _BUILTIN | {getattr(rules, word.key): word for word in _WORDS}  # of Python -> of Warp
 
 
 def translate(rule: Any, module: Any, known: dict[Any, Any]) -> Any:

@@ -154,8 +154,9 @@ def nearest(s, o):
 def _nearest(s, o):
   found, least = int(0), float(FAR)  # noqa: RUF046, UP018 - variables to Warp
   for k in range(bonds(s)):
-    if off(s, o, k) < least:
-      least = off(s, o, k)
+    far = off(s, o, k)
+    if far < least:
+      least = far
       found = k
   return bond(s, found)
 
