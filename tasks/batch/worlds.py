@@ -77,7 +77,6 @@ class Worlds:
     if self.states:
       self.episodes.draw = self.states.draw
     self.organ = self.batch.organ(task.organ)
-    domain.attach(self)
     dt = environment.control_timestep()
     self.fields, self.other = self._make(task, task.prefix, dt, limit), None
     if task.second:
@@ -269,7 +268,6 @@ class Worlds:
   def _judge(self) -> None:
     """Launches what follows the steps of the physics."""
     self._measure(False)
-    self._domain.sense(self)
     if self.fields.jaw >= 0:
       self._press()
     if self.states and self.fields.behind.shape[1]:
@@ -311,7 +309,6 @@ class Worlds:
     self._of_hands(kernels.measure, beginning)
     if self.other:
       self._over(kernels.join, self.other)
-    self._domain.read(self)
 
   def _of_hands(self, kernel: Any, *inputs: Any) -> None:
     """Launches a kernel over the fields of each instrument."""
@@ -391,8 +388,7 @@ class Worlds:
     if self.states:
       self._over(self.states.observe, self.states.records, beginning)
       return
-    others = (self.other,) if self.other else ()
-    self._over(self._domain.observe, self.own, *others, beginning)
+    self._over(self._domain.observe, self.own, beginning)
 
   def _over(self, kernel: Any, *inputs: Any) -> None:
     self.launch(kernel, self.nworld, [self.fields, *inputs])
