@@ -71,7 +71,7 @@ def force(s: Common):
 
 
 @word
-def last(s: Common, o: Any):
+def last_component(s: Common, o: Any):
   """See `rules`."""
   return s.action[s.world, s.action.shape[1] - 1]
 

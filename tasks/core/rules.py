@@ -170,7 +170,7 @@ def visible(s: Any, o: Any) -> float:
   return 1 - float(s.hidden(o.disc).mean())
 
 
-def last(s: Any, o: Any) -> float:
+def last_component(s: Any, o: Any) -> float:
   """Returns the last component of the action, the largest of its rows."""
   return float(o.action[..., -1].max())
 

@@ -31,7 +31,7 @@ from ..core.rules import (
   clamp,
   dot,
   is_free,
-  last,
+  last_component,
   length,
   many,
   other_force,
@@ -119,7 +119,7 @@ def distances(s, o) -> np.ndarray:
   return np.where(bonds.free, np.inf, far)
 
 
-def off(s, o, k):
+def wire_distance(s, o, k):
   """Returns how far a bond that holds is from the wire [m]; a free one is far away."""
   heel = other_tip(s)
   along, offset = other_point(s, o.toe) - heel, bond(s, k) - heel
@@ -139,7 +139,7 @@ def divide(s, o):
 def _divide(s, o):
   found = int(0)  # noqa: RUF046, UP018 - a variable to Warp
   for k in range(bonds(s)):
-    if off(s, o, k) < REACH:
+    if wire_distance(s, o, k) < REACH:
       weaken(s, k, RATE * o.control_timestep)
       found += 1
   return found > 0
@@ -154,7 +154,7 @@ def nearest(s, o):
 def _nearest(s, o):
   found, least = int(0), float(FAR)  # noqa: RUF046, UP018 - variables to Warp
   for k in range(bonds(s)):
-    far = off(s, o, k)
+    far = wire_distance(s, o, k)
     if far < least:
       least = far
       found = k
@@ -163,7 +163,7 @@ def _nearest(s, o):
 
 def act(s, o):
   """Sends the current through the hook: it divides, or burns what the hook touches."""
-  o.live = last(s, o) > 0.0
+  o.live = last_component(s, o) > 0.0
   if o.live and not divide(s, o) and other_force(s) > TOUCHING:
     o.time = o.time + o.control_timestep
   return o
