@@ -2,7 +2,8 @@
 
     env = palpate.tasks.load("touch", "easy", task_kwargs={"random": 0})
 
-`ALL_TASKS`, `BENCHMARKING`, `EASY` and `HARD` are tuples of (domain, task); see `suite`.
+`ALL_TASKS`, `BENCHMARKING`, `EASY` and `HARD` are tuples of (domain, task); see `suite`. `register`
+is the decorator that adds an exercise, see `registry`.
 
     import gymnasium, palpate.tasks
     env = gymnasium.make("palpate/TouchEasy-v0")
@@ -12,24 +13,26 @@ imports it by itself for `gymnasium.make("palpate.tasks:palpate/TouchEasy-v0")`;
 longer looks for entry points.
 """
 
-import contextlib
 import importlib
+import pkgutil
 from typing import TYPE_CHECKING, Any
 
-from . import registry
+from . import domains, registry, suite
+from .registry import exercise as register
+from .suite import TASKS_BY_DOMAIN, load
 
 if TYPE_CHECKING:
-  from .suite import ALL_TASKS, BENCHMARKING, EASY, HARD, TASKS_BY_DOMAIN, load
+  from .suite import ALL_TASKS, BENCHMARKING, EASY, HARD
 
-__all__ = ["ALL_TASKS", "BENCHMARKING", "EASY", "HARD", "TASKS_BY_DOMAIN", "load"]
+__all__ = ["ALL_TASKS", "BENCHMARKING", "EASY", "HARD", "TASKS_BY_DOMAIN", "load", "register"]
 
 
 def __getattr__(name: str) -> Any:
   if name not in __all__:
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-  suite = importlib.import_module(".suite", __package__)  # which takes a second
   return getattr(suite, name)
 
 
-with contextlib.suppress(ImportError):  # Gymnasium is an extra
-  registry.register()
+for _module in pkgutil.iter_modules(domains.__path__):
+  importlib.import_module(f"{domains.__name__}.{_module.name}")
+registry.find()

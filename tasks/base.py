@@ -48,6 +48,7 @@ from palpate.models import trocar
 from scipy.spatial import cKDTree
 
 from . import observation, randomisation, safety, scenes, stage
+from .core.rules import DAMAGED, OUTCOMES
 from .environment import CONTROL_TIMESTEP, Environment
 from .handle import ROW
 from .instrument import AXES, JAWS
@@ -87,6 +88,8 @@ class Task(control.Task):
   """
 
   name = "task"
+  rules: Any = None  # see `Rules`
+  touched = 12  # nodes that the instrument touches at once, and some more: slots of a GPU's window
   watch = ("miss", "unintended_contact")
   final: tuple[str, ...] = ()  # components that end the episode above 0.5
   control_timestep = CONTROL_TIMESTEP
@@ -111,6 +114,7 @@ class Task(control.Task):
     input: str = "drives",
     nodes: int | None = None,
     surroundings: str | None = None,
+    name: str = "task",
   ):
     """Makes the exercise.
 
@@ -133,7 +137,9 @@ class Task(control.Task):
       input: what an action moves: the instrument's position `drives`, or its `handle`
       nodes: of the organ, in place of the scene's
       surroundings: `abdomen` or `none`, in place of the scene's
+      name: domain and task, for instance "touch/easy"
     """
+    self.name = name
     if reward not in REWARDS:
       raise ValueError(f"reward is {reward!r}, expected one of {', '.join(REWARDS)}")
     drawn = isinstance(random, np.random.RandomState)
@@ -243,7 +249,19 @@ class Task(control.Task):
 
   def advance(self, physics: Physics) -> float:
     """Returns the progress after a control step; sets `outcome` on success or failure."""
-    raise NotImplementedError
+    _, progress, outcome = self.rules.advance(physics, self)
+    self.outcome = OUTCOMES[outcome]
+    if outcome == DAMAGED:
+      self.event(physics, "note", label=self.label("damage"))
+    self.show(physics)
+    return progress
+
+  def show(self, physics: Physics) -> None:
+    """Moves the marks of the pictures after a control step."""
+
+  def label(self, kind: str) -> str:
+    """Returns what an event of the rules is called, see `event`."""
+    return ""
 
   def instruct(self, physics: Physics) -> str:
     """Returns what a person is to do next, in words."""
@@ -251,7 +269,11 @@ class Task(control.Task):
 
   def observe(self, physics: Physics) -> Mapping[str, np.ndarray]:
     """Returns the domain's own observations."""
-    return {}
+    if self.rules is None:
+      return {}
+    self.rules.observe(physics, self)
+    own = self.rules.observed
+    return {name: np.atleast_1d(np.asarray(getattr(self, name), float)) for name in own}
 
   def recorded(self, physics: Physics) -> Mapping[str, Any]:
     """Returns further columns of a sample, see `Recorder.append`."""
@@ -349,6 +371,8 @@ class Task(control.Task):
       count = len(ROW if self.scene.handle else AXES) + len(extra)
       hand.act(values[..., first : first + count], self.control_timestep)
       first += count
+    if self.rules and self.rules.act:
+      self.rules.act(physics, self)
 
   def after_step(self, physics: Physics) -> None:
     """Measures the progress and looks for errors and damage."""
@@ -430,11 +454,6 @@ class Task(control.Task):
       for hand in physics.hands
     ]
     return {"time": physics.data.ptr.time} | together(hands[0] | own, *hands[1:])
-
-
-def closeness(distance: float, start: float) -> float:
-  """Returns 1 at the goal, 0 at the distance it started from, -1 at twice that and beyond [-]."""
-  return max(-1.0, 1.0 - distance / max(start, 1e-3))
 
 
 def make(task: Task, time_limit: float, environment_kwargs: Mapping | None) -> Environment:

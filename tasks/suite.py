@@ -1,31 +1,22 @@
 """The exercises by name, loaded as those of dm_control's suite."""
 
-import importlib
-import inspect
 from collections.abc import Mapping
 from typing import Any
 
 from dm_control.rl import control
 
-from . import registry
+from . import base, registry
 
-DOMAINS = {name: importlib.import_module(f".{name}", __package__) for name in registry.TASKS}
-
-
-def _tagged(tag: str | None) -> tuple[tuple[str, str], ...]:
-  return tuple(
-    (domain, task)
-    for domain, module in DOMAINS.items()
-    for task in (module.SUITE if tag is None else module.SUITE.tagged(tag))
-  )
+TASKS_BY_DOMAIN = registry.TASKS
+# Those with a tag, and all; each is looked up, as a package may have registered more since.
+_TAGS = {"ALL_TASKS": None, "BENCHMARKING": None, "EASY": "easy", "HARD": "hard",
+         "BIMANUAL": "bimanual"}  # fmt: skip
 
 
-ALL_TASKS = _tagged(None)
-BENCHMARKING = _tagged("benchmarking")
-EASY = _tagged("easy")
-HARD = _tagged("hard")
-BIMANUAL = _tagged("bimanual")  # for two hands
-TASKS_BY_DOMAIN = {domain: tuple(module.SUITE) for domain, module in DOMAINS.items()}
+def __getattr__(name: str) -> Any:
+  if name not in _TAGS:
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+  return registry.tagged(_TAGS[name])
 
 
 def load(
@@ -46,29 +37,29 @@ def load(
   Raises:
     ValueError: no such domain or task, or a value that is not allowed; the message lists what is.
   """
-  if domain_name not in DOMAINS:
-    raise ValueError(f"domain is {domain_name!r}, expected one of {', '.join(DOMAINS)}")
-  suite = DOMAINS[domain_name].SUITE
-  if task_name not in suite:
-    raise ValueError(f"{domain_name}: task is {task_name!r}, expected one of {', '.join(suite)}")
-  factory = suite[task_name]
+  if domain_name not in registry.TASKS:
+    raise ValueError(
+      f"domain is {domain_name!r}, {registry.choices(domain_name, registry.TASKS)}"
+    )
+  names = registry.TASKS[domain_name]
+  if task_name not in names:
+    raise ValueError(f"{domain_name}: task is {task_name!r}, {registry.choices(task_name, names)}")
+  entry = registry.ENTRIES[f"{domain_name}/{task_name}"]
   kwargs = dict(task_kwargs or {})
-  if environment_kwargs is not None:
-    kwargs["environment_kwargs"] = environment_kwargs
-  return factory(**kwargs)
+  limit = kwargs.pop("time_limit", entry.time_limit)
+  return base.make(entry.make(**kwargs | {"name": entry.name}), limit, environment_kwargs)
 
 
 def split(name: str) -> tuple[str, str]:
   """Returns domain and task of a name such as "touch/easy"; a domain alone means `standard`."""
   domain, _, task = name.partition("/")
   task = task or "standard"
-  if (domain, task) not in ALL_TASKS:
-    names = ", ".join("/".join(pair) for pair in ALL_TASKS)
-    raise ValueError(f"task is {name!r}, expected one of {names}")
+  if f"{domain}/{task}" not in registry.ENTRIES:
+    raise ValueError(f"task is {name!r}, {registry.choices(name, registry.ENTRIES)}")
   return domain, task
 
 
 def summary(domain_name: str, task_name: str) -> str:
   """Returns what the task asks for, in one line."""
-  text = inspect.getdoc(DOMAINS[domain_name].SUITE[task_name]) or ""
-  return text.splitlines()[0].removeprefix("Returns the task to ").rstrip(".")
+  text = registry.ENTRIES[f"{domain_name}/{task_name}"].summary
+  return text[0].lower() + text[1:]

@@ -16,12 +16,8 @@ class Domain:
     struct: of Warp, its state
     begin: kernel (fields, own): begins the episodes of `begun`, once the instrument is measured
     advance: kernel (fields, own): what `Task.advance` is; it ends with `kernels.judge`
-    observe: kernel (fields, own, beginning): what `Task.observe` is; with two hands (fields, own,
-      fields of the other, beginning)
-    nodes: of the organ that its instrument touches at once, and some more: the slots of a GPU's
-      window
+    observe: kernel (fields, own, beginning): what `Task.observe` is
     takes: numbers of the task that the struct has under the same names
-    metrics: of its own, by the struct's arrays of an episode's values so far
     tissue: keys of the organ's tissue among the rows of `draw`, which the struct does not have
   """
 
@@ -29,9 +25,7 @@ class Domain:
   begin: Any
   advance: Any
   observe: Any
-  nodes: int = 12
   takes: tuple[str, ...] = ()
-  metrics: Mapping[str, str] = {}
   tissue: tuple[str, ...] = ()
 
   @staticmethod
@@ -42,22 +36,6 @@ class Domain:
   def sizes(task: Any, physics: Physics) -> dict[str, int]:
     """Returns the named sizes of its arrays."""
     return {}
-
-  @staticmethod
-  def attach(worlds: Any) -> None:
-    """Asks the batch, which has just been made, for what the domain needs."""
-
-  @staticmethod
-  def act(worlds: Any) -> None:
-    """Does what of an action no drive does, before the steps of the physics."""
-
-  @staticmethod
-  def read(worlds: Any) -> None:
-    """Brings what is of the organ up to date, after a step or where episodes begin."""
-
-  @staticmethod
-  def sense(worlds: Any) -> None:
-    """Measures after a step what the domain alone wants to know."""
 
   @staticmethod
   def constants(task: Any, physics: Physics) -> Mapping[str, Any]:

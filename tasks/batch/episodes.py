@@ -81,6 +81,7 @@ class Episodes:
     self.physics: Any = Resting.from_model(wrapper.MjModel(model))
     self.physics.use(model, task.prefix, task.targets, task.organ, task.second)
     self._task, self._domain = task, domain
+    self.draw: Any = None
     self._random: list[np.random.RandomState | None] = [None] * nworld
     self.rows: dict[str, np.ndarray] = {}
     self._next: dict[str, np.ndarray] = {}
@@ -140,7 +141,8 @@ class Episodes:
       own = body.pos.copy(), body.quat.copy(), hand.pose
       frame |= dict(zip(of_hand(hand is not self.physics), own, strict=True))
     frame["reference"] = np.array(self._task.reference_length() or 0.0)
-    return frame | dict(self._domain.draw(self._task, self.physics))
+    own = self.draw(self._task) if self.draw else self._domain.draw(self._task, self.physics)
+    return frame | dict(own)
 
 
 def of_hand(other: bool) -> list[str]:

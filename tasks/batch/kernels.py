@@ -2,17 +2,19 @@
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 import warp as wp
-from palpate.tasks import base, safety
+from palpate.tasks import base, jaws, safety
+from palpate.tasks.core.rules import closeness as _closeness
 from palpate.tasks.physics import NEAR
+from palpate.tissue.types import Array, floats, ints, struct
 
 from .fields import DAMAGED, RUNNING, SUCCESS, Common
 
-closeness, parts = wp.func(base.closeness), wp.func(safety.parts)
+closeness, parts = wp.func(_closeness), wp.func(safety.parts)
 
 _SHARE, _PRICE = wp.constant(base.SHARE), wp.constant(base.PRICE)
 _MOST = wp.constant(base.MOST)
 _SLACK = wp.constant(base.SLACK)
-_NEAR = wp.constant(NEAR)
+_NEAR, _FACING = wp.constant(NEAR), wp.constant(jaws.FACING)
 _distances = wp.types.vector(length=NEAR, dtype=float)
 _numbers = wp.types.vector(length=NEAR, dtype=int)
 
@@ -274,3 +276,62 @@ def survey(s: Common, beginning: bool):
   offset = node(s, w, s.coarse[k]) - s.coarse0[k]
   for i in range(3):
     s.surface[w, k, i] = offset[i]
+
+
+# What jaws hold, and what the organ hides.
+
+
+@struct
+class Between:
+  """What the jaws touch."""
+
+  side: floats("nside")  # see `Common`
+  inner: floats("nworld", 2)
+  left: Array(wp.mat33, ("nworld",))  # axes of the jaws
+  right: Array(wp.mat33, ("nworld",))
+  geom: ints("nworld", "ncontact")  # see `palpate.batch.Contacts`
+  normal: floats("nworld", "ncontact", 3)
+  force: floats("nworld", "ncontact")  # [N]
+
+
+@wp.kernel(enable_backward=False)
+def press(b: Between):
+  """Adds up the force of the jaws' inner faces on the organ, see `Jaws.inner_force`."""
+  w = wp.tid()
+  both = wp.vec2(0.0, 0.0)
+  for k in range(b.geom.shape[1]):
+    g = b.geom[w, k]
+    if g >= 0 and b.side[g] != 0.0:
+      n = -wp.vec3(b.normal[w, k, 0], b.normal[w, k, 1], b.normal[w, k, 2])
+      jaw = int(0)  # noqa: RUF046, UP018 - a variable to Warp
+      axes = b.left[w]
+      if b.side[g] < 0.0:
+        jaw = 1
+        axes = b.right[w]
+      along = b.side[g] * (n[0] * axes[0, 0] + n[1] * axes[1, 0] + n[2] * axes[2, 0])
+      if along > _FACING:
+        both[jaw] = both[jaw] + b.force[w, k] * along
+  b.inner[w, 0] = both[0]
+  b.inner[w, 1] = both[1]
+
+
+@wp.kernel(enable_backward=False)
+def hide(s: Common):
+  """Finds which points of the disc the organ hides: rays against triangles, as `Physics.hidden`."""
+  w, k = wp.tid()
+  covered = wp.bool(False)
+  ray = s.disc[w, k] - s.eye
+  for i in range(s.elem.shape[0]):
+    a = node(s, w, s.elem[i, 0])
+    e1, e2 = node(s, w, s.elem[i, 1]) - a, node(s, w, s.elem[i, 2]) - a
+    out = s.eye - a
+    across = wp.cross(out, e1)
+    size = wp.dot(ray, wp.cross(e2, e1))
+    side = wp.sign(size)
+    size = side * size
+    u = side * wp.dot(ray, wp.cross(e2, out))
+    v = side * wp.dot(ray, across)
+    far = side * wp.dot(e2, across)
+    if u >= 0.0 and v >= 0.0 and u + v <= size and far > 0.0 and far < 0.999 * size:
+      covered = True
+  s.behind[w, k] = covered

@@ -5,7 +5,8 @@ from typing import Any
 
 import warp as wp
 from palpate.models import shapes
-from palpate.tasks import feeling, palpation, scenes
+from palpate.tasks import scenes
+from palpate.tasks.domains import feeling, palpation
 from palpate.tissue.types import Array, floats, ints, struct
 
 from . import domain

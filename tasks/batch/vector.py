@@ -26,25 +26,16 @@ from palpate.batch.base import on_device
 from palpate.tasks.gym import Exercise
 
 from . import tally
-from .bimanual import Bimanual
-from .cut import Cut
-from .dissect import Dissect
 from .domain import Domain
 from .fields import INFO, OBSERVED, OUTCOMES
-from .grasp import Grasp
 from .palpate import Palpate
-from .press import Press
-from .retract import Retract
-from .tease import Tease
-from .touch import Touch
-from .trace import Trace
 from .worlds import Worlds
 
 # Exercises that are vectorised, by the class of their task.
 DOMAINS: dict[str, type[Domain]] = {
-  "Touch": Touch, "Press": Press, "Palpate": Palpate, "Grasp": Grasp, "Retract": Retract,
-  "Trace": Trace, "Dissect": Dissect, "Tease": Tease, "Bimanual": Bimanual,
-  "Cut": Cut,
+  "Touch": Domain, "Press": Domain, "Palpate": Palpate, "Grasp": Domain, "Retract": Domain,
+  "Trace": Domain, "Dissect": Domain, "Tease": Domain, "Bimanual": Domain,
+  "Cut": Domain,
 }  # fmt: skip
 _ELSE = 'vectorization_mode="sync" runs single environments side by side'
 OUTPUTS = ("numpy", "torch", "warp")
@@ -135,7 +126,7 @@ class Exercises(VectorEnv):
         of_part = single
         if len(kinds) > 1:
           of_part = Exercise(task, **{**kwargs, "variants": (variant,)})
-        options = {} if where == "cpu" else {"nodes": domain.nodes if nodes is None else nodes}
+        options = {} if where == "cpu" else {"nodes": self.task.touched if nodes is None else nodes}
         count = end - start
         self.parts.append(Worlds(of_part.environment, domain, count, where, limit, **options))
         self.slices.append(slice(start, end))
@@ -222,8 +213,9 @@ class Exercises(VectorEnv):
   def _metrics(self) -> dict[str, Any]:
     """Returns the metrics of the episodes so far, NaN where they are unknown."""
     values, names = self._tell("values"), tally.names(self.task.jaws)
-    own = DOMAINS[type(self.task).__name__].metrics
-    more = {name: self._tell(field) for name, field in own.items()}
+    rules = self.task.rules
+    own = rules.metrics if rules else {}
+    more = {name: self._tell(field).reshape(self.num_envs) for name, field in own.items()}
     if self.output != "warp":
       return {name: values[:, k] for k, name in enumerate(names)} | more
     return {name: wp.clone(values[:, k]) for k, name in enumerate(names)} | more

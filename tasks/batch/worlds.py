@@ -12,8 +12,9 @@ import mujoco as mj
 import numpy as np
 import palpate.batch
 import warp as wp
+from palpate.batch.threads import Threads
 from palpate.models import trocar
-from palpate.tasks import episode
+from palpate.tasks import episode, jaws
 from palpate.tasks.environment import Environment
 from palpate.tasks.instrument import AXES, JAWS, RATES
 from palpate.tasks.stage import STATE
@@ -23,6 +24,7 @@ from . import kernels, tally
 from .domain import Domain
 from .episodes import FRAME, HAND, Episodes, at_rest, of_hand
 from .fields import OBSERVED, Common
+from .states import States
 
 _SENSORS = ("tip_force", "shaft_force", "touch_left", "touch_right")
 
@@ -71,8 +73,10 @@ class Worlds:
     self.device, self._substeps = self.batch.device, episode.substeps(environment)
     self.batch.start(at_rest(self.batch.model, stage.state, STATE))
     self.episodes = Episodes(task, domain, nworld)
+    self.states = States(task.rules, task, nworld, self.device) if task.rules else None
+    if self.states:
+      self.episodes.draw = self.states.draw
     self.organ = self.batch.organ(task.organ)
-    domain.attach(self)
     dt = environment.control_timestep()
     self.fields, self.other = self._make(task, task.prefix, dt, limit), None
     if task.second:
@@ -80,6 +84,20 @@ class Worlds:
       self.other.first = len(task.components) - len(AXES) - len(task.other)
       for name in ("action", "begun", "step"):
         setattr(self.other, name, getattr(self.fields, name))
+      for name in ("tip_pos", "tip_quat", "contact_force"):
+        setattr(self.fields, f"other_{name}", getattr(self.other, name))
+    if not self.states:
+      self._make_own(task, domain, nworld)
+    if self.fields.cutter_inside.shape[1]:
+      self.batch.feel(f"{task.prefix}tip_force", task.organ)
+    steps = self.batch.watch(self._substeps)
+    self.tally = self._count(task, steps)
+    self._tally = self._count(task, steps) if self.other else None
+    self._hows = tally.hows(self.device)
+    self._bad = wp.zeros(1, dtype=int, device=self.device)
+    self._done, self._graphs = set[str](), dict[str, Any]()
+
+  def _make_own(self, task, domain, nworld):
     sizes = {"nworld": nworld, **domain.sizes(task, self.episodes.physics)}
     self.own = allocate(domain.struct, self.device, sizes)
     shared: dict[str, Any] = {name: getattr(task, name) for name in domain.takes}
@@ -89,12 +107,16 @@ class Worlds:
         getattr(self.own, name).assign(value)
       else:
         setattr(self.own, name, value)
-    steps = self.batch.watch(self._substeps)
-    self.tally = self._count(task, steps)
-    self._tally = self._count(task, steps) if self.other else None
-    self._hows = tally.hows(self.device)
-    self._bad = wp.zeros(1, dtype=int, device=self.device)
-    self._done, self._graphs = set[str](), dict[str, Any]()
+
+  def _write_states(self, at: wp.array, rows: Any, worlds: np.ndarray) -> None:
+    """Begins with the states that were drawn for some worlds."""
+    assert self.states
+    for name in self.task.rules.fields:
+      if name in self.states.rows:
+        self._write(self.states.rows[name], at, rows[name][worlds])
+      else:
+        self.states.set(name, rows[name])
+    self._write(self.states.records, at, self.states.table()[worlds])
 
   @property
   def hands(self) -> tuple[Any, ...]:
@@ -106,7 +128,9 @@ class Worlds:
     sizes = dict(
       nworld=self.nworld, nvert=self.organ.nvert, nelem=len(self.organ.elem), nq=model.nq,
       nv=model.nv, nu=model.nu, nsensor=model.nsensor, nsensordata=model.nsensordata,
-      naction=len(task.components),
+      naction=len(task.components), nside=model.ngeom + 1,
+      nspot=len(getattr(task, "disc", ())), nbond=len(physics.organ.bonds),
+      ncutter=len(physics.organ.cutters),
     )  # fmt: skip
     s = allocate(Common, self.device, sizes)
     s.dt, s.limit, s.sparse = dt, limit, int(task.reward == "sparse")
@@ -121,8 +145,15 @@ class Worlds:
       "move": np.array(RATES) * dt, "elem": self.organ.elem, "coarse": coarse,
       "coarse0": physics.organ.xpos0[coarse],
     }  # fmt: skip
+    bonds = physics.organ.bonds
+    if len(bonds):
+      constants |= {"bond_vert": bonds.vertices, "bond_share": bonds.area / bonds.area.sum()}
+    if s.jaw >= 0:
+      constants["side"] = jaws.Jaws(model, prefix).side
     for name, value in constants.items():
       getattr(s, name).assign(np.asarray(value))
+    if self.states and s.behind.shape[1]:
+      s.disc, s.eye = self.states.rows["disc"], wp.vec3(*physics.camera()[0])
     batch = self.batch
     s.ctrl, s.failures = batch.ctrl, batch.failures
     s.sensor_peak, s.sensor_mean = batch.sensor_peak, batch.sensor_mean
@@ -160,6 +191,16 @@ class Worlds:
       batch.qpos, batch.qvel, batch.sensordata, self.organ.xpos
     )  # fmt: skip
 
+  def _read_organ(self) -> None:
+    """Brings what holds and cuts the organ up to date."""
+    s, organ = self.fields, self.organ
+    if s.bond_vert.shape[0]:
+      s.bond_damage, s.bond_force = organ.bonds.damage, organ.bonds.force
+    if s.cutter_inside.shape[1]:
+      found = organ.cutters
+      s.cutter_inside, s.cutter_length, s.cutter_seat = found.inside, found.length, found.seat
+      s.piece_count = organ.piece_count
+
   # Doing.
 
   def array(self, name: str) -> wp.array:
@@ -169,6 +210,9 @@ class Worlds:
     own = name.removeprefix(self.task.second.replace("/", "_")) if self.other else name
     if own != name and OBSERVED.get(own, own) in Common.vars:
       return getattr(self.other, OBSERVED.get(own, own))
+    if self.states:
+      own = self.task.rules.fields
+      return self.states.array(name) if name in own else getattr(self.tally, name)
     return getattr(self.own if name in self._domain.struct.vars else self.tally, name)
 
   def check(self, action: wp.array, first: int = 0) -> None:
@@ -200,9 +244,19 @@ class Worlds:
     """Begins a control step with actions that are allowed."""
     wp.copy(self.fields.action, action)
     self._of_hands(kernels.act)
-    self._domain.act(self)
+    if self.states and self.states.act:
+      self._act()
     self.batch.step(self._substeps)
     self._run(self._judge)
+
+  def _act(self) -> None:
+    """Does what of an action no drive does."""
+    assert self.states
+    lost = self.fields.bond_loss
+    lost.zero_()
+    self._over(self.states.act, self.states.records, False)
+    if lost.shape[1]:
+      self.organ.bonds.weaken(lost)
 
   def wait(self) -> np.ndarray:
     """Ends a control step; returns in which worlds the episode is over  (nworld,) bool."""
@@ -214,8 +268,14 @@ class Worlds:
   def _judge(self) -> None:
     """Launches what follows the steps of the physics."""
     self._measure(False)
-    self._domain.sense(self)
-    self._over(self._domain.advance, self.own)
+    if self.fields.jaw >= 0:
+      self._press()
+    if self.states and self.fields.behind.shape[1]:
+      self.launch(kernels.hide, self.fields.behind.shape, [self.fields])
+    if self.states:
+      self._over(self.states.advance, self.states.records)
+    else:
+      self._over(self._domain.advance, self.own)
     self._over(tally.add, self.tally)
     if self.other:
       self.launch(tally.add, self.nworld, [self.other, self._tally])
@@ -223,14 +283,32 @@ class Worlds:
       self.launch(tally.join, self.tally.values.shape, inputs)
     self._observe(False)
 
+  def _press(self) -> None:
+    """Measures what the jaws have between them."""
+    batch, s = self.batch, self.fields
+    found = jaws.Jaws(batch.model, self.task.prefix)
+    if not isinstance(batch, Threads):
+      between: Any = kernels.Between()
+      between.left, between.right = (batch.xmat(name) for name in found.names)
+      between.geom, between.normal, between.force = self.organ.contacts
+      between.side, between.inner = s.side, s.inner
+      self.launch(kernels.press, self.nworld, [between])
+      return
+    inner = s.inner.numpy()
+
+    def work(world: int):
+      inner[world] = found.inner_force(batch.models[world], batch.datas[world])
+
+    batch.each(work)
+
   def _measure(self, beginning: bool) -> None:
     """Measures the instruments, and brings what is of the batch up to date."""
     for hand in self.hands:
       self._read(hand)
+    self._read_organ()
     self._of_hands(kernels.measure, beginning)
     if self.other:
       self._over(kernels.join, self.other)
-    self._domain.read(self)
 
   def _of_hands(self, kernel: Any, *inputs: Any) -> None:
     """Launches a kernel over the fields of each instrument."""
@@ -248,11 +326,13 @@ class Worlds:
     s.begun.assign(mask)
     at = wp.array(worlds, dtype=int, device=self.device)
     for name, values in rows.items():
-      if name in self._domain.tissue:
+      if name in self._domain.tissue or (self.states and name in self.task.rules.fields):
         continue
       of_other = self.other is not None and name in of_hand(True)
       out = self.other if of_other else s if name in FRAME else self.own
       self._write(getattr(out, name.removeprefix("other_" if of_other else "")), at, values[worlds])
+    if self.states:
+      self._write_states(at, rows, worlds)
     self.batch.reset(s.begun)
     for hand, prefix in zip(self.hands, (self.task.prefix, self.task.second), strict=False):
       # The plugin's worlds take them as they were drawn, in float64.
@@ -270,7 +350,8 @@ class Worlds:
   def _write(self, out: wp.array, at: wp.array, rows: np.ndarray) -> None:
     """Writes rows of some worlds to an array on the device."""
     words = out.size * wp.types.type_size_in_bytes(out.dtype) // 4 // self.nworld
-    rows = np.ascontiguousarray(rows, np.float32 if rows.dtype.kind == "f" else np.int32)
+    kind = {"f": np.float32, "V": rows.dtype}.get(rows.dtype.kind, np.int32)
+    rows = np.ascontiguousarray(rows, kind)
     rows = rows.view(np.int32).reshape(len(rows), words)
     source = wp.array(rows, dtype=int, device=self.device)
     whole = wp.array(ptr=out.ptr, dtype=int, shape=(self.nworld, words), device=self.device)
@@ -280,7 +361,8 @@ class Worlds:
     """Launches what follows the beginning of episodes."""
     self._of_hands(kernels.begin)
     self._measure(True)
-    self._over(self._domain.begin, self.own)
+    if not self.states:
+      self._over(self._domain.begin, self.own)
     self._over(tally.start, self.tally)
     if self.other:
       self.launch(tally.start, self.nworld, [self.other, self._tally])
@@ -303,8 +385,10 @@ class Worlds:
     self._over(kernels.look, beginning)
     dim = (self.nworld, self.fields.coarse.shape[0])
     self.launch(kernels.survey, dim, [self.fields, beginning])
-    others = (self.other,) if self.other else ()
-    self._over(self._domain.observe, self.own, *others, beginning)
+    if self.states:
+      self._over(self.states.observe, self.states.records, beginning)
+      return
+    self._over(self._domain.observe, self.own, beginning)
 
   def _over(self, kernel: Any, *inputs: Any) -> None:
     self.launch(kernel, self.nworld, [self.fields, *inputs])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from palpate import tasks
 from palpate.tasks import lessons
-from palpate.tasks.feeling import Notes
+from palpate.tasks.domains.feeling import Notes
 
 GRID = np.array([(0.008 * x, 0.008 * y, 0.0) for x in range(-3, 4) for y in range(-3, 4)])
 UP = np.array([0.0, 0.0, 1.0])

@@ -19,16 +19,27 @@ import itertools
 from collections.abc import Callable
 
 import numpy as np
-from dm_control.utils import containers
 
-from . import base
-from .base import Physics
-from .freeing import Freeing
-from .grasp import FUNDUS, Hold
-from .performer import Performer, Script
-from .scenes import Scene
+from ..base import Physics
+from ..core.rules import (
+  Rules,
+  Vector,
+  bond,
+  bonds,
+  closeness,
+  drop,
+  is_free,
+  many,
+  point,
+  tip,
+  vector,
+)
+from ..performer import Performer, Script
+from ..registry import exercise
+from ..scenes import Scene
+from .freeing import METRICS, Freed, Freeing, count, earned, held, holding
+from .grasp import FUNDUS, Held, Hold, distance, follow
 
-SUITE = containers.TaggedTasks()
 # Stiffness [N/m^3], strength [Pa] and energy [J/m^2] of the bed, and of a tough one. Ours: we know
 # of no measurement; the bed bears the organ, and comes away under half a newton or one.
 BED, TOUGH = (1e7, 6e3, 8.0), (1e7, 7e3, 10.0)
@@ -36,53 +47,97 @@ BED, TOUGH = (1e7, 6e3, 8.0), (1e7, 7e3, 10.0)
 _FAR, _SPEED, _UP = 0.045, 0.01, 0.5
 
 
-@SUITE.add("benchmarking", "easy")
-def easy(time_limit=30, random=None, environment_kwargs=None, **kwargs):
-  """Returns the task to free half of the gallbladder's bed."""
+@exercise("dissect/easy", 30, "easy")
+def easy(**kwargs):
+  """Free half of the gallbladder's bed."""
   kwargs = {"wanted": 0.5, **kwargs}
   scene = dataclasses.replace(FUNDUS, nodes=250, bonds=BED)
-  task = Dissect(scene, random, name="dissect/easy", **kwargs)
-  return base.make(task, time_limit, environment_kwargs)
+  return Dissect(scene, **kwargs)
 
 
-@SUITE.add("benchmarking")
-def standard(time_limit=40, random=None, environment_kwargs=None, **kwargs):
-  """Returns the task to free 80 % of it."""
+@exercise("dissect/standard", 40)
+def standard(**kwargs):
+  """Free 80 % of it."""
   kwargs = {"wanted": 0.8, "jitter": 0.003, **kwargs}
   scene = dataclasses.replace(FUNDUS, nodes=250, bonds=BED)
-  task = Dissect(scene, random, name="dissect/standard", **kwargs)
-  return base.make(task, time_limit, environment_kwargs)
+  return Dissect(scene, **kwargs)
 
 
-@SUITE.add("benchmarking", "hard")
-def hard(time_limit=60, random=None, environment_kwargs=None, **kwargs):
-  """Returns the task to free 85 % of a tough bed with less force, on varying organs."""
+@exercise("dissect/hard", 60, "hard")
+def hard(**kwargs):
+  """Free 85 % of a tough bed with less force, on varying organs."""
   kwargs = {"wanted": 0.85, "jitter": 0.005, "variants": (None, 1, 2), **kwargs}
   kwargs = {"force_limit": 3.4, "damage": 6.0, "traction": 1.2, **kwargs}
   scene = dataclasses.replace(FUNDUS, nodes=500, bonds=TOUGH)
-  task = Dissect(scene, random, name="dissect/hard", **kwargs)
-  return base.make(task, time_limit, environment_kwargs)
+  return Dissect(scene, **kwargs)
+
+
+class State(Held, Freed):
+  """State of a world."""
+
+  front: Vector
+
+
+# The rules.
+
+
+def middle(s):
+  """Returns the middle of the bonds that hold, or of all where none does [m]."""
+  return held(s).mean(axis=0)
+
+
+@many(middle)
+def _middle(s):
+  found, total = holding(s), vector(0.0, 0.0, 0.0)
+  for k in range(bonds(s)):
+    if found == 0 or not is_free(s, k):
+      total += bond(s, k)
+  return total / float(bonds(s) if found == 0 else found)
+
+
+def hold(s, o):
+  """Follows the grasp; returns too how close the tip is to it, 1 while it holds."""
+  o, lost = follow(s, o)
+  if lost:
+    drop(s, o)
+  return o, 1.0 if o.grasped == 1.0 else closeness(distance(s, o), o.distance0)
+
+
+def advance(s, o):
+  """Follows the grasp and what comes free."""
+  o, near = hold(s, o)
+  o, outcome = count(s, o, o.grasped == 1.0)
+  return o, earned(o, near, outcome), outcome
+
+
+def observe(s, o):
+  """Finds target and front; freed, traction and grasped are up to date."""
+  o.target = point(s, o.site) - tip(s)
+  o.front = middle(s) - tip(s)
+  return o
 
 
 class Dissect(Freeing, Hold):
   """Free an organ from its bed by traction."""
 
+  rules = Rules(
+    State, advance, observe, ("target", "front", "freed", "traction", "grasped"), METRICS
+  )
   slip = 0.006
 
   def __init__(
-    self, scene: Scene, random=None, *, name: str, wanted: float, traction: float = 1.5, **kwargs
+    self, scene: Scene, random=None, *, wanted: float, traction: float = 1.5, **kwargs
   ):
     """Makes the task.
 
     Args:
       scene: what it plays in, with bonds
       random: see Task
-      name: domain and task
       wanted: share of the bed that must come free cleanly [-]
       traction: limit of the pull on the liver [N]
       **kwargs: see Task; the force limit counts the jaws too
     """
-    self.name, self.targets = name, 1
+    self.targets = 1
     kwargs = {"spread": 0.012, "force_limit": 4.0, "damage": 8.0, **kwargs}
     kwargs |= {"wanted": wanted, "traction": traction}
     super().__init__(dataclasses.replace(scene, targets=1), random, **kwargs)
@@ -91,20 +146,11 @@ class Dissect(Freeing, Hold):
     """Draws the site to grasp."""
     super().begin(physics)
     self.whole(physics)
-    physics.mark(0, physics.point(self.site), now=True)
+    self.show(physics)
 
-  def advance(self, physics: Physics) -> float:
-    """Follows the grasp and what comes free."""
+  def show(self, physics: Physics) -> None:
+    """Marks the site."""
     physics.mark(0, physics.point(self.site), now=True)
-    if self.follow(physics):
-      self.dropped(physics)
-    self.count(physics, self.fair(physics))
-    near = base.closeness(self.distance(physics), self.distance0)
-    return self.earned(1.0 if self.grasped else near)
-
-  def fair(self, physics: Physics) -> bool:
-    """Whether what comes free now counts as clean."""
-    return self.grasped
 
   def instruct(self, physics: Physics) -> str:
     """Says to grasp, or to pull."""
@@ -113,16 +159,6 @@ class Dissect(Freeing, Hold):
     if self.traction > self.limit:
       return "Pull less: the liver gives"
     return f"Pull it off its bed: {100 * self.clean:.0f} of {100 * self.wanted:.0f} % are free"
-
-  def observe(self, physics: Physics) -> dict[str, np.ndarray]:
-    """Returns target, front, freed, traction and grasped."""
-    return {
-      "target": physics.point(self.site) - physics.tip_pos(),
-      "front": self.front(physics) - physics.tip_pos(),
-      "freed": np.array([self.freed]),
-      "traction": np.array([self.traction]),
-      "grasped": np.array([float(self.grasped)]),
-    }
 
   def reference_length(self) -> float:
     """Returns the way to the site and off the bed [m]."""
@@ -148,7 +184,7 @@ class Dissect(Freeing, Hold):
       most: how far at most [m]
       further: whether to pull on, by the time that it was held [s]
     """
-    away = p.physics.point(self.site) - self.front(p.physics)
+    away = p.physics.point(self.site) - middle(p.physics)
     along = away / np.linalg.norm(away) + _UP * p.hand.trocar().mat[:, 2]
     along /= np.linalg.norm(along)
     start, far, contact = p.tip.copy(), 0.0, 0.0

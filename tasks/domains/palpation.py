@@ -6,11 +6,11 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.spatial import cKDTree
 
-from . import scenes
-from .base import Physics, Task
+from .. import scenes
+from ..base import Physics, Task
+from ..performer import Performer, Script
+from ..scenes import Scene
 from .feeling import APART, SOFT, Notes, chance, nearest
-from .performer import Performer, Script
-from .scenes import Scene
 
 _FACING = 0.75  # least cosine between the field's normal and the way to the trocar
 _PIN_GAP = 0.02  # the field keeps that far from pinned nodes [m]

@@ -14,65 +14,256 @@ limit.
 
 import dataclasses
 import math
+from typing import Annotated, Any
 
 import numpy as np
-from dm_control.utils import containers
+import warp as wp
+from palpate.tissue.types import Array, floats, ints
 from scipy.spatial import cKDTree
 
-from . import base
-from .base import Physics, Task
-from .performer import Performer, Script
-from .scenes import Scene
+from ..base import Physics, Task
+from ..core.rules import (
+  FAR,
+  RUNNING,
+  SUCCESS,
+  Rules,
+  Vector,
+  Vectors3,
+  clamp,
+  closeness,
+  corner,
+  dot,
+  drop,
+  force,
+  length,
+  many,
+  miss,
+  rows,
+  tip,
+)
+from ..performer import Performer, Script
+from ..registry import exercise
+from ..scenes import Scene
 
-SUITE = containers.TaggedTasks()
 STOMACH = Scene(organ="stomach", center="body", port=(0.03, 0.045, 0.12), camera=(-0.05, 0.1, 0.14))
 CONTACT = 0.02  # [N]
 STEP = 0.0015  # between points of the curve [m]
 GAP, SKIPPED = 0.003, 0.1  # largest gap in contact [m], and share of the length that all may have
 WINDOW = 4  # points before and after the end of what is traced, to look for the tip between
 AHEAD = tuple(round(d / STEP) for d in (0.005, 0.01, 0.015))  # points that are observed
+FIRST, SECOND, THIRD = AHEAD
 DRAWN = 160  # points along the curve as it is drawn
 _ATTEMPTS = 40
 _FACING = 0.7  # least cosine between the surface's normal and the way to the trocar
 _MARKS = 30  # spheres that draw the curve
 
 
-@SUITE.add("benchmarking", "easy")
-def easy(time_limit=20, random=None, environment_kwargs=None, **kwargs):
-  """Returns the task to trace an arc of about 40 mm within 5 mm."""
+@exercise("trace/easy", 20, "easy")
+def easy(**kwargs):
+  """Trace an arc of about 40 mm within 5 mm."""
   kwargs = {"size": 0.02, "turns": 0.0, "tolerance": 0.005, **kwargs}
-  task = Trace(dataclasses.replace(STOMACH, nodes=250), random, name="trace/easy", **kwargs)
-  return base.make(task, time_limit, environment_kwargs)
+  return Trace(dataclasses.replace(STOMACH, nodes=250), **kwargs)
 
 
-@SUITE.add("benchmarking")
-def standard(time_limit=30, random=None, environment_kwargs=None, **kwargs):
-  """Returns the task to trace an S of about 60 mm within 3.5 mm."""
+@exercise("trace/standard", 30)
+def standard(**kwargs):
+  """Trace an S of about 60 mm within 3.5 mm."""
   kwargs = {"size": 0.025, "turns": 1.0, "tolerance": 0.0035, "jitter": 0.005, **kwargs}
-  task = Trace(dataclasses.replace(STOMACH, nodes=500), random, name="trace/standard", **kwargs)
-  return base.make(task, time_limit, environment_kwargs)
+  return Trace(dataclasses.replace(STOMACH, nodes=500), **kwargs)
 
 
-@SUITE.add("benchmarking", "hard")
-def hard(time_limit=40, random=None, environment_kwargs=None, **kwargs):
-  """Returns the task to trace a double S of about 80 mm within 3 mm, on stomachs that vary."""
+@exercise("trace/hard", 40, "hard")
+def hard(**kwargs):
+  """Trace a double S of about 80 mm within 3 mm, on stomachs that vary."""
   kwargs = {"size": 0.026, "turns": 2.0, "tolerance": 0.003, "jitter": 0.005, **kwargs}
   kwargs = {"variants": (None, 1, 2), "force_limit": 0.5, "damage": 2.0, **kwargs}
-  task = Trace(dataclasses.replace(STOMACH, nodes=1000), random, name="trace/hard", **kwargs)
-  return base.make(task, time_limit, environment_kwargs)
+  return Trace(dataclasses.replace(STOMACH, nodes=1000), **kwargs)
+
+
+class State:
+  """State of a world."""
+
+  tolerance: float  # [m]
+  count: int  # points of the curve
+  triangles: Annotated[Any, ints(DRAWN)]  # they lie in
+  weights: Annotated[Any, Array(wp.vec3, (DRAWN,))]
+  arc: Annotated[Any, floats(DRAWN)]  # how far along the curve they are [m]
+  traced: float  # [m]
+  skipped: float  # [m]
+  tracing: bool
+  touching: bool
+  distance0: float  # [m]
+  target: Vector
+  ahead: Vectors3
+
+
+# The rules. What goes over many points is written for numpy, and for many worlds below it.
+
+
+def settle(s, o):
+  """Finds where the curve is, which moves with the organ."""
+  corners = s.nodes()[s.organ.elem[o.triangles]]
+  o.now = np.einsum("ij,ijk->ik", o.weights, corners)
+  return o
+
+
+@many(settle)
+def _settle(s, o):
+  return o
+
+
+def place(s, o, k):
+  """Returns where a point of the curve is [m]."""
+  return o.now[k]
+
+
+@many(place)
+def _place(s, o, k):
+  t, share = o.triangles[k], o.weights[k]
+  return share[0] * corner(s, t, 0) + share[1] * corner(s, t, 1) + share[2] * corner(s, t, 2)
+
+
+def done(o):
+  """Returns the number of points that are traced."""
+  return int(np.searchsorted(o.arc, o.traced, side="right")) if o.traced else 0
+
+
+@many(done)
+def _done(o):
+  found = int(0)  # noqa: RUF046, UP018 - a variable to Warp
+  if o.traced > 0.0:
+    for k in range(o.count):
+      if o.arc[k] <= o.traced:
+        found = k + 1
+  return found
+
+
+def project(s, o):
+  """Returns how far along the curve the tip is, near what is traced, and how far off it [m]."""
+  k = max(done(o) - 1, 0)
+  part = slice(max(k - WINDOW, 0), k + WINDOW + 1)
+  start, arc = o.now[part], o.arc[part]
+  along = np.diff(start, axis=0)
+  offset = tip(s) - start[:-1]
+  share = np.einsum("ij,ij->i", offset, along) / np.einsum("ij,ij->i", along, along)
+  share = np.clip(share, 0.0, 1.0)
+  off = np.linalg.norm(offset - share[:, None] * along, axis=1)
+  i = int(off.argmin())
+  return float(arc[i] + share[i] * (arc[i + 1] - arc[i])), float(off[i])
+
+
+@many(project)
+def _project(s, o):
+  middle = max(done(o) - 1, 0)
+  along_curve, off = float(0.0), float(FAR)  # noqa: UP018 - variables to Warp
+  for k in range(max(middle - WINDOW, 0), min(middle + WINDOW, o.count - 1)):
+    start = place(s, o, k)
+    along = place(s, o, k + 1) - start
+    share = clamp(dot(tip(s) - start, along) / dot(along, along), 0.0, 1.0)
+    far = length(tip(s) - start - share * along)
+    if far < off:
+      off = far
+      along_curve = o.arc[k] + share * (o.arc[k + 1] - o.arc[k])
+  return along_curve, off
+
+
+def aside(s, o):
+  """Returns how far the tip is from the nearest point of the curve [m]."""
+  return float(cKDTree(o.now).query(tip(s))[0])
+
+
+@many(aside)
+def _aside(s, o):
+  off = float(FAR)
+  for k in range(o.count):
+    off = min(off, length(place(s, o, k) - tip(s)))
+  return off
+
+
+def distance(s, o):
+  """Returns how far the tip is from the next point of the curve [m]."""
+  return length(place(s, o, min(done(o), o.count - 1)) - tip(s))
+
+
+def follow(
+  tracing: bool,
+  traced: float,
+  skipped: float,
+  place: float,
+  on: bool,
+  tolerance: float,
+  length: float,
+) -> tuple[bool, float, float]:
+  """Returns whether tracing goes on, how far it has come, and what gaps add up to [m].
+
+  Args:
+    tracing: whether it did
+    traced: how far it had come along the curve [m]
+    skipped: what gaps added up to [m]
+    place: of the tip along the curve [m]
+    on: whether it presses on the curve
+    tolerance: largest distance of the start from the curve's [m]
+    length: of the curve [m]
+  """
+  gap = place - traced
+  again = on and not tracing and gap > 0.0
+  within = gap <= GAP and skipped + gap <= SKIPPED * length
+  if traced == 0.0:
+    within = place <= tolerance
+  goes = on and (within or not again)
+  further = max(traced, place) if goes else traced
+  return goes, further, skipped + gap if again and goes and traced > 0.0 else skipped
+
+
+def advance(s, o):
+  """Follows the tip along the curve."""
+  o = settle(s, o)
+  whole = o.arc[o.count - 1]
+  touches = force(s) > CONTACT
+  along, off = project(s, o)
+  on = touches and off <= o.tolerance
+  tracing, traced, skipped = follow(o.tracing, o.traced, o.skipped, along, on, o.tolerance, whole)
+  o.tracing = tracing
+  o.traced = traced
+  o.skipped = skipped
+  if o.touching and not touches and traced > 0.0:
+    drop(s, o)
+  if touches and not o.touching:
+    beside = aside(s, o)
+    if beside > o.tolerance:
+      miss(s, o, beside)
+  o.touching = touches
+  if traced >= whole - STEP:
+    return o, 1.0, SUCCESS
+  progress = 0.1 + 0.9 * traced / whole
+  if traced == 0.0:
+    progress = 0.1 * closeness(distance(s, o), o.distance0)
+  return o, progress, RUNNING
+
+
+def observe(s, o):
+  """Finds target and ahead."""
+  at, last, here = done(o), o.count - 1, tip(s)
+  o.target = place(s, o, min(at, last)) - here
+  o.ahead = rows(
+    place(s, o, min(at + FIRST, last)) - here,
+    place(s, o, min(at + SECOND, last)) - here,
+    place(s, o, min(at + THIRD, last)) - here,
+  )
+  return o
 
 
 class Trace(Task):
   """Follow a curve in light contact."""
 
   watch = ("miss", "unintended_contact", "drop")
+  rules = Rules(State, advance, observe, ("target", "ahead"))
 
   def __init__(
     self,
     scene: Scene,
     random=None,
     *,
-    name: str,
     size: float,
     turns: float,
     tolerance: float,
@@ -83,13 +274,12 @@ class Trace(Task):
     Args:
       scene: what it plays in
       random: see Task
-      name: domain and task
       size: half the width of the curve [m]
       turns: how often it waves; 0 is an arc
       tolerance: largest distance of the tip from the curve [m]
       **kwargs: see Task
     """
-    self.name, self.targets = name, _MARKS
+    self.targets = _MARKS
     self.size, self.turns, self.tolerance = size, turns, tolerance
     kwargs = {"spread": 0.03, **kwargs}
     super().__init__(dataclasses.replace(scene, targets=_MARKS), random, **kwargs)
@@ -109,9 +299,9 @@ class Trace(Task):
     gaps = np.linalg.norm(np.diff(self.curve, axis=0), axis=1)
     self.arc = np.concatenate([[0.0], gaps.cumsum()])
     self.traced, self.skipped = 0.0, 0.0
-    self.tracing, self._touching = False, False
-    self.now = self.curve
-    self.distance0 = self.distance(physics)
+    self.tracing, self.touching = False, False
+    self.now, self.count = self.curve, len(self.curve)
+    self.distance0 = distance(physics, self)
     for i, k in enumerate(np.linspace(0, len(self.curve) - 1, _MARKS).round().astype(int)):
       physics.mark(i, self.curve[k], size=0.0015)
 
@@ -158,68 +348,19 @@ class Trace(Task):
   @property
   def done(self) -> int:
     """Number of points of the curve that are traced."""
-    return int(np.searchsorted(self.arc, self.traced, side="right")) if self.traced else 0
+    return done(self)
 
-  def distance(self, physics: Physics) -> float:
-    """Returns how far the tip is from the next point of the curve [m]."""
-    k = min(self.done, len(self.curve) - 1)
-    return float(np.linalg.norm(self.now[k] - physics.tip_pos()))
-
-  def advance(self, physics: Physics) -> float:
-    """Follows the tip along the curve, which moves with the organ."""
-    corner = physics.nodes()[physics.organ.elem[self.triangles]]
-    self.now = np.einsum("ij,ijk->ik", self.weights, corner)
-    tip = physics.tip_pos()
-    touching = float(np.linalg.norm(physics.contact_force())) > CONTACT
-    place, off = self._project(tip)
-    self._trace(place, touching and off <= self.tolerance)
-    if self._touching and not touching and self.traced:
-      self.event(physics, "drop", label="contact lost")
-    if touching and not self._touching:
-      off = float(cKDTree(self.now).query(tip)[0])
-      if off > self.tolerance:
-        self.event(physics, "miss", off)
-    self._touching = touching
-    if self.traced >= self.arc[-1] - STEP:
-      self.outcome = "success"
-      return 1.0
-    if not self.traced:
-      return 0.1 * base.closeness(self.distance(physics), self.distance0)
-    return 0.1 + 0.9 * self.traced / float(self.arc[-1])
-
-  def _trace(self, place: float, on: bool) -> None:
-    """Goes on to a place along the curve [m], where the tip presses on it."""
-    self.tracing, self.traced, self.skipped = follow(
-      self.tracing, self.traced, self.skipped, place, on, self.tolerance, float(self.arc[-1])
-    )
-
-  def _project(self, tip: np.ndarray) -> tuple[float, float]:
-    """Returns how far along the curve the tip is, near what is traced, and how far off it [m]."""
-    k = max(self.done - 1, 0)
-    part = slice(max(k - WINDOW, 0), k + WINDOW + 1)
-    start, arc = self.now[part], self.arc[part]
-    along = np.diff(start, axis=0)
-    offset = tip - start[:-1]
-    share = np.einsum("ij,ij->i", offset, along) / np.einsum("ij,ij->i", along, along)
-    share = np.clip(share, 0.0, 1.0)
-    off = np.linalg.norm(offset - share[:, None] * along, axis=1)
-    i = int(off.argmin())
-    return float(arc[i] + share[i] * (arc[i + 1] - arc[i])), float(off[i])
+  def label(self, kind: str) -> str:
+    """Returns what a drop is."""
+    return "contact lost" if kind == "drop" else ""
 
   def instruct(self, physics: Physics) -> str:
     """Says where to begin, or to go on."""
     if not self.traced:
       return "Touch the beginning of the line"
-    if not self._touching:
+    if not self.touching:
       return "Touch the line where you have left it, and go on"
     return f"Follow the line in light contact, {100 * self.traced / float(self.arc[-1]):.0f} % done"
-
-  def observe(self, physics: Physics) -> dict[str, np.ndarray]:
-    """Returns target and ahead."""
-    curve = self.now - physics.tip_pos()
-    last = len(curve) - 1
-    further = [min(self.done + count, last) for count in AHEAD]
-    return {"target": curve[min(self.done, last)], "ahead": curve[further]}
 
   def constants(self, physics: Physics) -> dict[str, np.ndarray]:
     """Returns the curve to trace [m]."""
@@ -256,33 +397,3 @@ class Trace(Task):
       p.tip = rest + height * up + wander * physics.trocar().mat[:, 0]
       yield p.step()
     yield from p.move(p.tip + 0.01 * up)
-
-
-def follow(
-  tracing: bool,
-  traced: float,
-  skipped: float,
-  place: float,
-  on: bool,
-  tolerance: float,
-  length: float,
-) -> tuple[bool, float, float]:
-  """Returns whether tracing goes on, how far it has come, and what gaps add up to [m].
-
-  Args:
-    tracing: whether it did
-    traced: how far it had come along the curve [m]
-    skipped: what gaps added up to [m]
-    place: of the tip along the curve [m]
-    on: whether it presses on the curve
-    tolerance: largest distance of the start from the curve's [m]
-    length: of the curve [m]
-  """
-  gap = place - traced
-  again = on and not tracing and gap > 0.0
-  within = gap <= GAP and skipped + gap <= SKIPPED * length
-  if traced == 0.0:
-    within = place <= tolerance
-  goes = on and (within or not again)
-  further = max(traced, place) if goes else traced
-  return goes, further, skipped + gap if again and goes and traced > 0.0 else skipped

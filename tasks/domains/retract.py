@@ -13,58 +13,110 @@ Failure: a force above the damage limit, jaws included, or the time limit.
 
 import dataclasses
 import itertools
+from typing import Annotated, Any
 
 import numpy as np
-from dm_control.utils import containers
+import warp as wp
+from palpate.tissue.types import Array
 
-from . import base
-from .base import Physics
-from .grasp import FUNDUS, Hold
-from .performer import Performer, Script
-from .scenes import Scene
+from ..base import Physics
+from ..core.rules import (
+  RUNNING,
+  SUCCESS,
+  Rules,
+  Vector,
+  closeness,
+  drop,
+  peak,
+  point,
+  tip,
+  visible,
+)
+from ..performer import Performer, Script
+from ..registry import exercise
+from ..scenes import Scene
+from .grasp import FUNDUS, Held, Hold, distance, follow
 from .touch import SLACK
 
-SUITE = containers.TaggedTasks()
 _BEHIND = 0.02  # from the organ's middle to the disc [m]
-_SAMPLES = 12  # points of the disc
+SAMPLES = 12  # points of the disc
 _GRIP = 1.8  # of the expert, more than to lift: what is pulled aside slides [N]
 SEEN = 1e-6  # what rounding may take from a share of it
 
 
-@SUITE.add("benchmarking", "easy")
-def easy(time_limit=20, random=None, environment_kwargs=None, **kwargs):
-  """Returns the task to uncover half of a disc of 3 mm for 0.5 s."""
+@exercise("retract/easy", 20, "easy")
+def easy(**kwargs):
+  """Uncover half of a disc of 3 mm for 0.5 s."""
   kwargs = {"radius": 0.003, "wanted": 0.5, "hold": 0.5, **kwargs}
-  task = Retract(dataclasses.replace(FUNDUS, nodes=250), random, name="retract/easy", **kwargs)
-  return base.make(task, time_limit, environment_kwargs)
+  return Retract(dataclasses.replace(FUNDUS, nodes=250), **kwargs)
 
 
-@SUITE.add("benchmarking")
-def standard(time_limit=30, random=None, environment_kwargs=None, **kwargs):
-  """Returns the task to uncover 80 % of a disc of 4 mm for 1 s."""
+@exercise("retract/standard", 30)
+def standard(**kwargs):
+  """Uncover 80 % of a disc of 4 mm for 1 s."""
   kwargs = {"radius": 0.004, "wanted": 0.8, "hold": 1.0, "jitter": 0.003, **kwargs}
-  task = Retract(dataclasses.replace(FUNDUS, nodes=250), random, name="retract/standard", **kwargs)
-  return base.make(task, time_limit, environment_kwargs)
+  return Retract(dataclasses.replace(FUNDUS, nodes=250), **kwargs)
 
 
-@SUITE.add("benchmarking", "hard")
-def hard(time_limit=40, random=None, environment_kwargs=None, **kwargs):
-  """Returns the task to uncover a disc of 4 mm for 2 s with less force, on varying organs."""
+@exercise("retract/hard", 40, "hard")
+def hard(**kwargs):
+  """Uncover a disc of 4 mm for 2 s with less force, on varying organs."""
   kwargs = {"radius": 0.004, "wanted": 1.0, "hold": 2.0, "jitter": 0.005, **kwargs}
   kwargs = {"variants": (None, 1, 2), "force_limit": 3.4, "damage": 6.0, **kwargs}
-  task = Retract(dataclasses.replace(FUNDUS, nodes=500), random, name="retract/hard", **kwargs)
-  return base.make(task, time_limit, environment_kwargs)
+  return Retract(dataclasses.replace(FUNDUS, nodes=500), **kwargs)
+
+
+class State(Held):
+  """State of a world."""
+
+  wanted: float  # share of the disc
+  hold: float  # [s]
+  disc: Annotated[Any, Array(wp.vec3, (SAMPLES,))]  # points of it [m]
+  time: float  # held [s]
+  hidden: Vector
+  visible: float
+  held: float
+
+
+# The rules.
+
+
+def advance(s, o):
+  """Follows the grasp and what is seen."""
+  o, lost = follow(s, o)
+  if lost:
+    drop(s, o)
+  o.visible = visible(s, o)
+  if o.visible < o.wanted - SEEN or o.grasped == 0.0:
+    o.time = 0.0
+  elif peak(s) <= o.force_limit:
+    o.time = o.time + o.control_timestep
+  if o.time >= o.hold - SLACK:
+    return o, 1.0, SUCCESS
+  progress = 0.15 * closeness(distance(s, o), o.distance0)
+  if o.grasped == 1.0:
+    progress = 0.3 + 0.5 * min(o.visible / o.wanted, 1.0) + 0.2 * o.time / o.hold
+  return o, progress, RUNNING
+
+
+def observe(s, o):
+  """Finds target, hidden and held; visible and grasped are up to date."""
+  o.target = point(s, o.site) - tip(s)
+  o.hidden = o.disc[0] - tip(s)
+  o.held = min(o.time / o.hold, 1.0)
+  return o
 
 
 class Retract(Hold):
   """Pull tissue aside and hold it."""
+
+  rules = Rules(State, advance, observe, ("target", "hidden", "visible", "held", "grasped"))
 
   def __init__(
     self,
     scene: Scene,
     random=None,
     *,
-    name: str,
     radius: float,
     wanted: float,
     hold: float,
@@ -75,13 +127,12 @@ class Retract(Hold):
     Args:
       scene: what it plays in
       random: see Task
-      name: domain and task
       radius: of the hidden disc [m]
       wanted: share of the disc that must be seen [-]
       hold: for how long [s]
       **kwargs: see Task; the force limit counts the jaws too
     """
-    self.name, self.targets = name, 2
+    self.targets = 2
     self.radius, self.wanted, self.hold = radius, wanted, hold
     kwargs = {"spread": 0.012, "force_limit": 4.0, "damage": 8.0, **kwargs}
     super().__init__(dataclasses.replace(scene, targets=2), random, **kwargs)
@@ -89,10 +140,14 @@ class Retract(Hold):
   def begin(self, physics: Physics) -> None:
     """Draws the site to grasp and hides the disc behind the organ's edge, far from the trocar."""
     super().begin(physics)
-    self.held, self.visible = 0.0, 0.0
+    self.time, self.visible = 0.0, 0.0
     _, center = self.place_of_work(physics)
     self.disc = self._hide(physics, center)
     physics.mark(0, self.disc[0], now=True, size=self.radius)
+    self.show(physics)
+
+  def show(self, physics: Physics) -> None:
+    """Marks the site."""
     physics.mark(1, physics.point(self.site))
 
   def _hide(self, physics: Physics, center: np.ndarray) -> np.ndarray:
@@ -109,27 +164,9 @@ class Retract(Hold):
     edge = aside[covered].min()
     self.right = right
     middle = behind - _BEHIND * back + height * up + (edge + 1.8 * self.radius) * right
-    turn = np.linspace(0, 2 * np.pi, _SAMPLES, endpoint=False)[:-1]
+    turn = np.linspace(0, 2 * np.pi, SAMPLES, endpoint=False)[:-1]
     ring = np.cos(turn)[:, None] * right + np.sin(turn)[:, None] * up
     return np.concatenate([middle[None], middle + 0.9 * self.radius * ring])
-
-  def advance(self, physics: Physics) -> float:
-    """Follows the grasp and what is seen."""
-    physics.mark(1, physics.point(self.site))
-    if self.follow(physics):
-      self.dropped(physics)
-    self.visible = 1 - float(physics.hidden(self.disc).mean())
-    seen = self.visible >= self.wanted - SEEN
-    gentle = physics.peak_force <= self.force_limit
-    if not (seen and self.grasped):
-      self.held = 0.0
-    elif gentle:
-      self.held += self.control_timestep
-    if self.held >= self.hold - SLACK:
-      self.outcome = "success"
-      return 1.0
-    near = base.closeness(self.distance(physics), self.distance0)
-    return progress(self.grasped, near, self.visible / self.wanted, self.held / self.hold)
 
   def instruct(self, physics: Physics) -> str:
     """Says to grasp, pull aside or hold."""
@@ -137,17 +174,7 @@ class Retract(Hold):
       return "Open the jaws, go over the marked fold and close them gently"
     if self.visible < self.wanted:
       return f"Pull it aside: {100 * self.visible:.0f} of {100 * self.wanted:.0f} % are seen"
-    return f"Hold it there for {max(self.hold - self.held, 0.0):.1f} s more"
-
-  def observe(self, physics: Physics) -> dict[str, np.ndarray]:
-    """Returns target, hidden, visible, held and grasped."""
-    return {
-      "target": physics.point(self.site) - physics.tip_pos(),
-      "hidden": self.disc[0] - physics.tip_pos(),
-      "visible": np.array([self.visible]),
-      "held": np.array([min(self.held / self.hold, 1.0)]),
-      "grasped": np.array([float(self.grasped)]),
-    }
+    return f"Hold it there for {max(self.hold - self.time, 0.0):.1f} s more"
 
   def reference_length(self) -> float:
     """Returns the way to the site and aside by four radii of the disc [m]."""
@@ -181,8 +208,3 @@ class Retract(Hold):
         yield p.step()
       yield from p.open()
       yield from p.move(p.tip + 0.02 * up)
-
-
-def progress(grasped: bool, near: float, seen: float, held: float) -> float:
-  """Returns the progress, see the module's head: of closeness, shares of disc and time."""
-  return 0.3 + 0.5 * min(seen, 1.0) + 0.2 * held if grasped else 0.15 * near

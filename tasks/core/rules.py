@@ -1,0 +1,273 @@
+"""The words that the rules of exercises are written in.
+
+A rule is a plain function of the world `s` and of the exercise's state in it, `o`, which it returns
+changed. Python runs it for one world: `s` is the `Physics`, `o` the task, and these words are what
+is below. For many worlds Warp compiles the same text, with the words of `tasks.batch.words` in
+place of these; so a rule has no dictionaries, no strings, no chained comparisons, and counts in
+loops from `int(0)`.
+"""
+
+import dataclasses
+import inspect
+import math
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any, get_type_hints
+
+import numpy as np
+import warp as wp
+
+RUNNING, SUCCESS, DAMAGED, MISSED = range(4)
+FAR = 1e9  # farther than anything [m]
+OUTCOMES = (None, "success", "damage", "missed")
+
+Vector = Annotated[Any, wp.vec3]
+Vectors3 = Annotated[Any, wp.mat33]  # three vectors, a row each
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Rules:
+  """The rules of a domain.
+
+  Attributes:
+    state: class whose annotations are a world's state: numbers, flags, `Vector`, and arrays, such
+      as `Annotated[Any, ints("targets")]`, whose sizes are numbers or attributes of the task; a
+      task has attributes of these names
+    advance: rule (s, o) that returns o, the progress and the outcome, one of RUNNING, SUCCESS,
+      DAMAGED, MISSED, after a control step
+    observe: rule (s, o) that returns o with its own observations up to date
+    observed: fields of the state that are these
+    metrics: of the domain's own, by the field that is an episode's value so far
+    act: rule (s, o) that returns o once an action has moved the drives, before the physics, or None
+  """
+
+  state: type
+  advance: Callable
+  observe: Callable
+  observed: tuple[str, ...]
+  metrics: Mapping[str, str] = dataclasses.field(default_factory=dict)
+  act: Callable | None = None
+
+  def __post_init__(self):
+    where = f"{self.state.__module__}.{self.state.__qualname__}"
+    for name in ("advance", "observe", *(["act"] if self.act else [])):
+      rule = getattr(self, name)
+      if not inspect.isfunction(rule) or len(inspect.signature(rule).parameters) != 2:
+        raise TypeError(f"{where}: {name} is {rule!r}, expected a function of s and o")
+    known = self.fields
+    for name in (*self.observed, *self.metrics.values()):
+      if name not in known:
+        raise TypeError(f"{where}: {name!r} is told, expected a field: {', '.join(known)}")
+
+  @property
+  def fields(self) -> dict[str, Any]:
+    """Kinds of the fields by name."""
+    found = get_type_hints(self.state, include_extras=True)
+    return {
+      name: hint.__metadata__[0] if hasattr(hint, "__metadata__") else hint
+      for name, hint in found.items()
+    }
+
+
+INSTEAD: dict[Callable, Callable] = {}  # what Warp compiles in place of a function
+
+
+def many(function: Callable) -> Callable:
+  """Returns a decorator: what it decorates is compiled for many worlds in place of a function.
+
+  For loops that numpy does at once: the two say the same, in the same words.
+  """
+
+  def add(other: Callable) -> Callable:
+    INSTEAD[function] = other
+    return other
+
+  return add
+
+
+# Numbers and vectors.
+
+
+def root(x: float) -> float:
+  """Returns the square root."""
+  return math.sqrt(x)
+
+
+def clamp(x: float, low: float, high: float) -> float:
+  """Returns the number between two others that is nearest to one."""
+  return min(max(x, low), high)
+
+
+def rows(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+  """Returns three vectors as rows, see `Vectors3`."""
+  return np.array([a, b, c])
+
+
+def vector(x: float, y: float, z: float) -> np.ndarray:
+  """Returns a vector."""
+  return np.array([x, y, z])
+
+
+def length(v: np.ndarray) -> float:
+  """Returns the length of a vector."""
+  return math.sqrt(v.dot(v))
+
+
+def dot(a: np.ndarray, b: np.ndarray) -> float:
+  """Returns the product of two vectors."""
+  return float(a.dot(b))
+
+
+# Questions to the world.
+
+
+def tip(s: Any) -> np.ndarray:
+  """Returns where the tip is [m]."""
+  return s.tip_pos()
+
+
+def point(s: Any, triangle: int) -> np.ndarray:
+  """Returns the middle of a triangle [m]."""
+  return s.point(triangle)
+
+
+def corner(s: Any, triangle: int, k: int) -> np.ndarray:
+  """Returns where corner k of a triangle is [m]."""
+  return s.nodes()[s.organ.elem[triangle, k]]
+
+
+def normal(s: Any, triangle: int) -> np.ndarray:
+  """Returns the outward unit normal of a triangle."""
+  return s.normal(triangle)
+
+
+def peak(s: Any) -> float:
+  """Returns the largest force of the control step, jaws included [N]."""
+  return s.peak_force
+
+
+def force(s: Any) -> float:
+  """Returns the force on the instrument below the shaft [N]."""
+  return length(s.contact_force())
+
+
+def from_tip(s: Any, place: np.ndarray) -> np.ndarray:
+  """Returns a place in the frame of the tip [m]."""
+  return s.from_tip(place)
+
+
+def closing(s: Any) -> bool:
+  """Returns whether the jaws are told to close, see `Instrument`."""
+  return s.closing()
+
+
+def holds(s: Any) -> bool:
+  """Returns whether tissue is between the jaws, see `Instrument`."""
+  return s.holds()
+
+
+def visible(s: Any, o: Any) -> float:
+  """Returns the share of the points `o.disc` that the organ does not hide [-]."""
+  return 1 - float(s.hidden(o.disc).mean())
+
+
+def last_component(s: Any, o: Any) -> float:
+  """Returns the last component of the action, the largest of its rows."""
+  return float(o.action[..., -1].max())
+
+
+def other_tip(s: Any) -> np.ndarray:
+  """Returns where the tip of the other hand's instrument is [m]."""
+  return s.second.tip_pos()
+
+
+def other_point(s: Any, place: np.ndarray) -> np.ndarray:
+  """Returns where a place in the frame of that tip is [m]."""
+  return s.second.to_world(place)
+
+
+def other_force(s: Any) -> float:
+  """Returns the force on that instrument below the shaft [N]."""
+  return length(s.second.contact_force())
+
+
+def bonds(s: Any) -> int:
+  """Returns how many bonds the organ has, free ones too."""
+  return len(s.organ.bonds)
+
+
+def bond(s: Any, k: int) -> np.ndarray:
+  """Returns where a bond is [m]."""
+  return s.organ.bonds.positions[k]
+
+
+def is_free(s: Any, k: int) -> bool:
+  """Returns whether a bond has broken."""
+  return bool(s.organ.bonds.free[k])
+
+
+def share_freed(s: Any) -> float:
+  """Returns the share of the area of bonds that is free [-]."""
+  return s.organ.bonds.share_freed
+
+
+def traction(s: Any) -> float:
+  """Returns the pull of all bonds together on the organ [N]."""
+  return length(s.organ.bonds.force.sum(axis=0))
+
+
+def weaken(s: Any, k: int, amount: float) -> None:
+  """Adds to the damage of a bond."""
+  amounts = np.zeros(bonds(s))
+  amounts[k] = amount
+  s.organ.bonds.weaken(amounts)
+
+
+def cutter(s: Any) -> tuple[bool, float, np.ndarray]:
+  """Returns of what cuts whether it is inside, how far it came, where it is at rest [m, m]."""
+  (found,) = s.organ.cutters
+  return found.inside, found.length, found.seat
+
+
+def pieces(s: Any) -> int:
+  """Returns how many parts the organ is in."""
+  return len(s.organ.pieces)
+
+
+# What the recorder is told; labels are the task's.
+
+
+def miss(s: Any, o: Any, value: float) -> None:
+  """Reports a contact, or a closing, beside what it was meant for, by so much [m]."""
+  o.event(s, "miss", value, o.label("miss"))
+
+
+def reach(s: Any, o: Any, value: float) -> None:
+  """Reports a target that was reached, at a distance from it [m]."""
+  o.event(s, "target", value, o.label("target"))
+
+
+def grip(s: Any, o: Any, value: float) -> None:
+  """Reports that the jaws have grasped the site, at a distance from it [m]."""
+  o.event(s, "target", value, "grasp")
+
+
+def slipped(s: Any, o: Any) -> None:
+  """Reports a grasp that was lost in closed jaws, which a recording shows by itself."""
+
+
+def drop(s: Any, o: Any) -> None:
+  """Reports that what was held, or followed, is lost."""
+  o.event(s, "drop", None, o.label("drop"))
+
+
+def tear(s: Any, o: Any, value: float) -> None:
+  """Reports what came free as it should not, a share of the area of bonds [-]."""
+  o.event(s, "slip", value, "torn")
+
+
+# Formulas.
+
+
+def closeness(distance: float, start: float) -> float:
+  """Returns 1 at the goal, 0 at the distance it started from, -1 at twice that and beyond [-]."""
+  return max(-1.0, 1.0 - distance / max(start, 1e-3))

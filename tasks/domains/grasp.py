@@ -1,0 +1,326 @@
+"""Grasp: grasp the gallbladder's fundus, lift it, hold it, lower it and let go.
+
+Own observations: `target` (3,), from the tip to the site to grasp [m]; `height` (1,), of the
+site above its place at rest, towards the trocar, minus the height to lift to [m]; `held` (1,),
+share of the holding time done [-]; `grasped` (1,), whether the jaws hold the site.
+
+Grasped means that there is tissue between the jaws, which are told to close on it: both inner
+faces press on it with 0.2 N or more, it keeps them open, and the site is within 12 mm of the tip.
+It stays grasped as long as all that is so and the site has not moved in the jaws by more than half
+of the lift, from where it was grasped, and again from where it was when the holding was done.
+
+Progress: 0.2 * closeness until it is grasped; then 0.3 + 0.4 * min(height / lift, 1) + 0.2 * held;
+0.9 + 0.05 * (1 - min(height / lift, 1)) once held long enough, 1 on release. Only time under the
+force limit counts as held. Lowered means to rest for 0.2 s, grasped, between a quarter of the lift
+below the site's place and 0.4 of the lift above it. Success: held, lowered, and let go with the
+site between there and half of the lift. Slipping from the jaws and letting go before it is lowered
+start the holding again. Failure: a force above the damage limit, jaws included, or the time limit.
+"""
+
+import dataclasses
+import itertools
+
+import numpy as np
+
+from ..base import Physics, Task
+from ..core.rules import (
+  RUNNING,
+  SUCCESS,
+  Rules,
+  Vector,
+  closeness,
+  closing,
+  dot,
+  drop,
+  from_tip,
+  grip,
+  holds,
+  length,
+  miss,
+  peak,
+  point,
+  slipped,
+  tip,
+)
+from ..performer import Performer, Script
+from ..registry import exercise
+from ..scenes import Scene
+from .touch import SLACK
+
+FUNDUS = Scene(
+  organ="gallbladder",
+  instrument="grasper",
+  center="fundus",
+  port=(0.03, 0.06, 0.12),
+  camera=(-0.09, 0.072, 0.054),
+)
+REACH = 0.012  # of the jaws around the site [m]
+REST = 0.2  # at a low height before release [s]
+# Heights that it rests between, and is let go below, as shares of the lift.
+LOW, RESTING, LETTING = -0.25, 0.4, 0.5
+
+
+@exercise("grasp/easy", 20, "easy")
+def easy(**kwargs):
+  """Lift the fundus by 6 mm for 0.5 s."""
+  kwargs = {"lift": 0.006, "hold": 0.5, **kwargs}
+  return Grasp(dataclasses.replace(FUNDUS, nodes=250), **kwargs)
+
+
+@exercise("grasp/standard", 30)
+def standard(**kwargs):
+  """Lift the fundus by 8 mm for 1 s."""
+  kwargs = {"lift": 0.008, "hold": 1.0, "jitter": 0.003, **kwargs}
+  return Grasp(dataclasses.replace(FUNDUS, nodes=250), **kwargs)
+
+
+@exercise("grasp/hard", 40, "hard")
+def hard(**kwargs):
+  """Lift the fundus by 10 mm for 2 s with less force, on varying organs."""
+  kwargs = {"lift": 0.01, "hold": 2.0, "jitter": 0.005, "variants": (None, 1, 2), **kwargs}
+  kwargs = {"force_limit": 3.4, "damage": 6.0, **kwargs}
+  return Grasp(dataclasses.replace(FUNDUS, nodes=500), **kwargs)
+
+
+class Held:
+  """State of jaws that are to hold a site."""
+
+  slip: float  # how far it may move in the jaws [m]
+  force_limit: float  # [N]
+  control_timestep: float  # [s]
+  site: int  # triangle to grasp
+  closing: bool  # whether the jaws are told to close
+  where: Vector  # the site in the frame of the tip, where it was grasped [m]
+  distance0: float  # [m]
+  target: Vector
+  grasped: float  # 1 while the jaws hold it
+
+
+# The rules of holding.
+
+
+def distance(s, o):
+  """Returns how far the tip is from the site [m]."""
+  return length(point(s, o.site) - tip(s))
+
+
+def slid(s, o):
+  """Returns how far the site has moved in the jaws from where it was grasped [m]."""
+  return length(from_tip(s, point(s, o.site)) - o.where)
+
+
+def follow(s, o):
+  """Finds out whether the site is grasped; returns too whether it was until now, and is no more."""
+  told, far, before, now = closing(s), distance(s, o), o.grasped == 1.0, False
+  if before:
+    now = told and holds(s) and slid(s, o) < o.slip
+    if told and not now:
+      slipped(s, o)
+  elif told and far < REACH and holds(s):
+    now = True
+    o.where = from_tip(s, point(s, o.site))
+    grip(s, o, far)
+  if told and not o.closing and far >= 2.0 * REACH:
+    miss(s, o, far)
+  o.closing = told
+  o.grasped = 1.0 if now else 0.0
+  return o, before and not now
+
+
+class Hold(Task):
+  """What the exercises of the grasper share: a site that is to be held between the jaws.
+
+  Attributes:
+    site: triangle to grasp
+    grasped: 1 while the jaws hold it, see the module's head
+    closing: whether they are told to close
+    slip: how far it may move in the jaws [m]
+  """
+
+  watch = ("miss", "unintended_contact", "drop")
+  touched = 24
+  site: int
+  slip = 0.005
+
+  def begin(self, physics: Physics) -> None:
+    """Draws the site."""
+    place, _ = self.place_of_work(physics)
+    self.site = int(self.random.choice(place))
+    self.grasped, self.closing, self.where = 0.0, False, np.zeros(3)
+    self.distance0 = distance(physics, self)
+
+  def slid(self, physics: Physics) -> float:
+    """Returns how far the site has moved in the jaws from where it was grasped [m]."""
+    return slid(physics, self)
+
+  def label(self, kind: str) -> str:
+    """Returns what a miss is, and how tissue was lost."""
+    return "closed off the site" if kind == "miss" else "slipped" if self.closing else "let go"
+
+  def recorded(self, physics: Physics) -> dict[str, float]:
+    """Returns whether the jaws are told to close and whether they hold."""
+    return {"grip": float(self.closing), "held": float(self.grasped)}
+
+
+class State(Held):
+  """State of a world."""
+
+  lift: float  # [m]
+  hold: float  # [s]
+  rest: Vector  # the site's place at rest [m]
+  up: Vector  # towards the trocar
+  time: float  # held [s]
+  done: bool  # it was held
+  lowered: float  # it rests low [s]
+  letting: bool  # the jaws let go
+  height: float
+  held: float
+
+
+# The rules.
+
+
+def raised(s, o):
+  """Returns how far the site is above its place at rest, towards the trocar [m]."""
+  return dot(point(s, o.site) - o.rest, o.up)
+
+
+def again(o):
+  """Starts the holding again."""
+  o.time = 0.0
+  o.done = False
+  o.lowered = 0.0
+  o.letting = False
+  return o
+
+
+def lose(s, o):
+  """Counts a loss, and starts again."""
+  drop(s, o)
+  return again(o)
+
+
+def count(s, o, share):
+  """Counts the time that the site is held high, and then at rest low."""
+  if not o.done:
+    if share < 1.0:
+      o.time = 0.0
+    elif peak(s) <= o.force_limit:
+      o.time = o.time + o.control_timestep
+    if o.time >= o.hold - SLACK:
+      o.done = True
+      o.where = from_tip(s, point(s, o.site))
+  low = o.done and share >= LOW and share <= RESTING
+  o.lowered = o.lowered + o.control_timestep if low else 0.0
+  return o
+
+
+def advance(s, o):
+  """Follows the grasp from closing to release."""
+  share = raised(s, o) / o.lift
+  o, lost = follow(s, o)
+  if lost:
+    o.letting = o.lowered >= REST - SLACK and not o.closing
+    if not o.letting:
+      o = lose(s, o)
+  if o.letting and (share < LOW or share > LETTING):
+    o = lose(s, o)
+  if o.letting and not holds(s):
+    return o, 1.0, SUCCESS
+  if o.grasped == 1.0:
+    o = count(s, o, share)
+  high = max(min(share, 1.0), 0.0)
+  progress = 0.2 * closeness(distance(s, o), o.distance0)
+  if o.done:
+    progress = 0.9 + 0.05 * (1.0 - high)
+  elif o.grasped == 1.0:
+    progress = 0.3 + 0.4 * high + 0.2 * min(o.time / o.hold, 1.0)
+  return o, progress, RUNNING
+
+
+def observe(s, o):
+  """Finds target, height and held; grasped is up to date."""
+  o.target = point(s, o.site) - tip(s)
+  o.height = raised(s, o) - o.lift
+  o.held = min(o.time / o.hold, 1.0)
+  return o
+
+
+class Grasp(Hold):
+  """Grasp, lift, hold, lower, release."""
+
+  rules = Rules(State, advance, observe, ("target", "height", "held", "grasped"))
+
+  def __init__(self, scene: Scene, random=None, *, lift: float, hold: float, **kwargs):
+    """Makes the task.
+
+    Args:
+      scene: what it plays in
+      random: see Task
+      lift: height to lift the site to [m]
+      hold: how long to hold it there [s]
+      **kwargs: see Task; the force limit counts the jaws too
+    """
+    self.targets, self.lift, self.hold = 1, lift, hold
+    self.slip = 0.5 * lift
+    kwargs = {"spread": 0.012, "force_limit": 4.0, "damage": 8.0, **kwargs}
+    super().__init__(dataclasses.replace(scene, targets=1), random, **kwargs)
+
+  def begin(self, physics: Physics) -> None:
+    """Draws the site."""
+    super().begin(physics)
+    self.rest = physics.point(self.site)
+    self.up = physics.trocar().mat[:, 2]
+    again(self)
+    self.show(physics)
+
+  def show(self, physics: Physics) -> None:
+    """Marks the site."""
+    physics.mark(0, physics.point(self.site))
+
+  @property
+  def rests(self) -> bool:
+    """Whether the site was held, lowered and rests there, ready to be let go."""
+    return self.lowered >= REST - SLACK
+
+  def instruct(self, physics: Physics) -> str:
+    """Says to grasp, lift, hold, lower or let go."""
+    if not self.grasped:
+      return "Open the jaws, go over the marked fold and close them gently"
+    if self.rests:
+      return "Open the jaws to let go"
+    if self.done:
+      return "Lower it to where it was"
+    if raised(physics, self) < self.lift:
+      return f"Lift it by {1e3 * self.lift:.0f} mm, towards the trocar"
+    return f"Hold it there for {max(self.hold - self.time, 0.0):.1f} s more"
+
+  def reference_length(self) -> float:
+    """Returns the way to the site, up and down again [m]."""
+    return self.distance0 + 2 * self.lift
+
+  def expert(self, p: Performer) -> Script:
+    """Grasps, lifts, holds, lowers and lets go."""
+    physics = p.physics
+    for again in itertools.count():
+      if self.outcome is not None:
+        return
+      yield from p.close(self.site, again)
+      up = physics.trocar().mat[:, 2]
+      speed, contact = 0.012 * p.style.speed, 0.0
+      yield from p.wait(p.style.delay)
+      goal = self.lift + 0.0015 + 0.3 * p.style.overshoot * self.lift
+      while self.grasped and not self.done:  # up, and hold
+        contact += self.control_timestep
+        missing = goal - raised(physics, self)
+        p.tip = p.tip + float(np.clip(3 * missing, -speed, speed)) * self.control_timestep * up
+        p.grip(contact)
+        yield p.step()
+      yield from p.wait(p.style.delay)
+      while self.grasped and not self.rests:
+        if raised(physics, self) > 0.2 * self.lift:
+          p.tip = p.tip - speed * self.control_timestep * up
+        p.grip(contact)
+        yield p.step()
+      yield from p.open()
+      yield from p.move(p.tip + 0.02 * up)
