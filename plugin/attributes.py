@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from .engine.weights import SOLIMP, SOLREF
+from .engine.contacts import SOLIMP, SOLREF
 
 # Of an organ under instruments. solmix: its solref counts, not theirs, for its nodes are light.
 CONTACT: Mapping[str, object] = {

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from palpate.engine.beside.bonds import Group
-from palpate.engine.beside.ties import motion
+from palpate.engine.forces.attachments import motion
+from palpate.engine.forces.cohesive_bonds import Group
 from palpate.engine.layout import BOND
 
 

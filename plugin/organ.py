@@ -5,7 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 import numpy.typing as npt
-from palpate.engine import change, mjstruct, motion, pierce, workspace
+from palpate.engine import change, mjstruct, motion, penetration, workspace
 from palpate.engine import plugin as engine
 from palpate.engine.cutting.cuts import Piece, Report
 from palpate.engine.cutting.cutters import Cutter
@@ -303,7 +303,7 @@ class Organ:
     """
     m = mjstruct.Model.from_address(self.model._address)
     d = mjstruct.Data.from_address(self.data._address)
-    tools = pierce.Tools(m, self._organ, pierce.tools(m, self._organ))
+    tools = penetration.Tools(m, self._organ, penetration.tools(m, self._organ))
     found = {*tools.inside(d, self._deformation), *self._space.watch.crossed}
     return tuple(self.model.geom(geom).name or f"geom {geom}" for geom in sorted(found))
 

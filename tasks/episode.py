@@ -90,9 +90,7 @@ def run(
   return finish()
 
 
-def _begin(
-  env: control.Environment, seed: int, info: Mapping[str, Any], states: bool
-) -> Recorder:
+def _begin(env: control.Environment, seed: int, info: Mapping[str, Any], states: bool) -> Recorder:
   """Returns the recorder of an episode, with the constants and the sample of its start."""
   task: Any = env.task
   physics: Any = env.physics

@@ -208,9 +208,7 @@ def _metric_table(
   return found + (f"<h2>Not known</h2><dl class='small'>{unknown}</dl>" if unknown else "")
 
 
-def _panel_cells(
-  name: str, spec: Spec, reference: Mapping[str, Any], result: Score
-) -> list[str]:
+def _panel_cells(name: str, spec: Spec, reference: Mapping[str, Any], result: Score) -> list[str]:
   row = reference["metrics"].get(name)
   if row is None:
     return ["–", "–", "–"]

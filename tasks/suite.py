@@ -38,9 +38,7 @@ def load(
     ValueError: no such domain or task, or a value that is not allowed; the message lists what is.
   """
   if domain_name not in registry.TASKS:
-    raise ValueError(
-      f"domain is {domain_name!r}, {registry.choices(domain_name, registry.TASKS)}"
-    )
+    raise ValueError(f"domain is {domain_name!r}, {registry.choices(domain_name, registry.TASKS)}")
   names = registry.TASKS[domain_name]
   if task_name not in names:
     raise ValueError(f"{domain_name}: task is {task_name!r}, {registry.choices(task_name, names)}")

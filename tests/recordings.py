@@ -4,7 +4,11 @@ import numpy as np
 from palpate.tasks.recorder import Recorder, Settings
 
 SETTINGS = Settings(
-  force_limit=1.5, grip_limit=1.5, reference_length=0.1, idle_speed=0.06, tip_cutoff=None,
+  force_limit=1.5,
+  grip_limit=1.5,
+  reference_length=0.1,
+  idle_speed=0.06,
+  tip_cutoff=None,
   movement_cutoff=25.0,  # half the rate of the recordings below: nothing is cut
 )
 

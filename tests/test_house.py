@@ -119,7 +119,7 @@ def private_above() -> set[str]:
 
 def device_switches() -> set[str]:
   """Returns the files but simd.h and group.h that ask whether they are compiled for CUDA."""
-  allowed = ("plugin/native/simd.h", "plugin/native/group.h")
+  allowed = ("plugin/core/simd.h", "plugin/core/group.h")
   paths = [p for p in [*package_files(), *headers()] if name_of(p) not in allowed]
   return {name_of(p) for p in paths if re.search(r"__CUDA_ARCH__|__CUDACC", p.read_text())}
 
@@ -168,7 +168,7 @@ def calls(pattern: str, paths: list[pathlib.Path], *allowed: str) -> set[str]:
 
 
 def flexcomp_writers() -> set[str]:
-  probe = "plugin/engine/weights.py"  # asks MuJoCo by one contact, and knows no models
+  probe = "plugin/engine/contacts.py"  # asks MuJoCo by one contact, and knows no models
   found = writers(r'<flexcomp\s+\w+="', "models/mjcf.py", probe)
   return found | calls(r"\.add_flex$", package_files(), "plugin/windows.py", "plugin/authoring.py")
 

@@ -92,9 +92,7 @@ def main(args: argparse.Namespace) -> int:
   seeds = range(args.seed, args.seed + args.episodes)
   progress, results = Progress(), []
   with Interrupt() as interrupt:
-    for result in evaluate(
-      name, args.policy, seeds, crew, args.recordings, interrupt, task_kwargs
-    ):
+    for result in evaluate(name, args.policy, seeds, crew, args.recordings, interrupt, task_kwargs):
       results.append(result)
       progress.show(f"{len(results)} of {args.episodes}")
   progress.clear()

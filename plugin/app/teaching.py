@@ -147,9 +147,7 @@ class School:
       # Of an easier exercise's policy alone it would learn what was missing, and forget the rest.
       if (self.path.parent / POLICY).exists() and (self.rounds or not k % 2):
         turn = _TURN if k % 2 else None
-        job = dataclasses.replace(
-          job, policy=str((self.path.parent / POLICY).resolve()), most=turn
-        )
+        job = dataclasses.replace(job, policy=str((self.path.parent / POLICY).resolve()), most=turn)
       jobs.append(job)
     return jobs
 

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 import mujoco
 
 from .base import Batch, Contacts, Tissue, count_of
-from .several import Several
+from .multi_device import Several
 from .threads import Threads
 from .worlds import Worlds
 

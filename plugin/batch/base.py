@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from .parting import Parting
+from .fracture import Parting
 
 
 class Batch(abc.ABC):

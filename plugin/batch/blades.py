@@ -12,28 +12,28 @@ import numpy as np
 import warp as wp
 from palpate.engine import mjstruct
 from palpate.engine.cutting import cutters
-from palpate.engine.cutting.current import ends
+from palpate.engine.cutting.electrosurgery import ends
 from palpate.engine.layout import BLADE, LAW
 from palpate.tissue.geometry.mesh import Mesh
 from palpate.tissue.step import SCHEMES
 from palpate.tissue.types import allocate, doubles, fill, floats, ints, struct
 
-from . import beside
-from .parting import Cutters
+from . import forces
+from .fracture import Cutters
 
 _ROWS = "state", "next", "force", "point", "held", "share", "hold", "due", "law"
-_WorldBlades = beside.in_worlds(
+_WorldBlades = forces.in_worlds(
   cutters.Blades,
   _ROWS,
   {
-    "own": beside.WorldNodes,
-    "mj": beside.WorldBodies,
+    "own": forces.WorldNodes,
+    "mj": forces.WorldBodies,
     "number": floats("nworld", "nnumber"),
     "elem": ints("nmesh", "nelem", 3),
     "flat": doubles("nmesh", "nnode", 3),
   },
 )
-_enter, _act, _keep = beside.kernels("blades.h", _WorldBlades, *cutters.KERNELS)
+_enter, _act, _keep = forces.kernels("cutting/blades.h", _WorldBlades, *cutters.KERNELS)
 _STAGE, _WORK, _OPENED, _AT = (
   wp.constant(k) for k in (BLADE.stage, BLADE.work, BLADE.opened, BLADE.at)
 )
@@ -82,7 +82,7 @@ def _feel(b: _WorldBlades, adr: int, data: wp.array2d[float]):
       data[w, adr + c] = data[w, adr + c] + float(turned)
 
 
-class Blades(beside.Opens):
+class Blades(forces.Opens):
   """What cuts an organ in all worlds.
 
   Args:
@@ -114,8 +114,8 @@ class Blades(beside.Opens):
       flat=organ.patch.rest,
       state=self._keep("blade", np.arange(n), len(BLADE)),
       due=self._zeros(self._nworld, n, dtype=int),
-      own=_by_nodes(beside.nodes_of(organ), body),
-      solve=_by_nodes(beside.input_of(organ), body),
+      own=_by_nodes(forces.nodes_of(organ), body),
+      solve=_by_nodes(forces.input_of(organ), body),
       number=body.tissue.number,
       mj=organ._batch.bodies,
     )

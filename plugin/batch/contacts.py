@@ -16,7 +16,7 @@ import warp as wp
 # All that depends on names inside of mujoco_warp: its tools against a triangle, and types.
 from mujoco_warp._src import collision_primitive_core as core
 from mujoco_warp._src.types import ContactType, vec5
-from palpate.engine import mjstruct, weights
+from palpate.engine import contacts, mjstruct
 from palpate.tissue.types import Array, fill, floats, ints, struct
 
 from . import convex, cylinder
@@ -174,7 +174,7 @@ def _put(c: Touch, at: Place, n: int, dist: float, pos: wp.vec3, normal: wp.vec3
 def _ellipsoid(pos: wp.vec3, rot: wp.mat33, size: wp.vec3, a: wp.vec3, b: wp.vec3, d: wp.vec3):
   """Returns distance, place and normal of the point of a triangle that is nearest to an ellipsoid.
 
-  Nearest is meant in units of its half axes; the distance is that of `native/geom.h`.
+  Nearest is meant in units of its half axes; the distance is that of `core/geom.h`.
   """
   t = wp.transpose(rot)
   la = wp.cw_div(t * (a - pos), size)
@@ -197,9 +197,7 @@ def _against(kinds: frozenset[int]):
   solid = bool(convex.KINDS & kinds)
 
   @wp.func
-  def against(
-    p: Patch, c: Touch, v: Convex, at: Place, n: int, a: wp.vec3, b: wp.vec3, d: wp.vec3
-  ):
+  def against(p: Patch, c: Touch, v: Convex, at: Place, n: int, a: wp.vec3, b: wp.vec3, d: wp.vec3):
     pos = p.geom_xpos[at.world, at.geom]
     rot = p.geom_xmat[at.world, at.geom]
     size = c.size[at.tool]
@@ -391,8 +389,8 @@ def make(model: mujoco.MjModel, organ, tools: np.ndarray, place, patch, data):
   ring = 1 if alone else int(np.diff(patch.near_adr.numpy()).max())
   own = organ.flexes[0]
   rows = [_mix(model, int(g), own) for g in tools]
-  if not weights.says(mjstruct.Model.from_address(model._address), own):
-    firm = {"solref": (weights.SLOW * model.opt.timestep, 1.0), "solimp": _HARD}
+  if not contacts.says(mjstruct.Model.from_address(model._address), own):
+    firm = {"solref": (contacts.SLOW * model.opt.timestep, 1.0), "solimp": _HARD}
     rows = [row | firm for row in rows]
   mixed = {name: np.array([row[name] for row in rows]).reshape(-1, *wide)
            for name, wide in _MIXED.items()}  # fmt: skip

@@ -284,9 +284,7 @@ def show(p: Patch, what: int, out: wp.array2d[wp.vec3]):
 
 
 @wp.kernel(enable_backward=False)
-def put_back_rows(
-  mask: wp.array[bool], start: wp.array2d[wp.float64], out: wp.array2d[wp.float64]
-):
+def put_back_rows(mask: wp.array[bool], start: wp.array2d[wp.float64], out: wp.array2d[wp.float64]):
   """Puts rows of the worlds of a mask back to where they start."""
   w, k = wp.tid()
   if mask[w]:

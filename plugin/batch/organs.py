@@ -9,20 +9,20 @@ import numpy as np
 import warp as wp
 from palpate.engine import coupling
 from palpate.engine.cutting.cuts import Report, pieces
-from palpate.engine.windows import slots
+from palpate.engine.windows import proxies
 from palpate.tissue import body as bodies
 from palpate.tissue import config as configuration
 from palpate.tissue import device as devices
 from palpate.tissue import order, shape, step
 
-from . import beside, contacts, convex, held, kernels, patch, sliding
+from . import contact_rows, contacts, convex, forces, kernels, passive_forces, patch
 from .base import Contacts, Tissue, spread
 from .blades import Blades
 from .cuts import Cuts
+from .fracture import Cutters
 from .material import KEYS, Material
-from .parting import Cutters
 from .patch import launch
-from .strip import Slots
+from .strip_organs import Slots
 
 _WHAT = {"xpos": 0, "xvel": 1, "contact_force": 2}
 _STATUS = {"iterations": 0, "residual": 1}
@@ -63,7 +63,7 @@ class Organ(Tissue):
     beside: what acts on it beside its tissue
   """
 
-  beside: tuple[beside.Beside, ...] = ()
+  beside: tuple[forces.Beside, ...] = ()
 
   def __init__(self, batch, w, place: Slots, tools: np.ndarray):
     organ, device, nworld = w.organ, batch.device, batch.nworld
@@ -81,7 +81,7 @@ class Organ(Tissue):
     self.body.state.mass.assign(np.tile(order.to_slices(mass), (nworld, 1, 1)))
     nodal, surface = w.inertia(model._address), patch.Surface(self.body, organ, model, tools)
     if not organ.windows:
-      nodal = np.where(organ.free, nodal, slots.WALL * organ.mass[organ.free].sum())
+      nodal = np.where(organ.free, nodal, proxies.WALL * organ.mass[organ.free].sum())
     values = patch.constants(self.body, organ, tools, model, nodal, surface)
     values |= patch.variables(nworld, place.nslot, self.body.shape.nslice)
     values |= dict(
@@ -116,7 +116,7 @@ class Organ(Tissue):
       self._cuts = Cuts(self, values, surface)
     self.patch = patch.make(values, self.body)
     self._touch = contacts.make(model, organ, tools, place, self.patch, d)
-    self._pressed = sliding.make(batch, model, organ, self._touch)
+    self._pressed = contact_rows.make(batch, model, organ, self._touch)
     self._convex = convex.make(model, tools, nworld * place.nslot, m, d)
     kinds = frozenset(int(kind) for kind in model.geom_type[tools])
     self._find = contacts.kernel(kinds)
@@ -181,7 +181,7 @@ class Organ(Tissue):
     """Adds the passive force, and keeps sliding contacts closed."""
     self._over(patch.push, self.place.nslot)
     dim = self._pressed.geom.shape
-    wp.launch(sliding.keep_closed, dim=dim, inputs=[self._pressed], device=self.body.device)
+    wp.launch(contact_rows.keep_closed, dim=dim, inputs=[self._pressed], device=self.body.device)
     for each in self.beside:
       each.act()
 
@@ -230,9 +230,9 @@ class Organ(Tissue):
     return {name: wp.zeros(shape, dtype=wp.vec3, device=self.body.device) for name in _WHAT}
 
   @functools.cached_property
-  def bonds(self) -> held.Grown:
+  def bonds(self) -> passive_forces.Grown:
     """What it has grown on to."""
-    return held.Grown(self)
+    return passive_forces.Grown(self)
 
   def _read(self, name: str) -> wp.array:
     if name in _STATUS:
@@ -245,7 +245,7 @@ class Organ(Tissue):
   def contacts(self) -> Contacts:
     """Contacts of the last step."""
     p = self._pressed
-    wp.launch(sliding.press, dim=p.geom.shape, inputs=[p], device=self.body.device)
+    wp.launch(contact_rows.press, dim=p.geom.shape, inputs=[p], device=self.body.device)
     return Contacts(p.geom, p.normal.view(float), p.force)
 
   # Cuts.

@@ -8,7 +8,7 @@ import warp as wp
 from palpate.engine import coupling, inertia, mjstruct
 from palpate.engine.coupling import Crossing
 from palpate.engine.layout import GEOM
-from palpate.engine.windows import slots
+from palpate.engine.windows import proxies
 from palpate.tissue import step
 from palpate.tissue.types import Array, Tissue, doubles, fill, floats, ints, struct, vector
 
@@ -115,7 +115,7 @@ class Patch:
 
 
 tell_tools, enter, rank, stand, push, take, follow, commit, find_bad, rest = coupling.kernels(
-  "worlds.h",
+  "coupling/worlds.h",
   Patch,
   *("tell_tools", "enter_worlds", "rank", "stand", "push_worlds", "take", "follow"),
   *("commit_worlds", "find_bad", "rest_organ"),
@@ -160,7 +160,7 @@ def constants(body, organ, tools: np.ndarray, model: mujoco.MjModel, met, surfac
     rest_share=step.REST,
     weight=float(organ.mass.sum()),
     skin=skin,
-    slow=slots.SLOW * float(np.linalg.norm(np.ptp(mesh.rest, axis=0))),
+    slow=proxies.SLOW * float(np.linalg.norm(np.ptp(mesh.rest, axis=0))),
     node=node,
     free=by_node(organ.free),
     mass=by_node(organ.mass),
@@ -192,9 +192,9 @@ class Surface:
     self._reach = _skin(organ, model) + float(model.geom_margin[tools].max(initial=0.0))
     mass = inertia.masses(mjstruct.Model.from_address(model._address), organ)
     if organ.windows:
-      self._held = slots.hold(organ, mass)
+      self._held = proxies.hold(organ, mass)
     else:
-      wall = slots.WALL * organ.mass[organ.free].sum()
+      wall = proxies.WALL * organ.mass[organ.free].sum()
       self._held = np.where(organ.free, mass, wall)
 
   def make(self, mesh) -> dict[str, np.ndarray]:

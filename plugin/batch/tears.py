@@ -7,7 +7,7 @@ import numpy as np
 import warp as wp
 from palpate.engine.cutting import tear
 
-from . import beside
+from . import forces
 from .patch import Patch
 
 # In what a triangle is beyond the limit: shares of it, and the most that are told apart.
@@ -56,7 +56,7 @@ def _find(p: Patch, limit: wp.float64, out: wp.array[wp.int64]):
                   + wp.int64(n - 1 - e))  # fmt: skip
 
 
-class Tears(beside.Opens):
+class Tears(forces.Opens):
   """Where an organ tears in all worlds.
 
   Args:

@@ -21,7 +21,7 @@ from palpate.tissue.geometry import mesh as topology
 
 from .base import Batch, Tissue, refuse_crowd, spread
 from .bonds import OfThreads
-from .parting import Cutters
+from .fracture import Cutters
 
 _OF_VERTICES = ("xpos", "xvel", "contact_force")
 _FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
@@ -180,9 +180,7 @@ class _Tissue(Tissue):
   @functools.cached_property
   def _arrays(self) -> dict[str, wp.array]:
     shape = (self._batch.nworld, self.nvert, 3)
-    arrays = {
-      name: wp.zeros(shape, dtype=float, device="cpu") for name in _OF_VERTICES
-    }
+    arrays = {name: wp.zeros(shape, dtype=float, device="cpu") for name in _OF_VERTICES}
     return arrays | {
       name: wp.zeros(self._batch.nworld, dtype=float, device="cpu")
       for name in ("residual", "iterations")

@@ -2,7 +2,7 @@
 
 A step, in all worlds at once: the slots stand on the nodes nearest to the tools, the tissue takes
 its step, mujoco_warp takes one with the windows' contacts and the force that brings the tissue's
-along (`native/formula.h`), and the nodes take over what contacts made of the slots.
+along (`coupling/node.h`), and the nodes take over what contacts made of the slots.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from palpate.engine import plugin as engine
 from palpate.organ import instances
 from palpate.tissue import device as devices
 
-from . import beside, blades, contacts, convex, held, kernels, states, strip, tears
+from . import blades, contacts, convex, forces, kernels, passive_forces, states, strip_organs, tears
 from .base import Batch, Tissue, refuse_crowd
 from .organs import Organ
-from .rest import Rest
+from .reset import Rest
 
 _CONTACTS = 16  # of a world, of tools with each other and with what is fixed
 _ITERATIONS = 6  # of the constraint solver, at most
@@ -57,11 +57,13 @@ class Worlds(Batch):
       name: engine.find(self.scratch._address, number) for name, number in instances(model).items()
     }
     declared = [w.organ for w in spaces.values()]
-    held.check(list(spaces.values()))
-    tools = [strip.tools_of(model, organ) for organ in declared]
-    nslots = [strip.slots_for(model, o, t, nodes) for o, t in zip(declared, tools, strict=True)]
-    bare, slots = strip.strip(spec, model, declared, nslots)
-    self._kept, self.bare = strip.kept(model, declared), bare
+    passive_forces.check(list(spaces.values()))
+    tools = [strip_organs.tools_of(model, organ) for organ in declared]
+    nslots = [
+      strip_organs.slots_for(model, o, t, nodes) for o, t in zip(declared, tools, strict=True)
+    ]
+    bare, slots = strip_organs.strip(spec, model, declared, nslots)
+    self._kept, self.bare = strip_organs.kept(model, declared), bare
     with wp.ScopedDevice(target):
       self._put(bare, nslots, tools, deterministic, spaces)
       self._allocate()
@@ -75,7 +77,7 @@ class Worlds(Batch):
       self._rest = Rest(self, bare)
       self.aims = self._join()
       every = (each for organ in self._organs.values() for each in organ.beside)
-      self._looks = [each for each in every if isinstance(each, beside.Opens)]
+      self._looks = [each for each in every if isinstance(each, forces.Opens)]
       self._teller = states.Teller(self)
       self._alias()
       self._sensed: Any = kernels.Sensed()
@@ -104,8 +106,8 @@ class Worlds(Batch):
     most = [contacts.most_of(model, t, n) for t, n in zip(tools, nslots, strict=True)]
     condim = int(max([1, *model.flex_condim, *model.geom_condim]))
     each = 1 if condim == 1 else 2 * (condim - 1) if self.paired else condim
-    between = _CONTACTS if strip.tools_meet(bare) else 0
-    self.njmax = strip.rows_of(bare) + (between + sum(most)) * each
+    between = _CONTACTS if strip_organs.tools_meet(bare) else 0
+    self.njmax = strip_organs.rows_of(bare) + (between + sum(most)) * each
     ncon = between + sum(most)
     size = states.bytes_of(bare, self.njmax, ncon) + sum(
       Organ.bytes_of(w, self.device) for w in spaces.values()
@@ -141,11 +143,11 @@ class Worlds(Batch):
       organ.beside = tears.make(organ)
     if not any(any(organ.space.beside) for organ in organs):
       return False
-    self.bodies = beside.bodies_of(self)
-    numbers = beside.numbers_of(self.model, self.bare, [organ.declared for organ in organs])
+    self.bodies = forces.bodies_of(self)
+    numbers = forces.numbers_of(self.model, self.bare, [organ.declared for organ in organs])
     for organ in organs:
-      organ.beside += (*held.make(organ, numbers), *blades.make(organ))
-    held.meet(organs)
+      organ.beside += (*passive_forces.make(organ, numbers), *blades.make(organ))
+    passive_forces.meet(organs)
     return any(each.aims for organ in organs for each in organ.beside)
 
   def _alias(self):

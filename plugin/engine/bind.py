@@ -9,8 +9,8 @@ import warp as wp
 from palpate.tissue import step
 from palpate.tissue.body import Body
 
-from . import coupling, declare, graphs, mjstruct, nodal, pierce, weights
-from .windows import declare_windows, nodes, slots, windowed
+from . import contacts, coupling, declare, graphs, mjstruct, nodal, penetration
+from .windows import declare_windows, nodes, proxies, windowed
 
 
 def bind(w, model: int):
@@ -117,24 +117,24 @@ def _before(w, model: int):
   """Returns what launches a step's work before the solve."""
   touched = _touched(w, model)
   m = mjstruct.Model.from_address(model)
-  tools = pierce.speeds(m, model, w.data, w.organ, np.asarray(w.flags))
+  tools = penetration.speeds(m, model, w.data, w.organ, np.asarray(w.flags))
 
   def launch():
-    weights.launch(touched)
+    contacts.launch(touched)
     if tools.ntool:
-      pierce.find_fast.launch("cpu", 1, 1, 0, tools)
+      penetration.find_fast.launch("cpu", 1, 1, 0, tools)
     w.phases.gather()
 
   return launch
 
 
-def _touched(w, model: int) -> weights.Weights:
+def _touched(w, model: int) -> contacts.Weights:
   """Returns what contacts with the organs of the model get weights by.
 
   With all of them, since one that looks for contacts again has those of the others found again.
   """
-  weights.tell(w, model)
-  out = weights.make(model, w.data, declare_windows.touching(model, w.instance), w.flags)
+  contacts.tell(w, model)
+  out = contacts.make(model, w.data, declare_windows.touching(model, w.instance), w.flags)
   out.mine.numpy()[w.organ.flexes] = 2
   w.views["mine"] = out.mine
   return out
@@ -160,5 +160,5 @@ def load(body: Body):
   there = [*step.kernels(body), nodes.commit]
   for kernel in there:
     kernel.load(body.device)
-  for kernel in (*there, nodal.gather, slots.gather, weights.weigh, pierce.find_fast):
+  for kernel in (*there, nodal.gather, proxies.gather, contacts.weigh, penetration.find_fast):
     kernel.load(wp.get_device("cpu"))

@@ -11,10 +11,10 @@ from palpate.tissue import reading, shape
 from palpate.tissue.config import Config
 from palpate.tissue.step import SCHEMES
 
-from . import graphs, mjstruct, weights, workspace
-from .beside import adhere, bonds, fasten
-from .beside.ties import Group
+from . import contacts, graphs, mjstruct, workspace
 from .bind import bind
+from .forces import cohesive_bonds, declare_attachments, declare_bonds
+from .forces.attachments import Group
 from .windows import windowed
 
 
@@ -45,7 +45,7 @@ def copy(w, model: int, other, twin):
   if not w.chosen and w.config != other.config:
     _change(w, model, other.config)
   mine, theirs = ([g for g in each.bonds.groups if not g.declared] for each in (w, other))
-  if len(mine) != len(theirs) or not all(map(bonds.alike, mine, theirs)):
+  if len(mine) != len(theirs) or not all(map(cohesive_bonds.alike, mine, theirs)):
     w.bonds.let_go()
     for group in theirs:
       _put(w, dataclasses.replace(group, own=w, other=group.other and twin(group.other)))
@@ -72,7 +72,7 @@ def attach(w, model: int, vertices, to, stiffness: float | None) -> list[tuple[A
   Raises:
     ValueError: vertices, stiffness or configuration do not allow it.
   """
-  vert = fasten.check_vertices(w, vertices)
+  vert = declare_attachments.check_vertices(w, vertices)
   spaces = [w] if isinstance(to, int) else [w, to]
   for each in spaces:
     workspace.attach(each, model)
@@ -83,9 +83,9 @@ def attach(w, model: int, vertices, to, stiffness: float | None) -> list[tuple[A
       )
   _find_bodies(w)
   if isinstance(to, int):
-    made = [fasten.to_body(w, vert, to, stiffness)]
+    made = [declare_attachments.to_body(w, vert, to, stiffness)]
   else:
-    made = list(fasten.to_organ(w, vert, to, stiffness))
+    made = list(declare_attachments.to_organ(w, vert, to, stiffness))
   for each, group in zip(spaces, made, strict=True):
     tie(each, model, [*each.ties.groups, group])
   return list(zip(spaces, made, strict=True))
@@ -135,9 +135,9 @@ def bond(w, model: int, to, name: str, law, near: float | None, vertices):
     workspace.attach(each, model)
   _find_bodies(w)
   if isinstance(to, int):
-    group = adhere.to_body(w, to, name, *how)
+    group = declare_bonds.to_body(w, to, name, *how)
   else:
-    group = adhere.to_organ(w, to, *how)
+    group = declare_bonds.to_organ(w, to, *how)
   _put(w, group)
 
 
@@ -146,7 +146,7 @@ def _find_bodies(w):
   mjstruct.library().mj_kinematics(w.model, w.data)
 
 
-def _put(w, group: bonds.Group):
+def _put(w, group: cohesive_bonds.Group):
   w.bonds.put(group)
   for each in [w] if group.other is None else [w, group.other]:
     with graphs.lock:
@@ -158,7 +158,7 @@ def _put(w, group: bonds.Group):
 def _change(w, model: int, config: Config):
   workspace.attach(w, model)
   before, w.config = w.config, config
-  weights.tell(w, model)
+  contacts.tell(w, model)
   if w.resident:
     w.resident.stop()
   material = any(getattr(before, key) != getattr(config, key) for key in configuration.MATERIAL)
@@ -176,6 +176,8 @@ def _change(w, model: int, config: Config):
     else:
       workspace.feel(w, mjstruct.Model.from_address(model))
   if config.foundation != before.foundation and config.carrier:
-    tie(w, model, [*fasten.carried(w), *(g for g in w.ties.groups if g.by != "carrier")])
+    tie(
+      w, model, [*declare_attachments.carried(w), *(g for g in w.ties.groups if g.by != "carrier")]
+    )
   if w.turn is not None:
     windowed.wake(w)

@@ -1,6 +1,6 @@
 """What a coupling does in a step, and the memory that it shares with MuJoCo and with the solver.
 
-An organ's new velocity v + dv reaches MuJoCo as a force, see `native/formula.h`: on all of its
+An organ's new velocity v + dv reaches MuJoCo as a force, see `coupling/node.h`: on all of its
 nodes (`nodal`), or on those that windows hold (`windowed`). Where tissue is stiff for the time step
 (`inertia.stiffness`) what contacts add to it is put right after MuJoCo's step: it becomes
 A^-1 h (f_c_new - f_c), the organ's own response, so that the organ has taken an implicit step under

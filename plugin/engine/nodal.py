@@ -39,7 +39,7 @@ class Nodal:
 
 
 gather, scatter, push, remember = coupling.kernels(
-  "nodal.h", Nodal, "gather_nodes", "scatter_nodes", "push_nodes", "remember_nodes"
+  "coupling/nodal.h", Nodal, "gather_nodes", "scatter_nodes", "push_nodes", "remember_nodes"
 )
 
 

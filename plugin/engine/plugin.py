@@ -15,8 +15,8 @@ import mujoco
 import numpy as np
 from palpate.tissue.config import KEYS
 
-from . import change, guard, mjstruct, room, skin, weights, workspace
-from .beside import adhere, fasten, rests
+from . import change, contacts, mjstruct, signals, skin, state_size, workspace
+from .forces import declare_attachments, declare_bonds, supports
 from .layout import FLAG, STAGE
 from .mjstruct import NAME, warn
 from .windows import windowed
@@ -99,22 +99,26 @@ def place_windows(model: mujoco.MjModel, data: mujoco.MjData):
 # Callbacks.
 
 
-@guard.watch
+@signals.watch
 def _nstate(model: int, instance: int) -> int:
   try:
-    return room.state_size(model, instance)
+    return state_size.state_size(model, instance)
   except BaseException as error:
     _say(error)
     return 0
 
 
-@guard.watch
+@signals.watch
 def _init(model: int, data: int, instance: int) -> int:
   try:
     w = workspace.make(model, data, instance)
     _workspaces[data, instance] = _states[w.plugin_state.ctypes.data] = w
     mine = [each for (of, _), each in _workspaces.items() if of == data]
-    changed = fasten.declare_between(mine) + adhere.declare_between(mine) + rests.meet(mine)
+    changed = (
+      declare_attachments.declare_between(mine)
+      + declare_bonds.declare_between(mine)
+      + supports.meet(mine)
+    )
     for each in {id(each): each for each in changed}.values():
       workspace.rebind(each)
     return 0
@@ -123,15 +127,15 @@ def _init(model: int, data: int, instance: int) -> int:
   return -1
 
 
-@guard.watch
+@signals.watch
 def _destroy(data: int, instance: int):
   w = _workspaces.pop((data, instance), None)
-  weights.forget(data)
+  contacts.forget(data)
   for state in [s for s, other in _states.items() if other is w]:
     del _states[state]
 
 
-@guard.watch
+@signals.watch
 def _copy(data: int, model: int, source: int, instance: int):
   w = _workspaces[data, instance]
   try:
@@ -139,10 +143,10 @@ def _copy(data: int, model: int, source: int, instance: int):
     change.copy(w, model, _workspaces[source, instance], twin)
   except BaseException as error:
     _fail(w, error)
-  return guard.leave()
+  return signals.leave()
 
 
-@guard.watch
+@signals.watch
 def _reset(model: int, state: int, unused: int | None, instance: int):
   m = mjstruct.Model.from_address(model)
   size = int(mjstruct.view(m.plugin_statenum, m.nplugin, np.int32)[instance])
@@ -153,10 +157,10 @@ def _reset(model: int, state: int, unused: int | None, instance: int):
     w.ties.put([group for group in w.ties.groups if group.by])
     w.bonds.let_go()
     w.nbad = 0
-  return guard.leave()
+  return signals.leave()
 
 
-@guard.watch
+@signals.watch
 def _compute(model: int, data: int, instance: int, capability: int):
   w = _workspaces[data, instance]
   w.flags[FLAG.stage] = STAGE.begun
@@ -167,12 +171,12 @@ def _compute(model: int, data: int, instance: int, capability: int):
       again = False
     except BaseException as error:
       again = _fail(w, error)
-  return guard.leave()
+  return signals.leave()
 
 
 def _push(w: Workspace, model: int):
   """Adds the passive force."""
-  guard.enter()
+  signals.enter()
   if not w.identity.is_of(model):
     workspace.attach(w, model)
   if _count_bad(w) > w.nbad:
@@ -182,7 +186,7 @@ def _push(w: Workspace, model: int):
     w.note(f"the {w.config.integrator} step has no finite solution: the motion diverged")
 
 
-@guard.watch
+@signals.watch
 def _advance(model: int, data: int, instance: int):
   w = _workspaces[data, instance]
   w.flags[FLAG.stage] = STAGE.pushed
@@ -193,7 +197,7 @@ def _advance(model: int, data: int, instance: int):
       again = False
     except BaseException as error:
       again = _fail(w, error)
-  return guard.leave()
+  return signals.leave()
 
 
 def _end(w: Workspace):
@@ -214,7 +218,7 @@ def _end(w: Workspace):
     _watch(w)
 
 
-@guard.watch
+@signals.watch
 def _visualize(model: int, data: int, option: int, scene: int, instance: int):
   w = _workspaces[data, instance]
   try:
@@ -230,7 +234,7 @@ def _visualize(model: int, data: int, option: int, scene: int, instance: int):
       _draw_skin(w, model, data)
   except BaseException as error:
     _fail(w, error)
-  return guard.leave()
+  return signals.leave()
 
 
 def _draw_skin(w: Workspace, model: int, data: int):
@@ -262,8 +266,8 @@ def _find_bad_state(w: Workspace):
 
 def _say(error: BaseException):
   """Makes the error message of a model that does not compile."""
-  if guard.is_foreign(error):
-    guard.raise_later(error)
+  if signals.is_foreign(error):
+    signals.raise_later(error)
   warn(str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}")
 
 
@@ -273,10 +277,10 @@ def _fail(w: Workspace, error: BaseException) -> bool:
   It is where a signal's handler ended it, but not where the motion is on a device: that may be a
   step ahead.
   """
-  if not guard.is_foreign(error):
+  if not signals.is_foreign(error):
     w.note(f"{type(error).__name__}: {error}")
     return False
-  guard.raise_later(error)
+  signals.raise_later(error)
   w.torn = w.resident is not None
   return not w.torn
 
@@ -320,7 +324,7 @@ def _miss(w: Workspace, nodes: int, triangles: int):
 def register() -> int:
   """Registers the plugin with MuJoCo, once a process; returns its slot."""
   mjstruct.check()
-  weights.are_wrong()  # compiles a model, which cannot be done while another is, or in a callback
+  contacts.are_wrong()  # compiles a model, which cannot be done while another is, or in a callback
   lib = mjstruct.library()
   slot = C.c_int(-1)
   if lib.mjp_getPlugin(NAME.encode(), C.byref(slot)):
@@ -353,7 +357,7 @@ def register() -> int:
     raise ImportError(f"palpate: MuJoCo did not accept the plugin {NAME!r} (slot {number})")
   _keep.append((plugin, attributes))
   atexit.register(_let_go, number)
-  guard.install()
+  signals.install()
   return number
 
 

@@ -12,23 +12,23 @@ from palpate.tissue import body as bodies
 from palpate.tissue.body import Body
 from palpate.tissue.config import Config
 
-from . import coupling, declare, graphs, inertia, mjstruct, prepare, skin, weights
-from .beside import adhere, fasten
-from .beside.bonds import Bonds
-from .beside.creep import Creep
-from .beside.hold import Beside, Hold
-from .beside.rests import Rests
-from .beside.ties import Ties
+from . import contacts, coupling, declare, graphs, inertia, mjstruct, prepare, skin
 from .bind import bind
 from .coupling import Phases
 from .cutting.cutters import Cutters
-from .cutting.hewn import Cuts, cuts_of
+from .cutting.solid_cuts import Cuts, cuts_of
 from .declare import Declaration
+from .forces import declare_attachments, declare_bonds
+from .forces.attachments import Ties
+from .forces.cohesive_bonds import Bonds
+from .forces.passive import Beside, Hold
+from .forces.relaxation import Creep
+from .forces.supports import Rests
 from .layout import FLAG, HEAD, STAGE
-from .pierce import Watch
+from .penetration import Watch
 from .windows import declare_windows, windowed
+from .windows.model_lock import Turn
 from .windows.resident import Resident
-from .windows.turns import Turn
 
 _ALLOWED = int(mujoco.mjtSleepPolicy.mjSLEEP_AUTO_ALLOWED)
 _RK4 = int(mujoco.mjtIntegrator.mjINT_RK4)
@@ -207,7 +207,7 @@ class Workspace:
     if not self.asleep:  # what `after` does was done with `before`
       self._solve()
     if self.flags[FLAG.weighed]:
-      weights.project(self.model, self.data)  # with the inertia that is in the model now
+      contacts.project(self.model, self.data)  # with the inertia that is in the model now
     self.computed = True
 
   def _solve(self):
@@ -385,8 +385,8 @@ def make(model: int, data: int, instance: int) -> Workspace:
     if organ.windows:
       w.turn = Turn()
     w.skin = skin.read(m, organ)
-    fasten.declare(w)
-    adhere.declare(w)
+    declare_attachments.declare(w)
+    declare_bonds.declare(w)
     w.cutters.declare()
     bind(w, model)
     w.plugin_state = w.views["plugin_state"].numpy()
@@ -436,6 +436,6 @@ def refresh(w: Workspace):
       if w.turn is not None and w.turn.mine:
         place(w, w.model)
     feel(w, m)
-    weights.tell(w, w.model)
+    contacts.tell(w, w.model)
     w.cutters.refresh()
     w.time_step = float(m.opt.timestep)

@@ -124,7 +124,7 @@ def patch(device, nslice: int, split: int = 1) -> int:
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-  """How a block takes a world's whole step, see native/whole.h.
+  """How a block takes a world's whole step, see solver/step.h.
 
   Attributes:
     own: nodes of a thread, 0 on the CPU

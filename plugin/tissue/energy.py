@@ -110,7 +110,7 @@ def enclosed(mesh: Mesh, config: Config, u: np.ndarray) -> float:
 
 
 def solid(mesh: Mesh, config: Config, u: np.ndarray) -> float:
-  """Returns the energy of the tetrahedra and of their means over nodes [J], see native/solid.h."""
+  """Returns the energy of the tetrahedra and of their means over nodes [J], see tissue/solid.h."""
   if config.elements != "solid":
     return 0.0
   volume, total = fill.volumes(mesh.rest, mesh.tet), fill.vertex_volumes(mesh)

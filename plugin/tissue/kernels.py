@@ -1,4 +1,4 @@
-"""The binding: functions of `native/*.h` become Warp kernels, all with one signature.
+"""The binding: functions of `native/` become Warp kernels, all with one signature.
 
 A kernel takes the number of threads that work on a world, one number that says what to do (a stage,
 a flag) and one struct, or where it is; its native function gets the struct, the `Thread` and that
@@ -66,7 +66,6 @@ class Kernel:
     inputs = [nthread, arg, fields if device.is_cuda else _reference(self.struct, fields)]
     dim = nworld, nthread
     wp.launch(self.on(device), dim=dim, inputs=inputs, device=device, block_dim=block_dim)
-
 
   def command(self, fields) -> wp.Launch:
     """Returns what launches the kernel on the CPU, a thread over a world, as often as is wanted.
@@ -151,7 +150,7 @@ def kernel(
 @functools.cache
 def _module(header: str, kind: str, constants: tuple, tag: str) -> str:
   """Declares the Warp module of a header for one kind of device and returns its name."""
-  name = f"palpate.{kind}.{header.removesuffix('.h')}{tag}"
+  name = f"palpate.{kind}.{header.removesuffix('.h').replace('/', '.')}{tag}"
   preamble = _constexpr(dict(constants)) + f'\n#include "{header}"\n'
   options = wp.ModuleBuildOptions(
     extra_cpu_include_dirs=[str(NATIVE)],
@@ -183,5 +182,5 @@ def _includes(header: str) -> list[str]:
     name = wanted.pop()
     if name not in found:
       found.append(name)
-      wanted += re.findall(r'#include "(\w+\.h)"', (NATIVE / name).read_text())
+      wanted += re.findall(r'#include "([\w/]+\.h)"', (NATIVE / name).read_text())
   return sorted(found)

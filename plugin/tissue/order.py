@@ -10,7 +10,7 @@ from scipy.sparse import csgraph
 
 from .geometry.mesh import Mesh
 
-LANES = 8  # nodes of a slice; see native/simd.h
+LANES = 8  # nodes of a slice; see core/simd.h
 
 
 def pad(array: np.ndarray, fill=0, least: int = 0) -> np.ndarray:

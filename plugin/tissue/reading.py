@@ -121,7 +121,7 @@ def spare(text: str, nelem: int) -> int:
 
 
 class Law(NamedTuple):
-  """How bonds hold and break: the bilinear law of `native/bonds.h`.
+  """How bonds hold and break: the bilinear law of `forces/cohesive_bonds.h`.
 
   Attributes:
     stiffness: by area [N/m^3]

@@ -1,4 +1,4 @@
-"""What vertices, triangles and hinges have in `Shape` and `Tissue`, as `native/rows.h` writes it.
+"""What vertices, triangles and hinges have in `Shape` and `Tissue`, as `tissue/rows.h` writes it.
 
 `shape` makes the arrays of all of them so, and `refill` writes those that a cut has changed.
 """
@@ -47,7 +47,7 @@ class Filling:
   surface: Surface
   every: int  # whether all is written
   loosened: int  # whether areas of all vertices are written
-  coarse: int  # whether it is a mesh for preconditioning alone, see `native/plate.h`
+  coarse: int  # whether it is a mesh for preconditioning alone, see `tissue/plate.h`
   bends: int  # whether there is bending
   springs: int  # whether edges are springs, not triangles a membrane
   nhinge: int  # hinges before the first cut
@@ -76,8 +76,8 @@ class Filling:
   reals: doubles("nreal")
 
 
-_count = kernel("count_bends", "rows.h", Filling, CONSTANTS)
-_fill = kernel("fill_rows", "rows.h", Filling, CONSTANTS)
+_count = kernel("count_bends", "tissue/rows.h", Filling, CONSTANTS)
+_fill = kernel("fill_rows", "tissue/rows.h", Filling, CONSTANTS)
 _PLATE = 21  # doubles of a triangle's plate
 
 

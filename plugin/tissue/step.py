@@ -1,7 +1,7 @@
 """A step of a body: the linear system, its solve, and the time stepping schemes by name.
 
 `implicit` takes Newton iterations on A dv = b, the first one with the present velocity's way ahead
-in it; see native/elastic.h for the equations and native/pcg.h for the solve.
+in it; see tissue/elastic.h for the equations and solver/pcg.h for the solve.
 
 `midpoint` is of second order in h. MuJoCo moves x by h v after each step, so that its v is that of
 the middle of a step; about the time of x the step is centred, and stable for every h:
@@ -72,15 +72,15 @@ _CONSTANTS = CONSTANTS | {
 
 
 def _elastic(name: str) -> Kernel:
-  return kernel(name, "elastic.h", Fields, CONSTANTS)
+  return kernel(name, "tissue/elastic.h", Fields, CONSTANTS)
 
 
 def _solid(name: str) -> Kernel:
-  return kernel(name, "solid.h", Fields, CONSTANTS | {"OWN_SHARE": OWN_SHARE})
+  return kernel(name, "tissue/solid.h", Fields, CONSTANTS | {"OWN_SHARE": OWN_SHARE})
 
 
 def _scheme(name: str, bounds: int | None = None) -> Kernel:
-  return kernel(name, "schemes.h", Fields, _CONSTANTS, bounds)
+  return kernel(name, "solver/schemes.h", Fields, _CONSTANTS, bounds)
 
 
 _elem_normal = _elastic("elem_normal")
@@ -92,19 +92,21 @@ _node_stress = _solid("node_stress")
 _tet_stress = _solid("tet_stress")
 _edge_block = _solid("edge_block")
 _solid_row = _solid("solid_row")
-_capsule_row = kernel("capsule_row", "capsule.h", Fields, CONSTANTS)
+_capsule_row = kernel("capsule_row", "tissue/capsule.h", Fields, CONSTANTS)
 _edge_change = _scheme("edge_change")
 _predict = _scheme("predict")
 _stay = _scheme("stay")
 _newton_update = _scheme("newton_update")
 _centre_step = _scheme("centre", BLOCK)
 _direct_step = _scheme("direct", BLOCK)
-_solve = kernel("solve", "pcg.h", Fields, _CONSTANTS, (BLOCK, 1))
-_solve_solid = kernel("solve_solid", "solid_solve.h", Fields, _CONSTANTS, (BLOCK, 1))
-_solve_solids = kernel("solve_solids", "solid_solve.h", Fields, _CONSTANTS, (BLOCK, 1))
-_keep_spin = kernel("keep_spin", "momentum.h", Fields, _CONSTANTS, (BLOCK, 1))
-_sample = kernel("sample", "multigrid.h", Cycle, _CONSTANTS)
-_solve_cycles = kernel("solve_cycles", "multigrid.h", Cycle, _CONSTANTS, (BLOCK, _CYCLES_PER_SM))
+_solve = kernel("solve", "solver/pcg.h", Fields, _CONSTANTS, (BLOCK, 1))
+_solve_solid = kernel("solve_solid", "solver/solid_solve.h", Fields, _CONSTANTS, (BLOCK, 1))
+_solve_solids = kernel("solve_solids", "solver/solid_solve.h", Fields, _CONSTANTS, (BLOCK, 1))
+_keep_spin = kernel("keep_spin", "solver/momentum.h", Fields, _CONSTANTS, (BLOCK, 1))
+_sample = kernel("sample", "solver/multigrid.h", Cycle, _CONSTANTS)
+_solve_cycles = kernel(
+  "solve_cycles", "solver/multigrid.h", Cycle, _CONSTANTS, (BLOCK, _CYCLES_PER_SM)
+)
 
 
 def _over(kernel: Kernel, body: Body, nslice: int, arg: int = 0, fields: Any = None):
@@ -116,7 +118,7 @@ def _over(kernel: Kernel, body: Body, nslice: int, arg: int = 0, fields: Any = N
 def _together(
   kernel: Kernel, body: Body, arg: int, fields: Any = None, per_sm: int = 1, split: int = 1
 ):
-  """Launches a kernel in which the threads of a world work together; see native/group.h.
+  """Launches a kernel in which the threads of a world work together; see core/group.h.
 
   Args:
     kernel: the kernel
@@ -153,7 +155,7 @@ def _world_kernel(plan: Plan) -> Kernel:
   constants = _CONSTANTS | {"OWN": plan.own} | {name: int(kind) for name, kind in kinds.items()}
   tag = f".{plan.own}.{plan.threads}.{plan.per_sm}." + "".join(str(int(k)) for k in kinds.values())
   bounds = (plan.threads, plan.per_sm)
-  return kernel("step_world", "whole.h", Fields, constants, bounds, tag, fast=plan.own > 0)
+  return kernel("step_world", "solver/step.h", Fields, constants, bounds, tag, fast=plan.own > 0)
 
 
 def _by_block(body: Body, plan: Plan, stage: Stage):
@@ -347,9 +349,7 @@ def _whole(h: float, damping: float) -> float:
 
 
 SCHEMES = {
-  "implicit": Scheme(
-    _implicit, _whole, _respond, levels=True, whole=True, ahead=True, damps=0.5
-  ),
+  "implicit": Scheme(_implicit, _whole, _respond, levels=True, whole=True, ahead=True, damps=0.5),
   "midpoint": Scheme(
     _midpoint, lambda h, b: 0.5 * _whole(h, b), _respond_centred, levels=True, damps=-0.05
   ),

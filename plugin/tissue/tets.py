@@ -1,4 +1,4 @@
-"""What the inside of a solid has in `Shape` and `Tissue`, as `native/tets.h` writes it.
+"""What the inside of a solid has in `Shape` and `Tissue`, as `tissue/tets.h` writes it.
 
 `solid` makes the arrays of all of it so, and `resolid` writes those that a cut has changed.
 """
@@ -83,7 +83,7 @@ class Within:
   reals: doubles("nreal")
 
 
-_fill = kernel("fill_solid", "tets.h", Within, CONSTANTS)
+_fill = kernel("fill_solid", "tissue/tets.h", Within, CONSTANTS)
 
 
 @dataclasses.dataclass(frozen=True)

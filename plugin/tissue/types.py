@@ -4,7 +4,7 @@ A line says meaning, unit, type and shape, and the shape is what `allocate` make
 nworld worlds; nslice slices of nodes, nelemslice of triangles, nhingeslice of hinges (0 without
 bending), ntetslice of tetrahedra (0 but for solids); nslot rows of stiffness blocks; others see
 `body`. Nodes lie in slices of eight, the last
-axis; `native/simd.h` says how they are read.
+axis; `core/simd.h` says how they are read.
 """
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.

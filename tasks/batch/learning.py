@@ -84,9 +84,7 @@ class Learner:
     seconds: spent on it, lessons included
   """
 
-  def __init__(
-    self, env: Exercises, settings: Settings, networks: Networks, seconds: float = 0.0
-  ):
+  def __init__(self, env: Exercises, settings: Settings, networks: Networks, seconds: float = 0.0):
     """Begins episodes in an environment with `output="torch"`.
 
     Args:

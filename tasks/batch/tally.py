@@ -237,9 +237,7 @@ def _tell(s: Common, t: Tally, w: int):
   t.values[w, 18] = float(t.shaft_peak[w])
   _tell_force(t, w, _GRIP, 19, 20, 21)
   end = wp.min(_end(t, w, _TIP), _end(t, w, _GRIP))
-  t.values[w, 22] = _share(
-    t.gripped[w] - end * t.last[w, _GRIP], t.pulled[w] - end * last
-  )
+  t.values[w, 22] = _share(t.gripped[w] - end * t.last[w, _GRIP], t.pulled[w] - end * last)
   t.values[w, 23] = wp.where(s.grasps[w] > 0, float(s.slips[w]), wp.nan)
 
 

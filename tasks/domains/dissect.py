@@ -125,9 +125,7 @@ class Dissect(Freeing, Hold):
   )
   slip = 0.006
 
-  def __init__(
-    self, scene: Scene, random=None, *, wanted: float, traction: float = 1.5, **kwargs
-  ):
+  def __init__(self, scene: Scene, random=None, *, wanted: float, traction: float = 1.5, **kwargs):
     """Makes the task.
 
     Args:

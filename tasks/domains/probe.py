@@ -277,4 +277,3 @@ class Press(Task):
       else:
         yield from p.push(middle, -normal, until, most=6.0)
       yield from p.move(point + 0.008 * normal)
-

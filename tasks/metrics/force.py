@@ -99,9 +99,7 @@ def excess_impulse(
 
 
 @metric("Peak contact pressure", "Pa", "safety", "max", "10.1136/bmjsit-2021-000084")
-def peak_pressure(
-  sampled_force: ArrayLike, area: ArrayLike, contact_force: float = 0.0
-) -> float:
+def peak_pressure(sampled_force: ArrayLike, area: ArrayLike, contact_force: float = 0.0) -> float:
   """Returns the largest force over contact area [Pa], lower is better.
 
   Bowel is damaged at 329-330 kPa (10.1136/bmjsit-2021-000084).

@@ -194,9 +194,7 @@ def test_recordings_are_run_anew_and_one_that_differs_is_left_out(tmp_path, caps
   with h5py.File("out/demos.hdf5") as file:
     (demo,) = file["data"].values()
     count = len(demo["obs/target"])
-    np.testing.assert_array_equal(
-      demo["obs/target"], episodes[0].observations["target"][:count]
-    )
+    np.testing.assert_array_equal(demo["obs/target"], episodes[0].observations["target"][:count])
   assert export("touch/easy", *words) == 2
   assert "of their own, expected none" in capsys.readouterr().err
 

@@ -57,7 +57,6 @@ def test_options(capsys):
   assert "processes is 0, expected a whole number >= 1" in capsys.readouterr().err
 
 
-
 DIES = """
 import os, pathlib, signal
 from palpate.tasks import performer

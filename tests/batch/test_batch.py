@@ -167,7 +167,6 @@ def test_a_block_comes_to_rest_under_a_plate(make):
   assert np.all(last.std(axis=0) < 0.006 * last.mean(axis=0))
 
 
-
 def test_each_world_has_a_tissue_of_its_own(make):
   batch = make(press(bend=0, foundation=2e4), 3)
   tissue = batch.organ("organ")

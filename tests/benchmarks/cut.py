@@ -124,7 +124,6 @@ def _cuts(model, data, organ, tool: str, tissue: str):
         jaw.ctrl[0] = opening
         yield step
   else:
-
     depth = DEEP if tissue == "solid" else None
 
     def cut(line):
@@ -237,8 +236,7 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
     "still (in contact) or moves on, with a tool in it that cuts nothing just then, the mean of "
     "all steps while it cuts, what a cut of two edges adds, a step with such a cut, 95 % of these, "
     "and that to a step in contact, and to one in which the ball moves; last: in contact, with "
-    "room for cuts to without. "
-    + results.link(out / "cut.csv"),
+    "room for cuts to without. " + results.link(out / "cut.csv"),
     "",
     *plots.table(head, table),
   ]

@@ -83,9 +83,7 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
   table = []
   for key in sorted({(r["organ"], r["nodes"], r["coupling"]) for r in good}):
     mine = {r["h"]: r for r in good if (r["organ"], r["nodes"], r["coupling"]) == key}
-    cells = [
-      f"{mine[h]['without']:.1f} / {mine[h]['change']:.1f}" if h in mine else "-" for h in H
-    ]
+    cells = [f"{mine[h]['without']:.1f} / {mine[h]['change']:.1f}" if h in mine else "-" for h in H]
     table.append([*map(str, key), *cells])
   head = ["organ", "nodes", "coupling", *(f"{1e3 * h:g} ms" for h in H)]
   lines = [str(__doc__).partition("\n\n")[2], "", *plots.table(head, table), ""]

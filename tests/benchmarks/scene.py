@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import mujoco
 import numpy as np
-from palpate.engine import weights
+from palpate.engine import contacts
 from palpate.models import mjcf
 from palpate.organ import Organ
 from palpate.tissue.geometry import fill
@@ -204,9 +204,7 @@ def masses(mesh: Mesh, tissue: Tissue) -> np.ndarray:
   return tissue.mass * share / share.sum()
 
 
-def _organ(
-  mesh: Mesh, tissue: Tissue, scheme: str, window: bool, contact: dict, keys: dict
-) -> str:
+def _organ(mesh: Mesh, tissue: Tissue, scheme: str, window: bool, contact: dict, keys: dict) -> str:
   """Returns the organ's MJCF, or that of a flex without the plugin."""
   shape = mesh.rest, mesh.elem
   if scheme == NATIVE:
@@ -314,8 +312,8 @@ def weigher(model: mujoco.MjModel, data: mujoco.MjData) -> Callable[[], None]:
 
   Where MuJoCo's are wrong, organs get them from the plugin; call this in `mjcb_passive` for others.
   """
-  touched = weights.make(model._address, data._address, slice(None))
-  return lambda: weights.launch(touched)
+  touched = contacts.make(model._address, data._address, slice(None))
+  return lambda: contacts.launch(touched)
 
 
 def put(data: mujoco.MjData, dofs: np.ndarray, position: np.ndarray, velocity: np.ndarray):

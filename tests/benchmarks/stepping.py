@@ -22,7 +22,9 @@ TOLERANCE = 1e-10
 SCENES = {
   "membrane, windows": ("sheet", 1000, {"windows": True, "bend": 0.0, "iterations": 40}),
   "membrane, windows, 4000 nodes": (
-    "sheet", 4000, {"windows": True, "bend": 0.0, "iterations": 60},
+    "sheet",
+    4000,
+    {"windows": True, "bend": 0.0, "iterations": 60},
   ),
   "plate, windows": ("sheet", 1000, {"windows": True, "iterations": 9}),
   "plate, windows, 4000 nodes": ("sheet", 4000, {"windows": True, "iterations": 9}),

@@ -10,7 +10,7 @@ import numpy as np
 import palpate
 import pytest
 from benchmarks import compare, error, films, judge, results, run, runner, scene, stability, thesis
-from palpate.engine import weights
+from palpate.engine import contacts
 from palpate.tissue import energy
 from palpate.tissue.config import Config
 from reference import exact
@@ -181,7 +181,7 @@ def test_implicit_force_is_closer_than_native_at_the_same_time_step(error_rows):
 
 def test_native_flex_on_mujoco_3_keeps_an_error_that_no_time_step_takes_away(error_rows):
   at = {r["run"]: r["force_rms"] for r in only(error_rows[1], scene="press", h=5e-4)}
-  if weights.are_wrong():
+  if contacts.are_wrong():
     assert at["native"] > 1.5 * at[compare.RIGHT]
   else:
     assert at["native"] == pytest.approx(at[compare.RIGHT], rel=1e-6)

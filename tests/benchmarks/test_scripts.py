@@ -5,7 +5,7 @@ import sys
 
 import pytest
 from benchmarks import peer, results, run
-from palpate.engine import weights
+from palpate.engine import contacts
 
 
 def command(*words) -> int:
@@ -94,7 +94,7 @@ def test_peer_is_beside_ours(tmp_path):
     assert ours["second_s"] > 0 and 0 < ours["error"] < 0.05
     if kind != "solid":  # whose linear tetrahedra lock in the flex; others have the same constants
       assert ours["force_N"] == pytest.approx(right["force_N"], rel=0.15)
-    if not weights.are_wrong():
+    if not contacts.are_wrong():
       assert flex["error"] == pytest.approx(right["error"], rel=1e-6)
     else:
       assert flex["error"] > 1.5 * right["error"] > 0

@@ -51,9 +51,7 @@ def end_share(mesh, x: float) -> np.ndarray:
   return share / share.sum()
 
 
-def bar(
-  poisson: float, spacing: float = 0.02, device="cpu", **skin
-) -> tuple[float, float, float]:
+def bar(poisson: float, spacing: float = 0.02, device="cpu", **skin) -> tuple[float, float, float]:
   """Returns the strain of a bar that is pulled at both ends, F / (E A), and Poisson's ratio.
 
   With a skin that is F / (E A + E' t U), U the bar's girth: both have the same Poisson's ratio.

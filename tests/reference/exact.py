@@ -224,7 +224,7 @@ class Step:
     newton: int = 1,
     scheme: str = "implicit",
   ) -> np.ndarray:
-    """Returns the change of velocity, (nvert, 3); see `native/elastic.h` for the equations.
+    """Returns the change of velocity, (nvert, 3); see `tissue/elastic.h` for the equations.
 
     Args:
       h: time step [s]

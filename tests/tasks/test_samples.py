@@ -18,9 +18,7 @@ def _gain(f, cutoff):
 def test_the_gain_of_the_low_pass(f):
   time = np.linspace(0, 4, 401)  # whole periods, from zero to zero: its own odd continuation
   wave = np.sin(2 * np.pi * f * time)
-  np.testing.assert_allclose(
-    metrics.low_pass(time, wave, 6.0), _gain(f, 6.0) * wave, atol=1e-12
-  )
+  np.testing.assert_allclose(metrics.low_pass(time, wave, 6.0), _gain(f, 6.0) * wave, atol=1e-12)
 
 
 def test_lines_and_ends_stay():

@@ -3,11 +3,11 @@
 import pytest
 import warp as wp
 from palpate.engine import nodal
-from palpate.engine.windows import nodes, slots
+from palpate.engine.windows import nodes, proxies
 from palpate.tissue import kernels, step
 
 # Kernels are declared where they are used; these modules declare all of them.
-DECLARING = (step, nodal, nodes, slots)
+DECLARING = (step, nodal, nodes, proxies)
 
 
 @pytest.mark.skipif(not wp.get_cuda_supported_archs(), reason="this Warp knows no CUDA")

@@ -11,7 +11,7 @@ from .device import Device, DeviceError, Reading
 from .devices import NAMES, device
 from .hand import Hand
 from .loop import Loop
-from .pace import Lateness, Pace
+from .realtime_clock import Lateness, Pace
 from .session import Session
 
 __all__ = [

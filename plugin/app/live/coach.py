@@ -118,9 +118,7 @@ def _words(text: str) -> str:
   return "".join(c for c in text if not c.isdigit() and c != ".")
 
 
-def advice(
-  recording: Recording, reference: Mapping[str, Any] | None, most: int = 4
-) -> list[str]:
+def advice(recording: Recording, reference: Mapping[str, Any] | None, most: int = 4) -> list[str]:
   """Returns sentences about an exercise: how it ended, what to do better, what was good.
 
   Args:

@@ -6,10 +6,10 @@ import math
 from collections.abc import Callable
 
 from .bridge import Bridge
-from .desk import Desk, Gamepad, SpaceMouse
 from .device import Device
 from .hand import Hand
 from .haptic import ForceDimension, Haply, OpenHaptics
+from .input_devices import Desk, Gamepad, SpaceMouse
 
 
 def _bridge(words: list[str]) -> Bridge:

@@ -15,7 +15,7 @@ from palpate.tasks.handle import spin
 
 from .coupling import Link, Options
 from .device import Device
-from .pace import Pace, punctual
+from .realtime_clock import Pace, punctual
 
 
 def tick(pace: Pace, links: Sequence[Link], tips: Sequence[Sequence[float]]) -> bool:

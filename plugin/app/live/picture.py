@@ -14,7 +14,7 @@ import trimesh
 from palpate import Organ
 
 from .coupling import Link
-from .pace import Pace
+from .realtime_clock import Pace
 
 # Numbers at the head of a frame, before the nodes, the geoms' places and the targets; `echo` is the
 # page's own clock when it sent the movement that is shown, `clock` the loop's [s].

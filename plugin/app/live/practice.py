@@ -15,8 +15,8 @@ from palpate import Organ, models
 from .coupling import Link, Options
 from .device import Device
 from .loop import Loop
-from .pace import Pace
 from .picture import Camera
+from .realtime_clock import Pace
 
 LIMIT, DAMAGE = 1.5, 3.0  # of the force bar [N]
 KEY = "touch"
@@ -87,9 +87,7 @@ class Practice:
     """Takes another scheme with the next step."""
     self._wanted = scheme
 
-  def run(
-    self, realtime: bool = False, watch: Callable[[Practice], None] | None = None
-  ) -> None:
+  def run(self, realtime: bool = False, watch: Callable[[Practice], None] | None = None) -> None:
     """Runs until `pace.stopped`; always leaves the devices without force.
 
     Args:

@@ -15,7 +15,7 @@ from palpate.tasks.recording import Recording
 from .coupling import Link, Options
 from .device import Device
 from .loop import axes, tick
-from .pace import Pace, punctual
+from .realtime_clock import Pace, punctual
 
 _FPS = 30  # of what is published
 # What a hand says for each of the components that do not move its instrument as a whole.
@@ -84,9 +84,7 @@ class Session:
     """Between the main device and its instrument."""
     return self.links[0]
 
-  def run(
-    self, realtime: bool = False, watch: Callable[[Any], Any] | None = None
-  ) -> Recording:
+  def run(self, realtime: bool = False, watch: Callable[[Any], Any] | None = None) -> Recording:
     """Does the exercise and returns its recording; always leaves the device without force.
 
     Args:

@@ -23,12 +23,12 @@ from ..trainee.keeping import Keeping, references
 from . import devices, ghost, menu
 from .coach import Coach, card
 from .coupling import Options
-from .desk import Desk
 from .device import Device, DeviceError
+from .input_devices import Desk
 from .keep import Finished
-from .pace import first
 from .picture import Camera
 from .practice import DAMAGE, LIMIT, Practice
+from .realtime_clock import first
 from .session import Session
 
 _STATUS = 0.1  # between words about the exercise [s]

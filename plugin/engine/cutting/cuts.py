@@ -24,7 +24,7 @@ from palpate.tissue.surface import WorkingCopy
 
 from .. import coupling, flexes, graphs, mjstruct
 from ..bind import bind
-from ..windows import turns
+from ..windows import model_lock
 from .tear import Tear
 
 _UNCUT = 1.0  # stands for the stamp of triangles before the first cut
@@ -127,7 +127,7 @@ class Cuts:
     self._own = {name: state[where[name]] for name in names}
     self._words = state[where["corner"].start : where["weight"].stop]
     self._found: Any = self._own["stamp"].data
-    self.lock = turns.lock_of(model)
+    self.lock = model_lock.lock_of(model)
     self._elem = flexes.element_data(m, w.organ.flex)
     self._border = np.flatnonzero(self.whole.twin < 0)
     self._rim = flexes.rim_data(m, w.organ.flex, len(self._border))
@@ -232,7 +232,7 @@ class Cuts:
     if self._marks[0] != own:
       self._elem[:] = self.mesh.elem[: self.whole.nelem]
       self._rim[:] = np.stack([topology.corners(self.mesh, self._border, k) for k in (0, 1)], 1)
-      self._marks[:] = own, turns.new_mark()
+      self._marks[:] = own, model_lock.new_mark()
     was, self._seen = self._seen, float(self._marks[1])
     return was != self._seen
 

@@ -1,4 +1,4 @@
-"""Geoms that cut an organ: blades, and the two of scissors; their forces are `native/blades.h`.
+"""Geoms that cut an organ: blades, and the two of scissors; their forces are `cutting/blades.h`.
 
 A blade's path grows in the plugin state, step by step; here the mesh comes apart along it, a few
 edges at a time, since the mesh cannot do so by less.
@@ -19,12 +19,12 @@ from palpate.tissue.step import SCHEMES
 from palpate.tissue.types import Views, doubles, fill, ints, struct
 
 from .. import coupling, flexes, mjstruct
-from ..beside import fasten
-from ..beside.hold import Beside, Bodies, Input, Nodes, base, nodes, solver
+from ..forces import declare_attachments
+from ..forces.passive import Beside, Bodies, Input, Nodes, base, nodes, solver
 from ..layout import BLADE, LAW, TRAIL
-from . import inward
-from .current import Current
+from . import solid_paths
 from .cuts import Report
+from .electrosurgery import Current
 
 _SLACK = 0.1  # edges of the mesh by which a blade's spring is stretched where it cuts
 _MORE = 0.5  # edges after which what could not come apart is tried again
@@ -74,7 +74,7 @@ class Blades:
 # Of the arrays that a step writes, a row for each.
 WIDTHS = {"force": 3, "point": 3, "held": HELD, "share": HELD, "hold": 6, "next": len(BLADE)}
 KERNELS = "enter_blades", "act_blades", "keep_blades"
-_enter, _act, _keep = coupling.kernels("blades.h", Blades, *KERNELS)
+_enter, _act, _keep = coupling.kernels("cutting/blades.h", Blades, *KERNELS)
 # As in the header: the blade is out of the tissue; edges between points of a path, and that come
 # apart at once.
 ENDED, _SPACING, _BATCH = 2, 0.4, 1.8
@@ -155,7 +155,7 @@ class Cutters(Beside):
     """Returns the rows of `Blades.law` where the wall has a thickness [m]."""
     w, rows = self._w, []
     solid, edge = w.config.elements == "solid", w.organ.mesh.whole.edge_length
-    thickness = inward.PIERCED if solid else thickness
+    thickness = solid_paths.PIERCED if solid else thickness
     for i, row in enumerate(w.config.cutters):
       force = row.energy * (1.0 if solid else thickness)  # of a solid by depth
       if row.current:
@@ -165,7 +165,7 @@ class Cutters(Beside):
       for g in self._arrays["geom"][i]:
         if g >= 0:
           body = int(mjstruct.view(m.geom_bodyid, m.ngeom, np.int32)[g])
-          stiff = min(stiff, fasten.most(w, m, body))
+          stiff = min(stiff, declare_attachments.most(w, m, body))
       rows.append((force, row.energy * self._width[i], stiff, thickness, solid))
     return np.array(rows)
 
@@ -254,13 +254,13 @@ class Cutters(Beside):
       organ = w.organ
       along = None if i in self.by_current else self._along(i)
       now, elem = self._on_surface(path)
-      way = inward.direction(organ, w.phases.motion()[0], along, elem)
+      way = solid_paths.direction(organ, w.phases.motion()[0], along, elem)
       now = organ.origin + now @ organ.frame.T
       return w.cuts.cut(now, given * float(deep[0].mean()), deep[0], way), w.organ.mesh
 
     if len(mesh.tet):
       edge = mesh.whole.edge_length
-      report, why = inward.open_path(row, edge, ended, w.cuts.finder, cut)
+      report, why = solid_paths.open_path(row, edge, ended, w.cuts.finder, cut)
     else:
       report, why = open_path(row, mesh, ended, w.organ, w.cuts.finder, cut)
     if "pinned" in why and not self._said:

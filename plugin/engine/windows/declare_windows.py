@@ -105,7 +105,7 @@ def _windows(model, m, instance, name, config, mesh, mass, place) -> Windows:
   )
   elem_num = mjstruct.view(m.flex_elemnum, m.nflex, np.int32)[found]
   # At rest the windows stand on patches of their own: their bodies move there, so that qpos0 fits.
-  # The last slot stays free; a patch of n nodes has up to 2 n - 4 triangles: see `native/slot.h`.
+  # The last slot stays free; a patch of n nodes has up to 2 n - 4 triangles: `coupling/proxy.h`.
   room = [min(n - 1, int(t) // 2 + 2) for n, t in zip(sizes, elem_num, strict=True)]
   home = _home_slots(mesh.elem, mesh.nouter, sizes, room)
   used = home >= 0

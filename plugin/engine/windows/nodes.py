@@ -35,7 +35,7 @@ class Nodes:
 
 
 commit, move_slots, enter, push_slots, push_impulses, search, report = coupling.kernels(
-  "nodes.h",
+  "coupling/window_nodes.h",
   Nodes,
   *("commit", "move_slots", "enter", "push_slots", "push_impulses", "search", "report"),
 )

@@ -20,9 +20,9 @@ import warp as wp
 from palpate.tissue import step
 from palpate.tissue.types import Views
 
-from .. import apart, coupling, inertia, layout, mjstruct, prepare
+from .. import coupling, inertia, layout, mjstruct, prepare, safe_calls
 from ..layout import TAIL, Inbox, Motion, Outbox, WindowState
-from . import nodes, slots
+from . import nodes, proxies
 from .resident import Resident
 
 # Candidates of a window that a device reports, times the window's slots.
@@ -51,7 +51,7 @@ class Phases(coupling.Phases):
     size = layout.size(WindowState, sizes)
     state = coupling.plugin_state(model, w.data, instance, size)
     if not w.views:
-      w.views = slots.scratch(organ.mesh.nvert, win.nslot) | {
+      w.views = proxies.scratch(organ.mesh.nvert, win.nslot) | {
         name: wp.zeros(layout.size(kind, sizes), dtype=wp.float64, device="cpu", pinned=self._away)
         for name, kind in (("inbox", Inbox), ("outbox", Outbox), ("foreseen", Inbox))
       }
@@ -63,7 +63,7 @@ class Phases(coupling.Phases):
       "outbox": layout.carve(Outbox, v["outbox"], sizes),
       "foreseen": layout.carve(Inbox, v["foreseen"], sizes),
     }
-    self._slots, self._w = slots.make(w, model, sizes), w
+    self._slots, self._w = proxies.make(w, model, sizes), w
     # The boxes here and on `side`, which may be the same.
     self._near, self._foreseen = (v["inbox"], v["outbox"]), v["foreseen"]
     self._far, motion = self._near, w.boxes["own"].motion
@@ -77,7 +77,7 @@ class Phases(coupling.Phases):
     self._nodes = nodes.make(w, self.side, motion, self._far, sizes)
     self._weights = nodes.Weights(w, self._nodes)
     self._weights.put(np.arange(organ.mesh.nvert))
-    self._reshape = slots.Reshape(organ, self._slots)
+    self._reshape = proxies.Reshape(organ, self._slots)
     self._motion_here = Views(w.boxes["own"].motion)
 
   # Cuts.
@@ -116,7 +116,7 @@ class Phases(coupling.Phases):
     return coupling.sizes(organ) | {"nwindow": len(win.flex), "most": most}
 
   def _over_slots(self, kernel):
-    slots.launch(kernel, self._slots)
+    proxies.launch(kernel, self._slots)
 
   def _over_nodes(self, kernel):
     nodes.launch(kernel, self._nodes, self._nodes.nvert, self.side)
@@ -130,11 +130,11 @@ class Phases(coupling.Phases):
 
   def place(self):
     """Puts the windows where the plugin state says."""
-    self._over_slots(slots.place)
+    self._over_slots(proxies.place)
 
   def gather(self):
     """Tells what acts on the slots and where the tools are."""
-    self._over_slots(slots.gather)
+    self._over_slots(proxies.gather)
 
   def enter(self):
     """Ends the last step if the motion is on a device; fills the solver's state."""
@@ -157,11 +157,11 @@ class Phases(coupling.Phases):
 
   def scatter(self):
     """Adds the passive force on the slots."""
-    self._over_slots(slots.scatter)
+    self._over_slots(proxies.scatter)
 
   def leave(self):
     """Takes the slots' motion and contact forces, and says whether the organ falls asleep."""
-    self._over_slots(slots.leave)
+    self._over_slots(proxies.leave)
 
   def push(self):
     """Fills the right-hand side with the impulses on the slots."""
@@ -189,11 +189,11 @@ class Phases(coupling.Phases):
 
   def advance(self):
     """Gives each window the nodes nearest to its tools."""
-    self._over_slots(slots.choose)
+    self._over_slots(proxies.choose)
 
   def foresee(self):
     """Guesses what the next `gather` tells."""
-    self._over_slots(slots.foresee)
+    self._over_slots(proxies.foresee)
 
   def enter_ahead(self):
     """Ends the last step and fills the solver's state with the guess."""
@@ -264,7 +264,7 @@ def find_contacts_again(w):
   kept = [(mjstruct.view(d.M, m.nC), row), (mjstruct.view(d.qLD, m.nC), row)]
   kept += [(mjstruct.view(d.qLDiagInv, m.nv), other)]
   values = [array[which].copy() for array, which in kept]
-  apart.find_contacts(w.model, w.data)
+  safe_calls.find_contacts(w.model, w.data)
   for (array, which), were in zip(kept, values, strict=True):
     array[which] = were
 
@@ -288,7 +288,7 @@ def share_inertia(w, vert: Any = slice(None)):
   """Gives vertices, some or all, that were one their part of its inertia."""
   nodal = w.views["whole"]
   nodal = w.cuts.share(nodal, vert) if w.cuts else nodal[vert]
-  w.views["inertia"].numpy()[vert] = slots.hold(w.organ, nodal, vert)
+  w.views["inertia"].numpy()[vert] = proxies.hold(w.organ, nodal, vert)
 
 
 def shortage(w) -> str | None:

@@ -1,7 +1,7 @@
 """Cuts: a path on the surface becomes edges of the mesh, and the mesh comes apart along them.
 
 A chain of edges near the path is found, its vertices are moved onto the path in the rest shape, as
-far as no triangle gets thin, and vertices on it are doubled: `native/cut.h`. Triangles keep their
+far as no triangle gets thin, and vertices on it are doubled: `cutting/cut.h`. Triangles keep their
 numbers and none is added, so that what is stored by triangle stays, and so does the room that
 arrays need.
 """
@@ -22,10 +22,10 @@ from ..surface import Surface, WorkingCopy, host_views
 from ..types import CONSTANTS, allocate, doubles, flags, ints, longs, struct
 from .path import check_points
 
-# Why nothing was cut, and what a path's samples are apart at most [edges], as in native/path.h.
+# Why nothing was cut, and what a path's samples are apart at most [edges], as in cutting/path.h.
 _DONE, _NO_ROOM, _OFF, _SHORT, _PINNED = range(5)
 _SAMPLE, _FAR = 0.25, 2.0
-_KINDS = {"membrane": 1, "spring": 2}  # of energy, as in native/snap.h
+_KINDS = {"membrane": 1, "spring": 2}  # of energy, as in cutting/snap.h
 _FOUND = (
   "status", "moved", "near", "split", "changed", "edges", "nouter", "stopped", "apart",
 )  # fmt: skip
@@ -77,7 +77,7 @@ class Cutting:
   reals: doubles("nworld", "nreal")
 
 
-_cut = kernel("cut_surface", "cut.h", Cutting, CONSTANTS | _NUMBERS)
+_cut = kernel("cut_surface", "cutting/cut.h", Cutting, CONSTANTS | _NUMBERS)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -223,7 +223,7 @@ class Knife:
       return
     n, self._config, self._how = 2 * n, None, ()
     sizes = self._copy.sizes | {"most_points": n}
-    # What native/cut.h takes of scratch, see there.
+    # What cutting/cut.h takes of scratch, see there.
     sizes["nint"] = 29 * whole.nvert + 18 * whole.nelem + 20 * n + 8 * sizes["most"] + 100
     sizes["nreal"] = 48 * whole.nvert + 6 * whole.nelem + 13 * n
     self._fields = fields = allocate(Cutting, "cpu", sizes)
@@ -234,9 +234,7 @@ class Knife:
     self._host["home"][:] = whole.home
     self._launch = _cut.command(fields).launch
 
-  def _put_material(
-    self, config: Config | None, held: Springs | None, given: float, at_rest: bool
-  ):
+  def _put_material(self, config: Config | None, held: Springs | None, given: float, at_rest: bool):
     fields, host = self._fields, self._host
     how = _KINDS[config.elements] if config else 0, int(held is not None), given, int(at_rest)
     if how != self._how:

@@ -12,7 +12,7 @@ from ..geometry.mesh import Mesh, lengths
 from ..kernels import aim, kernel
 from ..surface import WorkingCopy
 from ..types import CONSTANTS, doubles, ints, longs, struct
-from .stop import Stops
+from .crack_front import Stops
 
 
 @struct
@@ -36,7 +36,7 @@ class Nearest:
   spot: doubles("npoint", 8)  # triangle, weights of its corners, distance [m], a solid's normal
 
 
-_nearest = kernel("find_nearest", "cut.h", Nearest, CONSTANTS)
+_nearest = kernel("find_nearest", "cutting/cut.h", Nearest, CONSTANTS)
 
 
 class Finder:

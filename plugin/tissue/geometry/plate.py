@@ -1,6 +1,6 @@
 """Hinges of a surface and the stiffness that makes them a Kirchhoff plate.
 
-In float64, for energies; what kernels use is `native/plate.h`.
+In float64, for energies; what kernels use is `tissue/plate.h`.
 """
 
 from __future__ import annotations

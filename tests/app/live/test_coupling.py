@@ -46,9 +46,7 @@ def test_the_felt_force_has_no_steps(model, rate):
   """Pressed into the liver and over it at up to 63 mm/s; a handle that jumps 30 times a second
   makes steps of 1 N."""
   w = 2 * math.pi
-  hand = live.Hand(
-    lambda t: (0.01 * math.sin(w * t), 0, -0.005 * (1 - math.cos(w * t))), rate=rate
-  )
+  hand = live.Hand(lambda t: (0.01 * math.sin(w * t), 0, -0.005 * (1 - math.cos(w * t))), rate=rate)
   data = start(model)
   loop = couple(model, data, hand)
   force = run(loop, 1.2, lambda loop: loop.links[0].force)

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 from palpate.app.live import Lateness, Pace
-from palpate.app.live.pace import punctual
+from palpate.app.live.realtime_clock import punctual
 
 
 class Clock:

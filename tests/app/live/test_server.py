@@ -23,6 +23,7 @@ from websockets.sync.client import connect
 
 ANSWER = 120.0  # that a busy machine may take [s]
 
+
 @pytest.fixture
 def serve(tmp_path):
   running = []

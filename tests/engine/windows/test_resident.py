@@ -199,7 +199,7 @@ def test_sleep_changes_nothing_measurable(monkeypatch):
 
   slept, force, at_rest = run()
   assert slept > 500
-  monkeypatch.setattr("palpate.engine.windows.slots.SLOW", 0.0)
+  monkeypatch.setattr("palpate.engine.windows.proxies.SLOW", 0.0)
   never, expected, awake = run()
   assert never == 0
   assert np.abs(at_rest - awake).max() < 1e-7
@@ -297,7 +297,7 @@ def test_still_tool_nearby_lets_it_sleep_and_wakes_it_before_it_touches(
   monkeypatch, resident, swing, steps
 ):
   def press(slow):
-    monkeypatch.setattr("palpate.engine.windows.slots.SLOW", slow)
+    monkeypatch.setattr("palpate.engine.windows.proxies.SLOW", slow)
     m, d, organ = hovering(resident, swing)
     mujoco.mj_step(m, d, nstep=250)
     slept = organ.asleep

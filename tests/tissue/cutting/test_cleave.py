@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from palpate.tissue import energy
 from palpate.tissue.config import Config
-from palpate.tissue.cutting import cleave
+from palpate.tissue.cutting import solid_cut
 from palpate.tissue.cutting.cut import Motion
 from palpate.tissue.cutting.path import Finder, distance
 from palpate.tissue.geometry import faces, fill
@@ -39,7 +39,7 @@ def cut(mesh, points, depth=None, pinned=(), u=0.0, room=None, **keys):
   still = np.zeros_like(mesh.rest)
   motion = Motion(fill.vertex_volumes(mesh), still + u, still)
   whole = mesh.whole
-  knife = cleave.Cleaver(whole, Finder(WorkingCopy(whole)), room or whole.nelem + 4 * mesh.spare)
+  knife = solid_cut.Cleaver(whole, Finder(WorkingCopy(whole)), room or whole.nelem + 4 * mesh.spare)
   return knife.cut("organ", mesh, motion, np.asarray(points), held, depth, **keys)
 
 

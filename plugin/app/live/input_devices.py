@@ -1,0 +1,205 @@
+"""Devices that know movements and speeds but no place: mouse, keyboard, gamepad, SpaceMouse."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from .device import DeviceError, Reading, Silent
+
+SPEED, ROLL = 0.06, 2.0  # of the hand at full deflection [m/s], about the shaft [rad/s]
+BUTTONS = frozenset({"clutch", "grip", "report", "pause"})
+_MOST = 0.05  # of one movement [m]
+_DEAD = 0.08  # share of a stick's way in which nothing moves
+_EVERY = 0.008  # between readings of the hardware [s]
+
+
+class Desk(Silent):
+  """A hand that is moved by what another thread says: displacements, speeds, buttons."""
+
+  relative = True
+
+  def __init__(self, name: str = "desk"):
+    """Makes a hand at its origin."""
+    self.name = name
+    self._lock = threading.Lock()
+    self._moved = [0.0] * 4
+    self._rate: Sequence[float] = (0.0,) * 4
+    self._held: frozenset[str] = frozenset()
+    self._jaw: float | None = None
+    self._at = 0.0
+    self._pos, self._time = [0.0] * 4, None
+
+  def feed(
+    self,
+    move: Sequence[float] = (),
+    rate: Sequence[float] = (),
+    buttons: Iterable[str] = (),
+    jaw: float | None = None,
+    at: float = 0.0,
+  ) -> None:
+    """Takes what the hand does; ValueError says what is no such thing.
+
+    Args:
+      move: how far it went since the last call, x y z [m] and about the shaft [rad]  (4,)
+      rate: its speed from now on, in shares of the full one, each in [-1, 1]  (4,)
+      buttons: those that are held now, of `BUTTONS`
+      jaw: opening of the jaws in [-1, 1], None for the button `grip`
+      at: when it was so, by any clock, 1e9 at most
+    """
+    held = frozenset(buttons)
+    if not held <= BUTTONS:
+      raise ValueError(f"button is {min(held - BUTTONS)!r}, expected {', '.join(sorted(BUTTONS))}")
+    far, fast = _numbers("move", move, math.pi), _numbers("rate", rate, 1.0)
+    if jaw is not None:
+      jaw = _numbers("jaw", [jaw] * 4, 1.0)[0]
+    at = _numbers("at", [at] * 4, 1e9)[0]
+    with self._lock:
+      most = (_MOST, _MOST, _MOST, math.pi)
+      self._moved = [a + min(max(b, -m), m) for a, b, m in zip(self._moved, far, most, strict=True)]
+      self._rate, self._held, self._jaw, self._at = fast, held, jaw, at
+
+  def read(self, now: float) -> Reading:
+    """Returns where the hand is."""
+    span = 0.0 if self._time is None else min(now - self._time, 0.1)
+    self._time = now
+    with self._lock:
+      moved, rate, held, jaw = self._moved, self._rate, self._held, self._jaw
+      self._moved, self.stamp = [0.0] * 4, self._at
+    full = (SPEED, SPEED, SPEED, ROLL)
+    self._pos = [
+      p + m + span * r * f for p, m, r, f in zip(self._pos, moved, rate, full, strict=True)
+    ]
+    x, y, z, roll = self._pos
+    return Reading((x, y, z), None, roll, jaw, held)
+
+
+def _numbers(name: str, values: Sequence[float], most: float) -> tuple[float, ...]:
+  if not len(values):
+    return (0.0,) * 4
+  good = len(values) == 4 and all(
+    isinstance(v, int | float) and not isinstance(v, bool) and abs(v) <= most for v in values
+  )
+  if not good:
+    raise ValueError(f"{name} is {list(values)!r:.80}, expected 4 numbers in [-{most:g}, {most:g}]")
+  return tuple(float(v) for v in values)
+
+
+def sticks(value: float) -> float:
+  """Returns the deflection of a stick without its dead zone."""
+  size = (abs(value) - _DEAD) / (1 - _DEAD)
+  return math.copysign(min(size, 1.0), value) if size > 0 else 0.0
+
+
+class Hardware(Desk):
+  """A desk device that is asked for its deflections."""
+
+  def read(self, now: float) -> Reading:
+    """Asks the hardware when it is time, and returns where the hand is."""
+    if self._time is None or now - self._asked >= _EVERY:
+      self._asked = now
+      self.ask()
+    return super().read(now)
+
+  _asked = 0.0
+
+  def ask(self) -> None:
+    """Feeds what the hardware says; DeviceError if it is gone."""
+    raise NotImplementedError
+
+
+class Gamepad(Hardware):
+  """A gamepad by pygame: left stick across the picture, right stick depth and roll.
+
+  Buttons: 0 grips, 1 reports, 2 or either shoulder is the clutch, 7 pauses.
+  """
+
+  def __init__(self, index: int = 0):
+    """Opens the gamepad with a number."""
+    super().__init__("gamepad")
+    self._index = index
+    self._pygame: Any = _need("pygame", "gamepad")
+    if not self.reopen():
+      found = self._pygame.joystick.get_count()
+      raise DeviceError(f"gamepad {index}: there is none; {found} found")
+
+  def reopen(self) -> bool:
+    """Looks for it again."""
+    joystick = self._pygame.joystick
+    joystick.quit()
+    joystick.init()
+    if joystick.get_count() <= self._index:
+      return False
+    self._pad = joystick.Joystick(self._index)
+    self._pad.init()
+    return True
+
+  def ask(self) -> None:
+    """Feeds sticks and buttons."""
+    # Without a window of pygame events still have to be fetched.
+    self._pygame.event.pump()
+    if not self._pad.get_init() or self._pygame.joystick.get_count() <= self._index:
+      raise DeviceError(f"{self.name}: it is gone")
+    pad, count = self._pad, self._pad.get_numaxes()
+    x, y, u, v = (sticks(pad.get_axis(i)) if i < count else 0.0 for i in (0, 1, 2, 3))
+    down = {i for i in range(pad.get_numbuttons()) if pad.get_button(i)}
+    names = {0: "grip", 1: "report", 2: "clutch", 4: "clutch", 5: "clutch", 7: "pause"}
+    self.feed(rate=(x, -y, v, u), buttons={names[i] for i in down & set(names)})
+
+  def close(self) -> None:
+    """Lets go of it."""
+    self._pygame.joystick.quit()
+
+
+class SpaceMouse(Hardware):
+  """A SpaceMouse by pyspacemouse: pushed as the tip is to go, twisted to roll.
+
+  Buttons: the first is the clutch, the second grips, or reports where there are no jaws.
+  """
+
+  def __init__(self):
+    """Opens the first one."""
+    super().__init__("spacemouse")
+    self._library: Any = _need("pyspacemouse", "spacemouse")
+    self._mouse: Any = None
+    if not self.reopen():
+      raise DeviceError("spacemouse: none was found")
+
+  def reopen(self) -> bool:
+    """Looks for it again."""
+    try:
+      self._mouse = self._library.open(axis_convention="hid_z_up")
+    except Exception as error:  # the library's, hidapi's or the system's
+      raise DeviceError(f"spacemouse: {error}") from error
+    return self._mouse is not None
+
+  def ask(self) -> None:
+    """Feeds deflections and buttons."""
+    try:
+      state = self._mouse.read()
+    except Exception as error:
+      raise DeviceError(f"{self.name}: {error}") from error
+    first, second, *_ = [*state.buttons, 0, 0]
+    held = {"clutch"} if first else set()
+    rate = [sticks(min(max(v, -1.0), 1.0)) for v in (state.x, state.z, -state.y, state.yaw)]
+    self.feed(rate=rate, buttons=held | ({"grip", "report"} if second else set()))
+
+  def close(self) -> None:
+    """Lets go of it."""
+    if self._mouse is not None:
+      self._mouse.close()
+
+
+def _need(module: str, extra: str) -> Any:
+  """Returns a module that not everybody has; DeviceError says what to install."""
+  import importlib
+
+  try:
+    found = importlib.import_module(module)
+  except (ImportError, OSError) as error:
+    raise DeviceError(f"{extra}: {error}; pip install 'palpate[{extra}]'") from error
+  if module == "pygame":
+    found.init()
+  return found

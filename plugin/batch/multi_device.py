@@ -1,0 +1,235 @@
+"""Worlds split over several devices of a host, behind the interface of one batch.
+
+Each device has a batch of its own, in `parts`, and steps beside the others. What is read of all
+worlds is gathered on the first device; `parts` have theirs in place.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+from collections.abc import Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+import warp as wp
+from palpate.engine.cutting.cuts import Report
+
+from .base import Batch, Contacts, Tissue, on_device, spread
+from .bonds import Gathered
+from .fracture import Cutters
+from .worlds import Worlds
+
+
+class Several(Batch):
+  """A batch of batches.
+
+  Args:
+    spec: the scene
+    nworld: number of worlds
+    devices: one a part, which get as many worlds each as can be
+    nodes: see `Worlds`
+    deterministic: see `Worlds`
+
+  Attributes:
+    parts: the batches, whose worlds follow one another
+    slices: worlds of each
+  """
+
+  def __init__(
+    self,
+    spec: mujoco.MjSpec,
+    nworld: int,
+    devices: Sequence[str],
+    nodes: int | dict[str, int] | None = None,
+    deterministic: bool = False,
+  ):
+    if not 1 <= len(devices) <= nworld:
+      raise ValueError(f"device has {len(devices)} names, expected from 1 to nworld, {nworld}")
+    ends = np.linspace(0, nworld, len(devices) + 1).round().astype(int)
+    self.slices = [slice(int(a), int(b)) for a, b in itertools.pairwise(ends)]
+    self.parts = [
+      Worlds(spec, part.stop - part.start, device, nodes, deterministic)
+      for part, device in zip(self.slices, devices, strict=True)
+    ]
+    super().__init__(self.parts[0].model, nworld, self.parts[0].device)
+    self._allocate()
+    self._organs = {name: _Gathered(self, name) for name in self.parts[0].organs}
+
+  @property
+  def organs(self) -> dict[str, Tissue]:
+    """The organs by name."""
+    return dict(self._organs)
+
+  def gather(self, arrays: Sequence[wp.array], out: wp.array) -> wp.array:
+    """Copies an array of each part to one of all worlds."""
+    for part, array, batch in zip(self.slices, arrays, self.parts, strict=True):
+      if array.size:
+        wp.synchronize_device(batch.device)
+        wp.copy(_rows(out, part), array.contiguous())
+    return out
+
+  @property
+  def failures(self) -> wp.array:
+    """How often each world had numbers that are not finite, and was reset for it, (nworld,)."""
+    return self.gather([part.failures for part in self.parts], self._counts["failures"])
+
+  @property
+  def overflow(self) -> wp.array:
+    """Most touched triangles, or nodes, that windows had no room for so far, (nworld,)."""
+    return self.gather([part.overflow for part in self.parts], self._counts["overflow"])
+
+  @property
+  def sensor_peak(self) -> wp.array:
+    """Largest norm of each sensor in the steps of the last call of `step`, (nworld, nsensor)."""
+    return self.gather([part.sensor_peak for part in self.parts], self._summary["peak"])
+
+  @property
+  def sensor_mean(self) -> wp.array:
+    """Mean of the sensors over the steps of the last call of `step`, (nworld, nsensordata)."""
+    return self.gather([part.sensor_mean for part in self.parts], self._summary["mean"])
+
+  def _tell(self):
+    for name in ("time", "qpos", "qvel", "sensordata"):
+      self.gather([getattr(part, name) for part in self.parts], self._arrays[name])
+
+  def _step(self, n: int):
+    wp.synchronize_device(self.device)  # who wrote the controls
+    for at, part in zip(self.slices, self.parts, strict=True):
+      if self.ctrl.size:
+        wp.copy(part.ctrl, _rows(self.ctrl, at))
+    for part in self.parts:
+      part.step(n)
+
+  def _each(self, mask: wp.array):
+    """Yields each part, its worlds, and what of a mask is theirs."""
+    whole = mask.numpy()
+    for at, part in zip(self.slices, self.parts, strict=True):
+      yield part, at, on_device(whole[at], wp.bool, part.device)
+
+  def _reset(self, mask: wp.array):
+    for part, _, own in self._each(mask):
+      part.reset(own)
+    self.ctrl.assign(np.where(mask.numpy()[:, None], 0.0, self.ctrl.numpy()))
+
+  def _start(self, data: mujoco.MjData):
+    for part in self.parts:
+      part.start(data)
+
+  def pose(self, joints: Sequence[str], values, mask=None):
+    """Puts joints of worlds at positions, see `Batch.pose`."""
+    values = self._rows(values, "values", len(joints))
+    self._fresh = False
+    for part, at, own in self._each(self._mask(mask)):
+      part.pose(joints, values[at], own)
+
+  def place(self, body: str, pos, quat, mask=None):
+    """Moves a body of worlds in its parent's frame, see `Batch.place`."""
+    pos, quat = self._rows(pos, "pos", 3), self._rows(quat, "quat", 4)
+    self._fresh = False
+    for part, at, own in self._each(self._mask(mask)):
+      part.place(body, pos[at], quat[at], own)
+
+  def configure(self, mask=None, *, gravity=None, friction=None):
+    """Changes what worlds have besides organs, see `Batch.configure`."""
+    if gravity is not None:
+      gravity = self._rows(np.broadcast_to(gravity, (self.nworld, 3)), "gravity", 3)
+    rough = {name: np.broadcast_to(v, (self.nworld,)) for name, v in (friction or {}).items()}
+    for part, at, own in self._each(self._mask(mask)):
+      mine = {name: values[at] for name, values in rough.items()}
+      part.configure(own, gravity=None if gravity is None else gravity[at], friction=mine)
+
+  def _configure(self, worlds, gravity, friction):
+    raise AssertionError("the parts do")
+
+  def _find(self, world: int) -> tuple[Batch, int]:
+    k = next(k for k, at in enumerate(self.slices) if world < at.stop)
+    return self.parts[k], world - self.slices[k].start
+
+  def _get_state(self, world: int, data: mujoco.MjData):
+    part, own = self._find(world)
+    part.get_state(own, data)
+
+  def _set_state(self, world: int, data: mujoco.MjData):
+    part, own = self._find(world)
+    part.set_state(own, data)
+    if self.ctrl.size:
+      wp.copy(_rows(self.ctrl, slice(world, world + 1)), _rows(part.ctrl, slice(own, own + 1)))
+
+
+def _rows(array: wp.array, at: slice) -> Any:
+  """Returns rows of an array, in its memory."""
+  return array[at]
+
+
+class _Gathered(Tissue):
+  """An organ of `Several`."""
+
+  def __init__(self, batch: Several, name: str):
+    self._batch, self.name = batch, name
+    self._parts = [part.organ(name) for part in batch.parts]
+    self.nvert, self.elem = self._parts[0].nvert, self._parts[0].elem
+    self._arrays: dict[str, wp.array] = {}
+
+  def _gather(self, name: str, arrays: Sequence[wp.array]) -> wp.array:
+    batch = self._batch
+    if name not in self._arrays:
+      shape = (batch.nworld, *arrays[0].shape[1:])
+      self._arrays[name] = wp.zeros(shape, dtype=arrays[0].dtype, device=batch.device)
+    return batch.gather(arrays, self._arrays[name])
+
+  def _read(self, name: str) -> wp.array:
+    return self._gather(name, [getattr(part, name) for part in self._parts])
+
+  @functools.cached_property
+  def bonds(self) -> Gathered:
+    """What it has grown on to."""
+    return Gathered(self._batch, [part.bonds for part in self._parts])
+
+  @property
+  def _spare(self) -> int:
+    return self._parts[0]._spare
+
+  def _cut(self, points: dict[int, np.ndarray]) -> list[Report | None]:
+    out: list[Report | None] = []
+    for at, part in zip(self._batch.slices, self._parts, strict=True):
+      own = {world - at.start: points[world] for world in points if at.start <= world < at.stop}
+      out += part._cut(own) if own else [None] * (at.stop - at.start)
+    return out
+
+  def _told(self, name: str, world: int) -> list:
+    part, own = self._part(world)
+    return part._told(name, own)
+
+  def _part(self, world: int) -> tuple[Tissue, int]:
+    batch, own = self._batch._find(world)
+    return batch.organ(self.name), own
+
+  def _piece_count(self) -> wp.array:
+    return self._gather("piece_count", [part.piece_count for part in self._parts])
+
+  def _cutters(self) -> Cutters:
+    parts = [part.cutters for part in self._parts]
+    names = Cutters._fields
+    return Cutters(*(self._gather(n, [getattr(part, n) for part in parts]) for n in names))
+
+  def elem_of(self, world: int) -> np.ndarray:
+    """Returns the triangles of a world, see `Tissue.elem_of`."""
+    part, own = self._part(self._batch._world(world))
+    return part.elem_of(own)
+
+  @property
+  def contacts(self) -> Contacts:
+    """Contacts of the last step."""
+    parts = [part.contacts for part in self._parts]
+    names = Contacts._fields
+    every = {name: [getattr(part, name) for part in parts] for name in names}
+    return Contacts(*(self._gather(name, arrays) for name, arrays in every.items()))
+
+  def configure(self, mask=None, **keys):
+    """Changes the tissue of worlds, see `Tissue.configure`."""
+    batch = self._batch
+    rows = {key: spread(self, key, value, batch.nworld) for key, value in keys.items()}
+    for part, at, own in batch._each(batch._mask(mask)):
+      part.organ(self.name).configure(own, **{key: values[at] for key, values in rows.items()})

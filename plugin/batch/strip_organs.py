@@ -1,0 +1,275 @@
+# mujoco ships its bindings without type stubs:
+# pyright: reportAttributeAccessIssue=false
+"""What mujoco_warp gets of a scene: all but the organs, and slots in their place.
+
+The slots of an organ are the vertices of one flex whose triangles are all triples of slots, since
+mujoco_warp shares triangles between worlds: whichever nodes a window has, each of its triangles has
+an element.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+
+import mujoco
+import numpy as np
+from palpate import windows
+from palpate.engine import contacts, mjstruct
+from palpate.engine.contacts import TISSUE
+
+from .contacts import KINDS
+
+# Slots of an organ: all triples of more are too many.
+LEAST, MOST = 4, 48
+_USUAL = 24  # at most, unless told
+_INERTIA = 1e-8  # of a slot's body, which does not turn [kg m^2]
+_COUNTED = ("nu", "na", "nsensor", "nsensordata", "neq", "ntendon", "npair", "nexclude", "nmocap")
+
+
+@dataclasses.dataclass(frozen=True)
+class Slots:
+  """Where the stripped model has the slots of an organ."""
+
+  nslot: int
+  flex: int
+  body: int
+  dofadr: int
+  qposadr: int
+  mass: float
+
+
+def tools_of(model: mujoco.MjModel, organ) -> np.ndarray:
+  """Returns the geoms that an organ's slots follow.
+
+  Raises:
+    ValueError: one is not a tool that a batch knows, or it is not an organ that it can step.
+  """
+  for key in ("carrier", "relax_share"):
+    if getattr(organ.config, key):
+      raise ValueError(
+        f"organ {organ.name!r}: {key} is set, which a batch on a GPU cannot do; expected none"
+      )
+  for key, there in (
+    ("bonds", organ.config.bonded), ("attach", organ.config.attach),
+    ("support", organ.config.support),
+  ):  # fmt: skip
+    if organ.mesh.spare and there:
+      raise ValueError(
+        f"organ {organ.name!r}: spare and {key} are set, of which a batch on a GPU can do one"
+      )
+  if organ.config.bonded and any(row.current for row in organ.config.cutters):
+    raise ValueError(
+      f"organ {organ.name!r}: cutters has a current and bonds are set, which it frees none of in a "
+      "batch on a GPU; expected one of both"
+    )
+  if organ.windows:
+    found = np.unique(organ.windows.geom)
+  else:
+    contype, conaffinity = model.flex_contype[organ.flex], model.flex_conaffinity[organ.flex]
+    meets = (model.geom_contype & conaffinity) | (model.geom_conaffinity & contype)
+    found = np.flatnonzero(meets)
+  for g in found:
+    if int(model.geom_type[g]) not in KINDS:
+      raise ValueError(
+        f"organ {organ.name!r} collides with {_geom(model, int(g))}, of type "
+        f"{_kind(model.geom_type[g])}; a batch on a GPU knows {', '.join(map(_kind, KINDS))}"
+      )
+  return found
+
+
+def slots_for(model, organ, tools: np.ndarray, nodes) -> int:
+  """Returns how many slots an organ has: the nodes that its tools touch, and their neighbours.
+
+  Args:
+    model: the compiled scene
+    organ: the organ's declaration
+    tools: geoms that the slots follow
+    nodes: a number, or one by name, or None for what the tools' sizes ask for
+  """
+  given = nodes.get(organ.name) if isinstance(nodes, dict) else nodes
+  nvert = organ.mesh.nvert
+  if given is not None:
+    if isinstance(given, bool) or not isinstance(given, int) or not LEAST <= given <= MOST:
+      raise ValueError(f"organ {organ.name!r}: nodes is {given!r}, expected [{LEAST}, {MOST}]")
+    return min(given, nvert)
+  edge = organ.mesh.rest[organ.mesh.elem[:, [1, 2, 0]]] - organ.mesh.rest[organ.mesh.elem]
+  edge = float(np.linalg.norm(edge, axis=2).mean())
+  many = 0.0
+  for g in tools:
+    low, middle, large = np.sort(model.geom_aabb[g, 3:])
+    r = (0.5 * (low + middle)) + edge
+    many += (math.pi * r * r + 2 * r * 2 * (large - middle)) / (math.sqrt(3) / 2 * edge * edge)
+  return int(min(np.clip(math.ceil(many), 8, _USUAL), nvert))
+
+
+def _kind(kind: int) -> str:
+  return mujoco.mjtGeom(int(kind)).name.removeprefix("mjGEOM_").lower()
+
+
+def _geom(model, g: int) -> str:
+  name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, g)
+  body = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, int(model.geom_bodyid[g]))
+  return f"geom {name!r}" if name else f"a geom of body {body!r}"
+
+
+def strip(
+  spec: mujoco.MjSpec, model: mujoco.MjModel, organs: list, nslots: list[int]
+) -> tuple[mujoco.MjModel, list[Slots]]:
+  """Returns the model without organs and with slots, and where it has these.
+
+  Args:
+    spec: the scene
+    model: compiled from it
+    organs: its organs' declarations
+    nslots: slots of each
+  """
+  bare = spec.copy()
+  for key in list(bare.keys):
+    bare.delete(key)
+  bodies = {body.name: body for body in bare.bodies}
+  instances = _release_plugins(bare)
+  for organ in organs:
+    _take_out(bare, bodies, organ, model)
+  for instance in instances:
+    bare.delete(instance)
+  masses = [_slot_mass(organ) for organ in organs]
+  for organ, nslot, mass in zip(organs, nslots, masses, strict=True):
+    _add_slots(bare, organ, nslot, mass, model)
+  if any(sensor.type == mujoco.mjtSensor.mjSENS_TOUCH for sensor in bare.sensors):
+    _add_last(bare, f"{organs[-1].name}_slot_{nslots[-1] - 1}")
+  bare.option.jacobian = mujoco.mjtJacobian.mjJAC_AUTO
+  _check_option(bare.option)
+  made = bare.compile()
+  made.flex_vert[:] = 0.0  # vertices are where their bodies are
+  made.flex_centered[:] = True
+  if made.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC:
+    m = mjstruct.Model.from_address(model._address)
+    tissues = [contacts.tissue_of(m, organ) for organ in organs]
+    sticks = [1 / tissue[TISSUE.stuck] for tissue in tissues if tissue[TISSUE.firm]]
+    made.opt.impratio = max(made.opt.impratio, *sticks, 0)
+  if made.nv <= 60 and made.opt.solver == mujoco.mjtSolver.mjSOL_NEWTON:
+    made.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+  _check(model, made, organs, nslots)
+  slots = []
+  for organ, nslot, mass in zip(organs, nslots, masses, strict=True):
+    first = made.body(f"{organ.name}_slot_0").id
+    slots.append(
+      Slots(
+        nslot,
+        mujoco.mj_name2id(made, mujoco.mjtObj.mjOBJ_FLEX, f"{organ.name}_slots"),
+        first,
+        int(made.body_dofadr[first]),
+        int(made.jnt_qposadr[made.body_jntadr[first]]),
+        mass,
+      )
+    )
+  return made, slots
+
+
+def _release_plugins(bare) -> list:
+  """Deletes the instances of the plugin, which no body refers to from now on.
+
+  Returns:
+    those without a name, which are a body's own: bodies can be deleted safely as long as they are
+    there, but not where those with a name were left, which many refer to
+  """
+  mine = [b for b in bare.bodies if b.plugin.active and b.plugin.plugin_name == mjstruct.NAME]
+  numbers = {body.plugin.id for body in mine}  # some have no name
+  for body in mine:
+    body.plugin.active = False
+  instances = [instance for instance in bare.plugins if instance.id in numbers]
+  for instance in instances:
+    if instance.name:
+      bare.delete(instance)
+  return [instance for instance in instances if not instance.name]
+
+
+def _check_option(option):
+  if option.integrator == mujoco.mjtIntegrator.mjINT_IMPLICIT:
+    raise ValueError("integrator is implicit, expected Euler or implicitfast for a batch on a GPU")
+  if option.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
+    raise ValueError("sleep is enabled, which a batch on a GPU does not know")
+
+
+def _slot_mass(organ) -> float:
+  """Returns the mass of a slot's body, lighter than a node whatever its world's masses [kg]."""
+  return 0.1 * float(organ.mass[organ.free & (organ.mass > 0)].min())
+
+
+def _take_out(bare, bodies: dict, organ, model):
+  """Deletes an organ's flexes and the bodies of its nodes or windows."""
+  for number in {organ.flex, *organ.flexes}:
+    name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_FLEX, int(number))
+    flex = bare.flex(name)
+    mine = [bodies[body] for body in dict.fromkeys(flex.vertbody)]
+    bare.delete(flex)
+    moving = [body for body in mine if body.first_joint() is not None]
+    if not moving:
+      continue
+    # One by one they take MuJoCo quadratic time to delete.
+    doomed = moving[0].parent.add_frame()
+    for body in moving:
+      body.set_frame(doomed)
+    bare.delete(doomed)
+
+
+def _add_slots(bare, organ, nslot: int, mass: float, model):
+  flex = organ.windows.flex[0] if organ.windows else organ.flex
+  names = [f"{organ.name}_slot_{k}" for k in range(nslot)]
+  for name in names:
+    windows.add_node(bare.worldbody, name, np.zeros(3), mass, _INERTIA)
+  # No three points of a circle are in line, which MuJoCo wants of triangles.
+  angle = 2 * math.pi * np.arange(nslot) / nslot
+  points = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+  elem = np.array(list(itertools.combinations(range(nslot), 3)))
+  made = windows.make_flex(bare, f"{organ.name}_slots", points, names, elem)
+  made.contype = made.conaffinity = 0
+  made.selfcollide = mujoco.mjtFlexSelf.mjFLEXSELF_NONE
+  made.condim = int(model.flex_condim[flex])
+
+
+def _add_last(bare, body: str):
+  """Adds a geom that touches nothing, after all others.
+
+  mujoco_warp's touch sensors take the other side of a flex's contact, geom -1, for the last geom.
+  """
+  bare.body(body).add_geom(size=[1e-6, 0, 0], mass=0.0, contype=0, conaffinity=0)
+
+
+def _check(model, made, organs: list, nslots: list[int]):
+  """Raises ValueError where something of the scene hung on what was taken out."""
+  for name in _COUNTED:
+    before, after = getattr(model, name), getattr(made, name)
+    if before != after:
+      raise ValueError(
+        f"{name} is {before} and would be {after} without the organs' nodes: an actuator, sensor, "
+        "equality, tendon or pair refers to them, which a batch on a GPU cannot do"
+      )
+  gone = sum(organ.nfree if organ.windows is None else 3 * organ.windows.nslot for organ in organs)
+  more = made.ngeom - model.ngeom
+  if model.nv - gone != made.nv - 3 * sum(nslots) or more not in (0, 1):
+    raise ValueError("the scene has other flexes or plugins, which a batch on a GPU cannot do")
+
+
+def tools_meet(bare: mujoco.MjModel) -> bool:
+  """Returns whether two geoms can touch, one of which moves."""
+  kind, meets, body = bare.geom_contype, bare.geom_conaffinity, bare.body_weldid[bare.geom_bodyid]
+  pairs = (kind[:, None] & meets) | (meets[:, None] & kind)
+  return bool((pairs.astype(bool) & (body[:, None] != body)).any()) or bare.npair > 0
+
+
+def rows_of(bare: mujoco.MjModel) -> int:
+  """Returns the most rows of constraints that a world has besides those of contacts."""
+  limits = int(bare.jnt_limited.sum()) + 2 * int(bare.tendon_limited.sum())
+  friction = int((bare.dof_frictionloss > 0).sum() + (bare.tendon_frictionloss > 0).sum())
+  return 2 * limits + friction + 6 * bare.neq
+
+
+def kept(model: mujoco.MjModel, organs: list) -> tuple[np.ndarray, np.ndarray]:
+  """Returns the numbers of qpos and of qvel that are not an organ's; they come first in both."""
+  qpos, dofs = np.ones(model.nq, bool), np.ones(model.nv, bool)
+  for organ in organs:
+    qpos[organ.qposs] = dofs[organ.dofs] = False
+  return np.flatnonzero(qpos), np.flatnonzero(dofs)

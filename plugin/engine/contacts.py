@@ -1,0 +1,255 @@
+"""Contacts with an organ: weights of corners, stiffness, sliding; see `coupling/contact_*.h`.
+
+MuJoCo 3.17 weighs the corners of a touched triangle by inverse distance: forces are off and
+flicker where a tool presses. MuJoCo 4.0 has it right. Both part what slides.
+"""
+
+# Annotations here are objects, not text: no `from __future__ import annotations`.
+# pyright: reportInvalidTypeForm=false
+
+import functools
+
+import mujoco
+import numpy as np
+import warp as wp
+from palpate.tissue.config import Config, rigidity
+from palpate.tissue.kernels import kernel
+from palpate.tissue.solid import capsule
+from palpate.tissue.types import Array, doubles, ints, struct
+
+from . import coupling, mjstruct, safe_calls
+from .layout import FLAG, Numbers
+
+_DATA = (
+  *("contact", "ncon", "nefc", "nisland", "efc_type", "efc_J", "efc_J_rownnz", "efc_J_rowadr"),
+  *("efc_J_colind", "efc_pos", "efc_KBIP", "efc_diagA", "efc_R", "efc_D"),
+  *("map_efc2iefc", "iefc_R", "iefc_D"),
+)
+_CONTACT = (
+  *("dist", "pos", "frame", "friction", "solref", "solimp", "mu", "dim", "geom", "flex", "elem"),
+  *("vert", "exclude", "efc_address"),
+)
+# What an organ's contacts follow, of each flex.
+TISSUE = Numbers(
+  "TISSUE",
+  ("modulus", 1, "Pa", "young / (1 - poisson^2) of a solid without a skin, else 0"),
+  ("asked", 1, "1/kg", "R of a contact that the tissue asks for"),
+  ("share", 1, "1/kg", "R that the step can bear at least for each vertex that is touched"),
+  ("stuck", 1, "-", "of the R that the step can bear, the most that friction has"),
+  ("firm", 1, "-", "whether contacts are made so; 0 where the organ says itself how firm they are"),
+)
+# A contact: the steps in which it closes; of its tissue's compliance, how much it has; the least R
+# in the inverse inertia of an organ and of a tool, since firmer ones chatter; of that, friction's.
+SLOW, FIRM, SOFT, LIGHT, STUCK = 4.0, 0.03, 0.036, 0.0075, 0.2
+# Contacts are softer from a step on [s], and where a vertex has more times its mass than this.
+LONG, STIFF = 5e-3, 1000.0
+SKIN = 3.0  # times the least R of solids that skins have, for whose nodes MuJoCo answers
+# How a triangle is looked at under the flat end of a cylinder: how level it is at least; points
+# along an edge; in radii, how far in from the rim they count less, and how far off the end they
+# count; the share of points that carries it in full.
+FLAT = {"LEVEL": 0.85, "POINTS": 6, "RIM": 0.1, "SLACK": 0.01, "COVER": 0.25}
+_USUAL = (0.02, 1, 0.9, 0.95, 0.001, 0.5, 2)  # MuJoCo's solref and solimp
+# Those of `add_organ`, by which an organ does not say how firm its contacts are either.
+SOLREF, SOLIMP = (0.004, 1), (0.95, 0.99, 0.001)
+_tissue: dict[int, tuple] = {}  # by the address of an mjData, see `tell`
+_SPARSE_FROM = 60  # dofs from which MuJoCo's rows are sparse where it may choose
+
+
+@struct
+class Weights:
+  """The organs' flexes and MuJoCo's memory under its own names."""
+
+  nv: int  # dofs of the model
+  wrong: int  # whether MuJoCo's weights are
+  memory: Array(wp.uint64, ("nword",))  # the mjData itself
+  mine: ints("nflex")  # 1 where a flex is an organ's, or a window of one; 2 where of the own one
+  flags: ints(len(FLAG))  # see FLAG
+  tissue: doubles("nflex", len(TISSUE))  # see TISSUE
+  force_adr: ints("nflexvert")  # where the plugin state has a vertex' contact force, or -1
+  # mjOption:
+  jacobian: ints(1)
+  timestep: doubles(1)
+  impratio: doubles(1)
+  integrator: ints(1)
+  solver: ints(1)
+  noslip_iterations: ints(1)
+  enableflags: ints(1)
+  # mjModel:
+  body_dofadr: ints("nbody")
+  body_dofnum: ints("nbody")
+  body_parentid: ints("nbody")
+  body_rootid: ints("nbody")
+  dof_parentid: ints("nv")
+  body_invweight0: doubles("nbody", 2)
+  geom_bodyid: ints("ngeom")
+  geom_type: ints("ngeom")
+  geom_size: doubles("ngeom", 3)
+  flex_radius: doubles("nflex")
+  flex_dim: ints("nflex")
+  flex_vertadr: ints("nflex")
+  flex_vertbodyid: ints("nflexvert")
+  flex_elem: ints("nflexelemdata")
+  flex_elemdataadr: ints("nflex")
+  # mjData:
+  qvel: doubles("nv")
+  flexvert_xpos: doubles("nflexvert", 3)
+  geom_xpos: doubles("ngeom", 3)
+  geom_xmat: doubles("ngeom", 9)
+  subtree_com: doubles("nbody", 3)
+  cdof: doubles("nv", 6)
+  plugin_state: doubles("npluginstate")
+
+
+def _offsets(prefix: str, kind, names) -> dict[str, int]:
+  return {f"{prefix}_{name.upper()}": getattr(kind, name).offset for name in names}
+
+
+weigh = kernel(
+  "weigh",
+  "coupling/contact_weights.h",
+  Weights,
+  coupling.CONSTANTS
+  | TISSUE.constants()
+  | _offsets("DATA", mjstruct.Data, _DATA)
+  | _offsets("CONTACT", mjstruct.Contact, _CONTACT)
+  | {
+    "SLOW": SLOW,
+    "LIGHT": LIGHT,
+    **FLAT,
+    "CONTACT_LENGTH": mjstruct.size(mjstruct.Contact),
+    "CONTACT_PYRAMIDAL": int(mujoco.mjtConstraint.mjCNSTR_CONTACT_PYRAMIDAL),
+    "CONTACT_ELLIPTIC": int(mujoco.mjtConstraint.mjCNSTR_CONTACT_ELLIPTIC),
+    "JACOBIAN_DENSE": int(mujoco.mjtJacobian.mjJAC_DENSE),
+    "JACOBIAN_AUTO": int(mujoco.mjtJacobian.mjJAC_AUTO),
+    "SPARSE_FROM": _SPARSE_FROM,
+    "INTEGRATOR_DISCRETE": int(getattr(mujoco.mjtIntegrator, "mjINT_DISCRETE", -1)),
+    "SOLVER_PGS": int(mujoco.mjtSolver.mjSOL_PGS),
+    "ENABLE_DIAGEXACT": int(mujoco.mjtEnableBit.mjENBL_DIAGEXACT),
+  },
+)
+
+
+@functools.cache
+def are_wrong() -> bool:
+  """Returns whether MuJoCo's weights are not barycentric, by one contact with a triangle."""
+  slides = "".join(f'<joint type="slide" axis="{axis}"/>' for axis in ("1 0 0", "0 1 0", "0 0 1"))
+  corners = "".join(
+    f'<body name="{name}" pos="{pos}"><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>'
+    f"{slides}</body>"
+    for name, pos in (("a", "0 0 0"), ("b", "1 0 0"), ("c", "0 1 0"))
+  )
+  model = mujoco.MjModel.from_xml_string(
+    f"""<mujoco><option jacobian="dense"/><worldbody>{corners}
+    <geom size=".1" pos=".15 .25 .1" condim="1"/></worldbody>
+    <deformable><flex dim="2" body="a b c" element="0 1 2" radius=".01"><edge damping="1"/>
+    <contact selfcollide="none" condim="1"/></flex></deformable></mujoco>"""
+  )
+  data = mujoco.MjData(model)
+  mujoco.mj_fwdPosition(model, data)
+  found = np.linalg.norm(data.efc_J.reshape(-1, 3, 3)[0], axis=1)
+  at = data.contact.pos[0]
+  return not np.allclose(found, [1 - at[0] - at[1], at[0], at[1]], atol=1e-3)
+
+
+def make(model: int, data: int, flexes, flags: np.ndarray | None = None) -> Weights:
+  """Returns `Weights` of an mjModel and mjData.
+
+  Args:
+    model: address of the mjModel
+    data: address of the mjData
+    flexes: the flexes whose contacts get their weights
+    flags: where to report, see FLAG
+  """
+  mine = np.zeros(mjstruct.Model.from_address(model).nflex, np.int32)
+  mine[flexes] = 1
+  out = coupling.mujoco_arrays(model, data, Weights)
+  out.nv = mjstruct.Model.from_address(model).nv
+  out.wrong = are_wrong()
+  tissue, adr = _tissues(model, data)
+  out.tissue = wp.array(tissue, dtype=wp.float64, device="cpu", copy=False)
+  out.force_adr = wp.array(adr, dtype=int, device="cpu", copy=False)
+  out.memory = coupling.wrap(data, mjstruct.size(mjstruct.Data) // 8, wp.uint64)
+  out.mine = wp.array(mine, dtype=int, device="cpu")
+  flags = np.zeros(len(FLAG), np.int32) if flags is None else flags
+  out.flags = wp.array(flags, dtype=int, device="cpu", copy=False)
+  return out
+
+
+def _tissues(model: int, data: int) -> tuple[np.ndarray, np.ndarray]:
+  """Returns what the organs of an mjData tell of its flexes and their vertices."""
+  m = mjstruct.Model.from_address(model)
+  found = _tissue.get(data)
+  if found is None or (len(found[0]), len(found[1])) != (m.nflex, m.nflexvert):
+    found = np.zeros((m.nflex, len(TISSUE))), np.full(m.nflexvert, -1, np.int32)
+    _tissue[data] = found
+  return found
+
+
+def tell(w, model: int):
+  """Tells contacts with an organ what its tissue is like, and where its contact forces are."""
+  m, organ = mjstruct.Model.from_address(model), w.organ
+  found, adr = _tissues(model, w.data)
+  start = int(mjstruct.view(m.plugin_stateadr, m.nplugin, np.int32)[w.instance])
+  start += coupling.spans(organ)["force"].start
+  first = mjstruct.view(m.flex_vertadr, m.nflex, np.int32)
+  if organ.windows:
+    for k, flex in enumerate(organ.windows.flex):
+      slot = np.arange(*organ.windows.adr[k : k + 2])
+      adr[first[flex] + slot - slot[0]] = start + 3 * slot
+  else:
+    n = coupling.outer(organ)
+    own = organ.dofadr[:n] >= 0
+    adr[first[organ.flex] : first[organ.flex] + n] = np.where(own, start + organ.stateadr[:n], -1)
+  found[organ.flexes] = tissue_of(m, organ, w.config)
+
+
+def forget(data: int):
+  """Forgets what organs have told of an mjData that is freed."""
+  _tissue.pop(data, None)
+
+
+def tissue_of(m, organ, config: Config | None = None) -> np.ndarray:
+  """Returns TISSUE of an organ, as compiled or with another configuration.
+
+  Its compliance is that of an elastic half space, a membrane with bending (Winkler's plate under a
+  point) and a foundation, side by side.
+
+  Args:
+    m: the model's struct
+    organ: the organ's declaration
+    config: its configuration, or None for the declared one
+  """
+  config, h = config or organ.config, float(m.opt.timestep)
+  outside, plane, young = capsule(config), 1 - config.poisson**2, float(np.mean(config.young))
+  bare = young / plane if config.elements == "solid" else 0.0
+  skin = float(np.mean(outside.young)) * outside.thickness / plane
+  stretch = {"spring": config.stiffness, "solid": 0.0}.get(outside.elements, skin)
+  bend = float(rigidity(outside, np.size(outside.young)).mean())
+  corner = organ.mesh.rest[organ.mesh.elem]
+  edge = np.linalg.norm(corner - corner[:, [1, 2, 0]], axis=2).mean()
+  below = config.foundation
+  stiffness = bare * edge + stretch + 8 * np.sqrt(bend * below) + below * edge**2
+  mass = organ.mass[organ.free]
+  softer = max(1.0, (h / LONG) ** 2) * max(1.0, h**2 * stiffness / (STIFF * mass.mean()))
+  share = softer * SOFT / mass.sum() * (1.0 if bare else SKIN)
+  asked = FIRM / (stiffness * (SLOW * h) ** 2)
+  stuck = min(1.0, max(STUCK, h / LONG))
+  return np.array([0.0 if stretch else bare, asked, share, stuck, not says(m, organ.flexes[0])])
+
+
+def says(m, flex: int) -> bool:
+  """Returns whether an organ says itself how firm the contacts of a flex are."""
+  solref = mjstruct.view(m.flex_solref, (m.nflex, 2))[flex]
+  solimp = mjstruct.view(m.flex_solimp, (m.nflex, 5))[flex]
+  given, usual = [*solref, *solimp], [*SOLREF, *SOLIMP, 0.5, 2]
+  return not (np.allclose(given, _USUAL, atol=1e-9) or np.allclose(given, usual, atol=1e-9))
+
+
+def launch(weights):
+  """Gives the contacts their weights, where MuJoCo's are wrong, and keeps sliding ones closed."""
+  weigh.launch("cpu", 1, 1, 0, weights)
+
+
+def project(model: int, data: int):
+  """Computes again what MuJoCo's dual solvers and exact diagonals need of the rows."""
+  safe_calls.run(mjstruct.library().mj_projectConstraint, model, data)

@@ -1,0 +1,94 @@
+"""Stress relaxation of an organ: what elastic forces leave behind; see `forces/relaxation.h`."""
+
+# Annotations here are objects, not text: no `from __future__ import annotations`.
+# pyright: reportInvalidTypeForm=false
+
+import numpy as np
+import warp as wp
+from palpate.tissue.config import Config
+from palpate.tissue.types import doubles, fill, floats, ints, scalar, struct, vector
+
+from .. import coupling
+from ..layout import FLAG, TAIL
+from .passive import Beside
+
+
+@struct
+class Clock:
+  """MuJoCo's own memory, under its own names."""
+
+  timestep: doubles(1)
+
+
+@struct
+class Creeping:
+  """The nodes of an organ whose stress relaxes, the moving ones."""
+
+  windowed: int  # whether the motion is in the plugin state
+  ncreep: int  # number of them
+  node: ints("ncreep")  # node of each
+  own: doubles("ncreep", 6)  # elastic force of the last step, and what has not faded of it [N]
+  held: int  # whether springs hold nodes
+  number: doubles(2)  # share that relaxes [-], time constant [s]
+  flags: ints(len(FLAG))  # see FLAG
+  tail: doubles(len(TAIL))  # see TAIL
+  hold: floats("nworld", "nholdslice", 6, 8)
+  mass: scalar
+  force_ext: vector
+  dvel: vector
+  sol: vector
+  rhs: vector
+  status: floats("nworld", 4)
+  mj: Clock
+
+
+_enter, _end = coupling.kernels("forces/relaxation.h", Creeping, "enter_creep", "end_creep")
+
+
+class Creep(Beside):
+  """Stress relaxation of a workspace's organ.
+
+  Args:
+    w: the workspace
+  """
+
+  ENTER, END = _enter, _end
+
+  def __init__(self, w):
+    super().__init__(w)
+    self._number = wp.zeros(2, dtype=wp.float64, device="cpu")
+    self.renumber(w.config)
+
+  def __bool__(self) -> bool:
+    return self._w.organ.config.relax_share > 0
+
+  def renumber(self, config: Config):
+    """Takes the numbers of a configuration that may change while running."""
+    self._number.numpy()[:] = config.relax_share, config.relax_time
+
+  def bind(self, model: int):
+    """See `Beside`."""
+    if not self:
+      return
+    w, organ = self._w, self._w.organ
+    sizes = coupling.sizes(organ)
+    values = dict(
+      held=int(bool(w.hold)),
+      hold=w.hold.array if w.hold else np.zeros((0, 0, 6, 8)),
+      windowed=int(organ.windows is not None),
+      ncreep=sizes["ncreep"],
+      node=w.body.shape.node.numpy()[np.flatnonzero(organ.free)],
+      own=self.rows("creep", 6),
+      number=self._number,
+      flags=wp.array(np.asarray(w.flags), dtype=int, device="cpu", copy=False),
+      tail=w.boxes["own"].tail if organ.windows else np.zeros(len(TAIL)),
+      mj=coupling.mujoco_arrays(model, w.data, Clock),
+    )
+    names = ("mass", "force_ext", "dvel", "sol", "rhs", "status")
+    self.fields = fill(Creeping, "cpu", values | {name: w.host[name] for name in names})
+
+  def carry(self, group: np.ndarray, member: np.ndarray, share: np.ndarray):
+    """See `Beside`."""
+    if self:
+      own, at = self.fields.own.numpy(), np.cumsum(self._w.organ.free) - 1
+      own[at[member]] = share[:, None] * own[at[group]]

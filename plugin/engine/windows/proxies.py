@@ -1,0 +1,241 @@
+"""Windows, the slots' side: what MuJoCo and a windowed organ share, on the CPU."""
+
+# Annotations here are objects, not text: no `from __future__ import annotations`.
+# pyright: reportInvalidTypeForm=false
+from typing import Any
+
+import numpy as np
+import warp as wp
+from palpate.tissue import step
+from palpate.tissue.kernels import aim
+from palpate.tissue.types import doubles, fill, flags, floats, ints, longs, struct
+
+from .. import coupling, mjstruct
+from ..coupling import Mujoco
+from ..layout import FLAG, Inbox, Outbox, WindowState
+
+# Nodes within this many mean edges of a tool may be in its window.
+_REACH = 4.0
+# An organ whose nodes move by less than this share of its size a second is at rest.
+SLOW = 1e-5
+# Mass and inertia of a slot on a pinned node, in masses of the organ: a wall to tools. The more it
+# is, the less care MuJoCo's solver takes of light ones.
+WALL = 1e3
+
+
+@struct
+class Slots:
+  """A windowed organ, its windows' slots and MuJoCo; see `declare.Windows`."""
+
+  nvert: int  # vertices
+  nslot: int  # slots of all windows
+  nwindow: int  # windows
+  nroom: int  # triangles, and walls that cuts may open
+  most: int  # candidates of a window that the outbox has room for
+  resident: int  # 1 if the motion stays on a device and the plugin state may be old
+  rest_share: wp.float64  # see `step.REST`
+  reach: wp.float64  # distance from a geom within which nodes may be in a window [m]
+  slow: wp.float64  # speed below which the organ counts as at rest [m/s]
+  longest: wp.float64  # longest edge [m]
+  radius: wp.float64  # of the windows' flexes [m]
+  skin: wp.float64  # distance of surface and geom at which MuJoCo finds a contact, at most [m]
+  weight: wp.float64  # mass of the organ [kg]
+  # The organ:
+  free: ints("nvert")  # whether a node moves; others are pinned
+  node_mass: doubles("nvert")  # mass, of pinned nodes that of a wall [kg]
+  rest: doubles("nvert", 3)  # rest position [m]
+  inertia: doubles("nvert")  # effective inertia, of pinned nodes that of a wall [kg]
+  touch: doubles("nvert")  # distance from a geom within which a node's triangles may touch it [m]
+  elem: ints("nroom", 3)  # nodes of a triangle
+  begin: ints("nvert")  # first of the triangles whose first corner a node is, -1 for none
+  following: ints("nroom")  # the next one with the same first corner, -1 for none
+  frame: doubles(3, 3)  # rotation from the organ's axes to the world's
+  origin: doubles(3)  # position of its frame [m]
+  heaviest: doubles(1)  # see `Workspace`
+  number: doubles("nnumber")  # see `NUMBERS`
+  flags: ints(len(FLAG))  # see FLAG
+  # The windows:
+  home: ints("nslot")  # default node of a slot, -1 for none
+  qhome: doubles("nslot", 3)  # qpos less rest position and displacement [m]
+  dofadr: ints("nslot")  # first dof of a slot
+  massadr: ints("nslot", 3)  # where M has the diagonals of its dofs
+  qposadr: ints("nslot")  # its first number in qpos
+  bodyid: ints("nslot")  # its body
+  window_adr: ints("nwindow + 1")  # first slot of a window
+  elem_adr: ints("nwindow")  # where its triangles start in flex_elem
+  elem_num: ints("nwindow")  # how many it can hold
+  geom_adr: ints("nwindow + 1")  # first geom of a window in `geom`
+  geom: ints("ngeom")  # geoms that the windows follow
+  # What changes:
+  placed: ints("nslot")  # node of a slot in the model, -1 for none
+  taken: ints("nvert")  # slot of a node, -1 for none
+  chosen: ints("nvert")  # scratch; 0 between steps
+  candidate: ints("nvert")  # scratch
+  distance: doubles("nvert")  # scratch
+  claim: ints("nvert")  # scratch; -1 between steps
+  left: ints("nslot")  # node that a slot has given up in this step, -1 for none
+  kept: doubles("nslot", 3)  # contact force before the slots are given anew [N]
+  lagged: doubles("nslot", 3)  # external and lagged contact force [N]
+  other: doubles("nslot", 3)  # what acted on a slot besides contacts and its weight [N]
+  own: WindowState
+  inbox: Inbox
+  foreseen: Inbox  # what the next step is expected to have
+  outbox: Outbox
+  status: floats("nworld", 4)  # see `State`
+  mj: Mujoco
+
+
+place, gather, scatter, leave, choose, foresee = coupling.kernels(
+  "coupling/proxies.h",
+  Slots,
+  *("place", "gather_slots", "scatter_slots", "leave_slots", "choose", "foresee"),
+)
+
+
+@struct
+class Reshaping:
+  """What slots have of vertices, and the mesh that they are to have."""
+
+  nvert: int
+  nelem: int
+  most: int  # neighbours that a vertex has room for
+  nchanged: int
+  radius: wp.float64  # see `Slots`
+  wall: wp.float64  # mass of pinned nodes [kg]
+  rest: doubles("nvert", 3)  # see `Slots`, these and what follows
+  touch: doubles("nvert")
+  node_mass: doubles("nvert")
+  free: ints("nvert")
+  elem: ints("nroom", 3)
+  begin: ints("nvert")
+  following: ints("nroom")
+  vert: longs("nchanged")  # vertices that something has changed at
+  mesh_rest: doubles("nvert", 3)  # see `Mesh`
+  mesh_elem: longs("nelem", 3)
+  ring: longs("nvert", "most")
+  mass: doubles("nvert")  # [kg]
+  near: flags("nvert")  # scratch; 0 between calls
+
+
+(_reshape,) = coupling.kernels("coupling/proxies.h", Reshaping, "reshape_slots")
+
+
+def scratch(nvert: int, nslot: int) -> dict[str, wp.array]:
+  """Returns the arrays of `Slots` that outlive a new recording."""
+  ints_of = {"placed": (nslot, -2), "taken": (nvert, -1), "chosen": (nvert, 0)}
+  ints_of |= {"candidate": (nvert, 0), "claim": (nvert, -1), "left": (nslot, -1)}
+  zeros = {"distance": nvert, "inertia": nvert, "kept": (nslot, 3), "other": (nslot, 3)}
+  return {
+    name: wp.full(count, value, dtype=int, device="cpu") for name, (count, value) in ints_of.items()
+  } | {name: wp.zeros(shape, dtype=wp.float64, device="cpu") for name, shape in zeros.items()}
+
+
+def make(w, model: int, sizes: dict[str, int]):
+  """Returns the slots of a workspace.
+
+  Args:
+    w: the workspace, with `boxes`, and what `scratch` gave in `views`
+    model: address of the mjModel
+    sizes: what the blocks of `layout` need
+  """
+  m = mjstruct.Model.from_address(model)
+  organ, win, mesh = w.organ, w.organ.windows, w.organ.mesh
+  lengths, longest = _edges(mesh)
+  radius = float(mjstruct.view(m.flex_radius, m.nflex)[win.flex].max())
+  margin = float(mjstruct.view(m.flex_margin, m.nflex)[win.flex].max())
+  margin += float(mjstruct.view(m.geom_margin, m.ngeom)[win.geom].max(initial=0.0))
+  room = max(mesh.whole.nelem, sizes["ncorner"])
+  values = w.boxes | {name: w.views[name] for name in scratch(0, 0)} | dict(
+    nvert=sizes["nvert"],
+    nslot=sizes["nslot"],
+    nwindow=sizes["nwindow"],
+    nroom=room,
+    most=sizes["most"],
+    resident=int(w.config.resident),
+    rest_share=step.REST,
+    reach=max(_REACH * float(lengths.mean()), float(longest.max())) + radius,
+    slow=SLOW * float(np.linalg.norm(np.ptp(mesh.rest, axis=0))),
+    longest=float(longest.max()),
+    radius=radius,
+    skin=radius + margin,
+    weight=float(win.mass.sum()),
+    free=organ.free,
+    node_mass=hold(organ, organ.mass),
+    rest=mesh.rest,
+    touch=longest + radius,
+    elem=np.zeros((room, 3)),
+    begin=np.full(mesh.nvert, -1),
+    following=np.full(room, -1),
+    frame=organ.frame,
+    origin=organ.origin,
+    heaviest=wp.array(w.heaviest, dtype=wp.float64, device="cpu", copy=False),
+    number=w.body.numbers,
+    flags=wp.array(np.asarray(w.flags), dtype=int, device="cpu", copy=False),
+    home=win.home,
+    qhome=win.qhome,
+    dofadr=win.dofadr,
+    massadr=coupling.mass_addresses(m, win.dofadr[:, None] + np.arange(3)),
+    qposadr=win.qposadr,
+    bodyid=win.body,
+    window_adr=win.adr,
+    elem_adr=win.elem_adr,
+    elem_num=win.elem_num,
+    geom_adr=win.geom_adr,
+    geom=win.geom,
+    lagged=w.lagged,
+    status=w.host["status"],
+    mj=coupling.mujoco_arrays(model, w.data),
+  )  # fmt: skip
+  return fill(Slots, "cpu", values)
+
+
+class Reshape:
+  """Gives slots the mesh and the masses that vertices have; triangles keep their number.
+
+  Args:
+    organ: the declaration
+    slots: of it
+  """
+
+  def __init__(self, organ, slots):
+    self._fields = fields = Reshaping()
+    mesh = organ.mesh
+    for name in ("rest", "touch", "node_mass", "free", "elem", "begin", "following", "radius"):
+      setattr(fields, name, getattr(slots, name))
+    fields.nvert, fields.most = mesh.nvert, mesh.ring.shape[1]
+    fields.wall = WALL * float(organ.windows.mass.sum())
+    fields.near = wp.zeros(mesh.nvert, dtype=wp.uint8, device="cpu")
+    self._launch = _reshape.command(fields).launch
+    self.put(organ, np.arange(mesh.nvert))
+
+  def put(self, organ, vert: np.ndarray):
+    """Gives the slots what the organ has at vertices that something has changed at."""
+    mesh, fields = organ.mesh, self._fields
+    fields.nelem, fields.nchanged = mesh.nelem, len(vert)
+    whole = {"vert": vert, "mesh_elem": mesh.elem, "ring": mesh.ring}
+    whole = {name: np.ascontiguousarray(each, np.int64) for name, each in whole.items()}
+    aim(fields, mesh_rest=mesh.rest, mass=organ.mass, **whole)
+    self._launch()
+
+
+def hold(organ, inertia: np.ndarray, vert: Any = slice(None)) -> np.ndarray:
+  """Returns the inertia of nodes, with that of a wall for pinned ones [kg]."""
+  return np.where(organ.free[vert], inertia, WALL * organ.windows.mass.sum())
+
+
+def _edges(mesh) -> tuple[np.ndarray, np.ndarray]:
+  """Returns the lengths of the triangles' edges, (nelem, 3), and the longest one at each node.
+
+  A tool that touches a triangle is no farther from its corners than their longest edges.
+  """
+  edge = mesh.rest[mesh.elem[:, [1, 2, 0]]] - mesh.rest[mesh.elem]
+  length = np.linalg.norm(edge, axis=2)
+  longest = np.zeros(mesh.nvert)
+  for corner in (mesh.elem, mesh.elem[:, [1, 2, 0]]):
+    np.maximum.at(longest, corner.ravel(), length.ravel())
+  return length, longest
+
+
+def launch(kernel, slots):
+  """Launches a kernel over all slots."""
+  kernel.launch("cpu", 1, 1, 0, slots)

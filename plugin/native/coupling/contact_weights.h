@@ -1,0 +1,187 @@
+// Contacts with triangles: a contact acts on the corners of a triangle by the barycentric weights of
+// where it is. MuJoCo 3.17 weighs them by inverse distance, as if the contact were at another point.
+// Its rows are made when this runs, their reference accelerations are not.
+//
+// Contacts that slide stay closed. MuJoCo's friction is convex: a sliding contact parts, by its
+// friction times how fast it is braked. On light nodes that lifts a tool off within a step, and the
+// force flickers.
+#pragma once
+#include "coupling/contact_stiffness.h"
+
+namespace palpate {
+
+// Where a triangle lies under the flat end of a cylinder: the middle of that part, weighed by how deep
+// it is, as barycentric weights; its gap; and the axis out of that end. MuJoCo names the deepest point,
+// which jumps from corner to corner where a tool lies flat, and at times a way out that is longer.
+template <class Fields>
+PALPATE bool under_end(const Fields& f, int geom, double radius, const D3* x, D3& w, double& gap, D3& out) {
+  if (geom < 0 || f.geom_type.data[geom] != GEOM_IS_CYLINDER) return false;
+  const double* R = f.geom_xmat.data + 9 * geom;
+  const double* size = f.geom_size.data + 3 * geom;
+  D3 r[3], sum = {0.0, 0.0, 0.0};
+  for (int k = 0; k < 3; ++k) r[k] = x[k] - load(f.geom_xpos.data + 3 * geom);
+  out = {R[2], R[5], R[8]};
+  const D3 across = cross(r[1] - r[0], r[2] - r[0]);
+  if (fabs(dot(across, out)) < LEVEL * norm(across)) return false;
+  if (dot(r[0] + r[1] + r[2], out) < 0.0) out = -1.0 * out;
+  const double slack = SLACK * size[0];
+  double total = 0.0, covered = 0.0;
+  for (int i = 0; i < POINTS; ++i) {
+    for (int j = 0; i + j < POINTS; ++j) {
+      const double u = (i + 1.0 / 3.0) / POINTS, v = (j + 1.0 / 3.0) / POINTS;
+      const D3 at = blend(r, {1.0 - u - v, u, v});
+      const double high = dot(at, out), depth = size[1] + radius - high;
+      const double inside = (size[0] + radius - norm(at - high * out) - depth) / (RIM * size[0]);
+      if (!(depth > -slack && inside > 0.0)) continue;
+      const double part = inside < 1.0 ? inside : 1.0, counts = (depth + slack) * part;
+      covered += part;
+      sum += counts * D3{1.0 - u - v, u, v};
+      total += counts;
+    }
+  }
+  if (!(total > 0.0)) return false;
+  w = (1.0 / total) * sum;
+  gap = dot(blend(r, w), out) - size[1] - radius;
+  covered /= 0.5 * POINTS * (POINTS + 1) * COVER;
+  if (covered < 1.0) gap *= covered;
+  return true;
+}
+
+// Gives a contact another place, normal and gap, and the side of it that is a geom its columns.
+template <class Fields>
+PALPATE void put(const Fields& f, char* contact, Rows rows, int side, D3 pos, D3 normal, double gap) {
+  double* frame = (double*)(contact + CONTACT_FRAME);
+  const D3 other = fabs(normal.x) < 0.5 ? D3{1.0, 0.0, 0.0} : D3{0.0, 1.0, 0.0};
+  D3 tangent = cross(normal, other);
+  tangent = (1.0 / norm(tangent)) * tangent;
+  store(frame, normal);
+  store(frame + 3, tangent);
+  store(frame + 6, cross(normal, tangent));
+  store(pos_of(contact), pos);
+  *(double*)(contact + CONTACT_DIST) = gap;
+  double* efc_pos = datum<double*>(f, DATA_EFC_POS) + rows.first;
+  for (int r = 0; r < rows.normals().count; ++r) efc_pos[r] = gap;
+  int body = f.geom_bodyid.data[side_of(contact, CONTACT_GEOM, side)];
+  pos = pos - load(f.subtree_com.data + 3 * f.body_rootid.data[body]);
+  while (body > 0 && !f.body_dofnum.data[body]) body = f.body_parentid.data[body];
+  int dof = body ? f.body_dofadr.data[body] + f.body_dofnum.data[body] - 1 : -1;
+  for (; dof >= 0; dof = f.dof_parentid.data[dof]) {
+    const D3 turns = load(f.cdof.data + 6 * dof), moves = load(f.cdof.data + 6 * dof + 3) + cross(turns, pos);
+    for (int r = 0; r < rows.count; ++r) {
+      const Axis axis = axis_of(contact, rows, r);
+      double* a = column(f, rows.first + r, dof);
+      if (a) *a = (side ? 1.0 : -1.0) * (dot(axis.along, moves) + dot(axis.about, turns));
+    }
+  }
+}
+
+// Gives the corners of the triangle on one side of a contact their weights.
+template <class Fields>
+PALPATE void weigh_side(const Fields& f, char* contact, Rows rows, int side) {
+  const int flex = side_of(contact, CONTACT_FLEX, side), elem = side_of(contact, CONTACT_ELEM, side);
+  if (flex < 0 || elem < 0 || !f.mine.data[flex]) return;
+  const int start = f.flex_vertadr.data[flex], other = side_of(contact, CONTACT_VERT, 1 - side);
+  const int* e = f.flex_elem.data + f.flex_elemdataadr.data[flex] + 3 * elem;
+  D3 x[3];
+  for (int k = 0; k < 3; ++k) {
+    if (e[k] == other) return;  // MuJoCo leaves that corner out
+    x[k] = load(f.flexvert_xpos.data + 3 * (start + e[k]));
+  }
+  D3 w, out;
+  double gap;
+  if (under_end(f, side_of(contact, CONTACT_GEOM, 1 - side), f.flex_radius.data[flex], x, w, gap, out))
+    put(f, contact, rows, 1 - side, blend(x, w) - (f.flex_radius.data[flex] + 0.5 * gap) * out,
+        side ? out : -1.0 * out, gap);
+  else if (!f.wrong)
+    return;
+  else
+    w = barycentric(load(pos_of(contact)), x);
+  const double before = inverse_inertia(f, contact, rows, 1 - side);
+  double from = before, to = before;
+  const double right[3] = {w.x, w.y, w.z};
+  for (int k = 0; k < 3; ++k) {
+    const int body = f.flex_vertbodyid.data[start + e[k]];
+    if (!columns(f, rows.first, body)) continue;
+    from += weight_of(f, rows, body, 0.0) * f.body_invweight0.data[2 * body];
+    to += right[k] * f.body_invweight0.data[2 * body];
+    const double* slides = f.cdof.data + 6 * f.body_dofadr.data[body] + 3;
+    for (int r = 0; r < rows.count; ++r) {
+      const D3 along = (side ? right[k] : -right[k]) * axis_of(contact, rows, r).along;
+      store(columns(f, rows.first + r, body),
+            {dot(along, load(slides)), dot(along, load(slides + 6)), dot(along, load(slides + 12))});
+    }
+  }
+  if (from > 0.0 && to > 0.0) scale_impedance(f, rows, to / from);
+}
+
+// How fast MuJoCo brakes what slides at a contact, times friction [m/s^2]: with D the damping of a
+// row, |D mu v| over the directions in the contact's plane. The rows of a pyramid, n + mu t and
+// n - mu t, part by less where they share it.
+template <class Fields>
+PALPATE double parting(const Fields& f, const char* contact, Rows rows) {
+  const double* friction = (const double*)(contact + CONTACT_FRICTION);
+  double sum = 0.0;
+  for (int r = rows.first + !rows.paired; r < rows.first + rows.count; r += 1 + rows.paired) {
+    const double damping = datum<double*>(f, DATA_EFC_KBIP)[4 * r + 1];
+    const double v = rows.paired ? 0.5 * (velocity(f, r) - velocity(f, r + 1))
+                                 : friction[r - rows.first - 1] * velocity(f, r);
+    sum += damping * v * damping * v;
+  }
+  return sqrt(sum);
+}
+
+// Moves the contact's gap by as much as takes that parting away: sliding then has the gap, and the
+// force, of standing (de Saxce and Feng 1998, doi:10.1016/S0895-7177(98)00119-8, with the velocity
+// that the step begins with). Done twice it does nothing.
+template <class Fields>
+PALPATE void keep_closed(const Fields& f, const char* contact, Rows rows) {
+  if (rows.count < 2) return;
+  const double* row = datum<double*>(f, DATA_EFC_KBIP) + 4 * rows.first;
+  const double stiffness = row[0] * row[2];
+  if (!(stiffness > 0.0)) return;
+  const double gap = *(const double*)(contact + CONTACT_DIST) + parting(f, contact, rows) / stiffness;
+  for (int r = 0; r < rows.normals().count; ++r) datum<double*>(f, DATA_EFC_POS)[rows.first + r] = gap;
+}
+
+// Whether one of the two sides of a contact is an organ's.
+template <class Fields>
+PALPATE bool is_mine(const Fields& f, const char* contact) {
+  for (int side = 0; side < 2; ++side) {
+    const int flex = side_of(contact, CONTACT_FLEX, side);
+    if (flex >= 0 && f.mine.data[flex]) return true;
+  }
+  return false;
+}
+
+// Gives contacts with an organ their rows, and flags that what MuJoCo has computed of them for its dual
+// solvers has to be computed again. Done twice it does nothing.
+template <class Fields>
+PALPATE void weigh(const Fields& f, Thread, int) {
+  bool touched = false;
+  Touch last = {-1, -1, 0};
+  double least = 0.0;
+  int count = 0;
+  char* const contacts = datum<char*>(f, DATA_CONTACT);
+  const int ncon = datum<int>(f, DATA_NEFC) > 0 ? datum<int>(f, DATA_NCON) : 0;
+  for (int c = 0; c < ncon; ++c) {
+    char* contact = contacts + (size_t)CONTACT_LENGTH * c;
+    const Rows rows = is_mine(f, contact) ? rows_of(f, contact) : Rows{0, 0, false};
+    if (!rows.count) continue;
+    touched = true;
+    for (int side = 0; side < 2; ++side)
+      weigh_side(f, contact, rows, side);
+    const Touch touch = touch_of(f, contact);
+    if (touch.geom >= 0) {
+      if (!(touch == last)) least = unresolved(f, contacts, ncon, touch);
+      if (touch.flex != last.flex) count = count_of(contacts, ncon, touch.flex);
+      firm_up(f, contact, rows, touch, count, least);
+      last = touch;
+    }
+    keep_closed(f, contact, rows);
+  }
+  const bool projects = f.solver.data[0] == SOLVER_PGS || f.noslip_iterations.data[0] > 0 ||
+                        (f.enableflags.data[0] & ENABLE_DIAGEXACT);
+  f.flags.data[FLAG_WEIGHED] = touched && projects;
+}
+
+}  // namespace palpate

@@ -1,0 +1,364 @@
+// Batches: one organ in many worlds beside mujoco_warp, whose dofs of it are its slots: bodies that
+// stand on the nodes nearest to the tools, chosen anew in each step. A thread has a node or a slot.
+//
+// The coupling is that of `formula.h`. Slots move along the world's axes and their bodies have no
+// place of their own, so qpos is where they are; vectors of nodes are in the organ's frame.
+//
+// An organ that has been at rest for QUIET, with no tool so near that a node may get a slot, sleeps:
+// its step has no length until one comes, or something of the world changes.
+#pragma once
+#include "coupling/node.h"
+#include "core/geom.h"
+
+namespace palpate {
+
+// Where a slot waits that no node has [m], and its inertia then [kg].
+constexpr float WAITING = 1e3f, IDLE = 1.0f;
+
+// Three floats of mujoco_warp's, as doubles.
+PALPATE D3 load_floats(const float* p) { return {p[0], p[1], p[2]}; }
+PALPATE void store_floats(float* p, D3 a) {
+  p[0] = (float)a.x;
+  p[1] = (float)a.y;
+  p[2] = (float)a.z;
+}
+// R^T x.
+PALPATE D3 turned_back(const double* R, D3 x) { return add_turned({0.0, 0.0, 0.0}, R, x); }
+
+// Where node i of a world starts in a vector of slices, and in one a node after the other.
+template <class Fields>
+PALPATE size_t at_node(const Fields& f, int world, int i) {
+  return 24 * (size_t)world * f.nslice + offset_of(i);
+}
+template <class Fields>
+PALPATE size_t in_row(const Fields& f, int world, int i) {
+  return (size_t)world * f.nnode + i;
+}
+template <class Fields>
+PALPATE int slot_dof(const Fields& f, int world, int slot) {
+  return world * f.nv + f.dofadr + 3 * slot;
+}
+// What a world's mesh has, of an array with a row a mesh.
+template <class Array>
+PALPATE auto of_mesh(const Array& a, int mesh) -> decltype(a.data) {
+  return (decltype(a.data))((char*)a.data + (size_t)mesh * a.strides[0]);
+}
+// What a node was before cuts, its part of that, and where it is at rest.
+template <class Fields>
+PALPATE int source_of(const Fields& f, int world, int i) {
+  return of_mesh(f.source, f.mesh.data[world])[i];
+}
+template <class Fields>
+PALPATE double share_of(const Fields& f, int world, int i) {
+  return of_mesh(f.share, f.mesh.data[world])[i];
+}
+template <class Fields>
+PALPATE D3 at_rest(const Fields& f, int world, int i) {
+  return load(of_mesh(f.rest, f.mesh.data[world]) + 3 * i);
+}
+template <class Fields>
+PALPATE double mass_of(const Fields& f, int world, int i) {
+  return share_of(f, world, i) * f.mass.data[source_of(f, world, i)];
+}
+template <class Fields>
+PALPATE D3 gravity(const Fields& f, int world) {
+  return load_floats((const float*)f.gravity.data + (f.ngravity > 1 ? 3 * world : 0));
+}
+template <class Fields>
+PALPATE bool succeeded(const Fields& f, int world) {
+  return f.solve.status.data[4 * world + 3] == 0.0f;
+}
+
+// Whether a world's organ would sleep if no tool were near, and whether it does, known once `rank` has
+// run.
+template <class Fields>
+PALPATE bool is_calm(const Fields& f, int world) {
+  return f.sleeps && f.calm.data[world] >= QUIET;
+}
+template <class Fields>
+PALPATE bool sleeps(const Fields& f, int world) {
+  return f.solve.step.data[4 * world] == 0.0f;
+}
+
+// The inertia that a tool meets at a node, which follows the scales of Young's modulus and of mass.
+template <class Fields>
+PALPATE double inertia_of(const Fields& f, int world, int i) {
+  float grade = f.grade.data[world];
+  const int source = source_of(f, world, i);
+  if (f.lump.data) grade += log2f(f.lump.data[in_row(f, world, source)]);
+  const float last = (float)(f.ngrade - 1);
+  grade = grade < 0.0f ? 0.0f : grade > last ? last : grade;
+  const int k = (int)grade < f.ngrade - 1 ? (int)grade : f.ngrade - 2;
+  const double t = grade - k, low = f.inertia.data[k * f.nnode + source];
+  const double more = t * (f.inertia.data[(k + 1) * f.nnode + source] - low);
+  const double total = f.mass_scale.data[world] * share_of(f, world, i) * (low + more);
+  const D3 force = load_floats(f.force.data + 3 * in_row(f, world, i));
+  return touched(force) && f.heavier.data[world] > 1.0 ? f.heavier.data[world] * total : total;
+}
+
+// Writes where the tools are, in the organ's frame, and how long the organ has been at rest.
+template <class Fields>
+PALPATE void tell_tools(const Fields& f, Thread t, int) {
+  if (t.tid == 0) {
+    f.count.data[t.world] = f.missed.data[t.world] = 0;
+    f.calm.data[t.world] = f.stirred.data[t.world] ? 0.0 : f.calm.data[t.world] + f.h;
+    f.stirred.data[t.world] = 0;
+  }
+  each_item(t, f.ntool, [&](int q) {
+    const size_t g = (size_t)t.world * f.ngeom + f.tool_geom.data[q];
+    const float* R = (const float*)f.geom_xmat.data + 9 * g;
+    const D3 from = load_floats((const float*)f.geom_xpos.data + 3 * g) - load(f.origin.data);
+    double* tool = f.tool.data + (size_t)GEOM_LENGTH * (t.world * f.ntool + q);
+    store(tool + GEOM_POS, turned_back(f.frame.data, from));
+    for (int a = 0; a < 3; ++a)
+      store(tool + GEOM_AXIS + 3 * a, turned_back(f.frame.data, {R[a], R[3 + a], R[6 + a]}));
+  });
+}
+
+// Fills the solver's input, and lists the nodes that a tool may touch.
+template <class Fields>
+PALPATE void enter_worlds(const Fields& f, Thread t, int) {
+  const int w = t.world;
+  const double h = f.h, masses = f.mass_scale.data[w];
+  if (t.tid == 0) {
+    float* step = f.solve.step.data + 4 * w;
+    const double still = f.rest_share * 9.81 * h;
+    step[0] = (float)h;
+    step[1] = (float)weight_of_stiffness(h, numbers(f, w)[DAMPING], numbers(f, w)[EASED]);
+    step[2] = (float)(masses * f.weight * still * still);
+  }
+  const D3 g = turned_back(f.frame.data, gravity(f, w));
+  const double* tool = f.tool.data + (size_t)GEOM_LENGTH * w * f.ntool;
+  each_item(t, f.nnode, [&](int i) {
+    const size_t at = at_node(f, w, i);
+    const D3 last = load_lane(f.last.data + at), before = load_lane(f.before.data + at);
+    const D3 contact = load_floats(f.force.data + 3 * in_row(f, w, i));
+    store_lane(f.solve.dvel_warm.data + at, forecast(last, before));
+    store_lane(f.solve.force_ext.data + at, (masses * mass_of(f, w, i)) * g + contact);
+    f.node_slot.data[in_row(f, w, i)] = -1;
+    const D3 x = at_rest(f, w, i) + load_lane(f.solve.disp.data + at);
+    const double far = nearest(tool, f.ntool, x);
+    if (far > of_mesh(f.touch, f.mesh.data[w])[i]) return;
+    const int q = append(f.count.data + w);
+    if (q >= f.most) return;
+    f.candidate.data[w * f.most + q] = i;
+    f.distance.data[w * f.most + q] = (float)far;
+  });
+}
+
+template <class Fields>
+PALPATE int candidates(const Fields& f, int world) {
+  const int all = f.count.data[world];
+  return all < f.most ? all : f.most;
+}
+
+// Chooses the candidates nearest to the tools; the order of nodes decides between equals. Those that
+// touch and get no slot are counted. An organ without candidates may sleep.
+template <class Fields>
+PALPATE void rank(const Fields& f, Thread t, int) {
+  const int n = candidates(f, t.world);
+  if (t.tid == 0 && n > 0) f.calm.data[t.world] = 0.0;
+  if (t.tid == 0 && is_calm(f, t.world)) f.solve.step.data[4 * t.world] = 0.0f;
+  const int* node = f.candidate.data + t.world * f.most;
+  const float* far = f.distance.data + t.world * f.most;
+  each_item(t, n, [&](int q) {
+    int nearer = 0;
+    for (int p = 0; p < n; ++p)
+      nearer += far[p] < far[q] || (far[p] == far[q] && node[p] < node[q]);
+    f.chosen.data[t.world * f.most + q] = nearer < f.nslot;
+    if (nearer >= f.nslot && far[q] < f.skin) append(f.missed.data + t.world);
+  });
+}
+
+// Lets a slot wait where no tool is.
+template <class Fields>
+PALPATE void wait(const Fields& f, int world, int slot) {
+  const int adr = slot_dof(f, world, slot);
+  f.slot_node.data[world * f.nslot + slot] = -1;
+  store_floats(f.qpos.data + (size_t)world * f.nq + f.qposadr + 3 * slot, {0.0, 0.0, WAITING});
+  store_floats(f.qvel.data + adr, {0.0, 0.0, 0.0});
+  store_floats(f.dof_armature.data + adr, {IDLE, IDLE, IDLE});
+}
+
+// Puts a slot on a node, with its motion and effective inertia.
+template <class Fields>
+PALPATE void stand_on(const Fields& f, int world, int slot, int i) {
+  const int adr = slot_dof(f, world, slot);
+  const size_t at = at_node(f, world, i);
+  f.slot_node.data[world * f.nslot + slot] = i;
+  f.node_slot.data[in_row(f, world, i)] = slot;
+  const D3 x = at_rest(f, world, i) + load_lane(f.solve.disp.data + at);
+  const D3 v = load_lane(f.solve.vel.data + at);
+  store_floats(f.qpos.data + (size_t)world * f.nq + f.qposadr + 3 * slot,
+               load(f.origin.data) + turned(f.frame.data, x));
+  store_floats(f.qvel.data + adr, turned(f.frame.data, v));
+  const double more = inertia_of(f, world, i) - f.slot_mass;
+  store_floats(f.dof_armature.data + adr, {more, more, more});
+  float* inverse = (float*)f.body_invweight0.data + 2 * (world * f.nbody + f.bodyid + slot);
+  inverse[0] = (float)(1.0 / (f.mass_scale.data[world] * of_mesh(f.held, f.mesh.data[world])[i]));
+}
+
+// Gives the slots to the chosen nodes, in their order.
+template <class Fields>
+PALPATE void stand(const Fields& f, Thread t, int) {
+  const int n = candidates(f, t.world), used = n < f.nslot ? n : f.nslot;
+  const int* node = f.candidate.data + t.world * f.most;
+  const int* chosen = f.chosen.data + t.world * f.most;
+  each_item(t, n, [&](int q) {
+    if (!chosen[q]) return;
+    int slot = 0;
+    for (int p = 0; p < n; ++p) slot += chosen[p] && node[p] < node[q];
+    stand_on(f, t.world, slot, node[q]);
+  });
+  each_item(t, f.nslot, [&](int k) {
+    if (k >= used) wait(f, t.world, k);
+  });
+}
+
+// Adds the passive force that carries v + dv to the slots' dofs.
+template <class Fields>
+PALPATE void push_worlds(const Fields& f, Thread t, int) {
+  const D3 weight = f.slot_mass * gravity(f, t.world);
+  each_item(t, f.nslot, [&](int k) {
+    const int adr = slot_dof(f, t.world, k), i = f.slot_node.data[t.world * f.nslot + k];
+    D3 rate = {0.0, 0.0, 0.0}, contact = rate;
+    if (i >= 0) {
+      const double Mhat = f.slot_mass + f.dof_armature.data[adr];
+      const D3 dv = load_lane(f.solve.dvel.data + at_node(f, t.world, i));
+      if (succeeded(f, t.world)) rate = (Mhat / f.h) * turned(f.frame.data, dv);
+      contact = turned(f.frame.data, load_floats(f.force.data + 3 * in_row(f, t.world, i)));
+    }
+    store_floats(f.qfrc_passive.data + adr, passive(rate, contact + weight));
+  });
+}
+
+// The contact force on a slot's node that MuJoCo found.
+template <class Fields>
+PALPATE D3 contact_now(const Fields& f, int world, int slot, int i) {
+  const D3 found = load_floats(f.qfrc_constraint.data + slot_dof(f, world, slot));
+  return f.free.data[i] ? turned_back(f.frame.data, found) : D3{0.0, 0.0, 0.0};
+}
+
+// Takes the contact forces that MuJoCo found; where the organ answers, the impulses by which they
+// changed go to the solver's right-hand side, which is zero.
+template <class Fields>
+PALPATE void take(const Fields& f, Thread t, int) {
+  each_item(t, f.nslot, [&](int k) {
+    const int i = f.slot_node.data[t.world * f.nslot + k];
+    if (i < 0) return;
+    const D3 now = contact_now(f, t.world, k, i);
+    store_floats(f.found.data + 3 * (t.world * f.nslot + k), now);
+    if (!f.stiff) return;
+    const D3 change = now - load_floats(f.force.data + 3 * in_row(f, t.world, i));
+    store_lane(f.solve.rhs.data + at_node(f, t.world, i), (double)f.h * change);
+  });
+  if (t.tid > 0 || !f.stiff) return;
+  Expected expected;
+  for (int k = 0; k < f.nslot; ++k) {
+    const int i = f.slot_node.data[t.world * f.nslot + k];
+    if (i < 0) continue;
+    const D3 now = contact_now(f, t.world, k, i);
+    const D3 was = load_floats(f.force.data + 3 * in_row(f, t.world, i));
+    const double Mhat = f.slot_mass + f.dof_armature.data[slot_dof(f, t.world, k)];
+    expected.add((double)f.h * (now - was), Mhat, was, now);
+  }
+  f.solve.expected.data[t.world] = expected.value();
+}
+
+// Follows the organ's answer with the contact forces, and with the inertia that tools meet.
+template <class Fields>
+PALPATE void follow(const Fields& f, Thread t, int) {
+  if (t.tid > 0) return;
+  Secant secant;
+  const double ratio = f.solve.ratio.data[t.world];
+  for (int k = 0; k < f.nslot; ++k) {
+    const int i = f.slot_node.data[t.world * f.nslot + k];
+    if (i < 0) continue;
+    float* found = f.found.data + 3 * (t.world * f.nslot + k);
+    const D3 now = load_floats(found), was = load_floats(f.force.data + 3 * in_row(f, t.world, i));
+    secant.add(now - was, norm(now));
+    store_floats(found, relaxed(was, now, ratio));
+  }
+  double* heavier = f.heavier.data + t.world;
+  *heavier = secant.heavier(*heavier > 1.0 ? *heavier : 1.0, f.heaviest, ratio);
+}
+
+// Ends the step.
+template <class Fields>
+PALPATE void commit_worlds(const Fields& f, Thread t, int) {
+  const int w = t.world;
+  const double ok = succeeded(f, w) ? 1.0 : 0.0, h = f.h;
+  if (t.tid == 0) {
+    const int crowd = f.count.data[w] - f.most, missed = f.missed.data[w] + (crowd > 0 ? crowd : 0);
+    if (missed > f.overflow.data[w]) f.overflow.data[w] = missed;
+  }
+  const bool asleep = sleeps(f, w);
+  if (asleep && f.calm.data[w] > QUIET + h) return;  // it stands still already
+  each_item(t, f.nnode, [&](int i) {
+    if (!f.free.data[i]) return;
+    const size_t at = at_node(f, w, i);
+    const int slot = f.node_slot.data[in_row(f, w, i)];
+    D3 dv = load_lane(f.solve.dvel.data + at), now = {0.0, 0.0, 0.0};
+    if (f.stiff) dv += load_lane(f.solve.sol.data + at);
+    dv = ok * dv;
+    D3 v = load_lane(f.solve.vel.data + at) + dv;
+    if (asleep) v = dv = now;
+    if (slot >= 0) {
+      now = load_floats(f.found.data + 3 * (w * f.nslot + slot));
+      if (!f.stiff)
+        v = turned_back(f.frame.data, load_floats(f.qvel.data + slot_dof(f, w, slot)));
+    }
+    store_lane(f.solve.disp.data + at, load_lane(f.solve.disp.data + at) + h * v);
+    store_lane(f.solve.vel.data + at, v);
+    store_lane(f.before.data + at, asleep ? now : load_lane(f.last.data + at));
+    store_lane(f.last.data + at, dv);
+    store_floats(f.force.data + 3 * in_row(f, w, i), now);
+    if (touched(now) || dot(v, v) > f.slow * f.slow) f.stirred.data[w] = 1;
+  });
+}
+
+// Flags the worlds with numbers that are not finite, or huge.
+template <class Fields>
+PALPATE void find_bad(const Fields& f, Thread t, int) {
+  const float most = 1e6f;
+  bool bad = false;
+  each_item(t, f.nnode, [&](int i) {
+    const size_t at = at_node(f, t.world, i);
+    const D3 u = vabs(load_lane(f.solve.disp.data + at));
+    const D3 v = vabs(load_lane(f.solve.vel.data + at));
+    bad = bad || !(u.x < most && u.y < most && u.z < most && v.x < most && v.y < most && v.z < most);
+  });
+  each_item(t, f.nq, [&](int k) { bad = bad || !(fabs(f.qpos.data[t.world * f.nq + k]) < 1e10f); });
+  each_item(t, f.nv, [&](int k) { bad = bad || !(fabs(f.qvel.data[t.world * f.nv + k]) < 1e10f); });
+  if (bad) f.bad.data[t.world] = 1;
+}
+
+// The mass that the solve has of a node: nodes that wait for a cut have none.
+PALPATE float solved(double mass) { return mass > 0.0 ? (float)mass : 1.0f; }
+
+// Puts the organ of the worlds of a mask where it starts.
+template <class Fields>
+PALPATE void rest_organ(const Fields& f, Thread t, int) {
+  const int w = t.world;
+  if (!f.mask.data[w]) return;
+  if (t.tid == 0) {
+    f.heavier.data[w] = f.heavier0.data[0];
+    f.calm.data[w] = f.calm0.data[0];
+    f.stirred.data[w] = 0;
+  }
+  const bool heals = f.mesh.data[w] != 0;
+  each_item(t, f.nnode, [&](int i) {
+    const size_t at = at_node(f, w, i);
+    const int from = offset_of(i);
+    store_lane(f.solve.disp.data + at, load_lane(f.disp0.data + from));
+    store_lane(f.solve.vel.data + at, load_lane(f.vel0.data + from));
+    store_lane(f.last.data + at, load_lane(f.last0.data + from));
+    store_lane(f.before.data + at, load_lane(f.before0.data + from));
+    store_lane(f.solve.dvel.data + at, {0.0, 0.0, 0.0});
+    store_floats(f.force.data + 3 * in_row(f, w, i), load_floats(f.force0.data + 3 * i));
+    if (heals) f.solve.mass.data[in_row(f, w, i)] = solved(f.mass_scale.data[w] * f.mass.data[i]);
+  });
+  each_item(t, f.nslot, [&](int k) { wait(f, w, k); });
+}
+
+}  // namespace palpate

@@ -1,0 +1,308 @@
+// What is around a cut in a solid goes on with no more energy than it had.
+//
+// Means over nodes are finer where a node has become two, and by convexity have no less energy at the same
+// positions. So where a cut has raised the energy, what came apart gives way along its forces by as little as
+// puts that right: some hundredths of an edge. Masses go with the tissue, from which what was moved at rest
+// has another part then. Velocities keep momentum and angular momentum, and as much of what they have besides
+// as the energy allows.
+#pragma once
+#include "tissue/neohookean.h"
+#include "core/rotation.h"
+
+namespace palpate {
+
+constexpr int CONJUGATE = 60, SEARCHES = 4;
+constexpr int TURNS = 8;  // each with a ring of tetrahedra more
+constexpr double EVEN = 1e-9;  // of the kinetic energy, that counts as none
+constexpr double AMPLE = 1.001;  // times what is wanted that is asked for
+constexpr double FARTHEST = 4.0;  // times the way of a vertex that gives way alone
+
+// The part of a solid whose energy a cut changes: tetrahedra that are not the same after it, their vertices, and
+// the tetrahedra around these. By place in `vert`: volume, moduli of the means, foundation, stress, force.
+struct Patch {
+  Few own, vert, around;
+  double *size, *mu, *lam, *held, *hard;
+  Rows *slope, *mean;  // of `around`, of `vert`
+  D3* force;
+};
+
+PALPATE Patch patch_of(Scratch& memory, int nvert, int ntet) {
+  Patch p = {few(memory, ntet), few(memory, nvert), few(memory, ntet)};
+  double** lists[] = {&p.size, &p.mu, &p.lam, &p.held, &p.hard};
+  for (int i = 0; i < 5; ++i) *lists[i] = memory.values(nvert);
+  p.slope = (Rows*)memory.values(9 * ntet), p.mean = (Rows*)memory.values(9 * nvert);
+  p.force = (D3*)memory.values(3 * nvert);
+  return p;
+}
+
+// Finds what is around its own tetrahedra in the mesh as it is.
+template <class S, class L>
+PALPATE void find_patch(const S& m, const Neohookean& e, const L* loose, double foundation, int ntriangle,
+                        Patch& p) {
+  p.vert.clear(), p.around.clear();
+  for (int i = 0; i < 4 * p.own.count; ++i) p.vert.put(m.vert(4 * p.own.list[i / 4] + i % 4));
+  p.vert.sort(m.nvert);
+  for (int i = 0; i < p.vert.count; ++i) {
+    p.size[i] = p.mu[i] = p.lam[i] = p.held[i] = 0.0;
+    m.each_corner(p.vert.list[i], [&](int corner) {
+      const int t = corner / 4;
+      D3 x[4];
+      m.corners(t, x);
+      const double volume = volume_of(x) / 4.0;
+      p.around.put(t);
+      p.size[i] += volume, p.mu[i] += volume * (1.0 - OWN_SHARE) * e.mu[t], p.lam[i] += volume * e.lam[t];
+    });
+    p.mu[i] /= p.size[i], p.lam[i] /= p.size[i];
+  }
+  for (int t = 0; t < ntriangle && foundation > 0.0; ++t) {
+    if (loose[t]) continue;
+    D3 x[3];
+    for (int c = 0; c < 3; ++c) x[c] = m.place((int)m.elem[3 * t + c]);
+    const double third = norm(cross(x[1] - x[0], x[2] - x[0])) / 6.0;
+    for (int c = 0; c < 3; ++c) {
+      const int k = p.vert.place[m.elem[3 * t + c]] - 1;
+      if (k >= 0) p.held[k] += foundation * third;
+    }
+  }
+}
+
+// The energy of a patch with a displacement of all vertices; leaves the gradients of it and their means.
+template <class S>
+PALPATE double strain_patch(const S& m, const Neohookean& e, const double* disp, Patch& p) {
+  double out = 0.0;
+  for (int i = 0; i < p.vert.count; ++i) p.mean[i] = {};
+  for (int i = 0; i < p.around.count; ++i) {
+    const int t = p.around.list[i];
+    D3 x[4], u[4], g[4];
+    m.corners(t, x);
+    for (int c = 0; c < 4; ++c) u[c] = load(disp + 3 * m.vert(4 * t + c));
+    const double volume = slopes_of(x, g);
+    p.slope[i] = gradient_of(u, g);
+    if (p.own.has(t)) out += volume * density_of(p.slope[i], OWN_SHARE * e.mu[t], 0.0);
+    for (int c = 0; c < 4; ++c) {
+      const int k = p.vert.place[m.vert(4 * t + c)] - 1;
+      if (k >= 0) add(p.mean[k], volume / (4.0 * p.size[k]), p.slope[i]);
+    }
+  }
+  for (int i = 0; i < p.vert.count; ++i) {
+    const D3 u = load(disp + 3 * p.vert.list[i]);
+    out += p.size[i] * density_of(p.mean[i], p.mu[i], p.lam[i]) + 0.5 * p.held[i] * dot(u, u);
+  }
+  return out;
+}
+
+// The forces on vertices and their stiffness if they moved alone, after `strain_patch`, whose means it changes;
+// those on vertices that also have other tetrahedra than the patch's are not whole.
+template <class S>
+PALPATE void pull_patch(const S& m, const Neohookean& e, const double* disp, Patch& p) {
+  for (int i = 0; i < p.vert.count; ++i) {
+    p.force[i] = -p.held[i] * load(disp + 3 * p.vert.list[i]), p.hard[i] = p.held[i];
+    p.mean[i] = stress_of(p.mean[i], p.mu[i], p.lam[i]);
+  }
+  for (int i = 0; i < p.around.count; ++i) {
+    const int t = p.around.list[i];
+    if (!p.own.has(t)) continue;
+    D3 x[4], g[4];
+    m.corners(t, x);
+    const double volume = slopes_of(x, g);
+    Rows stress = stress_of(p.slope[i], OWN_SHARE * e.mu[t], 0.0);
+    for (int c = 0; c < 4; ++c) add(stress, 0.25, p.mean[p.vert.place[m.vert(4 * t + c)] - 1]);
+    for (int c = 0; c < 4; ++c) {
+      const int k = p.vert.place[m.vert(4 * t + c)] - 1;
+      for (int r = 0; r < 3; ++r) (&p.force[k].x)[r] -= volume * dot(stress.row[r], g[c]);
+      p.hard[k] += volume * (e.mu[t] + e.lam[t]) * dot(g[c], g[c]);
+    }
+  }
+}
+
+// Moves vertices along a way, by which the energy falls by about slope s - bend s^2, until it is less by `more`;
+// returns by how much it is.
+template <class S>
+PALPATE double search(const S& m, const Neohookean& e, Patch& p, const Few& apart, const D3* way, double slope,
+                      double more, D3* from, double* disp) {
+  const double was = strain_patch(m, e, disp, p);
+  double bend = 0.0, best = 0.0, chosen = 0.0;
+  const auto go = [&](double share) {
+    for (int i = 0; i < apart.count; ++i) store(disp + 3 * apart.list[i], from[i] + share * way[i]);
+  };
+  for (int i = 0; i < apart.count; ++i) from[i] = load(disp + 3 * apart.list[i]);
+  for (int k = 0; k < SEARCHES; ++k) {
+    const double root = slope * slope - 4.0 * bend * AMPLE * more;
+    double share = root > 0.0 ? 2.0 * AMPLE * more / (slope + sqrt(root)) : slope / (2.0 * bend);
+    share = share < FARTHEST ? share : FARTHEST;
+    go(share);
+    const double less = was - strain_patch(m, e, disp, p);
+    if (less > best) best = less, chosen = share;
+    if (less >= more || (bend > 0.0 && less > 0.0)) break;
+    const double found = (slope * share - less) / (share * share);
+    bend = found > 0.0 ? found : 0.0;
+  }
+  go(chosen);
+  return best;
+}
+
+// Moves vertices along their forces, by conjugate gradients (Fletcher and Reeves 1964,
+// doi:10.1093/comjnl/7.2.149), until the energy is not above `most`; returns by how much it is, or below.
+template <class S>
+PALPATE double give_way(const S& m, const Neohookean& e, Patch& p, const Few& apart, double most, double* disp,
+                        Scratch memory) {
+  double more = strain_patch(m, e, disp, p) - most, last = 0.0;
+  D3 *way = (D3*)memory.values(3 * apart.count), *from = (D3*)memory.values(3 * apart.count);
+  if (memory.full) return more;
+  for (int round = 0; round < CONJUGATE && more > 0.0; ++round) {
+    strain_patch(m, e, disp, p);
+    pull_patch(m, e, disp, p);
+    double size = 0.0, slope = 0.0;
+    for (int i = 0; i < apart.count; ++i) {
+      const int k = p.vert.place[apart.list[i]] - 1;
+      size += dot(p.force[k], p.force[k]) / p.hard[k];
+    }
+    for (int turn = 0; turn < 2 && slope <= 0.0; ++turn) {  // the second is down the forces alone
+      slope = 0.0;
+      for (int i = 0; i < apart.count; ++i) {
+        const int k = p.vert.place[apart.list[i]] - 1;
+        const D3 down = (1.0 / p.hard[k]) * p.force[k];
+        way[i] = last > 0.0 && !turn ? down + (size / last) * way[i] : down;
+        slope += dot(p.force[k], way[i]);
+      }
+    }
+    last = size;
+    if (!(slope > 0.0)) break;
+    const double less = search(m, e, p, apart, way, slope, more, from, disp);
+    if (less <= 0.0) break;
+    more -= less;
+  }
+  return more;
+}
+
+// What vertices have together: mass, centre, momentum, angular momentum about the origin, energy, and moments of
+// inertia about the centre.
+struct Sums { double mass, energy, inertia[3][3]; D3 centre, momentum, spin; };
+
+template <class S, class L>
+PALPATE Sums sums_of(const S& m, const Moving& x, const Few& vert, const L* pinned) {
+  Sums out = {};
+  const auto place = [&](int v) { return m.place(v) + load(x.disp + 3 * v); };
+  for (int i = 0; i < vert.count; ++i) {
+    const int v = vert.list[i];
+    if (pinned[v]) continue;
+    const D3 vel = load(x.vel + 3 * v), p = x.mass[v] * vel;
+    out.mass += x.mass[v], out.energy += 0.5 * dot(p, vel);
+    out.centre += x.mass[v] * place(v), out.momentum += p, out.spin += cross(place(v), p);
+  }
+  out.centre = (1.0 / out.mass) * out.centre;
+  for (int i = 0; i < vert.count; ++i) {
+    const int v = vert.list[i];
+    if (pinned[v]) continue;
+    const D3 arm = place(v) - out.centre;
+    const double a[3] = {arm.x, arm.y, arm.z}, square = dot(arm, arm);
+    for (int k = 0; k < 9; ++k)
+      out.inertia[k / 3][k % 3] += x.mass[v] * ((k / 3 == k % 3 ? square : 0.0) - a[k / 3] * a[k % 3]);
+  }
+  return out;
+}
+
+// A motion without strain.
+struct Rigid {
+  D3 mean, omega;
+  PALPATE D3 at(D3 arm) const { return mean + cross(omega, arm); }
+};
+
+// That with a momentum and an angular momentum about the origin.
+PALPATE Rigid rigid_of(const Sums& sums, D3 momentum, D3 spin) {
+  double inertia[3][3];
+  for (int k = 0; k < 9; ++k) inertia[k / 3][k % 3] = sums.inertia[k / 3][k % 3];
+  return {(1.0 / sums.mass) * momentum, rotation_of(inertia, spin - cross(sums.centre, momentum))};
+}
+
+// Gives vertices the momentum and angular momentum that they had: they turn slowly together for it. Where they
+// have more than their kinetic energy less `less`, they move less beside what they have in common. Returns by how
+// much they have more all the same; where `slows`, they turn by that more slowly instead.
+template <class S, class L>
+PALPATE double keep_motion(const S& m, const Moving& x, const Few& vert, const L* pinned, const Sums& was,
+                           double less, bool slows) {
+  const Sums now = sums_of(m, x, vert, pinned);
+  if (!(now.mass > 0.0)) return 0.0;
+  const Rigid own = rigid_of(now, now.momentum, now.spin);
+  Rigid goal = rigid_of(now, was.momentum, was.spin);
+  double common = 0.0, besides = 0.0;
+  const auto arm_of = [&](int v) { return m.place(v) + load(x.disp + 3 * v) - now.centre; };
+  for (int i = 0; i < vert.count; ++i) {
+    const int v = vert.list[i];
+    if (pinned[v]) continue;
+    const D3 a = goal.at(arm_of(v)), b = load(x.vel + 3 * v) - own.at(arm_of(v));
+    common += 0.5 * x.mass[v] * dot(a, a), besides += 0.5 * x.mass[v] * dot(b, b);
+  }
+  const double left = was.energy - less - common;
+  if (slows && left < 0.0) {
+    const double turning = common - 0.5 * now.mass * dot(goal.mean, goal.mean);
+    goal.omega = (turning > -left ? sqrt(1.0 + left / turning) : 0.0) * goal.omega;
+  }
+  const double share = left >= besides ? 1.0 : left > 0.0 ? sqrt(left / besides) : 0.0;
+  for (int i = 0; i < vert.count; ++i) {
+    const int v = vert.list[i];
+    if (pinned[v]) continue;
+    const D3 rest = load(x.vel + 3 * v) - own.at(arm_of(v));
+    store(x.vel + 3 * v, goal.at(arm_of(v)) + share * rest);
+  }
+  return -left;
+}
+
+// What is around a cut before it is made: the patch, its energy, what its vertices have together, and the volume
+// around each.
+struct Before { Patch patch; double energy; Sums sums; double* size; };
+
+// Adds a ring of tetrahedra, and lets all give way that then have theirs in the patch: the least energy of what
+// came apart may be more than it was, where the rest is held by it.
+template <class S, class F>
+PALPATE void widen(const S& m, const Neohookean& e, const Moving& x, const F& f, Before& was, Few& apart) {
+  Patch& p = was.patch;
+  for (int far = 0; far < 2; ++far) {
+    const Sums sums = sums_of(m, x, p.vert, f.pinned.data);
+    const double sign = far ? 1.0 : -1.0;
+    was.energy += sign * strain_patch(m, e, x.disp, p), was.sums.energy += sign * sums.energy;
+    was.sums.momentum += sign * sums.momentum, was.sums.spin += sign * sums.spin;
+    if (far) break;
+    for (int i = 0; i < p.vert.count; ++i) {
+      const int v = p.vert.list[i];
+      if (!f.pinned.data[v]) apart.put(v);
+      m.each_corner(v, [&](int corner) { p.own.put(corner / 4); });
+    }
+    find_patch(m, e, f.loose.data, f.foundation, f.found.data[FOUND_TRIANGLES], p);
+  }
+}
+
+// Lets what is around a cut go on with no more energy than it had.
+template <class S, class F>
+PALPATE bool ease(const S& m, const Neohookean& e, const Moving& x, const F& f, Before& was, Scratch& memory) {
+  Patch& p = was.patch;
+  Few apart = few(memory, m.nvert);
+  const int nsplit = f.found.data[FOUND_SPLIT];
+  double* part = memory.values(nsplit);
+  if (memory.full) return false;
+  for (int i = 0; i < nsplit; ++i) part[i] = f.share.data[i] * was.size[f.group.data[i]];
+  for (int i = 0; i < nsplit; ++i) was.size[f.member.data[i]] = part[i], apart.put(f.member.data[i]);
+  find_patch(m, e, f.loose.data, f.foundation, f.found.data[FOUND_TRIANGLES], p);
+  double had = 0.0, has = 0.0;
+  for (int i = 0; i < p.vert.count; ++i) {
+    const int v = p.vert.list[i];
+    had += x.mass[v], has += x.mass[v] *= p.size[i] / was.size[v];
+  }
+  for (int i = 0; i < p.vert.count; ++i) x.mass[p.vert.list[i]] *= had / has;
+  double ask = 0.0, over = 0.0;  // by how much less than before it is to have, and how much more all have
+  for (int turn = 0; turn < TURNS; ++turn) {
+    if (turn) widen(m, e, x, f, was, apart);
+    const double more = e.has ? give_way(m, e, p, apart, was.energy - ask, x.disp, memory) - ask : 0.0;
+    const bool rigid = turn && was.energy + more < over;  // no strain is left to give
+    over = keep_motion(m, x, p.vert, f.pinned.data, was.sums, more, rigid || turn + 1 == TURNS);
+    if (rigid || !e.has || !(over > EVEN * was.sums.energy)) break;
+    ask = AMPLE * (over - more);
+  }
+  int count = 0;
+  for (int i = 0; i < p.vert.count; ++i)
+    if (!f.pinned.data[p.vert.list[i]]) f.near.data[count++] = p.vert.list[i];
+  f.found.data[FOUND_NEAR] = count;
+  return true;
+}
+
+}  // namespace palpate

@@ -1,0 +1,185 @@
+// The mesh comes apart along edges: vertices on them are doubled. Triangles keep their numbers.
+#pragma once
+#include "cutting/chain.h"
+
+namespace palpate {
+
+// The edges that come apart, both of their half-edges marked.
+struct Seam {
+  int *pair, count;  // their vertices, two each
+  int* cut;  // of a half-edge
+};
+
+// Marks the first edges of a seam, or clears the marks.
+template <class S>
+PALPATE void mark(const S& m, Seam& seam, int count, int value) {
+  for (int i = 0; i < count; ++i) {
+    const int h = m.half_to(seam.pair[2 * i], seam.pair[2 * i + 1]);
+    seam.cut[h] = seam.cut[m.twin[h]] = value;
+  }
+}
+
+// Tells which part of a vertex's fan each of its spokes is in, once the marked edges came apart; returns
+// how many parts.
+template <class S>
+PALPATE int parts_of(const S& m, const int* cut, int v, int* part) {
+  const int degree = (int)m.degree[v];
+  int last = 0, filled = 0;
+  for (int k = 0; k < degree; ++k) {
+    const int h = m.half(v, k);
+    if (h >= 0 && cut[h] && filled) ++last, filled = 0;
+    part[k] = last;
+    filled += h >= 0;
+  }
+  const bool joined = m.half(v, degree - 1) >= 0 && last > 0 && !cut[m.half(v, 0)];
+  for (int k = 0; k < degree && joined; ++k)
+    if (part[k] == last) part[k] = 0;
+  return joined ? last : last + 1;
+}
+
+// Takes of the edges as many, from the first one, as there are spare vertices for, none where none would
+// come apart; returns whether they are fewer for want of these.
+template <class S>
+PALPATE bool find_room(const S& m, Seam& seam, int left, Few& vert, int* part) {
+  bool fewer = false;
+  while (seam.count) {
+    mark(m, seam, seam.count, 1);
+    vert.clear();
+    int need = 0;
+    for (int i = 0; i < 2 * seam.count; ++i)
+      if (vert.put(seam.pair[i])) need += parts_of(m, seam.cut, seam.pair[i], part) - 1;
+    if (need && need <= left) return fewer;
+    mark(m, seam, seam.count, 0);
+    const int over = need - left;
+    if (need) seam.count -= over < seam.count ? over : seam.count, fewer = true;
+    else seam.count = 0;  // it was cut already
+  }
+  vert.clear();
+  return fewer;
+}
+
+// The vertices that were one: `group` has the first, `member` each of them.
+struct Split { int *group, *member, count, following; };
+
+template <class S>
+PALPATE void double_vertices(const S& m, const Seam& seam, const Few& vert, int* part, int* size,
+                             Split& out) {
+  for (int i = 0; i < vert.count; ++i) {
+    const int v = vert.list[i], n = parts_of(m, seam.cut, v, part);
+    if (n < 2) continue;
+    for (int p = 0; p < n; ++p) size[p] = 0;
+    for (int k = 0; k < m.degree[v]; ++k) size[part[k]] += m.half(v, k) >= 0;
+    int kept = 0;
+    for (int p = 1; p < n; ++p) kept = size[p] > size[kept] ? p : kept;
+    for (int p = 0; p < n; ++p) {
+      const int name = p == kept ? v : out.following++;
+      for (int k = 0; k < m.degree[v]; ++k)
+        if (part[k] == p && m.half(v, k) >= 0) m.elem[m.half(v, k)] = name;
+      out.group[out.count] = v, out.member[out.count++] = name;
+    }
+  }
+}
+
+// Walks around a vertex by its spokes, of which `row` has those that it or what it came from had.
+template <class S>
+PALPATE void walk(const S& m, int v, const int* row, int n) {
+  int first = -1;
+  bool open = false;
+  for (int k = 0; k < n; ++k) {
+    const int h = row[k];
+    if (h < 0 || m.elem[h] != v || open) continue;
+    open = m.twin[h] < 0;
+    if (open || first < 0 || h < first) first = h;
+  }
+  auto* ring = m.ring + m.most * v;
+  auto* spoke = m.spoke + m.most * v;
+  int degree = 0;
+  for (int h = first; h >= 0;) {
+    ring[degree] = m.to(h), spoke[degree++] = h;
+    const int last = last_half(h), next = (int)m.twin[last];
+    if (next < 0) ring[degree] = m.from(last), spoke[degree++] = -1;
+    h = next == first ? -1 : next;
+  }
+  m.degree[v] = degree;
+  for (int k = degree; k < m.most; ++k) ring[k] = spoke[k] = -1;
+}
+
+// Gives triangles the twins that they have now, and vertices their rings.
+//
+// Args: the triangles around all that moved or came apart, ascending, with the corners that they had;
+// which of these were moved; the split; lists. Leaves in `elem` the triangles that are not as they were, and
+// in `before` their corners.
+template <class S>
+PALPATE void rejoin(const S& m, Few& elem, int* before, const Few& moved, const Split& split,
+                    Few& vert, int* row, int* source) {
+  int count = 0;
+  vert.clear();
+  for (int i = 0; i < split.count; ++i) source[split.member[i]] = split.group[i] + 1;
+  for (int i = 0; i < elem.count; ++i) {
+    const int t = elem.list[i];
+    bool cut = false, goes = false;
+    for (int c = 0; c < 3; ++c) {
+      const int h = 3 * t + c, other = (int)m.whole_twin[h];
+      const bool joined = other >= 0 && m.from(h) == m.to(other) && m.to(h) == m.from(other);
+      cut = cut || before[3 * i + c] != m.elem[h] || m.twin[h] != (joined ? other : -1);
+      m.twin[h] = joined ? other : -1;
+      goes = goes || moved.has(before[3 * i + c]);
+    }
+    for (int c = 0; c < 3 && cut; ++c) vert.put(before[3 * i + c]), vert.put((int)m.elem[3 * t + c]);
+    elem.place[t] = 0;
+    if (!cut && !goes) continue;
+    for (int c = 0; c < 3; ++c) before[3 * count + c] = before[3 * i + c];
+    elem.list[count++] = t;
+  }
+  elem.count = count;
+  // New vertices first: what they come from has its old row until then.
+  for (int old = 0; old < 2; ++old)
+    for (int i = 0; i < vert.count; ++i) {
+      const int v = vert.list[i], from = source[v] ? source[v] - 1 : v;
+      if ((from == v) != (old == 1)) continue;
+      const int n = (int)m.degree[from];
+      for (int k = 0; k < n; ++k) row[k] = m.half(from, k);
+      walk(m, v, row, n);
+    }
+}
+
+// What tells the pieces of a surface apart.
+struct Pieces { int *label, *queue, *home, *best, *many; double* size; };
+
+// Marks triangles that a cut has freed from the foundation: of what it held together until now, it goes
+// on to hold the largest piece.
+template <class S, class I>
+PALPATE void come_loose(const S& m, const I* home, unsigned char* loose, Pieces& p) {
+  int count = 0;
+  for (int t = 0; t < m.nelem; ++t) {
+    if (p.label[t]) continue;
+    int queued = 0;
+    p.label[t] = ++count;
+    p.home[count - 1] = (int)home[t], p.size[count - 1] = 0.0;
+    p.queue[queued++] = t;
+    while (queued) {
+      const int a = p.queue[--queued];
+      for (int h = 3 * a; h < 3 * a + 3; ++h) {
+        const int b = m.twin[h] >= 0 ? (int)m.twin[h] / 3 : a;
+        if (p.label[b]) continue;
+        p.label[b] = count, p.queue[queued++] = b;
+      }
+    }
+  }
+  for (int t = 0; t < m.nelem; ++t) {
+    D3 x[3];
+    m.corners(t, x);
+    if (!loose[t]) p.size[p.label[t] - 1] += 0.5 * norm(cross(x[1] - x[0], x[2] - x[0]));
+  }
+  for (int k = 0; k < count; ++k) {  // `best` of a home: its largest piece, from 1
+    int& best = p.best[p.home[k]];
+    p.many[p.home[k]] += p.size[k] > 0.0;
+    if (!best || p.size[k] > p.size[best - 1]) best = k + 1;
+  }
+  for (int t = 0; t < m.nelem; ++t) {
+    const int h = p.home[p.label[t] - 1];
+    if (p.many[h] > 1 && p.label[t] != p.best[h]) loose[t] = 1;
+  }
+}
+
+}  // namespace palpate

@@ -1,0 +1,309 @@
+// The surface of an organ that is cut: triangles and, of each vertex, the ring of its neighbours.
+//
+// A half-edge 3 t + k goes from corner k of triangle t to the next one; its twin is on the other side,
+// -1 on a boundary. A ring is counter-clockwise, with the half-edges from its vertex ("spokes"): in an
+// open one the last neighbour is reached by none, -1. Whole is what there was before the first cut.
+#pragma once
+#include "core/triangle.h"
+
+AS_WRITTEN
+
+namespace palpate {
+
+PALPATE int next_half(int h) { return h % 3 == 2 ? h - 2 : h + 1; }
+PALPATE int last_half(int h) { return h % 3 == 0 ? h + 2 : h - 1; }
+
+template <class I>
+struct Surface {
+  int nvert, nelem, most;
+  double* rest;
+  I *elem, *twin, *ring, *spoke, *degree;
+  const I *whole_elem, *whole_twin;
+
+  PALPATE D3 place(int v) const { return load(rest + 3 * v); }
+  PALPATE int from(int h) const { return (int)elem[h]; }
+  PALPATE int to(int h) const { return (int)elem[next_half(h)]; }
+  PALPATE int opposite(int h) const { return (int)elem[last_half(h)]; }
+  PALPATE int neighbour(int v, int k) const { return (int)ring[most * v + k]; }
+  PALPATE int half(int v, int k) const { return (int)spoke[most * v + k]; }
+  PALPATE bool on_rim(int v) const { return degree[v] == 0 || half(v, (int)degree[v] - 1) < 0; }
+  // The half-edge to a neighbour, -1 for none.
+  PALPATE int half_to(int v, int other) const {
+    for (int k = 0; k < degree[v]; ++k)
+      if (neighbour(v, k) == other) return half(v, k);
+    return -1;
+  }
+  PALPATE bool has_both_sides(int v, int other) const {
+    const int h = half_to(v, other);
+    return h >= 0 && twin[h] >= 0;
+  }
+  PALPATE void corners(int t, D3* x) const {
+    for (int c = 0; c < 3; ++c) x[c] = place((int)elem[3 * t + c]);
+  }
+};
+
+// The surface of a world in arrays of such names, all of them with the worlds one after the other.
+template <class F>
+PALPATE auto surface_of(const F& f, int world) {
+  using I = decltype(f.elem.data[0] + 0);
+  const long long v = world * (long long)f.nvert, t = world * (long long)f.nelem;
+  return Surface<I>{f.nvert, f.nelem, f.most, f.rest.data + 3 * v, f.elem.data + 3 * t,
+                    f.twin.data + 3 * t, f.ring.data + f.most * v, f.spoke.data + f.most * v,
+                    f.degree.data + v, f.whole_elem.data, f.whole_twin.data};
+}
+
+// What vertices carry.
+struct Moving { double *mass, *disp, *vel; };
+
+// Scratch of a world; numbers that are taken are zero, unless they are room alone.
+struct Scratch {
+  int* ints;
+  double* reals;
+  int nint, nreal;
+  bool full;
+
+  PALPATE int* room(int n) {
+    if (n > nint) return full = true, nullptr;
+    int* out = ints;
+    ints += n, nint -= n;
+    return out;
+  }
+  PALPATE int* numbers(int n) {
+    int* out = room(n);
+    for (int i = 0; i < n && out; ++i) out[i] = 0;
+    return out;
+  }
+  PALPATE double* values(int n) {
+    if (n > nreal) return full = true, nullptr;
+    double* out = reals;
+    reals += n, nreal -= n;
+    return out;
+  }
+};
+
+// Different numbers, in the order in which they came; `put` tells whether one is new.
+struct Few {
+  int *list, *place;  // of a number: where it is in the list, from 1; 0 where it is not
+  int count;
+
+  PALPATE bool put(int number) {
+    if (place[number]) return false;
+    list[count++] = number;
+    place[number] = count;
+    return true;
+  }
+  PALPATE bool has(int number) const { return place[number] > 0; }
+  PALPATE void clear() {
+    for (int i = 0; i < count; ++i) place[list[i]] = 0;
+    count = 0;
+  }
+  // Puts them in ascending order; they are under `end`.
+  PALPATE void sort(int end) {
+    int k = 0;
+    for (int n = 0; n < end; ++n)
+      if (place[n]) list[k++] = n, place[n] = k;
+  }
+};
+
+PALPATE Few few(Scratch& memory, int most) {
+  int* list = memory.room(most);
+  return {list, memory.numbers(most), 0};
+}
+
+// The area around a vertex, summed over triangles in ascending order; of those that `loose` marks none.
+template <class S, class L>
+PALPATE double area_around(const S& m, int v, const L* loose) {
+  double sum = 0.0;
+  for (int t = -1;;) {
+    int next = m.nelem;
+    for (int k = 0; k < m.degree[v]; ++k) {
+      const int h = m.half(v, k);
+      if (h >= 0 && h / 3 > t && h / 3 < next) next = h / 3;
+    }
+    if (next == m.nelem) return sum;
+    t = next;
+    D3 x[3];
+    m.corners(t, x);
+    if (!loose || !loose[t]) sum += norm(0.5 * cross(x[1] - x[0], x[2] - x[0])) / 3.0;
+  }
+}
+
+// Turns a symmetric matrix so that an entry beside its diagonal is 0 (Jacobi 1846), and with it `axes`.
+PALPATE void turn_axes(double (*a)[3], double (*axes)[3], int p, int q) {
+  if (a[p][q] == 0.0) return;
+  const double theta = 0.5 * (a[q][q] - a[p][p]) / a[p][q];
+  const double t = (theta >= 0.0 ? 1.0 : -1.0) / (fabs(theta) + sqrt(1.0 + theta * theta));
+  const double c = 1.0 / sqrt(1.0 + t * t), s = t * c;
+  for (int k = 0; k < 3; ++k) {
+    const double x = a[k][p], y = a[k][q];
+    a[k][p] = c * x - s * y, a[k][q] = s * x + c * y;
+  }
+  for (int k = 0; k < 3; ++k) {
+    const double x = a[p][k], y = a[q][k];
+    a[p][k] = c * x - s * y, a[q][k] = s * x + c * y;
+  }
+  a[p][q] = a[q][p] = 0.0;
+  for (int k = 0; k < 3; ++k) {
+    const double x = axes[k][p], y = axes[k][q];
+    axes[k][p] = c * x - s * y, axes[k][q] = s * x + c * y;
+  }
+}
+
+constexpr int SWEEPS = 6;
+
+// Leaves the eigenvalues of a symmetric matrix on its diagonal, and its eigenvectors as columns of `axes`;
+// rows that are 0 keep the axis of their own.
+PALPATE void find_axes(double (*a)[3], double (*axes)[3]) {
+  for (int i = 0; i < 9; ++i) axes[i / 3][i % 3] = i / 3 == i % 3;
+  for (int k = 0; k < SWEEPS; ++k)
+    for (int p = 0; p < 2; ++p)
+      for (int q = p + 1; q < 3; ++q) turn_axes(a, axes, p, q);
+}
+
+// The nearest place of a surface: a triangle, weights of its corners, and how far it is.
+struct Spot { int elem; D3 weight; double far; };
+
+// The spot nearest to a point among the triangles around some vertices; `x` has where vertices are.
+template <class S>
+PALPATE Spot nearest_around(const S& m, const double* x, D3 point, const int* vert, int n) {
+  Spot out = {0, {1.0, 0.0, 0.0}, 1e300};
+  for (int i = 0; i < n; ++i)
+    for (int k = 0; k < m.degree[vert[i]]; ++k) {
+      const int h = m.half(vert[i], k);
+      if (h < 0) continue;
+      D3 corner[3];
+      for (int c = 0; c < 3; ++c) corner[c] = load(x + 3 * m.elem[h - h % 3 + c]);
+      const D3 w = barycentric(point, corner);
+      const double far = norm(blend(corner, w) - point);
+      if (far < out.far) out = {h / 3, w, far};
+    }
+  return out;
+}
+
+constexpr double BOX = 3.0;  // edges from points within which they are found sooner
+constexpr int MIDDLES = 12;  // triangles around a point of a solid's skin among which the nearest is
+constexpr double TIE = 1e-9;  // edges by which a triangle must be nearer than one with a nearer middle
+constexpr int NEAR = 6;  // vertices nearest to a point around which its triangle is looked for
+
+// Finds those of a few vertices, all `n` where `among` is null, that are nearest to a point; returns
+// how many there are and the square of how far the last one is.
+PALPATE int nearest_vertices(const double* x, D3 p, const int* among, int n, int* near, double& last) {
+  double far[NEAR];
+  int count = 0;
+  for (int i = 0; i < n; ++i) {
+    const int v = among ? among[i] : i;
+    const D3 arm = load(x + 3 * v) - p;
+    const double d = dot(arm, arm);
+    if (count == NEAR && d >= far[NEAR - 1]) continue;
+    int k = count < NEAR ? count++ : NEAR - 1;
+    for (; k > 0 && far[k - 1] > d; --k) far[k] = far[k - 1], near[k] = near[k - 1];
+    far[k] = d, near[k] = v;
+  }
+  last = count ? far[count - 1] : 0.0;
+  return count;
+}
+
+// The box around points, and some room.
+struct Box {
+  D3 low, high;
+
+  PALPATE Box(const double* point, int n, double room) : low(load(point)), high(low) {
+    const D3 zero = {0.0, 0.0, 0.0}, more = {room, room, room};
+    for (int i = 1; i < n; ++i) {
+      high = vmax(high, load(point + 3 * i));
+      low = zero - vmax(zero - low, zero - load(point + 3 * i));
+    }
+    low = low - more, high = high + more;
+  }
+  PALPATE bool has(D3 a) const {
+    const D3 off = vmax(low - a, a - high);
+    return off.x <= 0.0 && off.y <= 0.0 && off.z <= 0.0;
+  }
+};
+
+// Finds the spots of a surface that are nearest to points, which `put` gets: looked for in a box around
+// all points first, whose vertices `inside` gets.
+template <class S, class Put>
+PALPATE void nearest_spots(const S& m, const double* x, int nouter, const double* point, int n,
+                           double edge, int* inside, Put put) {
+  const double room = BOX * edge;
+  const Box box(point, n, room);
+  int count = 0;
+  for (int v = 0; v < nouter; ++v)
+    if (box.has(load(x + 3 * v))) inside[count++] = v;
+  const int want = NEAR < nouter ? NEAR : nouter;
+  for (int i = 0; i < n; ++i) {
+    int near[NEAR];
+    double last;
+    int found = nearest_vertices(x, load(point + 3 * i), inside, count, near, last);
+    if (found < want || last > room * room)
+      found = nearest_vertices(x, load(point + 3 * i), nullptr, nouter, near, last);
+    INLINED put(i, nearest_around(m, x, load(point + 3 * i), near, found));
+  }
+}
+
+// The triangles of a solid's skin.
+template <class I>
+struct Skin {
+  int nelem;
+  const I* elem;
+  const double *x, *rest;  // where vertices are, now and at rest
+
+  PALPATE D3 corner(int t, int c) const { return load(x + 3 * elem[3 * t + c]); }
+  PALPATE D3 middle(int t) const { return (1.0 / 3.0) * (corner(t, 0) + corner(t, 1) + corner(t, 2)); }
+  PALPATE D3 area_vector(int t) const {
+    const D3 a = load(rest + 3 * elem[3 * t]), b = load(rest + 3 * elem[3 * t + 1]);
+    return 0.5 * cross(b - a, load(rest + 3 * elem[3 * t + 2]) - a);
+  }
+  // The nearest spot among the triangles of a list, all `n` where it is null, whose middles are nearest.
+  PALPATE Spot nearest(D3 p, double edge, const int* among, int n) const {
+    double far[MIDDLES];
+    int near[MIDDLES], found = 0;
+    for (int j = 0; j < n; ++j) {
+      const int t = among ? among[j] : j;
+      const D3 arm = middle(t) - p;
+      const double d = dot(arm, arm);
+      if (found == MIDDLES && d >= far[MIDDLES - 1]) continue;
+      int k = found < MIDDLES ? found++ : MIDDLES - 1;
+      for (; k > 0 && far[k - 1] > d; --k) far[k] = far[k - 1], near[k] = near[k - 1];
+      far[k] = d, near[k] = t;
+    }
+    Spot out = {0, {1.0, 0.0, 0.0}, 1e300};
+    for (int k = 0; k < found; ++k) {
+      D3 x[3];
+      for (int c = 0; c < 3; ++c) x[c] = corner(near[k], c);
+      const D3 w = barycentric(p, x);
+      const double off = norm(blend(x, w) - p);
+      if (off < out.far - TIE * edge) out = {near[k], w, off};  // on an edge that of the nearer middle
+    }
+    return out;
+  }
+  // The unit normal at rest, even across edges, of those triangles.
+  PALPATE D3 normal(Spot spot, const int* among, int n) const {
+    D3 sum[3] = {}, out = {0.0, 0.0, 0.0};
+    for (int j = 0; j < n; ++j) {
+      const int t = among ? among[j] : j;
+      for (int c = 0; c < 9; ++c)
+        if (elem[3 * t + c / 3] == elem[3 * spot.elem + c % 3]) sum[c % 3] += area_vector(t);
+    }
+    const double weight[3] = {spot.weight.x, spot.weight.y, spot.weight.z};
+    for (int c = 0; c < 3; ++c) out += (weight[c] / norm(sum[c])) * sum[c];
+    return (1.0 / norm(out)) * out;
+  }
+};
+
+// The same of the skin of a solid, whose normals `put` gets too.
+template <class I, class Put>
+PALPATE void nearest_of_skin(const Skin<I>& m, const double* point, int n, double edge, int* inside, Put put) {
+  const Box box(point, n, BOX * edge);
+  int count = 0;
+  for (int t = 0; t < m.nelem; ++t)
+    if (box.has(m.middle(t))) inside[count++] = t;
+  if (count < MIDDLES) inside = nullptr, count = m.nelem;
+  for (int i = 0; i < n; ++i) {
+    const Spot spot = m.nearest(load(point + 3 * i), edge, inside, count);
+    INLINED put(i, spot, m.normal(spot, inside, count));
+  }
+}
+
+}  // namespace palpate

@@ -1,0 +1,54 @@
+// Stress relaxation: one Prony term on the elastic forces of the nodes, by Simo's convolution (1987,
+// doi:10.1016/0045-7825(87)90107-1), as in quasi-linear viscoelasticity (Fung 1993, section 7.6).
+// Doubles, on the CPU beside MuJoCo.
+//
+// With f the elastic force at once, the force is (1 - g) f + q, and q follows f and fades:
+//
+//   q_new = exp(-h / tau) q + g (f_new - f)
+//
+// so that the step has f_new, which is its own, and exp(-h / tau) q - g f as a force besides. What
+// f_new was is known from the momentum that it gave, without another evaluation.
+#pragma once
+#include "forces/bodies.h"
+
+namespace palpate {
+
+// What a step has besides f_new.
+template <class Fields>
+PALPATE D3 faded(const Fields& f, int i) {
+  const double fade = exp(-f.mj.timestep.data[0] / f.number.data[1]);
+  const double* own = f.own.data + 6 * i;
+  return fade * load(own + 3) - f.number.data[0] * load(own);
+}
+
+// Adds it to the solver's input.
+template <class Fields>
+PALPATE void enter_creep(const Fields& f, Thread, int) {
+  if (f.windowed) f.tail.data[TAIL_QUIET] = 0.0;
+  for (int i = 0; i < f.ncreep; ++i) {
+    float* ext = f.force_ext.data + offset_of(f.node.data[i]);
+    store_lane(ext, load_lane(ext) + faded(f, i));
+  }
+}
+
+// Takes f_new from what the step, and its answer to the contacts, made of the velocities.
+template <class Fields>
+PALPATE void end_creep(const Fields& f, Thread, int) {
+  if (f.status.data[3] != 0.0f) return;
+  const double per_h = 1.0 / f.mj.timestep.data[0];
+  for (int i = 0; i < f.ncreep; ++i) {
+    const int node = f.node.data[i], at = offset_of(node);
+    D3 dv = load_lane(f.dvel.data + at), besides = load_lane(f.force_ext.data + at);
+    if (f.flags.data[FLAG_ANSWERED]) {
+      dv += load_lane(f.sol.data + at);
+      besides += per_h * load_lane(f.rhs.data + at);
+    }
+    if (f.held) besides = besides - per_h * (load_hold(hold_at(f.hold.data, node)) * dv);
+    const D3 force = (per_h * f.mass.data[node]) * dv - besides, left = faded(f, i);
+    double* own = f.own.data + 6 * i;
+    store(own, force);
+    store(own + 3, left + f.number.data[0] * force);
+  }
+}
+
+}  // namespace palpate

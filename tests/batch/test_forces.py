@@ -1,0 +1,123 @@
+"""Bonds, attachments and supports in batches are those of the plugin, in each world its own."""
+
+import mujoco
+import numpy as np
+import palpate
+import palpate.batch
+import pytest
+from palpate.batch import strip_organs
+from scenes import ball, box, load, needs_cuda, sphere, windowed, workspace, world
+
+BACKENDS = [
+  "cpu",
+  "warp-cpu",
+  pytest.param("cuda:0", marks=needs_cuda),
+]
+BODIES = """<body name="bed" pos="0 0 -0.0605"><geom name="bed" type="box" size="0.1 0.1 0.01"
+  contype="0" conaffinity="0"/></body>
+  <body name="hand" pos="0 0 0.08"><joint type="slide" axis="1 0 0"/>
+  <joint type="slide" axis="0 1 0"/><joint type="slide" axis="0 0 1"/>
+  <geom size="0.01" mass="0.5" contype="0" conaffinity="0"/></body>"""
+KEYS = {"young": 3e4, "tolerance": 1e-6, "damping": 0.01}
+KEYS |= {"contact": {"contype": 1, "conaffinity": 2}}
+NAMES = "globe", "one", "two"
+
+
+def scene():
+  """Returns a ball on a bed, a free body attached to it, a block bonded to it and one to that."""
+  points, elem = sphere(1)
+  block, blocks = box((0.04, 0.04, 0.02), 0.02)
+  block[:, 2] -= block[:, 2].min()
+
+  def top(x):
+    return " ".join(map(str, np.flatnonzero(x[:, 2] > x[:, 2].max() - 0.02)))
+
+  bonds = "bed 1e6 100 0.05 near 0.015, one 1e6 60 0.02 near 0.015"
+  on = {"attach": f"hand 20 {top(points)}", "bonds": bonds, "support": "bed", "foundation": 3e2}
+  organs = [windowed(points, elem, "globe", "w0", "5 4 1", **KEYS | on)]
+  on = {"attach": f"two 30 {top(block)}", "mass": 0.02}
+  organs.append(
+    windowed(block + np.array([0.0715, 0, -0.01]), blocks, "one", "w1", "3 3 1", **KEYS | on)
+  )
+  on = {"foundation": 1e4, "mass": 0.02}
+  organs.append(
+    windowed(block + np.array([0.0715, 0, 0.02]), blocks, "two", "w2", "3 3 1", **KEYS | on)
+  )
+  return world(*organs, ball(0.3), BODIES, gravity=(0.5, 0, 3.0))
+
+
+@pytest.fixture(params=BACKENDS)
+def make(request):
+  """Returns what makes a batch of the scene; on a GPU with few slots, which compile sooner."""
+  options = {} if request.param == "cpu" else {"nodes": 4}
+  spec = mujoco.MjSpec.from_string(scene())
+  return lambda nworld: palpate.batch.make(spec, nworld, device=request.param, **options)
+
+
+def test_what_acts_beside_the_tissue_is_what_the_plugin_has(make):
+  model, data, first = load(scene(), NAMES[0])
+  organs = [palpate.Organ(model, data, name) for name in NAMES]
+  batch = make(3)
+  bonds = batch.organ("globe").bonds
+  assert np.array_equal(bonds.vertices, first.bonds.vertices) and len(bonds) > 4
+  for k in range(140):
+    mujoco.mj_step(model, data)
+    batch.step()
+    if k == 40:
+      own = mujoco.MjData(batch.model)
+      batch.get_state(2, own)
+      batch.set_state(1, own)
+  assert 0.1 < first.bonds.share_freed < 0.9 and first.bonds.force.any()
+  for organ in organs:
+    found = batch.organ(organ.name).xpos.numpy()
+    np.testing.assert_allclose(found, np.tile(organ.xpos, (3, 1, 1)), atol=2e-6)
+  size = np.abs(first.bonds.force).max()
+  for k in range(3):
+    np.testing.assert_allclose(bonds.damage.numpy()[k], first.bonds.damage, atol=1e-3)
+    np.testing.assert_allclose(bonds.force.numpy()[k], first.bonds.force, atol=2e-3 * size)
+  np.testing.assert_allclose(bonds.share_freed.numpy(), first.bonds.share_freed, atol=1e-6)
+  np.testing.assert_allclose(batch.qpos.numpy()[:, -3:], np.tile(data.qpos[-3:], (3, 1)), atol=1e-6)
+
+
+def test_worlds_are_weakened_and_healed_alone(make):
+  batch = make(3)
+  bonds = batch.organ("globe").bonds
+  amount = np.zeros((3, len(bonds)))
+  amount[1], amount[2, 0] = 2.0, 0.5
+  bonds.weaken(amount)
+  assert bonds.share_freed.numpy().tolist() == [0, 1, 0]
+  assert bonds.damage.numpy()[:, 0].tolist() == [0, 1, 0.5]
+  batch.step(3)
+  force = np.abs(bonds.force.numpy()).max(axis=(1, 2))
+  assert force[0] > 0 and force[1] == 0 and force[2] > 0
+  own = mujoco.MjData(batch.model)
+  batch.get_state(1, own)
+  assert palpate.Organ(batch.model, own, "globe").bonds.share_freed == 1.0
+  batch.reset(np.array([False, True, False]))
+  assert bonds.share_freed.numpy().tolist() == [0, 0, 0] and bonds.damage.numpy()[2, 0] == 0.5
+  batch.start(own)
+  batch.reset(np.array([True, False, False]))
+  assert bonds.share_freed.numpy().tolist() == [1, 0, 0]
+  with pytest.raises(ValueError, match=r"amount has shape \(2,\), expected \(3, "):
+    bonds.weaken(np.zeros(2))
+  none = batch.organ("two").bonds
+  assert not len(none) and not none.share_freed.numpy().any()
+
+
+def test_windowed_organs_are_taken_out_of_a_scene():
+  made = scene()
+  model, data, _ = load(made, NAMES[0])
+  declared = [workspace(palpate.Organ(model, data, name)).organ for name in NAMES]
+  bare, slots = strip_organs.strip(mujoco.MjSpec.from_string(made), model, declared, [5, 6, 7])
+  assert bare.nplugin == 0 and bare.nflex == 3 and [each.nslot for each in slots] == [5, 6, 7]
+
+
+def test_a_support_that_is_an_organ_is_refused():
+  points, elem = sphere(1)
+  both = [
+    windowed(points + 0.1 * k, elem, name, f"w{k}", "4 3 1", **KEYS | on)
+    for k, (name, on) in enumerate((("low", {}), ("high", {"support": "low"})))
+  ]
+  spec = mujoco.MjSpec.from_string(world(*both, ball(1.0)))
+  with pytest.raises(ValueError, match=r"'high': support names organ 'low', .* expected geoms"):
+    palpate.batch.make(spec, 2, device="warp-cpu")
