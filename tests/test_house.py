@@ -119,7 +119,7 @@ def private_above() -> set[str]:
 
 def device_switches() -> set[str]:
   """Returns the files but simd.h and group.h that ask whether they are compiled for CUDA."""
-  allowed = ("plugin/core/simd.h", "plugin/core/group.h")
+  allowed = ("plugin/native/core/simd.h", "plugin/native/core/group.h")
   paths = [p for p in [*package_files(), *headers()] if name_of(p) not in allowed]
   return {name_of(p) for p in paths if re.search(r"__CUDA_ARCH__|__CUDACC", p.read_text())}
 

@@ -29,7 +29,6 @@ def write(folder: pathlib.Path, paths: Iterable[pathlib.Path], about: About) -> 
   import gymnasium
   from minari.dataset.minari_storage import MinariStorage
 
-  registry.register()
   kwargs = {name: value for name, value in about.task_kwargs.items() if name != "random"}
   env = gymnasium.make(registry.gym_id(*about.task.split("/")), **kwargs)
   jpeg = "segmentation" not in env.observation_space.spaces  # labels are no colours
