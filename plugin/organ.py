@@ -5,11 +5,12 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 import numpy.typing as npt
-from palpate.engine import change, mjstruct, motion, penetration, workspace
+from palpate.engine import change, motion, penetration, workspace
 from palpate.engine import plugin as engine
 from palpate.engine.cutting.cuts import Piece, Report
 from palpate.engine.cutting.cutters import Cutter
 from palpate.engine.layout import FLAG
+from palpate.engine.model import mjstruct
 from palpate.engine.windows import windowed
 from palpate.tissue import energy
 from palpate.tissue.config import Config

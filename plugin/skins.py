@@ -6,8 +6,8 @@ from __future__ import annotations
 
 import mujoco
 import numpy as np
+from palpate.engine.model.skin import HIDDEN
 
-from .engine.skin import HIDDEN
 from .tissue.geometry import subdivide
 from .tissue.geometry.mesh import vertex_normals
 from .windows import find_organ

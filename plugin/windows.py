@@ -11,8 +11,8 @@ from collections.abc import Iterator, Sequence
 
 import mujoco
 import numpy as np
+from palpate.engine.model import flexes
 
-from .engine import flexes
 from .engine import plugin as engine
 from .engine.layout import MAX_GEOMS
 from .tissue.config import holders

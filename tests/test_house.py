@@ -189,7 +189,7 @@ def obj_writers() -> set[str]:
 
 
 def film_writers() -> set[str]:
-  return calls(r"get_writer$|mimsave$|mimwrite$", package_files(), "plugin/app/film.py")
+  return calls(r"get_writer$|mimsave$|mimwrite$", package_files(), "plugin/app/draw/film.py")
 
 
 def csv_writers() -> set[str]:
@@ -208,7 +208,7 @@ def model_writers() -> set[str]:
         if re.match(r"(mjstruct\.)?view\((m|model)\.|(m|model)\.\w+\[", text):
           if "tree_sleep_policy" not in text:  # of the windows' bodies, in a step
             found.add(name_of(path))
-  return found - {"plugin/engine/prepare.py"}
+  return found - {"plugin/engine/model/prepare.py"}
 
 
 def scheme_comparisons() -> set[str]:
@@ -230,7 +230,7 @@ def version_questions() -> set[str]:
   for path in [*below("plugin/engine"), *below("plugin/tissue"), *below("plugin/organ")]:
     if re.search(r"mujoco\.(__version__|mj_version)", path.read_text()):
       found.add(name_of(path))
-  return found - {"plugin/engine/mjstruct.py"}
+  return found - {"plugin/engine/model/mjstruct.py"}
 
 
 def literal_offsets() -> set[str]:

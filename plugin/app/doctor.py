@@ -145,7 +145,7 @@ def _cache() -> list[str]:
 
 def _plugin() -> list[str]:
   from palpate import register
-  from palpate.engine.mjstruct import NAME
+  from palpate.engine.model.mjstruct import NAME
 
   slot = register()
   return [f"{NAME} is registered with MuJoCo, slot {slot}"]
@@ -195,10 +195,10 @@ def _self_test() -> list[str]:
   from palpate import register
   from palpate.organ import Organ
 
-  from . import press, probe
+  from .press import command, probe
 
   register()
-  model = mujoco.MjModel.from_xml_path(str(press.folder() / "scene.xml"))
+  model = mujoco.MjModel.from_xml_path(str(command.folder() / "scene.xml"))
   data = mujoco.MjData(model)
   organ = Organ(model, data, "organ")
   tool = probe.find(model, "probe")

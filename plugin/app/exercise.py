@@ -13,8 +13,9 @@ from typing import Any
 
 import palpate
 
-from . import film, options
+from . import options
 from .console import CommandError, Interrupt, Progress, output, output_folder, writing
+from .draw import film
 from .trainee import keeping
 
 _SIZE = (640, 480)  # of the film [pixels]
@@ -65,12 +66,12 @@ def main(args: argparse.Namespace) -> int:
     return _list()
   _check_who(args)
   if args.device:
-    from .live import devices
+    from .live.devices import registry
 
     try:
-      if devices.on_page(args.device):
+      if registry.on_page(args.device):
         return _page(args)
-      if args.left and devices.on_page(args.left):
+      if args.left and registry.on_page(args.left):
         raise ValueError(f"left is {args.left!r}, which is on a page as --device alone")
     except ValueError as error:
       raise CommandError(str(error)) from None

@@ -20,7 +20,7 @@ import palpate
 
 from . import workers
 from .console import CommandError, Interrupt, Progress, check_counts, output_folder, writing
-from .evaluate import Result, perform
+from .learn.evaluate import Result, perform
 
 _SEED = 10_000  # far from the seeds that people and tests use: those stay fresh
 _LEAST = 5  # successes to make a reference of

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import palpate
 
-from . import film
 from .console import CommandError, output_folder, writing
+from .draw import film
 from .trainee import keeping
 
 if TYPE_CHECKING:

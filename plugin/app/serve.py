@@ -40,10 +40,10 @@ def add_arguments(parser: argparse.ArgumentParser):
 def main(args: argparse.Namespace) -> int:
   """Runs the job and returns its exit code."""
   register()
-  from .live import devices
+  from .live.devices import registry
 
   try:
-    devices.check(args.device)
+    registry.check(args.device)
   except ValueError as error:
     raise CommandError(str(error)) from None
   if not 0 <= args.port < 65536:
@@ -80,7 +80,7 @@ def run(
     kept: the record that recordings go to, None for the folder
   """
   need("live", "websockets")
-  from .live.server import Server
+  from .live.page.server import Server
 
   folder = output_folder("out", folder)
   try:

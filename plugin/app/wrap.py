@@ -9,8 +9,8 @@ import sys
 
 from palpate import register
 
-from . import figures
 from .console import CommandError, compile_error, table
+from .press import figures
 
 _VOLUMES = (".nii", ".nii.gz", ".nrrd")
 _NODES = 1000

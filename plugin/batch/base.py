@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from .fracture import Parting
+from .cutting.fracture import Parting
 
 
 class Batch(abc.ABC):
@@ -376,7 +376,7 @@ class Tissue(Parting):
   @property
   @abc.abstractmethod
   def bonds(self) -> Any:
-    """What it has grown on to, see `palpate.batch.bonds.Bonds`."""
+    """What it has grown on to, see `palpate.batch.forces.bonds.Bonds`."""
 
   @abc.abstractmethod
   def configure(self, mask=None, **keys):

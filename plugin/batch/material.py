@@ -5,7 +5,7 @@ import dataclasses
 
 import numpy as np
 import warp as wp
-from palpate.engine import inertia, mjstruct
+from palpate.engine.model import inertia, mjstruct
 from palpate.tissue import body as bodies
 from palpate.tissue import shape
 from palpate.tissue.body import Body

@@ -15,11 +15,13 @@ from palpate.tissue import config as configuration
 from palpate.tissue import device as devices
 from palpate.tissue import order, shape, step
 
-from . import contact_rows, contacts, convex, forces, kernels, passive_forces, patch
+from . import kernels, patch
 from .base import Contacts, Tissue, spread
-from .blades import Blades
-from .cuts import Cuts
-from .fracture import Cutters
+from .contact import contact_rows, contacts, convex
+from .cutting.blades import Blades
+from .cutting.cuts import Cuts
+from .cutting.fracture import Cutters
+from .forces import base, passive
 from .material import KEYS, Material
 from .patch import launch
 from .strip_organs import Slots
@@ -63,7 +65,7 @@ class Organ(Tissue):
     beside: what acts on it beside its tissue
   """
 
-  beside: tuple[forces.Beside, ...] = ()
+  beside: tuple[base.Beside, ...] = ()
 
   def __init__(self, batch, w, place: Slots, tools: np.ndarray):
     organ, device, nworld = w.organ, batch.device, batch.nworld
@@ -230,9 +232,9 @@ class Organ(Tissue):
     return {name: wp.zeros(shape, dtype=wp.vec3, device=self.body.device) for name in _WHAT}
 
   @functools.cached_property
-  def bonds(self) -> passive_forces.Grown:
+  def bonds(self) -> passive.Grown:
     """What it has grown on to."""
-    return passive_forces.Grown(self)
+    return passive.Grown(self)
 
   def _read(self, name: str) -> wp.array:
     if name in _STATUS:

@@ -5,9 +5,10 @@
 import mujoco
 import numpy as np
 import warp as wp
-from palpate.engine import coupling, inertia, mjstruct
+from palpate.engine import coupling
 from palpate.engine.coupling import Crossing
 from palpate.engine.layout import GEOM
+from palpate.engine.model import inertia, mjstruct
 from palpate.engine.windows import proxies
 from palpate.tissue import step
 from palpate.tissue.types import Array, Tissue, doubles, fill, floats, ints, struct, vector

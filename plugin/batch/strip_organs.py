@@ -16,10 +16,11 @@ import math
 import mujoco
 import numpy as np
 from palpate import windows
-from palpate.engine import contacts, mjstruct
+from palpate.engine import contacts
 from palpate.engine.contacts import TISSUE
+from palpate.engine.model import mjstruct
 
-from .contacts import KINDS
+from .contact.contacts import KINDS
 
 # Slots of an organ: all triples of more are too many.
 LEAST, MOST = 4, 48

@@ -19,8 +19,11 @@ from palpate.engine import plugin as engine
 from palpate.organ import instances
 from palpate.tissue import device as devices
 
-from . import blades, contacts, convex, forces, kernels, passive_forces, states, strip_organs, tears
+from . import kernels, states, strip_organs
 from .base import Batch, Tissue, refuse_crowd
+from .contact import contacts, convex
+from .cutting import blades, tears
+from .forces import base, passive
 from .organs import Organ
 from .reset import Rest
 
@@ -57,7 +60,7 @@ class Worlds(Batch):
       name: engine.find(self.scratch._address, number) for name, number in instances(model).items()
     }
     declared = [w.organ for w in spaces.values()]
-    passive_forces.check(list(spaces.values()))
+    passive.check(list(spaces.values()))
     tools = [strip_organs.tools_of(model, organ) for organ in declared]
     nslots = [
       strip_organs.slots_for(model, o, t, nodes) for o, t in zip(declared, tools, strict=True)
@@ -77,7 +80,7 @@ class Worlds(Batch):
       self._rest = Rest(self, bare)
       self.aims = self._join()
       every = (each for organ in self._organs.values() for each in organ.beside)
-      self._looks = [each for each in every if isinstance(each, forces.Opens)]
+      self._looks = [each for each in every if isinstance(each, base.Opens)]
       self._teller = states.Teller(self)
       self._alias()
       self._sensed: Any = kernels.Sensed()
@@ -143,11 +146,11 @@ class Worlds(Batch):
       organ.beside = tears.make(organ)
     if not any(any(organ.space.beside) for organ in organs):
       return False
-    self.bodies = forces.bodies_of(self)
-    numbers = forces.numbers_of(self.model, self.bare, [organ.declared for organ in organs])
+    self.bodies = base.bodies_of(self)
+    numbers = base.numbers_of(self.model, self.bare, [organ.declared for organ in organs])
     for organ in organs:
-      organ.beside += (*passive_forces.make(organ, numbers), *blades.make(organ))
-    passive_forces.meet(organs)
+      organ.beside += (*passive.make(organ, numbers), *blades.make(organ))
+    passive.meet(organs)
     return any(each.aims for organ in organs for each in organ.beside)
 
   def _alias(self):

@@ -9,7 +9,8 @@ import warp as wp
 from palpate.tissue import step
 from palpate.tissue.body import Body
 
-from . import contacts, coupling, declare, graphs, mjstruct, nodal, penetration
+from . import contacts, coupling, graphs, nodal, penetration
+from .model import declare, mjstruct
 from .windows import declare_windows, nodes, proxies, windowed
 
 

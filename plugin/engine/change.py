@@ -11,10 +11,11 @@ from palpate.tissue import reading, shape
 from palpate.tissue.config import Config
 from palpate.tissue.step import SCHEMES
 
-from . import contacts, graphs, mjstruct, workspace
+from . import contacts, graphs, workspace
 from .bind import bind
 from .forces import cohesive_bonds, declare_attachments, declare_bonds
 from .forces.attachments import Group
+from .model import mjstruct
 from .windows import windowed
 
 

@@ -17,8 +17,9 @@ from palpate.tissue.kernels import kernel
 from palpate.tissue.solid import capsule
 from palpate.tissue.types import Array, doubles, ints, struct
 
-from . import coupling, mjstruct, safe_calls
+from . import coupling, safe_calls
 from .layout import FLAG, Numbers
+from .model import mjstruct
 
 _DATA = (
   *("contact", "ncon", "nefc", "nisland", "efc_type", "efc_J", "efc_J_rownnz", "efc_J_rowadr"),

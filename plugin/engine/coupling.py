@@ -20,8 +20,9 @@ from palpate.tissue.body import Body
 from palpate.tissue.kernels import Kernel, kernel
 from palpate.tissue.types import DIMS, doubles, floats, ints, scalar, struct, vector
 
-from . import layout, mjstruct
+from . import layout
 from .layout import NodalState, WindowState
+from .model import mjstruct
 
 _HUGE = 1e6  # more than any displacement, velocity or force of an organ [m, m/s, N]
 

@@ -7,9 +7,10 @@ import warp as wp
 from palpate.tissue import step
 from palpate.tissue.types import doubles, fill, ints, struct
 
-from . import coupling, inertia, layout, mjstruct
+from . import coupling, layout
 from .coupling import Crossing, Mujoco
 from .layout import FLAG, NodalState
+from .model import inertia, mjstruct
 
 
 @struct

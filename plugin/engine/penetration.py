@@ -13,8 +13,9 @@ import warp as wp
 from palpate.tissue.kernels import kernel
 from palpate.tissue.types import doubles, ints, struct
 
-from . import coupling, flexes, mjstruct
+from . import coupling
 from .layout import FLAG
+from .model import flexes, mjstruct
 
 _EVERY = 503  # steps between looks at what is inside; prime: not always where others do more too
 _OFTEN = 5  # steps between looks along the way of a fast tool

@@ -15,10 +15,11 @@ import mujoco
 import numpy as np
 from palpate.tissue.config import KEYS
 
-from . import change, contacts, mjstruct, signals, skin, state_size, workspace
+from . import change, contacts, signals, workspace
 from .forces import declare_attachments, declare_bonds, supports
 from .layout import FLAG, STAGE
-from .mjstruct import NAME, warn
+from .model import mjstruct, skin, state_size
+from .model.mjstruct import NAME, warn
 from .windows import windowed
 from .workspace import Workspace
 

@@ -8,7 +8,8 @@ from __future__ import annotations
 import _thread
 from collections.abc import Callable
 
-from . import mjstruct, signals
+from . import signals
+from .model import mjstruct
 
 # What says how many of something a constraint solver has.
 _COUNTS = ("ncon", "ne", "nf", "nl", "nefc", "nJ", "nA", "nisland", "nidof")

@@ -12,12 +12,11 @@ from palpate.tissue import body as bodies
 from palpate.tissue.body import Body
 from palpate.tissue.config import Config
 
-from . import contacts, coupling, declare, graphs, inertia, mjstruct, prepare, skin
+from . import contacts, coupling, graphs
 from .bind import bind
 from .coupling import Phases
 from .cutting.cutters import Cutters
 from .cutting.solid_cuts import Cuts, cuts_of
-from .declare import Declaration
 from .forces import declare_attachments, declare_bonds
 from .forces.attachments import Ties
 from .forces.cohesive_bonds import Bonds
@@ -25,6 +24,8 @@ from .forces.passive import Beside, Hold
 from .forces.relaxation import Creep
 from .forces.supports import Rests
 from .layout import FLAG, HEAD, STAGE
+from .model import declare, inertia, mjstruct, prepare, skin
+from .model.declare import Declaration
 from .penetration import Watch
 from .windows import declare_windows, windowed
 from .windows.model_lock import Turn

@@ -13,10 +13,10 @@ import warp as wp
 
 from . import config as configuration
 from .config import Config
+from .cutting.surface import Surface, WorkingCopy
 from .geometry import faces
 from .geometry.mesh import Mesh
 from .kernels import kernel
-from .surface import Surface, WorkingCopy
 from .types import CONSTANTS, Shape, Tissue, doubles, flags, ints, struct
 
 _OF_SHAPE = (

@@ -14,10 +14,10 @@ from . import device as devices
 from . import rows, solid, step
 from .body import Body
 from .config import Config
+from .cutting.surface import WorkingCopy
 from .geometry import mesh as topology
 from .geometry.mesh import Mesh
 from .order import LANES, addresses, banks, node_order, offset, to_slices
-from .surface import WorkingCopy
 from .types import NUMBERS, empty, zeros
 
 _BEND_MORE = 4  # entries that a cut may add to a row of the bending matrix

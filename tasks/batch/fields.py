@@ -61,7 +61,7 @@ class Common:
   bond_damage: floats("nworld", "nbond")  # 1 where it is free
   bond_force: floats("nworld", "nbond", 3)  # on the organ [N]
   bond_loss: floats("nworld", "nbond")  # that an action adds to the damage
-  # Of what cuts the organ, see `palpate.batch.fracture.Cutters`.
+  # Of what cuts the organ, see `palpate.batch.cutting.fracture.Cutters`.
   cutter_inside: floats("nworld", "ncutter")
   cutter_length: floats("nworld", "ncutter")  # [m]
   cutter_seat: floats("nworld", "ncutter", 3)  # [m]

@@ -9,7 +9,8 @@ import sys
 import mujoco
 import pytest
 import warp as wp
-from palpate.app import cli, doctor, press
+from palpate.app import cli, doctor
+from palpate.app.press import command
 
 VERSION = tuple(int(part) for part in mujoco.__version__.split(".")[:2])
 PROBE = '<body><joint name="j" type="slide" axis="0 0 -1"/><geom size=".01" mass="1"/></body>'
@@ -85,7 +86,7 @@ def test_without_a_command_it_says_what_is_missing():
 def test_loading_and_running_a_scene_says_nothing_and_leaves_no_log(tmp_path):
   code = (
     "import mujoco, palpate;"
-    f"model = mujoco.MjModel.from_xml_path({str(press.folder() / 'scene.xml')!r});"
+    f"model = mujoco.MjModel.from_xml_path({str(command.folder() / 'scene.xml')!r});"
     "data = mujoco.MjData(model); mujoco.mj_step(model, data, nstep=50)"
   )
   done = subprocess.run(
@@ -120,7 +121,7 @@ def test_loading_and_running_a_scene_says_nothing_and_leaves_no_log(tmp_path):
 )
 def test_a_wrong_option_is_one_line_and_exit_code_2(options, said, capsys, tmp_path, monkeypatch):
   monkeypatch.chdir(tmp_path)
-  words = options.replace("SCENE", str(press.folder() / "scene.xml")).split()
+  words = options.replace("SCENE", str(command.folder() / "scene.xml")).split()
   assert cli.main(["run", "press", "--out", str(tmp_path), *words]) == 2
   error = capsys.readouterr().err
   assert said in error
@@ -155,7 +156,7 @@ def test_a_wrong_scene_is_one_line_and_exit_code_2(scene, said, capsys, tmp_path
   ],
 )
 def test_a_probe_that_cannot_press_is_one_line_and_exit_code_2(actuator, said, capsys, tmp_path):
-  shutil.copy(press.folder() / "assets" / "organ.obj", tmp_path)
+  shutil.copy(command.folder() / "assets" / "organ.obj", tmp_path)
   hinge = '<body><joint name="hinge"/><geom size=".01"/></body>'
   (tmp_path / "scene.xml").write_text(
     '<mujoco><extension><plugin plugin="palpate.organ"/></extension><worldbody>'

@@ -8,7 +8,8 @@ import sys
 
 import pytest
 from palpate import tasks
-from palpate.app import cli, console, evaluate, panel, workers
+from palpate.app import cli, console, panel, workers
+from palpate.app.learn import evaluate
 from palpate.tasks import policy, score
 from palpate.tasks.recording import Recording
 

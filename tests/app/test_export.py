@@ -12,7 +12,7 @@ import sys
 import numpy as np
 import pytest
 from palpate.app import cli, console, live, options
-from palpate.app import export as command
+from palpate.app.learn import export as command
 from palpate.tasks import demonstrations, performer, policy, suite
 from palpate.tasks.recording import Recording
 

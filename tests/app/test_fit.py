@@ -13,8 +13,9 @@ import time
 import numpy as np
 import palpate
 import pytest
-from palpate.app import cli, fitting, indentation, measured
+from palpate.app import cli
 from palpate.app.console import CommandError
+from palpate.app.fit import indentation, least_squares, measured
 from palpate.tissue import config
 
 palpate.register()
@@ -117,7 +118,9 @@ def test_intervals_of_noisy_records_hold_the_truth(names, kept, count):
   starts = {"young": 5000.0, "damping": 0.01, "poisson": TRUE["poisson"]}
   for _ in range(count):
     record = true + 0.05 * true.max() * random.standard_normal(true.size)
-    found = fitting.fit([fitting.constant(n, starts[n]) for n in names], simulate, record)
+    found = least_squares.fit(
+      [least_squares.constant(n, starts[n]) for n in names], simulate, record
+    )
     assert set(found.kept) == kept
     hits += all(found.low[n] < TRUE[n] < found.high[n] for n in found.values)
     assert found.high["young"] < 1.3 * found.low["young"]
@@ -127,12 +130,12 @@ def test_intervals_of_noisy_records_hold_the_truth(names, kept, count):
 @pytest.mark.parametrize("start", [0.3, 0.45])
 def test_poisson_of_one_press_is_kept_wherever_it_starts(start):
   simulate = coarse("poisson")
-  free = [fitting.constant("young", 6000.0), fitting.constant("poisson", start)]
+  free = [least_squares.constant("young", 6000.0), least_squares.constant("poisson", start)]
   for noise in (0.0, 0.05):
     random = np.random.RandomState(1)
     true = simulate(TRUE)
     record = true + noise * true.max() * random.standard_normal(true.size)
-    assert fitting.fit(free, simulate, record).kept == {"poisson": pytest.approx(start)}
+    assert least_squares.fit(free, simulate, record).kept == {"poisson": pytest.approx(start)}
 
 
 def test_the_command_names_what_the_data_do_not_determine(tmp_path, capsys, record):
@@ -149,10 +152,10 @@ def test_the_command_names_what_the_data_do_not_determine(tmp_path, capsys, reco
 
 def test_a_press_that_depends_on_no_constant_is_refused():
   with pytest.raises(CommandError, match="the data determine none of damping, foundation"):
-    free = [fitting.constant("damping"), fitting.constant("foundation")]
-    fitting.fit(free, lambda _: np.ones(20), np.ones(20) + 0.01 * np.arange(20))
+    free = [least_squares.constant("damping"), least_squares.constant("foundation")]
+    least_squares.fit(free, lambda _: np.ones(20), np.ones(20) + 0.01 * np.arange(20))
   with pytest.raises(CommandError, match="2 rows for 2 constants"):
-    fitting.fit(free, lambda _: np.ones(2), np.ones(2))
+    least_squares.fit(free, lambda _: np.ones(2), np.ones(2))
 
 
 def test_intervals_hold_what_they_promise():
@@ -160,18 +163,18 @@ def test_intervals_hold_what_they_promise():
   hits = 0
   for _ in range(200):
     measured_force = 3.0 * x + 0.05 * random.standard_normal(200)
-    free = [fitting.constant("young", 2.0)]
-    one = fitting.fit(free, lambda v: v["young"] * x, measured_force, mesh=0.0, rough=0.0)
+    free = [least_squares.constant("young", 2.0)]
+    one = least_squares.fit(free, lambda v: v["young"] * x, measured_force, mesh=0.0, rough=0.0)
     hits += one.low["young"] < 3.0 < one.high["young"]
   assert 180 <= hits <= 199  # 95 %, and chance
 
 
 def test_any_number_of_the_tissue_may_be_sought():
-  known = fitting.allowed()
+  known = least_squares.allowed()
   assert {"young", "poisson", "damping", "foundation"} <= set(known)
   assert not {"tolerance", "iterations", "device", "mass"} & set(known)
   for name in known:
-    each = fitting.constant(name)
+    each = least_squares.constant(name)
     assert each.value(each.scaled(each.start)) == pytest.approx(each.start)
     assert 0 < each.start < each.high
 

@@ -15,7 +15,8 @@ import numpy as np
 import palpate
 import pytest
 import trimesh
-from palpate.app import cli, console, press, probe
+from palpate.app import cli, console
+from palpate.app.press import command, probe
 
 SHORT = ["--depth", "0.004", "--speed", "0.2", "--hold", "0.1"]
 ROWS = {
@@ -97,8 +98,8 @@ def test_the_organ_is_made_anew_with_the_nodes_and_seed_asked_for(tmp_path, caps
 
 def test_the_shipped_organ_is_what_the_code_makes():
   pytest.importorskip("skimage")
-  shipped = trimesh.load_mesh(press.folder() / "assets" / "organ.obj", process=False)
-  vertices, triangles = press.organ_mesh()
+  shipped = trimesh.load_mesh(command.folder() / "assets" / "organ.obj", process=False)
+  vertices, triangles = command.organ_mesh()
   made = trimesh.Trimesh(vertices, triangles, process=False)
   assert len(shipped.vertices) == len(made.vertices) == 1000
   assert shipped.is_watertight
@@ -108,7 +109,7 @@ def test_the_shipped_organ_is_what_the_code_makes():
 
 
 def test_force_on_the_probe_is_minus_that_on_the_organ():
-  model = mujoco.MjModel.from_xml_path(str(press.folder() / "scene.xml"))
+  model = mujoco.MjModel.from_xml_path(str(command.folder() / "scene.xml"))
   data = mujoco.MjData(model)
   organ = palpate.Organ(model, data, "organ")
   tool = probe.find(model, "probe")
@@ -123,9 +124,9 @@ def test_force_on_the_probe_is_minus_that_on_the_organ():
 
 
 def test_a_probe_that_meets_nothing_ends_with_1(tmp_path, capsys):
-  scene = (press.folder() / "press.xml").read_text()
+  scene = (command.folder() / "press.xml").read_text()
   scene = scene.replace('pos="0.007 -0.0124 0.0565"', 'pos="0.5 0 0.06"')
-  shutil.copytree(press.folder() / "assets", tmp_path / "assets")
+  shutil.copytree(command.folder() / "assets", tmp_path / "assets")
   (tmp_path / "scene.xml").write_text(scene)
   code, data = run(tmp_path, "--scene", str(tmp_path / "scene.xml"), "--speed", "1")
   assert code == 1

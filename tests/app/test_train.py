@@ -28,7 +28,7 @@ def train(folder, *words, lessons=0):
 def short(monkeypatch):
   monkeypatch.setattr(learning, "LEAST", 48)
   monkeypatch.setattr(networks, "CLONING", 20)
-  monkeypatch.setattr("palpate.app.train.ROUNDS", 2)
+  monkeypatch.setattr("palpate.app.learn.train.ROUNDS", 2)
 
 
 def learner(env, **settings):

@@ -2,7 +2,7 @@
 
 import numpy as np
 import warp as wp
-from palpate.batch import cylinder
+from palpate.batch.contact import cylinder
 
 RADIUS, HALF, CENTRE = 0.0025, 0.006, np.array([0.01, 0.02, 0.03])  # [m]
 COUNT = 200

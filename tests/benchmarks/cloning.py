@@ -19,8 +19,9 @@ import numpy as np
 from benchmarks import results
 from benchmarks.results import Row
 from benchmarks.runner import SEED, Bench, Case
-from palpate.app import cli, evaluate, options, workers
+from palpate.app import cli, options, workers
 from palpate.app.datasets.robomimic import FILE
+from palpate.app.learn import evaluate
 from palpate.tasks import policy
 
 TASK = "touch/standard"

@@ -120,7 +120,7 @@ def _page(case: Case) -> Row:
   path = shutil.which("chromium") or shutil.which("google-chrome")
   if path is None:
     raise BenchError("no chromium on this machine", code=1)
-  from palpate.app.live.server import Server
+  from palpate.app.live.page.server import Server
 
   with tempfile.TemporaryDirectory() as folder, sync_playwright() as play:
     server = Server(pathlib.Path(folder))

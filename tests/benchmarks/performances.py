@@ -7,7 +7,7 @@ import pathlib
 from collections.abc import Iterable, Iterator
 
 from palpate.app import panel
-from palpate.app.evaluate import Result
+from palpate.app.learn.evaluate import Result
 
 
 def arguments(parser: argparse.ArgumentParser):

@@ -15,7 +15,7 @@ import palpate
 from benchmarks import plots, results
 from benchmarks.runner import Bench, Case, Row
 from palpate import tasks
-from palpate.app import evaluate
+from palpate.app.learn import evaluate
 from palpate.tasks import policy, registry, score
 from palpate.tasks.metrics import Metrics
 

@@ -18,7 +18,7 @@ import palpate
 from benchmarks import plots, results
 from benchmarks.runner import Bench, Case, Row
 from palpate import models
-from palpate.engine import mjstruct
+from palpate.engine.model import mjstruct
 from palpate.models import markup
 from palpate.models import organs as anatomy
 

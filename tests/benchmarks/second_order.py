@@ -16,7 +16,7 @@ import numpy as np
 from benchmarks import compare, error, films, plots, results, scene
 from benchmarks.films import Film
 from benchmarks.runner import Bench, Case, Row
-from palpate.engine import inertia
+from palpate.engine.model import inertia
 from palpate.tissue import shape as making
 from reference import exact
 from scipy import sparse

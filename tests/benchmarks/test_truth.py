@@ -19,7 +19,7 @@ def test_hertz_and_the_other_finite_elements_agree():
 
 def pressed(edges, depths):
   """Returns ours over Hertz with the correction for the layer."""
-  from palpate.app.indentation import Test
+  from palpate.app.fit.indentation import Test
 
   edge = np.sqrt(truth.RADIUS * depths[-1]) / edges
   ours, _ = truth.held(Test("sphere", truth.RADIUS, truth.SIZE, edge=edge, step=0.002), depths)

@@ -185,8 +185,8 @@ def _row(kind: str, what: str, ours: float, reference: float, unit: str, **more)
 
 def held(test, depths) -> tuple[np.ndarray, int]:
   """Returns the force of a test held at these depths [N], (ndepth,), and its nodes."""
-  from palpate.app.indentation import Indentation
-  from palpate.app.measured import Record
+  from palpate.app.fit.indentation import Indentation
+  from palpate.app.fit.measured import Record
 
   go, stay = 0.1, 0.15  # [s]
   time, depth = [0.0], [0.0]
@@ -200,7 +200,7 @@ def held(test, depths) -> tuple[np.ndarray, int]:
 
 def _press(edges: float) -> list[Row]:
   """Returns rows of the block, against the closed form and the finite elements."""
-  from palpate.app.indentation import Test
+  from palpate.app.fit.indentation import Test
   from reference import elements
 
   edge = math.sqrt(RADIUS * DEPTHS[1]) / edges
@@ -282,7 +282,7 @@ def hertz(radius: float, depth: float, height: float) -> float:
 
 def _organ(name: str) -> list[Row]:
   """Returns rows of an organ as it ships and filled, against a solid that is fine at the probe."""
-  from palpate.app.indentation import Test
+  from palpate.app.fit.indentation import Test
 
   place = catalog.entry(name).ports[0].landmark
   test = Test("sphere", PROBE, organ=name, place=place, edge=FINE, step=5e-4)
@@ -302,8 +302,8 @@ def _organ(name: str) -> list[Row]:
 
 def _solid(test, name: str, depths: np.ndarray) -> np.ndarray:
   """Returns the force on a probe that is held in a solid of the catalogue's constants [N]."""
-  from palpate.app.indentation import Indentation
-  from palpate.app.measured import Record
+  from palpate.app.fit.indentation import Indentation
+  from palpate.app.fit.measured import Record
 
   go, stay = 0.2, 0.2
   time, depth = [0.0], [0.0]

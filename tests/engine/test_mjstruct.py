@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 import pytest
-from palpate.engine import mjstruct
+from palpate.engine.model import mjstruct
 
 
 def test_views_are_the_arrays_of_the_bindings(scenes):

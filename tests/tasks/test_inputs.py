@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from palpate.app import evaluate
+from palpate.app.learn import evaluate
 from palpate.tasks import metrics as functions
 from palpate.tasks.metrics import METRICS, Metrics, Unknown, metric
 from palpate.tasks.recorder import Recorder

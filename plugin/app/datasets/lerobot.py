@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from palpate.tasks.demonstrations import Demonstration, group, instruction
 
-from .. import film
+from ..draw import film
 from . import About
 
 _CHUNK = 1000  # files a folder

@@ -7,9 +7,9 @@ recording = live.Session(env, hand).run()
 """
 
 from .coupling import Link, Options
-from .device import Device, DeviceError, Reading
-from .devices import NAMES, device
-from .hand import Hand
+from .devices.device import Device, DeviceError, Reading
+from .devices.hand import Hand
+from .devices.registry import NAMES, device
 from .loop import Loop
 from .realtime_clock import Lateness, Pace
 from .session import Session

@@ -19,7 +19,7 @@ from collections.abc import Sequence
 import numpy as np
 from palpate.models.handle import Shaft, times
 
-from .device import Device, DeviceError, Four, Guard, Reading, Three
+from .devices.device import Device, DeviceError, Four, Guard, Reading, Three
 
 STILL: Three = (0.0, 0.0, 0.0)
 _SAME: Four = (1.0, 0.0, 0.0, 0.0)

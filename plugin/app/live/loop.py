@@ -14,7 +14,7 @@ from palpate.models.handle import Handle, Shaft
 from palpate.tasks.handle import spin
 
 from .coupling import Link, Options
-from .device import Device
+from .devices.device import Device
 from .realtime_clock import Pace, punctual
 
 

@@ -13,9 +13,9 @@ import numpy as np
 from palpate import Organ, models
 
 from .coupling import Link, Options
-from .device import Device
+from .devices.device import Device
 from .loop import Loop
-from .picture import Camera
+from .page.picture import Camera
 from .realtime_clock import Pace
 
 LIMIT, DAMAGE = 1.5, 3.0  # of the force bar [N]

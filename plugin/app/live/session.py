@@ -13,7 +13,7 @@ from palpate.tasks.handle import ROW
 from palpate.tasks.recording import Recording
 
 from .coupling import Link, Options
-from .device import Device
+from .devices.device import Device
 from .loop import axes, tick
 from .realtime_clock import Pace, punctual
 

@@ -17,13 +17,14 @@ from palpate.tissue import body as bodies
 from palpate.tissue.cutting import cut as cutting
 from palpate.tissue.cutting.path import Finder, check_points
 from palpate.tissue.cutting.refill import Refill
+from palpate.tissue.cutting.surface import WorkingCopy
 from palpate.tissue.geometry import fill
 from palpate.tissue.geometry import mesh as topology
 from palpate.tissue.geometry.mesh import Mesh
-from palpate.tissue.surface import WorkingCopy
 
-from .. import coupling, flexes, graphs, mjstruct
+from .. import coupling, graphs
 from ..bind import bind
+from ..model import flexes, mjstruct
 from ..windows import model_lock
 from .tear import Tear
 

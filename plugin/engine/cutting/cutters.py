@@ -18,10 +18,11 @@ from palpate.tissue.geometry.mesh import Mesh
 from palpate.tissue.step import SCHEMES
 from palpate.tissue.types import Views, doubles, fill, ints, struct
 
-from .. import coupling, flexes, mjstruct
+from .. import coupling
 from ..forces import declare_attachments
 from ..forces.passive import Beside, Bodies, Input, Nodes, base, nodes, solver
 from ..layout import BLADE, LAW, TRAIL
+from ..model import flexes, mjstruct
 from . import solid_paths
 from .cuts import Report
 from .electrosurgery import Current

@@ -10,12 +10,12 @@ from __future__ import annotations
 
 import numpy as np
 from palpate.tissue.cutting import path as paths
+from palpate.tissue.cutting.surface import WorkingCopy
 from palpate.tissue.geometry.mesh import Mesh
-from palpate.tissue.surface import WorkingCopy
 
-from .. import mjstruct
 from ..forces.attachments import motion
 from ..layout import BLADE, BOND
+from ..model import mjstruct
 
 _SPARK = 0.001  # how far from its surface, in air and tissue, a current acts [m]
 

@@ -14,12 +14,13 @@ from palpate.tissue.cutting import solid_cut
 from palpate.tissue.cutting.cut import Motion
 from palpate.tissue.cutting.path import Finder
 from palpate.tissue.cutting.resolid import SolidRefill
+from palpate.tissue.cutting.surface import WorkingCopy
 from palpate.tissue.geometry import faces
 from palpate.tissue.geometry import mesh as topology
 from palpate.tissue.geometry.mesh import Mesh
-from palpate.tissue.surface import WorkingCopy
 
-from .. import coupling, flexes
+from .. import coupling
+from ..model import flexes
 from . import cuts
 from .cuts import Cuts
 from .walls import Walls

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from palpate.tissue.geometry import mesh as topology
 
-from .. import flexes, mjstruct
+from ..model import flexes, mjstruct
 
 _COUNTS = ("flex_vertnum", "flex_elemnum", "flex_shellnum", "flex_bvhnum", "flex_bvhadr")
 

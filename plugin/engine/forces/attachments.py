@@ -17,7 +17,8 @@ from palpate.tissue.geometry.mesh import Mesh
 from palpate.tissue.step import SCHEMES
 from palpate.tissue.types import DIMS, doubles, fill, ints, struct, vector
 
-from .. import coupling, mjstruct
+from .. import coupling
+from ..model import mjstruct
 from .passive import Beside, Bodies, Input, Nodes, base, may_move, nodes, solver
 from .transfer import Grip, Held, pairs
 

@@ -14,8 +14,9 @@ from palpate.tissue.reading import Law
 from palpate.tissue.step import SCHEMES
 from palpate.tissue.types import doubles, fill, ints, struct
 
-from .. import coupling, mjstruct
+from .. import coupling
 from ..layout import BOND
+from ..model import mjstruct
 from .passive import Beside, Bodies, Input, Nodes, base, may_move, nodes, solver
 from .transfer import Grip, Spots
 

@@ -7,7 +7,7 @@ from palpate.tissue.config import OWN
 from palpate.tissue.geometry import mesh as topology
 from scipy.spatial import KDTree
 
-from .. import flexes, inertia, mjstruct
+from ..model import flexes, inertia, mjstruct
 from . import supports
 from .attachments import TO_OWN_MOTION, TO_POINT, Group, is_mocap, motion
 from .transfer import Grip

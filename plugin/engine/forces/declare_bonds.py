@@ -8,8 +8,9 @@ from palpate.tissue.geometry import mesh as topology
 from palpate.tissue.reading import Law
 from palpate.tissue.types import doubles, fill, ints, struct
 
-from .. import coupling, flexes, mjstruct
+from .. import coupling
 from ..layout import GEOM
+from ..model import flexes, mjstruct
 from . import declare_attachments, transfer
 from .attachments import motion
 from .cohesive_bonds import ON_ORGAN, Group

@@ -2,7 +2,7 @@
 
 `Beside` is what ties, bonds, supports and relaxation are to a step. All of them run on the CPU,
 over an organ's `Nodes` and its solver's `Input`, and cost nothing where they are not used. In a
-batch on a GPU the same kernels act in all worlds, see `palpate.batch.forces`.
+batch on a GPU the same kernels act in all worlds, see `palpate.batch.forces.base`.
 """
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
@@ -15,8 +15,9 @@ from palpate.tissue import body as bodies
 from palpate.tissue.kernels import Kernel
 from palpate.tissue.types import doubles, fill, floats, ints, struct, vector
 
-from .. import coupling, mjstruct
+from .. import coupling
 from ..layout import TAIL
+from ..model import mjstruct
 
 
 @struct

@@ -10,7 +10,8 @@ import warp as wp
 from palpate.tissue.geometry import mesh as topology
 from palpate.tissue.types import doubles, fill, ints, struct
 
-from .. import coupling, flexes, mjstruct
+from .. import coupling
+from ..model import flexes, mjstruct
 from .passive import Beside, Bodies, Input, Nodes, may_move, nodes, solver
 
 # Stiffness of the springs, by area, in Young's moduli an edge: an organ of that size sinks in by a

@@ -8,9 +8,9 @@ from palpate.tissue.config import Config
 from palpate.tissue.geometry import fill
 from palpate.tissue.geometry import mesh as topology
 
-from .. import declare, flexes, mjstruct
-from ..declare import Declaration, Windows
 from ..layout import MAX_GEOMS, MAX_WINDOWS
+from ..model import declare, flexes, mjstruct
+from ..model.declare import Declaration, Windows
 
 _NEAR = 0.1  # of its size: closer than that to an organ, a flex is beside it
 

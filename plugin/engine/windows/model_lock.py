@@ -21,8 +21,8 @@ from typing import Any
 
 import numpy as np
 
-from .. import mjstruct
-from ..declare import Windows
+from ..model import mjstruct
+from ..model.declare import Windows
 
 _marks = map(float, itertools.count(time.time_ns() >> 10))  # never the same twice
 _locks: weakref.WeakValueDictionary[int, Any] = weakref.WeakValueDictionary()  # by model address

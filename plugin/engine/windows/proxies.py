@@ -10,9 +10,10 @@ from palpate.tissue import step
 from palpate.tissue.kernels import aim
 from palpate.tissue.types import doubles, fill, flags, floats, ints, longs, struct
 
-from .. import coupling, mjstruct
+from .. import coupling
 from ..coupling import Mujoco
 from ..layout import FLAG, Inbox, Outbox, WindowState
+from ..model import mjstruct
 
 # Nodes within this many mean edges of a tool may be in its window.
 _REACH = 4.0

@@ -20,8 +20,9 @@ import warp as wp
 from palpate.tissue import step
 from palpate.tissue.types import Views
 
-from .. import coupling, inertia, layout, mjstruct, prepare, safe_calls
+from .. import coupling, layout, safe_calls
 from ..layout import TAIL, Inbox, Motion, Outbox, WindowState
+from ..model import inertia, mjstruct, prepare
 from . import nodes, proxies
 from .resident import Resident
 

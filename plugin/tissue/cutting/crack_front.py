@@ -7,8 +7,8 @@ import warp as wp
 
 from ..geometry.mesh import Mesh
 from ..kernels import kernel
-from ..surface import WorkingCopy, host_views
 from ..types import CONSTANTS, allocate, doubles, ints, longs, struct
+from .surface import WorkingCopy, host_views
 
 # In edges: which come apart at once at least, and do not yet behind the blade; between places that
 # are looked at; what a vertex may be farther from the path for an edge that is opened more.

@@ -18,9 +18,9 @@ from .. import config as configuration
 from ..config import Config
 from ..geometry.mesh import Mesh, lengths
 from ..kernels import kernel
-from ..surface import Surface, WorkingCopy, host_views
 from ..types import CONSTANTS, allocate, doubles, flags, ints, longs, struct
 from .path import check_points
+from .surface import Surface, WorkingCopy, host_views
 
 # Why nothing was cut, and what a path's samples are apart at most [edges], as in cutting/path.h.
 _DONE, _NO_ROOM, _OFF, _SHORT, _PINNED = range(5)

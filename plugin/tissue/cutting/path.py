@@ -10,9 +10,9 @@ import warp as wp
 
 from ..geometry.mesh import Mesh, lengths
 from ..kernels import aim, kernel
-from ..surface import WorkingCopy
 from ..types import CONSTANTS, doubles, ints, longs, struct
 from .crack_front import Stops
+from .surface import WorkingCopy
 
 
 @struct

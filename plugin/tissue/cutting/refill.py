@@ -14,7 +14,7 @@ from ..body import Body, arrays
 from ..config import Config
 from ..geometry.mesh import Mesh
 from ..rows import NAMES, Rows
-from ..surface import WorkingCopy
+from .surface import WorkingCopy
 
 
 class Refill:

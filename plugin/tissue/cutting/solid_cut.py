@@ -19,11 +19,11 @@ from ..geometry.mesh import Mesh, distinct, lengths
 from ..kernels import aim, kernel
 from ..order import addresses
 from ..step import OWN_SHARE
-from ..surface import host_views
 from ..types import CONSTANTS, allocate, doubles, flags, ints, longs, struct
 from .cut import Apart, Motion, listed
 from .cut_surface import sweep
 from .path import Finder
+from .surface import host_views
 
 _APART, _NOTHING, _HELD, _FULL = range(4)  # how it went, as in cutting/solid/solid_cut.h
 _FOUND = (

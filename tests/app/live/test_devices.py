@@ -9,9 +9,9 @@ import types
 import numpy as np
 import pytest
 from palpate.app import live
-from palpate.app.live import bridge
-from palpate.app.live.haptic import quaternion
-from palpate.app.live.input_devices import Desk
+from palpate.app.live.devices import bridge
+from palpate.app.live.devices.haptic import quaternion
+from palpate.app.live.devices.relative import Desk
 
 
 def test_a_desk_adds_up_what_it_is_told():

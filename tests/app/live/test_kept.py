@@ -6,7 +6,7 @@ import pathlib
 import threading
 
 import pytest
-from palpate.app.live import worker
+from palpate.app.live.page import worker
 from palpate.app.trainee import keeping
 from palpate.app.trainee.record import Record
 from palpate.tasks import limits

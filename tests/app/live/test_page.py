@@ -9,7 +9,7 @@ import pytest
 from palpate.tasks.recording import Recording
 
 pytest.importorskip("websockets")
-from palpate.app.live.server import Server
+from palpate.app.live.page.server import Server
 
 ANSWER = 90.0  # that a busy machine may take [s]
 FLAGS = ("--no-sandbox", "--enable-unsafe-swiftshader")

@@ -17,7 +17,7 @@ from palpate.tasks import episode
 from palpate.tasks.recording import Recording
 
 pytest.importorskip("websockets")
-from palpate.app.live.server import Server
+from palpate.app.live.page.server import Server
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 

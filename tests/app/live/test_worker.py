@@ -11,7 +11,7 @@ import time
 import numpy as np
 import palpate
 import pytest
-from palpate.app.live.worker import Worker
+from palpate.app.live.page.worker import Worker
 from palpate.tasks.recording import Recording
 
 ANSWER = 120.0  # that a busy machine may take [s]

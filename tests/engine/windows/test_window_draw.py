@@ -9,7 +9,8 @@ import mujoco
 import numpy as np
 import palpate
 import pytest
-from palpate.app import cli, figures
+from palpate.app import cli
+from palpate.app.press import figures
 from scenes import drive, probed
 
 CAMERA = '<camera name="side" pos="0 -.2 .12" xyaxes="1 0 0 0 .5 .9"/>'

@@ -10,9 +10,9 @@ from palpate.tissue.config import Config
 from palpate.tissue.cutting import solid_cut
 from palpate.tissue.cutting.cut import Motion
 from palpate.tissue.cutting.path import Finder, distance
+from palpate.tissue.cutting.surface import WorkingCopy
 from palpate.tissue.geometry import faces, fill
 from palpate.tissue.geometry import mesh as topology
-from palpate.tissue.surface import WorkingCopy
 
 
 @functools.cache

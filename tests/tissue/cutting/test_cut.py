@@ -5,11 +5,11 @@ import pytest
 import scenes
 from palpate.tissue import body as bodies
 from palpate.tissue import device as devices
-from palpate.tissue import energy, shape, surface
+from palpate.tissue import energy, shape
 from palpate.tissue.config import Config
 from palpate.tissue.cutting import cut as cutting
 from palpate.tissue.cutting import path as paths
-from palpate.tissue.cutting import refill
+from palpate.tissue.cutting import refill, surface
 from palpate.tissue.geometry import mesh as topology
 
 SPARE = 120

@@ -1,0 +1,113 @@
+"""Pictures and films: drawn without a screen, and written in this one place."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import pathlib
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..console import CommandError, need, writing
+
+if TYPE_CHECKING:
+  import mujoco
+
+FILMS = (".mp4", ".gif")
+PICTURES = (".png",)
+_FPS = 25  # of the laparoscope
+
+
+@contextlib.contextmanager
+def write(
+  path: pathlib.Path, fps: float, encoding: Sequence[str] = ()
+) -> Iterator[Callable[[np.ndarray], None]]:
+  """Gives a function that takes the frames of a film, or the picture of a .png.
+
+  Args:
+    path: what to write; its suffix says how, see `FILMS` and `PICTURES`
+    fps: frames a second
+    encoding: words for ffmpeg, in place of a good quality
+  """
+  suffix = path.suffix.lower()
+  check(suffix)
+  import imageio.v2 as imageio
+
+  with writing(path):
+    if suffix in PICTURES:
+      yield lambda image: imageio.imwrite(path, image)
+      return
+    options: dict[str, Any] = {"duration": 1000 / fps, "loop": 0}
+    if suffix == ".mp4":
+      options = {"fps": fps, "macro_block_size": 2, "quality": 8}
+      if encoding:
+        options |= {"quality": None, "output_params": list(encoding)}
+    with imageio.get_writer(path, **options) as writer:
+      yield writer.append_data
+
+
+@contextlib.contextmanager
+def laparoscope(path: pathlib.Path, size: tuple[int, int]) -> Iterator[Callable[[Any], None]]:
+  """Gives a function that takes the laparoscope's picture of an environment, for a film.
+
+  Args:
+    path: of the film
+    size: width and height [pixels]
+  """
+  from palpate.tasks.scenes import CAMERA
+
+  due = -math.inf
+  with write(path, _FPS) as frame:
+
+    def shoot(env: Any) -> None:
+      nonlocal due
+      if env.physics.time() >= due - 1e-9:
+        due = env.physics.time() + 1 / _FPS
+        camera = env.physics.model.ptr.camera(CAMERA).id
+        frame(env.physics.render(size[1], size[0], camera_id=camera))
+
+    yield shoot
+
+
+def of_recording(recording: Any, size: tuple[int, int]) -> bytes:
+  """Returns the MP4 of a recorded exercise, run anew; CommandError if it comes out differently."""
+  from palpate.tasks import episode
+
+  check(".mp4")
+  with tempfile.TemporaryDirectory() as folder:
+    path = pathlib.Path(folder) / "film.mp4"
+    with laparoscope(path, size) as shoot:
+      again = episode.replay(recording, shoot)
+    if changed := episode.differences(recording, again):
+      raise CommandError(f"no film: the replay differs in {', '.join(changed)}", code=1)
+    return path.read_bytes()
+
+
+def check(suffix: str):
+  """Raises CommandError where what writes such files is not installed."""
+  need("video", "imageio", *(["imageio_ffmpeg"] if suffix == ".mp4" else []))
+
+
+@contextlib.contextmanager
+def renderer(model: mujoco.MjModel, width: int, height: int) -> Iterator[mujoco.Renderer]:
+  """Gives a renderer of pictures [pixels] that needs no screen."""
+  import mujoco
+
+  model.vis.global_.offwidth = max(model.vis.global_.offwidth, width)
+  model.vis.global_.offheight = max(model.vis.global_.offheight, height)
+  try:
+    # Edges of surfaces may be drawn one by one.
+    made = mujoco.Renderer(model, height, width, max_geom=10000 + model.nflexedge)
+  except Exception as error:  # each backend of OpenGL has its own
+    raise CommandError(
+      f"no way to draw without a screen ({type(error).__name__}: {error}); install libegl1 or "
+      "libosmesa6 and set MUJOCO_GL=egl or osmesa; see palpate doctor",
+      code=1,
+    ) from None
+  try:
+    yield made
+  finally:
+    made.close()

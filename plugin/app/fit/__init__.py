@@ -1,0 +1,1 @@
+"""`palpate fit`: constants of tissue from what was measured."""

@@ -1,0 +1,1 @@
+"""Policies: trained, evaluated, and the data that others learn from."""

@@ -1,0 +1,187 @@
+"""Lessons for `palpate train`: an expert teaches, in processes beside."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import pathlib
+import time
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import palpate
+
+from .. import options, workers
+from ..console import CommandError, Interrupt, Progress, writing
+
+if TYPE_CHECKING:
+  from palpate.tasks.batch.networks import Networks
+  from palpate.tasks.lessons import Lesson
+
+LESSONS = "lessons.npz"
+_ROWS, _ENDS = ("seen", "meant", "done", "taught", "returns"), ("outcome", "alone")  # of a lesson
+_FIRST = 10_000_000  # seed of the first lesson
+_NOISE = 0.2  # SD of what shakes the expert in every other lesson, at most [-]
+_TURN = 60  # control steps of the policy's turns in every other lesson, at most
+_ENOUGH = 0.95  # share of the rest that it brings to a good end alone
+
+
+@dataclasses.dataclass(frozen=True)
+class Job:
+  """A lesson to be given.
+
+  Attributes:
+    task: such as "touch/easy"
+    task_kwargs: options as JSON
+    names: of what is observed
+    seed: of the episode
+    gamma: discount [-]
+    noise: see `lessons.give`
+    policy: file of who takes turns with the expert, or empty
+    most: see `lessons.give`
+  """
+
+  task: str
+  task_kwargs: str
+  names: tuple[str, ...]
+  seed: int
+  gamma: float
+  noise: float = 0.0
+  policy: str = ""
+  most: int | None = None
+
+
+def give(job: Job) -> Lesson:
+  """Returns a lesson, in a worker's process."""
+  palpate.register()
+  from palpate.tasks import lessons, policy
+
+  env = options.environment(job.task, job.task_kwargs)
+  learner = policy.load(job.policy) if job.policy else None
+  return lessons.give(env, job.names, job.seed, job.gamma, job.noise, learner, job.most)
+
+
+class School:
+  """Rounds of lessons of an exercise: first of the expert alone, then where the policy is.
+
+  Attributes:
+    lessons: of all rounds so far
+    rounds: that are done
+    seconds: spent on them
+    alone: share that the policy brought to a good end without help where it was let to, last [-]
+  """
+
+  def __init__(self, folder: pathlib.Path, task: str, task_kwargs: Mapping[str, Any], seed: int):
+    """Opens a folder, which may have lessons already."""
+    self.path, self.task, self.seed = folder / LESSONS, task, seed
+    self.task_kwargs = json.dumps({"surroundings": "none", **task_kwargs})  # it draws nothing
+    self.lessons: list[Lesson] = []
+    self.rounds, self.seconds, self.alone = 0, 0.0, 0.0
+    if self.path.exists():
+      self._load()
+
+  @property
+  def enough(self) -> bool:
+    """Whether the policy needs no more lessons."""
+    return self.alone >= _ENOUGH
+
+  def teach(
+    self,
+    networks: Networks,
+    crew: workers.Workers,
+    count: int,
+    gamma: float,
+    interrupt: Interrupt,
+  ) -> bool:
+    """Gives a round of lessons, which the networks learn from; returns whether it is whole.
+
+    Args:
+      networks: that learn; the policy beside the lessons is theirs
+      crew: who gives lessons
+      count: of lessons
+      gamma: discount [-]
+      interrupt: once seen, the round is given up
+    """
+    start, progress, given = time.perf_counter(), Progress(), []
+    jobs = self._jobs(count, gamma)
+    for lesson in workers.parallel(give, jobs, crew, interrupt):
+      given.append(lesson)
+      progress.show(f"round {self.rounds + 1}: {len(given)} of {count} lessons")
+    progress.clear()
+    if interrupt.seen:
+      return False
+    whole = [lesson for lesson in given if lesson is not None]
+    self.lessons += whole
+    if not self.lessons:
+      raise CommandError(f"{self.task}: no lesson was given: the workers died", code=1)
+    error = math.nan  # where it needed no help, or not yet
+    if any(lesson.taught.any() for lesson in self.lessons):
+      error = networks.learn(self.lessons, lambda: interrupt.seen)
+    self.rounds += 1
+    self.seconds += time.perf_counter() - start
+    wins = sum(lesson.outcome == "success" for lesson in whole)
+    free = [lesson for lesson, job in zip(given, jobs, strict=True) if lesson and _free(job)]
+    self.alone = sum(each.alone and each.outcome == "success" for each in free) / max(len(free), 1)
+    steps = sum(int(lesson.taught.sum()) for lesson in self.lessons)
+    told = f"; {100 * self.alone:.0f} % of {len(free)} alone" if free else ""
+    print(
+      f"lessons, round {self.rounds}: {wins} of {count} were a success{told}; {steps} steps to "
+      f"learn from, error {error:.3f}, {self.seconds:.0f} s",
+      flush=True,
+    )
+    return not interrupt.seen
+
+  def _jobs(self, count: int, gamma: float) -> list[Job]:
+    from palpate.tasks.batch.learning import POLICY
+
+    random = np.random.RandomState(self.seed + self.rounds)
+    first = _FIRST + (self.seed * 100 + self.rounds) * 10_000
+    env: Any = options.environment(self.task, self.task_kwargs)
+    jobs = []
+    for k in range(count):
+      job = Job(self.task, self.task_kwargs, tuple(env.observation_spec()), first + k, gamma)
+      if k % 2:
+        job = dataclasses.replace(job, noise=float(random.uniform(0, _NOISE)))
+      # Of an easier exercise's policy alone it would learn what was missing, and forget the rest.
+      if (self.path.parent / POLICY).exists() and (self.rounds or not k % 2):
+        turn = _TURN if k % 2 else None
+        job = dataclasses.replace(job, policy=str((self.path.parent / POLICY).resolve()), most=turn)
+      jobs.append(job)
+    return jobs
+
+  # The file.
+
+  def save(self) -> None:
+    """Writes the lessons, whole or not at all."""
+    from palpate.tasks.files import replacing
+
+    every: dict[str, Any] = {
+      name: np.concatenate([getattr(lesson, name) for lesson in self.lessons]) for name in _ROWS
+    }
+    every |= {name: np.array([getattr(each, name) for each in self.lessons]) for name in _ENDS}
+    every["lengths"] = np.array([len(lesson.done) for lesson in self.lessons])
+    about = [self.task, self.task_kwargs, self.rounds, self.seconds, self.alone]
+    with writing(self.path), replacing(self.path, "wb") as file:
+      np.savez(file, allow_pickle=False, about=np.array(json.dumps(about)), **every)
+
+  def _load(self) -> None:
+    from palpate.tasks.lessons import Lesson
+
+    try:
+      with np.load(self.path, allow_pickle=False) as file:
+        task, _, self.rounds, self.seconds, self.alone = json.loads(str(file["about"][()]))
+        ends = np.cumsum(file["lengths"])[:-1]
+        parts = [np.split(file[name], ends) for name in _ROWS]
+        parts += [file[name].tolist() for name in _ENDS]
+    except Exception as error:
+      raise CommandError(f"{self.path}: {error}") from None
+    if task != self.task:
+      raise CommandError(f"{self.path} is of {task}, not of {self.task}")
+    self.lessons = [Lesson(*row) for row in zip(*parts, strict=True)]
+
+
+def _free(job: Job) -> bool:
+  """Returns whether a policy was let to do all of a lesson."""
+  return bool(job.policy) and job.most is None

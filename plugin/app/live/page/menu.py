@@ -1,0 +1,125 @@
+"""What a page may ask for: the choices it is offered, and the check of what it sends."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ...trainee.record import check_name
+
+NODES = (250, 500, 1000, 2000, 4000)  # of an exercise
+SPEEDS = (0.1, 0.25, 0.5, 1.0)
+SCHEMES = ("implicit", "midpoint", "neumann", "explicit")
+STEPS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0)  # [ms]
+OTHER = ("", "keyboard", "pad")  # what a page can have for the left hand; none by default
+
+
+def offer(device: str) -> dict[str, Any]:
+  """Returns what a page offers, JSON.
+
+  Args:
+    device: that the program was started with
+  """
+  from palpate import models
+  from palpate.tasks import suite
+
+  return {
+    "type": "menu",
+    "tasks": {f"{d}/{t}": suite.summary(d, t) for d, t in suite.ALL_TASKS},
+    "two": ["/".join(pair) for pair in suite.BIMANUAL],
+    "nodes": NODES,
+    "speeds": SPEEDS,
+    "device": device,
+    "devices": devices(device),
+    "lefts": lefts(device),
+    "organs": models.NAMES,
+    "meshes": meshes(),
+    "schemes": SCHEMES,
+    "steps": STEPS,
+    "instruments": models.INSTRUMENTS,
+  }
+
+
+def devices(device: str) -> tuple[str, ...]:
+  """Returns the names of the devices that may be chosen; the first is the page itself."""
+  from ..devices import registry as known
+
+  own = () if known.on_page(device) else (device,)
+  others = (name for name in known.NAMES if not known.on_page(name))
+  return ("page", *dict.fromkeys((*own, *others)))
+
+
+def lefts(device: str) -> tuple[str, ...]:
+  """Returns the names of what may be in the left hand."""
+  return (*OTHER, *devices(device)[1:])
+
+
+def meshes() -> tuple[str, ...]:
+  """Returns the resolutions of an organ in free practice."""
+  from palpate import models
+
+  return (*(f"{n} nodes" for n in models.RESOLUTIONS), *(f"{n} x {n}" for n in models.GRIDS))
+
+
+def exercise(message: dict[str, Any], device: str) -> dict[str, Any]:
+  """Returns the exercise that a message asks for; ValueError names what is wrong with it."""
+  from palpate.tasks import suite
+
+  task = message.get("task")
+  if not isinstance(task, str):
+    raise ValueError(f"task is {task!r}, expected a name")
+  person = message.get("person", "")
+  person = check_name(person, "person") if person != "" else ""
+  seed = message.get("seed", 0)
+  if type(seed) is not int or not 0 <= seed < 2**31:
+    raise ValueError(f"seed is {seed!r}, expected a whole number in [0, 2^31)")
+  pair = suite.split(task)
+  left = choice("left", message.get("left", ""), lefts(device)) if pair in suite.BIMANUAL else None
+  if left == "":
+    raise ValueError(
+      f"task is {task!r}, which takes two hands, left is '', expected one of {lefts(device)[1:]}"
+    )
+  return _common(message) | {
+    "type": "start",
+    "task": "/".join(pair),
+    "person": person,
+    "seed": seed,
+    "nodes": choice("nodes", message.get("nodes"), (None, *NODES)),
+    "left": left or "",
+    "assessment": message.get("assessment") is True,
+  }
+
+
+def practice(message: dict[str, Any], device: str) -> dict[str, Any]:
+  """Returns the free practice that a message asks for; ValueError names what is wrong with it."""
+  from palpate import models
+
+  def chosen(name: str, default: Any, choices: tuple) -> Any:
+    return choice(name, message.get(name, default), choices)
+
+  mesh = chosen("mesh", "1000 nodes", meshes())
+  count, _, kind = mesh.partition(" ")
+  return _common(message) | {
+    "type": "practice",
+    "organ": chosen("organ", "liver", models.NAMES),
+    "mesh": mesh,
+    "size": {"nodes" if kind == "nodes" else "grid": int(count)},
+    "scheme": chosen("scheme", "implicit", SCHEMES),
+    "step": chosen("step", 1.0, STEPS),
+    "instrument": chosen("instrument", "probe", models.INSTRUMENTS),
+    "left": chosen("left", "", lefts(device)),
+  }
+
+
+def _common(message: dict[str, Any]) -> dict[str, Any]:
+  scale = message.get("scale", 1.0)
+  if type(scale) not in (int, float) or not 0.1 <= scale <= 5:
+    raise ValueError(f"scale is {scale!r}, expected a number in [0.1, 5]")
+  speed = choice("speed", message.get("speed", 1.0), SPEEDS)
+  return {"scale": float(scale), "speed": speed}
+
+
+def choice(name: str, value: Any, choices: tuple) -> Any:
+  """Returns a value that is one of the choices; ValueError lists them."""
+  if isinstance(value, bool) or value not in choices:
+    raise ValueError(f"{name} is {str(value)[:40]!r}, expected one of {choices}")
+  return value

@@ -1,0 +1,348 @@
+"""The process of one page: its exercises run here, and nothing of another's.
+
+Messages to here are JSON; from here JSON (`T` before it) or frames of a picture (`B`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import pathlib
+import queue
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from multiprocessing.connection import Connection
+from typing import Any
+
+import palpate
+
+from ...trainee.keeping import Keeping, references
+from ..coach import Coach, card
+from ..coupling import Options
+from ..devices import registry
+from ..devices.device import Device, DeviceError
+from ..devices.relative import Desk
+from ..keep import Finished
+from ..practice import DAMAGE, LIMIT, Practice
+from ..realtime_clock import first
+from ..session import Session
+from . import ghost, menu
+from .picture import Camera
+
+_STATUS = 0.1  # between words about the exercise [s]
+_WORDS = (
+  "hand", "start", "practice", "scheme", "device", "ghost", "keep", "pause", "speed", "stop",
+)  # fmt: skip
+
+
+def main(conn: Connection, folder: str, device: str, kept: Keeping | None = None) -> None:
+  """Serves one page until it says `end`.
+
+  Args:
+    conn: to the server
+    folder: where recordings are kept
+    device: name of the device; one of the page's own is moved by its messages
+    kept: the record that recordings go to, None for the folder
+  """
+  palpate.register()
+  try:
+    Worker(conn, pathlib.Path(folder), device, kept).serve()
+  except KeyboardInterrupt:
+    pass
+
+
+class Worker:
+  """Runs the exercises that a page asks for, one after another."""
+
+  def __init__(
+    self, conn: Connection, folder: pathlib.Path, device: str, kept: Keeping | None = None
+  ):
+    """Takes the arguments of `main`."""
+    self._record = kept.begin() if kept else None
+    self._references = self._record.references if self._record else references(None)
+    self._conn, self._folder, self._own = conn, folder, device
+    self._device = "page" if registry.on_page(device) else device
+    self._jobs: queue.SimpleQueue[dict | None] = queue.SimpleQueue()
+    self._now: Session | Practice | None = None  # what runs
+    self._job: dict[str, Any] = {}
+    self._desks: dict[str, Desk] = {}  # hands on the page, by the message's `which`
+    self._lock = threading.Lock()  # of the connection
+    self._frame: bytes | None = None
+    self._fresh = threading.Event()
+    self._camera: Camera | None = None
+    self._unkept: Finished | None = None
+    self._expert: subprocess.Popen | None = None
+    self._ended = False
+
+  def serve(self) -> None:
+    """Works until the end."""
+    for target in (self._receive, self._show):
+      threading.Thread(target=target, daemon=True).start()
+    self._tell(menu.offer(self._own))
+    while (job := self._jobs.get()) is not None:
+      if not self._jobs.empty():  # something else was asked for since
+        continue
+      try:
+        self._job = job
+        self._exercise(job) if job["type"] == "start" else self._practise(job)
+      except (ValueError, TypeError, OSError, DeviceError, RuntimeError) as error:
+        self._fault(error)
+        self._tell({"type": "idle"})
+    if self._unkept is not None and not self._unkept.keep(self._folder, self._record):
+      print(f"palpate: a recording is lost: {self._unkept.fault}", file=sys.stderr)
+
+  # Words.
+
+  def _tell(self, message: dict[str, Any]) -> None:
+    with self._lock:
+      if not self._ended:
+        self._conn.send_bytes(b"T" + json.dumps(message).encode())
+
+  def _fault(self, error: Exception | str) -> None:
+    self._tell({"type": "error", "text": " ".join(str(error).split())})
+
+  def _receive(self) -> None:
+    """Takes messages, in a thread of its own."""
+    first(1)  # behind the loop's, before other programs: the loop may wait for it
+    while not self._ended:
+      try:
+        message = json.loads(self._conn.recv_bytes())
+        self._obey(message)
+      except (EOFError, OSError):
+        self._end()
+      except (ValueError, TypeError, KeyError, DeviceError) as error:
+        self._fault(error)
+
+  def _obey(self, message: Any) -> None:
+    kind = message.get("type") if isinstance(message, dict) else None
+    if kind == "end":
+      self._end()
+    elif kind in _WORDS:
+      getattr(self, f"_on_{kind}")(message)
+    else:
+      raise ValueError(f"message is {str(message)[:60]!r}, expected {', '.join(_WORDS)}")
+
+  def _on_hand(self, message: dict[str, Any]) -> None:
+    desk = self._desks.get(message.get("which", "right"))
+    if desk is not None:
+      desk.feed(**{k: message[k] for k in ("move", "rate", "buttons", "jaw", "at") if k in message})
+
+  def _on_start(self, message: dict[str, Any]) -> None:
+    self._put(menu.exercise(message, self._own))
+
+  def _on_practice(self, message: dict[str, Any]) -> None:
+    self._put(menu.practice(message, self._own))
+
+  def _put(self, job: dict[str, Any]) -> None:
+    self._stop()
+    if self._expert is not None:
+      self._expert.kill()
+    self._jobs.put(job)
+
+  def _on_scheme(self, message: dict[str, Any]) -> None:
+    scheme = menu.choice("scheme", message.get("value"), menu.SCHEMES)
+    if not isinstance(self._now, Practice):
+      raise ValueError("the scheme may change in free practice alone")
+    self._now.change(scheme)
+
+  def _on_device(self, message: dict[str, Any]) -> None:
+    name = menu.choice("device", message.get("value"), menu.devices(self._own))
+    if self._now is None:
+      self._device = name
+    elif name != self._device:
+      self._now.link.change(self._open(name))
+      self._device = name
+
+  def _on_ghost(self, message: dict[str, Any]) -> None:
+    session = self._now
+    if not isinstance(session, Session) or self._job["assessment"]:
+      raise ValueError("the expert is shown in exercises alone, and not in an assessment")
+    session.coach.hint("the expert was shown")
+    if self._expert is None and message.get("known") is not True:
+      threading.Thread(target=self._show_expert, args=(self._job,), daemon=True).start()
+
+  def _on_keep(self, message: dict[str, Any]) -> None:
+    if self._unkept is not None:
+      done = self._unkept
+      self._unkept = None if done.keep(self._folder, self._record) and not done.fault else done
+      self._tell({"type": "kept", "path": str(done.path or ""), "fault": done.fault})
+
+  def _on_pause(self, message: dict[str, Any]) -> None:
+    if self._now is not None:
+      self._now.pace.paused = message.get("on") is True
+
+  def _on_speed(self, message: dict[str, Any]) -> None:
+    speed = menu.choice("speed", message.get("value"), menu.SPEEDS)
+    if self._now is not None:
+      self._now.pace.speed = speed
+
+  def _on_stop(self, message: dict[str, Any]) -> None:
+    self._stop()
+
+  def _stop(self) -> None:
+    if self._now is not None:
+      self._now.pace.stopped = True
+
+  def _end(self) -> None:
+    self._ended = True
+    self._stop()
+    if self._expert is not None:
+      self._expert.kill()
+    self._fresh.set()
+    self._jobs.put(None)
+
+  # Pictures.
+
+  def _publish(self, frame: Any) -> None:
+    """Hands on a frame, made by `frame` in the loop's thread if the last one was sent."""
+    if not self._fresh.is_set():
+      self._frame = frame()
+      self._fresh.set()
+
+  def _show(self) -> None:
+    """Sends pictures and words, in a thread of its own."""
+    first(1)
+    due, said = 0.0, None
+    while not self._ended:
+      self._fresh.wait()
+      frame, now, self._frame = self._frame, self._now, None
+      self._fresh.clear()
+      try:
+        if frame is not None:
+          with self._lock:
+            self._conn.send_bytes(b"B" + frame)
+        if now is not None and time.monotonic() > due:
+          due = time.monotonic() + _STATUS
+          words = _status(now)
+          if words != said:
+            said = words
+            self._tell(words)
+      except OSError:
+        self._end()
+
+  def _show_expert(self, job: dict[str, Any]) -> None:
+    """Has the expert's way worked out, in a thread of its own."""
+    self._expert = process = ghost.ask(job["task"], job["seed"], _kwargs(job))
+    text, _ = process.communicate()
+    if self._expert is process:
+      self._expert = None
+    if self._ended or job is not self._job:
+      return
+    if process.returncode:
+      self._fault("the expert could not be shown")
+    else:
+      self._tell({"type": "ghost", **json.loads(text)})
+
+  # Exercises.
+
+  def _exercise(self, job: dict[str, Any]) -> None:
+    from palpate.tasks import suite
+
+    if self._record is not None:
+      self._record.keeping.check(job["task"])
+    self._tell({"type": "loading", "text": job["task"], "note": ""})
+    kwargs = _kwargs(job)
+    env = suite.load(*suite.split(job["task"]), task_kwargs={"random": 0, **kwargs})
+    info = {"task_kwargs": kwargs, "person": job["person"], "seed": job["seed"]}
+    with self._hands(job["left"]) as (device, other):
+      session = Session(
+        env, device, job["seed"], info, Options(scale=job["scale"]),
+        coach=Coach(job["assessment"]), publish=self._draw, other=other,
+      )  # fmt: skip
+    recording = self._run(session, job, lambda: session.run(realtime=True))
+    done = Finished(recording)
+    self._unkept = None if done.keep(self._folder, self._record) and not done.fault else done
+    shown = card(recording, self._references(job["task"]))
+    shown["advice"] += done.said
+    self._tell({"type": "card", "path": str(done.path or ""), "fault": done.fault, **shown})
+
+  def _run(self, made: Session | Practice, job: dict[str, Any], run: Any) -> Any:
+    """Runs what was made, so that messages reach it."""
+    made.pace.speed, self._camera = job["speed"], None
+    made.pace.stopped = not self._jobs.empty()  # something else was asked for meanwhile
+    self._now = made
+    try:
+      return run()
+    finally:
+      self._now, self._desks = None, {}
+
+  def _draw(self, session: Session) -> None:
+    """Shows an exercise."""
+    env = session.env
+    if self._camera is None or self._camera.model is not env.physics.model.ptr:
+      self._camera = Camera.of(env)
+      task = env.task
+      limits = {"force_limit": task.force_limit, "damage": task.damage, "jaws": task.jaws}
+      self._tell(self._camera.shapes(
+        time_limit=env.step_limit * env.control_timestep(), report="report" in task.extra,
+        assessment=self._job["assessment"], practice=False, step=env.physics.timestep(), **limits,
+      ))  # fmt: skip
+    camera, link, pace = self._camera, session.link, session.pace
+    self._publish(lambda: camera.frame(link, pace, env.task.progress))
+
+  def _practise(self, job: dict[str, Any]) -> None:
+    note = ", which takes a minute or more" if job["size"].get("grid", 0) > 100 else ""
+    self._tell({"type": "loading", "text": f"{job['organ']}, {job['mesh']}", "note": note})
+    right, left = job["instrument"], job["left"]
+    with self._hands(left) as (device, other):
+      hands = {right: device}
+      if other is not None:
+        hands["grasper" if right != "grasper" else "probe"] = other
+      practice = Practice(
+        job["organ"], job["size"], hands, 1e-3 * job["step"], job["scheme"],
+        Options(scale=job["scale"]), self._picture,
+      )  # fmt: skip
+    self._run(practice, job, lambda: practice.run(realtime=True))
+    self._tell({"type": "idle", "late": practice.pace.lateness.summary()})
+
+  def _picture(self, practice: Practice) -> None:
+    """Shows free practice."""
+    camera = practice.camera
+    if self._camera is not camera:
+      self._camera = camera
+      self._tell(camera.shapes(
+        force_limit=LIMIT, damage=DAMAGE, jaws=self._job["instrument"] != "probe", time_limit=None,
+        report=False, assessment=False, practice=True, step=1e-3 * self._job["step"],
+      ))  # fmt: skip
+    self._publish(lambda: camera.frame(practice.link, practice.pace))
+
+  @contextlib.contextmanager
+  def _hands(self, left: str) -> Iterator[tuple[Device, Device | None]]:
+    """Opens the devices of both hands, the left one's if it has a name; closes them on failure."""
+    with contextlib.ExitStack() as stack:
+      right, other = self._open(self._device), None
+      stack.callback(right.close)
+      if left:
+        other = self._open("page" if left in menu.OTHER else left, "left")
+        stack.callback(other.close)
+      yield right, other
+      stack.pop_all()
+
+  def _open(self, name: str, which: str = "right") -> Device:
+    """Opens a device for a hand."""
+    if name != "page":
+      self._desks.pop(which, None)
+      return registry.device(name)
+    own = self._own if registry.on_page(self._own) else "mouse"
+    self._desks[which] = desk = Desk(own)
+    return desk
+
+
+def _kwargs(job: dict[str, Any]) -> dict[str, Any]:
+  """Returns the options of an exercise's environment."""
+  nodes = {"nodes": job["nodes"]} if job["nodes"] else {}
+  return {"input": "handle", "observations": ["joints"], **nodes}
+
+
+def _status(now: Session | Practice) -> dict[str, Any]:
+  """Returns the words about what runs."""
+  lost = next((link.message for link in now.links if link.state == "lost"), "")
+  words = {"type": "status", "instruction": "", "warning": "", "kind": "", "fault": lost}
+  if isinstance(now, Practice):
+    return words | {"fault": lost or "; ".join(now.faults[-1:]), "scheme": now.organ.integrator}
+  coach = now.coach
+  said = {"instruction": coach.instruction, "warning": coach.warning, "kind": coach.kind}
+  return words | said

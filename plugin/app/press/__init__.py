@@ -1,0 +1,1 @@
+"""`palpate run press`: a probe presses an organ."""

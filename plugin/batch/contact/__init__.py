@@ -1,0 +1,1 @@
+"""Contacts of organs with tools beside mujoco_warp."""

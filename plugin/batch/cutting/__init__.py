@@ -1,0 +1,1 @@
+"""What cuts and tears organs in all worlds."""

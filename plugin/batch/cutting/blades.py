@@ -1,0 +1,237 @@
+"""Geoms that cut an organ of `Worlds`: the plugin's kernels, over rows of worlds.
+
+A blade's path grows on the device. Now and then the host looks at which are long enough, or have
+ended, and lets the meshes of those worlds come apart; see `engine.cutting.cutters`.
+"""
+
+# Annotations here are objects, not text: no `from __future__ import annotations`.
+# pyright: reportInvalidTypeForm=false
+from typing import Any
+
+import numpy as np
+import warp as wp
+from palpate.engine.cutting import cutters
+from palpate.engine.cutting.electrosurgery import ends
+from palpate.engine.layout import BLADE, LAW
+from palpate.engine.model import mjstruct
+from palpate.tissue.geometry.mesh import Mesh
+from palpate.tissue.step import SCHEMES
+from palpate.tissue.types import allocate, doubles, fill, floats, ints, struct
+
+from ..forces import base
+from .fracture import Cutters
+
+_ROWS = "state", "next", "force", "point", "held", "share", "hold", "due", "law"
+_WorldBlades = base.in_worlds(
+  cutters.Blades,
+  _ROWS,
+  {
+    "own": base.WorldNodes,
+    "mj": base.WorldBodies,
+    "number": floats("nworld", "nnumber"),
+    "elem": ints("nmesh", "nelem", 3),
+    "flat": doubles("nmesh", "nnode", 3),
+  },
+)
+_enter, _act, _keep = base.kernels("cutting/blades.h", _WorldBlades, *cutters.KERNELS)
+_STAGE, _WORK, _OPENED, _AT = (
+  wp.constant(k) for k in (BLADE.stage, BLADE.work, BLADE.opened, BLADE.at)
+)
+_KEEPS = 1  # what is due is kept until it is done
+
+
+@wp.func
+def _turned(f: wp.array2d[wp.float64], c: int, x: wp.float64, y: wp.float64, z: wp.float64):
+  return f[c, 0] * x + f[c, 1] * y + f[c, 2] * z
+
+
+@struct
+class Told:
+  """Arrays of `Cutters`."""
+
+  inside: floats("nworld", "nblade")
+  force: floats("nworld", "nblade", 3)
+  energy: floats("nworld", "nblade")
+  length: floats("nworld", "nblade")
+  seat: floats("nworld", "nblade", 3)
+
+
+@wp.kernel(enable_backward=False)
+def _show(b: _WorldBlades, out: Told):
+  """Writes what cutters do, in the world's axes."""
+  w, i = wp.tid()
+  out.inside[w, i] = wp.where(b.state[w, i, _STAGE] == wp.float64(2.0), 1.0, 0.0)
+  out.energy[w, i] = float(b.state[w, i, _WORK])
+  out.length[w, i] = float(b.state[w, i, _OPENED])
+  f = b.own.frame
+  for c in range(3):
+    turned = _turned(f, c, b.force[w, i, 0], b.force[w, i, 1], b.force[w, i, 2])
+    out.force[w, i, c] = float(turned)
+    at = _turned(f, c, b.state[w, i, _AT], b.state[w, i, _AT + 1], b.state[w, i, _AT + 2])
+    out.seat[w, i, c] = float(b.own.origin[c] + at)
+
+
+@wp.kernel(enable_backward=False)
+def _feel(b: _WorldBlades, adr: int, data: wp.array2d[float]):
+  """Adds the force on the tissue to a sensor."""
+  w = wp.tid()
+  f = b.own.frame
+  for i in range(b.nblade):
+    for c in range(3):
+      turned = _turned(f, c, b.force[w, i, 0], b.force[w, i, 1], b.force[w, i, 2])
+      data[w, adr + c] = data[w, adr + c] + float(turned)
+
+
+class Blades(base.Opens):
+  """What cuts an organ in all worlds.
+
+  Args:
+    organ: the organ, which has room for cuts
+  """
+
+  def __init__(self, organ):
+    super().__init__(organ)
+    space, body, n = organ.space, organ.body, len(organ.config.cutters)
+    mesh, scheme = organ.declared.mesh, SCHEMES[organ.config.integrator]
+    self._model = mjstruct.Model.from_address(space.model)
+    widths = cutters.WIDTHS.items()
+    law = space.cutters.law(self._model, organ.config.thickness)
+    values: dict[str, Any] = {
+      name: self._zeros(self._nworld, n, wide, dtype=_WorldBlades.vars[name].type.dtype)
+      for name, wide in widths
+    }
+    values |= space.cutters.edges() | dict(
+      nblade=n,
+      nelem=mesh.nelem,
+      ntet=0,
+      tet=np.zeros((0, 4), int),
+      ahead=float(scheme.ahead),
+      gain=scheme.gain(1.0, 0.0),
+      edge=float(mesh.whole.edge_length),
+      law=np.tile(law, (self._nworld, 1, 1)),
+      mesh=organ.patch.mesh,
+      elem=organ.patch.elem,
+      flat=organ.patch.rest,
+      state=self._keep("blade", np.arange(n), len(BLADE)),
+      due=self._zeros(self._nworld, n, dtype=int),
+      own=_by_nodes(base.nodes_of(organ), body),
+      solve=_by_nodes(base.input_of(organ), body),
+      number=body.tissue.number,
+      mj=organ._batch.bodies,
+    )
+    self.fields = fill(_WorldBlades, self._device, values)
+    self._steps = 0
+    sizes = {"nworld": self._nworld, "nblade": n}
+    self._told = allocate(Told, self._device, sizes)
+    self._out = Cutters(*(getattr(self._told, name) for name in Cutters._fields))
+
+  @property
+  def aims(self) -> bool:
+    """See `Beside`."""
+    return True
+
+  def enter(self):
+    """See `Beside`."""
+    self._over(_enter, self.fields, 1, _KEEPS)
+
+  def act(self):
+    """See `Beside`."""
+    self._over(_act, self.fields, 1)
+
+  def end(self):
+    """See `Beside`."""
+    self._over(_keep, self.fields, 1)
+
+  def rest(self):
+    """See `Beside`."""
+    super().rest()
+    wp.launch(_forget, dim=self.fields.due.shape, inputs=[self._mask, self.fields.due],
+              device=self._device)  # fmt: skip
+
+  def configure(self, worlds: np.ndarray, rows: dict[str, np.ndarray]):
+    """See `Beside`."""
+    if "thickness" not in rows:
+      return
+    law = self.fields.law.numpy()
+    for world, thickness in zip(worlds, rows["thickness"], strict=True):
+      law[world] = self._organ.space.cutters.law(self._model, float(thickness))
+    self.fields.law.assign(law)
+
+  def feel(self, adr: int, data: wp.array):
+    """Adds their force to a sensor of three numbers."""
+    wp.launch(_feel, dim=self._nworld, inputs=[self.fields, adr, data], device=self._device)
+
+  def read(self) -> Cutters:
+    """Returns what they do."""
+    dim, inputs = self._told.inside.shape, [self.fields, self._told]
+    wp.launch(_show, dim=dim, inputs=inputs, device=self._device)
+    return self._out
+
+  # The meshes come apart.
+
+  def open(self, steps: int):
+    """Lets the meshes of worlds come apart along the paths that are long enough, or ended."""
+    due, currents = self.fields.due.numpy(), self._organ.space.cutters.by_current
+    ctrl = self._organ._batch.d.ctrl.numpy() if currents else None
+    state: Any = self.fields.state.numpy() if currents or due.any() else None
+    acts = due.any(axis=1)
+    for i, current in currents.items():
+      acts |= (ctrl[:, current.actuator] > 0) | (state[:, i, BLADE.count] > 0)
+    worlds = np.flatnonzero(acts).tolist()
+    if not worlds:
+      return
+    cuts = self._organ.topology
+    law, edge = self.fields.law.numpy(), self._organ.declared.mesh.edge_length
+    cuts.follow()
+    motion = cuts.motion(worlds)
+    for i, current in currents.items():
+      given = steps * float(self._organ._batch.model.opt.timestep) * ctrl[:, current.actuator]
+      self._follow(current, state[:, i], due[:, i], given, worlds, motion)
+    for k, world in enumerate(worlds):
+      for i in np.flatnonzero(due[world]):
+        given = cutters.GIVEN * float(law[world, i, LAW.force]) * edge
+        self._open(state[world, i], due[world, i] == cutters.ENDED, given, motion, k, world)
+    cuts.finish(worlds, motion)
+    self.fields.state.assign(state)
+    self.fields.due.zero_()
+
+  def _follow(self, current, state: np.ndarray, due: np.ndarray, given, worlds: list, motion):
+    """Lets paths of worlds follow a current; `given`: energy that it has brought [J], (nworld,)."""
+    cuts, d = self._organ.topology, self._organ._batch.d
+    place, axes = (array.numpy()[:, current.geom] for array in (d.geom_xpos, d.geom_xmat))
+    for k, world in enumerate(worlds):
+      row, mesh = state[world], cuts.mesh_of(world)
+      line = current.line(place[world].astype(float), axes[world].astype(float))
+      burns = given[world] > 0 and current.burn(
+        row, mesh, mesh.rest + motion.disp[k], cuts.finder, *line, float(given[world])
+      )
+      edge = mesh.whole.edge_length
+      due[world] = cutters.lay_trail(row, edge) if burns else cutters.ENDED * ends(row)
+
+  def _open(self, row: np.ndarray, ended: bool, given: float, motion, k: int, world: int):
+    cuts = self._organ.topology
+
+    def cut(path: np.ndarray) -> tuple[Any, Mesh]:
+      found = cuts.find(world, path, motion, k, given, True)
+      return cuts.apply(world, found, motion, k), cuts.mesh_of(world)
+
+    organ, mesh = self._organ.declared, cuts.mesh_of(world)
+    cutters.open_path(row, mesh, bool(ended), organ, cuts.finder, cut)
+
+
+@wp.kernel(enable_backward=False)
+def _forget(mask: wp.array[bool], due: wp.array2d[int]):
+  w, i = wp.tid()
+  if mask[w]:
+    due[w, i] = 0
+
+
+def _by_nodes(fields: Any, body) -> Any:
+  """Returns fields that name nodes in place of vertices."""
+  fields.node = wp.array(np.arange(body.shape.nnode), dtype=int, device=body.device)
+  return fields
+
+
+def make(organ) -> tuple[Blades, ...]:
+  """Returns what cuts an organ of `Worlds`, if anything does."""
+  return (Blades(organ),) if organ.topology and organ.space.cutters else ()

@@ -1,0 +1,375 @@
+"""Cuts of an organ in worlds, each with its mesh, as `engine.cutting.cuts` has one mjData's.
+
+Cuts are found on the host, for the worlds that are cut alone. Their motion comes from the device,
+and what has changed goes there; graphs go on as they were recorded.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import warp as wp
+from palpate.engine.cutting import cuts as engine
+from palpate.engine.cutting.cuts import Piece, Report
+from palpate.engine.model import flexes
+from palpate.tissue import body as bodies
+from palpate.tissue import device as devices
+from palpate.tissue import order, shape, step
+from palpate.tissue.cutting import cut as cutting
+from palpate.tissue.cutting.meshes import Meshes
+from palpate.tissue.cutting.path import Finder
+from palpate.tissue.cutting.surface import WorkingCopy
+from palpate.tissue.geometry import mesh as topology
+from palpate.tissue.geometry.mesh import Mesh
+from palpate.tissue.order import LANES
+from palpate.tissue.rows import Rows
+from palpate.tissue.types import NUMBERS, fill
+
+from .. import kernels
+from ..patch import Surface
+
+_OWN = ("rest", "elem", "touch", "source", "share", "held")  # fields of `Patch`
+_STATE = ("corner", "place", "weight", "source", "stamp")  # blocks of the plugin state
+_INSIDE = NUMBERS.index("bulk")  # and pressure after it
+
+
+@dataclasses.dataclass
+class World:
+  """A world that was cut.
+
+  Attributes:
+    mesh: as it is now
+    mass: of its vertices [kg]                       (nvert,)
+    source: what each was before the first cut       (nvert,)
+    pieces: how many there are
+    reports: what the cuts did
+  """
+
+  mesh: Mesh
+  mass: np.ndarray
+  source: np.ndarray
+  pieces: int
+  reports: list[Report] = dataclasses.field(default_factory=list)
+
+
+@dataclasses.dataclass
+class Motion:
+  """What vertices of some worlds have, (worlds, nvert, 3) each, see `Patch`."""
+
+  disp: np.ndarray
+  vel: np.ndarray
+  last: np.ndarray
+  before: np.ndarray
+  force: np.ndarray
+
+
+class Cuts:
+  """The meshes of an organ's worlds.
+
+  Args:
+    organ: the organ of a batch, whose patch is not made yet
+    values: fields of that, which take the meshes in place of the one
+    surface: makes what of these follows from a mesh
+  """
+
+  def __init__(self, organ, values: dict, surface: Surface):
+    declared, body = organ.declared, organ.body
+    self._organ, self._surface = organ, surface
+    self.whole: Mesh = declared.mesh
+    nodes = devices.patch(body.device, body.shape.nslice)
+    arrays = shape.arrays(self.whole, organ.config, ~declared.free, nodes)
+    still = bodies.worlds(bodies.constants(arrays, wp.get_device("cpu"), organ.config.newton))
+    node = still.shape.node.numpy()
+    self._node, self._place = node, order.offset(node)[:, None] + LANES * np.arange(3)
+    own = {f"patch.{name}": np.asarray(values[name][0]) for name in _OWN}
+    self._meshes = Meshes(body, own)
+    values |= {name: self._meshes.more[f"patch.{name}"] for name in _OWN}
+    values["mesh"] = self._meshes.which
+    self._here = {name: self._meshes.here[f"patch.{name}"] for name in _OWN}
+    copy = WorkingCopy(self.whole)
+    self._knife, self.finder = cutting.Knife(copy), Finder(copy)
+    starts = {"slot_adr": still.shape.slot_adr, "bend_adr": still.shape.bend_adr}
+    self._rows = Rows(copy, self._meshes.arrays | starts, node)
+    number = body.tissue.number.numpy()[:, _INSIDE : _INSIDE + 2]
+    self._worlds: dict[int, World] = {}
+    self._changed: dict[int, list[np.ndarray]] = {}  # vertices and triangles, see `finish`
+    self._whole_count = _count(self.whole)
+    self._intact = fill(kernels.Whole, body.device, {
+      "first": _INSIDE, "count": self._whole_count, "inside": number,
+      "pieces": np.full(body.nworld, self._whole_count),
+    })  # fmt: skip
+
+  # What there is.
+
+  def follow(self):
+    """Forgets what worlds were that have been reset."""
+    if not self._worlds:
+      return
+    which = self._meshes.which.numpy()
+    for world in [world for world in self._worlds if not which[world]]:
+      self._forget(world)
+
+  def _forget(self, world: int):
+    del self._worlds[world]
+    self._meshes.heal(world)
+
+  def mesh(self, world: int) -> Mesh:
+    """Returns the mesh of a world."""
+    self.follow()
+    return self.mesh_of(world)
+
+  def mesh_of(self, world: int) -> Mesh:
+    """Returns the mesh of a world, as it was when `follow` was called."""
+    return self._worlds[world].mesh if world in self._worlds else self.whole
+
+  def is_full(self, world: int) -> bool:
+    """Returns whether a world has no spare vertex left, as `mesh_of` has it."""
+    mesh = self.mesh_of(world)
+    return mesh.nouter == mesh.nskin
+
+  def mass(self, world: int) -> np.ndarray:
+    """Returns the masses of its vertices, as compiled [kg], (nvert,)."""
+    self.follow()
+    return self._worlds[world].mass if world in self._worlds else self._organ.declared.mass
+
+  def reports(self, world: int) -> list[Report]:
+    """Returns what the cuts of a world did."""
+    self.follow()
+    return list(self._worlds[world].reports) if world in self._worlds else []
+
+  def pieces(self, world: int) -> list[Piece]:
+    """Returns the parts of a world's organ that hang together, the heaviest first."""
+    scale = float(self._organ.patch.mass_scale.numpy()[world])
+    mass = scale * self.mass(world)
+    return engine.pieces(self.mesh(world), mass, self._organ.config.thickness)
+
+  def counts(self) -> wp.array:
+    """Returns how many pieces there are, (nworld,)."""
+    return self._intact.pieces
+
+  # Within a step.
+
+  def heal(self):
+    """Gives the worlds of the mask the first mesh; `rest` has put back the rest."""
+    inputs, body = [self._organ.patch, self._intact], self._organ.body
+    wp.launch(kernels.heal, dim=body.nworld, inputs=inputs, device=body.device)
+
+  def renumber(self, worlds: np.ndarray, number: np.ndarray, rows: dict[str, np.ndarray]):
+    """Keeps bulk and pressure of worlds for when they are whole again: where one is open they end.
+
+    Args:
+      worlds: that have changed
+      number: `NUMBERS` of all worlds, which are written to
+      rows: what has changed
+    """
+    self.follow()
+    inside = self._intact.inside.numpy()
+    for k in (_INSIDE, _INSIDE + 1):
+      if NUMBERS[k] in rows:
+        inside[worlds, k - _INSIDE] = rows[NUMBERS[k]]
+    self._intact.inside.assign(inside)
+    opened = [w for w, own in self._worlds.items() if self.whole.closed and not own.mesh.closed]
+    number[opened, _INSIDE : _INSIDE + 2] = 0.0
+
+  # Cutting.
+
+  def find(self, world: int, points: np.ndarray, motion: Motion, k: int, *how) -> cutting.Cut:
+    """Returns what a cut along points in the organ's frame, (n, 3) [m], makes of a world.
+
+    Args:
+      world: the world
+      points: the path
+      motion: what vertices of some worlds have
+      k: which of them it is
+      how: last arguments of `cutting.Knife.cut`
+    """
+    organ, had = self._organ, self._of(world)
+    carried = cutting.Motion(had.mass, motion.disp[k], motion.vel[k])
+    free, config = organ.declared.free, organ.config
+    found = self._knife.cut(organ.name, had.mesh, carried, points, ~free, config, None, *how)
+    kept = (getattr(found.motion, name).copy() for name in ("mass", "disp", "vel"))
+    return dataclasses.replace(found, motion=cutting.Motion(*kept))
+
+  def cut(self, points: dict[int, np.ndarray]) -> list[Report | None]:
+    """Cuts worlds along points in the world's axes, (n, 3) [m] each; see `Tissue.cut`."""
+    self.follow()
+    organ, worlds = self._organ, sorted(points)
+    motion, found = self.motion(worlds), []
+    for k, world in enumerate(worlds):
+      local = (points[world] - organ.declared.origin) @ organ.declared.frame
+      try:
+        found.append(self.find(world, local, motion, k))
+      except ValueError as error:
+        raise ValueError(f"world {world}: {error}") from None
+    out: list[Report | None] = [None] * organ.body.nworld
+    for k, world in enumerate(worlds):
+      out[world] = self.apply(world, found[k], motion, k)
+    self.finish(worlds, motion)
+    return out
+
+  def apply(self, world: int, cut: cutting.Cut, motion: Motion, k: int) -> Report:
+    """Makes a world the mesh that was found, the k-th of a motion; `finish` is to come."""
+    organ, had = self._organ, self._of(world)
+    report = engine.report(cut, had.mesh, organ.declared, organ.config.thickness)
+    if cut.changed.size:
+      _carry(motion, k, cut, organ.declared.free)
+      source = had.source.copy()
+      source[cut.member] = source[cut.group]
+      # Vertices that come apart inside do not make two pieces of one.
+      pieces = _count(cut.mesh) if cut.mesh.loose is not had.mesh.loose else had.pieces
+      now = World(cut.mesh, cut.motion.mass, source, pieces, had.reports)
+      self._become(world, had, now, cut.changed)
+      self._worlds[world].reports.append(report)
+    return report
+
+  def finish(self, worlds: list[int], motion: Motion):
+    """Brings the worlds that `apply` has changed to the device; `motion` is of `worlds`."""
+    which = [k for k, world in enumerate(worlds) if world in self._changed]
+    if which:
+      own = [worlds[k] for k in which]
+      self._upload(own)
+      names = [field.name for field in dataclasses.fields(Motion)]
+      self.put_motion(own, Motion(*(getattr(motion, name)[which] for name in names)))
+
+  def _of(self, world: int) -> World:
+    """Returns a world, that of the first mesh until it is cut."""
+    if world in self._worlds:
+      return self._worlds[world]
+    mass, source = self._organ.declared.mass.copy(), np.arange(self.whole.nvert)
+    return World(self.whole, mass, source, self._whole_count)
+
+  def _become(self, world: int, had: World, now: World, changed: np.ndarray):
+    """Writes the row of a world, in which triangles have changed."""
+    organ, mesh = self._organ, now.mesh
+    before, loosened = had.mesh.elem[changed], mesh.loose is not had.mesh.loose
+    how = ~organ.declared.free, changed, before, loosened
+    touched = topology.touched(had.mesh, mesh, changed)
+    if not self._rows.write(mesh, organ.config, *how, self._meshes.open(world)):
+      raise ValueError("cuts that meet leave no room in the bending matrix")
+    self._worlds[world] = now
+    kept = self._changed.get(world)
+    self._changed[world] = (
+      [touched, changed] if kept is None
+      else [topology.distinct(*pair) for pair in zip(kept, (touched, changed), strict=True)]
+    )  # fmt: skip
+
+  def _upload(self, worlds: list[int]):
+    """Gives the device the meshes of worlds, and what follows from them."""
+    organ, body = self._organ, self._organ.body
+    own = [self._worlds[world] for world in worlds]
+    changed = [self._changed.pop(world) for world in worlds]
+    changes = [(w.mesh, w.mass, w.source, *c) for w, c in zip(own, changed, strict=True)]
+    self._surface.write(self._here, worlds, changes)
+    self._meshes.upload(worlds)
+    for _ in range(2 * body.has_bending):  # what is left of the first time is exact
+      self._meshes.angle(worlds, step.rest_angles(body))
+    mass = np.ones((len(worlds), body.shape.nnode), np.float32)
+    scale = organ.patch.mass_scale.numpy()
+    for k, world in enumerate(worlds):
+      own = scale[world] * self._worlds[world].mass
+      mass[k, self._node] = np.where(own > 0, own, 1.0)
+    self._put(body.state.mass, worlds, mass)
+    if self.whole.closed and any(not self._worlds[world].mesh.closed for world in worlds):
+      number = body.tissue.number.numpy()
+      for world in worlds:
+        if not self._worlds[world].mesh.closed:
+          number[world, _INSIDE : _INSIDE + 2] = 0.0
+      body.tissue.number.assign(number)
+    count = self._intact.pieces.numpy()
+    count[worlds] = [self._worlds[world].pieces for world in worlds]
+    self._intact.pieces.assign(count)
+    organ.wake(worlds)
+
+  # Motion of some worlds, to the host and back.
+
+  def _vectors(self) -> dict[str, wp.array]:
+    p = self._organ.patch
+    solve = self._organ.body.state
+    return {"disp": solve.disp, "vel": solve.vel, "last": p.last, "before": p.before}
+
+  def motion(self, worlds: list[int]) -> Motion:
+    """Returns what the vertices of worlds have."""
+    out = {}
+    for name, array in self._vectors().items():
+      out[name] = self._get(array, worlds)[:, self._place].astype(float)
+    rows = self._get(self._organ.patch.force, worlds).reshape(len(worlds), -1, 3)
+    return Motion(**out, force=rows[:, self._node].astype(float))
+
+  def put_motion(self, worlds: list[int], motion: Motion):
+    """Gives vertices of worlds their motion."""
+    shape = len(worlds), 3 * self._organ.body.shape.nnode
+    for name, array in self._vectors().items():
+      rows = np.zeros(shape, np.float32)
+      rows[:, self._place] = getattr(motion, name)
+      self._put(array, worlds, rows)
+    rows = np.zeros(shape, np.float32).reshape(len(worlds), -1, 3)
+    rows[:, self._node] = motion.force
+    self._put(self._organ.patch.force, worlds, rows)
+
+  def _get(self, array: wp.array, worlds: list[int]) -> np.ndarray:
+    whole = array.reshape((array.shape[0], -1))
+    rows = wp.empty((len(worlds), whole.shape[1]), dtype=float, device=array.device)
+    at = wp.array(worlds, dtype=int, device=array.device)
+    wp.launch(kernels.get_rows, dim=rows.shape, inputs=[whole, at, rows], device=array.device)
+    return rows.numpy()
+
+  def _put(self, array: wp.array, worlds: list[int], values: np.ndarray):
+    whole = array.reshape((array.shape[0], -1))
+    rows = wp.array(values.reshape(len(worlds), -1), dtype=float, device=array.device)
+    at = wp.array(worlds, dtype=int, device=array.device)
+    wp.launch(kernels.put_rows, dim=rows.shape, inputs=[rows, at, whole], device=array.device)
+
+  # States.
+
+  def pull(self, world: int, own: np.ndarray, spans: dict[str, slice]):
+    """Writes the mesh of a world to the plugin state, zero where it was not cut."""
+    self.follow()
+    if world not in self._worlds:
+      return
+    had = self._worlds[world]
+    corner = flexes.pack(had.mesh.elem, had.mesh.loose)
+    stamp = flexes.stamp(corner, had.mesh.rest, had.mass)
+    blocks = {name: own[spans[name]] for name in _STATE}
+    engine.write(blocks, had.mesh, had.mass, had.source, stamp)
+
+  def push(self, world: int, own: np.ndarray, spans: dict[str, slice]):
+    """Gives a world the mesh of a plugin state."""
+    blocks = {name: own[spans[name]] for name in _STATE}
+    mass = self._organ.declared.mass
+    elem, loose, rest, mass, source = engine.read(self.whole, mass, blocks)
+    self.follow()
+    before = self.mesh_of(world)
+    mesh, changed = topology.recut(before, rest, elem, loose)
+    if changed.size or mesh is not before:
+      now = World(mesh, mass, source, _count(mesh))
+      self._become(world, self._of(world), now, changed)
+      self._upload([world])
+    if mesh is self.whole and world in self._worlds:
+      self._forget(world)
+      which = self._meshes.which.numpy()
+      which[world] = 0
+      self._meshes.which.assign(which)
+      count = self._intact.pieces.numpy()
+      count[world] = self._whole_count
+      self._intact.pieces.assign(count)
+
+  @staticmethod
+  def is_cut(own: np.ndarray, spans: dict[str, slice]) -> bool:
+    """Returns whether a plugin state has cuts."""
+    return bool(own[spans["stamp"]].any())
+
+
+def _count(mesh: Mesh) -> int:
+  return int(topology.pieces(mesh).max()) + 1
+
+
+def _carry(motion: Motion, k: int, cut: cutting.Cut, free: np.ndarray):
+  """Gives the vertices of the k-th world of a motion what a cut makes of it."""
+  motion.disp[k], motion.vel[k] = cut.motion.disp, cut.motion.vel
+  moves = free[cut.member]
+  group, member, share = cut.group[moves], cut.member[moves], cut.share[moves]
+  force = motion.force[k]
+  force[member] = share[:, None] * force[group]
+  for values in (motion.last[k], motion.before[k]):
+    values[member] = values[group]

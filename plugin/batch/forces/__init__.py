@@ -1,0 +1,1 @@
+"""What acts on an organ beside its tissue, in all worlds."""

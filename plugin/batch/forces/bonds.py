@@ -1,0 +1,122 @@
+"""What organs of a batch have grown on to, in all worlds."""
+
+# Annotations here are objects, not text: no `from __future__ import annotations`.
+import abc
+from typing import Any
+
+import numpy as np
+import warp as wp
+from palpate.bonds import Bonds as Alone
+
+from ..base import on_device
+from ..kernels import HELD, share_freed
+
+
+class Bonds(abc.ABC):
+  """The bonds of an organ in all worlds, those that the model declares; arrays as of `Batch`.
+
+  Attributes:
+    vertices: vertex of each, (n,)
+    area: area that each stands for [m^2], (n,)
+  """
+
+  vertices: np.ndarray
+  area: np.ndarray
+
+  def __init__(self, nworld: int, device: Any):
+    self._device, n = device, len(self.vertices)
+    self._damage = wp.zeros((nworld, n), dtype=float, device=device)
+    self._force = wp.zeros((nworld, n, 3), dtype=float, device=device)
+    self._share = wp.zeros(nworld, dtype=float, device=device)
+    self._each = wp.array(self.area, dtype=float, device=device)
+
+  def __len__(self) -> int:
+    return len(self.vertices)
+
+  @property
+  def damage(self) -> wp.array:
+    """Of each: 0 while it is whole, 1 when it is free, (nworld, n)."""
+    self._tell()
+    return self._damage
+
+  @property
+  def force(self) -> wp.array:
+    """Force of each on its vertex in the last step, in the world [N], (nworld, n, 3)."""
+    self._tell()
+    return self._force
+
+  @property
+  def share_freed(self) -> wp.array:
+    """Share of the area whose bonds have broken, (nworld,); 0 where there are none."""
+    inputs = [self.damage, self._each, self._share]
+    wp.launch(share_freed, dim=self._share.shape, inputs=inputs, device=self._device)
+    return self._share
+
+  def weaken(self, amount):
+    """Adds damage, as a hook's current does; what a bond had stored of energy goes with it.
+
+    Args:
+      amount: what is added to the damage of each bond in each world, (nworld, n) >= 0
+    """
+    if tuple(np.shape(amount)) != self._damage.shape:
+      raise ValueError(
+        f"amount has shape {tuple(np.shape(amount))}, expected {self._damage.shape}, one a bond of "
+        "each world"
+      )
+    self._weaken(on_device(amount, wp.float32, self._device))
+
+  @abc.abstractmethod
+  def _tell(self):
+    """Brings damage and force up to date."""
+
+  @abc.abstractmethod
+  def _weaken(self, amount: wp.array):
+    """Adds damage."""
+
+
+class OfThreads(Bonds):
+  """Bonds of worlds that are mjData of the plugin.
+
+  Args:
+    batch: the worlds
+    handles: the organ in each
+  """
+
+  def __init__(self, batch, handles: list):
+    self._batch, self._alone = batch, [Alone(handle._space) for handle in handles]
+    self.vertices, self.area = self._alone[0].vertices, self._alone[0].area
+    super().__init__(len(handles), batch.device)
+
+  def _tell(self):
+    damage, force = self._damage.numpy(), self._force.numpy()
+    for world, alone in enumerate(self._alone):
+      damage[world] = np.where(alone.free, 1.0, np.minimum(alone.damage, HELD))
+      force[world] = alone.force
+
+  def _weaken(self, amount: wp.array):
+    rows = amount.numpy().astype(float)
+    for world in np.flatnonzero(rows.any(axis=1)):
+      self._alone[world].weaken(rows[world])
+
+
+class Gathered(Bonds):
+  """Bonds of worlds of several batches.
+
+  Args:
+    batch: the batch of batches
+    parts: the bonds in each
+  """
+
+  def __init__(self, batch, parts: list[Bonds]):
+    self._batch, self._parts = batch, parts
+    self.vertices, self.area = parts[0].vertices, parts[0].area
+    super().__init__(batch.nworld, batch.device)
+
+  def _tell(self):
+    self._batch.gather([part.damage for part in self._parts], self._damage)
+    self._batch.gather([part.force for part in self._parts], self._force)
+
+  def _weaken(self, amount: wp.array):
+    rows = amount.numpy()
+    for at, part in zip(self._batch.slices, self._parts, strict=True):
+      part.weaken(rows[at])

@@ -1,0 +1,1 @@
+"""Compiled models: an organ's declaration is read, and the model made to fit."""
