@@ -110,7 +110,7 @@ def eased(config: Config) -> float:
 
 
 def gain(config: Config, h: float) -> float:
-  """Returns the factor of K in the matrix of a step h [s^2], as `formula.h` has it."""
+  """Returns the factor of K in the matrix of a step h [s^2], as `node.h` has it."""
   damping, less = config.damping, eased(config) * h
   damping = max(damping, -less) if less < 0 else damping - min(less, 0.5 * damping)
   return step.SCHEMES[config.integrator].gain(h, damping)

@@ -33,7 +33,7 @@ class Pressed:
   elem: Array(wp.vec2i, ("naconmax",))
   efc_address: ints("naconmax", "nrow")  # -1 for none
   aref: floats("nworld", "njmax")  # reference acceleration of the rows [m/s^2]
-  # See `weights.TISSUE`:
+  # See `contacts.TISSUE`:
   firm: int
   asked: float
   share: float

@@ -26,7 +26,7 @@ _LOOK = 10  # steps after which the host looks, at most
 
 @struct
 class WorldBodies:
-  """Bodies of mujoco_warp, a row a world; names as in `hold.Bodies`."""
+  """Bodies of mujoco_warp, a row a world; names as in `passive.Bodies`."""
 
   timestep: doubles(1)
   body_parentid: ints("nbody")
@@ -219,7 +219,7 @@ def nodes_of(organ):
 
 
 def input_of(organ):
-  """Returns `hold.Input` of an organ."""
+  """Returns `passive.Input` of an organ."""
   body = organ.body
   bodies.hold(body)
   values = {name: getattr(body.state, name) for name in ("hold", "force_ext", "vel", "dvel")}

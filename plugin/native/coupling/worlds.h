@@ -1,7 +1,7 @@
 // Batches: one organ in many worlds beside mujoco_warp, whose dofs of it are its slots: bodies that
 // stand on the nodes nearest to the tools, chosen anew in each step. A thread has a node or a slot.
 //
-// The coupling is that of `formula.h`. Slots move along the world's axes and their bodies have no
+// The coupling is that of `node.h`. Slots move along the world's axes and their bodies have no
 // place of their own, so qpos is where they are; vectors of nodes are in the organ's frame.
 //
 // An organ that has been at rest for QUIET, with no tool so near that a node may get a slot, sleeps:
