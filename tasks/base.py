@@ -48,7 +48,7 @@ from palpate.models import trocar
 from scipy.spatial import cKDTree
 
 from . import observation, randomisation, safety, scenes, stage
-from .core.rules import DAMAGED, OUTCOMES
+from .core.rules import DAMAGED, OUTCOMES, SUCCESS
 from .environment import CONTROL_TIMESTEP, Environment
 from .handle import ROW
 from .instrument import AXES, JAWS
@@ -254,7 +254,7 @@ class Task(control.Task):
     if outcome == DAMAGED:
       self.event(physics, "note", label=self.label("damage"))
     self.show(physics)
-    return progress
+    return 1.0 if outcome == SUCCESS else progress
 
   def show(self, physics: Physics) -> None:
     """Moves the marks of the pictures after a control step."""

@@ -33,8 +33,9 @@ class Toucher(live.Hand):
     physics, task = self.env.physics, self.env.task
     if now - self._last >= 0.02:
       self._last = now
-      normal = physics.normal(task.goal())
-      to = physics.point(task.goal()) + 0.006 * normal - physics.tip_pos()
+      goal = task.goals[0]
+      normal = physics.normal(goal)
+      to = physics.point(goal) + 0.006 * normal - physics.tip_pos()
       self._above = self._above or np.linalg.norm(to) < 0.001
       if self._above:
         to = -3e-4 * normal * (np.linalg.norm(physics.contact_force()) < 0.12)
