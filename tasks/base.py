@@ -239,6 +239,13 @@ class Task(control.Task):
 
   # What a domain says.
 
+  def share(self) -> None:
+    """Lets many worlds have one scene from now on; what differs in its tissue is `tissue`."""
+
+  def tissue(self) -> Mapping[str, np.ndarray]:
+    """Returns what differs in the organ's tissue in this episode, by key of its configuration."""
+    return {}
+
   def choose(self) -> int | None:
     """Draws the shape of an episode."""
     return self.variants[self.random.randint(len(self.variants))]
@@ -273,7 +280,7 @@ class Task(control.Task):
       return {}
     self.rules.observe(physics, self)
     own = self.rules.observed
-    return {name: np.atleast_1d(np.asarray(getattr(self, name), float)) for name in own}
+    return {name: np.array(getattr(self, name), float, ndmin=1) for name in own}
 
   def recorded(self, physics: Physics) -> Mapping[str, Any]:
     """Returns further columns of a sample, see `Recorder.append`."""

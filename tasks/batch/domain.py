@@ -20,7 +20,6 @@ class Domain:
       fields of the other, beginning)
     takes: numbers of the task that the struct has under the same names
     metrics: of its own, by the struct's arrays of an episode's values so far
-    tissue: keys of the organ's tissue among the rows of `draw`, which the struct does not have
   """
 
   struct: Any
@@ -29,11 +28,6 @@ class Domain:
   observe: Any
   takes: tuple[str, ...] = ()
   metrics: Mapping[str, str] = {}
-  tissue: tuple[str, ...] = ()
-
-  @staticmethod
-  def prepare(task: Any) -> None:
-    """Changes the task before its scene is made for all worlds."""
 
   @staticmethod
   def sizes(task: Any, physics: Physics) -> dict[str, int]:

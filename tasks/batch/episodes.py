@@ -142,7 +142,7 @@ class Episodes:
       frame |= dict(zip(of_hand(hand is not self.physics), own, strict=True))
     frame["reference"] = np.array(self._task.reference_length() or 0.0)
     own = self.draw(self._task) if self.draw else self._domain.draw(self._task, self.physics)
-    return frame | dict(own)
+    return frame | dict(own) | dict(self._task.tissue())
 
 
 def of_hand(other: bool) -> list[str]:

@@ -31,13 +31,12 @@ from .cut import Cut
 from .dissect import Dissect
 from .domain import Domain
 from .fields import INFO, OBSERVED, OUTCOMES
-from .palpate import Palpate
 from .tease import Tease
 from .worlds import Worlds
 
 # Exercises that are vectorised, by the class of their task.
 DOMAINS: dict[str, type[Domain]] = {
-  "Touch": Domain, "Press": Domain, "Palpate": Palpate, "Grasp": Domain, "Retract": Domain,
+  "Touch": Domain, "Press": Domain, "Palpate": Domain, "Grasp": Domain, "Retract": Domain,
   "Trace": Domain, "Dissect": Dissect, "Tease": Tease, "Bimanual": Bimanual,
   "Cut": Cut,
 }  # fmt: skip

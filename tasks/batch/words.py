@@ -116,6 +116,12 @@ def drop(s: Common, o: Any):
 
 
 @wp.func
+def reports(s: Common, o: Any):
+  """See `rules`."""
+  return s.action[s.world, s.action.shape[1] - 1] > 0.5
+
+
+@wp.func
 def visible(s: Common, o: Any):
   """See `rules`."""
   seen = wp.float32(0.0)
@@ -131,7 +137,7 @@ _BUILTIN = {
 }  # fmt: skip
 _WORDS = (
   tip, point, corner, normal, peak, force, miss, reach, from_tip, closing, holds, grip, slipped,
-  drop, visible,
+  drop, reports, visible,
 )  # fmt: skip
 WORDS = _BUILTIN | {getattr(rules, word.key): word for word in _WORDS}  # of Python -> of Warp
 

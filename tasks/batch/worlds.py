@@ -64,7 +64,7 @@ class Worlds:
     """
     task: Any = environment.task
     self.task, self._domain, self.nworld = task, domain, nworld
-    domain.prepare(task)
+    task.share()
     stage = task.compiled(task.variants[0])
     with warnings.catch_warnings():  # the plugin's passive forces are unknown to the compiler
       warnings.filterwarnings("ignore", ".*has no equality constraints or passive forces")
@@ -76,7 +76,7 @@ class Worlds:
     self.states = States(task.rules, task, nworld, self.device) if task.rules else None
     if self.states:
       self.episodes.draw = self.states.draw
-    self.organ = self.batch.organ(task.organ)
+    self.organ, self._tissue = self.batch.organ(task.organ), tuple(task.tissue())
     domain.attach(self)
     dt = environment.control_timestep()
     self.fields, self.other = self._make(task, task.prefix, dt, limit), None
@@ -108,7 +108,7 @@ class Worlds:
   def _write_states(self, at: wp.array, rows: Any, worlds: np.ndarray) -> None:
     """Begins with the states that were drawn for some worlds."""
     assert self.states
-    for name in self.task.rules.fields:
+    for name in self.states.drawn:
       if name in self.states.rows:
         self._write(self.states.rows[name], at, rows[name][worlds])
       else:
@@ -300,7 +300,7 @@ class Worlds:
     s.begun.assign(mask)
     at = wp.array(worlds, dtype=int, device=self.device)
     for name, values in rows.items():
-      if name in self._domain.tissue or (self.states and name in self.task.rules.fields):
+      if name in self._tissue or (self.states and name in self.task.rules.fields):
         continue
       of_other = self.other is not None and name in of_hand(True)
       out = self.other if of_other else s if name in FRAME else self.own
@@ -317,8 +317,8 @@ class Worlds:
       if self.task.jitter:
         self.batch.place(f"{prefix}trocar", pos, quat, s.begun)
       self.batch.pose([prefix + axis for axis in AXES], pose, s.begun)
-    if self._domain.tissue:
-      self.organ.configure(mask, **{key: rows[key] for key in self._domain.tissue})
+    if self._tissue:
+      self.organ.configure(mask, **{key: rows[key] for key in self._tissue})
     self._run(self._open)
 
   def _write(self, out: wp.array, at: wp.array, rows: np.ndarray) -> None:

@@ -36,6 +36,7 @@ class Rules:
     observe: rule (s, o) that returns o with its own observations up to date
     observed: fields of the state that are these
     metrics: of the domain's own, by the field that is an episode's value so far
+    shared: arrays of the state that are the same in all worlds and episodes
   """
 
   state: type
@@ -43,6 +44,7 @@ class Rules:
   observe: Callable
   observed: tuple[str, ...]
   metrics: Mapping[str, str] = dataclasses.field(default_factory=dict)
+  shared: tuple[str, ...] = ()
 
   def __post_init__(self):
     where = f"{self.state.__module__}.{self.state.__qualname__}"
@@ -51,9 +53,9 @@ class Rules:
       if not inspect.isfunction(rule) or len(inspect.signature(rule).parameters) != 2:
         raise TypeError(f"{where}: {name} is {rule!r}, expected a function of s and o")
     known = self.fields
-    for name in (*self.observed, *self.metrics.values()):
+    for name in (*self.observed, *self.metrics.values(), *self.shared):
       if name not in known:
-        raise TypeError(f"{where}: {name!r} is told, expected a field: {', '.join(known)}")
+        raise TypeError(f"{where}: {name!r} is no field, expected one of {', '.join(known)}")
 
   @property
   def fields(self) -> dict[str, Any]:
@@ -155,6 +157,11 @@ def closing(s: Any) -> bool:
 def holds(s: Any) -> bool:
   """Returns whether tissue is between the jaws, see `Instrument`."""
   return s.holds()
+
+
+def reports(s: Any, o: Any) -> bool:
+  """Returns whether the last component of the action is above 0.5."""
+  return bool(o.action[..., -1].max() > 0.5)
 
 
 def visible(s: Any, o: Any) -> float:
