@@ -378,6 +378,8 @@ class Task(control.Task):
       count = len(ROW if self.scene.handle else AXES) + len(extra)
       hand.act(values[..., first : first + count], self.control_timestep)
       first += count
+    if self.rules and self.rules.act:
+      self.rules.act(physics, self)
 
   def after_step(self, physics: Physics) -> None:
     """Measures the progress and looks for errors and damage."""

@@ -140,6 +140,12 @@ class Instrument:
     mj.mju_rotVecQuat(local, point - self.tip_pos(), turn)
     return local
 
+  def to_world(self, point: np.ndarray) -> np.ndarray:
+    """Returns where a point in the frame of the tip is [m]  (3,)."""
+    offset = np.zeros(3)
+    mj.mju_rotVecQuat(offset, point, self.tip_quat())
+    return self.tip_pos() + offset
+
   def trocar(self) -> trocar.Trocar:
     """Returns the instrument's trocar."""
     return self._trocar

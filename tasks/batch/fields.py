@@ -4,20 +4,11 @@ Sizes are named: nworld worlds, nvert nodes, nelem triangles, naction components
 """
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
-from typing import Any
-
 import warp as wp
 from palpate.tasks.physics import COARSE, NEAR
-from palpate.tissue.types import Array, floats, ints, struct
+from palpate.tissue.types import Array, doubles, floats, ints, struct
 
 flags = Array(wp.bool, ("nworld",))
-vectors = Array(wp.vec3, ("nworld",))
-
-
-def together(name: str, *parts: type) -> Any:
-  """Returns the struct of the fields of some classes."""
-  fields = {key: kind for part in parts for key, kind in part.__annotations__.items()}
-  return struct(type(name, (), {"__annotations__": fields, "__module__": __name__}))
 
 
 @struct
@@ -64,6 +55,21 @@ class Common:
   eye: wp.vec3  # of the laparoscope [m]
   disc: Array(wp.vec3, ("nworld", "nspot"))  # [m]
   behind: Array(wp.bool, ("nworld", "nspot"))  # whether the organ hides them
+  # Of bonds.
+  bond_vert: ints("nbond")  # vertex of each
+  bond_share: doubles("nbond")  # of their area
+  bond_damage: floats("nworld", "nbond")  # 1 where it is free
+  bond_force: floats("nworld", "nbond", 3)  # on the organ [N]
+  bond_loss: floats("nworld", "nbond")  # that an action adds to the damage
+  # Of what cuts the organ, see `palpate.batch.parting.Cutters`.
+  cutter_inside: floats("nworld", "ncutter")
+  cutter_length: floats("nworld", "ncutter")  # [m]
+  cutter_seat: floats("nworld", "ncutter", 3)  # [m]
+  piece_count: ints("nworld")
+  # Of the other hand.
+  other_tip_pos: floats("nworld", 3)
+  other_tip_quat: floats("nworld", 4)
+  other_contact_force: floats("nworld", 3)
   # Drawn for an episode.
   body_pos: floats("nworld", 3)  # of the trocar in the world [m]
   body_quat: floats("nworld", 4)  # w x y z

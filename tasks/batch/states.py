@@ -22,10 +22,11 @@ class States:
     drawn: names of what is not shared
     advance: kernel (fields, records)
     observe: kernel (fields, records, beginning)
+    act: the same of what an action does besides, or None
   """
 
   def __init__(self, own: Rules, task: Any, nworld: int, device: Any):
-    self.kind, self.advance, self.observe = compiled(own)
+    self.kind, self.advance, self.observe, self.act = compiled(own)
     self._fields, self._dtype = own.fields, self.kind.numpy_dtype()
     self._dtype = np.dtype(self._dtype)
     self.rows: dict[str, wp.array] = {}

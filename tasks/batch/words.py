@@ -4,6 +4,7 @@
 # Vectors of Warp's are not known to type checkers:
 # pyright: reportCallIssue=false, reportArgumentType=false, reportIndexIssue=false
 # pyright: reportInvalidTypeForm=false
+import dis
 import functools
 import types
 from typing import Any
@@ -21,49 +22,149 @@ _CLOSING, _GRIPPING = wp.constant(instrument.CLOSING), wp.constant(instrument.GR
 _FOLD, _FORCE = wp.constant(instrument.FOLD), wp.constant(instrument.HELD_FORCE)
 
 
-@wp.func
+WORDS: dict[Any, Any] = {  # of Python -> of Warp
+  rules.rows: wp.matrix_from_rows, rules.vector: wp.vec3, rules.length: wp.length,
+  rules.dot: wp.dot, rules.root: wp.sqrt, rules.closeness: kernels.closeness, rules.clamp: wp.clamp,
+}  # fmt: skip
+
+
+def word(function: Any) -> Any:
+  """Makes a Warp function of what a word of the same name in `rules` is for many worlds."""
+  WORDS[getattr(rules, function.__name__)] = found = wp.func(function)
+  return found
+
+
+@word
 def tip(s: Common):
   """See `rules`."""
   return kernels.vector(s.tip_pos, s.world)
 
 
-@wp.func
+@word
 def point(s: Common, triangle: int):
   """See `rules`."""
   return kernels.point(s, s.world, triangle)
 
 
-@wp.func
+@word
 def corner(s: Common, triangle: int, k: int):
   """See `rules`."""
   return kernels.node(s, s.world, s.elem[triangle, k])
 
 
-@wp.func
+@word
 def normal(s: Common, triangle: int):
   """See `rules`."""
   return kernels.normal(s, s.world, triangle)
 
 
-@wp.func
+@word
 def peak(s: Common):
   """See `rules`."""
   return s.peak_force[s.world, 0]
 
 
-@wp.func
+@word
 def force(s: Common):
   """See `rules`."""
   return wp.length(kernels.vector(s.contact_force, s.world))
 
 
-@wp.func
+@word
+def last_component(s: Common, o: Any):
+  """See `rules`."""
+  return s.action[s.world, s.action.shape[1] - 1]
+
+
+@word
+def other_tip(s: Common):
+  """See `rules`."""
+  return kernels.vector(s.other_tip_pos, s.world)
+
+
+@word
+def other_point(s: Common, place: wp.vec3):
+  """See `rules`."""
+  return other_tip(s) + wp.quat_rotate(_turn(s.other_tip_quat, s.world), place)
+
+
+@word
+def other_force(s: Common):
+  """See `rules`."""
+  return wp.length(kernels.vector(s.other_contact_force, s.world))
+
+
+@word
+def bonds(s: Common):
+  """See `rules`."""
+  return s.bond_vert.shape[0]
+
+
+@word
+def bond(s: Common, k: int):
+  """See `rules`."""
+  return kernels.node(s, s.world, s.bond_vert[k])
+
+
+@word
+def is_free(s: Common, k: int):
+  """See `rules`."""
+  return s.bond_damage[s.world, k] >= 1.0
+
+
+@word
+def share_freed(s: Common):
+  """See `rules`."""
+  free = wp.float64(0.0)
+  for k in range(bonds(s)):
+    if is_free(s, k):
+      free += s.bond_share[k]
+  return float(free)
+
+
+@word
+def traction(s: Common):
+  """See `rules`."""
+  sum = wp.vec3()
+  for k in range(bonds(s)):
+    sum += wp.vec3(
+      s.bond_force[s.world, k, 0], s.bond_force[s.world, k, 1], s.bond_force[s.world, k, 2]
+    )
+  return wp.length(sum)
+
+
+@word
+def weaken(s: Common, k: int, amount: float):
+  """See `rules`."""
+  s.bond_loss[s.world, k] = s.bond_loss[s.world, k] + amount
+
+
+@word
+def cutter(s: Common):
+  """See `rules`."""
+  w = s.world
+  seat = wp.vec3(s.cutter_seat[w, 0, 0], s.cutter_seat[w, 0, 1], s.cutter_seat[w, 0, 2])
+  return s.cutter_inside[w, 0] > 0.0, s.cutter_length[w, 0], seat
+
+
+@word
+def pieces(s: Common):
+  """See `rules`."""
+  return s.piece_count[s.world]
+
+
+@word
+def tear(s: Common, o: Any, value: float):
+  """See `rules`."""
+
+
+@word
 def miss(s: Common, o: Any, value: float):
   """See `rules`."""
   s.errors[s.world] = s.errors[s.world] + 1
 
 
-@wp.func
+@word
 def reach(s: Common, o: Any, value: float):
   """See `rules`."""
   s.targets[s.world] = s.targets[s.world] + 1
@@ -76,52 +177,46 @@ def _turn(quat: wp.array2d[float], w: int):
   return wp.quat(quat[w, 1], quat[w, 2], quat[w, 3], quat[w, 0])
 
 
-@wp.func
+@word
 def from_tip(s: Common, place: wp.vec3):
   """See `rules`."""
   return wp.quat_rotate_inv(_turn(s.tip_quat, s.world), place - tip(s))
 
 
-@wp.func
+@word
 def closing(s: Common):
   """See `rules`."""
   opening, target = s.gripper[s.world, 0], s.gripper[s.world, 1]
   return target < wp.min(opening - _CLOSING, _GRIPPING)
 
 
-@wp.func
+@word
 def holds(s: Common):
   """See `rules`."""
   both = wp.min(s.inner[s.world, 0], s.inner[s.world, 1])
   return both > _FORCE and s.gripper[s.world, 0] > _FOLD
 
 
-@wp.func
+@word
 def grip(s: Common, o: Any, value: float):
   """See `rules`."""
   reach(s, o, value)
   s.grasps[s.world] = s.grasps[s.world] + 1
 
 
-@wp.func
+@word
 def slipped(s: Common, o: Any):
   """See `rules`."""
   s.slips[s.world] = s.slips[s.world] + 1
 
 
-@wp.func
+@word
 def drop(s: Common, o: Any):
   """See `rules`."""
   s.errors[s.world] = s.errors[s.world] + 1
 
 
-@wp.func
-def reports(s: Common, o: Any):
-  """See `rules`."""
-  return s.action[s.world, s.action.shape[1] - 1] > 0.5
-
-
-@wp.func
+@word
 def visible(s: Common, o: Any):
   """See `rules`."""
   seen = wp.float32(0.0)
@@ -129,17 +224,6 @@ def visible(s: Common, o: Any):
     if not s.behind[s.world, k]:
       seen += 1.0
   return seen / float(s.behind.shape[1])
-
-
-_BUILTIN = {
-  rules.rows: wp.matrix_from_rows, rules.length: wp.length,
-  rules.dot: wp.dot, rules.root: wp.sqrt, rules.closeness: kernels.closeness, rules.clamp: wp.clamp,
-}  # fmt: skip
-_WORDS = (
-  tip, point, corner, normal, peak, force, miss, reach, from_tip, closing, holds, grip, slipped,
-  drop, reports, visible,
-)  # fmt: skip
-WORDS = _BUILTIN | {getattr(rules, word.key): word for word in _WORDS}  # of Python -> of Warp
 
 
 def translate(rule: Any, module: Any, known: dict[Any, Any]) -> Any:
@@ -156,19 +240,22 @@ def translate(rule: Any, module: Any, known: dict[Any, Any]) -> Any:
     known[rule] = translate(rules.INSTEAD[rule], module, known)
     return known[rule]
   names = dict(rule.__globals__)
-  for name in rule.__code__.co_names:
+  used = (step.argval for step in dis.get_instructions(rule) if step.opname == "LOAD_GLOBAL")
+  for name in used:
     if isinstance(names.get(name), types.FunctionType):
       names[name] = translate(names[name], module, known)
   code = rule.__code__
   copy = types.FunctionType(code, names, rule.__name__, rule.__defaults__, rule.__closure__)
   copy.__annotations__ = dict.fromkeys(code.co_varnames[: code.co_argcount], Any)
   copy.__module__, copy.__qualname__ = rule.__module__, rule.__qualname__
-  known[rule] = wp.func(copy, module=module)
+  # Domains that build on others have rules of the same names.
+  name = f"{rule.__module__.rpartition('.')[2]}_{rule.__name__}"
+  known[rule] = wp.func(copy, name=name, module=module)
   return known[rule]
 
 
 @functools.cache
-def compiled(own: Rules) -> tuple[Any, Any, Any]:
+def compiled(own: Rules) -> tuple[Any, Any, Any, Any]:
   """Returns the struct of a domain's state, and the kernels of its rules."""
   module, known = wp.get_module(own.state.__module__), dict(WORDS)
   kinds = {
@@ -176,7 +263,7 @@ def compiled(own: Rules) -> tuple[Any, Any, Any]:
     for name, kind in own.fields.items()
   }
   state: Any = wp.struct(type("State", (), {"__annotations__": kinds, "__module__": module.name}))
-  rule, look = (translate(each, module, known) for each in (own.advance, own.observe))
+  rule = translate(own.advance, module, known)
   judge = kernels.judge
 
   def advance(s: Common, states: wp.array(dtype=state)):
@@ -185,10 +272,18 @@ def compiled(own: Rules) -> tuple[Any, Any, Any]:
     states[s.world] = o
     judge(s, s.world, progress, outcome)
 
-  def observe(s: Common, states: wp.array(dtype=state), beginning: bool):
-    s.world = wp.tid()
-    if not beginning or s.begun[s.world]:
-      states[s.world] = look(s, states[s.world])
+  def following(name: str, rule: Any) -> Any:
+    """Returns the kernel of a rule that returns the state alone."""
 
-  after, seen = (wp.kernel(k, module=module, enable_backward=False) for k in (advance, observe))
-  return state, after, seen
+    def follow(s: Common, states: wp.array(dtype=state), beginning: bool):
+      s.world = wp.tid()
+      if not beginning or s.begun[s.world]:
+        states[s.world] = rule(s, states[s.world])
+
+    follow.__qualname__ = name
+    return wp.kernel(follow, module=module, enable_backward=False)
+
+  after = wp.kernel(advance, module=module, enable_backward=False)
+  look = following("observe", translate(own.observe, module, known))
+  act = following("act", translate(own.act, module, known)) if own.act else None
+  return state, after, look, act

@@ -17,6 +17,7 @@ import numpy as np
 import warp as wp
 
 RUNNING, SUCCESS, DAMAGED, MISSED = range(4)
+FAR = 1e9  # farther than anything [m]
 OUTCOMES = (None, "success", "damage", "missed")
 
 Vector = Annotated[Any, wp.vec3]
@@ -36,6 +37,7 @@ class Rules:
     observe: rule (s, o) that returns o with its own observations up to date
     observed: fields of the state that are these
     metrics: of the domain's own, by the field that is an episode's value so far
+    act: rule (s, o) that returns o once an action has moved the drives, before the physics, or None
     shared: arrays of the state that are the same in all worlds and episodes
   """
 
@@ -44,11 +46,12 @@ class Rules:
   observe: Callable
   observed: tuple[str, ...]
   metrics: Mapping[str, str] = dataclasses.field(default_factory=dict)
+  act: Callable | None = None
   shared: tuple[str, ...] = ()
 
   def __post_init__(self):
     where = f"{self.state.__module__}.{self.state.__qualname__}"
-    for name in ("advance", "observe"):
+    for name in ("advance", "observe", *(["act"] if self.act else [])):
       rule = getattr(self, name)
       if not inspect.isfunction(rule) or len(inspect.signature(rule).parameters) != 2:
         raise TypeError(f"{where}: {name} is {rule!r}, expected a function of s and o")
@@ -99,6 +102,11 @@ def clamp(x: float, low: float, high: float) -> float:
 def rows(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
   """Returns three vectors as rows, see `Vectors3`."""
   return np.array([a, b, c])
+
+
+def vector(x: float, y: float, z: float) -> np.ndarray:
+  """Returns a vector."""
+  return np.array([x, y, z])
 
 
 def length(v: np.ndarray) -> float:
@@ -159,14 +167,72 @@ def holds(s: Any) -> bool:
   return s.holds()
 
 
-def reports(s: Any, o: Any) -> bool:
-  """Returns whether the last component of the action is above 0.5."""
-  return bool(o.action[..., -1].max() > 0.5)
-
-
 def visible(s: Any, o: Any) -> float:
   """Returns the share of the points `o.disc` that the organ does not hide [-]."""
   return 1 - float(s.hidden(o.disc).mean())
+
+
+def last_component(s: Any, o: Any) -> float:
+  """Returns the last component of the action, the largest of its rows."""
+  return float(o.action[..., -1].max())
+
+
+def other_tip(s: Any) -> np.ndarray:
+  """Returns where the tip of the other hand's instrument is [m]."""
+  return s.second.tip_pos()
+
+
+def other_point(s: Any, place: np.ndarray) -> np.ndarray:
+  """Returns where a place in the frame of that tip is [m]."""
+  return s.second.to_world(place)
+
+
+def other_force(s: Any) -> float:
+  """Returns the force on that instrument below the shaft [N]."""
+  return length(s.second.contact_force())
+
+
+def bonds(s: Any) -> int:
+  """Returns how many bonds the organ has, free ones too."""
+  return len(s.organ.bonds)
+
+
+def bond(s: Any, k: int) -> np.ndarray:
+  """Returns where a bond is [m]."""
+  return s.organ.bonds.positions[k]
+
+
+def is_free(s: Any, k: int) -> bool:
+  """Returns whether a bond has broken."""
+  return bool(s.organ.bonds.free[k])
+
+
+def share_freed(s: Any) -> float:
+  """Returns the share of the area of bonds that is free [-]."""
+  return s.organ.bonds.share_freed
+
+
+def traction(s: Any) -> float:
+  """Returns the pull of all bonds together on the organ [N]."""
+  return length(s.organ.bonds.force.sum(axis=0))
+
+
+def weaken(s: Any, k: int, amount: float) -> None:
+  """Adds to the damage of a bond."""
+  amounts = np.zeros(bonds(s))
+  amounts[k] = amount
+  s.organ.bonds.weaken(amounts)
+
+
+def cutter(s: Any) -> tuple[bool, float, np.ndarray]:
+  """Returns of what cuts whether it is inside, how far it came, where it is at rest [m, m]."""
+  (found,) = s.organ.cutters
+  return found.inside, found.length, found.seat
+
+
+def pieces(s: Any) -> int:
+  """Returns how many parts the organ is in."""
+  return len(s.organ.pieces)
 
 
 # What the recorder is told; labels are the task's.
@@ -194,6 +260,11 @@ def slipped(s: Any, o: Any) -> None:
 def drop(s: Any, o: Any) -> None:
   """Reports that what was held, or followed, is lost."""
   o.event(s, "drop", None, o.label("drop"))
+
+
+def tear(s: Any, o: Any, value: float) -> None:
+  """Reports what came free as it should not, a share of the area of bonds [-]."""
+  o.event(s, "slip", value, "torn")
 
 
 # Formulas.

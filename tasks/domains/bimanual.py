@@ -20,9 +20,32 @@ import itertools
 import numpy as np
 
 from ..base import Physics
+from ..core.rules import (
+  DAMAGED,
+  FAR,
+  RUNNING,
+  Rules,
+  Vector,
+  bond,
+  bonds,
+  clamp,
+  dot,
+  is_free,
+  last_component,
+  length,
+  many,
+  other_force,
+  other_point,
+  other_tip,
+  point,
+  weaken,
+)
 from ..performer import Performer, Script
 from ..registry import exercise
-from .dissect import Dissect
+from . import dissect
+from .dissect import Dissect, hold, middle
+from .dissect import observe as look
+from .freeing import METRICS, count, earned, ruined
 from .grasp import FUNDUS
 
 # Stiffness [N/m^3], strength [Pa] and energy [J/m^2] of the bed; ours, we know of no measurement. A
@@ -61,13 +84,120 @@ def hard(**kwargs):
   return Bimanual(scene, **kwargs)
 
 
+class State(dissect.State):
+  """State of a world."""
+
+  toe: Vector  # other end of the hook's wire, in the frame of its tip [m]
+  rest: Vector  # the site's place at rest [m]
+  away: Vector  # from the bed
+  live: bool  # whether the current is on
+  time: float  # how long it has burnt what the hook touches [s]
+  hook_front: Vector
+  retracted: float
+  burnt: float
+
+
+# The rules. What goes over all bonds is written for numpy, and for many worlds below it.
+
+
+def retraction(s, o):
+  """Returns how far the site is from its place at rest, away from the bed [m]."""
+  return dot(point(s, o.site) - o.rest, o.away)
+
+
+def fair(s, o):
+  """Returns whether what comes free now is held away from the bed."""
+  return o.grasped == 1.0 and retraction(s, o) > AWAY
+
+
+def distances(s, o) -> np.ndarray:
+  """Returns how far the bonds that hold are from the wire [m]  (n,); free ones are far away."""
+  bonds, heel = s.organ.bonds, other_tip(s)
+  along, offset = other_point(s, o.toe) - heel, bonds.positions - heel
+  share = (offset @ along / (along @ along)).clip(0, 1)
+  far = np.linalg.norm(offset - share[:, None] * along, axis=1)
+  return np.where(bonds.free, np.inf, far)
+
+
+def wire_distance(s, o, k):
+  """Returns how far a bond that holds is from the wire [m]; a free one is far away."""
+  heel = other_tip(s)
+  along, offset = other_point(s, o.toe) - heel, bond(s, k) - heel
+  share = clamp(dot(offset, along) / dot(along, along), 0.0, 1.0)
+  return FAR if is_free(s, k) else length(offset - share * along)
+
+
+def divide(s, o):
+  """Weakens the bonds in reach of the wire; returns whether there are any."""
+  near = distances(s, o) < REACH
+  if near.any():
+    s.organ.bonds.weaken(RATE * o.control_timestep * near)
+  return bool(near.any())
+
+
+@many(divide)
+def _divide(s, o):
+  found = int(0)  # noqa: RUF046, UP018 - a variable to Warp
+  for k in range(bonds(s)):
+    if wire_distance(s, o, k) < REACH:
+      weaken(s, k, RATE * o.control_timestep)
+      found += 1
+  return found > 0
+
+
+def nearest(s, o):
+  """Returns where the bond is that holds and is nearest to the wire [m]."""
+  return s.organ.bonds.positions[distances(s, o).argmin()]
+
+
+@many(nearest)
+def _nearest(s, o):
+  found, least = int(0), float(FAR)  # noqa: RUF046, UP018 - variables to Warp
+  for k in range(bonds(s)):
+    far = wire_distance(s, o, k)
+    if far < least:
+      least = far
+      found = k
+  return bond(s, found)
+
+
+def act(s, o):
+  """Sends the current through the hook: it divides, or burns what the hook touches."""
+  o.live = last_component(s, o) > 0.0
+  if o.live and not divide(s, o) and other_force(s) > TOUCHING:
+    o.time = o.time + o.control_timestep
+  return o
+
+
+def advance(s, o):
+  """Follows the grasp, what comes free, and what is burnt."""
+  o, near = hold(s, o)
+  o, outcome = count(s, o, fair(s, o))
+  if o.time > BURN and outcome == RUNNING:
+    outcome = DAMAGED
+  return o, earned(o, near, outcome), outcome
+
+
+def observe(s, o):
+  """Finds what `dissect` does, hook_front, retracted and burnt."""
+  o = look(s, o)
+  o.hook_front = nearest(s, o) - other_tip(s)
+  o.retracted = retraction(s, o) / AWAY
+  o.burnt = min(o.time / BURN, 1.0)
+  return o
+
+
 class Bimanual(Dissect):
-  """Retract with one hand, dissect with the other.
+  """Retract with one hand, dissect with the other."""
 
-  Attributes:
-    burnt: how long the current has burnt what the hook touches [s]
-  """
-
+  rules = Rules(
+    State,
+    advance,
+    observe,
+    (*Dissect.rules.observed, "hook_front", "retracted", "burnt"),
+    METRICS,
+    act,
+  )
   touched = 36
 
   @property
@@ -78,49 +208,18 @@ class Bimanual(Dissect):
   def begin(self, physics: Physics) -> None:
     """Draws the site to grasp."""
     super().begin(physics)
-    self.burnt, self.live = 0.0, False
-    self._rest = physics.point(self.site)
-    away = self._rest - self.front(physics)
-    self._away = away / np.linalg.norm(away)
+    self.time, self.live = 0.0, False
+    heel, toe = (physics.data.site(f"{self.second}{end}") for end in ("tip", "toe"))
+    self.toe = heel.xmat.reshape(3, 3).T @ (toe.xpos - heel.xpos)
+    self.rest = physics.point(self.site)
+    away = self.rest - middle(physics)
+    self.away = away / np.linalg.norm(away)
 
-  def retracted(self, physics: Physics) -> float:
-    """Returns how far the site is from its place at rest, away from the bed [m]."""
-    return float((physics.point(self.site) - self._rest) @ self._away)
-
-  def fair(self, physics: Physics) -> bool:
-    """Whether what comes free now is held away from the bed."""
-    return bool(self.grasped) and self.retracted(physics) > AWAY
-
-  def before_step(self, action, physics: Physics) -> None:
-    """Moves both instruments, and sends the current through the hook."""
-    super().before_step(action, physics)
-    self.live = bool(self.action[..., -1].max() > 0)
-    if not self.live:
-      return
-    bonds = physics.organ.bonds
-    near = self._distances(physics) < REACH
-    if near.any():
-      bonds.weaken(RATE * self.control_timestep * near)
-    elif np.linalg.norm(physics.hands[1].contact_force()) > TOUCHING:
-      self.burnt += self.control_timestep
-
-  def _distances(self, physics: Physics) -> np.ndarray:
-    """Returns how far the bonds that hold are from the wire [m]  (n,); free ones are far away."""
-    bonds, hook = physics.organ.bonds, physics.hands[1]
-    heel = hook.tip_pos()
-    along = physics.data.ptr.site_xpos[physics.model.ptr.site("hook/toe").id] - heel
-    offset = bonds.positions - heel
-    share = (offset @ along / (along @ along)).clip(0, 1)
-    far = np.linalg.norm(offset - share[:, None] * along, axis=1)
-    return np.where(bonds.free, np.inf, far)
-
-  def advance(self, physics: Physics) -> float:
-    """Follows the grasp, what comes free, and what is burnt."""
-    done = super().advance(physics)
-    if self.burnt > BURN and self.outcome is None:
-      self.harm_done(physics, f"burnt for {self.burnt:.2f} s")
-      return self.earned(0.0)
-    return done
+  def label(self, kind: str) -> str:
+    """Returns what damage is."""
+    if kind == "damage" and not ruined(self):
+      return f"burnt for {self.time:.2f} s"
+    return super().label(kind)
 
   def instruct(self, physics: Physics) -> str:
     """Says to grasp, to pull, or to divide."""
@@ -128,22 +227,12 @@ class Bimanual(Dissect):
       return super().instruct(physics)
     if self.traction > self.limit:
       return "Pull less: the liver gives"
-    if not self.fair(physics):
+    if not fair(physics, self):
       return "Pull it further from its bed"
-    if self.live and not np.isfinite(self._distances(physics)).any():
+    if self.live and not np.isfinite(distances(physics, self)).any():
       return "Current off"
     share = f"{100 * self.clean:.0f} of {100 * self.wanted:.0f} % are free"
     return f"Hold it so, and divide its bed with the hook: {share}"
-
-  def observe(self, physics: Physics) -> dict[str, np.ndarray]:
-    """Returns what `dissect` does, hook_front, retracted and burnt."""
-    bonds, hook = physics.organ.bonds, physics.hands[1]
-    nearest = bonds.positions[self._distances(physics).argmin()]
-    return super().observe(physics) | {
-      "hook_front": nearest - hook.tip_pos(),
-      "retracted": np.array([self.retracted(physics) / AWAY]),
-      "burnt": np.array([min(self.burnt / BURN, 1.0)]),
-    }
 
   def expert(self, p: Performer) -> Script:
     """Grasps and pulls with one hand; the other divides, bond by bond from its side."""
@@ -154,7 +243,7 @@ class Bimanual(Dissect):
     """Grasps and pulls away from the bed, and holds it so."""
 
     def further(contact: float) -> bool:
-      near = self.retracted(p.physics) < (1 + _MORE) * p.excess(contact) * AWAY
+      near = retraction(p.physics, self) < (1 + _MORE) * p.excess(contact) * AWAY
       return near and self.traction < _SHARE * self.limit
 
     for again in itertools.count():
@@ -168,14 +257,14 @@ class Bimanual(Dissect):
     physics, up = p.physics, p.hand.trocar().mat[:, 2]
     while self.outcome is None:
       p.extra[:] = -1.0
-      if not self.fair(physics):
+      if not fair(physics, self):
         yield p.step()
         continue
       bonds = physics.organ.bonds
       held = np.flatnonzero(~bonds.free)
       near = held[np.linalg.norm(bonds.positions[held] - p.tip, axis=1).argmin()]
       yield from p.above(bonds.positions[near], _WAITS, up)
-      while self.outcome is None and self.fair(physics) and not bonds.free[near]:
+      while self.outcome is None and fair(physics, self) and not bonds.free[near]:
         goal = bonds.positions[near]
         step = goal + _OFF * up - p.tip
         far = float(np.linalg.norm(step))

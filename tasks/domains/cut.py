@@ -16,12 +16,32 @@ and Scott 2007, 10.1177/1553350607302329), with a scalpel in place of scissors a
 """
 
 import dataclasses
+from typing import Annotated, Any
 
 import mujoco
 import numpy as np
+import warp as wp
+from palpate.tissue.types import Array, ints
 
 from ..base import Physics, Task
-from ..core.rules import closeness
+from ..core.rules import (
+  DAMAGED,
+  FAR,
+  RUNNING,
+  SUCCESS,
+  Rules,
+  Vector,
+  Vectors3,
+  closeness,
+  cutter,
+  length,
+  many,
+  miss,
+  pieces,
+  root,
+  rows,
+  tip,
+)
 from ..performer import Performer, Script
 from ..registry import exercise
 from ..scenes import Scene
@@ -38,7 +58,7 @@ ASTRAY = 0.01  # most that may be cut beyond the tolerance [m]
 COVERED = 0.98  # share of the line that is to be cut
 CLOSING = 0.006  # length that is cut beyond that of the line where the piece counts as free [m]
 STEP = 0.001  # between points of the line [m]
-AHEAD = (5, 10, 15)  # points further on that are observed
+FIRST, SECOND, THIRD = 5, 10, 15  # points further on that are observed
 _MARKS = 36  # spheres that draw the line
 LEAP = 10  # points of the line between two control steps that do not follow one another
 # Of the expert: how fast it cuts [m/s], and how deep the tip is under the sheet and over it [m].
@@ -83,20 +103,150 @@ def line(radius: float, wave: float, start: float) -> tuple[np.ndarray, float]:
   return np.stack([np.interp(way, arc, column) for column in fine.T], axis=1), float(arc[-1])
 
 
-class Cut(Task):
-  """Cut out a marked piece.
+class State:
+  """State of a world."""
 
-  Attributes:
-    cut: which points of the line are cut           (n,) bool
-    opened: length that was cut so far [m]
-    astray: length of that beyond the tolerance [m]
-    jagged: length of that more than 2 mm from the line [m]
-    excess: area between cut and line [m^2]
-    deviation: mean distance of the cut from the line [m]
-    farthest: largest [m]
-  """
+  tolerance: float  # [m]
+  count: int  # points of the line
+  curve: Annotated[Any, Array(wp.vec3, ("room",))]  # these [m]
+  cut: Annotated[Any, ints("room")]  # whether they are cut
+  done: int  # how many are
+  next: int  # the first that is not, after those that are
+  length: float  # of the line [m]
+  opened: float  # length that was cut so far [m]
+  astray: float  # length of that beyond the tolerance [m]
+  jagged: float  # length of that more than 2 mm from the line [m]
+  excess: float  # area between cut and line [m^2]
+  mean: float  # distance of the cut from the line [m]
+  farthest: float  # largest [m]
+  inside: bool  # whether the edge was in the tissue a control step ago
+  seat: Vector  # where it was then [m]
+  travelled: float  # and how far it had come [m]
+  distance0: float  # [m]
+  nearest: float  # best closeness so far
+  target: Vector
+  ahead: Vectors3
+  covered: float
+  deviation: float
+
+
+# The rules. What goes over many points is written for numpy, and for many worlds below it.
+
+
+def following(o):
+  """Returns the first point of the line that is not cut, after those that are."""
+  for k in range(o.count):
+    if o.cut[k] == 0 and o.cut[(k + o.count - 1) % o.count] == 1:
+      return k
+  return 0
+
+
+def nearest(o, place):
+  """Returns the point of the line nearest to a place from above, and how far that is [m]."""
+  far = np.linalg.norm(o.curve[:, :2] - place[:2], axis=1)
+  k = int(far.argmin())
+  return k, float(far[k])
+
+
+@many(nearest)
+def _nearest(o, place):
+  found, least = int(0), float(FAR)  # noqa: RUF046, UP018 - variables to Warp
+  for k in range(o.count):
+    x, y = o.curve[k][0] - place[0], o.curve[k][1] - place[1]
+    far = root(x * x + y * y)
+    if far < least:
+      least = far
+      found = k
+  return found, least
+
+
+def distance(s, o):
+  """Returns how far the tip is from the next point of the line [m]."""
+  return length(o.curve[o.next] - tip(s))
+
+
+def cover(o, first, last):
+  """Counts the points between two that the edge went by as cut, where it did not leap."""
+  half = o.count // 2
+  way = (last - first + half + o.count) % o.count - half
+  low, high = min(way, 0), max(way, 0)
+  if abs(way) > LEAP:
+    low = way
+    high = way
+  for i in range(low, high + 1):
+    k = (first + i + o.count) % o.count
+    if o.cut[k] == 0:
+      o.cut[k] = 1
+      o.done = o.done + 1
+  o.covered = float(o.done) / float(o.count)
+  o.next = following(o)
+  return o
+
+
+def proceed(s, o, start, end, way):
+  """Counts a piece of the cut, between two places at rest [m]."""
+  first, before = nearest(o, start)
+  last, off = nearest(o, end)
+  if off > o.tolerance and before <= o.tolerance:
+    miss(s, o, off)
+  o.opened = o.opened + way
+  o.excess = o.excess + off * way
+  o.mean = o.excess / o.opened
+  o.farthest = max(o.farthest, off)
+  if off > RULE:
+    o.jagged = o.jagged + way
+  if off > o.tolerance:
+    o.astray = o.astray + way
+  else:
+    o = cover(o, first, last)
+  return o
+
+
+def advance(s, o):
+  """Follows the edge through the tissue."""
+  inside, travelled, seat = cutter(s)
+  if inside and travelled > o.travelled:
+    o = proceed(s, o, o.seat if o.inside else seat, seat, travelled - o.travelled)
+  o.inside = inside
+  o.seat = seat
+  o.travelled = travelled
+  if o.astray > ASTRAY:
+    return o, -1.0, DAMAGED
+  if o.covered >= COVERED and (o.opened > o.length + CLOSING or pieces(s) > 1):
+    return o, 1.0, SUCCESS
+  o.nearest = max(o.nearest, closeness(distance(s, o), o.distance0))
+  return o, 0.1 * o.nearest + 0.9 * o.covered, RUNNING
+
+
+def observe(s, o):
+  """Finds target, ahead and deviation; covered is up to date."""
+  k, n, here = o.next, o.count, tip(s)
+  o.target = o.curve[k] - here
+  o.ahead = rows(
+    o.curve[(k + FIRST) % n] - here,
+    o.curve[(k + SECOND) % n] - here,
+    o.curve[(k + THIRD) % n] - here,
+  )
+  o.deviation = o.farthest
+  return o
+
+
+class Cut(Task):
+  """Cut out a marked piece."""
 
   watch = ("miss", "unintended_contact")
+  rules = Rules(
+    State,
+    advance,
+    observe,
+    ("target", "ahead", "covered", "deviation"),
+    {
+      "cut_deviation": "mean",
+      "cut_farthest": "farthest",
+      "cut_excess": "excess",
+      "cut_jagged": "jagged",
+    },
+  )
 
   def __init__(
     self,
@@ -128,6 +278,7 @@ class Cut(Task):
     if not 0 < tolerance < radius:
       raise ValueError(f"{name}: tolerance is {tolerance}, expected a number in (0, {radius})")
     self.radius, self.wave, self.tolerance = radius, wave, tolerance
+    self.room = len(line(radius, wave, 0.0)[0]) + 4  # another may have a point or two more
     kwargs = {"force_limit": 0.8, "damage": 2.0, **kwargs}
     super().__init__(dataclasses.replace(scene, targets=_MARKS), random, name=name, **kwargs)
 
@@ -142,91 +293,27 @@ class Cut(Task):
   def begin(self, physics: Physics) -> None:
     """Draws the line, which begins anywhere on it."""
     self.curve, self.length = line(self.radius, self.wave, self.random.uniform(0, 2 * np.pi))
-    self.cut = np.zeros(len(self.curve), bool)
-    self.opened = self.astray = self.jagged = self.excess = self.farthest = 0.0
-    self._seat: np.ndarray | None = None
-    self._last = physics.organ.cutters[0].length
-    self.nearest, self.distance0 = 0.0, self.distance(physics)
+    self.count, self.cut = len(self.curve), np.zeros(len(self.curve), bool)
+    self.opened = self.astray = self.jagged = self.excess = self.mean = self.farthest = 0.0
+    self.inside, self.travelled, self.seat = cutter(physics)
+    self.done, self.next, self.covered, self.nearest = 0, 0, 0.0, 0.0
+    self.distance0 = distance(physics, self)
     for i, k in enumerate(np.linspace(0, len(self.curve), _MARKS, endpoint=False).astype(int)):
       physics.mark(i, self.curve[k] + [0.0, 0.0, 0.0006], size=0.0009)
 
-  @property
-  def deviation(self) -> float:
-    """Mean distance of the cut from the line so far [m]."""
-    return self.excess / self.opened if self.opened else 0.0
-
-  @property
-  def next(self) -> int:
-    """The first point of the line that is not cut, after those that are."""
-    if not self.cut.any() or self.cut.all():
-      return 0
-    return int(np.flatnonzero(~self.cut & np.roll(self.cut, 1))[0])
-
-  def distance(self, physics: Physics) -> float:
-    """Returns how far the tip is from the next point of the line [m]."""
-    return float(np.linalg.norm(self.curve[self.next] - physics.tip_pos()))
-
-  def advance(self, physics: Physics) -> float:
-    """Follows the edge through the tissue."""
-    (cutter,) = physics.organ.cutters
-    more, self._last = cutter.length - self._last, cutter.length
-    seat = cutter.seat if cutter.inside else None
-    if more > 0 and seat is not None:
-      self._open(physics, self._seat if self._seat is not None else seat, seat, more)
-    self._seat = seat
-    share = float(self.cut.mean())
-    if self.astray > ASTRAY:
-      self.outcome = "damage"
-      self.event(physics, "note", label=f"{1e3 * self.astray:.0f} mm are cut beside the line")
-      return -1.0
-    closed = self.opened > self.length + CLOSING
-    if share >= COVERED and (closed or len(physics.organ.pieces) > 1):
-      self.outcome = "success"
-      return 1.0
-    self.nearest = max(self.nearest, closeness(self.distance(physics), self.distance0))
-    return 0.1 * self.nearest + 0.9 * share
-
-  def _open(self, physics: Physics, start: np.ndarray, end: np.ndarray, length: float) -> None:
-    """Counts a piece of the cut, between two places at rest [m]."""
-    far = np.linalg.norm(self.curve[:, None, :2] - np.stack([start, end])[:, :2], axis=2)
-    first, last = far.argmin(axis=0)
-    off = float(far[last, 1])
-    beside, count = off > self.tolerance, len(self.curve)
-    if beside and not self._beside(start):
-      self.event(physics, "miss", off)
-    self.opened += length
-    self.excess += off * length
-    self.farthest = max(self.farthest, off)
-    self.jagged += length * (off > RULE)
-    self.astray += length * beside
-    if beside:
-      return
-    way = (last - first + count // 2) % count - count // 2
-    between = np.arange(min(0, way), max(0, way) + 1) if abs(way) <= LEAP else np.array([way])
-    self.cut[(first + between) % count] = True
-
-  def _beside(self, place: np.ndarray) -> bool:
-    return bool(np.linalg.norm(self.curve[:, :2] - place[:2], axis=1).min() > self.tolerance)
+  def label(self, kind: str) -> str:
+    """Returns what damage is."""
+    return f"{1e3 * self.astray:.0f} mm are cut beside the line" if kind == "damage" else ""
 
   def instruct(self, physics: Physics) -> str:
     """Says to begin, or to go on."""
     if not self.opened:
       return "Push the tip of the blade through the line"
-    return f"Cut along the line: {100 * self.cut.mean():.0f} % done"
-
-  def observe(self, physics: Physics) -> dict[str, np.ndarray]:
-    """Returns target, ahead, covered and deviation."""
-    further = [(self.next + k) % len(self.curve) for k in AHEAD]
-    return {
-      "target": self.curve[self.next] - physics.tip_pos(),
-      "ahead": self.curve[further] - physics.tip_pos(),
-      "covered": np.array([float(self.cut.mean())]),
-      "deviation": np.array([self.farthest]),
-    }
+    return f"Cut along the line: {100 * self.covered:.0f} % done"
 
   def recorded(self, physics: Physics) -> dict[str, float]:
     """Returns how the cut is so far."""
-    own = {"deviation": self.deviation, "farthest": self.farthest}
+    own = {"deviation": self.mean, "farthest": self.farthest}
     own |= {"excess": self.excess, "jagged": self.jagged}
     return dict(super().recorded(physics)) | own
 
@@ -240,9 +327,9 @@ class Cut(Task):
 
   def _goes_on(self, physics: Physics) -> bool:
     """Returns whether somebody else was cutting along the line."""
-    (cutter,) = physics.organ.cutters
-    off = np.linalg.norm(self.curve[self.next] - cutter.seat) if cutter.inside else np.inf
-    return bool(off < 2 * self.tolerance)
+    inside, _, seat = cutter(physics)
+    off = length(self.curve[self.next] - seat)
+    return inside and off < 2 * self.tolerance
 
   def expert(self, p: Performer) -> Script:
     """Goes through the sheet and around, a little beyond where it began."""
@@ -259,7 +346,7 @@ class Cut(Task):
         yield from p.move(self.curve[start] + _OVER * up)
       yield from p.line(under(self.curve[start], _DEEP), speed=0.02)
       for _ in range(100):  # the sheet gives before it is pierced
-        if physics.organ.cutters[0].inside:
+        if cutter(physics)[0]:
           break
         p.tip = p.tip - 0.01 * self.control_timestep * up
         yield p.step()

@@ -21,12 +21,24 @@ from collections.abc import Callable
 import numpy as np
 
 from ..base import Physics
-from ..core.rules import closeness, drop
+from ..core.rules import (
+  Rules,
+  Vector,
+  bond,
+  bonds,
+  closeness,
+  drop,
+  is_free,
+  many,
+  point,
+  tip,
+  vector,
+)
 from ..performer import Performer, Script
 from ..registry import exercise
 from ..scenes import Scene
-from .freeing import Freeing
-from .grasp import FUNDUS, Hold, distance, follow
+from .freeing import METRICS, Freed, Freeing, count, earned, held, holding
+from .grasp import FUNDUS, Held, Hold, distance, follow
 
 # Stiffness [N/m^3], strength [Pa] and energy [J/m^2] of the bed, and of a tough one. Ours: we know
 # of no measurement; the bed bears the organ, and comes away under half a newton or one.
@@ -60,9 +72,57 @@ def hard(**kwargs):
   return Dissect(scene, **kwargs)
 
 
+class State(Held, Freed):
+  """State of a world."""
+
+  front: Vector
+
+
+# The rules.
+
+
+def middle(s):
+  """Returns the middle of the bonds that hold, or of all where none does [m]."""
+  return held(s).mean(axis=0)
+
+
+@many(middle)
+def _middle(s):
+  found, total = holding(s), vector(0.0, 0.0, 0.0)
+  for k in range(bonds(s)):
+    if found == 0 or not is_free(s, k):
+      total += bond(s, k)
+  return total / float(bonds(s) if found == 0 else found)
+
+
+def hold(s, o):
+  """Follows the grasp; returns too how close the tip is to it, 1 while it holds."""
+  o, lost = follow(s, o)
+  if lost:
+    drop(s, o)
+  return o, 1.0 if o.grasped == 1.0 else closeness(distance(s, o), o.distance0)
+
+
+def advance(s, o):
+  """Follows the grasp and what comes free."""
+  o, near = hold(s, o)
+  o, outcome = count(s, o, o.grasped == 1.0)
+  return o, earned(o, near, outcome), outcome
+
+
+def observe(s, o):
+  """Finds target and front; freed, traction and grasped are up to date."""
+  o.target = point(s, o.site) - tip(s)
+  o.front = middle(s) - tip(s)
+  return o
+
+
 class Dissect(Freeing, Hold):
   """Free an organ from its bed by traction."""
 
+  rules = Rules(
+    State, advance, observe, ("target", "front", "freed", "traction", "grasped"), METRICS
+  )
   slip = 0.006
 
   def __init__(
@@ -86,20 +146,11 @@ class Dissect(Freeing, Hold):
     """Draws the site to grasp."""
     super().begin(physics)
     self.whole(physics)
-    physics.mark(0, physics.point(self.site), now=True)
+    self.show(physics)
 
-  def advance(self, physics: Physics) -> float:
-    """Follows the grasp and what comes free."""
+  def show(self, physics: Physics) -> None:
+    """Marks the site."""
     physics.mark(0, physics.point(self.site), now=True)
-    if follow(physics, self)[1]:
-      drop(physics, self)
-    self.count(physics, self.fair(physics))
-    near = closeness(distance(physics, self), self.distance0)
-    return self.earned(1.0 if self.grasped else near)
-
-  def fair(self, physics: Physics) -> bool:
-    """Whether what comes free now counts as clean."""
-    return bool(self.grasped)
 
   def instruct(self, physics: Physics) -> str:
     """Says to grasp, or to pull."""
@@ -108,16 +159,6 @@ class Dissect(Freeing, Hold):
     if self.traction > self.limit:
       return "Pull less: the liver gives"
     return f"Pull it off its bed: {100 * self.clean:.0f} of {100 * self.wanted:.0f} % are free"
-
-  def observe(self, physics: Physics) -> dict[str, np.ndarray]:
-    """Returns target, front, freed, traction and grasped."""
-    return {
-      "target": physics.point(self.site) - physics.tip_pos(),
-      "front": self.front(physics) - physics.tip_pos(),
-      "freed": np.array([self.freed]),
-      "traction": np.array([self.traction]),
-      "grasped": np.array([float(self.grasped)]),
-    }
 
   def reference_length(self) -> float:
     """Returns the way to the site and off the bed [m]."""
@@ -143,7 +184,7 @@ class Dissect(Freeing, Hold):
       most: how far at most [m]
       further: whether to pull on, by the time that it was held [s]
     """
-    away = p.physics.point(self.site) - self.front(p.physics)
+    away = p.physics.point(self.site) - middle(p.physics)
     along = away / np.linalg.norm(away) + _UP * p.hand.trocar().mat[:, 2]
     along /= np.linalg.norm(along)
     start, far, contact = p.tip.copy(), 0.0, 0.0

@@ -5,22 +5,92 @@ import math
 import numpy as np
 
 from ..base import Physics, Task
+from ..core.rules import (
+  DAMAGED,
+  RUNNING,
+  SUCCESS,
+  bonds,
+  is_free,
+  peak,
+  share_freed,
+  tear,
+  traction,
+)
 from ..scenes import Scene
 
-SEEN = 1e-6  # what rounding may take from a share
+SEEN = 1e-5  # what rounding may take from a share, in float32 too
+
+
+class Freed:
+  """State of bonds that are to come free."""
+
+  wanted: float  # share of their area that must come free as it should
+  limit: float  # of the pull on what the organ is bonded to [N]
+  force_limit: float  # [N]
+  clean: float  # share that came free with force and pull under their limits
+  torn: float  # share that came free otherwise
+  freed: float  # both
+  traction: float  # pull on what the organ is bonded to [N]
+  pulled: float  # the largest so far [N]
+
+
+METRICS = {"share_freed": "clean", "peak_traction": "pulled"}
+
+
+# The rules.
+
+
+def ruined(o):
+  """Returns whether so much is torn that too little is left, or the pull tears what is under it."""
+  return o.torn > 1.0 - o.wanted + SEEN or o.traction > 2.0 * o.limit
+
+
+def count(s, o, fair):
+  """Counts what came free, as torn where it was not fair; returns too what outcome that makes."""
+  o.traction = traction(s)
+  o.pulled = max(o.pulled, o.traction)
+  now = share_freed(s)
+  more = now - o.freed
+  o.freed = now
+  if fair and peak(s) <= o.force_limit and o.traction <= o.limit:
+    o.clean = o.clean + more
+  elif more > 0.0:
+    o.torn = o.torn + more
+    tear(s, o, more)
+  outcome = RUNNING
+  if o.clean >= o.wanted - SEEN:
+    outcome = SUCCESS
+  elif ruined(o):
+    outcome = DAMAGED
+  return o, outcome
+
+
+def earned(o, near, outcome):
+  """Returns the progress, of closeness to where the work begins and of what is clean."""
+  if outcome == DAMAGED:
+    return -1.0
+  if outcome == SUCCESS:
+    return 1.0
+  return 0.1 * near + 0.8 * min(o.clean / o.wanted, 1.0)
+
+
+def held(s) -> np.ndarray:
+  """Returns where the bonds that hold are, or all where none does [m]  (n, 3)."""
+  holds = ~s.organ.bonds.free
+  return s.organ.bonds.positions[holds if holds.any() else slice(None)]
+
+
+def holding(s):
+  """Returns how many bonds hold."""
+  found = int(0)  # noqa: RUF046, UP018 - a variable to Warp
+  for k in range(bonds(s)):
+    if not is_free(s, k):
+      found += 1
+  return found
 
 
 class Freeing(Task):
-  """An exercise on an organ with bonds.
-
-  Attributes:
-    wanted: share of their area that must come free as it should [-]
-    limit: of the pull on what the organ is bonded to [N]
-    clean: share that came free so far with force and pull under their limits [-]
-    torn: share that came free otherwise [-]
-    freed: both [-]
-    traction: pull on what the organ is bonded to [N]
-  """
+  """An exercise on an organ with bonds, of a state that is `Freed`."""
 
   wanted: float
   limit: float
@@ -44,44 +114,16 @@ class Freeing(Task):
 
   def whole(self, physics: Physics) -> None:
     """Begins with bonds that are whole."""
-    self.clean, self.torn, self.traction = 0.0, 0.0, 0.0
-    self.freed = physics.organ.bonds.share_freed
+    self.clean, self.torn, self.traction, self.pulled = 0.0, 0.0, 0.0, 0.0
+    self.freed = share_freed(physics)
 
-  def count(self, physics: Physics, fair: bool = True) -> None:
-    """Counts what has come free, as torn where it was not fair, and ends the episode by it."""
-    bonds = physics.organ.bonds
-    self.traction = float(np.linalg.norm(bonds.force.sum(axis=0)))
-    now = bonds.share_freed
-    more, self.freed = now - self.freed, now
-    if fair and physics.peak_force <= self.force_limit and self.traction <= self.limit:
-      self.clean += more
-    elif more > 0:
-      self.torn += more
-      self.event(physics, "slip", more, "torn")
-    if self.clean >= self.wanted - SEEN:
-      self.outcome = "success"
-    elif self.torn > 1.0 - self.wanted + SEEN:
-      self.harm_done(physics, f"torn off: {100 * self.torn:.0f} %")
-    elif self.traction > 2 * self.limit:
-      self.harm_done(physics, f"torn by a pull of {self.traction:.2f} N")
-
-  def harm_done(self, physics: Physics, what: str) -> None:
-    """Ends the episode with damage, and says by what."""
-    self.outcome = "damage"
-    self.event(physics, "note", label=what)
-
-  def earned(self, near: float) -> float:
-    """Returns the progress, of closeness to where the work begins and of what is clean."""
-    if self.outcome == "damage":
-      return -1.0
-    share = min(self.clean / self.wanted, 1.0)
-    return 1.0 if self.outcome == "success" else 0.1 * near + 0.8 * share
-
-  def front(self, physics: Physics) -> np.ndarray:
-    """Returns the middle of the bonds that hold, or of all where none does [m]  (3,)."""
-    bonds = physics.organ.bonds
-    where, holds = bonds.positions, ~bonds.free
-    return where[holds if holds.any() else slice(None)].mean(axis=0)
+  def label(self, kind: str) -> str:
+    """Returns what damage is."""
+    if kind != "damage":
+      return super().label(kind)
+    if self.torn > 1.0 - self.wanted + SEEN:
+      return f"torn off: {100 * self.torn:.0f} %"
+    return f"torn by a pull of {self.traction:.2f} N"
 
   def recorded(self, physics: Physics) -> dict[str, float]:
     """Returns the share that is clean and the pull."""

@@ -18,11 +18,11 @@ from ..core.rules import (
   Rules,
   Vector,
   force,
+  last_component,
   length,
   many,
   miss,
   reach,
-  reports,
   tip,
 )
 from ..performer import Performer, Script
@@ -79,7 +79,7 @@ def _touch(o, here):
 def advance(s, o):
   """Follows what was felt, and judges the report."""
   pressed, here = force(s), tip(s)
-  if reports(s, o):
+  if last_component(s, o) > 0.5:
     off = length(here - o.inclusion)
     if off <= o.tolerance and pressed >= REPORT:
       reach(s, o, off)

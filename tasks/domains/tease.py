@@ -17,12 +17,24 @@ import mujoco
 import numpy as np
 
 from ..base import Physics
-from ..core.rules import closeness
+from ..core.rules import (
+  FAR,
+  Rules,
+  Vector,
+  bond,
+  bonds,
+  closeness,
+  is_free,
+  length,
+  many,
+  tip,
+  vector,
+)
 from ..performer import Performer, Script
 from ..registry import exercise
 from ..scenes import Scene
 from . import adhesion
-from .freeing import Freeing
+from .freeing import METRICS, Freed, Freeing, count, earned, held, holding
 
 # Stiffness [N/m^3], strength [Pa] and energy [J/m^2]: ours, we know of no measurement.
 FILMY, DENSE = (1e7, 6e3, 6.0), (1e7, 8e3, 12.0)
@@ -61,11 +73,62 @@ def hard(**kwargs):
   return Tease(SCENE, **kwargs)
 
 
+class State(Freed):
+  """State of a world."""
+
+  front: Vector  # of what holds [m]
+  distance0: float  # [m]
+  nearest: float  # best closeness so far
+  target: Vector
+
+
+# The rules.
+
+
+def front(s):
+  """Returns the middle of the first row of bonds that hold, or of all where none does [m]."""
+  where = held(s)
+  row = where[where[:, 1] < where[:, 1].min() + ROW]
+  return np.array([0.0, row[:, 1].min(), row[:, 2].mean()])
+
+
+@many(front)
+def _front(s):
+  every, low, high, found = holding(s) == 0, float(FAR), float(0.0), float(0.0)  # noqa: UP018
+  for k in range(bonds(s)):
+    if every or not is_free(s, k):
+      low = min(low, bond(s, k)[1])
+  for k in range(bonds(s)):
+    if (every or not is_free(s, k)) and bond(s, k)[1] < low + ROW:
+      high += bond(s, k)[2]
+      found += 1.0
+  return vector(0.0, low, high / found)
+
+
+def distance(s, o):
+  """Returns how far the tip is from the front [m]."""
+  return length(o.front - tip(s))
+
+
+def advance(s, o):
+  """Follows what comes free."""
+  o, outcome = count(s, o, True)
+  o.front = front(s)
+  o.nearest = max(o.nearest, closeness(distance(s, o), o.distance0))
+  return o, earned(o, o.nearest, outcome), outcome
+
+
+def observe(s, o):
+  """Finds target; freed and traction are up to date."""
+  o.target = o.front - tip(s)
+  return o
+
+
 class Tease(Freeing):
   """Free a strip by blunt strokes."""
 
   watch = ("unintended_contact",)
-
+  rules = Rules(State, advance, observe, ("target", "freed", "traction"), METRICS)
   touched = 24
 
   def __init__(
@@ -97,49 +160,23 @@ class Tease(Freeing):
 
   def place_of_work(self, physics: Physics) -> tuple[np.ndarray, np.ndarray]:
     """Returns the triangles, and where the strip begins to hold [m]."""
-    return np.arange(len(physics.organ.elem)), self.front(physics)
+    return np.arange(len(physics.organ.elem)), front(physics)
 
   def begin(self, physics: Physics) -> None:
     """Marks the front."""
     self.whole(physics)
-    self._goal = self.front(physics)
-    self.distance0 = self.distance(physics)
-    self.nearest = 0.0
-    physics.mark(0, self._goal, now=True)
+    self.front, self.nearest = front(physics), 0.0
+    self.distance0 = distance(physics, self)
+    self.show(physics)
 
-  def front(self, physics: Physics) -> np.ndarray:
-    """Returns the middle of the first row of bonds that hold [m]  (3,)."""
-    bonds = physics.organ.bonds
-    holds = ~bonds.free
-    where = bonds.positions[holds if holds.any() else slice(None)]
-    row = where[where[:, 1] < where[:, 1].min() + ROW]
-    return np.array([0.0, row[:, 1].min(), row[:, 2].mean()])
-
-  def distance(self, physics: Physics) -> float:
-    """Returns how far the tip is from the front [m]."""
-    return float(np.linalg.norm(self._goal - physics.tip_pos()))
-
-  def advance(self, physics: Physics) -> float:
-    """Follows what comes free."""
-    self.count(physics)
-    self._goal = self.front(physics)
-    physics.mark(0, self._goal, now=True)
-    near = closeness(self.distance(physics), self.distance0)
-    self.nearest = max(self.nearest, near)
-    return self.earned(self.nearest)
+  def show(self, physics: Physics) -> None:
+    """Marks the front."""
+    physics.mark(0, self.front, now=True)
 
   def instruct(self, physics: Physics) -> str:
     """Says to stroke."""
     share = f"{100 * self.clean:.0f} of {100 * self.wanted:.0f} % are free"
     return f"Go under the flap and push gently along, side by side: {share}"
-
-  def observe(self, physics: Physics) -> dict[str, np.ndarray]:
-    """Returns target, freed and traction."""
-    return {
-      "target": self._goal - physics.tip_pos(),
-      "freed": np.array([self.freed]),
-      "traction": np.array([self.traction]),
-    }
 
   def reference_length(self) -> float:
     """Returns the way to the strip and there and back along its lanes [m]."""
@@ -150,7 +187,7 @@ class Tease(Freeing):
     physics, sides = p.physics, (0.0, -_LANE, _LANE)
     along, far = np.array([0.0, 1.0, 0.0]), _BEHIND + _BEYOND * (1 + p.style.overshoot)
     # Where somebody else was under the strip it begins with their lane.
-    under = self.distance(physics) < _UNDER and p.tip[2] < _LOW
+    under = distance(physics, self) < _UNDER and p.tip[2] < _LOW
     here = [abs(p.tip[0] - x) for x in sides] if under else []
     first = int(np.argmin(here)) if here else 0
     for turn in itertools.count(first):

@@ -23,6 +23,7 @@ from scipy.spatial import cKDTree
 
 from ..base import Physics, Task
 from ..core.rules import (
+  FAR,
   RUNNING,
   SUCCESS,
   Rules,
@@ -51,7 +52,6 @@ GAP, SKIPPED = 0.003, 0.1  # largest gap in contact [m], and share of the length
 WINDOW = 4  # points before and after the end of what is traced, to look for the tip between
 AHEAD = tuple(round(d / STEP) for d in (0.005, 0.01, 0.015))  # points that are observed
 FIRST, SECOND, THIRD = AHEAD
-FAR = 1e9  # [m]
 DRAWN = 160  # points along the curve as it is drawn
 _ATTEMPTS = 40
 _FACING = 0.7  # least cosine between the surface's normal and the way to the trocar

@@ -14,7 +14,8 @@ from palpate.tasks import performer, registry  # noqa: E402
 # float32 of the batch against float64; jaws on a fold of tissue magnify it.
 LIMITS = {"contact_force": 0.02, "shaft_force": 0.02, "peak_force": 0.02, "gripper": 0.1}
 LIMITS |= {"joint_vel": 5e-3, "traction": 0.02}
-ENDING = "touch/easy", "trace/easy", "grasp/easy", "retract/easy", "bimanual/easy"
+ENDING = "touch/easy", "trace/easy", "grasp/easy", "retract/easy", "dissect/easy"
+ENDING += ("bimanual/easy", "cut/easy")
 
 
 def ids(task):
@@ -86,10 +87,10 @@ def compare_metrics(told, k, expected):
     ("trace/easy", 1, 280, {}),
     ("grasp/easy", 1, 179, {"hold": 0.1, "lift": 0.003}),
     ("retract/easy", 1, 157, {"hold": 0.1, "wanted": 0.1}),
-    ("dissect/easy", 1, 15, {}),
+    ("dissect/easy", 1, 245, {"wanted": 0.2}),
     ("tease/easy", 1, 76, {}),
     ("bimanual/easy", 1, 213, {"wanted": 0.03}),
-    ("cut/easy", 1, 75, {}),
+    ("cut/easy", 1, 260, {"radius": 0.006}),
   ],
 )
 def test_each_world_is_the_single_environment_of_its_seed(task, count, steps, options):
