@@ -470,4 +470,8 @@ def make(task: Task, time_limit: float, environment_kwargs: Mapping | None) -> E
     task.initialize_episode(physics)
   task.random.set_state(before)
   observation.check(task, physics)
+  for name in task.rules.fields if task.rules else ():
+    if not hasattr(task, name):
+      kind = type(task).__name__
+      raise TypeError(f"{task.name}: {kind} has no {name!r}, which is a field of its state")
   return Environment(physics, task, time_limit, **(environment_kwargs or {}))
