@@ -48,7 +48,7 @@ from palpate.models import trocar
 from scipy.spatial import cKDTree
 
 from . import observation, randomisation, safety, scenes, stage
-from .core.rules import DAMAGED, OUTCOMES
+from .core.rules import DAMAGED, OUTCOMES, SUCCESS
 from .environment import CONTROL_TIMESTEP, Environment
 from .handle import ROW
 from .instrument import AXES, JAWS
@@ -239,6 +239,13 @@ class Task(control.Task):
 
   # What a domain says.
 
+  def share(self) -> None:
+    """Lets many worlds have one scene from now on; what differs in its tissue is `tissue`."""
+
+  def tissue(self) -> Mapping[str, np.ndarray]:
+    """Returns what differs in the organ's tissue in this episode, by key of its configuration."""
+    return {}
+
   def choose(self) -> int | None:
     """Draws the shape of an episode."""
     return self.variants[self.random.randint(len(self.variants))]
@@ -254,7 +261,7 @@ class Task(control.Task):
     if outcome == DAMAGED:
       self.event(physics, "note", label=self.label("damage"))
     self.show(physics)
-    return progress
+    return 1.0 if outcome == SUCCESS else progress
 
   def show(self, physics: Physics) -> None:
     """Moves the marks of the pictures after a control step."""
@@ -273,7 +280,7 @@ class Task(control.Task):
       return {}
     self.rules.observe(physics, self)
     own = self.rules.observed
-    return {name: np.atleast_1d(np.asarray(getattr(self, name), float)) for name in own}
+    return {name: np.array(getattr(self, name), float, ndmin=1) for name in own}
 
   def recorded(self, physics: Physics) -> Mapping[str, Any]:
     """Returns further columns of a sample, see `Recorder.append`."""
@@ -463,4 +470,8 @@ def make(task: Task, time_limit: float, environment_kwargs: Mapping | None) -> E
     task.initialize_episode(physics)
   task.random.set_state(before)
   observation.check(task, physics)
+  for name in task.rules.fields if task.rules else ():
+    if not hasattr(task, name):
+      kind = type(task).__name__
+      raise TypeError(f"{task.name}: {kind} has no {name!r}, which is a field of its state")
   return Environment(physics, task, time_limit, **(environment_kwargs or {}))

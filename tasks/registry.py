@@ -137,4 +137,8 @@ def _register(domain: str, task: str) -> None:
 def find() -> None:
   """Imports what other packages have registered as entry points."""
   for point in importlib.metadata.entry_points(group=GROUP):
-    point.load()
+    try:
+      point.load()
+    except Exception as error:
+      error.add_note(f"entry point {point.name!r} of {GROUP}, which is {point.value!r}")
+      raise

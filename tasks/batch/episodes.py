@@ -17,8 +17,6 @@ from palpate.tasks.instrument import Second
 from palpate.tasks.physics import Physics
 from palpate.tasks.scenes import ORGAN
 
-from .domain import Domain
-
 # What every exercise draws: trocar and joints of an instrument, and the length of the path.
 HAND = ("body_pos", "body_quat", "pose")
 FRAME = (*HAND, "reference")
@@ -76,12 +74,11 @@ class Episodes:
     rows: what the worlds began with by name, (nworld, ...) each
   """
 
-  def __init__(self, task: Task, domain: type[Domain], nworld: int):
+  def __init__(self, task: Task, draw: Callable[[Task], Mapping[str, np.ndarray]], nworld: int):
     model = task.compiled(task.variants[0]).model
     self.physics: Any = Resting.from_model(wrapper.MjModel(model))
     self.physics.use(model, task.prefix, task.targets, task.organ, task.second)
-    self._task, self._domain = task, domain
-    self.draw: Any = None
+    self._task, self._draw_own = task, draw
     self._random: list[np.random.RandomState | None] = [None] * nworld
     self.rows: dict[str, np.ndarray] = {}
     self._next: dict[str, np.ndarray] = {}
@@ -141,8 +138,7 @@ class Episodes:
       own = body.pos.copy(), body.quat.copy(), hand.pose
       frame |= dict(zip(of_hand(hand is not self.physics), own, strict=True))
     frame["reference"] = np.array(self._task.reference_length() or 0.0)
-    own = self.draw(self._task) if self.draw else self._domain.draw(self._task, self.physics)
-    return frame | dict(own)
+    return frame | dict(self._draw_own(self._task)) | dict(self._task.tissue())
 
 
 def of_hand(other: bool) -> list[str]:

@@ -18,7 +18,8 @@ class States:
 
   Attributes:
     records: the structs, an array of `kind`
-    rows: of arrays of the state by name, (nworld, ...) each
+    rows: of arrays of the state by name, (nworld, ...) each, or (1, ...) of what is shared
+    drawn: names of what is not shared
     advance: kernel (fields, records)
     observe: kernel (fields, records, beginning)
     act: the same of what an action does besides, or None
@@ -29,26 +30,33 @@ class States:
     self._fields, self._dtype = own.fields, self.kind.numpy_dtype()
     self._dtype = np.dtype(self._dtype)
     self.rows: dict[str, wp.array] = {}
+    self.drawn = [name for name in own.fields if name not in own.shared]
+    self._full: dict[str, tuple[int, ...]] = {}
     self._host = np.zeros(nworld, self._dtype)
     for name, kind in self._fields.items():
       if not isinstance(kind, Array):
         continue
       shape = tuple(getattr(task, dim) if isinstance(dim, str) else dim for dim in kind.dims)
-      rows = wp.zeros((nworld, *shape), dtype=kind.dtype, device=device)
+      count = 1 if name in own.shared else nworld
+      rows = wp.zeros((count, *shape), dtype=kind.dtype, device=device)
       self.rows[name], field = rows, self._host[name]
+      if name in own.shared:
+        rows.assign(np.asarray(getattr(task, name))[None])
       start: Any = rows.ptr
       strides: Any = rows.strides
-      field["data"] = start + np.arange(nworld, dtype=np.uint64) * strides[0]
+      field["data"] = start + np.arange(nworld, dtype=np.uint64) * strides[0] * (count > 1)
       field["shape"][:, : len(shape)] = shape
       field["strides"][:, : len(shape)] = strides[1:]
       field["ndim"] = len(shape)
+      if name in self.drawn:
+        self._full[name] = rows.numpy().shape[1:]
     self.records = wp.array(self._host, dtype=self.kind, device=device)
 
   def draw(self, task: Any) -> Mapping[str, np.ndarray]:
     """Returns the state that a task has, by name."""
-    found = {name: np.asarray(getattr(task, name)) for name in self._fields}
-    for name, rows in self.rows.items():  # an episode may need less than there is room for
-      value, full = found[name], rows.numpy().shape[1:]
+    found = {name: np.asarray(getattr(task, name)) for name in self.drawn}
+    for name, full in self._full.items():  # an episode may need less than there is room for
+      value = found[name]
       found[name] = np.zeros(full, value.dtype)
       found[name][tuple(slice(k) for k in value.shape)] = value
     return found

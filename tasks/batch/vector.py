@@ -26,17 +26,9 @@ from palpate.batch.base import on_device
 from palpate.tasks.gym import Exercise
 
 from . import tally
-from .domain import Domain
 from .fields import INFO, OBSERVED, OUTCOMES
-from .palpate import Palpate
 from .worlds import Worlds
 
-# Exercises that are vectorised, by the class of their task.
-DOMAINS: dict[str, type[Domain]] = {
-  "Touch": Domain, "Press": Domain, "Palpate": Palpate, "Grasp": Domain, "Retract": Domain,
-  "Trace": Domain, "Dissect": Domain, "Tease": Domain, "Bimanual": Domain,
-  "Cut": Domain,
-}  # fmt: skip
 _ELSE = 'vectorization_mode="sync" runs single environments side by side'
 OUTPUTS = ("numpy", "torch", "warp")
 
@@ -117,7 +109,6 @@ class Exercises(VectorEnv):
     nodes: int | None,
   ) -> None:  # fmt: skip
     """Makes the parts: each shape on each device has as many worlds as another."""
-    domain = DOMAINS[type(self.task).__name__]
     kinds = list(itertools.product(devices, self.task.variants))
     ends = np.linspace(0, self.num_envs, len(kinds) + 1).round().astype(int).tolist()
     self.parts, self.slices = list[Worlds](), list[slice]()
@@ -128,7 +119,7 @@ class Exercises(VectorEnv):
           of_part = Exercise(task, **{**kwargs, "variants": (variant,)})
         options = {} if where == "cpu" else {"nodes": self.task.touched if nodes is None else nodes}
         count = end - start
-        self.parts.append(Worlds(of_part.environment, domain, count, where, limit, **options))
+        self.parts.append(Worlds(of_part.environment, count, where, limit, **options))
         self.slices.append(slice(start, end))
 
   # Gymnasium's side.
@@ -213,8 +204,7 @@ class Exercises(VectorEnv):
   def _metrics(self) -> dict[str, Any]:
     """Returns the metrics of the episodes so far, NaN where they are unknown."""
     values, names = self._tell("values"), tally.names(self.task.jaws)
-    rules = self.task.rules
-    own = rules.metrics if rules else {}
+    own = self.task.rules.metrics
     more = {name: self._tell(field).reshape(self.num_envs) for name, field in own.items()}
     if self.output != "warp":
       return {name: values[:, k] for k, name in enumerate(names)} | more
@@ -269,9 +259,9 @@ def _refuse(task: str, kwargs: Mapping[str, Any]) -> None:
 
 
 def _refuse_task(task: Any) -> None:
-  kind = type(task).__name__
-  if kind not in DOMAINS:
-    raise NotVectorisedError(f"{task.name} is not vectorised yet; {_ELSE}")
+  if task.rules is None:
+    kind = type(task).__name__
+    raise NotVectorisedError(f"{task.name}: rules of {kind} is None, expected Rules; {_ELSE}")
   if task.observed.pictures:
     raise NotVectorisedError(
       f"{task.name}: observations has {task.observed.pictures[0]!r}, but a vectorised exercise "

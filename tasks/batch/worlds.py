@@ -21,7 +21,6 @@ from palpate.tasks.stage import STATE
 from palpate.tissue.types import allocate
 
 from . import kernels, tally
-from .domain import Domain
 from .episodes import FRAME, HAND, Episodes, at_rest, of_hand
 from .fields import OBSERVED, Common
 from .states import States
@@ -35,7 +34,7 @@ class Worlds:
   Attributes:
     fields: what every exercise has, arrays on the device
     other: the same of the other hand's instrument, or None
-    own: what the domain has
+    states: of the exercise's rules
     tally: what metrics are made of
     batch: the physics
     organ: the organ in it
@@ -46,7 +45,6 @@ class Worlds:
   def __init__(
     self,
     environment: Environment,
-    domain: type[Domain],
     nworld: int,
     device: str,
     limit: int,
@@ -56,15 +54,14 @@ class Worlds:
 
     Args:
       environment: a single one of the exercise, whose task is used up by this
-      domain: of the exercise
       nworld: how many
       device: of `palpate.batch.make`
       limit: control steps of an episode
       **options: of `palpate.batch.make`
     """
     task: Any = environment.task
-    self.task, self._domain, self.nworld = task, domain, nworld
-    domain.prepare(task)
+    self.task, self.nworld = task, nworld
+    task.share()
     stage = task.compiled(task.variants[0])
     with warnings.catch_warnings():  # the plugin's passive forces are unknown to the compiler
       warnings.filterwarnings("ignore", ".*has no equality constraints or passive forces")
@@ -72,11 +69,9 @@ class Worlds:
       self.batch = palpate.batch.make(scene, nworld, device, **options)
     self.device, self._substeps = self.batch.device, episode.substeps(environment)
     self.batch.start(at_rest(self.batch.model, stage.state, STATE))
-    self.episodes = Episodes(task, domain, nworld)
-    self.states = States(task.rules, task, nworld, self.device) if task.rules else None
-    if self.states:
-      self.episodes.draw = self.states.draw
-    self.organ = self.batch.organ(task.organ)
+    self.states = States(task.rules, task, nworld, self.device)
+    self.episodes = Episodes(task, self.states.draw, nworld)
+    self.organ, self._tissue = self.batch.organ(task.organ), tuple(task.tissue())
     dt = environment.control_timestep()
     self.fields, self.other = self._make(task, task.prefix, dt, limit), None
     if task.second:
@@ -86,8 +81,6 @@ class Worlds:
         setattr(self.other, name, getattr(self.fields, name))
       for name in ("tip_pos", "tip_quat", "contact_force"):
         setattr(self.fields, f"other_{name}", getattr(self.other, name))
-    if not self.states:
-      self._make_own(task, domain, nworld)
     if self.fields.cutter_inside.shape[1]:
       self.batch.feel(f"{task.prefix}tip_force", task.organ)
     steps = self.batch.watch(self._substeps)
@@ -97,21 +90,9 @@ class Worlds:
     self._bad = wp.zeros(1, dtype=int, device=self.device)
     self._done, self._graphs = set[str](), dict[str, Any]()
 
-  def _make_own(self, task, domain, nworld):
-    sizes = {"nworld": nworld, **domain.sizes(task, self.episodes.physics)}
-    self.own = allocate(domain.struct, self.device, sizes)
-    shared: dict[str, Any] = {name: getattr(task, name) for name in domain.takes}
-    shared.update(domain.constants(task, self.episodes.physics))
-    for name, value in shared.items():
-      if isinstance(value, np.ndarray):
-        getattr(self.own, name).assign(value)
-      else:
-        setattr(self.own, name, value)
-
   def _write_states(self, at: wp.array, rows: Any, worlds: np.ndarray) -> None:
     """Begins with the states that were drawn for some worlds."""
-    assert self.states
-    for name in self.task.rules.fields:
+    for name in self.states.drawn:
       if name in self.states.rows:
         self._write(self.states.rows[name], at, rows[name][worlds])
       else:
@@ -152,7 +133,7 @@ class Worlds:
       constants["side"] = jaws.Jaws(model, prefix).side
     for name, value in constants.items():
       getattr(s, name).assign(np.asarray(value))
-    if self.states and s.behind.shape[1]:
+    if s.behind.shape[1]:
       s.disc, s.eye = self.states.rows["disc"], wp.vec3(*physics.camera()[0])
     batch = self.batch
     s.ctrl, s.failures = batch.ctrl, batch.failures
@@ -204,16 +185,14 @@ class Worlds:
   # Doing.
 
   def array(self, name: str) -> wp.array:
-    """Returns one of the arrays of `fields`, `own` or `tally`."""
+    """Returns one of the arrays of `fields`, `states` or `tally`."""
     if name in Common.vars:
       return getattr(self.fields, name)
     own = name.removeprefix(self.task.second.replace("/", "_")) if self.other else name
     if own != name and OBSERVED.get(own, own) in Common.vars:
       return getattr(self.other, OBSERVED.get(own, own))
-    if self.states:
-      own = self.task.rules.fields
-      return self.states.array(name) if name in own else getattr(self.tally, name)
-    return getattr(self.own if name in self._domain.struct.vars else self.tally, name)
+    known = name in self.task.rules.fields
+    return self.states.array(name) if known else getattr(self.tally, name)
 
   def check(self, action: wp.array, first: int = 0) -> None:
     """Raises ValueError where an action is not in [-1, 1]; it names world and component.
@@ -244,14 +223,13 @@ class Worlds:
     """Begins a control step with actions that are allowed."""
     wp.copy(self.fields.action, action)
     self._of_hands(kernels.act)
-    if self.states and self.states.act:
+    if self.states.act:
       self._act()
     self.batch.step(self._substeps)
     self._run(self._judge)
 
   def _act(self) -> None:
     """Does what of an action no drive does."""
-    assert self.states
     lost = self.fields.bond_loss
     lost.zero_()
     self._over(self.states.act, self.states.records, False)
@@ -270,12 +248,9 @@ class Worlds:
     self._measure(False)
     if self.fields.jaw >= 0:
       self._press()
-    if self.states and self.fields.behind.shape[1]:
+    if self.fields.behind.shape[1]:
       self.launch(kernels.hide, self.fields.behind.shape, [self.fields])
-    if self.states:
-      self._over(self.states.advance, self.states.records)
-    else:
-      self._over(self._domain.advance, self.own)
+    self._over(self.states.advance, self.states.records)
     self._over(tally.add, self.tally)
     if self.other:
       self.launch(tally.add, self.nworld, [self.other, self._tally])
@@ -325,14 +300,11 @@ class Worlds:
     rows, s = self.episodes.take(worlds), self.fields
     s.begun.assign(mask)
     at = wp.array(worlds, dtype=int, device=self.device)
-    for name, values in rows.items():
-      if name in self._domain.tissue or (self.states and name in self.task.rules.fields):
-        continue
-      of_other = self.other is not None and name in of_hand(True)
-      out = self.other if of_other else s if name in FRAME else self.own
-      self._write(getattr(out, name.removeprefix("other_" if of_other else "")), at, values[worlds])
-    if self.states:
-      self._write_states(at, rows, worlds)
+    for name in FRAME:
+      self._write(getattr(s, name), at, rows[name][worlds])
+    for name, row in zip(HAND, of_hand(True), strict=True) if self.other else ():
+      self._write(getattr(self.other, name), at, rows[row][worlds])
+    self._write_states(at, rows, worlds)
     self.batch.reset(s.begun)
     for hand, prefix in zip(self.hands, (self.task.prefix, self.task.second), strict=False):
       # The plugin's worlds take them as they were drawn, in float64.
@@ -343,8 +315,8 @@ class Worlds:
       if self.task.jitter:
         self.batch.place(f"{prefix}trocar", pos, quat, s.begun)
       self.batch.pose([prefix + axis for axis in AXES], pose, s.begun)
-    if self._domain.tissue:
-      self.organ.configure(mask, **{key: rows[key] for key in self._domain.tissue})
+    if self._tissue:
+      self.organ.configure(mask, **{key: rows[key] for key in self._tissue})
     self._run(self._open)
 
   def _write(self, out: wp.array, at: wp.array, rows: np.ndarray) -> None:
@@ -361,8 +333,6 @@ class Worlds:
     """Launches what follows the beginning of episodes."""
     self._of_hands(kernels.begin)
     self._measure(True)
-    if not self.states:
-      self._over(self._domain.begin, self.own)
     self._over(tally.start, self.tally)
     if self.other:
       self.launch(tally.start, self.nworld, [self.other, self._tally])
@@ -385,10 +355,7 @@ class Worlds:
     self._over(kernels.look, beginning)
     dim = (self.nworld, self.fields.coarse.shape[0])
     self.launch(kernels.survey, dim, [self.fields, beginning])
-    if self.states:
-      self._over(self.states.observe, self.states.records, beginning)
-      return
-    self._over(self._domain.observe, self.own, beginning)
+    self._over(self.states.observe, self.states.records, beginning)
 
   def _over(self, kernel: Any, *inputs: Any) -> None:
     self.launch(kernel, self.nworld, [self.fields, *inputs])

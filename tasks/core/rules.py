@@ -15,6 +15,7 @@ from typing import Annotated, Any, get_type_hints
 
 import numpy as np
 import warp as wp
+from palpate.tissue.types import Array
 
 RUNNING, SUCCESS, DAMAGED, MISSED = range(4)
 FAR = 1e9  # farther than anything [m]
@@ -22,6 +23,8 @@ OUTCOMES = (None, "success", "damage", "missed")
 
 Vector = Annotated[Any, wp.vec3]
 Vectors3 = Annotated[Any, wp.mat33]  # three vectors, a row each
+TOLD = (float, wp.vec3, wp.mat33)  # kinds of what is observed
+KINDS = (*TOLD, int, bool)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -38,6 +41,7 @@ class Rules:
     observed: fields of the state that are these
     metrics: of the domain's own, by the field that is an episode's value so far
     act: rule (s, o) that returns o once an action has moved the drives, before the physics, or None
+    shared: arrays of the state that are the same in all worlds and episodes
   """
 
   state: type
@@ -46,6 +50,7 @@ class Rules:
   observed: tuple[str, ...]
   metrics: Mapping[str, str] = dataclasses.field(default_factory=dict)
   act: Callable | None = None
+  shared: tuple[str, ...] = ()
 
   def __post_init__(self):
     where = f"{self.state.__module__}.{self.state.__qualname__}"
@@ -54,9 +59,19 @@ class Rules:
       if not inspect.isfunction(rule) or len(inspect.signature(rule).parameters) != 2:
         raise TypeError(f"{where}: {name} is {rule!r}, expected a function of s and o")
     known = self.fields
-    for name in (*self.observed, *self.metrics.values()):
+    for name, kind in known.items():
+      if kind not in KINDS and not isinstance(kind, Array):
+        raise TypeError(
+          f"{where}: {name!r} is {kind!r}, expected int, float, bool, Vector, Vectors3 or an array"
+        )
+    for name in (*self.observed, *self.metrics.values(), *self.shared):
       if name not in known:
-        raise TypeError(f"{where}: {name!r} is told, expected a field: {', '.join(known)}")
+        raise TypeError(f"{where}: {name!r} is no field, expected one of {', '.join(known)}")
+    for name in (*self.observed, *self.metrics.values()):
+      if known[name] not in TOLD:
+        raise TypeError(
+          f"{where}: {name!r} is told and {known[name]!r}, expected float, Vector or Vectors3"
+        )
 
   @property
   def fields(self) -> dict[str, Any]:

@@ -1,6 +1,16 @@
-"""What a hand that searches remembers: where it has felt, and how stiff it was."""
+"""What a hand that searches remembers: where it has felt, and how stiff it was.
+
+A place counts with its stiffness, force over depth, 0 where nothing was felt. What goes over all
+places is written for numpy, and for many worlds below it.
+"""
+
+from typing import Annotated, Any
 
 import numpy as np
+import warp as wp
+from palpate.tissue.types import Array, floats, ints
+
+from ..core.rules import Vector, dot, length, many
 
 LEFT = 0.02  # force below which a press has ended [N]
 DEEP = 0.0028  # what tells enough [m]
@@ -10,75 +20,212 @@ SOFT = 0.25  # share of the places felt that are softer than what counts as soft
 STIFF = 1.6  # times that: what is felt around, before anything else [-]
 WIDTH = 1.2  # of the bell of stiffness above an inclusion, over its radius [-]
 NOISE = 8.0  # of what is felt: triangles differ [N/m]
+LEAST = 1e-9
 
 
 class Notes:
-  """Stiffness by place, of presses deep enough to tell, and what follows from it.
+  """State of who remembers."""
 
-  Attributes:
-    stiffness: force over depth, 0 where nothing was felt  (nplace,) [N/m]
-    beside: places to the four sides of each, -1 beyond the field  (nplace, 4)
+  radius: float  # of an inclusion [m]
+  places: Annotated[Any, Array(wp.vec3, ("nplace",))]  # that may be felt [m]
+  outward: Annotated[Any, Array(wp.vec3, ("nplace",))]  # normals there
+  beside: Annotated[Any, ints("nplace", 4)]  # places to the four sides, -1 beyond the field
+  stiffness: Annotated[Any, floats("nplace")]  # [N/m]
+  last: int  # place that was noted
+  depth: float  # there, 0 where no press goes on [m]
+  next: int  # place to feel next, -1 where enough is felt
+  likely: Vector  # where an inclusion is to be expected [m]
+
+
+SHARED = ("places", "outward", "beside")  # by all worlds
+
+
+def start(o: Any, places: np.ndarray, outward: np.ndarray, beside: np.ndarray) -> None:
+  """Remembers nothing yet.
+
+  Args:
+    o: the state
+    places: that may be felt  (nplace, 3) [m]
+    outward: normals there  (nplace, 3)
+    beside: of `sides`  (nplace, 4)
   """
+  o.places, o.outward, o.beside = places, outward, beside
+  o.nplace, o.stiffness, o.depth = len(places), np.zeros(len(places)), 0.0
+  o.likely = places.mean(axis=0)
+  o.last = o.next = nearest(o, o.likely)
 
-  def __init__(self, places: np.ndarray, outward: np.ndarray, up: np.ndarray):
-    """Remembers nothing yet.
 
-    Args:
-      places: that may be felt  (nplace, 3) [m]
-      outward: normals there  (nplace, 3)
-      up: what the sides are across  (3,)
-    """
-    self.places, self.beside = places, beside(places, up)
-    self._outward, self.stiffness = outward, np.zeros(len(places))
-    self._last, self._depth = nearest(places, places.mean(axis=0)), 0.0
+def felt(o: Any) -> dict[int, float]:
+  """Returns the stiffness of the places that were felt [N/m]."""
+  return {int(k): float(o.stiffness[k]) for k in np.flatnonzero(o.stiffness)}
 
-  def press(self, tip: np.ndarray, force: float) -> None:
-    """Follows a press with a force [N]; each counts once, where it was deepest."""
-    if force < LEFT:
-      self._depth = 0.0
-      return
-    k = nearest(self.places, tip)
-    depth = float((self.places[k] - tip) @ self._outward[k])
-    if depth > max(self._depth, DEEP):
-      if self._depth:
-        self.stiffness[self._last] = 0.0
-      self._last, self._depth, self.stiffness[k] = k, depth, force / depth
 
-  def felt(self) -> dict[int, float]:
-    """Returns the stiffness of the places that were felt [N/m]."""
-    return {int(k): float(self.stiffness[k]) for k in np.flatnonzero(self.stiffness)}
+# The rules.
 
-  def left(self) -> int | None:
-    """Returns the place to feel next, None where enough is felt.
 
-    That is a side of what is stiff, or else of those far from all that was felt the nearest to the
-    last; the first is in the middle.
-    """
-    felt = np.flatnonzero(self.stiffness)
-    gaps = np.linalg.norm(self.places[:, None] - self.places[felt], axis=2)
-    away = np.linalg.norm(self.places - self.places[self._last], axis=1)
-    away[gaps.min(axis=1, initial=np.inf) < APART] = np.inf
-    k = int(away.argmin())
-    if away[k] < np.inf and self.stiffness.max() <= STIFF * self.soft():
+def press(o, here, force):
+  """Follows a press with a force [N]; each counts once, where it was deepest."""
+  if force < LEFT:
+    o.depth = 0.0
+    return o
+  k = nearest(o, here)
+  deep = dot(o.places[k] - here, o.outward[k])
+  if deep > max(o.depth, DEEP):
+    if o.depth > 0.0:
+      o.stiffness[o.last] = 0.0
+    o.last = k
+    o.depth = deep
+    o.stiffness[k] = force / deep
+    o = conclude(o)
+  return o
+
+
+def conclude(o):
+  """Finds where to feel next, and where an inclusion is to be expected.
+
+  Next is a side of what is stiff, or else, of the places far from all that was felt, the nearest to
+  the last; the first is in the middle.
+  """
+  low, top = soft(o), stiffest(o)
+  o.next = -1
+  if o.stiffness[top] <= STIFF * low:
+    o.next = far(o)
+  if o.next < 0:
+    o.next = side(o, top)
+  o.likely = expected(o, low)
+  return o
+
+
+def nearest(o, point):
+  """Returns the place nearest to a point."""
+  return int(np.linalg.norm(o.places - point, axis=1).argmin())
+
+
+@many(nearest)
+def _nearest(o, point):
+  k = int(0)  # noqa: RUF046, UP018 - a variable to Warp
+  for i in range(o.places.shape[0]):
+    if length(o.places[i] - point) < length(o.places[k] - point):
+      k = i
+  return k
+
+
+def stiffest(o):
+  """Returns the stiffest place."""
+  return int(o.stiffness.argmax())
+
+
+@many(stiffest)
+def _stiffest(o):
+  top = int(0)  # noqa: RUF046, UP018 - a variable to Warp
+  for i in range(o.stiffness.shape[0]):
+    if o.stiffness[i] > o.stiffness[top]:
+      top = i
+  return top
+
+
+def soft(o):
+  """Returns what counts as soft [N/m]."""
+  felt = o.stiffness[o.stiffness > 0]
+  return float(np.quantile(felt, SOFT, method="lower")) if len(felt) else 0.0
+
+
+@many(soft)
+def _soft(o):
+  count = int(0)  # noqa: RUF046, UP018 - a variable to Warp
+  for i in range(o.stiffness.shape[0]):
+    if o.stiffness[i] > 0.0:
+      count += 1
+  for i in range(o.stiffness.shape[0]):
+    own, below = o.stiffness[i], int(0)  # noqa: RUF046, UP018 - a variable to Warp
+    for j in range(o.stiffness.shape[0]):
+      other = o.stiffness[j]
+      if other > 0.0 and (other < own or (other == own and j < i)):
+        below += 1
+    if own > 0.0 and below == int(SOFT * float(count - 1)):
+      return own
+  return float(0.0)  # noqa: UP018
+
+
+def far(o):
+  """Returns of the places far from all that was felt the nearest to the last, -1 without one."""
+  gaps = np.linalg.norm(o.places[:, None] - o.places[np.flatnonzero(o.stiffness)], axis=2)
+  away = np.linalg.norm(o.places - o.places[o.last], axis=1)
+  away[gaps.min(axis=1, initial=np.inf) < APART] = np.inf
+  k = int(away.argmin())
+  return k if away[k] < np.inf else -1
+
+
+@many(far)
+def _far(o):
+  found = int(-1)  # noqa: RUF046, UP018 - variables to Warp
+  least = float(0.0)  # noqa: UP018
+  for k in range(o.places.shape[0]):
+    away = length(o.places[k] - o.places[o.last])
+    if found < 0 or away < least:
+      new = wp.bool(True)
+      for j in range(o.places.shape[0]):
+        if new and o.stiffness[j] > 0.0:
+          new = length(o.places[k] - o.places[j]) >= APART
+      if new:
+        found = k
+        least = away
+  return found
+
+
+def side(o, top):
+  """Returns a place beside the stiffest that is left to feel, -1 without one."""
+  felt = np.flatnonzero(o.stiffness)
+  for k in o.beside[top][o.beside[top] >= 0]:
+    gaps = np.linalg.norm(o.places[felt] - o.places[k], axis=1)
+    if not (gaps[felt != top] < NEAR).any():
+      return int(k)
+  return -1
+
+
+@many(side)
+def _side(o, top):
+  for i in range(4):
+    k = o.beside[top, i]
+    new = k >= 0
+    for j in range(o.places.shape[0]):
+      if new and o.stiffness[j] > 0.0 and j != top:
+        new = length(o.places[j] - o.places[k]) >= NEAR
+    if new:
       return k
-    top = int(self.stiffness.argmax())
-    for side in self.beside[top][self.beside[top] >= 0]:
-      gaps = np.linalg.norm(self.places[felt] - self.places[side], axis=1)
-      if not (gaps[felt != top] < NEAR).any():
-        return int(side)
-    return None
+  return -1
 
-  def soft(self) -> float:
-    """Returns what counts as soft [N/m]."""
-    felt = self.stiffness[self.stiffness > 0]
-    return float(np.quantile(felt, SOFT, method="lower")) if len(felt) else 0.0
 
-  def expected(self, radius: float) -> np.ndarray:
-    """Returns where an inclusion is to be expected  (3,) [m]."""
-    felt = np.flatnonzero(self.stiffness)
-    more = self.stiffness[felt] - self.soft()
-    likely = chance(self.places, felt, more, radius)
-    return likely @ self.places / likely.sum()
+def expected(o, low):
+  """Returns where an inclusion is to be expected, with what counts as soft [N/m]  (3,) [m]."""
+  felt = np.flatnonzero(o.stiffness)
+  likely = chance(o.places, felt, o.stiffness[felt] - low, o.radius)
+  return likely @ o.places / likely.sum()
+
+
+@many(expected)
+def _expected(o, low):
+  best, mass, middle = float(0.0), float(0.0), wp.vec3()  # noqa: UP018 - variables to Warp
+  for k in range(o.places.shape[0]):
+    best = max(best, _gain(o, k, low))
+  for k in range(o.places.shape[0]):
+    likely = wp.exp((_gain(o, k, low) - best) / (2.0 * NOISE * NOISE))
+    mass += likely
+    middle += likely * o.places[k]
+  return middle / mass
+
+
+def _gain(o, k, low):
+  """Returns what the best bell on a place takes off the sum of squares, see `chance`."""
+  both, square = float(0.0), float(LEAST)  # noqa: UP018 - variables to Warp
+  for j in range(o.places.shape[0]):
+    if o.stiffness[j] > 0.0:
+      ratio = length(o.places[j] - o.places[k]) / (WIDTH * o.radius)
+      bell = wp.exp(-ratio * ratio)
+      both += bell * (o.stiffness[j] - low)
+      square += bell * bell
+  both = max(both, 0.0)
+  return both * both / square
 
 
 def chance(places: np.ndarray, felt: np.ndarray, more: np.ndarray, radius: float) -> np.ndarray:
@@ -95,17 +242,12 @@ def chance(places: np.ndarray, felt: np.ndarray, more: np.ndarray, radius: float
   distance = np.linalg.norm(places[:, None] - places[felt], axis=2)
   bell = np.exp(-((distance / (WIDTH * radius)) ** 2))
   # What the best height takes off the sum of squares.
-  gain = np.maximum(bell @ more, 0.0) ** 2 / np.maximum((bell**2).sum(axis=1), 1e-9)
+  gain = np.maximum(bell @ more, 0.0) ** 2 / np.maximum((bell**2).sum(axis=1), LEAST)
   return np.exp((gain - gain.max()) / (2 * NOISE**2))
 
 
-def nearest(places: np.ndarray, point: np.ndarray) -> int:
-  """Returns the place nearest to a point."""
-  return int(np.linalg.norm(places - point, axis=1).argmin())
-
-
-def beside(places: np.ndarray, up: np.ndarray) -> np.ndarray:
-  """Returns the places to the four sides of each, -1 where there is none  (nplace, 4)."""
+def sides(places: np.ndarray, up: np.ndarray) -> np.ndarray:
+  """Returns the places to the four sides of each, across `up`; -1 without one  (nplace, 4)."""
   one, two = np.linalg.svd(np.reshape(up, (1, 3)))[2][1:]
   found = np.full((len(places), 4), -1)
   for i, way in enumerate((one, two, -one, -two)):

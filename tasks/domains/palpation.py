@@ -1,16 +1,34 @@
 """What the exercises of palpation in `probe` are: a field with a stiff inclusion under it."""
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any
 
 import numpy as np
+from palpate.models import shapes
+from palpate.tissue.types import ints
 from scipy.spatial import cKDTree
 
 from .. import scenes
 from ..base import Physics, Task
+from ..core.rules import (
+  MISSED,
+  RUNNING,
+  SUCCESS,
+  Rules,
+  Vector,
+  force,
+  last_component,
+  length,
+  many,
+  miss,
+  reach,
+  tip,
+)
 from ..performer import Performer, Script
 from ..scenes import Scene
-from .feeling import APART, SOFT, Notes, chance, nearest
+from . import feeling
+from .feeling import APART, SHARED, SOFT, Notes, chance, nearest, press
 
 _FACING = 0.75  # least cosine between the field's normal and the way to the trocar
 _PIN_GAP = 0.02  # the field keeps that far from pinned nodes [m]
@@ -23,10 +41,80 @@ _LIKELY = 0.05  # of the likeliest place: others are not felt [-]
 _STIFF = 1.3  # times what is soft: what is worth a closer look [-]
 
 
+class State(Notes):
+  """State of a world."""
+
+  tolerance: float  # of the report [m]
+  center: Vector  # of the field [m]
+  inclusion: Vector  # where it is [m]
+  touched: Annotated[Any, ints("nplace")]  # 1 where the probe has felt near a place
+  field: Vector
+  felt: float
+  left: float
+  target: Vector
+  normal: Vector
+
+
+# The rules.
+
+
+def touch(o, here):
+  """Notes what lies near as felt."""
+  o.touched[np.linalg.norm(o.places - here, axis=1) < FELT] = 1
+  o.felt = float(o.touched.mean())
+  return o
+
+
+@many(touch)
+def _touch(o, here):
+  count = int(0)  # noqa: RUF046, UP018 - a variable to Warp
+  for k in range(o.places.shape[0]):
+    if length(o.places[k] - here) < FELT:
+      o.touched[k] = 1
+    count += o.touched[k]
+  o.felt = float(count) / float(o.places.shape[0])
+  return o
+
+
+def advance(s, o):
+  """Follows what was felt, and judges the report."""
+  pressed, here = force(s), tip(s)
+  if last_component(s, o) > 0.5:
+    off = length(here - o.inclusion)
+    if off <= o.tolerance and pressed >= REPORT:
+      reach(s, o, off)
+      return o, 1.0, SUCCESS
+    miss(s, o, off)
+    return o, 0.0, MISSED
+  o = press(o, here, pressed)
+  if pressed >= FEELING:
+    o = touch(o, here)
+  return o, 0.3 * o.felt, RUNNING
+
+
+def goal(o):
+  """Returns where to feel next, or to report [m]."""
+  if o.next < 0:
+    return o.likely
+  return o.places[o.next]
+
+
+def observe(s, o):
+  """Finds field, left, target and normal; felt is up to date."""
+  here = tip(s)
+  o.left = 1.0 if o.next >= 0 else 0.0
+  o.field = o.center - here
+  o.target = goal(o) - here
+  o.normal = o.outward[nearest(o, goal(o))]
+  return o
+
+
 class Palpate(Task):
   """Find the stiff inclusion and report its place."""
 
-  watch = ("miss", "unintended_contact")
+  rules = Rules(
+    State, advance, observe, ("field", "felt", "left", "target", "normal"), shared=SHARED
+  )
   final = ("report",)
 
   def __init__(
@@ -72,7 +160,8 @@ class Palpate(Task):
     variant = super().choose()
     if variant not in self._fields:
       self._fields[variant] = self._find_field(super()._scene(variant))
-    self.field, self.places, self.outward, corners, share, self.center = self._fields[variant]
+    self.triangles, *where, corners, share, self.center = self._fields[variant]
+    feeling.start(self, *where)
     triangle = corners[self.random.choice(len(share), p=share)]
     self.inclusion = self.random.dirichlet(np.ones(3)) @ triangle
     if self.embeds:
@@ -80,13 +169,13 @@ class Palpate(Task):
       self._models.clear()
     return variant
 
-  def leave_out(self) -> None:
-    """Lets the organ be made without inclusions from now on, for whoever puts them in otherwise."""
+  def share(self) -> None:
+    """Lets the organ be made without inclusions from now on: `tissue` has them."""
     self.embeds, self._inclusion = False, (0.0, 0.0, 0.0, self.radius, 1.0)
     self._models.clear()
 
   def _find_field(self, scene: Scene) -> tuple[np.ndarray, ...]:
-    """Returns the field's triangles, middles, normals, corners, shares of area, and the center."""
+    """Returns the field's triangles, middles, normals, sides, corners, shares of area; center."""
     vertices, triangles = scenes.surface(scene.organ, scene.nodes, scene.variant)
     center = scenes.landmark(scene, scene.center)
     corners = vertices[triangles]
@@ -100,61 +189,41 @@ class Palpate(Task):
     near &= pins.query(middle)[0] > _PIN_GAP
     field = np.flatnonzero(near & (normal @ port > _FACING * area))
     outward, share = normal[field] / area[field, None], area[field] / area[field].sum()
-    return field, middle[field], outward, corners[field], share, center
+    beside = feeling.sides(middle[field], np.asarray(scene.port, float))
+    return field, middle[field], outward, beside, corners[field], share, center
 
   def _scene(self, variant: int | None) -> Scene:
     return dataclasses.replace(super()._scene(variant), inclusion=self._inclusion)
 
+  def tissue(self) -> Mapping[str, np.ndarray]:
+    """Returns Young's modulus with the inclusion [Pa]."""
+    scene = self.scene
+    vertices, triangles = scenes.surface(scene.organ, scene.nodes, self.variants[0])
+    young = scenes.TISSUES[scene.organ].young
+    return {
+      "young": shapes.inclusion_young(
+        vertices, triangles, self.inclusion, self.radius, young, self.factor * young
+      )
+    }
+
   def begin(self, physics: Physics) -> None:
     """Starts the search."""
-    self._felt = np.zeros(len(self.field), bool)
-    self.notes = Notes(self.places, self.outward, self.up)
+    self.touched, self.felt = np.zeros(self.nplace, int), 0.0
     physics.mark(0, self.center, shown=False)
 
-  @property
-  def up(self) -> np.ndarray:
-    """Way from the field to the trocar, about."""
-    return np.asarray(self.scene.port, float)
-
-  def felt(self) -> float:
-    """Returns the share of the field that was felt [-]."""
-    return float(self._felt.mean())
-
-  def distance(self, physics: Physics) -> float:
-    """Returns how far the tip is from the surface above the inclusion [m]."""
-    return float(np.linalg.norm(physics.tip_pos() - self.inclusion))
-
-  def advance(self, physics: Physics) -> float:
-    """Follows what was felt, and judges the report."""
-    force = float(np.linalg.norm(physics.contact_force()))
-    if self.action[..., -1].max() > 0.5:
-      distance = self.distance(physics)
-      found = distance <= self.tolerance and force >= REPORT
-      self.outcome = "success" if found else "missed"
-      self.event(physics, "target" if found else "miss", distance, "report")
+  def show(self, physics: Physics) -> None:
+    """Shows where the inclusion is, once it was reported."""
+    if self.outcome:
       physics.mark(0, self.inclusion, shown=True)
-      return 1.0 if found else 0.0
-    self.notes.press(physics.tip_pos(), force)
-    if force >= FEELING:
-      self._felt |= np.linalg.norm(self.places - physics.tip_pos(), axis=1) < FELT
-    return 0.3 * self.felt()
+
+  def label(self, kind: str) -> str:
+    """Returns what was done there."""
+    return "report"
 
   def instruct(self, physics: Physics) -> str:
     """Says to feel, and to report."""
-    share = f"{100 * self.felt():.0f} % of the field is felt"
+    share = f"{100 * self.felt:.0f} % of the field is felt"
     return f"Press here and there, and report where it is stiff while you press: {share}"
-
-  def observe(self, physics: Physics) -> dict[str, np.ndarray]:
-    """Returns what was felt, and where to feel, or to report, next."""
-    tip, left = physics.tip_pos(), self.notes.left()
-    goal = self.notes.expected(self.radius) if left is None else self.places[left]
-    return {
-      "field": self.center - tip,
-      "felt": np.array([self.felt()]),
-      "left": np.array([float(left is not None)]),
-      "target": goal - tip,
-      "normal": self.outward[nearest(self.places, goal)].copy(),
-    }
 
   def expert(self, p: Performer) -> Script:
     """Feels over the field until something is stiff, then around it, and reports the middle.
@@ -162,15 +231,15 @@ class Palpate(Task):
     It knows where the organ's triangles are and presses their middles: on the coarse mesh corners
     feel stiffer. Where the inclusion is it learns from forces and depths alone.
     """
-    normals, felt = self.outward, self.notes.felt()  # place -> stiffness [N/m]
+    normals, felt = self.outward, feeling.felt(self)  # place -> stiffness [N/m]
     sweep = iter(self._left_out(felt))
     while (k := self._next(p, felt, sweep)) is not None:
       yield from self._hop(p, self.places[k] + _ABOVE * normals[k])
       felt[k] = yield from p.feel(self.places[k], -normals[k], _DEPTH)
       yield from p.line(self.places[k] + _ABOVE * normals[k], 0.03)
     # A hasty one goes by what is observed alone, which can be learned.
-    goal = self.notes.expected(self.radius) if p.hasty else self.places[self._guess(felt)]
-    normal = normals[nearest(self.places, goal)]
+    goal = self.likely if p.hasty else self.places[self._guess(felt)]
+    normal = normals[nearest(self, goal)]
     yield from self._hop(p, goal + _ABOVE * normal)
     yield from p.feel(goal, -normal, 0.5 * _DEPTH)
     yield from p.say()
@@ -178,7 +247,7 @@ class Palpate(Task):
   def _next(self, p: Performer, felt: dict[int, float], sweep: Iterator[int]) -> int | None:
     """Returns the place to feel next, None where enough is felt."""
     if p.hasty:
-      return self.notes.left()
+      return self.next if self.next >= 0 else None
     found = self._unsure(felt)
     return next(sweep, None) if found is None else found
 
@@ -214,7 +283,7 @@ class Palpate(Task):
     """
     chance = self._chance(felt)
     middle = chance @ self.places / chance.sum()
-    return nearest(self.places, middle)
+    return nearest(self, middle)
 
   def _chance(self, felt: dict[int, float]) -> np.ndarray:
     more = np.array(list(felt.values())) - _soft(felt)

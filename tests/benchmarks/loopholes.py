@@ -186,7 +186,7 @@ class Work:
     if hasattr(task, "curve"):
       return len(self.places) > 0.8 * len(task.curve)
     if hasattr(task, "felt"):
-      return task.felt() > 0.3
+      return task.felt > 0.3
     each = getattr(task, "hold", 0.08) / task.control_timestep
     return self.touches >= task.targets and self.pressed >= 0.9 * each * task.targets
 

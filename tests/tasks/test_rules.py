@@ -22,8 +22,9 @@ def observe(s, o):
     ({"advance": 3}, "advance is 3, expected a function of s and o"),
     ({"observe": lambda s: s}, "observe is .*, expected a function of s and o"),
     ({"act": lambda s: s}, "act is .*, expected a function of s and o"),
-    ({"observed": ("tine",)}, "State: 'tine' is told, expected a field: time"),
-    ({"metrics": {"time": "tine"}}, "State: 'tine' is told, expected a field: time"),
+    ({"observed": ("tine",)}, "State: 'tine' is no field, expected one of time"),
+    ({"shared": ("tine",)}, "State: 'tine' is no field, expected one of time"),
+    ({"metrics": {"time": "tine"}}, "State: 'tine' is no field, expected one of time"),
   ],
 )
 def test_malformed_rules_are_named(changes, message):

@@ -98,7 +98,7 @@ def ram(env, speed, deeper=0.003, back=None):
   task, physics = env.task, env.physics
   timestep, total, cost, touched = env.reset(), 0.0, 0.0, 0
   while not timestep.last():
-    port, point = physics.trocar().pos, physics.point(task.goal())
+    port, point = physics.trocar().pos, physics.tip_pos() + timestep.observation["target"]
     touched += physics.peak_force > 0.02
     out = back is not None and touched > back
     height = 0.02 if out else -deeper
@@ -138,15 +138,15 @@ def test_a_touch_is_a_contact_of_a_tenth_of_a_second_from_its_start():
   # The same, with one sample of too much force, or one beside the point:
   for force, tolerance in ((0.6, 0.005), (0.1, 0.0)):
     act, timestep = performer.make(env), env.reset()
-    while not timestep.last() and task.held < 0.05:
+    while not timestep.last() and timestep.observation["held"][0] < 0.5:
       timestep = env.step(act(timestep))
     physics.peak_force, task.tolerance = force, tolerance
     task.advance(physics)
-    assert task.held == 0
+    assert task.observe(physics)["held"] == 0
     physics.peak_force, task.tolerance = 0.1, 0.005
     for _ in range(10):
       task.advance(physics)
-    assert task.held == 0 and task.outcome is None
+    assert task.observe(physics)["held"] == 0 and task.outcome is None
     physics.peak_force = 0.0
     task.advance(physics)
     physics.peak_force = 0.1

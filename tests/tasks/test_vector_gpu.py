@@ -42,7 +42,7 @@ class Beside:
     self.physics.peak_shaft = float(shown.shaft_peak.numpy()[self.world])
 
   def holds(self):
-    inner = self.worlds.own.inner.numpy()[self.world]
+    inner = self.worlds.fields.inner.numpy()[self.world]
     opening = self.physics.sensor("jaw")[0]
     return bool(inner.min() > instrument.HELD_FORCE and opening > instrument.FOLD)
 

@@ -7,7 +7,6 @@ import palpate
 import pytest
 from palpate.app import live
 from palpate.tasks import episode, suite
-from palpate.tasks.domains import touch
 from palpate.tasks.recording import Recording
 
 KWARGS = {"input": "handle", "time_limit": 10}
@@ -34,8 +33,9 @@ class Toucher(live.Hand):
     physics, task = self.env.physics, self.env.task
     if now - self._last >= 0.02:
       self._last = now
-      normal = physics.normal(touch.goal(task))
-      to = physics.point(touch.goal(task)) + 0.006 * normal - physics.tip_pos()
+      goal = task.goals[0]
+      normal = physics.normal(goal)
+      to = physics.point(goal) + 0.006 * normal - physics.tip_pos()
       self._above = self._above or np.linalg.norm(to) < 0.001
       if self._above:
         to = -3e-4 * normal * (np.linalg.norm(physics.contact_force()) < 0.12)
