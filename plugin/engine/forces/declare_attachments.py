@@ -1,4 +1,4 @@
-"""What an organ is tied to, by its declaration or from Python, and how firmly; see `attachments`."""
+"""What an organ is tied to, by its declaration or from Python, and how firm; see `attachments`."""
 
 from __future__ import annotations
 
