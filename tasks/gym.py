@@ -20,10 +20,11 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from . import episode, registry, suite
+from . import registry, suite
+from .core import episode
+from .core.scenes import CAMERA
 from .display import Window
 from .recorder import Recorder
-from .scenes import CAMERA
 
 
 def _space(spec: Any) -> gymnasium.spaces.Box:

@@ -5,7 +5,8 @@ from typing import Any
 
 from dm_control.rl import control
 
-from . import base, registry
+from . import registry
+from .core import base
 
 TASKS_BY_DOMAIN = registry.TASKS
 # Those with a tag, and all; each is looked up, as a package may have registered more since.

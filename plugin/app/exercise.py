@@ -60,7 +60,7 @@ def main(args: argparse.Namespace) -> int:
   if not args.list and not args.task and not args.replay:
     raise CommandError("no TASK; `palpate exercise --list` lists them")
   palpate.register()
-  from palpate.tasks import episode
+  from palpate.tasks.core import episode
 
   if args.list:
     return _list()
@@ -151,7 +151,8 @@ def _page(args: argparse.Namespace) -> int:
 
 
 def _list() -> int:
-  from palpate.tasks import performer, suite
+  from palpate.tasks import suite
+  from palpate.tasks.core import performer
 
   for domain, task in suite.ALL_TASKS:
     print(f"{f'{domain}/{task}':24} {suite.summary(domain, task)}")
@@ -214,7 +215,7 @@ def _prepare(args: argparse.Namespace) -> _Job:
 
 def _replay(path: str):
   """Returns a recording, and what runs it again."""
-  from palpate.tasks import episode
+  from palpate.tasks.core import episode
   from palpate.tasks.recording import Recording
 
   old = Recording.load(path)
@@ -224,7 +225,7 @@ def _replay(path: str):
 
 def _perform(args: argparse.Namespace):
   """Returns a task's name, and what runs an episode of it."""
-  from palpate.tasks import episode, performer
+  from palpate.tasks.core import episode, performer
 
   name, task_kwargs = options.task_name(args.task), options.read(args.set)
   if args.device:
@@ -279,7 +280,7 @@ def _write(job: _Job, recording: Any, report: bool) -> str:
 def _write_files(job: _Job, folder: pathlib.Path, recording: Any, report: bool) -> None:
   """Writes recording, metrics and report to a folder."""
   from palpate.tasks.files import replacing
-  from palpate.tasks.report import write_report
+  from palpate.tasks.people.report import write_report
 
   with writing(folder):
     print(f"recording  {recording.save(folder / 'recording.npz')}")

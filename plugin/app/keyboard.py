@@ -7,10 +7,10 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-from palpate.tasks import episode
+from palpate.tasks.core import episode
+from palpate.tasks.core.scenes import CAMERA
 from palpate.tasks.display import Window
 from palpate.tasks.recording import Recording
-from palpate.tasks.scenes import CAMERA
 
 from .console import CommandError
 

@@ -44,7 +44,8 @@ def main(args: argparse.Namespace) -> int:
   check_counts(args, "episodes")
   crew = workers.chosen(args)
   palpate.register()
-  from palpate.tasks import performer, suite
+  from palpate.tasks import suite
+  from palpate.tasks.core import performer
 
   try:
     pairs = [suite.split(task) for task in args.tasks] or suite.ALL_TASKS
@@ -107,7 +108,7 @@ def _write(out: pathlib.Path, task: str, args: argparse.Namespace, results: list
   import mujoco
   from palpate.tasks.files import replacing
   from palpate.tasks.metrics import Metrics
-  from palpate.tasks.score import SUCCESS, make_reference
+  from palpate.tasks.people.score import SUCCESS, make_reference
 
   good = [Metrics.from_json(r.metrics) for r in results if r.outcome == SUCCESS]
   said = f"{task}: {len(good)} of {len(results)} episodes succeeded"

@@ -14,7 +14,7 @@ from .draw import film
 from .trainee import keeping
 
 if TYPE_CHECKING:
-  from palpate.tasks.limits import Lookup
+  from palpate.tasks.people.limits import Lookup
 
 _SIZE = (480, 360)  # of a film in a page [pixels]
 
@@ -33,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser):
 
 def main(args: argparse.Namespace) -> int:
   """Runs the job and returns its exit code."""
-  from palpate.tasks import comparison, report
+  from palpate.tasks.people import comparison, report
 
   paths = [pathlib.Path(name) for name in args.recordings]
   if args.film:
@@ -58,7 +58,7 @@ def main(args: argparse.Namespace) -> int:
 
 def _entries(paths: Sequence[pathlib.Path], references: Lookup, filmed: bool) -> list[Any]:
   """Returns what is compared: recordings, references and films."""
-  from palpate.tasks import comparison
+  from palpate.tasks.people import comparison
   from palpate.tasks.recording import Recording
 
   entries = []

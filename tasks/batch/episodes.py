@@ -12,10 +12,10 @@ import mujoco as mj
 import numpy as np
 from dm_control.mujoco import wrapper
 from palpate.models import trocar
-from palpate.tasks.base import Task
-from palpate.tasks.instrument import Second
-from palpate.tasks.physics import Physics
-from palpate.tasks.scenes import ORGAN
+from palpate.tasks.core.base import Task
+from palpate.tasks.core.instrument import Second
+from palpate.tasks.core.physics import Physics
+from palpate.tasks.core.scenes import ORGAN
 
 # What every exercise draws: trocar and joints of an instrument, and the length of the path.
 HAND = ("body_pos", "body_quat", "pose")

@@ -5,7 +5,7 @@ Sizes are named: nworld worlds, nvert nodes, nelem triangles, naction components
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 import warp as wp
-from palpate.tasks.physics import COARSE, NEAR
+from palpate.tasks.core.physics import COARSE, NEAR
 from palpate.tissue.types import Array, doubles, floats, ints, struct
 
 flags = Array(wp.bool, ("nworld",))

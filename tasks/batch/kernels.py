@@ -2,9 +2,9 @@
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 import warp as wp
-from palpate.tasks import base, jaws, safety
+from palpate.tasks.core import base, jaws, safety
+from palpate.tasks.core.physics import NEAR
 from palpate.tasks.core.rules import closeness as _closeness
-from palpate.tasks.physics import NEAR
 from palpate.tissue.types import Array, floats, ints, struct
 
 from .fields import DAMAGED, RUNNING, SUCCESS, Common

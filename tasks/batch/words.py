@@ -10,8 +10,7 @@ import types
 from typing import Any
 
 import warp as wp
-from palpate.tasks import instrument
-from palpate.tasks.core import rules
+from palpate.tasks.core import instrument, rules
 from palpate.tasks.core.rules import Rules
 from palpate.tissue.types import Array
 

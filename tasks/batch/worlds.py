@@ -14,10 +14,10 @@ import palpate.batch
 import warp as wp
 from palpate.batch.threads import Threads
 from palpate.models import trocar
-from palpate.tasks import episode, jaws
-from palpate.tasks.environment import Environment
-from palpate.tasks.instrument import AXES, JAWS, RATES
-from palpate.tasks.stage import STATE
+from palpate.tasks.core import episode, jaws
+from palpate.tasks.core.environment import Environment
+from palpate.tasks.core.instrument import AXES, JAWS, RATES
+from palpate.tasks.core.stage import STATE
 from palpate.tissue.types import allocate
 
 from . import kernels, tally

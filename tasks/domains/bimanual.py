@@ -19,7 +19,8 @@ import itertools
 
 import numpy as np
 
-from ..base import Physics
+from ..core.base import Physics
+from ..core.performer import Performer, Script
 from ..core.rules import (
   DAMAGED,
   FAR,
@@ -40,7 +41,6 @@ from ..core.rules import (
   point,
   weaken,
 )
-from ..performer import Performer, Script
 from ..registry import exercise
 from . import dissect
 from .dissect import Dissect, hold, middle

@@ -23,7 +23,8 @@ import numpy as np
 import warp as wp
 from palpate.tissue.types import Array, ints
 
-from ..base import Physics, Task
+from ..core.base import Physics, Task
+from ..core.performer import Performer, Script
 from ..core.rules import (
   DAMAGED,
   FAR,
@@ -42,9 +43,8 @@ from ..core.rules import (
   rows,
   tip,
 )
-from ..performer import Performer, Script
+from ..core.scenes import Scene
 from ..registry import exercise
-from ..scenes import Scene
 from . import sheet
 
 SCENE = Scene(

@@ -20,7 +20,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ..base import Physics
+from ..core.base import Physics
+from ..core.performer import Performer, Script
 from ..core.rules import (
   Rules,
   Vector,
@@ -34,9 +35,8 @@ from ..core.rules import (
   tip,
   vector,
 )
-from ..performer import Performer, Script
+from ..core.scenes import Scene
 from ..registry import exercise
-from ..scenes import Scene
 from .freeing import METRICS, Freed, Freeing, count, earned, held, holding
 from .grasp import FUNDUS, Held, Hold, distance, follow
 

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from ..base import Physics, Task
+from ..core.base import Physics, Task
 from ..core.rules import (
   DAMAGED,
   RUNNING,
@@ -16,7 +16,7 @@ from ..core.rules import (
   tear,
   traction,
 )
-from ..scenes import Scene
+from ..core.scenes import Scene
 
 SEEN = 1e-5  # what rounding may take from a share, in float32 too
 

@@ -22,7 +22,8 @@ import itertools
 
 import numpy as np
 
-from ..base import Physics, Task
+from ..core.base import Physics, Task
+from ..core.performer import Performer, Script
 from ..core.rules import (
   RUNNING,
   SUCCESS,
@@ -42,9 +43,8 @@ from ..core.rules import (
   slipped,
   tip,
 )
-from ..performer import Performer, Script
+from ..core.scenes import Scene
 from ..registry import exercise
-from ..scenes import Scene
 from .touch import SLACK
 
 FUNDUS = Scene(

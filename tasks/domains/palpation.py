@@ -9,8 +9,9 @@ from palpate.models import shapes
 from palpate.tissue.types import ints
 from scipy.spatial import cKDTree
 
-from .. import scenes
-from ..base import Physics, Task
+from ..core import scenes
+from ..core.base import Physics, Task
+from ..core.performer import Performer, Script
 from ..core.rules import (
   MISSED,
   RUNNING,
@@ -25,8 +26,7 @@ from ..core.rules import (
   reach,
   tip,
 )
-from ..performer import Performer, Script
-from ..scenes import Scene
+from ..core.scenes import Scene
 from . import feeling
 from .feeling import APART, SHARED, SOFT, Notes, chance, nearest, press
 

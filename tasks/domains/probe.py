@@ -28,7 +28,8 @@ import numpy as np
 import warp as wp
 from palpate.tissue.types import Array, ints
 
-from ..base import Physics, Task
+from ..core.base import Physics, Task
+from ..core.performer import Performer, Script
 from ..core.rules import (
   RUNNING,
   SUCCESS,
@@ -44,9 +45,8 @@ from ..core.rules import (
   root,
   tip,
 )
-from ..performer import Performer, Script
+from ..core.scenes import Scene
 from ..registry import exercise
-from ..scenes import Scene
 from .palpation import Palpate
 from .touch import SLACK, draw_apart
 

@@ -19,7 +19,8 @@ import numpy as np
 import warp as wp
 from palpate.tissue.types import Array
 
-from ..base import Physics
+from ..core.base import Physics
+from ..core.performer import Performer, Script
 from ..core.rules import (
   RUNNING,
   SUCCESS,
@@ -32,9 +33,8 @@ from ..core.rules import (
   tip,
   visible,
 )
-from ..performer import Performer, Script
+from ..core.scenes import Scene
 from ..registry import exercise
-from ..scenes import Scene
 from .grasp import FUNDUS, Held, Hold, distance, follow
 from .touch import SLACK
 

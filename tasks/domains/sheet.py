@@ -8,8 +8,8 @@ import numpy as np
 import palpate
 from palpate.models import catalog, mjcf, scenery, situs
 
-from .. import scenes
-from ..scenes import Scene
+from ..core import scenes
+from ..core.scenes import Scene
 
 SIZE = 0.06  # of its sides [m]
 ENERGY = 160.0  # that it takes to open an area [J/m^2]; catalogue and source: docs/cutting.md

@@ -16,7 +16,8 @@ import itertools
 import mujoco
 import numpy as np
 
-from ..base import Physics
+from ..core.base import Physics
+from ..core.performer import Performer, Script
 from ..core.rules import (
   FAR,
   Rules,
@@ -30,9 +31,8 @@ from ..core.rules import (
   tip,
   vector,
 )
-from ..performer import Performer, Script
+from ..core.scenes import Scene
 from ..registry import exercise
-from ..scenes import Scene
 from . import adhesion
 from .freeing import METRICS, Freed, Freeing, count, earned, held, holding
 

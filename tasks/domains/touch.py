@@ -16,7 +16,8 @@ from typing import Annotated, Any
 import numpy as np
 from palpate.tissue.types import ints
 
-from ..base import Physics, Task
+from ..core.base import Physics, Task
+from ..core.performer import Performer, Script
 from ..core.rules import (
   RUNNING,
   SUCCESS,
@@ -31,9 +32,8 @@ from ..core.rules import (
   reach,
   tip,
 )
-from ..performer import Performer, Script
+from ..core.scenes import Scene
 from ..registry import exercise
-from ..scenes import Scene
 
 CONTACT, DWELL = 0.03, 0.1  # least force and time of a touch [N], [s]
 SLACK = 1e-5  # what rounding may take from times [s]

@@ -21,7 +21,8 @@ import warp as wp
 from palpate.tissue.types import Array, floats, ints
 from scipy.spatial import cKDTree
 
-from ..base import Physics, Task
+from ..core.base import Physics, Task
+from ..core.performer import Performer, Script
 from ..core.rules import (
   FAR,
   RUNNING,
@@ -41,9 +42,8 @@ from ..core.rules import (
   rows,
   tip,
 )
-from ..performer import Performer, Script
+from ..core.scenes import Scene
 from ..registry import exercise
-from ..scenes import Scene
 
 STOMACH = Scene(organ="stomach", center="body", port=(0.03, 0.045, 0.12), camera=(-0.05, 0.1, 0.14))
 CONTACT = 0.02  # [N]

@@ -10,7 +10,8 @@ import pytest
 from palpate import tasks
 from palpate.app import cli, console, panel, workers
 from palpate.app.learn import evaluate
-from palpate.tasks import policy, score
+from palpate.tasks.learn import policy
+from palpate.tasks.people import score
 from palpate.tasks.recording import Recording
 
 QUICK = {"surroundings": "none", "nodes": 250}  # to load in another process

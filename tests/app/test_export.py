@@ -13,7 +13,9 @@ import numpy as np
 import pytest
 from palpate.app import cli, console, live, options
 from palpate.app.learn import export as command
-from palpate.tasks import demonstrations, performer, policy, suite
+from palpate.tasks import suite
+from palpate.tasks.core import performer
+from palpate.tasks.learn import demonstrations, policy
 from palpate.tasks.recording import Recording
 
 for name in ("pyarrow", "h5py", "minari", "imageio_ffmpeg"):

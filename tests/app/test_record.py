@@ -19,7 +19,7 @@ import pytest
 from palpate.app import cli
 from palpate.app.trainee import database, keeping
 from palpate.app.trainee.record import Record, Session, check_name
-from palpate.tasks import limits
+from palpate.tasks.people import limits
 from palpate.tasks.recorder import Recorder, Settings
 from palpate.tasks.recording import Recording
 

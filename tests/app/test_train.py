@@ -10,9 +10,9 @@ for name in ("gymnasium", "torch", "rsl_rl", "safetensors"):
   pytest.importorskip(name)
 
 import torch  # noqa: E402
-from palpate.tasks import policy  # noqa: E402
-from palpate.tasks.batch import learning, networks, rsl, vector  # noqa: E402
-from palpate.tasks.lessons import Lesson  # noqa: E402
+from palpate.tasks.batch import vector  # noqa: E402
+from palpate.tasks.learn import learning, networks, policy, rsl  # noqa: E402
+from palpate.tasks.learn.lessons import Lesson  # noqa: E402
 
 SMALL = ["--device", "cpu", "--num-envs", "2", "--processes", "1", "--set", "time_limit=0.4"]
 

@@ -22,7 +22,7 @@ from benchmarks.runner import SEED, Bench, Case
 from palpate.app import cli, options, workers
 from palpate.app.datasets.robomimic import FILE
 from palpate.app.learn import evaluate
-from palpate.tasks import policy
+from palpate.tasks.learn import policy
 
 TASK = "touch/standard"
 NOISE = 0.3

@@ -18,8 +18,9 @@ from benchmarks.performances import arguments as add_episodes
 from benchmarks.performances import folder, performances
 from benchmarks.runner import Bench, Case, Row
 from palpate import tasks
-from palpate.tasks import performer, score
+from palpate.tasks.core import performer
 from palpate.tasks.metrics import METRICS, Metrics
+from palpate.tasks.people import score
 
 NAMES = ["/".join(pair) for pair in tasks.ALL_TASKS]
 # Styles of each group, and episodes of each style.

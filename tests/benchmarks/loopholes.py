@@ -27,8 +27,10 @@ import palpate
 from benchmarks import plots, results
 from benchmarks.runner import SEED, Bench, Case, Row
 from palpate import tasks
-from palpate.tasks import base, episode, performer, score, suite
-from palpate.tasks.environment import CONTROL_TIMESTEP
+from palpate.tasks import suite
+from palpate.tasks.core import base, episode, performer
+from palpate.tasks.core.environment import CONTROL_TIMESTEP
+from palpate.tasks.people import score
 
 NAMES = ("touch/easy", "probe/easy", "probe/palpate_easy", "grasp/easy", "trace/easy")
 NAMES += ("retract/easy",)

@@ -16,8 +16,10 @@ from benchmarks import plots, results
 from benchmarks.runner import Bench, Case, Row
 from palpate import tasks
 from palpate.app.learn import evaluate
-from palpate.tasks import policy, registry, score
+from palpate.tasks import registry
+from palpate.tasks.learn import policy
 from palpate.tasks.metrics import Metrics
+from palpate.tasks.people import score
 
 NAMES = ["/".join(pair) for pair in tasks.ALL_TASKS]
 _EPISODES, _BLOCK = 50, 5  # of a policy, of a case

@@ -13,7 +13,7 @@ import numpy as np
 from benchmarks import results
 from benchmarks.performances import arguments, folder, performances
 from benchmarks.runner import Bench, Case, Row
-from palpate.tasks import performer
+from palpate.tasks.core import performer
 from palpate.tasks.metrics import METRICS, Metrics
 
 SKILL_TASKS = ("touch/standard", "probe/easy", "grasp/easy", "trace/easy", "retract/easy")

@@ -18,7 +18,8 @@ import palpate
 from benchmarks import plots, results
 from benchmarks.runner import Bench, Case, Row
 from palpate import tasks
-from palpate.tasks import episode, performer, suite
+from palpate.tasks import suite
+from palpate.tasks.core import episode, performer
 from palpate.tasks.recorder import Recorder
 
 NAMES = ["/".join(pair) for pair in tasks.ALL_TASKS]

@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 from benchmarks import cloning, experts, loopholes, results, run, skill
 from palpate.app import panel
-from palpate.tasks import performer, policy, score
+from palpate.tasks.core import performer
+from palpate.tasks.learn import policy
+from palpate.tasks.people import score
 
 HERE = pathlib.Path(__file__).parent
 # Share of experts that are not proficient where it is above 5 %: rare peaks of pressure and strain.

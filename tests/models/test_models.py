@@ -11,7 +11,7 @@ import pytest
 from dm_control import mujoco as dm_mujoco
 from palpate import models
 from palpate.models import build, catalog, organs, shapes
-from palpate.tasks import scenes
+from palpate.tasks.core import scenes
 
 NAMES = models.NAMES
 

@@ -15,7 +15,7 @@ def make(**options):
 
 def test_rsl_rl():
   pytest.importorskip("rsl_rl")
-  from palpate.tasks.batch.rsl import RslRl
+  from palpate.tasks.learn.rsl import RslRl
 
   env = RslRl(make(output="torch", time_limit=0.06), seed=0)
   seen = env.get_observations()
@@ -34,7 +34,7 @@ def test_rsl_rl():
 
 def test_stable_baselines3():
   pytest.importorskip("stable_baselines3")
-  from palpate.tasks.batch.sb3 import Sb3
+  from palpate.tasks.learn.sb3 import Sb3
   from stable_baselines3 import PPO
 
   env = Sb3(make(time_limit=0.06))

@@ -4,10 +4,10 @@ import re
 
 import numpy as np
 import pytest
-from palpate.tasks import comparison, plots
-from palpate.tasks.comparison import Entry
+from palpate.tasks.people import comparison, plots
+from palpate.tasks.people.comparison import Entry
+from palpate.tasks.people.score import make_reference
 from palpate.tasks.recorder import Recorder, Settings
-from palpate.tasks.score import make_reference
 
 pytest.importorskip("matplotlib")
 

@@ -1,7 +1,7 @@
 """Which exercises are open to a learner, and what is next."""
 
 import pytest
-from palpate.tasks import curriculum
+from palpate.tasks.people import curriculum
 from palpate.tasks.registry import TASKS
 
 NAMES = [f"{domain}/{task}" for domain, tasks in TASKS.items() for task in tasks]

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from palpate.tasks import cusum
+from palpate.tasks.people import cusum
 
 
 def test_the_chart_is_the_one_by_hand():

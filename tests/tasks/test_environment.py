@@ -7,7 +7,8 @@ import pytest
 from absl.testing import absltest
 from dm_env import test_utils
 from palpate import tasks
-from palpate.tasks import observation, performer, registry, suite
+from palpate.tasks import registry, suite
+from palpate.tasks.core import observation, performer
 
 PAGE = pathlib.Path(__file__).parents[2] / "docs" / "environments.md"
 PICTURES = ("pixels", "depth", "segmentation", "points")

@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 from palpate import tasks
-from palpate.tasks import episode, performer
+from palpate.tasks.core import episode, performer
 from palpate.tasks.recording import Recording
 from recordings import LINE, plain
 

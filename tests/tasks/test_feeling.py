@@ -5,8 +5,8 @@ import types
 import numpy as np
 import pytest
 from palpate import tasks
-from palpate.tasks import lessons
 from palpate.tasks.domains import feeling
+from palpate.tasks.learn import lessons
 
 GRID = np.array([(0.008 * x, 0.008 * y, 0.0) for x in range(-3, 4) for y in range(-3, 4)])
 UP = np.array([0.0, 0.0, 1.0])

@@ -4,7 +4,8 @@ import copy
 
 import numpy as np
 import pytest
-from palpate.tasks import episode, performer, suite
+from palpate.tasks import suite
+from palpate.tasks.core import episode, performer
 from palpate.tasks.recording import Recording
 
 HANDLE = {"input": "handle"}

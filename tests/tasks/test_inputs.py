@@ -8,9 +8,9 @@ import pytest
 from palpate.app.learn import evaluate
 from palpate.tasks import metrics as functions
 from palpate.tasks.metrics import METRICS, Metrics, Unknown, metric
+from palpate.tasks.people.score import make_reference, score
 from palpate.tasks.recorder import Recorder
 from palpate.tasks.recording import Recording
-from palpate.tasks.score import make_reference, score
 from recordings import LINE, SETTINGS, exercise, plain
 
 

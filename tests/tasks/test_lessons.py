@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 from palpate import tasks
-from palpate.tasks import lessons, performer, policy
+from palpate.tasks.core import performer
+from palpate.tasks.learn import lessons, policy
 
 
 def played(env, act, until, most=400):

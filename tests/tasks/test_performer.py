@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from palpate import tasks
 from palpate.models import trocar
-from palpate.tasks import base, episode, performer, suite
+from palpate.tasks import suite
+from palpate.tasks.core import base, episode, performer
 
 EASY = ["/".join(pair) for pair in tasks.EASY]
 OTHERS = ["/".join(pair) for pair in tasks.ALL_TASKS if pair not in tasks.EASY]

@@ -10,7 +10,9 @@ import pytest
 
 pytest.importorskip("safetensors")
 
-from palpate.tasks import performer, policy, registry, suite
+from palpate.tasks import registry, suite
+from palpate.tasks.core import performer
+from palpate.tasks.learn import policy
 from safetensors.numpy import save_file
 
 NAMES = ("target", "held")

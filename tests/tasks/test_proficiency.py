@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 from palpate import tasks
-from palpate.tasks import episode, performer, score, suite
+from palpate.tasks import suite
+from palpate.tasks.core import episode, performer
+from palpate.tasks.people import score
 
 NAMES = ["/".join(pair) for pair in tasks.ALL_TASKS]
 

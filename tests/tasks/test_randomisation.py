@@ -7,7 +7,7 @@ import pathlib
 import numpy as np
 import pytest
 from palpate import tasks
-from palpate.tasks import episode, observation, randomisation
+from palpate.tasks.core import episode, observation, randomisation
 
 PAGE = pathlib.Path(__file__).parents[2] / "docs" / "environments.md"
 RANGES = {

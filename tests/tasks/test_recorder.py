@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from palpate.tasks import recorder as recorder_module
 from palpate.tasks.metrics import METRICS
+from palpate.tasks.people.score import read_reference
 from palpate.tasks.recorder import Event, Recorder, Recording, Settings
-from palpate.tasks.score import read_reference
 from recordings import SETTINGS, exercise
 
 

@@ -11,10 +11,10 @@ import sys
 
 import numpy as np
 import pytest
-from palpate.tasks import plots, report
 from palpate.tasks.metrics import METRICS, Metrics, number
+from palpate.tasks.people import plots, report
+from palpate.tasks.people.score import make_reference
 from palpate.tasks.recorder import Recorder, Settings
-from palpate.tasks.score import make_reference
 
 pytest.importorskip("matplotlib")
 

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from palpate import tasks
 from palpate.models import trocar
-from palpate.tasks import instrument, performer, safety, suite
+from palpate.tasks import suite
+from palpate.tasks.core import instrument, performer, safety
 
 FAST = np.array(instrument.RATES) * 0.02  # of the drives in a control step
 

@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pytest
 from palpate import tasks
-from palpate.tasks import score as scoring
 from palpate.tasks.metrics import METRICS, Metrics, Unknown
-from palpate.tasks.score import SUCCESS, WEIGHTS, make_reference, score, z_score
+from palpate.tasks.people import score as scoring
+from palpate.tasks.people.score import SUCCESS, WEIGHTS, make_reference, score, z_score
 
 SCORED = [name for name, spec in METRICS.items() if spec.better != "neither"]
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from dm_control.rl import control
 from palpate import models, tasks
-from palpate.tasks import metrics, performer, registry, scenes, suite
+from palpate.tasks import metrics, registry, suite
+from palpate.tasks.core import performer, scenes
 
 IDS = ["/".join(pair) for pair in tasks.ALL_TASKS]
 _cache = {}

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 from palpate import tasks
-from palpate.tasks import observation, suite
+from palpate.tasks import suite
+from palpate.tasks.core import observation
 from palpate.tissue.geometry import subdivide
 
 

@@ -9,7 +9,8 @@ gymnasium = pytest.importorskip("gymnasium")
 
 from gymnasium.vector import AutoresetMode  # noqa: E402
 from gymnasium.wrappers.vector import RecordEpisodeStatistics  # noqa: E402
-from palpate.tasks import performer, registry  # noqa: E402
+from palpate.tasks import registry  # noqa: E402
+from palpate.tasks.core import performer  # noqa: E402
 
 # float32 of the batch against float64; jaws on a fold of tissue magnify it.
 LIMITS = {"contact_force": 0.02, "shaft_force": 0.02, "peak_force": 0.02, "gripper": 0.1}

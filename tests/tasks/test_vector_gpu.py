@@ -8,9 +8,10 @@ from scenes import needs_cuda
 pytest.importorskip("gymnasium")
 
 import warp as wp
-from palpate.tasks import instrument, performer, registry
+from palpate.tasks import registry
 from palpate.tasks.batch import fields, vector
-from palpate.tasks.stage import STATE
+from palpate.tasks.core import instrument, performer
+from palpate.tasks.core.stage import STATE
 
 SEED = 100
 

@@ -64,7 +64,7 @@ def card(about: About, form: str, lines: Sequence[str], path: pathlib.Path) -> s
     lines: about episodes, seeds and what is left out
     path: of one of its demonstrations
   """
-  from palpate.tasks.demonstrations import Demonstration, group, instruction
+  from palpate.tasks.learn.demonstrations import Demonstration, group, instruction
 
   demo = Demonstration.load(path)
   licence = about.licence.lower()

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
-from palpate.tasks.demonstrations import Demonstration, group, instruction
+from palpate.tasks.learn.demonstrations import Demonstration, group, instruction
 
 from ..draw import film
 from . import About

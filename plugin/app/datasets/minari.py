@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import palpate
 from palpate.tasks import registry
-from palpate.tasks.demonstrations import Demonstration
+from palpate.tasks.learn.demonstrations import Demonstration
 
 from . import About
 

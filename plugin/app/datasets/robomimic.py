@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 from palpate.tasks import registry
-from palpate.tasks.demonstrations import Demonstration, instruction
+from palpate.tasks.learn.demonstrations import Demonstration, instruction
 
 from . import About
 

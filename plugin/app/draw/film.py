@@ -57,7 +57,7 @@ def laparoscope(path: pathlib.Path, size: tuple[int, int]) -> Iterator[Callable[
     path: of the film
     size: width and height [pixels]
   """
-  from palpate.tasks.scenes import CAMERA
+  from palpate.tasks.core.scenes import CAMERA
 
   due = -math.inf
   with write(path, _FPS) as frame:
@@ -74,7 +74,7 @@ def laparoscope(path: pathlib.Path, size: tuple[int, int]) -> Iterator[Callable[
 
 def of_recording(recording: Any, size: tuple[int, int]) -> bytes:
   """Returns the MP4 of a recorded exercise, run anew; CommandError if it comes out differently."""
-  from palpate.tasks import episode
+  from palpate.tasks.core import episode
 
   check(".mp4")
   with tempfile.TemporaryDirectory() as folder:

@@ -71,7 +71,7 @@ def main(args: argparse.Namespace) -> int:
   check_counts(args, "episodes")
   crew = workers.chosen(args)
   palpate.register()
-  from palpate.tasks import performer
+  from palpate.tasks.core import performer
 
   known = keeping.references(args.references)
   name = options.task_name(args.task)
@@ -152,7 +152,7 @@ def perform(job: tuple[str, str, int, str | None, str]) -> Result:
   """Returns the result of an episode; a job is task, policy, seed, recordings' folder, options."""
   name, policy, seed, folder, kwargs = job
   palpate.register()
-  from palpate.tasks import episode, performer
+  from palpate.tasks.core import episode, performer
 
   env = options.environment(name, kwargs)
   info = {"task_kwargs": json.loads(kwargs), "performer": policy}
@@ -216,7 +216,7 @@ def _proficiency(
 ) -> tuple[list[str], list[float]]:
   """Returns the lines about proficiency, and the scores that are known."""
   from palpate.tasks.metrics import METRICS
-  from palpate.tasks.score import CONSECUTIVE, REPEATS, score, trained
+  from palpate.tasks.people.score import CONSECUTIVE, REPEATS, score, trained
 
   scores = [score(m, reference, o) for m, o in zip(metrics, outcomes, strict=True)]
   passed = [s.proficient for s in scores]

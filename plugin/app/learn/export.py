@@ -151,7 +151,7 @@ def _command(args: argparse.Namespace) -> str:
 
 def _todo(args: argparse.Namespace) -> tuple[str, dict[str, Any], list[tuple[str, dict]]]:
   """Returns task, options, and the recordings with their own options; all are checked."""
-  from palpate.tasks import performer
+  from palpate.tasks.core import performer
 
   chosen: dict[str, Any] = {"observations": args.observations}
   if args.size:
@@ -283,7 +283,8 @@ def _run(jobs: list[Job], crew: workers.Workers) -> tuple[list[Kept], bool]:
 def keep(job: Job) -> Kept:
   """Makes an episode and keeps it, unless it is there."""
   palpate.register()
-  from palpate.tasks import demonstrations, episode, performer
+  from palpate.tasks.core import episode, performer
+  from palpate.tasks.learn import demonstrations
   from palpate.tasks.recording import Recording
 
   path = pathlib.Path(job.path)

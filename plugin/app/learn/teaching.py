@@ -17,8 +17,8 @@ from .. import options, workers
 from ..console import CommandError, Interrupt, Progress, writing
 
 if TYPE_CHECKING:
-  from palpate.tasks.batch.networks import Networks
-  from palpate.tasks.lessons import Lesson
+  from palpate.tasks.learn.lessons import Lesson
+  from palpate.tasks.learn.networks import Networks
 
 LESSONS = "lessons.npz"
 _ROWS, _ENDS = ("seen", "meant", "done", "taught", "returns"), ("outcome", "alone")  # of a lesson
@@ -56,7 +56,7 @@ class Job:
 def give(job: Job) -> Lesson:
   """Returns a lesson, in a worker's process."""
   palpate.register()
-  from palpate.tasks import lessons, policy
+  from palpate.tasks.learn import lessons, policy
 
   env = options.environment(job.task, job.task_kwargs)
   learner = policy.load(job.policy) if job.policy else None
@@ -134,7 +134,7 @@ class School:
     return not interrupt.seen
 
   def _jobs(self, count: int, gamma: float) -> list[Job]:
-    from palpate.tasks.batch.learning import POLICY
+    from palpate.tasks.learn.learning import POLICY
 
     random = np.random.RandomState(self.seed + self.rounds)
     first = _FIRST + (self.seed * 100 + self.rounds) * 10_000
@@ -167,7 +167,7 @@ class School:
       np.savez(file, allow_pickle=False, about=np.array(json.dumps(about)), **every)
 
   def _load(self) -> None:
-    from palpate.tasks.lessons import Lesson
+    from palpate.tasks.learn.lessons import Lesson
 
     try:
       with np.load(self.path, allow_pickle=False) as file:

@@ -28,7 +28,7 @@ from ..console import (
 from .teaching import LESSONS, School
 
 if TYPE_CHECKING:
-  from palpate.tasks.batch.learning import Learner
+  from palpate.tasks.learn.learning import Learner
 
 _FEW = 16  # worlds on a CPU
 _MANY = 4096  # on a GPU
@@ -95,8 +95,7 @@ class Training:
   def __init__(self, name: str, args: argparse.Namespace, folder: pathlib.Path):
     """Makes the networks, or takes up what the folder has of them."""
     import warp as wp
-    from palpate.tasks import policy
-    from palpate.tasks.batch import learning, networks
+    from palpate.tasks.learn import learning, networks, policy
 
     self.name, self.args, self.folder = name, args, folder
     self.kwargs: dict[str, Any] = options.read(args.set)
@@ -131,7 +130,7 @@ class Training:
 
   def teach(self, crew: workers.Workers, interrupt: Interrupt) -> bool:
     """Lets the expert teach; returns whether it was to the end."""
-    from palpate.tasks.batch import learning
+    from palpate.tasks.learn import learning
 
     school, networks = self.school, self.networks
     if (self.folder / learning.CHECKPOINT).exists():  # it practises already
@@ -145,8 +144,7 @@ class Training:
 
   def _write_taught(self) -> None:
     """Writes the policy as it was taught so far, and its licence."""
-    from palpate.tasks import policy
-    from palpate.tasks.batch import learning
+    from palpate.tasks.learn import learning, policy
 
     school, networks = self.school, self.networks
     with writing(self.folder):
@@ -184,7 +182,8 @@ class Training:
 
   def _learner(self) -> Learner | None:
     """Returns who practises, None where an exercise can only be taught."""
-    from palpate.tasks.batch import learning, vector
+    from palpate.tasks.batch import vector
+    from palpate.tasks.learn import learning
 
     path = self.folder / learning.CHECKPOINT
     count = self.args.num_envs or (_FEW if self.device == "cpu" else _MANY)
@@ -210,8 +209,7 @@ class Training:
 
   def _save(self, learner: Learner, rows: list[dict[str, float]]) -> None:
     """Writes checkpoint, policy, licence and curves."""
-    from palpate.tasks import policy
-    from palpate.tasks.batch import learning
+    from palpate.tasks.learn import learning, policy
 
     folder = self.folder
     with writing(folder):

@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from palpate.tasks.metrics import METRICS, Spec, number
+from palpate.tasks.people.report import ending
+from palpate.tasks.people.score import SUCCESS, score
 from palpate.tasks.recording import Recording
-from palpate.tasks.report import ending
-from palpate.tasks.score import SUCCESS, score
 
 _STAYS = 0.6  # how long a warning is shown [s]
 # What helps, by metric; those that are left out say so by their names.

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 from palpate.models import trocar
 from palpate.models.handle import Handle, Shaft
-from palpate.tasks.handle import spin
+from palpate.tasks.core.handle import spin
 
 from .coupling import Link, Options
 from .devices.device import Device

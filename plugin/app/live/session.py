@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 from palpate.models.handle import Shaft
-from palpate.tasks import episode
-from palpate.tasks.handle import ROW
+from palpate.tasks.core import episode
+from palpate.tasks.core.handle import ROW
 from palpate.tasks.recording import Recording
 
 from .coupling import Link, Options

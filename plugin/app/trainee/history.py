@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-  from palpate.tasks.limits import Lookup
+  from palpate.tasks.people.limits import Lookup
 
   from .record import Episode
 
@@ -34,7 +34,7 @@ def passed(episodes: Iterable[Episode]) -> dict[str, list[bool]]:
 
 def judged(episodes: Sequence[Episode], references: Lookup) -> list[Episode]:
   """Returns the episodes with score and proficiency by other references."""
-  from palpate.tasks.score import score
+  from palpate.tasks.people.score import score
 
   found = []
   for episode in episodes:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from ..console import CommandError
 
 if TYPE_CHECKING:
-  from palpate.tasks.limits import Lookup
+  from palpate.tasks.people.limits import Lookup
   from palpate.tasks.recording import Recording
 
   from .record import Record, Session
@@ -53,7 +53,7 @@ def folder(args: argparse.Namespace) -> pathlib.Path:
 
 def references(path: str | pathlib.Path | None) -> Lookup:
   """Returns what finds the references of tasks; CommandError says what is wrong with the file."""
-  from palpate.tasks import limits
+  from palpate.tasks.people import limits
 
   try:
     return limits.lookup(None if path is None else pathlib.Path(path))
@@ -118,7 +118,7 @@ class Keeping:
 
   def check(self, task: str) -> None:
     """Raises ValueError unless the task is open to the trainee, RecordError without a record."""
-    from palpate.tasks import curriculum
+    from palpate.tasks.people import curriculum
 
     from . import history
     from .record import Record
@@ -225,7 +225,7 @@ def read(args: argparse.Namespace, task: str = "", pages: bool = False) -> Keepi
 
 def _progress(episodes: Sequence[Any], task: str, judged: bool) -> tuple[str, ...]:
   """Returns what the last episode, of a task that has limits or not, means for the person."""
-  from palpate.tasks import curriculum
+  from palpate.tasks.people import curriculum
 
   from . import history
 

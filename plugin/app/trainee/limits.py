@@ -34,8 +34,8 @@ def add_arguments(parser: argparse.ArgumentParser):
 
 def main(args: argparse.Namespace) -> int:
   """Runs the job and returns its exit code."""
-  from palpate.tasks import limits, score
   from palpate.tasks.files import replacing
+  from palpate.tasks.people import limits, score
 
   if not args.recordings and not args.trainee:
     raise CommandError("no FILE and no --trainee to make limits of")

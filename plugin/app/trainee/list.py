@@ -14,7 +14,7 @@ def add_arguments(parser: argparse.ArgumentParser):
 
 def main(args: argparse.Namespace) -> int:
   """Runs the job and returns its exit code."""
-  from palpate.tasks import curriculum
+  from palpate.tasks.people import curriculum
 
   from .record import Record
 

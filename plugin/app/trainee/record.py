@@ -24,12 +24,12 @@ import uuid
 from collections.abc import Iterator
 from typing import Any
 
-from palpate.tasks.curves import Attempt
 from palpate.tasks.files import free, replacing
-from palpate.tasks.limits import Lookup
 from palpate.tasks.metrics import METRICS, Metrics, Unknown
+from palpate.tasks.people.curves import Attempt
+from palpate.tasks.people.limits import Lookup
+from palpate.tasks.people.score import score
 from palpate.tasks.recording import Recording
-from palpate.tasks.score import score
 
 from . import database
 from .database import PendingError, RecordError

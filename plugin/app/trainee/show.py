@@ -10,7 +10,7 @@ from ..console import CommandError, output, writing
 from . import history, keeping
 
 if TYPE_CHECKING:
-  from palpate.tasks.limits import Lookup
+  from palpate.tasks.people.limits import Lookup
 
   from .record import Episode
 
@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser):
 
 def main(args: argparse.Namespace) -> int:
   """Runs the job and returns its exit code."""
-  from palpate.tasks import curves
+  from palpate.tasks.people import curves
 
   from .record import Record
 
@@ -82,7 +82,7 @@ def summary(head: str, shown: Mapping[str, Sequence[Episode]]) -> str:
 
 def standing(done: Sequence[Episode]) -> tuple[str, str]:
   """Returns how far a person is by the rule of proficiency, and by the CUSUM."""
-  from palpate.tasks import curriculum, cusum, score
+  from palpate.tasks.people import curriculum, cusum, score
 
   passed = [e.proficient for e in done]
   after = score.trained(passed)
@@ -98,7 +98,7 @@ def standing(done: Sequence[Episode]) -> tuple[str, str]:
 
 def _next(episodes: Sequence[Episode]) -> str:
   """Returns what to do next, in words."""
-  from palpate.tasks import curriculum
+  from palpate.tasks.people import curriculum
 
   met = curriculum.done(history.passed(episodes))
   then = curriculum.following(met)
@@ -109,7 +109,7 @@ def _picture(
   shown: Mapping[str, Sequence[Episode]], known: Lookup, metrics: Sequence[str]
 ) -> bytes:
   """Returns the plots of the one task that is shown, PNG."""
-  from palpate.tasks import curves, plots
+  from palpate.tasks.people import curves, plots
 
   if len(shown) != 1:
     tasks = ", ".join(shown) or "nothing"
@@ -134,7 +134,7 @@ def page(
     known: what finds the references of tasks
     metrics: names of those that are drawn
   """
-  from palpate.tasks import curriculum, curves, cusum, page, plots
+  from palpate.tasks.people import curriculum, curves, cusum, page, plots
 
   body = [f"<h1>{page.text(name)}</h1>", f"<p class='outcome'>{page.text(then)}</p>"]
   rows = []

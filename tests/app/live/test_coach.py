@@ -7,8 +7,9 @@ import numpy as np
 import palpate
 import pytest
 from palpate.app.live.coach import Coach, advice, card
-from palpate.tasks import episode, performer, suite
-from palpate.tasks.score import reference
+from palpate.tasks import suite
+from palpate.tasks.core import episode, performer
+from palpate.tasks.people.score import reference
 
 
 def load(name, **kwargs):

@@ -9,7 +9,7 @@ import pytest
 from palpate.app.live.page import worker
 from palpate.app.trainee import keeping
 from palpate.app.trainee.record import Record
-from palpate.tasks import limits
+from palpate.tasks.people import limits
 from palpate.tasks.recording import Recording
 
 ANSWER = 120.0  # that a busy machine may take [s]

@@ -13,7 +13,7 @@ import urllib.request
 import numpy as np
 import pytest
 from palpate.app import cli
-from palpate.tasks import episode
+from palpate.tasks.core import episode
 from palpate.tasks.recording import Recording
 
 pytest.importorskip("websockets")

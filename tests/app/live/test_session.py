@@ -6,7 +6,8 @@ import numpy as np
 import palpate
 import pytest
 from palpate.app import live
-from palpate.tasks import episode, suite
+from palpate.tasks import suite
+from palpate.tasks.core import episode
 from palpate.tasks.recording import Recording
 
 KWARGS = {"input": "handle", "time_limit": 10}

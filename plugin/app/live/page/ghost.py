@@ -20,7 +20,8 @@ _EVERY = 2  # control steps between what is shown
 
 def trace(task: str, seed: int, kwargs: dict[str, Any]) -> dict[str, Any]:
   """Returns how the expert does an episode, JSON: `time` (n,), `pose` (n, 7), `outcome`."""
-  from palpate.tasks import episode, performer, suite
+  from palpate.tasks import suite
+  from palpate.tasks.core import episode, performer
 
   env = suite.load(*suite.split(task), task_kwargs={"random": 0, **kwargs})
   made = episode.run(env, performer.make(env, seed=seed), seed, {"task_kwargs": kwargs})

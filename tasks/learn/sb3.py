@@ -15,8 +15,8 @@ import gymnasium
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
-from .fields import INFO
-from .vector import Exercises
+from ..batch.fields import INFO
+from ..batch.vector import Exercises
 
 
 class Sb3(VecEnv):

@@ -12,8 +12,8 @@ from palpate import Organ
 from palpate.models.handle import Handle, find
 from palpate.tissue.config import Config
 
-from . import display
-from .scenes import ORGAN
+from .. import display
+from ..core.scenes import ORGAN
 
 # What belongs to one process or is made anew from the data.
 _OWN = {"_contexts", "_contexts_lock", "_data", "_named", "organ", "handle"}

@@ -13,10 +13,10 @@ from dm_control.mujoco import wrapper
 from palpate import Organ
 from palpate.tissue.config import Config
 
+from ..learn.portable import Portable
+from ..metrics.samples import Stretch
 from . import scenes
 from .instrument import AXES, JAWS, Instrument, Second
-from .metrics.samples import Stretch
-from .portable import Portable
 from .scenes import CAMERA, ORGAN
 from .stage import STATE
 

@@ -31,7 +31,7 @@ import numpy as np
 from dm_control.rl import control
 from palpate.models import trocar
 
-from . import policy
+from ..learn import policy
 from .instrument import RATES
 
 Act = Callable[[Any], Any]

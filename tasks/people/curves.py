@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..metrics import METRICS, Metrics, number
 from . import cusum
-from .metrics import METRICS, Metrics, number
 from .plots import blank, legend_above, tidy
 from .score import FLOOR, SUCCESS
 

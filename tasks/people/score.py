@@ -49,7 +49,7 @@ from typing import Any
 
 import numpy as np
 
-from .metrics import METRICS, Metrics, Unknown, check_header, check_names
+from ..metrics import METRICS, Metrics, Unknown, check_header, check_names
 
 WEIGHTS = {
   "safety": 0.67,
@@ -162,7 +162,7 @@ def check_reference(reference: Any) -> None:
 
 def reference_path(task: str) -> pathlib.Path:
   """Returns where the expert reference of a task such as "touch/easy" is kept."""
-  return pathlib.Path(__file__).parent / "references" / f"{task.replace('/', '_')}.json"
+  return pathlib.Path(__file__).parents[1] / "references" / f"{task.replace('/', '_')}.json"
 
 
 @functools.cache

@@ -14,12 +14,13 @@ from typing import Any
 import numpy as np
 from dm_control.rl import control
 
-from . import episode, observation, suite
-from .files import replacing
-from .inputs import SIGNALS
-from .instrument import AXES
-from .performer import Act
-from .recording import Recording
+from .. import suite
+from ..core import episode, observation
+from ..core.instrument import AXES
+from ..core.performer import Act
+from ..files import replacing
+from ..inputs import SIGNALS
+from ..recording import Recording
 
 OPEN = ("time limit", "stopped")  # outcomes of an episode that could have gone on
 

@@ -16,16 +16,16 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
-from palpate.tasks import policy
 from palpate.tasks.files import replacing
 from rsl_rl.algorithms import PPO
 from rsl_rl.storage import RolloutStorage
 from safetensors import safe_open
 from safetensors.torch import save as dump
 
+from ..batch.vector import Exercises
+from . import policy
 from .networks import Networks
 from .rsl import RslRl
-from .vector import Exercises
 
 CHECKPOINT, POLICY = "checkpoint.safetensors", "policy.safetensors"
 ROW = (

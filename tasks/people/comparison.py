@@ -10,11 +10,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from ..metrics import METRICS, Metrics, Spec, number
+from ..recording import Recording
 from . import page
-from .metrics import METRICS, Metrics, Spec, number
 from .page import text
 from .plots import compared_figure, path_figure, png
-from .recording import Recording
 from .report import ending, verdict, write_page
 from .score import SUCCESS, WEIGHTS, Score, score
 

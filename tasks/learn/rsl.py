@@ -15,11 +15,11 @@ from typing import Any
 
 import torch
 import warp as wp
-from palpate.tasks.observation import GROUPS, ROWS
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
-from .vector import Exercises
+from ..batch.vector import Exercises
+from ..core.observation import GROUPS, ROWS
 
 
 class RslRl(VecEnv):

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from . import metrics as m
-from .recording import Recording
+from .. import metrics as m
+from ..recording import Recording
 
 if TYPE_CHECKING:
   from matplotlib.figure import Figure

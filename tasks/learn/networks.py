@@ -16,13 +16,14 @@ from typing import Any
 
 import palpate
 import torch
-from palpate.tasks import policy
-from palpate.tasks.lessons import Lesson
-from palpate.tasks.observation import ROWS
 from rsl_rl.models import MLPModel, RNNModel
 from tensordict import TensorDict
 from torch.nn.functional import smooth_l1_loss
 from torch.nn.utils.rnn import pad_sequence
+
+from ..core.observation import ROWS
+from . import policy
+from .lessons import Lesson
 
 HIDDEN = ("joint_vel", "drive", "tip_vel", "surface")  # from an actor that is taught
 ACTING, MORE = "acting", "more"  # groups of observations

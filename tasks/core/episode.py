@@ -15,10 +15,10 @@ import numpy as np
 import palpate
 from dm_control.rl import control
 
-from . import suite
+from .. import suite
+from ..recorder import Recorder
+from ..recording import Recording
 from .performer import Act
-from .recorder import Recorder
-from .recording import Recording
 
 
 class EpisodeError(RuntimeError):

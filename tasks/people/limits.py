@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from .metrics import METRICS, Metrics, check_header
+from ..metrics import METRICS, Metrics, check_header
 from .score import check_reference, make_reference, read_reference, reference
 
 FORMAT, VERSION = "palpate-references", 1

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from dm_control.rl import control
 
-from .performer import Performer, Script
-from .physics import AXES
+from ..core.performer import Performer, Script
+from ..core.physics import AXES
 from .policy import Policy
 
 SHAKEN, CALM = 25, 50  # control steps that noise lasts, and that follow without

@@ -9,12 +9,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from ..files import replacing
+from ..metrics import METRICS, Metrics, Spec, Unknown, number
+from ..recording import Recording
 from . import page
-from .files import replacing
-from .metrics import METRICS, Metrics, Spec, Unknown, number
 from .page import text
 from .plots import force_figure, path_figure, png, spectrum_figure
-from .recording import Recording
 from .score import CONSECUTIVE, FLOOR, PASSING, REPEATS, SUCCESS, WEIGHTS, Score, score
 
 _MOST_EVENTS = 50

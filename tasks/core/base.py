@@ -47,15 +47,15 @@ from dm_env import specs
 from palpate.models import trocar
 from scipy.spatial import cKDTree
 
+from ..recorder import together
+from ..recording import Event, Settings
 from . import observation, randomisation, safety, scenes, stage
-from .core.rules import DAMAGED, OUTCOMES, SUCCESS
 from .environment import CONTROL_TIMESTEP, Environment
 from .handle import ROW
 from .instrument import AXES, JAWS
 from .physics import Physics, check_scene
 from .randomisation import Ranges
-from .recorder import together
-from .recording import Event, Settings
+from .rules import DAMAGED, OUTCOMES, SUCCESS
 from .scenes import ORGAN, Scene
 from .stage import STATE, Stage
 

@@ -19,10 +19,10 @@ from typing import Any
 
 import numpy as np
 
-from .files import replacing
+from ..files import replacing
 
 SUFFIX = ".safetensors"
-FOLDER = pathlib.Path(__file__).parent / "policies"  # of those that come with exercises
+FOLDER = pathlib.Path(__file__).parents[1] / "policies"  # of those that come with exercises
 _KEY = "palpate"  # of the header
 _FORMAT = 2
 _DTYPES = ("F16", "F32", "F64")  # of arrays

@@ -1,0 +1,1 @@
+"""What learning agents take: demonstrations, lessons, policies, and adapters of libraries."""
