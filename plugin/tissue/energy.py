@@ -1,12 +1,13 @@
 """Elastic energy of a surface in float64: the definition that the kernels' forces are gradients of.
 
-Plain numpy on (nvert, 3) arrays, for reports and as the reference of the tests; nothing here runs
-inside a step.
+Numpy on (nvert, 3) arrays, for reports and as the reference of the tests; nothing here runs inside
+a step. The energy of solids is native, since cuts in solids need it too.
 """
 
-from __future__ import annotations
-
+# Annotations here are objects, not text: no `from __future__ import annotations`.
+# pyright: reportInvalidTypeForm=false
 import numpy as np
+import warp as wp
 
 from . import config as configuration
 from . import solid as solids
@@ -14,7 +15,23 @@ from .config import Config
 from .geometry import fill, plate
 from .geometry import mesh as topology
 from .geometry.mesh import Mesh
+from .kernels import kernel
 from .step import OWN_SHARE
+from .types import CONSTANTS, doubles, struct
+
+
+@struct
+class Densities:
+  """See `of_gradients`."""
+
+  slope: doubles("n", 9)
+  mu: doubles("n")
+  lam: doubles("n")
+  density: doubles("n")
+  stress: doubles("n", 9)
+
+
+_find = kernel("find_densities", "tissue/neohookean.h", Densities, CONSTANTS)
 
 
 def membrane(mesh: Mesh, config: Config, u: np.ndarray) -> float:
@@ -118,25 +135,33 @@ def solid(mesh: Mesh, config: Config, u: np.ndarray) -> float:
   parts = [fill.vertex_volumes(mesh, part) for part in slope.reshape(-1, 9).T]
   mean = np.stack(parts, axis=1).reshape(-1, 3, 3) / np.maximum(total, 1e-300)[:, None, None]
   mu, _ = solids.moduli(mesh, config)
-  own = OWN_SHARE * of_gradients(slope, mu, 0.0)
-  nodal = of_gradients(mean, *solids.nodal_moduli(mesh, config).T)
+  own = OWN_SHARE * of_gradients(slope, mu, 0.0)[0]
+  nodal = of_gradients(mean, *solids.nodal_moduli(mesh, config).T)[0]
   return float((volume * own).sum() + (total * nodal).sum())
 
 
-def of_gradients(slope: np.ndarray, mu: np.ndarray, lam: np.ndarray | float) -> np.ndarray:
-  """Returns the density of stable neo-Hookean energy [J/m^3], (n,).
+def of_gradients(slope: np.ndarray, mu: np.ndarray, lam: np.ndarray | float):
+  """Returns the density of stable neo-Hookean energy and its derivative, of `neohookean.h`.
 
   Args:
     slope: gradients of the displacement    (n, 3, 3)
     mu: [Pa]                                (n,)
     lam: [Pa]                               (n,)
+
+  Returns:
+    density [J/m^3]                         (n,)
+    first Piola-Kirchhoff stress [Pa]       (n, 3, 3)
   """
-  i = 2 * np.trace(slope, axis1=1, axis2=2) + (slope * slope).sum(axis=(1, 2))
-  cofactor = np.stack([np.cross(slope[:, k - 2], slope[:, k - 1]) for k in range(3)], axis=1)
-  swelling = np.trace(slope, axis1=1, axis2=2) + np.trace(cofactor, axis1=1, axis2=2)
-  swelling += (slope[:, 0] * cofactor[:, 0]).sum(axis=1)
-  shape = mu / 2 * (i - np.log1p(i / 4)) - 3 / 4 * mu * swelling
-  return shape + (lam + 5 / 8 * mu) / 2 * swelling**2
+  n = len(slope)
+  given = {"slope": np.reshape(slope, (n, 9)), "mu": mu, "lam": np.broadcast_to(lam, n)}
+  made = {"density": np.empty(n), "stress": np.empty((n, 9))}
+  fields = Densities()
+  for name, value in (given | made).items():
+    value = np.ascontiguousarray(value, float)
+    setattr(fields, name, wp.array(value, dtype=wp.float64, device="cpu", copy=False))
+  if n:
+    _find.launch("cpu", n, 1, 0, fields)
+  return fields.density.numpy(), fields.stress.numpy().reshape(n, 3, 3)
 
 
 # The terms of the energy: (mesh, config, displacement) -> [J], 0 where a term is off.

@@ -13,6 +13,27 @@ from reference import closed
 from reference.closed import YOUNG
 
 
+@pytest.mark.parametrize("size", [1e-6, 0.1, 1.0])
+def test_stress_is_the_derivative_of_the_energy(size):
+  random = np.random.RandomState(0)
+  slope, mu, lam = size * random.uniform(-1, 1, (40, 3, 3)), 1e3, 5e3
+  density, stress = energy.of_gradients(slope, np.full(40, mu), lam)
+  step, found = 1e-6, np.empty_like(stress)
+  for i, j in np.ndindex(3, 3):
+    ahead, behind = slope.copy(), slope.copy()
+    ahead[:, i, j] += step
+    behind[:, i, j] -= step
+    high, low = (energy.of_gradients(each, np.full(40, mu), lam)[0] for each in (ahead, behind))
+    found[:, i, j] = (high - low) / (2 * step)
+  np.testing.assert_allclose(stress, found, atol=1e-6 * np.abs(stress).max() + 1e-6)
+  # The definition, with F and its invariants (Smith, de Goes and Kim 2018, eq. 14).
+  F = np.eye(3) + slope
+  i, j = np.einsum("nij,nij->n", F, F) - 3, np.linalg.det(F) - 1
+  shape = mu / 2 * (i - np.log1p(i / 4)) - 3 / 4 * mu * j
+  expected = shape + (lam + 5 / 8 * mu) / 2 * j**2
+  np.testing.assert_allclose(density, expected, atol=1e-12 * mu, rtol=1e-6 if size < 1e-3 else 1e-9)
+
+
 @pytest.mark.parametrize("poisson", [0.0, 0.3, 0.45, 0.49])
 def test_small_uniform_strains_have_the_energy_of_linear_elasticity(scenes, poisson):
   points, elem = scenes.box((0.1, 0.08, 0.06), 0.02)

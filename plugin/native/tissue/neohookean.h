@@ -1,4 +1,5 @@
-// The energy of a solid's tetrahedra and nodes in double, as energy.of_gradients has it.
+// Stable neo-Hookean energy in double (Smith, de Goes and Kim 2018, doi:10.1145/3180491, eq. 14): its only
+// definition; solid.h has the forces and the matrix of it in float.
 #pragma once
 #include "core/tet.h"
 
@@ -71,6 +72,17 @@ PALPATE double energy_of(const D3* x, const D3* u, double mu, double lam) {
   D3 g[4];
   const double volume = slopes_of(x, g);
   return volume * density_of(gradient_of(u, g), mu, lam);
+}
+
+// Density and derivative of many gradients, a world each.
+template <class Fields>
+PALPATE void find_densities(const Fields& f, Thread t, int) {
+  const double* from = f.slope.data + 9 * t.world;
+  const Rows h = {{load(from), load(from + 3), load(from + 6)}};
+  const double mu = f.mu.data[t.world], lam = f.lam.data[t.world];
+  f.density.data[t.world] = density_of(h, mu, lam);
+  const Rows stress = stress_of(h, mu, lam);
+  for (int k = 0; k < 3; ++k) store(f.stress.data + 9 * t.world + 3 * k, stress.row[k]);
 }
 
 }  // namespace palpate
