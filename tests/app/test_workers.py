@@ -59,7 +59,7 @@ def test_options(capsys):
 
 DIES = """
 import os, pathlib, signal
-from palpate.tasks import performer
+from palpate.tasks.core import performer
 
 class Policy(performer.Performer):
   def __init__(self, env, seed):

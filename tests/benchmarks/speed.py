@@ -40,7 +40,8 @@ for name in ("OMP", "OPENBLAS", "MKL"):
   os.environ[name + "_NUM_THREADS"] = "1"
 import numpy as np
 from palpate import tasks
-from palpate.tasks import performer, suite
+from palpate.tasks import suite
+from palpate.tasks.core import performer
 say = os.fdopen(os.dup(1), "w", buffering=1)
 os.dup2(2, 1)  # what libraries print
 env = tasks.load(*suite.split(sys.argv[1]), {"random": 0})

@@ -29,7 +29,8 @@ USE = """
 import gymnasium, numpy as np
 SINGLE
 MANY
-from palpate.tasks import performer, suite
+from palpate.tasks import suite
+from palpate.tasks.core import performer
 assert suite.summary("hover", "easy") == "hold the tip 1 cm above a point, within 4 mm"
 acts = []
 for k in range(2):

@@ -402,7 +402,8 @@ def test_every_metric_can_be_shown():
 
 LATE = """
 import sys
-from palpate.tasks import recorder, report
+from palpate.tasks import recorder
+from palpate.tasks.people import report
 assert "matplotlib" not in sys.modules
 r = recorder.Recorder()
 for k in range(9):
