@@ -5,7 +5,7 @@ from typing import Any
 
 from dm_control.rl import control
 
-from . import base, registry
+from . import environment, registry
 
 TASKS_BY_DOMAIN = registry.TASKS
 # Those with a tag, and all; each is looked up, as a package may have registered more since.
@@ -47,7 +47,7 @@ def load(
   entry = registry.ENTRIES[f"{domain_name}/{task_name}"]
   kwargs = dict(task_kwargs or {})
   limit = kwargs.pop("time_limit", entry.time_limit)
-  return base.make(entry.make(**kwargs | {"name": entry.name}), limit, environment_kwargs)
+  return environment.make(entry.make(**kwargs | {"name": entry.name}), limit, environment_kwargs)
 
 
 def split(name: str) -> tuple[str, str]:
