@@ -6,7 +6,7 @@ from typing import Any
 from dm_control.rl import control
 
 from . import registry
-from .core import base
+from .core import environment
 
 TASKS_BY_DOMAIN = registry.TASKS
 # Those with a tag, and all; each is looked up, as a package may have registered more since.
@@ -46,7 +46,7 @@ def load(
   entry = registry.ENTRIES[f"{domain_name}/{task_name}"]
   kwargs = dict(task_kwargs or {})
   limit = kwargs.pop("time_limit", entry.time_limit)
-  return base.make(entry.make(**kwargs | {"name": entry.name}), limit, environment_kwargs)
+  return environment.make(entry.make(**kwargs | {"name": entry.name}), limit, environment_kwargs)
 
 
 def split(name: str) -> tuple[str, str]:

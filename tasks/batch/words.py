@@ -3,7 +3,7 @@
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # Vectors of Warp's are not known to type checkers:
 # pyright: reportCallIssue=false, reportArgumentType=false, reportIndexIssue=false
-# pyright: reportInvalidTypeForm=false
+# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false
 import dis
 import functools
 import types

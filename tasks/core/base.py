@@ -45,12 +45,11 @@ from dm_control.mujoco import wrapper
 from dm_control.rl import control
 from dm_env import specs
 from palpate.models import trocar
-from scipy.spatial import cKDTree
 
 from ..recorder import together
 from ..recording import Event, Settings
 from . import observation, randomisation, safety, scenes, stage
-from .environment import CONTROL_TIMESTEP, Environment
+from .environment import CONTROL_TIMESTEP
 from .handle import ROW
 from .instrument import AXES, JAWS
 from .physics import Physics, check_scene
@@ -64,8 +63,6 @@ REWARDS = ("dense", "sparse")
 # In the dense reward: share of the progress that is paid before the end, price of a unit of cost,
 # and most that costs take. Success with all costs pays more than any progress without.
 SHARE, PRICE, MOST = 0.4, 0.1, 0.55
-_FACING = 0.75  # least cosine between a target's normal and the way to the trocar
-_PIN_GAP = 0.012  # targets keep this far from pinned nodes [m]
 SLACK = 1e-6  # what rounding may add to an action
 _BACK = 0.008  # by how much the other hand begins farther away: the two would meet [m]
 
@@ -93,6 +90,8 @@ class Task(control.Task):
   watch = ("miss", "unintended_contact")
   final: tuple[str, ...] = ()  # components that end the episode above 0.5
   control_timestep = CONTROL_TIMESTEP
+  outcome: str | None = None
+  events: list[Event]
   targets = 1
 
   def __init__(
@@ -152,9 +151,6 @@ class Task(control.Task):
     self.observed = observation.choose(observations, pixels)
     self.ranges, self.drawn = randomisation.check(randomise or {}), dict[str, Any]()
     self._models: dict[int | None, Stage] = {}
-    self.outcome: str | None = None
-    self.progress, self.best, self.cost, self.harm = 0.0, 0.0, safety.Cost(), 0.0
-    self.events: list[Event] = []
     if model is not None:
       own: Any = model if isinstance(model, mj.MjSpec) else mj.MjSpec.from_file(os.fspath(model))
       self._models[self.variants[0]] = self._stage(own.copy())
@@ -211,31 +207,8 @@ class Task(control.Task):
     return dataclasses.replace(self.scene, variant=variant, targets=self.targets)
 
   def place_of_work(self, physics: Physics) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the triangles that targets are drawn from, and the middle of that place [m].
-
-    They face the trocar within 40 deg, lie within `spread` of where the shaft points and away
-    from pinned nodes.
-    """
-    organ, port = physics.organ, physics.trocar()
-    x = physics.nodes()
-    middle = x[organ.elem].mean(axis=1)
-    shaft = -port.mat[:, 2]
-    offset = middle - port.pos
-    depth = offset @ shaft
-    aside = np.linalg.norm(offset - depth[:, None] * shaft, axis=1)
-    facing = -(physics.normals() @ shaft)
-    free = organ.free[organ.elem].all(axis=1)
-    if not organ.free.all():
-      pins = cKDTree(x[~organ.free])
-      free &= pins.query(middle)[0] > _PIN_GAP
-    reach = np.linalg.norm(offset, axis=1)
-    low, high = port.ranges[2] + port.depth + np.array([0.01, -0.015])
-    fit = np.flatnonzero(free & (reach > low) & (reach < high) & (facing > _FACING))
-    if not len(fit):
-      raise ValueError(f"the shaft of {self.prefix!r} does not point at the organ, expected it to")
-    center = middle[fit[np.argmin(aside[fit] + 0.3 * depth[fit])]]
-    place = fit[np.linalg.norm(middle[fit] - center, axis=1) < self.spread]
-    return place, center
+    """Returns the triangles that targets are drawn from, and the middle of that place [m]."""
+    return physics.reachable(self.spread)
 
   # What a domain says.
 
@@ -461,17 +434,3 @@ class Task(control.Task):
       for hand in physics.hands
     ]
     return {"time": physics.data.ptr.time} | together(hands[0] | own, *hands[1:])
-
-
-def make(task: Task, time_limit: float, environment_kwargs: Mapping | None) -> Environment:
-  """Returns the environment of a task, in a state in which it can be observed."""
-  physics, before = task.physics(), task.random.get_state()
-  with physics.reset_context():
-    task.initialize_episode(physics)
-  task.random.set_state(before)
-  observation.check(task, physics)
-  for name in task.rules.fields if task.rules else ():
-    if not hasattr(task, name):
-      kind = type(task).__name__
-      raise TypeError(f"{task.name}: {kind} has no {name!r}, which is a field of its state")
-  return Environment(physics, task, time_limit, **(environment_kwargs or {}))

@@ -2,11 +2,14 @@
 
 import collections
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from dm_control.rl import control
 from dm_env import specs
+
+from . import observation
 
 CONTROL_TIMESTEP = 0.02  # [s]
 
@@ -57,3 +60,17 @@ class Environment(control.Environment):
     dtype = np.result_type(*(spec.dtype for spec in found.values()))
     name = control.FLAT_OBSERVATION_KEY
     return collections.OrderedDict([(name, specs.Array((count,), dtype, name=name))])
+
+
+def make(task: Any, time_limit: float, environment_kwargs: Mapping | None) -> Environment:
+  """Returns the environment of a task, in a state in which it can be observed."""
+  physics, before = task.physics(), task.random.get_state()
+  with physics.reset_context():
+    task.initialize_episode(physics)
+  task.random.set_state(before)
+  observation.check(task, physics)
+  for name in task.rules.fields if task.rules else ():
+    if not hasattr(task, name):
+      kind = type(task).__name__
+      raise TypeError(f"{task.name}: {kind} has no {name!r}, which is a field of its state")
+  return Environment(physics, task, time_limit, **(environment_kwargs or {}))

@@ -12,6 +12,7 @@ import numpy as np
 from dm_control.mujoco import wrapper
 from palpate import Organ
 from palpate.tissue.config import Config
+from scipy.spatial import cKDTree
 
 from ..learn.portable import Portable
 from ..metrics.samples import Stretch
@@ -21,6 +22,8 @@ from .scenes import CAMERA, ORGAN
 from .stage import STATE
 
 NEAR, COARSE = 8, 32  # nodes in the observations
+_FACING = 0.75  # least cosine between a target's normal and the way to the trocar
+_PIN_GAP = 0.012  # targets keep this far from pinned nodes [m]
 
 
 class Physics(Instrument, Portable):
@@ -197,6 +200,33 @@ class Physics(Instrument, Portable):
     x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
     length = math.sqrt(x * x + y * y + z * z)
     return np.array([x / length, y / length, z / length])
+
+  def reachable(self, spread: float) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the triangles that the instrument is to work on, and the middle of that place [m].
+
+    They face the trocar within 40 deg, lie within `spread` [m] of where the shaft points and away
+    from pinned nodes.
+    """
+    organ, port = self.organ, self.trocar()
+    x = self.nodes()
+    middle = x[organ.elem].mean(axis=1)
+    shaft = -port.mat[:, 2]
+    offset = middle - port.pos
+    depth = offset @ shaft
+    aside = np.linalg.norm(offset - depth[:, None] * shaft, axis=1)
+    facing = -(self.normals() @ shaft)
+    free = organ.free[organ.elem].all(axis=1)
+    if not organ.free.all():
+      pins = cKDTree(x[~organ.free])
+      free &= pins.query(middle)[0] > _PIN_GAP
+    reach = np.linalg.norm(offset, axis=1)
+    low, high = port.ranges[2] + port.depth + np.array([0.01, -0.015])
+    fit = np.flatnonzero(free & (reach > low) & (reach < high) & (facing > _FACING))
+    if not len(fit):
+      raise ValueError(f"the shaft of {self.prefix!r} does not point at the organ, expected it to")
+    center = middle[fit[np.argmin(aside[fit] + 0.3 * depth[fit])]]
+    place = fit[np.linalg.norm(middle[fit] - center, axis=1) < spread]
+    return place, center
 
   def contact_area(self) -> float:
     """Returns the area of the organ's triangles in contact with the instrument [m^2]."""
