@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from .refine import refine
+from .meshing.refine import refine
 
 _COARSE = 6  # edges along the shortest side, away from the tool
 

@@ -8,8 +8,9 @@ import argparse
 import pathlib
 from collections.abc import Sequence
 
-from . import markup, mjcf, organs, remesh, scene
+from . import markup, mjcf, organs, scene
 from .catalog import NAMES
+from .meshing import remesh
 
 INSTRUMENTS = ("probe", "grasper")  # of the committed scenes
 

@@ -5,9 +5,10 @@ import functools
 
 import numpy as np
 
-from . import catalog, quality, shapes
+from . import catalog, shapes
 from .catalog import DEFAULT, Entry
-from .refine import refine
+from .meshing import quality
+from .meshing.refine import refine
 
 _REACH = 0.006  # around a place that an instrument points at, of its finer triangles [m]
 

@@ -17,7 +17,8 @@ from palpate.tissue.geometry.mesh import vertex_normals
 from scipy.interpolate import CubicSpline
 from scipy.spatial import KDTree
 
-from . import catalog, grid, markup, texture
+from . import catalog, markup, texture
+from .meshing import grid
 
 # Axis of a texture's middle in the organ's frame: that of the exercises' laparoscopes.
 VIEW = (-0.1, 0.62, -0.78)

@@ -17,10 +17,10 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial import KDTree
 
-from .field import Field, Implicit, project, tabulate
-from .grid import shrink
-from .quality import normals
-from .remesh import guard, remesh
+from .meshing.field import Field, Implicit, project, tabulate
+from .meshing.grid import shrink
+from .meshing.quality import normals
+from .meshing.remesh import guard, remesh
 
 Mesh = tuple[np.ndarray, np.ndarray]
 Seed = int | np.random.RandomState | None

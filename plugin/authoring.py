@@ -48,7 +48,7 @@ def add_organ(
   """Adds an organ to a spec, in a body of its name; what a <flexcomp> with the plugin does in MJCF.
 
   The mesh is taken as it is: a manifold surface wound one way, its triangles not too thin, as
-  `palpate wrap`, or `palpate.models.wrap`, makes them.
+  `palpate wrap`, or `palpate.models.meshing.wrap`, makes them.
 
   Args:
     spec: changed in place, unless an error is raised

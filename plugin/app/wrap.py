@@ -47,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser):
 
 def main(args: argparse.Namespace) -> int:
   """Runs the job and returns its exit code."""
-  from palpate.models import folder, wrap
+  from palpate.models.meshing import folder, wrap
 
   figures.need("video", "imageio")
   source = pathlib.Path(args.mesh)
@@ -77,7 +77,7 @@ def main(args: argparse.Namespace) -> int:
 
 def _name(source: pathlib.Path, out: str) -> str:
   """Returns a name for the organ: the file's, or the folder's if that is the scene's."""
-  from palpate.models import folder
+  from palpate.models.meshing import folder
 
   for text in (source.name.split(".")[0], pathlib.Path(out).absolute().name, "organ"):
     name = _allowed(text)
@@ -103,7 +103,7 @@ def _check(args: argparse.Namespace, source: pathlib.Path):
 
 def _wrap(args: argparse.Namespace, source: pathlib.Path, name: str, nodes: int | None) -> dict:
   """Returns what was wrapped, by name."""
-  from palpate.models import volume, wrap
+  from palpate.models.meshing import volume, wrap
 
   if not source.name.lower().endswith(_VOLUMES):
     options = {"method": args.method, "scale": args.scale or 1.0}

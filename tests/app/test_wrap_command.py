@@ -202,7 +202,7 @@ def test_a_file_is_no_folder(tmp_path, wrap, out):
 
 
 def test_names_and_folders_are_refused_before_the_work(tmp_path, wrap, monkeypatch):
-  from palpate.models import wrap as wrapping
+  from palpate.models.meshing import wrap as wrapping
 
   def work(*_, **__):
     raise AssertionError("it was begun")

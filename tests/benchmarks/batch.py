@@ -25,7 +25,7 @@ import scenes
 import warp as wp
 from benchmarks import plots, results
 from benchmarks.runner import Bench, Case, Row
-from palpate.models import grid
+from palpate.models.meshing import grid
 
 RADIUS, BALL, H, DEEP = 0.05, 0.006, 1e-3, 0.006
 STEPS = 150  # of the press, and of what is timed together

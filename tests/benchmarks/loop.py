@@ -31,7 +31,8 @@ from benchmarks.runner import Bench, Case, Row
 from palpate.engine import workspace
 from palpate.engine.layout import HEAD, MODE
 from palpate.engine.windows import windowed
-from palpate.models import grid, shapes
+from palpate.models import shapes
+from palpate.models.meshing import grid
 from palpate.tissue import step as stepping
 from palpate.tissue.types import Stage
 

@@ -42,7 +42,8 @@ def shape(name: str, nodes: int) -> Mesh:
     if name == "sliver":
       points = _squeeze(points, elem)
   else:
-    from palpate.models import grid, shapes
+    from palpate.models import shapes
+    from palpate.models.meshing import grid
 
     if name == "octa":
       points, elem = grid.octasphere(max(1, round(np.sqrt((nodes - 2) / 4))))

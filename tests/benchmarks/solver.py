@@ -18,7 +18,7 @@ import warp as wp
 from benchmarks import plots, results
 from benchmarks.results import BenchError
 from benchmarks.runner import Bench, Case, Row
-from palpate.models import grid
+from palpate.models.meshing import grid
 from palpate.tissue import body as bodies
 from palpate.tissue import coarse, config
 from palpate.tissue import shape as making

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import palpate
 import pytest
-from palpate.models import grid
+from palpate.models.meshing import grid
 
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 BONDS = "1e6 200 0.2 near 0.004"

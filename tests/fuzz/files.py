@@ -11,7 +11,7 @@ import tempfile
 import numpy as np
 import scenes
 import trimesh
-from palpate.models import volume, wrap
+from palpate.models.meshing import volume, wrap
 from palpate.tasks.recorder import Recorder
 from palpate.tasks.recording import Recording
 

@@ -3,9 +3,9 @@ import functools
 import numpy as np
 import pytest
 from palpate.models import shapes
-from palpate.models.field import project
-from palpate.models.grid import octasphere, spherical
-from palpate.models.quality import normals, quality, volume
+from palpate.models.meshing.field import project
+from palpate.models.meshing.grid import octasphere, spherical
+from palpate.models.meshing.quality import normals, quality, volume
 
 ORGANS = ("liver", "stomach", "gallbladder", "kidney", "lobed")
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
-from palpate.models import grid
+from palpate.models.meshing import grid
 from palpate.tissue import body as bodies
 from palpate.tissue import coarse
 from palpate.tissue import shape as making

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from palpate.models import grid
+from palpate.models.meshing import grid
 from palpate.tissue import device as devices
 from palpate.tissue import step
 

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 from palpate import add_organ
 from palpate.models import block, catalog, organs, shapes
-from palpate.models.refine import refine
+from palpate.models.meshing.refine import refine
 from palpate.organ import Organ
 from palpate.tissue.geometry import fill
 from palpate.tissue.geometry import mesh as topology

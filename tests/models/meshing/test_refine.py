@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
-from palpate.models import refine, shapes
-from palpate.models.quality import angles
+from palpate.models import shapes
+from palpate.models.meshing import refine
+from palpate.models.meshing.quality import angles
 from palpate.tissue.geometry import fill
 from palpate.tissue.geometry import mesh as topology
 

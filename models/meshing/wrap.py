@@ -16,11 +16,11 @@ import time
 import numpy as np
 
 from . import losses
-from .cling import LEAST_ANGLE, LEAST_NODES, MOST_NODES, Fit, fit, foldovers
 from .losses import Comparison, Loss
 from .parts import Part, split
 from .quality import Quality, angles, normals, quality, volume
 from .repair import Mesh, Target, load
+from .shrink_wrap import LEAST_ANGLE, LEAST_NODES, MOST_NODES, Fit, fit, foldovers
 
 METHODS = ("even", "grid", "direct")
 

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import palpate
 import pytest
-from palpate.models import grid
+from palpate.models.meshing import grid
 from palpate.tissue.geometry import subdivide
 
 RADIUS = 0.03

@@ -2,9 +2,9 @@ import gzip
 
 import numpy as np
 import pytest
-from palpate.models import volume as volumes
-from palpate.models.quality import normals, quality
-from palpate.models.quality import volume as enclosed
+from palpate.models.meshing import volume as volumes
+from palpate.models.meshing.quality import normals, quality
+from palpate.models.meshing.quality import volume as enclosed
 
 nibabel = pytest.importorskip("nibabel")
 nrrd = pytest.importorskip("nrrd")

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import trimesh
 from palpate.models import shapes
-from palpate.models.field import tabulate
-from palpate.models.quality import quality
-from palpate.models.wrap import wrap, wrap_pieces
+from palpate.models.meshing.field import tabulate
+from palpate.models.meshing.quality import quality
+from palpate.models.meshing.wrap import wrap, wrap_pieces
 
 NODES = 250
 

@@ -9,7 +9,7 @@ import pytest
 from palpate import tasks
 from palpate.tasks.core import episode, observation, randomisation
 
-PAGE = pathlib.Path(__file__).parents[2] / "docs" / "environments.md"
+PAGE = pathlib.Path(__file__).parents[3] / "docs" / "environments.md"
 RANGES = {
   "colour": (-0.2, 0.2),
   "stiffness": [0.5, 2],

@@ -11,9 +11,9 @@ import numpy as np
 from palpate.tissue.geometry import fill
 from palpate.tissue.geometry import mesh as topology
 
-from . import markup, mjcf
-from .catalog import ENTRIES
-from .markup import numbers
+from .. import markup, mjcf
+from ..catalog import ENTRIES
+from ..markup import numbers
 from .wrap import Report
 
 Wrapped = tuple[np.ndarray, np.ndarray, Report]

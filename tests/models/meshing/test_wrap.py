@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 import trimesh
 from palpate.models import shapes
-from palpate.models.cling import foldovers
-from palpate.models.quality import quality
-from palpate.models.repair import Target
-from palpate.models.wrap import Report, wrap
+from palpate.models.meshing.quality import quality
+from palpate.models.meshing.repair import Target
+from palpate.models.meshing.shrink_wrap import foldovers
+from palpate.models.meshing.wrap import Report, wrap
 
 NODES = 250
 # Volume that chords of length s cut off a ball: 3/8 (s / r)^2, 2.8 % at 250 nodes.

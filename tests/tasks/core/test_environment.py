@@ -10,7 +10,7 @@ from palpate import tasks
 from palpate.tasks import registry, suite
 from palpate.tasks.core import observation, performer
 
-PAGE = pathlib.Path(__file__).parents[2] / "docs" / "environments.md"
+PAGE = pathlib.Path(__file__).parents[3] / "docs" / "environments.md"
 PICTURES = ("pixels", "depth", "segmentation", "points")
 
 
