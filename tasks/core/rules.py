@@ -8,6 +8,7 @@ loops from `int(0)`.
 """
 
 import dataclasses
+import functools
 import inspect
 import math
 from collections.abc import Callable, Mapping
@@ -73,7 +74,7 @@ class Rules:
           f"{where}: {name!r} is told and {known[name]!r}, expected float, Vector or Vectors3"
         )
 
-  @property
+  @functools.cached_property
   def fields(self) -> dict[str, Any]:
     """Kinds of the fields by name."""
     found = get_type_hints(self.state, include_extras=True)
