@@ -117,7 +117,7 @@ class Exercises(VectorEnv):
         of_part = single
         if len(kinds) > 1:
           of_part = Exercise(task, **{**kwargs, "variants": (variant,)})
-        options = {} if where == "cpu" else {"nodes": self.task.touched if nodes is None else nodes}
+        options = {} if where == "cpu" else {"nodes": self.task.slots if nodes is None else nodes}
         count = end - start
         self.parts.append(Worlds(of_part.environment, count, where, limit, **options))
         self.slices.append(slice(start, end))

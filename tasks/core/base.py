@@ -86,7 +86,7 @@ class Task(control.Task):
 
   name = "task"
   rules: Any = None  # see `Rules`
-  touched = 12  # nodes that the instrument touches at once, and some more: slots of a GPU's window
+  slots = 12  # nodes that the instrument touches at once, and some more: slots of a GPU's window
   watch = ("miss", "unintended_contact")
   final: tuple[str, ...] = ()  # components that end the episode above 0.5
   control_timestep = CONTROL_TIMESTEP

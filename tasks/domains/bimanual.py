@@ -198,7 +198,7 @@ class Bimanual(Dissect):
     METRICS,
     act,
   )
-  touched = 36
+  slots = 36
 
   @property
   def other(self) -> tuple[str, ...]:

@@ -138,7 +138,7 @@ class Hold(Task):
   """
 
   watch = ("miss", "unintended_contact", "drop")
-  touched = 24
+  slots = 24
   site: int
   slip = 0.005
 

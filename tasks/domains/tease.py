@@ -129,7 +129,7 @@ class Tease(Freeing):
 
   watch = ("unintended_contact",)
   rules = Rules(State, advance, observe, ("target", "freed", "traction"), METRICS)
-  touched = 24
+  slots = 24
 
   def __init__(
     self,

@@ -122,6 +122,21 @@ def test_each_world_is_the_single_environment_of_its_seed(task, count, steps, op
   env.close()
 
 
+@pytest.mark.parametrize("task", ["touch/easy", "probe/palpate_easy", "grasp/easy"])
+def test_worlds_of_the_gpu_backend_are_the_single_environment(task):
+  env, experts = make(task, 2, device="warp-cpu"), Experts(task, 2, 3)
+  env.reset(seed=3)
+  for _ in range(20):
+    action = experts.action()
+    seen, reward, *_ = env.step(action)
+    for k, (_, paid, *_) in enumerate(experts.step(action)):
+      assert reward[k] == pytest.approx(paid, abs=2e-3)
+      for name in ("tip_pos", "target", "contact_force", "progress"):
+        atol = LIMITS.get(name, 2e-3)
+        np.testing.assert_allclose(seen[name][k], experts.seen[k][name], atol=atol)
+  env.close()
+
+
 def test_a_report_of_palpation_ends_the_episode():
   env, alone = make("probe/palpate_easy"), single("probe/palpate_easy")
   env.reset(seed=0)
