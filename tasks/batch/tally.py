@@ -6,6 +6,8 @@ is not in `NAMES` a recording of the single environment has.
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
+import enum
+
 import warp as wp
 from palpate.tasks.metrics import METRICS
 from palpate.tasks.metrics import force as pressing
@@ -21,8 +23,7 @@ NAMES = (
   "excess_impulse", "shaft_contact", "peak_shaft_force",
   "peak_grip", "mean_grip", "grip_breaches", "grip_ratio", "grasp_slips",
 )  # fmt: skip
-_OF_JAWS = NAMES.index("peak_grip")
-_INEFFICIENCY = wp.constant(NAMES.index("path_inefficiency"))
+M = enum.IntEnum("M", NAMES, start=0)  # columns of `Tally.values`
 _SETTLE = wp.constant(pressing.SETTLE)
 _LONG = wp.constant(1 << 30)  # steps ago: never
 _TIP, _GRIP = wp.constant(0), wp.constant(1)
@@ -213,32 +214,34 @@ def _tell(s: Common, t: Tally, w: int):
   time = wp.float64(s.dt) * wp.float64(s.step[w])
   path, size = t.path[w], t.high[w] - t.low[w]
   moved = path > wp.float64(0.0)
-  t.values[w, 0] = float(time)
-  t.values[w, 1] = wp.where(moved, float(path), wp.nan)
-  t.values[w, 2] = wp.where(moved, float(path / time), wp.nan)
-  t.values[w, 3] = wp.where(moved, float(t.fastest[w]) / s.dt, wp.nan)
-  t.values[w, 4] = _share(wp.float64(wp.pow(size[0] * size[1] * size[2], 1.0 / 3.0)), path)
-  t.values[w, 5] = 100.0 * (_share(path, wp.float64(s.reference[w])) - 1.0)
-  t.values[w, 6] = wp.where(moved, float(t.depth[w]), wp.nan)
-  t.values[w, 7] = wp.where(moved, float(t.turned[w]), wp.nan)
-  t.values[w, 8] = wp.where(moved, float(t.rolled[w]), wp.nan)
-  t.values[w, 9] = float(s.errors[w])
-  t.values[w, 10] = _share(wp.float64(s.missed_by[w]), wp.float64(s.targets[w]))
-  _tell_force(t, w, _TIP, 11, 12, 15)
+  t.values[w, M.time] = float(time)
+  t.values[w, M.path_length] = wp.where(moved, float(path), wp.nan)
+  t.values[w, M.mean_speed] = wp.where(moved, float(path / time), wp.nan)
+  t.values[w, M.peak_speed] = wp.where(moved, float(t.fastest[w]) / s.dt, wp.nan)
+  side = wp.pow(size[0] * size[1] * size[2], 1.0 / 3.0)
+  t.values[w, M.economy_of_volume] = _share(wp.float64(side), path)
+  t.values[w, M.path_inefficiency] = 100.0 * (_share(path, wp.float64(s.reference[w])) - 1.0)
+  t.values[w, M.depth_path] = wp.where(moved, float(t.depth[w]), wp.nan)
+  t.values[w, M.angular_path] = wp.where(moved, float(t.turned[w]), wp.nan)
+  t.values[w, M.response_orientation] = wp.where(moved, float(t.rolled[w]), wp.nan)
+  t.values[w, M.errors] = float(s.errors[w])
+  t.values[w, M.target_error] = _share(wp.float64(s.missed_by[w]), wp.float64(s.targets[w]))
+  _tell_force(t, w, _TIP, M.peak_force, M.mean_force, M.force_breaches)
   half = _end(t, w, _TIP)
   last = t.last[w, _TIP]
   square = _share(t.square[w, _TIP] - half * last * last, t.touched[w, _TIP] - half)
-  t.values[w, 13] = wp.sqrt(square)
+  t.values[w, M.rms_force] = wp.sqrt(square)
   was = t.touched[w, _TIP] > wp.float64(0.0)
-  t.values[w, 14] = wp.where(was, float(t.product[w, _TIP] - half * last), wp.nan)
-  t.values[w, 16] = wp.where(was, float(t.excess[w]), wp.nan)
+  t.values[w, M.force_time_product] = wp.where(was, float(t.product[w, _TIP] - half * last), wp.nan)
+  t.values[w, M.excess_impulse] = wp.where(was, float(t.excess[w]), wp.nan)
   lies = wp.where(t.shaft_last[w] > wp.float64(t.contact), wp.float64(0.5) * t.h, wp.float64(0.0))
-  t.values[w, 17] = float(t.shaft_time[w] - lies)
-  t.values[w, 18] = float(t.shaft_peak[w])
-  _tell_force(t, w, _GRIP, 19, 20, 21)
+  t.values[w, M.shaft_contact] = float(t.shaft_time[w] - lies)
+  t.values[w, M.peak_shaft_force] = float(t.shaft_peak[w])
+  _tell_force(t, w, _GRIP, M.peak_grip, M.mean_grip, M.grip_breaches)
   end = wp.min(_end(t, w, _TIP), _end(t, w, _GRIP))
-  t.values[w, 22] = _share(t.gripped[w] - end * t.last[w, _GRIP], t.pulled[w] - end * last)
-  t.values[w, 23] = wp.where(s.grasps[w] > 0, float(s.slips[w]), wp.nan)
+  gripped = t.gripped[w] - end * t.last[w, _GRIP]
+  t.values[w, M.grip_ratio] = _share(gripped, t.pulled[w] - end * last)
+  t.values[w, M.grasp_slips] = wp.where(s.grasps[w] > 0, float(s.slips[w]), wp.nan)
 
 
 _SUM, _MAX, _MEAN = (wp.constant(k) for k in range(3))
@@ -251,7 +254,7 @@ def join(s: Common, t: Tally, other: Tally, how: wp.array[int]):
   w, k = wp.tid()
   a, b = t.values[w, k], other.values[w, k]
   if how[k] > _MEAN:  # they are of the whole
-    if k == _INEFFICIENCY:
+    if k == M.path_inefficiency:
       path = t.path[w] + other.path[w]
       t.values[w, k] = 100.0 * (_share(path, wp.float64(s.reference[w])) - 1.0)
   elif wp.isnan(a) or wp.isnan(b):
@@ -269,4 +272,4 @@ def hows(device) -> wp.array:
 
 def names(jaws: bool) -> tuple[str, ...]:
   """Returns the metrics of an instrument, with jaws or without."""
-  return NAMES if jaws else NAMES[:_OF_JAWS]
+  return NAMES if jaws else NAMES[: M.peak_grip]
