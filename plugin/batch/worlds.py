@@ -14,7 +14,6 @@ import mujoco
 import mujoco_warp as mjw
 import numpy as np
 import warp as wp
-from mujoco_warp._src.types import DeterminismType, OverflowType
 from palpate.engine import plugin as engine
 from palpate.organ import instances
 from palpate.tissue import device as devices
@@ -25,6 +24,7 @@ from .contact import contacts, convex
 from .cutting import blades, tears
 from .forces import base, passive
 from .organs import Organ
+from .private import DeterminismType, OverflowType
 from .reset import Rest
 
 _CONTACTS = 16  # of a world, of tools with each other and with what is fixed

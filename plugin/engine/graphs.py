@@ -15,7 +15,7 @@ from collections.abc import Callable
 from typing import Any
 
 import warp as wp
-from warp._src import context
+from palpate.tissue.device import warp_context
 
 # Held where models are compiled, data made, kernels loaded, graphs recorded; never in a step.
 lock = threading.RLock()
@@ -42,7 +42,7 @@ def _of_this_thread(name: str) -> property:
 
 def _record_by_thread():
   """Gives each thread its own recording; once a process, and not while one is under way."""
-  runtime = context.runtime
+  runtime = warp_context.runtime
   if any(getattr(runtime, name) is not None for name in _KEPT):
     return
   for name in _KEPT:

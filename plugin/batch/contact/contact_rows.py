@@ -10,11 +10,12 @@ what the gap adds follows from those rows.
 # pyright: reportInvalidTypeForm=false
 import mujoco
 import warp as wp
-from mujoco_warp._src.types import vec5
 from palpate.engine import contacts
 from palpate.engine.contacts import TISSUE
 from palpate.engine.model import mjstruct
 from palpate.tissue.types import Array, floats, ints, struct
+
+from ..private import vec5
 
 
 @struct

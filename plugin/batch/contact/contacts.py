@@ -14,14 +14,14 @@ import numpy as np
 import warp as wp
 
 # All that depends on names inside of mujoco_warp: its tools against a triangle, and types.
-from mujoco_warp._src import collision_primitive_core as core
-from mujoco_warp._src.types import ContactType, vec5
 from palpate.engine import contacts
 from palpate.engine.model import mjstruct
 from palpate.tissue.types import Array, fill, floats, ints, struct
 
+from .. import private
 from ..kernels import triple
 from ..patch import Patch
+from ..private import ContactType, vec5
 from . import convex, cylinder
 from .convex import Convex
 
@@ -181,7 +181,7 @@ def _ellipsoid(pos: wp.vec3, rot: wp.mat33, size: wp.vec3, a: wp.vec3, b: wp.vec
   la = wp.cw_div(t * (a - pos), size)
   lb = wp.cw_div(t * (b - pos), size)
   ld = wp.cw_div(t * (d - pos), size)
-  dist, nearest, _normal = core.sphere_triangle(wp.vec3(0.0), 0.0, la, lb, ld, 0.0, _FAR)
+  dist, nearest, _normal = private.sphere_triangle(wp.vec3(0.0), 0.0, la, lb, ld, 0.0, _FAR)
   k = wp.normalize(nearest) * wp.max(dist, 1e-6)
   r = wp.length(k)
   gradient = wp.cw_div(k, size)
@@ -207,7 +207,7 @@ def _against(kinds: frozenset[int]):
     margin = c.margin[at.tool]
     if wp.static(sphere):
       if kind == _SPHERE:
-        dist, x, normal = core.sphere_triangle(pos, size[0], a, b, d, c.radius, margin)
+        dist, x, normal = private.sphere_triangle(pos, size[0], a, b, d, c.radius, margin)
         n = _put(c, at, n, dist, x, normal)
     if wp.static(ellipsoid):
       if kind == _ELLIPSOID:
@@ -216,14 +216,14 @@ def _against(kinds: frozenset[int]):
         n = _put(c, at, n, gap, y - (c.radius + 0.5 * gap) * out, out)
     if wp.static(capsule):
       if kind == _CAPSULE:
-        dists, xs, normals = core.capsule_triangle(
+        dists, xs, normals = private.capsule_triangle(
           pos, axis, size[0], size[1], a, b, d, c.radius, margin
         )
         for k in range(5):
           n = _put(c, at, n, dists[k], xs[k], normals[k])
     if wp.static(box):
       if kind == _BOX:
-        dists2, xs2, normals2 = core.box_triangle(pos, rot, size, a, b, d, c.radius, margin)
+        dists2, xs2, normals2 = private.box_triangle(pos, rot, size, a, b, d, c.radius, margin)
         for k in range(11):
           n = _put(c, at, n, dists2[k], xs2[k], normals2[k])
     if wp.static(_CYLINDER in kinds):

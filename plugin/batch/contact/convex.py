@@ -7,10 +7,9 @@ import numpy as np
 import warp as wp
 
 # All that depends on names inside of mujoco_warp, with those of `contacts`.
-from mujoco_warp._src.collision_core import Geom
-from mujoco_warp._src.collision_gjk import ccd
-from mujoco_warp._src.types import MJ_MAX_EPAFACES, MJ_MAX_EPAHORIZON, GeomType
 from palpate.tissue.types import Array, fill, floats, ints, struct
+
+from ..private import MJ_MAX_EPAFACES, MJ_MAX_EPAHORIZON, Geom, GeomType, ccd
 
 KINDS = {int(mujoco.mjtGeom.mjGEOM_MESH)}
 _ROUNDS = wp.constant(16)  # of GJK and of EPA, at most

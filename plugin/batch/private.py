@@ -1,0 +1,23 @@
+"""What batches need of mujoco_warp's private modules, since its public ones lack it."""
+
+from mujoco_warp._src.collision_core import Geom
+from mujoco_warp._src.collision_gjk import ccd
+from mujoco_warp._src.collision_primitive_core import (
+  box_triangle,
+  capsule_triangle,
+  sphere_triangle,
+)
+from mujoco_warp._src.types import (
+  MJ_MAX_EPAFACES,
+  MJ_MAX_EPAHORIZON,
+  ContactType,
+  DeterminismType,
+  GeomType,
+  OverflowType,
+  vec5,
+)
+
+__all__ = [
+  "MJ_MAX_EPAFACES", "MJ_MAX_EPAHORIZON", "ContactType", "DeterminismType", "Geom", "GeomType",
+  "OverflowType", "box_triangle", "capsule_triangle", "ccd", "sphere_triangle", "vec5",
+]  # fmt: skip
