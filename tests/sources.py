@@ -128,5 +128,6 @@ def private_uses(paths: list[pathlib.Path]) -> set[str]:
         node.func, "attr", "")) in ("setattr", "getattr", "delattr", "hasattr"):  # fmt: skip
         words = [a.value for a in node.args if isinstance(a, ast.Constant)]
         used = [str(word).rpartition(".")[2] for word in words]
+      used = [name for name in used if name.rstrip("_") != "_fields"]  # of named tuples, ctypes
       found |= {f"{name_of(path)}: {name}" for name in used if name in foreign}
   return found

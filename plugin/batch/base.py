@@ -182,7 +182,7 @@ class Batch(abc.ABC):
       mask: worlds to reset, (nworld,) of bool; None for all
     """
     self._fresh = False
-    self._reset(self._mask(mask))
+    self._reset(self.checked(mask))
 
   @abc.abstractmethod
   def _reset(self, mask: wp.array):
@@ -211,7 +211,7 @@ class Batch(abc.ABC):
     values = self._rows(values, "values", len(found))
     self._fresh = False
     adr = [(int(joint.qposadr[0]), int(joint.dofadr[0])) for joint in found]
-    self._pose(np.array(adr, int).reshape(-1, 2), values, self._mask(mask))
+    self._pose(np.array(adr, int).reshape(-1, 2), values, self.checked(mask))
 
   def _pose(self, adr: np.ndarray, values: Any, mask: wp.array):
     raise ValueError("a batch on a GPU cannot pose joints yet")
@@ -230,7 +230,7 @@ class Batch(abc.ABC):
       raise ValueError(f"body {body!r} has joints, expected one that is fixed to its parent")
     pos, quat = self._rows(pos, "pos", 3), self._rows(quat, "quat", 4)
     self._fresh = False
-    self._place(number, pos, quat, self._mask(mask))
+    self._place(number, pos, quat, self.checked(mask))
 
   def _place(self, body: int, pos: Any, quat: Any, mask: wp.array):
     raise ValueError("a batch on a GPU cannot place bodies a world yet")
@@ -250,7 +250,7 @@ class Batch(abc.ABC):
       gravity: gravity [m/s^2], (3,) or (nworld, 3)
       friction: sliding friction of geoms by name, a number or (nworld,)
     """
-    worlds = np.flatnonzero(self._mask(mask).numpy())
+    worlds = np.flatnonzero(self.checked(mask).numpy())
     if gravity is not None:
       gravity = self._rows(np.broadcast_to(gravity, (self.nworld, 3)), "gravity", 3)[worlds]
     rough = {}
@@ -265,7 +265,8 @@ class Batch(abc.ABC):
   def _configure(self, worlds: np.ndarray, gravity: np.ndarray | None, friction: dict):
     """Changes some worlds; values have a row for each of these."""
 
-  def _mask(self, mask) -> wp.array:
+  def checked(self, mask) -> wp.array:
+    """Returns a mask of worlds on the device, all of them for None; refuses what is none."""
     if mask is None:
       return wp.full(self.nworld, True, dtype=wp.bool, device=self.device)
     if not isinstance(mask, wp.array):
@@ -276,7 +277,8 @@ class Batch(abc.ABC):
       raise ValueError(f"mask has {what}, expected ({self.nworld},) of bool, one a world")
     return on_device(mask, wp.bool, self.device)
 
-  def _world(self, world: int) -> int:
+  def index(self, world: int) -> int:
+    """Returns the number of a world; refuses what is none."""
     if isinstance(world, bool) or not isinstance(world, int | np.integer):
       raise ValueError(f"world is {world!r}, expected a whole number")
     if not 0 <= world < self.nworld:
@@ -290,7 +292,7 @@ class Batch(abc.ABC):
 
   def get_state(self, world: int, data: mujoco.MjData):
     """Writes the state of a world to an mjData of `model`, where the plugin goes on with it."""
-    world = self._world(world)
+    world = self.index(world)
     self._check(data)
     self._get_state(world, data)
 
@@ -300,7 +302,7 @@ class Batch(abc.ABC):
 
   def set_state(self, world: int, data: mujoco.MjData):
     """Gives a world the state of an mjData of `model`."""
-    world = self._world(world)
+    world = self.index(world)
     self._check(data)
     self._fresh = False
     self._set_state(world, data)

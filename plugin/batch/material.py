@@ -43,7 +43,7 @@ class Material:
 
   def __init__(self, organ, batch, touch):
     config, nworld = organ.config, batch.nworld
-    self._organ, self._batch, self._touch = organ, batch, touch
+    self._organ, self.batch, self._touch = organ, batch, touch
     self._young = np.broadcast_to(config.young, (organ.declared.mesh.nelem,))
     full = {"scale": 1.0, "poisson": config.poisson, "thickness": config.thickness, "mass": 1.0}
     self._worlds = {name: np.full(nworld, value) for name, value in full.items()}
@@ -73,7 +73,7 @@ class Material:
     plan, inside = self._organ.body.plan, ("bulk", "pressure")
     if plan and not plan.volumes and any(np.any(rows[key]) for key in inside if key in rows):
       self._organ.enclose()
-      self._batch.record()
+      self.batch.record()
     number = self._organ.body.tissue.number.numpy()
     for key, values in numbers.items():
       number[worlds, NUMBERS.index(key)] = values
@@ -128,7 +128,7 @@ class Material:
       self._lumps = Lumps(self._organ.declared, self._organ.body)
       self._organ.patch.lump = self._lumps.node
       self._lumps.put(worlds, factor)
-      self._batch.record()
+      self.batch.record()
     else:
       self._lumps.put(worlds, factor)
 
@@ -157,7 +157,7 @@ class Material:
         f"organ {organ.name!r}: young times thickness is in [{low:g}, {high:g}] times the "
         f"compiled one, expected [{GRADES[0]:g}, {GRADES[-1]:g}]"
       )
-    m = mjstruct.Model.from_address(self._batch.model._address)
+    m = mjstruct.Model.from_address(self.batch.model._address)
     self._find_inertia(m)
     organ.patch.grade.assign(np.log2(scale / own["mass"] / GRADES[0]).astype(np.float32))
     most, nu = scale * self._most, own["poisson"]
@@ -172,11 +172,11 @@ class Material:
     newton = max(organ.body.newton, inertia.iterations(m, organ.space.organ, config))
     stiff = bool(organ.patch.stiff)
     if not stiff and organ.responds:
-      nodal = organ.space.inertia(self._batch.model._address)
+      nodal = organ.space.inertia(self.batch.model._address)
       stiff = inertia.stiffness(m, organ.space.organ, body, config, nodal)[0]
     if (newton, stiff) != (organ.body.newton, bool(organ.patch.stiff)):
       organ.body.newton, organ.patch.stiff = newton, int(stiff)
-      self._batch.record()
+      self.batch.record()
 
   def _find_inertia(self, m):
     """Fills the effective inertia at each of GRADES, once."""

@@ -121,14 +121,14 @@ class Several(Batch):
     """Puts joints of worlds at positions, see `Batch.pose`."""
     values = self._rows(values, "values", len(joints))
     self._fresh = False
-    for part, at, own in self._each(self._mask(mask)):
+    for part, at, own in self._each(self.checked(mask)):
       part.pose(joints, values[at], own)
 
   def place(self, body: str, pos, quat, mask=None):
     """Moves a body of worlds in its parent's frame, see `Batch.place`."""
     pos, quat = self._rows(pos, "pos", 3), self._rows(quat, "quat", 4)
     self._fresh = False
-    for part, at, own in self._each(self._mask(mask)):
+    for part, at, own in self._each(self.checked(mask)):
       part.place(body, pos[at], quat[at], own)
 
   def configure(self, mask=None, *, gravity=None, friction=None):
@@ -136,7 +136,7 @@ class Several(Batch):
     if gravity is not None:
       gravity = self._rows(np.broadcast_to(gravity, (self.nworld, 3)), "gravity", 3)
     rough = {name: np.broadcast_to(v, (self.nworld,)) for name, v in (friction or {}).items()}
-    for part, at, own in self._each(self._mask(mask)):
+    for part, at, own in self._each(self.checked(mask)):
       mine = {name: values[at] for name, values in rough.items()}
       part.configure(own, gravity=None if gravity is None else gravity[at], friction=mine)
 
@@ -167,13 +167,13 @@ class _Gathered(Tissue):
   """An organ of `Several`."""
 
   def __init__(self, batch: Several, name: str):
-    self._batch, self.name = batch, name
+    self.batch, self.name = batch, name
     self._parts = [part.organ(name) for part in batch.parts]
     self.nvert, self.elem = self._parts[0].nvert, self._parts[0].elem
     self._arrays: dict[str, wp.array] = {}
 
   def _gather(self, name: str, arrays: Sequence[wp.array]) -> wp.array:
-    batch = self._batch
+    batch = self.batch
     if name not in self._arrays:
       shape = (batch.nworld, *arrays[0].shape[1:])
       self._arrays[name] = wp.zeros(shape, dtype=arrays[0].dtype, device=batch.device)
@@ -185,7 +185,7 @@ class _Gathered(Tissue):
   @functools.cached_property
   def bonds(self) -> Gathered:
     """What it has grown on to."""
-    return Gathered(self._batch, [part.bonds for part in self._parts])
+    return Gathered(self.batch, [part.bonds for part in self._parts])
 
   @property
   def _spare(self) -> int:
@@ -193,7 +193,7 @@ class _Gathered(Tissue):
 
   def _cut(self, points: dict[int, np.ndarray]) -> list[Report | None]:
     out: list[Report | None] = []
-    for at, part in zip(self._batch.slices, self._parts, strict=True):
+    for at, part in zip(self.batch.slices, self._parts, strict=True):
       own = {world - at.start: points[world] for world in points if at.start <= world < at.stop}
       out += part._cut(own) if own else [None] * (at.stop - at.start)
     return out
@@ -203,7 +203,7 @@ class _Gathered(Tissue):
     return part._told(name, own)
 
   def _part(self, world: int) -> tuple[Tissue, int]:
-    batch, own = self._batch._find(world)
+    batch, own = self.batch._find(world)
     return batch.organ(self.name), own
 
   def _piece_count(self) -> wp.array:
@@ -216,7 +216,7 @@ class _Gathered(Tissue):
 
   def elem_of(self, world: int) -> np.ndarray:
     """Returns the triangles of a world, see `Tissue.elem_of`."""
-    part, own = self._part(self._batch._world(world))
+    part, own = self._part(self.batch.index(world))
     return part.elem_of(own)
 
   @property
@@ -229,7 +229,7 @@ class _Gathered(Tissue):
 
   def configure(self, mask=None, **keys):
     """Changes the tissue of worlds, see `Tissue.configure`."""
-    batch = self._batch
+    batch = self.batch
     rows = {key: spread(self, key, value, batch.nworld) for key, value in keys.items()}
-    for part, at, own in batch._each(batch._mask(mask)):
+    for part, at, own in batch._each(batch.checked(mask)):
       part.organ(self.name).configure(own, **{key: values[at] for key, values in rows.items()})

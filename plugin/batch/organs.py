@@ -72,7 +72,7 @@ class Organ(Tissue):
     self.name, self.nvert, self.elem = organ.name, coupling.outer(organ), organ.mesh.elem
     self.declared, self.config, self.space, self.place = organ, organ.config, w, place
     self.instance = w.instance
-    self._batch, self._scheme = batch, step.SCHEMES[organ.config.integrator]
+    self.batch, self._scheme = batch, step.SCHEMES[organ.config.integrator]
     still = shape.make(organ.mesh, organ.config, ~organ.free, str(device), nworld=0)
     self.body = bodies.worlds(still, nworld, plan_of(still, organ.config))
     self.body.newton = w.body.newton
@@ -154,7 +154,7 @@ class Organ(Tissue):
       kernel.load(self.body.device)
 
   def _over(self, kernel, count: int):
-    launch(kernel, self.patch, self._batch.nworld, count, self.body.device)
+    launch(kernel, self.patch, self.batch.nworld, count, self.body.device)
 
   def begin(self):
     """Puts the slots on the nodes nearest to the tools and takes the tissue's step."""
@@ -228,7 +228,7 @@ class Organ(Tissue):
 
   @functools.cached_property
   def _out(self) -> dict[str, wp.array]:
-    shape = (self._batch.nworld, self.nvert)
+    shape = (self.batch.nworld, self.nvert)
     return {name: wp.zeros(shape, dtype=wp.vec3, device=self.body.device) for name in _WHAT}
 
   @functools.cached_property
@@ -239,7 +239,7 @@ class Organ(Tissue):
   def _read(self, name: str) -> wp.array:
     if name in _STATUS:
       return self.body.system.status[:, _STATUS[name]]
-    out, dim = self._out[name], (self._batch.nworld, self.nvert)
+    out, dim = self._out[name], (self.batch.nworld, self.nvert)
     wp.launch(kernels.show, dim=dim, inputs=[self.patch, _WHAT[name], out], device=self.body.device)
     return out.view(float)
 
@@ -273,7 +273,7 @@ class Organ(Tissue):
 
   def _piece_count(self) -> wp.array:
     if self._cuts is None:
-      return wp.full(self._batch.nworld, len(self._told("pieces", 0)), dtype=int,
+      return wp.full(self.batch.nworld, len(self._told("pieces", 0)), dtype=int,
                      device=self.body.device)  # fmt: skip
     return self._cuts.counts()
 
@@ -285,14 +285,14 @@ class Organ(Tissue):
 
   def elem_of(self, world: int) -> np.ndarray:
     """Returns the triangles of a world, see `Tissue.elem_of`."""
-    return self._cuts.mesh(self._batch._world(world)).elem if self._cuts else self.elem
+    return self._cuts.mesh(self.batch.index(world)).elem if self._cuts else self.elem
 
   # Changing.
 
   def configure(self, mask=None, **keys):
     """Changes the tissue of worlds, see `Tissue.configure`."""
-    batch, nworld = self._batch, self._batch.nworld
-    chosen = np.flatnonzero(batch._mask(mask).numpy())
+    batch, nworld = self.batch, self.batch.nworld
+    chosen = np.flatnonzero(batch.checked(mask).numpy())
     rows = {key: spread(self, key, value, nworld)[chosen] for key, value in keys.items()}
     for key in rows:
       why = self._fixed(key)

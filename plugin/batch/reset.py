@@ -27,7 +27,7 @@ class Rest:
   def __init__(self, batch, bare: mujoco.MjModel):
     start = mujoco.MjData(bare)
     mujoco.mj_forward(bare, start)
-    self._batch, self.mask = batch, batch.mask
+    self.batch, self.mask = batch, batch.mask
     d = batch.d
     values = {name: getattr(d, name) for name in Start.vars if hasattr(d, name)}
     values |= dict(
@@ -51,36 +51,36 @@ class Rest:
 
   def launch(self):
     """Puts the worlds of the mask at rest."""
-    wp.launch(kernels.reset, dim=self._batch.nworld, inputs=[self.start], device=self._batch.device)
-    for organ in self._batch.organs.values():
+    wp.launch(kernels.reset, dim=self.batch.nworld, inputs=[self.start], device=self.batch.device)
+    for organ in self.batch.organs.values():
       organ.rest()
 
   def pose(self, at: np.ndarray, values):
     """Puts joints of the worlds of the mask at positions; `at` has their places."""
-    move, device = self._move, self._batch.device
+    move, device = self._move, self.batch.device
     move.at = wp.array(at, dtype=int, device=device)
     move.values = on_device(values, wp.float32, device)
     wp.launch(kernels.pose, dim=values.shape, inputs=[move], device=device)
 
   def place(self, body: int, pos, quat):
     """Moves a body of the worlds of the mask; quaternions have w first."""
-    move, device = self._move, self._batch.device
+    move, device = self._move, self.batch.device
     move.body = body
     move.pos = on_device(pos, wp.float32, device).view(wp.vec3)
     move.quat = on_device(quat, wp.float32, device).view(wp.quat)
-    wp.launch(kernels.place, dim=self._batch.nworld, inputs=[move], device=device)
+    wp.launch(kernels.place, dim=self.batch.nworld, inputs=[move], device=device)
 
   def look(self):
     """Finds where geoms are in the worlds of the mask, whose joints or bodies have been moved."""
-    d, move = self._batch.d, self._move
+    d, move = self.batch.d, self._move
     wp.copy(move.xpos, d.geom_xpos)
     wp.copy(move.xmat, d.geom_xmat)
-    mjw.kinematics(self._batch.m, d)
-    wp.launch(kernels.put_back, dim=move.xpos.shape, inputs=[move], device=self._batch.device)
+    mjw.kinematics(self.batch.m, d)
+    wp.launch(kernels.put_back, dim=move.xpos.shape, inputs=[move], device=self.batch.device)
 
   def find(self):
     """Resets and counts the worlds with numbers that are not finite."""
-    batch = self._batch
+    batch = self.batch
     for organ in batch.organs.values():
       organ.find_bad()
     inputs = [batch.bad, self.mask, batch.failures]
@@ -89,6 +89,6 @@ class Rest:
 
   def count_lost(self, lost: int):
     """Brings `overflow` up to date; `lost` are the bits of mujoco_warp's that count."""
-    batch = self._batch
+    batch = self.batch
     inputs = [batch.lost, batch.d.overflow, lost, batch.counted]
     wp.launch(kernels.count, dim=batch.nworld, inputs=inputs, device=batch.device)

@@ -35,7 +35,7 @@ class Teller:
     def put(values):
       return wp.array(values, dtype=int, device=batch.device)
 
-    self._batch = batch
+    self.batch = batch
     self._kept = [put(numbers) for numbers in batch.kept]
     nodal = [organ for organ in batch.organs.values() if organ.declared.windows is None]
     self._nodes = [
@@ -44,7 +44,7 @@ class Teller:
 
   def tell(self):
     """Brings both up to date."""
-    batch, device = self._batch, self._batch.device
+    batch, device = self.batch, self.batch.device
     outs = (batch.qpos_out, batch.qvel_out)
     for k, (at, source, out) in enumerate(
       zip(self._kept, (batch.d.qpos, batch.d.qvel), outs, strict=True)

@@ -174,22 +174,22 @@ class _Tissue(Tissue):
     self.spaces = [engine.find(data._address, instance) for data in batch.datas]
     self.name, self.elem = name, self.handles[0].elem
     self.nvert = coupling.outer(self.spaces[0].organ)
-    self._batch, self._counted = batch, list[Any]([None] * batch.nworld)
+    self.batch, self._counted = batch, list[Any]([None] * batch.nworld)
     self._pieces = wp.zeros(batch.nworld, dtype=int, device="cpu")
 
   @functools.cached_property
   def _arrays(self) -> dict[str, wp.array]:
-    shape = (self._batch.nworld, self.nvert, 3)
+    shape = (self.batch.nworld, self.nvert, 3)
     arrays = {name: wp.zeros(shape, dtype=float, device="cpu") for name in _OF_VERTICES}
     return arrays | {
-      name: wp.zeros(self._batch.nworld, dtype=float, device="cpu")
+      name: wp.zeros(self.batch.nworld, dtype=float, device="cpu")
       for name in ("residual", "iterations")
     }
 
   @functools.cached_property
   def bonds(self) -> OfThreads:
     """What it has grown on to."""
-    return OfThreads(self._batch, self.handles)
+    return OfThreads(self.batch, self.handles)
 
   def _read(self, name: str) -> wp.array:
     array = self._arrays[name]
@@ -241,12 +241,12 @@ class _Tissue(Tissue):
 
   def elem_of(self, world: int) -> np.ndarray:
     """Returns the triangles of a world, see `Tissue.elem_of`."""
-    return self.handles[self._batch._world(world)].elem
+    return self.handles[self.batch.index(world)].elem
 
   def configure(self, mask=None, **keys):
     """Changes the tissue of worlds, see `Tissue.configure`."""
-    worlds = np.flatnonzero(self._batch._mask(mask).numpy())
-    rows = {key: spread(self, key, value, self._batch.nworld) for key, value in keys.items()}
+    worlds = np.flatnonzero(self.batch.checked(mask).numpy())
+    rows = {key: spread(self, key, value, self.batch.nworld) for key, value in keys.items()}
 
     def work(world: int):
       values = {key: value[world] for key, value in rows.items()}
@@ -254,11 +254,11 @@ class _Tissue(Tissue):
         self._rub(world, float(values.pop("friction")))
       self.handles[world].configure(**values)
 
-    self._batch.each(work, worlds)
+    self.batch.each(work, worlds)
 
   def _rub(self, world: int, friction: float):
     organ = self.spaces[world].organ
-    self._batch.models[world].flex_friction[organ.flexes, 0] = friction
+    self.batch.models[world].flex_friction[organ.flexes, 0] = friction
 
 
 def _threads(nthread: int | None) -> int:

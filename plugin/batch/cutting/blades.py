@@ -117,7 +117,7 @@ class Blades(base.Opens):
       own=_by_nodes(base.nodes_of(organ), body),
       solve=_by_nodes(base.input_of(organ), body),
       number=body.tissue.number,
-      mj=organ._batch.bodies,
+      mj=organ.batch.bodies,
     )
     self.fields = fill(_WorldBlades, self._device, values)
     self._steps = 0
@@ -172,7 +172,7 @@ class Blades(base.Opens):
   def open(self, steps: int):
     """Lets the meshes of worlds come apart along the paths that are long enough, or ended."""
     due, currents = self.fields.due.numpy(), self._organ.space.cutters.by_current
-    ctrl = self._organ._batch.d.ctrl.numpy() if currents else None
+    ctrl = self._organ.batch.d.ctrl.numpy() if currents else None
     state: Any = self.fields.state.numpy() if currents or due.any() else None
     acts = due.any(axis=1)
     for i, current in currents.items():
@@ -185,7 +185,7 @@ class Blades(base.Opens):
     cuts.follow()
     motion = cuts.motion(worlds)
     for i, current in currents.items():
-      given = steps * float(self._organ._batch.model.opt.timestep) * ctrl[:, current.actuator]
+      given = steps * float(self._organ.batch.model.opt.timestep) * ctrl[:, current.actuator]
       self._follow(current, state[:, i], due[:, i], given, worlds, motion)
     for k, world in enumerate(worlds):
       for i in np.flatnonzero(due[world]):
@@ -197,7 +197,7 @@ class Blades(base.Opens):
 
   def _follow(self, current, state: np.ndarray, due: np.ndarray, given, worlds: list, motion):
     """Lets paths of worlds follow a current; `given`: energy that it has brought [J], (nworld,)."""
-    cuts, d = self._organ.topology, self._organ._batch.d
+    cuts, d = self._organ.topology, self._organ.batch.d
     place, axes = (array.numpy()[:, current.geom] for array in (d.geom_xpos, d.geom_xmat))
     for k, world in enumerate(worlds):
       row, mesh = state[world], cuts.mesh_of(world)

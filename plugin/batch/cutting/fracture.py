@@ -33,7 +33,7 @@ class Parting(abc.ABC):
 
   name: str
   nvert: int
-  _batch: Any
+  batch: Any
 
   def cut(self, points, mask=None) -> list[Report | None]:
     """Cuts worlds along the path on the surface that is nearest to points, see `Organ.cut`.
@@ -48,12 +48,12 @@ class Parting(abc.ABC):
     Raises:
       ValueError: the organ has no room for cuts, or a path cannot be cut; nothing is cut then.
     """
-    batch, points = self._batch, _paths(self.name, points, self._batch.nworld)
+    batch, points = self.batch, _paths(self.name, points, self.batch.nworld)
     if not self._spare:
       raise ValueError(
         f"organ {self.name!r}: spare is 0, expected room for cuts: palpate.add_organ(..., spare=)"
       )
-    worlds = np.flatnonzero(batch._mask(mask).numpy()).tolist()
+    worlds = np.flatnonzero(batch.checked(mask).numpy()).tolist()
     batch._fresh = False
     paths = {world: points[world] for world in worlds}
     return self._cut(paths) if paths else [None] * batch.nworld
@@ -61,12 +61,12 @@ class Parting(abc.ABC):
   @property
   def cuts(self) -> list[list[Report]]:
     """What cuts did since worlds were reset, a list a world."""
-    return [self._told("reports", world) for world in range(self._batch.nworld)]
+    return [self._told("reports", world) for world in range(self.batch.nworld)]
 
   @property
   def pieces(self) -> list[list[Piece]]:
     """The parts that hang together, the heaviest first, a list a world."""
-    return [self._told("pieces", world) for world in range(self._batch.nworld)]
+    return [self._told("pieces", world) for world in range(self.batch.nworld)]
 
   @property
   def piece_count(self) -> wp.array:

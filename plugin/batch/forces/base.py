@@ -118,7 +118,7 @@ class Beside:
 
   def __init__(self, organ):
     self._organ = organ
-    batch = organ._batch
+    batch = organ.batch
     self._nworld, self._device, self._mask = batch.nworld, batch.device, batch.mask
     self.kept: list[Kept] = []
 

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import warp as wp
-from palpate.bonds import Bonds as Alone
 
 from ..base import on_device
 from ..kernels import HELD, share_freed
@@ -83,7 +82,7 @@ class OfThreads(Bonds):
   """
 
   def __init__(self, batch, handles: list):
-    self._batch, self._alone = batch, [Alone(handle._space) for handle in handles]
+    self.batch, self._alone = batch, [handle.bonds for handle in handles]
     self.vertices, self.area = self._alone[0].vertices, self._alone[0].area
     super().__init__(len(handles), batch.device)
 
@@ -108,15 +107,15 @@ class Gathered(Bonds):
   """
 
   def __init__(self, batch, parts: list[Bonds]):
-    self._batch, self._parts = batch, parts
+    self.batch, self._parts = batch, parts
     self.vertices, self.area = parts[0].vertices, parts[0].area
     super().__init__(batch.nworld, batch.device)
 
   def _tell(self):
-    self._batch.gather([part.damage for part in self._parts], self._damage)
-    self._batch.gather([part.force for part in self._parts], self._force)
+    self.batch.gather([part.damage for part in self._parts], self._damage)
+    self.batch.gather([part.force for part in self._parts], self._force)
 
   def _weaken(self, amount: wp.array):
     rows = amount.numpy()
-    for at, part in zip(self._batch.slices, self._parts, strict=True):
+    for at, part in zip(self.batch.slices, self._parts, strict=True):
       part.weaken(rows[at])

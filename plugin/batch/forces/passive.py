@@ -59,7 +59,7 @@ class InBonds(Beside):
     self.groups: list[tuple[Any, Any]] = []
     self.borne: list[tuple[Any, Any]] = []
     for group in organ.space.bonds.groups:
-      other = organ._batch.organ(group.other.organ.name) if group.other else None
+      other = organ.batch.organ(group.other.organ.name) if group.other else None
       self.groups.append((group, self._fill(group, other, numbers)))
 
   def bear(self, others: list["InBonds"]):
@@ -90,7 +90,7 @@ class InBonds(Beside):
       other=WorldNodes() if other is None else nodes_of(other),
       below=passive.Input() if other is None else input_of(other),
       number=organ.body.tissue.number,
-      mj=organ._batch.bodies,
+      mj=organ.batch.bodies,
     )
     return fill(WorldBonded, self._device, values)
 
@@ -134,7 +134,7 @@ class Grown(Bonds):
     made = [group for group, _ in self._groups]
     self.vertices = np.concatenate([np.zeros(0, int), *(group.vert for group in made)])
     self.area = np.concatenate([np.zeros(0), *(group.area for group in made)])
-    super().__init__(organ._batch.nworld, organ._batch.device)
+    super().__init__(organ.batch.nworld, organ.batch.device)
 
   def _over(self, what, name: str, values: wp.array):
     first = 0
@@ -157,7 +157,7 @@ class Ties(Beside):
 
   def __init__(self, organ, numbers: np.ndarray):
     super().__init__(organ)
-    made, batch = organ.space.ties, organ._batch
+    made, batch = organ.space.ties, organ.batch
     known: Any = made.fields
     self._count = int(known.count.numpy()[0])
     names = "vert", "leads", "stiffness", "anchor", "count", "owned", "restless"
@@ -203,7 +203,7 @@ class Rests(Beside):
 
   def __init__(self, organ, numbers: np.ndarray):
     super().__init__(organ)
-    alone: Any = organ.space.rests._alone
+    alone: Any = organ.space.rests.alone
     n = alone.nouter
     shapes = {"slipped": (n, 3), "force": (n, 3), "hardness": (n, 6), "weight": (n, 3)}
     names = "ngeom", "nouter", "nother", "restless", "skin", "cell", "mu"
@@ -220,7 +220,7 @@ class Rests(Beside):
       solve=input_of(organ),
       other=WorldNodes(),
       below=passive.Input(),
-      mj=organ._batch.bodies,
+      mj=organ.batch.bodies,
     )
     self._fields = fill(WorldRest, self._device, values)
 

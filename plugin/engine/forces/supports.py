@@ -72,7 +72,7 @@ class Rests(Beside):
     self.below: list = []  # workspaces of organs that it rests on
     self.above: list = []  # of organs that rest on it
     self._arrays: dict[str, Any] = {}
-    self._alone: Any = None
+    self.alone: Any = None
     self._on: list = []
 
   def __bool__(self) -> bool:
@@ -127,7 +127,7 @@ class Rests(Beside):
       mj=coupling.mujoco_arrays(model, w.data, Bodies),
     )
     alone = common | _nothing() | {"other": Nodes(), "below": Input()}
-    self._alone = fill(Rest, "cpu", alone, into=self._alone)
+    self.alone = fill(Rest, "cpu", alone, into=self.alone)
     self._on += [None] * (len(self.below) - len(self._on))
     self._on = [
       fill(Rest, "cpu", common | self._other(m, other), into=on)
@@ -166,7 +166,7 @@ class Rests(Beside):
 
   def reshape(self) -> list:
     """See `Beside`."""
-    if self.any and self._alone is not None:
+    if self.any and self.alone is not None:
       for rests in (self, *(each.rests for each in self.above)):
         if rests:
           rests._bind(self._w.model)
@@ -174,7 +174,7 @@ class Rests(Beside):
 
   def find(self):
     """Finds what each node rests on."""
-    _launch(_find_geoms, self._alone)
+    _launch(_find_geoms, self.alone)
     for k, each in enumerate(self._on):
       _launch(_find_organ, each, k)
 
@@ -182,7 +182,7 @@ class Rests(Beside):
     """See `Beside`."""
     if self:
       self.find()
-      _launch(_press, self._alone)
+      _launch(_press, self.alone)
     for each in self.above:
       each.rests.find()
       which = each.rests.below.index(self._w)
@@ -191,14 +191,14 @@ class Rests(Beside):
   def act(self):
     """Lets the bodies feel what rests on them."""
     if self:
-      _launch(_act, self._alone)
-      if self._alone.restless:
-        _launch(_feel, self._alone)
+      _launch(_act, self.alone)
+      if self.alone.restless:
+        _launch(_feel, self.alone)
 
   def end(self):
     """Keeps how far the nodes have slipped."""
     if self:
-      _launch(_keep, self._alone)
+      _launch(_keep, self.alone)
 
   def force(self) -> np.ndarray:
     """Returns the force on each vertex in the last step, in the world [N], (nouter, 3)."""
