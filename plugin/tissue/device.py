@@ -150,7 +150,7 @@ class Plan:
 
 
 def plan(device, nslice: int, nheld: int, **kinds: bool) -> Plan | None:
-  """Returns how a block takes the whole step of a world; None where a block has too few threads.
+  """Returns how a block takes the whole step of a world; None where that is too large for one.
 
   Args:
     device: where it runs
@@ -166,7 +166,10 @@ def plan(device, nslice: int, nheld: int, **kinds: bool) -> Plan | None:
   if threads > _MOST:
     return None
   room = device.max_shared_memory_per_block - _STATIC
-  wanted = 4 * (LANES * (16 if kinds["bends"] else 13) * nslice + nheld)
+  vectors = 4 * LANES * (16 if kinds["bends"] else 13) * nslice
+  if vectors > room:
+    return None
+  wanted = vectors + 4 * nheld
   per_sm = max(1, min(3, room // (wanted + _STATIC), _REGISTERS // threads))
   return Plan(own, threads, per_sm, min(wanted, room), wanted <= room, **kinds)
 
