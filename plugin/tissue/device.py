@@ -25,7 +25,8 @@ BLOCK = 512  # threads of a block, at most
 MAX_BLOCKS = 512  # of one world
 SPLIT = 4  # threads of a node of a solid, which share its neighbours, where there is one world
 WORDS = 2 * MAX_BLOCKS + 1  # of 128 bits that a world's threads exchange
-_MOST = 1024  # threads of a block that has a world to itself
+_MOST = 512  # threads of a block that has a world to itself; with more it gets no 223 KiB
+_MANY = 1024  # nodes up to which a thread has two
 _FEW = 128  # nodes of which a thread has one
 _STATIC = 4096  # bytes of its memory that others have [B]
 _REGISTERS = 65536 // 128  # threads of a multiprocessor that have 128 registers
@@ -161,15 +162,12 @@ def plan(device, nslice: int, nheld: int, **kinds: bool) -> Plan | None:
   if not device.is_cuda:
     return Plan(0, 1, 1, 0, False, **kinds)
   nodes = LANES * nslice
-  own = 1 if nodes <= _FEW else 2 if nodes <= _MOST else 4
+  own = 1 if nodes <= _FEW else 2 if nodes <= _MANY else 4
   threads = -(-nodes // (32 * own)) * 32
   if threads > _MOST:
     return None
   room = device.max_shared_memory_per_block - _STATIC
-  vectors = 4 * LANES * (16 if kinds["bends"] else 13) * nslice
-  if vectors > room:
-    return None
-  wanted = vectors + 4 * nheld
+  wanted = 4 * (LANES * (16 if kinds["bends"] else 13) * nslice + nheld)
   per_sm = max(1, min(3, room // (wanted + _STATIC), _REGISTERS // threads))
   return Plan(own, threads, per_sm, min(wanted, room), wanted <= room, **kinds)
 
