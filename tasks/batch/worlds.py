@@ -185,13 +185,16 @@ class Worlds:
   # Doing.
 
   def array(self, name: str) -> wp.array:
-    """Returns one of the arrays of `fields`, `states` or `tally`."""
+    """Returns one of the arrays of `states`, `fields` or `tally`; what rules tell goes first."""
+    rules = self.task.rules
+    if name in (*rules.observed, *rules.metrics.values()):
+      return self.states.array(name)
     if name in Common.vars:
       return getattr(self.fields, name)
     own = name.removeprefix(self.task.second.replace("/", "_")) if self.other else name
     if own != name and OBSERVED.get(own, own) in Common.vars:
       return getattr(self.other, OBSERVED.get(own, own))
-    known = name in self.task.rules.fields
+    known = name in rules.fields
     return self.states.array(name) if known else getattr(self.tally, name)
 
   def check(self, action: wp.array, first: int = 0) -> None:
