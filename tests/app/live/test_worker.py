@@ -117,7 +117,6 @@ def test_free_practice_changes_while_it_runs(page):
   one.tell("practice", organ="kidney", mesh="16 x 16", instrument="grasper", scheme="neumann")
   assert one.hear("scene")["nodes"] == 258 and one.scene["jaws"]
   assert one.value("steps") < 5000  # another loop
-  one.tell("stop")
   one.hear("idle")
   for words, said in (
     ({"organ": "heart"}, "organ is 'heart', expected one of"),
@@ -130,6 +129,16 @@ def test_free_practice_changes_while_it_runs(page):
     assert said in one.hear("error")["text"]
   one.tell("device", value="udp:0.0.0.0:1")
   assert "device is 'udp:0.0.0.0:1', expected one of" in one.hear("error")["text"]
+
+
+@pytest.mark.parametrize("message", [b"[" * 200_000, b"\xff", b"{}", b'{"type": "hand", "at": 3}'])
+def test_whatever_is_sent_is_answered_and_the_exercise_goes_on(page, message):
+  one = page()
+  exercise(one)
+  one.near.send_bytes(message)
+  if message[-1:] != b"}" or message == b"{}":
+    assert one.hear("error", faults=True)["text"]
+  assert finish(one)
 
 
 def test_two_hands_on_one_page(page):

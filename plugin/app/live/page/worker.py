@@ -113,7 +113,7 @@ class Worker:
         self._obey(message)
       except (EOFError, OSError):
         self._end()
-      except (ValueError, TypeError, KeyError, DeviceError) as error:
+      except Exception as error:  # whatever was sent, the exercise goes on and is kept
         self._fault(error)
 
   def _obey(self, message: Any) -> None:
