@@ -21,6 +21,7 @@ PAGES = [
   for pattern in (
     "*.md",
     "docs/*.md",
+    "docs/tutorials/*.md",
     "tasks/*.md",
     "models/*/*.md",
     "tests/benchmarks/results/*.md",
