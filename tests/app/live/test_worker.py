@@ -117,6 +117,7 @@ def test_free_practice_changes_while_it_runs(page):
   one.tell("practice", organ="kidney", mesh="16 x 16", instrument="grasper", scheme="neumann")
   assert one.hear("scene")["nodes"] == 258 and one.scene["jaws"]
   assert one.value("steps") < 5000  # another loop
+  one.tell("stop")
   one.hear("idle")
   for words, said in (
     ({"organ": "heart"}, "organ is 'heart', expected one of"),
