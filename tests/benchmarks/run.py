@@ -7,7 +7,8 @@ import pathlib
 import sys
 from collections.abc import Sequence
 
-sys.path.insert(0, str(pathlib.Path(__file__).parents[1]))  # `benchmarks`, `reference`, `scenes`
+FOLDER = pathlib.Path(__file__).parent
+sys.path.insert(0, str(FOLDER.parent))  # `benchmarks`, `reference`, `scenes`
 
 from benchmarks.results import BenchError
 
@@ -56,7 +57,9 @@ def main(argv: Sequence[str] | None = None) -> int:
   from palpate.app.console import CommandError
 
   try:
-    return runner.main(importlib.import_module(f"benchmarks.{words[0]}").BENCH, words[1:])
+    (path,) = FOLDER.glob(f"*/{words[0]}.py")
+    module = importlib.import_module(f"benchmarks.{path.parent.name}.{words[0]}")
+    return runner.main(module.BENCH, words[1:])
   except (BenchError, CommandError) as error:
     print(f"run.py: {error}", file=sys.stderr)
     return error.code

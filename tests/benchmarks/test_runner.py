@@ -3,7 +3,8 @@
 import dataclasses
 
 import pytest
-from benchmarks import error, results, run, runner
+from benchmarks import results, run, runner
+from benchmarks.accuracy import error
 
 
 def command(*words) -> int:

@@ -4,7 +4,8 @@ import json
 import sys
 
 import pytest
-from benchmarks import peer, results, run
+from benchmarks import results, run
+from benchmarks.accuracy import peer
 from palpate.engine import contacts
 
 

@@ -16,7 +16,8 @@ import mujoco
 import numpy as np
 import palpate
 import scenes
-from benchmarks import loop, plots, results
+from benchmarks import plots, results
+from benchmarks.timing import loop
 from benchmarks.runner import Bench, Case, Row
 from palpate.tissue.body import Body
 from palpate.tissue.order import from_slices
@@ -172,4 +173,5 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
   return [results.page(out / "locality.md", "What leaving out nodes would gain", about, lines)]
 
 
-BENCH = Bench("locality", stages, run, report=report, arguments=arguments)
+BENCH = Bench("locality", stages, run, report=report, arguments=arguments,
+              folder="development")  # fmt: skip

@@ -265,7 +265,7 @@ def table(out: pathlib.Path) -> list[str]:
   """Returns the lines of the page, microseconds a step and nanoseconds a node."""
   lines = [
     "Microseconds; device: its work by itself, which on CUDA goes on beside MuJoCo's. Per node:",
-    "the device's work in ns. From loop_cpu.csv and loop_cuda.csv; `tests/benchmarks/loop.py` says",
+    "the device's work in ns. From loop_cpu.csv and loop_cuda.csv; `run.py loop --help` says",
     "how they were measured.",
     "",
     *_rows(out, "loop_c*.csv"),

@@ -23,11 +23,12 @@ import tempfile
 
 import numpy as np
 import scenes
-from benchmarks import plots, results, stepping
+from benchmarks import plots, results
+from benchmarks.development import stepping
 from benchmarks.results import BenchError
 from benchmarks.runner import SEED, Bench, Case, Row
 
-ROOT = pathlib.Path(__file__).parents[2]
+ROOT = pathlib.Path(__file__).parents[3]
 BLOCK = 0.012  # CPU time of a round of a process [s]
 
 
@@ -185,4 +186,5 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
   return [results.page(out / "uncut.md", title, about, lines)]
 
 
-BENCH = Bench("uncut", stages, run, report=report, arguments=arguments, jobs=1, limit=3600.0)
+BENCH = Bench("uncut", stages, run, report=report, arguments=arguments, jobs=1, limit=3600.0,
+              folder="development")  # fmt: skip

@@ -13,8 +13,9 @@ import pathlib
 
 import mujoco
 import numpy as np
-from benchmarks import compare, error, films, plots, results, scene
-from benchmarks.films import Film
+from benchmarks import plots, results, scene
+from benchmarks.accuracy import compare, error, films
+from benchmarks.accuracy.films import Film
 from benchmarks.runner import Bench, Case, Row
 from palpate.engine.model import inertia
 from palpate.tissue import shape as making
@@ -209,4 +210,5 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
   return [picture, results.page(page, "Schemes of second order, in float64", about, lines)]
 
 
-BENCH = Bench("second_order", stages, run, _COLUMNS, report)
+BENCH = Bench("second_order", stages, run, _COLUMNS, report,
+              folder="development")  # fmt: skip

@@ -26,7 +26,9 @@ import mujoco_warp as mjw
 import numpy as np
 import palpate.batch
 import warp as wp
-from benchmarks import batch, peer, plots, results
+from benchmarks import plots, results
+from benchmarks.accuracy import peer
+from benchmarks.timing import batch
 from benchmarks.runner import Bench, Case, Row
 
 TOLERANCES = {"flex": (1e-6, 1e-4), "ours": (1e-3, 1e-2)}  # float32 has no finer ones

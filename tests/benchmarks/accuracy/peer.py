@@ -245,9 +245,9 @@ def another(python: str) -> Iterator[subprocess.Popen | None]:
   if not python:
     yield None
     return
-  paths = [str(pathlib.Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")]
+  paths = [str(pathlib.Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")]
   env = os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
-  command = [python, "-m", "benchmarks.peer"]
+  command = [python, "-m", "benchmarks.accuracy.peer"]
   try:
     with subprocess.Popen(
       command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=env

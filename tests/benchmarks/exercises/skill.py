@@ -11,7 +11,7 @@ import pathlib
 
 import numpy as np
 from benchmarks import results
-from benchmarks.performances import arguments, folder, performances
+from benchmarks.exercises.performances import arguments, folder, performances
 from benchmarks.runner import Bench, Case, Row
 from palpate.tasks.core import performer
 from palpate.tasks.metrics import METRICS, Metrics

@@ -16,8 +16,8 @@ from collections.abc import Iterator
 import numpy as np
 import scenes
 from benchmarks import plots, results, runner, scene
-from benchmarks.judge import CHATTER, DEPTH, FAILURES, JUDGEMENT, STEPS, VERDICTS
-from benchmarks.judge import run as judged
+from benchmarks.accuracy.judge import CHATTER, DEPTH, FAILURES, JUDGEMENT, STEPS, VERDICTS
+from benchmarks.accuracy.judge import run as judged
 from benchmarks.runner import Bench, Case, Row
 from scenes.resting import LYING, PRESSED
 

@@ -14,7 +14,7 @@ import scenes
 from benchmarks import plots, results
 from benchmarks.runner import Bench, Case, Row
 
-PRESS = pathlib.Path(__file__).parents[1] / "reference" / "press_explicit_20us.py"
+PRESS = pathlib.Path(__file__).parents[2] / "reference" / "press_explicit_20us.py"
 H = (0.5e-3, 1e-3, 2e-3, 4e-3)  # [s]
 FACTORS = (1e-3, 0.25, 0.5, 1.0, 2.0, 4.0)
 
@@ -59,4 +59,5 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
   return [results.page(out / "inertia.md", "Scaled effective inertia", about, lines)]
 
 
-BENCH = Bench("inertia", stages, run, report=report)
+BENCH = Bench("inertia", stages, run, report=report,
+              folder="development")  # fmt: skip

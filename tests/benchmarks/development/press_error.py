@@ -23,7 +23,7 @@ from palpate.tissue import step as stepping
 from palpate.tissue.body import Body
 from palpate.tissue.types import Stage
 
-REFERENCE = pathlib.Path(__file__).parents[1] / "reference" / "press_explicit_20us"
+REFERENCE = pathlib.Path(__file__).parents[2] / "reference" / "press_explicit_20us"
 PARTS = {"touch": (0, 0.035), "ramp": (0.035, 0.1), "hold": (0.1, 1)}  # [s]
 H = (5e-4, 1e-3, 2e-3)  # [s]
 CASES = {
@@ -115,4 +115,5 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
   return [results.page(out / "press_error.md", "What is left of the press's error", about, lines)]
 
 
-BENCH = Bench("press_error", stages, run, report=report)
+BENCH = Bench("press_error", stages, run, report=report,
+              folder="development")  # fmt: skip

@@ -10,8 +10,9 @@ from collections.abc import Callable
 
 import mujoco
 import numpy as np
-from benchmarks import films, scene
-from benchmarks.films import SAMPLE, SCRIPTS, Film
+from benchmarks import scene
+from benchmarks.accuracy import films
+from benchmarks.accuracy.films import SAMPLE, SCRIPTS, Film
 from benchmarks.runner import Case, Row
 from benchmarks.scene import NATIVE
 from reference import exact

@@ -15,7 +15,7 @@ import numpy as np
 import trimesh
 from benchmarks import plots, results
 from benchmarks.runner import Bench, Case, Row
-from benchmarks.solver import PRECONDITIONERS, condition, limit, make, press, sphere
+from benchmarks.timing.solver import PRECONDITIONERS, condition, limit, make, press, sphere
 from palpate import models as _models
 from palpate.tissue import coarse as coarsening
 from palpate.tissue import step as stepping
@@ -117,4 +117,5 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
   return [results.page(out / "preconditioner.md", title, about, lines)]
 
 
-BENCH = Bench("preconditioner", stages, run, report=report, arguments=arguments)
+BENCH = Bench("preconditioner", stages, run, report=report, arguments=arguments,
+              folder="development")  # fmt: skip

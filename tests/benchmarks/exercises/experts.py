@@ -14,8 +14,8 @@ from collections.abc import Iterator
 
 import numpy as np
 from benchmarks import plots, results
-from benchmarks.performances import arguments as add_episodes
-from benchmarks.performances import folder, performances
+from benchmarks.exercises.performances import arguments as add_episodes
+from benchmarks.exercises.performances import folder, performances
 from benchmarks.runner import Bench, Case, Row
 from palpate import tasks
 from palpate.tasks.core import performer

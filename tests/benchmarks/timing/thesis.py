@@ -22,7 +22,8 @@ import numpy as np
 import palpate
 import scenes
 import warp as wp
-from benchmarks import loop, plots, results, runner, scene
+from benchmarks import plots, results, runner, scene
+from benchmarks.timing import loop
 from benchmarks.runner import Bench, Case, Row
 
 SIDES = (16, 32, 64, 128, 256)

@@ -186,7 +186,7 @@ def run(case: Case, out: pathlib.Path) -> list[Row]:
 def table(out: pathlib.Path) -> list[str]:
   """Returns the lines of the page."""
   lines = [
-    "From batch_cpu.csv and batch_cuda.csv; `tests/benchmarks/batch.py` says how they were",
+    "From batch_cpu.csv and batch_cuda.csv; `run.py batch --help` says how they were",
     "measured. What a world takes is from the GPU's free memory before and after, which earlier",
     "cases that give theirs back blur: good to some tens of kB.",
     "",

@@ -17,8 +17,8 @@ from collections.abc import Callable
 import mujoco
 import numpy as np
 from benchmarks import plots, results
-from benchmarks.compare import DRAWN, LEVELS, RIGHT, TAU, H, run
-from benchmarks.films import LONGEST, SCRIPTS
+from benchmarks.accuracy.compare import DRAWN, LEVELS, RIGHT, TAU, H, run
+from benchmarks.accuracy.films import LONGEST, SCRIPTS
 from benchmarks.runner import Bench, Case, Row
 from benchmarks.scene import NATIVE
 
