@@ -7,11 +7,11 @@ import pathlib
 import sys
 from collections.abc import Sequence
 
-FOLDER = pathlib.Path(__file__).parent
-sys.path.insert(0, str(FOLDER.parent))  # `benchmarks`, `reference`, `scenes`
+sys.path.insert(0, str(pathlib.Path(__file__).parents[1]))  # `benchmarks`, `reference`, `scenes`
 
 from benchmarks.results import BenchError
 
+FOLDER = pathlib.Path(__file__).parent
 BENCHES = {
   "attacks": "what random attacks break",
   "batch": "world-steps a second of batches, and what a world takes",

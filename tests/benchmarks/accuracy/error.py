@@ -241,10 +241,33 @@ def summarize(rows: list[Row]) -> list[str]:
   return lines
 
 
+def finding(rows: list[Row]) -> list[str]:
+  """Returns what the page begins with."""
+  lines = []
+  for scene in ("press", "slide", "vibrate"):
+    mine = [r for r in rows if r["kind"] == "run" and r["scene"] == scene
+            and r["elements"] in ("membrane", "shell", "bending")]  # fmt: skip
+    mine = [r for r in mine if r["nodes"] == min(r["nodes"] for r in mine)]
+    best, ours = cheapest([r for r in mine if r["scheme"] in OURS], 0.01)
+    others = {
+      "`explicit`": cheapest([r for r in mine if r["scheme"] == "explicit"], 0.01)[0],
+      "MuJoCo's flex": cheapest([r for r in mine if r["run"] == NATIVE], 0.01)[0],
+      "the flex with right weights": cheapest([r for r in mine if r["run"] == RIGHT], 0.01)[0],
+    }
+    told = [f"{who} takes {time / best:.2g} times as long" if math.isfinite(time)
+            else f"{who} does not reach it" for who, time in others.items()]  # fmt: skip
+    if ours:
+      lines.append(f"`{scene}`, {ours['nodes']} nodes, within 1 %: `{ours['run']}` with "
+                   f"{1e3 * ours['h']:g} ms is cheapest of ours; {', '.join(told)}.")  # fmt: skip
+  return lines
+
+
 def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
   """Draws the figures and writes the page."""
-  page = results.page(out / "error.md", "Run time against error", about, summarize(rows))
-  return [*draw(rows, out), page]
+  drawn = draw(rows, out)
+  page = results.page(out / "error.md", "Run time against error", about, summarize(rows),
+                      finding(rows), drawn[0] if drawn else None)  # fmt: skip
+  return [*drawn, page]
 
 
 BENCH = Bench("error", stages, run, _COLUMNS, report, jobs=1, limit=3600.0)

@@ -9,6 +9,7 @@ along it, and `missed` how far the path is from the nearest of these edges, ends
 
 import argparse
 import itertools
+import math
 import pathlib
 
 import mujoco
@@ -132,6 +133,23 @@ def arguments(parser: argparse.ArgumentParser):
   parser.add_argument("--seeds", type=int, default=10)
 
 
+def finding(rows: list[Row]) -> list[str]:
+  """Returns what the page begins with."""
+  good = [row for row in rows if row["status"] == "ok"]
+  lines = []
+  for low, high in ((0, 2000), (2000, math.inf)):
+    mine = [row for row in good if low <= float(row["nodes"]) < high]
+    if mine:
+      off = max(float(row["off_mm"]) for row in mine)
+      few, many = (pick(int(row["nodes"]) for row in mine) for pick in (min, max))
+      lines.append(f"Cuts of organs of {few} to {many} nodes stay within {off:.2g} mm of their "
+                   "path.")  # fmt: skip
+  if good:
+    mass = max(abs(float(row["mass"])) for row in good)
+    lines.append(f"Mass changes by at most {mass:.1g} of itself, which is rounding.")
+  return lines
+
+
 def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
   """Writes the page: the worst of all seeds."""
   groups: dict[tuple, list[Row]] = {}
@@ -152,7 +170,11 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
   lines = [*(__doc__ or "").split("\n\n", 2)[2].splitlines(), ""]
   lines += ["The worst of all cuts; mass and volumes are changes, relative. "
             + results.link(out / "paths.csv"), "", *plots.table(head, table)]  # fmt: skip
-  return [results.page(out / "paths.md", "How near cuts follow their path", about, lines)]
+  names = [f"{line[0]}, {line[1]}, {line[2]} nodes" for line in table]
+  picture = plots.bars(out / "paths.png", "How far a cut is from its path at most", names,
+                       {"": [float(line[5]) for line in table]}, "[mm]")  # fmt: skip
+  title = "How near cuts follow their path"
+  return [picture, results.page(out / "paths.md", title, about, lines, finding(rows), picture)]
 
 
 BENCH = Bench("paths", stages, run, COLUMNS, report, arguments)

@@ -330,6 +330,46 @@ def stages(args: argparse.Namespace) -> list[list[Case]]:
   return [[{"case": f"{n}-{kind}", "nodes": n, "kind": kind} | keys for n, kind in sizes]]
 
 
+def finding(rows: list[Row]) -> list[str]:
+  """Returns what the page begins with."""
+  lines = []
+  for kind in dict.fromkeys(r["kind"] for r in rows):
+    told = []
+    for nodes in sorted({r["nodes"] for r in rows if r["kind"] == kind}):
+      mine = [r for r in rows if (r["kind"], r["nodes"]) == (kind, nodes)]
+      ours = _least([r for r in mine if r["side"] == "window"], 0.02)
+      flex = _least([r for r in mine if (r["side"], r["weights"]) == ("peer", "as is")], 0.02)
+      if ours and flex:
+        ratio = flex["second_s"] / ours["second_s"]
+        told.append(f"{ratio:.0f} times ({nodes} nodes, flex of {flex['mujoco']})")
+    if told and kind != "limp":
+      lines.append(f"{kind}, force error up to 2 %: the fastest flex takes {', '.join(told)} as "
+                   "long as an organ with a window.")  # fmt: skip
+  return lines
+
+
+def draw(rows: list[Row], out: pathlib.Path) -> pathlib.Path:
+  """Draws the least time to each error, for the smaller meshes."""
+  panels: dict = {}
+  for kind in dict.fromkeys(r["kind"] for r in rows):
+    least = min(r["nodes"] for r in rows if r["kind"] == kind)
+    mine = [r for r in rows if (r["kind"], r["nodes"], r["weights"]) == (kind, least, "as is")]
+    lines: dict = {}
+    for side, version in sorted({(r["side"], str(r["mujoco"])) for r in mine}, reverse=True):
+      if side != "peer" and version != max(str(r["mujoco"]) for r in mine if r["side"] == side):
+        continue
+      here = [r for r in mine if (r["side"], str(r["mujoco"])) == (side, version)]
+      front = sorted(
+        (r for r in here if r == _least(here, r["error"])), key=lambda r: r["second_s"]
+      )
+      name = f"flex of {version}" if side == "peer" else f"organ, {side}"
+      lines[name] = [r["second_s"] for r in front], [100 * r["error"] for r in front]
+    panels[f"{kind}, {least} nodes"] = lines
+  title = "Below and left is better"
+  return plots.curves(out / "peer.png", title, panels, "CPU time of a simulated second [s]",
+                      "force error [% of peak]")  # fmt: skip
+
+
 def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
   """Writes the page."""
   sides: dict = {"organ, window": {"side": "window"}, "organ, nodal": {"side": "nodal"}}
@@ -359,7 +399,8 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
   lines += [*plots.table(["tissue", "nodes", *sides], steps), ""]
   lines += ["Every setting, with its force: [peer.csv](peer.csv)."]
   title = "Run time against error beside MuJoCo's flex"
-  return [results.page(out / "peer.md", title, about, lines)]
+  picture = draw(rows, out)
+  return [picture, results.page(out / "peer.md", title, about, lines, finding(rows), picture)]
 
 
 def _least(rows: list[Row], level: float) -> Row | None:

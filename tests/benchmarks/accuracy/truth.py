@@ -348,6 +348,34 @@ def _shipped(
   return [measure.press(model, name, depth) for depth in ORGAN_DEPTHS]
 
 
+def finding(rows: list[Row]) -> list[str]:
+  """Returns what the page begins with."""
+  lines = []
+  for kinds, what in ((("hertz", "elements"), "a sphere on a solid block"),
+                      (("bar", "cantilever", "lame"), "closed forms of solids"),
+                      (("organ",), "organs under the 5 mm probe")):  # fmt: skip
+    mine = [r for r in rows if r["kind"] in kinds]
+    if mine:
+      errors = sorted(abs(r["error"]) for r in mine)
+      inside = sum(abs(r["error"]) <= ALLOWED[r["kind"]] for r in mine)
+      lines.append(f"{what[0].upper()}{what[1:]}: the median error is "
+                   f"{errors[len(errors) // 2]:.2g} %, {inside} of {len(mine)} cases are within "
+                   f"{' to '.join(sorted({f'{ALLOWED[k]:g}' for k in kinds}))} %.")  # fmt: skip
+  return lines
+
+
+def draw(rows: list[Row], out: pathlib.Path) -> pathlib.Path:
+  """Draws the median and the largest error of each kind of case."""
+  errors = {kind: sorted(abs(r["error"]) for r in rows if r["kind"] == kind) for kind in ALLOWED}
+  errors = {kind: found for kind, found in errors.items() if found}
+  groups = {
+    "median": [found[len(found) // 2] for found in errors.values()],
+    "largest": [found[-1] for found in errors.values()],
+  }
+  title = "Errors of forces and shapes"
+  return plots.bars(out / "truth.png", title, list(errors), groups, "error [%]")
+
+
 def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
   """Writes the page."""
   good = [r for r in rows if r["status"] == "ok"]
@@ -372,7 +400,8 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
   lines += [*plots.table(["source", "what it has", "why"], PUBLISHED), ""]
   lines += [results.link(out / "truth.csv")]
   title = "Forces against theory, other finite elements, measurements"
-  return [results.page(out / "truth.md", title, about, lines)]
+  picture = draw(good, out)
+  return [picture, results.page(out / "truth.md", title, about, lines, finding(good), picture)]
 
 
 BENCH = Bench("truth", stages, run, columns=_COLUMNS, report=report, begin=begin)

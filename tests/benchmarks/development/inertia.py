@@ -48,6 +48,17 @@ def run(case: Case, out: pathlib.Path) -> list[Row]:
   return [{"h": case["h"], "factor": case["factor"], "rms_percent": off}]
 
 
+def finding(rows: list[Row]) -> list[str]:
+  """Returns what the page begins with."""
+  lines = []
+  for h in sorted({row["h"] for row in rows if row["h"] <= 2.001e-3}):
+    errors = {row["factor"]: row["rms_percent"] for row in rows if row["h"] == h}
+    best = min(errors, key=lambda factor: errors[factor])
+    lines.append(f"At {1e3 * h:g} ms the best factor, {best:g}, has an error of {errors[best]:.2g} "
+                 f"% of the peak; the inertia as it is has {errors[1]:.2g} %.")  # fmt: skip
+  return lines[:3]
+
+
 def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
   """Writes the page."""
   table = []
@@ -56,7 +67,14 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
     table.append([f"{1e3 * h:g}", *(f"{off:.2f}" if off < 100 else "-" for off in found)])
   lines = [str(__doc__).partition("\n\n")[2], ""]
   lines += plots.table(["h [ms]", *(f"x {factor:g}" for factor in FACTORS)], table)
-  return [results.page(out / "inertia.md", "Scaled effective inertia", about, lines)]
+  steps = dict.fromkeys(row["h"] for row in rows)
+  panels = {"": {f"{1e3 * h:g} ms": (
+    [row["factor"] for row in rows if row["h"] == h],
+    [row["rms_percent"] for row in rows if row["h"] == h],
+  ) for h in steps}}  # fmt: skip
+  title = "Scaled effective inertia"
+  picture = plots.curves(out / "inertia.png", title, panels, "factor", "RMS error [% of peak]")
+  return [picture, results.page(out / "inertia.md", title, about, lines, finding(rows), picture)]
 
 
 BENCH = Bench("inertia", stages, run, report=report,

@@ -17,8 +17,8 @@ import numpy as np
 import palpate
 import scenes
 from benchmarks import plots, results
-from benchmarks.timing import loop
 from benchmarks.runner import Bench, Case, Row
+from benchmarks.timing import loop
 from palpate.tissue.body import Body
 from palpate.tissue.order import from_slices
 from scipy import sparse
@@ -161,6 +161,18 @@ def run(case: Case, out: pathlib.Path) -> list[Row]:
   return [row | {"gain": 1 - row["active_cost"] / row["iterations"]}]
 
 
+def finding(rows: list[Row]) -> list[str]:
+  """Returns what the page begins with."""
+  good = [r for r in rows if r["gain"] > 0]
+  best = max(rows, key=lambda r: r["gain"])
+  return [
+    f"Solving on a part of the nodes alone saves products in {len(good)} of {len(rows)} cases.",
+    f"It saves most, {best['gain']:.0%}, with {best['nodes']} nodes and a tolerance of "
+    f"{best['tolerance']:g}.",
+    "So the solver always solves on all nodes.",
+  ]
+
+
 def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
   """Writes the page."""
   table = [
@@ -170,7 +182,8 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
   ]  # fmt: skip
   head = ["nodes", "bend", "tolerance", "warm residual", "its carriers", "iterations", "active"]
   lines = [str(__doc__).partition("\n\n")[2], "", *plots.table([*head, "cost", "gain"], table)]
-  return [results.page(out / "locality.md", "What leaving out nodes would gain", about, lines)]
+  title = "What leaving out nodes would gain"
+  return [results.page(out / "locality.md", title, about, lines, finding(rows))]
 
 
 BENCH = Bench("locality", stages, run, report=report, arguments=arguments,

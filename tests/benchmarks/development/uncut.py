@@ -166,6 +166,17 @@ def arguments(parser: argparse.ArgumentParser):
   add("--rounds", type=int, default=60, help="of each life (%(default)s)")
 
 
+def finding(rows: list[Row]) -> list[str]:
+  """Returns what the page begins with."""
+  sheets = [100 * (r["ratio"] - 1) for r in rows if "closed" not in r["scene"]]
+  closed = [f"{r['scene']} {100 * (r['ratio'] - 1):+.1f} %" for r in rows if "closed" in r["scene"]]
+  lines = []
+  if sheets:
+    lines.append(f"Steps of sheets that are never cut changed by {min(sheets):+.1f} to "
+                 f"{max(sheets):+.1f} %.")  # fmt: skip
+  return [*lines, *([f"Steps of closed organs: {', '.join(closed)}."] if closed else [])]
+
+
 def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
   """Writes the page."""
 
@@ -183,7 +194,12 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
   lines += ["Differences with their standard error over lives. " + results.link(out / "uncut.csv")]
   lines += ["", *plots.table(head, table)]
   title = "What cuts cost organs that have no room for them"
-  return [results.page(out / "uncut.md", title, about, lines)]
+  good = [row for row in rows if row["status"] == "ok"]
+  picture = plots.bars(out / "uncut.png", title, [row["scene"] for row in good], {
+    "now to before": [100 * (row["ratio"] - 1) for row in good],
+    "control": [100 * (row["control"] - 1) for row in good],
+  }, "change of the time of a step [%]")  # fmt: skip
+  return [picture, results.page(out / "uncut.md", title, about, lines, finding(good), picture)]
 
 
 BENCH = Bench("uncut", stages, run, report=report, arguments=arguments, jobs=1, limit=3600.0,

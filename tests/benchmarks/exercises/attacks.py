@@ -104,6 +104,13 @@ def arguments(parser: argparse.ArgumentParser):
                       help=f"of attacks: {', '.join(WHAT)} (all)")  # fmt: skip
 
 
+def finding(rows: list[Row]) -> list[str]:
+  """Returns what the page begins with."""
+  tried, failed = (sum(row[key] for row in rows) for key in ("tried", "failed"))
+  kinds = ", ".join(what for kind, what in WHAT.items() if any(r["kind"] == kind for r in rows))
+  return [f"{failed} of {tried:,} random attacks and steps failed.", f"Tried: {kinds}."]
+
+
 def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
   """Writes the page."""
   table = []
@@ -129,7 +136,7 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
     *(["", "What failed:", "", *why] if why else []),
     *(["", "What was said of tools at full scale:", "", *said] if said else []),
   ]
-  return [results.page(out / "attacks.md", "What attacks break", about, lines)]
+  return [results.page(out / "attacks.md", "What attacks break", about, lines, finding(rows))]
 
 
 BENCH = Bench("attacks", stages, run, report=report, arguments=arguments, limit=3600.0)

@@ -132,6 +132,14 @@ def run(case: Case, out: pathlib.Path) -> list[Row]:
   ]
 
 
+def finding(rows: list[Row]) -> list[str]:
+  """Returns what the page begins with."""
+  return [
+    f"{r['demonstrations']} demonstrations: {r['success']} of {r['episodes']} episodes succeed."
+    for r in sorted((r for r in rows if r["status"] == "ok"), key=lambda r: r["demonstrations"])
+  ][-3:]
+
+
 def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
   """Writes the page."""
   lines = ["| demonstrations | steps | training | success | damage | time limit |",
@@ -146,7 +154,7 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
           f"network of {' and '.join(map(str, LAYERS))} tanh units (scikit-learn), judged in seeds "
           f"from {UNSEEN} on.")  # fmt: skip
   path = out / "cloning.md"
-  results.page(path, "Behaviour cloning", about, [head, "\n".join(lines)])
+  results.page(path, "Behaviour cloning", about, [head, "\n".join(lines)], finding(rows))
   return [path]
 
 

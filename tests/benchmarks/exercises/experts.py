@@ -76,6 +76,23 @@ def run(case: Case, out) -> list[Row]:
   return rows
 
 
+def finding(rows: list[Row]) -> list[str]:
+  """Returns what the page begins with."""
+  lines = []
+  for who in ("expert", "skilled", "novice"):
+    mine = [r for r in rows if r["status"] == "ok" and r["who"] == who]
+    if mine:
+      won = sum(r["outcome"] == score.SUCCESS for r in mine)
+      lines.append(f"Of {len(mine)} episodes of {who} performers {won} succeed and "
+                   f"{_share(mine):.0f} % are proficient.")  # fmt: skip
+  return lines
+
+
+def _share(rows: list[Row]) -> float:
+  """Returns the share of episodes that are proficient [%]; NaN of none."""
+  return 100 * sum(int(r["proficient"] or 0) for r in rows) / len(rows) if rows else math.nan
+
+
 def report(rows: list[Row], about: dict, out) -> list:
   """Writes the page: a line an exercise, and what the groups fail by."""
   groups: dict[tuple[str, str], list[Row]] = collections.defaultdict(list)
@@ -92,7 +109,10 @@ def report(rows: list[Row], about: dict, out) -> list:
   lines += [_WHAT + results.link(out / "experts.csv"), "", *plots.table(head, table), ""]
   lines += ["## What they fail by", "", *plots.table(_WHY, list(_reasons(groups)))]
   title = "Experts, skilled people and novices"
-  return [results.page(out / "experts.md", title, about, lines)]
+  picture = plots.bars(out / "experts.png", "Episodes that are proficient", names, {
+    who: [_share(groups.get((name, who), [])) for name in names] for who in GROUPS
+  }, "share of the episodes [%]")  # fmt: skip
+  return [picture, results.page(out / "experts.md", title, about, lines, finding(rows), picture)]
 
 
 _HEAD = ("success", "proficient", "score")

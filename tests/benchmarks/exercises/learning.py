@@ -133,6 +133,20 @@ def run(case: Case, out: pathlib.Path) -> list[Row]:
   return rows
 
 
+def finding(rows: list[Row]) -> list[str]:
+  """Returns what the page begins with."""
+  agent = [r for r in rows if r["policy"] == "SAC"]
+  first = next((r for r in agent if r["success_percent"] >= 95), None)
+  lines = [f"Random actions succeed in {rows[0]['success_percent']:.0f} % of the episodes."]
+  if first:
+    lines.append(f"SAC succeeds in {first['success_percent']:.0f} % after "
+                 f"{first['simulated_s'] / 60:.0f} minutes of practice.")  # fmt: skip
+  last = agent[-1]
+  return [*lines, f"At the end, after {last['simulated_s'] / 60:.0f} simulated minutes and "
+          f"{last['training_s'] / 60:.0f} minutes of training, it succeeds in "
+          f"{last['success_percent']:.0f} % of {last['episodes']}."]  # fmt: skip
+
+
 def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
   """Draws return and success over training."""
   from matplotlib.figure import Figure
@@ -167,10 +181,10 @@ def write(rows: list[Row], about: dict, out: pathlib.Path) -> pathlib.Path:
     "has not seen, beside random actions. " + results.link(out / "learning.csv"),
     "",
     *plots.table(head, table),
-    "",
-    "![return and success of SAC on touch/easy over 20 minutes of practice](learning.png)",
   ]
-  return results.page(out / "learning.md", "Learning `touch/easy`", about, lines)
+  picture = out / "learning.png"
+  return results.page(out / "learning.md", "Learning `touch/easy`", about, lines, finding(rows),
+                      picture if picture.exists() else None)  # fmt: skip
 
 
 BENCH = Bench("learning", stages, run, report=report, arguments=arguments)

@@ -278,6 +278,29 @@ def run(case: Case, out: pathlib.Path) -> list[Row]:
   return [row]
 
 
+def _extreme(rows: list[Row], task: str, key: str, pick) -> float:
+  found = [float(r[key]) for r in rows if r["task"] == task and math.isfinite(float(r[key]))]
+  return pick(found) if found else math.nan
+
+
+def finding(rows: list[Row]) -> list[str]:
+  """Returns what the page begins with."""
+  tried, work, failed = (
+    sum(int(row[key]) for row in rows)
+    for key in ("tried", "policies_without_the_work", "failures_with_a_score")
+  )
+  tasks = dict.fromkeys(row["task"] for row in rows)
+  limits = ("most_without_success", max), ("least_with_success", min)
+  over = [task for task in tasks
+          if _extreme(rows, task, *limits[0]) >= _extreme(rows, task, *limits[1])]  # fmt: skip
+  return [
+    f"Of {tried} policies that a search tried {work} succeeded without the work.",
+    f"{failed} failures had a score.",
+    f"Failure was paid as much as some success in {len(over)} of {len(tasks)} exercises"
+    f"{': ' * bool(over)}{', '.join(over)}.",
+  ]
+
+
 def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
   """Writes the page."""
 
@@ -313,7 +336,13 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
     "",
   ]
   lines += plots.table(head, table)
-  return [results.page(out / "loopholes.md", "Loopholes of the exercises", about, lines)]
+  tasks = list(dict.fromkeys(row["task"] for row in rows))
+  title = "Loopholes of the exercises"
+  picture = plots.bars(out / "loopholes.png", "What a search was paid", tasks, {
+    "most paid without success": [_extreme(rows, task, limits[0], max) for task in tasks],
+    "least paid with success": [_extreme(rows, task, limits[1], min) for task in tasks],
+  }, "return")  # fmt: skip
+  return [picture, results.page(out / "loopholes.md", title, about, lines, finding(rows), picture)]
 
 
 BENCH = Bench("loopholes", stages, run, report=report, arguments=arguments, jobs=2, limit=3600.0)

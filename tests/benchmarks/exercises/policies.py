@@ -92,6 +92,29 @@ def _side_by_side(name: str, file: str, count: int) -> int:
   return won
 
 
+def finding(judged: dict[str, list[Row]]) -> list[str]:
+  """Returns what the page begins with: of the episodes of each exercise."""
+  if not judged:
+    return []
+  won = {name: _share(rows, lambda r: r["outcome"] == score.SUCCESS)
+         for name, rows in judged.items()}  # fmt: skip
+  worst = min(won, key=lambda name: won[name])
+  count = sum(map(len, judged.values()))
+  passed = _share(
+    [r for rows in judged.values() for r in rows], lambda r: int(r["proficient"] or 0)
+  )
+  return [
+    f"{sum(share == 100 for share in won.values())} of {len(won)} policies succeed in every "
+    f"episode, {sum(share >= 90 for share in won.values())} in 90 % or more.",
+    f"`{worst}` succeeds least often, in {won[worst]:.0f} %.",
+    f"{passed:.0f} % of all {count} episodes are proficient by the experts' limits.",
+  ]
+
+
+def _share(rows: list[Row], which) -> float:
+  return 100 * sum(bool(which(r)) for r in rows) / len(rows)
+
+
 def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
   """Writes the page: a line an exercise."""
   groups: dict[str, list[Row]] = collections.defaultdict(list)
@@ -118,7 +141,13 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
     f"that one's training: with 0 lessons it is that one. {results.link(out / 'policies.csv')}",
     "", *plots.table(head, table),
   ]  # fmt: skip
-  return [results.page(out / "policies.md", "Policies that were trained", about, lines)]
+  judged = {name: groups[name] for name in NAMES if name in groups}
+  title = "Policies that were trained"
+  picture = plots.bars(out / "policies.png", "Policies that ship", list(judged), {
+    "success": [_share(rows, lambda r: r["outcome"] == score.SUCCESS) for rows in judged.values()],
+    "proficient": [_share(rows, lambda r: int(r["proficient"] or 0)) for rows in judged.values()],
+  }, "share of the episodes [%]")  # fmt: skip
+  return [picture, results.page(out / "policies.md", title, about, lines, finding(judged), picture)]
 
 
 def _line(name: str, rows: list[Row]) -> list[str]:

@@ -83,7 +83,20 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
   for task in dict.fromkeys(row["task"] for row in rows):
     lines += _task(task, [row for row in rows if row["task"] == task], told)
   lines = [*head, "", "## Metric by metric", "", *_verdicts(told), *lines]
-  return [results.page(out / "skill.md", "Metrics: expert against novices", about, lines)]
+  title = "Metrics: expert against novices"
+  return [results.page(out / "skill.md", title, about, lines, finding(told))]
+
+
+def finding(told: dict[tuple[str, str], dict[str, float]]) -> list[str]:
+  """Returns what the page begins with: d by task for every (metric, novice)."""
+  found = {(metric, style, task): d for (metric, style), by_task in told.items()
+           for task, d in by_task.items() if metric in STATED[style][1]}  # fmt: skip
+  missed = sorted({METRICS[metric].label for (metric, _, _), d in found.items() if d < LARGE})
+  good = sum(d >= LARGE for d in found.values())
+  return [
+    f"Metrics tell a novice from the expert in {good} of {len(found)} cases where they must.",
+    f"Not everywhere: {', '.join(missed) or 'none'}.",
+  ]
 
 
 def _task(name: str, rows: list[Row], told: dict) -> list[str]:

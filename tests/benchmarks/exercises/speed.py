@@ -151,6 +151,20 @@ def run(case: Case, out: pathlib.Path) -> list[Row]:
   return [row | (race(name, case["against"], case["episodes"]) if case["against"] else none)]
 
 
+def finding(rows: list[Row]) -> list[str]:
+  """Returns what the page begins with."""
+  if not rows:
+    return []
+  least, most = (pick(rows, key=lambda r: r["steps_per_s"]) for pick in (min, max))
+  share = max(r["metrics_percent"] for r in rows)
+  return [
+    f"One core takes {least['steps_per_s']:.0f} (`{least['task']}`) to {most['steps_per_s']:.0f} "
+    f"(`{most['task']}`) control steps a second.",
+    f"Every exercise runs at least {0.02 * least['steps_per_s']:.2g} times as fast as real time.",
+    f"Recording and metrics take at most {share:.0f} % of a step.",
+  ]
+
+
 def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
   """Writes the page."""
   raced = all(row["times"] for row in rows)
@@ -172,7 +186,11 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
       "commit. "
     )
   lines = [text + results.link(out / "exercises_cpu.csv"), "", *plots.table(head, table)]
-  return [results.page(out / "exercises.md", "How fast the exercises run", about, lines)]
+  title = "How fast the exercises run"
+  rates = {"": [r["steps_per_s"] for r in rows]}
+  names = [r["task"] for r in rows]
+  picture = plots.bars(out / "exercises.png", title, names, rates, "control steps a second")
+  return [picture, results.page(out / "exercises.md", title, about, lines, finding(rows), picture)]
 
 
 BENCH = Bench("speed", stages, run, report=report, arguments=arguments, file="exercises_cpu")

@@ -239,12 +239,29 @@ def draw(out: pathlib.Path) -> pathlib.Path:
   return plots.save(figure, out / "batch.png", "Batches on one GPU")
 
 
+def finding(out: pathlib.Path) -> list[str]:
+  """Returns what the page begins with."""
+  rows = [r for path in sorted(out.glob("batch_c*.csv")) for r in results.read(path)]
+  rows = [r for r in rows if r["status"] == "ok"]
+  lines = []
+  for device in dict.fromkeys(r["device"] for r in rows if r["device"].startswith("cuda")):
+    best = max((r for r in rows if r["device"] == device), key=lambda r: r["rate"])
+    lines.append(
+      f"{1 + device.count('+')} GPU{'s' * ('+' in device)}: up to {best['rate'] / 1e6:.3g} "
+      f"million world-steps a second ({best['nodes']} nodes, {best['nworld']} worlds)."
+    )
+  off = [r["force_rms"] for r in rows if r["device"] != "cpu" and r["force_rms"] >= 0]
+  if off:
+    lines.append(f"Forces differ from the CPU's by at most {100 * max(off):.1g} % of their peak.")
+  return lines[-3:]
+
+
 def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
   """Writes the page, of all devices that there are results of."""
   title, lines = "How many worlds a batch steps a second", table(out)
   picture = draw(out)
-  lines += ["", "![world-steps a second over worlds](batch.png)", "", *PUBLISHED]
-  return [picture, results.page(out / "batch.md", title, about, lines)]
+  lines += ["", *PUBLISHED]
+  return [picture, results.page(out / "batch.md", title, about, lines, finding(out), picture)]
 
 
 BENCH = Bench("batch", stages, run, report=report, arguments=arguments, file="batch_{device}")

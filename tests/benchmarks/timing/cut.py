@@ -211,6 +211,31 @@ def arguments(parser: argparse.ArgumentParser):
   parser.add_argument("--tissues", nargs="+", choices=TISSUES, default=TISSUES)
 
 
+def finding(rows: list[Row]) -> list[str]:
+  """Returns what the page begins with."""
+  lines = []
+  for name, tissues in (("sheets", ("membrane", "plate")), ("solids", ("solid",))):
+    mine = [r for r in rows if r["status"] == "ok" and r["tissue"] in tissues]
+    if mine:
+      some = [r["cut_ms"] for r in mine]
+      most = max(mine, key=lambda r: r["ratio"])
+      lines.append(
+        f"A cut of two edges adds {min(some):.2g} to {max(some):.2g} ms to a step of {name}; a "
+        f"step with it takes at most {most['ratio']:.2g} times one in contact ({most['nodes']} "
+        f"nodes, {most['tool']}, {most['tissue']})."
+      )
+  return lines
+
+
+def draw(rows: list[Row], out: pathlib.Path) -> pathlib.Path:
+  """Draws a step in contact, one that cuts, and the cut alone."""
+  good = [r for r in rows if r["status"] == "ok"]
+  names = [f"{r['nodes']} nodes, {r['tissue']}, {r['tool']}" for r in good]
+  keys = {"step in contact": "contact_ms", "step that cuts": "open_ms", "cut alone": "cut_ms"}
+  groups = {label: [r[key] for r in good] for label, key in keys.items()}
+  return plots.bars(out / "cut.png", "What cutting costs a step", names, groups, "CPU time [ms]")
+
+
 def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
   """Writes the page."""
   names = ("contact", "moving", "between", "mean", "cut", "open", "open_most")
@@ -240,7 +265,11 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
     "",
     *plots.table(head, table),
   ]
-  return [results.page(out / "cut.md", "What cutting costs a step", about, lines)]
+  picture = draw(rows, out)
+  page = results.page(
+    out / "cut.md", "What cutting costs a step", about, lines, finding(rows), picture
+  )
+  return [picture, page]
 
 
 BENCH = Bench("cut", stages, run, report=report, arguments=arguments)

@@ -28,8 +28,8 @@ import palpate.batch
 import warp as wp
 from benchmarks import plots, results
 from benchmarks.accuracy import peer
-from benchmarks.timing import batch
 from benchmarks.runner import Bench, Case, Row
+from benchmarks.timing import batch
 
 TOLERANCES = {"flex": (1e-6, 1e-4), "ours": (1e-3, 1e-2)}  # float32 has no finer ones
 STEPS = (1e-3, 2e-3, 4e-3)  # [s]
@@ -225,6 +225,37 @@ def run(case: Case, out: pathlib.Path) -> list[Row]:
   return [measure(**{key: value for key, value in case.items() if key != "case"})]
 
 
+def finding(rows: list[Row]) -> list[str]:
+  """Returns what the page begins with."""
+  lines = []
+  for kind in dict.fromkeys(r["kind"] for r in rows):
+    most = max(r["nworld"] for r in rows if r["kind"] == kind)
+    here = [r for r in rows if (r["kind"], r["nworld"]) == (kind, most)]
+    for level in LEVELS:
+      ours, flex = (
+        max((r["rate"] * r["h"] for r in here if r["side"] == side and r["error"] <= level),
+            default=0.0)
+        for side in ("ours", "flex")
+      )  # fmt: skip
+      if ours and flex:
+        lines.append(f"{kind}, {most} worlds, error up to {100 * level:g} %: ours simulates "
+                     f"{ours / flex:.2g} times as much time a second.")  # fmt: skip
+        break
+  return lines
+
+
+def draw(rows: list[Row], out: pathlib.Path) -> pathlib.Path:
+  """Draws simulated time a second over the force error."""
+  panels: dict = {}
+  for key in dict.fromkeys((r["kind"], r["nworld"], r["side"]) for r in rows):
+    mine = [r for r in rows if (r["kind"], r["nworld"], r["side"]) == key]
+    mine.sort(key=lambda r: r["error"])
+    line = [100 * r["error"] for r in mine], [r["rate"] * r["h"] for r in mine]
+    panels.setdefault(key[0], {})[f"{key[2]}, {key[1]} worlds"] = line
+  title = "Above and left is better"
+  return plots.curves(out / "flex.png", title, panels, "force error [%]", "simulated s a second")
+
+
 def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
   """Writes the page."""
   done = [row for row in rows if row["status"] == "ok"]
@@ -251,7 +282,9 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
         lines.append(f"{kind}, {count} worlds, error up to {100 * level:g} %: ours simulates "
                      f"{fastest[0] / fastest[1]:.3g} times as much time a second.\n")  # fmt: skip
   lines += [*batch.PUBLISHED, "", results.link(out / f"flex_{_kind(about)}.csv")]
-  return [results.page(out / "flex.md", "Batches beside mujoco_warp's flex", about, lines)]
+  picture = draw(done, out)
+  title = "Batches beside mujoco_warp's flex"
+  return [picture, results.page(out / "flex.md", title, about, lines, finding(done), picture)]
 
 
 def _kind(about: dict) -> str:

@@ -269,6 +269,18 @@ def draw(rows: list[Row], out: pathlib.Path) -> list[pathlib.Path]:
   return [plots.save(figure, out / "live.png", "A live loop while a page shows it")]
 
 
+def finding(rows: list[Row]) -> list[str]:
+  """Returns what the page begins with."""
+  lines = []
+  for row in rows:
+    if row["kind"] in ("exercise", "practice") and row["late"] != "":
+      lines.append(f"In `{row['kind']}` {100 * row['on_time']:.2f} % of the steps of 1 ms are on "
+                   f"time; a hand's motion is in the picture after {row['way_ms']:.0f} ms "
+                   "(median).")  # fmt: skip
+  cost = [row["beside_us"] for row in rows if row["kind"] == "beside"]
+  return [*lines, *(f"The loop costs {us:.0f} us a step beside physics." for us in cost)][:3]
+
+
 def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
   """Draws the figure and writes the page."""
   good = [r for r in rows if r["status"] == "ok"]
@@ -298,7 +310,10 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
   lines += [*plots.table(["mesh", "nodes", "made ready in", *SCHEMES], cells), ""]
   wanted = f"{100 * ON_TIME} % on time, {PICTURES} pictures a second, {1e3 * WAY:.0f} ms"
   lines += [f"Asked for: {wanted}, {1e6 * BESIDE:.0f} us.", "", results.link(out / "live.csv")]
-  return [*draw(good, out), results.page(out / "live.md", "A live loop", about, lines)]
+  drawn = draw(good, out)
+  picture = drawn[0] if drawn else None
+  page = results.page(out / "live.md", "A live loop", about, lines, finding(good), picture)
+  return [*drawn, page]
 
 
 def _rate(row: Row | None) -> str:

@@ -26,7 +26,7 @@ import numpy as np
 import palpate
 import scenes
 import warp as wp
-from benchmarks import results, runner
+from benchmarks import plots, results, runner
 from benchmarks.runner import Bench, Case, Row
 from palpate.engine import workspace
 from palpate.engine.layout import HEAD, MODE
@@ -340,10 +340,44 @@ def run(case: Case, out: pathlib.Path) -> list[Row]:
   return [measure(**{key: value for key, value in case.items() if key != "case"})]
 
 
+def _rates(out: pathlib.Path) -> dict[str, list[Row]]:
+  """Returns the rows with friction of each kind of device, skins before solids."""
+  found = {}
+  for path in sorted(out.glob("loop_*.csv")):
+    rows = [r for r in results.read(path) if r["status"] == "ok" and r["condim"] == 3]
+    if rows:
+      name = f"{'solid, ' * ('solid' in path.stem)}{rows[0]['device'].partition(':')[0]}"
+      found[name] = sorted(rows, key=lambda r: r["nodes"])
+  return found
+
+
+def finding(out: pathlib.Path) -> list[str]:
+  """Returns what the page begins with."""
+  lines = []
+  for name, rows in _rates(out).items():
+    fast = [r for r in rows if r["rate_Hz"] >= 1000]
+    if fast and "solid" not in name:
+      lines.append(f"On `{name}` a whole step with a probe in contact runs at 1 kHz or faster up "
+                   f"to {fast[-1]['nodes']} nodes ({fast[-1]['rate_Hz']:.0f} Hz).")  # fmt: skip
+  solids = [f"{rows[-1]['rate_Hz']:.0f} Hz on `{name.removeprefix('solid, ')}` "
+            f"({rows[-1]['nodes']} surface nodes)"
+            for name, rows in _rates(out).items() if "solid" in name]  # fmt: skip
+  return [*lines, *(["The largest solid: " + ", ".join(solids) + "."] if solids else [])][:3]
+
+
+def draw(out: pathlib.Path) -> pathlib.Path:
+  """Draws the rate over the number of nodes."""
+  panels = {"": {name: ([r["nodes"] for r in rows], [r["rate_Hz"] for r in rows])
+                 for name, rows in _rates(out).items()}}  # fmt: skip
+  title = "Whole steps with a probe in contact"
+  return plots.curves(out / "loop.png", title, panels, "nodes", "steps a second")
+
+
 def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
   """Writes the page, of all devices that there are results of."""
-  return [results.page(out / "loop.md", "What a step costs, and where the time goes", about,
-                       table(out))]  # fmt: skip
+  title = "What a step costs, and where the time goes"
+  picture = draw(out)
+  return [picture, results.page(out / "loop.md", title, about, table(out), finding(out), picture)]
 
 
 BENCH = Bench("loop", stages, run, report=report, arguments=arguments, file="loop{solid}_{device}")

@@ -95,6 +95,17 @@ def arguments(parser: argparse.ArgumentParser):
   parser.add_argument("--nodes", type=int, nargs="+", default=[1000, 4000])
 
 
+def finding(rows: list[Row]) -> list[str]:
+  """Returns what the page begins with."""
+  return [
+    f"{r['nodes']} nodes: a step takes {r['asleep_us']:.0f} us asleep, {r['awake_us']:.0f} us "
+    f"awake and {r['bare_us']:.0f} us without the organ; {r['mujoco_us']:.0f} us of the first are "
+    "MuJoCo's."
+    for r in rows
+    if not r["insertion_m"]
+  ][:3]
+
+
 def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
   """Writes the page."""
   table = []
@@ -113,7 +124,13 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
     "",
     *plots.table([*head, "asleep, with the flag"], table),
   ]
-  return [results.page(out / "rest.md", "What a sleeping organ costs", about, lines)]
+  names = [f"{r['nodes']} nodes, {'withdrawn' if r['insertion_m'] else 'home pose'}" for r in rows]
+  title = "What a sleeping organ costs"
+  picture = plots.bars(out / "rest.png", title, names, {
+    label: [r[f"{key}_us"] for r in rows]
+    for label, key in (("kept awake", "awake"), ("asleep", "asleep"), ("without it", "bare"))
+  }, "CPU time of a step [us]")  # fmt: skip
+  return [picture, results.page(out / "rest.md", title, about, lines, finding(rows), picture)]
 
 
 BENCH = Bench("rest", stages, run, report=report, arguments=arguments, file="rest_cpu")

@@ -222,6 +222,33 @@ def run(case: Case, out: pathlib.Path) -> list[Row]:
   return measure(args.device, args.nodes, args.tolerance, args.bend, args)
 
 
+def finding(rows: list[Row]) -> list[str]:
+  """Returns what the page begins with."""
+  lines = []
+  for bend in (0, 1):
+    mine = sorted((r for r in rows if r["bend"] == bend and r["auto"] == r["preconditioner"]),
+                  key=lambda r: r["nodes"])  # fmt: skip
+    if mine:
+      told = [f"{r['step_ms']:.2g} ms ({r['nodes']} nodes)" for r in (mine[0], mine[-1])]
+      name = "with" if bend else "without"
+      lines.append(f"A step from a cold start {name} bending takes {' to '.join(told)}.")
+  chosen = [r["nodes"] for r in rows if r["auto"] == r["preconditioner"] == "multilevel"]
+  if chosen:
+    lines.append(f"The plugin takes the multilevel preconditioner from {min(chosen)} nodes on.")
+  return lines
+
+
+def draw(rows: list[Row], path: pathlib.Path) -> pathlib.Path:
+  """Draws the step over the number of nodes."""
+  panels: dict = {}
+  for r in sorted(rows, key=lambda r: r["nodes"]):
+    panel = panels.setdefault(f"bending {'on' if r['bend'] else 'off'}", {})
+    x, y = panel.setdefault(r["preconditioner"], ([], []))
+    x.append(r["nodes"])
+    y.append(r["step_ms"])
+  return plots.curves(path, "The organ's step alone", panels, "nodes", "step [ms]")
+
+
 def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
   """Writes the page, of the device that there are results of."""
   path = out / f"solver_{str(rows[0]['device']).partition(':')[0]}.csv"
@@ -241,7 +268,9 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
   head = ["nodes", "bending", "tolerance", "preconditioner", "chosen", "step", "assemble", "solve"]
   lines += plots.table([*head, "iterations", "bytes a node"], table)
   name = "solver.md" if path.stem == "solver_cuda" else f"{path.stem}.md"
-  return [results.page(out / name, "The organ's step alone", about, lines)]
+  picture = draw(rows, (out / name).with_suffix(".png"))
+  page = results.page(out / name, "The organ's step alone", about, lines, finding(rows), picture)
+  return [picture, page]
 
 
 BENCH = Bench("solver", stages, run, report=report, arguments=arguments, begin=begin,

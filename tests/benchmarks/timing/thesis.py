@@ -23,8 +23,8 @@ import palpate
 import scenes
 import warp as wp
 from benchmarks import plots, results, runner, scene
-from benchmarks.timing import loop
 from benchmarks.runner import Bench, Case, Row
+from benchmarks.timing import loop
 
 SIDES = (16, 32, 64, 128, 256)
 DRAWN = (16, 64, 128)  # the sizes of the figures
@@ -394,13 +394,28 @@ def _speedup(rates: dict[tuple, Row]) -> list[str]:
   return out
 
 
+def finding(rows: list[Row]) -> list[str]:
+  """Returns what the page begins with."""
+  lines = []
+  for (scheme, device), then in RATE.items():
+    mine = [r for r in _stable(rows) if (r["scheme"], r["device"]) == (scheme, device)]
+    found = {r["side"]: r["rate_hz"] for r in mine if r["side"] in then}
+    if found:
+      side = max(found)
+      lines.append(f"`{scheme}` on {device}, {side} x {side}: {found[side]:.0f} haptic cycles a "
+                   f"second, {found[side] / then[side]:.2g} times the thesis's "
+                   f"{then[side]}.")  # fmt: skip
+  return lines
+
+
 def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
   """Draws the figures and writes the page, of all devices that there are results of."""
   rows = [r for path in sorted(out.glob("thesis_c*.csv")) for r in results.read(path)
           if r["status"] == "ok"]  # fmt: skip
+  drawn = draw(rows, out)
   page = results.page(out / "thesis.md", "The tables of the thesis, measured today", about,
-                      summarize(rows))  # fmt: skip
-  return [*draw(rows, out), page]
+                      summarize(rows), finding(rows), drawn[0])  # fmt: skip
+  return [*drawn, page]
 
 
 BENCH = Bench(
