@@ -24,7 +24,7 @@ PAGES = [
     "docs/tutorials/*.md",
     "tasks/*.md",
     "models/*/*.md",
-    "tests/benchmarks/results/*.md",
+    "tests/benchmarks/results/**/*.md",
   )
   for page in sorted(ROOT.glob(pattern))
 ]

@@ -7,7 +7,8 @@ import sys
 
 import numpy as np
 import pytest
-from benchmarks import cloning, experts, loopholes, results, run, skill
+from benchmarks import results, run
+from benchmarks.exercises import cloning, experts, loopholes, skill
 from palpate.app import panel
 from palpate.tasks.core import performer
 from palpate.tasks.learn import policy

@@ -7,7 +7,7 @@
 namespace palpate {
 
 // How far a mesh yields at a node to a unit force there, times E* and its edges' mean length: that of
-// pressed blocks (tests/benchmarks/truth.py).
+// pressed blocks (tests/benchmarks/accuracy/truth.py).
 constexpr double SELF = 1.75;
 
 // Edges that a tool's radius has at least, else it is told that the mesh is too coarse.
