@@ -60,19 +60,8 @@ FLAG = Numbers(
   ("answered", 1, "-", "the organ responded to that"),
   ("foreseen", 1, "-", "what acts on the organ is what was guessed"),
   ("weighed", 1, "-", "rows of contacts changed, or may have, that MuJoCo has made use of"),
-  ("stage", 1, "-", "how far the step is, see STAGE"),
   ("fast", 1, "-", "a tool may go through the organ and out again between two looks"),
   ("coarse", 1, "um", "edge that a tool needs which is too small for the mesh; negative once told"),
-)
-
-# What of a step is done that must not be done twice. These are values, not offsets.
-STAGE = Numbers(
-  "STAGE",
-  ("begun", 1, "-", "nothing"),
-  ("gathered", 1, "-", "contacts got their weights, and what acts was read"),
-  ("pushed", 1, "-", "the passive force was added"),
-  ("left", 1, "-", "contact forces and motion were taken from MuJoCo"),
-  ("ended", 1, "-", "the plugin state was stepped"),
 )
 
 # How the last step ends on the nodes' side. These are values, not offsets.
@@ -199,7 +188,7 @@ TAIL = Numbers(
 )
 
 TABLES = (
-  FLAG, STAGE, MODE, HEAD, MOVED, PUSHED, GEOM, SUMMARY, ANSWER, RECORD, POSE, BOND, BLADE, LAW,
+  FLAG, MODE, HEAD, MOVED, PUSHED, GEOM, SUMMARY, ANSWER, RECORD, POSE, BOND, BLADE, LAW,
   TAIL,
 )  # fmt: skip
 CONSTANTS = {

@@ -9,6 +9,7 @@ from __future__ import annotations
 import atexit
 import ctypes as C
 import functools
+import sys
 from typing import Any
 
 import mujoco
@@ -17,7 +18,7 @@ from palpate.tissue.config import KEYS
 
 from . import change, contacts, signals, workspace
 from .forces import declare_attachments, declare_bonds, supports
-from .layout import FLAG, STAGE
+from .layout import FLAG
 from .model import mjstruct, skin, state_size
 from .model.mjstruct import NAME, warn
 from .windows import windowed
@@ -164,14 +165,10 @@ def _reset(model: int, state: int, unused: int | None, instance: int):
 @signals.watch
 def _compute(model: int, data: int, instance: int, capability: int):
   w = _workspaces[data, instance]
-  w.flags[FLAG.stage] = STAGE.begun
-  again = True
-  while again:
-    try:
-      _push(w, model)
-      again = False
-    except BaseException as error:
-      again = _fail(w, error)
+  try:
+    _push(w, model)
+  except BaseException as error:
+    _fail(w, error)
   return signals.leave()
 
 
@@ -190,14 +187,10 @@ def _push(w: Workspace, model: int):
 @signals.watch
 def _advance(model: int, data: int, instance: int):
   w = _workspaces[data, instance]
-  w.flags[FLAG.stage] = STAGE.pushed
-  again = True
-  while again:
-    try:
-      _end(w)
-      again = False
-    except BaseException as error:
-      again = _fail(w, error)
+  try:
+    _end(w)
+  except BaseException as error:
+    _fail(w, error)
   return signals.leave()
 
 
@@ -267,23 +260,35 @@ def _find_bad_state(w: Workspace):
 
 def _say(error: BaseException):
   """Makes the error message of a model that does not compile."""
-  if signals.is_foreign(error):
+  if not isinstance(error, Exception):
     signals.raise_later(error)
   warn(str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}")
 
 
-def _fail(w: Workspace, error: BaseException) -> bool:
-  """Makes an error of an exception in a callback; returns whether the callback is to go on.
-
-  It is where a signal's handler ended it, but not where the motion is on a device: that may be a
-  step ahead.
-  """
-  if not signals.is_foreign(error):
+def _fail(w: Workspace, error: BaseException):
+  """Makes an error of an exception in a callback, whose step is not whole."""
+  if isinstance(error, Exception):
     w.note(f"{type(error).__name__}: {error}")
-    return False
+  else:
+    _interrupt(w, error)
+
+
+def _interrupt(w: Workspace | None, error: BaseException):
+  """Makes an error of what a signal's handler raised, and raises that after the callback."""
   signals.raise_later(error)
-  w.torn = w.resident is not None
-  return not w.torn
+  if w is not None:
+    w.note(f"a step was interrupted by {type(error).__name__}; reset the data or set a state")
+
+
+@signals.watch
+def _on_unraisable(unraisable, before=sys.unraisablehook):
+  """Takes what a signal's handler raised at the first or last instruction of a callback."""
+  trace = unraisable.exc_traceback
+  if trace is None or not signals.is_callback(trace.tb_frame.f_code):
+    return before(unraisable)
+  known = trace.tb_frame.f_locals
+  _interrupt(_workspaces.get((known.get("data"), known.get("instance"))), unraisable.exc_value)
+  return signals.leave()
 
 
 def _watch(w: Workspace):
@@ -358,6 +363,7 @@ def register() -> int:
     raise ImportError(f"palpate: MuJoCo did not accept the plugin {NAME!r} (slot {number})")
   _keep.append((plugin, attributes))
   atexit.register(_let_go, number)
+  sys.unraisablehook = _on_unraisable
   signals.install()
   return number
 

@@ -23,7 +23,7 @@ from .forces.cohesive_bonds import Bonds
 from .forces.passive import Beside, Hold
 from .forces.relaxation import Creep
 from .forces.supports import Rests
-from .layout import FLAG, HEAD, STAGE
+from .layout import FLAG, HEAD
 from .model import declare, inertia, mjstruct, prepare, skin
 from .model.declare import Declaration
 from .penetration import Watch
@@ -74,8 +74,7 @@ class Workspace:
     missed: most nodes and triangles that the windows had no room for in a step
     warning: last index and count of each of MuJoCo's warnings, one after the other
     strange: whether the plugin state is not one of this organ
-    noticed, torn: whether it was said that windows came without their state; whether a signal's
-      handler has ended a callback of the last step
+    noticed: whether it was said that windows came without their state
     watch: looks whether tools come through the surface
     nbad: MuJoCo's warnings of bad states that were looked at since the last reset
     model_step, time_step: the model's time step comes first, and the armature's [s]
@@ -126,7 +125,6 @@ class Workspace:
   missed: tuple[int, int] = (0, 0)
   strange: bool = False
   noticed: bool = False
-  torn: bool = False
   watch: Watch = dataclasses.field(default_factory=Watch)
   # Views that every step looks at: an item of a memoryview costs a tenth of one of an array.
   flags: memoryview = dataclasses.field(default_factory=lambda: np.zeros(len(FLAG), np.int32).data)
@@ -158,11 +156,7 @@ class Workspace:
     return self.ties, self.bonds, self.rests, self.creep, self.cutters
 
   def run(self):
-    """Computes the step's forces and adds them to qfrc_passive.
-
-    As `step` it may be called again where a signal's handler ended it (`FLAG.stage`), but not where
-    the motion is on a device, which may be a step ahead.
-    """
+    """Computes the step's forces and adds them to qfrc_passive."""
     self._check_model()
     self.strange = self.signature[0] != self.organ.signature
     if self.strange:
@@ -184,21 +178,17 @@ class Workspace:
     """Runs an organ that may be cut: the model's triangles must be its own."""
     with self.cuts.lock:
       others = self.cuts.show()
-      if self.flags[FLAG.stage] < STAGE.gathered and (changed or others):
+      if changed or others:
         windowed.find_contacts_again(self)
       self._run()
 
   def _run(self):
-    if self.flags[FLAG.stage] == STAGE.pushed:
-      self.computed = True
-      return
     if self.turn is not None:
       # The model's windows may not be those of this state, which was set from outside or shares the
       # model with another: contacts must be found again with the windows in place.
       if self._is_astray() or not self.turn.mine:
         self._find_contacts_again()
-    if self.flags[FLAG.stage] < STAGE.gathered:
-      wp.capture_launch(self.before)
+    wp.capture_launch(self.before)
     if self.turn is not None:
       if self.flags[FLAG.stale]:
         self._find_contacts_again()
@@ -240,8 +230,7 @@ class Workspace:
     if self.qpos.tobytes() == self.stood:
       return False
     far = windowed.find_astray(self)
-    torn, self.torn = self.torn, False
-    if far > _ASTRAY and not (self.noticed or torn):
+    if far > _ASTRAY and not self.noticed and self.error is None:  # else a step was not whole
       self.noticed = True
       mjstruct.warn(
         f"organ {self.organ.name!r}: qpos of its windows was set without plugin_state, which has "
@@ -287,16 +276,15 @@ class Workspace:
         windowed.let_sleep(self, True)
       return
     responds = bool(self.respond) and self.stiff and computed
-    if (responds or self.turn is not None) and self.flags[FLAG.stage] < STAGE.left:
+    if responds or self.turn is not None:
       wp.capture_launch(self.leave)
     if self.turn is not None:
       windowed.hide(self)
     responds = responds and bool(self.flags[FLAG.changed])
     self.flags[FLAG.answered] = responds
-    if self.flags[FLAG.stage] < STAGE.ended:
-      if responds:
-        self._answer()
-      wp.capture_launch(self.advance if responds else self.end)
+    if responds:
+      self._answer()
+    wp.capture_launch(self.advance if responds else self.end)
     if self.resident:
       self.resident.step(computed)
     self.computed = False

@@ -224,7 +224,6 @@ PALPATE void choose(const Fields& f, Thread, int) {
     if (i >= 0 && f.taken.data[i] == k && f.placed.data[k] != i) f.taken.data[i] = -1;
   }
   if (renewed) list_triangles(f);
-  f.flags.data[FLAG_STAGE] = STAGE_ENDED;
 }
 
 }  // namespace palpate

@@ -162,7 +162,6 @@ PALPATE void gather_slots(const Fields& f, Thread, int) {
   const bool stirs = tell_geoms(f);
   const bool asleep = tail(f)[TAIL_QUIET] >= QUIET && !stirs && !pushes && !changed;
   f.flags.data[FLAG_ASLEEP] = asleep;
-  f.flags.data[FLAG_STAGE] = STAGE_GATHERED;
   if (!asleep || stale) return;
   // The slots stay where they are; nothing else is done in such a step.
   f.status.data[0] = f.status.data[1] = 0.0f;
@@ -171,7 +170,6 @@ PALPATE void gather_slots(const Fields& f, Thread, int) {
     if (f.mj.body_awake.data[f.bodyid.data[k]])
       store(out, load(out) + passive({0.0, 0.0, 0.0}, load(f.lagged.data + 3 * k)));
   }
-  f.flags.data[FLAG_STAGE] = STAGE_PUSHED;
 }
 
 // Writes what the next `gather_slots` will if the step and what acts on the slots besides contacts
@@ -210,7 +208,6 @@ PALPATE void scatter_slots(const Fields& f, Thread, int) {
     double* out = f.mj.qfrc_passive.data + adr;
     store(out, load(out) + passive({p.x / h, p.y / h, p.z / h}, load(f.lagged.data + 3 * k)));
   }
-  f.flags.data[FLAG_STAGE] = STAGE_PUSHED;
 }
 
 }  // namespace palpate

@@ -150,7 +150,6 @@ PALPATE void leave_slots(const Fields& f, Thread, int) {
   in[HEAD_MODE] = mode;
   in[HEAD_STEP_ENDED] = in[HEAD_STEP];
   f.flags.data[FLAG_PENDING] = f.resident ? mode : MODE_STILL;
-  f.flags.data[FLAG_STAGE] = STAGE_LEFT;
 }
 
 }  // namespace palpate
