@@ -54,7 +54,7 @@ class Turn:
   def bind(self, model: int, windows: Windows):
     """Points at the mark and the lock of a model, or of a copy."""
     m = mjstruct.Model.from_address(model)
-    edge = int(mjstruct.view(m.flex_edgeadr, m.nflex, np.int32)[windows.flex[0]])
+    edge = int(mjstruct.view(m.flex_edgeadr, m.nflex, np.int32)[windows.flex])
     self._found = mjstruct.view(m.flexedge_invweight0, m.nflexedge)[edge:].data
     self.lock = _locks.setdefault(model, self.lock)
 

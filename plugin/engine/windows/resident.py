@@ -38,7 +38,7 @@ class Resident:
     self.state = w.views["plugin_state"].numpy()[: motion.size]  # the motion comes first there
     self.tail, self.head = own.tail.numpy(), inbox.head.numpy()
     self.found = outbox.found.numpy()
-    _, self.most, _ = outbox.record.shape
+    self.most, _ = outbox.record.shape
     self.device = w.body.device
     self.live = -1
     # Recorded graphs: the guess, on the CPU; the solve with it, on the device; what is left then.
@@ -103,7 +103,7 @@ class Resident:
 
   def look(self):
     """Repeats the search within a shorter reach while it finds more than there is room for."""
-    while self.found.max() > self.most:
+    while self.found[0] > self.most:
       self.head[HEAD.reach] *= 0.75
       self._look_again()
       wp.synchronize_device(self.device)

@@ -26,12 +26,12 @@ from ..model import inertia, mjstruct, prepare
 from . import nodes, proxies
 from .resident import Resident
 
-# Candidates of a window that a device reports, times the window's slots.
+# Candidates that a device reports, times the slots.
 ROOM = 16
 
 
 def state_size(nvert: int, nslot: int, ngeom: int, **more: int) -> int:
-  """Returns the length of the plugin state; ngeom is summed over the windows."""
+  """Returns the length of the plugin state."""
   sizes = {"nvert": nvert, "nslot": nslot, "ngeom": ngeom, "ncreep": 0, "nrest": 0, "nbond": 0}
   return layout.size(WindowState, sizes | layout.NO_CUTS | more)
 
@@ -110,11 +110,10 @@ class Phases(coupling.Phases):
 
   def _sizes(self, organ) -> dict[str, int]:
     """Returns what the blocks of `layout` need."""
-    win, nvert = organ.windows, organ.mesh.nvert
-    most = nvert
-    if self.side.is_cuda:
-      most = min(nvert, ROOM * int(np.diff(win.adr).max()))
-    return coupling.sizes(organ) | {"nwindow": len(win.flex), "most": most}
+    nvert, nslot = organ.mesh.nvert, organ.windows.nslot
+    return coupling.sizes(organ) | {
+      "most": min(nvert, ROOM * nslot) if self.side.is_cuda else nvert
+    }
 
   def _over_slots(self, kernel):
     proxies.launch(kernel, self._slots)
@@ -189,7 +188,7 @@ class Phases(coupling.Phases):
     self._end()
 
   def advance(self):
-    """Gives each window the nodes nearest to its tools."""
+    """Gives the window the nodes nearest to the tools."""
     self._over_slots(proxies.choose)
 
   def foresee(self):
@@ -280,7 +279,7 @@ def set_inertia(w, m):
   organ, win = w.declared, w.organ.windows
   nodal = win.mass
   if step.SCHEMES[w.config.integrator].spreads:
-    nodal = inertia.of_nodes(m, organ, w.body, w.config, win.mass, int(win.flex[0]))
+    nodal = inertia.of_nodes(m, organ, w.body, w.config, win.mass, win.flex)
   w.views["whole"] = nodal
   share_inertia(w)
 
