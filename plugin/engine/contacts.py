@@ -190,7 +190,7 @@ def tell(w, model: int):
   """Tells contacts with an organ what its tissue is like, and where its contact forces are."""
   m, organ = mjstruct.Model.from_address(model), w.organ
   found, adr = _tissues(model, w.data)
-  start = int(mjstruct.view(m.plugin_stateadr, m.nplugin, np.int32)[w.instance])
+  start = int(mjstruct.view(m.plugin_stateadr, m.nplugin, np.int32)[w.seen.instance])
   start += coupling.spans(organ)["force"].start
   first = mjstruct.view(m.flex_vertadr, m.nflex, np.int32)
   if organ.windows:

@@ -44,10 +44,13 @@ class Turn:
   Attributes:
     lock: held while the model's windows are read or written
     mark: of the windows that are this mjData's
+    qpos, stood: numbers of qpos that the slots have, as bytes; after the last step, or None
   """
 
   def __init__(self):
     self.mark = math.nan
+    self.stood: bytes | None = None
+    self.qpos = memoryview(b"")
     self.lock: Any = threading.RLock()
     self._found: Any = memoryview(b"")
 
