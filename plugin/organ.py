@@ -287,7 +287,8 @@ class Organ:
   @property
   def window_overflow(self) -> tuple[int, int]:
     """Touched nodes and triangles that the windows had no room for in the last step."""
-    return int(self._space.flags[FLAG.missed_nodes]), int(self._space.flags[FLAG.missed_elements])
+    flags = self._space.report.flags
+    return int(flags[FLAG.missed_nodes]), int(flags[FLAG.missed_elements])
 
   @property
   def window_warning(self) -> str | None:
@@ -305,7 +306,7 @@ class Organ:
     m = mjstruct.Model.from_address(self.model._address)
     d = mjstruct.Data.from_address(self.data._address)
     tools = penetration.Tools(m, self._organ, penetration.tools(m, self._organ))
-    found = {*tools.inside(d, self._deformation), *self._space.watch.crossed}
+    found = {*tools.inside(d, self._deformation), *self._space.report.watch.crossed}
     return tuple(self.model.geom(geom).name or f"geom {geom}" for geom in sorted(found))
 
   @property
@@ -334,12 +335,12 @@ class Organ:
   @property
   def iterations(self) -> int:
     """PCG iterations of the last step."""
-    return int(self._space.status[0])
+    return int(self._space.seen.status[0])
 
   @property
   def residual(self) -> float:
     """Relative residual of the last step's solve [-]."""
-    return float(self._space.status[1])
+    return float(self._space.seen.status[1])
 
   @property
   def asleep(self) -> bool:
@@ -349,7 +350,7 @@ class Organ:
   @property
   def error(self) -> str | None:
     """What went wrong while running since the last reset, or None."""
-    return self._space.error
+    return self._space.report.error
 
   @property
   def device(self) -> str:

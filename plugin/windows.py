@@ -14,7 +14,6 @@ import numpy as np
 from palpate.engine.model import flexes
 
 from .engine import plugin as engine
-from .engine.layout import MAX_GEOMS
 from .tissue.config import holders
 
 # Slots of a window: from so few up to so many, unless told.
@@ -41,20 +40,16 @@ def add_windows(
   parameters and configuration are carried over. A rigid organ that is declared with `mass`, and no
   `window` yet, keeps what it has. The spec can be saved as XML, compiled and attached to another.
 
-  One window for all tools is right for most scenes. Windows of their own, one a tool, keep a tool
-  that touches much from taking the nodes of another; where tools meet, the first window serves
-  both, because a triangle whose corners are in different windows touches nothing.
-
   Args:
     spec: changed in place
     organ: name of the flexcomp
-    tools: what each window follows: a body with all that hangs on it, or several; None for one
-      window that follows all that moves and collides, and what an organ may fall on that nothing
-      holds
-    nodes: most nodes in each window; None sizes it from the tools' geoms and the organ's edges
+    tools: bodies that the window follows with all that hangs on them; of an entry with several,
+      one has to collide; None for all that moves and collides, and what an organ may fall on that
+      nothing holds
+    nodes: most nodes in the window; None sizes it from the tools' geoms and the organ's edges
 
   Returns:
-    Names of the windows.
+    The name of the window, alone.
 
   Raises:
     ValueError: there is no such organ or body, or it cannot have windows.
@@ -62,9 +57,8 @@ def add_windows(
   flex, plugin, bodies = find_organ(spec, organ)
   config = {key: value for key, value in plugin.config.items() if value}
   groups = _groups(organ, bodies, tools)
-  many = len(groups) if groups else 1
-  names = [f"{organ}_window{k if many > 1 else ''}" for k in range(many)]
-  _check(spec, flex, config, names, nodes)
+  name = f"{organ}_window"
+  _check(spec, flex, config, name, nodes)
   nodal = len(set(flex.vertbody)) > 1 or "mass" not in config
   meets = (flex.contype, flex.conaffinity) if nodal or flex.contype or flex.conaffinity else (1, 1)
   colliding = [g for g in spec.geoms if (g.contype & meets[1]) | (g.conaffinity & meets[0])]
@@ -77,17 +71,15 @@ def add_windows(
   # From here on the spec changes.
   keys = _take_keys(spec)
   surface = _make_rigid(spec, flex, own, plugin, config) if nodal else bodies[flex.vertbody[0]]
-  _fill(spec, flex, surface, names, followed, nodes, meets, config)
+  _add_window(spec, flex, surface, name, followed, nodes, meets, config)
   _warn_of_others(organ, colliding, groups, held, config.get("support", "").split())
-  config["window"] = " ".join(names)
+  config["window"] = name
   if groups:
-    config["follow"] = ", ".join(
-      " ".join(dict.fromkeys(g.parent.name for g in mine)) for mine in followed
-    )
+    config["follow"] = " ".join(dict.fromkeys(geom.parent.name for geom in followed))
   plugin.config = config
   flex.contype = flex.conaffinity = 0
   _fit_keys(spec, organ, keys)
-  return tuple(names)
+  return (name,)
 
 
 def find_organ(spec: mujoco.MjSpec, organ: str):
@@ -104,42 +96,34 @@ def find_organ(spec: mujoco.MjSpec, organ: str):
   return flex, _plugin(spec, organ, [bodies[name] for name in dict.fromkeys(flex.vertbody)]), bodies
 
 
-def _check(spec, flex, config: dict[str, str], names: list[str], nodes: int | None):
-  """Raises ValueError where an organ cannot have windows of these names and so many nodes."""
+def _check(spec, flex, config: dict[str, str], name: str, nodes: int | None):
+  """Raises ValueError where an organ cannot have a window of this name and so many nodes."""
   organ = flex.name
   if config.get("window"):
     raise ValueError(f"organ {organ!r} has window {config['window']!r} already, expected none")
   if flex.dim != 2:
     raise ValueError(f"organ {organ!r}: flexcomp dim is {flex.dim}, expected dim='2' (a surface)")
-  taken = [name for name in names if spec.flex(name) is not None]
-  if taken:
-    raise ValueError(f"organ {organ!r}: the spec has a flex {taken[0]!r} already")
+  if spec.flex(name) is not None:
+    raise ValueError(f"organ {organ!r}: the spec has a flex {name!r} already")
   if nodes is not None and not 5 <= nodes:
     raise ValueError(f"organ {organ!r}: nodes is {nodes}, expected at least 5")
 
 
-def _followed(organ: str, groups: list[set[str]], colliding: list, held: bool) -> list[list]:
-  """Returns the geoms that each window follows.
+def _followed(organ: str, groups: list[set[str]], colliding: list, held: bool) -> list:
+  """Returns the geoms that the window follows.
 
-  One window follows all that moves, and where nothing holds the organ all that it may fall on.
+  Without tools, all that moves, and where nothing holds the organ all that it may fall on.
   """
   if not groups:
-    followed = [[g for g in colliding if _moves(g) or not held]]
-  else:
-    followed = [[g for g in colliding if not group.isdisjoint(_ancestors(g))] for group in groups]
-  for group, mine in zip(groups, followed, strict=False):
+    return [geom for geom in colliding if _moves(geom) or not held]
+  for group in groups:
+    mine = [geom for geom in colliding if not group.isdisjoint(_ancestors(geom))]
     if not mine:
       raise ValueError(f"organ {organ!r}: nothing of {sorted(group)} collides with it")
-    if not all(g.parent.name for g in mine):
+    if not all(geom.parent.name for geom in mine):
       raise ValueError(f"organ {organ!r}: a body of {sorted(group)} has no name, expected one")
-  for k, mine in enumerate(followed):
-    if len(mine) > MAX_GEOMS:
-      what = f"{sorted(groups[k])} have" if groups else "the bodies that move have"
-      raise ValueError(
-        f"organ {organ!r}: {what} {len(mine)} geoms that collide with it, expected at most "
-        f"{MAX_GEOMS} a window; name bodies in tools, or let some geoms not collide"
-      )
-  return followed
+  tools = set().union(*groups)
+  return [geom for geom in colliding if not tools.isdisjoint(_ancestors(geom))]
 
 
 def organs(spec: mujoco.MjSpec) -> dict[str, bool]:
@@ -191,11 +175,11 @@ def _moves(geom) -> bool:
 
 
 def _groups(organ: str, bodies: dict, tools) -> list[set[str]]:
-  """Returns the bodies that each window follows; none for all that moves."""
+  """Returns the bodies that each tool may be; none for all that moves."""
   if tools is None:
     return []
   if isinstance(tools, str) or not len(tools):
-    raise ValueError(f"tools is {tools!r}, expected a list of bodies, one entry a window")
+    raise ValueError(f"tools is {tools!r}, expected a list of bodies")
   groups = [{tool} if isinstance(tool, str) else set(tool) for tool in tools]
   for name in itertools.chain(*groups):
     if name not in bodies:
@@ -275,32 +259,25 @@ def _slots(geoms: list, edge: float, radius: float) -> int:
   return int(np.clip(math.ceil(area / (math.sqrt(3) / 2 * edge**2)), _LEAST, _MOST))
 
 
-def _fill(spec, flex, surface, names: list[str], followed: list, nodes: int | None, meets, config):
-  """Adds the windows; each has room for all tools, for when they meet."""
+def _add_window(spec, flex, surface, name: str, followed: list, nodes: int | None, meets, config):
+  """Adds a window: a bipyramid, which has as many triangles as so many nodes can have."""
   rest = np.reshape(flex.vert, (-1, 3))
   elem = np.reshape(flex.elem, (-1, 3))
   edge = float(np.linalg.norm(rest[elem[:, [1, 2, 0]]] - rest[elem], axis=2).mean())
-  every = list(itertools.chain(*followed))
-  size = 1 + min(nodes or _slots(every, edge, flex.radius), len(rest))  # one slot stays free
-  for name in names:
-    _add_window(spec, flex, surface, name, size, meets, edge, config)
-
-
-def _add_window(spec, flex, surface, name: str, size: int, meets, edge: float, config):
-  """Adds a window: a bipyramid, which has as many triangles as so many nodes can have."""
-  size = max(size, 5)
+  most = nodes or _slots(followed, edge, flex.radius)
+  size = max(1 + min(most, len(rest)), 5)  # one slot stays free
   angle = 2 * np.pi * np.arange(size - 2) / (size - 2)
   ring = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
   points = edge * np.concatenate([ring, [[0, 0, 1], [0, 0, -1]]])
   a, pole = np.arange(size - 2), np.full(size - 2, size - 2)
   b = (a + 1) % (size - 2)
-  elem = np.concatenate([np.stack([a, b, pole], axis=1), np.stack([b, a, pole + 1], axis=1)])
-  mass = _SHARE * float(config["mass"]) / (len(flex.vert) // 3)
+  triangles = np.concatenate([np.stack([a, b, pole], axis=1), np.stack([b, a, pole + 1], axis=1)])
+  mass = _SHARE * float(config["mass"]) / len(rest)
   names = [f"{name}_{k}" for k in range(size)]
   # Next to the organ's own body, or in it, so that they turn alike.
   for own, point in zip(names, points, strict=True):
     add_node(surface, own, point, mass, _INERTIA)
-  window = make_flex(spec, name, np.zeros((size, 3)), names, elem)
+  window = make_flex(spec, name, np.zeros((size, 3)), names, triangles)
   for key in ("condim", "priority", "friction", "solmix", "solref", "solimp", "margin", "gap"):
     setattr(window, key, getattr(flex, key))
   window.contype, window.conaffinity = meets

@@ -11,7 +11,7 @@ import math
 import os
 import typing
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -211,24 +211,17 @@ class Recording:
   @classmethod
   def load(cls, path: str | os.PathLike[str]) -> "Recording":
     """Reads a recording; ValueError and OSError name the file and what is wrong with it."""
-    path = Path(path)
-    if path.exists() and not path.is_file():  # a pipe would be waited for
-      raise ValueError(f"{path}: not a {FORMAT}: not a file")
-    try:
-      opened = path.open("rb")
-    except OSError as error:
-      why = f"{error.strerror}, expected a {FORMAT} (.npz), as palpate exercise keeps"
-      raise type(error)(f"{path}: {why}") from None
-    with opened as file:
-      if file.read(2) != b"PK":
-        raise ValueError(f"{path}: not a {FORMAT}: not a zip archive")
-      file.seek(0)
-      # Whatever broken bytes make zipfile, zlib, numpy or json raise is the file's fault.
-      try:
-        return cls._read(file)
-      except Exception as error:
-        text = str(error) or type(error).__name__
-        raise ValueError(f"{path}: not a readable {FORMAT}: {text}") from error
+    return _reading(path, cls._read)
+
+  @classmethod
+  def load_info(cls, path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Reads `info` alone, in a twentieth of the time; errors as of `load`."""
+    return _reading(path, cls._read_info)
+
+  @classmethod
+  def _read_info(cls, file: Any) -> dict[str, Any]:
+    with np.load(file, allow_pickle=False) as archive:
+      return _meta(archive)["info"]
 
   @classmethod
   def _read(cls, file: Any) -> "Recording":
@@ -241,12 +234,7 @@ class Recording:
     file.seek(0)
     tables: dict[str, dict[str, np.ndarray]] = {table: {} for table in _TABLES.values()}
     with np.load(file, allow_pickle=False) as archive:
-      for required in ("meta", "time"):
-        if required not in archive.files:
-          raise ValueError(f"no entry {required!r}")
-      if archive["meta"].dtype.kind != "U" or archive["meta"].shape != ():
-        raise ValueError("entry 'meta' is no text")
-      meta = _check_meta(json.loads(str(archive["meta"][()])))
+      meta = _meta(archive)
       time = check_time(check_array("time", archive["time"]), least=0)
       for name in set(archive.files) - {"meta", "time"}:
         kind, _, rest = name.partition(".")
@@ -299,6 +287,38 @@ def _check_column(name: str, value: np.ndarray, count: int, substeps: int) -> No
   allowed = [(count, *shape) for shape in entry_shapes(name, substeps)]
   if value.dtype != np.float64 or value.shape[1:] not in allowed:
     raise ValueError(f"column {name} is {value.dtype} {value.shape}, expected float64 {allowed}")
+
+
+def _reading(path: str | os.PathLike[str], read: Callable[[Any], Any]) -> Any:
+  """Returns what `read` makes of a file; ValueError and OSError name the file."""
+  path = Path(path)
+  if path.exists() and not path.is_file():  # a pipe would be waited for
+    raise ValueError(f"{path}: not a {FORMAT}: not a file")
+  try:
+    opened = path.open("rb")
+  except OSError as error:
+    why = f"{error.strerror}, expected a {FORMAT} (.npz), as palpate exercise keeps"
+    raise type(error)(f"{path}: {why}") from None
+  with opened as file:
+    if file.read(2) != b"PK":
+      raise ValueError(f"{path}: not a {FORMAT}: not a zip archive")
+    file.seek(0)
+    # Whatever broken bytes make zipfile, zlib, numpy or json raise is the file's fault.
+    try:
+      return read(file)
+    except Exception as error:
+      text = str(error) or type(error).__name__
+      raise ValueError(f"{path}: not a readable {FORMAT}: {text}") from error
+
+
+def _meta(archive: Any) -> dict[str, Any]:
+  """Returns the entry `meta` of an archive, checked."""
+  for required in ("meta", "time"):
+    if required not in archive.files:
+      raise ValueError(f"no entry {required!r}")
+  if archive["meta"].dtype.kind != "U" or archive["meta"].shape != ():
+    raise ValueError("entry 'meta' is no text")
+  return _check_meta(json.loads(str(archive["meta"][()])))
 
 
 def _check_meta(meta: Any) -> dict[str, Any]:

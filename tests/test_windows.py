@@ -37,17 +37,15 @@ def nodal(windowed, **options):
   [
     (None, None, "", False),
     (["grasper"], 60, FRAME, False),
-    (["left", "right"], None, "", False),  # windows of their own, which meet over the ridge
+    (["left", "right"], None, FRAME, False),
     ([["left", "right"]], 150, "", False),
-    (["left", "right"], 90, FRAME, False),  # together more than the organ has nodes
     (["left", "right"], 80, "", True),
   ],
 )
 def test_grasp_and_release_equal_nodal_coupling(tools, nodes, frame, resident):
   made = spec(frame=frame)
-  names = palpate.add_windows(made, "organ", tools, nodes)
+  assert palpate.add_windows(made, "organ", tools, nodes) == ("organ_window",)
   made.plugins[0].config = made.plugins[0].config | {"resident": str(resident).lower()}
-  assert len(names) == (2 if tools == ["left", "right"] else 1)
   m, d, organ = scenes.load(made)
   windowed = scenes.grasp(m, d, organ)
   reference = scenes.grasp(*nodal(organ, frame=frame))
@@ -128,7 +126,7 @@ def test_attached_with_a_prefix_names_still_fit():
   m = world.compile()
   d = mujoco.MjData(m)
   organs = [palpate.Organ(m, d, f"{prefix}kidney") for prefix in ("a/", "b/")]
-  flexes = [scenes.workspace(organ).organ.windows.flex.tolist() for organ in organs]
+  flexes = [scenes.workspace(organ).organ.windows.flex for organ in organs]
   assert flexes[0] != flexes[1]
   mujoco.mj_step(m, d)
   assert m.nv < 250 and all(organ.error is None for organ in organs)
@@ -257,10 +255,11 @@ def test_the_motion_of_a_keyframe_that_windows_leave_out_is_pointed_out():
     palpate.add_windows(made, "organ")
 
 
-def test_a_tool_of_many_geoms_is_named():
+def test_a_tool_may_have_many_geoms():
   geoms = '<geom size=".001" mass="1e-4"/>' * 40
   extra = f'<body name="brush" pos="0 0 .2"><freejoint/>{geoms}</body>'
-  with pytest.raises(ValueError, match=r"'brush'.*40 geoms.*expected at most 32"):
-    palpate.add_windows(spec(extra=extra), "organ", ["brush"])
-  with pytest.raises(ValueError, match=r"42 geoms.*name bodies in tools"):
-    palpate.add_windows(spec(extra=extra), "organ")
+  made = mujoco.MjSpec.from_string(scenes.ridge(extra=extra))
+  palpate.add_windows(made, "organ")
+  m, d, organ = scenes.load(made)
+  forces, _ = scenes.grasp(m, d, organ)
+  assert organ.error is None and np.abs(forces).max() > 0.02

@@ -183,7 +183,7 @@ class Material:
     organ, w = self._organ, self._organ.space
     if self._graded or not organ.spreads:
       return
-    flex = int(w.organ.windows.flex[0]) if w.organ.windows else w.organ.flex
+    flex = w.organ.windows.flex if w.organ.windows else w.organ.flex
     mass = inertia.masses(m, w.organ)
     table, node = organ.patch.inertia.numpy(), organ.body.shape.node.numpy()
     for k, grade in enumerate(GRADES):

@@ -71,7 +71,7 @@ class Organ(Tissue):
     organ, device, nworld = w.organ, batch.device, batch.nworld
     self.name, self.nvert, self.elem = organ.name, coupling.outer(organ), organ.mesh.elem
     self.declared, self.config, self.space, self.place = organ, organ.config, w, place
-    self.instance = w.instance
+    self.instance = w.seen.instance
     self.batch, self._scheme = batch, step.SCHEMES[organ.config.integrator]
     still = shape.make(organ.mesh, organ.config, ~organ.free, str(device), nworld=0)
     self.body = bodies.worlds(still, nworld, plan_of(still, organ.config))
@@ -96,8 +96,8 @@ class Organ(Tissue):
       bodyid=place.body,
       slot_mass=place.mass,
       sleeps=int(self.body.plan is not None),
-      stiff=int(w.stiff and self._scheme.respond is not None),
-      heaviest=float(w.heaviest[0]),
+      stiff=int(w.graphs.stiff and self._scheme.respond is not None),
+      heaviest=float(w.host["heaviest"].numpy()[0]),
       ngravity=nworld,
       overflow=batch.lost,
       bad=batch.bad,

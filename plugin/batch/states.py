@@ -141,7 +141,7 @@ def _pull_slots(organ: Organ, world: int, own, spans, force: np.ndarray):
   node = organ.patch.slot_node[world].numpy()
   node = organ.body.shape.vert.numpy()[node[node >= 0]]  # vertices from here on
   node = node[np.argsort(-np.linalg.norm(force[node], axis=1), kind="stable")]
-  node = node[: win.adr[1] - 1]  # the last slot of a window stays free
+  node = node[: win.nslot - 1]  # the last slot stays free
   number, forces = np.full(win.nslot, -1.0), np.zeros((win.nslot, 3))
   number[: len(node)], forces[: len(node)] = node + 1, force[node]
   own[spans["slot"]], own[spans["force"]] = number, forces.ravel()

@@ -217,7 +217,7 @@ def _take_out(bare, bodies: dict, organ, model):
 
 
 def _add_slots(bare, organ, nslot: int, mass: float, model):
-  flex = organ.windows.flex[0] if organ.windows else organ.flex
+  flex = organ.windows.flex if organ.windows else organ.flex
   names = [f"{organ.name}_slot_{k}" for k in range(nslot)]
   for name in names:
     windows.add_node(bare.worldbody, name, np.zeros(3), mass, _INERTIA)

@@ -23,9 +23,9 @@ def bind(w, model: int):
   with graphs.lock:
     declare.check_frame(m, w.organ)
     load(w.body)
-    if w.resident:
-      w.resident.fetch()
-    w.phases = does = side.Phases(w, model, w.instance)
+    if w.graphs.resident:
+      w.graphs.resident.fetch()
+    w.graphs.phases = does = side.Phases(w, model, w.seen.instance)
     w.cuts.bind(model)
     near = wp.get_device(does.side)
     crossing = device != near
@@ -51,22 +51,22 @@ def bind(w, model: int):
         _cross(w, ("sol", "status", "ratio"), to_device=False)
 
     # As few graphs as may be: a launch costs a small organ a hundredth of its step.
-    after = [] if w.resident else [(cpu, part(_scatter, w, does))]
-    w.before = graphs.record(cpu, before)
+    after = [] if w.graphs.resident else [(cpu, part(_scatter, w, does))]
+    w.graphs.before = graphs.record(cpu, before)
     enter = (near, part(_enter, w, does))
-    w.solve = graphs.record_all(enter, (device, solve), (near, does.look), *after)
-    w.after = graphs.record(cpu, does.scatter) if w.resident else None
-    w.leave = graphs.record(cpu, does.leave)
+    w.graphs.solve = graphs.record_all(enter, (device, solve), (near, does.look), *after)
+    w.graphs.after = graphs.record(cpu, does.scatter) if w.graphs.resident else None
+    w.graphs.leave = graphs.record(cpu, does.leave)
     answer = (near, does.push), (device, respond), (near, does.answer)
-    w.respond = graphs.record_all(*answer) if scheme.respond else []
-    w.end = graphs.record(cpu, part(_advance, w, does, ends=True))
-    w.advance = graphs.record(cpu, part(_advance, w, does, ends=False))
-    w.place = graphs.record(cpu, does.place) if w.organ.windows else None
-    if w.resident:
-      w.resident.foresee = graphs.record(cpu, does.foresee)
+    w.graphs.respond = graphs.record_all(*answer) if scheme.respond else []
+    w.graphs.end = graphs.record(cpu, part(_advance, w, does, ends=True))
+    w.graphs.advance = graphs.record(cpu, part(_advance, w, does, ends=False))
+    w.graphs.place = graphs.record(cpu, does.place) if w.organ.windows else None
+    if w.graphs.resident:
+      w.graphs.resident.foresee = graphs.record(cpu, does.foresee)
       ahead = graphs.record_all((near, does.enter_ahead), (device, solve))
-      w.resident.begin_graph = ahead[0][1]
-      w.resident.rest = graphs.record_all((near, does.look_ahead))
+      w.graphs.resident.begin_graph = ahead[0][1]
+      w.graphs.resident.rest = graphs.record_all((near, does.look_ahead))
     if w.turn is not None:
       w.turn.bind(model, w.organ.windows)
   _watch(w, model)
@@ -106,25 +106,25 @@ def _advance(w, does, ends: bool):
 def _watch(w, model: int):
   """Notes what of a model a step looks at, and what it was."""
   m = mjstruct.Model.from_address(model)
-  w.model, w.identity = model, mjstruct.Identity(model)
+  w.model, w.seen.identity = model, mjstruct.Identity(model)
   option = model + mjstruct.Model.opt.offset
-  w.model_step = mjstruct.view(option + type(m.opt).timestep.offset, 1).data
-  w.time_step = float(m.opt.timestep)
-  w.integrator = mjstruct.view(option + type(m.opt).integrator.offset, 1, np.int32).data
-  w.static = [(view, view.tobytes()) for view in declare.static_places(m, w.organ)]
+  w.seen.model_step = mjstruct.view(option + type(m.opt).timestep.offset, 1).data
+  w.seen.time_step = float(m.opt.timestep)
+  w.seen.integrator = mjstruct.view(option + type(m.opt).integrator.offset, 1, np.int32).data
+  w.seen.static = [(view, view.tobytes()) for view in declare.static_places(m, w.organ)]
 
 
 def _before(w, model: int):
   """Returns what launches a step's work before the solve."""
   touched = _touched(w, model)
   m = mjstruct.Model.from_address(model)
-  tools = penetration.speeds(m, model, w.data, w.organ, np.asarray(w.flags))
+  tools = penetration.speeds(m, model, w.data, w.organ, np.asarray(w.report.flags))
 
   def launch():
     contacts.launch(touched)
     if tools.ntool:
       penetration.find_fast.launch("cpu", 1, 1, 0, tools)
-    w.phases.gather()
+    w.graphs.phases.gather()
 
   return launch
 
@@ -135,7 +135,8 @@ def _touched(w, model: int) -> contacts.Weights:
   With all of them, since one that looks for contacts again has those of the others found again.
   """
   contacts.tell(w, model)
-  out = contacts.make(model, w.data, declare_windows.touching(model, w.instance), w.flags)
+  flexes = declare_windows.touching(model, w.seen.instance)
+  out = contacts.make(model, w.data, flexes, w.report.flags)
   out.mine.numpy()[w.organ.flexes] = 2
   w.views["mine"] = out.mine
   return out

@@ -28,7 +28,7 @@ def configure(w, model: int, texts: dict[str, str]):
   organ, mesh = w.organ, w.organ.mesh
   arguments = texts, mesh.nelem, mesh.whole.closed, organ.config
   _change(w, model, configuration.change(organ.name, w.config, *arguments))
-  w.chosen = True
+  w.report.chosen = True
 
 
 def copy(w, model: int, other, twin):
@@ -43,7 +43,7 @@ def copy(w, model: int, other, twin):
   one, two = w.organ, other.organ  # which may have been made for different time steps
   if (one.signature, one.config) != (two.signature, two.config):
     return
-  if not w.chosen and w.config != other.config:
+  if not w.report.chosen and w.config != other.config:
     _change(w, model, other.config)
   mine, theirs = ([g for g in each.bonds.groups if not g.declared] for each in (w, other))
   if len(mine) != len(theirs) or not all(map(cohesive_bonds.alike, mine, theirs)):
@@ -160,8 +160,8 @@ def _change(w, model: int, config: Config):
   workspace.attach(w, model)
   before, w.config = w.config, config
   contacts.tell(w, model)
-  if w.resident:
-    w.resident.stop()
+  if w.graphs.resident:
+    w.graphs.resident.stop()
   material = any(getattr(before, key) != getattr(config, key) for key in configuration.MATERIAL)
   with graphs.lock:
     if material:

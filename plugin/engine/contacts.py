@@ -196,13 +196,12 @@ def tell(w, model: int):
   """Tells contacts with an organ what its tissue is like, and where its contact forces are."""
   m, organ = mjstruct.Model.from_address(model), w.organ
   found, adr = _tissues(model, w.data)
-  start = int(mjstruct.view(m.plugin_stateadr, m.nplugin, np.int32)[w.instance])
+  start = int(mjstruct.view(m.plugin_stateadr, m.nplugin, np.int32)[w.seen.instance])
   start += coupling.spans(organ)["force"].start
   first = mjstruct.view(m.flex_vertadr, m.nflex, np.int32)
   if organ.windows:
-    for k, flex in enumerate(organ.windows.flex):
-      slot = np.arange(*organ.windows.adr[k : k + 2])
-      adr[first[flex] + slot - slot[0]] = start + 3 * slot
+    slot = np.arange(organ.windows.nslot)
+    adr[first[organ.windows.flex] + slot] = start + 3 * slot
   else:
     n = coupling.outer(organ)
     own = organ.dofadr[:n] >= 0

@@ -13,8 +13,6 @@ from collections.abc import Mapping
 import warp as wp
 from palpate.tissue.types import DIMS, doubles, struct
 
-MAX_WINDOWS = 64  # of an organ
-MAX_GEOMS = 32  # of a window
 WALLS = 4  # triangles that cuts of a solid may open, for one spare vertex
 TRAIL = 12  # points of the path of a blade that has not come apart yet
 
@@ -50,29 +48,18 @@ class Numbers:
 
 FLAG = Numbers(
   "FLAG",
-  ("stale", 1, "-", "the model's windows are not those of the state"),
+  ("stale", 1, "-", "the model's window is not that of the state"),
   ("asleep", 1, "-", "the organ is at rest and its step is skipped"),
-  ("missed_nodes", 1, "-", "nodes that tools touch and windows have no room for"),
-  ("missed_elements", 1, "-", "triangles that windows have no room for"),
+  ("missed_nodes", 1, "-", "nodes that tools touch and the window has no room for"),
+  ("missed_elements", 1, "-", "triangles that the window has no room for"),
   ("pending", 1, "-", "mode of the next commit, see MODE"),
   ("near", 1, "-", "a tool is near"),
   ("changed", 1, "-", "the contact forces are not those of the last step"),
   ("answered", 1, "-", "the organ responded to that"),
   ("foreseen", 1, "-", "what acts on the organ is what was guessed"),
   ("weighed", 1, "-", "rows of contacts changed, or may have, that MuJoCo has made use of"),
-  ("stage", 1, "-", "how far the step is, see STAGE"),
   ("fast", 1, "-", "a tool may go through the organ and out again between two looks"),
   ("coarse", 1, "um", "edge that a tool needs which is too small for the mesh; negative once told"),
-)
-
-# What of a step is done that must not be done twice. These are values, not offsets.
-STAGE = Numbers(
-  "STAGE",
-  ("begun", 1, "-", "nothing"),
-  ("gathered", 1, "-", "contacts got their weights, and what acts was read"),
-  ("pushed", 1, "-", "the passive force was added"),
-  ("left", 1, "-", "contact forces and motion were taken from MuJoCo"),
-  ("ended", 1, "-", "the plugin state was stepped"),
 )
 
 # How the last step ends on the nodes' side. These are values, not offsets.
@@ -112,7 +99,7 @@ PUSHED = Numbers(
   ("force", 3, "N", "besides weight; after MuJoCo's step the impulse to answer [N s]"),
 )
 
-# Of the inbox: a geom that a window follows, in the organ's frame.
+# Of the inbox: a geom that the window follows, in the organ's frame.
 GEOM = Numbers(
   "GEOM",
   ("pos", 3, "m", "centre"),
@@ -141,7 +128,7 @@ ANSWER = Numbers(
   ("vel", 3, "m/s", "velocity"),
 )
 
-# Of the outbox: a node that is near a window's geoms.
+# Of the outbox: a node that is near the window's geoms.
 RECORD = Numbers(
   "RECORD",
   ("node", 1, "-", "its number"),
@@ -199,12 +186,10 @@ TAIL = Numbers(
 )
 
 TABLES = (
-  FLAG, STAGE, MODE, HEAD, MOVED, PUSHED, GEOM, SUMMARY, ANSWER, RECORD, POSE, BOND, BLADE, LAW,
+  FLAG, MODE, HEAD, MOVED, PUSHED, GEOM, SUMMARY, ANSWER, RECORD, POSE, BOND, BLADE, LAW,
   TAIL,
 )  # fmt: skip
 CONSTANTS = {
-  "MAX_WINDOWS": MAX_WINDOWS,
-  "MAX_GEOMS": MAX_GEOMS,
   "TRAIL": TRAIL,
   **{name: value for table in TABLES for name, value in table.constants().items()},
 }
@@ -264,7 +249,7 @@ class WindowState:
   slip: doubles("nrest", 3)  # how far nodes have slipped on what they rest on [m]
   slot: doubles("nslot")  # node + 1; 0: the slot's default node, -1: not used
   cuts: Topology
-  pose: doubles("ngeom", len(POSE))  # where the windows' geoms were, see POSE
+  pose: doubles("ngeom", len(POSE))  # where the window's geoms were, see POSE
   tail: doubles(len(TAIL))  # see TAIL
   signature: doubles(1)  # of the organ, see `Declaration`; 0 where it was set by hand [-]
 
@@ -276,8 +261,7 @@ class Inbox:
   head: doubles(len(HEAD))  # see HEAD
   moved: doubles("nslot", len(MOVED))  # see MOVED
   pushed: doubles("nslot", len(PUSHED))  # see PUSHED
-  ngeom: doubles("nwindow")  # geoms of each window
-  geom: doubles("nwindow", MAX_GEOMS, len(GEOM))  # see GEOM
+  geom: doubles("ngeom", len(GEOM))  # see GEOM
 
 
 @struct
@@ -287,8 +271,8 @@ class Outbox:
   summary: doubles(len(SUMMARY))  # see SUMMARY
   dvel: doubles("nslot", 3)  # change of each slot's velocity in this step [m/s]
   answer: doubles("nslot", len(ANSWER))  # see ANSWER
-  found: doubles("nwindow")  # nodes near each window's geoms
-  record: doubles("nwindow", "most", len(RECORD))  # see RECORD, as far as there is room
+  found: doubles(1)  # nodes near the window's geoms
+  record: doubles("most", len(RECORD))  # see RECORD, as far as there is room
 
 
 def spans(kind, sizes: Mapping[str, int], start: int = 0) -> dict[str, slice]:

@@ -246,8 +246,8 @@ class Watch:
     disp = _displacement(m, d, w)
     found = set(seen.inside(d, disp))
     before, self._inside = found if self._inside is None else self._inside, found
-    if w.flags[FLAG.fast]:
-      passed = set(seen.passed(m, d, disp, w.model_step[0] * _OFTEN)) - before
+    if w.report.flags[FLAG.fast]:
+      passed = set(seen.passed(m, d, disp, w.seen.model_step[0] * _OFTEN)) - before
       self.crossed |= passed
       found = found | passed
     new = sorted(found - before - self._said)
@@ -259,7 +259,7 @@ class Watch:
     mesh, before = w.organ.mesh, self._inverted
     if not len(mesh.tet) or self._steps % _EVERY != 1 or (before is not None and not before.size):
       return 0
-    found = _inside_out(mesh.rest + w.phases.motion()[0], mesh.tet)
+    found = _inside_out(mesh.rest + w.motion()[0], mesh.tet)
     stay = int((found & before).sum()) if before is not None and len(before) == len(found) else 0
     self._inverted = found[:0] if stay else found
     return stay

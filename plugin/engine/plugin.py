@@ -9,6 +9,7 @@ from __future__ import annotations
 import atexit
 import ctypes as C
 import functools
+import sys
 from typing import Any
 
 import mujoco
@@ -17,7 +18,7 @@ from palpate.tissue.config import KEYS
 
 from . import change, contacts, signals, workspace
 from .forces import declare_attachments, declare_bonds, supports
-from .layout import FLAG, STAGE
+from .layout import FLAG
 from .model import mjstruct, skin, state_size
 from .model.mjstruct import NAME, warn
 from .windows import windowed
@@ -140,7 +141,7 @@ def _destroy(data: int, instance: int):
 def _copy(data: int, model: int, source: int, instance: int):
   w = _workspaces[data, instance]
   try:
-    twin = lambda each: _workspaces[data, each.instance]  # noqa: E731
+    twin = lambda each: _workspaces[data, each.seen.instance]  # noqa: E731
     change.copy(w, model, _workspaces[source, instance], twin)
   except BaseException as error:
     _fail(w, error)
@@ -157,47 +158,39 @@ def _reset(model: int, state: int, unused: int | None, instance: int):
     w.forget()
     w.ties.put([group for group in w.ties.groups if group.by])
     w.bonds.let_go()
-    w.nbad = 0
+    w.report.nbad = 0
   return signals.leave()
 
 
 @signals.watch
 def _compute(model: int, data: int, instance: int, capability: int):
   w = _workspaces[data, instance]
-  w.flags[FLAG.stage] = STAGE.begun
-  again = True
-  while again:
-    try:
-      _push(w, model)
-      again = False
-    except BaseException as error:
-      again = _fail(w, error)
+  try:
+    _push(w, model)
+  except BaseException as error:
+    _fail(w, error)
   return signals.leave()
 
 
 def _push(w: Workspace, model: int):
   """Adds the passive force."""
   signals.enter()
-  if not w.identity.is_of(model):
+  if not w.seen.identity.is_of(model):
     workspace.attach(w, model)
-  if _count_bad(w) > w.nbad:
+  if _count_bad(w) > w.report.nbad:
     _find_bad_state(w)
   w.run()
-  if w.status[3]:
+  if w.seen.status[3]:
     w.note(f"the {w.config.integrator} step has no finite solution: the motion diverged")
 
 
 @signals.watch
 def _advance(model: int, data: int, instance: int):
   w = _workspaces[data, instance]
-  w.flags[FLAG.stage] = STAGE.pushed
-  again = True
-  while again:
-    try:
-      _end(w)
-      again = False
-    except BaseException as error:
-      again = _fail(w, error)
+  try:
+    _end(w)
+  except BaseException as error:
+    _fail(w, error)
   return signals.leave()
 
 
@@ -208,14 +201,14 @@ def _end(w: Workspace):
     w.cuts.hide(w.model)
   if (w.cuts.tear and w.cuts.tear.act()) or (w.cutters and w.cutters.open()):
     workspace.place(w, w.model)
-  nodes, triangles = w.flags[FLAG.missed_nodes], w.flags[FLAG.missed_elements]
-  if nodes > w.missed[0] or triangles > w.missed[1]:
+  nodes, triangles = w.report.flags[FLAG.missed_nodes], w.report.flags[FLAG.missed_elements]
+  if nodes > w.report.missed[0] or triangles > w.report.missed[1]:
     _miss(w, int(nodes), int(triangles))
-  if w.flags[FLAG.coarse] > 0:
+  if w.report.flags[FLAG.coarse] > 0:
     _tell_coarse(w)
-  if w.model_step[0] != w.time_step:
+  if w.seen.model_step[0] != w.seen.time_step:
     workspace.refresh(w)
-  if w.watch.due(w.flags[FLAG.fast]) and not (w.asleep or w.resident):
+  if w.report.watch.due(w.report.flags[FLAG.fast]) and not (w.asleep or w.graphs.resident):
     _watch(w)
 
 
@@ -250,51 +243,63 @@ def _draw_skin(w: Workspace, model: int, data: int):
 
 
 def _count_bad(w: Workspace) -> int:
-  warned = w.warning  # last index and count of each
+  warned = w.seen.warning  # last index and count of each
   return warned[2 * _BAD[0] + 1] + warned[2 * _BAD[1] + 1] + warned[2 * _BAD[2] + 1]
 
 
 def _find_bad_state(w: Workspace):
   """Makes an error of what MuJoCo warned of, and has reset since, if it is in this organ's dofs."""
-  w.nbad = _count_bad(w)
+  w.report.nbad = _count_bad(w)
   organ = w.organ
   names = ("position (qpos", "velocity (qvel", "acceleration (qacc")
   for kind, name, own in zip(_BAD, names, (organ.qposs, organ.dofs, organ.dofs), strict=True):
-    index, count = w.warning[2 * kind : 2 * kind + 2]
+    index, count = w.seen.warning[2 * kind : 2 * kind + 2]
     if count and index in own:
       w.note(f"{name} {index}) is not finite or huge; the motion diverged")
 
 
 def _say(error: BaseException):
   """Makes the error message of a model that does not compile."""
-  if signals.is_foreign(error):
+  if not isinstance(error, Exception):
     signals.raise_later(error)
   warn(str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}")
 
 
-def _fail(w: Workspace, error: BaseException) -> bool:
-  """Makes an error of an exception in a callback; returns whether the callback is to go on.
-
-  It is where a signal's handler ended it, but not where the motion is on a device: that may be a
-  step ahead.
-  """
-  if not signals.is_foreign(error):
+def _fail(w: Workspace, error: BaseException):
+  """Makes an error of an exception in a callback, whose step is not whole."""
+  if isinstance(error, Exception):
     w.note(f"{type(error).__name__}: {error}")
-    return False
+  else:
+    _interrupt(w, error)
+
+
+def _interrupt(w: Workspace | None, error: BaseException):
+  """Makes an error of what a signal's handler raised, and raises that after the callback."""
   signals.raise_later(error)
-  w.torn = w.resident is not None
-  return not w.torn
+  if w is not None:
+    w.note(f"a step was interrupted by {type(error).__name__}; reset the data or set a state")
+
+
+@signals.watch
+def _on_unraisable(unraisable, before=sys.unraisablehook):
+  """Takes what a signal's handler raised at the first or last instruction of a callback."""
+  trace = unraisable.exc_traceback
+  if trace is None or not signals.is_callback(trace.tb_frame.f_code):
+    return before(unraisable)
+  known = trace.tb_frame.f_locals
+  _interrupt(_workspaces.get((known.get("data"), known.get("instance"))), unraisable.exc_value)
+  return signals.leave()
 
 
 def _watch(w: Workspace):
   """Warns of tools that have come through the surface, and of tetrahedra that stay inside out."""
-  if stuck := w.watch.stuck(w):
+  if stuck := w.report.watch.stuck(w):
     warn(
       f"organ {w.organ.name!r}: {stuck} of {len(w.organ.mesh.tet)} tetrahedra are inside out and "
       "do not recover: the tissue is crushed or was placed so; a smaller time step, newton of 2 or "
       "3 or a greater young may keep them from it, a reset puts them right"
     )
-  for geom in w.watch.look(w):
+  for geom in w.report.watch.look(w):
     m = mjstruct.Model.from_address(w.model)
     name = mjstruct.name_of(m, m.name_geomadr, geom) or geom
     warn(
@@ -305,7 +310,7 @@ def _watch(w: Workspace):
 
 def _tell_coarse(w: Workspace):
   """Warns, once, of a tool that is too small for the mesh."""
-  edge, w.flags[FLAG.coarse] = 1e-6 * w.flags[FLAG.coarse], -1
+  edge, w.report.flags[FLAG.coarse] = 1e-6 * w.report.flags[FLAG.coarse], -1
   warn(
     f"organ {w.organ.name!r}: a tool touches it whose radius is under a twentieth of an edge of "
     f"its triangles, so that forces depend on where it meets them; edges of {1e3 * edge:.2g} mm "
@@ -315,8 +320,8 @@ def _tell_coarse(w: Workspace):
 
 def _miss(w: Workspace, nodes: int, triangles: int):
   """Keeps the most that the windows had no room for, and warns the first time."""
-  first = w.missed == (0, 0)
-  w.missed = max(nodes, w.missed[0]), max(triangles, w.missed[1])
+  first = w.report.missed == (0, 0)
+  w.report.missed = max(nodes, w.report.missed[0]), max(triangles, w.report.missed[1])
   if first:
     warn(windowed.shortage(w) or "")
 
@@ -358,6 +363,7 @@ def register() -> int:
     raise ImportError(f"palpate: MuJoCo did not accept the plugin {NAME!r} (slot {number})")
   _keep.append((plugin, attributes))
   atexit.register(_let_go, number)
+  sys.unraisablehook = _on_unraisable
   signals.install()
   return number
 

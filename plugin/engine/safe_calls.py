@@ -8,7 +8,6 @@ from __future__ import annotations
 import _thread
 from collections.abc import Callable
 
-from . import signals
 from .model import mjstruct
 
 # What says how many of something a constraint solver has.
@@ -70,7 +69,8 @@ def run(function: Callable, *args):
 
 
 def _wait(begin, done, results: list):
-  """Lets a thread begin and waits for its result, whatever signals' handlers raise meanwhile."""
+  """Lets a thread begin and waits for its result, even if a signal's handler raises meanwhile."""
+  late = None
   while not results:
     try:
       if begin.locked():
@@ -78,4 +78,6 @@ def _wait(begin, done, results: list):
       while not results:
         done.acquire()
     except BaseException as error:
-      signals.raise_later(error)
+      late = error
+  if late is not None:
+    raise late

@@ -1,4 +1,4 @@
-"""What reaches a callback from outside: exceptions of signals, the end of the process.
+"""Ctrl-C during a step, and the end of the process while threads step.
 
 MuJoCo calls the plugin through ctypes, which drops exceptions; and a thread that is ended in a
 callback takes the process with it.
@@ -8,28 +8,26 @@ from __future__ import annotations
 
 import _thread
 import atexit
-import ctypes as C
-import functools
 import signal
-import sys
 import threading
 import time
 import types
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 _codes: set[types.CodeType] = set()  # of the callbacks
-_MARK = "raised late"  # of an exception that came in a callback and is kept until after it
-_late: list[BaseException] = []  # of the main thread
-_late_in: dict[int, BaseException] = {}  # of another thread
-_before: list = []  # handler of SIGINT while there are some
-_raise_in_thread = C.pythonapi.PyThreadState_SetAsyncExc
-_raise_in_thread.argtypes = [C.c_ulong, C.py_object]
+_late: list[BaseException] = []  # what the main thread raises when it has left its callback
+_before: list = []  # the handler of SIGINT that ours replaces until then
 
 
 def watch(callback: Callable) -> Callable:
   """Makes a function known as a callback of MuJoCo's; returns it."""
   _codes.add(callback.__code__)
   return callback
+
+
+def is_callback(code: types.CodeType) -> bool:
+  """Returns whether this is the code of a callback."""
+  return code in _codes
 
 
 # Exceptions.
@@ -42,103 +40,34 @@ class _Bell:
 
 
 def leave() -> object:
-  """Returns what a callback has to return: ctypes drops it, and with that what is late is raised.
+  """Returns what a callback has to return: ctypes drops it, and `_on_interrupt` is called then.
 
-  Python looks for signals, and exceptions of other threads, between its instructions. From where
-  ctypes drops what a callback returned the next instruction is one of MuJoCo's caller or of another
-  callback, which does the same again.
+  Python looks for signals between its instructions: the next one is of MuJoCo's caller, or of
+  another callback, which does the same again.
   """
-  if not (_late or _late_in):
-    return None
-  ident = threading.get_ident()
-  if ident == threading.main_thread().ident:
-    return _Bell() if _late else None
-  error = _late_in.pop(ident, None)
-  if error is None:
-    return None
-  # Python makes the exception from a class, where it is raised.
-  kind = type(type(error).__name__, (type(error),), {"__new__": lambda _: error})
-  ring = functools.partial(_raise_in_thread, ident, kind)
-  return type("_Bell", (), {"__del__": staticmethod(ring)})()
+  return _Bell() if _late and threading.current_thread() is threading.main_thread() else None
 
 
 def raise_later(error: BaseException):
-  """Raises an exception in this thread as soon as that is in no callback, see `leave`."""
-  vars(error)[_MARK] = True
-  error.__traceback__ = None
+  """Raises an exception in the main thread as soon as that is in no callback, see `leave`."""
   if threading.current_thread() is not threading.main_thread():
-    _late_in[threading.get_ident()] = error
     return
-  _late.append(error)
-  if signal.getsignal(signal.SIGINT) is not _on_bell:
-    _before[:] = [signal.getsignal(signal.SIGINT)]
-    signal.signal(signal.SIGINT, _on_bell)
-
-
-def _on_bell(number: int, frame: types.FrameType | None):
-  """Raises what is late, once the main thread is in no callback."""
-  if _is_inside(frame):
-    return
-  error = _late.pop(0) if _late else KeyboardInterrupt()
-  if not _late:
-    signal.signal(signal.SIGINT, _before[0] or signal.SIG_DFL)
-  raise error
-
-
-def is_foreign(error: BaseException) -> bool:
-  """Returns whether a signal's handler raised an exception that a callback has caught."""
-  if not isinstance(error, Exception) or _MARK in vars(error):
-    return True
-  handlers = set(_handlers())
-  trace = error.__traceback__
-  while trace is not None:
-    if trace.tb_frame.f_code in handlers:
-      return True
-    trace = trace.tb_next
-  return False
-
-
-def _handlers() -> Iterator[types.CodeType]:
-  """Yields the code of the signals' handlers."""
-  for number in signal.valid_signals():
-    handler = signal.getsignal(number)
-    handler = getattr(handler, "func", handler)  # of functools.partial
-    if not hasattr(handler, "__code__") and not hasattr(handler, "__func__"):
-      handler = getattr(handler, "__call__", handler)  # noqa: B004
-    code = getattr(getattr(handler, "__func__", handler), "__code__", None)
-    if code is not None:
-      yield code
-
-
-def _is_inside(frame: types.FrameType | None) -> bool:
-  """Returns whether a frame is in a callback."""
-  while frame is not None and frame.f_code not in _codes:
-    frame = frame.f_back
-  return frame is not None
+  error.__traceback__ = None
+  _late[:] = [error]
+  if signal.getsignal(signal.SIGINT) is not _on_interrupt:
+    _before[:] = [signal.signal(signal.SIGINT, _on_interrupt) or signal.SIG_DFL]
 
 
 def _on_interrupt(number: int, frame: types.FrameType | None):
-  """Raises KeyboardInterrupt, but not inside a callback."""
-  if _is_inside(frame):
-    raise_later(KeyboardInterrupt())
-  else:
-    signal.default_int_handler(number, frame)
-
-
-@watch
-def _on_unraisable(unraisable, before=sys.unraisablehook):
-  """Takes what was raised in a callback before its first line, which is run then, or its last."""
-  callback, error = unraisable.object, unraisable.exc_value
-  code = getattr(callback, "__code__", None)
-  if code not in _codes or error is None:
-    return before(unraisable)
-  known = error.__traceback__.tb_frame.f_locals
-  begun = len(known) > code.co_argcount
-  arguments = [] if begun else [known[name] for name in code.co_varnames[: code.co_argcount]]
-  raise_later(error)
-  if begun or "return" in callback.__annotations__:  # which is lost
-    return leave()
-  return callback(*arguments)
+  """Raises what is late, or KeyboardInterrupt, once the main thread is in no callback."""
+  while frame is not None:
+    if frame.f_code in _codes:
+      _late[:] = _late or [KeyboardInterrupt()]
+      return
+    frame = frame.f_back
+  if _before:
+    signal.signal(signal.SIGINT, _before.pop())
+  raise _late.pop() if _late else KeyboardInterrupt()
 
 
 # The end of the process.
@@ -177,7 +106,6 @@ def _park():
 
 def install():
   """Looks after signals and the end of the process; once a process."""
-  sys.unraisablehook = _on_unraisable
   atexit.register(_park)
   if (
     threading.current_thread() is threading.main_thread()

@@ -23,7 +23,7 @@ from .forces.cohesive_bonds import Bonds
 from .forces.passive import Beside, Hold
 from .forces.relaxation import Creep
 from .forces.supports import Rests
-from .layout import FLAG, HEAD, STAGE
+from .layout import FLAG, HEAD
 from .model import declare, inertia, mjstruct, prepare, skin
 from .model.declare import Declaration
 from .penetration import Watch
@@ -36,6 +36,99 @@ _RK4 = int(mujoco.mjtIntegrator.mjINT_RK4)
 _ASTRAY = 1e-9  # distance of a slot from its node that rounding does not explain [m]
 
 
+# An item of a memoryview costs a tenth of one of an array; this stands for those not yet there.
+_NONE = memoryview(bytes(4)).cast("i")
+
+
+@dataclasses.dataclass
+class Graphs:
+  """Recorded graphs of a step, see `bind`.
+
+  Attributes:
+    phases: what they launch
+    stiff: whether the response is needed, see `inertia.stiffness`
+    before: the forces before the solve
+    solve: the solve and what is around it, each on one device
+    after: the forces after it where the motion is on a device, else part of it
+    leave: takes the contact forces after MuJoCo's step
+    respond: the organ's response to their change; none where the scheme has none
+    advance, end: the plugin state's step after that, or without a response
+    place: puts the window where the state says, or None
+    resident: keeper of a motion that stays on the device, or None
+  """
+
+  phases: Phases = dataclasses.field(default_factory=Phases)
+  stiff: bool = False
+  before: Any = None
+  solve: list = dataclasses.field(default_factory=list)
+  after: Any = None
+  leave: Any = None
+  respond: list = dataclasses.field(default_factory=list)
+  advance: Any = None
+  end: Any = None
+  place: Any = None
+  resident: Resident | None = None
+
+
+@dataclasses.dataclass
+class Seen:
+  """What of a model and its data every step looks at, as views; their first number unless said.
+
+  Attributes:
+    instance: number of the plugin instance
+    identity: tells the model from others
+    model_step, time_step: the model's time step, and the armature's [s]
+    integrator: MuJoCo's
+    static: places of the bodies that the organ hangs on, and what they were
+    policy, counts: MuJoCo's sleep policy of the window's bodies, and the number of vertices that it
+      sees of a windowed organ
+    status: iterations, relative residual, norm, failure  (4,)
+    warning: last index and count of each of MuJoCo's warnings, one after the other
+    nefc: number of MuJoCo's constraints
+    signature: the last number of the plugin state, see `Declaration`
+  """
+
+  instance: int
+  identity: Any = None
+  model_step: memoryview = _NONE
+  time_step: float = 0.0
+  integrator: memoryview = _NONE
+  static: list = dataclasses.field(default_factory=list)
+  policy: memoryview = _NONE
+  counts: memoryview = _NONE
+  status: memoryview = _NONE
+  warning: memoryview = _NONE
+  nefc: memoryview = _NONE
+  signature: Any = _NONE
+
+
+@dataclasses.dataclass
+class Report:
+  """What happened in an mjData.
+
+  Attributes:
+    flags: what the coupling reports, see `layout.FLAG`
+    computed: whether forces were computed for the step that ends
+    strange: whether the plugin state is not one of this organ
+    error: what went wrong since the last reset, or None
+    missed: most nodes and triangles that the window had no room for in a step
+    noticed: whether it was said that the window came without its state
+    nbad: MuJoCo's warnings of bad states that were looked at since the last reset
+    watch: looks whether tools come through the surface
+    chosen: whether the configuration was changed here, not by a copy
+  """
+
+  flags: memoryview = dataclasses.field(default_factory=lambda: np.zeros(len(FLAG), np.int32).data)
+  computed: bool = False
+  strange: bool = False
+  error: str | None = None
+  missed: tuple[int, int] = (0, 0)
+  noticed: bool = False
+  nbad: int = 0
+  watch: Watch = dataclasses.field(default_factory=Watch)
+  chosen: bool = False
+
+
 @dataclasses.dataclass
 class Workspace:
   """One organ in one mjData.
@@ -44,71 +137,31 @@ class Workspace:
     organ: constants
     config: configuration in force, which may differ from the compiled one
     body: shape, tissue and state on the organ's device
-    host: the arrays of its state that MuJoCo's side reads and writes, on the CPU
-    lagged: external and lagged contact force [N]  (nodes or slots, 3)
-    data: address of the mjData
-    instance: the plugin instance
-    model: address of the mjModel the views are of
-    identity: tells that model from others
-    chosen: whether the configuration was changed here, not by a copy
-    turn: this mjData's part in the model's windows, or None
-    before: recorded graph of a step's forces before the solve
-    solve: recorded graphs of the solve and what is around it, each on one device
-    after: recorded graph of the forces after it where the motion is on a device, else part of it
-    leave: recorded graph that takes the contact forces after MuJoCo's step
-    respond: recorded graphs of the organ's response to their change; none where the scheme has none
-    advance, end: recorded graphs of the plugin state's step after that, or without a response
-    place: recorded graph that puts the windows where the state says, or None
+    host: the arrays of its state that MuJoCo's side reads and writes, on the CPU; `lagged`,
+      external and lagged contact force [N] (nodes or slots, 3); `heaviest`, most times its inertia
+      that a node in contact may have (1,)
+    data, model: addresses of the mjData, and of the mjModel that views are of
+    seen: what a step looks at there
+    graphs: what it launches
+    report: what came of it
     hold, creep: springs that hold nodes; its stress relaxation
     ties, bonds, rests: what the organ is tied to, has grown on to, and rests on
     cuts, cutters: its mesh as it is now, and what cuts it
-    resident: keeper of a motion that stays on the device, or None
-    stiff: whether the response is needed, see `inertia.stiffness`
-    heaviest: most times its inertia that a node in contact may have, see there  (1,)
-    computed: whether forces were computed for the step that ends
-    flags: what the coupling reports, see `layout.FLAG`
-    policy, counts: MuJoCo's sleep policy of the windows' bodies, and the number of vertices that it
-      sees of a windowed organ, come first
-    status: iterations, relative residual, norm, failure  (4,)
-    error: what went wrong since the last reset, or None
-    missed: most nodes and triangles that the windows had no room for in a step
-    warning: last index and count of each of MuJoCo's warnings, one after the other
-    strange: whether the plugin state is not one of this organ
-    noticed, torn: whether it was said that windows came without their state; whether a signal's
-      handler has ended a callback of the last step
-    watch: looks whether tools come through the surface
-    nbad: MuJoCo's warnings of bad states that were looked at since the last reset
-    model_step, time_step: the model's time step comes first, and the armature's [s]
-    integrator, nefc: MuJoCo's, and the number of its constraints, come first
-    static: places of the bodies that the organ hangs on, and what they were
-    qpos, stood: numbers of qpos that the slots have, as bytes; after the last step, or None
-    plugin_state: the organ's own numbers
-    signature: the last of them, see `Declaration`
-    views: what a coupling keeps when its graphs are recorded anew
+    turn: this mjData's part in the model's window, or None
     skin: what is drawn for it, or None
+    views: what a coupling keeps when its graphs are recorded anew
     boxes: blocks of the plugin state and of what crosses in a step, see `layout`; windows
-    phases: what the graphs launch
   """
 
   organ: Declaration
   config: Config
   body: Body
   host: dict[str, wp.array]
-  lagged: wp.array
   data: int
-  instance: int
-  model: int = 0
-  identity: Any = None
-  chosen: bool = False
-  turn: Turn | None = None
-  before: Any = None
-  solve: list = dataclasses.field(default_factory=list)
-  after: Any = None
-  leave: Any = None
-  respond: list = dataclasses.field(default_factory=list)
-  end: Any = None
-  advance: Any = None
-  place: Any = None
+  model: int
+  seen: Seen
+  graphs: Graphs = dataclasses.field(default_factory=Graphs)
+  report: Report = dataclasses.field(default_factory=Report)
   hold: Hold = dataclasses.field(init=False)
   ties: Ties = dataclasses.field(init=False)
   bonds: Bonds = dataclasses.field(init=False)
@@ -116,36 +169,10 @@ class Workspace:
   creep: Creep = dataclasses.field(init=False)
   cuts: Cuts = dataclasses.field(init=False)
   cutters: Cutters = dataclasses.field(init=False)
-  resident: Resident | None = None
-  stiff: bool = False
-  heaviest: np.ndarray = dataclasses.field(default_factory=lambda: np.ones(1))
-  computed: bool = False
-  policy: memoryview = dataclasses.field(default_factory=lambda: np.zeros(1, np.int32).data)
-  counts: memoryview = dataclasses.field(default_factory=lambda: np.zeros(1, np.int32).data)
-  error: str | None = None
-  missed: tuple[int, int] = (0, 0)
-  strange: bool = False
-  noticed: bool = False
-  torn: bool = False
-  watch: Watch = dataclasses.field(default_factory=Watch)
-  # Views that every step looks at: an item of a memoryview costs a tenth of one of an array.
-  flags: memoryview = dataclasses.field(default_factory=lambda: np.zeros(len(FLAG), np.int32).data)
-  status: memoryview = dataclasses.field(default_factory=lambda: np.zeros(4, np.float32).data)
-  warning: memoryview = dataclasses.field(default_factory=lambda: memoryview(b""))
-  nefc: memoryview = dataclasses.field(default_factory=lambda: memoryview(b"\0"))
-  nbad: int = 0
-  model_step: memoryview = dataclasses.field(default_factory=lambda: memoryview(b"\0"))
-  time_step: float = 0.0
-  integrator: memoryview = dataclasses.field(default_factory=lambda: memoryview(b"\0"))
-  static: list = dataclasses.field(default_factory=list)
-  qpos: memoryview = dataclasses.field(default_factory=lambda: memoryview(b""))
-  stood: bytes | None = None
-  plugin_state: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))
-  signature: Any = dataclasses.field(default_factory=lambda: memoryview(b"\0"))
-  views: dict = dataclasses.field(default_factory=dict)
+  turn: Turn | None = None
   skin: skin.Skin | None = None
+  views: dict = dataclasses.field(default_factory=dict)
   boxes: dict = dataclasses.field(default_factory=dict)
-  phases: Phases = dataclasses.field(init=False)
 
   def __post_init__(self):
     self.hold, self.ties = Hold(self), Ties(self)
@@ -157,17 +184,22 @@ class Workspace:
     """What acts on the organ beside its tissue, in the order in which it does."""
     return self.ties, self.bonds, self.rests, self.creep, self.cutters
 
-  def run(self):
-    """Computes the step's forces and adds them to qfrc_passive.
+  @property
+  def plugin_state(self) -> np.ndarray:
+    """The organ's own numbers."""
+    return self.views["plugin_state"].numpy()
 
-    As `step` it may be called again where a signal's handler ended it (`FLAG.stage`), but not where
-    the motion is on a device, which may be a step ahead.
-    """
+  def motion(self) -> tuple[np.ndarray, np.ndarray]:
+    """Returns displacement and velocity of the vertices, in the organ's frame, (nvert, 3) each."""
+    return self.graphs.phases.motion()
+
+  def run(self):
+    """Computes the step's forces and adds them to qfrc_passive."""
     self._check_model()
-    self.strange = self.signature[0] != self.organ.signature
-    if self.strange:
+    self.report.strange = self.seen.signature[0] != self.organ.signature
+    if self.report.strange:
       coupling.check_state(self.organ, self.plugin_state)
-      self.strange = False
+      self.report.strange = False
     changed = bool(self.cuts) and self.cuts.renewed()
     if self.turn is None:
       if self.cuts:
@@ -184,44 +216,40 @@ class Workspace:
     """Runs an organ that may be cut: the model's triangles must be its own."""
     with self.cuts.lock:
       others = self.cuts.show()
-      if self.flags[FLAG.stage] < STAGE.gathered and (changed or others):
+      if changed or others:
         windowed.find_contacts_again(self)
       self._run()
 
   def _run(self):
-    if self.flags[FLAG.stage] == STAGE.pushed:
-      self.computed = True
-      return
     if self.turn is not None:
       # The model's windows may not be those of this state, which was set from outside or shares the
       # model with another: contacts must be found again with the windows in place.
-      if self._is_astray() or not self.turn.mine:
+      if self._is_astray(self.turn) or not self.turn.mine:
         self._find_contacts_again()
-    if self.flags[FLAG.stage] < STAGE.gathered:
-      wp.capture_launch(self.before)
+    wp.capture_launch(self.graphs.before)
     if self.turn is not None:
-      if self.flags[FLAG.stale]:
+      if self.report.flags[FLAG.stale]:
         self._find_contacts_again()
-        wp.capture_launch(self.before)
-      if not self.asleep and self.policy[0] == _ALLOWED:
+        wp.capture_launch(self.graphs.before)
+      if not self.asleep and self.seen.policy[0] == _ALLOWED:
         windowed.let_sleep(self, False)
     if not self.asleep:  # what `after` does was done with `before`
       self._solve()
-    if self.flags[FLAG.weighed]:
+    if self.report.flags[FLAG.weighed]:
       contacts.project(self.model, self.data)  # with the inertia that is in the model now
-    self.computed = True
+    self.report.computed = True
 
   def _solve(self):
     """Solves for the step, and tells MuJoCo."""
     if self.ties.aims:
       self.ties.aim()
-    if self.resident:
-      self.resident.send()
-      graphs.launch_all(self.resident.left_to_do())
-      self.resident.look()
-      wp.capture_launch(self.after)
+    if self.graphs.resident:
+      self.graphs.resident.send()
+      graphs.launch_all(self.graphs.resident.left_to_do())
+      self.graphs.resident.look()
+      wp.capture_launch(self.graphs.after)
     else:
-      graphs.launch_all(self.solve)
+      graphs.launch_all(self.graphs.solve)
 
   def _check_model(self):
     """Makes sure that nothing has changed in the model that may not change while running.
@@ -229,20 +257,20 @@ class Workspace:
     Raises:
       ValueError: something has.
     """
-    if self.integrator[0] == _RK4:
+    if self.seen.integrator[0] == _RK4:
       raise ValueError(declare.NO_RK4)
-    for place, was in self.static:
+    for place, was in self.seen.static:
       if place.tobytes() != was:
         declare.check_frame(mjstruct.Model.from_address(self.model), self.organ)
 
-  def _is_astray(self) -> bool:
+  def _is_astray(self, turn: Turn) -> bool:
     """Returns whether qpos was set without the plugin state: slots are not on their nodes."""
-    if self.qpos.tobytes() == self.stood:
+    if turn.qpos.tobytes() == turn.stood:
       return False
     far = windowed.find_astray(self)
-    torn, self.torn = self.torn, False
-    if far > _ASTRAY and not (self.noticed or torn):
-      self.noticed = True
+    report = self.report
+    if far > _ASTRAY and not (report.noticed or report.error):  # by which a step is not whole
+      report.noticed = True
       mjstruct.warn(
         f"organ {self.organ.name!r}: qpos of its windows was set without plugin_state, which has "
         "its motion and is kept; save and set mjSTATE_FULLPHYSICS"
@@ -255,60 +283,59 @@ class Workspace:
 
   def put_windows(self):
     """Puts the windows where the plugin state says."""
-    if self.resident:
-      self.resident.fetch()
-    wp.capture_launch(self.place)
+    if self.graphs.resident:
+      self.graphs.resident.fetch()
+    wp.capture_launch(self.graphs.place)
     if self.turn is not None:
       self.turn.take()
 
   def step(self):
     """Steps the plugin state after MuJoCo has moved."""
-    if self.strange:
+    if self.report.strange:
       return
-    if self.computed:
-      self.signature[0] = self.organ.signature
+    if self.report.computed:
+      self.seen.signature[0] = self.organ.signature
     if self.turn is None:
       self._step()
     else:
       with self.turn.lock:
         self._step()
         self.turn.end()
-        self.stood = self.qpos.tobytes()
+        self.turn.stood = self.turn.qpos.tobytes()
 
   def _step(self):
-    computed = self.computed
+    computed = self.report.computed
     if self.asleep:
-      self.computed = False
-      if self.nefc[0]:  # contacts of a window that was left behind wake the organ
-        wp.capture_launch(self.leave)
-      if self.counts[0]:
+      self.report.computed = False
+      if self.seen.nefc[0]:  # contacts of a window that was left behind wake the organ
+        wp.capture_launch(self.graphs.leave)
+      if self.seen.counts[0]:
         windowed.hide(self)
-      if self.policy[0] != _ALLOWED:
+      if self.seen.policy[0] != _ALLOWED:
         windowed.let_sleep(self, True)
       return
-    responds = bool(self.respond) and self.stiff and computed
-    if (responds or self.turn is not None) and self.flags[FLAG.stage] < STAGE.left:
-      wp.capture_launch(self.leave)
+    responds = bool(self.graphs.respond) and self.graphs.stiff and computed
+    if responds or self.turn is not None:
+      wp.capture_launch(self.graphs.leave)
     if self.turn is not None:
       windowed.hide(self)
-    responds = responds and bool(self.flags[FLAG.changed])
-    self.flags[FLAG.answered] = responds
-    if self.flags[FLAG.stage] < STAGE.ended:
-      if responds:
-        self._answer()
-      wp.capture_launch(self.advance if responds else self.end)
-    if self.resident:
-      self.resident.step(computed)
-    self.computed = False
+    responds = responds and bool(self.report.flags[FLAG.changed])
+    self.report.flags[FLAG.answered] = responds
+    if responds:
+      self._answer()
+    wp.capture_launch(self.graphs.advance if responds else self.graphs.end)
+    if self.graphs.resident:
+      self.graphs.resident.step(computed)
+    self.report.computed = False
 
   def _answer(self):
     """Ends the step with the organ's own response to the change of the contact forces."""
     if self.turn is not None:
       self.boxes["inbox"].head.numpy()[HEAD.answered] = 1.0
-    graphs.launch_all(self.respond)
-    if self.resident:
-      self.flags[FLAG.pending] = 0
-      self.resident.look()
+    graphs.launch_all(self.graphs.respond)
+    if self.graphs.resident:
+      self.report.flags[FLAG.pending] = 0
+      self.graphs.resident.look()
 
   @property
   def declared(self) -> Declaration:
@@ -318,7 +345,7 @@ class Workspace:
   @property
   def asleep(self) -> bool:
     """Whether the organ is at rest and its solve was skipped."""
-    return bool(self.flags[FLAG.asleep])
+    return bool(self.report.flags[FLAG.asleep])
 
   @property
   def slots(self) -> np.ndarray:
@@ -333,13 +360,13 @@ class Workspace:
 
   def note(self, text: str):
     """Keeps the first error and says it."""
-    if self.error is None:
-      self.error = f"organ {self.organ.name!r}: {text}"
-      mjstruct.warn(self.error)
+    if self.report.error is None:
+      self.report.error = f"organ {self.organ.name!r}: {text}"
+      mjstruct.warn(self.report.error)
 
   def forget(self):
     """Forgets what went wrong."""
-    self.error, self.watch = None, Watch()
+    self.report.error, self.report.watch = None, Watch()
 
 
 def place(w: Workspace, model: int):
@@ -348,7 +375,7 @@ def place(w: Workspace, model: int):
   if w.turn is not None:
     with w.turn.lock:
       w.put_windows()
-      w.stood = w.qpos.tobytes()
+      w.turn.stood = w.turn.qpos.tobytes()
 
 
 def rebind(w: Workspace):
@@ -358,7 +385,7 @@ def rebind(w: Workspace):
 
 def attach(w: Workspace, model: int):
   """Makes a workspace fit a living model, which need not be the one that it last ran with."""
-  if not w.identity.is_of(model):
+  if not w.seen.identity.is_of(model):
     bind(w, model)
 
 
@@ -376,22 +403,22 @@ def make(model: int, data: int, instance: int) -> Workspace:
         array = wp.zeros(array.shape, dtype=float, device="cpu", pinned=True)
       host[field] = array
     size = organ.windows.nslot if organ.windows else s.nnode
-    lagged = wp.zeros((size, 3), dtype=wp.float64, device="cpu")
-    w = Workspace(organ, organ.config, body, host, lagged, data, instance, model)
+    host["lagged"] = wp.zeros((size, 3), dtype=wp.float64, device="cpu")
+    host["heaviest"] = wp.ones(1, dtype=wp.float64, device="cpu")
+    w = Workspace(organ, organ.config, body, host, data, model, Seen(instance))
+    if organ.windows:
+      w.turn = Turn()
     _view(w, mjstruct.Data.from_address(data), m)
     prepare.fit(m, organ, body)
     # Padding nodes have a mass so that nothing divides by zero.
     mass = np.where(s.vert.numpy() >= 0, 0.0, 1.0).reshape(1, -1, 8)
     host["mass"].assign(mass)
-    if organ.windows:
-      w.turn = Turn()
     w.skin = skin.read(m, organ)
     declare_attachments.declare(w)
     declare_bonds.declare(w)
     w.cutters.declare()
     bind(w, model)
-    w.plugin_state = w.views["plugin_state"].numpy()
-    w.signature = w.plugin_state[coupling.spans(organ)["signature"]].data
+    w.seen.signature = w.plugin_state[coupling.spans(organ)["signature"]].data
     if w.turn is not None:
       windowed.settle(w, model)
     feel(w, m)
@@ -401,18 +428,19 @@ def make(model: int, data: int, instance: int) -> Workspace:
 def _view(w: Workspace, d, m):
   """Takes views of an mjData that every step looks at."""
   fields, count = mjstruct.Data, len(d.warning)
-  w.status = w.host["status"].numpy()[0].data
-  w.warning = mjstruct.view(w.data + fields.warning.offset, 2 * count, np.int32).data
-  w.nefc = mjstruct.view(w.data + fields.nefc.offset, 1, np.int32).data
-  if w.organ.windows:
+  w.seen.status = w.host["status"].numpy()[0].data
+  w.seen.warning = mjstruct.view(w.data + fields.warning.offset, 2 * count, np.int32).data
+  w.seen.nefc = mjstruct.view(w.data + fields.nefc.offset, 1, np.int32).data
+  if w.turn is not None:
     first, last = int(w.organ.qposs.min()), int(w.organ.qposs.max()) + 1
-    w.qpos = mjstruct.view(d.qpos + 8 * first, 8 * (last - first), np.uint8).data
+    w.turn.qpos = mjstruct.view(d.qpos + 8 * first, 8 * (last - first), np.uint8).data
 
 
 def feel(w: Workspace, m):
   """Notes how stiff the organ is for the present time step, and what its step takes for it."""
   nodal = w.inertia(w.model)
-  w.stiff, w.heaviest[0] = inertia.stiffness(m, w.declared, w.body, w.config, nodal)
+  w.graphs.stiff, heaviest = inertia.stiffness(m, w.declared, w.body, w.config, nodal)
+  w.host["heaviest"].numpy()[0] = heaviest
   newton = inertia.iterations(m, w.declared, w.config)
   if newton != w.body.newton:
     w.body.newton = newton
@@ -421,8 +449,8 @@ def feel(w: Workspace, m):
 
 def sync(w: Workspace):
   """Brings a motion that is on a device into the plugin state."""
-  if w.resident:
-    w.resident.fetch()
+  if w.graphs.resident:
+    w.graphs.resident.fetch()
 
 
 def refresh(w: Workspace):
@@ -431,7 +459,7 @@ def refresh(w: Workspace):
   with graphs.lock:
     if w.organ.windows is None:
       prepare.give_armature(m, w.declared, w.body, w.config)
-      w.phases.reshape()
+      w.graphs.phases.reshape()
     else:
       windowed.set_inertia(w, m)
       if w.turn is not None and w.turn.mine:
@@ -439,4 +467,4 @@ def refresh(w: Workspace):
     feel(w, m)
     contacts.tell(w, w.model)
     w.cutters.refresh()
-    w.time_step = float(m.opt.timestep)
+    w.seen.time_step = float(m.opt.timestep)

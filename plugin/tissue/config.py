@@ -137,17 +137,16 @@ class Config:
     1e-4, reading.number(1e-10, 1.0), "relative residual at which PCG stops", change=NUMBER
   )
   newton: int = _row(1, reading.whole(1, 100), "Newton iterations a step", change=GRAPH)
-  window: tuple[str, ...] = _row(
-    (),
-    (reading.names, "names of flexcomps"),
-    "flexcomps that follow the tools over the organ, which is rigid then (`add_windows` sets it); "
+  window: str = _row(
+    "",
+    (reading.name, "the name of a flexcomp"),
+    "flexcomp that follows the tools over the organ, which is rigid then (`add_windows` sets it); "
     "none where the vertices are MuJoCo's dofs",
   )
-  follow: tuple[tuple[str, ...], ...] = _row(
+  follow: tuple[str, ...] = _row(
     (),
-    (reading.groups, "names of bodies"),
-    "bodies that each window follows, a comma between windows; left out, all that moves and "
-    "collides",
+    (reading.names, "names of bodies"),
+    "bodies that the window follows; left out, all that moves and collides",
   )
   mass: float = _row(0.0, reading.POSITIVE, "mass of the organ, with `window` alone", "kg")
   pin: tuple[int, ...] = _row(

@@ -96,11 +96,6 @@ def name(text: str, nelem: int) -> str:
   return name
 
 
-def groups(text: str, nelem: int) -> tuple[tuple[str, ...], ...]:
-  """Returns names in groups, a comma between them."""
-  return tuple(tuple(group.split()) for group in text.split(","))
-
-
 def ties(text: str, nelem: int) -> tuple[tuple[str, float, tuple[int, ...]], ...]:
   """Returns groups of a name, a stiffness and vertices."""
   found = []

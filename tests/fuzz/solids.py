@@ -45,7 +45,7 @@ def energy(organ) -> float:
   """Returns that of all nodes, at rest or in motion [J]."""
   space = scenes.workspace(organ)
   space.cuts.follow()
-  vel = space.phases.motion()[1]
+  vel = space.motion()[1]
   return organ.energy + 0.5 * float((space.organ.mass[:, None] * vel**2).sum())
 
 

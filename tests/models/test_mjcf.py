@@ -49,7 +49,7 @@ def test_a_rigid_organ_and_its_window_are_written_too():
   )
   plain = compile_(f'<body name="b">{mjcf.plugin(config)}{organ}</body>{window}')
   for model in (named, plain):
-    assert palpate.Organ(model, mujoco.MjData(model), "o").config.window == ("w",)
+    assert palpate.Organ(model, mujoco.MjData(model), "o").config.window == "w"
 
 
 def test_pins_with_names_and_without_are_the_same():

@@ -109,8 +109,8 @@ def contact_force(model, data, probe: Probe, organ: Organ) -> tuple[np.ndarray, 
   """Returns the force of an organ's contacts on the probe [N] (3,), and their number."""
   contact = data.contact
   total, wrench = np.zeros(3), np.zeros(6)
-  # Contacts are with the organ, or with the windows that stand in for it.
-  names = (organ.name, *organ.config.window)
+  # Contacts are with the organ, or with the window that stands in for it.
+  names = [name for name in (organ.name, organ.config.window) if name]
   flexes = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_FLEX, name) for name in names]
   touched = np.isin(contact.flex, flexes).any(axis=1)
   mine = np.flatnonzero(touched & (contact.geom >= 0).any(axis=1))

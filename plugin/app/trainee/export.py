@@ -53,6 +53,7 @@ def main(args: argparse.Namespace) -> int:
     else:
       named = person
     episodes = record.episodes(person)
+    keeping.tell(record)
     with writing(out), _complete(out) as folder:
       missing = _write(folder, record, named, episodes)
   for name in missing:

@@ -66,7 +66,7 @@ def references(path: str | pathlib.Path | None) -> Lookup:
 @contextlib.contextmanager
 def one_line():
   """Turns what is wrong with a record into one line."""
-  from .database import RecordError
+  from .record import RecordError
 
   try:
     yield
@@ -169,8 +169,7 @@ class Sitting:
       recording: of an exercise that ended
       person: who did it, where there is no `trainee`; added to the record if new
     """
-    from .database import PendingError, RecordError
-    from .record import Record
+    from .record import Record, RecordError
 
     folder, trainee = self.keeping.folder, self.keeping.trainee
     assert folder is not None, "there is no record"
@@ -182,8 +181,6 @@ class Sitting:
         said = _progress(record.episodes(who), episode.task, judged) if trainee else ()
         tell(record)
         return Kept(record.path(episode), "", said)
-    except PendingError as error:
-      return Kept(error.path, "", (str(error),))
     except (RecordError, ValueError) as error:
       fault = f"not kept in {folder}: {error}"
     try:
@@ -214,7 +211,7 @@ def read(args: argparse.Namespace, task: str = "", pages: bool = False) -> Keepi
   name = ""
   with one_line():
     if args.trainee is None:
-      Record(folder(args), references(None)).close()  # what is wrong with it is said now
+      Record(folder(args), references(None))  # what is wrong with it is said now
     else:
       with Record(folder(args)) as record:
         name = record.find(args.trainee).name

@@ -26,4 +26,5 @@ def main(args: argparse.Namespace) -> int:
       count = f"{len(episodes)} episode{'' if len(episodes) == 1 else 's'}{last}"
       then = curriculum.following(met) or "none"
       print(f"{person.name:24} {count}; exercises done: {len(met)}, next {then}")
+    keeping.tell(record)
   return 0

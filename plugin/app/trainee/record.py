@@ -1,13 +1,11 @@
-"""A record of people's training: a folder with a database and their recordings.
+"""A record of people's training: a folder of their recordings.
 
-    FOLDER/record.sqlite                  trainees, sessions, episodes; see `database`
     FOLDER/recordings/ID/trainee.json     who ID is
     FOLDER/recordings/ID/TIME_TASK.npz    recordings, see `recording.Recording`
 
-A recording is written before its row is, and holds all that the row says: a row that is missing,
-since a process was killed or the disk was full in between, is made when the record is opened
-the next time, and so is a whole database from the recordings. No name stands in a path or in a
-recording. Folders that this makes are their owner's alone (0700), and so is every file (0600).
+A recording that is kept has its score and metrics in `info`, by the limits of then, so that a list
+reads no samples. No name stands in a path or in a recording. Folders that this makes are their
+owner's alone (0700), and so is every file (0600).
 """
 
 from __future__ import annotations
@@ -17,6 +15,7 @@ import dataclasses
 import datetime
 import json
 import math
+import os
 import pathlib
 import re
 import unicodedata
@@ -26,18 +25,20 @@ from typing import Any
 
 from palpate.tasks.files import free, replacing
 from palpate.tasks.metrics import METRICS, Metrics, Unknown
+from palpate.tasks.people import limits
 from palpate.tasks.people.curves import Attempt
 from palpate.tasks.people.limits import Lookup
 from palpate.tasks.people.score import score
 from palpate.tasks.recording import Recording
 
-from . import database
-from .database import PendingError, RecordError
-
 RECORDINGS = "recordings"
 _WHO = "trainee.json"
 _LONGEST = 80  # name
 _ID = re.compile(r"[0-9a-f]{32}")
+
+
+class RecordError(RuntimeError):
+  """Something about a record that people should know, in one line."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,12 +107,12 @@ def check_name(name: Any, option: str = "trainee") -> str:
   return text
 
 
-class Record:
-  """A record, open until it is closed; use it as a context.
+class Record(contextlib.AbstractContextManager):
+  """A record; a context, so that it is used as long as its block.
 
   Attributes:
     folder: of the record
-    said: what people should know about it: a damaged file that was kept aside, rows made anew
+    said: what people should know about it: files that could not be read
   """
 
   def __init__(self, folder: pathlib.Path, references: Lookup | None = None):
@@ -119,49 +120,63 @@ class Record:
 
     Args:
       folder: of the record
-      references: what episodes that have no row yet are scored by, see `limits.lookup`
+      references: what recordings without a score are scored by, see `limits.lookup`
     """
     self.folder, self.said = folder, []
-    self._path = folder / database.FILE
-    if references is None:
-      self._db = database.open_to_read(self._path)
-      return
-    self._db, aside = database.open_to_write(self._path)
-    if aside is not None:
-      text = f"{self._path} was damaged: it is kept as {aside.name}, and made anew of recordings"
-      self.said.append(text)
-    try:
-      with database.named(folder / RECORDINGS):
-        database.private_folder(folder / RECORDINGS)
-      with self._writing():
-        self._enter_missing(references)
-    except RecordError as error:  # a full disk: they wait on
-      self.said.append(f"{error}; some recordings have no row yet")
-
-  def __enter__(self) -> Record:
-    return self
+    self._people = folder / RECORDINGS
+    self._references = references or limits.lookup()
+    with _named(self._people):
+      if references is None:
+        if not self._people.is_dir():
+          raise RecordError(f"no record in {str(folder)!r}; `palpate trainee add` begins one")
+        return
+      for each in (folder, self._people):
+        each.mkdir(mode=0o700, parents=True, exist_ok=True)
+      with self._alone():
+        for part in self._people.glob("*/.*.part"):  # of a process that was killed
+          part.unlink(missing_ok=True)
 
   def __exit__(self, *_):
-    self.close()
-
-  def close(self) -> None:
-    """Closes the record."""
-    self._db.close()
+    """Nothing is left to do."""
 
   @contextlib.contextmanager
-  def _writing(self) -> Iterator[None]:
-    with database.named(self._path), database.transaction(self._db):
+  def _alone(self) -> Iterator[None]:
+    """Lets one process at a time write; a killed one blocks nobody."""
+    try:
+      import fcntl
+    except ImportError:  # Windows
       yield
+      return
+    lock = os.open(self._people, os.O_RDONLY)
+    try:
+      fcntl.flock(lock, fcntl.LOCK_EX)
+      yield
+    finally:
+      os.close(lock)
 
-  def _rows(self, query: str, *values: Any) -> list[tuple]:
-    with database.named(self._path):
-      return self._db.execute(query, values).fetchall()
+  def _say(self, text: str) -> None:
+    if text not in self.said:
+      self.said.append(text)
 
   # People.
 
   def trainees(self) -> list[Trainee]:
     """Returns the people, by name."""
-    return [Trainee(*row) for row in self._rows("select * from trainee order by name")]
+    found: dict[str, Trainee] = {}
+    with _named(self._people):
+      for folder in sorted(self._people.iterdir()):
+        if not _ID.fullmatch(folder.name) or folder.is_symlink():
+          continue
+        try:
+          person = Trainee(**json.loads((folder / _WHO).read_text(encoding="utf-8")))
+          person = Trainee(folder.name, check_name(person.name), str(person.added))
+          if person.name in found:
+            raise ValueError(f"there is another {person.name!r}")
+        except (ValueError, TypeError, OSError) as error:
+          self._say(f"{folder / _WHO}: {error}; its recordings are not counted")
+          continue
+        found[person.name] = person
+    return [found[name] for name in sorted(found)]
 
   def find(self, name: str) -> Trainee:
     """Returns a person; RecordError names those that there are."""
@@ -176,127 +191,83 @@ class Record:
   def add(self, name: str) -> Trainee:
     """Returns a person, who is added if there is none of the name."""
     name = check_name(name)
-    with self._writing():
-      rows = self._rows("select * from trainee where name = ?", name)
-      if rows:
-        return Trainee(*rows[0])
+    with _named(self._people), self._alone():
+      for person in self.trainees():
+        if person.name == name:
+          return person
       person = Trainee(uuid.uuid4().hex, name, now())
-      folder = self.folder / RECORDINGS / person.id
-      database.private_folder(folder)
-      _write_private(folder / _WHO, json.dumps(dataclasses.asdict(person)))
-      self._db.execute("insert into trainee values (?, ?, ?)", dataclasses.astuple(person))
+      folder = self._people / person.id
+      folder.mkdir(mode=0o700)
+      with replacing(folder / _WHO) as file:
+        file.write(json.dumps(dataclasses.asdict(person)))
+      (folder / _WHO).chmod(0o600)
     return person
 
   # Episodes.
 
   def episodes(self, person: Trainee) -> list[Episode]:
     """Returns what a person has done, in order."""
-    rows = self._rows(
-      "select outcome, score, proficient, assessment, metrics, path, session.id, performer, ended,"
-      " task, seed, seconds, hints, versions from episode join session on session = session.id"
-      " where trainee = ? order by episode.id",
-      person.id,
-    )
-    return [_episode(row) for row in rows]
+    found = []
+    for path in sorted((self._people / person.id).glob("*.npz")):
+      try:
+        found.append(self._episode(person, path))
+      except (ValueError, TypeError, KeyError, OSError) as error:  # whoever put it there
+        self._say(f"{path}: not counted: {error}")
+    return found
 
   def keep(
     self, person: Trainee, recording: Recording, session: Session, references: Lookup
   ) -> Episode:
-    """Keeps a recording and its row, and returns what is kept.
-
-    PendingError where the recording is kept but its row is not yet; RecordError where neither is.
-    """
+    """Keeps a recording, and returns what is kept; RecordError where it is not."""
     ended = now()
     info = {k: v for k, v in recording.info.items() if k != "person"}
     info["record"] = {"session": session.id, "began": session.began, "ended": ended}
+    info["record"] |= _facts(recording, references)
     recording = dataclasses.replace(recording, info=info)
     task = re.sub(r"\W+", "_", str(info.get("task", "exercise")), flags=re.ASCII)[:_LONGEST]
-    path = None
-    try:
-      # The file too: nobody else shall find it before its row, and enter it.
-      with self._writing():
-        if not self._rows("select 1 from trainee where id = ?", person.id):
-          raise RecordError(f"{person.name!r} is no longer in {str(self.folder)!r}")
-        folder = self.folder / RECORDINGS / person.id
-        file = free(folder, f"{re.sub('[^0-9]', '', ended[:23])}_{task}", ".npz")
-        with database.named(file):
-          database.private_folder(folder)
-          path = recording.save(file)
-          path.chmod(0o600)
-        self._enter(person, path, recording, references)
-    except RecordError as error:
-      if path is None:
-        raise
-      raise PendingError(str(error), path) from None
-    return next(e for e in self.episodes(person) if self.folder / e.path == path)
+    folder = self._people / person.id
+    with _named(folder), self._alone():
+      if not (folder / _WHO).is_file():
+        raise RecordError(f"{person.name!r} is no longer in {str(self.folder)!r}")
+      path = recording.save(free(folder, f"{re.sub('[^0-9]', '', ended[:23])}_{task}", ".npz"))
+      path.chmod(0o600)
+    return self._episode(person, path)
 
   def path(self, episode: Episode) -> pathlib.Path:
-    """Returns where a recording is; RecordError unless that is a file of the record."""
-    path = self.folder / episode.path
-    inside = (self.folder / RECORDINGS).resolve()
-    if not path.resolve().is_relative_to(inside):
-      raise RecordError(f"{self._path}: recording {episode.path!r} is outside of the record")
-    return path
+    """Returns where a recording is."""
+    return self.folder / episode.path
 
-  def _enter(
-    self, person: Trainee, path: pathlib.Path, recording: Recording, references: Lookup
-  ) -> None:
-    """Makes the row of a recording."""
-    info = recording.info
-    kept: Any = info.get("record")
+  def _episode(self, person: Trainee, path: pathlib.Path) -> Episode:
+    """Returns what a recording says; one that was not kept by a record is scored now."""
+    if path.is_symlink():
+      raise ValueError("it is a link, expected a file")
+    info = Recording.load_info(path)
+    kept = info.get("record")
     kept = kept if isinstance(kept, dict) else {}
-    session = Session(str(kept.get("session", person.id)), str(kept.get("began", person.added)))
-    owners = self._rows("select trainee from session where id = ?", session.id)
-    if owners not in ([], [(person.id,)]):  # a file that was copied from another's folder
-      session = dataclasses.replace(session, id=person.id)
-    row = (session.id, person.id, session.began, str(info.get("performer", "")))
-    self._db.execute("insert or ignore into session values (?, ?, ?, ?)", row)
-    row = {
-      "session": session.id,
-      "path": path.relative_to(self.folder).as_posix(),
-      "ended": str(kept.get("ended", person.added)),
-      **_facts(recording, references),
+    if "metrics" not in kept:
+      kept = kept | _facts(Recording.load(path), self._references)
+    value, known = kept["score"], kept["metrics"]
+    values = {
+      name: Unknown(kept["unknown"].get(name, "not recorded")) if number is None else float(number)
+      for name, number in known.items()
+      if name in METRICS  # not one of another version's
     }
-    names, marks = ", ".join(row), ", ".join("?" * len(row))
-    self._db.execute(f"insert into episode ({names}) values ({marks})", tuple(row.values()))
-
-  def _enter_missing(self, references: Lookup) -> None:
-    """Makes the rows of recordings, and people, that have none."""
-    known = {path for (path,) in self._rows("select path from episode")}
-    people = {person.id: person for person in self.trainees()}
-    count = 0
-    for folder in sorted((self.folder / RECORDINGS).iterdir()):
-      if not _ID.fullmatch(folder.name) or folder.is_symlink():
-        continue
-      for part in folder.glob(".*.part"):  # of a process that was killed: nobody else writes now
-        part.unlink(missing_ok=True)
-      paths = sorted(folder.glob("*.npz"))
-      paths = [p for p in paths if p.relative_to(self.folder).as_posix() not in known]
-      person = people.get(folder.name) or self._restore(folder)
-      if person is None:
-        continue
-      for path in paths:
-        try:
-          self._enter(person, path, Recording.load(path), references)
-          count += 1
-        except (ValueError, TypeError, KeyError, OSError) as error:  # whoever put it there
-          self.said.append(f"{path}: not entered: {error}")
-    if count:
-      self.said.append(f"{count} recordings had no row in {self._path}, they have now")
-
-  def _restore(self, folder: pathlib.Path) -> Trainee | None:
-    """Returns the person whose folder it is, entered; None where nobody can say who that is."""
-    try:
-      person = Trainee(**json.loads((folder / _WHO).read_text(encoding="utf-8")))
-      person = Trainee(folder.name, check_name(person.name), str(person.added))
-    except (ValueError, TypeError, OSError) as error:
-      self.said.append(f"{folder / _WHO}: {error}; its recordings are not entered")
-      return None
-    if self._rows("select 1 from trainee where name = ?", person.name):
-      self.said.append(f"{folder / _WHO}: there is another {person.name!r}; not entered")
-      return None
-    self._db.execute("insert into trainee values (?, ?, ?)", dataclasses.astuple(person))
-    return person
+    return Episode(
+      outcome=str(kept["outcome"]),
+      score=None if value is None else float(value),
+      proficient=kept["proficient"] is True,
+      assessment=kept["assessment"] is True,
+      metrics=Metrics(**values),
+      path=path.relative_to(self.folder).as_posix(),
+      session=str(kept.get("session", person.id)),
+      performer=str(info.get("performer", "")),
+      ended=str(kept.get("ended", person.added)),
+      task=str(info.get("task", "")),
+      seed=_seed(info),
+      seconds=float(kept["seconds"]),
+      hints=int(kept["hints"]),
+      versions={k: str(info[k]) for k in ("palpate", "mujoco") if k in info},
+    )
 
   # Deletion.
 
@@ -304,16 +275,12 @@ class Record:
     """Deletes all of a person's data, and returns what it was; RecordError where some is left."""
     episodes = self.episodes(person)
     sessions = len({e.session for e in episodes})
-    folder = self.folder / RECORDINGS / person.id
-    with self._writing():
+    folder = self._people / person.id
+    with _named(folder), self._alone():
       files = _remove(folder)
-      self._db.execute("delete from trainee where id = ?", (person.id,))
-    with database.named(self._path):
-      self._db.execute("vacuum")  # writes every page that is left anew
-      self._db.execute("pragma wal_checkpoint(truncate)")
     if left := self.traces(person):
       text = f"{', '.join(map(str, left))}: still has data of {person.name!r}"
-      raise RecordError(f"{text}; close other programs that use it, or delete it, and try again")
+      raise RecordError(f"{text}; delete it")
     return [f"{len(episodes)} episodes in {sessions} sessions", f"{files} files in {folder}"]
 
   def traces(self, person: Trainee) -> list[pathlib.Path]:
@@ -337,44 +304,35 @@ def _remove(folder: pathlib.Path) -> int:
   return len(files)
 
 
-def _write_private(path: pathlib.Path, text: str) -> None:
-  with replacing(path) as file:
-    file.write(text)
-  path.chmod(0o600)
-
-
 def _facts(recording: Recording, references: Lookup) -> dict[str, Any]:
-  """Returns the columns of a recording's row that follow from it."""
+  """Returns what a record says of a recording that follows from it and from the limits of now."""
   info, metrics = recording.info, recording.metrics()
-  task, coach = str(info.get("task", "")), info.get("coach")
+  coach = info.get("coach")
   coach = coach if isinstance(coach, dict) else {"assessment": True}
   hints = coach.get("hints")
-  reference = references(task)
+  reference = references(str(info.get("task", "")))
   judged = None if reference is None else score(metrics, reference, recording.outcome)
-  seed = info.get("seed")
-  values = {k: v if math.isfinite(v) else None for k, v in metrics.values().items()}
   return {
-    "task": task,
-    "seed": seed if type(seed) is int and abs(seed) < 2**63 else None,
     "outcome": recording.outcome or "not recorded",
     "seconds": float(recording.time[-1] - recording.time[0]) if len(recording.time) else 0.0,
     "score": judged.composite if judged and math.isfinite(judged.composite) else None,
     "proficient": judged is not None and judged.proficient,
     "assessment": coach.get("assessment") is True,
     "hints": len(hints) if isinstance(hints, list) else 0,
-    "metrics": json.dumps({"values": values, "unknown": metrics.reasons()}, allow_nan=False),
-    "versions": json.dumps({k: str(info[k]) for k in ("palpate", "mujoco") if k in info}),
+    "metrics": {k: v if math.isfinite(v) else None for k, v in metrics.values().items()},
+    "unknown": metrics.reasons(),
   }
 
 
-def _episode(row: tuple) -> Episode:
-  outcome, value, proficient, assessment, metrics, *middle, versions = row
-  found = json.loads(metrics)
-  values = {
-    name: Unknown(found["unknown"].get(name, "not recorded")) if number is None else number
-    for name, number in found["values"].items()
-    if name in METRICS  # not one of another version's
-  }
-  head = [outcome, value, bool(proficient), bool(assessment), Metrics(**values)]
-  columns: list[Any] = [*head, *middle, json.loads(versions)]
-  return Episode(*columns)
+def _seed(info: dict[str, Any]) -> int | None:
+  seed = info.get("seed")
+  return seed if type(seed) is int else None
+
+
+@contextlib.contextmanager
+def _named(path: pathlib.Path) -> Iterator[None]:
+  """Turns what the system says about a file into an error that names it."""
+  try:
+    yield
+  except OSError as error:
+    raise RecordError(f"{error.filename or path}: {error.strerror or error}") from None

@@ -43,6 +43,7 @@ def main(args: argparse.Namespace) -> int:
     with Record(keeping.folder(args)) as record:
       person = record.find(args.name)
       episodes = record.episodes(person)
+      keeping.tell(record)
   if args.references:
     episodes = history.judged(episodes, known)
   then = _next(episodes)

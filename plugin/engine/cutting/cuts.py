@@ -201,7 +201,7 @@ class Cuts:
     bodies.occupy(w.body, mesh)
     self.mass, self.source, self.stamp = mass, source, stamp
     w.organ = self.declared.cut(mesh, mass)
-    w.phases.reshape(touched)
+    w.graphs.phases.reshape(touched)
     for grown in [space for each in w.beside for space in each.reshape()]:
       with graphs.lock:
         bind(grown, grown.model)
@@ -281,7 +281,7 @@ class Cuts:
         f"organ {organ.name!r}: direction is {direction}, expected three numbers, not all 0"
       )
     local = (check_points(organ.name, points) - organ.origin) @ organ.frame
-    motion = cutting.Motion(self.mass, *w.phases.motion())
+    motion = cutting.Motion(self.mass, *w.motion())
     return self._find(motion, local, given, depth, direction)
 
   def _find(self, motion: cutting.Motion, points, given: float, depth, direction) -> Any:
@@ -296,7 +296,7 @@ class Cuts:
   def _state(self, points: np.ndarray, motion: cutting.Motion | None = None) -> tuple:
     """Returns what `Knife.cut` is told of the organ."""
     w, organ = self._w, self._w.organ
-    motion = motion or cutting.Motion(self.mass, *w.phases.motion())
+    motion = motion or cutting.Motion(self.mass, *w.motion())
     return organ.name, self.mesh, motion, points, ~organ.free, w.config, self._held()
 
   def _held(self) -> cutting.Springs | None:
@@ -326,7 +326,7 @@ class Cuts:
     touched = self._become(mesh, found.changed, motion.mass.copy(), source, self.stamp)
     self._write(found, touched)
     changed = topology.distinct(found.near, member)
-    w.phases.carry(changed, motion.disp, motion.vel, group, member, share)
+    w.graphs.phases.carry(changed, motion.disp, motion.vel, group, member, share)
     if not w.organ.windows:  # of which MuJoCo reads triangles only where they are drawn
       with self.lock:
         self.show()

@@ -255,7 +255,7 @@ class Cutters(Beside):
       organ = w.organ
       along = None if i in self.by_current else self._along(i)
       now, elem = self._on_surface(path)
-      way = solid_paths.direction(organ, w.phases.motion()[0], along, elem)
+      way = solid_paths.direction(organ, w.motion()[0], along, elem)
       now = organ.origin + now @ organ.frame.T
       return w.cuts.cut(now, given * float(deep[0].mean()), deep[0], way), w.organ.mesh
 
@@ -285,7 +285,7 @@ class Cutters(Beside):
     w, mesh = self._w, self._w.organ.mesh
     elem, weight, _ = w.cuts.finder.nearest(mesh, mesh.rest, path)
     vert = mesh.elem[elem]
-    return np.einsum("nk,nkj->nj", weight, mesh.rest[vert] + w.phases.motion()[0][vert]), elem
+    return np.einsum("nk,nkj->nj", weight, mesh.rest[vert] + w.motion()[0][vert]), elem
 
   def read(self) -> list[Cutter]:
     """Returns what the cutters do."""

@@ -50,7 +50,7 @@ class Current:
     if given:
       self._free(d, m, given)
     if power > 0 and w.cuts:
-      x = w.organ.mesh.rest + w.phases.motion()[0]
+      x = w.organ.mesh.rest + w.motion()[0]
       if self.burn(row, w.organ.mesh, x, self._finder, *self._line(d, m), given):
         return False
     return ends(row)

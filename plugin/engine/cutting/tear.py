@@ -30,7 +30,7 @@ class Tear:
   def act(self) -> bool:
     """Tears the organ at its most stretched triangle, if that is too far; returns whether."""
     w, mesh = self._w, self._w.organ.mesh
-    x = mesh.rest + w.phases.motion()[0]
+    x = mesh.rest + w.motion()[0]
     if mesh is not self._mesh:
       self._mesh, self._rest = mesh, _metric(mesh.rest[mesh.elem])
     stretch = _squares(self._rest, _metric(x[mesh.elem]))

@@ -71,7 +71,7 @@ class Walls:
     self._show(m, True)
     start = int(mjstruct.view(m.flex_vertadr, m.nflex, np.int32)[self._flex])
     out = mjstruct.view(d.flexvert_xpos, (m.nflexvert, 3))[start : start + n]
-    x = (mesh.rest + self._w.phases.motion()[0])[:n]
+    x = (mesh.rest + self._w.motion()[0])[:n]
     # The skin is drawn its flex's radius outside: so is the mouth of a cut.
     radius = mjstruct.view(m.flex_radius, m.nflex)[organ.flex]
     x += radius * topology.vertex_normals(x, mesh.elem[: mesh.whole.nelem])

@@ -80,7 +80,7 @@ class Creep(Beside):
       node=w.body.shape.node.numpy()[np.flatnonzero(organ.free)],
       own=self.rows("creep", 6),
       number=self._number,
-      flags=wp.array(np.asarray(w.flags), dtype=int, device="cpu", copy=False),
+      flags=wp.array(np.asarray(w.report.flags), dtype=int, device="cpu", copy=False),
       tail=w.boxes["own"].tail if organ.windows else np.zeros(len(TAIL)),
       mj=coupling.mujoco_arrays(model, w.data, Clock),
     )

@@ -105,7 +105,7 @@ class Rests(Beside):
     n, geoms = coupling.outer(organ), self._geoms(m)
     area = topology.vertex_areas(organ.mesh.rest, organ.mesh.elem)[:n]
     young = float(np.mean(w.config.young))
-    flex = int(organ.windows.flex[0])
+    flex = organ.windows.flex
     if not self._arrays:
       shapes = {"slipped": (n, 3), "force": (n, 3), "weight": (n, 3), "hardness": (n, 6)}
       self._arrays = {k: wp.zeros(s, dtype=wp.float64, device="cpu") for k, s in shapes.items()}
@@ -142,7 +142,7 @@ class Rests(Beside):
   def _other(self, m, other) -> dict[str, Any]:
     """Returns the fields of an organ that this one rests on."""
     mesh = other.organ.mesh
-    mine, theirs = (int(w.organ.windows.flex[0]) for w in (self._w, other))
+    mine, theirs = (w.organ.windows.flex for w in (self._w, other))
     count = np.bincount(mesh.elem.ravel(), minlength=mesh.nouter)
     return dict(
       mu=max(_mu(m, mine), _mu(m, theirs)),
@@ -243,7 +243,7 @@ def check(m, w):
       "does not exist, expected a geom or another organ"
     )
   if found:
-    meets = flexes.meeting_geoms(m, int(organ.windows.flex[0]))
+    meets = flexes.meeting_geoms(m, organ.windows.flex)
     for geom in meets:
       if geoms[geom] in found:
         _warn_twice(organ.name, geoms[geom])

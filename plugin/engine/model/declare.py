@@ -88,8 +88,8 @@ class Declaration:
 
   @property
   def flexes(self) -> list[int]:
-    """Flexes that tools meet: those of the windows, or its own."""
-    return [int(flex) for flex in self.windows.flex] if self.windows else [self.flex]
+    """Flexes that tools meet: the window's, or its own."""
+    return [self.windows.flex if self.windows else self.flex]
 
   @property
   def jointed(self) -> np.ndarray:
@@ -116,41 +116,37 @@ class Declaration:
 
 @dataclasses.dataclass(frozen=True)
 class Windows:
-  """The windows of an organ; a slot is one of their vertices.
+  """The window of an organ; a slot is one of its vertices.
 
   Attributes:
-    flex: flex of each window                                 (nwindow,)
-    adr: first slot of each window                            (nwindow + 1,)
+    flex: its flex
     body: body of each slot                                   (nslot,)
     dofadr: its first dof                                     (nslot,)
     qposadr: its first qpos                                   (nslot,)
     home: node of each slot after a reset, -1 for none        (nslot,)
     stand: where its body stands at rest, in its parent [m]   (nslot, 3)
     qhome: qpos less rest position and displacement [m]       (nslot, 3)
-    elem_adr: where each window's triangles start in flex_elem(nwindow,)
-    elem_num: how many it can hold                            (nwindow,)
-    geom_adr: first geom of each window                       (nwindow + 1,)
-    geom: geoms that the windows follow
+    elem_adr: where its triangles start in flex_elem
+    elem_num: how many it can hold
+    geom: geoms that it follows                               (ngeom,)
     mass: mass of each node [kg]                              (nvert,)
   """
 
-  flex: np.ndarray
-  adr: np.ndarray
+  flex: int
   body: np.ndarray
   dofadr: np.ndarray
   qposadr: np.ndarray
   home: np.ndarray
   stand: np.ndarray
   qhome: np.ndarray
-  elem_adr: np.ndarray
-  elem_num: np.ndarray
-  geom_adr: np.ndarray
+  elem_adr: int
+  elem_num: int
   geom: np.ndarray
   mass: np.ndarray
 
   @property
   def nslot(self) -> int:
-    """Number of slots of all windows."""
+    """Number of slots."""
     return len(self.body)
 
 

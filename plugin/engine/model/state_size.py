@@ -15,7 +15,6 @@ def state_size(model: int, instance: int) -> int:
   Contact force, last dv and the one before of each moving vertex, or what `windowed` says.
   """
   m = mjstruct.Model.from_address(model)
-  names = mjstruct.config(model, instance, "window").split()
   relaxes, rests, bonded = (
     bool(mjstruct.config(model, instance, key).strip())
     for key in ("relax_share", "support", "bonds")
@@ -28,10 +27,10 @@ def state_size(model: int, instance: int) -> int:
   cuts = coupling.cut_sizes(m.nflexelem, most, spare * m.nflexvert, solid)
   cutters = mjstruct.config(model, instance, "cutters").strip()
   cuts |= {"nblade": cutters.count(",") + 1 if cutters else 0}
-  if names:
+  if mjstruct.config(model, instance, "window").strip():
     outer = {"nrest": rests * m.nflexvert, "nbond": bonded * m.nflexvert}
     outer |= {"ncreep": relaxes * most} | cuts
-    return windowed.state_size(most, 0, m.ngeom * len(names), **outer)
+    return windowed.state_size(most, 0, m.ngeom, **outer)
   moving = len(declare.moving_bodies(m, instance))
   cuts |= {"ncreep": relaxes * (moving + inner), "nbond": bonded * moving}
   return nodal.state_size(3 * moving, 3 * inner, **cuts)

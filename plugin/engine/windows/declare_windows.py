@@ -8,7 +8,6 @@ from palpate.tissue.config import Config
 from palpate.tissue.geometry import fill
 from palpate.tissue.geometry import mesh as topology
 
-from ..layout import MAX_GEOMS, MAX_WINDOWS
 from ..model import declare, flexes, mjstruct
 from ..model.declare import Declaration, Windows
 
@@ -93,66 +92,51 @@ def _rigid_flexes(m, instance: int) -> tuple[np.ndarray, list[int]]:
 
 
 def _windows(model, m, instance, name, config, mesh, mass, place) -> Windows:
-  """Returns the windows of an organ, and where they stand at rest."""
-  found = _claimed(model, m, instance, name, config)
-  slots = [
-    _slots(m, f"organ {name!r}: window {window!r}", window, flex, place)
-    for window, flex in zip(config.window, found, strict=True)
-  ]
-  sizes = [len(each[0]) for each in slots]
-  body, dofadr, qposadr, offset, turn = (
-    np.concatenate(parts) for parts in zip(*slots, strict=True)
-  )
-  elem_num = mjstruct.view(m.flex_elemnum, m.nflex, np.int32)[found]
-  # At rest the windows stand on patches of their own: their bodies move there, so that qpos0 fits.
+  """Returns the window of an organ, and where it stands at rest."""
+  flex = _claimed(model, m, instance, name, config)
+  body, dofadr, qposadr, offset, turn = _slots(m, name, config.window, flex, place)
+  elem_num = int(mjstruct.view(m.flex_elemnum, m.nflex, np.int32)[flex])
+  # At rest the window stands on a patch of its own: its bodies move there, so that qpos0 fits.
   # The last slot stays free; a patch of n nodes has up to 2 n - 4 triangles: `coupling/proxy.h`.
-  room = [min(n - 1, int(t) // 2 + 2) for n, t in zip(sizes, elem_num, strict=True)]
-  home = _home_slots(mesh.elem, mesh.nouter, sizes, room)
+  room = min(len(body) - 1, elem_num // 2 + 2)
+  home = _home_slots(mesh.elem, mesh.nouter, len(body), room)
   used = home >= 0
   stand = mjstruct.view(m.body_pos, (m.nbody, 3))[body]
   stand[used] = np.einsum("kij,kj->ki", turn[used], offset[used] + mesh.rest[home[used]])
-  geom_adr, geom = _followed(m, name, config, found)
   return Windows(
-    flex=np.array(found),
-    adr=np.concatenate([[0], np.cumsum(sizes)]),
+    flex=flex,
     body=body,
     dofadr=dofadr,
     qposadr=qposadr,
     home=home,
     stand=stand,
     qhome=offset - np.einsum("kji,kj->ki", turn, stand),
-    elem_adr=mjstruct.view(m.flex_elemdataadr, m.nflex, np.int32)[found],
+    elem_adr=int(mjstruct.view(m.flex_elemdataadr, m.nflex, np.int32)[flex]),
     elem_num=elem_num,
-    geom_adr=geom_adr,
-    geom=geom,
+    geom=_followed(m, name, config, flex),
     mass=mass,
   )
 
 
-def _claimed(model, m, instance: int, name: str, config: Config) -> list[int]:
-  """Returns the flexes that an organ names as its windows and nobody else does."""
+def _claimed(model, m, instance: int, name: str, config: Config) -> int:
+  """Returns the flex that an organ names as its window and nobody else does."""
   names = [flexes.name(m, f) for f in range(m.nflex)]
   surface = _surfaces(model, m, instance, without=instance)
-  claimed = {names[window]: f"organ {names[flex]!r}" for window, flex in surface.items()}
-  if len(config.window) > MAX_WINDOWS:
+  what = f"organ {name!r}: window {config.window!r}"
+  found = flexes.resolve(config.window, name, names)
+  if found is None:
+    raise ValueError(f"{what} does not exist, expected a flexcomp; the model has {names}")
+  flex = names.index(found)
+  if flex in surface:
     raise ValueError(
-      f"organ {name!r}: window has {len(config.window)} names, expected at most {MAX_WINDOWS}"
+      f"{what} is claimed by organ {names[surface[flex]]!r} too, expected one organ a window"
     )
-  out = []
-  for window in config.window:
-    what = f"organ {name!r}: window {window!r}"
-    found = flexes.resolve(window, name, names)
-    if found is None:
-      raise ValueError(f"{what} does not exist, expected a flexcomp; the model has {names}")
-    if found in claimed:
-      raise ValueError(f"{what} is claimed by {claimed[found]} too, expected one organ a window")
-    claimed[found] = "this organ"
-    out.append(names.index(found))
-  return out
+  return flex
 
 
-def _slots(m, what: str, window: str, flex: int, place) -> tuple[np.ndarray, ...]:
+def _slots(m, name: str, window: str, flex: int, place) -> tuple[np.ndarray, ...]:
   """Returns body, first dof, first qpos, offset from the organ and turn of each of its slots."""
+  what = f"organ {name!r}: window {window!r}"
   start = int(mjstruct.view(m.flex_vertadr, m.nflex, np.int32)[flex])
   count = flexes.vertices(m, flex)
   own = mjstruct.view(m.flex_vertbodyid, m.nflexvert, np.int32)[start : start + count].copy()
@@ -173,58 +157,29 @@ def _slots(m, what: str, window: str, flex: int, place) -> tuple[np.ndarray, ...
   return own, dofs, qposs, offset, np.tile(turn, (count, 1, 1))
 
 
-def _followed(m, name: str, config: Config, flex: list[int]) -> tuple[np.ndarray, np.ndarray]:
-  """Returns the geoms of each window: those of the bodies named, or all that move and collide.
+def _followed(m, name: str, config: Config, flex: int) -> np.ndarray:
+  """Returns the geoms that a window follows: of the bodies named, or all that move and collide.
 
-  An organ that nothing holds may fall on what stands still: a window follows that too.
+  An organ that nothing holds may fall on what stands still: its window follows that too.
   """
   bodyid = mjstruct.view(m.geom_bodyid, m.ngeom, np.int32)
-  weld = mjstruct.view(m.body_weldid, m.nbody, np.int32)
+  meets = flexes.meeting_geoms(m, flex)
+  if not config.follow:
+    weld = mjstruct.view(m.body_weldid, m.nbody, np.int32)
+    return np.array([g for g in meets if weld[bodyid[g]] or not config.held], np.int64)
   names = [mjstruct.name_of(m, m.name_bodyadr, b) for b in range(m.nbody)]
-  groups: list[list[int]] = []
-  for k, f in enumerate(flex):
-    meets = flexes.meeting_geoms(m, f)
-    if config.follow:
-      if len(config.follow) != len(flex):
-        raise ValueError(
-          f"organ {name!r}: follow has {len(config.follow)} groups, expected {len(flex)}, "
-          "one a window"
-        )
-      wanted = []
-      for body in config.follow[k]:
-        found = flexes.resolve(body, name, names)
-        if found is None:
-          raise ValueError(f"organ {name!r}: follow names body {body!r}, which does not exist")
-        wanted.append(names.index(found))
-      mine = [g for g in meets if bodyid[g] in wanted]
-      _check_follow(name, config.follow[k], {int(bodyid[g]) for g in mine}, wanted)
-    else:
-      mine = [g for g in meets if weld[bodyid[g]] != 0 or not config.held]
-    groups.append(mine)
-  if not config.follow and len(flex) > 1:
-    # A tree of bodies is one tool: a triangle between two windows would touch neither jaw.
-    root = mjstruct.view(m.body_treeid, m.nbody, np.int32)[bodyid]
-    trees = sorted({root[g] for group in groups for g in group})
-    turn = {tree: k % len(flex) for k, tree in enumerate(trees)}
-    groups = [[g for g in group if turn[root[g]] == k] for k, group in enumerate(groups)]
-  for k, group in enumerate(groups):
-    if len(group) > MAX_GEOMS:
+  wanted = set()
+  for body in config.follow:
+    found = flexes.resolve(body, name, names)
+    if found is None:
+      raise ValueError(f"organ {name!r}: follow names body {body!r}, which does not exist")
+    if not any(bodyid[g] == names.index(found) for g in meets):
       raise ValueError(
-        f"organ {name!r}: window {config.window[k]!r} follows {len(group)} geoms, expected at most "
-        f"{MAX_GEOMS}; name bodies in follow"
-      )
-  adr = np.concatenate([[0], np.cumsum([len(group) for group in groups])])
-  return adr, np.array([g for group in groups for g in group], np.int64)
-
-
-def _check_follow(organ: str, follow: tuple[str, ...], touching: set[int], wanted: list[int]):
-  """Raises ValueError where a window follows a body with which it cannot collide."""
-  for body, number in zip(follow, wanted, strict=True):
-    if number not in touching:
-      raise ValueError(
-        f"organ {organ!r}: follow names body {body!r}, which has no geoms that collide with its "
+        f"organ {name!r}: follow names body {body!r}, which has no geoms that collide with its "
         "window, expected bodies with geoms"
       )
+    wanted.add(names.index(found))
+  return np.array([g for g in meets if bodyid[g] in wanted], np.int64)
 
 
 def _check_neighbours(m, model, instance, name, windows: Windows, frame, origin, rest):
@@ -232,7 +187,7 @@ def _check_neighbours(m, model, instance, name, windows: Windows, frame, origin,
 
   Windows follow geoms: they would not be there.
   """
-  own = np.isin(np.arange(m.nflex), windows.flex)
+  own = np.arange(m.nflex) == windows.flex
   contype = mjstruct.view(m.flex_contype, m.nflex, np.int32)
   conaffinity = mjstruct.view(m.flex_conaffinity, m.nflex, np.int32)
   surface = _surfaces(model, m, instance, without=instance)
@@ -286,33 +241,24 @@ def _surfaces(model, m, instance: int, without: int = -1) -> dict[int, int]:
   for other in range(m.nplugin):
     if other != without and plugin[other] == plugin[instance]:
       for flex in _rigid_flexes(m, other)[1]:
-        for window in mjstruct.config(model, other, "window").split():
-          resolved = flexes.resolve(window, names[flex], names)
-          if resolved in names:
-            found[names.index(resolved)] = flex
+        window = mjstruct.config(model, other, "window").strip()
+        resolved = flexes.resolve(window, names[flex], names)
+        if resolved in names:
+          found[names.index(resolved)] = flex
   return found
 
 
-def _home_slots(elem: np.ndarray, nvert: int, sizes: list[int], room: list[int]) -> np.ndarray:
-  """Returns the default node of each slot: disjoint patches grown over the surface, (W,)."""
+def _home_slots(elem: np.ndarray, nvert: int, size: int, most: int) -> np.ndarray:
+  """Returns the default node of each slot: a patch grown over the surface, (size,)."""
   neighbours: list[set[int]] = [set() for _ in range(nvert)]
   for a, b, c in elem:
     neighbours[a] |= {b, c}
     neighbours[b] |= {a, c}
     neighbours[c] |= {a, b}
-  used: set[int] = set()
-  out = []
-  for size, most in zip(sizes, room, strict=True):
-    # None where other windows have all nodes already.
-    queue = [i for i in range(nvert) if i not in used][:1]
-    patch: list[int] = []
-    used.update(queue)
-    while queue and len(patch) < most:
-      i = queue.pop(0)
-      patch.append(i)
-      for j in sorted(neighbours[i] - used):
-        used.add(j)
-        queue.append(j)
-    used -= set(queue)
-    out += patch + [-1] * (size - len(patch))
-  return np.array(out)
+  patch, seen = [0], {0}
+  for i in patch:
+    fresh = sorted(neighbours[i] - seen)
+    seen.update(fresh)
+    patch += fresh
+  patch = patch[: min(most, nvert)]
+  return np.array(patch + [-1] * (size - len(patch)))

@@ -44,17 +44,20 @@ class Turn:
   Attributes:
     lock: held while the model's windows are read or written
     mark: of the windows that are this mjData's
+    qpos, stood: numbers of qpos that the slots have, as bytes; after the last step, or None
   """
 
   def __init__(self):
     self.mark = math.nan
+    self.stood: bytes | None = None
+    self.qpos = memoryview(b"")
     self.lock: Any = threading.RLock()
     self._found: Any = memoryview(b"")
 
   def bind(self, model: int, windows: Windows):
     """Points at the mark and the lock of a model, or of a copy."""
     m = mjstruct.Model.from_address(model)
-    edge = int(mjstruct.view(m.flex_edgeadr, m.nflex, np.int32)[windows.flex[0]])
+    edge = int(mjstruct.view(m.flex_edgeadr, m.nflex, np.int32)[windows.flex])
     self._found = mjstruct.view(m.flexedge_invweight0, m.nflexedge)[edge:].data
     self.lock = _locks.setdefault(model, self.lock)
 

@@ -20,13 +20,13 @@ class Nodes:
 
   nvert: int  # vertices
   nouter: int  # those on the surface, the first ones, with spare ones that have no mass yet
-  nslot: int  # slots of all windows
-  nwindow: int  # windows
-  most: int  # candidates of a window that the outbox has room for
+  nslot: int  # slots
+  ngeom: int  # geoms that the window follows
+  most: int  # candidates that the outbox has room for
   node: ints("nvert")  # where a vertex starts in vectors of slices
   mass: doubles("nvert")  # mass [kg]
   rest: doubles("nvert", 3)  # rest position [m]
-  count: ints("nwindow")  # candidates of each window; 0 between steps
+  count: ints(1)  # candidates; 0 between steps
   extent: ints(7)  # squared speed, bounds, as `put_most` has them; nothing put between steps
   motion: Motion
   inbox: Inbox
@@ -57,12 +57,12 @@ def make(w, side, motion, boxes: tuple[wp.array, wp.array], sizes: dict[str, int
     nvert=sizes["nvert"],
     nouter=coupling.outer(organ),
     nslot=sizes["nslot"],
-    nwindow=sizes["nwindow"],
+    ngeom=sizes["ngeom"],
     most=sizes["most"],
     node=order.offset(node),
     mass=organ.mass,
     rest=organ.mesh.rest,
-    count=np.zeros(sizes["nwindow"]),
+    count=np.zeros(1),
     extent=np.full(7, -(2**31)),  # nothing put
     motion=motion,
     inbox=layout.carve(Inbox, boxes[0], sizes),

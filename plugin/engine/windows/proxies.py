@@ -15,7 +15,7 @@ from ..coupling import Mujoco
 from ..layout import FLAG, Inbox, Outbox, WindowState
 from ..model import mjstruct
 
-# Nodes within this many mean edges of a tool may be in its window.
+# Nodes within this many mean edges of a tool may be in the window.
 _REACH = 4.0
 # An organ whose nodes move by less than this share of its size a second is at rest.
 SLOW = 1e-5
@@ -26,19 +26,19 @@ WALL = 1e3
 
 @struct
 class Slots:
-  """A windowed organ, its windows' slots and MuJoCo; see `declare.Windows`."""
+  """A windowed organ, its slots and MuJoCo; see `declare.Windows`."""
 
   nvert: int  # vertices
-  nslot: int  # slots of all windows
-  nwindow: int  # windows
+  nslot: int  # slots
+  ngeom: int  # geoms that the window follows
   nroom: int  # triangles, and walls that cuts may open
-  most: int  # candidates of a window that the outbox has room for
+  most: int  # candidates that the outbox has room for
   resident: int  # 1 if the motion stays on a device and the plugin state may be old
   rest_share: wp.float64  # see `step.REST`
-  reach: wp.float64  # distance from a geom within which nodes may be in a window [m]
+  reach: wp.float64  # distance from a geom within which nodes may be in the window [m]
   slow: wp.float64  # speed below which the organ counts as at rest [m/s]
   longest: wp.float64  # longest edge [m]
-  radius: wp.float64  # of the windows' flexes [m]
+  radius: wp.float64  # of the window's flex [m]
   skin: wp.float64  # distance of surface and geom at which MuJoCo finds a contact, at most [m]
   weight: wp.float64  # mass of the organ [kg]
   # The organ:
@@ -55,27 +55,23 @@ class Slots:
   heaviest: doubles(1)  # see `Workspace`
   number: doubles("nnumber")  # see `NUMBERS`
   flags: ints(len(FLAG))  # see FLAG
-  # The windows:
+  # The window:
   home: ints("nslot")  # default node of a slot, -1 for none
   qhome: doubles("nslot", 3)  # qpos less rest position and displacement [m]
   dofadr: ints("nslot")  # first dof of a slot
   massadr: ints("nslot", 3)  # where M has the diagonals of its dofs
   qposadr: ints("nslot")  # its first number in qpos
   bodyid: ints("nslot")  # its body
-  window_adr: ints("nwindow + 1")  # first slot of a window
-  elem_adr: ints("nwindow")  # where its triangles start in flex_elem
-  elem_num: ints("nwindow")  # how many it can hold
-  geom_adr: ints("nwindow + 1")  # first geom of a window in `geom`
-  geom: ints("ngeom")  # geoms that the windows follow
+  elem_adr: int  # where its triangles start in flex_elem
+  elem_num: int  # how many it can hold
+  geom: ints("ngeom")  # geoms that it follows
   # What changes:
   placed: ints("nslot")  # node of a slot in the model, -1 for none
   taken: ints("nvert")  # slot of a node, -1 for none
   chosen: ints("nvert")  # scratch; 0 between steps
   candidate: ints("nvert")  # scratch
   distance: doubles("nvert")  # scratch
-  claim: ints("nvert")  # scratch; -1 between steps
-  left: ints("nslot")  # node that a slot has given up in this step, -1 for none
-  kept: doubles("nslot", 3)  # contact force before the slots are given anew [N]
+  at: ints("nvert")  # scratch: a node's place in the outbox; -1 between steps
   lagged: doubles("nslot", 3)  # external and lagged contact force [N]
   other: doubles("nslot", 3)  # what acted on a slot besides contacts and its weight [N]
   own: WindowState
@@ -124,8 +120,8 @@ class Reshaping:
 def scratch(nvert: int, nslot: int) -> dict[str, wp.array]:
   """Returns the arrays of `Slots` that outlive a new recording."""
   ints_of = {"placed": (nslot, -2), "taken": (nvert, -1), "chosen": (nvert, 0)}
-  ints_of |= {"candidate": (nvert, 0), "claim": (nvert, -1), "left": (nslot, -1)}
-  zeros = {"distance": nvert, "inertia": nvert, "kept": (nslot, 3), "other": (nslot, 3)}
+  ints_of |= {"candidate": (nvert, 0), "at": (nvert, -1)}
+  zeros = {"distance": nvert, "inertia": nvert, "other": (nslot, 3)}
   return {
     name: wp.full(count, value, dtype=int, device="cpu") for name, (count, value) in ints_of.items()
   } | {name: wp.zeros(shape, dtype=wp.float64, device="cpu") for name, shape in zeros.items()}
@@ -142,14 +138,14 @@ def make(w, model: int, sizes: dict[str, int]):
   m = mjstruct.Model.from_address(model)
   organ, win, mesh = w.organ, w.organ.windows, w.organ.mesh
   lengths, longest = _edges(mesh)
-  radius = float(mjstruct.view(m.flex_radius, m.nflex)[win.flex].max())
-  margin = float(mjstruct.view(m.flex_margin, m.nflex)[win.flex].max())
+  radius = float(mjstruct.view(m.flex_radius, m.nflex)[win.flex])
+  margin = float(mjstruct.view(m.flex_margin, m.nflex)[win.flex])
   margin += float(mjstruct.view(m.geom_margin, m.ngeom)[win.geom].max(initial=0.0))
   room = max(mesh.whole.nelem, sizes["ncorner"])
   values = w.boxes | {name: w.views[name] for name in scratch(0, 0)} | dict(
     nvert=sizes["nvert"],
     nslot=sizes["nslot"],
-    nwindow=sizes["nwindow"],
+    ngeom=sizes["ngeom"],
     nroom=room,
     most=sizes["most"],
     resident=int(w.config.resident),
@@ -169,21 +165,19 @@ def make(w, model: int, sizes: dict[str, int]):
     following=np.full(room, -1),
     frame=organ.frame,
     origin=organ.origin,
-    heaviest=wp.array(w.heaviest, dtype=wp.float64, device="cpu", copy=False),
+    heaviest=w.host["heaviest"],
     number=w.body.numbers,
-    flags=wp.array(np.asarray(w.flags), dtype=int, device="cpu", copy=False),
+    flags=wp.array(np.asarray(w.report.flags), dtype=int, device="cpu", copy=False),
     home=win.home,
     qhome=win.qhome,
     dofadr=win.dofadr,
     massadr=coupling.mass_addresses(m, win.dofadr[:, None] + np.arange(3)),
     qposadr=win.qposadr,
     bodyid=win.body,
-    window_adr=win.adr,
     elem_adr=win.elem_adr,
     elem_num=win.elem_num,
-    geom_adr=win.geom_adr,
     geom=win.geom,
-    lagged=w.lagged,
+    lagged=w.host["lagged"],
     status=w.host["status"],
     mj=coupling.mujoco_arrays(model, w.data),
   )  # fmt: skip

@@ -38,7 +38,7 @@ class Resident:
     self.state = w.views["plugin_state"].numpy()[: motion.size]  # the motion comes first there
     self.tail, self.head = own.tail.numpy(), inbox.head.numpy()
     self.found = outbox.found.numpy()
-    _, self.most, _ = outbox.record.shape
+    self.most, _ = outbox.record.shape
     self.device = w.body.device
     self.live = -1
     # Recorded graphs: the guess, on the CPU; the solve with it, on the device; what is left then.
@@ -46,7 +46,7 @@ class Resident:
     self.begin_graph: Any = None
     self.rest: list = []
     self._begun = False
-    w.flags[FLAG.foreseen] = 1
+    w.report.flags[FLAG.foreseen] = 1
     self._end_step, self._look_again, self._motion = end_step, look_again, motion
     self._staging = wp.zeros(
       motion.size, dtype=wp.float64, device="cpu", pinned=self.device.is_cuda
@@ -70,7 +70,7 @@ class Resident:
     self._staging.numpy()[:] = self.state
     wp.copy(self._motion, self._staging)
     wp.synchronize_device(self.device)
-    self.w.flags[FLAG.pending] = self.head[HEAD.mode] = MODE.still  # it ends no step
+    self.w.report.flags[FLAG.pending] = self.head[HEAD.mode] = MODE.still  # it ends no step
     self.live = next(_stamps)
     self.tail[TAIL.stamp] = self.live
 
@@ -89,21 +89,21 @@ class Resident:
       return
     w = self.w
     wp.capture_launch(self.foresee)
-    self._begun = bool(w.flags[FLAG.foreseen]) and w.flags[FLAG.pending] != MODE.halt
+    self._begun = bool(w.report.flags[FLAG.foreseen]) and w.report.flags[FLAG.pending] != MODE.halt
     if self._begun:
       wp.capture_launch(self.begin_graph)
-      w.flags[FLAG.pending] = self.head[HEAD.mode] = MODE.still  # this ends the last step
+      w.report.flags[FLAG.pending] = self.head[HEAD.mode] = MODE.still  # this ends the last step
 
   def left_to_do(self) -> list:
     """Returns the graphs of the solve, or of what is left of one that was begun with the truth."""
-    if self._begun and self.w.flags[FLAG.foreseen]:
+    if self._begun and self.w.report.flags[FLAG.foreseen]:
       return self.rest
     self._begun = False
-    return self.w.solve
+    return self.w.graphs.solve
 
   def look(self):
     """Repeats the search within a shorter reach while it finds more than there is room for."""
-    while self.found.max() > self.most:
+    while self.found[0] > self.most:
       self.head[HEAD.reach] *= 0.75
       self._look_again()
       wp.synchronize_device(self.device)
@@ -111,7 +111,7 @@ class Resident:
   def stop(self):
     """Brings the motion into the plugin state and forgets the step that was begun."""
     self.fetch()
-    self.live, self.w.flags[FLAG.foreseen] = -1, 1
+    self.live, self.w.report.flags[FLAG.foreseen] = -1, 1
 
   def renew(self):
     """Notes that the motion in the plugin state was changed, and has to be sent."""
@@ -123,7 +123,7 @@ class Resident:
     stamp = int(self.tail[TAIL.stamp])
     if stamp >= 0 or -stamp != self.live:
       return
-    flags = self.w.flags
+    flags = self.w.report.flags
     self.head[HEAD.mode] = flags[FLAG.pending]
     self._end_step()
     wp.copy(self._staging, self._motion)

@@ -26,12 +26,12 @@ from ..model import inertia, mjstruct, prepare
 from . import nodes, proxies
 from .resident import Resident
 
-# Candidates of a window that a device reports, times the window's slots.
+# Candidates that a device reports, times the slots.
 ROOM = 16
 
 
 def state_size(nvert: int, nslot: int, ngeom: int, **more: int) -> int:
-  """Returns the length of the plugin state; ngeom is summed over the windows."""
+  """Returns the length of the plugin state."""
   sizes = {"nvert": nvert, "nslot": nslot, "ngeom": ngeom, "ncreep": 0, "nrest": 0, "nbond": 0}
   return layout.size(WindowState, sizes | layout.NO_CUTS | more)
 
@@ -46,8 +46,8 @@ class Phases(coupling.Phases):
     self._status = w.host["status"], w.body.system.status
     m = mjstruct.Model.from_address(model)
     first = mjstruct.view(m.body_treeid, m.nbody, np.int32)[win.body[0]]
-    w.policy = mjstruct.view(m.tree_sleep_policy, m.ntree, np.int32)[first:].data
-    w.counts = mjstruct.view(m.flex_vertnum, m.nflex, np.int32)[organ.flex :].data
+    w.seen.policy = mjstruct.view(m.tree_sleep_policy, m.ntree, np.int32)[first:].data
+    w.seen.counts = mjstruct.view(m.flex_vertnum, m.nflex, np.int32)[organ.flex :].data
     sizes = self._sizes(organ)
     size = layout.size(WindowState, sizes)
     state = coupling.plugin_state(model, w.data, instance, size)
@@ -74,7 +74,7 @@ class Phases(coupling.Phases):
     if w.config.resident:
       self._motion = wp.zeros(layout.size(Motion, sizes), dtype=wp.float64, device=self.side)
       motion = layout.carve(Motion, self._motion, sizes)
-      w.resident = Resident(w, self._motion, self._end_now, self.look_ahead)
+      w.graphs.resident = Resident(w, self._motion, self._end_now, self.look_ahead)
     self._nodes = nodes.make(w, self.side, motion, self._far, sizes)
     self._weights = nodes.Weights(w, self._nodes)
     self._weights.put(np.arange(organ.mesh.nvert))
@@ -94,8 +94,8 @@ class Phases(coupling.Phases):
 
   def motion(self) -> tuple[np.ndarray, np.ndarray]:
     """Returns displacement and velocity of the vertices, where the state has them."""
-    if self._w.resident:
-      self._w.resident.fetch()
+    if self._w.graphs.resident:
+      self._w.graphs.resident.fetch()
     motion = self._motion_here
     return motion.disp, motion.vel
 
@@ -105,16 +105,15 @@ class Phases(coupling.Phases):
     motion.disp[changed], motion.vel[changed] = disp[changed], vel[changed]
     for values in (motion.last, motion.before):
       values[member] = values[group]
-    if self._w.resident:
-      self._w.resident.renew()
+    if self._w.graphs.resident:
+      self._w.graphs.resident.renew()
 
   def _sizes(self, organ) -> dict[str, int]:
     """Returns what the blocks of `layout` need."""
-    win, nvert = organ.windows, organ.mesh.nvert
-    most = nvert
-    if self.side.is_cuda:
-      most = min(nvert, ROOM * int(np.diff(win.adr).max()))
-    return coupling.sizes(organ) | {"nwindow": len(win.flex), "most": most}
+    nvert, nslot = organ.mesh.nvert, organ.windows.nslot
+    return coupling.sizes(organ) | {
+      "most": min(nvert, ROOM * nslot) if self.side.is_cuda else nvert
+    }
 
   def _over_slots(self, kernel):
     proxies.launch(kernel, self._slots)
@@ -189,7 +188,7 @@ class Phases(coupling.Phases):
     self._end()
 
   def advance(self):
-    """Gives each window the nodes nearest to its tools."""
+    """Gives the window the nodes nearest to the tools."""
     self._over_slots(proxies.choose)
 
   def foresee(self):
@@ -217,7 +216,7 @@ def find_astray(w) -> float:
   """Returns how far a slot is from the node that the plugin state says it is on, at most [m]."""
   own = w.boxes["own"]
   if own.tail.numpy()[TAIL.stamp] < 0:  # that motion is on a device, and the slots have moved
-    return np.inf if w.stood else 0.0
+    return np.inf if w.turn.stood else 0.0
   win, n, number = w.organ.windows, w.organ.mesh.nvert, own.slot.numpy()
   node = np.where(number == 0, win.home, np.where((number >= 1) & (number <= n), number - 1, -1))
   used = np.flatnonzero(node >= 0)
@@ -230,7 +229,7 @@ def find_astray(w) -> float:
 
 def hide(w):
   """Hides the organ's flex from MuJoCo until it is drawn again."""
-  if w.counts[0]:
+  if w.seen.counts[0]:
     prepare.show(mjstruct.Model.from_address(w.model), w.organ, shown=False)
 
 
@@ -250,7 +249,7 @@ def let_sleep(w, allowed: bool):
   find_contacts_again(w)  # trees that may not sleep wake
   mjstruct.library().mj_comVel(w.model, w.data)
   mjstruct.view(d.qfrc_passive, m.nv)[w.organ.dofs] = 0.0
-  wp.capture_launch(w.before)
+  wp.capture_launch(w.graphs.before)
 
 
 def find_contacts_again(w):
@@ -280,7 +279,7 @@ def set_inertia(w, m):
   organ, win = w.declared, w.organ.windows
   nodal = win.mass
   if step.SCHEMES[w.config.integrator].spreads:
-    nodal = inertia.of_nodes(m, organ, w.body, w.config, win.mass, int(win.flex[0]))
+    nodal = inertia.of_nodes(m, organ, w.body, w.config, win.mass, win.flex)
   w.views["whole"] = nodal
   share_inertia(w)
 
@@ -294,7 +293,7 @@ def share_inertia(w, vert: Any = slice(None)):
 
 def shortage(w) -> str | None:
   """Returns what the windows had no room for at most, and what to do, or None."""
-  nodes, triangles = w.missed
+  nodes, triangles = w.report.missed
   if nodes:
     what = f"{nodes} nodes that tools touch and keep the deepest; give them more vertices"
   elif triangles:
@@ -311,8 +310,8 @@ def draw(w, model: int, data: int):
   start = int(mjstruct.view(m.flex_vertadr, m.nflex, np.int32)[organ.flex])
   n = prepare.drawn(organ.mesh)
   prepare.show(m, organ, shown=True)
-  if w.resident:
-    w.resident.fetch()
+  if w.graphs.resident:
+    w.graphs.resident.fetch()
   out = mjstruct.view(d.flexvert_xpos, (m.nflexvert, 3))[start : start + n]
   disp = w.boxes["own"].motion.disp.numpy()[:n]
   out[:] = organ.origin + (organ.mesh.rest[:n] + disp) @ organ.frame.T

@@ -4,22 +4,6 @@
 
 namespace palpate {
 
-// Candidates of all windows by their place in the outbox: the q-th of window w is w most + q.
-template <class Fields>
-PALPATE const double* record(const Fields& f, int q) {
-  return f.outbox.record.data + (size_t)RECORD_LENGTH * q;
-}
-template <class Fields>
-PALPATE int candidate(const Fields& f, int q) { return (int)record(f, q)[RECORD_NODE]; }
-template <class Fields>
-PALPATE double far_at(const Fields& f, int q) { return record(f, q)[RECORD_DISTANCE]; }
-// Number of a window's candidates that there was room for.
-template <class Fields>
-PALPATE int found(const Fields& f, int w) {
-  const double all = f.outbox.found.data[w];
-  return all < f.most ? (int)all : f.most;
-}
-
 // Where a slot's node is after the step that ends: displacement, then velocity.
 template <class Fields>
 PALPATE const double* moved_to(const Fields& f, int k) {
@@ -42,12 +26,10 @@ PALPATE void follow_answer(const Fields& f) {
   *heavier = secant.heavier(*heavier > 1.0 ? *heavier : 1.0, f.heaviest.data[0], ratio);
 }
 
-// Puts the slots where their nodes went, and keeps their contact forces for those that get them.
+// Puts the slots where their nodes went.
 template <class Fields>
 PALPATE void follow_nodes(const Fields& f) {
   for (int k = 0; k < f.nslot; ++k) {
-    f.left.data[k] = -1;
-    store(f.kept.data + 3 * k, contact_force(f, k));
     const double* to = moved_to(f, k);
     if (f.placed.data[k] >= 0)
       stand(f, k, f.placed.data[k], load(to), load(to + 3));
@@ -59,29 +41,11 @@ PALPATE void follow_nodes(const Fields& f) {
 // Takes a slot from its node.
 template <class Fields>
 PALPATE void give_up(const Fields& f, int k) {
-  f.left.data[k] = f.placed.data[k];
+  f.taken.data[f.placed.data[k]] = -1;
   f.own.slot.data[k] = -1.0;
   f.placed.data[k] = -1;
   store(f.own.force.data + 3 * k, {0.0, 0.0, 0.0});
   store(f.mj.qvel.data + f.dofadr.data[k], {0.0, 0.0, 0.0});
-}
-
-// Gives each node to the window whose tool is nearest. Windows whose tools touch the same nodes
-// pick as one, the first of them first: a triangle between two windows would touch nothing.
-template <class Fields>
-PALPATE void claim_nodes(const Fields& f, int* group) {
-  for (int w = 0; w < f.nwindow; ++w) {
-    group[w] = w;
-    for (int q = w * f.most; q < w * f.most + found(f, w); ++q) {
-      const int i = candidate(f, q), other = f.claim.data[i];
-      if (other < 0 || far_at(f, q) < far_at(f, other)) f.claim.data[i] = q;
-      const double touch = f.touch.data[i];
-      if (other < 0 || far_at(f, q) >= touch || far_at(f, other) >= touch) continue;
-      const int a = group[other / f.most], b = group[w], joint = a < b ? a : b;
-      for (int v = 0; v <= w; ++v)
-        if (group[v] == a || group[v] == b) group[v] = joint;
-    }
-  }
 }
 
 // Moves the `many` nearest of `count` candidates to the front (quickselect, Hoare 1961); vertex
@@ -115,31 +79,13 @@ PALPATE void select_nearest(const Fields& f, int count, int many) {
   }
 }
 
-// Lists what the group of a window has claimed, into `candidate` and `distance`; returns how many.
-template <class Fields>
-PALPATE int list_claims(const Fields& f, int w, const int* group) {
-  int count = 0;
-  for (int v = 0; v < f.nwindow; ++v) {
-    if (group[v] != group[w]) continue;
-    for (int q = v * f.most; q < v * f.most + found(f, v); ++q) {
-      if (f.claim.data[candidate(f, q)] != q) continue;
-      f.candidate.data[count] = q;
-      f.distance.data[count++] = far_at(f, q);
-    }
-  }
-  return count;
-}
-
 // Keeps the slots of the nodes that stay; returns how many others there are, those first in
 // `candidate` and in the order of the mesh.
 template <class Fields>
-PALPATE int keep_slots(const Fields& f, int first, int many, int count, bool* renewed) {
+PALPATE int keep_slots(const Fields& f, int many, int count, bool* renewed) {
   int* which = f.candidate.data;
-  for (int q = 0; q < count; ++q) {
-    f.chosen.data[candidate(f, which[q])] = 1;
-    f.claim.data[candidate(f, which[q])] = -1;
-  }
-  for (int k = first; k < first + many; ++k) {
+  for (int q = 0; q < count; ++q) f.chosen.data[candidate(f, which[q])] = 1;
+  for (int k = 0; k < many; ++k) {
     const int i = f.placed.data[k];
     if (i >= 0 && !f.chosen.data[i]) {
       give_up(f, k);
@@ -163,23 +109,16 @@ PALPATE int keep_slots(const Fields& f, int first, int many, int count, bool* re
   return fresh;
 }
 
-// Gives the free slots of a window to the nodes that have none.
+// Gives the free slots to the nodes that have none.
 template <class Fields>
-PALPATE void fill_slots(const Fields& f, int first, int fresh) {
-  int k = first;
+PALPATE void fill_slots(const Fields& f, int fresh) {
+  int k = 0;
   for (int q = 0; q < fresh; ++q) {
     const double* r = record(f, f.candidate.data[q]);
     while (f.own.slot.data[k] >= 0.0) ++k;
-    const int i = (int)r[RECORD_NODE], other = f.taken.data[i];
+    const int i = (int)r[RECORD_NODE];
     const double* disp = f.resident ? r + RECORD_DISP : f.own.motion.disp.data + 3 * i;
     const double* vel = f.resident ? r + RECORD_VEL : f.own.motion.vel.data + 3 * i;
-    if (other >= 0) {
-      // Another window had it: its motion and contact force come along.
-      if (f.placed.data[other] == i) give_up(f, other);
-      disp = moved_to(f, other);
-      vel = disp + 3;
-      store(f.own.force.data + 3 * k, load(f.kept.data + 3 * other));
-    }
     f.own.slot.data[k] = i + 1.0;
     f.placed.data[k] = i;
     f.taken.data[i] = k;
@@ -187,44 +126,33 @@ PALPATE void fill_slots(const Fields& f, int first, int fresh) {
   }
 }
 
-// Gives each window the nodes nearest to its geoms. Nodes that stay keep their slot; the others
-// fill the free ones in the order of the mesh.
+// Gives the window the nodes nearest to the tools' geoms. Nodes that stay keep their slot; the
+// others fill the free ones in the order of the mesh.
 template <class Fields>
 PALPATE void choose(const Fields& f, Thread, int) {
   if (f.flags.data[FLAG_ASLEEP]) return;
   f.flags.data[FLAG_MISSED_NODES] = 0;
   if (f.flags.data[FLAG_ANSWERED]) follow_answer(f);
   follow_nodes(f);
-  int group[MAX_WINDOWS];
-  claim_nodes(f, group);
+  // The last slot stays free, see `list_triangles`. A patch of n nodes has up to 2 n - 4 triangles.
+  const int room = f.elem_num / 2 + 2, many = room < f.nslot - 1 ? room : f.nslot - 1;
+  int count = found(f);
+  if (count < 3) return;
+  for (int q = 0; q < count; ++q) {
+    f.candidate.data[q] = q;
+    f.distance.data[q] = far_at(f, q);
+  }
+  if (count > many) {
+    select_nearest(f, count, many);
+    for (int q = many; q < count; ++q)
+      f.flags.data[FLAG_MISSED_NODES] +=
+        f.distance.data[q] < f.touch.data[candidate(f, f.candidate.data[q])];
+    count = many;
+  }
   bool renewed = false;
-  for (int w = 0; w < f.nwindow; ++w) {
-    // The last slot stays free, see `list_triangles`. A patch of n nodes has up to 2 n - 4
-    // triangles.
-    const int first = f.window_adr.data[w], room = f.elem_num.data[w] / 2 + 2;
-    int many = f.window_adr.data[w + 1] - first - 1;
-    if (many > room) many = room;
-    int count = list_claims(f, w, group);
-    if (count < 3) continue;
-    if (count > many) {
-      select_nearest(f, count, many);
-      for (int q = many; q < count; ++q)
-        f.flags.data[FLAG_MISSED_NODES] +=
-          f.distance.data[q] < f.touch.data[candidate(f, f.candidate.data[q])];
-      count = many;
-    }
-    const int fresh = keep_slots(f, first, many, count, &renewed);
-    fill_slots(f, first, fresh);
-    renewed = renewed || fresh > 0;
-  }
-  for (int w = 0; w < f.nwindow; ++w)
-    for (int q = w * f.most; q < w * f.most + found(f, w); ++q) f.claim.data[candidate(f, q)] = -1;
-  for (int k = 0; k < f.nslot; ++k) {
-    const int i = f.left.data[k];
-    if (i >= 0 && f.taken.data[i] == k && f.placed.data[k] != i) f.taken.data[i] = -1;
-  }
-  if (renewed) list_triangles(f);
-  f.flags.data[FLAG_STAGE] = STAGE_ENDED;
+  const int fresh = keep_slots(f, many, count, &renewed);
+  fill_slots(f, fresh);
+  if (renewed || fresh > 0) list_triangles(f);
 }
 
 }  // namespace palpate

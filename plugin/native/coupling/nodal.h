@@ -91,7 +91,6 @@ PALPATE void gather_nodes(const Fields& f, Thread, int) {
   // Residual floor: with D ~ mass, sqrt(r^T D^-1 r) of this share of the weight's impulse.
   const double rest = f.rest_share * 9.81 * h;
   solve.step.data[2] = (float)(weight * rest * rest);
-  f.flags.data[FLAG_STAGE] = STAGE_GATHERED;
 }
 
 // Adds the passive force.
@@ -113,7 +112,6 @@ PALPATE void scatter_nodes(const Fields& f, Thread, int) {
     double* out = mj.qfrc_passive.data + adr;
     store(out, load(out) + passive(ok ? rate : D3{0.0, 0.0, 0.0}, load(f.lagged.data + 3 * i)));
   }
-  f.flags.data[FLAG_STAGE] = STAGE_PUSHED;
 }
 
 // Writes the impulses by which the contact forces changed to the solver's right-hand side.
@@ -187,7 +185,6 @@ PALPATE void remember_nodes(const Fields& f, Thread, int) {
     store(force, relaxed(was, now, ratio));
   }
   if (answered) f.own.heavier.data[0] = secant.heavier(heavy, f.heaviest.data[0], ratio);
-  f.flags.data[FLAG_STAGE] = STAGE_ENDED;
 }
 
 }  // namespace palpate

@@ -52,17 +52,14 @@ PALPATE bool tell_forces(const Fields& f) {
   return pushes;
 }
 
-// Whether the model's windows are not those of the plugin state.
+// Whether the model's window is not that of the plugin state.
 template <class Fields>
 PALPATE bool is_stale(const Fields& f) {
   for (int k = 0; k < f.nslot; ++k)
     if (node_of(f, k) != f.placed.data[k]) return true;
-  for (int w = 0; w < f.nwindow; ++w) {
-    const int spare = f.window_adr.data[w + 1] - 1;
-    const D3 gone = vabs(load(f.mj.qpos.data + f.qposadr.data[spare]) - parked(f, spare));
-    if (gone.x > 1.0 || gone.y > 1.0 || gone.z > 1.0) return true;
-  }
-  return false;
+  const int spare = f.nslot - 1;
+  const D3 gone = vabs(load(f.mj.qpos.data + f.qposadr.data[spare]) - parked(f, spare));
+  return gone.x > 1.0 || gone.y > 1.0 || gone.z > 1.0;
 }
 
 // Whether the inbox is what `foresee` wrote.
@@ -131,22 +128,18 @@ PALPATE double gone(const Fields& f, const double* geom, int q) {
          sqrt(turned2) * (norm(load(geom + GEOM_BOX)) + norm(load(geom + GEOM_HALF)));
 }
 
-// Writes the windows' geoms to the inbox, flags whether one is near the organ's bounds, and says
+// Writes the followed geoms to the inbox, flags whether one is near the organ's bounds, and says
 // whether one that is has moved too far since the organ fell asleep.
 template <class Fields>
 PALPATE bool tell_geoms(const Fields& f) {
   const double* last = tail(f);
   bool near = last[TAIL_HIGH] <= last[TAIL_LOW], stirs = near;  // they are not known yet
-  for (int w = 0; w < f.nwindow; ++w) {
-    int count = 0;
-    for (int q = f.geom_adr.data[w]; q < f.geom_adr.data[w + 1] && count < MAX_GEOMS; ++q) {
-      double* geom = geom_at(f, w, count++);
-      tell_geom(f, f.geom.data[q], geom);
-      if (is_apart(f, geom)) continue;
-      near = true;
-      stirs = stirs || !(gone(f, geom, q) < last[TAIL_LEEWAY]);
-    }
-    f.inbox.ngeom.data[w] = count;
+  for (int q = 0; q < f.ngeom; ++q) {
+    double* geom = geom_at(f, q);
+    tell_geom(f, f.geom.data[q], geom);
+    if (is_apart(f, geom)) continue;
+    near = true;
+    stirs = stirs || !(gone(f, geom, q) < last[TAIL_LEEWAY]);
   }
   f.flags.data[FLAG_NEAR] = near;
   return stirs;
@@ -162,7 +155,6 @@ PALPATE void gather_slots(const Fields& f, Thread, int) {
   const bool stirs = tell_geoms(f);
   const bool asleep = tail(f)[TAIL_QUIET] >= QUIET && !stirs && !pushes && !changed;
   f.flags.data[FLAG_ASLEEP] = asleep;
-  f.flags.data[FLAG_STAGE] = STAGE_GATHERED;
   if (!asleep || stale) return;
   // The slots stay where they are; nothing else is done in such a step.
   f.status.data[0] = f.status.data[1] = 0.0f;
@@ -171,7 +163,6 @@ PALPATE void gather_slots(const Fields& f, Thread, int) {
     if (f.mj.body_awake.data[f.bodyid.data[k]])
       store(out, load(out) + passive({0.0, 0.0, 0.0}, load(f.lagged.data + 3 * k)));
   }
-  f.flags.data[FLAG_STAGE] = STAGE_PUSHED;
 }
 
 // Writes what the next `gather_slots` will if the step and what acts on the slots besides contacts
@@ -193,7 +184,7 @@ PALPATE void foresee(const Fields& f, Thread, int) {
   }
 }
 
-// Adds the passive force that carries v + dv to the windows' dofs.
+// Adds the passive force that carries v + dv to the window's dofs.
 template <class Fields>
 PALPATE void scatter_slots(const Fields& f, Thread, int) {
   const bool ok = f.outbox.summary.data[SUMMARY_STATUS + 3] == 0.0;
@@ -210,7 +201,6 @@ PALPATE void scatter_slots(const Fields& f, Thread, int) {
     double* out = f.mj.qfrc_passive.data + adr;
     store(out, load(out) + passive({p.x / h, p.y / h, p.z / h}, load(f.lagged.data + 3 * k)));
   }
-  f.flags.data[FLAG_STAGE] = STAGE_PUSHED;
 }
 
 }  // namespace palpate

@@ -1,12 +1,12 @@
-// Windows: a slot is a vertex body of a window. It stands on a node of the organ; the last one of
-// each window waits far away.
+// Windows: a slot is a vertex body of the window. It stands on a node of the organ; the last one
+// waits far away.
 #pragma once
 #include "coupling/node.h"
 #include "core/geom.h"
 
 namespace palpate {
 
-// Height at which the spare slot of a window waits [m].
+// Height at which the spare slot waits [m].
 constexpr double AWAY = 1e3;
 
 template <class Fields>
@@ -22,11 +22,25 @@ PALPATE double* moved(const Fields& f, int slot) {
   return f.inbox.moved.data + MOVED_LENGTH * slot;
 }
 template <class Fields>
-PALPATE double* geom_at(const Fields& f, int window, int q) {
-  return f.inbox.geom.data + GEOM_LENGTH * (MAX_GEOMS * window + q);
-}
+PALPATE double* geom_at(const Fields& f, int q) { return f.inbox.geom.data + GEOM_LENGTH * q; }
 template <class Fields>
 PALPATE D3 contact_force(const Fields& f, int slot) { return load(f.own.force.data + 3 * slot); }
+
+// Candidates of the last search by their place in the outbox.
+template <class Fields>
+PALPATE const double* record(const Fields& f, int q) {
+  return f.outbox.record.data + (size_t)RECORD_LENGTH * q;
+}
+template <class Fields>
+PALPATE int candidate(const Fields& f, int q) { return (int)record(f, q)[RECORD_NODE]; }
+template <class Fields>
+PALPATE double far_at(const Fields& f, int q) { return record(f, q)[RECORD_DISTANCE]; }
+// Number of candidates that there was room for.
+template <class Fields>
+PALPATE int found(const Fields& f) {
+  const double all = f.outbox.found.data[0];
+  return all < f.most ? (int)all : f.most;
+}
 
 // Node of a slot by the plugin state, -1 for none.
 template <class Fields>
@@ -35,7 +49,7 @@ PALPATE int node_of(const Fields& f, int slot) {
   return n == 0.0 ? f.home.data[slot] : n >= 1.0 && n <= f.nvert ? (int)n - 1 : -1;
 }
 
-// Where the spare slot of a window waits, in qpos.
+// Where the spare slot waits, in qpos.
 template <class Fields>
 PALPATE D3 parked(const Fields& f, int slot) {
   return load(f.qhome.data + 3 * slot) + AWAY * load(f.frame.data + 6);
@@ -59,41 +73,37 @@ PALPATE void stand(const Fields& f, int slot, int i, D3 disp, D3 vel) {
   mj.body_invweight0.data[2 * body] = 1.0 / f.node_mass.data[i];
 }
 
-// Lists the windows' triangles: those of the organ whose corners are in one window.
+// Lists the window's triangles: those of the organ whose corners have slots.
 template <class Fields>
 PALPATE void list_triangles(const Fields& f) {
   f.flags.data[FLAG_MISSED_ELEMENTS] = 0;
-  for (int w = 0; w < f.nwindow; ++w) {
-    const int first = f.window_adr.data[w], last = f.window_adr.data[w + 1];
-    int* list = f.mj.flex_elem.data + f.elem_adr.data[w];
-    const int most = f.elem_num.data[w];
-    int count = 0;
-    for (int k = first; k < last; ++k) {
-      const int i = f.placed.data[k];
-      if (i < 0) continue;
-      for (int t = f.begin.data[i]; t >= 0; t = f.following.data[t]) {
-        const int* e = f.elem.data + 3 * t;
-        const int b = f.taken.data[e[1]], c = f.taken.data[e[2]];
-        if (b < first || b >= last || c < first || c >= last) continue;
-        if (count == most) {
-          f.flags.data[FLAG_MISSED_ELEMENTS] += 1;
-          continue;
-        }
-        list[3 * count] = k - first;
-        list[3 * count + 1] = b - first;
-        list[3 * count + 2] = c - first;
-        ++count;
+  int* list = f.mj.flex_elem.data + f.elem_adr;
+  int count = 0;
+  for (int k = 0; k < f.nslot; ++k) {
+    const int i = f.placed.data[k];
+    if (i < 0) continue;
+    for (int t = f.begin.data[i]; t >= 0; t = f.following.data[t]) {
+      const int* e = f.elem.data + 3 * t;
+      const int b = f.taken.data[e[1]], c = f.taken.data[e[2]];
+      if (b < 0 || c < 0) continue;
+      if (count == f.elem_num) {
+        f.flags.data[FLAG_MISSED_ELEMENTS] += 1;
+        continue;
       }
+      list[3 * count] = k;
+      list[3 * count + 1] = b;
+      list[3 * count + 2] = c;
+      ++count;
     }
-    // Triangles to spare are points of the last slot, out of everybody's way: repeating one of the
-    // others would multiply its contacts.
-    const int spare = last - 1;
-    store(f.mj.qpos.data + f.qposadr.data[spare], parked(f, spare));
-    for (int q = 3 * count; q < 3 * most; ++q) list[q] = spare - first;
   }
+  // Triangles to spare are points of the last slot, out of everybody's way: repeating one of the
+  // others would multiply its contacts.
+  const int spare = f.nslot - 1;
+  store(f.mj.qpos.data + f.qposadr.data[spare], parked(f, spare));
+  for (int q = 3 * count; q < 3 * f.elem_num; ++q) list[q] = spare;
 }
 
-// Puts the windows' bodies on the nodes of their slots and rewrites their triangles.
+// Puts the window's bodies on the nodes of their slots and rewrites their triangles.
 template <class Fields>
 PALPATE void place(const Fields& f, Thread, int) {
   for (int i = 0; i < f.nvert; ++i) f.taken.data[i] = -1;

@@ -9,10 +9,10 @@ namespace palpate {
 constexpr int FINE = 16;
 constexpr double CORNER = 0.578;
 
-// The distance of a window's geoms from a triangle of candidates of the last search, from below;
+// The distance of the followed geoms from a triangle of candidates of the last search, from below;
 // `enough` where it is more.
 template <class Fields>
-PALPATE double clearance(const Fields& f, int w, const double* const* corner, double enough) {
+PALPATE double clearance(const Fields& f, const double* const* corner, double enough) {
   D3 x[3];
   double lowest = 1e300, longest = 0.0;
   for (int k = 0; k < 3; ++k) {
@@ -27,13 +27,12 @@ PALPATE double clearance(const Fields& f, int w, const double* const* corner, do
   }
   if (lowest - CORNER * longest >= enough) return enough;
   const D3 s = x[1] - x[0], t = x[2] - x[0];
-  const int ngeom = (int)f.inbox.ngeom.data[w];
   for (int a = 0; a <= FINE; ++a) {
     for (int b = 0; a + b <= FINE; ++b) {
       const D3 p = {a * s.x + b * t.x, a * s.y + b * t.y, a * s.z + b * t.z};
       const D3 at = x[0] + D3{p.x / FINE, p.y / FINE, p.z / FINE};
-      for (int q = 0; q < ngeom; ++q) {
-        const double* geom = geom_at(f, w, q);
+      for (int q = 0; q < f.ngeom; ++q) {
+        const double* geom = geom_at(f, q);
         const double far = distance(geom, at - load(geom + GEOM_POS));
         lowest = far < lowest ? far : lowest;
       }
@@ -47,26 +46,19 @@ PALPATE double clearance(const Fields& f, int w, const double* const* corner, do
 template <class Fields>
 PALPATE double clearance(const Fields& f) {
   double least = head(f)[HEAD_REACH] - f.longest;
-  for (int w = 0; w < f.nwindow; ++w) {
-    const double* record = f.outbox.record.data + (size_t)RECORD_LENGTH * w * f.most;
-    auto node_at = [&](int q) { return (int)record[RECORD_LENGTH * q + RECORD_NODE]; };
-    const double found = f.outbox.found.data[w];
-    const int count = found < f.most ? (int)found : f.most;
-    for (int q = 0; q < count; ++q) f.claim.data[node_at(q)] = q;
-    for (int q = 0; q < count; ++q) {
-      const int i = node_at(q);
-      for (int t = f.begin.data[i]; t >= 0; t = f.following.data[t]) {
-        const int* e = f.elem.data + 3 * t;
-        const int b = f.claim.data[e[1]], c = f.claim.data[e[2]];
-        if (b < 0 || c < 0) continue;
-        const double* corner[3] = {record + RECORD_LENGTH * q, record + RECORD_LENGTH * b,
-                                   record + RECORD_LENGTH * c};
-        const double at = clearance(f, w, corner, least);
-        least = at < least ? at : least;
-      }
+  const int count = found(f);
+  for (int q = 0; q < count; ++q) f.at.data[candidate(f, q)] = q;
+  for (int q = 0; q < count; ++q) {
+    for (int t = f.begin.data[candidate(f, q)]; t >= 0; t = f.following.data[t]) {
+      const int* e = f.elem.data + 3 * t;
+      const int b = f.at.data[e[1]], c = f.at.data[e[2]];
+      if (b < 0 || c < 0) continue;
+      const double* corner[3] = {record(f, q), record(f, b), record(f, c)};
+      const double far = clearance(f, corner, least);
+      least = far < least ? far : least;
     }
-    for (int q = 0; q < count; ++q) f.claim.data[node_at(q)] = -1;
   }
+  for (int q = 0; q < count; ++q) f.at.data[candidate(f, q)] = -1;
   return least - f.skin;
 }
 
@@ -105,13 +97,11 @@ PALPATE bool take_contacts(const Fields& f) {
 // Notes where the tools are and what pulls when the organ falls asleep.
 template <class Fields>
 PALPATE void fall_asleep(const Fields& f) {
-  for (int w = 0; w < f.nwindow; ++w) {
-    for (int q = f.geom_adr.data[w]; q < f.geom_adr.data[w + 1]; ++q) {
-      const double* geom = geom_at(f, w, q - f.geom_adr.data[w]);
-      double* pose = f.own.pose.data + POSE_LENGTH * q;
-      store(pose + POSE_POS, load(geom + GEOM_POS));
-      for (int c = 0; c < 9; ++c) pose[POSE_AXIS + c] = geom[GEOM_AXIS + c];
-    }
+  for (int q = 0; q < f.ngeom; ++q) {
+    const double* geom = geom_at(f, q);
+    double* pose = f.own.pose.data + POSE_LENGTH * q;
+    store(pose + POSE_POS, load(geom + GEOM_POS));
+    for (int c = 0; c < 9; ++c) pose[POSE_AXIS + c] = geom[GEOM_AXIS + c];
   }
   store(tail(f) + TAIL_GRAVITY, load(head(f) + HEAD_GRAVITY));
   for (int k = 0; k < f.nslot; ++k) store(moved(f, k) + MOVED_VEL, {0.0, 0.0, 0.0});
@@ -150,7 +140,6 @@ PALPATE void leave_slots(const Fields& f, Thread, int) {
   in[HEAD_MODE] = mode;
   in[HEAD_STEP_ENDED] = in[HEAD_STEP];
   f.flags.data[FLAG_PENDING] = f.resident ? mode : MODE_STILL;
-  f.flags.data[FLAG_STAGE] = STAGE_LEFT;
 }
 
 }  // namespace palpate

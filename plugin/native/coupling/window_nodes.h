@@ -122,42 +122,38 @@ PALPATE void push_impulses(const Fields& n, Thread t, int) {
   if (t.tid == 0) n.solve.expected.data[0] = (float)head(n, HEAD_EXPECTED);
 }
 
-// Whether a window's geom comes near the organ's bounds.
+// Whether a followed geom comes near the organ's bounds.
 template <class Fields>
-PALPATE bool any_near(const Fields& n, const double* geom, int ngeom) {
+PALPATE bool any_near(const Fields& n) {
+  const double* geom = n.inbox.geom.data;
   const D3 low = load(n.outbox.summary.data + SUMMARY_LOW);
   const D3 high = load(n.outbox.summary.data + SUMMARY_HIGH);
-  for (int q = 0; q < ngeom; ++q, geom += GEOM_LENGTH)
+  for (int q = 0; q < n.ngeom; ++q, geom += GEOM_LENGTH)
     if (comes_near(geom, low, high, head(n, HEAD_REACH))) return true;
   return false;
 }
 
-// Lists the nodes that will be near each window's geoms, by their distance to the surface. Before
+// Lists the nodes that will be near the followed geoms, by their distance to the surface. Before
 // the step has ended: where it will, without what contacts change.
 template <class Fields>
 PALPATE void search(const Fields& n, Thread t, int) {
   const bool answered = head(n, HEAD_ANSWERED) != 0.0;
   const double reach = head(n, HEAD_REACH), h = answered ? 0.0 : head(n, HEAD_STEP);
   const double ok = n.solve.status.data[3] == 0.0f && !answered ? 1.0 : 0.0;
-  for (int w = 0; w < n.nwindow; ++w) {
-    const double* geom = n.inbox.geom.data + MAX_GEOMS * GEOM_LENGTH * w;
-    const int ngeom = (int)n.inbox.ngeom.data[w];
-    if (!any_near(n, geom, ngeom)) continue;
-    double* record = n.outbox.record.data + (size_t)RECORD_LENGTH * n.most * w;
-    each_item(t, n.nouter, [&](int i) {
-      if (n.mass.data[i] == 0.0) return;  // it waits for a cut
-      const D3 v = next_velocity(n, i, ok), u = load(n.motion.disp.data + 3 * i) + h * v;
-      const double far = nearest(geom, ngeom, load(n.rest.data + 3 * i) + u);
-      if (far > reach) return;
-      const int at = append(n.count.data + w);
-      if (at >= n.most) return;
-      double* r = record + RECORD_LENGTH * at;
-      r[RECORD_NODE] = i;
-      r[RECORD_DISTANCE] = far;
-      store(r + RECORD_DISP, u);
-      store(r + RECORD_VEL, v);
-    });
-  }
+  if (!any_near(n)) return;
+  each_item(t, n.nouter, [&](int i) {
+    if (n.mass.data[i] == 0.0) return;  // it waits for a cut
+    const D3 v = next_velocity(n, i, ok), u = load(n.motion.disp.data + 3 * i) + h * v;
+    const double far = nearest(n.inbox.geom.data, n.ngeom, load(n.rest.data + 3 * i) + u);
+    if (far > reach) return;
+    const int at = append(n.count.data);
+    if (at >= n.most) return;
+    double* r = n.outbox.record.data + (size_t)RECORD_LENGTH * at;
+    r[RECORD_NODE] = i;
+    r[RECORD_DISTANCE] = far;
+    store(r + RECORD_DISP, u);
+    store(r + RECORD_VEL, v);
+  });
 }
 
 // Tells status, dv of the slots and the number of candidates.
@@ -177,10 +173,8 @@ PALPATE void report(const Fields& n, Thread t, int) {
   for (int k = 0; k < 4; ++k) n.outbox.summary.data[SUMMARY_STATUS + k] = n.solve.status.data[k];
   n.outbox.summary.data[SUMMARY_RATIO] = n.solve.ratio.data[0];
   if (answered) n.inbox.head.data[HEAD_MODE] = MODE_STILL;  // the answer has ended the step
-  for (int w = 0; w < n.nwindow; ++w) {
-    n.outbox.found.data[w] = n.count.data[w];
-    n.count.data[w] = 0;
-  }
+  n.outbox.found.data[0] = n.count.data[0];
+  n.count.data[0] = 0;
 }
 
 }  // namespace palpate

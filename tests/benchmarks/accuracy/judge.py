@@ -109,7 +109,7 @@ class SolidEnergy:
   def __call__(self, *_) -> tuple[float, float]:
     """Returns elastic and kinetic energy [J]."""
     w = self.space
-    u, v = w.phases.motion()
+    u, v = w.motion()
     with np.errstate(all="ignore"):
       kinetic = 0.5 * (w.organ.mass[:, None] * v * v).sum()
       return float(energy.total(w.organ.mesh, w.config, u)), float(kinetic)

@@ -154,7 +154,7 @@ def run(case: Case, out: pathlib.Path) -> list[Row]:
     d.ctrl[0] = -0.0015 * min(1.0, step / (0.3 * steps))
     d.ctrl[1] = 0.002 * max(0.0, min(step / steps, 0.7) - 0.4)
     mujoco.mj_step(m, d)
-    if step % (steps // 8) == steps // 8 - 1 and w.status[0] > 0:
+    if step % (steps // 8) == steps // 8 - 1 and w.seen.status[0] > 0:
       found.append(study(w.body, tolerance))
   row = {"nodes": w.body.shape.nvert, "bend": case["bend"], "tolerance": tolerance}
   row |= {key: float(np.median([each[key] for each in found])) for key in found[0]}

@@ -166,8 +166,8 @@ def timed(w, spent: dict, clock=time.perf_counter):
     return call
 
   original = wp.capture_launch
-  rest = w.resident.rest if w.resident else []
-  device_graphs = {id(graph) for _, graph in [*w.solve, *w.respond, *rest]}
+  rest = w.graphs.resident.rest if w.graphs.resident else []
+  device_graphs = {id(graph) for _, graph in [*w.graphs.solve, *w.graphs.respond, *rest]}
 
   def capture_launch(graph, *args):
     if id(graph) not in device_graphs:

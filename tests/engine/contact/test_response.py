@@ -91,15 +91,15 @@ def test_the_contact_force_of_stiff_tissue_comes_to_rest(device):
 
 def test_tissue_is_stiff_for_a_time_step(device):
   soft = load("nodal", device, h=1e-3, young=3e4, foundation=1e4)
-  assert not scenes.workspace(soft[2]).stiff
-  assert scenes.workspace(load("window", device)[2]).stiff
+  assert not scenes.workspace(soft[2]).graphs.stiff
+  assert scenes.workspace(load("window", device)[2]).graphs.stiff
   m, d, organ = soft
   m.opt.timestep = 2e-2
   mujoco.mj_step(m, d, 2)
-  assert scenes.workspace(organ).stiff
+  assert scenes.workspace(organ).graphs.stiff
   m.opt.timestep = 1e-3
   mujoco.mj_step(m, d, 2)
-  assert not scenes.workspace(organ).stiff
+  assert not scenes.workspace(organ).graphs.stiff
 
 
 def test_a_light_organ_is_not_heavier_for_its_window(device):

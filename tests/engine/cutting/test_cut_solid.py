@@ -123,7 +123,7 @@ def moving(organ):
   """Returns mass, momentum, angular momentum, and energy, of all nodes."""
   space = scenes.workspace(organ)
   space.cuts.follow()
-  u, v = space.phases.motion()
+  u, v = space.motion()
   mass, x = space.organ.mass[:, None], space.organ.mesh.rest + u
   kept = np.concatenate([[mass.sum()], (mass * v).sum(0), (mass * np.cross(x, v)).sum(0)])
   return kept, organ.energy + 0.5 * (mass * v**2).sum()

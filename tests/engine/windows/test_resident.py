@@ -115,7 +115,7 @@ def test_what_changes_between_steps_counts_at_once(device):
 
 def test_steps_are_begun_ahead_unless_what_acts_changes(device, monkeypatch):
   m, d, _ = make(device, resident=True)
-  resident = engine.find(d._address, 0).resident
+  resident = engine.find(d._address, 0).graphs.resident
   original, left = resident.left_to_do, []
 
   def left_to_do():

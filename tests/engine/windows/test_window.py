@@ -191,7 +191,6 @@ def test_set_state_and_reset():
     ({"pin": "0 9999"}, ["pin", "9999"]),
     ({"pin": "a"}, ["pin", "'a'"]),
     ({"follow": "nobody"}, ["nobody"]),
-    ({"follow": "tool, tool"}, ["follow", "2 groups"]),
   ],
 )
 def test_bad_windows_are_named(keys, words):
