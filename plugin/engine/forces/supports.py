@@ -67,6 +67,8 @@ class Rests(Beside):
     w: the workspace
   """
 
+  KEYS = ("support",)
+
   def __init__(self, w):
     super().__init__(w)
     self.below: list = []  # workspaces of organs that it rests on
