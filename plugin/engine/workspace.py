@@ -36,8 +36,8 @@ _RK4 = int(mujoco.mjtIntegrator.mjINT_RK4)
 _ASTRAY = 1e-9  # distance of a slot from its node that rounding does not explain [m]
 
 
-# What acts on an organ beside its tissue, in that order: attributes of a workspace. A batch on a GPU
-# reads this too, and refuses what it has not.
+# What acts on an organ beside its tissue, in that order: attributes of a workspace. A batch reads it
+# too, and on a GPU refuses what it has not.
 FORCES: dict[str, type[Beside]] = {
   "ties": Ties,
   "bonds": Bonds,
