@@ -2,6 +2,8 @@
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
+from typing import TYPE_CHECKING
+
 import numpy as np
 import warp as wp
 from palpate.tissue import step
@@ -11,6 +13,9 @@ from . import coupling, layout
 from .coupling import Crossing, Mujoco
 from .layout import FLAG, NodalState
 from .model import inertia, mjstruct
+
+if TYPE_CHECKING:
+  from .workspace import Workspace
 
 
 @struct
@@ -55,7 +60,7 @@ class Phases(coupling.Phases):
 
   side = "cpu"
 
-  def __init__(self, w, model: int, instance: int):
+  def __init__(self, w: "Workspace", model: int, instance: int):
     m, organ, s = mjstruct.Model.from_address(model), w.organ, w.body.shape
     vert = s.vert.numpy()
     dofadr = _in_node_order(organ.dofadr, vert)

@@ -9,7 +9,7 @@ stamp too, and a number that each writing changes, so that several mjData of one
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +27,10 @@ from ..bind import bind
 from ..model import flexes, mjstruct
 from ..windows import model_lock
 from .tear import Tear
+
+if TYPE_CHECKING:
+  from ..model.declare import Declaration
+  from ..workspace import Workspace
 
 _UNCUT = 1.0  # stands for the stamp of triangles before the first cut
 FOREIGN = "plugin_state has cuts that are not of this organ; set a state that was saved from it"
@@ -79,7 +83,7 @@ class Cuts:
     w: the workspace, whose body has a state but no graphs yet
   """
 
-  def __init__(self, w):
+  def __init__(self, w: Workspace):
     self._w = w
     self.whole: Mesh = w.organ.mesh
     self.stamp = 0.0
@@ -336,7 +340,7 @@ class Cuts:
     return pieces(self.mesh, self._w.organ.mass, self._w.config.thickness)
 
 
-def report(found: cutting.Cut, before: Mesh, organ, thickness: float) -> Report:
+def report(found: cutting.Cut, before: Mesh, organ: Declaration, thickness: float) -> Report:
   """Returns what a cut of a mesh has done; `organ` is its declaration."""
   path = [organ.origin + line @ organ.frame.T for line in found.path]
   nodes = found.mesh.nouter - before.nouter

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from palpate.tissue.cutting.path import Finder
 from palpate.tissue.geometry.mesh import Mesh
+
+if TYPE_CHECKING:
+  from ..workspace import Workspace
 
 _WAY = 1.2  # edges by which a tear goes on, to each side where it begins
 _NEAR = 1.5  # edges from the end of a cut from which it goes on
@@ -19,7 +22,7 @@ class Tear:
     w: the workspace
   """
 
-  def __init__(self, w):
+  def __init__(self, w: Workspace):
     self._w = w
     self._mesh: Any = None
     self._rest: tuple = ()

@@ -6,10 +6,15 @@ written when MuJoCo draws. Between pictures it is hidden, so that a step spends 
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from palpate.tissue.geometry import mesh as topology
 
 from ..model import flexes, mjstruct
+
+if TYPE_CHECKING:
+  from ..workspace import Workspace
 
 _COUNTS = ("flex_vertnum", "flex_elemnum", "flex_shellnum", "flex_bvhnum", "flex_bvhadr")
 
@@ -24,7 +29,7 @@ class Walls:
     ValueError: the configuration names no flex, or one without room.
   """
 
-  def __init__(self, w):
+  def __init__(self, w: Workspace):
     self._w, name = w, w.organ.config.walls
     self._flex, self._shown = -1, True
     if not name:

@@ -13,11 +13,14 @@ from __future__ import annotations
 
 import itertools
 import time
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
 from ..layout import FLAG, HEAD, MODE, TAIL
+
+if TYPE_CHECKING:
+  from ..workspace import Workspace
 
 _stamps = itertools.count(time.time_ns() >> 10)  # never the same number twice
 
@@ -32,7 +35,7 @@ class Resident:
     look_again: launches the search for nodes near the tools once more
   """
 
-  def __init__(self, w, motion: wp.array, end_step, look_again):
+  def __init__(self, w: Workspace, motion: wp.array, end_step, look_again):
     self.w = w
     own, inbox, outbox = (w.boxes[name] for name in ("own", "inbox", "outbox"))
     self.state = w.views["plugin_state"].numpy()[: motion.size]  # the motion comes first there
