@@ -49,12 +49,6 @@ gather, scatter, push, remember = coupling.kernels(
 )
 
 
-def state_size(nfree: int, ninner: int = 0, **more: int) -> int:
-  """Returns the length of the plugin state of `nfree` degrees of freedom; see `coupling.sizes`."""
-  sizes = coupling.nodal_sizes(nfree, ninner) | {"ncreep": 0, "nbond": 0} | layout.NO_CUTS
-  return layout.size(NodalState, sizes | more)
-
-
 class Phases(coupling.Phases):
   """Nodal coupling of a workspace's organ."""
 

@@ -34,12 +34,6 @@ if TYPE_CHECKING:
 ROOM = 16
 
 
-def state_size(nvert: int, nslot: int, ngeom: int, **more: int) -> int:
-  """Returns the length of the plugin state."""
-  sizes = {"nvert": nvert, "nslot": nslot, "ngeom": ngeom, "ncreep": 0, "nrest": 0, "nbond": 0}
-  return layout.size(WindowState, sizes | layout.NO_CUTS | more)
-
-
 class Phases(coupling.Phases):
   """Window coupling of a workspace's organ."""
 
