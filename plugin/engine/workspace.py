@@ -245,7 +245,7 @@ class Workspace:
       self.ties.aim()
     if self.graphs.resident:
       self.graphs.resident.send()
-      graphs.launch_all(self.graphs.resident.left_to_do())
+      graphs.launch_all(self.graphs.resident.left_to_do(self.graphs.solve))
       self.graphs.resident.look()
       wp.capture_launch(self.graphs.after)
     else:

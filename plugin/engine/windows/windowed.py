@@ -72,7 +72,8 @@ class Phases(coupling.Phases):
     if w.config.resident:
       self._motion = wp.zeros(layout.size(Motion, sizes), dtype=wp.float64, device=self.side)
       motion = layout.carve(Motion, self._motion, sizes)
-      w.graphs.resident = Resident(w, self._motion, self._end_now, self.look_ahead)
+      own = w.report.flags, w.boxes, w.plugin_state
+      w.graphs.resident = Resident(*own, self._motion, self._end_now, self.look_ahead)
     self._nodes = nodes.make(w, self.side, motion, self._far, sizes)
     self._weights = nodes.Weights(w, self._nodes)
     self._weights.put(np.arange(organ.mesh.nvert))
