@@ -89,7 +89,7 @@ class Cuts:
     self.stamp = 0.0
     self._fresh = False
     self.reports: list[Report] = []
-    self.tear = Tear(w)
+    self._tear = Tear()
     if not self:
       return
     bodies.unshare(w.body)
@@ -248,6 +248,18 @@ class Cuts:
     """Hides it again, after a picture."""
 
   # Cutting.
+
+  def tear(self) -> bool:
+    """Cuts the organ at its most stretched triangle, if that is too far; returns whether."""
+    organ, most = self._w.organ, self._w.config.tear
+    if self.full:
+      return False
+    x = organ.mesh.rest + self._w.motion()[0]
+    line = self._tear.line(organ.mesh, x, most, self.finder)
+    try:
+      return line is not None and self.cut(organ.origin + line @ organ.frame.T).nodes > 0
+    except ValueError:  # pinned tissue around it
+      return False
 
   def cut(self, points: npt.ArrayLike, given: float = 0.0, depth=None, direction=None) -> Report:
     """Cuts the organ along points in the world, (n, 3) [m]; see `Organ.cut`, and `Knife.cut`."""

@@ -39,13 +39,14 @@ class SolidCuts(Cuts):
 
   def __init__(self, w: Workspace):
     super().__init__(w)
-    self.walls = Walls(w)
+    self.walls = Walls(w.organ, w.model)
     self._ranked: np.ndarray | None = None  # see `_usual`
     self._median = 0.0
 
   def draw(self, model: int, data: int):
     """Writes what is drawn of the walls of cuts."""
-    self.walls.draw(model, data)
+    if self.walls:
+      self.walls.draw(self._w.organ, self._w.motion()[0], model, data)
 
   def hide(self, model: int):
     """Hides it again."""
