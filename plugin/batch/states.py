@@ -141,7 +141,7 @@ def _shift(organ: Organ, world: int) -> np.ndarray:
 
 
 def _pull_slots(organ: Organ, world: int, own, spans, force: np.ndarray):
-  """Gives the first window the nodes of the slots, those with the greatest forces first."""
+  """Gives the window the nodes of the slots, those with the greatest forces first."""
   win = organ.declared.window
   node = organ.patch.slot_node[world].numpy()
   node = organ.body.shape.vert.numpy()[node[node >= 0]]  # vertices from here on

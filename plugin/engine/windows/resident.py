@@ -51,7 +51,7 @@ class Resident:
     self.tail, self.head = own.tail.numpy(), inbox.head.numpy()
     self.found = outbox.found.numpy()
     self.most, _ = outbox.record.shape
-    self.device = motion.device
+    self.device = wp.get_device(motion.device)
     self.live = -1
     # Recorded graphs: the guess, on the CPU; the solve with it, on the device; what is left then.
     self.foresee: Any = None

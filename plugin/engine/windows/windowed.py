@@ -1,7 +1,7 @@
-"""Windows: what MuJoCo sees of an organ are small flexes that slide over it, under the tools.
+"""Windows: what MuJoCo sees of an organ is a small flex that slides over it, under the tools.
 
 Only nodes near a tool need degrees of freedom of MuJoCo: the organ's motion lives in
-`plugin_state`, and each window's vertex bodies ("slots") stand on the nodes nearest to the tool,
+`plugin_state`, and the window's vertex bodies ("slots") stand on the nodes nearest to the tools,
 with their position, velocity and effective inertia. The window's triangles are the organ's
 triangles between them. Forces follow the same formula as on all nodes; a node outside the window
 moves by dv exactly as it would with dofs of its own and no contact.
