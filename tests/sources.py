@@ -66,8 +66,12 @@ def strings(path: pathlib.Path) -> list[str]:
 
 
 @functools.cache
-def imports() -> list[tuple[str, str, bool]]:
-  """Returns (module, what it imports, whether inside a function), of the package and of others."""
+def imports(types: bool = True) -> list[tuple[str, str, bool]]:
+  """Returns (module, what it imports, whether inside a function), of the package and of others.
+
+  Args:
+    types: whether with what type checkers alone import
+  """
   found = []
   for module, path in modules().items():
     inside = {
@@ -78,7 +82,15 @@ def imports() -> list[tuple[str, str, bool]]:
       if isinstance(within, ast.Import | ast.ImportFrom)
     }
     package = module if path.name == "__init__.py" else module.rpartition(".")[0]
+    unrun = {
+      id(within)
+      for node in nodes(path)
+      if not types and isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
+      for within in node.body
+    }
     for node in nodes(path):
+      if id(node) in unrun:
+        continue
       if isinstance(node, ast.Import):
         found += [(module, alias.name, id(node) in inside) for alias in node.names]
       elif isinstance(node, ast.ImportFrom):

@@ -45,9 +45,9 @@ def floor(module: str) -> int:
 
 
 @functools.cache
-def inner() -> list[tuple[str, str, bool]]:
-  """Returns the imports of the package's own modules."""
-  return [(a, b, hidden) for a, b, hidden in imports() if b in modules() and a != b]
+def inner(types: bool = True) -> list[tuple[str, str, bool]]:
+  """Returns the imports of the package's own modules, with those for type checkers alone or not."""
+  return [(a, b, hidden) for a, b, hidden in imports(types) if b in modules() and a != b]
 
 
 def upward() -> set[str]:
@@ -61,7 +61,7 @@ def app_imported() -> set[str]:
 def cycles() -> set[str]:
   """Returns the modules that are on a circle of imports, function by function ones too."""
   below_: dict[str, set[str]] = {}
-  for a, b, _ in inner():
+  for a, b, _ in inner(types=False):
     if a != "palpate" and b != "palpate":  # the package itself is imported with every module
       below_.setdefault(a, set()).add(b)
 

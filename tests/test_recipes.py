@@ -111,12 +111,14 @@ def follow(folder, made):
     text = re.sub("^@@$", numbers, part, flags=re.M)
     command = ["git", "apply", "--recount", "-"]
     subprocess.run(command, cwd=folder, input=text, text=True, check=True)
-  return {**os.environ, "PYTHONPATH": str(folder / "site"), "OMP_NUM_THREADS": "1"}
+  inherited = {name: value for name, value in os.environ.items() if name != "PYTEST_ADDOPTS"}
+  return {**inherited, "PYTHONPATH": str(folder / "site")}
 
 
 def run(folder, environment, words):
+  command = [sys.executable, *words]
   return subprocess.run(
-    [sys.executable, *words], cwd=folder, env=environment, capture_output=True, text=True, check=False
+    command, cwd=folder, env=environment, capture_output=True, text=True, check=False
   )
 
 

@@ -145,7 +145,7 @@ class Batch(abc.ABC):
 
   @property
   @abc.abstractmethod
-  def organs(self) -> dict[str, Tissue]:
+  def organs(self) -> Mapping[str, Tissue]:
     """The organs by name."""
 
   def organ(self, name: str) -> Tissue:

@@ -8,6 +8,7 @@ are products with sparse matrices.
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
@@ -18,6 +19,9 @@ from palpate.tissue.geometry.fill import vertex_volumes, volumes
 from palpate.tissue.order import LANES, ellpack, offset
 from palpate.tissue.types import Lump, allocate, fill, floats, ints, struct
 from scipy import sparse
+
+if TYPE_CHECKING:
+  from palpate.engine.model.declare import Declaration
 
 
 @struct
@@ -47,7 +51,7 @@ class Lumps:
     body: its tissue in all worlds, whose `lump` is filled
   """
 
-  def __init__(self, organ, body):
+  def __init__(self, organ: "Declaration", body):
     self._device, self._nelem = body.device, organ.mesh.nelem
     body.fields.lump = allocate(Lump, body.device, body.sizes | {"nlump": body.nworld})
     self.node = wp.zeros((body.nworld, body.shape.nnode), dtype=float, device=body.device)
@@ -91,7 +95,7 @@ def _around(mesh, body) -> sparse.csr_matrix:
   return sparse.csr_matrix(sparse.diags_array(1.0 / total) @ around)
 
 
-def _solid_maps(organ, body) -> dict:
+def _solid_maps(organ: "Declaration", body) -> dict:
   """Returns the matrices from factors to the moduli of tetrahedra and nodes."""
   mesh, lump, node = organ.mesh, body.fields.lump, body.shape.node.numpy()
   ntet, nlane = len(mesh.tet), LANES * body.shape.ntetslice
@@ -116,7 +120,7 @@ def _solid_maps(organ, body) -> dict:
   return out
 
 
-def _left(organ, body) -> np.ndarray:
+def _left(organ: "Declaration", body) -> np.ndarray:
   """Returns `Lump.hinge_left`."""
   out = np.zeros(body.fields.lump.hinge_left.size)
   if body.has_bending:
@@ -127,12 +131,12 @@ def _left(organ, body) -> np.ndarray:
   return out.reshape(-1, LANES)
 
 
-def _hinges(organ) -> plate.Hinges:
+def _hinges(organ: "Declaration") -> plate.Hinges:
   mesh, config = organ.mesh, organ.config
   return plate.hinges(mesh, configuration.rigidity(config, mesh.nelem), config.poisson)
 
 
-def _maps(organ, body) -> dict:
+def _maps(organ: "Declaration", body) -> dict:
   """Returns the matrices from factors to the arrays of `Lump` that a surface has."""
   nelem, shape = organ.mesh.nelem, body.shape
 

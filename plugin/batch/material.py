@@ -2,6 +2,7 @@
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 import dataclasses
+from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
@@ -14,6 +15,10 @@ from palpate.tissue.types import NUMBERS
 
 from .lumps import Lumps
 from .patch import GRADES, Patch
+
+if TYPE_CHECKING:
+  from .organs import Organ
+  from .worlds import Worlds
 
 _PLAIN = ("foundation", "bulk", "pressure", "damping", "tolerance", "iterations", "stiffness")
 # What may change: numbers of the tissue, what its moduli follow from, and what else.
@@ -41,7 +46,7 @@ class Material:
     touch: how it touches tools
   """
 
-  def __init__(self, organ, batch, touch):
+  def __init__(self, organ: "Organ", batch: "Worlds", touch):
     config, nworld = organ.config, batch.nworld
     self._organ, self.batch, self._touch = organ, batch, touch
     self._young = np.broadcast_to(config.young, (organ.declared.mesh.nelem,))

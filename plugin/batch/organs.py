@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
@@ -25,6 +26,11 @@ from .forces import base, passive
 from .material import KEYS, Material
 from .patch import launch
 from .strip_organs import Slots
+
+if TYPE_CHECKING:
+  from palpate.engine.workspace import Workspace
+
+  from .worlds import Worlds
 
 _WHAT = {"xpos": 0, "xvel": 1, "contact_force": 2}
 _STATUS = {"iterations": 0, "residual": 1}
@@ -67,7 +73,7 @@ class Organ(Tissue):
 
   beside: tuple[base.Beside, ...] = ()
 
-  def __init__(self, batch, w, place: Slots, tools: np.ndarray):
+  def __init__(self, batch: Worlds, w: Workspace, place: Slots, tools: np.ndarray):
     organ, device, nworld = w.organ, batch.device, batch.nworld
     self.name, self.nvert, self.elem = organ.name, coupling.outer(organ), organ.mesh.elem
     self.declared, self.config, self.space, self.place = organ, organ.config, w, place
@@ -139,7 +145,7 @@ class Organ(Tissue):
     return self._scheme.spreads
 
   @staticmethod
-  def bytes_of(w, device) -> float:
+  def bytes_of(w: Workspace, device) -> float:
     """Returns about how many bytes a world takes of the organ of a workspace."""
     there = dataclasses.replace(w.body, device=device)
     alone = dataclasses.replace(w.body, levels=None, plan=plan_of(there, w.organ.config))

@@ -2,6 +2,8 @@
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
+from typing import TYPE_CHECKING
+
 import mujoco
 import numpy as np
 import warp as wp
@@ -12,6 +14,9 @@ from palpate.engine.model import inertia, mjstruct
 from palpate.engine.windows import proxies
 from palpate.tissue import step
 from palpate.tissue.types import Array, Tissue, doubles, fill, floats, ints, struct, vector
+
+if TYPE_CHECKING:
+  from palpate.engine.model.declare import Declaration
 
 _BLOCK = 128  # threads, whole warps
 _ENDLESS = 1e300  # square of a distance beyond all others [m^2]
@@ -129,7 +134,9 @@ def launch(kernel, patch, nworld: int, count: int, device, arg: int = 0):
   kernel.launch(device, nworld, nthread, arg, patch, _BLOCK)
 
 
-def constants(body, organ, tools: np.ndarray, model: mujoco.MjModel, met, surface) -> dict:
+def constants(
+  body, organ: "Declaration", tools: np.ndarray, model: mujoco.MjModel, met, surface
+) -> dict:
   """Returns the fields of `Patch` that say what the organ is and which tools it meets.
 
   Args:
@@ -187,7 +194,7 @@ class Surface:
     tools: geoms that the slots follow
   """
 
-  def __init__(self, body, organ, model: mujoco.MjModel, tools: np.ndarray):
+  def __init__(self, body, organ: "Declaration", model: mujoco.MjModel, tools: np.ndarray):
     self._node, self._nnode = body.shape.node.numpy(), body.shape.nnode
     self._organ = organ
     self._reach = _skin(organ, model) + float(model.geom_margin[tools].max(initial=0.0))
@@ -244,7 +251,7 @@ class Surface:
     out["held"][at] = np.where(waits, 1.0, held)
 
 
-def _skin(organ, model) -> float:
+def _skin(organ: "Declaration", model) -> float:
   """Returns the distance from an organ's triangles within which it touches [m]."""
   flexes = organ.flexes
   return float(model.flex_radius[flexes].max() + model.flex_margin[flexes].max())

@@ -5,6 +5,8 @@ Where worlds start is in arrays of its own: at first what `qpos0` has, or any st
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import mujoco
 import mujoco_warp as mjw
 import numpy as np
@@ -15,6 +17,9 @@ from . import kernels
 from .base import on_device
 from .kernels import Start
 
+if TYPE_CHECKING:
+  from .worlds import Worlds
+
 
 class Rest:
   """Resets of the worlds of a batch.
@@ -24,7 +29,7 @@ class Rest:
     bare: the model that mujoco_warp has
   """
 
-  def __init__(self, batch, bare: mujoco.MjModel):
+  def __init__(self, batch: Worlds, bare: mujoco.MjModel):
     start = mujoco.MjData(bare)
     mujoco.mj_forward(bare, start)
     self.batch, self.mask = batch, batch.mask

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import mujoco
 import numpy as np
 import warp as wp
@@ -12,6 +14,9 @@ from palpate.tissue.order import from_slices, to_slices
 
 from . import kernels
 from .organs import Organ
+
+if TYPE_CHECKING:
+  from .worlds import Worlds
 
 _MOTION = ("disp", "vel", "last", "before")
 _PLAIN = ("act", "ctrl", "mocap_pos")
@@ -31,7 +36,7 @@ def bytes_of(bare: mujoco.MjModel, njmax: int, ncon: int) -> float:
 class Teller:
   """Writes qpos and qvel of a batch in the model's layout."""
 
-  def __init__(self, batch):
+  def __init__(self, batch: Worlds):
     def put(values):
       return wp.array(values, dtype=int, device=batch.device)
 
@@ -59,7 +64,7 @@ class Teller:
 # One world, to and from an mjData.
 
 
-def pull(batch, world: int, data: mujoco.MjData):
+def pull(batch: Worlds, world: int, data: mujoco.MjData):
   """Writes the state of a world to an mjData."""
   model, d = batch.model, batch.d
   mujoco.mj_resetData(model, data)
@@ -136,8 +141,8 @@ def _shift(organ: Organ, world: int) -> np.ndarray:
 
 
 def _pull_slots(organ: Organ, world: int, own, spans, force: np.ndarray):
-  """Gives the first window the nodes of the slots, those with the greatest forces first."""
-  win = organ.declared.windows
+  """Gives the window the nodes of the slots, those with the greatest forces first."""
+  win = organ.declared.window
   node = organ.patch.slot_node[world].numpy()
   node = organ.body.shape.vert.numpy()[node[node >= 0]]  # vertices from here on
   node = node[np.argsort(-np.linalg.norm(force[node], axis=1), kind="stable")]
@@ -147,7 +152,7 @@ def _pull_slots(organ: Organ, world: int, own, spans, force: np.ndarray):
   own[spans["slot"]], own[spans["force"]] = number, forces.ravel()
 
 
-def push(batch, world: int, data: mujoco.MjData):
+def push(batch: Worlds, world: int, data: mujoco.MjData):
   """Gives a world the state of an mjData."""
   model, d = batch.model, batch.d
   engine.sync(model, data)
@@ -176,7 +181,7 @@ def push(batch, world: int, data: mujoco.MjData):
     _push_organ(organ, world, model, data)
 
 
-def keep(batch, start, data: mujoco.MjData):
+def keep(batch: Worlds, start, data: mujoco.MjData):
   """Lets worlds start in the state of an mjData; `start` is what resets have of it."""
   d, organs = batch.d, batch.organs.values()
   for organ in organs:
@@ -230,7 +235,7 @@ def _push_organ(organ: Organ, world: int, model, data):
     for name in _MOTION:
       motion[name][:] = own[spans[name]].reshape(-1, 3)
     number = own[spans["slot"]].astype(int)
-    slot_node = np.where(number == 0, declared.windows.home, number - 1)
+    slot_node = np.where(number == 0, declared.window.home, number - 1)
     used = slot_node >= 0
     force[slot_node[used]] = own[spans["force"]].reshape(-1, 3)[used]
     heavier, calm = (float(own[spans["tail"].start + k]) for k in (TAIL.heavier, TAIL.quiet))

@@ -12,6 +12,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
@@ -21,6 +22,9 @@ from palpate.engine.contacts import TISSUE
 from palpate.engine.model import mjstruct
 
 from .contact.contacts import KINDS
+
+if TYPE_CHECKING:
+  from palpate.engine.model.declare import Declaration
 
 # Slots of an organ: all triples of more are too many.
 LEAST, MOST = 4, 48
@@ -41,7 +45,7 @@ class Slots:
   mass: float
 
 
-def tools_of(model: mujoco.MjModel, organ) -> np.ndarray:
+def tools_of(model: mujoco.MjModel, organ: Declaration) -> np.ndarray:
   """Returns the geoms that an organ's slots follow.
 
   Raises:
@@ -79,7 +83,7 @@ def tools_of(model: mujoco.MjModel, organ) -> np.ndarray:
   return found
 
 
-def slots_for(model, organ, tools: np.ndarray, nodes) -> int:
+def slots_for(model, organ: Declaration, tools: np.ndarray, nodes) -> int:
   """Returns how many slots an organ has: the nodes that its tools touch, and their neighbours.
 
   Args:
@@ -193,12 +197,12 @@ def _check_option(option):
     raise ValueError("sleep is enabled, which a batch on a GPU does not know")
 
 
-def _slot_mass(organ) -> float:
+def _slot_mass(organ: Declaration) -> float:
   """Returns the mass of a slot's body, lighter than a node whatever its world's masses [kg]."""
   return 0.1 * float(organ.mass[organ.free & (organ.mass > 0)].min())
 
 
-def _take_out(bare, bodies: dict, organ, model):
+def _take_out(bare, bodies: dict, organ: Declaration, model):
   """Deletes an organ's flexes and the bodies of its nodes or windows."""
   for number in {organ.flex, *organ.flexes}:
     name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_FLEX, int(number))
@@ -215,7 +219,7 @@ def _take_out(bare, bodies: dict, organ, model):
     bare.delete(doomed)
 
 
-def _add_slots(bare, organ, nslot: int, mass: float, model):
+def _add_slots(bare, organ: Declaration, nslot: int, mass: float, model):
   flex = organ.windows.flex if organ.windows else organ.flex
   names = [f"{organ.name}_slot_{k}" for k in range(nslot)]
   for name in names:

@@ -106,7 +106,7 @@ class Threads(Batch):
     """Counts what the windows had no room for, and resets a world that diverged."""
     data, overflow, failed = self.datas[world], self.overflow.numpy(), False
     for organ in self._organs.values():
-      overflow[world] = max(overflow[world], sum(organ.spaces[world].missed))
+      overflow[world] = max(overflow[world], sum(organ.spaces[world].report.missed))
       failed = failed or organ.handles[world].error is not None
     if failed or any(data.warning[kind].number for kind in _BAD):
       self.failures.numpy()[world] += 1

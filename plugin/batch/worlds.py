@@ -19,7 +19,7 @@ from palpate.organ import instances
 from palpate.tissue import device as devices
 
 from . import kernels, states, strip_organs
-from .base import Batch, Tissue, refuse_crowd
+from .base import Batch, refuse_crowd
 from .contact import contacts, convex
 from .cutting import blades, tears
 from .forces import base, passive
@@ -296,7 +296,7 @@ class Worlds(Batch):
     states.push(self, world, data)
 
   @property
-  def organs(self) -> dict[str, Tissue]:
+  def organs(self) -> dict[str, Organ]:
     """The organs by name."""
     return dict(self._organs)
 

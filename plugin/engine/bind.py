@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
@@ -13,8 +14,11 @@ from . import contacts, coupling, graphs, nodal, penetration
 from .model import declare, mjstruct
 from .windows import declare_windows, nodes, proxies, windowed
 
+if TYPE_CHECKING:
+  from .workspace import Workspace
 
-def bind(w, model: int):
+
+def bind(w: Workspace, model: int):
   """Points the graphs at the arrays of `model` and of the workspace's mjData and records them."""
   m = mjstruct.Model.from_address(model)
   device, cpu = w.body.device, wp.get_device("cpu")
@@ -68,20 +72,20 @@ def bind(w, model: int):
       w.graphs.resident.begin_graph = ahead[0][1]
       w.graphs.resident.rest = graphs.record_all((near, does.look_ahead))
     if w.turn is not None:
-      w.turn.bind(model, w.organ.windows)
+      w.turn.bind(model, w.organ.window)
   _watch(w, model)
 
 
 # Phases of a coupling, with what acts on the organ beside it.
 
 
-def _bind_more(w, model: int):
+def _bind_more(w: Workspace, model: int):
   for each in w.beside:
     each.load()
     each.bind(model)
 
 
-def _enter(w, does):
+def _enter(w: Workspace, does):
   does.enter()
   if w.hold:
     w.hold.clear()
@@ -89,13 +93,13 @@ def _enter(w, does):
     each.enter()
 
 
-def _scatter(w, does):
+def _scatter(w: Workspace, does):
   does.scatter()
   for each in w.beside:
     each.act()
 
 
-def _advance(w, does, ends: bool):
+def _advance(w: Workspace, does, ends: bool):
   for each in w.beside:
     each.end()
   if ends:
@@ -103,7 +107,7 @@ def _advance(w, does, ends: bool):
   does.advance()
 
 
-def _watch(w, model: int):
+def _watch(w: Workspace, model: int):
   """Notes what of a model a step looks at, and what it was."""
   m = mjstruct.Model.from_address(model)
   w.model, w.seen.identity = model, mjstruct.Identity(model)
@@ -114,7 +118,7 @@ def _watch(w, model: int):
   w.seen.static = [(view, view.tobytes()) for view in declare.static_places(m, w.organ)]
 
 
-def _before(w, model: int):
+def _before(w: Workspace, model: int):
   """Returns what launches a step's work before the solve."""
   touched = _touched(w, model)
   m = mjstruct.Model.from_address(model)
@@ -129,7 +133,7 @@ def _before(w, model: int):
   return launch
 
 
-def _touched(w, model: int) -> contacts.Weights:
+def _touched(w: Workspace, model: int) -> contacts.Weights:
   """Returns what contacts with the organs of the model get weights by.
 
   With all of them, since one that looks for contacts again has those of the others found again.
@@ -147,7 +151,7 @@ _IN = ("step", "disp", "vel", "mass", "force_ext", "dvel_warm")
 _OUT = ("dvel", "status")
 
 
-def _cross(w, fields: tuple[str, ...], to_device: bool):
+def _cross(w: Workspace, fields: tuple[str, ...], to_device: bool):
   theirs = coupling.on_body(w.body)
   for field in fields:
     there, here = theirs[field], w.host[field]

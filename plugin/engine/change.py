@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from palpate.tissue import config as configuration
 from palpate.tissue import reading, shape
@@ -18,8 +18,11 @@ from .forces.attachments import Group
 from .model import mjstruct
 from .windows import windowed
 
+if TYPE_CHECKING:
+  from .workspace import Workspace
 
-def configure(w, model: int, texts: dict[str, str]):
+
+def configure(w: Workspace, model: int, texts: dict[str, str]):
   """Changes configuration keys while running.
 
   Raises:
@@ -31,7 +34,7 @@ def configure(w, model: int, texts: dict[str, str]):
   w.report.chosen = True
 
 
-def copy(w, model: int, other, twin):
+def copy(w: Workspace, model: int, other, twin):
   """Gives a copy of an mjData the configuration of the original, unless it was given one itself.
 
   Args:
@@ -57,7 +60,9 @@ def copy(w, model: int, other, twin):
     tie(w, model, groups)
 
 
-def attach(w, model: int, vertices, to, stiffness: float | None) -> list[tuple[Any, Group]]:
+def attach(
+  w: Workspace, model: int, vertices, to, stiffness: float | None
+) -> list[tuple[Any, Group]]:
   """Ties vertices to a body, or to another organ's vertices nearest to them, where they are.
 
   Args:
@@ -92,12 +97,12 @@ def attach(w, model: int, vertices, to, stiffness: float | None) -> list[tuple[A
   return list(zip(spaces, made, strict=True))
 
 
-def detach(w, model: int, groups: list[Group]):
+def detach(w: Workspace, model: int, groups: list[Group]):
   """Takes ties away."""
   tie(w, model, [group for group in w.ties.groups if group not in groups])
 
 
-def tie(w, model: int, groups: list[Group]):
+def tie(w: Workspace, model: int, groups: list[Group]):
   """Makes these the ties of an organ."""
   with graphs.lock:
     if w.ties.put(groups):
@@ -106,7 +111,7 @@ def tie(w, model: int, groups: list[Group]):
     windowed.wake(w)
 
 
-def bond(w, model: int, to, name: str, law, near: float | None, vertices):
+def bond(w: Workspace, model: int, to, name: str, law, near: float | None, vertices):
   """Bonds an organ to a body or another organ, where its vertices are.
 
   Args:
@@ -142,12 +147,12 @@ def bond(w, model: int, to, name: str, law, near: float | None, vertices):
   _put(w, group)
 
 
-def _find_bodies(w):
+def _find_bodies(w: Workspace):
   """Brings up to date where bodies are: before a first step, or after one, they are not there."""
   mjstruct.library().mj_kinematics(w.model, w.data)
 
 
-def _put(w, group: cohesive_bonds.Group):
+def _put(w: Workspace, group: cohesive_bonds.Group):
   w.bonds.put(group)
   for each in [w] if group.other is None else [w, group.other]:
     with graphs.lock:
@@ -156,7 +161,7 @@ def _put(w, group: cohesive_bonds.Group):
       windowed.wake(each)
 
 
-def _change(w, model: int, config: Config):
+def _change(w: Workspace, model: int, config: Config):
   workspace.attach(w, model)
   before, w.config = w.config, config
   contacts.tell(w, model)

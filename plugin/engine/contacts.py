@@ -8,6 +8,7 @@ flicker where a tool presses. MuJoCo 4.0 has it right. Both part what slides.
 # pyright: reportInvalidTypeForm=false
 
 import functools
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
@@ -20,6 +21,10 @@ from palpate.tissue.types import Array, doubles, ints, struct
 from . import coupling, safe_calls
 from .layout import FLAG, Numbers
 from .model import mjstruct
+
+if TYPE_CHECKING:
+  from .model.declare import Declaration
+  from .workspace import Workspace
 
 _DATA = (
   *("contact", "ncon", "nefc", "nisland", "efc_type", "efc_J", "efc_J_rownnz", "efc_J_rowadr"),
@@ -158,7 +163,7 @@ def are_wrong() -> bool:
   return not np.allclose(found, [1 - at[0] - at[1], at[0], at[1]], atol=1e-3)
 
 
-def make(model: int, data: int, flexes, flags: np.ndarray | None = None) -> Weights:
+def make(model: int, data: int, flexes, flags: np.ndarray | memoryview | None = None) -> Weights:
   """Returns `Weights` of an mjModel and mjData.
 
   Args:
@@ -178,7 +183,7 @@ def make(model: int, data: int, flexes, flags: np.ndarray | None = None) -> Weig
   out.memory = coupling.wrap(data, mjstruct.size(mjstruct.Data) // 8, wp.uint64)
   out.mine = wp.array(mine, dtype=int, device="cpu")
   flags = np.zeros(len(FLAG), np.int32) if flags is None else flags
-  out.flags = wp.array(flags, dtype=int, device="cpu", copy=False)
+  out.flags = wp.array(np.asarray(flags), dtype=int, device="cpu", copy=False)
   return out
 
 
@@ -192,7 +197,7 @@ def _tissues(model: int, data: int) -> tuple[np.ndarray, np.ndarray]:
   return found
 
 
-def tell(w, model: int):
+def tell(w: "Workspace", model: int):
   """Tells contacts with an organ what its tissue is like, and where its contact forces are."""
   m, organ = mjstruct.Model.from_address(model), w.organ
   found, adr = _tissues(model, w.data)
@@ -214,7 +219,7 @@ def forget(data: int):
   _tissue.pop(data, None)
 
 
-def tissue_of(m, organ, config: Config | None = None) -> np.ndarray:
+def tissue_of(m, organ: "Declaration", config: Config | None = None) -> np.ndarray:
   """Returns TISSUE of an organ, as compiled or with another configuration.
 
   Its compliance is that of an elastic half space, a membrane with bending (Winkler's plate under a

@@ -10,7 +10,7 @@ then is a guess of what a tool meets, and follows the organ's answers.
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
@@ -23,6 +23,9 @@ from palpate.tissue.types import DIMS, doubles, floats, ints, scalar, struct, ve
 from . import layout
 from .layout import NodalState, WindowState
 from .model import mjstruct
+
+if TYPE_CHECKING:
+  from .model.declare import Declaration
 
 _HUGE = 1e6  # more than any displacement, velocity or force of an organ [m, m/s, N]
 
@@ -209,12 +212,12 @@ def mass_addresses(m, dofs: np.ndarray) -> np.ndarray:
   return rowadr + mjstruct.view(m.M_rownnz, m.nv, np.int32)[dofs] - 1
 
 
-def outer(organ) -> int:
+def outer(organ: "Declaration") -> int:
   """Returns how many vertices there are on an organ's surface, or may be by cuts."""
   return organ.mesh.nskin
 
 
-def sizes(organ) -> dict[str, int]:
+def sizes(organ: "Declaration") -> dict[str, int]:
   """Returns what the blocks of an organ's plugin state need."""
   relaxes = organ.config.relax_share > 0
   out = {"ncreep": int(organ.free.sum()) if relaxes else 0}
@@ -243,12 +246,12 @@ def cut_sizes(nelem: int, nvert: int, spare: int, solid: bool) -> dict[str, int]
   return {"ncorner": nelem + walls, "nplace": nvert, "nspare": spare, "ncuts": 1}
 
 
-def spans(organ) -> dict[str, slice]:
+def spans(organ: "Declaration") -> dict[str, slice]:
   """Returns where the blocks of an organ's plugin state lie."""
   return layout.spans(WindowState if organ.windows else NodalState, sizes(organ))
 
 
-def check_state(organ, state: np.ndarray):
+def check_state(organ: "Declaration", state: np.ndarray):
   """Makes sure that a plugin state that was set from outside is one of this organ.
 
   Raises:

@@ -2,6 +2,8 @@
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
+from typing import TYPE_CHECKING
+
 import numpy as np
 import warp as wp
 from palpate.tissue import step
@@ -11,6 +13,9 @@ from . import coupling, layout
 from .coupling import Crossing, Mujoco
 from .layout import FLAG, NodalState
 from .model import inertia, mjstruct
+
+if TYPE_CHECKING:
+  from .workspace import Workspace
 
 
 @struct
@@ -44,18 +49,12 @@ gather, scatter, push, remember = coupling.kernels(
 )
 
 
-def state_size(nfree: int, ninner: int = 0, **more: int) -> int:
-  """Returns the length of the plugin state of `nfree` degrees of freedom; see `coupling.sizes`."""
-  sizes = coupling.nodal_sizes(nfree, ninner) | {"ncreep": 0, "nbond": 0} | layout.NO_CUTS
-  return layout.size(NodalState, sizes | more)
-
-
 class Phases(coupling.Phases):
   """Nodal coupling of a workspace's organ."""
 
   side = "cpu"
 
-  def __init__(self, w, model: int, instance: int):
+  def __init__(self, w: "Workspace", model: int, instance: int):
     m, organ, s = mjstruct.Model.from_address(model), w.organ, w.body.shape
     vert = s.vert.numpy()
     dofadr = _in_node_order(organ.dofadr, vert)

@@ -7,6 +7,8 @@ radius in a step, or is pressed through, comes out inside.
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
 
+from typing import TYPE_CHECKING
+
 import mujoco
 import numpy as np
 import warp as wp
@@ -16,6 +18,10 @@ from palpate.tissue.types import doubles, ints, struct
 from . import coupling
 from .layout import FLAG
 from .model import flexes, mjstruct
+
+if TYPE_CHECKING:
+  from .model.declare import Declaration
+  from .workspace import Workspace
 
 _EVERY = 503  # steps between looks at what is inside; prime: not always where others do more too
 _OFTEN = 5  # steps between looks along the way of a fast tool
@@ -82,7 +88,7 @@ def _right_of(point: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
   return meets & (x < x0 + (y - y0) * (x1 - x0) / np.where(meets, y1 - y0, 1.0))
 
 
-def tools(m, organ) -> np.ndarray:
+def tools(m, organ: "Declaration") -> np.ndarray:
   """Returns the geoms that move and meet an organ; none where it is open and has no inside."""
   if not organ.mesh.closed:
     return np.zeros(0, int)
@@ -121,7 +127,7 @@ class Tools:
     reach: of their points from their centres [m]
   """
 
-  def __init__(self, m, organ, geoms: np.ndarray):
+  def __init__(self, m, organ: "Declaration", geoms: np.ndarray):
     """Takes the geoms of an mjModel."""
     self.geoms, self.organ, self._ngeom = geoms, organ, m.ngeom
     found = points(m, geoms)
@@ -199,7 +205,7 @@ def _reach(found: list[np.ndarray]) -> np.ndarray:
   return np.array([np.linalg.norm(each, axis=1).max() for each in found])
 
 
-def speeds(m, model: int, data: int, organ, flags: np.ndarray) -> Speeds:
+def speeds(m, model: int, data: int, organ: "Declaration", flags: np.ndarray) -> Speeds:
   """Returns `Speeds` of the tools of an organ."""
   geoms = tools(m, organ)
   out = coupling.mujoco_arrays(model, data, Speeds)
@@ -232,7 +238,7 @@ class Watch:
     self._steps += 1
     return self._steps % (_OFTEN if fast else _EVERY) == 1
 
-  def look(self, w) -> list[int]:
+  def look(self, w: "Workspace") -> list[int]:
     """Returns the geoms that have come through a workspace's organ since the last look.
 
     Each once; not those that were inside when this began to look.
@@ -254,7 +260,7 @@ class Watch:
     self._said.update(new)
     return new
 
-  def stuck(self, w) -> int:
+  def stuck(self, w: "Workspace") -> int:
     """Returns how many tetrahedra are inside out as at the last look; 0 once that is said."""
     mesh, before = w.organ.mesh, self._inverted
     if not len(mesh.tet) or self._steps % _EVERY != 1 or (before is not None and not before.size):
@@ -272,7 +278,7 @@ def _inside_out(x: np.ndarray, tet: np.ndarray) -> np.ndarray:
   return ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx) <= 0
 
 
-def _displacement(m, d, w) -> np.ndarray:
+def _displacement(m, d, w: "Workspace") -> np.ndarray:
   """Returns the displacement of the vertices from rest, in the organ's frame [m], (nvert, 3)."""
   if w.organ.windows:
     return w.boxes["own"].motion.disp.numpy()

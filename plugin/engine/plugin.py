@@ -199,7 +199,7 @@ def _end(w: Workspace):
   w.step()
   if w.cuts:
     w.cuts.hide(w.model)
-  if (w.cuts.tear and w.cuts.tear.act()) or (w.cutters and w.cutters.open()):
+  if (w.config.tear > 0 and w.cuts.tear()) or (w.cutters and w.cutters.open()):
     workspace.place(w, w.model)
   nodes, triangles = w.report.flags[FLAG.missed_nodes], w.report.flags[FLAG.missed_elements]
   if nodes > w.report.missed[0] or triangles > w.report.missed[1]:

@@ -36,8 +36,8 @@ _RK4 = int(mujoco.mjtIntegrator.mjINT_RK4)
 _ASTRAY = 1e-9  # distance of a slot from its node that rounding does not explain [m]
 
 
-# What acts on an organ beside its tissue, in that order: attributes of a workspace. A batch reads it
-# too, and on a GPU refuses what it has not.
+# What acts on an organ beside its tissue, in that order: attributes of a workspace. A batch reads
+# it too, and refuses on a GPU what it has not.
 FORCES: dict[str, type[Beside]] = {
   "ties": Ties,
   "bonds": Bonds,
@@ -255,7 +255,7 @@ class Workspace:
       self.ties.aim()
     if self.graphs.resident:
       self.graphs.resident.send()
-      graphs.launch_all(self.graphs.resident.left_to_do())
+      graphs.launch_all(self.graphs.resident.left_to_do(self.graphs.solve))
       self.graphs.resident.look()
       wp.capture_launch(self.graphs.after)
     else:

@@ -8,6 +8,8 @@ what the gap adds follows from those rows.
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
+from typing import TYPE_CHECKING
+
 import mujoco
 import warp as wp
 from palpate.engine import contacts
@@ -16,6 +18,11 @@ from palpate.engine.model import mjstruct
 from palpate.tissue.types import Array, floats, ints, struct
 
 from ..private import vec5
+
+if TYPE_CHECKING:
+  from palpate.engine.model.declare import Declaration
+
+  from ..worlds import Worlds
 
 
 @struct
@@ -126,7 +133,7 @@ def press(p: Pressed):
   p.force[world, k] = total
 
 
-def make(batch, model: mujoco.MjModel, organ, touch):
+def make(batch: "Worlds", model: mujoco.MjModel, organ: "Declaration", touch):
   """Returns the contacts of an organ.
 
   Args:

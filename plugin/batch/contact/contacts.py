@@ -8,6 +8,7 @@ depend on who comes first.
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
 import functools
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
@@ -24,6 +25,9 @@ from ..patch import Patch
 from ..private import ContactType, vec5
 from . import convex, cylinder
 from .convex import Convex
+
+if TYPE_CHECKING:
+  from palpate.engine.model.declare import Declaration
 
 _GEOM = mujoco.mjtGeom
 # Contacts of a triangle with a tool, at most, as mujoco_warp finds them.
@@ -373,7 +377,7 @@ def most_of(model: mujoco.MjModel, tools: np.ndarray, nslot: int) -> int:
   return nslot * (4 if each > _EACH[int(_GEOM.mjGEOM_CAPSULE)] else 3 if len(tools) > _FEW else 2)
 
 
-def make(model: mujoco.MjModel, organ, tools: np.ndarray, place, patch, data):
+def make(model: mujoco.MjModel, organ: "Declaration", tools: np.ndarray, place, patch, data):
   """Returns how an organ touches its tools.
 
   Args:

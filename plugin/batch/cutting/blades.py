@@ -6,7 +6,7 @@ ended, and lets the meshes of those worlds come apart; see `engine.cutting.cutte
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
@@ -20,6 +20,9 @@ from palpate.tissue.types import allocate, doubles, fill, floats, ints, struct
 
 from ..forces import base
 from .fracture import Cutters
+
+if TYPE_CHECKING:
+  from ..organs import Organ
 
 _ROWS = "state", "next", "force", "point", "held", "share", "hold", "due", "law"
 _WorldBlades = base.in_worlds(
@@ -89,7 +92,7 @@ class Blades(base.Opens):
     organ: the organ, which has room for cuts
   """
 
-  def __init__(self, organ):
+  def __init__(self, organ: "Organ"):
     super().__init__(organ)
     space, body, n = organ.space, organ.body, len(organ.config.cutters)
     mesh, scheme = organ.declared.mesh, SCHEMES[organ.config.integrator]
@@ -181,6 +184,7 @@ class Blades(base.Opens):
     if not worlds:
       return
     cuts = self._organ.topology
+    assert cuts is not None
     law, edge = self.fields.law.numpy(), self._organ.declared.mesh.edge_length
     cuts.follow()
     motion = cuts.motion(worlds)
@@ -198,6 +202,7 @@ class Blades(base.Opens):
   def _follow(self, current, state: np.ndarray, due: np.ndarray, given, worlds: list, motion):
     """Lets paths of worlds follow a current; `given`: energy that it has brought [J], (nworld,)."""
     cuts, d = self._organ.topology, self._organ.batch.d
+    assert cuts is not None
     place, axes = (array.numpy()[:, current.geom] for array in (d.geom_xpos, d.geom_xmat))
     for k, world in enumerate(worlds):
       row, mesh = state[world], cuts.mesh_of(world)
@@ -210,6 +215,7 @@ class Blades(base.Opens):
 
   def _open(self, row: np.ndarray, ended: bool, given: float, motion, k: int, world: int):
     cuts = self._organ.topology
+    assert cuts is not None
 
     def cut(path: np.ndarray) -> tuple[Any, Mesh]:
       found = cuts.find(world, path, motion, k, given, True)
@@ -232,6 +238,6 @@ def _by_nodes(fields: Any, body) -> Any:
   return fields
 
 
-def make(organ) -> tuple[Blades, ...]:
+def make(organ: "Organ") -> tuple[Blades, ...]:
   """Returns what cuts an organ of `Worlds`, if anything does."""
   return (Blades(organ),) if organ.topology and organ.space.cutters else ()

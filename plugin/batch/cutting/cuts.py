@@ -7,6 +7,7 @@ and what has changed goes there; graphs go on as they were recorded.
 from __future__ import annotations
 
 import dataclasses
+from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
@@ -28,6 +29,9 @@ from palpate.tissue.types import NUMBERS, fill
 
 from .. import kernels
 from ..patch import Surface
+
+if TYPE_CHECKING:
+  from ..organs import Organ
 
 _OWN = ("rest", "elem", "touch", "source", "share", "held")  # fields of `Patch`
 _STATE = ("corner", "place", "weight", "source", "stamp")  # blocks of the plugin state
@@ -73,7 +77,7 @@ class Cuts:
     surface: makes what of these follows from a mesh
   """
 
-  def __init__(self, organ, values: dict, surface: Surface):
+  def __init__(self, organ: Organ, values: dict, surface: Surface):
     declared, body = organ.declared, organ.body
     self._organ, self._surface = organ, surface
     self.whole: Mesh = declared.mesh

@@ -2,6 +2,7 @@
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 import contextlib
+from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
@@ -9,6 +10,9 @@ from palpate.engine.cutting import tear
 
 from ..forces import base
 from ..patch import Patch
+
+if TYPE_CHECKING:
+  from ..organs import Organ
 
 # In what a triangle is beyond the limit: shares of it, and the most that are told apart.
 _FINE, _MOST = wp.constant(wp.float64(2.0**26)), wp.constant(wp.float64(1e4))
@@ -63,13 +67,14 @@ class Tears(base.Opens):
     organ: the organ, which has room for cuts
   """
 
-  def __init__(self, organ):
+  def __init__(self, organ: "Organ"):
     super().__init__(organ)
     self._found = self._zeros(self._nworld, dtype=wp.int64)
 
   def open(self, steps: int):
     """Tears each world at its most stretched triangle, where that is too far."""
     organ, cuts, nelem = self._organ, self._organ.topology, len(self._organ.elem)
+    assert cuts is not None
     limit = (1 + organ.config.tear) ** 2
     self._found.zero_()
     inputs = [organ.patch, limit, self._found]
@@ -88,6 +93,6 @@ class Tears(base.Opens):
     cuts.finish(worlds, motion)
 
 
-def make(organ) -> tuple[Tears, ...]:
+def make(organ: "Organ") -> tuple[Tears, ...]:
   """Returns what tears an organ of `Worlds`, if it can tear."""
   return (Tears(organ),) if organ.config.tear else ()

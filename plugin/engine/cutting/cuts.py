@@ -9,7 +9,7 @@ stamp too, and a number that each writing changes, so that several mjData of one
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +27,10 @@ from ..bind import bind
 from ..model import flexes, mjstruct
 from ..windows import model_lock
 from .tear import Tear
+
+if TYPE_CHECKING:
+  from ..model.declare import Declaration
+  from ..workspace import Workspace
 
 _UNCUT = 1.0  # stands for the stamp of triangles before the first cut
 FOREIGN = "plugin_state has cuts that are not of this organ; set a state that was saved from it"
@@ -79,13 +83,13 @@ class Cuts:
     w: the workspace, whose body has a state but no graphs yet
   """
 
-  def __init__(self, w):
+  def __init__(self, w: Workspace):
     self._w = w
     self.whole: Mesh = w.organ.mesh
     self.stamp = 0.0
     self._fresh = False
     self.reports: list[Report] = []
-    self.tear = Tear(w)
+    self._tear = Tear()
     if not self:
       return
     bodies.unshare(w.body)
@@ -245,6 +249,18 @@ class Cuts:
 
   # Cutting.
 
+  def tear(self) -> bool:
+    """Cuts the organ at its most stretched triangle, if that is too far; returns whether."""
+    organ, most = self._w.organ, self._w.config.tear
+    if self.full:
+      return False
+    x = organ.mesh.rest + self._w.motion()[0]
+    line = self._tear.line(organ.mesh, x, most, self.finder)
+    try:
+      return line is not None and self.cut(organ.origin + line @ organ.frame.T).nodes > 0
+    except ValueError:  # pinned tissue around it
+      return False
+
   def cut(self, points: npt.ArrayLike, given: float = 0.0, depth=None, direction=None) -> Report:
     """Cuts the organ along points in the world, (n, 3) [m]; see `Organ.cut`, and `Knife.cut`."""
     return self._end(self.find(points, given, depth, direction))
@@ -336,7 +352,7 @@ class Cuts:
     return pieces(self.mesh, self._w.organ.mass, self._w.config.thickness)
 
 
-def report(found: cutting.Cut, before: Mesh, organ, thickness: float) -> Report:
+def report(found: cutting.Cut, before: Mesh, organ: Declaration, thickness: float) -> Report:
   """Returns what a cut of a mesh has done; `organ` is its declaration."""
   path = [organ.origin + line @ organ.frame.T for line in found.path]
   nodes = found.mesh.nouter - before.nouter

@@ -8,7 +8,7 @@ edges at a time, since the mesh cannot do so by less.
 # pyright: reportInvalidTypeForm=false
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
@@ -26,6 +26,10 @@ from ..model import flexes, mjstruct
 from . import solid_paths
 from .cuts import Report
 from .electrosurgery import Current
+
+if TYPE_CHECKING:
+  from ..model.declare import Declaration
+  from ..workspace import Workspace
 
 _SLACK = 0.1  # edges of the mesh by which a blade's spring is stretched where it cuts
 _MORE = 0.5  # edges after which what could not come apart is tried again
@@ -113,7 +117,7 @@ class Cutters(Beside):
 
   ENTER, ACT, END = _enter, _act, _keep
 
-  def __init__(self, w):
+  def __init__(self, w: "Workspace"):
     super().__init__(w)
     self.names: list[tuple[str, ...]] = []
     self._arrays: dict[str, np.ndarray] = {}
@@ -328,7 +332,7 @@ def open_path(
   row: np.ndarray,
   mesh: Mesh,
   ended: bool,
-  organ,
+  organ: "Declaration",
   finder: Finder,
   cut: Callable[[np.ndarray], tuple[Report, Mesh]],
 ) -> tuple[Report | None, str]:
@@ -383,7 +387,7 @@ def _name(m, geom: int) -> str:
   return mjstruct.name_of(m, m.name_geomadr, geom)
 
 
-def _find_actuator(w, m, name: str) -> int:
+def _find_actuator(w: "Workspace", m, name: str) -> int:
   names = [mjstruct.name_of(m, m.name_actuatoradr, a) for a in range(m.nu)]
   found = flexes.resolve(name, w.organ.name, names)
   if found is None:
@@ -393,7 +397,7 @@ def _find_actuator(w, m, name: str) -> int:
   return names.index(found)
 
 
-def _find(w, m, name: str, current: bool) -> int:
+def _find(w: "Workspace", m, name: str, current: bool) -> int:
   names = [_name(m, g) for g in range(m.ngeom)]
   found = flexes.resolve(name, w.organ.name, names)
   if found is None:
@@ -415,7 +419,7 @@ def _find(w, m, name: str, current: bool) -> int:
   return geom
 
 
-def _shape(w, m, geom: int) -> tuple[int, float, float]:
+def _shape(w: "Workspace", m, geom: int) -> tuple[int, float, float]:
   """Returns the axis of a geom along which its edge is, half its length and its width [m]."""
   kind = int(mjstruct.view(m.geom_type, m.ngeom, np.int32)[geom])
   size = mjstruct.view(m.geom_size, (m.ngeom, 3))[geom]

@@ -8,6 +8,8 @@ grows by power / (energy * thickness) a second, and bonds near it lose their hol
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from palpate.tissue.cutting import path as paths
 from palpate.tissue.cutting.surface import WorkingCopy
@@ -16,6 +18,9 @@ from palpate.tissue.geometry.mesh import Mesh
 from ..forces.attachments import motion
 from ..layout import BLADE, BOND
 from ..model import mjstruct
+
+if TYPE_CHECKING:
+  from ..workspace import Workspace
 
 _SPARK = 0.001  # how far from its surface, in air and tissue, a current acts [m]
 
@@ -31,7 +36,9 @@ class Current:
     shape: axis along which it is long, half that length and its width [m]
   """
 
-  def __init__(self, w, geom: int, actuator: int, energy: float, shape: tuple[int, float, float]):
+  def __init__(
+    self, w: Workspace, geom: int, actuator: int, energy: float, shape: tuple[int, float, float]
+  ):
     self._w, self.geom, self.actuator = w, geom, actuator
     self._finder = w.cuts.finder if w.cuts else paths.Finder(WorkingCopy(w.organ.mesh))
     self._energy, (self._axis, self._half, width) = energy, shape

@@ -7,7 +7,7 @@ have made a corner of a tetrahedron that it has: the rest follows, see `faces.re
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from palpate.tissue.cutting import solid_cut
@@ -25,8 +25,11 @@ from . import cuts
 from .cuts import Cuts
 from .walls import Walls
 
+if TYPE_CHECKING:
+  from ..workspace import Workspace
 
-def cuts_of(w) -> Cuts:
+
+def cuts_of(w: Workspace) -> Cuts:
   """Returns what cuts a workspace's organ."""
   return (SolidCuts if len(w.organ.mesh.tet) else Cuts)(w)
 
@@ -34,15 +37,16 @@ def cuts_of(w) -> Cuts:
 class SolidCuts(Cuts):
   """The mesh of a workspace's solid; false where there is no room for cuts."""
 
-  def __init__(self, w):
+  def __init__(self, w: Workspace):
     super().__init__(w)
-    self.walls = Walls(w)
+    self.walls = Walls(w.organ, w.model)
     self._ranked: np.ndarray | None = None  # see `_usual`
     self._median = 0.0
 
   def draw(self, model: int, data: int):
     """Writes what is drawn of the walls of cuts."""
-    self.walls.draw(model, data)
+    if self.walls:
+      self.walls.draw(self._w.organ, self._w.motion()[0], model, data)
 
   def hide(self, model: int):
     """Hides it again."""

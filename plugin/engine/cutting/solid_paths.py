@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from palpate.tissue.geometry.mesh import cross, lengths
 
 from ..layout import BLADE, TRAIL
+
+if TYPE_CHECKING:
+  from ..model.declare import Declaration
 
 PIERCED = 0.001  # how deep a blade is in a solid before it cuts along it [m]
 # Edges of a path that are cut again with what follows, since the end of a cut is not even, and that
@@ -60,7 +65,9 @@ def open_path(row: np.ndarray, edge: float, ended: bool, finder, cut):
   return report, why
 
 
-def direction(organ, disp: np.ndarray, along: np.ndarray | None, elem: np.ndarray) -> np.ndarray:
+def direction(
+  organ: Declaration, disp: np.ndarray, along: np.ndarray | None, elem: np.ndarray
+) -> np.ndarray:
   """Returns the unit vector along which a blade cuts into the tissue, in the world.
 
   Args:

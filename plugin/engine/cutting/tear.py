@@ -13,35 +13,26 @@ _NEAR = 1.5  # edges from the end of a cut from which it goes on
 
 
 class Tear:
-  """Looks after each step whether a workspace's organ tears; false where it cannot.
+  """Finds where a surface tears."""
 
-  Args:
-    w: the workspace
-  """
-
-  def __init__(self, w):
-    self._w = w
+  def __init__(self):
     self._mesh: Any = None
     self._rest: tuple = ()
 
-  def __bool__(self) -> bool:
-    return self._w.config.tear > 0
+  def line(self, mesh: Mesh, x: np.ndarray, most: float, finder: Finder) -> np.ndarray | None:
+    """Returns the path on which the most stretched triangle tears, None where that holds.
 
-  def act(self) -> bool:
-    """Tears the organ at its most stretched triangle, if that is too far; returns whether."""
-    w, mesh = self._w, self._w.organ.mesh
-    x = mesh.rest + w.motion()[0]
+    Args:
+      mesh: the surface
+      x: where its vertices are [m]  (nvert, 3)
+      most: the strain that it bears
+      finder: of its surfaces
+    """
     if mesh is not self._mesh:
       self._mesh, self._rest = mesh, _metric(mesh.rest[mesh.elem])
     stretch = _squares(self._rest, _metric(x[mesh.elem]))
     worst = int(np.argmax(stretch))
-    if not stretch[worst] > (1 + w.config.tear) ** 2 or self._w.cuts.full:
-      return False
-    line, organ = line_of(mesh, x, worst, w.cuts.finder), w.organ
-    try:
-      return w.cuts.cut(organ.origin + line @ organ.frame.T).nodes > 0
-    except ValueError:  # pinned tissue around it
-      return False
+    return line_of(mesh, x, worst, finder) if stretch[worst] > (1 + most) ** 2 else None
 
 
 def line_of(mesh: Mesh, x: np.ndarray, worst: int, finder: Finder) -> np.ndarray:

@@ -6,30 +6,36 @@ written when MuJoCo draws. Between pictures it is hidden, so that a step spends 
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from palpate.tissue.geometry import mesh as topology
 
 from ..model import flexes, mjstruct
 
+if TYPE_CHECKING:
+  from ..model.declare import Declaration
+
 _COUNTS = ("flex_vertnum", "flex_elemnum", "flex_shellnum", "flex_bvhnum", "flex_bvhadr")
 
 
 class Walls:
-  """What draws the walls of a workspace's solid; false where nothing does.
+  """What draws the walls of a solid; false where nothing does.
 
   Args:
-    w: the workspace
+    organ: the solid
+    model: address of the mjModel
 
   Raises:
     ValueError: the configuration names no flex, or one without room.
   """
 
-  def __init__(self, w):
-    self._w, name = w, w.organ.config.walls
+  def __init__(self, organ: Declaration, model: int):
+    name, self._nskin = organ.config.walls, organ.mesh.nskin
     self._flex, self._shown = -1, True
     if not name:
       return
-    m, organ = mjstruct.Model.from_address(w.model), w.organ
+    m = mjstruct.Model.from_address(model)
     names = [flexes.name(m, f) for f in range(m.nflex)]
     found = flexes.resolve(name, organ.name, names)
     if found is None:
@@ -53,17 +59,14 @@ class Walls:
 
   def _show(self, m, shown: bool):
     room = len(flexes.element_data(m, self._flex))
-    counts = (self._w.organ.mesh.nskin, room, 0) if shown else (0, 0, room)
+    counts = (self._nskin, room, 0) if shown else (0, 0, room)
     for name, count in zip(_COUNTS, (*counts, 0, -1), strict=True):
       mjstruct.view(getattr(m, name), m.nflex, np.int32)[self._flex] = count
     self._shown = shown
 
-  def draw(self, model: int, data: int):
-    """Writes the walls where renderers read them."""
-    if not self:
-      return
+  def draw(self, organ: Declaration, disp: np.ndarray, model: int, data: int):
+    """Writes the walls, of vertices displaced by `disp` [m], where renderers read them."""
     m, d = mjstruct.Model.from_address(model), mjstruct.Data.from_address(data)
-    organ = self._w.organ
     mesh, n = organ.mesh, organ.mesh.nskin
     elem = flexes.element_data(m, self._flex)
     wall = mesh.elem[mesh.whole.nelem :][: len(elem)]
@@ -71,7 +74,7 @@ class Walls:
     self._show(m, True)
     start = int(mjstruct.view(m.flex_vertadr, m.nflex, np.int32)[self._flex])
     out = mjstruct.view(d.flexvert_xpos, (m.nflexvert, 3))[start : start + n]
-    x = (mesh.rest + self._w.motion()[0])[:n]
+    x = (mesh.rest + disp)[:n]
     # The skin is drawn its flex's radius outside: so is the mouth of a cut.
     radius = mjstruct.view(m.flex_radius, m.nflex)[organ.flex]
     x += radius * topology.vertex_normals(x, mesh.elem[: mesh.whole.nelem])

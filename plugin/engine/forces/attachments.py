@@ -8,7 +8,7 @@ the bodies feel what they have pulled; see `forces/attachments.h`.
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
 import dataclasses
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
@@ -21,6 +21,9 @@ from .. import coupling
 from ..model import mjstruct
 from .passive import Beside, Bodies, Input, Nodes, base, may_move, nodes, solver
 from .transfer import Grip, Held, pairs
+
+if TYPE_CHECKING:
+  from ..workspace import Workspace
 
 TO_POINT, TO_OWN_MOTION = -1, -2  # in place of a body
 _LEAST = 64  # ties that there is room for at once
@@ -128,7 +131,7 @@ class Ties(Beside):
 
   ENTER, ACT = _enter, _act
 
-  def __init__(self, w):
+  def __init__(self, w: "Workspace"):
     super().__init__(w)
     self.groups: list[Group] = []
     self._room = 0
@@ -253,7 +256,7 @@ def _rows(group: Group, name: str) -> tuple[int, ...]:
   return (len(group.vert), 3) if name == "anchor" else (len(group.vert),)
 
 
-def motion(w, vert: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def motion(w: "Workspace", vert: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
   """Returns places and velocities of an organ's vertices in the world [m, m/s], (n, 3) each."""
   organ = w.organ
   if organ.windows:

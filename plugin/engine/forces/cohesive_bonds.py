@@ -6,7 +6,7 @@ The kernels are in `forces/cohesive_bonds.h`; what is bonded to what is found in
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
 import dataclasses
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
@@ -19,6 +19,9 @@ from ..layout import BOND
 from ..model import mjstruct
 from .passive import Beside, Bodies, Input, Nodes, base, may_move, nodes, solver
 from .transfer import Grip, Spots
+
+if TYPE_CHECKING:
+  from ..workspace import Workspace
 
 ON_ORGAN = -1  # in place of a body
 _OF_GROUP = ("vert", "slot", "area", "anchor", "normal", "corner", "weight")
@@ -192,7 +195,7 @@ class Bonds(Beside):
 
   ENTER = _enter
 
-  def __init__(self, w):
+  def __init__(self, w: "Workspace"):
     super().__init__(w)
     self.groups: list[Group] = []
     self.borne: list[Group] = []  # of other organs, which lead to this one

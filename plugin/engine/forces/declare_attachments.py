@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from palpate.tissue.config import OWN
 from palpate.tissue.geometry import mesh as topology
@@ -12,6 +14,9 @@ from . import supports
 from .attachments import TO_OWN_MOTION, TO_POINT, Group, is_mocap, motion
 from .transfer import Grip
 
+if TYPE_CHECKING:
+  from ..workspace import Workspace
+
 # Times the mass of a vertex that its spring weighs in a step, where nothing else is said: it then
 # follows to a hundredth of the way.
 _FIRM = 100.0
@@ -19,7 +24,7 @@ _FIRM = 100.0
 _LIGHT = 0.5
 
 
-def declare(w):
+def declare(w: Workspace):
   """Ties an organ to the bodies that its configuration names."""
   made = carried(w)
   supports.check(mjstruct.Model.from_address(w.model), w)
@@ -53,7 +58,9 @@ def declare_between(spaces: list) -> list:
   return changed
 
 
-def to_body(w, vert: np.ndarray, body: int, stiffness: float | None, now: bool = True) -> Group:
+def to_body(
+  w: Workspace, vert: np.ndarray, body: int, stiffness: float | None, now: bool = True
+) -> Group:
   """Returns springs from vertices to the points of a body where they are, now or at rest.
 
   Args:
@@ -79,7 +86,7 @@ def to_body(w, vert: np.ndarray, body: int, stiffness: float | None, now: bool =
   return Group(w, Grip(w.organ.mesh, vert), body, made, by="" if now else "attach")
 
 
-def to_organ(w, vert: np.ndarray, other, stiffness: float | None, now: bool = True):
+def to_organ(w: Workspace, vert: np.ndarray, other, stiffness: float | None, now: bool = True):
   """Returns springs between vertices of two organs, each to the nearest one: of both organs.
 
   They keep the distances that there are, now or at rest. Arguments as for `to_body`.
@@ -101,7 +108,7 @@ def to_organ(w, vert: np.ndarray, other, stiffness: float | None, now: bool = Tr
   )  # fmt: skip
 
 
-def carried(w) -> list[Group]:
+def carried(w: Workspace) -> list[Group]:
   """Returns the foundation and the pins of an organ that has a carrier, tied to it."""
   name, organ = w.config.carrier, w.organ
   if not name:
@@ -125,7 +132,7 @@ def carried(w) -> list[Group]:
   return [Group(w, Grip(mesh, vert), body, made, by="carrier")]
 
 
-def find_body(w, m, key: str, name: str) -> int:
+def find_body(w: Workspace, m, key: str, name: str) -> int:
   """Returns the body that an organ's configuration names, by its own name or with its prefix."""
   names = [mjstruct.name_of(m, m.name_bodyadr, b) for b in range(m.nbody)]
   found = flexes.resolve(name, w.organ.name, names)
@@ -134,7 +141,7 @@ def find_body(w, m, key: str, name: str) -> int:
   return names.index(found)
 
 
-def check_vertices(w, vertices) -> np.ndarray:
+def check_vertices(w: Workspace, vertices) -> np.ndarray:
   """Returns vertices that springs may hold, each once.
 
   Raises:
@@ -153,24 +160,24 @@ def check_vertices(w, vertices) -> np.ndarray:
   return vert
 
 
-def at_rest(w, vert: np.ndarray) -> np.ndarray:
+def at_rest(w: Workspace, vert: np.ndarray) -> np.ndarray:
   """Returns where vertices are in the world at rest [m], (n, 3)."""
   return w.organ.origin + w.organ.mesh.rest[vert] @ w.organ.frame.T
 
 
-def _gain(w) -> float:
+def _gain(w: Workspace) -> float:
   """Returns h^2 + h damping [s^2]."""
   h = float(mjstruct.Model.from_address(w.model).opt.timestep)
   return h * (h + w.config.damping)
 
 
-def _firm(w) -> np.ndarray:
+def _firm(w: Workspace) -> np.ndarray:
   """Returns the stiffness with which a spring weighs much more than its vertex [N/m], (nvert,)."""
   m = mjstruct.Model.from_address(w.model)
   return _FIRM * inertia.masses(m, w.organ) / _gain(w)
 
 
-def most(w, m, body: int) -> float:
+def most(w: Workspace, m, body: int) -> float:
   """Returns the most that springs to a body may have together [N/m]."""
   if is_mocap(m, body) or not mjstruct.view(m.body_weldid, m.nbody, np.int32)[body]:
     return np.inf
@@ -178,7 +185,7 @@ def most(w, m, body: int) -> float:
   return _LIGHT / (_gain(w) * max(weight, 1e-12))
 
 
-def _stiffness(w, vert: np.ndarray, stiffness: float | None, most: float) -> np.ndarray:
+def _stiffness(w: Workspace, vert: np.ndarray, stiffness: float | None, most: float) -> np.ndarray:
   """Returns the stiffness of each spring, by the area of its vertex [N/m], (n,)."""
   name = w.organ.name
   mesh = w.organ.mesh

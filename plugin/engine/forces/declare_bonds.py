@@ -2,6 +2,8 @@
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
+from typing import TYPE_CHECKING
+
 import numpy as np
 import warp as wp
 from palpate.tissue.geometry import mesh as topology
@@ -15,6 +17,9 @@ from . import declare_attachments, transfer
 from .attachments import motion
 from .cohesive_bonds import ON_ORGAN, Group
 from .transfer import Grip, Spots
+
+if TYPE_CHECKING:
+  from ..workspace import Workspace
 
 
 @struct
@@ -37,7 +42,7 @@ _measure_geoms, _measure_triangles = coupling.kernels(
 )
 
 
-def declare(w):
+def declare(w: "Workspace"):
   """Bonds an organ to the bodies that its configuration names.
 
   Raises:
@@ -67,7 +72,9 @@ def declare_between(spaces: list) -> list:
   return changed
 
 
-def to_body(w, body: int, name: str, law: Law, near: float, vertices, now: bool = True) -> Group:
+def to_body(
+  w: "Workspace", body: int, name: str, law: Law, near: float, vertices, now: bool = True
+) -> Group:
   """Returns bonds from vertices to the points of a body where they are, now or at rest.
 
   Args:
@@ -108,7 +115,7 @@ def to_body(w, body: int, name: str, law: Law, near: float, vertices, now: bool 
   return _group(w, vert, made, law, body, not now)
 
 
-def to_organ(w, other, law: Law, near: float, vertices, now: bool = True) -> Group:
+def to_organ(w: "Workspace", other, law: Law, near: float, vertices, now: bool = True) -> Group:
   """Returns bonds from vertices to the nearest points of another organ; arguments as `to_body`."""
   name, mesh = other.organ.name, other.organ.mesh
   if other is w:
@@ -132,7 +139,9 @@ def to_organ(w, other, law: Law, near: float, vertices, now: bool = True) -> Gro
   return _group(w, vert, made, law, ON_ORGAN, not now, other, Spots(mesh, elem, weight))
 
 
-def _group(w, vert, made, law, body: int, declared: bool, other=None, spots=None) -> Group:
+def _group(
+  w: "Workspace", vert, made, law, body: int, declared: bool, other=None, spots=None
+) -> Group:
   bonded = [g.vert for g in w.bonds.groups]
   twice = np.intersect1d(vert, np.concatenate(bonded)) if bonded else vert[:0]
   if twice.size:
@@ -142,15 +151,15 @@ def _group(w, vert, made, law, body: int, declared: bool, other=None, spots=None
   return Group(w, Grip(w.organ.mesh, vert), made, law, body, other, spots, declared)
 
 
-def _free(w) -> np.ndarray:
+def _free(w: "Workspace") -> np.ndarray:
   return np.flatnonzero(w.organ.free[: w.organ.mesh.nouter])
 
 
-def _places(w, vert: np.ndarray, now: bool) -> np.ndarray:
+def _places(w: "Workspace", vert: np.ndarray, now: bool) -> np.ndarray:
   return motion(w, vert)[0] if now else declare_attachments.at_rest(w, vert)
 
 
-def _areas(w, vert: np.ndarray, name: str, near: float) -> np.ndarray:
+def _areas(w: "Workspace", vert: np.ndarray, name: str, near: float) -> np.ndarray:
   """Returns the area of each vertex [m^2], (n,)."""
   if not len(vert):
     raise ValueError(
@@ -161,7 +170,7 @@ def _areas(w, vert: np.ndarray, name: str, near: float) -> np.ndarray:
   return topology.vertex_areas(mesh.rest, mesh.elem)[vert]
 
 
-def _normals(w, now: bool) -> np.ndarray:
+def _normals(w: "Workspace", now: bool) -> np.ndarray:
   """Returns the unit normals of an organ's vertices in the world, (nouter, 3)."""
   mesh = w.organ.mesh
   x = _places(w, np.arange(mesh.nouter), now)

@@ -7,7 +7,7 @@ batch on a GPU the same kernels act in all worlds, see `palpate.batch.forces.bas
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
@@ -18,6 +18,10 @@ from palpate.tissue.types import doubles, fill, floats, ints, struct, vector
 from .. import coupling
 from ..layout import TAIL
 from ..model import mjstruct
+
+if TYPE_CHECKING:
+  from ..model.declare import Declaration
+  from ..workspace import Workspace
 
 
 @struct
@@ -91,7 +95,7 @@ class Beside:
   ACT: Kernel | None = None
   END: Kernel | None = None
 
-  def __init__(self, w):
+  def __init__(self, w: "Workspace"):
     self._w = w
     self.fields: Any = None
 
@@ -143,7 +147,7 @@ class Beside:
     return wp.array(ptr=state.ptr + 8 * where.start, dtype=wp.float64, shape=shape, device="cpu")
 
 
-def nodes(w):
+def nodes(w: "Workspace"):
   """Returns `Nodes` of a workspace."""
   organ = w.organ
   windowed = organ.windows is not None
@@ -162,12 +166,12 @@ def nodes(w):
   return fill(Nodes, "cpu", values)
 
 
-def base(organ) -> np.ndarray:
+def base(organ: "Declaration") -> np.ndarray:
   """Returns what displacements here are from: nodal, qpos0 whatever was cut [m], (nvert, 3)."""
   return organ.mesh.rest if organ.windows else organ.mesh.whole.rest
 
 
-def solver(w):
+def solver(w: "Workspace"):
   """Returns `Input` of a workspace."""
   values = {name: w.host[name] for name in ("force_ext", "vel", "dvel", "status")}
   quiet = np.zeros(1)
@@ -184,7 +188,7 @@ class Hold:
     w: the workspace
   """
 
-  def __init__(self, w):
+  def __init__(self, w: "Workspace"):
     self._w = w
     self.array: wp.array | None = None
 

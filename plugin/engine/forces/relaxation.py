@@ -3,6 +3,8 @@
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import warp as wp
 from palpate.tissue.config import Config
@@ -11,6 +13,9 @@ from palpate.tissue.types import doubles, fill, floats, ints, scalar, struct, ve
 from .. import coupling
 from ..layout import FLAG, TAIL
 from .passive import Beside
+
+if TYPE_CHECKING:
+  from ..workspace import Workspace
 
 
 @struct
@@ -56,7 +61,7 @@ class Creep(Beside):
 
   ENTER, END = _enter, _end
 
-  def __init__(self, w):
+  def __init__(self, w: "Workspace"):
     super().__init__(w)
     self._number = wp.zeros(2, dtype=wp.float64, device="cpu")
     self.renumber(w.config)

@@ -3,7 +3,7 @@
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
 import functools
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
@@ -13,6 +13,9 @@ from palpate.tissue.types import doubles, fill, ints, struct
 from .. import coupling
 from ..model import flexes, mjstruct
 from .passive import Beside, Bodies, Input, Nodes, may_move, nodes, solver
+
+if TYPE_CHECKING:
+  from ..workspace import Workspace
 
 # Stiffness of the springs, by area, in Young's moduli an edge: an organ of that size sinks in by a
 # hundredth of what its own weight makes of it.
@@ -69,7 +72,7 @@ class Rests(Beside):
 
   KEYS = ("support",)
 
-  def __init__(self, w):
+  def __init__(self, w: "Workspace"):
     super().__init__(w)
     self.below: list = []  # workspaces of organs that it rests on
     self.above: list = []  # of organs that rest on it
@@ -107,7 +110,7 @@ class Rests(Beside):
     n, geoms = coupling.outer(organ), self._geoms(m)
     area = topology.vertex_areas(organ.mesh.rest, organ.mesh.elem)[:n]
     young = float(np.mean(w.config.young))
-    flex = organ.windows.flex
+    flex = organ.window.flex
     if not self._arrays:
       shapes = {"slipped": (n, 3), "force": (n, 3), "weight": (n, 3), "hardness": (n, 6)}
       self._arrays = {k: wp.zeros(s, dtype=wp.float64, device="cpu") for k, s in shapes.items()}
@@ -144,7 +147,7 @@ class Rests(Beside):
   def _other(self, m, other) -> dict[str, Any]:
     """Returns the fields of an organ that this one rests on."""
     mesh = other.organ.mesh
-    mine, theirs = (w.organ.windows.flex for w in (self._w, other))
+    mine, theirs = (w.organ.window.flex for w in (self._w, other))
     count = np.bincount(mesh.elem.ravel(), minlength=mesh.nouter)
     return dict(
       mu=max(_mu(m, mine), _mu(m, theirs)),
@@ -230,7 +233,7 @@ def meet(spaces: list) -> list:
   return changed
 
 
-def check(m, w):
+def check(m, w: "Workspace"):
   """Looks at the names of what an organ rests on, and warns of what bears it by contacts too.
 
   Raises:
@@ -245,7 +248,7 @@ def check(m, w):
       "does not exist, expected a geom or another organ"
     )
   if found:
-    meets = flexes.meeting_geoms(m, organ.windows.flex)
+    meets = flexes.meeting_geoms(m, organ.window.flex)
     for geom in meets:
       if geoms[geom] in found:
         _warn_twice(organ.name, geoms[geom])

@@ -87,6 +87,12 @@ class Declaration:
     return out
 
   @property
+  def window(self) -> Windows:
+    """The window of an organ that has one."""
+    assert self.windows is not None
+    return self.windows
+
+  @property
   def flexes(self) -> list[int]:
     """Flexes that tools meet: the window's, or its own."""
     return [self.windows.flex if self.windows else self.flex]

@@ -8,6 +8,7 @@ nothing of it: there are no dofs, no contacts, and nothing in mjData.
 from __future__ import annotations
 
 import dataclasses
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
@@ -16,6 +17,10 @@ from palpate.tissue.geometry import subdivide
 from palpate.tissue.geometry.subdivide import Smooth
 
 from . import flexes, mjstruct, prepare
+
+if TYPE_CHECKING:
+  from ..workspace import Workspace
+  from .declare import Declaration
 
 HIDDEN = 4  # the group of an organ's own surface where a skin is drawn for it
 
@@ -41,7 +46,7 @@ class Skin:
   groups: tuple[int, int]
 
 
-def read(m, organ) -> Skin | None:
+def read(m, organ: Declaration) -> Skin | None:
   """Returns the skin that an organ's configuration names, or None.
 
   Raises:
@@ -106,10 +111,11 @@ def place(skin: Skin, vertices: np.ndarray) -> np.ndarray:
   return base + skin.height[:, None] * topology.vertex_normals(base, skin.smooth.elem)
 
 
-def draw(w, model: int, data: int):
+def draw(w: Workspace, model: int, data: int):
   """Writes an organ's skin where renderers read it, from `flexvert_xpos`."""
   m, d = mjstruct.Model.from_address(model), mjstruct.Data.from_address(data)
   organ, skin = w.organ, w.skin
+  assert skin is not None
   start = int(mjstruct.view(m.flex_vertadr, m.nflex, np.int32)[organ.flex])
   n = organ.mesh.nouter
   coarse = mjstruct.view(d.flexvert_xpos, (m.nflexvert, 3))[start : start + n]
@@ -126,7 +132,9 @@ def draw(w, model: int, data: int):
   out[skin.adr : skin.adr + len(fine)] = bound
 
 
-def show(w, model: int, shown: bool):
+def show(w: Workspace, model: int, shown: bool):
   """Draws the skin, or the organ's own surface in its place, as where its triangles change."""
-  groups = w.skin.groups if shown else w.skin.groups[::-1]
+  assert w.skin is not None
+  usual, hidden = w.skin.groups
+  groups = (usual, hidden) if shown else (hidden, usual)
   prepare.group(mjstruct.Model.from_address(model), w.skin.index, w.organ.flex, groups)

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from palpate.tissue.geometry import fill
 
-from .. import coupling, nodal
-from ..windows import windowed
+from .. import coupling, layout
+from ..layout import NodalState, WindowState
 from . import declare, mjstruct
 
 
 def state_size(model: int, instance: int) -> int:
-  """Returns the length of the plugin state.
-
-  Contact force, last dv and the one before of each moving vertex, or what `windowed` says.
-  """
+  """Returns the length of the plugin state: at least what `coupling.sizes` will ask for."""
   m = mjstruct.Model.from_address(model)
   relaxes, rests, bonded = (
     bool(mjstruct.config(model, instance, key).strip())
@@ -26,11 +23,12 @@ def state_size(model: int, instance: int) -> int:
   most = inner + m.nflexvert
   cuts = coupling.cut_sizes(m.nflexelem, most, spare * m.nflexvert, solid)
   cutters = mjstruct.config(model, instance, "cutters").strip()
-  cuts |= {"nblade": cutters.count(",") + 1 if cutters else 0}
+  sizes = cuts | {"nblade": cutters.count(",") + 1 if cutters else 0}
   if mjstruct.config(model, instance, "window").strip():
-    outer = {"nrest": rests * m.nflexvert, "nbond": bonded * m.nflexvert}
-    outer |= {"ncreep": relaxes * most} | cuts
-    return windowed.state_size(most, 0, m.ngeom, **outer)
+    # A window's vertices count as the organ's, which have more numbers than a slot.
+    sizes |= {"nvert": most, "nslot": 0, "ngeom": m.ngeom, "ncreep": relaxes * most}
+    sizes |= {"nrest": rests * m.nflexvert, "nbond": bonded * m.nflexvert}
+    return layout.size(WindowState, sizes)
   moving = len(declare.moving_bodies(m, instance))
-  cuts |= {"ncreep": relaxes * (moving + inner), "nbond": bonded * moving}
-  return nodal.state_size(3 * moving, 3 * inner, **cuts)
+  sizes |= {"ncreep": relaxes * (moving + inner), "nbond": bonded * moving}
+  return layout.size(NodalState, sizes | coupling.nodal_sizes(3 * moving, 3 * inner))

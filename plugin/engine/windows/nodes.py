@@ -2,6 +2,8 @@
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
+from typing import TYPE_CHECKING
+
 import numpy as np
 import warp as wp
 from palpate.tissue import order
@@ -10,6 +12,9 @@ from palpate.tissue.types import Views, doubles, fill, ints, struct
 from .. import coupling, layout
 from ..coupling import Crossing
 from ..layout import Inbox, Motion, Outbox
+
+if TYPE_CHECKING:
+  from ..workspace import Workspace
 
 _BLOCK = 128  # threads, whole warps
 
@@ -41,7 +46,7 @@ commit, move_slots, enter, push_slots, push_impulses, search, report = coupling.
 )
 
 
-def make(w, side, motion, boxes: tuple[wp.array, wp.array], sizes: dict[str, int]):
+def make(w: "Workspace", side, motion, boxes: tuple[wp.array, wp.array], sizes: dict[str, int]):
   """Returns a workspace's nodes on a device.
 
   Args:
@@ -80,7 +85,7 @@ class Weights:
     nodes: `Nodes` of it
   """
 
-  def __init__(self, w, nodes):
+  def __init__(self, w: "Workspace", nodes):
     self._w, self._nodes, self._here = w, nodes, Views(nodes)
     self._number, self._mass = w.body.shape.node.numpy(), w.host["mass"].numpy().reshape(-1)
 

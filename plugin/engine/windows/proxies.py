@@ -2,7 +2,7 @@
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
@@ -14,6 +14,10 @@ from .. import coupling
 from ..coupling import Mujoco
 from ..layout import FLAG, Inbox, Outbox, WindowState
 from ..model import mjstruct
+
+if TYPE_CHECKING:
+  from ..model.declare import Declaration
+  from ..workspace import Workspace
 
 # Nodes within this many mean edges of a tool may be in the window.
 _REACH = 4.0
@@ -127,7 +131,7 @@ def scratch(nvert: int, nslot: int) -> dict[str, wp.array]:
   } | {name: wp.zeros(shape, dtype=wp.float64, device="cpu") for name, shape in zeros.items()}
 
 
-def make(w, model: int, sizes: dict[str, int]):
+def make(w: "Workspace", model: int, sizes: dict[str, int]):
   """Returns the slots of a workspace.
 
   Args:
@@ -136,7 +140,7 @@ def make(w, model: int, sizes: dict[str, int]):
     sizes: what the blocks of `layout` need
   """
   m = mjstruct.Model.from_address(model)
-  organ, win, mesh = w.organ, w.organ.windows, w.organ.mesh
+  organ, win, mesh = w.organ, w.organ.window, w.organ.mesh
   lengths, longest = _edges(mesh)
   radius = float(mjstruct.view(m.flex_radius, m.nflex)[win.flex])
   margin = float(mjstruct.view(m.flex_margin, m.nflex)[win.flex])
@@ -192,18 +196,18 @@ class Reshape:
     slots: of it
   """
 
-  def __init__(self, organ, slots):
+  def __init__(self, organ: "Declaration", slots):
     self._fields = fields = Reshaping()
     mesh = organ.mesh
     for name in ("rest", "touch", "node_mass", "free", "elem", "begin", "following", "radius"):
       setattr(fields, name, getattr(slots, name))
     fields.nvert, fields.most = mesh.nvert, mesh.ring.shape[1]
-    fields.wall = WALL * float(organ.windows.mass.sum())
+    fields.wall = WALL * float(organ.window.mass.sum())
     fields.near = wp.zeros(mesh.nvert, dtype=wp.uint8, device="cpu")
     self._launch = _reshape.command(fields).launch
     self.put(organ, np.arange(mesh.nvert))
 
-  def put(self, organ, vert: np.ndarray):
+  def put(self, organ: "Declaration", vert: np.ndarray):
     """Gives the slots what the organ has at vertices that something has changed at."""
     mesh, fields = organ.mesh, self._fields
     fields.nelem, fields.nchanged = mesh.nelem, len(vert)
@@ -213,9 +217,9 @@ class Reshape:
     self._launch()
 
 
-def hold(organ, inertia: np.ndarray, vert: Any = slice(None)) -> np.ndarray:
+def hold(organ: "Declaration", inertia: np.ndarray, vert: Any = slice(None)) -> np.ndarray:
   """Returns the inertia of nodes, with that of a wall for pinned ones [kg]."""
-  return np.where(organ.free[vert], inertia, WALL * organ.windows.mass.sum())
+  return np.where(organ.free[vert], inertia, WALL * organ.window.mass.sum())
 
 
 def _edges(mesh) -> tuple[np.ndarray, np.ndarray]:

@@ -13,8 +13,10 @@ from __future__ import annotations
 
 import itertools
 import time
+from collections.abc import Callable, Mapping
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from ..layout import FLAG, HEAD, MODE, TAIL
@@ -26,27 +28,37 @@ class Resident:
   """The motion of one windowed organ on a device.
 
   Args:
-    w: the workspace
+    flags: see `layout.FLAG`
+    boxes: blocks of the plugin state and of what crosses, see `Workspace`
+    state: the organ's own numbers
     motion: the motion on the device, the numbers of `layout.Motion`
     end_step: launches the end of the last step on the device
     look_again: launches the search for nodes near the tools once more
   """
 
-  def __init__(self, w, motion: wp.array, end_step, look_again):
-    self.w = w
-    own, inbox, outbox = (w.boxes[name] for name in ("own", "inbox", "outbox"))
-    self.state = w.views["plugin_state"].numpy()[: motion.size]  # the motion comes first there
+  def __init__(
+    self,
+    flags: memoryview,
+    boxes: Mapping[str, Any],
+    state: np.ndarray,
+    motion: wp.array,
+    end_step: Callable[[], None],
+    look_again: Callable[[], None],
+  ):
+    self._flags = flags
+    own, inbox, outbox = (boxes[name] for name in ("own", "inbox", "outbox"))
+    self.state = state[: motion.size]  # the motion comes first there
     self.tail, self.head = own.tail.numpy(), inbox.head.numpy()
     self.found = outbox.found.numpy()
     self.most, _ = outbox.record.shape
-    self.device = w.body.device
+    self.device = wp.get_device(motion.device)
     self.live = -1
     # Recorded graphs: the guess, on the CPU; the solve with it, on the device; what is left then.
     self.foresee: Any = None
     self.begin_graph: Any = None
     self.rest: list = []
     self._begun = False
-    w.report.flags[FLAG.foreseen] = 1
+    flags[FLAG.foreseen] = 1
     self._end_step, self._look_again, self._motion = end_step, look_again, motion
     self._staging = wp.zeros(
       motion.size, dtype=wp.float64, device="cpu", pinned=self.device.is_cuda
@@ -70,7 +82,7 @@ class Resident:
     self._staging.numpy()[:] = self.state
     wp.copy(self._motion, self._staging)
     wp.synchronize_device(self.device)
-    self.w.report.flags[FLAG.pending] = self.head[HEAD.mode] = MODE.still  # it ends no step
+    self._flags[FLAG.pending] = self.head[HEAD.mode] = MODE.still  # it ends no step
     self.live = next(_stamps)
     self.tail[TAIL.stamp] = self.live
 
@@ -87,19 +99,19 @@ class Resident:
     self._begun = False
     if not computed:
       return
-    w = self.w
     wp.capture_launch(self.foresee)
-    self._begun = bool(w.report.flags[FLAG.foreseen]) and w.report.flags[FLAG.pending] != MODE.halt
+    flags = self._flags
+    self._begun = bool(flags[FLAG.foreseen]) and flags[FLAG.pending] != MODE.halt
     if self._begun:
       wp.capture_launch(self.begin_graph)
-      w.report.flags[FLAG.pending] = self.head[HEAD.mode] = MODE.still  # this ends the last step
+      flags[FLAG.pending] = self.head[HEAD.mode] = MODE.still  # this ends the last step
 
-  def left_to_do(self) -> list:
+  def left_to_do(self, solve: list) -> list:
     """Returns the graphs of the solve, or of what is left of one that was begun with the truth."""
-    if self._begun and self.w.report.flags[FLAG.foreseen]:
+    if self._begun and self._flags[FLAG.foreseen]:
       return self.rest
     self._begun = False
-    return self.w.graphs.solve
+    return solve
 
   def look(self):
     """Repeats the search within a shorter reach while it finds more than there is room for."""
@@ -111,7 +123,7 @@ class Resident:
   def stop(self):
     """Brings the motion into the plugin state and forgets the step that was begun."""
     self.fetch()
-    self.live, self.w.report.flags[FLAG.foreseen] = -1, 1
+    self.live, self._flags[FLAG.foreseen] = -1, 1
 
   def renew(self):
     """Notes that the motion in the plugin state was changed, and has to be sent."""
@@ -123,7 +135,7 @@ class Resident:
     stamp = int(self.tail[TAIL.stamp])
     if stamp >= 0 or -stamp != self.live:
       return
-    flags = self.w.report.flags
+    flags = self._flags
     self.head[HEAD.mode] = flags[FLAG.pending]
     self._end_step()
     wp.copy(self._staging, self._motion)

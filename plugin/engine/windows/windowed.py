@@ -1,7 +1,7 @@
-"""Windows: what MuJoCo sees of an organ are small flexes that slide over it, under the tools.
+"""Windows: what MuJoCo sees of an organ is a small flex that slides over it, under the tools.
 
 Only nodes near a tool need degrees of freedom of MuJoCo: the organ's motion lives in
-`plugin_state`, and each window's vertex bodies ("slots") stand on the nodes nearest to the tool,
+`plugin_state`, and the window's vertex bodies ("slots") stand on the nodes nearest to the tools,
 with their position, velocity and effective inertia. The window's triangles are the organ's
 triangles between them. Forces follow the same formula as on all nodes; a node outside the window
 moves by dv exactly as it would with dofs of its own and no contact.
@@ -12,7 +12,7 @@ its device over a copy that `Resident` keeps; the slots' kernels (`slots`) on th
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
@@ -26,21 +26,19 @@ from ..model import inertia, mjstruct, prepare
 from . import nodes, proxies
 from .resident import Resident
 
+if TYPE_CHECKING:
+  from ..model.declare import Declaration
+  from ..workspace import Workspace
+
 # Candidates that a device reports, times the slots.
 ROOM = 16
-
-
-def state_size(nvert: int, nslot: int, ngeom: int, **more: int) -> int:
-  """Returns the length of the plugin state."""
-  sizes = {"nvert": nvert, "nslot": nslot, "ngeom": ngeom, "ncreep": 0, "nrest": 0, "nbond": 0}
-  return layout.size(WindowState, sizes | layout.NO_CUTS | more)
 
 
 class Phases(coupling.Phases):
   """Window coupling of a workspace's organ."""
 
-  def __init__(self, w, model: int, instance: int):
-    organ, win = w.organ, w.organ.windows
+  def __init__(self, w: Workspace, model: int, instance: int):
+    organ, win = w.organ, w.organ.window
     self.side = w.body.device if w.config.resident else wp.get_device("cpu")
     self._resident, self._away = w.config.resident, self.side.is_cuda
     self._status = w.host["status"], w.body.system.status
@@ -74,7 +72,8 @@ class Phases(coupling.Phases):
     if w.config.resident:
       self._motion = wp.zeros(layout.size(Motion, sizes), dtype=wp.float64, device=self.side)
       motion = layout.carve(Motion, self._motion, sizes)
-      w.graphs.resident = Resident(w, self._motion, self._end_now, self.look_ahead)
+      own = w.report.flags, w.boxes, w.plugin_state
+      w.graphs.resident = Resident(*own, self._motion, self._end_now, self.look_ahead)
     self._nodes = nodes.make(w, self.side, motion, self._far, sizes)
     self._weights = nodes.Weights(w, self._nodes)
     self._weights.put(np.arange(organ.mesh.nvert))
@@ -108,9 +107,9 @@ class Phases(coupling.Phases):
     if self._w.graphs.resident:
       self._w.graphs.resident.renew()
 
-  def _sizes(self, organ) -> dict[str, int]:
+  def _sizes(self, organ: Declaration) -> dict[str, int]:
     """Returns what the blocks of `layout` need."""
-    nvert, nslot = organ.mesh.nvert, organ.windows.nslot
+    nvert, nslot = organ.mesh.nvert, organ.window.nslot
     return coupling.sizes(organ) | {
       "most": min(nvert, ROOM * nslot) if self.side.is_cuda else nvert
     }
@@ -206,18 +205,19 @@ class Phases(coupling.Phases):
     self.look()
 
 
-def settle(w, model: int):
+def settle(w: Workspace, model: int):
   """Readies the state for the default slots."""
   set_inertia(w, mjstruct.Model.from_address(model))
   w.views["plugin_state"].fill_(0.0)  # MuJoCo has not cleared it yet
 
 
-def find_astray(w) -> float:
+def find_astray(w: Workspace) -> float:
   """Returns how far a slot is from the node that the plugin state says it is on, at most [m]."""
-  own = w.boxes["own"]
+  own, turn = w.boxes["own"], w.turn
+  assert turn is not None
   if own.tail.numpy()[TAIL.stamp] < 0:  # that motion is on a device, and the slots have moved
-    return np.inf if w.turn.stood else 0.0
-  win, n, number = w.organ.windows, w.organ.mesh.nvert, own.slot.numpy()
+    return np.inf if turn.stood else 0.0
+  win, n, number = w.organ.window, w.organ.mesh.nvert, own.slot.numpy()
   node = np.where(number == 0, win.home, np.where((number >= 1) & (number <= n), number - 1, -1))
   used = np.flatnonzero(node >= 0)
   node = node[used].astype(int)
@@ -227,20 +227,20 @@ def find_astray(w) -> float:
   return float(np.abs(qpos - win.qhome[used] - w.organ.mesh.rest[node] - disp).max(initial=0.0))
 
 
-def hide(w):
+def hide(w: Workspace):
   """Hides the organ's flex from MuJoCo until it is drawn again."""
   if w.seen.counts[0]:
     prepare.show(mjstruct.Model.from_address(w.model), w.organ, shown=False)
 
 
-def let_sleep(w, allowed: bool):
+def let_sleep(w: Workspace, allowed: bool):
   """Lets MuJoCo put the windows' bodies to sleep, or wakes them in the middle of a step.
 
   It does so itself where `<flag sleep="enable"/>` is set: it then spends next to nothing on dofs
   that have nothing to do while the organ sleeps.
   """
   m, d = mjstruct.Model.from_address(w.model), mjstruct.Data.from_address(w.data)
-  tree = mjstruct.view(m.body_treeid, m.nbody, np.int32)[w.organ.windows.body]
+  tree = mjstruct.view(m.body_treeid, m.nbody, np.int32)[w.organ.window.body]
   policy = mujoco.mjtSleepPolicy
   may = policy.mjSLEEP_AUTO_ALLOWED if allowed else policy.mjSLEEP_AUTO_NEVER
   mjstruct.view(m.tree_sleep_policy, m.ntree, np.int32)[tree] = int(may)
@@ -252,7 +252,7 @@ def let_sleep(w, allowed: bool):
   wp.capture_launch(w.graphs.before)
 
 
-def find_contacts_again(w):
+def find_contacts_again(w: Workspace):
   """Does the position stage once more.
 
   Inertias of others stay: an organ may have made its own greater in this step.
@@ -269,14 +269,14 @@ def find_contacts_again(w):
     array[which] = were
 
 
-def wake(w):
+def wake(w: Workspace):
   """Ends the organ's sleep: something has changed."""
   w.boxes["own"].tail.numpy()[TAIL.quiet] = 0.0
 
 
-def set_inertia(w, m):
+def set_inertia(w: Workspace, m):
   """Stores the effective inertia of every node for the present time step."""
-  organ, win = w.declared, w.organ.windows
+  organ, win = w.declared, w.organ.window
   nodal = win.mass
   if step.SCHEMES[w.config.integrator].spreads:
     nodal = inertia.of_nodes(m, organ, w.body, w.config, win.mass, win.flex)
@@ -284,14 +284,14 @@ def set_inertia(w, m):
   share_inertia(w)
 
 
-def share_inertia(w, vert: Any = slice(None)):
+def share_inertia(w: Workspace, vert: Any = slice(None)):
   """Gives vertices, some or all, that were one their part of its inertia."""
   nodal = w.views["whole"]
   nodal = w.cuts.share(nodal, vert) if w.cuts else nodal[vert]
   w.views["inertia"].numpy()[vert] = proxies.hold(w.organ, nodal, vert)
 
 
-def shortage(w) -> str | None:
+def shortage(w: Workspace) -> str | None:
   """Returns what the windows had no room for at most, and what to do, or None."""
   nodes, triangles = w.report.missed
   if nodes:
@@ -303,7 +303,7 @@ def shortage(w) -> str | None:
   return f"organ {w.organ.name!r}: its windows have no room for {what}"
 
 
-def draw(w, model: int, data: int):
+def draw(w: Workspace, model: int, data: int):
   """Writes the deformed surface where renderers read it."""
   m, d = mjstruct.Model.from_address(model), mjstruct.Data.from_address(data)
   organ = w.organ

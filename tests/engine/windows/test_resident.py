@@ -118,9 +118,9 @@ def test_steps_are_begun_ahead_unless_what_acts_changes(device, monkeypatch):
   resident = engine.find(d._address, 0).graphs.resident
   original, left = resident.left_to_do, []
 
-  def left_to_do():
-    left.append(original() is resident.rest)
-    return original()
+  def left_to_do(solve):
+    left.append(original(solve) is resident.rest)
+    return original(solve)
 
   monkeypatch.setattr(resident, "left_to_do", left_to_do)
   drive(m, d, 100)
