@@ -13,7 +13,7 @@ from mkdocs.structure.files import File, Files
 
 ROOT = pathlib.Path(__file__).parents[1]
 PAGES = ("*.md", "docs/*.md", "docs/tutorials/*.md", "docs/tutorials/*.ipynb", "tasks/*.md",
-         "models/*/*.md", "tests/benchmarks/results/*.md")  # fmt: skip
+         "models/*/*.md", "tests/benchmarks/results/**/*.md")  # fmt: skip
 SOURCES = ROOT / "out" / "api"  # `paths` of mkdocs.yml
 _LINK = re.compile(r"\]\((?![a-z]+:)([^)#\s]+)")
 

@@ -1,10 +1,21 @@
-"""The screen: whether there is one, and how to draw without."""
+"""The screen: whether there is one, and how to draw without.
+
+OpenGL is loaded when a picture is asked for, not before: Mesa brings an LLVM that ends the process
+where torch brings another one later. MuJoCo and dm_control load it as they are imported.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import ctypes.util
+import importlib
 import os
 import sys
+from collections.abc import Callable, Iterator
+from types import ModuleType
+from typing import Any
+
+_LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa"}  # what draws without a screen, by MUJOCO_GL
 
 
 def has_display() -> bool:
@@ -15,13 +26,57 @@ def has_display() -> bool:
 
 
 def prepare_gl() -> None:
-  """Chooses a way to draw without a screen, unless MUJOCO_GL is set or there is a screen.
+  """Imports MuJoCo so that it draws without a screen where there is none.
 
-  MuJoCo reads the variable once, when it is imported, and so does dm_control.
+  Without a screen MUJOCO_GL is set, unless it is, to what draws. Where MuJoCo was imported before,
+  it has read the variable and loaded what it says.
   """
-  if "MUJOCO_GL" in os.environ or has_display():
+  if "MUJOCO_GL" not in os.environ and not has_display():
+    for name, library in _LIBRARIES.items():
+      if "MUJOCO_GL" not in os.environ and ctypes.util.find_library(library):
+        os.environ["MUJOCO_GL"] = name
+  if "mujoco" in sys.modules:
     return
-  for backend, library in (("egl", "EGL"), ("osmesa", "OSMesa")):
-    if ctypes.util.find_library(library):
-      os.environ["MUJOCO_GL"] = backend
-      return
+  with _put_off() as backend:
+    names = "mujoco", "mujoco.rendering.classic.gl_context"
+    for module in [importlib.import_module(name) for name in names]:
+      if backend:
+        _bring(module, "GLContext", lambda: importlib.import_module(f"mujoco.{backend}").GLContext)
+
+
+def import_dm_control() -> None:
+  """Imports dm_control's renderer, which loads OpenGL when it draws."""
+  if "dm_control._render" in sys.modules:
+    return
+  with _put_off() as backend:
+    render: Any = importlib.import_module("dm_control._render")
+  if backend:
+    render.BACKEND, render.USING_GPU = backend, backend == "egl"
+    del render.Renderer
+    _bring(render, "Renderer", getattr(render, f"_import_{backend}"))
+
+
+@contextlib.contextmanager
+def _put_off() -> Iterator[str]:
+  """Hides MUJOCO_GL from imports where it names what draws without a screen, and yields it."""
+  backend = os.environ.get("MUJOCO_GL", "").lower().strip()
+  if backend not in _LIBRARIES:
+    yield ""
+    return
+  os.environ["MUJOCO_GL"] = "disabled"
+  try:
+    yield backend
+  finally:
+    os.environ["MUJOCO_GL"] = backend
+
+
+def _bring(module: ModuleType, name: str, load: Callable[[], Any]) -> None:
+  """Lets a module load an attribute when it is asked for (PEP 562)."""
+
+  def find(asked: str) -> Any:
+    if asked != name:
+      raise AttributeError(f"module {module.__name__!r} has no attribute {asked!r}")
+    setattr(module, name, load())
+    return getattr(module, name)
+
+  setattr(module, "__getattr__", find)  # noqa: B010, a module has none to assign to

@@ -17,9 +17,13 @@ import importlib
 import pkgutil
 from typing import TYPE_CHECKING, Any
 
-from . import domains, registry, suite
-from .registry import exercise as register
-from .suite import TASKS_BY_DOMAIN, load
+from palpate import screen
+
+screen.import_dm_control()  # before others import it
+
+from . import domains, registry, suite  # noqa: E402
+from .registry import exercise as register  # noqa: E402
+from .suite import TASKS_BY_DOMAIN, load  # noqa: E402
 
 if TYPE_CHECKING:
   from .suite import ALL_TASKS, BENCHMARKING, EASY, HARD

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import importlib.metadata
+import importlib.util
 import os
 import pathlib
 import platform
@@ -172,6 +173,13 @@ def _gl() -> list[str]:
   return [f"works: {', '.join(works)}; MUJOCO_GL is {chosen or 'not set'}"]
 
 
+def _torch() -> list[str]:
+  if importlib.util.find_spec("torch") is None:
+    return ["not installed"]
+  _python("import palpate.tasks; palpate.tasks.load('touch', 'easy').reset(); import torch")
+  return ["starts after an exercise"]
+
+
 def _python(code: str, **environment: str):
   """Runs code in an interpreter of its own; raises CommandError with its last word if it fails."""
   inherited = {k: v for k, v in os.environ.items() if k != "PYOPENGL_PLATFORM"}  # MuJoCo sets it
@@ -220,5 +228,6 @@ CHECKS: dict[str, Callable[[], list[str]]] = {
   "plugin": _plugin,
   "tasks": _dm_control,
   "drawing": _gl,
+  "torch": _torch,
   "self-test": _self_test,
 }

@@ -47,6 +47,9 @@ TISSUE = Numbers(
 # A contact: the steps in which it closes; of its tissue's compliance, how much it has; the least R
 # in the inverse inertia of an organ and of a tool, since firmer ones chatter; of that, friction's.
 SLOW, FIRM, SOFT, LIGHT, STUCK = 4.0, 0.03, 0.036, 0.0075, 0.2
+# Least R of contacts between organs, in their nodes' inverse inertia; those are turned that go this
+# much against both triangles, and are this deep, in their radii.
+LOOSE, FACING, SUNK = 0.05, 0.3, 0.3
 # Contacts are softer from a step on [s], and where a vertex has more times its mass than this.
 LONG, STIFF = 5e-3, 1000.0
 SKIN = 3.0  # times the least R of solids that skins have, for whose nodes MuJoCo answers
@@ -121,6 +124,9 @@ weigh = kernel(
   | {
     "SLOW": SLOW,
     "LIGHT": LIGHT,
+    "LOOSE": LOOSE,
+    "FACING": FACING,
+    "SUNK": SUNK,
     **FLAT,
     "CONTACT_LENGTH": mjstruct.size(mjstruct.Contact),
     "CONTACT_PYRAMIDAL": int(mujoco.mjtConstraint.mjCNSTR_CONTACT_PYRAMIDAL),

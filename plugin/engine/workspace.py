@@ -36,6 +36,16 @@ _RK4 = int(mujoco.mjtIntegrator.mjINT_RK4)
 _ASTRAY = 1e-9  # distance of a slot from its node that rounding does not explain [m]
 
 
+# What acts on an organ beside its tissue, in that order: attributes of a workspace. A batch reads
+# it too, and on a GPU refuses what it has not.
+FORCES: dict[str, type[Beside]] = {
+  "ties": Ties,
+  "bonds": Bonds,
+  "rests": Rests,
+  "creep": Creep,
+  "cutters": Cutters,
+}
+
 # An item of a memoryview costs a tenth of one of an array; this stands for those not yet there.
 _NONE = memoryview(bytes(4)).cast("i")
 
@@ -175,14 +185,14 @@ class Workspace:
   boxes: dict = dataclasses.field(default_factory=dict)
 
   def __post_init__(self):
-    self.hold, self.ties = Hold(self), Ties(self)
-    self.bonds, self.rests, self.creep = Bonds(self), Rests(self), Creep(self)
-    self.cuts, self.cutters = cuts_of(self), Cutters(self)
+    self.hold, self.cuts = Hold(self), cuts_of(self)
+    for name, kind in FORCES.items():
+      setattr(self, name, kind(self))
 
   @property
   def beside(self) -> tuple[Beside, ...]:
     """What acts on the organ beside its tissue, in the order in which it does."""
-    return self.ties, self.bonds, self.rests, self.creep, self.cutters
+    return tuple(getattr(self, name) for name in FORCES)
 
   @property
   def plugin_state(self) -> np.ndarray:

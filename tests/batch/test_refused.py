@@ -4,6 +4,8 @@ import mujoco
 import palpate.batch
 import pytest
 import warp as wp
+from palpate.engine.forces.passive import Beside
+from palpate.engine.workspace import FORCES
 from scenes import load, needs_cuda, press, probed
 
 DEVICE = "warp-cpu"  # what mujoco_warp gets is the same
@@ -37,6 +39,18 @@ def test_a_tool_that_it_does_not_know():
 def test_what_hangs_on_an_organs_nodes(extra):
   with pytest.raises(ValueError, match="without the organs' nodes"):
     make(press(subdivisions=1).replace("</mujoco>", extra + "</mujoco>"))
+
+
+def test_what_acts_beside_the_tissue_and_has_no_kind_in_worlds(monkeypatch):
+  with pytest.raises(ValueError, match="organ 'organ': relax_share is set, which a batch on a GPU"):
+    make(press(subdivisions=1, relax_share=0.3))
+
+  class Tide(Beside):
+    KEYS = ("tide",)
+
+  monkeypatch.setitem(FORCES, "tide", Tide)  # one that somebody adds, for one world
+  with pytest.raises(ValueError, match="organ 'organ': tide is set, which a batch on a GPU cannot"):
+    make(press(subdivisions=1))
 
 
 def test_tissues_of_worlds_without_a_gpu_to_step_them():

@@ -56,6 +56,48 @@ def cell(at: tuple[int, int], colour: str):
   return Rectangle((at[0] - 0.48, at[1] - 0.48), 0.96, 0.96, color=colour, lw=0)
 
 
+def curves(
+  path: pathlib.Path,
+  title: str,
+  panels: dict[str, dict[str, tuple[Sequence, Sequence]]],
+  xlabel: str,
+  ylabel: str,
+) -> pathlib.Path:
+  """Draws lines on logarithmic axes and returns the path: panel by panel, line by line (x, y)."""
+  columns = max(1, len(panels))
+  figure, axes = grid(1, columns, 3.6 * columns + 2.0, 3.6)
+  for ax, (name, lines) in zip(axes, panels.items(), strict=False):
+    for label, (x, y) in lines.items():
+      ax.plot(x, y, "o-", ms=4, label=label)
+    ax.set_title(name, loc="left", fontsize=9)
+    ax.set(xlabel=xlabel)
+    if lines:
+      ax.set(xscale="log", yscale="log")
+      plain(ax.xaxis)
+      plain(ax.yaxis)
+      ax.legend(frameon=False, fontsize=7)
+  axes[0].set_ylabel(ylabel)
+  return save(figure, path, title)
+
+
+def bars(
+  path: pathlib.Path, title: str, names: Sequence[str], groups: dict[str, Sequence], xlabel: str
+) -> pathlib.Path:
+  """Draws horizontal bars and returns the path: a line a name, a colour a group."""
+  figure, (ax,) = grid(1, 1, 7.6, 0.14 * len(names) * (len(groups) + 0.6) + 1.4)
+  width = 0.8 / max(1, len(groups))
+  for k, (label, values) in enumerate(groups.items()):
+    at = [i + width * (k - (len(groups) - 1) / 2) for i in range(len(names))]
+    ax.barh(at, values, 0.9 * width, label=label)
+  ax.set_yticks(range(len(names)), names)
+  ax.invert_yaxis()
+  ax.axvline(0, color=INK, lw=0.8)
+  ax.set_xlabel(xlabel)
+  if len(groups) > 1:
+    ax.legend(frameon=False, fontsize=8)
+  return save(figure, path, title)
+
+
 def save(figure, path: pathlib.Path, title: str) -> pathlib.Path:
   """Writes a figure and returns its path."""
   figure.suptitle(title, fontsize=10, color=INK, x=0.01, ha="left")

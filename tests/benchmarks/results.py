@@ -179,11 +179,33 @@ def caption(about: dict) -> str:
   return f"{line}." if line else ""
 
 
-def page(path: pathlib.Path, title: str, about: dict, lines: list[str]) -> pathlib.Path:
-  """Writes a page: a title, what it was measured with and how, and the lines; returns its path.
+def page(
+  path: pathlib.Path,
+  title: str,
+  about: dict,
+  lines: list[str],
+  finding: list[str],
+  plot: pathlib.Path | None = None,
+) -> pathlib.Path:
+  """Writes a page and returns its path.
 
-  What a page that is there has from `## Remarks` on was written by hand and stays.
+  A page begins with its title, its finding and its plot. What it was measured with, the command and
+  the lines follow. What an existing page has from `## Remarks` on was written by hand and stays.
+
+  Args:
+    path: the page
+    title: its title
+    about: notes on the machine and the run
+    lines: tables and what explains them
+    finding: one to three lines that answer the page's question, with numbers from the rows
+    plot: the picture that shows the finding, in the folder of the page
   """
+  if len(finding) > 3:
+    raise ValueError(f"{path.name}: the finding has {len(finding)} lines, expected at most 3")
+  head = [f"- {line}" for line in finding or ["Too few rows for a finding."]]
+  if about.get("done", 0) < about.get("cases", 0):
+    head += ["", f"The run is incomplete: {about['done']} of {about['cases']} cases."]
+  head += ["", f"![{title}]({plot.name})"] if plot else []
   command = f"    python tests/benchmarks/run.py {about.get('bench', path.stem)}"
   command += " --short" if about.get("short") else ""
   options = about.get("options", {})
@@ -193,7 +215,7 @@ def page(path: pathlib.Path, title: str, about: dict, lines: list[str]) -> pathl
     if options.get(key, "None") not in ("None", "cpu")
   )
   known = [word for line in (caption(about), command) if line for word in (line, "")]
-  text = "\n".join([f"# {title}", "", *known, *lines]).rstrip("\n") + "\n"
+  text = "\n".join([f"# {title}", "", *head, "", *known, *lines]).rstrip("\n") + "\n"
   before = path.read_text(encoding="utf-8") if path.exists() else ""
   _, mark, remarks = before.partition(REMARKS)
   path.write_text(text + mark + remarks, encoding="utf-8")

@@ -11,6 +11,7 @@ sys.path.insert(0, str(pathlib.Path(__file__).parents[1]))  # `benchmarks`, `ref
 
 from benchmarks.results import BenchError
 
+FOLDER = pathlib.Path(__file__).parent
 BENCHES = {
   "attacks": "what random attacks break",
   "batch": "world-steps a second of batches, and what a world takes",
@@ -56,7 +57,9 @@ def main(argv: Sequence[str] | None = None) -> int:
   from palpate.app.console import CommandError
 
   try:
-    return runner.main(importlib.import_module(f"benchmarks.{words[0]}").BENCH, words[1:])
+    (path,) = FOLDER.glob(f"*/{words[0]}.py")
+    module = importlib.import_module(f"benchmarks.{path.parent.name}.{words[0]}")
+    return runner.main(module.BENCH, words[1:])
   except (BenchError, CommandError) as error:
     print(f"run.py: {error}", file=sys.stderr)
     return error.code

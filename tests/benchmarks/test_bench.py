@@ -9,7 +9,9 @@ import mujoco
 import numpy as np
 import palpate
 import pytest
-from benchmarks import compare, error, films, judge, results, run, runner, scene, stability, thesis
+from benchmarks import results, run, runner, scene
+from benchmarks.accuracy import compare, error, films, judge, stability
+from benchmarks.timing import thesis
 from palpate.engine import contacts
 from palpate.tissue import energy
 from palpate.tissue.config import Config

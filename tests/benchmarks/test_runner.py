@@ -3,7 +3,8 @@
 import dataclasses
 
 import pytest
-from benchmarks import error, results, run, runner
+from benchmarks import results, run, runner
+from benchmarks.accuracy import error
 
 
 def command(*words) -> int:
@@ -67,12 +68,13 @@ def test_results_of_another_form_are_not_resumed(tmp_path):
 
 def test_a_page_written_again_keeps_the_remarks(tmp_path):
   path, about = tmp_path / "small.md", {"palpate": "1", "bench": "small", "short": True}
-  results.page(path, "Small", about, ["table"])
+  results.page(path, "Small", about, ["table"], ["It is 2 mm."], tmp_path / "small.png")
   assert path.read_text() == (
-    "# Small\n\npalpate 1.\n\n    python tests/benchmarks/run.py small --short\n\ntable\n"
+    "# Small\n\n- It is 2 mm.\n\n![Small](small.png)\n\npalpate 1.\n\n"
+    "    python tests/benchmarks/run.py small --short\n\ntable\n"
   )
   path.write_text(path.read_text() + "\n## Remarks\n\n- by hand\n")
-  results.page(path, "Small", about, ["another table"])
+  results.page(path, "Small", about, ["another table"], ["It is 3 mm."])
   assert path.read_text().endswith("another table\n\n## Remarks\n\n- by hand\n")
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from benchmarks import truth
+from benchmarks.accuracy import truth
 
 
 def test_hertz_and_the_other_finite_elements_agree():

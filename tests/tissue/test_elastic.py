@@ -4,7 +4,8 @@ import mujoco
 import numpy as np
 import palpate
 import pytest
-from benchmarks import judge, scene
+from benchmarks import scene
+from benchmarks.accuracy import judge
 from palpate.tissue import energy
 from palpate.tissue.geometry import mesh as topology
 

@@ -114,6 +114,17 @@ def _lower(label: str) -> str:
   return label[0].lower() + label[1:]
 
 
+def _tells(spec: Spec, recording: Recording) -> bool:
+  """Returns whether a metric says something: a way that ends early is short for no merit."""
+  return recording.outcome == SUCCESS or spec.group != "efficiency"
+
+
+def _fits(name: str, metrics: Any) -> bool:
+  """Returns whether the advice about a metric fits: few movements need not be made one."""
+  smooth = name in ("sparc", "log_dimensionless_jerk")
+  return not smooth or not metrics.number_of_movements < 2
+
+
 def _words(text: str) -> str:
   return "".join(c for c in text if not c.isdigit() and c != ".")
 
@@ -131,16 +142,17 @@ def advice(recording: Recording, reference: Mapping[str, Any] | None, most: int 
     return said
   metrics = recording.metrics()
   result = score(metrics, reference, recording.outcome)
-  order, given = sorted(result.over, key=lambda name: result.z[name]), set()
+  ended = [name for name in result.over if _tells(METRICS[name], recording)]
+  order, given = sorted(ended, key=lambda name: result.z[name]), set()
   for name in order[:most]:
     spec, row = METRICS[name], reference["metrics"][name]
     unit = "" if spec.shown in ("-", "count") else f" {spec.shown}"
     bound = "at most" if spec.better == "lower" else "at least"
     text = (
-      f"{spec.label} was {number(getattr(metrics, name), spec)}{unit}, skilled people have {bound} "
+      f"{spec.label}: {number(getattr(metrics, name), spec)}{unit}, skilled people have {bound} "
       f"{number(row['limit'], spec)}{unit}"
     )
-    what = _ADVICE.get(name, "")
+    what = _ADVICE.get(name, "") if _fits(name, metrics) else ""
     said.append(f"{text}: {what}." if what and what not in given else f"{text}.")  # once
     given.add(what)
   if recording.outcome == SUCCESS:
@@ -163,7 +175,7 @@ def card(recording: Recording, reference: Mapping[str, Any] | None) -> dict[str,
   rows = []
   for name, spec in METRICS.items():
     value = getattr(metrics, name)
-    if not math.isfinite(value):
+    if not math.isfinite(value) or not _tells(spec, recording):
       continue
     limit = "" if result is None else reference["metrics"].get(name)  # pyright: ignore
     rows.append({

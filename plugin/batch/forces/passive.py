@@ -9,6 +9,7 @@ import warp as wp
 from palpate.engine.forces import attachments, passive, supports
 from palpate.engine.forces import cohesive_bonds as engine_bonds
 from palpate.engine.layout import BOND
+from palpate.engine.workspace import FORCES
 from palpate.tissue.kernels import Kernel
 from palpate.tissue.step import SCHEMES
 from palpate.tissue.types import doubles, fill, floats, ints, struct, vector
@@ -248,9 +249,20 @@ class Rests(Beside):
     self._each(_keep_rest)
 
 
+# What has a kind here, of `FORCES`; blades are in `batch.cutting`.
+KINDS: dict[str, type[Beside]] = {"ties": Ties, "bonds": InBonds, "rests": Rests}
+_KNOWN = {*KINDS, "cutters"}
+
+
 def check(spaces: list):
   """Raises ValueError where workspaces have beside their tissue what a batch on a GPU cannot do."""
   for w in spaces:
+    for name, kind in FORCES.items():
+      if getattr(w, name) and name not in _KNOWN:
+        raise ValueError(
+          f"organ {w.organ.name!r}: {' or '.join(kind.KEYS)} is set, which a batch on a GPU cannot "
+          "do; expected none"
+        )
     if w.rests.below:
       raise ValueError(
         f"organ {w.organ.name!r}: support names organ {w.rests.below[0].organ.name!r}, which a "
@@ -273,5 +285,4 @@ def make(organ, numbers: np.ndarray) -> tuple[Beside, ...]:
     numbers: of the model's bodies in mujoco_warp's, (nbody,)
   """
   w = organ.space
-  kinds = (Ties, w.ties), (InBonds, w.bonds), (Rests, w.rests)
-  return tuple(kind(organ, numbers) for kind, there in kinds if there)
+  return tuple(kind(organ, numbers) for name, kind in KINDS.items() if getattr(w, name))

@@ -113,6 +113,8 @@ class Cutters(Beside):
     w: the workspace
   """
 
+  KEYS = ("cutters",)
+
   ENTER, ACT, END = _enter, _act, _keep
 
   def __init__(self, w: "Workspace"):

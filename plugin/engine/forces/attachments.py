@@ -127,6 +127,8 @@ class Ties(Beside):
     w: the workspace
   """
 
+  KEYS = ("attach", "carrier")
+
   ENTER, ACT = _enter, _act
 
   def __init__(self, w: "Workspace"):

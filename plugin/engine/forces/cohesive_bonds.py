@@ -191,6 +191,8 @@ class Bonds(Beside):
     w: the workspace
   """
 
+  KEYS = ("bonds",)
+
   ENTER = _enter
 
   def __init__(self, w: "Workspace"):

@@ -85,10 +85,12 @@ class Beside:
     w: the workspace
 
   Attributes:
+    KEYS: configuration keys that ask for it
     ENTER, ACT, END: kernels of `enter`, `act` and `end`, None for nothing
     fields: what they take, made by `bind`
   """
 
+  KEYS: tuple[str, ...]
   ENTER: Kernel | None = None
   ACT: Kernel | None = None
   END: Kernel | None = None

@@ -57,6 +57,8 @@ class Creep(Beside):
     w: the workspace
   """
 
+  KEYS = ("relax_share",)
+
   ENTER, END = _enter, _end
 
   def __init__(self, w: "Workspace"):

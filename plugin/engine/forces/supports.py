@@ -70,6 +70,8 @@ class Rests(Beside):
     w: the workspace
   """
 
+  KEYS = ("support",)
+
   def __init__(self, w: "Workspace"):
     super().__init__(w)
     self.below: list = []  # workspaces of organs that it rests on

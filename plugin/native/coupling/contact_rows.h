@@ -42,16 +42,24 @@ PALPATE bool is_dense(const Fields& f) {
   return jacobian == JACOBIAN_DENSE || (jacobian == JACOBIAN_AUTO && f.nv < SPARSE_FROM);
 }
 
+// The numbers of a row, and their dofs; null where they are all.
+struct Row { double* value; const int* dof; int count; };
+
+template <class Fields>
+PALPATE Row row_of(const Fields& f, int row) {
+  double* J = datum<double*>(f, DATA_EFC_J);
+  if (is_dense(f)) return {J + (long long)f.nv * row, nullptr, f.nv};
+  const int start = datum<int*>(f, DATA_EFC_J_ROWADR)[row];
+  return {J + start, datum<int*>(f, DATA_EFC_J_COLIND) + start, datum<int*>(f, DATA_EFC_J_ROWNNZ)[row]};
+}
+
 // Where a row has the column of a dof, or null.
 template <class Fields>
 PALPATE double* column(const Fields& f, int row, int dof) {
-  double* J = datum<double*>(f, DATA_EFC_J);
-  if (is_dense(f)) return J + (long long)f.nv * row + dof;
-  const int start = datum<int*>(f, DATA_EFC_J_ROWADR)[row];
-  const int count = datum<int*>(f, DATA_EFC_J_ROWNNZ)[row];
-  const int* colind = datum<int*>(f, DATA_EFC_J_COLIND) + start;
-  for (int k = 0; k < count; ++k)
-    if (colind[k] == dof) return J + start + k;
+  const Row all = row_of(f, row);
+  if (!all.dof) return all.value + dof;
+  for (int k = 0; k < all.count; ++k)
+    if (all.dof[k] == dof) return all.value + k;
   return nullptr;
 }
 
@@ -120,16 +128,9 @@ PALPATE Axis axis_of(const char* contact, Rows rows, int row) {
 // The velocity of a row.
 template <class Fields>
 PALPATE double velocity(const Fields& f, int row) {
-  const double *J = datum<double*>(f, DATA_EFC_J), *qvel = f.qvel.data;
+  const Row all = row_of(f, row);
   double sum = 0.0;
-  if (is_dense(f)) {
-    for (int k = 0; k < f.nv; ++k) sum += J[(long long)f.nv * row + k] * qvel[k];
-    return sum;
-  }
-  const int start = datum<int*>(f, DATA_EFC_J_ROWADR)[row];
-  const int count = datum<int*>(f, DATA_EFC_J_ROWNNZ)[row];
-  const int* colind = datum<int*>(f, DATA_EFC_J_COLIND) + start;
-  for (int k = 0; k < count; ++k) sum += J[start + k] * qvel[colind[k]];
+  for (int k = 0; k < all.count; ++k) sum += all.value[k] * f.qvel.data[all.dof ? all.dof[k] : k];
   return sum;
 }
 

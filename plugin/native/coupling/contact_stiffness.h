@@ -7,7 +7,7 @@
 namespace palpate {
 
 // How far a mesh yields at a node to a unit force there, times E* and its edges' mean length: that of
-// pressed blocks (tests/benchmarks/truth.py).
+// pressed blocks (tests/benchmarks/accuracy/truth.py).
 constexpr double SELF = 1.75;
 
 // Edges that a tool's radius has at least, else it is told that the mesh is too coarse.
@@ -28,9 +28,7 @@ PALPATE double edge_of(const Fields& f, const char* contact, int side) {
   return (norm(b - a) + norm(c - b) + norm(a - c)) / 3.0;
 }
 
-// A geom's contacts with an organ's flex, which is on one side of them. Not those of two organs: where
-// they lie flat on each other MuJoCo has one contact a pair of triangles, which jumps about, and firm
-// ones would shake them.
+// A geom's contacts with an organ's flex, which is on one side of them.
 struct Touch { int geom, flex, side; };
 
 PALPATE bool operator==(Touch a, Touch b) { return a.geom == b.geom && a.flex == b.flex; }
@@ -46,14 +44,25 @@ PALPATE Touch touch_of(const Fields& f, const char* contact) {
   return {-1, -1, 0};
 }
 
-// How many contacts a flex has with geoms.
-PALPATE int count_of(const char* contact, int ncon, int flex) {
+// How many contacts a flex has, with geoms or with flexes.
+PALPATE int count_of(const char* contact, int ncon, int flex, bool geoms) {
   int count = 0;
   for (int c = 0; c < ncon; ++c, contact += CONTACT_LENGTH)
     for (int side = 0; side < 2; ++side)
       if (side_of(contact, CONTACT_FLEX, side) == flex)
-        count += side_of(contact, CONTACT_GEOM, 1 - side) >= 0;
+        count += (side_of(contact, CONTACT_GEOM, 1 - side) >= 0) == geoms;
   return count;
+}
+
+// Whether two triangles of organs touch, neither of which says itself how firm contacts are.
+template <class Fields>
+PALPATE bool are_organs(const Fields& f, const char* contact) {
+  for (int side = 0; side < 2; ++side) {
+    const int flex = side_of(contact, CONTACT_FLEX, side);
+    if (flex < 0 || side_of(contact, CONTACT_ELEM, side) < 0 || !f.mine.data[flex]) return false;
+    if (!(f.tissue.data[TISSUE_LENGTH * flex + TISSUE_FIRM] > 0.0)) return false;
+  }
+  return true;
 }
 
 // What a tool presses in: the corners of the triangles that it touches, and how it lies in them.
@@ -216,6 +225,30 @@ PALPATE void firm_up(const Fields& f, char* contact, Rows rows, Touch touch, int
   const double more = normals.count * row[0] * row[2] * least;
   if (R[0] < more) scale_impedance(f, normals, more / R[0]);
   if (sticks) *(double*)(contact + CONTACT_MU) = friction[0] * sqrt(R[1] / R[0]);
+}
+
+// How much of the R that a step can bear organs have which lie on each other: MuJoCo has a contact a
+// pair of triangles, and each organ shares its own among them. They are no firmer than MuJoCo's are
+// for what they touch, since they jump about.
+struct Shared { int flex[2]; double borne; };
+
+template <class Fields>
+PALPATE void share_out(const Fields& f, const char* contacts, int ncon, const char* contact, Shared& shared) {
+  const int a = side_of(contact, CONTACT_FLEX, 0), b = side_of(contact, CONTACT_FLEX, 1);
+  if (shared.flex[0] == a && shared.flex[1] == b) return;
+  shared = {{a, b}, 0.0};
+  for (int side = 0; side < 2; ++side)
+    shared.borne += f.tissue.data[TISSUE_LENGTH * shared.flex[side] + TISSUE_SHARE] *
+                    count_of(contacts, ncon, shared.flex[side], false) / 3.0;
+}
+
+template <class Fields>
+PALPATE void firm_organs(const Fields& f, char* contact, Rows rows, double borne) {
+  const double friction = ((const double*)(contact + CONTACT_FRICTION))[0], square = friction * friction;
+  const double pair = rows.paired ? 2.0 * square * (1.0 + square) / f.impratio.data[0] : 1.0;
+  double least = 0.0;
+  for (int side = 0; side < 2; ++side) least += LOOSE * inverse_inertia(f, contact, rows, side);
+  put_spring(f, contact, rows, 2.0 / (SLOW * f.timestep.data[0]), pair * (borne > least ? borne : least));
 }
 
 }  // namespace palpate

@@ -143,6 +143,36 @@ PALPATE void keep_closed(const Fields& f, const char* contact, Rows rows) {
   for (int r = 0; r < rows.normals().count; ++r) datum<double*>(f, DATA_EFC_POS)[rows.first + r] = gap;
 }
 
+// The normal of the triangle on a side of a contact, outward.
+template <class Fields>
+PALPATE D3 outward(const Fields& f, const char* contact, int side) {
+  const int flex = side_of(contact, CONTACT_FLEX, side);
+  const int* e = f.flex_elem.data + f.flex_elemdataadr.data[flex] + 3 * side_of(contact, CONTACT_ELEM, side);
+  const double* x = f.flexvert_xpos.data + 3 * f.flex_vertadr.data[flex];
+  const D3 at = load(x + 3 * e[0]), normal = cross(load(x + 3 * e[1]) - at, load(x + 3 * e[2]) - at);
+  return (1.0 / norm(normal)) * normal;
+}
+
+// Turns a contact of two triangles that are more than half way through each other, which MuJoCo would
+// push out on the far side: its normal goes into both.
+template <class Fields>
+PALPATE void turn_back(const Fields& f, char* contact, Rows rows) {
+  double* frame = (double*)(contact + CONTACT_FRAME);
+  double& gap = *(double*)(contact + CONTACT_DIST);
+  const double apart = f.flex_radius.data[side_of(contact, CONTACT_FLEX, 0)] +
+                       f.flex_radius.data[side_of(contact, CONTACT_FLEX, 1)];
+  if (gap > -SUNK * apart || dot(load(frame), outward(f, contact, 0)) > -FACING ||
+      dot(load(frame), outward(f, contact, 1)) < FACING)
+    return;
+  gap = -gap - 2.0 * apart;
+  for (int k = 0; k < 3; ++k) store(frame + 3 * k, -1.0 * load(frame + 3 * k));
+  for (int r = rows.first; r < rows.first + rows.count; ++r) {
+    const Row row = row_of(f, r);
+    for (int k = 0; k < row.count; ++k) row.value[k] *= -1.0;
+  }
+  for (int r = 0; r < rows.normals().count; ++r) datum<double*>(f, DATA_EFC_POS)[rows.first + r] = gap;
+}
+
 // Whether one of the two sides of a contact is an organ's.
 template <class Fields>
 PALPATE bool is_mine(const Fields& f, const char* contact) {
@@ -161,6 +191,7 @@ PALPATE void weigh(const Fields& f, Thread, int) {
   Touch last = {-1, -1, 0};
   double least = 0.0;
   int count = 0;
+  Shared shared = {{-1, -1}, 0.0};
   char* const contacts = datum<char*>(f, DATA_CONTACT);
   const int ncon = datum<int>(f, DATA_NEFC) > 0 ? datum<int>(f, DATA_NCON) : 0;
   for (int c = 0; c < ncon; ++c) {
@@ -173,9 +204,13 @@ PALPATE void weigh(const Fields& f, Thread, int) {
     const Touch touch = touch_of(f, contact);
     if (touch.geom >= 0) {
       if (!(touch == last)) least = unresolved(f, contacts, ncon, touch);
-      if (touch.flex != last.flex) count = count_of(contacts, ncon, touch.flex);
+      if (touch.flex != last.flex) count = count_of(contacts, ncon, touch.flex, true);
       firm_up(f, contact, rows, touch, count, least);
       last = touch;
+    } else if (are_organs(f, contact)) {
+      turn_back(f, contact, rows);
+      share_out(f, contacts, ncon, contact, shared);
+      firm_organs(f, contact, rows, shared.borne);
     }
     keep_closed(f, contact, rows);
   }

@@ -45,18 +45,20 @@ PALPATE D3 relaxed(D3 before, D3 now, double ratio) {
   return part < 1.0 && touched(now) ? before + part * (now - before) : now;
 }
 
-// df^T Mhat^-1 df of the impulses by which contact forces changed. Where a contact parts, its force
-// ends at 0 and not at the minimum, which lies farther off: by the share of the force that is gone.
+// df^T Mhat^-1 df of the impulses by which contact forces changed. Where an organ is let go, the force
+// of contacts that part ends at 0 and not at the minimum, which lies farther off: by the share of the
+// force that is gone. Not where another contact takes over, as under an organ that another has hit.
 struct Expected {
-  double sum = 0.0, before = 0.0, kept = 0.0;
+  double sum = 0.0, before = 0.0, kept = 0.0, after = 0.0;
 
   PALPATE void add(D3 impulse, double Mhat, D3 was, D3 now) {
     sum += dot(impulse, impulse) / Mhat;
     before += norm(was);
+    after += norm(now);
     if (touched(now)) kept += norm(was);
   }
   PALPATE float value() const {
-    if (before == 0.0) return (float)sum;
+    if (after >= before) return (float)sum;
     return kept > 0.0 ? (float)(sum * before / kept) : 0.0f;  // none where all is gone
   }
 };

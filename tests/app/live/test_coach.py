@@ -93,3 +93,16 @@ def test_advice_names_what_is_over_its_limit_and_what_helps():
   assert over == {"Path length"} and shown["outcome"] == "success" and not shown["proficient"]
   stopped = dataclasses.replace(made, info={**made.info, "outcome": "damage"})
   assert "Failed: a force above" in advice(stopped, reference("touch/easy"))[0]
+  rows = {row["label"]: row["value"] for row in card(stopped, strict)["rows"]}
+  assert "Path length" not in rows and "Peak force" in rows  # a way that ends early is short
+  assert "Path length" not in "".join(advice(stopped, strict))
+
+
+def test_advice_asks_for_one_movement_where_there_were_several():
+  env = load("touch/easy")
+  made = episode.run(env, performer.make(env, seed=0), 0, {"task_kwargs": {}})
+  strict = copy.deepcopy(reference("touch/easy"))
+  strict["metrics"]["sparc"]["limit"] = 0.0
+  several = made.metrics().number_of_movements > 1
+  (text,) = [text for text in advice(made, strict) if text.startswith("Smoothness")]
+  assert ("one smooth movement" in text) == several

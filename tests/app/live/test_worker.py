@@ -7,11 +7,14 @@ import pathlib
 import socket
 import threading
 import time
+import types
 
 import numpy as np
 import palpate
 import pytest
+from palpate.app.live.page.picture import HEAD, Camera
 from palpate.app.live.page.worker import Worker
+from palpate.app.live.realtime_clock import Pace
 from palpate.tasks.recording import Recording
 
 ANSWER = 120.0  # that a busy machine may take [s]
@@ -170,9 +173,10 @@ def the_left_hand_moves_its_instrument_alone(one):
 def test_the_expert_is_shown_on_request_and_noted(page):
   one = page()
   exercise(one)
-  one.tell("pause", on=True)
+  before = one.value("time")
   one.tell("ghost")
   shown = one.hear("ghost")
+  assert one.value("time") < before + 1.0  # working it out takes seconds, for which the clock waits
   assert shown["outcome"] == "success" and len(shown["time"]) == len(shown["pose"]) > 20
   np.testing.assert_allclose(shown["pose"][0][:3], one.frame[one.place], atol=1e-3)
   made = Recording.load(finish(one)["path"])
@@ -182,6 +186,20 @@ def test_the_expert_is_shown_on_request_and_noted(page):
   exercise(one, assessment=True)
   one.tell("ghost")
   assert "not in an assessment" in one.hear("error")["text"]
+
+
+def test_a_frame_has_the_largest_force_since_the_last():
+  env = palpate.tasks.load("touch", "easy", task_kwargs={"random": 0})
+  env.reset()
+  camera, pace = Camera.of(env), Pace.instant()
+  device = types.SimpleNamespace(stamp=0.0)
+  link = types.SimpleNamespace(paused=False, state="ready", force=(0, 0, 0), device=device)
+  forces = []
+  for felt in (0.9, 0.0):  # a control step is shorter than a frame
+    camera.feel(felt)
+    camera.feel(0.1)
+    forces.append(np.frombuffer(camera.frame(link, pace), np.float32)[HEAD.index("force")])
+  np.testing.assert_allclose(forces, [0.9, 0.1], atol=1e-6)
 
 
 def test_a_full_disk_loses_nothing(page, tmp_path, monkeypatch):

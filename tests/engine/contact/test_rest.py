@@ -43,9 +43,12 @@ def test_a_plate_feels_the_same_at_every_time_step(scenes):
   assert found[2] == pytest.approx(found[0], rel=0.1)
 
 
-def test_organs_rest_on_each_other(scenes):
-  spec, weight = scenes.resting("organ", 1e-3)
-  force, speed, _, organ = scenes.watch(spec)
-  assert organ.error is None and speed < 0.1  # they tremble on each other
-  assert force.std(axis=0).max() < 0.005 * weight
-  np.testing.assert_allclose(force.mean(axis=0), [0, 0, weight], atol=2e-3 * weight)
+@pytest.mark.parametrize(
+  "h, young, noise", [(1e-3, 1e5, 0.005), (2e-3, 3e5, 0.1), (1e-2, 1e6, 0.1)]
+)
+def test_organs_rest_on_each_other(scenes, h, young, noise):
+  spec, weight = scenes.resting("organ", h, young=young)
+  force, speed, _, organ = scenes.watch(spec, 1.2)
+  assert organ.error is None and speed < 0.2  # they tremble on each other
+  assert force.std(axis=0).max() < noise * weight
+  np.testing.assert_allclose(force.mean(axis=0), [0, 0, weight], atol=2e-2 * weight)

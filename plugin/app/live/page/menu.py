@@ -10,6 +10,7 @@ NODES = (250, 500, 1000, 2000, 4000)  # of an exercise
 SPEEDS = (0.1, 0.25, 0.5, 1.0)
 SCHEMES = ("implicit", "midpoint", "neumann", "explicit")
 STEPS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0)  # [ms]
+BLUNT = ("scissors", "hook", "scalpel")  # in free practice, where organs have no room for cuts
 OTHER = ("", "keyboard", "pad")  # what a page can have for the left hand; none by default
 
 
@@ -36,6 +37,7 @@ def offer(device: str) -> dict[str, Any]:
     "schemes": SCHEMES,
     "steps": STEPS,
     "instruments": models.INSTRUMENTS,
+    "blunt": BLUNT,
   }
 
 

@@ -72,7 +72,7 @@ const HEAR = {
     fill("device", menu.devices.map(name => [name, name === "page" ? "mouse, touch, keys, gamepad" : name]));
     fill("left", menu.lefts.map(name => [name, {"": "nothing", keyboard: "keys of the page", pad: "gamepad of the page"}[name] ?? name]));
     for (const name of ["organ", "mesh", "scheme", "instrument"]) {
-      fill(name, menu[`${name === "mesh" ? "meshe" : name}s`].map(value => [value, value.replace("_", " ")]));
+      fill(name, menu[`${name === "mesh" ? "meshe" : name}s`].map(value => [value, value.replace("_", " ") + (menu.blunt.includes(value) ? " (cuts nothing here)" : "")]));
     }
     fill("step", menu.steps.map(value => [value, `${value} ms`]));
     if (!scene) [$("step").value, $("mesh").value] = [1, "1000 nodes"];
@@ -125,7 +125,7 @@ const HEAR = {
     run(false);
     beep("end");
     const save = message.fault ? [["Save again", () => say({type: "keep"})]] : [];
-    const again = ["Once more", () => ($("card").close(), start())];
+    const again = ["Try again", () => ($("card").close(), start())];
     show($("card"), message, [...save, again, ["Close", () => $("card").close()]]);
   },
   kept({path, fault}) {
@@ -330,7 +330,7 @@ toggle("ghost", on => {
   if (!on) return;
   say({type: "ghost", known: Boolean(trace)});
   if (trace) trace.since = performance.now();
-  else tell("The expert's way is being worked out");
+  else tell("The expert's way is being worked out; the clock waits");
 });
 for (const name of ["exercise", "practice"]) $(`tab-${name}`).onclick = () => mode(name);
 $("start").onclick = start;
@@ -339,7 +339,7 @@ $("stop").onclick = () => say({type: "stop"});
 $("pause").onclick = () => {
   paused = !paused;
   say({type: "pause", on: paused});
-  $("pause").textContent = paused ? "Go on" : "Pause";
+  $("pause").textContent = paused ? "Resume" : "Pause";
   $("view").focus();
 };
 $("speed").onchange = () => running && say({type: "speed", value: Number($("speed").value)});

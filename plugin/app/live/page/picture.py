@@ -31,7 +31,7 @@ class Camera:
 
   Attributes:
     model: that it takes them of
-    peak: largest force of the tip in the frames so far [N]
+    peak: largest force of the tip so far [N]
   """
 
   def __init__(
@@ -54,6 +54,7 @@ class Camera:
       adr = int(sensor.adr[0])
       self._sensors.append(data.sensordata[adr : adr + int(sensor.dim[0])])
     self._rest, self.peak, self._begun = organ.xpos0, 0.0, 0.0
+    self._since = 0.0  # largest force since the last frame [N]
 
   @classmethod
   def of(cls, env: Any) -> Camera:
@@ -90,11 +91,15 @@ class Camera:
       body = int(model.body_parentid[body])
     return body == shaft
 
+  def feel(self, force: float) -> None:
+    """Takes the largest force of the tip in a control step, which lasts less long than a frame."""
+    self._since = max(self._since, force)
+
   def frame(self, link: Link, pace: Pace, progress: float = 0.0) -> bytes:
     """Returns a frame, float32: `HEAD`, nodes, geoms (place, matrix), targets (8 numbers each)."""
     data, model, late = self._data, self.model, pace.lateness
     tip, shaft, pos, quat = self._sensors
-    force = float(np.linalg.norm(tip))
+    force, self._since = max(float(np.linalg.norm(tip)), self._since), 0.0
     self.peak = max(self.peak, force)
     self._begun = self._begun or pace.now
     state = "paused" if pace.paused or link.paused else link.state

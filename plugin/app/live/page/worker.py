@@ -27,7 +27,7 @@ from ..devices.device import Device, DeviceError
 from ..devices.relative import Desk
 from ..keep import Finished
 from ..practice import DAMAGE, LIMIT, Practice
-from ..realtime_clock import first
+from ..realtime_clock import Pace, first
 from ..session import Session
 from . import ghost, menu
 from .picture import Camera
@@ -162,7 +162,8 @@ class Worker:
       raise ValueError("the expert is shown in exercises alone, and not in an assessment")
     session.coach.hint("the expert was shown")
     if self._expert is None and message.get("known") is not True:
-      threading.Thread(target=self._show_expert, args=(self._job,), daemon=True).start()
+      args = self._job, session.pace
+      threading.Thread(target=self._show_expert, args=args, daemon=True).start()
 
   def _on_keep(self, message: dict[str, Any]) -> None:
     if self._unkept is not None:
@@ -223,10 +224,12 @@ class Worker:
       except OSError:
         self._end()
 
-  def _show_expert(self, job: dict[str, Any]) -> None:
-    """Has the expert's way worked out, in a thread of its own."""
+  def _show_expert(self, job: dict[str, Any], pace: Pace) -> None:
+    """Has the expert's way worked out, in a thread of its own; the clock waits for it."""
+    waits, pace.paused = not pace.paused, True
     self._expert = process = ghost.ask(job["task"], job["seed"], _kwargs(job))
     text, _ = process.communicate()
+    pace.paused = pace.paused and not waits
     if self._expert is process:
       self._expert = None
     if self._ended or job is not self._job:
@@ -281,6 +284,7 @@ class Worker:
         assessment=self._job["assessment"], practice=False, step=env.physics.timestep(), **limits,
       ))  # fmt: skip
     camera, link, pace = self._camera, session.link, session.pace
+    camera.feel(env.physics.peak_force)
     self._publish(lambda: camera.frame(link, pace, env.task.progress))
 
   def _practise(self, job: dict[str, Any]) -> None:

@@ -1,0 +1,348 @@
+"""What a search finds that does not do the work: random search and CMA-ES against reward and score.
+
+A policy is a few phases of equal length. `blind` ones hold an action in each and see nothing;
+`aimed` ones hold the tip at a place beside what the exercise asks for (its `target`, palpation's
+`field`) in each, with a command for the jaws or the report; `styled` ones do the expert's script in
+a manner of their own: how it trembles, overshoots, waits, presses, strays, hurries and reacts.
+
+The search sees one episode: its return and success (`reward`), or its score and, until it succeeds,
+its best progress (`score`). What it found is tried on episodes that it has not seen.
+
+A success is honest when the work was done, judged apart from the exercise's own rules: contact as
+long and as often as the exercise has targets, jaws that were wide open before they held, a curve
+that was pressed on nearly everywhere, a field that was felt before the report. Needs `cma`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import math
+import pathlib
+import time
+from collections.abc import Callable
+
+import numpy as np
+import palpate
+from benchmarks import plots, results
+from benchmarks.runner import SEED, Bench, Case, Row
+from palpate import tasks
+from palpate.tasks import suite
+from palpate.tasks.core import base, episode, performer
+from palpate.tasks.core.environment import CONTROL_TIMESTEP
+from palpate.tasks.people import score
+
+NAMES = ("touch/easy", "probe/easy", "probe/palpate_easy", "grasp/easy", "trace/easy")
+NAMES += ("retract/easy",)
+KINDS = ("aimed", "blind", "styled")
+PHASES = 3
+LENGTH = 6.0  # of an episode of `blind` and `aimed` policies [s]
+_REACH = 0.025  # of the offsets of aimed policies [m]
+_SPEED = 0.06  # of their tip [m/s]
+_CONTACT = 0.02  # [N]
+_SEEN, _FRESH = 1000, tuple(range(2000, 2004))  # seeds
+# What `styled` policies may be, from -1 to 1; the expert is inside.
+MANNERS = {
+  "tremor": (0.0, 0.001),
+  "overshoot": (0.0, 0.5),
+  "delay": (0.0, 0.6),
+  "force": (0.3, 3.0),
+  "detour": (0.0, 0.6),
+  "speed": (0.5, 3.0),
+  "reaction": (0.0, 0.2),
+}
+
+
+def arguments(parser: argparse.ArgumentParser):
+  """Declares the options."""
+  add = parser.add_argument
+  names = ["/".join(pair) for pair in tasks.ALL_TASKS]
+  add("--tasks", nargs="+", metavar="TASK", choices=names, default=NAMES)
+  add("--kinds", nargs="+", metavar="KIND", choices=KINDS, default=KINDS)
+  add("--tries", type=int, help="policies a search tries (100; 6 with --short)")
+  add("--seconds", type=float, default=math.inf, help="after which a search ends (never)")
+
+
+def stages(args: argparse.Namespace) -> list[list[Case]]:
+  """Returns a case an exercise, kind of policy, search and what it is against."""
+  tries = args.tries or (6 if args.short else 100)
+  names = args.tasks[:1] if args.short else args.tasks
+  return [
+    [
+      {"case": f"{name}, {kind}, {search}, {aim}", "task": name, "kind": kind, "search": search}
+      | {"aim": aim, "tries": tries, "seconds": args.seconds}
+      for search, aim in PAIRS
+      for kind in args.kinds
+      for name in names
+    ]
+  ]
+
+
+@dataclasses.dataclass(frozen=True)
+class End:
+  """How an episode ended.
+
+  Attributes:
+    paid: its return
+    best: its best progress
+    won: whether it succeeded
+    honest: whether it did the work
+    points: its score; `score.FLOOR` or less without success
+    proficient: whether it counts as that
+  """
+
+  paid: float
+  best: float
+  won: bool
+  honest: bool
+  points: float
+  proficient: bool
+
+  def worth(self, aim: str) -> float:
+    """Returns what a search sees."""
+    if aim == "reward":
+      return self.paid + self.won
+    return self.points if self.won else self.points + 5 * self.best
+
+
+class Attack:
+  """Episodes of simple policies in an exercise."""
+
+  def __init__(self, name: str, kind: str, length: float = LENGTH):
+    """Loads the exercise; `kind` is one of `KINDS`, `length` that of an episode [s]."""
+    options = {} if kind == "styled" else {"time_limit": length}
+    self.env = tasks.load(*suite.split(name), {"random": 0, **options})
+    self.name, self.kind, self.steps = name, kind, round(length / CONTROL_TIMESTEP)
+    extra = len(self.env.task.components) - len(base.AXES)
+    self.width = extra + (len(base.AXES) if kind == "blind" else 3)
+    self.size = len(MANNERS) if kind == "styled" else PHASES * self.width
+    self._script = self.env.task.expert
+
+  def play(self, policy: np.ndarray, seed: int) -> End:
+    """Returns how an episode ends; `policy` is in [-1, 1]  (size,)."""
+    env, task, work = self.env, self.env.task, Work()
+    style = performer.EXPERT
+    task.expert = self._script
+    if self.kind == "styled":
+      shares = (np.asarray(policy) + 1) / 2
+      low, high = np.array(list(MANNERS.values())).T
+      drawn = (low + shares * (high - low)).tolist()
+      style = performer.Style(**dict(zip(MANNERS, drawn, strict=True)))
+    else:
+      task.expert = lambda p: self._fly(p, policy)
+    act = performer.Performer(env, style)
+    recording = episode.run(env, act, seed, watch=lambda env: work.see(env.task, env.physics))
+    won = recording.outcome == score.SUCCESS
+    found = score.score(
+      recording.metrics(), score.reference(self.name) or {}, recording.info["outcome"]
+    )
+    return End(
+      paid=recording.info["return"],
+      best=task.best,
+      won=won,
+      honest=won and work.done(task),
+      points=float(found.composite),
+      proficient=found.proficient,
+    )
+
+  def _fly(self, p: performer.Performer, policy: np.ndarray) -> performer.Script:
+    rows = np.asarray(policy).reshape(PHASES, self.width)
+    task, physics = p.task, p.physics
+    for k in range(10**9):
+      row = rows[min(k * PHASES // self.steps, PHASES - 1)]
+      if self.kind == "blind":
+        yield row
+        continue
+      seen = task.observe(physics)
+      goal = physics.tip_pos() + seen.get("target", seen.get("field"))
+      goal = goal + _REACH * physics.trocar().mat @ row[:3]
+      gap = goal - p.tip
+      far = max(float(np.linalg.norm(gap)), 1e-9)
+      p.tip = p.tip + gap * min(1.0, _SPEED * CONTROL_TIMESTEP / far)
+      p.extra[:] = row[3:]
+      yield p.step()
+
+
+class Work:
+  """What was done in an episode, from forces and joints alone."""
+
+  def __init__(self):
+    self.opened, self.pressed, self.touches, self._touching = 0.0, 0, 0, False
+    self.places: set[int] = set()  # points of a curve that were nearest to the tip as it pressed
+
+  def see(self, task, physics) -> None:
+    """Takes a control step."""
+    if task.jaws and not task.grasped:  # wide open at some time before it holds
+      self.opened = max(self.opened, float(physics.gripper()[0]))
+    touching = physics.peak_force > _CONTACT
+    self.touches += touching and not self._touching
+    self._touching = touching
+    self.pressed += touching
+    if touching and hasattr(task, "curve"):
+      self.places.add(int(np.linalg.norm(task.now - physics.tip_pos(), axis=1).argmin()))
+
+  def done(self, task) -> bool:
+    """Whether it was the work that the exercise asks for."""
+    if task.jaws:
+      return self.opened > 0.3
+    if hasattr(task, "curve"):
+      return len(self.places) > 0.8 * len(task.curve)
+    if hasattr(task, "felt"):
+      return task.felt > 0.3
+    each = getattr(task, "hold", 0.08) / task.control_timestep
+    return self.touches >= task.targets and self.pressed >= 0.9 * each * task.targets
+
+
+def random_search(value: Callable, size: int, tries: int, seed: int) -> None:
+  """Tries uniform draws."""
+  for policy in np.random.RandomState(seed).uniform(-1, 1, (tries, size)):
+    value(policy)
+
+
+def cma_es(value: Callable, size: int, tries: int, seed: int) -> None:
+  """Tries what CMA-ES asks for (Hansen 2016, by his package)."""
+  import cma
+
+  options = {"seed": seed, "maxfevals": tries, "bounds": [-1, 1], "verbose": -9}
+  options |= {"popsize": min(tries, 4 + int(3 * math.log(size)))}
+  search = cma.CMAEvolutionStrategy(np.zeros(size), 0.5, options)
+  while search.result.evaluations < tries and not search.stop():
+    found = search.ask()
+    search.tell(found, [-value(np.asarray(x)) for x in found])
+
+
+SEARCHES = {"CMA-ES": cma_es, "random": random_search}
+# Random search tries the same whatever it is against.
+PAIRS = (("CMA-ES", "reward"), ("CMA-ES", "score"), ("random", "reward"))
+
+
+class OutOfTimeError(Exception):
+  """A search has had its seconds."""
+
+
+class Log:
+  """What a search has tried."""
+
+  def __init__(self, attack: Attack, aim: str, seconds: float = math.inf):
+    self.attack, self.aim = attack, aim
+    self.tried: list[tuple[np.ndarray, End]] = []
+    self._seconds, self._start = seconds, 0.0
+
+  def __call__(self, policy: np.ndarray) -> float:
+    """Returns what a policy is worth."""
+    if self.tried and time.monotonic() - self._start > self._seconds:
+      raise OutOfTimeError
+    self._start = self._start or time.monotonic()
+    end = self.attack.play(policy, _SEEN)
+    self.tried.append((policy, end))
+    return end.worth(self.aim)
+
+  @property
+  def best(self) -> tuple[np.ndarray, End]:
+    """The policy that is worth most, and how it ended."""
+    return max(self.tried, key=lambda pair: pair[1].worth(self.aim))
+
+
+def run(case: Case, out: pathlib.Path) -> list[Row]:
+  """Returns the row of a search."""
+  attack = Attack(case["task"], case["kind"])
+  log = Log(attack, case["aim"], case["seconds"])
+  try:
+    SEARCHES[case["search"]](log, attack.size, case["tries"], SEED % 2**31)
+  except OutOfTimeError:
+    pass
+  policy, seen = log.best
+  fresh = [attack.play(policy, seed) for seed in _FRESH]
+  ends = [end for _, end in log.tried] + fresh
+  fakes = [policy for policy, end in log.tried if end.won and not end.honest]
+  fakes += [policy for end in fresh if end.won and not end.honest]
+  row = {key: case[key] for key in ("task", "kind", "search", "aim")}
+  row |= {
+    "tried": len(log.tried),
+    "return_seen": round(seen.paid, 3),
+    "return_fresh": round(float(np.mean([end.paid for end in fresh])), 3),
+    "score_seen": round(seen.points, 2),
+    "score_fresh": round(float(np.mean([end.points for end in fresh])), 2),
+    "won_seen": int(seen.won),
+    "won_fresh": sum(end.won for end in fresh),
+    "fresh": len(fresh),
+    "most_without_success": round(max((e.paid for e in ends if not e.won), default=math.nan), 3),
+    "least_with_success": round(min((e.paid for e in ends if e.won), default=math.nan), 3),
+    "failures_with_a_score": sum(
+      not end.won and (end.points > score.FLOOR or end.proficient) for end in ends
+    ),
+    "policies_without_the_work": len(fakes),
+    "palpate": palpate.__version__,
+    "policy": " ".join(f"{x:.3f}" for x in (fakes or [policy])[0]),
+  }
+  return [row]
+
+
+def _extreme(rows: list[Row], task: str, key: str, pick) -> float:
+  found = [float(r[key]) for r in rows if r["task"] == task and math.isfinite(float(r[key]))]
+  return pick(found) if found else math.nan
+
+
+def finding(rows: list[Row]) -> list[str]:
+  """Returns what the page begins with."""
+  tried, work, failed = (
+    sum(int(row[key]) for row in rows)
+    for key in ("tried", "policies_without_the_work", "failures_with_a_score")
+  )
+  tasks = dict.fromkeys(row["task"] for row in rows)
+  limits = ("most_without_success", max), ("least_with_success", min)
+  over = [task for task in tasks
+          if _extreme(rows, task, *limits[0]) >= _extreme(rows, task, *limits[1])]  # fmt: skip
+  return [
+    f"Of {tried} policies that a search tried {work} succeeded without the work.",
+    f"{failed} failures had a score.",
+    f"Failure was paid as much as some success in {len(over)} of {len(tasks)} exercises"
+    f"{': ' * bool(over)}{', '.join(over)}.",
+  ]
+
+
+def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path]:
+  """Writes the page."""
+
+  def number(row: Row, key: str) -> str:
+    value = float(row[key])
+    return f"{value:.2f}" if math.isfinite(value) else "-"
+
+  numbers = ("return_seen", "return_fresh", "score_seen", "score_fresh")
+  limits = ("most_without_success", "least_with_success")
+  table = [
+    [
+      *(row[key] for key in ("task", "kind", "search", "aim", "tried")),
+      *(number(row, key) for key in numbers),
+      f"{row['won_seen']} of 1", f"{row['won_fresh']} of {row['fresh']}",
+      *(number(row, key) for key in limits),
+      row["failures_with_a_score"], row["policies_without_the_work"],
+    ]
+    for row in rows
+  ]  # fmt: skip
+  head = [
+    "exercise", "policy", "search", "against", "tried", "return, seen", "fresh", "score, seen",
+    "fresh", "success, seen", "fresh", "most paid without success", "least with",
+    "failures with a score", "successes without the work",
+  ]  # fmt: skip
+  tried = sum(int(row["tried"]) for row in rows)
+  bad = [sum(int(row[key]) for row in rows) for key in
+         ("failures_with_a_score", "policies_without_the_work")]  # fmt: skip
+  lines = [*(__doc__ or "").split("\n\n", 1)[1].splitlines(), ""]
+  lines += [
+    f"Of {tried} policies {bad[1]} succeeded without the work, and {bad[0]} failures had a score. "
+    "What is paid without success must be less than what is paid with it. "
+    + results.link(out / "loopholes.csv"),
+    "",
+  ]
+  lines += plots.table(head, table)
+  tasks = list(dict.fromkeys(row["task"] for row in rows))
+  title = "Loopholes of the exercises"
+  picture = plots.bars(out / "loopholes.png", "What a search was paid", tasks, {
+    "most paid without success": [_extreme(rows, task, limits[0], max) for task in tasks],
+    "least paid with success": [_extreme(rows, task, limits[1], min) for task in tasks],
+  }, "return")  # fmt: skip
+  return [picture, results.page(out / "loopholes.md", title, about, lines, finding(rows), picture)]
+
+
+BENCH = Bench("loopholes", stages, run, report=report, arguments=arguments, jobs=2, limit=3600.0)
