@@ -37,7 +37,7 @@ _ASTRAY = 1e-9  # distance of a slot from its node that rounding does not explai
 
 
 # What acts on an organ beside its tissue, in that order: attributes of a workspace. A batch reads
-# it too, and refuses on a GPU what it has not.
+# it too, and on a GPU refuses what it has not.
 FORCES: dict[str, type[Beside]] = {
   "ties": Ties,
   "bonds": Bonds,

@@ -250,7 +250,7 @@ class Rests(Beside):
 
 
 # What has a kind here, of `FORCES`; blades are in `batch.cutting`.
-KINDS: dict[str, type[Beside]] = {"ties": Ties, "bonds": InBonds, "rests": Rests}
+KINDS: dict[str, Any] = {"ties": Ties, "bonds": InBonds, "rests": Rests}
 _KNOWN = {*KINDS, "cutters"}
 
 
