@@ -1,4 +1,4 @@
-"""Bonds, attachments and supports in batches are those of the plugin, in each world its own."""
+"""What acts beside the tissue in batches is what the plugin has, in each world its own."""
 
 import mujoco
 import numpy as np
@@ -39,7 +39,7 @@ def scene():
   organs.append(
     windowed(block + np.array([0.0715, 0, -0.01]), blocks, "one", "w1", "3 3 1", **KEYS | on)
   )
-  on = {"foundation": 1e4, "mass": 0.02}
+  on = {"foundation": 1e4, "mass": 0.02, "relax_share": 0.6, "relax_time": 0.05}
   organs.append(
     windowed(block + np.array([0.0715, 0, 0.02]), blocks, "two", "w2", "3 3 1", **KEYS | on)
   )

@@ -42,9 +42,6 @@ def test_what_hangs_on_an_organs_nodes(extra):
 
 
 def test_what_acts_beside_the_tissue_and_has_no_kind_in_worlds(monkeypatch):
-  with pytest.raises(ValueError, match="organ 'organ': relax_share is set, which a batch on a GPU"):
-    make(press(subdivisions=1, relax_share=0.3))
-
   class Tide(Beside):
     KEYS = ("tide",)
 

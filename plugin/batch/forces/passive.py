@@ -1,4 +1,4 @@
-"""What holds an organ of `Worlds`: bonds, attachments and supports; kernels are the plugin's."""
+"""What acts beside the tissue of an organ of `Worlds`; kernels are the plugin's."""
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 import warp as wp
-from palpate.engine.forces import attachments, passive, supports
+from palpate.engine.forces import attachments, passive, relaxation, supports
 from palpate.engine.forces import cohesive_bonds as engine_bonds
-from palpate.engine.layout import BOND
+from palpate.engine.layout import BOND, FLAG
 from palpate.engine.workspace import FORCES
+from palpate.tissue import body as bodies
 from palpate.tissue.kernels import Kernel
 from palpate.tissue.step import SCHEMES
 from palpate.tissue.types import doubles, fill, floats, ints, struct, vector
@@ -27,6 +28,7 @@ WorldTied = in_worlds(
   attachments.Tied, ("point", "force"), _PARTS | {"number": _number, "dvel_warm": vector}
 )
 WorldRest = in_worlds(supports.Rest, REST_ROWS, _PARTS)
+WorldCreeping = in_worlds(relaxation.Creeping, ("own",), {})
 
 
 @struct
@@ -50,6 +52,7 @@ _enter_ties, _act_ties = kernels("forces/attachments.h", WorldTied, *attachments
 _find, _press, _act_rest, _feel_rest, _keep_rest = kernels(
   "forces/supports.h", WorldRest, *supports.KERNELS
 )
+_enter_creep, _end_creep = kernels("forces/relaxation.h", WorldCreeping, *relaxation.KERNELS)
 
 
 class InBonds(Beside):
@@ -249,8 +252,46 @@ class Rests(Beside):
     self._each(_keep_rest)
 
 
+class Creep(Beside):
+  """Stress relaxation of an organ."""
+
+  def __init__(self, organ, numbers: np.ndarray):
+    super().__init__(organ)
+    w, body, h = organ.space, organ.body, organ.batch.bare.opt.timestep
+    bodies.hold(body)
+    node = body.shape.node.numpy()[np.flatnonzero(organ.declared.free)]
+    # Whether the step ended with the organ's answer, which is the same in all worlds.
+    answered = np.zeros((2, len(FLAG)), np.int32)
+    answered[1, FLAG.answered] = 1
+    self._flags = [wp.array(row, dtype=int, device=self._device) for row in answered]
+    values = dict(
+      ncreep=len(node),
+      node=node,
+      own=self._keep("creep", np.arange(len(node)), 6),
+      held=1,
+      number=np.array([w.config.relax_share, w.config.relax_time]),
+      flags=self._flags[0],
+      quiet=organ.patch.calm,
+      hold=body.state.hold,
+      mj=fill(relaxation.Clock, self._device, {"timestep": np.array([h])}),
+    )
+    values |= {name: getattr(body.state, name) for name in ("mass", "force_ext", "dvel")}
+    values |= {name: getattr(body.system, name) for name in ("sol", "rhs", "status")}
+    self._fields = fill(WorldCreeping, self._device, values)
+
+  def enter(self):
+    """See `Beside`."""
+    self._over(_enter_creep, self._fields, self._fields.ncreep)
+
+  def end(self):
+    """See `Beside`."""
+    organ = self._organ
+    self._fields.flags = self._flags[bool(organ.patch.stiff and organ.responds)]
+    self._over(_end_creep, self._fields, self._fields.ncreep)
+
+
 # What has a kind here, of `FORCES`; blades are in `batch.cutting`.
-KINDS: dict[str, Any] = {"ties": Ties, "bonds": InBonds, "rests": Rests}
+KINDS: dict[str, Any] = {"ties": Ties, "bonds": InBonds, "rests": Rests, "creep": Creep}
 _KNOWN = {*KINDS, "cutters"}
 
 

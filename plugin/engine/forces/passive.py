@@ -174,11 +174,15 @@ def base(organ: "Declaration") -> np.ndarray:
 def solver(w: "Workspace"):
   """Returns `Input` of a workspace."""
   values = {name: w.host[name] for name in ("force_ext", "vel", "dvel", "status")}
-  quiet = np.zeros(1)
-  if w.organ.windows:
-    quiet = coupling.wrap(w.boxes["own"].tail.ptr + 8 * TAIL.quiet, 1)
   node = w.body.shape.node.numpy()
-  return fill(Input, "cpu", values | {"node": node, "quiet": quiet, "hold": w.hold.array})
+  return fill(Input, "cpu", values | {"node": node, "quiet": quiet(w), "hold": w.hold.array})
+
+
+def quiet(w: "Workspace") -> np.ndarray | wp.array:
+  """Returns where a workspace has how long its organ has been at rest [s], (1,)."""
+  if w.organ.windows:
+    return coupling.wrap(w.boxes["own"].tail.ptr + 8 * TAIL.quiet, 1)
+  return np.zeros(1)
 
 
 class Hold:

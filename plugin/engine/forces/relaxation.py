@@ -11,8 +11,8 @@ from palpate.tissue.config import Config
 from palpate.tissue.types import doubles, fill, floats, ints, scalar, struct, vector
 
 from .. import coupling
-from ..layout import FLAG, TAIL
-from .passive import Beside
+from ..layout import FLAG
+from .passive import Beside, quiet
 
 if TYPE_CHECKING:
   from ..workspace import Workspace
@@ -29,14 +29,13 @@ class Clock:
 class Creeping:
   """The nodes of an organ whose stress relaxes, the moving ones."""
 
-  windowed: int  # whether the motion is in the plugin state
   ncreep: int  # number of them
   node: ints("ncreep")  # node of each
   own: doubles("ncreep", 6)  # elastic force of the last step, and what has not faded of it [N]
   held: int  # whether springs hold nodes
   number: doubles(2)  # share that relaxes [-], time constant [s]
   flags: ints(len(FLAG))  # see FLAG
-  tail: doubles(len(TAIL))  # see TAIL
+  quiet: doubles("nworld")  # how long it has been at rest [s]
   hold: floats("nworld", "nholdslice", 6, 8)
   mass: scalar
   force_ext: vector
@@ -47,7 +46,8 @@ class Creeping:
   mj: Clock
 
 
-_enter, _end = coupling.kernels("forces/relaxation.h", Creeping, "enter_creep", "end_creep")
+KERNELS = "enter_creep", "end_creep"
+_enter, _end = coupling.kernels("forces/relaxation.h", Creeping, *KERNELS)
 
 
 class Creep(Beside):
@@ -82,13 +82,12 @@ class Creep(Beside):
     values = dict(
       held=int(bool(w.hold)),
       hold=w.hold.array if w.hold else np.zeros((0, 0, 6, 8)),
-      windowed=int(organ.windows is not None),
       ncreep=sizes["ncreep"],
       node=w.body.shape.node.numpy()[np.flatnonzero(organ.free)],
       own=self.rows("creep", 6),
       number=self._number,
       flags=wp.array(np.asarray(w.report.flags), dtype=int, device="cpu", copy=False),
-      tail=w.boxes["own"].tail if organ.windows else np.zeros(len(TAIL)),
+      quiet=quiet(w),
       mj=coupling.mujoco_arrays(model, w.data, Clock),
     )
     names = ("mass", "force_ext", "dvel", "sol", "rhs", "status")

@@ -1,6 +1,6 @@
 // Stress relaxation: one Prony term on the elastic forces of the nodes, by Simo's convolution (1987,
 // doi:10.1016/0045-7825(87)90107-1), as in quasi-linear viscoelasticity (Fung 1993, section 7.6).
-// Doubles, on the CPU beside MuJoCo.
+// In doubles.
 //
 // With f the elastic force at once, the force is (1 - g) f + q, and q follows f and fades:
 //
@@ -13,6 +13,20 @@
 
 namespace palpate {
 
+template <class Fields>
+PALPATE Fields of_world(Fields f, int world) {
+  move_to(f.own, world);
+  move_to(f.quiet, world);
+  move_to(f.hold, world);
+  move_to(f.mass, world);
+  move_to(f.force_ext, world);
+  move_to(f.dvel, world);
+  move_to(f.sol, world);
+  move_to(f.rhs, world);
+  move_to(f.status, world);
+  return f;
+}
+
 // What a step has besides f_new.
 template <class Fields>
 PALPATE D3 faded(const Fields& f, int i) {
@@ -23,20 +37,22 @@ PALPATE D3 faded(const Fields& f, int i) {
 
 // Adds it to the solver's input.
 template <class Fields>
-PALPATE void enter_creep(const Fields& f, Thread, int) {
-  if (f.windowed) f.tail.data[TAIL_QUIET] = 0.0;
-  for (int i = 0; i < f.ncreep; ++i) {
+PALPATE void enter_creep(const Fields& all, Thread t, int) {
+  const Fields f = of_world(all, t.world);
+  f.quiet.data[0] = 0.0;
+  each_item(t, f.ncreep, [&](int i) {
     float* ext = f.force_ext.data + offset_of(f.node.data[i]);
     store_lane(ext, load_lane(ext) + faded(f, i));
-  }
+  });
 }
 
 // Takes f_new from what the step, and its answer to the contacts, made of the velocities.
 template <class Fields>
-PALPATE void end_creep(const Fields& f, Thread, int) {
+PALPATE void end_creep(const Fields& all, Thread t, int) {
+  const Fields f = of_world(all, t.world);
   if (f.status.data[3] != 0.0f) return;
   const double per_h = 1.0 / f.mj.timestep.data[0];
-  for (int i = 0; i < f.ncreep; ++i) {
+  each_item(t, f.ncreep, [&](int i) {
     const int node = f.node.data[i], at = offset_of(node);
     D3 dv = load_lane(f.dvel.data + at), besides = load_lane(f.force_ext.data + at);
     if (f.flags.data[FLAG_ANSWERED]) {
@@ -48,7 +64,7 @@ PALPATE void end_creep(const Fields& f, Thread, int) {
     double* own = f.own.data + 6 * i;
     store(own, force);
     store(own + 3, left + f.number.data[0] * force);
-  }
+  });
 }
 
 }  // namespace palpate
