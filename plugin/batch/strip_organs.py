@@ -51,13 +51,9 @@ def tools_of(model: mujoco.MjModel, organ: Declaration) -> np.ndarray:
   Raises:
     ValueError: one is not a tool that a batch knows, or it is not an organ that it can step.
   """
-  if organ.config.carrier:
-    raise ValueError(
-      f"organ {organ.name!r}: carrier is set, which a batch on a GPU cannot do; expected none"
-    )
   for key, there in (
     ("bonds", organ.config.bonded), ("attach", organ.config.attach),
-    ("support", organ.config.support),
+    ("support", organ.config.support), ("carrier", organ.config.carrier),
   ):  # fmt: skip
     if organ.mesh.spare and there:
       raise ValueError(

@@ -225,7 +225,6 @@ CURRENT = {"cutters": "edge 1e6 by x", "spare": 0, "bonds": "none"}
 @pytest.mark.parametrize(
   ("make", "keys", "match"),
   [
-    (pressed, {"carrier": "own", "spare": 0}, "carrier is set, which a batch on a GPU cannot do"),
     (pressed, {"bonds": "none"}, "spare and bonds are set, of which a batch on a GPU can do one"),
     (strip, CURRENT, "cutters has a current and bonds are set, which it frees none of"),
   ],

@@ -18,9 +18,9 @@ BODIES = """<body name="bed" pos="0 0 -0.0605"><geom name="bed" type="box" size=
   <body name="hand" pos="0 0 0.08"><joint type="slide" axis="1 0 0"/>
   <joint type="slide" axis="0 1 0"/><joint type="slide" axis="0 0 1"/>
   <geom size="0.01" mass="0.5" contype="0" conaffinity="0"/></body>"""
+NAMES = "globe", "one", "two"
 KEYS = {"young": 3e4, "tolerance": 1e-6, "damping": 0.01}
 KEYS |= {"contact": {"contype": 1, "conaffinity": 2}}
-NAMES = "globe", "one", "two"
 
 
 def scene():
@@ -35,11 +35,11 @@ def scene():
   bonds = "bed 1e6 100 0.05 near 0.015, one 1e6 60 0.02 near 0.015"
   on = {"attach": f"hand 20 {top(points)}", "bonds": bonds, "support": "bed", "foundation": 3e2}
   organs = [windowed(points, elem, "globe", "w0", "5 4 1", **KEYS | on)]
-  on = {"attach": f"two 30 {top(block)}", "mass": 0.02}
+  on = {"attach": f"two 30 {top(block)}", "mass": 0.02, "foundation": 1e3, "carrier": "own"}
   organs.append(
     windowed(block + np.array([0.0715, 0, -0.01]), blocks, "one", "w1", "3 3 1", **KEYS | on)
   )
-  on = {"foundation": 1e4, "mass": 0.02, "relax_share": 0.6, "relax_time": 0.05}
+  on = {"foundation": 1e4, "carrier": "hand", "mass": 0.02, "relax_share": 0.6, "relax_time": 0.05}
   organs.append(
     windowed(block + np.array([0.0715, 0, 0.02]), blocks, "two", "w2", "3 3 1", **KEYS | on)
   )
