@@ -112,12 +112,23 @@ def test_windowed_organs_are_taken_out_of_a_scene():
   assert bare.nplugin == 0 and bare.nflex == 3 and [each.nslot for each in slots] == [5, 6, 7]
 
 
-def test_a_support_that_is_an_organ_is_refused():
+@pytest.mark.parametrize("device", BACKENDS)
+def test_an_organ_rests_on_another(device):
   points, elem = sphere(1)
-  both = [
-    windowed(points + 0.1 * k, elem, name, f"w{k}", "4 3 1", **KEYS | on)
-    for k, (name, on) in enumerate((("low", {}), ("high", {"support": "low"})))
-  ]
-  spec = mujoco.MjSpec.from_string(world(*both, ball(1.0)))
-  with pytest.raises(ValueError, match=r"'high': support names organ 'low', .* expected geoms"):
-    palpate.batch.make(spec, 2, device="warp-cpu")
+  block, blocks = box((0.04, 0.04, 0.02), 0.02)
+  block[:, 2] += points[:, 2].max() - block[:, 2].min() - 0.002
+  made = world(
+    windowed(points, elem, "low", "w0", "4 3 1", **KEYS | {"foundation": 2e3}),
+    windowed(block, blocks, "high", "w1", "4 3 1", **KEYS | {"mass": 0.02, "support": "low"}),
+    ball(1.0), gravity=(0, 0, -9.81),
+  )  # fmt: skip
+  model, data, high = load(made, "high")
+  low = palpate.Organ(model, data, "low")
+  options = {} if device == "cpu" else {"nodes": 4}
+  batch = palpate.batch.make(mujoco.MjSpec.from_string(made), 2, device=device, **options)
+  mujoco.mj_step(model, data, 200)
+  batch.step(200)
+  assert high.support_force[2] > 0.1  # of 0.2 N
+  for organ in (low, high):
+    found = batch.organ(organ.name).xpos.numpy()
+    np.testing.assert_allclose(found, np.tile(organ.xpos, (2, 1, 1)), atol=2e-6)

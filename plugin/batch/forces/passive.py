@@ -23,7 +23,18 @@ _PARTS = {"own": WorldNodes, "other": WorldNodes, "mj": WorldBodies}
 _number = floats("nworld", "nnumber")
 BOND_ROWS = "state", "next", "stretch", "force", "pull", "hardness"
 WorldBonded = in_worlds(engine_bonds.Bonded, BOND_ROWS, _PARTS | {"number": _number})
-REST_ROWS = "slip", "slipped", "on", "force", "hardness"
+REST_ROWS = (
+  "slip",
+  "slipped",
+  "on",
+  "force",
+  "hardness",
+  "corner",
+  "weight",
+  "where",
+  "next",
+  "first",
+)
 WorldTied = in_worlds(
   attachments.Tied, ("point", "force"), _PARTS | {"number": _number, "dvel_warm": vector}
 )
@@ -52,6 +63,7 @@ _enter_ties, _act_ties = kernels("forces/attachments.h", WorldTied, *attachments
 _find, _press, _act_rest, _feel_rest, _keep_rest = kernels(
   "forces/supports.h", WorldRest, *supports.KERNELS
 )
+_find_organ, _bear_organ = kernels("forces/supports.h", WorldRest, *supports.BELOW)
 _enter_creep, _end_creep = kernels("forces/relaxation.h", WorldCreeping, *relaxation.KERNELS)
 
 
@@ -203,30 +215,46 @@ class Ties(Beside):
 
 
 class Rests(Beside):
-  """The geoms that an organ rests on."""
+  """The geoms and organs that an organ rests on.
+
+  Attributes:
+    on: what the kernels take of each organ below, and that organ
+  """
 
   def __init__(self, organ, numbers: np.ndarray):
     super().__init__(organ)
     alone: Any = organ.space.rests.alone
     n = alone.nouter
     shapes = {"slipped": (n, 3), "force": (n, 3), "hardness": (n, 6), "weight": (n, 3)}
-    names = "ngeom", "nouter", "nother", "restless", "skin", "cell", "mu"
+    names = "ngeom", "nouter", "restless", "skin", "cell"
     values: dict[str, Any] = {name: getattr(alone, name) for name in names}
-    same = "geom", "friction", "free", "stiffness", "elem", "near_adr", "near", "where", "next"
-    values |= {name: getattr(alone, name).numpy() for name in (*same, "first")}
+    same = "geom", "friction", "free", "stiffness"
+    values |= {name: getattr(alone, name).numpy() for name in same}
     values |= {name: self._zeros(self._nworld, *shape) for name, shape in shapes.items()}
     values |= dict(
-      weight=self._zeros(n, 3),
-      corner=self._zeros(n, 3, dtype=int),
+      corner=self._zeros(self._nworld, n, 3, dtype=int),
       on=self._zeros(self._nworld, n, dtype=int),
       slip=self._keep("slip", np.arange(n), 3),
       own=nodes_of(organ),
       solve=input_of(organ),
-      other=WorldNodes(),
-      below=passive.Input(),
       mj=organ.batch.bodies,
     )
-    self._fields = fill(WorldRest, self._device, values)
+    nothing = self._other(alone) | {"other": WorldNodes(), "below": passive.Input()}
+    self._fields = fill(WorldRest, self._device, values | nothing)
+    self.on = []
+    for known, below in zip(organ.space.rests.on, organ.space.rests.below, strict=True):
+      theirs = organ.batch.organ(below.organ.name)
+      own = self._other(known) | {"other": nodes_of(theirs), "below": input_of(theirs)}
+      self.on.append((fill(WorldRest, self._device, values | own), theirs))
+
+  def _other(self, known) -> dict[str, Any]:
+    """Returns the fields of the plugin's other organ, in all worlds."""
+    values: dict[str, Any] = {"mu": known.mu, "nother": known.nother}
+    values |= {name: getattr(known, name).numpy() for name in ("elem", "near_adr", "near")}
+    values["where"] = self._zeros(self._nworld, known.nother, 3)
+    for name in ("next", "first"):
+      values[name] = self._zeros(self._nworld, *getattr(known, name).shape, dtype=int)
+    return values
 
   @property
   def aims(self) -> bool:
@@ -236,9 +264,15 @@ class Rests(Beside):
   def _each(self, what: Kernel):
     self._over(what, self._fields, self._fields.nouter)
 
+  def find(self):
+    """Finds what each node rests on."""
+    self._each(_find)
+    for which, (fields, _) in enumerate(self.on):
+      self._over(_find_organ, fields, 1, which)
+
   def enter(self):
     """See `Beside`."""
-    self._each(_find)
+    self.find()
     self._each(_press)
 
   def act(self):
@@ -250,6 +284,25 @@ class Rests(Beside):
   def end(self):
     """See `Beside`."""
     self._each(_keep_rest)
+
+
+class Bears(Beside):
+  """An organ that another rests on.
+
+  Args:
+    organ: the organ below
+    rests: what the other rests on
+    which: where it is among those
+  """
+
+  def __init__(self, organ, rests: Rests, which: int):
+    super().__init__(organ)
+    self._rests, self._which = rests, which
+
+  def enter(self):
+    """See `Beside`."""
+    self._rests.find()
+    self._over(_bear_organ, self._rests.on[self._which][0], 1, self._which)
 
 
 class Creep(Beside):
@@ -304,11 +357,6 @@ def check(spaces: list):
           f"organ {w.organ.name!r}: {' or '.join(kind.KEYS)} is set, which a batch on a GPU cannot "
           "do; expected none"
         )
-    if w.rests.below:
-      raise ValueError(
-        f"organ {w.organ.name!r}: support names organ {w.rests.below[0].organ.name!r}, which a "
-        "batch on a GPU cannot do; expected geoms"
-      )
 
 
 def meet(organs: list):
@@ -316,6 +364,9 @@ def meet(organs: list):
   every = [each for organ in organs for each in organ.beside if isinstance(each, InBonds)]
   for each in every:
     each.bear(every)
+  for rests in [each for organ in organs for each in organ.beside if isinstance(each, Rests)]:
+    for which, (_, below) in enumerate(rests.on):
+      below.beside += (Bears(below, rests, which),)
 
 
 def make(organ, numbers: np.ndarray) -> tuple[Beside, ...]:

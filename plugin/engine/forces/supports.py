@@ -60,11 +60,16 @@ class Rest:
 
 KERNELS = "find_geoms", "press", "act_rests", "feel_rests", "keep"
 _find_geoms, _press, _act, _feel, _keep = coupling.kernels("forces/supports.h", Rest, *KERNELS)
-_find_organ, _bear = coupling.kernels("forces/supports.h", Rest, "find_organ", "bear")
+BELOW = "find_organ", "bear"
+_find_organ, _bear = coupling.kernels("forces/supports.h", Rest, *BELOW)
 
 
 class Rests(Beside):
   """What a workspace's organ rests on, and what rests on it.
+
+  Attributes:
+    below, above: workspaces of organs that it rests on, and of those that rest on it
+    alone, on: what the kernels take of geoms, and of each organ below
 
   Args:
     w: the workspace
@@ -74,11 +79,11 @@ class Rests(Beside):
 
   def __init__(self, w: "Workspace"):
     super().__init__(w)
-    self.below: list = []  # workspaces of organs that it rests on
-    self.above: list = []  # of organs that rest on it
+    self.below: list = []
+    self.above: list = []
     self._arrays: dict[str, Any] = {}
     self.alone: Any = None
-    self._on: list = []
+    self.on: list = []
 
   def __bool__(self) -> bool:
     return bool(self._w.organ.config.support)
@@ -133,10 +138,10 @@ class Rests(Beside):
     )
     alone = common | _nothing() | {"other": Nodes(), "below": Input()}
     self.alone = fill(Rest, "cpu", alone, into=self.alone)
-    self._on += [None] * (len(self.below) - len(self._on))
-    self._on = [
+    self.on += [None] * (len(self.below) - len(self.on))
+    self.on = [
       fill(Rest, "cpu", common | self._other(m, other), into=on)
-      for other, on in zip(self.below, self._on, strict=True)
+      for other, on in zip(self.below, self.on, strict=True)
     ]
 
   def _geoms(self, m) -> np.ndarray:
@@ -180,7 +185,7 @@ class Rests(Beside):
   def find(self):
     """Finds what each node rests on."""
     _launch(_find_geoms, self.alone)
-    for k, each in enumerate(self._on):
+    for k, each in enumerate(self.on):
       _launch(_find_organ, each, k)
 
   def enter(self):
@@ -191,7 +196,7 @@ class Rests(Beside):
     for each in self.above:
       each.rests.find()
       which = each.rests.below.index(self._w)
-      _launch(_bear, each.rests._on[which], which)
+      _launch(_bear, each.rests.on[which], which)
 
   def act(self):
     """Lets the bodies feel what rests on them."""

@@ -22,8 +22,15 @@ PALPATE Fields of_world(Fields f, int world) {
   move_to(f.on, world);
   move_to(f.force, world);
   move_to(f.hardness, world);
+  move_to(f.corner, world);
+  move_to(f.weight, world);
+  move_to(f.where, world);
+  move_to(f.next, world);
+  move_to(f.first, world);
   move_nodes(f.own, world);
+  move_nodes(f.other, world);
   move_input(f.solve, world);
+  move_input(f.below, world);
   move_bodies(f.mj, world);
   return f;
 }
@@ -196,7 +203,9 @@ PALPATE Bounds sort_nodes(const Fields& f) {
 // Finds where nodes that rest on no geom rest on organ number `which`. Neither organ's step knows
 // what the other's changes: each has the spring twice in its matrix, which is stable for both.
 template <class Fields>
-PALPATE void find_organ(const Fields& f, Thread, int which) {
+PALPATE void find_organ(const Fields& all, Thread t, int which) {
+  if (t.tid > 0) return;
+  const Fields f = of_world(all, t.world);
   const Bounds near = sort_nodes(f);
   for (int i = 0; i < f.nouter; ++i) {
     if (f.on.data[i] != ON_NOTHING || !f.free.data[i]) continue;
@@ -204,8 +213,7 @@ PALPATE void find_organ(const Fields& f, Thread, int which) {
     const int j = near.has(x.at, f.cell) ? nearest_node(f, x.at) : -1;
     if (j < 0) continue;
     D3 w, point;
-    const int t = nearest_triangle(f, j, x.at, w, point);
-    const int* e = f.elem.data + 3 * t;
+    const int* e = f.elem.data + 3 * nearest_triangle(f, j, x.at, w, point);
     D3 n = w.x * normal_at(f, e[0]) + w.y * normal_at(f, e[1]) + w.z * normal_at(f, e[2]);
     const double length = norm(n);
     if (!(length > 0.0)) continue;
@@ -278,7 +286,9 @@ PALPATE void feel_rests(const Fields& all, Thread t, int) {
 
 // Adds what rests on an organ, which is number `which` of the one above, to its solver's input.
 template <class Fields>
-PALPATE void bear(const Fields& f, Thread, int which) {
+PALPATE void bear(const Fields& all, Thread t, int which) {
+  if (t.tid > 0) return;
+  const Fields f = of_world(all, t.world);
   const double* R = f.other.frame.data;
   f.below.quiet.data[0] = 0.0;
   for (int i = 0; i < f.nouter; ++i) {
