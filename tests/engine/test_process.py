@@ -60,7 +60,9 @@ def test_ctrl_c_ends_a_loop_of_steps(tmp_path):
   # The signal nearly always falls into a callback, where ctypes would drop the exception.
   script = tmp_path / "loop.py"
   script.write_text(
-    "import os, signal, threading, mujoco, palpate\n"
+    "import os, signal, threading\n"
+    "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # which the parent may ignore
+    "import mujoco, palpate\n"
     f"m = mujoco.MjModel.from_xml_path({str(SCENE)!r})\n"
     "d = mujoco.MjData(m)\n"
     "mujoco.mj_step(m, d)\n"
