@@ -9,6 +9,7 @@ import dataclasses
 from collections.abc import Mapping
 
 import numpy as np
+from palpate.tissue.reading import choices
 
 RESOLUTIONS = (250, 1000, 4000, 16000)  # nodes
 GRIDS = (16, 32, 64, 128, 256)  # nodes along a side of the regular sheet
@@ -342,5 +343,5 @@ def to_world(point) -> np.ndarray:
 def entry(name: str) -> Entry:
   """Returns an organ of the catalogue."""
   if name not in ENTRIES:
-    raise ValueError(f"organ is {name!r}, expected one of {', '.join(NAMES)}")
+    raise ValueError(f"organ is {name!r}, {choices(name, NAMES)}")
   return ENTRIES[name]

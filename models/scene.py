@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 import mujoco
 from palpate import windows as author
+from palpate.tissue.reading import choices
 
 from . import catalog, markup, organs, shapes, trocar
 from .catalog import DEFAULT, GRIDS, RESOLUTIONS
@@ -117,11 +118,11 @@ def _build(
 ) -> Build:
   catalog.entry(name)
   if nodes not in RESOLUTIONS:
-    choices = ", ".join(map(str, RESOLUTIONS))
-    raise ValueError(f"organ {name!r}: nodes is {nodes!r}, expected one of {choices}")
+    known = ", ".join(map(str, RESOLUTIONS))
+    raise ValueError(f"organ {name!r}: nodes is {nodes!r}, expected one of {known}")
   if grid is not None and grid not in GRIDS:
-    choices = ", ".join(map(str, GRIDS))
-    raise ValueError(f"organ {name!r}: grid is {grid!r}, expected one of {choices}, or None")
+    known = ", ".join(map(str, GRIDS))
+    raise ValueError(f"organ {name!r}: grid is {grid!r}, expected one of {known}, or None")
   if seed is not None and not 0 <= seed < 2**32:
     raise ValueError(f"organ {name!r}: seed is {seed!r}, expected a number in [0, 2^32), or None")
   built = organs.build(name, 0 if grid else nodes, grid or 0, seed)
@@ -134,7 +135,6 @@ def check_instruments(instruments: Sequence[str]):
     raise ValueError(f"instruments is {instruments!r}, expected a tuple such as ({instruments!r},)")
   for instrument in instruments:
     if instrument not in INSTRUMENTS:
-      choices = ", ".join(INSTRUMENTS)
-      raise ValueError(f"instrument is {instrument!r}, expected one of {choices}")
+      raise ValueError(f"instrument is {instrument!r}, {choices(instrument, INSTRUMENTS)}")
   if len(instruments) > 2:
     raise ValueError(f"instruments has {len(instruments)} names, expected at most two")

@@ -15,6 +15,7 @@ import pathlib
 from collections.abc import Sequence
 
 import numpy as np
+from palpate.tissue.reading import choices
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import KDTree
@@ -101,7 +102,7 @@ def texture(kind: str, seed: int = 0, size: int = SIZE) -> np.ndarray:
     Red, green, blue  (size, size, 3) uint8.
   """
   if kind not in LOOKS:
-    raise ValueError(f"texture is {kind!r}, expected one of {', '.join(LOOKS)}")
+    raise ValueError(f"texture is {kind!r}, {choices(kind, LOOKS)}")
   if not 16 <= size <= 4096:
     raise ValueError(f"texture {kind!r}: size is {size}, expected a whole number in [16, 4096]")
   look, random = LOOKS[kind], np.random.RandomState([seed, list(LOOKS).index(kind)])

@@ -16,6 +16,7 @@ import pathlib
 
 import mujoco
 import numpy as np
+from palpate.tissue.reading import choices
 
 NAMES = ("probe", "grasper", "scissors", "hook", "scalpel")
 JOINTS = ("pitch", "yaw", "insertion", "roll")
@@ -46,7 +47,7 @@ class Trocar:
 def path(name: str, handle: bool = False) -> pathlib.Path:
   """Returns the MJCF file of an instrument, `handle` for the one with the virtual coupling."""
   if name not in NAMES:
-    raise ValueError(f"instrument is {name!r}, expected one of {', '.join(NAMES)}")
+    raise ValueError(f"instrument is {name!r}, {choices(name, NAMES)}")
   return pathlib.Path(__file__).parent / "instruments" / f"{name}{'_handle' if handle else ''}.xml"
 
 

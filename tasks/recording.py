@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from palpate.tissue.reading import choices
 
 from .files import replacing
 from .inputs import COLUMNS, SIGNALS, measure
@@ -283,7 +284,7 @@ def entry_shapes(name: str, substeps: int) -> list[tuple[int, ...]]:
 
 def _check_column(name: str, value: np.ndarray, count: int, substeps: int) -> None:
   if name not in COLUMNS:
-    raise ValueError(f"unknown column {name!r}, expected one of {', '.join(COLUMNS)}")
+    raise ValueError(f"unknown column {name!r}, {choices(name, COLUMNS)}")
   allowed = [(count, *shape) for shape in entry_shapes(name, substeps)]
   if value.dtype != np.float64 or value.shape[1:] not in allowed:
     raise ValueError(f"column {name} is {value.dtype} {value.shape}, expected float64 {allowed}")
@@ -355,14 +356,14 @@ def check_watch(watch: Sequence[str]) -> tuple[str, ...]:
   """Returns the kinds; ValueError unless all are `metrics.EVENTS`."""
   for kind in watch:
     if kind not in EVENTS:
-      raise ValueError(f"no event {kind!r} to watch, expected one of {', '.join(EVENTS)}")
+      raise ValueError(f"no event {kind!r} to watch, {choices(kind, EVENTS)}")
   return tuple(watch)
 
 
 def check_event(event: Event, count: int) -> None:
   """Raises ValueError unless the event is one that `count` instruments can have."""
   if event.kind not in EVENTS:
-    raise ValueError(f"no event {event.kind!r}, expected one of {', '.join(EVENTS)}")
+    raise ValueError(f"no event {event.kind!r}, {choices(event.kind, EVENTS)}")
   if type(event.instrument) is not int or not 0 <= event.instrument < count:
     raise ValueError(f"event {event.kind!r}: instrument is {event.instrument!r} of {count}")
   if not isinstance(event.label, str):

@@ -12,12 +12,11 @@ a new version.
 """
 
 import dataclasses
-import difflib
 import importlib.metadata
 import inspect
 import math
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any
 
 GROUP = "palpate.tasks"  # of entry points
@@ -91,13 +90,6 @@ def exercise(name: str, time_limit: float, *tags: str) -> Callable:
     return make
 
   return add
-
-
-def choices(value: str, known: Iterable[str]) -> str:
-  """Returns what is expected in place of a name that is not known, the most similar one first."""
-  known = [*known]
-  near = difflib.get_close_matches(value, known, 1)
-  return f"expected one of {', '.join(known)}" + (f"; did you mean {near[0]!r}?" if near else "")
 
 
 def tagged(tag: str | None = None) -> tuple[tuple[str, str], ...]:

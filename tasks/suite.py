@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from dm_control.rl import control
+from palpate.tissue.reading import choices
 
 from . import registry
 from .core import environment
@@ -39,10 +40,10 @@ def load(
     ValueError: no such domain or task, or a value that is not allowed; the message lists what is.
   """
   if domain_name not in registry.TASKS:
-    raise ValueError(f"domain is {domain_name!r}, {registry.choices(domain_name, registry.TASKS)}")
+    raise ValueError(f"domain is {domain_name!r}, {choices(domain_name, registry.TASKS)}")
   names = registry.TASKS[domain_name]
   if task_name not in names:
-    raise ValueError(f"{domain_name}: task is {task_name!r}, {registry.choices(task_name, names)}")
+    raise ValueError(f"{domain_name}: task is {task_name!r}, {choices(task_name, names)}")
   entry = registry.ENTRIES[f"{domain_name}/{task_name}"]
   kwargs = dict(task_kwargs or {})
   limit = kwargs.pop("time_limit", entry.time_limit)
@@ -54,7 +55,7 @@ def split(name: str) -> tuple[str, str]:
   domain, _, task = name.partition("/")
   task = task or "standard"
   if f"{domain}/{task}" not in registry.ENTRIES:
-    raise ValueError(f"task is {name!r}, {registry.choices(name, registry.ENTRIES)}")
+    raise ValueError(f"task is {name!r}, {choices(name, registry.ENTRIES)}")
   return domain, task
 
 

@@ -342,7 +342,7 @@ def _values(organ: str, texts: dict[str, str], nelem: int) -> dict[str, Any]:
   values = {}
   for key, text in texts.items():
     if key not in ROWS:
-      raise ValueError(f"organ {organ!r}: unknown key {key!r}, expected one of {', '.join(KEYS)}")
+      raise ValueError(f"organ {organ!r}: unknown key {key!r}, {reading.choices(key, KEYS)}")
     if text.strip():
       values[key] = _value(organ, key, text, ROWS[key].read, ROWS[key].allowed, nelem)
   return values

@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
+import difflib
 import math
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 AUTO = -1  # spare vertices: as many as there are
 NOTHING = "none"  # as bonds: they are made while running
+
+
+def choices(value: str, known: Iterable[str]) -> str:
+  """Returns what is expected in place of a name that is not known, and the most similar one."""
+  known = [*known]
+  near = difflib.get_close_matches(str(value), known, 1)
+  return f"expected one of {', '.join(known)}" + (f"; did you mean {near[0]!r}?" if near else "")
 
 
 def plain(word: str) -> str:

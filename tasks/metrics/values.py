@@ -5,6 +5,8 @@ import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from palpate.tissue.reading import choices
+
 from .definition import METRICS, Unknown
 
 
@@ -87,4 +89,4 @@ def check_header(data: Any, name: str, version: int = 1) -> None:
 def check_names(names: Mapping[str, Any]) -> None:
   """Raises ValueError unless all are names of metrics."""
   if strange := sorted(set(names) - set(METRICS)):
-    raise ValueError(f"no such metric {strange[0]!r}, expected one of {', '.join(METRICS)}")
+    raise ValueError(f"no such metric {strange[0]!r}, {choices(strange[0], METRICS)}")

@@ -129,3 +129,8 @@ def test_constants_are_those_of_plane_stress_and_of_the_plate():
   np.testing.assert_allclose(4 * mu * (lam + mu) / (lam + 2 * mu), 5000)
   np.testing.assert_allclose(lam / (lam + 2 * mu), 0.3)
   assert math.isclose(rigidity(config, 1)[0], 2 * 5000 * 0.002**3 / (12 * (1 - 0.09)))
+
+
+def test_a_key_that_is_misspelt_is_guessed():
+  with pytest.raises(ValueError, match=r"unknown key 'yuong', .*; did you mean 'young'\?"):
+    parse("organ", {"yuong": "1e4"}, 20, True)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+from palpate.tissue.reading import choices
+
 from .bridge import Bridge
 from .device import Device
 from .hand import Hand
@@ -43,7 +45,7 @@ def check(name: str) -> str:
   """Returns the kind of a device, ValueError if there is none of the name."""
   kind = name.partition(":")[0]
   if kind not in _MAKERS:
-    raise ValueError(f"device is {name!r}, expected one of {', '.join(NAMES)}")
+    raise ValueError(f"device is {name!r}, {choices(name, NAMES)}")
   return kind
 
 
