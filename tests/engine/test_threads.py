@@ -350,22 +350,24 @@ def on_alarm(number, frame):
 signal.signal(signal.SIGALRM, on_alarm)
 m, d, organ = load(probed())
 other, raised = mujoco.MjData(m), 0
+pairs = (d, organ), (other, palpate.Organ(m, other, "organ"))
 signal.setitimer(signal.ITIMER_REAL, 0.001, 0.003)
 end = time.perf_counter() + 2
 while time.perf_counter() < end:
   try:
     armed = True
-    mujoco.mj_step(m, d)
-    mujoco.mj_step(m, other)
+    for data, _ in pairs: mujoco.mj_step(m, data)
     armed = False
   except TimeoutError: raised += 1
-  if organ.error:
-    raised += "interrupted by TimeoutError" in organ.error
-    mujoco.mj_resetData(m, d)
+  for data, each in pairs:
+    if each.error:
+      raised += "TimeoutError" in each.error
+      mujoco.mj_resetData(m, data)
 signal.setitimer(signal.ITIMER_REAL, 0)
-print(raised > 10, bool(np.isfinite(organ.displacement).all()))
+print(raised > 0, bool(np.isfinite(organ.displacement).all()), raised)
 """
-  assert process(code)[:2] == (0, "True True")
+  status, said, errors = process(code)
+  assert status == 0 and said.startswith("True True"), said + errors
 
 
 def test_ctrl_c_is_heard_in_a_loop_of_forward(process):
