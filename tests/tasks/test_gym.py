@@ -124,3 +124,30 @@ def test_vectors_and_the_end_of_an_episode():
   assert truncated.all() and not terminated.any() and reward.shape == (2,)
   assert "time" in info["metrics"]
   envs.close()
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="looks into /proc")
+@pytest.mark.parametrize("backend", ["egl", "osmesa"])
+def test_opengl_is_loaded_when_a_picture_is_asked_for(monkeypatch, backend):
+  # Torch ends a process that has Mesa's LLVM.
+  if not ctypes.util.find_library({"egl": "EGL", "osmesa": "OSMesa"}[backend]):
+    pytest.skip(f"no {backend}")
+  monkeypatch.setenv("MUJOCO_GL", backend)
+  monkeypatch.delenv("PYOPENGL_PLATFORM", raising=False)
+  code = f"""
+import os, palpate.tasks, mujoco
+def drawn():
+  return any(name in open("/proc/self/maps").read() for name in ("LLVM", "libEGL", "OSMesa"))
+env = palpate.tasks.load("touch", "easy", task_kwargs=dict(random=0))
+env.step(env.action_spec().minimum)
+assert not drawn() and os.environ["MUJOCO_GL"] == {backend!r}
+assert env.physics.render(48, 64).std() > 1 and drawn()
+with mujoco.Renderer(env.physics.model.ptr, 48, 64) as renderer:
+  renderer.update_scene(env.physics.data.ptr)
+  assert renderer.render().std() > 1
+try:
+  mujoco.nothing
+except AttributeError as error:
+  assert "nothing" in str(error)
+"""
+  subprocess.run([sys.executable, "-c", code], check=True)
