@@ -411,7 +411,7 @@ class Attachment:
   @property
   def vertices(self) -> np.ndarray:
     """Vertices of the organ that it holds, (n,)."""
-    return self._made[0][1].vert
+    return self._made[0][1].now.vert
 
   @property
   def force(self) -> np.ndarray:

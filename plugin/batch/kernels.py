@@ -2,7 +2,7 @@
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 import warp as wp
-from palpate.tissue.types import Array, floats, ints, struct
+from palpate.tissue.types import Array, doubles, floats, ints, struct
 
 from .patch import Patch
 
@@ -291,28 +291,48 @@ def put_back_rows(mask: wp.array[bool], start: wp.array2d[wp.float64], out: wp.a
     out[w, k] = start[0, k]
 
 
-@wp.kernel(enable_backward=False)
-def show_damage(state: wp.array3d[wp.float64], first: int, damage: wp.array2d[float]):
-  """Writes the damage of bonds, the first of which has a place."""
-  w, n = wp.tid()
-  had = state[w, n, 0]
-  damage[w, first + n] = wp.where(had >= wp.float64(1.0), 1.0, wp.min(float(had), HELD))
+@struct
+class BondLists:
+  """Bonds that were made together, in all worlds: fields of `cohesive_bonds.Bonded`."""
+
+  before: int  # number of bonds in groups before this one
+  row: ints("nworld")
+  count: ints("nrow", 1)
+  made: ints("nrow", "nbond")
+  slot: ints("nrow", "nbond")
+  state: doubles("nworld", "nfree", 2)
+  pull: doubles("nworld", "nbond", 3)
 
 
 @wp.kernel(enable_backward=False)
-def show_pull(pull: wp.array3d[wp.float64], first: int, force: wp.array3d[float]):
-  """Writes the force of bonds."""
+def show_bonds(b: BondLists, damage: wp.array2d[float], force: wp.array3d[float]):
+  """Takes damage and force of bonds to those that were made."""
   w, n = wp.tid()
-  for c in range(3):
-    force[w, first + n, c] = float(pull[w, n, c])
+  r = b.row[w]
+  if n < b.count[r, 0]:
+    i = b.before + b.made[r, n]
+    had = b.state[w, b.slot[r, n], 0]
+    wp.atomic_min(damage, w, i, wp.where(had >= wp.float64(1.0), 1.0, wp.min(float(had), HELD)))
+    for c in range(3):
+      wp.atomic_add(force, w, i, c, float(b.pull[w, n, c]))
 
 
 @wp.kernel(enable_backward=False)
-def weaken_bonds(state: wp.array3d[wp.float64], first: int, amount: wp.array2d[float]):
-  """Adds damage to bonds."""
+def weaken_bonds(b: BondLists, amount: wp.array2d[float]):
+  """Adds to the damage of bonds what is given for those that were made."""
   w, n = wp.tid()
-  more = state[w, n, 0] + wp.float64(amount[w, first + n])
-  state[w, n, 0] = wp.min(more, wp.float64(1.0))
+  r = b.row[w]
+  if n < b.count[r, 0]:
+    more = b.state[w, b.slot[r, n], 0] + wp.float64(amount[w, b.before + b.made[r, n]])
+    b.state[w, b.slot[r, n], 0] = wp.min(more, wp.float64(1.0))
+
+
+@wp.kernel(enable_backward=False)
+def forget(mask: wp.array[bool], row: wp.array[int]):
+  """Gives worlds the lists of the first meshes again."""
+  w = wp.tid()
+  if mask[w]:
+    row[w] = 0
 
 
 @wp.kernel(enable_backward=False)

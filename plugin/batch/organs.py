@@ -115,11 +115,6 @@ class Organ(Tissue):
         "geom_xpos", "geom_xmat", "qpos", "qvel", "qfrc_passive", "qfrc_constraint")},
     )  # fmt: skip
     self._cuts = None
-    if organ.mesh.spare and len(organ.mesh.tet):
-      raise ValueError(
-        f"organ {organ.name!r}: spare is {organ.mesh.spare}, allowed in batches on a GPU only "
-        "where elements is not 'solid'"
-      )
     if organ.mesh.spare:
       self._cuts = Cuts(self, values, surface)
     self.patch = patch.make(values, self.body)
@@ -150,6 +145,8 @@ class Organ(Tissue):
     there = dataclasses.replace(w.body, device=device)
     alone = dataclasses.replace(w.body, levels=None, plan=plan_of(there, w.organ.config))
     held = 24.0 + 160.0 if any(w.beside) else 0.0  # of springs beside the tissue
+    if held and w.organ.mesh.spare:  # which follow a mesh a world
+      held += 400.0
     return bodies.nbytes(alone) + (44.0 + held) * w.organ.mesh.nvert
 
   # Within a step.

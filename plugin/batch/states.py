@@ -13,6 +13,7 @@ from palpate.engine.layout import TAIL
 from palpate.tissue.order import from_slices, to_slices
 
 from . import kernels
+from .forces import base
 from .organs import Organ
 
 if TYPE_CHECKING:
@@ -179,6 +180,7 @@ def push(batch: Worlds, world: int, data: mujoco.MjData):
   d.time[world : world + 1].assign(np.array([data.time], np.float32))
   for organ in batch.organs.values():
     _push_organ(organ, world, model, data)
+  base.follow(batch, [world])
 
 
 def keep(batch: Worlds, start, data: mujoco.MjData):

@@ -51,18 +51,10 @@ def tools_of(model: mujoco.MjModel, organ: Declaration) -> np.ndarray:
   Raises:
     ValueError: one is not a tool that a batch knows, or it is not an organ that it can step.
   """
-  for key, there in (
-    ("bonds", organ.config.bonded), ("attach", organ.config.attach),
-    ("support", organ.config.support), ("carrier", organ.config.carrier),
-  ):  # fmt: skip
-    if organ.mesh.spare and there:
-      raise ValueError(
-        f"organ {organ.name!r}: spare and {key} are set, of which a batch on a GPU can do one"
-      )
-  if organ.config.bonded and any(row.current for row in organ.config.cutters):
+  if organ.mesh.spare and len(organ.mesh.tet):
     raise ValueError(
-      f"organ {organ.name!r}: cutters has a current and bonds are set, which it frees none of in a "
-      "batch on a GPU; expected one of both"
+      f"organ {organ.name!r}: spare is {organ.mesh.spare}, allowed in batches on a GPU only where "
+      "elements is not 'solid'"
     )
   if organ.windows:
     found = np.unique(organ.windows.geom)

@@ -5,7 +5,7 @@ import numpy as np
 import palpate
 import palpate.batch
 import pytest
-from scenes import needs_cuda, servo, sphere, triangular
+from scenes import box, needs_cuda, servo, sphere, triangular
 
 BACKENDS = [
   "cpu",
@@ -219,16 +219,32 @@ def test_what_cannot_be_cut_is_named():
   assert whole.piece_count.numpy().tolist() == [1, 1]
 
 
-CURRENT = {"cutters": "edge 1e6 by x", "spare": 0, "bonds": "none"}
+@pytest.mark.parametrize("device", BACKENDS[1:])
+@pytest.mark.parametrize("spare", [0, 60])
+def test_a_current_frees_bonds_in_each_world(device, spare):
+  spec = strip(0.0, "edge 4e3 by power", (1e-3, 4e-3, 0), spare=spare,
+               bonds="bed 1e7 3000 1 near 0.004")  # fmt: skip
+  bed = spec.worldbody.add_body(name="bed", pos=[0, 0, -0.005])
+  bed.add_geom(size=[0.02, 0.02, 0.003], type=mujoco.mjtGeom.mjGEOM_BOX, contype=0, conaffinity=0)
+  spec.add_actuator(name="power", target="x", trntype=mujoco.mjtTrn.mjTRN_JOINT, gainprm=10 * [0])
+  batch = palpate.batch.make(spec, 3, device=device)
+  model, data = batch.model, mujoco.MjData(batch.model)
+  alone, bonds = palpate.Organ(model, data, "organ"), batch.organ("organ").bonds
+  for k in range(60):
+    power = -2.0 * (k < 50)  # coagulates: the wall stays whole
+    data.ctrl[:] = 0.06 * data.time, power
+    batch.ctrl = np.array([[0.06 * data.time, power * share] for share in (1, 1, 0)])
+    mujoco.mj_step(model, data)
+    batch.step()
+  damage = bonds.damage.numpy()
+  assert 0.05 < alone.bonds.share_freed < 0.9 and ((damage[0] > 0) & (damage[0] < 1)).any()
+  np.testing.assert_allclose(damage[:2], np.tile(alone.bonds.damage, (2, 1)), atol=1e-4)
+  assert not damage[2].any() and not any(batch.organ("organ").cuts)
 
 
-@pytest.mark.parametrize(
-  ("make", "keys", "match"),
-  [
-    (pressed, {"bonds": "none"}, "spare and bonds are set, of which a batch on a GPU can do one"),
-    (strip, CURRENT, "cutters has a current and bonds are set, which it frees none of"),
-  ],
-)
-def test_what_a_gpu_cannot_do_is_named(make, keys, match):
-  with pytest.raises(ValueError, match=match):
-    palpate.batch.make(make(windows=True, **keys), 2, device="warp-cpu")
+def test_a_solid_with_room_for_cuts_is_refused_by_name():
+  spec = mujoco.MjSpec()
+  keys = {"elements": "solid", "spare": 50, "mass": 0.1, "windows": True}
+  palpate.add_organ(spec, box((0.04,) * 3, 0.02), "organ", **keys)
+  with pytest.raises(ValueError, match=r"spare is \d+, allowed .* where elements is not 'solid'"):
+    palpate.batch.make(spec, 2, device="warp-cpu")

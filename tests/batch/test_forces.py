@@ -104,6 +104,81 @@ def test_worlds_are_weakened_and_healed_alone(make):
   assert not len(none) and not none.share_freed.numpy().any()
 
 
+def holding():
+  """Returns what `scene` has, with room for cuts, and a block that rests on the ball."""
+  points, elem = sphere(2)
+  block, blocks = box((0.04, 0.04, 0.02), 0.02)
+  on_top = block + np.array([0, 0, points[:, 2].max() - block[:, 2].min() - 1e-4])
+  block[:, 2] -= block[:, 2].min()
+  side = np.flatnonzero(points[:, 1] > 0.03)
+  bonds = "bed 1e6 150 0.02 near 0.015, one 1e6 150 0.02 near 0.015"
+  on = {"attach": f"hand 20 {' '.join(map(str, side))}", "bonds": bonds, "support": "bed"}
+  on |= {"foundation": 3e2, "carrier": "bed"}
+  spec = mujoco.MjSpec.from_string(world(ball(0.3), BODIES, gravity=(5.0, 0, -9.81)))
+  keys = {**KEYS, "windows": True, "device": "cpu"}
+  given = keys | on | {"mass": 0.1, "spare": 80, "thickness": 2e-3}
+  palpate.add_organ(spec, (points, elem), "globe", **given)
+  on = {"attach": "globe 30 " + " ".join(map(str, np.flatnonzero(block[:, 0] < 0)))}
+  given = keys | on | {"mass": 0.02, "foundation": 1e3, "carrier": "own"}
+  palpate.add_organ(spec, (block + np.array([0.0715, 0, -0.01]), blocks), "one", **given)
+  given = keys | {"mass": 0.02, "support": "globe"}
+  palpate.add_organ(spec, (on_top, blocks), "two", **given)
+  return spec
+
+
+ARC = np.linspace(-0.7, 0.7, 9)
+CUTS = [  # through what is tied, bonded, and under what rests
+  0.05 * np.stack([np.cos(1.2) + 0 * ARC, np.cos(ARC) * np.sin(1.2), np.sin(ARC)], 1),
+  0.05 * np.stack([np.sin(ARC), 0.1 + 0 * ARC, -np.cos(ARC)], 1),
+  0.05 * np.stack([np.sin(ARC), 0.1 + 0 * ARC, np.cos(ARC)], 1),
+]
+
+
+@pytest.mark.parametrize("device", BACKENDS)
+def test_a_cut_organ_keeps_what_acts_beside_it(device):
+  spec = holding()
+  options = {} if device == "cpu" else {"nodes": 4}
+  batch = palpate.batch.make(spec, 3, device=device, **options)
+  model, data = batch.model, mujoco.MjData(batch.model)
+  organs = [palpate.Organ(model, data, name) for name in NAMES]
+  globe, there = organs[0], batch.organ("globe")
+  bonds = there.bonds
+  mask = np.array([True, False, True])
+  for k in range(50):
+    if k in (10, 20, 30):
+      path = CUTS[k // 10 - 1]
+      report = globe.cut(path)
+      assert report.nodes and [r and r.nodes for r in there.cut(path, mask)] == [
+        report.nodes, None, report.nodes
+      ]  # fmt: skip
+    mujoco.mj_step(model, data)
+    batch.step()
+  freed = globe.bonds.share_freed
+  assert len(globe.bonds) > len(bonds) and 0.1 < freed < 0.9 and organs[2].support_force[2] > 0.02
+  for organ in organs:
+    found = batch.organ(organ.name).xpos.numpy()[:, : organ.nvert]
+    np.testing.assert_allclose(found[::2], np.tile(organ.xpos, (2, 1, 1)), atol=2e-6)
+    off = np.linalg.norm(found[1] - organ.xpos, axis=1)
+    assert organ.name == "two" or np.nanmax(off) > 1e-4
+  worst = np.ones(len(bonds))
+  np.minimum.at(worst, globe.bonds.made, globe.bonds.damage)
+  np.testing.assert_allclose(bonds.damage.numpy()[0], worst, atol=1e-3)
+  assert np.array_equal(bonds.damage.numpy()[0], bonds.damage.numpy()[2])
+  own = mujoco.MjData(model)
+  batch.get_state(2, own)
+  batch.set_state(1, own)
+  batch.reset(np.array([True, False, False]))
+  assert bonds.share_freed.numpy()[0] == 0
+  whole = palpate.batch.make(spec, 1, device=device, **options)
+  for _ in range(10):
+    batch.step()
+    whole.step()
+  for name in NAMES:
+    found = batch.organ(name).xpos.numpy()
+    np.testing.assert_allclose(found[1], found[2], atol=1e-6)
+    np.testing.assert_allclose(found[0], whole.organ(name).xpos.numpy()[0], atol=1e-7)
+
+
 def test_windowed_organs_are_taken_out_of_a_scene():
   made = scene()
   model, data, _ = load(made, NAMES[0])

@@ -148,8 +148,8 @@ class Blades(base.Opens):
   def rest(self):
     """See `Beside`."""
     super().rest()
-    wp.launch(_forget, dim=self.fields.due.shape, inputs=[self._mask, self.fields.due],
-              device=self._device)  # fmt: skip
+    inputs = [self._mask, self.fields.due]
+    wp.launch(_forget, dim=self.fields.due.shape, inputs=inputs, device=self._device)
 
   def configure(self, worlds: np.ndarray, rows: dict[str, np.ndarray]):
     """See `Beside`."""

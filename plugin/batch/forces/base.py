@@ -18,9 +18,10 @@ from palpate.tissue import body as bodies
 from palpate.tissue.kernels import Kernel, kernel
 from palpate.tissue.types import DIMS, Array, doubles, fill, floats, ints, struct, vector
 
-from ..kernels import put_back_rows
+from ..kernels import forget, put_back_rows
 from ..patch import launch
 
+_COUNTS = ("count", "first", "nouter", "nother")  # of what follows meshes
 _LOOK = 10  # steps after which the host looks, at most
 
 
@@ -53,27 +54,32 @@ class WorldNodes:
   """Where an organ's vertices are: in the solver's own vectors."""
 
   node: ints("nvert")  # node of each vertex
-  rest: doubles("nvert", 3)  # rest position [m]
+  mesh: ints("nworld")  # which mesh each world has
+  rest: doubles("nmesh", "nnode", 3)  # rest position of each node [m]
   disp: vector
   vel: vector
   frame: doubles(3, 3)  # rotation from the organ's axes to the world
   origin: doubles(3)  # position of its frame [m]
 
 
-def in_worlds(kind, rows: tuple[str, ...], others: dict[str, Any]) -> Any:
+def in_worlds(
+  kind, rows: tuple[str, ...], others: dict[str, Any], lists: tuple[str, ...] = ()
+) -> Any:
   """Returns a struct of many worlds.
 
   Args:
     kind: that of one
     rows: its arrays that have one a world
     others: types of fields that are others
+    lists: its arrays that follow meshes, see `Beside.lists`
   """
   fields = {}
   for name, var in kind.vars.items():
     dims = DIMS[kind.key].get(name)
     fields[name] = others.get(name, var.type)
     if dims is not None and name not in others:
-      fields[name] = Array(var.type.dtype, ("nworld", *dims) if name in rows else dims)
+      first = ("nworld",) if name in rows else ("nrow",) if name in lists else ()
+      fields[name] = Array(var.type.dtype, (*first, *dims))
   own = {"__annotations__": fields, "__module__": __name__}
   return struct(type(f"{kind.key}InWorlds", (), own))
 
@@ -121,6 +127,10 @@ class Beside:
     batch = organ.batch
     self._nworld, self._device, self._mask = batch.nworld, batch.device, batch.mask
     self.kept: list[Kept] = []
+    # Which row of the lists that follow meshes each world has: 0 until it is cut.
+    self._row = wp.zeros(self._nworld, dtype=int, device=self._device)
+    self._parts = False
+    self._lists: list[dict[str, wp.array]] = []
 
   @property
   def aims(self) -> bool:
@@ -141,6 +151,9 @@ class Beside:
     for kept in self.kept:
       inputs = [self._mask, kept.start, kept.flat]
       wp.launch(put_back_rows, dim=kept.flat.shape, inputs=inputs, device=self._device)
+    if self._lists:
+      inputs = [self._mask, self._row]
+      wp.launch(forget, dim=self._nworld, inputs=inputs, device=self._device)
 
   def _keep(self, block: str, rows: np.ndarray, width: int) -> wp.array:
     """Returns an array of what worlds keep in rows of a block of the plugin state."""
@@ -153,6 +166,57 @@ class Beside:
 
   def configure(self, worlds: np.ndarray, rows: dict[str, np.ndarray]):
     """Follows the tissue of worlds, which has changed; `rows` as `Material.change` takes them."""
+
+  # What follows the meshes of worlds.
+
+  def carry(self, world: int, group: np.ndarray, member: np.ndarray, share: np.ndarray):
+    """Gives vertices of a world that a cut has divided their part, see the plugin's `Beside`."""
+
+  def springs(self, world: int) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Returns vertices, stiffness [N/m] and stretch in the organ's frame [m], see the plugin's."""
+    return []
+
+  def reshape(self, world: int):
+    """Follows the meshes of a world, which was cut."""
+    if self._lists:
+      for arrays, values in zip(self._lists, self.found(world), strict=True):
+        for name, value in values.items():
+          row = arrays[name][1 + world].numpy()
+          row[: len(value)] = value
+          arrays[name][1 + world].assign(row)
+      which = self._row.numpy()
+      which[world] = 1 + world
+      self._row.assign(which)
+
+  def found(self, world: int) -> list[dict[str, np.ndarray]]:
+    """Returns what a world's lists are with the meshes that it has now."""
+    return []
+
+  def follow(self, organs: list):
+    """Says which organs' meshes its lists follow; with no room for cuts they have one row."""
+    self._parts = any(organ.topology for organ in organs)
+
+  def lists(self, kind: Any, values: dict[str, np.ndarray], room: int = 0) -> dict[str, wp.array]:
+    """Returns arrays of what follows meshes: a row for the first ones, and one for each world.
+
+    Args:
+      kind: the struct that they are of
+      values: the first row
+      room: for how many more entries there is room, where there may be cuts
+    """
+    out = {}
+    for name, value in values.items():
+      more = room if self._parts and name not in _COUNTS else 0
+      whole = np.zeros((1 + self._nworld * self._parts, len(value) + more, *value.shape[1:]))
+      whole[0, : len(value)] = value
+      out[name] = wp.array(whole, dtype=kind.vars[name].type.dtype, device=self._device)
+    if self._parts:
+      self._lists.append(out)
+    return out | {"row": self._row}
+
+  def at(self, world: int) -> int:
+    """Returns which row of the lists a world has."""
+    return int(self._row.numpy()[world])
 
   def stepped(self, last: bool):
     """Does what the host has to do after a step; `last`: it was the last one for now."""
@@ -208,12 +272,28 @@ def _rows(array: Any) -> Any:
   return out
 
 
+def mesh_of(organ, world: int):
+  """Returns the mesh of an organ in a world, as `Cuts.mesh_of`."""
+  return organ.topology.mesh_of(world) if organ.topology else organ.declared.mesh
+
+
+def follow(batch, worlds: list[int]):
+  """Lets what lies beside organs follow their meshes in worlds, which have changed."""
+  organs = batch.organs.values()
+  for organ in organs:
+    if organ.topology:
+      organ.topology.follow()
+  for each in (each for organ in organs for each in organ.beside):
+    for world in worlds:
+      each.reshape(world)
+
+
 def nodes_of(organ):
   """Returns `WorldNodes` of an organ."""
-  declared, body = organ.declared, organ.body
+  declared, body, patch = organ.declared, organ.body, organ.patch
   values = dict(
-    node=body.shape.node, rest=declared.mesh.rest, disp=body.state.disp, vel=body.state.vel,
-    frame=declared.frame, origin=declared.origin,
+    node=body.shape.node, mesh=patch.mesh, rest=patch.rest, disp=body.state.disp,
+    vel=body.state.vel, frame=declared.frame, origin=declared.origin,
   )  # fmt: skip
   return fill(WorldNodes, organ.body.device, values)
 

@@ -14,6 +14,8 @@ from ..kernels import HELD, share_freed
 class Bonds(abc.ABC):
   """The bonds of an organ in all worlds, those that the model declares; arrays as of `Batch`.
 
+  A bond that a cut has divided has the damage of the part that holds best.
+
   Attributes:
     vertices: vertex of each, (n,)
     area: area that each stands for [m^2], (n,)
@@ -89,13 +91,16 @@ class OfThreads(Bonds):
   def _tell(self):
     damage, force = self._damage.numpy(), self._force.numpy()
     for world, alone in enumerate(self._alone):
-      damage[world] = np.where(alone.free, 1.0, np.minimum(alone.damage, HELD))
-      force[world] = alone.force
+      made, part = alone.made, np.where(alone.free, 1.0, np.minimum(alone.damage, HELD))
+      damage[world], force[world] = 1.0, 0.0
+      np.minimum.at(damage[world], made, part.astype(np.float32))
+      np.add.at(force[world], made, alone.force.astype(np.float32))
 
   def _weaken(self, amount: wp.array):
     rows = amount.numpy().astype(float)
     for world in np.flatnonzero(rows.any(axis=1)):
-      self._alone[world].weaken(rows[world])
+      alone = self._alone[world]
+      alone.weaken(rows[world][alone.made])
 
 
 class Gathered(Bonds):

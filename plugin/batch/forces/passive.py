@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import warp as wp
+from palpate.engine import coupling
 from palpate.engine.forces import attachments, passive, relaxation, supports
 from palpate.engine.forces import cohesive_bonds as engine_bonds
 from palpate.engine.layout import BOND, FLAG
@@ -15,14 +16,28 @@ from palpate.tissue.kernels import Kernel
 from palpate.tissue.step import SCHEMES
 from palpate.tissue.types import doubles, fill, floats, ints, struct, vector
 
-from ..kernels import show_damage, show_pull, weaken_bonds
-from .base import Beside, WorldBodies, WorldNodes, in_worlds, input_of, kernels, nodes_of
+from ..kernels import BondLists, show_bonds, weaken_bonds
+from .base import (
+  Beside,
+  WorldBodies,
+  WorldNodes,
+  in_worlds,
+  input_of,
+  kernels,
+  mesh_of,
+  nodes_of,
+)
 from .bonds import Bonds
 
 _PARTS = {"own": WorldNodes, "other": WorldNodes, "mj": WorldBodies}
 _number = floats("nworld", "nnumber")
 BOND_ROWS = "state", "next", "stretch", "force", "pull", "hardness"
-WorldBonded = in_worlds(engine_bonds.Bonded, BOND_ROWS, _PARTS | {"number": _number})
+WorldBonded = in_worlds(
+  engine_bonds.Bonded, BOND_ROWS, _PARTS | {"number": _number}, ("count", *engine_bonds.LISTS)
+)
+WorldBurning = in_worlds(
+  engine_bonds.Burning, (), {"bonds": WorldBonded, "ctrl": floats("nworld", "nu")}
+)
 REST_ROWS = (
   "slip",
   "slipped",
@@ -36,9 +51,13 @@ REST_ROWS = (
   "first",
 )
 WorldTied = in_worlds(
-  attachments.Tied, ("point", "force"), _PARTS | {"number": _number, "dvel_warm": vector}
+  attachments.Tied,
+  ("point", "force"),
+  _PARTS | {"number": _number, "dvel_warm": vector},
+  attachments.LISTS,
 )
-WorldRest = in_worlds(supports.Rest, REST_ROWS, _PARTS)
+BELOW = "nother", "elem", "near_adr", "near"
+WorldRest = in_worlds(supports.Rest, REST_ROWS, _PARTS, ("nouter", "stiffness", *BELOW))
 WorldCreeping = in_worlds(relaxation.Creeping, ("own",), {})
 
 
@@ -46,10 +65,11 @@ WorldCreeping = in_worlds(relaxation.Creeping, ("own",), {})
 class Aimed:
   """Ties to another organ."""
 
-  npair: int  # number of them
-  first: int  # the first among all ties
-  pair: ints("npair")  # vertices of the other organ
-  anchor: doubles("npair", 3)  # from there to the points, in the world [m]
+  row: ints("nworld")  # which row of the lists below a world has
+  count: ints("nrow", 1)  # number of them
+  first: ints("nrow", 1)  # the first among all ties
+  pair: ints("nrow", "npair")  # vertices of the other organ
+  anchor: doubles("nrow", "npair", 3)  # from there to the points, in the world [m]
   point: doubles("nworld", "ntie", 6)  # place and velocity of the points [m, m/s]
   other: WorldNodes
   mj: WorldBodies
@@ -58,6 +78,7 @@ class Aimed:
 _stretch, _enter, _bear, _act, _feel, _keep = kernels(
   "forces/cohesive_bonds.h", WorldBonded, *engine_bonds.KERNELS
 )
+(_burn,) = kernels("forces/cohesive_bonds.h", WorldBurning, "burn_bonds")
 _enter_ties, _act_ties = kernels("forces/attachments.h", WorldTied, *attachments.KERNELS)
 (_aim,) = kernels("forces/attachments.h", Aimed, "aim_ties")
 _find, _press, _act_rest, _feel_rest, _keep_rest = kernels(
@@ -72,11 +93,22 @@ class InBonds(Beside):
 
   def __init__(self, organ, numbers: np.ndarray):
     super().__init__(organ)
+    made, batch = organ.space.bonds.groups, organ.batch
+    self._others = [group.other and batch.organ(group.other.organ.name) for group in made]
+    self.follow([organ, *filter(None, self._others)])
     self.groups: list[tuple[Any, Any]] = []
     self.borne: list[tuple[Any, Any]] = []
-    for group in organ.space.bonds.groups:
-      other = organ.batch.organ(group.other.organ.name) if group.other else None
+    count = coupling.sizes(organ.declared)["nbond"]
+    if made:
+      self._state = self._keep("bond", np.arange(count), len(BOND))
+    for group, other in zip(made, self._others, strict=True):
       self.groups.append((group, self._fill(group, other, numbers)))
+    currents = organ.space.cutters.by_current.values()
+    self._burning = [
+      fill(WorldBurning, self._device, current.burning | {"bonds": b, "ctrl": batch.d.ctrl})
+      for current in currents
+      for _, b in self.groups
+    ]
 
   def bear(self, others: list["InBonds"]):
     """Finds the bonds that others have to it, once all have been made."""
@@ -84,23 +116,21 @@ class InBonds(Beside):
     self.borne = [pair for each in others for pair in each.groups if pair[0] in mine]
 
   def _fill(self, group, other, numbers: np.ndarray):
-    organ, n = self._organ, len(group.vert)
-    scheme = SCHEMES[organ.config.integrator]
+    organ = self._organ
+    room = organ.declared.mesh.spare
+    values: dict[str, Any] = self.lists(WorldBonded, _bonds_of(group.now), room)
+    scheme, n = SCHEMES[organ.config.integrator], values["vert"].shape[1]
     shapes: dict[str, tuple] = {name: (n, 3) for name in ("stretch", "force", "pull")}
     shapes |= {"next": (n, len(BOND)), "hardness": (n,)}
-    values: dict[str, Any] = dict(zip(("stiffness", "strength", "energy"), group.law, strict=True))
-    of_group = "vert", "area", "anchor", "normal", "corner", "weight"
-    values |= {name: getattr(group, name) for name in of_group}
+    values |= dict(zip(("stiffness", "strength", "energy"), group.law, strict=True))
     values |= {name: self._zeros(self._nworld, *shape) for name, shape in shapes.items()}
     values |= dict(
-      nbond=n,
       body=int(numbers[group.body]) if group.body >= 0 else group.body,
       restless=group.bonded.restless,
       ahead=float(scheme.ahead),
       gain=scheme.gain(1.0, 0.0),
       live=np.ones(1),
-      slot=np.arange(n),
-      state=self._keep("bond", group.slot, len(BOND)),
+      state=self._state,
       own=nodes_of(organ),
       solve=input_of(organ),
       other=WorldNodes() if other is None else nodes_of(other),
@@ -118,23 +148,59 @@ class InBonds(Beside):
   def enter(self):
     """See `Beside`."""
     for _, b in self.groups:
-      self._over(_stretch, b, b.nbond)
-      self._over(_enter, b, b.nbond)
+      self._over(_stretch, b, _count(b))
+      self._over(_enter, b, _count(b))
     for _, b in self.borne:
-      self._over(_stretch, b, b.nbond)
+      self._over(_stretch, b, _count(b))
       self._over(_bear, b, 1)
 
   def act(self):
     """See `Beside`."""
     for _, b in self.groups:
-      self._over(_act, b, b.nbond)
+      self._over(_act, b, _count(b))
       if b.body >= 0 and b.restless:
         self._over(_feel, b, 1)
 
   def end(self):
     """See `Beside`."""
     for _, b in self.groups:
-      self._over(_keep, b, b.nbond)
+      self._over(_keep, b, _count(b))
+    for burning in self._burning:
+      self._over(_burn, burning, 1)
+
+  def found(self, world: int) -> list[dict[str, np.ndarray]]:
+    """See `Beside`."""
+    return [_bonds_of(each) for each in self._now(world)]
+
+  def _now(self, world: int) -> list:
+    pairs = zip(self.groups, self._others, strict=True)
+    own = mesh_of(self._organ, world)
+    return [group.found(own, other and mesh_of(other, world)) for (group, _), other in pairs]
+
+  def carry(self, world: int, group: np.ndarray, member: np.ndarray, share: np.ndarray):
+    """See `Beside`."""
+    if self.groups:
+      state = self._state[world].numpy()
+      engine_bonds.carry(self._organ.declared, state, group, member, share)
+      self._state[world].assign(state)
+
+  def springs(self, world: int) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """See `Beside`."""
+    state = self._state[world].numpy()
+    return [
+      group.springs(now, state, b.stretch[world].numpy())
+      for (group, b), now in zip(self.groups, self._now(world), strict=True)
+    ]
+
+
+def _bonds_of(now: engine_bonds.Found) -> dict[str, np.ndarray]:
+  out = {name: np.asarray(getattr(now, name)) for name in engine_bonds.LISTS}
+  return out | {"count": np.array([len(now.vert)])}
+
+
+def _count(b) -> int:
+  """Returns how many bonds there is room for."""
+  return b.hardness.shape[1]
 
 
 class Grown(Bonds):
@@ -146,26 +212,30 @@ class Grown(Bonds):
 
   def __init__(self, organ):
     found = [each.groups for each in organ.beside if isinstance(each, InBonds)]
-    self._groups = [pair for groups in found for pair in groups]
-    made = [group for group, _ in self._groups]
-    self.vertices = np.concatenate([np.zeros(0, int), *(group.vert for group in made)])
-    self.area = np.concatenate([np.zeros(0), *(group.area for group in made)])
+    groups = [pair for each in found for pair in each]
+    made = [group.now for group, _ in groups]
+    self.vertices = np.concatenate([np.zeros(0, int), *(now.vert for now in made)])
+    self.area = np.concatenate([np.zeros(0), *(now.area for now in made)])
+    first = np.cumsum([0, *(len(now.vert) for now in made)])
+    names = "row", "count", "made", "slot", "state", "pull"
+    self._groups = [
+      fill(BondLists, b.row.device, {"before": int(k)} | {name: getattr(b, name) for name in names})
+      for (_, b), k in zip(groups, first, strict=False)
+    ]
     super().__init__(organ.batch.nworld, organ.batch.device)
 
-  def _over(self, what, name: str, values: wp.array):
-    first = 0
-    for _, b in self._groups:
-      inputs = [getattr(b, name), first, values]
-      dim = (self._share.shape[0], b.nbond)
-      wp.launch(what, dim=dim, inputs=inputs, device=self._device)
-      first += b.nbond
+  def _over(self, what, *values: wp.array):
+    for lists in self._groups:
+      dim = lists.pull.shape[:2]
+      wp.launch(what, dim=dim, inputs=[lists, *values], device=self._device)
 
   def _tell(self):
-    self._over(show_damage, "state", self._damage)
-    self._over(show_pull, "pull", self._force)
+    self._damage.fill_(1.0)
+    self._force.zero_()
+    self._over(show_bonds, self._damage, self._force)
 
   def _weaken(self, amount: wp.array):
-    self._over(weaken_bonds, "state", amount)
+    self._over(weaken_bonds, amount)
 
 
 class Ties(Beside):
@@ -175,25 +245,52 @@ class Ties(Beside):
     super().__init__(organ)
     made, batch = organ.space.ties, organ.batch
     known: Any = made.fields
-    self._count = int(known.count.numpy()[0])
-    names = "vert", "leads", "stiffness", "anchor", "count", "owned", "restless"
-    values = {name: getattr(known, name).numpy() for name in names}
-    body = known.body.numpy()
-    point = self._zeros(self._nworld, len(body), 6)
+    self._groups, self._numbers = made.groups, numbers
+    self._others = [g.other and batch.organ(g.other.organ.name) for g in made.groups]
+    organs = [organ, *{id(other): other for other in self._others if other}.values()]
+    self.follow(organs)
+    lists, *aims = self._lists_of([group.now for group in made.groups])
+    room = len(made.groups) * sum(each.declared.mesh.spare for each in organs)
+    values: dict[str, Any] = self.lists(WorldTied, lists, room)
+    n = values["vert"].shape[1]
+    values |= {name: getattr(known, name).numpy() for name in ("owned", "restless")}
+    point = self._zeros(self._nworld, n, 6)
     values |= dict(
-      ahead=known.ahead, gain=known.gain, body=np.where(body < 0, body, numbers[body]), point=point,
-      force=self._zeros(self._nworld, len(body), 3), own=nodes_of(organ), solve=input_of(organ),
-      number=organ.body.tissue.number, dvel_warm=organ.body.state.dvel_warm, mj=batch.bodies,
+      ahead=known.ahead, gain=known.gain, point=point, force=self._zeros(self._nworld, n, 3),
+      own=nodes_of(organ), solve=input_of(organ), number=organ.body.tissue.number,
+      dvel_warm=organ.body.state.dvel_warm, mj=batch.bodies,
     )  # fmt: skip
-    self._fields, self._aimed, first = fill(WorldTied, self._device, values), [], 0
-    self._moves = bool(values["restless"][0] and (body >= 0).any())
-    for group in made.groups:
-      if group.other is not None:
-        other = nodes_of(batch.organ(group.other.organ.name))
-        own = {"npair": len(group.pair), "first": first, "pair": group.pair, "point": point}
-        own |= {"anchor": group.anchor, "other": other, "mj": batch.bodies}
-        self._aimed.append(fill(Aimed, self._device, own))
-      first += len(group.vert)
+    self._fields, self._aimed = fill(WorldTied, self._device, values), []
+    self._moves = bool(values["restless"][0] and (lists["body"] >= 0).any())
+    for other, aim in zip(filter(None, self._others), aims, strict=True):
+      own = {"point": point, "other": nodes_of(other), "mj": batch.bodies}
+      own |= self.lists(Aimed, aim, room)
+      self._aimed.append(fill(Aimed, self._device, own))
+
+  def _lists_of(self, found: list) -> list[dict[str, np.ndarray]]:
+    """Returns what `WorldTied` has of groups that became this, and `Aimed` of those to organs."""
+    lists, aims, first = self._organ.space.ties.lists(found), [], 0
+    body = lists["body"]
+    out = [lists | {"body": np.where(body < 0, body, self._numbers[body])}]
+    for now, other in zip(found, self._others, strict=True):
+      if other:
+        numbers = {"count": np.array([len(now.vert)]), "first": np.array([first])}
+        aims.append(numbers | {"pair": now.pair, "anchor": now.anchor})
+      first += len(now.vert)
+    return out + aims
+
+  def found(self, world: int) -> list[dict[str, np.ndarray]]:
+    """See `Beside`."""
+    own = mesh_of(self._organ, world)
+    pairs = zip(self._groups, self._others, strict=True)
+    return self._lists_of([g.found(own, o and mesh_of(o, world)) for g, o in pairs])
+
+  def springs(self, world: int) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """See `Beside`."""
+    f, row = self._fields, self.at(world)
+    count = int(f.count[row].numpy()[0])
+    vert, stiff = (array[row].numpy()[:count] for array in (f.vert, f.stiffness))
+    return [attachments.springs(vert, stiff, f.force[world].numpy()[:count])]
 
   @property
   def aims(self) -> bool:
@@ -206,7 +303,7 @@ class Ties(Beside):
   def enter(self):
     """See `Beside`."""
     for aimed in self._aimed:
-      self._over(_aim, aimed, aimed.npair)
+      self._over(_aim, aimed, aimed.pair.shape[1])
     self._alone(_enter_ties)
 
   def act(self):
@@ -223,38 +320,60 @@ class Rests(Beside):
 
   def __init__(self, organ, numbers: np.ndarray):
     super().__init__(organ)
-    alone: Any = organ.space.rests.alone
-    n = alone.nouter
+    known: Any = organ.space.rests
+    alone, n = known.alone, organ.nvert
+    below = [organ.batch.organ(other.organ.name) for other in known.below]
+    self._n, self._known, self._below = n, known, below
+    self.follow([organ, *below])
+    above = self._of_mesh(known.above_of(organ.declared.mesh))
     shapes = {"slipped": (n, 3), "force": (n, 3), "hardness": (n, 6), "weight": (n, 3)}
-    names = "ngeom", "nouter", "restless", "skin", "cell"
-    values: dict[str, Any] = {name: getattr(alone, name) for name in names}
-    same = "geom", "friction", "free", "stiffness"
-    values |= {name: getattr(alone, name).numpy() for name in same}
+    values: dict[str, Any] = {name: getattr(alone, name) for name in ("ngeom", "restless", "skin")}
+    values |= {name: getattr(alone, name).numpy() for name in ("geom", "friction", "free")}
     values |= {name: self._zeros(self._nworld, *shape) for name, shape in shapes.items()}
+    self._slip = self._keep("slip", np.arange(n), 3)
     values |= dict(
+      cell=alone.cell,
       corner=self._zeros(self._nworld, n, 3, dtype=int),
       on=self._zeros(self._nworld, n, dtype=int),
-      slip=self._keep("slip", np.arange(n), 3),
+      slip=self._slip,
       own=nodes_of(organ),
       solve=input_of(organ),
       mj=organ.batch.bodies,
     )
-    nothing = self._other(alone) | {"other": WorldNodes(), "below": passive.Input()}
+    nothing = self._other(alone, 0) | {"other": WorldNodes(), "below": passive.Input()}
+    none = {name: getattr(alone, name).numpy() for name in BELOW}
+    nothing |= self.lists(WorldRest, above | none)
     self._fields = fill(WorldRest, self._device, values | nothing)
     self.on = []
-    for known, below in zip(organ.space.rests.on, organ.space.rests.below, strict=True):
-      theirs = organ.batch.organ(below.organ.name)
-      own = self._other(known) | {"other": nodes_of(theirs), "below": input_of(theirs)}
+    for fields, theirs in zip(known.on, below, strict=True):
+      own = self._other(fields, theirs.nvert)
+      own |= {"other": nodes_of(theirs), "below": input_of(theirs)}
+      own |= self.lists(WorldRest, above | supports.below_of(theirs.declared.mesh))
       self.on.append((fill(WorldRest, self._device, values | own), theirs))
 
-  def _other(self, known) -> dict[str, Any]:
-    """Returns the fields of the plugin's other organ, in all worlds."""
-    values: dict[str, Any] = {"mu": known.mu, "nother": known.nother}
-    values |= {name: getattr(known, name).numpy() for name in ("elem", "near_adr", "near")}
-    values["where"] = self._zeros(self._nworld, known.nother, 3)
-    for name in ("next", "first"):
-      values[name] = self._zeros(self._nworld, *getattr(known, name).shape, dtype=int)
-    return values
+  def _of_mesh(self, above: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Returns the stiffness of the springs with that of all vertices."""
+    stiffness = np.zeros(self._n)
+    stiffness[: len(above["stiffness"])] = above["stiffness"]
+    return above | {"stiffness": stiffness}
+
+  def found(self, world: int) -> list[dict[str, np.ndarray]]:
+    """See `Beside`."""
+    above = self._of_mesh(self._known.above_of(mesh_of(self._organ, world)))
+    below = [supports.below_of(mesh_of(other, world)) for other in self._below]
+    return [above, *(above | each for each in below)]
+
+  def carry(self, world: int, group: np.ndarray, member: np.ndarray, share: np.ndarray):
+    """See `Beside`."""
+    slip = self._slip[world].numpy()
+    supports.carry(slip, group, member)
+    self._slip[world].assign(slip)
+
+  def _other(self, known, n: int) -> dict[str, Any]:
+    """Returns the fields of the plugin's other organ of n vertices, in all worlds."""
+    zeros = {"next": (n,), "first": known.first.shape}
+    out = {name: self._zeros(self._nworld, *shape, dtype=int) for name, shape in zeros.items()}
+    return out | {"mu": known.mu, "where": self._zeros(self._nworld, n, 3)}
 
   @property
   def aims(self) -> bool:
@@ -262,7 +381,7 @@ class Rests(Beside):
     return bool(self._fields.restless)
 
   def _each(self, what: Kernel):
-    self._over(what, self._fields, self._fields.nouter)
+    self._over(what, self._fields, self._n)
 
   def find(self):
     """Finds what each node rests on."""

@@ -317,16 +317,7 @@ class Cuts:
 
   def _held(self) -> cutting.Springs | None:
     """Returns the ties and bonds, None where there are none."""
-    springs = [*self._w.ties.springs(), *self._w.bonds.springs()]
-    if not springs:
-      return None
-    n = self.mesh.nvert
-    energy, force, hard = np.zeros(n), np.zeros((n, 3)), np.zeros(n)
-    for vert, stiffness, stretch in springs:
-      np.add.at(energy, vert, 0.5 * stiffness * (stretch**2).sum(axis=1))
-      np.add.at(force, vert, stiffness[:, None] * stretch)
-      np.add.at(hard, vert, stiffness)
-    return cutting.Springs(energy, force, hard)
+    return together([*self._w.ties.springs(), *self._w.bonds.springs()], self.mesh.nvert)
 
   def _report(self, found: Any) -> Report:
     return report(found, self.mesh, self._w.organ, self._w.config.thickness)
@@ -350,6 +341,23 @@ class Cuts:
   def pieces(self) -> list[Piece]:
     """Returns the parts that hang together, the largest first."""
     return pieces(self.mesh, self._w.organ.mass, self._w.config.thickness)
+
+
+def together(springs: list[tuple], nvert: int) -> cutting.Springs | None:
+  """Returns what springs are together of each vertex; None where there are none.
+
+  Args:
+    springs: vertices, stiffness [N/m], and stretch in the organ's frame [m] of several
+    nvert: number of the organ's vertices
+  """
+  if not springs:
+    return None
+  energy, force, hard = np.zeros(nvert), np.zeros((nvert, 3)), np.zeros(nvert)
+  for vert, stiffness, stretch in springs:
+    np.add.at(energy, vert, 0.5 * stiffness * (stretch**2).sum(axis=1))
+    np.add.at(force, vert, stiffness[:, None] * stretch)
+    np.add.at(hard, vert, stiffness)
+  return cutting.Springs(energy, force, hard)
 
 
 def report(found: cutting.Cut, before: Mesh, organ: Declaration, thickness: float) -> Report:

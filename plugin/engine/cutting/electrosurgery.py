@@ -8,15 +8,14 @@ grows by power / (energy * thickness) a second, and bonds near it lose their hol
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from palpate.tissue.cutting import path as paths
 from palpate.tissue.cutting.surface import WorkingCopy
 from palpate.tissue.geometry.mesh import Mesh
 
-from ..forces.attachments import motion
-from ..layout import BLADE, BOND
+from ..layout import BLADE
 from ..model import mjstruct
 
 if TYPE_CHECKING:
@@ -55,12 +54,20 @@ class Current:
     power = float(mjstruct.view(d.ctrl, m.nu)[self.actuator])
     given = abs(power) * float(m.opt.timestep)  # [J]
     if given:
-      self._free(d, m, given)
+      w.bonds.burn(self.burning)
     if power > 0 and w.cuts:
       x = w.organ.mesh.rest + w.motion()[0]
       if self.burn(row, w.organ.mesh, x, self._finder, *self._line(d, m), given):
         return False
     return ends(row)
+
+  @property
+  def burning(self) -> dict[str, Any]:
+    """What `cohesive_bonds.Burning` has of it."""
+    return dict(
+      geom=self.geom, axis=self._axis, actuator=self.actuator, half=self._half, reach=self._reach,
+      energy=self._energy,
+    )  # fmt: skip
 
   def _line(self, d, m) -> tuple[np.ndarray, np.ndarray]:
     middle = mjstruct.view(d.geom_xpos, (m.ngeom, 3))[self.geom]
@@ -70,18 +77,6 @@ class Current:
     """Returns the ends of its axis in the world [m], of where the geom is."""
     axis = axes[:, self._axis]
     return middle - self._half * axis, middle + self._half * axis
-
-  def _free(self, d, m, given: float):
-    """Weakens the bonds that are near."""
-    w = self._w
-    for group in w.bonds.groups:
-      damage = w.bonds.state[group.slot, BOND.damage]
-      far = paths.distance(np.array(self._line(d, m)), motion(w, group.vert)[0])[0]
-      near = (far < self._reach) & (damage < 1)
-      if near.any():
-        slot = group.slot[near]
-        more = given / (self._energy * group.area[near].sum())
-        w.bonds.state[slot, BOND.damage] = np.minimum(damage[near] + more, 1.0)
 
   def burn(
     self, row: np.ndarray, mesh: Mesh, x: np.ndarray, finder: paths.Finder,

@@ -8,7 +8,7 @@ the bodies feel what they have pulled; see `forces/attachments.h`.
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
 import dataclasses
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -37,14 +37,15 @@ class Tied:
 
   ahead: wp.float64  # share of the step's way at which its scheme takes forces
   gain: wp.float64  # how much of a step's stiffness its scheme has on dv
+  row: ints("nworld")  # which row of the lists below a world has, in a batch with cuts
   count: ints(1)  # number of ties
-  owned: ints(1)  # whether any leads to the organ's own motion
-  restless: ints(1)  # whether one leads to what may move while the organ sleeps
   vert: ints("ntie")  # vertex
   body: ints("ntie")  # body, or what `forces/attachments.h` has besides
   leads: ints("ntie")  # whether the last steps say how fast the point will be
   stiffness: doubles("ntie")  # [N/m]
   anchor: doubles("ntie", 3)  # the point in its body's frame [m]
+  owned: ints(1)  # whether any leads to the organ's own motion
+  restless: ints(1)  # whether one leads to what may move while the organ sleeps
   point: doubles("ntie", 6)  # place and velocity of another point, in the world [m, m/s]
   force: doubles("ntie", 3)  # on the node, in the organ's frame [N]
   own: Nodes
@@ -56,8 +57,24 @@ class Tied:
 
 KERNELS = "enter_ties", "act_ties"
 _enter, _act = coupling.kernels("forces/attachments.h", Tied, *KERNELS)
-_OF_COUNT = ("count", "owned", "restless")
-_OF_TIE = ("vert", "body", "leads", "stiffness", "anchor", "point", "force")
+LISTS = ("count", "vert", "body", "leads", "stiffness", "anchor")
+_OWN = (*LISTS, "owned", "restless", "point", "force")
+
+
+class Found(NamedTuple):
+  """What became of ties on meshes that have been cut.
+
+  Attributes:
+    vert: vertices that they are on                       (n,)
+    stiffness: of each [N/m]                              (n,)
+    anchor: as in `Group.made`, now [m]                   (n, 3)
+    pair: the other organ's vertices, if there is one     (n,)
+  """
+
+  vert: np.ndarray
+  stiffness: np.ndarray
+  anchor: np.ndarray
+  pair: np.ndarray | None
 
 
 @dataclasses.dataclass(eq=False)
@@ -74,10 +91,7 @@ class Group:
     other: workspace of the other organ, or None
     theirs: its vertices
     by: key of the configuration that declares it, or "" where it was made while running
-    vert: vertices that they are on now                   (n,)
-    stiffness: of each [N/m]                              (n,)
-    anchor: as in `made`, now [m]                         (n, 3)
-    pair: the other organ's vertices                      (n,)
+    now: what became of them
   """
 
   own: Any
@@ -87,29 +101,28 @@ class Group:
   other: Any = None
   theirs: Grip | None = None
   by: str = ""
-  vert: np.ndarray = dataclasses.field(init=False)
-  stiffness: np.ndarray = dataclasses.field(init=False)
-  anchor: np.ndarray = dataclasses.field(init=False)
-  pair: np.ndarray | None = dataclasses.field(default=None, init=False)
+  now: Found = dataclasses.field(init=False)
 
   def __post_init__(self):
     self.find()
 
   def find(self):
     """Finds what became of the vertices."""
-    organ, made = self.own.organ, self.made
-    held = self.grip.now(organ.mesh)
+    self.now = self.found(self.own.organ.mesh, self.other and self.other.organ.mesh)
+
+  def found(self, mesh: Mesh, other: Mesh | None) -> Found:
+    """Returns what became of the ties where their organ, and the other one, have these meshes."""
+    made, held, pair = self.made, self.grip.now(mesh), None
     share, shift = held.share, held.shift @ made["turn"].T
-    if self.other is not None and self.theirs is not None:
-      other = self.other.organ
-      far = self.theirs.now(other.mesh)
+    if self.theirs is not None and other is not None:
+      far = self.theirs.now(other)
       k, j = pairs(held, far)
-      held, self.pair = Held(held.row[k], held.vert[k], held.share[k], held.shift[k]), far.vert[j]
-      share, shift = share[k] * far.share[j], shift[k] - far.shift[j] @ other.frame.T
+      held, pair = Held(held.row[k], held.vert[k], held.share[k], held.shift[k]), far.vert[j]
+      share, shift = share[k] * far.share[j], shift[k] - far.shift[j] @ self.other.organ.frame.T
     elif self.by == "carrier":  # the bed lets go of what is cut free
-      share = share * _held_share(organ.mesh, held.vert, organ.config.pin)
-    self.vert, self.stiffness = held.vert, made["stiffness"][held.row] * share
-    self.anchor = made["anchor"][held.row] + shift
+      share = share * _held_share(mesh, held.vert, self.own.organ.config.pin)
+    stiffness, anchor = made["stiffness"][held.row] * share, made["anchor"][held.row] + shift
+    return Found(held.vert, stiffness, anchor, pair)
 
 
 def _held_share(mesh: Mesh, vert: np.ndarray, pins: tuple[int, ...]) -> np.ndarray:
@@ -143,7 +156,7 @@ class Ties(Beside):
   def put(self, groups: list[Group]) -> bool:
     """Makes these the ties; returns whether the step's graphs have to be recorded anew."""
     self.groups = sorted(groups, key=lambda group: group.body)
-    total = sum(len(group.vert) for group in groups)
+    total = sum(len(group.now.vert) for group in groups)
     grown = total > self._room
     if grown:
       self._room = max(_LEAST, 2 * total) + len(groups) * self._w.organ.mesh.spare
@@ -154,23 +167,28 @@ class Ties(Beside):
 
   def _allocate(self):
     sizes = {"ntie": self._room}
-    for name in (*_OF_COUNT, *_OF_TIE):
+    for name in _OWN:
       shape = [sizes[n] if isinstance(n, str) else n for n in DIMS[Tied.key][name]]
       self._arrays[name] = wp.zeros(shape, dtype=Tied.vars[name].type.dtype, device="cpu")
     self._w.hold.need()
 
   def _write(self, total: int):
-    for name in ("vert", "body", "stiffness", "anchor"):
-      parts = [np.broadcast_to(getattr(g, name), _rows(g, name)) for g in self.groups]
-      if parts:
-        self._arrays[name].numpy()[:total] = np.concatenate(parts)
+    for name, values in self.lists([group.now for group in self.groups]).items():
+      self._arrays[name].numpy()[: len(values)] = values
     self._arrays["restless"].numpy()[0] = any(self._moves(group.body) for group in self.groups)
     self._arrays["owned"].numpy()[0] = any(g.body == TO_OWN_MOTION for g in self.groups)
-    self._arrays["count"].numpy()[0] = total
-    parts = [np.full(len(g.vert), self._leads(g.body)) for g in self.groups]
-    if parts:
-      self._arrays["leads"].numpy()[:total] = np.concatenate(parts)
     self._arrays["force"].zero_()
+
+  def lists(self, found: list[Found]) -> dict[str, np.ndarray]:
+    """Returns `LISTS` of what became of the groups."""
+    count = [len(each.vert) for each in found]
+    body = np.repeat([group.body for group in self.groups], count)
+    leads = np.repeat([self._leads(group.body) for group in self.groups], count)
+    out = {"count": np.array([sum(count)]), "body": body, "leads": leads}
+    for name, wide in (("vert", ()), ("stiffness", ()), ("anchor", (3,))):
+      parts = [np.broadcast_to(getattr(each, name), (len(each.vert), *wide)) for each in found]
+      out[name] = np.concatenate([np.zeros((0, *wide)), *parts])
+    return out
 
   def _moves(self, body: int) -> bool:
     return body < 0 or may_move(mjstruct.Model.from_address(self._w.model), body)
@@ -191,13 +209,13 @@ class Ties(Beside):
 
   def springs(self) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Returns vertices, stiffness [N/m], and last stretch in the organ's frame [m] of its ties."""
-    out, start = [], 0
-    for group in self.groups:
-      stop = start + len(group.vert)
-      stiff = np.maximum(group.stiffness, 1e-30)[:, None]
-      out.append((group.vert, group.stiffness, -self._arrays["force"].numpy()[start:stop] / stiff))
-      start = stop
-    return out
+    if not self:
+      return []
+    count = sum(len(group.now.vert) for group in self.groups)
+    vert, stiff, force = (
+      self._arrays[name].numpy()[:count].copy() for name in ("vert", "stiffness", "force")
+    )
+    return [springs(vert, stiff, force)]
 
   def bind(self, model: int):
     """See `Beside`."""
@@ -206,6 +224,7 @@ class Ties(Beside):
     w = self._w
     scheme = SCHEMES[w.config.integrator]
     values = self._arrays | dict(
+      row=np.zeros(1),
       ahead=float(scheme.ahead),
       gain=scheme.gain(1.0, 0.0),
       own=nodes(w),
@@ -221,7 +240,7 @@ class Ties(Beside):
     w = self._w
     m = mjstruct.Model.from_address(w.model)
     gain = float(m.opt.timestep) * (float(m.opt.timestep) + w.config.damping)
-    weight = gain * sum(group.stiffness.sum() for group in self.groups if group.body == body)
+    weight = gain * sum(group.now.stiffness.sum() for group in self.groups if group.body == body)
     if body == TO_OWN_MOTION:
       return weight < _LEADS * w.organ.mass.sum()
     return body > 0 and weight * mjstruct.view(m.body_invweight0, (m.nbody, 2))[body, 0] < _LEADS
@@ -230,10 +249,11 @@ class Ties(Beside):
     """Finds where the points on other organs are."""
     start = 0
     for group in self.groups:
-      stop = start + len(group.vert)
-      if group.other is not None and group.pair is not None:
-        at, vel = motion(group.other, group.pair)
-        self._arrays["point"].numpy()[start:stop] = np.hstack([at + group.anchor, vel])
+      stop = start + len(group.now.vert)
+      now = group.now
+      if group.other is not None and now.pair is not None:
+        at, vel = motion(group.other, now.pair)
+        self._arrays["point"].numpy()[start:stop] = np.hstack([at + now.anchor, vel])
       start = stop
 
   @property
@@ -245,15 +265,16 @@ class Ties(Beside):
     """Returns the force of a group's ties on its vertices in the last step [N], (n, 3)."""
     start = 0
     for each in self.groups:
-      stop = start + len(each.vert)
+      stop = start + len(each.now.vert)
       if each is group:
         return self._arrays["force"].numpy()[start:stop] @ self._w.organ.frame.T
       start = stop
-    return np.zeros((len(group.vert), 3))
+    return np.zeros((len(group.now.vert), 3))
 
 
-def _rows(group: Group, name: str) -> tuple[int, ...]:
-  return (len(group.vert), 3) if name == "anchor" else (len(group.vert),)
+def springs(vert: np.ndarray, stiff: np.ndarray, force: np.ndarray) -> tuple:
+  """Returns vertices, stiffness [N/m], and last stretch [m] of ties that had forces [N]."""
+  return vert, stiff, -force / np.maximum(stiff, 1e-30)[:, None]
 
 
 def motion(w: "Workspace", vert: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

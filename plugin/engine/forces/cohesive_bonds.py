@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
+from palpate.tissue.geometry.mesh import Mesh
 from palpate.tissue.reading import Law
 from palpate.tissue.step import SCHEMES
 from palpate.tissue.types import doubles, fill, ints, struct
@@ -24,14 +25,13 @@ if TYPE_CHECKING:
   from ..workspace import Workspace
 
 ON_ORGAN = -1  # in place of a body
-_OF_GROUP = ("vert", "slot", "area", "anchor", "normal", "corner", "weight")
+LISTS = ("made", "vert", "slot", "area", "anchor", "normal", "corner", "weight")
 
 
 @struct
 class Bonded:
   """Bonds of an organ that were made together, to one body or to one other organ."""
 
-  nbond: int  # number of them
   body: int  # body, or ON_ORGAN
   restless: int  # whether what they lead to may move while the organ sleeps
   ahead: wp.float64  # share of the step's way at which its scheme takes forces
@@ -40,6 +40,9 @@ class Bonded:
   strength: wp.float64  # [Pa]
   energy: wp.float64  # by area, of a bond from whole to free [J/m^2]
   live: ints(1)  # whether there are any
+  row: ints("nworld")  # which row of the lists up to `weight` a world has, in a batch with cuts
+  count: ints(1)  # number of bonds
+  made: ints("nbond")  # which of those that were made
   vert: ints("nbond")  # vertex
   slot: ints("nbond")  # its row in `state`
   area: doubles("nbond")  # [m^2]
@@ -61,10 +64,52 @@ class Bonded:
   mj: Bodies
 
 
+@struct
+class Burning:
+  """A geom whose current frees bonds, see `engine.cutting.electrosurgery`."""
+
+  bonds: Bonded
+  geom: int
+  axis: int  # along which it is long
+  actuator: int  # whose control is its power [W]
+  half: wp.float64  # of its length [m]
+  reach: wp.float64  # from that line [m]
+  energy: wp.float64  # that an area takes [J/m^2]
+  ctrl: doubles("nu")  # controls
+
+
 KERNELS = tuple(f"{verb}_bonds" for verb in ("stretch", "enter", "bear", "act", "feel", "keep"))
 _stretch, _enter, _bear, _act, _feel, _keep = coupling.kernels(
   "forces/cohesive_bonds.h", Bonded, *KERNELS
 )
+
+
+(_burn,) = coupling.kernels("forces/cohesive_bonds.h", Burning, "burn_bonds")
+
+
+@dataclasses.dataclass(frozen=True)
+class Found:
+  """What became of bonds on meshes that have been cut.
+
+  Attributes:
+    made: which of those that were made                   (n,)
+    vert: vertices that they are on                       (n,)
+    slot: their rows in the plugin state                  (n,)
+    area: of each [m^2]                                   (n,)
+    anchor: what each leads to in the axes of body or triangle [m] (n, 3)
+    normal: away from its bed in these axes, or 0         (n, 3)
+    corner: vertices of the other organ that hold each    (n, 3)
+    weight: their shares                                  (n, 3)
+  """
+
+  made: np.ndarray
+  vert: np.ndarray
+  slot: np.ndarray
+  area: np.ndarray
+  anchor: np.ndarray
+  normal: np.ndarray
+  corner: np.ndarray
+  weight: np.ndarray
 
 
 @dataclasses.dataclass(eq=False)
@@ -81,13 +126,7 @@ class Group:
     other: workspace of the other organ, or None
     spots: the points of it that they lead to
     declared: whether the model has them, not somebody who made them while running
-    vert: vertices that they are on now                   (n,)
-    slot: their rows in the plugin state                  (n,)
-    area: of each [m^2]                                   (n,)
-    anchor: what each leads to in the axes of body or triangle [m] (n, 3)
-    normal: away from its bed in these axes, or 0         (n, 3)
-    corner: vertices of the other organ that hold each    (n, 3)
-    weight: their shares                                  (n, 3)
+    now: what became of them
     arrays: what the kernels write, with room for cuts
     bonded: what they take
   """
@@ -100,13 +139,7 @@ class Group:
   other: Any
   spots: Spots | None
   declared: bool
-  vert: np.ndarray = dataclasses.field(init=False)
-  slot: np.ndarray = dataclasses.field(init=False)
-  area: np.ndarray = dataclasses.field(init=False)
-  anchor: np.ndarray = dataclasses.field(init=False)
-  normal: np.ndarray = dataclasses.field(init=False)
-  corner: np.ndarray = dataclasses.field(init=False)
-  weight: np.ndarray = dataclasses.field(init=False)
+  now: Found = dataclasses.field(init=False)
   arrays: dict[str, wp.array] = dataclasses.field(init=False)
   bonded: Any = dataclasses.field(default=None, init=False)
 
@@ -115,32 +148,35 @@ class Group:
     shapes = {name: (n, 3) for name in ("stretch", "force", "pull")}
     shapes |= {"next": (n, len(BOND)), "hardness": n}
     self.arrays = {k: wp.zeros(s, dtype=wp.float64, device="cpu") for k, s in shapes.items()}
-    self.arrays["live"] = wp.ones(1, dtype=int, device="cpu")
+    self.arrays |= {name: wp.ones(1, dtype=int, device="cpu") for name in ("live", "count")}
+    self.arrays["row"] = wp.zeros(1, dtype=int, device="cpu")
     self._find()
 
   def _find(self):
-    """Finds what became of the vertices, and of what they lead to."""
-    organ, made = self.own.organ, self.made
-    held = self.grip.now(organ.mesh)
-    row, self.vert = held.row, held.vert
-    self.slot = (np.cumsum(organ.free) - 1)[self.vert]
-    self.area, self.normal = made["area"][row] * held.share, made["normal"][row]
-    self.anchor = made["anchor"][row] + np.einsum("nij,nj->ni", made["turn"][row], held.shift)
-    self.corner = self.weight = np.zeros((len(row), 3))
-    if self.spots is not None:
-      corner, weight, turn = (each[row] for each in self.spots.now(self.other.organ.mesh))
-      self.corner, self.weight = corner, weight
-      self.anchor = np.einsum("nij,nj->ni", turn, self.anchor)
+    self.now = self.found(self.own.organ.mesh, self.other and self.other.organ.mesh)
+
+  def found(self, mesh: Mesh, other: Mesh | None) -> Found:
+    """Returns what became of the bonds where their organ, and the other one, have these meshes."""
+    made, held = self.made, self.grip.now(mesh)
+    row = held.row
+    anchor = made["anchor"][row] + np.einsum("nij,nj->ni", made["turn"][row], held.shift)
+    corner = weight = np.zeros((len(row), 3))
+    if self.spots is not None and other is not None:
+      corner, weight, turn = (each[row] for each in self.spots.now(other))
+      anchor = np.einsum("nij,nj->ni", turn, anchor)
+    slot = (np.cumsum(self.own.organ.free) - 1)[held.vert]
+    area, normal = made["area"][row] * held.share, made["normal"][row]
+    return Found(row, held.vert, slot, area, anchor, normal, corner, weight)
 
   def reshape(self):
     """Follows the organs, one of which was cut, in the arrays that graphs know."""
     self._find()
-    bonded, n = self.bonded, len(self.vert)
+    bonded, n = self.bonded, len(self.now.vert)
     if bonded is None:
       return
-    bonded.nbond = n
-    for name in _OF_GROUP:
-      getattr(bonded, name).numpy()[:n] = getattr(self, name)
+    bonded.count.numpy()[0] = n
+    for name in LISTS:
+      getattr(bonded, name).numpy()[:n] = getattr(self.now, name)
     bonded.own.rest.numpy()[:] = base(self.own.organ)
     if self.other is not None:
       bonded.other.rest.numpy()[:] = base(self.other.organ)
@@ -149,14 +185,14 @@ class Group:
     """Points what the kernels take at the arrays of a model, in place: both organs launch them."""
     w, other = self.own, self.other
     m, scheme = mjstruct.Model.from_address(model), SCHEMES[w.config.integrator]
-    n, room = len(self.vert), self.arrays["hardness"].size
+    n, room = len(self.now.vert), self.arrays["hardness"].size
+    self.arrays["count"].numpy()[0] = n
     values: dict[str, Any] = dict(zip(("stiffness", "strength", "energy"), self.law, strict=True))
-    for name in _OF_GROUP:
-      value = getattr(self, name)
+    for name in LISTS:
+      value = getattr(self.now, name)
       values[name] = np.concatenate([value, np.zeros((room - n, *value.shape[1:]))])
     values |= self.arrays
     values |= dict(
-      nbond=n,
       body=self.body,
       restless=int(other is not None or may_move(m, self.body)),
       ahead=float(scheme.ahead),
@@ -171,9 +207,31 @@ class Group:
     )
     self.bonded = fill(Bonded, "cpu", values, into=self.bonded)
 
+  def springs(self, now: Found, state: np.ndarray, stretch: np.ndarray) -> tuple:
+    """Returns vertices, stiffness [N/m], and stretch in the organ's frame [m] of the bonds.
+
+    Args:
+      now: what became of them
+      state: damage and more of the organ's vertices, as in the plugin state
+      stretch: of each in the world [m]  (n, 3), and more
+    """
+    whole = 1.0 - state[now.slot, BOND.damage].clip(0.0, 1.0)
+    stretch = stretch[: len(now.vert)] @ self.own.organ.frame
+    return now.vert, self.law.stiffness * now.area * whole, stretch
+
   def launch(self, kernel):
     """Launches one of the kernels above over it."""
     kernel.launch("cpu", 1, 1, 0, self.bonded)
+
+
+def carry(organ, state: np.ndarray, group, member, share):
+  """Gives vertices of an organ that a cut has divided their part, see `Beside.carry`."""
+  outer = group < organ.mesh.nskin  # what was inside of a solid had none
+  group, member, share = group[outer], member[outer], share[outer]
+  slot = np.cumsum(organ.free) - 1
+  damage, released = BOND.damage, BOND.released
+  state[slot[member], damage] = state[slot[group], damage]
+  state[slot[member], released] = share * state[slot[group], released]
 
 
 def alike(a: Group, b: Group) -> bool:
@@ -224,9 +282,8 @@ class Bonds(Beside):
     out = []
     for group in self.groups:
       group.launch(_stretch)
-      whole = 1.0 - self.state[group.slot, BOND.damage].clip(0.0, 1.0)
-      stretch = group.arrays["stretch"].numpy()[: len(group.vert)] @ self._w.organ.frame
-      out.append((group.vert, group.law.stiffness * group.area * whole, stretch))
+      now, stretch = group.now, group.arrays["stretch"].numpy()
+      out.append(group.springs(now, self.state, stretch))
     return out
 
   def reshape(self) -> list:
@@ -237,14 +294,15 @@ class Bonds(Beside):
 
   def carry(self, group: np.ndarray, member: np.ndarray, share: np.ndarray):
     """See `Beside`."""
-    if not self._w.config.bonded:
-      return
-    outer = group < self._w.organ.mesh.nskin  # what was inside of a solid had none
-    group, member, share = group[outer], member[outer], share[outer]
-    slot, state = np.cumsum(self._w.organ.free) - 1, self.state
-    damage, released = BOND.damage, BOND.released
-    state[slot[member], damage] = state[slot[group], damage]
-    state[slot[member], released] = share * state[slot[group], released]
+    if self._w.config.bonded:
+      carry(self._w.organ, self.state, group, member, share)
+
+  def burn(self, current: dict[str, Any]):
+    """Weakens the bonds near a geom with a current; see `Burning`."""
+    ctrl = coupling.mujoco_arrays(self._w.model, self._w.data, Burning).ctrl
+    for group in self.groups:
+      fields = fill(Burning, "cpu", current | {"bonds": group.bonded, "ctrl": ctrl})
+      _burn.launch("cpu", 1, 1, 0, fields)
 
   @property
   def state(self) -> np.ndarray:

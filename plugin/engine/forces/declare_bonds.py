@@ -142,7 +142,7 @@ def to_organ(w: "Workspace", other, law: Law, near: float, vertices, now: bool =
 def _group(
   w: "Workspace", vert, made, law, body: int, declared: bool, other=None, spots=None
 ) -> Group:
-  bonded = [g.vert for g in w.bonds.groups]
+  bonded = [g.now.vert for g in w.bonds.groups]
   twice = np.intersect1d(vert, np.concatenate(bonded)) if bonded else vert[:0]
   if twice.size:
     raise ValueError(

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 from palpate.tissue.geometry import mesh as topology
+from palpate.tissue.geometry.mesh import Mesh
 from palpate.tissue.types import doubles, fill, ints, struct
 
 from .. import coupling
@@ -28,12 +29,13 @@ class Rest:
   """An organ that rests on geoms, and on one other organ."""
 
   ngeom: int  # geoms that it rests on
-  nouter: int  # vertices on the surface
-  nother: int  # vertices on that of the other organ
   restless: int  # whether what it rests on may move while it sleeps
   skin: wp.float64  # distance from which it is borne [m]
   cell: wp.float64  # length of a cell; farther apart no nodes meet [m]
   mu: wp.float64  # friction with the other organ
+  row: ints("nworld")  # which row of what follows the meshes a world has, in a batch with cuts
+  nouter: ints(1)  # vertices on the surface
+  nother: ints(1)  # vertices on that of the other organ
   own: Nodes
   solve: Input
   geom: ints("ngeom")  # geoms
@@ -113,17 +115,15 @@ class Rests(Beside):
     corner = organ.mesh.rest[organ.mesh.elem]
     edge = np.linalg.norm(corner - corner[:, [1, 2, 0]], axis=2)
     n, geoms = coupling.outer(organ), self._geoms(m)
-    area = topology.vertex_areas(organ.mesh.rest, organ.mesh.elem)[:n]
-    young = float(np.mean(w.config.young))
     flex = organ.window.flex
     if not self._arrays:
       shapes = {"slipped": (n, 3), "force": (n, 3), "weight": (n, 3), "hardness": (n, 6)}
       self._arrays = {k: wp.zeros(s, dtype=wp.float64, device="cpu") for k, s in shapes.items()}
       self._arrays |= {"on": wp.full(n, -1, dtype=int, device="cpu")}
       self._arrays |= {"corner": wp.zeros((n, 3), dtype=int, device="cpu")}
-    common = self._arrays | dict(
+    common = self._arrays | self.above_of(organ.mesh) | dict(
+      row=np.zeros(1),
       ngeom=len(geoms),
-      nouter=organ.mesh.nouter,
       restless=int(bool(self.below) or may_move(m, _body(m, geoms))),
       skin=float(mjstruct.view(m.flex_radius, m.nflex)[flex]),
       cell=2.0 * float(edge.max()),
@@ -132,7 +132,6 @@ class Rests(Beside):
       geom=geoms,
       friction=np.maximum(mjstruct.view(m.geom_friction, (m.ngeom, 3))[geoms, 0], _mu(m, flex)),
       free=organ.free,
-      stiffness=_FIRM * young / float(edge.mean()) * area,
       slip=w.boxes["own"].slip,
       mj=coupling.mujoco_arrays(model, w.data, Bodies),
     )
@@ -140,9 +139,17 @@ class Rests(Beside):
     self.alone = fill(Rest, "cpu", alone, into=self.alone)
     self.on += [None] * (len(self.below) - len(self.on))
     self.on = [
-      fill(Rest, "cpu", common | self._other(m, other), into=on)
+      fill(Rest, "cpu", common | self._other(m, other) | below_of(other.organ.mesh), into=on)
       for other, on in zip(self.below, self.on, strict=True)
     ]
+
+  def above_of(self, mesh: Mesh) -> dict[str, np.ndarray]:
+    """Returns what of `Rest` follows from the organ's mesh."""
+    organ = self._w.organ
+    edge = mesh.rest[mesh.elem] - mesh.rest[mesh.elem[:, [1, 2, 0]]]
+    area = topology.vertex_areas(mesh.rest, mesh.elem)[: coupling.outer(organ)]
+    firm = _FIRM * float(np.mean(self._w.config.young)) / float(topology.lengths(edge).mean())
+    return {"nouter": np.array([mesh.nouter]), "stiffness": firm * area}
 
   def _geoms(self, m) -> np.ndarray:
     names, organ = _geom_names(m), self._w.organ
@@ -153,15 +160,10 @@ class Rests(Beside):
     """Returns the fields of an organ that this one rests on."""
     mesh = other.organ.mesh
     mine, theirs = (w.organ.window.flex for w in (self._w, other))
-    count = np.bincount(mesh.elem.ravel(), minlength=mesh.nouter)
     return dict(
       mu=max(_mu(m, mine), _mu(m, theirs)),
-      nother=mesh.nouter,
       other=nodes(other),
       below=solver(other),
-      elem=mesh.elem,
-      near_adr=np.concatenate([[0], np.cumsum(count)]),
-      near=np.argsort(mesh.elem.ravel(), kind="stable") // 3,
       where=np.zeros((mesh.nouter, 3)),
       next=np.zeros(mesh.nouter),
       first=np.zeros(_CELLS),
@@ -170,9 +172,7 @@ class Rests(Beside):
   def carry(self, group: np.ndarray, member: np.ndarray, share: np.ndarray):
     """See `Beside`."""
     if self:
-      slip = self._w.boxes["own"].slip.numpy()
-      outer = group < len(slip)  # what was inside of a solid rested on nothing
-      slip[member[outer]] = slip[group[outer]]
+      carry(self._w.boxes["own"].slip.numpy(), group, member)
 
   def reshape(self) -> list:
     """See `Beside`."""
@@ -217,6 +217,23 @@ class Rests(Beside):
       on = np.flatnonzero(self._arrays["on"].numpy()[: len(out)] != -1)
       out[on] = self._arrays["force"].numpy()[on]
     return out
+
+
+def carry(slip: np.ndarray, group: np.ndarray, member: np.ndarray):
+  """Gives vertices that a cut has divided the slip of what they were, see `Beside.carry`."""
+  outer = group < len(slip)  # what was inside of a solid rested on nothing
+  slip[member[outer]] = slip[group[outer]]
+
+
+def below_of(mesh: Mesh) -> dict[str, np.ndarray]:
+  """Returns what of `Rest` follows from the mesh of an organ that it rests on."""
+  count = np.bincount(mesh.elem.ravel(), minlength=mesh.nskin)
+  return dict(
+    nother=np.array([mesh.nouter]),
+    elem=mesh.elem,
+    near_adr=np.concatenate([[0], np.cumsum(count)]),
+    near=np.argsort(mesh.elem.ravel(), kind="stable") // 3,
+  )
 
 
 def meet(spaces: list) -> list:
@@ -287,4 +304,5 @@ def _mu(m, flex: int) -> float:
 def _nothing() -> dict[str, Any]:
   """Returns the fields of no other organ."""
   none = {"elem": (0, 3), "near_adr": 1, "near": 0, "where": (0, 3), "next": 0, "first": _CELLS}
-  return {name: np.zeros(shape) for name, shape in none.items()} | {"mu": 0.0, "nother": 0}
+  none |= {"nother": 1}
+  return {name: np.zeros(shape) for name, shape in none.items()} | {"mu": 0.0}

@@ -37,14 +37,6 @@ constexpr double LEAVES = 0.8;  // cosine of a pull to the normal of a face by w
 enum { AWAY, PIERCING, THROUGH };  // stages
 enum { NOTHING, LONG, ENDED };  // what is due
 
-// Moves what worlds have of their own to one of them, see `bodies.h`; there a mesh is by nodes.
-template <class Nodes>
-PALPATE auto stand_on(Nodes& o, const double* rest) -> decltype(*o.node.data, void()) {
-  o.rest.data = (double*)rest;
-}
-template <class Nodes>
-PALPATE auto stand_on(Nodes& o, const double*) -> decltype(*o.qposadr.data, void()) {}
-
 template <class Fields>
 PALPATE Fields of_world(Fields f, int world) {
   move_bodies(f.mj, world);
@@ -56,7 +48,6 @@ PALPATE Fields of_world(Fields f, int world) {
   f.number.data += NUMBERS * world;
   move_to(f.elem, f.mesh.data[world]);
   move_to(f.flat, f.mesh.data[world]);
-  stand_on(f.own, f.flat.data);
   return f;
 }
 

@@ -17,6 +17,13 @@ constexpr int TO_POINT = -1, TO_OWN_MOTION = -2;
 
 template <class Fields>
 PALPATE Fields of_world(Fields f, int world) {
+  const int row = f.row.data[world];
+  move_to(f.count, row);
+  move_to(f.vert, row);
+  move_to(f.body, row);
+  move_to(f.leads, row);
+  move_to(f.stiffness, row);
+  move_to(f.anchor, row);
   move_to(f.point, world);
   move_to(f.force, world);
   move_to(f.number, world);
@@ -77,7 +84,7 @@ PALPATE Rigid own_motion(const Fields& f) {
     if (f.body.data[n] != TO_OWN_MOTION) continue;
     const int i = f.vert.data[n];
     const double k = f.stiffness.data[n];
-    const D3 X = load(f.own.rest.data + 3 * i);
+    const D3 X = rest_of(f.own, i);
     total += k;
     ahead = f.leads.data[n] ? 1.0 : 0.0;
     out.rest += k * X;
@@ -93,8 +100,8 @@ PALPATE Rigid own_motion(const Fields& f) {
     if (f.body.data[n] != TO_OWN_MOTION) continue;
     const int i = f.vert.data[n];
     const double k = f.stiffness.data[n];
-    const D3 X = load(f.own.rest.data + 3 * i) - out.rest;
-    const D3 x = load(f.own.rest.data + 3 * i) + moved_by(f.mj, f.own, i) - out.middle;
+    const D3 X = rest_of(f.own, i) - out.rest;
+    const D3 x = rest_of(f.own, i) + moved_by(f.mj, f.own, i) - out.middle;
     const double a[3] = {x.x, x.y, x.z}, b[3] = {X.x, X.y, X.z};
     for (int r = 0; r < 3; ++r)
       for (int c = 0; c < 3; ++c) {
@@ -131,12 +138,18 @@ PALPATE D3 point_of_body(const Fields& f, int n) {
 template <class Fields>
 PALPATE void aim_ties(const Fields& all, Thread t, int) {
   Fields f = all;
+  const int row = f.row.data[t.world];
+  move_to(f.count, row);
+  move_to(f.first, row);
+  move_to(f.pair, row);
+  move_to(f.anchor, row);
   move_to(f.point, t.world);
   move_nodes(f.other, t.world);
-  each_item(t, f.npair, [&](int n) {
+  each_item(t, f.count.data[0], [&](int n) {
     const Place p = place_of(f.mj, f.other, f.pair.data[n]);
-    store(f.point.data + 6 * (f.first + n), p.at + load(f.anchor.data + 3 * n));
-    store(f.point.data + 6 * (f.first + n) + 3, p.vel);
+    double* point = f.point.data + 6 * (f.first.data[0] + n);
+    store(point, p.at + load(f.anchor.data + 3 * n));
+    store(point + 3, p.vel);
   });
 }
 
@@ -153,7 +166,7 @@ PALPATE void enter_ties(const Fields& all, Thread t, int) {
   for (int n = 0; n < count; ++n) {
     const int i = f.vert.data[n], node = f.solve.node.data[i];
     const double k = f.stiffness.data[n];
-    const D3 rest = load(f.own.rest.data + 3 * i);
+    const D3 rest = rest_of(f.own, i);
     D3 to = load(f.point.data + 6 * n), vel = load(f.point.data + 6 * n + 3);
     const int b = f.body.data[n];
     if (b >= 0) {

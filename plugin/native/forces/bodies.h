@@ -24,11 +24,17 @@ PALPATE void move_bodies(Arrays& mj, int world) {
   move_to(mj.geom_xmat, world);
   move_to(mj.qfrc_passive, world);
 }
+// Of an organ in the solver's own vectors, whose mesh is its world's; of one in MuJoCo's memory, of
+// which there is one.
 template <class Nodes>
-PALPATE void move_nodes(Nodes& o, int world) {
+PALPATE auto move_nodes(Nodes& o, int world) -> decltype(*o.node.data, void()) {
+  if (!o.node.data) return;
   move_to(o.disp, world);
   move_to(o.vel, world);
+  move_to(o.rest, o.mesh.data[world]);
 }
+template <class Nodes>
+PALPATE auto move_nodes(Nodes& o, int) -> decltype(*o.qposadr.data, void()) {}
 template <class Solve>
 PALPATE void move_input(Solve& s, int world) {
   move_to(s.quiet, world);
@@ -59,7 +65,7 @@ PALPATE Sym load_hold(const float* p) {
 
 struct Place { D3 at, vel; };
 
-// Displacement of a vertex from rest and its velocity, in the organ's frame: of an organ that is in
+// Displacement of a vertex from rest, its velocity and its rest place, in the organ's frame: of an organ that is in
 // MuJoCo's memory or, with windows, in the plugin state.
 template <class Arrays, class Nodes>
 PALPATE auto moved_by(const Arrays& mj, const Nodes& o, int i) -> decltype(*o.qposadr.data, D3{}) {
@@ -74,7 +80,16 @@ PALPATE auto goes_by(const Arrays& mj, const Nodes& o, int i) -> decltype(*o.qpo
   return load(o.windowed ? o.vel.data + 3 * i : mj.qvel.data + dof);
 }
 
+template <class Nodes>
+PALPATE auto rest_of(const Nodes& o, int i) -> decltype(*o.qposadr.data, D3{}) {
+  return load(o.rest.data + 3 * i);
+}
+
 // Of one in the solver's own vectors.
+template <class Nodes>
+PALPATE auto rest_of(const Nodes& o, int i) -> decltype(*o.node.data, D3{}) {
+  return load(o.rest.data + 3 * o.node.data[i]);
+}
 template <class Arrays, class Nodes>
 PALPATE auto moved_by(const Arrays&, const Nodes& o, int i) -> decltype(*o.node.data, D3{}) {
   return load_lane(o.disp.data + offset_of(o.node.data[i]));
@@ -88,7 +103,7 @@ PALPATE auto goes_by(const Arrays&, const Nodes& o, int i) -> decltype(*o.node.d
 template <class Arrays, class Nodes>
 PALPATE Place place_of(const Arrays& mj, const Nodes& o, int i) {
   const double* R = o.frame.data;
-  return {load(o.origin.data) + turned(R, load(o.rest.data + 3 * i) + moved_by(mj, o, i)),
+  return {load(o.origin.data) + turned(R, rest_of(o, i) + moved_by(mj, o, i)),
           turned(R, goes_by(mj, o, i))};
 }
 

@@ -23,6 +23,15 @@ struct Seat { D3 at, vel, x, y, z; };
 
 template <class Fields>
 PALPATE Fields of_world(Fields f, int world) {
+  const int row = f.row.data[world];
+  move_to(f.count, row);
+  move_to(f.vert, row);
+  move_to(f.slot, row);
+  move_to(f.area, row);
+  move_to(f.anchor, row);
+  move_to(f.normal, row);
+  move_to(f.corner, row);
+  move_to(f.weight, row);
   move_to(f.state, world);
   move_to(f.next, world);
   move_to(f.stretch, world);
@@ -92,7 +101,7 @@ PALPATE void stretch_bonds(const Fields& all, Thread t, int) {
   const D3 zero = {0.0, 0.0, 0.0};
   const Twist moving = f.body >= 0 ? twist(f.mj, f.body, true) : Twist{zero, zero};
   const Seat fixed = f.body >= 0 ? seat_on_body(f, moving) : Seat{zero, zero, zero, zero, zero};
-  each_item(t, f.nbond, [&](int n) {
+  each_item(t, f.count.data[0], [&](int n) {
     const double* had = f.state.data + 2 * f.slot.data[n];
     const double d = had[0] > 0.0 ? had[0] < 1.0 ? had[0] : 1.0 : 0.0;
     double* next = f.next.data + 2 * n;
@@ -128,7 +137,7 @@ PALPATE void enter_bonds(const Fields& all, Thread t, int) {
   if (!all.live.data[0]) return;
   const Fields f = of_world(all, t.world);
   const D3 zero = {0.0, 0.0, 0.0};
-  each_item(t, f.nbond, [&](int n) {
+  each_item(t, f.count.data[0], [&](int n) {
     const double weight = f.hardness.data[n];
     if (weight == 0.0) return;
     if (f.restless) f.solve.quiet.data[0] = 0.0;
@@ -144,7 +153,7 @@ PALPATE void bear_bonds(const Fields& all, Thread t, int) {
   if (!all.live.data[0] || t.tid > 0) return;
   const Fields f = of_world(all, t.world);
   const D3 zero = {0.0, 0.0, 0.0};
-  for (int n = 0; n < f.nbond; ++n) {
+  for (int n = 0; n < f.count.data[0]; ++n) {
     const double weight = f.hardness.data[n];
     if (weight == 0.0) continue;
     f.below.quiet.data[0] = 0.0;
@@ -164,7 +173,7 @@ PALPATE void act_bonds(const Fields& all, Thread t, int) {
   const Fields f = of_world(all, t.world);
   const bool ok = f.solve.status.data[3] == 0.0f;
   const double per_h = 1.0 / f.mj.timestep.data[0];
-  each_item(t, f.nbond, [&](int n) {
+  each_item(t, f.count.data[0], [&](int n) {
     const double weight = f.hardness.data[n];
     store(f.pull.data + 3 * n, {0.0, 0.0, 0.0});
     if (weight == 0.0 || !ok) return;
@@ -182,7 +191,7 @@ PALPATE void feel_bonds(const Fields& all, Thread t, int) {
   const D3 zero = {0.0, 0.0, 0.0};
   const Seat s = seat_on_body(f, Twist{zero, zero});
   D3 force = zero, torque = zero;
-  for (int n = 0; n < f.nbond; ++n) {
+  for (int n = 0; n < f.count.data[0]; ++n) {
     const D3 pull = load(f.pull.data + 3 * n);
     const D3 point = s.at + in_axes(s, load(f.anchor.data + 3 * n));
     force = force - pull;
@@ -196,13 +205,42 @@ template <class Fields>
 PALPATE void keep_bonds(const Fields& all, Thread t, int) {
   if (!all.live.data[0]) return;
   const Fields f = of_world(all, t.world);
-  each_item(t, f.nbond, [&](int n) {
+  each_item(t, f.count.data[0], [&](int n) {
     double* state = f.state.data + 2 * f.slot.data[n];
     const double* next = f.next.data + 2 * n;
     // A current may have weakened it between the step's two halves.
     state[0] = next[0] > state[0] ? next[0] : state[0];
     state[1] = next[1];
   });
+}
+
+// Weakens the bonds that are near the axis of a geom with a current by what it gives in a step.
+template <class Fields>
+PALPATE void burn_bonds(const Fields& all, Thread t, int) {
+  if (!all.bonds.live.data[0] || t.tid > 0) return;
+  const auto f = of_world(all.bonds, t.world);
+  auto ctrl = all.ctrl;
+  move_to(ctrl, t.world);
+  const double given = fabs((double)ctrl.data[all.actuator]) * f.mj.timestep.data[0];
+  if (given == 0.0) return;
+  const auto* R = f.mj.geom_xmat.data + 9 * all.geom;
+  const D3 axis = {R[all.axis], R[3 + all.axis], R[6 + all.axis]};
+  const D3 middle = load(f.mj.geom_xpos.data + 3 * all.geom);
+  auto near = [&](int n) {
+    const D3 off = place_of(f.mj, f.own, f.vert.data[n]).at - middle;
+    const double along = dot(off, axis), far = all.half;
+    const double end = along > far ? far : along < -far ? -far : along;
+    return f.state.data[2 * f.slot.data[n]] < 1.0 && norm(off - end * axis) < all.reach;
+  };
+  double area = 0.0;
+  for (int n = 0; n < f.count.data[0]; ++n)
+    if (near(n)) area += f.area.data[n];
+  if (area == 0.0) return;
+  for (int n = 0; n < f.count.data[0]; ++n) {
+    double& damage = f.state.data[2 * f.slot.data[n]];
+    const double more = damage + given / (all.energy * area);
+    if (near(n)) damage = more < 1.0 ? more : 1.0;
+  }
 }
 
 // How far points are from some geoms.

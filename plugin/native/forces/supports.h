@@ -17,6 +17,13 @@ constexpr int CELLS = 1024;
 
 template <class Fields>
 PALPATE Fields of_world(Fields f, int world) {
+  const int row = f.row.data[world];
+  move_to(f.nouter, row);
+  move_to(f.stiffness, row);
+  move_to(f.nother, row);
+  move_to(f.elem, row);
+  move_to(f.near_adr, row);
+  move_to(f.near, row);
   move_to(f.slip, world);
   move_to(f.slipped, world);
   move_to(f.on, world);
@@ -96,13 +103,13 @@ PALPATE void read_geom(const Fields& f, int g, double* geom) {
 template <class Fields>
 PALPATE void find_geoms(const Fields& all, Thread t, int) {
   const Fields f = of_world(all, t.world);
-  each_item(t, f.nouter, [&](int i) { f.on.data[i] = ON_NOTHING; });
+  each_item(t, f.nouter.data[0], [&](int i) { f.on.data[i] = ON_NOTHING; });
   for (int q = 0; q < f.ngeom; ++q) {
     const int g = f.geom.data[q], b = f.mj.geom_bodyid.data[g];
     double geom[GEOM_LENGTH];
     read_geom(f, g, geom);
     const Twist moving = twist(f.mj, b, false);
-    each_item(t, f.nouter, [&](int i) {
+    each_item(t, f.nouter.data[0], [&](int i) {
       if (f.on.data[i] != ON_NOTHING || !f.free.data[i]) return;
       const Place x = place_of(f.mj, f.own, i);
       const D3 d = x.at - load(geom + GEOM_POS);
@@ -185,9 +192,9 @@ struct Bounds {
 template <class Fields>
 PALPATE Bounds sort_nodes(const Fields& f) {
   Bounds mine, near;
-  for (int i = 0; i < f.nouter; ++i) mine.add(place_of(f.mj, f.own, i).at);
+  for (int i = 0; i < f.nouter.data[0]; ++i) mine.add(place_of(f.mj, f.own, i).at);
   for (int c = 0; c < CELLS; ++c) f.first.data[c] = -1;
-  for (int j = 0; j < f.nother; ++j) {
+  for (int j = 0; j < f.nother.data[0]; ++j) {
     const D3 x = place_of(f.mj, f.other, j).at;
     store(f.where.data + 3 * j, x);
     if (!mine.has(x, f.cell)) continue;
@@ -207,13 +214,15 @@ PALPATE void find_organ(const Fields& all, Thread t, int which) {
   if (t.tid > 0) return;
   const Fields f = of_world(all, t.world);
   const Bounds near = sort_nodes(f);
-  for (int i = 0; i < f.nouter; ++i) {
+  for (int i = 0; i < f.nouter.data[0]; ++i) {
     if (f.on.data[i] != ON_NOTHING || !f.free.data[i]) continue;
     const Place x = place_of(f.mj, f.own, i);
     const int j = near.has(x.at, f.cell) ? nearest_node(f, x.at) : -1;
     if (j < 0) continue;
     D3 w, point;
-    const int* e = f.elem.data + 3 * nearest_triangle(f, j, x.at, w, point);
+    const int best = nearest_triangle(f, j, x.at, w, point);
+    if (best < 0) continue;
+    const int* e = f.elem.data + 3 * best;
     D3 n = w.x * normal_at(f, e[0]) + w.y * normal_at(f, e[1]) + w.z * normal_at(f, e[2]);
     const double length = norm(n);
     if (!(length > 0.0)) continue;
@@ -245,7 +254,7 @@ PALPATE void press(const Fields& all, Thread t, int) {
   const D3 zero = {0, 0, 0};
   const double* R = f.own.frame.data;
   if (f.restless && t.tid == 0) f.solve.quiet.data[0] = 0.0;
-  each_item(t, f.nouter, [&](int i) {
+  each_item(t, f.nouter.data[0], [&](int i) {
     if (f.on.data[i] == ON_NOTHING) return;
     push_node(f.solve, f.solve.node.data[i], add_turned(zero, R, load(f.force.data + 3 * i)),
               turned_back(R, hardness(f, i)));
@@ -257,7 +266,7 @@ template <class Fields>
 PALPATE void act_rests(const Fields& all, Thread t, int) {
   const Fields f = of_world(all, t.world);
   const double per_h = 1.0 / f.mj.timestep.data[0];
-  each_item(t, f.nouter, [&](int i) {
+  each_item(t, f.nouter.data[0], [&](int i) {
     if (f.on.data[i] > ON_GEOM) return;
     const D3 dv = turned(f.own.frame.data,
                          load_lane(f.solve.dvel.data + offset_of(f.solve.node.data[i])));
@@ -274,7 +283,7 @@ PALPATE void feel_rests(const Fields& all, Thread t, int) {
   for (int q = 0; q < f.ngeom; ++q) {
     const int b = f.mj.geom_bodyid.data[f.geom.data[q]];
     D3 force = zero, torque = zero;
-    for (int i = 0; i < f.nouter; ++i) {
+    for (int i = 0; i < f.nouter.data[0]; ++i) {
       if (f.on.data[i] != ON_GEOM - q) continue;
       const D3 push = load(f.force.data + 3 * i);
       force = force - push;
@@ -291,7 +300,7 @@ PALPATE void bear(const Fields& all, Thread t, int which) {
   const Fields f = of_world(all, t.world);
   const double* R = f.other.frame.data;
   f.below.quiet.data[0] = 0.0;
-  for (int i = 0; i < f.nouter; ++i) {
+  for (int i = 0; i < f.nouter.data[0]; ++i) {
     if (f.on.data[i] != which) continue;
     const D3 push = add_turned({0, 0, 0}, R, D3{0, 0, 0} - load(f.force.data + 3 * i));
     const Sym weight = turned_back(R, hardness(f, i));
@@ -307,7 +316,7 @@ template <class Fields>
 PALPATE void keep(const Fields& all, Thread t, int) {
   const Fields f = of_world(all, t.world);
   const D3 zero = {0, 0, 0};
-  each_item(t, f.nouter, [&](int i) {
+  each_item(t, f.nouter.data[0], [&](int i) {
     store(f.slip.data + 3 * i, f.on.data[i] == ON_NOTHING ? zero : load(f.slipped.data + 3 * i));
   });
 }
