@@ -30,6 +30,9 @@ COLUMNS: dict[str, tuple[int, ...]] = {
   "farthest": (),
   "excess": (),
   "jagged": (),
+  "depth": (),
+  "current": (),
+  "idle_current": (),
 }
 # Those that are measured faster: with substeps, magnitudes, one for each since the last sample.
 SIGNALS = ("force", "grip_force", "shaft_force")
@@ -141,6 +144,11 @@ class Inputs:
   def speed(self) -> np.ndarray:
     """Speed in each interval [m/s]  (nstep - 1,)."""
     return self._speed(0)
+
+  @property
+  def touching(self) -> np.ndarray | None:
+    """Whether there was contact since the sample before  (nstep,)."""
+    return self._recording.touching(self._which[0])
 
   @property
   def steady_speed(self) -> np.ndarray:

@@ -160,7 +160,8 @@ class Recorder:
         tip, else 0; `freed`, share of what is bonded that came free as it should; `traction`, pull
         on what it is bonded to [N]; of a cut so far, `deviation`, mean distance from its line [m],
         `farthest`, the largest [m], `excess`, area between the two [m^2], `jagged`, length that is
-        more than 2 mm off [m]
+        more than 2 mm off [m], `depth`, of the blade under the wall at most [m]; `current`, time
+        that one was on so far [s], and `idle_current` with nothing to free in reach [s]
     """
     time = float(time)
     if not (math.isfinite(time) and time > self._last):

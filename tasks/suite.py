@@ -59,6 +59,13 @@ def split(name: str) -> tuple[str, str]:
   return domain, task
 
 
+def ends(name: str) -> dict[str, float]:
+  """Returns at which value of a metric an exercise ends, and fails [SI]."""
+  entry = registry.ENTRIES["/".join(split(name))]
+  damage = float(entry.make(name=entry.name).damage)
+  return {"time": entry.time_limit, "peak_force": damage, "peak_grip": damage}
+
+
 def summary(domain_name: str, task_name: str) -> str:
   """Returns what the task asks for, in one line."""
   text = registry.ENTRIES[f"{domain_name}/{task_name}"].summary

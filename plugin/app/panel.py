@@ -106,6 +106,7 @@ def kept(job: tuple[str, str, int, str]) -> Result:
 def _write(out: pathlib.Path, task: str, args: argparse.Namespace, results: list[Result]):
   """Writes the reference of a task's successes and says how many there were."""
   import mujoco
+  from palpate.tasks import suite
   from palpate.tasks.files import replacing
   from palpate.tasks.metrics import Metrics
   from palpate.tasks.people.score import SUCCESS, make_reference
@@ -115,7 +116,7 @@ def _write(out: pathlib.Path, task: str, args: argparse.Namespace, results: list
   if len(good) < min(_LEAST, len(results)):
     first = next((r.error for r in results if r.error), "")
     raise CommandError(f"{said}, too few for a reference" + (f"; {first}" if first else ""), code=1)
-  data: dict[str, Any] = make_reference(good, task, args.seed)
+  data: dict[str, Any] = make_reference(good, task, args.seed, suite.ends(task))
   data |= {"performer": args.performer, "episodes": len(results)}
   data |= {"palpate": palpate.__version__, "mujoco": mujoco.__version__}
   path = out / f"{task.replace('/', '_')}.json"

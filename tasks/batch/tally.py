@@ -17,7 +17,8 @@ from .fields import Common
 from .kernels import vector
 
 NAMES = (
-  "time", "path_length", "mean_speed", "peak_speed", "economy_of_volume", "path_inefficiency",
+  "time", "path_length", "mean_speed", "peak_speed", "contact_speed", "economy_of_volume",
+  "path_inefficiency",
   "depth_path", "angular_path", "response_orientation", "errors", "target_error",
   "peak_force", "mean_force", "rms_force", "force_time_product", "force_breaches",
   "excess_impulse", "shaft_contact", "peak_shaft_force",
@@ -44,6 +45,7 @@ class Tally:
   high: Array(wp.vec3, ("nworld",))
   path: doubles("nworld")  # [m]
   fastest: doubles("nworld")  # longest way in a control step [m]
+  rush: doubles("nworld")  # that in one with contact [m]
   depth: doubles("nworld")  # [m]
   turned: doubles("nworld")  # [rad]
   rolled: doubles("nworld")  # [rad]
@@ -74,6 +76,7 @@ def start(s: Common, t: Tally):
   zero = wp.float64(0.0)
   t.path[w] = zero
   t.fastest[w] = zero
+  t.rush[w] = zero
   t.depth[w] = zero
   t.turned[w] = zero
   t.rolled[w] = zero
@@ -111,7 +114,7 @@ def _shaft(q: wp.array2d[float], w: int):
 
 @wp.func
 def _move(s: Common, t: Tally, w: int):
-  """Adds the way of a control step."""
+  """Adds the way of a control step; returns it [m]."""
   way = vector(s.tip_pos, w) - vector(t.pos, w)
   far = wp.float64(wp.length(way))
   t.path[w] = t.path[w] + far
@@ -129,6 +132,7 @@ def _move(s: Common, t: Tally, w: int):
   roll = wp.abs(2.0 * wp.atan2(side * turn[2], side * real))
   t.rolled[w] = t.rolled[w] + wp.float64(roll)
   _stay(s, t, w)
+  return far
 
 
 @wp.func
@@ -167,7 +171,7 @@ def _norm(t: Tally, w: int, k: int, adr: int):
 def add(s: Common, t: Tally):
   """Adds a control step."""
   w = wp.tid()
-  _move(s, t, w)
+  far, touched = _move(s, t, w), t.touched[w, _TIP]
   for k in range(t.sensor_steps.shape[1]):
     force, shaft = _norm(t, w, k, s.sensoradr[0]), _norm(t, w, k, s.sensoradr[1])
     _press(t, w, _TIP, force)
@@ -181,6 +185,8 @@ def add(s: Common, t: Tally):
       if force > t.contact and grip > t.contact:
         t.pulled[w] = t.pulled[w] + t.h * wp.float64(force)
         t.gripped[w] = t.gripped[w] + t.h * wp.float64(grip)
+  if t.touched[w, _TIP] > touched:
+    t.rush[w] = wp.max(t.rush[w], far)
   _tell(s, t, w)
 
 
@@ -218,6 +224,8 @@ def _tell(s: Common, t: Tally, w: int):
   t.values[w, M.path_length] = wp.where(moved, float(path), wp.nan)
   t.values[w, M.mean_speed] = wp.where(moved, float(path / time), wp.nan)
   t.values[w, M.peak_speed] = wp.where(moved, float(t.fastest[w]) / s.dt, wp.nan)
+  met = t.touched[w, _TIP] > wp.float64(0.0)
+  t.values[w, M.contact_speed] = wp.where(met, float(t.rush[w]) / s.dt, wp.nan)
   side = wp.pow(size[0] * size[1] * size[2], 1.0 / 3.0)
   t.values[w, M.economy_of_volume] = _share(wp.float64(side), path)
   t.values[w, M.path_inefficiency] = 100.0 * (_share(path, wp.float64(s.reference[w])) - 1.0)

@@ -404,11 +404,11 @@ class Performer:
     else:  # somebody else was about to close
       self.extra[:] = self._share()
     while self.extra[0] > -0.35:
-      self.extra[0] -= 0.06
+      self.extra[0] -= 3.0 * self.dt
       yield self.step()
-    for _ in range(round(100 / self.care)):
+    for _ in range(round(2 / self.care / self.dt)):
       yield self.step()
-      if abs(self._squeeze(0.0, 0.02)) < 0.25 and self.hand.holds():
+      if abs(self._squeeze(0.0, 1.0)) < 0.25 and self.hand.holds():
         return
 
   def say(self) -> Script:
@@ -425,11 +425,12 @@ class Performer:
     """Keeps the force of the jaws, which have held for a time [s]; more where the tissue slides."""
     slid = max(self.task.slid(self.physics) - _SLID, 0.0) if self.task.grasped else 0.0
     self.firm = max(self.firm, min(self._enough + _REFLEX * slid, _FIRMEST))
-    self._squeeze(contact, 0.01)
+    self._squeeze(contact, 0.5)
 
   def _squeeze(self, contact: float, gain: float) -> float:
     """Closes or opens the jaws towards their force; returns what is missing of it [N]."""
     missing = self.firm * self.excess(contact) - float(self.hand.gripper()[2:].max())
+    gain *= self.dt
     change = self.care * float(np.clip(gain * missing, -0.5 * gain, 0.5 * gain))
     self.extra[0] = float(np.clip(self.extra[0] - change, -1, -0.3))
     return missing
@@ -437,5 +438,5 @@ class Performer:
   def open(self) -> Script:
     """Lets go, gently until nothing is held: a pinched fold would jump."""
     while self.extra[0] < 0.1:
-      self.extra[0] += 0.02 if self.hand.gripper()[2:].any() else 0.06
+      self.extra[0] += self.dt * (1.0 if self.hand.gripper()[2:].any() else 3.0)
       yield self.step()

@@ -92,6 +92,8 @@ class State(dissect.State):
   away: Vector  # from the bed
   live: bool  # whether the current is on
   time: float  # how long it has burnt what the hook touches [s]
+  powered: float  # how long it was on [s]
+  wasted: float  # with no bond in reach [s]
   hook_front: Vector
   retracted: float
   burnt: float
@@ -164,8 +166,12 @@ def _nearest(s, o):
 def act(s, o):
   """Sends the current through the hook: it divides, or burns what the hook touches."""
   o.live = last_component(s, o) > 0.0
-  if o.live and not divide(s, o) and other_force(s) > TOUCHING:
-    o.time = o.time + o.control_timestep
+  if o.live:
+    o.powered = o.powered + o.control_timestep
+    if not divide(s, o):
+      o.wasted = o.wasted + o.control_timestep
+      if other_force(s) > TOUCHING:
+        o.time = o.time + o.control_timestep
   return o
 
 
@@ -195,7 +201,7 @@ class Bimanual(Dissect):
     advance,
     observe,
     (*Dissect.rules.observed, "hook_front", "retracted", "burnt"),
-    METRICS,
+    METRICS | {"current_time": "powered", "current_wasted": "wasted"},
     act,
   )
   slots = 36
@@ -208,12 +214,17 @@ class Bimanual(Dissect):
   def begin(self, physics: Physics) -> None:
     """Draws the site to grasp."""
     super().begin(physics)
-    self.time, self.live = 0.0, False
+    self.time, self.powered, self.wasted, self.live = 0.0, 0.0, 0.0, False
     heel, toe = (physics.data.site(f"{self.second}{end}") for end in ("tip", "toe"))
     self.toe = heel.xmat.reshape(3, 3).T @ (toe.xpos - heel.xpos)
     self.rest = physics.point(self.site)
     away = self.rest - middle(physics)
     self.away = away / np.linalg.norm(away)
+
+  def recorded(self, physics: Physics) -> dict[str, float]:
+    """Returns for how long the current was on, too."""
+    own = {"current": self.powered, "idle_current": self.wasted}
+    return dict(super().recorded(physics)) | own
 
   def label(self, kind: str) -> str:
     """Returns what damage is."""

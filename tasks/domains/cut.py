@@ -119,6 +119,7 @@ class State:
   excess: float  # area between cut and line [m^2]
   mean: float  # distance of the cut from the line [m]
   farthest: float  # largest [m]
+  deepest: float  # how far the tip was under the sheet while it cut [m]
   inside: bool  # whether the edge was in the tissue a control step ago
   seat: Vector  # where it was then [m]
   travelled: float  # and how far it had come [m]
@@ -187,7 +188,7 @@ def proceed(s, o, start, end, way):
   """Counts a piece of the cut, between two places at rest [m]."""
   first, before = nearest(o, start)
   last, off = nearest(o, end)
-  if off > o.tolerance and before <= o.tolerance:
+  if off > o.tolerance and (before <= o.tolerance or not o.inside):
     miss(s, o, off)
   o.opened = o.opened + way
   o.excess = o.excess + off * way
@@ -207,6 +208,7 @@ def advance(s, o):
   inside, travelled, seat = cutter(s)
   if inside and travelled > o.travelled:
     o = proceed(s, o, o.seat if o.inside else seat, seat, travelled - o.travelled)
+    o.deepest = max(o.deepest, -tip(s)[2])
   o.inside = inside
   o.seat = seat
   o.travelled = travelled
@@ -245,6 +247,7 @@ class Cut(Task):
       "cut_farthest": "farthest",
       "cut_excess": "excess",
       "cut_jagged": "jagged",
+      "cut_depth": "deepest",
     },
   )
 
@@ -295,6 +298,7 @@ class Cut(Task):
     self.curve, self.length = line(self.radius, self.wave, self.random.uniform(0, 2 * np.pi))
     self.count, self.cut = len(self.curve), np.zeros(len(self.curve), bool)
     self.opened = self.astray = self.jagged = self.excess = self.mean = self.farthest = 0.0
+    self.deepest = 0.0
     self.inside, self.travelled, self.seat = cutter(physics)
     self.done, self.next, self.covered, self.nearest = 0, 0, 0.0, 0.0
     self.distance0 = distance(physics, self)
@@ -314,7 +318,7 @@ class Cut(Task):
   def recorded(self, physics: Physics) -> dict[str, float]:
     """Returns how the cut is so far."""
     own = {"deviation": self.mean, "farthest": self.farthest}
-    own |= {"excess": self.excess, "jagged": self.jagged}
+    own |= {"excess": self.excess, "jagged": self.jagged, "depth": self.deepest}
     return dict(super().recorded(physics)) | own
 
   def constants(self, physics: Physics) -> dict[str, np.ndarray]:

@@ -47,9 +47,11 @@ def mean_speed(time: ArrayLike, tip_pos: ArrayLike) -> float:
   return _moved(path_length(tip_pos)) / (time[-1] - time[0])
 
 
-@metric("Peak speed", "m/s", "efficiency", "max", "PMC5845064", "neither")
+@metric("Peak speed", "m/s", "dexterity", "max", "PMC5845064")
 def peak_speed(speed: ArrayLike) -> float:
-  """Returns the largest speed [m/s], neither is better (a feature of PMC5845064).
+  """Returns the largest speed [m/s], lower is better (a feature of PMC5845064).
+
+  A tip that is fast cannot stop before what it meets.
 
   Args:
     speed: in each interval [m/s]  (nstep - 1,)
@@ -58,6 +60,25 @@ def peak_speed(speed: ArrayLike) -> float:
   if not values.any():
     raise UnknownError("no motion")
   return values.max()
+
+
+@metric("Peak speed in contact", "m/s", "safety", "max", "this project; as PMC5845064 of the path")
+def contact_speed(speed: ArrayLike, touching: ArrayLike) -> float:
+  """Returns the largest speed with which the tip meets or moves tissue [m/s], lower is better.
+
+  Ripping, slashing and ramming succeed by speed where a slow hand succeeds by care.
+
+  Args:
+    speed: in each interval [m/s]  (nstep - 1,)
+    touching: whether there was contact since the sample before  (nstep,)
+  """
+  values = rows("speed", speed)
+  touch = rows("touching", touching) > 0.5
+  if len(touch) != len(values) + 1:
+    raise ValueError(f"touching has {len(touch)} samples, expected {len(values) + 1}")
+  if not touch[1:].any():
+    raise UnknownError("no contact")
+  return values[touch[1:]].max()
 
 
 @metric("Economy of volume", "-", "efficiency", "mean", _EVA, "neither")

@@ -124,6 +124,36 @@ def cut_jagged(jagged: ArrayLike) -> float:
   return float(rows("jagged", jagged)[-1])
 
 
+@metric("Depth of the blade", "m", "safety", "max", "this project: what lies under a wall")
+def cut_depth(depth: ArrayLike) -> float:
+  """Returns how far the blade's tip was under the wall that it cut [m], lower is better.
+
+  Args:
+    depth: largest so far [m]  (nstep,)
+  """
+  return float(rows("depth", depth)[-1])
+
+
+@metric("Time of current", "s", "safety", "all", "10.1007/s00464-013-3297-1: cautery time")
+def current_time(current: ArrayLike) -> float:
+  """Returns how long a current was on [s], lower is better.
+
+  Args:
+    current: time so far [s]  (nstep,)
+  """
+  return float(rows("current", current)[-1])
+
+
+@metric("Current without a target", "s", "safety", "all", "as `current_time`")
+def current_wasted(idle_current: ArrayLike) -> float:
+  """Returns how long a current was on with nothing to free in reach [s], lower is better.
+
+  Args:
+    idle_current: time so far [s]  (nstep,)
+  """
+  return float(rows("idle_current", idle_current)[-1])
+
+
 @metric("Tracing error (Frechet)", "m", "outcome", "all", "Perk Tutor; Eiter and Mannila 1994")
 def trace_frechet(traced_pos: ArrayLike, curve: ArrayLike) -> float:
   """Returns the discrete Frechet distance of the tip's path to a curve [m], lower is better.

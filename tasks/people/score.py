@@ -25,11 +25,12 @@ unknown.
 Weights: safety 67 %, efficiency 17 % (Heidelberg VR score, 10.1007/s00464-018-6480-x). Its other
 16 % go to time, dexterity and outcome; the abstract does not say how, here they share it equally.
 
-Proficiency of an episode: success, and no metric over its limit. A limit is the panel's mean and so
-many SDs, the same number for every metric, that of the panel's episodes `PASSING` pass limits that
-are made of the others: a new person of the panel's skill then passes as often. The worst episodes
-beyond that count neither in mean nor SD. Both are of log(1 + value / median) where no value is
-negative: forces, times and paths vary by factors, and their long tails are no normal one's. The
+Proficiency of an episode: success, and no metric over its limit. A limit is of its own metric: the
+median of the panel and `SPREADS` times a spread that one freak does not move, from the median to
+the value that 90 % are as good as, or the worst value of the best `PASSING` of the panel's
+episodes, whichever lets more pass; and at most `BELOW` of what ends an episode, such as its time
+limit, or of 100 %. It is of log(1 + value / median) where no value is negative: forces, times and
+paths vary by factors, and their long tails are no normal one's. The
 mean + 2 SD of SAGES would fail half of the panel, since each of thirty metrics may fail by itself,
 and so would the panel's worst values the next person. A metric that some of the panel's successes
 lack is not asked for.
@@ -61,19 +62,29 @@ WEIGHTS = {
 Z_LIMIT = 10.0
 FLOOR = -20.0  # of an exercise that did not succeed; a success scores -10 or more
 PASSING = 0.95
+SPREADS, BELOW = 2.5, 0.9
+_NINTH = 1.2816  # normal deviate that 90 % are under
 CONSECUTIVE, REPEATS = 2, 10
 LEAST_WEIGHT = 0.5
 SUCCESS = "success"
 _VERSION = 2
 
 
-def make_reference(results: Sequence[Metrics], task: str, seed: int) -> dict[str, Any]:
+def make_reference(
+  results: Sequence[Metrics], task: str, seed: int, caps: Mapping[str, float] | None = None
+) -> dict[str, Any]:
   """Returns the reference of several successful recordings of one task.
 
   The mean and sample SD (n - 1) of the recordings where the metric is known, and the limit of
   proficiency, see the module's head. A metric that is known nowhere, or of which neither more nor
   less is better, is left out, and so are movements where some make none; the SD of a single value
   is null.
+
+  Args:
+    results: the recordings' metrics
+    task: such as "touch/easy"
+    seed: of the first recording
+    caps: metric -> value at which an episode fails, such as the time limit [SI]
   """
   table: dict[str, dict[str, Any]] = {}
   for name, spec in METRICS.items():
@@ -89,7 +100,7 @@ def make_reference(results: Sequence[Metrics], task: str, seed: int) -> dict[str
     squares = 0.0 if constant else math.fsum((v - mean) ** 2 for v in known)
     sd = math.sqrt(squares / (len(known) - 1)) if len(known) > 1 else None
     table[name] = {"mean": mean, "sd": sd, "n": len(known)}
-  for name, limit in _limits(results, list(table)).items():
+  for name, limit in _limits(results, list(table), caps or {}).items():
     table[name]["limit"] = limit
   return {
     "format": "palpate-reference",
@@ -101,7 +112,9 @@ def make_reference(results: Sequence[Metrics], task: str, seed: int) -> dict[str
   }
 
 
-def _limits(results: Sequence[Metrics], names: Sequence[str]) -> dict[str, float]:
+def _limits(
+  results: Sequence[Metrics], names: Sequence[str], caps: Mapping[str, float]
+) -> dict[str, float]:
   """Returns metric -> limit of proficiency [SI], see the module's head."""
   signs = np.array([1.0 if METRICS[name].better == "lower" else -1.0 for name in names])
   values = np.array([[float(getattr(r, name)) for name in names] for r in results])
@@ -113,16 +126,21 @@ def _limits(results: Sequence[Metrics], names: Sequence[str]) -> dict[str, float
   panel = np.where(np.isfinite(unit), np.log1p(np.maximum(panel, 0.0) / unit), panel)
   far = _ahead_of_others(panel)
   kept = panel[np.argsort(far, kind="stable")[: math.ceil(PASSING * len(panel))]]
-  most = max(0.0, float(_ahead_of_others(kept).max(initial=0.0)))
-  spread = kept.std(axis=0, ddof=1) if len(kept) > 1 else 0.0
-  high, low = kept.max(axis=0), kept.min(axis=0)
-  # The mean of equal values may round, as above.
-  limit = np.where(high > low, kept.mean(axis=0) + most * spread, high)
-  limit = np.maximum(limit, high)
+  middle = np.median(panel, axis=0)
+  spread = (np.quantile(panel, 0.9, axis=0) - middle) / _NINTH
+  limit = np.maximum(middle + SPREADS * spread, kept.max(axis=0))
   factors = np.isfinite(unit)
   limit[factors] = unit[factors] * np.expm1(limit[factors])
   worst[asked] = limit
-  return dict(zip(names, (worst * signs).tolist(), strict=True))
+  most = np.array([_most(name, caps) for name in names])
+  limits = np.where(signs > 0, np.minimum(worst, most), worst) * signs
+  return dict(zip(names, limits.tolist(), strict=True))
+
+
+def _most(name: str, caps: Mapping[str, float]) -> float:
+  """Returns above what the limit of a metric would bind nobody."""
+  share = 100.0 if METRICS[name].unit == "%" and name != "path_inefficiency" else math.inf
+  return BELOW * min(caps.get(name, math.inf), share)
 
 
 def _ahead_of_others(panel: np.ndarray) -> np.ndarray:
