@@ -5,7 +5,8 @@ site above its place at rest, towards the trocar, minus the height to lift to [m
 share of the holding time done [-]; `grasped` (1,), whether the jaws hold the site.
 
 Grasped means that there is tissue between the jaws, which are told to close on it: both inner
-faces press on it with 0.2 N or more, it keeps them open, and the site is within 12 mm of the tip.
+faces press on it with 0.2 N or more, it keeps them open, and the site is within 12 mm of the tip
+and 4 mm of the shaft's axis: a fold beside the mark is another one.
 It stays grasped as long as all that is so and the site has not moved in the jaws by more than half
 of the lift, from where it was grasped, and again from where it was when the holding was done.
 
@@ -40,6 +41,7 @@ from ..core.rules import (
   miss,
   peak,
   point,
+  root,
   slipped,
   tip,
 )
@@ -54,7 +56,7 @@ FUNDUS = Scene(
   port=(0.03, 0.06, 0.12),
   camera=(-0.09, 0.072, 0.054),
 )
-REACH = 0.012  # of the jaws around the site [m]
+REACH, ASIDE = 0.012, 0.004  # of the jaws around the site, and across the shaft [m]
 REST = 0.2  # at a low height before release [s]
 # Heights that it rests between, and is let go below, as shares of the lift.
 LOW, RESTING, LETTING = -0.25, 0.4, 0.5
@@ -104,6 +106,12 @@ def distance(s, o):
   return length(point(s, o.site) - tip(s))
 
 
+def aside(s, o):
+  """Returns how far the site is from the axis of the shaft [m]."""
+  off = from_tip(s, point(s, o.site))
+  return root(off[0] * off[0] + off[1] * off[1])
+
+
 def slid(s, o):
   """Returns how far the site has moved in the jaws from where it was grasped [m]."""
   return length(from_tip(s, point(s, o.site)) - o.where)
@@ -116,7 +124,7 @@ def follow(s, o):
     now = told and holds(s) and slid(s, o) < o.slip
     if told and not now:
       slipped(s, o)
-  elif told and far < REACH and holds(s):
+  elif told and far < REACH and aside(s, o) < ASIDE and holds(s):
     now = True
     o.where = from_tip(s, point(s, o.site))
     grip(s, o, far)
