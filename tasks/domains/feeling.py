@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 from palpate.tissue.types import Array, floats, ints
 
-from ..core.rules import Vector, dot, length, many
+from ..core.rules import FAR, Vector, dot, length, many, root
 
 LEFT = 0.02  # force below which a press has ended [N]
 DEEP = 0.0028  # what tells enough [m]
@@ -20,6 +20,7 @@ SOFT = 0.25  # share of the places felt that are softer than what counts as soft
 STIFF = 1.6  # times that: what is felt around, before anything else [-]
 WIDTH = 1.2  # of the bell of stiffness above an inclusion, over its radius [-]
 NOISE = 8.0  # of what is felt: triangles differ [N/m]
+SURE = 0.45  # of the radius: who knows the place of an inclusion to within that is sure [-]
 LEAST = 1e-9
 
 
@@ -35,6 +36,7 @@ class Notes:
   depth: float  # there, 0 where no press goes on [m]
   next: int  # place to feel next, -1 where enough is felt
   likely: Vector  # where an inclusion is to be expected [m]
+  doubt: float  # RMS distance from there to where else it may be [m]
 
 
 SHARED = ("places", "outward", "beside")  # by all worlds
@@ -51,7 +53,7 @@ def start(o: Any, places: np.ndarray, outward: np.ndarray, beside: np.ndarray) -
   """
   o.places, o.outward, o.beside = places, outward, beside
   o.nplace, o.stiffness, o.depth = len(places), np.zeros(len(places)), 0.0
-  o.likely = places.mean(axis=0)
+  o.likely, o.doubt = places.mean(axis=0), FAR
   o.last = o.next = nearest(o, o.likely)
 
 
@@ -84,16 +86,25 @@ def conclude(o):
   """Finds where to feel next, and where an inclusion is to be expected.
 
   Next is a side of what is stiff, or else, of the places far from all that was felt, the nearest to
-  the last; the first is in the middle.
+  the last; the first is in the middle. Who is not sure then feels around what is likely.
   """
   low, top = soft(o), stiffest(o)
+  place, doubt = expected(o, low)
+  o.likely = place
+  o.doubt = doubt
   o.next = -1
   if o.stiffness[top] <= STIFF * low:
-    o.next = far(o)
+    o.next = new(o, o.places[o.last], APART)
   if o.next < 0:
     o.next = side(o, top)
-  o.likely = expected(o, low)
+  if o.next < 0 and not sure(o):
+    o.next = new(o, o.likely, NEAR)
   return o
+
+
+def sure(o):
+  """Returns whether what was felt tells where an inclusion is."""
+  return o.doubt <= SURE * o.radius
 
 
 def nearest(o, point):
@@ -147,27 +158,27 @@ def _soft(o):
   return float(0.0)  # noqa: UP018
 
 
-def far(o):
-  """Returns of the places far from all that was felt the nearest to the last, -1 without one."""
+def new(o, place, apart):
+  """Returns of the places that far from all that was felt the nearest to one, -1 without one."""
   gaps = np.linalg.norm(o.places[:, None] - o.places[np.flatnonzero(o.stiffness)], axis=2)
-  away = np.linalg.norm(o.places - o.places[o.last], axis=1)
-  away[gaps.min(axis=1, initial=np.inf) < APART] = np.inf
+  away = np.linalg.norm(o.places - place, axis=1)
+  away[gaps.min(axis=1, initial=np.inf) < apart] = np.inf
   k = int(away.argmin())
   return k if away[k] < np.inf else -1
 
 
-@many(far)
-def _far(o):
+@many(new)
+def _new(o, place, apart):
   found = int(-1)  # noqa: RUF046, UP018 - variables to Warp
   least = float(0.0)  # noqa: UP018
   for k in range(o.places.shape[0]):
-    away = length(o.places[k] - o.places[o.last])
+    away = length(o.places[k] - place)
     if found < 0 or away < least:
-      new = wp.bool(True)
+      left = wp.bool(True)
       for j in range(o.places.shape[0]):
-        if new and o.stiffness[j] > 0.0:
-          new = length(o.places[k] - o.places[j]) >= APART
-      if new:
+        if left and o.stiffness[j] > 0.0:
+          left = length(o.places[k] - o.places[j]) >= apart
+      if left:
         found = k
         least = away
   return found
@@ -197,22 +208,31 @@ def _side(o, top):
 
 
 def expected(o, low):
-  """Returns where an inclusion is to be expected, with what counts as soft [N/m]  (3,) [m]."""
+  """Returns where an inclusion is to be expected (3,), and how far from there it may be [m].
+
+  What counts as soft is `low` [N/m].
+  """
   felt = np.flatnonzero(o.stiffness)
   likely = chance(o.places, felt, o.stiffness[felt] - low, o.radius)
-  return likely @ o.places / likely.sum()
+  likely /= likely.sum()
+  middle = likely @ o.places
+  return middle, float(np.sqrt(likely @ ((o.places - middle) ** 2).sum(axis=1)))
 
 
 @many(expected)
 def _expected(o, low):
-  best, mass, middle = float(0.0), float(0.0), wp.vec3()  # noqa: UP018 - variables to Warp
+  best, mass, square = float(0.0), float(0.0), float(0.0)  # noqa: UP018 - variables to Warp
+  sum = wp.vec3()
   for k in range(o.places.shape[0]):
     best = max(best, _gain(o, k, low))
   for k in range(o.places.shape[0]):
     likely = wp.exp((_gain(o, k, low) - best) / (2.0 * NOISE * NOISE))
+    away = o.places[k] - o.places[o.last]  # small numbers: squares of them are told apart
     mass += likely
-    middle += likely * o.places[k]
-  return middle / mass
+    sum += likely * away
+    square += likely * dot(away, away)
+  sum = sum / mass
+  return o.places[o.last] + sum, root(max(square / mass - dot(sum, sum), 0.0))
 
 
 def _gain(o, k, low):

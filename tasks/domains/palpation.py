@@ -1,4 +1,7 @@
-"""What the exercises of palpation in `probe` are: a field with a stiff inclusion under it."""
+"""What the exercises of palpation in `probe` are: a field with a stiff inclusion under it.
+
+A report succeeds that is right, made while pressing, and follows from what was felt: luck is a miss.
+"""
 
 import dataclasses
 from collections.abc import Iterator, Mapping
@@ -28,7 +31,7 @@ from ..core.rules import (
 )
 from ..core.scenes import Scene
 from . import feeling
-from .feeling import APART, SHARED, SOFT, Notes, chance, nearest, press
+from .feeling import APART, SHARED, SOFT, Notes, chance, nearest, press, sure
 
 _FACING = 0.75  # least cosine between the field's normal and the way to the trocar
 _PIN_GAP = 0.02  # the field keeps that far from pinned nodes [m]
@@ -81,7 +84,7 @@ def advance(s, o):
   pressed, here = force(s), tip(s)
   if last_component(s, o) > 0.5:
     off = length(here - o.inclusion)
-    if off <= o.tolerance and pressed >= REPORT:
+    if off <= o.tolerance and pressed >= REPORT and sure(o):
       reach(s, o, off)
       return o, 1.0, SUCCESS
     miss(s, o, off)
@@ -139,7 +142,7 @@ class Palpate(Task):
       tolerance: largest error of the report [m]
       **kwargs: see Task
     """
-    self.name, self.targets = name, 1
+    self.targets = 1
     self.factor, self.radius, self.tolerance = factor, radius, tolerance
     self.embeds, self._inclusion = True, None
     self._fields: dict[int | None, tuple[np.ndarray, ...]] = {}
@@ -148,7 +151,7 @@ class Palpate(Task):
         f"{name}: model is given, expected none: the organ is made with its inclusion"
       )
     kwargs = {"spread": 0.036, **kwargs}
-    super().__init__(dataclasses.replace(scene, targets=1), random, **kwargs)
+    super().__init__(dataclasses.replace(scene, targets=1), random, name=name, **kwargs)
 
   @property
   def extra(self) -> tuple[str, ...]:

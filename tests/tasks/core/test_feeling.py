@@ -33,7 +33,11 @@ def test_a_press_is_noted_where_it_was_deepest_and_what_is_far_is_left():
   all_of_it = [(x, y, 0.2) for x in (-3, -1, 1, 3) for y in (-3, -1, 1, 3)]
   assert pressed(*all_of_it).next >= 0  # beside the stiffest
   sides = [(x, y, 0.2) for x, y in ((-3, -2), (-2, -3))]
-  assert pressed(*all_of_it, *sides).next < 0
+  notes = pressed(*all_of_it, *sides)
+  assert notes.next == len(GRID) // 2  # nothing is stiff: it is not sure, and goes on in the middle
+  assert not feeling.sure(notes) and notes.doubt > 0.02
+  everywhere = [(x, y, 0.2) for x in range(-3, 4) for y in range(-3, 4)]
+  assert pressed(*everywhere).next < 0
 
 
 def test_what_is_stiff_is_felt_around_and_expected_in_the_middle():
@@ -45,7 +49,7 @@ def test_what_is_stiff_is_felt_around_and_expected_in_the_middle():
     stiff.append((*asked[-1], force))
   assert sorted(asked) == [(0, 0), (1, -1), (1, 1), (2, 0)]
   notes = pressed(*stiff)
-  assert notes.next < 0
+  assert notes.next < 0 and feeling.sure(notes) and not feeling.sure(pressed(*stiff[:3]))
   np.testing.assert_allclose(notes.likely, (0.008, 0, 0), atol=0.003)
   lone = pressed((3, 3, 0.4), (-3, -3, 0.2))
   assert len({lone.next, *map(int, lone.beside[len(GRID) - 1])} - {-1}) == 2
