@@ -49,7 +49,7 @@ def measure(recording: Any, which: Sequence[int]) -> Metrics:
     if spec.combine != "all"
   }
   together = Inputs(recording, which, values)
-  for name, spec in METRICS.items():
+  for name, spec in METRICS.items():  # those of others come after them
     if spec.combine == "all":
       values[name] = together.value(name, spec)
   return Metrics(**values)
@@ -149,6 +149,13 @@ class Inputs:
   def touching(self) -> np.ndarray | None:
     """Whether there was contact since the sample before  (nstep,)."""
     return self._recording.touching(self._which[0])
+
+  @property
+  def at_work(self) -> np.ndarray | None:
+    """Whether any instrument had contact since the sample before  (nstep,)."""
+    each = [self._recording.touching(k) for k in self._which]
+    known = [touch for touch in each if touch is not None]
+    return np.any(known, axis=0) if known else None
 
   @property
   def steady_speed(self) -> np.ndarray:

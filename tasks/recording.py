@@ -40,7 +40,7 @@ class Settings:
       voluntary movement is below 2 Hz, and tremor is above (Riviere, Rader and Khosla 1997) [Hz]
     movement_speed: tip speed above which an instrument moves [m/s]
     movement_debounce: shortest movement, and shortest pause between two [s]
-    idle_speed: tip speed below which an instrument rests [m/s]
+    idle_speed: tip speed below which an instrument without contact rests [m/s]
     contact_force: force above which there is contact [N]
     force_cutoff: where the low pass cuts that the force's rate is taken after [Hz]
     local_axis: direction of the shaft in the tip's own frame, used where no axis is recorded  (3,)

@@ -12,7 +12,7 @@ of the tip, or `SHAFT_LIMIT` and `SHAFT_DAMAGE` where those are of jaws and high
 
 import dataclasses
 
-SHAFT_CONTACT = 0.05  # below it the shaft is as good as not in contact [N]
+SHAFT_CONTACT = 0.1  # what lies on the shaft with less, such as a flap, is no contact [N]
 SHAFT_LIMIT, SHAFT_DAMAGE = 1.5, 3.0  # [N]
 
 

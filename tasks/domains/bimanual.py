@@ -8,10 +8,11 @@ holds [m]; `retracted` (1,), how far the site is from its place at rest, away fr
 share of what is needed [-]; `burnt` (1,), share of the burn that is damage [-].
 
 A current frees the bonds within 3 mm of the hook's wire in 0.2 s. What comes free while the site is
-grasped and retracted by 5 mm, with the pull on the liver under its limit, is `clean`; the rest is
-`torn`: what is not held away is not seen. A current without a bond in reach burns what the hook
-touches; half a second of that is damage. Progress, success and failure are those of `dissect`; the
-bed is too strong to be pulled off.
+grasped and retracted by 5 mm, with the pull on the liver under its limit and the hook's force under
+1.5 N, is `clean`; the rest is `torn`: what is not held away is not seen. A current without a bond in
+reach burns what the hook touches; half a second of that is damage, and so is a hook that presses
+with 3 N. Progress, success and failure are those of `dissect`; the bed is too strong to be pulled
+off.
 """
 
 import dataclasses
@@ -54,6 +55,7 @@ BED = (1e7, 2.5e4, 40.0)
 AWAY = 0.005  # least way of the site from the bed, for what is divided to count [m]
 REACH, RATE = 0.003, 5.0  # of the current around the wire [m], damage that it does to bonds [1/s]
 TOUCHING, BURN = 0.03, 0.5  # force with which the hook touches [N], time that it may burn [s]
+HOOK_LIMIT, HOOK_DAMAGE = 1.5, 3.0  # of its force, as of other tips without jaws [N]
 SCENE = dataclasses.replace(
   FUNDUS, nodes=250, bonds=BED, second="hook", second_port=(-0.05, -0.01, 0.12)
 )
@@ -108,8 +110,8 @@ def retraction(s, o):
 
 
 def fair(s, o):
-  """Returns whether what comes free now is held away from the bed."""
-  return o.grasped == 1.0 and retraction(s, o) > AWAY
+  """Returns whether what comes free now is held away from the bed, and divided gently."""
+  return o.grasped == 1.0 and retraction(s, o) > AWAY and other_force(s) <= HOOK_LIMIT
 
 
 def distances(s, o) -> np.ndarray:
@@ -179,7 +181,7 @@ def advance(s, o):
   """Follows the grasp, what comes free, and what is burnt."""
   o, near = hold(s, o)
   o, outcome = count(s, o, fair(s, o))
-  if o.time > BURN and outcome == RUNNING:
+  if outcome == RUNNING and (o.time > BURN or other_force(s) > HOOK_DAMAGE):
     outcome = DAMAGED
   return o, earned(o, near, outcome), outcome
 
@@ -229,7 +231,8 @@ class Bimanual(Dissect):
   def label(self, kind: str) -> str:
     """Returns what damage is."""
     if kind == "damage" and not ruined(self):
-      return f"burnt for {self.time:.2f} s"
+      burnt = self.time > BURN
+      return f"burnt for {self.time:.2f} s" if burnt else "the hook's force"
     return super().label(kind)
 
   def instruct(self, physics: Physics) -> str:

@@ -5,11 +5,11 @@ from the tip to points 5, 10 and 15 mm further along the line [m]; `covered` (1,
 that is cut [-]; `deviation` (1,), largest distance of the cut from the line so far [m].
 
 Progress: 0.1 * closeness to the line, at its best, + 0.9 * share of the line that is cut. A point
-of the line is cut where the edge has gone through the wall within the tolerance of it; moving
-along without cutting counts nothing. Success: 98 % of it, and the piece is free, or 6 mm more are
+of the line is cut where the edge has gone through the wall within the tolerance of it, slower than
+60 mm/s; moving along without cutting counts nothing. Success: 98 % of it, and the piece is free, or 6 mm more are
 cut than the line is long: the mesh may hang together by an edge. Failure: more than
-10 mm cut farther from the line than the tolerance, a force above the damage limit, or the time
-limit.
+10 mm cut farther from the line than the tolerance or faster, a force above the damage limit, or the
+time limit.
 
 That is the pattern cut of FLS: a circle of 4 cm, and all of the cut within 2 mm of the line (Ritter
 and Scott 2007, 10.1177/1553350607302329), with a scalpel in place of scissors and a grasper.
@@ -54,7 +54,8 @@ SCENE = Scene(
   camera=(-0.03, -0.07, 0.09),
 )
 RULE = 0.002  # [m], of FLS
-ASTRAY = 0.01  # most that may be cut beyond the tolerance [m]
+ASTRAY = 0.01  # most that may be cut beyond the tolerance, or slashed [m]
+SLASH = 0.06  # speed from which on a cut is a slash: nobody stops it at the line [m/s]
 COVERED = 0.98  # share of the line that is to be cut
 CLOSING = 0.006  # length that is cut beyond that of the line where the piece counts as free [m]
 STEP = 0.001  # between points of the line [m]
@@ -114,7 +115,7 @@ class State:
   next: int  # the first that is not, after those that are
   length: float  # of the line [m]
   opened: float  # length that was cut so far [m]
-  astray: float  # length of that beyond the tolerance [m]
+  astray: float  # length of that beyond the tolerance, or slashed [m]
   jagged: float  # length of that more than 2 mm from the line [m]
   excess: float  # area between cut and line [m^2]
   mean: float  # distance of the cut from the line [m]
@@ -196,7 +197,7 @@ def proceed(s, o, start, end, way):
   o.farthest = max(o.farthest, off)
   if off > RULE:
     o.jagged = o.jagged + way
-  if off > o.tolerance:
+  if off > o.tolerance or way > SLASH * o.control_timestep:
     o.astray = o.astray + way
   else:
     o = cover(o, first, last)
@@ -307,7 +308,7 @@ class Cut(Task):
 
   def label(self, kind: str) -> str:
     """Returns what damage is."""
-    return f"{1e3 * self.astray:.0f} mm are cut beside the line" if kind == "damage" else ""
+    return f"{1e3 * self.astray:.0f} mm are cut beside the line or slashed" if kind == "damage" else ""
 
   def instruct(self, physics: Physics) -> str:
     """Says to begin, or to go on."""

@@ -5,8 +5,8 @@ to the middle of the bonds that still hold [m]; `freed` (1,), share of the bed's
 [-]; `traction` (1,), pull on the liver [N]; `grasped` (1,), whether the jaws hold the site, as in
 `grasp`; here it may slip by 6 mm.
 
-What comes free while the site is grasped, with the force and the traction under their limits, is
-`clean`; the rest is `torn`. Progress: 0.1 * closeness until it is grasped, 0.1 then, and besides
+What comes free while the site is grasped and pulled slower than 30 mm/s, with the force and the
+traction under their limits, is `clean`; the rest is `torn`. Progress: 0.1 * closeness until it is grasped, 0.1 then, and besides
 0.8 * clean / wanted. Success: the wanted share is clean. Failure: a force above the damage limit,
 jaws included, a traction above twice its limit, which tears the liver, so much torn that too little
 is left, or the time limit.
@@ -30,6 +30,7 @@ from ..core.rules import (
   closeness,
   drop,
   is_free,
+  length,
   many,
   point,
   tip,
@@ -43,6 +44,7 @@ from .grasp import FUNDUS, Held, Hold, distance, follow
 # Stiffness [N/m^3], strength [Pa] and energy [J/m^2] of the bed, and of a tough one. Ours: we know
 # of no measurement; the bed bears the organ, and comes away under half a newton or one.
 BED, TOUGH = (1e7, 6e3, 8.0), (1e7, 7e3, 10.0)
+RIP = 0.03  # speed of a pull from which on what comes free is torn [m/s]
 # Of the expert: how far it pulls at most [m], how fast [m/s], and how much towards the trocar.
 _FAR, _SPEED, _UP = 0.045, 0.01, 0.5
 
@@ -76,6 +78,7 @@ class State(Held, Freed):
   """State of a world."""
 
   front: Vector
+  last: Vector  # where the tip was a control step ago [m]
 
 
 # The rules.
@@ -106,7 +109,9 @@ def hold(s, o):
 def advance(s, o):
   """Follows the grasp and what comes free."""
   o, near = hold(s, o)
-  o, outcome = count(s, o, o.grasped == 1.0)
+  slow = length(tip(s) - o.last) < RIP * o.control_timestep
+  o.last = tip(s)
+  o, outcome = count(s, o, o.grasped == 1.0 and slow)
   return o, earned(o, near, outcome), outcome
 
 
@@ -144,6 +149,7 @@ class Dissect(Freeing, Hold):
     """Draws the site to grasp."""
     super().begin(physics)
     self.whole(physics)
+    self.last = physics.tip_pos()
     self.show(physics)
 
   def show(self, physics: Physics) -> None:

@@ -118,13 +118,14 @@ def _moved(length: float) -> float:
   return length
 
 
-@metric("Smoothness (SPARC)", "-", "dexterity", "mean", _SMOOTH, "higher")
+@metric("Smoothness (SPARC)", "-", "dexterity", "mean", _SMOOTH, "neither")
 def sparc(even_speed: ArrayLike, rate: float) -> float:
-  """Returns the spectral arc length of the speed [-], higher (towards 0) is smoother.
+  """Returns the spectral arc length of the speed [-], neither is better.
 
   Minus the arc length of the normalised spectrum up to the last frequency <= 10 Hz with amplitude
   >= 0.05, zero-padding 4 (Balasubramanian et al. 2015; 10.1186/s12984-015-0090-9). It is defined
-  for one movement; over an exercise of many movements compare recordings of the same task only.
+  for one movement, where higher (towards 0) is smoother. An exercise has many, and their number moves it more than a tremor does (the
+  trembling novice is the smoother one in `touch/standard`), so it is not scored: the jerk is.
   Its filter is the cut-off itself; a recording's positions also went through `tip_cutoff`.
 
   Args:
@@ -269,37 +270,46 @@ def number_of_movements(
 
 
 @metric("Idle time", "s", "efficiency", "all", "PMC4412306")
-def idle_time(time: ArrayLike, steady_speeds: ArrayLike, idle_speed: float = 0.005) -> float:
-  """Returns the time with every instrument slower than the threshold [s], lower is better.
+def idle_time(
+  time: ArrayLike,
+  steady_speeds: ArrayLike,
+  at_work: ArrayLike | None = None,
+  idle_speed: float = 0.005,
+) -> float:
+  """Returns the time with every instrument slow and none in contact [s], lower is better.
 
-  PMC4412306 calls it the lack of movement of both hands; 5 mm/s is this project's number.
+  PMC4412306 calls it the lack of movement of both hands; 5 mm/s is this project's number. Who
+  presses, holds or cuts with care is slow and not idle, so contact counts as work.
 
   Args:
     time: sample times [s]  (nstep,)
     steady_speeds: as in `number_of_movements`, a row an instrument [m/s]  (ninstrument, nstep - 1)
+    at_work: whether an instrument had contact since the sample before; never without it  (nstep,)
     idle_speed: below which an instrument rests [m/s]
   """
   time = check_time(time)
   table = np.atleast_2d(np.asarray(steady_speeds, np.float64)).T
   table = same("speeds", rows("speeds", table, table.shape[1]), time, less=1)
-  return np.diff(time)[(table < idle_speed).all(axis=1)].sum()
+  idle = (table < idle_speed).all(axis=1)
+  if at_work is not None:
+    idle &= ~(same("at_work", rows("at_work", at_work), time)[1:] > 0.5)
+  return np.diff(time)[idle].sum()
 
 
 @metric("Idle share", "%", "efficiency", "all", "PMC4412306")
-def idle_share(time: ArrayLike, steady_speeds: ArrayLike, idle_speed: float = 0.005) -> float:
+def idle_share(time: ArrayLike, idle_time: float) -> float:
   """Returns `idle_time` as a share of the whole time [%], lower is better (PMC4412306)."""
-  idle = idle_time(time, steady_speeds, idle_speed)
-  if isinstance(idle, Unknown):
-    raise UnknownError(idle.reason, idle.fault)
+  if isinstance(idle_time, Unknown):
+    raise UnknownError(idle_time.reason, idle_time.fault)
   time = check_time(time)
-  return 100 * idle / (time[-1] - time[0])
+  return 100 * idle_time / (time[-1] - time[0])
 
 
-@metric("Bimanual dexterity", "-", "dexterity", "all", "Hofstad et al. 2013", "higher")
+@metric("Bimanual dexterity", "-", "dexterity", "all", "Hofstad et al. 2013", "neither")
 def bimanual_dexterity(first_speed: ArrayLike, second_speed: ArrayLike) -> float:
-  """Returns Pearson's correlation of two instruments' speeds [-], higher is better.
+  """Returns Pearson's correlation of two instruments' speeds [-], neither is better.
 
-  Hofstad et al. 2013.
+  Hofstad et al. 2013. Where one hand holds still and the other divides it is low for good reason.
 
   Args:
     first_speed: of one instrument [m/s]  (n,)

@@ -18,7 +18,8 @@ cannot outweigh a category. Where the panel never varies (sd = 0) there is no sc
 value as good or better (within 1e-9, relative), -10 for a worse one.
 
 Composite: the weighted mean over categories of the mean z of the category's known metrics, 0 for
-the panel's average, -10 to 10. A category without a known metric drops out and its weight is shared
+the panel's average, -10 to 10. Safety counts with its worst metric where one is over its limit: no
+haste makes up for a harm. A category without a known metric drops out and its weight is shared
 by the rest; where less than half of the weight is known, so always without safety, the composite is
 unknown.
 
@@ -28,8 +29,8 @@ Weights: safety 67 %, efficiency 17 % (Heidelberg VR score, 10.1007/s00464-018-6
 Proficiency of an episode: success, and no metric over its limit. A limit is of its own metric: the
 median of the panel and `SPREADS` times a spread that one freak does not move, from the median to
 the value that 90 % are as good as, or the worst value of the best `PASSING` of the panel's
-episodes, whichever lets more pass; and at most `BELOW` of what ends an episode, such as its time
-limit, or of 100 %. It is of log(1 + value / median) where no value is negative: forces, times and
+episodes, whichever lets more pass; where a panel hardly varies `LEAST` of the median beyond it, or
+what nobody feels (`SMALL`); and at most `BELOW` of what ends an episode, such as its time limit, or of 100 %. It is of log(1 + value / median) where no value is negative: forces, times and
 paths vary by factors, and their long tails are no normal one's. The
 mean + 2 SD of SAGES would fail half of the panel, since each of thirty metrics may fail by itself,
 and so would the panel's worst values the next person. A metric that some of the panel's successes
@@ -62,7 +63,8 @@ WEIGHTS = {
 Z_LIMIT = 10.0
 FLOOR = -20.0  # of an exercise that did not succeed; a success scores -10 or more
 PASSING = 0.95
-SPREADS, BELOW = 2.5, 0.9
+SPREADS, LEAST, BELOW = 2.5, 0.1, 0.9
+SMALL = {"s": 0.5, "N": 0.1, "N s": 0.05}
 _NINTH = 1.2816  # normal deviate that 90 % are under
 CONSECUTIVE, REPEATS = 2, 10
 LEAST_WEIGHT = 0.5
@@ -130,7 +132,9 @@ def _limits(
   spread = (np.quantile(panel, 0.9, axis=0) - middle) / _NINTH
   limit = np.maximum(middle + SPREADS * spread, kept.max(axis=0))
   factors = np.isfinite(unit)
-  limit[factors] = unit[factors] * np.expm1(limit[factors])
+  limit[factors] = unit[factors] * np.maximum(np.expm1(limit[factors]), 1.0 + LEAST)
+  small = np.array([SMALL.get(METRICS[name].unit, -np.inf) for name in names])
+  limit = np.where(signs[asked] > 0, np.maximum(limit, small[asked]), limit)
   worst[asked] = limit
   most = np.array([_most(name, caps) for name in names])
   limits = np.where(signs > 0, np.minimum(worst, most), worst) * signs
@@ -280,7 +284,7 @@ def score(
         missing.append(name)
     elif not _as_good(value, row["limit"], better):
       over.append(name)
-  composite, group, applied = _composite(z, weights)
+  composite, group, applied = _composite(z, weights, over)
   if outcome is None:
     composite = Unknown("the recording does not say how it ended")
   elif outcome != SUCCESS:
@@ -290,13 +294,15 @@ def score(
 
 
 def _composite(
-  z: Mapping[str, float], weights: Mapping[str, float]
+  z: Mapping[str, float], weights: Mapping[str, float], over: Sequence[str]
 ) -> tuple[float, dict[str, float], dict[str, float]]:
   """Returns composite, category -> mean z, and category -> weight as applied."""
   group: dict[str, float] = {}
   for name in WEIGHTS:
     known = [v for k, v in z.items() if METRICS[k].group == name and math.isfinite(v)]
     group[name] = math.fsum(known) / len(known) if known else Unknown("no known metric")
+  harms = [z[k] for k in over if METRICS[k].group == "safety" and math.isfinite(z[k])]
+  group["safety"] = min([group["safety"], *harms]) if harms else group["safety"]
   total = sum(weights.values())
   share = sum(weights[name] for name, v in group.items() if math.isfinite(v)) / total
   applied = {

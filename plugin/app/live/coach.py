@@ -26,7 +26,6 @@ _ADVICE = {
   "time": "plan the next movement during the present one",
   "path_length": "go straight to the target",
   "path_inefficiency": "go straight to the target",
-  "sparc": "make one smooth movement in place of several corrections",
   "log_dimensionless_jerk": "make one smooth movement in place of several corrections",
   "angular_path": "turn the instrument less",
   "depth_path": "find the depth first, then go in once",
@@ -121,8 +120,7 @@ def _tells(spec: Spec, recording: Recording) -> bool:
 
 def _fits(name: str, metrics: Any) -> bool:
   """Returns whether the advice about a metric fits: few movements need not be made one."""
-  smooth = name in ("sparc", "log_dimensionless_jerk")
-  return not smooth or not metrics.number_of_movements < 2
+  return name != "log_dimensionless_jerk" or not metrics.number_of_movements < 2
 
 
 def _words(text: str) -> str:

@@ -102,7 +102,7 @@ def test_advice_asks_for_one_movement_where_there_were_several():
   env = load("touch/easy")
   made = episode.run(env, performer.make(env, seed=0), 0, {"task_kwargs": {}})
   strict = copy.deepcopy(reference("touch/easy"))
-  strict["metrics"]["sparc"]["limit"] = 0.0
+  strict["metrics"]["log_dimensionless_jerk"]["limit"] = 0.0
   several = made.metrics().number_of_movements > 1
-  (text,) = [text for text in advice(made, strict) if text.startswith("Smoothness")]
+  (text,) = [text for text in advice(made, strict) if text.startswith("Log dimensionless jerk")]
   assert ("one smooth movement" in text) == several

@@ -19,7 +19,7 @@ from palpate.tasks.metrics import METRICS, Metrics
 SKILL_TASKS = ("touch/standard", "probe/easy", "grasp/easy", "trace/easy", "retract/easy")
 # What each novice does differently, and the metrics that must show it.
 STATED = {
-  "tremor": ("trembles", ("sparc", "log_dimensionless_jerk")),
+  "tremor": ("trembles", ("log_dimensionless_jerk",)),
   "overshoot": ("goes too far and comes back", ("path_length", "path_inefficiency")),
   "delay": ("waits and is slow", ("time", "idle_time", "idle_share")),
   "force": (

@@ -192,8 +192,16 @@ def test_idle_time_needs_every_instrument_at_rest():
   right = np.array([1, 1, 0, 0, 0, 0, 1, 1, 1, 0], float)
   assert metrics.idle_time(time, left) == pytest.approx(3.5)
   assert metrics.idle_time(time, [left, right]) == pytest.approx(1.5)
-  assert metrics.idle_share(time, [left, right]) == pytest.approx(30.0)
-  assert metrics.idle_share(time, 0 * left) == pytest.approx(100.0)
+  assert metrics.idle_share(time, 1.5) == pytest.approx(30.0)
+  assert metrics.idle_time(time, 0 * left) == pytest.approx(5.0)
+
+
+def test_who_works_slowly_is_not_idle():
+  time, still = np.arange(11) * 0.5, np.zeros(10)
+  touch = np.array([0, 0, 1, 1, 1, 0, 0, 0, 0, 0, 1], bool)
+  assert metrics.idle_time(time, still, touch) == pytest.approx(3.0)
+  with pytest.raises(ValueError, match="at_work has 10 samples, expected 11"):
+    metrics.idle_time(time, still, touch[1:])
 
 
 def test_bimanual_dexterity():

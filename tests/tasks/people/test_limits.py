@@ -8,11 +8,11 @@ from palpate.tasks.metrics import Metrics
 from palpate.tasks.people import limits, score
 
 TIMES, SMOOTH = [10.0, 12.0, 14.0, 16.0, 18.0], [-2.0, -3.0, -4.0, -5.0, -6.0]
-EXPERTS = [Metrics(time=t, sparc=s, errors=0) for t, s in zip(TIMES, SMOOTH, strict=True)]
+EXPERTS = [Metrics(time=t, log_dimensionless_jerk=s, errors=0) for t, s in zip(TIMES, SMOOTH, strict=True)]
 
 
 @pytest.mark.parametrize(
-  ("rule", "time", "sparc"),
+  ("rule", "time", "jerk"),
   [
     ("sd:2", 14 + 2 * np.sqrt(10), -4 - 2 * np.sqrt(2.5)),
     ("sd:0", 14, -4),
@@ -21,10 +21,10 @@ EXPERTS = [Metrics(time=t, sparc=s, errors=0) for t, s in zip(TIMES, SMOOTH, str
     ("percentile:95", 17.6, -5.8),
   ],
 )
-def test_limits_are_those_by_hand(rule, time, sparc):
+def test_limits_are_those_by_hand(rule, time, jerk):
   rows = limits.of_people(EXPERTS, "touch/easy", rule)["metrics"]
   assert rows["time"]["limit"] == pytest.approx(time)
-  assert rows["sparc"]["limit"] == pytest.approx(sparc)
+  assert rows["log_dimensionless_jerk"]["limit"] == pytest.approx(jerk)
   assert rows["errors"]["limit"] == 0
 
 
