@@ -10,7 +10,9 @@ its best progress (`score`). What it found is tried on episodes that it has not 
 
 A success is honest when the work was done, judged apart from the exercise's own rules: contact as
 long and as often as the exercise has targets, jaws that were wide open before they held, a curve
-that was pressed on nearly everywhere, a field that was felt before the report. Needs `cma`.
+that was pressed on or cut nearly everywhere, a strip that was touched for two seconds, a field that
+was felt before the report. What scores above the expert in the same episode is counted, with the
+categories of the score that it is better in. Needs `cma`.
 """
 
 from __future__ import annotations
@@ -33,13 +35,13 @@ from palpate.tasks.core.environment import CONTROL_TIMESTEP
 from palpate.tasks.people import score
 
 NAMES = ("touch/easy", "probe/easy", "probe/palpate_easy", "grasp/easy", "trace/easy")
-NAMES += ("retract/easy",)
+NAMES += ("retract/easy", "cut/easy", "dissect/easy", "tease/easy", "bimanual/easy")
 KINDS = ("aimed", "blind", "styled")
 PHASES = 3
 LENGTH = 6.0  # of an episode of `blind` and `aimed` policies [s]
 _REACH = 0.025  # of the offsets of aimed policies [m]
 _SPEED = 0.06  # of their tip [m/s]
-_CONTACT = 0.02  # [N]
+_CONTACT, _STROKES = 0.02, 2.0  # force of a contact [N], time of that to free a strip [s]
 _SEEN, _FRESH = 1000, tuple(range(2000, 2004))  # seeds
 # What `styled` policies may be, from -1 to 1; the expert is inside.
 MANNERS = {
@@ -48,7 +50,7 @@ MANNERS = {
   "delay": (0.0, 0.6),
   "force": (0.3, 3.0),
   "detour": (0.0, 0.6),
-  "speed": (0.5, 3.0),
+  "speed": (0.5, 8.0),
   "reaction": (0.0, 0.2),
 }
 
@@ -89,6 +91,7 @@ class End:
     honest: whether it did the work
     points: its score; `score.FLOOR` or less without success
     proficient: whether it counts as that
+    group: category of the score -> mean z [-]
   """
 
   paid: float
@@ -97,6 +100,7 @@ class End:
   honest: bool
   points: float
   proficient: bool
+  group: dict[str, float]
 
   def worth(self, aim: str) -> float:
     """Returns what a search sees."""
@@ -113,17 +117,20 @@ class Attack:
     options = {} if kind == "styled" else {"time_limit": length}
     self.env = tasks.load(*suite.split(name), {"random": 0, **options})
     self.name, self.kind, self.steps = name, kind, round(length / CONTROL_TIMESTEP)
-    extra = len(self.env.task.components) - len(base.AXES)
-    self.width = extra + (len(base.AXES) if kind == "blind" else 3)
+    hands = 2 if self.env.task.other else 1
+    extra = len(self.env.task.components) - hands * len(base.AXES)
+    self.width = extra + hands * (len(base.AXES) if kind == "blind" else 3)
     self.size = len(MANNERS) if kind == "styled" else PHASES * self.width
     self._script = self.env.task.expert
 
-  def play(self, policy: np.ndarray, seed: int) -> End:
-    """Returns how an episode ends; `policy` is in [-1, 1]  (size,)."""
+  def play(self, policy: np.ndarray | None, seed: int) -> End:
+    """Returns how an episode ends; `policy` is in [-1, 1]  (size,), or None for the expert."""
     env, task, work = self.env, self.env.task, Work()
     style = performer.EXPERT
     task.expert = self._script
-    if self.kind == "styled":
+    if policy is None:
+      pass
+    elif self.kind == "styled":
       shares = (np.asarray(policy) + 1) / 2
       low, high = np.array(list(MANNERS.values())).T
       drawn = (low + shares * (high - low)).tolist()
@@ -143,24 +150,29 @@ class Attack:
       honest=won and work.done(task),
       points=float(found.composite),
       proficient=found.proficient,
+      group=found.group,
     )
 
   def _fly(self, p: performer.Performer, policy: np.ndarray) -> performer.Script:
     rows = np.asarray(policy).reshape(PHASES, self.width)
-    task, physics = p.task, p.physics
+    hands = ((p, ("target", "field")), (p.other, ("hook_front",)))
     for k in range(10**9):
       row = rows[min(k * PHASES // self.steps, PHASES - 1)]
       if self.kind == "blind":
         yield row
         continue
-      seen = task.observe(physics)
-      goal = physics.tip_pos() + seen.get("target", seen.get("field"))
-      goal = goal + _REACH * physics.trocar().mat @ row[:3]
-      gap = goal - p.tip
-      far = max(float(np.linalg.norm(gap)), 1e-9)
-      p.tip = p.tip + gap * min(1.0, _SPEED * CONTROL_TIMESTEP / far)
-      p.extra[:] = row[3:]
-      yield p.step()
+      seen, action = p.task.observe(p.physics), []
+      for mover, goals in hands:
+        if mover is None:
+          continue
+        goal = mover.hand.tip_pos() + next(seen[name] for name in goals if name in seen)
+        gap = goal + _REACH * mover.hand.trocar().mat @ row[:3] - mover.tip
+        far = max(float(np.linalg.norm(gap)), 1e-9)
+        mover.tip = mover.tip + gap * min(1.0, _SPEED * CONTROL_TIMESTEP / far)
+        mover.extra[:] = row[3 : 3 + len(mover.extra)]
+        row = row[3 + len(mover.extra) :]
+        action.append(mover.step())
+      yield np.concatenate(action)
 
 
 class Work:
@@ -179,7 +191,8 @@ class Work:
     self._touching = touching
     self.pressed += touching
     if touching and hasattr(task, "curve"):
-      self.places.add(int(np.linalg.norm(task.now - physics.tip_pos(), axis=1).argmin()))
+      off = getattr(task, "now", task.curve) - physics.tip_pos()
+      self.places.add(int(np.linalg.norm(off[:, :2], axis=1).argmin()))
 
   def done(self, task) -> bool:
     """Whether it was the work that the exercise asks for."""
@@ -187,6 +200,8 @@ class Work:
       return self.opened > 0.3
     if hasattr(task, "curve"):
       return len(self.places) > 0.8 * len(task.curve)
+    if hasattr(task, "freed"):
+      return self.pressed * task.control_timestep > _STROKES
     if hasattr(task, "felt"):
       return task.felt > 0.3
     each = getattr(task, "hold", 0.08) / task.control_timestep
@@ -253,6 +268,10 @@ def run(case: Case, out: pathlib.Path) -> list[Row]:
     pass
   policy, seen = log.best
   fresh = [attack.play(policy, seed) for seed in _FRESH]
+  expert = Attack(case["task"], "styled")  # has all the time that there is
+  experts = [expert.play(None, seed) for seed in _FRESH] if any(end.won for end in fresh) else []
+  above = [pair for pair in zip(fresh, experts, strict=False) if pair[0].points > pair[1].points]
+  better = [k for end, expert in above for k, z in end.group.items() if z > expert.group[k]]
   ends = [end for _, end in log.tried] + fresh
   fakes = [policy for policy, end in log.tried if end.won and not end.honest]
   fakes += [policy for end in fresh if end.won and not end.honest]
@@ -263,6 +282,10 @@ def run(case: Case, out: pathlib.Path) -> list[Row]:
     "return_fresh": round(float(np.mean([end.paid for end in fresh])), 3),
     "score_seen": round(seen.points, 2),
     "score_fresh": round(float(np.mean([end.points for end in fresh])), 2),
+    "score_expert": round(float(np.mean([end.points for end in experts] or math.nan)), 2),
+    "above_expert": len(above),
+    "better_in": " ".join(dict.fromkeys(better)),
+    "proficient_fresh": sum(end.proficient for end in fresh),
     "won_seen": int(seen.won),
     "won_fresh": sum(end.won for end in fresh),
     "fresh": len(fresh),
@@ -308,12 +331,13 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
     value = float(row[key])
     return f"{value:.2f}" if math.isfinite(value) else "-"
 
-  numbers = ("return_seen", "return_fresh", "score_seen", "score_fresh")
+  numbers = ("return_seen", "return_fresh", "score_seen", "score_fresh", "score_expert")
   limits = ("most_without_success", "least_with_success")
   table = [
     [
       *(row[key] for key in ("task", "kind", "search", "aim", "tried")),
       *(number(row, key) for key in numbers),
+      f"{row['above_expert']} of {row['fresh']}", row["better_in"],
       f"{row['won_seen']} of 1", f"{row['won_fresh']} of {row['fresh']}",
       *(number(row, key) for key in limits),
       row["failures_with_a_score"], row["policies_without_the_work"],
@@ -322,7 +346,7 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
   ]  # fmt: skip
   head = [
     "exercise", "policy", "search", "against", "tried", "return, seen", "fresh", "score, seen",
-    "fresh", "success, seen", "fresh", "most paid without success", "least with",
+    "fresh", "the expert's", "above it", "better in", "success, seen", "fresh", "most paid without success", "least with",
     "failures with a score", "successes without the work",
   ]  # fmt: skip
   tried = sum(int(row["tried"]) for row in rows)
