@@ -171,7 +171,8 @@ def _norm(t: Tally, w: int, k: int, adr: int):
 def add(s: Common, t: Tally):
   """Adds a control step."""
   w = wp.tid()
-  far, touched = _move(s, t, w), t.touched[w, _TIP]
+  far = _move(s, t, w)
+  touched = t.touched[w, _TIP]
   for k in range(t.sensor_steps.shape[1]):
     force, shaft = _norm(t, w, k, s.sensoradr[0]), _norm(t, w, k, s.sensoradr[1])
     _press(t, w, _TIP, force)

@@ -107,6 +107,7 @@ def line(radius: float, wave: float, start: float) -> tuple[np.ndarray, float]:
 class State:
   """State of a world."""
 
+  control_timestep: float  # [s]
   tolerance: float  # [m]
   count: int  # points of the line
   curve: Annotated[Any, Array(wp.vec3, ("room",))]  # these [m]

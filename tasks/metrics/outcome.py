@@ -74,9 +74,11 @@ def target_error(target_distance: ArrayLike) -> float:
   return float(touched.mean())
 
 
-@metric("Share freed", "-", "outcome", "all", "VTE: teasing (Kotamraju 2008)", better="higher")
+@metric("Share freed", "-", "outcome", "all", "VTE: teasing (Kotamraju 2008)", better="neither")
 def share_freed(freed: ArrayLike) -> float:
-  """Returns the share of the bonds' area that came free as it should [-], higher is better.
+  """Returns the share of the bonds' area that came free as it should [-], neither is better.
+
+  A success has what was wanted: more of it, or just that, tells nothing.
 
   Args:
     freed: share so far [-]  (nstep,)

@@ -40,9 +40,8 @@ def test_table_is_consistent():
   assert METRICS["angular_path"].scale * math.pi == pytest.approx(180)
   assert {n for n, s in METRICS.items() if s.better == "higher"} == {
     "log_dimensionless_jerk",
-    "share_freed",
   }
-  shown = {"mean_speed", "economy_of_volume", "sparc", "bimanual_dexterity"}
+  shown = {"mean_speed", "economy_of_volume", "sparc", "bimanual_dexterity", "share_freed"}
   assert set(METRICS) - set(SCORED) == shown
 
 
@@ -54,7 +53,7 @@ def test_metrics_json_round_trip_is_exact():
   assert again.reasons()["peak_force"] == "no contact"
   data = json.loads(made.to_json())
   assert data["values"]["peak_force"] is None
-  assert data["unit"]["path_length"] == "m" and data["better"]["share_freed"] == "higher"
+  assert data["unit"]["path_length"] == "m" and data["better"]["log_dimensionless_jerk"] == "higher"
   assert made != Metrics(time=0.3, path_length=1e-300, peak_force=Unknown("no contact"))
   assert made != Metrics(time=0.1 + 0.2, path_length=1e-300, peak_force=Unknown("other"))
   assert Metrics() == Metrics() and set(Metrics().reasons()) == set(METRICS)
@@ -121,7 +120,7 @@ def test_make_reference():
 
 def _panel(count, seed):
   rng = np.random.RandomState(seed)
-  rows = {f: rng.rand(count) for f in ("mean_force", "rms_force", "path_length", "share_freed")}
+  rows = {f: rng.rand(count) for f in ("mean_force", "rms_force", "path_length", "depth_path")}
   rows |= {"time": 10 + rng.rand(count), "peak_force": rng.gamma(2.0, size=count)}
   return [Metrics(**{k: v[i] for k, v in rows.items()}, errors=0.0) for i in range(count)]
 
@@ -140,7 +139,7 @@ def test_one_freak_of_a_panel_does_not_make_a_limit():
   panel[7] = Metrics(
     time=900.0,
     path_length=0.5,
-    share_freed=0.5,
+    depth_path=0.5,
     errors=3.0,
     mean_force=0.5,
     rms_force=0.5,
@@ -234,11 +233,11 @@ def test_composite_of_the_mean_is_zero_and_at_the_limits_minus_two():
   reference = _reference(**{n: (1.5, 0.25) for n in SCORED})
   assert score(Metrics(**{n: 1.5 for n in SCORED}), reference, SUCCESS).composite == 0
   limits = _limits(reference)
-  assert limits["share_freed"] == 1.0 and limits["time"] == 2.0  # each in its worse direction
+  assert limits["log_dimensionless_jerk"] == 1.0 and limits["time"] == 2.0  # each in its worse direction
   at_limit = score(Metrics(**limits), reference, SUCCESS)
   assert at_limit.composite == pytest.approx(-2) and at_limit.proficient
-  over = score(Metrics(**{**limits, "peak_force": 2.01, "share_freed": 0.99}), reference, SUCCESS)
-  assert not over.proficient and set(over.over) == {"peak_force", "share_freed"}
+  over = score(Metrics(**{**limits, "peak_force": 2.01, "log_dimensionless_jerk": 0.99}), reference, SUCCESS)
+  assert not over.proficient and set(over.over) == {"peak_force", "log_dimensionless_jerk"}
   rounded = {**limits, "time": 2.0 * (1 + 1e-12)}
   assert score(Metrics(**rounded), reference, SUCCESS).proficient
 
