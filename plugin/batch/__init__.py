@@ -56,6 +56,8 @@ def make(
   if not isinstance(scene, mujoco.MjSpec | mujoco.MjModel):
     kind = type(scene).__name__
     raise ValueError(f"scene is a {kind}, expected a mujoco.MjSpec or mujoco.MjModel")
+  if not isinstance(device, str | Sequence):
+    raise ValueError(f"device is {device!r}, expected a name such as 'cpu', or several")
   if device == "cpu":
     return Threads(scene, nworld, nthread)
   if not isinstance(scene, mujoco.MjSpec):

@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import abc
+import os
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 import warp as wp
+from palpate.engine import coupling
+from palpate.engine.model.declare import Declaration
+from palpate.organ import instances
 
 from .cutting.fracture import Parting
+
+_MOVING = ("qpos", "qvel", "act", "ctrl", "mocap_pos", "mocap_quat", "plugin_state")
 
 
 class Batch(abc.ABC):
@@ -33,6 +39,12 @@ class Batch(abc.ABC):
   def __init__(self, model: mujoco.MjModel, nworld: int, device):
     self.model, self.nworld, self.device = model, nworld, wp.get_device(device)
     self._fresh = False
+
+  def __reduce__(self):
+    raise TypeError(
+      "a batch cannot be pickled or copied: its worlds are in a device's memory or on threads; make "
+      "another and give it the states of this one, see get_state and set_state"
+    )
 
   def _allocate(self):
     """Makes the arrays, once it is known that there is room for them."""
@@ -204,7 +216,7 @@ class Batch(abc.ABC):
       values: positions [rad, m], (nworld, number of joints), here or on the device
       mask: worlds, (nworld,) of bool; None for all
     """
-    found = [self.model.joint(name) for name in joints]
+    found = [_named(self.model.joint, "joint", name) for name in joints]
     for joint in found:
       if int(joint.type[0]) < int(mujoco.mjtJoint.mjJNT_SLIDE):
         raise ValueError(f"joint {joint.name!r} is neither a hinge nor a slide")
@@ -225,10 +237,12 @@ class Batch(abc.ABC):
       quat: orientations, w x y z, (nworld, 4)
       mask: worlds, (nworld,) of bool; None for all
     """
-    number = self.model.body(body).id
+    number = _named(self.model.body, "body", body).id
     if not number or self.model.body_jntnum[number]:
       raise ValueError(f"body {body!r} has joints, expected one that is fixed to its parent")
     pos, quat = self._rows(pos, "pos", 3), self._rows(quat, "quat", 4)
+    if isinstance(quat, np.ndarray) and not quat.any(axis=1).all():
+      raise ValueError("quat is zero, expected orientations, w x y z")
     self._fresh = False
     self._place(number, pos, quat, self.checked(mask))
 
@@ -240,6 +254,8 @@ class Batch(abc.ABC):
       values = np.asarray(values, float)
     if values.shape != (self.nworld, count):
       raise ValueError(f"{name} has shape {values.shape}, expected ({self.nworld}, {count})")
+    if isinstance(values, np.ndarray) and not np.isfinite(values).all():
+      raise ValueError(f"{name} has numbers that are not finite")
     return values
 
   def configure(self, mask=None, *, gravity=None, friction: Mapping[str, Any] | None = None):
@@ -252,13 +268,15 @@ class Batch(abc.ABC):
     """
     worlds = np.flatnonzero(self.checked(mask).numpy())
     if gravity is not None:
-      gravity = self._rows(np.broadcast_to(gravity, (self.nworld, 3)), "gravity", 3)[worlds]
+      gravity = np.asarray(gravity, float)
+      gravity = np.tile(gravity, (self.nworld, 1)) if gravity.shape == (3,) else gravity
+      gravity = self._rows(gravity, "gravity", 3)[worlds]
     rough = {}
     for name, values in (friction or {}).items():
       values = np.broadcast_to(np.asarray(values, float), (self.nworld,))
-      if not (values >= 0).all():
+      if not ((values >= 0) & np.isfinite(values)).all():
         raise ValueError(f"geom {name!r}: friction is {values.min()}, expected numbers >= 0")
-      rough[self.model.geom(name).id] = values[worlds]
+      rough[_named(self.model.geom, "geom", name).id] = values[worlds]
     self._configure(worlds, gravity, rough)
 
   @abc.abstractmethod
@@ -289,6 +307,20 @@ class Batch(abc.ABC):
     sizes = {"qpos": "nq", "qvel": "nv", "ctrl": "nu", "plugin_state": "npluginstate"}
     if any(getattr(data, name).size != getattr(self.model, size) for name, size in sizes.items()):
       raise ValueError("data is of another model, expected an MjData of the batch's `model`")
+
+  def _check_state(self, data: mujoco.MjData, organs: Mapping[str, Declaration]):
+    """Refuses a state with numbers that are not finite, or of another organ."""
+    for name in _MOVING:
+      if not np.isfinite(getattr(data, name)).all():
+        raise ValueError(f"data.{name} has numbers that are not finite")
+    for name, number in instances(self.model).items():
+      start = self.model.plugin_stateadr[number]
+      own = data.plugin_state[start : start + self.model.plugin_statenum[number]]
+      if own[coupling.spans(organs[name])["signature"]][0] != organs[name].signature:
+        try:
+          coupling.check_state(organs[name], own)
+        except ValueError as error:
+          raise ValueError(f"organ {name!r}: data's {error}") from None
 
   def get_state(self, world: int, data: mujoco.MjData):
     """Writes the state of a world to an mjData of `model`, where the plugin goes on with it."""
@@ -431,6 +463,23 @@ def spread(tissue: Tissue, key: str, value, nworld: int) -> np.ndarray:
   if key == "friction" and not (array >= 0).all():
     raise ValueError(f"organ {tissue.name!r}: friction is {array.min()}, expected numbers >= 0")
   return array
+
+
+def _named(find: Any, kind: str, name: str) -> Any:
+  """Returns what a model has under a name; ValueError lists those that it has."""
+  try:
+    return find(name)
+  except KeyError as error:
+    have = error.args[0].partition(". ")[2]
+    raise ValueError(f"no {kind} {name!r} in the model. {have}") from None
+
+
+def free_memory() -> float:
+  """Returns how many bytes this machine has free, infinity where it does not say."""
+  try:
+    return os.sysconf("SC_AVPHYS_PAGES") * float(os.sysconf("SC_PAGE_SIZE"))
+  except (AttributeError, ValueError, OSError):  # not on every system
+    return float("inf")
 
 
 def refuse_crowd(nworld: int, each: float, room: float, where: str):

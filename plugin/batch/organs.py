@@ -328,5 +328,5 @@ class Organ(Tissue):
     """Raises ValueError where a value of a key is not allowed."""
     mesh, values = self.declared.mesh, np.unique(values)
     for value in values if len(values) < _FEW else (values.min(), values.max()):
-      text = {key: f"{int(value)}" if key == "iterations" else f"{value:.9g}"}
+      text = {key: f"{value:.9g}"}
       configuration.change(self.name, self.config, text, mesh.nelem, mesh.closed, self.config)

@@ -15,11 +15,12 @@ import warp as wp
 from palpate.engine import coupling
 from palpate.engine import plugin as engine
 from palpate.engine.cutting.cuts import Report
+from palpate.engine.model.declare import Declaration
 from palpate.organ import Organ, instances
 from palpate.tissue import body as bodies
 from palpate.tissue.geometry import mesh as topology
 
-from .base import Batch, Tissue, refuse_crowd, spread
+from .base import Batch, Tissue, free_memory, refuse_crowd, spread
 from .cutting.fracture import Cutters
 from .forces.bonds import OfThreads
 
@@ -52,11 +53,11 @@ class Threads(Batch):
     first = self.datas[0]
     spaces = [engine.find(first._address, number) for number in instances(model).values()]
     each = mujoco.mj_sizeModel(model) + first.nbuffer + sum(bodies.nbytes(w.body) for w in spaces)
-    refuse_crowd(nworld, each, _free_memory(), "this machine")
+    refuse_crowd(nworld, each, free_memory(), "this machine")
     self._allocate()
     self.models += [copy.copy(model) for _ in range(nworld - 1)]
     self.datas += [mujoco.MjData(each) for each in self.models[1:]]
-    self._pool = ThreadPoolExecutor(min(nthread, nworld))
+    self._pool, self._pid = ThreadPoolExecutor(min(nthread, nworld)), os.getpid()
     self._begin: np.ndarray | None = None
     self._felt: list[tuple[int, str]] = []
     self._seen = np.zeros((nworld, 0, model.nsensordata), np.float32)
@@ -69,6 +70,8 @@ class Threads(Batch):
 
   def each(self, work: Callable[[int], object], worlds=None):
     """Does work(world) for all worlds, or some, on the threads."""
+    if os.getpid() != self._pid:
+      raise RuntimeError("a batch does not work in a process that was forked: make it there")
     list(self._pool.map(work, range(self.nworld) if worlds is None else worlds))
 
   def _step(self, n: int):
@@ -124,7 +127,11 @@ class Threads(Batch):
   def _reset(self, mask: wp.array):
     self.each(self._reset_world, np.flatnonzero(mask.numpy()))
 
+  def _declared(self) -> dict[str, Declaration]:
+    return {name: organ.spaces[0].organ for name, organ in self._organs.items()}
+
   def _start(self, data: mujoco.MjData):
+    self._check_state(data, self._declared())
     engine.sync(self.model, data)
     self._begin = np.empty(mujoco.mj_stateSize(self.model, _ALL))
     mujoco.mj_getState(self.model, data, self._begin, _ALL)
@@ -160,6 +167,7 @@ class Threads(Batch):
     _copy_state(model, own, self.model, data)
 
   def _set_state(self, world: int, data: mujoco.MjData):
+    self._check_state(data, self._declared())
     engine.sync(self.model, data)
     _copy_state(self.model, data, self.models[world], self.datas[world])
     self.ctrl.numpy()[world] = data.ctrl
@@ -277,8 +285,3 @@ def _copy_state(model, data, other_model, other):
   engine.place_windows(other_model, other)
 
 
-def _free_memory() -> float:
-  try:
-    return os.sysconf("SC_AVPHYS_PAGES") * float(os.sysconf("SC_PAGE_SIZE"))
-  except (AttributeError, ValueError, OSError):  # not on every system
-    return float("inf")

@@ -19,7 +19,7 @@ from palpate.organ import instances
 from palpate.tissue import device as devices
 
 from . import kernels, states, strip_organs
-from .base import Batch, refuse_crowd
+from .base import Batch, free_memory, refuse_crowd
 from .contact import contacts, convex
 from .cutting import blades, tears
 from .forces import base, passive
@@ -258,7 +258,12 @@ class Worlds(Batch):
     wp.copy(self.mask, mask)
     self._run("reset")
 
+  def _check_own(self, data: mujoco.MjData):
+    organs = {name: organ.declared for name, organ in self._organs.items()}
+    self._check_state(data, organs)
+
   def _start(self, data: mujoco.MjData):
+    self._check_own(data)
     states.keep(self, self._rest.start, data)
 
   def _pose(self, adr: np.ndarray, values: np.ndarray, mask: wp.array):
@@ -293,6 +298,7 @@ class Worlds(Batch):
     states.pull(self, world, data)
 
   def _set_state(self, world: int, data: mujoco.MjData):
+    self._check_own(data)
     states.push(self, world, data)
 
   @property
@@ -338,4 +344,4 @@ def _resolve(device: str):
 
 
 def _room(device) -> float:
-  return 0.95 * device.free_memory if device.is_cuda else float("inf")
+  return 0.95 * (device.free_memory if device.is_cuda else free_memory())

@@ -1,6 +1,12 @@
 """What a batch on a GPU cannot do is refused by name, before anything is compiled for it."""
 
+import copy
+import pickle
+import subprocess
+import sys
+
 import mujoco
+import numpy as np
 import palpate.batch
 import pytest
 import warp as wp
@@ -96,3 +102,78 @@ def test_the_kernels_compile_for_cuda(tmp_path, scenes, which):
     (kernel,) = step.kernels(body)
   wp.compile_aot_module(kernel.cuda.module, arch=90, module_dir=str(tmp_path), use_ptx=True)
   assert any(tmp_path.iterdir())
+
+
+@pytest.fixture(params=["cpu", DEVICE, pytest.param("cuda:0", marks=needs_cuda)])
+def batch(request):
+  return palpate.batch.make(mujoco.MjSpec.from_string(probed()), 2, device=request.param)
+
+
+@pytest.mark.parametrize(
+  ("do", "message"),
+  [
+    (lambda b: b.configure(gravity=[0, 0, np.nan]), "gravity has numbers that are not finite"),
+    (lambda b: b.configure(gravity=[0, 0]), r"gravity has shape \(2,\), expected \(2, 3\)"),
+    (lambda b: b.configure(friction={"tap": 1}), "no geom 'tap' in the model. Valid names: .*tip"),
+    (lambda b: b.organ("organ").configure(iterations=1.5), "iterations is '1.5', expected a whole"),
+    (lambda b: b.place("bed", np.zeros((2, 3)), np.zeros((2, 4))), "quat is zero, expected orient"),
+    (lambda b: b.pose(["nope"], np.zeros((2, 1))), "no joint 'nope' in the model"),
+  ],
+)
+def test_numbers_and_names_that_cannot_be(do, message):
+  spec = mujoco.MjSpec.from_string(probed())
+  spec.worldbody.add_body(name="bed")
+  for device in ("cpu", DEVICE):
+    with pytest.raises(ValueError, match=message):
+      do(palpate.batch.make(spec, 2, device=device))
+
+
+def test_a_state_that_is_not_finite_or_of_another_organ(batch):
+  data = mujoco.MjData(batch.model)
+  batch.get_state(0, data)
+  batch.set_state(1, data)
+  spec = mujoco.MjSpec.from_string(probed())
+  spec.flexes[0].vert = 1.1 * np.asarray(spec.flexes[0].vert)  # larger, of as many vertices
+  other = spec.compile()
+  strange = mujoco.MjData(other)
+  mujoco.mj_step(other, strange, 3)
+  for take in (batch.start, lambda data: batch.set_state(0, data)):
+    with pytest.raises(ValueError, match="organ 'organ': data's plugin_state is not one of this"):
+      take(strange)
+    for name in ("qpos", "plugin_state"):
+      wrong = mujoco.MjData(batch.model)
+      getattr(wrong, name)[0] = np.nan
+      with pytest.raises(ValueError, match=f"data.{name} has numbers that are not finite"):
+        take(wrong)
+  batch.step(2)
+  assert not batch.failures.numpy().any()
+
+
+def test_more_worlds_than_there_is_memory_for():
+  for device in ("cpu", DEVICE):
+    with pytest.raises(ValueError, match=r"nworld is 1000000000, .* free; expected at most \d+"):
+      palpate.batch.make(mujoco.MjSpec.from_string(probed()), 10**9, device=device)
+
+
+def test_a_batch_is_neither_pickled_nor_copied_nor_taken_into_a_fork(batch):
+  for take in (pickle.dumps, copy.deepcopy):
+    with pytest.raises(TypeError, match="a batch cannot be pickled or copied"):
+      take(batch)
+
+
+def test_a_forked_process_is_told_to_make_its_own():
+  code = """
+import os, sys, mujoco, palpate.batch
+b = palpate.batch.make(mujoco.MjSpec.from_string(sys.argv[1]), 2)
+b.step()
+pid = os.fork()
+if not pid:
+  try:
+    b.step()
+  except RuntimeError as error:
+    print(error, flush=True)
+  os._exit(0)
+os.waitpid(pid, 0)
+"""
+  told = subprocess.run([sys.executable, "-c", code, probed()], capture_output=True, timeout=120)
+  assert b"does not work in a process that was forked" in told.stdout

@@ -136,7 +136,7 @@ def test_people_see_millimetres_and_degrees():
   assert page.row("Path length")[1:4] == [f"{length:.3g}", "mm", "lower"]
   assert page.row("Angular path")[1:3] == ["45", "deg"]
   assert page.row("Peak force")[1:3] == ["2", "N"]
-  assert page.row("Smoothness (SPARC)")[3] == "higher"
+  assert page.row("Smoothness (SPARC)")[3] == "\N{EN DASH}"
   assert page.row("Smoothness (SPARC)")[1].startswith("−")  # a minus, not a hyphen
   assert page.row("0.5") == ["0.5", "target", "1.5 mm", "probe", "first"]
   assert page.row("Target error")[1] == "1.5"
