@@ -42,8 +42,8 @@ class Batch(abc.ABC):
 
   def __reduce__(self):
     raise TypeError(
-      "a batch cannot be pickled or copied: its worlds are in a device's memory or on threads; make "
-      "another and give it the states of this one, see get_state and set_state"
+      "a batch cannot be pickled or copied: its worlds are in a device's memory or on threads; "
+      "make another and give it the states of this one, see get_state and set_state"
     )
 
   def _allocate(self):

@@ -283,5 +283,3 @@ def _copy_state(model, data, other_model, other):
     mujoco.mj_getState(model, data, state, kind)
     mujoco.mj_setState(other_model, other, state, kind)
   engine.place_windows(other_model, other)
-
-

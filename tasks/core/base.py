@@ -35,6 +35,7 @@ ended it.
 
 import collections
 import dataclasses
+import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -139,6 +140,9 @@ class Task(control.Task):
       name: domain and task, for instance "touch/easy"
     """
     self.name = name
+    for limit, value in (("force_limit", force_limit), ("damage", damage)):
+      if not 0 < value < math.inf:
+        raise ValueError(f"{name}: {limit} is {value}, expected a number > 0 [N]")
     if reward not in REWARDS:
       raise ValueError(f"reward is {reward!r}, expected one of {', '.join(REWARDS)}")
     drawn = isinstance(random, np.random.RandomState)

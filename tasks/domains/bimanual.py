@@ -9,8 +9,8 @@ share of what is needed [-]; `burnt` (1,), share of the burn that is damage [-].
 
 A current frees the bonds within 3 mm of the hook's wire in 0.2 s. What comes free while the site is
 grasped and retracted by 5 mm, with the pull on the liver under its limit and the hook's force under
-1.5 N, is `clean`; the rest is `torn`: what is not held away is not seen. A current without a bond in
-reach burns what the hook touches; half a second of that is damage, and so is a hook that presses
+1.5 N, is `clean`; the rest is `torn`: what is not held away is not seen. A current without a bond
+in reach burns what the hook touches; half a second of that is damage, and so is a hook that presses
 with 3 N. Progress, success and failure are those of `dissect`; the bed is too strong to be pulled
 off.
 """
@@ -61,7 +61,7 @@ SCENE = dataclasses.replace(
 )
 # Of the expert: how far it pulls at most [m], how much further than it has to, the share of the
 # largest traction it keeps under, how far the hook stays from a bond and begins above it [m].
-_FAR, _MORE, _SHARE, _OFF, _WAITS = 0.03, 0.3, 0.7, 0.0015, 0.01
+_FAR, _MORE, _SHARE, OFF, _WAITS = 0.03, 0.3, 0.7, 0.0015, 0.01
 
 
 @exercise("bimanual/easy", 40, "easy", "bimanual")
@@ -280,7 +280,7 @@ class Bimanual(Dissect):
       yield from p.above(bonds.positions[near], _WAITS, up)
       while self.outcome is None and fair(physics, self) and not bonds.free[near]:
         goal = bonds.positions[near]
-        step = goal + _OFF * up - p.tip
+        step = goal + OFF * up - p.tip
         far = float(np.linalg.norm(step))
         reach = 0.02 * p.style.speed * self.control_timestep
         p.tip = p.tip + step * min(1.0, reach / max(far, 1e-9))

@@ -6,8 +6,8 @@ that is cut [-]; `deviation` (1,), largest distance of the cut from the line so 
 
 Progress: 0.1 * closeness to the line, at its best, + 0.9 * share of the line that is cut. A point
 of the line is cut where the edge has gone through the wall within the tolerance of it, slower than
-60 mm/s; moving along without cutting counts nothing. Success: 98 % of it, and the piece is free, or 6 mm more are
-cut than the line is long: the mesh may hang together by an edge. Failure: more than
+60 mm/s; moving along without cutting counts nothing. Success: 98 % of it, and the piece is free, or
+6 mm more are cut than the line is long: the mesh may hang together by an edge. Failure: more than
 10 mm cut farther from the line than the tolerance or faster, a force above the damage limit, or the
 time limit.
 
@@ -309,7 +309,9 @@ class Cut(Task):
 
   def label(self, kind: str) -> str:
     """Returns what damage is."""
-    return f"{1e3 * self.astray:.0f} mm are cut beside the line or slashed" if kind == "damage" else ""
+    return (
+      f"{1e3 * self.astray:.0f} mm are cut beside the line or slashed" if kind == "damage" else ""
+    )
 
   def instruct(self, physics: Physics) -> str:
     """Says to begin, or to go on."""

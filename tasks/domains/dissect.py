@@ -6,10 +6,10 @@ to the middle of the bonds that still hold [m]; `freed` (1,), share of the bed's
 `grasp`; here it may slip by 6 mm.
 
 What comes free while the site is grasped and pulled slower than 30 mm/s, with the force and the
-traction under their limits, is `clean`; the rest is `torn`. Progress: 0.1 * closeness until it is grasped, 0.1 then, and besides
-0.8 * clean / wanted. Success: the wanted share is clean. Failure: a force above the damage limit,
-jaws included, a traction above twice its limit, which tears the liver, so much torn that too little
-is left, or the time limit.
+traction under their limits, is `clean`; the rest is `torn`. Progress: 0.1 * closeness until it is
+grasped, 0.1 then, and besides 0.8 * clean / wanted. Success: the wanted share is clean. Failure: a
+force above the damage limit, jaws included, a traction above twice its limit, which tears the
+liver, so much torn that too little is left, or the time limit.
 
 The bed stands: the liver is what its bonds pull at.
 """

@@ -1,6 +1,6 @@
 """What the exercises of palpation in `probe` are: a field with a stiff inclusion under it.
 
-A report succeeds that is right, made while pressing, and follows from what was felt: luck is a miss.
+A report succeeds that is right, made while pressing, and follows from what was felt: luck is none.
 """
 
 import dataclasses

@@ -124,8 +124,9 @@ def sparc(even_speed: ArrayLike, rate: float) -> float:
 
   Minus the arc length of the normalised spectrum up to the last frequency <= 10 Hz with amplitude
   >= 0.05, zero-padding 4 (Balasubramanian et al. 2015; 10.1186/s12984-015-0090-9). It is defined
-  for one movement, where higher (towards 0) is smoother. An exercise has many, and their number moves it more than a tremor does (the
-  trembling novice is the smoother one in `touch/standard`), so it is not scored: the jerk is.
+  for one movement, where higher (towards 0) is smoother. An exercise has many, and their number
+  moves it more than a tremor does (the trembling novice is smoother in `touch/standard`), so it is
+  not scored: the jerk is.
   Its filter is the cut-off itself; a recording's positions also went through `tip_cutoff`.
 
   Args:

@@ -29,8 +29,9 @@ Weights: safety 67 %, efficiency 17 % (Heidelberg VR score, 10.1007/s00464-018-6
 Proficiency of an episode: success, and no metric over its limit. A limit is of its own metric: the
 median of the panel and `SPREADS` times a spread that one freak does not move, from the median to
 the value that 90 % are as good as, or the worst value of the best `PASSING` of the panel's
-episodes, whichever lets more pass; where a panel hardly varies `LEAST` of the median beyond it, or
-what nobody feels (`SMALL`); and at most `BELOW` of what ends an episode, such as its time limit, or of 100 %. It is of log(1 + value / median) where no value is negative: forces, times and
+episodes, whichever lets more pass. Where a panel hardly varies it is `LEAST` of the median beyond
+it, or what nobody feels (`SMALL`). It is at most `BELOW` of what ends an episode, such as its time
+limit, or of 100 %. It is of log(1 + value / median) where no value is negative: forces, times and
 paths vary by factors, and their long tails are no normal one's. The
 mean + 2 SD of SAGES would fail half of the panel, since each of thirty metrics may fail by itself,
 and so would the panel's worst values the next person. A metric that some of the panel's successes

@@ -300,6 +300,13 @@ def test_too_much_force_is_a_failure():
   assert timestep.last() and env.task.outcome == "damage" and env.task.progress == -1
 
 
+@pytest.mark.parametrize("limit", ["force_limit", "damage"])
+@pytest.mark.parametrize("value", [np.nan, -1.0, 0.0, np.inf])
+def test_limits_that_cannot_be(limit, value):
+  with pytest.raises(ValueError, match=f"touch/easy: {limit} is {value}, expected a number > 0"):
+    load("touch/easy", **{limit: value})
+
+
 def test_a_wrong_report_is_a_miss():
   env = load("probe/palpate_easy")
   env.reset()

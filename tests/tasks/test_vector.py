@@ -229,7 +229,7 @@ def test_a_world_whose_numbers_are_not_finite_begins_again_and_others_do_not_not
   env.reset(seed=0)
   other.reset(seed=0)
   broken = np.array([True, False])
-  env.unwrapped.parts[0].batch.pose(["probe/pitch"], np.full((2, 1), np.nan), broken)
+  env.unwrapped.parts[0].batch.pose(["probe/pitch"], np.full((2, 1), 1e12), broken)
   found = [each.step(np.full((2, 4), 0.1)) for each in (env, other)]
   assert found[0][3].tolist() == [True, False] and found[0][1][0] == 0
   assert np.isfinite(found[0][0]["tip_pos"]).all()

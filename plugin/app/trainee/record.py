@@ -132,6 +132,7 @@ class Record(contextlib.AbstractContextManager):
         return
       for each in (folder, self._people):
         each.mkdir(mode=0o700, parents=True, exist_ok=True)
+      self._people.chmod(0o700)  # it may have been there, open to others
       with self._alone():
         for part in self._people.glob("*/.*.part"):  # of a process that was killed
           part.unlink(missing_ok=True)

@@ -1,5 +1,7 @@
 """The page's server: who may come in, what is refused, and an exercise over its socket."""
 
+import contextlib
+import http.client
 import json
 import pathlib
 import signal
@@ -9,6 +11,7 @@ import threading
 import time
 import urllib.error
 import urllib.request
+from socket import gethostname
 
 import numpy as np
 import pytest
@@ -99,9 +102,32 @@ def test_strangers_are_refused(serve):
     assert refused.value.response.status_code == 403
 
 
+def test_a_request_of_two_hosts_is_a_bad_one_and_a_page_connects_to_its_own_alone(serve):
+  server = serve()
+  with contextlib.closing(http.client.HTTPConnection("127.0.0.1", server.port)) as line:
+    line.putrequest("GET", "/", skip_host=True)
+    for _ in range(2):
+      line.putheader("Host", f"localhost:{server.port}")
+    line.endheaders()
+    assert line.getresponse().status == 400
+  url = f"http://localhost:{server.port}/"
+  with urllib.request.urlopen(url, timeout=10) as found:
+    policy = found.headers["Content-Security-Policy"]
+  own = f"localhost:{server.port}"
+  assert f"connect-src 'self' ws://{own} wss://{own};" in policy
+
+
+def test_a_page_that_is_loaded_again_waits_for_its_place(serve):
+  server = serve(most=1)
+  for _ in range(2):
+    with socket(server) as page:
+      hear(page, "menu")
+
+
 def test_what_others_can_reach_wants_a_token(serve):
   server = serve(host="0.0.0.0")
   assert len(server.token) > 20 and server.url.endswith(f"?token={server.token}")
+  assert server.url.startswith(f"http://{gethostname()}:")  # not localhost, which others are too
   assert get(server)[0] == 403 and get(server, "/?token=wrong")[0] == 403
   assert get(server, f"/?token={server.token}")[0] == 200
   for query in ("", "?token=wrong"):

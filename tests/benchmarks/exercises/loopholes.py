@@ -346,7 +346,8 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
   ]  # fmt: skip
   head = [
     "exercise", "policy", "search", "against", "tried", "return, seen", "fresh", "score, seen",
-    "fresh", "the expert's", "above it", "better in", "success, seen", "fresh", "most paid without success", "least with",
+    "fresh", "the expert's", "above it", "better in", "success, seen", "fresh",
+    "most paid without success", "least with",
     "failures with a score", "successes without the work",
   ]  # fmt: skip
   tried = sum(int(row["tried"]) for row in rows)

@@ -8,7 +8,9 @@ from palpate.tasks.metrics import Metrics
 from palpate.tasks.people import limits, score
 
 TIMES, SMOOTH = [10.0, 12.0, 14.0, 16.0, 18.0], [-2.0, -3.0, -4.0, -5.0, -6.0]
-EXPERTS = [Metrics(time=t, log_dimensionless_jerk=s, errors=0) for t, s in zip(TIMES, SMOOTH, strict=True)]
+EXPERTS = [
+  Metrics(time=t, log_dimensionless_jerk=s, errors=0) for t, s in zip(TIMES, SMOOTH, strict=True)
+]
 
 
 @pytest.mark.parametrize(

@@ -166,7 +166,9 @@ def test_the_score_is_explained():
 
 
 def test_higher_is_better_is_bounded_from_below():
-  page = _Page(report.render(_recorder().recording(), _reference(log_dimensionless_jerk=(-1.5, 0.1))))
+  page = _Page(
+    report.render(_recorder().recording(), _reference(log_dimensionless_jerk=(-1.5, 0.1)))
+  )
   assert page.row("Log dimensionless jerk")[5] == "≥ −1.7"
   assert "No composite score" in page.text() and "no safety" in page.text()
 

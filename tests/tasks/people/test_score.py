@@ -233,10 +233,14 @@ def test_composite_of_the_mean_is_zero_and_at_the_limits_minus_two():
   reference = _reference(**{n: (1.5, 0.25) for n in SCORED})
   assert score(Metrics(**{n: 1.5 for n in SCORED}), reference, SUCCESS).composite == 0
   limits = _limits(reference)
-  assert limits["log_dimensionless_jerk"] == 1.0 and limits["time"] == 2.0  # each in its worse direction
+  assert (
+    limits["log_dimensionless_jerk"] == 1.0 and limits["time"] == 2.0
+  )  # each in its worse direction
   at_limit = score(Metrics(**limits), reference, SUCCESS)
   assert at_limit.composite == pytest.approx(-2) and at_limit.proficient
-  over = score(Metrics(**{**limits, "peak_force": 2.01, "log_dimensionless_jerk": 0.99}), reference, SUCCESS)
+  over = score(
+    Metrics(**{**limits, "peak_force": 2.01, "log_dimensionless_jerk": 0.99}), reference, SUCCESS
+  )
   assert not over.proficient and set(over.over) == {"peak_force", "log_dimensionless_jerk"}
   rounded = {**limits, "time": 2.0 * (1 + 1e-12)}
   assert score(Metrics(**rounded), reference, SUCCESS).proficient

@@ -7,7 +7,9 @@ import ipaddress
 import json
 import multiprocessing
 import pathlib
+import re
 import secrets
+import socket as socketlib
 import threading
 import urllib.parse
 from http import HTTPStatus
@@ -30,7 +32,8 @@ _FILES = {"/": ("page.html", "text/html")} | {
 }  # fmt: skip
 _LARGEST = 4096  # message from a page [bytes]
 _PATIENCE = 10.0  # for a page's process to keep its recording [s]
-_POLICY = "default-src 'self'; connect-src 'self' ws: wss:; frame-ancestors 'none'"
+_POLICY = "default-src 'self'; connect-src 'self' {sockets}; frame-ancestors 'none'"
+_HOST = re.compile(r"[\w.:\[\]-]+")
 
 
 class Server:
@@ -72,7 +75,7 @@ class Server:
     )  # fmt: skip
     self.port = self._server.socket.getsockname()[1]
     self._hosts = _names(host, self.port)
-    shown = host if host not in ("0.0.0.0", "::") else "localhost"
+    shown = host if host not in ("0.0.0.0", "::") else socketlib.gethostname()
     query = f"?token={self.token}" if self.token else ""
     self.url = f"http://{f'[{shown}]' if ':' in shown else shown}:{self.port}/{query}"
 
@@ -89,7 +92,9 @@ class Server:
   def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
     """Refuses a stranger, sends a file, or lets a page in."""
     path, _, query = request.path.partition("?")
-    host = request.headers.get("Host", "")
+    host, *more = request.headers.get_all("Host") or [""]
+    if more or not _HOST.fullmatch(host):
+      return _response(HTTPStatus.BAD_REQUEST, "expected one Host, a name and a port")
     # A foreign page whose name leads here is as foreign as one that says so.
     if self._hosts and host not in self._hosts:
       return _response(HTTPStatus.FORBIDDEN, f"host is {host!r}, expected {self._hosts[0]}")
@@ -106,11 +111,12 @@ class Server:
       return _response(HTTPStatus.NOT_FOUND, "no such page")
     name, kind = _FILES[path]
     text = (pathlib.Path(__file__).parent / name).read_text(encoding="utf-8")
-    return _response(HTTPStatus.OK, text, kind)
+    return _response(HTTPStatus.OK, text, kind, host)
 
   def _page(self, socket: ServerConnection) -> None:
     """Connects a page with a process of its own, in a thread of its own."""
-    if not self._places.acquire(blocking=False):
+    # A page that is loaded again comes before its former self has kept its recording and gone.
+    if not self._places.acquire(timeout=_PATIENCE):
       socket.send(json.dumps({"type": "error", "text": "all places are taken; close another page"}))
       socket.close(1013)
       return
@@ -154,12 +160,13 @@ def _pump(near: Any, socket: ServerConnection) -> None:
     socket.close()
 
 
-def _response(status: HTTPStatus, text: str, kind: str = "text/plain") -> Response:
+def _response(status: HTTPStatus, text: str, kind: str = "text/plain", host: str = "") -> Response:
   body = text.encode()
+  sockets = f"ws://{host} wss://{host}" if host else ""  # older browsers: 'self' is http alone
   headers = Headers({
     "Content-Type": f"{kind}; charset=utf-8",
     "Content-Length": str(len(body)),
-    "Content-Security-Policy": _POLICY,
+    "Content-Security-Policy": _POLICY.format(sockets=sockets),
     "Referrer-Policy": "no-referrer",  # the address has the token
     "X-Content-Type-Options": "nosniff",
     "Cache-Control": "no-store",
