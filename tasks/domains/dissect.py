@@ -5,7 +5,7 @@ to the middle of the bonds that still hold [m]; `freed` (1,), share of the bed's
 [-]; `traction` (1,), pull on the liver [N]; `grasped` (1,), whether the jaws hold the site, as in
 `grasp`; here it may slip by 6 mm.
 
-What comes free while the site is grasped and pulled slower than 30 mm/s, with the force and the
+What comes free while the site is grasped and pulled slower than 25 mm/s, with the force and the
 traction under their limits, is `clean`; the rest is `torn`. Progress: 0.1 * closeness until it is
 grasped, 0.1 then, and besides 0.8 * clean / wanted. Success: the wanted share is clean. Failure: a
 force above the damage limit, jaws included, a traction above twice its limit, which tears the
@@ -44,7 +44,7 @@ from .grasp import FUNDUS, Held, Hold, distance, follow
 # Stiffness [N/m^3], strength [Pa] and energy [J/m^2] of the bed, and of a tough one. Ours: we know
 # of no measurement; the bed bears the organ, and comes away under half a newton or one.
 BED, TOUGH = (1e7, 6e3, 8.0), (1e7, 7e3, 10.0)
-RIP = 0.03  # speed of a pull from which on what comes free is torn [m/s]
+RIP = 0.025  # speed of a pull from which on what comes free is torn [m/s]
 # Of the expert: how far it pulls at most [m], how fast [m/s], and how much towards the trocar.
 _FAR, _SPEED, _UP = 0.045, 0.01, 0.5
 

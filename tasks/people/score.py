@@ -26,7 +26,8 @@ unknown.
 Weights: safety 67 %, efficiency 17 % (Heidelberg VR score, 10.1007/s00464-018-6480-x). Its other
 16 % go to time, dexterity and outcome; the abstract does not say how, here they share it equally.
 
-Proficiency of an episode: success, and no metric over its limit. A limit is of its own metric: the
+Proficiency of an episode: success, and no metric over its limit by more than `MARGIN` of it, which
+is what a mesh or a rounding may do. A limit is of its own metric: the
 median of the panel and `SPREADS` times a spread that one freak does not move, from the median to
 the value that 90 % are as good as, or the worst value of the best `PASSING` of the panel's
 episodes, whichever lets more pass. Where a panel hardly varies it is `LEAST` of the median beyond
@@ -65,7 +66,8 @@ Z_LIMIT = 10.0
 FLOOR = -20.0  # of an exercise that did not succeed; a success scores -10 or more
 PASSING = 0.95
 SPREADS, LEAST, BELOW = 2.5, 0.1, 0.9
-SMALL = {"s": 0.5, "N": 0.1, "N s": 0.05}
+SMALL = {"s": 0.5, "N": 0.1, "N s": 0.05, "%": 15.0}
+MARGIN = 0.05
 _NINTH = 1.2816  # normal deviate that 90 % are under
 CONSECUTIVE, REPEATS = 2, 10
 LEAST_WEIGHT = 0.5
@@ -250,9 +252,9 @@ def _ahead(value: float, other: float, better: str) -> float:
   return value - other if better == "higher" else other - value
 
 
-def _as_good(value: float, other: float, better: str) -> bool:
-  """Returns whether a value is as good as another, but for rounding."""
-  return _ahead(value, other, better) >= -1e-9 * max(abs(value), abs(other))
+def _as_good(value: float, other: float, better: str, margin: float = 1e-9) -> bool:
+  """Returns whether a value is as good as another, but for a share of it; for rounding alone."""
+  return _ahead(value, other, better) >= -margin * max(abs(value), abs(other))
 
 
 def score(
@@ -283,7 +285,7 @@ def score(
     if not math.isfinite(value):
       if row.get("n") == reference.get("n"):
         missing.append(name)
-    elif not _as_good(value, row["limit"], better):
+    elif not _as_good(value, row["limit"], better, MARGIN):
       over.append(name)
   composite, group, applied = _composite(z, weights, over)
   if outcome is None:

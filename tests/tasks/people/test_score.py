@@ -239,7 +239,7 @@ def test_composite_of_the_mean_is_zero_and_at_the_limits_minus_two():
   at_limit = score(Metrics(**limits), reference, SUCCESS)
   assert at_limit.composite == pytest.approx(-2) and at_limit.proficient
   over = score(
-    Metrics(**{**limits, "peak_force": 2.01, "log_dimensionless_jerk": 0.99}), reference, SUCCESS
+    Metrics(**{**limits, "peak_force": 2.2, "log_dimensionless_jerk": 0.9}), reference, SUCCESS
   )
   assert not over.proficient and set(over.over) == {"peak_force", "log_dimensionless_jerk"}
   rounded = {**limits, "time": 2.0 * (1 + 1e-12)}
@@ -282,7 +282,7 @@ def test_a_reference_of_one_recording_has_limits_and_no_scale():
   reference = make_reference([made], "touch", 0)
   result = score(made, reference, SUCCESS)
   assert math.isnan(result.composite) and result.proficient
-  assert not score(Metrics(time=10.0, peak_force=2.21), reference, SUCCESS).proficient
+  assert not score(Metrics(time=10.0, peak_force=2.4), reference, SUCCESS).proficient
 
 
 def test_what_nobody_feels_is_within_every_limit():
@@ -294,9 +294,9 @@ def test_what_nobody_feels_is_within_every_limit():
 def test_no_haste_makes_up_for_a_harm():
   reference = _reference(time=(10, 2), peak_force=(2, 0.5), mean_force=(1, 0.5), errors=(1, 1))
   careful = score(Metrics(time=10.0, peak_force=2.0, mean_force=1.0, errors=1), reference, SUCCESS)
-  hasty = Metrics(time=2.0, peak_force=3.1, mean_force=0.1, errors=0.0)
+  hasty = Metrics(time=2.0, peak_force=3.5, mean_force=0.1, errors=0.0)
   rash = score(hasty, reference, SUCCESS)
-  assert rash.over == ("peak_force",) and rash.group["safety"] == pytest.approx(-2.2)
+  assert rash.over == ("peak_force",) and rash.group["safety"] == pytest.approx(-3.0)
   assert rash.composite < careful.composite == 0
 
 
