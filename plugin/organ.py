@@ -5,7 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 import numpy.typing as npt
-from palpate.engine import change, motion, penetration, workspace
+from palpate.engine import change, motion, penetration, signals, workspace
 from palpate.engine import plugin as engine
 from palpate.engine.cutting.cuts import Piece, Report
 from palpate.engine.cutting.cutters import Cutter
@@ -161,6 +161,7 @@ class Organ:
         change.detach(group.other, self.model._address, theirs)
     change.detach(self._space, self.model._address, made)
 
+  @signals.deferred()
   def cut(
     self,
     points: npt.ArrayLike,
@@ -357,6 +358,7 @@ class Organ:
     """Device the organ is solved on."""
     return self._organ.still.device.alias
 
+  @signals.deferred()
   def set_state(self, xpos: np.ndarray | None = None, xvel: np.ndarray | None = None):
     """Places the organ; pinned vertices stay, and forces of the past are forgotten.
 
@@ -384,6 +386,7 @@ class Organ:
     """
     workspace.sync(self._space)
 
+  @signals.deferred()
   def reset(self):
     """Puts the organ at rest, its bonds whole; the rest of the model stays as it is."""
     if self._organ.config.bonded:

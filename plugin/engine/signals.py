@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import _thread
 import atexit
+import contextlib
 import signal
 import threading
 import time
 import types
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 _codes: set[types.CodeType] = set()  # of the callbacks
 _late: list[BaseException] = []  # what the main thread raises when it has left its callback
@@ -68,6 +69,34 @@ def _on_interrupt(number: int, frame: types.FrameType | None):
   if _before:
     signal.signal(signal.SIGINT, _before.pop())
   raise _late.pop() if _late else KeyboardInterrupt()
+
+
+@contextlib.contextmanager
+def deferred() -> Iterator[None]:
+  """Lets handlers of signals wait until what is inside is done: half a cut is no organ."""
+  if threading.current_thread() is not threading.main_thread():
+    yield
+    return
+  found = {number: signal.getsignal(number) for number in signal.valid_signals()}
+  handlers = {number: handler for number, handler in found.items() if callable(handler)}
+  came: list[int] = []
+  try:
+    for number in handlers:
+      signal.signal(number, lambda number, _: came.append(number))
+    yield
+  finally:
+    _restore(handlers)
+    for number in dict.fromkeys(came):
+      signal.raise_signal(number)
+
+
+def _restore(handlers: dict):
+  """Puts handlers back, whatever one of them raises meanwhile."""
+  try:
+    signal.signal(*handlers.popitem())
+  finally:
+    if handlers:
+      _restore(handlers)
 
 
 # The end of the process.

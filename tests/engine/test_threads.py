@@ -370,6 +370,43 @@ print(raised > 0, bool(np.isfinite(organ.displacement).all()), raised)
   assert status == 0 and said.startswith("True True"), said + errors
 
 
+@pytest.mark.parametrize("window", [True, False])
+def test_a_signal_in_the_middle_of_a_cut_waits_until_it_is_made(process, window):
+  code = f"""
+import trimesh
+def on_alarm(number, frame):
+  raise TimeoutError
+signal.signal(signal.SIGALRM, on_alarm)
+spec = mujoco.MjSpec()
+spec.option.gravity = 0, 0, 0
+palpate.add_organ(spec, trimesh.creation.icosphere(2, 0.05), "organ", mass=0.3, young=5000,
+                  foundation=4e4, windows={window}, spare=120)
+m = spec.compile()
+d = mujoco.MjData(m)
+organ, rng, raised, made = palpate.Organ(m, d, "organ"), np.random.RandomState(0), 0, 0
+mujoco.mj_step(m, d, 20)
+still, mass = organ.xpos.copy(), organ.mass.sum()
+end = time.perf_counter() + 4
+while time.perf_counter() < end:
+  count = organ.nvert
+  try:
+    signal.setitimer(signal.ITIMER_REAL, rng.uniform(2e-4, 4e-3))
+    organ.cut(organ.xpos[rng.randint(organ.nvert, size=2)])
+  except (TimeoutError, ValueError) as error: raised += isinstance(error, TimeoutError)
+  signal.setitimer(signal.ITIMER_REAL, 0)
+  made += organ.nvert > count
+  assert abs(organ.mass.sum() - mass) < 1e-12 and np.isfinite(organ.xpos).all()
+  if made % 5 == 4:
+    mujoco.mj_resetData(m, d)
+    mujoco.mj_step(m, d, 20)
+    assert organ.error is None and np.array_equal(organ.xpos, still), organ.error
+    made += 1
+print(raised > 5, made > 10, raised, made)
+"""
+  status, said, errors = process(code)
+  assert status == 0 and said.startswith("True True"), said + errors
+
+
 def test_ctrl_c_is_heard_in_a_loop_of_forward(process):
   code = """
 m, d, organ = load(probed())
