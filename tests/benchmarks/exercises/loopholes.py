@@ -41,6 +41,7 @@ PHASES = 3
 LENGTH = 6.0  # of an episode of `blind` and `aimed` policies [s]
 _REACH = 0.025  # of the offsets of aimed policies [m]
 _SPEED = 0.06  # of their tip [m/s]
+_LEAP = 10  # points of a curve that follow one another in two control steps, at most
 _CONTACT, _STROKES = 0.02, 2.0  # force of a contact [N], time of that to free a strip [s]
 _SEEN, _FRESH = 1000, tuple(range(2000, 2004))  # seeds
 # What `styled` policies may be, from -1 to 1; the expert is inside.
@@ -180,7 +181,8 @@ class Work:
 
   def __init__(self):
     self.opened, self.pressed, self.touches, self._touching = 0.0, 0, 0, False
-    self.places: set[int] = set()  # points of a curve that were nearest to the tip as it pressed
+    self.places: set[int] = set()  # points of a curve that the tip went by as it pressed
+    self._last = -1  # of these, -1 where it did not press
 
   def see(self, task, physics) -> None:
     """Takes a control step."""
@@ -190,9 +192,13 @@ class Work:
     self.touches += touching and not self._touching
     self._touching = touching
     self.pressed += touching
+    near = -1
     if touching and hasattr(task, "curve"):
       off = getattr(task, "now", task.curve) - physics.tip_pos()
-      self.places.add(int(np.linalg.norm(off[:, :2], axis=1).argmin()))
+      near = int(np.linalg.norm(off, axis=1).argmin())
+      first = self._last if 0 <= self._last and abs(near - self._last) < _LEAP else near
+      self.places.update(range(min(first, near), max(first, near) + 1))
+    self._last = near
 
   def done(self, task) -> bool:
     """Whether it was the work that the exercise asks for."""
