@@ -7,6 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 from scipy.ndimage import binary_dilation, distance_transform_edt, label
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from . import raster
 from .field import Field
@@ -21,6 +23,7 @@ KINDS = {
   "part": "a part too thin for the nodes is left out",
   "filled": "a hole, tube or cleft is filled",
   "sheet": "a sheet without an inside is left out",
+  "cap": "an open end is capped, and what it leads to is solid",
   "rest": "smaller places are left out or filled",
 }
 _MOST = 8  # losses that are named; the smaller ones are added up
@@ -58,9 +61,26 @@ def of_part(part: Part, kind: str) -> Loss:
   return Loss(kind, part.volume, tuple(part.middle.tolist()), part.extent)
 
 
+def open_ends(mesh: Mesh, wide: float) -> list[Loss]:
+  """Returns the rims of an open surface that are wider than a gap which is bridged [m]."""
+  points, triangles = mesh
+  edges = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+  edges, count = np.unique(edges, axis=0, return_counts=True)
+  rim = edges[count == 1]
+  links = coo_array((np.ones(len(rim)), tuple(rim.T)), shape=(len(points), len(points)))
+  _, which = connected_components(links, directed=False)
+  out = []
+  for k in np.unique(which[rim[:, 0]]):
+    low, high = (f(points[which == k], axis=0) for f in (np.min, np.max))
+    extent = float(np.linalg.norm(high - low))
+    if extent > wide:
+      out.append(Loss("cap", 0.0, tuple(((low + high) / 2).tolist()), extent))
+  return out
+
+
 def notable(losses: Sequence[Loss], whole: float) -> tuple[Loss, ...]:
   """Returns the losses that are no specks beside a volume [m^3], the largest first."""
-  kept = [loss for loss in losses if loss.kind == "sheet" or loss.volume > SPECK * whole]
+  kept = [loss for loss in losses if loss.kind in ("sheet", "cap") or loss.volume > SPECK * whole]
   kept.sort(key=lambda loss: -loss.volume)
   if len(kept) > _MOST:
     kept, rest = kept[:_MOST], kept[_MOST:]

@@ -256,7 +256,7 @@ def _against(
     surface = found.target.vertices, found.target.triangles
     body = Comparison(surface, found.found.field, len(wrapped[0]))
     away, more = body.of(wrapped, edge)
-    lost += more
+    lost += more + losses.open_ends(parts[0].mesh, max(2 * found.solid.reach, 2 * edge))
   others = [*parts[1:], *within]
   if others:
     points = np.concatenate([part.mesh[0] for part in others])

@@ -314,9 +314,9 @@ def _extreme(rows: list[Row], task: str, key: str, pick) -> float:
 
 def finding(rows: list[Row]) -> list[str]:
   """Returns what the page begins with."""
-  tried, work, failed = (
+  tried, work, failed, above = (
     sum(int(row[key]) for row in rows)
-    for key in ("tried", "policies_without_the_work", "failures_with_a_score")
+    for key in ("tried", "policies_without_the_work", "failures_with_a_score", "above_expert")
   )
   tasks = dict.fromkeys(row["task"] for row in rows)
   limits = ("most_without_success", max), ("least_with_success", min)
@@ -324,7 +324,7 @@ def finding(rows: list[Row]) -> list[str]:
           if _extreme(rows, task, *limits[0]) >= _extreme(rows, task, *limits[1])]  # fmt: skip
   return [
     f"Of {tried} policies that a search tried {work} succeeded without the work.",
-    f"{failed} failures had a score.",
+    f"{failed} failures had a score, and {above} successes one above the expert's in that episode.",
     f"Failure was paid as much as some success in {len(over)} of {len(tasks)} exercises"
     f"{': ' * bool(over)}{', '.join(over)}.",
   ]

@@ -114,6 +114,16 @@ def test_holes_are_closed():
   assert quality(*result[:2]).volume == pytest.approx(expected, rel=CHORDS)
 
 
+def test_open_ends_are_named():
+  pipe = trimesh.creation.cylinder(0.02, 0.1, sections=48)
+  side = np.abs(pipe.face_normals[:, 2]) < 0.5
+  report = wrap((pipe.vertices, pipe.faces[side]), NODES)[2]
+  assert [loss.kind for loss in report.losses] == ["cap", "cap"]
+  assert sorted(round(loss.middle[2], 3) for loss in report.losses) == [-0.05, 0.05]
+  assert "an open end is capped, and what it leads to is solid" in str(report)
+  assert not wrap((pipe.vertices, pipe.faces), NODES)[2].losses
+
+
 def crossing(radius):
   one, two = trimesh.creation.icosphere(4, radius), trimesh.creation.icosphere(4, radius)
   return trimesh.util.concatenate([one, two.apply_translation([radius, 0, 0])])
