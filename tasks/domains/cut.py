@@ -60,7 +60,7 @@ COVERED = 0.98  # share of the line that is to be cut
 CLOSING = 0.006  # length that is cut beyond that of the line where the piece counts as free [m]
 STEP = 0.001  # between points of the line [m]
 FIRST, SECOND, THIRD = 5, 10, 15  # points further on that are observed
-_MARKS = 36  # spheres that draw the line
+_MARKS, _ABOVE = 36, (0.0, 0.0, 0.0006)  # spheres that draw the line, and how far above it [m]
 LEAP = 10  # points of the line between two control steps that do not follow one another
 # Of the expert: how fast it cuts [m/s], and how deep the tip is under the sheet and over it [m].
 _SPEED, _DEEP, _OVER = 0.012, 0.0035, 0.012
@@ -304,8 +304,17 @@ class Cut(Task):
     self.inside, self.travelled, self.seat = cutter(physics)
     self.done, self.next, self.covered, self.nearest = 0, 0, 0.0, 0.0
     self.distance0 = distance(physics, self)
-    for i, k in enumerate(np.linspace(0, len(self.curve), _MARKS, endpoint=False).astype(int)):
-      physics.mark(i, self.curve[k] + [0.0, 0.0, 0.0006], size=0.0009)
+    self._marked = np.linspace(0, len(self.curve), _MARKS, endpoint=False).astype(int)
+    self._dark = np.zeros(_MARKS, bool)
+    for i, k in enumerate(self._marked):
+      physics.mark(i, self.curve[k] + _ABOVE, size=0.0009)
+
+  def show(self, physics: Physics) -> None:
+    """Darkens the line where it is cut."""
+    dark = self.cut[self._marked] > 0
+    for i in np.flatnonzero(dark & ~self._dark):
+      physics.mark(i, self.curve[self._marked[i]] + _ABOVE, size=0.0012, done=True)
+    self._dark = dark
 
   def label(self, kind: str) -> str:
     """Returns what damage is."""
