@@ -120,19 +120,25 @@ class Keeping:
     """Raises ValueError unless the task is open to the trainee, RecordError without a record."""
     from palpate.tasks.people import curriculum
 
+    if before := self.locked().get(task):
+      raise ValueError(
+        f"task is {task!r}, which is not open to {self.trainee!r} yet: {before} comes first, "
+        f"{curriculum.RULE}; --any-task does not ask"
+      )
+
+  def locked(self) -> dict[str, str]:
+    """Returns the tasks that are not open to the trainee, each with the one that comes first."""
+    from palpate.tasks.people import curriculum
+
     from . import history
     from .record import Record
 
-    if self.folder is None or not (task and self.trainee) or self.any_task:
-      return
+    if self.folder is None or not self.trainee or self.any_task:
+      return {}
     with Record(self.folder) as record:
-      person = record.find(self.trainee)
-      met = curriculum.done(history.passed(record.episodes(person)))
-    if before := curriculum.locked(task, met):
-      raise ValueError(
-        f"task is {task!r}, which is not open to {person.name!r} yet: {before} comes first, "
-        f"{curriculum.RULE}; --any-task does not ask"
-      )
+      met = curriculum.done(history.passed(record.episodes(record.find(self.trainee))))
+    found = {task: curriculum.locked(task, met) for task in curriculum.AFTER}
+    return {task: before for task, before in found.items() if before}
 
   def knows(self, person: str) -> bool:
     """Returns whether what a person did goes to a record; a trainee does everything."""

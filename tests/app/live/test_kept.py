@@ -7,6 +7,7 @@ import threading
 
 import pytest
 from palpate.app.live.page import worker
+from palpate.app.live.page.menu import offer
 from palpate.app.trainee import keeping
 from palpate.app.trainee.record import Record
 from palpate.tasks.people import limits
@@ -75,6 +76,14 @@ def test_an_exercise_on_the_page_is_kept_and_what_is_locked_refused(page, folder
     done = record.episodes(record.find("Ada"))
   assert [e.assessment for e in done] == [False, True] and done[0].hints > 0 == done[1].hints
   assert len({e.session for e in done}) == 1 and done[0].performer == "device:mouse"
+
+
+def test_a_page_offers_what_is_open_to_its_trainee(folder):
+  menu = offer("mouse", keeping.Keeping(folder, "Ada"))
+  assert menu["trainee"] == "Ada" and menu["locked"]["touch/hard"] == "touch/standard"
+  assert "touch/easy" not in menu["locked"] and set(menu["locked"]) < set(menu["tasks"])
+  for kept in (None, keeping.Keeping(folder), keeping.Keeping(folder, "Ada", any_task=True)):
+    assert not offer("mouse", kept)["locked"]
 
 
 def test_references_need_no_record(page, tmp_path):

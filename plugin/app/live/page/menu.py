@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from ...trainee.keeping import Keeping
 from ...trainee.record import check_name
 
 NODES = (250, 500, 1000, 2000, 4000)  # of an exercise
@@ -14,11 +15,12 @@ BLUNT = ("scissors", "hook", "scalpel")  # in free practice, where organs have n
 OTHER = ("", "keyboard", "pad")  # what a page can have for the left hand; none by default
 
 
-def offer(device: str) -> dict[str, Any]:
+def offer(device: str, kept: Keeping | None = None) -> dict[str, Any]:
   """Returns what a page offers, JSON.
 
   Args:
     device: that the program was started with
+    kept: whose exercises they are
   """
   from palpate import models
   from palpate.tasks import suite
@@ -26,6 +28,8 @@ def offer(device: str) -> dict[str, Any]:
   return {
     "type": "menu",
     "tasks": {f"{d}/{t}": suite.summary(d, t) for d, t in suite.ALL_TASKS},
+    "trainee": kept.trainee if kept else "",
+    "locked": kept.locked() if kept else {},
     "two": ["/".join(pair) for pair in suite.BIMANUAL],
     "nodes": NODES,
     "speeds": SPEEDS,

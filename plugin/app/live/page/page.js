@@ -63,7 +63,12 @@ const HEAR = {
     keep("task", () => $("task").replaceChildren(...Object.entries(groups).map(([domain, names]) => {
       const group = document.createElement("optgroup");
       group.label = domain;
-      group.append(...names.map(name => new Option(`${name}: ${menu.tasks[name]}`, name)));
+      group.append(...names.map(name => {
+        const after = menu.locked[name];
+        const option = new Option(`${name}: ${menu.tasks[name]}${after ? ` (after ${after})` : ""}`, name);
+        option.disabled = Boolean(after);
+        return option;
+      }));
       return group;
     })));
     fill("nodes", [["", "the exercise's"], ...menu.nodes.map(n => [n, `${n} nodes`])]);
@@ -78,7 +83,9 @@ const HEAR = {
     if (!scene) [$("step").value, $("mesh").value] = [1, "1000 nodes"];
     if (menu.devices.includes(menu.device)) $("device").value = menu.device;
     const wanted = new URLSearchParams(location.hash.slice(1)).get("task");
-    if (wanted in menu.tasks) $("task").value = wanted;
+    if (wanted in menu.tasks && !(wanted in menu.locked)) $("task").value = wanted;
+    if ($("task").selectedOptions[0]?.disabled) $("task").value = Object.keys(menu.tasks).find(name => !(name in menu.locked));
+    if (menu.trainee) [$("person").value, $("person").disabled] = [menu.trainee, true];
     two = menu.two;
     hands();
     $("start").disabled = false;

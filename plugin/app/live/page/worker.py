@@ -61,7 +61,7 @@ class Worker:
     self, conn: Connection, folder: pathlib.Path, device: str, kept: Keeping | None = None
   ):
     """Takes the arguments of `main`."""
-    self._record = kept.begin() if kept else None
+    self._kept, self._record = kept, kept.begin() if kept else None
     self._references = self._record.references if self._record else references(None)
     self._conn, self._folder, self._own = conn, folder, device
     self._device = "page" if registry.on_page(device) else device
@@ -81,7 +81,7 @@ class Worker:
     """Works until the end."""
     for target in (self._receive, self._show):
       threading.Thread(target=target, daemon=True).start()
-    self._tell(menu.offer(self._own))
+    self._tell(menu.offer(self._own, self._kept))
     while (job := self._jobs.get()) is not None:
       if not self._jobs.empty():  # something else was asked for since
         continue
@@ -261,6 +261,8 @@ class Worker:
     shown = card(recording, self._references(job["task"]))
     shown["advice"] += done.said
     self._tell({"type": "card", "path": str(done.path or ""), "fault": done.fault, **shown})
+    if self._kept and self._kept.trainee:  # another exercise may be open now
+      self._tell(menu.offer(self._own, self._kept))
 
   def _run(self, made: Session | Practice, job: dict[str, Any], run: Any) -> Any:
     """Runs what was made, so that messages reach it."""
