@@ -92,11 +92,13 @@ def deferred() -> Iterator[None]:
 
 def _restore(handlers: dict):
   """Puts handlers back, whatever one of them raises meanwhile."""
-  try:
-    signal.signal(*handlers.popitem())
-  finally:
-    if handlers:
+  while handlers:
+    number, handler = handlers.popitem()
+    try:
+      signal.signal(number, handler)
+    except BaseException:
       _restore(handlers)
+      raise
 
 
 # The end of the process.

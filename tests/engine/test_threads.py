@@ -390,10 +390,11 @@ end = time.perf_counter() + 4
 while time.perf_counter() < end:
   count = organ.nvert
   try:
-    signal.setitimer(signal.ITIMER_REAL, rng.uniform(2e-4, 4e-3))
-    organ.cut(organ.xpos[rng.randint(organ.nvert, size=2)])
+    try:
+      signal.setitimer(signal.ITIMER_REAL, rng.uniform(2e-4, 4e-3))
+      organ.cut(organ.xpos[rng.randint(organ.nvert, size=2)])
+    finally: signal.setitimer(signal.ITIMER_REAL, 0)
   except (TimeoutError, ValueError) as error: raised += isinstance(error, TimeoutError)
-  signal.setitimer(signal.ITIMER_REAL, 0)
   made += organ.nvert > count
   assert abs(organ.mass.sum() - mass) < 1e-12 and np.isfinite(organ.xpos).all()
   if made % 5 == 4:

@@ -24,6 +24,7 @@ _SAYS: dict[str, Callable[[Link], float]] = {
   "report": lambda link: float(link.report),
   "current": lambda link: 1.0 if link.grip else -1.0,
 }
+_FIRST = ("current",)  # of these, what acts as a control step begins, and does not change in it
 
 
 class Session:
@@ -77,6 +78,7 @@ class Session:
     self.faults: list[str] = []
     self._info, self._publish = dict(info or {}), publish
     self._rows = np.zeros((episode.substeps(env), len(env.task.components)))
+    self._held: list[tuple[int, Link, Callable[[Link], float]]] = []  # columns of `_FIRST`
     self._due = 0.0
 
   @property
@@ -114,28 +116,35 @@ class Session:
     if timestep.first():
       turn = axes(physics.model.ptr, physics.data.ptr)
       self._rows[:] = 0.0
+      self._held.clear()
       first, extras = 0, (task.extra, task.other)
       for hand, link, extra in zip(physics.hands, self.links, extras, strict=False):
         handle = hand.handle
         link.attach(Shaft(hand.trocar()), handle.pos, handle.quat, turn)
         self._rows[:, first : first + len(ROW)] = link.row
-        first += len(ROW) + len(extra)
-        hand.guide.live = functools.partial(self._live, link, [_SAYS[name] for name in extra])
+        first += len(ROW)
+        said = [(first + i, _SAYS[name]) for i, name in enumerate(extra) if name in _FIRST]
+        self._held += [(column, link, say) for column, say in said]
+        first += len(extra)
+        says = [(i, _SAYS[name]) for i, name in enumerate(extra, len(ROW)) if name not in _FIRST]
+        hand.guide.live = functools.partial(self._live, link, says)
       if self.coach is not None:
         self.coach.begin(self.env)
       if self._publish is not None:
         self._publish(self)  # the shapes of a scene take longer than a step
+    for column, link, say in self._held:
+      self._rows[:, column] = say(link)
     return self._rows
 
   def _live(
-    self, link: Link, says: Sequence[Callable[[Link], float]], rows: np.ndarray, k: int
+    self, link: Link, says: Sequence[tuple[int, Callable[[Link], float]]], rows: np.ndarray, k: int
   ) -> None:
     """Fills a hand's row when its step is due, the main one's first."""
     if link is self.link:
       self._tick()
     row = rows[k]
     row[:7] = link.row
-    for i, say in enumerate(says, 7):
+    for i, say in says:
       row[i] = say(link)
     # Not beside what a control step does at its end.
     last = link is self.links[-1] and 0 < k < len(rows) - 1

@@ -131,6 +131,7 @@ def test_two_hands_move_two_instruments_and_what_they_do_replays(tmp_path):
   assert ((second[-1] - second[0]) @ axes)[0] > 0.004 > abs(((second[-1] - second[0]) @ axes)[1])
   current = made.arrays["action"][1:, :, -1]
   assert (current[0] == -1).all() and (current[-1] == 1).all()
+  assert 0.2 < made.columns["current"][-1, 0] < 0.35  # it is on, not told alone
   assert made.arrays["hook_felt"].shape == made.arrays["felt"].shape
   assert made.info["performer"] == "device:hand+hand"
   made.info["task_kwargs"] = {**KWARGS, "time_limit": 0.6}
