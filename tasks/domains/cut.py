@@ -313,7 +313,7 @@ class Cut(Task):
     """Darkens the line where it is cut."""
     dark = self.cut[self._marked] > 0
     for i in np.flatnonzero(dark & ~self._dark):
-      physics.mark(i, self.curve[self._marked[i]] + _ABOVE, size=0.0012, done=True)
+      physics.mark(int(i), self.curve[self._marked[i]] + _ABOVE, size=0.0012, done=True)
     self._dark = dark
 
   def label(self, kind: str) -> str:
