@@ -44,10 +44,18 @@ def prepare_gl() -> None:
         _bring(module, "GLContext", lambda: importlib.import_module(f"mujoco.{backend}").GLContext)
 
 
-def import_dm_control() -> None:
-  """Imports dm_control so that it works with MuJoCo 4 and loads OpenGL only when it draws."""
-  if "dm_control._render" in sys.modules:
-    return
+def import_dm_control() -> bool:
+  """Imports dm_control so that it works with MuJoCo 4 and loads OpenGL only when it draws.
+
+  Returns:
+    whether it is installed
+  """
+  if sys.modules.get("dm_control._render"):
+    return True
+  try:
+    importlib.import_module("dm_control")
+  except ModuleNotFoundError:
+    return False
   with _put_off() as backend:
     render: Any = importlib.import_module("dm_control._render")
     _drop_removed_sizes()
@@ -55,6 +63,7 @@ def import_dm_control() -> None:
     render.BACKEND, render.USING_GPU = backend, backend == "egl"
     del render.Renderer
     _bring(render, "Renderer", getattr(render, f"_import_{backend}"))
+  return True
 
 
 def _drop_removed_sizes() -> None:
