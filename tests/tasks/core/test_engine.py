@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -36,6 +37,7 @@ np.savez(sys.argv[3], **pictures, **rewards, **extra)
 """
 
 
+@pytest.mark.skipif(find_spec("dm_control") is None, reason="dm_control is not installed")
 @pytest.mark.parametrize("task", ["touch/easy", "grasp/easy"])
 def test_an_exercise_without_dm_control_does_the_same(task, tmp_path):
   found = []
