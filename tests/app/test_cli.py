@@ -113,7 +113,7 @@ def test_loading_and_running_a_scene_says_nothing_and_leaves_no_log(tmp_path):
     ("--organ spleen", "no organ 'spleen' in the model, it has 'organ'"),
     ("--actuator motor", "no actuator 'motor' in the scene, it has 'probe'"),
     ("--video press.avi", "video is 'press.avi', expected a name that ends in .mp4 or .gif"),
-    ("--picture a.jpg", "picture is 'a.jpg', expected a name that ends in .png"),
+    ("--picture a.bmp", "picture is 'a.bmp', expected a name that ends in .png"),
     ("--scene SCENE --nodes 500", "nodes and seed make the shipped organ anew"),
   ],
 )
