@@ -27,7 +27,7 @@ __all__ = [
   "add_windows",
   "register",
 ]
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 # Modules of what `register` brings.
 _BROUGHT = {
   "Organ": "organ", "add_skin": "skins", "add_spare": "spares", "add_windows": "windows",

@@ -44,16 +44,41 @@ def prepare_gl() -> None:
         _bring(module, "GLContext", lambda: importlib.import_module(f"mujoco.{backend}").GLContext)
 
 
-def import_dm_control() -> None:
-  """Imports dm_control's renderer, which loads OpenGL when it draws."""
-  if "dm_control._render" in sys.modules:
-    return
+def import_dm_control() -> bool:
+  """Imports dm_control so that it works with MuJoCo 4 and loads OpenGL only when it draws.
+
+  Returns:
+    whether it is installed
+  """
+  if sys.modules.get("dm_control._render"):
+    return True
+  try:
+    importlib.import_module("dm_control")
+  except ModuleNotFoundError:
+    return False
   with _put_off() as backend:
     render: Any = importlib.import_module("dm_control._render")
+    _drop_removed_sizes()
   if backend:
     render.BACKEND, render.USING_GPU = backend, backend == "egl"
     del render.Renderer
     _bring(render, "Renderer", getattr(render, f"_import_{backend}"))
+  return True
+
+
+def _drop_removed_sizes() -> None:
+  """Drops the fields that the installed MuJoCo no longer has from dm_control's table of sizes.
+
+  dm_control 1.0.50 reads every array in that table. The table is the one of MuJoCo 3.17, of which
+  4.0 has removed nine. Remove this function when dm_control has followed.
+  """
+  import mujoco
+
+  sizes = importlib.import_module("dm_control.mujoco.wrapper.mjbindings.sizes").array_sizes
+  model = mujoco.MjModel.from_xml_string("<mujoco/>")
+  for name, owner in (("mjmodel", model), ("mjdata", mujoco.MjData(model))):
+    for field in [field for field in sizes[name] if not hasattr(owner, field)]:
+      del sizes[name][field]
 
 
 @contextlib.contextmanager

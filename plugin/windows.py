@@ -192,11 +192,6 @@ def _own_bodies(flex, bodies: dict) -> list:
   own = [bodies[name] for name in flex.vertbody if bodies[name].first_joint() is not None]
   if not own or len({body.name for body in own}) < len(own):
     raise ValueError(f"organ {flex.name!r} has no vertices of its own, expected a <flexcomp>")
-  if flex.selfcollide != mujoco.mjtFlexSelf.mjFLEXSELF_NONE:
-    raise ValueError(
-      f"organ {flex.name!r} collides with itself, which needs nodal coupling; expected "
-      "<contact selfcollide='none'/>"
-    )
   return own
 
 
@@ -282,7 +277,7 @@ def _add_window(spec, flex, surface, name: str, followed: list, nodes: int | Non
     setattr(window, key, getattr(flex, key))
   window.contype, window.conaffinity = meets
   window.radius, window.group = flex.radius, _WINDOW_GROUP
-  window.selfcollide = mujoco.mjtFlexSelf.mjFLEXSELF_NONE
+  window.selfcollide = flex.selfcollide
 
 
 def add_node(parent, name: str, pos: np.ndarray, mass: float, inertia: float):

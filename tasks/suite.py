@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from typing import Any
 
-from dm_control.rl import control
 from palpate.tissue.reading import choices
 
 from . import registry
@@ -26,7 +25,7 @@ def load(
   task_name: str,
   task_kwargs: Mapping[str, Any] | None = None,
   environment_kwargs: Mapping[str, Any] | None = None,
-) -> control.Environment:
+) -> environment.Environment:
   """Returns the environment of an exercise.
 
   Args:

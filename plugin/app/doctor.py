@@ -18,7 +18,7 @@ from palpate import __version__
 
 from .console import CommandError
 
-_PACKAGES = ("mujoco", "warp-lang", "dm-control", "numpy", "scipy", "trimesh")
+_PACKAGES = ("mujoco", "warp-lang", "numpy", "scipy", "trimesh")
 _EXTRAS = {
   "matplotlib": "plot",
   "imageio-ffmpeg": "video",
@@ -152,9 +152,12 @@ def _plugin() -> list[str]:
   return [f"{NAME} is registered with MuJoCo, slot {slot}"]
 
 
-def _dm_control() -> list[str]:
-  _python("import dm_control.mujoco, dm_control.rl.control")
-  return ["dm_control starts"]
+def _tasks() -> list[str]:
+  _python("import palpate.tasks; palpate.tasks.load('touch', 'easy')")
+  try:
+    return [f"start with dm-control {importlib.metadata.version('dm-control')}"]
+  except importlib.metadata.PackageNotFoundError:
+    return ["start without dm-control"]
 
 
 def _gl() -> list[str]:
@@ -226,7 +229,7 @@ CHECKS: dict[str, Callable[[], list[str]]] = {
   "devices": _devices,
   "cache": _cache,
   "plugin": _plugin,
-  "tasks": _dm_control,
+  "tasks": _tasks,
   "drawing": _gl,
   "torch": _torch,
   "self-test": _self_test,

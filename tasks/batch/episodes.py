@@ -10,9 +10,9 @@ from typing import Any
 import gymnasium
 import mujoco as mj
 import numpy as np
-from dm_control.mujoco import wrapper
 from palpate.models import trocar
 from palpate.tasks.core.base import Task
+from palpate.tasks.core.engine import wrap
 from palpate.tasks.core.instrument import Second
 from palpate.tasks.core.physics import Physics
 from palpate.tasks.core.scenes import ORGAN
@@ -76,7 +76,7 @@ class Episodes:
 
   def __init__(self, task: Task, draw: Callable[[Task], Mapping[str, np.ndarray]], nworld: int):
     model = task.compiled(task.variants[0]).model
-    self.physics: Any = Resting.from_model(wrapper.MjModel(model))
+    self.physics: Any = Resting.from_model(wrap(model))
     self.physics.use(model, task.prefix, task.targets, task.organ, task.second)
     self._task, self._draw_own = task, draw
     self._random: list[np.random.RandomState | None] = [None] * nworld

@@ -42,14 +42,12 @@ from typing import Any
 
 import mujoco as mj
 import numpy as np
-from dm_control.mujoco import wrapper
-from dm_control.rl import control
 from dm_env import specs
 from palpate.models import trocar
 
 from ..recorder import together
 from ..recording import Event, Settings
-from . import observation, randomisation, safety, scenes, stage
+from . import engine, observation, randomisation, safety, scenes, stage
 from .environment import CONTROL_TIMESTEP
 from .handle import ROW
 from .instrument import AXES, JAWS
@@ -68,7 +66,7 @@ SLACK = 1e-6  # what rounding may add to an action
 _BACK = 0.008  # by how much the other hand begins farther away: the two would meet [m]
 
 
-class Task(control.Task):
+class Task(engine.Task):
   """An exercise on one organ with one instrument; a domain says what progress and success are.
 
   Attributes:
@@ -186,7 +184,7 @@ class Task(control.Task):
   def physics(self) -> Physics:
     """Returns the physics of the scene, to make an environment of."""
     model = self.compiled(self.variants[0]).model
-    physics = Physics.from_model(wrapper.MjModel(model))
+    physics = Physics.from_model(engine.wrap(model))
     physics.use(model, self.prefix, self.targets, self.organ, self.second)
     return physics
 

@@ -6,20 +6,19 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from dm_control.rl import control
 from dm_env import specs
 
-from . import observation
+from . import engine, observation
 
 CONTROL_TIMESTEP = 0.02  # [s]
 
 
-class Environment(control.Environment):
+class Environment(engine.Environment):
   """An exercise as dm_control has it; a step after the last one of an episode begins another."""
 
   def __init__(
     self,
-    physics: control.Physics,
+    physics: engine.Physics,
     task: Any,
     time_limit: float,
     control_timestep: float | None = None,
@@ -58,7 +57,7 @@ class Environment(control.Environment):
       return found
     count = sum(math.prod(spec.shape) for spec in found.values())
     dtype = np.result_type(*(spec.dtype for spec in found.values()))
-    name = control.FLAT_OBSERVATION_KEY
+    name = engine.FLAT_OBSERVATION_KEY
     return collections.OrderedDict([(name, specs.Array((count,), dtype, name=name))])
 
 

@@ -13,11 +13,11 @@ from typing import Any
 import mujoco
 import numpy as np
 import palpate
-from dm_control.rl import control
 
 from .. import suite
 from ..recorder import Recorder
 from ..recording import Recording
+from .environment import Environment
 from .performer import Act
 
 
@@ -34,7 +34,7 @@ class EpisodeError(RuntimeError):
 
 
 def run(
-  env: control.Environment,
+  env: Environment,
   act: Act,
   seed: int,
   info: Mapping[str, Any] | None = None,
@@ -90,7 +90,7 @@ def run(
   return finish()
 
 
-def _begin(env: control.Environment, seed: int, info: Mapping[str, Any], states: bool) -> Recorder:
+def _begin(env: Environment, seed: int, info: Mapping[str, Any], states: bool) -> Recorder:
   """Returns the recorder of an episode, with the constants and the sample of its start."""
   task: Any = env.task
   physics: Any = env.physics
@@ -115,12 +115,12 @@ def _begin(env: control.Environment, seed: int, info: Mapping[str, Any], states:
   return recorder
 
 
-def substeps(env: control.Environment) -> int:
+def substeps(env: Environment) -> int:
   """Returns how many steps the physics takes in a control step."""
   return round(env.control_timestep() / env.physics.timestep())
 
 
-def environment(recording: Recording) -> control.Environment:
+def environment(recording: Recording) -> Environment:
   """Returns the environment that a recording was made in."""
   info = recording.info
   if "action" not in recording.arrays and len(recording.time) > 1:
@@ -138,7 +138,7 @@ def environment(recording: Recording) -> control.Environment:
 def replay(
   recording: Recording,
   watch: Callable[[Any], Any] | None = None,
-  env: control.Environment | None = None,
+  env: Environment | None = None,
 ) -> Recording:
   """Returns a recording's episode run anew from its seed and actions.
 

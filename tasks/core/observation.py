@@ -15,9 +15,9 @@ from typing import Any
 
 import mujoco as mj
 import numpy as np
-from dm_control import mujoco
 from dm_env import specs
 
+from .engine import Camera
 from .instrument import JAWS
 from .physics import COARSE, NEAR, Physics
 from .scenes import CAMERA
@@ -105,11 +105,11 @@ ROWS = {
 }
 
 
-def _pixels(camera: mujoco.Camera, physics: Physics) -> np.ndarray:
+def _pixels(camera: Camera, physics: Physics) -> np.ndarray:
   return camera.render().copy()  # the next picture is drawn into the same array
 
 
-def _depth(camera: mujoco.Camera, physics: Physics) -> np.ndarray:
+def _depth(camera: Camera, physics: Physics) -> np.ndarray:
   # The sky is written into the depth too, and colours alone are smoothed when labels are drawn.
   flags: Any = camera.scene.flags
   flags[mj.mjtRndFlag.mjRND_SKYBOX], flags[mj.mjtRndFlag.mjRND_SEGMENT] = 0, 1
@@ -118,7 +118,7 @@ def _depth(camera: mujoco.Camera, physics: Physics) -> np.ndarray:
   return depth
 
 
-def _points(camera: mujoco.Camera, physics: Physics) -> np.ndarray:
+def _points(camera: Camera, physics: Physics) -> np.ndarray:
   depth = _depth(camera, physics)
   height, width = depth.shape
   model = physics.model.ptr
@@ -131,7 +131,7 @@ def _points(camera: mujoco.Camera, physics: Physics) -> np.ndarray:
   return points
 
 
-def _segmentation(camera: mujoco.Camera, physics: Physics) -> np.ndarray:
+def _segmentation(camera: Camera, physics: Physics) -> np.ndarray:
   model, found = physics.model.ptr, camera.render(segmentation=True)
   kind, name = found[..., 1], found[..., 0]
   out = np.zeros(kind.shape, np.uint8)
@@ -166,7 +166,7 @@ class Picture:
   shape: tuple[int, ...]
   low: float
   high: float
-  draw: Callable[[mujoco.Camera, Physics], np.ndarray]
+  draw: Callable[[Camera, Physics], np.ndarray]
 
 
 PICTURES = {
@@ -273,7 +273,7 @@ def take(task: Any, physics: Physics) -> collections.OrderedDict:
   names = task.observed.pictures
   if names:
     height, width = task.observed.size
-    camera = mujoco.Camera(physics, height, width, physics.model.ptr.camera(CAMERA).id)
+    camera = Camera(physics, height, width, physics.model.ptr.camera(CAMERA).id)
     for name in names:
       out[name] = PICTURES[name].draw(camera, physics)
     camera.scene.free()

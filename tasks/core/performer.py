@@ -28,10 +28,10 @@ from collections.abc import Callable, Generator, Iterator
 from typing import Any
 
 import numpy as np
-from dm_control.rl import control
 from palpate.models import trocar
 
 from ..learn import policy
+from .environment import Environment
 from .instrument import RATES
 
 Act = Callable[[Any], Any]
@@ -106,7 +106,7 @@ _REFLEX, _FIRMEST = 400.0, 3.0  # force for each metre that slides further [N/m]
 _TREMOR_HZ = np.array([4.0, 5.3, 7.1, 8.6, 10.0])
 
 
-def make(env: control.Environment, who: str | Style = EXPERT, seed: int = 0) -> Act:
+def make(env: Environment, who: str | Style = EXPERT, seed: int = 0) -> Act:
   """Returns who acts in an environment, to be called with each time step.
 
   Args:
@@ -166,7 +166,7 @@ def _drawn(ranges: dict[str, tuple[float, float]], seed: int) -> Style:
   return Style(**{name: float(random.uniform(*span)) for name, span in ranges.items()})
 
 
-def trained(env: control.Environment) -> policy.Policy:
+def trained(env: Environment) -> policy.Policy:
   """Returns the policy that comes with an exercise."""
   return policy.shipped(env.task.name)
 
@@ -227,7 +227,7 @@ class Performer:
 
   hasty = False
 
-  def __init__(self, env: control.Environment, style: Style = EXPERT, seed: int = 0, hand: int = 0):
+  def __init__(self, env: Environment, style: Style = EXPERT, seed: int = 0, hand: int = 0):
     """Makes a performer in a style, see `make`; `hand` is which of the instruments it moves."""
     self.env, self.style, self._which = env, style, hand
     self.dt = env.control_timestep()  # [s]

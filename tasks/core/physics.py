@@ -9,7 +9,6 @@ from typing import Any
 
 import mujoco as mj
 import numpy as np
-from dm_control.mujoco import wrapper
 from palpate import Organ
 from palpate.tissue.config import Config
 from scipy.spatial import cKDTree
@@ -17,6 +16,7 @@ from scipy.spatial import cKDTree
 from ..learn.portable import Portable
 from ..metrics.samples import Stretch
 from . import scenes
+from .engine import wrap
 from .instrument import AXES, JAWS, Instrument, Second
 from .scenes import CAMERA, ORGAN
 from .stage import STATE
@@ -58,7 +58,7 @@ class Physics(Instrument, Portable):
       held = mj.mj_name2id(model, mj.mjtObj.mjOBJ_BODY, f"{name}handle") >= 0
       check_scene(model, name, targets, organ, held)
     if model is not self.model.ptr:
-      self._reload_from_data(wrapper.MjData(wrapper.MjModel(model)))
+      self._reload_from_model(wrap(model))
     self.organ = Organ(model, self.data.ptr, organ)
     self._nodes: np.ndarray | None = None
     self._points: dict[int, np.ndarray] = {}

@@ -285,5 +285,11 @@ def tear(s: Any, o: Any, value: float) -> None:
 
 
 def closeness(distance: float, start: float) -> float:
-  """Returns 1 at the goal, 0 at the distance it started from, -1 at twice that and beyond [-]."""
-  return max(-1.0, 1.0 - distance / max(start, 1e-3))
+  """Returns 1 at the goal, 0 at the distance it started from, towards -1 far away [-].
+
+  It falls with every distance, so that an agent that has gone astray is still told the way back.
+  """
+  least = max(start, 1e-3)
+  if distance < least:
+    return 1.0 - distance / least
+  return least / distance - 1.0

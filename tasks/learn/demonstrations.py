@@ -12,10 +12,10 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from dm_control.rl import control
 
 from .. import suite
 from ..core import episode, observation
+from ..core.environment import Environment
 from ..core.instrument import AXES
 from ..core.performer import Act
 from ..files import replacing
@@ -87,7 +87,7 @@ class Demonstration:
 
 
 def perform(
-  env: control.Environment,
+  env: Environment,
   act: Act,
   seed: int,
   info: Mapping[str, Any] | None = None,
@@ -118,7 +118,7 @@ def perform(
   return dataclasses.replace(made, actions=np.array(meant))
 
 
-def repeat(env: control.Environment, recording: Recording) -> Demonstration:
+def repeat(env: Environment, recording: Recording) -> Demonstration:
   """Returns the episode of a recording, run anew.
 
   Args:

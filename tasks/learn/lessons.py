@@ -13,8 +13,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from dm_control.rl import control
 
+from ..core.environment import Environment
 from ..core.performer import Performer, Script
 from ..core.physics import AXES
 from .policy import Policy
@@ -93,7 +93,7 @@ class Teacher(Performer):
 
 
 def give(
-  env: control.Environment,
+  env: Environment,
   names: Sequence[str],
   seed: int,
   gamma: float,
@@ -154,7 +154,7 @@ class _Turns:
   """
 
   def __init__(
-    self, env: control.Environment, random: np.random.RandomState, most: int | None, both: bool
+    self, env: Environment, random: np.random.RandomState, most: int | None, both: bool
   ):
     self._env, self._random, self._most, self._both = env, random, most, both
     self._expert: Teacher | None = None

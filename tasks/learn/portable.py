@@ -7,12 +7,12 @@ import dataclasses
 from typing import Any
 
 import mujoco as mj
-from dm_control import mujoco
 from palpate import Organ
 from palpate.models.handle import Handle, find
 from palpate.tissue.config import Config
 
 from .. import display
+from ..core.engine import Physics
 from ..core.scenes import ORGAN
 
 # What belongs to one process or is made anew from the data.
@@ -20,7 +20,7 @@ _OWN = {"_contexts", "_contexts_lock", "_data", "_named", "organ", "handle"}
 _OWN |= {"meanwhile", "_warnings", "_warnings_before", "_new_warnings"}
 
 
-class Portable(mujoco.Physics):
+class Portable(Physics):
   """Physics with one organ; `copy`, `copy.deepcopy` and `pickle` take it in mid-episode.
 
   dm_control's own copy has MuJoCo's numbers alone, and recomputes them without controls.

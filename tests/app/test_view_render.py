@@ -110,6 +110,18 @@ def test_path_of_a_scene():
   assert np.ptp(_render(str(models.path("gallbladder")))) > 100
 
 
+def test_a_picture_of_an_exercise_shows_the_expert_at_work():
+  start, later = _render("touch/easy"), _render("touch/easy", "--seconds", "1.0")
+  assert (np.abs(start - later).max(axis=2) > 40).mean() > 0.01  # the shaft has moved
+
+
+@pytest.mark.parametrize("suffix", ["webp", "jpg"])
+def test_small_pictures(suffix):
+  assert cli.main(["render", "kidney", "--nodes", "250", "-o", f"small.{suffix}", *SIZE]) == 0
+  like = _render("kidney", "--nodes", "250")
+  assert np.abs(imageio.imread(f"small.{suffix}").astype(int) - like).mean() < 8
+
+
 @pytest.mark.parametrize("suffix", ["gif", "mp4"])
 def test_film(suffix, capsys):
   if suffix == "mp4":
@@ -142,7 +154,7 @@ def test_bad_input(words, message, capsys):
 
 
 def test_bad_files(tmp_path, capsys):
-  assert cli.main(["render", "liver", "-o", "out.jpg"]) == 2
+  assert cli.main(["render", "liver", "-o", "out.bmp"]) == 2
   assert "expected a name that ends in .png" in capsys.readouterr().err
   (tmp_path / "broken.xml").write_text("<mujoco><worldbody>")
   assert cli.main(["render", "broken.xml", "-o", "out.png"]) == 2

@@ -6,6 +6,7 @@ import pathlib
 import subprocess
 import sys
 
+import mujoco
 import pytest
 
 SCENE = pathlib.Path(__file__).parents[2] / "models" / "press" / "scene.xml"
@@ -46,12 +47,12 @@ def test_a_fresh_process_prints_nothing_and_leaves_no_log(scenes, tmp_path):
   assert [path.name for path in tmp_path.iterdir()] == ["scene.xml"]
 
 
-def test_mujoco_4_gives_the_same_motion(scenes, tmp_path):
-  python = os.environ.get("PALPATE_MUJOCO4_PYTHON", "")
+def test_another_mujoco_gives_the_same_motion(scenes, tmp_path):
+  python = os.environ.get("PALPATE_OTHER_PYTHON", "")
   if not pathlib.Path(python).is_file():
-    pytest.skip("PALPATE_MUJOCO4_PYTHON names no Python that has mujoco 4 and palpate")
+    pytest.skip("PALPATE_OTHER_PYTHON names no Python that has another mujoco and palpate")
   version, nvert, error, qpos = _process(scenes, tmp_path, python).stdout.split()
-  assert version.startswith("4.") and (nvert, error) == ("42", "None")
+  assert version != mujoco.__version__ and (nvert, error) == ("42", "None")
   ours = _process(scenes, tmp_path).stdout.split()[3]
   assert float(qpos) == pytest.approx(float(ours), abs=1e-7)
 

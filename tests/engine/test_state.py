@@ -9,6 +9,7 @@ import numpy as np
 import palpate
 import pytest
 from mujoco import rollout
+from palpate import screen
 from palpate.engine import plugin as engine
 
 GRAVITY = (0, 0, -9.81)
@@ -151,8 +152,8 @@ def test_an_organ_attached_with_a_prefix(scenes):
   np.testing.assert_allclose(organ.xpos.mean(axis=0)[:2], [0.1, 0.2], atol=1e-3)
 
 
-@pytest.mark.skipif(mujoco.__version__ >= "4", reason="dm_control 1.0.50 knows MuJoCo 3")
 def test_dm_control_physics_copies_and_resets(scenes):
+  screen.import_dm_control()
   dm_mujoco = pytest.importorskip("dm_control.mujoco", reason="dm_control is not installed")
   physics = dm_mujoco.Physics.from_xml_string(scenes.press())
 

@@ -8,8 +8,7 @@ import mujoco
 import numpy as np
 import palpate
 import pytest
-from dm_control import mujoco as dm_mujoco
-from palpate import models
+from palpate import models, screen
 from palpate.models import build, catalog, organs, shapes
 from palpate.tasks.core import scenes
 
@@ -241,6 +240,8 @@ def test_mjcf_attach_and_include_twice(tmp_path):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_dm_control(name):
+  screen.import_dm_control()
+  dm_mujoco = pytest.importorskip("dm_control.mujoco", reason="dm_control is not installed")
   physics = dm_mujoco.Physics.from_xml_path(str(models.path(name)))
   physics.reset(keyframe_id=physics.model.name2id("press", "key"))
   physics.step(nstep=100)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
   import mujoco
 
 FILMS = (".mp4", ".gif")
-PICTURES = (".png",)
+PICTURES = (".png", ".webp", ".jpg")
 _FPS = 25  # of the laparoscope
 
 
@@ -25,7 +25,7 @@ _FPS = 25  # of the laparoscope
 def write(
   path: pathlib.Path, fps: float, encoding: Sequence[str] = ()
 ) -> Iterator[Callable[[np.ndarray], None]]:
-  """Gives a function that takes the frames of a film, or the picture of a .png.
+  """Gives a function that takes the frames of a film, or a picture.
 
   Args:
     path: what to write; its suffix says how, see `FILMS` and `PICTURES`

@@ -25,14 +25,15 @@ def add_arguments(parser: argparse.ArgumentParser):
 
   scenes.add_arguments(parser)
   add = parser.add_argument
-  add("-o", "--out", metavar="FILE", required=True, help="ends in .png, .mp4 or .gif")
+  add("-o", "--out", metavar="FILE", required=True, help="ends in .png, .webp, .jpg, .mp4 or .gif")
   add("--camera", metavar="NAME", help="camera of the scene, or free (laparoscope, else the first)")
   add("--size", metavar="WxH", default="1280x960", help="pixels (%(default)s)")
   add(
     "--seconds",
     metavar="S",
     type=float,
-    help="simulated: a picture shows the end, a film all of it (0, 2)",
+    help="simulated: a picture shows the end, a film all of it (0, 2); in a picture of an exercise "
+    "its expert acts until then",
   )
   add("--fps", metavar="N", type=int, default=25, help="frames a second of a film (%(default)s)")
   add("--slower", metavar="X", type=float, default=1.0, help="slow motion (%(default)s)")
@@ -52,9 +53,9 @@ def main(args: argparse.Namespace) -> int:
   register()
   from . import scenes
 
-  model, data = scenes.load(args, handle=False)
   moving = out.suffix.lower() in film.FILMS
   seconds = args.seconds if args.seconds is not None else (2.0 if moving else 0.0)
+  model, data = scenes.load(args, handle=False, seconds=0.0 if moving else seconds)
   with Interrupt() as interrupt, film.renderer(model, width, height) as renderer:
     shots = _shots(args, model, data, renderer, seconds, moving)
     progress = Progress()
@@ -110,7 +111,7 @@ def _shots(args, model, data, renderer, seconds: float, moving: bool) -> Iterato
   if args.sites:
     option.sitegroup[3] = 1
   renderer.scene.flags[mujoco.mjtRndFlag.mjRND_WIREFRAME] = args.wireframe
-  steps = round(seconds / model.opt.timestep)
+  steps = max(0, round((seconds - data.time) / model.opt.timestep))  # less what an expert has done
   nframe = max(round(seconds * args.fps * args.slower), 1) if moving else 1
   done = 0
   for k in range(nframe):

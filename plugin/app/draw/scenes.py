@@ -41,14 +41,22 @@ def add_arguments(parser: argparse.ArgumentParser):
   parser.add_argument("--keyframe", metavar="NAME", help="state to start from (the first keyframe)")
 
 
-def load(args: argparse.Namespace, handle: bool) -> tuple[mujoco.MjModel, mujoco.MjData]:
-  """Returns model and data at the keyframe; `handle` gives named organs handles to drag."""
+def load(
+  args: argparse.Namespace, handle: bool, seconds: float = 0.0
+) -> tuple[mujoco.MjModel, mujoco.MjData]:
+  """Returns model and data at the keyframe.
+
+  Args:
+    args: the options
+    handle: whether named organs get handles to drag
+    seconds: for which an exercise's expert acts
+  """
   from palpate import models
   from palpate.models import situs
 
   options = ("nodes", "seed", "instruments", "coupling")
   given = [option for option in options if getattr(args, option) is not None]
-  if not given and (found := _exercise(args.scene)):
+  if not given and (found := _exercise(args.scene, seconds)):
     return found
   try:
     if args.scene in models.NAMES:
@@ -72,15 +80,18 @@ def load(args: argparse.Namespace, handle: bool) -> tuple[mujoco.MjModel, mujoco
   return model, data
 
 
-def _exercise(name: str) -> tuple[mujoco.MjModel, mujoco.MjData] | None:
-  """Returns model and data at the start of an exercise of seed 0, None where it is none."""
+def _exercise(name: str, seconds: float) -> tuple[mujoco.MjModel, mujoco.MjData] | None:
+  """Returns model and data of an exercise of seed 0, None where it is none."""
   from palpate import tasks
+  from palpate.tasks.core import performer
 
   domain, _, task = name.partition("/")
   if (domain, task) not in tasks.ALL_TASKS or pathlib.Path(name).exists():
     return None
   env = tasks.load(domain, task, task_kwargs={"random": 0})
-  env.reset()
+  timestep, act = env.reset(), performer.make(env)
+  while env.physics.time() < seconds and not timestep.last():
+    timestep = env.step(act(timestep))
   return env.physics.model.ptr, env.physics.data.ptr
 
 

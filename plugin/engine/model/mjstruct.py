@@ -170,5 +170,5 @@ def check():
         version = importlib.metadata.version("mujoco")
         raise ImportError(
           f"palpate: {struct.__name__}.{field} of mujoco {version} is not where its introspection "
-          "data says; install a version that palpate was run with (3.17)"
+          "data says; install a version that palpate was run with (3.17, 4.0)"
         )

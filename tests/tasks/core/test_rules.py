@@ -1,6 +1,8 @@
 """Rules of exercises, which one world runs and many are compiled from."""
 
+import numpy as np
 import pytest
+from palpate.tasks.core import rules
 from palpate.tasks.core.rules import Rules
 
 
@@ -32,3 +34,10 @@ def test_malformed_rules_are_named(changes, message):
   Rules(**rules)
   with pytest.raises(TypeError, match=message):
     Rules(**rules | changes)
+
+
+def test_closeness_tells_the_way_back_from_anywhere():
+  start, far = 0.05, np.geomspace(1e-4, 10.0, 200)
+  values = np.array([rules.closeness(d, start) for d in far])
+  assert (np.diff(values) < 0).all() and values[0] > 0.99 and -1 < values[-1] < -0.99
+  assert rules.closeness(start, start) == 0
