@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from palpate.engine.forces.attachments import motion
-from palpate.engine.forces.cohesive_bonds import Group
 from palpate.engine.layout import BOND
+from palpate.engine.workspace import Workspace
+from palpate.forces.cohesive_bonds import Group
 
 
 class Bonds:
@@ -16,7 +16,7 @@ class Bonds:
     space: the organ's workspace
   """
 
-  def __init__(self, space):
+  def __init__(self, space: Workspace):
     self._space = space
 
   @property
@@ -100,7 +100,7 @@ class Bonds:
   @property
   def positions(self) -> np.ndarray:
     """Where their vertices are now [m], (n, 3)."""
-    return motion(self._space, self.vertices)[0]
+    return self._space.host.places(self.vertices)
 
   @property
   def stretch(self) -> np.ndarray:
@@ -122,5 +122,5 @@ class Bonds:
     return self._written("pull")
 
   def _written(self, name: str) -> np.ndarray:
-    parts = [group.arrays[name].numpy()[: len(group.now.vert)] for group in self._groups]
+    parts = [group.arrays[name].numpy()[0, : len(group.now.vert)] for group in self._groups]
     return np.concatenate([np.zeros((0, 3)), *parts])

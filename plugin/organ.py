@@ -154,11 +154,13 @@ class Organ:
 
   def detach(self):
     """Takes away what `attach` has made; what the model declares stays."""
-    made = [group for group in self._space.ties.groups if not group.by]
+    held = self._space.attachments
+    made = [group for group in held.groups if not group.by]
     for group in made:
       if group.other is not None:
-        theirs = [g for g in group.other.ties.groups if g.other is self._space and not g.by]
-        change.detach(group.other, self.model._address, theirs)
+        other = engine.find(self.data._address, group.other.host.instance)
+        theirs = [g for g in group.other.groups if g.other is held and not g.by]
+        change.detach(other, self.model._address, theirs)
     change.detach(self._space, self.model._address, made)
 
   @signals.deferred()
@@ -318,7 +320,7 @@ class Organ:
   @property
   def support_force(self) -> np.ndarray:
     """Sum of the forces of what the organ rests on (`support`) in the last step [N], (3,)."""
-    return self._space.rests.force().sum(axis=0)
+    return self._space.supports.force().sum(axis=0)
 
   @property
   def energy(self) -> float:
@@ -420,7 +422,7 @@ class Attachment:
   def force(self) -> np.ndarray:
     """Force on the organ in the last step, in the world [N], (3,); zero when it is detached."""
     space, group = self._made[0]
-    return space.ties.force(group).sum(axis=0)
+    return space.attachments.force(group).sum(axis=0)
 
   def detach(self):
     """Lets go."""

@@ -220,7 +220,7 @@ def outer(organ: "Declaration") -> int:
 def sizes(organ: "Declaration") -> dict[str, int]:
   """Returns what the blocks of an organ's plugin state need."""
   relaxes = organ.config.relax_share > 0
-  out = {"ncreep": int(organ.free.sum()) if relaxes else 0}
+  out = {"nrelax": int(organ.free.sum()) if relaxes else 0}
   whole = organ.mesh.whole
   out |= cut_sizes(whole.nelem, whole.nvert, whole.spare, bool(len(whole.tet)))
   out["nbond"] = int(organ.free[: outer(organ)].sum()) if organ.config.bonded else 0

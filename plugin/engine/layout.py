@@ -219,7 +219,7 @@ class NodalState:
   force: doubles("nfree")  # contact force of the last step [N]
   last: doubles("nmoving")  # last change of the velocity, of those inside after the others [m/s]
   before: doubles("nmoving")  # the one before it [m/s]
-  creep: doubles("ncreep", 6)  # see `creep`
+  relaxation: doubles("nrelax", 6)  # see `forces/relaxation.h` [N]
   bond: doubles("nbond", len(BOND))  # of each vertex that moves, see BOND
   blade: doubles("nblade", len(BLADE))  # of each geom that cuts, see BLADE
   cuts: Topology
@@ -243,7 +243,7 @@ class WindowState:
 
   motion: Motion
   force: doubles("nslot", 3)  # contact force of the last step on each slot [N]
-  creep: doubles("ncreep", 6)  # see `creep`
+  relaxation: doubles("nrelax", 6)  # see `forces/relaxation.h` [N]
   bond: doubles("nbond", len(BOND))  # of each vertex that moves, see BOND
   blade: doubles("nblade", len(BLADE))  # of each geom that cuts, see BLADE
   slip: doubles("nrest", 3)  # how far nodes have slipped on what they rest on [m]

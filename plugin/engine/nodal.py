@@ -5,11 +5,10 @@
 from typing import TYPE_CHECKING
 
 import numpy as np
-import warp as wp
 from palpate.tissue import step
 from palpate.tissue.types import doubles, fill, ints, struct
 
-from . import coupling, layout
+from . import coupling
 from .coupling import Crossing, Mujoco
 from .layout import FLAG, NodalState
 from .model import inertia, mjstruct
@@ -59,8 +58,6 @@ class Phases(coupling.Phases):
     vert = s.vert.numpy()
     dofadr = _in_node_order(organ.dofadr, vert)
     dofs = np.maximum(dofadr, 0)[:, None] + np.arange(3)
-    sizes = coupling.sizes(organ)
-    state = coupling.plugin_state(model, w.data, instance, layout.size(NodalState, sizes))
     weighs = organ.mesh.spare > 0 or len(organ.mesh.tet) > 0
     nweighed = weighs * len(vert)
     values = dict(
@@ -77,15 +74,14 @@ class Phases(coupling.Phases):
       weight=np.zeros(nweighed),
       inertia=np.zeros(nweighed),
       shift=np.zeros((nweighed, 3)),
-      heaviest=w.host["heaviest"],
+      heaviest=w.host.arrays["heaviest"],
       number=w.body.numbers,
-      flags=wp.array(np.asarray(w.report.flags), dtype=int, device="cpu", copy=False),
-      lagged=w.host["lagged"],
-      own=layout.carve(NodalState, state, sizes),
+      flags=w.host.flags,
+      lagged=w.host.arrays["lagged"],
+      own=w.host.own,
       mj=coupling.mujoco_arrays(model, w.data),
-      solve=coupling.crossing(w.host),
+      solve=coupling.crossing(w.host.arrays),
     )
-    w.views["plugin_state"] = state
     self._nodal, self._w, self._model = fill(Nodal, "cpu", values), w, m
     self.reshape()
 

@@ -72,7 +72,7 @@ def make(w: "Workspace", side, motion, boxes: tuple[wp.array, wp.array], sizes: 
     motion=motion,
     inbox=layout.carve(Inbox, boxes[0], sizes),
     outbox=layout.carve(Outbox, boxes[1], sizes),
-    solve=coupling.crossing(coupling.on_body(w.body) if w.config.resident else w.host),
+    solve=coupling.crossing(coupling.on_body(w.body) if w.config.resident else w.host.arrays),
   )
   return fill(Nodes, side, values)
 
@@ -87,7 +87,7 @@ class Weights:
 
   def __init__(self, w: "Workspace", nodes):
     self._w, self._nodes, self._here = w, nodes, Views(nodes)
-    self._number, self._mass = w.body.shape.node.numpy(), w.host["mass"].numpy().reshape(-1)
+    self._number, self._mass = w.body.shape.node.numpy(), w.host.arrays["mass"].numpy().reshape(-1)
 
   def put(self, vert: np.ndarray):
     """Gives the nodes what these vertices have now."""
@@ -101,7 +101,7 @@ class Weights:
     # Nodes without a mass have one in the solver, so that nothing divides by zero.
     self._mass[self._number[vert]] = np.where(mass[vert] > 0, mass[vert], 1.0)
     if w.body.device.is_cuda:
-      wp.copy(w.body.state.mass, w.host["mass"])
+      wp.copy(w.body.state.mass, w.host.arrays["mass"])
 
 
 def launch(kernel, nodes, count: int, device):

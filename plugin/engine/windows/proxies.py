@@ -169,9 +169,9 @@ def make(w: "Workspace", model: int, sizes: dict[str, int]):
     following=np.full(room, -1),
     frame=organ.frame,
     origin=organ.origin,
-    heaviest=w.host["heaviest"],
+    heaviest=w.host.arrays["heaviest"],
     number=w.body.numbers,
-    flags=wp.array(np.asarray(w.report.flags), dtype=int, device="cpu", copy=False),
+    flags=w.host.flags,
     home=win.home,
     qhome=win.qhome,
     dofadr=win.dofadr,
@@ -181,8 +181,8 @@ def make(w: "Workspace", model: int, sizes: dict[str, int]):
     elem_adr=win.elem_adr,
     elem_num=win.elem_num,
     geom=win.geom,
-    lagged=w.host["lagged"],
-    status=w.host["status"],
+    lagged=w.host.arrays["lagged"],
+    status=w.host.arrays["status"],
     mj=coupling.mujoco_arrays(model, w.data),
   )  # fmt: skip
   return fill(Slots, "cpu", values)

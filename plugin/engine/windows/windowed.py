@@ -21,7 +21,7 @@ from palpate.tissue import step
 from palpate.tissue.types import Views
 
 from .. import coupling, layout, safe_calls
-from ..layout import TAIL, Inbox, Motion, Outbox, WindowState
+from ..layout import TAIL, Inbox, Motion, Outbox
 from ..model import inertia, mjstruct, prepare
 from . import nodes, proxies
 from .resident import Resident
@@ -41,23 +41,20 @@ class Phases(coupling.Phases):
     organ, win = w.organ, w.organ.window
     self.side = w.body.device if w.config.resident else wp.get_device("cpu")
     self._resident, self._away = w.config.resident, self.side.is_cuda
-    self._status = w.host["status"], w.body.system.status
+    self._status = w.host.arrays["status"], w.body.system.status
     m = mjstruct.Model.from_address(model)
     first = mjstruct.view(m.body_treeid, m.nbody, np.int32)[win.body[0]]
     w.seen.policy = mjstruct.view(m.tree_sleep_policy, m.ntree, np.int32)[first:].data
     w.seen.counts = mjstruct.view(m.flex_vertnum, m.nflex, np.int32)[organ.flex :].data
     sizes = self._sizes(organ)
-    size = layout.size(WindowState, sizes)
-    state = coupling.plugin_state(model, w.data, instance, size)
     if not w.views:
       w.views = proxies.scratch(organ.mesh.nvert, win.nslot) | {
         name: wp.zeros(layout.size(kind, sizes), dtype=wp.float64, device="cpu", pinned=self._away)
         for name, kind in (("inbox", Inbox), ("outbox", Outbox), ("foreseen", Inbox))
       }
     v = w.views
-    v["plugin_state"] = state
     w.boxes = {
-      "own": layout.carve(WindowState, state, sizes),
+      "own": w.host.own,
       "inbox": layout.carve(Inbox, v["inbox"], sizes),
       "outbox": layout.carve(Outbox, v["outbox"], sizes),
       "foreseen": layout.carve(Inbox, v["foreseen"], sizes),
@@ -208,7 +205,7 @@ class Phases(coupling.Phases):
 def settle(w: Workspace, model: int):
   """Readies the state for the default slots."""
   set_inertia(w, mjstruct.Model.from_address(model))
-  w.views["plugin_state"].fill_(0.0)  # MuJoCo has not cleared it yet
+  w.host.state.fill_(0.0)  # MuJoCo has not cleared it yet
 
 
 def find_astray(w: Workspace) -> float:

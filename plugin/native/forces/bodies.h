@@ -14,6 +14,7 @@ PALPATE void move_to(Array& a, int world) {
 
 template <class Arrays>
 PALPATE void move_bodies(Arrays& mj, int world) {
+  move_to(mj.ctrl, world);
   move_to(mj.xpos, world);
   move_to(mj.xmat, world);
   move_to(mj.cvel, world);

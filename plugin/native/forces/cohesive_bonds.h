@@ -219,9 +219,7 @@ template <class Fields>
 PALPATE void burn_bonds(const Fields& all, Thread t, int) {
   if (!all.bonds.live.data[0] || t.tid > 0) return;
   const auto f = of_world(all.bonds, t.world);
-  auto ctrl = all.ctrl;
-  move_to(ctrl, t.world);
-  const double given = fabs((double)ctrl.data[all.actuator]) * f.mj.timestep.data[0];
+  const double given = fabs((double)f.mj.ctrl.data[all.actuator]) * f.mj.timestep.data[0];
   if (given == 0.0) return;
   const auto* R = f.mj.geom_xmat.data + 9 * all.geom;
   const D3 axis = {R[all.axis], R[3 + all.axis], R[6 + all.axis]};

@@ -204,7 +204,7 @@ def times(w, count: int = 20, clock=time.perf_counter) -> dict[str, np.ndarray]:
   """
   body, scheme = w.body, w.config.integrator
   workspace.sync(w)
-  state = w.views["plugin_state"].numpy()
+  state = w.plugin_state
   kept = state.copy()
   works = {"step": lambda: stepping.step(body, scheme)}
   if stepping.SCHEMES[scheme].respond:
