@@ -24,7 +24,7 @@ class Bonds:
     return self._space.bonds.groups
 
   def _all(self, name: str, width: tuple[int, ...] = ()) -> np.ndarray:
-    parts = [np.asarray(getattr(group.now, name)) for group in self._groups]
+    parts = [np.asarray(group.now[name]) for group in self._groups]
     return np.concatenate([np.zeros((0, *width)), *parts])
 
   @property
@@ -49,7 +49,7 @@ class Bonds:
   def made(self) -> np.ndarray:
     """Which of the bonds that were made each is, or is a part of since a cut, (n,)."""
     first = np.cumsum([0, *(len(group.grip.vert) for group in self._groups)])
-    parts = [group.now.made + k for group, k in zip(self._groups, first, strict=False)]
+    parts = [group.now["made"] + k for group, k in zip(self._groups, first, strict=False)]
     return np.concatenate([np.zeros(0, int), *parts])
 
   @property
@@ -111,7 +111,7 @@ class Bonds:
   def stored(self) -> float:
     """Elastic energy that they had then, less what the step's damage took of it [J]."""
     stiffness = np.repeat(
-      [g.law.stiffness for g in self._groups], [len(g.now.vert) for g in self._groups]
+      [g.law.stiffness for g in self._groups], [len(g.now["vert"]) for g in self._groups]
     )
     far2 = (self.stretch**2).sum(axis=1)
     return float((0.5 * stiffness * self.area * (1.0 - self.damage) * far2).sum())
@@ -122,5 +122,5 @@ class Bonds:
     return self._written("pull")
 
   def _written(self, name: str) -> np.ndarray:
-    parts = [group.arrays[name].numpy()[0, : len(group.now.vert)] for group in self._groups]
+    parts = [group.arrays[name].numpy()[0, : len(group.now["vert"])] for group in self._groups]
     return np.concatenate([np.zeros((0, 3)), *parts])

@@ -142,9 +142,9 @@ class Grown(Bonds):
   def __init__(self, organ: Organ):
     groups, self.batch = organ.forces.of(cohesive_bonds.Bonds).groups, organ.batch
     made = [group.now for group in groups]
-    self.vertices = np.concatenate([np.zeros(0, int), *(now.vert for now in made)])
-    self.area = np.concatenate([np.zeros(0), *(now.area for now in made)])
-    first = np.cumsum([0, *(len(now.vert) for now in made)])
+    self.vertices = np.concatenate([np.zeros(0, int), *(now["vert"] for now in made)])
+    self.area = np.concatenate([np.zeros(0), *(now["area"] for now in made)])
+    first = np.cumsum([0, *(len(now["vert"]) for now in made)])
     names = "row", "count", "made", "slot", "state", "pull"
     self._groups = [
       fill(BondLists, None, {name: getattr(g.fields, name) for name in names} | {"before": int(k)})
@@ -152,7 +152,7 @@ class Grown(Bonds):
     ]
     super().__init__(organ.batch.nworld, organ.batch.device)
 
-  def _over(self, what: wp.Kernel, *values: wp.array):
+  def _over(self, what: Any, *values: wp.array):
     for lists in self._groups:
       dim = lists.pull.shape[:2]
       wp.launch(what, dim=dim, inputs=[lists, *values], device=self._device)

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import abc
-import functools
-from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
@@ -13,12 +12,12 @@ from palpate.engine import coupling
 from palpate.engine.layout import FLAG
 from palpate.engine.workspace import Workspace
 from palpate.forces import host
-from palpate.forces.host import Input, Rows, Twin, WorldBodies, WorldNodes
+from palpate.forces.host import Input, Twin, WorldBodies, WorldNodes
 from palpate.forces.passive import Force
 from palpate.forces.table import FORCES
 from palpate.tissue import body as bodies
 from palpate.tissue.geometry.mesh import Mesh
-from palpate.tissue.types import fill
+from palpate.tissue.types import DIMS, fill
 
 from .kernels import forget, put_back_rows
 from .patch import launch
@@ -30,23 +29,6 @@ if TYPE_CHECKING:
 _LOOK = 10  # steps after which the host looks, at most
 
 
-class Kept(NamedTuple):
-  """What worlds keep of a block of the plugin state.
-
-  Attributes:
-    array: in each world, (nworld, n, width)
-    start: where worlds start, (1, n * width)
-  """
-
-  array: wp.array
-  start: wp.array
-
-  @property
-  def flat(self) -> wp.array:
-    """The array, (nworld, n * width)."""
-    return self.array.reshape((self.array.shape[0], -1))
-
-
 class Host(host.Host):
   """An organ in all worlds of a batch.
 
@@ -54,7 +36,8 @@ class Host(host.Host):
     organ: the organ, whose patch is made
 
   Attributes:
-    kept: blocks of the plugin state that forces have asked for, by name
+    kept: what worlds keep of blocks of the plugin state that forces have asked for, by name, and
+      where they start: (nworld, numbers) and (1, numbers)
   """
 
   alone = False
@@ -64,67 +47,44 @@ class Host(host.Host):
     self.nworld, self.device = organ.batch.nworld, organ.batch.device
     self.instance, self.model = organ.instance, organ.space.model
     self.organ, self.config = organ.declared, organ.config
-    self.arrays = coupling.on_body(organ.body)
-    self.kept: dict[str, Kept] = {}
-    self._rows: list[Rows] = []
+    self.arrays, self.number = coupling.on_body(organ.body), organ.body.tissue.number
+    self.kept: dict[str, tuple[wp.array, wp.array]] = {}
+    self._which: list[wp.array] = []
     # Whether the step ended with the organ's answer, which is the same in all worlds.
     answered = np.zeros((2, len(FLAG)), np.int32)
     answered[1, FLAG.answered] = 1
     self._flags = [wp.array(row, dtype=int, device=self.device) for row in answered]
+    self.nodes, self.input = nodes_of(organ), input_of(organ)
 
-  @property
-  def bodies(self) -> Any:
-    """See `Host`."""
-    return self._batch.bodies
-
-  @functools.cached_property
-  def nodes(self) -> Any:
-    """See `Host`."""
-    return nodes_of(self._organ)
-
-  @property
-  def input(self) -> Any:
-    """See `Host`."""
-    return input_of(self._organ)
-
-  @property
-  def number(self) -> wp.array:
-    """See `Host`."""
-    return self._organ.body.tissue.number
-
-  @property
-  def flags(self) -> wp.array:
-    """See `Host`."""
-    return self._flags[bool(self._organ.patch.stiff and self._organ.responds)]
-
-  @property
-  def springs(self) -> wp.array | None:
-    """See `Host`."""
-    hold = self._organ.body.state.hold
-    return hold if hold.size else None
+  def bind(self):
+    """Points at the bodies and the springs that there are by now."""
+    self.bodies, self.input = self._batch.bodies, input_of(self._organ)
 
   def need_springs(self):
     """See `Host`."""
-    bodies.hold(self._organ.body)
+    self.springs = bodies.hold(self._organ.body)
+
+  def flags(self) -> wp.array:
+    """See `Host`."""
+    return self._flags[bool(self._organ.patch.stiff and self._organ.responds)]
 
   def rows(self, block: str, width: int) -> wp.array:
     """See `Host`."""
     if block not in self.kept:
       where = coupling.spans(self.organ)[block]
-      n = (where.stop - where.start) // width
-      start = wp.zeros((1, n * width), dtype=wp.float64, device=self.device)
-      self.kept[block] = Kept(self.zeros(n, width), start)
-    return self.kept[block].array
+      n, kind = where.stop - where.start, {"dtype": wp.float64, "device": self.device}
+      self.kept[block] = wp.zeros((self.nworld, n), **kind), wp.zeros((1, n), **kind)
+    return self.kept[block][0].reshape((self.nworld, -1, width))
 
   def mesh(self, world: int) -> Mesh:
     """See `Host`; as it was when the topology's `follow` was called."""
     topology = self._organ.topology
     return topology.mesh_of(world) if topology else self.organ.mesh
 
-  def which_rows(self, others: Iterable[host.Host] = ()) -> Rows:
+  def which(self, others: Sequence[host.Host]) -> wp.array:
     """See `Host`."""
-    self._rows.append(Rows(self, any(each.organ.mesh.spare for each in (self, *others))))
-    return self._rows[-1]
+    self._which.append(super().which(others))
+    return self._which[-1]
 
   def body_number(self, body: int) -> int:
     """See `Host`."""
@@ -143,13 +103,11 @@ class Host(host.Host):
 
   def rest(self):
     """Puts what worlds keep where those of the mask start, and gives these the first lists."""
-    mask = self._batch.mask
-    for kept in self.kept.values():
-      inputs = [mask, kept.start, kept.flat]
-      wp.launch(put_back_rows, dim=kept.flat.shape, inputs=inputs, device=self.device)
-    for rows in self._rows:
-      if rows.count > 1:
-        wp.launch(forget, dim=self.nworld, inputs=[mask, rows.which], device=self.device)
+    mask, device = self._batch.mask, self.device
+    for there, start in self.kept.values():
+      wp.launch(put_back_rows, dim=there.shape, inputs=[mask, start, there], device=device)
+    for which in self._which:
+      wp.launch(forget, dim=self.nworld, inputs=[mask, which], device=device)
 
 
 class Opens(Force):
@@ -202,17 +160,13 @@ def check(spaces: Iterable[Workspace]):
 
 def bodies_of(batch: Worlds) -> Any:
   """Returns `WorldBodies` of a batch's worlds."""
-  m, d, model = batch.m, batch.d, batch.bare
-  own = {"timestep": np.array([model.opt.timestep])}
-  own |= {"geom_size": model.geom_size, "geom_aabb": model.geom_aabb.reshape(-1, 6)}
-  values = {}
+  d, model, values = batch.d, batch.bare, {}
   for name in WorldBodies.vars:
-    if name in own:
-      values[name] = np.asarray(own[name])
-    elif hasattr(d, name):
+    if hasattr(d, name):
       values[name] = _rows(getattr(d, name))
     else:
-      values[name] = getattr(m, name)
+      source = model.opt if hasattr(model.opt, name) else model
+      values[name] = np.asarray(getattr(source, name)).reshape(-1, *DIMS["WorldBodies"][name][1:])
   return fill(WorldBodies, batch.device, values)
 
 

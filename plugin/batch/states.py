@@ -129,8 +129,8 @@ def _pull_organ(organ: Organ, world: int, model, data):
     _pull_slots(organ, world, own, spans, force)
   if organ.topology:
     organ.topology.pull(world, own, spans)
-  for block, kept in organ.host.kept.items():
-    own[spans[block]] = kept.array[world].numpy().ravel()
+  for block, (there, _) in organ.host.kept.items():
+    own[spans[block]] = there[world].numpy()
   own[spans["signature"]] = declared.signature
 
 
@@ -198,7 +198,7 @@ def keep(batch: Worlds, start, data: mujoco.MjData):
       name: getattr(organ.patch, name) for name in ("force", "heavier", "calm")
     }
     pairs += [(array, getattr(organ.patch, f"{name}0")) for name, array in own.items()]
-    pairs += [(kept.flat, kept.start) for kept in organ.host.kept.values()]
+    pairs += organ.host.kept.values()
   # The first world has it for a moment.
   changed = [array for array, _ in pairs] + [d.ctrl, d.time, d.qacc_warmstart]
   saved = [(array, wp.clone(array[:1])) for array in changed if array.size]
@@ -249,5 +249,5 @@ def _push_organ(organ: Organ, world: int, model, data):
   _assign(organ.patch.force, world, full)
   for array, value in ((organ.patch.heavier, heavier), (organ.patch.calm, calm)):
     array[world : world + 1].assign(np.array([value]))
-  for block, kept in organ.host.kept.items():
-    _assign(kept.array, world, own[spans[block]].reshape(kept.array.shape[1:]))
+  for block, (there, _) in organ.host.kept.items():
+    _assign(there, world, own[spans[block]])

@@ -5,17 +5,16 @@ from typing import Any
 
 import numpy as np
 import warp as wp
+from palpate.engine import coupling, layout
+from palpate.engine.layout import FLAG, TAIL, NodalState, WindowState
+from palpate.engine.model import mjstruct
+from palpate.engine.model.declare import Declaration
 from palpate.forces import host
-from palpate.forces.host import Bodies, Input, Nodes, Rows, Twin
+from palpate.forces.host import Bodies, Input, Nodes, Twin
 from palpate.tissue import body as bodies
 from palpate.tissue.body import Body
 from palpate.tissue.geometry.mesh import Mesh
 from palpate.tissue.types import fill
-
-from . import coupling, layout
-from .layout import FLAG, TAIL, NodalState, WindowState
-from .model import mjstruct
-from .model.declare import Declaration
 
 
 class Host(host.Host):
@@ -50,39 +49,18 @@ class Host(host.Host):
     size = organ.windows.nslot if organ.windows else body.shape.nnode
     self.arrays["lagged"] = wp.zeros((size, 3), dtype=wp.float64, device="cpu")
     self.arrays["heaviest"] = wp.ones(1, dtype=wp.float64, device="cpu")
-    self._flags = wp.zeros(len(FLAG), dtype=int, device="cpu")
-    self._springs: wp.array | None = None
-    self._known: dict[str, Any] = {}
+    self.number, self._flags = body.numbers, wp.zeros(len(FLAG), dtype=int, device="cpu")
     self.bind(model)
 
   def bind(self, model: int):
     """Points at the arrays of a model and of the mjData."""
-    organ, self.model, self._known = self.organ, model, {}
-    kind, self._sizes = WindowState if organ.windows else NodalState, coupling.sizes(organ)
-    size = layout.size(kind, self._sizes)
+    organ, self.model = self.organ, model
+    kind, sizes = WindowState if organ.windows else NodalState, coupling.sizes(organ)
+    size = layout.size(kind, sizes)
     self.state = coupling.plugin_state(model, self.data, self.instance, size)
-    self.own = layout.carve(kind, self.state, self._sizes)
-
-  def _once(self, name: str, make: Any) -> Any:
-    """Returns what `make` returned first since the arrays are these."""
-    if name not in self._known:
-      self._known[name] = make()
-    return self._known[name]
-
-  @property
-  def bodies(self) -> Any:
-    """See `Host`."""
-    make = lambda: coupling.mujoco_arrays(self.model, self.data, Bodies)  # noqa: E731
-    return self._once("bodies", make)
-
-  @property
-  def nodes(self) -> Any:
-    """See `Host`."""
-    return self._once("nodes", self._nodes)
-
-  def _nodes(self) -> Any:
-    organ, none = self.organ, np.zeros((0, 3))
-    motion = self.own.motion if organ.windows else None
+    self.own = layout.carve(kind, self.state, sizes)
+    self.bodies = coupling.mujoco_arrays(model, self.data, Bodies)
+    motion, none = self.own.motion if organ.windows else None, np.zeros((0, 3))
     values = dict(
       windowed=int(motion is not None),
       rest=self._rest(),
@@ -93,73 +71,53 @@ class Host(host.Host):
       frame=organ.frame,
       origin=organ.origin,
     )
-    return fill(Nodes, "cpu", values)
+    self.nodes = fill(Nodes, "cpu", values)
+    self._fill_input()
 
   def _rest(self) -> np.ndarray:
     """Returns what displacements are from: nodal, qpos0 whatever was cut [m], (nvert, 3)."""
     return self.organ.mesh.rest if self.organ.windows else self.organ.mesh.whole.rest
 
-  @property
-  def input(self) -> Any:
-    """See `Host`."""
-    return self._once("input", self._input)
-
-  def _input(self) -> Any:
+  def _fill_input(self):
     values = {name: self.arrays[name] for name in ("force_ext", "vel", "dvel", "status")}
     quiet = np.zeros(1)
     if self.organ.windows:
       quiet = coupling.wrap(self.own.tail.ptr + 8 * TAIL.quiet, 1)
-    hold = np.zeros((0, 0, 6, 8)) if self._springs is None else self._springs
+    hold = np.zeros((0, 0, 6, 8)) if self.springs is None else self.springs
     node = self.body.shape.node.numpy()
-    return fill(Input, "cpu", values | {"node": node, "quiet": quiet, "hold": hold})
-
-  @property
-  def number(self) -> wp.array:
-    """See `Host`."""
-    return self.body.numbers
-
-  @property
-  def flags(self) -> wp.array:
-    """See `Host`."""
-    return self._flags
-
-  @property
-  def springs(self) -> wp.array | None:
-    """See `Host`."""
-    return self._springs
-
-  def need_springs(self):
-    """See `Host`."""
-    if self._springs is None:
-      there = bodies.hold(self.body)
-      cuda = self.body.device.is_cuda
-      self._springs = wp.zeros_like(there, device="cpu", pinned=True) if cuda else there
-      self._known.pop("input", None)
-
-  def send_springs(self):
-    """Brings the springs to the device of the solve."""
-    there = self.body.state.hold
-    if self._springs is not None and there.device.is_cuda:
-      wp.copy(there, self._springs)
-
-  def rows(self, block: str, width: int) -> wp.array:
-    """See `Host`."""
-    array = getattr(self.own, block)
-    return self._once(block, lambda: array.reshape((1, *array.shape)))
-
-  def mesh(self, world: int) -> Mesh:
-    """See `Host`."""
-    return self.organ.mesh
+    self.input = fill(Input, "cpu", values | {"node": node, "quiet": quiet, "hold": hold})
 
   def become(self, organ: Declaration):
     """Takes the organ that a cut has made, or a state that was set."""
     self.organ = organ
-    if "nodes" in self._known:
-      self.nodes.rest.numpy()[:] = self._rest()
+    self.nodes.rest.numpy()[:] = self._rest()
 
-  def which_rows(self, others=()) -> Rows:
+  def need_springs(self):
     """See `Host`."""
-    return Rows(self, False)
+    if self.springs is None:
+      there = bodies.hold(self.body)
+      cuda = self.body.device.is_cuda
+      self.springs = wp.zeros_like(there, device="cpu", pinned=True) if cuda else there
+      self._fill_input()
+
+  def send_springs(self):
+    """Brings the springs to the device of the solve."""
+    there = self.body.state.hold
+    if self.springs is not None and there.device.is_cuda:
+      wp.copy(there, self.springs)
+
+  def flags(self) -> wp.array:
+    """See `Host`."""
+    return self._flags
+
+  def rows(self, block: str, width: int) -> wp.array:
+    """See `Host`."""
+    array = getattr(self.own, block)
+    return array.reshape((1, *array.shape))
+
+  def mesh(self, world: int) -> Mesh:
+    """See `Host`."""
+    return self.organ.mesh
 
   def load(self, kernel: Twin):
     """See `Host`."""

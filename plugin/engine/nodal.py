@@ -76,7 +76,7 @@ class Phases(coupling.Phases):
       shift=np.zeros((nweighed, 3)),
       heaviest=w.host.arrays["heaviest"],
       number=w.body.numbers,
-      flags=w.host.flags,
+      flags=w.host.flags(),
       lagged=w.host.arrays["lagged"],
       own=w.host.own,
       mj=coupling.mujoco_arrays(model, w.data),

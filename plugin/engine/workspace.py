@@ -8,6 +8,8 @@ from typing import Any
 import mujoco
 import numpy as np
 import warp as wp
+from palpate.engine.host import Host
+from palpate.engine.model.declare import Declaration
 from palpate.forces import declare_attachments, declare_bonds, supports
 from palpate.forces.attachments import Attachments
 from palpate.forces.cohesive_bonds import Bonds
@@ -23,10 +25,8 @@ from .bind import bind
 from .coupling import Phases
 from .cutting.cutters import Cutters
 from .cutting.solid_cuts import Cuts, cuts_of
-from .host import Host
 from .layout import FLAG, HEAD
 from .model import declare, flexes, inertia, mjstruct, prepare, skin
-from .model.declare import Declaration
 from .penetration import Watch
 from .windows import declare_windows, windowed
 from .windows.model_lock import Turn
@@ -414,7 +414,7 @@ def make(model: int, data: int, instance: int) -> Workspace:
     m = mjstruct.Model.from_address(model)
     body = bodies.worlds(organ.still)
     host = Host(organ, body, data, model, instance)
-    w = Workspace(host, Seen(instance), Report(host.flags.numpy().data))
+    w = Workspace(host, Seen(instance), Report(host.flags().numpy().data))
     if organ.windows:
       w.turn = Turn()
     _view(w, mjstruct.Data.from_address(data), m)

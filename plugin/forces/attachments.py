@@ -182,10 +182,10 @@ class Attachments(Force):
   def _allocate(self, values: dict[str, np.ndarray]):
     """Makes room, with some for cuts, and where there is one world for more of them."""
     host, n = self.host, len(values["vert"])
-    spare = sum(each.organ.mesh.spare for each in (host, *(other.host for other in self._others)))
+    others = [other.host for other in self._others]
+    spare = sum(each.organ.mesh.spare for each in (host, *others))
     room = (max(_LEAST, 2 * n) if host.alone else n) + len(self.groups) * spare
-    rows = host.which_rows([other.host for other in self._others])
-    self._lists = Lists(host, Attached, rows, values, room - n)
+    self._lists = Lists(host, Attached, others, values, room - n)
     self._own = {"point": host.zeros(room, 6), "force": host.zeros(room, 3)}
     host.need_springs()
     if self.fields is not None:
@@ -270,10 +270,8 @@ class Attachments(Force):
     """See `Force`; the stretch is that of the last step."""
     if self._lists is None:
       return []
-    names, row = ("count", "vert", "stiffness"), self._lists.rows.at(world)
-    count, vert, stiff = (self._lists.arrays[name][row].numpy() for name in names)
-    vert, stiff = vert[: count[0]].copy(), stiff[: count[0]].copy()
-    force = self._own["force"][world].numpy()[: count[0]]
+    vert, stiff = self._lists.of(world, "vert", "stiffness")
+    force = self._own["force"][world].numpy()[: len(vert)]
     return [(vert, stiff, -force / np.maximum(stiff, 1e-30)[:, None])]
 
   def force(self, group: Group) -> np.ndarray:

@@ -19,7 +19,6 @@ from .passive import Force, Springs
 from .transfer import Grip, Spots
 
 ON_ORGAN = -1  # in place of a body
-_LISTS = ("made", "vert", "slot", "area", "anchor", "normal", "corner", "weight")
 
 
 @struct
@@ -82,35 +81,6 @@ _stretch, _enter, _bear, _act, _feel, _keep = kernels(
 (_burn,) = kernels(_HEADER, Burning, "burn_bonds")
 
 
-@dataclasses.dataclass(frozen=True)
-class Found:
-  """What became of bonds on meshes that have been cut.
-
-  Attributes:
-    made: which of those that were made                   (n,)
-    vert: vertices that they are on                       (n,)
-    slot: their rows in the plugin state                  (n,)
-    area: of each [m^2]                                   (n,)
-    anchor: what each leads to in the axes of body or triangle [m] (n, 3)
-    normal: away from its bed in these axes, or 0         (n, 3)
-    corner: vertices of the other organ that hold each    (n, 3)
-    weight: their shares                                  (n, 3)
-  """
-
-  made: np.ndarray
-  vert: np.ndarray
-  slot: np.ndarray
-  area: np.ndarray
-  anchor: np.ndarray
-  normal: np.ndarray
-  corner: np.ndarray
-  weight: np.ndarray
-
-  def lists(self) -> dict[str, np.ndarray]:
-    """Returns the lists of `Bonded`."""
-    return {"count": np.array([len(self.vert)])} | {name: getattr(self, name) for name in _LISTS}
-
-
 @dataclasses.dataclass(eq=False)
 class Group:
   """Bonds that were made together.
@@ -124,8 +94,8 @@ class Group:
     other: bonds of the other organ, or None
     spots: the points of it that they lead to
     declared: whether the model has them, not somebody who made them while running
-    now: what became of them; with many worlds, what they were at first
-    lists: that, as the kernels have it
+    now: what became of them, lists of `Bonded`; with many worlds, what they were at first
+    lists: that of all worlds
     arrays: what the kernels write, with room for cuts
     fields: what they take
   """
@@ -137,13 +107,13 @@ class Group:
   other: Optional["Bonds"]
   spots: Spots | None
   declared: bool
-  now: Any = dataclasses.field(default=None, init=False)
+  now: dict[str, np.ndarray] = dataclasses.field(default_factory=dict, init=False)
   lists: Any = dataclasses.field(default=None, init=False)
   arrays: dict[str, wp.array] = dataclasses.field(default_factory=dict, init=False)
   fields: Any = dataclasses.field(default=None, init=False)
 
-  def found(self, host: Host, world: int) -> Found:
-    """Returns what became of the bonds of a host's organ in a world."""
+  def found(self, host: Host, world: int) -> dict[str, np.ndarray]:
+    """Returns what became of the bonds of a host's organ in a world, lists of `Bonded`."""
     made, held = self.made, self.grip.now(host.mesh(world))
     row = held.row
     anchor = made["anchor"][row] + np.einsum("nij,nj->ni", made["turn"][row], held.shift)
@@ -152,9 +122,17 @@ class Group:
       there = self.other.host.mesh(world)
       corner, weight, turn = (each[row] for each in self.spots.now(there))
       anchor = np.einsum("nij,nj->ni", turn, anchor)
-    slot = (np.cumsum(host.organ.free) - 1)[held.vert]
-    area, normal = made["area"][row] * held.share, made["normal"][row]
-    return Found(row, held.vert, slot, area, anchor, normal, corner, weight)
+    return {
+      "count": np.array([len(row)]),
+      "made": row,
+      "vert": held.vert,
+      "slot": (np.cumsum(host.organ.free) - 1)[held.vert],
+      "area": made["area"][row] * held.share,
+      "anchor": anchor,
+      "normal": made["normal"][row],
+      "corner": corner,
+      "weight": weight,
+    }
 
   def alike(self, other: "Group") -> bool:
     """Returns whether bonds of another mjData of the model are the same."""
@@ -197,17 +175,17 @@ class Bonds(Force):
       ValueError: a vertex is bonded already.
     """
     host, found = self.host, group.found(self.host, 0)
-    bonded = [found.vert[:0], *(each.now.vert for each in self.groups)]
-    twice = np.intersect1d(found.vert, np.concatenate(bonded))
+    bonded = [found["vert"][:0], *(each.now["vert"] for each in self.groups)]
+    twice = np.intersect1d(found["vert"], np.concatenate(bonded))
     if twice.size:
       raise ValueError(
         f"organ {host.organ.name!r}: vertex {twice[0]} is bonded already, expected one bond a "
         "vertex"
       )
     room = len(group.grip.vert) + host.organ.mesh.spare
-    rows = host.which_rows([] if group.other is None else [group.other.host])
+    others = [] if group.other is None else [group.other.host]
     group.now = found
-    group.lists = Lists(host, Bonded, rows, found.lists(), room - len(found.vert))
+    group.lists = Lists(host, Bonded, others, found, room - len(found["vert"]))
     group.arrays = {name: host.zeros(room, *wide) for name, wide in _WIDTHS.items()}
     group.arrays["live"] = wp.ones(1, dtype=int, device=host.device)
     self.groups.append(group)
@@ -299,7 +277,7 @@ class Bonds(Force):
     """See `Force`."""
     for group in self.groups:
       found = group.found(self.host, world)
-      group.lists.put(world, found.lists())
+      group.lists.put(world, found)
       if self.host.alone:
         group.now = found
 
@@ -308,13 +286,9 @@ class Bonds(Force):
     out = []
     for group in self.groups:
       self._over(group, _stretch)
-      row = group.lists.rows.at(world)
-      count, vert, slot, area = (
-        group.lists.arrays[name][row].numpy() for name in ("count", "vert", "slot", "area")
-      )
-      n = int(count[0])
-      damage = group.fields.state[world].numpy()[slot[:n], BOND.damage]
-      stiffness = group.law.stiffness * area[:n] * (1.0 - damage.clip(0.0, 1.0))
-      stretch = group.arrays["stretch"][world].numpy()[:n] @ self.host.organ.frame
-      out.append((vert[:n].copy(), stiffness, stretch))
+      vert, slot, area = group.lists.of(world, "vert", "slot", "area")
+      damage = group.fields.state[world].numpy()[slot, BOND.damage]
+      stiffness = group.law.stiffness * area * (1.0 - damage.clip(0.0, 1.0))
+      stretch = group.arrays["stretch"][world].numpy()[: len(vert)] @ self.host.organ.frame
+      out.append((vert, stiffness, stretch))
     return out

@@ -59,31 +59,6 @@ class Bodies:
 
 
 @struct
-class WorldBodies:
-  """Bodies of mujoco_warp, a row a world."""
-
-  timestep: doubles(1)
-  body_parentid: ints("nbody")
-  body_rootid: ints("nbody")
-  body_dofnum: ints("nbody")
-  body_dofadr: ints("nbody")
-  geom_bodyid: ints("ngeom")
-  geom_type: ints("ngeom")
-  geom_size: doubles("ngeom", 3)
-  geom_aabb: doubles("ngeom", 6)
-  ctrl: floats("nworld", "nu")
-  xpos: floats("nworld", "3 nbody")
-  xmat: floats("nworld", "9 nbody")
-  cvel: floats("nworld", "6 nbody")
-  cdof: floats("nworld", "6 nv")
-  qacc_warmstart: floats("nworld", "nv")
-  subtree_com: floats("nworld", "3 nbody")
-  geom_xpos: floats("nworld", "3 ngeom")
-  geom_xmat: floats("nworld", "9 ngeom")
-  qfrc_passive: floats("nworld", "nv")
-
-
-@struct
 class Nodes:
   """Where an organ's vertices are: in MuJoCo's memory, or with windows in the plugin state."""
 
@@ -123,6 +98,19 @@ class Input:
   status: floats("nworld", 4)
 
 
+def _in_rows(kind: Any) -> Any:
+  """Returns `Bodies` of mujoco_warp: of its data floats, a row a world."""
+  fields: dict[str, Any] = {}
+  for name, dims in DIMS[kind.key].items():
+    rows = hasattr(mjstruct.Data, name)
+    fields[name] = floats("nworld", f"n{name}") if rows else Array(kind.vars[name].type.dtype, dims)
+  return struct(type("WorldBodies", (), {"__annotations__": fields, "__module__": __name__}))
+
+
+WorldBodies = _in_rows(Bodies)
+_KNOWN = {"Nodes": WorldNodes, "Bodies": WorldBodies, "Input": Input}
+
+
 class Twin(NamedTuple):
   """A kernel over one world of the plugin, and the same over rows of worlds."""
 
@@ -143,6 +131,7 @@ def world_kernel(name: str, header: str, kind: Any) -> Kernel:
   return kernel(name, header, kind, CONSTANTS, tag=".worlds")
 
 
+@functools.cache
 def for_worlds(
   kind: Any, rows: tuple[str, ...] = (), others: tuple[tuple[str, Any], ...] = ()
 ) -> Any:
@@ -153,25 +142,19 @@ def for_worlds(
     rows: its arrays that lack an axis of worlds and get one
     others: fields that are of another type, and that type
   """
-  return _for_worlds(kind.key, kind, rows, others)
-
-
-@functools.cache
-def _for_worlds(key: str, kind: Any, rows: tuple[str, ...], others: tuple) -> Any:
-  known = {Nodes.key: WorldNodes, Bodies.key: WorldBodies}
+  if kind.key in _KNOWN:
+    return _KNOWN[kind.key]
   fields: dict[str, Any] = {}
   for name, var in kind.vars.items():
     dims = DIMS[kind.key].get(name)
-    if dims == numbers.dims:
+    if dims is None:
+      fields[name] = for_worlds(var.type) if isinstance(var.type, type(kind)) else var.type
+    elif dims == numbers.dims:
       fields[name] = floats("nworld", *dims)
-    elif dims is not None:
-      fields[name] = Array(var.type.dtype, ("nworld", *dims) if name in rows else dims)
-    elif isinstance(var.type, type(kind)) and var.type.key != Input.key:
-      fields[name] = known.get(var.type.key) or for_worlds(var.type)
     else:
-      fields[name] = var.type
+      fields[name] = Array(var.type.dtype, ("nworld", *dims) if name in rows else dims)
   own = {"__annotations__": fields | dict(others), "__module__": __name__}
-  return struct(type(f"{key}InWorlds", (), own))
+  return struct(type(f"{kind.key}InWorlds", (), own))
 
 
 class Host(abc.ABC):
@@ -186,125 +169,42 @@ class Host(abc.ABC):
     config: its configuration in force
     model: address of the compiled mjModel
     arrays: the solver's vectors, by the names of `coupling.Crossing`
+    springs: what springs weigh on nodes, `State.hold`; None until it is needed
+    bodies: `Bodies`, or `WorldBodies`
+    nodes: `Nodes`, or `WorldNodes`
+    input: `Input` of its solver
+    number: its `NUMBERS`
   """
 
   alone: bool
   nworld: int
-  device: Any
+  device: wp.Device
   instance: int
   organ: "Declaration"
   config: Config
   model: int
   arrays: dict[str, wp.array]
-
-  # What kernels take of it.
-
-  @property
-  @abc.abstractmethod
-  def bodies(self) -> Any:
-    """`Bodies`, or `WorldBodies`."""
-
-  @property
-  @abc.abstractmethod
-  def nodes(self) -> Any:
-    """`Nodes`, or `WorldNodes`."""
-
-  @property
-  @abc.abstractmethod
-  def input(self) -> Any:
-    """`Input` of its solver."""
-
-  @property
-  @abc.abstractmethod
-  def number(self) -> wp.array:
-    """Its `NUMBERS`."""
-
-  @property
-  @abc.abstractmethod
-  def flags(self) -> wp.array:
-    """What its coupling reports, see `layout.FLAG`."""
-
-  @property
-  @abc.abstractmethod
-  def springs(self) -> wp.array | None:
-    """What springs weigh on nodes, `State.hold`; None until it is needed."""
+  springs: wp.array | None = None
+  bodies: Any
+  nodes: Any
+  input: Any
+  number: wp.array
 
   @abc.abstractmethod
   def need_springs(self):
     """Makes `springs`."""
 
   @abc.abstractmethod
+  def flags(self) -> wp.array:
+    """Returns what its coupling reports, see `layout.FLAG`."""
+
+  @abc.abstractmethod
   def rows(self, block: str, width: int) -> wp.array:
     """Returns a block of the plugin state, (nworld, n, width), as worlds keep it."""
-
-  @property
-  def nnode(self) -> int:
-    """Number of nodes in the solver's vectors, padding among them."""
-    return self.arrays["mass"].shape[1] * LANES
-
-  # What follows its mesh.
 
   @abc.abstractmethod
   def mesh(self, world: int) -> Mesh:
     """Returns the mesh that a world has now."""
-
-  @abc.abstractmethod
-  def which_rows(self, others: Sequence["Host"] = ()) -> "Rows":
-    """Returns which row of lists a world has that follow its mesh, and those of other organs."""
-
-  # Where bodies are.
-
-  def body_number(self, body: int) -> int:
-    """Returns the number in `bodies` of a body of the compiled model."""
-    return body
-
-  @property
-  def m(self) -> Any:
-    """The compiled mjModel's struct."""
-    return mjstruct.Model.from_address(self.model)
-
-  def may_move(self, body: Any) -> bool:
-    """Returns whether one of these bodies may move: all but what is welded to the world."""
-    m = self.m
-    return bool(mjstruct.view(m.body_weldid, m.nbody, np.int32)[body].any())
-
-  # Structs and launches.
-
-  def struct(self, kind: Any) -> Any:
-    """Returns the struct that this host has for one of the plugin's."""
-    known = {Nodes.key: WorldNodes, Bodies.key: WorldBodies, Input.key: Input}
-    return kind if self.alone else known.get(kind.key) or for_worlds(kind)
-
-  def fill(self, kind: Any, values: dict[str, Any], into: Any = None) -> Any:
-    """Returns a struct, or fills it anew in place.
-
-    The solver's arrays by their names, and `own`, `solve`, `mj`, `number`, `flags`, `ahead` and
-    `gain`, the share of the step's way at which the scheme takes forces and how much of a step's
-    stiffness it has on dv, need not be given.
-
-    Args:
-      kind: the struct, that of one world
-      values: its other fields
-      into: the struct that kernels have been recorded with, None for none
-    """
-    scheme = SCHEMES[self.config.integrator]
-    known: dict[str, Any] = {
-      "own": lambda: self.nodes,
-      "solve": lambda: self.input,
-      "mj": lambda: self.bodies,
-      "number": lambda: self.number,
-      "flags": lambda: self.flags,
-      "ahead": lambda: float(scheme.ahead),
-      "gain": lambda: scheme.gain(1.0, 0.0),
-    }
-    kind = self.struct(kind)
-    given = {name: array for name, array in self.arrays.items() if name in kind.vars}
-    given |= {name: get() for name, get in known.items() if name in kind.vars.keys() - values}
-    return fill(kind, self.device, given | values, into=into)
-
-  def zeros(self, *shape: int, dtype: Any = wp.float64) -> wp.array:
-    """Returns an array with worlds in front."""
-    return wp.zeros((self.nworld, *shape), dtype=dtype, device=self.device)
 
   @abc.abstractmethod
   def load(self, kernel: Twin):
@@ -321,64 +221,108 @@ class Host(abc.ABC):
       arg: what to do
     """
 
+  def which(self, others: Sequence["Host"]) -> wp.array:
+    """Returns which row of lists each world has that follow its mesh, and those of others."""
+    return self.zeros(dtype=int)
 
-class Rows:
-  """Which row of lists worlds have that follow their meshes: the first until they are cut.
+  def body_number(self, body: int) -> int:
+    """Returns the number in `bodies` of a body of the compiled model."""
+    return body
 
-  Args:
-    host: the host
-    parts: whether worlds get a row of their own
-  """
+  @property
+  def m(self) -> Any:
+    """The compiled mjModel's struct."""
+    return mjstruct.Model.from_address(self.model)
 
-  def __init__(self, host: Host, parts: bool):
-    self.count = 1 + host.nworld * parts
-    self.which = host.zeros(dtype=int)
+  @property
+  def nnode(self) -> int:
+    """Number of nodes in the solver's vectors, padding among them."""
+    return self.arrays["mass"].shape[1] * LANES
 
-  def take(self, world: int) -> int:
-    """Gives a world a row of its own, where there are any, and returns it."""
-    if self.count == 1:
-      return 0
-    which = self.which.numpy()
-    which[world] = 1 + world
-    self.which.assign(which)
-    return 1 + world
+  def may_move(self, body: int | np.ndarray) -> bool:
+    """Returns whether one of these bodies may move: all but what is welded to the world."""
+    m = self.m
+    return bool(mjstruct.view(m.body_weldid, m.nbody, np.int32)[body].any())
 
-  def at(self, world: int) -> int:
-    """Returns which row a world has."""
-    return int(self.which.numpy()[world])
+  def zeros(self, *shape: int, dtype: Any = wp.float64) -> wp.array:
+    """Returns an array with worlds in front."""
+    return wp.zeros((self.nworld, *shape), dtype=dtype, device=self.device)
+
+  def struct(self, kind: Any) -> Any:
+    """Returns the struct that this host has for one of the plugin's."""
+    return kind if self.alone else for_worlds(kind)
+
+  def fill(self, kind: Any, values: dict[str, Any], into: Any = None) -> Any:
+    """Returns a struct, or fills it anew in place.
+
+    The solver's arrays by their names, and `own`, `solve`, `mj`, `number`, `flags`, `ahead` and
+    `gain`, the share of the step's way at which the scheme takes forces and how much of a step's
+    stiffness it has on dv, need not be given.
+
+    Args:
+      kind: the struct, that of one world
+      values: its other fields
+      into: the struct that kernels have been recorded with, None for none
+    """
+    scheme, kind = SCHEMES[self.config.integrator], self.struct(kind)
+    known = self.arrays | dict(
+      own=self.nodes,
+      solve=self.input,
+      mj=self.bodies,
+      number=self.number,
+      flags=self.flags(),
+      ahead=float(scheme.ahead),
+      gain=scheme.gain(1.0, 0.0),
+    )
+    return fill(kind, self.device, known | values, into=into)
 
 
 class Lists:
   """Fields of a struct that follow meshes, with room for what cuts add.
 
+  A row is of the first meshes. With many worlds, each gets a row of its own as it is cut.
+
   Args:
     host: the host
     kind: the struct
-    rows: which rows there are
+    others: hosts of other organs whose meshes they follow
     values: the lists of the first meshes
     room: for how many more entries there is room, of all lists or by name
+
+  Attributes:
+    arrays: the lists, (nrow, n, ...), and `row`, which of them a world has
   """
 
   def __init__(
-    self, host: Host, kind: Any, rows: Rows, values: dict[str, np.ndarray],
+    self, host: Host, kind: Any, others: Sequence[Host], values: dict[str, np.ndarray],
     room: int | dict[str, int] = 0,
   ):  # fmt: skip
-    self.rows = rows
-    self.arrays: dict[str, wp.array] = {"row": rows.which}
+    cuts = not host.alone and any(each.organ.mesh.spare for each in (host, *others))
+    self.arrays: dict[str, wp.array] = {"row": host.which(others)}
     for name, value in values.items():
       more = room.get(name, 0) if isinstance(room, dict) else room
       more = 0 if DIMS[kind.key][name][1] == 1 else more  # a number
-      whole = np.zeros((rows.count, len(value) + more, *np.shape(value)[1:]))
+      whole = np.zeros((1 + host.nworld * cuts, len(value) + more, *np.shape(value)[1:]))
       whole[0, : len(value)] = value
       self.arrays[name] = wp.array(whole, dtype=kind.vars[name].type.dtype, device=host.device)
+    self._cuts = cuts
 
   def put(self, world: int, values: dict[str, np.ndarray]):
     """Gives a world the lists of the meshes that it has now."""
-    row = self.rows.take(world)
+    if self._cuts:
+      which = self.arrays["row"].numpy()
+      which[world] = 1 + world
+      self.arrays["row"].assign(which)
     for name, value in values.items():
       if len(value):
-        with edited(self.arrays[name], row) as there:
+        with edited(self.arrays[name], (1 + world) * self._cuts) as there:
           there[: len(value)] = value
+
+  def of(self, world: int, *names: str) -> list[np.ndarray]:
+    """Returns lists that a world has, without the room."""
+    row = int(self.arrays["row"].numpy()[world])
+    count = int(self.arrays["count"][row].numpy()[0])
+    return [self.arrays[name][row].numpy()[:count].copy() for name in names]
 
 
 @contextlib.contextmanager
@@ -386,5 +330,5 @@ def edited(array: wp.array, row: int) -> Iterator[np.ndarray]:
   """Yields a row of an array, and keeps what is written to it."""
   values = array[row].numpy()
   yield values
-  if array.device.is_cuda:
+  if wp.get_device(array.device).is_cuda:
     array[row].assign(values)

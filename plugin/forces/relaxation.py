@@ -74,7 +74,7 @@ class Relaxation(Force):
   def end(self):
     """See `Force`."""
     if self:
-      self.fields.flags = self.host.flags  # in a batch they follow how stiff the tissue is
+      self.fields.flags = self.host.flags()  # in a batch they follow how stiff the tissue is
       super().end()
 
   def carry(self, world: int, group: np.ndarray, member: np.ndarray, share: np.ndarray):

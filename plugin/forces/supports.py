@@ -161,8 +161,7 @@ class Supports(Force):
     arrays = {"where": host.zeros(n, 3), "next": host.zeros(n, dtype=int)}
     arrays["first"] = host.zeros(_CELLS, dtype=int)
     rooms = {"elem": room, "near": 3 * room}
-    values, rows = self._values(other, 0), host.which_rows(others)
-    return _Bed(other, Lists(host, Supported, rows, values, rooms), arrays)
+    return _Bed(other, Lists(host, Supported, others, self._values(other, 0), rooms), arrays)
 
   def _values(self, other: Optional["Supports"], world: int) -> dict[str, np.ndarray]:
     """Returns the lists of `Supported` for the meshes of a world."""

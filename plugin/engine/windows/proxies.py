@@ -171,7 +171,7 @@ def make(w: "Workspace", model: int, sizes: dict[str, int]):
     origin=organ.origin,
     heaviest=w.host.arrays["heaviest"],
     number=w.body.numbers,
-    flags=w.host.flags,
+    flags=w.host.flags(),
     home=win.home,
     qhome=win.qhome,
     dofadr=win.dofadr,
