@@ -24,14 +24,18 @@ def bind(w: Workspace, model: int):
   m = mjstruct.Model.from_address(model)
   device, cpu = w.body.device, wp.get_device("cpu")
   scheme = step.SCHEMES[w.config.integrator]
-  side = windowed if w.organ.windows else nodal
   with graphs.lock:
     declare.check_frame(m, w.organ)
     load(w.body)
     if w.graphs.resident:
       w.graphs.resident.fetch()
     w.host.bind(model)
-    w.graphs.phases = does = side.Phases(w, model, w.seen.instance)
+    if w.organ.windows:
+      w.views = w.views or windowed.scratch(w.host)
+      does = windowed.Phases(w.host, w.views, w.share)
+    else:
+      does = nodal.Phases(w.host, w.share)
+    w.graphs.phases, w.graphs.resident = does, does.resident
     w.cuts.bind(model)
     near = wp.get_device(does.side)
     crossing = device != near
@@ -102,6 +106,11 @@ def _advance(w: Workspace, does: Phases, ends: bool):
 def _watch(w: Workspace, model: int):
   """Notes what of a model a step looks at, and what it was."""
   m = mjstruct.Model.from_address(model)
+  organ = w.organ
+  if organ.windows:
+    tree = mjstruct.view(m.body_treeid, m.nbody, np.int32)[organ.windows.body[0]]
+    w.seen.policy = mjstruct.view(m.tree_sleep_policy, m.ntree, np.int32)[tree:].data
+    w.seen.counts = mjstruct.view(m.flex_vertnum, m.nflex, np.int32)[organ.flex :].data
   w.seen.identity = mjstruct.Identity(model)
   option = model + mjstruct.Model.opt.offset
   w.seen.model_step = mjstruct.view(option + type(m.opt).timestep.offset, 1).data

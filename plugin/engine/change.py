@@ -113,7 +113,7 @@ def hold(w: Workspace, model: int, groups: list[Group]):
     if w.attachments.put(groups):
       bind(w, model)
   if w.turn is not None:
-    windowed.wake(w)
+    windowed.wake(w.host)
 
 
 def bond(w: Workspace, model: int, to, name: str, law, near: float | None, vertices):
@@ -162,7 +162,7 @@ def _put(w: Workspace, other: Workspace | None, group: cohesive_bonds.Group):
     with graphs.lock:
       bind(each, each.model)
     if each.turn is not None:
-      windowed.wake(each)
+      windowed.wake(each.host)
 
 
 def _change(w: Workspace, model: int, config: Config):
@@ -189,4 +189,4 @@ def _change(w: Workspace, model: int, config: Config):
     others = [group for group in w.attachments.groups if group.by != "carrier"]
     hold(w, model, [*declare_attachments.carried(w.host), *others])
   if w.turn is not None:
-    windowed.wake(w)
+    windowed.wake(w.host)

@@ -10,6 +10,8 @@ then is a guess of what a tool meets, and follows the organ's answers.
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import mujoco
@@ -30,6 +32,10 @@ if TYPE_CHECKING:
 _HUGE = 1e6  # more than any displacement, velocity or force of an organ [m, m/s, N]
 
 
+# Gives vertices, all or some, their part of what they were of values by mass, see `Cuts.share`.
+Share = Callable[..., np.ndarray]
+
+
 class Phases:
   """What a coupling launches around the solve, in the order of a step.
 
@@ -38,9 +44,13 @@ class Phases:
 
   Attributes:
     side: device of the phases that are not on the CPU
+    boxes: blocks of the plugin state and of what crosses in a step, see `layout`; windows
+    resident: keeper of a motion that stays on `side`, or None
   """
 
   side: Any
+  boxes: Mapping[str, Any] = MappingProxyType({})
+  resident: Any = None
 
   def place(self):
     """Makes the model fit the plugin state, before a step whose state came from outside."""

@@ -82,7 +82,7 @@ class Windowed:
     out = np.zeros((self._nvert, 3))
     node = self._w.slots
     used = node >= 0
-    out[node[used]] = self._w.boxes["own"].force.numpy()[used]
+    out[node[used]] = self._w.host.own.force.numpy()[used]
     return out
 
   def put(self, model: mujoco.MjModel, data, u: np.ndarray | None, v: np.ndarray | None):
@@ -99,7 +99,7 @@ class Windowed:
   def _own(self, name: str) -> np.ndarray:
     """Returns a vector of the motion in the plugin state."""
     workspace.sync(self._w)
-    return getattr(self._w.boxes["own"].motion, name).numpy()
+    return getattr(self._w.host.own.motion, name).numpy()
 
 
 def _forget(w: Workspace):

@@ -9,12 +9,12 @@ from palpate.tissue import step
 from palpate.tissue.types import doubles, fill, ints, struct
 
 from . import coupling
-from .coupling import Crossing, Mujoco
+from .coupling import Crossing, Mujoco, Share
 from .layout import FLAG, NodalState
 from .model import inertia, mjstruct
 
 if TYPE_CHECKING:
-  from .workspace import Workspace
+  from .host import Host
 
 
 @struct
@@ -34,7 +34,7 @@ class Nodal:
   weight: doubles("nweighed")  # mass of a node [kg]
   inertia: doubles("nweighed")  # its inertia to MuJoCo [kg]
   shift: doubles("nweighed", 3)  # rest position now less that of the compiled model [m]
-  heaviest: doubles(1)  # see `Workspace`
+  heaviest: doubles(1)  # see `Host`
   number: doubles("nnumber")  # see `NUMBERS`
   flags: ints(len(FLAG))  # see FLAG
   lagged: doubles("nnode", 3)  # external and lagged contact force [N]
@@ -49,12 +49,17 @@ gather, scatter, push, remember = coupling.kernels(
 
 
 class Phases(coupling.Phases):
-  """Nodal coupling of a workspace's organ."""
+  """Nodal coupling of an organ.
+
+  Args:
+    host: the organ, bound to a model
+    share: what cuts have made of values by mass
+  """
 
   side = "cpu"
 
-  def __init__(self, w: "Workspace", model: int, instance: int):
-    m, organ, s = mjstruct.Model.from_address(model), w.organ, w.body.shape
+  def __init__(self, host: "Host", share: Share):
+    m, organ, s = host.m, host.organ, host.body.shape
     vert = s.vert.numpy()
     dofadr = _in_node_order(organ.dofadr, vert)
     dofs = np.maximum(dofadr, 0)[:, None] + np.arange(3)
@@ -74,15 +79,15 @@ class Phases(coupling.Phases):
       weight=np.zeros(nweighed),
       inertia=np.zeros(nweighed),
       shift=np.zeros((nweighed, 3)),
-      heaviest=w.host.arrays["heaviest"],
-      number=w.body.numbers,
-      flags=w.host.flags(),
-      lagged=w.host.arrays["lagged"],
-      own=w.host.own,
-      mj=coupling.mujoco_arrays(model, w.data),
-      solve=coupling.crossing(w.host.arrays),
+      heaviest=host.arrays["heaviest"],
+      number=host.number,
+      flags=host.flags(),
+      lagged=host.arrays["lagged"],
+      own=host.own,
+      mj=coupling.mujoco_arrays(host.model, host.data),
+      solve=coupling.crossing(host.arrays),
     )
-    self._nodal, self._w, self._model = fill(Nodal, "cpu", values), w, m
+    self._nodal, self._host, self._share = fill(Nodal, "cpu", values), host, share
     self.reshape()
 
   def _launch(self, kernel):
@@ -108,23 +113,23 @@ class Phases(coupling.Phases):
 
   def reshape(self, touched: np.ndarray | None = None):
     """Takes the mesh and the masses that the organ has now."""
-    w, organ, n = self._w, self._w.organ, self._nodal
+    host, organ, n = self._host, self._host.organ, self._nodal
     if not n.weighs:
       return
-    node, found = w.body.shape.node.numpy(), inertia.of_dofs(self._model, organ)
+    node, found = host.body.shape.node.numpy(), inertia.of_dofs(host.m, organ)
     n.weight.numpy()[node] = np.where(organ.mass > 0, organ.mass, 1.0)
-    n.inertia.numpy()[node] = w.cuts.share(found) if w.cuts else found
+    n.inertia.numpy()[node] = self._share(found)
     n.shift.numpy()[node] = organ.mesh.rest - organ.mesh.whole.rest
 
   def _views(self) -> tuple[np.ndarray, np.ndarray]:
     """Returns MuJoCo's qpos and qvel."""
-    m, d = self._model, mjstruct.Data.from_address(self._w.data)
+    m, d = self._host.m, mjstruct.Data.from_address(self._host.data)
     return mjstruct.view(d.qpos, m.nq), mjstruct.view(d.qvel, m.nv)
 
   def motion(self) -> tuple[np.ndarray, np.ndarray]:
     """Returns displacement and velocity of the vertices, in the organ's frame, (nvert, 3) each."""
-    organ, (qpos, qvel) = self._w.organ, self._views()
-    qpos0 = mjstruct.view(self._model.qpos0, self._model.nq)
+    organ, (qpos, qvel) = self._host.organ, self._views()
+    qpos0 = mjstruct.view(self._host.m.qpos0, len(qpos))
     shift = organ.mesh.rest - organ.mesh.whole.rest
     disp, vel = np.zeros((organ.mesh.nvert, 3)), np.zeros((organ.mesh.nvert, 3))
     at, dofs = organ.qposs.reshape(-1, 3), organ.dofs.reshape(-1, 3)
@@ -137,8 +142,8 @@ class Phases(coupling.Phases):
 
   def carry(self, changed, disp, vel, group, member, share):
     """Gives vertices their motion after a cut, see `coupling.Phases`."""
-    organ, (qpos, qvel) = self._w.organ, self._views()
-    qpos0 = mjstruct.view(self._model.qpos0, self._model.nq)
+    organ, (qpos, qvel) = self._host.organ, self._views()
+    qpos0 = mjstruct.view(self._host.m.qpos0, len(qpos))
     shift = organ.mesh.rest - organ.mesh.whole.rest
     mine, within = (changed[organ.free[changed] & (there == (organ.dofadr[changed] >= 0))]
                     for there in (True, False))  # fmt: skip

@@ -281,7 +281,7 @@ def _inside_out(x: np.ndarray, tet: np.ndarray) -> np.ndarray:
 def _displacement(m, d, w: "Workspace") -> np.ndarray:
   """Returns the displacement of the vertices from rest, in the organ's frame [m], (nvert, 3)."""
   if w.organ.windows:
-    return w.boxes["own"].motion.disp.numpy()
+    return w.host.own.motion.disp.numpy()
   out = np.zeros((w.organ.mesh.nvert, 3))  # only those on the surface are asked for
   moved = mjstruct.view(d.qpos, m.nq) - mjstruct.view(m.qpos0, m.nq)
   out[w.organ.jointed] = moved[w.organ.qposs].reshape(-1, 3)

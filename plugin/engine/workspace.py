@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any
 
 import mujoco
@@ -143,7 +144,6 @@ class Workspace:
     turn: this mjData's part in the model's window, or None
     skin: what is drawn for it, or None
     views: what a coupling keeps when its graphs are recorded anew
-    boxes: blocks of the plugin state and of what crosses in a step, see `layout`; windows
   """
 
   host: Host
@@ -156,7 +156,6 @@ class Workspace:
   turn: Turn | None = None
   skin: skin.Skin | None = None
   views: dict = dataclasses.field(default_factory=dict)
-  boxes: dict = dataclasses.field(default_factory=dict)
 
   def __post_init__(self):
     self.cuts = cuts_of(self)
@@ -202,6 +201,15 @@ class Workspace:
   def supports(self) -> Supports:
     """What it rests on."""
     return self.forces.of(Supports)
+
+  @property
+  def boxes(self) -> Mapping[str, Any]:
+    """Blocks of the plugin state and of what crosses in a step, see `layout`; windows."""
+    return self.graphs.phases.boxes
+
+  def share(self, values: np.ndarray, vert: Any = slice(None)) -> np.ndarray:
+    """Returns what cuts have made of values by mass of vertices, some or all, (n,)."""
+    return self.cuts.share(values, vert) if self.cuts else values[vert]
 
   @property
   def plugin_state(self) -> np.ndarray:
