@@ -5,7 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 import numpy.typing as npt
-from palpate.engine import change, motion, penetration, signals, workspace
+from palpate.engine import change, penetration, signals, workspace
 from palpate.engine import plugin as engine
 from palpate.engine.cutting.cuts import Piece, Report
 from palpate.engine.cutting.cutters import Cutter
@@ -43,7 +43,6 @@ class Organ:
     self.data = data
     self.name = name
     self._space = engine.find(data._address, organs[name])
-    self._motion = motion.of(self._space)
 
   @property
   def _organ(self):
@@ -257,7 +256,7 @@ class Organ:
   @property
   def _deformation(self) -> np.ndarray:
     """Displacement from rest in the organ's own frame, with the inside [m], (nvert + ., 3)."""
-    return self._motion.displacement(self.model, self.data)
+    return self._space.motion()[0]
 
   @property
   def xpos(self) -> np.ndarray:
@@ -280,12 +279,12 @@ class Organ:
   @property
   def xvel(self) -> np.ndarray:
     """Velocities [m/s], (nvert, 3)."""
-    return self._motion.velocity(self.data)[: self.nvert] @ self._organ.frame.T
+    return self._space.motion()[1][: self.nvert] @ self._organ.frame.T
 
   @property
   def contact_force(self) -> np.ndarray:
     """Constraint force on each vertex that the last step took [N], (nvert, 3); at rest MuJoCo's."""
-    return self._motion.contact_force(self.data)[: self.nvert] @ self._organ.frame.T
+    return self._space.graphs.phases.contact_force()[: self.nvert] @ self._organ.frame.T
 
   @property
   def window_overflow(self) -> tuple[int, int]:
@@ -379,7 +378,7 @@ class Organ:
     u = None if xpos is None else fill.inside(self._organ.mesh, (xpos - self.xpos0) @ frame)
     v = None if xvel is None else fill.inside(self._organ.mesh, xvel @ frame)
     self._space.forget()
-    self._motion.put(self.model, self.data, u, v)
+    workspace.set_motion(self._space, self.model._address, u, v)
 
   def sync(self):
     """Brings a motion that stays on a device (`resident`) into mjData.plugin_state.

@@ -86,20 +86,38 @@ class Phases:
     """Returns displacement and velocity of the vertices, in the organ's frame, (nvert, 3) each."""
     raise NotImplementedError
 
+  def contact_force(self) -> np.ndarray:
+    """Returns the contact force that the organ took in the last step, there [N], (nvert, 3)."""
+    raise NotImplementedError
+
   def reshape(self, touched: np.ndarray | None = None):
     """Takes the mesh and the masses that the organ has now; `touched` as in `cut`, None for all."""
 
-  def carry(self, changed, disp, vel, group, member, share):
-    """Gives vertices the motion that they have after a cut, and those that were one their part.
+  def put(self, vert: np.ndarray, disp: np.ndarray | None, vel: np.ndarray | None):
+    """Gives vertices that move a displacement and a velocity, None for what they have.
 
     Args:
-      changed: vertices that lie elsewhere at rest, or are new
-      disp: displacement of all vertices [m]   (nvert, 3)
-      vel: velocity of all vertices [m/s]      (nvert, 3)
+      vert: the vertices
+      disp: displacement of all vertices [m]  (nvert, 3)
+      vel: velocity of all vertices [m/s]     (nvert, 3)
+    """
+
+  def divide(self, group: np.ndarray, member: np.ndarray, share: np.ndarray):
+    """Gives vertices that a cut has divided their part of what there is from the last steps.
+
+    Args:
       group: of vertices that were one, which  (n,)
       member: those vertices                   (n,)
       share: their part of its mass            (n,)
     """
+
+  def carry(
+    self, changed: np.ndarray, disp: np.ndarray, vel: np.ndarray,
+    group: np.ndarray, member: np.ndarray, share: np.ndarray,
+  ):  # fmt: skip
+    """Gives vertices the motion that they have after a cut; see `put` and `divide`."""
+    self.put(changed, disp, vel)
+    self.divide(group, member, share)
 
   def foresee(self):
     """Guesses what the next `gather` reads."""

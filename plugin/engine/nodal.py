@@ -140,19 +140,31 @@ class Phases(coupling.Phases):
       values[organ.inner] = inside.numpy().reshape(-1, 3)
     return disp, vel
 
-  def carry(self, changed, disp, vel, group, member, share):
-    """Gives vertices their motion after a cut, see `coupling.Phases`."""
-    organ, (qpos, qvel) = self._host.organ, self._views()
+  def contact_force(self) -> np.ndarray:
+    """See `coupling.Phases`."""
+    out = np.zeros((self._host.organ.mesh.nvert, 3))
+    out[self._host.organ.jointed] = self._nodal.own.force.numpy().reshape(-1, 3)
+    return out
+
+  def put(self, vert: np.ndarray, disp: np.ndarray | None, vel: np.ndarray | None):
+    """See `coupling.Phases`."""
+    organ, (qpos, qvel), own = self._host.organ, self._views(), self._nodal.own
     qpos0 = mjstruct.view(self._host.m.qpos0, len(qpos))
     shift = organ.mesh.rest - organ.mesh.whole.rest
-    mine, within = (changed[organ.free[changed] & (there == (organ.dofadr[changed] >= 0))]
-                    for there in (True, False))  # fmt: skip
-    at = organ.qposadr[mine, None] + np.arange(3)
-    qpos[at] = qpos0[at] + shift[mine] + disp[mine]
-    qvel[organ.dofadr[mine, None] + np.arange(3)] = vel[mine]
-    own = self._nodal.own
-    for inner, values in ((own.disp, disp), (own.vel, vel)):
-      inner.numpy().reshape(-1, 3)[within - organ.mesh.nskin] = values[within]
+    vert = vert[organ.free[vert]]
+    jointed = organ.dofadr[vert] >= 0
+    mine, within = vert[jointed], vert[~jointed]
+    if disp is not None:
+      at = organ.qposadr[mine, None] + np.arange(3)
+      qpos[at] = qpos0[at] + shift[mine] + disp[mine]
+      own.disp.numpy().reshape(-1, 3)[within - organ.mesh.nskin] = disp[within]
+    if vel is not None:
+      qvel[organ.dofadr[mine, None] + np.arange(3)] = vel[mine]
+      own.vel.numpy().reshape(-1, 3)[within - organ.mesh.nskin] = vel[within]
+
+  def divide(self, group: np.ndarray, member: np.ndarray, share: np.ndarray):
+    """See `coupling.Phases`."""
+    organ, own = self._host.organ, self._nodal.own
     at = organ.stateadr[:, None] + np.arange(3)
     for name in ("last", "before"):
       block = getattr(own, name).numpy()

@@ -249,7 +249,7 @@ class Watch:
     seen = self._tools
     if not len(seen.geoms) or not w.organ.mesh.closed:  # a cut opens it
       return []
-    disp = _displacement(m, d, w)
+    disp = w.motion()[0]
     found = set(seen.inside(d, disp))
     before, self._inside = found if self._inside is None else self._inside, found
     if w.report.flags[FLAG.fast]:
@@ -276,13 +276,3 @@ def _inside_out(x: np.ndarray, tet: np.ndarray) -> np.ndarray:
   corner = x.T[:, tet.T]
   (ax, bx, cx), (ay, by, cy), (az, bz, cz) = corner[:, 1:] - corner[:, :1]
   return ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx) <= 0
-
-
-def _displacement(m, d, w: "Workspace") -> np.ndarray:
-  """Returns the displacement of the vertices from rest, in the organ's frame [m], (nvert, 3)."""
-  if w.organ.windows:
-    return w.host.own.motion.disp.numpy()
-  out = np.zeros((w.organ.mesh.nvert, 3))  # only those on the surface are asked for
-  moved = mjstruct.view(d.qpos, m.nq) - mjstruct.view(m.qpos0, m.nq)
-  out[w.organ.jointed] = moved[w.organ.qposs].reshape(-1, 3)
-  return out

@@ -26,7 +26,7 @@ from .bind import bind
 from .coupling import Phases
 from .cutting.cutters import Cutters
 from .cutting.solid_cuts import Cuts, cuts_of
-from .layout import FLAG, HEAD
+from .layout import FLAG, HEAD, Topology
 from .model import declare, flexes, inertia, mjstruct, prepare, skin
 from .penetration import Watch
 from .windows import declare_windows, windowed
@@ -35,6 +35,7 @@ from .windows.resident import Resident
 
 _ALLOWED = int(mujoco.mjtSleepPolicy.mjSLEEP_AUTO_ALLOWED)
 _RK4 = int(mujoco.mjtIntegrator.mjINT_RK4)
+_STAYS = ("disp", "vel", "bond", *Topology.vars)  # of the plugin state, where a motion is set
 _ASTRAY = 1e-9  # distance of a slot from its node that rounding does not explain [m]
 
 # An item of a memoryview costs a tenth of one of an array; this stands for those not yet there.
@@ -401,6 +402,26 @@ def place(w: Workspace, model: int):
     with w.turn.lock:
       w.put_windows()
       w.turn.stood = w.turn.qpos.tobytes()
+
+
+def set_motion(w: Workspace, model: int, u: np.ndarray | None, v: np.ndarray | None):
+  """Sets the motion of the vertices that move, and forgets forces of the past.
+
+  Args:
+    w: the workspace
+    model: address of the mjModel
+    u: displacement in the organ's frame [m], (nvert, 3); None for what it is
+    v: velocity there [m/s], (nvert, 3); None for what it is
+  """
+  sync(w)
+  state, where = w.plugin_state, coupling.spans(w.organ)
+  kept = {name: state[where[name]].copy() for name in _STAYS if name in where}
+  state[:] = 0.0
+  for name, values in kept.items():
+    state[where[name]] = values
+  w.graphs.phases.put(np.flatnonzero(w.organ.free), u, v)
+  if w.turn is not None:
+    place(w, model)
 
 
 def rebind(w: Workspace):

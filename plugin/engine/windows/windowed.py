@@ -114,14 +114,26 @@ class Phases(coupling.Phases):
     motion = self._motion_here
     return motion.disp, motion.vel
 
-  def carry(self, changed, disp, vel, group, member, share):
-    """Gives vertices their motion after a cut, see `coupling.Phases`; slots keep their forces."""
+  def contact_force(self) -> np.ndarray:
+    """See `coupling.Phases`."""
+    out, node = np.zeros((self._host.organ.mesh.nvert, 3)), self._kept["placed"].numpy()
+    used = node >= 0
+    out[node[used]] = self._host.own.force.numpy()[used]
+    return out
+
+  def put(self, vert: np.ndarray, disp: np.ndarray | None, vel: np.ndarray | None):
+    """See `coupling.Phases`."""
     motion = self._motion_here
-    motion.disp[changed], motion.vel[changed] = disp[changed], vel[changed]
-    for values in (motion.last, motion.before):
-      values[member] = values[group]
+    for there, values in ((motion.disp, disp), (motion.vel, vel)):
+      if values is not None:
+        there[vert] = values[vert]
     if self.resident:
       self.resident.renew()
+
+  def divide(self, group: np.ndarray, member: np.ndarray, share: np.ndarray):
+    """See `coupling.Phases`; slots keep their forces."""
+    for values in (self._motion_here.last, self._motion_here.before):
+      values[member] = values[group]
 
   def _over_slots(self, kernel: Kernel):
     proxies.launch(kernel, self._slots)
