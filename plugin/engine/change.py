@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+import numpy.typing as npt
 from palpate.forces import cohesive_bonds, declare_attachments, declare_bonds
 from palpate.forces.attachments import Group
 from palpate.forces.passive import Force
@@ -61,11 +62,12 @@ def copy(
       _put(w, to, dataclasses.replace(group, other=bonds))
   if w.attachments.groups or other.attachments.groups:
     groups = other.attachments.groups
-    hold(w, model, [dataclasses.replace(g, other=g.other and twin(g.other)[1]) for g in groups])
+    ends = [None if group.other is None else twin(group.other)[1] for group in groups]
+    hold(w, model, [dataclasses.replace(g, other=o) for g, o in zip(groups, ends, strict=True)])
 
 
 def attach(
-  w: Workspace, model: int, vertices, to, stiffness: float | None
+  w: Workspace, model: int, vertices: npt.ArrayLike, to: int | Workspace, stiffness: float | None
 ) -> list[tuple[Any, Group]]:
   """Attaches vertices to a body, or to another organ's vertices nearest to them, where they are.
 
@@ -116,7 +118,15 @@ def hold(w: Workspace, model: int, groups: list[Group]):
     windowed.wake(w.host)
 
 
-def bond(w: Workspace, model: int, to, name: str, law, near: float | None, vertices):
+def bond(
+  w: Workspace,
+  model: int,
+  to: int | Workspace,
+  name: str,
+  law: tuple[float, float, float],
+  near: float | None,
+  vertices: npt.ArrayLike | None,
+):
   """Bonds an organ to a body or another organ, where its vertices are.
 
   Args:

@@ -191,17 +191,17 @@ CONSTANTS = {
 }  # fmt: skip
 
 
-def kernels(header: str, kind, *names: str) -> list[Kernel]:
+def kernels(header: str, kind: Any, *names: str) -> list[Kernel]:
   """Returns the kernels of a header that take a struct."""
   return [kernel(name, header, kind, CONSTANTS) for name in names]
 
 
-def wrap(address: int, shape, dtype: type = wp.float64) -> wp.array:
+def wrap(address: int, shape: Any, dtype: type = wp.float64) -> wp.array:
   """Returns MuJoCo's own memory as a Warp array."""
   return wp.array(ptr=address, dtype=dtype, shape=shape, device="cpu")
 
 
-def mujoco_arrays(model: int, data: int, kind=Mujoco):
+def mujoco_arrays(model: int, data: int, kind: Any = Mujoco):
   """Returns `Mujoco`, or what has MuJoCo's names in another struct, for an mjModel and mjData."""
   m, d = mjstruct.Model.from_address(model), mjstruct.Data.from_address(data)
   option, start = type(m.opt), model + mjstruct.Model.opt.offset
@@ -234,7 +234,7 @@ def crossing(arrays: dict[str, wp.array]):
   return out
 
 
-def mass_addresses(m, dofs: np.ndarray) -> np.ndarray:
+def mass_addresses(m: mjstruct.Struct, dofs: np.ndarray) -> np.ndarray:
   """Returns where the diagonal of each dof lies in mjData.M, the inertia that MuJoCo uses."""
   rowadr = mjstruct.view(m.M_rowadr, m.nv, np.int32)[dofs]
   return rowadr + mjstruct.view(m.M_rownnz, m.nv, np.int32)[dofs] - 1

@@ -9,6 +9,7 @@ fields and the offsets of the short ones as constants, HEAD_MODE for `HEAD.mode`
 # pyright: reportInvalidTypeForm=false
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import warp as wp
 from palpate.tissue.types import DIMS, doubles, struct
@@ -275,7 +276,7 @@ class Outbox:
   record: doubles("most", len(RECORD))  # see RECORD, as far as there is room
 
 
-def spans(kind, sizes: Mapping[str, int], start: int = 0) -> dict[str, slice]:
+def spans(kind: Any, sizes: Mapping[str, int], start: int = 0) -> dict[str, slice]:
   """Returns where each block of a struct lies, by name; `sizes` has the named sizes."""
   out: dict[str, slice] = {}
   for name, var in kind.vars.items():
@@ -288,17 +289,17 @@ def spans(kind, sizes: Mapping[str, int], start: int = 0) -> dict[str, slice]:
   return out
 
 
-def size(kind, sizes: Mapping[str, int]) -> int:
+def size(kind: Any, sizes: Mapping[str, int]) -> int:
   """Returns how many numbers the blocks of a struct have."""
   return list(spans(kind, sizes).values())[-1].stop
 
 
-def carve(kind, array: wp.array, sizes: Mapping[str, int]):
+def carve(kind: Any, array: wp.array, sizes: Mapping[str, int]):
   """Returns the struct whose blocks are views of an array, which must outlive it."""
   return _carve(kind, array, sizes, spans(kind, sizes))
 
 
-def _carve(kind, array, sizes, where):
+def _carve(kind: Any, array: wp.array, sizes: Mapping[str, int], where: dict[str, slice]):
   out = kind()
   for name, var in kind.vars.items():
     dims = DIMS[kind.key].get(name)

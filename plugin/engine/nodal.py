@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from palpate.tissue import step
+from palpate.tissue.kernels import Kernel
 from palpate.tissue.types import doubles, fill, ints, struct
 
 from . import coupling
@@ -90,7 +91,7 @@ class Phases(coupling.Phases):
     self._nodal, self._host, self._share = fill(Nodal, "cpu", values), host, share
     self.reshape()
 
-  def _launch(self, kernel):
+  def _launch(self, kernel: Kernel):
     kernel.launch("cpu", 1, 1, 0, self._nodal)
 
   def gather(self):

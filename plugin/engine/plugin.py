@@ -281,7 +281,7 @@ def _interrupt(w: Workspace | None, error: BaseException):
 
 
 @signals.watch
-def _on_unraisable(unraisable, before=sys.unraisablehook):
+def _on_unraisable(unraisable: Any, before: Any = sys.unraisablehook):
   """Takes what a signal's handler raised at the first or last instruction of a callback."""
   trace = unraisable.exc_traceback
   if trace is None or not signals.is_callback(trace.tb_frame.f_code):

@@ -464,7 +464,7 @@ def make(model: int, data: int, instance: int) -> Workspace:
     return w
 
 
-def _view(w: Workspace, d, m):
+def _view(w: Workspace, d: mjstruct.Struct, m: mjstruct.Struct):
   """Takes views of an mjData that every step looks at."""
   fields, count = mjstruct.Data, len(d.warning)
   w.seen.status = w.host.arrays["status"].numpy()[0].data
@@ -498,7 +498,7 @@ def join(spaces: list[Workspace]) -> list[Workspace]:
   return list(changed.values())
 
 
-def feel(w: Workspace, m):
+def feel(w: Workspace, m: mjstruct.Struct):
   """Notes how stiff the organ is for the present time step, and what its step takes for it."""
   nodal = w.inertia(w.model)
   w.graphs.stiff, heaviest = inertia.stiffness(m, w.declared, w.body, w.config, nodal)

@@ -161,7 +161,7 @@ def most(host: Host, body: int) -> float:
   return _LIGHT / (_gain(host) * max(weight, 1e-12))
 
 
-def _is_mocap(m, body: int) -> bool:
+def _is_mocap(m: mjstruct.Struct, body: int) -> bool:
   """Returns whether a body or one above it is a mocap body."""
   mocap = mjstruct.view(m.body_mocapid, m.nbody, np.int32)
   parent = mjstruct.view(m.body_parentid, m.nbody, np.int32)

@@ -11,6 +11,7 @@ from palpate.engine.host import Host
 from palpate.engine.layout import GEOM
 from palpate.engine.model import flexes, mjstruct
 from palpate.tissue.geometry import mesh as topology
+from palpate.tissue.kernels import Kernel
 from palpate.tissue.reading import BondRow, Law
 from palpate.tissue.types import doubles, fill, ints, struct
 
@@ -151,7 +152,7 @@ def _normals(host: Host, now: bool) -> np.ndarray:
   return out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-300)
 
 
-def _far_from_geoms(m, body: int, points: np.ndarray) -> np.ndarray:
+def _far_from_geoms(m: mjstruct.Struct, body: int, points: np.ndarray) -> np.ndarray:
   """Returns the distance of points to a body's geoms, in its frame [m], (n,)."""
   geoms = np.flatnonzero(mjstruct.view(m.geom_bodyid, m.ngeom, np.int32) == body)
   geom = np.zeros((len(geoms), len(GEOM)))
@@ -171,7 +172,7 @@ def _far_from_geoms(m, body: int, points: np.ndarray) -> np.ndarray:
   return _search(_measure_geoms, points, geom, np.zeros((0, 3, 3))).far.numpy()
 
 
-def _up(m, body: int, points: np.ndarray, step: float) -> np.ndarray:
+def _up(m: mjstruct.Struct, body: int, points: np.ndarray, step: float) -> np.ndarray:
   """Returns the directions in which points get away from a body's geoms, in its frame, (n, 3)."""
   moved = points[:, None, None] + step * np.eye(3)[:, None] * np.array([[1.0], [-1.0]])
   far = _far_from_geoms(m, body, moved.reshape(-1, 3)).reshape(-1, 3, 2)
@@ -185,7 +186,7 @@ def _on_triangles(points: np.ndarray, corner: np.ndarray) -> tuple[np.ndarray, .
   return found.elem.numpy(), found.weight.numpy(), found.far.numpy()
 
 
-def _search(kernel, points: np.ndarray, geom: np.ndarray, corner: np.ndarray):
+def _search(kernel: Kernel, points: np.ndarray, geom: np.ndarray, corner: np.ndarray):
   n = len(points)
   sizes = {"npoint": n, "ngeom": len(geom), "nelem": len(corner)}
   found = {"far": np.zeros(n), "elem": np.zeros(n), "weight": np.zeros((n, 3))}

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 from palpate.tissue import step
+from palpate.tissue.geometry.mesh import Mesh
 from palpate.tissue.kernels import Kernel, aim
 from palpate.tissue.types import doubles, fill, flags, floats, ints, longs, struct
 
@@ -199,7 +200,7 @@ class Reshape:
     slots: of it
   """
 
-  def __init__(self, organ: "Declaration", slots):
+  def __init__(self, organ: "Declaration", slots: Any):
     self._fields = fields = Reshaping()
     mesh = organ.mesh
     for name in ("rest", "touch", "node_mass", "free", "elem", "begin", "following", "radius"):
@@ -225,7 +226,7 @@ def hold(organ: "Declaration", inertia: np.ndarray, vert: Any = slice(None)) -> 
   return np.where(organ.free[vert], inertia, WALL * organ.window.mass.sum())
 
 
-def _edges(mesh) -> tuple[np.ndarray, np.ndarray]:
+def _edges(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
   """Returns the lengths of the triangles' edges, (nelem, 3), and the longest one at each node.
 
   A tool that touches a triangle is no farther from its corners than their longest edges.

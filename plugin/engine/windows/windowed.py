@@ -295,7 +295,7 @@ def wake(host: Host):
   host.own.tail.numpy()[TAIL.quiet] = 0.0
 
 
-def set_inertia(w: Workspace, m):
+def set_inertia(w: Workspace, m: mjstruct.Struct):
   """Stores the effective inertia of every node for the present time step."""
   organ, win = w.declared, w.organ.window
   nodal = win.mass
