@@ -18,18 +18,8 @@ constexpr int TO_POINT = -1, TO_OWN_MOTION = -2;
 template <class Fields>
 PALPATE Fields of_world(Fields f, int world) {
   const int row = f.row.data[world];
-  move_to(f.count, row);
-  move_to(f.vert, row);
-  move_to(f.body, row);
-  move_to(f.leads, row);
-  move_to(f.stiffness, row);
-  move_to(f.anchor, row);
-  move_to(f.whom, row);
-  move_to(f.pair, row);
-  move_to(f.point, world);
-  move_to(f.force, world);
-  move_to(f.number, world);
-  move_to(f.dvel_warm, world);
+  move_each(row, f.count, f.vert, f.body, f.leads, f.stiffness, f.anchor, f.whom, f.pair);
+  move_each(world, f.point, f.force, f.number, f.dvel_warm);
   move_nodes(f.own, world);
   move_input(f.solve, world);
   move_bodies(f.mj, world);

@@ -24,21 +24,8 @@ struct Seat { D3 at, vel, x, y, z; };
 template <class Fields>
 PALPATE Fields of_world(Fields f, int world) {
   const int row = f.row.data[world];
-  move_to(f.count, row);
-  move_to(f.vert, row);
-  move_to(f.slot, row);
-  move_to(f.area, row);
-  move_to(f.anchor, row);
-  move_to(f.normal, row);
-  move_to(f.corner, row);
-  move_to(f.weight, row);
-  move_to(f.state, world);
-  move_to(f.next, world);
-  move_to(f.stretch, world);
-  move_to(f.force, world);
-  move_to(f.pull, world);
-  move_to(f.hardness, world);
-  move_to(f.number, world);
+  move_each(row, f.count, f.vert, f.slot, f.area, f.anchor, f.normal, f.corner, f.weight);
+  move_each(world, f.state, f.next, f.stretch, f.force, f.pull, f.hardness, f.number);
   move_nodes(f.own, world);
   move_nodes(f.other, world);
   move_input(f.solve, world);

@@ -15,15 +15,7 @@ namespace palpate {
 
 template <class Fields>
 PALPATE Fields of_world(Fields f, int world) {
-  move_to(f.memory, world);
-  move_to(f.quiet, world);
-  move_to(f.hold, world);
-  move_to(f.mass, world);
-  move_to(f.force_ext, world);
-  move_to(f.dvel, world);
-  move_to(f.sol, world);
-  move_to(f.rhs, world);
-  move_to(f.status, world);
+  move_each(world, f.memory, f.quiet, f.hold, f.mass, f.force_ext, f.dvel, f.sol, f.rhs, f.status);
   return f;
 }
 

@@ -18,23 +18,9 @@ constexpr int CELLS = 1024;
 template <class Fields>
 PALPATE Fields of_world(Fields f, int world) {
   const int row = f.row.data[world];
-  move_to(f.nouter, row);
-  move_to(f.stiffness, row);
-  move_to(f.cell, row);
-  move_to(f.nother, row);
-  move_to(f.elem, row);
-  move_to(f.near_adr, row);
-  move_to(f.near, row);
-  move_to(f.slip, world);
-  move_to(f.slipped, world);
-  move_to(f.on, world);
-  move_to(f.force, world);
-  move_to(f.hardness, world);
-  move_to(f.corner, world);
-  move_to(f.weight, world);
-  move_to(f.where, world);
-  move_to(f.next, world);
-  move_to(f.first, world);
+  move_each(row, f.nouter, f.stiffness, f.cell, f.nother, f.elem, f.near_adr, f.near);
+  move_each(world, f.slip, f.slipped, f.on, f.force, f.hardness, f.corner, f.weight, f.where,
+            f.next, f.first);
   move_nodes(f.own, world);
   move_nodes(f.other, world);
   move_input(f.solve, world);
