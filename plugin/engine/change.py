@@ -8,15 +8,15 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy.typing as npt
-from palpate.forces import cohesive_bonds, declare_attachments, declare_bonds
-from palpate.forces.attachments import Group
-from palpate.forces.passive import Force
-from palpate.forces.relaxation import Relaxation
 from palpate.tissue import config as configuration
 from palpate.tissue import reading, shape
 from palpate.tissue.config import Config
 from palpate.tissue.step import SCHEMES
 
+from ..forces import cohesive_bonds, declare_attachments, declare_bonds
+from ..forces.attachments import Group
+from ..forces.passive import Force
+from ..forces.relaxation import Relaxation
 from . import contacts, graphs, workspace
 from .bind import bind
 from .model import mjstruct

@@ -5,16 +5,17 @@ from typing import Any
 
 import numpy as np
 import warp as wp
-from palpate.engine import coupling, layout
-from palpate.engine.layout import FLAG, TAIL, NodalState, WindowState
-from palpate.engine.model import mjstruct
-from palpate.engine.model.declare import Declaration
-from palpate.forces import host
-from palpate.forces.host import Bodies, Input, Nodes, Twin
 from palpate.tissue import body as bodies
 from palpate.tissue.body import Body
 from palpate.tissue.geometry.mesh import Mesh
 from palpate.tissue.types import fill
+
+from ..forces import host
+from ..forces.host import Bodies, Input, Nodes, Twin
+from . import coupling, layout
+from .layout import FLAG, TAIL, NodalState, WindowState
+from .model import mjstruct
+from .model.declare import Declaration
 
 
 class Host(host.Host):

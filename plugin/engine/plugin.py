@@ -14,9 +14,9 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from palpate.forces.passive import Force
 from palpate.tissue.config import KEYS
 
+from ..forces.passive import Force
 from . import change, contacts, signals, workspace
 from .layout import FLAG
 from .model import mjstruct, skin, state_size

@@ -9,25 +9,25 @@ from typing import Any
 import mujoco
 import numpy as np
 import warp as wp
-from palpate.engine.host import Host
-from palpate.engine.model.declare import Declaration
-from palpate.forces import declare_attachments, declare_bonds, supports
-from palpate.forces.attachments import Attachments
-from palpate.forces.cohesive_bonds import Bonds
-from palpate.forces.passive import Forces
-from palpate.forces.supports import Supports
-from palpate.forces.table import FORCES
 from palpate.tissue import body as bodies
 from palpate.tissue.body import Body
 from palpate.tissue.config import Config
 
+from ..forces import declare_attachments, declare_bonds, supports
+from ..forces.attachments import Attachments
+from ..forces.cohesive_bonds import Bonds
+from ..forces.passive import Forces
+from ..forces.supports import Supports
+from ..forces.table import FORCES
 from . import contacts, coupling, graphs
 from .bind import bind
 from .coupling import Phases
 from .cutting.cutters import Cutters
 from .cutting.solid_cuts import Cuts, cuts_of
+from .host import Host
 from .layout import FLAG, HEAD, Topology
 from .model import declare, flexes, inertia, mjstruct, prepare, skin
+from .model.declare import Declaration
 from .penetration import Watch
 from .windows import declare_windows, windowed
 from .windows.model_lock import Turn

@@ -12,11 +12,11 @@ from typing import Any, NamedTuple, Optional
 
 import numpy as np
 import warp as wp
-from palpate.engine.model import mjstruct
 from palpate.tissue.geometry import mesh as topology
 from palpate.tissue.geometry.mesh import Mesh
 from palpate.tissue.types import doubles, ints, struct, vector
 
+from ..engine.model import mjstruct
 from .host import Bodies, Host, Input, Lists, Nodes, kernels, numbers
 from .passive import Force, Springs
 from .transfer import Grip, Held, pairs

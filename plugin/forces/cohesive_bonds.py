@@ -10,10 +10,10 @@ from typing import Any, Optional
 
 import numpy as np
 import warp as wp
-from palpate.engine.layout import BOND
 from palpate.tissue.reading import Law
 from palpate.tissue.types import doubles, ints, struct
 
+from ..engine.layout import BOND
 from .host import Bodies, Host, Input, Lists, Nodes, edited, kernels, numbers
 from .passive import Force, Springs
 from .transfer import Grip, Spots
@@ -264,7 +264,7 @@ class Bonds(Force):
   def carry(self, world: int, group: np.ndarray, member: np.ndarray, share: np.ndarray):
     """See `Force`."""
     organ = self.host.organ
-    if not self.host.config.bonded:
+    if not (self.groups or (self.host.alone and self.host.config.bonded)):
       return
     outer = group < organ.mesh.nskin  # what was inside of a solid had none
     group, member, share = group[outer], member[outer], share[outer]

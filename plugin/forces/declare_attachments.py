@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from palpate.engine.host import Host
-from palpate.engine.model import flexes, inertia, mjstruct
 from palpate.tissue.config import OWN
 from palpate.tissue.geometry import mesh as topology
 from scipy.spatial import KDTree
 
+from ..engine.host import Host
+from ..engine.model import flexes, inertia, mjstruct
 from .attachments import TO_OWN_MOTION, TO_POINT, Attachments, Group
 from .transfer import Grip
 

@@ -6,15 +6,15 @@ from typing import Any
 
 import numpy as np
 import warp as wp
-from palpate.engine import coupling
-from palpate.engine.host import Host
-from palpate.engine.layout import GEOM
-from palpate.engine.model import flexes, mjstruct
 from palpate.tissue.geometry import mesh as topology
 from palpate.tissue.kernels import Kernel
 from palpate.tissue.reading import BondRow, Law
 from palpate.tissue.types import doubles, fill, ints, struct
 
+from ..engine import coupling
+from ..engine.host import Host
+from ..engine.layout import GEOM
+from ..engine.model import flexes, mjstruct
 from . import transfer
 from .cohesive_bonds import ON_ORGAN, Bonds, Group
 from .declare_attachments import check_vertices, find_body, most

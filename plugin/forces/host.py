@@ -15,8 +15,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import warp as wp
-from palpate.engine.coupling import CONSTANTS
-from palpate.engine.model import mjstruct
 from palpate.tissue.config import Config
 from palpate.tissue.geometry.mesh import Mesh
 from palpate.tissue.kernels import Kernel, kernel
@@ -24,8 +22,11 @@ from palpate.tissue.order import LANES
 from palpate.tissue.step import SCHEMES
 from palpate.tissue.types import DIMS, Array, doubles, fill, floats, ints, struct, vector
 
+from ..engine.coupling import CONSTANTS
+from ..engine.model import mjstruct
+
 if TYPE_CHECKING:
-  from palpate.engine.model.declare import Declaration
+  from ..engine.model.declare import Declaration
 
 numbers = doubles("nnumber")  # of a tissue, see `NUMBERS`; in a batch a row a world
 

@@ -4,9 +4,9 @@
 # pyright: reportInvalidTypeForm=false
 import numpy as np
 import warp as wp
-from palpate.engine.layout import FLAG
 from palpate.tissue.types import doubles, floats, ints, scalar, struct, vector
 
+from ..engine.layout import FLAG
 from .host import Bodies, Host, edited, kernels
 from .passive import Force
 

@@ -8,12 +8,12 @@ from typing import Any, Optional
 
 import numpy as np
 import warp as wp
-from palpate.engine import coupling
-from palpate.engine.model import flexes, mjstruct
 from palpate.tissue.geometry import mesh as topology
 from palpate.tissue.geometry.mesh import Mesh
 from palpate.tissue.types import doubles, ints, struct
 
+from ..engine import coupling
+from ..engine.model import flexes, mjstruct
 from .host import Bodies, Host, Input, Lists, Nodes, edited, kernels
 from .passive import Force
 

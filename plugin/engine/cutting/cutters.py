@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import numpy as np
 import warp as wp
-from palpate.forces.declare_attachments import most
-from palpate.forces.host import Bodies, Input, Nodes, Twin
-from palpate.forces.passive import Force
 from palpate.tissue.cutting.path import Finder
 from palpate.tissue.geometry.mesh import Mesh
 from palpate.tissue.step import SCHEMES
 from palpate.tissue.types import Views, doubles, fill, ints, struct
 
+from ...forces.declare_attachments import most
+from ...forces.host import Bodies, Input, Nodes, Twin
+from ...forces.passive import Force
 from .. import coupling
 from ..layout import BLADE, LAW, TRAIL
 from ..model import flexes, mjstruct
