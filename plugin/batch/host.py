@@ -56,8 +56,8 @@ class Host(host.Host):
     self._flags = [wp.array(row, dtype=int, device=self.device) for row in answered]
     self.nodes, self.input = nodes_of(organ), input_of(organ)
 
-  def bind(self):
-    """Points at the bodies and the springs that there are by now."""
+  def bind(self, model: int):
+    """See `Host`."""
     self.bodies, self.input = self._batch.bodies, input_of(self._organ)
 
   def need_springs(self):

@@ -160,7 +160,7 @@ class Worlds(Batch):
       for each in (*tears.make(organ), *blades.make(organ)):
         organ.forces.add(each)
     for organ in organs:
-      organ.host.bind()
+      organ.host.bind(organ.host.model)
     for organ in organs:
       organ.forces.bind()
     return any(each.aims for organ in organs for each in organ.forces)

@@ -51,10 +51,11 @@ class Host(host.Host):
     self.arrays["lagged"] = wp.zeros((size, 3), dtype=wp.float64, device="cpu")
     self.arrays["heaviest"] = wp.ones(1, dtype=wp.float64, device="cpu")
     self.number, self._flags = body.numbers, wp.zeros(len(FLAG), dtype=int, device="cpu")
+    self._rest = wp.array(self._from(), dtype=wp.float64, device="cpu")  # that of all `nodes`
     self.bind(model)
 
   def bind(self, model: int):
-    """Points at the arrays of a model and of the mjData."""
+    """See `Host`."""
     organ, self.model = self.organ, model
     kind, sizes = WindowState if organ.windows else NodalState, coupling.sizes(organ)
     size = layout.size(kind, sizes)
@@ -64,7 +65,7 @@ class Host(host.Host):
     motion, none = self.own.motion if organ.windows else None, np.zeros((0, 3))
     values = dict(
       windowed=int(motion is not None),
-      rest=self._rest(),
+      rest=self._rest,
       disp=motion.disp if motion else none,
       vel=motion.vel if motion else none,
       qposadr=organ.qposadr,
@@ -73,9 +74,10 @@ class Host(host.Host):
       origin=organ.origin,
     )
     self.nodes = fill(Nodes, "cpu", values)
+    self._rest.assign(self._from())
     self._fill_input()
 
-  def _rest(self) -> np.ndarray:
+  def _from(self) -> np.ndarray:
     """Returns what displacements are from: nodal, qpos0 whatever was cut [m], (nvert, 3)."""
     return self.organ.mesh.rest if self.organ.windows else self.organ.mesh.whole.rest
 
@@ -91,7 +93,7 @@ class Host(host.Host):
   def become(self, organ: Declaration):
     """Takes the organ that a cut has made, or a state that was set."""
     self.organ = organ
-    self.nodes.rest.numpy()[:] = self._rest()
+    self._rest.assign(self._from())
 
   def need_springs(self):
     """See `Host`."""
@@ -148,4 +150,4 @@ class Host(host.Host):
       qpos = np.maximum(organ.qposadr[vert], 0)[:, None] + np.arange(3)
       u = mjstruct.view(d.qpos, m.nq)[qpos] - mjstruct.view(m.qpos0, m.nq)[qpos]
       u = (organ.dofadr[vert] >= 0)[:, None] * u
-    return organ.origin + (self._rest()[vert] + u) @ organ.frame.T
+    return organ.origin + (self._from()[vert] + u) @ organ.frame.T

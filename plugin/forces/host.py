@@ -192,6 +192,10 @@ class Host(abc.ABC):
   number: wp.array
 
   @abc.abstractmethod
+  def bind(self, model: int):
+    """Points at the arrays of a model, and at the springs that there are by now."""
+
+  @abc.abstractmethod
   def need_springs(self):
     """Makes `springs`."""
 

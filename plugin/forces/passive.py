@@ -143,8 +143,10 @@ class Forces:
       kernel = each.ENTER or each.ACT or each.END
       if (each or each.followers) and kernel is not None:
         self.host.load(kernel)
-      for one in (each, *each.followers):
-        one.bind()
+      each.bind()
+      for follower in each.followers:
+        follower.host.bind(self.host.model)  # kernels of this organ read its bodies
+        follower.bind()
 
   def enter(self):
     """Adds to the solver's input."""
