@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from palpate.engine.forces.attachments import motion
-from palpate.engine.forces.cohesive_bonds import Group
 from palpate.engine.layout import BOND
+from palpate.engine.workspace import Workspace
+from palpate.forces.cohesive_bonds import Group
 
 
 class Bonds:
@@ -16,7 +16,7 @@ class Bonds:
     space: the organ's workspace
   """
 
-  def __init__(self, space):
+  def __init__(self, space: Workspace):
     self._space = space
 
   @property
@@ -24,7 +24,7 @@ class Bonds:
     return self._space.bonds.groups
 
   def _all(self, name: str, width: tuple[int, ...] = ()) -> np.ndarray:
-    parts = [np.asarray(getattr(group.now, name)) for group in self._groups]
+    parts = [np.asarray(group.now[name]) for group in self._groups]
     return np.concatenate([np.zeros((0, *width)), *parts])
 
   @property
@@ -49,7 +49,7 @@ class Bonds:
   def made(self) -> np.ndarray:
     """Which of the bonds that were made each is, or is a part of since a cut, (n,)."""
     first = np.cumsum([0, *(len(group.grip.vert) for group in self._groups)])
-    parts = [group.now.made + k for group, k in zip(self._groups, first, strict=False)]
+    parts = [group.now["made"] + k for group, k in zip(self._groups, first, strict=False)]
     return np.concatenate([np.zeros(0, int), *parts])
 
   @property
@@ -100,7 +100,7 @@ class Bonds:
   @property
   def positions(self) -> np.ndarray:
     """Where their vertices are now [m], (n, 3)."""
-    return motion(self._space, self.vertices)[0]
+    return self._space.host.places(self.vertices)
 
   @property
   def stretch(self) -> np.ndarray:
@@ -111,7 +111,7 @@ class Bonds:
   def stored(self) -> float:
     """Elastic energy that they had then, less what the step's damage took of it [J]."""
     stiffness = np.repeat(
-      [g.law.stiffness for g in self._groups], [len(g.now.vert) for g in self._groups]
+      [g.law.stiffness for g in self._groups], [len(g.now["vert"]) for g in self._groups]
     )
     far2 = (self.stretch**2).sum(axis=1)
     return float((0.5 * stiffness * self.area * (1.0 - self.damage) * far2).sum())
@@ -122,5 +122,5 @@ class Bonds:
     return self._written("pull")
 
   def _written(self, name: str) -> np.ndarray:
-    parts = [group.arrays[name].numpy()[: len(group.now.vert)] for group in self._groups]
+    parts = [group.arrays[name].numpy()[0, : len(group.now["vert"])] for group in self._groups]
     return np.concatenate([np.zeros((0, 3)), *parts])

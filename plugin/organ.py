@@ -5,7 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 import numpy.typing as npt
-from palpate.engine import change, motion, penetration, signals, workspace
+from palpate.engine import change, penetration, signals, workspace
 from palpate.engine import plugin as engine
 from palpate.engine.cutting.cuts import Piece, Report
 from palpate.engine.cutting.cutters import Cutter
@@ -43,7 +43,6 @@ class Organ:
     self.data = data
     self.name = name
     self._space = engine.find(data._address, organs[name])
-    self._motion = motion.of(self._space)
 
   @property
   def _organ(self):
@@ -154,11 +153,13 @@ class Organ:
 
   def detach(self):
     """Takes away what `attach` has made; what the model declares stays."""
-    made = [group for group in self._space.ties.groups if not group.by]
+    held = self._space.attachments
+    made = [group for group in held.groups if not group.by]
     for group in made:
       if group.other is not None:
-        theirs = [g for g in group.other.ties.groups if g.other is self._space and not g.by]
-        change.detach(group.other, self.model._address, theirs)
+        other = engine.find(self.data._address, group.other.host.instance)
+        theirs = [g for g in group.other.groups if g.other is held and not g.by]
+        change.detach(other, self.model._address, theirs)
     change.detach(self._space, self.model._address, made)
 
   @signals.deferred()
@@ -255,7 +256,7 @@ class Organ:
   @property
   def _deformation(self) -> np.ndarray:
     """Displacement from rest in the organ's own frame, with the inside [m], (nvert + ., 3)."""
-    return self._motion.displacement(self.model, self.data)
+    return self._space.motion()[0]
 
   @property
   def xpos(self) -> np.ndarray:
@@ -278,12 +279,12 @@ class Organ:
   @property
   def xvel(self) -> np.ndarray:
     """Velocities [m/s], (nvert, 3)."""
-    return self._motion.velocity(self.data)[: self.nvert] @ self._organ.frame.T
+    return self._space.motion()[1][: self.nvert] @ self._organ.frame.T
 
   @property
   def contact_force(self) -> np.ndarray:
     """Constraint force on each vertex that the last step took [N], (nvert, 3); at rest MuJoCo's."""
-    return self._motion.contact_force(self.data)[: self.nvert] @ self._organ.frame.T
+    return self._space.graphs.phases.contact_force()[: self.nvert] @ self._organ.frame.T
 
   @property
   def window_overflow(self) -> tuple[int, int]:
@@ -318,7 +319,7 @@ class Organ:
   @property
   def support_force(self) -> np.ndarray:
     """Sum of the forces of what the organ rests on (`support`) in the last step [N], (3,)."""
-    return self._space.rests.force().sum(axis=0)
+    return self._space.supports.force().sum(axis=0)
 
   @property
   def energy(self) -> float:
@@ -377,7 +378,7 @@ class Organ:
     u = None if xpos is None else fill.inside(self._organ.mesh, (xpos - self.xpos0) @ frame)
     v = None if xvel is None else fill.inside(self._organ.mesh, xvel @ frame)
     self._space.forget()
-    self._motion.put(self.model, self.data, u, v)
+    workspace.set_motion(self._space, self.model._address, u, v)
 
   def sync(self):
     """Brings a motion that stays on a device (`resident`) into mjData.plugin_state.
@@ -420,7 +421,7 @@ class Attachment:
   def force(self) -> np.ndarray:
     """Force on the organ in the last step, in the world [N], (3,); zero when it is detached."""
     space, group = self._made[0]
-    return space.ties.force(group).sum(axis=0)
+    return space.attachments.force(group).sum(axis=0)
 
   def detach(self):
     """Lets go."""

@@ -38,7 +38,7 @@ def floor(module: str) -> int:
   """Returns the floor of a module of the package."""
   words = module.split(".")
   room = words[1] if len(words) > 1 else "organ"  # palpate itself: the handle and register
-  names = {"__main__": "app"} | dict.fromkeys(
+  names = {"__main__": "app", "forces": "engine"} | dict.fromkeys(  # one floor, no circle
     ("attributes", "authoring", "bonds", "meshes", "screen", "skins", "spares", "windows"), "organ"
   )
   return FLOORS.index(names.get(room, room))

@@ -410,7 +410,7 @@ class Tissue(Parting):
   @property
   @abc.abstractmethod
   def bonds(self) -> Any:
-    """What it has grown on to, see `palpate.batch.forces.bonds.Bonds`."""
+    """What it has grown on to, see `palpate.batch.bonds.Bonds`."""
 
   @abc.abstractmethod
   def configure(self, mask=None, **keys):

@@ -17,8 +17,8 @@ import warp as wp
 from palpate.engine.cutting.cuts import Report
 
 from .base import Batch, Contacts, Tissue, on_device, spread
+from .bonds import Gathered
 from .cutting.fracture import Cutters
-from .forces.bonds import Gathered
 from .worlds import Worlds
 
 

@@ -11,18 +11,19 @@ import warp as wp
 from palpate.engine import coupling
 from palpate.engine.cutting.cuts import Report, pieces
 from palpate.engine.windows import proxies
+from palpate.forces.passive import Forces
+from palpate.forces.table import FORCES
 from palpate.tissue import body as bodies
 from palpate.tissue import config as configuration
 from palpate.tissue import device as devices
 from palpate.tissue import order, shape, step
 
-from . import kernels, patch
+from . import bonds, host, kernels, patch
 from .base import Contacts, Tissue, spread
 from .contact import contact_rows, contacts, convex
 from .cutting.blades import Blades
 from .cutting.cuts import Cuts
 from .cutting.fracture import Cutters
-from .forces import base, passive
 from .material import KEYS, Material
 from .patch import launch
 from .strip_organs import Slots
@@ -68,10 +69,9 @@ class Organ(Tissue):
     tools: geoms that they follow
 
   Attributes:
-    beside: what acts on it beside its tissue
+    host: it, as forces see it
+    forces: what acts on it beside its tissue
   """
-
-  beside: tuple[base.Beside, ...] = ()
 
   def __init__(self, batch: Worlds, w: Workspace, place: Slots, tools: np.ndarray):
     organ, device, nworld = w.organ, batch.device, batch.nworld
@@ -103,7 +103,7 @@ class Organ(Tissue):
       slot_mass=place.mass,
       sleeps=int(self.body.plan is not None),
       stiff=int(w.graphs.stiff and self._scheme.respond is not None),
-      heaviest=float(w.host["heaviest"].numpy()[0]),
+      heaviest=float(w.host.arrays["heaviest"].numpy()[0]),
       ngravity=nworld,
       overflow=batch.lost,
       bad=batch.bad,
@@ -124,6 +124,8 @@ class Organ(Tissue):
     kinds = frozenset(int(kind) for kind in model.geom_type[tools])
     self._find = contacts.kernel(kinds)
     self._material = Material(self, batch, self._touch)
+    self.host = host.Host(self)
+    self.forces = Forces(self.host, FORCES)
 
   def enclose(self):
     """Lets the step know volume stiffness and pressure, from the next record on."""
@@ -144,10 +146,15 @@ class Organ(Tissue):
     """Returns about how many bytes a world takes of the organ of a workspace."""
     there = dataclasses.replace(w.body, device=device)
     alone = dataclasses.replace(w.body, levels=None, plan=plan_of(there, w.organ.config))
-    held = 24.0 + 160.0 if any(w.beside) else 0.0  # of springs beside the tissue
+    held = 24.0 + 160.0 if w.forces else 0.0  # of springs beside the tissue
     if held and w.organ.mesh.spare:  # which follow a mesh a world
       held += 400.0
     return bodies.nbytes(alone) + (44.0 + held) * w.organ.mesh.nvert
+
+  @property
+  def opens(self) -> list[host.Opens]:
+    """What lets its meshes come apart."""
+    return [each for each in self.forces if isinstance(each, host.Opens)]
 
   # Within a step.
 
@@ -166,8 +173,7 @@ class Organ(Tissue):
     self._over(patch.enter, p.nnode)
     if self.body.state.hold.size:
       self.body.state.hold.zero_()
-    for each in self.beside:
-      each.enter()
+    self.forces.enter()
     self._over(patch.rank, p.most)
     self._over(patch.stand, max(p.most, p.nslot))
     self._scheme.step(self.body)
@@ -187,8 +193,7 @@ class Organ(Tissue):
     self._over(patch.push, self.place.nslot)
     dim = self._pressed.geom.shape
     wp.launch(contact_rows.keep_closed, dim=dim, inputs=[self._pressed], device=self.body.device)
-    for each in self.beside:
-      each.act()
+    self.forces.act()
 
   def end(self):
     """Ends the step with the contact forces that mujoco_warp found."""
@@ -201,8 +206,7 @@ class Organ(Tissue):
       respond(self.body)
       self._over(patch.follow, 1)
     self._over(patch.commit, self.patch.nnode)
-    for each in self.beside:
-      each.end()
+    self.forces.end()
 
   def find_bad(self):
     """Flags worlds that are not finite."""
@@ -211,7 +215,8 @@ class Organ(Tissue):
   def rest(self):
     """Puts the worlds of the mask at rest."""
     self._over(patch.rest, self.patch.nnode)
-    for each in self.beside:
+    self.host.rest()
+    for each in self.opens:
       each.rest()
     if self._cuts:
       self._cuts.heal()
@@ -235,9 +240,9 @@ class Organ(Tissue):
     return {name: wp.zeros(shape, dtype=wp.vec3, device=self.body.device) for name in _WHAT}
 
   @functools.cached_property
-  def bonds(self) -> passive.Grown:
+  def bonds(self) -> bonds.Bonds:
     """What it has grown on to."""
-    return passive.Grown(self)
+    return bonds.Grown(self)
 
   def _read(self, name: str) -> wp.array:
     if name in _STATUS:
@@ -281,7 +286,7 @@ class Organ(Tissue):
     return self._cuts.counts()
 
   def _cutters(self) -> Cutters:
-    for each in self.beside:
+    for each in self.forces:
       if isinstance(each, Blades):
         return each.read()
     raise ValueError(f"organ {self.name!r}: nothing cuts it, expected the key cutters")
@@ -308,7 +313,7 @@ class Organ(Tissue):
       if key != "friction" and key != "mass":
         self._check(key, values)
     self._material.change(chosen, rows)
-    for each in self.beside:
+    for each in self.opens:
       each.configure(chosen, rows)
     self.wake(chosen)
 

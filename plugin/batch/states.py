@@ -12,8 +12,7 @@ from palpate.engine import plugin as engine
 from palpate.engine.layout import TAIL
 from palpate.tissue.order import from_slices, to_slices
 
-from . import kernels
-from .forces import base
+from . import host, kernels
 from .organs import Organ
 
 if TYPE_CHECKING:
@@ -130,8 +129,8 @@ def _pull_organ(organ: Organ, world: int, model, data):
     _pull_slots(organ, world, own, spans, force)
   if organ.topology:
     organ.topology.pull(world, own, spans)
-  for kept in (kept for each in organ.beside for kept in each.kept):
-    kept.of(own, spans)[kept.rows] = kept.array[world].numpy()
+  for block, (there, _) in organ.host.kept.items():
+    own[spans[block]] = there[world].numpy()
   own[spans["signature"]] = declared.signature
 
 
@@ -180,7 +179,7 @@ def push(batch: Worlds, world: int, data: mujoco.MjData):
   d.time[world : world + 1].assign(np.array([data.time], np.float32))
   for organ in batch.organs.values():
     _push_organ(organ, world, model, data)
-  base.follow(batch, [world])
+  host.follow(batch, [world])
 
 
 def keep(batch: Worlds, start, data: mujoco.MjData):
@@ -199,7 +198,7 @@ def keep(batch: Worlds, start, data: mujoco.MjData):
       name: getattr(organ.patch, name) for name in ("force", "heavier", "calm")
     }
     pairs += [(array, getattr(organ.patch, f"{name}0")) for name, array in own.items()]
-    pairs += [(kept.flat, kept.start) for each in organ.beside for kept in each.kept]
+    pairs += organ.host.kept.values()
   # The first world has it for a moment.
   changed = [array for array, _ in pairs] + [d.ctrl, d.time, d.qacc_warmstart]
   saved = [(array, wp.clone(array[:1])) for array in changed if array.size]
@@ -250,5 +249,5 @@ def _push_organ(organ: Organ, world: int, model, data):
   _assign(organ.patch.force, world, full)
   for array, value in ((organ.patch.heavier, heavier), (organ.patch.calm, calm)):
     array[world : world + 1].assign(np.array([value]))
-  for kept in (kept for each in organ.beside for kept in each.kept):
-    _assign(kept.array, world, kept.of(own, spans)[kept.rows])
+  for block, (there, _) in organ.host.kept.items():
+    _assign(there, world, own[spans[block]])

@@ -21,8 +21,8 @@ from palpate.tissue import body as bodies
 from palpate.tissue.geometry import mesh as topology
 
 from .base import Batch, Tissue, free_memory, refuse_crowd, spread
+from .bonds import OfThreads
 from .cutting.fracture import Cutters
-from .forces.bonds import OfThreads
 
 _OF_VERTICES = ("xpos", "xvel", "contact_force")
 _FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS

@@ -7,6 +7,7 @@ along (`coupling/node.h`), and the nodes take over what contacts made of the slo
 
 from __future__ import annotations
 
+import functools
 import warnings
 from typing import Any
 
@@ -15,14 +16,14 @@ import mujoco_warp as mjw
 import numpy as np
 import warp as wp
 from palpate.engine import plugin as engine
+from palpate.forces.cohesive_bonds import Bonds
 from palpate.organ import instances
 from palpate.tissue import device as devices
 
-from . import kernels, states, strip_organs
+from . import host, kernels, states, strip_organs
 from .base import Batch, free_memory, refuse_crowd
 from .contact import contacts, convex
 from .cutting import blades, tears
-from .forces import base, passive
 from .organs import Organ
 from .private import DeterminismType, OverflowType
 from .reset import Rest
@@ -60,7 +61,7 @@ class Worlds(Batch):
       name: engine.find(self.scratch._address, number) for name, number in instances(model).items()
     }
     declared = [w.organ for w in spaces.values()]
-    passive.check(list(spaces.values()))
+    host.check(spaces.values())
     tools = [strip_organs.tools_of(model, organ) for organ in declared]
     nslots = [
       strip_organs.slots_for(model, o, t, nodes) for o, t in zip(declared, tools, strict=True)
@@ -79,8 +80,7 @@ class Worlds(Batch):
       }
       self._rest = Rest(self, bare)
       self.aims = self._join()
-      every = (each for organ in self._organs.values() for each in organ.beside)
-      self._looks = [each for each in every if isinstance(each, base.Opens)]
+      self._looks = [each for organ in self._organs.values() for each in organ.opens]
       self._teller = states.Teller(self)
       self._alias()
       self._sensed: Any = kernels.Sensed()
@@ -139,19 +139,31 @@ class Worlds(Batch):
     gravity = np.tile(model.opt.gravity, (nworld, 1)).astype(np.float32)
     self.m.opt.gravity = wp.array(gravity, dtype=wp.vec3)
 
+  @functools.cached_property
+  def bodies(self) -> Any:
+    """`WorldBodies` of its worlds."""
+    return host.bodies_of(self)
+
+  @functools.cached_property
+  def numbers(self) -> np.ndarray:
+    """Numbers of the model's bodies in mujoco_warp's, see `host.numbers_of`."""
+    return host.numbers_of(self)
+
   def _join(self) -> bool:
-    """Lets organs have what acts beside them; returns whether it asks where bodies are."""
+    """Lets organs have their forces; returns whether these ask where bodies are."""
     organs = list(self._organs.values())
+    twin = lambda force: self._organs[force.host.organ.name].forces.of(type(force))  # noqa: E731
     for organ in organs:
-      organ.beside = tears.make(organ)
-    if not any(any(organ.space.beside) for organ in organs):
-      return False
-    self.bodies = base.bodies_of(self)
-    numbers = base.numbers_of(self.model, self.bare, [organ.declared for organ in organs])
+      organ.forces.take(organ.space.forces, twin)
+      currents = organ.space.cutters.by_current.values()
+      organ.forces.of(Bonds).currents = [current.burning for current in currents]
+      for each in (*tears.make(organ), *blades.make(organ)):
+        organ.forces.add(each)
     for organ in organs:
-      organ.beside += (*passive.make(organ, numbers), *blades.make(organ))
-    passive.meet(organs)
-    return any(each.aims for organ in organs for each in organ.beside)
+      organ.host.bind(organ.host.model)
+    for organ in organs:
+      organ.forces.bind()
+    return any(each.aims for organ in organs for each in organ.forces)
 
   def _alias(self):
     """Lets controls, sensors and time be mujoco_warp's own arrays."""
@@ -200,7 +212,7 @@ class Worlds(Batch):
 
   def _feel(self, sensor: int, organ: str):
     adr = int(self.model.sensor_adr[sensor])
-    found = self._organs[organ].beside
+    found = self._organs[organ].forces
     self._felt += [(each, adr) for each in found if isinstance(each, blades.Blades)]
     self.record()
 

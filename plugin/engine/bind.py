@@ -11,6 +11,7 @@ from palpate.tissue import step
 from palpate.tissue.body import Body
 
 from . import contacts, coupling, graphs, nodal, penetration
+from .coupling import Phases
 from .model import declare, mjstruct
 from .windows import declare_windows, nodes, proxies, windowed
 
@@ -23,25 +24,29 @@ def bind(w: Workspace, model: int):
   m = mjstruct.Model.from_address(model)
   device, cpu = w.body.device, wp.get_device("cpu")
   scheme = step.SCHEMES[w.config.integrator]
-  side = windowed if w.organ.windows else nodal
   with graphs.lock:
     declare.check_frame(m, w.organ)
     load(w.body)
     if w.graphs.resident:
       w.graphs.resident.fetch()
-    w.graphs.phases = does = side.Phases(w, model, w.seen.instance)
+    w.host.bind(model)
+    if w.organ.windows:
+      w.views = w.views or windowed.scratch(w.host)
+      does = windowed.Phases(w.host, w.views, w.share)
+    else:
+      does = nodal.Phases(w.host, w.share)
+    w.graphs.phases, w.graphs.resident = does, does.resident
     w.cuts.bind(model)
     near = wp.get_device(does.side)
     crossing = device != near
 
     before, part = _before(w, model), functools.partial
-    _bind_more(w, model)
+    w.forces.bind()
 
     def solve():
       if crossing:
         _cross(w, _IN, to_device=True)
-      if w.hold:
-        w.hold.cross()
+      w.host.send_springs()
       scheme.step(w.body)
       if crossing:
         _cross(w, _OUT, to_device=False)
@@ -79,29 +84,20 @@ def bind(w: Workspace, model: int):
 # Phases of a coupling, with what acts on the organ beside it.
 
 
-def _bind_more(w: Workspace, model: int):
-  for each in w.beside:
-    each.load()
-    each.bind(model)
-
-
-def _enter(w: Workspace, does):
+def _enter(w: Workspace, does: Phases):
   does.enter()
-  if w.hold:
-    w.hold.clear()
-  for each in w.beside:
-    each.enter()
+  if w.host.springs is not None:
+    w.host.springs.zero_()
+  w.forces.enter()
 
 
-def _scatter(w: Workspace, does):
+def _scatter(w: Workspace, does: Phases):
   does.scatter()
-  for each in w.beside:
-    each.act()
+  w.forces.act()
 
 
-def _advance(w: Workspace, does, ends: bool):
-  for each in w.beside:
-    each.end()
+def _advance(w: Workspace, does: Phases, ends: bool):
+  w.forces.end()
   if ends:
     does.end()
   does.advance()
@@ -110,7 +106,12 @@ def _advance(w: Workspace, does, ends: bool):
 def _watch(w: Workspace, model: int):
   """Notes what of a model a step looks at, and what it was."""
   m = mjstruct.Model.from_address(model)
-  w.model, w.seen.identity = model, mjstruct.Identity(model)
+  organ = w.organ
+  if organ.windows:
+    tree = mjstruct.view(m.body_treeid, m.nbody, np.int32)[organ.windows.body[0]]
+    w.seen.policy = mjstruct.view(m.tree_sleep_policy, m.ntree, np.int32)[tree:].data
+    w.seen.counts = mjstruct.view(m.flex_vertnum, m.nflex, np.int32)[organ.flex :].data
+  w.seen.identity = mjstruct.Identity(model)
   option = model + mjstruct.Model.opt.offset
   w.seen.model_step = mjstruct.view(option + type(m.opt).timestep.offset, 1).data
   w.seen.time_step = float(m.opt.timestep)
@@ -154,7 +155,7 @@ _OUT = ("dvel", "status")
 def _cross(w: Workspace, fields: tuple[str, ...], to_device: bool):
   theirs = coupling.on_body(w.body)
   for field in fields:
-    there, here = theirs[field], w.host[field]
+    there, here = theirs[field], w.host.arrays[field]
     if to_device:
       wp.copy(there, here)
     else:

@@ -1,20 +1,24 @@
-"""What changes of an organ while it runs: configuration keys, and what it is tied to."""
+"""What changes of an organ while it runs: configuration keys, and what it is attached to."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+import numpy.typing as npt
 from palpate.tissue import config as configuration
 from palpate.tissue import reading, shape
 from palpate.tissue.config import Config
 from palpate.tissue.step import SCHEMES
 
+from ..forces import cohesive_bonds, declare_attachments, declare_bonds
+from ..forces.attachments import Group
+from ..forces.passive import Force
+from ..forces.relaxation import Relaxation
 from . import contacts, graphs, workspace
 from .bind import bind
-from .forces import cohesive_bonds, declare_attachments, declare_bonds
-from .forces.attachments import Group
 from .model import mjstruct
 from .windows import windowed
 
@@ -34,14 +38,16 @@ def configure(w: Workspace, model: int, texts: dict[str, str]):
   w.report.chosen = True
 
 
-def copy(w: Workspace, model: int, other, twin):
+def copy(
+  w: Workspace, model: int, other: Workspace, twin: Callable[[Force], tuple[Workspace, Force]]
+):
   """Gives a copy of an mjData the configuration of the original, unless it was given one itself.
 
   Args:
     w: workspace of the copy
     model: the mjModel
     other: workspace of the original
-    twin: returns the workspace of the copy for one of the original
+    twin: returns the workspace and force of the copy for a force of the original
   """
   one, two = w.organ, other.organ  # which may have been made for different time steps
   if (one.signature, one.config) != (two.signature, two.config):
@@ -49,21 +55,21 @@ def copy(w: Workspace, model: int, other, twin):
   if not w.report.chosen and w.config != other.config:
     _change(w, model, other.config)
   mine, theirs = ([g for g in each.bonds.groups if not g.declared] for each in (w, other))
-  if len(mine) != len(theirs) or not all(map(cohesive_bonds.alike, mine, theirs)):
+  if len(mine) != len(theirs) or not all(a.alike(b) for a, b in zip(mine, theirs, strict=True)):
     w.bonds.let_go()
     for group in theirs:
-      _put(w, dataclasses.replace(group, own=w, other=group.other and twin(group.other)))
-  if w.ties.groups or other.ties.groups:
-    groups = [
-      dataclasses.replace(g, own=w, other=g.other and twin(g.other)) for g in other.ties.groups
-    ]
-    tie(w, model, groups)
+      to, bonds = (None, None) if group.other is None else twin(group.other)
+      _put(w, to, dataclasses.replace(group, other=bonds))
+  if w.attachments.groups or other.attachments.groups:
+    groups = other.attachments.groups
+    ends = [None if group.other is None else twin(group.other)[1] for group in groups]
+    hold(w, model, [dataclasses.replace(g, other=o) for g, o in zip(groups, ends, strict=True)])
 
 
 def attach(
-  w: Workspace, model: int, vertices, to, stiffness: float | None
+  w: Workspace, model: int, vertices: npt.ArrayLike, to: int | Workspace, stiffness: float | None
 ) -> list[tuple[Any, Group]]:
-  """Ties vertices to a body, or to another organ's vertices nearest to them, where they are.
+  """Attaches vertices to a body, or to another organ's vertices nearest to them, where they are.
 
   Args:
     w: the workspace of the organ
@@ -78,7 +84,7 @@ def attach(
   Raises:
     ValueError: vertices, stiffness or configuration do not allow it.
   """
-  vert = declare_attachments.check_vertices(w, vertices)
+  vert = declare_attachments.check_vertices(w.host, vertices)
   spaces = [w] if isinstance(to, int) else [w, to]
   for each in spaces:
     workspace.attach(each, model)
@@ -89,29 +95,38 @@ def attach(
       )
   _find_bodies(w)
   if isinstance(to, int):
-    made = [declare_attachments.to_body(w, vert, to, stiffness)]
+    made = [declare_attachments.to_body(w.host, vert, to, stiffness)]
   else:
-    made = list(declare_attachments.to_organ(w, vert, to, stiffness))
+    ends = w.attachments, to.attachments
+    made = list(declare_attachments.to_organ(*ends, vert, stiffness, now=True))
   for each, group in zip(spaces, made, strict=True):
-    tie(each, model, [*each.ties.groups, group])
+    hold(each, model, [*each.attachments.groups, group])
   return list(zip(spaces, made, strict=True))
 
 
 def detach(w: Workspace, model: int, groups: list[Group]):
-  """Takes ties away."""
-  tie(w, model, [group for group in w.ties.groups if group not in groups])
+  """Takes attachments away."""
+  hold(w, model, [group for group in w.attachments.groups if group not in groups])
 
 
-def tie(w: Workspace, model: int, groups: list[Group]):
-  """Makes these the ties of an organ."""
+def hold(w: Workspace, model: int, groups: list[Group]):
+  """Makes these the attachments of an organ."""
   with graphs.lock:
-    if w.ties.put(groups):
+    if w.attachments.put(groups):
       bind(w, model)
   if w.turn is not None:
-    windowed.wake(w)
+    windowed.wake(w.host)
 
 
-def bond(w: Workspace, model: int, to, name: str, law, near: float | None, vertices):
+def bond(
+  w: Workspace,
+  model: int,
+  to: int | Workspace,
+  name: str,
+  law: tuple[float, float, float],
+  near: float | None,
+  vertices: npt.ArrayLike | None,
+):
   """Bonds an organ to a body or another organ, where its vertices are.
 
   Args:
@@ -141,10 +156,9 @@ def bond(w: Workspace, model: int, to, name: str, law, near: float | None, verti
     workspace.attach(each, model)
   _find_bodies(w)
   if isinstance(to, int):
-    group = declare_bonds.to_body(w, to, name, *how)
+    _put(w, None, declare_bonds.to_body(w.host, to, name, *how))
   else:
-    group = declare_bonds.to_organ(w, to, *how)
-  _put(w, group)
+    _put(w, to, declare_bonds.to_organ(w.bonds, to.bonds, *how))
 
 
 def _find_bodies(w: Workspace):
@@ -152,18 +166,18 @@ def _find_bodies(w: Workspace):
   mjstruct.library().mj_kinematics(w.model, w.data)
 
 
-def _put(w: Workspace, group: cohesive_bonds.Group):
+def _put(w: Workspace, other: Workspace | None, group: cohesive_bonds.Group):
   w.bonds.put(group)
-  for each in [w] if group.other is None else [w, group.other]:
+  for each in [w] if other is None else [w, other]:
     with graphs.lock:
       bind(each, each.model)
     if each.turn is not None:
-      windowed.wake(each)
+      windowed.wake(each.host)
 
 
 def _change(w: Workspace, model: int, config: Config):
   workspace.attach(w, model)
-  before, w.config = w.config, config
+  before, w.host.config = w.config, config
   contacts.tell(w, model)
   if w.graphs.resident:
     w.graphs.resident.stop()
@@ -174,7 +188,7 @@ def _change(w: Workspace, model: int, config: Config):
       w.cuts.forget()
     else:
       shape.renumber(w.body, config, w.organ.mesh.closed or not w.cuts)
-    w.creep.renumber(config)
+    w.forces.of(Relaxation).refresh()
     if any(getattr(before, key) != getattr(config, key) for key in configuration.RECORDED):
       bind(w, model)
     if material:
@@ -182,8 +196,7 @@ def _change(w: Workspace, model: int, config: Config):
     else:
       workspace.feel(w, mjstruct.Model.from_address(model))
   if config.foundation != before.foundation and config.carrier:
-    tie(
-      w, model, [*declare_attachments.carried(w), *(g for g in w.ties.groups if g.by != "carrier")]
-    )
+    others = [group for group in w.attachments.groups if group.by != "carrier"]
+    hold(w, model, [*declare_attachments.carried(w.host), *others])
   if w.turn is not None:
-    windowed.wake(w)
+    windowed.wake(w.host)

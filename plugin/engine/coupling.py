@@ -10,6 +10,8 @@ then is a guess of what a tool meets, and follows the organ's answers.
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import mujoco
@@ -30,6 +32,10 @@ if TYPE_CHECKING:
 _HUGE = 1e6  # more than any displacement, velocity or force of an organ [m, m/s, N]
 
 
+# Gives vertices, all or some, their part of what they were of values by mass, see `Cuts.share`.
+Share = Callable[..., np.ndarray]
+
+
 class Phases:
   """What a coupling launches around the solve, in the order of a step.
 
@@ -38,9 +44,13 @@ class Phases:
 
   Attributes:
     side: device of the phases that are not on the CPU
+    boxes: blocks of the plugin state and of what crosses in a step, see `layout`; windows
+    resident: keeper of a motion that stays on `side`, or None
   """
 
   side: Any
+  boxes: Mapping[str, Any] = MappingProxyType({})
+  resident: Any = None
 
   def place(self):
     """Makes the model fit the plugin state, before a step whose state came from outside."""
@@ -76,20 +86,38 @@ class Phases:
     """Returns displacement and velocity of the vertices, in the organ's frame, (nvert, 3) each."""
     raise NotImplementedError
 
+  def contact_force(self) -> np.ndarray:
+    """Returns the contact force that the organ took in the last step, there [N], (nvert, 3)."""
+    raise NotImplementedError
+
   def reshape(self, touched: np.ndarray | None = None):
     """Takes the mesh and the masses that the organ has now; `touched` as in `cut`, None for all."""
 
-  def carry(self, changed, disp, vel, group, member, share):
-    """Gives vertices the motion that they have after a cut, and those that were one their part.
+  def put(self, vert: np.ndarray, disp: np.ndarray | None, vel: np.ndarray | None):
+    """Gives vertices that move a displacement and a velocity, None for what they have.
 
     Args:
-      changed: vertices that lie elsewhere at rest, or are new
-      disp: displacement of all vertices [m]   (nvert, 3)
-      vel: velocity of all vertices [m/s]      (nvert, 3)
+      vert: the vertices
+      disp: displacement of all vertices [m]  (nvert, 3)
+      vel: velocity of all vertices [m/s]     (nvert, 3)
+    """
+
+  def divide(self, group: np.ndarray, member: np.ndarray, share: np.ndarray):
+    """Gives vertices that a cut has divided their part of what there is from the last steps.
+
+    Args:
       group: of vertices that were one, which  (n,)
       member: those vertices                   (n,)
       share: their part of its mass            (n,)
     """
+
+  def carry(
+    self, changed: np.ndarray, disp: np.ndarray, vel: np.ndarray,
+    group: np.ndarray, member: np.ndarray, share: np.ndarray,
+  ):  # fmt: skip
+    """Gives vertices the motion that they have after a cut; see `put` and `divide`."""
+    self.put(changed, disp, vel)
+    self.divide(group, member, share)
 
   def foresee(self):
     """Guesses what the next `gather` reads."""
@@ -163,17 +191,17 @@ CONSTANTS = {
 }  # fmt: skip
 
 
-def kernels(header: str, kind, *names: str) -> list[Kernel]:
+def kernels(header: str, kind: Any, *names: str) -> list[Kernel]:
   """Returns the kernels of a header that take a struct."""
   return [kernel(name, header, kind, CONSTANTS) for name in names]
 
 
-def wrap(address: int, shape, dtype: type = wp.float64) -> wp.array:
+def wrap(address: int, shape: Any, dtype: type = wp.float64) -> wp.array:
   """Returns MuJoCo's own memory as a Warp array."""
   return wp.array(ptr=address, dtype=dtype, shape=shape, device="cpu")
 
 
-def mujoco_arrays(model: int, data: int, kind=Mujoco):
+def mujoco_arrays(model: int, data: int, kind: Any = Mujoco):
   """Returns `Mujoco`, or what has MuJoCo's names in another struct, for an mjModel and mjData."""
   m, d = mjstruct.Model.from_address(model), mjstruct.Data.from_address(data)
   option, start = type(m.opt), model + mjstruct.Model.opt.offset
@@ -206,7 +234,7 @@ def crossing(arrays: dict[str, wp.array]):
   return out
 
 
-def mass_addresses(m, dofs: np.ndarray) -> np.ndarray:
+def mass_addresses(m: mjstruct.Struct, dofs: np.ndarray) -> np.ndarray:
   """Returns where the diagonal of each dof lies in mjData.M, the inertia that MuJoCo uses."""
   rowadr = mjstruct.view(m.M_rowadr, m.nv, np.int32)[dofs]
   return rowadr + mjstruct.view(m.M_rownnz, m.nv, np.int32)[dofs] - 1
@@ -220,7 +248,7 @@ def outer(organ: "Declaration") -> int:
 def sizes(organ: "Declaration") -> dict[str, int]:
   """Returns what the blocks of an organ's plugin state need."""
   relaxes = organ.config.relax_share > 0
-  out = {"ncreep": int(organ.free.sum()) if relaxes else 0}
+  out = {"nrelax": int(organ.free.sum()) if relaxes else 0}
   whole = organ.mesh.whole
   out |= cut_sizes(whole.nelem, whole.nvert, whole.spare, bool(len(whole.tet)))
   out["nbond"] = int(organ.free[: outer(organ)].sum()) if organ.config.bonded else 0

@@ -50,7 +50,7 @@ def _record_by_thread():
       setattr(type(runtime), name, _of_this_thread(name))
 
 
-def record(device, work: Callable[[], None]) -> Any:
+def record(device: wp.Device, work: Callable[[], None]) -> Any:
   """Returns the graph of what `work` launches on a device; none of it is run."""
   with lock:
     _record_by_thread()

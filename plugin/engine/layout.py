@@ -9,6 +9,7 @@ fields and the offsets of the short ones as constants, HEAD_MODE for `HEAD.mode`
 # pyright: reportInvalidTypeForm=false
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import warp as wp
 from palpate.tissue.types import DIMS, doubles, struct
@@ -219,7 +220,7 @@ class NodalState:
   force: doubles("nfree")  # contact force of the last step [N]
   last: doubles("nmoving")  # last change of the velocity, of those inside after the others [m/s]
   before: doubles("nmoving")  # the one before it [m/s]
-  creep: doubles("ncreep", 6)  # see `creep`
+  relaxation: doubles("nrelax", 6)  # see `forces/relaxation.h` [N]
   bond: doubles("nbond", len(BOND))  # of each vertex that moves, see BOND
   blade: doubles("nblade", len(BLADE))  # of each geom that cuts, see BLADE
   cuts: Topology
@@ -243,7 +244,7 @@ class WindowState:
 
   motion: Motion
   force: doubles("nslot", 3)  # contact force of the last step on each slot [N]
-  creep: doubles("ncreep", 6)  # see `creep`
+  relaxation: doubles("nrelax", 6)  # see `forces/relaxation.h` [N]
   bond: doubles("nbond", len(BOND))  # of each vertex that moves, see BOND
   blade: doubles("nblade", len(BLADE))  # of each geom that cuts, see BLADE
   slip: doubles("nrest", 3)  # how far nodes have slipped on what they rest on [m]
@@ -275,7 +276,7 @@ class Outbox:
   record: doubles("most", len(RECORD))  # see RECORD, as far as there is room
 
 
-def spans(kind, sizes: Mapping[str, int], start: int = 0) -> dict[str, slice]:
+def spans(kind: Any, sizes: Mapping[str, int], start: int = 0) -> dict[str, slice]:
   """Returns where each block of a struct lies, by name; `sizes` has the named sizes."""
   out: dict[str, slice] = {}
   for name, var in kind.vars.items():
@@ -288,17 +289,17 @@ def spans(kind, sizes: Mapping[str, int], start: int = 0) -> dict[str, slice]:
   return out
 
 
-def size(kind, sizes: Mapping[str, int]) -> int:
+def size(kind: Any, sizes: Mapping[str, int]) -> int:
   """Returns how many numbers the blocks of a struct have."""
   return list(spans(kind, sizes).values())[-1].stop
 
 
-def carve(kind, array: wp.array, sizes: Mapping[str, int]):
+def carve(kind: Any, array: wp.array, sizes: Mapping[str, int]):
   """Returns the struct whose blocks are views of an array, which must outlive it."""
   return _carve(kind, array, sizes, spans(kind, sizes))
 
 
-def _carve(kind, array, sizes, where):
+def _carve(kind: Any, array: wp.array, sizes: Mapping[str, int], where: dict[str, slice]):
   out = kind()
   for name, var in kind.vars.items():
     dims = DIMS[kind.key].get(name)

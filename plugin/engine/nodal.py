@@ -5,17 +5,17 @@
 from typing import TYPE_CHECKING
 
 import numpy as np
-import warp as wp
 from palpate.tissue import step
+from palpate.tissue.kernels import Kernel
 from palpate.tissue.types import doubles, fill, ints, struct
 
-from . import coupling, layout
-from .coupling import Crossing, Mujoco
+from . import coupling
+from .coupling import Crossing, Mujoco, Share
 from .layout import FLAG, NodalState
 from .model import inertia, mjstruct
 
 if TYPE_CHECKING:
-  from .workspace import Workspace
+  from .host import Host
 
 
 @struct
@@ -35,7 +35,7 @@ class Nodal:
   weight: doubles("nweighed")  # mass of a node [kg]
   inertia: doubles("nweighed")  # its inertia to MuJoCo [kg]
   shift: doubles("nweighed", 3)  # rest position now less that of the compiled model [m]
-  heaviest: doubles(1)  # see `Workspace`
+  heaviest: doubles(1)  # see `Host`
   number: doubles("nnumber")  # see `NUMBERS`
   flags: ints(len(FLAG))  # see FLAG
   lagged: doubles("nnode", 3)  # external and lagged contact force [N]
@@ -50,17 +50,20 @@ gather, scatter, push, remember = coupling.kernels(
 
 
 class Phases(coupling.Phases):
-  """Nodal coupling of a workspace's organ."""
+  """Nodal coupling of an organ.
+
+  Args:
+    host: the organ, bound to a model
+    share: what cuts have made of values by mass
+  """
 
   side = "cpu"
 
-  def __init__(self, w: "Workspace", model: int, instance: int):
-    m, organ, s = mjstruct.Model.from_address(model), w.organ, w.body.shape
+  def __init__(self, host: "Host", share: Share):
+    m, organ, s = host.m, host.organ, host.body.shape
     vert = s.vert.numpy()
     dofadr = _in_node_order(organ.dofadr, vert)
     dofs = np.maximum(dofadr, 0)[:, None] + np.arange(3)
-    sizes = coupling.sizes(organ)
-    state = coupling.plugin_state(model, w.data, instance, layout.size(NodalState, sizes))
     weighs = organ.mesh.spare > 0 or len(organ.mesh.tet) > 0
     nweighed = weighs * len(vert)
     values = dict(
@@ -77,19 +80,18 @@ class Phases(coupling.Phases):
       weight=np.zeros(nweighed),
       inertia=np.zeros(nweighed),
       shift=np.zeros((nweighed, 3)),
-      heaviest=w.host["heaviest"],
-      number=w.body.numbers,
-      flags=wp.array(np.asarray(w.report.flags), dtype=int, device="cpu", copy=False),
-      lagged=w.host["lagged"],
-      own=layout.carve(NodalState, state, sizes),
-      mj=coupling.mujoco_arrays(model, w.data),
-      solve=coupling.crossing(w.host),
+      heaviest=host.arrays["heaviest"],
+      number=host.number,
+      flags=host.flags(),
+      lagged=host.arrays["lagged"],
+      own=host.own,
+      mj=coupling.mujoco_arrays(host.model, host.data),
+      solve=coupling.crossing(host.arrays),
     )
-    w.views["plugin_state"] = state
-    self._nodal, self._w, self._model = fill(Nodal, "cpu", values), w, m
+    self._nodal, self._host, self._share = fill(Nodal, "cpu", values), host, share
     self.reshape()
 
-  def _launch(self, kernel):
+  def _launch(self, kernel: Kernel):
     kernel.launch("cpu", 1, 1, 0, self._nodal)
 
   def gather(self):
@@ -112,23 +114,23 @@ class Phases(coupling.Phases):
 
   def reshape(self, touched: np.ndarray | None = None):
     """Takes the mesh and the masses that the organ has now."""
-    w, organ, n = self._w, self._w.organ, self._nodal
+    host, organ, n = self._host, self._host.organ, self._nodal
     if not n.weighs:
       return
-    node, found = w.body.shape.node.numpy(), inertia.of_dofs(self._model, organ)
+    node, found = host.body.shape.node.numpy(), inertia.of_dofs(host.m, organ)
     n.weight.numpy()[node] = np.where(organ.mass > 0, organ.mass, 1.0)
-    n.inertia.numpy()[node] = w.cuts.share(found) if w.cuts else found
+    n.inertia.numpy()[node] = self._share(found)
     n.shift.numpy()[node] = organ.mesh.rest - organ.mesh.whole.rest
 
   def _views(self) -> tuple[np.ndarray, np.ndarray]:
     """Returns MuJoCo's qpos and qvel."""
-    m, d = self._model, mjstruct.Data.from_address(self._w.data)
+    m, d = self._host.m, mjstruct.Data.from_address(self._host.data)
     return mjstruct.view(d.qpos, m.nq), mjstruct.view(d.qvel, m.nv)
 
   def motion(self) -> tuple[np.ndarray, np.ndarray]:
     """Returns displacement and velocity of the vertices, in the organ's frame, (nvert, 3) each."""
-    organ, (qpos, qvel) = self._w.organ, self._views()
-    qpos0 = mjstruct.view(self._model.qpos0, self._model.nq)
+    organ, (qpos, qvel) = self._host.organ, self._views()
+    qpos0 = mjstruct.view(self._host.m.qpos0, len(qpos))
     shift = organ.mesh.rest - organ.mesh.whole.rest
     disp, vel = np.zeros((organ.mesh.nvert, 3)), np.zeros((organ.mesh.nvert, 3))
     at, dofs = organ.qposs.reshape(-1, 3), organ.dofs.reshape(-1, 3)
@@ -139,19 +141,31 @@ class Phases(coupling.Phases):
       values[organ.inner] = inside.numpy().reshape(-1, 3)
     return disp, vel
 
-  def carry(self, changed, disp, vel, group, member, share):
-    """Gives vertices their motion after a cut, see `coupling.Phases`."""
-    organ, (qpos, qvel) = self._w.organ, self._views()
-    qpos0 = mjstruct.view(self._model.qpos0, self._model.nq)
+  def contact_force(self) -> np.ndarray:
+    """See `coupling.Phases`."""
+    out = np.zeros((self._host.organ.mesh.nvert, 3))
+    out[self._host.organ.jointed] = self._nodal.own.force.numpy().reshape(-1, 3)
+    return out
+
+  def put(self, vert: np.ndarray, disp: np.ndarray | None, vel: np.ndarray | None):
+    """See `coupling.Phases`."""
+    organ, (qpos, qvel), own = self._host.organ, self._views(), self._nodal.own
+    qpos0 = mjstruct.view(self._host.m.qpos0, len(qpos))
     shift = organ.mesh.rest - organ.mesh.whole.rest
-    mine, within = (changed[organ.free[changed] & (there == (organ.dofadr[changed] >= 0))]
-                    for there in (True, False))  # fmt: skip
-    at = organ.qposadr[mine, None] + np.arange(3)
-    qpos[at] = qpos0[at] + shift[mine] + disp[mine]
-    qvel[organ.dofadr[mine, None] + np.arange(3)] = vel[mine]
-    own = self._nodal.own
-    for inner, values in ((own.disp, disp), (own.vel, vel)):
-      inner.numpy().reshape(-1, 3)[within - organ.mesh.nskin] = values[within]
+    vert = vert[organ.free[vert]]
+    jointed = organ.dofadr[vert] >= 0
+    mine, within = vert[jointed], vert[~jointed]
+    if disp is not None:
+      at = organ.qposadr[mine, None] + np.arange(3)
+      qpos[at] = qpos0[at] + shift[mine] + disp[mine]
+      own.disp.numpy().reshape(-1, 3)[within - organ.mesh.nskin] = disp[within]
+    if vel is not None:
+      qvel[organ.dofadr[mine, None] + np.arange(3)] = vel[mine]
+      own.vel.numpy().reshape(-1, 3)[within - organ.mesh.nskin] = vel[within]
+
+  def divide(self, group: np.ndarray, member: np.ndarray, share: np.ndarray):
+    """See `coupling.Phases`."""
+    organ, own = self._host.organ, self._nodal.own
     at = organ.stateadr[:, None] + np.arange(3)
     for name in ("last", "before"):
       block = getattr(own, name).numpy()

@@ -88,7 +88,7 @@ def _right_of(point: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
   return meets & (x < x0 + (y - y0) * (x1 - x0) / np.where(meets, y1 - y0, 1.0))
 
 
-def tools(m, organ: "Declaration") -> np.ndarray:
+def tools(m: mjstruct.Struct, organ: "Declaration") -> np.ndarray:
   """Returns the geoms that move and meet an organ; none where it is open and has no inside."""
   if not organ.mesh.closed:
     return np.zeros(0, int)
@@ -127,7 +127,7 @@ class Tools:
     reach: of their points from their centres [m]
   """
 
-  def __init__(self, m, organ: "Declaration", geoms: np.ndarray):
+  def __init__(self, m: mjstruct.Struct, organ: "Declaration", geoms: np.ndarray):
     """Takes the geoms of an mjModel."""
     self.geoms, self.organ, self._ngeom = geoms, organ, m.ngeom
     found = points(m, geoms)
@@ -136,7 +136,7 @@ class Tools:
     self._tool = np.repeat(np.arange(len(geoms)), [len(each) for each in found])
     self._local = np.concatenate([np.zeros((0, 3)), *found])
 
-  def inside(self, d, disp: np.ndarray) -> list[int]:
+  def inside(self, d: mjstruct.Struct, disp: np.ndarray) -> list[int]:
     """Returns which of the geoms are inside of the organ.
 
     Args:
@@ -145,7 +145,9 @@ class Tools:
     """
     return self.geoms[self._inside(*self._poses(d), disp)].tolist()
 
-  def passed(self, m, d, disp: np.ndarray, time: float) -> list[int]:
+  def passed(
+    self, m: mjstruct.Struct, d: mjstruct.Struct, disp: np.ndarray, time: float
+  ) -> list[int]:
     """Returns which of the fast ones were inside of it on their way within the last seconds."""
     pos, turn = self._poses(d)
     spin, vel = self._motion(m, d, pos)
@@ -164,12 +166,14 @@ class Tools:
     found[tool[inside(point, organ.mesh.rest + disp, organ.mesh.elem)]] = True
     return found
 
-  def _poses(self, d) -> tuple[np.ndarray, np.ndarray]:
+  def _poses(self, d: mjstruct.Struct) -> tuple[np.ndarray, np.ndarray]:
     """Returns the tools' places [m], (ntool, 3), and rotations, (ntool, 3, 3)."""
     pos = mjstruct.view(d.geom_xpos, (self._ngeom, 3))[self.geoms]
     return pos, mjstruct.view(d.geom_xmat, (self._ngeom, 3, 3))[self.geoms]
 
-  def _motion(self, m, d, pos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+  def _motion(
+    self, m: mjstruct.Struct, d: mjstruct.Struct, pos: np.ndarray
+  ) -> tuple[np.ndarray, np.ndarray]:
     """Returns angular velocity [rad/s] and velocity [m/s], (ntool, 3) both."""
     body = mjstruct.view(m.geom_bodyid, m.ngeom, np.int32)[self.geoms]
     root = mjstruct.view(m.body_rootid, m.nbody, np.int32)[body]
@@ -178,7 +182,7 @@ class Tools:
     return spin, vel + np.cross(spin, pos - com)
 
 
-def points(m, geoms: np.ndarray) -> list[np.ndarray]:
+def points(m: mjstruct.Struct, geoms: np.ndarray) -> list[np.ndarray]:
   """Returns what stands for each geom, in its frame [m], (n, 3) each.
 
   Points along the axis of a capsule or cylinder, over the middle of a box, the centre of another:
@@ -205,7 +209,9 @@ def _reach(found: list[np.ndarray]) -> np.ndarray:
   return np.array([np.linalg.norm(each, axis=1).max() for each in found])
 
 
-def speeds(m, model: int, data: int, organ: "Declaration", flags: np.ndarray) -> Speeds:
+def speeds(
+  m: mjstruct.Struct, model: int, data: int, organ: "Declaration", flags: np.ndarray
+) -> Speeds:
   """Returns `Speeds` of the tools of an organ."""
   geoms = tools(m, organ)
   out = coupling.mujoco_arrays(model, data, Speeds)
@@ -249,7 +255,7 @@ class Watch:
     seen = self._tools
     if not len(seen.geoms) or not w.organ.mesh.closed:  # a cut opens it
       return []
-    disp = _displacement(m, d, w)
+    disp = w.motion()[0]
     found = set(seen.inside(d, disp))
     before, self._inside = found if self._inside is None else self._inside, found
     if w.report.flags[FLAG.fast]:
@@ -276,13 +282,3 @@ def _inside_out(x: np.ndarray, tet: np.ndarray) -> np.ndarray:
   corner = x.T[:, tet.T]
   (ax, bx, cx), (ay, by, cy), (az, bz, cz) = corner[:, 1:] - corner[:, :1]
   return ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx) <= 0
-
-
-def _displacement(m, d, w: "Workspace") -> np.ndarray:
-  """Returns the displacement of the vertices from rest, in the organ's frame [m], (nvert, 3)."""
-  if w.organ.windows:
-    return w.boxes["own"].motion.disp.numpy()
-  out = np.zeros((w.organ.mesh.nvert, 3))  # only those on the surface are asked for
-  moved = mjstruct.view(d.qpos, m.nq) - mjstruct.view(m.qpos0, m.nq)
-  out[w.organ.jointed] = moved[w.organ.qposs].reshape(-1, 3)
-  return out

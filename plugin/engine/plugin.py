@@ -16,8 +16,8 @@ import mujoco
 import numpy as np
 from palpate.tissue.config import KEYS
 
+from ..forces.passive import Force
 from . import change, contacts, signals, workspace
-from .forces import declare_attachments, declare_bonds, supports
 from .layout import FLAG
 from .model import mjstruct, skin, state_size
 from .model.mjstruct import NAME, warn
@@ -116,12 +116,7 @@ def _init(model: int, data: int, instance: int) -> int:
     w = workspace.make(model, data, instance)
     _workspaces[data, instance] = _states[w.plugin_state.ctypes.data] = w
     mine = [each for (of, _), each in _workspaces.items() if of == data]
-    changed = (
-      declare_attachments.declare_between(mine)
-      + declare_bonds.declare_between(mine)
-      + supports.meet(mine)
-    )
-    for each in {id(each): each for each in changed}.values():
+    for each in workspace.join(mine):
       workspace.rebind(each)
     return 0
   except BaseException as error:
@@ -141,11 +136,16 @@ def _destroy(data: int, instance: int):
 def _copy(data: int, model: int, source: int, instance: int):
   w = _workspaces[data, instance]
   try:
-    twin = lambda each: _workspaces[data, each.seen.instance]  # noqa: E731
-    change.copy(w, model, _workspaces[source, instance], twin)
+    change.copy(w, model, _workspaces[source, instance], functools.partial(_twin, data))
   except BaseException as error:
     _fail(w, error)
   return signals.leave()
+
+
+def _twin(data: int, force: Force) -> tuple[Workspace, Force]:
+  """Returns the workspace and the force of an mjData for a force of another one."""
+  w = _workspaces[data, force.host.instance]
+  return w, w.forces.of(type(force))
 
 
 @signals.watch
@@ -156,7 +156,7 @@ def _reset(model: int, state: int, unused: int | None, instance: int):
   w = _states.get(state)  # mjData.plugin_data, the other argument, is copied by pickle
   if w is not None:
     w.forget()
-    w.ties.put([group for group in w.ties.groups if group.by])
+    w.attachments.put([group for group in w.attachments.groups if group.by])
     w.bonds.let_go()
     w.report.nbad = 0
   return signals.leave()
@@ -281,7 +281,7 @@ def _interrupt(w: Workspace | None, error: BaseException):
 
 
 @signals.watch
-def _on_unraisable(unraisable, before=sys.unraisablehook):
+def _on_unraisable(unraisable: Any, before: Any = sys.unraisablehook):
   """Takes what a signal's handler raised at the first or last instruction of a callback."""
   trace = unraisable.exc_traceback
   if trace is None or not signals.is_callback(trace.tb_frame.f_code):

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import _thread
 from collections.abc import Callable
+from typing import Any
 
 from .model import mjstruct
 
@@ -68,7 +69,7 @@ def run(function: Callable, *args):
     raise RuntimeError(" ".join(results[0].split()))
 
 
-def _wait(begin, done, results: list):
+def _wait(begin: Any, done: Any, results: list):
   """Lets a thread begin and waits for its result, even if a signal's handler raises meanwhile."""
   late = None
   while not results:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any
 
 import mujoco
@@ -12,19 +13,20 @@ from palpate.tissue import body as bodies
 from palpate.tissue.body import Body
 from palpate.tissue.config import Config
 
+from ..forces import declare_attachments, declare_bonds, supports
+from ..forces.attachments import Attachments
+from ..forces.cohesive_bonds import Bonds
+from ..forces.passive import Forces
+from ..forces.supports import Supports
+from ..forces.table import FORCES
 from . import contacts, coupling, graphs
 from .bind import bind
 from .coupling import Phases
 from .cutting.cutters import Cutters
 from .cutting.solid_cuts import Cuts, cuts_of
-from .forces import declare_attachments, declare_bonds
-from .forces.attachments import Ties
-from .forces.cohesive_bonds import Bonds
-from .forces.passive import Beside, Hold
-from .forces.relaxation import Creep
-from .forces.supports import Rests
-from .layout import FLAG, HEAD
-from .model import declare, inertia, mjstruct, prepare, skin
+from .host import Host
+from .layout import FLAG, HEAD, Topology
+from .model import declare, flexes, inertia, mjstruct, prepare, skin
 from .model.declare import Declaration
 from .penetration import Watch
 from .windows import declare_windows, windowed
@@ -33,18 +35,8 @@ from .windows.resident import Resident
 
 _ALLOWED = int(mujoco.mjtSleepPolicy.mjSLEEP_AUTO_ALLOWED)
 _RK4 = int(mujoco.mjtIntegrator.mjINT_RK4)
+_STAYS = ("disp", "vel", "bond", *Topology.vars)  # of the plugin state, where a motion is set
 _ASTRAY = 1e-9  # distance of a slot from its node that rounding does not explain [m]
-
-
-# What acts on an organ beside its tissue, in that order: attributes of a workspace. A batch reads
-# it too, and on a GPU refuses what it has not.
-FORCES: dict[str, type[Beside]] = {
-  "ties": Ties,
-  "bonds": Bonds,
-  "rests": Rests,
-  "creep": Creep,
-  "cutters": Cutters,
-}
 
 # An item of a memoryview costs a tenth of one of an array; this stands for those not yet there.
 _NONE = memoryview(bytes(4)).cast("i")
@@ -128,7 +120,7 @@ class Report:
     chosen: whether the configuration was changed here, not by a copy
   """
 
-  flags: memoryview = dataclasses.field(default_factory=lambda: np.zeros(len(FLAG), np.int32).data)
+  flags: memoryview
   computed: bool = False
   strange: bool = False
   error: str | None = None
@@ -144,60 +136,86 @@ class Workspace:
   """One organ in one mjData.
 
   Attributes:
-    organ: constants
-    config: configuration in force, which may differ from the compiled one
-    body: shape, tissue and state on the organ's device
-    host: the arrays of its state that MuJoCo's side reads and writes, on the CPU; `lagged`,
-      external and lagged contact force [N] (nodes or slots, 3); `heaviest`, most times its inertia
-      that a node in contact may have (1,)
-    data, model: addresses of the mjData, and of the mjModel that views are of
-    seen: what a step looks at there
-    graphs: what it launches
+    host: the organ as it is now, its body, and the memory that all share
+    seen: what a step looks at of the mjData and the mjModel
     report: what came of it
-    hold, creep: springs that hold nodes; its stress relaxation
-    ties, bonds, rests: what the organ is tied to, has grown on to, and rests on
+    graphs: what it launches
+    forces: what acts on the organ beside its tissue
     cuts, cutters: its mesh as it is now, and what cuts it
     turn: this mjData's part in the model's window, or None
     skin: what is drawn for it, or None
     views: what a coupling keeps when its graphs are recorded anew
-    boxes: blocks of the plugin state and of what crosses in a step, see `layout`; windows
   """
 
-  organ: Declaration
-  config: Config
-  body: Body
-  host: dict[str, wp.array]
-  data: int
-  model: int
+  host: Host
   seen: Seen
+  report: Report
   graphs: Graphs = dataclasses.field(default_factory=Graphs)
-  report: Report = dataclasses.field(default_factory=Report)
-  hold: Hold = dataclasses.field(init=False)
-  ties: Ties = dataclasses.field(init=False)
-  bonds: Bonds = dataclasses.field(init=False)
-  rests: Rests = dataclasses.field(init=False)
-  creep: Creep = dataclasses.field(init=False)
+  forces: Forces = dataclasses.field(init=False)
   cuts: Cuts = dataclasses.field(init=False)
   cutters: Cutters = dataclasses.field(init=False)
   turn: Turn | None = None
   skin: skin.Skin | None = None
   views: dict = dataclasses.field(default_factory=dict)
-  boxes: dict = dataclasses.field(default_factory=dict)
 
   def __post_init__(self):
-    self.hold, self.cuts = Hold(self), cuts_of(self)
-    for name, kind in FORCES.items():
-      setattr(self, name, kind(self))
+    self.cuts = cuts_of(self)
+    self.forces, self.cutters = Forces(self.host, FORCES), Cutters(self)
+    self.forces.add(self.cutters)
 
   @property
-  def beside(self) -> tuple[Beside, ...]:
-    """What acts on the organ beside its tissue, in the order in which it does."""
-    return tuple(getattr(self, name) for name in FORCES)
+  def organ(self) -> Declaration:
+    """Constants of the organ as it is now."""
+    return self.host.organ
+
+  @property
+  def config(self) -> Config:
+    """Configuration in force, which may differ from the compiled one."""
+    return self.host.config
+
+  @property
+  def body(self) -> Body:
+    """Shape, tissue and state on the organ's device."""
+    return self.host.body
+
+  @property
+  def data(self) -> int:
+    """Address of the mjData."""
+    return self.host.data
+
+  @property
+  def model(self) -> int:
+    """Address of the mjModel that views are of."""
+    return self.host.model
+
+  @property
+  def attachments(self) -> Attachments:
+    """Springs that hold vertices."""
+    return self.forces.of(Attachments)
+
+  @property
+  def bonds(self) -> Bonds:
+    """What the organ has grown on to."""
+    return self.forces.of(Bonds)
+
+  @property
+  def supports(self) -> Supports:
+    """What it rests on."""
+    return self.forces.of(Supports)
+
+  @property
+  def boxes(self) -> Mapping[str, Any]:
+    """Blocks of the plugin state and of what crosses in a step, see `layout`; windows."""
+    return self.graphs.phases.boxes
+
+  def share(self, values: np.ndarray, vert: Any = slice(None)) -> np.ndarray:
+    """Returns what cuts have made of values by mass of vertices, some or all, (n,)."""
+    return self.cuts.share(values, vert) if self.cuts else values[vert]
 
   @property
   def plugin_state(self) -> np.ndarray:
     """The organ's own numbers."""
-    return self.views["plugin_state"].numpy()
+    return self.host.state.numpy()
 
   def motion(self) -> tuple[np.ndarray, np.ndarray]:
     """Returns displacement and velocity of the vertices, in the organ's frame, (nvert, 3) each."""
@@ -251,8 +269,6 @@ class Workspace:
 
   def _solve(self):
     """Solves for the step, and tells MuJoCo."""
-    if self.ties.aims:
-      self.ties.aim()
     if self.graphs.resident:
       self.graphs.resident.send()
       graphs.launch_all(self.graphs.resident.left_to_do(self.graphs.solve))
@@ -388,6 +404,26 @@ def place(w: Workspace, model: int):
       w.turn.stood = w.turn.qpos.tobytes()
 
 
+def set_motion(w: Workspace, model: int, u: np.ndarray | None, v: np.ndarray | None):
+  """Sets the motion of the vertices that move, and forgets forces of the past.
+
+  Args:
+    w: the workspace
+    model: address of the mjModel
+    u: displacement in the organ's frame [m], (nvert, 3); None for what it is
+    v: velocity there [m/s], (nvert, 3); None for what it is
+  """
+  sync(w)
+  state, where = w.plugin_state, coupling.spans(w.organ)
+  kept = {name: state[where[name]].copy() for name in _STAYS if name in where}
+  state[:] = 0.0
+  for name, values in kept.items():
+    state[where[name]] = values
+  w.graphs.phases.put(np.flatnonzero(w.organ.free), u, v)
+  if w.turn is not None:
+    place(w, model)
+
+
 def rebind(w: Workspace):
   """Records the graphs of a workspace anew."""
   bind(w, w.model)
@@ -406,26 +442,19 @@ def make(model: int, data: int, instance: int) -> Workspace:
     organ = (declare_windows if has_windows else declare).read(model, instance)
     m = mjstruct.Model.from_address(model)
     body = bodies.worlds(organ.still)
-    s = body.shape
-    host = {}
-    for field, array in coupling.on_body(body).items():
-      if body.device.is_cuda:
-        array = wp.zeros(array.shape, dtype=float, device="cpu", pinned=True)
-      host[field] = array
-    size = organ.windows.nslot if organ.windows else s.nnode
-    host["lagged"] = wp.zeros((size, 3), dtype=wp.float64, device="cpu")
-    host["heaviest"] = wp.ones(1, dtype=wp.float64, device="cpu")
-    w = Workspace(organ, organ.config, body, host, data, model, Seen(instance))
+    host = Host(organ, body, data, model, instance)
+    w = Workspace(host, Seen(instance), Report(host.flags().numpy().data))
     if organ.windows:
       w.turn = Turn()
     _view(w, mjstruct.Data.from_address(data), m)
     prepare.fit(m, organ, body)
     # Padding nodes have a mass so that nothing divides by zero.
-    mass = np.where(s.vert.numpy() >= 0, 0.0, 1.0).reshape(1, -1, 8)
-    host["mass"].assign(mass)
+    mass = np.where(body.shape.vert.numpy() >= 0, 0.0, 1.0).reshape(1, -1, 8)
+    host.arrays["mass"].assign(mass)
     w.skin = skin.read(m, organ)
-    declare_attachments.declare(w)
-    declare_bonds.declare(w)
+    declare_attachments.declare(w.attachments, host)
+    supports.check(host)
+    declare_bonds.declare(w.bonds, host)
     w.cutters.declare()
     bind(w, model)
     w.seen.signature = w.plugin_state[coupling.spans(organ)["signature"]].data
@@ -435,10 +464,10 @@ def make(model: int, data: int, instance: int) -> Workspace:
     return w
 
 
-def _view(w: Workspace, d, m):
+def _view(w: Workspace, d: mjstruct.Struct, m: mjstruct.Struct):
   """Takes views of an mjData that every step looks at."""
   fields, count = mjstruct.Data, len(d.warning)
-  w.seen.status = w.host["status"].numpy()[0].data
+  w.seen.status = w.host.arrays["status"].numpy()[0].data
   w.seen.warning = mjstruct.view(w.data + fields.warning.offset, 2 * count, np.int32).data
   w.seen.nefc = mjstruct.view(w.data + fields.nefc.offset, 1, np.int32).data
   if w.turn is not None:
@@ -446,11 +475,34 @@ def _view(w: Workspace, d, m):
     w.turn.qpos = mjstruct.view(d.qpos + 8 * first, 8 * (last - first), np.uint8).data
 
 
-def feel(w: Workspace, m):
+def join(spaces: list[Workspace]) -> list[Workspace]:
+  """Lets the organs of an mjData have what leads from one to another, as their keys say.
+
+  Args:
+    spaces: workspaces of the organs that there are so far, the one that has come last
+
+  Returns:
+    those whose graphs have to be recorded anew, in this order
+  """
+  changed: dict[int, Workspace] = {}
+  for one, other, row in flexes.named(spaces, lambda c: [(a[0], a) for a in c.attach]):
+    declare_attachments.declare_between(one.attachments, other.attachments, row)
+    changed |= {id(w): w for w in (one, other)}
+  for one, other, row in flexes.named(spaces, lambda c: [(b.to, b) for b in c.bonds or ()]):
+    declare_bonds.declare_between(one.bonds, other.bonds, row)
+    changed |= {id(w): w for w in (one, other)}
+  for one, other, _ in flexes.named(spaces, lambda c: [(name, None) for name in c.support]):
+    if other is not one:
+      one.supports.put(other.supports)
+      changed |= {id(w): w for w in (one, other)}
+  return list(changed.values())
+
+
+def feel(w: Workspace, m: mjstruct.Struct):
   """Notes how stiff the organ is for the present time step, and what its step takes for it."""
   nodal = w.inertia(w.model)
   w.graphs.stiff, heaviest = inertia.stiffness(m, w.declared, w.body, w.config, nodal)
-  w.host["heaviest"].numpy()[0] = heaviest
+  w.host.arrays["heaviest"].numpy()[0] = heaviest
   newton = inertia.iterations(m, w.declared, w.config)
   if newton != w.body.newton:
     w.body.newton = newton

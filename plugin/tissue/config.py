@@ -160,7 +160,10 @@ class Config:
   )
   attach: tuple[tuple[str, float, tuple[int, ...]], ...] = _row(
     (),
-    (reading.ties, "a body or organ, a stiffness > 0 and vertices, a comma between such groups"),
+    (
+      reading.attachments,
+      "a body or organ, a stiffness > 0 and vertices, a comma between such groups",
+    ),
     "springs from vertices to a body, or to the nearest vertices of another organ: "
     "`rib 500 3 17 18, stomach 200 40 41`; the stiffness is that of a group",
     "-, N/m, -",

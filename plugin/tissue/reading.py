@@ -105,7 +105,7 @@ def name(text: str, nelem: int) -> str:
   return name
 
 
-def ties(text: str, nelem: int) -> tuple[tuple[str, float, tuple[int, ...]], ...]:
+def attachments(text: str, nelem: int) -> tuple[tuple[str, float, tuple[int, ...]], ...]:
   """Returns groups of a name, a stiffness and vertices."""
   found = []
   for group in text.split(","):

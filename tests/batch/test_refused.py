@@ -10,8 +10,8 @@ import numpy as np
 import palpate.batch
 import pytest
 import warp as wp
-from palpate.engine.forces.passive import Beside
-from palpate.engine.workspace import FORCES
+from palpate.forces.passive import Force
+from palpate.forces.table import FORCES
 from scenes import load, needs_cuda, press, probed
 
 DEVICE = "warp-cpu"  # what mujoco_warp gets is the same
@@ -47,8 +47,8 @@ def test_what_hangs_on_an_organs_nodes(extra):
     make(press(subdivisions=1).replace("</mujoco>", extra + "</mujoco>"))
 
 
-def test_what_acts_beside_the_tissue_and_has_no_kind_in_worlds(monkeypatch):
-  class Tide(Beside):
+def test_a_force_that_is_not_over_rows_of_worlds(monkeypatch):
+  class Tide(Force):
     KEYS = ("tide",)
 
   monkeypatch.setitem(FORCES, "tide", Tide)  # one that somebody adds, for one world

@@ -10,7 +10,7 @@ from scenes import probed
 
 SIZES = {"nfree": 21, "ninner": 6, "nmoving": 27}
 SIZES |= {"nvert": 9, "nslot": 5, "ngeom": 3, "most": 7}
-SIZES |= {"ncreep": 4, "nrest": 6, "nbond": 3, "nblade": 2}
+SIZES |= {"nrelax": 4, "nrest": 6, "nbond": 3, "nblade": 2}
 SIZES |= {"ncorner": 8, "nplace": 10, "nspare": 2, "ncuts": 1}
 BLOCKS = (layout.NodalState, layout.WindowState, layout.Inbox, layout.Outbox)
 
@@ -38,7 +38,7 @@ def test_the_plugin_state_has_room_for_its_table(window):
   organ = palpate.Organ(m, mujoco.MjData(m), "organ")
   sizes = coupling.nodal_sizes(3 * organ.nvert, 0)
   sizes |= {"nvert": organ.nvert, "nslot": 54, "ngeom": 1}
-  sizes |= layout.NO_CUTS | {"ncreep": 0, "nrest": 0, "nbond": 0}
+  sizes |= layout.NO_CUTS | {"nrelax": 0, "nrest": 0, "nbond": 0}
   needed = layout.size(layout.WindowState if window else layout.NodalState, sizes)
   # It is asked for before the windows are known.
   assert m.npluginstate >= needed if window else m.npluginstate == needed

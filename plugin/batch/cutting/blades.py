@@ -14,29 +14,23 @@ from palpate.engine.cutting import cutters
 from palpate.engine.cutting.electrosurgery import ends
 from palpate.engine.layout import BLADE, LAW
 from palpate.engine.model import mjstruct
+from palpate.forces.host import for_worlds, world_kernel
 from palpate.tissue.geometry.mesh import Mesh
 from palpate.tissue.step import SCHEMES
 from palpate.tissue.types import allocate, doubles, fill, floats, ints, struct
 
-from ..forces import base
+from .. import host
 from .fracture import Cutters
 
 if TYPE_CHECKING:
   from ..organs import Organ
 
 _ROWS = "state", "next", "force", "point", "held", "share", "hold", "due", "law"
-_WorldBlades = base.in_worlds(
-  cutters.Blades,
-  _ROWS,
-  {
-    "own": base.WorldNodes,
-    "mj": base.WorldBodies,
-    "number": floats("nworld", "nnumber"),
-    "elem": ints("nmesh", "nelem", 3),
-    "flat": doubles("nmesh", "nnode", 3),
-  },
+_MESH = ("elem", ints("nmesh", "nelem", 3)), ("flat", doubles("nmesh", "nnode", 3))
+_WorldBlades = for_worlds(cutters.Blades, _ROWS, _MESH)
+_enter, _act, _keep = (
+  world_kernel(name, "cutting/blades.h", _WorldBlades) for name in cutters.KERNELS
 )
-_enter, _act, _keep = base.kernels("cutting/blades.h", _WorldBlades, *cutters.KERNELS)
 _STAGE, _WORK, _OPENED, _AT = (
   wp.constant(k) for k in (BLADE.stage, BLADE.work, BLADE.opened, BLADE.at)
 )
@@ -85,7 +79,7 @@ def _feel(b: _WorldBlades, adr: int, data: wp.array2d[float]):
       data[w, adr + c] = data[w, adr + c] + float(turned)
 
 
-class Blades(base.Opens):
+class Blades(host.Opens):
   """What cuts an organ in all worlds.
 
   Args:
@@ -94,6 +88,7 @@ class Blades(base.Opens):
 
   def __init__(self, organ: "Organ"):
     super().__init__(organ)
+    self.host.need_springs()
     space, body, n = organ.space, organ.body, len(organ.config.cutters)
     mesh, scheme = organ.declared.mesh, SCHEMES[organ.config.integrator]
     self._model = mjstruct.Model.from_address(space.model)
@@ -115,10 +110,10 @@ class Blades(base.Opens):
       mesh=organ.patch.mesh,
       elem=organ.patch.elem,
       flat=organ.patch.rest,
-      state=self._keep("blade", np.arange(n), len(BLADE)),
+      state=self.host.rows("blade", len(BLADE)),
       due=self._zeros(self._nworld, n, dtype=int),
-      own=_by_nodes(base.nodes_of(organ), body),
-      solve=_by_nodes(base.input_of(organ), body),
+      own=_by_nodes(host.nodes_of(organ), body),
+      solve=_by_nodes(host.input_of(organ), body),
       number=body.tissue.number,
       mj=organ.batch.bodies,
     )
@@ -130,29 +125,29 @@ class Blades(base.Opens):
 
   @property
   def aims(self) -> bool:
-    """See `Beside`."""
+    """See `Force`."""
     return True
 
   def enter(self):
-    """See `Beside`."""
+    """See `Force`."""
     self._over(_enter, self.fields, 1, _KEEPS)
 
   def act(self):
-    """See `Beside`."""
+    """See `Force`."""
     self._over(_act, self.fields, 1)
 
   def end(self):
-    """See `Beside`."""
+    """See `Force`."""
     self._over(_keep, self.fields, 1)
 
   def rest(self):
-    """See `Beside`."""
+    """See `Force`."""
     super().rest()
     inputs = [self._mask, self.fields.due]
     wp.launch(_forget, dim=self.fields.due.shape, inputs=inputs, device=self._device)
 
   def configure(self, worlds: np.ndarray, rows: dict[str, np.ndarray]):
-    """See `Beside`."""
+    """See `Force`."""
     if "thickness" not in rows:
       return
     law = self.fields.law.numpy()

@@ -27,8 +27,7 @@ from palpate.tissue.order import LANES
 from palpate.tissue.rows import Rows
 from palpate.tissue.types import NUMBERS, fill
 
-from .. import kernels
-from ..forces import base
+from .. import host, kernels
 from ..patch import Surface
 
 if TYPE_CHECKING:
@@ -192,8 +191,7 @@ class Cuts:
     organ, had = self._organ, self._of(world)
     carried = cutting.Motion(had.mass, motion.disp[k], motion.vel[k])
     free, config = organ.declared.free, organ.config
-    springs = [spring for each in organ.beside for spring in each.springs(world)]
-    held = engine.together(springs, had.mesh.nvert)
+    held = engine.together(organ.forces.springs(world), had.mesh.nvert)
     found = self._knife.cut(organ.name, had.mesh, carried, points, ~free, config, held, *how)
     kept = (getattr(found.motion, name).copy() for name in ("mass", "disp", "vel"))
     return dataclasses.replace(found, motion=cutting.Motion(*kept))
@@ -223,8 +221,7 @@ class Cuts:
       _carry(motion, k, cut, organ.declared.free)
       source = had.source.copy()
       source[cut.member] = source[cut.group]
-      for each in organ.beside:
-        each.carry(world, cut.group, cut.member, cut.share)
+      organ.forces.carry(world, cut.group, cut.member, cut.share)
       # Vertices that come apart inside do not make two pieces of one.
       pieces = _count(cut.mesh) if cut.mesh.loose is not had.mesh.loose else had.pieces
       now = World(cut.mesh, cut.motion.mass, source, pieces, had.reports)
@@ -241,7 +238,7 @@ class Cuts:
       self._upload(own)
       names = [field.name for field in dataclasses.fields(Motion)]
       self.put_motion(own, Motion(*(getattr(motion, name)[which] for name in names)))
-      base.follow(organ.batch, own)
+      host.follow(organ.batch, own)
 
   def _of(self, world: int) -> World:
     """Returns a world, that of the first mesh until it is cut."""

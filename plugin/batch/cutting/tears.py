@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 from palpate.engine.cutting import tear
 
-from ..forces import base
+from .. import host
 from ..patch import Patch
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ def _find(p: Patch, limit: wp.float64, out: wp.array[wp.int64]):
                   + wp.int64(n - 1 - e))  # fmt: skip
 
 
-class Tears(base.Opens):
+class Tears(host.Opens):
   """Where an organ tears in all worlds.
 
   Args:

@@ -22,8 +22,7 @@ from palpate.tissue.geometry import fill
 from palpate.tissue.geometry import mesh as topology
 from palpate.tissue.geometry.mesh import Mesh
 
-from .. import coupling, graphs
-from ..bind import bind
+from .. import coupling
 from ..model import flexes, mjstruct
 from ..windows import model_lock
 from .tear import Tear
@@ -127,7 +126,7 @@ class Cuts:
     if not self:
       return
     w, m = self._w, mjstruct.Model.from_address(model)
-    state, where = w.views["plugin_state"].numpy(), coupling.spans(w.organ)
+    state, where = w.plugin_state, coupling.spans(w.organ)
     names = ("corner", "place", "weight", "source", "stamp")
     self._own = {name: state[where[name]] for name in names}
     self._words = state[where["corner"].start : where["weight"].stop]
@@ -204,11 +203,9 @@ class Cuts:
     self._refill.write(mesh, changed, w.config, ~w.organ.free)
     bodies.occupy(w.body, mesh)
     self.mass, self.source, self.stamp = mass, source, stamp
-    w.organ = self.declared.cut(mesh, mass)
+    w.host.become(self.declared.cut(mesh, mass))
     w.graphs.phases.reshape(touched)
-    for grown in [space for each in w.beside for space in each.reshape()]:
-      with graphs.lock:
-        bind(grown, grown.model)
+    w.forces.reshape(0)
     return touched
 
   def _touched(self, mesh: Mesh, changed: np.ndarray) -> np.ndarray:
@@ -316,8 +313,8 @@ class Cuts:
     return organ.name, self.mesh, motion, points, ~organ.free, w.config, self._held()
 
   def _held(self) -> cutting.Springs | None:
-    """Returns the ties and bonds, None where there are none."""
-    return together([*self._w.ties.springs(), *self._w.bonds.springs()], self.mesh.nvert)
+    """Returns the springs that hold it, None where there are none."""
+    return together(self._w.forces.springs(0), self.mesh.nvert)
 
   def _report(self, found: Any) -> Report:
     return report(found, self.mesh, self._w.organ, self._w.config.thickness)
@@ -328,8 +325,7 @@ class Cuts:
     group, member, share = found.group, found.member, found.share
     source = self.source.copy()
     source[member] = source[group]
-    for each in w.beside:
-      each.carry(group, member, share)
+    w.forces.carry(0, group, member, share)
     touched = self._become(mesh, found.changed, motion.mass.copy(), source, self.stamp)
     self._write(found, touched)
     changed = topology.distinct(found.near, member)

@@ -18,9 +18,10 @@ from palpate.tissue.geometry.mesh import Mesh
 from palpate.tissue.step import SCHEMES
 from palpate.tissue.types import Views, doubles, fill, ints, struct
 
+from ...forces.declare_attachments import most
+from ...forces.host import Bodies, Input, Nodes, Twin
+from ...forces.passive import Force
 from .. import coupling
-from ..forces import declare_attachments
-from ..forces.passive import Beside, Bodies, Input, Nodes, base, nodes, solver
 from ..layout import BLADE, LAW, TRAIL
 from ..model import flexes, mjstruct
 from . import solid_paths
@@ -79,7 +80,9 @@ class Blades:
 # Of the arrays that a step writes, a row for each.
 WIDTHS = {"force": 3, "point": 3, "held": HELD, "share": HELD, "hold": 6, "next": len(BLADE)}
 KERNELS = "enter_blades", "act_blades", "keep_blades"
-_enter, _act, _keep = coupling.kernels("cutting/blades.h", Blades, *KERNELS)
+_enter, _act, _keep = (
+  Twin(each, each) for each in coupling.kernels("cutting/blades.h", Blades, *KERNELS)
+)
 # As in the header: the blade is out of the tissue; edges between points of a path, and that come
 # apart at once.
 ENDED, _SPACING, _BATCH = 2, 0.4, 1.8
@@ -106,7 +109,7 @@ class Cutter:
   seat: np.ndarray
 
 
-class Cutters(Beside):
+class Cutters(Force):
   """What cuts a workspace's organ; false where nothing does.
 
   Args:
@@ -118,14 +121,14 @@ class Cutters(Beside):
   ENTER, ACT, END = _enter, _act, _keep
 
   def __init__(self, w: "Workspace"):
-    super().__init__(w)
+    super().__init__(w.host)
+    self._w = w
     self.names: list[tuple[str, ...]] = []
     self._arrays: dict[str, np.ndarray] = {}
     self._width = np.zeros(0)
     self.by_current: dict[int, Current] = {}
     self._due: Any = ()
-    self._here: Any = None  # the arrays of `fields`, and of what it has of the organ
-    self._own: Any = None
+    self._here: Any = None  # the arrays of `fields`
     self._said = False
 
   def __bool__(self) -> bool:
@@ -156,7 +159,7 @@ class Cutters(Beside):
         self.by_current[i] = Current(w, geoms[0], actuator, rows[i].energy, shape)
     self.names = [tuple(_name(m, g) for g in geoms) for geoms in found]
     self._arrays = {"geom": geom, "axis": axis, "half": half}
-    w.hold.need()
+    w.host.need_springs()
 
   def law(self, m, thickness: float) -> np.ndarray:
     """Returns the rows of `Blades.law` where the wall has a thickness [m]."""
@@ -172,7 +175,7 @@ class Cutters(Beside):
       for g in self._arrays["geom"][i]:
         if g >= 0:
           body = int(mjstruct.view(m.geom_bodyid, m.ngeom, np.int32)[g])
-          stiff = min(stiff, declare_attachments.most(w, m, body))
+          stiff = min(stiff, most(w.host, body))
       rows.append((force, row.energy * self._width[i], stiff, thickness, solid))
     return np.array(rows)
 
@@ -190,12 +193,12 @@ class Cutters(Beside):
     """Where each is in the tissue, in the plugin state, (nblade, len(BLADE))."""
     return self._here.state
 
-  def bind(self, model: int):
-    """See `Beside`."""
+  def bind(self):
+    """See `Force`."""
     if not self:
       return
     w, n, mesh = self._w, len(self.names), self._w.organ.mesh
-    m, scheme = mjstruct.Model.from_address(model), SCHEMES[w.config.integrator]
+    m, scheme = w.host.m, SCHEMES[w.config.integrator]
     values = {name: np.zeros((n, width)) for name, width in WIDTHS.items()}
     values |= self._arrays | dict(
       nblade=n,
@@ -209,15 +212,15 @@ class Cutters(Beside):
       elem=mesh.elem[: mesh.whole.nelem],
       tet=mesh.tet,
       flat=mesh.rest,
-      state=self.rows("blade", len(BLADE)),
+      state=w.host.own.blade,
       due=np.zeros(n),
-      own=nodes(w),
-      solve=solver(w),
+      own=w.host.nodes,
+      solve=w.host.input,
       number=w.body.numbers,
-      mj=coupling.mujoco_arrays(model, w.data, Bodies),
+      mj=w.host.bodies,
     )
     self.fields = fill(Blades, "cpu", values)
-    self._here, self._own = Views(self.fields), Views(self.fields.own)
+    self._here = Views(self.fields)
     self._due = self._here.due.data
     if w.cuts and not len(mesh.tet):
       assert w.cuts.finder.stops  # made now, since its kernel takes a while to load
@@ -228,15 +231,13 @@ class Cutters(Beside):
       m = mjstruct.Model.from_address(self._w.model)
       self.fields.law.assign(self.law(m, self._w.config.thickness))
 
-  def reshape(self) -> list:
-    """See `Beside`."""
+  def reshape(self, world: int):
+    """See `Force`."""
     if self.fields is not None:
       mesh = self._w.organ.mesh
       self._here.elem[:] = mesh.elem[: mesh.whole.nelem]
       self._here.tet[:] = mesh.tet
       self._here.flat[:] = mesh.rest
-      self._own.rest[:] = base(self._w.organ)
-    return []
 
   def open(self) -> bool:
     """Lets the mesh come apart along the paths that are long enough, or ended; returns whether."""

@@ -38,7 +38,7 @@ _alone: dict[bytes, np.ndarray] = {}  # what it depends on -> `_by_itself`
 
 
 def stiffness(
-  m, organ: Declaration, body: Body, config: Config, nodal: np.ndarray
+  m: mjstruct.Struct, organ: Declaration, body: Body, config: Config, nodal: np.ndarray
 ) -> tuple[bool, float]:
   """Returns whether tissue is stiff for the model's time step, and how much one node alone is more.
 
@@ -62,7 +62,7 @@ def stiffness(
   return bool(stiff), _PRESSED * max(1.0, float(np.median(alone / nodal[sample])))
 
 
-def iterations(m, organ: Declaration, config: Config) -> int:
+def iterations(m: mjstruct.Struct, organ: Declaration, config: Config) -> int:
   """Returns how many Newton iterations a step takes, for the model's time step."""
   if not len(organ.mesh.tet) or not SCHEMES[config.integrator].ahead:
     return config.newton
@@ -70,7 +70,9 @@ def iterations(m, organ: Declaration, config: Config) -> int:
   return max(config.newton, solid.iterations(organ.mesh, config, masses(m, organ), gain))
 
 
-def _by_itself(m, organ: Declaration, body: Body, config: Config, sample: np.ndarray) -> np.ndarray:
+def _by_itself(
+  m: mjstruct.Struct, organ: Declaration, body: Body, config: Config, sample: np.ndarray
+) -> np.ndarray:
   """Returns the effective inertia of the nodes `sample` [kg], each pushed alone."""
   h, mass = float(m.opt.timestep), masses(m, organ)
   numbers = [h, config.damping, config.foundation, config.bulk]
@@ -89,7 +91,7 @@ def _by_itself(m, organ: Declaration, body: Body, config: Config, sample: np.nda
 
 
 def of_nodes(
-  m, organ: Declaration, body: Body, config: Config, mass: np.ndarray, flex: int
+  m: mjstruct.Struct, organ: Declaration, body: Body, config: Config, mass: np.ndarray, flex: int
 ) -> np.ndarray:
   """Returns the effective inertia of every node for the tools that meet `flex` [kg], (nvert,).
 
@@ -112,7 +114,7 @@ def _naming(organ: Declaration):
     raise ValueError(f"organ {organ.name!r}: {error}") from None
 
 
-def of_dofs(m, organ: Declaration) -> np.ndarray:
+def of_dofs(m: mjstruct.Struct, organ: Declaration) -> np.ndarray:
   """Returns the inertia that the dofs of every node have in the model [kg], (nvert,)."""
   inertia = masses(m, organ).copy()
   own = organ.jointed
@@ -121,7 +123,7 @@ def of_dofs(m, organ: Declaration) -> np.ndarray:
   return inertia
 
 
-def masses(m, organ: Declaration) -> np.ndarray:
+def masses(m: mjstruct.Struct, organ: Declaration) -> np.ndarray:
   """Returns the mass of every node that MuJoCo, a solid or the windows give it [kg], (nvert,)."""
   if organ.windows:
     return organ.windows.mass
@@ -152,7 +154,7 @@ def _digest(values: np.ndarray) -> bytes:
   return hashlib.sha256(np.ascontiguousarray(values).tobytes()).digest()
 
 
-def _tool_radius(m, organ: Declaration, flex: int) -> float:
+def _tool_radius(m: mjstruct.Struct, organ: Declaration, flex: int) -> float:
   """Returns the radius of the largest contact patch to expect [m]: that of the thickest tool.
 
   Planes and height fields touch all there is; a patch of a quarter of the organ stands for them.

@@ -36,7 +36,7 @@ _SCALAR = {
 }
 
 
-def _ctype(declared) -> type:
+def _ctype(declared: Any) -> type:
   if isinstance(declared, ast_nodes.PointerType):
     return C.c_void_p
   if isinstance(declared, ast_nodes.ArrayType):
@@ -61,6 +61,7 @@ def _struct(name: str) -> type[C.Structure]:
   return type(declared.name, (C.Structure,), {"_fields_": fields})
 
 
+Struct = Any  # one of these, whose fields are known when MuJoCo is
 Model = _struct("mjModel")
 Data = _struct("mjData")
 Contact = _struct("mjContact")
@@ -102,7 +103,7 @@ def warn(text: str):
   library().mju_warning(b"%s", f"{NAME}: {text}".encode())
 
 
-def view(address: int | None, shape, dtype: type = np.float64) -> np.ndarray:
+def view(address: int | None, shape: Any, dtype: type = np.float64) -> np.ndarray:
   """Returns the array of `shape` that starts at `address`, without a copy."""
   sizes: tuple[int, ...] = tuple(int(n) for n in np.atleast_1d(shape))
   if not address or 0 in sizes:

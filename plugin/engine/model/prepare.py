@@ -11,6 +11,7 @@ import hashlib
 import numpy as np
 from palpate.tissue.body import Body
 from palpate.tissue.config import Config
+from palpate.tissue.geometry.mesh import Mesh
 from palpate.tissue.step import SCHEMES
 
 from . import inertia, mjstruct
@@ -21,7 +22,7 @@ _PARTS = 8  # that cuts may make of a node
 _made_for: dict[bytes, tuple] = {}  # digest of an armature of ours -> time step and material
 
 
-def fit(m, organ: Declaration, body: Body):
+def fit(m: mjstruct.Struct, organ: Declaration, body: Body):
   """Makes a model fit an organ that it declares, with the tissue `body`."""
   # MuJoCo warns of a flex without forces of its own; an <edge damping> silences it and, zero here,
   # costs nothing while running. The plugin's own damping acts instead.
@@ -39,7 +40,7 @@ def fit(m, organ: Declaration, body: Body):
   mass[win.body] = np.minimum(mass[win.body], light)
 
 
-def give_armature(m, organ: Declaration, body: Body, config: Config):
+def give_armature(m: mjstruct.Struct, organ: Declaration, body: Body, config: Config):
   """Gives the organ's dofs the effective inertia as armature, unless the MJCF gave them one.
 
   Ours are recognised by their digest, so that they can follow the time step and the tissue.
@@ -72,7 +73,7 @@ def give_armature(m, organ: Declaration, body: Body, config: Config):
   mjstruct.view(m.dof_M0, m.nv)[dofs] = np.repeat(total, 3)
 
 
-def give_weights(m, organ: Declaration):
+def give_weights(m: mjstruct.Struct, organ: Declaration):
   """Makes contacts with a solid as soft as its nodes' masses, which are not MuJoCo's, have it.
 
   MuJoCo spreads the mass evenly over the vertices, the nodes inside have their part of it.
@@ -84,7 +85,7 @@ def give_weights(m, organ: Declaration):
   mjstruct.view(m.dof_invweight0, m.nv)[organ.dofs] = np.repeat(weight, 3)
 
 
-def show(m, organ: Declaration, shown: bool):
+def show(m: mjstruct.Struct, organ: Declaration, shown: bool):
   """Lets MuJoCo see a windowed organ's own flex, or hides it, so that a step spends nothing on it.
 
   It touches nothing and is drawn from what `window.draw` writes, but MuJoCo updates its vertices,
@@ -103,12 +104,12 @@ def show(m, organ: Declaration, shown: bool):
   body[1:] = body[0] if shown else 0
 
 
-def drawn(mesh) -> int:
+def drawn(mesh: Mesh) -> int:
   """Returns how many vertices of an organ a flex has: those on the surface, and spare ones."""
   return mesh.nskin
 
 
-def group(m, skin: int, flex: int, groups: tuple[int, int]):
+def group(m: mjstruct.Struct, skin: int, flex: int, groups: tuple[int, int]):
   """Puts an organ's skin and its own surface into groups, which viewers draw or do not."""
   mjstruct.view(m.skin_group, m.nskin, np.int32)[skin] = groups[0]
   mjstruct.view(m.flex_group, m.nflex, np.int32)[flex] = groups[1]

@@ -46,7 +46,7 @@ class Skin:
   groups: tuple[int, int]
 
 
-def read(m, organ: Declaration) -> Skin | None:
+def read(m: mjstruct.Struct, organ: Declaration) -> Skin | None:
   """Returns the skin that an organ's configuration names, or None.
 
   Raises:
@@ -93,7 +93,7 @@ def read(m, organ: Declaration) -> Skin | None:
   return Skin(k, smooth, _height(m, adr, smooth, rest), adr, bone, (group, own))
 
 
-def _height(m, adr: int, smooth: Smooth, rest: np.ndarray) -> np.ndarray:
+def _height(m: mjstruct.Struct, adr: int, smooth: Smooth, rest: np.ndarray) -> np.ndarray:
   """Returns how far the skin's vertices, as they are declared, lie above the smooth surface [m].
 
   Both are in the frame of the body that the organ is in; a skin is bound to that.

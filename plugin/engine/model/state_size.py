@@ -26,9 +26,9 @@ def state_size(model: int, instance: int) -> int:
   sizes = cuts | {"nblade": cutters.count(",") + 1 if cutters else 0}
   if mjstruct.config(model, instance, "window").strip():
     # A window's vertices count as the organ's, which have more numbers than a slot.
-    sizes |= {"nvert": most, "nslot": 0, "ngeom": m.ngeom, "ncreep": relaxes * most}
+    sizes |= {"nvert": most, "nslot": 0, "ngeom": m.ngeom, "nrelax": relaxes * most}
     sizes |= {"nrest": rests * m.nflexvert, "nbond": bonded * m.nflexvert}
     return layout.size(WindowState, sizes)
   moving = len(declare.moving_bodies(m, instance))
-  sizes |= {"ncreep": relaxes * (moving + inner), "nbond": bonded * moving}
+  sizes |= {"nrelax": relaxes * (moving + inner), "nbond": bonded * moving}
   return layout.size(NodalState, sizes | coupling.nodal_sizes(3 * moving, 3 * inner))

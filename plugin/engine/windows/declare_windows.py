@@ -7,10 +7,12 @@ from palpate.tissue import device as devices
 from palpate.tissue.config import Config
 from palpate.tissue.geometry import fill
 from palpate.tissue.geometry import mesh as topology
+from palpate.tissue.geometry.mesh import Mesh
 
 from ..model import declare, flexes, mjstruct
 from ..model.declare import Declaration, Windows
 
+Frame = tuple[np.ndarray, np.ndarray]  # rotation to the world, and origin [m]
 _NEAR = 0.1  # of its size: closer than that to an organ, a flex is beside it
 
 
@@ -63,7 +65,7 @@ def read(model: int, instance: int) -> Declaration:
   )
 
 
-def _surface(m, instance: int) -> tuple[int, int]:
+def _surface(m: mjstruct.Struct, instance: int) -> tuple[int, int]:
   """Returns the rigid flex that is the organ and the body that it is in."""
   bodies, mine = _rigid_flexes(m, instance)
   who = mjstruct.name_of(m, m.name_bodyadr, int(bodies[0]))
@@ -82,7 +84,7 @@ def _surface(m, instance: int) -> tuple[int, int]:
   return flex, int(bodies[0])
 
 
-def _rigid_flexes(m, instance: int) -> tuple[np.ndarray, list[int]]:
+def _rigid_flexes(m: mjstruct.Struct, instance: int) -> tuple[np.ndarray, list[int]]:
   """Returns the bodies of a plugin instance and the rigid flexes in them."""
   bodies = np.flatnonzero(mjstruct.view(m.body_plugin, m.nbody, np.int32) == instance)
   start = mjstruct.view(m.flex_vertadr, m.nflex, np.int32)
@@ -91,7 +93,16 @@ def _rigid_flexes(m, instance: int) -> tuple[np.ndarray, list[int]]:
   return bodies, [f for f in range(m.nflex) if rigid[f] and vertbody[start[f]] in bodies]
 
 
-def _windows(model, m, instance, name, config, mesh, mass, place) -> Windows:
+def _windows(
+  model: int,
+  m: mjstruct.Struct,
+  instance: int,
+  name: str,
+  config: Config,
+  mesh: Mesh,
+  mass: np.ndarray,
+  place: Frame,
+) -> Windows:
   """Returns the window of an organ, and where it stands at rest."""
   flex = _claimed(model, m, instance, name, config)
   body, dofadr, qposadr, offset, turn = _slots(m, name, config.window, flex, place)
@@ -118,7 +129,7 @@ def _windows(model, m, instance, name, config, mesh, mass, place) -> Windows:
   )
 
 
-def _claimed(model, m, instance: int, name: str, config: Config) -> int:
+def _claimed(model: int, m: mjstruct.Struct, instance: int, name: str, config: Config) -> int:
   """Returns the flex that an organ names as its window and nobody else does."""
   names = [flexes.name(m, f) for f in range(m.nflex)]
   surface = _surfaces(model, m, instance, without=instance)
@@ -134,7 +145,9 @@ def _claimed(model, m, instance: int, name: str, config: Config) -> int:
   return flex
 
 
-def _slots(m, name: str, window: str, flex: int, place) -> tuple[np.ndarray, ...]:
+def _slots(
+  m: mjstruct.Struct, name: str, window: str, flex: int, place: Frame
+) -> tuple[np.ndarray, ...]:
   """Returns body, first dof, first qpos, offset from the organ and turn of each of its slots."""
   what = f"organ {name!r}: window {window!r}"
   start = int(mjstruct.view(m.flex_vertadr, m.nflex, np.int32)[flex])
@@ -157,7 +170,7 @@ def _slots(m, name: str, window: str, flex: int, place) -> tuple[np.ndarray, ...
   return own, dofs, qposs, offset, np.tile(turn, (count, 1, 1))
 
 
-def _followed(m, name: str, config: Config, flex: int) -> np.ndarray:
+def _followed(m: mjstruct.Struct, name: str, config: Config, flex: int) -> np.ndarray:
   """Returns the geoms that a window follows: of the bodies named, or all that move and collide.
 
   An organ that nothing holds may fall on what stands still: its window follows that too.
@@ -182,7 +195,16 @@ def _followed(m, name: str, config: Config, flex: int) -> np.ndarray:
   return np.array([g for g in meets if bodyid[g] in wanted], np.int64)
 
 
-def _check_neighbours(m, model, instance, name, windows: Windows, frame, origin, rest):
+def _check_neighbours(
+  m: mjstruct.Struct,
+  model: int,
+  instance: int,
+  name: str,
+  windows: Windows,
+  frame: np.ndarray,
+  origin: np.ndarray,
+  rest: np.ndarray,
+):
   """Raises ValueError where a flex is beside the organ and collides with its windows.
 
   Windows follow geoms: they would not be there.
@@ -208,7 +230,7 @@ def _check_neighbours(m, model, instance, name, windows: Windows, frame, origin,
       )
 
 
-def _bearing(model, m, instance: int, name: str) -> set[str]:
+def _bearing(model: int, m: mjstruct.Struct, instance: int, name: str) -> set[str]:
   """Returns the organs on which one rests, and those that rest on it."""
   names = [flexes.name(m, f) for f in range(m.nflex)]
   found = {}
@@ -233,7 +255,7 @@ def touching(model: int, instance: int) -> np.ndarray:
   return np.array([*nodal, *_surfaces(model, m, instance)], int)
 
 
-def _surfaces(model, m, instance: int, without: int = -1) -> dict[int, int]:
+def _surfaces(model: int, m: mjstruct.Struct, instance: int, without: int = -1) -> dict[int, int]:
   """Returns the flex of the organ that each window is of, of all organs or without one."""
   names = [flexes.name(m, f) for f in range(m.nflex)]
   plugin = mjstruct.view(m.plugin, m.nplugin, np.int32)

@@ -2,11 +2,12 @@
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
 from palpate.tissue import order
+from palpate.tissue.kernels import Kernel
 from palpate.tissue.types import Views, doubles, fill, ints, struct
 
 from .. import coupling, layout
@@ -14,7 +15,7 @@ from ..coupling import Crossing
 from ..layout import Inbox, Motion, Outbox
 
 if TYPE_CHECKING:
-  from ..workspace import Workspace
+  from ..host import Host
 
 _BLOCK = 128  # threads, whole warps
 
@@ -46,17 +47,23 @@ commit, move_slots, enter, push_slots, push_impulses, search, report = coupling.
 )
 
 
-def make(w: "Workspace", side, motion, boxes: tuple[wp.array, wp.array], sizes: dict[str, int]):
-  """Returns a workspace's nodes on a device.
+def make(
+  host: "Host",
+  side: wp.Device,
+  motion: Any,
+  boxes: tuple[wp.array, wp.array],
+  sizes: dict[str, int],
+) -> Any:
+  """Returns an organ's nodes on a device.
 
   Args:
-    w: the workspace
+    host: the organ
     side: the device
     motion: where the motion is there, `Motion`
     boxes: numbers of inbox and outbox there
     sizes: what the blocks of `layout` need
   """
-  organ, s = w.organ, w.body.shape
+  organ, s = host.organ, host.body.shape
   node = s.node.numpy()
   values = dict(
     nvert=sizes["nvert"],
@@ -72,27 +79,28 @@ def make(w: "Workspace", side, motion, boxes: tuple[wp.array, wp.array], sizes: 
     motion=motion,
     inbox=layout.carve(Inbox, boxes[0], sizes),
     outbox=layout.carve(Outbox, boxes[1], sizes),
-    solve=coupling.crossing(coupling.on_body(w.body) if w.config.resident else w.host),
+    solve=coupling.crossing(coupling.on_body(host.body) if host.config.resident else host.arrays),
   )
   return fill(Nodes, side, values)
 
 
 class Weights:
-  """Rest places and masses of a workspace's nodes, which cuts change.
+  """Rest places and masses of an organ's nodes, which cuts change.
 
   Args:
-    w: the workspace
+    host: the organ
     nodes: `Nodes` of it
   """
 
-  def __init__(self, w: "Workspace", nodes):
-    self._w, self._nodes, self._here = w, nodes, Views(nodes)
-    self._number, self._mass = w.body.shape.node.numpy(), w.host["mass"].numpy().reshape(-1)
+  def __init__(self, host: "Host", nodes: Any):
+    self._host, self._nodes, self._here = host, nodes, Views(nodes)
+    self._number = host.body.shape.node.numpy()
+    self._mass = host.arrays["mass"].numpy().reshape(-1)
 
   def put(self, vert: np.ndarray):
     """Gives the nodes what these vertices have now."""
-    w, nodes = self._w, self._nodes
-    rest, mass = w.organ.mesh.rest, w.organ.mass
+    host, nodes = self._host, self._nodes
+    rest, mass = host.organ.mesh.rest, host.organ.mass
     if nodes.rest.device.is_cuda:
       nodes.rest.assign(rest)
       nodes.mass.assign(mass)
@@ -100,11 +108,11 @@ class Weights:
       self._here.rest[vert], self._here.mass[vert] = rest[vert], mass[vert]
     # Nodes without a mass have one in the solver, so that nothing divides by zero.
     self._mass[self._number[vert]] = np.where(mass[vert] > 0, mass[vert], 1.0)
-    if w.body.device.is_cuda:
-      wp.copy(w.body.state.mass, w.host["mass"])
+    if host.body.device.is_cuda:
+      wp.copy(host.body.state.mass, host.arrays["mass"])
 
 
-def launch(kernel, nodes, count: int, device):
+def launch(kernel: Kernel, nodes: Any, count: int, device: wp.Device):
   """Launches a kernel over `count` items: one thread each on CUDA, one for all on the CPU."""
-  nthread = -(-count // _BLOCK) * _BLOCK if wp.get_device(device).is_cuda else 1
+  nthread = -(-count // _BLOCK) * _BLOCK if device.is_cuda else 1
   kernel.launch(device, 1, nthread, 0, nodes, _BLOCK)

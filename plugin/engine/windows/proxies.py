@@ -2,12 +2,14 @@
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
 from palpate.tissue import step
-from palpate.tissue.kernels import aim
+from palpate.tissue.geometry.mesh import Mesh
+from palpate.tissue.kernels import Kernel, aim
 from palpate.tissue.types import doubles, fill, flags, floats, ints, longs, struct
 
 from .. import coupling
@@ -16,8 +18,8 @@ from ..layout import FLAG, Inbox, Outbox, WindowState
 from ..model import mjstruct
 
 if TYPE_CHECKING:
+  from ..host import Host
   from ..model.declare import Declaration
-  from ..workspace import Workspace
 
 # Nodes within this many mean edges of a tool may be in the window.
 _REACH = 4.0
@@ -131,28 +133,30 @@ def scratch(nvert: int, nslot: int) -> dict[str, wp.array]:
   } | {name: wp.zeros(shape, dtype=wp.float64, device="cpu") for name, shape in zeros.items()}
 
 
-def make(w: "Workspace", model: int, sizes: dict[str, int]):
-  """Returns the slots of a workspace.
+def make(
+  host: "Host", boxes: Mapping[str, Any], kept: Mapping[str, wp.array], sizes: Mapping[str, int]
+) -> Any:
+  """Returns the slots of an organ.
 
   Args:
-    w: the workspace, with `boxes`, and what `scratch` gave in `views`
-    model: address of the mjModel
+    host: the organ
+    boxes: blocks of the plugin state and of what crosses
+    kept: what `scratch` gave
     sizes: what the blocks of `layout` need
   """
-  m = mjstruct.Model.from_address(model)
-  organ, win, mesh = w.organ, w.organ.window, w.organ.mesh
+  m, organ, win, mesh = host.m, host.organ, host.organ.window, host.organ.mesh
   lengths, longest = _edges(mesh)
   radius = float(mjstruct.view(m.flex_radius, m.nflex)[win.flex])
   margin = float(mjstruct.view(m.flex_margin, m.nflex)[win.flex])
   margin += float(mjstruct.view(m.geom_margin, m.ngeom)[win.geom].max(initial=0.0))
   room = max(mesh.whole.nelem, sizes["ncorner"])
-  values = w.boxes | {name: w.views[name] for name in scratch(0, 0)} | dict(
+  values = {**boxes} | {name: kept[name] for name in scratch(0, 0)} | dict(
     nvert=sizes["nvert"],
     nslot=sizes["nslot"],
     ngeom=sizes["ngeom"],
     nroom=room,
     most=sizes["most"],
-    resident=int(w.config.resident),
+    resident=int(host.config.resident),
     rest_share=step.REST,
     reach=max(_REACH * float(lengths.mean()), float(longest.max())) + radius,
     slow=SLOW * float(np.linalg.norm(np.ptp(mesh.rest, axis=0))),
@@ -169,9 +173,9 @@ def make(w: "Workspace", model: int, sizes: dict[str, int]):
     following=np.full(room, -1),
     frame=organ.frame,
     origin=organ.origin,
-    heaviest=w.host["heaviest"],
-    number=w.body.numbers,
-    flags=wp.array(np.asarray(w.report.flags), dtype=int, device="cpu", copy=False),
+    heaviest=host.arrays["heaviest"],
+    number=host.number,
+    flags=host.flags(),
     home=win.home,
     qhome=win.qhome,
     dofadr=win.dofadr,
@@ -181,9 +185,9 @@ def make(w: "Workspace", model: int, sizes: dict[str, int]):
     elem_adr=win.elem_adr,
     elem_num=win.elem_num,
     geom=win.geom,
-    lagged=w.host["lagged"],
-    status=w.host["status"],
-    mj=coupling.mujoco_arrays(model, w.data),
+    lagged=host.arrays["lagged"],
+    status=host.arrays["status"],
+    mj=coupling.mujoco_arrays(host.model, host.data),
   )  # fmt: skip
   return fill(Slots, "cpu", values)
 
@@ -196,7 +200,7 @@ class Reshape:
     slots: of it
   """
 
-  def __init__(self, organ: "Declaration", slots):
+  def __init__(self, organ: "Declaration", slots: Any):
     self._fields = fields = Reshaping()
     mesh = organ.mesh
     for name in ("rest", "touch", "node_mass", "free", "elem", "begin", "following", "radius"):
@@ -222,7 +226,7 @@ def hold(organ: "Declaration", inertia: np.ndarray, vert: Any = slice(None)) -> 
   return np.where(organ.free[vert], inertia, WALL * organ.window.mass.sum())
 
 
-def _edges(mesh) -> tuple[np.ndarray, np.ndarray]:
+def _edges(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
   """Returns the lengths of the triangles' edges, (nelem, 3), and the longest one at each node.
 
   A tool that touches a triangle is no farther from its corners than their longest edges.
@@ -235,6 +239,6 @@ def _edges(mesh) -> tuple[np.ndarray, np.ndarray]:
   return length, longest
 
 
-def launch(kernel, slots):
+def launch(kernel: Kernel, slots: Any):
   """Launches a kernel over all slots."""
   kernel.launch("cpu", 1, 1, 0, slots)

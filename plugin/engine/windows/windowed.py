@@ -18,109 +18,130 @@ import mujoco
 import numpy as np
 import warp as wp
 from palpate.tissue import step
+from palpate.tissue.kernels import Kernel
 from palpate.tissue.types import Views
 
 from .. import coupling, layout, safe_calls
-from ..layout import TAIL, Inbox, Motion, Outbox, WindowState
+from ..coupling import Share
+from ..layout import TAIL, Inbox, Motion, Outbox
 from ..model import inertia, mjstruct, prepare
 from . import nodes, proxies
 from .resident import Resident
 
 if TYPE_CHECKING:
-  from ..model.declare import Declaration
+  from ..host import Host
   from ..workspace import Workspace
 
 # Candidates that a device reports, times the slots.
 ROOM = 16
 
 
-class Phases(coupling.Phases):
-  """Window coupling of a workspace's organ."""
+def side_of(host: Host) -> wp.Device:
+  """Returns the device of the nodes' kernels."""
+  return host.body.device if host.config.resident else wp.get_device("cpu")
 
-  def __init__(self, w: Workspace, model: int, instance: int):
-    organ, win = w.organ, w.organ.window
-    self.side = w.body.device if w.config.resident else wp.get_device("cpu")
-    self._resident, self._away = w.config.resident, self.side.is_cuda
-    self._status = w.host["status"], w.body.system.status
-    m = mjstruct.Model.from_address(model)
-    first = mjstruct.view(m.body_treeid, m.nbody, np.int32)[win.body[0]]
-    w.seen.policy = mjstruct.view(m.tree_sleep_policy, m.ntree, np.int32)[first:].data
-    w.seen.counts = mjstruct.view(m.flex_vertnum, m.nflex, np.int32)[organ.flex :].data
-    sizes = self._sizes(organ)
-    size = layout.size(WindowState, sizes)
-    state = coupling.plugin_state(model, w.data, instance, size)
-    if not w.views:
-      w.views = proxies.scratch(organ.mesh.nvert, win.nslot) | {
-        name: wp.zeros(layout.size(kind, sizes), dtype=wp.float64, device="cpu", pinned=self._away)
-        for name, kind in (("inbox", Inbox), ("outbox", Outbox), ("foreseen", Inbox))
-      }
-    v = w.views
-    v["plugin_state"] = state
-    w.boxes = {
-      "own": layout.carve(WindowState, state, sizes),
-      "inbox": layout.carve(Inbox, v["inbox"], sizes),
-      "outbox": layout.carve(Outbox, v["outbox"], sizes),
-      "foreseen": layout.carve(Inbox, v["foreseen"], sizes),
+
+def sizes_of(host: Host) -> dict[str, int]:
+  """Returns what the blocks of `layout` need."""
+  nvert, nslot = host.organ.mesh.nvert, host.organ.window.nslot
+  most = min(nvert, ROOM * nslot) if side_of(host).is_cuda else nvert
+  return coupling.sizes(host.organ) | {"most": most}
+
+
+def scratch(host: Host) -> dict[str, Any]:
+  """Returns what outlives a new recording of an organ's graphs."""
+  organ, sizes, pinned = host.organ, sizes_of(host), side_of(host).is_cuda
+  return proxies.scratch(organ.mesh.nvert, organ.window.nslot) | {
+    name: wp.zeros(layout.size(kind, sizes), dtype=wp.float64, device="cpu", pinned=pinned)
+    for name, kind in (("inbox", Inbox), ("outbox", Outbox), ("foreseen", Inbox))
+  }
+
+
+class Phases(coupling.Phases):
+  """Window coupling of an organ.
+
+  Args:
+    host: the organ, bound to a model
+    kept: what `scratch` gave
+    share: what cuts have made of values by mass
+  """
+
+  def __init__(self, host: Host, kept: dict[str, Any], share: Share):
+    organ, sizes = host.organ, sizes_of(host)
+    self.side = side_of(host)
+    self._resident, self._away = host.config.resident, self.side.is_cuda
+    self._status = host.arrays["status"], host.body.system.status
+    self.boxes = {
+      "own": host.own,
+      "inbox": layout.carve(Inbox, kept["inbox"], sizes),
+      "outbox": layout.carve(Outbox, kept["outbox"], sizes),
+      "foreseen": layout.carve(Inbox, kept["foreseen"], sizes),
     }
-    self._slots, self._w = proxies.make(w, model, sizes), w
+    self._slots = proxies.make(host, self.boxes, kept, sizes)
+    self._host, self._kept, self._share = host, kept, share
     # The boxes here and on `side`, which may be the same.
-    self._near, self._foreseen = (v["inbox"], v["outbox"]), v["foreseen"]
-    self._far, motion = self._near, w.boxes["own"].motion
+    self._near, self._foreseen = (kept["inbox"], kept["outbox"]), kept["foreseen"]
+    self._far, motion = self._near, host.own.motion
     if self._away:
       inbox, outbox = (wp.clone(box, device=self.side) for box in self._near)
       self._far = inbox, outbox
-    if w.config.resident:
+    if self._resident:
       self._motion = wp.zeros(layout.size(Motion, sizes), dtype=wp.float64, device=self.side)
       motion = layout.carve(Motion, self._motion, sizes)
-      own = w.report.flags, w.boxes, w.plugin_state
-      w.graphs.resident = Resident(*own, self._motion, self._end_now, self.look_ahead)
-    self._nodes = nodes.make(w, self.side, motion, self._far, sizes)
-    self._weights = nodes.Weights(w, self._nodes)
+      own = host.flags().numpy().data, self.boxes, host.state.numpy()
+      self.resident = Resident(*own, self._motion, self._end_now, self.look_ahead)
+    self._nodes = nodes.make(host, self.side, motion, self._far, sizes)
+    self._weights = nodes.Weights(host, self._nodes)
     self._weights.put(np.arange(organ.mesh.nvert))
     self._reshape = proxies.Reshape(organ, self._slots)
-    self._motion_here = Views(w.boxes["own"].motion)
+    self._motion_here = Views(host.own.motion)
 
   # Cuts.
 
   def reshape(self, touched: np.ndarray | None = None):
     """Takes the mesh and the masses that the organ has now."""
-    organ = self._w.organ
+    organ = self._host.organ
     touched = np.arange(organ.mesh.nvert) if touched is None else touched
     self._reshape.put(organ, touched)
-    share_inertia(self._w, touched)
+    share_inertia(self._host, self._kept, self._share, touched)
     self._weights.put(touched)
-    wake(self._w)
+    wake(self._host)
 
   def motion(self) -> tuple[np.ndarray, np.ndarray]:
     """Returns displacement and velocity of the vertices, where the state has them."""
-    if self._w.graphs.resident:
-      self._w.graphs.resident.fetch()
+    if self.resident:
+      self.resident.fetch()
     motion = self._motion_here
     return motion.disp, motion.vel
 
-  def carry(self, changed, disp, vel, group, member, share):
-    """Gives vertices their motion after a cut, see `coupling.Phases`; slots keep their forces."""
+  def contact_force(self) -> np.ndarray:
+    """See `coupling.Phases`."""
+    out, node = np.zeros((self._host.organ.mesh.nvert, 3)), self._kept["placed"].numpy()
+    used = node >= 0
+    out[node[used]] = self._host.own.force.numpy()[used]
+    return out
+
+  def put(self, vert: np.ndarray, disp: np.ndarray | None, vel: np.ndarray | None):
+    """See `coupling.Phases`."""
     motion = self._motion_here
-    motion.disp[changed], motion.vel[changed] = disp[changed], vel[changed]
-    for values in (motion.last, motion.before):
+    for there, values in ((motion.disp, disp), (motion.vel, vel)):
+      if values is not None:
+        there[vert] = values[vert]
+    if self.resident:
+      self.resident.renew()
+
+  def divide(self, group: np.ndarray, member: np.ndarray, share: np.ndarray):
+    """See `coupling.Phases`; slots keep their forces."""
+    for values in (self._motion_here.last, self._motion_here.before):
       values[member] = values[group]
-    if self._w.graphs.resident:
-      self._w.graphs.resident.renew()
 
-  def _sizes(self, organ: Declaration) -> dict[str, int]:
-    """Returns what the blocks of `layout` need."""
-    nvert, nslot = organ.mesh.nvert, organ.window.nslot
-    return coupling.sizes(organ) | {
-      "most": min(nvert, ROOM * nslot) if self.side.is_cuda else nvert
-    }
-
-  def _over_slots(self, kernel):
+  def _over_slots(self, kernel: Kernel):
     proxies.launch(kernel, self._slots)
 
-  def _over_nodes(self, kernel):
+  def _over_nodes(self, kernel: Kernel):
     nodes.launch(kernel, self._nodes, self._nodes.nvert, self.side)
 
-  def _over_pushed(self, kernel):
+  def _over_pushed(self, kernel: Kernel):
     nodes.launch(kernel, self._nodes, self._nodes.nslot, self.side)
 
   def _receive(self):
@@ -208,12 +229,12 @@ class Phases(coupling.Phases):
 def settle(w: Workspace, model: int):
   """Readies the state for the default slots."""
   set_inertia(w, mjstruct.Model.from_address(model))
-  w.views["plugin_state"].fill_(0.0)  # MuJoCo has not cleared it yet
+  w.host.state.fill_(0.0)  # MuJoCo has not cleared it yet
 
 
 def find_astray(w: Workspace) -> float:
   """Returns how far a slot is from the node that the plugin state says it is on, at most [m]."""
-  own, turn = w.boxes["own"], w.turn
+  own, turn = w.host.own, w.turn
   assert turn is not None
   if own.tail.numpy()[TAIL.stamp] < 0:  # that motion is on a device, and the slots have moved
     return np.inf if turn.stood else 0.0
@@ -269,26 +290,24 @@ def find_contacts_again(w: Workspace):
     array[which] = were
 
 
-def wake(w: Workspace):
+def wake(host: Host):
   """Ends the organ's sleep: something has changed."""
-  w.boxes["own"].tail.numpy()[TAIL.quiet] = 0.0
+  host.own.tail.numpy()[TAIL.quiet] = 0.0
 
 
-def set_inertia(w: Workspace, m):
+def set_inertia(w: Workspace, m: mjstruct.Struct):
   """Stores the effective inertia of every node for the present time step."""
   organ, win = w.declared, w.organ.window
   nodal = win.mass
   if step.SCHEMES[w.config.integrator].spreads:
     nodal = inertia.of_nodes(m, organ, w.body, w.config, win.mass, win.flex)
   w.views["whole"] = nodal
-  share_inertia(w)
+  share_inertia(w.host, w.views, w.share)
 
 
-def share_inertia(w: Workspace, vert: Any = slice(None)):
+def share_inertia(host: Host, kept: dict[str, Any], share: Share, vert: Any = slice(None)):
   """Gives vertices, some or all, that were one their part of its inertia."""
-  nodal = w.views["whole"]
-  nodal = w.cuts.share(nodal, vert) if w.cuts else nodal[vert]
-  w.views["inertia"].numpy()[vert] = proxies.hold(w.organ, nodal, vert)
+  kept["inertia"].numpy()[vert] = proxies.hold(host.organ, share(kept["whole"], vert), vert)
 
 
 def shortage(w: Workspace) -> str | None:
@@ -313,5 +332,5 @@ def draw(w: Workspace, model: int, data: int):
   if w.graphs.resident:
     w.graphs.resident.fetch()
   out = mjstruct.view(d.flexvert_xpos, (m.nflexvert, 3))[start : start + n]
-  disp = w.boxes["own"].motion.disp.numpy()[:n]
+  disp = w.host.own.motion.disp.numpy()[:n]
   out[:] = organ.origin + (organ.mesh.rest[:n] + disp) @ organ.frame.T

@@ -1,5 +1,5 @@
-// Ties: springs from nodes of an organ to points of MuJoCo's bodies, of other organs, or of the
-// organ's own rigid motion. Doubles, a thread a world: several may share a node.
+// Attachments: springs from nodes of an organ to points of MuJoCo's bodies, of other organs, or of
+// the organ's own rigid motion. Doubles, a thread a world: several may share a node.
 //
 // The force on a node at the end of the step, where the node will be and where the point will be:
 //
@@ -12,22 +12,14 @@
 
 namespace palpate {
 
-// What a tie leads to besides bodies.
+// What an attachment leads to besides bodies.
 constexpr int TO_POINT = -1, TO_OWN_MOTION = -2;
 
 template <class Fields>
 PALPATE Fields of_world(Fields f, int world) {
   const int row = f.row.data[world];
-  move_to(f.count, row);
-  move_to(f.vert, row);
-  move_to(f.body, row);
-  move_to(f.leads, row);
-  move_to(f.stiffness, row);
-  move_to(f.anchor, row);
-  move_to(f.point, world);
-  move_to(f.force, world);
-  move_to(f.number, world);
-  move_to(f.dvel_warm, world);
+  move_each(row, f.count, f.vert, f.body, f.leads, f.stiffness, f.anchor, f.whom, f.pair);
+  move_each(world, f.point, f.force, f.number, f.dvel_warm);
   move_nodes(f.own, world);
   move_input(f.solve, world);
   move_bodies(f.mj, world);
@@ -67,9 +59,9 @@ PALPATE void make_rotation(double* a) {
     for (int k = 0; k < 9; ++k) a[k] = k % 4 == 0;
 }
 
-// The rigid motion that is nearest to that of the nodes which are tied to it (shape matching,
-// Mueller et al. 2005, doi:10.1145/1073204.1073216), by the ties' stiffness: their forces then have
-// neither sum nor moment. Its velocity is that which the last steps lead to.
+// The rigid motion that is nearest to that of the nodes which are attached to it (shape matching,
+// Mueller et al. 2005, doi:10.1145/1073204.1073216), weighted by the springs' stiffness: their forces
+// then have neither sum nor moment. Its velocity is that which the last steps lead to.
 template <class Fields>
 PALPATE Rigid own_motion(const Fields& f) {
   double total = 0.0, A[9] = {}, I[9] = {};
@@ -118,7 +110,7 @@ PALPATE Rigid own_motion(const Fields& f) {
   return out;
 }
 
-// What the spring of a tie weighs on the change of its node's velocity [kg]; twice where another organ
+// What an attachment's spring weighs on the change of its node's velocity [kg]; twice where another organ
 // is at the other end, whose step does not know of this one's.
 template <class Fields>
 PALPATE double weight_of(const Fields& f, int n) {
@@ -126,7 +118,7 @@ PALPATE double weight_of(const Fields& f, int n) {
   return twice * f.stiffness.data[n] * f.gain * h * (h + f.number.data[DAMPING]);
 }
 
-// Where the point of a tie to a body is in the world, and from the centre of mass of its tree.
+// Where the point of an attachment to a body is in the world.
 template <class Fields>
 PALPATE D3 point_of_body(const Fields& f, int n) {
   const int b = f.body.data[n];
@@ -134,34 +126,29 @@ PALPATE D3 point_of_body(const Fields& f, int n) {
     + turned(f.mj.xmat.data + 9 * b, load(f.anchor.data + 3 * n));
 }
 
-// Finds where points on another organ are, of a world that is a row.
+// Finds where the points on another organ are, which has number `which`.
 template <class Fields>
-PALPATE void aim_ties(const Fields& all, Thread t, int) {
-  Fields f = all;
-  const int row = f.row.data[t.world];
-  move_to(f.count, row);
-  move_to(f.first, row);
-  move_to(f.pair, row);
-  move_to(f.anchor, row);
-  move_to(f.point, t.world);
-  move_nodes(f.other, t.world);
+PALPATE void aim_attachments(const Fields& all, Thread t, int which) {
+  const auto f = of_world(all.held, t.world);
+  auto other = all.other;
+  move_nodes(other, t.world);
   each_item(t, f.count.data[0], [&](int n) {
-    const Place p = place_of(f.mj, f.other, f.pair.data[n]);
-    double* point = f.point.data + 6 * (f.first.data[0] + n);
-    store(point, p.at + load(f.anchor.data + 3 * n));
-    store(point + 3, p.vel);
+    if (f.whom.data[n] != which) return;
+    const Place p = place_of(f.mj, other, f.pair.data[n]);
+    store(f.point.data + 6 * n, p.at + load(f.anchor.data + 3 * n));
+    store(f.point.data + 6 * n + 3, p.vel);
   });
 }
 
-// Adds to the solver's input what pulls at the tied nodes.
+// Adds to the solver's input what pulls at the attached nodes.
 template <class Fields>
-PALPATE void enter_ties(const Fields& all, Thread t, int) {
+PALPATE void enter_attachments(const Fields& all, Thread t, int) {
   const Fields f = of_world(all, t.world);
   const int count = f.count.data[0];
   const double h = f.mj.timestep.data[0], reach = f.ahead * h + f.number.data[DAMPING];
   const D3 zero = {0.0, 0.0, 0.0};
-  const Rigid own = f.owned.data[0] ? own_motion(f) : Rigid{};
-  if (f.restless.data[0]) f.solve.quiet.data[0] = 0.0;
+  const Rigid own = f.owned ? own_motion(f) : Rigid{};
+  if (f.restless) f.solve.quiet.data[0] = 0.0;
   Twist moving = {zero, zero};
   for (int n = 0; n < count; ++n) {
     const int i = f.vert.data[n], node = f.solve.node.data[i];
@@ -190,10 +177,9 @@ PALPATE void enter_ties(const Fields& all, Thread t, int) {
   }
 }
 
-// Ends the forces of the ties with what the step makes of the nodes' velocities, and lets the bodies
-// feel them.
+// Ends the forces with what the step makes of the nodes' velocities, and lets the bodies feel them.
 template <class Fields>
-PALPATE void act_ties(const Fields& all, Thread t, int) {
+PALPATE void act_attachments(const Fields& all, Thread t, int) {
   const Fields f = of_world(all, t.world);
   const auto& mj = f.mj;
   const bool ok = f.solve.status.data[3] == 0.0f;

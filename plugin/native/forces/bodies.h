@@ -12,37 +12,29 @@ PALPATE void move_to(Array& a, int world) {
   a.data += (size_t)world * ((size_t)a.strides[0] / sizeof(*a.data));
 }
 
+template <class... Arrays>
+PALPATE void move_each(int world, Arrays&... arrays) {
+  (move_to(arrays, world), ...);
+}
+
 template <class Arrays>
 PALPATE void move_bodies(Arrays& mj, int world) {
-  move_to(mj.xpos, world);
-  move_to(mj.xmat, world);
-  move_to(mj.cvel, world);
-  move_to(mj.cdof, world);
-  move_to(mj.qacc_warmstart, world);
-  move_to(mj.subtree_com, world);
-  move_to(mj.geom_xpos, world);
-  move_to(mj.geom_xmat, world);
-  move_to(mj.qfrc_passive, world);
+  move_each(world, mj.ctrl, mj.xpos, mj.xmat, mj.cvel, mj.cdof, mj.qacc_warmstart, mj.subtree_com,
+            mj.geom_xpos, mj.geom_xmat, mj.qfrc_passive);
 }
 // Of an organ in the solver's own vectors, whose mesh is its world's; of one in MuJoCo's memory, of
 // which there is one.
 template <class Nodes>
 PALPATE auto move_nodes(Nodes& o, int world) -> decltype(*o.node.data, void()) {
   if (!o.node.data) return;
-  move_to(o.disp, world);
-  move_to(o.vel, world);
+  move_each(world, o.disp, o.vel);
   move_to(o.rest, o.mesh.data[world]);
 }
 template <class Nodes>
 PALPATE auto move_nodes(Nodes& o, int) -> decltype(*o.qposadr.data, void()) {}
 template <class Solve>
 PALPATE void move_input(Solve& s, int world) {
-  move_to(s.quiet, world);
-  move_to(s.hold, world);
-  move_to(s.force_ext, world);
-  move_to(s.vel, world);
-  move_to(s.dvel, world);
-  move_to(s.status, world);
+  move_each(world, s.quiet, s.hold, s.force_ext, s.vel, s.dvel, s.status);
 }
 
 // A symmetric matrix, by its upper half.

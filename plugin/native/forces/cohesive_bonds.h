@@ -24,21 +24,8 @@ struct Seat { D3 at, vel, x, y, z; };
 template <class Fields>
 PALPATE Fields of_world(Fields f, int world) {
   const int row = f.row.data[world];
-  move_to(f.count, row);
-  move_to(f.vert, row);
-  move_to(f.slot, row);
-  move_to(f.area, row);
-  move_to(f.anchor, row);
-  move_to(f.normal, row);
-  move_to(f.corner, row);
-  move_to(f.weight, row);
-  move_to(f.state, world);
-  move_to(f.next, world);
-  move_to(f.stretch, world);
-  move_to(f.force, world);
-  move_to(f.pull, world);
-  move_to(f.hardness, world);
-  move_to(f.number, world);
+  move_each(row, f.count, f.vert, f.slot, f.area, f.anchor, f.normal, f.corner, f.weight);
+  move_each(world, f.state, f.next, f.stretch, f.force, f.pull, f.hardness, f.number);
   move_nodes(f.own, world);
   move_nodes(f.other, world);
   move_input(f.solve, world);
@@ -219,9 +206,7 @@ template <class Fields>
 PALPATE void burn_bonds(const Fields& all, Thread t, int) {
   if (!all.bonds.live.data[0] || t.tid > 0) return;
   const auto f = of_world(all.bonds, t.world);
-  auto ctrl = all.ctrl;
-  move_to(ctrl, t.world);
-  const double given = fabs((double)ctrl.data[all.actuator]) * f.mj.timestep.data[0];
+  const double given = fabs((double)f.mj.ctrl.data[all.actuator]) * f.mj.timestep.data[0];
   if (given == 0.0) return;
   const auto* R = f.mj.geom_xmat.data + 9 * all.geom;
   const D3 axis = {R[all.axis], R[3 + all.axis], R[6 + all.axis]};

@@ -15,32 +15,24 @@ namespace palpate {
 
 template <class Fields>
 PALPATE Fields of_world(Fields f, int world) {
-  move_to(f.own, world);
-  move_to(f.quiet, world);
-  move_to(f.hold, world);
-  move_to(f.mass, world);
-  move_to(f.force_ext, world);
-  move_to(f.dvel, world);
-  move_to(f.sol, world);
-  move_to(f.rhs, world);
-  move_to(f.status, world);
+  move_each(world, f.memory, f.quiet, f.hold, f.mass, f.force_ext, f.dvel, f.sol, f.rhs, f.status);
   return f;
 }
 
 // What a step has besides f_new.
 template <class Fields>
 PALPATE D3 faded(const Fields& f, int i) {
-  const double fade = exp(-f.mj.timestep.data[0] / f.number.data[1]);
-  const double* own = f.own.data + 6 * i;
-  return fade * load(own + 3) - f.number.data[0] * load(own);
+  const double fade = exp(-f.mj.timestep.data[0] / f.law.data[1]);
+  const double* memory = f.memory.data + 6 * i;
+  return fade * load(memory + 3) - f.law.data[0] * load(memory);
 }
 
 // Adds it to the solver's input.
 template <class Fields>
-PALPATE void enter_creep(const Fields& all, Thread t, int) {
+PALPATE void enter_relaxation(const Fields& all, Thread t, int) {
   const Fields f = of_world(all, t.world);
   f.quiet.data[0] = 0.0;
-  each_item(t, f.ncreep, [&](int i) {
+  each_item(t, f.nrelax, [&](int i) {
     float* ext = f.force_ext.data + offset_of(f.node.data[i]);
     store_lane(ext, load_lane(ext) + faded(f, i));
   });
@@ -48,11 +40,11 @@ PALPATE void enter_creep(const Fields& all, Thread t, int) {
 
 // Takes f_new from what the step, and its answer to the contacts, made of the velocities.
 template <class Fields>
-PALPATE void end_creep(const Fields& all, Thread t, int) {
+PALPATE void end_relaxation(const Fields& all, Thread t, int) {
   const Fields f = of_world(all, t.world);
   if (f.status.data[3] != 0.0f) return;
   const double per_h = 1.0 / f.mj.timestep.data[0];
-  each_item(t, f.ncreep, [&](int i) {
+  each_item(t, f.nrelax, [&](int i) {
     const int node = f.node.data[i], at = offset_of(node);
     D3 dv = load_lane(f.dvel.data + at), besides = load_lane(f.force_ext.data + at);
     if (f.flags.data[FLAG_ANSWERED]) {
@@ -61,9 +53,9 @@ PALPATE void end_creep(const Fields& all, Thread t, int) {
     }
     if (f.held) besides = besides - per_h * (load_hold(hold_at(f.hold.data, node)) * dv);
     const D3 force = (per_h * f.mass.data[node]) * dv - besides, left = faded(f, i);
-    double* own = f.own.data + 6 * i;
-    store(own, force);
-    store(own + 3, left + f.number.data[0] * force);
+    double* memory = f.memory.data + 6 * i;
+    store(memory, force);
+    store(memory + 3, left + f.law.data[0] * force);
   });
 }
 

@@ -18,22 +18,9 @@ constexpr int CELLS = 1024;
 template <class Fields>
 PALPATE Fields of_world(Fields f, int world) {
   const int row = f.row.data[world];
-  move_to(f.nouter, row);
-  move_to(f.stiffness, row);
-  move_to(f.nother, row);
-  move_to(f.elem, row);
-  move_to(f.near_adr, row);
-  move_to(f.near, row);
-  move_to(f.slip, world);
-  move_to(f.slipped, world);
-  move_to(f.on, world);
-  move_to(f.force, world);
-  move_to(f.hardness, world);
-  move_to(f.corner, world);
-  move_to(f.weight, world);
-  move_to(f.where, world);
-  move_to(f.next, world);
-  move_to(f.first, world);
+  move_each(row, f.nouter, f.stiffness, f.cell, f.nother, f.elem, f.near_adr, f.near);
+  move_each(world, f.slip, f.slipped, f.on, f.force, f.hardness, f.corner, f.weight, f.where,
+            f.next, f.first);
   move_nodes(f.own, world);
   move_nodes(f.other, world);
   move_input(f.solve, world);
@@ -52,7 +39,7 @@ PALPATE Sym along_and_across(D3 n, double a, double b) {
 // Writes the force on a node that rests on something, if it does: `depth` in it, its normal and
 // velocity. The spring is damped with the time of a step; where it slips it gives way along.
 template <class Fields>
-PALPATE bool rest(const Fields& f, int i, const Place& x, double depth, D3 n, D3 vel, double mu) {
+PALPATE bool support(const Fields& f, int i, const Place& x, double depth, D3 n, D3 vel, double mu) {
   const double h = f.mj.timestep.data[0], reach = 2.0 * h, k = f.stiffness.data[i];
   const D3 v = x.vel - vel;
   const double fast = dot(v, n), spring = k * (depth - reach * fast);
@@ -117,7 +104,7 @@ PALPATE void find_geoms(const Fields& all, Thread t, int) {
       if (!(depth > 0.0)) return;
       const D3 n = up(geom, d, 0.1 * f.skin), arm = arm_of(f.mj, b, x.at);
       const D3 vel = velocity_at(moving, arm);
-      if (rest(f, i, x, depth, n, vel, f.friction.data[q])) f.on.data[i] = ON_GEOM - q;
+      if (support(f, i, x, depth, n, vel, f.friction.data[q])) f.on.data[i] = ON_GEOM - q;
     });
   }
 }
@@ -134,8 +121,8 @@ PALPATE void cell_of(D3 x, double size, int* c) {
 template <class Fields>
 PALPATE int nearest_node(const Fields& f, D3 x) {
   int at[3], best = -1;
-  cell_of(x, f.cell, at);
-  double least = f.cell * f.cell;
+  cell_of(x, f.cell.data[0], at);
+  double least = f.cell.data[0] * f.cell.data[0];
   for (int k = 0; k < 27; ++k) {
     const int c[3] = {at[0] + k % 3 - 1, at[1] + k / 3 % 3 - 1, at[2] + k / 9 - 1};
     for (int j = f.first.data[cell(c)]; j >= 0; j = f.next.data[j]) {
@@ -197,9 +184,9 @@ PALPATE Bounds sort_nodes(const Fields& f) {
   for (int j = 0; j < f.nother.data[0]; ++j) {
     const D3 x = place_of(f.mj, f.other, j).at;
     store(f.where.data + 3 * j, x);
-    if (!mine.has(x, f.cell)) continue;
+    if (!mine.has(x, f.cell.data[0])) continue;
     int c[3];
-    cell_of(x, f.cell, c);
+    cell_of(x, f.cell.data[0], c);
     f.next.data[j] = f.first.data[cell(c)];
     f.first.data[cell(c)] = j;
     near.add(x);
@@ -217,7 +204,7 @@ PALPATE void find_organ(const Fields& all, Thread t, int which) {
   for (int i = 0; i < f.nouter.data[0]; ++i) {
     if (f.on.data[i] != ON_NOTHING || !f.free.data[i]) continue;
     const Place x = place_of(f.mj, f.own, i);
-    const int j = near.has(x.at, f.cell) ? nearest_node(f, x.at) : -1;
+    const int j = near.has(x.at, f.cell.data[0]) ? nearest_node(f, x.at) : -1;
     if (j < 0) continue;
     D3 w, point;
     const int best = nearest_triangle(f, j, x.at, w, point);
@@ -230,7 +217,7 @@ PALPATE void find_organ(const Fields& all, Thread t, int which) {
     const D3 vel = w.x * place_of(f.mj, f.other, e[0]).vel + w.y * place_of(f.mj, f.other, e[1]).vel
       + w.z * place_of(f.mj, f.other, e[2]).vel;
     const double depth = f.skin - dot(x.at - point, n);
-    if (!(depth > 0.0) || !rest(f, i, x, depth, n, vel, f.mu)) continue;
+    if (!(depth > 0.0) || !support(f, i, x, depth, n, vel, f.mu)) continue;
     f.on.data[i] = which;
     for (int c = 0; c < 6; ++c) f.hardness.data[6 * i + c] *= 2.0;
     store(f.weight.data + 3 * i, w);
@@ -263,7 +250,7 @@ PALPATE void press(const Fields& all, Thread t, int) {
 
 // Ends the forces of geoms with what the step made of the nodes' velocities.
 template <class Fields>
-PALPATE void act_rests(const Fields& all, Thread t, int) {
+PALPATE void act_supports(const Fields& all, Thread t, int) {
   const Fields f = of_world(all, t.world);
   const double per_h = 1.0 / f.mj.timestep.data[0];
   each_item(t, f.nouter.data[0], [&](int i) {
@@ -276,7 +263,7 @@ PALPATE void act_rests(const Fields& all, Thread t, int) {
 
 // Lets the geoms' bodies feel them.
 template <class Fields>
-PALPATE void feel_rests(const Fields& all, Thread t, int) {
+PALPATE void feel_supports(const Fields& all, Thread t, int) {
   if (t.tid > 0) return;
   const Fields f = of_world(all, t.world);
   const D3 zero = {0, 0, 0};

@@ -67,7 +67,7 @@ def press(script: dict, h: float, ahead=True, extrapolate=0.0, armature=1.0, **k
       model.dof_M0[nodes] = mass + model.dof_armature[nodes]
   finally:
     stepping.SCHEMES["implicit"] = known
-  sizes = layout.NO_CUTS | coupling.nodal_sizes(model.nv - 1, 0) | {"ncreep": 0, "nbond": 0}
+  sizes = layout.NO_CUTS | coupling.nodal_sizes(model.nv - 1, 0) | {"nrelax": 0, "nbond": 0}
   lagged = data.plugin_state[layout.spans(layout.NodalState, sizes)["force"]]
   old = np.zeros_like(lagged)
   rows = []

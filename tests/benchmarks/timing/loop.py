@@ -204,17 +204,17 @@ def times(w, count: int = 20, clock=time.perf_counter) -> dict[str, np.ndarray]:
   """
   body, scheme = w.body, w.config.integrator
   workspace.sync(w)
-  state = w.views["plugin_state"].numpy()
+  state = w.plugin_state
   kept = state.copy()
   works = {"step": lambda: stepping.step(body, scheme)}
   if stepping.SCHEMES[scheme].respond:
     works["assemble"] = lambda: stepping.assemble(body, Stage.FIRST)
     works["solve"] = lambda: stepping.solve(body, Stage.FIRST)
   out = replay(body.device, works, count, clock)
-  phases = windowed.Phases(w, w.model, 0)
+  phases = windowed.Phases(w.host, w.views, w.share)
   side = wp.get_device(phases.side)
   boxes = [(wp.clone(w.views[name], device=side), w.views[name]) for name in ("inbox", "outbox")]
-  w.boxes["inbox"].head.numpy()[HEAD.mode] = MODE.commit  # there is a step to end
+  phases.boxes["inbox"].head.numpy()[HEAD.mode] = MODE.commit  # there is a step to end
   works = {"enter": phases.enter, "search": phases.look, "end": phases.end}
   if side.is_cuda:
     works["to"] = lambda: wp.copy(*boxes[0])

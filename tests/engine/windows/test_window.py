@@ -117,7 +117,7 @@ def test_two_steps_back_tell_where_the_solve_starts(window):
       where = layout.spans(layout.Motion, {"nvert": organ.nvert})
     else:
       sizes = layout.NO_CUTS | coupling.nodal_sizes(3 * organ.nvert, 0)
-      sizes |= {"ncreep": 0, "nbond": 0}
+      sizes |= {"nrelax": 0, "nbond": 0}
       where = layout.spans(layout.NodalState, sizes)
     before = where["before"]
     forces.append([])

@@ -1,14 +1,20 @@
 """What organs of a batch have grown on to, in all worlds."""
 
-# Annotations here are objects, not text: no `from __future__ import annotations`.
+from __future__ import annotations
+
 import abc
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
+from palpate.forces import cohesive_bonds
+from palpate.tissue.types import fill
 
-from ..base import on_device
-from ..kernels import HELD, share_freed
+from .base import on_device
+from .kernels import HELD, BondLists, share_freed, show_bonds, weaken_bonds
+
+if TYPE_CHECKING:
+  from .organs import Organ
 
 
 class Bonds(abc.ABC):
@@ -124,3 +130,37 @@ class Gathered(Bonds):
     rows = amount.numpy()
     for at, part in zip(self.batch.slices, self._parts, strict=True):
       part.weaken(rows[at])
+
+
+class Grown(Bonds):
+  """Bonds of an organ of `Worlds`.
+
+  Args:
+    organ: the organ
+  """
+
+  def __init__(self, organ: Organ):
+    groups, self.batch = organ.forces.of(cohesive_bonds.Bonds).groups, organ.batch
+    made = [group.now for group in groups]
+    self.vertices = np.concatenate([np.zeros(0, int), *(now["vert"] for now in made)])
+    self.area = np.concatenate([np.zeros(0), *(now["area"] for now in made)])
+    first = np.cumsum([0, *(len(now["vert"]) for now in made)])
+    names = "row", "count", "made", "slot", "state", "pull"
+    self._groups = [
+      fill(BondLists, None, {name: getattr(g.fields, name) for name in names} | {"before": int(k)})
+      for g, k in zip(groups, first, strict=False)
+    ]
+    super().__init__(organ.batch.nworld, organ.batch.device)
+
+  def _over(self, what: Any, *values: wp.array):
+    for lists in self._groups:
+      dim = lists.pull.shape[:2]
+      wp.launch(what, dim=dim, inputs=[lists, *values], device=self._device)
+
+  def _tell(self):
+    self._damage.fill_(1.0)
+    self._force.zero_()
+    self._over(show_bonds, self._damage, self._force)
+
+  def _weaken(self, amount: wp.array):
+    self._over(weaken_bonds, amount)

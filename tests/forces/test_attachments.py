@@ -90,7 +90,7 @@ def test_a_declared_attachment_is_renamed_with_its_organ(scenes):
   assert organ.config.attach == (("hook", 800.0, (3, 4)),)
 
 
-def test_organs_tied_to_each_other_hang_on_one(scenes):
+def test_organs_attached_to_each_other_hang_on_one(scenes):
   points, elem = scenes.sphere(2)
   low = points - [0, 0, 0.11]
   held = " ".join(map(str, np.flatnonzero(points[:, 2] > 0.03)))
@@ -107,7 +107,7 @@ def test_organs_tied_to_each_other_hang_on_one(scenes):
     mujoco.mj_step(model, data)
   drop = -other.displacement[:, 2].mean()
   assert 0.1 * 9.81 / 400 < drop < 0.06
-  pull = scenes.workspace(organ).ties
+  pull = scenes.workspace(organ).attachments
   force = pull.force(pull.groups[0]).sum(axis=0)
   np.testing.assert_allclose(force, [0, 0, -0.981], atol=0.02)
   assert organ.error is None and other.error is None

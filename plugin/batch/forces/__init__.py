@@ -1,1 +1,0 @@
-"""What acts on an organ beside its tissue, in all worlds."""

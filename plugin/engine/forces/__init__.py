@@ -1,1 +1,0 @@
-"""What acts on an organ beside its tissue: ties, bonds, supports, relaxation."""

@@ -1,0 +1,17 @@
+"""The table of passive forces, which both hosts read."""
+
+from __future__ import annotations
+
+from .attachments import Attachments
+from .cohesive_bonds import Bonds
+from .passive import Force
+from .relaxation import Relaxation
+from .supports import Supports
+
+# In the order in which they act. What a host cannot do it refuses by the keys of the kind.
+FORCES: dict[str, type[Force]] = {
+  "attachments": Attachments,
+  "bonds": Bonds,
+  "supports": Supports,
+  "relaxation": Relaxation,
+}
