@@ -109,7 +109,8 @@ class Physics(Instrument, Portable):
     """Takes the largest forces of both hands."""
     if self.second:
       self.peak_force = max(self.peak_force, self.second.peak_force)
-      self.peak_shaft = max(self.peak_shaft, self.second.peak_shaft)
+      if self.second.peak_shaft > self.peak_shaft:
+        self.peak_shaft, self.strayed = self.second.peak_shaft, self.second.strayed
 
   def resume(self, data: mj.MjData, rest: dict[str, Any], config: Config) -> None:
     """See `Portable`."""
