@@ -20,7 +20,7 @@ import palpate
 from palpate.models import catalog, mjcf, scenery, shapes, situs, trocar
 from palpate.models.catalog import Tissue
 
-NOW, LATER, DONE = (1.0, 0.8, 0.1), (0.2, 0.75, 0.95), (0.2, 0.02, 0.02)  # colours of targets
+NOW, LATER = (1.0, 0.8, 0.1), (0.2, 0.75, 0.95)  # colours of targets
 ORGAN = "organ"
 BED = "bed"  # patch of the gallbladder, and the body that is in the liver's place
 CAMERA = "laparoscope"
