@@ -13,7 +13,7 @@ import functools
 import numpy as np
 import trimesh
 from palpate.tissue.geometry import subdivide
-from palpate.tissue.geometry.mesh import vertex_normals
+from palpate.tissue.geometry.mesh import vertex_areas, vertex_normals
 from scipy.interpolate import CubicSpline
 from scipy.spatial import KDTree
 
@@ -24,6 +24,8 @@ from .meshing import grid
 VIEW = (-0.1, 0.62, -0.78)
 _SPHERE = "sphere.csv"  # beside an organ's mesh: its vertices on a unit sphere
 _NORMAL = 0.02  # what a normal counts beside a distance [m]
+# Of balls: the largest radius, how near they lie to a surface, by how much they may stand out [m].
+_ROUND, _NEAR, _POKE = 0.4, 0.005, 0.002
 
 
 @dataclasses.dataclass(frozen=True)
@@ -176,6 +178,39 @@ def lattice(vertices: np.ndarray, texcoord: np.ndarray) -> Surface:
   b, c, d = a + columns, a + columns + 1, a + 1
   triangles = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
   return Surface(vertices.reshape(-1, 3), triangles, texcoord.reshape(-1, 2))
+
+
+def balls(surface: Surface, count: int) -> tuple[np.ndarray, np.ndarray]:
+  """Returns balls behind a surface that lie against as much of it as so many can.
+
+  Each is the largest behind a vertex, as in Ma, Bae and Choi 2012 (10.1007/s00371-011-0594-7). One
+  is chosen after the other, for the area that it is the first to lie near.
+
+  Args:
+    surface: seen from outside
+    count: of the balls
+
+  Returns:
+    Centers [m] (count, 3) and radii [m] (count,).
+  """
+  x, normal = surface.vertices, vertex_normals(surface.vertices, surface.triangles)
+  height = (x * normal).sum(axis=1)[:, None] - normal @ x.T - _POKE  # below each vertex
+  radii = np.where(height > 0, _squares(x, x) / (2 * np.maximum(height, 1e-9)), _ROUND)
+  radii = radii.min(axis=1)
+  centers = x - radii[:, None] * normal
+  gap = np.sqrt(_squares(centers, x)) - radii[:, None]
+  near, left = (np.abs(gap) < _NEAR).astype(float), vertex_areas(x, surface.triangles)
+  chosen = []
+  for _ in range(count):  # `left` is the area that none is near to yet
+    chosen.append(int((near @ left).argmax()))
+    left = left * (1 - near[chosen[-1]])
+  return centers[chosen], radii[chosen]
+
+
+def _squares(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+  """Returns the squares of the distances between points  (len(a), len(b))."""
+  square = (a * a).sum(axis=1)[:, None] + (b * b).sum(axis=1) - 2 * a @ b.T
+  return np.maximum(square, 0.0)
 
 
 def bumps(seed: int, size: float, height: float):

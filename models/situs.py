@@ -2,15 +2,17 @@
 # pyright: reportAttributeAccessIssue=false
 """One abdomen: any of its organs soft, the others scenery, lit by an endoscope.
 
-Scenery is drawn and nothing else: it has no contacts and no dofs. World: that of the catalogue's
-scenes, the liver's frame turned so that anterior is up and superior is -y.
+`furnish` draws scenery, which then has no contacts and no dofs; `obstruct` lets instruments meet
+it. World: that of the catalogue's scenes, the liver's frame turned so that anterior is up and
+superior is -y.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -22,6 +24,7 @@ from .scenery import Surface
 
 NAMES = ("liver", "gallbladder", "stomach")  # organs, in the order they are drawn
 CAMERA, LIGHT = "laparoscope", "endoscope"
+SURROUNDINGS = "surroundings"  # body of what instruments meet there
 GROUP = 2  # of the scenery
 _LEVELS = {"liver": 1, "gallbladder": 0, "stomach": 1}  # of the smooth surfaces of scenery
 # By eye after photographs of operations; a texture takes 14 % off.
@@ -37,6 +40,14 @@ COLOURS = {
 _SHEEN = {"fat": 0.12, "wall": 0.15, "stomach": 0.3, "gallbladder": 0.4}
 # What the fixed renderer's light loses on its way, 1 at 15 cm: 0.55 + 0.45 (d / 15 cm)^2.
 _FADE = (0.55, 0.0, 0.45 / 0.15**2)
+# What instruments meet: number of balls in an organ, the shell of the wall, and the bits of organs
+# and fat and of the wall. Contact is a spring of about 200 N/m to a tip of 0.2 kg: an impedance of
+# 0.01 lets a hundredth of the drive through to it, and its stiffness is mass / (0.01 t^2).
+_BALLS = {"liver": 20, "stomach": 10, "gallbladder": 6, "fat": 16}
+_WALL = ((-0.01, 0.09, 0.035), (0.175, 0.21, 0.175), 2.4)
+_SOFT = {"solref": (0.3, 1.0), "solimp": (0.01, 0.01, 0.001, 0.5, 2.0), "condim": 1, "priority": 1}
+_INSIDE, _WITHIN = 2, 4
+_JAW = (0.0025, 0.0215)  # of closed jaws: radius, and from the tip to their pivot [m]
 _VIEW = ((0.0, 0.175, 0.135), (0.0, 0.03, 0.005))  # of `abdomen`'s camera: from, to [m]
 
 
@@ -225,14 +236,8 @@ def furnish(
     look: seed of spots and vessels
   """
   held = arrangement or Arrangement()
-  origin = place(around)
-  for name in organs:
-    if name in held.without:
-      continue
-    skin = paint(spec, name, look)
-    lift = held.lifts.get(name, (0, 0, 0))
-    surface = scenery.to_world(scenery.organ(name, _LEVELS[name]))
-    draw(spec, name, surface, skin, place(name) - origin + lift)
+  for name, surface, pos in _placed(organs, around, held):
+    draw(spec, name, surface, paint(spec, name, look, 2.0 if name == "fat" else 1.0), pos)
   for name, duct in catalog.DUCTS.items():
     if name in held.without:
       continue
@@ -242,18 +247,108 @@ def furnish(
     skin = _material(spec, name, duct.rgba, kind, look)
     goes_with = "stomach" if name == "duodenum" else "gallbladder"
     lift = held.lifts.get(goes_with, (0, 0, 0))
-    draw(spec, name, surface, skin, np.array(lift) - origin)
-  fat, wall = _bounds()
+    draw(spec, name, surface, skin, np.array(lift) - place(around))
+
+
+def _placed(
+  organs: Sequence[str], around: str, held: Arrangement
+) -> Iterator[tuple[str, Surface, np.ndarray]]:
+  """Yields organs, fat and the wall: name, surface and where it is; arguments as of `furnish`."""
+  origin = place(around)
+  for name in organs:
+    if name not in held.without:
+      yield name, _surface(name), place(name) - origin + held.lifts.get(name, (0, 0, 0))
   if "fat" not in held.without:
-    draw(spec, "fat", fat, paint(spec, "fat", look, 2), [0, 0, held.fat] - origin)
-  draw(spec, "wall", wall, paint(spec, "wall", look), -origin)
+    yield "fat", _surface("fat"), [0, 0, held.fat] - origin
+  yield "wall", _surface("wall"), -origin
 
 
 @functools.cache
-def _bounds() -> tuple[Surface, Surface]:
-  """Returns the fat and the wall; ours."""
-  fat = scenery.sheet(_fat, (-0.17, -0.06), (0.15, 0.27), (54, 56))
-  return fat, scenery.shell((-0.01, 0.09, 0.035), (0.175, 0.21, 0.175), 2.4, (44, 30))
+def _surface(name: str) -> Surface:
+  """Returns an organ's surface, or that of the fat or the wall, which are ours."""
+  if name == "fat":
+    return scenery.sheet(_fat, (-0.17, -0.06), (0.15, 0.27), (54, 56))
+  if name == "wall":
+    return scenery.shell(*_WALL, (44, 30))
+  return scenery.to_world(scenery.organ(name, _LEVELS[name]))
+
+
+@functools.cache
+def _balls(name: str) -> tuple[np.ndarray, np.ndarray]:
+  """Returns the balls in the place of an organ or of the fat, see `scenery.balls`."""
+  if name == "fat":
+    surface = scenery.sheet(_fat, (-0.17, -0.06), (0.15, 0.27), (36, 36))
+  else:
+    surface = scenery.to_world(scenery.organ(name, 0))
+  return scenery.balls(surface, _BALLS[name])
+
+
+def obstruct(
+  spec: mujoco.MjSpec,
+  organs: Sequence[str] = NAMES,
+  around: str = "liver",
+  arrangement: Arrangement | None = None,
+  more: Surface | None = None,
+):
+  """Lets the instruments of a scene, and nothing else, meet what is around.
+
+  Organs and fat are balls in their inside, the wall is planes around it; shafts, which go through
+  the wall, do not meet that. `<instrument>/surroundings_force` is what an instrument exerts there.
+
+  Args:
+    spec: changed in place, with its instruments
+    organs: which ones
+    around: organ whose origin is the world's
+    arrangement: what is held aside
+    more: fat that lies elsewhere
+  """
+  body, held = spec.worldbody.add_body(name=SURROUNDINGS), arrangement or Arrangement()
+  wall = body.add_body()  # planes have no bounds: beside them MuJoCo would try every ball
+
+  def add(on: mujoco.MjsBody, meets: int, **shape: Any) -> None:
+    on.add_geom(contype=0, conaffinity=meets, group=skins.HIDDEN, mass=0, **_SOFT, **shape)
+
+  every = [(_balls(name), pos) for name, _, pos in _placed(organs, around, held) if name in _BALLS]
+  if more is not None:
+    every.append((scenery.balls(more, _BALLS["fat"]), np.zeros(3)))
+  for (centers, radii), pos in every:
+    for center, radius in zip(centers + pos, radii, strict=True):
+      add(body, _INSIDE, pos=center, size=[radius, 0, 0])
+  middle, radii, power = _WALL
+  for turn in np.arange(6) * np.pi / 3:
+    way = np.array([np.cos(turn), np.sin(turn), 0.0])
+    # Of |x/a|^p + |y/b|^p + |z/c|^p = 1 this is how far it goes that way, by Hoelder's inequality.
+    far = np.linalg.norm(np.multiply(radii, way), power / (power - 1))
+    quat = trocar.aim(np.zeros(3), way)  # z of a plane is out of it
+    pos = middle + far * way - place(around)
+    add(wall, _WITHIN, type=mujoco.mjtGeom.mjGEOM_PLANE, pos=pos, quat=quat, size=[1, 1, 1])
+  for port in spec.bodies:
+    if port.name.endswith("/trocar"):
+      prefix = port.name.removesuffix("trocar")
+      jaws = spec.body(f"{prefix}jaw_left") is not None
+      if jaws:  # closed they are a capsule: their many geoms would cost a twelfth of a step
+        spec.body(f"{prefix}tip").add_geom(
+          type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+          fromto=[0.0, 0.0, _JAW[0], 0.0, 0.0, _JAW[1]],
+          size=[_JAW[0], 0, 0],
+          contype=_INSIDE | _WITHIN,
+          conaffinity=0,
+          group=skins.HIDDEN,
+          mass=0,
+        )
+      shaft = spec.geom(f"{prefix}shaft")
+      shaft.contype |= _INSIDE
+      for geom in [] if jaws else spec.body(f"{prefix}tip").geoms:
+        geom.contype |= geom.contype and _INSIDE | _WITHIN
+      spec.add_sensor(
+        name=f"{prefix}{SURROUNDINGS}_force",
+        type=mujoco.mjtSensor.mjSENS_CONTACT,
+        objtype=mujoco.mjtObj.mjOBJ_XBODY,
+        objname=SURROUNDINGS,
+        reftype=mujoco.mjtObj.mjOBJ_XBODY,
+        refname=port.name,
+        intprm=[2, 3, 1],  # the force, of all contacts together
+      )
 
 
 def _fat(x: np.ndarray, y: np.ndarray) -> np.ndarray:

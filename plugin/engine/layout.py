@@ -15,6 +15,7 @@ import warp as wp
 from palpate.tissue.types import DIMS, doubles, struct
 
 WALLS = 4  # triangles that cuts of a solid may open, for one spare vertex
+LIPS = 3  # edges that cuts of a sheet may open, for one spare vertex
 TRAIL = 12  # points of the path of a blade that has not come apart yet
 
 

@@ -37,6 +37,7 @@ class Common:
   move: floats(4)  # what an action of 1 adds to the drives' targets [rad, m]
   sensor: ints(4)  # tip and shaft force, force on the left and right jaw
   sensoradr: ints(4)
+  around: int  # sensor of the force on what is around, -1 where nothing is
   elem: ints("nelem", 3)
   coarse: ints(COARSE)  # nodes of `surface`
   coarse0: Array(wp.vec3, (COARSE,))

@@ -135,6 +135,8 @@ def measure(s: Common, beginning: bool):
       s.shaft_force[w, k] = -s.sensordata[w, s.sensoradr[1] + k]
     most = s.sensor_peak[w, s.sensor[0]]
     shaft = s.sensor_peak[w, s.sensor[1]]
+    if s.around >= 0:
+      shaft = wp.max(shaft, s.sensor_peak[w, s.around])
   if s.jaw >= 0:
     for k in range(2):
       s.gripper[w, 2 + k] = 0.0

@@ -83,7 +83,7 @@ class Exercises(VectorEnv):
       raise ValueError(f"num_envs is {num_envs!r}, expected a whole number >= 1")
     self.num_envs, self.output = int(num_envs), output
     _refuse(task, kwargs)
-    kwargs = {"surroundings": "none", **kwargs}  # it draws nothing
+    kwargs = {"surroundings": "unseen", **kwargs}  # it draws nothing
     single = Exercise(task, **kwargs)
     environment = single.environment
     self.task, limit = environment.task, environment.step_limit

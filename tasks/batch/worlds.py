@@ -16,7 +16,7 @@ from palpate.batch.threads import Threads
 from palpate.models import trocar
 from palpate.tasks.core import episode, jaws
 from palpate.tasks.core.environment import Environment
-from palpate.tasks.core.instrument import AXES, JAWS, RATES
+from palpate.tasks.core.instrument import AROUND, AXES, JAWS, RATES
 from palpate.tasks.core.stage import STATE
 from palpate.tissue.types import allocate
 
@@ -164,6 +164,7 @@ class Worlds:
     sensors += [0] * (4 - len(sensors))
     s.sensor.assign(np.array(sensors))
     s.sensoradr.assign(model.sensor_adr[sensors])
+    s.around = mj.mj_name2id(model, mj.mjtObj.mjOBJ_SENSOR, prefix + AROUND)
 
   def _read(self, s: Any) -> None:
     """Brings what is of the batch up to date."""

@@ -134,7 +134,7 @@ class Task(engine.Task):
       organ: name of the organ in it
       input: what an action moves: the instrument's position `drives`, or its `handle`
       nodes: of the organ, in place of the scene's
-      surroundings: `abdomen` or `none`, in place of the scene's
+      surroundings: `abdomen`, `unseen` or `none`, in place of the scene's, see `Scene`
       name: domain and task, for instance "touch/easy"
     """
     self.name = name
@@ -363,10 +363,10 @@ class Task(engine.Task):
     tip, shaft, lay = physics.peak_force, physics.peak_shaft, self.cost.shaft > 0
     self.cost = safety.cost(tip, shaft, self.force_limit, self.damage)
     if self.cost.shaft and not lay:
-      self.event(physics, "unintended_contact", shaft, label="shaft")
+      self.event(physics, "unintended_contact", shaft, label=physics.strayed)
     if self.cost.damage:
       self.outcome, self.progress = "damage", -1.0
-      what = "damage" if tip > self.damage else "damage by the shaft"
+      what = "damage" if tip > self.damage else f"damage by the {physics.strayed}"
       self.event(physics, "note", label=f"{what}: {tip if tip > self.damage else shaft:.2f} N")
     elif self.outcome == "success":
       self.event(physics, "note", label="success")

@@ -6,7 +6,7 @@ from typing import Any
 
 import mujoco as mj
 import numpy as np
-from palpate.models import trocar
+from palpate.models import situs, trocar
 from palpate.models.handle import Handle, find, pose
 
 from .handle import ROW, Guide
@@ -15,6 +15,7 @@ from .jaws import Jaws
 AXES = ("pitch", "yaw", "roll", "insertion")
 JAWS = "grasper/"  # prefix of the instrument that has them
 TOUCH = ("touch_left", "touch_right")  # sensors of the jaws
+AROUND = f"{situs.SURROUNDINGS}_force"  # sensor of what an instrument exerts on what is around
 RATES = (1.0, 1.0, 3.0, 0.12)  # pitch, yaw, roll [rad/s], insertion [m/s]
 HELD_FORCE = 0.2  # of the inner face of either jaw on tissue between them, to hold it [N]
 
@@ -34,7 +35,8 @@ class Instrument:
     handle: that pulls it, None where position drives move it
     guide: takes the handle along an action
     peak_force: largest force since the last control step, or a jaw's mean if that is more [N]
-    peak_shaft: largest force on the shaft since then [N]
+    peak_shaft: largest force where none is meant since then: on the shaft, or on what is around [N]
+    strayed: where that was, "shaft" or "surroundings"
     edge: force of its edges on tissue that they cut [N]  (3,)
   """
 
@@ -63,7 +65,8 @@ class Instrument:
     self.jaw = model.actuator(prefix + "jaw").id if self.has_jaw else -1
     self._jaws = Jaws(model, prefix) if self.has_jaw else None
     self._inner = np.zeros(2)
-    signals = ["tip_force", "shaft_force", *(TOUCH if self.has_jaw else ())]
+    self._forced = [n for n in ("tip_force", "shaft_force", AROUND) if n in self._sensors]
+    signals = [*self._forced, *(TOUCH if self.has_jaw else ())]
     self._signals = np.concatenate([np.arange(*self._sensors[n].indices(10**6)) for n in signals])
     self._trocar = trocar.trocar(model, prefix)
 
@@ -228,12 +231,15 @@ class Instrument:
   def keep(self, sensors: np.ndarray) -> None:
     """Keeps the forces of steps that had these sensor values  (nstep, nsensordata)."""
     values = sensors[:, self._signals]
-    parts = values[:, :6].reshape(-1, 2, 3)
-    tip, shaft = np.sqrt(np.einsum("ijk,ijk->ji", parts, parts))
+    count = len(self._forced)
+    parts = values[:, : 3 * count].reshape(-1, count, 3)
+    tip, shaft, *around = np.sqrt(np.einsum("ijk,ijk->ji", parts, parts))
     self._forces = {"force": tip, "shaft_force": shaft}
-    self.peak_force, self.peak_shaft = float(tip.max()), float(shaft.max())
+    self.peak_force, self.peak_shaft, self.strayed = float(tip.max()), float(shaft.max()), "shaft"
+    if around and around[0].max() > self.peak_shaft:
+      self.peak_shaft, self.strayed = float(around[0].max()), situs.SURROUNDINGS
     if self.has_jaw:
-      jaws = values[:, 6:]
+      jaws = values[:, 3 * count :]
       self._forces["grip_force"] = jaws.max(axis=1)
       # Pinched folds make single steps of large jaw force: the jaws' is a mean over the step.
       self.peak_force = max(self.peak_force, float(jaws.sum(axis=0).max()) / len(jaws))

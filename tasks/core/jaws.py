@@ -33,7 +33,8 @@ class Jaws:
     """
     contact = data.contact
     geom = self.side[contact.geom]
-    mine = np.flatnonzero(geom.any(axis=1) & (contact.efc_address >= 0))
+    tissue = contact.geom.min(axis=1) < 0  # not what is rigid
+    mine = np.flatnonzero(geom.any(axis=1) & tissue & (contact.efc_address >= 0))
     if not len(mine):
       return np.zeros(2)
     side = geom[mine].sum(axis=1)

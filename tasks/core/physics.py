@@ -109,7 +109,8 @@ class Physics(Instrument, Portable):
     """Takes the largest forces of both hands."""
     if self.second:
       self.peak_force = max(self.peak_force, self.second.peak_force)
-      self.peak_shaft = max(self.peak_shaft, self.second.peak_shaft)
+      if self.second.peak_shaft > self.peak_shaft:
+        self.peak_shaft, self.strayed = self.second.peak_shaft, self.second.strayed
 
   def resume(self, data: mj.MjData, rest: dict[str, Any], config: Config) -> None:
     """See `Portable`."""
@@ -297,19 +298,19 @@ class Physics(Instrument, Portable):
     shown: bool = True,
     now: bool = False,
     size: float | None = None,
-    done: bool = False,
   ) -> None:
-    """Puts target site `index` at `pos` [m], for the pictures.
-
-    It is yellow where it is its turn now, and dark where it is done.
-    """
+    """Puts target site `index` at `pos` [m], for the pictures, yellow where it is its turn now."""
     site = self.target_sites[index]
     if size is not None:
       self.model.site_size[site] = size
-    self.model.site_rgba[site, :3] = scenes.DONE if done else scenes.NOW if now else scenes.LATER
+    self.model.site_rgba[site, :3] = scenes.NOW if now else scenes.LATER
     self.model.site_pos[site] = pos
     self.data.site_xpos[site] = pos
     self.model.site_rgba[site, 3] = 0.9 if shown else 0.0
+
+  def unmark(self, indices: np.ndarray) -> None:
+    """Hides target sites."""
+    self.model.site_rgba[np.array(self.target_sites)[indices], 3] = 0.0
 
 
 def check_scene(

@@ -3,11 +3,12 @@
 | part | what | size |
 |---|---|---|
 | `force` | the step's largest force over its limit, of the tip or the shaft | share of the limit |
-| `shaft` | the shaft lies against the organ, with more than `SHAFT_CONTACT` | force / limit, to 1 |
+| `shaft` | more than `SHAFT_CONTACT` on the shaft, or on what is around | force / limit, to 1 |
 | `damage` | a force above the damage limit | 1 |
 
 Their sum is the cost: 0 for a gentle step, 1 for one with twice the limit. A shaft has the limits
-of the tip, or `SHAFT_LIMIT` and `SHAFT_DAMAGE` where those are of jaws and higher.
+of the tip, or `SHAFT_LIMIT` and `SHAFT_DAMAGE` where those are of jaws and higher; so has what
+presses on the surroundings.
 """
 
 import dataclasses
@@ -35,7 +36,7 @@ def cost(peak_force: float, shaft_force: float, limit: float, damage: float) -> 
 
   Args:
     peak_force: largest force on the tip, or on a jaw, in the step [N]
-    shaft_force: largest force on the shaft in it [N]
+    shaft_force: largest force in it on the shaft, or on what is around [N]
     limit: of the force on the tip [N]
     damage: force above which the tip damages [N]
   """

@@ -20,13 +20,13 @@ import palpate
 from palpate.models import catalog, mjcf, scenery, shapes, situs, trocar
 from palpate.models.catalog import Tissue
 
-NOW, LATER, DONE = (1.0, 0.8, 0.1), (0.2, 0.75, 0.95), (0.2, 0.02, 0.02)  # colours of targets
+NOW, LATER = (1.0, 0.8, 0.1), (0.2, 0.75, 0.95)  # colours of targets
 ORGAN = "organ"
 BED = "bed"  # patch of the gallbladder, and the body that is in the liver's place
 CAMERA = "laparoscope"
 LIGHT = situs.LIGHT
 INPUTS = ("drives", "handle")
-SURROUNDINGS = ("abdomen", "none")
+SURROUNDINGS = ("abdomen", "unseen", "none")
 # The organ's solref counts, not the instrument's: light nodes want stiff contacts.
 CONTACT = {
   "condim": 3,
@@ -73,7 +73,8 @@ class Scene:
     handle: whether a handle pulls the instrument in place of position drives
     bonds: stiffness [N/m^3], strength [Pa], energy [J/m^2] of what holds the organ in its bed; None
       where it is pinned there
-    surroundings: what is drawn around the organ, one of SURROUNDINGS; it touches nothing
+    surroundings: what is around the organ, one of SURROUNDINGS: an abdomen that instruments meet,
+      the same without pictures, or nothing
   """
 
   organ: str = "liver"
@@ -189,11 +190,14 @@ def build(scene: Scene) -> mujoco.MjSpec:
   spec = furnish(scene, flex, center)
   if scene.inclusion is not None:
     spec.option.gravity = np.zeros(3)
+  # What it has grown on to is in its place.
+  held = situs.Arrangement() if scene.bonds else situs.ARRANGEMENTS[scene.organ]
   if scene.surroundings == "abdomen":
     uv = scenery.texcoord(scene.organ, vertices @ _TURN, triangles)
-    held = situs.Arrangement() if scene.bonds else None  # what it has grown on to is in its place
     view = center + scene.camera, center
     situs.surround(spec, ORGAN, scene.organ, uv, view, arrangement=held)
+  if scene.surroundings != "none":
+    situs.obstruct(spec, [n for n in situs.NAMES if n != scene.organ], scene.organ, held)
   return spec
 
 

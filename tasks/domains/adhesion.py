@@ -72,6 +72,8 @@ def build(scene: Scene) -> mujoco.MjSpec:
   spec.option.gravity = np.zeros(3)
   if scene.surroundings == "abdomen":
     _surround(spec, scene, vertices)
+  if scene.surroundings != "none":
+    situs.obstruct(spec, (), arrangement=_HELD)
   return spec
 
 

@@ -305,16 +305,12 @@ class Cut(Task):
     self.done, self.next, self.covered, self.nearest = 0, 0, 0.0, 0.0
     self.distance0 = distance(physics, self)
     self._marked = np.linspace(0, len(self.curve), _MARKS, endpoint=False).astype(int)
-    self._dark = np.zeros(_MARKS, bool)
     for i, k in enumerate(self._marked):
       physics.mark(i, self.curve[k] + _ABOVE, size=0.0009)
 
   def show(self, physics: Physics) -> None:
-    """Darkens the line where it is cut."""
-    dark = self.cut[self._marked] > 0
-    for i in np.flatnonzero(dark & ~self._dark):
-      physics.mark(int(i), self.curve[self._marked[i]] + _ABOVE, size=0.0012, done=True)
-    self._dark = dark
+    """Takes the line away where it is cut: there are the lips of the cut."""
+    physics.unmark(np.flatnonzero(self.cut[self._marked]))
 
   def label(self, kind: str) -> str:
     """Returns what damage is."""

@@ -76,6 +76,8 @@ def build(scene: Scene) -> mujoco.MjSpec:
     situs.draw(spec, "abdomen_border", _border(), situs.paint(spec, "fat"))
     situs.furnish(spec, (), arrangement=_HELD)
     situs.light(spec, scene.camera, np.zeros(3))
+  if scene.surroundings != "none":
+    situs.obstruct(spec, (), arrangement=_HELD, more=_border(12, 37))
   return spec
 
 
@@ -91,10 +93,10 @@ def _frame(seen: bool) -> str:
   )
 
 
-def _border() -> scenery.Surface:
+def _border(rings: int = 33, rays: int = 145) -> scenery.Surface:
   """Returns the fat that the sheet lies in: under it, over its sides, and in lumps around it."""
   out, around = np.meshgrid(
-    np.r_[0, np.linspace(0, 1, 33)], np.linspace(0, 2 * np.pi, 145), indexing="ij"
+    np.r_[0, np.linspace(0, 1, rings)], np.linspace(0, 2 * np.pi, rays), indexing="ij"
   )
   square = (np.cos(around) ** 8 + np.sin(around) ** 8) ** (-1 / 8)  # with round corners
   far = SIZE / 2 * (0.95 + 5 * out**1.6)

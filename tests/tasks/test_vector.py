@@ -137,6 +137,23 @@ def test_worlds_of_the_gpu_backend_are_the_single_environment(task):
   env.close()
 
 
+@pytest.mark.parametrize("device", ["cpu", "warp-cpu"])
+def test_worlds_have_the_abdomen_of_the_single_environment(device):
+  env, alone = make("touch/easy", 1, device=device), single("touch/easy", surroundings="abdomen")
+  env.reset(seed=3), alone.reset(seed=3)
+  met = 0
+  for _ in range(76):
+    aside = np.array([[0.5, 0.5, 0.0, 0.5]])
+    seen, _, _, _, info = env.step(aside)
+    expected, *_, said = alone.step(aside[0])
+    np.testing.assert_allclose(seen["contact_force"][0], expected["contact_force"], atol=0.02)
+    for name in ("cost", "shaft_force"):
+      assert info[name][0] == pytest.approx(said[name], abs=0.02)
+    met += said["cost"] > 0
+  assert met > 5
+  env.close()
+
+
 def test_a_report_of_palpation_ends_the_episode():
   env, alone = make("probe/palpate_easy"), single("probe/palpate_easy")
   env.reset(seed=0)

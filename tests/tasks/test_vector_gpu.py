@@ -23,7 +23,7 @@ class Beside:
     import gymnasium
 
     name = registry.gym_id(*worlds.task.name.split("/"))
-    self.env = gymnasium.make(name, disable_env_checker=True, surroundings="none")
+    self.env = gymnasium.make(name, disable_env_checker=True, surroundings="unseen")
     self.seen, _ = self.env.reset(seed=SEED + world)
     self.worlds, self.world, self.first = worlds, world, True
     self.act = performer.make(self.env.unwrapped.environment)

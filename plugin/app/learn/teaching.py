@@ -76,7 +76,7 @@ class School:
   def __init__(self, folder: pathlib.Path, task: str, task_kwargs: Mapping[str, Any], seed: int):
     """Opens a folder, which may have lessons already."""
     self.path, self.task, self.seed = folder / LESSONS, task, seed
-    self.task_kwargs = json.dumps({"surroundings": "none", **task_kwargs})  # it draws nothing
+    self.task_kwargs = json.dumps({"surroundings": "unseen", **task_kwargs})  # it draws nothing
     self.lessons: list[Lesson] = []
     self.rounds, self.seconds, self.alone = 0, 0.0, 0.0
     if self.path.exists():

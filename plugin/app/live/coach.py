@@ -90,7 +90,9 @@ class Coach:
     if peak > limit:
       return "force", f"Too much force: {peak:.1f} N, expected at most {limit:.1f} N"
     if task.cost.shaft:
-      return "shaft", f"The shaft presses on the organ with {physics.peak_shaft:.1f} N"
+      shaft = physics.strayed == "shaft"
+      what = "The shaft presses on the organ" if shaft else "You press on what is around"
+      return "shaft", f"{what} with {physics.peak_shaft:.1f} N"
     if not physics.tip_visible():
       return "view", "The tip is out of the picture"
     return "", ""

@@ -26,6 +26,7 @@ from .. import coupling
 from ..model import flexes, mjstruct
 from ..windows import model_lock
 from .tear import Tear
+from .walls import Walls
 
 if TYPE_CHECKING:
   from ..model.declare import Declaration
@@ -94,6 +95,7 @@ class Cuts:
     bodies.unshare(w.body)
     bodies.occupy(w.body, self.whole)
     self._make()
+    self.walls = Walls(w.organ, w.model)
     self.declared = w.organ
     self.mass = w.organ.mass.copy()
     self.source = np.arange(self.whole.nvert)
@@ -239,10 +241,13 @@ class Cuts:
     return was != self._seen
 
   def draw(self, model: int, data: int):
-    """Writes what is drawn besides these triangles."""
+    """Writes what is drawn of cuts besides these triangles."""
+    if self.walls:
+      self.walls.draw(self._w.organ, self._w.motion()[0], model, data)
 
   def hide(self, model: int):
     """Hides it again, after a picture."""
+    self.walls.hide(model)
 
   # Cutting.
 

@@ -23,7 +23,6 @@ from .. import coupling
 from ..model import flexes
 from . import cuts
 from .cuts import Cuts
-from .walls import Walls
 
 if TYPE_CHECKING:
   from ..workspace import Workspace
@@ -39,18 +38,8 @@ class SolidCuts(Cuts):
 
   def __init__(self, w: Workspace):
     super().__init__(w)
-    self.walls = Walls(w.organ, w.model)
     self._ranked: np.ndarray | None = None  # see `_usual`
     self._median = 0.0
-
-  def draw(self, model: int, data: int):
-    """Writes what is drawn of the walls of cuts."""
-    if self.walls:
-      self.walls.draw(self._w.organ, self._w.motion()[0], model, data)
-
-  def hide(self, model: int):
-    """Hides it again."""
-    self.walls.hide(model)
 
   def _make(self):
     self._refill = SolidRefill(self._w.body, self.whole)

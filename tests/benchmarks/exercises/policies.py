@@ -56,7 +56,7 @@ def run(case: Case, out: pathlib.Path) -> list[Row]:
   name, seeds = case["task"], range(case["start"], case["end"])
   training, reference = policy.load(case["file"]).about.training, score.reference(name)
   rows = []
-  options = {"surroundings": "none"}  # nothing is drawn
+  options = {"surroundings": "unseen"}  # nothing is drawn
   for result in evaluate.evaluate(name, case["file"], seeds, task_kwargs=options):
     row = {"task": name, "seed": result.seed, "outcome": result.outcome}
     row |= {"time_s": round(result.time, 2), "lessons": training.get("lessons", 0)}

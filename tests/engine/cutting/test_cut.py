@@ -244,8 +244,9 @@ def test_a_scene_is_drawn_with_the_triangles_of_its_data():
     mujoco.mj_forward(model, each)
     arguments = mujoco.MjvOption(), mujoco.MjvPerturb(), mujoco.MjvCamera()
     mujoco.mjv_updateScene(model, each, *arguments, mujoco.mjtCatBit.mjCAT_ALL.value, drawn)
-    seen.append(model.flex_elem.reshape(-1, 3).copy())
-    assert np.array_equal(seen[-1], handle(model, each).elem)
+    organ = handle(model, each)
+    seen.append(model.flex_elem.reshape(-1, 3)[-len(organ.elem) :].copy())  # lips come before
+    assert np.array_equal(seen[-1], organ.elem)
   assert not np.array_equal(seen[0], seen[1]) and np.array_equal(seen[0], seen[2])
 
 
@@ -440,3 +441,31 @@ def test_a_declared_spare_without_vertices_is_refused():
   xml = scenes.world(scenes.organ(points, elem, spare=20))
   with pytest.raises(ValueError, match=r"spare is 20 and vertex .* has triangles"):
     mujoco.MjModel.from_xml_string(xml)
+
+
+@BOTH
+def test_the_lips_are_drawn_and_hidden_between_pictures(windows):
+  model, data = scene(strip(), windows, tool=windows)
+  organ, drawn = handle(model, data), mujoco.MjvScene(model, 4000)
+  arguments = mujoco.MjvOption(), mujoco.MjvPerturb(), mujoco.MjvCamera()
+  flex = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_FLEX, "organ_inside")
+  first, count = model.flex_elemdataadr[flex], 6 * SPARE
+  start, line = model.flex_vertadr[flex], np.array([[0.03, 0.0, 0.0], [0.09, 0.0, 0.0]])
+  for cuts in range(3):
+    if cuts == 1:
+      organ.cut(line)
+    if cuts == 2:
+      mujoco.mj_resetData(model, data)
+    mujoco.mj_forward(model, data)
+    mujoco.mjv_updateScene(model, data, *arguments, mujoco.mjtCatBit.mjCAT_ALL.value, drawn)
+    elem = model.flex_elem[first : first + 3 * count].reshape(-1, 3)
+    lips = data.flexvert_xpos[start:][elem[elem.any(axis=1)]]
+    area = np.linalg.norm(np.cross(lips[:, 1] - lips[:, 0], lips[:, 2] - lips[:, 0]), axis=1).sum()
+    if cuts == 1:  # on both sides, as wide as they are
+      assert organ.cuts[0].length > 0.03
+      assert area / 2 == pytest.approx(2 * organ.cuts[0].length * 8e-4, rel=0.01)
+      assert np.abs(lips[..., 1]).max() < 5e-3
+    else:
+      assert not len(lips)
+    run(model, data, 1)
+    assert model.flex_vertnum[flex] == 0

@@ -70,7 +70,7 @@ SHAFTS = [("probe/palpate_easy", 1.0), ("touch/easy", 0.3), ("trace/easy", 0.3)]
 
 @pytest.mark.parametrize(("name", "speed"), SHAFTS)
 def test_the_shaft_does_not_go_through_an_organ_and_its_force_damages(name, speed):
-  env = load(name)
+  env = load(name, surroundings="none")
   rewards, costs, forces, through = sweep(env, speed)
   assert not through
   assert env.task.outcome == "damage" and costs[-1].damage == 1

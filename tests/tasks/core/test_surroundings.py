@@ -1,10 +1,11 @@
-"""The abdomen around an exercise: it is seen, hides no target, and changes nothing else."""
+"""The abdomen around an exercise: it is seen and met, hides no target, changes nothing else."""
 
+import mujoco
 import numpy as np
 import pytest
 from palpate import tasks
 from palpate.tasks import suite
-from palpate.tasks.core import observation
+from palpate.tasks.core import instrument, observation
 from palpate.tissue.geometry import subdivide
 
 
@@ -27,11 +28,43 @@ def test_forces_are_the_same_to_the_bit(name, action, steps, least):
     env.reset()
     seen = [env.step(action).observation for _ in range(steps)]
     assert any(s["peak_force"] >= least for s in seen)
-    found.append((env.physics.integration_state(), seen))
+    found.append((env.physics.data.qpos.copy(), seen))
   np.testing.assert_array_equal(found[0][0], found[1][0])
   for one, other in zip(found[0][1], found[1][1], strict=True):
     for key in one:
       np.testing.assert_array_equal(one[key], other[key])
+
+
+@pytest.mark.parametrize("name", ["touch/easy", "grasp/easy", "cut/easy", "tease/easy"])
+@pytest.mark.parametrize("surroundings", ["none", "unseen"])
+def test_who_goes_aside_meets_what_is_around(name, surroundings):
+  env = load(name, surroundings)
+  env.reset()
+  aside = np.zeros(env.action_spec().shape)
+  aside[:4] = -0.5 if name == "cut/easy" else 0.5, 0.5, 0.0, 0.5
+  felt, events = [], []
+  for _ in range(100):
+    felt.append(env.step(aside).observation["peak_force"][0])
+    events += [event.label for event in env.task.take_events()]
+    if "surroundings" in events:
+      break
+  met = surroundings == "unseen"
+  assert (env.task.cost.shaft > 0) == met and (max(felt) > 0.1) == met
+  assert env.task.outcome is None and ("surroundings" in events) == met
+  if met:  # further in the force grows as that of a spring, and the wall does not throw it back
+    more = [env.step(aside).observation["peak_force"][0] for _ in range(4)]
+    assert felt[-1] < more[-1] < 3
+
+
+@pytest.mark.parametrize("name", ["grasp/easy", "bimanual/easy", "dissect/hard", "cut/hard"])
+def test_nobody_begins_in_what_is_around(name):
+  env = load(name, "unseen")
+  for seed in range(10):
+    env.task.random = np.random.RandomState(seed)
+    env.reset()
+    mujoco.mj_forward(env.physics.model.ptr, env.physics.data.ptr)
+    for hand in env.physics.hands:
+      assert not hand.sensor(instrument.AROUND).any()
 
 
 def _scenery(model) -> dict[str, np.ndarray]:
@@ -98,5 +131,5 @@ def test_what_is_pressed_is_seen_pressed():
 
 
 def test_bad_surroundings_are_named():
-  with pytest.raises(ValueError, match="surroundings is 'sea', expected one of abdomen, none"):
+  with pytest.raises(ValueError, match="is 'sea', expected one of abdomen, unseen, none"):
     load("touch/easy", "sea")
