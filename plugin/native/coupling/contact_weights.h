@@ -203,7 +203,7 @@ PALPATE void weigh(const Fields& f, Thread, int) {
       weigh_side(f, contact, rows, side);
     const Touch touch = touch_of(f, contact);
     if (touch.geom >= 0) {
-      if (!(touch == last)) least = unresolved(f, contacts, ncon, touch);
+      if (!(touch == last)) least = series_compliance(f, contacts, ncon, touch);
       if (touch.flex != last.flex) count = count_of(contacts, ncon, touch.flex, true);
       firm_up(f, contact, rows, touch, count, least);
       last = touch;
