@@ -94,14 +94,6 @@ PALPATE double series_compliance(const Fields& f, const char* contacts, int ncon
   return unresolved(all, tool, dent, f.tissue.data + TISSUE_LENGTH * touch.flex);
 }
 
-// What the discrete integrator divides R by: what a spring and damper do within the step. It makes rows
-// again, from the contact's solref and solimp.
-template <class Fields>
-PALPATE double within_step(const Fields& f, double stiffness, double damping) {
-  const double h = f.timestep.data[0];
-  return f.integrator.data[0] == INTEGRATOR_DISCRETE ? 1.0 + h * damping + h * h * stiffness : 1.0;
-}
-
 // Gives the rows of a contact a critically damped spring and its R, less what the step takes of it.
 template <class Fields>
 PALPATE void put_spring(const Fields& f, char* contact, Rows rows, double damping, double R) {
