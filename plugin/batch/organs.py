@@ -119,11 +119,11 @@ class Organ(Tissue):
       self._cuts = Cuts(self, values, surface)
     self.patch = patch.make(values, self.body)
     self._touch = contacts.make(model, organ, tools, place, self.patch, d)
-    self._pressed = contact_rows.make(batch, model, organ, self._touch)
+    self._pressed = contact_rows.make(self, model, self._touch)
     self._convex = convex.make(model, tools, nworld * place.nslot, m, d)
     kinds = frozenset(int(kind) for kind in model.geom_type[tools])
     self._find = contacts.kernel(kinds)
-    self._material = Material(self, batch, self._touch)
+    self._material = Material(self, batch, self._touch, self._pressed)
 
   def enclose(self):
     """Lets the step know volume stiffness and pressure, from the next record on."""
@@ -185,8 +185,7 @@ class Organ(Tissue):
   def push(self):
     """Adds the passive force, and keeps sliding contacts closed."""
     self._over(patch.push, self.place.nslot)
-    dim = self._pressed.geom.shape
-    wp.launch(contact_rows.keep_closed, dim=dim, inputs=[self._pressed], device=self.body.device)
+    contact_rows.keep_closed(self._pressed, self.body.device)
     for each in self.beside:
       each.act()
 
@@ -251,7 +250,7 @@ class Organ(Tissue):
     """Contacts of the last step."""
     p = self._pressed
     wp.launch(contact_rows.press, dim=p.geom.shape, inputs=[p], device=self.body.device)
-    return Contacts(p.geom, p.normal.view(float), p.force)
+    return Contacts(p.geom, p.normal.view(float), p.pressed)
 
   # Cuts.
 
