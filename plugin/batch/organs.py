@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
 _WHAT = {"xpos": 0, "xvel": 1, "contact_force": 2}
 _STATUS = {"iterations": 0, "residual": 1}
+_RANKED = 6  # threads that choose nodes, times the slots
 _FEW = 32  # values that are checked one by one
 
 
@@ -147,7 +148,7 @@ class Organ(Tissue):
     held = 24.0 + 160.0 if any(w.beside) else 0.0  # of springs beside the tissue
     if held and w.organ.mesh.spare:  # which follow a mesh a world
       held += 400.0
-    return bodies.nbytes(alone) + (44.0 + held) * w.organ.mesh.nvert
+    return bodies.nbytes(alone) + (56.0 + held) * w.organ.mesh.nvert
 
   # Within a step.
 
@@ -168,8 +169,9 @@ class Organ(Tissue):
       self.body.state.hold.zero_()
     for each in self.beside:
       each.enter()
-    self._over(patch.rank, p.most)
-    self._over(patch.stand, max(p.most, p.nslot))
+    some = min(p.nnode, _RANKED * p.nslot)  # threads, for as many candidates as there mostly are
+    self._over(patch.rank, some)
+    self._over(patch.stand, max(some, p.nslot))
     self._scheme.step(self.body)
 
   def touch(self):

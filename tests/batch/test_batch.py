@@ -166,6 +166,24 @@ def test_a_block_comes_to_rest_under_a_plate(make):
   assert np.all(last.std(axis=0) < 0.006 * last.mean(axis=0))
 
 
+@pytest.mark.parametrize("h", [1e-3, 2e-3])
+def test_a_plate_over_more_nodes_than_slots_comes_to_rest_and_is_told(make, h):
+  if make.device == "cpu":
+    pytest.skip("its windows have room")
+  made, _ = resting("plate", h=h, mesh=block(edge=0.01))
+  batch = palpate.batch.make(made, 2, device=make.device, deterministic=True)
+  tissue, depth, forces = batch.organ("organ"), batch.model.actuator_ctrlrange[0, 0], []
+  for k in range(round(0.6 / h)):
+    batch.ctrl = np.full((2, 1), depth * min(1, k * h / 0.3))
+    batch.step()
+    forces.append(tissue.contact_force.numpy().sum(axis=1)[:, 2])
+  last = -np.array(forces[-50:])
+  assert np.all(last.std(axis=0) < 0.01 * last.mean(axis=0)) and last.min() > 1.0
+  assert np.abs(tissue.xvel.numpy()).max() < 0.01 and not batch.failures.numpy().any()
+  with pytest.warns(UserWarning, match="windows had no room"):
+    assert (batch.overflow.numpy() > 0).all()
+
+
 def test_each_world_has_a_tissue_of_its_own(make):
   batch = make(press(bend=0, foundation=2e4), 3)
   tissue = batch.organ("organ")
