@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
+from palpate.engine import contacts
 from palpate.engine.model import inertia, mjstruct
 from palpate.tissue import body as bodies
 from palpate.tissue import shape
@@ -44,13 +45,15 @@ class Material:
     organ: the organ in all worlds
     batch: these worlds
     touch: how it touches tools
+    pressed: its contacts
   """
 
-  def __init__(self, organ: "Organ", batch: "Worlds", touch):
+  def __init__(self, organ: "Organ", batch: "Worlds", touch, pressed):
     config, nworld = organ.config, batch.nworld
-    self._organ, self.batch, self._touch = organ, batch, touch
+    self._organ, self.batch, self._touch, self._pressed = organ, batch, touch, pressed
     self._young = np.broadcast_to(config.young, (organ.declared.mesh.nelem,))
-    full = {"scale": 1.0, "poisson": config.poisson, "thickness": config.thickness, "mass": 1.0}
+    full = {"scale": 1.0, "poisson": config.poisson, "thickness": config.thickness, "mass": 1.0,
+            "young": float(np.mean(config.young))}  # fmt: skip
     self._worlds = {name: np.full(nworld, value) for name, value in full.items()}
     self._most = np.ones(nworld)  # greatest factor of a triangle
     self._lumps: Lumps | None = None
@@ -85,11 +88,25 @@ class Material:
     if self._organ.topology:
       self._organ.topology.renumber(worlds, number, numbers)
     self._organ.body.tissue.number.assign(number)
+    self._firm_up(worlds, number[worlds])
 
   def _put(self, array: wp.array, worlds: np.ndarray, values: np.ndarray):
     whole = array.numpy()
     whole[worlds] = values
     array.assign(whole)
+
+  def _firm_up(self, worlds: np.ndarray, number: np.ndarray):
+    """Lets contacts be as firm as the tissue of these worlds asks for."""
+    organ, own = self._organ, self._worlds
+    config = dataclasses.replace(
+      organ.config,
+      young=own["young"][None, worlds],
+      **{key: own[key][worlds] for key in ("poisson", "thickness")},
+      **{key: number[:, NUMBERS.index(key)] for key in ("foundation", "stiffness")},
+    )
+    m = mjstruct.Model.from_address(self.batch.model._address)
+    tissue = contacts.tissue_of(m, organ.declared, config, own["mass"][worlds])
+    self._put(self._pressed.tissue, worlds, tissue)
 
   def _moduli(self, worlds: np.ndarray) -> dict[str, np.ndarray]:
     """Returns the scales of mu, lambda' and the plate's rigidity."""
@@ -120,7 +137,9 @@ class Material:
       factor = np.atleast_2d(rows["young"].T).T / self._young  # (worlds, nelem)
       if (factor == factor[:, :1]).all():
         scale, factor = factor[:, 0], np.ones((len(worlds), 1))
-    self._worlds["scale"][worlds] = 1.0 if scale is None else scale
+    scale = np.ones(len(worlds)) if scale is None else scale
+    self._worlds["scale"][worlds] = scale
+    self._worlds["young"][worlds] = scale * np.mean(self._young * factor, axis=1)
     self._most[worlds] = factor.max(axis=1)
     if self._lumps is None:
       if factor.shape[1] == 1:

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
 _WHAT = {"xpos": 0, "xvel": 1, "contact_force": 2}
 _STATUS = {"iterations": 0, "residual": 1}
+_RANKED = 6  # threads that choose nodes, times the slots
 _FEW = 32  # values that are checked one by one
 
 
@@ -119,11 +120,11 @@ class Organ(Tissue):
       self._cuts = Cuts(self, values, surface)
     self.patch = patch.make(values, self.body)
     self._touch = contacts.make(model, organ, tools, place, self.patch, d)
-    self._pressed = contact_rows.make(batch, model, organ, self._touch)
+    self._pressed = contact_rows.make(self, model, self._touch)
     self._convex = convex.make(model, tools, nworld * place.nslot, m, d)
     kinds = frozenset(int(kind) for kind in model.geom_type[tools])
     self._find = contacts.kernel(kinds)
-    self._material = Material(self, batch, self._touch)
+    self._material = Material(self, batch, self._touch, self._pressed)
     self.host = host.Host(self)
     self.forces = Forces(self.host, FORCES)
 
@@ -149,7 +150,7 @@ class Organ(Tissue):
     held = 24.0 + 160.0 if w.forces else 0.0  # of springs beside the tissue
     if held and w.organ.mesh.spare:  # which follow a mesh a world
       held += 400.0
-    return bodies.nbytes(alone) + (44.0 + held) * w.organ.mesh.nvert
+    return bodies.nbytes(alone) + (56.0 + held) * w.organ.mesh.nvert
 
   @property
   def opens(self) -> list[host.Opens]:
@@ -174,8 +175,9 @@ class Organ(Tissue):
     if self.body.state.hold.size:
       self.body.state.hold.zero_()
     self.forces.enter()
-    self._over(patch.rank, p.most)
-    self._over(patch.stand, max(p.most, p.nslot))
+    some = min(p.nnode, _RANKED * p.nslot)  # threads, for as many candidates as there mostly are
+    self._over(patch.rank, some)
+    self._over(patch.stand, max(some, p.nslot))
     self._scheme.step(self.body)
 
   def touch(self):
@@ -191,8 +193,7 @@ class Organ(Tissue):
   def push(self):
     """Adds the passive force, and keeps sliding contacts closed."""
     self._over(patch.push, self.place.nslot)
-    dim = self._pressed.geom.shape
-    wp.launch(contact_rows.keep_closed, dim=dim, inputs=[self._pressed], device=self.body.device)
+    contact_rows.keep_closed(self._pressed, self.body.device)
     self.forces.act()
 
   def end(self):
@@ -256,7 +257,7 @@ class Organ(Tissue):
     """Contacts of the last step."""
     p = self._pressed
     wp.launch(contact_rows.press, dim=p.geom.shape, inputs=[p], device=self.body.device)
-    return Contacts(p.geom, p.normal.view(float), p.force)
+    return Contacts(p.geom, p.normal.view(float), p.pressed)
 
   # Cuts.
 

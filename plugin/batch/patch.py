@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 _BLOCK = 128  # threads, whole warps
 _ENDLESS = 1e300  # square of a distance beyond all others [m^2]
 _LONGER = 1.5  # times which an edge may be that a cut has moved
-# Candidates for the slots, times the slots.
-_ROOM = 6
 # Steps of the scale of Young's modulus for which the effective inertia is known.
 GRADES = 2.0 ** np.arange(-4, 5)
 
@@ -37,7 +35,6 @@ class Patch:
   nnode: int  # nodes
   nslice: int  # slices of nodes
   nslot: int  # slots
-  most: int  # candidates for them
   ntool: int  # geoms that the slots follow
   ngeom: int  # geoms of the model
   nq: int
@@ -96,9 +93,9 @@ class Patch:
   # Within a step:
   tool: doubles("nworld", "ntool", len(GEOM))  # see GEOM
   count: ints("nworld")  # candidates
-  candidate: ints("nworld", "most")  # their nodes
-  distance: floats("nworld", "most")  # from the nearest tool [m]
-  chosen: ints("nworld", "most")  # whether they have a slot
+  candidate: ints("nworld", "nnode")  # their nodes
+  distance: floats("nworld", "nnode")  # from the nearest tool [m]
+  chosen: ints("nworld", "nnode")  # whether they have a slot
   slot_node: ints("nworld", "nslot")  # node of a slot, -1 for none
   node_slot: ints("nworld", "nnode")  # slot of a node, -1 for none
   found: floats("nworld", "nslot", 3)  # contact force of this step [N]
@@ -279,11 +276,9 @@ def _tools(tools: np.ndarray, model, reach: float) -> np.ndarray:
 def variables(nworld: int, nslot: int, nslice: int) -> dict:
   """Returns the fields of `Patch` that worlds have of their own, at rest."""
   nnode = 8 * nslice
-  most = min(nnode, _ROOM * nslot)
   shape = (nworld, nslice, 3, 8)
   return dict(
     nslot=nslot,
-    most=most,
     grade=np.full(nworld, np.log2(1.0 / GRADES[0])),
     mass_scale=np.ones(nworld),
     lump=np.zeros((0, nnode)),
@@ -298,9 +293,9 @@ def variables(nworld: int, nslot: int, nslice: int) -> dict:
     heavier0=np.zeros(1),
     calm0=np.zeros(1),
     count=np.zeros(nworld),
-    candidate=np.zeros((nworld, most)),
-    distance=np.zeros((nworld, most)),
-    chosen=np.zeros((nworld, most)),
+    candidate=np.zeros((nworld, nnode)),
+    distance=np.zeros((nworld, nnode)),
+    chosen=np.zeros((nworld, nnode)),
     slot_node=np.full((nworld, nslot), -1),
     node_slot=np.full((nworld, nnode), -1),
     found=np.zeros((nworld, nslot, 3)),

@@ -7,6 +7,7 @@ from mujoco_warp._src.collision_primitive_core import (
   capsule_triangle,
   sphere_triangle,
 )
+from mujoco_warp._src.constraint import _contact_kbimp as contact_kbimp
 from mujoco_warp._src.types import (
   MJ_MAX_EPAFACES,
   MJ_MAX_EPAHORIZON,
@@ -19,5 +20,6 @@ from mujoco_warp._src.types import (
 
 __all__ = [
   "MJ_MAX_EPAFACES", "MJ_MAX_EPAHORIZON", "ContactType", "DeterminismType", "Geom", "GeomType",
-  "OverflowType", "box_triangle", "capsule_triangle", "ccd", "sphere_triangle", "vec5",
+  "OverflowType", "box_triangle", "capsule_triangle", "ccd", "contact_kbimp", "sphere_triangle",
+  "vec5",
 ]  # fmt: skip

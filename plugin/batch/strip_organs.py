@@ -71,8 +71,17 @@ def tools_of(model: mujoco.MjModel, organ: Declaration) -> np.ndarray:
   return found
 
 
+def nodes_under(model, organ: Declaration, tools: np.ndarray) -> np.ndarray:
+  """Returns about how many nodes of an organ each tool touches, and their neighbours."""
+  edge = organ.mesh.rest[organ.mesh.elem[:, [1, 2, 0]]] - organ.mesh.rest[organ.mesh.elem]
+  edge = float(np.linalg.norm(edge, axis=2).mean())
+  low, middle, large = np.sort(model.geom_aabb[tools, 3:], axis=1).T
+  r = 0.5 * (low + middle) + edge
+  return (math.pi * r * r + 2 * r * 2 * (large - middle)) / (math.sqrt(3) / 2 * edge * edge)
+
+
 def slots_for(model, organ: Declaration, tools: np.ndarray, nodes) -> int:
-  """Returns how many slots an organ has: the nodes that its tools touch, and their neighbours.
+  """Returns how many slots an organ has.
 
   Args:
     model: the compiled scene
@@ -86,13 +95,7 @@ def slots_for(model, organ: Declaration, tools: np.ndarray, nodes) -> int:
     if isinstance(given, bool) or not isinstance(given, int) or not LEAST <= given <= MOST:
       raise ValueError(f"organ {organ.name!r}: nodes is {given!r}, expected [{LEAST}, {MOST}]")
     return min(given, nvert)
-  edge = organ.mesh.rest[organ.mesh.elem[:, [1, 2, 0]]] - organ.mesh.rest[organ.mesh.elem]
-  edge = float(np.linalg.norm(edge, axis=2).mean())
-  many = 0.0
-  for g in tools:
-    low, middle, large = np.sort(model.geom_aabb[g, 3:])
-    r = (0.5 * (low + middle)) + edge
-    many += (math.pi * r * r + 2 * r * 2 * (large - middle)) / (math.sqrt(3) / 2 * edge * edge)
+  many = nodes_under(model, organ, tools).sum()
   return int(min(np.clip(math.ceil(many), 8, _USUAL), nvert))
 
 

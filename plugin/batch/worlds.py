@@ -29,7 +29,9 @@ from .private import DeterminismType, OverflowType
 from .reset import Rest
 
 _CONTACTS = 16  # of a world, of tools with each other and with what is fixed
-_ITERATIONS = 6  # of the constraint solver, at most
+# Of the constraint solver, at most, and where a tool covers more nodes than there are slots: these
+# share what presses, and 6 iterations threw them about.
+_ITERATIONS, _CROWDED = 6, 20
 _LOST = int(OverflowType.NEFC | OverflowType.NJMAX_NNZ | OverflowType.NARROWPHASE)
 
 
@@ -66,6 +68,10 @@ class Worlds(Batch):
     nslots = [
       strip_organs.slots_for(model, o, t, nodes) for o, t in zip(declared, tools, strict=True)
     ]
+    self._crowded = any(
+      (strip_organs.nodes_under(model, o, t) > n).any()
+      for o, t, n in zip(declared, tools, nslots, strict=True)
+    )
     bare, slots = strip_organs.strip(spec, model, declared, nslots)
     self._kept, self.bare = strip_organs.kept(model, declared), bare
     with wp.ScopedDevice(target):
@@ -132,7 +138,8 @@ class Worlds(Batch):
     )
     self.m.opt.warn_overflow = 0  # counted, see `overflow`
     # All worlds wait for the one that takes longest.
-    self.m.opt.iterations = min(self.m.opt.iterations, _ITERATIONS)
+    most = _CROWDED if self._crowded else _ITERATIONS
+    self.m.opt.iterations = min(self.m.opt.iterations, most)
     self.m.opt.deterministic = int(DeterminismType.ALL if deterministic else DeterminismType.NONE)
     # The windows' triangles have no forces and contacts of mujoco_warp's own.
     self.m.nflexelem = self.m.nflexedge = 0

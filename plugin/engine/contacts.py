@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 _DATA = (
   *("contact", "ncon", "nefc", "nisland", "efc_type", "efc_J", "efc_J_rownnz", "efc_J_rowadr"),
-  *("efc_J_colind", "efc_pos", "efc_KBIP", "efc_diagA", "efc_R", "efc_D"),
+  *("efc_J_colind", "efc_pos", "efc_margin", "efc_KBIP", "efc_diagA", "efc_R", "efc_D"),
   *("map_efc2iefc", "iefc_R", "iefc_D"),
 )
 _CONTACT = (
@@ -219,7 +219,7 @@ def forget(data: int):
   _tissue.pop(data, None)
 
 
-def tissue_of(m, organ: "Declaration", config: Config | None = None) -> np.ndarray:
+def tissue_of(m, organ: "Declaration", config: Config | None = None, mass=1.0) -> np.ndarray:
   """Returns TISSUE of an organ, as compiled or with another configuration.
 
   Its compliance is that of an elastic half space, a membrane with bending (Winkler's plate under a
@@ -228,24 +228,32 @@ def tissue_of(m, organ: "Declaration", config: Config | None = None) -> np.ndarr
   Args:
     m: the model's struct
     organ: the organ's declaration
-    config: its configuration, or None for the declared one
+    config: its configuration, or None for the declared one; of many worlds its young is
+      (1, nworld), and its other numbers may be (nworld,)
+    mass: times the declared masses; may be (nworld,)
+
+  Returns:
+    (len(TISSUE),), or (nworld, len(TISSUE))
   """
   config, h = config or organ.config, float(m.opt.timestep)
-  outside, plane, young = capsule(config), 1 - config.poisson**2, float(np.mean(config.young))
+  outside, plane, young = capsule(config), 1 - config.poisson**2, np.mean(config.young, axis=0)
   bare = young / plane if config.elements == "solid" else 0.0
-  skin = float(np.mean(outside.young)) * outside.thickness / plane
+  skin = np.mean(outside.young, axis=0) * outside.thickness / plane
   stretch = {"spring": config.stiffness, "solid": 0.0}.get(outside.elements, skin)
-  bend = float(rigidity(outside, np.size(outside.young)).mean())
+  bend = rigidity(outside, len(outside.young)).mean(axis=0)
   corner = organ.mesh.rest[organ.mesh.elem]
   edge = np.linalg.norm(corner - corner[:, [1, 2, 0]], axis=2).mean()
   below = config.foundation
   stiffness = bare * edge + stretch + 8 * np.sqrt(bend * below) + below * edge**2
-  mass = organ.mass[organ.free]
-  softer = max(1.0, (h / LONG) ** 2) * max(1.0, h**2 * stiffness / (STIFF * mass.mean()))
-  share = softer * SOFT / mass.sum() * (1.0 if bare else SKIN)
+  masses = mass * organ.mass[organ.free].sum()
+  each = mass * organ.mass[organ.free].mean()
+  softer = max(1.0, (h / LONG) ** 2) * np.maximum(1.0, h**2 * stiffness / (STIFF * each))
+  share = softer * SOFT / masses * (1.0 if config.elements == "solid" else SKIN)
   asked = FIRM / (stiffness * (SLOW * h) ** 2)
   stuck = min(1.0, max(STUCK, h / LONG))
-  return np.array([0.0 if stretch else bare, asked, share, stuck, not says(m, organ.flexes[0])])
+  bare = np.where(np.asarray(stretch) != 0, 0.0, bare)
+  rows = bare, asked, share, stuck, not says(m, organ.flexes[0])
+  return np.stack(np.broadcast_arrays(*(np.asarray(row, float) for row in rows)), axis=-1)
 
 
 def says(m, flex: int) -> bool:

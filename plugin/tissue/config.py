@@ -447,6 +447,7 @@ def lame(config: Config, nelem: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def rigidity(config: Config, nelem: int) -> np.ndarray:
-  """Returns the plate bending rigidity bend E t^3 / (12 (1 - nu^2)) [N m], (nelem,)."""
-  young = np.broadcast_to(np.asarray(config.young), (nelem,))
+  """Returns the plate bending rigidity bend E t^3 / (12 (1 - nu^2)) [N m], (nelem, ...)."""
+  young = np.asarray(config.young)
+  young = np.broadcast_to(young, (nelem, *young.shape[1:]))
   return config.bend * young * config.thickness**3 / (12 * (1 - config.poisson**2))

@@ -89,12 +89,13 @@ def test_more_worlds_than_memory():
 
 
 @pytest.mark.skipif(not wp.get_cuda_supported_archs(), reason="this Warp knows no CUDA")
-@pytest.mark.parametrize("which", ["patch", "whole"])
+@pytest.mark.parametrize("which", ["patch", "contacts", "whole"])
 def test_the_kernels_compile_for_cuda(tmp_path, scenes, which):
   from palpate.batch import patch
+  from palpate.batch.contact import contact_rows
   from palpate.tissue import device, step
 
-  kernel = patch.enter
+  kernel = contact_rows.find_compliance if which == "contacts" else patch.enter
   if which == "whole":
     _, _, body = scenes.kernels(*scenes.sphere(1))
     kinds = {"bends": True, "springs": True, "volumes": True}

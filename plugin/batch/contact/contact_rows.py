@@ -1,4 +1,4 @@
-"""Rows of an organ's contacts: what slides stays closed, and how hard contacts press.
+"""Rows of an organ's contacts: how firm they are, what slides stays closed, how hard they press.
 
 Contacts that slide stay closed, see `keep_closed` of coupling/contact_weights.h, which widens the
 gap of a contact by D mu |v| over its stiffness, D the damping of its rows. A gap is in the
@@ -11,18 +11,29 @@ what the gap adds follows from those rows.
 from typing import TYPE_CHECKING
 
 import mujoco
+import numpy as np
 import warp as wp
-from palpate.engine import contacts
+from palpate.engine import contacts, coupling
 from palpate.engine.contacts import TISSUE
+from palpate.engine.layout import GEOM
 from palpate.engine.model import mjstruct
-from palpate.tissue.types import Array, floats, ints, struct
+from palpate.tissue.kernels import kernel
+from palpate.tissue.types import Array, doubles, floats, ints, struct
 
-from ..private import vec5
+from ..patch import launch
+from ..private import contact_kbimp, vec5
 
 if TYPE_CHECKING:
-  from palpate.engine.model.declare import Declaration
+  from ..organs import Organ
 
-  from ..worlds import Worlds
+_ASKED, _SHARE, _FIRM = (wp.constant(k) for k in (TISSUE.asked, TISSUE.share, TISSUE.firm))
+# Tools under which contacts yield by what the mesh cannot, see coupling/series_compliance.h.
+_SMALL = tuple(int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}"))
+               for name in ("SPHERE", "CAPSULE", "CYLINDER"))  # fmt: skip
+# What of these fields are those of `Patch`.
+_OF_PATCH = ("nnode", "nslice", "nslot", "ntool", "ngeom", "mesh", "rest", "force", "slot_node",
+             "tool", "tool_geom", "geom_xpos", "geom_xmat")  # fmt: skip
+_OF_CONTACT = ("dim", "dist", "pos", "frame", "friction", "solref", "solimp", "elem", "efc_address")
 
 
 @struct
@@ -36,23 +47,56 @@ class Pressed:
   count: ints("nworld")  # its contacts
   dim: ints("naconmax")  # rows of a contact, or pairs of them and one
   contact_geom: Array(wp.vec2i, ("naconmax",))
+  dist: floats("naconmax")  # gap [m]
+  pos: Array(wp.vec3, ("naconmax",))
   frame: Array(wp.mat33, ("naconmax",))
   friction: Array(vec5, ("naconmax",))
+  solref: Array(wp.vec2, ("naconmax",))
+  solimp: Array(vec5, ("naconmax",))
   elem: Array(wp.vec2i, ("naconmax",))
   efc_address: ints("naconmax", "nrow")  # -1 for none
   aref: floats("nworld", "njmax")  # reference acceleration of the rows [m/s^2]
-  # See `contacts.TISSUE`:
-  firm: int
-  asked: float
-  share: float
+  disableflags: int  # of mjOption
+  discrete: int  # whether the integrator is
+  timestep: float  # [s]
+  tissue: doubles("nworld", len(TISSUE))  # see `contacts.TISSUE`
   tools: floats("ngeom")  # R that the step can bear for each tool [1/kg]
   pairs: float  # times R, in a pyramid: 2 / impratio
+  # What contacts yield by, a tool, and what that is found from; see also `Patch`:
+  yields: int  # whether there is a tool that is small and round or flat, on tissue that yields so
+  tool_of: ints("ngeom")  # which of the organ's tools a geom is, -1 for none
+  compliance: floats("nworld", "ntool")  # of each contact [m/N]
+  flex_elem: ints("nflexelemdata")  # slots of a triangle
+  elemadr: int  # where those of the organ begin
+  radius: float  # of its flex [m]
+  disp: floats("nworld", "nslice", 3, 8)  # displacement [m]
+  nnode: int
+  nslice: int
+  nslot: int
+  ntool: int
+  ngeom: int
+  mesh: ints("nworld")
+  rest: doubles("nmesh", "nnode", 3)
+  force: floats("nworld", "nnode", 3)
+  slot_node: ints("nworld", "nslot")
+  tool: doubles("nworld", "ntool", len(GEOM))
+  tool_geom: ints("ntool")
+  geom_xpos: Array(wp.vec3, ("nworld", "ngeom"))
+  geom_xmat: Array(wp.mat33, ("nworld", "ngeom"))
   D: floats("nworld", "njmax")  # inverse of the rows' R [kg]
   row_force: floats("nworld", "njmax")  # force of the rows [N]
   # See `Contacts`:
   geom: ints("nworld", "many")
   normal: Array(wp.vec3, ("nworld", "many"))
-  force: floats("nworld", "many")
+  pressed: floats("nworld", "many")
+
+
+find_compliance = kernel(
+  "find_compliance",
+  "coupling/world_contacts.h",
+  Pressed,
+  coupling.CONSTANTS | TISSUE.constants(),
+)
 
 
 @wp.func
@@ -73,24 +117,37 @@ def _has_rows(p: Pressed, c: int):
 
 @wp.func
 def _firm_up(p: Pressed, world: int, c: int):
-  """Makes a contact as firm as under the plugin, see coupling/contact_stiffness.h."""
-  if p.firm == 0:
-    return
-  touched = float(p.count[world])
-  if p.elem[c][1] >= 0:
-    touched = touched / 3.0
-  R = wp.max(p.asked, touched * p.share + p.tools[p.contact_geom[c][0]])
-  if p.paired == 1 and p.dim[c] > 1:
-    square = p.friction[c][0] * p.friction[c][0]
-    R *= p.pairs * square * (1.0 + square)
-  gain = 1.0 / (R * p.D[world, p.efc_address[c, 0]])
-  for r in range(_rows(p, c)):
-    row = p.efc_address[c, r]
-    p.D[world, row] = gain * p.D[world, row]
+  """Makes a contact as firm as under the plugin, see coupling/contact_stiffness.h.
+
+  Rows of friction have the normal's R times what mujoco_warp says, so they yield with it.
+  """
+  geom = p.contact_geom[c][0]
+  R = 1.0 / p.D[world, p.efc_address[c, 0]]
+  now = R
+  if p.tissue[world, _FIRM] > wp.float64(0.0):
+    touched = float(p.count[world])
+    if p.elem[c][1] >= 0:
+      touched = touched / 3.0
+    borne = touched * float(p.tissue[world, _SHARE]) + p.tools[geom]
+    R = wp.max(float(p.tissue[world, _ASKED]), borne)
+    if p.paired == 1 and p.dim[c] > 1:
+      square = p.friction[c][0] * p.friction[c][0]
+      R *= p.pairs * square * (1.0 + square)
+  tool = p.tool_of[geom]
+  if tool >= 0 and p.compliance[world, tool] > 0.0:
+    spring = contact_kbimp(
+      p.disableflags, p.timestep, p.solref[c], p.solimp[c], p.dist[c], p.discrete == 1
+    )
+    normals = float(wp.where(p.paired == 1, _rows(p, c), 1))
+    R = wp.max(R, normals * spring[0] * spring[2] * p.compliance[world, tool])
+  if R != now:
+    for r in range(_rows(p, c)):
+      row = p.efc_address[c, r]
+      p.D[world, row] = now / R * p.D[world, row]
 
 
 @wp.kernel(enable_backward=False)
-def keep_closed(p: Pressed):
+def _closed(p: Pressed):
   """Makes contacts firm, and takes the parting of those that slide off their reference."""
   world, k = wp.tid()
   if k >= p.count[world]:
@@ -116,13 +173,21 @@ def keep_closed(p: Pressed):
     p.aref[world, row] = p.aref[world, row] - wp.sqrt(square)
 
 
+def keep_closed(p, device):
+  """Makes contacts firm, and keeps those that slide closed."""
+  dim = p.geom.shape
+  if p.yields:
+    launch(find_compliance, p, dim[0], p.ntool, device)
+  wp.launch(_closed, dim=dim, inputs=[p], device=device)
+
+
 @wp.kernel(enable_backward=False)
 def press(p: Pressed):
   """Writes the geoms, normals and normal forces of contacts."""
   world, k = wp.tid()
   c = p.start[0] + p.before[world] + k
   p.geom[world, k] = -1
-  p.force[world, k] = 0.0
+  p.pressed[world, k] = 0.0
   if k >= p.count[world] or not _has_rows(p, c):
     return
   total = float(0.0)  # noqa: UP018 - a variable to Warp
@@ -130,32 +195,42 @@ def press(p: Pressed):
     total += p.row_force[world, p.efc_address[c, r]]
   p.geom[world, k] = p.contact_geom[c][0]
   p.normal[world, k] = wp.vec3(p.frame[c][0, 0], p.frame[c][0, 1], p.frame[c][0, 2])
-  p.force[world, k] = total
+  p.pressed[world, k] = total
 
 
-def make(batch: "Worlds", model: mujoco.MjModel, organ: "Declaration", touch):
+def make(organ: "Organ", model: mujoco.MjModel, touch):
   """Returns the contacts of an organ.
 
   Args:
-    batch: the worlds, with mujoco_warp's data
+    organ: the organ in all worlds
     model: the compiled scene
-    organ: the organ's declaration
     touch: how the organ touches its tools
   """
-  out, d = Pressed(), batch.d
+  batch, patch, place = organ.batch, organ.patch, organ.place
+  out, d, bare, device = Pressed(), batch.d, batch.bare, batch.device
   out.many, out.paired = touch.most, int(batch.paired)
   out.start, out.before, out.count = touch.start, touch.before, touch.count
-  for name in ("dim", "frame", "friction", "elem", "efc_address"):
+  for name in _OF_CONTACT:
     setattr(out, name, getattr(d.contact, name))
+  for name in _OF_PATCH:
+    setattr(out, name, getattr(patch, name))
   out.D, out.pairs = d.efc.D, 2.0 / float(model.opt.impratio)
-  tissue = contacts.tissue_of(mjstruct.Model.from_address(model._address), organ)
-  out.firm = int(tissue[TISSUE.firm])
-  out.asked, out.share = tissue[TISSUE.asked], tissue[TISSUE.share]
+  out.disableflags, out.timestep = bare.opt.disableflags, float(bare.opt.timestep)
+  out.discrete = int(bare.opt.integrator == getattr(mujoco.mjtIntegrator, "mjINT_DISCRETE", -1))
+  tissue = contacts.tissue_of(mjstruct.Model.from_address(model._address), organ.declared)
+  out.tissue = wp.array(np.tile(tissue, (batch.nworld, 1)), dtype=wp.float64, device=device)
   tools = contacts.LIGHT * model.body_invweight0[model.geom_bodyid, 0]
-  out.tools = wp.array(tools, dtype=float, device=batch.device)
+  out.tools = wp.array(tools, dtype=float, device=device)
+  geoms, tool_of = patch.tool_geom.numpy(), np.full(model.ngeom, -1)
+  tool_of[geoms] = np.arange(len(geoms))
+  out.yields = int(tissue[TISSUE.modulus] > 0 and np.isin(model.geom_type[geoms], _SMALL).any())
+  out.tool_of = wp.array(tool_of, dtype=int, device=device)
+  out.compliance = wp.zeros((batch.nworld, len(geoms)), dtype=float, device=device)
+  out.flex_elem, out.elemadr = batch.m.flex_elem, int(bare.flex_elemdataadr[place.flex])
+  out.radius, out.disp = touch.radius, patch.solve.disp
   out.contact_geom, out.aref, out.row_force = d.contact.geom, d.efc.aref, d.efc.force
   shape = (batch.nworld, out.many)
-  out.geom, out.normal, out.force = (
-    wp.zeros(shape, dtype=kind, device=batch.device) for kind in (int, wp.vec3, float)
+  out.geom, out.normal, out.pressed = (
+    wp.zeros(shape, dtype=kind, device=device) for kind in (int, wp.vec3, float)
   )
   return out

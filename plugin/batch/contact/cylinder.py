@@ -13,6 +13,7 @@ _LEVEL, _RIM, _SLACK, _COVER = (
 )
 _HALVINGS = wp.constant(20)  # of an edge: to 1e-6 of its length
 _LEAST = wp.constant(1e-9)  # length of a direction [m]
+_JUST = wp.constant(1e-8)  # how far in what just touches is [m]
 
 
 @wp.func
@@ -98,16 +99,13 @@ def touch(
 ):
   """Returns distance, point of a triangle and normal there of a cylinder that is nearest to it.
 
-  Under a flat end that is its middle there. Else the cylinder's utmost point towards the triangle's
-  plane lies over the triangle, or an edge is nearest. What is farther than `reach` is not looked
-  at closely.
+  The cylinder's utmost point towards the triangle's plane lies over the triangle, or an edge is
+  nearest. What is farther than `reach` is not looked at closely. What touches under a flat end does
+  so at its middle there; if that is not in the skin, it touches just so.
   """
   r, half = size[0], size[1]
   t = wp.transpose(rot)
   la, lb, ld = t * (a - pos), t * (b - pos), t * (d - pos)
-  under, middle, gap, end = _under_end(size, radius, la, lb, ld)
-  if under > 0.0:
-    return gap + radius, pos + rot * middle, rot * wp.vec3(0.0, 0.0, end)
   n = wp.normalize(wp.cross(lb - la, ld - la))
   up = n  # towards the cylinder
   if wp.dot(n, la) > 0.0:
@@ -128,4 +126,9 @@ def touch(
       far, out = _beyond(y, r, half)
       if far < dist:
         x, dist, normal = y, far, out
+  if dist < reach:
+    under, middle, gap, end = _under_end(size, radius, la, lb, ld)
+    if under > 0.0:
+      x, normal = middle, wp.vec3(0.0, 0.0, end)
+      dist = wp.min(gap + radius, reach - _JUST)
   return dist, pos + rot * x, rot * normal

@@ -110,6 +110,37 @@ PALPATE void scale_impedance(const Fields& f, Rows rows, double gain) {
   }
 }
 
+// What the discrete integrator divides R by: what a spring and damper do within the step. It makes rows
+// again, from the contact's solref and solimp.
+template <class Fields>
+PALPATE double within_step(const Fields& f, double stiffness, double damping) {
+  const double h = f.timestep.data[0];
+  return f.integrator.data[0] == INTEGRATOR_DISCRETE ? 1.0 + h * damping + h * h * stiffness : 1.0;
+}
+
+// The impedance of a contact at a gap, by its solimp (MuJoCo, Modeling, Solver parameters).
+PALPATE double impedance(const double* solimp, double gap) {
+  const double low = solimp[0], high = solimp[1], width = solimp[2], middle = solimp[3], power = solimp[4];
+  if (low == high || !(width > 0.0)) return 0.5 * (low + high);
+  const double x = fabs(gap) / width;
+  if (x >= 1.0) return high;
+  if (!(power > 1.0)) return low + x * (high - low);
+  const double y = x <= middle ? pow(x, power) / pow(middle, power - 1.0)
+                               : 1.0 - pow(1.0 - x, power) / pow(1.0 - middle, power - 1.0);
+  return low + y * (high - low);
+}
+
+// Gives the rows of a contact that MuJoCo made for another gap their impedance, and R with it.
+template <class Fields>
+PALPATE void impede(const Fields& f, const char* contact, Rows rows, double gap) {
+  double* row = datum<double*>(f, DATA_EFC_KBIP) + 4 * rows.first;
+  const double now = row[2], next = impedance((const double*)(contact + CONTACT_SOLIMP), gap);
+  if (!(now > 0.0 && now < 1.0 && next > 0.0 && next < 1.0)) return;
+  const double before = within_step(f, row[0] * now, row[1]), after = within_step(f, row[0] * next, row[1]);
+  scale_impedance(f, rows, (1.0 - next) / next * now / (1.0 - now) * before / after);
+  for (int r = 0; r < rows.count; ++r) row[4 * r + 2] = next;
+}
+
 // How a row of a contact sees velocities: along the normal, a tangent, or in a pyramid along the normal
 // and part of a tangent; and about them, where it rolls and twists.
 struct Axis { D3 along, about; };

@@ -1,32 +1,13 @@
 // How firm contacts are: as firm as their tissue asks for and a step can bear; MuJoCo's grow softer as
-// nodes grow lighter. Under a round or flat-ended tool that is small for the mesh they yield by what
-// the mesh cannot.
+// nodes grow lighter.
 #pragma once
 #include "coupling/contact_rows.h"
+#include "coupling/series_compliance.h"
 
 namespace palpate {
 
-// How far a mesh yields at a node to a unit force there, times E* and its edges' mean length: that of
-// pressed blocks (tests/benchmarks/accuracy/truth.py).
-constexpr double SELF = 1.75;
-
 // Edges that a tool's radius has at least, else it is told that the mesh is too coarse.
 constexpr double COARSE = 0.05;
-
-// Most that a tool sinks in, in radii.
-constexpr double DEEPEST = 0.5;
-
-constexpr double PI = 3.14159265358979;
-
-// Mean length of the edges of the triangle on a side of a contact [m].
-template <class Fields>
-PALPATE double edge_of(const Fields& f, const char* contact, int side) {
-  const int flex = side_of(contact, CONTACT_FLEX, side), elem = side_of(contact, CONTACT_ELEM, side);
-  const int* e = f.flex_elem.data + f.flex_elemdataadr.data[flex] + 3 * elem;
-  const double* x = f.flexvert_xpos.data + 3 * f.flex_vertadr.data[flex];
-  const D3 a = load(x + 3 * e[0]), b = load(x + 3 * e[1]), c = load(x + 3 * e[2]);
-  return (norm(b - a) + norm(c - b) + norm(a - c)) / 3.0;
-}
 
 // A geom's contacts with an organ's flex, which is on one side of them.
 struct Touch { int geom, flex, side; };
@@ -65,114 +46,52 @@ PALPATE bool are_organs(const Fields& f, const char* contact) {
   return true;
 }
 
-// What a tool presses in: the corners of the triangles that it touches, and how it lies in them.
-struct Dent {
-  static constexpr int MOST = 64;
-  int node[MOST], nnode = 0, ncon = 0;
-  double edges = 0.0, deepest = 0.0, gaps = 0.0;
-  double square = 0.0;  // of the way from the tool's middle to its contacts, weighed by their gaps
-  D3 way = {0.0, 0.0, 0.0}, normal = {0.0, 0.0, 0.0};  // mean ones, weighed so
+// A geom's contacts with an organ, in MuJoCo's memory.
+template <class Fields>
+struct ToolContacts {
+  const Fields& f;
+  const char* contacts;
+  int ncon;
+  Touch touch;
 
-  PALPATE void sink(double gap, D3 r, D3 along) {
-    if (gap > deepest) deepest = gap;
-    if (!(gap > 0.0)) return;
-    gaps += gap;
-    square += gap * dot(r, r);
-    way += gap * r;
-    normal += gap * along;
-  }
+  PALPATE int count() const { return ncon; }
 
-  PALPATE bool add(int vert) {
-    for (int q = 0; q < nnode; ++q)
-      if (node[q] == vert) return true;
-    if (nnode == MOST) return false;
-    node[nnode++] = vert;
+  PALPATE bool at(int c, Press& press) const {
+    const char* contact = contacts + (size_t)CONTACT_LENGTH * c;
+    const int elem = side_of(contact, CONTACT_ELEM, touch.side);
+    if (!(touch_of(f, contact) == touch) || elem < 0) return false;
+    const int* e = f.flex_elem.data + f.flex_elemdataadr.data[touch.flex] + 3 * elem;
+    const int start = f.flex_vertadr.data[touch.flex];
+    press.gap = *(const double*)(contact + CONTACT_DIST);
+    press.pos = load((const double*)(contact + CONTACT_POS));
+    press.normal = load((const double*)(contact + CONTACT_FRAME));
+    press.edge = mean_edge(place(start + e[0]), place(start + e[1]), place(start + e[2]));
+    for (int k = 0; k < 3; ++k) press.corner[k] = f.force_adr.data[start + e[k]] < 0 ? -1 : start + e[k];
     return true;
   }
 
-  // The mean square of the contacts' distances from the middle of the dent.
-  PALPATE double spread() const { return square / gaps - dot(way, way) / (gaps * gaps); }
+  PALPATE D3 place(int vert) const { return load(f.flexvert_xpos.data + 3 * vert); }
+  PALPATE D3 force(int vert) const { return load(f.plugin_state.data + f.force_adr.data[vert]); }
 };
 
-// Looks at the dent of a tool; returns whether it is one of few nodes.
 template <class Fields>
-PALPATE bool find_dent(const Fields& f, const char* contact, int ncon, Touch touch, Dent& dent) {
-  const D3 middle = load(f.geom_xpos.data + 3 * touch.geom);
-  const int start = f.flex_vertadr.data[touch.flex];
-  for (int c = 0; c < ncon; ++c, contact += CONTACT_LENGTH) {
-    if (!(touch_of(f, contact) == touch)) continue;
-    const D3 r = load((const double*)(contact + CONTACT_POS)) - middle;
-    dent.sink(-*(const double*)(contact + CONTACT_DIST), r,
-              load((const double*)(contact + CONTACT_FRAME)));
-    dent.edges += edge_of(f, contact, touch.side);
-    ++dent.ncon;
-    const int* e = f.flex_elem.data + f.flex_elemdataadr.data[touch.flex] +
-                   3 * side_of(contact, CONTACT_ELEM, touch.side);
-    for (int k = 0; k < 3; ++k)
-      if (f.force_adr.data[start + e[k]] >= 0 && !dent.add(start + e[k])) return false;
-  }
-  return dent.deepest > 0.0;
+PALPATE Tool tool_of(const Fields& f, Touch touch) {
+  const double* R = f.geom_xmat.data + 9 * touch.geom;
+  return {f.geom_type.data[touch.geom], load(f.geom_xpos.data + 3 * touch.geom), {R[2], R[5], R[8]},
+          f.geom_size.data[3 * touch.geom], f.flex_radius.data[touch.flex]};
 }
 
-// The force in a dent, and the work of the forces on its nodes, those of the last step, as it is on a
-// mesh of E* = 1: a node yields by SELF / edge to its own, by 1 / (pi r) to another at r (Boussinesq).
+// The series compliance of each contact of a tool [m/N]; flags a mesh that is too coarse for the tool.
 template <class Fields>
-PALPATE double work_of(const Fields& f, const Dent& dent, double& total) {
-  D3 sum = {0.0, 0.0, 0.0};
-  double work = 0.0;
-  for (int i = 0; i < dent.nnode; ++i) {
-    const D3 x = load(f.flexvert_xpos.data + 3 * dent.node[i]);
-    const D3 force = load(f.plugin_state.data + f.force_adr.data[dent.node[i]]);
-    D3 others = {0.0, 0.0, 0.0};
-    for (int j = 0; j < i; ++j) {
-      const double r = norm(load(f.flexvert_xpos.data + 3 * dent.node[j]) - x);
-      others += 2.0 / (PI * r) * load(f.plugin_state.data + f.force_adr.data[dent.node[j]]);
-    }
-    sum += force;
-    work += dot(force, (SELF * dent.ncon / dent.edges) * force + others);
-  }
-  total = norm(sum);
-  return work;
-}
-
-// How much less the mesh under a tool yields than a half space would, as a compliance of each of its
-// contacts [m/N]. Under a round tool the half space yields by 3 / (4 E* a), a the radius of the contact
-// (Hertz), less what the tool rises off its axis; under a flat end by 1 / (2 E* radius).
-template <class Fields>
-PALPATE double unresolved(const Fields& f, const char* contacts, int ncon, Touch touch) {
-  const double* tissue = f.tissue.data + TISSUE_LENGTH * touch.flex;
-  const double modulus = tissue[TISSUE_MODULUS];
-  const int type = f.geom_type.data[touch.geom];
-  const bool round = type == GEOM_IS_SPHERE || type == GEOM_IS_CAPSULE;
-  if (!round && type != GEOM_IS_CYLINDER) return 0.0;
+PALPATE double series_compliance(const Fields& f, const char* contacts, int ncon, Touch touch) {
+  const Tool tool = tool_of(f, touch);
+  const ToolContacts<Fields> all = {f, contacts, ncon, touch};
   Dent dent;
-  if (!find_dent(f, contacts, ncon, touch, dent)) return 0.0;
-  const double size = f.geom_size.data[3 * touch.geom], radius = size + f.flex_radius.data[touch.flex];
+  if (!tool.is_known() || !find_dent(all, tool, dent)) return 0.0;
+  const double radius = tool.size + tool.skin;
   if (f.mine.data[touch.flex] > 1 && !f.flags.data[FLAG_COARSE] && radius < COARSE * dent.edges / dent.ncon)
     f.flags.data[FLAG_COARSE] = (int)(2e6 * radius) + 1;
-  if (!(modulus > 0.0)) return 0.0;
-  double total;
-  const double work = work_of(f, dent, total);
-  if (!(total > 0.0)) return 0.0;
-  double yields = 0.5 / (modulus * size);
-  if (round) {
-    const double a = cbrt(0.75 * total * radius / modulus);
-    yields = 0.75 / (modulus * a) - dent.spread() / (2.0 * radius * total);
-  } else {
-    const double* R = f.geom_xmat.data + 9 * touch.geom;
-    if (fabs(dot(D3{R[2], R[5], R[8]}, dent.normal)) < 0.95 * norm(dent.normal)) return 0.0;
-  }
-  double lacks = yields - work / (modulus * total * total);
-  if (lacks * total > DEEPEST * radius) lacks = DEEPEST * radius / total;  // or a needle falls through
-  return lacks > 0.0 ? lacks * dent.gaps / dent.deepest : 0.0;  // contacts in parallel
-}
-
-// What the discrete integrator divides R by: what a spring and damper do within the step. It makes rows
-// again, from the contact's solref and solimp.
-template <class Fields>
-PALPATE double within_step(const Fields& f, double stiffness, double damping) {
-  const double h = f.timestep.data[0];
-  return f.integrator.data[0] == INTEGRATOR_DISCRETE ? 1.0 + h * damping + h * h * stiffness : 1.0;
+  return unresolved(all, tool, dent, f.tissue.data + TISSUE_LENGTH * touch.flex);
 }
 
 // Gives the rows of a contact a critically damped spring and its R, less what the step takes of it.

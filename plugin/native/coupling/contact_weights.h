@@ -61,6 +61,7 @@ PALPATE void put(const Fields& f, char* contact, Rows rows, int side, D3 pos, D3
   *(double*)(contact + CONTACT_DIST) = gap;
   double* efc_pos = datum<double*>(f, DATA_EFC_POS) + rows.first;
   for (int r = 0; r < rows.normals().count; ++r) efc_pos[r] = gap;
+  impede(f, contact, rows, gap - datum<double*>(f, DATA_EFC_MARGIN)[rows.first]);
   int body = f.geom_bodyid.data[side_of(contact, CONTACT_GEOM, side)];
   pos = pos - load(f.subtree_com.data + 3 * f.body_rootid.data[body]);
   while (body > 0 && !f.body_dofnum.data[body]) body = f.body_parentid.data[body];
@@ -194,16 +195,19 @@ PALPATE void weigh(const Fields& f, Thread, int) {
   Shared shared = {{-1, -1}, 0.0};
   char* const contacts = datum<char*>(f, DATA_CONTACT);
   const int ncon = datum<int>(f, DATA_NEFC) > 0 ? datum<int>(f, DATA_NCON) : 0;
+  for (int c = 0; c < ncon; ++c) {  // places before what follows from all of a tool's
+    char* contact = contacts + (size_t)CONTACT_LENGTH * c;
+    const Rows rows = is_mine(f, contact) ? rows_of(f, contact) : Rows{0, 0, false};
+    for (int side = 0; side < 2 && rows.count; ++side) weigh_side(f, contact, rows, side);
+  }
   for (int c = 0; c < ncon; ++c) {
     char* contact = contacts + (size_t)CONTACT_LENGTH * c;
     const Rows rows = is_mine(f, contact) ? rows_of(f, contact) : Rows{0, 0, false};
     if (!rows.count) continue;
     touched = true;
-    for (int side = 0; side < 2; ++side)
-      weigh_side(f, contact, rows, side);
     const Touch touch = touch_of(f, contact);
     if (touch.geom >= 0) {
-      if (!(touch == last)) least = unresolved(f, contacts, ncon, touch);
+      if (!(touch == last)) least = series_compliance(f, contacts, ncon, touch);
       if (touch.flex != last.flex) count = count_of(contacts, ncon, touch.flex, true);
       firm_up(f, contact, rows, touch, count, least);
       last = touch;

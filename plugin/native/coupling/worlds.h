@@ -12,6 +12,10 @@
 
 namespace palpate {
 
+// The distance of nodes that a tool touches and that it had a slot for: they keep it, since slots that
+// take turns under a tool over more nodes than there are slots shake it.
+constexpr float HELD = -1e3f;
+
 // Where a slot waits that no node has [m], and its inertia then [kg].
 constexpr float WAITING = 1e3f, IDLE = 1.0f;
 
@@ -139,33 +143,26 @@ PALPATE void enter_worlds(const Fields& f, Thread t, int) {
     const D3 x = at_rest(f, w, i) + load_lane(f.solve.disp.data + at);
     const double far = nearest(tool, f.ntool, x);
     if (far > of_mesh(f.touch, f.mesh.data[w])[i]) return;
-    const int q = append(f.count.data + w);
-    if (q >= f.most) return;
-    f.candidate.data[w * f.most + q] = i;
-    f.distance.data[w * f.most + q] = (float)far;
+    const size_t q = in_row(f, w, append(f.count.data + w));
+    f.candidate.data[q] = i;
+    f.distance.data[q] = touched(contact) && far < f.skin ? HELD : (float)far;
   });
-}
-
-template <class Fields>
-PALPATE int candidates(const Fields& f, int world) {
-  const int all = f.count.data[world];
-  return all < f.most ? all : f.most;
 }
 
 // Chooses the candidates nearest to the tools; the order of nodes decides between equals. Those that
 // touch and get no slot are counted. An organ without candidates may sleep.
 template <class Fields>
 PALPATE void rank(const Fields& f, Thread t, int) {
-  const int n = candidates(f, t.world);
+  const int n = f.count.data[t.world];
   if (t.tid == 0 && n > 0) f.calm.data[t.world] = 0.0;
   if (t.tid == 0 && is_calm(f, t.world)) f.solve.step.data[4 * t.world] = 0.0f;
-  const int* node = f.candidate.data + t.world * f.most;
-  const float* far = f.distance.data + t.world * f.most;
+  const int* node = f.candidate.data + in_row(f, t.world, 0);
+  const float* far = f.distance.data + in_row(f, t.world, 0);
   each_item(t, n, [&](int q) {
     int nearer = 0;
     for (int p = 0; p < n; ++p)
       nearer += far[p] < far[q] || (far[p] == far[q] && node[p] < node[q]);
-    f.chosen.data[t.world * f.most + q] = nearer < f.nslot;
+    f.chosen.data[in_row(f, t.world, q)] = nearer < f.nslot;
     if (nearer >= f.nslot && far[q] < f.skin) append(f.missed.data + t.world);
   });
 }
@@ -201,9 +198,9 @@ PALPATE void stand_on(const Fields& f, int world, int slot, int i) {
 // Gives the slots to the chosen nodes, in their order.
 template <class Fields>
 PALPATE void stand(const Fields& f, Thread t, int) {
-  const int n = candidates(f, t.world), used = n < f.nslot ? n : f.nslot;
-  const int* node = f.candidate.data + t.world * f.most;
-  const int* chosen = f.chosen.data + t.world * f.most;
+  const int n = f.count.data[t.world], used = n < f.nslot ? n : f.nslot;
+  const int* node = f.candidate.data + in_row(f, t.world, 0);
+  const int* chosen = f.chosen.data + in_row(f, t.world, 0);
   each_item(t, n, [&](int q) {
     if (!chosen[q]) return;
     int slot = 0;
@@ -288,10 +285,7 @@ template <class Fields>
 PALPATE void commit_worlds(const Fields& f, Thread t, int) {
   const int w = t.world;
   const double ok = succeeded(f, w) ? 1.0 : 0.0, h = f.h;
-  if (t.tid == 0) {
-    const int crowd = f.count.data[w] - f.most, missed = f.missed.data[w] + (crowd > 0 ? crowd : 0);
-    if (missed > f.overflow.data[w]) f.overflow.data[w] = missed;
-  }
+  if (t.tid == 0 && f.missed.data[w] > f.overflow.data[w]) f.overflow.data[w] = f.missed.data[w];
   const bool asleep = sleeps(f, w);
   if (asleep && f.calm.data[w] > QUIET + h) return;  // it stands still already
   each_item(t, f.nnode, [&](int i) {

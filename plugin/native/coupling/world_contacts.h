@@ -1,0 +1,53 @@
+// Batches: how much an organ's contacts yield under each of its tools. A thread has a tool of a world.
+#pragma once
+#include "coupling/series_compliance.h"
+#include "coupling/worlds.h"
+
+namespace palpate {
+
+// A tool's contacts with an organ in one world, in mujoco_warp's memory.
+template <class Fields>
+struct WorldContacts {
+  const Fields& f;
+  int world, geom;
+
+  PALPATE int count() const { return f.count.data[world]; }
+
+  PALPATE bool at(int k, Press& press) const {
+    const size_t c = f.start.data[0] + f.before.data[world] + k;
+    const int elem = ((const int*)f.elem.data)[2 * c + 1];
+    if (((const int*)f.contact_geom.data)[2 * c] != geom || elem < 0) return false;
+    const int* slot = f.flex_elem.data + f.elemadr + 3 * elem;
+    for (int q = 0; q < 3; ++q) press.corner[q] = f.slot_node.data[world * f.nslot + slot[q]];
+    press.gap = f.dist.data[c];
+    press.pos = load((const float*)f.pos.data + 3 * c);
+    press.normal = load((const float*)f.frame.data + 9 * c);
+    press.edge = mean_edge(place(press.corner[0]), place(press.corner[1]), place(press.corner[2]));
+    return true;
+  }
+
+  PALPATE D3 place(int node) const {
+    return at_rest(f, world, node) + load_lane(f.disp.data + at_node(f, world, node));
+  }
+  PALPATE D3 force(int node) const { return load(f.force.data + 3 * in_row(f, world, node)); }
+};
+
+// Finds the series compliance of the contacts of each tool [m/N].
+template <class Fields>
+PALPATE void find_compliance(const Fields& f, Thread t, int) {
+  each_item(t, f.ntool, [&](int q) {
+    const int geom = f.tool_geom.data[q];
+    const size_t g = (size_t)t.world * f.ngeom + geom;
+    const double* of = f.tool.data + (size_t)GEOM_LENGTH * (t.world * f.ntool + q);
+    const float* R = (const float*)f.geom_xmat.data + 9 * g;
+    const Tool tool = {(int)of[GEOM_TYPE], load((const float*)f.geom_xpos.data + 3 * g), {R[2], R[5], R[8]},
+                       of[GEOM_SIZE], f.radius};
+    const WorldContacts<Fields> all = {f, t.world, geom};
+    Dent dent;
+    const bool known = tool.is_known() && find_dent(all, tool, dent);
+    f.compliance.data[t.world * f.ntool + q] =
+        known ? unresolved(all, tool, dent, f.tissue.data + TISSUE_LENGTH * t.world) : 0.0;
+  });
+}
+
+}  // namespace palpate
