@@ -398,7 +398,7 @@ PALPATE int cleave(const F& f, const S& m, const Sheet& sheet, const Neohookean&
   for (int t = f.ntriangle; t < count / 3; ++t) f.loose.data[t] = 1;
   measure_walls(m, sheet, f.edge, f.ntriangle, count / 3, f);
   if (!come_loose(m, o.parts, was.patch.own, f.home.data, f.loose.data, memory)) return FULL;
-  return ease(m, p, x, f, was, memory) && !memory.full ? APART : FULL;
+  return correct_energy(m, p, x, f, was, memory) && !memory.full ? APART : FULL;
 }
 
 template <class Fields>
