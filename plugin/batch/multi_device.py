@@ -14,7 +14,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import warp as wp
-from palpate.engine.cutting.cuts import Report
+from palpate.tissue.cutting.topology import Report
 
 from .base import Batch, Contacts, Tissue, on_device, spread
 from .cutting.fracture import Cutters

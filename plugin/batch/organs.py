@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 from palpate.engine import coupling
-from palpate.engine.cutting.cuts import Report, pieces
 from palpate.engine.windows import proxies
 from palpate.tissue import body as bodies
 from palpate.tissue import config as configuration
 from palpate.tissue import device as devices
 from palpate.tissue import order, shape, step
+from palpate.tissue.cutting.topology import Report, pieces
 
 from . import kernels, patch
 from .base import Contacts, Tissue, spread

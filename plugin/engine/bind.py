@@ -30,7 +30,7 @@ def bind(w: Workspace, model: int):
     if w.graphs.resident:
       w.graphs.resident.fetch()
     w.graphs.phases = does = side.Phases(w, model, w.seen.instance)
-    w.cuts.bind(model)
+    w.cuts.bind(model, w.plugin_state)
     near = wp.get_device(does.side)
     crossing = device != near
 

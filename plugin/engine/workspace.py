@@ -15,8 +15,9 @@ from palpate.tissue.config import Config
 from . import contacts, coupling, graphs
 from .bind import bind
 from .coupling import Phases
+from .cutting import cuts
+from .cutting.cuts import Cuts
 from .cutting.cutters import Cutters
-from .cutting.solid_cuts import Cuts, cuts_of
 from .forces import declare_attachments, declare_bonds
 from .forces.attachments import Ties
 from .forces.cohesive_bonds import Bonds
@@ -185,7 +186,7 @@ class Workspace:
   boxes: dict = dataclasses.field(default_factory=dict)
 
   def __post_init__(self):
-    self.hold, self.cuts = Hold(self), cuts_of(self)
+    self.hold, self.cuts = Hold(self), Cuts(self.organ, self.body, self.model)
     for name, kind in FORCES.items():
       setattr(self, name, kind(self))
 
@@ -210,7 +211,8 @@ class Workspace:
     if self.report.strange:
       coupling.check_state(self.organ, self.plugin_state)
       self.report.strange = False
-    changed = bool(self.cuts) and self.cuts.renewed()
+    cuts.follow(self)
+    changed = self.cuts.renewed()
     if self.turn is None:
       if self.cuts:
         self._run_cut(changed)

@@ -14,6 +14,7 @@ from palpate.engine.cutting import cutters
 from palpate.engine.cutting.electrosurgery import ends
 from palpate.engine.layout import BLADE, LAW
 from palpate.engine.model import mjstruct
+from palpate.tissue.cutting.facets import Path
 from palpate.tissue.geometry.mesh import Mesh
 from palpate.tissue.step import SCHEMES
 from palpate.tissue.types import allocate, doubles, fill, floats, ints, struct
@@ -218,7 +219,7 @@ class Blades(base.Opens):
     assert cuts is not None
 
     def cut(path: np.ndarray) -> tuple[Any, Mesh]:
-      found = cuts.find(world, path, motion, k, given, True)
+      found = cuts.find(world, Path(path, given, at_rest=True), motion, k)
       return cuts.apply(world, found, motion, k), cuts.mesh_of(world)
 
     organ, mesh = self._organ.declared, cuts.mesh_of(world)

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
-from palpate.engine.cutting.cuts import Piece, Report
+from palpate.tissue.cutting.topology import Piece, Report
 
 
 class Cutters(NamedTuple):

@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 import warp as wp
 from palpate.tissue.cutting.path import Finder
+from palpate.tissue.cutting.topology import Report
 from palpate.tissue.geometry.mesh import Mesh
 from palpate.tissue.step import SCHEMES
 from palpate.tissue.types import Views, doubles, fill, ints, struct
@@ -23,8 +24,7 @@ from ..forces import declare_attachments
 from ..forces.passive import Beside, Bodies, Input, Nodes, base, nodes, solver
 from ..layout import BLADE, LAW, TRAIL
 from ..model import flexes, mjstruct
-from . import solid_paths
-from .cuts import Report
+from . import cuts, solid_paths
 from .electrosurgery import Current
 
 if TYPE_CHECKING:
@@ -257,13 +257,13 @@ class Cutters(Beside):
 
     def cut(path: np.ndarray, *deep: np.ndarray) -> tuple[Report, Mesh]:
       if not deep:
-        return w.cuts.cut_at_rest(path, given), w.organ.mesh
+        return cuts.cut_at_rest(w, path, given), w.organ.mesh
       organ = w.organ
       along = None if i in self.by_current else self._along(i)
       now, elem = self._on_surface(path)
       way = solid_paths.direction(organ, w.motion()[0], along, elem)
       now = organ.origin + now @ organ.frame.T
-      return w.cuts.cut(now, given * float(deep[0].mean()), deep[0], way), w.organ.mesh
+      return cuts.cut(w, now, given * float(deep[0].mean()), deep[0], way), w.organ.mesh
 
     if len(mesh.tet):
       edge = mesh.whole.edge_length

@@ -8,8 +8,8 @@ from palpate.tissue import device as devices
 from palpate.tissue import energy, shape
 from palpate.tissue.config import Config
 from palpate.tissue.cutting import cut as cutting
+from palpate.tissue.cutting import facets, refill, surface
 from palpate.tissue.cutting import path as paths
-from palpate.tissue.cutting import refill, surface
 from palpate.tissue.geometry import mesh as topology
 
 SPARE = 120
@@ -162,11 +162,10 @@ def test_a_refilled_body_is_one_made_anew_to_the_bit(kind, device):
   pinned[:3] = True
   body = shape.make(mesh, config, pinned, device, np.inf if kind == "plate" else 0.0)
   bodies.unshare(body)
-  copy = surface.WorkingCopy(mesh)
-  filler = refill.Refill(body, copy)
+  filler = refill.Refill(body, facets.of(mesh, mesh.nelem))
   first = fields(body)
   assert first["fan_width"][-1] == 0 < first["fan_width"][0]  # rows of what waits are left out
-  r, knife = np.random.RandomState(1), cutting.Knife(copy)
+  r, knife = np.random.RandomState(1), cutting.Knife(surface.WorkingCopy(mesh))
   for _ in range(4):
     ends = points[r.choice(np.arange(10, len(points)), 2, replace=False)]
     path = ends[0] + np.linspace(0, 1, 40)[:, None] * (ends[1] - ends[0])
