@@ -49,13 +49,8 @@ def tools_of(model: mujoco.MjModel, organ: Declaration) -> np.ndarray:
   """Returns the geoms that an organ's slots follow.
 
   Raises:
-    ValueError: one is not a tool that a batch knows, or it is not an organ that it can step.
+    ValueError: one is not a tool that a batch knows.
   """
-  if organ.mesh.spare and len(organ.mesh.tet):
-    raise ValueError(
-      f"organ {organ.name!r}: spare is {organ.mesh.spare}, allowed in batches on a GPU only where "
-      "elements is not 'solid'"
-    )
   if organ.windows:
     found = np.unique(organ.windows.geom)
   else:

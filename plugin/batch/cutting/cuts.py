@@ -14,7 +14,7 @@ import warp as wp
 from palpate.engine.cutting.cuts import topology_of
 from palpate.tissue import step
 from palpate.tissue.cutting import facets, topology
-from palpate.tissue.cutting.cut import Apart
+from palpate.tissue.cutting.cut import Cut
 from palpate.tissue.cutting.cut import Motion as Carried
 from palpate.tissue.cutting.facets import Path
 from palpate.tissue.cutting.meshes import Meshes
@@ -30,7 +30,7 @@ from ..patch import Surface
 if TYPE_CHECKING:
   from ..organs import Organ
 
-_OWN = ("rest", "elem", "touch", "source", "share", "held")  # fields of `Patch`
+_OWN = ("rest", "elem", "tet", "touch", "source", "share", "held")  # fields of `Patch`
 _INSIDE = NUMBERS.index("bulk")  # and pressure after it
 
 
@@ -84,7 +84,7 @@ class Cuts:
     self._facets.aim(self._meshes.arrays | starts, node, body.shape.nnode)
     number = body.tissue.number.numpy()[:, _INSIDE : _INSIDE + 2]
     self._worlds: dict[int, World] = {}
-    self._changed: dict[int, list[np.ndarray]] = {}  # vertices and triangles, see `finish`
+    self._changed: dict[int, list[np.ndarray]] = {}  # vertices and elements, see `finish`
     self._whole_count = topology.count(self.whole)
     self._intact = fill(kernels.Whole, body.device, {
       "first": _INSIDE, "count": self._whole_count, "inside": number,
@@ -165,7 +165,7 @@ class Cuts:
 
   # Cutting.
 
-  def find(self, world: int, path: Path, motion: Motion, k: int) -> Apart:
+  def find(self, world: int, path: Path, motion: Motion, k: int) -> Cut:
     """Returns what a path makes of a world, the k-th of a motion."""
     organ = self._organ
     springs = [spring for each in organ.beside for spring in each.springs(world)]
@@ -191,7 +191,7 @@ class Cuts:
     self.finish(worlds, motion)
     return out
 
-  def apply(self, world: int, cut: Apart, motion: Motion, k: int) -> Report:
+  def apply(self, world: int, cut: Cut, motion: Motion, k: int) -> Report:
     """Makes a world the mesh that was found, the k-th of a motion; `finish` is to come."""
     organ, had = self._organ, self._of(world)
     report = self._topology.report(had, cut, organ.config.thickness)
@@ -240,13 +240,14 @@ class Cuts:
   def _upload(self, worlds: list[int]):
     """Gives the device the meshes of worlds, and what follows from them."""
     organ, body = self._organ, self._organ.body
-    own = [self._worlds[world] for world in worlds]
-    changed = [self._changed.pop(world) for world in worlds]
-    changes = [(w.mesh, w.mass, w.source, *c) for w, c in zip(own, changed, strict=True)]
+    changes = [(self._worlds[world], *self._changed.pop(world)) for world in worlds]
     self._surface.write(self._here, worlds, changes)
     self._meshes.upload(worlds)
     for _ in range(2 * body.has_bending):  # what is left of the first time is exact
       self._meshes.angle(worlds, step.rest_angles(body))
+    if body.is_solid:
+      for world in worlds:  # whose blocks have neighbours that are none any more
+        body.system.half[world].zero_()
     mass = np.ones((len(worlds), body.shape.nnode), np.float32)
     scale = organ.patch.mass_scale.numpy()
     for k, world in enumerate(worlds):
@@ -336,7 +337,7 @@ class Cuts:
     return bool(own[spans["stamp"]].any())
 
 
-def _carry(motion: Motion, k: int, cut: Apart, free: np.ndarray):
+def _carry(motion: Motion, k: int, cut: Cut, free: np.ndarray):
   """Gives the vertices of the k-th world of a motion what a cut makes of it."""
   motion.disp[k], motion.vel[k] = cut.motion.disp, cut.motion.vel
   moves = free[cut.member]

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from palpate.tissue import body as bodies
 from palpate.tissue.cutting import stamps
-from palpate.tissue.cutting.cut import Apart
+from palpate.tissue.cutting.cut import Cut
 from palpate.tissue.cutting.facets import Path, World
 from palpate.tissue.cutting.path import check_points
 from palpate.tissue.cutting.refill import Refill
@@ -193,7 +193,7 @@ class Cuts:
 
   # Cutting.
 
-  def take(self, found: Apart, config: Config) -> tuple[Report, np.ndarray]:
+  def take(self, found: Cut, config: Config) -> tuple[Report, np.ndarray]:
     """Takes over a cut that was found; returns what it did, and the vertices that it changed."""
     had, touched = self.world, np.zeros(0, int)
     done = self.topology.report(had, found, config.thickness)
@@ -239,7 +239,7 @@ def _reshape(w: Workspace, touched: np.ndarray):
       record(grown, grown.model)
 
 
-def find(w: Workspace, points: npt.ArrayLike, given=0.0, depth=None, direction=None) -> Apart:
+def find(w: Workspace, points: npt.ArrayLike, given=0.0, depth=None, direction=None) -> Cut:
   """Returns what a cut along points in the world, (n, 3) [m], would make of a workspace's organ."""
   organ = w.organ
   if not w.cuts:
@@ -256,7 +256,7 @@ def find(w: Workspace, points: npt.ArrayLike, given=0.0, depth=None, direction=N
   return _find(w, Path(local, given, depth=depth, direction=direction))
 
 
-def _find(w: Workspace, path: Path) -> Apart:
+def _find(w: Workspace, path: Path) -> Cut:
   follow(w)
   springs = [*w.ties.springs(), *w.bonds.springs()]
   return w.cuts.topology.find(w.cuts.world, *w.motion(), path, w.config, springs)
@@ -275,9 +275,9 @@ def cut(w: Workspace, points: npt.ArrayLike, given=0.0, depth=None, direction=No
   return _take(w, find(w, points, given, depth, direction))
 
 
-def cut_at_rest(w: Workspace, points: np.ndarray, given: float) -> Report:
-  """Cuts a sheet along points on it at rest, in its frame, (n, 3) [m]."""
-  return _take(w, _find(w, Path(points, given, at_rest=True)))
+def cut_path(w: Workspace, path: Path) -> Report:
+  """Cuts a workspace's organ along a path in its frame."""
+  return _take(w, _find(w, path))
 
 
 def tear(w: Workspace) -> bool:
@@ -290,7 +290,7 @@ def tear(w: Workspace) -> bool:
     return False
 
 
-def _take(w: Workspace, found: Apart) -> Report:
+def _take(w: Workspace, found: Cut) -> Report:
   """Makes an organ the mesh that was found; what moved goes on as it moved."""
   group, member, share, motion = found.group, found.member, found.share, found.motion
   if found.stopped:

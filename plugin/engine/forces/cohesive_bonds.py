@@ -66,7 +66,7 @@ class Bonded:
 
 @struct
 class Burning:
-  """A geom whose current frees bonds, see `engine.cutting.electrosurgery`."""
+  """A geom whose current frees bonds, see `engine.cutting.trails`."""
 
   bonds: Bonded
   geom: int

@@ -143,7 +143,6 @@ struct Answer {
       f.share.data[vert + i] = c.share[i];
     }
     for (int i = 0; i < c.elem.count; ++i) f.changed.data[elem + i] = c.elem.list[i];
-    for (int i = 0; i < 3 * c.elem.count; ++i) f.before.data[3 * elem + i] = c.before[i];
     for (int i = 0; i < 2 * seam.count; ++i) f.seam.data[2 * vert + i] = seam.pair[i];
     found[FOUND_NEAR] = c.vert.count, found[FOUND_SPLIT] = c.split.count;
     found[FOUND_CHANGED] = c.elem.count, found[FOUND_EDGES] = seam.count;

@@ -71,7 +71,6 @@ class Cutting:
   member: ints("nworld", "nvert")
   share: doubles("nworld", "nvert")
   changed: ints("nworld", "nelem")
-  before: ints("nworld", "nelem", 3)
   seam: ints("nworld", "nvert", 2)  # edges that came apart
   ints: ints("nworld", "nint")  # scratch
   reals: doubles("nworld", "nreal")
@@ -111,22 +110,25 @@ class Motion:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Apart:
-  """What came of a path, of a surface or a solid: elements are triangles or tetrahedra.
+class Cut:
+  """What came of a path, of a sheet or a solid: elements are triangles or tetrahedra.
 
   Attributes:
     mesh: the mesh, cut
     motion: what its vertices carry, until the next cut
     moved: how many vertices lie elsewhere at rest
-    near: vertices that move on otherwise                 (n,)
-    changed: elements that are not as they were           (n,)
-    group: vertices that were one, which                  (m,)
-    member: those vertices, old and new                   (m,)
-    share: their parts of its mass                        (m,)
-    path: the edges that came apart at rest [m]           list of (k, 3)
+    near: vertices that move on otherwise; of a sheet without those that have come  (n,)
+    changed: elements that are not as they were                (n,)
+    group: vertices that were one, which                       (m,)
+    member: those vertices, old and new                        (m,)
+    share: their parts of its mass                             (m,)
+    path: the edges that came apart at rest, on the skin [m]   list of (k, 3)
     length: of these [m]
     deviation: greatest distance of the path's vertices from it [m]
     stopped: whether there was too little room
+    seat: in a solid, a corner of each member, see `faces.restored`      (m,)
+    area: of the opened faces of a solid, one of each pair, at rest, else None [m^2]
+    depth: how far these go below the skin, along the sheet, at most [m]
   """
 
   mesh: Mesh
@@ -141,17 +143,9 @@ class Apart:
   length: float
   deviation: float
   stopped: bool
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Cut(Apart):
-  """What came of a path on a surface; `near` is without the vertices that have come.
-
-  Attributes:
-    before: corners that the changed triangles had  (n, 3)
-  """
-
-  before: np.ndarray
+  seat: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, np.int64))
+  area: float | None = None
+  depth: float = 0.0
 
 
 class Knife:
@@ -278,7 +272,7 @@ class Knife:
 
   def _answer(self, mesh: Mesh, found: dict[Any, int]) -> Cut:
     host = self._host
-    lists = listed(host, found, {"before": "changed", "group": "split", "member": "split"})
+    lists = listed(host, found, {"group": "split", "member": "split"})
     if found["changed"]:
       closed = mesh.closed and not found["split"]
       mesh = self._copy.take(mesh, closed, bool(found["apart"]), found["nouter"])

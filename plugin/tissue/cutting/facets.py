@@ -6,7 +6,6 @@ plugin state has it. What is above, in one world or many, does not ask which kin
 
 from __future__ import annotations
 
-import abc
 import dataclasses
 from collections.abc import Mapping
 from typing import Any
@@ -19,7 +18,7 @@ from ..geometry import faces
 from ..geometry import mesh as topology
 from ..geometry.mesh import Mesh
 from . import stamps
-from .cut import Apart, Knife, Motion, Springs
+from .cut import Cut, Knife, Motion, Springs
 from .path import Finder
 from .solid_cut import Cleaver
 from .surface import WorkingCopy
@@ -60,8 +59,8 @@ class Path:
   direction: Any = None
 
 
-class Facets(abc.ABC):
-  """What comes apart of a mesh.
+class Edges:
+  """Edges of a sheet.
 
   Args:
     whole: the mesh before the first cut
@@ -73,33 +72,37 @@ class Facets(abc.ABC):
     finder: of places on the surface
   """
 
-  OF_SHAPE: tuple[str, ...]
-  OF_TISSUE: tuple[str, ...]
-  READ: tuple[str, ...]
-  finder: Finder
+  OF_SHAPE, OF_TISSUE, READ = rows.OF_SHAPE, rows.OF_TISSUE, rows.ADDRESSES
 
   def __init__(self, whole: Mesh, room: int):
-    self.whole, self._room = whole, room
+    self.whole, self._room, self._copy = whole, room, WorkingCopy(whole)
+    self.finder = Finder(self._copy)
+    self._knife = self._make_knife()
+    self._rows: Any = None
+    self._config: Config | None = None
 
-  @abc.abstractmethod
+  def _make_knife(self) -> Any:
+    return Knife(self._copy)
+
   def cut(
     self, organ: str, had: World, motion: Motion, path: Path, pinned, config, held: Springs | None
-  ) -> Apart:
+  ) -> Cut:
     """Returns what a path makes of a world; see `Knife.cut` and `Cleaver.cut`."""
-
-  @abc.abstractmethod
-  def extent(self, found: Any, thickness: float) -> tuple[float, float]:
-    """Returns the area that a cut has opened [m^2], and of a solid how deep it is [m]."""
+    if path.depth is not None or path.direction is not None:
+      raise ValueError(
+        f"organ {organ!r}: depth or direction is set, allowed only with elements='solid'"
+      )
+    how = config, held, path.given, path.at_rest
+    return self._knife.cut(organ, had.mesh, motion, path.points, pinned, *how)
 
   def seats(self, had: World, found: Any) -> np.ndarray:
     """Returns the corners of vertices that cuts have made, see `World`."""
     return had.seat
 
-  @abc.abstractmethod
   def touched(self, old: Mesh, new: Mesh, changed: np.ndarray) -> np.ndarray:
     """Returns the vertices that something has changed at, in one mesh and another."""
+    return topology.touched(old, new, changed)
 
-  @abc.abstractmethod
   def aim(self, arrays: Mapping[str, Any], node: np.ndarray, nnode: int, half: Any = None):
     """Writes into other arrays from now on.
 
@@ -109,12 +112,15 @@ class Facets(abc.ABC):
       nnode: number of nodes
       half: of a solid, blocks to clear of neighbours that are none any more, or None
     """
+    if self._rows is None:
+      self._rows = rows.Rows(self._copy, arrays, node)
+    else:
+      self._rows.put(arrays)
 
-  @abc.abstractmethod
   def write(
     self, old: Mesh, new: Mesh, changed: np.ndarray, config: Config, pinned: np.ndarray, skip=0
   ):
-    """Writes what has changed from one mesh to another.
+    """Writes what has changed from one mesh to another, `skip` words on.
 
     Args:
       old: what the arrays have
@@ -127,90 +133,18 @@ class Facets(abc.ABC):
     Raises:
       ValueError: there is no room; nothing has changed then.
     """
-
-  # The plugin state: `own` has its blocks, see `engine.layout.Topology`.
-
-  @abc.abstractmethod
-  def restored(self, own: Mapping[str, np.ndarray], like: Mesh, rest: np.ndarray) -> tuple:
-    """Returns the mesh of a state, what differs from `like`, sources and seats.
-
-    Args:
-      own: blocks of the state
-      like: a mesh of the same whole
-      rest: rest positions [m]  (nvert, 3)
-
-    Raises:
-      ValueError: the state is not one of this organ.
-    """
-
-  @abc.abstractmethod
-  def healed(self, like: Mesh) -> tuple[Mesh, np.ndarray]:
-    """Returns the whole mesh, and what differs from `like`."""
-
-  @abc.abstractmethod
-  def corner(self, world: World, some: Any = slice(None)) -> np.ndarray:
-    """Returns the block `corner`, of some triangles of a sheet or all."""
-
-  @abc.abstractmethod
-  def origin(self, world: World) -> np.ndarray:
-    """Returns the block `source`."""
-
-  def words(self, old: Mesh, new: World, changed: np.ndarray, vert: np.ndarray) -> tuple[Any, Any]:
-    """Returns which words of a state may have changed, None for all, and what they are now."""
-    return None, self.every_word(new)
-
-  def every_word(self, world: World) -> np.ndarray:
-    """Returns the blocks that a stamp is of."""
-    return np.concatenate([self.corner(world), world.mesh.rest.ravel(), world.mass])
-
-
-class Edges(Facets):
-  """Edges of a sheet."""
-
-  OF_SHAPE, OF_TISSUE, READ = rows.OF_SHAPE, rows.OF_TISSUE, rows.ADDRESSES
-
-  def __init__(self, whole: Mesh, room: int):
-    super().__init__(whole, room)
-    self._copy = WorkingCopy(whole)
-    self.finder, self._knife = Finder(self._copy), Knife(self._copy)
-    self._rows: Any = None
-
-  def cut(
-    self, organ: str, had: World, motion: Motion, path: Path, pinned, config, held: Springs | None
-  ) -> Apart:
-    """See `Facets`."""
-    if path.depth is not None or path.direction is not None:
-      raise ValueError(
-        f"organ {organ!r}: depth or direction is set, allowed only with elements='solid'"
-      )
-    how = config, held, path.given, path.at_rest
-    return self._knife.cut(organ, had.mesh, motion, path.points, pinned, *how)
-
-  def extent(self, found: Any, thickness: float) -> tuple[float, float]:
-    """See `Facets`."""
-    return found.length * thickness, 0.0
-
-  def touched(self, old: Mesh, new: Mesh, changed: np.ndarray) -> np.ndarray:
-    """See `Facets`."""
-    return topology.touched(old, new, changed)
-
-  def aim(self, arrays: Mapping[str, Any], node: np.ndarray, nnode: int, half: Any = None):
-    """See `Facets`."""
-    if self._rows is None:
-      self._rows = rows.Rows(self._copy, arrays, node)
-    else:
-      self._rows.put(arrays)
-
-  def write(
-    self, old: Mesh, new: Mesh, changed: np.ndarray, config: Config, pinned: np.ndarray, skip=0
-  ):
-    """See `Facets`."""
     loosened = new.loose is not old.loose
     if not self._rows.write(new, config, pinned, changed, old.elem[changed], loosened, skip):
       raise ValueError("cuts that meet leave no room in the bending matrix")
 
+  # The plugin state: `own` has its blocks, see `engine.layout.Topology`.
+
   def restored(self, own: Mapping[str, np.ndarray], like: Mesh, rest: np.ndarray) -> tuple:
-    """See `Facets`."""
+    """Returns the mesh of a state, what differs from one like it, sources and seats.
+
+    Raises:
+      ValueError: the state is not one of this organ.
+    """
     whole = self.whole
     elem, loose = stamps.unpack(own["corner"])
     source = np.append(np.arange(whole.nvert - whole.spare), own["source"]).astype(int)
@@ -219,53 +153,49 @@ class Edges(Facets):
     return *topology.recut(like, rest, elem, loose), source, np.zeros(0, np.int64)
 
   def healed(self, like: Mesh) -> tuple[Mesh, np.ndarray]:
-    """See `Facets`."""
+    """Returns the whole mesh, and what differs from `like`."""
     return topology.recut(like, self.whole.rest, self.whole.elem)
 
   def corner(self, world: World, some: Any = slice(None)) -> np.ndarray:
-    """See `Facets`."""
-    loose = world.mesh.loose
-    return stamps.pack(world.mesh.elem[some], None if loose is None else loose[some])
+    """Returns the block `corner`, of some triangles of a sheet or all."""
+    mesh = world.mesh
+    return stamps.pack(mesh.elem[some], None if mesh.loose is None else mesh.loose[some])
 
   def origin(self, world: World) -> np.ndarray:
-    """See `Facets`."""
+    """Returns the block `source`."""
     return world.source[self.whole.nvert - self.whole.spare :].astype(float)
 
   def words(self, old: Mesh, new: World, changed: np.ndarray, vert: np.ndarray) -> tuple[Any, Any]:
-    """See `Facets`."""
+    """Returns which words of a state may have changed, None for all, and what they are now."""
     mesh = new.mesh
-    if mesh.loose is not old.loose or old.uncut is None:
+    if len(mesh.tet) or mesh.loose is not old.loose or old.uncut is None:
       return None, self.every_word(new)
     place = (3 * vert[:, None] + np.arange(3)).ravel()
     at = np.concatenate([changed, mesh.nelem + place, mesh.nelem + 3 * mesh.nvert + vert])
     return at, np.concatenate([self.corner(new, changed), mesh.rest[vert].ravel(), new.mass[vert]])
 
+  def every_word(self, world: World) -> np.ndarray:
+    """Returns the blocks that a stamp is of."""
+    return np.concatenate([self.corner(world), world.mesh.rest.ravel(), world.mass])
 
-class Faces(Facets):
-  """Faces between the tetrahedra of a solid."""
+
+class Faces(Edges):
+  """Faces between the tetrahedra of a solid: what of these is not as of edges."""
 
   OF_SHAPE, OF_TISSUE, READ = tets.OF_SHAPE, tets.OF_TISSUE, tets.ADDRESSES
 
-  def __init__(self, whole: Mesh, room: int):
-    super().__init__(whole, room)
-    self.finder = Finder(WorkingCopy(whole))
-    self._cleaver = Cleaver(whole, self.finder, room)
-    self._tets: Any = None
-    self._config: Config | None = None
+  def _make_knife(self) -> Any:
+    return Cleaver(self.whole, self.finder, self._room)
 
   def cut(
     self, organ: str, had: World, motion: Motion, path: Path, pinned, config, held: Springs | None
-  ) -> Apart:
-    """See `Facets`."""
+  ) -> Cut:
+    """See `Edges`."""
     how = pinned, path.depth, path.direction, config, path.given
-    return self._cleaver.cut(organ, had.mesh, motion, path.points, *how)
-
-  def extent(self, found: Any, thickness: float) -> tuple[float, float]:
-    """See `Facets`."""
-    return found.area, found.depth
+    return self._knife.cut(organ, had.mesh, motion, path.points, *how)
 
   def seats(self, had: World, found: Any) -> np.ndarray:
-    """See `Facets`."""
+    """See `Edges`."""
     first = self.whole.nouter
     seat = np.zeros(found.mesh.nouter - first, np.int64)
     seat[: len(had.seat)] = had.seat
@@ -274,29 +204,29 @@ class Faces(Facets):
     return seat
 
   def touched(self, old: Mesh, new: Mesh, changed: np.ndarray) -> np.ndarray:
-    """See `Facets`."""
+    """See `Edges`."""
     return topology.distinct(old.tet[changed], new.tet[changed])
 
   def aim(self, arrays: Mapping[str, Any], node: np.ndarray, nnode: int, half: Any = None):
-    """See `Facets`."""
-    if self._tets is None:
-      self._tets = tets.Tets(self.whole, tets.layout(self.whole, node, nnode), node, arrays)
+    """See `Edges`."""
+    if self._rows is None:
+      self._rows = tets.Tets(self.whole, tets.layout(self.whole, node, nnode), node, arrays)
     else:
-      self._tets.put(arrays)
+      self._rows.put(arrays)
     if half is not None:
-      self._tets.clear(half)
+      self._rows.clear(half)
 
   def write(
     self, old: Mesh, new: Mesh, changed: np.ndarray, config: Config, pinned: np.ndarray, skip=0
   ):
-    """See `Facets`."""
+    """See `Edges`."""
     moduli = None if config == self._config else solid.moduli(new, config)
-    if not self._tets.write(new, moduli, pinned | new.unused, changed, old, skip):
+    if not self._rows.write(new, moduli, pinned | new.unused, changed, old, skip):
       raise ValueError("cuts leave no room for edges; give the organ more spare vertices")
     self._config = config
 
   def restored(self, own: Mapping[str, np.ndarray], like: Mesh, rest: np.ndarray) -> tuple:
-    """See `Facets`."""
+    """See `Edges`."""
     whole, n = self.whole, self.whole.nelem
     face, seat = (np.rint(np.clip(each[each > 0], 0, 2.0**52)).astype(np.int64) - 1
                   for each in (own["corner"][n:], own["source"]))  # fmt: skip
@@ -309,11 +239,11 @@ class Faces(Facets):
     return dataclasses.replace(mesh, loose=loose), changed, source, seat
 
   def healed(self, like: Mesh) -> tuple[Mesh, np.ndarray]:
-    """See `Facets`."""
+    """See `Edges`."""
     return faces.grown(like, self.whole.rest, self.whole.tet, self.whole.of_tet)
 
   def corner(self, world: World, some: Any = slice(None)) -> np.ndarray:
-    """See `Facets`: of walls their faces, from 1."""
+    """See `Edges`: of walls their faces, from 1."""
     mesh, n = world.mesh, self.whole.nelem
     out = np.zeros(self._room)
     out[:n] = stamps.pack(mesh.elem[:n], None if mesh.loose is None else mesh.loose[:n])
@@ -322,12 +252,12 @@ class Faces(Facets):
     return out
 
   def origin(self, world: World) -> np.ndarray:
-    """See `Facets`: corners, from 1."""
+    """See `Edges`: corners, from 1."""
     out = np.zeros(self.whole.spare)
     out[: len(world.seat)] = world.seat + 1
     return out
 
 
-def of(whole: Mesh, room: int) -> Facets:
+def of(whole: Mesh, room: int) -> Edges:
   """Returns what comes apart of a mesh; `room`: triangles that there may be."""
   return (Faces if len(whole.tet) else Edges)(whole, room)

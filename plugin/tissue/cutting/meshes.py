@@ -14,7 +14,7 @@ import warp as wp
 
 from .. import body as bodies
 from ..body import Body
-from .facets import Facets
+from .facets import Edges
 
 _WARP = {np.dtype(np.int32): wp.int32, np.dtype(np.float32): wp.float32,
          np.dtype(np.float64): wp.float64}  # fmt: skip
@@ -43,7 +43,7 @@ class Meshes:
     arrays: all arrays of the first of these rows; those of others are `open` words on
   """
 
-  def __init__(self, body: Body, facets: Facets, more: dict[str, np.ndarray]):
+  def __init__(self, body: Body, facets: Edges, more: dict[str, np.ndarray]):
     self._device = body.device
     of_shape = *facets.OF_SHAPE, _ANGLE
     arrays = {name: getattr(body.shape, name) for name in of_shape}

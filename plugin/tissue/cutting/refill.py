@@ -13,7 +13,7 @@ from .. import shape, step
 from ..body import Body, arrays
 from ..config import Config
 from ..geometry.mesh import Mesh
-from .facets import Facets
+from .facets import Edges
 
 
 class Refill:
@@ -24,7 +24,7 @@ class Refill:
     facets: what comes apart
   """
 
-  def __init__(self, body: Body, facets: Facets):
+  def __init__(self, body: Body, facets: Edges):
     self._body, self._facets = body, facets
     self.mesh: Mesh = facets.whole
     self._arrays = arrays(body)

@@ -17,7 +17,7 @@ from ..geometry import fill
 from ..geometry import mesh as topology
 from ..geometry.mesh import Mesh
 from . import facets, stamps
-from .cut import Apart, Motion, Springs
+from .cut import Cut, Motion, Springs
 from .facets import Path, World
 
 BLOCKS = ("corner", "place", "weight", "source", "stamp")  # of the plugin state
@@ -93,7 +93,7 @@ class Topology:
 
   def find(
     self, had: World, disp: np.ndarray, vel: np.ndarray, path: Path, config: Config, springs: list
-  ) -> Apart:
+  ) -> Cut:
     """Returns what a path makes of a world.
 
     Args:
@@ -107,19 +107,19 @@ class Topology:
     motion, held = Motion(had.mass, disp, vel), together(springs, self.whole.nvert)
     return self.facets.cut(self._name, had, motion, path, self._pinned, config, held)
 
-  def taken(self, had: World, found: Apart) -> World:
+  def taken(self, had: World, found: Cut) -> World:
     """Returns what a world becomes by a cut that was found."""
     source = had.source.copy()
     source[found.member] = source[found.group]
     return World(found.mesh, found.motion.mass.copy(), source, self.facets.seats(had, found))
 
-  def report(self, had: World, found: Apart, thickness: float) -> Report:
+  def report(self, had: World, found: Cut, thickness: float) -> Report:
     """Returns what a cut that was found does to a world."""
     frame, origin = self._frame
     path = [origin + line @ frame.T for line in found.path]
     nodes = found.mesh.nouter - had.mesh.nouter
-    area, depth = self.facets.extent(found, thickness)
-    return Report(found.length, area, path, found.deviation, nodes, found.stopped, depth)
+    area = found.length * thickness if found.area is None else found.area
+    return Report(found.length, area, path, found.deviation, nodes, found.stopped, found.depth)
 
   def share(self, world: World, values: np.ndarray, vert: Any = slice(None)) -> np.ndarray:
     """Returns what has become of values by mass of the whole's vertices, at some or all, (n,).
