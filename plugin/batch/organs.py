@@ -264,9 +264,9 @@ class Organ(Tissue):
   def _spare(self) -> int:
     return self.declared.mesh.spare
 
-  def _cut(self, points: dict[int, np.ndarray]) -> list[Report | None]:
+  def _cut(self, points: dict[int, np.ndarray], depth, direction) -> list[Report | None]:
     assert self._cuts is not None
-    return self._cuts.cut(points)
+    return self._cuts.cut(points, depth, direction)
 
   def _told(self, name: str, world: int) -> list:
     if self._cuts is None:

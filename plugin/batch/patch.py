@@ -204,8 +204,9 @@ class Surface:
     if organ.windows:
       self._held = proxies.hold(organ, mass)
     else:
-      wall = proxies.WALL * organ.mass[organ.free].sum()
-      self._held = np.where(organ.free, mass, wall)
+      wall, own = proxies.WALL * organ.mass[organ.free].sum(), mass[organ.jointed]
+      some = own[own > 0].mean()  # as `prepare` gives it to what waits for a cut
+      self._held = np.where(organ.free, np.where(mass > 0, mass, some), wall)
 
   def make(self, mesh) -> dict[str, np.ndarray]:
     """Returns the fields of `Patch` that a cut changes, of the mesh before the first one."""

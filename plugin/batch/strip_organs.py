@@ -19,7 +19,7 @@ import numpy as np
 from palpate import windows
 from palpate.engine import contacts
 from palpate.engine.contacts import TISSUE
-from palpate.engine.model import mjstruct
+from palpate.engine.model import flexes, mjstruct
 
 from .contact.contacts import KINDS
 
@@ -187,6 +187,10 @@ def _slot_mass(organ: Declaration) -> float:
 
 def _take_out(bare, bodies: dict, organ: Declaration, model):
   """Deletes an organ's flexes and the bodies of its nodes or windows."""
+  names = [flex.name for flex in bare.flexes]
+  walls = flexes.resolve(organ.config.walls, organ.name, names) if organ.config.walls else None
+  if walls is not None:
+    bare.delete(bare.flex(walls))
   for number in {organ.flex, *organ.flexes}:
     name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_FLEX, int(number))
     flex = bare.flex(name)

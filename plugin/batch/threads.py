@@ -216,14 +216,14 @@ class _Tissue(Tissue):
   def _spare(self) -> int:
     return self.spaces[0].organ.mesh.spare
 
-  def _cut(self, points: dict[int, np.ndarray]) -> list[Report | None]:
+  def _cut(self, points: dict[int, np.ndarray], depth, direction) -> list[Report | None]:
     for world, path in points.items():
       try:
-        cutting.find(self.spaces[world], path)
+        cutting.find(self.spaces[world], path, 0.0, depth, direction)
       except ValueError as error:
         raise ValueError(f"world {world}: {error}") from None
     return [
-      handle.cut(points[world]) if world in points else None
+      handle.cut(points[world], depth, direction) if world in points else None
       for world, handle in enumerate(self.handles)
     ]
 

@@ -174,15 +174,15 @@ class Cuts:
     kept = (getattr(found.motion, name).copy() for name in ("mass", "disp", "vel"))
     return dataclasses.replace(found, motion=Carried(*kept))
 
-  def cut(self, points: dict[int, np.ndarray]) -> list[Report | None]:
+  def cut(self, points: dict[int, np.ndarray], depth, direction) -> list[Report | None]:
     """Cuts worlds along points in the world's axes, (n, 3) [m] each; see `Tissue.cut`."""
     self.follow()
     organ, worlds = self._organ, sorted(points)
     motion, found = self.motion(worlds), []
     for k, world in enumerate(worlds):
-      local = (points[world] - organ.declared.origin) @ organ.declared.frame
       try:
-        found.append(self.find(world, Path(local), motion, k))
+        path = self._topology.path(points[world], 0.0, depth, direction)
+        found.append(self.find(world, path, motion, k))
       except ValueError as error:
         raise ValueError(f"world {world}: {error}") from None
     out: list[Report | None] = [None] * organ.body.nworld

@@ -18,7 +18,6 @@ from palpate.tissue import body as bodies
 from palpate.tissue.cutting import stamps
 from palpate.tissue.cutting.cut import Cut
 from palpate.tissue.cutting.facets import Path, World
-from palpate.tissue.cutting.path import check_points
 from palpate.tissue.cutting.refill import Refill
 from palpate.tissue.cutting.topology import BLOCKS, Report, Topology
 from palpate.tissue.geometry import mesh as topology
@@ -241,19 +240,11 @@ def _reshape(w: Workspace, touched: np.ndarray):
 
 def find(w: Workspace, points: npt.ArrayLike, given=0.0, depth=None, direction=None) -> Cut:
   """Returns what a cut along points in the world, (n, 3) [m], would make of a workspace's organ."""
-  organ = w.organ
   if not w.cuts:
     raise ValueError(
-      f"organ {organ.name!r}: spare is 0, expected room for cuts: palpate.add_organ(..., spare=)"
+      f"organ {w.organ.name!r}: spare is 0, expected room for cuts: palpate.add_organ(..., spare=)"
     )
-  if direction is not None and np.shape(direction) != (3,):
-    raise ValueError(
-      f"organ {organ.name!r}: direction is {direction}, expected three numbers, not all 0"
-    )
-  if direction is not None:
-    direction = np.asarray(direction, float) @ organ.frame
-  local = (check_points(organ.name, points) - organ.origin) @ organ.frame
-  return _find(w, Path(local, given, depth=depth, direction=direction))
+  return _find(w, w.cuts.topology.path(points, given, depth, direction))
 
 
 def _find(w: Workspace, path: Path) -> Cut:

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from ..config import Config
 from ..geometry import fill
@@ -19,6 +20,7 @@ from ..geometry.mesh import Mesh
 from . import facets, stamps
 from .cut import Cut, Motion, Springs
 from .facets import Path, World
+from .path import check_points
 
 BLOCKS = ("corner", "place", "weight", "source", "stamp")  # of the plugin state
 FOREIGN = "plugin_state has cuts that are not of this organ; set a state that was saved from it"
@@ -90,6 +92,22 @@ class Topology:
     self.first = World(whole, mass.copy(), np.arange(whole.nvert), np.zeros(0, np.int64))
     self._ranked: np.ndarray | None = None  # see `_of_skin`
     self._median = 0.0
+
+  def path(self, points: npt.ArrayLike, given=0.0, depth=None, direction=None) -> Path:
+    """Returns a path of points in the world, (n, 3) [m], see `Path`; `direction` is there too.
+
+    Raises:
+      ValueError: these are no points, or that is no direction.
+    """
+    frame, origin = self._frame
+    if direction is not None:
+      if np.shape(direction) != (3,):
+        raise ValueError(
+          f"organ {self._name!r}: direction is {direction}, expected three numbers, not all 0"
+        )
+      direction = np.asarray(direction, float) @ frame
+    local = (check_points(self._name, points) - origin) @ frame
+    return Path(local, given, depth=depth, direction=direction)
 
   def find(
     self, had: World, disp: np.ndarray, vel: np.ndarray, path: Path, config: Config, springs: list
