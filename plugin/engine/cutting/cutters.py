@@ -208,8 +208,6 @@ class Cutters(Beside):
     self.fields = fill(Blades, "cpu", values)
     self._here, self._own = Views(self.fields), Views(self.fields.own)
     self._due = self._here.due.data
-    if w.cuts and not len(mesh.tet):
-      assert w.cuts.finder.stops  # made now, since its kernel takes a while to load
 
   def refresh(self):
     """Takes the thickness that the wall has now."""

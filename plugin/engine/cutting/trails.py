@@ -13,6 +13,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from palpate.tissue.cutting import crack_front
 from palpate.tissue.cutting.facets import Path
 from palpate.tissue.cutting.path import Finder
 from palpate.tissue.cutting.topology import Report
@@ -183,7 +184,7 @@ def open_path(
     deep = np.maximum(np.append(below, row[BLADE.depth]), PIERCED)
   if not ended:
     if deep is None:
-      path, rest = finder.stops.part(mesh, path)
+      path, rest = crack_front.part(finder, mesh, path)
     else:
       path, deep = _until(path, deep, left - _BEHIND * edge)
   report, why = None, ""
