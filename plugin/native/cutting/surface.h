@@ -42,20 +42,18 @@ struct Surface {
   }
 };
 
-// The surface of a world in arrays of such names, all of them with the worlds one after the other.
+// The surface in arrays of such names.
 template <class F>
-PALPATE auto surface_of(const F& f, int world) {
+PALPATE auto surface_of(const F& f) {
   using I = decltype(f.elem.data[0] + 0);
-  const long long v = world * (long long)f.nvert, t = world * (long long)f.nelem;
-  return Surface<I>{f.nvert, f.nelem, f.most, f.rest.data + 3 * v, f.elem.data + 3 * t,
-                    f.twin.data + 3 * t, f.ring.data + f.most * v, f.spoke.data + f.most * v,
-                    f.degree.data + v, f.whole_elem.data, f.whole_twin.data};
+  return Surface<I>{f.nvert, f.nelem, f.most, f.rest.data, f.elem.data, f.twin.data, f.ring.data,
+                    f.spoke.data, f.degree.data, f.whole_elem.data, f.whole_twin.data};
 }
 
 // What vertices carry.
 struct Moving { double *mass, *disp, *vel; };
 
-// Scratch of a world; numbers that are taken are zero, unless they are room alone.
+// Scratch; numbers that are taken are zero, unless they are room alone.
 struct Scratch {
   int* ints;
   double* reals;

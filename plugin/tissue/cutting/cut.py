@@ -39,7 +39,7 @@ _NUMBERS = {
 
 @struct
 class Cutting:
-  """What cuts of nworld surfaces of one whole read and write; the surfaces are other ones then."""
+  """What a cut of a surface reads and writes; the surface is another one then."""
 
   surface: Surface
   most_points: int  # points of a path
@@ -53,27 +53,27 @@ class Cutting:
   stiffness: wp.float64  # of an edge's spring [N/m]
   given: wp.float64  # by which the energy around a vertex may rise as it moves [J]
   home: longs("nelem")  # `Mesh.home`
-  mass: doubles("nworld", "nvert")  # of vertices, before and after [kg]
-  disp: doubles("nworld", "nvert", 3)  # displacement [m]
-  vel: doubles("nworld", "nvert", 3)  # velocity [m/s]
-  pinned: flags("nworld", "nvert")  # whether a vertex does not move
+  mass: doubles("nvert")  # of vertices, before and after [kg]
+  disp: doubles("nvert", 3)  # displacement [m]
+  vel: doubles("nvert", 3)  # velocity [m/s]
+  pinned: flags("nvert")  # whether a vertex does not move
   lame: doubles("nelem")  # of triangles [Pa]
   shear: doubles("nelem")  # [Pa]
-  whole: doubles("nworld", "nvert")  # energy of springs at vertices [J]
-  pull: doubles("nworld", "nvert", 3)  # its gradient [N]
-  hard: doubles("nworld", "nvert")  # their stiffness [N/m]
-  npoint: ints("nworld")  # points of the path
-  point: doubles("nworld", "most_points", 3)  # these, where the surface is now, or at rest [m]
-  found: ints("nworld", len(_FOUND))  # see _FOUND; nouter is read too
-  size: doubles("nworld", len(_SIZE))  # see _SIZE
-  near: ints("nworld", "nvert")  # see `Cut`, these and what follows
-  group: ints("nworld", "nvert")
-  member: ints("nworld", "nvert")
-  share: doubles("nworld", "nvert")
-  changed: ints("nworld", "nelem")
-  seam: ints("nworld", "nvert", 2)  # edges that came apart
-  ints: ints("nworld", "nint")  # scratch
-  reals: doubles("nworld", "nreal")
+  whole: doubles("nvert")  # energy of springs at vertices [J]
+  pull: doubles("nvert", 3)  # its gradient [N]
+  hard: doubles("nvert")  # their stiffness [N/m]
+  npoint: ints(1)  # points of the path
+  point: doubles("most_points", 3)  # these, where the surface is now, or at rest [m]
+  found: ints(len(_FOUND))  # see _FOUND; nouter is read too
+  size: doubles(len(_SIZE))  # see _SIZE
+  near: ints("nvert")  # see `Cut`, these and what follows
+  group: ints("nvert")
+  member: ints("nvert")
+  share: doubles("nvert")
+  changed: ints("nelem")
+  seam: ints("nvert", 2)  # edges that came apart
+  ints: ints("nint")  # scratch
+  reals: doubles("nreal")
 
 
 _cut = kernel("cut_surface", "cutting/cut.h", Cutting, CONSTANTS | _NUMBERS)

@@ -49,7 +49,7 @@ class Finder:
     self._fields = fields = Nearest()
     fields.nvert, fields.nelem, fields.solid = whole.nvert, whole.nelem, int(len(whole.tet) > 0)
     fields.most, fields.edge = copy.sizes["most"], whole.edge_length
-    fields.elem, fields.spoke, fields.degree = there.elem[0], there.spoke[0], there.degree[0]
+    fields.elem, fields.spoke, fields.degree = there.elem, there.spoke, there.degree
     self._x, self._box = np.zeros((whole.nvert, 3)), np.zeros(whole.nvert + whole.nelem, np.int32)
     fields.x, fields.box = _wrap(self._x), _wrap(self._box)
     self._launch = _nearest.command(fields).launch
