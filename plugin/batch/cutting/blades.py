@@ -14,7 +14,6 @@ from palpate.engine.cutting import cutters, trails
 from palpate.engine.layout import BLADE, LAW
 from palpate.engine.model import mjstruct
 from palpate.tissue.geometry.mesh import Mesh
-from palpate.tissue.step import SCHEMES
 from palpate.tissue.types import allocate, doubles, fill, floats, ints, struct
 
 from ..forces import base
@@ -95,7 +94,6 @@ class Blades(base.Opens):
   def __init__(self, organ: "Organ"):
     super().__init__(organ)
     space, body, n = organ.space, organ.body, len(organ.config.cutters)
-    mesh, scheme = organ.declared.mesh, SCHEMES[organ.config.integrator]
     self._model = mjstruct.Model.from_address(space.model)
     widths = cutters.WIDTHS.items()
     law = space.cutters.law(self._model, organ.config.thickness)
@@ -103,18 +101,12 @@ class Blades(base.Opens):
       name: self._zeros(self._nworld, n, wide, dtype=_WorldBlades.vars[name].type.dtype)
       for name, wide in widths
     }
-    self._edges = space.cutters.edges()
+    self._edges = space.cutters.constants()
     values |= self._edges | dict(
-      nblade=n,
-      nelem=mesh.nelem,
-      ntet=len(mesh.tet),
-      tet=organ.patch.tet,
-      ahead=float(scheme.ahead),
-      gain=scheme.gain(1.0, 0.0),
-      edge=float(mesh.whole.edge_length),
       law=np.tile(law, (self._nworld, 1, 1)),
       mesh=organ.patch.mesh,
       elem=organ.patch.elem,
+      tet=organ.patch.tet,
       flat=organ.patch.rest,
       state=self._keep("blade", np.arange(n), len(BLADE)),
       due=self._zeros(self._nworld, n, dtype=int),

@@ -170,9 +170,17 @@ class Cutters(Beside):
     """Names of the geoms that cut by a current."""
     return [self.names[i][0] for i in self.by_current]
 
-  def edges(self) -> dict[str, np.ndarray]:
-    """Returns the fields of `Blades` that say which geoms they are, and their edges."""
-    return self._arrays
+  def constants(self) -> dict[str, Any]:
+    """Returns the fields of `Blades` that say which geoms they are and what they meet."""
+    mesh, scheme = self._w.organ.mesh, SCHEMES[self._w.config.integrator]
+    return self._arrays | dict(
+      nblade=len(self.names),
+      nelem=mesh.whole.nelem,
+      ntet=len(mesh.tet),
+      ahead=float(scheme.ahead),
+      gain=scheme.gain(1.0, 0.0),
+      edge=float(mesh.whole.edge_length),
+    )
 
   @property
   def state(self) -> np.ndarray:
@@ -184,15 +192,9 @@ class Cutters(Beside):
     if not self:
       return
     w, n, mesh = self._w, len(self.names), self._w.organ.mesh
-    m, scheme = mjstruct.Model.from_address(model), SCHEMES[w.config.integrator]
+    m = mjstruct.Model.from_address(model)
     values = {name: np.zeros((n, width)) for name, width in WIDTHS.items()}
-    values |= self._arrays | dict(
-      nblade=n,
-      nelem=mesh.whole.nelem,
-      ntet=len(mesh.tet),
-      ahead=float(scheme.ahead),
-      gain=scheme.gain(1.0, 0.0),
-      edge=float(mesh.whole.edge_length),
+    values |= self.constants() | dict(
       law=self.law(m, w.config.thickness),
       mesh=np.zeros(1),
       elem=mesh.elem[: mesh.whole.nelem],

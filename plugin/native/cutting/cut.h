@@ -170,12 +170,11 @@ PALPATE int cut_along(const F& f, const S& m, const Material& p, const Path& pat
   for (int r = 0; r < path.nrun && made.elem.count; ++r)
     apart = apart || may_separate(chains, r, made.split);
   if (!apart) return DONE;
-  Pieces pieces = {memory.numbers(m.nelem), memory.numbers(m.nelem), memory.numbers(m.nelem),
-                   memory.numbers(m.nelem), memory.numbers(m.nelem), memory.values(m.nelem)};
+  const Pieces pieces = all_apart(memory, m.nvert);
   if (memory.full) return NO_ROOM;
-  come_loose(m, f.home.data, f.surface.loose.data, pieces);
+  for (int h = 0; h < 3 * m.nelem; ++h) pieces.join(m.from(h), m.to(h));
   found[FOUND_APART] = 1;
-  return DONE;
+  return let_go(m, pieces, f.home.data, f.surface.loose.data, memory) ? DONE : NO_ROOM;
 }
 
 // Finds the places of a surface that are nearest to points.

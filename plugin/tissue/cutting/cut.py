@@ -272,7 +272,7 @@ class Knife:
 
   def _answer(self, mesh: Mesh, found: dict[Any, int]) -> Cut:
     host = self._host
-    lists = listed(host, found, {"group": "split", "member": "split"})
+    lists: Any = listed(host, found, {"group": "split", "member": "split"})
     if found["changed"]:
       closed = mesh.closed and not found["split"]
       mesh = self._copy.take(mesh, closed, bool(found["apart"]), found["nouter"])
