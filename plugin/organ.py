@@ -7,13 +7,14 @@ import numpy as np
 import numpy.typing as npt
 from palpate.engine import change, penetration, signals, workspace
 from palpate.engine import plugin as engine
-from palpate.engine.cutting.cuts import Piece, Report
+from palpate.engine.cutting import cuts as cutting
 from palpate.engine.cutting.cutters import Cutter
 from palpate.engine.layout import FLAG
 from palpate.engine.model import mjstruct
 from palpate.engine.windows import windowed
 from palpate.tissue import energy
 from palpate.tissue.config import Config
+from palpate.tissue.cutting.topology import Piece, Report, pieces
 from palpate.tissue.geometry import fill
 from palpate.tissue.geometry import mesh as topology
 
@@ -47,7 +48,7 @@ class Organ:
   @property
   def _organ(self):
     """The organ as it is now, cut or not."""
-    self._space.cuts.follow()
+    cutting.follow(self._space)
     return self._space.organ
 
   @property
@@ -197,14 +198,14 @@ class Organ:
         goes through pinned vertices; the depth is not above 0, or the organ is no solid.
     """
     inward = (None if v is None else np.asarray(v, dtype=float) for v in (depth, direction))
-    report = self._space.cuts.cut(points, 0.0, *inward)
+    report = cutting.cut(self._space, points, 0.0, *inward)
     workspace.place(self._space, self.model._address)
     return report
 
   @property
   def cuts(self) -> tuple[Report, ...]:
     """What `cut` has done in this data, but not what a state that was set or copied brought."""
-    self._space.cuts.follow()
+    cutting.follow(self._space)
     return tuple(self._space.cuts.reports)
 
   @property
@@ -215,8 +216,8 @@ class Organ:
   @property
   def pieces(self) -> tuple[Piece, ...]:
     """The parts of the organ that hang together, the heaviest first."""
-    self._space.cuts.follow()
-    return tuple(self._space.cuts.pieces())
+    organ = self._organ
+    return tuple(pieces(organ.mesh, organ.mass, self.config.thickness))
 
   @property
   def nvert(self) -> int:

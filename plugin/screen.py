@@ -72,8 +72,7 @@ def _drop_removed_sizes() -> None:
   dm_control 1.0.50 reads every array in that table. The table is the one of MuJoCo 3.17, of which
   4.0 has removed nine. Remove this function when dm_control has followed.
   """
-  import mujoco
-
+  mujoco = importlib.import_module("mujoco")
   sizes = importlib.import_module("dm_control.mujoco.wrapper.mjbindings.sizes").array_sizes
   model = mujoco.MjModel.from_xml_string("<mujoco/>")
   for name, owner in (("mjmodel", model), ("mjdata", mujoco.MjData(model))):

@@ -14,7 +14,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import warp as wp
-from palpate.engine.cutting.cuts import Report
+from palpate.tissue.cutting.topology import Report
 
 from .base import Batch, Contacts, Tissue, on_device, spread
 from .bonds import Gathered
@@ -191,11 +191,11 @@ class _Gathered(Tissue):
   def _spare(self) -> int:
     return self._parts[0]._spare
 
-  def _cut(self, points: dict[int, np.ndarray]) -> list[Report | None]:
+  def _cut(self, points: dict[int, np.ndarray], depth, direction) -> list[Report | None]:
     out: list[Report | None] = []
     for at, part in zip(self.batch.slices, self._parts, strict=True):
       own = {world - at.start: points[world] for world in points if at.start <= world < at.stop}
-      out += part._cut(own) if own else [None] * (at.stop - at.start)
+      out += part._cut(own, depth, direction) if own else [None] * (at.stop - at.start)
     return out
 
   def _told(self, name: str, world: int) -> list:

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 from palpate.engine import coupling
-from palpate.engine.cutting.cuts import Report, pieces
 from palpate.engine.windows import proxies
 from palpate.forces.passive import Forces
 from palpate.forces.table import FORCES
@@ -17,6 +16,7 @@ from palpate.tissue import body as bodies
 from palpate.tissue import config as configuration
 from palpate.tissue import device as devices
 from palpate.tissue import order, shape, step
+from palpate.tissue.cutting.topology import Report, pieces
 
 from . import bonds, host, kernels, patch
 from .base import Contacts, Tissue, spread
@@ -270,9 +270,9 @@ class Organ(Tissue):
   def _spare(self) -> int:
     return self.declared.mesh.spare
 
-  def _cut(self, points: dict[int, np.ndarray]) -> list[Report | None]:
+  def _cut(self, points: dict[int, np.ndarray], depth, direction) -> list[Report | None]:
     assert self._cuts is not None
-    return self._cuts.cut(points)
+    return self._cuts.cut(points, depth, direction)
 
   def _told(self, name: str, world: int) -> list:
     if self._cuts is None:

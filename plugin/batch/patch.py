@@ -13,6 +13,7 @@ from palpate.engine.layout import GEOM
 from palpate.engine.model import inertia, mjstruct
 from palpate.engine.windows import proxies
 from palpate.tissue import step
+from palpate.tissue.cutting.facets import World
 from palpate.tissue.types import Array, Tissue, doubles, fill, floats, ints, struct, vector
 
 if TYPE_CHECKING:
@@ -67,7 +68,8 @@ class Patch:
   # The organ's mesh, of worlds that are cut their own:
   mesh: ints("nworld")  # which of these a world has
   rest: doubles("nmesh", "nnode", 3)  # rest position [m]
-  elem: ints("nmesh", "nelem", 3)  # nodes of a triangle
+  elem: ints("nmesh", "nelem", 3)  # nodes of a triangle, of solids those of the skin
+  tet: ints("nmesh", "ntet", 4)  # nodes of a tetrahedron, of solids that may be cut
   touch: doubles("nmesh", "nnode")  # distance of a geom within which its triangles may touch it [m]
   source: ints("nmesh", "nnode")  # what a node was before it was divided
   share: doubles("nmesh", "nnode")  # its part of that; 0 where it waits for a cut
@@ -199,8 +201,9 @@ class Surface:
     if organ.windows:
       self._held = proxies.hold(organ, mass)
     else:
-      wall = proxies.WALL * organ.mass[organ.free].sum()
-      self._held = np.where(organ.free, mass, wall)
+      wall, own = proxies.WALL * organ.mass[organ.free].sum(), mass[organ.jointed]
+      some = own[own > 0].mean()  # as `prepare` gives it to what waits for a cut
+      self._held = np.where(organ.free, np.where(mass > 0, mass, some), wall)
 
   def make(self, mesh) -> dict[str, np.ndarray]:
     """Returns the fields of `Patch` that a cut changes, of the mesh before the first one."""
@@ -208,14 +211,16 @@ class Surface:
     out = {
       "rest": np.zeros((n, 3)),
       "elem": np.zeros((mesh.nelem, 3), np.int32),
+      "tet": np.zeros((len(mesh.tet) * (mesh.spare > 0), 4), np.int32),
       "touch": np.full(n, -np.inf),  # padding is never near
       "source": np.arange(n, dtype=np.int32),
       "share": np.ones(n),
       "held": np.ones(n),
     }
-    vert, elem = np.arange(mesh.nvert), np.arange(mesh.nelem)
     here = {name: values[None] for name, values in out.items()}
-    self.write(here, [0], [(mesh, self._organ.mass, vert, vert, elem)])
+    vert, changed = np.arange(mesh.nvert), np.arange(len(mesh.tet) or mesh.nelem)
+    world = World(mesh, self._organ.mass, vert, np.zeros(0, int))
+    self.write(here, [0], [(world, vert, changed)])
     return out
 
   def write(self, out: dict[str, np.ndarray], worlds, changes: list[tuple]):
@@ -224,15 +229,21 @@ class Surface:
     Args:
       out: the fields, with a row a world
       worlds: the worlds
-      changes: of each its mesh, masses and sources of vertices, which vertices and which triangles
+      changes: of each what it is, which vertices, and which triangles, of a solid tetrahedra
     """
+    for world, (now, _, changed) in zip(worlds, changes, strict=True):
+      mesh, elem = now.mesh, changed
+      if len(mesh.tet):
+        elem = np.arange(mesh.whole.nelem)
+        if len(out["tet"][world]):
+          out["tet"][world, changed] = self._node[mesh.tet[changed]]
+      out["elem"][world, elem] = self._node[mesh.elem[elem]]
     parts = [
-      (v, mesh.rest[v], mesh.unused[v], _longest(mesh, v), source[v], mass[v], e, mesh.elem[e])
-      for mesh, mass, source, v, e in changes
+      (v, w.mesh.rest[v], w.mesh.unused[v], _longest(w.mesh, v), w.source[v], w.mass[v])
+      for w, v, _ in changes
     ]
     of_vert = np.repeat(worlds, [len(each[0]) for each in parts])
-    of_elem = np.repeat(worlds, [len(each[6]) for each in parts])
-    vert, rest, waits, longest, source, mass, elem, corner = (
+    vert, rest, waits, longest, source, mass = (
       np.concatenate(each) for each in zip(*parts, strict=True)
     )
     was = self._organ.mass[source]
@@ -240,9 +251,10 @@ class Surface:
     # Nodal coupling leaves contacts the masses of the compiled model.
     held = share * self._held[source] if self._organ.windows else self._held[vert]
     at = of_vert, self._node[vert]
-    out["elem"][of_elem, elem] = self._node[corner]
     out["rest"][at] = rest
-    out["touch"][at] = np.where(waits, -np.inf, self._reach + longest)
+    # Tools do not touch the walls of cuts in a solid.
+    wall = (source != vert) & (source >= self._organ.mesh.nskin)
+    out["touch"][at] = np.where(waits | wall, -np.inf, self._reach + longest)
     out["source"][at] = self._node[source]
     out["share"][at] = np.where(waits, 0.0, share)
     out["held"][at] = np.where(waits, 1.0, held)

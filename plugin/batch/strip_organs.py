@@ -49,13 +49,8 @@ def tools_of(model: mujoco.MjModel, organ: Declaration) -> np.ndarray:
   """Returns the geoms that an organ's slots follow.
 
   Raises:
-    ValueError: one is not a tool that a batch knows, or it is not an organ that it can step.
+    ValueError: one is not a tool that a batch knows.
   """
-  if organ.mesh.spare and len(organ.mesh.tet):
-    raise ValueError(
-      f"organ {organ.name!r}: spare is {organ.mesh.spare}, allowed in batches on a GPU only where "
-      "elements is not 'solid'"
-    )
   if organ.windows:
     found = np.unique(organ.windows.geom)
   else:
@@ -195,8 +190,9 @@ def _slot_mass(organ: Declaration) -> float:
 
 def _take_out(bare, bodies: dict, organ: Declaration, model):
   """Deletes an organ's flexes and the bodies of its nodes or windows."""
-  drawn = [flex.name for flex in bare.flexes] if organ.config.walls else []
-  if (walls := flexes.resolve(organ.config.walls, organ.name, drawn)) is not None:
+  names = [flex.name for flex in bare.flexes]
+  walls = flexes.resolve(organ.config.walls, organ.name, names) if organ.config.walls else None
+  if walls is not None:
     bare.delete(bare.flex(walls))
   for number in {organ.flex, *organ.flexes}:
     name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_FLEX, int(number))

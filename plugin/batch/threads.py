@@ -14,10 +14,11 @@ import numpy as np
 import warp as wp
 from palpate.engine import coupling
 from palpate.engine import plugin as engine
-from palpate.engine.cutting.cuts import Report
+from palpate.engine.cutting import cuts as cutting
 from palpate.engine.model.declare import Declaration
 from palpate.organ import Organ, instances
 from palpate.tissue import body as bodies
+from palpate.tissue.cutting.topology import Report
 from palpate.tissue.geometry import mesh as topology
 
 from .base import Batch, Tissue, free_memory, refuse_crowd, spread
@@ -215,14 +216,14 @@ class _Tissue(Tissue):
   def _spare(self) -> int:
     return self.spaces[0].organ.mesh.spare
 
-  def _cut(self, points: dict[int, np.ndarray]) -> list[Report | None]:
+  def _cut(self, points: dict[int, np.ndarray], depth, direction) -> list[Report | None]:
     for world, path in points.items():
       try:
-        self.spaces[world].cuts.find(path)
+        cutting.find(self.spaces[world], path, 0.0, depth, direction)
       except ValueError as error:
         raise ValueError(f"world {world}: {error}") from None
     return [
-      handle.cut(points[world]) if world in points else None
+      handle.cut(points[world], depth, direction) if world in points else None
       for world, handle in enumerate(self.handles)
     ]
 
@@ -233,7 +234,7 @@ class _Tissue(Tissue):
   def _piece_count(self) -> wp.array:
     out = self._pieces.numpy()
     for world, space in enumerate(self.spaces):
-      space.cuts.follow()
+      cutting.follow(space)
       mesh = space.organ.mesh
       if mesh is not self._counted[world]:
         self._counted[world], out[world] = mesh, int(topology.pieces(mesh).max()) + 1

@@ -36,7 +36,7 @@ def bind(w: Workspace, model: int):
     else:
       does = nodal.Phases(w.host, w.share)
     w.graphs.phases, w.graphs.resident = does, does.resident
-    w.cuts.bind(model)
+    w.cuts.bind(model, w.plugin_state)
     near = wp.get_device(does.side)
     crossing = device != near
 

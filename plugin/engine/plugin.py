@@ -18,6 +18,7 @@ from palpate.tissue.config import KEYS
 
 from ..forces.passive import Force
 from . import change, contacts, signals, workspace
+from .cutting import cuts
 from .layout import FLAG
 from .model import mjstruct, skin, state_size
 from .model.mjstruct import NAME, warn
@@ -199,7 +200,7 @@ def _end(w: Workspace):
   w.step()
   if w.cuts:
     w.cuts.hide(w.model)
-  if (w.config.tear > 0 and w.cuts.tear()) or (w.cutters and w.cutters.open()):
+  if (w.config.tear > 0 and cuts.tear(w)) or (w.cutters and w.cutters.open()):
     workspace.place(w, w.model)
   nodes, triangles = w.report.flags[FLAG.missed_nodes], w.report.flags[FLAG.missed_elements]
   if nodes > w.report.missed[0] or triangles > w.report.missed[1]:
@@ -217,13 +218,13 @@ def _visualize(model: int, data: int, option: int, scene: int, instance: int):
   w = _workspaces[data, instance]
   try:
     if w.cuts:
-      w.cuts.follow()
+      cuts.follow(w)
       with w.cuts.lock:
         w.cuts.show()
     if w.organ.windows:
       windowed.draw(w, model, data)
     if w.cuts:
-      w.cuts.draw(model, data)
+      w.cuts.draw(w.organ, w.motion()[0], model, data)
     if w.skin is not None:
       _draw_skin(w, model, data)
   except BaseException as error:

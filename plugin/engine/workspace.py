@@ -22,8 +22,9 @@ from ..forces.table import FORCES
 from . import contacts, coupling, graphs
 from .bind import bind
 from .coupling import Phases
+from .cutting import cuts
+from .cutting.cuts import Cuts
 from .cutting.cutters import Cutters
-from .cutting.solid_cuts import Cuts, cuts_of
 from .host import Host
 from .layout import FLAG, HEAD, Topology
 from .model import declare, flexes, inertia, mjstruct, prepare, skin
@@ -159,7 +160,7 @@ class Workspace:
   views: dict = dataclasses.field(default_factory=dict)
 
   def __post_init__(self):
-    self.cuts = cuts_of(self)
+    self.cuts = Cuts(self.organ, self.body, self.model)
     self.forces, self.cutters = Forces(self.host, FORCES), Cutters(self)
     self.forces.add(self.cutters)
 
@@ -228,7 +229,8 @@ class Workspace:
     if self.report.strange:
       coupling.check_state(self.organ, self.plugin_state)
       self.report.strange = False
-    changed = bool(self.cuts) and self.cuts.renewed()
+    cuts.follow(self)
+    changed = self.cuts.renewed()
     if self.turn is None:
       if self.cuts:
         self._run_cut(changed)

@@ -62,7 +62,7 @@ _WIDTHS = {"stretch": (3,), "force": (3,), "pull": (3,), "next": (len(BOND),), "
 
 @struct
 class Burning:
-  """A geom whose current frees bonds, see `engine.cutting.electrosurgery`."""
+  """A geom whose current frees bonds, see `engine.cutting.trails`."""
 
   bonds: Bonded
   geom: int

@@ -19,13 +19,14 @@ from .geometry.mesh import Mesh
 from .kernels import kernel
 from .types import CONSTANTS, Shape, Tissue, doubles, flags, ints, struct
 
-_OF_SHAPE = (
+OF_SHAPE = (
   "fan_node", "fan_rest", "fan_corner", "fan_side", "fan_width", "degree", "rest", "area", "free",
   "elem_node", "elem_rest", "elem_hinge", "hinge_node", "hinge_rest", "hinge_elem", "hinge_near",
   "bend_node", "bend_width",
 )  # fmt: skip
-_OF_TISSUE = ("fan_metric", "fan_spring", "hinge_gain", "bend_gain", "bend_diag")
-NAMES = (*_OF_SHAPE, *_OF_TISSUE)
+OF_TISSUE = ("fan_metric", "fan_spring", "hinge_gain", "bend_gain", "bend_diag")
+NAMES = (*OF_SHAPE, *OF_TISSUE)
+ADDRESSES = ("slot_adr", "bend_adr")
 
 
 def typed(*names: tuple[str, ...]) -> Callable[[type], type]:
@@ -40,7 +41,7 @@ def typed(*names: tuple[str, ...]) -> Callable[[type], type]:
 
 
 @struct
-@typed(_OF_SHAPE, _OF_TISSUE)
+@typed(OF_SHAPE, OF_TISSUE)
 class Filling:
   """A surface, what its rows are made of, and what they are written to, under the names there."""
 
@@ -117,7 +118,7 @@ class Rows:
 
   def put(self, arrays: Mapping[str, Any]):
     """Writes into these arrays from now on."""
-    for name in (*NAMES, "slot_adr", "bend_adr"):
+    for name in (*NAMES, *ADDRESSES):
       if name in arrays:
         setattr(self.fields, name, _array(name, arrays[name]))
 

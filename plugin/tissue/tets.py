@@ -21,17 +21,17 @@ from .types import CONSTANTS, doubles, flags, halves, ints, longs, struct
 
 EDGES = 2  # by which cuts may divide edges, for one spare vertex
 _WINDOW = 8 * LANES  # edges that are sorted by the number of their tetrahedra
-_OF_SHAPE = (
+OF_SHAPE = (
   "fan_node", "fan_rest", "fan_width", "degree", "rest", "free", "area", "tet_node", "tet_gradient",
   "around_corner", "fan_slope", "edge_from", "edge_to", "edge_node", "edge_slot",
 )  # fmt: skip
-_OF_TISSUE = ("tet_moduli", "node_moduli", "stiffness")
-NAMES = (*_OF_SHAPE, *_OF_TISSUE)
-_ADDRESSES = ("slot_adr", "around_adr", "edge_adr")
+OF_TISSUE = ("tet_moduli", "node_moduli", "stiffness")
+NAMES = (*OF_SHAPE, *OF_TISSUE)
+ADDRESSES = ("slot_adr", "around_adr", "edge_adr")
 
 
 @struct
-@typed(_OF_SHAPE, _OF_TISSUE)
+@typed(OF_SHAPE, OF_TISSUE)
 class Within:
   """A solid, what its rows are made of, and what they are written to, under the names there."""
 
@@ -49,6 +49,7 @@ class Within:
   clears: int  # whether blocks of neighbours that are none any more are in `half`
   nint: int  # whole numbers of scratch
   nreal: int  # others
+  skip: wp.int64  # words by which what is written to lies after the arrays
   own: wp.float64  # share of mu that tetrahedra have by themselves
   centre: doubles(3)  # that rest positions are about [m]
   mesh_rest: doubles("nvert", 3)  # see `Mesh`, with those that follow
@@ -76,7 +77,6 @@ class Within:
   edge_begin: ints("nedge + 1")  # of the pairs of each edge
   edge_pair: ints("npair")  # these
   place: ints("nedge")  # where each edge lies
-  owner: ints("nwait")  # the edge that has each place that waits, -1 for none
   half: halves("nhalf")  # see `System`
   found: ints(1)  # whether there was room
   ints: ints("nint")
@@ -193,7 +193,9 @@ class Tets:
     ntet, nvert, npair = len(whole.tet), whole.nvert, len(lay.which)
     self._fields = fields = Within()
     self.put(arrays)
+    self._mesh: Mesh | None = None  # what the arrays were last
     self._tet = whole.tet[lay.order].astype(np.int32)
+    self._steep = np.zeros(ntet)
     self._changed, self._before = np.zeros(ntet, np.int32), np.zeros((ntet, 4), np.int32)
     self._pinned = np.zeros(nvert, np.uint8)
     corner, edges = self._tet.ravel(), len(lay.place)
@@ -203,10 +205,10 @@ class Tets:
       nedge=edges, nplace=LANES * (len(lay.edge_adr) - 1), nwait=lay.waits, own=OWN_SHARE,
       nint=nint, nreal=nreal, centre=whole.centre, tet=self._tet, whole_tet=self._tet.copy(),
       around=np.argsort(corner, kind="stable"), changed=self._changed, before=self._before,
-      begin=addresses(np.bincount(corner, minlength=nvert)), steep=np.zeros(ntet), node=node,
+      begin=addresses(np.bincount(corner, minlength=nvert)), steep=self._steep, node=node,
       which=lay.which, first=lay.first, last=lay.last, place=lay.place, pinned=self._pinned,
       edge_pair=np.argsort(lay.which, kind="stable"), edge_begin=addresses(np.bincount(lay.which)),
-      owner=np.full(lay.waits, -1), found=np.zeros(1), ints=np.zeros(nint), reals=np.zeros(nreal),
+      found=np.zeros(1), ints=np.zeros(nint), reals=np.zeros(nreal),
       half=np.zeros(0),
     )  # fmt: skip
     assert npair == 6 * ntet
@@ -215,7 +217,7 @@ class Tets:
 
   def put(self, arrays: Mapping[str, Any]):
     """Writes into these arrays from now on."""
-    self._set(**{name: arrays[name] for name in (*NAMES, *_ADDRESSES) if name in arrays})
+    self._set(**{name: arrays[name] for name in (*NAMES, *ADDRESSES) if name in arrays})
 
   def clear(self, half: wp.array):
     """Clears the blocks of neighbours that are none any more, on the CPU."""
@@ -235,6 +237,8 @@ class Tets:
     moduli: tuple[np.ndarray, np.ndarray] | None,
     pinned: np.ndarray,
     changed: np.ndarray | None = None,
+    before: Mesh | None = None,
+    skip: int = 0,
   ) -> bool:
     """Writes the rows of a solid; returns False where there is no room for its edges.
 
@@ -245,6 +249,8 @@ class Tets:
       moduli: mu and lambda of each tetrahedron [Pa], None for those before
       pinned: vertices that do not move, (nvert,) bool
       changed: tetrahedra that are not as in the arrays, None for all
+      before: the solid that the arrays are of
+      skip: words by which what is written to lies after the arrays
     """
     every = changed is None
     which = np.arange(len(self._order)) if changed is None else np.sort(self._place[changed])
@@ -252,15 +258,16 @@ class Tets:
     new = mesh.tet[self._order[which]]
     if every:  # an edge that was divided is so whatever was there before
       self._tet[:] = new
+    elif before is not None and before is not self._mesh:  # of another world
+      self._tet[:], self._steep[:] = before.tet[self._order], 0.0
     self._changed[:n], self._before[:n], self._tet[which] = which, self._tet[which], new
     self._pinned[:] = pinned
     if moduli is not None:
       self._set(mu=moduli[0][self._order], lam=moduli[1][self._order])
     loose = np.zeros(mesh.nelem, bool) if mesh.loose is None else mesh.loose
-    self._set(nelem=mesh.nelem, nchanged=n, every=int(every))
+    self._set(nelem=mesh.nelem, nchanged=n, every=int(every), skip=skip)
     aim(self._fields, mesh_rest=mesh.rest, ring=mesh.ring, mesh_degree=mesh.degree,
         elem=mesh.elem, loose=loose)  # fmt: skip
     self._launch()
-    if not self._found[0]:
-      self._tet[which] = self._before[:n]
+    self._mesh = mesh if self._found[0] else None
     return bool(self._found[0])

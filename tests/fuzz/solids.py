@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import palpate
 import scenes
+from palpate.engine.cutting import cuts
 from scipy.spatial import cKDTree
 
 KEPT: tuple[int, ...] = (5, 20, 349, 598, 721, 791)  # seeds that once failed
@@ -44,7 +45,7 @@ def scene(seed: int):
 def energy(organ) -> float:
   """Returns that of all nodes, at rest or in motion [J]."""
   space = scenes.workspace(organ)
-  space.cuts.follow()
+  cuts.follow(space)
   vel = space.motion()[1]
   return organ.energy + 0.5 * float((space.organ.mass[:, None] * vel**2).sum())
 

@@ -10,13 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
-from palpate.engine.cutting import cutters
-from palpate.engine.cutting.electrosurgery import ends
+from palpate.engine.cutting import cutters, trails
 from palpate.engine.layout import BLADE, LAW
 from palpate.engine.model import mjstruct
 from palpate.forces.host import for_worlds, world_kernel
 from palpate.tissue.geometry.mesh import Mesh
-from palpate.tissue.step import SCHEMES
 from palpate.tissue.types import allocate, doubles, fill, floats, ints, struct
 
 from .. import host
@@ -26,7 +24,11 @@ if TYPE_CHECKING:
   from ..organs import Organ
 
 _ROWS = "state", "next", "force", "point", "held", "share", "hold", "due", "law"
-_MESH = ("elem", ints("nmesh", "nelem", 3)), ("flat", doubles("nmesh", "nnode", 3))
+_MESH = (
+  ("elem", ints("nmesh", "nelem", 3)),
+  ("tet", ints("nmesh", "ntet", 4)),
+  ("flat", doubles("nmesh", "nnode", 3)),
+)
 _WorldBlades = for_worlds(cutters.Blades, _ROWS, _MESH)
 _enter, _act, _keep = (
   world_kernel(name, "cutting/blades.h", _WorldBlades) for name in cutters.KERNELS
@@ -90,7 +92,6 @@ class Blades(host.Opens):
     super().__init__(organ)
     self.host.need_springs()
     space, body, n = organ.space, organ.body, len(organ.config.cutters)
-    mesh, scheme = organ.declared.mesh, SCHEMES[organ.config.integrator]
     self._model = mjstruct.Model.from_address(space.model)
     widths = cutters.WIDTHS.items()
     law = space.cutters.law(self._model, organ.config.thickness)
@@ -98,17 +99,12 @@ class Blades(host.Opens):
       name: self._zeros(self._nworld, n, wide, dtype=_WorldBlades.vars[name].type.dtype)
       for name, wide in widths
     }
-    values |= space.cutters.edges() | dict(
-      nblade=n,
-      nelem=mesh.nelem,
-      ntet=0,
-      tet=np.zeros((0, 4), int),
-      ahead=float(scheme.ahead),
-      gain=scheme.gain(1.0, 0.0),
-      edge=float(mesh.whole.edge_length),
+    self._edges = space.cutters.constants()
+    values |= self._edges | dict(
       law=np.tile(law, (self._nworld, 1, 1)),
       mesh=organ.patch.mesh,
       elem=organ.patch.elem,
+      tet=organ.patch.tet,
       flat=organ.patch.rest,
       state=self.host.rows("blade", len(BLADE)),
       due=self._zeros(self._nworld, n, dtype=int),
@@ -182,42 +178,46 @@ class Blades(host.Opens):
     assert cuts is not None
     law, edge = self.fields.law.numpy(), self._organ.declared.mesh.edge_length
     cuts.follow()
-    motion = cuts.motion(worlds)
+    motion, d = cuts.motion(worlds), self._organ.batch.d
+    turn = d.geom_xmat.numpy().astype(float) if currents or self.fields.ntet else np.zeros(0)
     for i, current in currents.items():
       given = steps * float(self._organ.batch.model.opt.timestep) * ctrl[:, current.actuator]
-      self._follow(current, state[:, i], due[:, i], given, worlds, motion)
+      place = d.geom_xpos.numpy()[:, current.geom].astype(float)
+      for k, world in enumerate(worlds):
+        row, line = state[world, i], current.line(place[world], turn[world, current.geom])
+        burns = given[world] > 0 and self._burn(current, row, world, motion.disp[k], line, given)
+        due[world, i] = trails.lay(row, edge) if burns else trails.end(row)
     for k, world in enumerate(worlds):
       for i in np.flatnonzero(due[world]):
-        given = cutters.GIVEN * float(law[world, i, LAW.force]) * edge
-        self._open(state[world, i], due[world, i] == cutters.ENDED, given, motion, k, world)
+        given, ended = (
+          trails.GIVEN * float(law[world, i, LAW.force]) * edge,
+          due[world, i] == trails.ENDED,
+        )
+        way = None
+        if self.fields.ntet and i not in currents:
+          way = trails.along(turn[world], self._edges["geom"][i], self._edges["axis"][i])
+        self._open(state[world, i], bool(ended), given, way, motion, k, world)
     cuts.finish(worlds, motion)
     self.fields.state.assign(state)
     self.fields.due.zero_()
 
-  def _follow(self, current, state: np.ndarray, due: np.ndarray, given, worlds: list, motion):
-    """Lets paths of worlds follow a current; `given`: energy that it has brought [J], (nworld,)."""
-    cuts, d = self._organ.topology, self._organ.batch.d
-    assert cuts is not None
-    place, axes = (array.numpy()[:, current.geom] for array in (d.geom_xpos, d.geom_xmat))
-    for k, world in enumerate(worlds):
-      row, mesh = state[world], cuts.mesh_of(world)
-      line = current.line(place[world].astype(float), axes[world].astype(float))
-      burns = given[world] > 0 and current.burn(
-        row, mesh, mesh.rest + motion.disp[k], cuts.finder, *line, float(given[world])
-      )
-      edge = mesh.whole.edge_length
-      due[world] = cutters.lay_trail(row, edge) if burns else cutters.ENDED * ends(row)
+  def _burn(self, current, row: np.ndarray, world: int, disp: np.ndarray, line, given) -> bool:
+    """Lets a path of a world follow a current, which has brought an energy [J]."""
+    organ, cuts = self._organ, self._organ.topology
+    mesh, thickness = cuts.mesh_of(world), organ.config.thickness
+    where = organ.declared, mesh, mesh.rest + disp, cuts.finder, line
+    return current.burn(row, *where, float(given[world]), thickness)
 
-  def _open(self, row: np.ndarray, ended: bool, given: float, motion, k: int, world: int):
-    cuts = self._organ.topology
-    assert cuts is not None
+  def _open(self, row: np.ndarray, ended: bool, given: float, way, motion, k: int, world: int):
+    """Opens the path of a blade in a world, the k-th of a motion."""
+    organ, cuts = self._organ.declared, self._organ.topology
 
-    def cut(path: np.ndarray) -> tuple[Any, Mesh]:
-      found = cuts.find(world, path, motion, k, given, True)
+    def cut(path: np.ndarray, depth: np.ndarray | None) -> tuple[Any, Mesh]:
+      where = organ, cuts.mesh_of(world), motion.disp[k], cuts.finder, way
+      found = cuts.find(world, trails.path_of(path, depth, given, *where), motion, k)
       return cuts.apply(world, found, motion, k), cuts.mesh_of(world)
 
-    organ, mesh = self._organ.declared, cuts.mesh_of(world)
-    cutters.open_path(row, mesh, bool(ended), organ, cuts.finder, cut)
+    trails.open_path(row, organ, cuts.mesh_of(world), ended, cuts.finder, cut)
 
 
 @wp.kernel(enable_backward=False)

@@ -11,20 +11,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
-from palpate.engine.cutting import cuts as engine
-from palpate.engine.cutting.cuts import Piece, Report
-from palpate.engine.model import flexes
-from palpate.tissue import body as bodies
-from palpate.tissue import device as devices
-from palpate.tissue import order, shape, step
-from palpate.tissue.cutting import cut as cutting
+from palpate.engine.cutting.cuts import topology_of
+from palpate.tissue import step
+from palpate.tissue.cutting import facets, topology
+from palpate.tissue.cutting.cut import Cut
+from palpate.tissue.cutting.cut import Motion as Carried
+from palpate.tissue.cutting.facets import Path
 from palpate.tissue.cutting.meshes import Meshes
-from palpate.tissue.cutting.path import Finder
-from palpate.tissue.cutting.surface import WorkingCopy
-from palpate.tissue.geometry import mesh as topology
-from palpate.tissue.geometry.mesh import Mesh
-from palpate.tissue.order import LANES
-from palpate.tissue.rows import Rows
+from palpate.tissue.cutting.topology import BLOCKS, Piece, Report
+from palpate.tissue.geometry.mesh import Mesh, distinct
+from palpate.tissue.order import LANES, offset
 from palpate.tissue.types import NUMBERS, fill
 
 from .. import host, kernels
@@ -33,26 +29,19 @@ from ..patch import Surface
 if TYPE_CHECKING:
   from ..organs import Organ
 
-_OWN = ("rest", "elem", "touch", "source", "share", "held")  # fields of `Patch`
-_STATE = ("corner", "place", "weight", "source", "stamp")  # blocks of the plugin state
+_OWN = ("rest", "elem", "tet", "touch", "source", "share", "held")  # fields of `Patch`
 _INSIDE = NUMBERS.index("bulk")  # and pressure after it
 
 
 @dataclasses.dataclass
-class World:
+class World(facets.World):
   """A world that was cut.
 
   Attributes:
-    mesh: as it is now
-    mass: of its vertices [kg]                       (nvert,)
-    source: what each was before the first cut       (nvert,)
     pieces: how many there are
     reports: what the cuts did
   """
 
-  mesh: Mesh
-  mass: np.ndarray
-  source: np.ndarray
   pieces: int
   reports: list[Report] = dataclasses.field(default_factory=list)
 
@@ -81,24 +70,21 @@ class Cuts:
     declared, body = organ.declared, organ.body
     self._organ, self._surface = organ, surface
     self.whole: Mesh = declared.mesh
-    nodes = devices.patch(body.device, body.shape.nslice)
-    arrays = shape.arrays(self.whole, organ.config, ~declared.free, nodes)
-    still = bodies.worlds(bodies.constants(arrays, wp.get_device("cpu"), organ.config.newton))
-    node = still.shape.node.numpy()
-    self._node, self._place = node, order.offset(node)[:, None] + LANES * np.arange(3)
+    self._topology = topology_of(declared)
+    self._facets, self.finder = self._topology.facets, self._topology.facets.finder
+    self._node = node = body.shape.node.numpy()
+    self._place = offset(node)[:, None] + LANES * np.arange(3)
     own = {f"patch.{name}": np.asarray(values[name][0]) for name in _OWN}
-    self._meshes = Meshes(body, own)
+    self._meshes = Meshes(body, self._facets, own)
     values |= {name: self._meshes.more[f"patch.{name}"] for name in _OWN}
     values["mesh"] = self._meshes.which
     self._here = {name: self._meshes.here[f"patch.{name}"] for name in _OWN}
-    copy = WorkingCopy(self.whole)
-    self._knife, self.finder = cutting.Knife(copy), Finder(copy)
-    starts = {"slot_adr": still.shape.slot_adr, "bend_adr": still.shape.bend_adr}
-    self._rows = Rows(copy, self._meshes.arrays | starts, node)
+    starts = {name: getattr(body.shape, name).to("cpu") for name in self._facets.READ}
+    self._facets.aim(self._meshes.arrays | starts, node, body.shape.nnode)
     number = body.tissue.number.numpy()[:, _INSIDE : _INSIDE + 2]
     self._worlds: dict[int, World] = {}
-    self._changed: dict[int, list[np.ndarray]] = {}  # vertices and triangles, see `finish`
-    self._whole_count = _count(self.whole)
+    self._changed: dict[int, list[np.ndarray]] = {}  # vertices and elements, see `finish`
+    self._whole_count = topology.count(self.whole)
     self._intact = fill(kernels.Whole, body.device, {
       "first": _INSIDE, "count": self._whole_count, "inside": number,
       "pieces": np.full(body.nworld, self._whole_count),
@@ -146,7 +132,7 @@ class Cuts:
     """Returns the parts of a world's organ that hang together, the heaviest first."""
     scale = float(self._organ.patch.mass_scale.numpy()[world])
     mass = scale * self.mass(world)
-    return engine.pieces(self.mesh(world), mass, self._organ.config.thickness)
+    return topology.pieces(self.mesh(world), mass, self._organ.config.thickness)
 
   def counts(self) -> wp.array:
     """Returns how many pieces there are, (nworld,)."""
@@ -178,33 +164,23 @@ class Cuts:
 
   # Cutting.
 
-  def find(self, world: int, points: np.ndarray, motion: Motion, k: int, *how) -> cutting.Cut:
-    """Returns what a cut along points in the organ's frame, (n, 3) [m], makes of a world.
-
-    Args:
-      world: the world
-      points: the path
-      motion: what vertices of some worlds have
-      k: which of them it is
-      how: last arguments of `cutting.Knife.cut`
-    """
-    organ, had = self._organ, self._of(world)
-    carried = cutting.Motion(had.mass, motion.disp[k], motion.vel[k])
-    free, config = organ.declared.free, organ.config
-    held = engine.together(organ.forces.springs(world), had.mesh.nvert)
-    found = self._knife.cut(organ.name, had.mesh, carried, points, ~free, config, held, *how)
+  def find(self, world: int, path: Path, motion: Motion, k: int) -> Cut:
+    """Returns what a path makes of a world, the k-th of a motion."""
+    organ = self._organ
+    had, moving = self._of(world), (motion.disp[k], motion.vel[k])
+    found = self._topology.find(had, *moving, path, organ.config, organ.forces.springs(world))
     kept = (getattr(found.motion, name).copy() for name in ("mass", "disp", "vel"))
-    return dataclasses.replace(found, motion=cutting.Motion(*kept))
+    return dataclasses.replace(found, motion=Carried(*kept))
 
-  def cut(self, points: dict[int, np.ndarray]) -> list[Report | None]:
+  def cut(self, points: dict[int, np.ndarray], depth, direction) -> list[Report | None]:
     """Cuts worlds along points in the world's axes, (n, 3) [m] each; see `Tissue.cut`."""
     self.follow()
     organ, worlds = self._organ, sorted(points)
     motion, found = self.motion(worlds), []
     for k, world in enumerate(worlds):
-      local = (points[world] - organ.declared.origin) @ organ.declared.frame
       try:
-        found.append(self.find(world, local, motion, k))
+        path = self._topology.path(points[world], 0.0, depth, direction)
+        found.append(self.find(world, path, motion, k))
       except ValueError as error:
         raise ValueError(f"world {world}: {error}") from None
     out: list[Report | None] = [None] * organ.body.nworld
@@ -213,20 +189,19 @@ class Cuts:
     self.finish(worlds, motion)
     return out
 
-  def apply(self, world: int, cut: cutting.Cut, motion: Motion, k: int) -> Report:
+  def apply(self, world: int, cut: Cut, motion: Motion, k: int) -> Report:
     """Makes a world the mesh that was found, the k-th of a motion; `finish` is to come."""
     organ, had = self._organ, self._of(world)
-    report = engine.report(cut, had.mesh, organ.declared, organ.config.thickness)
+    report = self._topology.report(had, cut, organ.config.thickness)
     if cut.changed.size:
       _carry(motion, k, cut, organ.declared.free)
-      source = had.source.copy()
-      source[cut.member] = source[cut.group]
       organ.forces.carry(world, cut.group, cut.member, cut.share)
       # Vertices that come apart inside do not make two pieces of one.
-      pieces = _count(cut.mesh) if cut.mesh.loose is not had.mesh.loose else had.pieces
-      now = World(cut.mesh, cut.motion.mass, source, pieces, had.reports)
+      same = cut.mesh.loose is had.mesh.loose
+      pieces = had.pieces if same else topology.count(cut.mesh)
+      now = World(**vars(self._topology.taken(had, cut)), pieces=pieces, reports=had.reports)
       self._become(world, had, now, cut.changed)
-      self._worlds[world].reports.append(report)
+      now.reports.append(report)
     return report
 
   def finish(self, worlds: list[int], motion: Motion):
@@ -244,34 +219,32 @@ class Cuts:
     """Returns a world, that of the first mesh until it is cut."""
     if world in self._worlds:
       return self._worlds[world]
-    mass, source = self._organ.declared.mass.copy(), np.arange(self.whole.nvert)
-    return World(self.whole, mass, source, self._whole_count)
+    return World(**vars(self._topology.first), pieces=self._whole_count)
 
   def _become(self, world: int, had: World, now: World, changed: np.ndarray):
     """Writes the row of a world, in which triangles have changed."""
     organ, mesh = self._organ, now.mesh
-    before, loosened = had.mesh.elem[changed], mesh.loose is not had.mesh.loose
-    how = ~organ.declared.free, changed, before, loosened
-    touched = topology.touched(had.mesh, mesh, changed)
-    if not self._rows.write(mesh, organ.config, *how, self._meshes.open(world)):
-      raise ValueError("cuts that meet leave no room in the bending matrix")
+    touched, pinned = self._facets.touched(had.mesh, mesh, changed), ~organ.declared.free
+    skip = self._meshes.open(world)
+    self._facets.write(had.mesh, mesh, changed, organ.config, pinned, skip)
     self._worlds[world] = now
     kept = self._changed.get(world)
     self._changed[world] = (
       [touched, changed] if kept is None
-      else [topology.distinct(*pair) for pair in zip(kept, (touched, changed), strict=True)]
+      else [distinct(*pair) for pair in zip(kept, (touched, changed), strict=True)]
     )  # fmt: skip
 
   def _upload(self, worlds: list[int]):
     """Gives the device the meshes of worlds, and what follows from them."""
     organ, body = self._organ, self._organ.body
-    own = [self._worlds[world] for world in worlds]
-    changed = [self._changed.pop(world) for world in worlds]
-    changes = [(w.mesh, w.mass, w.source, *c) for w, c in zip(own, changed, strict=True)]
+    changes = [(self._worlds[world], *self._changed.pop(world)) for world in worlds]
     self._surface.write(self._here, worlds, changes)
     self._meshes.upload(worlds)
     for _ in range(2 * body.has_bending):  # what is left of the first time is exact
       self._meshes.angle(worlds, step.rest_angles(body))
+    if body.is_solid:
+      for world in worlds:  # whose blocks have neighbours that are none any more
+        body.system.half[world].zero_()
     mass = np.ones((len(worlds), body.shape.nnode), np.float32)
     scale = organ.patch.mass_scale.numpy()
     for k, world in enumerate(worlds):
@@ -333,27 +306,20 @@ class Cuts:
   def pull(self, world: int, own: np.ndarray, spans: dict[str, slice]):
     """Writes the mesh of a world to the plugin state, zero where it was not cut."""
     self.follow()
-    if world not in self._worlds:
-      return
-    had = self._worlds[world]
-    corner = flexes.pack(had.mesh.elem, had.mesh.loose)
-    stamp = flexes.stamp(corner, had.mesh.rest, had.mass)
-    blocks = {name: own[spans[name]] for name in _STATE}
-    engine.write(blocks, had.mesh, had.mass, had.source, stamp)
+    if world in self._worlds:
+      self._topology.write({name: own[spans[name]] for name in BLOCKS}, self._worlds[world])
 
   def push(self, world: int, own: np.ndarray, spans: dict[str, slice]):
     """Gives a world the mesh of a plugin state."""
-    blocks = {name: own[spans[name]] for name in _STATE}
-    mass = self._organ.declared.mass
-    elem, loose, rest, mass, source = engine.read(self.whole, mass, blocks)
+    blocks = {name: own[spans[name]] for name in BLOCKS}
     self.follow()
-    before = self.mesh_of(world)
-    mesh, changed = topology.recut(before, rest, elem, loose)
-    if changed.size or mesh is not before:
-      now = World(mesh, mass, source, _count(mesh))
-      self._become(world, self._of(world), now, changed)
+    had = self._of(world)
+    found, changed = self._topology.read(blocks, had.mesh)
+    if changed.size or found.mesh is not had.mesh:
+      now = World(**vars(found), pieces=topology.count(found.mesh))
+      self._become(world, had, now, changed)
       self._upload([world])
-    if mesh is self.whole and world in self._worlds:
+    if found.mesh is self.whole and world in self._worlds:
       self._forget(world)
       which = self._meshes.which.numpy()
       which[world] = 0
@@ -368,11 +334,7 @@ class Cuts:
     return bool(own[spans["stamp"]].any())
 
 
-def _count(mesh: Mesh) -> int:
-  return int(topology.pieces(mesh).max()) + 1
-
-
-def _carry(motion: Motion, k: int, cut: cutting.Cut, free: np.ndarray):
+def _carry(motion: Motion, k: int, cut: Cut, free: np.ndarray):
   """Gives the vertices of the k-th world of a motion what a cut makes of it."""
   motion.disp[k], motion.vel[k] = cut.motion.disp, cut.motion.vel
   moves = free[cut.member]

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
-from palpate.engine.cutting.cuts import Piece, Report
+from palpate.tissue.cutting.topology import Piece, Report
 
 
 class Cutters(NamedTuple):
@@ -35,12 +35,14 @@ class Parting(abc.ABC):
   nvert: int
   batch: Any
 
-  def cut(self, points, mask=None) -> list[Report | None]:
+  def cut(self, points, mask=None, depth=None, direction=None) -> list[Report | None]:
     """Cuts worlds along the path on the surface that is nearest to points, see `Organ.cut`.
 
     Args:
       points: the path in the world's axes [m], (n, 3) for all, or one a world
       mask: worlds to cut, (nworld,) of bool; None for all
+      depth: of the cut in a solid [m], in all of them; see `Organ.cut`
+      direction: in which that goes, in the world, or None
 
     Returns:
       what was done, one a world; None where it was not cut
@@ -56,7 +58,7 @@ class Parting(abc.ABC):
     worlds = np.flatnonzero(batch.checked(mask).numpy()).tolist()
     batch._fresh = False
     paths = {world: points[world] for world in worlds}
-    return self._cut(paths) if paths else [None] * batch.nworld
+    return self._cut(paths, depth, direction) if paths else [None] * batch.nworld
 
   @property
   def cuts(self) -> list[list[Report]]:
@@ -84,7 +86,7 @@ class Parting(abc.ABC):
     """Vertices that wait for a cut."""
 
   @abc.abstractmethod
-  def _cut(self, points: dict[int, np.ndarray]) -> list[Report | None]:
+  def _cut(self, points: dict[int, np.ndarray], depth, direction) -> list[Report | None]:
     """Cuts worlds along paths, by world."""
 
   @abc.abstractmethod

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 from palpate.engine.cutting import tear
+from palpate.tissue.cutting.facets import Path
 
 from .. import host
 from ..patch import Patch
@@ -89,7 +90,7 @@ class Tears(host.Opens):
       mesh, worst = cuts.mesh_of(world), nelem - 1 - int(found[world]) % nelem
       line = tear.line_of(mesh, mesh.rest + motion.disp[k], worst, cuts.finder)
       with contextlib.suppress(ValueError):  # pinned tissue around it
-        cuts.apply(world, cuts.find(world, line, motion, k), motion, k)
+        cuts.apply(world, cuts.find(world, Path(line), motion, k), motion, k)
     cuts.finish(worlds, motion)
 
 

@@ -7,13 +7,12 @@ edges at a time, since the mesh cannot do so by less.
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
 import dataclasses
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
 import warp as wp
-from palpate.tissue.cutting.path import Finder
+from palpate.tissue.cutting.topology import Report
 from palpate.tissue.geometry.mesh import Mesh
 from palpate.tissue.step import SCHEMES
 from palpate.tissue.types import Views, doubles, fill, ints, struct
@@ -22,21 +21,14 @@ from ...forces.declare_attachments import most
 from ...forces.host import Bodies, Input, Nodes, Twin
 from ...forces.passive import Force
 from .. import coupling
-from ..layout import BLADE, LAW, TRAIL
+from ..layout import BLADE, LAW
 from ..model import flexes, mjstruct
-from . import solid_paths
-from .cuts import Report
-from .electrosurgery import Current
+from . import cuts, trails
 
 if TYPE_CHECKING:
-  from ..model.declare import Declaration
   from ..workspace import Workspace
 
 _SLACK = 0.1  # edges of the mesh by which a blade's spring is stretched where it cuts
-_MORE = 0.5  # edges after which what could not come apart is tried again
-# Share of the work on an edge that moving a vertex may turn into strain: without it none could move
-# on to the blade's path, where tissue is stretched.
-GIVEN = 0.1
 _ROUND = (int(mujoco.mjtGeom.mjGEOM_CAPSULE), int(mujoco.mjtGeom.mjGEOM_CYLINDER))
 _BOX = int(mujoco.mjtGeom.mjGEOM_BOX)
 
@@ -83,9 +75,6 @@ KERNELS = "enter_blades", "act_blades", "keep_blades"
 _enter, _act, _keep = (
   Twin(each, each) for each in coupling.kernels("cutting/blades.h", Blades, *KERNELS)
 )
-# As in the header: the blade is out of the tissue; edges between points of a path, and that come
-# apart at once.
-ENDED, _SPACING, _BATCH = 2, 0.4, 1.8
 
 
 @dataclasses.dataclass(frozen=True)
@@ -126,7 +115,7 @@ class Cutters(Force):
     self.names: list[tuple[str, ...]] = []
     self._arrays: dict[str, np.ndarray] = {}
     self._width = np.zeros(0)
-    self.by_current: dict[int, Current] = {}
+    self.by_current: dict[int, trails.Current] = {}
     self._due: Any = ()
     self._here: Any = None  # the arrays of `fields`
     self._said = False
@@ -156,7 +145,7 @@ class Cutters(Force):
         self._width[i] = max(self._width[i], width)
       if rows[i].current:
         actuator, shape = _find_actuator(w, m, rows[i].current), _shape(w, m, geoms[0])
-        self.by_current[i] = Current(w, geoms[0], actuator, rows[i].energy, shape)
+        self.by_current[i] = trails.current(geoms[0], actuator, rows[i].energy, shape)
     self.names = [tuple(_name(m, g) for g in geoms) for geoms in found]
     self._arrays = {"geom": geom, "axis": axis, "half": half}
     w.host.need_springs()
@@ -165,7 +154,7 @@ class Cutters(Force):
     """Returns the rows of `Blades.law` where the wall has a thickness [m]."""
     w, rows = self._w, []
     solid, edge = w.config.elements == "solid", w.organ.mesh.whole.edge_length
-    thickness = solid_paths.PIERCED if solid else thickness
+    thickness = trails.PIERCED if solid else thickness
     for i, row in enumerate(w.config.cutters):
       force = row.energy * (1.0 if solid else thickness)  # of a solid by depth
       if row.current:
@@ -184,9 +173,17 @@ class Cutters(Force):
     """Names of the geoms that cut by a current."""
     return [self.names[i][0] for i in self.by_current]
 
-  def edges(self) -> dict[str, np.ndarray]:
-    """Returns the fields of `Blades` that say which geoms they are, and their edges."""
-    return self._arrays
+  def constants(self) -> dict[str, Any]:
+    """Returns the fields of `Blades` that say which geoms they are and what they meet."""
+    mesh, scheme = self._w.organ.mesh, SCHEMES[self._w.config.integrator]
+    return self._arrays | dict(
+      nblade=len(self.names),
+      nelem=mesh.whole.nelem,
+      ntet=len(mesh.tet),
+      ahead=float(scheme.ahead),
+      gain=scheme.gain(1.0, 0.0),
+      edge=float(mesh.whole.edge_length),
+    )
 
   @property
   def state(self) -> np.ndarray:
@@ -198,15 +195,9 @@ class Cutters(Force):
     if not self:
       return
     w, n, mesh = self._w, len(self.names), self._w.organ.mesh
-    m, scheme = w.host.m, SCHEMES[w.config.integrator]
+    m = w.host.m
     values = {name: np.zeros((n, width)) for name, width in WIDTHS.items()}
-    values |= self._arrays | dict(
-      nblade=n,
-      nelem=mesh.whole.nelem,
-      ntet=len(mesh.tet),
-      ahead=float(scheme.ahead),
-      gain=scheme.gain(1.0, 0.0),
-      edge=float(mesh.whole.edge_length),
+    values |= self.constants() | dict(
       law=self.law(m, w.config.thickness),
       mesh=np.zeros(1),
       elem=mesh.elem[: mesh.whole.nelem],
@@ -222,8 +213,6 @@ class Cutters(Force):
     self.fields = fill(Blades, "cpu", values)
     self._here = Views(self.fields)
     self._due = self._here.due.data
-    if w.cuts and not len(mesh.tet):
-      assert w.cuts.finder.stops  # made now, since its kernel takes a while to load
 
   def refresh(self):
     """Takes the thickness that the wall has now."""
@@ -241,58 +230,49 @@ class Cutters(Force):
 
   def open(self) -> bool:
     """Lets the mesh come apart along the paths that are long enough, or ended; returns whether."""
-    opened, mesh = False, self._w.organ.mesh
+    opened, edge = False, self._w.organ.mesh.whole.edge_length
     for i, current in self.by_current.items():
       row = self.state[i]
-      self._due[i] = ENDED if current.act(row) else lay_trail(row, mesh.whole.edge_length)
+      self._due[i] = trails.lay(row, edge) if self._burn(current, row) else trails.end(row)
     for i, due in enumerate(self._due):
       if due:
-        given = GIVEN * self._here.law[i, LAW.force] * mesh.whole.edge_length
-        opened = self._open(i, due == ENDED, given) or opened
+        given = trails.GIVEN * self._here.law[i, LAW.force] * edge
+        opened = self._open(i, due == trails.ENDED, given) or opened
         self._due[i] = 0
     return opened
 
+  def _burn(self, current: trails.Current, row: np.ndarray) -> bool:
+    """Does what a step's current does; returns whether it cuts."""
+    w = self._w
+    m, d = mjstruct.Model.from_address(w.model), mjstruct.Data.from_address(w.data)
+    power = float(mjstruct.view(d.ctrl, m.nu)[current.actuator])
+    given = abs(power) * float(m.opt.timestep)  # [J]
+    if given:
+      w.bonds.burn(current.burning)
+    if power <= 0 or not w.cuts:
+      return False
+    mesh, place = w.organ.mesh, mjstruct.view(d.geom_xpos, (m.ngeom, 3))[current.geom]
+    line = current.line(place, mjstruct.view(d.geom_xmat, (m.ngeom, 3, 3))[current.geom])
+    x, thickness = mesh.rest + w.motion()[0], w.config.thickness
+    return current.burn(row, w.organ, mesh, x, w.cuts.finder, line, given, thickness)
+
   def _open(self, i: int, ended: bool, given: float) -> bool:
     """Opens the path of a blade; returns whether the mesh is another."""
-    w, row, mesh = self._w, self.state[i], self._w.organ.mesh
+    w, finder, way = self._w, self._w.cuts.finder, None
+    if len(w.organ.mesh.tet) and i not in self.by_current:
+      m, d = mjstruct.Model.from_address(w.model), mjstruct.Data.from_address(w.data)
+      turn = mjstruct.view(d.geom_xmat, (m.ngeom, 3, 3))
+      way = trails.along(turn, self._arrays["geom"][i], self._arrays["axis"][i])
 
-    def cut(path: np.ndarray, *deep: np.ndarray) -> tuple[Report, Mesh]:
-      if not deep:
-        return w.cuts.cut_at_rest(path, given), w.organ.mesh
-      organ = w.organ
-      along = None if i in self.by_current else self._along(i)
-      now, elem = self._on_surface(path)
-      way = solid_paths.direction(organ, w.motion()[0], along, elem)
-      now = organ.origin + now @ organ.frame.T
-      return w.cuts.cut(now, given * float(deep[0].mean()), deep[0], way), w.organ.mesh
+    def cut(path: np.ndarray, depth: np.ndarray | None) -> tuple[Report, Mesh]:
+      where = w.organ, w.organ.mesh, w.motion()[0], finder, way
+      return cuts.cut_path(w, trails.path_of(path, depth, given, *where)), w.organ.mesh
 
-    if len(mesh.tet):
-      edge = mesh.whole.edge_length
-      report, why = solid_paths.open_path(row, edge, ended, w.cuts.finder, cut)
-    else:
-      report, why = open_path(row, mesh, ended, w.organ, w.cuts.finder, cut)
+    report, why = trails.open_path(self.state[i], w.organ, w.organ.mesh, ended, finder, cut)
     if "pinned" in why and not self._said:
       self._said = True
       mjstruct.warn(why)
     return report is not None and report.nodes > 0
-
-  def _along(self, i: int) -> np.ndarray:
-    """Returns the way along a blade, or along which scissors close, in the world, either sign."""
-    m = mjstruct.Model.from_address(self._w.model)
-    d = mjstruct.Data.from_address(self._w.data)
-    turn = mjstruct.view(d.geom_xmat, (m.ngeom, 3, 3))
-    geoms, axes = self._arrays["geom"][i], self._arrays["axis"][i]
-    one, two = (turn[g][:, k] for g, k in zip(geoms, axes, strict=True))
-    if geoms[1] < 0:
-      return one
-    return one - np.copysign(1.0, one @ two) * two  # blades are at less than 90 degrees
-
-  def _on_surface(self, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns where points of the rest shape are now, in the organ's frame, and their triangles."""
-    w, mesh = self._w, self._w.organ.mesh
-    elem, weight, _ = w.cuts.finder.nearest(mesh, mesh.rest, path)
-    vert = mesh.elem[elem]
-    return np.einsum("nk,nkj->nj", weight, mesh.rest[vert] + w.motion()[0][vert]), elem
 
   def read(self) -> list[Cutter]:
     """Returns what the cutters do."""
@@ -308,80 +288,6 @@ class Cutters(Force):
 
   def _forces(self) -> np.ndarray:
     return self._here.force @ self._w.organ.frame.T
-
-
-def lay_trail(row: np.ndarray, edge: float) -> int:
-  """Lets a path follow what cuts by a current; returns what is due, as the header says of blades.
-
-  Args:
-    row: of the blades' state
-    edge: mean length of the mesh's edges [m]
-  """
-  count, at = int(row[BLADE.count]), row[BLADE.at : BLADE.at + 3]
-  if not row[BLADE.stage]:
-    return 0
-  start, last = (row[k : k + 3] for k in (BLADE.trail, BLADE.trail + 3 * (count - 1)))
-  if count < TRAIL and np.linalg.norm(at - last) > _SPACING * edge:
-    row[BLADE.trail + 3 * count : BLADE.trail + 3 * count + 3] = at
-    row[BLADE.below + count] = row[BLADE.depth]
-    row[BLADE.count] += 1
-  wait = row[BLADE.wait] or _BATCH * edge
-  return int(np.linalg.norm(at - start) > wait or row[BLADE.count] == TRAIL)
-
-
-def open_path(
-  row: np.ndarray,
-  mesh: Mesh,
-  ended: bool,
-  organ: "Declaration",
-  finder: Finder,
-  cut: Callable[[np.ndarray], tuple[Report, Mesh]],
-) -> tuple[Report | None, str]:
-  """Opens the path of a blade, as far as the mesh is to come apart along it.
-
-  Args:
-    row: of the blades' state
-    mesh: the organ's
-    ended: whether all of it comes apart
-    organ: its declaration
-    finder: of its surfaces
-    cut: cuts along a path at rest, (n, 3) [m]; returns what it did, and the mesh then
-
-  Returns:
-    what was cut, None for nothing, and why it could not be
-  """
-  count, at = int(row[BLADE.count]), row[BLADE.at : BLADE.at + 3]
-  edge = mesh.whole.edge_length
-  trail = row[BLADE.trail : BLADE.trail + 3 * count].reshape(-1, 3)
-  path, rest = np.vstack([trail, at]), at[None]
-  if not ended:
-    path, rest = finder.stops.part(mesh, path)
-  report, why = None, ""
-  try:
-    if len(path) > 1:
-      report, mesh = cut(path)
-  except ValueError as error:
-    why = str(error)
-  if ended:
-    row[BLADE.count] = 0
-  elif report is None:
-    _wait(row, at, edge, "pinned" in why or count == TRAIL)
-  else:
-    tip = (report.path[-1][-1] - organ.origin) @ organ.frame if report.path else path[-1]
-    trail = np.concatenate([tip[None], rest[:-1]])[:TRAIL]
-    row[BLADE.count], row[BLADE.wait] = len(trail), 0.0
-    row[BLADE.trail : BLADE.trail + trail.size] = trail.ravel()
-    row[BLADE.elem] = finder.nearest(mesh, mesh.rest, at[None])[0][0]
-  return report, why
-
-
-def _wait(row: np.ndarray, at: np.ndarray, edge: float, full: bool):
-  """Lets a path grow that could not come apart, or forgets it where there is no more room."""
-  start = row[BLADE.trail : BLADE.trail + 3]
-  row[BLADE.wait] = np.linalg.norm(at - start) + _MORE * edge
-  if full:
-    row[BLADE.count], row[BLADE.wait] = 1, 0.0
-    start[:] = at
 
 
 def _name(m, geom: int) -> str:

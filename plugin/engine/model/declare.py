@@ -16,6 +16,7 @@ from palpate.tissue import device as devices
 from palpate.tissue import shape
 from palpate.tissue.body import Body
 from palpate.tissue.config import Config
+from palpate.tissue.cutting import stamps
 from palpate.tissue.geometry import diagonals, faces, fill, gmsh
 from palpate.tissue.geometry import mesh as topology
 from palpate.tissue.geometry.mesh import Mesh
@@ -219,10 +220,10 @@ def read_mesh(
   text = texts.get("spare", "").strip()
   elem = flexes.compiled_elements(m, flex) if text else flexes.elements(m, flex)
   spare = configuration.spare(name, text, len(rest) - int(elem.max(initial=-1)) - 1)
-  if spare and len(rest) > flexes.MOST:
+  if spare and len(rest) > stamps.MOST:
     raise ValueError(
       f"organ {name!r}: spare is {spare} and it has {len(rest)} vertices, expected at most "
-      f"{flexes.MOST}"
+      f"{stamps.MOST}"
     )
   mesh = topology.build(name, rest, elem, spare)
   config = configuration.parse(name, texts, len(elem), mesh.closed)

@@ -46,7 +46,7 @@ PALPATE Fields of_world(Fields f, int world) {
   move_to(f.force, world), move_to(f.point, world), move_to(f.share, world), move_to(f.hold, world);
   move_to(f.held, world);
   f.number.data += NUMBERS * world;
-  move_to(f.elem, f.mesh.data[world]);
+  move_to(f.elem, f.mesh.data[world]), move_to(f.tet, f.mesh.data[world]);
   move_to(f.flat, f.mesh.data[world]);
   return f;
 }

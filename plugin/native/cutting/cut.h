@@ -1,4 +1,4 @@
-// Cuts a surface along a path, by one thread a world: a chain of edges near the path is found, its
+// Cuts a surface along a path, by one thread: a chain of edges near the path is found, its
 // vertices are moved onto it in the rest shape ("snap"), and vertices on it are doubled ("split";
 // Nienhuys and van der Stappen 2001).
 //
@@ -128,60 +128,53 @@ PALPATE bool apply(const S& m, const Moving& x, const Move* move, int nmove, con
   return true;
 }
 
-// What a world's cut has done, in the arrays of such names.
+// Writes what a cut has done.
 template <class F>
-struct Answer {
-  const F& f;
-  long long vert, elem;  // where those of the world start
-  int* found;  // numbers, see FOUND
-  double* size;  // see SIZE
-
-  PALPATE void write(const Changes& c, const Seam& seam, int nmove) const {
-    for (int i = 0; i < c.vert.count; ++i) f.near.data[vert + i] = c.vert.list[i];
-    for (int i = 0; i < c.split.count; ++i) {
-      f.group.data[vert + i] = c.split.group[i], f.member.data[vert + i] = c.split.member[i];
-      f.share.data[vert + i] = c.share[i];
-    }
-    for (int i = 0; i < c.elem.count; ++i) f.changed.data[elem + i] = c.elem.list[i];
-    for (int i = 0; i < 3 * c.elem.count; ++i) f.before.data[3 * elem + i] = c.before[i];
-    for (int i = 0; i < 2 * seam.count; ++i) f.seam.data[2 * vert + i] = seam.pair[i];
-    found[FOUND_NEAR] = c.vert.count, found[FOUND_SPLIT] = c.split.count;
-    found[FOUND_CHANGED] = c.elem.count, found[FOUND_EDGES] = seam.count;
-    found[FOUND_NOUTER] = c.split.following, found[FOUND_MOVED] = nmove;
+PALPATE void answer(const F& f, const Changes& c, const Seam& seam, int nmove) {
+  for (int i = 0; i < c.vert.count; ++i) f.near.data[i] = c.vert.list[i];
+  for (int i = 0; i < c.split.count; ++i) {
+    f.group.data[i] = c.split.group[i], f.member.data[i] = c.split.member[i];
+    f.share.data[i] = c.share[i];
   }
-};
+  for (int i = 0; i < c.elem.count; ++i) f.changed.data[i] = c.elem.list[i];
+  for (int i = 0; i < 2 * seam.count; ++i) f.seam.data[i] = seam.pair[i];
+  int* found = f.found.data;
+  found[FOUND_NEAR] = c.vert.count, found[FOUND_SPLIT] = c.split.count;
+  found[FOUND_CHANGED] = c.elem.count, found[FOUND_EDGES] = seam.count;
+  found[FOUND_NOUTER] = c.split.following, found[FOUND_MOVED] = nmove;
+}
 
 // Cuts along a path that was traced; returns how it went.
 template <class F, class S>
 PALPATE int cut_along(const F& f, const S& m, const Material& p, const Path& path, const Moving& x,
-                      Scratch& memory, const Answer<F>& out) {
+                      Scratch& memory) {
+  int* found = f.found.data;
   Chains chains;
   Changes made = {few(memory, m.nelem), few(memory, m.nvert), nullptr};
-  made.split = {memory.numbers(m.nvert), memory.numbers(m.nvert), 0, out.found[FOUND_NOUTER]};
-  const auto* pinned = f.pinned.data + out.vert;
+  made.split = {memory.numbers(m.nvert), memory.numbers(m.nvert), 0, found[FOUND_NOUTER]};
+  const auto* pinned = f.pinned.data;
   if (memory.full) return NO_ROOM;
   int status = find_chains(m, path, memory, chains);
-  if (status == DONE) status = check_chains(m, path, chains, pinned, out.size + SIZE_BAD);
+  if (status == DONE) status = check_chains(m, path, chains, pinned, f.size.data + SIZE_BAD);
   if (status != DONE) return status;
   Plan plan = new_plan(m, chains, memory);
   if (memory.full || !mend(m, path, p, x.disp, pinned, m.nvert - made.split.following, chains, plan, memory) ||
       plan.seam.count > m.nvert)
     return NO_ROOM;
-  out.found[FOUND_STOPPED] = plan.stopped;
+  found[FOUND_STOPPED] = plan.stopped;
   const int nmove = those_that_move(plan.move, plan.movers.count);
   if (!apply(m, x, plan.move, nmove, plan.seam, plan.there, pinned, made, memory)) return NO_ROOM;
-  out.write(made, plan.seam, nmove);
-  out.size[SIZE_DEVIATION] = deviation_of(m, path, chains, plan.there);
+  answer(f, made, plan.seam, nmove);
+  f.size.data[SIZE_DEVIATION] = deviation_of(m, path, chains, plan.there);
   bool apart = false;
   for (int r = 0; r < path.nrun && made.elem.count; ++r)
     apart = apart || may_separate(chains, r, made.split);
   if (!apart) return DONE;
-  Pieces pieces = {memory.numbers(m.nelem), memory.numbers(m.nelem), memory.numbers(m.nelem),
-                   memory.numbers(m.nelem), memory.numbers(m.nelem), memory.values(m.nelem)};
+  const Pieces pieces = all_apart(memory, m.nvert);
   if (memory.full) return NO_ROOM;
-  come_loose(m, f.home.data, f.surface.loose.data + out.elem, pieces);
-  out.found[FOUND_APART] = 1;
-  return DONE;
+  for (int h = 0; h < 3 * m.nelem; ++h) pieces.join(m.from(h), m.to(h));
+  found[FOUND_APART] = 1;
+  return let_go(m, pieces, f.home.data, f.surface.loose.data, memory) ? DONE : NO_ROOM;
 }
 
 // Finds the places of a surface that are nearest to points.
@@ -209,24 +202,21 @@ PALPATE void find_nearest(const Fields& f, Thread t, int) {
 template <class Fields>
 PALPATE void cut_surface(const Fields& f, Thread t, int) {
   if (t.tid) return;
-  const int w = t.world;
-  const auto m = surface_of(f.surface, w);
-  const long long v = w * (long long)m.nvert, e = w * (long long)m.nelem;
-  const Answer<Fields> out = {f, v, e, f.found.data + FOUND_LENGTH * w, f.size.data + SIZE_LENGTH * w};
-  Scratch memory = {f.ints.data + w * (long long)f.nint, f.reals.data + w * (long long)f.nreal,
-                    f.nint, f.nreal, false};
+  const auto m = surface_of(f.surface);
+  Scratch memory = {f.ints.data, f.reals.data, f.nint, f.nreal, false};
   double* x = memory.values(3 * m.nvert);
   if (memory.full) return;
-  const Moving moving = {f.mass.data + v, f.disp.data + 3 * v, f.vel.data + 3 * v};
+  const Moving moving = {f.mass.data, f.disp.data, f.vel.data};
   for (int i = 0; i < 3 * m.nvert; ++i) x[i] = f.at_rest ? m.rest[i] : m.rest[i] + moving.disp[i];
   const Material p = {f.kind, f.held, f.thickness, f.stiffness, f.given, f.lame.data, f.shear.data,
-                      f.whole.data + v, f.pull.data + 3 * v, f.hard.data + v};
+                      f.whole.data, f.pull.data, f.hard.data};
   Path path = {};
   path.edge = f.edge;
-  int status = trace(m, x, out.found[FOUND_NOUTER], f.point.data + 3 * w * (long long)f.most_points,
-                     f.npoint.data[w], memory, path, out.size + SIZE_BAD);
-  if (status == DONE) status = cut_along(f, m, p, path, moving, memory, out);
-  out.found[FOUND_STATUS] = status;
+  int* found = f.found.data;
+  int status = trace(m, x, found[FOUND_NOUTER], f.point.data, f.npoint.data[0], memory, path,
+                     f.size.data + SIZE_BAD);
+  if (status == DONE) status = cut_along(f, m, p, path, moving, memory);
+  found[FOUND_STATUS] = status;
 }
 
 }  // namespace palpate

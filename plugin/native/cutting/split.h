@@ -143,43 +143,4 @@ PALPATE void rejoin(const S& m, Few& elem, int* before, const Few& moved, const 
     }
 }
 
-// What tells the pieces of a surface apart.
-struct Pieces { int *label, *queue, *home, *best, *many; double* size; };
-
-// Marks triangles that a cut has freed from the foundation: of what it held together until now, it goes
-// on to hold the largest piece.
-template <class S, class I>
-PALPATE void come_loose(const S& m, const I* home, unsigned char* loose, Pieces& p) {
-  int count = 0;
-  for (int t = 0; t < m.nelem; ++t) {
-    if (p.label[t]) continue;
-    int queued = 0;
-    p.label[t] = ++count;
-    p.home[count - 1] = (int)home[t], p.size[count - 1] = 0.0;
-    p.queue[queued++] = t;
-    while (queued) {
-      const int a = p.queue[--queued];
-      for (int h = 3 * a; h < 3 * a + 3; ++h) {
-        const int b = m.twin[h] >= 0 ? (int)m.twin[h] / 3 : a;
-        if (p.label[b]) continue;
-        p.label[b] = count, p.queue[queued++] = b;
-      }
-    }
-  }
-  for (int t = 0; t < m.nelem; ++t) {
-    D3 x[3];
-    m.corners(t, x);
-    if (!loose[t]) p.size[p.label[t] - 1] += 0.5 * norm(cross(x[1] - x[0], x[2] - x[0]));
-  }
-  for (int k = 0; k < count; ++k) {  // `best` of a home: its largest piece, from 1
-    int& best = p.best[p.home[k]];
-    p.many[p.home[k]] += p.size[k] > 0.0;
-    if (!best || p.size[k] > p.size[best - 1]) best = k + 1;
-  }
-  for (int t = 0; t < m.nelem; ++t) {
-    const int h = p.home[p.label[t] - 1];
-    if (p.many[h] > 1 && p.label[t] != p.best[h]) loose[t] = 1;
-  }
-}
-
 }  // namespace palpate

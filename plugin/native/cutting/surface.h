@@ -42,20 +42,18 @@ struct Surface {
   }
 };
 
-// The surface of a world in arrays of such names, all of them with the worlds one after the other.
+// The surface in arrays of such names.
 template <class F>
-PALPATE auto surface_of(const F& f, int world) {
+PALPATE auto surface_of(const F& f) {
   using I = decltype(f.elem.data[0] + 0);
-  const long long v = world * (long long)f.nvert, t = world * (long long)f.nelem;
-  return Surface<I>{f.nvert, f.nelem, f.most, f.rest.data + 3 * v, f.elem.data + 3 * t,
-                    f.twin.data + 3 * t, f.ring.data + f.most * v, f.spoke.data + f.most * v,
-                    f.degree.data + v, f.whole_elem.data, f.whole_twin.data};
+  return Surface<I>{f.nvert, f.nelem, f.most, f.rest.data, f.elem.data, f.twin.data, f.ring.data,
+                    f.spoke.data, f.degree.data, f.whole_elem.data, f.whole_twin.data};
 }
 
 // What vertices carry.
 struct Moving { double *mass, *disp, *vel; };
 
-// Scratch of a world; numbers that are taken are zero, unless they are room alone.
+// Scratch; numbers that are taken are zero, unless they are room alone.
 struct Scratch {
   int* ints;
   double* reals;
@@ -126,6 +124,53 @@ PALPATE double area_around(const S& m, int v, const L* loose) {
     m.corners(t, x);
     if (!loose || !loose[t]) sum += norm(0.5 * cross(x[1] - x[0], x[2] - x[0])) / 3.0;
   }
+}
+
+// Vertices that hang together have the lowest of them for a root.
+struct Pieces {
+  int* root;
+
+  PALPATE int find(int v) const {
+    while (root[v] != v) v = root[v] = root[root[v]];
+    return v;
+  }
+  PALPATE void join(int v, int w) const {
+    const int a = find(v), b = find(w);
+    root[a > b ? a : b] = a < b ? a : b;
+  }
+};
+
+PALPATE Pieces all_apart(Scratch& memory, int nvert) {
+  Pieces out = {memory.room(nvert)};
+  for (int v = 0; v < nvert && out.root; ++v) out.root[v] = v;
+  return out;
+}
+
+// Marks triangles that a cut has freed from the foundation: of what it held together until now, it goes on to
+// hold the largest piece.
+template <class S, class I>
+PALPATE bool let_go(const S& m, const Pieces& p, const I* home, unsigned char* loose, Scratch& memory) {
+  int *best = memory.numbers(m.nelem), *many = memory.numbers(m.nelem);
+  double* size = memory.values(m.nvert);
+  if (memory.full) return false;
+  for (int v = 0; v < m.nvert; ++v) size[v] = 0.0;
+  for (int t = 0; t < m.nelem; ++t) {
+    D3 x[3];
+    for (int c = 0; c < 3; ++c) x[c] = m.place((int)m.elem[3 * t + c]);
+    if (!loose[t]) size[p.find((int)m.elem[3 * t])] += norm(0.5 * cross(x[1] - x[0], x[2] - x[0]));
+  }
+  for (int t = 0; t < m.nelem; ++t) {  // `best` of a home: its largest piece, from 1
+    const int v = p.find((int)m.elem[3 * t]), h = (int)home[t];
+    if (size[v] == 0.0 || best[h] == v + 1) continue;
+    const double most = best[h] ? size[best[h] - 1] : 0.0;
+    many[h] = 1 + (best[h] > 0);
+    if (size[v] > most || (size[v] == most && v + 1 < best[h])) best[h] = v + 1;
+  }
+  for (int t = 0; t < m.nelem; ++t) {
+    const int h = (int)home[t];
+    if (many[h] > 1 && p.find((int)m.elem[3 * t]) + 1 != best[h]) loose[t] = 1;
+  }
+  return true;
 }
 
 // Turns a symmetric matrix so that an entry beside its diagonal is 0 (Jacobi 1846), and with it `axes`.

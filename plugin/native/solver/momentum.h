@@ -25,12 +25,13 @@ PALPATE void keep_spin(const Fields& f, Thread t, int) {
   if (h == 0.0f || f.state.hold.data || numbers(f, t.world)[FOUNDATION] != 0.0f) return;
   Group<SUMS> group(t, f.system.partial.data);
   const size_t base = (size_t)t.world * f.shape.nslice;
-  const float* rest = f.shape.rest.data + mesh_of(f, t.world);
+  const size_t mesh = mesh_of(f, t.world);
+  const float *rest = f.shape.rest.data + mesh, *free = f.shape.free.data + mesh;
   const float* disp = f.state.disp.data + 24 * base;
   float* dvel = f.state.dvel.data + 24 * base;
   const auto place = [&](int s, Lane lane) { return ld3(rest + 24 * s, lane) + ld3(disp + 24 * s, lane); };
   const auto mass_of = [&](int s, Lane lane) {
-    return ld(f.shape.free.data, s, lane) * ld(f.state.mass.data + 8 * base, s, lane);
+    return ld(free, s, lane) * ld(f.state.mass.data + 8 * base, s, lane);
   };
   const V zero = splat(0.0f);
   const V3 none = {zero, zero, zero};
@@ -49,7 +50,7 @@ PALPATE void keep_spin(const Fields& f, Thread t, int) {
     const V m = mass_of(s, lane);
     const V3 r = place(s, lane) - centre;
     const V3 impulse = h * ld3(f.state.force_ext.data + 24 * base + 24 * s, lane);
-    lost += cross(r, ld(f.shape.free.data, s, lane) * impulse - m * ld3(dvel + 24 * s, lane));
+    lost += cross(r, ld(free, s, lane) * impulse - m * ld3(dvel + 24 * s, lane));
     square += m * V3{r.x * r.x, r.y * r.y, r.z * r.z};
     mixed += m * V3{r.y * r.z, r.z * r.x, r.x * r.y};
   });
@@ -60,7 +61,7 @@ PALPATE void keep_spin(const Fields& f, Thread t, int) {
   const V3 omega = {splat((float)turn.x), splat((float)turn.y), splat((float)turn.z)};
   group.each(0, f.shape.nused, [&](int s, Lane lane) {
     const V3 back = cross(omega, place(s, lane) - centre);
-    st3(dvel + 24 * s, ld3(dvel + 24 * s, lane) + ld(f.shape.free.data, s, lane) * back, lane);
+    st3(dvel + 24 * s, ld3(dvel + 24 * s, lane) + ld(free, s, lane) * back, lane);
   });
 }
 

@@ -59,7 +59,7 @@ struct Solid : Matrix {
 
 template <class Fields>
 PALPATE float unit(const Fields& f, int world) {
-  return f.state.step.data[4 * world + 1] * numbers(f, world)[SHEAR] * f.tissue.stiffness.data[0];
+  return f.state.step.data[4 * world + 1] * numbers(f, world)[SHEAR] * f.tissue.stiffness.data[mesh_of(f, world)];
 }
 
 template <class Fields>

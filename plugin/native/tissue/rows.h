@@ -358,7 +358,7 @@ PALPATE bool write_rows(const F& f, const S& m, Scratch& memory) {
 template <class Fields>
 PALPATE void count_bends(const Fields& f, Thread t, int) {
   if (t.tid) return;
-  const auto m = surface_of(f.surface, t.world);
+  const auto m = surface_of(f.surface);
   Scratch memory = {f.ints.data, f.reals.data, f.nint, f.nreal, false};
   BendRow row = bend_row(m, memory);
   for (int v = 0; v < m.nvert; ++v) {
@@ -386,7 +386,7 @@ template <class Fields>
 PALPATE void fill_rows(const Fields& fields, Thread t, int) {
   if (t.tid) return;
   const Fields f = skipped(fields);
-  const auto m = surface_of(f.surface, t.world);
+  const auto m = surface_of(f.surface);
   Scratch memory = {f.ints.data, f.reals.data, f.nint, f.nreal, false};
   f.found.data[0] = write_rows(f, m, memory);
 }

@@ -104,12 +104,13 @@ PALPATE void node_stress(const Fields& f, Thread t, int stage) {
   const size_t base = 96 * (size_t)t.world * f.shape.nslice;
   const float* motion = f.system.node_motion.data + base;
   const float* number = numbers(f, t.world);
+  const size_t mesh = mesh_of(f, t.world);
   const float* moduli = f.lump.node_moduli.data ? f.lump.node_moduli.data + base / 6
-                                                : f.tissue.node_moduli.data;
+                                                : f.tissue.node_moduli.data + mesh;
   each_slice(t, f.shape.nused, [&](int s, Lane lane) {
-    const int row = f.shape.slot_adr.data[s], width = f.shape.fan_width.data[s];
-    const int* node = f.shape.fan_node.data + 8 * (row + 2 * s + 1);
-    const float* slope = f.shape.fan_slope.data + 24 * (size_t)row;
+    const int row = f.shape.slot_adr.data[s], width = f.shape.fan_width.data[mesh + s];
+    const int* node = f.shape.fan_node.data + mesh + 8 * (row + 2 * s + 1);
+    const float* slope = f.shape.fan_slope.data + mesh + 24 * (size_t)row;
     const V3 u = ld3(f.system.disp_trial.data + base / 4 + 24 * s, lane);
     const V3 v = ld3(f.system.vel_trial.data + base / 4 + 24 * s, lane);
     const V zero = splat(0.0f);
@@ -173,11 +174,12 @@ PALPATE void tet_stress(const Fields& f, Thread t, int stage) {
   const float* motion = f.system.node_motion.data + base;
   const float* nodal = f.system.node_stress.data + base;
   const float* number = numbers(f, t.world);
+  const size_t mesh = mesh_of(f, t.world);
   each_slice(t, f.shape.ntetslice, [&](int s, Lane lane) {
-    const int* node = f.shape.tet_node.data + 32 * s;
-    const float* g = f.shape.tet_gradient.data + 72 * s;
+    const int* node = f.shape.tet_node.data + mesh + 32 * s;
+    const float* g = f.shape.tet_gradient.data + mesh + 72 * s;
     const size_t at = (size_t)t.world * f.shape.ntetslice + s;
-    const float* own = f.tissue.tet_moduli.data + 24 * s;
+    const float* own = f.tissue.tet_moduli.data + mesh + 24 * s;
     const float* moduli = f.lump.tet_moduli.data ? f.lump.tet_moduli.data + 16 * at : own + 8;
     const V volume = ld(own, 0, lane);
     const V mu = number[SHEAR] * ld(moduli, 0, lane), lam = number[LAME] * ld(moduli, 1, lane);
@@ -234,22 +236,24 @@ PALPATE void edge_block(const Fields& f, Thread t, int) {
   Half* out = f.system.half.data + 72 * (size_t)t.world * f.shape.nslot;
   const float* mass = f.state.mass.data + 8 * (size_t)t.world * f.shape.nslice;
   const float whole = unit(f, t.world), per_unit = whole > 0.0f ? 1.0f / whole : 0.0f;
+  const size_t mesh = mesh_of(f, t.world);
+  const int *from = f.shape.edge_from.data + mesh, *to = f.shape.edge_to.data + mesh;
   each_slice(t, f.shape.nedgeslice, [&](int s, Lane lane) {
     const V zero = splat(0.0f);
     M3 block = {zero, zero, zero, zero, zero, zero, zero, zero, zero};
     for (int k = f.shape.edge_adr.data[s]; k < f.shape.edge_adr.data[s + 1]; ++k) {
       V beside;
-      const V3 a = gather_shared(arm, f.shape.edge_from.data + 8 * k, beside, lane);
-      const V3 c = gather_shared(arm, f.shape.edge_to.data + 8 * k, lane);
+      const V3 a = gather_shared(arm, from + 8 * k, beside, lane);
+      const V3 c = gather_shared(arm, to + 8 * k, lane);
       block = block + outer(first_of(beside) * a, c) + outer(c, a) + second_of(beside) * dot(a, c);
     }
     block = splat(per_unit) * block;
     const V size = vsqrt(inner(block, block)) + 1e-7f;
-    const int* end = f.shape.edge_node.data + 16 * s;
+    const int* end = f.shape.edge_node.data + mesh + 16 * s;
     const V light = vmin(gather(mass, end, 0, lane), gather(mass, end + 8, 0, lane));
     const V taken = vmax(ROUNDING * size - (CARRIED * per_unit) * light, zero);
     block = vmin(splat(1.0f), MOST_HALF / size) * block + splat(-1.0f) * taken;
-    const int* at = f.shape.edge_slot.data + 16 * s;
+    const int* at = f.shape.edge_slot.data + mesh + 16 * s;
     put9(out, at, block, lane);
     put9(out, at + 8, transposed(block), lane);
   });
@@ -266,16 +270,18 @@ PALPATE void solid_row(const Fields& f, Thread t, int stage) {
   const size_t base = (size_t)t.world * f.shape.nslice;
   const size_t tet = (size_t)t.world * f.shape.ntetslice;
   const float* impulse = f.system.tet_impulse.data + 128 * tet;
+  const size_t mesh = mesh_of(f, t.world);
+  const int* around = f.shape.around_corner.data + mesh;
   each_slice(t, f.shape.nused, [&](int s, Lane lane) {
     const size_t at = base + s;
     const V mass = ld(f.state.mass.data + 8 * at, 0, lane);
-    const V kf = splat(foundation) * ld(f.shape.area.data, s, lane), diag = mass + g * kf;
+    const V kf = splat(foundation) * ld(f.shape.area.data + mesh, s, lane), diag = mass + g * kf;
     const V3 u = ld3(f.system.disp_trial.data + 24 * at, lane);
     const V3 v = ld3(f.system.vel_trial.data + 24 * at, lane);
     V3 b = h * (ld3(f.state.force_ext.data + 24 * at, lane) - kf * u) - gv * kf * v;
     if (stage == LATER) b -= mass * ld3(f.state.dvel.data + 24 * at, lane);
     for (int k = f.shape.around_adr.data[s]; k < f.shape.around_adr.data[s + 1]; ++k)
-      b += gather_shared(impulse, f.shape.around_corner.data + 8 * k, lane);
+      b += gather_shared(impulse, around + 8 * k, lane);
     const V zero = splat(0.0f);
     S3 held = {zero, zero, zero, zero, zero, zero};
     if (f.state.hold.data) held = hold(f, stage, at, b, lane);
@@ -287,11 +293,11 @@ PALPATE void solid_row(const Fields& f, Thread t, int stage) {
     if (!implicit) return;
     S3 self = {zero, zero, zero, zero, zero, zero};
     const Half* block = f.system.half.data + 72 * (size_t)t.world * f.shape.nslot;
-    const int row = f.shape.slot_adr.data[s], end = row + f.shape.fan_width.data[s];
+    const int row = f.shape.slot_adr.data[s], end = row + f.shape.fan_width.data[mesh + s];
     for (int j = row; j < end; ++j)
       self = self + symmetric(ld9(block + 72 * (size_t)j, lane));
     put_diagonal(f.system.diag.data + 8 * at, f.system.inverse.data + 48 * at,
-                 ld(f.shape.free.data, s, lane), diag, splat(-unit(f, t.world)) * self + diag + held, lane);
+                 ld(f.shape.free.data + mesh, s, lane), diag, splat(-unit(f, t.world)) * self + diag + held, lane);
   });
 }
 

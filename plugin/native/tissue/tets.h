@@ -144,27 +144,39 @@ PALPATE void put_edge(const F& f, const S& m, int edge, int a, int b, int place)
   }
 }
 
+// The edge that has a place that waits, -1 for none: from the corners of the first tetrahedron there.
+template <class F>
+PALPATE int owner_of(const F& f, int place) {
+  const int s = place / LANES, lane = place % LANES, row = LANES * f.edge_adr.data[s] + lane;
+  if (f.edge_slot.data[2 * LANES * s + lane] < 0) return -1;
+  const int from = f.edge_from.data[row], to = f.edge_to.data[row];
+  const int t = from / (4 * LANES) * LANES + from % LANES;
+  for (int pair = 6 * t; pair < 6 * t + 6; ++pair)
+    if (number_of(t, f.first.data[pair]) == from && number_of(t, f.last.data[pair]) == to) return f.which.data[pair];
+  return -1;
+}
+
 // Writes edges: what each has become beside itself goes to places that wait. Returns whether there were
 // enough of these; nothing was written otherwise.
 template <class F, class S>
 PALPATE bool put_edges(const F& f, const S& m, const Few& edges, int* a, int* b) {
+  const int first = f.nplace - f.nwait;
+  const auto may_take = [&](int place) {
+    const int owner = owner_of(f, place);
+    return owner < 0 || edges.has(owner);
+  };
   int wanted = 0, has = 0;
   for (int i = 0; i < edges.count; ++i) wanted += ends_of(f, edges.list[i], a, b) - 1;
-  for (int i = 0; i < f.nwait; ++i) has += f.owner.data[i] < 0 || edges.has(f.owner.data[i]);
+  for (int i = first; i < f.nplace; ++i) has += may_take(i);
   if (wanted > has) return false;
-  const int first = f.nplace - f.nwait;
-  for (int i = 0; i < f.nwait; ++i) {
-    if (f.owner.data[i] < 0 || !edges.has(f.owner.data[i])) continue;
-    f.owner.data[i] = -1;
-    clear_edge(f, first + i);
-  }
-  for (int i = 0, free = 0; i < edges.count; ++i) {
+  for (int i = first; i < f.nplace; ++i)
+    if (may_take(i)) clear_edge(f, i);
+  for (int i = 0, free = first; i < edges.count; ++i) {
     const int edge = edges.list[i], n = ends_of(f, edge, a, b);
     put_edge(f, m, edge, a[0], b[0], f.place.data[edge]);
     for (int k = 1; k < n; ++k) {
-      while (f.owner.data[free] >= 0) ++free;
-      f.owner.data[free] = edge;
-      put_edge(f, m, edge, a[k], b[k], first + free);
+      while (owner_of(f, free) >= 0) ++free;
+      put_edge(f, m, edge, a[k], b[k], free);
     }
   }
   return true;
@@ -220,9 +232,22 @@ PALPATE bool write_solid(const F& f, const S& m, Scratch& memory) {
   return true;
 }
 
+// The same with the arrays that are written to some words on.
+template <class F>
+PALPATE F skipped_solid(F f) {
+  const auto n = f.skip;
+  f.fan_node.data += n, f.fan_rest.data += n, f.fan_width.data += n, f.degree.data += n;
+  f.rest.data += n, f.free.data += n, f.area.data += n, f.tet_node.data += n, f.tet_gradient.data += n;
+  f.around_corner.data += n, f.fan_slope.data += n, f.edge_from.data += n, f.edge_to.data += n;
+  f.edge_node.data += n, f.edge_slot.data += n;
+  f.tet_moduli.data += n, f.node_moduli.data += n, f.stiffness.data += n;
+  return f;
+}
+
 template <class Fields>
-PALPATE void fill_solid(const Fields& f, Thread t, int) {
+PALPATE void fill_solid(const Fields& fields, Thread t, int) {
   if (t.tid) return;
+  const Fields f = skipped_solid(fields);
   using I = decltype(f.ring.data[0] + 0);
   const Star<I> m = {f.most, f.mesh_rest.data, f.ring.data, f.mesh_degree.data};
   Scratch memory = {f.ints.data, f.reals.data, f.nint, f.nreal, false};

@@ -39,7 +39,7 @@ _NUMBERS = {
 
 @struct
 class Cutting:
-  """What cuts of nworld surfaces of one whole read and write; the surfaces are other ones then."""
+  """What a cut of a surface reads and writes; the surface is another one then."""
 
   surface: Surface
   most_points: int  # points of a path
@@ -53,28 +53,27 @@ class Cutting:
   stiffness: wp.float64  # of an edge's spring [N/m]
   given: wp.float64  # by which the energy around a vertex may rise as it moves [J]
   home: longs("nelem")  # `Mesh.home`
-  mass: doubles("nworld", "nvert")  # of vertices, before and after [kg]
-  disp: doubles("nworld", "nvert", 3)  # displacement [m]
-  vel: doubles("nworld", "nvert", 3)  # velocity [m/s]
-  pinned: flags("nworld", "nvert")  # whether a vertex does not move
+  mass: doubles("nvert")  # of vertices, before and after [kg]
+  disp: doubles("nvert", 3)  # displacement [m]
+  vel: doubles("nvert", 3)  # velocity [m/s]
+  pinned: flags("nvert")  # whether a vertex does not move
   lame: doubles("nelem")  # of triangles [Pa]
   shear: doubles("nelem")  # [Pa]
-  whole: doubles("nworld", "nvert")  # energy of springs at vertices [J]
-  pull: doubles("nworld", "nvert", 3)  # its gradient [N]
-  hard: doubles("nworld", "nvert")  # their stiffness [N/m]
-  npoint: ints("nworld")  # points of the path
-  point: doubles("nworld", "most_points", 3)  # these, where the surface is now, or at rest [m]
-  found: ints("nworld", len(_FOUND))  # see _FOUND; nouter is read too
-  size: doubles("nworld", len(_SIZE))  # see _SIZE
-  near: ints("nworld", "nvert")  # see `Cut`, these and what follows
-  group: ints("nworld", "nvert")
-  member: ints("nworld", "nvert")
-  share: doubles("nworld", "nvert")
-  changed: ints("nworld", "nelem")
-  before: ints("nworld", "nelem", 3)
-  seam: ints("nworld", "nvert", 2)  # edges that came apart
-  ints: ints("nworld", "nint")  # scratch
-  reals: doubles("nworld", "nreal")
+  whole: doubles("nvert")  # energy of springs at vertices [J]
+  pull: doubles("nvert", 3)  # its gradient [N]
+  hard: doubles("nvert")  # their stiffness [N/m]
+  npoint: ints(1)  # points of the path
+  point: doubles("most_points", 3)  # these, where the surface is now, or at rest [m]
+  found: ints(len(_FOUND))  # see _FOUND; nouter is read too
+  size: doubles(len(_SIZE))  # see _SIZE
+  near: ints("nvert")  # see `Cut`, these and what follows
+  group: ints("nvert")
+  member: ints("nvert")
+  share: doubles("nvert")
+  changed: ints("nelem")
+  seam: ints("nvert", 2)  # edges that came apart
+  ints: ints("nint")  # scratch
+  reals: doubles("nreal")
 
 
 _cut = kernel("cut_surface", "cutting/cut.h", Cutting, CONSTANTS | _NUMBERS)
@@ -111,22 +110,25 @@ class Motion:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Apart:
-  """What came of a path, of a surface or a solid: elements are triangles or tetrahedra.
+class Cut:
+  """What came of a path, of a sheet or a solid: elements are triangles or tetrahedra.
 
   Attributes:
     mesh: the mesh, cut
     motion: what its vertices carry, until the next cut
     moved: how many vertices lie elsewhere at rest
-    near: vertices that move on otherwise                 (n,)
-    changed: elements that are not as they were           (n,)
-    group: vertices that were one, which                  (m,)
-    member: those vertices, old and new                   (m,)
-    share: their parts of its mass                        (m,)
-    path: the edges that came apart at rest [m]           list of (k, 3)
+    near: vertices that move on otherwise; of a sheet without those that have come  (n,)
+    changed: elements that are not as they were                (n,)
+    group: vertices that were one, which                       (m,)
+    member: those vertices, old and new                        (m,)
+    share: their parts of its mass                             (m,)
+    path: the edges that came apart at rest, on the skin [m]   list of (k, 3)
     length: of these [m]
     deviation: greatest distance of the path's vertices from it [m]
     stopped: whether there was too little room
+    seat: in a solid, a corner of each member, see `faces.restored`      (m,)
+    area: of the opened faces of a solid, one of each pair, at rest, else None [m^2]
+    depth: how far these go below the skin, along the sheet, at most [m]
   """
 
   mesh: Mesh
@@ -141,17 +143,9 @@ class Apart:
   length: float
   deviation: float
   stopped: bool
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Cut(Apart):
-  """What came of a path on a surface; `near` is without the vertices that have come.
-
-  Attributes:
-    before: corners that the changed triangles had  (n, 3)
-  """
-
-  before: np.ndarray
+  seat: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, np.int64))
+  area: float | None = None
+  depth: float = 0.0
 
 
 class Knife:
@@ -278,7 +272,7 @@ class Knife:
 
   def _answer(self, mesh: Mesh, found: dict[Any, int]) -> Cut:
     host = self._host
-    lists = listed(host, found, {"before": "changed", "group": "split", "member": "split"})
+    lists: Any = listed(host, found, {"group": "split", "member": "split"})
     if found["changed"]:
       closed = mesh.closed and not found["split"]
       mesh = self._copy.take(mesh, closed, bool(found["apart"]), found["nouter"])

@@ -14,16 +14,11 @@ import warp as wp
 
 from .. import body as bodies
 from ..body import Body
+from .facets import Edges
 
-# What a cut changes of a body's arrays.
-_OF_SHAPE = (
-  "fan_node", "fan_rest", "fan_corner", "fan_side", "fan_width", "degree", "rest", "area", "free",
-  "elem_node", "elem_rest", "elem_hinge", "hinge_node", "hinge_rest", "hinge_elem", "hinge_near",
-  "hinge_angle0", "bend_node", "bend_width",
-)  # fmt: skip
-_OF_TISSUE = ("fan_metric", "fan_spring", "hinge_gain", "bend_gain", "bend_diag")
 _WARP = {np.dtype(np.int32): wp.int32, np.dtype(np.float32): wp.float32,
          np.dtype(np.float64): wp.float64}  # fmt: skip
+_ANGLE = "hinge_angle0"  # that rows also have, where tissue bends
 
 
 @wp.kernel(enable_backward=False)
@@ -38,6 +33,7 @@ class Meshes:
 
   Args:
     body: the body, whose shape and tissue become views of the first row
+    facets: what comes apart
     more: arrays of the first mesh besides, by names of their own
 
   Attributes:
@@ -47,10 +43,11 @@ class Meshes:
     arrays: all arrays of the first of these rows; those of others are `open` words on
   """
 
-  def __init__(self, body: Body, more: dict[str, np.ndarray]):
+  def __init__(self, body: Body, facets: Edges, more: dict[str, np.ndarray]):
     self._device = body.device
-    arrays = {name: getattr(body.shape, name) for name in _OF_SHAPE}
-    arrays |= {name: getattr(body.tissue, name) for name in _OF_TISSUE}
+    of_shape = *facets.OF_SHAPE, _ANGLE
+    arrays = {name: getattr(body.shape, name) for name in of_shape}
+    arrays |= {name: getattr(body.tissue, name) for name in facets.OF_TISSUE}
     values = {name: array.numpy() for name, array in arrays.items()} | more
     # Those of 64 bits come first, where they are aligned.
     names = sorted(values, key=lambda name: -values[name].itemsize)
@@ -72,10 +69,13 @@ class Meshes:
     wp.copy(self._memory.flatten(), first, count=self.nword)
     self.which = wp.zeros(body.nworld, dtype=int, device=self._device)
     bodies.unshare(body)
-    _point(body.fields, self._views(self._memory.ptr, self._device))
+    views = self._views(self._memory.ptr, self._device)
+    for struct, some in ((body.shape, of_shape), (body.tissue, facets.OF_TISSUE)):
+      for name in some:
+        setattr(struct, name, views[name])
     body.fields.shape.mesh, body.fields.shape.stride = self.which, self.nword
     views = self._views(self._memory.ptr, self._device, nrow)
-    self.more, self._angle = {name: views[name] for name in more}, views["hinge_angle0"]
+    self.more, self._angle = {name: views[name] for name in more}, views[_ANGLE]
 
   def of(self, row: np.ndarray) -> dict[str, np.ndarray]:
     """Returns the arrays of a row that is on the host, or of several."""
@@ -123,9 +123,3 @@ class Meshes:
     at = wp.array(worlds, dtype=int, device=self._device)
     dim = (len(worlds), *self._angle.shape[1:])
     wp.launch(_turn, dim=dim, inputs=[at, more, self._angle], device=self._device)
-
-
-def _point(fields: Any, views: dict[str, wp.array]):
-  for struct, names in ((fields.shape, _OF_SHAPE), (fields.tissue, _OF_TISSUE)):
-    for name in names:
-      setattr(struct, name, views[name])

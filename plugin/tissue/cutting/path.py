@@ -2,8 +2,6 @@
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
-import functools
-
 import numpy as np
 import numpy.typing as npt
 import warp as wp
@@ -11,7 +9,6 @@ import warp as wp
 from ..geometry.mesh import Mesh, lengths
 from ..kernels import aim, kernel
 from ..types import CONSTANTS, doubles, ints, longs, struct
-from .crack_front import Stops
 from .surface import WorkingCopy
 
 
@@ -52,7 +49,7 @@ class Finder:
     self._fields = fields = Nearest()
     fields.nvert, fields.nelem, fields.solid = whole.nvert, whole.nelem, int(len(whole.tet) > 0)
     fields.most, fields.edge = copy.sizes["most"], whole.edge_length
-    fields.elem, fields.spoke, fields.degree = there.elem[0], there.spoke[0], there.degree[0]
+    fields.elem, fields.spoke, fields.degree = there.elem, there.spoke, there.degree
     self._x, self._box = np.zeros((whole.nvert, 3)), np.zeros(whole.nvert + whole.nelem, np.int32)
     fields.x, fields.box = _wrap(self._x), _wrap(self._box)
     self._launch = _nearest.command(fields).launch
@@ -95,11 +92,6 @@ class Finder:
     These are even across edges: means by area around vertices.
     """
     return *self.nearest(mesh, position, points), -self._spot[: len(points), 5:]
-
-  @functools.cached_property
-  def stops(self) -> Stops:
-    """What finds where paths end that come apart."""
-    return Stops(self._copy)
 
 
 def _wrap(array: np.ndarray) -> wp.array:

@@ -20,7 +20,7 @@ from ..kernels import aim, kernel
 from ..order import addresses
 from ..step import OWN_SHARE
 from ..types import CONSTANTS, allocate, doubles, flags, ints, longs, struct
-from .cut import Apart, Motion, listed
+from .cut import Cut, Motion, listed
 from .cut_surface import sweep
 from .path import Finder
 from .surface import host_views
@@ -103,21 +103,6 @@ class Cleaving:
 
 _CONSTANTS = CONSTANTS | _NUMBERS | {"OWN_SHARE": OWN_SHARE}
 _cleave = kernel("cleave_solid", "cutting/solid/solid_cut.h", Cleaving, _CONSTANTS)
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Cut(Apart):
-  """What came of a path in a solid; the path's edges are those of the skin.
-
-  Attributes:
-    seat: of each member, a corner that it has, see `faces.restored`  (m,)
-    area: of the opened faces, one of each pair, at rest [m^2]
-    depth: how far they go below the skin, along the sheet, at most [m]
-  """
-
-  seat: np.ndarray
-  area: float
-  depth: float
 
 
 class Cleaver:

@@ -12,18 +12,18 @@ from ..types import DIMS, allocate, doubles, flags, longs, struct
 
 @struct
 class Surface:
-  """Surfaces of nworld worlds that are one whole, cut or not; `Mesh` says what the fields are."""
+  """A surface, cut or not; `Mesh` says what the fields are."""
 
   nvert: int
   nelem: int
   most: int  # neighbours that a vertex has room for
-  rest: doubles("nworld", "nvert", 3)
-  elem: longs("nworld", "nelem", 3)
-  twin: longs("nworld", "nhalf")
-  ring: longs("nworld", "nvert", "most")
-  spoke: longs("nworld", "nvert", "most")  # `Mesh.ring_elem`
-  degree: longs("nworld", "nvert")
-  loose: flags("nworld", "nelem")
+  rest: doubles("nvert", 3)
+  elem: longs("nelem", 3)
+  twin: longs("nhalf")
+  ring: longs("nvert", "most")
+  spoke: longs("nvert", "most")  # `Mesh.ring_elem`
+  degree: longs("nvert")
+  loose: flags("nelem")
   whole_elem: longs("nelem", 3)
   whole_twin: longs("nhalf")
 
@@ -47,7 +47,7 @@ class WorkingCopy:
     self.whole = whole = mesh.whole
     self._mesh: Mesh | None = None
     sizes = {"nvert": whole.nvert, "nelem": whole.nelem, "most": whole.ring.shape[1]}
-    self.sizes = sizes | {"nworld": 1, "nhalf": 3 * whole.nelem}
+    self.sizes = sizes | {"nhalf": 3 * whole.nelem}
     self.fields = allocate(Surface, "cpu", self.sizes)
     for name, value in sizes.items():
       setattr(self.fields, name, value)
@@ -87,9 +87,5 @@ class WorkingCopy:
 
 
 def host_views(fields, kind) -> dict[str, np.ndarray]:
-  """Returns the arrays of a struct on the CPU, without the axis of its one world."""
-  out = {}
-  for name, dims in DIMS[kind.key].items():
-    array = getattr(fields, name).numpy()
-    out[name] = array[0] if dims[0] == "nworld" and len(dims) > 1 else array
-  return out
+  """Returns the arrays of a struct on the CPU."""
+  return {name: getattr(fields, name).numpy() for name in DIMS[kind.key]}

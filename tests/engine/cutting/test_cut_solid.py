@@ -7,6 +7,7 @@ import numpy as np
 import palpate
 import pytest
 import scenes
+from palpate.engine.cutting import cuts
 from scipy.spatial import cKDTree
 
 FULL = mujoco.mjtState.mjSTATE_INTEGRATION
@@ -122,7 +123,7 @@ def test_a_cut_solid_may_be_placed_and_put_to_rest(windows):
 def moving(organ):
   """Returns mass, momentum, angular momentum, and energy, of all nodes."""
   space = scenes.workspace(organ)
-  space.cuts.follow()
+  cuts.follow(space)
   u, v = space.motion()
   mass, x = space.organ.mass[:, None], space.organ.mesh.rest + u
   kept = np.concatenate([[mass.sum()], (mass * v).sum(0), (mass * np.cross(x, v)).sum(0)])
@@ -190,17 +191,17 @@ def test_the_walls_are_drawn_and_hidden_between_pictures(windows):
   flex = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_FLEX, "organ_inside")
   faces = mujoco.mjtCatBit.mjCAT_ALL.value
   first, count = model.flex_elemdataadr[flex], 4 * KEYS["spare"]
-  for cuts in range(3):
-    if cuts == 1:
+  for act in range(3):
+    if act == 1:
       organ.cut(across(), depth=0.02)
-    if cuts == 2:
+    if act == 2:
       mujoco.mj_resetData(model, data)
     mujoco.mj_forward(model, data)
     mujoco.mjv_updateScene(model, data, *arguments, faces, drawn)
     elem = model.flex_elem[first : first + 3 * count].reshape(-1, 3)
     wall = organ.elem[len(block()[1]) :]
-    assert np.array_equal(elem[: len(wall)], wall) and bool(len(wall)) == (cuts == 1)
-    if cuts == 1:
+    assert np.array_equal(elem[: len(wall)], wall) and bool(len(wall)) == (act == 1)
+    if act == 1:
       assert model.flex_vertnum[flex] > 0 and not elem[len(wall) :].any()
       at = data.flexvert_xpos[model.flex_vertadr[flex] :][wall]
       np.testing.assert_allclose(at, organ.xpos[wall], atol=2e-3)

@@ -7,9 +7,9 @@ from palpate.tissue import body as bodies
 from palpate.tissue import device as devices
 from palpate.tissue import energy, shape
 from palpate.tissue.config import Config
+from palpate.tissue.cutting import crack_front, facets, refill, surface
 from palpate.tissue.cutting import cut as cutting
 from palpate.tissue.cutting import path as paths
-from palpate.tissue.cutting import refill, surface
 from palpate.tissue.geometry import mesh as topology
 
 SPARE = 120
@@ -162,11 +162,10 @@ def test_a_refilled_body_is_one_made_anew_to_the_bit(kind, device):
   pinned[:3] = True
   body = shape.make(mesh, config, pinned, device, np.inf if kind == "plate" else 0.0)
   bodies.unshare(body)
-  copy = surface.WorkingCopy(mesh)
-  filler = refill.Refill(body, copy)
+  filler = refill.Refill(body, facets.of(mesh, mesh.nelem))
   first = fields(body)
   assert first["fan_width"][-1] == 0 < first["fan_width"][0]  # rows of what waits are left out
-  r, knife = np.random.RandomState(1), cutting.Knife(copy)
+  r, knife = np.random.RandomState(1), cutting.Knife(surface.WorkingCopy(mesh))
   for _ in range(4):
     ends = points[r.choice(np.arange(10, len(points)), 2, replace=False)]
     path = ends[0] + np.linspace(0, 1, 40)[:, None] * (ends[1] - ends[0])
@@ -207,14 +206,14 @@ def test_what_comes_apart_behind_a_blade_ends_near_a_vertex():
   finder, edge = paths.Finder(surface.WorkingCopy(mesh)), mesh.edge_length
   start = mesh.rest[mesh.nouter // 2]
   path = start + edge * np.linspace(0, 2, 6)[:, None] * [1.0, 0.1, 0.0]
-  part, rest = finder.stops.part(mesh, path)
+  part, rest = crack_front.part(finder, mesh, path)
   assert np.array_equal(np.concatenate([part[:-1], rest]), path)
   length = np.linalg.norm(np.diff(part, axis=0), axis=1).sum()
   assert 0.9 * edge <= length * (1 + 1e-9) and length < (2 * np.hypot(1, 0.1) - 0.3) * edge
   near = np.linalg.norm(mesh.rest[: mesh.nouter] - part[-1], axis=1).min()
   other = np.linalg.norm(mesh.rest[: mesh.nouter] - path[3], axis=1).min()
   assert near < min(other, 0.4 * edge)
-  assert not len(finder.stops.part(mesh, path[:2])[0])  # too short
+  assert not len(crack_front.part(finder, mesh, path[:2])[0])  # too short
 
 
 def test_uneven_strain_does_not_rise_by_moving_vertices():

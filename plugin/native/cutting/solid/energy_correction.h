@@ -11,11 +11,10 @@
 
 namespace palpate {
 
-constexpr int CONJUGATE = 60, SEARCHES = 4;
-constexpr int TURNS = 8;  // each with a ring of tetrahedra more
+constexpr int GIVES_WAY = 40;  // at most
+constexpr int TURNS = 8;
 constexpr double EVEN = 1e-9;  // of the kinetic energy, that counts as none
-constexpr double AMPLE = 1.001;  // times what is wanted that is asked for
-constexpr double FARTHEST = 4.0;  // times the way of a vertex that gives way alone
+constexpr double STEP_ALONE = 0.3;  // share of the way of a vertex that gives way alone
 
 // The part of a solid whose energy a cut changes: tetrahedra that are not the same after it, their vertices, and
 // the tetrahedra around these. By place in `vert`: volume, moduli of the means, foundation, stress, force.
@@ -115,62 +114,18 @@ PALPATE void pull_patch(const S& m, const Neohookean& e, const double* disp, Pat
   }
 }
 
-// Moves vertices along a way, by which the energy falls by about slope s - bend s^2, until it is less by `more`;
-// returns by how much it is.
+// Lets vertices give way along their forces, all at once and each as if it moved alone (damped Jacobi), until the
+// energy is not above `most`; returns by how much it is, or below.
 template <class S>
-PALPATE double search(const S& m, const Neohookean& e, Patch& p, const Few& apart, const D3* way, double slope,
-                      double more, D3* from, double* disp) {
-  const double was = strain_patch(m, e, disp, p);
-  double bend = 0.0, best = 0.0, chosen = 0.0;
-  const auto go = [&](double share) {
-    for (int i = 0; i < apart.count; ++i) store(disp + 3 * apart.list[i], from[i] + share * way[i]);
-  };
-  for (int i = 0; i < apart.count; ++i) from[i] = load(disp + 3 * apart.list[i]);
-  for (int k = 0; k < SEARCHES; ++k) {
-    const double root = slope * slope - 4.0 * bend * AMPLE * more;
-    double share = root > 0.0 ? 2.0 * AMPLE * more / (slope + sqrt(root)) : slope / (2.0 * bend);
-    share = share < FARTHEST ? share : FARTHEST;
-    go(share);
-    const double less = was - strain_patch(m, e, disp, p);
-    if (less > best) best = less, chosen = share;
-    if (less >= more || (bend > 0.0 && less > 0.0)) break;
-    const double found = (slope * share - less) / (share * share);
-    bend = found > 0.0 ? found : 0.0;
-  }
-  go(chosen);
-  return best;
-}
-
-// Moves vertices along their forces, by conjugate gradients (Fletcher and Reeves 1964,
-// doi:10.1093/comjnl/7.2.149), until the energy is not above `most`; returns by how much it is, or below.
-template <class S>
-PALPATE double give_way(const S& m, const Neohookean& e, Patch& p, const Few& apart, double most, double* disp,
-                        Scratch memory) {
-  double more = strain_patch(m, e, disp, p) - most, last = 0.0;
-  D3 *way = (D3*)memory.values(3 * apart.count), *from = (D3*)memory.values(3 * apart.count);
-  if (memory.full) return more;
-  for (int round = 0; round < CONJUGATE && more > 0.0; ++round) {
-    strain_patch(m, e, disp, p);
+PALPATE double give_way(const S& m, const Neohookean& e, Patch& p, const Few& apart, double most, double* disp) {
+  double more = strain_patch(m, e, disp, p) - most;
+  for (int round = 0; round < GIVES_WAY && more > 0.0; ++round) {
     pull_patch(m, e, disp, p);
-    double size = 0.0, slope = 0.0;
     for (int i = 0; i < apart.count; ++i) {
-      const int k = p.vert.place[apart.list[i]] - 1;
-      size += dot(p.force[k], p.force[k]) / p.hard[k];
+      const int v = apart.list[i], k = p.vert.place[v] - 1;
+      store(disp + 3 * v, load(disp + 3 * v) + (STEP_ALONE / p.hard[k]) * p.force[k]);
     }
-    for (int turn = 0; turn < 2 && slope <= 0.0; ++turn) {  // the second is down the forces alone
-      slope = 0.0;
-      for (int i = 0; i < apart.count; ++i) {
-        const int k = p.vert.place[apart.list[i]] - 1;
-        const D3 down = (1.0 / p.hard[k]) * p.force[k];
-        way[i] = last > 0.0 && !turn ? down + (size / last) * way[i] : down;
-        slope += dot(p.force[k], way[i]);
-      }
-    }
-    last = size;
-    if (!(slope > 0.0)) break;
-    const double less = search(m, e, p, apart, way, slope, more, from, disp);
-    if (less <= 0.0) break;
-    more -= less;
+    more = strain_patch(m, e, disp, p) - most;
   }
   return more;
 }
@@ -252,29 +207,9 @@ PALPATE double keep_motion(const S& m, const Moving& x, const Few& vert, const L
 // around each.
 struct Before { Patch patch; double energy; Sums sums; double* size; };
 
-// Adds a ring of tetrahedra, and lets all give way that then have theirs in the patch: the least energy of what
-// came apart may be more than it was, where the rest is held by it.
-template <class S, class F>
-PALPATE void widen(const S& m, const Neohookean& e, const Moving& x, const F& f, Before& was, Few& apart) {
-  Patch& p = was.patch;
-  for (int far = 0; far < 2; ++far) {
-    const Sums sums = sums_of(m, x, p.vert, f.pinned.data);
-    const double sign = far ? 1.0 : -1.0;
-    was.energy += sign * strain_patch(m, e, x.disp, p), was.sums.energy += sign * sums.energy;
-    was.sums.momentum += sign * sums.momentum, was.sums.spin += sign * sums.spin;
-    if (far) break;
-    for (int i = 0; i < p.vert.count; ++i) {
-      const int v = p.vert.list[i];
-      if (!f.pinned.data[v]) apart.put(v);
-      m.each_corner(v, [&](int corner) { p.own.put(corner / 4); });
-    }
-    find_patch(m, e, f.loose.data, f.foundation, f.found.data[FOUND_TRIANGLES], p);
-  }
-}
-
 // Lets what is around a cut go on with no more energy than it had.
 template <class S, class F>
-PALPATE bool ease(const S& m, const Neohookean& e, const Moving& x, const F& f, Before& was, Scratch& memory) {
+PALPATE bool correct_energy(const S& m, const Neohookean& e, const Moving& x, const F& f, Before& was, Scratch& memory) {
   Patch& p = was.patch;
   Few apart = few(memory, m.nvert);
   const int nsplit = f.found.data[FOUND_SPLIT];
@@ -289,14 +224,13 @@ PALPATE bool ease(const S& m, const Neohookean& e, const Moving& x, const F& f, 
     had += x.mass[v], has += x.mass[v] *= p.size[i] / was.size[v];
   }
   for (int i = 0; i < p.vert.count; ++i) x.mass[p.vert.list[i]] *= had / has;
-  double ask = 0.0, over = 0.0;  // by how much less than before it is to have, and how much more all have
-  for (int turn = 0; turn < TURNS; ++turn) {
-    if (turn) widen(m, e, x, f, was, apart);
-    const double more = e.has ? give_way(m, e, p, apart, was.energy - ask, x.disp, memory) - ask : 0.0;
-    const bool rigid = turn && was.energy + more < over;  // no strain is left to give
-    over = keep_motion(m, x, p.vert, f.pinned.data, was.sums, more, rigid || turn + 1 == TURNS);
-    if (rigid || !e.has || !(over > EVEN * was.sums.energy)) break;
-    ask = AMPLE * (over - more);
+  double ask = 0.0;  // by how much less strain energy than before is to be left for the motion
+  for (int turn = 1; turn <= TURNS; ++turn) {
+    const double more = e.has ? give_way(m, e, p, apart, was.energy - ask, x.disp) - ask : 0.0;
+    const bool rigid = turn == TURNS || !e.has || was.energy + more <= 0.0;
+    const double over = keep_motion(m, x, p.vert, f.pinned.data, was.sums, more, rigid);
+    if (rigid || !(over > EVEN * was.sums.energy)) break;
+    ask = over - more;
   }
   int count = 0;
   for (int i = 0; i < p.vert.count; ++i)

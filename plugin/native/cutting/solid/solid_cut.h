@@ -274,53 +274,23 @@ PALPATE void measure_walls(const S& m, const Sheet& sheet, double skin, int firs
   f.size.data[SIZE_DEPTH] = depth < sheet.reach ? depth : sheet.reach;
 }
 
-// Marks triangles that a cut has freed from the foundation: of what it held together until now, it goes on to
-// hold the largest piece. Pieces are known by their first vertices. Where vertices that were one hang together
-// still by the tetrahedra around them, nothing has come free.
+// Marks triangles that a cut has freed from the foundation, see `let_go`. Where vertices that were one hang
+// together still by the tetrahedra around them, nothing has come free.
 template <class S, class I>
 PALPATE bool come_loose(const S& m, const Parts& parts, const Few& near, const I* home, unsigned char* loose,
                         Scratch& memory) {
-  int *root = memory.numbers(m.nvert), *best = memory.numbers(m.nelem), *many = memory.numbers(m.nelem);
-  double* size = memory.values(m.nvert);
+  const Pieces p = all_apart(memory, m.nvert);
   if (memory.full) return false;
-  const auto find = [&](int v) {
-    while (root[v] != v) v = root[v] = root[root[v]];
-    return v;
-  };
-  for (int v = 0; v < m.nvert; ++v) root[v] = v, size[v] = 0.0;
   const auto join = [&](int t) {
-    int a = find(m.vert(4 * t));
-    for (int c = 1; c < 4; ++c) {
-      const int v = m.vert(4 * t + c);
-      if (root[v] == a) continue;
-      const int b = find(v);
-      root[a > b ? a : b] = a < b ? a : b;
-      a = a < b ? a : b;
-    }
+    for (int c = 1; c < 4; ++c) p.join(m.vert(4 * t), m.vert(4 * t + c));
   };
   for (int i = 0; i < near.count; ++i) join(near.list[i]);
   bool free = false;
   for (int k = 1; k < parts.count; ++k)
-    free = free || (parts.vert[k] == parts.vert[k - 1] && find(parts.name[k]) != find(parts.name[k - 1]));
+    free = free || (parts.vert[k] == parts.vert[k - 1] && p.find(parts.name[k]) != p.find(parts.name[k - 1]));
   if (!free) return true;
   for (int t = 0; t < m.ntet; ++t) join(t);
-  for (int t = 0; t < m.nelem; ++t) {
-    D3 x[3];
-    for (int c = 0; c < 3; ++c) x[c] = m.place((int)m.elem[3 * t + c]);
-    if (!loose[t]) size[find((int)m.elem[3 * t])] += norm(0.5 * cross(x[1] - x[0], x[2] - x[0]));
-  }
-  for (int t = 0; t < m.nelem; ++t) {  // `best` of a home: its largest piece, from 1
-    const int v = find((int)m.elem[3 * t]), h = (int)home[t];
-    if (size[v] == 0.0 || best[h] == v + 1) continue;
-    const double most = best[h] ? size[best[h] - 1] : 0.0;
-    many[h] = 1 + (best[h] > 0);
-    if (size[v] > most || (size[v] == most && v + 1 < best[h])) best[h] = v + 1;
-  }
-  for (int t = 0; t < m.nelem; ++t) {
-    const int h = (int)home[t];
-    if (many[h] > 1 && find((int)m.elem[3 * t]) + 1 != best[h]) loose[t] = 1;
-  }
-  return true;
+  return let_go(m, p, home, loose, memory);
 }
 
 template <class F>
@@ -398,7 +368,7 @@ PALPATE int cleave(const F& f, const S& m, const Sheet& sheet, const Neohookean&
   for (int t = f.ntriangle; t < count / 3; ++t) f.loose.data[t] = 1;
   measure_walls(m, sheet, f.edge, f.ntriangle, count / 3, f);
   if (!come_loose(m, o.parts, was.patch.own, f.home.data, f.loose.data, memory)) return FULL;
-  return ease(m, p, x, f, was, memory) && !memory.full ? APART : FULL;
+  return correct_energy(m, p, x, f, was, memory) && !memory.full ? APART : FULL;
 }
 
 template <class Fields>
