@@ -113,7 +113,7 @@ def holding():
   side = np.flatnonzero(points[:, 1] > 0.03)
   bonds = "bed 1e6 150 0.02 near 0.015, one 1e6 150 0.02 near 0.015"
   on = {"attach": f"hand 20 {' '.join(map(str, side))}", "bonds": bonds, "support": "bed"}
-  on |= {"foundation": 3e2, "carrier": "bed"}
+  on |= {"foundation": 3e2, "carrier": "bed", "relax_share": 0.2, "relax_time": 0.1}
   spec = mujoco.MjSpec.from_string(world(ball(0.3), BODIES, gravity=(5.0, 0, -9.81)))
   keys = {**KEYS, "windows": True, "device": "cpu"}
   given = keys | on | {"mass": 0.1, "spare": 80, "thickness": 2e-3}
