@@ -256,6 +256,12 @@ def _installed(folder: str) -> bool:
 def _unpacked(path: list[str], packed: bytes) -> tuple[str, Any]:
   """Does a job where modules are found as they were where it was packed."""
   sys.path.extend(folder for folder in path if folder not in sys.path)
+  import palpate
+
+  if not hasattr(palpate, "register"):  # Ray's workers look in the current folder first
+    where = next(iter(palpate.__path__))
+    text = f"ray: workers take the folder {where!r} for the package palpate"
+    return "error", CommandError(f"{text}; run the command in another folder", code=1)
   return _attempt(*pickle.loads(packed))
 
 

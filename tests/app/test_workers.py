@@ -85,6 +85,15 @@ def test_a_ray_cluster_loses_nothing_with_a_worker(tmp_path, monkeypatch, capsys
   assert (tmp_path / "ray.json").read_bytes() == (tmp_path / "one.json").read_bytes()
 
 
+def test_beside_a_clone_named_palpate_a_cluster_says_so(tmp_path, monkeypatch, capsys):
+  pytest.importorskip("ray")
+  (tmp_path / "palpate").mkdir()  # which Python takes for a package without modules
+  monkeypatch.chdir(tmp_path)
+  assert cli.main(["evaluate", "touch/easy", "--episodes", "1", "--ray", "--processes", "1"]) == 1
+  error = capsys.readouterr().err.splitlines()[-1]
+  assert error.startswith("palpate: ray: workers take the folder") and "another folder" in error
+
+
 def test_a_cluster_that_is_not_there_is_one_line(monkeypatch, capsys):
   ray = pytest.importorskip("ray")
 
