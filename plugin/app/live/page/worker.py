@@ -255,7 +255,7 @@ class Worker:
         env, device, job["seed"], info, Options(scale=job["scale"]),
         coach=Coach(job["assessment"]), publish=self._draw, other=other,
       )  # fmt: skip
-    recording = self._run(session, job, lambda: session.run(realtime=True))
+    recording = self._run(session, job, lambda: session.run(realtime=True, watch=self._feel))
     done = Finished(recording)
     self._unkept = None if done.keep(self._folder, self._record) and not done.fault else done
     shown = card(recording, self._references(job["task"]))
@@ -286,8 +286,12 @@ class Worker:
         assessment=self._job["assessment"], practice=False, step=env.physics.timestep(), **limits,
       ))  # fmt: skip
     camera, link, pace = self._camera, session.link, session.pace
-    camera.feel(env.physics.peak_force)
     self._publish(lambda: camera.frame(link, pace, env.task.progress))
+
+  def _feel(self, env: Any) -> None:
+    """Takes the force of a control step, of which there are more than frames."""
+    if self._camera is not None:
+      self._camera.feel(env.physics.peak_force)
 
   def _practise(self, job: dict[str, Any]) -> None:
     note = ", which takes a minute or more" if job["size"].get("grid", 0) > 100 else ""
