@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterator, Sequence
 from multiprocessing import connection
 from typing import Any, Protocol
 
-from .console import CommandError, Interrupt, check_counts, need
+from .console import CommandError, check_counts, need
 
 _POLL = 0.2  # of Ctrl-C, while workers work [s]
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -278,7 +278,7 @@ def parallel(
   function: Callable[[Any], Any],
   jobs: Sequence[Any],
   workers: Workers,
-  interrupt: Interrupt | None = None,
+  stop: Callable[[], bool] = _never,
 ) -> Iterator[Any]:
   """Yields what a function makes of each job, in order; None where its worker died.
 
@@ -286,17 +286,16 @@ def parallel(
     function: of a module, so that a worker can find it
     jobs: its arguments
     workers: who does them; `HERE` is this process
-    interrupt: once seen, the jobs that run are finished and no more are begun
+    stop: see `Workers.run`
   """
-  interrupt = interrupt or Interrupt()
   if workers == HERE:
     for job in jobs:
-      if interrupt.seen:
+      if stop():
         return
       yield function(job)
     return
   done, index = {}, 0
-  for ended in workers.run(function, jobs, lambda: interrupt.seen):
+  for ended in workers.run(function, jobs, stop):
     if ended.status == "error":
       raise ended.value
     done[ended.index] = ended.value

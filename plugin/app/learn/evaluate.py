@@ -10,7 +10,7 @@ import math
 import os
 import pathlib
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import palpate
@@ -126,7 +126,7 @@ def evaluate(
   seeds: Sequence[int],
   crew: workers.Workers = workers.HERE,
   recordings: str | None = None,
-  interrupt: Interrupt | None = None,
+  stop: Callable[[], bool] = lambda: False,
   task_kwargs: Mapping[str, Any] | None = None,
 ) -> Iterator[Result]:
   """Yields the result of each seed, in order.
@@ -137,13 +137,13 @@ def evaluate(
     seeds: of the episodes
     crew: who runs them; this process by default
     recordings: folder to keep the recordings in, SEED.npz
-    interrupt: once seen, the episodes that run are finished and no more are begun
+    stop: once it says so, the episodes that run are finished and no more are begun
     task_kwargs: options of the task, JSON
   """
   kwargs = json.dumps(dict(task_kwargs or {}))
   folder = recordings and os.path.abspath(recordings)  # workers of a cluster stand elsewhere
   jobs = [(name, policy, seed, folder, kwargs) for seed in seeds]
-  done = workers.parallel(perform, jobs, crew, interrupt)
+  done = workers.parallel(perform, jobs, crew, stop)
   for seed, result in zip(seeds, done, strict=False):  # an interrupt leaves some out
     yield result or Result(seed, "error", 0.0, 0.0, error="a process died in it")
 
