@@ -293,7 +293,7 @@ def test_keys_gamepad_and_buttons_move_the_tip(pages):
 @pytest.mark.slow
 def test_a_program_that_ends_is_named_and_found_again(pages):
   pages.close()
-  said = "document.getElementById('fault').textContent.includes('not to be reached')"
+  said = "document.getElementById('fault').textContent.includes('No connection')"
   pages.until(said, "nothing said")
   assert not pages.page.is_enabled("#start")
   pages.serve(pages.server.port)
