@@ -12,7 +12,7 @@ import json
 import os
 import pathlib
 import subprocess
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -76,7 +76,7 @@ def write(folder: pathlib.Path, paths: Iterable[pathlib.Path], about: About) -> 
 
   features: dict[str, Any] = {}
   data, rows = _Tables(folder / "data"), _Tables(folder / "meta/episodes")
-  films, total, frames, rate = _Films(folder / "videos" / _PIXELS), _Total(), 0, 0
+  films, every, frames, rate = _Films(folder / "videos" / _PIXELS), [], 0, 0
   for index, path in enumerate(paths):
     demo = Demonstration.load(path)
     now, rate = _features(demo), round(demo.rate)
@@ -94,7 +94,7 @@ def write(folder: pathlib.Path, paths: Iterable[pathlib.Path], about: About) -> 
         key: np.array(v) if key == "count" else np.reshape(v, (3, 1, 1)) for key, v in seen.items()
       }
       place |= films.add(_film(path), len(demo) / rate)
-    total.add(stats)
+    every.append(stats)
     row = {
       "episode_index": index, "tasks": [instruction(about.task)], "length": len(demo), **place,
       "dataset_from_index": frames, "dataset_to_index": frames + len(demo),
@@ -105,7 +105,7 @@ def write(folder: pathlib.Path, paths: Iterable[pathlib.Path], about: About) -> 
     frames += len(demo)
   for part in (data, rows, films):
     part.close()
-  _write_meta(folder, about, features, total.stats(), (rows.count, frames, rate))
+  _write_meta(folder, about, features, _total(every), (rows.count, frames, rate))
   films = ["its pictures are compressed (H.264)"] if _PIXELS in features else []
   return ["the last observation of an episode, which no action answers",
           "numbers beyond float32", *films]  # fmt: skip
@@ -197,37 +197,18 @@ def _stats(values: np.ndarray) -> Stats:
   }
 
 
-class _Total:
-  """Statistics of all episodes from those of each; a quantile is the mean of theirs, as there."""
-
-  def __init__(self):
-    self._sums: dict[str, Stats] = {}
-
-  def add(self, stats: Mapping[str, Stats]):
-    for key, s in stats.items():
-      n = float(s["count"][0])
-      weighted = {name: n * s[name] for name in ("mean", *_QUANTILES)}
-      weighted |= {"count": s["count"], "square": n * (s["std"] ** 2 + s["mean"] ** 2)}
-      total = self._sums.setdefault(key, {"min": s["min"], "max": s["max"]})
-      total["min"], total["max"] = np.minimum(total["min"], s["min"]), np.maximum(
-        total["max"], s["max"]
-      )  # fmt: skip
-      for name, value in weighted.items():
-        total[name] = total.get(name, 0) + value
-
-  def stats(self) -> dict[str, Any]:
-    """Returns them as JSON."""
-    out = {}
-    for key, total in self._sums.items():
-      n = float(total["count"][0])
-      mean = total["mean"] / n
-      known = {
-        "min": total["min"], "max": total["max"], "mean": mean,
-        "std": np.sqrt(np.maximum(total["square"] / n - mean**2, 0)), "count": total["count"],
-        **{name: total[name] / n for name in _QUANTILES},
-      }  # fmt: skip
-      out[key] = {name: value.tolist() for name, value in known.items()}
-    return out
+def _total(episodes: Sequence[Mapping[str, Stats]]) -> dict[str, Any]:
+  """Returns the statistics of all episodes as JSON; a quantile is the mean of theirs, as there."""
+  out = {}
+  for key in episodes[0]:
+    every = {name: np.array([stats[key][name] for stats in episodes]) for name in episodes[0][key]}
+    count = every["count"][:, 0]
+    known = {name: np.average(every[name], axis=0, weights=count) for name in ("mean", *_QUANTILES)}
+    square = np.average(every["std"] ** 2 + every["mean"] ** 2, axis=0, weights=count)
+    known |= {"min": every["min"].min(axis=0), "max": every["max"].max(axis=0)}
+    known |= {"std": np.sqrt(np.maximum(square - known["mean"] ** 2, 0)), "count": [sum(count)]}
+    out[key] = {name: np.asarray(value).tolist() for name, value in known.items()}
+  return out
 
 
 class _Tables:
