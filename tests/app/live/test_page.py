@@ -233,6 +233,7 @@ def test_free_practice_on_the_page(pages):
   page.click("#tab-practice")
   page.select_option("#mesh", "16 x 16")
   pages.start()
+  page.get_by_text("Speed of the simulation").click()
   for name in ("force", "way", "rate"):
     assert page.is_visible(f"#plot-{name}")
   pages.until("window.palpate().head.time > 0.5", "no time")
