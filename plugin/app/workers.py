@@ -307,10 +307,10 @@ def parallel(
 def add_arguments(parser: argparse.ArgumentParser, count: int):
   """Declares the options; `count` is that of processes by default."""
   add = parser.add_argument
-  add("--processes", metavar="N", type=int, help=f"at a time ({count}; a cluster's CPUs)")
+  add("--processes", metavar="N", type=int, help=f"at a time ({count}; on a cluster its CPUs)")
   add(
     "--ray", metavar="ADDRESS", nargs="?", const="",
-    help="on a Ray cluster, or on a cluster of this machine alone",
+    help="use a Ray cluster; without ADDRESS a cluster of this machine",
   )  # fmt: skip
   parser.set_defaults(default_processes=count)
 

@@ -64,7 +64,7 @@ def add_arguments(parser: argparse.ArgumentParser):
   options.add_argument(parser)
   keeping.add_references(parser)
   add("--json", metavar="FILE", help="write every episode's metrics")
-  add("--recordings", metavar="FOLDER", help="keep every episode's recording, whole or not")
+  add("--recordings", metavar="FOLDER", help="save the recording of every episode, complete or not")
 
 
 def main(args: argparse.Namespace) -> int:

@@ -52,17 +52,17 @@ def add_arguments(parser: argparse.ArgumentParser):
     "--lessons", metavar="N", type=int, default=_LESSONS,
     help=f"of an expert, in each of {ROUNDS} rounds at most (%(default)s); 0 for practice alone",
   )  # fmt: skip
-  add("--from", metavar="FILE", dest="start", help="policy of an easier exercise to begin with")
+  add("--from", metavar="FILE", dest="start", help="start from the policy of an easier exercise")
   add("--iterations", metavar="N", type=int, default=1000, help="of practice (%(default)s)")
   add(
     "--minutes", metavar="T", type=float, default=math.inf,
-    help="in all, after which neither a lesson nor an iteration begins",
+    help="no lesson and no iteration begins after this time",
   )  # fmt: skip
-  add("--success", metavar="SHARE", type=float, default=math.inf, help="enough, without spread")
+  add("--success", metavar="SHARE", type=float, default=math.inf, help="enough, without noise")
   add("--seed", metavar="N", type=int, default=0, help="of all that is random (%(default)s)")
   add("--num-envs", metavar="N", type=int, help=f"worlds ({_FEW} on a CPU, {_MANY} on a GPU)")
-  add("--device", metavar="NAME", help="cpu or cuda:N; a GPU where there is one")
-  add("--resume", action="store_true", help="go on with what is in the folder")
+  add("--device", metavar="NAME", help="cpu or cuda:N (a GPU if there is one)")
+  add("--resume", action="store_true", help="continue with the files of the folder")
   workers.add_arguments(parser, os.cpu_count() or 1)
   options.add_argument(parser)
 

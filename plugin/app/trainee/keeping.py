@@ -24,7 +24,7 @@ FOLDER = "out/record"  # where a record is unless a command is told otherwise
 
 def add_record(parser: argparse.ArgumentParser):
   """Declares the option that says where the record is."""
-  text = f"where trainees and what they did are kept ({FOLDER})"
+  text = f"folder of the trainees and their recordings ({FOLDER})"
   parser.add_argument("--record", metavar="FOLDER", help=text)
 
 
@@ -32,7 +32,7 @@ def add_references(parser: argparse.ArgumentParser):
   """Declares the option that says what is scored against."""
   parser.add_argument(
     "--references", metavar="FILE",
-    help="references of scores and limits, of `palpate trainee limits` or `palpate panel` (those "
+    help="references of scores and limits, from `palpate trainee limits` or `palpate panel` (those "
     "that ship)",
   )  # fmt: skip
 
@@ -40,9 +40,9 @@ def add_references(parser: argparse.ArgumentParser):
 def add_arguments(parser: argparse.ArgumentParser):
   """Declares the options of a command whose exercises are kept."""
   add = parser.add_argument
-  add("--trainee", metavar="NAME", help="who does it: it is kept in the record")
+  add("--trainee", metavar="NAME", help="name of the trainee; the recording goes to the record")
   add_record(parser)
-  add("--any-task", action="store_true", help="also exercises that are not open to the trainee")
+  add("--any-task", action="store_true", help="allow exercises that are not open to the trainee")
   add_references(parser)
 
 
