@@ -106,14 +106,16 @@ class School:
       count: of lessons
       gamma: discount [-]
       stop: once it says so, the round is given up
-      until: seconds of all rounds after which no lesson is begun; the networks still learn
+      until: seconds of all rounds that learning ends after; no lesson begins after half of those
+        that are left
     """
     start, progress, given = time.perf_counter(), Progress(lines=LINES), []
-    jobs = self._jobs(count, gamma)
-    late = start + until - self.seconds
-    for lesson in workers.parallel(
-      give, jobs, crew, lambda: stop() or time.perf_counter() >= late
-    ):
+    jobs, left = self._jobs(count, gamma), until - self.seconds
+
+    def over(share: float = 1.0) -> bool:
+      return stop() or time.perf_counter() - start >= share * left
+
+    for lesson in workers.parallel(give, jobs, crew, lambda: over(0.5)):
       given.append(lesson)
       progress.show(f"round {self.rounds + 1}: {len(given)} of {count} lessons")
     if stop():
@@ -130,7 +132,7 @@ class School:
 
       def learning() -> bool:
         progress.show(f"round {self.rounds + 1}: learning, step {next(steps)}")
-        return stop()
+        return over()
 
       error = networks.learn(self.lessons, learning)
     progress.clear()

@@ -56,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser):
   add("--iterations", metavar="N", type=int, default=1000, help="of practice (%(default)s)")
   add(
     "--minutes", metavar="T", type=float, default=math.inf,
-    help="no lesson and no iteration begins after this time",
+    help="at most, in all; lessons take half of what is left, learning from them the rest",
   )  # fmt: skip
   add("--success", metavar="SHARE", type=float, default=math.inf, help="enough, without noise")
   add("--seed", metavar="N", type=int, default=0, help="of all that is random (%(default)s)")
