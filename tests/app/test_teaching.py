@@ -55,4 +55,5 @@ def test_without_a_terminal_lessons_tell_how_far_they_are(tmp_path, monkeypatch,
   monkeypatch.setattr(teaching, "LINES", 0.1)
   assert teach(school(tmp_path, monkeypatch), 6)
   lines = capsys.readouterr().err.splitlines()
-  assert len(lines) >= 2 and "learning, step" in lines[-1] and lines[0].startswith("round 1: ") and "of 6 lessons" in lines[0]
+  assert lines[0].startswith("round 1: ") and "of 6 lessons" in lines[0]
+  assert len(lines) >= 2 and "learning, step" in lines[-1]
