@@ -5,11 +5,13 @@ Axes of a device: x to the right, y up, z towards the person, as the laparoscope
 
 from __future__ import annotations
 
+import importlib
 import math
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 Three = tuple[float, float, float]
 Four = tuple[float, float, float, float]
+STILL: Three = (0.0, 0.0, 0.0)
 
 
 class DeviceError(RuntimeError):
@@ -105,6 +107,14 @@ class Silent:
 
   def close(self) -> None:
     """Does nothing."""
+
+
+def library(module: str, extra: str, also: str = "") -> Any:
+  """Returns a package that only some devices need; DeviceError says what to install."""
+  try:
+    return importlib.import_module(module)
+  except (ImportError, OSError, AttributeError) as error:
+    raise DeviceError(f"{extra}: {error}; pip install 'palpate[{extra}]'{also}") from error
 
 
 FASTEST = 3.0  # a hand's speed; what is faster is a jump [m/s]
