@@ -114,8 +114,8 @@ def _lower(label: str) -> str:
 
 
 def _tells(spec: Spec, recording: Recording) -> bool:
-  """Returns whether a metric says something: a way that ends early is short for no merit."""
-  return recording.outcome == SUCCESS or spec.group != "efficiency"
+  """Returns whether a metric says something: an exercise that ends early is short for no merit."""
+  return recording.outcome == SUCCESS or spec.group not in ("efficiency", "time")
 
 
 def _fits(name: str, metrics: Any) -> bool:
