@@ -113,19 +113,17 @@ def write(folder: pathlib.Path, paths: Iterable[pathlib.Path], about: About) -> 
 
 def _features(demo: Demonstration) -> dict[str, Any]:
   """Returns what `info.json` says of each column."""
-  out: dict[str, Any] = {}
-
-  def add(key: str, dtype: str, names: list[str] | None, count: int = 1):
-    out[key] = {"dtype": dtype, "shape": [len(names) if names else count], "names": names}
-
+  names = {"action": list(demo.components)}
   for key, kind in _VECTORS.items():
-    names = [
+    names[key] = [
       name if np.size(value[0]) == 1 else f"{name}.{i}"
       for name, value in demo.observations.items() if group(name) == kind
       for i in range(np.size(value[0]))
     ]  # fmt: skip
-    if names:
-      add(key, "float32", names)
+  out: dict[str, Any] = {
+    key: {"dtype": value.dtype.name, "shape": list(value.shape[1:]) or [1], "names": names.get(key)}
+    for key, value in _columns(demo, 0, 0).items()
+  }
   if "pixels" in demo.info:
     height, width, depth = demo.info["pixels"]["shape"]
     out[_PIXELS] = {
@@ -136,15 +134,6 @@ def _features(demo: Demonstration) -> dict[str, Any]:
         "video.fps": round(demo.rate), "has_audio": False,
       },
     }  # fmt: skip
-  add("action", "float32", list(demo.components))
-  for name, value in demo.forces.items():
-    add(f"next.{name}", "float32", None, value.shape[1])
-  add("next.reward", "float32", None)
-  for key in ("next.done", "next.success"):
-    add(key, "bool", None)
-  add("timestamp", "float32", None)
-  for key in ("frame_index", "episode_index", "index", "task_index"):
-    add(key, "int64", None)
   return out
 
 

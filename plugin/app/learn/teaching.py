@@ -128,10 +128,10 @@ class School:
       raise CommandError(f"{self.task}: no lesson was given: {why}", code=1)
     error = math.nan  # where it needed no help, or not yet
     if any(lesson.taught.any() for lesson in self.lessons):
-      steps = itertools.count(1)
+      turns = itertools.count(1)
 
       def learning() -> bool:
-        progress.show(f"round {self.rounds + 1}: learning, step {next(steps)}")
+        progress.show(f"round {self.rounds + 1}: learning, step {next(turns)}")
         return over()
 
       error = networks.learn(self.lessons, learning)
