@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
+from palpate.tissue import step
+
 from ...trainee.keeping import Keeping
 from ...trainee.record import check_name
 
 NODES = (250, 500, 1000, 2000, 4000)  # of an exercise
 SPEEDS = (0.1, 0.25, 0.5, 1.0)
-SCHEMES = ("implicit", "midpoint", "neumann", "explicit")
+SCHEMES = tuple(step.SCHEMES)
 STEPS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0)  # [ms]
 BLUNT = ("scissors", "hook", "scalpel")  # in free practice, whose organs have no spare vertices
 OTHER = ("", "keyboard", "pad")  # what a page can have for the left hand; none by default
