@@ -76,8 +76,8 @@ def main(args: argparse.Namespace) -> int:
     except ValueError as error:
       raise CommandError(str(error)) from None
   job = _prepare(args)
-  progress, failure = Progress(), None
-  with Interrupt() as interrupt, _camera(job.film) as shoot:
+  progress, failure, camera = Progress(), None, contextlib.nullcontext(lambda env: None)
+  with Interrupt() as interrupt, film.laparoscope(job.film, _SIZE) if job.film else camera as shoot:
 
     def watch(env) -> bool:
       progress.show(f"{job.name} {env.physics.time():.1f} s, {100 * env.task.best:.0f} % done")
@@ -291,8 +291,3 @@ def _write_files(job: _Job, folder: pathlib.Path, recording: Any, report: bool) 
         print(f"report     {write_report(recording, folder, job.references(job.name))}")
       except ImportError as error:
         print(f"no report: {error}; install palpate[plot]", file=sys.stderr)
-
-
-def _camera(path: pathlib.Path | None) -> contextlib.AbstractContextManager[Callable[[Any], None]]:
-  """Gives a function that takes a picture for the film, if there is to be one."""
-  return contextlib.nullcontext(lambda env: None) if path is None else film.laparoscope(path, _SIZE)

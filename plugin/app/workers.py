@@ -213,7 +213,8 @@ class Cluster:
     left = len(jobs)
     with self._joined(ray):
       attempt = ray.remote(max_retries=_RETRIES)(_unpacked)
-      path = [folder for folder in map(os.path.abspath, sys.path) if not _installed(folder)]
+      installed = (sys.prefix, sys.base_prefix)
+      path = [p for p in map(os.path.abspath, sys.path) if not p.startswith(installed)]
       count = self.count or max(1, int(ray.cluster_resources().get("CPU", 1)))
       while True:
         while left and len(running) < count and time.monotonic() < deadline and not stop():
@@ -247,10 +248,6 @@ class Cluster:
       yield
     finally:
       ray.shutdown()
-
-
-def _installed(folder: str) -> bool:
-  return folder.startswith((sys.prefix, sys.base_prefix))
 
 
 def _unpacked(path: list[str], packed: bytes) -> tuple[str, Any]:

@@ -224,9 +224,10 @@ def _jobs(
   parts: pathlib.Path,
 ) -> list[Job]:
   if todo:
+    names = [hashlib.sha256(pathlib.Path(path).read_bytes()).hexdigest()[:16] for path, _ in todo]
     return [
-      Job(args.format, task, "", json.dumps(own), 0, path, str(parts / f"{_digest(path)}.npz"))
-      for path, own in todo
+      Job(args.format, task, "", json.dumps(own), 0, path, str(parts / f"{name}.npz"))
+      for name, (path, own) in zip(names, todo, strict=True)
     ]
   seeds, options_ = range(args.seed, args.seed + args.episodes), json.dumps(kwargs)
   paths = [str(parts / f"{seed:08d}.npz") for seed in seeds]
@@ -234,10 +235,6 @@ def _jobs(
     Job(args.format, task, args.performer, options_, seed, "", path, args.noise)
     for seed, path in zip(seeds, paths, strict=True)
   ]
-
-
-def _digest(path: str) -> str:
-  return hashlib.sha256(pathlib.Path(path).read_bytes()).hexdigest()[:16]
 
 
 def _begin(parts: pathlib.Path, args: argparse.Namespace, task: str, kwargs: dict[str, Any]):

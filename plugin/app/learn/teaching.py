@@ -139,7 +139,9 @@ class School:
     self.rounds += 1
     self.seconds += time.perf_counter() - start
     wins = sum(lesson.outcome == "success" for lesson in whole)
-    free = [lesson for lesson, job in zip(given, jobs, strict=False) if lesson and _free(job)]
+    # Lessons in which a policy was let to do all.
+    pairs = zip(given, jobs, strict=False)
+    free = [each for each, job in pairs if each and job.policy and job.most is None]
     self.alone = sum(each.alone and each.outcome == "success" for each in free) / max(len(free), 1)
     steps = sum(int(lesson.taught.sum()) for lesson in self.lessons)
     told = f"; {100 * self.alone:.0f} % of {len(free)} alone" if free else ""
@@ -197,8 +199,3 @@ class School:
     if task != self.task:
       raise CommandError(f"{self.path} is of {task}, not of {self.task}")
     self.lessons = [Lesson(*row) for row in zip(*parts, strict=True)]
-
-
-def _free(job: Job) -> bool:
-  """Returns whether a policy was let to do all of a lesson."""
-  return bool(job.policy) and job.most is None

@@ -101,7 +101,9 @@ def main(args: argparse.Namespace) -> int:
       print("palpate: interrupted; the data up to there is kept", file=sys.stderr)
       return 130
     try:
-      figures.plot(run.samples, out / "press.png", _title(args))
+      name = pathlib.Path(args.scene).name if args.scene else "press"
+      title = f"{name}: {1e3 * args.depth:g} mm at {1e3 * args.speed:g} mm/s"
+      figures.plot(run.samples, out / "press.png", title)
       print(f"{out / 'press.png'}: force and displacement over time")
     except CommandError as error:
       print(f"palpate: no plot: {error}", file=sys.stderr)
@@ -340,8 +342,3 @@ def _summary(model, organ, samples: Sequence) -> list[tuple[str, str]]:
     (f"steps that hit a solve's limit, {most}", str(len(ended))),
     *([("largest residual of those", f"{max(ended):.1e}")] if ended else []),
   ]
-
-
-def _title(args) -> str:
-  name = pathlib.Path(args.scene).name if args.scene else "press"
-  return f"{name}: {1e3 * args.depth:g} mm at {1e3 * args.speed:g} mm/s"

@@ -141,7 +141,8 @@ class Guard:
     pos, quat, roll, jaw, _ = reading
     numbers = pos[0] + pos[1] + pos[2] + roll + sum(quat or ()) + (jaw or 0.0)
     if not math.isfinite(numbers) or (quat and sum(q * q for q in quat) < 1e-6):
-      self.last = f"{self._device.name}: pose is {_text(reading)}, expected finite numbers"
+      pose = f"{pos} {quat or ''}".strip()
+      self.last = f"{self._device.name}: pose is {pose}, expected finite numbers"
       return "bad"
     before, self._before = self._before, pos
     span, self._time = now - self._time, now
@@ -152,7 +153,3 @@ class Guard:
       return "good"
     self.last = f"{self._device.name}: jumped {1e3 * moved:.0f} mm in {1e3 * span:.0f} ms"
     return "jump"
-
-
-def _text(reading: Reading) -> str:
-  return f"{reading.pos}" if reading.quat is None else f"{reading.pos} {reading.quat}"
