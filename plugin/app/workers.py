@@ -212,7 +212,7 @@ class Cluster:
     todo, running = iter(range(len(jobs))), {}
     left = len(jobs)
     with self._joined(ray):
-      attempt = ray.remote(max_retries=_RETRIES)(_unpacked)
+      attempt = ray.remote(max_retries=_RETRIES)(unpacked)
       installed = (sys.prefix, sys.base_prefix)
       path = [p for p in map(os.path.abspath, sys.path) if not p.startswith(installed)]
       count = self.count or max(1, int(ray.cluster_resources().get("CPU", 1)))
@@ -250,7 +250,7 @@ class Cluster:
       ray.shutdown()
 
 
-def _unpacked(path: list[str], packed: bytes) -> tuple[str, Any]:
+def unpacked(path: list[str], packed: bytes) -> tuple[str, Any]:
   """Does a job where modules are found as they were where it was packed."""
   sys.path.extend(folder for folder in path if folder not in sys.path)
   import palpate
