@@ -6,6 +6,7 @@ import argparse
 import contextlib
 import csv
 import importlib.util
+import math
 import os
 import pathlib
 import signal
@@ -58,6 +59,10 @@ class Interrupt:
   def __exit__(self, *_):
     signal.signal(signal.SIGINT, self._before or signal.default_int_handler)
 
+  def __call__(self) -> bool:
+    """Returns whether Ctrl-C was pressed."""
+    return self.seen
+
   def _handle(self, *_):
     if self.seen:
       raise KeyboardInterrupt
@@ -65,19 +70,25 @@ class Interrupt:
 
 
 class Progress:
-  """One line on standard error that is written over; silent unless people see it and the output."""
+  """One line on standard error that is written over.
 
-  def __init__(self, every: float = 0.1):
+  Unless both the output and the errors go to a terminal it is silent, or writes a line from time to
+  time.
+  """
+
+  def __init__(self, every: float = 0.1, lines: float = math.inf):
+    """Shows a text at most once in `every` seconds; without a terminal once in `lines` seconds."""
     self._on = sys.stdout.isatty() and sys.stderr.isatty()
-    self._every = every
-    self._next = 0.0
+    self._every = every if self._on else lines
+    self._next = 0.0 if self._on else time.perf_counter() + lines
 
   def show(self, text: str, always: bool = False):
-    """Shows the text, at most once in `every` seconds."""
+    """Shows the text if it is time; on a terminal also with `always`."""
     now = time.perf_counter()
-    if self._on and (always or now >= self._next):
+    if now >= self._next or (always and self._on):
       self._next = now + self._every
-      print(f"\r\033[K{text}", end="", file=sys.stderr, flush=True)
+      start, end = ("\r\033[K", "") if self._on else ("", "\n")
+      print(f"{start}{text}", end=end, file=sys.stderr, flush=True)
 
   def clear(self):
     """Takes the line away."""

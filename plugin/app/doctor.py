@@ -14,11 +14,11 @@ import subprocess
 import sys
 from collections.abc import Callable
 
+from packaging import requirements
 from palpate import __version__
 
 from .console import CommandError
 
-_PACKAGES = ("mujoco", "warp-lang", "numpy", "scipy", "trimesh")
 _EXTRAS = {
   "matplotlib": "plot",
   "imageio-ffmpeg": "video",
@@ -65,16 +65,18 @@ def _palpate() -> list[str]:
 
 def _packages() -> list[str]:
   lines, bad = [], []
-  wanted = _requirements()
-  for package in _PACKAGES:
-    try:
-      version = importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-      bad.append(f"{package} is not installed, expected {wanted.get(package, 'it')}")
+  every = map(requirements.Requirement, importlib.metadata.requires("palpate") or [])
+  for wanted in every:
+    if wanted.marker and not wanted.marker.evaluate({"extra": ""}):
       continue
-    lines.append(f"{package} {version}")
-    if not _within(version, wanted.get(package, "")):
-      bad.append(f"{package} is {version}, expected {wanted[package]}")
+    try:
+      version = importlib.metadata.version(wanted.name)
+    except importlib.metadata.PackageNotFoundError:
+      bad.append(f"{wanted.name} is not installed, expected {wanted.specifier or 'it'}")
+      continue
+    lines.append(f"{wanted.name} {version}")
+    if not wanted.specifier.contains(version, prereleases=True):
+      bad.append(f"{wanted.name} is {version}, expected {wanted.specifier}")
   if bad:
     raise CommandError("; ".join(bad))
   missing = []
@@ -84,40 +86,6 @@ def _packages() -> list[str]:
     except importlib.metadata.PackageNotFoundError:
       missing.append(f"{package} (extra {extra})")
   return [", ".join(lines)] + ([f"not installed: {', '.join(missing)}"] if missing else [])
-
-
-def _requirements() -> dict[str, str]:
-  """Returns the version ranges this package asks for, by package."""
-  ranges = {}
-  for line in importlib.metadata.requires("palpate") or []:
-    spec = line.partition(";")[0].replace(" ", "")
-    if ";" in line and "extra" in line:
-      continue
-    at = min((spec.index(c) for c in "<>=!~" if c in spec), default=len(spec))
-    ranges[spec[:at]] = spec[at:]
-  return ranges
-
-
-def _within(version: str, spec: str) -> bool:
-  """Returns whether a release lies in a range of >=, < and == parts."""
-
-  def parts(text: str) -> list[int]:
-    numbers = []
-    for word in text.split("."):
-      if not word.isdigit():
-        break
-      numbers.append(int(word))
-    return (numbers + [0] * 4)[:4]
-
-  mine = parts(version)
-  for part in filter(None, spec.split(",")):
-    if part.startswith(">=") and mine < parts(part[2:]):
-      return False
-    if part.startswith("<") and mine >= parts(part[1:]):
-      return False
-    if part.startswith("==") and mine != parts(part[2:]):
-      return False
-  return True
 
 
 def _devices() -> list[str]:

@@ -36,23 +36,23 @@ def add_arguments(parser: argparse.ArgumentParser):
   )  # fmt: skip
   add(
     "--device", metavar="NAME",
-    help="do it by hand, live: mouse, keyboard or touch on a page; gamepad, spacemouse, udp, "
+    help="do it live with a device: mouse, keyboard or touch on a page; gamepad, spacemouse, udp, "
     "openhaptics, forcedimension, haply, hand",
   )  # fmt: skip
-  add("--left", metavar="NAME", help="device of the other hand, in an exercise that takes two")
+  add("--left", metavar="NAME", help="device of the other hand, in an exercise for two hands")
   add("--scale", metavar="X", type=float, default=1.0, help="of a device's movements (%(default)s)")
   add("--seed", metavar="N", type=int, default=0, help="of the episode (%(default)s)")
-  add("--replay", metavar="FILE", help="repeat a recording and check that it comes out the same")
+  add("--replay", metavar="FILE", help="replay a recording and check that the result is the same")
   add(
     "-o", "--out", metavar="FOLDER",
-    help="where recording and report go (out/TASK; out/TASK_replay; with --trainee nowhere but in "
+    help="folder of recording and report (out/TASK; out/TASK_replay; with --trainee only "
     "the record)",
   )  # fmt: skip
   add("--film", metavar="FILE", help="write a film too, .mp4 or .gif")
   options.add_argument(parser)
   keeping.add_arguments(parser)
-  add("--states", action="store_true", help="keep the state of every step in the recording")
-  add("--no-report", action="store_true", help="write the recording alone")
+  add("--states", action="store_true", help="store the state of every step in the recording")
+  add("--no-report", action="store_true", help="write no report")
 
 
 def main(args: argparse.Namespace) -> int:
@@ -76,8 +76,8 @@ def main(args: argparse.Namespace) -> int:
     except ValueError as error:
       raise CommandError(str(error)) from None
   job = _prepare(args)
-  progress, failure = Progress(), None
-  with Interrupt() as interrupt, _camera(job.film) as shoot:
+  progress, failure, camera = Progress(), None, contextlib.nullcontext(lambda env: None)
+  with Interrupt() as interrupt, film.laparoscope(job.film, _SIZE) if job.film else camera as shoot:
 
     def watch(env) -> bool:
       progress.show(f"{job.name} {env.physics.time():.1f} s, {100 * env.task.best:.0f} % done")
@@ -116,7 +116,7 @@ def main(args: argparse.Namespace) -> int:
 def _check_who(args: argparse.Namespace):
   """Raises CommandError where the options do not agree on who does what."""
   if args.device and not args.task:
-    raise CommandError("device is given without a TASK; a replay needs none")
+    raise CommandError("device is given without a TASK; a replay takes no device")
   if args.left and not args.device:
     raise CommandError(f"left is {args.left!r} without --device NAME, that of the main hand")
   if args.device and args.performer:
@@ -126,7 +126,7 @@ def _check_who(args: argparse.Namespace):
     return
   if not (args.device or args.performer):
     raise CommandError(
-      f"trainee is {args.trainee!r} without --device NAME: the expert's script would do it in "
+      f"trainee is {args.trainee!r} without --device NAME: the expert's script would act under "
       "that name; --performer expert if that is meant"
     )
   if args.set:
@@ -291,8 +291,3 @@ def _write_files(job: _Job, folder: pathlib.Path, recording: Any, report: bool) 
         print(f"report     {write_report(recording, folder, job.references(job.name))}")
       except ImportError as error:
         print(f"no report: {error}; install palpate[plot]", file=sys.stderr)
-
-
-def _camera(path: pathlib.Path | None) -> contextlib.AbstractContextManager[Callable[[Any], None]]:
-  """Gives a function that takes a picture for the film, if there is to be one."""
-  return contextlib.nullcontext(lambda env: None) if path is None else film.laparoscope(path, _SIZE)

@@ -19,7 +19,7 @@ def add_argument(parser: argparse.ArgumentParser):
     action="append",
     default=[],
     help="option of the exercise, such as reward=sparse, time_limit=5 or pixels=[84,84]; JSON or a "
-    "word, may be repeated",
+    "word; may be repeated",
   )
 
 

@@ -30,8 +30,8 @@ _SOURCES = {".py", ".h", ".xml", ".obj", ".stl", ".json"}
 def add_arguments(parser: argparse.ArgumentParser):
   """Declares the options."""
   add = parser.add_argument
-  add("tasks", metavar="TASK", nargs="*", help="such as touch/easy; all without one")
-  add("-o", "--out", metavar="FOLDER", required=True, help="where TASK.json goes")
+  add("tasks", metavar="TASK", nargs="*", help="such as touch/easy (all)")
+  add("-o", "--out", metavar="FOLDER", required=True, help="folder of the TASK.json files")
   add("--runs", metavar="FOLDER", default="out/panel", help="of the episodes (%(default)s)")
   add("--performer", metavar="NAME", default="skilled", help="as evaluate's policy (%(default)s)")
   add("--episodes", metavar="N", type=int, default=100, help="of each task (%(default)s)")

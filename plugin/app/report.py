@@ -25,10 +25,10 @@ def add_arguments(parser: argparse.ArgumentParser):
   add("recordings", metavar="FILE", nargs="+", help="a recording, .npz; several are compared")
   add(
     "-o", "--out", metavar="FOLDER",
-    help="where report.html or comparison.html goes (the first recording's folder)",
+    help="folder of report.html or comparison.html (the first recording's folder)",
   )  # fmt: skip
   keeping.add_references(parser)
-  add("--film", action="store_true", help="run the exercise anew and put its film in the page")
+  add("--film", action="store_true", help="replay the exercise and put its film in the page")
 
 
 def main(args: argparse.Namespace) -> int:

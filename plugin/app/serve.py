@@ -18,20 +18,20 @@ _LOOK = 0.2  # between looks at whether Ctrl-C was pressed [s]
 def add_arguments(parser: argparse.ArgumentParser):
   """Declares the options."""
   parser.epilog = (
-    "The page is reached from this machine alone. With another --host it is reached from others "
-    "too, by the printed address with its token, and unencrypted: put it behind a proxy that "
+    "Only this machine reaches the page. With another --host other machines reach it "
+    "with the printed address and its token. The connection is not encrypted: use a proxy that "
     "encrypts."
   )
   add = parser.add_argument
   add("--host", default="127.0.0.1", help="address to listen on (%(default)s)")
   add("--port", type=int, default=8090, help="0 for any that is free (%(default)s)")
-  add("--token", help="that a page must know; one is made up where others can reach the page")
+  add("--token", help="that a page must send; made up if other machines can reach the page")
   add(
     "--device", metavar="NAME", default="mouse",
-    help="mouse for all that is on the page, or gamepad, spacemouse, udp, openhaptics, "
+    help="mouse for the controls of the page, or gamepad, spacemouse, udp, openhaptics, "
     "forcedimension, haply, hand (%(default)s)",
   )  # fmt: skip
-  add("--pages", metavar="N", type=int, default=2, help="that may be open at a time (%(default)s)")
+  add("--pages", metavar="N", type=int, default=2, help="most pages open at a time (%(default)s)")
   add("-o", "--out", metavar="FOLDER", default="out/live", help="of recordings (%(default)s)")
   keeping.add_arguments(parser)
   add("--open", action="store_true", help="open the page in a browser")

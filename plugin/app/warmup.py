@@ -12,7 +12,7 @@ from .console import CommandError, Progress, table
 
 def add_arguments(parser: argparse.ArgumentParser):
   """Declares the options."""
-  parser.add_argument("--device", help="this one alone: cpu, cuda:0, ... (all)")
+  parser.add_argument("--device", help="compile for this device only: cpu, cuda:0, ... (all)")
 
 
 def main(args: argparse.Namespace) -> int:

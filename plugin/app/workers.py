@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterator, Sequence
 from multiprocessing import connection
 from typing import Any, Protocol
 
-from .console import CommandError, Interrupt, check_counts, need
+from .console import CommandError, check_counts, need
 
 _POLL = 0.2  # of Ctrl-C, while workers work [s]
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -212,8 +212,9 @@ class Cluster:
     todo, running = iter(range(len(jobs))), {}
     left = len(jobs)
     with self._joined(ray):
-      attempt = ray.remote(max_retries=_RETRIES)(_unpacked)
-      path = [folder for folder in map(os.path.abspath, sys.path) if not _installed(folder)]
+      attempt = ray.remote(max_retries=_RETRIES)(unpacked)
+      installed = (sys.prefix, sys.base_prefix)
+      path = [p for p in map(os.path.abspath, sys.path) if not p.startswith(installed)]
       count = self.count or max(1, int(ray.cluster_resources().get("CPU", 1)))
       while True:
         while left and len(running) < count and time.monotonic() < deadline and not stop():
@@ -249,13 +250,15 @@ class Cluster:
       ray.shutdown()
 
 
-def _installed(folder: str) -> bool:
-  return folder.startswith((sys.prefix, sys.base_prefix))
-
-
-def _unpacked(path: list[str], packed: bytes) -> tuple[str, Any]:
+def unpacked(path: list[str], packed: bytes) -> tuple[str, Any]:
   """Does a job where modules are found as they were where it was packed."""
   sys.path.extend(folder for folder in path if folder not in sys.path)
+  import palpate
+
+  if not hasattr(palpate, "register"):  # Ray's workers look in the current folder first
+    where = next(iter(palpate.__path__))
+    text = f"ray: workers take the folder {where!r} for the package palpate"
+    return "error", CommandError(f"{text}; run the command in another folder", code=1)
   return _attempt(*pickle.loads(packed))
 
 
@@ -272,7 +275,7 @@ def parallel(
   function: Callable[[Any], Any],
   jobs: Sequence[Any],
   workers: Workers,
-  interrupt: Interrupt | None = None,
+  stop: Callable[[], bool] = _never,
 ) -> Iterator[Any]:
   """Yields what a function makes of each job, in order; None where its worker died.
 
@@ -280,17 +283,16 @@ def parallel(
     function: of a module, so that a worker can find it
     jobs: its arguments
     workers: who does them; `HERE` is this process
-    interrupt: once seen, the jobs that run are finished and no more are begun
+    stop: see `Workers.run`
   """
-  interrupt = interrupt or Interrupt()
   if workers == HERE:
     for job in jobs:
-      if interrupt.seen:
+      if stop():
         return
       yield function(job)
     return
   done, index = {}, 0
-  for ended in workers.run(function, jobs, lambda: interrupt.seen):
+  for ended in workers.run(function, jobs, stop):
     if ended.status == "error":
       raise ended.value
     done[ended.index] = ended.value
@@ -302,10 +304,10 @@ def parallel(
 def add_arguments(parser: argparse.ArgumentParser, count: int):
   """Declares the options; `count` is that of processes by default."""
   add = parser.add_argument
-  add("--processes", metavar="N", type=int, help=f"at a time ({count}; a cluster's CPUs)")
+  add("--processes", metavar="N", type=int, help=f"at a time ({count}; on a cluster its CPUs)")
   add(
     "--ray", metavar="ADDRESS", nargs="?", const="",
-    help="on a Ray cluster, or on a cluster of this machine alone",
+    help="use a Ray cluster; without ADDRESS a cluster of this machine",
   )  # fmt: skip
   parser.set_defaults(default_processes=count)
 

@@ -19,15 +19,15 @@ _NODES = 1000
 def add_arguments(parser: argparse.ArgumentParser):
   """Declares the options."""
   parser.epilog = (
-    "What of the mesh the organ leaves out or fills is named, with its volume; nothing is written "
-    "then, and the exit code is 1, unless --accept-losses or --pieces takes care of it."
+    "Parts of the mesh that the organ leaves out or fills are listed with their volume. Then "
+    "nothing is written and the exit code is 1, unless --accept-losses or --pieces is given."
   )
   add = parser.add_argument
   add("mesh", metavar="MESH", help="OBJ, STL, PLY, glTF, or a label map in NIfTI or NRRD")
   add(
     "-o", "--out", metavar="FOLDER", required=True, help="the model folder to write, new or empty"
   )
-  add("--force", action="store_true", help="write into a folder that has files; they are replaced")
+  add("--force", action="store_true", help="write into a folder with files, which are replaced")
   add("--nodes", metavar="N", type=int, help=f"nodes of the organ ({_NODES})")
   add("--method", choices=("even", "grid", "direct"), default="even", help="(%(default)s)")
   add("--scale", metavar="X", help="metres per unit of a mesh, or its unit: m, cm, mm, inch (m)")
@@ -35,14 +35,14 @@ def add_arguments(parser: argparse.ArgumentParser):
     "--label",
     metavar="K",
     action="append",
-    help="number or name of a label to take from a volume; may be repeated, or all",
+    help="number or name of a label of a volume, or all; may be repeated",
   )
-  add("--pieces", action="store_true", help="make an organ of every separate piece")
-  add("--accept-losses", action="store_true", help="write the organ even if it leaves parts out")
+  add("--pieces", action="store_true", help="make an organ from each separate piece")
+  add("--accept-losses", action="store_true", help="write the organ even if it leaves out parts")
   add("--name", help="of the organ (the file's)")
   add("--young", metavar="PA", type=float, help="Young's modulus (the liver's)")
   add("--foundation", metavar="PA/M", type=float, help="foundation (the liver's; of a solid none)")
-  add("--solid", action="store_true", help="fill it with tetrahedra, in place of a skin")
+  add("--solid", action="store_true", help="fill it with tetrahedra instead of a skin")
 
 
 def main(args: argparse.Namespace) -> int:

@@ -27,7 +27,7 @@ from . import policy
 from .networks import Networks
 from .rsl import RslRl
 
-CHECKPOINT, POLICY = "checkpoint.safetensors", "policy.safetensors"
+CHECKPOINT = "checkpoint.safetensors"
 ROW = (
   "iteration", "steps", "seconds", "episodes", "success", "return", "length", "spread",
   "learning_rate",

@@ -22,6 +22,7 @@ import numpy as np
 from ..files import replacing
 
 SUFFIX = ".safetensors"
+FILE = f"policy{SUFFIX}"  # in a folder of training
 FOLDER = pathlib.Path(__file__).parents[1] / "policies"  # of those that come with exercises
 _KEY = "palpate"  # of the header
 _FORMAT = 2

@@ -166,14 +166,10 @@ def _metric_table(measured: Sequence[_Measured]) -> str:
       cells += [text(spec.shown), "–" if spec.better == "neither" else spec.better]
       if two:
         first, second = (getattr(m.metrics, name) for m in measured)
-        cells.append(_signed(second - first, spec))
+        cells.append("+" * (second > first) + number(second - first, spec))
       rows.append(page.row(cells, numbers))
   about = (
     "Bold is the better value of those that succeeded; red is over the limit of proficiency; the "
     "difference is the second less the first."
   )
   return f"<h2>Metrics</h2>{page.table(head, rows, numbers)}<p class='small faint'>{about}</p>"
-
-
-def _signed(value: float, spec: Spec) -> str:
-  return ("+" if value > 0 else "") + number(value, spec)

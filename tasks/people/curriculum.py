@@ -20,27 +20,16 @@ AFTER: dict[str, str | None] = {
   "dissect/easy": "retract/easy",
   "cut/easy": "trace/easy",
   "bimanual/easy": "dissect/easy",
-  "touch/standard": "touch/easy",
-  "probe/standard": "probe/easy",
-  "probe/depth": "probe/easy",
-  "trace/standard": "trace/easy",
-  "grasp/standard": "grasp/easy",
-  "retract/standard": "retract/easy",
-  "tease/standard": "tease/easy",
-  "dissect/standard": "dissect/easy",
-  "cut/standard": "cut/easy",
-  "bimanual/standard": "bimanual/easy",
+}
+_DOMAINS = [name.partition("/")[0] for name in AFTER]
+for _domain in _DOMAINS:
+  AFTER[f"{_domain}/standard"] = f"{_domain}/easy"
+  if _domain == "probe":
+    AFTER["probe/depth"] = "probe/easy"
+AFTER |= {
   "probe/palpate_easy": "probe/standard",
   "probe/palpate_standard": "probe/palpate_easy",
-  "touch/hard": "touch/standard",
-  "probe/hard": "probe/standard",
-  "trace/hard": "trace/standard",
-  "grasp/hard": "grasp/standard",
-  "retract/hard": "retract/standard",
-  "tease/hard": "tease/standard",
-  "dissect/hard": "dissect/standard",
-  "cut/hard": "cut/standard",
-  "bimanual/hard": "bimanual/standard",
+  **{f"{domain}/hard": f"{domain}/standard" for domain in _DOMAINS},
   "probe/palpate_hard": "probe/palpate_standard",
 }
 RULE = f"{CONSECUTIVE} proficient attempts in a row and {REPEATS} more"

@@ -325,7 +325,7 @@ def test_a_name_on_a_page_adds_and_tells_nothing(folder):
   fill(folder, "Ada", 3)
   keep = keeping.Keeping(folder)
   for name in ("Ada", "New"):
-    kept = keep.begin().keep(made(1, person=name), name)
+    kept = keep.begin().keep(made(1, person=name))
     assert (kept.said, kept.fault) == ((), "")
     assert "person" not in Recording.load(kept.path).info
   assert len(episodes(folder, "Ada")) == 4 and len(episodes(folder, "New")) == 1

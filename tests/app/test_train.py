@@ -58,7 +58,7 @@ def test_training_goes_on_where_it_stopped_and_its_policy_is_evaluated(tmp_path,
   words = ["--policy", path, "--episodes", "1", "--set", "time_limit=0.4"]
   assert cli.main(["evaluate", "touch/easy", *words]) == 0
   assert "time limit 1" in capsys.readouterr().out
-  assert cli.main(["evaluate", "touch/standard", *words]) == 1
+  assert cli.main(["evaluate", "touch/standard", *words]) == 2
   assert "the policy is of touch/easy, not of touch/standard" in capsys.readouterr().err
 
 

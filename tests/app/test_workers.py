@@ -2,9 +2,11 @@
 
 import os
 import pathlib
+import pickle
 import signal
 import sys
 import time
+import types
 
 import pytest
 from palpate.app import cli, workers
@@ -83,6 +85,17 @@ def test_a_ray_cluster_loses_nothing_with_a_worker(tmp_path, monkeypatch, capsys
   assert {path.name for path in (tmp_path / "kept").iterdir()} == {"0.npz", "1.npz"}
   assert cli.main(["evaluate", "touch/easy", "--json", "one.json", *short]) == 0
   assert (tmp_path / "ray.json").read_bytes() == (tmp_path / "one.json").read_bytes()
+
+
+def test_a_worker_names_the_folder_that_it_takes_for_the_package(tmp_path, monkeypatch):
+  """As Ray's do beside a clone named palpate: Python finds a package without modules there."""
+  empty = types.ModuleType("palpate")
+  empty.__path__ = [str(tmp_path / "palpate")]
+  job = pickle.dumps((square, 2))
+  assert workers.unpacked([], job) == ("ok", 4)
+  monkeypatch.setitem(sys.modules, "palpate", empty)
+  status, error = workers.unpacked([], job)
+  assert status == "error" and f"workers take the folder {empty.__path__[0]!r}" in str(error)
 
 
 def test_a_cluster_that_is_not_there_is_one_line(monkeypatch, capsys):

@@ -191,6 +191,7 @@ def page(
 
   A page begins with its title, its finding and its plot. What it was measured with, the command and
   the lines follow. What an existing page has from `## Remarks` on was written by hand and stays.
+  `older` in the notes, written by hand until the next run, says what the rows are older than.
 
   Args:
     path: the page
@@ -205,6 +206,7 @@ def page(
   head = [f"- {line}" for line in finding or ["Too few rows for a finding."]]
   if about.get("done", 0) < about.get("cases", 0):
     head += ["", f"The run is incomplete: {about['done']} of {about['cases']} cases."]
+  head += ["", f"**Older.** {about['older']}"] if about.get("older") else []
   head += ["", f"![{title}]({plot.name})"] if plot else []
   command = f"    python tests/benchmarks/run.py {about.get('bench', path.stem)}"
   command += " --short" if about.get("short") else ""

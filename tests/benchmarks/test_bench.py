@@ -344,8 +344,19 @@ def test_thesis_bench_measures_every_scheme(tmp_path):
   for row in rates:
     row["diverged"] = int(row["scheme"] == "explicit")
   page = thesis.summarize(rows)
-  assert "| explicit | cpu | - |" in page and "| implicit | cpu | - |" not in page
+  assert "| explicit | cpu | diverged |" in page and "| implicit | cpu | diverged |" not in page
   assert "Not stable at 1 ms: explicit on cpu at 16 x 16." in page[-1]
+
+
+def test_the_thesis_page_says_its_headline_and_what_shared_the_machine():
+  paths = [results.FOLDER / f"thesis_{name}.csv" for name in ("cpu", "cuda")]
+  rows = [row for path in paths for row in results.read(path)]
+  first, *_ = thesis.finding(rows)
+  assert "6.5 times in the thesis" in first and "3.4 times in the whole haptic cycle" in first
+  page = "\n".join(thesis.summarize(rows, thesis.conditions(results.FOLDER)))
+  assert "5 runs at a time shared 16 cores and one card" in page
+  assert "At 16386 nodes [loop](loop.md) steps at 4605 Hz and this page at 1758" in page
+  assert page.count("| diverged |") == 6  # rate, cycle and integration of explicit at 256 x 256
 
 
 def test_skipping_bench_gives_a_row_to_every_feature(tmp_path):

@@ -12,7 +12,7 @@ import json
 import os
 import pathlib
 import subprocess
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -76,7 +76,7 @@ def write(folder: pathlib.Path, paths: Iterable[pathlib.Path], about: About) -> 
 
   features: dict[str, Any] = {}
   data, rows = _Tables(folder / "data"), _Tables(folder / "meta/episodes")
-  films, total, frames, rate = _Films(folder / "videos" / _PIXELS), _Total(), 0, 0
+  films, every, frames, rate = _Films(folder / "videos" / _PIXELS), [], 0, 0
   for index, path in enumerate(paths):
     demo = Demonstration.load(path)
     now, rate = _features(demo), round(demo.rate)
@@ -94,7 +94,7 @@ def write(folder: pathlib.Path, paths: Iterable[pathlib.Path], about: About) -> 
         key: np.array(v) if key == "count" else np.reshape(v, (3, 1, 1)) for key, v in seen.items()
       }
       place |= films.add(_film(path), len(demo) / rate)
-    total.add(stats)
+    every.append(stats)
     row = {
       "episode_index": index, "tasks": [instruction(about.task)], "length": len(demo), **place,
       "dataset_from_index": frames, "dataset_to_index": frames + len(demo),
@@ -105,7 +105,7 @@ def write(folder: pathlib.Path, paths: Iterable[pathlib.Path], about: About) -> 
     frames += len(demo)
   for part in (data, rows, films):
     part.close()
-  _write_meta(folder, about, features, total.stats(), (rows.count, frames, rate))
+  _write_meta(folder, about, features, _total(every), (rows.count, frames, rate))
   films = ["its pictures are compressed (H.264)"] if _PIXELS in features else []
   return ["the last observation of an episode, which no action answers",
           "numbers beyond float32", *films]  # fmt: skip
@@ -113,19 +113,17 @@ def write(folder: pathlib.Path, paths: Iterable[pathlib.Path], about: About) -> 
 
 def _features(demo: Demonstration) -> dict[str, Any]:
   """Returns what `info.json` says of each column."""
-  out: dict[str, Any] = {}
-
-  def add(key: str, dtype: str, names: list[str] | None, count: int = 1):
-    out[key] = {"dtype": dtype, "shape": [len(names) if names else count], "names": names}
-
+  names = {"action": list(demo.components)}
   for key, kind in _VECTORS.items():
-    names = [
+    names[key] = [
       name if np.size(value[0]) == 1 else f"{name}.{i}"
       for name, value in demo.observations.items() if group(name) == kind
       for i in range(np.size(value[0]))
     ]  # fmt: skip
-    if names:
-      add(key, "float32", names)
+  out: dict[str, Any] = {
+    key: {"dtype": value.dtype.name, "shape": list(value.shape[1:]) or [1], "names": names.get(key)}
+    for key, value in _columns(demo, 0, 0).items()
+  }
   if "pixels" in demo.info:
     height, width, depth = demo.info["pixels"]["shape"]
     out[_PIXELS] = {
@@ -136,15 +134,6 @@ def _features(demo: Demonstration) -> dict[str, Any]:
         "video.fps": round(demo.rate), "has_audio": False,
       },
     }  # fmt: skip
-  add("action", "float32", list(demo.components))
-  for name, value in demo.forces.items():
-    add(f"next.{name}", "float32", None, value.shape[1])
-  add("next.reward", "float32", None)
-  for key in ("next.done", "next.success"):
-    add(key, "bool", None)
-  add("timestamp", "float32", None)
-  for key in ("frame_index", "episode_index", "index", "task_index"):
-    add(key, "int64", None)
   return out
 
 
@@ -197,37 +186,18 @@ def _stats(values: np.ndarray) -> Stats:
   }
 
 
-class _Total:
-  """Statistics of all episodes from those of each; a quantile is the mean of theirs, as there."""
-
-  def __init__(self):
-    self._sums: dict[str, Stats] = {}
-
-  def add(self, stats: Mapping[str, Stats]):
-    for key, s in stats.items():
-      n = float(s["count"][0])
-      weighted = {name: n * s[name] for name in ("mean", *_QUANTILES)}
-      weighted |= {"count": s["count"], "square": n * (s["std"] ** 2 + s["mean"] ** 2)}
-      total = self._sums.setdefault(key, {"min": s["min"], "max": s["max"]})
-      total["min"], total["max"] = np.minimum(total["min"], s["min"]), np.maximum(
-        total["max"], s["max"]
-      )  # fmt: skip
-      for name, value in weighted.items():
-        total[name] = total.get(name, 0) + value
-
-  def stats(self) -> dict[str, Any]:
-    """Returns them as JSON."""
-    out = {}
-    for key, total in self._sums.items():
-      n = float(total["count"][0])
-      mean = total["mean"] / n
-      known = {
-        "min": total["min"], "max": total["max"], "mean": mean,
-        "std": np.sqrt(np.maximum(total["square"] / n - mean**2, 0)), "count": total["count"],
-        **{name: total[name] / n for name in _QUANTILES},
-      }  # fmt: skip
-      out[key] = {name: value.tolist() for name, value in known.items()}
-    return out
+def _total(episodes: Sequence[Mapping[str, Stats]]) -> dict[str, Any]:
+  """Returns the statistics of all episodes as JSON; a quantile is the mean of theirs, as there."""
+  out = {}
+  for key in episodes[0]:
+    every = {name: np.array([stats[key][name] for stats in episodes]) for name in episodes[0][key]}
+    count = every["count"][:, 0]
+    known = {name: np.average(every[name], axis=0, weights=count) for name in ("mean", *_QUANTILES)}
+    square = np.average(every["std"] ** 2 + every["mean"] ** 2, axis=0, weights=count)
+    known |= {"min": every["min"].min(axis=0), "max": every["max"].max(axis=0)}
+    known |= {"std": np.sqrt(np.maximum(square - known["mean"] ** 2, 0)), "count": [sum(count)]}
+    out[key] = {name: np.asarray(value).tolist() for name, value in known.items()}
+  return out
 
 
 class _Tables:

@@ -32,13 +32,13 @@ def add_arguments(parser: argparse.ArgumentParser):
     "--seconds",
     metavar="S",
     type=float,
-    help="simulated: a picture shows the end, a film all of it (0, 2); in a picture of an exercise "
-    "its expert acts until then",
+    help="simulated time: a picture shows its end, a film all of it (0, 2); in a picture of an "
+    "exercise its expert acts until then",
   )
   add("--fps", metavar="N", type=int, default=25, help="frames a second of a film (%(default)s)")
   add("--slower", metavar="X", type=float, default=1.0, help="slow motion (%(default)s)")
   add("--edges", action="store_true", help="draw the organ's edges over its surface")
-  add("--wireframe", action="store_true", help="draw edges in place of every surface")
+  add("--wireframe", action="store_true", help="draw edges instead of surfaces")
   add(
     "--forces", action="store_true", help="draw contact forces on the instruments, 10 cm a newton"
   )

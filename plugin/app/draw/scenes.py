@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser):
   parser.add_argument(
     "--coupling",
     choices=("nodal", "window"),
-    help="of a named organ; window: MuJoCo knows the nodes near the instruments alone (nodal)",
+    help="of a named organ; window: MuJoCo has only the nodes near the instruments (nodal)",
   )
   parser.add_argument("--keyframe", metavar="NAME", help="state to start from (the first keyframe)")
 

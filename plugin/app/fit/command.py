@@ -28,16 +28,16 @@ def add_arguments(parser: argparse.ArgumentParser):
   add = parser.add_argument
   add("data", metavar="DATA.csv", help="time, depth and force")
   add("--test", choices=("indentation", "grasp"), default="indentation",
-      help="by a tool, or by two that face each other and close (%(default)s)")  # fmt: skip
+      help="by one tool, or by two tools that close on each other (%(default)s)")  # fmt: skip
   add("--tip", choices=("sphere", "flat"), default="sphere", help="of the tool (%(default)s)")
   add("--radius", metavar="M", type=float, required=True, help="of the tool")
   add("--sample-size", metavar="M", type=float, nargs=3,
-      help="of a block: width, depth, height; held at its bottom, grasped: at one end")  # fmt: skip
+      help="of a block: width, depth, height; held at its bottom (grasp: one end)")  # fmt: skip
   add("--organ", metavar="NAME[:PLACE]", help="an organ of the catalogue instead of a block")
   add("--free", metavar="KEY", nargs="+", default=["young", "damping"],
-      help="constants to find, keys of the configuration (young damping)")  # fmt: skip
+      help="constants to find, as keys of the configuration (young damping)")  # fmt: skip
   add("--set", metavar="KEY=VALUE", action="append", default=[],
-      help="a constant that is known, or where a free one starts; may be repeated")  # fmt: skip
+      help="a known constant, or the start value of a free one; may be repeated")  # fmt: skip
   add("--edge", metavar="M", type=float,
       help="longest edge of a triangle under the tool (a third of the contact)")  # fmt: skip
   add("--h", metavar="S", type=float, help="time step (600 for the record)")
@@ -59,7 +59,7 @@ def main(args: argparse.Namespace) -> int:
   test = _test(args)
   known = _known(args)
   progress = Progress()
-  progress.show("filling the tissue; the first time takes some seconds more", always=True)
+  progress.show("filling the tissue; the first run takes some seconds longer", always=True)
   simulation = indentation.Indentation(test, record)
   starts = {"poisson": Config.poisson, "damping": Config.damping}
   starts |= {key: value for key, value in simulation.keys.items() if isinstance(value, float)}

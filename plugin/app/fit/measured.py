@@ -57,7 +57,8 @@ def read(path: pathlib.Path) -> Record:
     text = path.read_text(encoding="utf-8-sig")
   except (OSError, UnicodeDecodeError) as error:
     raise CommandError(f"cannot read {path.name!r}: {error}") from None
-  rows = [(n, line) for n, line in enumerate(text.splitlines(), 1) if _is_row(line)]
+  rows = [(n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip()]
+  rows = [(n, line) for n, line in rows if not line.lstrip().startswith("#")]
   if not rows:
     raise CommandError(f"{path.name}: it is empty, expected a header and rows")
   comma = ";" if rows[0][1].count(";") > rows[0][1].count(",") else ","
@@ -71,10 +72,6 @@ def read(path: pathlib.Path) -> Record:
     for name, (column, scale) in where.items():
       values[name].append(scale * _number(path.name, line, name, row, column))
   return _checked(path.name, **{name: np.array(each) for name, each in values.items()})
-
-
-def _is_row(line: str) -> bool:
-  return bool(line.strip()) and not line.lstrip().startswith("#")
 
 
 def _columns(file: str, header: list[str]) -> dict[str, tuple[int, float]]:

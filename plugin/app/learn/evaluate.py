@@ -9,8 +9,9 @@ import json
 import math
 import os
 import pathlib
+import statistics
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import palpate
@@ -63,7 +64,7 @@ def add_arguments(parser: argparse.ArgumentParser):
   options.add_argument(parser)
   keeping.add_references(parser)
   add("--json", metavar="FILE", help="write every episode's metrics")
-  add("--recordings", metavar="FOLDER", help="keep every episode's recording, whole or not")
+  add("--recordings", metavar="FOLDER", help="save the recording of every episode, complete or not")
 
 
 def main(args: argparse.Namespace) -> int:
@@ -126,7 +127,7 @@ def evaluate(
   seeds: Sequence[int],
   crew: workers.Workers = workers.HERE,
   recordings: str | None = None,
-  interrupt: Interrupt | None = None,
+  stop: Callable[[], bool] = lambda: False,
   task_kwargs: Mapping[str, Any] | None = None,
 ) -> Iterator[Result]:
   """Yields the result of each seed, in order.
@@ -137,13 +138,13 @@ def evaluate(
     seeds: of the episodes
     crew: who runs them; this process by default
     recordings: folder to keep the recordings in, SEED.npz
-    interrupt: once seen, the episodes that run are finished and no more are begun
+    stop: once it says so, the episodes that run are finished and no more are begun
     task_kwargs: options of the task, JSON
   """
   kwargs = json.dumps(dict(task_kwargs or {}))
   folder = recordings and os.path.abspath(recordings)  # workers of a cluster stand elsewhere
   jobs = [(name, policy, seed, folder, kwargs) for seed in seeds]
-  done = workers.parallel(perform, jobs, crew, interrupt)
+  done = workers.parallel(perform, jobs, crew, stop)
   for seed, result in zip(seeds, done, strict=False):  # an interrupt leaves some out
     yield result or Result(seed, "error", 0.0, 0.0, error="a process died in it")
 
@@ -182,21 +183,23 @@ def perform(job: tuple[str, str, int, str | None, str]) -> Result:
 def table(name: str, policy: str, results: list[Result], reference: Mapping | None) -> str:
   """Returns mean and spread of return, time and every known metric, for people."""
   from palpate.tasks.metrics import METRICS, Metrics
+  from scipy import stats
 
   wins = sum(r.outcome == "success" for r in results)
-  low, high = _wilson(wins, len(results))
+  share = stats.binomtest(wins, len(results)).proportion_ci(method="wilson")
+  span = f"{100 * share.low:.0f} to {100 * share.high:.0f} %"
   other = {r.outcome for r in results} - {"success"}
   counts = ", ".join(f"{k} {sum(r.outcome == k for r in results)}" for k in sorted(other))
   lines = [
     f"{name}, policy {policy}, {len(results)} episodes",
-    f"success  {wins}/{len(results)} (95 % interval {100 * low:.0f} to {100 * high:.0f} %)"
+    f"success  {wins}/{len(results)} (95 % interval {span})"
     + (f"; {counts}" if counts else ""),
     f"{'':28} {'mean':>10} {'SD':>10} {'n':>5}",
   ]
 
   def row(label: str, values: list[float]) -> str:
-    mean, sd = _mean_sd(values)
-    return f"{label:28} {mean:>10.4g} {sd:>10.3g} {len(values):>5}"
+    sd = statistics.stdev(values) if len(values) > 1 else math.nan
+    return f"{label:28} {statistics.fmean(values):>10.4g} {sd:>10.3g} {len(values):>5}"
 
   lines.append(row("Return [-]", [r.total for r in results]))
   metrics = [Metrics.from_json(r.metrics) if r.metrics else Metrics() for r in results]
@@ -229,20 +232,3 @@ def _proficiency(
     most = ", ".join(f"{label} {count}" for label, count in over.most_common(5))
     lines.append(f"over the limit most often: {most}")
   return lines, [s.composite for s in scores if math.isfinite(s.composite)]
-
-
-def _mean_sd(values: list[float]) -> tuple[float, float]:
-  mean = math.fsum(values) / len(values)
-  if len(values) < 2:
-    return mean, math.nan
-  return mean, math.sqrt(math.fsum((v - mean) ** 2 for v in values) / (len(values) - 1))
-
-
-def _wilson(wins: int, count: int, z: float = 1.96) -> tuple[float, float]:
-  """Returns the 95 % interval of a share (Wilson 1927)."""
-  share = wins / count
-  middle = (share + z * z / (2 * count)) / (1 + z * z / count)
-  half = (
-    z / (1 + z * z / count) * math.sqrt(share * (1 - share) / count + z * z / (4 * count * count))
-  )
-  return max(middle - half, 0.0), min(middle + half, 1.0)

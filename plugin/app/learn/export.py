@@ -87,11 +87,11 @@ def add_arguments(parser: argparse.ArgumentParser):
   add("--seed", metavar="N", type=int, default=0, help="of the first episode (%(default)s)")
   add(
     "--noise", metavar="SD", type=float, default=0.0,
-    help="shake the instrument; the actions kept are those that were meant (%(default)s)",
+    help="add noise to the instrument's motion; the stored actions are without it (%(default)s)",
   )  # fmt: skip
   add(
     "--recordings", metavar="PATH", nargs="+",
-    help="in place of new episodes: recordings, or folders of them",
+    help="recordings, or folders of them, instead of new episodes",
   )  # fmt: skip
   add(
     "--observations", metavar="NAME", nargs="+", default=["sensors", "state"],
@@ -99,9 +99,9 @@ def add_arguments(parser: argparse.ArgumentParser):
   )  # fmt: skip
   add("--size", metavar="HxW", help="of pictures [pixels] (84x84)")
   options.add_argument(parser)
-  add("--failures", action="store_true", help="take episodes without success too, marked")
+  add("--failures", action="store_true", help="include episodes without success, marked as such")
   add("--licence", metavar="NAME", help=f"of the data ({_LICENCE}; unknown for recordings)")
-  add("--resume", action="store_true", help="go on with what FOLDER.part has")
+  add("--resume", action="store_true", help="continue with the episodes in FOLDER.part")
   workers.add_arguments(parser, os.cpu_count() or 1)
 
 
@@ -224,9 +224,10 @@ def _jobs(
   parts: pathlib.Path,
 ) -> list[Job]:
   if todo:
+    names = [hashlib.sha256(pathlib.Path(path).read_bytes()).hexdigest()[:16] for path, _ in todo]
     return [
-      Job(args.format, task, "", json.dumps(own), 0, path, str(parts / f"{_digest(path)}.npz"))
-      for path, own in todo
+      Job(args.format, task, "", json.dumps(own), 0, path, str(parts / f"{name}.npz"))
+      for name, (path, own) in zip(names, todo, strict=True)
     ]
   seeds, options_ = range(args.seed, args.seed + args.episodes), json.dumps(kwargs)
   paths = [str(parts / f"{seed:08d}.npz") for seed in seeds]
@@ -234,10 +235,6 @@ def _jobs(
     Job(args.format, task, args.performer, options_, seed, "", path, args.noise)
     for seed, path in zip(seeds, paths, strict=True)
   ]
-
-
-def _digest(path: str) -> str:
-  return hashlib.sha256(pathlib.Path(path).read_bytes()).hexdigest()[:16]
 
 
 def _begin(parts: pathlib.Path, args: argparse.Namespace, task: str, kwargs: dict[str, Any]):

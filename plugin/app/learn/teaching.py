@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import math
 import pathlib
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import palpate
 
 from .. import options, workers
-from ..console import CommandError, Interrupt, Progress, writing
+from ..console import CommandError, Progress, writing
 
 if TYPE_CHECKING:
   from palpate.tasks.learn.lessons import Lesson
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 
 LESSONS = "lessons.npz"
 _ROWS, _ENDS = ("seen", "meant", "done", "taught", "returns"), ("outcome", "alone")  # of a lesson
+LINES = 30.0  # seconds between lines about the progress, where there is no terminal
 _FIRST = 10_000_000  # seed of the first lesson
 _NOISE = 0.2  # SD of what shakes the expert in every other lesson, at most [-]
 _TURN = 60  # control steps of the policy's turns in every other lesson, at most
@@ -93,7 +95,8 @@ class School:
     crew: workers.Workers,
     count: int,
     gamma: float,
-    interrupt: Interrupt,
+    stop: Callable[[], bool],
+    until: float = math.inf,
   ) -> bool:
     """Gives a round of lessons, which the networks learn from; returns whether it is whole.
 
@@ -102,52 +105,68 @@ class School:
       crew: who gives lessons
       count: of lessons
       gamma: discount [-]
-      interrupt: once seen, the round is given up
+      stop: once it says so, the round is given up
+      until: seconds of all rounds that learning ends after; no lesson begins after half of those
+        that are left
     """
-    start, progress, given = time.perf_counter(), Progress(), []
-    jobs = self._jobs(count, gamma)
-    for lesson in workers.parallel(give, jobs, crew, interrupt):
+    start, progress, given = time.perf_counter(), Progress(lines=LINES), []
+    jobs, left = self._jobs(count, gamma), until - self.seconds
+
+    def over(share: float = 1.0) -> bool:
+      return stop() or time.perf_counter() - start >= share * left
+
+    for lesson in workers.parallel(give, jobs, crew, lambda: over(0.5)):
       given.append(lesson)
       progress.show(f"round {self.rounds + 1}: {len(given)} of {count} lessons")
-    progress.clear()
-    if interrupt.seen:
+    if stop():
+      progress.clear()
       return False
     whole = [lesson for lesson in given if lesson is not None]
     self.lessons += whole
     if not self.lessons:
-      raise CommandError(f"{self.task}: no lesson was given: the workers died", code=1)
+      why = "the workers died" if given else "the time was over"
+      raise CommandError(f"{self.task}: no lesson was given: {why}", code=1)
     error = math.nan  # where it needed no help, or not yet
     if any(lesson.taught.any() for lesson in self.lessons):
-      error = networks.learn(self.lessons, lambda: interrupt.seen)
+      turns = itertools.count(1)
+
+      def learning() -> bool:
+        progress.show(f"round {self.rounds + 1}: learning, step {next(turns)}")
+        return over()
+
+      error = networks.learn(self.lessons, learning)
+    progress.clear()
     self.rounds += 1
     self.seconds += time.perf_counter() - start
     wins = sum(lesson.outcome == "success" for lesson in whole)
-    free = [lesson for lesson, job in zip(given, jobs, strict=True) if lesson and _free(job)]
+    # Lessons in which a policy was let to do all.
+    pairs = zip(given, jobs, strict=False)
+    free = [each for each, job in pairs if each and job.policy and job.most is None]
     self.alone = sum(each.alone and each.outcome == "success" for each in free) / max(len(free), 1)
     steps = sum(int(lesson.taught.sum()) for lesson in self.lessons)
     told = f"; {100 * self.alone:.0f} % of {len(free)} alone" if free else ""
     print(
-      f"lessons, round {self.rounds}: {wins} of {count} were a success{told}; {steps} steps to "
-      f"learn from, error {error:.3f}, {self.seconds:.0f} s",
+      f"lessons, round {self.rounds}: {wins} of {len(given)} were a success{told}; "
+      f"{steps} steps to learn from, error {error:.3f}, {self.seconds:.0f} s",
       flush=True,
     )
-    return not interrupt.seen
+    return not stop()
 
   def _jobs(self, count: int, gamma: float) -> list[Job]:
-    from palpate.tasks.learn.learning import POLICY
+    from palpate.tasks.learn.policy import FILE
 
     random = np.random.RandomState(self.seed + self.rounds)
     first = _FIRST + (self.seed * 100 + self.rounds) * 10_000
     env: Any = options.environment(self.task, self.task_kwargs)
-    jobs = []
+    jobs, own = [], (self.path.parent / FILE).resolve()
     for k in range(count):
       job = Job(self.task, self.task_kwargs, tuple(env.observation_spec()), first + k, gamma)
       if k % 2:
         job = dataclasses.replace(job, noise=float(random.uniform(0, _NOISE)))
       # Of an easier exercise's policy alone it would learn what was missing, and forget the rest.
-      if (self.path.parent / POLICY).exists() and (self.rounds or not k % 2):
+      if own.exists() and (self.rounds or not k % 2):
         turn = _TURN if k % 2 else None
-        job = dataclasses.replace(job, policy=str((self.path.parent / POLICY).resolve()), most=turn)
+        job = dataclasses.replace(job, policy=str(own), most=turn)
       jobs.append(job)
     return jobs
 
@@ -180,8 +199,3 @@ class School:
     if task != self.task:
       raise CommandError(f"{self.path} is of {task}, not of {self.task}")
     self.lessons = [Lesson(*row) for row in zip(*parts, strict=True)]
-
-
-def _free(job: Job) -> bool:
-  """Returns whether a policy was let to do all of a lesson."""
-  return bool(job.policy) and job.most is None

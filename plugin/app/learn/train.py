@@ -25,7 +25,7 @@ from ..console import (
   output_folder,
   writing,
 )
-from .teaching import LESSONS, School
+from .teaching import LESSONS, LINES, School
 
 if TYPE_CHECKING:
   from palpate.tasks.learn.learning import Learner
@@ -52,14 +52,17 @@ def add_arguments(parser: argparse.ArgumentParser):
     "--lessons", metavar="N", type=int, default=_LESSONS,
     help=f"of an expert, in each of {ROUNDS} rounds at most (%(default)s); 0 for practice alone",
   )  # fmt: skip
-  add("--from", metavar="FILE", dest="start", help="policy of an easier exercise to begin with")
+  add("--from", metavar="FILE", dest="start", help="start from the policy of an easier exercise")
   add("--iterations", metavar="N", type=int, default=1000, help="of practice (%(default)s)")
-  add("--minutes", metavar="T", type=float, default=math.inf, help="at most, in all")
-  add("--success", metavar="SHARE", type=float, default=math.inf, help="enough, without spread")
+  add(
+    "--minutes", metavar="T", type=float, default=math.inf,
+    help="at most, in all; lessons take half of what is left, learning from them the rest",
+  )  # fmt: skip
+  add("--success", metavar="SHARE", type=float, default=math.inf, help="enough, without noise")
   add("--seed", metavar="N", type=int, default=0, help="of all that is random (%(default)s)")
   add("--num-envs", metavar="N", type=int, help=f"worlds ({_FEW} on a CPU, {_MANY} on a GPU)")
-  add("--device", metavar="NAME", help="cpu or cuda:N; a GPU where there is one")
-  add("--resume", action="store_true", help="go on with what is in the folder")
+  add("--device", metavar="NAME", help="cpu or cuda:N (a GPU if there is one)")
+  add("--resume", action="store_true", help="continue with the files of the folder")
   workers.add_arguments(parser, os.cpu_count() or 1)
   options.add_argument(parser)
 
@@ -71,6 +74,8 @@ def main(args: argparse.Namespace) -> int:
       raise CommandError(f"{count} is {getattr(args, count)}, expected a whole number >= 0")
   if args.num_envs is not None:
     check_counts(args, "num_envs")
+  if not args.minutes > 0:
+    raise CommandError(f"minutes is {args.minutes:g}, expected a number > 0")
   crew = workers.chosen(args)
   need("train", "torch", "rsl_rl", "tensordict", "safetensors", "gymnasium")
   palpate.register()
@@ -120,7 +125,7 @@ class Training:
     )  # fmt: skip
     if self.school.rounds:
       self.networks.remember(self.school.lessons)
-    start = folder / learning.POLICY if self.school.rounds else args.start
+    start = folder / policy.FILE if self.school.rounds else args.start
     if start and not begun:
       try:
         self.networks.take(policy.load(start))
@@ -135,8 +140,9 @@ class Training:
     school, networks = self.school, self.networks
     if (self.folder / learning.CHECKPOINT).exists():  # it practises already
       return True
-    while self.args.lessons and school.rounds < ROUNDS and not school.enough:
-      if not school.teach(networks, crew, self.args.lessons, self.settings.gamma, interrupt):
+    count, gamma, until = self.args.lessons, self.settings.gamma, 60 * self.args.minutes
+    while count and school.rounds < ROUNDS and not school.enough and school.seconds < until:
+      if not school.teach(networks, crew, count, gamma, interrupt, until):
         return False
       school.save()
       self._write_taught()
@@ -144,7 +150,7 @@ class Training:
 
   def _write_taught(self) -> None:
     """Writes the policy as it was taught so far, and its licence."""
-    from palpate.tasks.learn import learning, policy
+    from palpate.tasks.learn import policy
 
     school, networks = self.school, self.networks
     with writing(self.folder):
@@ -154,18 +160,19 @@ class Training:
       }  # fmt: skip
       training |= {"from": pathlib.Path(self.args.start).name} if self.args.start else {}
       made = networks.policy(self.task, self._told(), training)
-      policy.save(self.folder / learning.POLICY, made)
+      policy.save(self.folder / policy.FILE, made)
       (self.folder / "LICENSE").write_text(_LICENCE, encoding="utf-8")
 
   def practise(self, interrupt: Interrupt) -> bool:
     """Practises in many worlds; returns whether it was to the end."""
-    learner = self._learner() if self.args.iterations else None
+    time_left = self.school.seconds < 60 * self.args.minutes
+    learner = self._learner() if self.args.iterations and time_left else None
     if learner is None:
       return True
-    rows, stop = _kept(self.folder, learner.iteration), _watch(interrupt)
-    progress, last = Progress(), learner.seconds
-    while not interrupt.seen and not _enough(self.args, learner, rows, stop):
-      row = learner.iterate(stop)
+    rows, progress = _kept(self.folder, learner.iteration), Progress(lines=LINES)
+    last = learner.seconds
+    while not interrupt.seen and not _enough(self.args, learner, rows, interrupt):
+      row = learner.iterate(interrupt)
       if row is None:
         break
       rows.append(row)
@@ -214,7 +221,7 @@ class Training:
     folder = self.folder
     with writing(folder):
       learner.save(folder / learning.CHECKPOINT, self.name)
-      policy.save(folder / learning.POLICY, learner.policy(self.task, self._told()))
+      policy.save(folder / policy.FILE, learner.policy(self.task, self._told()))
       (folder / "LICENSE").write_text(_LICENCE, encoding="utf-8")
       if rows:
         _plot(folder / "curve.png", self.name, rows)
@@ -223,11 +230,9 @@ class Training:
         write(row[name] for name in learning.ROW)
 
 
-def _watch(interrupt: Interrupt) -> Callable[[], bool]:
-  return lambda: interrupt.seen
-
-
-def _enough(args: argparse.Namespace, learner: Learner, rows: list, stop: Any) -> bool:
+def _enough(
+  args: argparse.Namespace, learner: Learner, rows: list, stop: Callable[[], bool]
+) -> bool:
   if learner.iteration >= args.iterations or learner.seconds >= 60 * args.minutes:
     return True
   # With the spread of learning a policy may succeed that alone does not.

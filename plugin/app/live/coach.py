@@ -111,18 +111,9 @@ def _shown(value: float, spec: Spec) -> str:
   return "0" if "e\N{MINUS SIGN}" in text else text
 
 
-def _lower(label: str) -> str:
-  return label[0].lower() + label[1:]
-
-
 def _tells(spec: Spec, recording: Recording) -> bool:
-  """Returns whether a metric says something: a way that ends early is short for no merit."""
-  return recording.outcome == SUCCESS or spec.group != "efficiency"
-
-
-def _fits(name: str, metrics: Any) -> bool:
-  """Returns whether the advice about a metric fits: few movements need not be made one."""
-  return name != "log_dimensionless_jerk" or not metrics.number_of_movements < 2
+  """Returns whether a metric says something: an exercise that ends early is short for no merit."""
+  return recording.outcome == SUCCESS or spec.group not in ("efficiency", "time")
 
 
 def _words(text: str) -> str:
@@ -152,14 +143,16 @@ def advice(recording: Recording, reference: Mapping[str, Any] | None, most: int 
       f"{spec.label}: {number(getattr(metrics, name), spec)}{unit}, skilled people have {bound} "
       f"{number(row['limit'], spec)}{unit}"
     )
-    what = _ADVICE.get(name, "") if _fits(name, metrics) else ""
+    single = name == "log_dimensionless_jerk" and metrics.number_of_movements < 2
+    what = "" if single else _ADVICE.get(name, "")  # one movement cannot be made of several
     said.append(f"{text}: {what}." if what and what not in given else f"{text}.")  # once
     given.add(what)
   if recording.outcome == SUCCESS:
     good = [k for k, z in result.z.items() if math.isfinite(z) and z > 0.5 and k not in result.over]
     good.sort(key=lambda name: -result.z[name])
     if good:
-      labels = ", ".join(_lower(METRICS[name].label) for name in good[:3])
+      labels = (METRICS[name].label for name in good[:3])
+      labels = ", ".join(label[0].lower() + label[1:] for label in labels)
       said.append(f"Better than most skilled people: {labels}.")
     if result.proficient:
       said.append("Every metric is within its limit: this was a proficient episode.")

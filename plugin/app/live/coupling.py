@@ -19,9 +19,8 @@ from collections.abc import Sequence
 import numpy as np
 from palpate.models.handle import Shaft, times
 
-from .devices.device import Device, DeviceError, Four, Guard, Reading, Three
+from .devices.device import STILL, Device, DeviceError, Four, Guard, Reading, Three
 
-STILL: Three = (0.0, 0.0, 0.0)
 _SAME: Four = (1.0, 0.0, 0.0, 0.0)
 _CLOSE, _OPEN = 2.0, -0.6  # speed of the jaws by button [1/s], and where they grip
 _RETRY = 0.5  # between tries to find a device again [s]

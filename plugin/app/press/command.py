@@ -39,17 +39,17 @@ def add_arguments(parser: argparse.ArgumentParser):
   add = parser.add_argument
   add("--scene", metavar="FILE", help="MJCF with an organ and a probe (the scene that ships)")
   add("--organ", metavar="NAME", help="organ to measure (the first)")
-  add("--actuator", metavar="NAME", default="probe", help="what drives the probe (%(default)s)")
+  add("--actuator", metavar="NAME", default="probe", help="actuator of the probe (%(default)s)")
   add("--depth", metavar="M", type=float, default=0.01, help="indentation (%(default)s m)")
   add("--speed", metavar="M/S", type=float, default=0.05, help="of the probe (%(default)s m/s)")
   add("--hold", metavar="S", type=float, default=0.5, help="time at that depth (%(default)s s)")
   add("--h", metavar="S", type=float, help="time step (the scene's)")
-  add("--nodes", metavar="N", type=int, help="make the shipped organ anew with so many nodes")
-  add("--seed", metavar="N", type=int, help="make the shipped organ anew with other lobes")
+  add("--nodes", metavar="N", type=int, help="remake the shipped organ with this number of nodes")
+  add("--seed", metavar="N", type=int, help="remake the shipped organ with other lobes")
   add(
     "--coupling",
     choices=("nodal", "window"),
-    help="window: MuJoCo knows the nodes near the probe alone (the scene's)",
+    help="window: MuJoCo has only the nodes near the probe (the scene's)",
   )
   add("--device", metavar="DEVICE", help="cpu, cuda:0 or auto (the scene's)")
   add(
@@ -88,7 +88,7 @@ def main(args: argparse.Namespace) -> int:
   from . import figures, probe
 
   with Interrupt() as interrupt, _warnings():
-    Progress().show("loading; the first time takes some seconds more", always=True)
+    Progress().show("loading; the first run takes some seconds longer", always=True)
     model, data, organ = _load(args)
     run = _Run(model, data, organ, probe.find(model, args.actuator), filmed=bool(video))
     failure = run.press(args, out / "press.csv", interrupt)
@@ -101,7 +101,9 @@ def main(args: argparse.Namespace) -> int:
       print("palpate: interrupted; the data up to there is kept", file=sys.stderr)
       return 130
     try:
-      figures.plot(run.samples, out / "press.png", _title(args))
+      name = pathlib.Path(args.scene).name if args.scene else "press"
+      title = f"{name}: {1e3 * args.depth:g} mm at {1e3 * args.speed:g} mm/s"
+      figures.plot(run.samples, out / "press.png", title)
       print(f"{out / 'press.png'}: force and displacement over time")
     except CommandError as error:
       print(f"palpate: no plot: {error}", file=sys.stderr)
@@ -340,8 +342,3 @@ def _summary(model, organ, samples: Sequence) -> list[tuple[str, str]]:
     (f"steps that hit a solve's limit, {most}", str(len(ended))),
     *([("largest residual of those", f"{max(ended):.1e}")] if ended else []),
   ]
-
-
-def _title(args) -> str:
-  name = pathlib.Path(args.scene).name if args.scene else "press"
-  return f"{name}: {1e3 * args.depth:g} mm at {1e3 * args.speed:g} mm/s"

@@ -11,12 +11,12 @@ from . import keeping
 def add_arguments(parser: argparse.ArgumentParser):
   """Declares the options."""
   parser.epilog = (
-    "What was exported, or written elsewhere by --out, and backups of the folder are not the "
-    "record's: delete those yourself."
+    "Exports, files written elsewhere with --out, and backups of the folder are not part of the "
+    "record. Delete them yourself."
   )
   parser.add_argument("name", metavar="NAME", help="of the person")
   keeping.add_record(parser)
-  parser.add_argument("--yes", action="store_true", help="do it; else it is said what would go")
+  parser.add_argument("--yes", action="store_true", help="delete; else only say what would go")
 
 
 def main(args: argparse.Namespace) -> int:

@@ -29,8 +29,8 @@ _PLAIN = ("ended", "session", "performer", "task", "seed", "outcome", "seconds",
 def add_arguments(parser: argparse.ArgumentParser):
   """Declares the options."""
   parser.epilog = (
-    "trainee.json has everything that the record says; episodes.csv has a row for each episode, "
-    "metrics in SI units; recordings are files of `palpate report` and `palpate exercise --replay`."
+    "trainee.json contains the whole record; episodes.csv has a row for each episode, "
+    "metrics in SI units. `palpate report` and `palpate exercise --replay` read the recordings."
   )
   add = parser.add_argument
   add("name", metavar="NAME", help="of the person")

@@ -8,6 +8,7 @@ import dataclasses
 import pathlib
 import sys
 import tempfile
+import time
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -24,7 +25,7 @@ FOLDER = "out/record"  # where a record is unless a command is told otherwise
 
 def add_record(parser: argparse.ArgumentParser):
   """Declares the option that says where the record is."""
-  text = f"where trainees and what they did are kept ({FOLDER})"
+  text = f"folder of the trainees and their recordings ({FOLDER})"
   parser.add_argument("--record", metavar="FOLDER", help=text)
 
 
@@ -32,7 +33,7 @@ def add_references(parser: argparse.ArgumentParser):
   """Declares the option that says what is scored against."""
   parser.add_argument(
     "--references", metavar="FILE",
-    help="references of scores and limits, of `palpate trainee limits` or `palpate panel` (those "
+    help="references of scores and limits, from `palpate trainee limits` or `palpate panel` (those "
     "that ship)",
   )  # fmt: skip
 
@@ -40,9 +41,9 @@ def add_references(parser: argparse.ArgumentParser):
 def add_arguments(parser: argparse.ArgumentParser):
   """Declares the options of a command whose exercises are kept."""
   add = parser.add_argument
-  add("--trainee", metavar="NAME", help="who does it: it is kept in the record")
+  add("--trainee", metavar="NAME", help="name of the trainee; the recording goes to the record")
   add_record(parser)
-  add("--any-task", action="store_true", help="also exercises that are not open to the trainee")
+  add("--any-task", action="store_true", help="allow exercises that are not open to the trainee")
   add_references(parser)
 
 
@@ -88,7 +89,7 @@ class Kept:
 
   Attributes:
     path: where it is, None where it could not be kept anywhere
-    fault: why it is not in the record; empty where it is
+    fault: why it is not where it belongs; empty if it is
     said: what it means for the person, in sentences
   """
 
@@ -144,11 +145,11 @@ class Keeping:
     """Returns whether what a person did goes to a record; a trainee does everything."""
     return self.folder is not None and bool(self.trainee or person)
 
-  def begin(self) -> Sitting:
-    """Returns a use of the program, which is a session of the record."""
+  def begin(self, folder: pathlib.Path | None = None) -> Sitting:
+    """Returns a use of the program, a session of the record; `folder` takes what nobody did."""
     from .record import Session
 
-    return Sitting(self, Session(), references(self.references))
+    return Sitting(self, Session(), references(self.references), folder or pathlib.Path("out"))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -159,41 +160,62 @@ class Sitting:
     keeping: where
     session: of the record
     references: what finds the references of tasks
+    folder: of recordings that go to no record
   """
 
   keeping: Keeping
   session: Session
   references: Lookup
+  folder: pathlib.Path
 
-  def keep(self, recording: Recording, person: str = "") -> Kept:
-    """Keeps a recording, in the record or, where that cannot be, among the temporary files.
+  def keep(self, recording: Recording, before: Kept | None = None) -> Kept:
+    """Keeps a recording, or else puts it among the temporary files.
 
-    What is said tells of the person's other exercises, and only where there is a `trainee`: who
-    gives a name on a page learns nothing about whom it belongs to.
+    It goes to the record if there is a trainee, or if its `info` has a `person`, who is added if
+    new; otherwise to the folder. Only a trainee is told of the other exercises: a person who gives
+    a name on a page learns nothing about its owner.
 
     Args:
       recording: of an exercise that ended
-      person: who did it, where there is no `trainee`; added to the record if new
+      before: result of a call that failed; its temporary file stays the only one
     """
-    from .record import Record, RecordError
+    from palpate.tasks.files import free
 
-    folder, trainee = self.keeping.folder, self.keeping.trainee
-    assert folder is not None, "there is no record"
+    person = str(recording.info.get("person", ""))
+    known = self.keeping.knows(person)
+    folder = (known and self.keeping.folder) or self.folder
+    task = str(recording.info.get("task", "exercise")).replace("/", "_")
+    name = f"{time.strftime('%Y%m%d-%H%M%S')}_{task}"
     try:
-      with Record(folder, self.references) as record:
-        who = record.find(trainee) if trainee else record.add(person)
-        episode = record.keep(who, recording, self.session, self.references)
-        judged = self.references(episode.task) is not None
-        said = _progress(record.episodes(who), episode.task, judged) if trainee else ()
-        tell(record)
-        return Kept(record.path(episode), "", said)
-    except (RecordError, ValueError) as error:
-      fault = f"not kept in {folder}: {error}"
+      if known:
+        return self._record(folder, recording, person)
+      folder.mkdir(parents=True, exist_ok=True)
+      return Kept(recording.save(free(folder, name, ".npz")))
+    except (RuntimeError, ValueError, OSError) as error:  # RecordError is a RuntimeError
+      fault = f"not kept in {folder}: {_why(error)}"
+    if before is not None and before.path is not None:
+      return Kept(before.path, fault)
     try:
-      spare = pathlib.Path(tempfile.mkdtemp(prefix="palpate-")) / "recording.npz"
-      return Kept(recording.save(spare), fault)
+      spare = pathlib.Path(tempfile.mkdtemp(prefix="palpate-"))
+      return Kept(recording.save(spare / f"{name}.npz"), fault)
     except OSError as error:
-      return Kept(None, f"{fault}; nor among the temporary files: {error.strerror or error}")
+      return Kept(None, f"{fault}; nor among the temporary files: {_why(error)}")
+
+  def _record(self, folder: pathlib.Path, recording: Recording, person: str) -> Kept:
+    from .record import Record
+
+    trainee = self.keeping.trainee
+    with Record(folder, self.references) as record:
+      who = record.find(trainee) if trainee else record.add(person)
+      episode = record.keep(who, recording, self.session, self.references)
+      judged = self.references(episode.task) is not None
+      said = _progress(record.episodes(who), episode.task, judged) if trainee else ()
+      tell(record)
+      return Kept(record.path(episode), "", said)
+
+
+def _why(error: Exception) -> str:
+  return getattr(error, "strerror", None) or str(error)
 
 
 def read(args: argparse.Namespace, task: str = "", pages: bool = False) -> Keeping | None:

@@ -17,11 +17,11 @@ from . import keeping
 def add_arguments(parser: argparse.ArgumentParser):
   """Declares the options."""
   parser.epilog = (
-    "A file of references is what --references of exercise, evaluate, serve, report and trainee "
-    "show take. Limits come of successes; for other exercises the references that ship are used."
+    "The option --references of exercise, evaluate, serve, report and trainee show takes the file. "
+    "Limits are made from successes. Other exercises use the references that ship."
   )
   add = parser.add_argument
-  add("recordings", metavar="FILE", nargs="*", help="recordings, .npz; and those of the record:")
+  add("recordings", metavar="FILE", nargs="*", help="recordings, .npz, beside those of --trainee")
   add("--trainee", metavar="NAME", action="append", default=[], help="an expert; may be repeated")
   keeping.add_record(parser)
   add(
@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser):
     help="panel: as the references that ship, 95 %% of the experts pass limits made of the others; "
     "sd:K: mean and K SDs; percentile:P (%(default)s)",
   )  # fmt: skip
-  add("-o", "--out", metavar="FILE", required=True, help="where the references go, .json")
+  add("-o", "--out", metavar="FILE", required=True, help="file of the references, .json")
 
 
 def main(args: argparse.Namespace) -> int:

@@ -264,7 +264,7 @@ class Record(contextlib.AbstractContextManager):
       performer=str(info.get("performer", "")),
       ended=str(kept.get("ended", person.added)),
       task=str(info.get("task", "")),
-      seed=_seed(info),
+      seed=info["seed"] if type(info.get("seed")) is int else None,
       seconds=float(kept["seconds"]),
       hints=int(kept["hints"]),
       versions={k: str(info[k]) for k in ("palpate", "mujoco") if k in info},
@@ -323,11 +323,6 @@ def _facts(recording: Recording, references: Lookup) -> dict[str, Any]:
     "metrics": {k: v if math.isfinite(v) else None for k, v in metrics.values().items()},
     "unknown": metrics.reasons(),
   }
-
-
-def _seed(info: dict[str, Any]) -> int | None:
-  seed = info.get("seed")
-  return seed if type(seed) is int else None
 
 
 @contextlib.contextmanager

@@ -20,12 +20,12 @@ def add_arguments(parser: argparse.ArgumentParser):
   add = parser.add_argument
   add("name", metavar="NAME", help="of the person")
   keeping.add_record(parser)
-  add("--task", metavar="TASK", action="append", default=[], help="this one alone; may be repeated")
+  add("--task", metavar="TASK", action="append", default=[], help="only this task; may be repeated")
   add(
     "--metric", metavar="METRIC", action="append", default=[],
-    help="to draw, such as peak_force; may be repeated (time, path_length, peak_force)",
+    help="metric to draw, such as peak_force; may be repeated (time, path_length, peak_force)",
   )  # fmt: skip
-  add("--assessments", action="store_true", help="without the attempts that had a coach")
+  add("--assessments", action="store_true", help="leave out attempts with a coach")
   keeping.add_references(parser)
   add("-o", "--out", metavar="FILE", help="page to write, .html, or the plots of a task, .png")
 

@@ -94,7 +94,8 @@ def test_advice_names_what_is_over_its_limit_and_what_helps():
   stopped = dataclasses.replace(made, info={**made.info, "outcome": "damage"})
   assert "Failed: a force above" in advice(stopped, reference("touch/easy"))[0]
   rows = {row["label"]: row["value"] for row in card(stopped, strict)["rows"]}
-  assert "Path length" not in rows and "Peak force" in rows  # a way that ends early is short
+  assert "Path length" not in rows and "Peak force" in rows  # what ends early is short
+  assert "Time to completion" not in rows
   assert "Path length" not in "".join(advice(stopped, strict))
 
 

@@ -88,11 +88,11 @@ def test_a_page_offers_what_is_open_to_its_trainee(folder):
 
 def test_references_need_no_record(page, tmp_path):
   reference = limits.lookup()("touch/easy")
-  lax = reference | {"metrics": {"time": reference["metrics"]["time"] | {"limit": 1e-9}}}
-  (tmp_path / "own.json").write_text(limits.to_json({"touch/easy": lax}))
+  strict = {"metrics": {"errors": reference["metrics"]["errors"] | {"limit": -1.0}}}
+  (tmp_path / "own.json").write_text(limits.to_json({"touch/easy": reference | strict}))
   card = do(page(keeping.Keeping(None, references=str(tmp_path / "own.json"))), task="touch/easy")
   assert pathlib.Path(card["path"]).parent == tmp_path / "live"
-  assert [row["label"] for row in card["rows"] if row["over"]] == ["Time to completion"]
+  assert [row["label"] for row in card["rows"] if row["over"]] == ["Errors"]
 
 
 def test_a_name_on_a_page_is_kept_apart_and_nothing_is_told(page, folder, tmp_path):

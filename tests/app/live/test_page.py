@@ -233,6 +233,7 @@ def test_free_practice_on_the_page(pages):
   page.click("#tab-practice")
   page.select_option("#mesh", "16 x 16")
   pages.start()
+  page.get_by_text("Speed of the simulation").click()
   for name in ("force", "way", "rate"):
     assert page.is_visible(f"#plot-{name}")
   pages.until("window.palpate().head.time > 0.5", "no time")
@@ -293,7 +294,7 @@ def test_keys_gamepad_and_buttons_move_the_tip(pages):
 @pytest.mark.slow
 def test_a_program_that_ends_is_named_and_found_again(pages):
   pages.close()
-  said = "document.getElementById('fault').textContent.includes('not to be reached')"
+  said = "document.getElementById('fault').textContent.includes('No connection')"
   pages.until(said, "nothing said")
   assert not pages.page.is_enabled("#start")
   pages.serve(pages.server.port)

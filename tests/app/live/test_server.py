@@ -141,6 +141,7 @@ def test_a_session_over_the_socket(serve, tmp_path):
   with socket(server) as page:
     menu, _ = hear(page, "menu")
     assert menu["tasks"]["touch/easy"] and 1000 in menu["nodes"]
+    assert next(iter(menu["tasks"])) == "touch/easy"  # what a beginner begins with
     with socket(server) as other:
       assert "all places are taken" in json.loads(other.recv(timeout=ANSWER))["text"]
     for words, said in (

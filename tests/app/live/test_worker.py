@@ -15,6 +15,7 @@ import pytest
 from palpate.app.live.page.picture import HEAD, Camera
 from palpate.app.live.page.worker import Worker
 from palpate.app.live.realtime_clock import Pace
+from palpate.tasks.core.instrument import Instrument
 from palpate.tasks.recording import Recording
 
 ANSWER = 120.0  # that a busy machine may take [s]
@@ -200,6 +201,27 @@ def test_a_frame_has_the_largest_force_since_the_last():
     camera.feel(0.1)
     forces.append(np.frombuffer(camera.frame(link, pace), np.float32)[HEAD.index("force")])
   np.testing.assert_allclose(forces, [0.9, 0.1], atol=1e-6)
+
+
+def test_the_plot_has_the_force_of_every_control_step(page, monkeypatch):
+  """As warnings have: a force that lasts for one control step falls between two frames."""
+  keep, steps = Instrument.keep, []
+
+  def spiked(self, values):
+    keep(self, values)
+    steps.append(0)
+    self.peak_force = 0.1 + 1e-3 * len(steps) if len(steps) % 10 == 0 else 0.0
+
+  monkeypatch.setattr(Instrument, "keep", spiked)
+  one = page()
+  exercise(one)
+  begun, felt = len(steps), []
+  while len(steps) < begun + 210:
+    felt.append(one.value("force"))
+  finish(one)
+  spikes = [0.1 + 1e-3 * k for k in range(-(-begun // 10) * 10 + 10, begun + 200, 10)]
+  seen = sum(any(abs(force - spike) < 1e-5 for force in felt) for spike in spikes)
+  assert seen >= 0.9 * len(spikes)  # frames of a busy machine may be far apart
 
 
 def test_a_full_disk_loses_nothing(page, tmp_path, monkeypatch):

@@ -55,6 +55,7 @@ GPU = {
   "from": {16: 0.023, 64: 0.063, 128: 0.391},
   "step": {16: 0.57, 64: 0.703, 128: 1.20},
 }
+HEADLINE = 6.5  # times, of the implicit scheme on the GPU over `explicit` on the CPU
 CPU = {
   "broad": {16: 0.001, 64: 0.001, 128: 0.002},
   "narrow": {16: 0.003, 64: 0.003, 128: 0.003},
@@ -289,8 +290,13 @@ def _traces(rows: list[Row], out: pathlib.Path) -> pathlib.Path:
   return plots.save(figure, out / "thesis_trace.png", about)
 
 
-def summarize(rows: list[Row]) -> list[str]:
-  """Returns the page: each table of the thesis with today's figures beside it."""
+def summarize(rows: list[Row], conditions: str = "") -> list[str]:
+  """Returns the page: each table of the thesis with today's figures beside it.
+
+  Args:
+    rows: of all devices
+    conditions: what else ran on the machine, see `conditions`
+  """
   rates = {(r["scheme"], r["device"], r["side"]): r for r in _stable(rows)}
   traces = [r for r in rows if r["kind"] == "trace"]
   lines = [
@@ -300,11 +306,14 @@ def summarize(rows: list[Row]) -> list[str]:
     "A haptic cycle is a whole `mj_step` with a window under the tool, which a hand presses 8 mm "
     "into an organ of 1.2 kg through a virtual coupling. Means of 10,000 cycles (1000 at 256 x "
     f"256) and of {REPLAYS} replays of a part, +- their standard deviation; on the CPU of the "
-    "thread's own time. A run that diverges has no figures (`-`). "
+    "thread's own time. A run that diverged is marked and has no figures. "
     "[thesis_cpu.csv](thesis_cpu.csv), [thesis_cuda.csv](thesis_cuda.csv).",
+    *(["", conditions] if conditions else []),
     "",
-    *_tables(rates),
+    *_tables(rates, {(r["scheme"], r["device"], r["side"]) for r in rows if r["diverged"]}),
+    *_headline(rates),
     *_speedup(rates),
+    *_beside_loop(rates),
   ]
   held = [r for r in traces if 300 <= r["cycle"] < 500 and not r["diverged"]]
   gone = sum(abs(r["force_N"]) < 1e-3 for r in held)
@@ -328,21 +337,22 @@ def summarize(rows: list[Row]) -> list[str]:
   ]
 
 
-def _tables(rates: dict[tuple, Row]) -> list[str]:
-  """Returns the tables 7.1 to 7.4."""
-  sides = sorted({key[2] for key in rates})
+def _tables(rates: dict[tuple, Row], diverged: set[tuple]) -> list[str]:
+  """Returns the tables 7.1 to 7.4; `diverged` has the runs without figures."""
+  sides = sorted({key[2] for key in [*rates, *diverged]})
   devices = [device for device in ("cuda", "cpu") if any(k[1] == device for k in rates)]
 
-  def cell(row: Row | None, key: str, spread: str, then: float | None) -> str:
+  def cell(run: tuple, key: str, spread: str, then: float | None) -> str:
+    row = rates.get(run)
     if row is None:
-      return "-"
+      return "diverged" if run in diverged else "-"
     sd = f" +- {row[spread]:.1g}" if row.get(spread, "") != "" else ""
     return f"{row[key]:.3g}{sd}" + (f" ({then:g})" if then else "")
 
   def table(title: str, lines: list[tuple]) -> list[str]:
     filled = [
       [scheme, device, *name, *(
-        cell(rates.get((scheme, device, side)), key, spread, then.get(side)) for side in sides)]
+        cell((scheme, device, side), key, spread, then.get(side)) for side in sides)]
       for scheme, device, name, key, spread, then in lines
     ]  # fmt: skip
     names = ["part"] if lines and lines[0][2] else []
@@ -394,17 +404,85 @@ def _speedup(rates: dict[tuple, Row]) -> list[str]:
   return out
 
 
+def _headline(rates: dict[tuple, Row]) -> list[str]:
+  """Returns the thesis's headline, the implicit scheme on the GPU over `explicit` on the CPU."""
+  side, slow = 128, ("explicit", "cpu", 128)
+  fast = [("neumann", "cuda", side), ("implicit", "cuda", side)]
+  if not {slow, *fast} <= set(rates):
+    return []
+
+  def ratio(key: str, sign: int) -> str:
+    each = ((rates[run][key] / rates[slow][key]) ** sign for run in fast)
+    return " and ".join(f"{r:.2g} (`{run[0]}`)" for r, run in zip(each, fast, strict=True))
+
+  then = INTEGRATION["explicit", "cpu"][side] / INTEGRATION["neumann", "cuda"][side]
+  rate = RATE["neumann", "cuda"][side] / RATE["explicit", "cpu"][side]
+  return [
+    "## The thesis's headline", "",
+    f"The thesis compares its implicit scheme on the GPU with `explicit` on the CPU and reports up "
+    f"to {HEADLINE} times the speed at {side} x {side}. Its table 7.2 gives {then:.1f} times for "
+    f"the integration and its table 7.1 {rate:.1f} times for the haptic rate. Today the "
+    f"integration is {ratio('step_ms', -1)} times as fast, and the haptic rate "
+    f"{ratio('rate_hz', 1)} times as high.",
+    "",
+  ]  # fmt: skip
+
+
+def _beside_loop(rates: dict[tuple, Row]) -> list[str]:
+  """Returns why a step takes longer here than in `loop.md` at the same size."""
+  path, run = results.FOLDER / "loop_cuda.csv", ("implicit", "cuda", 128)
+  if run not in rates or not path.exists():
+    return []
+  mine = rates[run]
+  side = scene.window_side(scene.shape("octa", mine["side"] ** 2))
+  other = next(r for r in results.read(path) if r["nodes"] == mine["nodes"] and r["condim"] == 3)
+  return [
+    "",
+    f"At {mine['nodes']} nodes [loop](loop.md) steps at {other['rate_Hz']:.0f} Hz and this page at "
+    f"{mine['rate_hz']:.0f}. The motion stays on the device in both, and the device is not what "
+    f"differs: the integration here takes {mine['step_ms']:.2g} of {mine['cycle_ms']:.2g} ms, in "
+    f"{mine['iterations']:.2g} iterations for {other['iterations']:.2g} there. MuJoCo's contacts "
+    f"differ. Here a tip of {1e3 * TIP:g} mm is {1e3 * DEPTH:g} mm deep in springs, with "
+    f"{mine['contacts']} contacts at most, of {side * side} slots; there a tip of "
+    f"{1e3 * other['tip_m']:g} mm is 1.5 mm deep in a shell, with {other['contacts']} "
+    f"contacts, of {other['slots']} slots. This page gives the mean over whole presses, that one "
+    "the median of steps in contact.",
+  ]
+
+
+def conditions(out: pathlib.Path) -> str:
+  """Returns how many runs shared the machine; a single one had its card and cores to itself."""
+  words = []
+  for device in ("cuda", "cpu"):
+    about = results.notes(out / f"thesis_{device}.csv")
+    jobs = about.get("jobs") or 1
+    if about and jobs > 1:
+      where = f"{about['cores']} cores" + (" and one card" if device == "cuda" else "")
+      words.append(f"`{device}`: {jobs} runs at a time shared {where}, so that a run alone may be "
+                   "faster")  # fmt: skip
+    elif about:
+      words.append(f"`{device}`: one run at a time, the bench's only one on its card and cores")
+  return f"Measured on {'; '.join(words)}." if words else ""
+
+
 def finding(rows: list[Row]) -> list[str]:
-  """Returns what the page begins with."""
-  lines = []
-  for (scheme, device), then in RATE.items():
-    mine = [r for r in _stable(rows) if (r["scheme"], r["device"]) == (scheme, device)]
-    found = {r["side"]: r["rate_hz"] for r in mine if r["side"] in then}
-    if found:
-      side = max(found)
-      lines.append(f"`{scheme}` on {device}, {side} x {side}: {found[side]:.0f} haptic cycles a "
-                   f"second, {found[side] / then[side]:.2g} times the thesis's "
-                   f"{then[side]}.")  # fmt: skip
+  """Returns what the page begins with: the thesis's headline, and the rates on each device."""
+  stable, lines = {(r["scheme"], r["device"], r["side"]): r for r in _stable(rows)}, []
+  slow, fast = (stable.get((*which, 128)) for which in (("explicit", "cpu"), ("neumann", "cuda")))
+  if slow and fast:
+    lines.append(f"Implicit on the GPU over `explicit` on the CPU, 128 x 128: {HEADLINE} times in "
+                 f"the thesis; today {slow['step_ms'] / fast['step_ms']:.0f} times in the "
+                 f"integration and {fast['rate_hz'] / slow['rate_hz']:.1f} times in the whole "
+                 "haptic cycle.")  # fmt: skip
+  for device in ("cuda", "cpu"):
+    found = []
+    for which, then in RATE.items():
+      if which[1] == device and (sides := [s for s in then if (*which, s) in stable]):
+        side = max(sides)
+        rate = stable[*which, side]["rate_hz"]
+        found.append(f"{rate:.0f} Hz with `{which[0]}` at {side} x {side}, {rate / then[side]:.2g} "
+                     f"times the thesis's {then[side]}")  # fmt: skip
+    lines += [f"Haptic cycles on {device}: {'; '.join(found)}."] if found else []
   return lines
 
 
@@ -414,7 +492,7 @@ def report(rows: list[Row], about: dict, out: pathlib.Path) -> list[pathlib.Path
           if r["status"] == "ok"]  # fmt: skip
   drawn = draw(rows, out)
   page = results.page(out / "thesis.md", "The tables of the thesis, measured today", about,
-                      summarize(rows), finding(rows), drawn[0])  # fmt: skip
+                      summarize(rows, conditions(out)), finding(rows), drawn[0])  # fmt: skip
   return [*drawn, page]
 
 

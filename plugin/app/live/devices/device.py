@@ -5,11 +5,13 @@ Axes of a device: x to the right, y up, z towards the person, as the laparoscope
 
 from __future__ import annotations
 
+import importlib
 import math
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 Three = tuple[float, float, float]
 Four = tuple[float, float, float, float]
+STILL: Three = (0.0, 0.0, 0.0)
 
 
 class DeviceError(RuntimeError):
@@ -107,6 +109,14 @@ class Silent:
     """Does nothing."""
 
 
+def library(module: str, extra: str, also: str = "") -> Any:
+  """Returns a package that only some devices need; DeviceError says what to install."""
+  try:
+    return importlib.import_module(module)
+  except (ImportError, OSError, AttributeError) as error:
+    raise DeviceError(f"{extra}: {error}; pip install 'palpate[{extra}]'{also}") from error
+
+
 FASTEST = 3.0  # a hand's speed; what is faster is a jump [m/s]
 _STEP = 0.01  # which no reading need explain [m]
 
@@ -131,7 +141,8 @@ class Guard:
     pos, quat, roll, jaw, _ = reading
     numbers = pos[0] + pos[1] + pos[2] + roll + sum(quat or ()) + (jaw or 0.0)
     if not math.isfinite(numbers) or (quat and sum(q * q for q in quat) < 1e-6):
-      self.last = f"{self._device.name}: pose is {_text(reading)}, expected finite numbers"
+      pose = f"{pos} {quat or ''}".strip()
+      self.last = f"{self._device.name}: pose is {pose}, expected finite numbers"
       return "bad"
     before, self._before = self._before, pos
     span, self._time = now - self._time, now
@@ -142,7 +153,3 @@ class Guard:
       return "good"
     self.last = f"{self._device.name}: jumped {1e3 * moved:.0f} mm in {1e3 * span:.0f} ms"
     return "jump"
-
-
-def _text(reading: Reading) -> str:
-  return f"{reading.pos}" if reading.quat is None else f"{reading.pos} {reading.quat}"

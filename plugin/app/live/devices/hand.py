@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from .device import DeviceError, Four, Reading, Silent, Three
-
-STILL: Three = (0.0, 0.0, 0.0)
+from .device import STILL, DeviceError, Four, Reading, Silent, Three
 
 
 class Hand(Silent):

@@ -7,7 +7,6 @@ thread of its own, and lets go by itself when the loop says nothing for 50 ms.
 from __future__ import annotations
 
 import ctypes
-import importlib
 import math
 import threading
 import time
@@ -16,22 +15,29 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from .device import DeviceError, Four, Reading, Silent, Three
+from .device import STILL, DeviceError, Four, Reading, Silent, Three, library
 
-STILL: Three = (0.0, 0.0, 0.0)
 _WATCHDOG = 0.05  # [s]
 
 
 class Servo(Silent):
-  """What they share: the last reading, the last force, and a watchdog between them."""
+  """What they share: the library, the last reading and force, and a watchdog between them."""
 
   relative = False
+  module = ""  # of the maker's library
 
-  def __init__(self):
-    """Starts without force."""
+  def __init__(self, index: int = 0):
+    """Opens the device with a number."""
+    self._library: Any = library(self.module, self.name, ", and the maker's SDK")
+    self._index, self._error = index, ""
     self._reading: Reading | None = None
     self._wrench, self._sent = (STILL, STILL), -math.inf
-    self._error = ""
+    if not self.reopen():
+      raise DeviceError(f"{self.name}: {self.missing()}")
+
+  def missing(self) -> str:
+    """Returns why the device could not be opened."""
+    return f"no device {self._index} was found"
 
   def read(self, now: float) -> Reading | None:
     """Returns the last reading, once."""
@@ -78,31 +84,27 @@ class ForceDimension(Servo):
   """Omega, delta, sigma and lambda by forcedimension-core; needs the Force Dimension SDK."""
 
   name = "forcedimension"
-  rate = 1000.0
+  module = "forcedimension_core.dhd"
   force_limit = 12.0
   torque_limit = 0.4
 
-  def __init__(self, index: int = 0):
-    """Opens the device with a number."""
-    super().__init__()
-    self._dhd: Any = library("forcedimension_core.dhd", self.name)
-    self._index = index
-    if not self.reopen():
-      raise DeviceError(f"{self.name}: no device {index}: {self._dhd.errorGetLastStr()}")
+  def missing(self) -> str:
+    """See `Servo`."""
+    return f"no device {self._index}: {self._library.errorGetLastStr()}"
 
   def reopen(self) -> bool:
     """Opens it again."""
-    self._id = self._dhd.openID(self._index)
+    self._id = self._library.openID(self._index)
     if self._id < 0:
       return False
-    self._dhd.enableForce(True, self._id)
+    self._library.enableForce(True, self._id)
     self._frame = [[0.0] * 3 for _ in range(3)]
     self.start()
     return True
 
   def exchange(self, force: Three, torque: Three) -> Reading:
     """Its axes: x towards the person, y to the right, z up."""
-    dhd, pos, frame = self._dhd, [0.0] * 3, self._frame
+    dhd, pos, frame = self._library, [0.0] * 3, self._frame
     (x, y, z), (a, b, c) = force, torque
     if dhd.setForceAndTorque([z, x, y], [c, a, b], self._id) < 0:
       raise OSError(dhd.errorGetLastStr())
@@ -119,24 +121,20 @@ class ForceDimension(Servo):
   def close(self) -> None:
     """Stops it."""
     self.stop()
-    self._dhd.stop(self._id)
-    self._dhd.close(self._id)
+    self._library.stop(self._id)
+    self._library.close(self._id)
 
 
 class Haply(Servo):
   """Inverse3 by haplyhardwareapi: a place and a force, no orientation."""
 
   name = "haply"
-  rate = 1000.0
+  module = "HaplyHardwareAPI"
   force_limit = 8.0
 
-  def __init__(self, index: int = 0):
-    """Opens the device with a number."""
-    super().__init__()
-    self._library: Any = library("HaplyHardwareAPI", self.name)
-    self._index = index
-    if not self.reopen():
-      raise DeviceError(f"{self.name}: no Inverse3 with number {index} was found")
+  def missing(self) -> str:
+    """See `Servo`."""
+    return f"no Inverse3 with number {self._index} was found"
 
   def reopen(self) -> bool:
     """Opens it again."""
@@ -164,22 +162,14 @@ class OpenHaptics(Servo):
   """Touch and Touch X by pyOpenHaptics; needs 3D Systems' OpenHaptics and driver."""
 
   name = "openhaptics"
-  rate = 1000.0
+  module = "pyOpenHaptics.hd"
   force_limit = 3.3
 
-  def __init__(self):
-    """Opens the default device."""
-    super().__init__()
-    self._hd: Any = library("pyOpenHaptics.hd", self.name)
-    self._callback: Any = library("pyOpenHaptics.hd_callback", self.name).hd_callback
-    self._maker: Any = library("pyOpenHaptics.hd_device", self.name).HapticDevice
-    if not self.reopen():
-      raise DeviceError(f"{self.name}: the device could not be initialized")
-
   def reopen(self) -> bool:
-    """Opens it again; its scheduler calls `exchange`."""
-    self._scheduled = self._callback(self._serve)  # must live as long as the scheduler
-    self._device = self._maker(self._scheduled)
+    """Opens the default device; its scheduler calls `exchange`."""
+    callback = library("pyOpenHaptics.hd_callback", self.name).hd_callback
+    self._scheduled = callback(self._serve)  # must live as long as the scheduler
+    self._device = library("pyOpenHaptics.hd_device", self.name).HapticDevice(self._scheduled)
     return self._device.id is not None
 
   def _serve(self) -> None:
@@ -190,11 +180,11 @@ class OpenHaptics(Servo):
 
   def exchange(self, force: Three, torque: Three) -> Reading:
     """Its axes are those of every device; its lengths are in mm, its matrix in columns."""
-    self._hd.set_force(list(force))
-    columns = self._hd.get_transform()
+    self._library.set_force(list(force))
+    columns = self._library.get_transform()
     mat = [[columns[j][i] for j in range(3)] for i in range(3)]
     x, y, z = (1e-3 * columns[3][i] for i in range(3))
-    bits = self._hd.get_buttons()
+    bits = self._library.get_buttons()
     held = frozenset(name for i, name in enumerate(("clutch", "grip")) if bits >> i & 1)
     return Reading((x, y, z), quaternion(mat), buttons=held)
 
@@ -210,13 +200,3 @@ def quaternion(mat: list[list[float]]) -> Four:
   mujoco.mju_mat2Quat(quat, np.ravel(mat))
   w, x, y, z = quat.tolist()
   return (w, x, y, z)
-
-
-def library(module: str, extra: str) -> Any:
-  """Returns a maker's library; DeviceError says what is missing."""
-  try:
-    return importlib.import_module(module)
-  except (ImportError, OSError, AttributeError) as error:
-    raise DeviceError(
-      f"{extra}: {error}; pip install 'palpate[{extra}]', and the maker's SDK"
-    ) from error

@@ -7,7 +7,7 @@ import threading
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from .device import DeviceError, Reading, Silent
+from .device import DeviceError, Reading, Silent, library
 
 SPEED, ROLL = 0.06, 2.0  # of the hand at full deflection [m/s], about the shaft [rad/s]
 BUTTONS = frozenset({"clutch", "grip", "report", "pause"})
@@ -120,7 +120,8 @@ class Gamepad(Hardware):
     """Opens the gamepad with a number."""
     super().__init__("gamepad")
     self._index = index
-    self._pygame: Any = _need("pygame", "gamepad")
+    self._pygame: Any = library("pygame", "gamepad")
+    self._pygame.init()
     if not self.reopen():
       found = self._pygame.joystick.get_count()
       raise DeviceError(f"gamepad {index}: there is none; {found} found")
@@ -162,7 +163,7 @@ class SpaceMouse(Hardware):
   def __init__(self):
     """Opens the first one."""
     super().__init__("spacemouse")
-    self._library: Any = _need("pyspacemouse", "spacemouse")
+    self._library: Any = library("pyspacemouse", "spacemouse")
     self._mouse: Any = None
     if not self.reopen():
       raise DeviceError("spacemouse: none was found")
@@ -190,16 +191,3 @@ class SpaceMouse(Hardware):
     """Lets go of it."""
     if self._mouse is not None:
       self._mouse.close()
-
-
-def _need(module: str, extra: str) -> Any:
-  """Returns a module that not everybody has; DeviceError says what to install."""
-  import importlib
-
-  try:
-    found = importlib.import_module(module)
-  except (ImportError, OSError) as error:
-    raise DeviceError(f"{extra}: {error}; pip install 'palpate[{extra}]'") from error
-  if module == "pygame":
-    found.init()
-  return found

@@ -21,7 +21,7 @@ export function show(card, {advice, composite, proficient, rows, path, fault}, a
     button.onclick = () => act(button);
     buttons.append(button);
   }
-  const score = composite === null ? "No score" : `Score ${composite}`;
+  const score = composite === null ? "No score" : `Score ${composite}`.replace("-", "\u2212");
   card.replaceChildren(
     make("h2", proficient ? `${score}, proficient` : score, proficient ? "good" : ""), make("p", ending),
     ...rest.map(text => make("p", text)), table, kept(path, fault), buttons,

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from typing import Any
 
+from palpate.tissue import step
+
 from ...trainee.keeping import Keeping
 from ...trainee.record import check_name
 
 NODES = (250, 500, 1000, 2000, 4000)  # of an exercise
 SPEEDS = (0.1, 0.25, 0.5, 1.0)
-SCHEMES = ("implicit", "midpoint", "neumann", "explicit")
+SCHEMES = tuple(step.SCHEMES)
 STEPS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0)  # [ms]
-BLUNT = ("scissors", "hook", "scalpel")  # in free practice, where organs have no room for cuts
+BLUNT = ("scissors", "hook", "scalpel")  # in free practice, whose organs have no spare vertices
 OTHER = ("", "keyboard", "pad")  # what a page can have for the left hand; none by default
 
 
@@ -27,7 +29,7 @@ def offer(device: str, kept: Keeping | None = None) -> dict[str, Any]:
 
   return {
     "type": "menu",
-    "tasks": {f"{d}/{t}": suite.summary(d, t) for d, t in suite.ALL_TASKS},
+    "tasks": {name: suite.summary(*suite.split(name)) for name in _order()},
     "trainee": kept.trainee if kept else "",
     "locked": kept.locked() if kept else {},
     "two": ["/".join(pair) for pair in suite.BIMANUAL],
@@ -43,6 +45,14 @@ def offer(device: str, kept: Keeping | None = None) -> dict[str, Any]:
     "instruments": models.INSTRUMENTS,
     "blunt": BLUNT,
   }
+
+
+def _order() -> list[str]:
+  """Returns the exercises by name, those of the curriculum first and in its order."""
+  from palpate.tasks import suite
+  from palpate.tasks.people import curriculum
+
+  return list(dict.fromkeys([*curriculum.AFTER, *map("/".join, suite.ALL_TASKS)]))
 
 
 def devices(device: str) -> tuple[str, ...]:

@@ -47,7 +47,7 @@ function connect() {
   socket.onclose = () => {
     run(false);
     $("start").disabled = true;
-    if (!trouble) tell("The program is not to be reached; what was recorded is kept. Trying again");
+    if (!trouble) tell("No connection to the program. Recordings are kept. Connecting again");
     setTimeout(connect, AGAIN);
   };
 }
@@ -71,13 +71,13 @@ const HEAR = {
       }));
       return group;
     })));
-    fill("nodes", [["", "the exercise's"], ...menu.nodes.map(n => [n, `${n} nodes`])]);
-    fill("speed", menu.speeds.map(s => [s, s === 1 ? "real time" : `${s} of real time`]).reverse());
-    fill("scale", [1, 0.5, 0.25, 2].map(s => [s, s === 1 ? "as the hand's" : `${s} of the hand's`]));
+    fill("nodes", [["", "default"], ...menu.nodes.map(n => [n, `${n} nodes`])]);
+    fill("speed", menu.speeds.map(s => [s, s === 1 ? "real time" : `${s} \u00d7 real time`]).reverse());
+    fill("scale", [1, 0.5, 0.25, 2].map(s => [s, `${s} : 1`]));
     fill("device", menu.devices.map(name => [name, name === "page" ? "mouse, touch, keys, gamepad" : name]));
-    fill("left", menu.lefts.map(name => [name, {"": "nothing", keyboard: "keys of the page", pad: "gamepad of the page"}[name] ?? name]));
+    fill("left", menu.lefts.map(name => [name, {"": "none", keyboard: "keyboard, on this page", pad: "gamepad, on this page"}[name] ?? name]));
     for (const name of ["organ", "mesh", "scheme", "instrument"]) {
-      fill(name, menu[`${name === "mesh" ? "meshe" : name}s`].map(value => [value, value.replace("_", " ") + (menu.blunt.includes(value) ? " (cuts nothing here)" : "")]));
+      fill(name, menu[`${name === "mesh" ? "meshe" : name}s`].map(value => [value, value.replace("_", " ") + (menu.blunt.includes(value) ? " (does not cut here)" : "")]));
     }
     fill("step", menu.steps.map(value => [value, `${value} ms`]));
     if (!scene) [$("step").value, $("mesh").value] = [1, "1000 nodes"];
@@ -93,7 +93,7 @@ const HEAR = {
   },
   loading({text, note}) {
     tell("");
-    $("instruction").textContent = `${text} is being made ready${note}`;
+    $("instruction").textContent = `Loading ${text}${note}`;
   },
   scene(message) {
     scene = message;
@@ -166,7 +166,7 @@ const practice = () => document.body.dataset.mode === "practice";
 function mode(name) {
   document.body.dataset.mode = name;
   for (const each of ["exercise", "practice"]) $(`tab-${each}`).setAttribute("aria-selected", each === name);
-  $("welcome").textContent = name === "practice" ? "Choose an organ and press Start; everything may be changed while it runs."
+  $("welcome").textContent = name === "practice" ? "Choose an organ and press Start. Every choice may be changed while it runs."
     : "Choose an exercise and press Start.";
   hands();
 }
@@ -303,7 +303,7 @@ function draw() {
     if (ways.length > KEPT) ways.shift();
   }
   // One a picture: ten times a second is enough for curves.
-  [() => plots.force.draw(scene.force_limit), () => plots.way.draw(), () => plots.rate.draw(undefined, 0)][turn++ % 3]();
+  [() => plots.force.draw(scene.force_limit), () => plots.way.draw(undefined, 2, 0.5), () => plots.rate.draw(undefined, 0)][turn++ % 3]();
 }
 requestAnimationFrame(draw);
 
@@ -337,7 +337,7 @@ toggle("ghost", on => {
   if (!on) return;
   say({type: "ghost", known: Boolean(trace)});
   if (trace) trace.since = performance.now();
-  else tell("The expert's way is being worked out; the clock waits");
+  else tell("Computing the expert's path. The clock is stopped");
 });
 for (const name of ["exercise", "practice"]) $(`tab-${name}`).onclick = () => mode(name);
 $("start").onclick = start;

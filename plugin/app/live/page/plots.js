@@ -17,14 +17,15 @@ export class Plot {
     this.values.length = 0;
   }
 
-  draw(limit, digits = 2) {
+  // `least` is what the axis spans at least.
+  draw(limit, digits = 2, least = 1e-3) {
     const {canvas, values} = this, pen = canvas.getContext("2d"), scale = devicePixelRatio || 1;
     const width = canvas.clientWidth, height = canvas.clientHeight;
     if (!width) return;
     if (canvas.width !== Math.round(width * scale)) {
       [canvas.width, canvas.height] = [Math.round(width * scale), Math.round(height * scale)];
     }
-    const most = Math.max(...values, 1.2 * (limit ?? 0), 1e-3);
+    const most = Math.max(...values, 1.2 * (limit ?? 0), least);
     pen.setTransform(scale, 0, 0, scale, 0, 0);
     pen.clearRect(0, 0, width, height);
     const y = value => height - 4 - (height - 18) * value / most;

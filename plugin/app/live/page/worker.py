@@ -18,14 +18,14 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 import palpate
+from palpate.tasks.recording import Recording
 
-from ...trainee.keeping import Keeping, references
+from ...trainee.keeping import Keeping, Kept
 from ..coach import Coach, card
 from ..coupling import Options
 from ..devices import registry
 from ..devices.device import Device, DeviceError
 from ..devices.relative import Desk
-from ..keep import Finished
 from ..practice import DAMAGE, LIMIT, Practice
 from ..realtime_clock import Pace, first
 from ..session import Session
@@ -61,9 +61,8 @@ class Worker:
     self, conn: Connection, folder: pathlib.Path, device: str, kept: Keeping | None = None
   ):
     """Takes the arguments of `main`."""
-    self._kept, self._record = kept, kept.begin() if kept else None
-    self._references = self._record.references if self._record else references(None)
-    self._conn, self._folder, self._own = conn, folder, device
+    self._sitting = (kept or Keeping(None)).begin(folder)
+    self._conn, self._own = conn, device
     self._device = "page" if registry.on_page(device) else device
     self._jobs: queue.SimpleQueue[dict | None] = queue.SimpleQueue()
     self._now: Session | Practice | None = None  # what runs
@@ -73,7 +72,7 @@ class Worker:
     self._frame: bytes | None = None
     self._fresh = threading.Event()
     self._camera: Camera | None = None
-    self._unkept: Finished | None = None
+    self._unkept: tuple[Recording, Kept] | None = None
     self._expert: subprocess.Popen | None = None
     self._ended = False
 
@@ -81,7 +80,7 @@ class Worker:
     """Works until the end."""
     for target in (self._receive, self._show):
       threading.Thread(target=target, daemon=True).start()
-    self._tell(menu.offer(self._own, self._kept))
+    self._tell(menu.offer(self._own, self._sitting.keeping))
     while (job := self._jobs.get()) is not None:
       if not self._jobs.empty():  # something else was asked for since
         continue
@@ -91,8 +90,14 @@ class Worker:
       except (ValueError, TypeError, OSError, DeviceError, RuntimeError) as error:
         self._fault(error)
         self._tell({"type": "idle"})
-    if self._unkept is not None and not self._unkept.keep(self._folder, self._record):
-      print(f"palpate: a recording is lost: {self._unkept.fault}", file=sys.stderr)
+    if self._unkept is not None and (kept := self._keep(*self._unkept)).path is None:
+      print(f"palpate: a recording is lost: {kept.fault}", file=sys.stderr)
+
+  def _keep(self, recording: Recording, before: Kept | None = None) -> Kept:
+    """Keeps a recording, and notes one that is not where it belongs, to try again."""
+    kept = self._sitting.keep(recording, before)
+    self._unkept = (recording, kept) if kept.fault else None
+    return kept
 
   # Words.
 
@@ -167,9 +172,8 @@ class Worker:
 
   def _on_keep(self, message: dict[str, Any]) -> None:
     if self._unkept is not None:
-      done = self._unkept
-      self._unkept = None if done.keep(self._folder, self._record) and not done.fault else done
-      self._tell({"type": "kept", "path": str(done.path or ""), "fault": done.fault})
+      kept = self._keep(*self._unkept)
+      self._tell({"type": "kept", "path": str(kept.path or ""), "fault": kept.fault})
 
   def _on_pause(self, message: dict[str, Any]) -> None:
     if self._now is not None:
@@ -244,8 +248,7 @@ class Worker:
   def _exercise(self, job: dict[str, Any]) -> None:
     from palpate.tasks import suite
 
-    if self._record is not None:
-      self._record.keeping.check(job["task"])
+    self._sitting.keeping.check(job["task"])
     self._tell({"type": "loading", "text": job["task"], "note": ""})
     kwargs = _kwargs(job)
     env = suite.load(*suite.split(job["task"]), task_kwargs={"random": 0, **kwargs})
@@ -255,14 +258,13 @@ class Worker:
         env, device, job["seed"], info, Options(scale=job["scale"]),
         coach=Coach(job["assessment"]), publish=self._draw, other=other,
       )  # fmt: skip
-    recording = self._run(session, job, lambda: session.run(realtime=True))
-    done = Finished(recording)
-    self._unkept = None if done.keep(self._folder, self._record) and not done.fault else done
-    shown = card(recording, self._references(job["task"]))
-    shown["advice"] += done.said
-    self._tell({"type": "card", "path": str(done.path or ""), "fault": done.fault, **shown})
-    if self._kept and self._kept.trainee:  # another exercise may be open now
-      self._tell(menu.offer(self._own, self._kept))
+    recording = self._run(session, job, lambda: session.run(realtime=True, watch=self._feel))
+    kept = self._keep(recording)
+    shown = card(recording, self._sitting.references(job["task"]))
+    shown["advice"] += kept.said
+    self._tell({"type": "card", "path": str(kept.path or ""), "fault": kept.fault, **shown})
+    if self._sitting.keeping.trainee:  # another exercise may be open now
+      self._tell(menu.offer(self._own, self._sitting.keeping))
 
   def _run(self, made: Session | Practice, job: dict[str, Any], run: Any) -> Any:
     """Runs what was made, so that messages reach it."""
@@ -286,8 +288,12 @@ class Worker:
         assessment=self._job["assessment"], practice=False, step=env.physics.timestep(), **limits,
       ))  # fmt: skip
     camera, link, pace = self._camera, session.link, session.pace
-    camera.feel(env.physics.peak_force)
     self._publish(lambda: camera.frame(link, pace, env.task.progress))
+
+  def _feel(self, env: Any) -> None:
+    """Takes the force of a control step, of which there are more than frames."""
+    if self._camera is not None:
+      self._camera.feel(env.physics.peak_force)
 
   def _practise(self, job: dict[str, Any]) -> None:
     note = ", which takes a minute or more" if job["size"].get("grid", 0) > 100 else ""
