@@ -23,6 +23,7 @@ from .raster import Grid
 Mesh = tuple[np.ndarray, np.ndarray]
 
 _LEAST_THICKNESS = 1e-2  # of the diagonal; thinner is flat
+_AT_ONCE = 5000  # points, whose triangles fit the processor's cache
 _MOST_CAP = 0.15  # of the area; a larger hole makes the surface open
 SHELL = 0.3  # of the grid's spacing; the inside starts below this, so that sheets have none
 
@@ -112,12 +113,28 @@ class Target:
 
   def closest(self, points: np.ndarray) -> np.ndarray:
     """Returns the closest points of the surface, (n, 3)."""
+    some = np.array_split(points, len(points) // _AT_ONCE + 1)
+    return np.concatenate([self._closest(each) for each in some])
+
+  def _closest(self, points: np.ndarray) -> np.ndarray:
+    """Returns the same, on the triangles of the nearest samples: inside of one or on its edges."""
     near = self._tree.query(points, k=min(8, len(self.points)))[1].reshape(len(points), -1)
-    triangle = self.triangle[near]
-    share, squared = _closest_on_triangle(points, self.vertices, self.triangles, triangle)
-    row, best = np.arange(len(points)), squared.argmin(axis=1)
-    corner = self.vertices[self.triangles[triangle[row, best]]]
-    return np.einsum("nk,nkd->nd", share[row, best], corner)
+    corner, point = self.vertices[self.triangles[self.triangle[near]]], points[:, None, None]
+    edge = np.roll(corner, -1, axis=2) - corner
+    along = _dot(point - corner, edge) / np.maximum(_dot(edge, edge), 1e-300)
+    on_edge = corner + np.clip(along, 0, 1)[..., None] * edge
+    normal = np.cross(edge[:, :, :1], edge[:, :, 1:2])
+    height = _dot(point - corner[:, :, :1], normal) / np.maximum(_dot(normal, normal), 1e-300)
+    on_plane = point - height[..., None] * normal
+    is_out = (_dot(np.cross(normal, edge), on_plane - corner) <= 0).any(axis=2, keepdims=True)
+    on_plane = np.where(is_out[..., None], np.inf, on_plane)
+    found = np.concatenate([on_edge, on_plane], axis=2).reshape(len(points), -1, 3)
+    squared = ((found - points[:, None]) ** 2).sum(axis=2)
+    return found[np.arange(len(points)), squared.argmin(axis=1)]
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+  return np.einsum("...d,...d->...", a, b)
 
 
 def _sample(
@@ -156,46 +173,6 @@ def _thin_out(
   _, first = np.unique(key, return_index=True)
   first = np.sort(first)
   return points[first], label[first]
-
-
-def _closest_on_triangle(
-  points: np.ndarray, vertices: np.ndarray, triangles: np.ndarray, which: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-  """Returns the closest points of triangles, as shares of the corners, and squared distances.
-
-  Args:
-    points: points to measure from          (n, 3)
-    vertices: vertices of the surface       (v, 3)
-    triangles: triangles of the surface     (m, 3)
-    which: triangles to measure to          (n, k)
-  """
-  a = vertices[triangles[:, 0]]
-  ab, ac = vertices[triangles[:, 1]] - a, vertices[triangles[:, 2]] - a
-  bb, cc, bc = (np.einsum("md,md->m", x, y)[which] for x, y in ((ab, ab), (ac, ac), (ab, ac)))
-  bb, cc = np.maximum(bb, 1e-300), np.maximum(cc, 1e-300)
-  ap = points[:, None] - a[which]
-  pb, pc = (np.einsum("nkd,nkd->nk", x[which], ap) for x in (ab, ac))
-  det = bb * cc - bc**2
-  flat = det < 1e-14 * bb * cc
-  det = np.where(flat, 1.0, det)
-  u, v = (cc * pb - bc * pc) / det, (bb * pc - bc * pb) / det
-  inside = ~flat & (u >= 0) & (v >= 0) & (u + v <= 1)
-  # Otherwise the closest point is on an edge.
-  t = np.clip((pc - pb + bb - bc) / np.maximum(bb + cc - 2 * bc, 1e-300), 0, 1)
-  zero = np.zeros_like(t)
-  edges = [(np.clip(pb / bb, 0, 1), zero), (zero, np.clip(pc / cc, 0, 1)), (1 - t, t)]
-
-  def squared(u, v):
-    return u * u * bb + v * v * cc + 2 * (u * v * bc - u * pb - v * pc)
-
-  best = np.where(inside, squared(u, v), np.inf)
-  u, v = np.where(inside, u, 0.0), np.where(inside, v, 0.0)
-  for eu, ev in edges:
-    other = squared(eu, ev)
-    better = ~inside & (other < best)
-    best = np.where(better, other, best)
-    u, v = np.where(better, eu, u), np.where(better, ev, v)
-  return np.stack([1 - u - v, u, v], axis=2), best + np.einsum("nkd,nkd->nk", ap, ap)
 
 
 @dataclasses.dataclass(frozen=True)
