@@ -111,8 +111,7 @@ class Comparison:
     self.target = Target(*mesh, spacing)
     self.grid = raster.Grid.around(mesh[0], spacing)
     is_closed = raster.closed(mesh[1])
-    euler = len(np.unique(mesh[1])) - len(mesh[1]) // 2
-    self._handles = is_closed and euler < 2
+    self._handles = _handles(mesh[1]) if is_closed else 0
     if is_closed:
       self.given = raster.inside(mesh, self.grid)
     else:
@@ -139,7 +138,7 @@ class Comparison:
     parts = regions(less, _edt(~made), _DEEP * cells)
     depth = _edt(made)
     filled = regions(more, depth, _DEEP * cells)
-    if not filled and self._handles:  # the wrap has none
+    if not filled and self._handles > _handles(wrapped[1]):
       tries = (regions(more, depth, share * cells) for share in _SHALLOW)
       filled = next((found for found in tries if found), [])
     sheets = self._sheets(missed, parts + filled, 2 * _DEEP * edge)
@@ -164,6 +163,11 @@ class Comparison:
     low, high = (self.grid.place(f(np.argwhere(mask), axis=0)) for f in (np.min, np.max))
     volume = 0.0 if kind == "sheet" else float(mask.sum()) * self.grid.spacing**3
     return Loss(kind, volume, tuple(((low + high) / 2).tolist()), float(np.linalg.norm(high - low)))
+
+
+def _handles(triangles: np.ndarray) -> int:
+  """Returns how many holes go through a closed surface of one piece."""
+  return 1 - (len(np.unique(triangles)) - len(triangles) // 2) // 2
 
 
 def regions(only: np.ndarray, away: np.ndarray, reach: float) -> list[np.ndarray]:

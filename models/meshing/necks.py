@@ -53,8 +53,9 @@ def _behind(triangles: np.ndarray, neck: np.ndarray, nodes: int) -> np.ndarray:
   open_ = ~np.isin(edges.vert, neck).all(axis=1)
   count = len(triangles)
   link = coo_array((np.ones(open_.sum()), edges.tri[open_].T), shape=(count, count))
-  label = connected_components(link, directed=False)[1]
-  return label == np.bincount(label).argmin()
+  parts, label = connected_components(link, directed=False)
+  # A loop around a ring has one side: nothing is behind it.
+  return (label == np.bincount(label).argmin()) & (parts > 1)
 
 
 def _lid(triangles: np.ndarray, neck: np.ndarray) -> np.ndarray:
