@@ -8,6 +8,7 @@ chosen by rank: the result repeats bit for bit.
 from collections.abc import Callable
 
 import numpy as np
+from palpate.tissue.geometry.mesh import vertex_normals
 from scipy.sparse import coo_array
 
 from .quality import angles, normals
@@ -60,12 +61,6 @@ class Edges:
     np.minimum.at(out, self.vert[:, 0], value[self.vert[:, 1]])
     np.minimum.at(out, self.vert[:, 1], value[self.vert[:, 0]])
     return out
-
-
-def vertex_normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-  """Returns unit normals at the nodes, (n, 3), weighted by area."""
-  out = _scatter(triangles, np.repeat(normals(vertices, triangles)[:, None], 3, 1), len(vertices))
-  return out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-300)
 
 
 def remesh(

@@ -11,14 +11,14 @@ import dataclasses
 
 import numpy as np
 from palpate import meshes
-from scipy.ndimage import distance_transform_edt, label
+from scipy.ndimage import distance_transform_edt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from .field import Field
 from .quality import normals
-from .raster import Grid
+from .raster import Grid, depth, parts
 
 Mesh = tuple[np.ndarray, np.ndarray]
 
@@ -66,17 +66,22 @@ def _tidy(vertices: np.ndarray, triangles: np.ndarray) -> Mesh:
   return vertices[first][used], number.reshape(-1, 3)
 
 
+def rims(nodes: int, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+  """Returns the edges around the holes of a surface (k, 2), and which hole each is of (k,)."""
+  edge = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2))
+  key, count = np.unique(edge[:, 0] * nodes + edge[:, 1], return_counts=True)
+  rim = np.stack(np.divmod(key[count == 1], nodes), axis=1)
+  graph = coo_array((np.ones(len(rim)), rim.T), shape=(nodes, nodes))
+  label = connected_components(graph, directed=False)[1]
+  return rim, np.unique(label[rim[:, 0]], return_inverse=True)[1]
+
+
 def cap(vertices: np.ndarray, triangles: np.ndarray) -> Mesh:
   """Returns the mesh with a fan over every hole that is small beside the surface."""
   n = len(vertices)
-  edge = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]))
-  key, count = np.unique(edge[:, 0] * n + edge[:, 1], return_counts=True)
-  rim = np.stack(np.divmod(key[count == 1], n), axis=1)
+  rim, hole = rims(n, triangles)
   if not len(rim):
     return vertices, triangles
-  graph = coo_array((np.ones(len(rim)), rim.T), shape=(n, n))
-  _, label = connected_components(graph, directed=False)
-  _, hole = np.unique(label[rim[:, 0]], return_inverse=True)
   share = np.bincount(hole)[:, None]
   middle = np.stack([np.bincount(hole, x) for x in vertices[rim].mean(axis=1).T], axis=1) / share
   fan = np.column_stack([rim, n + hole])
@@ -206,9 +211,9 @@ class Solid:
   def without(self, region: np.ndarray) -> Solid:
     """Returns the shape less a region, a mask of its grid's points  (nx, ny, nz)."""
     spacing = self.field.spacing
-    away = _edt(~region) * spacing
+    away = depth(~region) * spacing
     value = np.maximum(self.field.value, 0.5 * spacing - away)
-    label, _ = _pieces(value < -self.shell)
+    label, _ = parts(value < -self.shell)
     kept = np.bincount(label.ravel())[1:].argmax() + 1
     value[(label > 0) & (label != kept)] = spacing
     left = away[self.grid.index(self.exposed)] > 1.5 * spacing
@@ -230,24 +235,24 @@ def solidify(target: Target, spacing: float, reach: float) -> Solid | None:
   place = np.round((target.points - origin) / spacing).astype(int)
   empty = np.ones(count.astype(int), dtype=bool)
   empty[tuple(place.T)] = False
-  distance = _edt(empty) * spacing
+  distance = depth(empty) * spacing
   near = np.argwhere(np.abs(distance - reach) < 2 * spacing)
   distance[tuple(near.T)] = target.distance(origin + near * spacing)
-  label, _ = _pieces(distance > reach)
+  label, _ = parts(distance > reach)
   air = label == label[0, 0, 0]
   rim = Field(np.where(air | (distance <= reach), distance, 0.0) - reach, origin, spacing)
   tree = KDTree(rim.surface()[0])
-  value = np.where(air, reach + spacing * _edt(air), reach - spacing * _edt(~air))
+  value = np.where(air, reach + spacing * depth(air), reach - spacing * depth(~air))
   near = np.argwhere(np.abs(value) < reach + 4 * spacing)
   away = tree.query(origin + near * spacing)[0]
   value[tuple(near.T)] = reach + np.where(air[tuple(near.T)], away, -away)
 
   inside = value < -SHELL * spacing
-  label, pieces = _pieces(inside)
+  label, pieces = parts(inside)
   if not pieces:
     return None
   kept = np.bincount(label.ravel())[1:].argmax() + 1
-  away, nearest = _edt(~inside), _nearest(inside)
+  away, nearest = distance_transform_edt(~inside, return_indices=True)  # pyright: ignore
   covered = away[tuple(place.T)] <= 2.5
   own = label[tuple(nearest[(slice(None), *place.T)])] == kept
   value[inside & (label != kept)] = spacing
@@ -255,19 +260,3 @@ def solidify(target: Target, spacing: float, reach: float) -> Solid | None:
   exposed = covered & own & (field.at(target.points) > -0.5 * reach - spacing)
   points, _ = _thin_out(target.points[exposed], np.flatnonzero(exposed), spacing / 2)
   return Solid(field, reach, float(covered.mean()), int(pieces), points)
-
-
-def _pieces(mask: np.ndarray) -> tuple[np.ndarray, int]:
-  """Returns which connected piece of true cells every cell belongs to, and their count."""
-  numbered, count = label(mask)  # pyright: ignore
-  return numbered, count
-
-
-def _nearest(mask: np.ndarray) -> np.ndarray:
-  """Returns the index of the true cell nearest to every cell, (3, nx, ny, nz)."""
-  return np.asarray(distance_transform_edt(~mask, return_distances=False, return_indices=True))
-
-
-def _edt(mask: np.ndarray) -> np.ndarray:
-  """Returns the distance of every true cell to the nearest false one, in cells."""
-  return np.asarray(distance_transform_edt(mask))

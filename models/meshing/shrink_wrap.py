@@ -6,7 +6,6 @@ import dataclasses
 import math
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt
 from scipy.spatial import KDTree
 
 from . import losses, necks, raster
@@ -147,7 +146,7 @@ def _trim(solid: Solid, fine: Mesh, nodes: int) -> tuple[Solid, Mesh, Mesh]:
   made = raster.inside((rough[0], necks.cut(*rough)), solid.grid)
   lost = losses.regions(
     (solid.field.value < -solid.shell) & ~made,
-    np.asarray(distance_transform_edt(~made)),
+    raster.depth(~made),
     _LOST * edge / solid.field.spacing,
   )
   if not lost:

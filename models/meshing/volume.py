@@ -17,6 +17,7 @@ from scipy import ndimage
 from . import images
 from .field import Field
 from .images import Segment
+from .raster import depth, parts
 from .wrap import Report, wrap, wrap_pieces
 
 _SMOOTHING = 0.6  # of the largest voxel edge; removes the steps between slices
@@ -149,7 +150,7 @@ def _largest(name: str, values: np.ndarray, affine: np.ndarray, low: float, high
   if len(values) > 1:
     raise ValueError(f"{name}: has {len(values)} layers, expected a scan with one")
   what = f"{low:g} and more" if high == math.inf else f"{low:g} to {high:g}"
-  part, count = ndimage.label((values[0] >= low) & (values[0] <= high))  # pyright: ignore
+  part, count = parts((values[0] >= low) & (values[0] <= high))
   if not count:
     least, most = (f(values[0]) for f in (np.nanmin, np.nanmax))
     raise ValueError(f"{name}: no voxel has {what}, its values are {least:g} to {most:g}")
@@ -191,7 +192,7 @@ def surface(mask: np.ndarray, affine: np.ndarray) -> tuple[np.ndarray, np.ndarra
   (box,) = ndimage.find_objects(mask.astype(np.int8))
   mask, low = np.pad(mask[box], _PAD), np.array([each.start for each in box], dtype=float)
   edge = np.linalg.norm(affine[:3, :3], axis=0)
-  distance = _edt(~mask, edge) - _edt(mask, edge)
+  distance = depth(~mask, edge) - depth(mask, edge)
   distance = ndimage.gaussian_filter(distance, _SMOOTHING * edge.max() / edge)
   if distance.min() >= 0:
     raise ValueError(f"too small, {mask.sum()} voxels, expected an organ")
@@ -199,7 +200,3 @@ def surface(mask: np.ndarray, affine: np.ndarray) -> tuple[np.ndarray, np.ndarra
   if np.linalg.det(affine[:3, :3]) < 0:
     triangles = triangles[:, ::-1].copy()
   return vertices @ affine[:3, :3].T + affine[:3, 3], triangles
-
-
-def _edt(mask: np.ndarray, edge: np.ndarray) -> np.ndarray:
-  return np.asarray(ndimage.distance_transform_edt(mask, sampling=edge))

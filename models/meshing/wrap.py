@@ -16,7 +16,7 @@ import time
 import numpy as np
 
 from . import losses
-from .losses import Comparison, Loss
+from .losses import Loss
 from .parts import Part, split
 from .quality import Quality, angles, normals, quality, volume
 from .repair import Mesh, Target, load
@@ -253,8 +253,7 @@ def _against(
   lost += [losses.of_part(part, "inside") for part in within]
   if found:
     surface = found.target.vertices, found.target.triangles
-    body = Comparison(surface, found.found.field, len(wrapped[0]))
-    away, more = body.of(wrapped, edge)
+    away, more = losses.compare(surface, found.found.field, wrapped, edge)
     lost += more + losses.open_ends(parts[0].mesh, max(2 * found.solid.reach, 2 * edge))
   others = [*parts[1:], *within]
   if others:
