@@ -159,9 +159,10 @@ def _largest(name: str, values: np.ndarray, affine: np.ndarray, low: float, high
     number, times = np.unique(each, return_counts=True)
     size[number] += times
   size[0] = 0
-  first, *others = 1e6 * abs(np.linalg.det(affine[:3, :3])) * np.sort(size[1:])[::-1][:2]
-  note = f"; taken: {first:.3g} ml of {what}"
-  note += f", left out: {count - 1} parts of up to {others[0]:.3g} ml" if others else ""
+  millilitres = 1e6 * abs(np.linalg.det(affine[:3, :3])) * np.sort(size[1:])[::-1]
+  first, *others = (f"{float(f'{each:.3g}'):g} ml" for each in millilitres[:2])
+  note = f"; taken: {first} of {what}"
+  note += f", left out: {count - 1} parts of up to {others[0]}" if others else ""
   mask = (part == size.argmax()).astype(np.uint8)[None]
   return Labels(name, mask, affine, (Segment(1, 0, what),), note)
 

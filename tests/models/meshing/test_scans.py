@@ -1,5 +1,8 @@
 """Scans become organs by a threshold: NIfTI, NRRD and folders of DICOM slices made here."""
 
+import pathlib
+import re
+
 import numpy as np
 import pytest
 from palpate.models.meshing import volume as volumes
@@ -270,3 +273,12 @@ def test_layers_are_no_scan(tmp_path):
   nrrd.write(str(tmp_path / "scan.nrrd"), np.ones((2, 4, 4, 4), np.int16), header)
   with pytest.raises(ValueError, match="has 2 layers, expected a scan with one"):
     volumes.read(tmp_path / "scan.nrrd", 0)
+
+
+def test_the_example_of_the_page_runs(tmp_path, monkeypatch, capsys):
+  page = pathlib.Path(__file__).parents[3] / "docs" / "wrapping.md"
+  text = page.read_text(encoding="utf-8").split("### Scans")[1]
+  monkeypatch.chdir(tmp_path)
+  code = re.search(r"```python\n(.*?)```", text, re.S)[1]
+  exec(compile(code, str(page), "exec"), {})
+  assert f"{float(capsys.readouterr().out):.2e}" == re.search(r"# (1\.\d+e-)4", code)[1] + "04"
