@@ -143,7 +143,9 @@ def _trim(solid: Solid, fine: Mesh, nodes: int) -> tuple[Solid, Mesh, Mesh]:
   """
   rough = remesh(*fine, nodes, solid.field.projector(), iterations=5)
   edge = quality(*rough).spacing
-  made = raster.inside((rough[0], necks.cut(*rough)), solid.grid)
+  made = raster.inside(rough, solid.grid)
+  for tube in necks.tubes(*rough, edge):
+    made &= ~raster.inside((rough[0], tube), solid.grid)
   lost = losses.regions(
     (solid.field.value < -solid.shell) & ~made,
     raster.depth(~made),
