@@ -165,7 +165,7 @@ def _segments(header: dict) -> list[Segment]:
 def _read_dicom(folder: pathlib.Path) -> Volume:
   """Returns the slices of one series, in the order of their places, rescaled as they say."""
   from pydicom import dcmread
-  from pydicom.pixels import apply_rescale
+  from pydicom.pixels.processing import apply_rescale
 
   heads = {}
   for path in sorted(folder.iterdir()):
@@ -195,6 +195,7 @@ def _slice_header(path: pathlib.Path):
     if read_file_meta_info(path).get("TransferSyntaxUID") == DeflatedExplicitVRLittleEndian:
       raise ValueError("is deflated, expected pixels that are stored or compressed by slice")
     head = dcmread(path, stop_before_pixels=True, specific_tags=wanted)
+    [head.get(key) for key in wanted]  # values are decoded when they are asked for
   except InvalidDicomError:
     return None
   except Exception as error:

@@ -62,7 +62,7 @@ def split(vertices: np.ndarray, triangles: np.ndarray) -> list[Part]:
   pieces.sort(key=lambda t: -float(np.prod(np.ptp(vertices[t].reshape(-1, 3), axis=0))))
   for number, piece in enumerate(pieces):
     corner = grid.index(vertices[np.unique(piece)])
-    low = [max(k.min() - 1, 0) for k in corner]
+    low = np.array([max(k.min() - 1, 0) for k in corner])
     box = tuple(slice(k, int(c.max()) + 2) for k, c in zip(low, corner, strict=True))
     here = owner[box]
     filled = raster.inside((vertices, piece), raster.Grid(grid.place(low), spacing, here.shape))

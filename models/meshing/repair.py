@@ -131,8 +131,8 @@ class Target:
     normal = np.cross(edge[:, :, :1], edge[:, :, 1:2])
     height = _dot(point - corner[:, :, :1], normal) / np.maximum(_dot(normal, normal), 1e-300)
     on_plane = point - height[..., None] * normal
-    is_out = (_dot(np.cross(normal, edge), on_plane - corner) <= 0).any(axis=2, keepdims=True)
-    on_plane = np.where(is_out[..., None], np.inf, on_plane)
+    inward = _dot(np.cross(normal, edge), on_plane - corner).min(axis=2)
+    on_plane = np.where(inward[..., None, None] > 0, on_plane, np.inf)
     found = np.concatenate([on_edge, on_plane], axis=2).reshape(len(points), -1, 3)
     squared = ((found - points[:, None]) ** 2).sum(axis=2)
     return found[np.arange(len(points)), squared.argmin(axis=1)]
