@@ -95,32 +95,6 @@ def relax(
   return vertices, _flip(vertices, triangles)
 
 
-def soften(vertices: np.ndarray, triangles: np.ndarray, least: float = 0.85) -> np.ndarray:
-  """Returns the nodes with creases rounded until every triangle faces nearly as its nodes do.
-
-  MuJoCo draws a triangle of a mesh flat if the cosine between its normal and a node's is under 0.8.
-
-  Args:
-    vertices: nodes              (n, 3)
-    triangles: their triangles   (m, 3)
-    least: cosine between the normals of a triangle and of its nodes
-  """
-  edges, vertices = Edges(triangles, len(vertices)), vertices.copy()
-  for _ in range(100):
-    face = normals(vertices, triangles)
-    face /= np.maximum(np.linalg.norm(face, axis=1, keepdims=True), 1e-300)
-    facing = np.einsum("md,mkd->mk", face, vertex_normals(vertices, triangles)[triangles])
-    sharp = np.unique(triangles[facing.min(axis=1) < least])
-    if not len(sharp):
-      break
-    around = np.zeros_like(vertices)
-    for one, other in (edges.vert.T, edges.vert.T[::-1]):
-      np.add.at(around, one, vertices[other])
-    middle = around[sharp] / edges.valence[sharp, None]
-    vertices[sharp] += 0.5 * (middle - vertices[sharp])
-  return vertices
-
-
 def guard(
   vertices: np.ndarray, moved: np.ndarray, triangles: np.ndarray, least_angle: float = 25.0
 ) -> np.ndarray:
