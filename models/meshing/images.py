@@ -111,11 +111,12 @@ def _read_nrrd(name: str) -> Volume:
     values = nrrd.read_data(header, file, name)
   affine = np.eye(4)
   if header.get("space directions") is not None:
-    rows = [_direction(row) for row in header["space directions"]]
-    layers = [k for k, row in enumerate(rows) if row is None]  # an axis that is not in space
-    if len(rows) - len(layers) != 3:
-      raise ValueError(f"it has {len(rows) - len(layers)} axes in space, expected 3")
-    affine[:3, :3] = np.array([row for row in rows if row is not None]).T
+    rows = np.asarray(header["space directions"], dtype=float)
+    in_space = np.isfinite(rows).all(axis=1)
+    layers = np.flatnonzero(~in_space)
+    if in_space.sum() != 3:
+      raise ValueError(f"it has {in_space.sum()} axes in space, expected 3")
+    affine[:3, :3] = rows[in_space].T
   else:
     affine[:3, :3] = np.diag(header.get("spacings", np.ones(3))[-3:])
     layers = [0] if values.ndim == 4 else []
@@ -141,13 +142,6 @@ def _check_stream(file, encoding: str, most: int):
       if most < 0:
         raise ValueError("it holds more voxels than its header declares")
   file.seek(at)
-
-
-def _direction(row) -> np.ndarray | None:
-  """Returns an axis of a volume; None for one that is not in space, such as that of the layers."""
-  if row is None or not np.isfinite(np.asarray(row, dtype=float)).all():
-    return None
-  return np.asarray(row, dtype=float)
 
 
 def _segments(header: dict) -> list[Segment]:
