@@ -20,7 +20,6 @@ class Quality:
     components: number of connected pieces
     genus: number of handles of a closed surface, all pieces together; -1 if it is not closed
     volume: enclosed volume [m^3], positive if the triangles wind outward
-    area: surface area [m^2]
     spacing: mean edge length [m]
     spacing_spread: standard deviation of the edge lengths over their mean
   """
@@ -33,7 +32,6 @@ class Quality:
   components: int
   genus: int
   volume: float
-  area: float
   spacing: float
   spacing_spread: float
 
@@ -101,7 +99,6 @@ def quality(vertices: np.ndarray, triangles: np.ndarray) -> Quality:
     components=int(components),
     genus=int(components - euler // 2) if watertight and manifold else -1,
     volume=volume(vertices, triangles),
-    area=float(np.linalg.norm(normals(vertices, triangles), axis=1).sum() / 2),
     spacing=float(edge.mean()) if m else 0.0,
     spacing_spread=float(edge.std() / edge.mean()) if m else 0.0,
   )

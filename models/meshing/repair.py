@@ -188,14 +188,12 @@ class Solid:
     field: the shape
     reach: half the width of the widest gap bridged [m]
     covered: share of the samples that lie on or in the shape
-    pieces: number of separate pieces found, of which the largest is kept
     exposed: samples of the target that the shape's surface should pass through  (k, 3)
   """
 
   field: Field
   reach: float
   covered: float
-  pieces: int
   exposed: np.ndarray
 
   @property
@@ -259,4 +257,4 @@ def solidify(target: Target, spacing: float, reach: float) -> Solid | None:
   field = Field(value, origin, spacing)
   exposed = covered & own & (field.at(target.points) > -0.5 * reach - spacing)
   points, _ = _thin_out(target.points[exposed], np.flatnonzero(exposed), spacing / 2)
-  return Solid(field, reach, float(covered.mean()), int(pieces), points)
+  return Solid(field, reach, float(covered.mean()), points)
