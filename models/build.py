@@ -8,9 +8,10 @@ import argparse
 import pathlib
 from collections.abc import Sequence
 
+import trimesh
+
 from . import markup, mjcf, organs, scene
 from .catalog import NAMES
-from .meshing import remesh
 
 INSTRUMENTS = ("probe", "grasper")  # of the committed scenes
 
@@ -28,8 +29,9 @@ def files(name: str) -> dict[pathlib.Path, str]:
   }
   if build.entry.backdrop is not None:  # drawn only, and as a mesh
     other = organs.build(build.entry.backdrop[0])
-    soft = remesh.soften(other.vertices, other.triangles)
-    made[assets / f"{build.entry.backdrop[0]}.obj"] = mjcf.obj(soft, other.triangles)
+    soft = trimesh.Trimesh(other.vertices, other.triangles, process=False)
+    trimesh.smoothing.filter_laplacian(soft, iterations=5)  # MuJoCo draws sharp creases in shards
+    made[assets / f"{build.entry.backdrop[0]}.obj"] = mjcf.obj(soft.vertices, other.triangles)
   return made
 
 

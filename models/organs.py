@@ -55,11 +55,6 @@ class Build:
     return quality.volume(self.vertices, self.triangles)
 
   @property
-  def area(self) -> float:
-    """Surface [m^2]."""
-    return float(np.linalg.norm(quality.normals(self.vertices, self.triangles), axis=1).sum() / 2)
-
-  @property
   def mass(self) -> float:
     """Mass of the whole organ [kg]."""
     return self.entry.tissue.mass_of(self.volume)

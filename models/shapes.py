@@ -11,6 +11,7 @@ pylorus 1.2 cm.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 
 import numpy as np
@@ -133,29 +134,21 @@ def _tabulate(shape: Anatomy, nodes: int) -> Field:
   return tabulate(shape.implicit, shape.bounds, spacing)
 
 
-def liver(nodes: int = 1000, seed: Seed = None) -> Mesh:
-  """Returns a liver; seed None is the mean shape, a number a variant of it."""
-  return mesh(anatomy("liver", seed), nodes)
+def organ(name: str, nodes: int = 1000, seed: Seed = None) -> Mesh:
+  """Returns an organ's mesh; seed None is the mean shape, a number a variant of it.
+
+  Args:
+    name: liver; stomach, moderately filled; gallbladder, down to its neck; kidney, the right one
+      with its pelvis; or lobed, a test shape: a ball of 5 cm radius with lobes placed by the seed
+    nodes: their number
+    seed: of the variant
+  """
+  return mesh(anatomy(name, seed), nodes)
 
 
-def stomach(nodes: int = 1000, seed: Seed = None) -> Mesh:
-  """Returns a moderately filled, J-shaped stomach; seed as in liver."""
-  return mesh(anatomy("stomach", seed), nodes)
-
-
-def gallbladder(nodes: int = 1000, seed: Seed = None) -> Mesh:
-  """Returns a gallbladder down to its neck; seed as in liver."""
-  return mesh(anatomy("gallbladder", seed), nodes)
-
-
-def kidney(nodes: int = 1000, seed: Seed = None) -> Mesh:
-  """Returns a right kidney with its renal pelvis; seed as in liver."""
-  return mesh(anatomy("kidney", seed), nodes)
-
-
-def lobed(nodes: int = 1000, seed: Seed = 0) -> Mesh:
-  """Returns a test shape: a ball of 5 cm radius with lobes placed by the seed."""
-  return mesh(anatomy("lobed", seed), nodes)
+liver, stomach, gallbladder, kidney, lobed = (
+  functools.partial(organ, name) for name in ("liver", "stomach", "gallbladder", "kidney", "lobed")
+)
 
 
 def anatomy(name: str, seed: Seed = None) -> Anatomy:

@@ -26,8 +26,11 @@ class Field:
 
   def at(self, points: np.ndarray) -> np.ndarray:
     """Returns the distance [m] at points (n, 3), linear between values."""
+    return self._between(self.value, points)
+
+  def _between(self, array: np.ndarray, points: np.ndarray) -> np.ndarray:
     index = (points - self.origin).T / self.spacing
-    return np.asarray(map_coordinates(self.value, index, order=1, mode="nearest"))
+    return np.asarray(map_coordinates(array, index, order=1, mode="nearest"))
 
   def surface(self, level: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """Returns where the field has a level: vertices (n, 3), triangles (m, 3), winding outward."""
@@ -47,14 +50,9 @@ class Field:
 
     def project(points):
       for _ in range(2):
-        index = (points - self.origin).T / self.spacing
-        value, *gradient = (
-          np.asarray(map_coordinates(a, index, order=1, mode="nearest"))
-          for a in (self.value, *slope)
-        )
-        gradient = np.stack(gradient, axis=1)
+        gradient = np.stack([self._between(each, points) for each in slope], axis=1)
         squared = np.maximum(np.einsum("nd,nd->n", gradient, gradient), 0.1)
-        points = points - (value / squared)[:, None] * gradient
+        points = points - (self.at(points) / squared)[:, None] * gradient
       return points
 
     return project

@@ -6,12 +6,13 @@ tips, which have four. n x n is n^2 + 2 nodes.
 """
 
 import numpy as np
+from palpate.tissue.geometry.mesh import vertex_normals
 from scipy.sparse import coo_array, diags_array
 from scipy.sparse.linalg import splu
 from scipy.spatial import KDTree
 
 from .quality import angles, normals
-from .remesh import Project, guard, vertex_normals
+from .remesh import Project, guard
 
 Mesh = tuple[np.ndarray, np.ndarray]
 

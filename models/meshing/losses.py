@@ -6,14 +6,12 @@ import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.ndimage import binary_dilation, distance_transform_edt, label
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+from scipy.ndimage import binary_dilation
 
 from . import raster
 from .field import Field
 from .parts import Part
-from .repair import Target
+from .repair import Target, rims
 
 Mesh = tuple[np.ndarray, np.ndarray]
 
@@ -63,19 +61,18 @@ def of_part(part: Part, kind: str) -> Loss:
 
 def open_ends(mesh: Mesh, wide: float) -> list[Loss]:
   """Returns the rims of an open surface that are wider than a gap which is bridged [m]."""
-  points, triangles = mesh
-  edges = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-  edges, count = np.unique(edges, axis=0, return_counts=True)
-  rim = edges[count == 1]
-  links = coo_array((np.ones(len(rim)), tuple(rim.T)), shape=(len(points), len(points)))
-  _, which = connected_components(links, directed=False)
-  out = []
-  for k in np.unique(which[rim[:, 0]]):
-    low, high = (f(points[which == k], axis=0) for f in (np.min, np.max))
-    extent = float(np.linalg.norm(high - low))
-    if extent > wide:
-      out.append(Loss("cap", 0.0, tuple(((low + high) / 2).tolist()), extent))
+  points, out = mesh[0], []
+  rim, hole = rims(len(points), mesh[1])
+  for k in range(hole.max(initial=-1) + 1):
+    around = _loss("cap", points[rim[hole == k]].reshape(-1, 3), 0.0)
+    out += [around] if around.extent > wide else []
   return out
+
+
+def _loss(kind: str, points: np.ndarray, volume: float) -> Loss:
+  low, high = points.min(axis=0), points.max(axis=0)
+  middle = tuple(((low + high) / 2).tolist())
+  return Loss(kind, volume, middle, float(np.linalg.norm(high - low)))
 
 
 def notable(losses: Sequence[Loss], whole: float) -> tuple[Loss, ...]:
@@ -90,80 +87,61 @@ def notable(losses: Sequence[Loss], whole: float) -> tuple[Loss, ...]:
   return tuple(kept)
 
 
-class Comparison:
-  """A body of a mesh, to compare a wrap of it with.
+def compare(surface: Mesh, shape: Field, wrapped: Mesh, edge: float) -> tuple[float, list[Loss]]:
+  """Returns the largest distance between a body and its wrap, both ways [m], and the losses.
 
-  Attributes:
-    target: the body's surface
-    grid: points all over it
-    given: which of them lie in it  (nx, ny, nz)
+  Args:
+    surface: of the body
+    shape: what was found in it; it counts where the surface is not closed
+    wrapped: the wrap
+    edge: its mean edge [m]
   """
+  nodes = len(wrapped[0])
+  spacing = float(np.linalg.norm(np.ptp(surface[0], axis=0))) / (75 + 2 * np.sqrt(nodes))
+  target, own = Target(*surface, spacing), Target(*wrapped, spacing)
+  grid = raster.Grid.around(surface[0], spacing)
+  is_closed = raster.closed(surface[1])
+  if is_closed:
+    given = raster.inside(surface, grid)
+  else:
+    index = np.indices(grid.shape).reshape(3, -1).T
+    given = (shape.at(grid.place(index)) < 0).reshape(grid.shape)
+  # Where bodies cross, their walls run through the inside, and are no surface.
+  points = target.points[raster.depth(given)[grid.index(target.points)] <= 2]
+  there = np.linalg.norm(target.closest(own.points) - own.points, axis=1)
+  missed = np.linalg.norm(own.closest(points) - points, axis=1)
+  made = raster.inside(wrapped, grid)
+  cells, inner = edge / spacing, raster.depth(made)
+  parts = regions(given & ~made, raster.depth(~made), _DEEP * cells)
+  filled = regions(made & ~given, inner, _DEEP * cells)
+  if not filled and is_closed and _handles(surface[1]) > _handles(wrapped[1]):
+    tries = (regions(made & ~given, inner, share * cells) for share in _SHALLOW)
+    filled = next((found for found in tries if found), [])
+  reach = 2 * _DEEP * edge
+  sheets = _sheets(grid, points[missed > reach], parts + filled, reach)
+  out = []
+  for kind, masks in (("part", parts), ("filled", filled), ("sheet", sheets)):
+    size = 0.0 if kind == "sheet" else spacing**3
+    out += [_loss(kind, grid.place(np.argwhere(m)), float(m.sum()) * size) for m in masks]
+  return float(max(there.max(), missed.max(initial=0))), out
 
-  def __init__(self, mesh: Mesh, shape: Field, nodes: int):
-    """Samples a body.
 
-    Args:
-      mesh: its surface
-      shape: what was found in it; it counts where the surface is not closed
-      nodes: of the wraps to compare it with; samples are finer for more
-    """
-    spacing = float(np.linalg.norm(np.ptp(mesh[0], axis=0))) / (75 + 2 * np.sqrt(nodes))
-    self.target = Target(*mesh, spacing)
-    self.grid = raster.Grid.around(mesh[0], spacing)
-    is_closed = raster.closed(mesh[1])
-    euler = len(np.unique(mesh[1])) - len(mesh[1]) // 2
-    self._handles = is_closed and euler < 2
-    if is_closed:
-      self.given = raster.inside(mesh, self.grid)
-    else:
-      index = np.indices(self.grid.shape).reshape(3, -1).T
-      self.given = (shape.at(self.grid.place(index)) < 0).reshape(self.grid.shape)
-    # Where bodies cross, their walls run through the inside, and are no surface.
-    exposed = _edt(self.given)[self.grid.index(self.target.points)] <= 2
-    self._points = self.target.points[exposed]
+def _sheets(
+  grid: raster.Grid, far: np.ndarray, known: list[np.ndarray], reach: float
+) -> list[np.ndarray]:
+  """Returns clusters of samples that are far from a wrap and from known losses, as masks."""
+  if known:
+    away = raster.depth(~np.logical_or.reduce(known)) * grid.spacing
+    far = far[away[grid.index(far)] > reach]
+  mask = np.zeros(grid.shape, dtype=bool)
+  mask[grid.index(far)] = True
+  label, count = raster.parts(_grow(mask, np.ones_like(mask), 2))
+  return [mask & (label == k) for k in range(1, count + 1)]
 
-  def of(self, wrapped: Mesh, edge: float) -> tuple[float, list[Loss]]:
-    """Returns the largest distance between body and wrap, both ways [m], and the wrap's losses.
 
-    Args:
-      wrapped: the wrap
-      edge: its mean edge [m]
-    """
-    own = Target(*wrapped, self.grid.spacing)
-    there = np.linalg.norm(self.target.closest(own.points) - own.points, axis=1)
-    missed = np.linalg.norm(own.closest(self._points) - self._points, axis=1)
-    away = float(max(there.max(), missed.max(initial=0)))
-    made = raster.inside(wrapped, self.grid)
-    cells = edge / self.grid.spacing
-    less, more = self.given & ~made, made & ~self.given
-    parts = regions(less, _edt(~made), _DEEP * cells)
-    depth = _edt(made)
-    filled = regions(more, depth, _DEEP * cells)
-    if not filled and self._handles:  # the wrap has none
-      tries = (regions(more, depth, share * cells) for share in _SHALLOW)
-      filled = next((found for found in tries if found), [])
-    sheets = self._sheets(missed, parts + filled, 2 * _DEEP * edge)
-    out = [self._loss("part", mask) for mask in parts]
-    out += [self._loss("filled", mask) for mask in filled]
-    return away, out + [self._loss("sheet", mask) for mask in sheets]
-
-  def _sheets(self, missed: np.ndarray, known: list[np.ndarray], reach: float) -> list[np.ndarray]:
-    """Returns clusters of samples, as masks, that are far from the wrap and from known losses."""
-    far = self._points[missed > reach]
-    if not len(far):
-      return []
-    if known:
-      away = _edt(~np.logical_or.reduce(known)) * self.grid.spacing
-      far = far[away[self.grid.index(far)] > reach]
-    mask = np.zeros(self.given.shape, dtype=bool)
-    mask[self.grid.index(far)] = True
-    label, count = _label(_grow(mask, np.ones_like(mask), 2))
-    return [mask & (label == k) for k in range(1, count + 1)]
-
-  def _loss(self, kind: str, mask: np.ndarray) -> Loss:
-    low, high = (self.grid.place(f(np.argwhere(mask), axis=0)) for f in (np.min, np.max))
-    volume = 0.0 if kind == "sheet" else float(mask.sum()) * self.grid.spacing**3
-    return Loss(kind, volume, tuple(((low + high) / 2).tolist()), float(np.linalg.norm(high - low)))
+def _handles(triangles: np.ndarray) -> int:
+  """Returns how many holes go through a closed surface of one piece."""
+  return 1 - (len(np.unique(triangles)) - len(triangles) // 2) // 2
 
 
 def regions(only: np.ndarray, away: np.ndarray, reach: float) -> list[np.ndarray]:
@@ -175,19 +153,10 @@ def regions(only: np.ndarray, away: np.ndarray, reach: float) -> list[np.ndarray
     reach: in spacings
   """
   reach = max(reach, 1.5)
-  label, count = _label(only & (away > 0.4 * reach))
+  label, count = raster.parts(only & (away > 0.4 * reach))
   deep = np.unique(label[only & (away > reach)])
   back = int(np.ceil(0.4 * reach)) + 1
   return [_grow(label == k, only, back) for k in range(1, count + 1) if k in deep]
-
-
-def _edt(mask: np.ndarray) -> np.ndarray:
-  """Returns the distance of every true point to the nearest false one, in spacings."""
-  return np.asarray(distance_transform_edt(mask))
-
-
-def _label(mask: np.ndarray) -> tuple[np.ndarray, int]:
-  return label(mask)  # pyright: ignore
 
 
 def _grow(mask: np.ndarray, within: np.ndarray, times: int) -> np.ndarray:

@@ -48,15 +48,50 @@ class Part:
 
 
 def split(vertices: np.ndarray, triangles: np.ndarray) -> list[Part]:
-  """Returns the bodies of a mesh, the largest first."""
-  pieces = _pieces(len(vertices), triangles)
+  """Returns the bodies of a mesh, the largest first.
+
+  Every point of a grid has the number of the body that fills it, so that a piece is compared with
+  those that are where it is, and not with all others.
+  """
   spacing = float(np.linalg.norm(np.ptp(vertices, axis=0))) / _CELLS
   grid = raster.Grid.around(vertices, spacing)
-  bodies: list[_Body] = []
-  for piece in sorted(pieces, key=lambda t: -float(np.prod(np.ptp(vertices[t].reshape(-1, 3), 0)))):
-    _place(bodies, _Body(vertices, piece, grid))
-  parts = [body.part(vertices, grid) for body in bodies]
+  owner = np.full(grid.shape, -1)
+  groups: dict[int, list[np.ndarray]] = {}  # pieces that cross each other, by number
+  within: dict[int, list[Part]] = {}
+  pieces = _pieces(len(vertices), triangles)
+  pieces.sort(key=lambda t: -float(np.prod(np.ptp(vertices[t].reshape(-1, 3), axis=0))))
+  for number, piece in enumerate(pieces):
+    corner = grid.index(vertices[np.unique(piece)])
+    low = np.array([max(k.min() - 1, 0) for k in corner])
+    box = tuple(slice(k, int(c.max()) + 2) for k, c in zip(low, corner, strict=True))
+    here = owner[box]
+    filled = raster.inside((vertices, piece), raster.Grid(grid.place(low), spacing, here.shape))
+    held = owner[corner]
+    if held[0] >= 0 and (held == held[0]).all():
+      within[held[0]].append(_part(vertices, [piece], float(filled.sum()) * spacing**3, []))
+      continue
+    crossed, count = np.unique(here[filled], return_counts=True)
+    crossed = crossed[count > _CROSSING * filled.sum()]
+    if not raster.closed(piece):
+      crossed = np.union1d(crossed, held)
+    groups[number], within[number] = [piece], []
+    here[filled & (here < 0)] = number
+    for k in crossed[crossed >= 0]:
+      groups[number] += groups.pop(k)
+      within[number] += within.pop(k)
+      owner[owner == k] = number
+  size = np.bincount(owner[owner >= 0], minlength=len(pieces)) * spacing**3
+  parts = [_part(vertices, group, float(size[k]), within[k]) for k, group in groups.items()]
   return sorted(parts, key=lambda part: -part.volume)
+
+
+def _part(vertices: np.ndarray, pieces: list[np.ndarray], size: float, within: list[Part]) -> Part:
+  """Returns a body of pieces; `size` is its volume [m^3] unless they enclose one exactly."""
+  triangles = np.concatenate(pieces)
+  used, number = np.unique(triangles, return_inverse=True)
+  mesh = vertices[used], number.reshape(-1, 3)
+  exact = len(pieces) == 1 and raster.closed(triangles)
+  return Part(mesh, abs(volume(*mesh)) if exact else size, within)
 
 
 def _pieces(nodes: int, triangles: np.ndarray) -> list[np.ndarray]:
@@ -71,71 +106,3 @@ def _pieces(nodes: int, triangles: np.ndarray) -> list[np.ndarray]:
   label = np.where(is_open[label], -1, label)[triangles[:, 0]]
   order = np.argsort(label, kind="stable")
   return np.split(triangles[order], np.flatnonzero(np.diff(label[order])) + 1)
-
-
-class _Body:
-  """Pieces that cross each other, and where they are on a grid.
-
-  Attributes:
-    pieces: their triangles
-    corner: the grid's points nearest to the vertices of the first  (n, 3)
-    low: where the box that holds them starts                       (3,)
-    filled: which points of that box lie inside
-    within: bodies inside of them
-  """
-
-  def __init__(self, vertices: np.ndarray, triangles: np.ndarray, grid: raster.Grid):
-    self.pieces, self.within = [triangles], []
-    self.corner = np.stack(grid.index(vertices[np.unique(triangles)]), axis=1)
-    self.low = np.maximum(self.corner.min(axis=0) - 1, 0)
-    high = np.minimum(self.corner.max(axis=0) + 2, grid.shape)
-    box = raster.Grid(grid.place(self.low), grid.spacing, tuple(high - self.low))
-    self.filled = raster.inside((vertices, triangles), box)
-
-  def part(self, vertices: np.ndarray, grid: raster.Grid) -> Part:
-    """Returns what others see of it."""
-    triangles = np.concatenate(self.pieces)
-    used, number = np.unique(triangles, return_inverse=True)
-    mesh = vertices[used], number.reshape(-1, 3)
-    exact = len(self.pieces) == 1 and raster.closed(triangles)
-    size = abs(volume(*mesh)) if exact else float(self.filled.sum()) * grid.spacing**3
-    return Part(mesh, size, [body.part(vertices, grid) for body in self.within])
-
-  def holds(self, corner: np.ndarray) -> np.ndarray:
-    """Returns which of the grid's points (n, 3) lie inside."""
-    at = corner - self.low
-    known = ((at >= 0) & (at < self.filled.shape)).all(axis=1)
-    return known & self.filled[tuple(np.where(known[:, None], at, 0).T)]
-
-  def shares(self, other: _Body) -> int:
-    """Returns how many points lie inside of both."""
-    return int(self.holds(np.argwhere(other.filled) + other.low).sum())
-
-  def take(self, other: _Body) -> None:
-    """Makes one body of two."""
-    low = np.minimum(self.low, other.low)
-    high = np.maximum(self.low + self.filled.shape, other.low + other.filled.shape)
-    filled = np.zeros(high - low, dtype=bool)
-    for one in (self, other):
-      start = one.low - low
-      filled[tuple(map(slice, start, start + one.filled.shape))] |= one.filled
-    self.low, self.filled = low, filled
-    self.pieces += other.pieces
-    self.within += other.within
-
-
-def _place(bodies: list[_Body], new: _Body) -> None:
-  """Puts a piece that is smaller than all before it with those that it crosses or is inside of."""
-  patches = not raster.closed(new.pieces[0])
-  crossed = []
-  for body in bodies:
-    held = body.holds(new.corner)
-    if held.all():
-      body.within.append(new)
-      return
-    if body.shares(new) > _CROSSING * new.filled.sum() or (patches and held.any()):
-      crossed.append(body)
-  for body in crossed:
-    bodies.remove(body)
-    new.take(body)
-  bodies.append(new)

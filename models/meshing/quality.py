@@ -15,15 +15,11 @@ class Quality:
     nodes: number of nodes
     triangles: number of triangles
     min_angle: smallest angle of any triangle [deg]
-    min_valence: fewest edges at a node
-    max_valence: most edges at a node
     watertight: every edge has exactly two triangles, run through in opposite directions
     manifold: the triangles around every node form one closed fan, every node is used
     components: number of connected pieces
     genus: number of handles of a closed surface, all pieces together; -1 if it is not closed
     volume: enclosed volume [m^3], positive if the triangles wind outward
-    area: surface area [m^2]
-    max_aspect: largest aspect ratio, circumradius over twice the inradius; 1 is equilateral
     spacing: mean edge length [m]
     spacing_spread: standard deviation of the edge lengths over their mean
   """
@@ -31,15 +27,11 @@ class Quality:
   nodes: int
   triangles: int
   min_angle: float
-  min_valence: int
-  max_valence: int
   watertight: bool
   manifold: bool
   components: int
   genus: int
   volume: float
-  area: float
-  max_aspect: float
   spacing: float
   spacing_spread: float
 
@@ -84,7 +76,6 @@ def quality(vertices: np.ndarray, triangles: np.ndarray) -> Quality:
     and (tail != head).all()
   )
   undirected, first = np.unique(np.minimum(directed, reverse), return_index=True)
-  degree = np.bincount(np.stack([tail[first], head[first]]).ravel(), minlength=n)
   # Corners joined across shared edges: a node with one fan has all its corners in one piece.
   fans = -1
   if watertight:
@@ -98,23 +89,16 @@ def quality(vertices: np.ndarray, triangles: np.ndarray) -> Quality:
   components = connected_components(graph, directed=False)[0]
   euler = n - len(undirected) + m
   edge = np.linalg.norm(vertices[tail[first]] - vertices[head[first]], axis=1)
-  corner_angle = angles(vertices, triangles)
-  # R / (2 r) = 1 / (8 sin(A/2) sin(B/2) sin(C/2)).
-  half_sines = np.sin(corner_angle / 2).prod(axis=1)
   manifold = fans == n
   return Quality(
     nodes=n,
     triangles=m,
-    min_angle=float(np.degrees(corner_angle.min(initial=np.pi))),
-    min_valence=int(degree.min(initial=n)),
-    max_valence=int(degree.max(initial=0)),
+    min_angle=float(np.degrees(angles(vertices, triangles).min(initial=np.pi))),
     watertight=watertight,
     manifold=manifold,
     components=int(components),
     genus=int(components - euler // 2) if watertight and manifold else -1,
     volume=volume(vertices, triangles),
-    area=float(np.linalg.norm(normals(vertices, triangles), axis=1).sum() / 2),
-    max_aspect=float((1 / np.maximum(8 * half_sines, 1e-12)).max(initial=1.0)),
     spacing=float(edge.mean()) if m else 0.0,
     spacing_spread=float(edge.std() / edge.mean()) if m else 0.0,
   )

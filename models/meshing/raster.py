@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+from scipy.ndimage import distance_transform_edt, label
 
 Mesh = tuple[np.ndarray, np.ndarray]
 
@@ -47,6 +48,16 @@ class Grid:
   def place(self, index: np.ndarray) -> np.ndarray:
     """Returns the points [m] with indices (n, 3)."""
     return self.origin + self.spacing * np.asarray(index)
+
+
+def depth(mask: np.ndarray, spacing: float | np.ndarray = 1.0) -> np.ndarray:
+  """Returns the distance of every true point of a grid to the nearest false one."""
+  return np.asarray(distance_transform_edt(mask, np.broadcast_to(spacing, 3)))
+
+
+def parts(mask: np.ndarray) -> tuple[np.ndarray, int]:
+  """Returns the connected part, from 1, that every true point of a grid is in, and their count."""
+  return label(mask)  # pyright: ignore
 
 
 def closed(triangles: np.ndarray) -> bool:

@@ -8,6 +8,7 @@ chosen by rank: the result repeats bit for bit.
 from collections.abc import Callable
 
 import numpy as np
+from palpate.tissue.geometry.mesh import vertex_normals
 from scipy.sparse import coo_array
 
 from .quality import angles, normals
@@ -62,12 +63,6 @@ class Edges:
     return out
 
 
-def vertex_normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-  """Returns unit normals at the nodes, (n, 3), weighted by area."""
-  out = _scatter(triangles, np.repeat(normals(vertices, triangles)[:, None], 3, 1), len(vertices))
-  return out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-300)
-
-
 def remesh(
   vertices: np.ndarray,
   triangles: np.ndarray,
@@ -98,32 +93,6 @@ def relax(
     triangles = _flip(vertices, triangles)
     vertices = project(_slide(vertices, triangles))
   return vertices, _flip(vertices, triangles)
-
-
-def soften(vertices: np.ndarray, triangles: np.ndarray, least: float = 0.85) -> np.ndarray:
-  """Returns the nodes with creases rounded until every triangle faces nearly as its nodes do.
-
-  MuJoCo draws a triangle of a mesh flat if the cosine between its normal and a node's is under 0.8.
-
-  Args:
-    vertices: nodes              (n, 3)
-    triangles: their triangles   (m, 3)
-    least: cosine between the normals of a triangle and of its nodes
-  """
-  edges, vertices = Edges(triangles, len(vertices)), vertices.copy()
-  for _ in range(100):
-    face = normals(vertices, triangles)
-    face /= np.maximum(np.linalg.norm(face, axis=1, keepdims=True), 1e-300)
-    facing = np.einsum("md,mkd->mk", face, vertex_normals(vertices, triangles)[triangles])
-    sharp = np.unique(triangles[facing.min(axis=1) < least])
-    if not len(sharp):
-      break
-    around = np.zeros_like(vertices)
-    for one, other in (edges.vert.T, edges.vert.T[::-1]):
-      np.add.at(around, one, vertices[other])
-    middle = around[sharp] / edges.valence[sharp, None]
-    vertices[sharp] += 0.5 * (middle - vertices[sharp])
-  return vertices
 
 
 def guard(

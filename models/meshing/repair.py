@@ -11,18 +11,19 @@ import dataclasses
 
 import numpy as np
 from palpate import meshes
-from scipy.ndimage import distance_transform_edt, label
+from scipy.ndimage import distance_transform_edt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from .field import Field
 from .quality import normals
-from .raster import Grid
+from .raster import Grid, depth, parts
 
 Mesh = tuple[np.ndarray, np.ndarray]
 
 _LEAST_THICKNESS = 1e-2  # of the diagonal; thinner is flat
+_AT_ONCE = 5000  # points, whose triangles fit the processor's cache
 _MOST_CAP = 0.15  # of the area; a larger hole makes the surface open
 SHELL = 0.3  # of the grid's spacing; the inside starts below this, so that sheets have none
 
@@ -65,17 +66,22 @@ def _tidy(vertices: np.ndarray, triangles: np.ndarray) -> Mesh:
   return vertices[first][used], number.reshape(-1, 3)
 
 
+def rims(nodes: int, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+  """Returns the edges around the holes of a surface (k, 2), and which hole each is of (k,)."""
+  edge = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2))
+  key, count = np.unique(edge[:, 0] * nodes + edge[:, 1], return_counts=True)
+  rim = np.stack(np.divmod(key[count == 1], nodes), axis=1)
+  graph = coo_array((np.ones(len(rim)), rim.T), shape=(nodes, nodes))
+  label = connected_components(graph, directed=False)[1]
+  return rim, np.unique(label[rim[:, 0]], return_inverse=True)[1]
+
+
 def cap(vertices: np.ndarray, triangles: np.ndarray) -> Mesh:
   """Returns the mesh with a fan over every hole that is small beside the surface."""
   n = len(vertices)
-  edge = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]))
-  key, count = np.unique(edge[:, 0] * n + edge[:, 1], return_counts=True)
-  rim = np.stack(np.divmod(key[count == 1], n), axis=1)
+  rim, hole = rims(n, triangles)
   if not len(rim):
     return vertices, triangles
-  graph = coo_array((np.ones(len(rim)), rim.T), shape=(n, n))
-  _, label = connected_components(graph, directed=False)
-  _, hole = np.unique(label[rim[:, 0]], return_inverse=True)
   share = np.bincount(hole)[:, None]
   middle = np.stack([np.bincount(hole, x) for x in vertices[rim].mean(axis=1).T], axis=1) / share
   fan = np.column_stack([rim, n + hole])
@@ -112,12 +118,28 @@ class Target:
 
   def closest(self, points: np.ndarray) -> np.ndarray:
     """Returns the closest points of the surface, (n, 3)."""
+    some = np.array_split(points, len(points) // _AT_ONCE + 1)
+    return np.concatenate([self._closest(each) for each in some])
+
+  def _closest(self, points: np.ndarray) -> np.ndarray:
+    """Returns the same, on the triangles of the nearest samples: inside of one or on its edges."""
     near = self._tree.query(points, k=min(8, len(self.points)))[1].reshape(len(points), -1)
-    triangle = self.triangle[near]
-    share, squared = _closest_on_triangle(points, self.vertices, self.triangles, triangle)
-    row, best = np.arange(len(points)), squared.argmin(axis=1)
-    corner = self.vertices[self.triangles[triangle[row, best]]]
-    return np.einsum("nk,nkd->nd", share[row, best], corner)
+    corner, point = self.vertices[self.triangles[self.triangle[near]]], points[:, None, None]
+    edge = np.roll(corner, -1, axis=2) - corner
+    along = _dot(point - corner, edge) / np.maximum(_dot(edge, edge), 1e-300)
+    on_edge = corner + np.clip(along, 0, 1)[..., None] * edge
+    normal = np.cross(edge[:, :, :1], edge[:, :, 1:2])
+    height = _dot(point - corner[:, :, :1], normal) / np.maximum(_dot(normal, normal), 1e-300)
+    on_plane = point - height[..., None] * normal
+    inward = _dot(np.cross(normal, edge), on_plane - corner).min(axis=2)
+    on_plane = np.where(inward[..., None, None] > 0, on_plane, np.inf)
+    found = np.concatenate([on_edge, on_plane], axis=2).reshape(len(points), -1, 3)
+    squared = ((found - points[:, None]) ** 2).sum(axis=2)
+    return found[np.arange(len(points)), squared.argmin(axis=1)]
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+  return np.einsum("...d,...d->...", a, b)
 
 
 def _sample(
@@ -158,46 +180,6 @@ def _thin_out(
   return points[first], label[first]
 
 
-def _closest_on_triangle(
-  points: np.ndarray, vertices: np.ndarray, triangles: np.ndarray, which: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-  """Returns the closest points of triangles, as shares of the corners, and squared distances.
-
-  Args:
-    points: points to measure from          (n, 3)
-    vertices: vertices of the surface       (v, 3)
-    triangles: triangles of the surface     (m, 3)
-    which: triangles to measure to          (n, k)
-  """
-  a = vertices[triangles[:, 0]]
-  ab, ac = vertices[triangles[:, 1]] - a, vertices[triangles[:, 2]] - a
-  bb, cc, bc = (np.einsum("md,md->m", x, y)[which] for x, y in ((ab, ab), (ac, ac), (ab, ac)))
-  bb, cc = np.maximum(bb, 1e-300), np.maximum(cc, 1e-300)
-  ap = points[:, None] - a[which]
-  pb, pc = (np.einsum("nkd,nkd->nk", x[which], ap) for x in (ab, ac))
-  det = bb * cc - bc**2
-  flat = det < 1e-14 * bb * cc
-  det = np.where(flat, 1.0, det)
-  u, v = (cc * pb - bc * pc) / det, (bb * pc - bc * pb) / det
-  inside = ~flat & (u >= 0) & (v >= 0) & (u + v <= 1)
-  # Otherwise the closest point is on an edge.
-  t = np.clip((pc - pb + bb - bc) / np.maximum(bb + cc - 2 * bc, 1e-300), 0, 1)
-  zero = np.zeros_like(t)
-  edges = [(np.clip(pb / bb, 0, 1), zero), (zero, np.clip(pc / cc, 0, 1)), (1 - t, t)]
-
-  def squared(u, v):
-    return u * u * bb + v * v * cc + 2 * (u * v * bc - u * pb - v * pc)
-
-  best = np.where(inside, squared(u, v), np.inf)
-  u, v = np.where(inside, u, 0.0), np.where(inside, v, 0.0)
-  for eu, ev in edges:
-    other = squared(eu, ev)
-    better = ~inside & (other < best)
-    best = np.where(better, other, best)
-    u, v = np.where(better, eu, u), np.where(better, ev, v)
-  return np.stack([1 - u - v, u, v], axis=2), best + np.einsum("nkd,nkd->nk", ap, ap)
-
-
 @dataclasses.dataclass(frozen=True)
 class Solid:
   """The closed shape found in a surface.
@@ -206,14 +188,12 @@ class Solid:
     field: the shape
     reach: half the width of the widest gap bridged [m]
     covered: share of the samples that lie on or in the shape
-    pieces: number of separate pieces found, of which the largest is kept
     exposed: samples of the target that the shape's surface should pass through  (k, 3)
   """
 
   field: Field
   reach: float
   covered: float
-  pieces: int
   exposed: np.ndarray
 
   @property
@@ -229,9 +209,9 @@ class Solid:
   def without(self, region: np.ndarray) -> Solid:
     """Returns the shape less a region, a mask of its grid's points  (nx, ny, nz)."""
     spacing = self.field.spacing
-    away = _edt(~region) * spacing
+    away = depth(~region) * spacing
     value = np.maximum(self.field.value, 0.5 * spacing - away)
-    label, _ = _pieces(value < -self.shell)
+    label, _ = parts(value < -self.shell)
     kept = np.bincount(label.ravel())[1:].argmax() + 1
     value[(label > 0) & (label != kept)] = spacing
     left = away[self.grid.index(self.exposed)] > 1.5 * spacing
@@ -253,44 +233,28 @@ def solidify(target: Target, spacing: float, reach: float) -> Solid | None:
   place = np.round((target.points - origin) / spacing).astype(int)
   empty = np.ones(count.astype(int), dtype=bool)
   empty[tuple(place.T)] = False
-  distance = _edt(empty) * spacing
+  distance = depth(empty) * spacing
   near = np.argwhere(np.abs(distance - reach) < 2 * spacing)
   distance[tuple(near.T)] = target.distance(origin + near * spacing)
-  label, _ = _pieces(distance > reach)
+  label, _ = parts(distance > reach)
   air = label == label[0, 0, 0]
   rim = Field(np.where(air | (distance <= reach), distance, 0.0) - reach, origin, spacing)
   tree = KDTree(rim.surface()[0])
-  value = np.where(air, reach + spacing * _edt(air), reach - spacing * _edt(~air))
+  value = np.where(air, reach + spacing * depth(air), reach - spacing * depth(~air))
   near = np.argwhere(np.abs(value) < reach + 4 * spacing)
   away = tree.query(origin + near * spacing)[0]
   value[tuple(near.T)] = reach + np.where(air[tuple(near.T)], away, -away)
 
   inside = value < -SHELL * spacing
-  label, pieces = _pieces(inside)
+  label, pieces = parts(inside)
   if not pieces:
     return None
   kept = np.bincount(label.ravel())[1:].argmax() + 1
-  away, nearest = _edt(~inside), _nearest(inside)
+  away, nearest = distance_transform_edt(~inside, return_indices=True)  # pyright: ignore
   covered = away[tuple(place.T)] <= 2.5
   own = label[tuple(nearest[(slice(None), *place.T)])] == kept
   value[inside & (label != kept)] = spacing
   field = Field(value, origin, spacing)
   exposed = covered & own & (field.at(target.points) > -0.5 * reach - spacing)
   points, _ = _thin_out(target.points[exposed], np.flatnonzero(exposed), spacing / 2)
-  return Solid(field, reach, float(covered.mean()), int(pieces), points)
-
-
-def _pieces(mask: np.ndarray) -> tuple[np.ndarray, int]:
-  """Returns which connected piece of true cells every cell belongs to, and their count."""
-  numbered, count = label(mask)  # pyright: ignore
-  return numbered, count
-
-
-def _nearest(mask: np.ndarray) -> np.ndarray:
-  """Returns the index of the true cell nearest to every cell, (3, nx, ny, nz)."""
-  return np.asarray(distance_transform_edt(~mask, return_distances=False, return_indices=True))
-
-
-def _edt(mask: np.ndarray) -> np.ndarray:
-  """Returns the distance of every true cell to the nearest false one, in cells."""
-  return np.asarray(distance_transform_edt(mask))
+  return Solid(field, reach, float(covered.mean()), points)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt
 from scipy.spatial import KDTree
 
 from . import losses, necks, raster
@@ -20,6 +20,7 @@ LEAST_ANGLE = 10.0  # [deg]; thinner triangles lock and need tiny steps
 _REACHES = (0.65, 1.5, 3.5)  # of the grid's spacing
 _LEAST_COVERED = 0.8  # of the surface; with less too much has no inside: it is open
 _MOST_VOXELS = 2e7
+_EVEN = "method='even' makes an organ with them"
 _LOST = 1.0  # of an edge: what sticks out so far of a mesh of so many nodes is too thin for them
 
 
@@ -74,6 +75,9 @@ def _fit(name: str, body: Mesh, nodes: int, method: str) -> Fit:
     smooth = relax(*rough, onto, 20)
     vertices, triangles = relax(*smooth, clinging, 10)
   else:
+    handles = quality(*fine).genus
+    if handles:
+      raise ValueError(f"{name}: {handles} holes go through it, expected none of a grid; {_EVEN}")
     rough = remesh(*fine, min(2000, len(fine[0]) // 2), onto, iterations=15)
     vertices, triangles = smooth = shrink(*rough, round(np.sqrt(nodes / 4)), onto)
   vertices = guard(vertices, clinging(vertices), triangles)
@@ -104,8 +108,11 @@ def _solid(
 
 
 def _inside(name: str, target: Target, spacing: float) -> tuple[Solid, Mesh]:
-  """Returns the shape in the surface and its fine mesh, keeping air out as little as it takes."""
-  problem = ""
+  """Returns the shape in the surface and its fine mesh, keeping air out as little as it takes.
+
+  A farther reach is tried for fewer holes through the shape: what it closes was narrow.
+  """
+  problem, found, least = "", None, math.inf
   for reach in _REACHES:
     solid = solidify(target, spacing, reach * spacing)
     if solid is None or solid.covered < _LEAST_COVERED:
@@ -119,13 +126,13 @@ def _inside(name: str, target: Target, spacing: float) -> tuple[Solid, Mesh]:
       continue
     fine = solid.field.surface(-solid.shell)
     handles = quality(*fine).genus
-    if not handles:
-      return solid, fine
-    problem = (
-      f"{handles} holes go through it that are wider than {2e3 * reach * spacing:.2g} mm, expected "
-      "none: close them in a mesh editor"
-    )
-  raise ValueError(f"{name}: {problem}")
+    if handles < least:
+      found, least = (solid, fine), handles
+    if not least:
+      break
+  if found is None:
+    raise ValueError(f"{name}: {problem}")
+  return found
 
 
 def _trim(solid: Solid, fine: Mesh, nodes: int) -> tuple[Solid, Mesh, Mesh]:
@@ -136,17 +143,19 @@ def _trim(solid: Solid, fine: Mesh, nodes: int) -> tuple[Solid, Mesh, Mesh]:
   """
   rough = remesh(*fine, nodes, solid.field.projector(), iterations=5)
   edge = quality(*rough).spacing
-  made = raster.inside((rough[0], necks.cut(*rough)), solid.grid)
+  made = raster.inside(rough, solid.grid)
+  for tube in necks.tubes(*rough, edge):
+    made &= ~raster.inside((rough[0], tube), solid.grid)
   lost = losses.regions(
     (solid.field.value < -solid.shell) & ~made,
-    np.asarray(distance_transform_edt(~made)),
+    raster.depth(~made),
     _LOST * edge / solid.field.spacing,
   )
   if not lost:
     return solid, fine, rough
   trimmed = solid.without(np.logical_or.reduce(lost))
   cut = trimmed.field.surface(-trimmed.shell)
-  if quality(*cut).genus or len(cut[0]) < nodes:
+  if quality(*cut).genus > quality(*fine).genus or len(cut[0]) < nodes:
     return solid, fine, rough
   return trimmed, cut, remesh(*cut, nodes, trimmed.field.projector(), iterations=5)
 

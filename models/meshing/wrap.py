@@ -16,7 +16,7 @@ import time
 import numpy as np
 
 from . import losses
-from .losses import Comparison, Loss
+from .losses import Loss
 from .parts import Part, split
 from .quality import Quality, angles, normals, quality, volume
 from .repair import Mesh, Target, load
@@ -35,6 +35,7 @@ class Report:
     triangles: number of triangles
     size: of the box around it [m]
     volume: enclosed [m^3]
+    handles: holes that go through it, as through a ring
     foldovers: triangles folded back over their neighbours; 0, anything else is an error
     min_angle: smallest angle [deg]
     area_distortion: standard deviation of the triangles' areas over their mean; 0 is an even sheet
@@ -54,6 +55,7 @@ class Report:
   triangles: int
   size: tuple[float, ...]
   volume: float
+  handles: int
   foldovers: int
   min_angle: float
   area_distortion: float
@@ -76,6 +78,7 @@ class Report:
       ("triangles", f"{self.triangles}"),
       ("size", f"{extents} mm"),
       ("volume", f"{1e6 * self.volume:.4g} ml"),
+      ("holes through it", f"{self.handles}"),
       ("foldovers", f"{self.foldovers}"),
       ("smallest angle", f"{self.min_angle:.3g} degrees"),
       ("spread of areas", f"{100 * self.area_distortion:.3g} % of their mean"),
@@ -202,11 +205,6 @@ def _wrong(q: Quality) -> str:
     return "a node joins several surfaces; method='even' makes one around them"
   if q.components != 1:
     return f"{q.components} pieces cross each other, expected 1; method='even' makes one of them"
-  if q.genus:
-    return (
-      f"{q.genus} holes go through it, expected none; method='even' fills narrow ones, close wide "
-      "ones in a mesh editor"
-    )
   if q.min_angle < LEAST_ANGLE:
     return (
       f"the smallest angle is {q.min_angle:.2g} degrees, expected {LEAST_ANGLE} or more; "
@@ -230,6 +228,7 @@ def _report(
     triangles=q.triangles,
     size=tuple(np.ptp(wrapped[0], axis=0).tolist()),
     volume=q.volume,
+    handles=q.genus,
     foldovers=foldovers(*wrapped, found.solid.field if found else None),
     min_angle=q.min_angle,
     area_distortion=float(area.std() / area.mean()),
@@ -254,8 +253,7 @@ def _against(
   lost += [losses.of_part(part, "inside") for part in within]
   if found:
     surface = found.target.vertices, found.target.triangles
-    body = Comparison(surface, found.found.field, len(wrapped[0]))
-    away, more = body.of(wrapped, edge)
+    away, more = losses.compare(surface, found.found.field, wrapped, edge)
     lost += more + losses.open_ends(parts[0].mesh, max(2 * found.solid.reach, 2 * edge))
   others = [*parts[1:], *within]
   if others:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import pathlib
 import re
 import sys
@@ -12,7 +13,6 @@ from palpate import register
 from .console import CommandError, compile_error, table
 from .press import figures
 
-_VOLUMES = (".nii", ".nii.gz", ".nrrd")
 _NODES = 1000
 
 
@@ -23,7 +23,11 @@ def add_arguments(parser: argparse.ArgumentParser):
     "nothing is written and the exit code is 1, unless --accept-losses or --pieces is given."
   )
   add = parser.add_argument
-  add("mesh", metavar="MESH", help="OBJ, STL, PLY, glTF, or a label map in NIfTI or NRRD")
+  add(
+    "mesh",
+    metavar="MESH",
+    help="OBJ, STL, PLY, glTF; a volume in NIfTI or NRRD; the folder of a DICOM series",
+  )
   add(
     "-o", "--out", metavar="FOLDER", required=True, help="the model folder to write, new or empty"
   )
@@ -37,8 +41,15 @@ def add_arguments(parser: argparse.ArgumentParser):
     action="append",
     help="number or name of a label of a volume, or all; may be repeated",
   )
-  add("--pieces", action="store_true", help="make an organ from each separate piece")
-  add("--accept-losses", action="store_true", help="write the organ even if it leaves out parts")
+  add(
+    "--threshold",
+    metavar="X",
+    type=float,
+    help="lowest value of the organ in a scan, which need be no label map (CT: Hounsfield units)",
+  )
+  add("--upper", metavar="X", type=float, default=math.inf, help="highest value of the organ")
+  add("--pieces", action="store_true", help="make an organ of every separate piece")
+  add("--accept-losses", action="store_true", help="write the organ even if it leaves parts out")
   add("--name", help="of the organ (the file's)")
   add("--young", metavar="PA", type=float, help="Young's modulus (the liver's)")
   add("--foundation", metavar="PA/M", type=float, help="foundation (the liver's; of a solid none)")
@@ -51,7 +62,7 @@ def main(args: argparse.Namespace) -> int:
 
   figures.need("video", "imageio")
   source = pathlib.Path(args.mesh)
-  if not source.is_file():
+  if not (source.is_file() or source.is_dir()):
     raise CommandError(f"no file {str(source)!r}")
   constants = {k: getattr(args, k) for k in ("young", "foundation") if getattr(args, k) is not None}
   constants["solid"] = args.solid
@@ -92,25 +103,37 @@ def _allowed(text: str) -> str:
 
 def _check(args: argparse.Namespace, source: pathlib.Path):
   """Refuses options that would do nothing, and a folder that the mesh itself is in danger in."""
-  volume = source.name.lower().endswith(_VOLUMES)
+  from palpate.models.meshing import images
+
+  volume, scan = images.is_volume(source), args.threshold is not None
   if volume and args.scale is not None:
     raise CommandError("--scale goes with a mesh; a volume has its own units")
-  if not volume and args.label:
-    raise CommandError(f"--label goes with a volume ({', '.join(_VOLUMES)})")
-  if args.force and pathlib.Path(args.out).resolve() in source.resolve().parents:
+  if not volume and (args.label or scan):
+    option = "--threshold" if scan else "--label"
+    kinds = ", ".join(images.KINDS)
+    raise CommandError(f"{option} goes with a volume ({kinds}, or the folder of a DICOM series)")
+  if source.is_dir() and not scan:
+    raise CommandError(f"{str(source)!r} is a folder, and a DICOM series needs --threshold")
+  if scan and args.label:
+    raise CommandError("--label goes with a label map, --threshold with a scan; expected one")
+  if not scan and args.upper != math.inf:
+    raise CommandError("--upper goes with --threshold")
+  inside = (source.resolve(), *source.resolve().parents)
+  if args.force and pathlib.Path(args.out).resolve() in inside:
     raise CommandError(f"{str(source)!r} is in the folder that --force writes into")
 
 
 def _wrap(args: argparse.Namespace, source: pathlib.Path, name: str, nodes: int | None) -> dict:
   """Returns what was wrapped, by name."""
-  from palpate.models.meshing import volume, wrap
+  from palpate.models.meshing import images, volume, wrap
 
-  if not source.name.lower().endswith(_VOLUMES):
+  if not images.is_volume(source):
     options = {"method": args.method, "scale": args.scale or 1.0}
     if args.pieces:
       return _named(name, wrap.wrap_pieces(source, nodes, **options))
     return _named(name, [wrap.wrap(source, nodes, **options)])
-  labels = volume.read(source)
+  labels = volume.read(source, args.threshold, args.upper)
+  print(labels)
   if args.label == ["all"]:
     chosen = list(labels.segments)
   else:
@@ -152,6 +175,7 @@ def _advice(lost: list[str], args: argparse.Namespace) -> str:
 def _words(message: str) -> str:
   """Returns a message of Python's in the words of the command."""
   message = re.sub(r"\b(scale|method)='(\w+)'", r"--\1 \2", message)
+  message = message.replace("needs a threshold", "needs --threshold")
   return message.replace("and nothing in it is to be lost", "--force writes into it")
 
 

@@ -159,6 +159,40 @@ def test_labels_are_organs_of_their_own(tmp_path, wrap):
     assert palpate.Organ(model, mujoco.MjData(model), f"{name}/{name}").nvert == 100
 
 
+def test_a_scan_is_wrapped_by_a_threshold(tmp_path, wrap):
+  import nrrd
+
+  x = np.indices((30, 28, 26)) - 13.0
+  values = 120.0 - 10 * np.sqrt((x**2).sum(axis=0))  # 0 at 12 voxels of 4 mm
+  scan = tmp_path / "mr.nrrd"
+  nrrd.write(str(scan), values, {"space": "LPS", "space directions": 4 * np.eye(3)})
+  code, _, said = wrap(scan, "-o", "out")
+  assert code == 2 and "a scan needs --threshold" in said
+  code, said, _ = wrap(scan, "-o", "out", "--nodes", 100, "--threshold", 0)
+  assert code == 0 and "30 x 28 x 26 voxels of 4 x 4 x 4 mm; taken: 4" in said
+  model = mujoco.MjModel.from_xml_path(str(tmp_path / "out" / "scene.xml"))
+  organ = palpate.Organ(model, mujoco.MjData(model), "mr/mr")
+  assert organ.volume == pytest.approx(4 / 3 * np.pi * 0.048**3, rel=0.09)  # 100 nodes cut off 7 %
+  assert wrap(scan, "-o", "inner", "--nodes", 100, "--threshold", -50, "--upper", 60)[0] == 1
+  for words, wrong in (
+    (["--upper", 3], "--upper goes with --threshold"),
+    (["--threshold", 3, "--label", 1], "expected one"),
+    (["--threshold", 9, "--upper", 3], "upper is 3, expected a number > 9"),
+    (["--threshold", 500], "no voxel has 500 and more, its values are -129"),
+  ):
+    code, _, said = wrap(scan, "-o", "none", *words)
+    assert code == 2 and wrong in said and said.count("\n") == 1
+  code, _, said = wrap(_mesh(tmp_path / "organ.ply"), "-o", "none", "--threshold", 3)
+  assert code == 2 and "--threshold goes with a volume" in said
+  (tmp_path / "series").mkdir()
+  code, _, said = wrap("series", "-o", "none")
+  assert code == 2 and "a DICOM series needs --threshold" in said
+  code, _, said = wrap("series", "-o", "none", "--threshold", 3)
+  assert code == 2 and "holds 0 DICOM slices" in said
+  code, _, said = wrap("series", "-o", "series", "--force", "--threshold", 3)
+  assert code == 2 and "--force writes into" in said
+
+
 def test_what_is_in_a_folder_is_not_lost(tmp_path, wrap):
   mesh, out, elsewhere = _mesh(tmp_path / "organ.obj"), tmp_path / "out", tmp_path / "elsewhere"
   (out / "assets").mkdir(parents=True)

@@ -30,7 +30,8 @@ def assert_good(vertices, triangles, nodes):
   assert q.closed, q
   assert q.nodes == nodes
   assert q.min_angle > 20, q
-  assert q.min_valence >= 4 and q.max_valence <= 9, q
+  valence = np.bincount(triangles.ravel())
+  assert valence.min() >= 4 and valence.max() <= 9
 
 
 @pytest.mark.parametrize("nodes", [250, 1000])
@@ -86,7 +87,7 @@ def test_nodes_lie_on_the_shape():
 @pytest.mark.parametrize("name", ORGANS)
 def test_patches_and_landmarks_are_on_the_organ(name):
   vertices, triangles = mesh(name, 250, 4)
-  spacing = np.sqrt(quality(vertices, triangles).area / 250)
+  spacing = np.sqrt(np.linalg.norm(normals(vertices, triangles), axis=1).sum() / 2 / 250)
   for patch, nodes in shapes.patches(name, vertices, 4).items():
     assert 3 <= len(nodes) < 100, patch
     assert nodes.max() < len(vertices)
@@ -130,9 +131,10 @@ def test_inclusion_is_a_bell():
 
 @pytest.mark.parametrize("frequency", [1, 2, 8])
 def test_octasphere_is_regular(frequency):
-  q = quality(*octasphere(frequency))
+  vertices, triangles = octasphere(frequency)
+  q, valence = quality(vertices, triangles), np.bincount(triangles.ravel())
   assert q.closed and q.nodes == 4 * frequency**2 + 2
-  assert (q.min_valence, q.max_valence) == (4, 6 if frequency > 1 else 4)
+  assert (valence.min(), valence.max()) == (4, 6 if frequency > 1 else 4)
 
 
 @pytest.mark.parametrize("name", ORGANS)
@@ -169,7 +171,7 @@ def test_quality_of_known_meshes():
   corner = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], float)
   solid = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
   q = quality(corner, solid)
-  assert q.closed and q.genus == 0 and (q.min_valence, q.max_valence) == (3, 3)
+  assert q.closed and q.genus == 0
   assert q.volume == pytest.approx(1 / 6)
   assert q.min_angle == pytest.approx(45)
   assert not quality(corner, solid[:, ::-1]).closed  # inside out

@@ -14,7 +14,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse import csgraph
 
-from .fill import FACES, joined
+from .fill import FACES, flips, joined, key_of
 from .mesh import Mesh, among, build, distinct
 
 MORE = 6  # neighbours beyond those of any vertex that one may have by cuts
@@ -35,16 +35,16 @@ def cuttable(surface: Mesh, solid: Mesh) -> Mesh:
   mesh, elem = joined(surface, solid.rest[first:], tet), surface.elem
   mate = _mates(tet)
   corner = corners(np.flatnonzero(mate < 0))
-  known = _key(tet.ravel()[corner], mesh.nvert)
+  known = key_of(tet.ravel()[corner], mesh.nvert)
   order = np.argsort(known)
 
   def find(triangle):
-    key = _key(triangle, mesh.nvert)
+    key = key_of(triangle, mesh.nvert)
     at = order[np.searchsorted(known, key, sorter=order).clip(0, len(order) - 1)]
     return np.where(known[at] == key, at, -1)
 
   at = find(elem)
-  for s, t, others in _flips(elem, np.flatnonzero(at < 0)):
+  for s, t, others in flips(elem, np.flatnonzero(at < 0)):
     found = find(others)
     if (found >= 0).all() and at[s] < 0 and at[t] < 0:
       at[[s, t]] = found
@@ -86,30 +86,13 @@ def room(mesh: Mesh) -> np.ndarray:
 
 def _mates(tet: np.ndarray) -> np.ndarray:
   """Returns the face on the other side of each face, -1 for none, (4 ntet,)."""
-  face = np.sort(tet[:, FACES].reshape(-1, 3), axis=1)
-  key = _key(face, int(tet.max(initial=0)) + 1, ordered=True)
+  key = key_of(tet[:, FACES].reshape(-1, 3), int(tet.max(initial=0)) + 1)
   order = np.argsort(key, kind="stable")
   same = np.flatnonzero(key[order][1:] == key[order][:-1])
   out = np.full(len(key), -1)
   a, b = order[same], order[same + 1]
   out[a], out[b] = b, a
   return out
-
-
-def _key(corner: np.ndarray, n: int, ordered: bool = False) -> np.ndarray:
-  a, b, c = (corner if ordered else np.sort(corner, axis=1)).T
-  return (a * n + b) * n + c
-
-
-def _flips(elem: np.ndarray, missing: np.ndarray):
-  """Yields pairs of triangles that share an edge, and the two across the other diagonal."""
-  beside: dict[frozenset, tuple[int, int]] = {}
-  for t in missing:
-    for k in range(3):
-      a, b, p = (int(elem[t, (k + i) % 3]) for i in range(3))
-      s, q = beside.setdefault(frozenset((a, b)), (int(t), p))
-      if s != t:
-        yield s, int(t), np.array([[p, q, a], [p, q, b]])
 
 
 def _patches(elem: np.ndarray, some: np.ndarray) -> list[np.ndarray]:

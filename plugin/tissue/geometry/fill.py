@@ -259,7 +259,7 @@ def _inside(point: np.ndarray, triangle: np.ndarray, nsurface: int) -> tuple[np.
   tet, neighbour = _joined(point)
   face = tet[:, FACES]
   has = (face < nsurface).all(axis=2)
-  known = np.where(has, _key(np.minimum(face, nsurface - 1), nsurface), -1)
+  known = np.where(has, key_of(np.minimum(face, nsurface - 1), nsurface), -1)
   wanted, faulty = _flipped(triangle, np.unique(known), nsurface)
   if faulty >= 0:
     return tet, faulty
@@ -275,7 +275,7 @@ def _inside(point: np.ndarray, triangle: np.ndarray, nsurface: int) -> tuple[np.
   at = order[np.searchsorted(wanted, known[which, corner], sorter=order)]
   side = point[tet[which, corner]] - point[triangle[at, 0]]
   height = (side * area_vectors(point, triangle)[at]).sum(axis=1)
-  sure = wanted[at] == _key(triangle[at], nsurface)  # others were flipped
+  sure = wanted[at] == key_of(triangle[at], nsurface)  # others were flipped
   within = np.bincount(part[which], np.where(sure, np.sign(height), 0), count)[part] < 0
   tet = np.where((volumes(point, tet) < 0)[:, None], tet[:, [0, 2, 1, 3]], tet)
   # A flat one has a pair of the surface's triangles; without it they have the other diagonal.
@@ -302,7 +302,7 @@ def _joined(point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
   return hull.simplices[low].astype(np.int64), number[hull.neighbors[low]]
 
 
-def _key(corner: np.ndarray, n: int) -> np.ndarray:
+def key_of(corner: np.ndarray, n: int) -> np.ndarray:
   """Returns a number for the three vertices of each triangle, of n."""
   a, b, c = np.moveaxis(np.sort(corner, axis=-1), -1, 0)
   return (a * n + b) * n + c
@@ -313,22 +313,25 @@ def _flipped(triangle: np.ndarray, known: np.ndarray, n: int) -> tuple[np.ndarra
 
   Where two that share an edge are not, the two across the other diagonal may be.
   """
-  key = _key(triangle, n)
+  key = key_of(triangle, n)
   missing = np.flatnonzero(~np.isin(key, known))
   if not missing.size:
     return key, -1
-  apexes: dict[tuple[int, int], list[tuple[int, int]]] = {}
-  for t in missing:
-    for k in range(3):
-      a, b, apex = (int(triangle[t, (k + i) % 3]) for i in range(3))
-      apexes.setdefault((min(a, b), max(a, b)), []).append((int(t), apex))
   left, faces = set(missing.tolist()), set(known.tolist())
-  for (a, b), sides in apexes.items():
-    if len(sides) < 2 or not {sides[0][0], sides[1][0]} <= left:
-      continue
-    (s, p), (t, q) = sides
-    flipped = _key(np.array([[p, q, a], [p, q, b]]), n)
-    if faces >= set(flipped.tolist()):
+  for s, t, others in flips(triangle, missing):
+    flipped = key_of(others, n)
+    if {s, t} <= left and faces >= set(flipped.tolist()):
       key[[s, t]] = flipped
       left -= {s, t}
   return key, min(left, default=-1)
+
+
+def flips(elem: np.ndarray, some: np.ndarray):
+  """Yields pairs of triangles that share an edge, and the two across the other diagonal."""
+  beside: dict[frozenset, tuple[int, int]] = {}
+  for t in some:
+    for k in range(3):
+      a, b, p = (int(elem[t, (k + i) % 3]) for i in range(3))
+      s, q = beside.setdefault(frozenset((a, b)), (int(t), p))
+      if s != t:
+        yield s, int(t), np.array([[p, q, a], [p, q, b]])

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import os
+from collections.abc import Iterator
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -33,7 +35,7 @@ def read(organ: str, file: str, mesh: Mesh) -> Mesh:
       point, tet = _parse(stream.read().split())
   except OSError as error:
     raise ValueError(f"{where}: {error.strerror}, expected a Gmsh file") from None
-  except (ValueError, IndexError, KeyError):
+  except (ValueError, KeyError):
     raise ValueError(
       f"{where}, which cannot be read: expected a Gmsh file as text, version 2 or 4.1"
     ) from None
@@ -44,59 +46,51 @@ def read(organ: str, file: str, mesh: Mesh) -> Mesh:
 
 def _parse(words: list[str]) -> tuple[np.ndarray, np.ndarray]:
   """Returns nodes (n, 3) and tetrahedra (m, 4) of the words of a file."""
-  version = words[words.index("$MeshFormat") + 1]
-  if words[words.index("$MeshFormat") + 2] != "0" or version not in ("2", "2.1", "2.2", "4.1"):
+  version, kind = words[words.index("$MeshFormat") + 1 :][:2]
+  if kind != "0" or version not in ("2", "2.1", "2.2", "4.1"):
     raise ValueError
-  parse = _blocks if version == "4.1" else _lines
-  parts = [words[words.index(f"${part}") + 1 :] for part in ("Nodes", "Elements")]
-  names, point, tet = parse(*parts)
+  parts = (iter(words[words.index(f"${part}") + 1 :]) for part in ("Nodes", "Elements"))
+  names, point, tet = (_blocks if version == "4.1" else _lines)(*parts)
   number = {name: k for k, name in enumerate(names)}
   corner = [[number[name] for name in four] for four in tet]
   return np.array(point, float).reshape(-1, 3), np.array(corner, np.int64).reshape(-1, 4)
 
 
-def _lines(nodes: list[str], elements: list[str]) -> tuple[list, list, list]:
+def _lines(nodes: Iterator[str], elements: Iterator[str]) -> tuple[list, list, list]:
   """Returns names and places of nodes, and names of tetrahedra's corners, of version 2."""
-  rows = [nodes[k : k + 4] for k in range(1, 4 * _count(nodes[0], 4, nodes) + 1, 4)]
-  tet, at = [], 1
-  for _ in range(_count(elements[0], 3, elements)):
-    kind, tags = int(elements[at + 1]), _count(elements[at + 2], 1, elements)
-    end = at + 3 + tags + _CORNERS[kind]
-    if kind == _TETRAHEDRON:
-      tet.append(elements[end - 4 : end])
-    at = end
+  rows = [_take(nodes, 4) for _ in range(int(*_take(nodes, 1)))]
+  tet = []
+  for _ in range(int(*_take(elements, 1))):
+    _, kind, tags = map(int, _take(elements, 3))
+    corners = _take(elements, tags + _CORNERS[kind])[tags:]
+    tet += [corners] if kind == _TETRAHEDRON else []
   return [row[0] for row in rows], [row[1:] for row in rows], tet
 
 
-def _blocks(nodes: list[str], elements: list[str]) -> tuple[list, list, list]:
+def _blocks(nodes: Iterator[str], elements: Iterator[str]) -> tuple[list, list, list]:
   """Returns the same of version 4.1, where both come in blocks."""
-  names, point, at = [], [], 4
-  for _ in range(_count(nodes[0], 4, nodes)):
-    count = _count(nodes[at + 3], 4, nodes)
-    if nodes[at + 2] != "0":  # with parameters behind the places
+  names, point, tet = [], [], []
+  for _ in range(int(_take(nodes, 4)[0])):
+    _, _, parametric, count = map(int, _take(nodes, 4))
+    if parametric:  # with parameters behind the places
       raise ValueError
-    at += 4
-    names += nodes[at : at + count]
-    point += [nodes[k : k + 3] for k in range(at + count, at + 4 * count, 3)]
-    at += 4 * count
-  tet, at = [], 4
-  for _ in range(_count(elements[0], 4, elements)):
-    kind = int(elements[at + 2])
+    names += _take(nodes, count)
+    point += _take(nodes, 3 * count)
+  for _ in range(int(_take(elements, 4)[0])):
+    _, _, kind, count = map(int, _take(elements, 4))
     step = 1 + _CORNERS[kind]
-    count = _count(elements[at + 3], step, elements)
-    at += 4
+    flat = _take(elements, step * count)
     if kind == _TETRAHEDRON:
-      tet += [elements[k + 1 : k + step] for k in range(at, at + step * count, step)]
-    at += step * count
+      tet += [flat[k + 1 : k + step] for k in range(0, len(flat), step)]
   return names, point, tet
 
 
-def _count(word: str, size: int, words: list[str]) -> int:
-  """Returns a count of what takes `size` words each; ValueError where there are fewer words."""
-  count = int(word)
-  if not 0 <= size * count <= len(words):
+def _take(words: Iterator[str], count: int) -> list[str]:
+  """Returns the next words; ValueError where there are fewer, so that no count is believed."""
+  taken = list(itertools.islice(words, count))
+  if len(taken) < count:
     raise ValueError
-  return count
+  return taken
 
 
 # Corners of Gmsh's elements of first order: line, triangle, quadrangle, tetrahedron and so on; 15

@@ -12,7 +12,7 @@ import dataclasses
 import functools
 
 import numpy as np
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, diags_array, vstack
 from scipy.sparse.linalg import SuperLU, splu
 
 LEVELS = (1, 2, 3, 4)
@@ -84,30 +84,22 @@ def _edges(elem: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
   return edge, number, np.bincount(number.ravel(), minlength=len(edge))
 
 
-def _matrix(rows: list, columns: list, values: list, shape: tuple[int, int]) -> csr_array:
-  parts = (np.concatenate([np.ravel(part) for part in each]) for each in (values, rows, columns))
-  value, row, column = parts
-  return csr_array((value, (row, column)), shape=shape)
-
-
 def _divide(elem: np.ndarray) -> tuple[csr_array, np.ndarray]:
   """Returns a step of subdivision as a matrix, and the triangles after it."""
   n = int(elem.max()) + 1
   edge, side, count = _edges(elem)
   border = count < 2
-  corner = elem[:, [2, 0, 1]]  # opposite to each side
-  near = np.where(border, 0.5, 0.375)
-  inner = ~border[side]
-  rows = [n + np.arange(len(edge))] * 2 + [n + side[inner]]
-  columns = [edge[:, 0], edge[:, 1], corner[inner]]
-  values = [near, near, np.full(int(inner.sum()), 0.125)]
-  around = _around(n, edge, border, beta=lambda k: _beta(k), border_share=0.125)
-  for each, part in zip((rows, columns, values), around, strict=True):
-    each.extend(part)
+  ends = np.repeat(np.arange(len(edge)), 2), edge.ravel()
+  shape = len(edge), n
+  middle = csr_array((np.repeat(np.where(border, 0.5, 0.375), 2), ends), shape=shape)
+  inner, corner = ~border[side], elem[:, [2, 0, 1]]  # opposite to each side
+  opposite = np.full(int(inner.sum()), 0.125)
+  middle += csr_array((opposite, (side[inner], corner[inner])), shape=shape)
   a, b, c = elem.T
   ab, bc, ca = (n + side).T
   fine = np.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], axis=1).reshape(-1, 3)
-  return _matrix(rows, columns, values, (n + len(edge), n)), fine.astype(np.int32)
+  step = vstack([_around(n, edge, border, _beta, 0.125), middle], format="csr")
+  return csr_array(step), fine.astype(np.int32)
 
 
 def _beta(degree: np.ndarray) -> np.ndarray:
@@ -117,24 +109,18 @@ def _beta(degree: np.ndarray) -> np.ndarray:
 
 def _limit(elem: np.ndarray) -> csr_array:
   """Returns where the vertices end after infinitely many steps, as a matrix."""
-  n = int(elem.max()) + 1
   edge, _, count = _edges(elem)
-
-  def beta(degree: np.ndarray) -> np.ndarray:
-    return 1 / (3 / (8 * _beta(degree)) + degree)
-
-  return _matrix(*_around(n, edge, count < 2, beta, border_share=1 / 6), (n, n))
+  n = int(elem.max()) + 1
+  return _around(n, edge, count < 2, lambda k: 1 / (3 / (8 * _beta(k)) + k), 1 / 6)
 
 
-def _around(n: int, edge: np.ndarray, border: np.ndarray, beta, border_share: float):
-  """Returns rows, columns and values of vertices as means of themselves and their neighbours."""
+def _around(n: int, edge: np.ndarray, border: np.ndarray, beta, border_share: float) -> csr_array:
+  """Returns the matrix of vertices as means of themselves and their neighbours."""
   both = np.concatenate([edge, edge[:, ::-1]])
   on_border = np.zeros(n, bool)
   on_border[edge[border]] = True
-  of_border = np.concatenate([border, border])
-  kept = np.where(on_border[both[:, 0]], of_border, True)
-  both = both[kept]
+  both = both[~on_border[both[:, 0]] | np.concatenate([border, border])]
   degree = np.bincount(both[:, 0], minlength=n)
   share = np.where(on_border, border_share, beta(np.maximum(degree, 1)))
-  own = 1 - share * degree
-  return [both[:, 0], np.arange(n)], [both[:, 1], np.arange(n)], [share[both[:, 0]], own]
+  near = csr_array((share[both[:, 0]], both.T), shape=(n, n))
+  return csr_array(near + diags_array(1 - share * degree))

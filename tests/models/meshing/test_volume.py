@@ -269,5 +269,5 @@ def test_files_that_are_no_label_maps(tmp_path):
     volumes.read(path)
   path = tmp_path / "many.nii"
   nibabel.save(nibabel.Nifti1Image(np.ones((4, 4, 4, 3), np.int16), affine), path)
-  with pytest.raises(ValueError, match="has 4 dimensions, expected a label map with 3"):
+  with pytest.raises(ValueError, match="has 4 dimensions, expected a volume with 3"):
     volumes.read(path)
