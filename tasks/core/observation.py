@@ -136,7 +136,8 @@ def _segmentation(camera: Camera, physics: Physics) -> np.ndarray:
   kind, name = found[..., 1], found[..., 0]
   out = np.zeros(kind.shape, np.uint8)
   flex, site, geom = (mj.mjtObj.mjOBJ_FLEX, mj.mjtObj.mjOBJ_SITE, mj.mjtObj.mjOBJ_GEOM)
-  out[(kind == flex) & (name == mj.mj_name2id(model, flex, physics.organ_name))] = LABELS["organ"]
+  organ = [mj.mj_name2id(model, flex, physics.organ_name + part) for part in ("", "_inside")]
+  out[(kind == flex) & np.isin(name, organ)] = LABELS["organ"]
   out[(kind == mj.mjtObj.mjOBJ_SKIN) & (name == physics.organ.skin)] = LABELS["organ"]
   out[(kind == site) & np.isin(name, physics.target_sites)] = LABELS["target"]
   hands = tuple(hand.prefix for hand in physics.hands)

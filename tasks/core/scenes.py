@@ -19,6 +19,7 @@ import numpy as np
 import palpate
 from palpate.models import catalog, mjcf, scenery, shapes, situs, trocar
 from palpate.models.catalog import Tissue
+from palpate.tissue.geometry.mesh import vertex_normals
 
 NOW, LATER = (1.0, 0.8, 0.1), (0.2, 0.75, 0.95)  # colours of targets
 ORGAN = "organ"
@@ -43,6 +44,7 @@ _SLOTS = {"probe": 40, "grasper": 48, "scalpel": 40, "hook": 24}
 _IMPRATIO = {"probe": 3, "grasper": 10, "scalpel": 3}
 # Foundation of an organ that comes away from its bed [Pa/m]; ours: what lies around it lets go too.
 _LOOSE = 3e3
+_FILM = (0.0045, 0.0045, 0.0012)  # of the film where a bond is, and of the raw bed [m]
 _TURN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # organ's frame to world
 
 
@@ -196,6 +198,12 @@ def build(scene: Scene) -> mujoco.MjSpec:
     uv = scenery.texcoord(scene.organ, vertices @ _TURN, triangles)
     view = center + scene.camera, center
     situs.surround(spec, ORGAN, scene.organ, uv, view, arrangement=held)
+    flat, outward = mujoco.mjtGeom.mjGEOM_ELLIPSOID, vertex_normals(vertices, triangles)
+    for node in bed(*shape) if scene.bonds else ():
+      turn = trocar.aim(np.zeros(3), outward[node])
+      spec.worldbody.add_site(
+        name=f"{BED}{node}", type=flat, pos=vertices[node], quat=turn, size=_FILM
+      )
   if scene.surroundings != "none":
     situs.obstruct(spec, [n for n in situs.NAMES if n != scene.organ], scene.organ, held)
   return spec

@@ -153,7 +153,8 @@ class Dissect(Freeing, Hold):
     self.show(physics)
 
   def show(self, physics: Physics) -> None:
-    """Marks the site."""
+    """Marks the site, and shows the bed."""
+    super().show(physics)
     physics.mark(0, physics.point(self.site), now=True)
 
   def instruct(self, physics: Physics) -> str:
