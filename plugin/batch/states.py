@@ -192,7 +192,7 @@ def keep(batch: Worlds, starts: list[tuple[Any, Any]], data: mujoco.MjData):
   saved = [(array, wp.clone(array[:1])) for array in changed if array.size]
   push(batch, 0, data)
   for array, start in pairs:
-    wp.copy(start, array[:1])
+    wp.copy(start.flatten(), array[:1].flatten())
   for array, row in saved:
     wp.copy(array[:1], row)
 
