@@ -91,7 +91,7 @@ class Pressed:
   pressed: floats("nworld", "many")
 
 
-find_compliance = kernel(
+_find_compliance = kernel(
   "find_compliance",
   "coupling/world_contacts.h",
   Pressed,
@@ -177,7 +177,7 @@ def keep_closed(p, device):
   """Makes contacts firm, and keeps those that slide closed."""
   dim = p.geom.shape
   if p.yields:
-    launch(find_compliance, p, dim[0], p.ntool, device)
+    launch(_find_compliance, p, dim[0], p.ntool, device)
   wp.launch(_closed, dim=dim, inputs=[p], device=device)
 
 
