@@ -1,6 +1,6 @@
 """What the inside of a solid has in `Shape` and `Tissue`, as `tissue/tets.h` writes it.
 
-`solid` makes the arrays of all of it so, and `resolid` writes those that a cut has changed.
+`solid` makes the arrays of all of it so, and `cutting.refill` writes those that a cut has changed.
 """
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
