@@ -184,7 +184,8 @@ def keep(batch: Worlds, starts: list[tuple[Any, Any]], data: mujoco.MjData):
         f"organ {organ.name!r}: data has cuts, which a batch on a GPU cannot start with; cut after "
         "a reset"
       )
-  pairs = [*starts, *(pair for organ in organs for pair in organ.host.kept.values() if pair[0].size)]
+  beside = (pair for organ in organs for pair in organ.host.kept.values())
+  pairs = [*starts, *(pair for pair in beside if pair[0].size)]
   # The first world has it for a moment.
   changed = [array for array, _ in pairs] + [d.ctrl, d.time, d.qacc_warmstart]
   saved = [(array, wp.clone(array[:1])) for array in changed if array.size]
