@@ -6,9 +6,11 @@ import dataclasses
 import math
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from . import losses, necks, raster
+from . import losses, raster
 from .field import Field
 from .grid import shrink
 from .quality import normals, quality
@@ -21,6 +23,7 @@ _REACHES = (0.65, 1.5, 3.5)  # of the grid's spacing
 _LEAST_COVERED = 0.8  # of the surface; with less too much has no inside: it is open
 _MOST_VOXELS = 2e7
 _EVEN = "method='even' makes an organ with them"
+_THIN = 0.25  # volume over area of a tube, in edges; half of its radius
 _LOST = 1.0  # of an edge: what sticks out so far of a mesh of so many nodes is too thin for them
 
 
@@ -144,7 +147,7 @@ def _trim(solid: Solid, fine: Mesh, nodes: int) -> tuple[Solid, Mesh, Mesh]:
   rough = remesh(*fine, nodes, solid.field.projector(), iterations=5)
   edge = quality(*rough).spacing
   made = raster.inside(rough, solid.grid)
-  for tube in necks.tubes(*rough, edge):
+  for tube in _tubes(*rough, edge):
     made &= ~raster.inside((rough[0], tube), solid.grid)
   lost = losses.regions(
     (solid.field.value < -solid.shell) & ~made,
@@ -158,6 +161,46 @@ def _trim(solid: Solid, fine: Mesh, nodes: int) -> tuple[Solid, Mesh, Mesh]:
   if quality(*cut).genus > quality(*fine).genus or len(cut[0]) < nodes:
     return solid, fine, rough
   return trimmed, cut, remesh(*cut, nodes, trimmed.field.projector(), iterations=5)
+
+
+def _tubes(vertices: np.ndarray, triangles: np.ndarray, edge: float) -> list[np.ndarray]:
+  """Returns the triangles of tubes that are three nodes around, each with a lid.
+
+  A loop of three edges that are no triangle's is a neck; what is behind it is a tube, if that is
+  thin too: a vessel is, a lobe on a thin stalk is not.
+
+  Args:
+    vertices: nodes [m]           (n, 3)
+    triangles: between them       (m, 3)
+    edge: their mean edge [m]
+  """
+  edges, out = Edges(triangles, len(vertices)), []
+  for neck in _loops(edges, triangles):
+    behind = triangles[_behind(edges, neck, len(triangles))]
+    area = np.linalg.norm(normals(vertices, behind), axis=1).sum() / 2
+    a, b, c = (vertices[behind[:, k]] - vertices[neck[0]] for k in range(3))
+    if abs((a * np.cross(b, c)).sum() / 6) < _THIN * edge * area:
+      out.append(np.concatenate([behind, neck[None]]))
+  return out
+
+
+def _loops(edges: Edges, triangles: np.ndarray) -> np.ndarray:
+  """Returns loops of three edges that are no triangle, (k, 3)."""
+  (a, b), nodes = edges.vert.T, len(edges.valence)
+  both = np.concatenate([a, b]), np.concatenate([b, a])
+  joined = coo_array((np.ones(2 * len(a)), both), shape=(nodes, nodes)).tocsr()
+  edge, third = joined[a].multiply(joined[b]).nonzero()
+  loops = np.unique(np.sort(np.column_stack([edges.vert[edge], third]), axis=1), axis=0)
+  own = {tuple(t) for t in np.sort(triangles, axis=1).tolist()}
+  return np.array([t for t in loops.tolist() if tuple(t) not in own], dtype=int).reshape(-1, 3)
+
+
+def _behind(edges: Edges, neck: np.ndarray, count: int) -> np.ndarray:
+  """Returns which triangles are on the side of a loop that has fewer of them, if it has two."""
+  open_ = ~np.isin(edges.vert, neck).all(axis=1)
+  link = coo_array((np.ones(open_.sum()), edges.tri[open_].T), shape=(count, count))
+  parts, label = connected_components(link, directed=False)
+  return (label == np.bincount(label).argmin()) & (parts > 1)
 
 
 def _clinging(target: Target, solid: Solid) -> Project:
