@@ -16,6 +16,7 @@ from palpate.tissue.geometry import subdivide
 from palpate.tissue.geometry.mesh import vertex_areas, vertex_normals
 from scipy.interpolate import CubicSpline
 from scipy.spatial import KDTree
+from scipy.spatial.distance import cdist
 
 from . import catalog, markup, texture
 from .meshing import grid
@@ -195,22 +196,16 @@ def balls(surface: Surface, count: int) -> tuple[np.ndarray, np.ndarray]:
   """
   x, normal = surface.vertices, vertex_normals(surface.vertices, surface.triangles)
   height = (x * normal).sum(axis=1)[:, None] - normal @ x.T - _POKE  # below each vertex
-  radii = np.where(height > 0, _squares(x, x) / (2 * np.maximum(height, 1e-9)), _ROUND)
+  radii = np.where(height > 0, cdist(x, x, "sqeuclidean") / (2 * np.maximum(height, 1e-9)), _ROUND)
   radii = radii.min(axis=1)
   centers = x - radii[:, None] * normal
-  gap = np.sqrt(_squares(centers, x)) - radii[:, None]
+  gap = cdist(centers, x) - radii[:, None]
   near, left = (np.abs(gap) < _NEAR).astype(float), vertex_areas(x, surface.triangles)
   chosen = []
   for _ in range(count):  # `left` is the area that none is near to yet
     chosen.append(int((near @ left).argmax()))
     left = left * (1 - near[chosen[-1]])
   return centers[chosen], radii[chosen]
-
-
-def _squares(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-  """Returns the squares of the distances between points  (len(a), len(b))."""
-  square = (a * a).sum(axis=1)[:, None] + (b * b).sum(axis=1) - 2 * a @ b.T
-  return np.maximum(square, 0.0)
 
 
 def bumps(seed: int, size: float, height: float):

@@ -46,7 +46,7 @@ _FADE = (0.55, 0.0, 0.45 / 0.15**2)
 _BALLS = {"liver": 20, "stomach": 10, "gallbladder": 6, "fat": 16}
 _WALL = ((-0.01, 0.09, 0.035), (0.175, 0.21, 0.175), 2.4)
 _SOFT = {"solref": (0.3, 1.0), "solimp": (0.01, 0.01, 0.001, 0.5, 2.0), "condim": 1, "priority": 1}
-_INSIDE, _WITHIN = 2, 4
+_INSIDE, _WITHIN, _HIDDEN = 2, 4, 4  # and the group that nobody draws
 _JAW = (0.0025, 0.0215)  # of closed jaws: radius, and from the tip to their pivot [m]
 _VIEW = ((0.0, 0.175, 0.135), (0.0, 0.03, 0.005))  # of `abdomen`'s camera: from, to [m]
 
@@ -264,23 +264,19 @@ def _placed(
 
 
 @functools.cache
-def _surface(name: str) -> Surface:
+def _surface(name: str, fine: bool = True) -> Surface:
   """Returns an organ's surface, or that of the fat or the wall, which are ours."""
   if name == "fat":
-    return scenery.sheet(_fat, (-0.17, -0.06), (0.15, 0.27), (54, 56))
+    return scenery.sheet(_fat, (-0.17, -0.06), (0.15, 0.27), (54, 56) if fine else (36, 36))
   if name == "wall":
     return scenery.shell(*_WALL, (44, 30))
-  return scenery.to_world(scenery.organ(name, _LEVELS[name]))
+  return scenery.to_world(scenery.organ(name, _LEVELS[name] if fine else 0))
 
 
 @functools.cache
 def _balls(name: str) -> tuple[np.ndarray, np.ndarray]:
   """Returns the balls in the place of an organ or of the fat, see `scenery.balls`."""
-  if name == "fat":
-    surface = scenery.sheet(_fat, (-0.17, -0.06), (0.15, 0.27), (36, 36))
-  else:
-    surface = scenery.to_world(scenery.organ(name, 0))
-  return scenery.balls(surface, _BALLS[name])
+  return scenery.balls(_surface(name, fine=False), _BALLS[name])
 
 
 def obstruct(
@@ -306,7 +302,7 @@ def obstruct(
   wall = body.add_body()  # planes have no bounds: beside them MuJoCo would try every ball
 
   def add(on: mujoco.MjsBody, meets: int, **shape: Any) -> None:
-    on.add_geom(contype=0, conaffinity=meets, group=skins.HIDDEN, mass=0, **_SOFT, **shape)
+    on.add_geom(contype=0, conaffinity=meets, group=_HIDDEN, mass=0, **_SOFT, **shape)
 
   every = [(_balls(name), pos) for name, _, pos in _placed(organs, around, held) if name in _BALLS]
   if more is not None:
@@ -333,7 +329,7 @@ def obstruct(
           size=[_JAW[0], 0, 0],
           contype=_INSIDE | _WITHIN,
           conaffinity=0,
-          group=skins.HIDDEN,
+          group=_HIDDEN,
           mass=0,
         )
       shaft = spec.geom(f"{prefix}shaft")

@@ -6,6 +6,7 @@ Sizes are named: nworld worlds, nvert nodes, nelem triangles, naction components
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 import warp as wp
 from palpate.tasks.core.physics import COARSE, NEAR
+from palpate.tasks.core.rules import OUTCOMES
 from palpate.tissue.types import Array, doubles, floats, ints, struct
 
 flags = Array(wp.bool, ("nworld",))
@@ -114,8 +115,7 @@ class Common:
   progress: floats("nworld", 1)
 
 
-OUTCOMES = (None, "success", "damage", "missed")
-RUNNING, SUCCESS, DAMAGED, MISSED = wp.constant(0), wp.constant(1), wp.constant(2), wp.constant(3)
+RUNNING, SUCCESS, DAMAGED, MISSED = (wp.constant(k) for k in range(len(OUTCOMES)))
 # Common by the names of the observations and of Gymnasium's information, where those differ.
 OBSERVED = {"drive": "drive_error"}
 INFO = {

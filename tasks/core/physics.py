@@ -308,10 +308,6 @@ class Physics(Instrument, Portable):
     self.data.site_xpos[site] = pos
     self.model.site_rgba[site, 3] = 0.9 if shown else 0.0
 
-  def unmark(self, indices: np.ndarray) -> None:
-    """Hides target sites."""
-    self.model.site_rgba[np.array(self.target_sites)[indices], 3] = 0.0
-
 
 def check_scene(
   model: mj.MjModel, prefix: str, targets: int, organ: str, handle: bool = False

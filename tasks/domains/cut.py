@@ -310,7 +310,8 @@ class Cut(Task):
 
   def show(self, physics: Physics) -> None:
     """Takes the line away where it is cut: there are the lips of the cut."""
-    physics.unmark(np.flatnonzero(self.cut[self._marked]))
+    cut = self.cut[self._marked] > 0
+    physics.model.site_rgba[np.array(physics.target_sites)[cut], 3] = 0.0
 
   def label(self, kind: str) -> str:
     """Returns what damage is."""
