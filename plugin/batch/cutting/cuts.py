@@ -111,7 +111,7 @@ class Cuts:
 
   def mesh_of(self, world: int) -> Mesh:
     """Returns the mesh of a world, as it was when `follow` was called."""
-    return self._worlds[world].mesh if world in self._worlds else self.whole
+    return self._of(world).mesh
 
   def is_full(self, world: int) -> bool:
     """Returns whether a world has no spare vertex left, as `mesh_of` has it."""
@@ -121,12 +121,12 @@ class Cuts:
   def mass(self, world: int) -> np.ndarray:
     """Returns the masses of its vertices, as compiled [kg], (nvert,)."""
     self.follow()
-    return self._worlds[world].mass if world in self._worlds else self._organ.declared.mass
+    return self._of(world).mass
 
   def reports(self, world: int) -> list[Report]:
     """Returns what the cuts of a world did."""
     self.follow()
-    return list(self._worlds[world].reports) if world in self._worlds else []
+    return list(self._of(world).reports)
 
   def pieces(self, world: int) -> list[Piece]:
     """Returns the parts of a world's organ that hang together, the heaviest first."""
@@ -217,9 +217,8 @@ class Cuts:
 
   def _of(self, world: int) -> World:
     """Returns a world, that of the first mesh until it is cut."""
-    if world in self._worlds:
-      return self._worlds[world]
-    return World(**vars(self._topology.first), pieces=self._whole_count)
+    known = self._worlds.get(world)
+    return known or World(**vars(self._topology.first), pieces=self._whole_count)
 
   def _become(self, world: int, had: World, now: World, changed: np.ndarray):
     """Writes the row of a world, in which triangles have changed."""

@@ -1,8 +1,8 @@
 // What is around a cut in a solid goes on with no more energy than it had.
 //
 // Means over nodes are finer where a node has become two, and by convexity have no less energy at the same
-// positions. So where a cut has raised the energy, what came apart gives way along its forces by as little as
-// puts that right: some hundredths of an edge. Masses go with the tissue, from which what was moved at rest
+// positions. So where a cut has raised the energy, what came apart gives way along its forces until that is put
+// right: by some hundredths of an edge. Masses go with the tissue, from which what was moved at rest
 // has another part then. Velocities keep momentum and angular momentum, and as much of what they have besides
 // as the energy allows.
 #pragma once
