@@ -1,76 +1,14 @@
 """Small kernels of batches on a device: resets, counts, and states in the user's layout."""
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
+from typing import Any
+
 import warp as wp
 from palpate.tissue.types import Array, doubles, floats, ints, struct
 
 from .patch import Patch
 
 HELD = wp.constant(1.0 - 2.0**-24)  # the most damage that leaves a bond, in float32
-
-
-@struct
-class Start:
-  """What of mujoco_warp's data a reset puts back, and where to."""
-
-  mask: Array(wp.bool, ("nworld",))  # worlds to reset
-  qpos0: floats("nq")
-  qvel0: floats("nv")
-  act0: floats("na")
-  geom_xpos0: Array(wp.vec3, ("ngeom",))  # [m]
-  geom_xmat0: Array(wp.mat33, ("ngeom",))
-  mocap_pos0: Array(wp.vec3, ("nmocap",))
-  mocap_quat0: Array(wp.quat, ("nmocap",))
-  eq_active0: Array(wp.bool, ("neq",))
-  time: floats("nworld")
-  qpos: floats("nworld", "nq")
-  qvel: floats("nworld", "nv")
-  act: floats("nworld", "na")
-  ctrl: floats("nworld", "nu")
-  qacc: floats("nworld", "nv")
-  qacc_warmstart: floats("nworld", "nv")
-  qfrc_applied: floats("nworld", "nv")
-  xfrc_applied: Array(wp.spatial_vector, ("nworld", "nbody"))
-  sensordata: floats("nworld", "nsensordata")
-  eq_active: Array(wp.bool, ("nworld", "neq"))
-  mocap_pos: Array(wp.vec3, ("nworld", "nmocap"))
-  mocap_quat: Array(wp.quat, ("nworld", "nmocap"))
-  geom_xpos: Array(wp.vec3, ("nworld", "ngeom"))
-  geom_xmat: Array(wp.mat33, ("nworld", "ngeom"))
-  overflow: ints("nworld")
-
-
-@wp.kernel(enable_backward=False)
-def reset(s: Start):
-  """Puts the worlds of the mask where they were at first."""
-  w = wp.tid()
-  if not s.mask[w]:
-    return
-  s.time[w] = 0.0
-  s.overflow[w] = 0
-  for k in range(s.qpos.shape[1]):
-    s.qpos[w, k] = s.qpos0[k]
-  for k in range(s.qvel.shape[1]):
-    s.qvel[w, k] = s.qvel0[k]
-    s.qacc[w, k] = 0.0
-    s.qacc_warmstart[w, k] = 0.0
-    s.qfrc_applied[w, k] = 0.0
-  for k in range(s.act.shape[1]):
-    s.act[w, k] = s.act0[k]
-  for k in range(s.ctrl.shape[1]):
-    s.ctrl[w, k] = 0.0
-  for k in range(s.sensordata.shape[1]):
-    s.sensordata[w, k] = 0.0
-  for k in range(s.xfrc_applied.shape[1]):
-    s.xfrc_applied[w, k] = wp.spatial_vector()
-  for k in range(s.eq_active.shape[1]):
-    s.eq_active[w, k] = s.eq_active0[k]
-  for k in range(s.mocap_pos.shape[1]):
-    s.mocap_pos[w, k] = s.mocap_pos0[k]
-    s.mocap_quat[w, k] = s.mocap_quat0[k]
-  for k in range(s.geom_xpos.shape[1]):
-    s.geom_xpos[w, k] = s.geom_xpos0[k]
-    s.geom_xmat[w, k] = s.geom_xmat0[k]
 
 
 @struct
@@ -284,11 +222,16 @@ def show(p: Patch, what: int, out: wp.array2d[wp.vec3]):
 
 
 @wp.kernel(enable_backward=False)
-def put_back_rows(mask: wp.array[bool], start: wp.array2d[wp.float64], out: wp.array2d[wp.float64]):
+def put_back_rows(mask: wp.array[bool], start: wp.array2d[Any], out: wp.array2d[Any]):
   """Puts rows of the worlds of a mask back to where they start."""
   w, k = wp.tid()
   if mask[w]:
     out[w, k] = start[0, k]
+
+
+NUMBERS = wp.bool, wp.int32, wp.float32, wp.float64  # of rows that are put back
+for _number in NUMBERS:
+  wp.overload(put_back_rows, {name: wp.array2d[_number] for name in ("start", "out")})
 
 
 @struct

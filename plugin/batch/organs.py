@@ -140,6 +140,18 @@ class Organ(Tissue):
     """Whether a push on one node moves others within a step."""
     return self._scheme.spreads
 
+  @functools.cached_property
+  def vectors(self) -> dict[str, wp.array]:
+    """Its motion in slices: displacement, velocity and the last two changes of that."""
+    state, p = self.body.state, self.patch
+    return {"disp": state.disp, "vel": state.vel, "last": p.last, "before": p.before}
+
+  @functools.cached_property
+  def motion(self) -> dict[str, wp.array]:
+    """What worlds keep of it from step to step, a row each."""
+    p = self.patch
+    return self.vectors | {"force": p.force, "heavier": p.heavier, "calm": p.calm}
+
   @staticmethod
   def bytes_of(w: Workspace, device) -> float:
     """Returns about how many bytes a world takes of the organ of a workspace."""

@@ -82,14 +82,6 @@ class Patch:
   force: floats("nworld", "nnode", 3)  # contact force of the last step [N]
   last: vector  # last change of the velocity [m/s]
   before: vector  # the one before it [m/s]
-  # Where a reset puts it:
-  disp0: floats("nslice", 3, 8)  # displacement [m]
-  vel0: floats("nslice", 3, 8)  # velocity [m/s]
-  last0: floats("nslice", 3, 8)
-  before0: floats("nslice", 3, 8)
-  force0: floats("nnode", 3)  # contact force [N]
-  heavier0: doubles(1)
-  calm0: doubles(1)  # [s]
   # Within a step:
   tool: doubles("nworld", "ntool", len(GEOM))  # see GEOM
   count: ints("nworld")  # candidates
@@ -288,10 +280,6 @@ def variables(nworld: int, nslot: int, nslice: int) -> dict:
     force=np.zeros((nworld, nnode, 3)),
     last=np.zeros(shape),
     before=np.zeros(shape),
-    **{f"{name}0": np.zeros(shape[1:]) for name in ("disp", "vel", "last", "before")},
-    force0=np.zeros((nnode, 3)),
-    heavier0=np.zeros(1),
-    calm0=np.zeros(1),
     count=np.zeros(nworld),
     candidate=np.zeros((nworld, nnode)),
     distance=np.zeros((nworld, nnode)),

@@ -11,14 +11,16 @@ import mujoco
 import mujoco_warp as mjw
 import numpy as np
 import warp as wp
-from palpate.tissue.types import fill
 
 from . import kernels
 from .base import on_device
-from .kernels import Start
 
 if TYPE_CHECKING:
   from .worlds import Worlds
+
+# What of mujoco_warp's data is zero after a reset.
+_ZERO = ("time", "overflow", "qacc", "qacc_warmstart", "qfrc_applied", "xfrc_applied", "ctrl",
+         "sensordata")  # fmt: skip
 
 
 class Rest:
@@ -27,6 +29,9 @@ class Rest:
   Args:
     batch: its worlds, with mujoco_warp's data at rest
     bare: the model that mujoco_warp has
+
+  Attributes:
+    starts: arrays with a row a world, and one of where worlds start
   """
 
   def __init__(self, batch: Worlds, bare: mujoco.MjModel):
@@ -34,19 +39,22 @@ class Rest:
     mujoco.mj_forward(bare, start)
     self.batch, self.mask = batch, batch.mask
     d = batch.d
-    values = {name: getattr(d, name) for name in Start.vars if hasattr(d, name)}
-    values |= dict(
-      mask=batch.mask,
-      qpos0=bare.qpos0,
-      qvel0=np.zeros(bare.nv),
-      act0=np.zeros(bare.na),
-      geom_xpos0=start.geom_xpos,
-      geom_xmat0=start.geom_xmat.reshape(-1, 3, 3),
-      mocap_pos0=start.mocap_pos,
-      mocap_quat0=start.mocap_quat,
-      eq_active0=bare.eq_active0.astype(bool),
-    )  # fmt: skip
-    self.start = fill(Start, batch.device, values)
+    first = {
+      "qpos": bare.qpos0,
+      "qvel": np.zeros(bare.nv),
+      "act": np.zeros(bare.na),
+      "geom_xpos": start.geom_xpos,
+      "geom_xmat": start.geom_xmat,
+      "mocap_pos": start.mocap_pos,
+      "mocap_quat": start.mocap_quat,
+      "eq_active": bare.eq_active0.astype(bool),
+    }
+    self.starts = [_start(getattr(d, name), each) for name, each in first.items() if each.size]
+    zero = [getattr(d, name) for name in _ZERO]
+    for organ in batch.organs.values():
+      self.starts += [_start(array) for array in organ.motion.values()]
+      zero += [organ.body.state.dvel, organ.patch.stirred]
+    self._rows = self.starts + [_start(array) for array in zero if array.size]
     self._move = move = kernels.Move()
     for name in kernels.Move.vars:
       source = d if hasattr(d, name) else batch.m
@@ -56,7 +64,9 @@ class Rest:
 
   def launch(self):
     """Puts the worlds of the mask at rest."""
-    wp.launch(kernels.reset, dim=self.batch.nworld, inputs=[self.start], device=self.batch.device)
+    for out, start in self._rows:
+      inputs = [self.mask, start, out]
+      wp.launch(kernels.put_back_rows, dim=out.shape, inputs=inputs, device=out.device)
     for organ in self.batch.organs.values():
       organ.rest()
 
@@ -97,3 +107,11 @@ class Rest:
     batch = self.batch
     inputs = [batch.lost, batch.d.overflow, lost, batch.counted]
     wp.launch(kernels.count, dim=batch.nworld, inputs=inputs, device=batch.device)
+
+
+def _start(array: wp.array, values: np.ndarray | None = None) -> tuple[wp.array, wp.array]:
+  """Returns an array's numbers, a row a world, and a row of where worlds start: zero if None."""
+  plain = array if array.dtype in kernels.NUMBERS else array.view(wp.float32)
+  rows = plain.reshape((array.shape[0], -1))
+  start = np.zeros(rows.shape[1]) if values is None else values
+  return rows, wp.array(start.reshape(1, -1), dtype=rows.dtype, device=rows.device)

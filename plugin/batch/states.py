@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
 _MOTION = ("disp", "vel", "last", "before")
 _PLAIN = ("act", "ctrl", "mocap_pos")
-_STARTS = ("qpos", "qvel", "act", "mocap_pos", "mocap_quat", "eq_active", "geom_xpos", "geom_xmat")
 
 
 def bytes_of(bare: mujoco.MjModel, njmax: int, ncon: int) -> float:
@@ -92,13 +91,6 @@ def _own(organ: Organ, model, data) -> tuple[np.ndarray, dict[str, slice]]:
   return data.plugin_state[start : start + size], coupling.spans(organ.declared)
 
 
-def _vectors(organ: Organ) -> dict[str, wp.array]:
-  state = organ.body.state
-  return {
-    "disp": state.disp, "vel": state.vel, "last": organ.patch.last, "before": organ.patch.before
-  }  # fmt: skip
-
-
 def _kept(declared) -> list[tuple[str, np.ndarray]]:
   """Returns what the plugin state has of an organ's motion with nodal coupling, and of whom."""
   moving = np.flatnonzero(declared.free)
@@ -110,7 +102,7 @@ def _pull_organ(organ: Organ, world: int, model, data):
   own, spans = _own(organ, model, data)
   motion = {
     name: from_slices(array[world].numpy())[node].astype(float)
-    for name, array in _vectors(organ).items()
+    for name, array in organ.vectors.items()
   }
   force = organ.patch.force[world].numpy()[node].astype(float)
   heavier = float(organ.patch.heavier[world : world + 1].numpy()[0])
@@ -183,8 +175,8 @@ def push(batch: Worlds, world: int, data: mujoco.MjData):
   base.follow(batch, [world])
 
 
-def keep(batch: Worlds, start, data: mujoco.MjData):
-  """Lets worlds start in the state of an mjData; `start` is what resets have of it."""
+def keep(batch: Worlds, starts: list[tuple[Any, Any]], data: mujoco.MjData):
+  """Lets worlds start in the state of an mjData; `starts` is what resets have of it."""
   d, organs = batch.d, batch.organs.values()
   for organ in organs:
     own, spans = _own(organ, batch.model, data)
@@ -193,20 +185,14 @@ def keep(batch: Worlds, start, data: mujoco.MjData):
         f"organ {organ.name!r}: data has cuts, which a batch on a GPU cannot start with; cut after "
         "a reset"
       )
-  pairs = [(getattr(d, name), getattr(start, f"{name}0")) for name in _STARTS]
-  for organ in organs:
-    own = _vectors(organ) | {
-      name: getattr(organ.patch, name) for name in ("force", "heavier", "calm")
-    }
-    pairs += [(array, getattr(organ.patch, f"{name}0")) for name, array in own.items()]
-    pairs += [(kept.flat, kept.start) for each in organ.beside for kept in each.kept]
+  beside = [(kept.flat, kept.start) for o in organs for each in o.beside for kept in each.kept]
+  pairs = [*starts, *(pair for pair in beside if pair[0].size)]
   # The first world has it for a moment.
   changed = [array for array, _ in pairs] + [d.ctrl, d.time, d.qacc_warmstart]
   saved = [(array, wp.clone(array[:1])) for array in changed if array.size]
   push(batch, 0, data)
-  for array, kept in pairs:
-    if array.size:
-      wp.copy(kept.flatten(), array[:1].flatten())
+  for array, start in pairs:
+    wp.copy(start, array[:1])
   for array, row in saved:
     wp.copy(array[:1], row)
 
@@ -241,7 +227,7 @@ def _push_organ(organ: Organ, world: int, model, data):
     used = slot_node >= 0
     force[slot_node[used]] = own[spans["force"]].reshape(-1, 3)[used]
     heavier, calm = (float(own[spans["tail"].start + k]) for k in (TAIL.heavier, TAIL.quiet))
-  for name, array in _vectors(organ).items():
+  for name, array in organ.vectors.items():
     full = np.zeros((organ.body.shape.nnode, 3), np.float32)
     full[node] = motion[name]
     _assign(array, world, to_slices(full))

@@ -271,7 +271,7 @@ class Worlds(Batch):
 
   def _start(self, data: mujoco.MjData):
     self._check_own(data)
-    states.keep(self, self._rest.start, data)
+    states.keep(self, self._rest.starts, data)
 
   def _pose(self, adr: np.ndarray, values: np.ndarray, mask: wp.array):
     at = [np.searchsorted(kept, numbers) for kept, numbers in zip(self._kept, adr.T, strict=True)]

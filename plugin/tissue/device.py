@@ -153,6 +153,10 @@ class Plan:
 def plan(device, nslice: int, nheld: int, **kinds: bool) -> Plan | None:
   """Returns how a block takes the whole step of a world; None where that is too large for one.
 
+  What nodes tell each other must have room in the block's memory. Rows of the matrix have what is
+  left; the others stay outside. An organ that is too large is stepped by a kernel for each part of
+  the step, by blocks that share a world.
+
   Args:
     device: where it runs
     nslice: slices of nodes
@@ -164,10 +168,11 @@ def plan(device, nslice: int, nheld: int, **kinds: bool) -> Plan | None:
   nodes = LANES * nslice
   own = 1 if nodes <= _FEW else 2 if nodes <= _MANY else 4
   threads = -(-nodes // (32 * own)) * 32
-  if threads > _MOST:
-    return None
   room = device.max_shared_memory_per_block - _STATIC
-  wanted = 4 * (LANES * (16 if kinds["bends"] else 13) * nslice + nheld)
+  told = 4 * (16 if kinds["bends"] else 13) * nodes
+  if threads > _MOST or told > room:
+    return None
+  wanted = told + 4 * nheld
   per_sm = max(1, min(3, room // (wanted + _STATIC), _REGISTERS // threads))
   return Plan(own, threads, per_sm, min(wanted, room), wanted <= room, **kinds)
 

@@ -125,6 +125,32 @@ def test_a_masked_reset_leaves_other_worlds_alone(make):
   assert np.array_equal(driven(batch, 30), first)
 
 
+def test_an_organ_too_large_for_a_block_steps_as_others_do(make, monkeypatch):
+  if make.device == "cpu":
+    pytest.skip("it has no blocks")
+  batches = [make(probed(), 2, deterministic=True)]
+  monkeypatch.setattr("palpate.tissue.device.plan", lambda *args, **kinds: None)
+  batches.append(make(probed(), 2, deterministic=True))
+  one, several = (driven(batch, 40) for batch in batches)
+  np.testing.assert_allclose(several, one, atol=1e-4 * np.abs(one).max())
+
+
+@needs_cuda
+@pytest.mark.parametrize("keys", [{"bend": 1}, {"elements": "solid", "poisson": 0.4}])
+def test_a_large_organ_is_that_of_the_plugin(keys):
+  made = press(subdivisions=4, foundation=2e4, **keys)  # 2562 nodes on the surface
+  batch = palpate.batch.make(spec(made), 2, device="cuda:0")
+  model, data, organ = load(made)
+  for k in range(60):
+    data.ctrl[:] = -0.0001 * k
+    batch.ctrl = np.full((2, 1), data.ctrl[0])
+    mujoco.mj_step(model, data)
+    batch.step()
+  found = batch.organ("organ").contact_force.numpy().sum(axis=1)
+  expected = organ.contact_force.sum(axis=0)
+  np.testing.assert_allclose(found, np.tile(expected, (2, 1)), atol=0.01 * np.abs(expected).max())
+
+
 @pytest.mark.parametrize("window", [True, False])
 def test_a_world_goes_out_to_the_plugin_and_back(make, window):
   batch = make(probed(window), 2)

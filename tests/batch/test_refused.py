@@ -89,10 +89,10 @@ def test_more_worlds_than_memory():
 
 
 @pytest.mark.skipif(not wp.get_cuda_supported_archs(), reason="this Warp knows no CUDA")
-@pytest.mark.parametrize("which", ["patch", "whole"])
+@pytest.mark.parametrize("which", ["patch", "contacts", "whole"])
 def test_the_kernels_compile_for_cuda(tmp_path, scenes, which):
   from palpate.batch import patch
-  from palpate.tissue import device, step
+  from palpate.tissue import device, kernels, step
 
   kernel = patch.enter
   if which == "whole":
@@ -100,7 +100,10 @@ def test_the_kernels_compile_for_cuda(tmp_path, scenes, which):
     kinds = {"bends": True, "springs": True, "volumes": True}
     body.plan = device.Plan(own=2, threads=160, per_sm=2, nbytes=0, whole=True, **kinds)
     (kernel,) = step.kernels(body)
-  wp.compile_aot_module(kernel.cuda.module, arch=90, module_dir=str(tmp_path), use_ptx=True)
+  module = kernel.cuda.module
+  if which == "contacts":
+    (module,) = (name for name in kernels.MODULES["cuda"] if "world_contacts" in name)
+  wp.compile_aot_module(module, arch=90, module_dir=str(tmp_path), use_ptx=True)
   assert any(tmp_path.iterdir())
 
 

@@ -1,6 +1,7 @@
 """A step of worlds by one kernel is that of many."""
 
 import dataclasses
+import types
 
 import numpy as np
 import pytest
@@ -64,3 +65,20 @@ def test_one_kernel_steps_as_many_do(scenes, device, kind):
     np.testing.assert_allclose(one, many, atol=2e-5 * np.abs(many).max())
     np.testing.assert_allclose(other, answer, atol=1e-3 * np.abs(answer).max())
     assert np.abs(count - iterations).max() <= 1
+
+
+@pytest.mark.parametrize("memory", [48, 99, 163, 227])  # of a block [KiB], from old GPUs to an H100
+@pytest.mark.parametrize("nodes", [64, 250, 1000, 1600, 2048, 4000])
+@pytest.mark.parametrize("bends", [False, True])
+def test_what_nodes_tell_each_other_has_room_in_a_block_or_several_share_a_world(
+  memory, nodes, bends
+):
+  device = types.SimpleNamespace(is_cuda=True, max_shared_memory_per_block=1024 * memory)
+  rows = 7 * 9 * nodes  # of stiffness blocks, in floats
+  plan = devices.plan(device, nodes // 8, rows, bends=bends, springs=False, volumes=False)
+  told = 4 * (16 if bends else 13) * nodes
+  room = 1024 * memory - 4096  # less what the kernel has of its own
+  assert (plan is None) == (nodes > 2048 or told > room)
+  if plan:
+    assert plan.own * plan.threads >= nodes and told <= plan.nbytes <= room
+    assert plan.whole == (told + 4 * rows <= room)

@@ -330,26 +330,14 @@ PALPATE void find_bad(const Fields& f, Thread t, int) {
 // The mass that the solve has of a node: nodes that wait for a cut have none.
 PALPATE float solved(double mass) { return mass > 0.0 ? (float)mass : 1.0f; }
 
-// Puts the organ of the worlds of a mask where it starts.
+// Gives the organ of the worlds of a mask the masses of the mesh that it starts with, which it has
+// again, and lets its slots wait.
 template <class Fields>
 PALPATE void rest_organ(const Fields& f, Thread t, int) {
   const int w = t.world;
   if (!f.mask.data[w]) return;
-  if (t.tid == 0) {
-    f.heavier.data[w] = f.heavier0.data[0];
-    f.calm.data[w] = f.calm0.data[0];
-    f.stirred.data[w] = 0;
-  }
   const bool heals = f.mesh.data[w] != 0;
   each_item(t, f.nnode, [&](int i) {
-    const size_t at = at_node(f, w, i);
-    const int from = offset_of(i);
-    store_lane(f.solve.disp.data + at, load_lane(f.disp0.data + from));
-    store_lane(f.solve.vel.data + at, load_lane(f.vel0.data + from));
-    store_lane(f.last.data + at, load_lane(f.last0.data + from));
-    store_lane(f.before.data + at, load_lane(f.before0.data + from));
-    store_lane(f.solve.dvel.data + at, {0.0, 0.0, 0.0});
-    store_floats(f.force.data + 3 * in_row(f, w, i), load_floats(f.force0.data + 3 * i));
     if (heals) f.solve.mass.data[in_row(f, w, i)] = solved(f.mass_scale.data[w] * f.mass.data[i]);
   });
   each_item(t, f.nslot, [&](int k) { wait(f, w, k); });
