@@ -260,7 +260,8 @@ def tissue_of(m, organ: "Declaration", config: Config | None = None, mass=1.0) -
   modulus = np.where(np.asarray(stretch) != 0, 0.0, bare) * config.subgrid
   # A shell's curvature holds it as a foundation would (Reissner 1946, doi:10.1002/sapm194625180):
   # that of a ball of the organ's area.
-  held = below + plane * stretch * (4 * np.pi / area if organ.mesh.closed else 0.0)
+  curved = 4 * np.pi / area if organ.mesh.closed else 0.0
+  held = below + np.multiply(stretch, plane * curved)
   plates = config.subgrid and config.elements == "membrane"
   bearing = np.where(np.asarray(below) > 0, held, 0.0) * plates
   # The second is Foeppl's membrane on a foundation under a point, by least energy.

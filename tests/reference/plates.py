@@ -43,5 +43,5 @@ def ball(radius: float, depth: float, foundation: float, rigidity: float) -> flo
     return deep, 2 * np.pi * (deep * a**2 / 2 - a**4 / 8 - beyond)
 
   scale = unit**2 / radius
-  a = brentq(lambda a: solve(a)[0] - depth / scale, 1e-6, 200.0)
+  a = float(brentq(lambda a: solve(a)[0] - depth / scale, 1e-6, 200.0))  # pyright: ignore
   return foundation * unit**2 * scale * solve(a)[1] * (1 - 2 * depth / (3 * radius))
