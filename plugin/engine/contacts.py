@@ -244,7 +244,8 @@ def tissue_of(m, organ: "Declaration", config: Config | None = None, mass=1.0) -
   solid = config.elements == "solid"
   bare = young / plane if solid else 0.0
   skin = np.mean(outside.young, axis=0) * outside.thickness / plane
-  stretch = {"spring": config.stiffness, "solid": 0.0}.get(outside.elements, skin)
+  kinds = {"spring": config.stiffness, "solid": 0.0, "membrane": skin}
+  stretch = kinds[outside.elements]
   bend = rigidity(outside, len(outside.young)).mean(axis=0)
   corner = organ.mesh.rest[organ.mesh.elem]
   edge = np.linalg.norm(corner - corner[:, [1, 2, 0]], axis=2).mean()
@@ -261,7 +262,7 @@ def tissue_of(m, organ: "Declaration", config: Config | None = None, mass=1.0) -
   # A shell's curvature holds it as a foundation would (Reissner 1946, doi:10.1002/sapm194625180):
   # that of a ball of the organ's area.
   curved = 4 * np.pi / area if organ.mesh.closed else 0.0
-  held = below + np.multiply(stretch, plane * curved)
+  held = below + plane * curved * stretch
   plates = config.subgrid and config.elements == "membrane"
   bearing = np.where(np.asarray(below) > 0, held, 0.0) * plates
   # The second is Foeppl's membrane on a foundation under a point, by least energy.
