@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 import warp as wp
 from palpate.tissue.config import Config, rigidity
+from palpate.tissue.geometry.mesh import vertex_areas
 from palpate.tissue.kernels import kernel
 from palpate.tissue.solid import capsule
 from palpate.tissue.types import Array, doubles, ints, struct
@@ -39,6 +40,9 @@ _CONTACT = (
 TISSUE = Numbers(
   "TISSUE",
   ("modulus", 1, "Pa", "young / (1 - poisson^2) of a solid without a skin, else 0"),
+  ("bearing", 1, "Pa/m", "of a skin that has a foundation: what holds a patch of it, else 0"),
+  ("plate", 1, "N/m", "sqrt(bearing * rigidity) of such a skin"),
+  ("taut", 1, "N/m^2", "force under a point over its depth squared, where that only stretches"),
   ("asked", 1, "1/kg", "R of a contact that the tissue asks for"),
   ("share", 1, "1/kg", "R that the step can bear at least for each vertex that is touched"),
   ("stuck", 1, "-", "of the R that the step can bear, the most that friction has"),
@@ -237,22 +241,34 @@ def tissue_of(m, organ: "Declaration", config: Config | None = None, mass=1.0) -
   """
   config, h = config or organ.config, float(m.opt.timestep)
   outside, plane, young = capsule(config), 1 - config.poisson**2, np.mean(config.young, axis=0)
-  bare = young / plane if config.elements == "solid" else 0.0
+  solid = config.elements == "solid"
+  bare = young / plane if solid else 0.0
   skin = np.mean(outside.young, axis=0) * outside.thickness / plane
-  stretch = {"spring": config.stiffness, "solid": 0.0}.get(outside.elements, skin)
+  kinds = {"spring": config.stiffness, "solid": 0.0, "membrane": skin}
+  stretch = kinds[outside.elements]
   bend = rigidity(outside, len(outside.young)).mean(axis=0)
   corner = organ.mesh.rest[organ.mesh.elem]
   edge = np.linalg.norm(corner - corner[:, [1, 2, 0]], axis=2).mean()
+  area = vertex_areas(organ.mesh.rest, organ.mesh.elem).sum()
   below = config.foundation
   stiffness = bare * edge + stretch + 8 * np.sqrt(bend * below) + below * edge**2
   masses = mass * organ.mass[organ.free].sum()
   each = mass * organ.mass[organ.free].mean()
   softer = max(1.0, (h / LONG) ** 2) * np.maximum(1.0, h**2 * stiffness / (STIFF * each))
-  share = softer * SOFT / masses * (1.0 if config.elements == "solid" else SKIN)
+  share = softer * SOFT / masses * (1.0 if solid else SKIN)
   asked = FIRM / (stiffness * (SLOW * h) ** 2)
   stuck = min(1.0, max(STUCK, h / LONG))
-  bare = np.where(np.asarray(stretch) != 0, 0.0, bare)
-  rows = bare, asked, share, stuck, not says(m, organ.flexes[0])
+  modulus = np.where(np.asarray(stretch) != 0, 0.0, bare) * config.subgrid
+  # A shell's curvature holds it as a foundation would (Reissner 1946, doi:10.1002/sapm194625180):
+  # that of a ball of the organ's area.
+  curved = 4 * np.pi / area if organ.mesh.closed else 0.0
+  held = below + plane * curved * stretch
+  plates = config.subgrid and config.elements == "membrane"
+  bearing = np.where(np.asarray(below) > 0, held, 0.0) * plates
+  # The second is Foeppl's membrane on a foundation under a point, by least energy.
+  plate, taut = np.sqrt(bend * bearing), 0.86 * np.sqrt(stretch * bearing)
+  firm = not says(m, organ.flexes[0])
+  rows = modulus, bearing, plate, taut, asked, share, stuck, firm
   return np.stack(np.broadcast_arrays(*(np.asarray(row, float) for row in rows)), axis=-1)
 
 

@@ -220,6 +220,12 @@ class Config:
     "with `window` alone: the motion stays on the CUDA device between steps, and the plugin state "
     "is brought up to date by `Organ.sync` alone ([internals](internals.md#resident))",
   )
+  subgrid: bool = _row(
+    True,
+    reading.choice({"true": True, "false": False}),
+    "whether contacts of a tool that is small for the mesh yield by what the mesh cannot "
+    "([small tools](authoring.md#small-tools)); `false` where constants were chosen for one mesh",
+  )
   skin: str = _row(
     "",
     (reading.name, "the name of a skin"),

@@ -57,7 +57,7 @@ def test_a_tool_presses_as_under_the_plugin(device, kind):
     expected.append(handle.contact_force.sum(axis=0))
   found, expected = np.array(found), np.array(expected)
   peak = np.abs(expected).max()
-  assert peak > 0.1 and not batch.overflow.numpy().any() and not batch.failures.numpy().any()
+  assert peak > 0.05 and not batch.overflow.numpy().any() and not batch.failures.numpy().any()
   assert np.sqrt(np.mean((found[:, 0] - expected) ** 2)) < 0.01 * peak
   assert np.array_equal(found[:, 0], found[:, 1])
 
@@ -167,7 +167,7 @@ def test_a_touch_sensor_feels_its_own_body_alone(device):
   for _ in range(60):
     mujoco.mj_step(model, data)
     batch.step()
-  assert data.sensordata[0] > 0.05 and data.sensordata[1] == 0
+  assert data.sensordata[0] > 0.02 and data.sensordata[1] == 0
   np.testing.assert_allclose(batch.sensordata.numpy(), np.tile(data.sensordata, (2, 1)), rtol=0.02)
 
 

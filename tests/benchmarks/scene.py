@@ -213,7 +213,8 @@ def _organ(mesh: Mesh, tissue: Tissue, scheme: str, window: bool, contact: dict,
     return flex(*shape, inside, mass=tissue.mass, contact=contact)
   if scheme == "passive":
     return flex(*shape, mjcf.EDGE, mass=tissue.mass, contact=contact)
-  keys = tissue.keys() | {"integrator": None if scheme == "implicit" else scheme} | keys
+  same = {"integrator": None if scheme == "implicit" else scheme, "subgrid": "false"}
+  keys = tissue.keys() | same | keys  # the reference is of the same mesh
   if not window:
     return organ(*shape, mass=tissue.mass, contact=contact, **keys)
   side = window_side(mesh)

@@ -65,7 +65,7 @@ class Pressed:
   # What contacts yield by, a tool, and what that is found from; see also `Patch`:
   yields: int  # whether there is a tool that is small and round or flat, on tissue that yields so
   tool_of: ints("ngeom")  # which of the organ's tools a geom is, -1 for none
-  compliance: floats("nworld", "ntool")  # of each contact [m/N]
+  yields_by: Array(wp.vec3, ("naconmax",))  # of a contact: `Stiff` [m/N], what is off its gap [m]
   flex_elem: ints("nflexelemdata")  # slots of a triangle
   elemadr: int  # where those of the organ begin
   radius: float  # of its flex [m]
@@ -91,8 +91,8 @@ class Pressed:
   pressed: floats("nworld", "many")
 
 
-_find_compliance = kernel(
-  "find_compliance",
+_find_series = kernel(
+  "find_series",
   "coupling/world_contacts.h",
   Pressed,
   coupling.CONSTANTS | TISSUE.constants(),
@@ -119,9 +119,11 @@ def _has_rows(p: Pressed, c: int):
 def _firm_up(p: Pressed, world: int, c: int):
   """Makes a contact as firm as under the plugin, see coupling/contact_stiffness.h.
 
-  Rows of friction have the normal's R times what mujoco_warp says, so they yield with it.
+  Rows of friction have the normal's R times what mujoco_warp says, so they yield with it. Returns
+  what is off its gap, as an acceleration [m/s^2].
   """
   geom = p.contact_geom[c][0]
+  rate = float(0.0)  # noqa: UP018 - a variable to Warp
   R = 1.0 / p.D[world, p.efc_address[c, 0]]
   now = R
   if p.tissue[world, _FIRM] > wp.float64(0.0):
@@ -133,17 +135,21 @@ def _firm_up(p: Pressed, world: int, c: int):
     if p.paired == 1 and p.dim[c] > 1:
       square = p.friction[c][0] * p.friction[c][0]
       R *= p.pairs * square * (1.0 + square)
-  tool = p.tool_of[geom]
-  if tool >= 0 and p.compliance[world, tool] > 0.0:
+  if p.yields == 1 and p.tool_of[geom] >= 0:
     spring = contact_kbimp(
       p.disableflags, p.timestep, p.solref[c], p.solimp[c], p.dist[c], p.discrete == 1
     )
-    normals = float(wp.where(p.paired == 1, _rows(p, c), 1))
-    R = wp.max(R, normals * spring[0] * spring[2] * p.compliance[world, tool])
+    by, off = p.yields_by[c], p.yields_by[c][2]
+    per = float(wp.where(p.paired == 1, _rows(p, c), 1)) * spring[0] * spring[2]
+    R = wp.max(R, per * by[1])
+    if R < per * by[0]:
+      off -= (p.dist[c] + off) * (1.0 - R / (per * by[0]))
+    rate = off * spring[0] * spring[2]
   if R != now:
     for r in range(_rows(p, c)):
       row = p.efc_address[c, r]
       p.D[world, row] = now / R * p.D[world, row]
+  return rate
 
 
 @wp.kernel(enable_backward=False)
@@ -156,9 +162,7 @@ def _closed(p: Pressed):
   n = p.dim[c]
   if not _has_rows(p, c):
     return
-  _firm_up(p, world, c)
-  if n < 2:
-    return
+  off = _firm_up(p, world, c)
   square = float(0.0)  # noqa: UP018 - a variable to Warp
   for r in range(n - 1):
     if p.paired == 1:
@@ -170,14 +174,14 @@ def _closed(p: Pressed):
       square += v * v
   for r in range(wp.where(p.paired == 1, _rows(p, c), 1)):
     row = p.efc_address[c, r]
-    p.aref[world, row] = p.aref[world, row] - wp.sqrt(square)
+    p.aref[world, row] = p.aref[world, row] - wp.sqrt(square) - off
 
 
 def keep_closed(p, device):
   """Makes contacts firm, and keeps those that slide closed."""
   dim = p.geom.shape
   if p.yields:
-    launch(_find_compliance, p, dim[0], p.ntool, device)
+    launch(_find_series, p, dim[0], p.ntool, device)
   wp.launch(_closed, dim=dim, inputs=[p], device=device)
 
 
@@ -223,9 +227,10 @@ def make(organ: "Organ", model: mujoco.MjModel, touch):
   out.tools = wp.array(tools, dtype=float, device=device)
   geoms, tool_of = patch.tool_geom.numpy(), np.full(model.ngeom, -1)
   tool_of[geoms] = np.arange(len(geoms))
-  out.yields = int(tissue[TISSUE.modulus] > 0 and np.isin(model.geom_type[geoms], _SMALL).any())
+  small = np.isin(model.geom_type[geoms], _SMALL).any()
+  out.yields = int(tissue[TISSUE.modulus] + tissue[TISSUE.bearing] > 0 and small)
   out.tool_of = wp.array(tool_of, dtype=int, device=device)
-  out.compliance = wp.zeros((batch.nworld, len(geoms)), dtype=float, device=device)
+  out.yields_by = wp.zeros(d.contact.dist.shape[0], dtype=wp.vec3, device=device)
   out.flex_elem, out.elemadr = batch.m.flex_elem, int(bare.flex_elemdataadr[place.flex])
   out.radius, out.disp = touch.radius, patch.solve.disp
   out.contact_geom, out.aref, out.row_force = d.contact.geom, d.efc.aref, d.efc.force

@@ -65,8 +65,17 @@ struct ToolContacts {
     press.gap = *(const double*)(contact + CONTACT_DIST);
     press.pos = load((const double*)(contact + CONTACT_POS));
     press.normal = load((const double*)(contact + CONTACT_FRAME));
-    press.edge = mean_edge(place(start + e[0]), place(start + e[1]), place(start + e[2]));
+    press.measure(place(start + e[0]), place(start + e[1]), place(start + e[2]));
     for (int k = 0; k < 3; ++k) press.corner[k] = f.force_adr.data[start + e[k]] < 0 ? -1 : start + e[k];
+    return true;
+  }
+
+  PALPATE bool other(int c, Press& press) const {
+    const char* contact = contacts + (size_t)CONTACT_LENGTH * c;
+    const Touch found = touch_of(f, contact);
+    if (found.flex != touch.flex || found.geom == touch.geom) return false;
+    press.pos = load((const double*)(contact + CONTACT_POS));
+    press.normal = (found.side == touch.side ? 1.0 : -1.0) * load((const double*)(contact + CONTACT_FRAME));
     return true;
   }
 
@@ -81,16 +90,18 @@ PALPATE Tool tool_of(const Fields& f, Touch touch) {
           f.geom_size.data[3 * touch.geom], f.flex_radius.data[touch.flex]};
 }
 
-// The series compliance of each contact of a tool [m/N]; flags a mesh that is too coarse for the tool.
+// What the contacts of a tool make up for; flags a mesh that is too coarse for the tool.
 template <class Fields>
-PALPATE double series_compliance(const Fields& f, const char* contacts, int ncon, Touch touch) {
+PALPATE Series series_of(const Fields& f, const char* contacts, int ncon, Touch touch) {
   const Tool tool = tool_of(f, touch);
   const ToolContacts<Fields> all = {f, contacts, ncon, touch};
   Dent dent;
-  if (!tool.is_known() || !find_dent(all, tool, dent)) return 0.0;
-  const double radius = tool.size + tool.skin;
-  if (f.mine.data[touch.flex] > 1 && !f.flags.data[FLAG_COARSE] && radius < COARSE * dent.edges / dent.ncon)
-    f.flags.data[FLAG_COARSE] = (int)(2e6 * radius) + 1;
+  if (!tool.is_known() || !find_dent(all, tool, dent)) return {0.0, 0.0};
+  if (tool.size + tool.skin < COARSE * dent.edges / dent.ncon) {
+    if (f.mine.data[touch.flex] > 1 && !f.flags.data[FLAG_COARSE])
+      f.flags.data[FLAG_COARSE] = (int)(2e6 * (tool.size + tool.skin)) + 1;
+    return {0.0, 0.0};
+  }
   return unresolved(all, tool, dent, f.tissue.data + TISSUE_LENGTH * touch.flex);
 }
 
@@ -115,14 +126,15 @@ PALPATE void put_spring(const Fields& f, char* contact, Rows rows, double dampin
 }
 
 // Makes a contact as firm as its tissue asks for, whatever its nodes weigh, but no firmer than the time
-// step can bear; unless the organ says itself how firm it is. It is at least `least` soft [m/N].
+// step can bear; unless the organ says itself how firm it is. It yields by the series too.
+// Returns where it has no force, off its gap [m].
 //
 // At rest its force is gap / compliance with R = compliance * stiffness; the rows of a pyramid have a
 // part each. Friction is firmer the shorter the step, since what sticks creeps at a speed in proportion
 // to its R; in a pyramid it has no R of its own (MuJoCo, Computation, Constraint model). Done twice it
 // does nothing.
 template <class Fields>
-PALPATE void firm_up(const Fields& f, char* contact, Rows rows, Touch touch, int count, double least) {
+PALPATE double firm_up(const Fields& f, char* contact, Rows rows, Touch touch, int count, Series series) {
   const double* row = datum<double*>(f, DATA_EFC_KBIP) + 4 * rows.first;
   const double* R = datum<double*>(f, DATA_EFC_R) + rows.first;
   const double* friction = (const double*)(contact + CONTACT_FRICTION);
@@ -141,9 +153,22 @@ PALPATE void firm_up(const Fields& f, char* contact, Rows rows, Touch touch, int
     if (sticks && R[1] > most) scale_impedance(f, {rows.first + 1, rows.count - 1, false}, most / R[1]);
   }
   const Rows normals = rows.normals();
-  const double more = normals.count * row[0] * row[2] * least;
-  if (R[0] < more) scale_impedance(f, normals, more / R[0]);
+  const double radius = f.geom_size.data[3 * touch.geom] + f.flex_radius.data[touch.flex];
+  double gap = *(const double*)(contact + CONTACT_DIST), off = 0.0;
+  if (series.rounds > 0.0) {
+    const int* e = f.flex_elem.data + f.flex_elemdataadr.data[touch.flex] +
+                   3 * side_of(contact, CONTACT_ELEM, touch.side);
+    D3 x[3];
+    for (int k = 0; k < 3; ++k) x[k] = load(f.flexvert_xpos.data + 3 * (f.flex_vertadr.data[touch.flex] + e[k]));
+    off = series.rounds * rise(x, load(pos_of(contact)), radius);
+  }
+  gap += off;
+  const double per = normals.count * row[0] * row[2];
+  const Stiff stiff = stiffened(gap, radius, per * series.compliance);
+  if (R[0] < stiff.tangent) scale_impedance(f, normals, stiff.tangent / R[0]);
+  if (R[0] < stiff.secant) off -= gap * (1.0 - R[0] / stiff.secant);
   if (sticks) *(double*)(contact + CONTACT_MU) = friction[0] * sqrt(R[1] / R[0]);
+  return off;
 }
 
 // How much of the R that a step can bear organs have which lie on each other: MuJoCo has a contact a

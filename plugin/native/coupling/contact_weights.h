@@ -131,16 +131,16 @@ PALPATE double parting(const Fields& f, const char* contact, Rows rows) {
   return sqrt(sum);
 }
 
-// Moves the contact's gap by as much as takes that parting away: sliding then has the gap, and the
-// force, of standing (de Saxce and Feng 1998, doi:10.1016/S0895-7177(98)00119-8, with the velocity
-// that the step begins with). Done twice it does nothing.
+// Moves the contact's gap by what lies off it, and by as much as takes that parting away: sliding then
+// has the gap, and the force, of standing (de Saxce and Feng 1998, doi:10.1016/S0895-7177(98)00119-8,
+// with the velocity that the step begins with). Done twice it does nothing.
 template <class Fields>
-PALPATE void keep_closed(const Fields& f, const char* contact, Rows rows) {
-  if (rows.count < 2) return;
+PALPATE void keep_closed(const Fields& f, const char* contact, Rows rows, double off) {
   const double* row = datum<double*>(f, DATA_EFC_KBIP) + 4 * rows.first;
   const double stiffness = row[0] * row[2];
   if (!(stiffness > 0.0)) return;
-  const double gap = *(const double*)(contact + CONTACT_DIST) + parting(f, contact, rows) / stiffness;
+  double gap = *(const double*)(contact + CONTACT_DIST) + off;
+  if (rows.count > 1) gap += parting(f, contact, rows) / stiffness;
   for (int r = 0; r < rows.normals().count; ++r) datum<double*>(f, DATA_EFC_POS)[rows.first + r] = gap;
 }
 
@@ -190,7 +190,7 @@ template <class Fields>
 PALPATE void weigh(const Fields& f, Thread, int) {
   bool touched = false;
   Touch last = {-1, -1, 0};
-  double least = 0.0;
+  Series series = {0.0, 0.0};
   int count = 0;
   Shared shared = {{-1, -1}, 0.0};
   char* const contacts = datum<char*>(f, DATA_CONTACT);
@@ -205,18 +205,19 @@ PALPATE void weigh(const Fields& f, Thread, int) {
     const Rows rows = is_mine(f, contact) ? rows_of(f, contact) : Rows{0, 0, false};
     if (!rows.count) continue;
     touched = true;
+    double off = 0.0;
     const Touch touch = touch_of(f, contact);
     if (touch.geom >= 0) {
-      if (!(touch == last)) least = series_compliance(f, contacts, ncon, touch);
+      if (!(touch == last)) series = series_of(f, contacts, ncon, touch);
       if (touch.flex != last.flex) count = count_of(contacts, ncon, touch.flex, true);
-      firm_up(f, contact, rows, touch, count, least);
+      off = firm_up(f, contact, rows, touch, count, series);
       last = touch;
     } else if (are_organs(f, contact)) {
       turn_back(f, contact, rows);
       share_out(f, contacts, ncon, contact, shared);
       firm_organs(f, contact, rows, shared.borne);
     }
-    keep_closed(f, contact, rows);
+    keep_closed(f, contact, rows, off);
   }
   const bool projects = f.solver.data[0] == SOLVER_PGS || f.noslip_iterations.data[0] > 0 ||
                         (f.enableflags.data[0] & ENABLE_DIAGEXACT);

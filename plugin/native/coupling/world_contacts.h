@@ -13,16 +13,27 @@ struct WorldContacts {
 
   PALPATE int count() const { return f.count.data[world]; }
 
-  PALPATE bool at(int k, Press& press) const {
-    const size_t c = f.start.data[0] + f.before.data[world] + k;
-    const int elem = ((const int*)f.elem.data)[2 * c + 1];
-    if (((const int*)f.contact_geom.data)[2 * c] != geom || elem < 0) return false;
-    const int* slot = f.flex_elem.data + f.elemadr + 3 * elem;
-    for (int q = 0; q < 3; ++q) press.corner[q] = f.slot_node.data[world * f.nslot + slot[q]];
-    press.gap = f.dist.data[c];
+  PALPATE size_t contact(int k) const { return f.start.data[0] + f.before.data[world] + k; }
+
+  // Whether a contact is this tool's, or another's, with the organ, and where.
+  PALPATE bool find(int k, bool own, Press& press) const {
+    const size_t c = contact(k);
+    const int met = ((const int*)f.contact_geom.data)[2 * c], elem = ((const int*)f.elem.data)[2 * c + 1];
+    if (met < 0 || (met == geom) != own || elem < 0) return false;
     press.pos = load((const float*)f.pos.data + 3 * c);
     press.normal = load((const float*)f.frame.data + 9 * c);
-    press.edge = mean_edge(place(press.corner[0]), place(press.corner[1]), place(press.corner[2]));
+    return true;
+  }
+
+  PALPATE bool other(int k, Press& press) const { return find(k, false, press); }
+
+  PALPATE bool at(int k, Press& press) const {
+    if (!find(k, true, press)) return false;
+    const size_t c = contact(k);
+    const int* slot = f.flex_elem.data + f.elemadr + 3 * ((const int*)f.elem.data)[2 * c + 1];
+    for (int q = 0; q < 3; ++q) press.corner[q] = f.slot_node.data[world * f.nslot + slot[q]];
+    press.gap = f.dist.data[c];
+    press.measure(place(press.corner[0]), place(press.corner[1]), place(press.corner[2]));
     return true;
   }
 
@@ -32,9 +43,9 @@ struct WorldContacts {
   PALPATE D3 force(int node) const { return load(f.force.data + 3 * in_row(f, world, node)); }
 };
 
-// Finds the series compliance of the contacts of each tool [m/N].
+// Finds how the contacts of each tool yield.
 template <class Fields>
-PALPATE void find_compliance(const Fields& f, Thread t, int) {
+PALPATE void find_series(const Fields& f, Thread t, int) {
   each_item(t, f.ntool, [&](int q) {
     const int geom = f.tool_geom.data[q];
     const size_t g = (size_t)t.world * f.ngeom + geom;
@@ -44,9 +55,19 @@ PALPATE void find_compliance(const Fields& f, Thread t, int) {
                        of[GEOM_SIZE], f.radius};
     const WorldContacts<Fields> all = {f, t.world, geom};
     Dent dent;
-    const bool known = tool.is_known() && find_dent(all, tool, dent);
-    f.compliance.data[t.world * f.ntool + q] =
-        known ? unresolved(all, tool, dent, f.tissue.data + TISSUE_LENGTH * t.world) : 0.0;
+    Series series = {0.0, 0.0};
+    if (tool.is_known() && find_dent(all, tool, dent))
+      series = unresolved(all, tool, dent, f.tissue.data + TISSUE_LENGTH * t.world);
+    Press press;
+    for (int k = 0; k < all.count(); ++k) {
+      if (!all.at(k, press)) continue;
+      const D3 x[3] = {all.place(press.corner[0]), all.place(press.corner[1]), all.place(press.corner[2])};
+      const double radius = tool.size + tool.skin;
+      const double off = series.rounds > 0.0 ? series.rounds * rise(x, press.pos, radius) : 0.0;
+      const Stiff stiff = stiffened(press.gap + off, radius, series.compliance);
+      float* out = (float*)f.yields_by.data + 3 * all.contact(k);
+      out[0] = (float)stiff.secant, out[1] = (float)stiff.tangent, out[2] = (float)off;
+    }
   });
 }
 

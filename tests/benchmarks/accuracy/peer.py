@@ -75,7 +75,7 @@ def mjcf(subdivisions: int, side: str, kind: str, tolerance: float = 1e-4, h: fl
   tissue = KINDS[kind]
   pin = np.flatnonzero(points[:, 2] < -0.9 * RADIUS) if not tissue.foundation else ()
   contact = {"condim": 3, "solref": "0.019 1"}  # the plugin makes those of 0.02 firmer
-  keys: dict = tissue.keys() | {"mass": tissue.mass, "tolerance": tolerance}
+  keys: dict = tissue.keys() | {"mass": tissue.mass, "tolerance": tolerance, "subgrid": "false"}
   if side == "peer":
     organ = _flex(shape, tissue, pin, contact)
   elif side == "nodal":

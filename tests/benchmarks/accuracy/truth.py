@@ -12,9 +12,9 @@ measured modulus with edges of 1.5 mm under such a sphere, as deep from the firs
 rows above within some 5 % itself; beside it solids, and the shipped skins, whose foundation stands
 for their inside. `mesh`: those skins with fewer triangles, even ones and with `fine` ones where the
 probe goes, over 16,000 nodes, with contacts as firm as those of `fine` and as they ship.
-`small`: a ball on a block, over Hertz's layer, and on a skin with a foundation, over one with edges
-of a quarter, on a node and between nodes; and its greatest force over the least where it slides on
-over an edge, as deep and without friction.
+`small`: a ball on a block, over Hertz's layer, and on a skin with a foundation, over the closed
+form of a plate on one (`reference/plates.py`), on a node and between nodes; and its greatest force
+over the least where it slides on over an edge, as deep and without friction.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from benchmarks.results import BenchError
 from benchmarks.runner import Bench, Case, Row
 from palpate import models, register
 from palpate.models import catalog
-from reference import closed
+from reference import closed, plates
 
 YOUNG, POISSON = 5000.0, 0.45
 SIZE, RADIUS = (0.08, 0.08, 0.04), 0.04  # of the block and the sphere [m]
@@ -44,6 +44,7 @@ PROBE = 0.0035  # [m], the radius of the shipped probe and of the flexes
 FINE = 0.0015  # edges of the organs that are the reference [m]
 NODES = 1000  # of the others
 FLEX = 0.0005  # radius of the flex under the small ball [m]
+SKIN = {"thickness": 0.002, "foundation": 2e5, "mass": 0.05}  # under it
 SHIPPED = {
   "skin on foundation": {},
   "skin on foundation, 3 mm under the probe": {"coupling": "window", "fine": 3e-3},
@@ -221,11 +222,15 @@ def _small(kind: str, edges: float) -> list[Row]:
   """Returns rows of a ball whose contact's radius is `edges` edges, and of its sliding."""
   edge = 0.008
   depth = (edges * edge) ** 2 / RADIUS
-  fine = _touched(kind, edge / 4, depth, (1, 0, 0))[0] if kind == "skin" else 0.0
+  radius = RADIUS + FLEX
+  if kind == "skin":
+    rigidity = YOUNG * SKIN["thickness"] ** 3 / (12 * (1 - POISSON**2))
+    reference = plates.ball(radius, depth, SKIN["foundation"], rigidity)
+  else:
+    reference = hertz(radius, depth, SIZE[2])
   rows, more = [], {"edges": edges, "depth_mm": round(1e3 * depth, 3)}
   for place, at in PLACES.items():
     force, nodes, _ = _touched(kind, edge, depth, at)
-    reference = fine or hertz(RADIUS + FLEX, depth, SIZE[2])
     what = f"ball on a {kind}, {place}"
     rows.append(_row("small", what, force, reference, "N", nodes=nodes, **more))
   _, nodes, slid = _touched(kind, edge, depth, (1, 0, 0), slides=edge)
@@ -248,7 +253,7 @@ def _touched(kind: str, edge: float, depth: float, at, slides: float = 0.0):
   if kind == "skin":
     kept, elem = np.unique(upper, return_inverse=True)
     points, elem = points[kept], elem.reshape(-1, 3)
-    keys = {"thickness": 0.002, "foundation": 2e5, "mass": 0.05}
+    keys = SKIN
   drive = '<position joint="z" kp="2e4" kv="200"/><position joint="x" kp="2e4" kv="200"/>'
   spec = mujoco.MjSpec.from_string(f"""<mujoco><option gravity="0 0 0" timestep="0.001"
     integrator="implicitfast" cone="elliptic"/><size memory="1G"/><worldbody>

@@ -3,9 +3,11 @@
 import mujoco
 import numpy as np
 import pytest
+from reference import plates
 from trimesh.triangles import closest_point, points_to_barycentric
 
 JACOBIAN = {"dense": mujoco.mjtJacobian.mjJAC_DENSE, "sparse": mujoco.mjtJacobian.mjJAC_SPARSE}
+USUAL = {"condim": 1, "solref": "0.02 1"}  # contacts as firm as their tissue asks for
 
 
 def corners(model, data, contact):
@@ -137,8 +139,7 @@ def pressed(scenes, mesh, tool, depth, steps=250, h=1e-3, **config):
   points, elem = mesh
   low, top = points[:, 2].min(), points[:, 2].max()
   pin = np.flatnonzero(points[:, 2] < low + 0.1 * (top - low))
-  usual = {"condim": 1, "solref": "0.02 1"}
-  keys = {"radius": 0.0005, "pin": pin, "damping": 0.005, "contact": usual} | config
+  keys = {"radius": 0.0005, "pin": pin, "damping": 0.005, "contact": USUAL} | config
   tissue = scenes.organ(points, elem, **keys)
   body = f"""<body name="tool" pos="0 0 {top + 0.0007}"><joint name="z" type="slide" axis="0 0 1"/>
     <geom name="tool" {tool} mass="0.5" condim="1"/></body>"""
@@ -151,7 +152,7 @@ def pressed(scenes, mesh, tool, depth, steps=250, h=1e-3, **config):
 
 @pytest.mark.parametrize("subdivisions", [2, 3])
 @pytest.mark.parametrize(("tool", "kind"), [
-  ('size=".006" pos="0 0 .006"', {"young": 1e6, "foundation": 1e5}),
+  ('size=".006" pos="0 0 .006"', {"young": 1e6, "foundation": 1e5, "subgrid": "false"}),
   ('type="box" size=".012 .012 .01" pos="0 0 .01"',
    {"young": 1e5, "elements": "solid", "mass": 0.27}),
 ])  # fmt: skip
@@ -183,6 +184,71 @@ def test_a_ball_that_is_small_for_the_mesh_meets_tissue(scenes, at):
   layer = 1 + 1.133 * np.sqrt(radius * deep) / 0.04
   # 20 to 80 % more where contacts yield by nothing that the mesh lacks.
   assert np.linalg.norm(organ.force) == pytest.approx(hertz * layer, rel=0.12)
+
+
+SKIN = {"young": 5000.0, "poisson": 0.45, "thickness": 0.002, "foundation": 2e5, "tolerance": 1e-5,
+        "damping": 0.005, "radius": 0.0005, "contact": USUAL}  # fmt: skip
+
+
+def skin(scenes, at):
+  """Returns the top of that block, alone."""
+  points, elem = block(scenes, 0.008, at)
+  kept, elem = np.unique(
+    elem[(points[elem][:, :, 2] > points[:, 2].max() - 1e-6).all(axis=1)], return_inverse=True
+  )
+  return points[kept], elem.reshape(-1, 3)
+
+
+def on_skin(scenes, at, depth, mass, **keys):
+  """Returns the forces of a ball that is held in a skin and its place, once it is there."""
+  points, elem = skin(scenes, at)
+  tissue = scenes.organ(points, elem, mass=mass, **SKIN | keys)
+  top, radius = points[:, 2].max() + 0.0005, 0.04
+  ball = f"""<body pos="0 0 {top + radius}"><joint name="z" type="slide" axis="0 0 1"/>
+    <geom size="{radius}" mass="0.5" condim="1"/></body>"""
+  drive = '<actuator><position joint="z" kp="20000" kv="200"/></actuator>'
+  model, data, _ = scenes.load(scenes.world(tissue, ball, extra=drive))
+  force = []
+  for k in range(700):
+    data.ctrl[:] = -depth * min(1.0, k / 300)
+    mujoco.mj_step(model, data)
+    force.append(data.joint("z").qfrc_constraint[0])
+  return np.array(force[-200:]), radius + 0.0005
+
+
+@pytest.mark.parametrize("depth", [4e-4, 1.6e-3])  # of a contact half an edge wide, and an edge
+@pytest.mark.parametrize("at", [(1, 0, 0), (1 / 2, 1 / 2, 0), (1 / 3, 1 / 3, 1 / 3)])
+def test_a_ball_that_is_small_for_the_mesh_meets_a_skin(scenes, at, depth):
+  force, radius = on_skin(scenes, at, depth, 0.05)
+  rigidity = SKIN["young"] * SKIN["thickness"] ** 3 / (12 * (1 - SKIN["poisson"] ** 2))
+  exact = plates.ball(radius, depth, SKIN["foundation"], rigidity)
+  # 37 to 200 % more where contacts yield by nothing that the mesh lacks.
+  assert force.mean() == pytest.approx(exact, rel=0.14)
+  mesh = on_skin(scenes, at, depth, 0.05, subgrid="false")[0]
+  assert mesh.mean() > 1.3 * exact
+
+
+@pytest.mark.parametrize("depth", [4e-4, 8e-4, 1.6e-3])
+def test_a_ball_in_a_heavy_skin_is_at_rest(scenes, depth):
+  force, _ = on_skin(scenes, (1 / 3, 1 / 3, 1 / 3), depth, 0.5)
+  assert force.std() < 0.005 * force.mean()  # 150 % where C falls faster than the force grows
+
+
+def test_what_two_tools_pinch_does_not_yield_to_them(scenes):
+  points, elem = skin(scenes, (1, 0, 0))
+  tissue = scenes.organ(points, elem, mass=0.05, **SKIN)
+  balls = "".join(
+    f"""<body name="{name}" pos="0 0 {points[0, 2] + side * 0.0035}">
+    <joint name="{name}" type="slide" axis="0 0 {-side}"/><geom size=".003" mass="0.02" condim="1"/>
+    </body>""" for name, side in (("up", 1), ("down", -1))
+  )  # fmt: skip
+  drive = "".join(f'<motor joint="{name}"/>' for name in ("up", "down"))
+  scene = scenes.world(tissue, balls, extra=f"<actuator>{drive}</actuator>")
+  model, data, _ = scenes.load(scene)
+  data.ctrl[:] = 0.2
+  for _ in range(400):
+    mujoco.mj_step(model, data)
+  assert abs(data.qpos[-2:]).max() < 2e-4 and data.ncon
 
 
 def test_a_needle_does_not_fall_through_a_coarse_mesh(scenes):

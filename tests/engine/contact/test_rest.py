@@ -1,6 +1,8 @@
 """Organs that lie, stand or are pressed flat come to rest, and carry what they should."""
 
+import mujoco
 import numpy as np
+import palpate
 import pytest
 
 # An organ's height in force, its energy by what it fell: 5 mm and what it is pressed together then.
@@ -32,6 +34,22 @@ def test_it_comes_to_rest_with_its_weight(scenes, kind, h, coupling, keys):
   if np.isfinite(weight):
     assert mean == pytest.approx(weight, rel=1e-3)
     assert energy < weight * 0.015  # [J]
+
+
+def test_a_soft_cube_swings_out_after_its_fall(scenes):
+  # Of 3 kPa at 9 Hz, as its damping says: nothing feeds the motion, and then it rests.
+  model = scenes.resting("edge", 2e-3, young=3e3)[0].compile()
+  data = mujoco.MjData(model)
+  organ, energy, force = palpate.Organ(model, data, "organ"), [], []
+  for _ in range(1500):
+    mujoco.mj_step(model, data)
+    at = np.concatenate([organ.xpos, organ.inside])
+    speed = (organ.xvel**2).sum(axis=1).mean()
+    energy.append(organ.energy + 0.064 * (9.81 * at[:, 2].mean() + 0.5 * speed))
+    force.append(organ.force)
+  swing = np.array(energy).reshape(-1, 250).max(axis=1) - energy[-1]  # of each half second
+  assert (swing[1:4] < 0.5 * swing[:3]).all()
+  assert np.std(force[-150:], axis=0)[2] < 0.005 * 0.064 * 9.81
 
 
 def test_a_plate_feels_the_same_at_every_time_step(scenes):
