@@ -258,12 +258,12 @@ def tissue_of(m, organ: "Declaration", config: Config | None = None, mass=1.0) -
   share = softer * SOFT / masses * (1.0 if solid else SKIN)
   asked = FIRM / (stiffness * (SLOW * h) ** 2)
   stuck = min(1.0, max(STUCK, h / LONG))
-  modulus = np.where(np.asarray(stretch) != 0, 0.0, bare) * config.subgrid
+  modulus = np.where(np.asarray(stretch) != 0, 0.0, bare) * (config.subgrid != "false")
   # A shell's curvature holds it as a foundation would (Reissner 1946, doi:10.1002/sapm194625180):
   # that of a ball of the organ's area.
   curved = 4 * np.pi / area if organ.mesh.closed else 0.0
   held = below + plane * curved * stretch
-  plates = config.subgrid and config.elements == "membrane"
+  plates = config.subgrid == "true" and config.elements == "membrane"
   bearing = np.where(np.asarray(below) > 0, held, 0.0) * plates
   # The second is Foeppl's membrane on a foundation under a point, by least energy.
   plate, taut = np.sqrt(bend * bearing), 0.86 * np.sqrt(stretch * bearing)

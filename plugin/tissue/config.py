@@ -220,11 +220,11 @@ class Config:
     "with `window` alone: the motion stays on the CUDA device between steps, and the plugin state "
     "is brought up to date by `Organ.sync` alone ([internals](internals.md#resident))",
   )
-  subgrid: bool = _row(
-    True,
-    reading.choice({"true": True, "false": False}),
+  subgrid: str = _row(
+    "auto",
+    reading.words("auto", "true", "false"),
     "whether contacts of a tool that is small for the mesh yield by what the mesh cannot "
-    "([small tools](authoring.md#small-tools)); `false` where constants were chosen for one mesh",
+    "([small tools](authoring.md#small-tools)); `auto`: those of bare solids",
   )
   skin: str = _row(
     "",

@@ -3,6 +3,7 @@
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 import warp as wp
 from palpate.tasks.core import base, jaws, safety
+from palpate.tasks.core.instrument import BRUSH
 from palpate.tasks.core.physics import NEAR
 from palpate.tasks.core.rules import closeness as _closeness
 from palpate.tissue.types import Array, floats, ints, struct
@@ -14,6 +15,7 @@ closeness, parts = wp.func(_closeness), wp.func(safety.parts)
 _SHARE, _PRICE = wp.constant(base.SHARE), wp.constant(base.PRICE)
 _MOST = wp.constant(base.MOST)
 _SLACK = wp.constant(base.SLACK)
+_BRUSH = wp.constant(BRUSH)
 _NEAR, _FACING = wp.constant(NEAR), wp.constant(jaws.FACING)
 _distances = wp.types.vector(length=NEAR, dtype=float)
 _numbers = wp.types.vector(length=NEAR, dtype=int)
@@ -136,7 +138,7 @@ def measure(s: Common, beginning: bool):
     most = s.sensor_peak[w, s.sensor[0]]
     shaft = s.sensor_peak[w, s.sensor[1]]
     if s.around >= 0:
-      shaft = wp.max(shaft, s.sensor_peak[w, s.around])
+      shaft = wp.max(shaft, s.sensor_peak[w, s.around] - _BRUSH)
   if s.jaw >= 0:
     for k in range(2):
       s.gripper[w, 2 + k] = 0.0

@@ -15,6 +15,7 @@ from .jaws import Jaws
 AXES = ("pitch", "yaw", "roll", "insertion")
 JAWS = "grasper/"  # prefix of the instrument that has them
 TOUCH = ("touch_left", "touch_right")  # sensors of the jaws
+BRUSH = 0.2  # force with which an instrument may brush along what is around [N]
 AROUND = f"{situs.SURROUNDINGS}_force"  # sensor of what an instrument exerts on what is around
 RATES = (1.0, 1.0, 3.0, 0.12)  # pitch, yaw, roll [rad/s], insertion [m/s]
 HELD_FORCE = 0.2  # of the inner face of either jaw on tissue between them, to hold it [N]
@@ -35,7 +36,8 @@ class Instrument:
     handle: that pulls it, None where position drives move it
     guide: takes the handle along an action
     peak_force: largest force since the last control step, or a jaw's mean if that is more [N]
-    peak_shaft: largest force where none is meant since then: on the shaft, or on what is around [N]
+    peak_shaft: largest force where none is meant since then: on the shaft, or what exceeds BRUSH
+      on what is around [N]
     strayed: where that was, "shaft" or "surroundings"
     edge: force of its edges on tissue that they cut [N]  (3,)
   """
@@ -236,8 +238,8 @@ class Instrument:
     tip, shaft, *around = np.sqrt(np.einsum("ijk,ijk->ji", parts, parts))
     self._forces = {"force": tip, "shaft_force": shaft}
     self.peak_force, self.peak_shaft, self.strayed = float(tip.max()), float(shaft.max()), "shaft"
-    if around and around[0].max() > self.peak_shaft:
-      self.peak_shaft, self.strayed = float(around[0].max()), situs.SURROUNDINGS
+    if around and around[0].max() - BRUSH > self.peak_shaft:
+      self.peak_shaft, self.strayed = float(around[0].max()) - BRUSH, situs.SURROUNDINGS
     if self.has_jaw:
       jaws = values[:, 3 * count :]
       self._forces["grip_force"] = jaws.max(axis=1)

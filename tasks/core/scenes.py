@@ -175,7 +175,6 @@ def build(scene: Scene) -> mujoco.MjSpec:
   center = landmark(scene, scene.center)
   shape, config = (scene.organ, scene.nodes, scene.variant), tissue.keys()
   config = config | {"young": young, "device": "cpu", "tolerance": TOLERANCE}
-  config["subgrid"] = "false"  # constants, scores and policies are those of these meshes
   if scene.bonds is not None:
     law, grown = mjcf.numbers(scene.bonds), " ".join(map(str, bed(*shape)))
     config |= {"bonds": f"{BED} {law} at {grown}", "foundation": _LOOSE}

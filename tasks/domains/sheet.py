@@ -54,7 +54,7 @@ def build(scene: Scene) -> mujoco.MjSpec:
   """Returns the scene, ready to be compiled; what cuts is the instrument's `edge`."""
   vertices, triangles = sheet(scene.nodes)
   spare = round(_SPARE * np.sqrt(len(vertices)))
-  config = _TISSUE | {"device": "cpu", "tolerance": scenes.TOLERANCE, "subgrid": "false"}
+  config = _TISSUE | {"device": "cpu", "tolerance": scenes.TOLERANCE}
   config |= {"cutters": f"{scene.instrument}/edge {ENERGY}"}
   flex = mjcf.flexcomp(
     scenes.ORGAN,

@@ -139,7 +139,9 @@ def test_poisson_of_one_press_is_kept_wherever_it_starts(start):
 
 
 def test_the_command_names_what_the_data_do_not_determine(tmp_path, capsys, record):
-  data, out = written(tmp_path / "data.csv", record), tmp_path / "out"
+  noise = 0.2 * record.force.max() * np.random.RandomState(1).standard_normal(record.time.size)
+  rough = dataclasses.replace(record, force=record.force + noise)
+  data, out = written(tmp_path / "data.csv", rough), tmp_path / "out"
   free = ["--free", "young", "poisson", "--set", "damping=0.02", "--set", "poisson=0.4"]
   code, shown = run(capsys, data, *WORDS, *free, "-o", out)
   assert code == 0, shown.err

@@ -59,7 +59,7 @@ REFUSED = [
   ("spare", "-1", "a whole number >= 0 or 'auto'"),
   ("spare", "some", "a whole number >= 0 or 'auto'"),
   ("resident", "yes", "'true' or 'false'"),
-  ("subgrid", "on", "'true' or 'false'"),
+  ("subgrid", "on", "'auto' or 'true' or 'false'"),
   ("walls", "two words", "the name of a flexcomp"),
 ]
 

@@ -23,6 +23,7 @@ import argparse
 import importlib.util
 import math
 import pathlib
+from collections.abc import Mapping
 
 import numpy as np
 from benchmarks import plots, results
@@ -44,7 +45,8 @@ PROBE = 0.0035  # [m], the radius of the shipped probe and of the flexes
 FINE = 0.0015  # edges of the organs that are the reference [m]
 NODES = 1000  # of the others
 FLEX = 0.0005  # radius of the flex under the small ball [m]
-SKIN = {"thickness": 0.002, "foundation": 2e5, "mass": 0.05}  # under it
+SUBGRID = {"subgrid": "true"}
+SKIN = {"thickness": 0.002, "foundation": 2e5, "mass": 0.05} | SUBGRID  # under it
 SHIPPED = {
   "skin on foundation": {},
   "skin on foundation, 3 mm under the probe": {"coupling": "window", "fine": 3e-3},
@@ -293,7 +295,9 @@ def _organ(name: str) -> list[Row]:
   test = Test("sphere", PROBE, organ=name, place=place, edge=FINE, step=5e-4)
   presses = {what: _shipped(name, NODES, **how) for what, how in SHIPPED.items()}
   softer = f"skin, foundation {AS_SOLID[name]:g} Pa/m, 3 mm under the probe"
-  presses[softer] = _shipped(name, NODES, False, AS_SOLID[name], coupling="window", fine=3e-3)
+  presses[softer] = _shipped(
+    name, NODES, False, {"foundation": f"{AS_SOLID[name]:g}"}, coupling="window", fine=3e-3
+  )
   depth = {what: np.array([p.depth + p.touch for p in mine]) for what, mine in presses.items()}
   mean = np.mean(list(depth.values()), axis=0)
   fine, rows = _solid(test, name, mean), []
@@ -326,7 +330,7 @@ def _meshes(name: str, contact: str) -> list[Row]:
   firm = contact == "firm"
   meshes = [(nodes, fine) for nodes, fine in MESHES if firm or not fine]
   *forces, finest = [
-    [press.force for press in _shipped(name, n, firm, coupling="window", fine=fine)]
+    [press.force for press in _shipped(name, n, firm, SUBGRID, coupling="window", fine=fine)]
     for n, fine in meshes
   ]
   rows = []
@@ -339,16 +343,16 @@ def _meshes(name: str, contact: str) -> list[Row]:
 
 
 def _shipped(
-  name: str, nodes: int, firm: bool = False, foundation: float | None = None, **how
+  name: str, nodes: int, firm: bool = False, keys: Mapping[str, str] | None = None, **how
 ) -> list:
-  """Returns presses by the shipped probe to the depths."""
+  """Returns presses by the shipped probe to the depths; `keys` are set in the configuration."""
   from palpate.models import measure
 
   spec = models.load(name, nodes=nodes, **how)
   for flex in spec.flexes if firm else ():
     flex.solimp[:3] = 0.99, 0.999, 1e-4
-  for plugin in spec.plugins if foundation else ():
-    plugin.config = dict(plugin.config) | {"foundation": str(foundation)}
+  for plugin in spec.plugins if keys else ():
+    plugin.config = dict(plugin.config) | dict(keys or {})
   model = spec.compile()
   return [measure.press(model, name, depth) for depth in ORGAN_DEPTHS]
 

@@ -53,7 +53,7 @@ def test_who_goes_aside_meets_what_is_around(name, surroundings):
   assert env.task.outcome is None and ("surroundings" in events) == met
   if met:  # further in the force grows as that of a spring, and the wall does not throw it back
     more = [env.step(aside).observation["peak_force"][0] for _ in range(4)]
-    assert felt[-1] < more[-1] < 3
+    assert felt[-1] < max(more) < 3
 
 
 @pytest.mark.parametrize("name", ["grasp/easy", "bimanual/easy", "dissect/hard", "cut/hard"])
