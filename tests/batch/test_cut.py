@@ -293,9 +293,9 @@ def test_a_cut_solid_goes_on_as_the_plugin_does(device, windows):
     force.append((alone.contact_force.sum(axis=0)[2], *total))
   force = np.array(force)
   peak = np.abs(force[:, 0]).max()
-  # A batch leaves out how a bare solid gives way under a small tool: whole ones differ as much.
-  assert peak > 0.1 and np.sqrt(np.mean((force[:, 0] - force[:, 1]) ** 2)) < 0.05 * peak
-  assert np.array_equal(force[:, 1], force[:, 2])
+  assert peak > 0.1 and np.sqrt(np.mean((force[:, 0] - force[:, 1]) ** 2)) < 0.01 * peak
+  alike = 1e-4 * peak if "cuda" in device else 0.0  # where contacts are in no order
+  np.testing.assert_allclose(force[:, 1], force[:, 2], atol=alike, rtol=0)
   assert np.abs(force[:, 0] - force[:, 3]).max() > 0.3 * peak  # that is whole
   batch.get_state(0, data)
   mujoco.mj_forward(model, data)
@@ -305,7 +305,7 @@ def test_a_cut_solid_goes_on_as_the_plugin_does(device, windows):
   xpos = organ.xpos.numpy()
   there = np.isfinite(xpos[2]).all(axis=1)
   assert organ.piece_count.numpy().tolist() == [1, 2, 1] and there.sum() == whole
-  np.testing.assert_array_equal(xpos[0, there], xpos[2, there])
+  np.testing.assert_allclose(xpos[0, there], xpos[2, there], atol=alike and 1e-7, rtol=0)
   assert not batch.failures.numpy().any()
 
 
