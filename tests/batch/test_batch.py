@@ -204,7 +204,7 @@ def test_a_plate_over_more_nodes_than_slots_comes_to_rest_and_is_told(make, h):
     batch.step()
     forces.append(tissue.contact_force.numpy().sum(axis=1)[:, 2])
   last = -np.array(forces[-50:])
-  # On CUDA each world has its contacts in another order, and the solver, which stops early, trembles.
+  # On CUDA each world has its contacts in another order, and the solver stops early.
   assert np.all(last.std(axis=0) < 0.02 * last.mean(axis=0)) and last.min() > 1.0
   assert np.abs(tissue.xvel.numpy()).max() < 0.01 and not batch.failures.numpy().any()
   with pytest.warns(UserWarning, match="windows had no room"):
