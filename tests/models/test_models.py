@@ -65,8 +65,8 @@ def test_what_is_behind_an_organ_is_drawn_smooth():
 @pytest.mark.parametrize("name", NAMES)
 def test_folder_is_complete(name):
   folder = models.path(name).parent
-  picture = folder / f"{name}.png"
-  assert picture.stat().st_size < 350_000
+  picture = folder / f"{name}.webp"
+  assert picture.stat().st_size < 100_000
   readme = (folder / "README.md").read_text()
   tissue = catalog.entry(name).tissue
   numbers = {
