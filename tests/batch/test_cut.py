@@ -293,8 +293,9 @@ def test_a_cut_solid_goes_on_as_the_plugin_does(device, windows):
     force.append((alone.contact_force.sum(axis=0)[2], *total))
   force = np.array(force)
   peak = np.abs(force[:, 0]).max()
-  assert peak > 0.1 and np.sqrt(np.mean((force[:, 0] - force[:, 1]) ** 2)) < 0.01 * peak
-  alike = 1e-4 * peak if "cuda" in device else 0.0  # where contacts are in no order
+  # Contacts are in no order on CUDA.
+  off, alike = (0.02, 1e-4 * peak) if "cuda" in device else (0.01, 0.0)
+  assert peak > 0.1 and np.sqrt(np.mean((force[:, 0] - force[:, 1]) ** 2)) < off * peak
   np.testing.assert_allclose(force[:, 1], force[:, 2], atol=alike, rtol=0)
   assert np.abs(force[:, 0] - force[:, 3]).max() > 0.3 * peak  # that is whole
   batch.get_state(0, data)
