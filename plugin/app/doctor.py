@@ -121,7 +121,7 @@ def _plugin() -> list[str]:
 
 
 def _tasks() -> list[str]:
-  _python("import palpate.tasks; palpate.tasks.load('touch', 'easy')")
+  _python("import palpate.tasks.core.engine")
   try:
     return [f"start with dm-control {importlib.metadata.version('dm-control')}"]
   except importlib.metadata.PackageNotFoundError:
