@@ -304,7 +304,9 @@ def obstruct(
   def add(on: mujoco.MjsBody, meets: int, **shape: Any) -> None:
     on.add_geom(contype=0, conaffinity=meets, group=_HIDDEN, mass=0, **_SOFT, **shape)
 
-  every = [(_balls(name), pos) for name, _, pos in _placed(organs, around, held) if name in _BALLS]
+  # A kidney is felt through the fat that it lies in: to brush that is part of the work.
+  firm = set(_BALLS) - ({"fat"} if around == "kidney" else set())
+  every = [(_balls(name), pos) for name, _, pos in _placed(organs, around, held) if name in firm]
   if more is not None:
     every.append((scenery.balls(more, _BALLS["fat"]), np.zeros(3)))
   for (centers, radii), pos in every:
