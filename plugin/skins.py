@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import mujoco
 import numpy as np
-from palpate.engine.model.skin import HIDDEN as HIDDEN
+from palpate.engine.model.skin import HIDDEN
 
 from .tissue.geometry import subdivide
 from .tissue.geometry.mesh import vertex_normals

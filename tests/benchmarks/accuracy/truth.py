@@ -11,10 +11,11 @@ end and the surface, 1 mm thick, meet as a sphere of 3.5 mm: the reference is a 
 measured modulus with edges of 1.5 mm under such a sphere, as deep from the first touch on, by the
 rows above within some 5 % itself; beside it solids, and the shipped skins, whose foundation stands
 for their inside. `mesh`: those skins with fewer triangles, even ones and with `fine` ones where the
-probe goes, over 16,000 nodes, with contacts as firm as those of `fine` and as they ship.
-`small`: a ball on a block, over Hertz's layer, and on a skin with a foundation, over the closed
-form of a plate on one (`reference/plates.py`), on a node and between nodes; and its greatest force
-over the least where it slides on over an edge, as deep and without friction.
+probe goes, over 16,000 nodes, with contacts as firm as those of `fine`; and as they ship, with
+`subgrid="true"`. `small`: a ball on a block, over Hertz's layer, and on a skin with a foundation
+and `subgrid="true"`, over the closed form of a plate on one (`reference/plates.py`), on a node and
+between nodes; and its greatest force over the least where it slides on over an edge, as deep and
+without friction.
 """
 
 from __future__ import annotations
@@ -120,7 +121,7 @@ def stages(args: argparse.Namespace) -> list[list[Case]]:
     cases += [
       {"case": f"mesh {name} {contact}", "kind": "mesh", "organ": name, "contact": contact}
       for name in ("liver", "kidney")
-      for contact in ("firm", "as shipped")
+      for contact in ("firm", "subgrid")
     ]
     cases += [
       {"case": f"organ {name}", "kind": "organ", "organ": name} for name in ("liver", "kidney")
@@ -327,10 +328,10 @@ def _solid(test, name: str, depths: np.ndarray) -> np.ndarray:
 
 def _meshes(name: str, contact: str) -> list[Row]:
   """Returns rows of an organ's skin by its mesh, over that of the last one."""
-  firm = contact == "firm"
+  firm, keys = contact == "firm", SUBGRID if contact == "subgrid" else None
   meshes = [(nodes, fine) for nodes, fine in MESHES if firm or not fine]
   *forces, finest = [
-    [press.force for press in _shipped(name, n, firm, SUBGRID, coupling="window", fine=fine)]
+    [press.force for press in _shipped(name, n, firm, keys, coupling="window", fine=fine)]
     for n, fine in meshes
   ]
   rows = []
