@@ -48,8 +48,6 @@ class BarePhysics:
     data, model: the wrapped data and its model
   """
 
-  legacy_step = True
-
   def __init__(self, data: Wrapped):
     self._reload_from_data(data)
 
@@ -90,10 +88,6 @@ class BarePhysics:
   def timestep(self) -> float:
     """Returns the time step [s]."""
     return self.model.opt.timestep
-
-  def set_control(self, control: np.ndarray) -> None:
-    """Sets the actuators' controls."""
-    self.data.ctrl[:] = control
 
   def forward(self) -> None:
     """Recomputes what depends on the state."""
@@ -192,10 +186,9 @@ class BareEnvironment(dm_env.Environment):
 
   def __init__(
     self, physics, task, time_limit, control_timestep, n_sub_steps, flat_observation=False,
-    legacy_step=True,
+    legacy_step=True,  # which an exercise's physics, with steps of its own, does not read
   ):  # fmt: skip
     self._physics, self._task, self._flat_observation = physics, task, flat_observation
-    physics.legacy_step = legacy_step
     if n_sub_steps is not None and control_timestep is not None:
       raise ValueError("Both n_sub_steps and control_timestep were supplied.")
     if n_sub_steps is None:

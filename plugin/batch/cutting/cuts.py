@@ -263,15 +263,10 @@ class Cuts:
 
   # Motion of some worlds, to the host and back.
 
-  def _vectors(self) -> dict[str, wp.array]:
-    p = self._organ.patch
-    solve = self._organ.body.state
-    return {"disp": solve.disp, "vel": solve.vel, "last": p.last, "before": p.before}
-
   def motion(self, worlds: list[int]) -> Motion:
     """Returns what the vertices of worlds have."""
     out = {}
-    for name, array in self._vectors().items():
+    for name, array in self._organ.vectors.items():
       out[name] = self._get(array, worlds)[:, self._place].astype(float)
     rows = self._get(self._organ.patch.force, worlds).reshape(len(worlds), -1, 3)
     return Motion(**out, force=rows[:, self._node].astype(float))
@@ -279,7 +274,7 @@ class Cuts:
   def put_motion(self, worlds: list[int], motion: Motion):
     """Gives vertices of worlds their motion."""
     shape = len(worlds), 3 * self._organ.body.shape.nnode
-    for name, array in self._vectors().items():
+    for name, array in self._organ.vectors.items():
       rows = np.zeros(shape, np.float32)
       rows[:, self._place] = getattr(motion, name)
       self._put(array, worlds, rows)
