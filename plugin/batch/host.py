@@ -1,4 +1,4 @@
-"""An organ of `Worlds` as its passive forces see it, and what lets meshes of worlds come apart."""
+"""An organ of `Worlds` as the host of its passive forces; the base class of cutters and tears."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ class Host(host.Host):
 
 
 class Opens(Force):
-  """What lets meshes come apart, for which the host looks now and then.
+  """A cutter or tears, which the host looks at every few steps.
 
   Args:
     organ: the organ

@@ -1,4 +1,4 @@
-"""Rows of an organ's contacts: how firm they are, what slides stays closed, how hard they press.
+"""Rows of an organ's contacts: their stiffness, the gaps of sliding contacts, and their forces.
 
 Contacts that slide stay closed, see `keep_closed` of coupling/contact_weights.h, which widens the
 gap of a contact by D mu |v| over its stiffness, D the damping of its rows. A gap is in the

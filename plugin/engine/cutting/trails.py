@@ -1,9 +1,9 @@
-"""Paths of what cuts, in any world: they grow behind a blade or a current, and come apart.
+"""Paths of cutters, in any world: they grow behind a blade or a current, and the mesh opens there.
 
-What cuts by a current, such as a hook, has an actuator whose control is its power, in watts. Above
-0 it cuts the wall and frees bonds; below 0 it coagulates, which frees bonds alone. What it touches
+A tool that cuts by a current, such as a hook, has an actuator whose control is its power, in watts.
+Above 0 it cuts the wall and frees bonds; below 0 it coagulates, which frees bonds alone. The tissue
 takes `energy` an area: a path in the wall grows by power / (energy * thickness) a second, and bonds
-near it lose their hold by power / (energy * area).
+near the tool lose their hold by power / (energy * area).
 """
 
 from __future__ import annotations

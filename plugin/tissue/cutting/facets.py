@@ -1,4 +1,4 @@
-"""What comes apart of a mesh: edges of sheets, or faces between tetrahedra of solids.
+"""Facets, which cuts open: edges of sheets, or faces between tetrahedra of solids.
 
 Two kinds behind one interface: how a path becomes a cut, how a body's arrays follow it, and how the
 plugin state has it. What is above, in one world or many, does not ask which kind it is.

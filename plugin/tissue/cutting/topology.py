@@ -1,7 +1,7 @@
-"""What cuts of an organ do in a world: find, take over, report, and what the plugin state has.
+"""Cuts of an organ in one world: finding and applying them, their reports, and the plugin state.
 
-One world of the plugin and each of a batch go through here, sheets and solids; `facets` knows which
-of the two it is.
+The plugin's world and every world of a batch use this text, for sheets and for solids; `facets`
+knows which of the two an organ is.
 """
 
 from __future__ import annotations
