@@ -50,8 +50,8 @@ def strip(nodes: int) -> tuple[np.ndarray, np.ndarray]:
 def build(scene: Scene) -> mujoco.MjSpec:
   """Returns the scene, ready to be compiled; `scene.bonds` hold the strip."""
   vertices, triangles = strip(scene.nodes)
-  config = _TISSUE | {"device": "cpu", "tolerance": scenes.TOLERANCE}
-  config |= {"support": BED, "bonds": f"{BED} {mjcf.numbers(scene.bonds)} near {_NEAR}"}
+  config = _TISSUE | {"device": "cpu", "tolerance": scenes.TOLERANCE, "support": BED}
+  config |= {"bonds": f"{BED} {mjcf.numbers(scene.bonds)} near {_NEAR}"}
   contact = scenes.CONTACT | {"contype": 0, "conaffinity": 1}  # with tools, not with the bed
   flex = mjcf.flexcomp(
     scenes.ORGAN,
