@@ -304,7 +304,7 @@ def _joined(point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def key_of(corner: np.ndarray, n: int) -> np.ndarray:
   """Returns a number for the three vertices of each triangle, of n."""
-  a, b, c = np.moveaxis(np.sort(corner, axis=-1), -1, 0)
+  a, b, c = np.moveaxis(np.sort(corner.astype(np.int64), axis=-1), -1, 0)
   return (a * n + b) * n + c
 
 

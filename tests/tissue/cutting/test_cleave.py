@@ -224,3 +224,15 @@ def test_a_cut_at_4000_nodes_follows_its_path():
   mesh = faces.cuttable(surface, fill.fill("organ", surface.without_spare))
   far = off(mesh, (0.0, 0.1, 0.2, 0.3, 0.4, 0.5), 0.012)
   assert np.percentile(far, 98) < 0.1e-3 and far.max() < 1e-3
+
+
+def test_triangles_of_a_solid_with_room_for_cuts_keep_their_numbers():
+  """MuJoCo's are of 32 bits, which numbers of three vertices together exceed."""
+  import scenes
+
+  points, elem = scenes.box((0.06, 0.05, 0.03), 0.004)
+  both = np.concatenate([points, np.zeros((2500, 3))])
+  surface = topology.build("organ", both, elem.astype(np.int32), 2500)
+  mesh = faces.cuttable(surface, fill.fill("organ", surface.without_spare))
+  # Some have the diagonal of the tetrahedra: two corners of their own.
+  assert all(len(np.intersect1d(*pair)) >= 2 for pair in zip(mesh.elem, elem, strict=True))
