@@ -247,7 +247,7 @@ def test_the_picture_is_of_the_deepest_point(tmp_path):
   imageio = pytest.importorskip("imageio.v3")
   code, _ = run(tmp_path, "--picture")
   assert code == 0
-  assert imageio.imread(tmp_path / "press_deepest.png").shape == (720, 960, 3)
+  assert imageio.imread(tmp_path / "press_deepest.png").shape == (960, 1280, 3)
 
 
 def test_a_missing_extra_is_named(tmp_path, capsys, monkeypatch):

@@ -62,7 +62,7 @@ def snapshot(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
 
 def picture(model: mujoco.MjModel, data: mujoco.MjData, state: np.ndarray, path: pathlib.Path):
   """Draws a snapshot into a PNG file, without a screen."""
-  with film.renderer(model, 960, 720) as renderer, film.write(path, 1) as write:
+  with film.renderer(model, 1280, 960) as renderer, film.write(path, 1) as write:
     write(frame(model, data, state, renderer))
 
 
