@@ -1,9 +1,13 @@
 """Records an exercise step by step; see `recording` for what comes out."""
 
+import concurrent.futures
+import contextlib
+import dataclasses
 import json
 import math
 import os
 import re
+import time as clock
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -27,6 +31,7 @@ from .recording import (
 
 __all__ = ["Event", "Recorder", "Recording", "Settings"]
 
+_EVERY = 1.0  # between parts of a recording that goes on [s]
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*")
 
 
@@ -73,6 +78,50 @@ class _Buffer:
       self.values = grown
 
 
+class _Journal:
+  """Appends what is new of a recording to its file, in a thread: the disk may take its time."""
+
+  def __init__(self, path: str | os.PathLike[str]):
+    self._file = open(path, "ab", buffering=0)
+    self._thread = concurrent.futures.ThreadPoolExecutor(1)
+    self._work: concurrent.futures.Future[None] | None = None
+    self._due = 0.0
+    self._samples = self._events = 0
+    self._constants: dict[str, np.ndarray] = {}
+
+  @property
+  def due(self) -> bool:
+    """Whether a part is to be written: not before the last one is on the disk."""
+    return clock.monotonic() >= self._due and (self._work is None or self._work.done())
+
+  def add(self, recording: Recording) -> None:
+    """Writes what is new."""
+    part = recording.since(self._samples, self._events)
+    known = self._constants
+    new = {name: v for name, v in part.constants.items() if v is not known.get(name)}
+    part = dataclasses.replace(part, constants=new, info=dict(part.info))
+    known |= new
+    self._samples, self._events = len(recording.time), len(recording.events)
+    self._due = clock.monotonic() + _EVERY
+    self._work = self._thread.submit(self._append, part)
+
+  def _append(self, part: Recording) -> None:
+    data, written = part.part(), 0
+    with contextlib.suppress(OSError):
+      written = self._file.write(data)
+      os.fsync(self._file.fileno())
+    if written < len(data):
+      self._due = math.inf  # the disk is full: nothing can follow half a part
+
+  def close(self, recording: Recording) -> None:
+    """Writes the rest and ends the file."""
+    if self._due < math.inf:
+      self.add(recording)
+    self._thread.shutdown()
+    with contextlib.suppress(OSError):
+      self._file.close()
+
+
 class Recorder:
   """Takes one sample a control step from any environment or plain MuJoCo loop.
 
@@ -88,6 +137,7 @@ class Recorder:
     watch: Sequence[str] = (),
     info: Mapping[str, Any] | None = None,
     substeps: int = 1,
+    journal: str | os.PathLike[str] | None = None,
   ):
     """Starts an empty recording.
 
@@ -100,6 +150,8 @@ class Recorder:
         `outcome`, which is `success` or another word, there is no score
       substeps: how many values of the forces come with each sample, for instance the physics' steps
         in a control step
+      journal: file that what is recorded is appended to every second, so that a process that is
+        killed leaves it; `Recording.load` reads it. `close` ends it, `save` may take its place
     """
     if isinstance(instruments, str) or not instruments:
       raise ValueError(f"instruments is {instruments!r}, expected a list of names")
@@ -119,6 +171,7 @@ class Recorder:
     self._constants: dict[str, np.ndarray] = {}
     self._events: list[Event] = []
     self._owed: Callable[[], float] | None = None  # the last sample's strain
+    self._journal = None if journal is None else _Journal(journal)
 
   def __len__(self) -> int:
     return self._count
@@ -175,6 +228,8 @@ class Recorder:
     own = {name: self._own(name, value) for name, value in arrays.items()} if arrays else {}
     self._store(time, columns, own)
     self._owed = owed
+    if self._journal is not None and self._journal.due:
+      self._journal.add(self._view(self._count - (owed is not None)))
 
   def settle(self) -> None:
     """Works out what the last sample was given as a function; at the latest the next one does."""
@@ -276,7 +331,16 @@ class Recorder:
   def recording(self) -> Recording:
     """Returns what was recorded so far; read-only views, cheap."""
     self.settle()
-    n = self._count
+    return self._view(self._count)
+
+  def close(self) -> None:
+    """Writes the rest to the journal, if there is one, and ends it."""
+    if self._journal is not None:
+      self._journal.close(self.recording())
+      self._journal = None
+
+  def _view(self, n: int) -> Recording:
+    """Returns the first n samples."""
     return Recording(
       time=self._time.view(n),
       columns={name: buffer.view(n) for name, buffer in self._columns.items()},

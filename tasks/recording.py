@@ -3,15 +3,21 @@
 A recording is enough to compute every metric again to the bit, and, with the caller's own arrays
 (states, actions), to replay the exercise. On disk it is an `.npz` of plain arrays; the rest is JSON
 in its entry `meta`. Nothing in it is executed when it is read.
+
+While an exercise goes on, its file is a sequence of parts: `PART`, the length of what follows (8
+bytes, little-endian), and an `.npz` of the samples since the part before. The complete recording
+takes the place of the parts. Where the process was killed before that, the parts are read as one
+recording whose outcome is `interrupted`.
 """
 
 import dataclasses
+import io
 import json
 import math
 import os
 import typing
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +30,8 @@ from .metrics import EVENTS, Metrics, check_time, low_pass, rows
 
 FORMAT = "palpate-recording"
 VERSION = 2
+PART = b"PART"
+INTERRUPTED = "interrupted"  # outcome of what its process did not live to complete
 
 
 @dataclasses.dataclass(frozen=True)
@@ -192,6 +200,23 @@ class Recording:
       path: the file, by custom with the suffix .npz; its folder must exist
     """
     path = Path(path)
+    with replacing(path, "wb") as file:
+      np.savez_compressed(file, allow_pickle=False, **self._entries())
+    return path
+
+  def part(self) -> bytes:
+    """Returns the recording as a part of a file, to be appended to those before."""
+    file = io.BytesIO()
+    np.savez(file, allow_pickle=False, **self._entries())
+    data = file.getvalue()
+    return PART + len(data).to_bytes(8, "little") + data
+
+  def since(self, sample: int, event: int) -> "Recording":
+    """Returns the samples and the events from these on; views, with the constants."""
+    tables = {name: {k: v[sample:] for k, v in getattr(self, name).items()} for name in _SAMPLED}
+    return dataclasses.replace(self, time=self.time[sample:], events=self.events[event:], **tables)
+
+  def _entries(self) -> dict[str, np.ndarray]:
     meta = {
       "format": FORMAT,
       "version": VERSION,
@@ -205,19 +230,17 @@ class Recording:
     entries = {"meta": np.array(json.dumps(meta, allow_nan=False)), "time": self.time}
     for kind, table in _TABLES.items():
       entries |= {f"{kind}.{name}": value for name, value in getattr(self, table).items()}
-    with replacing(path, "wb") as file:
-      np.savez_compressed(file, allow_pickle=False, **entries)
-    return path
+    return entries
 
   @classmethod
   def load(cls, path: str | os.PathLike[str]) -> "Recording":
     """Reads a recording; ValueError and OSError name the file and what is wrong with it."""
-    return _reading(path, cls._read)
+    return _reading(path, cls._read, _joined)
 
   @classmethod
   def load_info(cls, path: str | os.PathLike[str]) -> dict[str, Any]:
     """Reads `info` alone, in a twentieth of the time; errors as of `load`."""
-    return _reading(path, cls._read_info)
+    return _reading(path, cls._read_info, lambda infos: _ended(list(infos)[-1]))
 
   @classmethod
   def _read_info(cls, file: Any) -> dict[str, Any]:
@@ -254,6 +277,7 @@ class Recording:
 
 _MOST = 2**30  # bytes of all entries, not compressed
 _TABLES = {"column": "columns", "array": "arrays", "constant": "constants"}
+_SAMPLED = ("columns", "arrays")
 
 
 def check_array(name: str, value: np.ndarray) -> np.ndarray:
@@ -290,8 +314,15 @@ def _check_column(name: str, value: np.ndarray, count: int, substeps: int) -> No
     raise ValueError(f"column {name} is {value.dtype} {value.shape}, expected float64 {allowed}")
 
 
-def _reading(path: str | os.PathLike[str], read: Callable[[Any], Any]) -> Any:
-  """Returns what `read` makes of a file; ValueError and OSError name the file."""
+def _reading(
+  path: str | os.PathLike[str],
+  read: Callable[[Any], Any],
+  join: Callable[[Iterator[Any]], Any],
+) -> Any:
+  """Returns what `read` makes of a file, or what `join` makes of its parts, each of them read.
+
+  ValueError and OSError name the file.
+  """
   path = Path(path)
   if path.exists() and not path.is_file():  # a pipe would be waited for
     raise ValueError(f"{path}: not a {FORMAT}: not a file")
@@ -301,15 +332,65 @@ def _reading(path: str | os.PathLike[str], read: Callable[[Any], Any]) -> Any:
     why = f"{error.strerror}, expected a {FORMAT} (.npz), as palpate exercise keeps"
     raise type(error)(f"{path}: {why}") from None
   with opened as file:
-    if file.read(2) != b"PK":
+    head = file.read(len(PART))
+    if head[:2] != b"PK" and head != PART:
       raise ValueError(f"{path}: not a {FORMAT}: not a zip archive")
     file.seek(0)
     # Whatever broken bytes make zipfile, zlib, numpy or json raise is the file's fault.
     try:
-      return read(file)
+      return read(file) if head != PART else join(map(read, _parts(file)))
     except Exception as error:
       text = str(error) or type(error).__name__
       raise ValueError(f"{path}: not a readable {FORMAT}: {text}") from error
+
+
+def _parts(file: Any) -> Iterator[io.BytesIO]:
+  """Yields the parts of a file that were written to their end; ValueError where none was."""
+  count = 0
+  while file.read(len(PART)) == PART:
+    length = int.from_bytes(file.read(8), "little")
+    data = file.read(min(length, _MOST))
+    if len(data) < length:
+      break
+    yield io.BytesIO(data)
+    count += 1
+  if not count:
+    raise ValueError("no part of it is complete")
+
+
+def _joined(parts: Iterator[Recording]) -> Recording:
+  """Returns the recording that its parts make, as interrupted."""
+  known, size = [], 0
+  for part in parts:
+    known.append(part)
+    size += sum(v.nbytes for kind in _TABLES.values() for v in getattr(part, kind).values())
+    if size > _MOST:
+      raise ValueError(f"its parts hold {size} bytes, expected at most {_MOST}")
+  last, counts = known[-1], [len(each.time) for each in known]
+  tables: dict[str, dict[str, np.ndarray]] = {"constants": {}}
+  for each in known:
+    tables["constants"] |= each.constants
+  for table in _SAMPLED:
+    rows = [getattr(each, table) for each in known]
+    like = {name: value for row in rows for name, value in row.items()}
+    tables[table] = {
+      name: np.concatenate([
+        row[name] if name in row else np.full((n, *value.shape[1:]), np.nan, value.dtype)
+        for row, n in zip(rows, counts, strict=True)
+      ])
+      for name, value in like.items()
+    }  # fmt: skip
+  return dataclasses.replace(
+    last,
+    time=check_time(np.concatenate([each.time for each in known]), least=0),
+    events=tuple(event for each in known for event in each.events),
+    info=_ended(last.info),
+    **tables,
+  )
+
+
+def _ended(info: dict[str, Any]) -> dict[str, Any]:
+  return {"outcome": INTERRUPTED, **info}
 
 
 def _meta(archive: Any) -> dict[str, Any]:

@@ -13,10 +13,11 @@ SETTINGS = Settings(
 )
 
 
-def exercise(steps=300, instruments=("left", "right"), seed=0):
+def exercise(steps=300, instruments=("left", "right"), seed=0, journal=None):
   """Everything that can be recorded, with two instruments that move and touch."""
   rng = np.random.RandomState(seed)
-  recorder = Recorder(instruments, SETTINGS, watch=["drop"], info={"task": "touch", "seed": seed})
+  info = {"task": "touch", "seed": seed}
+  recorder = Recorder(instruments, SETTINGS, watch=["drop"], info=info, journal=journal)
   recorder.attach("curve", [[0, 0, 0], [0.05, 0, 0], [0.1, 0.02, 0]])
   recorder.attach("initial_state", rng.rand(7))
   pos = np.cumsum(rng.randn(steps, len(instruments), 3) * 1e-3, 0)

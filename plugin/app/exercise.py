@@ -173,7 +173,8 @@ class _Job:
     folder: of the files, None where they are in a record alone
     film: file of the film, None without one
     references: what finds the references of tasks
-    keeping: of a record, None without one
+    sitting: of a record, None without one
+    path: of the file in it
   """
 
   name: str
@@ -183,12 +184,13 @@ class _Job:
   folder: pathlib.Path | None
   film: pathlib.Path | None
   references: Any
-  keeping: keeping.Keeping | None
+  sitting: keeping.Sitting | None
+  path: pathlib.Path | None
 
 
 def _prepare(args: argparse.Namespace) -> _Job:
   """Returns the job, everything that can be wrong with it checked."""
-  old, kept = None, None
+  old, sitting, path = None, None, None
   references = keeping.references(args.references)
   try:
     if args.replay:
@@ -197,12 +199,15 @@ def _prepare(args: argparse.Namespace) -> _Job:
       old, run = _replay(args.replay)
       name, seed = old.info["task"], old.info["seed"]
     else:
-      kept = keeping.read(args, options.task_name(args.task))
-      (name, run), seed = _perform(args), args.seed
+      name, seed, info = options.task_name(args.task), args.seed, {}
+      if kept := keeping.read(args, name):
+        sitting = kept.begin()
+        path, info = sitting.reserve(name)
+      run = _perform(args, name, info, path)
   except (ValueError, OSError) as error:
     raise CommandError(str(error)) from None
   folder = None
-  if args.out or not kept:
+  if args.out or not sitting:
     default = f"out/{name.replace('/', '_')}{'_replay' if old else ''}"
     folder = output_folder("out", pathlib.Path(args.out or default))
   if old and folder and (folder / "recording.npz").resolve() == pathlib.Path(args.replay).resolve():
@@ -210,7 +215,7 @@ def _prepare(args: argparse.Namespace) -> _Job:
   shot = output("film", args.film, film.FILMS) if args.film else None
   if shot:
     film.check(shot.suffix)
-  return _Job(name, seed, run, old, folder, shot, references, kept)
+  return _Job(name, seed, run, old, folder, shot, references, sitting, path)
 
 
 def _replay(path: str):
@@ -223,29 +228,37 @@ def _replay(path: str):
   return old, lambda watch: episode.replay(old, watch, env)
 
 
-def _perform(args: argparse.Namespace):
-  """Returns a task's name, and what runs an episode of it."""
+def _perform(
+  args: argparse.Namespace, name: str, info: dict[str, Any], journal: pathlib.Path | None
+):
+  """Returns what runs an episode of a task."""
   from palpate.tasks.core import episode, performer
 
-  name, task_kwargs = options.task_name(args.task), options.read(args.set)
+  task_kwargs = options.read(args.set)
   if args.device:
-    return name, _by_hand(args, name, task_kwargs)
+    return _by_hand(args, name, task_kwargs, info, journal)
   who = args.performer or "expert"
-  info = {"task_kwargs": task_kwargs, "performer": who}
+  info = {"task_kwargs": task_kwargs, "performer": who, **info}
   if who == "keyboard":
     from . import keyboard
 
     env = options.load(name, task_kwargs)
-    run = functools.partial(keyboard.run, env, args.seed, info)
+    run = functools.partial(keyboard.run, env, args.seed, info, journal=journal)
   else:
     performer.find(who, "keyboard")
     env = options.load(name, task_kwargs)
     act = performer.make(env, who, args.seed)
-    run = functools.partial(episode.run, env, act, args.seed, info, args.states)
-  return name, run
+    run = functools.partial(episode.run, env, act, args.seed, info, args.states, journal=journal)
+  return run
 
 
-def _by_hand(args: argparse.Namespace, name: str, task_kwargs: dict[str, Any]):
+def _by_hand(
+  args: argparse.Namespace,
+  name: str,
+  task_kwargs: dict[str, Any],
+  info: dict[str, Any],
+  journal: pathlib.Path | None,
+):
   """Returns what runs an episode of a task with a device."""
   from . import live
 
@@ -256,8 +269,8 @@ def _by_hand(args: argparse.Namespace, name: str, task_kwargs: dict[str, Any]):
     other = live.device(args.left) if args.left else None
   except live.DeviceError as error:
     raise CommandError(str(error), code=1) from None
-  info = {"task_kwargs": task_kwargs}
-  session = live.Session(env, device, args.seed, info, coupled, other=other)
+  info = {"task_kwargs": task_kwargs, **info}
+  session = live.Session(env, device, args.seed, info, coupled, other=other, journal=journal)
   return lambda watch: session.run(watch=watch)
 
 
@@ -269,9 +282,9 @@ def _write(job: _Job, recording: Any, report: bool) -> str:
     _write_files(job, job.folder, recording, report)
   if job.film:
     print(f"film       {job.film}")
-  if job.keeping is None:
+  if job.sitting is None:
     return ""
-  kept = job.keeping.begin().keep(recording)
+  kept = job.sitting.keep(recording, path=job.path)
   print(f"recording  {kept.path or 'lost'}")
   print("\n".join(kept.said), end="\n" * bool(kept.said))
   return kept.fault

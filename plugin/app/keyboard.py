@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pathlib
 import time
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -60,7 +61,13 @@ class Hand:
     return np.array([action.get(name, 0.0) for name in self._components])
 
 
-def run(env, seed: int, info: Mapping[str, Any], watch: Callable[[Any], bool]) -> Recording:
+def run(
+  env,
+  seed: int,
+  info: Mapping[str, Any],
+  watch: Callable[[Any], bool],
+  journal: pathlib.Path | None = None,
+) -> Recording:
   """Returns the recording of an episode, as `episode.run` does; Esc or the window ends it."""
   hand = Hand(env.task.components)
   # The episode starts with the first step; the window needs the model that it will have.
@@ -80,4 +87,4 @@ def run(env, seed: int, info: Mapping[str, Any], watch: Callable[[Any], bool]) -
       time.sleep(max(0.0, due - time.monotonic()))
       return watch(env) or hand.ended or not there
 
-    return episode.run(env, hand, seed, info, watch=step)
+    return episode.run(env, hand, seed, info, watch=step, journal=journal)

@@ -7,6 +7,7 @@ Sample 0 is the start; action and reward of sample k are those of the step that 
 
 import dataclasses
 import json
+import os
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -40,6 +41,7 @@ def run(
   info: Mapping[str, Any] | None = None,
   states: bool = False,
   watch: Callable[[Any], Any] | None = None,
+  journal: str | os.PathLike[str] | None = None,
 ) -> Recording:
   """Returns the recording of one episode.
 
@@ -50,6 +52,7 @@ def run(
     info: the caller's own entries of the recording, JSON; with `task_kwargs` it can be replayed
     states: whether the state (mjSTATE_INTEGRATION) of every step is kept; it is large
     watch: called with the environment after every step; a true result ends the episode
+    journal: file that takes the episode second by second, see `Recorder`
 
   Raises:
     EpisodeError: the policy raised, an action is not allowed or the motion diverged.
@@ -58,7 +61,7 @@ def run(
   physics: Any = env.physics
   task.random = np.random.RandomState(seed)
   timestep = env.reset()
-  recorder = _begin(env, seed, info or {}, states)
+  recorder = _begin(env, seed, info or {}, states, journal)
   physics.meanwhile = recorder.settle
   total = 0.0
 
@@ -66,6 +69,7 @@ def run(
     physics.meanwhile = None
     recorder.info |= {"outcome": task.outcome or "time limit", "return": total}
     recorder.attach("state_last", physics.integration_state())
+    recorder.close()
     return recorder.recording()
 
   while not timestep.last():
@@ -90,12 +94,18 @@ def run(
   return finish()
 
 
-def _begin(env: Environment, seed: int, info: Mapping[str, Any], states: bool) -> Recorder:
+def _begin(
+  env: Environment,
+  seed: int,
+  info: Mapping[str, Any],
+  states: bool,
+  journal: str | os.PathLike[str] | None,
+) -> Recorder:
   """Returns the recorder of an episode, with the constants and the sample of its start."""
   task: Any = env.task
   physics: Any = env.physics
   names = [hand.prefix.rstrip("/") for hand in physics.hands]
-  recorder = Recorder(names, task.settings(), task.watch, substeps=substeps(env))
+  recorder = Recorder(names, task.settings(), task.watch, substeps=substeps(env), journal=journal)
   recorder.info = {
     "task": task.name,
     "seed": seed,

@@ -11,7 +11,7 @@ from typing import Any
 
 from ..files import replacing
 from ..metrics import METRICS, Metrics, Spec, Unknown, number
-from ..recording import Recording
+from ..recording import INTERRUPTED, Recording
 from . import page
 from .page import text
 from .plots import force_figure, path_figure, png, spectrum_figure
@@ -24,6 +24,7 @@ _ENDS = {
   "missed": "Failed: reported a wrong place",
   "time limit": "Failed: the time ran out",
   "stopped": "Stopped before the end",
+  INTERRUPTED: "Interrupted: the program was killed, this is what it had written",
   "error": "Failed: the performer or the simulation raised an error",
 }
 

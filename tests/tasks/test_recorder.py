@@ -45,6 +45,32 @@ def test_round_trip_is_exact(tmp_path):
   assert Recording.load(again).metrics() == made.metrics()
 
 
+def test_a_journal_is_the_recording_until_it_is_saved(tmp_path):
+  """Parts that were written while it went on make it, to the bit; half a part is left out."""
+  path = tmp_path / "exercise.npz"
+  made = exercise(60, journal=path)
+  made.close()
+  whole, parts = made.recording(), Recording.load(path)
+  assert parts.outcome == "interrupted"
+  assert Recording.load_info(path) == parts.info == {**whole.info, "outcome": "interrupted"}
+  _same_bits(parts.time, whole.time)
+  for table in ("columns", "arrays", "constants"):
+    old, new = getattr(whole, table), getattr(parts, table)
+    assert old.keys() == new.keys() and old
+    for name in old:
+      _same_bits(new[name], old[name])
+  assert parts.events == whole.events and parts.metrics() == whole.metrics()
+  data = path.read_bytes()
+  assert data.count(b"PART") >= 2
+  path.write_bytes(data[:-100])
+  assert 0 < len(Recording.load(path).time) < 60
+  path.write_bytes(data[:100])
+  with pytest.raises(ValueError, match="no part of it is complete"):
+    Recording.load(path)
+  whole.save(path)
+  assert Recording.load(path).outcome is None
+
+
 def test_the_file_needs_no_pickle(tmp_path):
   path = exercise(5).save(tmp_path / "exercise.npz")
   with np.load(path, allow_pickle=False) as archive:

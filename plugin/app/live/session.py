@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import os
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -51,6 +52,7 @@ class Session:
     coach: Any = None,
     publish: Callable[[Session], None] | None = None,
     other: Device | None = None,
+    journal: str | os.PathLike[str] | None = None,
   ):
     """Prepares the exercise.
 
@@ -65,6 +67,7 @@ class Session:
       publish: called before the first step, and then 30 times a second, in the loop's thread: to
         copy what pictures need, no more
       other: device of the other hand, where the exercise has two
+      journal: file that takes the exercise second by second, see `Recorder`
     """
     if not env.task.scene.handle:
       raise ValueError(f"{env.task.name}: input is 'drives', expected 'handle' for a device")
@@ -76,7 +79,7 @@ class Session:
     h = env.physics.timestep()
     self.links = [Link(each, options, h) for each in (device, other) if each is not None]
     self.faults: list[str] = []
-    self._info, self._publish = dict(info or {}), publish
+    self._info, self._publish, self._journal = dict(info or {}), publish, journal
     self._rows = np.zeros((episode.substeps(env), len(env.task.components)))
     self._held: list[tuple[int, Link, Callable[[Link], float]]] = []  # columns of `_FIRST`
     self._due = 0.0
@@ -96,9 +99,13 @@ class Session:
     self._look = watch
     names = "+".join(link.device.name for link in self.links)
     info = {"performer": f"device:{names}", **self._info}
+    if self.coach is not None:
+      info["coach"] = self.coach.log()
     try:
       with punctual(realtime):
-        made = episode.run(self.env, self._act, self.seed, info, watch=self._watch)
+        made = episode.run(
+          self.env, self._act, self.seed, info, watch=self._watch, journal=self._journal
+        )
     except episode.EpisodeError as error:
       made = error.recording
     finally:

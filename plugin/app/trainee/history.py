@@ -14,15 +14,17 @@ if TYPE_CHECKING:
 
 
 def attempts(episodes: Iterable[Episode], assessments: bool = False) -> dict[str, list[Episode]]:
-  """Returns task -> attempts at it, in order; what the program's errors ended is none.
+  """Returns task -> attempts at it, in order; what an error or a kill ended is none.
 
   Args:
     episodes: of a person, in order
     assessments: whether those with the coach are left out
   """
+  from palpate.tasks.recording import INTERRUPTED
+
   found: dict[str, list[Episode]] = {}
   for episode in episodes:
-    if episode.outcome != "error" and (episode.assessment or not assessments):
+    if episode.outcome not in ("error", INTERRUPTED) and (episode.assessment or not assessments):
       found.setdefault(episode.task, []).append(episode)
   return found
 

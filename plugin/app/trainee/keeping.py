@@ -9,7 +9,7 @@ import pathlib
 import sys
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from ..console import CommandError
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
   from palpate.tasks.people.limits import Lookup
   from palpate.tasks.recording import Recording
 
-  from .record import Record, Session
+  from .record import Record, Session, Trainee
 
 FOLDER = "out/record"  # where a record is unless a command is told otherwise
 
@@ -168,7 +168,33 @@ class Sitting:
   references: Lookup
   folder: pathlib.Path
 
-  def keep(self, recording: Recording, before: Kept | None = None) -> Kept:
+  def reserve(self, task: str, person: str = "") -> tuple[pathlib.Path | None, dict[str, Any]]:
+    """Returns the file, empty so far, that an exercise is to take, and what its `info` says first.
+
+    No person's name is in what a record holds. Without a file, `keep` will say what is wrong.
+
+    Args:
+      task: of the exercise
+      person: see `keep`
+    """
+    known = self.keeping.knows(person)
+    info = {"record": self.session.facts()} if known else {"person": person}
+    try:
+      if known:
+        with self._opened(person) as (record, who):
+          return record.reserve(who, task), info
+      path = self._free(task)
+      path.touch(exist_ok=False)
+      return path, info
+    except (RuntimeError, ValueError, OSError):  # RecordError is a RuntimeError
+      return None, info
+
+  def keep(
+    self,
+    recording: Recording,
+    before: Kept | None = None,
+    path: pathlib.Path | None = None,
+  ) -> Kept:
     """Keeps a recording, or else puts it among the temporary files.
 
     It goes to the record if there is a trainee, or if its `info` has a `person`, who is added if
@@ -178,40 +204,54 @@ class Sitting:
     Args:
       recording: of an exercise that ended
       before: result of a call that failed; its temporary file stays the only one
+      path: from `reserve`
     """
-    from palpate.tasks.files import free
-
     person = str(recording.info.get("person", ""))
     known = self.keeping.knows(person)
     folder = (known and self.keeping.folder) or self.folder
-    task = str(recording.info.get("task", "exercise")).replace("/", "_")
-    name = f"{time.strftime('%Y%m%d-%H%M%S')}_{task}"
+    task = str(recording.info.get("task", "exercise"))
     try:
       if known:
-        return self._record(folder, recording, person)
-      folder.mkdir(parents=True, exist_ok=True)
-      return Kept(recording.save(free(folder, name, ".npz")))
+        return self._record(recording, person, path)
+      return Kept(recording.save(path or self._free(task)))
     except (RuntimeError, ValueError, OSError) as error:  # RecordError is a RuntimeError
       fault = f"not kept in {folder}: {_why(error)}"
     if before is not None and before.path is not None:
       return Kept(before.path, fault)
     try:
       spare = pathlib.Path(tempfile.mkdtemp(prefix="palpate-"))
-      return Kept(recording.save(spare / f"{name}.npz"), fault)
+      return Kept(recording.save(spare / f"{_name(task)}.npz"), fault)
     except OSError as error:
       return Kept(None, f"{fault}; nor among the temporary files: {_why(error)}")
 
-  def _record(self, folder: pathlib.Path, recording: Recording, person: str) -> Kept:
+  def _free(self, task: str) -> pathlib.Path:
+    from palpate.tasks.files import free
+
+    self.folder.mkdir(parents=True, exist_ok=True)
+    return free(self.folder, _name(task), ".npz")
+
+  @contextlib.contextmanager
+  def _opened(self, person: str) -> Iterator[tuple[Record, Trainee]]:
+    """Gives the record, and who does the exercises."""
     from .record import Record
 
-    trainee = self.keeping.trainee
-    with Record(folder, self.references) as record:
-      who = record.find(trainee) if trainee else record.add(person)
-      episode = record.keep(who, recording, self.session, self.references)
+    assert self.keeping.folder is not None
+    with Record(self.keeping.folder, self.references) as record:
+      trainee = self.keeping.trainee
+      yield record, record.find(trainee) if trainee else record.add(person)
+
+  def _record(self, recording: Recording, person: str, path: pathlib.Path | None) -> Kept:
+    with self._opened(person) as (record, who):
+      episode = record.keep(who, recording, self.session, self.references, path)
       judged = self.references(episode.task) is not None
-      said = _progress(record.episodes(who), episode.task, judged) if trainee else ()
+      told = self.keeping.trainee
+      said = _progress(record.episodes(who), episode.task, judged) if told else ()
       tell(record)
       return Kept(record.path(episode), "", said)
+
+
+def _name(task: str) -> str:
+  return f"{time.strftime('%Y%m%d-%H%M%S')}_{task.replace('/', '_')}"
 
 
 def _why(error: Exception) -> str:

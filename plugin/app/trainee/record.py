@@ -18,6 +18,7 @@ import math
 import os
 import pathlib
 import re
+import time
 import unicodedata
 import uuid
 from collections.abc import Iterator
@@ -90,10 +91,19 @@ class Session:
   id: str = dataclasses.field(default_factory=lambda: uuid.uuid4().hex)
   began: str = dataclasses.field(default_factory=lambda: now())
 
+  def facts(self) -> dict[str, str]:
+    """Returns what a recording says of the session that it was made in."""
+    return {"session": self.id, "began": self.began}
+
 
 def now() -> str:
   """Returns the time, UTC."""
-  return datetime.datetime.now(datetime.UTC).isoformat(timespec="milliseconds")
+  return _time(time.time())
+
+
+def _time(seconds: float) -> str:
+  at = datetime.datetime.fromtimestamp(seconds, datetime.UTC)
+  return at.isoformat(timespec="milliseconds")
 
 
 def check_name(name: Any, option: str = "trainee") -> str:
@@ -211,27 +221,49 @@ class Record(contextlib.AbstractContextManager):
     found = []
     for path in sorted((self._people / person.id).glob("*.npz")):
       try:
+        if not path.stat().st_size:  # an exercise begins
+          continue
         found.append(self._episode(person, path))
       except (ValueError, TypeError, KeyError, OSError) as error:  # whoever put it there
         self._say(f"{path}: not counted: {error}")
     return found
 
-  def keep(
-    self, person: Trainee, recording: Recording, session: Session, references: Lookup
-  ) -> Episode:
-    """Keeps a recording, and returns what is kept; RecordError where it is not."""
-    ended = now()
-    info = {k: v for k, v in recording.info.items() if k != "person"}
-    info["record"] = {"session": session.id, "began": session.began, "ended": ended}
-    info["record"] |= _facts(recording, references)
-    recording = dataclasses.replace(recording, info=info)
-    task = re.sub(r"\W+", "_", str(info.get("task", "exercise")), flags=re.ASCII)[:_LONGEST]
+  def reserve(self, person: Trainee, task: str) -> pathlib.Path:
+    """Returns the file, empty so far, that an exercise's recording is to take."""
+    task = re.sub(r"\W+", "_", task, flags=re.ASCII)[:_LONGEST]
     folder = self._people / person.id
     with _named(folder), self._alone():
       if not (folder / _WHO).is_file():
         raise RecordError(f"{person.name!r} is no longer in {str(self.folder)!r}")
-      path = recording.save(free(folder, f"{re.sub('[^0-9]', '', ended[:23])}_{task}", ".npz"))
-      path.chmod(0o600)
+      path = free(folder, f"{re.sub('[^0-9]', '', now()[:23])}_{task}", ".npz")
+      path.touch(0o600, exist_ok=False)
+    return path
+
+  def keep(
+    self,
+    person: Trainee,
+    recording: Recording,
+    session: Session,
+    references: Lookup,
+    path: pathlib.Path | None = None,
+  ) -> Episode:
+    """Keeps a recording, and returns what is kept; RecordError where it is not.
+
+    Args:
+      person: who did it
+      recording: of an exercise
+      session: that it was done in
+      references: that it is scored by
+      path: from `reserve`; its file may hold parts of the recording
+    """
+    info = {k: v for k, v in recording.info.items() if k != "person"}
+    info["record"] = session.facts() | {"ended": now()} | _facts(recording, references)
+    recording = dataclasses.replace(recording, info=info)
+    path = path or self.reserve(person, str(info.get("task", "exercise")))
+    with _named(path), self._alone():
+      if not path.exists():
+        raise RecordError(f"{person.name!r} is no longer in {str(self.folder)!r}")
+      recording.save(path).chmod(0o600)
     return self._episode(person, path)
 
   def path(self, episode: Episode) -> pathlib.Path:
@@ -245,7 +277,7 @@ class Record(contextlib.AbstractContextManager):
     info = Recording.load_info(path)
     kept = info.get("record")
     kept = kept if isinstance(kept, dict) else {}
-    if "metrics" not in kept:
+    if "metrics" not in kept:  # interrupted, or not made by a record
       kept = kept | _facts(Recording.load(path), self._references)
     value, known = kept["score"], kept["metrics"]
     values = {
@@ -262,7 +294,7 @@ class Record(contextlib.AbstractContextManager):
       path=path.relative_to(self.folder).as_posix(),
       session=str(kept.get("session", person.id)),
       performer=str(info.get("performer", "")),
-      ended=str(kept.get("ended", person.added)),
+      ended=str(kept.get("ended") or _time(path.stat().st_mtime)),
       task=str(info.get("task", "")),
       seed=info["seed"] if type(info.get("seed")) is int else None,
       seconds=float(kept["seconds"]),

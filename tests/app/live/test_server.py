@@ -3,6 +3,7 @@
 import contextlib
 import http.client
 import json
+import multiprocessing
 import pathlib
 import signal
 import subprocess
@@ -16,7 +17,10 @@ from socket import gethostname
 import numpy as np
 import pytest
 from palpate.app import cli
+from palpate.app.trainee.keeping import Keeping
+from palpate.app.trainee.record import Record
 from palpate.tasks.core import episode
+from palpate.tasks.people import limits, report
 from palpate.tasks.recording import Recording
 
 pytest.importorskip("websockets")
@@ -184,6 +188,33 @@ def test_a_session_over_the_socket(serve, tmp_path):
   assert episode.differences(made, episode.replay(made)) == []
 
 
+def test_a_killed_exercise_is_in_the_record_up_to_the_last_second(serve, tmp_path, capsys):
+  folder = tmp_path / "record"
+  with Record(folder, limits.lookup()) as record:
+    ada = record.add("Ada")
+  with socket(serve(kept=Keeping(folder, "Ada"))) as page:
+    hear(page, "menu")
+    tell(page, type="start", task="touch/easy", seed=3, assessment=True)
+    scene, _ = hear(page, "scene")
+    until = scene["head"].index("time")
+    while (now := hear(page, "frame")[0][until]) < 2.5:
+      pass
+    (process,) = multiprocessing.active_children()
+    process.kill()
+    process.join()
+  with Record(folder) as record:
+    (done,) = record.episodes(ada)
+    made = Recording.load(record.path(done))
+    assert not record.said
+  assert done.outcome == "interrupted" and done.seed == 3 and done.assessment
+  assert now - 1.3 < made.time[-1] < now + 0.5 and not done.proficient
+  assert "vertices" in made.constants and np.isfinite(made.columns["tip_pos"]).all()
+  assert episode.differences(made, episode.replay(made)) == ["constant state_last"]
+  assert report.ending(made).startswith("Interrupted: the program was killed")
+  assert cli.main(["trainee", "show", "Ada", "--record", str(folder)]) == 0
+  assert "attempts" not in capsys.readouterr().out  # it is none
+
+
 def test_a_closed_tab_keeps_its_recording(serve, tmp_path):
   server = serve()
   with socket(server) as page:
@@ -191,7 +222,8 @@ def test_a_closed_tab_keeps_its_recording(serve, tmp_path):
     tell(page, type="start", task="touch/easy", assessment=True)
     hear(page, "frame")
   for _ in range(600):
-    if kept := list((tmp_path / "out").glob("*.npz")):
+    kept = [path for path in (tmp_path / "out").glob("*.npz") if path.stat().st_size]
+    if kept and Recording.load(kept[0]).outcome != "interrupted":
       break
     time.sleep(0.1)
   made = Recording.load(kept[0])

@@ -72,7 +72,7 @@ class Worker:
     self._frame: bytes | None = None
     self._fresh = threading.Event()
     self._camera: Camera | None = None
-    self._unkept: tuple[Recording, Kept] | None = None
+    self._unkept: tuple[Recording, Kept, pathlib.Path | None] | None = None
     self._expert: subprocess.Popen | None = None
     self._ended = False
 
@@ -93,10 +93,10 @@ class Worker:
     if self._unkept is not None and (kept := self._keep(*self._unkept)).path is None:
       print(f"palpate: a recording is lost: {kept.fault}", file=sys.stderr)
 
-  def _keep(self, recording: Recording, before: Kept | None = None) -> Kept:
+  def _keep(self, recording: Recording, before: Kept | None, path: pathlib.Path | None) -> Kept:
     """Keeps a recording, and notes one that is not where it belongs, to try again."""
-    kept = self._sitting.keep(recording, before)
-    self._unkept = (recording, kept) if kept.fault else None
+    kept = self._sitting.keep(recording, before, path)
+    self._unkept = (recording, kept, path) if kept.fault else None
     return kept
 
   # Words.
@@ -252,14 +252,15 @@ class Worker:
     self._tell({"type": "loading", "text": job["task"], "note": ""})
     kwargs = _kwargs(job)
     env = suite.load(*suite.split(job["task"]), task_kwargs={"random": 0, **kwargs})
-    info = {"task_kwargs": kwargs, "person": job["person"], "seed": job["seed"]}
     with self._hands(job["left"]) as (device, other):
+      path, info = self._sitting.reserve(job["task"], job["person"])
       session = Session(
-        env, device, job["seed"], info, Options(scale=job["scale"]),
-        coach=Coach(job["assessment"]), publish=self._draw, other=other,
+        env, device, job["seed"], {"task_kwargs": kwargs, **info}, Options(scale=job["scale"]),
+        coach=Coach(job["assessment"]), publish=self._draw, other=other, journal=path,
       )  # fmt: skip
     recording = self._run(session, job, lambda: session.run(realtime=True, watch=self._feel))
-    kept = self._keep(recording)
+    recording.info["person"] = job["person"]
+    kept = self._keep(recording, None, path)
     shown = card(recording, self._sitting.references(job["task"]))
     shown["advice"] += kept.said
     self._tell({"type": "card", "path": str(kept.path or ""), "fault": kept.fault, **shown})
