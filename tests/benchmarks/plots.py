@@ -34,7 +34,7 @@ def grid(rows: int, columns: int, width: float, height: float):
   axes = figure.subplots(rows, columns, squeeze=False)
   for ax in axes.ravel():
     ax.spines[["top", "right"]].set_visible(False)
-    ax.tick_params(labelsize=8)
+    ax.tick_params(labelsize=9)
   return figure, axes[0] if rows == 1 else axes
 
 

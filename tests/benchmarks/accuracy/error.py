@@ -14,7 +14,6 @@ import math
 import pathlib
 from collections.abc import Callable
 
-import mujoco
 import numpy as np
 from benchmarks import plots, results
 from benchmarks.accuracy.compare import DRAWN, LEVELS, RIGHT, TAU, H, run
@@ -98,56 +97,53 @@ def cheapest(rows: list[Row], level: float) -> tuple[float, Row | None]:
 
 
 def draw(rows: list[Row], out: pathlib.Path) -> list[pathlib.Path]:
-  """Draws error against run time and error against h, one figure a scene."""
+  """Draws error against run time, one figure a scene, one panel a mesh and its elements."""
   written = []
   by_scene: dict[str, list[tuple]] = {}
   for key in groups(rows):
     by_scene.setdefault(key[0], []).append(key)
   for name, keys in by_scene.items():
-    figure, axes = plots.grid(2, len(keys), width=4.6 * len(keys) + 1.0, height=7.2)
-    axes = np.reshape(axes, (2, len(keys)))
-    for column, key in enumerate(keys):
+    columns = min(2, len(keys))
+    lines = -(-len(keys) // columns)
+    figure, axes = plots.grid(lines, columns, width=4.8 * columns, height=3.7 * lines + 0.8)
+    axes, handles = np.ravel(axes), {}
+    for ax, key in zip(axes, keys, strict=False):
       mine = groups(rows)[key]
       what = measure(mine[0])
-      label = f"{what.split('_')[0]} error, RMS [% of peak]"
-      for ax, x, text in ((axes[0, column], "total_s", "run time of the scene [s]"),
-                          (axes[1, column], "h", "time step [ms]")):  # fmt: skip
-        scale = 1e3 if x == "h" else 1.0
-        for run_name in DRAWN:
-          line = sorted((r for r in mine if r["run"] == run_name and r[what] != ""),
-                        key=lambda r: r["h"])  # fmt: skip
-          line = [r for r in line if r[what] < 2]
-          colour, mark, style = plots.STYLES[run_name]
-          if line:
-            label_of = run_name.replace("native", "MuJoCo flex")
-            ax.plot([scale * r[x] for r in line], [100 * r[what] for r in line], style,
-                    marker=mark, ms=4, color=colour, label=label_of)  # fmt: skip
-        floor = 100 * mine[0]["reference_force" if what == "force_rms" else "reference_position"]
-        ax.axhline(floor, color="#999999", lw=0.8, ls=":")
-        ax.annotate("reference", (1, floor), xycoords=("axes fraction", "data"), ha="right",
-                    va="bottom", fontsize=7, color="#777777")  # fmt: skip
-        ax.set(xscale="log", yscale="log", xlabel=text)
-        plots.plain(ax.xaxis, 2)
-        plots.plain(ax.yaxis, 2)
-        if column == 0:
-          ax.set_ylabel(label, fontsize=9)
-      axes[0, column].set_title(f"{key[1]} nodes, {key[2]}", loc="left", fontsize=10)
-    handles = {}
-    for ax in axes.ravel():
-      handles |= dict(zip(*reversed(ax.get_legend_handles_labels()), strict=True))
-    figure.legend(handles.values(), handles.keys(), loc="outside lower center",
-                  ncols=3 * len(keys), fontsize=8, frameon=False)  # fmt: skip
+      for run_name in DRAWN:
+        line = sorted((r for r in mine if r["run"] == run_name and r[what] != ""),
+                      key=lambda r: r["h"])  # fmt: skip
+        line = [r for r in line if r[what] < 2]
+        colour, mark, style = plots.STYLES[run_name]
+        if line:
+          label = run_name.replace("native", "MuJoCo flex")
+          (handles[label],) = ax.plot(
+            [r["total_s"] for r in line], [100 * r[what] for r in line], style, marker=mark, ms=5,
+            color=colour)  # fmt: skip
+      floor = 100 * mine[0]["reference_force" if what == "force_rms" else "reference_position"]
+      ax.axhline(floor, color="#999999", lw=0.8, ls=":")
+      ax.annotate("reference", (1, floor), xycoords=("axes fraction", "data"), ha="right",
+                  va="bottom", fontsize=8, color="#777777")  # fmt: skip
+      ax.set(xscale="log", yscale="log", xlabel="run time of the scene [s]")
+      ax.set_ylabel(f"{what.split('_')[0]} error, RMS [% of peak]")
+      plots.plain(ax.xaxis, 2)
+      plots.plain(ax.yaxis, 2)
+      ax.set_title(f"{key[1]} nodes, {key[2]}", loc="left", fontsize=10)
+    for ax in axes[len(keys) :]:
+      ax.set_axis_off()
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=3,
+                  fontsize=9, frameon=False)  # fmt: skip
     written.append(
       plots.save(figure, out / f"error_{name}.png", f"{name}: below and left is better")
     )
   return written
 
 
-_SIDES = f"""`ours`: `implicit` or `midpoint` with all nodes as MuJoCo's dofs, as the others have
+_SIDES = """`ours`: `implicit` or `midpoint` with all nodes as MuJoCo's dofs, as the others have
 them; `ours, window`: the same with window coupling (scenes with a contact), alone with solids
 (10 kPa, nu 0.45, 0.5 kg), whose contacts have a time constant of 5 ms, others 20. `explicit` and
 `neumann` are those of the thesis and its predecessor on our kernels. `MuJoCo flex` is what users of
-mujoco {mujoco.__version__} get: 3.17 weighs the corners of a touched triangle by inverse distance,
+the mujoco named above get: 3.17 weighs the corners of a touched triangle by inverse distance,
 which is part of its force error in `press` and `slide`. `right weights` is the same flex with
 barycentric weights, as MuJoCo 4.0 has them, from a passive callback whose 0.01 ms are in its
 time."""

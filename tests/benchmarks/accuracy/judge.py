@@ -25,17 +25,18 @@ CLEARANCE = 2e-4  # between probe and organ at first [m]
 # Most steps of a stroke of the probe, of holding it and of the free motion after it: a run of many
 # nodes and small steps presses less deep and is watched for less long.
 STEPS = {162: 600, 642: 600, 2562: 300, 10242: 120}
-# How a run may end; those of FAILURES have failed.
+# How a run may end; those of FAILURES have failed. The colours differ for the colour-blind too
+# (Okabe and Ito 2008): failures dark or warm, the rest blue to grey.
 VERDICTS = {
-  "not finite": "#a50026",
-  "energy grows": "#f46d43",
-  "chatters": "#dd1c77",
-  "penetrates": "#fdae61",
-  "too slow": "#bbbbbb",
-  "tunnels": "#e0d8c8",
-  "elsewhere": "#c6dbef",
-  "moving": "#6baed6",
-  "rest": "#08519c",
+  "not finite": "#000000",
+  "energy grows": "#d55e00",
+  "chatters": "#cc79a7",
+  "penetrates": "#f0e442",
+  "too slow": "#8c8c8c",
+  "tunnels": "#009e73",
+  "elsewhere": "#d9d9d9",
+  "moving": "#a6d4f2",
+  "rest": "#0072b2",
 }
 FAILURES = ("not finite", "energy grows", "chatters", "penetrates")
 GROWTH = 1.05  # most that the energy of the free organ may be over its first

@@ -212,34 +212,33 @@ def draw(rows: list[Row], out: pathlib.Path) -> list[pathlib.Path]:
       ax.set_axis_off()
     for ax in axes[::columns]:
       ax.set_ylabel("Young's modulus [Pa]")
-    _legend(figure, 8 if columns > 2 else 4)
+    _legend(figure, 5)
     nodes = maps[0]["nodes"]
     about = f"Sphere of {nodes} nodes, t = 2 mm, 0.1 kg, pressed 8 mm at 0.1 m/s"
     written.append(plots.save(figure, out / "stability_map.png", about))
   cube = [row for row in rows if row["set"] == "hypercube"]
   if cube:
     sides = [s for s in SIDES if any(row["side"] == s for row in cube)]
-    figure, axes = plots.grid(len(sides), 2, width=9.0, height=3.2 * len(sides) + 0.7)
-    for line, side in zip(np.reshape(axes, (-1, 2)), sides, strict=True):
+    columns = min(2, len(sides))
+    lines = -(-len(sides) // columns)
+    figure, axes = plots.grid(lines, columns, width=4.8 * columns, height=3.6 * lines + 0.7)
+    for ax, side in zip(np.ravel(axes), sides, strict=False):
       mine = [row for row in cube if row["side"] == side]
-      line[0].set_title(f"{side}, {len(mine)} runs", loc="left", fontsize=10)
-      for ax, (x, y, label, title) in zip(
-        line,
-        (("h", "stiff", "time step [ms]", "h² E t / nodal mass [-]"),
-         ("speed", "mass", "probe speed [m/s]", "mass [kg]")),
-        strict=True,
-      ):  # fmt: skip
-        factor = 1e3 if x == "h" else 1.0
-        for verdict, colour in reversed(VERDICTS.items()):
-          at = [row for row in mine if row["verdict"] == verdict]
-          fails = verdict in FAILURES
-          ax.plot([factor * r[x] for r in at], [r[y] for r in at], "X" if fails else "o",
-                  ms=6 if fails else 3, mec="none", color=colour)  # fmt: skip
-        ax.set(xscale="log", yscale="log", xlabel=label, ylabel=title)
-        span = [[k * r[axis] for r in cube] for axis, k in ((x, factor), (y, 1.0))]
-        ax.set_xlim(0.8 * min(span[0]), 1.25 * max(span[0]))
-        ax.set_ylim(0.5 * min(span[1]), 2 * max(span[1]))
-    _legend(figure)
+      ax.set_title(f"{side}, {len(mine)} runs", loc="left", fontsize=10)
+      for verdict, colour in reversed(VERDICTS.items()):
+        at = [row for row in mine if row["verdict"] == verdict]
+        fails = verdict in FAILURES
+        ax.plot([1e3 * r["h"] for r in at], [r["stiff"] for r in at], "X" if fails else "o",
+                ms=7 if fails else 4, mec="#333333" if fails else "none", mew=0.5,
+                color=colour)  # fmt: skip
+      ax.set(xscale="log", yscale="log", xlabel="time step [ms]")
+      plots.plain(ax.xaxis)
+      ax.set_ylim(0.5 * min(r["stiff"] for r in cube), 2 * max(r["stiff"] for r in cube))
+    for ax in np.ravel(axes)[len(sides) :]:
+      ax.set_axis_off()
+    for ax in np.ravel(axes)[::columns]:
+      ax.set_ylabel("h² E t / nodal mass [-]")
+    _legend(figure, 5)
     about = "Draws over h, E, thickness, damping, mass, speed, foundation, volume, nodes, shapes"
     written.append(plots.save(figure, out / "stability_hypercube.png", about))
   return written
@@ -257,11 +256,11 @@ def _map(ax, rows: list[Row]):
   ax.set_xlabel("time step [ms]")
 
 
-def _legend(figure, columns: int = 8):
+def _legend(figure, columns: int):
   from matplotlib.patches import Patch
 
   handles = [Patch(color=colour, label=verdict) for verdict, colour in VERDICTS.items()]
-  figure.legend(handles=handles, loc="outside lower center", ncols=columns, fontsize=8,
+  figure.legend(handles=handles, loc="outside lower center", ncols=columns, fontsize=9,
                 frameon=False)  # fmt: skip
 
 
