@@ -19,6 +19,7 @@ from .draw import film
 from .trainee import keeping
 
 _SIZE = (640, 480)  # of the film [pixels]
+_SMALL = (320, 240)  # of each picture at the top of a report
 
 
 def add_arguments(parser: argparse.ArgumentParser):
@@ -76,12 +77,14 @@ def main(args: argparse.Namespace) -> int:
     except ValueError as error:
       raise CommandError(str(error)) from None
   job = _prepare(args)
-  progress, failure, camera = Progress(), None, contextlib.nullcontext(lambda env: None)
+  progress, failure, views = Progress(), None, _views(args, job)
+  camera = contextlib.nullcontext(views)
   with Interrupt() as interrupt, film.laparoscope(job.film, _SIZE) if job.film else camera as shoot:
 
     def watch(env) -> bool:
       progress.show(f"{job.name} {env.physics.time():.1f} s, {100 * env.task.best:.0f} % done")
-      shoot(env)
+      if shoot is not None:
+        shoot(env)
       return interrupt.seen
 
     try:
@@ -90,7 +93,7 @@ def main(args: argparse.Namespace) -> int:
       recording, failure = error.recording, error
     finally:
       progress.clear()
-  fault = _write(job, recording, report=not args.no_report)
+  fault = _write(job, recording, not args.no_report, views)
   if "live" in recording.info:
     live = recording.info["live"]
     print(
@@ -274,12 +277,19 @@ def _by_hand(
   return lambda watch: session.run(watch=watch)
 
 
-def _write(job: _Job, recording: Any, report: bool) -> str:
+def _views(args: argparse.Namespace, job: _Job) -> film.Strip | None:
+  """Returns what takes the report's pictures; None where a person would wait for them."""
+  by_hand = args.device or args.performer == "keyboard"
+  wanted = job.folder and not (args.no_report or job.film or by_hand)
+  return film.Strip(_SMALL) if wanted else None
+
+
+def _write(job: _Job, recording: Any, report: bool, views: film.Strip | None) -> str:
   """Writes recording, metrics and report, says where they are, and returns what went wrong."""
   end = recording.time[-1] if len(recording.time) else 0.0
   print(f"{job.name}, seed {job.seed}: {recording.info['outcome']} after {end:.2f} s")
   if job.folder:
-    _write_files(job, job.folder, recording, report)
+    _write_files(job, job.folder, recording, report, views)
   if job.film:
     print(f"film       {job.film}")
   if job.sitting is None:
@@ -290,7 +300,9 @@ def _write(job: _Job, recording: Any, report: bool) -> str:
   return kept.fault
 
 
-def _write_files(job: _Job, folder: pathlib.Path, recording: Any, report: bool) -> None:
+def _write_files(
+  job: _Job, folder: pathlib.Path, recording: Any, report: bool, views: film.Strip | None
+) -> None:
   """Writes recording, metrics and report to a folder."""
   from palpate.tasks.files import replacing
   from palpate.tasks.people.report import write_report
@@ -300,7 +312,11 @@ def _write_files(job: _Job, folder: pathlib.Path, recording: Any, report: bool) 
     with replacing(folder / "metrics.json") as file:
       file.write(recording.metrics().to_json(1) + "\n")
     if report and len(recording.time):
+      shot = job.film.read_bytes() if job.film and job.film.suffix == ".mp4" else None
+      pictures = None if views is None else views.picture()
       try:
-        print(f"report     {write_report(recording, folder, job.references(job.name))}")
+        reference = job.references(job.name)
+        page = write_report(recording, folder, reference, film=shot, pictures=pictures)
+        print(f"report     {page}")
       except ImportError as error:
         print(f"no report: {error}; install palpate[plot]", file=sys.stderr)

@@ -25,6 +25,10 @@ tr.group td { background: #f4f6f9; font-weight: 600; }
 .beside figure { flex: 1 1 24rem; margin: 0; }
 img, video { max-width: 100%; height: auto; }
 dl { display: grid; grid-template-columns: max-content 1fr; gap: .1rem 1rem; margin: 0; }
+@media (max-width: 40rem) {
+  body { margin: 1rem auto; padding: 0 .6rem; } table { font-size: .8rem; }
+  th, td { padding: .25rem .3rem; } dl { grid-template-columns: 1fr; } dd { margin-bottom: .4rem; }
+}
 dt { color: #5d6472; } dd { margin: 0; overflow-wrap: anywhere; }
 """
 
@@ -64,9 +68,9 @@ def table(head: Iterable[str], rows: Iterable[str], numbers: Iterable[int] = ())
   return f"<div class='wide'><table><thead>{first}</thead><tbody>{rest}</tbody></table></div>"
 
 
-def image(png: bytes, alt: str) -> str:
-  """Returns a picture."""
-  return f"<img alt='{text(alt)}' src='data:image/png;base64,{_base64(png)}'>"
+def image(data: bytes, alt: str, kind: str = "png") -> str:
+  """Returns a picture, of a kind that browsers show."""
+  return f"<img alt='{text(alt)}' src='data:image/{kind};base64,{_base64(data)}'>"
 
 
 def film(mp4: bytes, about: str) -> str:

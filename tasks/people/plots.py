@@ -27,7 +27,7 @@ def path_figure(recording: Recording) -> "Figure | None":
   paths = [None if p is None or not np.isfinite(p).all(axis=1).any() else 1e3 * p for p in paths]
   if all(p is None for p in paths):
     return None
-  figure = blank(7.5, 6.2)
+  figure = blank(5.2, 4.2)
   from matplotlib import rc_context
 
   with rc_context({"grid.color": "#dfe3e8"}):
@@ -241,6 +241,15 @@ def png(figure: "Figure") -> bytes:
   """Returns a figure as PNG."""
   buffer = io.BytesIO()
   figure.savefig(buffer, format="png", dpi=120, facecolor="white")
+  return buffer.getvalue()
+
+
+def jpeg(picture: np.ndarray) -> bytes:
+  """Returns a picture (height, width, 3), uint8, as JPEG."""
+  from PIL import Image  # which matplotlib needs too
+
+  buffer = io.BytesIO()
+  Image.fromarray(picture).save(buffer, format="JPEG", quality=85)
   return buffer.getvalue()
 
 

@@ -9,12 +9,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ..files import replacing
 from ..metrics import METRICS, Metrics, Spec, Unknown, number
 from ..recording import INTERRUPTED, Recording
 from . import page
 from .page import text
-from .plots import force_figure, path_figure, png, spectrum_figure
+from .plots import force_figure, jpeg, path_figure, png, spectrum_figure
 from .score import CONSECUTIVE, FLOOR, PASSING, REPEATS, SUCCESS, WEIGHTS, Score, score
 
 _MOST_EVENTS = 50
@@ -35,6 +37,7 @@ def write_report(
   reference: Mapping[str, Any] | None = None,
   title: str | None = None,
   film: bytes | None = None,
+  pictures: np.ndarray | None = None,
 ) -> Path:
   """Writes `report.html` into a folder and returns its path.
 
@@ -44,8 +47,10 @@ def write_report(
     reference: see `score.make_reference`; without it there is no score
     title: heading; the recording's task by default
     film: of the exercise, MP4
+    pictures: of the exercise, side by side, (height, width, 3) uint8
   """
-  return write_page(Path(folder) / "report.html", render(recording, reference, title, film))
+  content = render(recording, reference, title, film, pictures)
+  return write_page(Path(folder) / "report.html", content)
 
 
 def write_page(path: Path, content: str) -> Path:
@@ -61,6 +66,7 @@ def render(
   reference: Mapping[str, Any] | None = None,
   title: str | None = None,
   film: bytes | None = None,
+  pictures: np.ndarray | None = None,
 ) -> str:
   """Returns the page that `write_report` writes."""
   title = title or str(recording.info.get("task", "Exercise"))
@@ -70,8 +76,8 @@ def render(
     f"<h1>{text(title)}</h1>",
     _outcome(recording),
     f"<p class='faint'>{text(_summary(recording))}</p>",
+    _views(film, pictures),
     _score_part(result),
-    "" if film is None else f"<h2>Film</h2>{page.film(film, 'what the laparoscope saw')}",
     _plots(recording, metrics),
     _metric_table(recording, metrics, reference, result),
     _event_table(recording),
@@ -106,6 +112,14 @@ def _summary(recording: Recording) -> str:
     f"{number(length)} s, {count} samples at {number((count - 1) / length)} Hz, "
     f"{', '.join(recording.instruments)}"
   )
+
+
+def _views(film: bytes | None, pictures: np.ndarray | None) -> str:
+  if film is not None:
+    return page.film(film, "what the laparoscope saw")
+  if pictures is None:
+    return ""
+  return page.image(jpeg(pictures), "what the laparoscope saw, from the start to the end", "jpeg")
 
 
 def _score_part(result: Score | None) -> str:

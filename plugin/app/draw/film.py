@@ -72,6 +72,47 @@ def laparoscope(path: pathlib.Path, size: tuple[int, int]) -> Iterator[Callable[
     yield shoot
 
 
+class Strip:
+  """Pictures of an exercise, evenly over its time, for a report: call it after every step.
+
+  There are none where nothing can draw.
+
+  Args:
+    size: width and height of each [pixels]
+    count: how many
+  """
+
+  def __init__(self, size: tuple[int, int], count: int = 5):
+    self._size, self._count = size, count
+    self._frames: list[np.ndarray] = []
+    self._every, self._due = 0.5, 0.0  # [s]
+
+  def __call__(self, env: Any) -> None:
+    """Takes the laparoscope's picture if it is due."""
+    from palpate.tasks.core.scenes import CAMERA
+
+    time = env.physics.time()
+    if time < self._due - 1e-9:
+      return
+    camera = env.physics.model.ptr.camera(CAMERA).id
+    try:
+      self._frames.append(env.physics.render(self._size[1], self._size[0], camera_id=camera))
+    except Exception:  # each backend of OpenGL has its own
+      self._due = math.inf
+      return
+    if len(self._frames) == 4 * self._count:  # the exercise is a long one
+      self._frames, self._every = self._frames[::2], 2 * self._every
+    self._due = time + self._every
+
+  def picture(self) -> np.ndarray | None:
+    """Returns the pictures side by side, (height, width, 3) uint8; None without any."""
+    if not self._frames:
+      return None
+    last = len(self._frames) - 1
+    chosen = np.unique(np.linspace(0, last, self._count).round().astype(int))
+    return np.concatenate([self._frames[k] for k in chosen], axis=1)
+
+
 def of_recording(recording: Any, size: tuple[int, int]) -> bytes:
   """Returns the MP4 of a recorded exercise, run anew; CommandError if it comes out differently."""
   from palpate.tasks.core import episode

@@ -2,6 +2,7 @@
 
 import base64
 import html.parser
+import io
 import json
 import math
 import re
@@ -15,6 +16,7 @@ from palpate.tasks.metrics import METRICS, Metrics, number
 from palpate.tasks.people import plots, report
 from palpate.tasks.people.score import make_reference
 from palpate.tasks.recorder import Recorder, Settings
+from PIL import Image
 
 pytest.importorskip("matplotlib")
 
@@ -216,8 +218,17 @@ def test_a_film_is_in_the_page():
   assert "video" in page.tags and not page.tags & {"script", "link", "iframe", "object"}
   data = re.search(r"<video [^>]*src='data:video/mp4;base64,([^']*)'", text)[1]
   assert base64.b64decode(data, validate=True) == b"\0\0ftyp"
-  assert "Film" in page.text()
-  assert "Film" not in _Page(report.render(_recorder().recording())).text()
+  assert text.index("<video ") < text.index("<h2>")  # the operation comes first
+
+
+def test_pictures_of_the_operation_come_first_in_the_page():
+  shown = np.zeros((24, 160, 3), np.uint8)
+  shown[:, 80:] = 255
+  text = report.render(_recorder().recording(), pictures=shown)
+  assert text.index("<img ") < text.index("<h2>")
+  data = re.search(r"<img [^>]*src='data:image/jpeg;base64,([^']*)'", text)[1]
+  picture = np.asarray(Image.open(io.BytesIO(base64.b64decode(data, validate=True))))
+  assert picture.shape == shown.shape and np.abs(picture.astype(int) - shown).max() < 10
 
 
 def test_a_grasper_s_grip_and_pull_are_two_lines():
