@@ -23,6 +23,9 @@ from ..inputs import SIGNALS
 from ..recording import Recording
 
 OPEN = ("time limit", "stopped")  # outcomes of an episode that could have gone on
+# What LeRobot calls the groups, in data sets and in environments, and the pictures.
+VECTORS = {"observation.state": "sensors", "observation.environment_state": "state"}
+PIXELS = "observation.images.laparoscope"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -176,6 +179,21 @@ def group(name: str) -> str:
   if name in observation.PICTURES:
     return "pictures"
   return observation.ROWS[name].group if name in observation.ROWS else "state"
+
+
+def vector(observed: Mapping[str, np.ndarray], kind: str) -> np.ndarray:
+  """Returns the observations of one step that are of a group, one after the other  (n,)."""
+  parts = [np.ravel(value) for name, value in observed.items() if group(name) == kind]
+  return np.concatenate([np.empty(0), *parts]).astype(np.float32)
+
+
+def components(observed: Mapping[str, np.ndarray], kind: str) -> list[str]:
+  """Returns the names of the numbers in `vector`, such as "tip_pos.0"."""
+  return [
+    name if np.size(value) == 1 else f"{name}.{i}"
+    for name, value in observed.items() if group(name) == kind
+    for i in range(np.size(value))
+  ]  # fmt: skip
 
 
 def instruction(task: str) -> str:

@@ -1,6 +1,7 @@
 """`palpate export`: data sets that their own libraries read, whole or not at all, and resumed."""
 
 import errno
+import importlib.util
 import json
 import os
 import pathlib
@@ -12,22 +13,22 @@ import sys
 import numpy as np
 import pytest
 from palpate.app import cli, console, live, options
+from palpate.app.datasets import lerobot as written
 from palpate.app.learn import export as command
 from palpate.tasks import suite
 from palpate.tasks.core import performer
 from palpate.tasks.learn import demonstrations, policy
 from palpate.tasks.recording import Recording
 
-for name in ("pyarrow", "h5py", "minari", "imageio_ffmpeg"):
+for name in ("h5py", "minari"):
   pytest.importorskip(name)
 
 import h5py  # noqa: E402
-import imageio_ffmpeg  # noqa: E402
 import minari  # noqa: E402
-import pyarrow.parquet as pq  # noqa: E402
 
 SHORT = ["--episodes", "2", "--processes", "1"]
 SEEN = ["--observations", "sensors", "state", "pixels", "--size", "32x48"]
+ROBOT = ["touch/easy", "--format", "lerobot"]
 IDLE = "import numpy as np\ndef act(observation): return np.zeros(4)\n"
 
 
@@ -45,7 +46,7 @@ def _here(tmp_path, monkeypatch):
 def data(tmp_path_factory):
   """A folder with a data set of two episodes in each format."""
   folder = tmp_path_factory.mktemp("data")
-  for form in ("lerobot", "robomimic", "minari"):
+  for form in ("robomimic", "minari"):
     assert export("touch/easy", "-o", folder / form, "--format", form, *SHORT, *SEEN) == 0
   return folder
 
@@ -53,7 +54,8 @@ def data(tmp_path_factory):
 @pytest.fixture(scope="module")
 def episodes():
   """What is in them."""
-  kwargs = {"random": 0, "observations": ["sensors", "state"]}
+  observed = ["sensors", "state", "pixels"]
+  kwargs = {"random": 0, "observations": observed, "pixels": (32, 48)}
   env = suite.load("touch", "easy", task_kwargs=kwargs)
   return [demonstrations.perform(env, performer.make(env, seed=k), k) for k in range(2)]
 
@@ -65,64 +67,34 @@ def column(table, name) -> np.ndarray:
 # LeRobot.
 
 
-def test_lerobot_has_what_version_3_asks_for(data, episodes):
-  folder = data / "lerobot"
-  info = json.loads((folder / "meta/info.json").read_text())
-  lengths = [len(episode) for episode in episodes]
-  assert (info["codebase_version"], info["fps"]) == ("v3.0", 50)
-  assert (info["total_episodes"], info["total_frames"]) == (2, sum(lengths))
-  assert info["splits"] == {"train": "0:2"}
-  path = folder / info["data_path"].format(chunk_index=0, file_index=0)
-  table = pq.read_table(path)
-  assert pq.ParquetFile(path).num_row_groups == 2
-  films = {k for k, f in info["features"].items() if f["dtype"] == "video"}
-  assert set(table.column_names) == set(info["features"]) - films
-  for key in table.column_names:
-    shape = tuple(info["features"][key]["shape"])
-    assert column(table, key).shape[1:] == (() if shape == (1,) else shape), key
-  actions = np.concatenate([episode.actions for episode in episodes])
-  np.testing.assert_array_equal(column(table, "action"), actions.astype(np.float32))
-  names = info["features"]["observation.environment_state"]["names"]
-  target = column(table, "observation.environment_state")[:, names.index("target.0")]
-  expected = np.concatenate([episode.observations["target"][:-1, 0] for episode in episodes])
-  np.testing.assert_array_equal(target, expected.astype(np.float32))
-  np.testing.assert_allclose(column(table, "timestamp")[: lengths[0]], np.arange(lengths[0]) / 50)
-  assert column(table, "next.done").nonzero()[0].tolist() == [lengths[0] - 1, sum(lengths) - 1]
-  assert column(table, "next.force").shape == (sum(lengths), 20)
-  stats = json.loads((folder / "meta/stats.json").read_text())
-  np.testing.assert_allclose(stats["action"]["mean"], actions.mean(axis=0), rtol=1e-5)
-  np.testing.assert_allclose(stats["action"]["std"], actions.std(axis=0), rtol=1e-5)
-  assert np.shape(stats["observation.images.laparoscope"]["mean"]) == (3, 1, 1)
+def test_lerobot_is_given_types_names_and_frames(episodes):
+  names = written.features(episodes[0])
+  assert names["observation.images.laparoscope"]["dtype"] == "video"
+  assert names["action"] == {
+    "dtype": "float32", "shape": (4,), "names": ["pitch", "yaw", "roll", "insertion"],
+  }  # fmt: skip
+  place = names["observation.environment_state"]["names"].index("target.0")
+  for episode in episodes:
+    frames = list(written.frames(episode))
+    assert [bool(frame["next.done"][0]) for frame in frames] == [False] * (len(frames) - 1) + [True]
+    assert frames[-1]["next.success"] and not frames[0]["next.success"]
+    for k, frame in enumerate(frames):
+      assert set(frame) == set(names)
+      for key, about in names.items():
+        assert frame[key].shape == tuple(about["shape"]), key
+      target = np.float32(episode.observations["target"][k, 0])
+      assert frame["observation.environment_state"][place] == target
+      np.testing.assert_array_equal(frame["action"], np.float32(episode.actions[k]))
+      np.testing.assert_array_equal(frame["next.force"], np.float32(episode.forces["force"][k + 1]))
 
 
-def test_lerobot_says_where_episodes_and_films_are(data, episodes):
-  folder = data / "lerobot"
-  (film,) = (key for key in json.loads((folder / "meta/info.json").read_text())["features"]
-             if key.startswith("observation.images"))  # fmt: skip
-  rows = pq.read_table(folder / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
-  start = 0
-  for k, (row, episode) in enumerate(zip(rows, episodes, strict=True)):
-    assert (row["episode_index"], row["length"], row["seed"]) == (k, len(episode), k)
-    assert (row["dataset_from_index"], row["dataset_to_index"]) == (start, start + len(episode))
-    assert row[f"videos/{film}/from_timestamp"] == pytest.approx(start / 50)
-    assert row["tasks"] == ["touch one point within 5 mm"] and row["outcome"] == "success"
-    start += len(episode)
-  frames, seconds = imageio_ffmpeg.count_frames_and_secs(
-    folder / f"videos/{film}/chunk-000/file-000.mp4"
+def test_lerobot_is_named_where_it_is_missing(capsys, monkeypatch, tmp_path):
+  found = importlib.util.find_spec
+  monkeypatch.setattr(
+    importlib.util, "find_spec", lambda name: None if name == "lerobot" else found(name)
   )
-  assert frames == start and seconds == pytest.approx(start / 50, abs=0.011)
-  tasks = pq.read_table(folder / "meta/tasks.parquet")
-  assert tasks.to_pylist() == [{"task_index": 0, "task": "touch one point within 5 mm"}]
-  assert json.loads(tasks.schema.metadata[b"pandas"])["index_columns"] == ["task"]
-
-
-def test_lerobot_itself_reads_it(data, episodes):
-  found = pytest.importorskip("lerobot.datasets.lerobot_dataset")
-  dataset = found.LeRobotDataset("palpate/touch", root=data / "lerobot", video_backend="pyav")
-  assert dataset.num_episodes == 2 and dataset.num_frames == sum(map(len, episodes))
-  last = dataset[len(dataset) - 1]
-  assert last["observation.images.laparoscope"].shape == (3, 32, 48) and last["next.success"]
-  np.testing.assert_allclose(last["action"], episodes[1].actions[-1], atol=1e-6)
+  assert export("touch/easy", "-o", "out", "--format", "lerobot") == 1
+  assert "installed: pip install 'palpate[lerobot]'" in capsys.readouterr().err
 
 
 # robomimic.
@@ -173,7 +145,7 @@ def test_minari_itself_reads_it(data, episodes):
 
 
 def test_the_card_says_licence_seeds_and_command(data):
-  for form in ("lerobot", "robomimic", "minari"):
+  for form in ("robomimic", "minari"):
     text = (data / form / "README.md").read_text()
     assert text.startswith("---\nlicense: apache-2.0\n") and "Licence of the data: Apache" in text
     assert "Seeds 0 to 1" in text and f"palpate export touch/easy --format {form}" in text
@@ -314,14 +286,15 @@ def test_a_full_disk_is_named_and_nothing_is_lost(tmp_path, monkeypatch, capsys)
     (["touch/easy", "--episodes", "0"], "episodes is 0"),
     (["touch/easy", "--noise", "2"], "noise is 2.0, expected a number in [0, 1]"),
     (["touch/easy", "--size", "84"], "size is '84', expected height and width such as 96x128"),
-    (["touch/easy", "--observations", "pixels", "--size", "33x48"], "expected even numbers"),
-    (["touch/easy", "--observations", "sensors", "depth"], "of pictures lerobot has pixels alone"),
+    ([*ROBOT, "--observations", "pixels", "--size", "33x48"], "expected even numbers"),
+    ([*ROBOT, "--observations", "sensors", "depth"], "of pictures lerobot has pixels alone"),
     (["touch/easy", "--observations", "sensor"], "observations has 'sensor', expected some of"),
     (["--recordings", "nowhere"], "nowhere"),
   ],
 )
 def test_what_is_wrong_is_said_before_the_work(words, said, capsys, monkeypatch, tmp_path):
   monkeypatch.setattr(command, "keep", lambda job: pytest.fail("it worked first"))
+  monkeypatch.setattr(command, "need", lambda *names: None)
   assert export(*words, "-o", "out") == 2
   message = capsys.readouterr().err
   assert said in message and message.count("\n") == 1

@@ -3,8 +3,6 @@
 A format is a module with
 
 - `check(env)`: raises ValueError for what it cannot hold
-- `stage(demo, path)`: puts what is costly into files beside `path`, in the process that made the
-  demonstration, and returns the rest, which is kept at `path`
 - `write(folder, paths, about)`: makes the data set of the demonstrations at `paths`; returns what
   they have that it has not, in words
 """
@@ -16,11 +14,11 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-# What each is written with.
+# The extra that each needs, and what it is written with.
 FORMATS = {
-  "lerobot": ("pyarrow", "imageio", "imageio_ffmpeg"),
-  "robomimic": ("h5py",),
-  "minari": ("minari", "h5py", "gymnasium", "PIL"),
+  "robomimic": ("data", "h5py"),
+  "lerobot": ("lerobot", "lerobot", "datasets", "av"),
+  "minari": ("data", "minari", "h5py", "gymnasium", "PIL"),
 }
 _TAGS = {"lerobot": "LeRobot"}  # as its hub has it
 
@@ -75,8 +73,6 @@ def card(about: About, form: str, lines: Sequence[str], path: pathlib.Path) -> s
   rows = ["| observation | group | shape |", "|---|---|---|"]
   for name, value in demo.observations.items():
     rows.append(f"| `{name}` | {group(name)} | {value.shape[1:]} |")
-  if form == "lerobot" and "pixels" in demo.info:
-    rows.append(f"| `pixels` | pictures | {tuple(demo.info['pixels']['shape'])} |")
   info = demo.info
   text = [
     f"# {about.task} by {about.performer}",

@@ -19,11 +19,6 @@ def check(env: Any) -> None:
   """It holds everything."""
 
 
-def stage(demo: Demonstration, path: pathlib.Path) -> Demonstration:
-  """Nothing is costly."""
-  return demo
-
-
 def write(folder: pathlib.Path, paths: Iterable[pathlib.Path], about: About) -> list[str]:
   """Writes the folder `data`."""
   import gymnasium

@@ -25,11 +25,6 @@ def check(env: Any) -> None:
   """It holds everything."""
 
 
-def stage(demo: Demonstration, path: pathlib.Path) -> Demonstration:
-  """Nothing is costly."""
-  return demo
-
-
 def write(folder: pathlib.Path, paths: Iterable[pathlib.Path], about: About) -> list[str]:
   """Writes the file."""
   import h5py

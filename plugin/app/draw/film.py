@@ -6,7 +6,7 @@ import contextlib
 import math
 import pathlib
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,15 +22,12 @@ _FPS = 25  # of the laparoscope
 
 
 @contextlib.contextmanager
-def write(
-  path: pathlib.Path, fps: float, encoding: Sequence[str] = ()
-) -> Iterator[Callable[[np.ndarray], None]]:
+def write(path: pathlib.Path, fps: float) -> Iterator[Callable[[np.ndarray], None]]:
   """Gives a function that takes the frames of a film, or a picture.
 
   Args:
     path: what to write; its suffix says how, see `FILMS` and `PICTURES`
     fps: frames a second
-    encoding: words for ffmpeg, in place of a good quality
   """
   suffix = path.suffix.lower()
   check(suffix)
@@ -43,8 +40,6 @@ def write(
     options: dict[str, Any] = {"duration": 1000 / fps, "loop": 0}
     if suffix == ".mp4":
       options = {"fps": fps, "macro_block_size": 2, "quality": 8}
-      if encoding:
-        options |= {"quality": None, "output_params": list(encoding)}
     with imageio.get_writer(path, **options) as writer:
       yield writer.append_data
 

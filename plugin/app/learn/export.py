@@ -51,7 +51,6 @@ class Job:
   """An episode to be made, or to be made again.
 
   Attributes:
-    format: of the data set
     task: such as "touch/easy"
     performer: see `performer.make`
     kwargs: options of the exercise, JSON
@@ -61,7 +60,6 @@ class Job:
     noise: see `demonstrations.perform`
   """
 
-  format: str
   task: str
   performer: str
   kwargs: str
@@ -81,7 +79,7 @@ def add_arguments(parser: argparse.ArgumentParser):
   add = parser.add_argument
   add("task", metavar="TASK", nargs="?", help="such as touch/easy; a domain alone is its standard")
   add("-o", "--out", metavar="FOLDER", required=True, help="of the data set; it must be new")
-  add("--format", choices=datasets.FORMATS, default="lerobot", help="(%(default)s)")
+  add("--format", choices=datasets.FORMATS, default="robomimic", help="(%(default)s)")
   add("--performer", metavar="NAME", default="expert", help="as evaluate's policy (%(default)s)")
   add("--episodes", metavar="N", type=int, default=10, help="how many (%(default)s)")
   add("--seed", metavar="N", type=int, default=0, help="of the first episode (%(default)s)")
@@ -111,7 +109,7 @@ def main(args: argparse.Namespace) -> int:
   if not 0 <= args.noise <= 1:
     raise CommandError(f"noise is {args.noise}, expected a number in [0, 1]")
   crew = workers.chosen(args)
-  need("data", *datasets.FORMATS[args.format])
+  need(*datasets.FORMATS[args.format])
   palpate.register()
   task, kwargs, todo = _todo(args)
   out = pathlib.Path(args.out)
@@ -226,13 +224,13 @@ def _jobs(
   if todo:
     names = [hashlib.sha256(pathlib.Path(path).read_bytes()).hexdigest()[:16] for path, _ in todo]
     return [
-      Job(args.format, task, "", json.dumps(own), 0, path, str(parts / f"{name}.npz"))
+      Job(task, "", json.dumps(own), 0, path, str(parts / f"{name}.npz"))
       for name, (path, own) in zip(names, todo, strict=True)
     ]
   seeds, options_ = range(args.seed, args.seed + args.episodes), json.dumps(kwargs)
   paths = [str(parts / f"{seed:08d}.npz") for seed in seeds]
   return [
-    Job(args.format, task, args.performer, options_, seed, "", path, args.noise)
+    Job(task, args.performer, options_, seed, "", path, args.noise)
     for seed, path in zip(seeds, paths, strict=True)
   ]
 
@@ -242,8 +240,8 @@ def _begin(parts: pathlib.Path, args: argparse.Namespace, task: str, kwargs: dic
   from palpate.tasks.files import replacing
 
   mine = {
-    "task": task, "format": args.format, "performer": _who(args)[0], "options": kwargs,
-    "noise": args.noise, "sources": fingerprint(),
+    "task": task, "performer": _who(args)[0], "options": kwargs, "noise": args.noise,
+    "sources": fingerprint(),
   }  # fmt: skip
   mine, path = json.loads(json.dumps(mine)), parts / _JOB
   if path.exists():
@@ -302,7 +300,7 @@ def keep(job: Job) -> Kept:
     return Kept(job.name, None, why="it has no steps")
   steps, outcome = len(demo), demo.info["outcome"]
   with writing(path):
-    datasets.of(job.format).stage(demo, path).save(path)
+    demo.save(path)
   return Kept(job.name, outcome, steps)
 
 
