@@ -3,6 +3,7 @@
 import palpate  # noqa: F401 - before MuJoCo is imported: it chooses how to draw
 import pytest
 import scenes as builders
+from devices import needs_cuda
 
 
 def pytest_addoption(parser):
@@ -23,6 +24,6 @@ def scenes():
   return builders
 
 
-@pytest.fixture(params=["cpu", pytest.param("cuda:0", marks=builders.needs_cuda)])
+@pytest.fixture(params=["cpu", pytest.param("cuda:0", marks=needs_cuda)])
 def device(request) -> str:
   return request.param

@@ -28,7 +28,7 @@ _ENTRIES = 4  # weights of a vertex
 # Condition number from which cycles take less time than the iterations of block Jacobi that they
 # save, where there is bending. In warm contact steps with cycles take 1.4 times as long at 65, 1.0
 # at 75, 0.9 at 110 and 0.8 at 220 on the CPU (2562 to 16,386 nodes, medians of CPU time); a cycle
-# takes as long as 9 iterations there and as 15 on an H200 (`run.py solver`).
+# takes as long as 9 iterations there and as 15 on an H200 (`palpate bench solver`).
 _THRESHOLD = {"cpu": 100.0, "cuda": 300.0}
 # Interval of the smoother, as greatest eigenvalue of D^-1 A and its ratio to the lower end, by
 # degree. A membrane's is 2.3 on good meshes, at most 3 (three corners an element), and bending
@@ -318,7 +318,7 @@ def pay(part: dict, scale: float, threshold: float) -> bool:
 
   Not on a membrane: contact moves it where it is touched, and block Jacobi takes at most ten times
   the cycles, warm half of that, from 678 to 262,146 nodes and from 3 kPa to 3 MPa
-  (`run.py preconditioner`), while a cycle takes as long as eight iterations and more.
+  (`palpate bench preconditioner`), while a cycle takes as long as eight iterations and more.
 
   Args:
     part: fields of the mesh, see `shape.arrays`

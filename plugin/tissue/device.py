@@ -19,7 +19,7 @@ from warp._src import context as warp_context
 
 from .order import LANES
 
-# With fewer nodes the CPU solves a step before a GPU has met its barriers (`run.py solver`).
+# With fewer nodes the CPU solves a step before a GPU has met its barriers (`palpate bench solver`).
 _CUDA_FROM = 2000
 BLOCK = 512  # threads of a block, at most
 MAX_BLOCKS = 512  # of one world

@@ -4,7 +4,8 @@ import mujoco
 import numpy as np
 import palpate.batch
 import pytest
-from scenes import RADIUS, drive, load, masses, needs_cuda, press, probed
+from devices import needs_cuda
+from scenes import RADIUS, drive, load, masses, press, probed
 from scenes.resting import block, resting
 
 BACKENDS = [

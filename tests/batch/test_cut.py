@@ -5,7 +5,8 @@ import numpy as np
 import palpate
 import palpate.batch
 import pytest
-from scenes import box, needs_cuda, servo, sphere, triangular
+from devices import needs_cuda
+from scenes import box, servo, sphere, triangular
 
 BACKENDS = [
   "cpu",

@@ -5,8 +5,9 @@ import numpy as np
 import palpate
 import palpate.batch
 import pytest
+from devices import needs_cuda
 from palpate.batch import strip_organs
-from scenes import ball, box, load, needs_cuda, sphere, windowed, workspace, world
+from scenes import ball, box, load, sphere, windowed, workspace, world
 
 BACKENDS = [
   "cpu",

@@ -5,7 +5,8 @@ import numpy as np
 import palpate.batch
 import pytest
 import warp as wp
-from scenes import needs_cuda, probed
+from devices import needs_cuda
+from scenes import probed
 
 DEVICES = [
   ("warp-cpu", "warp-cpu"),

@@ -10,9 +10,10 @@ import numpy as np
 import palpate.batch
 import pytest
 import warp as wp
+from devices import needs_cuda
 from palpate.forces.passive import Force
 from palpate.forces.table import FORCES
-from scenes import load, needs_cuda, press, probed
+from scenes import load, press, probed
 
 DEVICE = "warp-cpu"  # what mujoco_warp gets is the same
 

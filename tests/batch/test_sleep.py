@@ -4,7 +4,8 @@ import mujoco
 import numpy as np
 import palpate.batch
 import pytest
-from scenes import load, needs_cuda, probed
+from devices import needs_cuda
+from scenes import load, probed
 
 DEVICES = [
   "warp-cpu",

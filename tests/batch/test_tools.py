@@ -4,7 +4,8 @@ import mujoco
 import numpy as np
 import palpate.batch
 import pytest
-from scenes import RADIUS, load, needs_cuda, organ, sphere, world
+from devices import needs_cuda
+from scenes import RADIUS, load, organ, sphere, world
 
 DEVICES = [
   "warp-cpu",

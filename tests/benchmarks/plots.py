@@ -5,7 +5,7 @@ from __future__ import annotations
 import pathlib
 from collections.abc import Sequence
 
-from benchmarks.results import BenchError
+from palpate.app.console import CommandError
 
 INK = "#333333"
 # One colour and marker a scheme, the same in every figure.
@@ -27,7 +27,7 @@ def grid(rows: int, columns: int, width: float, height: float):
   try:
     from matplotlib.figure import Figure
   except ImportError:
-    raise BenchError(
+    raise CommandError(
       "matplotlib is not installed: pip install 'palpate[plot]'; the rows are kept", code=1
     ) from None
   figure = Figure(figsize=(width, height), dpi=140, layout="constrained")

@@ -11,22 +11,12 @@ import platform
 import subprocess
 from collections.abc import Iterable
 
+from palpate.app.console import CommandError
+
 FOLDER = pathlib.Path(__file__).parent / "results"
 FIRST = ("case", "status")  # columns of every file
 
 Row = dict
-
-
-class BenchError(Exception):
-  """Ends a bench with one line for people.
-
-  Attributes:
-    code: exit code; 2 for a wrong option, 1 for what did not work
-  """
-
-  def __init__(self, message: str, code: int = 2):
-    super().__init__(message)
-    self.code = code
 
 
 class Table:
@@ -48,7 +38,7 @@ class Table:
       with open(path, newline="", encoding="utf-8") as file:
         head = tuple(next(csv.reader(file), ()))
       if head[:2] != FIRST or (self.columns and head[2:] != self.columns):
-        raise BenchError(f"{path} is of another form, so it cannot be resumed")
+        raise CommandError(f"{path} is of another form, so it cannot be resumed")
       self.columns = head[2:]
     elif self.columns:
       self._append([[*FIRST, *self.columns]])
@@ -208,7 +198,7 @@ def page(
     head += ["", f"The run is incomplete: {about['done']} of {about['cases']} cases."]
   head += ["", f"**Older.** {about['older']}"] if about.get("older") else []
   head += ["", f"![{title}]({plot.name})"] if plot else []
-  command = f"    python tests/benchmarks/run.py {about.get('bench', path.stem)}"
+  command = f"    palpate bench {about.get('bench', path.stem)}"
   command += " --short" if about.get("short") else ""
   options = about.get("options", {})
   command += "".join(

@@ -1,15 +1,13 @@
-"""Runs one benchmark: `python tests/benchmarks/run.py NAME --help`."""
+"""All benchmarks; `palpate bench NAME --help` runs one."""
 
 from __future__ import annotations
 
 import importlib
 import pathlib
-import sys
 from collections.abc import Sequence
 
-sys.path.insert(0, str(pathlib.Path(__file__).parents[1]))  # `benchmarks`, `reference`, `scenes`
-
-from benchmarks.results import BenchError
+from benchmarks import runner
+from palpate.app.console import CommandError
 
 FOLDER = pathlib.Path(__file__).parent
 BENCHES = {
@@ -45,28 +43,12 @@ BENCHES = {
 }
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-  """Runs the command line and returns its exit code."""
-  words = list(sys.argv[1:] if argv is None else argv)
-  if not words or words[0] not in BENCHES:
-    known = "\n".join(f"  {name:16}{text}" for name, text in BENCHES.items())
-    print(f"usage: run.py BENCH [options]; run.py BENCH --help says which\n\n{known}")
-    return 0 if words in (["-h"], ["--help"]) else 2
-  importlib.import_module("palpate")  # before MuJoCo: it chooses how to draw without a screen
-  from benchmarks import runner
-  from palpate.app.console import CommandError
-
+def main(name: str, words: Sequence[str]) -> int:
+  """Runs the bench of that name with its options and returns the exit code."""
+  (path,) = FOLDER.glob(f"*/{name}.py")
   try:
-    (path,) = FOLDER.glob(f"*/{words[0]}.py")
-    module = importlib.import_module(f"benchmarks.{path.parent.name}.{words[0]}")
-    return runner.main(module.BENCH, words[1:])
-  except (BenchError, CommandError) as error:
-    print(f"run.py: {error}", file=sys.stderr)
-    return error.code
-  except KeyboardInterrupt:
-    print("run.py: interrupted", file=sys.stderr)
-    return 130
-
-
-if __name__ == "__main__":
-  sys.exit(main())
+    module = importlib.import_module(f"benchmarks.{path.parent.name}.{name}")
+  except ModuleNotFoundError as error:
+    text = f"{name}: {error.name} is not installed: pip install '.[bench]', for learning '.[learn]'"
+    raise CommandError(text, code=1) from None
+  return runner.main(module.BENCH, list(words))

@@ -17,7 +17,8 @@ import time
 from collections.abc import Callable, Iterator
 
 from benchmarks import results, workers
-from benchmarks.results import BenchError, Row
+from benchmarks.results import Row
+from palpate.app.console import CommandError
 from palpate.app.workers import Cluster, Processes
 
 Case = dict
@@ -70,7 +71,7 @@ def options(bench: Bench, words: list[str]) -> argparse.Namespace:
   """Returns the options that the words of a command line give."""
   about = sys.modules[bench.stages.__module__].__doc__ or ""
   parser = argparse.ArgumentParser(
-    f"run.py {bench.name}", description=about, formatter_class=argparse.RawTextHelpFormatter
+    f"palpate bench {bench.name}", description=about, formatter_class=argparse.RawTextHelpFormatter
   )
   add = parser.add_argument
   add("-o", "--out", metavar="FOLDER", type=pathlib.Path,
@@ -89,7 +90,7 @@ def options(bench: Bench, words: list[str]) -> argparse.Namespace:
   bench.arguments(parser)
   args = parser.parse_args(words)
   if args.jobs < 0:
-    raise BenchError(f"jobs is {args.jobs}, expected a number >= 0")
+    raise CommandError(f"jobs is {args.jobs}, expected a number >= 0")
   args.out = args.out or (
     pathlib.Path("out", "bench") if args.short else results.FOLDER / bench.folder
   )
@@ -102,18 +103,18 @@ def main(bench: Bench, words: list[str]) -> int:
   try:
     args.out.mkdir(parents=True, exist_ok=True)
   except OSError as error:
-    raise BenchError(f"cannot write to {str(args.out)!r}: {error.strerror}") from None
+    raise CommandError(f"cannot write to {str(args.out)!r}: {error.strerror}") from None
   if args.only:
     return _again(bench, args)
   complete = args.draw or execute(bench, args)
   path = bench.path(args)
   if not path.exists():
-    raise BenchError(f"no {path}, expected the rows of an earlier run", code=1)
+    raise CommandError(f"no {path}, expected the rows of an earlier run", code=1)
   for written in report(bench, args):
     print(written)
   failed = [row["case"] for row in results.read(path) if row["status"] != "ok"]
   if failed:
-    print(f"run.py: {len(failed)} cases have failed, the first is {failed[0]}", file=sys.stderr)
+    print(f"palpate: {len(failed)} cases have failed, the first is {failed[0]}", file=sys.stderr)
   return 130 if not complete else int(bool(failed))
 
 
@@ -123,13 +124,13 @@ def _again(bench: Bench, args: argparse.Namespace) -> int:
   for name in args.only:
     if name not in cases:
       near = difflib.get_close_matches(name, cases, 3, 0) or ["none"]
-      raise BenchError(f"no case {name!r} in this bench, the nearest are {', '.join(near)}")
+      raise CommandError(f"no case {name!r} in this bench, the nearest are {', '.join(near)}")
   workers.register_quietly()
   for name in args.only:
     try:
       rows = bench.run(cases[name], args.out.resolve())
     except Exception as error:
-      raise BenchError(f"{name}: {type(error).__name__}: {error}", code=1) from None
+      raise CommandError(f"{name}: {type(error).__name__}: {error}", code=1) from None
     for row in rows:
       _show(name, row)
   return 0
@@ -183,7 +184,7 @@ def execute(bench: Bench, args: argparse.Namespace) -> bool:
     "seconds": seconds,
   })  # fmt: skip
   if finished < total:
-    print(f"run.py: {reason} after {finished} of {total} cases; --resume goes on from there")
+    print(f"palpate: {reason} after {finished} of {total} cases; --resume goes on from there")
   return finished >= total
 
 

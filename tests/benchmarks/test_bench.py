@@ -9,9 +9,10 @@ import mujoco
 import numpy as np
 import palpate
 import pytest
-from benchmarks import results, run, runner, scene
+from benchmarks import results, runner, scene
 from benchmarks.accuracy import compare, error, films, judge, stability
 from benchmarks.timing import thesis
+from palpate.app import cli
 from palpate.engine import contacts
 from palpate.tissue import energy
 from palpate.tissue.config import Config
@@ -26,7 +27,7 @@ def rows_of(name: str, out: pathlib.Path) -> list[dict]:
 
 
 def command(*words) -> int:
-  return run.main([*map(str, words)])
+  return cli.main(["bench", *map(str, words)])
 
 
 def options(bench, *words):
@@ -136,7 +137,7 @@ def test_error_bench_fills_its_files(error_rows):
   for name in ("error_press.png", "error_vibrate.png"):
     assert (out / name).read_bytes().startswith(b"\x89PNG")
   page = (out / "error.md").read_text()
-  assert "run.py error --short" in page and "A peer is faster" in page
+  assert "palpate bench error --short" in page and "A peer is faster" in page
 
 
 @pytest.mark.parametrize("run", ["implicit", "implicit, window", "midpoint", compare.RIGHT])

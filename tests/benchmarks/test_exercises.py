@@ -7,9 +7,9 @@ import sys
 
 import numpy as np
 import pytest
-from benchmarks import results, run
+from benchmarks import results
 from benchmarks.exercises import cloning, experts, loopholes, skill
-from palpate.app import panel
+from palpate.app import cli, panel
 from palpate.tasks.core import performer
 from palpate.tasks.learn import policy
 from palpate.tasks.people import score
@@ -20,7 +20,7 @@ SHORT = {"bimanual/hard": 0.12}
 
 
 def command(*words) -> int:
-  return run.main([*map(str, words)])
+  return cli.main(["bench", *map(str, words)])
 
 
 def table(path):
@@ -132,7 +132,7 @@ def test_a_race_against_itself_is_even(tmp_path):
 def test_learning_writes_table_and_curve(tmp_path):
   pytest.importorskip("stable_baselines3")
   words = ("--decisions", "20", "--every", "20", "--episodes", "2", "-o", str(tmp_path))
-  command = [sys.executable, str(HERE / "run.py"), "learning", *words]
+  command = [sys.executable, "-m", "palpate", "bench", "learning", *words]
   subprocess.run(command, check=True, timeout=300)
   rows = table(tmp_path / "learning.csv")
   assert [(row["policy"], row["decisions"]) for row in rows] == [

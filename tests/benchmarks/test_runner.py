@@ -1,14 +1,18 @@
 """The runner: cases that fail, runs that go on, options, and that every bench starts."""
 
 import dataclasses
+import subprocess
+import sys
 
 import pytest
 from benchmarks import results, run, runner
 from benchmarks.accuracy import error
+from palpate.app import cli
+from palpate.app.console import CommandError
 
 
 def command(*words) -> int:
-  return run.main([*map(str, words)])
+  return cli.main(["bench", *map(str, words)])
 
 
 def execute(bench, *words) -> bool:
@@ -61,7 +65,7 @@ def test_in_one_process_a_case_that_fails_ends_the_run_and_it_resumes_there(tmp_
 def test_results_of_another_form_are_not_resumed(tmp_path):
   (tmp_path / "small.csv").write_text("number,square\n1,1\n")
   assert rows_of(tmp_path / "small.csv") == [{"status": "ok", "number": 1, "square": 1}]
-  with pytest.raises(results.BenchError, match="another form"):
+  with pytest.raises(CommandError, match="another form"):
     execute(SMALL, "--out", tmp_path, "--resume")
   assert (tmp_path / "small.csv").read_text() == "number,square\n1,1\n"
 
@@ -71,7 +75,7 @@ def test_a_page_written_again_keeps_the_remarks(tmp_path):
   results.page(path, "Small", about, ["table"], ["It is 2 mm."], tmp_path / "small.png")
   assert path.read_text() == (
     "# Small\n\n- It is 2 mm.\n\n![Small](small.png)\n\npalpate 1.\n\n"
-    "    python tests/benchmarks/run.py small --short\n\ntable\n"
+    "    palpate bench small --short\n\ntable\n"
   )
   path.write_text(path.read_text() + "\n## Remarks\n\n- by hand\n")
   results.page(path, "Small", about, ["another table"], ["It is 3 mm."])
@@ -99,10 +103,25 @@ def test_every_bench_is_a_command_with_help(name, capsys):
 
 
 def test_the_list_of_benches(capsys):
-  assert command("--help") == 0
-  text = capsys.readouterr().out
-  assert all(f"  {name} " in text for name in run.BENCHES)
+  assert command() == 0
+  assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == list(run.BENCHES)
   assert command("nothing") == 2
+  assert "no bench 'nothing', expected one of attacks, " in capsys.readouterr().err
+
+
+def test_benches_need_no_pytest(tmp_path, monkeypatch):
+  code = "import sys; sys.modules['pytest'] = None; from palpate.app import cli; cli.main()"
+  words = ["bench", "solver", "--nodes", "200", "--repeat", "1", "-o", str(tmp_path)]
+  monkeypatch.chdir(tmp_path)  # an editable install knows its checkout
+  done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True)
+  assert (tmp_path / "solver_cpu.csv").exists(), done.stderr
+
+
+def test_without_a_checkout_it_says_so(tmp_path, monkeypatch, capsys):
+  monkeypatch.setattr("palpate.__file__", str(tmp_path / "site-packages/palpate/__init__.py"))
+  monkeypatch.chdir(tmp_path)
+  assert command("solver") == 1
+  assert "run the command in a checkout of Palpate's sources" in capsys.readouterr().err
 
 
 def test_wrong_options_are_refused_in_one_line(tmp_path, capsys):

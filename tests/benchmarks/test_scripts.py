@@ -5,13 +5,15 @@ import json
 import sys
 
 import pytest
-from benchmarks import results, run
+from benchmarks import results
 from benchmarks.accuracy import peer
+from palpate.app import cli
+from palpate.app.console import CommandError
 from palpate.engine import contacts
 
 
 def command(*words) -> int:
-  return run.main([*map(str, words)])
+  return cli.main(["bench", *map(str, words)])
 
 
 @pytest.mark.parametrize(
@@ -75,7 +77,7 @@ def test_short_forms_write_rows_and_a_page(tmp_path, name, words):
   rows = results.read(tmp_path / f"{name}.csv")
   assert rows and all(row["status"] == "ok" for row in rows)
   page = (tmp_path / f"{name}.md").read_text()
-  assert f"run.py {name} --short" in page and page.count("|") >= 12
+  assert f"palpate bench {name} --short" in page and page.count("|") >= 12
 
 
 def test_another_python_takes_the_same_steps():
@@ -89,7 +91,7 @@ def test_another_python_takes_the_same_steps():
       run.finish()
     assert there.about == here.about and there.time > 0
     assert there.force == pytest.approx(here.force, abs=1e-15)
-  with pytest.raises(results.BenchError, match="expected an interpreter"), peer.another("/none"):
+  with pytest.raises(CommandError, match="expected an interpreter"), peer.another("/none"):
     pass
 
 

@@ -3,8 +3,6 @@
 Every size is in SI units.
 """
 
-import pytest
-import warp as wp
 from palpate.models.block import box
 
 from .bare import force, get, kernels, put, step
@@ -38,12 +36,10 @@ from .running import (
 from .specs import servo
 from .surfaces import RADIUS, sphere, strip, triangular
 
-needs_cuda = pytest.mark.skipif(not wp.is_cuda_available(), reason="needs a CUDA device")
-
 __all__ = [
   "RADIUS", "Warnings", "adrift", "ball", "beside", "bodies", "box", "contacts", "dofs", "drive",
   "flex", "follow", "force", "get", "grasp", "kernels", "load", "lump", "masses", "motion",
-  "needs_cuda", "organ", "plugin", "press", "probed", "put", "qposs", "resting", "ridge", "run",
+  "organ", "plugin", "press", "probed", "put", "qposs", "resting", "ridge", "run",
   "servo", "settle", "slot_bodies", "slots", "sphere", "state", "step", "strip", "triangular",
   "watch", "windowed", "workspace", "world",
 ]  # fmt: skip

@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 import pytest
-from scenes import needs_cuda
+from devices import needs_cuda
 
 pytest.importorskip("gymnasium")
 

@@ -1,6 +1,6 @@
 """How near cuts of surfaces follow their path, and what of mass and volume they keep.
 
-    python tests/benchmarks/run.py paths
+    palpate bench paths
 
 `Organ.cut` along curves on a sheet of 15 by 10 cm and on a closed ball of 5 cm radius, through the
 whole wall of 2 mm. `off` is how far an edge that came apart is from the path at most, anywhere

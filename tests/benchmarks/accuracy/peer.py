@@ -34,9 +34,9 @@ import numpy as np
 import palpate
 import scenes
 from benchmarks import plots, results, scene
-from benchmarks.results import BenchError
 from benchmarks.runner import Bench, Case, Row
 from benchmarks.scene import Tissue
+from palpate.app.console import CommandError
 from palpate.tissue.geometry import fill
 from palpate.tissue.geometry import mesh as topology
 from scenes import RADIUS
@@ -198,7 +198,7 @@ class Beside:
     process.stdin.flush()
     line = process.stdout.readline()
     if not line:
-      raise BenchError("the other interpreter has ended; expected this package there", code=1)
+      raise CommandError("the other interpreter has ended; expected this package there", code=1)
     return json.loads(line)
 
   def restart(self):
@@ -254,7 +254,7 @@ def another(python: str) -> Iterator[subprocess.Popen | None]:
     ) as process:
       yield process
   except OSError as error:
-    raise BenchError(f"beside is {python!r}, expected an interpreter: {error.strerror}") from None
+    raise CommandError(f"beside is {python!r}, expected an interpreter: {error.strerror}") from None
 
 
 def measure(case: Case, out: pathlib.Path) -> list[Row]:

@@ -287,7 +287,7 @@ def summarize(rows: list[Row]) -> list[str]:
   failed = [r for r in pressed if r["scheme"] == "implicit" and r["verdict"] in FAILURES]
   if failed:
     lines += [f"## Failures of the implicit scheme ({len(failed)})", ""]
-    lines += ["One again: `run.py stability --only CASE`.", ""]
+    lines += ["One again: `palpate bench stability --only CASE`.", ""]
     head = ["case", "verdict", "h [ms]", "E [Pa]", "t [mm]", "nodes", "mass [kg]", "speed [m/s]"]
     head += ["h²Et/m", "growth", "excess", "chatter", "sunk [mm]", "residual"]
     body = [

@@ -28,9 +28,9 @@ from collections.abc import Mapping
 
 import numpy as np
 from benchmarks import plots, results
-from benchmarks.results import BenchError
 from benchmarks.runner import Bench, Case, Row
 from palpate import models, register
+from palpate.app.console import CommandError
 from palpate.models import catalog
 from reference import closed, plates
 
@@ -109,9 +109,9 @@ PUBLISHED = (
 
 
 def begin(args: argparse.Namespace):
-  """Raises BenchError where the other library is missing."""
+  """Raises CommandError where the other library is missing."""
   if importlib.util.find_spec("skfem") is None:
-    raise BenchError("scikit-fem is not installed: pip install 'palpate[bench]'", code=1)
+    raise CommandError("scikit-fem is not installed: pip install 'palpate[bench]'", code=1)
 
 
 def stages(args: argparse.Namespace) -> list[list[Case]]:

@@ -1,6 +1,6 @@
 """Counts PCG iterations with block Jacobi and with the multilevel preconditioner.
 
-    python tests/benchmarks/run.py preconditioner
+    palpate bench preconditioner
 
 The organs are the spheres of `solver.py` and the liver and the stomach of the models, refined by
 halving edges (t = 2 mm, 0.1 kg, h = 1 ms), after ten steps under a load at the top, solved from a

@@ -1,7 +1,7 @@
 """Times steps of organs that are never cut, beside those of an older state of the code.
 
     git worktree add before 0e5a0ce    # the last one that knew of no cuts
-    python tests/benchmarks/run.py uncut --before before
+    palpate bench uncut --before before
 
 Processes of both, two each, are asked in turn for a few milliseconds of steps of the same scene,
 on one core and in another order each round. Of each round the CPU time of the two new ones to that
@@ -25,8 +25,8 @@ import numpy as np
 import scenes
 from benchmarks import plots, results
 from benchmarks.development import stepping
-from benchmarks.results import BenchError
 from benchmarks.runner import SEED, Bench, Case, Row
+from palpate.app.console import CommandError
 
 ROOT = pathlib.Path(__file__).parents[3]
 BLOCK = 0.012  # CPU time of a round of a process [s]
@@ -55,7 +55,7 @@ class Server:
     while line and not line.isdigit() and line != "ready":  # what libraries say
       line = self._process.stdout.readline().strip()
     if not line:
-      raise BenchError("a process that steps has ended", code=1)
+      raise CommandError("a process that steps has ended", code=1)
     return line
 
   def wait(self):
@@ -80,7 +80,7 @@ def package(checkout: str | os.PathLike, where: pathlib.Path) -> pathlib.Path:
   """Makes a folder in which the package of a checkout has its name."""
   tree = pathlib.Path(checkout).resolve()
   if not (tree / "plugin").is_dir():
-    raise BenchError(f"before is {str(checkout)!r}, expected a checkout of the repository")
+    raise CommandError(f"before is {str(checkout)!r}, expected a checkout of the repository")
   (where / "palpate").mkdir(parents=True)
   for path in (tree / "plugin").iterdir():
     (where / "palpate" / path.name).symlink_to(path)

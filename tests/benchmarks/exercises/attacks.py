@@ -1,7 +1,7 @@
 """Counts what random attacks break: files, meshes, configurations, lives, threads, long runs.
 
-    python tests/benchmarks/run.py attacks
-    python tests/benchmarks/run.py attacks --kinds exercises --jobs 14 --minutes 60 --resume
+    palpate bench attacks
+    palpate bench attacks --kinds exercises --jobs 14 --minutes 60 --resume
 
 A case is a block of seeds or of steps; a seed that fails is named. The first seeds of each run in
 every test; here are ten thousand of each, a million steps of one organ, ten million of the hard

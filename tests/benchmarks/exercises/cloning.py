@@ -20,6 +20,7 @@ from benchmarks import results
 from benchmarks.results import Row
 from benchmarks.runner import SEED, Bench, Case
 from palpate.app import cli, options, workers
+from palpate.app.console import CommandError
 from palpate.app.datasets.robomimic import FILE
 from palpate.app.learn import evaluate
 from palpate.tasks.learn import policy
@@ -95,7 +96,7 @@ def made_data(folder: pathlib.Path, kind: str, count: int) -> pathlib.Path:
   words += ["--seed", FIRST[kind], "--observations", *OBSERVATIONS]
   words += ["--noise", NOISE] if kind == "shaken" else []
   if not path.exists() and cli.main([str(word) for word in words]):
-    raise results.BenchError("the data set was not made; --resume goes on", code=1)
+    raise CommandError("the data set was not made; --resume goes on", code=1)
   return path
 
 

@@ -1,6 +1,6 @@
 """World-steps a second of batches, a probe in contact in each world, and what a world takes.
 
-    python tests/benchmarks/run.py batch --device cuda:0
+    palpate bench batch --device cuda:0
 
 An octahedral sphere of radius 5 cm (E = 30 kPa, t = 2 mm, 0.1 kg, foundation 1e5 Pa/m, h = 1 ms) is
 pressed by a ball of 6 mm on a slide, to depths of up to 6 mm that differ from world to world. Then
@@ -186,7 +186,7 @@ def run(case: Case, out: pathlib.Path) -> list[Row]:
 def table(out: pathlib.Path) -> list[str]:
   """Returns the lines of the page."""
   lines = [
-    "From batch_cpu.csv and batch_cuda.csv; `run.py batch --help` says how they were",
+    "From batch_cpu.csv and batch_cuda.csv; `palpate bench batch --help` says how they were",
     "measured. What a world takes is from the GPU's free memory before and after, which earlier",
     "cases that give theirs back blur: good to some tens of kB.",
     "",

@@ -1,6 +1,6 @@
 """Times steps in which an organ is cut, beside steps in which it is touched.
 
-    python tests/benchmarks/run.py cut
+    palpate bench cut
 
 A sheet of 15 by 10 cm (E = 200 kPa, t = 2 mm, h = 2 ms, windows), a membrane or with bending,
 pinned at its long sides, is cut by a blade at 80 mm/s, by scissors that close, by a hook's current

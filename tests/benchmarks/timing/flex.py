@@ -1,6 +1,6 @@
 """World-steps a second against force error, beside mujoco_warp's own flex on the same device.
 
-    python tests/benchmarks/run.py flex --device cuda:0
+    palpate bench flex --device cuda:0
 
 The shell that bends and the solid of `peer`, 642 nodes at the surface, pinned below, a ball pressed
 6 mm into it at 50 mm/s: the same mesh, mass, constants, contacts and drive for mujoco_warp's flex

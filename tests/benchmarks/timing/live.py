@@ -23,10 +23,10 @@ import time
 import mujoco
 import numpy as np
 from benchmarks import plots, results
-from benchmarks.results import BenchError
 from benchmarks.runner import Bench, Case, Row
 from palpate import models, register
 from palpate.app import live
+from palpate.app.console import CommandError
 from palpate.app.live.practice import Practice
 from palpate.tasks import suite
 from palpate.tasks.recording import Recording
@@ -116,10 +116,10 @@ def _page(case: Case) -> Row:
   try:
     from playwright.sync_api import sync_playwright
   except ImportError:
-    raise BenchError("playwright is not installed: pip install 'palpate[test]'", code=1) from None
+    raise CommandError("playwright is not installed: pip install 'palpate[test]'", code=1) from None
   path = shutil.which("chromium") or shutil.which("google-chrome")
   if path is None:
-    raise BenchError("no chromium on this machine", code=1)
+    raise CommandError("no chromium on this machine", code=1)
   from palpate.app.live.page.server import Server
 
   with tempfile.TemporaryDirectory() as folder, sync_playwright() as play:

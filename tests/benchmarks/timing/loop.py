@@ -1,8 +1,8 @@
 """Times the whole loop, mj_step with a probe in contact with a windowed organ, and where it goes.
 
-    python tests/benchmarks/run.py loop --device cuda:0 --nodes 16384 65536 262144
-    python tests/benchmarks/run.py loop --solid --nodes 1000 4000 --tip 0.005 --tolerance 1e-2
-    python tests/benchmarks/run.py loop --draw
+    palpate bench loop --device cuda:0 --nodes 16384 65536 262144
+    palpate bench loop --solid --nodes 1000 4000 --tip 0.005 --tolerance 1e-2
+    palpate bench loop --draw
 
 An octahedral sphere of radius 5 cm (E = 30 kPa, t = 2 mm, 0.1 kg, foundation 1e5 Pa/m, h = 1 ms),
 pinned below, is pressed 1.5 mm deep by a probe of 5 mm, or as thick as `--tip` says, and slid
@@ -265,8 +265,8 @@ def table(out: pathlib.Path) -> list[str]:
   """Returns the lines of the page, microseconds a step and nanoseconds a node."""
   lines = [
     "Microseconds; device: its work by itself, which on CUDA goes on beside MuJoCo's. Per node:",
-    "the device's work in ns. From loop_cpu.csv and loop_cuda.csv; `run.py loop --help` says",
-    "how they were measured.",
+    "the device's work in ns. From loop_cpu.csv and loop_cuda.csv; `palpate bench loop --help`",
+    "says how they were measured.",
     "",
     *_rows(out, "loop_c*.csv"),
   ]

@@ -1,6 +1,6 @@
 """Times mj_step of a scene with a sleeping windowed organ against the scene without the organ.
 
-    python tests/benchmarks/run.py rest
+    palpate bench rest
 
 The liver with a probe in its home pose, or withdrawn; CPU time of blocks of steps, all variants in
 turn. `mujoco_us` is the same model with the plugin left out: what MuJoCo spends on the

@@ -1,6 +1,6 @@
 """Times the implicit step alone, device by device, and checks CUDA against the CPU first.
 
-    python tests/benchmarks/run.py solver --device cuda:0 --nodes 678 16386 65538 262146
+    palpate bench solver --device cuda:0 --nodes 678 16386 65538 262146
 
 Each size is an octahedral sphere of radius 5 cm pressed over a 6 mm patch (E = 30 kPa, t = 2 mm,
 0.1 kg, h = 1 ms) and solved from a cold start with each preconditioner; the median of graph replays
@@ -16,8 +16,8 @@ import numpy as np
 import scenes
 import warp as wp
 from benchmarks import plots, results
-from benchmarks.results import BenchError
 from benchmarks.runner import Bench, Case, Row
+from palpate.app.console import CommandError
 from palpate.models.meshing import grid
 from palpate.tissue import body as bodies
 from palpate.tissue import coarse, config
@@ -213,7 +213,7 @@ def stages(args: argparse.Namespace) -> list[list[Case]]:
 def begin(args: argparse.Namespace):
   """Checks the device against the CPU."""
   if args.device != "cpu" and agreement(args.device) > 1e-4:
-    raise BenchError(f"{args.device} disagrees with the CPU", code=1)
+    raise CommandError(f"{args.device} disagrees with the CPU", code=1)
 
 
 def run(case: Case, out: pathlib.Path) -> list[Row]:

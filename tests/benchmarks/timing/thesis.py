@@ -1,7 +1,7 @@
 """Tables 7.1-7.4 and figures 7.6-7.14 of the thesis with today's program.
 
-    python tests/benchmarks/run.py thesis
-    python tests/benchmarks/run.py thesis --device cuda:0
+    palpate bench thesis
+    palpate bench thesis --device cuda:0
 
 V. Kotamraju, "A GPU-based integrated approach to simulation for deformable surface meshes", Simon
 Fraser University, 2008: a 3.0 GHz Pentium 4 and a GeForce 7600 GS. The same work here: springs on a
@@ -25,6 +25,7 @@ import warp as wp
 from benchmarks import plots, results, runner, scene
 from benchmarks.runner import Bench, Case, Row
 from benchmarks.timing import loop
+from palpate.app.console import CommandError
 
 SIDES = (16, 32, 64, 128, 256)
 DRAWN = (16, 64, 128)  # the sizes of the figures
@@ -147,7 +148,7 @@ def lead(cycle: int) -> float:
 def run(case: Case, out: pathlib.Path) -> list[Row]:
   """Returns the row of a case of the tables, or a row every 20th cycle of a figure."""
   if case["device"] != "cpu" and not wp.is_cuda_available():
-    raise results.BenchError(f"no CUDA device for {case['place']!r}", code=1)
+    raise CommandError(f"no CUDA device for {case['place']!r}", code=1)
   m = model(case)
   d = mujoco.MjData(m)
   organ = palpate.Organ(m, d, "organ")

@@ -7,6 +7,7 @@ import numpy as np
 import palpate
 import pytest
 import scenes
+from devices import needs_cuda
 from scipy import ndimage
 
 FULL = mujoco.mjtState.mjSTATE_INTEGRATION
@@ -192,7 +193,7 @@ def test_what_is_cut_off_rests_on_what_the_organ_rested_on(below):
   assert np.abs(organ.xpos[:, 2] - x[:, 2].mean()).max() < 1.5e-3
 
 
-@pytest.mark.parametrize("where", ["cpu", pytest.param("cuda:0", marks=scenes.needs_cuda)])
+@pytest.mark.parametrize("where", ["cpu", pytest.param("cuda:0", marks=needs_cuda)])
 def test_a_motion_that_stays_on_the_device_is_cut_there(where):
   spec = mujoco.MjSpec()
   spec.option.gravity = [0, 0, 0]

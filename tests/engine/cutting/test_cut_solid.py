@@ -7,6 +7,7 @@ import numpy as np
 import palpate
 import pytest
 import scenes
+from devices import needs_cuda
 from palpate.engine.cutting import cuts
 from scipy.spatial import cKDTree
 
@@ -15,7 +16,7 @@ BOTH = pytest.mark.parametrize("windows", [False, True], ids=["nodal", "windows"
 KEYS = {"elements": "solid", "mass": 0.3, "young": 1e4, "spare": 260}
 
 
-@pytest.fixture(params=["cpu", pytest.param("cuda:0", marks=scenes.needs_cuda)])
+@pytest.fixture(params=["cpu", pytest.param("cuda:0", marks=needs_cuda)])
 def device(request) -> str:
   return request.param
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import scenes
+from devices import needs_cuda
 from palpate.tissue import body as bodies
 from palpate.tissue import device as devices
 from palpate.tissue import energy, shape
@@ -152,7 +153,7 @@ def test_the_foundation_holds_the_largest_piece_of_what_it_held():
   assert not (topology.held_areas(mesh) > 0)[free].any()
 
 
-@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda:0", marks=scenes.needs_cuda)])
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda:0", marks=needs_cuda)])
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_refilled_body_is_one_made_anew_to_the_bit(kind, device):
   config = KINDS[kind]
