@@ -44,6 +44,7 @@ COMMANDS = {
   ("trainee", "export"): ("trainee.export", "write all of a person's data"),
   ("trainee", "delete"): ("trainee.delete", "delete all of a person's data"),
   ("trainee", "limits"): ("trainee.limits", "make proficiency limits from experts' recordings"),
+  ("library",): ("library", "build a plugin library for programs in C and C++"),
   ("bench",): ("bench", "run a measurement of a checkout: accuracy, speed, exercises"),
   ("panel",): ("panel", "make the references of scores from many skilled performers"),
 }
