@@ -8,10 +8,10 @@ import numpy.typing as npt
 from palpate.engine import change, penetration, signals, workspace
 from palpate.engine import plugin as engine
 from palpate.engine.cutting import cuts as cutting
-from palpate.engine.cutting.cutters import Cutter
 from palpate.engine.layout import FLAG
 from palpate.engine.model import mjstruct
 from palpate.engine.windows import windowed
+from palpate.forces.cutters import Cutter
 from palpate.tissue import energy
 from palpate.tissue.config import Config
 from palpate.tissue.cutting.topology import Piece, Report, pieces

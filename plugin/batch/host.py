@@ -1,8 +1,7 @@
-"""An organ of `Worlds` as the host of its passive forces; the base class of cutters and tears."""
+"""An organ of `Worlds` as the host of its passive forces."""
 
 from __future__ import annotations
 
-import abc
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +12,6 @@ from palpate.engine.layout import FLAG
 from palpate.engine.workspace import Workspace
 from palpate.forces import host
 from palpate.forces.host import Input, Twin, WorldBodies, WorldNodes
-from palpate.forces.passive import Force
 from palpate.forces.table import FORCES
 from palpate.tissue import body as bodies
 from palpate.tissue.geometry.mesh import Mesh
@@ -25,8 +23,6 @@ from .patch import launch
 if TYPE_CHECKING:
   from .organs import Organ
   from .worlds import Worlds
-
-_LOOK = 10  # steps after which the host looks, at most
 
 
 class Host(host.Host):
@@ -79,7 +75,7 @@ class Host(host.Host):
   def mesh(self, world: int) -> Mesh:
     """See `Host`; as it was when the topology's `follow` was called."""
     topology = self._organ.topology
-    return topology.mesh_of(world) if topology else self.organ.mesh
+    return topology.mesh(world) if topology else self.organ.mesh
 
   def which(self, others: Sequence[host.Host]) -> wp.array:
     """See `Host`."""
@@ -89,6 +85,20 @@ class Host(host.Host):
   def body_number(self, body: int) -> int:
     """See `Host`."""
     return int(self._batch.numbers[body])
+
+  def surface(self) -> dict[str, Any]:
+    """See `Host`: of nodes."""
+    patch, mesh = self._organ.patch, self.organ.mesh
+    own, solve = nodes_of(self._organ), input_of(self._organ)
+    own.node = solve.node = wp.array(np.arange(patch.nnode), dtype=int, device=self.device)
+    return dict(
+      nelem=mesh.nelem, ntet=len(mesh.tet), mesh=patch.mesh, elem=patch.elem, tet=patch.tet,
+      flat=patch.rest, own=own, solve=solve,
+    )  # fmt: skip
+
+  def tools(self, name: str) -> np.ndarray:
+    """See `Host`."""
+    return getattr(self._batch.d, name).numpy().astype(float)
 
   def load(self, kernel: Twin):
     """See `Host`."""
@@ -108,43 +118,6 @@ class Host(host.Host):
       wp.launch(put_back_rows, dim=there.shape, inputs=[mask, start, there], device=device)
     for which in self._which:
       wp.launch(forget, dim=self.nworld, inputs=[mask, which], device=device)
-
-
-class Opens(Force):
-  """A cutter or tears, which the host looks at every few steps.
-
-  Args:
-    organ: the organ
-  """
-
-  def __init__(self, organ: Organ):
-    super().__init__(organ.host)
-    self._organ, self._steps = organ, 0
-    batch = organ.batch
-    self._nworld, self._device, self._mask = batch.nworld, batch.device, batch.mask
-
-  def _zeros(self, *shape: int, dtype: Any = wp.float64) -> wp.array:
-    return wp.zeros(shape, dtype=dtype, device=self._device)
-
-  def _over(self, what, fields: Any, count: int, arg: int = 0):
-    launch(what, fields, self._nworld, max(1, count), self._device, arg)
-
-  def rest(self):
-    """Forgets what worlds of the mask were about to open."""
-
-  def configure(self, worlds: np.ndarray, rows: dict[str, np.ndarray]):
-    """Follows the tissue of worlds, which has changed; `rows` as `Material.change` takes them."""
-
-  def stepped(self, last: bool):
-    """Looks after a step where it is time, or where that was the last step for now."""
-    self._steps += 1
-    if last or self._steps >= _LOOK:
-      self.open(self._steps)
-      self._steps = 0
-
-  @abc.abstractmethod
-  def open(self, steps: int):
-    """Lets the meshes of worlds come apart where they have to, so many steps since the last."""
 
 
 def check(spaces: Iterable[Workspace]):

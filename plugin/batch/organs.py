@@ -10,8 +10,10 @@ import numpy as np
 import warp as wp
 from palpate.engine import coupling
 from palpate.engine.windows import proxies
+from palpate.forces import cutters
 from palpate.forces.passive import Forces
 from palpate.forces.table import FORCES
+from palpate.forces.tears import Tears
 from palpate.tissue import body as bodies
 from palpate.tissue import config as configuration
 from palpate.tissue import device as devices
@@ -21,7 +23,7 @@ from palpate.tissue.cutting.topology import Report, pieces
 from . import bonds, host, kernels, patch
 from .base import Contacts, Tissue, spread
 from .contact import contact_rows, contacts, convex
-from .cutting.blades import Blades
+from .cutting import blades
 from .cutting.cuts import Cuts
 from .cutting.fracture import Cutters
 from .material import KEYS, Material
@@ -37,6 +39,7 @@ _WHAT = {"xpos": 0, "xvel": 1, "contact_force": 2}
 _STATUS = {"iterations": 0, "residual": 1}
 _RANKED = 6  # threads that choose nodes, times the slots
 _FEW = 32  # values that are checked one by one
+_LOOK = 10  # steps after which it looks at most where meshes come apart
 
 
 def plan_of(body, config, volumes: bool = False) -> devices.Plan | None:
@@ -125,7 +128,7 @@ class Organ(Tissue):
     kinds = frozenset(int(kind) for kind in model.geom_type[tools])
     self._find = contacts.kernel(kinds)
     self._material = Material(self, batch, self._touch, self._pressed)
-    self.host = host.Host(self)
+    self.host, self._steps = host.Host(self), 0
     self.forces = Forces(self.host, FORCES)
 
   def enclose(self):
@@ -164,10 +167,20 @@ class Organ(Tissue):
       held += 400.0
     return bodies.nbytes(alone) + (56.0 + held) * w.organ.mesh.nvert
 
+  def stepped(self, last: bool):
+    """Looks now and then after a step, or after the last one for now, where meshes come apart."""
+    self._steps += 1
+    opens = self.forces.of(Tears), self.cuts_by
+    if self._cuts and any(opens) and (last or self._steps >= _LOOK):
+      self._cuts.follow()
+      for each in opens:
+        each.open(self._cuts, self._steps)
+      self._steps = 0
+
   @property
-  def opens(self) -> list[host.Opens]:
-    """What lets its meshes come apart."""
-    return [each for each in self.forces if isinstance(each, host.Opens)]
+  def cuts_by(self) -> cutters.Cutters:
+    """The force of its cutters."""
+    return self.forces.of(cutters.Cutters)
 
   # Within a step.
 
@@ -229,8 +242,6 @@ class Organ(Tissue):
     """Puts the worlds of the mask at rest."""
     self._over(patch.rest, self.patch.nnode)
     self.host.rest()
-    for each in self.opens:
-      each.rest()
     if self._cuts:
       self._cuts.heal()
 
@@ -284,7 +295,7 @@ class Organ(Tissue):
 
   def _cut(self, points: dict[int, np.ndarray], depth, direction) -> list[Report | None]:
     assert self._cuts is not None
-    return self._cuts.cut(points, depth, direction)
+    return self._cuts.cut_each(points, depth, direction)
 
   def _told(self, name: str, world: int) -> list:
     if self._cuts is None:
@@ -299,14 +310,21 @@ class Organ(Tissue):
     return self._cuts.counts()
 
   def _cutters(self) -> Cutters:
-    for each in self.forces:
-      if isinstance(each, Blades):
-        return each.read()
-    raise ValueError(f"organ {self.name!r}: nothing cuts it, expected the key cutters")
+    if not self.cuts_by:
+      raise ValueError(f"organ {self.name!r}: nothing cuts it, expected the key cutters")
+    return self._blades.read()
+
+  @functools.cached_property
+  def _blades(self) -> blades.Shown:
+    return blades.Shown(self.cuts_by)
+
+  def feel(self, adr: int):
+    """Adds the force of its cutters to a sensor of three numbers."""
+    blades.feel(self.cuts_by, adr, self.batch.d.sensordata)
 
   def elem_of(self, world: int) -> np.ndarray:
     """Returns the triangles of a world, see `Tissue.elem_of`."""
-    return self._cuts.mesh(self.batch.index(world)).elem if self._cuts else self.elem
+    return self._cuts.mesh_now(self.batch.index(world)).elem if self._cuts else self.elem
 
   # Changing.
 
@@ -326,8 +344,8 @@ class Organ(Tissue):
       if key != "friction" and key != "mass":
         self._check(key, values)
     self._material.change(chosen, rows)
-    for each in self.opens:
-      each.configure(chosen, rows)
+    if "thickness" in rows:
+      self.cuts_by.refresh(rows["thickness"], chosen)
     self.wake(chosen)
 
   def _fixed(self, key: str) -> str | None:

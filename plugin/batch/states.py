@@ -129,7 +129,7 @@ def _pull_organ(organ: Organ, world: int, model, data):
 def _shift(organ: Organ, world: int) -> np.ndarray:
   """Returns how far cuts have moved vertices at rest [m], (nvert, 3)."""
   whole = organ.declared.mesh
-  return organ.topology.mesh(world).rest - whole.rest if organ.topology else 0.0 * whole.rest
+  return organ.topology.mesh_now(world).rest - whole.rest if organ.topology else 0.0 * whole.rest
 
 
 def _pull_slots(organ: Organ, world: int, own, spans, force: np.ndarray):

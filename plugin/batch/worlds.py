@@ -23,7 +23,6 @@ from palpate.tissue import device as devices
 from . import host, kernels, states, strip_organs
 from .base import Batch, free_memory, refuse_crowd
 from .contact import contacts, convex
-from .cutting import blades, tears
 from .organs import Organ
 from .private import DeterminismType, OverflowType
 from .reset import Rest
@@ -86,7 +85,6 @@ class Worlds(Batch):
       }
       self._rest = Rest(self, bare)
       self.aims = self._join()
-      self._looks = [each for organ in self._organs.values() for each in organ.opens]
       self._teller = states.Teller(self)
       self._alias()
       self._sensed: Any = kernels.Sensed()
@@ -94,7 +92,7 @@ class Worlds(Batch):
       self._sensed.data, self._sensed.count = self.d.sensordata, wp.zeros(nworld, dtype=int)
       self._sensed.peak, self._sensed.mean = self._summary["peak"], self._summary["mean"]
       self._sensed.seen = self._make(0, model.nsensordata)
-      self._felt: list[tuple[blades.Blades, int]] = []
+      self._felt: list[tuple[Organ, int]] = []
       self._callbacks()
       try:
         self.record()
@@ -164,8 +162,6 @@ class Worlds(Batch):
       organ.forces.take(organ.space.forces, twin)
       currents = organ.space.cutters.by_current.values()
       organ.forces.of(Bonds).currents = [current.burning for current in currents]
-      for each in (*tears.make(organ), *blades.make(organ)):
-        organ.forces.add(each)
     for organ in organs:
       organ.host.bind(organ.host.model)
     for organ in organs:
@@ -213,14 +209,13 @@ class Worlds(Batch):
     self.begin()
     self.step_tools()
     self.end()
-    for each, adr in self._felt:
-      each.feel(adr, self.d.sensordata)
+    for organ, adr in self._felt:
+      organ.feel(adr)
     self._sense(kernels.sum_up)
 
   def _feel(self, sensor: int, organ: str):
     adr = int(self.model.sensor_adr[sensor])
-    found = self._organs[organ].forces
-    self._felt += [(each, adr) for each in found if isinstance(each, blades.Blades)]
+    self._felt.append((self._organs[organ], adr))
     self.record()
 
   def _sense(self, kernel):
@@ -268,8 +263,8 @@ class Worlds(Batch):
       sums.zero_()
     for k in range(n):
       self._run("step")
-      for each in self._looks:
-        each.stepped(k + 1 == n)
+      for organ in self._organs.values():
+        organ.stepped(k + 1 == n)
     self._sense(kernels.average)
     self._run("after")
 

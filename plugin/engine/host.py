@@ -52,6 +52,7 @@ class Host(host.Host):
     self.arrays["heaviest"] = wp.ones(1, dtype=wp.float64, device="cpu")
     self.number, self._flags = body.numbers, wp.zeros(len(FLAG), dtype=int, device="cpu")
     self._rest = wp.array(self._from(), dtype=wp.float64, device="cpu")  # that of all `nodes`
+    self._surface: dict[str, Any] = {}
     self.bind(model)
 
   def bind(self, model: int):
@@ -94,6 +95,28 @@ class Host(host.Host):
     """Takes the organ that a cut has made, or a state that was set."""
     self.organ = organ
     self._rest.assign(self._from())
+    for name, values in self._meshes().items() if self._surface else ():
+      self._surface[name].assign(values)
+
+  def _meshes(self) -> dict[str, np.ndarray]:
+    mesh = self.organ.mesh
+    return {"elem": mesh.elem[None, : mesh.whole.nelem], "tet": mesh.tet[None],
+            "flat": mesh.rest[None]}  # fmt: skip
+
+  def surface(self) -> dict[str, Any]:
+    """See `Host`."""
+    if not self._surface:
+      mesh, kinds = self.organ.mesh, {"elem": int, "tet": int, "flat": wp.float64}
+      self._surface = {"nelem": mesh.whole.nelem, "ntet": len(mesh.tet), "mesh": np.zeros(1)}
+      for name, values in self._meshes().items():
+        self._surface[name] = wp.array(values, dtype=kinds[name], device="cpu")
+    return self._surface
+
+  def tools(self, name: str) -> np.ndarray:
+    """See `Host`."""
+    m, d = self.m, mjstruct.Data.from_address(self.data)
+    shape = {"ctrl": (m.nu,), "geom_xpos": (m.ngeom, 3), "geom_xmat": (m.ngeom, 3, 3)}[name]
+    return mjstruct.view(getattr(d, name), (1, *shape))
 
   def need_springs(self):
     """See `Host`."""

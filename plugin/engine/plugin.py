@@ -200,7 +200,7 @@ def _end(w: Workspace):
   w.step()
   if w.cuts:
     w.cuts.hide(w.model)
-  if (w.config.tear > 0 and cuts.tear(w)) or (w.cutters and w.cutters.open()):
+  if any(each and each.open(cuts.Opening(w)) for each in w.opens):
     workspace.place(w, w.model)
   nodes, triangles = w.report.flags[FLAG.missed_nodes], w.report.flags[FLAG.missed_elements]
   if nodes > w.report.missed[0] or triangles > w.report.missed[1]:

@@ -16,15 +16,16 @@ from palpate.tissue.config import Config
 from ..forces import declare_attachments, declare_bonds, supports
 from ..forces.attachments import Attachments
 from ..forces.cohesive_bonds import Bonds
+from ..forces.cutters import Cutters
 from ..forces.passive import Forces
 from ..forces.supports import Supports
 from ..forces.table import FORCES
+from ..forces.tears import Tears
 from . import contacts, coupling, graphs
 from .bind import bind
 from .coupling import Phases
 from .cutting import cuts
 from .cutting.cuts import Cuts
-from .cutting.cutters import Cutters
 from .host import Host
 from .layout import FLAG, HEAD, Topology
 from .model import declare, flexes, inertia, mjstruct, prepare, skin
@@ -142,7 +143,8 @@ class Workspace:
     report: what came of it
     graphs: what it launches
     forces: what acts on the organ beside its tissue
-    cuts, cutters: its mesh as it is now, and what cuts it
+    cuts: its mesh as it is now
+    opens: forces that let it come apart
     turn: this mjData's part in the model's window, or None
     skin: what is drawn for it, or None
     views: what a coupling keeps when its graphs are recorded anew
@@ -154,15 +156,15 @@ class Workspace:
   graphs: Graphs = dataclasses.field(default_factory=Graphs)
   forces: Forces = dataclasses.field(init=False)
   cuts: Cuts = dataclasses.field(init=False)
-  cutters: Cutters = dataclasses.field(init=False)
+  opens: tuple[Tears, Cutters] = dataclasses.field(init=False)
   turn: Turn | None = None
   skin: skin.Skin | None = None
   views: dict = dataclasses.field(default_factory=dict)
 
   def __post_init__(self):
     self.cuts = Cuts(self.organ, self.body, self.model)
-    self.forces, self.cutters = Forces(self.host, FORCES), Cutters(self)
-    self.forces.add(self.cutters)
+    self.forces = Forces(self.host, FORCES)
+    self.opens = self.forces.of(Tears), self.cutters
 
   @property
   def organ(self) -> Declaration:
@@ -198,6 +200,11 @@ class Workspace:
   def bonds(self) -> Bonds:
     """What the organ has grown on to."""
     return self.forces.of(Bonds)
+
+  @property
+  def cutters(self) -> Cutters:
+    """What cuts it."""
+    return self.forces.of(Cutters)
 
   @property
   def supports(self) -> Supports:
@@ -530,5 +537,5 @@ def refresh(w: Workspace):
         place(w, w.model)
     feel(w, m)
     contacts.tell(w, w.model)
-    w.cutters.refresh()
+    w.cutters.refresh([w.config.thickness])
     w.seen.time_step = float(m.opt.timestep)

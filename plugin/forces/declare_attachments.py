@@ -10,6 +10,7 @@ from scipy.spatial import KDTree
 
 from ..engine.host import Host
 from ..engine.model import flexes, inertia, mjstruct
+from . import host as base
 from .attachments import TO_OWN_MOTION, TO_POINT, Attachments, Group
 from .transfer import Grip
 
@@ -141,7 +142,7 @@ def check_vertices(host: Host, vertices: npt.ArrayLike) -> np.ndarray:
   return vert
 
 
-def _gain(host: Host) -> float:
+def _gain(host: base.Host) -> float:
   """Returns h^2 + h damping [s^2]."""
   h = float(host.m.opt.timestep)
   return h * (h + host.config.damping)
@@ -152,7 +153,7 @@ def _firm(host: Host) -> np.ndarray:
   return _FIRM * inertia.masses(host.m, host.organ) / _gain(host)
 
 
-def most(host: Host, body: int) -> float:
+def most(host: base.Host, body: int) -> float:
   """Returns the most that springs to a body may have together [N/m]."""
   m = host.m
   if _is_mocap(m, body) or not mjstruct.view(m.body_weldid, m.nbody, np.int32)[body]:

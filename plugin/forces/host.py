@@ -122,27 +122,17 @@ class Twin(NamedTuple):
 def kernels(header: str, kind: Any, *names: str) -> list[Twin]:
   """Returns the kernels of a header that take a struct, for both hosts."""
   return [
-    Twin(kernel(name, header, kind, CONSTANTS), world_kernel(name, header, for_worlds(kind)))
+    Twin(
+      kernel(name, header, kind, CONSTANTS),
+      kernel(name, header, for_worlds(kind), CONSTANTS, tag=".worlds"),
+    )
     for name in names
   ]
 
 
-def world_kernel(name: str, header: str, kind: Any) -> Kernel:
-  """Returns a kernel of a header that takes a struct of `for_worlds`."""
-  return kernel(name, header, kind, CONSTANTS, tag=".worlds")
-
-
 @functools.cache
-def for_worlds(
-  kind: Any, rows: tuple[str, ...] = (), others: tuple[tuple[str, Any], ...] = ()
-) -> Any:
-  """Returns the struct of many worlds that stands for one of the plugin's.
-
-  Args:
-    kind: the struct of one world
-    rows: its arrays that lack an axis of worlds and get one
-    others: fields that are of another type, and that type
-  """
+def for_worlds(kind: Any) -> Any:
+  """Returns the struct of many worlds that stands for one of the plugin's."""
   if kind.key in _KNOWN:
     return _KNOWN[kind.key]
   fields: dict[str, Any] = {}
@@ -150,12 +140,11 @@ def for_worlds(
     dims = DIMS[kind.key].get(name)
     if dims is None:
       fields[name] = for_worlds(var.type) if isinstance(var.type, type(kind)) else var.type
-    elif dims == numbers.dims:
-      fields[name] = floats("nworld", *dims)
     else:
-      fields[name] = Array(var.type.dtype, ("nworld", *dims) if name in rows else dims)
-  own = {"__annotations__": fields | dict(others), "__module__": __name__}
-  return struct(type(f"{kind.key}InWorlds", (), own))
+      own = dims == numbers.dims
+      fields[name] = floats("nworld", *dims) if own else Array(var.type.dtype, dims)
+  known = {"__annotations__": fields, "__module__": __name__}
+  return struct(type(f"{kind.key}InWorlds", (), known))
 
 
 class Host(abc.ABC):
@@ -210,6 +199,14 @@ class Host(abc.ABC):
   @abc.abstractmethod
   def mesh(self, world: int) -> Mesh:
     """Returns the mesh that a world has now."""
+
+  @abc.abstractmethod
+  def surface(self) -> dict[str, Any]:
+    """Returns fields with the meshes: `mesh`, `elem`, `tet`, `flat`, and what numbers are of."""
+
+  @abc.abstractmethod
+  def tools(self, name: str) -> np.ndarray:
+    """Returns `ctrl`, `geom_xpos` or `geom_xmat` as they are now, a row a world."""
 
   @abc.abstractmethod
   def load(self, kernel: Twin):

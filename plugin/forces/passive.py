@@ -10,10 +10,45 @@ from collections.abc import Iterator
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
+from palpate.tissue.cutting.facets import Path
+from palpate.tissue.cutting.path import Finder
+from palpate.tissue.cutting.topology import Report
+from palpate.tissue.geometry.mesh import Mesh
 
 from .host import Host, Twin
 
 Springs = tuple[np.ndarray, np.ndarray, np.ndarray]  # vertices, stiffness [N/m], stretch [m]
+
+
+class Opening:
+  """An organ whose meshes forces let come apart, in one world or in many.
+
+  Attributes:
+    finder: of places on its surface
+  """
+
+  finder: Finder
+
+  def begin(self, worlds: list[int]):
+    """Prepares worlds, which `disp` and `cut` are asked of."""
+
+  def mesh(self, world: int) -> Mesh:
+    """Returns the mesh of a world as it is now."""
+    raise NotImplementedError
+
+  def disp(self, world: int) -> np.ndarray:
+    """Returns the displacements of its vertices in the organ's frame [m], (nvert, 3)."""
+    raise NotImplementedError
+
+  def cut(self, world: int, path: Path) -> Report:
+    """Cuts a world along a path; ValueError where that cannot be."""
+    raise NotImplementedError
+
+  def burn(self, current: Any):
+    """Lets the bonds of one world feel a current; in a batch they do so in each step."""
+
+  def finish(self):
+    """Ends what `begin` has begun."""
 
 
 class Force:
@@ -72,6 +107,10 @@ class Force:
   def end(self):
     """Keeps what the step has made of it."""
     self._launch(self.END)
+
+  def open(self, opening: Opening, steps: int = 1) -> bool:
+    """Lets meshes come apart where they have to, `steps` after the last time; returns whether."""
+    return False
 
   def _launch(self, kernel: Twin | None):
     if self and kernel is not None:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from .attachments import Attachments
 from .cohesive_bonds import Bonds
+from .cutters import Cutters
 from .passive import Force
 from .relaxation import Relaxation
 from .supports import Supports
+from .tears import Tears
 
 # In the order in which they act. What a host cannot do it refuses by the keys of the kind.
 FORCES: dict[str, type[Force]] = {
@@ -14,4 +16,6 @@ FORCES: dict[str, type[Force]] = {
   "bonds": Bonds,
   "supports": Supports,
   "relaxation": Relaxation,
+  "tears": Tears,
+  "cutters": Cutters,
 }

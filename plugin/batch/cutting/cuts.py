@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 from palpate.engine.cutting.cuts import topology_of
+from palpate.forces import passive
 from palpate.tissue import step
 from palpate.tissue.cutting import facets, topology
 from palpate.tissue.cutting.cut import Cut
@@ -57,7 +58,7 @@ class Motion:
   force: np.ndarray
 
 
-class Cuts:
+class Cuts(passive.Opening):
   """The meshes of an organ's worlds.
 
   Args:
@@ -83,6 +84,7 @@ class Cuts:
     self._facets.aim(self._meshes.arrays | starts, node, body.shape.nnode)
     number = body.tissue.number.numpy()[:, _INSIDE : _INSIDE + 2]
     self._worlds: dict[int, World] = {}
+    self._row: dict[int, int] = {}  # of `_motion`, between `begin` and `finish`
     self._changed: dict[int, list[np.ndarray]] = {}  # vertices and elements, see `finish`
     self._whole_count = topology.count(self.whole)
     self._intact = fill(kernels.Whole, body.device, {
@@ -105,18 +107,13 @@ class Cuts:
     self._meshes.heal(world)
 
   def mesh(self, world: int) -> Mesh:
-    """Returns the mesh of a world."""
-    self.follow()
-    return self.mesh_of(world)
-
-  def mesh_of(self, world: int) -> Mesh:
-    """Returns the mesh of a world, as it was when `follow` was called."""
+    """See `Opening`; as it was when `follow` was called."""
     return self._of(world).mesh
 
-  def is_full(self, world: int) -> bool:
-    """Returns whether a world has no spare vertex left, as `mesh_of` has it."""
-    mesh = self.mesh_of(world)
-    return mesh.nouter == mesh.nskin
+  def mesh_now(self, world: int) -> Mesh:
+    """Returns the mesh of a world."""
+    self.follow()
+    return self.mesh(world)
 
   def mass(self, world: int) -> np.ndarray:
     """Returns the masses of its vertices, as compiled [kg], (nvert,)."""
@@ -132,7 +129,7 @@ class Cuts:
     """Returns the parts of a world's organ that hang together, the heaviest first."""
     scale = float(self._organ.patch.mass_scale.numpy()[world])
     mass = scale * self.mass(world)
-    return topology.pieces(self.mesh(world), mass, self._organ.config.thickness)
+    return topology.pieces(self.mesh_now(world), mass, self._organ.config.thickness)
 
   def counts(self) -> wp.array:
     """Returns how many pieces there are, (nworld,)."""
@@ -164,37 +161,49 @@ class Cuts:
 
   # Cutting.
 
-  def find(self, world: int, path: Path, motion: Motion, k: int) -> Cut:
-    """Returns what a path makes of a world, the k-th of a motion."""
-    organ = self._organ
-    had, moving = self._of(world), (motion.disp[k], motion.vel[k])
+  def begin(self, worlds: list[int]):
+    """See `Opening`."""
+    self.follow()
+    self._motion, self._row = self.motion(worlds), {world: k for k, world in enumerate(worlds)}
+
+  def disp(self, world: int) -> np.ndarray:
+    """See `Opening`."""
+    return self._motion.disp[self._row[world]]
+
+  def cut(self, world: int, path: Path) -> Report:
+    """See `Opening`."""
+    return self._apply(world, self._find(world, path))
+
+  def _find(self, world: int, path: Path) -> Cut:
+    """Returns what a path makes of a world."""
+    organ, k = self._organ, self._row[world]
+    had, moving = self._of(world), (self._motion.disp[k], self._motion.vel[k])
     found = self._topology.find(had, *moving, path, organ.config, organ.forces.springs(world))
     kept = (getattr(found.motion, name).copy() for name in ("mass", "disp", "vel"))
     return dataclasses.replace(found, motion=Carried(*kept))
 
-  def cut(self, points: dict[int, np.ndarray], depth, direction) -> list[Report | None]:
+  def cut_each(self, points: dict[int, np.ndarray], depth, direction) -> list[Report | None]:
     """Cuts worlds along points in the world's axes, (n, 3) [m] each; see `Tissue.cut`."""
-    self.follow()
-    organ, worlds = self._organ, sorted(points)
-    motion, found = self.motion(worlds), []
-    for k, world in enumerate(worlds):
+    found: dict[int, Cut] = {}
+    out: list[Report | None] = [None] * self._organ.body.nworld
+    self.begin(sorted(points))
+    for world in self._row:
       try:
         path = self._topology.path(points[world], 0.0, depth, direction)
-        found.append(self.find(world, path, motion, k))
+        found[world] = self._find(world, path)
       except ValueError as error:
         raise ValueError(f"world {world}: {error}") from None
-    out: list[Report | None] = [None] * organ.body.nworld
-    for k, world in enumerate(worlds):
-      out[world] = self.apply(world, found[k], motion, k)
-    self.finish(worlds, motion)
+    for world, cut in found.items():
+      out[world] = self._apply(world, cut)
+    self.finish()
     return out
 
-  def apply(self, world: int, cut: Cut, motion: Motion, k: int) -> Report:
-    """Makes a world the mesh that was found, the k-th of a motion; `finish` is to come."""
+  def _apply(self, world: int, cut: Cut) -> Report:
+    """Makes a world the mesh that was found; `finish` is to come."""
     organ, had = self._organ, self._of(world)
     report = self._topology.report(had, cut, organ.config.thickness)
     if cut.changed.size:
-      _carry(motion, k, cut, organ.declared.free)
+      _carry(self._motion, self._row[world], cut, organ.declared.free)
       organ.forces.carry(world, cut.group, cut.member, cut.share)
       # Vertices that come apart inside do not make two pieces of one.
       same = cut.mesh.loose is had.mesh.loose
@@ -204,15 +213,14 @@ class Cuts:
       now.reports.append(report)
     return report
 
-  def finish(self, worlds: list[int], motion: Motion):
-    """Brings the worlds that `apply` has changed to the device; `motion` is of `worlds`."""
-    organ = self._organ
-    which = [k for k, world in enumerate(worlds) if world in self._changed]
-    if which:
-      own = [worlds[k] for k in which]
+  def finish(self):
+    """See `Opening`: brings the worlds that have changed to the device."""
+    organ, own = self._organ, [world for world in self._row if world in self._changed]
+    if own:
+      which = [self._row[world] for world in own]
       self._upload(own)
       names = [field.name for field in dataclasses.fields(Motion)]
-      self.put_motion(own, Motion(*(getattr(motion, name)[which] for name in names)))
+      self.put_motion(own, Motion(*(getattr(self._motion, name)[which] for name in names)))
       host.follow(organ.batch, own)
 
   def _of(self, world: int) -> World:

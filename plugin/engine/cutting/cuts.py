@@ -18,15 +18,17 @@ from palpate.tissue import body as bodies
 from palpate.tissue.cutting import stamps
 from palpate.tissue.cutting.cut import Cut
 from palpate.tissue.cutting.facets import Path, World
+from palpate.tissue.cutting.path import Finder
 from palpate.tissue.cutting.refill import Refill
 from palpate.tissue.cutting.topology import BLOCKS, Report, Topology
 from palpate.tissue.geometry import mesh as topology
 from palpate.tissue.geometry.mesh import Mesh
 
+from ...forces import passive
 from .. import coupling
 from ..model import flexes, mjstruct
 from ..windows import model_lock
-from .tear import Tear
+from .trails import Current
 from .walls import Walls
 
 if TYPE_CHECKING:
@@ -67,7 +69,7 @@ class Cuts:
     bodies.occupy(body, self.whole)
     self.topology = topology_of(organ)
     self.world, self.finder = self.topology.first, self.topology.facets.finder
-    self._refill, self._tear = Refill(body, self.topology.facets), Tear()
+    self._refill = Refill(body, self.topology.facets)
     self._walls = Walls(organ, model)
     self._own: dict[str, np.ndarray] = {}
     self._total: int | None = None  # that the stamp is made of, None for not known
@@ -201,12 +203,6 @@ class Cuts:
     self.reports.append(done)
     return done, touched
 
-  def most_stretched(self, disp: np.ndarray, most: float) -> np.ndarray | None:
-    """Returns the path in the organ's frame on which it tears, None where it holds."""
-    if self.mesh.nouter == self.mesh.nskin:  # there is no room for it
-      return None
-    return self._tear.line(self.mesh, self.mesh.rest + disp, most, self.finder)
-
 
 def topology_of(organ: Declaration) -> Topology:
   """Returns what may become of an organ's mesh by cuts."""
@@ -262,19 +258,33 @@ def cut(w: Workspace, points: npt.ArrayLike, given=0.0, depth=None, direction=No
   return _take(w, find(w, points, given, depth, direction))
 
 
-def cut_path(w: Workspace, path: Path) -> Report:
-  """Cuts a workspace's organ along a path in its frame."""
-  return _take(w, _find(w, path))
+class Opening(passive.Opening):
+  """The organ of a workspace, whose mesh forces let come apart."""
 
+  def __init__(self, w: Workspace):
+    self._w = w
+    follow(w)
 
-def tear(w: Workspace) -> bool:
-  """Cuts an organ at its most stretched triangle, if that is too far; returns whether."""
-  follow(w)
-  organ, line = w.organ, w.cuts.most_stretched(w.motion()[0], w.config.tear)
-  try:
-    return line is not None and cut(w, organ.origin + line @ organ.frame.T).nodes > 0
-  except ValueError:  # pinned tissue around it
-    return False
+  @property
+  def finder(self) -> Finder:
+    """See `Opening`."""
+    return self._w.cuts.finder
+
+  def mesh(self, world: int) -> Mesh:
+    """See `Opening`."""
+    return self._w.organ.mesh
+
+  def disp(self, world: int) -> np.ndarray:
+    """See `Opening`."""
+    return self._w.motion()[0]
+
+  def cut(self, world: int, path: Path) -> Report:
+    """See `Opening`."""
+    return _take(self._w, _find(self._w, path))
+
+  def burn(self, current: Current):
+    """See `Opening`."""
+    self._w.bonds.burn(current.burning)
 
 
 def _take(w: Workspace, found: Cut) -> Report:

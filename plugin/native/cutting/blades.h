@@ -305,7 +305,7 @@ PALPATE int due_of(const Fields& f, const double* s) {
 }
 
 // Adds the blades' forces to the solver's input, and finds what state they will be in. What is due is
-// kept until it is done where `keeps` says so.
+// kept until it is done where `keeps` says so, as long as there is a path.
 template <class Fields>
 PALPATE void enter_blades(const Fields& given, Thread t, int keeps) {
   const Fields f = of_world(given, t.world);
@@ -326,7 +326,7 @@ PALPATE void enter_blades(const Fields& given, Thread t, int keeps) {
     }
     if (t.tid > 0) continue;
     for (int c = 0; c < BLADE_LENGTH; ++c) f.next.data[BLADE_LENGTH * i + c] = s[c];
-    if (!keeps || due > f.due.data[i]) f.due.data[i] = due;
+    if (!keeps || due > f.due.data[i] || !(s[BLADE_COUNT] > 0.0)) f.due.data[i] = due;
   }
 }
 
