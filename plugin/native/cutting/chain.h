@@ -16,7 +16,7 @@ PALPATE void find_band(const S& m, const Path& path, const Run& run, Band& band)
   Few& v = band.vert;
   v.clear();
   for (int i = run.first; i < run.last; ++i)
-    for (int c = 0; c < 3; ++c) v.put((int)m.elem[3 * path.spot[i].elem + c]);
+    for (int c = 0; c < 3; ++c) v.put((int)m.elem[3 * path.elem[i] + c]);
   for (int i = 0, n = v.count; i < n; ++i)
     for (int k = 0; k < m.degree[v.list[i]]; ++k) v.put(m.neighbour(v.list[i], k));
   v.sort(m.nvert);

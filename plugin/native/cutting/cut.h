@@ -182,21 +182,13 @@ template <class Fields>
 PALPATE void find_nearest(const Fields& f, Thread t, int) {
   if (t.tid) return;
   using I = decltype(f.elem.data[0] + 0);
-  const auto put = [&](int i, Spot s, D3 normal) {
+  const Triangles<I> all = {f.elem.data, f.x.data, f.rest.data, nullptr, f.nelem};
+  nearest_spots(all, f.point.data, f.npoint, f.edge, f.box.data, [&](int i, Spot s, const Triangles<I>& near) {
     double* out = f.spot.data + 8 * i;
     out[0] = s.elem, out[4] = s.far;
     store(out + 1, s.weight);
-    store(out + 5, normal);
-  };
-  if (f.solid) {
-    const Skin<I> skin = {f.nelem, f.elem.data, f.x.data, f.rest.data};
-    nearest_of_skin(skin, f.point.data, f.npoint, f.edge, f.box.data, put);
-    return;
-  }
-  const Surface<I> m = {f.nvert, 0, f.most, nullptr, f.elem.data, nullptr, nullptr, f.spoke.data,
-                        f.degree.data, nullptr, nullptr};
-  nearest_spots(m, f.x.data, f.nouter, f.point.data, f.npoint, f.edge, f.box.data,
-                [&](int i, Spot s) { put(i, s, {0.0, 0.0, 0.0}); });
+    if (f.normals) store(out + 5, near.normal(s));
+  });
 }
 
 template <class Fields>
@@ -204,19 +196,12 @@ PALPATE void cut_surface(const Fields& f, Thread t, int) {
   if (t.tid) return;
   const auto m = surface_of(f.surface);
   Scratch memory = {f.ints.data, f.reals.data, f.nint, f.nreal, false};
-  double* x = memory.values(3 * m.nvert);
-  if (memory.full) return;
-  const Moving moving = {f.mass.data, f.disp.data, f.vel.data};
-  for (int i = 0; i < 3 * m.nvert; ++i) x[i] = f.at_rest ? m.rest[i] : m.rest[i] + moving.disp[i];
   const Material p = {f.kind, f.held, f.thickness, f.stiffness, f.given, f.lame.data, f.shear.data,
                       f.whole.data, f.pull.data, f.hard.data};
-  Path path = {};
-  path.edge = f.edge;
-  int* found = f.found.data;
-  int status = trace(m, x, found[FOUND_NOUTER], f.point.data, f.npoint.data[0], memory, path,
-                     f.size.data + SIZE_BAD);
-  if (status == DONE) status = cut_along(f, m, p, path, moving, memory);
-  found[FOUND_STATUS] = status;
+  Path path = {f.edge, f.path.data, f.spot.data, f.npath, nullptr, 0};
+  const bool found = find_runs(m, path, memory);
+  const Moving moving = {f.mass.data, f.disp.data, f.vel.data};
+  f.found.data[FOUND_STATUS] = found ? cut_along(f, m, p, path, moving, memory) : NO_ROOM;
 }
 
 }  // namespace palpate

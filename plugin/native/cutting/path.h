@@ -4,37 +4,24 @@
 
 namespace palpate {
 
-// In edges of the mesh: between samples; from the surface from which a point is off it; from an older
-// cut within which a path goes along it; between samples that are on both sides of a gap.
-constexpr double SAMPLE = 0.25, OFF = 2.0, ALONG = 0.2, JUMP = 2.0;
+// In edges of the mesh: between samples (as in `path.py`); from an older cut within which a path goes along it;
+// between samples that are on both sides of a gap.
+constexpr double SAMPLE = 0.25, ALONG = 0.2, JUMP = 2.0;
 
 // Why nothing was cut.
-enum { DONE, NO_ROOM, OFF_SURFACE, TOO_SHORT, PINNED };
+enum { DONE, NO_ROOM, TOO_SHORT, PINNED };
 
 // Samples first .. last - 1 of a path; `open` where they lie along an older cut: nothing to cut there.
 struct Run { int first, last, open; };
 
 struct Path {
   double edge;  // mean length of the edges
-  double* at;  // samples at rest
-  Spot* spot;  // where they are
+  const double* at;  // samples at rest
+  const int* elem;  // triangles that they are in
   int count;
   Run* run;
   int nrun;
 };
-
-// The samples of the edge between two points.
-PALPATE int samples_between(D3 a, D3 b, double edge) {
-  const double n = ceil(norm(b - a) / (SAMPLE * edge));
-  return n > 1.0 ? (int)n : 1;
-}
-
-PALPATE int samples_of(const double* point, int npoint, double edge) {
-  int n = 1;
-  for (int i = 0; i + 1 < npoint; ++i)
-    n += samples_between(load(point + 3 * i), load(point + 3 * i + 3), edge);
-  return n;
-}
 
 // Whether a place in a triangle lies along one of its edges that came apart before.
 template <class S>
@@ -65,7 +52,7 @@ PALPATE bool came_apart(const S& m, int a, int b) {
 template <class S>
 PALPATE void find_open(const S& m, const Path& path, int* open) {
   for (int i = 0; i < path.count; ++i)
-    open[i] = along_cut(m, path.spot[i].elem, load(path.at + 3 * i), path.edge);
+    open[i] = along_cut(m, path.elem[i], load(path.at + 3 * i), path.edge);
   for (int first = 0, last; first < path.count; first = last) {
     for (last = first; last < path.count && open[last] == open[first]; ++last) {}
     if ((last - first) * SAMPLE < 1.0)
@@ -73,48 +60,22 @@ PALPATE void find_open(const S& m, const Path& path, int* open) {
   }
 }
 
-// Puts the path through points on the surface; returns how it went, and what it is about in `bad`.
-// `x` has where the vertices are.
+// Finds the parts of a path: where it crosses an older cut, or leaps, it begins anew.
 template <class S>
-PALPATE int trace(const S& m, const double* x, int nouter, const double* point, int npoint,
-                  Scratch& memory, Path& path, double* bad) {
-  const double edge = path.edge;
-  const int n = path.count = samples_of(point, npoint, edge);
-  double* sample = memory.values(3 * n);
-  int *given = memory.numbers(n), *open = memory.numbers(n), *box = memory.numbers(m.nvert);
-  path.at = memory.values(3 * n);
-  path.spot = (Spot*)memory.values(n * (int)(sizeof(Spot) / sizeof(double)));
+PALPATE bool find_runs(const S& m, Path& path, Scratch& memory) {
+  const int n = path.count;
+  int* open = memory.numbers(n);
   path.run = (Run*)memory.numbers(3 * n);
-  if (memory.full) return NO_ROOM;
-  int k = 0;
-  for (int i = 0; i + 1 < npoint; ++i) {
-    const D3 a = load(point + 3 * i), b = load(point + 3 * i + 3);
-    const int steps = samples_between(a, b, edge);
-    given[k] = i + 1;
-    for (int j = 0; j < steps; ++j) store(sample + 3 * k++, a + ((double)j / steps) * (b - a));
-  }
-  given[k] = npoint;
-  store(sample + 3 * k, load(point + 3 * (npoint - 1)));
-  nearest_spots(m, x, nouter, sample, n, edge, box, [&](int i, Spot s) { path.spot[i] = s; });
-  for (int i = 0; i < n; ++i) {
-    if (given[i] && path.spot[i].far > OFF * edge) {
-      bad[0] = given[i] - 1, bad[1] = path.spot[i].far;
-      return OFF_SURFACE;
-    }
-    D3 corner[3];
-    m.corners(path.spot[i].elem, corner);
-    store(path.at + 3 * i, blend(corner, path.spot[i].weight));
-  }
+  if (memory.full) return false;
   find_open(m, path, open);
-  // Where the path crosses an older cut, or leaps, it begins anew.
   for (int first = 0, i = 1; i <= n; ++i) {
-    const bool ends = i == n || norm(load(path.at + 3 * i) - load(path.at + 3 * i - 3)) > JUMP * edge ||
-      (came_apart(m, path.spot[i - 1].elem, path.spot[i].elem) && !open[i]) || open[i] != open[i - 1];
+    const bool ends = i == n || norm(load(path.at + 3 * i) - load(path.at + 3 * i - 3)) > JUMP * path.edge ||
+      (came_apart(m, path.elem[i - 1], path.elem[i]) && !open[i]) || open[i] != open[i - 1];
     if (!ends) continue;
     if (i - first > 1) path.run[path.nrun++] = {first, i, open[first]};
     first = i;
   }
-  return DONE;
+  return true;
 }
 
 // The place of a polyline of dense samples that is nearest to a point, beside its nearest sample.

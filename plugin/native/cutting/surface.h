@@ -225,28 +225,8 @@ PALPATE Spot nearest_around(const S& m, const double* x, D3 point, const int* ve
   return out;
 }
 
-constexpr double BOX = 3.0;  // edges from points within which they are found sooner
-constexpr int MIDDLES = 12;  // triangles around a point of a solid's skin among which the nearest is
+constexpr double BOX = 3.0;  // edges from points within which they are looked for first
 constexpr double TIE = 1e-9;  // edges by which a triangle must be nearer than one with a nearer middle
-constexpr int NEAR = 6;  // vertices nearest to a point around which its triangle is looked for
-
-// Finds those of a few vertices, all `n` where `among` is null, that are nearest to a point; returns
-// how many there are and the square of how far the last one is.
-PALPATE int nearest_vertices(const double* x, D3 p, const int* among, int n, int* near, double& last) {
-  double far[NEAR];
-  int count = 0;
-  for (int i = 0; i < n; ++i) {
-    const int v = among ? among[i] : i;
-    const D3 arm = load(x + 3 * v) - p;
-    const double d = dot(arm, arm);
-    if (count == NEAR && d >= far[NEAR - 1]) continue;
-    int k = count < NEAR ? count++ : NEAR - 1;
-    for (; k > 0 && far[k - 1] > d; --k) far[k] = far[k - 1], near[k] = near[k - 1];
-    far[k] = d, near[k] = v;
-  }
-  last = count ? far[count - 1] : 0.0;
-  return count;
-}
 
 // The box around points, and some room.
 struct Box {
@@ -266,88 +246,80 @@ struct Box {
   }
 };
 
-// Finds the spots of a surface that are nearest to points, which `put` gets: looked for in a box around
-// all points first, whose vertices `inside` gets.
-template <class S, class Put>
-PALPATE void nearest_spots(const S& m, const double* x, int nouter, const double* point, int n,
-                           double edge, int* inside, Put put) {
-  const double room = BOX * edge;
-  const Box box(point, n, room);
-  int count = 0;
-  for (int v = 0; v < nouter; ++v)
-    if (box.has(load(x + 3 * v))) inside[count++] = v;
-  const int want = NEAR < nouter ? NEAR : nouter;
-  for (int i = 0; i < n; ++i) {
-    int near[NEAR];
-    double last;
-    int found = nearest_vertices(x, load(point + 3 * i), inside, count, near, last);
-    if (found < want || last > room * room)
-      found = nearest_vertices(x, load(point + 3 * i), nullptr, nouter, near, last);
-    INLINED put(i, nearest_around(m, x, load(point + 3 * i), near, found));
-  }
-}
-
-// The triangles of a solid's skin.
+// Triangles of a surface, all or those of a list.
 template <class I>
-struct Skin {
-  int nelem;
+struct Triangles {
   const I* elem;
   const double *x, *rest;  // where vertices are, now and at rest
+  const int* among;
+  int count;
 
+  PALPATE int of(int j) const { return among ? among[j] : j; }
   PALPATE D3 corner(int t, int c) const { return load(x + 3 * elem[3 * t + c]); }
   PALPATE D3 middle(int t) const { return (1.0 / 3.0) * (corner(t, 0) + corner(t, 1) + corner(t, 2)); }
   PALPATE D3 area_vector(int t) const {
     const D3 a = load(rest + 3 * elem[3 * t]), b = load(rest + 3 * elem[3 * t + 1]);
     return 0.5 * cross(b - a, load(rest + 3 * elem[3 * t + 2]) - a);
   }
-  // The nearest spot among the triangles of a list, all `n` where it is null, whose middles are nearest.
-  PALPATE Spot nearest(D3 p, double edge, const int* among, int n) const {
-    double far[MIDDLES];
-    int near[MIDDLES], found = 0;
-    for (int j = 0; j < n; ++j) {
-      const int t = among ? among[j] : j;
-      const D3 arm = middle(t) - p;
-      const double d = dot(arm, arm);
-      if (found == MIDDLES && d >= far[MIDDLES - 1]) continue;
-      int k = found < MIDDLES ? found++ : MIDDLES - 1;
-      for (; k > 0 && far[k - 1] > d; --k) far[k] = far[k - 1], near[k] = near[k - 1];
-      far[k] = d, near[k] = t;
-    }
+  // How far a corner is from the middle of its triangle, at most.
+  PALPATE double reach() const {
+    double most = 0.0;
+    for (int j = 0; j < count; ++j)
+      for (int c = 0; c < 3; ++c) {
+        const D3 arm = corner(of(j), c) - middle(of(j));
+        most = dot(arm, arm) > most ? dot(arm, arm) : most;
+      }
+    return sqrt(most);
+  }
+  // The spot that is nearest to a point; on an edge, that of the triangle whose middle is nearer.
+  PALPATE Spot nearest(D3 p, double tie, double reach) const {
     Spot out = {0, {1.0, 0.0, 0.0}, 1e300};
-    for (int k = 0; k < found; ++k) {
+    double least = 1e300;
+    for (int j = 0; j < count; ++j) {
+      const int t = of(j);
+      const D3 arm = middle(t) - p;
+      const double far2 = dot(arm, arm), bound = out.far + tie + reach;
+      if (far2 > bound * bound) continue;
       D3 x[3];
-      for (int c = 0; c < 3; ++c) x[c] = corner(near[k], c);
+      for (int c = 0; c < 3; ++c) x[c] = corner(t, c);
       const D3 w = barycentric(p, x);
       const double off = norm(blend(x, w) - p);
-      if (off < out.far - TIE * edge) out = {near[k], w, off};  // on an edge that of the nearer middle
+      if (off < out.far - tie || (off < out.far + tie && far2 < least)) out = {t, w, off}, least = far2;
     }
     return out;
   }
-  // The unit normal at rest, even across edges, of those triangles.
-  PALPATE D3 normal(Spot spot, const int* among, int n) const {
+  // The unit normal at rest at a spot, even across edges.
+  PALPATE D3 normal(Spot spot) const {
     D3 sum[3] = {}, out = {0.0, 0.0, 0.0};
-    for (int j = 0; j < n; ++j) {
-      const int t = among ? among[j] : j;
+    for (int j = 0; j < count; ++j)
       for (int c = 0; c < 9; ++c)
-        if (elem[3 * t + c / 3] == elem[3 * spot.elem + c % 3]) sum[c % 3] += area_vector(t);
-    }
+        if (elem[3 * of(j) + c / 3] == elem[3 * spot.elem + c % 3]) sum[c % 3] += area_vector(of(j));
     const double weight[3] = {spot.weight.x, spot.weight.y, spot.weight.z};
     for (int c = 0; c < 3; ++c) out += (weight[c] / norm(sum[c])) * sum[c];
     return (1.0 / norm(out)) * out;
   }
 };
 
-// The same of the skin of a solid, whose normals `put` gets too.
+// Finds the spots that are nearest to points, which `put` gets with the triangles around: looked for in a box
+// around all points first, whose triangles `inside` gets.
 template <class I, class Put>
-PALPATE void nearest_of_skin(const Skin<I>& m, const double* point, int n, double edge, int* inside, Put put) {
+PALPATE void nearest_spots(const Triangles<I>& all, const double* point, int n, double edge, int* inside, Put put) {
   const Box box(point, n, BOX * edge);
-  int count = 0;
-  for (int t = 0; t < m.nelem; ++t)
-    if (box.has(m.middle(t))) inside[count++] = t;
-  if (count < MIDDLES) inside = nullptr, count = m.nelem;
+  Triangles<I> near = all;
+  near.among = inside, near.count = 0;
+  for (int t = 0; t < all.count; ++t)
+    if (box.has(all.middle(t))) inside[near.count++] = t;
+  const double reach = near.reach();
+  double most = 0.0;  // of all
   for (int i = 0; i < n; ++i) {
-    const Spot spot = m.nearest(load(point + 3 * i), edge, inside, count);
-    INLINED put(i, spot, m.normal(spot, inside, count));
+    const D3 p = load(point + 3 * i);
+    const Spot spot = near.nearest(p, TIE * edge, reach);
+    if (spot.far + reach < BOX * edge) {
+      put(i, spot, near);
+      continue;
+    }
+    most = most > 0.0 ? most : all.reach();
+    put(i, all.nearest(p, TIE * edge, most), all);
   }
 }
 

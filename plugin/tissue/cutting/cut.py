@@ -17,19 +17,17 @@ import warp as wp
 from .. import config as configuration
 from ..config import Config
 from ..geometry.mesh import Mesh, lengths
-from ..kernels import kernel
+from ..kernels import aim, kernel
 from ..types import CONSTANTS, allocate, doubles, flags, ints, longs, struct
-from .path import check_points
+from .path import Finder
 from .surface import Surface, WorkingCopy, host_views
 
-# Why nothing was cut, and what a path's samples are apart at most [edges], as in cutting/path.h.
-_DONE, _NO_ROOM, _OFF, _SHORT, _PINNED = range(5)
-_SAMPLE, _FAR = 0.25, 2.0
+_DONE, _NO_ROOM, _SHORT, _PINNED = range(4)  # why nothing was cut, as in cutting/path.h
 _KINDS = {"membrane": 1, "spring": 2}  # of energy, as in cutting/snap.h
 _FOUND = (
   "status", "moved", "near", "split", "changed", "edges", "nouter", "stopped", "apart",
 )  # fmt: skip
-_SIZE = ("bad", "far", "deviation")
+_SIZE = ("bad", "deviation")
 _NUMBERS = {
   f"{prefix}_{name.upper()}": k
   for prefix, names in (("FOUND", (*_FOUND, "length")), ("SIZE", (*_SIZE, "length")))
@@ -42,12 +40,11 @@ class Cutting:
   """What a cut of a surface reads and writes; the surface is another one then."""
 
   surface: Surface
-  most_points: int  # points of a path
+  npath: int  # samples of the path
   nint: int  # whole numbers of scratch
   nreal: int  # others
   kind: int  # of energy: 0 none, 1 membrane, 2 springs
   held: int  # whether springs hold vertices
-  at_rest: int  # whether points are where the surface is at rest
   edge: wp.float64  # mean length of the whole's edges [m]
   thickness: wp.float64  # [m]
   stiffness: wp.float64  # of an edge's spring [N/m]
@@ -62,8 +59,8 @@ class Cutting:
   whole: doubles("nvert")  # energy of springs at vertices [J]
   pull: doubles("nvert", 3)  # its gradient [N]
   hard: doubles("nvert")  # their stiffness [N/m]
-  npoint: ints(1)  # points of the path
-  point: doubles("most_points", 3)  # these, where the surface is now, or at rest [m]
+  path: doubles("npath", 3)  # its samples at rest [m]
+  spot: ints("npath")  # triangles that they are in
   found: ints(len(_FOUND))  # see _FOUND; nouter is read too
   size: doubles(len(_SIZE))  # see _SIZE
   near: ints("nvert")  # see `Cut`, these and what follows
@@ -153,12 +150,14 @@ class Knife:
 
   Args:
     copy: where they are
+    finder: of places on them
   """
 
-  def __init__(self, copy: WorkingCopy):
-    self._copy, self._whole = copy, copy.whole
+  def __init__(self, copy: WorkingCopy, finder: Finder):
+    self._copy, self._whole, self._finder = copy, copy.whole, finder
     self._config: Config | None = None
     self._how: tuple = ()
+    self._room = 0  # for samples of a path
     self._fields: Any = None
     self._host: dict[str, np.ndarray] = {}
     self._launch: Any = None
@@ -192,15 +191,17 @@ class Knife:
       ValueError: points are off the surface; the path goes through pinned vertices, or is too
         short.
     """
-    check_points(organ, points)
-    self._make_room(points)
+    position = mesh.rest if at_rest else mesh.rest + motion.disp
+    traced = self._finder.trace(organ, mesh, position, points)
+    self._make_room(len(traced.elem))
     self._copy.put(mesh)
     config = config if config and config.elements in _KINDS else None
-    self._put_material(config, held, given, at_rest)
-    host = self._host
+    self._put_material(config, held, given)
+    host, spot = self._host, traced.elem.astype(np.int32)
+    aim(self._fields, path=traced.rest, spot=spot)
+    self._fields.npath = len(spot)
     host["mass"][:], host["disp"][:], host["vel"][:] = motion.mass, motion.disp, motion.vel
     host["pinned"][:] = pinned
-    host["point"][: len(points)], host["npoint"][0] = points, len(points)
     host["found"][:] = 0
     host["found"][_FOUND.index("nouter")] = mesh.nouter
     self._launch()
@@ -208,31 +209,29 @@ class Knife:
     self._check(organ, found["status"])
     return self._answer(mesh, found)
 
-  def _make_room(self, points: np.ndarray):
-    """Makes the arrays, and makes them larger for a long path."""
-    whole, edge = self._whole, self._whole.edge_length
-    way = np.abs(points[1:] - points[:-1]).sum()  # no less than the path is long
-    n = 2 * len(points) + int(way / (_SAMPLE * edge))
-    if self._fields is not None and n <= self._fields.most_points:
+  def _make_room(self, n: int):
+    """Makes the arrays, and makes them larger for a path of more samples."""
+    whole = self._whole
+    if n <= self._room:
       return
     n, self._config, self._how = 2 * n, None, ()
-    sizes = self._copy.sizes | {"most_points": n}
+    self._room, sizes = n, self._copy.sizes | {"npath": 0}
     # What cutting/cut.h takes of scratch, see there.
     sizes["nint"] = 29 * whole.nvert + 18 * whole.nelem + 20 * n + 8 * sizes["most"] + 100
     sizes["nreal"] = 48 * whole.nvert + 6 * whole.nelem + 13 * n
     self._fields = fields = allocate(Cutting, "cpu", sizes)
-    fields.surface, fields.edge = self._copy.fields, edge
-    for name in ("most_points", "nint", "nreal"):
+    fields.surface, fields.edge = self._copy.fields, whole.edge_length
+    for name in ("nint", "nreal"):
       setattr(fields, name, sizes[name])
     self._host = host_views(fields, Cutting)
     self._host["home"][:] = whole.home
     self._launch = _cut.command(fields).launch
 
-  def _put_material(self, config: Config | None, held: Springs | None, given: float, at_rest: bool):
+  def _put_material(self, config: Config | None, held: Springs | None, given: float):
     fields, host = self._fields, self._host
-    how = _KINDS[config.elements] if config else 0, int(held is not None), given, int(at_rest)
+    how = _KINDS[config.elements] if config else 0, int(held is not None), given
     if how != self._how:
-      fields.kind, fields.held, fields.given, fields.at_rest = self._how = how
+      fields.kind, fields.held, fields.given = self._how = how
     if config and config is not self._config and config != self._config:
       fields.thickness, fields.stiffness = config.thickness, config.stiffness
       host["lame"][:], host["shear"][:] = configuration.lame(config, self._whole.nelem)
@@ -247,13 +246,6 @@ class Knife:
     Raises:
       ValueError: nothing was.
     """
-    bad, far = self._host["size"][:2]
-    edge = self._whole.edge_length
-    if status == _OFF:
-      raise ValueError(
-        f"organ {organ!r}: point {int(bad)} of the path is {far:.3g} m from the surface, expected "
-        f"at most {_FAR * edge:.3g} m"
-      )
     if status == _SHORT:
       raise ValueError(
         f"organ {organ!r}: the path is shorter than two edges of the mesh there, expected a longer "
@@ -261,8 +253,8 @@ class Knife:
       )
     if status == _PINNED:
       raise ValueError(
-        f"organ {organ!r}: the path goes through vertex {int(bad)}, which is pinned, expected "
-        "tissue that moves"
+        f"organ {organ!r}: the path goes through vertex {int(self._host['size'][0])}, which is "
+        "pinned, expected tissue that moves"
       )
     if status == _NO_ROOM:
       self._copy.forget()

@@ -7,10 +7,8 @@ import dataclasses
 import numpy as np
 
 from ..geometry.mesh import Mesh, area_vectors, lengths
-from .path import Finder, check_points
+from .path import SAMPLE, Finder, check_points
 
-_STEP = 0.25  # between samples of the path, and between lines, in edges
-_OFF = 2.0  # edges from the skin from which a point is off it
 _LEVEL = 0.25  # least cosine of the normals of a path's triangles to their mean for one direction
 _AROUND = 0.5  # length of the mean of the normals up to which a path goes around the organ
 _SMOOTH = 2.0  # edges along the path over which directions are averaged otherwise
@@ -62,25 +60,12 @@ def sweep(
   """
   edge = mesh.whole.edge_length
   reach = _check(organ, points, depth)
-  gap = lengths(points[1:] - points[:-1])
-  steps = np.maximum(np.ceil(gap / (_STEP * edge)).astype(int), 1)
-  given = np.append(0, np.cumsum(steps))
-  at = np.interp(np.arange(given[-1] + 1), given, np.arange(len(points)))
-  k = np.minimum(at.astype(int), len(points) - 2)
-  sample = points[k] + (at - k)[:, None] * (points[k + 1] - points[k])
+  at, path, elem, inward = finder.trace(organ, mesh, position, points, normals=True)
   reach = np.interp(at, np.arange(len(points)), reach)
-  elem, weight, far, inward = finder.inward(mesh, position, sample)
-  off = np.flatnonzero(far[given] > _OFF * edge)
-  if off.size:
-    raise ValueError(
-      f"organ {organ!r}: point {off[0]} of the path is {far[given[off[0]]]:.3g} m from the "
-      f"surface, expected at most {_OFF * edge:.3g} m"
-    )
-  path = np.einsum("nk,nkj->nj", weight, mesh.rest[mesh.elem[elem]])
   new = np.flatnonzero(lengths(path[1:] - path[:-1]) > 2 * edge) + 1  # it leaps
   part = max(np.split(np.arange(len(path)), new), key=len)
   path, elem, reach = path[part], elem[part], reach[part]
-  if len(path) < 2 or lengths(path[1:] - path[:-1]).sum() < _STEP * edge:
+  if len(path) < 2 or lengths(path[1:] - path[:-1]).sum() < SAMPLE * edge:
     raise ValueError(f"organ {organ!r}: the path is shorter than an edge of the mesh")
   inward = inward[part]
   if direction is not None:
@@ -153,14 +138,14 @@ def _lines(path, way, depth, inward, edge: float) -> Sheet:
   mid = 0.5 * (way[1:] + way[:-1])
   step = step - (step * mid).sum(1, keepdims=True) * mid / (mid * mid).sum(1, keepdims=True)
   arc = np.append(0.0, np.cumsum(lengths(step)))
-  count = max(2, round(arc[-1] / (_STEP * edge)) + 1)
+  count = max(2, round(arc[-1] / (SAMPLE * edge)) + 1)
   goal = np.linspace(0, arc[-1], count)
 
   def spread(values):
     return np.stack([np.interp(goal, arc, column) for column in values.T], axis=1)
 
   begin, end = spread(path), spread(path + depth[:, None] * way)
-  closes = np.linalg.norm(path[-1] - path[0]) < _STEP * edge and arc[-1] > 3 * edge
+  closes = np.linalg.norm(path[-1] - path[0]) < SAMPLE * edge and arc[-1] > 3 * edge
   if closes:
     begin[-1], end[-1] = begin[0], end[0]
   falls = [(inward[k] * way[k]).sum() < _FALLS for k in (0, -1)]

@@ -76,13 +76,13 @@ class Edges:
 
   def __init__(self, whole: Mesh, room: int):
     self.whole, self._room, self._copy = whole, room, WorkingCopy(whole)
-    self.finder = Finder(self._copy)
+    self.finder = Finder(whole)
     self._knife = self._make_knife()
     self._rows: Any = None
     self._config: Config | None = None
 
   def _make_knife(self) -> Any:
-    return Knife(self._copy)
+    return Knife(self._copy, self.finder)
 
   def cut(
     self, organ: str, had: World, motion: Motion, path: Path, pinned, config, held: Springs | None

@@ -1,7 +1,9 @@
-"""Places of a surface that are nearest to points, and how far points are from a path."""
+"""Places of a surface that are nearest to points, and paths on it."""
 
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
+from typing import NamedTuple
+
 import numpy as np
 import numpy.typing as npt
 import warp as wp
@@ -9,28 +11,25 @@ import warp as wp
 from ..geometry.mesh import Mesh, lengths
 from ..kernels import aim, kernel
 from ..types import CONSTANTS, doubles, ints, longs, struct
-from .surface import WorkingCopy
+
+SAMPLE = 0.25  # edges of the mesh between samples of a path, as in cutting/path.h
+_OFF = 2.0  # edges from the surface from which a point is off it
 
 
 @struct
 class Nearest:
   """A surface, and what is asked of it; see `nearest`."""
 
-  nvert: int
   nelem: int
-  solid: int  # whether it is the skin of a solid, whose rings are others
-  most: int  # neighbours that a vertex has room for
-  nouter: int
+  normals: int  # whether normals are asked for
   npoint: int
   edge: wp.float64  # mean length of its edges [m]
   elem: longs("nelem", 3)
-  spoke: longs("nvert", "most")  # `Mesh.ring_elem`
-  degree: longs("nvert")
   x: doubles("nvert", 3)  # where the vertices are [m]
+  rest: doubles("nvert", 3)  # where they are at rest [m]
   point: doubles("npoint", 3)
-  box: ints("nvert + nelem")  # scratch
-  rest: doubles("nvert", 3)  # of a solid [m]
-  spot: doubles("npoint", 8)  # triangle, weights of its corners, distance [m], a solid's normal
+  box: ints("nelem")  # scratch
+  spot: doubles("npoint", 8)  # triangle, weights of its corners, distance [m], normal at rest
 
 
 _nearest = kernel("find_nearest", "cutting/cut.h", Nearest, CONSTANTS)
@@ -40,29 +39,33 @@ class Finder:
   """Finds the points of surfaces of one whole that are nearest to points, one after the other.
 
   Args:
-    copy: where the surfaces are
+    whole: the mesh before the first cut
   """
 
-  def __init__(self, copy: WorkingCopy):
-    self._copy, whole, there = copy, copy.whole, copy.fields
-    self._elem, self._rest = whole.elem, whole.rest
+  def __init__(self, whole: Mesh):
     self._fields = fields = Nearest()
-    fields.nvert, fields.nelem, fields.solid = whole.nvert, whole.nelem, int(len(whole.tet) > 0)
-    fields.most, fields.edge = copy.sizes["most"], whole.edge_length
-    fields.elem, fields.spoke, fields.degree = there.elem, there.spoke, there.degree
-    self._x, self._box = np.zeros((whole.nvert, 3)), np.zeros(whole.nvert + whole.nelem, np.int32)
-    fields.x, fields.box = _wrap(self._x), _wrap(self._box)
+    fields.nelem, fields.edge = whole.nelem, whole.edge_length
+    self._box, self._spot = np.zeros(whole.nelem, np.int32), np.zeros((16, 8))
     self._launch = _nearest.command(fields).launch
-    self._make_room(16)
 
-  def _make_room(self, count: int):
-    self._point, self._spot = np.zeros((count, 3)), np.zeros((count, 8))
-    self._fields.point, self._fields.spot = _wrap(self._point), _wrap(self._spot)
+  def _find(
+    self, mesh: Mesh, position: np.ndarray, points: np.ndarray, normals: bool
+  ) -> np.ndarray:
+    n = len(points)
+    if n > len(self._spot):
+      self._spot = np.zeros((2 * n, 8))
+    given = {"x": position, "rest": mesh.rest, "point": points}
+    arrays = {name: np.ascontiguousarray(each, float) for name, each in given.items()}
+    arrays |= {"elem": np.ascontiguousarray(mesh.elem, np.int64), "box": self._box}
+    aim(self._fields, **arrays, spot=self._spot)
+    self._fields.npoint, self._fields.normals = n, normals
+    self._launch()
+    return self._spot[:n].copy()
 
   def nearest(
     self, mesh: Mesh, position: np.ndarray, points: np.ndarray
   ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns the points of the surface nearest to points.
+    """Returns the points of the surface nearest to points; of a solid, of its skin.
 
     Args:
       mesh: the surface
@@ -72,37 +75,64 @@ class Finder:
     Returns:
       triangles (n,), weights of their corners (n, 3), distances [m] (n,)
     """
-    n = len(points)
-    if n > len(self._point):
-      self._make_room(2 * n)
-    if self._fields.solid:
-      self._elem, self._rest = mesh.elem, mesh.rest  # which native code reads
-      aim(self._fields, elem=mesh.elem, rest=mesh.rest)
-    else:
-      self._copy.put(mesh)
-    self._x[:], self._point[:n] = position, points
-    self._fields.npoint, self._fields.nouter = n, mesh.nouter
-    self._launch()
-    spot = self._spot[:n].copy()
+    spot = self._find(mesh, position, points, normals=False)
     return spot[:, 0].astype(int), spot[:, 1:4], spot[:, 4]
 
-  def inward(self, mesh: Mesh, position: np.ndarray, points: np.ndarray) -> tuple:
-    """Returns what `nearest` does of a solid, and the normals inward there at rest, (n, 3).
+  def trace(
+    self, organ: str, mesh: Mesh, position: np.ndarray, points: npt.ArrayLike, normals: bool = False
+  ) -> "Traced":
+    """Returns the path on a surface that is nearest to points.
 
-    These are even across edges: means by area around vertices.
+    Args:
+      organ: its name, for messages
+      mesh: the surface
+      position: where its vertices are [m]          (nvert, 3)
+      points: the path, in the same frame [m]       (n, 3)
+      normals: whether to find the normals inward
+
+    Raises:
+      ValueError: these are no points, or one is off the surface.
     """
-    return *self.nearest(mesh, position, points), -self._spot[: len(points), 5:]
+    points, edge = check_points(organ, points), mesh.whole.edge_length
+    gap = lengths(points[1:] - points[:-1])
+    steps = np.maximum(np.ceil(gap / (SAMPLE * edge)).astype(int), 1)
+    given = np.append(0, np.cumsum(steps))
+    at = np.interp(np.arange(given[-1] + 1), given, np.arange(len(points)))
+    k = np.minimum(at.astype(int), len(points) - 2)
+    sample = points[k] + (at - k)[:, None] * (points[k + 1] - points[k])
+    spot = self._find(mesh, position, sample, normals)
+    elem, far = spot[:, 0].astype(int), spot[given, 4]
+    off = np.flatnonzero(far > _OFF * edge)
+    if off.size:
+      raise ValueError(
+        f"organ {organ!r}: point {off[0]} of the path is {far[off[0]]:.3g} m from the surface, "
+        f"expected at most {_OFF * edge:.3g} m"
+      )
+    rest = np.einsum("nk,nkj->nj", spot[:, 1:4], mesh.rest[mesh.elem[elem]])
+    return Traced(at, rest, elem, -spot[:, 5:])
 
 
-def _wrap(array: np.ndarray) -> wp.array:
-  return wp.array(array, device="cpu", copy=False)
+class Traced(NamedTuple):
+  """A path on a surface, in dense samples.
+
+  Attributes:
+    at: which of the points each is, or between which   (n,)
+    rest: where they are at rest [m]                    (n, 3)
+    elem: triangles that they are in                    (n,)
+    inward: unit normals at rest, even across edges: means by area around vertices; see `trace`
+  """
+
+  at: np.ndarray
+  rest: np.ndarray
+  elem: np.ndarray
+  inward: np.ndarray
 
 
 def nearest(
   mesh: Mesh, position: np.ndarray, points: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
   """Returns what `Finder.nearest` does, once."""
-  return Finder(WorkingCopy(mesh)).nearest(mesh, position, points)
+  return Finder(mesh.whole).nearest(mesh, position, points)
 
 
 def distance(line: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

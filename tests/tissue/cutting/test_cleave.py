@@ -10,7 +10,6 @@ from palpate.tissue.config import Config
 from palpate.tissue.cutting import solid_cut
 from palpate.tissue.cutting.cut import Motion
 from palpate.tissue.cutting.path import Finder, distance
-from palpate.tissue.cutting.surface import WorkingCopy
 from palpate.tissue.geometry import faces, fill
 from palpate.tissue.geometry import mesh as topology
 
@@ -39,7 +38,7 @@ def cut(mesh, points, depth=None, pinned=(), u=0.0, room=None, **keys):
   still = np.zeros_like(mesh.rest)
   motion = Motion(fill.vertex_volumes(mesh), still + u, still)
   whole = mesh.whole
-  knife = solid_cut.Cleaver(whole, Finder(WorkingCopy(whole)), room or whole.nelem + 4 * mesh.spare)
+  knife = solid_cut.Cleaver(whole, Finder(whole), room or whole.nelem + 4 * mesh.spare)
   return knife.cut("organ", mesh, motion, np.asarray(points), held, depth, **keys)
 
 

@@ -44,7 +44,7 @@ def circle(radius, centre=(0.0, 0.0, 0.0), count=80):
 def cut(mesh, points, pinned=(), **given):
   mask = np.zeros(mesh.nvert, bool)
   mask[list(pinned)] = True
-  knife = cutting.Knife(surface.WorkingCopy(mesh))
+  knife = cutting.Knife(surface.WorkingCopy(mesh), paths.Finder(mesh))
   return knife.cut("organ", mesh, at_rest(mesh), np.asarray(points, float), mask, **given)
 
 
@@ -166,7 +166,7 @@ def test_a_refilled_body_is_one_made_anew_to_the_bit(kind, device):
   filler = refill.Refill(body, facets.of(mesh, mesh.nelem))
   first = fields(body)
   assert first["fan_width"][-1] == 0 < first["fan_width"][0]  # rows of what waits are left out
-  r, knife = np.random.RandomState(1), cutting.Knife(surface.WorkingCopy(mesh))
+  r, knife = np.random.RandomState(1), cutting.Knife(surface.WorkingCopy(mesh), paths.Finder(mesh))
   for _ in range(4):
     ends = points[r.choice(np.arange(10, len(points)), 2, replace=False)]
     path = ends[0] + np.linspace(0, 1, 40)[:, None] * (ends[1] - ends[0])
@@ -204,7 +204,7 @@ def fields(body):
 
 def test_what_comes_apart_behind_a_blade_ends_near_a_vertex():
   mesh = sheet(30)
-  finder, edge = paths.Finder(surface.WorkingCopy(mesh)), mesh.edge_length
+  finder, edge = paths.Finder(mesh), mesh.edge_length
   start = mesh.rest[mesh.nouter // 2]
   path = start + edge * np.linspace(0, 2, 6)[:, None] * [1.0, 0.1, 0.0]
   part, rest = crack_front.part(finder, mesh, path)
@@ -228,7 +228,8 @@ def test_uneven_strain_does_not_rise_by_moving_vertices():
   way = paths.nearest(mesh, mesh.rest, np.linspace(*path, 60))
   now = np.einsum("nk,nkj->nj", way[1], points[mesh.elem[way[0]]])
   moving = cutting.Motion(np.ones(len(u)), u, np.zeros_like(u))
-  found = cutting.Knife(surface.WorkingCopy(mesh)).cut("organ", mesh, moving, now, mask, config)
+  knife = cutting.Knife(surface.WorkingCopy(mesh), paths.Finder(mesh))
+  found = knife.cut("organ", mesh, moving, now, mask, config)
   before = energy.membrane(mesh, config, u)
   risen = energy.membrane(found.mesh, config, found.motion.disp)
   assert found.moved > 10 and risen < 1.002 * before
