@@ -4,11 +4,6 @@
 
 namespace palpate {
 
-PALPATE D3 unit(D3 a) {
-  const double size = norm(a);
-  return (1.0 / (size > 1e-300 ? size : 1e-300)) * a;
-}
-
 // Writes the gradients of the shares of a tetrahedron's corners; returns its volume.
 PALPATE double slopes_of(const D3* x, D3* g) {
   const D3 a = x[1] - x[0], b = x[2] - x[0], c = x[3] - x[0];

@@ -4,6 +4,17 @@
 
 namespace palpate {
 
+PALPATE D3 unit(D3 a) {
+  const double size = norm(a);
+  return (1.0 / (size > 1e-300 ? size : 1e-300)) * a;
+}
+
+// 1 of an equilateral triangle.
+PALPATE double shape_of(const D3* x) {
+  const D3 a = x[1] - x[0], b = x[2] - x[1], c = x[0] - x[2];
+  return 2.0 * sqrt(3.0) * norm(cross(a, x[2] - x[0])) / (dot(a, a) + dot(b, b) + dot(c, c));
+}
+
 // The barycentric weights of the point nearest to p on the edge from a to b; `far2` gets the square
 // of its distance.
 PALPATE double along_edge(D3 p, D3 a, D3 b, double& far2) {

@@ -137,7 +137,6 @@ struct Mender {
   const S& m;
   const Path& path;
   const Material& p;
-  const double* disp;
   const P* pinned;
   int left;  // vertices that wait
   Chains& chains;
@@ -156,8 +155,7 @@ struct Mender {
     find_seam(m, path, chains, plan.seam);
     plan.stopped = find_room(m, plan.seam, left, plan.there, plan.part);
     find_goals(m, path, chains, plan.there, pinned, plan.movers, plan.goal, plan.seen);
-    find_moves(m, disp, p, plan.goal, plan.movers, plan.move, memory);
-    return !memory.full;
+    return find_moves(m, p, plan.goal, plan.movers, plan.move, memory);
   }
 
   // How far a vertex of a run, and the middle of the edge after it, will be from the path.
@@ -262,9 +260,9 @@ struct Mender {
 
 // Plans what is to come apart, along chains that may be other ones then; returns whether there was memory.
 template <class S, class P>
-PALPATE bool mend(const S& m, const Path& path, const Material& p, const double* disp, const P* pinned,
-                  int left, Chains& chains, Plan& plan, Scratch memory) {
-  Mender<S, P> mender = {m, path, p, disp, pinned, left, chains, plan,
+PALPATE bool mend(const S& m, const Path& path, const Material& p, const P* pinned, int left, Chains& chains,
+                  Plan& plan, Scratch memory) {
+  Mender<S, P> mender = {m, path, p, pinned, left, chains, plan,
                          memory.values(chains.most), memory.numbers(m.nvert)};
   return !memory.full && mender.mend(memory);
 }

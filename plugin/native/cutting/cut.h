@@ -100,9 +100,7 @@ PALPATE bool apply(const S& m, const Moving& x, const Move* move, int nmove, con
   D3 *to = (D3*)memory.values(3 * nmove), *from = (D3*)memory.values(3 * nmove);
   if (memory.full) return false;
   for (int i = 0; i < nmove; ++i) {
-    int corner[3];
-    for (int c = 0; c < 3; ++c) corner[c] = (int)m.elem[3 * move[i].elem + c];
-    from[i] = m.place(move[i].vert), to[i] = at_corners(m.rest, corner, move[i].weight);
+    from[i] = m.place(move[i].vert), to[i] = from[i] + move[i].share * move[i].way;
     if (to[i] != from[i]) moved.put(move[i].vert);
   }
   for (int pass = 0; pass < 2; ++pass)
@@ -123,8 +121,14 @@ PALPATE bool apply(const S& m, const Moving& x, const Move* move, int nmove, con
   out.vert.clear();
   for (int i = 0; i < 3 * near.count; ++i)
     if (!pinned[out.before[i]]) out.vert.put(out.before[i]);
-  carry_motion(m, x, move, nmove, from, out.vert);
-  share_masses(m, x, out.split, out.share);
+  carry_motion(m, x, move, nmove, from, out.vert, pinned);
+  const Split& s = out.split;
+  const unsigned char* all = nullptr;
+  for (int first = 0, last; first < s.count; first = last) {
+    for (last = first; last < s.count && s.group[last] == s.group[first]; ++last)
+      out.share[last] = area_around(m, s.member[last], all);
+    share_mass(x, s.group[first], s.member + first, out.share + first, last - first);
+  }
   return true;
 }
 
@@ -158,7 +162,7 @@ PALPATE int cut_along(const F& f, const S& m, const Material& p, const Path& pat
   if (status == DONE) status = check_chains(m, path, chains, pinned, f.size.data + SIZE_BAD);
   if (status != DONE) return status;
   Plan plan = new_plan(m, chains, memory);
-  if (memory.full || !mend(m, path, p, x.disp, pinned, m.nvert - made.split.following, chains, plan, memory) ||
+  if (memory.full || !mend(m, path, p, pinned, m.nvert - made.split.following, chains, plan, memory) ||
       plan.seam.count > m.nvert)
     return NO_ROOM;
   found[FOUND_STOPPED] = plan.stopped;
@@ -197,7 +201,7 @@ PALPATE void cut_surface(const Fields& f, Thread t, int) {
   const auto m = surface_of(f.surface);
   Scratch memory = {f.ints.data, f.reals.data, f.nint, f.nreal, false};
   const Material p = {f.kind, f.held, f.thickness, f.stiffness, f.given, f.lame.data, f.shear.data,
-                      f.whole.data, f.pull.data, f.hard.data};
+                      f.whole.data, f.pull.data, f.hard.data, f.disp.data, f.kind != NO_ENERGY};
   Path path = {f.edge, f.path.data, f.spot.data, f.npath, nullptr, 0};
   const bool found = find_runs(m, path, memory);
   const Moving moving = {f.mass.data, f.disp.data, f.vel.data};

@@ -78,24 +78,4 @@ PALPATE bool find_runs(const S& m, Path& path, Scratch& memory) {
   return true;
 }
 
-// The place of a polyline of dense samples that is nearest to a point, beside its nearest sample.
-PALPATE D3 place_on(const double* line, int n, D3 p, double& far) {
-  int near = 0;
-  double least = 1e300;
-  for (int i = 0; i < n; ++i) {
-    const D3 arm = load(line + 3 * i) - p;
-    if (dot(arm, arm) < least) least = dot(arm, arm), near = i;
-  }
-  D3 best = p;
-  far = 1e300;
-  for (int begin = near - 1; begin <= near; ++begin) {
-    if (begin < 0 || begin > n - 2) continue;
-    const D3 a = load(line + 3 * begin), b = load(line + 3 * begin + 3);
-    double far2;
-    const double share = along_edge(p, a, b, far2);
-    if (sqrt(far2) < far) far = sqrt(far2), best = a + share * (b - a);
-  }
-  return best;
-}
-
 }  // namespace palpate

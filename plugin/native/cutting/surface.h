@@ -15,6 +15,11 @@ PALPATE int last_half(int h) { return h % 3 == 0 ? h + 2 : h - 1; }
 
 template <class I>
 struct Surface {
+  // Of moves: least quality of a triangle, or so much of what it had; times its energy that the tissue around a
+  // vertex may have when it moved; how much less it moves, how often; see `moves.h`.
+  static constexpr int CORNERS = 3, ROUNDS = 22;
+  static constexpr double THIN = 0.3, KEPT = 0.9, RISE = 1.01, SHORTER = 0.87, GIVES = 0.0;
+
   int nvert, nelem, most;
   double* rest;
   I *elem, *twin, *ring, *spoke, *degree;
@@ -40,6 +45,19 @@ struct Surface {
   PALPATE void corners(int t, D3* x) const {
     for (int c = 0; c < 3; ++c) x[c] = place((int)elem[3 * t + c]);
   }
+  PALPATE int vert(int corner) const { return (int)elem[corner]; }
+  PALPATE int size() const { return nelem; }
+  PALPATE int most_triangles() const { return 0; }
+  PALPATE bool inside(int) const { return false; }
+  PALPATE double quality(const D3* x) const { return shape_of(x); }
+  // Calls body(corner) for the corners that a vertex has.
+  template <class Body>
+  PALPATE void each_corner(int v, Body body) const {
+    for (int k = 0; k < degree[v]; ++k)
+      if (half(v, k) >= 0) body(half(v, k));
+  }
+  template <class Body>
+  PALPATE void each_triangle(int, Body) const {}
 };
 
 // The surface in arrays of such names.
@@ -321,6 +339,26 @@ PALPATE void nearest_spots(const Triangles<I>& all, const double* point, int n, 
     most = most > 0.0 ? most : all.reach();
     put(i, all.nearest(p, TIE * edge, most), all);
   }
+}
+
+// The place of a polyline of dense samples that is nearest to a point, beside its nearest sample.
+PALPATE D3 place_on(const double* line, int n, D3 p, double& far) {
+  int near = 0;
+  double least = 1e300;
+  for (int i = 0; i < n; ++i) {
+    const D3 arm = load(line + 3 * i) - p;
+    if (dot(arm, arm) < least) least = dot(arm, arm), near = i;
+  }
+  D3 best = p;
+  far = 1e300;
+  for (int begin = near - 1; begin <= near; ++begin) {
+    if (begin < 0 || begin > n - 2) continue;
+    const D3 a = load(line + 3 * begin), b = load(line + 3 * begin + 3);
+    double far2;
+    const double share = along_edge(p, a, b, far2);
+    if (sqrt(far2) < far) far = sqrt(far2), best = a + share * (b - a);
+  }
+  return best;
 }
 
 }  // namespace palpate

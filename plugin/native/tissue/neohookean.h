@@ -5,13 +5,6 @@
 
 namespace palpate {
 
-// What tells the energy of tetrahedra.
-struct Neohookean {
-  bool has;
-  double given;  // by so much that around a vertex may rise
-  const double *mu, *lam, *disp;
-};
-
 // A 3x3 matrix, row by row.
 struct Rows { D3 row[3]; };
 
@@ -73,6 +66,16 @@ PALPATE double energy_of(const D3* x, const D3* u, double mu, double lam) {
   const double volume = slopes_of(x, g);
   return volume * density_of(gradient_of(u, g), mu, lam);
 }
+
+// What tells the energy of tetrahedra.
+struct Neohookean {
+  bool has;
+  double given;  // by so much that around a vertex may rise
+  const double *mu, *lam, *disp;
+
+  PALPATE double energy(int t, const D3* x, const D3* u) const { return energy_of(x, u, mu[t], lam[t]); }
+  PALPATE void hold(int, D3, double&, double&) const {}
+};
 
 // Density and derivative of many gradients, a world each.
 template <class Fields>

@@ -9,7 +9,7 @@ arrays need.
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
 import dataclasses
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import warp as wp
@@ -17,7 +17,7 @@ import warp as wp
 from .. import config as configuration
 from ..config import Config
 from ..geometry.mesh import Mesh, lengths
-from ..kernels import aim, kernel
+from ..kernels import Kernel, aim, kernel
 from ..types import CONSTANTS, allocate, doubles, flags, ints, longs, struct
 from .path import Finder
 from .surface import Surface, WorkingCopy, host_views
@@ -28,11 +28,12 @@ _FOUND = (
   "status", "moved", "near", "split", "changed", "edges", "nouter", "stopped", "apart",
 )  # fmt: skip
 _SIZE = ("bad", "deviation")
-_NUMBERS = {
-  f"{prefix}_{name.upper()}": k
-  for prefix, names in (("FOUND", (*_FOUND, "length")), ("SIZE", (*_SIZE, "length")))
-  for k, name in enumerate(names)
-}
+_LISTS = "near", "changed"  # of `Cut`, as long as `found` says
+
+
+def numbers(**names: tuple[str, ...]) -> dict[str, int]:
+  """Returns what native code calls the numbers of FOUND and SIZE."""
+  return {f"{kind}_{name.upper()}": k for kind in names for k, name in enumerate(names[kind])}
 
 
 @struct
@@ -73,7 +74,8 @@ class Cutting:
   reals: doubles("nreal")
 
 
-_cut = kernel("cut_surface", "cutting/cut.h", Cutting, CONSTANTS | _NUMBERS)
+_CONSTANTS = CONSTANTS | numbers(FOUND=_FOUND, SIZE=_SIZE)
+_cut = kernel("cut_surface", "cutting/cut.h", Cutting, _CONSTANTS)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -145,7 +147,53 @@ class Cut:
   depth: float = 0.0
 
 
-class Knife:
+class Native:
+  """What native code takes for cuts of one whole, and what it writes.
+
+  Attributes:
+    FOUND, SIZE: whole numbers and others that it writes, by name
+  """
+
+  FOUND: ClassVar[tuple[str, ...]]
+  SIZE: ClassVar[tuple[str, ...]]
+  _fields: Any = None
+
+  def _aim(self, kernel: Kernel, fields: Any, kind: Any, sizes: dict[str, int]):
+    """Lets a kernel read and write a struct."""
+    for name, size in sizes.items():
+      setattr(fields, name, size)
+    self._fields, self._host = fields, host_views(fields, kind)
+    self._launch = kernel.command(fields).launch
+
+  def _run(self, motion: Motion, pinned: np.ndarray) -> dict[str, int]:
+    """Cuts; returns the numbers of FOUND."""
+    host = self._host
+    host["mass"][:], host["disp"][:], host["vel"][:] = motion.mass, motion.disp, motion.vel
+    host["pinned"][:] = pinned
+    self._launch()
+    return dict(zip(self.FOUND, host["found"].tolist(), strict=True))
+
+  def _cut(self, mesh: Mesh, found: dict[str, int], path: list[np.ndarray], **more: Any) -> Cut:
+    """Returns what native code has written."""
+    host, n = self._host, found["split"]
+    lists: dict[str, Any] = {name: host[name][: found[name]].astype(int) for name in _LISTS}
+    lists |= {name: host[name][:n].astype(int) for name in ("group", "member")}
+    ways = [line[1:] - line[:-1] for line in path]
+    return Cut(
+      mesh=mesh,
+      motion=Motion(host["mass"], host["disp"], host["vel"]),
+      moved=found["moved"],
+      share=host["share"][:n].copy(),
+      path=path,
+      length=float(lengths(np.concatenate(ways)).sum()) if ways else 0.0,
+      deviation=float(host["size"][self.SIZE.index("deviation")]),
+      stopped=bool(found["stopped"]),
+      **lists,
+      **more,
+    )
+
+
+class Knife(Native):
   """Cuts surfaces of one whole, one after the other.
 
   Args:
@@ -153,14 +201,13 @@ class Knife:
     finder: of places on them
   """
 
+  FOUND, SIZE = _FOUND, _SIZE
+
   def __init__(self, copy: WorkingCopy, finder: Finder):
     self._copy, self._whole, self._finder = copy, copy.whole, finder
     self._config: Config | None = None
     self._how: tuple = ()
     self._room = 0  # for samples of a path
-    self._fields: Any = None
-    self._host: dict[str, np.ndarray] = {}
-    self._launch: Any = None
 
   def cut(
     self,
@@ -200,14 +247,14 @@ class Knife:
     host, spot = self._host, traced.elem.astype(np.int32)
     aim(self._fields, path=traced.rest, spot=spot)
     self._fields.npath = len(spot)
-    host["mass"][:], host["disp"][:], host["vel"][:] = motion.mass, motion.disp, motion.vel
-    host["pinned"][:] = pinned
     host["found"][:] = 0
     host["found"][_FOUND.index("nouter")] = mesh.nouter
-    self._launch()
-    found: dict[Any, int] = dict(zip(_FOUND, host["found"].tolist(), strict=True))
+    found = self._run(motion, pinned)
     self._check(organ, found["status"])
-    return self._answer(mesh, found)
+    if found["changed"]:
+      closed = mesh.closed and not found["split"]
+      mesh = self._copy.take(mesh, closed, bool(found["apart"]), found["nouter"])
+    return self._cut(mesh, found, _lines(mesh.rest, host["seam"][: found["edges"]].tolist()))
 
   def _make_room(self, n: int):
     """Makes the arrays, and makes them larger for a path of more samples."""
@@ -217,15 +264,12 @@ class Knife:
     n, self._config, self._how = 2 * n, None, ()
     self._room, sizes = n, self._copy.sizes | {"npath": 0}
     # What cutting/cut.h takes of scratch, see there.
-    sizes["nint"] = 29 * whole.nvert + 18 * whole.nelem + 20 * n + 8 * sizes["most"] + 100
-    sizes["nreal"] = 48 * whole.nvert + 6 * whole.nelem + 13 * n
-    self._fields = fields = allocate(Cutting, "cpu", sizes)
+    sizes["nint"] = 29 * whole.nvert + 20 * whole.nelem + 20 * n + 8 * sizes["most"] + 100
+    sizes["nreal"] = 48 * whole.nvert + 9 * whole.nelem + 13 * n
+    fields = allocate(Cutting, "cpu", sizes)
     fields.surface, fields.edge = self._copy.fields, whole.edge_length
-    for name in ("nint", "nreal"):
-      setattr(fields, name, sizes[name])
-    self._host = host_views(fields, Cutting)
+    self._aim(_cut, fields, Cutting, {name: sizes[name] for name in ("nint", "nreal")})
     self._host["home"][:] = whole.home
-    self._launch = _cut.command(fields).launch
 
   def _put_material(self, config: Config | None, held: Springs | None, given: float):
     fields, host = self._fields, self._host
@@ -261,35 +305,6 @@ class Knife:
       raise ValueError(
         f"organ {organ!r}: the path goes to and fro too often, expected shorter cuts"
       )
-
-  def _answer(self, mesh: Mesh, found: dict[Any, int]) -> Cut:
-    host = self._host
-    lists: Any = listed(host, found, {"group": "split", "member": "split"})
-    if found["changed"]:
-      closed = mesh.closed and not found["split"]
-      mesh = self._copy.take(mesh, closed, bool(found["apart"]), found["nouter"])
-    path = _lines(mesh.rest, host["seam"][: found["edges"]].tolist())
-    return Cut(
-      mesh=mesh,
-      motion=Motion(host["mass"], host["disp"], host["vel"]),
-      moved=found["moved"],
-      share=host["share"][: found["split"]].copy(),
-      path=path,
-      length=sum(float(lengths(line[1:] - line[:-1]).sum()) for line in path),
-      deviation=float(host["size"][_SIZE.index("deviation")]),
-      stopped=bool(found["stopped"]),
-      **lists,
-    )
-
-
-def listed(
-  host: dict[str, np.ndarray], found: dict[Any, int], parts: dict[str, str]
-) -> dict[str, np.ndarray]:
-  """Returns lists that native code has written, those of `parts` as long as others."""
-  return {
-    name: host[name][: found[parts.get(name, name)]].astype(int)
-    for name in ("near", "changed", *parts)
-  }
 
 
 def _lines(rest: np.ndarray, pairs: list[list[int]]) -> list[np.ndarray]:

@@ -7,7 +7,6 @@ none is added, so that what is stored by tetrahedron stays, and so does the room
 # Annotations here are objects, not text: no `from __future__ import annotations`.
 # pyright: reportInvalidTypeForm=false
 import dataclasses
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -15,26 +14,20 @@ import warp as wp
 from .. import solid
 from ..config import Config
 from ..geometry import faces
-from ..geometry.mesh import Mesh, distinct, lengths
+from ..geometry.mesh import Mesh, distinct
 from ..kernels import aim, kernel
 from ..order import addresses
 from ..step import OWN_SHARE
 from ..types import CONSTANTS, allocate, doubles, flags, ints, longs, struct
-from .cut import Cut, Motion, listed
+from .cut import Cut, Motion, Native, numbers
 from .cut_surface import sweep
 from .path import Finder
-from .surface import host_views
 
 _APART, _NOTHING, _HELD, _FULL = range(4)  # how it went, as in cutting/solid/solid_cut.h
 _FOUND = (
   "status", "stopped", "moved", "near", "split", "changed", "mouth", "triangles", "nouter",
 )  # fmt: skip
 _SIZE = ("bad", "area", "depth", "deviation")
-_NUMBERS = {
-  f"{prefix}_{name.upper()}": k
-  for prefix, names in (("FOUND", _FOUND), ("SIZE", _SIZE))
-  for k, name in enumerate(names)
-}
 _MESH = ("rest", "tet", "ring", "degree")  # of `Mesh` and of `Cleaving`, what a cut changes
 _BY_TRIANGLE = ("elem", "of_tet")
 
@@ -101,11 +94,11 @@ class Cleaving:
   reals: doubles("nreal")
 
 
-_CONSTANTS = CONSTANTS | _NUMBERS | {"OWN_SHARE": OWN_SHARE}
+_CONSTANTS = CONSTANTS | numbers(FOUND=_FOUND, SIZE=_SIZE) | {"OWN_SHARE": OWN_SHARE}
 _cleave = kernel("cleave_solid", "cutting/solid/solid_cut.h", Cleaving, _CONSTANTS)
 
 
-class Cleaver:
+class Cleaver(Native):
   """Cuts solids of one whole, one after the other.
 
   Args:
@@ -113,6 +106,8 @@ class Cleaver:
     finder: of its surfaces
     room: triangles that there may be
   """
+
+  FOUND, SIZE = _FOUND, _SIZE
 
   def __init__(self, whole: Mesh, finder: Finder, room: int):
     self._whole, self._finder = whole, finder
@@ -124,19 +119,17 @@ class Cleaver:
     # What cutting/solid/solid_cut.h takes of scratch, see there.
     sizes |= {"nint": 92 * ntet + 40 * nvert + 8 * room, "nreal": 70 * nvert + 26 * ntet + 3 * room}
     sizes |= {"nmouth": 3 * (room - whole.nelem), "npath": 0, "nline": 0}
-    self._fields: Any = allocate(Cleaving, "cpu", sizes)
-    for name in ("nvert", "ntet", "nelem", "most", "most_elem", "nint", "nreal"):
-      setattr(self._fields, name, sizes[name])
-    self._fields.nskin, self._fields.nspare = whole.nskin, whole.spare
-    self._fields.most_spare, self._fields.edge = int(faces.room(whole).max()), whole.edge_length
-    self._host = host_views(self._fields, Cleaving)
+    fields = allocate(Cleaving, "cpu", sizes)
+    fields.nskin, fields.nspare = whole.nskin, whole.spare
+    fields.most_spare, fields.edge = int(faces.room(whole).max()), whole.edge_length
+    names = "nvert", "ntet", "nelem", "most", "most_elem", "nint", "nreal"
+    self._aim(_cleave, fields, Cleaving, {name: sizes[name] for name in names})
     corner = whole.tet.ravel()
     fixed = {"whole_tet": whole.tet, "whole_degree": whole.degree, "home": whole.home}
     fixed |= {"around": np.argsort(corner, kind="stable"), "mate": whole.mate}
     fixed["begin"] = addresses(np.bincount(corner, minlength=nvert))
     for name, values in fixed.items():
       self._host[name][:] = values
-    self._launch = _cleave.command(self._fields).launch
 
   def cut(
     self,
@@ -179,10 +172,7 @@ class Cleaver:
     if config is not None and config != self._config:
       host["mu"][:], host["lam"][:] = solid.moduli(mesh, config)
       self._config = config
-    host["mass"][:], host["disp"][:], host["vel"][:] = motion.mass, motion.disp, motion.vel
-    host["pinned"][:] = pinned
-    self._launch()
-    return self._answer(organ, mesh, motion)
+    return self._answer(organ, mesh, motion, self._run(motion, pinned))
 
   def _put(self, mesh: Mesh):
     """Makes the arrays those of a mesh."""
@@ -199,10 +189,9 @@ class Cleaver:
     host["triangle"][faces.corner_face(mesh.of_tet)] = np.arange(n)
     self._mesh = mesh
 
-  def _answer(self, organ: str, mesh: Mesh, motion: Motion) -> Cut:
+  def _answer(self, organ: str, mesh: Mesh, motion: Motion, found: dict[str, int]) -> Cut:
     host = self._host
-    found: dict[str, int] = dict(zip(_FOUND, host["found"].tolist(), strict=True))
-    bad, area, depth, deviation = host["size"].tolist()
+    bad, area, depth, _ = host["size"].tolist()
     status, stopped = found["status"], bool(found["stopped"])
     none = np.zeros(0, int)
     if status == _NOTHING and stopped:
@@ -225,21 +214,8 @@ class Cleaver:
     key = distinct(ends[:, 0] * mesh.nvert + ends[:, 1])
     new = self._take(mesh, found["triangles"])
     path = new.rest[np.stack([key // mesh.nvert, key % mesh.nvert], axis=1)]
-    lists = listed(host, found, {"group": "split", "member": "split", "sat": "split"})
-    lists["seat"] = lists.pop("sat")
-    return Cut(
-      mesh=new,
-      motion=Motion(host["mass"], host["disp"], host["vel"]),
-      moved=found["moved"],
-      share=host["share"][: found["split"]].copy(),
-      path=list(path),
-      length=float(lengths(path[:, 1] - path[:, 0]).sum()),
-      area=area,
-      depth=depth,
-      deviation=deviation,
-      stopped=stopped,
-      **lists,
-    )
+    seat = host["sat"][: found["split"]].astype(int)
+    return self._cut(new, found, list(path), seat=seat, area=area, depth=depth)
 
   def _take(self, mesh: Mesh, n: int) -> Mesh:
     """Returns the mesh that native code has made of one, with so many triangles."""

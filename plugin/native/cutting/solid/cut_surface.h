@@ -1,6 +1,6 @@
 // The surface along which a solid is cut: lines from a path on its skin inward, side by side.
 #pragma once
-#include "core/tet.h"
+#include "cutting/surface.h"
 
 namespace palpate {
 
@@ -86,20 +86,6 @@ PALPATE Where measure(const Sheet& s, D3 p) {
   for (int k = 0; k < start; ++k) out.along += norm(s.top(k + 1) - s.top(k));
   out.along += on * (start + 1 < s.nline ? norm(s.top(start + 1) - s.top(start)) : 0.0);
   return out;
-}
-
-// The point of a polyline that is nearest to one; `far` gets its distance.
-PALPATE D3 nearest_on(const double* line, int n, D3 p, double& far) {
-  D3 best = load(line);
-  double least = 1e300;
-  for (int k = 0; k + 1 < n; ++k) {
-    const D3 a = load(line + 3 * k), way = load(line + 3 * k + 3) - a;
-    double far2;
-    const double t = along_edge(p, a, a + way, far2);
-    if (far2 < least) least = far2, best = a + t * way;
-  }
-  far = sqrt(least);
-  return best;
 }
 
 }  // namespace palpate

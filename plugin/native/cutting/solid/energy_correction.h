@@ -7,7 +7,7 @@
 // as the energy allows.
 #pragma once
 #include "tissue/neohookean.h"
-#include "core/rotation.h"
+#include "cutting/transfer_state.h"
 
 namespace palpate {
 
@@ -128,33 +128,6 @@ PALPATE double give_way(const S& m, const Neohookean& e, Patch& p, const Few& ap
     more = strain_patch(m, e, disp, p) - most;
   }
   return more;
-}
-
-// What vertices have together: mass, centre, momentum, angular momentum about the origin, energy, and moments of
-// inertia about the centre.
-struct Sums { double mass, energy, inertia[3][3]; D3 centre, momentum, spin; };
-
-template <class S, class L>
-PALPATE Sums sums_of(const S& m, const Moving& x, const Few& vert, const L* pinned) {
-  Sums out = {};
-  const auto place = [&](int v) { return m.place(v) + load(x.disp + 3 * v); };
-  for (int i = 0; i < vert.count; ++i) {
-    const int v = vert.list[i];
-    if (pinned[v]) continue;
-    const D3 vel = load(x.vel + 3 * v), p = x.mass[v] * vel;
-    out.mass += x.mass[v], out.energy += 0.5 * dot(p, vel);
-    out.centre += x.mass[v] * place(v), out.momentum += p, out.spin += cross(place(v), p);
-  }
-  out.centre = (1.0 / out.mass) * out.centre;
-  for (int i = 0; i < vert.count; ++i) {
-    const int v = vert.list[i];
-    if (pinned[v]) continue;
-    const D3 arm = place(v) - out.centre;
-    const double a[3] = {arm.x, arm.y, arm.z}, square = dot(arm, arm);
-    for (int k = 0; k < 9; ++k)
-      out.inertia[k / 3][k % 3] += x.mass[v] * ((k / 3 == k % 3 ? square : 0.0) - a[k / 3] * a[k % 3]);
-  }
-  return out;
 }
 
 // A motion without strain.

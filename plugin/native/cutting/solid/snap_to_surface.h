@@ -1,24 +1,16 @@
 // Vertices of a solid are moved onto a sheet in the rest shape, as far as its tetrahedra allow.
 #pragma once
 #include "tissue/neohookean.h"
+#include "cutting/moves.h"
 #include "cutting/solid/solid_mesh.h"
 #include "cutting/solid/cut_surface.h"
 
 namespace palpate {
 
-constexpr double THICK = 0.15, KEPT = 0.9;  // least quality of a tetrahedron, or so much of what it had
-constexpr double TURNED = 0.95;  // least cosine between a triangle's normals before and after
-constexpr int ROUNDS = 10;
-constexpr double ABOVE = 1.005;  // times its energy that the tissue around a vertex may have when it moved
-constexpr double SHORTER = 0.7;
-constexpr double GIVES = 0.1;  // share of its way down to which a vertex inside gives way to the skin's
 constexpr double LIPS = 0.75;  // edges from the path within which a vertex of the skin goes to it
 constexpr double ALONG = 0.02;  // edges from the path within which one gives way along it
 constexpr int PASSES = 4;  // times that each goes farther by itself
 constexpr int EXACT = 3;  // times that the volume is put right
-
-// A vertex that moves to a place in a tetrahedron.
-struct Shift { int vert, corner[4]; double share, weight[4]; D3 way, lead; };
 
 // The point of the skin around a vertex that is nearest to a goal.
 template <class S>
@@ -41,14 +33,14 @@ PALPATE D3 nearest_on_skin(const S& m, int v, D3 goal) {
 template <class S>
 PALPATE D3 goal_on_skin(const S& m, const Sheet& sheet, double edge, int v, D3 goal) {
   double far;
-  const D3 at = nearest_on(sheet.path, sheet.npath, m.place(v), far);
+  const D3 at = place_on(sheet.path, sheet.npath, m.place(v), far);
   return nearest_on_skin(m, v, far < LIPS * edge ? at : goal);
 }
 
 // Finds the tetrahedron in which a goal is, or which it is the least outside of, and the weights of its
 // corners there.
 template <class S>
-PALPATE void find_weights(const S& m, int v, D3 goal, Shift& out) {
+PALPATE void find_weights(const S& m, int v, D3 goal, Move& out) {
   double most = -1e300;
   m.each_corner(v, [&](int corner) {
     const int t = corner / 4;
@@ -66,124 +58,15 @@ PALPATE void find_weights(const S& m, int v, D3 goal, Shift& out) {
   });
 }
 
-PALPATE D3 at_corners(const double* values, const Shift& a) {
-  D3 out = {0.0, 0.0, 0.0};
-  for (int k = 0; k < 4; ++k) out += a.weight[k] * load(values + 3 * a.corner[k]);
-  return out;
-}
-
 // How a vertex moves to a goal.
 template <class S>
-PALPATE Shift shift_to(const S& m, int v, D3 goal, const double* disp) {
-  Shift a = {v};
+PALPATE Move shift_to(const S& m, int v, D3 goal, const double* disp) {
+  Move a = {v};
   a.share = 1.0;
   find_weights(m, v, goal, a);
   a.way = goal - m.place(v);
-  a.lead = at_corners(disp, a) - load(disp + 3 * v);
+  a.lead = at_corners(m, disp, a) - load(disp + 3 * v);
   return a;
-}
-
-// The tetrahedra and triangles around vertices that move, as they are before.
-struct Nearby {
-  Few tet, side;
-  double *least, *had, *has, *next;  // energies before, now, and with what is tried
-  D3* normal;
-};
-
-// Where a vertex is, and its displacement, with its share of its way; `mover` tells which moves, from 1.
-template <class S>
-PALPATE D3 moved_place(const S& m, const Shift* shift, const int* mover, int v) {
-  const int k = mover[v] - 1;
-  return k < 0 ? m.place(v) : m.place(v) + shift[k].share * shift[k].way;
-}
-PALPATE D3 moved_disp(const double* disp, const Shift* shift, const int* mover, int v) {
-  const int k = mover[v] - 1;
-  return k < 0 ? load(disp + 3 * v) : load(disp + 3 * v) + shift[k].share * shift[k].lead;
-}
-
-template <class S>
-PALPATE D3 moved_normal(const S& m, const Shift* shift, const int* mover, int t) {
-  D3 x[3];
-  for (int c = 0; c < 3; ++c) x[c] = moved_place(m, shift, mover, (int)m.elem[3 * t + c]);
-  return unit(cross(x[1] - x[0], x[2] - x[0]));
-}
-
-// Finds what is around vertices that do not move yet.
-template <class S>
-PALPATE bool find_nearby(const S& m, const Few& movers, const Shift* shift, const Neohookean& p,
-                         Nearby& out, Scratch& memory) {
-  for (int i = 0; i < movers.count; ++i) {
-    m.each_corner(movers.list[i], [&](int corner) { out.tet.put(corner / 4); });
-    m.each_triangle(movers.list[i], [&](int t) { out.side.put(t); });
-  }
-  out.tet.sort(m.ntet);
-  double** lists[] = {&out.least, &out.had, &out.has, &out.next};
-  for (int i = 0; i < 4; ++i) *lists[i] = memory.values(out.tet.count);
-  out.normal = (D3*)memory.values(3 * out.side.count);
-  if (memory.full) return false;
-  for (int i = 0; i < out.tet.count; ++i) {
-    const int t = out.tet.list[i];
-    D3 x[4], u[4];
-    m.corners(t, x);
-    for (int c = 0; c < 4; ++c) u[c] = load(p.disp + 3 * m.tet[4 * t + c]);
-    const double kept = KEPT * quality_of(x);
-    out.least[i] = kept < THICK ? kept : THICK;
-    out.had[i] = p.has ? energy_of(x, u, p.mu[t], p.lam[t]) : 0.0;
-  }
-  for (int i = 0; i < out.side.count; ++i) {
-    D3 x[3];
-    for (int c = 0; c < 3; ++c) x[c] = m.place((int)m.elem[3 * out.side.list[i] + c]);
-    out.normal[i] = unit(cross(x[1] - x[0], x[2] - x[0]));
-  }
-  return true;
-}
-
-// Marks in `less` the vertices of a thin tetrahedron that are to move less: those inside give way to those
-// of the skin, where the path is seen.
-template <class S>
-PALPATE void mark_thin(const S& m, const Shift* shift, const int* mover, int t, int* less) {
-  bool any = false;
-  for (int pass = 0; pass < 2; ++pass)
-    for (int c = 0; c < 4; ++c) {
-      const int v = m.vert(4 * t + c), k = mover[v] - 1;
-      const bool gives = k >= 0 && v >= m.nskin && shift[k].share > GIVES;
-      any = any || gives;
-      if (pass && k >= 0 && (gives || !any)) less[k] = 1;
-    }
-}
-
-// Marks in `less` the vertices that are to move less.
-template <class S>
-PALPATE void weigh_shifts(const S& m, const Shift* shift, const Few& movers, const Neohookean& p,
-                          Nearby& near, double* old, double* now, int* less) {
-  const int* mover = movers.place;
-  for (int i = 0; i < movers.count; ++i) old[i] = now[i] = 0.0, less[i] = 0;
-  for (int i = 0; i < near.tet.count; ++i) {
-    const int t = near.tet.list[i];
-    D3 x[4], u[4];
-    for (int c = 0; c < 4; ++c) x[c] = moved_place(m, shift, mover, m.vert(4 * t + c));
-    const bool bad = quality_of(x) < near.least[i];
-    if (bad) mark_thin(m, shift, mover, t, less);
-    if (!p.has) continue;
-    double has = near.had[i];
-    for (int c = 0; c < 4 && !bad; ++c) u[c] = moved_disp(p.disp, shift, mover, m.vert(4 * t + c));
-    if (!bad) has = energy_of(x, u, p.mu[t], p.lam[t]);
-    near.has[i] = has;
-    for (int c = 0; c < 4; ++c) {
-      const int k = mover[m.vert(4 * t + c)] - 1;
-      if (k >= 0) old[k] += near.had[i], now[k] += has;
-    }
-  }
-  for (int i = 0; i < near.side.count; ++i) {
-    const int t = near.side.list[i];
-    if (dot(moved_normal(m, shift, mover, t), near.normal[i]) >= TURNED) continue;
-    for (int c = 0; c < 3; ++c) {
-      const int k = mover[m.elem[3 * t + c]] - 1;
-      if (k >= 0) less[k] = 1;
-    }
-  }
-  for (int i = 0; i < movers.count && p.has; ++i)
-    if (now[i] > ABOVE * old[i] + p.given) less[i] = 1;
 }
 
 // Vertices that move, what is around them, and the energy around each before and now.
@@ -194,7 +77,7 @@ struct Settling {
   const Neohookean& p;
   const Sheet& sheet;
   double edge;
-  Shift* shift;
+  Move* shift;
   Nearby near;
   double *old, *now;
 
@@ -215,7 +98,7 @@ struct Settling {
       D3 x[4];
       const int t = corner / 4;
       place_of(t, x);
-      if (out < 0 && quality_of(x) < near.least[near.tet.place[t] - 1]) out = t;
+      if (out < 0 && quality_of(x) < near.least[near.elem.place[t] - 1]) out = t;
     });
     return out;
   }
@@ -231,36 +114,36 @@ struct Settling {
   PALPATE bool weigh(int i) {
     bool may = true;
     m.each_corner(shift[i].vert, [&](int corner) {
-      const int t = corner / 4, n = near.tet.place[t] - 1;
+      const int t = corner / 4, n = near.elem.place[t] - 1;
       D3 x[4], u[4];
       place_of(t, x);
       for (int c = 0; c < 4; ++c) u[c] = moved_disp(p.disp, shift, movers.place, m.vert(4 * t + c));
-      near.next[n] = energy_of(x, u, p.mu[t], p.lam[t]);
+      near.next[n] = p.energy(t, x, u);
       add(t, near.next[n] - near.has[n]);
     });
     m.each_corner(shift[i].vert, [&](int corner) {
       for (int c = corner - corner % 4; c < corner - corner % 4 + 4; ++c) {
         const int k = movers.place[m.vert(c)] - 1;
-        may = may && (k < 0 || now[k] <= ABOVE * old[k] + p.given);
+        may = may && (k < 0 || now[k] <= S::RISE * old[k] + p.given);
       }
     });
     m.each_corner(shift[i].vert, [&](int corner) {
-      const int t = corner / 4, n = near.tet.place[t] - 1;
+      const int t = corner / 4, n = near.elem.place[t] - 1;
       if (may) near.has[n] = near.next[n];
       else add(t, near.has[n] - near.next[n]);
     });
     return may;
   }
   // Lets a vertex move otherwise, where the others stay; returns whether it may.
-  PALPATE bool takes(int i, const Shift& other) {
-    const Shift before = shift[i];
+  PALPATE bool takes(int i, const Move& other) {
+    const Move before = shift[i];
     shift[i] = other;
     if (thin(i) < 0 && !turns(i) && (!p.has || weigh(i))) return true;
     shift[i] = before;
     return false;
   }
   PALPATE bool goes(int i, double share) {
-    Shift other = shift[i];
+    Move other = shift[i];
     other.share = share;
     return takes(i, other);
   }
@@ -268,9 +151,9 @@ struct Settling {
   PALPATE D3 aside(int v, D3 here, D3 goal) const {
     double far;
     if (v >= m.nskin) return goal;
-    nearest_on(sheet.path, sheet.npath, here, far);
+    place_on(sheet.path, sheet.npath, here, far);
     if (far > ALONG * edge) return here;
-    return nearest_on_skin(m, v, nearest_on(sheet.path, sheet.npath, goal, far));
+    return nearest_on_skin(m, v, place_on(sheet.path, sheet.npath, goal, far));
   }
   // Lets a vertex of the skin have a share of its way where others of a tetrahedron that would be thin give
   // way.
@@ -286,11 +169,11 @@ struct Settling {
     for (int c = 0; c < 4; ++c) {
       const int v = m.vert(4 * t + c), k = movers.place[v] - 1;
       if (k < 0 || k == i) continue;
-      const Shift before = shift[k];
+      const Move before = shift[k];
       for (double part = 0.1; part < 0.7; part *= 2.0) {
         const D3 goal = aside(v, x[c], x[c] + part * edge * g[c]);
         if (goal == x[c]) break;
-        const Shift other = shift_to(m, v, goal, p.disp);
+        const Move other = shift_to(m, v, goal, p.disp);
         if (!takes(k, other)) break;
         if (goes(i, wanted)) return true;
       }
@@ -304,23 +187,14 @@ struct Settling {
 // turn, and that the energy around none rises. All go as far as they may together, and then each farther
 // where the others leave it room.
 template <class S>
-PALPATE bool find_shares(const S& m, const Sheet& sheet, double edge, Shift* shift, const Few& movers,
+PALPATE bool find_shares(const S& m, const Sheet& sheet, double edge, Move* shift, const Few& movers,
                          const Neohookean& p, Scratch& memory) {
-  Settling<S> all = {m, movers, p, sheet, edge, shift, {few(memory, m.ntet), few(memory, m.most_elem)}};
+  Settling<S> all = {m, movers, p, sheet, edge, shift, {}};
   all.old = memory.values(movers.count), all.now = memory.values(movers.count);
   int* less = memory.numbers(movers.count);
-  if (memory.full || !find_nearby(m, movers, shift, p, all.near, memory)) return false;
-  for (int k = 0; k <= ROUNDS; ++k) {
-    weigh_shifts(m, shift, movers, p, all.near, all.old, all.now, less);
-    bool any = false;
-    for (int i = 0; i < movers.count; ++i) {
-      if (!less[i] || shift[i].share == 0.0) continue;
-      shift[i].share *= k + 1 < ROUNDS ? SHORTER : 0.0;
-      any = true;
-    }
-    if (!any) break;
-  }
-  weigh_shifts(m, shift, movers, p, all.near, all.old, all.now, less);
+  if (memory.full || !find_nearby(m, movers, p, all.near, memory)) return false;
+  shorten_moves(m, shift, movers, p, all.near, all.old, all.now, less);
+  weigh_moves(m, shift, movers, p, all.near, all.old, all.now, less);
   for (int k = 0; k < 2 * PASSES; ++k)  // those of the skin first, where the path is seen
     for (int i = 0; i < movers.count; ++i) {
       const double share = shift[i].share;
@@ -376,7 +250,7 @@ PALPATE bool keep_volume(const S& m, double* rest, const Few& vert, Scratch& mem
 // those that have moved, with the shift of each, and in `rest` where all are then.
 template <class S, class P>
 PALPATE bool settle(const S& m, const Sheet& sheet, double edge, const Where* where, const P* pinned,
-                    const Neohookean& p, Few& movers, Shift*& shift, double* rest, Scratch& memory) {
+                    const Neohookean& p, Few& movers, Move*& shift, double* rest, Scratch& memory) {
   Few outer = few(memory, m.nvert);
   int count = 0;
   // Those on the walls of older cuts stay.
@@ -397,7 +271,7 @@ PALPATE bool settle(const S& m, const Sheet& sheet, double edge, const Where* wh
     });
   const int helpers = count;
   count = movers.count;
-  shift = (Shift*)memory.values(count * (int)(sizeof(Shift) / sizeof(double)));
+  shift = (Move*)memory.values(count * (int)(sizeof(Move) / sizeof(double)));
   if (memory.full) return false;
   for (int i = 0; i < count; ++i) {
     const int v = movers.list[i];

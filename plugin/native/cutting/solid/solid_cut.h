@@ -196,19 +196,14 @@ PALPATE int share_masses(const S& m, const Opening& o, const Moving& x, const F&
   int count = 0;
   for (int first = 0, last; first < p.count; first = last) {
     const int v = p.vert[first];
-    const double mass = x.mass[v];
-    double total = 0.0;
-    for (last = first; last < p.count && p.vert[last] == v; ++last) total += volume[last];
+    for (last = first; last < p.count && p.vert[last] == v; ++last) {}
     if (last == first + 1 && p.name[first] == v) continue;
-    x.mass[v] = 0.0;
     for (int k = first; k < last; ++k) {
-      const int w = p.name[k];
-      f.group.data[count] = v, f.member.data[count] = w, f.sat.data[count] = p.first[k];
-      f.share.data[count++] = volume[k] / total;
-      x.mass[w] = volume[k] / total * mass;
-      store(x.disp + 3 * w, load(x.disp + 3 * v));
-      store(x.vel + 3 * w, load(x.vel + 3 * v));
+      const int i = count + k - first;
+      f.group.data[i] = v, f.member.data[i] = p.name[k], f.sat.data[i] = p.first[k], f.share.data[i] = volume[k];
     }
+    share_mass(x, v, f.member.data + count, f.share.data + count, last - first);
+    count += last - first;
   }
   return count;
 }
@@ -216,7 +211,7 @@ PALPATE int share_masses(const S& m, const Opening& o, const Moving& x, const F&
 // Vertices that have moved get what is carried where they are now; lists the tetrahedra that are not as they
 // were, and their vertices.
 template <class S, class F>
-PALPATE bool carry(const S& m, const Opening& o, const Few& movers, const Shift* shift, const double* rest,
+PALPATE bool carry(const S& m, const Opening& o, const Few& movers, const Move* shift, const double* rest,
                    const Moving& x, const F& f, Scratch& memory) {
   Few tets = few(memory, m.ntet);
   D3* now = (D3*)memory.values(6 * movers.count);
@@ -227,7 +222,7 @@ PALPATE bool carry(const S& m, const Opening& o, const Few& movers, const Shift*
     const double* of[2] = {x.disp, x.vel};
     for (int k = 0; k < 2; ++k) {
       const D3 was = load(of[k] + 3 * v);
-      now[2 * i + k] = was + shift[i].share * (at_corners(of[k], shift[i]) - was);
+      now[2 * i + k] = was + shift[i].share * (at_corners(m, of[k], shift[i]) - was);
     }
     if (load(rest + 3 * v) != m.place(v)) m.each_corner(v, [&](int corner) { tets.put(corner / 4); });
   }
@@ -256,7 +251,7 @@ PALPATE void measure_walls(const S& m, const Sheet& sheet, double skin, int firs
     for (int c = 0; c < 3; ++c) {
       x[c] = m.place((int)vert[c]);
       const double below = measure(sheet, x[c]).deep + sheet.reach;
-      nearest_on(sheet.path, sheet.npath, x[c], off[c]);
+      place_on(sheet.path, sheet.npath, x[c], off[c]);
       depth = below > depth ? below : depth;
       top[c] = off[c] < WIDE * skin && below < MOUTH * skin;
     }
@@ -354,7 +349,7 @@ PALPATE int cleave(const F& f, const S& m, const Sheet& sheet, const Neohookean&
     return HELD;
   }
   movers.sort(m.nvert);
-  Shift* shift = nullptr;
+  Move* shift = nullptr;
   for (int i = 0; i < 3 * m.nvert; ++i) rest[i] = m.rest[i];
   if (!settle(m, sheet, f.edge, at.where, f.pinned.data, p, movers, shift, rest, memory)) return FULL;
   const Moving x = {f.mass.data, f.disp.data, f.vel.data};

@@ -4,6 +4,7 @@
 // was before the first cut. Tetrahedra keep their numbers, so that the corners around a vertex are some of
 // those that were around the one that it comes from.
 #pragma once
+#include "core/tet.h"
 #include "cutting/surface.h"
 
 namespace palpate {
@@ -18,6 +19,10 @@ PALPATE int other_corner(int corner, int k) { return corner - corner % 4 + k + (
 
 template <class I>
 struct Solid {
+  // Of moves, see `Surface`; share of its way down to which a vertex inside gives way to the skin's.
+  static constexpr int CORNERS = 4, ROUNDS = 10;
+  static constexpr double THIN = 0.15, KEPT = 0.9, RISE = 1.005, SHORTER = 0.7, GIVES = 0.1;
+
   int nvert, ntet, nelem, most_elem, most, nskin, nspare;  // triangles of the skin, and at most; `ring` is
                                                           // so wide
   double* rest;
@@ -29,6 +34,10 @@ struct Solid {
 
   PALPATE D3 place(int v) const { return load(rest + 3 * v); }
   PALPATE int vert(int corner) const { return (int)tet[corner]; }
+  PALPATE int size() const { return ntet; }
+  PALPATE int most_triangles() const { return most_elem; }
+  PALPATE bool inside(int v) const { return v >= nskin; }
+  PALPATE double quality(const D3* x) const { return quality_of(x); }
   PALPATE int face_vert(int face, int k) const { return (int)tet[corner_of(face, k)]; }
   // The face beside one, -1 for none.
   PALPATE int beside(int face) const { return triangle[face] >= 0 ? -1 : (int)mate[face]; }
