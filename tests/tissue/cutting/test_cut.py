@@ -217,6 +217,21 @@ def test_what_comes_apart_behind_a_blade_ends_near_a_vertex():
   assert not len(crack_front.part(finder, mesh, path[:2])[0])  # too short
 
 
+def test_the_nearest_place_is_the_nearest_on_long_triangles_too():
+  points, elem = scenes.triangular(0.15, 0.1, 24, 16, 0.2)
+  points[:, 0] = 0.075 * np.sign(points[:, 0]) * (np.abs(points[:, 0]) / 0.075) ** 3
+  mesh, r = topology.build("organ", points, elem), np.random.RandomState(2)
+  finder, n = paths.Finder(mesh), range(9)
+  grid = np.array([(i, j, 8 - i - j) for i in n for j in n if i + j <= 8])
+  places = np.einsum("gk,ekj->egj", grid / 8, mesh.rest[mesh.elem]).reshape(-1, 3)
+  for far in (0.002, 0.05):  # beside them, and where nothing is around
+    asked = mesh.rest[r.randint(mesh.nvert, size=50)] + far * r.randn(50, 3)
+    found, weight, off = finder.nearest(mesh, mesh.rest, asked)
+    at = np.einsum("nk,nkj->nj", weight, mesh.rest[mesh.elem[found]])
+    np.testing.assert_allclose(np.linalg.norm(at - asked, axis=1), off, atol=1e-12)
+    assert (off <= np.linalg.norm(asked[:, None] - places, axis=2).min(axis=1) + 1e-12).all()
+
+
 def test_uneven_strain_does_not_rise_by_moving_vertices():
   mesh, config = sheet(24, spare=SPARE), Config(bend=0.0, **FLAT)
   x = mesh.rest
